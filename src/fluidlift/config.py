@@ -1,0 +1,243 @@
+"""What a job can be told: typed sections, presets, YAML files and single overrides."""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+import typing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from fluidlift.errors import InputRejected
+
+
+@dataclass(frozen=True)
+class ReadConfig:
+    """Decoding."""
+
+    start: float = 0.0
+    """s into the clip"""
+    duration: float | None = None
+    """s to read; None reads to the end"""
+    max_size: int = 512
+    """longer side of the working pictures, px"""
+    fps: float = 25.0
+    """frame rate of image sequences, which carry none"""
+    max_pixels: int = 50_000_000
+    """largest picture accepted, px"""
+    max_frames: int = 600
+    """most frames accepted"""
+    stabilise: bool = True
+    """take out mild camera shake"""
+
+
+@dataclass(frozen=True)
+class ShapeConfig:
+    """Geometry."""
+
+    kind: Literal["auto", "stream", "fall", "pour", "plume"] = "auto"
+    """what the fluid does; auto decides from evidence"""
+    fov: float = 50.0
+    """field of view across the longer side, degrees, where no camera file says it"""
+    pitch: float | None = None
+    """degrees that the camera looks below the horizon; None estimates it"""
+    roll: float | None = None
+    """degrees that the picture is turned clockwise; None estimates it"""
+    size: float | None = None
+    """m across the fluid (longest side of its box); None: camera file, free fall, or 1 m"""
+    depth_ratio: float | None = None
+    """greatest depth of a stream over its width; None: 0.2 (stream), 0.1 (fall)"""
+    cells: int = 64
+    """grid cells along the longest side"""
+    cell_limit: int = 120_000
+    """most grid cells"""
+    stride: int = 2
+    """px between front Gaussians"""
+    refine_iterations: int = 30
+    """steps of the single-view optimisation"""
+    max_gaussians: int = 120_000
+    """most rest Gaussians"""
+    rays: int = 9
+    """random rays of the inside test"""
+    longest_union: int = 6
+    """most frames united into one body"""
+
+
+@dataclass(frozen=True)
+class MotionConfig:
+    """Velocities."""
+
+    method: Literal["dis", "farneback"] = "dis"
+    """optical flow"""
+    divergence: Literal["paper", "exact"] = "exact"
+    """form of the screen-divergence constraint"""
+    targets: int = 8
+    """consecutive frames whose volume velocity is computed"""
+    complete_every: int = 6
+    """frames between completed flow fields outside the targets"""
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """Parameters."""
+
+    max_seconds: float = 40.0
+    """time budget"""
+    method: Literal["lm", "adam"] = "lm"
+    """Levenberg-Marquardt, or Adam as in the paper"""
+
+
+@dataclass(frozen=True)
+class SimulateConfig:
+    """Re-simulation."""
+
+    frames: int | None = None
+    """frames to simulate; None: as many as the clip has"""
+    max_particles: int = 150_000
+    """most particles"""
+
+
+@dataclass(frozen=True)
+class ShowConfig:
+    """Pictures and files."""
+
+    width: int = 512
+    """longer side of one preview panel, px"""
+    usd: bool = True
+    """write asset.usda"""
+    splats: bool = True
+    """keep frames/splats/####.ply"""
+
+
+@dataclass(frozen=True)
+class JobConfig:
+    """Everything about one job that is not its input."""
+
+    preset: Literal["draft", "standard", "hero"] = "draft"
+    seed: int = 0
+    read: ReadConfig = field(default_factory=ReadConfig)
+    shape: ShapeConfig = field(default_factory=ShapeConfig)
+    motion: MotionConfig = field(default_factory=MotionConfig)
+    fit: FitConfig = field(default_factory=FitConfig)
+    simulate: SimulateConfig = field(default_factory=SimulateConfig)
+    show: ShowConfig = field(default_factory=ShowConfig)
+
+    def section(self, name: str) -> dict[str, Any]:
+        """One section as plain values."""
+        return dataclasses.asdict(getattr(self, name))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, nested."""
+        return dataclasses.asdict(self)
+
+
+PRESETS: dict[str, dict[str, dict[str, Any]]] = {
+    "draft": {},
+    "standard": {
+        "shape": {"cells": 96, "cell_limit": 300_000, "stride": 1, "refine_iterations": 100, "max_gaussians": 250_000},
+        "motion": {"targets": 12, "complete_every": 3},
+        "fit": {"max_seconds": 120.0},
+        "simulate": {"max_particles": 300_000},
+    },
+    "hero": {
+        "read": {"max_size": 768},
+        "shape": {"cells": 128, "cell_limit": 900_000, "stride": 1, "refine_iterations": 300, "max_gaussians": 600_000},
+        "motion": {"targets": 16, "complete_every": 2},
+        "fit": {"max_seconds": 600.0},
+        "simulate": {"max_particles": 900_000},
+        "show": {"width": 768},
+    },
+}
+
+
+def build_config(
+    preset: str = "draft", file: Path | None = None, overrides: typing.Sequence[str] = (), flat: dict[str, Any] | None = None
+) -> JobConfig:  # fmt: skip
+    """Preset, then file, then flat options, then `section.name=value` overrides; later ones win.
+
+    Args:
+        preset: draft, standard or hero.
+        file: YAML with the sections of `JobConfig`.
+        overrides: texts such as "fit.max_seconds=60".
+        flat: values by dotted name, from command-line options; None values are left out.
+
+    Raises:
+        InputRejected: an unknown name or a value of the wrong type.
+    """
+    values: dict[str, Any] = {}
+    if file is not None:
+        values.update(_flatten(_read_yaml(file)))
+    preset = str(values.pop("preset", preset))
+    if preset not in PRESETS:
+        raise InputRejected(f"unknown preset '{preset}'", "one of " + ", ".join(PRESETS))
+    merged = _flatten(PRESETS[preset]) | values
+    merged |= {k: v for k, v in (flat or {}).items() if v is not None}
+    for text in overrides:
+        name, sign, value = text.partition("=")
+        if not sign:
+            raise InputRejected(f"override '{text}'", "section.name=value, such as fit.max_seconds=60")
+        merged[name.strip()] = _parse(value.strip())
+    config: Any = JobConfig(preset=typing.cast(Any, preset))
+    for name, value in merged.items():
+        config = _with(config, name.split("."), value, name)
+    return config
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    import yaml
+
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise InputRejected(f"config file {path.name} cannot be read: {error}", "a YAML file") from None
+    if not isinstance(data, dict):
+        raise InputRejected(f"config file {path.name} holds no sections", "read:, shape:, motion:, fit:, ...")
+    return data
+
+
+def _flatten(data: dict[str, Any]) -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in data.items():
+        if isinstance(value, dict):
+            flat |= {f"{key}.{k}": v for k, v in value.items()}
+        else:
+            flat[str(key)] = value
+    return flat
+
+
+def _parse(text: str) -> Any:
+    import yaml
+
+    return yaml.safe_load(text)
+
+
+def _with(config: Any, path: list[str], value: Any, name: str) -> Any:
+    fields = typing.get_type_hints(type(config))
+    if path[0] not in fields:
+        known = ", ".join(fields)
+        raise InputRejected(f"unknown option '{name}'", f"one of {known}", "see --print-config for all names")
+    if len(path) > 1:
+        inner = getattr(config, path[0])
+        if not dataclasses.is_dataclass(inner):
+            raise InputRejected(f"unknown option '{name}'", f"{path[0]} has no parts")
+        return dataclasses.replace(config, **{path[0]: _with(inner, path[1:], value, name)})
+    return dataclasses.replace(config, **{path[0]: _checked(value, fields[path[0]], name)})
+
+
+def _checked(value: Any, kind: Any, name: str) -> Any:
+    options = typing.get_args(kind) if isinstance(kind, types.UnionType) else (kind,)
+    for option in options:
+        if option is type(None) and value is None:
+            return None
+        if typing.get_origin(option) is Literal and value in typing.get_args(option):
+            return value
+        if option is float and isinstance(value, int | float) and not isinstance(value, bool):
+            return float(value)
+        if option in (int, bool, str) and type(value) is option:
+            return value
+    wanted = ", ".join(
+        "/".join(map(str, typing.get_args(o))) if typing.get_origin(o) is Literal else getattr(o, "__name__", str(o))
+        for o in options
+    )
+    raise InputRejected(f"option {name} = {value!r}", f"a value of type {wanted}")

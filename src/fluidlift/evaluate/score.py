@@ -1,0 +1,121 @@
+"""The door: an asset folder against a case with a known truth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fluidlift.errors import FluidliftError
+from fluidlift.evaluate.case import Case, read_arrays, read_case, read_json
+from fluidlift.evaluate.planar import (
+    Arrays,
+    picked,
+    score_conservation,
+    score_flow,
+    score_resimulation,
+    score_segmentation,
+)
+from fluidlift.evaluate.report import Evaluation, Figure, figure
+from fluidlift.evaluate.space import align, score_depth, score_divergence, score_parameters, score_volume
+from fluidlift.types import FluidAsset
+
+
+def score_cost(manifest: Mapping[str, Any]) -> list[Figure]:
+    """Seconds per stage and peak memory, as the manifest has them (`timings` in s, `peak_memory_bytes`)."""
+    timings = manifest.get("timings")
+    out = []
+    if isinstance(timings, Mapping) and timings:
+        seconds = {str(k): float(v) for k, v in timings.items() if isinstance(v, int | float)}
+        out += [figure(f"cost.seconds.{k}", v, "s") for k, v in seconds.items() if k != "total"]
+        out.append(figure("cost.seconds", seconds.get("total", sum(seconds.values())), "s", "all stages"))
+    else:
+        out.append(figure("cost.seconds", None, "s", "the manifest has no timings"))
+    peak = manifest.get("peak_memory_bytes")
+    known = isinstance(peak, int | float)
+    out.append(
+        figure("cost.peak_memory", peak / 2**20 if known else None, "MiB", "" if known else "not in the manifest")
+    )
+    return out
+
+
+def evaluate_arrays(
+    asset: FluidAsset,
+    arrays: Arrays,
+    manifest: Mapping[str, Any],
+    case: Case,
+    *,
+    video: np.ndarray | None = None,
+    rows: tuple[int, int] | None = None,
+) -> Evaluation:
+    """All figures of an asset and the arrays of its run. A figure that cannot be measured is None and says why.
+
+    Args:
+        asset: the product.
+        arrays: of the run: labels u8 [T,H,W], front_depth f [H,W] (m), flow_raw and flow_completed f [T-1,H,W,2]
+            (px/frame), first_frame, fit_frames [first, last), and of the re-simulation, whose index k shows frame
+            first_frame + k: resim_flow f [K-1,H,W,2], resim_mask [K,H,W], resim_frames u8 [K,H,W,3],
+            particle_volume [K] (m^3), leak_share [K]. The raster may differ from the truth's. Each may be missing.
+        manifest: timings and peak memory.
+        case: the truth.
+        video: u8 [T,H,W,3], the clip of the case on the raster of resim_frames.
+        rows: score the flow only on these picture rows [first, last) of the truth.
+    """
+    segmentation, series = score_segmentation(arrays, case)
+    flow = score_flow(arrays, case, rows)
+    depth, scale, frame = score_depth(arrays, case)
+    if scale is None:
+        why = "no scale: " + depth[0].note
+        names = ("geometry.occupancy_iou", "geometry.chamfer", "volume.overlap", "volume.relative_l2", "volume.cosine")
+        space = [figure(n, None, "", why) for n in (*names, "parameters")]
+    else:
+        alignment = align(asset, case, scale, frame)
+        space = score_volume(asset, case, alignment) + score_parameters(asset, case, alignment)
+    pictures, more = score_resimulation(arrays, case, video)
+    figures = [*segmentation, *flow, *depth, *space, *score_divergence(asset), *pictures]
+    figures += [*score_conservation(arrays, case), *score_cost(manifest)]
+    return Evaluation(case.name, tuple(figures), {**series, **more})
+
+
+def read_video(path: Path, size: tuple[int, int]) -> np.ndarray:
+    """u8 [T,h,w,3]: all frames of a clip, shrunk or enlarged to `size` (width, height)."""
+    import cv2
+
+    from fluidlift.io.video import read_clip
+
+    frames = read_clip(path, max_size=1 << 14).frames
+    if (frames.shape[2], frames.shape[1]) == size:
+        return frames
+    way = cv2.INTER_AREA if size[0] < frames.shape[2] else cv2.INTER_LINEAR
+    return np.stack([cv2.resize(f, size, interpolation=way) for f in frames])
+
+
+def evaluate_asset(folder: Path, truth: Path, *, rows: tuple[int, int] | None = None) -> Evaluation:
+    """Score an asset folder against a case folder.
+
+    Args:
+        folder: the asset; its `work/evaluation.npz` holds the arrays of the run (see `evaluate_arrays`).
+        truth: the case; see `read_case`.
+        rows: score the flow only on these picture rows [first, last) of the truth.
+
+    Raises:
+        InputRejected: the asset or the case cannot be read. A missing evaluation.npz only leaves figures out.
+    """
+    from fluidlift.io.asset_folder import load_asset
+
+    folder = Path(folder)
+    case = read_case(Path(truth))
+    asset = load_asset(folder)
+    stored = folder / "work" / "evaluation.npz"
+    arrays = read_arrays(stored) if stored.is_file() else {}
+    manifest = read_json(folder / "manifest.json")
+    frames, _ = picked(arrays, "resim_frames", 4, 3)
+    video = None
+    if frames is not None:
+        try:
+            video = read_video(case.video, (frames.shape[2], frames.shape[1]))
+        except FluidliftError:
+            video = None  # the pictures are then not scored, and the figure says so
+    return evaluate_arrays(asset, arrays, manifest, case, video=video, rows=rows)

@@ -1,0 +1,393 @@
+"""The asset folder: what is written where, and a reader that trusts nothing.
+
+    river.fluid/
+      manifest.json   parameters.json   scene.yaml
+      rest/           gaussians.ply  terrain.glb  terrain.npz  velocity.vdb  velocity.npz  camera.json
+      frames/         splats/####.ply   mesh/####.ply   velocity/####.vdb
+      work/           cached stage results
+
+Files for other tools (glb, vdb) lie beside exact arrays (npz), from which the asset is read back. Every file is written
+under a temporary name and renamed.
+"""
+
+from __future__ import annotations
+
+import importlib.resources
+import json
+import zipfile
+from collections.abc import Mapping, Sequence
+from functools import cache
+from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Any
+
+import jsonschema
+import numpy as np
+
+from fluidlift.errors import InputRejected
+from fluidlift.io.atomic import (
+    atomic_path,
+    atomic_write,
+    disk_errors,
+    plain,
+    require_free_space,
+    write_bytes,
+    write_json,
+)
+from fluidlift.io.frames import FIRST_FRAME
+from fluidlift.io.limits import read_json
+from fluidlift.io.ply import read_gaussians, write_gaussians
+from fluidlift.io.scene import SCENE_TEMPLATE, read_scene
+from fluidlift.io.stage_cache import WORK_MARKER, load_stage, mark_work_folder, save_stage
+from fluidlift.io.volume_grid import VolumeGrid, velocity_grid, write_vdb
+from fluidlift.types import (
+    FORMAT_VERSION,
+    CellType,
+    Estimate,
+    FaceVelocity,
+    FluidAsset,
+    FluidParameters,
+    Grid,
+    PinholeCamera,
+    Similarity3,
+    Terrain,
+    TriangleMesh,
+)
+
+__all__ = [
+    "FILES", "asset_file", "atomic_path", "atomic_write", "check_output_folder", "disk_errors", "load_asset",
+    "load_stage", "read_manifest", "read_parameters", "read_scene", "require_free_space", "save_asset", "save_stage",
+    "update_manifest", "write_parameters",
+]  # fmt: skip
+
+FILES = {
+    "gaussians": "rest/gaussians.ply",
+    "terrain": "rest/terrain.npz",
+    "terrain_mesh": "rest/terrain.glb",
+    "velocity": "rest/velocity.npz",
+    "velocity_volume": "rest/velocity.vdb",
+    "camera": "rest/camera.json",
+    "parameters": "parameters.json",
+    "scene": "scene.yaml",
+}
+"""where the parts lie, relative to the folder"""
+
+_MAX_JSON = 16 * 2**20
+_MAX_ARRAYS = 8 * 2**30
+
+
+def check_output_folder(path: Path | str) -> Path:
+    """The path, if an asset may be written there: it does not exist, is an empty folder, or holds an asset already.
+
+    Raises:
+        InputRejected: it is a file, or a folder with other things in it.
+    """
+    path = Path(path)
+    if path.is_symlink() and not path.exists():
+        raise InputRejected(f"'{path}' is a broken link", "a new name or an existing asset")
+    if not path.exists():
+        return path
+    if not path.is_dir():
+        raise InputRejected(f"'{path}' is a file", "a folder", "choose another name with -o, such as river.fluid")
+    if any(path.iterdir()) and not _is_asset(path):
+        raise InputRejected(
+            f"the folder '{path}' holds other things",
+            "a new name, an empty folder, or an earlier asset",
+            "choose another folder with -o; nothing was changed",
+        )
+    return path
+
+
+def _is_asset(path: Path) -> bool:
+    """Whether the folder was begun by fluidlift: our marker under work/, or a manifest of ours."""
+    if (path / "work" / WORK_MARKER).is_file():
+        return True
+    try:
+        manifest = read_json(path / "manifest.json", "manifest", _MAX_JSON)
+    except InputRejected:
+        return False
+    return isinstance(manifest, dict) and manifest.get("format") == "fluidlift asset"
+
+
+def save_asset(
+    folder: Path | str,
+    asset: FluidAsset,
+    *,
+    timings: Mapping[str, Any] | None = None,
+    metrics: Mapping[str, Any] | None = None,
+    warnings: Sequence[str] = (),
+    files: Mapping[str, str] | None = None,
+    start_frame: int = FIRST_FRAME,
+) -> Path:
+    """Write or rewrite an asset. `scene.yaml` is written only if there is none: it belongs to the person who edits it.
+
+    Args:
+        folder: as `check_output_folder` accepts it.
+        timings: seconds per stage, or dictionaries with seconds and more.
+        metrics: figures for the report.
+        warnings: what the user should know.
+        files: further files of the folder by name, relative (preview, report, asset_usd, mask, ...).
+        start_frame: number of the first frame of exported sequences.
+
+    Returns:
+        The folder.
+
+    Raises:
+        InputRejected: the folder holds other things, or the disk is full or may not be written.
+    """
+    folder = check_output_folder(folder)
+    with disk_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        mark_work_folder(folder)
+        write_gaussians(folder / FILES["gaussians"], asset.rest, comments=["rest shape"])
+        _write_terrain(folder, asset)
+        _write_velocity(folder, asset)
+        write_json(folder / FILES["camera"], asset.camera.to_dict())
+        write_parameters(folder, asset.parameters, asset.estimates)
+        if not (folder / FILES["scene"]).exists():
+            write_bytes(folder / FILES["scene"], SCENE_TEMPLATE.encode())
+        present = {name: file for name, file in FILES.items() if (folder / file).is_file()}
+        manifest = _manifest(asset, start_frame) | {
+            "files": present | dict(files or {}),
+            "timings": dict(timings or {}),
+            "metrics": dict(metrics or {}),
+            "warnings": list(warnings),
+        }
+        _write_manifest(folder, manifest)  # last: an asset without a manifest is not finished
+    return folder
+
+
+def _manifest(asset: FluidAsset, start_frame: int) -> dict[str, Any]:
+    canonical = asset.world_from_canonical
+    return {
+        "format": "fluidlift asset",
+        "format_version": FORMAT_VERSION,
+        "kind": asset.kind,
+        "units": {"length": "m", "time": "s", "mass": "kg", "up": "z"},
+        "frame_interval": asset.interval,
+        "frame_count": asset.frame_count,
+        "start_frame": start_frame,
+        "grid": _grid_dict(asset.grid),
+        "world_from_canonical": {
+            "scale": canonical.scale,
+            "rotation": canonical.rotation,
+            "translation": canonical.translation,
+        },
+        "provenance": asset.provenance,
+    }
+
+
+def _write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
+    data = plain(manifest)
+    _validate(data, "manifest", ValueError)
+    for name in data["files"].values():
+        asset_file(folder, name)
+    write_json(folder / "manifest.json", data)
+
+
+def update_manifest(folder: Path | str, **changes: Any) -> dict[str, Any]:
+    """Change top-level entries of a manifest; dictionaries are merged, anything else is replaced. The new manifest."""
+    manifest = read_manifest(folder)
+    for key, value in changes.items():
+        merge = isinstance(value, Mapping) and isinstance(manifest.get(key), dict)
+        manifest[key] = {**manifest[key], **value} if merge else value
+    _write_manifest(Path(folder), manifest)
+    return plain(manifest)
+
+
+def read_manifest(folder: Path | str) -> dict[str, Any]:
+    """The manifest of an asset, checked.
+
+    Raises:
+        InputRejected: no asset, a newer format, a broken manifest, or a file entry that leads out of the folder.
+    """
+    folder = Path(folder)
+    if not (folder / "manifest.json").is_file():
+        raise InputRejected(
+            f"'{folder}' is not a fluidlift asset (it has no manifest.json)",
+            "a folder made with 'fluidlift make'",
+            "check the name, or run 'fluidlift make' to its end",
+        )
+    manifest = read_json(asset_file(folder, "manifest.json"), "manifest", _MAX_JSON)
+    version = manifest.get("format_version") if isinstance(manifest, dict) else None
+    if isinstance(version, int) and version > FORMAT_VERSION:
+        raise InputRejected(
+            f"'{folder.name}' has format version {version}",
+            f"version {FORMAT_VERSION} or older",
+            "update fluidlift: pip install -U fluidlift",
+        )
+    _validate(manifest, "manifest", InputRejected)
+    for name in manifest["files"].values():
+        asset_file(folder, name)
+    return manifest
+
+
+def load_asset(folder: Path | str) -> FluidAsset:
+    """Read an asset back. `scene.yaml` is not applied here; `read_scene` gives its content.
+
+    Raises:
+        InputRejected: as `read_manifest`, or a missing, damaged or contradictory part.
+    """
+    folder = Path(folder)
+    manifest = read_manifest(folder)
+    part = {name: asset_file(folder, file) for name, file in manifest["files"].items()}
+    grid = _grid(manifest["grid"])
+    parameters, estimates = read_parameters(part["parameters"])
+    camera = read_json(part["camera"], "camera JSON", _MAX_JSON)
+    canonical = manifest["world_from_canonical"]
+    moving = _arrays(part["velocity"], ("u", "v", "w", "cell_types"))
+    try:
+        velocity = FaceVelocity(moving["u"], moving["v"], moving["w"])
+        if velocity.shape != grid.shape or moving["cell_types"].shape != grid.shape:
+            raise ValueError(f"velocity {velocity.shape} for a grid {grid.shape}")
+        if moving["cell_types"].dtype != np.uint8 or moving["cell_types"].max() > max(CellType):
+            raise ValueError("cell types that do not exist")
+        return FluidAsset(
+            kind=manifest["kind"],
+            rest=read_gaussians(part["gaussians"]),
+            terrain=_read_terrain(part["terrain"]),
+            grid=grid,
+            cell_types=moving["cell_types"],
+            velocity=velocity,
+            parameters=parameters,
+            estimates=estimates,
+            camera=PinholeCamera.from_dict(camera),
+            world_from_canonical=Similarity3(
+                canonical["scale"], np.array(canonical["rotation"]), np.array(canonical["translation"])
+            ),
+            interval=manifest["frame_interval"],
+            frame_count=manifest["frame_count"],
+            provenance=manifest.get("provenance", {}),
+        )
+    except ValueError as error:
+        raise InputRejected(f"the parts of '{folder.name}' contradict each other: {error}", "a whole asset") from None
+
+
+def asset_file(folder: Path | str, name: str) -> Path:
+    """The file `name` of an asset.
+
+    Raises:
+        InputRejected: an absolute name, a drive, `..`, or a link on the way: the file could be anywhere.
+    """
+    folder = Path(folder)
+    foreign = PurePosixPath(name).is_absolute() or PureWindowsPath(name).drive or PureWindowsPath(name).root
+    parts = PurePosixPath(name.replace("\\", "/")).parts
+    if foreign or ".." in parts or not parts or "\0" in name:
+        raise InputRejected(
+            f"the asset names the file '{name}'", "names inside its own folder", "do not trust this asset"
+        )
+    path = folder
+    for part in parts:
+        path = path / part
+        if path.is_symlink():
+            raise InputRejected(f"'{name}' in '{folder.name}' is a link", "plain files", "do not trust this asset")
+    return path
+
+
+def write_parameters(folder: Path | str, parameters: FluidParameters, estimates: Mapping[str, Estimate]) -> Path:
+    """Write parameters.json. A sigma of infinity becomes null."""
+    data = plain({"values": parameters.to_dict(), "estimates": {k: vars(e) for k, e in estimates.items()}})
+    _validate(data, "parameters", ValueError)
+    return write_json(Path(folder) / FILES["parameters"], data)
+
+
+def read_parameters(path: Path | str) -> tuple[FluidParameters, dict[str, Estimate]]:
+    """Parameters and their estimates.
+
+    Args:
+        path: of parameters.json.
+
+    Raises:
+        InputRejected: a broken file or a value out of its range.
+    """
+    data = read_json(path, "parameters.json", _MAX_JSON)
+    _validate(data, "parameters", InputRejected)
+    estimates = {}
+    for name, e in data["estimates"].items():
+        sigma = np.inf if e["sigma"] is None else float(e["sigma"])
+        prior = np.nan if e["prior"] is None else float(e["prior"])
+        estimates[name] = Estimate(float(e["value"]), sigma, e["identifiable"], prior, e.get("unit", ""))
+    return FluidParameters().updated(data["values"]), estimates
+
+
+@cache
+def _validator(name: str) -> jsonschema.Draft202012Validator:
+    text = importlib.resources.files("fluidlift.io").joinpath(f"{name}.schema.json").read_text(encoding="utf-8")
+    return jsonschema.Draft202012Validator(json.loads(text))
+
+
+def _validate(data: Any, name: str, error: type[Exception]) -> None:
+    """Raise the first and deepest complaint of the schema."""
+    complaint = jsonschema.exceptions.best_match(_validator(name).iter_errors(data))
+    if complaint is not None:
+        raise error(f"{name}.json: {complaint.json_path}: {complaint.message[:300]}")
+
+
+def _grid_dict(grid: Grid) -> dict[str, Any]:
+    return {"shape": list(grid.shape), "spacing": grid.spacing, "origin": list(grid.origin)}
+
+
+def _grid(data: Mapping[str, Any]) -> Grid:
+    return Grid(tuple(data["shape"]), data["spacing"], tuple(data["origin"]))
+
+
+def _write_terrain(folder: Path, asset: FluidAsset) -> None:
+    terrain = asset.terrain
+    arrays = {
+        "shape": np.array(terrain.grid.shape),
+        "spacing": np.array(terrain.grid.spacing),
+        "origin": np.array(terrain.grid.origin),
+        "signed_distance": terrain.signed_distance,
+        "mainstream": terrain.mainstream,
+        "vertices": terrain.mesh.vertices,
+        "faces": terrain.mesh.faces,
+    }
+    if terrain.mesh.colors is not None:
+        arrays["colors"] = terrain.mesh.colors
+    with atomic_write(folder / FILES["terrain"]) as file:
+        np.savez(file, **arrays)
+    glb = folder / FILES["terrain_mesh"]
+    if len(terrain.mesh.faces):
+        from fluidlift.io.export_mesh import write_glb  # trimesh is slow to import
+
+        write_glb(glb, terrain.mesh)
+    else:
+        glb.unlink(missing_ok=True)
+
+
+def _read_terrain(path: Path) -> Terrain:
+    a = _arrays(path, ("shape", "spacing", "origin", "signed_distance", "mainstream", "vertices", "faces"))
+    grid = Grid(tuple(a["shape"].tolist()), float(a["spacing"]), tuple(a["origin"].tolist()))
+    faces = a["faces"]
+    if len(faces) and (faces.min() < 0 or faces.max() >= len(a["vertices"])):
+        raise ValueError("terrain faces that name missing vertices")
+    return Terrain(grid, a["signed_distance"], a["mainstream"], TriangleMesh(a["vertices"], faces, a.get("colors")))
+
+
+def _write_velocity(folder: Path, asset: FluidAsset) -> None:
+    v = asset.velocity
+    with atomic_write(folder / FILES["velocity"]) as file:
+        np.savez(file, u=v.u, v=v.v, w=v.w, cell_types=asset.cell_types)
+    fluid = np.isin(asset.cell_types, (CellType.FLUID, CellType.INFLOW, CellType.OUTFLOW))
+    density = VolumeGrid("density", fluid.astype(np.float32), asset.grid.spacing, asset.grid.origin)
+    write_vdb(folder / FILES["velocity_volume"], [density, velocity_grid(v, asset.grid, active=fluid)])
+
+
+def _arrays(path: Path, needed: Sequence[str]) -> dict[str, np.ndarray]:
+    """The arrays of an npz; pickles and oversize content are refused before anything is unpacked."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if sum(member.file_size for member in archive.infolist()) > _MAX_ARRAYS:
+                raise InputRejected(f"'{path.name}' unpacks to too much", f"at most {_MAX_ARRAYS} bytes")
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, NotImplementedError, MemoryError) as error:
+        raise InputRejected(f"'{path.name}' cannot be read ({error})", "an undamaged asset", "make it again") from None
+    missing = [name for name in needed if name not in arrays]
+    if missing:
+        raise InputRejected(f"'{path.name}' lacks {', '.join(missing)}", "a whole asset", "make it again")
+    bad = [
+        n for n, a in arrays.items() if a.dtype.kind not in "fiub" or (a.dtype.kind == "f" and not np.isfinite(a).all())
+    ]
+    if bad:
+        raise InputRejected(f"'{path.name}' holds {', '.join(bad)} with no finite numbers", "a whole asset")
+    return arrays

@@ -1,0 +1,47 @@
+"""Meshes for other tools: glTF binary (y up), PLY and OBJ (z up)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from fluidlift.errors import require
+from fluidlift.io.atomic import atomic_write, write_bytes
+from fluidlift.io.color import linear_from_srgb
+from fluidlift.io.ply import AXES, write_mesh
+from fluidlift.types import TriangleMesh
+
+__all__ = ["write_glb", "write_mesh", "write_obj"]
+
+
+def write_glb(path: Path | str, mesh: TriangleMesh, *, name: str = "terrain") -> Path:
+    """Write a binary glTF: y up and metres, as glTF demands, with vertex colours in linear light.
+
+    Raises:
+        ValueError: a mesh without faces, which glTF does not allow.
+    """
+    require(len(mesh.faces) > 0 and len(mesh.vertices) > 0, "an empty mesh", "at least one triangle")
+    vertices = np.asarray(mesh.vertices, np.float64) @ AXES["y_up"].T
+    colors = None
+    if mesh.colors is not None:
+        linear = np.round(255 * linear_from_srgb(np.asarray(mesh.colors, np.float64))).astype(np.uint8)
+        colors = np.concatenate([linear, np.full((len(linear), 1), 255, np.uint8)], axis=1)
+    body = trimesh.Trimesh(vertices, np.asarray(mesh.faces), vertex_colors=colors, process=False)
+    scene = trimesh.Scene()
+    scene.add_geometry(body, node_name=name, geom_name=name)
+    return write_bytes(path, scene.export(file_type="glb"))
+
+
+def write_obj(path: Path | str, mesh: TriangleMesh) -> Path:
+    """Write a Wavefront OBJ in world axes (z up, metres); vertex colours follow the coordinates."""
+    columns = [np.asarray(mesh.vertices, np.float64)]
+    if mesh.colors is not None:
+        columns.append(np.clip(np.asarray(mesh.colors, np.float64), 0, 1))
+    table = np.concatenate(columns, axis=1)
+    with atomic_write(path) as file:
+        file.write(b"# metres, z up\n")
+        np.savetxt(file, table, fmt="v" + " %.7g" * table.shape[1])
+        np.savetxt(file, np.asarray(mesh.faces, np.int64) + 1, fmt="f %d %d %d")
+    return Path(path)

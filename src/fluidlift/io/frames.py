@@ -1,0 +1,43 @@
+"""One instant of an animated fluid, as the exporters take it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from fluidlift.errors import require
+from fluidlift.types import Gaussians, TriangleMesh
+
+FIRST_FRAME = 1001
+"""number of the first frame of every exported sequence, as visual-effects departments count"""
+
+
+class FluidFrame(NamedTuple):
+    """What an exporter shows at one frame."""
+
+    gaussians: Gaussians
+    """world, m"""
+    ids: np.ndarray
+    """int [n], stable over time"""
+    velocities: np.ndarray
+    """[n,3], m/s"""
+    surface: TriangleMesh | None = None
+    """the free surface, where it was made"""
+    surface_velocities: np.ndarray | None = None
+    """[v,3], m/s, of the vertices of `surface`"""
+    volume: str | None = None
+    """name of this frame's OpenVDB file, relative to the USD file"""
+
+    def checked(self) -> FluidFrame:
+        """Itself, after a check of the array lengths."""
+        n = len(self.gaussians)
+        require(
+            np.shape(self.ids) == (n,) and np.shape(self.velocities) == (n, 3),
+            f"ids {np.shape(self.ids)} and velocities {np.shape(self.velocities)} for {n} Gaussians",
+            "[n] and [n,3]",
+        )
+        if self.surface is not None and self.surface_velocities is not None:
+            v = len(self.surface.vertices)
+            require(np.shape(self.surface_velocities) == (v, 3), "surface velocities of the wrong shape", f"({v}, 3)")
+        return self

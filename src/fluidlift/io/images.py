@@ -1,0 +1,243 @@
+"""What a user may bring besides the clip: masks, depth and cameras."""
+
+from __future__ import annotations
+
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+
+from fluidlift.errors import InputRejected
+from fluidlift.io.limits import ReadLimits, read_json, require_file, require_size
+from fluidlift.io.pictures import PICTURE_SUFFIXES, read_picture, resample, same_shape, write_png
+from fluidlift.io.sequences import is_sequence, list_sequence
+from fluidlift.io.video import read_clip
+from fluidlift.types import PinholeCamera, RigidTransform, VideoClip
+
+__all__ = ["read_camera", "read_depth", "read_distortion", "read_json", "read_mask", "undistort_clip", "write_png"]
+
+
+def read_mask(
+    path: Path | str,
+    size: tuple[int, int],
+    frames: int,
+    *,
+    start: float = 0.0,
+    duration: float | None = None,
+    limits: ReadLimits | None = None,
+) -> Bool[np.ndarray, "*t h w"]:
+    """Which pixels are fluid: [H,W] from one picture, [T,H,W] from a folder, a sequence or a video.
+
+    White (or opaque, where an alpha channel says anything) is fluid. A mask of another size but of the clip's aspect
+    ratio, such as one drawn on the full-size video, is resampled.
+
+    Args:
+        path: a picture, a folder of pictures, a pattern such as masks/%04d.png, or a video.
+        size: width, height of the clip in px.
+        frames: number of frames of the clip.
+        start, duration: s, where the mask is a video that was cut as the clip was.
+
+    Raises:
+        InputRejected: empty mask, another aspect ratio, another number of frames, or an unreadable file.
+    """
+    path = Path(path)
+    if is_sequence(path):
+        masks = [_binary(read_picture(file, limits=limits)) for _, file in list_sequence(path)]
+    elif path.suffix.lower() in PICTURE_SUFFIXES:
+        masks = [_binary(read_picture(path, limits=limits))]
+    else:
+        clip = read_clip(path, start=start, duration=duration, max_size=max(*size, 16), limits=limits)
+        pictures = clip.frames if clip.alpha is None else clip.alpha
+        masks = [_binary(picture) for picture in pictures]
+    if len(masks) not in (1, frames):
+        raise InputRejected(
+            f"'{path.name}' has {len(masks)} masks", f"one, or {frames} (one per frame)", "cut it as the clip is cut"
+        )
+    fitted = np.stack([_fitted_mask(mask, size, path.name) for mask in masks])
+    if not fitted.any():
+        raise InputRejected(
+            f"the mask '{path.name}' is empty (nothing is white or opaque)",
+            "white (255) where the fluid is, black elsewhere",
+            "check that it is not inverted to black and that the layer was exported",
+        )
+    return fitted[0] if len(masks) == 1 else fitted
+
+
+def _binary(picture: np.ndarray) -> np.ndarray:
+    """float32 0/1 of a mask picture of any depth; the alpha channel decides where it is not constant."""
+    if picture.ndim == 3 and picture.shape[2] == 4 and picture[..., 3].min() < picture[..., 3].max():
+        picture = picture[..., 3]
+    elif picture.ndim == 3:
+        picture = picture[..., :3].max(axis=-1)
+    top = {np.dtype(np.uint8): 255, np.dtype(np.uint16): 65535}.get(picture.dtype, 1.0)
+    if picture.max(initial=0) <= 1:
+        top = 1.0  # masks of 0 and 1
+    return (picture > 0.5 * top).astype(np.float32)
+
+
+def _fitted_mask(mask: np.ndarray, size: tuple[int, int], name: str) -> np.ndarray:
+    _require_shape(mask.shape[1::-1], size, f"the mask '{name}'")
+    return resample(mask, size) >= 0.5
+
+
+def _require_shape(got: tuple[int, int], size: tuple[int, int], what: str) -> None:
+    if not same_shape(got, size):
+        raise InputRejected(
+            f"{what} is {got[0]} x {got[1]} px, another aspect ratio than the clip's {size[0]} x {size[1]}",
+            "the size of the video or of the clip",
+            "export it at the size of the video, upright",
+        )
+
+
+def read_depth(
+    path: Path | str, size: tuple[int, int], *, scale: float | None = None, limits: ReadLimits | None = None
+) -> Float[np.ndarray, "*t h w"]:
+    """Camera depth z (not ray length), float32 [H,W] or, from arrays, [T,H,W]; nan where the file says nothing.
+
+    Depth is taken from the nearest pixel: averages across an edge lie where nothing is.
+
+    Args:
+        path: a 16-bit PNG or TIFF, a float TIFF, .npy, or .npz (its array `depth`, or its only array).
+        size: width, height of the clip in px.
+        scale: m per stored unit. None: 0.001 (millimetres) for 16-bit pictures, 1 for floats.
+
+    Raises:
+        InputRejected: an unreadable file, another aspect ratio, 8-bit samples, or no valid depth.
+    """
+    path = require_file(path, "depth file")
+    limits = limits or ReadLimits()
+    suffix = path.suffix.lower()
+    if suffix in (".npy", ".npz"):
+        depth = _depth_array(path, limits)
+    elif suffix == ".exr":
+        raise InputRejected(
+            f"'{path.name}' is an OpenEXR file, which this build cannot read",
+            "a 16-bit PNG, .npy or .npz",
+            "convert it, for example with: oiiotool depth.exr -d uint16 depth.png (and give --depth-scale)",
+        )
+    else:
+        depth = read_picture(path, limits=limits)
+        if depth.dtype == np.uint8:
+            raise InputRejected(f"'{path.name}' has 8 bits", "16-bit or floating-point depth", "export 16-bit PNG")
+        if depth.ndim == 3:
+            depth = depth[..., 0]
+    if scale is None:
+        scale = 0.001 if depth.dtype == np.uint16 else 1.0
+    if depth.ndim not in (2, 3):
+        raise InputRejected(f"'{path.name}' holds an array {depth.shape}", "[H,W] or [T,H,W]")
+    _require_shape(depth.shape[:-3:-1], size, f"the depth '{path.name}'")
+    layers = depth.reshape(-1, *depth.shape[-2:]).astype(np.float32) * np.float32(scale)
+    fitted = np.stack([cv2.resize(layer, size, interpolation=cv2.INTER_NEAREST_EXACT) for layer in layers])
+    fitted[~(np.isfinite(fitted) & (fitted > 0))] = np.nan
+    if not np.isfinite(fitted).any():
+        raise InputRejected(f"no valid depth in '{path.name}'", "positive metres", "check --depth-scale")
+    return fitted[0] if depth.ndim == 2 else fitted
+
+
+def _depth_array(path: Path, limits: ReadLimits) -> np.ndarray:
+    require_size(path, limits.max_bytes, "depth array")
+    try:
+        arrays = np.load(path, allow_pickle=False)
+        if isinstance(arrays, np.ndarray):
+            depth = arrays
+        else:
+            with arrays:
+                if sum(i.file_size for i in arrays.zip.infolist()) > limits.max_bytes:
+                    raise InputRejected(f"'{path.name}' unpacks to too much", f"at most {limits.max_bytes} bytes")
+                names = arrays.files
+                if "depth" not in names and len(names) != 1:
+                    raise InputRejected(f"'{path.name}' holds {', '.join(names) or 'nothing'}", "an array 'depth'")
+                depth = arrays["depth" if "depth" in names else names[0]]
+    except (ValueError, OSError, EOFError, zipfile.BadZipFile, KeyError) as error:
+        raise InputRejected(
+            f"'{path.name}' cannot be read as an array ({error})", "numbers saved with numpy.save or numpy.savez"
+        ) from None
+    if depth.dtype.kind not in "fui":
+        raise InputRejected(f"'{path.name}' holds {depth.dtype}", "numbers")
+    return depth
+
+
+def read_camera(path: Path | str, size: tuple[int, int]) -> PinholeCamera:
+    """The camera of the clip, scaled to its size.
+
+    Two kinds of file: width, height, K, R, t as `PinholeCamera.to_dict` writes them (further keys are let pass), and
+    nerfstudio's transforms.json (OpenGL axes, z-up world; all frames must have one pose, since the camera stands).
+
+    Args:
+        path: a JSON file.
+        size: width, height of the clip in px.
+
+    Raises:
+        InputRejected: an unreadable file, missing keys, another aspect ratio, or a moving camera.
+    """
+    data = read_json(path, "camera JSON")
+    name = Path(path).name
+    if not isinstance(data, dict):
+        raise InputRejected(f"'{name}' holds no camera", "a JSON object with width, height and K")
+    camera = _from_transforms(data, name) if "frames" in data and "K" not in data else PinholeCamera.from_dict(data)
+    _require_shape(camera.size, size, f"the camera of '{name}'")
+    return camera.resized(size)
+
+
+def _from_transforms(data: dict[str, Any], name: str) -> PinholeCamera:
+    try:
+        poses = np.array([f["transform_matrix"] for f in data["frames"]], float).reshape(-1, 4, 4)
+        first = {**data, **data["frames"][0]}
+        size = (int(first["w"]), int(first["h"]))
+        if "fl_x" in first:
+            focal = float(first["fl_x"]), float(first.get("fl_y", first["fl_x"]))
+        else:
+            focal = (0.5 * size[0] / np.tan(0.5 * float(first["camera_angle_x"])),) * 2
+        center = float(first.get("cx", size[0] / 2)), float(first.get("cy", size[1] / 2))
+        if len(poses) == 0 or np.abs(poses - poses[0]).max() > 1e-3 * max(1.0, np.abs(poses[0, :3, 3]).max()):
+            raise InputRejected(f"'{name}' has a moving camera", "one pose", "give a clip from a standing camera")
+        rotation = poses[0, :3, :3] @ np.diag([1.0, -1.0, -1.0])  # world from camera, OpenGL axes to OpenCV axes
+        pose = RigidTransform(rotation, poses[0, :3, 3]).inverse()
+        return PinholeCamera(focal, center, size, pose)
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise InputRejected(
+            f"'{name}' is a transforms.json that cannot be read ({type(error).__name__}: {error})",
+            "w, h, fl_x or camera_angle_x, and frames with a rigid transform_matrix (4x4)",
+        ) from None
+
+
+def read_distortion(path: Path | str) -> tuple[float, ...] | None:
+    """k1, k2, p1, p2 (and k3) of a camera file in OpenCV's model, or None where it has none or only zeros."""
+    data = read_json(path, "camera JSON")
+    if not isinstance(data, dict):
+        return None
+    listed = data.get("distortion_k1_k2_p1_p2", data.get("distortion"))
+    values = listed if listed is not None else [data.get(k, 0.0) for k in ("k1", "k2", "p1", "p2", "k3")]
+    try:
+        numbers = tuple(float(v) for v in values)
+    except (TypeError, ValueError):
+        raise InputRejected(f"distortion {values} in '{Path(path).name}'", "4 or 5 numbers: k1 k2 p1 p2 (k3)") from None
+    if not any(numbers):
+        return None
+    if len(numbers) not in (4, 5) or not np.isfinite(numbers).all():
+        raise InputRejected(f"distortion {numbers} in '{Path(path).name}'", "4 or 5 numbers: k1 k2 p1 p2 (k3)")
+    return numbers
+
+
+def undistort_clip(clip: VideoClip, camera: PinholeCamera, distortion: tuple[float, ...]) -> VideoClip:
+    """The clip as the pinhole camera without lens distortion would have seen it.
+
+    Pixels that the lens did not see are black, and transparent where the clip has an alpha channel.
+
+    Args:
+        camera: at the size of the clip.
+        distortion: k1, k2, p1, p2 (and k3), OpenCV's model, for the same camera.
+    """
+    (fx, fy), (cx, cy) = camera.focal, camera.center
+    matrix = np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1.0]])  # OpenCV puts pixel centres at integers
+    maps = cv2.initUndistortRectifyMap(matrix, np.array(distortion), None, matrix, clip.size, cv2.CV_32FC1)
+    frames = np.stack([cv2.remap(frame, *maps, cv2.INTER_LINEAR) for frame in clip.frames])
+    alpha = None
+    if clip.alpha is not None:
+        alpha = np.stack([cv2.remap(layer, *maps, cv2.INTER_LINEAR) for layer in clip.alpha])
+    note = "lens distortion was removed with the coefficients of the camera file"
+    return replace(clip, frames=frames, alpha=alpha, warnings=(*clip.warnings, note))

@@ -1,0 +1,86 @@
+"""How much a reader takes in before it says no, and the first look at any file that a user names."""
+
+from __future__ import annotations
+
+import difflib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from fluidlift.errors import InputRejected, require
+
+MAX_TEXT_BYTES = 64 * 2**20
+"""of a JSON or YAML file"""
+
+
+@dataclass(frozen=True)
+class ReadLimits:
+    """Bounds on what a video or a picture may cost, so that a hostile or mistaken file cannot fill the machine."""
+
+    max_pixels: int = 8192 * 4320
+    """of one source frame, before it is scaled down"""
+    max_frames: int = 2000
+    """frames kept"""
+    max_bytes: int = 4 * 2**30
+    """memory of all frames kept, after they are scaled down"""
+
+    def __post_init__(self) -> None:
+        require(min(self.max_pixels, self.max_frames, self.max_bytes) > 0, f"limits {self}", "positive numbers")
+
+
+def require_file(path: Path | str, what: str = "file") -> Path:
+    """The path, if it names a readable regular file with something in it.
+
+    Raises:
+        InputRejected: nothing there, a folder, a device, an empty file, or no permission.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise InputRejected(f"no such {what}: '{path}'", f"an existing {what}", _suggestion(path))
+    if path.is_dir():
+        raise InputRejected(f"'{path}' is a folder", f"a {what}")
+    if not path.is_file():
+        raise InputRejected(f"'{path}' is not a regular file", f"a {what}")
+    try:
+        with path.open("rb") as file:
+            first = file.read(1)
+    except PermissionError:
+        raise InputRejected(f"'{path}' may not be read", "permission to read it", "change its access rights") from None
+    if not first:
+        raise InputRejected(f"'{path}' is empty (0 bytes)", f"a {what} with content", "copy or download it again")
+    return path
+
+
+def _suggestion(path: Path) -> str:
+    """Names nearby that look like the one that was asked for."""
+    parent = path.parent
+    if not parent.is_dir():
+        return f"check the folder: '{parent}' does not exist either"
+    near = difflib.get_close_matches(path.name, [p.name for p in parent.iterdir()], n=3, cutoff=0.6)
+    return f"check the name; similar ones there: {', '.join(near)}" if near else "check the name"
+
+
+def require_size(path: Path, max_bytes: int, what: str) -> None:
+    """Raise `InputRejected` if the file is larger than `max_bytes`."""
+    size = path.stat().st_size
+    if size > max_bytes:
+        raise InputRejected(
+            f"'{path.name}' has {size} bytes",
+            f"at most {max_bytes} bytes in a {what}",
+            "check that it is the right file",
+        )
+
+
+def read_json(path: Path | str, what: str = "JSON file", max_bytes: int = MAX_TEXT_BYTES) -> Any:
+    """The content of a JSON file.
+
+    Raises:
+        InputRejected: no such file, larger than `max_bytes`, or not JSON.
+    """
+    path = require_file(path, what)
+    require_size(path, max_bytes, what)
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise InputRejected(f"'{path.name}' is not valid JSON ({error})", f"a {what}", "check the file") from None

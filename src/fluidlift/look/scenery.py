@@ -1,0 +1,116 @@
+"""Terrain in pictures: as surfels beside the fluid's splats, and as a depth that hides what lies behind rocks."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from fluidlift.numerics.sampling import sample_nodes
+from fluidlift.types import Gaussians, PinholeCamera, Terrain, TriangleMesh, decompose_covariances, sh_from_rgb
+
+LIGHT = np.array([0.35, -0.45, 0.82])
+"""direction towards a high light beside the viewer, world"""
+
+
+def vertex_normals(mesh: TriangleMesh) -> Float[np.ndarray, "v 3"]:
+    """Area-weighted unit normals."""
+    a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
+    face = np.cross(b - a, c - a)
+    normals = np.zeros((len(mesh.vertices), 3))
+    for k in range(3):
+        np.add.at(normals, mesh.faces[:, k], face)
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
+
+
+def terrain_surfels(terrain: Terrain, *, opacity: float = 0.98) -> Gaussians:
+    """One flat, shaded Gaussian per vertex of the terrain's surface, so that one rasteriser draws everything."""
+    mesh, h = terrain.mesh, terrain.grid.spacing
+    if len(mesh.vertices) == 0:
+        return Gaussians.empty()
+    normals = vertex_normals(mesh)
+    light = LIGHT / np.linalg.norm(LIGHT)
+    shade = 0.55 + 0.45 * np.clip(normals @ light, 0.0, 1.0)
+    colors = np.full((len(normals), 3), 0.5) if mesh.colors is None else mesh.colors
+    outer = normals[:, :, None] * normals[:, None, :]
+    covariance = (0.62 * h) ** 2 * (np.eye(3) - outer) + (0.12 * h) ** 2 * outer
+    quats, scales = decompose_covariances(covariance)
+    return Gaussians(
+        mesh.vertices, quats, scales, np.full(len(normals), opacity), sh_from_rgb(colors * shade[:, None])
+    )
+
+
+def terrain_depth(terrain: Terrain, camera: PinholeCamera, *, steps: int = 96) -> Float[np.ndarray, "h w"]:
+    """Camera depth (m) at which each pixel's ray meets the terrain; inf where it does not (sphere tracing)."""
+    grid = terrain.grid
+    rays = camera.rays(camera.pixel_grid()).reshape(-1, 3)
+    length = np.linalg.norm(rays, axis=1)
+    eye = camera.position
+    with np.errstate(divide="ignore", invalid="ignore"):
+        a, b = (grid.low - eye) / rays, (grid.high - eye) / rays
+    near = np.nanmax(np.minimum(a, b), axis=1)
+    far = np.nanmin(np.maximum(a, b), axis=1)
+    z = np.maximum(near, 1e-6) + 1e-6
+    hit = np.zeros(len(z), bool)
+    active = np.where(far > z)[0]
+    for _ in range(steps):
+        if len(active) == 0:
+            break
+        p = eye + rays[active] * z[active, None]
+        distance = sample_nodes(terrain.signed_distance, grid, p)
+        close = distance < 0.05 * grid.spacing
+        hit[active[close]] = True
+        # the distance transform is not exact: step a little less than it allows
+        z[active] += np.where(close, 0.0, np.maximum(0.8 * distance, 0.05 * grid.spacing) / length[active])
+        active = active[~close & (z[active] < far[active])]
+    return np.where(hit, z, np.inf).reshape(camera.size[1], camera.size[0])
+
+
+def visible_beside_rocks(
+    means: Float[np.ndarray, "n 3"],
+    camera: PinholeCamera,
+    depth: Float[np.ndarray, "h w"],
+    where: Bool[np.ndarray, "h w"],
+    *,
+    margin: float,
+) -> Bool[np.ndarray, "n"]:
+    """False for points that lie more than `margin` (m) behind the solid seen at a pixel of `where`."""
+    uv, z = camera.project(means)
+    width, height = camera.size
+    uv = np.nan_to_num(uv, nan=-1.0, posinf=1e9, neginf=-1e9)
+    col, row = np.clip(uv[:, 0], 0, width - 1).astype(int), np.clip(uv[:, 1], 0, height - 1).astype(int)
+    return ~(where[row, col] & (z > depth[row, col] + margin))
+
+
+def orbit_camera(
+    camera: PinholeCamera,
+    points: Float[np.ndarray, "n 3"],
+    *,
+    azimuth: float = 65.0,
+    elevation: float = 24.0,
+    size: tuple[int, int] | None = None,
+    fov: float = 40.0,
+) -> PinholeCamera:
+    """A camera turned around the middle of some points, far enough away to see all of them.
+
+    Args:
+        camera: the original view; azimuth is counted from it.
+        points: what must be seen, m.
+        azimuth: degrees around the vertical, counter-clockwise seen from above.
+        elevation: degrees above the horizontal.
+        size: of the picture; None keeps the original's.
+        fov: degrees across the longer side.
+    """
+    low, high = np.percentile(points, 1, axis=0), np.percentile(points, 99, axis=0)
+    centre, radius = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
+    away = camera.position - centre
+    angle = math.atan2(away[1], away[0]) + math.radians(azimuth)
+    tilt = math.radians(elevation)
+    size = size or camera.size
+    narrow = math.atan(math.tan(math.radians(fov) / 2) * min(size) / max(size))
+    distance = 0.92 * radius / math.sin(max(narrow, 0.05))
+    eye = centre + distance * np.array(
+        [math.cos(angle) * math.cos(tilt), math.sin(angle) * math.cos(tilt), math.sin(tilt)]
+    )
+    return PinholeCamera.looking(eye, centre, fov, size)

@@ -1,0 +1,92 @@
+"""Signed distances at grid nodes: making them, and keeping points outside the solid."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numba import njit, prange
+from scipy import ndimage
+
+from fluidlift.errors import require
+from fluidlift.types import Grid
+
+
+def distance_of_mask(solid: Bool[np.ndarray, "..."], spacing: float) -> Float[np.ndarray, "..."]:
+    """Signed distance (m, positive outside) to the surface half way between solid and open samples."""
+    require(solid.dtype == bool, f"mask of type {solid.dtype}", "bool")
+    if not solid.any():
+        return np.full(solid.shape, spacing * sum(solid.shape), np.float32)
+    outside = ndimage.distance_transform_edt(~solid)
+    if solid.all():
+        return np.full(solid.shape, -spacing * sum(solid.shape), np.float32)
+    inside = ndimage.distance_transform_edt(solid)
+    return (spacing * np.where(solid, 0.5 - inside, outside - 0.5)).astype(np.float32)
+
+
+def distance_of_heights(heights: Float[np.ndarray, "nx+1 ny+1"], grid: Grid) -> Float[np.ndarray, "nx+1 ny+1 nz+1"]:
+    """First-order signed distance (m) to a height field: vertical distance over the length of the slope vector."""
+    require(heights.shape == (grid.shape[0] + 1, grid.shape[1] + 1), f"heights {heights.shape}", "one per node column")
+    slope_x, slope_y = np.gradient(np.asarray(heights, np.float64), grid.spacing)
+    z = grid.low[2] + np.arange(grid.shape[2] + 1) * grid.spacing
+    vertical = z[None, None, :] - heights[:, :, None]
+    return (vertical / np.sqrt(1.0 + slope_x**2 + slope_y**2)[:, :, None]).astype(np.float32)
+
+
+@njit(cache=True)
+def distance_and_gradient(field, low, inverse_spacing, x, y, z):
+    """Trilinear value and gradient (per m) of a node field at one point, for kernels."""
+    nx, ny, nz = field.shape
+    px = min(max((x - low[0]) * inverse_spacing, 0.0), nx - 1.0)
+    py = min(max((y - low[1]) * inverse_spacing, 0.0), ny - 1.0)
+    pz = min(max((z - low[2]) * inverse_spacing, 0.0), nz - 1.0)
+    i = min(np.int64(px), nx - 2)
+    j = min(np.int64(py), ny - 2)
+    k = min(np.int64(pz), nz - 2)
+    fx, fy, fz = px - i, py - j, pz - k
+    a00 = field[i, j, k] * (1 - fx) + field[i + 1, j, k] * fx
+    a10 = field[i, j + 1, k] * (1 - fx) + field[i + 1, j + 1, k] * fx
+    a01 = field[i, j, k + 1] * (1 - fx) + field[i + 1, j, k + 1] * fx
+    a11 = field[i, j + 1, k + 1] * (1 - fx) + field[i + 1, j + 1, k + 1] * fx
+    value = (a00 * (1 - fy) + a10 * fy) * (1 - fz) + (a01 * (1 - fy) + a11 * fy) * fz
+    gz = (a01 * (1 - fy) + a11 * fy) - (a00 * (1 - fy) + a10 * fy)
+    gy = (a10 - a00) * (1 - fz) + (a11 - a01) * fz
+    d00 = field[i + 1, j, k] - field[i, j, k]
+    d10 = field[i + 1, j + 1, k] - field[i, j + 1, k]
+    d01 = field[i + 1, j, k + 1] - field[i, j, k + 1]
+    d11 = field[i + 1, j + 1, k + 1] - field[i, j + 1, k + 1]
+    gx = (d00 * (1 - fy) + d10 * fy) * (1 - fz) + (d01 * (1 - fy) + d11 * fy) * fz
+    return value, gx * inverse_spacing, gy * inverse_spacing, gz * inverse_spacing
+
+
+@njit(parallel=True, cache=True)
+def _push(points, field, low, inverse_spacing, margin, inside):
+    for p_ in prange(len(points)):
+        p = np.int64(p_)
+        x, y, z = np.float64(points[p, 0]), np.float64(points[p, 1]), np.float64(points[p, 2])
+        for _ in range(8):
+            value, gx, gy, gz = distance_and_gradient(field, low, inverse_spacing, x, y, z)
+            if value >= margin:
+                break
+            squared = gx * gx + gy * gy + gz * gz
+            if squared < 1e-6:
+                break
+            step = 1.01 * (margin - value) / squared
+            x += step * gx
+            y += step * gy
+            z += step * gz
+        points[p, 0], points[p, 1], points[p, 2] = x, y, z
+        value, gx, gy, gz = distance_and_gradient(
+            field, low, inverse_spacing, np.float64(points[p, 0]), np.float64(points[p, 1]), np.float64(points[p, 2])
+        )
+        inside[p] = value < 0.0
+
+
+def push_outside(
+    points: Float[np.ndarray, "n 3"], signed_distance: np.ndarray, grid: Grid, margin: float = 0.0
+) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, "n"]]:
+    """Points (m, float32) moved along the gradient until `margin` m outside, and which of them are still inside."""
+    moved = np.array(points, np.float32, order="C")
+    inside = np.zeros(len(moved), bool)
+    field = np.ascontiguousarray(signed_distance, np.float32)
+    _push(moved, field, grid.low, 1.0 / grid.spacing, float(margin), inside)
+    return moved, inside

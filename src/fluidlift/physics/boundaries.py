@@ -1,0 +1,285 @@
+"""Walls and free surfaces: open faces, liquid cells, velocity beyond the liquid, collisions of particles.
+
+Wall model (paper: b, d). The grid lets no fluid through a wall. `wall_damping` takes its share of the tangential
+velocity of particles within one cell of the wall once per nominal time step; the share fades linearly with distance.
+`restitution` gives back its share of the normal velocity to particles that still reach the wall (splashes: inside a
+body of liquid the pressure has already turned the flow along the wall).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numba import njit, prange
+
+from fluidlift.numerics.sampling import gradient_nodes
+from fluidlift.numerics.signed_distance import distance_and_gradient
+from fluidlift.physics.pressure import face_fractions
+from fluidlift.types import CellType, FaceVelocity, Grid, Terrain
+
+CLEARANCE = 0.02
+"""cells: how far outside the solid a colliding particle is put"""
+
+
+@dataclass(frozen=True)
+class Walls:
+    """What is static about the boundaries of a simulation."""
+
+    grid: Grid
+    signed_distance: Float[np.ndarray, "nx+1 ny+1 nz+1"]
+    """m, positive outside the solid"""
+    openings: tuple[np.ndarray, np.ndarray, np.ndarray]
+    """open fraction of every face, closed sides of the box included"""
+    normals: tuple[np.ndarray, np.ndarray, np.ndarray]
+    """float32 [...,3] per face: unit vector out of the solid on closed faces, 0 on open ones"""
+    solid: Bool[np.ndarray, "nx ny nz"]
+    """cells without any open face"""
+    regions: np.ndarray
+    """u8 [nx,ny,nz]: INFLOW, OUTFLOW, SOLID or EMPTY (everywhere else)"""
+    open_sides: Bool[np.ndarray, "3 2"]
+    """sides of the box (axis, low/high) that let particles and fluid out everywhere"""
+
+
+def build_walls(terrain: Terrain, regions: np.ndarray, open_sides: np.ndarray) -> Walls:
+    """Prepare the boundaries.
+
+    Args:
+        terrain: its signed distance decides what is solid; SOLID marks in `regions` are not needed.
+        regions: u8 [nx,ny,nz]; only INFLOW and OUTFLOW count.
+        open_sides: bool [3,2], see `Walls`.
+    """
+    grid = terrain.grid
+    distance = np.ascontiguousarray(terrain.signed_distance, np.float32)
+    fractions = face_fractions(distance)
+    any_open = np.zeros(grid.shape, bool)
+    for axis, f in enumerate(fractions):
+        along = np.moveaxis(f, axis, 0)
+        any_open |= np.moveaxis((along[1:] > 0) | (along[:-1] > 0), 0, axis)
+    through = np.isin(regions, (CellType.INFLOW, CellType.OUTFLOW))
+    openings, normals = [], []
+    for axis, f in enumerate(fractions):
+        opening = f.copy()
+        normal = np.zeros((*f.shape, 3), np.float32)
+        closed = f == 0
+        if closed.any():
+            gradient = gradient_nodes(distance, grid, grid.faces(axis)[closed])
+            length = np.linalg.norm(gradient, axis=1, keepdims=True)
+            normal[closed] = np.where(length > 1e-3, gradient / np.maximum(length, 1e-3), np.eye(3)[axis])
+        for side, at in enumerate((0, -1)):
+            if not open_sides[axis, side]:
+                shut = ~np.moveaxis(through, axis, 0)[at]
+                np.moveaxis(opening, axis, 0)[at][shut] = 0.0
+                np.moveaxis(normal, axis, 0)[at][shut] = np.eye(3)[axis]
+        openings.append(opening)
+        normals.append(normal)
+    clean = np.where(any_open & through, regions, CellType.EMPTY)
+    clean = np.where(any_open, clean, CellType.SOLID).astype(np.uint8)
+    return Walls(grid, distance, tuple(openings), tuple(normals), ~any_open, clean, np.asarray(open_sides, bool))
+
+
+def liquid_cells(occupied: Bool[np.ndarray, "nx ny nz"], walls: Walls) -> np.ndarray:
+    """u8 cell types of this step.
+
+    FLUID where there are particles, and in single empty cells that are enclosed (five of six neighbours hold liquid
+    or are solid, at least three liquid): sampling gaps, not bubbles. INFLOW cells are always INFLOW.
+    """
+    wet = occupied & ~walls.solid
+    blocked = np.pad(wet | walls.solid, 1)
+    wide = np.pad(wet, 1)
+    inner = slice(1, -1)
+    around, liquid = np.zeros(wet.shape, np.int8), np.zeros(wet.shape, np.int8)
+    for axis in range(3):
+        for shift in (slice(0, -2), slice(2, None)):
+            index = [inner, inner, inner]
+            index[axis] = shift
+            around += blocked[tuple(index)]
+            liquid += wide[tuple(index)]
+    gap = ~wet & ~walls.solid & (around >= 5) & (liquid >= 3)
+    types = walls.regions.copy()
+    types[(wet | gap) & (walls.regions == CellType.EMPTY)] = CellType.FLUID
+    return types
+
+
+@njit(parallel=True, cache=True)
+def _grow(field, valid, new_field, new_valid):
+    """One layer: faces without a value take the mean of their neighbours that have one."""
+    nx, ny, nz = field.shape
+    for i_ in prange(nx):
+        i = np.int64(i_)
+        for j in range(ny):
+            for k in range(nz):
+                new_field[i, j, k] = field[i, j, k]
+                new_valid[i, j, k] = valid[i, j, k]
+                if valid[i, j, k]:
+                    continue
+                total = np.float32(0.0)
+                count = 0
+                if i > 0 and valid[i - 1, j, k]:
+                    total += field[i - 1, j, k]
+                    count += 1
+                if i < nx - 1 and valid[i + 1, j, k]:
+                    total += field[i + 1, j, k]
+                    count += 1
+                if j > 0 and valid[i, j - 1, k]:
+                    total += field[i, j - 1, k]
+                    count += 1
+                if j < ny - 1 and valid[i, j + 1, k]:
+                    total += field[i, j + 1, k]
+                    count += 1
+                if k > 0 and valid[i, j, k - 1]:
+                    total += field[i, j, k - 1]
+                    count += 1
+                if k < nz - 1 and valid[i, j, k + 1]:
+                    total += field[i, j, k + 1]
+                    count += 1
+                if count > 0:
+                    new_field[i, j, k] = total / np.float32(count)
+                    new_valid[i, j, k] = True
+
+
+def extrapolate(
+    velocity: FaceVelocity, valid: tuple[np.ndarray, np.ndarray, np.ndarray], layers: int = 3
+) -> FaceVelocity:
+    """Continue the velocity beyond the faces where it is known (bool per face), layer by layer; 0 farther away."""
+    out = []
+    for component, known in zip(velocity.components, valid):
+        field = np.where(known, component, 0).astype(np.float32)
+        mask = known.copy()
+        for _ in range(layers):
+            new_field, new_mask = np.empty_like(field), np.empty_like(mask)
+            _grow(field, mask, new_field, new_mask)
+            field, mask = new_field, new_mask
+        out.append(field)
+    return FaceVelocity(*out)
+
+
+@njit(parallel=True, cache=True)
+def _slide(u, v, w, opening, normals, axis, out):
+    """Closed faces of one component lose the part of the local velocity that is normal to the wall."""
+    nx, ny, nz = out.shape
+    for i_ in prange(nx):
+        i = np.int64(i_)
+        for j in range(ny):
+            for k in range(nz):
+                if opening[i, j, k] > 0:
+                    continue
+                n0, n1, n2 = normals[i, j, k, 0], normals[i, j, k, 1], normals[i, j, k, 2]
+                na = n0 if axis == 0 else (n1 if axis == 1 else n2)
+                if na == 0:
+                    continue
+                speed = na * out[i, j, k]
+                for b in range(3):
+                    nb = n0 if b == 0 else (n1 if b == 1 else n2)
+                    if b == axis or nb == 0:
+                        continue
+                    # the four faces of component b around this face
+                    other = u if b == 0 else (v if b == 1 else w)
+                    mx, my, mz = other.shape
+                    total = np.float32(0.0)
+                    for s in range(2):
+                        for t in range(2):
+                            ii = i - s if axis == 0 else (i + t if b == 0 else i)
+                            jj = j - s if axis == 1 else (j + t if b == 1 else j)
+                            kk = k - s if axis == 2 else (k + t if b == 2 else k)
+                            ii = min(max(ii, 0), mx - 1)
+                            jj = min(max(jj, 0), my - 1)
+                            kk = min(max(kk, 0), mz - 1)
+                            total += other[ii, jj, kk]
+                    speed += nb * total * np.float32(0.25)
+                out[i, j, k] -= na * speed
+
+
+def slide_along_walls(velocity: FaceVelocity, walls: Walls) -> FaceVelocity:
+    """The velocity continued into the solid, made tangential to its surface (free slip)."""
+    out = []
+    for axis, component in enumerate(velocity.components):
+        new = component.copy()
+        _slide(*velocity.components, walls.openings[axis], walls.normals[axis], axis, new)
+        out.append(new)
+    return FaceVelocity(*out)
+
+
+@njit(parallel=True, cache=True)
+def _collide(new, old, velocities, field, regions, low, high, h, open_sides, restitution, keep):
+    inverse = 1.0 / h
+    margin = CLEARANCE * h
+    for p_ in prange(len(new)):
+        p = np.int64(p_)
+        i = min(max(np.int64((old[p, 0] - low[0]) * inverse), 0), regions.shape[0] - 1)
+        j = min(max(np.int64((old[p, 1] - low[1]) * inverse), 0), regions.shape[1] - 1)
+        k = min(max(np.int64((old[p, 2] - low[2]) * inverse), 0), regions.shape[2] - 1)
+        through = regions[i, j, k] >= 3  # INFLOW or OUTFLOW
+        for a in range(3):
+            lowest, highest = low[a] + margin, high[a] - margin
+            if through:
+                continue
+            if new[p, a] < lowest and not open_sides[a, 0]:
+                new[p, a] = lowest
+                velocities[p, a] = max(velocities[p, a], -restitution * velocities[p, a])
+            elif new[p, a] > highest and not open_sides[a, 1]:
+                new[p, a] = highest
+                velocities[p, a] = min(velocities[p, a], -restitution * velocities[p, a])
+        x, y, z = np.float64(new[p, 0]), np.float64(new[p, 1]), np.float64(new[p, 2])
+        value, gx, gy, gz = distance_and_gradient(field, low, inverse, x, y, z)
+        if value >= h:
+            continue
+        length = np.sqrt(gx * gx + gy * gy + gz * gz)
+        if length > 1e-3:
+            nx, ny, nz = gx / length, gy / length, gz / length
+            normal = velocities[p, 0] * nx + velocities[p, 1] * ny + velocities[p, 2] * nz
+            # share of the damping at this distance
+            factor = 1.0 - (1.0 - keep) * min(max(1.0 - value / h, 0.0), 1.0)
+            back = normal
+            if value < margin and normal < 0.0:
+                back = -restitution * normal
+            velocities[p, 0] = factor * (velocities[p, 0] - normal * nx) + back * nx
+            velocities[p, 1] = factor * (velocities[p, 1] - normal * ny) + back * ny
+            velocities[p, 2] = factor * (velocities[p, 2] - normal * nz) + back * nz
+        if value >= margin:
+            continue
+        for _ in range(6):
+            squared = gx * gx + gy * gy + gz * gz
+            if value >= margin or squared < 1e-6:
+                break
+            step = 1.01 * (margin - value) / squared
+            x = min(max(x + step * gx, low[0]), high[0])
+            y = min(max(y + step * gy, low[1]), high[1])
+            z = min(max(z + step * gz, low[2]), high[2])
+            value, gx, gy, gz = distance_and_gradient(field, low, inverse, x, y, z)
+        # judged as stored, in single precision; the old place was outside
+        fx, fy, fz = np.float32(x), np.float32(y), np.float32(z)
+        value, gx, gy, gz = distance_and_gradient(
+            field, low, inverse, np.float64(fx), np.float64(fy), np.float64(fz)
+        )
+        if value > 0.0:
+            new[p, 0], new[p, 1], new[p, 2] = fx, fy, fz
+        else:
+            for a in range(3):
+                new[p, a] = old[p, a]
+
+
+def collide(
+    positions: Float[np.ndarray, "n 3"],
+    previous: Float[np.ndarray, "n 3"],
+    velocities: Float[np.ndarray, "n 3"],
+    walls: Walls,
+    *,
+    restitution: float,
+    tangential_share: float,
+) -> None:
+    """Keep particles out of the solid and within the closed sides of the box, in place.
+
+    Args:
+        positions: float32, moved.
+        previous: where the particles were, outside the solid.
+        velocities: changed at walls.
+        walls: the boundaries.
+        restitution: share of the normal velocity given back on impact.
+        tangential_share: share of the tangential velocity that survives this step at the wall.
+    """
+    _collide(
+        positions, previous, velocities, walls.signed_distance, walls.regions, walls.grid.low,
+        walls.grid.high, walls.grid.spacing, walls.open_sides, float(restitution), float(tangential_share),
+    )  # fmt: skip

@@ -1,0 +1,68 @@
+"""Against clumps: small moves of particles from crowded places to others, which leave the velocity alone.
+
+After Kugelstadt, Longva, Thuerey, Bender 2019, "Implicit density projection for volume conserving liquids": where
+particles fill more than a cell holds, a displacement field with the divergence of the excess spreads them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from fluidlift.numerics.poisson import solve
+from fluidlift.numerics.sampling import sample_nodes
+from fluidlift.physics.pressure import PressureSystem, subtract_gradient
+from fluidlift.physics.transfer import CellOrder, deposit_to_cells, grid_to_particles
+from fluidlift.types import FaceVelocity, Grid
+
+TOLERATED = 0.05
+"""share of excess that is left alone: the noise of irregular sampling"""
+RELAXATION = 0.5
+"""share of the remaining excess that one step takes away"""
+LARGEST_EXCESS = 0.5
+LARGEST_MOVE = 0.2
+"""cells per step"""
+
+
+def cell_capacity(signed_distance: Float[np.ndarray, "nx+1 ny+1 nz+1"], grid: Grid) -> Float[np.ndarray, "nx ny nz"]:
+    """Share (0 to 1) of the trilinear kernel around each cell centre that is not solid, from 4^3 samples."""
+    capacity = np.ones(grid.shape, np.float32)
+    nodes = np.asarray(signed_distance)
+    near = np.abs(0.125 * sum(nodes[i : i + grid.shape[0], j : j + grid.shape[1], k : k + grid.shape[2]]
+                              for i in (0, 1) for j in (0, 1) for k in (0, 1))) < 2.0 * grid.spacing  # fmt: skip
+    centers = grid.centers()[near]
+    total = np.zeros(len(centers))
+    offsets = np.array([-0.75, -0.25, 0.25, 0.75])
+    for step in np.ndindex(4, 4, 4):
+        shift = offsets[list(step)]
+        weight = 0.125 * np.prod(1.0 - np.abs(shift))
+        total += weight * (sample_nodes(nodes, grid, centers + shift * grid.spacing) > 0)
+    capacity[near] = total
+    return capacity
+
+
+def fill_ratio(
+    positions: np.ndarray, volumes: np.ndarray, grid: Grid, order: CellOrder, capacity: np.ndarray
+) -> Float[np.ndarray, "nx ny nz"]:
+    """Volume (m^3) of the particles around each cell centre over what fits there."""
+    return deposit_to_cells(positions, volumes, grid, order) / (grid.spacing**3 * np.maximum(capacity, 0.25))
+
+
+def spreading(
+    positions: Float[np.ndarray, "n 3"],
+    ratio: Float[np.ndarray, "nx ny nz"],
+    system: PressureSystem,
+    grid: Grid,
+    order: CellOrder,
+) -> Float[np.ndarray, "n 3"] | None:
+    """Displacement (m) of each particle that lessens the crowding, or None where there is none."""
+    excess = np.where(system.unknown, np.clip(ratio - 1.0 - TOLERATED, 0.0, LARGEST_EXCESS), 0.0)
+    if not excess.any():
+        return None
+    # a rough solution will do: what it leaves, the next step takes
+    psi, _ = solve(system, RELAXATION * excess, tolerance=0.1, max_iterations=6)
+    field = subtract_gradient(FaceVelocity.zeros(grid), system, psi)
+    moves, _ = grid_to_particles(field, grid, positions, order)
+    limit = LARGEST_MOVE * grid.spacing
+    length = np.linalg.norm(moves, axis=1, keepdims=True)
+    return moves * np.minimum(1.0, limit / np.maximum(length, 1e-12))

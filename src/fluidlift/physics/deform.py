@@ -1,0 +1,230 @@
+"""Deformation of particles and of the Gaussians they carry (paper: F <- (I + dt C) F, A = F A0 F^T)."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+from numba import njit, prange
+
+from fluidlift.errors import require
+from fluidlift.types import Gaussians, Particles
+
+
+@njit(cache=True)
+def _eigen(a, v):
+    """Cyclic Jacobi: the symmetric 3x3 `a` becomes diagonal, the columns of `v` its eigenvectors (proper rotation)."""
+    for i in range(3):
+        for j in range(3):
+            v[i, j] = 1.0 if i == j else 0.0
+    for _ in range(12):
+        off = a[0, 1] * a[0, 1] + a[0, 2] * a[0, 2] + a[1, 2] * a[1, 2]
+        trace = a[0, 0] * a[0, 0] + a[1, 1] * a[1, 1] + a[2, 2] * a[2, 2]
+        if off <= 1e-24 * trace:
+            break
+        for p in range(2):
+            for q in range(p + 1, 3):
+                if a[p, q] == 0.0:
+                    continue
+                theta = (a[q, q] - a[p, p]) / (2.0 * a[p, q])
+                t = 1.0 / (abs(theta) + np.sqrt(theta * theta + 1.0))
+                if theta < 0:
+                    t = -t
+                c = 1.0 / np.sqrt(t * t + 1.0)
+                s = t * c
+                for k in range(3):
+                    x, y = a[k, p], a[k, q]
+                    a[k, p] = c * x - s * y
+                    a[k, q] = s * x + c * y
+                for k in range(3):
+                    x, y = a[p, k], a[q, k]
+                    a[p, k] = c * x - s * y
+                    a[q, k] = s * x + c * y
+                for k in range(3):
+                    x, y = v[k, p], v[k, q]
+                    v[k, p] = c * x - s * y
+                    v[k, q] = s * x + c * y
+
+
+@njit(parallel=True, cache=True)
+def _update(deformation, affine, dt, max_stretch):
+    for p_ in prange(len(deformation)):
+        p = np.int64(p_)
+        f = np.empty((3, 3))
+        for i in range(3):
+            for j in range(3):
+                total = np.float64(deformation[p, i, j])
+                for k in range(3):
+                    total += dt * affine[p, i, k] * deformation[p, k, j]
+                f[i, j] = total
+        det = (
+            f[0, 0] * (f[1, 1] * f[2, 2] - f[1, 2] * f[2, 1])
+            - f[0, 1] * (f[1, 0] * f[2, 2] - f[1, 2] * f[2, 0])
+            + f[0, 2] * (f[1, 0] * f[2, 1] - f[1, 1] * f[2, 0])
+        )
+        if not (det > 1e-6 and det < 1e6):
+            for i in range(3):
+                for j in range(3):
+                    deformation[p, i, j] = 1.0 if i == j else 0.0
+            continue
+        scale = det ** (-1.0 / 3.0)
+        squared = 0.0
+        for i in range(3):
+            for j in range(3):
+                f[i, j] *= scale
+                squared += f[i, j] * f[i, j]
+        # with det F = 1 and a limit s >= 2, a sum of squared stretches up to 2 s keeps all within [1/s, s]
+        if squared > 2.0 * max_stretch or max_stretch < 2.0:
+            a, v, g = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+            for i in range(3):
+                for j in range(3):
+                    a[i, j] = f[i, 0] * f[j, 0] + f[i, 1] * f[j, 1] + f[i, 2] * f[j, 2]
+            _eigen(a, v)
+            for e in range(3):
+                stretch = np.sqrt(max(a[e, e], 1e-12))
+                factor = min(max(stretch, 1.0 / max_stretch), max_stretch) / stretch
+                for j in range(3):
+                    g[e, j] = factor * (v[0, e] * f[0, j] + v[1, e] * f[1, j] + v[2, e] * f[2, j])
+            for i in range(3):
+                for j in range(3):
+                    f[i, j] = v[i, 0] * g[0, j] + v[i, 1] * g[1, j] + v[i, 2] * g[2, j]
+        for i in range(3):
+            for j in range(3):
+                deformation[p, i, j] = f[i, j]
+
+
+def updated_deformation(
+    deformation: Float[np.ndarray, "n 3 3"], affine: Float[np.ndarray, "n 3 3"], dt: float, *, max_stretch: float = 4.0
+) -> Float[np.ndarray, "n 3 3"]:
+    """(I + dt C) F with its determinant brought back to 1 and its stretches kept within [1/max_stretch, max_stretch].
+
+    The flow is incompressible: a determinant other than 1 is the error of the interpolated gradient. A determinant
+    beyond repair (a particle turned inside out within one step) starts again from the identity.
+
+    Args:
+        deformation: F, no unit.
+        affine: C, 1/s.
+        dt: s.
+        max_stretch: largest singular value, above 1.
+    """
+    require(max_stretch > 1, f"max_stretch {max_stretch}", "above 1")
+    out = np.array(deformation, np.float32, order="C")
+    _update(out, np.ascontiguousarray(affine, np.float32), float(dt), float(max_stretch))
+    return out
+
+
+def updated_deformation_plain(
+    deformation: Float[np.ndarray, "n 3 3"], affine: Float[np.ndarray, "n 3 3"], dt: float, *, max_stretch: float = 4.0
+) -> Float[np.ndarray, "n 3 3"]:
+    """`updated_deformation` with singular values, as it reads."""
+    f = (np.eye(3) + dt * np.asarray(affine, np.float64)) @ np.asarray(deformation, np.float64)
+    det = np.linalg.det(f)
+    lost = ~((det > 1e-6) & (det < 1e6))
+    f[lost], det[lost] = np.eye(3), 1.0
+    u, s, vt = np.linalg.svd(f / np.cbrt(det)[:, None, None])
+    return (u * np.clip(s, 1 / max_stretch, max_stretch)[:, None, :]) @ vt
+
+
+@njit(parallel=True, cache=True)
+def _deform(f, rest, quats, scales, max_ratio, max_size):
+    for p_ in prange(len(f)):
+        p = np.int64(p_)
+        m, a, v = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+        finite = True
+        for i in range(3):
+            for j in range(3):
+                m[i, j] = (
+                    np.float64(f[p, i, 0]) * rest[p, 0, j] + f[p, i, 1] * rest[p, 1, j] + f[p, i, 2] * rest[p, 2, j]
+                )
+        for i in range(3):
+            for j in range(3):
+                a[i, j] = m[i, 0] * f[p, j, 0] + m[i, 1] * f[p, j, 1] + m[i, 2] * f[p, j, 2]
+                finite = finite and np.isfinite(a[i, j])
+        if not finite:
+            for i in range(3):
+                for j in range(3):
+                    a[i, j] = rest[p, i, j]
+        _eigen(a, v)
+        volume = 1.0
+        for e in range(3):
+            scales[p, e] = np.sqrt(max(a[e, e], 1e-18))
+            volume *= scales[p, e]
+        size = volume ** (1.0 / 3.0)
+        limit = max_ratio * size
+        needle = not finite
+        for e in range(3):
+            needle = needle or scales[p, e] > limit
+        for e in range(3):
+            if needle:
+                scales[p, e] = size
+            scales[p, e] = min(max(scales[p, e], 1e-3 * size), max_size)
+        d = v[0, 0] + v[1, 1] + v[2, 2]
+        if needle:
+            quats[p, 0], quats[p, 1], quats[p, 2], quats[p, 3] = 1.0, 0.0, 0.0, 0.0
+            continue
+        # the largest of the four squared components is safe to divide by
+        best, largest = 0, d
+        for e in range(3):
+            if v[e, e] > largest:
+                best, largest = e + 1, v[e, e]
+        if best == 0:
+            w = np.sqrt(max(1.0 + d, 0.0)) / 2.0
+            x, y, z = (v[2, 1] - v[1, 2]) / (4 * w), (v[0, 2] - v[2, 0]) / (4 * w), (v[1, 0] - v[0, 1]) / (4 * w)
+        elif best == 1:
+            x = np.sqrt(max(1.0 + v[0, 0] - v[1, 1] - v[2, 2], 0.0)) / 2.0
+            w, y, z = (v[2, 1] - v[1, 2]) / (4 * x), (v[1, 0] + v[0, 1]) / (4 * x), (v[0, 2] + v[2, 0]) / (4 * x)
+        elif best == 2:
+            y = np.sqrt(max(1.0 - v[0, 0] + v[1, 1] - v[2, 2], 0.0)) / 2.0
+            w, x, z = (v[0, 2] - v[2, 0]) / (4 * y), (v[1, 0] + v[0, 1]) / (4 * y), (v[2, 1] + v[1, 2]) / (4 * y)
+        else:
+            z = np.sqrt(max(1.0 - v[0, 0] - v[1, 1] + v[2, 2], 0.0)) / 2.0
+            w, x, y = (v[1, 0] - v[0, 1]) / (4 * z), (v[0, 2] + v[2, 0]) / (4 * z), (v[2, 1] + v[1, 2]) / (4 * z)
+        quats[p, 0], quats[p, 1], quats[p, 2], quats[p, 3] = w, x, y, z
+
+
+def deformed_covariances(
+    covariances: Float[np.ndarray, "n 3 3"], deformation: Float[np.ndarray, "n 3 3"], *, max_ratio: float = 12.0
+) -> Float[np.ndarray, "n 3 3"]:
+    """F A F^T (m^2), symmetric positive definite (plain reference of `deform_gaussians`).
+
+    Needles, whose longest axis exceeds `max_ratio` times the mean one (cube root of the product), become spheres of
+    the same volume; axes below 1/1000 of the mean one are lifted to it.
+    """
+    f = np.asarray(deformation, np.float64)
+    a = f @ np.asarray(covariances, np.float64) @ np.swapaxes(f, 1, 2)
+    bad = ~np.isfinite(a).all(axis=(1, 2))
+    a[bad] = covariances[bad]
+    values, vectors = np.linalg.eigh(0.5 * (a + np.swapaxes(a, 1, 2)))
+    scales = np.sqrt(np.maximum(values, 1e-18))
+    size = np.cbrt(scales.prod(axis=1, keepdims=True))
+    needle = bad[:, None] | (scales > max_ratio * size).any(axis=1, keepdims=True)
+    scales = np.where(needle, size, np.maximum(scales, 1e-3 * size))
+    return (vectors * (scales**2)[:, None, :]) @ np.swapaxes(vectors, 1, 2)
+
+
+def deform_gaussians(
+    rest: Gaussians, particles: Particles, *, max_stretch: float = 12.0, max_size: float = np.inf
+) -> Gaussians:
+    """The Gaussians that the particles carry now, one per particle.
+
+    Centres are the particles, covariances F A0 F^T of their source, opacities and colours those of the source.
+    Needles are rounded as in `deformed_covariances` with `max_ratio` = max_stretch.
+
+    Args:
+        rest: the undeformed Gaussians.
+        particles: `source` indexes `rest`.
+        max_stretch: longest axis over the mean one beyond which a Gaussian starts again as a sphere.
+        max_size: largest standard deviation, m.
+
+    Raises:
+        ValueError: a source outside the rest Gaussians.
+    """
+    source = particles.source
+    n = len(source)
+    in_range = n == 0 or (len(rest) > 0 and int(source.min()) >= 0 and int(source.max()) < len(rest))
+    require(in_range, "a particle whose source is no rest Gaussian", f"0 to {len(rest) - 1}")
+    quats, scales = np.zeros((n, 4), np.float32), np.zeros((n, 3), np.float32)
+    if n:
+        covariances = rest.covariances().astype(np.float32)[source]
+        deformation = np.ascontiguousarray(particles.deformation, np.float32)
+        _deform(deformation, covariances, quats, scales, float(max_stretch), float(max_size))
+    return Gaussians(particles.positions, quats, scales, rest.opacities[source], rest.sh[source])

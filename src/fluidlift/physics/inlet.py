@@ -1,0 +1,148 @@
+"""The inlet: prescribed velocity in INFLOW cells (paper: v_in, v~_in) and gap-free emission of particles."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial import cKDTree
+
+from fluidlift.numerics.sampling import sample_faces, sample_nodes
+from fluidlift.physics.boundaries import CLEARANCE, Walls
+from fluidlift.types import CellType, FaceVelocity, FluidParameters
+
+MODES = 12
+"""plane waves that make up the inflow fluctuation"""
+
+
+@dataclass(frozen=True)
+class Fluctuation:
+    """A smooth, divergence-free random velocity with |v| of unit root mean square over space and time."""
+
+    wave_vectors: Float[np.ndarray, "m 3"]
+    """1/m"""
+    frequencies: Float[np.ndarray, "m"]
+    """1/s"""
+    directions: Float[np.ndarray, "m 3"]
+    """unit vectors normal to the wave vectors"""
+    phases: Float[np.ndarray, "m"]
+
+    def __call__(self, points: Float[np.ndarray, "n 3"], time: float) -> Float[np.ndarray, "n 3"]:
+        """No unit."""
+        angle = points @ self.wave_vectors.T - self.frequencies * time + self.phases
+        return np.sqrt(2.0 / len(self.phases)) * np.cos(angle) @ self.directions
+
+
+def random_fluctuation(
+    size: float, finest: float, bulk: Float[np.ndarray, "3"], amplitude: float, rng: np.random.Generator
+) -> Fluctuation:
+    """Waves from the size of the inlet (m) down to a quarter of it, not shorter than `finest` (m).
+
+    They are carried along by the bulk velocity and change while they travel; without one, the amplitude (m/s) sets
+    the time scale.
+    """
+    lengths = np.maximum(size * 0.25 ** rng.uniform(0.0, 1.0, MODES), finest)
+    axes = rng.normal(size=(MODES, 3))
+    k = axes / np.linalg.norm(axes, axis=1, keepdims=True) * (2 * np.pi / lengths)[:, None]
+    directions = np.cross(k, rng.normal(size=(MODES, 3)))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    own = rng.uniform(0.5, 1.0, MODES) * max(float(np.linalg.norm(bulk)), amplitude) * 2 * np.pi / lengths
+    return Fluctuation(k, k @ bulk + 0.5 * own, directions, rng.uniform(0, 2 * np.pi, MODES))
+
+
+class Inlet:
+    """What flows in: velocity as a function of place and time, and where new particles are due."""
+
+    def __init__(
+        self, walls: Walls, parameters: FluidParameters, profile: FaceVelocity | None, seed: int, per_cell: int
+    ) -> None:
+        grid = walls.grid
+        self._walls = walls
+        self._cells = walls.regions == CellType.INFLOW
+        self.active = bool(self._cells.any())
+        self.bulk = np.asarray(parameters.inflow_velocity, np.float64)
+        self._amplitude = parameters.inflow_fluctuation
+        self._per_side = max(1, round(per_cell ** (1.0 / 3.0)))
+        self.particle_spacing = grid.spacing / self._per_side
+        """m"""
+        self._shift = np.zeros(3)
+        self._profile, self._gain, self._offset = profile, 0.0, self.bulk
+        if not self.active:
+            return
+        index = np.argwhere(self._cells)
+        self._low, self._high = index.min(axis=0), index.max(axis=0) + 1
+        centers = grid.low + (index + 0.5) * grid.spacing
+        if profile is not None:
+            mean = sample_faces(profile, grid, centers).mean(axis=0, dtype=np.float64)
+            size = float(np.linalg.norm(mean))
+            self._gain = float(np.linalg.norm(self.bulk)) / size if size > 1e-6 else 0.0
+            self._offset = self.bulk - self._gain * mean
+        extent = float((self._high - self._low).max()) * grid.spacing
+        rng = np.random.default_rng(seed)
+        self._fluctuation = random_fluctuation(extent, 4 * grid.spacing, self.bulk, self._amplitude, rng)
+        self.faces = []
+        """bool per component: faces of INFLOW cells"""
+        self._face_points = []
+        for axis in range(3):
+            pad = [(0, 0)] * 3
+            pad[axis] = (1, 1)
+            wide = np.moveaxis(np.pad(self._cells, pad), axis, 0)
+            touched = np.moveaxis(wide[1:] | wide[:-1], 0, axis) & (walls.openings[axis] > 0)
+            self.faces.append(touched)
+            self._face_points.append(grid.faces(axis)[touched])
+
+    def velocity(self, points: Float[np.ndarray, "n 3"], time: float) -> Float[np.ndarray, "n 3"]:
+        """Prescribed velocity, m/s: the profile, scaled and shifted so that its mean over the INFLOW cells is the
+        bulk velocity, plus the fluctuation."""
+        out = np.broadcast_to(self._offset, (len(points), 3)).copy()
+        if self._profile is not None and self._gain > 0:
+            out += self._gain * sample_faces(self._profile, self._walls.grid, points)
+        if self._amplitude > 0:
+            out += self._amplitude * self._fluctuation(points, time)
+        return out
+
+    def impose(self, velocity: FaceVelocity, time: float) -> FaceVelocity:
+        """The velocity with the faces of INFLOW cells set."""
+        if not self.active:
+            return velocity
+        out = []
+        for axis, component in enumerate(velocity.components):
+            new = component.copy()
+            new[self.faces[axis]] = self.velocity(self._face_points[axis], time)[:, axis]
+            out.append(new)
+        return FaceVelocity(*out)
+
+    def inside(self, positions: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
+        """Particles in INFLOW cells."""
+        grid = self._walls.grid
+        cells = np.clip(grid.cell_of(positions), 0, np.asarray(grid.shape) - 1)
+        return self._cells[tuple(cells.T)]
+
+    def travel(self, dt: float) -> None:
+        """Move the emission pattern along with the bulk flow, so that new particles continue the old lattice."""
+        self._shift = np.mod(self._shift + self.bulk * dt, self.particle_spacing)
+
+    def missing(self, positions: Float[np.ndarray, "n 3"], rng: np.random.Generator) -> Float[np.ndarray, "n 3"]:
+        """Places in INFLOW cells that lack a particle: points of the travelling lattice farther than 0.8 of its
+        spacing from every particle, slightly jittered."""
+        if not self.active:
+            return np.zeros((0, 3), np.float32)
+        grid, s = self._walls.grid, self.particle_spacing
+        counts = (self._high - self._low) * self._per_side + 1  # one more: the pattern is shifted by up to a spacing
+        start = grid.low + self._low * grid.spacing - 0.5 * s + self._shift
+        axes = [start[a] + s * np.arange(counts[a]) for a in range(3)]
+        candidates = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+        candidates = candidates[grid.contains(candidates)]
+        candidates = candidates[self.inside(candidates)]
+        outside_solid = sample_nodes(self._walls.signed_distance, grid, candidates) > 0.25 * s
+        candidates = candidates[outside_solid]
+        margin = 2 * grid.spacing
+        box_low, box_high = grid.low + self._low * grid.spacing - margin, grid.low + self._high * grid.spacing + margin
+        near = positions[((positions > box_low) & (positions < box_high)).all(axis=1)]
+        if len(near) and len(candidates):
+            distance, _ = cKDTree(near).query(candidates, distance_upper_bound=0.8 * s)
+            candidates = candidates[~np.isfinite(distance)]
+        jittered = candidates + rng.uniform(-0.1, 0.1, candidates.shape) * s
+        clear = CLEARANCE * grid.spacing
+        return np.clip(jittered, grid.low + clear, grid.high - clear).astype(np.float32)

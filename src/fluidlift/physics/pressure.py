@@ -1,0 +1,199 @@
+"""Pressure: the projection that makes a face velocity divergence-free (paper: `eq::v`, first term; `divProj`).
+
+With q = p dt / density (m^2/s) the projection solves -div(w grad q) = -div(w v) and subtracts grad q from the open
+faces. w is the open fraction of each face, after Batty, Bertails and Bridson 2007, "A fast variational framework
+for accurate solid-fluid coupling".
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from fluidlift.errors import require
+from fluidlift.numerics.poisson import PoissonSystem, solve
+from fluidlift.types import CellType, FaceVelocity, Grid, SolveReport, Terrain
+
+SMALLEST_OPENING = 0.02
+"""open fractions below this are closed: slivers of faces carry no flow worth their bad conditioning"""
+
+
+@dataclass(frozen=True)
+class PressureSystem(PoissonSystem):
+    """A Poisson system that also knows which share of each face lets fluid through.
+
+    The two differ where a velocity is prescribed (inflow): weight 0, since pressure must not change it, but open.
+    """
+
+    open_x: Float[np.ndarray, "nx+1 ny nz"]
+    """0 (wall) to 1 (open), prescribed faces included"""
+    open_y: Float[np.ndarray, "nx ny+1 nz"]
+    open_z: Float[np.ndarray, "nx ny nz+1"]
+
+    @property
+    def openings(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Open fractions across x, y, z."""
+        return (self.open_x, self.open_y, self.open_z)
+
+
+def _open_share_of_triangle(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """Share of a triangle where the linear function with corner values a, b, c is positive."""
+    low, middle, high = np.sort(np.stack([a, b, c]), axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        one_below = 1.0 - low * low / ((low - middle) * (low - high))
+        two_below = high * high / ((high - low) * (high - middle))
+    return np.select([low >= 0, high <= 0, middle >= 0], [1.0, 0.0, one_below], two_below)
+
+
+def face_fractions(signed_distance: Float[np.ndarray, "nx+1 ny+1 nz+1"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Open share of every face across x, y and z, float32, from the signed distance at the nodes.
+
+    Each square is cut into triangles along both diagonals, and the two results are averaged (no preferred diagonal).
+    """
+    fractions = []
+    for axis in range(3):
+        phi = np.moveaxis(np.asarray(signed_distance, np.float64), axis, 0)
+        a, b, c, d = phi[:, :-1, :-1], phi[:, 1:, :-1], phi[:, 1:, 1:], phi[:, :-1, 1:]
+        parts = [(a, b, c), (a, c, d), (b, c, d), (a, b, d)]
+        share = sum(_open_share_of_triangle(*corners) for corners in parts) / 4.0
+        share = np.where(share < SMALLEST_OPENING, 0.0, share)
+        fractions.append(np.ascontiguousarray(np.moveaxis(share, 0, axis), np.float32))
+    return tuple(fractions)
+
+
+def _beside(mask: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
+    """Whether the cell on the low and on the high side of each face across `axis` is in the mask (False outside)."""
+    pad = [(0, 0)] * 3
+    pad[axis] = (1, 1)
+    wide = np.pad(mask, pad)
+    low, high = [slice(None)] * 3, [slice(None)] * 3
+    low[axis], high[axis] = slice(None, -1), slice(1, None)
+    return wide[tuple(low)], wide[tuple(high)]
+
+
+def build_system(
+    cell_types: np.ndarray,
+    terrain_or_fractions: Terrain | tuple[np.ndarray, np.ndarray, np.ndarray] | None,
+    grid: Grid,
+    *,
+    open_border: bool = False,
+) -> PressureSystem:
+    """The pressure system of a cell layout.
+
+    FLUID cells are unknown (save those without any open face: buried); EMPTY and OUTFLOW cells hold p = 0; SOLID cells are closed on all faces; faces of INFLOW
+    cells have a prescribed velocity. Without a terrain, faces are open or closed by cell type alone.
+
+    Args:
+        cell_types: u8 [nx,ny,nz], `CellType`.
+        terrain_or_fractions: the terrain, or open fractions from `face_fractions`, or None.
+        grid: the grid of the cells.
+        open_border: False: the sides of the box are walls; True: p = 0 outside the box.
+    """
+    types = np.asarray(cell_types)
+    require(types.shape == grid.shape, f"cell types {types.shape}", str(grid.shape))
+    if isinstance(terrain_or_fractions, Terrain):
+        terrain_or_fractions = face_fractions(terrain_or_fractions.signed_distance)
+    unknown = types == CellType.FLUID
+    weights, openings = [], []
+    for axis in range(3):
+        shape = grid.face_shape(axis)
+        given = None if terrain_or_fractions is None else terrain_or_fractions[axis]
+        require(given is None or given.shape == shape, "face fractions of the wrong shape", str(shape))
+        opening = np.ones(shape, np.float32) if given is None else np.array(given, np.float32)
+        solid_low, solid_high = _beside(types == CellType.SOLID, axis)
+        opening[solid_low | solid_high] = 0.0
+        inflow_low, inflow_high = _beside(types == CellType.INFLOW, axis)
+        if not open_border:
+            border = [slice(None)] * 3
+            border[axis] = slice(None, None, shape[axis] - 1)
+            # the outer faces of in- and outflow cells stay open: fluid passes there
+            through_low, through_high = _beside((types == CellType.OUTFLOW) | (types == CellType.INFLOW), axis)
+            opening[tuple(border)] *= (through_low | through_high)[tuple(border)]
+        unknown_low, unknown_high = _beside(unknown, axis)
+        prescribed = inflow_low | inflow_high
+        weights.append(np.where((unknown_low | unknown_high) & ~prescribed, opening, 0.0).astype(np.float32))
+        openings.append(opening)
+    reached = np.zeros(grid.shape, bool)
+    for axis, w in enumerate(weights):
+        low, high = [slice(None)] * 3, [slice(None)] * 3
+        low[axis], high[axis] = slice(None, -1), slice(1, None)
+        reached |= (w[tuple(low)] > 0) | (w[tuple(high)] > 0)
+    return PressureSystem(unknown & reached, *weights, grid.spacing, *openings)
+
+
+def divergence(
+    velocity: FaceVelocity, grid: Grid, system: PoissonSystem | None = None
+) -> Float[np.ndarray, "nx ny nz"]:
+    """Net outflow per volume, 1/s.
+
+    With a `PressureSystem` each face counts with its open share, and cells that are not unknown give 0. With a plain
+    `PoissonSystem` a closed face counts in full with the velocity given there (prescribed; 0 at a wall).
+    """
+    h = grid.spacing
+    flux = [c.astype(np.float64) for c in velocity.components]
+    if isinstance(system, PressureSystem):
+        flux = [f * w for f, w in zip(flux, system.openings)]
+    elif system is not None:
+        flux = [f * np.where(w > 0, w, 1.0) for f, w in zip(flux, system.weights)]
+    total = sum(np.diff(f, axis=axis) for axis, f in enumerate(flux)) / h
+    if system is None:
+        return total
+    return np.where(system.unknown, total, 0.0)
+
+
+def subtract_gradient(
+    velocity: FaceVelocity, system: PoissonSystem, q: np.ndarray, known: np.ndarray | None = None
+) -> FaceVelocity:
+    """v - grad q on the open faces of unknown cells; walls of a `PressureSystem` become 0; other faces stay.
+
+    `known` is q in the cells that are not unknown (default 0).
+    """
+    q = np.where(system.unknown, q, 0.0 if known is None else known)
+    out = []
+    for axis, (component, w) in enumerate(zip(velocity.components, system.weights)):
+        pad = [(0, 0)] * 3
+        pad[axis] = (1, 1)
+        change = np.diff(np.pad(q, pad), axis=axis) / system.spacing
+        new = np.where(w > 0, component - change, component)
+        if isinstance(system, PressureSystem):
+            new = np.where(system.openings[axis] > 0, new, 0.0)
+        out.append(np.ascontiguousarray(new, component.dtype))
+    return FaceVelocity(*out)
+
+
+def project(
+    velocity: FaceVelocity,
+    system: PoissonSystem,
+    *,
+    tolerance: float = 1e-5,
+    initial: Float[np.ndarray, "nx ny nz"] | None = None,
+    method: str = "multigrid",
+    max_iterations: int = 200,
+    source: Float[np.ndarray, "nx ny nz"] | None = None,
+    known: Float[np.ndarray, "nx ny nz"] | None = None,
+) -> tuple[FaceVelocity, Float[np.ndarray, "nx ny nz"], SolveReport]:
+    """The velocity without its divergence (paper: `divProj`, all constraints at once).
+
+    Args:
+        velocity: m/s.
+        system: from `build_system`.
+        tolerance: relative residual of the solve, which is the share of the divergence that may stay.
+        initial: first guess of q.
+        method: see `numerics.poisson.solve`.
+        max_iterations: iterations of the method.
+        source: wanted divergence, 1/s (default 0).
+        known: q in the cells that are not unknown, m^2/s (default 0: air and free outflow).
+
+    Returns:
+        the projected velocity, q = pressure / density * dt (float32, m^2/s), and the report of the solve.
+    """
+    grid = Grid(system.unknown.shape, system.spacing)
+    rhs = -divergence(velocity, grid, system)
+    if source is not None:
+        rhs = rhs + np.where(system.unknown, source, 0.0)
+    if known is not None:
+        rhs = rhs + system.boundary_term(known)
+    q, report = solve(system, rhs, method=method, tolerance=tolerance, max_iterations=max_iterations, initial=initial)
+    return subtract_gradient(velocity, system, q, known), q.astype(np.float32), report

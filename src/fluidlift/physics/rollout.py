@@ -1,0 +1,317 @@
+"""DiffSim^n: n differentiable steps of incompressible flow on a MAC grid (paper, "Presumed APIC Simulation").
+
+One step splits the momentum equation as: extrapolate, advect, body force, inflow and walls, viscosity, wall friction
+and bounce, outflow, pressure. Advection comes first, so that the carrying velocity is free of divergence.
+
+* Gravity acts on the fluid only and EMPTY cells hold p = 0, so a slope accelerates the flow; density drops out of the
+  velocity and only scales the pressure.
+* Viscosity: backward Euler at any value (so the result is smooth in it), free slip on walls, no stress at air.
+* `wall_damping` d: a wall takes the share d of the tangential velocity of the cells along it per step of `time_step`.
+* `restitution` b: of the fluid that moves to a wall one cell ahead, the share dt |v| / h arrives within a step and
+  has its normal velocity v answered by -b v. The wall itself stays closed: no volume is made.
+* Outflow: faces to OUTFLOW cells take `outflow_velocity` along the mainstream, then the pressure (p = 0 outside)
+  corrects them as it does all others.
+
+Gradients: pressure and viscosity by implicit differentiation (one more solve with the same symmetric operator), the
+rest by transposes and autograd.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy import sparse
+from torch import Tensor
+
+from fluidlift.errors import require
+from fluidlift.numerics.poisson import PoissonSystem, solve
+from fluidlift.physics.advection import Faces, advect
+from fluidlift.physics.rollout_domain import LinearMap, RolloutDomain
+from fluidlift.types import FaceVelocity, FluidParameters, SolveReport
+
+
+@dataclass(frozen=True)
+class RolloutParameters:
+    """Physical parameters as tensors (units of `FluidParameters`)."""
+
+    density: Tensor
+    kinematic_viscosity: Tensor
+    gravity: Tensor
+    """[3]"""
+    inflow_velocity: Tensor
+    """[3]"""
+    inflow_fluctuation: Tensor
+    outflow_velocity: Tensor
+    restitution: Tensor
+    wall_damping: Tensor
+    time_step: Tensor
+
+    @classmethod
+    def of(cls, parameters: FluidParameters, dtype: torch.dtype = torch.float32) -> RolloutParameters:
+        """Constants from plain numbers."""
+        return cls(**{k: torch.tensor(v, dtype=dtype) for k, v in parameters.to_dict().items()})
+
+    def fluid_parameters(self) -> FluidParameters:
+        """Plain numbers."""
+        return FluidParameters(**{k: v.detach().double().tolist() for k, v in vars(self).items()})
+
+
+@dataclass(frozen=True)
+class RolloutOptions:
+    """How a step is computed."""
+
+    projection: str = "implicit"
+    """"implicit": solved to `tolerance`, differentiated implicitly; "jacobi": exactly `sweeps` sweeps, self-adjoint"""
+    tolerance: float = 1e-5
+    sweeps: int = 100
+    advection_gradient: str = "exact"
+    """"exact", "upwind" (the paper's surrogate) or "plain" """
+    max_iterations: int = 200
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """What a rollout gives."""
+
+    velocity: Float[Tensor, "f"]
+    """flat face velocity after the last step, m/s, extrapolated beyond the fluid"""
+    domain: RolloutDomain
+    """layout of the last step"""
+    potentials: tuple[np.ndarray, ...]
+    """p dt / density of every step, m^2/s: good first guesses for a neighbouring rollout"""
+    reports: tuple[SolveReport, ...]
+    """of the pressure solves, forward"""
+
+    def faces(self) -> Faces:
+        """u, v, w."""
+        return unflatten(self.velocity, self.domain)
+
+    def pressure(self, parameters: RolloutParameters) -> Float[np.ndarray, "nx ny nz"]:
+        """Pressure of the last step, Pa."""
+        return self.potentials[-1] * float(parameters.density) / float(parameters.time_step)
+
+
+def flatten(velocity: FaceVelocity | Faces, dtype: torch.dtype = torch.float32) -> Float[Tensor, "f"]:
+    """Face arrays to the flat vector."""
+    parts = velocity.components if isinstance(velocity, FaceVelocity) else velocity
+    return torch.cat([torch.as_tensor(p, dtype=dtype).reshape(-1) for p in parts])
+
+
+def unflatten(flat: Float[Tensor, "f"], domain: RolloutDomain) -> Faces:
+    """The flat vector to u, v, w."""
+    o = domain.offsets
+    u, v, w = (flat[o[a] : o[a + 1]].reshape(s) for a, s in enumerate(domain.face_shapes))
+    return (u, v, w)
+
+
+class _Apply(torch.autograd.Function):
+    """A sparse matrix; backward is its transpose."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, linear: LinearMap) -> Tensor:
+        ctx.linear = linear
+        return torch.from_numpy(linear.matrix @ x.detach().numpy())
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> Any:
+        return torch.from_numpy(ctx.linear.transpose @ gradients[0].contiguous().numpy()), None
+
+
+class _Pressure(torch.autograd.Function):
+    """q with A q = rhs. A is symmetric, so the adjoint is the same solve (or the same sweeps) of the gradient.
+
+    K Jacobi sweeps from zero are a polynomial in the scaled operator times its diagonal: symmetric as well.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        rhs: Tensor,
+        system: PoissonSystem,
+        options: RolloutOptions,
+        guess: np.ndarray | None,
+        kept: list[tuple[np.ndarray, SolveReport]],
+    ) -> Tensor:
+        ctx.system, ctx.options = system, options
+        q, report = _solve_pressure(rhs, system, options, guess)
+        kept.append((q, report))
+        return torch.from_numpy(q.ravel())
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> Any:
+        q, _ = _solve_pressure(gradients[0], ctx.system, ctx.options, None)
+        return torch.from_numpy(q.ravel()), None, None, None, None
+
+
+def _solve_pressure(
+    rhs: Tensor, system: PoissonSystem, options: RolloutOptions, guess: np.ndarray | None
+) -> tuple[np.ndarray, SolveReport]:
+    b = np.where(system.unknown, rhs.detach().contiguous().numpy().reshape(system.unknown.shape), 0)
+    if options.projection == "jacobi":
+        return solve(system, b, method="jacobi", tolerance=0.0, max_iterations=options.sweeps)
+    return solve(system, b, tolerance=options.tolerance, max_iterations=options.max_iterations, initial=guess)
+
+
+class _Diffuse(torch.autograd.Function):
+    """x with (1 - c L) x = b, L symmetric: adjoint l = (1 - c L)^-1 g gives db = l, dc = l . L x."""
+
+    @staticmethod
+    def forward(ctx: Any, b: Tensor, c: Tensor, laplacian: sparse.csr_matrix) -> Tensor:
+        x = _solve_diffusion(b.detach().numpy(), float(c), laplacian)
+        ctx.laplacian, ctx.c = laplacian, float(c)
+        ctx.save_for_backward(torch.from_numpy(x))
+        return torch.from_numpy(x)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> Any:
+        (x,) = ctx.saved_tensors
+        g = gradients[0].contiguous().numpy()
+        adjoint = _solve_diffusion(g, ctx.c, ctx.laplacian)
+        change = np.vdot(adjoint.astype(float), (ctx.laplacian @ x.numpy()).astype(float))
+        return torch.from_numpy(adjoint), torch.as_tensor(change, dtype=gradients[0].dtype), None
+
+
+def _solve_diffusion(b: np.ndarray, c: float, laplacian: sparse.csr_matrix, max_iterations: int = 500) -> np.ndarray:
+    """Conjugate gradients for (1 - c L) x = b; the diagonal is nearly constant, so no preconditioner is needed."""
+    tolerance = 1e-6 if b.dtype == np.float32 else 1e-13
+    x = b.copy()
+    residual = c * (laplacian @ b)
+    direction = residual.copy()
+    rr = float(np.vdot(residual, residual))
+    goal = (tolerance * float(np.linalg.norm(b))) ** 2
+    for _ in range(max_iterations):
+        if rr <= goal:
+            break
+        image = direction - c * (laplacian @ direction)
+        alpha = rr / float(np.vdot(direction, image))
+        x += b.dtype.type(alpha) * direction
+        residual -= b.dtype.type(alpha) * image
+        rr, previous = float(np.vdot(residual, residual)), rr
+        direction = residual + b.dtype.type(rr / previous) * direction
+    return x
+
+
+def apply_walls(
+    velocity: Float[Tensor, "f"], domain: RolloutDomain, parameters: RolloutParameters
+) -> Float[Tensor, "f"]:
+    """Friction of walls along the motion, and the bounce of walls across it."""
+    share = torch.from_numpy(domain.wall_share)
+    below, above = torch.from_numpy(domain.wall_below), torch.from_numpy(domain.wall_above)
+    velocity = velocity * (1 - parameters.wall_damping * share)
+    arriving = (velocity.abs() * parameters.time_step / domain.system.spacing).clamp(max=1)
+    ahead = torch.where(velocity.detach() < 0, below, above)
+    return velocity * (1 - parameters.restitution * ahead * arriving)
+
+
+def diffuse(
+    velocity: Float[Tensor, "f"], domain: RolloutDomain, viscosity: Tensor, time_step: Tensor
+) -> Float[Tensor, "f"]:
+    """One backward Euler step of viscosity; prescribed faces act as boundary values."""
+    c = viscosity * time_step
+    b = velocity + c * _Apply.apply(velocity, domain.boundary_laplacian)
+    return _Diffuse.apply(b, c, domain.laplacian)
+
+
+def project(
+    velocity: Float[Tensor, "f"],
+    domain: RolloutDomain,
+    *,
+    options: RolloutOptions | None = None,
+    guess: np.ndarray | None = None,
+    kept: list[tuple[np.ndarray, SolveReport]] | None = None,
+) -> Float[Tensor, "f"]:
+    """The velocity without its divergence; appends the potential and the report of the solve to `kept`."""
+    options = options or RolloutOptions()
+    rhs = -_Apply.apply(velocity, domain.divergence)
+    q = _Pressure.apply(rhs, domain.system, options, guess, [] if kept is None else kept)
+    return velocity - _Apply.apply(q, domain.gradient)
+
+
+def set_inflow(
+    velocity: Float[Tensor, "f"],
+    domain: RolloutDomain,
+    parameters: RolloutParameters,
+    pattern: Float[Tensor, "f"] | None,
+) -> Float[Tensor, "f"]:
+    """Inflow faces take the bulk velocity plus fluctuation times pattern; closed faces become 0."""
+    o = domain.offsets
+    given = torch.cat([parameters.inflow_velocity[a].expand(o[a + 1] - o[a]) for a in range(3)])
+    if pattern is not None:
+        given = given + parameters.inflow_fluctuation * pattern
+    return velocity * torch.from_numpy(domain.interior) + given * torch.from_numpy(domain.inflow)
+
+
+def step(
+    velocity: Float[Tensor, "f"],
+    domain: RolloutDomain,
+    parameters: RolloutParameters,
+    *,
+    pattern: Float[Tensor, "f"] | None = None,
+    options: RolloutOptions | None = None,
+    guess: np.ndarray | None = None,
+    kept: list[tuple[np.ndarray, SolveReport]] | None = None,
+) -> Float[Tensor, "f"]:
+    """One time step of the flat face velocity; see the module for the order of terms."""
+    options = options or RolloutOptions()
+    o, h, dt = domain.offsets, float(domain.system.spacing), parameters.time_step
+    velocity = _Apply.apply(velocity, domain.extrapolation)
+    moved = advect(
+        unflatten(velocity, domain), dt, spacing=h, gradient=options.advection_gradient, active=domain.active()
+    )
+    velocity = torch.cat([m.reshape(-1) for m in moved])
+    force = torch.cat([parameters.gravity[a].expand(o[a + 1] - o[a]) for a in range(3)])
+    velocity = velocity + dt * force * torch.from_numpy(domain.force)
+    velocity = set_inflow(velocity, domain, parameters, pattern)
+    velocity = diffuse(velocity, domain, parameters.kinematic_viscosity, dt)
+    velocity = apply_walls(velocity, domain, parameters)
+    leaving = torch.from_numpy(domain.outflow_faces)
+    velocity = velocity * (1 - leaving) + parameters.outflow_velocity * torch.from_numpy(domain.outflow)
+    return project(velocity, domain, options=options, guess=guess, kept=kept)
+
+
+def rollout(
+    start: FaceVelocity | Faces | Float[Tensor, "f"],
+    domains: RolloutDomain | Sequence[RolloutDomain],
+    parameters: RolloutParameters,
+    *,
+    steps: int,
+    patterns: Float[Tensor, "f"] | Sequence[Float[Tensor, "f"] | None] | None = None,
+    options: RolloutOptions | None = None,
+    guesses: Sequence[np.ndarray] | None = None,
+) -> Rollout:
+    """DiffSim^n of the paper (`optLoss`): the face velocity after `steps` steps.
+
+    Args:
+        start: face velocity, m/s (types, or tensors, or the flat vector).
+        domains: the cell layout, or one per step; all of one shape and number type.
+        parameters: with or without gradients.
+        steps: n.
+        patterns: flat fluctuation of the inflow of unit root mean square, or one per step (None: bulk velocity only).
+        options: see there.
+        guesses: potentials of an earlier, similar rollout (`Rollout.potentials`), first guesses of the solves.
+
+    Returns:
+        the last velocity and the reports; a pressure solve that failed is seen in the reports.
+
+    Raises:
+        ValueError: counts that do not match.
+    """
+    layouts = [domains] * steps if isinstance(domains, RolloutDomain) else list(domains)
+    fields = [patterns] * steps if patterns is None or isinstance(patterns, Tensor) else list(patterns)
+    require(steps >= 1 and len(layouts) == steps, f"{len(layouts)} domains for {steps} steps", "one per step")
+    require(len(fields) == steps, f"{len(fields)} patterns for {steps} steps", "one per step")
+    dtype = torch.from_numpy(layouts[0].inflow).dtype
+    flat = start if isinstance(start, Tensor) else flatten(start, dtype)
+    require(flat.shape == (layouts[0].offsets[3],), f"{tuple(flat.shape)} faces", str(layouts[0].offsets[3]))
+    kept: list[tuple[np.ndarray, SolveReport]] = []
+    for i, (domain, pattern) in enumerate(zip(layouts, fields)):
+        guess = guesses[i] if guesses is not None else None
+        flat = step(flat, domain, parameters, pattern=pattern, options=options, guess=guess, kept=kept)
+    flat = _Apply.apply(flat, layouts[-1].extrapolation)
+    potentials, reports = zip(*kept)
+    return Rollout(flat, layouts[-1], potentials, reports)

@@ -1,0 +1,353 @@
+"""Stages that build the body: geometry (kind, up, front surface, metres, terrain) and refine (to the rest Gaussians)."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from fluidlift.config import JobConfig
+from fluidlift.errors import InputRejected
+from fluidlift.pipeline.seeing import Inputs, clip_of, flow_of, labels_of
+from fluidlift.pipeline.story import Result, Story
+from fluidlift.shape import generate, place, surface, terrain
+from fluidlift.shape import kind as kinds
+from fluidlift.types import (
+    Gaussians,
+    Grid,
+    Label,
+    PinholeCamera,
+    Similarity3,
+    Terrain,
+    TriangleMesh,
+    concatenate,
+)
+
+
+def rest_frame(fluid: np.ndarray) -> int:
+    """First frame in which a good part of the fluid is there (smoke and pours begin with nothing)."""
+    area = fluid.sum(axis=(1, 2)).astype(float)
+    enough = area >= 0.3 * np.percentile(area, 90)
+    return int(np.argmax(enough)) if enough.any() else int(np.argmax(area))
+
+
+def geometry(story: Story, inputs: Inputs, config: JobConfig) -> Result:
+    """Kind, camera, front surface, scale, terrain, cells."""
+    from fluidlift.motion.optical_flow import mean_flow
+    from fluidlift.shape.unite import window_length
+
+    clip, labels, flow, c = clip_of(story), labels_of(story), flow_of(story), config.shape
+    fluid = labels.fluid
+    start = rest_frame(fluid)
+    united = _united(clip.frames, fluid, start, c.longest_union, window_length)
+    mask = generate.united_mask(fluid[start : start + united])
+    if not mask.any():
+        mask = fluid[start]
+    wet_some_time = fluid.any(axis=0)
+    motion, trust = mean_flow(flow, wet_some_time)
+    warnings: list[str] = []
+
+    known, pose_given = _known_camera(inputs, config, clip.size, warnings)
+    pitch = float(place.pose_up(known)[0].pitch) if pose_given else c.pitch
+    pick = np.unique(np.linspace(0, len(clip) - 1, 8).astype(int))
+    evidence = kinds.estimate_kind(clip.frames[pick], fluid[pick], motion, trust, pitch=pitch)
+    kind = evidence.kind if c.kind == "auto" else c.kind
+    heading = eye = None
+    if pose_given:
+        up, heading = place.pose_up(known)
+        eye = known.position
+    else:
+        up = kinds.estimate_up(kind, mask, motion, trust, known, pitch=c.pitch, roll=c.roll)
+    canonical = kinds.level_camera(known, up)
+
+    front, known_scale = _front(inputs, canonical, mask, kind, motion, trust)
+    visible = mask & (front.depth > 0)
+    points, velocities = _surface_motion(canonical, visible, front.depth, motion, clip.interval)
+    level = _water_level(inputs)
+    height = float(eye[2] - level) if eye is not None and kind == "stream" else None
+    scale = place.metric_scale(
+        kind, points, velocities, size=c.size, camera_height=height, known_scale=known_scale
+    )
+    if scale.warning:
+        warnings.append(scale.warning)
+    mainstream = _mainstream(kind, velocities, trust[visible])
+    to_world, camera = place.place(
+        canonical, points, scale.value, heading=heading, eye=eye, mainstream=mainstream
+    )
+    depth = (front.depth * scale.value).astype(np.float32)
+    half = (front.half_thickness * scale.value).astype(np.float32)
+    bulk = to_world.vectors(mainstream) / to_world.scale
+    setting = _setting(kind, front, labels.labels, fluid, start, united, camera, to_world, depth, half, bulk, c)
+    meta: dict[str, Any] = {
+        "warnings": warnings,
+        "kind": kind,
+        "kind_evidence": asdict(evidence),
+        "kind_source": "evidence" if c.kind == "auto" else "user",
+        "up": asdict(up),
+        "scale": asdict(scale),
+        "camera": camera.to_dict(),
+        "world_from_canonical": {
+            "scale": to_world.scale,
+            "rotation": to_world.rotation.tolist(),
+            "translation": to_world.translation.tolist(),
+        },
+        "rest_frame": start,
+        "united_frames": united,
+        "grid": {"shape": setting.terrain.grid.shape, "spacing": setting.terrain.grid.spacing,
+                 "origin": setting.terrain.grid.origin},
+        "height_field": setting.surface_height is not None,
+    }  # fmt: skip
+    arrays = {
+        "mask": mask,
+        "depth": depth,
+        "half_thickness": half,
+        "mean_flow": motion,
+        "mean_confidence": trust,
+        "signed_distance": setting.terrain.signed_distance,
+        "mainstream": setting.terrain.mainstream,
+        "mesh_vertices": setting.terrain.mesh.vertices,
+        "mesh_faces": setting.terrain.mesh.faces,
+        "cell_types": setting.cell_types,
+        "bed_height": setting.bed_height.astype(np.float32),
+    }
+    if setting.surface_height is not None:
+        arrays["surface_height"] = setting.surface_height.astype(np.float32)
+    plate = generate.background_plate(clip.frames, fluid)
+    arrays["plate"], arrays["plate_seen"] = plate.image, plate.seen
+    return Result(arrays, meta)
+
+
+def _united(frames, fluid, start, longest, window_length) -> int:
+    stop = min(len(frames), start + 2 * longest + 1)
+    return int(min(window_length(frames[start:stop], fluid[start], longest=longest), len(frames) - start))
+
+
+def _known_camera(inputs: Inputs, config: JobConfig, size, warnings) -> tuple[PinholeCamera, bool]:
+    """The camera file's camera, or one from the field of view; and whether its pose is known."""
+    from fluidlift.io.images import read_camera, read_distortion, read_json
+
+    if inputs.camera is None:
+        return PinholeCamera.from_fov(config.shape.fov, size), False
+    camera = read_camera(inputs.camera, size)
+    if read_distortion(inputs.camera) is not None:
+        warnings.append(
+            "the camera file gives lens distortion, which is not corrected: straight edges near the picture's border "
+            "bend by up to a few pixels"
+        )
+    data = read_json(inputs.camera, "camera file")
+    return camera, "R" in data or "frames" in data
+
+
+def _water_level(inputs: Inputs) -> float:
+    """z of the water, m, where a camera file says it; else the ground of its world, 0."""
+    from fluidlift.io.images import read_json
+
+    data = read_json(inputs.camera, "camera file") if inputs.camera is not None else {}
+    value = data.get("water_level_z", 0.0)
+    return float(value) if isinstance(value, int | float) else 0.0
+
+
+def _front(inputs, canonical, mask, kind, motion, trust) -> tuple[surface.FrontSurface, float | None]:
+    """The front surface in canonical units; metres per unit where the depth came in metres."""
+    if inputs.depth is not None:
+        from fluidlift.io.images import read_depth
+
+        given = read_depth(inputs.depth, canonical.size)
+        valid = mask & np.isfinite(given) & (given > 0)
+        scale = float(np.median(given[valid])) if valid.any() else None
+        return surface.given_surface(canonical, mask, given, kind), scale
+    if kind == "stream":
+        return surface.level_surface(canonical, mask), None
+    if kind == "fall":
+        return surface.falling_surface(canonical, mask, motion, trust), None
+    return surface.inflated_surface(canonical, mask, kind), None
+
+
+def _surface_motion(camera, visible, depth, motion, interval) -> tuple[np.ndarray, np.ndarray]:
+    """Canonical points on the fluid and their velocities (units/s), moving along the surface."""
+    from scipy import ndimage
+
+    grid = camera.pixel_grid()
+    uv = grid[visible]
+    if len(uv) == 0:
+        raise InputRejected(
+            "no fluid pixel has a depth", "a surface that the camera sees", "give --pitch or another --kind"
+        )
+    points = camera.unproject(uv, depth[visible])
+    index = ndimage.distance_transform_edt(~visible, return_distances=False, return_indices=True)
+    whole = depth[tuple(index)]
+    end = uv + motion[visible]
+    row = np.clip(end[:, 1] - 0.5, 0, depth.shape[0] - 1)
+    col = np.clip(end[:, 0] - 0.5, 0, depth.shape[1] - 1)
+    later = ndimage.map_coordinates(whole, np.stack([row, col]), order=1)
+    return points, (camera.unproject(end, later) - points) / interval
+
+
+def _mainstream(kind: str, velocities: np.ndarray, trust: np.ndarray) -> np.ndarray:
+    """Bulk direction: confident and fast motion counts most; bodies in the air move along the vertical."""
+    speed = np.linalg.norm(velocities, axis=1)
+    capped = velocities * np.minimum(1.0, np.percentile(speed, 95) / np.maximum(speed, 1e-12))[:, None]
+    bulk = (capped * (trust * np.linalg.norm(capped, axis=1))[:, None]).sum(axis=0)
+    if kind in ("pour", "plume"):
+        bulk = bulk / max(np.linalg.norm(bulk), 1e-12)
+        bulk = np.array([bulk[0], bulk[1], -max(-bulk[2], 1.0) if kind == "pour" else max(bulk[2], 1.0)])
+    norm = np.linalg.norm(bulk)
+    return bulk / norm if norm > 1e-12 else np.array([1.0, 0.0, 0.0])
+
+
+def _setting(kind, front, labels, fluid, start, united, camera, to_world, depth, half, bulk, c) -> terrain.Setting:
+    window = slice(start, start + united)
+    mask = generate.united_mask(fluid[window])
+    visible = mask & (depth > 0)
+    grid = camera.pixel_grid()
+    near = camera.unproject(grid[visible], depth[visible])
+    if front.height is not None:
+        solid = (labels[window] == Label.SOLID).mean(axis=0) > 0.5
+        seen = np.where(mask, Label.FLUID, np.where(solid, Label.SOLID, Label.BACKGROUND)).astype(np.uint8)
+        return terrain.channel_setting(
+            place.PlacedHeight(front.height, to_world), seen, near, camera, bulk,
+            kind=kind, longest=c.cells, cell_limit=c.cell_limit, depth_ratio=c.depth_ratio,
+        )  # fmt: skip
+    back = depth + 2 * half
+    far = camera.unproject(grid[visible], back[visible])
+    # the box holds what the clip shows later, in the same vertical plane
+    later = fluid.any(axis=0)
+    middle = np.median((depth + half)[visible])
+    reach = camera.unproject(grid[later], np.full(int(later.sum()), middle))
+    return terrain.airborne_setting(
+        depth, back, visible, camera, np.concatenate([near, far, reach]), bulk,
+        kind=kind, longest=c.cells, cell_limit=c.cell_limit,
+    )  # fmt: skip
+
+
+# what later stages see ------------------------------------------------------------------------------------------
+
+
+def camera_of(story: Story) -> PinholeCamera:
+    """The video's camera in the world."""
+    return PinholeCamera.from_dict(story["geometry"].meta["camera"])
+
+
+def grid_of(story: Story) -> Grid:
+    """The simulation grid."""
+    g = story["geometry"].meta["grid"]
+    return Grid(tuple(g["shape"]), g["spacing"], tuple(g["origin"]))
+
+
+def placement_of(story: Story) -> Similarity3:
+    """world_from_canonical."""
+    t = story["geometry"].meta["world_from_canonical"]
+    return Similarity3(t["scale"], np.array(t["rotation"]), np.array(t["translation"]))
+
+
+def terrain_of(story: Story) -> Terrain:
+    """The solid, textured from the background plate."""
+    a = story["geometry"].arrays
+    colors = generate.picture_colours(a["plate"], a["mesh_vertices"], camera_of(story))
+    mesh = TriangleMesh(a["mesh_vertices"], a["mesh_faces"], colors)
+    return Terrain(grid_of(story), a["signed_distance"], a["mainstream"], mesh)
+
+
+def setting_of(story: Story) -> terrain.Setting:
+    """Terrain and cells."""
+    a = story["geometry"].arrays
+    return terrain.Setting(terrain_of(story), a["cell_types"], a.get("surface_height"), a["bed_height"])
+
+
+def gaussians_to_arrays(g: Gaussians, prefix: str = "") -> dict[str, np.ndarray]:
+    """Fields by name."""
+    return {prefix + k: getattr(g, k) for k in ("means", "quats", "scales", "opacities", "sh")}
+
+
+def gaussians_from_arrays(arrays: dict[str, np.ndarray], prefix: str = "") -> Gaussians:
+    """The reverse of `gaussians_to_arrays`."""
+    return Gaussians(*(arrays[prefix + k] for k in ("means", "quats", "scales", "opacities", "sh")))
+
+
+def rest_of(story: Story) -> Gaussians:
+    """The rest body."""
+    return gaussians_from_arrays(story["refine"].arrays)
+
+
+def refine(story: Story, inputs: Inputs, config: JobConfig) -> Result:
+    """Generate per frame, refine on the first, prune, unite, fill."""
+    from fluidlift.shape.fill import fill
+    from fluidlift.shape.prune import prune
+    from fluidlift.shape.unite import unite
+
+    clip, labels, c = clip_of(story), labels_of(story), config.shape
+    g, camera, setting = story["geometry"], camera_of(story), setting_of(story)
+    start, united = g.meta["rest_frame"], g.meta["united_frames"]
+    h = setting.terrain.grid.spacing
+    depth = g.arrays["depth"]
+    fluid = labels.fluid
+    first, fitted = _refined_front(story, config, fluid[start], depth)
+    bodies = [first]
+    for t in range(start + 1, start + united):
+        bodies.append(generate.front_gaussians(clip.frames[t], fluid[t], depth, camera, stride=c.stride))
+    shown = generate.fluid_colour_frame(clip.frames[start], fluid[start])
+    hull = generate.hull_gaussians(shown, setting, camera, seed=config.seed)
+    front = unite([b for b in bodies if len(b)], spacing=max(0.35 * h, 0.6 * c.stride * _pixel(depth, camera)))
+    shell, pruned = prune(_outside_solid(concatenate([front, hull]), setting), min_opacity=0.05, max_stretch=12.0)
+    room = max(c.max_gaussians - len(shell), 0)
+    added = fill(shell, spacing=h / 2, rays=c.rays, rng=np.random.default_rng(config.seed), max_added=room)
+    body = _outside_solid(_bounded(concatenate([shell, added]), c.max_gaussians, config.seed), setting)
+    if len(body) < 50:
+        raise InputRejected(
+            f"the body of the fluid has only {len(body)} Gaussians", "more fluid in the picture",
+            "check the mask in the report, or raise --max-size",
+        )  # fmt: skip
+    meta = {
+        "warnings": list(fitted.pop("warnings")),
+        "front": len(front),
+        "hull": len(hull),
+        "pruned": len(front) + len(hull) - len(shell),
+        "filled": len(added),
+        "total": len(body),
+        "prune_report": str(pruned),
+    } | fitted
+    return Result(gaussians_to_arrays(body), meta)
+
+
+def _refined_front(story, config, mask, depth) -> tuple[Gaussians, dict[str, Any]]:
+    """The front of the rest frame, optimised against its picture."""
+    from fluidlift.shape.refine import refine as refine_view
+
+    clip, camera, c = clip_of(story), camera_of(story), config.shape
+    start = story["geometry"].meta["rest_frame"]
+    front = generate.front_gaussians(clip.frames[start], mask, depth, camera, stride=c.stride)
+    fitted: dict[str, Any] = {"warnings": []}
+    if c.refine_iterations > 0 and len(front):
+        found = refine_view(
+            front, clip.frames[start], mask, camera, iterations=c.refine_iterations, seed=config.seed,
+            max_gaussians=max(int(1.5 * len(front)), 1000), progress=story.step,
+        )  # fmt: skip
+        fitted |= {"psnr_before": found.psnr_before, "psnr_after": found.psnr_after, "kept": found.kept}
+        fitted["loss_history"] = [float(x) for x in found.loss_history]
+        front = found.gaussians
+    return front, fitted
+
+
+def _pixel(depth: np.ndarray, camera: PinholeCamera) -> float:
+    """Median size of a pixel on the fluid, m."""
+    return float(np.median(depth[depth > 0]) / camera.focal[0])
+
+
+def _outside_solid(g: Gaussians, setting: terrain.Setting) -> Gaussians:
+    """Those whose centre is in the box and not inside the terrain."""
+    from fluidlift.numerics.sampling import sample_nodes
+
+    grid = setting.terrain.grid
+    inside = grid.contains(g.means, margin=1e-6)
+    g = g.select(inside)
+    distance = sample_nodes(setting.terrain.signed_distance, grid, g.means)
+    return g.select(distance > -0.25 * grid.spacing)
+
+
+def _bounded(g: Gaussians, most: int, seed: int) -> Gaussians:
+    """A random subset where there are too many; each stands for more fluid then."""
+    if len(g) <= most:
+        return g
+    keep = np.sort(np.random.default_rng(seed).permutation(len(g))[:most])
+    return g.select(keep)

@@ -1,0 +1,219 @@
+"""From a clip to an asset folder."""
+
+from __future__ import annotations
+
+import platform
+import shutil
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fluidlift import __version__
+from fluidlift.config import JobConfig
+from fluidlift.errors import InputRejected
+from fluidlift.pipeline import body, moving, seeing, showing
+from fluidlift.pipeline.seeing import Inputs
+from fluidlift.pipeline.story import Progress, Silence, Story, file_hash, peak_memory_mb
+from fluidlift.types import FluidAsset
+
+STAGES = ("read", "flow", "segment", "geometry", "refine", "motion", "fit", "simulate", "show")
+
+
+@dataclass(frozen=True)
+class Made:
+    """What `make` left."""
+
+    folder: Path
+    warnings: tuple[str, ...]
+    seconds: float
+    timings: dict[str, dict[str, Any]]
+
+
+def make(
+    inputs: Inputs,
+    folder: Path,
+    config: JobConfig,
+    *,
+    force: Iterable[str] = (),
+    progress: Progress | None = None,
+) -> Made:
+    """Run every stage that is not already done and write the asset folder.
+
+    Args:
+        inputs: the clip and what the user adds to it.
+        folder: of the asset; an existing asset is continued or rewritten.
+        config: of the job.
+        force: stages to run again, with all that come after.
+        progress: where progress is told.
+
+    Raises:
+        InputRejected: an input that cannot be used, or a folder that is not an asset. Nothing is left behind then
+            where nothing was before.
+        FluidliftError: a stage failed; what was done before it is kept and the next run goes on from there.
+    """
+    from fluidlift.io.asset_folder import check_output_folder
+    from fluidlift.io.atomic import disk_errors
+
+    unknown = set(force) - set(STAGES)
+    if unknown:
+        raise InputRejected(f"unknown stage '{sorted(unknown)[0]}'", "one of " + ", ".join(STAGES))
+    check_output_folder(folder)
+    fresh = not folder.exists()
+    began = time.perf_counter()
+    story = Story(folder, STAGES, force=frozenset(force), progress=progress or Silence())
+    try:
+        with disk_errors(folder):
+            provenance = _run(story, inputs, folder, config)
+            _write_asset(story, folder, config, provenance)
+    except InputRejected:
+        if fresh:
+            shutil.rmtree(folder, ignore_errors=True)
+        raise
+    return Made(folder, tuple(story.warnings), time.perf_counter() - began, story.timings)
+
+
+def _run(story: Story, inputs: Inputs, folder: Path, config: JobConfig) -> dict[str, Any]:
+    from fluidlift.io.limits import require_file
+    from fluidlift.io.sequences import is_sequence
+
+    if not is_sequence(inputs.clip):
+        require_file(inputs.clip, "video")
+    hashes = {}
+    for name, path in inputs.existing().items():
+        if name != "clip" or path.exists():
+            if not path.exists():
+                raise InputRejected(f"no such {name} file: '{path.name}'", "an existing file", f"check --{name}")
+            hashes[name] = file_hash(path)
+        else:
+            from fluidlift.io.sequences import list_sequence
+
+            hashes[name] = [file_hash(p) for _, p in list_sequence(path)]
+    seed = config.seed
+    run = story.run
+    run("read", lambda: seeing.read(inputs, config), settings=[hashes["clip"], config.section("read")], after=())
+    run("flow", lambda: seeing.flow(story, config), settings=config.motion.method, after=("read",))
+    run("segment", lambda: seeing.segment(story, inputs, config), settings=hashes.get("mask"), after=("read", "flow"))
+    geometry = ("kind", "fov", "pitch", "roll", "size", "depth_ratio", "cells", "cell_limit", "longest_union")
+    given = {k: hashes.get(k) for k in ("camera", "depth", "geometry")}
+    shape = config.section("shape")
+    run(
+        "geometry",
+        lambda: body.geometry(story, inputs, config),
+        settings=[{k: shape[k] for k in geometry}, given],
+        after=("read", "flow", "segment"),
+    )
+    run("refine", lambda: body.refine(story, inputs, config), settings=[shape, seed], after=("geometry",))
+    run("motion", lambda: moving.motion(story, config), settings=config.section("motion"), after=("geometry",))
+    run("fit", lambda: moving.fit(story, config), settings=config.section("fit"), after=("motion",))
+    run(
+        "simulate",
+        lambda: moving.simulate(story, folder, config),
+        settings=[config.section("simulate"), seed],
+        after=("refine", "fit"),
+        still_there=moving.frames_still_there(folder),
+    )
+    wanted = [folder / "preview.mp4"] + [folder / "asset.usda"] * config.show.usd
+    run(
+        "show",
+        lambda: showing.show(story, folder, config),
+        settings=config.section("show"),
+        after=("simulate",),
+        still_there=lambda result: all(p.is_file() for p in wanted),
+    )
+    return {"inputs": {k: {"name": inputs.existing()[k].name, "sha256": v} for k, v in hashes.items()}}
+
+
+def _write_asset(story: Story, folder: Path, config: JobConfig, provenance: dict[str, Any]) -> None:
+    from fluidlift.io.asset_folder import save_asset
+    from fluidlift.io.atomic import atomic_write
+
+    clip, g = seeing.clip_of(story), story["geometry"]
+    setting = body.setting_of(story)
+    asset = FluidAsset(
+        kind=g.meta["kind"],
+        rest=body.rest_of(story),
+        terrain=setting.terrain,
+        grid=setting.terrain.grid,
+        cell_types=setting.cell_types,
+        velocity=moving.targets_of(story)[0],
+        parameters=moving.parameters_of(story),
+        estimates=moving.estimates_of(story),
+        camera=body.camera_of(story),
+        world_from_canonical=body.placement_of(story),
+        interval=clip.interval,
+        frame_count=len(clip),
+        provenance=provenance | {"config": config.to_dict(), "versions": versions(), "seed": config.seed},
+    )
+    showing.write_report(story, folder, config, story.timings)
+    with atomic_write(folder / "work" / "evaluation.npz") as stream:
+        np.savez_compressed(stream, **evaluation_arrays(story))
+    present = {
+        name: file
+        for name, file in {
+            "preview": "preview.mp4", "report": "report.html", "usd": "asset.usda", "mask_overlay": "mask_overlay.png",
+        }.items()
+        if (folder / file).is_file()
+    }  # fmt: skip
+    save_asset(
+        folder,
+        asset,
+        timings={k: float(t["seconds"]) for k, t in story.timings.items()},
+        metrics=_metrics(story),
+        warnings=story.warnings,
+        files=present,
+    )
+
+
+def evaluation_arrays(story: Story) -> dict[str, np.ndarray]:
+    """What `fluidlift evaluate` compares with a truth."""
+    g, m, s, shown = story["geometry"], story["motion"], story["simulate"], story["show"].arrays
+    targets = m.meta["targets"]
+    start = g.meta["rest_frame"]
+    return {
+        "labels": story["segment"].arrays["labels"],
+        "front_depth": g.arrays["depth"] * g.arrays["mask"],
+        "flow_raw": story["flow"].arrays["displacement"],
+        "flow_completed": m.arrays["completed"],
+        "resim_flow": shown["resim_flow"][:-1],
+        "resim_mask": shown["resim_mask"],
+        "resim_frames": shown["resim_frames"],
+        "first_frame": np.int64(start),
+        "fit_frames": np.array([targets[0], targets[-1] + 1] if targets else [0, 0]),
+        "particle_volume": s.arrays["volume"],
+        "leak_share": s.arrays["leak"],
+    }
+
+
+def _metrics(story: Story) -> dict[str, Any]:
+    g, refined, reports = story["geometry"].meta, story["refine"].meta, story["motion"].meta["reports"]
+    return {
+        "kind_scores": g["kind_evidence"]["scores"],
+        "up": g["up"],
+        "scale": g["scale"],
+        "rest_frame": g["rest_frame"],
+        "gaussians": refined["total"],
+        "refine_psnr_after": refined.get("psnr_after"),
+        "divergence_max": max((r.get("divergence_max", 0.0) for r in reports), default=None),
+        "fit_converged": story["fit"].meta["converged"],
+        "fit_rollouts": story["fit"].meta["rollouts"],
+        "fit_extra": story["fit"].meta["extra"],
+        "peak_memory_mb": round(peak_memory_mb(), 1),
+        "stages": story.timings,
+    }
+
+
+def versions() -> dict[str, str]:
+    """Of what computed this asset."""
+    from importlib import metadata
+
+    found = {"fluidlift": __version__, "python": platform.python_version(), "system": platform.system()}
+    for name in ("numpy", "scipy", "numba", "torch", "av", "opencv-python-headless", "usd-core"):
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return found

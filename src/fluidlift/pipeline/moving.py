@@ -1,0 +1,294 @@
+"""Stages that make it move: motion (velocity targets), fit (parameters), simulate (frames)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fluidlift.config import JobConfig
+from fluidlift.pipeline.body import camera_of, rest_of, setting_of
+from fluidlift.pipeline.seeing import clip_of, flow_of, labels_of
+from fluidlift.pipeline.story import Result, Story, one_torch_thread
+from fluidlift.types import (
+    CellType,
+    Estimate,
+    FaceVelocity,
+    FluidParameters,
+    Gaussians,
+    Particles,
+    PixelFlow,
+)
+
+HALF_WINDOW = 2
+"""frames on either side whose flow is averaged into one target: turbulence of single pairs is mostly flow noise"""
+
+VISCOSITY_PRIOR = {"stream": 1e-5, "fall": 1e-5, "pour": 1e-4, "plume": 1e-5}
+"""m^2/s, where the fit starts"""
+
+
+def motion(story: Story, config: JobConfig) -> Result:
+    """Completed flow of many frames, volume velocity of the target frames."""
+    from fluidlift.motion.lift import lift_flow
+    from fluidlift.motion.volume import volume_velocity
+
+    clip, flow, g = clip_of(story), flow_of(story), story["geometry"]
+    camera, setting = camera_of(story), setting_of(story)
+    grid, kind = setting.terrain.grid, g.meta["kind"]
+    pairs, start = len(flow), min(g.meta["rest_frame"], len(flow) - 1)
+    targets = list(range(start, min(start + config.motion.targets, pairs)))
+    wanted = sorted(set(targets) | set(range(0, pairs, config.motion.complete_every)))
+    completed = np.full((pairs, *clip.frames.shape[1:3], 2), np.nan, np.float16)
+    observed = np.zeros((pairs, *clip.frames.shape[1:3]), bool)
+    arrays: dict[str, np.ndarray] = {}
+    reports: list[dict[str, Any]] = []
+    depth = g.arrays["depth"]
+    for done, t in enumerate(wanted):
+        story.step(done, len(wanted))
+        mask = labels_of(story).fluid[t]
+        if not mask.any():
+            continue
+        full, seen = _completed(flow, t, mask, depth, camera, config)
+        completed[t], observed[t] = full, seen
+        if t not in targets:
+            continue
+        on_body = mask & (depth > 0)
+        lifted = lift_flow(full, seen, on_body, depth, depth, camera, clip.interval)
+        velocity, report = volume_velocity(
+            lifted, setting.terrain, setting.cell_types, grid, kind=kind, mainstream=setting.terrain.mainstream
+        )
+        k = len(reports)
+        for name, component in zip("uvw", velocity.components):
+            arrays[f"target_{k:03d}_{name}"] = component.astype(np.float32)
+        reports.append({"frame": t, **_plain(report)})
+    warnings = []
+    if reports and not all(r.get("solve", {}).get("converged", True) for r in reports):
+        warnings.append("the divergence-free solve of the target velocity did not converge on every frame")
+    arrays |= {"completed": completed, "observed": np.packbits(observed, axis=-1)}
+    return Result(arrays, {"warnings": warnings, "targets": [r["frame"] for r in reports], "reports": reports})
+
+
+def _completed(flow: PixelFlow, t: int, mask, depth, camera, config: JobConfig) -> tuple[np.ndarray, np.ndarray]:
+    """Mean of the flow around frame t, failed regions filled in along the mainstream."""
+    from fluidlift.motion.mainstream import complete_flow, mainstream_direction, project_screen_divergence
+    from fluidlift.motion.optical_flow import mean_flow
+
+    window = slice(max(t - HALF_WINDOW, 0), min(t + HALF_WINDOW + 1, len(flow)))
+    mean, trust = mean_flow(PixelFlow(flow.displacement[window], flow.confidence[window]), mask)
+    direction = mainstream_direction(mean, trust, mask)
+    with_depth = bool((depth[mask] > 0).all())
+    full, seen = complete_flow(mean, trust, mask, direction, depth if with_depth else None)
+    on_body = mask & (depth > 0)
+    if on_body.any() and (on_body & ~seen).any():
+        projected, _ = project_screen_divergence(
+            full, on_body, seen & on_body, np.where(on_body, depth, 1.0), np.zeros_like(depth), camera,
+            form=config.motion.divergence,
+        )  # fmt: skip
+        full = np.where(on_body[..., None], projected, full)
+    return full, seen
+
+
+def _plain(report: Any) -> dict[str, Any]:
+    """A report as plain values for JSON."""
+    return {k: v for k, v in asdict(report).items() if isinstance(v, int | float | str | bool | dict)}
+
+
+def targets_of(story: Story) -> list[FaceVelocity]:
+    """Target velocities of consecutive frames."""
+    a = story["motion"].arrays
+    count = len(story["motion"].meta["targets"])
+    return [FaceVelocity(*(a[f"target_{k:03d}_{name}"] for name in "uvw")) for k in range(count)]
+
+
+def fit(story: Story, config: JobConfig) -> Result:
+    """Physical parameters that make the grid move like the targets."""
+    from fluidlift.fit.optimize import fit_parameters
+
+    setting, kind = setting_of(story), story["geometry"].meta["kind"]
+    targets = targets_of(story)
+    initial = first_guess(story, targets)
+    with one_torch_thread():
+        found = fit_parameters(
+            targets, setting.cell_types, setting.terrain, setting.terrain.grid, clip_of(story).interval, initial,
+            kind=kind, method=config.fit.method, max_seconds=config.fit.max_seconds, progress=story.step,
+        )  # fmt: skip
+    warnings = []
+    if not found.converged:
+        warnings.append(
+            "the parameter fit stopped before it converged: its values are the best found so far "
+            "(--set fit.max_seconds=... gives it more time)"
+        )
+    return Result(
+        {"loss_history": np.asarray(found.loss_history, np.float64)},
+        {
+            "warnings": warnings,
+            "parameters": found.parameters.to_dict(),
+            "estimates": {k: asdict(e) for k, e in found.estimates.items()},
+            "initial": initial.to_dict(),
+            "converged": found.converged,
+            "rollouts": found.rollouts,
+            "notes": list(found.notes),
+            "extra": {k: float(v) for k, v in found.extra.items()},
+        },
+    )
+
+
+def first_guess(story: Story, targets: list[FaceVelocity]) -> FluidParameters:
+    """Where the fit starts: velocities measured at the ends, the rest from what such a fluid usually has."""
+    setting, kind = setting_of(story), story["geometry"].meta["kind"]
+    cells, direction = setting.cell_types, setting.terrain.mainstream
+    mean = np.mean([t.at_centers() for t in targets], axis=0)
+    inlet = cells == CellType.INFLOW
+    wet = inlet | (cells == CellType.FLUID)
+    bulk = mean[inlet].mean(axis=0) if inlet.any() else mean[wet].mean(axis=0)
+    spread = np.std([t.at_centers()[inlet] for t in targets], axis=0).mean() if inlet.any() else 0.0
+    outlet = np.zeros(cells.shape, bool)
+    if (cells == CellType.OUTFLOW).any():
+        from scipy import ndimage
+
+        outlet = ndimage.binary_dilation(cells == CellType.OUTFLOW, iterations=2) & (cells == CellType.FLUID)
+    out = float((mean[outlet] @ direction).mean()) if outlet.any() else float((mean[wet] @ direction).mean())
+    speed = float(np.linalg.norm(mean[wet], axis=1).max()) if wet.any() else 0.0
+    interval = clip_of(story).interval
+    courant = setting.terrain.grid.spacing / max(speed, 1e-6)
+    return FluidParameters(
+        kinematic_viscosity=VISCOSITY_PRIOR[kind],
+        inflow_velocity=tuple(float(x) for x in bulk),
+        inflow_fluctuation=float(spread),
+        outflow_velocity=max(out, 0.0),
+        restitution=0.05,
+        wall_damping=0.3,
+        time_step=float(np.clip(min(interval, 2.0 * courant), interval / 20, interval)),
+    )
+
+
+def parameters_of(story: Story) -> FluidParameters:
+    """The fitted parameters."""
+    p = dict(story["fit"].meta["parameters"])
+    return FluidParameters(**{k: tuple(v) if isinstance(v, list) else v for k, v in p.items()})
+
+
+def estimates_of(story: Story) -> dict[str, Estimate]:
+    """The fitted parameters with their uncertainties."""
+    found = {}
+    for name, e in story["fit"].meta["estimates"].items():
+        sigma = float("inf") if e["sigma"] is None else e["sigma"]  # JSON has no infinity
+        found[name] = Estimate(e["value"], sigma, e["identifiable"], e["prior"], e["unit"])
+    return found
+
+
+def emission_look(
+    rest: Gaussians, direction: np.ndarray, speed: float
+) -> Callable[[np.ndarray, float], np.ndarray]:
+    """Which rest Gaussian lends its look to a particle that enters at a place and time.
+
+    The fluid that enters later is taken to look like the body further downstream, mirrored at its ends: the pattern
+    goes on without a seam at the inlet and never shows one colour for long.
+    """
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(rest.means)
+    reach = rest.means @ direction
+    low, high = np.percentile(reach, [2, 98])
+    length = max(float(high - low), 1e-9)
+
+    def source(positions: np.ndarray, time: float) -> np.ndarray:
+        run = (speed * time) % (2 * length)
+        shift = run if run < length else 2 * length - run
+        return tree.query(positions + shift * direction)[1].astype(np.int64)
+
+    return source
+
+
+def simulator_of(story: Story, config: JobConfig, rest: Gaussians) -> Any:
+    """The simulator at the first instant."""
+    from fluidlift.numerics.sampling import sample_faces
+
+    setting, kind = setting_of(story), story["geometry"].meta["kind"]
+    parameters, grid = parameters_of(story), setting.terrain.grid
+    velocity = targets_of(story)[0]
+    start = sample_faces(velocity, grid, rest.means)
+    # all Gaussians of a cell share its mass
+    cell = np.ravel_multi_index(tuple(np.clip(grid.cell_of(rest.means), 0, np.array(grid.shape) - 1).T), grid.shape)
+    count = np.bincount(cell, minlength=grid.cells)
+    masses = parameters.density * grid.spacing**3 / np.maximum(count[cell], 1)
+    particles = Particles.at_rest(rest.means, masses, np.arange(len(rest)), start)
+    direction = setting.terrain.mainstream
+    look = emission_look(rest, direction, float(np.linalg.norm(parameters.inflow_velocity)))
+    if kind == "plume":
+        from fluidlift.physics.gas import GasSimulator
+
+        return GasSimulator(
+            grid, setting.terrain, parameters, particles, cell_types=setting.cell_types, inflow_profile=velocity,
+            velocity=velocity, seed=config.seed, emit_source=look,
+            buoyancy=float(np.linalg.norm(parameters.gravity)),
+        )  # fmt: skip
+    from fluidlift.physics.apic import LiquidSimulator
+
+    return LiquidSimulator(
+        grid, setting.terrain, parameters, particles, cell_types=setting.cell_types, inflow_profile=velocity,
+        seed=config.seed, emit_source=look,
+    )  # fmt: skip
+
+
+def frame_file(folder: Path, number: int) -> Path:
+    """Splats of one frame; numbers start at 1001."""
+    return folder / "frames" / "splats" / f"{number:04d}.ply"
+
+
+def simulate(story: Story, folder: Path, config: JobConfig) -> Result:
+    """Frames of the re-simulation, as splats with ids and velocities."""
+    from fluidlift.io.atomic import require_free_space
+    from fluidlift.io.ply import write_gaussians
+    from fluidlift.numerics.sampling import sample_nodes
+    from fluidlift.physics.deform import deform_gaussians
+
+    rest, setting = rest_of(story), setting_of(story)
+    clip = clip_of(story)
+    start = story["geometry"].meta["rest_frame"]
+    frames = config.simulate.frames or (len(clip) - start)
+    require_free_space(folder, frames * len(rest) * 80)
+    simulator = simulator_of(story, config, rest)
+    grid = setting.terrain.grid
+    volumes, leaks, counts, substeps = [], [], [], []
+    for old in (folder / "frames" / "splats").glob("*.ply"):
+        old.unlink()
+    for k in range(frames):
+        story.step(k, frames)
+        if k:
+            step = simulator.advance(clip.interval)
+            substeps.append(int(step.substeps))
+        p = simulator.particles
+        if len(p) > config.simulate.max_particles * 2:
+            break
+        shown = deform_gaussians(rest, p)
+        write_gaussians(frame_file(folder, 1001 + k), shown, ids=p.ids, velocities=p.velocities)
+        occupied = np.unique(np.floor((p.positions - grid.low) / grid.spacing).astype(np.int64), axis=0)
+        volumes.append(len(occupied) * grid.spacing**3)
+        inside = grid.contains(p.positions)
+        distance = sample_nodes(setting.terrain.signed_distance, grid, p.positions[inside])
+        leaks.append(float((distance < -0.1 * grid.spacing).mean()) if inside.any() else 0.0)
+        counts.append(len(p))
+    return Result(
+        {"volume": np.array(volumes, np.float32), "leak": np.array(leaks, np.float32), "count": np.array(counts)},
+        {"frames": len(counts), "substeps": substeps, "warnings": _simulation_warnings(volumes, leaks)},
+    )
+
+
+def _simulation_warnings(volumes: list[float], leaks: list[float]) -> list[str]:
+    warnings = []
+    drift = volumes[-1] / max(volumes[0], 1e-12) - 1
+    if abs(drift) > 0.5:
+        word = "lost" if drift < 0 else "gained"
+        warnings.append(f"the re-simulation {word} {100 * abs(drift):.0f} % of its volume by its last frame")
+    if max(leaks) > 0.01:
+        warnings.append(f"up to {100 * max(leaks):.1f} % of the particles are inside the terrain")
+    return warnings
+
+
+def frames_still_there(folder: Path) -> Callable[[Result], bool]:
+    """Whether the splat files of a cached simulation are complete."""
+    return lambda result: all(frame_file(folder, 1001 + k).is_file() for k in range(result.meta["frames"]))

@@ -1,0 +1,271 @@
+"""The stage that shows: preview, report, USD, pictures for measurement."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fluidlift.config import JobConfig
+from fluidlift.look.report import Figure, Section, report_html
+from fluidlift.pipeline.body import camera_of, rest_of, setting_of, terrain_of
+from fluidlift.pipeline.moving import estimates_of, frame_file, parameters_of, targets_of
+from fluidlift.pipeline.seeing import clip_of, flow_of, labels_of
+from fluidlift.pipeline.story import Result, Story
+from fluidlift.types import CellType, Gaussians, PinholeCamera, concatenate
+
+
+def splat_frames(folder: Path, count: int) -> Iterator[tuple[Gaussians, np.ndarray, np.ndarray]]:
+    """(gaussians, ids, velocities) of each simulated frame."""
+    from fluidlift.io.ply import read_splats
+
+    for k in range(count):
+        splats = read_splats(frame_file(folder, 1001 + k))
+        velocity = np.stack([splats.extras[v] for v in ("vx", "vy", "vz")], axis=-1)
+        yield splats.gaussians, splats.extras["id"], velocity
+
+
+def show(story: Story, folder: Path, config: JobConfig) -> Result:
+    """Render the frames, write what people open."""
+    from fluidlift.io.export_usd import write_usd
+    from fluidlift.io.video import write_video
+
+    clip = clip_of(story)
+    count = story["simulate"].meta["frames"]
+    measured: dict[str, list[np.ndarray]] = {"frames": [], "mask": [], "flow": []}
+    fps = 1.0 / clip.interval
+    write_video(folder / "preview.mp4", _panels(story, folder, config, count, measured), fps)
+    if config.show.usd:
+        write_usd(
+            folder / "asset.usda",
+            frames=splat_frames(folder, count),
+            interval=clip.interval,
+            terrain=terrain_of(story).mesh,
+            camera=camera_of(story),
+            attributes={k: v for k, v in parameters_of(story).to_dict().items()} | {"kind": _kind(story)},
+        )
+    arrays = {
+        "resim_frames": np.stack(measured["frames"]),
+        "resim_mask": np.stack(measured["mask"]),
+        "resim_flow": np.stack(measured["flow"]).astype(np.float16),
+    }
+    return Result(arrays, {"frames": count})
+
+
+def _kind(story: Story) -> str:
+    return story["geometry"].meta["kind"]
+
+
+def _panels(story: Story, folder: Path, config: JobConfig, count: int, measured) -> Iterator[np.ndarray]:
+    """Input | re-simulation | side view, frame by frame; keeps what the evaluation needs on the way."""
+    from fluidlift.look.pictures import caption
+    from fluidlift.look.rasterize import render
+    from fluidlift.look.scenery import orbit_camera, terrain_depth, terrain_surfels, visible_beside_rocks
+
+    clip, labels = clip_of(story), labels_of(story)
+    g, camera, terrain = story["geometry"], camera_of(story), terrain_of(story)
+    start, rest = g.meta["rest_frame"], rest_of(story)
+    plate = g.arrays["plate"].astype(np.float32) / 255.0
+    rocks = labels.solid.mean(axis=0) > 0.5
+    solid_depth = terrain_depth(terrain, camera) if rocks.any() else None
+    airborne = not g.meta["height_field"]
+    ground = terrain_surfels(terrain, opacity=0.25 if airborne and _kind(story) == "pour" else 0.98)
+    size = _panel_size(clip.size, config.show.width)
+    corners = np.concatenate([rest.means, terrain.mesh.vertices]) if len(terrain.mesh.vertices) else rest.means
+    side = orbit_camera(camera, corners if not airborne else rest.means, size=size)
+    sky = np.linspace(0.93, 0.78, size[1], dtype=np.float32)[:, None, None] * np.ones((1, size[0], 3), np.float32)
+    for k, (gaussians, _, velocity) in enumerate(splat_frames(folder, count)):
+        story.step(k, count)
+        front = gaussians
+        if solid_depth is not None:
+            keep = visible_beside_rocks(
+                gaussians.means, camera, solid_depth, rocks, margin=1.5 * terrain.grid.spacing
+            )
+            front, velocity = gaussians.select(keep), velocity[keep]
+        rendered = render(front, camera, background=plate)
+        picture = _bytes(rendered.image)
+        measured["frames"].append(picture)
+        measured["mask"].append(rendered.alpha > 0.5)
+        measured["flow"].append(_screen_velocity(front, velocity, camera, clip.interval, rendered.alpha))
+        view = render(concatenate([ground, gaussians]), side, background=sky)
+        source = clip.frames[min(start + k, len(clip) - 1)]
+        panels = [
+            caption(_resized(source, size), "input"),
+            caption(_resized(picture, size), "re-simulation"),
+            caption(_bytes(view.image), "side view"),
+        ]
+        yield np.concatenate(panels, axis=1)
+
+
+def _panel_size(size: tuple[int, int], width: int) -> tuple[int, int]:
+    factor = min(1.0, width / max(size))
+    return max(2, 2 * round(size[0] * factor / 2)), max(2, 2 * round(size[1] * factor / 2))
+
+
+def _resized(picture: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    import cv2
+
+    if picture.shape[1::-1] == tuple(size):
+        return picture
+    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+
+
+def _bytes(image: np.ndarray) -> np.ndarray:
+    return (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
+
+
+def _screen_velocity(gaussians, velocity, camera: PinholeCamera, interval: float, alpha) -> np.ndarray:
+    """Motion of the re-simulation in the picture, px per frame; NaN where it shows no fluid."""
+    from fluidlift.look.rasterize import render
+
+    before, z0 = camera.project(gaussians.means)
+    after, z1 = camera.project(gaussians.means + velocity * interval)
+    ok = (z0 > 0) & (z1 > 0)
+    move = np.where(ok[:, None], after - before, 0.0).astype(np.float32)
+    drawn = render(gaussians, camera, features=np.clip(move, -1e3, 1e3)).image
+    return np.where(alpha[..., None] > 0.3, drawn / np.maximum(alpha, 0.3)[..., None], np.nan)
+
+
+def write_report(story: Story, folder: Path, config: JobConfig, timings: dict[str, Any]) -> Path:
+    """report.html and the overlay picture."""
+    from fluidlift.io.atomic import write_bytes
+    from fluidlift.io.images import write_png
+    from fluidlift.shape.segment import overlay
+
+    clip, labels = clip_of(story), labels_of(story)
+    start = story["geometry"].meta["rest_frame"]
+    write_png(folder / "mask_overlay.png", overlay(clip.frames[start], labels.labels[start]))
+    sections = [
+        _section_outcome(story),
+        _section_seeing(story, overlay),
+        _section_body(story),
+        _section_motion(story),
+        _section_parameters(story),
+        _section_simulation(story),
+        Section(
+            "Time and memory",
+            rows=[
+                [name, f"{t['seconds']:.1f} s", "from cache" if t["cached"] else "", f"{t['peak_memory_mb']:.0f} MB"]
+                for name, t in timings.items()
+            ],
+            header=["stage", "time", "", "peak memory so far"],
+        ),
+    ]
+    page = report_html(
+        f"{clip.source} as a fluid asset",
+        f"kind: {_kind(story)} · {len(clip)} frames at {1 / clip.interval:.4g} per second · {clip.size[0]} x "
+        f"{clip.size[1]} px · preset {config.preset}",
+        sections,
+        warnings=story.warnings,
+        links={"preview": "preview.mp4", "USD": "asset.usda", "parameters": "parameters.json", "scene": "scene.yaml"},
+    )
+    return write_bytes(folder / "report.html", page.encode())
+
+
+def _section_outcome(story: Story) -> Section:
+    clip, shown = clip_of(story), story["show"].arrays["resim_frames"]
+    start = story["geometry"].meta["rest_frame"]
+    figures = []
+    for k in sorted({0, len(shown) // 2, len(shown) - 1}):
+        pair = np.concatenate([clip.frames[min(start + k, len(clip) - 1)], shown[k]], axis=1)
+        figures.append(Figure(pair, f"frame {start + k}: input and re-simulation from the same camera"))
+    return Section("Input and re-simulation", figures)
+
+
+def _section_seeing(story: Story, overlay) -> Section:
+    clip, labels = clip_of(story), labels_of(story)
+    pick = sorted({0, len(clip) // 2, len(clip) - 1})
+    figures = [
+        Figure(overlay(clip.frames[t], labels.labels[t]), f"frame {t}: fluid tinted, solids in it marked") for t in pick
+    ]
+    meta, read = story["segment"].meta, story["read"].meta
+    rows = [
+        ["mask", "given by the user" if meta["user_mask"] else "found from motion and colour"],
+        ["mean confidence on the fluid", meta["confidence_mean"]],
+        ["share of the picture", meta["fluid_share"]],
+        ["camera shake", f"{read['shake_px']:.2f} px per frame" + (", taken out" if read["stabilised"] else "")],
+        ["optical flow trusted on", f"{100 * meta['flow_trusted']:.0f} % of the fluid"],
+    ]
+    return Section("What is fluid", figures, rows)
+
+
+def _section_body(story: Story) -> Section:
+    from fluidlift.look.pictures import colour_map
+
+    g, fitted = story["geometry"], story["refine"].meta
+    m = g.meta
+    evidence = m["kind_evidence"]
+    rows: list[list[Any]] = [
+        ["kind", f"{m['kind']} ({m['kind_source']})"],
+        ["belief per kind", ", ".join(f"{k} {v:.2f}" for k, v in evidence["scores"].items())],
+        ["evidence", ", ".join(f"{k} {v:.2f}" for k, v in evidence["features"].items())],
+        ["camera looks down by", f"{m['up']['pitch']:.1f} degrees, rolled {m['up']['roll']:.1f} ({m['up']['source']})"],
+        ["scale", f"{m['scale']['value']:.4g} m per unit ({m['scale']['source']})"],
+        ["grid", f"{' x '.join(map(str, m['grid']['shape']))} cells of {1000 * m['grid']['spacing']:.2f} mm"],
+        ["frames united", m["united_frames"]],
+        ["Gaussians", f"{fitted['total']} ({fitted['front']} seen, {fitted['hull']} hull, {fitted['filled']} inside, "
+                      f"{fitted['pruned']} pruned)"],
+    ]  # fmt: skip
+    if "psnr_before" in fitted:
+        kept = "" if fitted["kept"] else " (rejected by the depth guard)"
+        rows.append(
+            ["single-view refinement", f"PSNR {fitted['psnr_before']:.1f} to {fitted['psnr_after']:.1f} dB{kept}"]
+        )
+    depth, mask = g.arrays["depth"], g.arrays["mask"]
+    figures = [Figure(colour_map(depth, mask & (depth > 0)), "front depth (dark is near)")]
+    figures.append(Figure(g.arrays["plate"], "background without the fluid: texture of the terrain"))
+    return Section("Body", figures, rows)
+
+
+def _section_motion(story: Story) -> Section:
+    from fluidlift.look.pictures import velocity_slices
+    from fluidlift.motion.optical_flow import flow_picture
+
+    meta, a = story["motion"].meta, story["motion"].arrays
+    figures = []
+    if meta["targets"]:
+        t = meta["targets"][0]
+        raw, full = flow_of(story).displacement[t], a["completed"][t].astype(np.float32)
+        mask = labels_of(story).fluid[t]
+        scale = float(np.percentile(np.linalg.norm(full[mask], axis=-1), 95)) if mask.any() else 1.0
+        figures = [
+            Figure(flow_picture(raw, mask, scale), f"optical flow at frame {t} (hue: direction, value: speed)"),
+            Figure(flow_picture(full, mask, scale), "averaged over neighbouring frames, mainstream-corrected"),
+        ]
+        cells = setting_of(story).cell_types
+        wet = (cells == CellType.FLUID) | (cells == CellType.INFLOW)
+        figures.append(
+            Figure(velocity_slices(targets_of(story)[0].at_centers(), wet), "speed in the volume: from above, along, across")
+        )
+    rows = [
+        [r["frame"], r.get("divergence_max", ""), r.get("divergence_mean", ""), r.get("flux_in", ""), r.get("flux_out", "")]
+        for r in meta["reports"][:12]
+    ]
+    return Section("Motion", figures, rows, ["frame", "max |div| dx / speed", "mean", "flux in, m3/s", "flux out, m3/s"])
+
+
+def _section_parameters(story: Story) -> Section:
+    from fluidlift.look.pictures import curve
+
+    meta = story["fit"].meta
+    rows = [
+        [name, e.value, f"± {e.sigma:.2g}", e.unit, "fitted" if e.identifiable else "not identifiable: keeps its prior"]
+        for name, e in estimates_of(story).items()
+    ]
+    loss = story["fit"].arrays["loss_history"]
+    figures = [Figure(curve(loss, title="loss of the fit", x="iteration", y="loss"), "parameter fit")] if len(loss) else []
+    return Section("Physical parameters", figures, rows, ["parameter", "value", "uncertainty", "unit", ""], meta["notes"])
+
+
+def _section_simulation(story: Story) -> Section:
+    from fluidlift.look.pictures import curve
+
+    a = story["simulate"].arrays
+    figures = [
+        Figure(curve(a["volume"] / max(a["volume"][0], 1e-12), title="volume over its start", x="frame", y="ratio"), "volume"),
+        Figure(curve(a["count"], title="particles", x="frame", y="count"), "particles"),
+    ]
+    rows = [["largest share of particles inside the terrain", f"{100 * float(a['leak'].max()):.2f} %"]]
+    return Section("Re-simulation", figures, rows)

@@ -1,0 +1,251 @@
+"""What in a clip speaks for fluid: change against the clip's own noise, and motion that goes somewhere.
+
+Nothing here was learned from data. All thresholds are relative to the noise of the clip, which is read from
+the quietest part of the picture, separately for flat and for sharply drawn places: where an edge is sharp, the
+slightest tremble of the camera or of the codec changes the brightness.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from fluidlift.types.clip import VideoClip
+from fluidlift.types.flow import PixelFlow
+
+QUANTISATION = 0.3
+"""mean absolute change between two 8-bit readings of the same brightness, grey levels: a floor for the noise"""
+QUIET_QUANTILE = 0.2
+"""the part of the picture that is assumed to show no fluid, at each sharpness of edges"""
+
+POOLING = 0.008
+"""radius over which evidence is shared between neighbours, parts of the longer side"""
+LARGEST_TREMBLE = 0.25
+"""px, mean displacement of a still thing between frames of a stabilised clip"""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Maps at working size [h,w], smaller than the clip by `scale`."""
+
+    pictures: np.ndarray
+    """float16 [T,h,w,3], brightness and two colour differences, global flicker removed"""
+    change: np.ndarray
+    """float16 [T,h,w], change around each frame in units of the noise"""
+    activity: np.ndarray
+    """float32 [h,w], log of the mean change in units of the noise, pooled over neighbours"""
+    fine_activity: np.ndarray
+    """float32 [h,w], the same, hardly pooled"""
+    swaying: np.ndarray
+    """float32 [h,w] in [0,1], change that is explained by motion that goes nowhere"""
+    streaming: np.ndarray
+    """float32 [h,w] in [0,1], motion that goes somewhere, where there is change"""
+    level: float
+    """activity that separates still from moving"""
+    noise: np.ndarray
+    """float32 [h,w], mean absolute change that a still thing would show, grey levels"""
+    scale: float
+
+
+def opponent(frames: np.ndarray) -> np.ndarray:
+    """Brightness and two colour differences, float32 [...,3] of u8 [...,3] sRGB; linear, so noise stays noise."""
+    matrix = np.array([[0.299, 0.587, 0.114], [0.5, 0.0, -0.5], [-0.25, 0.5, -0.25]], np.float32)
+    return cv2.transform(frames.astype(np.float32), matrix)
+
+
+def working_scale(height: int, width: int, *, longest: int = 384) -> float:
+    """Factor (at most 1) that brings the longer side to `longest` px."""
+    return min(1.0, longest / max(height, width))
+
+
+def shrink(picture: np.ndarray, scale: float) -> np.ndarray:
+    """The picture at working size (area mean)."""
+    if scale == 1.0:
+        return picture
+    height, width = picture.shape[:2]
+    size = (max(round(width * scale), 8), max(round(height * scale), 8))
+    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+
+
+def small_pictures(frames: np.ndarray, scale: float) -> np.ndarray:
+    """float16 [T,h,w,3]: opponent colours at working size, lightly smoothed, without global flicker.
+
+    A lamp that flickers multiplies every pixel by nearly the same factor: the median ratio to the median picture.
+    """
+    pictures = np.stack(
+        [cv2.GaussianBlur(opponent(shrink(frame, scale)), (0, 0), 0.8).astype(np.float16) for frame in frames]
+    )
+    reference = typical_picture(pictures)[..., 0]
+    lit = reference > 16.0
+    if lit.mean() > 0.1:
+        for picture in pictures:
+            gain = float(np.median(picture[..., 0][lit] / reference[lit]))
+            if abs(gain - 1.0) > 0.004 and 0.25 < gain < 4.0:
+                picture /= np.float16(gain)
+    return pictures
+
+
+def typical_picture(pictures: np.ndarray, *, most: int = 31) -> np.ndarray:
+    """Temporal median, float32 [h,w,3], of at most `most` evenly spaced pictures."""
+    pick = np.unique(np.linspace(0, len(pictures) - 1, min(most, len(pictures))).round().astype(int))
+    return np.median(pictures[pick].astype(np.float32), axis=0)
+
+
+def distance_of_pictures(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """float32 [h,w]: absolute difference, colour counted as brightness is."""
+    return np.abs(first.astype(np.float32) - second.astype(np.float32)).sum(axis=-1)
+
+
+def pool(log_ratio: np.ndarray, sigma: float) -> np.ndarray:
+    """Local mean (Gaussian, `sigma` px) of a log ratio taken of its square root: single sparks count less."""
+    return 2.0 * np.log(cv2.GaussianBlur(np.exp(0.5 * log_ratio), (0, 0), sigma))
+
+
+def sharpness(picture: np.ndarray) -> np.ndarray:
+    """Gradient magnitude of float32 [h,w,3], summed over channels, spread by a pixel (what a tremble would reach)."""
+    steep = np.zeros(picture.shape[:2], np.float32)
+    for channel in range(3):
+        plane = np.ascontiguousarray(picture[..., channel], np.float32)
+        steep += np.hypot(
+            cv2.Sobel(plane, cv2.CV_32F, 1, 0, scale=0.125), cv2.Sobel(plane, cv2.CV_32F, 0, 1, scale=0.125)
+        )
+    return cv2.dilate(steep, np.ones((3, 3), np.uint8))
+
+
+def noise_map(change: np.ndarray, steep: np.ndarray, *, bins: int = 10) -> np.ndarray:
+    """Change that a still thing of this sharpness shows, float32 [h,w], grey levels.
+
+    base + tremble * steep, where tremble is a displacement in px. In each of `bins` classes of sharpness the quiet
+    quantile of the change is read; the base is that of the quietest class. A class that the fluid fills would make
+    the fluid its own noise, so the tremble is the least that any class shows, and below `LARGEST_TREMBLE`.
+    """
+    edges = np.geomspace(0.5, max(float(steep.max()), 1.0), bins)
+    classes = np.digitize(steep, edges)
+    base, trembles = np.inf, [LARGEST_TREMBLE]
+    for number in range(bins + 1):
+        inside = classes == number
+        if inside.mean() < 0.005:
+            continue
+        quiet = float(np.quantile(change[inside], QUIET_QUANTILE))
+        base = min(base, quiet)
+        if number > bins // 3:
+            trembles.append(max(quiet - base, 0.0) / float(np.median(steep[inside])))
+    return (max(base, QUANTISATION) + min(trembles) * steep).astype(np.float32)
+
+
+def lagged_change(pictures: np.ndarray, lag: int) -> np.ndarray:
+    """float32 [h,w]: mean absolute difference of pictures `lag` frames apart."""
+    total = np.zeros(pictures.shape[1:3], np.float32)
+    starts = range(len(pictures) - lag)
+    for start in starts:
+        total += distance_of_pictures(pictures[start], pictures[start + lag])
+    return total / len(starts)
+
+
+def change_over_time(pictures: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """float16 [T,h,w]: mean change over the intervals before and after each frame, in units of the noise.
+
+    Each interval is also measured against its own quiet part (a hand that trembles now and then), and a repeated
+    frame (an interval without any change) takes the change of its neighbours.
+    """
+    frames = len(pictures)
+    between = np.empty((frames - 1, *noise.shape), np.float16)
+    for t in range(frames - 1):
+        ratio = distance_of_pictures(pictures[t], pictures[t + 1]) / noise
+        between[t] = np.minimum(ratio / max(1.0, float(np.quantile(ratio, QUIET_QUANTILE))), 1e4)
+    energy = between.mean(axis=(1, 2), dtype=np.float32)
+    live = np.flatnonzero(energy > 0.1 * np.median(energy))
+    if 0 < len(live) < frames - 1:
+        between = between[live[np.abs(np.arange(frames - 1)[:, None] - live).argmin(axis=1)]]
+    around = np.empty((frames, *noise.shape), np.float16)
+    around[0], around[-1] = between[0], between[-1]
+    around[1:-1] = (between[1:] + between[:-1]) * np.float16(0.5)
+    return around
+
+
+def flow_evidence(
+    pictures: np.ndarray, displacement: np.ndarray, confidence: np.ndarray, scale: float, noise: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Swaying and streaming, both float32 [h,w] in [0,1].
+
+    A leaf moves to and fro: its flow explains the change of brightness well (small residual after warping) but sums
+    to nearly nothing. A stream either goes somewhere (large sum) or changes in ways that no motion explains.
+    """
+    height, width = noise.shape
+    sigma = 0.012 * max(height, width)
+    rows, columns = np.mgrid[0:height, 0:width].astype(np.float32)
+    walked = np.zeros((height, width, 2), np.float32)
+    farthest, path = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32)
+    before, after = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32)
+    for t, step in enumerate(displacement):
+        sure = shrink(confidence[t].astype(np.float32), scale)[..., None]
+        step = shrink(np.nan_to_num(step.astype(np.float32)), scale) * scale
+        first, second = pictures[t].astype(np.float32), pictures[t + 1].astype(np.float32)
+        warped = cv2.remap(
+            second, columns + step[..., 0], rows + step[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
+        before += distance_of_pictures(second, first)
+        after += distance_of_pictures(warped, first)
+        walked += step * np.clip(sure, 0.0, 1.0)
+        path += np.hypot(step[..., 0], step[..., 1])
+        np.maximum(farthest, np.hypot(walked[..., 0], walked[..., 1]), out=farthest)
+    floor = noise * len(displacement)
+    before, after = (cv2.GaussianBlur(np.maximum(x - floor, 0.0), (0, 0), sigma) for x in (before, after))
+    explained = np.clip(1.0 - after / (before + 0.2 * floor), 0.0, 1.0)
+    gone = farthest / (0.04 * max(height, width))
+    direct = farthest / (path + 0.5)
+    swaying = explained * np.exp(-(gone**2)) * (1.0 - direct)
+    streaming = direct * (1.0 - np.exp(-(gone**2))) * (before > floor)
+    return swaying.astype(np.float32), streaming.astype(np.float32)
+
+
+def gather_evidence(clip: VideoClip, flow: PixelFlow) -> Evidence:
+    """All maps of one clip of at least 2 frames."""
+    frames, height, width = clip.frames.shape[:3]
+    scale = working_scale(height, width)
+    pictures = small_pictures(clip.frames, scale)
+    steep = sharpness(typical_picture(pictures))
+    slow_lag = int(np.clip(round(0.2 / clip.interval), 1, max(1, frames // 3)))
+    quick, slow = lagged_change(pictures, 1), lagged_change(pictures, slow_lag)
+    noise, slow_noise = noise_map(quick, steep), noise_map(slow, steep)
+    fine = 0.5 * (np.log(np.maximum(quick, 1e-3) / noise) + np.log(np.maximum(slow, 1e-3) / slow_noise))
+    fine = np.maximum(fine, 0.0).astype(np.float32)
+    pooled = pool(fine, POOLING * max(pictures.shape[1:3]))
+    swaying, streaming = flow_evidence(pictures, flow.displacement, flow.confidence, scale, noise)
+    return Evidence(
+        pictures=pictures,
+        change=change_over_time(pictures, noise),
+        activity=pooled,
+        fine_activity=pool(fine, 1.0),
+        swaying=swaying,
+        streaming=streaming,
+        level=separating_level(pooled),
+        noise=noise,
+        scale=scale,
+    )
+
+
+def fluid_score(evidence: Evidence) -> np.ndarray:
+    """Log odds of fluid for the whole clip, float32 [h,w].
+
+    The divisor is the spread of the log activity of still things about their own mean, seen in clips of still rooms.
+    """
+    height, width = evidence.noise.shape
+    both = 0.5 * (evidence.activity + evidence.fine_activity) - evidence.level
+    score = both / 0.3 + 1.5 * evidence.streaming - 2.5 * evidence.swaying
+    return np.clip(score, -12.0, 12.0).astype(np.float32).reshape(height, width)
+
+
+def separating_level(activity: np.ndarray, *, lowest: float = np.log(1.8), highest: float = np.log(10.0)) -> float:
+    """Otsu's threshold of the activity, held between factors of the noise that cannot be doubted."""
+    top = max(float(activity.max()), 1e-3)
+    counts, edges = np.histogram(np.minimum(activity, np.log(100.0)), bins=128, range=(0.0, min(top, np.log(100.0))))
+    centres = 0.5 * (edges[1:] + edges[:-1])
+    weight = np.cumsum(counts)
+    mass = np.cumsum(counts * centres)
+    rest = weight[-1] - weight
+    with np.errstate(divide="ignore", invalid="ignore"):
+        between = weight * rest * (mass / weight - (mass[-1] - mass) / rest) ** 2
+    return float(np.clip(centres[int(np.nanargmax(between))], lowest, highest))

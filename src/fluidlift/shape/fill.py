@@ -1,0 +1,275 @@
+"""Fills a hollow body with Gaussians by the parity of random rays (paper: filling before the simulation).
+
+Generated Gaussians lie on surfaces. A point is inside if most rays from it cross the hull an odd number of times. The
+hull is found on a grid: voxels where the field of opacities (PhysGaussian, 3.7) exceeds a threshold. A crossing is one
+run of hull voxels along the ray, so that thick and thin walls count once. Holes cost single rays, the majority holds.
+
+Bounded on any input: radii are clamped to a few voxels, outliers do not widen the grid, and the voxels grow until the
+grid fits.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numba as nb
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from fluidlift.errors import require
+from fluidlift.numerics.sampling import sample_nodes
+from fluidlift.types.gaussians import Gaussians
+from fluidlift.types.grid import Grid
+from fluidlift.types.terrain import Terrain
+from fluidlift.types.transforms import matrix_from_quat
+
+CELLS_MAX = 4_000_000
+"""voxels of the hull at most (256 x 125 x 125); a ray then crosses a few hundred"""
+
+THRESHOLD = 0.25
+"""opacity field above which a voxel belongs to the hull"""
+
+RADIUS_MAX = 12
+"""voxels that a Gaussian reaches at most in the field"""
+
+WORK_MAX = 200_000_000
+"""visits of voxels by Gaussians at most; radii shrink until they fit"""
+
+_EMPTY, _HULL, _SOLID = np.uint8(0), np.uint8(1), np.uint8(2)
+
+
+@dataclass(frozen=True)
+class Hull:
+    """Which voxels the Gaussians (1) and the terrain (2) occupy."""
+
+    grid: Grid
+    voxels: UInt8[np.ndarray, "nx ny nz"]
+
+
+@nb.njit(cache=True)
+def _splat_field(low, spacing, means, precisions, opacities, reach, field):
+    """Sum of opacity x exp(-d^T P d / 2) at the voxel centres near every Gaussian."""
+    nx, ny, nz = field.shape
+    for n in range(means.shape[0]):
+        x, y, z = means[n, 0] - low[0], means[n, 1] - low[1], means[n, 2] - low[2]
+        i, j, k = int(math.floor(x / spacing)), int(math.floor(y / spacing)), int(math.floor(z / spacing))
+        r = reach[n]
+        for a in range(max(0, i - r), min(nx, i + r + 1)):
+            dx = (a + 0.5) * spacing - x
+            for b in range(max(0, j - r), min(ny, j + r + 1)):
+                dy = (b + 0.5) * spacing - y
+                for c in range(max(0, k - r), min(nz, k + r + 1)):
+                    dz = (c + 0.5) * spacing - z
+                    q = dx * (precisions[n, 0] * dx + 2 * (precisions[n, 1] * dy + precisions[n, 2] * dz))
+                    q += dy * (precisions[n, 3] * dy + 2 * precisions[n, 4] * dz) + precisions[n, 5] * dz * dz
+                    if q < 12.0:
+                        field[a, b, c] += opacities[n] * math.exp(-0.5 * q)
+
+
+@nb.njit(cache=True, parallel=True)
+def _odd_rays(voxels, starts, directions, rays, odd):
+    """How many of the rays from each start (voxel units) cross the hull an odd number of times.
+
+    A ray is mirrored where it meets the face of a terrain voxel: a surface over a bed is closed by its mirror image.
+    """
+    shape = voxels.shape
+    limit = 2 * (shape[0] + shape[1] + shape[2])
+    for n0 in nb.prange(starts.shape[0]):
+        n = np.int64(n0)
+        count = 0
+        for r in range(rays):
+            m = (n * rays + r) % directions.shape[0]
+            d0, d1, d2 = directions[m, 0], directions[m, 1], directions[m, 2]
+            x, y, z = starts[n, 0], starts[n, 1], starts[n, 2]
+            i, j, k = int(math.floor(x)), int(math.floor(y)), int(math.floor(z))
+            runs, before = 0, False
+            for _ in range(limit):
+                tx = ((i + 1 if d0 > 0 else i) - x) / d0
+                ty = ((j + 1 if d1 > 0 else j) - y) / d1
+                tz = ((k + 1 if d2 > 0 else k) - z) / d2
+                t = min(tx, ty, tz)
+                x, y, z = x + t * d0, y + t * d1, z + t * d2
+                a, b, c = i, j, k
+                if t == tx:
+                    a += 1 if d0 > 0 else -1
+                elif t == ty:
+                    b += 1 if d1 > 0 else -1
+                else:
+                    c += 1 if d2 > 0 else -1
+                if a < 0 or a >= shape[0] or b < 0 or b >= shape[1] or c < 0 or c >= shape[2]:
+                    break
+                if voxels[a, b, c] == _SOLID:
+                    d0, d1, d2 = (-d0 if a != i else d0), (-d1 if b != j else d1), (-d2 if c != k else d2)
+                    continue
+                i, j, k = a, b, c
+                hull = voxels[i, j, k] == _HULL
+                runs += 1 if hull and not before else 0
+                before = hull
+            count += runs % 2
+        odd[n] = count
+
+
+def hull(gaussians: Gaussians, *, spacing: float, closed_below: Terrain | None = None) -> Hull:
+    """Voxelise a body.
+
+    A Gaussian counts as at least half a voxel wide, so that fine ones leave no gaps, and gaps of one voxel are closed.
+
+    Args:
+        gaussians: any Gaussians; those with non-finite numbers or hardly any opacity are left out.
+        spacing: m; larger voxels are used where the grid would exceed `CELLS_MAX`.
+        closed_below: terrain under the body.
+    """
+    require(math.isfinite(spacing) and spacing > 0, f"spacing {spacing}", "positive metres")
+    g = gaussians
+    sound = np.isfinite(g.means).all(1) & np.isfinite(g.scales).all(1) & np.isfinite(g.quats).all(1)
+    g = g.select(sound & (g.opacities > 0.02) & (np.abs(g.means) < 1e6).all(1))
+    if len(g) == 0:
+        return Hull(Grid((1, 1, 1), spacing), np.zeros((1, 1, 1), np.uint8))
+    grid = _hull_grid(g.means, spacing, closed_below)
+    scales = np.clip(g.scales, 0.5 * grid.spacing, RADIUS_MAX / 3.46 * grid.spacing)
+    reach = np.ceil(3.46 * scales.max(1) / grid.spacing).astype(np.int64)
+    while ((2 * reach + 1.0) ** 3).sum() > WORK_MAX and reach.max() > 2:
+        reach = np.minimum(reach, reach.max() - 1)
+    scales = np.minimum(scales, np.maximum(reach / 3.46, 0.5)[:, None] * grid.spacing)
+    axes = matrix_from_quat(g.quats) / scales[:, None, :]
+    p = axes @ np.swapaxes(axes, 1, 2)
+    precisions = np.stack([p[:, 0, 0], p[:, 0, 1], p[:, 0, 2], p[:, 1, 1], p[:, 1, 2], p[:, 2, 2]], 1).astype(
+        np.float32
+    )
+    field = np.zeros(grid.shape, np.float32)
+    _splat_field(grid.low, grid.spacing, g.means, precisions, np.clip(g.opacities, 0, 1), reach, field)
+    solid = np.pad(field > THRESHOLD, 2)
+    solid = ndimage.binary_closing(solid, ndimage.generate_binary_structure(3, 2))[2:-2, 2:-2, 2:-2]
+    voxels = solid.astype(np.uint8) * _HULL
+    if closed_below is not None:
+        centers = grid.centers().reshape(-1, 3)
+        distance = sample_nodes(closed_below.signed_distance, closed_below.grid, centers)
+        voxels[(distance < 0).reshape(grid.shape)] = _SOLID
+    return Hull(grid, voxels)
+
+
+def _hull_grid(means: np.ndarray, spacing: float, terrain: Terrain | None) -> Grid:
+    """A box around all but stray Gaussians, and down into the terrain, with at most `CELLS_MAX` voxels."""
+    inner_low, inner_high = np.quantile(means, [0.002, 0.998], axis=0).astype(float)
+    slack = 0.25 * (inner_high - inner_low) + spacing
+    low = np.maximum(means.min(0), inner_low - slack) - 2 * spacing
+    high = np.minimum(means.max(0), inner_high + slack) + 2 * spacing
+    if terrain is not None:
+        low[2] = min(low[2], terrain.grid.low[2])
+    shape = np.maximum(np.ceil((high - low) / spacing), 1)
+    while shape.prod() > CELLS_MAX:
+        spacing *= max(1.02, (shape.prod() / CELLS_MAX) ** (1 / 3))
+        shape = np.maximum(np.ceil((high - low) / spacing), 1)
+    return Grid(tuple(int(n) for n in shape), spacing, tuple(low))
+
+
+def inside(
+    points: Float[np.ndarray, "n 3"],
+    gaussians: Gaussians | Hull,
+    *,
+    spacing: float | None = None,
+    rays: int = 12,
+    rng: np.random.Generator,
+    closed_below: Terrain | None = None,
+) -> Bool[np.ndarray, "n"]:
+    """Whether points lie inside: in the hull, or most of the rays from them cross the hull an odd number of times.
+
+    Args:
+        points: m.
+        gaussians: the body, or its hull where it is at hand.
+        spacing: voxel of the hull, m; needed with Gaussians.
+        rays: random rays per point.
+        rng: of their directions.
+        closed_below: terrain that closes the body from below.
+    """
+    require(rays >= 1, f"{rays} rays", "1 or more")
+    if isinstance(gaussians, Gaussians):
+        require(spacing is not None, "no spacing", "the voxel of the hull in m")
+        gaussians = hull(gaussians, spacing=spacing, closed_below=closed_below)
+    grid, voxels = gaussians.grid, gaussians.voxels
+    points = np.asarray(points, np.float64)
+    out = np.zeros(len(points), bool)
+    known = np.flatnonzero(np.isfinite(points).all(1) & grid.contains(points))
+    local = (points[known] - grid.low) / grid.spacing
+    cell = np.minimum(local.astype(np.int64), np.asarray(grid.shape) - 1)
+    here = voxels[tuple(cell.T)]
+    out[known] = here == _HULL
+    free = here == _EMPTY
+    directions = rng.normal(size=(8191, 3))  # a prime number, so that neighbours do not share their rays
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    directions = np.where(np.abs(directions) < 1e-6, 1e-6, directions)
+    odd = np.zeros(int(free.sum()), np.int64)
+    _odd_rays(voxels, np.ascontiguousarray(local[free]), directions, rays, odd)
+    out[known[free]] = 2 * odd > rays
+    return out
+
+
+def fill(
+    gaussians: Gaussians,
+    *,
+    spacing: float,
+    rays: int = 12,
+    rng: np.random.Generator,
+    max_added: int = 500_000,
+    closed_below: Terrain | None = None,
+) -> Gaussians:
+    """The Gaussians that are missing inside a hollow body: one at the centre of every empty voxel inside.
+
+    Args:
+        gaussians: the body, m.
+        spacing: of the voxels, m (larger where the grid would exceed `CELLS_MAX`).
+        rays: per voxel.
+        rng: of the rays.
+        max_added: a random choice of this many is made if there are more, wider in return.
+        closed_below: terrain that closes the body from below.
+
+    Returns:
+        Only those added: round, half a voxel wide, colour and opacity of the nearest Gaussian of the body.
+    """
+    shell = hull(gaussians, spacing=spacing, closed_below=closed_below)
+    grid, voxels = shell.grid, shell.voxels
+    held = np.zeros(grid.shape, bool)
+    cells = grid.cell_of(gaussians.means[np.isfinite(gaussians.means).all(1) & (np.abs(gaussians.means) < 1e6).all(1)])
+    cells = cells[((cells >= 0) & (cells < grid.shape)).all(1)]
+    held[tuple(cells.T)] = True
+
+    wanted = np.zeros(grid.shape, bool)
+    free = np.argwhere(voxels == _EMPTY)
+    free = free[_boxed(voxels == _HULL, free, closed_below is not None)]
+    centers = grid.low + (free + 0.5) * grid.spacing
+    found = inside(centers, shell, rays=rays, rng=rng)
+    wanted[tuple(free[found].T)] = True
+    body = wanted | (voxels == _HULL)
+    # a voxel found inside by chance stands alone; a hull voxel without a centre is inner if it is surrounded
+    wanted &= ndimage.uniform_filter(body.astype(np.float32), 3, mode="constant") > 0.4
+    closed = body | (voxels == _SOLID)
+    wanted |= (voxels == _HULL) & ndimage.binary_erosion(closed, ndimage.generate_binary_structure(3, 1))
+    chosen = np.argwhere(wanted & ~held)
+    width = 0.5 * grid.spacing
+    if len(chosen) > max_added:
+        width *= (len(chosen) / max(max_added, 1)) ** (1 / 3)
+        chosen = chosen[np.sort(rng.choice(len(chosen), max_added, replace=False))]
+    if len(chosen) == 0:
+        return Gaussians.empty(gaussians.sh.shape[1])
+    means = (grid.low + (chosen + 0.5) * grid.spacing).astype(np.float32)
+    usable = gaussians.select(np.isfinite(gaussians.means).all(1) & np.isfinite(gaussians.sh).all((1, 2)))
+    nearest = cKDTree(usable.means).query(means)[1]
+    quats = np.tile(np.float32([1, 0, 0, 0]), (len(means), 1))
+    opacities = np.nan_to_num(usable.opacities[nearest])
+    return Gaussians(means, quats, np.full((len(means), 3), width), opacities, usable.sh[nearest])
+
+
+def _boxed(shell: np.ndarray, cells: np.ndarray, open_below: bool) -> Bool[np.ndarray, "n"]:
+    """Cells with hull on both sides along some axis, or above them over a bed: the only ones worth any rays."""
+    sides = np.zeros(len(cells), np.int64)
+    above = np.zeros(len(cells), bool)
+    for axis in range(3):
+        forth = np.maximum.accumulate(shell, axis=axis)
+        back = np.flip(np.maximum.accumulate(np.flip(shell, axis), axis=axis), axis)
+        sides += (forth & back)[tuple(cells.T)]
+        if axis == 2:
+            above = back[tuple(cells.T)]
+    return (sides >= 1) | (above & open_below)

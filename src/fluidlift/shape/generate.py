@@ -1,0 +1,177 @@
+"""The embedded generator: from a picture, a mask and a model of the front surface to Gaussians, without any weights."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from scipy import ndimage
+
+from fluidlift.errors import require
+from fluidlift.shape.terrain import Setting
+from fluidlift.types import CellType, Gaussians, PinholeCamera, concatenate, decompose_covariances, sh_from_rgb
+
+_WET = (CellType.FLUID, CellType.INFLOW)
+
+
+@dataclass(frozen=True)
+class BackgroundPlate:
+    """The scene without its fluid."""
+
+    image: UInt8[np.ndarray, "h w 3"]
+    """sRGB, inpainted where no frame shows the background"""
+    seen: Bool[np.ndarray, "h w"]
+    """True where some frame shows the background"""
+
+
+def background_plate(frames: UInt8[np.ndarray, "t h w 3"], fluid: Bool[np.ndarray, "t h w"]) -> BackgroundPlate:
+    """Median of the frames where they show no fluid; the rest inpainted from around it."""
+    import cv2
+
+    pick = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), 25)).astype(int))
+    wet = np.stack([ndimage.binary_dilation(fluid[t], iterations=2) for t in pick])
+    values = np.ma.masked_array(frames[pick].astype(np.float32), mask=np.repeat(wet[..., None], 3, axis=-1))
+    seen = ~wet.all(axis=0)
+    image = np.ma.median(values, axis=0).filled(0.0)
+    image = np.clip(image, 0, 255).astype(np.uint8)
+    if not seen.any():
+        return BackgroundPlate(np.median(frames[pick], axis=0).astype(np.uint8), seen)
+    if not seen.all():
+        # inpainting at a quarter of the size: wide holes get smooth ground instead of streaks
+        h, w = seen.shape
+        small = (max(w // 4, 8), max(h // 4, 8))
+        hole = cv2.resize((~seen).astype(np.uint8), small, interpolation=cv2.INTER_AREA)
+        hole = (cv2.resize((~seen).astype(np.float32), small, interpolation=cv2.INTER_AREA) > 0.01).astype(np.uint8)
+        filled = cv2.inpaint(cv2.resize(image, small, interpolation=cv2.INTER_AREA), hole, 5, cv2.INPAINT_TELEA)
+        rough = cv2.resize(filled, (w, h), interpolation=cv2.INTER_CUBIC)
+        blend = np.clip(ndimage.gaussian_filter((~seen).astype(np.float32), 1.5) * 2.0, 0, 1)
+        blend[~seen] = 1.0
+        image = (image * (1 - blend[..., None]) + rough * blend[..., None]).astype(np.uint8)
+    return BackgroundPlate(image, seen)
+
+
+def front_gaussians(
+    frame: UInt8[np.ndarray, "h w 3"],
+    mask: Bool[np.ndarray, "h w"],
+    depth: Float[np.ndarray, "h w"],
+    camera: PinholeCamera,
+    *,
+    stride: int = 1,
+    opacity: float = 0.95,
+) -> Gaussians:
+    """One flat Gaussian per pixel block on the visible surface, as large as the block is there.
+
+    Args:
+        frame: the picture that gives the colours.
+        mask: fluid.
+        depth: camera z, m (positive on the mask).
+        camera: in the world.
+        stride: width of a block, px.
+        opacity: of each Gaussian.
+    """
+    require(depth.shape == mask.shape, f"depth {depth.shape} for a mask {mask.shape}")
+    ok = mask & (depth > 0)
+    if not ok.any():
+        return Gaussians.empty()
+    index = ndimage.distance_transform_edt(~ok, return_distances=False, return_indices=True)
+    whole = depth[tuple(index)]  # derivatives at the rim use values from inside
+    points = camera.unproject(camera.pixel_grid(), whole)
+    du, dv = np.gradient(points, axis=1) * stride, np.gradient(points, axis=0) * stride
+    rows, cols = np.mgrid[stride // 2 : mask.shape[0] : stride, stride // 2 : mask.shape[1] : stride]
+    keep = ok[rows, cols]
+    rows, cols = rows[keep], cols[keep]
+    a, b = du[rows, cols], dv[rows, cols]
+    footprint = whole[rows, cols] / camera.focal[0] * stride
+    for edge in (a, b):  # a depth jump between neighbours is not a long Gaussian
+        length = np.linalg.norm(edge, axis=1, keepdims=True)
+        edge *= np.minimum(1.0, 4.0 * footprint[:, None] / np.maximum(length, 1e-12))
+    normal = np.cross(a, b)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    thin = 0.25 * footprint
+    outer = lambda v: v[:, :, None] * v[:, None, :]
+    covariance = 0.3 * (outer(a) + outer(b)) + outer(normal * thin[:, None])
+    quats, scales = decompose_covariances(covariance, floor=(0.02 * float(np.median(footprint))) ** 2)
+    colours = frame[rows, cols].astype(np.float32) / 255.0
+    return Gaussians(points[rows, cols], quats, scales, np.full(len(rows), opacity), sh_from_rgb(colours))
+
+
+def hull_gaussians(
+    frame: UInt8[np.ndarray, "h w 3"],
+    setting: Setting,
+    camera: PinholeCamera,
+    *,
+    shade: float = 0.75,
+    seed: int = 0,
+) -> Gaussians:
+    """Gaussians on the sides of the body that the camera does not see: its bed, its ends, what lies off the picture.
+
+    The cells of the body next to another kind of cell are sampled at half the grid spacing; colours come from the
+    picture along the line of sight (the nearest pixel for what lies outside it), darkened a little below the surface.
+    """
+    grid, cells = setting.terrain.grid, setting.cell_types
+    wet = body_cells(setting)
+    rim = wet & ~ndimage.binary_erosion(wet, border_value=0)
+    base = np.argwhere(rim)
+    if len(base) == 0:
+        return Gaussians.empty()
+    rng = np.random.default_rng(seed)
+    offsets = np.array([[i, j, k] for i in (0.25, 0.75) for j in (0.25, 0.75) for k in (0.25, 0.75)])
+    local = (base[:, None] + offsets[None]).reshape(-1, 3) + rng.uniform(-0.08, 0.08, (len(base) * 8, 3))
+    points = grid.low + local * grid.spacing
+    below = None
+    if setting.surface_height is not None:
+        column = np.repeat(base[:, :2], 8, axis=0)
+        level = setting.surface_height[column[:, 0], column[:, 1]]
+        points, below = points[points[:, 2] < level], (level - points[:, 2])[points[:, 2] < level]
+    colours = picture_colours(frame, points, camera)
+    if below is not None:
+        colours = colours * np.where(below > grid.spacing, shade, 1.0)[:, None]
+    del cells
+    return Gaussians.isotropic(points, 0.42 * grid.spacing, colours, 0.8)
+
+
+def body_cells(setting: Setting) -> Bool[np.ndarray, "nx ny nz"]:
+    """Cells that hold fluid at the first instant, those of the inlet and the outlet among them."""
+    cells = setting.cell_types
+    wet = np.isin(cells, [int(c) for c in _WET])
+    if setting.surface_height is not None:
+        z = setting.terrain.grid.centers()[..., 2]
+        below = z < setting.surface_height[..., None]
+        touching = ndimage.binary_dilation(wet, iterations=6) if wet.any() else wet
+        wet = wet | ((cells == CellType.OUTFLOW) & below & touching)
+    return wet
+
+
+def picture_colours(
+    frame: UInt8[np.ndarray, "h w 3"], points: Float[np.ndarray, "n 3"], camera: PinholeCamera
+) -> Float[np.ndarray, "n 3"]:
+    """sRGB in [0, 1] where each point appears in a picture; the nearest pixel for points outside it."""
+    uv, z = camera.project(points)
+    height, width = frame.shape[:2]
+    uv = np.where(z[:, None] > 0, np.nan_to_num(uv, nan=0.0, posinf=1e9, neginf=-1e9), 0.0)
+    col = np.clip(uv[:, 0], 0, width - 1).astype(int)
+    row = np.clip(uv[:, 1], 0, height - 1).astype(int)
+    return frame[row, col].astype(np.float32) / 255.0
+
+
+def fluid_colour_frame(
+    frame: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]
+) -> UInt8[np.ndarray, "h w 3"]:
+    """The picture with fluid colours carried to every pixel, so that look-ups beside the mask find fluid."""
+    if not mask.any():
+        return frame
+    core = ndimage.binary_erosion(mask, iterations=2)
+    source = core if core.any() else mask
+    index = ndimage.distance_transform_edt(~source, return_distances=False, return_indices=True)
+    return np.where(mask[..., None], frame, frame[tuple(index)])
+
+
+def united_mask(fluid: Bool[np.ndarray, "t h w"]) -> Bool[np.ndarray, "h w"]:
+    """Pixels that are fluid in at least a third of the frames (one frame for pairs)."""
+    return fluid.mean(axis=0) >= 0.34
+
+
+def body_from(front: Gaussians, hull: Gaussians) -> Gaussians:
+    """The shell of the body: what is seen, then what closes it."""
+    return concatenate([front, hull])

@@ -1,0 +1,236 @@
+"""What kind of fluid a clip shows, and where up is: decided from evidence that the report can show."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from scipy import ndimage
+
+from fluidlift.errors import require
+from fluidlift.types import PinholeCamera, RigidTransform
+
+Kind = Literal["stream", "fall", "pour", "plume"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
+
+PITCH_PRIOR: dict[str, tuple[float, float]] = {
+    "stream": (35.0, 15.0),
+    "fall": (8.0, 8.0),
+    "pour": (8.0, 8.0),
+    "plume": (2.0, 6.0),
+}
+"""mean and standard deviation of how far people tilt a camera down at such a fluid, degrees (a choice, not a law)"""
+
+
+@dataclass(frozen=True)
+class KindEvidence:
+    """Why a kind was chosen."""
+
+    kind: Kind
+    scores: dict[str, float]
+    """share of belief per kind, sums to 1"""
+    features: dict[str, float]
+    """the measured figures behind the scores"""
+
+
+@dataclass(frozen=True)
+class UpEvidence:
+    """Which way is up, as seen by the camera."""
+
+    pitch: float
+    """degrees that the camera looks below the horizon"""
+    roll: float
+    """degrees that the picture is turned clockwise"""
+    source: str
+    """user, camera file, or what it was estimated from"""
+    confidence: float
+    """0 (prior alone) to 1 (given)"""
+
+
+def estimate_kind(
+    frames: UInt8[np.ndarray, "t h w 3"],
+    fluid: Bool[np.ndarray, "t h w"],
+    displacement: Float[np.ndarray, "h w 2"],
+    confidence: Float[np.ndarray, "h w"],
+    *,
+    pitch: float | None = None,
+) -> KindEvidence:
+    """Weigh direction of motion, shape of the mask and colour against what each kind looks like.
+
+    Args:
+        frames: sRGB pictures (a few, spread over the clip, are enough).
+        fluid: mask of each of these frames.
+        displacement: mean optical flow, px per frame.
+        confidence: of the flow, 0 to 1.
+        pitch: known tilt of the camera, degrees below the horizon, or None.
+    """
+    require(fluid.shape == frames.shape[:3], f"masks {fluid.shape} for frames {frames.shape}")
+    f = _features(frames, fluid, displacement, confidence)
+    belief = {
+        # smoke rises, is grey and spreads; nothing else rises over most of its area
+        "plume": 3.0 * f["rising"] + 1.2 * f["grey"] * (0.3 + f["rising"]) - 2.0 * f["falling"] - 1.0 * f["sideways"],
+        # a jet falls and is slender
+        "pour": 1.6 * f["falling"] + 2.4 * f["slender"] - 1.2 * f["wide"] - 1.5 * f["rising"] - 0.8 * f["sideways"],
+        # a curtain falls, is not slender
+        "fall": 2.8 * f["falling"] - 1.6 * f["slender"] - 1.2 * f["rising"] - 1.4 * f["sideways"] - f["foreground"],
+        # a stream runs across the picture, or towards the viewer and then fills the foreground
+        "stream": 0.6
+        + 1.8 * f["sideways"]
+        + 0.8 * f["wide"]
+        + 2.0 * f["foreground"] * (1 - f["slender"])
+        - 1.8 * f["falling"]
+        - 1.5 * f["rising"],
+    }
+    if pitch is not None:  # steep views of bodies in the air are rare
+        belief["stream"] += 1.5 * np.clip((pitch - 20.0) / 20.0, -1.0, 1.0)
+    values = np.array([belief[k] for k in KINDS]) * 2.0
+    share = np.exp(values - values.max())
+    share /= share.sum()
+    best = KINDS[int(np.argmax(share))]
+    return KindEvidence(best, {k: float(s) for k, s in zip(KINDS, share)}, f)
+
+
+def _features(frames, fluid, displacement, confidence) -> dict[str, float]:
+    height, width = fluid.shape[1:]
+    union = fluid.mean(axis=0) > 0.25
+    if not union.any():
+        union = fluid.any(axis=0)
+    speed = np.linalg.norm(displacement, axis=-1)
+    weight = np.where(union, confidence * speed, 0.0)
+    total = max(float(weight.sum()), 1e-9)
+    angle = np.degrees(np.arctan2(displacement[..., 1], displacement[..., 0]))  # +90 is down in the picture
+    within = lambda centre, span: float(weight[np.abs((angle - centre + 180) % 360 - 180) < span].sum() / total)
+    falling, rising = within(90, 40), within(-90, 50)
+    # the shape of what moves: still water around a jet says nothing about the jet
+    moving = union & (weight > 0.25 * np.percentile(weight[union], 95))
+    moving = ndimage.binary_opening(moving) if ndimage.binary_opening(moving).any() else union
+    rows, cols = np.where(moving)
+    box_h = np.ptp(np.percentile(rows, [2, 98])) + 1
+    box_w = np.ptp(np.percentile(cols, [2, 98])) + 1
+    typical_width = float(np.median(moving.sum(axis=1)[moving.any(axis=1)]))
+    lowest = slice(int(0.93 * height), None)
+    colours = frames[fluid].astype(np.float32) / 255.0
+    if len(colours) > 20000:
+        colours = colours[:: len(colours) // 20000]
+    chroma = float((colours.max(1) - colours.min(1)).mean()) if len(colours) else 0.0
+    return {
+        "falling": falling,
+        "rising": rising,
+        "sideways": max(0.0, 1.0 - falling - rising),
+        "slender": float(np.clip((box_h / max(typical_width, 1.0) - 2.0) / 3.0, 0.0, 1.0)),
+        "wide": float(np.clip((box_w / box_h - 0.8) / 1.2, 0.0, 1.0)),
+        "foreground": float(moving[lowest].any(axis=0).mean()),
+        "grey": float(np.clip(1.0 - chroma / 0.15, 0.0, 1.0)),
+        "speed_px": float(total / max(float((confidence * union).sum()), 1e-9)),
+        "area_share": float(union.sum() / (height * width)),
+    }
+
+
+def estimate_up(
+    kind: Kind,
+    mask: Bool[np.ndarray, "h w"],
+    displacement: Float[np.ndarray, "h w 2"],
+    confidence: Float[np.ndarray, "h w"],
+    camera: PinholeCamera,
+    *,
+    pitch: float | None = None,
+    roll: float | None = None,
+) -> UpEvidence:
+    """The camera's tilt from the fluid.
+
+    A stream is taken as a level plane in uniform motion: its image velocity changes over the picture as perspective
+    says, and the tilt with the least misfit wins, weighed against how people hold cameras. What falls or rises does
+    so along the vertical, which gives the roll; its pitch keeps the prior.
+
+    Args:
+        kind: of the fluid.
+        mask: fluid pixels.
+        displacement: mean optical flow, px per frame.
+        confidence: of the flow.
+        camera: for the focal length; its pose is not used.
+        pitch: degrees below the horizon, when the user gave it.
+        roll: degrees clockwise, when the user gave it.
+    """
+    mean, sigma = PITCH_PRIOR[kind]
+    found_pitch, found_roll, source, trust = mean, 0.0, f"usual view of a {kind}", 0.0
+    if kind == "stream":
+        found_pitch, trust = _pitch_of_plane(mask, displacement, confidence, camera, mean, sigma)
+        source = "perspective of the flow on a level surface"
+    else:
+        weight = np.where(mask, confidence * np.linalg.norm(displacement, axis=-1), 0.0)
+        down = (weight[..., None] * displacement).sum((0, 1)) * (-1.0 if kind == "plume" else 1.0)
+        if down[1] > 0 and weight.sum() > 0:
+            lean = float(np.degrees(np.arctan2(-down[0], down[1])))
+            if abs(lean) < 10.0:  # a larger lean is a thrown jet or wind, not a turned camera
+                found_roll, trust = 0.5 * lean, 0.3
+                source = "direction of the rise" if kind == "plume" else "direction of the fall"
+    if pitch is not None or roll is not None:
+        source = "user" if pitch is not None and roll is not None else f"user and {source}"
+        trust = 1.0 if pitch is not None else trust
+    return UpEvidence(
+        float(found_pitch if pitch is None else pitch), float(found_roll if roll is None else roll), source, trust
+    )
+
+
+def _pitch_of_plane(mask, displacement, confidence, camera, mean, sigma) -> tuple[float, float]:
+    """Best pitch (degrees) of a level plane in uniform motion, and how much the flow had to say (0 to 1).
+
+    For a plane with unit normal n in camera axes, inverse depth is n.r / h along the ray r = (x, y, 1), so a plane
+    velocity (a, b) in units of h per frame moves the picture by f n.r ((t1 - x t1z) a + (t2 - ...) b): linear in a, b.
+    """
+    inner = ndimage.binary_erosion(mask, iterations=2) if mask.sum() > 2000 else mask
+    weight = np.where(inner, confidence, 0.0)
+    rows, cols = np.where(weight > 0.3)
+    if len(rows) < 200:
+        return mean, 0.0
+    pick = np.linspace(0, len(rows) - 1, min(len(rows), 4000)).astype(int)
+    rows, cols = rows[pick], cols[pick]
+    flow, w = displacement[rows, cols], weight[rows, cols]
+    x = (cols + 0.5 - camera.center[0]) / camera.focal[0]
+    y = (rows + 0.5 - camera.center[1]) / camera.focal[1]
+    all_rows = np.where(mask.any(axis=1))[0]
+    y_top = (all_rows.min() + 0.5 - camera.center[1]) / camera.focal[1]
+    y_bottom = (all_rows.max() + 0.5 - camera.center[1]) / camera.focal[1]
+    pitches, cost = np.arange(8.0, 81.0, 2.0), []
+    energy = float((w * (flow**2).sum(1)).sum()) + 1e-12
+    for degrees in pitches:
+        s, c = np.sin(np.radians(degrees)), np.cos(np.radians(degrees))
+        near, far = s + y_bottom * c, s + y_top * c
+        if far < near / 12.0:  # the surface would reach the horizon inside the mask
+            cost.append(np.inf)
+            continue
+        inverse = s + y * c
+        # plane axes in camera coordinates: right (1,0,0), away (0,-s,c)
+        basis = np.stack([np.stack([inverse, 0 * x], 1), np.stack([-x * c * inverse, (-s - y * c) * inverse], 1)], 2)
+        a = (basis * np.sqrt(w)[:, None, None]).reshape(-1, 2) * camera.focal[0]
+        b = (flow * np.sqrt(w)[:, None]).reshape(-1)
+        solution, *_ = np.linalg.lstsq(a, b, rcond=None)
+        misfit = float(((a @ solution - b) ** 2).sum()) / energy
+        cost.append(misfit)
+    cost = np.asarray(cost)
+    finite = np.isfinite(cost)
+    if not finite.any():
+        return float(pitches[-1]), 0.0
+    # the least misfit says how far the motion is from uniform; flow errors are correlated over the picture, so that
+    # thousands of pixels are some tens of independent looks
+    looks, floor = 40.0, 0.02
+    least = float(cost[finite].min())
+    log_likelihood = 0.5 * looks * (cost - least) / (least + floor)
+    posterior = log_likelihood + 0.5 * ((pitches - mean) / sigma) ** 2
+    best = int(np.argmin(np.where(finite, posterior, np.inf)))
+    spread = float(np.ptp(log_likelihood[finite]))
+    return float(pitches[best]), float(np.clip(spread / 10.0, 0.0, 0.8))
+
+
+def level_camera(camera: PinholeCamera, up: UpEvidence) -> PinholeCamera:
+    """The camera at the origin of a frame whose z axis is up and whose y axis points away from the viewer."""
+    p, r = np.radians(up.pitch), np.radians(up.roll)
+    right = np.array([1.0, 0.0, 0.0])
+    forward = np.array([0.0, np.cos(p), -np.sin(p)])
+    down = np.cross(forward, right)
+    turned_right = np.cos(r) * right + np.sin(r) * down
+    turned_down = np.cross(forward, turned_right)
+    rotation = np.stack([turned_right, turned_down, forward])
+    return PinholeCamera(camera.focal, camera.center, camera.size, RigidTransform(rotation, np.zeros(3)))

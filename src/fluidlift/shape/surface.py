@@ -1,0 +1,223 @@
+"""Where the visible surface of a fluid is: level planes, falling profiles, inflated silhouettes, given depths.
+
+Everything here lives in the canonical frame: origin at the camera, z up, y away from the viewer, lengths in units in
+which the fluid is about 1 away. `place` (shape/place.py) turns that into metres.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from fluidlift.errors import InputRejected, require
+from fluidlift.shape.kind import Kind
+from fluidlift.types import PinholeCamera
+
+FAR = 12.0
+"""no part of a surface is taken to be further away than this many times the nearest part"""
+
+
+class HeightModel(Protocol):
+    """A surface that is a function of the ground position."""
+
+    def height(self, xy: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
+        """z above the ground positions."""
+        ...
+
+
+@dataclass(frozen=True)
+class PlaneHeight:
+    """z = slope . (x, y) + offset."""
+
+    slope: tuple[float, float]
+    offset: float
+
+    def height(self, xy: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
+        """z above the ground positions."""
+        return xy[..., 0] * self.slope[0] + xy[..., 1] * self.slope[1] + self.offset
+
+
+@dataclass(frozen=True)
+class ProfileHeight:
+    """A surface of translation: z depends on the distance from the viewer alone (a fall seen from the front)."""
+
+    away: Float[np.ndarray, "k"]
+    """increasing y"""
+    z: Float[np.ndarray, "k"]
+
+    def height(self, xy: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
+        """z above the ground positions; level beyond the upper end, gently sloping (5 degrees) beyond the foot."""
+        y = xy[..., 1]
+        inside = np.interp(y, self.away, self.z)
+        return np.where(y < self.away[0], self.z[0] - (self.away[0] - y) * np.tan(np.radians(5.0)), inside)
+
+
+@dataclass(frozen=True)
+class SampledHeight:
+    """A surface through given points: inverse-distance mean of the nearest four."""
+
+    points: Float[np.ndarray, "n 3"]
+
+    def height(self, xy: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
+        """z above the ground positions."""
+        flat = np.asarray(xy).reshape(-1, 2)
+        distance, index = cKDTree(self.points[:, :2]).query(flat, k=min(4, len(self.points)))
+        distance, index = distance.reshape(len(flat), -1), index.reshape(len(flat), -1)
+        weight = 1.0 / (distance + 1e-6)
+        z = (weight * self.points[index, 2]).sum(1) / weight.sum(1)
+        return z.reshape(np.shape(xy)[:-1])
+
+
+@dataclass(frozen=True)
+class FrontSurface:
+    """The visible side of a fluid in one picture, canonical units."""
+
+    depth: Float[np.ndarray, "h w"]
+    """camera z at every pixel where the model has one, else 0 (not limited to the mask for height models)"""
+    half_thickness: Float[np.ndarray, "h w"]
+    """half the extent along the view for bodies in the air; 0 for a fluid that lies on something"""
+    height: HeightModel | None
+    """for a fluid that lies on something"""
+
+
+def level_surface(camera: PinholeCamera, mask: Bool[np.ndarray, "h w"]) -> FrontSurface:
+    """A horizontal plane below the camera, at the height that puts the median fluid pixel at depth 1."""
+    down = -camera.rays(camera.pixel_grid())[..., 2]
+    below = down[mask]
+    require(len(below) > 0, "an empty mask")
+    visible = down > max(float(np.percentile(below, 99)) / FAR, 1e-3)
+    if not (visible & mask).any():
+        raise InputRejected(
+            "the camera looks above the horizon at every fluid pixel",
+            "a tilt that sees the surface of a stream from above",
+            "give --pitch with a larger value, or another --kind",
+        )
+    drop = float(np.median(down[mask & visible]))
+    return _from_height(camera, PlaneHeight((0.0, 0.0), -drop), np.where(visible, drop / np.maximum(down, 1e-6), 0.0))
+
+
+def falling_surface(
+    camera: PinholeCamera, mask: Bool[np.ndarray, "h w"], displacement: Float[np.ndarray, "h w 2"],
+    confidence: Float[np.ndarray, "h w"],
+) -> FrontSurface:  # fmt: skip
+    """A sheet that is steep where the picture shows the fluid falling and flat where it runs.
+
+    The inclination per picture row follows from how much of the motion points down; the profile is then integrated
+    along the rays from the row of strongest fall, both ways.
+    """
+    rows = np.where(mask.any(axis=1))[0]
+    require(len(rows) > 1, "a mask of fewer than two rows")
+    weight = np.where(mask, confidence, 0.0)
+    down = np.where(mask, displacement[..., 1], 0.0)
+    speed = np.linalg.norm(displacement, axis=-1)
+    total = weight.sum(1)[rows] + 1e-6
+    fall = (weight * np.maximum(down, 0.0)).sum(1)[rows] / total
+    share = (weight * np.maximum(down, 0.0)).sum(1)[rows] / ((weight * speed).sum(1)[rows] + 1e-6)
+    strength = ndimage.gaussian_filter1d(fall / max(np.percentile(fall, 90), 1e-6) * share, max(2.0, len(rows) / 40))
+    blend = np.clip((strength - 0.2) / 0.35, 0.0, 1.0)
+    incline = np.radians(5.0 + 73.0 * blend * blend * (3 - 2 * blend))
+    # rays of the middle column; the picture of a level camera does not change along a row
+    u = np.full(len(rows), camera.center[0])
+    ray = camera.rays(np.stack([u, rows + 0.5], -1))
+    ry, rz = ray[:, 1], ray[:, 2]
+    depth = np.ones(len(rows))
+    start = int(np.argmax(strength))
+    # above the strongest fall a flatter surface could hardly be seen from below; nowhere is it seen edge-on
+    incline[:start] = np.maximum(incline[:start], np.radians(70.0))
+    incline = np.maximum(incline, np.arctan2(rz, ry) + np.radians(10.0))
+    for step in (1, -1):
+        for i in range(start, len(rows) - 1 if step > 0 else 0, step):
+            j = i + step
+            # (z_j rz_j - z_i rz_i) = tan(incline) (z_j ry_j - z_i ry_i), solved for the next depth
+            t = np.tan(0.5 * (incline[i] + incline[j]))
+            below = rz[j] - t * ry[j]
+            next_depth = depth[i] * (rz[i] - t * ry[i]) / below if abs(below) > 1e-3 else depth[i]
+            depth[j] = np.clip(next_depth, depth[i] * 0.9, depth[i] * 1.1)  # a grazing ray does not run away
+    points = ray * depth[:, None]
+    order = np.argsort(points[:, 1])
+    away, z = points[order, 1], np.maximum.accumulate(points[order, 2])
+    keep = np.concatenate([[True], np.diff(away) > 1e-6])
+    profile = ProfileHeight(away[keep], z[keep])
+    return _from_height(camera, profile, intersect_height(camera, profile, 0.2 * depth.min(), 3.0 * depth.max()))
+
+
+def intersect_height(
+    camera: PinholeCamera, model: HeightModel, near: float, far: float, *, samples: int = 96
+) -> Float[np.ndarray, "h w"]:
+    """Camera depth where each pixel's ray first goes below a height model (0 where it never does)."""
+    rays = camera.rays(camera.pixel_grid())
+    eye = camera.position
+    depth = np.zeros(rays.shape[:2])
+    found = np.zeros(rays.shape[:2], bool)
+    steps = np.geomspace(near, far, samples)
+    previous = steps[0]
+    low, high = np.zeros_like(depth), np.zeros_like(depth)
+    for z in steps[1:]:
+        p = eye + rays * z
+        below = (p[..., 2] < model.height(p[..., :2])) & ~found
+        low[below], high[below] = previous, z
+        found |= below
+        previous = z
+    for _ in range(10):
+        middle = 0.5 * (low + high)
+        p = eye + rays * middle[..., None]
+        below = p[..., 2] < model.height(p[..., :2])
+        high, low = np.where(below, middle, high), np.where(below, low, middle)
+    depth[found] = 0.5 * (low + high)[found]
+    return depth
+
+
+def inflated_surface(camera: PinholeCamera, mask: Bool[np.ndarray, "h w"], kind: Kind) -> FrontSurface:
+    """A rounded body in the air: its middle in a vertical plane facing the viewer, its thickness from the silhouette.
+
+    Where the silhouette is 2R wide the body is taken to be a circle across (pour), a little flatter for smoke.
+    """
+    require(bool(mask.any()), "an empty mask")
+    ray = camera.rays(camera.pixel_grid())
+    middle = 1.0 / np.maximum(ray[..., 1], 0.2)  # plane y = 1: depth z with z * ray_y = 1
+    middle /= np.median(middle[mask])
+    padded = np.pad(mask, 2, mode="edge")  # a body cut by the picture's edge goes on beyond it
+    distance = ndimage.distance_transform_edt(padded)[2:-2, 2:-2]
+    ridge = (distance == ndimage.maximum_filter(distance, size=5)) & mask
+    index = ndimage.distance_transform_edt(~ridge, return_distances=False, return_indices=True)
+    radius = np.maximum(ndimage.gaussian_filter(distance[tuple(index)], 3.0), distance)
+    thickness = np.sqrt(np.maximum(2 * radius * distance - distance**2, 0.0))
+    thickness = ndimage.gaussian_filter(thickness, 1.5) * mask
+    flatness = {"pour": 1.0, "plume": 0.85, "fall": 0.3, "stream": 0.3}[kind]
+    half = flatness * thickness * middle / camera.focal[0]
+    front = np.where(mask, middle - half, 0.0)
+    return FrontSurface(front.astype(np.float32), half.astype(np.float32), None)
+
+
+def given_surface(
+    camera: PinholeCamera, mask: Bool[np.ndarray, "h w"], depth: Float[np.ndarray, "h w"], kind: Kind
+) -> FrontSurface:
+    """The user's depth, scaled to a median of 1 on the fluid.
+
+    Raises:
+        InputRejected: the depth says nothing on most of the fluid.
+    """
+    valid = mask & np.isfinite(depth) & (depth > 0)
+    if valid.sum() < 0.5 * mask.sum():
+        raise InputRejected(
+            f"a depth map that is empty on {100 * (1 - valid.sum() / max(mask.sum(), 1)):.0f} % of the fluid",
+            "positive camera depths on the fluid pixels",
+        )
+    index = ndimage.distance_transform_edt(~valid, return_distances=False, return_indices=True)
+    filled = depth[tuple(index)] / np.median(depth[valid])
+    if kind in ("pour", "plume"):
+        inflated = inflated_surface(camera, mask, kind)
+        return FrontSurface(np.where(mask, filled, 0.0).astype(np.float32), inflated.half_thickness, None)
+    rows, cols = np.where(valid)
+    pick = np.linspace(0, len(rows) - 1, min(len(rows), 20000)).astype(int)
+    points = camera.unproject(np.stack([cols[pick] + 0.5, rows[pick] + 0.5], -1), filled[rows[pick], cols[pick]])
+    return _from_height(camera, SampledHeight(points), filled)
+
+
+def _from_height(camera: PinholeCamera, model: HeightModel, depth: np.ndarray) -> FrontSurface:
+    return FrontSurface(depth.astype(np.float32), np.zeros_like(depth, dtype=np.float32), model)

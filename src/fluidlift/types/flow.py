@@ -1,0 +1,48 @@
+"""Motion seen in pictures and motion in the world."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from fluidlift.errors import require
+
+
+@dataclass(frozen=True)
+class PixelFlow:
+    """Optical flow between neighbouring frames of a clip of T frames."""
+
+    displacement: Float[np.ndarray, "t-1 h w 2"]
+    """px per frame, (+x right, +y down), from frame t to t+1"""
+    confidence: Float[np.ndarray, "t-1 h w"]
+    """0 (flow failed) to 1"""
+
+    def __post_init__(self) -> None:
+        d = self.displacement
+        require(d.ndim == 4 and d.shape[-1] == 2, f"displacement {d.shape}", "[T-1,H,W,2]")
+        require(self.confidence.shape == d.shape[:-1], f"confidence {self.confidence.shape}", str(d.shape[:-1]))
+
+    def __len__(self) -> int:
+        return len(self.displacement)
+
+
+@dataclass(frozen=True)
+class SurfaceMotion:
+    """Velocity of points on the visible surface at one instant."""
+
+    points: Float[np.ndarray, "n 3"]
+    """m"""
+    velocities: Float[np.ndarray, "n 3"]
+    """m/s"""
+    observed: Bool[np.ndarray, "n"]
+    """False where the mainstream filled in"""
+
+    def __post_init__(self) -> None:
+        n = len(self.points)
+        require(
+            self.points.shape == (n, 3) and self.velocities.shape == (n, 3) and self.observed.shape == (n,),
+            f"points {self.points.shape}, velocities {self.velocities.shape}, observed {self.observed.shape}",
+            "[n,3], [n,3], [n]",
+        )

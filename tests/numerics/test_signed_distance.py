@@ -1,0 +1,41 @@
+"""Signed distances and what stays outside."""
+
+import numpy as np
+
+from fluidlift.numerics.sampling import sample_nodes
+from fluidlift.numerics.signed_distance import distance_of_heights, distance_of_mask, push_outside
+from fluidlift.types import Grid
+
+GRID = Grid((16, 14, 12), 0.1, (-0.3, 0.2, 0.0))
+
+
+def test_a_half_space_has_an_exact_distance():
+    solid = np.zeros((9, 9, 9), bool)
+    solid[:, :, :4] = True
+    distance = distance_of_mask(solid, 0.5)
+    np.testing.assert_allclose(distance[2, 3], 0.5 * (np.arange(9) - 3.5), atol=1e-6)
+
+
+def test_masks_without_a_surface_are_far_from_it():
+    assert (distance_of_mask(np.zeros((3, 3, 3), bool), 1.0) > 5).all()
+    assert (distance_of_mask(np.ones((3, 3, 3), bool), 1.0) < -5).all()
+
+
+def test_a_tilted_bed_has_its_true_distance():
+    x = GRID.nodes()[:, :, 0, 0]
+    distance = distance_of_heights(0.4 + 0.5 * x, GRID)
+    nodes = GRID.nodes()
+    truth = (nodes[..., 2] - 0.4 - 0.5 * nodes[..., 0]) / np.sqrt(1.25)
+    np.testing.assert_allclose(distance, truth, atol=1e-6)
+
+
+def test_points_in_a_sphere_are_pushed_out_and_others_stay():
+    center = np.array([0.5, 0.9, 0.6])
+    field = np.linalg.norm(GRID.nodes() - center, axis=-1) - 0.35
+    points = np.random.default_rng(0).uniform(GRID.low, GRID.high, (500, 3)).astype(np.float32)
+    before = sample_nodes(field, GRID, points)
+    moved, inside = push_outside(points, field, GRID, margin=0.01)
+    assert not inside.any()
+    # float32 positions of order 1 m
+    assert sample_nodes(field, GRID, moved).min() > 0.01 - 1e-5
+    np.testing.assert_array_equal(moved[before > 0.01], points[before > 0.01])

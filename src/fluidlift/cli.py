@@ -252,7 +252,13 @@ def _evaluate(c: Evaluate) -> int:
     from fluidlift.evaluate import evaluate_asset
 
     found = evaluate_asset(c.asset, c.truth)
-    print(found.to_json() if c.json else found.table())
+    if c.json:
+        print(found.to_json())
+        return DONE
+    rows = found.table()
+    width = max(len(row[0]) for row in rows)
+    for name, value, unit, note in rows:
+        print(f"{name:{width}}  {value:>10} {unit:9} {note}".rstrip())
     return DONE
 
 

@@ -152,8 +152,11 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
 
 
 def build_config(
-    preset: str = "draft", file: Path | None = None, overrides: typing.Sequence[str] = (), flat: dict[str, Any] | None = None
-) -> JobConfig:  # fmt: skip
+    preset: str = "draft",
+    file: Path | None = None,
+    overrides: typing.Sequence[str] = (),
+    flat: dict[str, Any] | None = None,
+) -> JobConfig:
     """Preset, then file, then flat options, then `section.name=value` overrides; later ones win.
 
     Args:

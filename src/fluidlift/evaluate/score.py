@@ -23,22 +23,25 @@ from fluidlift.evaluate.space import align, score_depth, score_divergence, score
 from fluidlift.types import FluidAsset
 
 
+def _seconds(entry: Any) -> float | None:
+    """Of one stage: a number, or an object with `seconds`."""
+    value = entry.get("seconds") if isinstance(entry, Mapping) else entry
+    return float(value) if isinstance(value, int | float) else None
+
+
 def score_cost(manifest: Mapping[str, Any]) -> list[Figure]:
-    """Seconds per stage and peak memory, as the manifest has them (`timings` in s, `peak_memory_bytes`)."""
+    """Seconds per stage (`timings`) and peak memory (`peak_memory_bytes`, of the manifest or of its `metrics`)."""
     timings = manifest.get("timings")
-    out = []
-    if isinstance(timings, Mapping) and timings:
-        seconds = {str(k): float(v) for k, v in timings.items() if isinstance(v, int | float)}
-        out += [figure(f"cost.seconds.{k}", v, "s") for k, v in seconds.items() if k != "total"]
-        out.append(figure("cost.seconds", seconds.get("total", sum(seconds.values())), "s", "all stages"))
-    else:
-        out.append(figure("cost.seconds", None, "s", "the manifest has no timings"))
-    peak = manifest.get("peak_memory_bytes")
-    known = isinstance(peak, int | float)
-    out.append(
-        figure("cost.peak_memory", peak / 2**20 if known else None, "MiB", "" if known else "not in the manifest")
-    )
-    return out
+    stages = {str(k): _seconds(v) for k, v in timings.items()} if isinstance(timings, Mapping) else {}
+    known = {k: v for k, v in stages.items() if v is not None}
+    out = [figure(f"cost.seconds.{k}", v, "s") for k, v in known.items() if k != "total"]
+    total = known.get("total", sum(known.values())) if known else None
+    out.append(figure("cost.seconds", total, "s", "all stages" if known else "the manifest has no timings"))
+    metrics = manifest.get("metrics")
+    peak = manifest.get("peak_memory_bytes", metrics.get("peak_memory_bytes") if isinstance(metrics, Mapping) else None)
+    if isinstance(peak, int | float):
+        return [*out, figure("cost.peak_memory", peak / 2**20, "MiB")]
+    return [*out, figure("cost.peak_memory", None, "MiB", "not in the manifest")]
 
 
 def evaluate_arrays(

@@ -14,7 +14,8 @@ from fluidlift.fit.identifiability import Curvature, effective_observations, noi
 from fluidlift.fit.problem import FitProblem
 from fluidlift.fit.ranges import ParameterSpace
 
-Progress = Callable[[float, str], None]
+Progress = Callable[[int, int], None]
+"""called with (done, total)"""
 DIFFERENCE = 0.02
 """raw step of the forward differences: a few per cent, far above the 1e-5 that pressure solves leave"""
 RESCALED_ITERATIONS = 4
@@ -37,12 +38,12 @@ class Budget:
         """Nothing is left."""
         return time.monotonic() >= self.deadline or self.rollouts >= self.max_rollouts
 
-    def tell(self, words: str) -> None:
+    def tell(self) -> None:
         """Report the share of the budget that is used."""
         if self.progress is not None:
             whole = max(self.deadline - self.started, 1e-9)
             used = max((time.monotonic() - self.started) / whole, self.rollouts / self.max_rollouts)
-            self.progress(min(used, 1.0), words)
+            self.progress(round(100 * min(used, 1.0)), 100)
 
 
 @dataclass(frozen=True)
@@ -180,7 +181,7 @@ def levenberg_marquardt(
             break
         here = better
         history.append(here.loss)
-        budget.tell(f"iteration {iteration + 1}, loss {here.loss:.4g}")
+        budget.tell()
         if converged:
             break
     if curvature is not None:
@@ -237,7 +238,7 @@ def adam(
         if not np.isfinite(value):
             break
         optimizer.step()
-        budget.tell(f"iteration {iteration + 1}, loss {data:.4g}")
+        budget.tell()
         if len(values) > 30 and min(values[-15:]) > min(values[:-15]) * (1 - 1e-3):
             converged = True
             break

@@ -102,7 +102,7 @@ def fit_parameters(
         weights: of the loss.
         options: of the rollout.
         device: "cpu".
-        progress: called with the used share of the budget and words.
+        progress: called with (done, total): per cent of the budget used.
 
     Returns:
         parameters, one `Estimate` per number (`gravity_z`, `restitution`, ...), the loss history, and what happened.

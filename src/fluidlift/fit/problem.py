@@ -226,8 +226,7 @@ def boundary_prior(scene: FitScene, initial: FluidParameters) -> FluidParameters
         if not any(initial.inflow_velocity):
             changes["inflow_velocity"] = tuple(bulk)
         if initial.inflow_fluctuation == 0:
-            rest = np.concatenate([(p - b).ravel() for p, b in zip(parts, bulk)])
-            changes["inflow_fluctuation"] = float(np.sqrt(np.nanmean(rest**2)))
+            changes["inflow_fluctuation"] = _inflow_deviation(scene)[1]
     if initial.outflow_velocity == 0:
         through = []
         for target, domain in zip(scene.targets, scene.domains):
@@ -245,18 +244,27 @@ def inflow_patterns(scene: FitScene) -> tuple[Tensor | None, ...]:
 
     None where the inlet is uniform and steady.
     """
+    rest, size = _inflow_deviation(scene)
+    if size < 1e-6 * scene.speed:
+        return (None,) * len(scene.targets)
+    return tuple(torch.from_numpy((row / size).astype(np.float32)) for row in rest)
+
+
+def _inflow_deviation(scene: FitScene) -> tuple[Float[np.ndarray, "t f"], float]:
+    """Inlet velocity less the mean of each component over inlet and time (0 off the inlet), and its size.
+
+    The size is that of the vector: the root of the components' mean squares added up.
+    """
     values = scene.inflow_values()
     o = scene.domains[0].offsets
-    rest = np.zeros_like(values)
+    rest, power = np.zeros_like(values), 0.0
     for a in range(3):
         part = values[:, o[a] : o[a + 1]]
         if np.isfinite(part).any():
-            rest[:, o[a] : o[a + 1]] = part - np.nanmean(part)
-    known = np.isfinite(values)
-    rms = float(np.sqrt(np.mean(rest[known] ** 2))) if known.any() else 0.0
-    if rms < 1e-6 * scene.speed:
-        return (None,) * len(scene.targets)
-    return tuple(torch.from_numpy(np.nan_to_num(row / rms).astype(np.float32)) for row in rest)
+            change = part - np.nanmean(part)
+            power += float(np.nanmean(change**2))
+            rest[:, o[a] : o[a + 1]] = np.nan_to_num(change)
+    return rest, math.sqrt(power)
 
 
 def build_problem(

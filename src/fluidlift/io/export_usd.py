@@ -196,17 +196,18 @@ class _Body:
         for time in ([Usd.TimeCode.Default()] if first else []) + [Usd.TimeCode(code)]:
             self._set_splats(frame.gaussians, time)
             self._set_points(frame, time)
+        written = len(frame.gaussians) * (90 + 6 * self.coefficients)
         if frame.surface is not None:
             if self.surface is None:
                 self.surface = UsdGeom.Mesh.Define(self.stage, "/Fluid/Surface")
                 _write_mesh(self.surface, frame.surface, frame.surface_velocities, Usd.TimeCode.Default())
             _write_mesh(self.surface, frame.surface, frame.surface_velocities, Usd.TimeCode(code))
+            written += 12 * (2 * len(frame.surface.vertices) + len(frame.surface.faces))
+        elif self.surface is not None:
+            _write_mesh(self.surface, _NOTHING, np.zeros((0, 3)), Usd.TimeCode(code))
         if frame.volume is not None:
             self._set_volume(frame.volume, code)
-        surface_bytes = (
-            0 if frame.surface is None else 12 * (2 * len(frame.surface.vertices) + len(frame.surface.faces))
-        )
-        return len(frame.gaussians) * (90 + 6 * self.coefficients) + surface_bytes
+        return written
 
     def _define(self, gaussians: Gaussians) -> None:
         self.coefficients = gaussians.sh.shape[1]

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from fluidlift.errors import InputRejected
+from fluidlift.io.exr import read_channels
 from fluidlift.io.limits import ReadLimits, read_json, require_file, require_size
 from fluidlift.io.pictures import PICTURE_SUFFIXES, read_picture, resample, same_shape, write_png
 from fluidlift.io.sequences import is_sequence, list_sequence
@@ -101,7 +102,7 @@ def read_depth(
     Depth is taken from the nearest pixel: averages across an edge lie where nothing is.
 
     Args:
-        path: a 16-bit PNG or TIFF, a float TIFF, .npy, or .npz (its array `depth`, or its only array).
+        path: OpenEXR, a 16-bit PNG or TIFF, a float TIFF, .npy, or .npz (its array `depth`, or its only array).
         size: width, height of the clip in px.
         scale: m per stored unit. None: 0.001 (millimetres) for 16-bit pictures, 1 for floats.
 
@@ -114,11 +115,7 @@ def read_depth(
     if suffix in (".npy", ".npz"):
         depth = _depth_array(path, limits)
     elif suffix == ".exr":
-        raise InputRejected(
-            f"'{path.name}' is an OpenEXR file, which this build cannot read",
-            "a 16-bit PNG, .npy or .npz",
-            "convert it, for example with: oiiotool depth.exr -d uint16 depth.png (and give --depth-scale)",
-        )
+        depth = _depth_channel(path, limits)
     else:
         depth = read_picture(path, limits=limits)
         if depth.dtype == np.uint8:
@@ -136,6 +133,18 @@ def read_depth(
     if not np.isfinite(fitted).any():
         raise InputRejected(f"no valid depth in '{path.name}'", "positive metres", "check --depth-scale")
     return fitted[0] if depth.ndim == 2 else fitted
+
+
+def _depth_channel(path: Path, limits: ReadLimits) -> np.ndarray:
+    """The channel of an OpenEXR file that holds depth; renderers write 1e10 or more where there is nothing."""
+    channels = read_channels(path, limits=limits)
+    wanted = ("z", "depth.z", "depth", "depth.v", "y", "v", "r")
+    named = {name.lower(): name for name in channels}
+    layer = [n for n in named if n.endswith((".z", "depth.v", ".depth"))]  # ViewLayer.Depth.Z and the like
+    hit = next((named[n] for n in (*wanted, *layer) if n in named), None)
+    if hit is None:
+        raise InputRejected(f"'{path.name}' has the channels {', '.join(channels)}", "a channel Z, depth.Z, Y or R")
+    return np.where(channels[hit] < 1e9, channels[hit], np.nan)
 
 
 def _depth_array(path: Path, limits: ReadLimits) -> np.ndarray:

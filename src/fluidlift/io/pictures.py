@@ -10,13 +10,15 @@ import numpy as np
 
 from fluidlift.errors import InputRejected
 from fluidlift.io.atomic import write_bytes
+from fluidlift.io.color import srgb_from_linear
+from fluidlift.io.exr import read_channels
 from fluidlift.io.limits import ReadLimits, require_file
 
-PICTURE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"})
+PICTURE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".exr"})
 
 
 def read_picture(path: Path | str, *, limits: ReadLimits | None = None) -> np.ndarray:
-    """Samples as they are stored: [H,W], [H,W,3] or [H,W,4] in RGB(A) order, u8, u16 or float32.
+    """Samples as they are stored: [H,W], [H,W,3] or [H,W,4] in RGB(A) order, u8, u16 or float32 (linear light).
 
     Raises:
         InputRejected: no such file, not a picture, damaged, or more pixels than `limits.max_pixels`.
@@ -27,6 +29,8 @@ def read_picture(path: Path | str, *, limits: ReadLimits | None = None) -> np.nd
         raise InputRejected(
             f"'{path.name}' is not a picture of a known kind", "one of " + ", ".join(sorted(PICTURE_SUFFIXES))
         )
+    if path.suffix.lower() == ".exr":
+        return _from_channels(path, read_channels(path, limits=limits))
     with path.open("rb") as file:
         size = _size_in_header(file.read(2**16))
     if size is not None:
@@ -43,6 +47,16 @@ def read_picture(path: Path | str, *, limits: ReadLimits | None = None) -> np.nd
         return picture
     order = {3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGBA}.get(picture.shape[2])
     return cv2.cvtColor(picture, order) if order is not None else np.ascontiguousarray(picture[..., 0])
+
+
+def _from_channels(path: Path, channels: dict[str, np.ndarray]) -> np.ndarray:
+    """R, G, B (and A) of an OpenEXR file, or the one channel that it has."""
+    if {"R", "G", "B"} <= channels.keys():
+        return np.stack([channels[c] for c in "RGBA" if c in channels], axis=-1)
+    for name in ("Y", "Z", "A", *channels):
+        if name in channels:
+            return channels[name]
+    raise InputRejected(f"'{path.name}' has no channels", "R, G, B or Y")
 
 
 def _require_pixels(path: Path, size: tuple[int, int], limits: ReadLimits) -> None:
@@ -75,7 +89,11 @@ def eight_bit(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
     if picture.dtype == np.uint16:
         picture = np.round(picture / 257.0).astype(np.uint8)
     elif picture.dtype != np.uint8:
-        picture = np.round(255.0 * np.clip(np.nan_to_num(picture), 0.0, 1.0)).astype(np.uint8)
+        light = np.clip(np.nan_to_num(picture), 0.0, 1.0)
+        encoded = srgb_from_linear(light)
+        if picture.ndim == 3 and picture.shape[2] == 4:
+            encoded[..., 3] = light[..., 3]
+        picture = np.round(255.0 * encoded).astype(np.uint8)
     if picture.ndim == 2:
         picture = np.repeat(picture[..., None], 3, axis=-1)
     return np.ascontiguousarray(picture[..., :3]), picture[..., 3].copy() if picture.shape[2] == 4 else None

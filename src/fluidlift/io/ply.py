@@ -87,7 +87,7 @@ def write_gaussians(
     columns: dict[str, np.ndarray] = dict(zip(("x", "y", "z"), turned.means.T))
     columns |= {name: np.zeros(n, np.float32) for name in ("nx", "ny", "nz")}
     columns |= {f"f_dc_{c}": turned.sh[:, 0, c] for c in range(3)}
-    rest = turned.sh[:, 1:].transpose(0, 2, 1).reshape(n, -1)
+    rest = turned.sh[:, 1:].transpose(0, 2, 1).reshape(n, 3 * (turned.sh.shape[1] - 1))
     columns |= {f"f_rest_{i}": rest[:, i] for i in range(rest.shape[1])}
     opacity = np.clip(turned.opacities.astype(np.float64), _OPACITY_EDGE, 1 - _OPACITY_EDGE)
     columns["opacity"] = np.log(opacity / (1 - opacity))
@@ -136,7 +136,7 @@ def read_splats(path: Path | str) -> SplatFile:
     n = len(vertex)
     sh = stacked(["f_dc_0", "f_dc_1", "f_dc_2"])[:, None]
     if rest:
-        higher = stacked([f"f_rest_{i}" for i in range(len(rest))]).reshape(n, 3, -1).transpose(0, 2, 1)
+        higher = stacked([f"f_rest_{i}" for i in range(len(rest))]).reshape(n, 3, len(rest) // 3).transpose(0, 2, 1)
         sh = np.concatenate([sh, higher], axis=1)
     quats = stacked([f"rot_{a}" for a in range(4)])
     norm = np.linalg.norm(quats, axis=1, keepdims=True)

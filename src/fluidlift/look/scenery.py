@@ -103,14 +103,17 @@ def orbit_camera(
         fov: degrees across the longer side.
     """
     low, high = np.percentile(points, 1, axis=0), np.percentile(points, 99, axis=0)
-    centre, radius = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
+    centre = 0.5 * (low + high)
     away = camera.position - centre
     angle = math.atan2(away[1], away[0]) + math.radians(azimuth)
     tilt = math.radians(elevation)
     size = size or camera.size
-    narrow = math.atan(math.tan(math.radians(fov) / 2) * min(size) / max(size))
-    distance = 0.92 * radius / math.sin(max(narrow, 0.05))
-    eye = centre + distance * np.array(
-        [math.cos(angle) * math.cos(tilt), math.sin(angle) * math.cos(tilt), math.sin(tilt)]
-    )
-    return PinholeCamera.looking(eye, centre, fov, size)
+    toward = np.array([math.cos(angle) * math.cos(tilt), math.sin(angle) * math.cos(tilt), math.sin(tilt)])
+    view = PinholeCamera.looking(centre + toward, centre, fov, size)
+    box = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+    seen = (box - centre) @ view.camera_from_world.rotation.T
+    # the nearest distance from which every corner of the box is inside the picture, and a rim of 6 %
+    half = np.array([size[0] / (2 * view.focal[0]), size[1] / (2 * view.focal[1])]) / 1.06
+    distance = float((np.abs(seen[:, :2]) / half - seen[:, 2:]).max())
+    distance = max(distance, 1.5 * float(-seen[:, 2].min()))
+    return PinholeCamera.looking(centre + distance * toward, centre, fov, size)

@@ -352,14 +352,18 @@ def _sums(
 
 def _blur(image: np.ndarray, sigma: float) -> np.ndarray:
     """Gaussian blur, float32 [H,W,C]; wide ones on a reduced picture. Nothing lies beyond the border."""
-    image = np.ascontiguousarray(image, np.float32)
     h, w = image.shape[:2]
     factor = 2 ** max(0, int(math.floor(math.log2(max(sigma, 1.0) / 2.0))))
     size = (max(1, -(-w // factor)), max(1, -(-h // factor)))
-    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA) if factor > 1 else image
-    small = cv2.GaussianBlur(small, (0, 0), sigma * size[0] / w, None, sigma * size[1] / h, cv2.BORDER_CONSTANT)
-    out = cv2.resize(small, (w, h), interpolation=cv2.INTER_LINEAR) if factor > 1 else small
-    return out.reshape(h, w, -1)
+    wide, high = max(sigma * size[0] / w, 0.3), max(sigma * size[1] / h, 0.3)
+    out = np.empty(image.shape, np.float32)
+    for c in range(0, image.shape[2], 4):  # OpenCV resizes at most four channels
+        part = np.ascontiguousarray(image[..., c : c + 4], np.float32)
+        part = cv2.resize(part, size, interpolation=cv2.INTER_AREA) if factor > 1 else part
+        part = cv2.GaussianBlur(part, (0, 0), wide, None, high, cv2.BORDER_CONSTANT)
+        part = cv2.resize(part, (w, h), interpolation=cv2.INTER_LINEAR) if factor > 1 else part
+        out[..., c : c + 4] = part.reshape(h, w, -1)
+    return out
 
 
 def _unit(v: np.ndarray, fallback: np.ndarray) -> np.ndarray:

@@ -24,9 +24,11 @@ STEADY_DRIFT_PX = 1.0
 """drift below this is left alone"""
 MENDED = 0.6
 """the shake that is left, as part of what was, below which the correction is kept"""
+HYPOTHESES = 3
+"""motions tried, each among the features that the ones before left over"""
 LEAST_CELLS = 6
 """cells of the grid that must agree on the motion of the camera"""
-LEAST_AGREEMENT = 0.35
+LEAST_AGREEMENT = 0.2
 """part of the features found again that must agree"""
 
 
@@ -181,16 +183,34 @@ def similarity_to(
     good = (ok_ahead[:, 0] > 0) & (ok_back[:, 0] > 0) & (gone < 0.5) & (moved < limit)
     if good.sum() < 3 * LEAST_CELLS:
         return None
+    return calmest_similarity(features[good, 0], ahead[good, 0], cells[good])
+
+
+def calmest_similarity(source: np.ndarray, target: np.ndarray, cells: np.ndarray) -> np.ndarray | None:
+    """The similarity [2,3] of least motion among those that enough of the pairs [n,2] agree on, or None.
+
+    A river that slides by as one sheet is a similarity too, and may have more features than its banks: it moves
+    farther from the reference than a camera on its place does.
+    """
+    left = np.ones(len(source), bool)
+    best, least = None, np.inf
     cv2.setRNGSeed(0)
-    similarity, inliers = cv2.estimateAffinePartial2D(
-        features[good], ahead[good], method=cv2.RANSAC, ransacReprojThreshold=0.7, maxIters=500, confidence=0.995
-    )
-    if similarity is None:
-        return None
-    agree = inliers[:, 0] > 0
-    if agree.mean() < LEAST_AGREEMENT or len(np.unique(cells[good][agree])) < LEAST_CELLS:
-        return None
-    return similarity
+    for _ in range(HYPOTHESES):
+        if left.sum() < max(3 * LEAST_CELLS, LEAST_AGREEMENT * len(source)):
+            break
+        similarity, inliers = cv2.estimateAffinePartial2D(
+            source[left], target[left], method=cv2.RANSAC, ransacReprojThreshold=0.7, maxIters=500, confidence=0.995
+        )
+        if similarity is None:
+            break
+        agree = np.flatnonzero(left)[inliers[:, 0] > 0]
+        if len(agree) < LEAST_AGREEMENT * len(source):
+            break
+        moved = float(np.linalg.norm(target[agree] - source[agree], axis=-1).mean())
+        if len(np.unique(cells[agree])) >= LEAST_CELLS and moved < least:
+            best, least = similarity, moved
+        left[agree] = False
+    return best
 
 
 def shake_and_drift(motions: np.ndarray, width: int, height: int, cuts: tuple[int, ...]) -> tuple[float, float]:

@@ -40,9 +40,9 @@ from fluidlift.types import (
     Terrain,
 )
 
-SURFACE_MOBILITY = 0.05
+SURFACE_MOBILITY = 0.02
 """mobility of faces between fluid and air: 1 lets the surface leak freely, 0 is a wall that moves as it was seen"""
-SEEN_MOBILITY = 0.5
+SEEN_MOBILITY = 0.2
 """mobility of faces whose velocity was seen"""
 FILLED_WEIGHT = 0.25
 """weight of a surface sample that the mainstream filled in, beside 1 for an observed one"""

@@ -1,7 +1,8 @@
 """Against clumps: small moves of particles from crowded places to others, which leave the velocity alone.
 
 After Kugelstadt, Longva, Thuerey, Bender 2019, "Implicit density projection for volume conserving liquids": where
-particles fill more than a cell holds, a displacement field with the divergence of the excess spreads them.
+particles fill more than a cell holds, a displacement field with the divergence of the excess spreads them. Cells
+inside the liquid that are underfilled draw particles in, more gently; at the free surface a cell may be partly empty.
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ TOLERATED = 0.05
 RELAXATION = 0.5
 """share of the remaining excess that one step takes away"""
 LARGEST_EXCESS = 0.5
+LARGEST_LACK = 0.3
+"""of cells without a face to the air"""
 LARGEST_MOVE = 0.2
 """cells per step"""
 
@@ -55,12 +58,15 @@ def spreading(
     grid: Grid,
     order: CellOrder,
 ) -> Float[np.ndarray, "n 3"] | None:
-    """Displacement (m) of each particle that lessens the crowding, or None where there is none."""
-    excess = np.where(system.unknown, np.clip(ratio - 1.0 - TOLERATED, 0.0, LARGEST_EXCESS), 0.0)
-    if not excess.any():
+    """Displacement (m) of each particle that evens out the filling, or None where it is even."""
+    excess = np.clip(ratio - 1.0 - TOLERATED, 0.0, LARGEST_EXCESS)
+    surface = system.boundary_term(np.ones(grid.shape)) > 0
+    lack = np.where(surface, 0.0, np.clip(ratio - 1.0 + TOLERATED, -LARGEST_LACK, 0.0))
+    wanted = np.where(system.unknown, RELAXATION * excess + 0.5 * RELAXATION * lack, 0.0)
+    if not wanted.any():
         return None
     # a rough solution will do: what it leaves, the next step takes
-    psi, _ = solve(system, RELAXATION * excess, tolerance=0.1, max_iterations=6)
+    psi, _ = solve(system, wanted, tolerance=0.1, max_iterations=6)
     field = subtract_gradient(FaceVelocity.zeros(grid), system, psi)
     moves, _ = grid_to_particles(field, grid, positions, order)
     limit = LARGEST_MOVE * grid.spacing

@@ -1,12 +1,15 @@
 """DiffSim^n: n differentiable steps of incompressible flow on a MAC grid (paper, "Presumed APIC Simulation").
 
-One step splits the momentum equation as: extrapolate, advect, body force, inflow and walls, viscosity, wall friction
-and bounce, outflow, pressure. Advection comes first, so that the carrying velocity is free of divergence.
+One step splits the momentum equation as: extrapolate, advect, wall friction and bounce, body force, inflow, viscosity,
+outflow, pressure. Advection comes first, so that the carrying velocity is free of divergence; walls answer the motion
+that is there and not what gravity adds before the pressure takes it back, so a pool at rest stays at rest.
 
 * Gravity acts on the fluid only and EMPTY cells hold p = 0, so a slope accelerates the flow; density drops out of the
   velocity and only scales the pressure.
-* Viscosity: backward Euler at any value (so the result is smooth in it), free slip on walls, no stress at air.
-* `wall_damping` d: a wall takes the share d of the tangential velocity of the cells along it per step of `time_step`.
+* Viscosity: backward Euler at any value (so the result is smooth in it), no stress at air; a wall beside a face takes
+  v = 0 at half a cell's distance, times `wall_damping`.
+* `wall_damping` d also takes the share d / 2 of the tangential velocity of the cells along a wall per step: the mean
+  over a cell of a share that fades linearly with the distance from the wall, as for the particles in `boundaries`.
 * `restitution` b: of the fluid that moves to a wall one cell ahead, the share dt |v| / h arrives within a step and
   has its normal velocity v answered by -b v. The wall itself stays closed: no volume is made.
 * Outflow: faces to OUTFLOW cells take `outflow_velocity` along the mainstream, then the pressure (p = 0 outside)
@@ -158,36 +161,44 @@ def _solve_pressure(
 
 
 class _Diffuse(torch.autograd.Function):
-    """x with (1 - c L) x = b, L symmetric: adjoint l = (1 - c L)^-1 g gives db = l, dc = l . L x."""
+    """x with (1 - c L + e W) x = b, L symmetric, W diagonal (given as a vector).
+
+    The adjoint l = (1 - c L + e W)^-1 g gives db = l, dc = l . L x, de = -l . W x.
+    """
 
     @staticmethod
-    def forward(ctx: Any, b: Tensor, c: Tensor, laplacian: sparse.csr_matrix) -> Tensor:
-        x = _solve_diffusion(b.detach().numpy(), float(c), laplacian)
-        ctx.laplacian, ctx.c = laplacian, float(c)
+    def forward(ctx: Any, b: Tensor, c: Tensor, e: Tensor, laplacian: sparse.csr_matrix, drag: np.ndarray) -> Tensor:
+        ctx.operator = (float(c), float(e), laplacian, drag)
+        x = _solve_diffusion(b.detach().numpy(), *ctx.operator)
         ctx.save_for_backward(torch.from_numpy(x))
         return torch.from_numpy(x)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> Any:
-        (x,) = ctx.saved_tensors
-        g = gradients[0].contiguous().numpy()
-        adjoint = _solve_diffusion(g, ctx.c, ctx.laplacian)
-        change = np.vdot(adjoint.astype(float), (ctx.laplacian @ x.numpy()).astype(float))
-        return torch.from_numpy(adjoint), torch.as_tensor(change, dtype=gradients[0].dtype), None
+        x = ctx.saved_tensors[0].numpy()
+        _, _, laplacian, drag = ctx.operator
+        adjoint = _solve_diffusion(gradients[0].contiguous().numpy(), *ctx.operator)
+        wide = adjoint.astype(float)
+        gc, ge = float(np.vdot(wide, laplacian @ x)), -float(np.vdot(wide, drag * x))
+        dtype = gradients[0].dtype
+        return torch.from_numpy(adjoint), torch.tensor(gc, dtype=dtype), torch.tensor(ge, dtype=dtype), None, None
 
 
-def _solve_diffusion(b: np.ndarray, c: float, laplacian: sparse.csr_matrix, max_iterations: int = 500) -> np.ndarray:
-    """Conjugate gradients for (1 - c L) x = b; the diagonal is nearly constant, so no preconditioner is needed."""
+def _solve_diffusion(
+    b: np.ndarray, c: float, e: float, laplacian: sparse.csr_matrix, drag: np.ndarray, max_iterations: int = 500
+) -> np.ndarray:
+    """Conjugate gradients for (1 - c L + e W) x = b; the diagonal varies little, so no preconditioner is needed."""
     tolerance = 1e-6 if b.dtype == np.float32 else 1e-13
+    friction = b.dtype.type(e) * drag
     x = b.copy()
-    residual = c * (laplacian @ b)
+    residual = c * (laplacian @ b) - friction * b
     direction = residual.copy()
     rr = float(np.vdot(residual, residual))
     goal = (tolerance * float(np.linalg.norm(b))) ** 2
     for _ in range(max_iterations):
         if rr <= goal:
             break
-        image = direction - c * (laplacian @ direction)
+        image = direction - c * (laplacian @ direction) + friction * direction
         alpha = rr / float(np.vdot(direction, image))
         x += b.dtype.type(alpha) * direction
         residual -= b.dtype.type(alpha) * image
@@ -202,19 +213,18 @@ def apply_walls(
     """Friction of walls along the motion, and the bounce of walls across it."""
     share = torch.from_numpy(domain.wall_share)
     below, above = torch.from_numpy(domain.wall_below), torch.from_numpy(domain.wall_above)
-    velocity = velocity * (1 - parameters.wall_damping * share)
+    velocity = velocity * (1 - 0.5 * parameters.wall_damping * share)
     arriving = (velocity.abs() * parameters.time_step / domain.system.spacing).clamp(max=1)
     ahead = torch.where(velocity.detach() < 0, below, above)
     return velocity * (1 - parameters.restitution * ahead * arriving)
 
 
-def diffuse(
-    velocity: Float[Tensor, "f"], domain: RolloutDomain, viscosity: Tensor, time_step: Tensor
-) -> Float[Tensor, "f"]:
-    """One backward Euler step of viscosity; prescribed faces act as boundary values."""
-    c = viscosity * time_step
+def diffuse(velocity: Float[Tensor, "f"], domain: RolloutDomain, parameters: RolloutParameters) -> Float[Tensor, "f"]:
+    """One backward Euler step of viscosity; prescribed faces act as boundary values, walls by their damping."""
+    c = parameters.kinematic_viscosity * parameters.time_step
     b = velocity + c * _Apply.apply(velocity, domain.boundary_laplacian)
-    return _Diffuse.apply(b, c, domain.laplacian)
+    e = c * parameters.wall_damping * (2 / float(domain.system.spacing) ** 2)
+    return _Diffuse.apply(b, c, e, domain.laplacian, domain.wall_count)
 
 
 def project(
@@ -263,12 +273,11 @@ def step(
     moved = advect(
         unflatten(velocity, domain), dt, spacing=h, gradient=options.advection_gradient, active=domain.active()
     )
-    velocity = torch.cat([m.reshape(-1) for m in moved])
+    velocity = apply_walls(torch.cat([m.reshape(-1) for m in moved]), domain, parameters)
     force = torch.cat([parameters.gravity[a].expand(o[a + 1] - o[a]) for a in range(3)])
     velocity = velocity + dt * force * torch.from_numpy(domain.force)
     velocity = set_inflow(velocity, domain, parameters, pattern)
-    velocity = diffuse(velocity, domain, parameters.kinematic_viscosity, dt)
-    velocity = apply_walls(velocity, domain, parameters)
+    velocity = diffuse(velocity, domain, parameters)
     leaving = torch.from_numpy(domain.outflow_faces)
     velocity = velocity * (1 - leaving) + parameters.outflow_velocity * torch.from_numpy(domain.outflow)
     return project(velocity, domain, options=options, guess=guess, kept=kept)

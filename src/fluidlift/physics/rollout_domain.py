@@ -53,6 +53,8 @@ class RolloutDomain:
     buoyancy acts against gravity, whose size is then that of the buoyancy)"""
     wall_share: Float[np.ndarray, "f"]
     """0 to 1: how much solid runs along a dynamic face's cells"""
+    wall_count: Float[np.ndarray, "f"]
+    """0 to 4: closed faces beside a dynamic face, mean of its two cells"""
     wall_below: Float[np.ndarray, "f"]
     wall_above: Float[np.ndarray, "f"]
     """0 to 1: closed share of the next face towards lower / higher index, where a wall stands across the motion"""
@@ -134,8 +136,8 @@ def _viscous_matrices(
 ) -> tuple[sparse.csr_matrix, sparse.csr_matrix]:
     """Laplacian of one component: among dynamic faces (with its diagonal), and from prescribed faces.
 
-    A wall face ahead or behind holds the normal velocity 0; beside a face, walls are free slip (wall damping is
-    separate); towards air the derivative is 0.
+    A wall face ahead or behind holds the normal velocity 0; walls beside a face are left to `wall_count`; towards air
+    the derivative is 0.
     """
     n = dynamic.size
     d, b, z = dynamic.ravel(), prescribed.ravel(), wall.ravel()
@@ -219,12 +221,13 @@ def prepare_domain(
         low_out, high_out = _sides(types == CellType.OUTFLOW, axis)
         leaving = dynamic & (low_out | high_out)
         along = 0.0 if mainstream is None else float(mainstream[axis])
-        side = np.zeros(types.shape)
+        side, count = np.zeros(types.shape), np.zeros(types.shape)
         for other in range(3):
             if other != axis:
                 n = types.shape[other]
                 for ends in (range(n), range(1, n + 1)):
-                    side = np.maximum(side, np.take(closed_share[other], ends, other))
+                    closed = np.take(closed_share[other], ends, other)
+                    side, count = np.maximum(side, closed), count + closed
         share = dynamic if smoke is None else dynamic * -0.5 * np.add(*_sides(np.asarray(smoke, float), axis))
         below, above = _sides(unknown, axis)
         inner, outer = _viscous_matrices(dynamic, inflow, wall, axis, h)
@@ -237,6 +240,7 @@ def prepare_domain(
             "interior": ~(inflow | wall),
             "force": share,
             "wall_share": dynamic * np.maximum(*_sides(side, axis)),
+            "wall_count": dynamic * 0.5 * np.add(*_sides(count * unknown, axis)),
             "wall_below": dynamic * below * _shift(closed_share[axis], axis, -1),
             "wall_above": dynamic * above * _shift(closed_share[axis], axis, 1),
             "extrapolation": extrapolation_matrix(dynamic | inflow | wall, sweeps),
@@ -247,7 +251,7 @@ def prepare_domain(
         }
         for name, value in new.items():
             parts[name].append(value)
-    flat = {n: np.concatenate([np.asarray(x).ravel() for x in parts[n]]).astype(dtype) for n in _PARTS[1:9]}
+    flat = {n: np.concatenate([np.asarray(x).ravel() for x in parts[n]]).astype(dtype) for n in _PARTS[1:10]}
     return RolloutDomain(
         shape=types.shape,
         system=system,
@@ -262,6 +266,6 @@ def prepare_domain(
 
 
 _PARTS = (
-    "dynamic", "inflow", "outflow", "outflow_faces", "interior", "force", "wall_share", "wall_below", "wall_above",
-    "extrapolation", "laplacian", "boundary", "divergence", "gradient",
+    "dynamic", "inflow", "outflow", "outflow_faces", "interior", "force", "wall_share", "wall_count", "wall_below",
+    "wall_above", "extrapolation", "laplacian", "boundary", "divergence", "gradient",
 )  # fmt: skip

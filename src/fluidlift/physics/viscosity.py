@@ -14,8 +14,9 @@ from jaxtyping import Bool, Float
 from fluidlift.numerics import multigrid
 from fluidlift.types import FaceVelocity, SolveReport
 
-NEGLIGIBLE = 1e-5
-"""dt nu / h^2 below which the step changes nothing that float32 velocities would keep for long"""
+NEGLIGIBLE = 1e-4
+"""dt nu / h^2 below which the step is left out: it would take 0.1 % from the finest waves of the grid, far less than
+the transfers do"""
 
 
 def _along(array: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
@@ -66,7 +67,7 @@ def diffuse_component(
             extra += number * near_fixed + 2.0 * number * wall_share * near_wall
     rhs = np.where(solved, component + source, 0.0)
     start = np.where(solved, component, 0.0).astype(np.float64)
-    norm = float(np.linalg.norm(rhs))
+    norm = float(np.abs(rhs).max(initial=0.0))
     if norm == 0.0:
         return component, SolveReport(True, 0, 0.0, "conjugate_gradient")
     result, iterations, residual = multigrid.solve(

@@ -1,4 +1,4 @@
-"""Stages that build the body: geometry (kind, up, front surface, metres, terrain) and refine (to the rest Gaussians)."""
+"""Stages that build the body: geometry (kind, up, front surface, metres, terrain) and refine (rest Gaussians)."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def geometry(story: Story, inputs: Inputs, config: JobConfig) -> Result:
     }
     if setting.surface_height is not None:
         arrays["surface_height"] = setting.surface_height.astype(np.float32)
-    plate = generate.background_plate(clip.frames, fluid)
+    plate = generate.background_plate(clip.frames, fluid, labels.solid.mean(axis=0) > 0.5)
     arrays["plate"], arrays["plate_seen"] = plate.image, plate.seen
     return Result(arrays, meta)
 

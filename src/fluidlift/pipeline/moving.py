@@ -26,6 +26,9 @@ from fluidlift.types import (
 HALF_WINDOW = 2
 """frames on either side whose flow is averaged into one target: turbulence of single pairs is mostly flow noise"""
 
+MAX_STRETCH = 3.0
+"""longest axis over the mean one before a Gaussian starts again round: longer ones show as hair"""
+
 VISCOSITY_PRIOR = {"stream": 1e-5, "fall": 1e-5, "pour": 1e-4, "plume": 1e-5}
 """m^2/s, where the fit starts"""
 
@@ -192,13 +195,16 @@ def emission_look(
 
     tree = cKDTree(rest.means)
     reach = rest.means @ direction
-    low, high = np.percentile(reach, [2, 98])
+    # the ends of a body are often shaded by what stands there (a gate, a lip): the pattern comes from between them
+    low, high = np.percentile(reach, [12, 90])
     length = max(float(high - low), 1e-9)
 
     def source(positions: np.ndarray, time: float) -> np.ndarray:
         run = (speed * time) % (2 * length)
         shift = run if run < length else 2 * length - run
-        return tree.query(positions + shift * direction)[1].astype(np.int64)
+        inlet = positions @ direction
+        target = np.clip(inlet + shift, low, high)
+        return tree.query(positions + (target - inlet)[:, None] * direction)[1].astype(np.int64)
 
     return source
 
@@ -264,7 +270,7 @@ def simulate(story: Story, folder: Path, config: JobConfig) -> Result:
         p = simulator.particles
         if len(p) > config.simulate.max_particles * 2:
             break
-        shown = deform_gaussians(rest, p)
+        shown = deform_gaussians(rest, p, max_stretch=MAX_STRETCH)
         write_gaussians(frame_file(folder, 1001 + k), shown, ids=p.ids, velocities=p.velocities)
         occupied = np.unique(np.floor((p.positions - grid.low) / grid.spacing).astype(np.int64), axis=0)
         volumes.append(len(occupied) * grid.spacing**3)

@@ -9,6 +9,9 @@ import numpy as np
 
 from fluidlift.shape.evidence import Evidence
 
+DECISIVE = 3.5
+"""log odds at which colour alone is held to say no more"""
+
 
 def still_background(
     evidence: Evidence, active: np.ndarray, domain: np.ndarray
@@ -17,7 +20,8 @@ def still_background(
 
     A pixel is taken before the fluid first reached it, or after it was last seen there. What looks more like the
     moving fluid than like the surroundings is not believed: a steady column of smoke is quiet too. The domain is
-    extended, in place, over such quiet fluid where it touches the moving one.
+    extended, in place, over such quiet fluid where it touches the moving one. Colour is trusted as far as the moving
+    places have colours of their own: clear water shows those of the background.
     """
     frames = len(active)
     ever = active.any(axis=0)
@@ -30,18 +34,28 @@ def still_background(
         count += free
     background = total / np.maximum(count, 1.0)[..., None]
     pick = np.unique(np.linspace(0, frames - 1, min(frames, 15)).round().astype(int))
-    fluid = colour_histogram(evidence.pictures[pick][active[pick]])
-    around = colour_histogram(evidence.pictures[pick][:, ~domain].reshape(-1, 3))
+    moving = colour_histogram(evidence.pictures[pick][active[pick]])
+    domain |= quiet_fluid(background, domain, moving, colour_histogram(evidence.pictures[pick][:, ~domain]))
+    around = colour_histogram(evidence.pictures[pick][:, ~domain])
+    fluid = without_background(moving, around)
+    rare = 1e-5 * (around.sum() + fluid.sum())
+    trust = float(np.clip((fluid.sum() / max(moving.sum(), 1.0) - 0.3) / 0.4, 0.0, 1.0))
 
     def like_fluid(picture: np.ndarray) -> np.ndarray:
         bins = colour_bins(picture)
-        return np.log((fluid[bins] + 1e-5) / (around[bins] + 1e-5))
+        return trust * np.clip(np.log((fluid[bins] + rare) / (around[bins] + rare)), -DECISIVE, DECISIVE)
 
     suspect = like_fluid(background) > np.log(2.0)
-    alien = like_fluid(background) > np.log(20.0)
-    parts = cv2.connectedComponents((domain | alien).astype(np.uint8), connectivity=4)[1]
-    domain |= alien & np.isin(parts, np.unique(parts[domain]))
     return background, (count >= 3) & ~suspect, like_fluid
+
+
+def quiet_fluid(picture: np.ndarray, domain: np.ndarray, moving: np.ndarray, around: np.ndarray) -> np.ndarray:
+    """bool [h,w]: what touches the domain and has a colour that is common in the moving fluid, rare around it."""
+    bins = colour_bins(picture)
+    share_moving, share_around = moving[bins] / max(moving.sum(), 1.0), around[bins] / max(around.sum(), 1.0)
+    alien = share_moving + 1e-5 > 20.0 * (share_around + 1e-5)
+    parts = cv2.connectedComponents((domain | alien).astype(np.uint8), connectivity=4)[1]
+    return alien & np.isin(parts, np.unique(parts[domain]))
 
 
 def typical_contrast(
@@ -72,10 +86,21 @@ def colour_bins(colours: np.ndarray, *, bins: int = 16) -> tuple[np.ndarray, np.
 
 
 def colour_histogram(colours: np.ndarray, *, bins: int = 16) -> np.ndarray:
-    """Smoothed density of opponent colours [n,3], float32 [bins,bins,bins]."""
+    """Smoothed counts of opponent colours [...,3], float32 [bins,bins,bins]."""
     counts = np.zeros((bins, bins, bins), np.float32)
-    np.add.at(counts, colour_bins(colours, bins=bins), 1.0)
+    np.add.at(counts, colour_bins(colours.reshape(-1, 3), bins=bins), 1.0)
     kernel = np.array([0.25, 0.5, 0.25], np.float32)
     for axis in range(3):
         counts = np.apply_along_axis(np.convolve, axis, counts, kernel, mode="same")
-    return (counts / max(len(colours), 1)).astype(np.float32)
+    return counts.astype(np.float32)
+
+
+def without_background(mixed: np.ndarray, around: np.ndarray) -> np.ndarray:
+    """The histogram of active places less the background that shows through and beside the fluid in them.
+
+    The share of background is the one that explains the surroundings' own colours (their median ratio).
+    """
+    common = np.sort(around.ravel())[::-1]
+    main = around >= common[min(int(np.searchsorted(np.cumsum(common), 0.9 * common.sum())), len(common) - 1)]
+    share = float(np.quantile((mixed[main] / np.maximum(around[main], 1e-6)), 0.5))
+    return np.maximum(mixed - share * around, 0.0)

@@ -248,4 +248,6 @@ def separating_level(activity: np.ndarray, *, lowest: float = np.log(1.8), highe
     rest = weight[-1] - weight
     with np.errstate(divide="ignore", invalid="ignore"):
         between = weight * rest * (mass / weight - (mass[-1] - mass) / rest) ** 2
-    return float(np.clip(centres[int(np.nanargmax(between))], lowest, highest))
+    between = np.nan_to_num(between)
+    best = centres[between >= (1.0 - 1e-3) * between.max()].mean()  # the middle of a gap between two populations
+    return float(np.clip(best, lowest, highest))

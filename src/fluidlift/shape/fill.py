@@ -136,9 +136,7 @@ def hull(gaussians: Gaussians, *, spacing: float, closed_below: Terrain | None =
     scales = np.minimum(scales, np.maximum(reach / 3.46, 0.5)[:, None] * grid.spacing)
     axes = matrix_from_quat(g.quats) / scales[:, None, :]
     p = axes @ np.swapaxes(axes, 1, 2)
-    precisions = np.stack([p[:, 0, 0], p[:, 0, 1], p[:, 0, 2], p[:, 1, 1], p[:, 1, 2], p[:, 2, 2]], 1).astype(
-        np.float32
-    )
+    precisions = np.ascontiguousarray(p[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]], dtype=np.float32)
     field = np.zeros(grid.shape, np.float32)
     _splat_field(grid.low, grid.spacing, g.means, precisions, np.clip(g.opacities, 0, 1), reach, field)
     solid = np.pad(field > THRESHOLD, 2)

@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from fluidlift.errors import require
 from fluidlift.shape.terrain import Setting
-from fluidlift.types import CellType, Gaussians, PinholeCamera, concatenate, decompose_covariances, sh_from_rgb
+from fluidlift.types import CellType, Gaussians, PinholeCamera, decompose_covariances, sh_from_rgb
 
 _WET = (CellType.FLUID, CellType.INFLOW)
 
@@ -25,30 +25,47 @@ class BackgroundPlate:
     """True where some frame shows the background"""
 
 
-def background_plate(frames: UInt8[np.ndarray, "t h w 3"], fluid: Bool[np.ndarray, "t h w"]) -> BackgroundPlate:
-    """Median of the frames where they show no fluid; the rest inpainted from around it."""
-    import cv2
+def background_plate(
+    frames: UInt8[np.ndarray, "t h w 3"],
+    fluid: Bool[np.ndarray, "t h w"],
+    solid: Bool[np.ndarray, "h w"] | None = None,
+) -> BackgroundPlate:
+    """Median of the frames where they show no fluid; the rest inpainted from the ground around it.
 
+    Args:
+        frames: sRGB.
+        fluid: per frame.
+        solid: still things in the fluid: they stay in the picture, but the bed beside them is not painted with them.
+    """
     pick = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), 25)).astype(int))
     wet = np.stack([ndimage.binary_dilation(fluid[t], iterations=2) for t in pick])
-    values = np.ma.masked_array(frames[pick].astype(np.float32), mask=np.repeat(wet[..., None], 3, axis=-1))
+    if solid is not None:
+        wet &= ~solid
     seen = ~wet.all(axis=0)
-    image = np.ma.median(values, axis=0).filled(0.0)
-    image = np.clip(image, 0, 255).astype(np.uint8)
     if not seen.any():
         return BackgroundPlate(np.median(frames[pick], axis=0).astype(np.uint8), seen)
-    if not seen.all():
-        # inpainting at a quarter of the size: wide holes get smooth ground instead of streaks
-        h, w = seen.shape
-        small = (max(w // 4, 8), max(h // 4, 8))
-        hole = cv2.resize((~seen).astype(np.uint8), small, interpolation=cv2.INTER_AREA)
-        hole = (cv2.resize((~seen).astype(np.float32), small, interpolation=cv2.INTER_AREA) > 0.01).astype(np.uint8)
-        filled = cv2.inpaint(cv2.resize(image, small, interpolation=cv2.INTER_AREA), hole, 5, cv2.INPAINT_TELEA)
-        rough = cv2.resize(filled, (w, h), interpolation=cv2.INTER_CUBIC)
+    values = np.ma.masked_array(frames[pick], mask=np.repeat(wet[..., None], 3, axis=-1))
+    image = np.clip(np.ma.median(values, axis=0).filled(0), 0, 255).astype(np.uint8)
+    ground = seen if solid is None else seen & ~ndimage.binary_dilation(solid, iterations=3)
+    if ground.any() and not seen.all():
+        painted = _inpainted(image, ~ground)
         blend = np.clip(ndimage.gaussian_filter((~seen).astype(np.float32), 1.5) * 2.0, 0, 1)
         blend[~seen] = 1.0
-        image = (image * (1 - blend[..., None]) + rough * blend[..., None]).astype(np.uint8)
+        image = (image * (1 - blend[..., None]) + painted * blend[..., None]).astype(np.uint8)
     return BackgroundPlate(image, seen)
+
+
+def _inpainted(image: np.ndarray, hole: np.ndarray) -> np.ndarray:
+    """Telea inpainting at a quarter of the size: wide holes get smooth ground instead of streaks."""
+    import cv2
+
+    h, w = hole.shape
+    small = (max(w // 4, 8), max(h // 4, 8))
+    coarse = (cv2.resize(hole.astype(np.float32), small, interpolation=cv2.INTER_AREA) > 0.01).astype(np.uint8)
+    if coarse.all():
+        return image
+    filled = cv2.inpaint(cv2.resize(image, small, interpolation=cv2.INTER_AREA), coarse, 5, cv2.INPAINT_TELEA)
+    return cv2.resize(filled, (w, h), interpolation=cv2.INTER_CUBIC)
 
 
 def front_gaussians(
@@ -89,11 +106,14 @@ def front_gaussians(
     normal = np.cross(a, b)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
     thin = 0.25 * footprint
-    outer = lambda v: v[:, :, None] * v[:, None, :]
-    covariance = 0.3 * (outer(a) + outer(b)) + outer(normal * thin[:, None])
+    covariance = 0.3 * (_outer(a) + _outer(b)) + _outer(normal * thin[:, None])
     quats, scales = decompose_covariances(covariance, floor=(0.02 * float(np.median(footprint))) ** 2)
     colours = frame[rows, cols].astype(np.float32) / 255.0
     return Gaussians(points[rows, cols], quats, scales, np.full(len(rows), opacity), sh_from_rgb(colours))
+
+
+def _outer(v: np.ndarray) -> np.ndarray:
+    return v[:, :, None] * v[:, None, :]
 
 
 def hull_gaussians(
@@ -109,7 +129,7 @@ def hull_gaussians(
     The cells of the body next to another kind of cell are sampled at half the grid spacing; colours come from the
     picture along the line of sight (the nearest pixel for what lies outside it), darkened a little below the surface.
     """
-    grid, cells = setting.terrain.grid, setting.cell_types
+    grid = setting.terrain.grid
     wet = body_cells(setting)
     rim = wet & ~ndimage.binary_erosion(wet, border_value=0)
     base = np.argwhere(rim)
@@ -127,7 +147,6 @@ def hull_gaussians(
     colours = picture_colours(frame, points, camera)
     if below is not None:
         colours = colours * np.where(below > grid.spacing, shade, 1.0)[:, None]
-    del cells
     return Gaussians.isotropic(points, 0.42 * grid.spacing, colours, 0.8)
 
 
@@ -170,8 +189,3 @@ def fluid_colour_frame(
 def united_mask(fluid: Bool[np.ndarray, "t h w"]) -> Bool[np.ndarray, "h w"]:
     """Pixels that are fluid in at least a third of the frames (one frame for pairs)."""
     return fluid.mean(axis=0) >= 0.34
-
-
-def body_from(front: Gaussians, hull: Gaussians) -> Gaussians:
-    """The shell of the body: what is seen, then what closes it."""
-    return concatenate([front, hull])

@@ -1,4 +1,4 @@
-"""Denoises a body: takes out faint, stretched, huge, lonely and broken Gaussians (paper: pruning before the filling)."""
+"""Denoises a body: takes out faint, stretched, huge, lonely and broken Gaussians (paper: before the filling)."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ def prune(
     Args:
         gaussians: any Gaussians, m.
         min_opacity: fainter ones go.
-        max_stretch: largest ratio of the two largest scales. Needles go, flat discs stay: a surface may be made of them.
-        max_scale: largest standard deviation, m. None: a quarter of the body's size (between its 2 % and 98 % quantiles,
-            diagonal), more than any piece of a body can be.
-        neighbours: a Gaussian with fewer neighbours than this, within three times the distance that usually holds
-            eight (so that usually some seventy are found there), is isolated and goes. 0: keep the lonely.
+        max_stretch: largest ratio of the two largest scales. Needles go, flat discs stay: surfaces are made of them.
+        max_scale: largest standard deviation, m. None: a quarter of the body's size (diagonal between its 2 % and 98 %
+            quantiles), more than any piece of a body can be.
+        neighbours: a Gaussian with fewer neighbours than this, within three times the distance that holds eight nearby
+            (so that some seventy should be found there), is isolated and goes. 0: keep the lonely.
 
     Returns:
         Those left, in order, and the counts.
@@ -82,8 +82,12 @@ def body_size(points: Float[np.ndarray, "n 3"]) -> float:
 
 
 def lonely(points: Float[np.ndarray, "n 3"], neighbours: int = 4) -> Bool[np.ndarray, "n"]:
-    """Points with fewer than `neighbours` others within three times the median distance of the eighth neighbour."""
+    """Points with fewer than `neighbours` others within three times the distance at which the points nearby hold eight.
+
+    The comparison is with the nearest eight points, so that a body may thin out with its distance from the camera.
+    """
     if len(points) < 10:
         return np.zeros(len(points), bool)
-    distances = cKDTree(points).query(points, k=max(neighbours, 8) + 1)[0]
-    return distances[:, neighbours] > 3 * np.median(distances[:, 8])
+    distances, others = cKDTree(points).query(points, k=max(neighbours, 8) + 1)
+    usual = np.median(distances[others[:, 1:9], 8], axis=1)
+    return distances[:, neighbours] > 3 * usual

@@ -214,7 +214,8 @@ def _run(
         history[i], push = _step(raw, beside, weights, unit, pace)
         pushes += push
         if i + 1 in density_steps:
-            _densify(raw, pushes / (i + 1 - since), max(max_gaussians, len(gaussians)) - len(unseen), rng)
+            room = max(max_gaussians, len(gaussians)) - len(unseen)
+            _densify(raw, pushes / (i + 1 - since), room, frame.view, first.depth, rng)
             pruned += _prune_background(raw, frame)
             since = i + 1
             pushes = torch.zeros(len(raw))
@@ -268,11 +269,11 @@ def _step(raw: _Raw, frame: Frame, weights: LossWeights, unit: float, pace: floa
     return float(loss.detach()), uv.grad.norm(dim=1) * (0.5 * max(frame.view.size))
 
 
-def _densify(raw: _Raw, pushes: torch.Tensor, room: int, rng: torch.Generator) -> None:
+def _densify(raw: _Raw, pushes: torch.Tensor, room: int, view: View, depth: np.ndarray, rng: torch.Generator) -> None:
     """More Gaussians where the picture pulls hardest: large ones are split, small ones cloned.
 
-    A split moves the halves apart along the axis that is longest across the line of sight: depth stays as it was. Two
-    splits in turn make four Gaussians of half the width.
+    A split moves the halves apart along the axis that is longest across the line of sight, and along it as the visible
+    surface slopes (`depth`, before the refinement). Two splits in turn make four Gaussians of half the width.
 
     The threshold is a quarter of that of 3D Gaussian Splatting (paper: a lower threshold). Gaussians finer than half a
     pixel stay as they are: what they would add cannot be seen.
@@ -296,8 +297,10 @@ def _densify(raw: _Raw, pushes: torch.Tensor, room: int, rng: torch.Generator) -
     axis = (scales[old].exp() * (1 - along**2).clamp(min=0).sqrt()).argmax(1)
     shift = axes[torch.arange(len(old)), :, axis]
     shift = 0.6 * scales[old, axis].exp()[:, None] * (shift - (shift * ray).sum(1, keepdim=True) * ray)
-    raw.fixed["anchor"][old] -= shift
-    raw.fixed["anchor"][new] += shift
+    anchor, middle = raw.fixed["anchor"], raw.activated(raw.free)[0][old]
+    for index, move in ((old, -shift), (new, shift)):
+        slope = _surface_step(view, depth, middle.numpy(), move.numpy(), scales[old].exp().max(1).values.numpy())
+        anchor[index] += move + torch.from_numpy(slope)[:, None] * ray
     for index in (old, new):
         scales[index] -= math.log(1.26)
         scales[index, axis] -= math.log(1.27)
@@ -308,6 +311,31 @@ def _densify(raw: _Raw, pushes: torch.Tensor, room: int, rng: torch.Generator) -
     raw.free["opacities"][old] = raw.free["opacities"][new] = torch.logit(opacity, 1e-4)
 
 
+def _surface_step(
+    view: View, depth: np.ndarray, middle: np.ndarray, move: np.ndarray, scale: np.ndarray
+) -> Float[np.ndarray, "n"]:
+    """How far (m) along the line of sight the visible surface runs under a move across it; 0 away from the surface."""
+    (u0, v0), z0 = _pixels(view, middle)
+    (u1, v1), _ = _pixels(view, middle + move)
+    height, width = depth.shape
+    seen = (np.minimum(u0, u1) >= 0) & (np.maximum(u0, u1) < width)
+    seen &= (np.minimum(v0, v1) >= 0) & (np.maximum(v0, v1) < height)
+    out = np.zeros(len(middle), np.float32)
+    at, to = depth[v0[seen], u0[seen]], depth[v1[seen], u1[seen]]
+    step = np.where(np.abs(z0[seen] - at) < 3 * scale[seen], to - at, 0.0)
+    bound = 3 * np.linalg.norm(move[seen], axis=1)  # a steeper step is an edge
+    out[seen] = np.where(np.abs(step) < bound, np.nan_to_num(step), 0.0)
+    return out
+
+
+def _pixels(view: View, points: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
+    """Column and row (int64) of points, and their camera z (m)."""
+    x = points @ np.float32(view.rotation.T) + np.float32(view.translation)
+    uv = x[:, :2] / np.maximum(x[:, 2:], view.near) * np.float32(view.focal) + np.float32(view.center)
+    column, row = np.floor(np.clip(uv, -1e6, 1e6)).astype(np.int64).T
+    return (column, row), x[:, 2]
+
+
 def _prune_background(raw: _Raw, frame: Frame) -> int:
     """Drop what turned into background: its colour, or transparent, and at the border of the mask or outside it.
 
@@ -315,10 +343,7 @@ def _prune_background(raw: _Raw, frame: Frame) -> int:
     taken it is no fluid (paper: pruning by the colour of the background).
     """
     means, _, opacities, colors = raw.activated(raw.free)
-    view = frame.view
-    x = means.numpy() @ np.float32(view.rotation.T) + np.float32(view.translation)
-    uv = x[:, :2] / np.maximum(x[:, 2:], view.near) * np.float32(view.focal) + np.float32(view.center)
-    column, row = np.floor(uv).astype(np.int64).T
+    (column, row), _ = _pixels(frame.view, means.numpy())
     height, width = frame.mask.shape
     within = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     deep = cv2.erode(frame.mask.astype(np.uint8), np.ones((2 * BORDER + 1,) * 2, np.uint8), borderValue=1) > 0

@@ -28,7 +28,7 @@ from fluidlift.types.flow import PixelFlow
 Progress = Callable[[float, str], None]
 """Called with the part done (0 to 1) and a few words."""
 
-SMALLEST_PART = 0.03
+SMALLEST_PART = 0.04
 """components below this part of the whole fluid are dropped"""
 SMALLEST_SOLID = 4e-4
 """holes below this part of the picture are filled"""
@@ -38,7 +38,7 @@ FEEBLE = 0.4
 """of the fluid's typical score: what moves less must look like the fluid to be counted as fluid"""
 SHADOW = 0.2
 """factor on changes of brightness against the sign of the fluid's own contrast"""
-FAINTEST = 0.2
+FAINTEST = 0.3
 """of the fluid's typical contrast with the background: what is fainter is not counted as fluid"""
 SATURATION = 0.9
 """a region that is nearly all seen active early (mean of the union's growth curve above this) is one that stays"""
@@ -281,7 +281,7 @@ def advancing_labels(evidence: Evidence, score: np.ndarray, active: np.ndarray) 
         differs[change_of_colour[..., 0] * brightens < -0.5 * np.abs(change_of_colour).sum(axis=-1)] *= SHADOW
         stands_out = np.log(np.maximum(differs, 1e-3)) / 0.3
         seen = stands_out + 0.25 * np.clip(moved, -4.0, 4.0)
-        best = np.where(known, seen, np.clip(moved, -4.0, 4.0) + like_fluid(picture))
+        best = np.where(known, seen, np.clip(moved, -3.0, 3.0) + like_fluid(picture))
         odds[t] = np.clip(np.where(domain, best, -12.0), -12.0, 12.0)
     odds = median_over_time(odds)
     labels = np.zeros(active.shape, np.uint8)

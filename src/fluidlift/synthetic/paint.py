@@ -82,7 +82,7 @@ class GroundPaint:
         a, b, c = self.coarse.at(points), self.fine.at(points), self.pebbles.at(points)
         rock, green, wet = np.moveaxis(shares, -1, 0)
         earth = mix(np.array(self.dark), np.array(self.light), 0.45 * a + 0.3 * b + 0.25 * c)
-        earth = earth * (0.72 + 0.75 * smoothstep(c, 0.6, 0.85))[:, None]
+        earth = earth * (0.86 + 0.32 * smoothstep(c, 0.45, 0.95))[:, None]
         turf = np.array(self.grass) * (0.35 + 0.5 * b + 0.35 * a + 0.45 * c)[:, None]
         stone = np.array(self.rock) * (0.45 + 0.5 * b + 0.25 * a + 0.2 * c)[:, None]
         dry = mix(mix(earth, turf, smoothstep(green + 0.35 * (a - 0.5), 0.3, 0.7)), stone, rock)

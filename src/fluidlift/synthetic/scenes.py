@@ -112,7 +112,7 @@ def _solid_cells(grid: Grid, solid: ScalarField) -> np.ndarray:
 
 def stream(*, size: tuple[int, int] = (320, 208), seed: int = 0, cells: int = 72) -> Scene:
     """A brook 2 m long with one large rock and two small ones, flowing along +x."""
-    length, width, height, speed, slope, level = 2.0, 1.28, 0.44, 0.62, 0.012, 0.225
+    length, width, height, speed, slope, level = 2.0, 1.28, 0.44, 0.5, 0.008, 0.225
     h = length / cells
     grid = Grid((cells, round(width / h), round(height / h)), h, (-length / 2, -width / 2, 0.0))
 

@@ -1,0 +1,301 @@
+"""An asset comes back as it was; a folder that is not ours, a broken disk or a hostile asset is refused."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+
+import numpy as np
+import pytest
+import trimesh
+
+from fluidlift.errors import InputRejected
+from fluidlift.io import asset_folder as af
+from fluidlift.io.atomic import atomic_path
+from fluidlift.io.export_mesh import write_glb, write_obj
+from fluidlift.types import FluidAsset, TriangleMesh
+
+
+def assert_same(a: FluidAsset, b: FluidAsset) -> None:
+    """Everything equal; what goes through the splat file up to float32's logarithms."""
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        np.testing.assert_allclose(getattr(a.rest, name), getattr(b.rest, name), rtol=2e-6, atol=2e-6)
+    for x, y in zip(a.velocity.components, b.velocity.components):
+        np.testing.assert_array_equal(x, y)
+    np.testing.assert_array_equal(a.cell_types, b.cell_types)
+    np.testing.assert_array_equal(a.terrain.signed_distance, b.terrain.signed_distance)
+    np.testing.assert_array_equal(a.terrain.mesh.vertices, b.terrain.mesh.vertices)
+    np.testing.assert_array_equal(a.terrain.mesh.faces, b.terrain.mesh.faces)
+    np.testing.assert_array_equal(a.terrain.mesh.colors, b.terrain.mesh.colors)
+    assert a.camera.to_dict() == b.camera.to_dict()
+    np.testing.assert_array_equal(a.world_from_canonical.translation, b.world_from_canonical.translation)
+    for name in ("kind", "grid", "parameters", "estimates", "interval", "frame_count", "provenance"):
+        assert getattr(a, name) == getattr(b, name)
+    assert a.terrain.grid == b.terrain.grid and a.world_from_canonical.scale == b.world_from_canonical.scale
+
+
+@pytest.fixture
+def folder(tmp_path, asset):
+    """A saved asset."""
+    return af.save_asset(tmp_path / "river.fluid", asset, warnings=["metric scale is a guess"], timings={"read": 0.5})
+
+
+def test_an_asset_comes_back(folder, asset):
+    assert_same(af.load_asset(folder), asset)
+    manifest = af.read_manifest(folder)
+    assert manifest["warnings"] == ["metric scale is a guess"] and manifest["timings"] == {"read": 0.5}
+    for file in manifest["files"].values():
+        assert (folder / file).is_file()
+    assert set(af.FILES.values()) == set(manifest["files"].values())
+    assert not [p for p in folder.rglob("*") if ".part" in p.name]
+
+
+def test_the_manifest_tells_nothing_about_the_machine(folder):
+    assert str(folder.parent) not in (folder / "manifest.json").read_text()
+
+
+def test_an_unknown_sigma_is_null_in_the_file_and_infinite_in_memory(folder):
+    data = json.loads((folder / "parameters.json").read_text())
+    assert data["estimates"]["density"]["sigma"] is None
+    assert af.load_asset(folder).estimates["density"].sigma == np.inf
+
+
+def test_saving_again_keeps_the_scene_that_a_person_edited(folder, asset):
+    (folder / "scene.yaml").write_text("parameters: {kinematic_viscosity: 1e-3}\n")
+    af.save_asset(folder, asset)
+    assert af.read_scene(folder) == {"parameters": {"kinematic_viscosity": 1e-3}}
+
+
+def test_the_first_scene_changes_nothing(folder):
+    assert all(not value for value in af.read_scene(folder).values())
+
+
+@pytest.mark.parametrize("text", ["a: [", "- 1\n- 2\n", "a: &x [1]\nb: *x\n", "a: !!python/object:os.system {}\n"])
+def test_broken_and_hostile_scenes_are_refused(folder, text):
+    (folder / "scene.yaml").write_text(text)
+    with pytest.raises(InputRejected, match=r"scene\.yaml"):
+        af.read_scene(folder)
+
+
+def test_the_manifest_can_be_extended(folder):
+    af.update_manifest(folder, files={"preview": "preview.mp4"}, metrics={"psnr": np.float32(30)}, warnings=["a"])
+    manifest = af.read_manifest(folder)
+    assert manifest["files"]["preview"] == "preview.mp4" and manifest["files"]["camera"] == "rest/camera.json"
+    assert manifest["metrics"] == {"psnr": 30.0} and manifest["warnings"] == ["a"]
+    with pytest.raises(InputRejected, match="inside its own folder"):
+        af.update_manifest(folder, files={"preview": "../preview.mp4"})
+
+
+def _change(folder, name: str, **values) -> None:
+    data = json.loads((folder / name).read_text())
+    data.update(values)
+    (folder / name).write_text(json.dumps(data))
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["/etc/passwd", "../secret.ply", "rest/../../secret.ply", "C:\\secret.ply", "C:secret.ply", "\\\\host\\a",
+     "rest\\..\\..\\a", ""],
+)  # fmt: skip
+def test_files_outside_the_folder_are_refused(folder, name):
+    files = json.loads((folder / "manifest.json").read_text())["files"] | {"gaussians": name}
+    _change(folder, "manifest.json", files=files)
+    with pytest.raises(InputRejected):
+        af.load_asset(folder)
+
+
+def test_links_are_refused(folder, tmp_path):
+    target = tmp_path / "secret.ply"
+    os.replace(folder / "rest/gaussians.ply", target)
+    (folder / "rest/gaussians.ply").symlink_to(target)
+    with pytest.raises(InputRejected, match="link"):
+        af.load_asset(folder)
+
+
+def test_a_linked_folder_inside_is_refused(folder, tmp_path):
+    os.replace(folder / "rest", tmp_path / "rest")
+    (folder / "rest").symlink_to(tmp_path / "rest")
+    with pytest.raises(InputRejected, match="link"):
+        af.load_asset(folder)
+
+
+def test_a_newer_format_is_refused(folder):
+    _change(folder, "manifest.json", format_version=99)
+    with pytest.raises(InputRejected, match="update fluidlift"):
+        af.load_asset(folder)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"kind": "lava"}, {"frame_interval": 0}, {"frame_interval": "fast"}, {"format": "another"},
+        {"grid": {"shape": [6, 5], "spacing": 0.1, "origin": [0, 0, 0]}}, {"files": {}},
+        {"grid": {"shape": [6, 5, 9], "spacing": 0.1, "origin": [0, 0, 0]}},
+    ],
+)  # fmt: skip
+def test_a_manifest_that_makes_no_sense_is_refused(folder, change):
+    _change(folder, "manifest.json", **change)
+    with pytest.raises(InputRejected):
+        af.load_asset(folder)
+
+
+def test_an_oversize_manifest_is_refused_before_it_is_read(folder):
+    with (folder / "manifest.json").open("ab") as file:
+        file.truncate(17 * 2**20)
+    with pytest.raises(InputRejected, match="at most"):
+        af.load_asset(folder)
+
+
+@pytest.mark.parametrize(
+    ("part", "value"), [("density", -1), ("density", "heavy"), ("restitution", 2), ("color", 3), ("gravity", [0, 1])]
+)
+def test_parameters_out_of_range_are_refused(folder, part, value):
+    data = json.loads((folder / "parameters.json").read_text())
+    data["values"][part] = value
+    (folder / "parameters.json").write_text(json.dumps(data))
+    with pytest.raises(InputRejected):
+        af.load_asset(folder)
+
+
+def test_pickles_are_refused(folder):
+    np.savez(
+        folder / "rest/velocity.npz", u=np.array([{}], object), v=np.zeros(1), w=np.zeros(1), cell_types=np.zeros(1)
+    )
+    with pytest.raises(InputRejected, match="cannot be read"):
+        af.load_asset(folder)
+
+
+@pytest.mark.parametrize("file", ["rest/velocity.npz", "rest/terrain.npz", "rest/gaussians.ply", "rest/camera.json"])
+def test_damaged_and_missing_parts_are_refused(folder, file):
+    data = (folder / file).read_bytes()
+    (folder / file).write_bytes(data[: len(data) // 2])
+    with pytest.raises(InputRejected):
+        af.load_asset(folder)
+    (folder / file).unlink()
+    with pytest.raises(InputRejected):
+        af.load_asset(folder)
+
+
+def test_a_folder_that_is_no_asset_is_refused(tmp_path):
+    with pytest.raises(InputRejected, match="not a fluidlift asset"):
+        af.load_asset(tmp_path)
+
+
+def test_output_goes_to_new_empty_or_own_folders_only(tmp_path, folder):
+    assert af.check_output_folder(tmp_path / "new.fluid") == tmp_path / "new.fluid"
+    (tmp_path / "empty").mkdir()
+    af.check_output_folder(tmp_path / "empty")
+    af.check_output_folder(folder)
+    af.save_stage(tmp_path / "begun", "read", "k", {}, {})
+    af.check_output_folder(tmp_path / "begun")  # a run that was killed before its manifest
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos/manifest.json").write_text('{"name": "a web app"}')
+    (tmp_path / "work-of-others/work").mkdir(parents=True)
+    (tmp_path / "file").write_text("x")
+    (tmp_path / "broken").symlink_to(tmp_path / "nowhere")
+    for name in ("photos", "work-of-others", "file", "broken"):
+        with pytest.raises(InputRejected):
+            af.check_output_folder(tmp_path / name)
+
+
+def test_a_fluid_without_terrain_faces_can_be_saved(tmp_path, asset):
+    from dataclasses import replace
+
+    nothing = TriangleMesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int64))
+    bare = replace(asset, terrain=replace(asset.terrain, mesh=nothing))
+    back = af.load_asset(af.save_asset(tmp_path / "a.fluid", bare))
+    assert len(back.terrain.mesh.faces) == 0 and back.terrain.mesh.colors is None
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path):
+    path = tmp_path / "a.bin"
+    with af.atomic_write(path) as file:
+        file.write(b"old")
+    with pytest.raises(RuntimeError), af.atomic_write(path) as file:
+        file.write(b"new")
+        raise RuntimeError("broke")
+    assert path.read_bytes() == b"old" and [p.name for p in tmp_path.iterdir()] == ["a.bin"]
+    with atomic_path(tmp_path / "b.usdc") as name:
+        assert name.suffix == ".usdc"
+        name.write_bytes(b"x")
+    assert (tmp_path / "b.usdc").read_bytes() == b"x"
+
+
+@pytest.mark.parametrize(("number", "word"), [(errno.ENOSPC, "disk full"), (errno.EACCES, "cannot be written")])
+def test_disk_errors_say_what_to_do(tmp_path, number, word):
+    with pytest.raises(InputRejected, match=word), af.atomic_write(tmp_path / "a.bin"):
+        raise OSError(number, os.strerror(number))
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(FileNotFoundError), af.disk_errors("a"):
+        raise FileNotFoundError("something else is not hidden")
+
+
+def test_too_little_space_is_noticed_before_the_work(tmp_path):
+    af.require_free_space(tmp_path / "not" / "yet", 1)
+    with pytest.raises(InputRejected, match="MB free"):
+        af.require_free_space(tmp_path, 10**18)
+
+
+def test_stage_results_come_back(tmp_path):
+    arrays = {
+        "flow": np.arange(6, dtype=np.float16).reshape(2, 3),
+        "mask": np.array([True, False]),
+        "file": np.zeros(0),
+    }
+    af.save_stage(tmp_path, "motion", "abc123", arrays, {"psnr": np.float64(3.5), "names": ("a", "b"), "bad": np.nan})
+    found, meta = af.load_stage(tmp_path, "motion", "abc123")
+    assert set(found) == set(arrays) and meta == {"psnr": 3.5, "names": ["a", "b"], "bad": None}
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(found[name], array)
+        assert found[name].dtype == array.dtype
+    assert af.load_stage(tmp_path, "motion", "other") is None
+    assert af.load_stage(tmp_path, "shape", "abc123") is None
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".json"])
+@pytest.mark.parametrize("damage", ["cut", "flip", "gone", "empty"])
+def test_damaged_caches_count_as_absent(tmp_path, suffix, damage):
+    af.save_stage(tmp_path, "s", "k", {"a": np.arange(1000.0)}, {})
+    path = tmp_path / "work" / "s" / f"k{suffix}"
+    data = path.read_bytes()
+    if damage == "gone":
+        path.unlink()
+    else:
+        middle = len(data) // 2
+        flipped = data[:middle] + bytes([data[middle] ^ 0xFF]) + data[middle + 1 :]
+        path.write_bytes({"cut": data[:middle], "flip": flipped, "empty": b""}[damage])
+    assert af.load_stage(tmp_path, "s", "k") is None
+
+
+def test_only_the_last_results_of_a_stage_are_kept(tmp_path):
+    for i in range(4):
+        af.save_stage(tmp_path, "s", f"k{i}", {"a": np.zeros(1)}, {})
+        os.utime(tmp_path / "work" / "s" / f"k{i}.json", (i, i))
+    assert [af.load_stage(tmp_path, "s", f"k{i}") is not None for i in range(4)] == [False, False, True, True]
+    assert len(list((tmp_path / "work" / "s").iterdir())) == 4
+
+
+def test_stage_names_cannot_lead_elsewhere(tmp_path):
+    for stage, key in (("../x", "k"), ("s", "a/b"), ("", "k")):
+        with pytest.raises(ValueError, match="letters and digits"):
+            af.load_stage(tmp_path, stage, key)
+    with pytest.raises(ValueError, match="numbers"):
+        af.save_stage(tmp_path, "s", "k", {"a": np.array([{}], object)}, {})
+
+
+def test_the_terrain_glb_is_y_up_and_keeps_its_size(tmp_path, mesh):
+    loaded = trimesh.load(write_glb(tmp_path / "t.glb", mesh), force="mesh", process=False)
+    x, y, z = mesh.vertices.T
+    np.testing.assert_allclose(loaded.vertices, np.stack([x, z, -y], axis=-1), atol=1e-6)
+    assert loaded.volume == pytest.approx(1.0, rel=1e-6)  # positive: the faces still look outwards (1 * 2 * 3 / 6)
+    grey = loaded.visual.vertex_colors[3, 0] / 255
+    assert grey == pytest.approx(0.214, abs=0.003)  # sRGB 0.5 in linear light, 8 bits
+    with pytest.raises(ValueError, match="empty mesh"):
+        write_glb(tmp_path / "e.glb", TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), int)))
+
+
+def test_the_obj_is_z_up(tmp_path, mesh):
+    loaded = trimesh.load(write_obj(tmp_path / "t.obj", mesh), process=False, maintain_order=True)
+    np.testing.assert_allclose(loaded.vertices, mesh.vertices)
+    np.testing.assert_array_equal(loaded.faces, mesh.faces)

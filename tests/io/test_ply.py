@@ -1,0 +1,140 @@
+"""Splats, points and meshes survive a round trip through PLY, and bad files are refused before memory is taken."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fluidlift.errors import InputRejected
+from fluidlift.io.export_sequence import write_mesh_sequence, write_splat_sequence, write_volume_sequence
+from fluidlift.io.frames import FluidFrame
+from fluidlift.io.ply import AXES, read_gaussians, read_mesh, read_splats, write_gaussians, write_mesh, write_points
+from fluidlift.io.volume_grid import VolumeGrid
+from fluidlift.numerics import harmonics
+from fluidlift.types import Gaussians
+
+
+@pytest.mark.parametrize("coefficients", [1, 4, 9, 16])
+@pytest.mark.parametrize("axes", list(AXES))
+def test_splats_come_back(tmp_path, gaussians, coefficients, axes):
+    g = gaussians(50, coefficients)
+    velocities = np.random.default_rng(1).normal(size=(50, 3)).astype(np.float32)
+    path = write_gaussians(tmp_path / "a.ply", g, ids=np.arange(50) * 3, velocities=velocities, axes=axes)
+    back = read_splats(path)
+    for name in ("means", "scales", "opacities", "sh"):  # float32 through log, exp and a rotation
+        np.testing.assert_allclose(getattr(back.gaussians, name), getattr(g, name), rtol=2e-5, atol=2e-6)
+    np.testing.assert_allclose(back.gaussians.covariances(), g.covariances(), atol=1e-8)
+    np.testing.assert_array_equal(back.extras["id"], np.arange(50) * 3)
+    np.testing.assert_allclose(np.stack([back.extras[v] for v in ("vx", "vy", "vz")], -1), velocities, atol=1e-6)
+
+
+def test_the_file_is_the_one_that_splat_viewers_read(tmp_path, gaussians):
+    g = gaussians(2, 4)
+    data = write_gaussians(tmp_path / "a.ply", g).read_bytes()
+    header, body = data.split(b"end_header\n", 1)
+    names = [line.split()[-1].decode() for line in header.splitlines() if line.startswith(b"property float")]
+    expected = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"] + [f"f_rest_{i}" for i in range(9)]
+    assert names == [*expected, "opacity", *(f"scale_{a}" for a in range(3)), *(f"rot_{a}" for a in range(4))]
+    row = dict(zip(names, np.frombuffer(body, "<f4", len(names))))
+    assert row["scale_1"] == pytest.approx(np.log(g.scales[0, 1]), rel=1e-6)
+    assert row["opacity"] == pytest.approx(np.log(g.opacities[0] / (1 - g.opacities[0])), rel=1e-4)
+    assert row["rot_0"] == pytest.approx(g.quats[0, 0])
+    assert row["f_rest_3"] == pytest.approx(g.sh[0, 1, 1])  # green begins after the three coefficients of red
+
+
+def test_a_turned_frame_shows_the_same_colours_from_the_same_side(tmp_path, gaussians):
+    g = gaussians(20, 16)
+    data = write_gaussians(tmp_path / "a.ply", g, axes="y_down").read_bytes().replace(b"axes y_down", b"axes z_up  ")
+    (tmp_path / "b.ply").write_bytes(data)
+    turned = read_gaussians(tmp_path / "b.ply")  # taken as it stands in the file
+    directions = np.random.default_rng(2).normal(size=(20, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    here = np.einsum("nk,nkc->nc", harmonics.basis(directions, 3), g.sh)
+    there = np.einsum("nk,nkc->nc", harmonics.basis(directions @ AXES["y_down"].T, 3), turned.sh)
+    np.testing.assert_allclose(there, here, atol=1e-5)  # float32 sums of 16 terms
+    np.testing.assert_allclose(turned.means[:, 1], -g.means[:, 2], atol=1e-6)  # up is minus y
+
+
+def test_opacities_of_0_and_1_stay_finite(tmp_path, gaussians):
+    g = gaussians(3)
+    g = Gaussians(g.means, g.quats, g.scales, np.array([0.0, 1.0, 0.5]), g.sh)
+    np.testing.assert_allclose(read_gaussians(write_gaussians(tmp_path / "a.ply", g)).opacities, [0, 1, 0.5], atol=2e-6)
+
+
+def test_no_splats_at_all_is_a_file_too(tmp_path):
+    assert len(read_gaussians(write_gaussians(tmp_path / "a.ply", Gaussians.empty()))) == 0
+
+
+def test_big_endian_files_are_read(tmp_path, gaussians):
+    g = gaussians(5, 1)
+    header, body = write_gaussians(tmp_path / "a.ply", g).read_bytes().split(b"end_header\n", 1)
+    swapped = np.frombuffer(body, "<f4").astype(">f4").tobytes()
+    (tmp_path / "b.ply").write_bytes(header.replace(b"little", b"big") + b"end_header\n" + swapped)
+    np.testing.assert_allclose(read_gaussians(tmp_path / "b.ply").means, g.means)
+
+
+def _bad_files(good: bytes) -> dict[str, tuple[bytes, str]]:
+    huge = good.replace(b"element vertex 50", b"element vertex 99999999999999")
+    ascii_header = good.replace(b"binary_little_endian", b"ascii")
+    return {
+        "too short": (good[:-10], "promises"),
+        "huge count": (huge, "promises"),
+        "negative count": (good.replace(b"vertex 50", b"vertex -5"), "cannot be understood"),
+        "text": (ascii_header, "binary PLY"),
+        "not ply": (b"hello", "not a PLY"),
+        "no end": (good[:200], "not a PLY"),
+        "unknown type": (good.replace(b"float opacity", b"quark opacity"), "cannot be understood"),
+        "other names": (good.replace(b"opacity", b"opaqueR"), "missing opacity"),
+        "not finite": (good[:-8] + np.float32([np.nan, np.nan]).tobytes(), "finite"),
+        "no properties": (b"ply\nformat binary_little_endian 1.0\nelement vertex 9\nend_header\n", "properties"),
+    }
+
+
+@pytest.mark.parametrize("case", list(_bad_files(b"")))
+def test_bad_files_are_refused(tmp_path, gaussians, case):
+    good = write_gaussians(tmp_path / "a.ply", gaussians(50, 1)).read_bytes()
+    data, reason = _bad_files(good)[case]
+    (tmp_path / "bad.ply").write_bytes(data)
+    with pytest.raises(InputRejected, match=reason):
+        read_gaussians(tmp_path / "bad.ply")
+
+
+def test_meshes_come_back(tmp_path, mesh):
+    back = read_mesh(write_mesh(tmp_path / "m.ply", mesh, velocities=np.ones((4, 3))))
+    np.testing.assert_array_equal(back.vertices, mesh.vertices)
+    np.testing.assert_array_equal(back.faces, mesh.faces)
+    np.testing.assert_allclose(back.colors, mesh.colors, atol=0.5 / 255 + 1e-6)  # 8 bits
+
+
+def test_meshes_with_wrong_indices_are_refused(tmp_path, mesh):
+    path = write_mesh(tmp_path / "m.ply", mesh)
+    path.write_bytes(path.read_bytes()[:-4] + np.int32(99).tobytes())
+    with pytest.raises(InputRejected, match="missing vertices"):
+        read_mesh(path)
+    path.write_bytes(path.read_bytes()[:-13] + b"\x04" + bytes(12))
+    with pytest.raises(InputRejected, match="triangles"):
+        read_mesh(path)
+
+
+def test_trimesh_reads_our_points_and_meshes(tmp_path, mesh):
+    trimesh = pytest.importorskip("trimesh")
+    loaded = trimesh.load(write_mesh(tmp_path / "m.ply", mesh), process=False)
+    np.testing.assert_array_equal(loaded.vertices, mesh.vertices)
+    np.testing.assert_array_equal(loaded.faces, mesh.faces)
+    cloud = trimesh.load(write_points(tmp_path / "p.ply", mesh.vertices, colors=mesh.colors))
+    np.testing.assert_array_equal(cloud.vertices, mesh.vertices)
+
+
+def test_sequences_begin_at_1001_and_keep_ids(tmp_path, gaussians, mesh):
+    frames = [FluidFrame(gaussians(5 + t), np.arange(5 + t) + t, np.zeros((5 + t, 3)), mesh) for t in range(3)]
+    written = write_splat_sequence(tmp_path / "splats", iter(frames))
+    assert [p.name for p in written] == ["1001.ply", "1002.ply", "1003.ply"]
+    np.testing.assert_array_equal(read_splats(written[2]).extras["id"], np.arange(7) + 2)
+    assert [p.name for p in write_mesh_sequence(tmp_path / "mesh", frames)] == [p.name for p in written]
+    grids = [[VolumeGrid("density", np.ones((4, 4, 4)), 0.1)]] * 2
+    assert [p.name for p in write_volume_sequence(tmp_path / "vdb", grids)] == ["1001.vdb", "1002.vdb"]
+
+
+def test_a_sequence_of_wrong_lengths_is_a_fault_of_the_caller(tmp_path, gaussians):
+    with pytest.raises(ValueError, match="ids"):
+        write_splat_sequence(tmp_path, [(gaussians(5), np.arange(4), np.zeros((5, 3)))])

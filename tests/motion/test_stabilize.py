@@ -1,0 +1,131 @@
+"""A camera that shakes, a clip that is cut, and fluids that must not pass for either."""
+
+import cv2
+import numpy as np
+import pytest
+
+from fluidlift.motion.stabilize import find_cuts, shake_and_drift, stabilise, unlike
+from fluidlift.types.clip import VideoClip
+
+FRAMES, HEIGHT, WIDTH = 14, 180, 240
+
+
+def scene(seed: int) -> np.ndarray:
+    """A still picture with detail at several scales, float32 [H+40,W+40]."""
+    rng = np.random.default_rng(seed)
+    size = (HEIGHT + 40, WIDTH + 40)
+    parts = [cv2.GaussianBlur(rng.normal(size=size).astype(np.float32), (0, 0), s) for s in (1.5, 4.0, 20.0)]
+    return 120.0 + sum(w * p / p.std() for w, p in zip((15.0, 25.0, 20.0), parts))
+
+
+def clip_of(grey: np.ndarray) -> VideoClip:
+    frames = np.clip(grey, 0, 255).round().astype(np.uint8)[..., None].repeat(3, axis=-1)
+    return VideoClip(frames, np.arange(len(frames)) / 25.0)
+
+
+def shaken(places: np.ndarray, seed: int = 0) -> np.ndarray:
+    """Views of one scene from a camera displaced by `places` [T,2] px."""
+    picture = scene(seed)
+    return np.stack(
+        [
+            cv2.warpAffine(
+                picture, np.float32([[1, 0, x - 20], [0, 1, y - 20]]), (WIDTH, HEIGHT), flags=cv2.INTER_CUBIC
+            )
+            for x, y in places
+        ]
+    )
+
+
+def flowing(grey: np.ndarray, *, speed: int = 4) -> np.ndarray:
+    """The same with a pattern that flows through 60% of the picture."""
+    result, pattern = grey.copy(), scene(99)[:HEIGHT, :WIDTH]
+    rows = slice(int(0.2 * HEIGHT), int(0.8 * HEIGHT))
+    for t in range(len(grey)):
+        result[t, rows] = np.roll(pattern, speed * t, axis=1)[rows]
+    return result
+
+
+def test_a_still_camera_is_left_alone():
+    clip = clip_of(shaken(np.zeros((FRAMES, 2))))
+    same, report = stabilise(clip)
+    assert same is clip and not report.stabilised
+    assert report.shake_px < 0.05 and report.drift_px < 0.05 and report.cuts == () and report.warnings == ()
+
+
+def test_a_mild_shake_is_measured_and_taken_out():
+    places = np.random.default_rng(1).normal(scale=1.2, size=(FRAMES, 2))
+    steady, report = stabilise(clip_of(shaken(places)))
+    true = np.percentile(np.linalg.norm(np.diff(places, axis=0), axis=1), 95)
+    assert report.stabilised
+    assert report.shake_px == pytest.approx(true, rel=0.1)  # feature tracking is good to about 0.1 px
+    _, after = stabilise(steady)
+    assert after.shake_px < 0.3, "what is left is below the level at which anything would be warped"
+
+
+def test_a_fluid_over_most_of_the_picture_does_not_pass_for_the_camera():
+    clip = clip_of(flowing(shaken(np.zeros((FRAMES, 2)))))
+    same, report = stabilise(clip)
+    assert same is clip and report.shake_px < 0.1
+
+
+def test_a_strong_motion_is_reported_and_not_warped():
+    places = np.stack([1.5 * np.arange(FRAMES), np.zeros(FRAMES)], axis=1) - 10.0
+    clip = clip_of(shaken(places))
+    same, report = stabilise(clip, max_correction_px=5.0)
+    assert same is clip and not report.stabilised
+    assert any("tripod" in warning for warning in report.warnings)
+    # the reference is the middle frame: 7 frames of 1.5 px to either side
+    assert report.drift_px == pytest.approx(10.5, abs=0.5)
+
+
+def test_without_features_the_camera_is_assumed_still_and_the_report_says_so():
+    black = np.zeros((FRAMES, HEIGHT, WIDTH), np.float32)
+    rows, columns = np.mgrid[0:HEIGHT, 0:WIDTH]
+    for t in range(FRAMES):
+        black[t] += 150.0 * np.exp(-((rows - 150 + 5 * t) ** 2 + (columns - 120) ** 2) / 300.0)
+    clip = clip_of(black)
+    same, report = stabilise(clip)
+    assert same is clip and report.shake_px == 0.0 and report.cuts == ()
+    assert any("assumed still" in warning for warning in report.warnings)
+
+
+def test_a_cut_is_found_at_the_first_frame_of_the_new_shot():
+    clip = clip_of(np.concatenate([shaken(np.zeros((8, 2)), 0), shaken(np.zeros((9, 2)), 5)]))
+    same, report = stabilise(clip)
+    assert report.cuts == (8,) and "frame 8" in report.warnings[0]
+    assert report.shake_px < 0.05, "the jump at the cut is no shake"
+    assert same is clip
+
+
+def test_flicker_flash_and_flow_are_no_cuts():
+    still = shaken(np.zeros((FRAMES, 2)))
+    flicker = still * (1.0 + 0.3 * np.sin(2.0 * np.arange(FRAMES)))[:, None, None]
+    flash = still.copy()
+    flash[6] = 255.0
+    for pictures in (flicker, flash, flowing(still, speed=9)):
+        assert find_cuts(list(np.clip(pictures, 0, 255).astype(np.uint8))) == ()
+
+
+def test_layouts_are_compared_without_their_brightness_and_contrast():
+    layout = np.random.default_rng(0).normal(100.0, 30.0, (18, 32)).astype(np.float32)
+    assert unlike(layout, 0.5 * layout + 40.0) == pytest.approx(0.0, abs=1e-5)
+    assert unlike(layout, 200.0 - layout) == pytest.approx(2.0, abs=1e-5)
+    assert unlike(np.full_like(layout, 9.0), np.full_like(layout, 10.0)) == 0.0
+
+
+def test_shake_counts_steps_and_drift_counts_distance():
+    motions = np.tile(np.eye(2, 3), (11, 1, 1))
+    motions[:, 0, 2] = 0.5 * (np.arange(11) - 5)
+    shake, drift = shake_and_drift(motions, 100, 80, ())
+    assert shake == pytest.approx(0.5) and drift == pytest.approx(2.5)
+    assert shake_and_drift(motions[:1], 100, 80, ()) == (0.0, 0.0)
+
+
+def test_a_clip_of_one_frame_passes_through():
+    clip = clip_of(shaken(np.zeros((1, 2))))
+    assert stabilise(clip)[0] is clip
+
+
+def test_a_limit_of_zero_is_an_error():
+    with pytest.raises(ValueError, match="max_correction_px"):
+        stabilise(clip_of(shaken(np.zeros((2, 2)))), max_correction_px=0.0)

@@ -1,6 +1,7 @@
 """The figures: by hand on small arrays, perfect for the truth itself, blind to the scale that one view cannot see."""
 
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -123,7 +124,7 @@ PERFECT = {
     "resimulation.ssim.predicted": 1, "resimulation.volume_drift": 0, "resimulation.leak_share": 0,
     "cost.seconds": 3, "cost.peak_memory": 2,
 }  # fmt: skip
-MANIFEST = {"timings": {"flow": 1.0, "fit": 2.0}, "peak_memory_bytes": 2 * 2**20}
+MANIFEST = {"timings": {"flow": 1.0, "fit": 2.0}, "metrics": {"peak_memory_mb": 2.0}}
 
 
 def check_perfect(sheet) -> None:
@@ -382,3 +383,21 @@ def test_a_link_in_place_of_a_file_is_rejected(tmp_path):
     (folder / "video.mp4").symlink_to(folder / "scene.json")
     with pytest.raises(InputRejected, match=r"video\.mp4"):
         read_case(folder)
+
+
+def shared_cases() -> Path:
+    root = Path(os.environ.get("FLUIDLIFT_SHARED", Path(__file__).resolve().parents[2] / "shared"))
+    return root / "cases"
+
+
+@pytest.mark.parametrize("name", ["river", "honey", "smoke"])
+def test_cases_of_another_simulator_are_read_and_agree_with_themselves(name):
+    folder = shared_cases() / name
+    if not folder.is_dir():
+        pytest.skip(f"no case '{name}': set FLUIDLIFT_SHARED to the folder that holds cases/")
+    case = read_case(folder)
+    assert (case.depth[case.mask] > 0).all() and not case.flow[~case.mask].any()
+    assert case.solids and case.occupied(0).any()
+    run = {"labels": case.mask.astype(np.uint8), "flow_raw": case.flow[:-1]}
+    sheet = evaluate_arrays(an_asset(), run, {}, case)
+    assert sheet["segmentation.iou"] == 1 and sheet["flow.raw.epe"] == 0

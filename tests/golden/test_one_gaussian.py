@@ -3,7 +3,7 @@
 import numpy as np
 
 from fluidlift.look.rasterize import render
-from fluidlift.numerics.splatting import ALPHA_MIN, BLUR
+from fluidlift.numerics.splatting_kernels import ALPHA_MIN, BLUR
 from fluidlift.types.camera import PinholeCamera
 from fluidlift.types.gaussians import Gaussians
 

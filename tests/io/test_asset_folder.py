@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import time
 
 import numpy as np
 import pytest
@@ -220,6 +221,15 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
         assert name.suffix == ".usdc"
         name.write_bytes(b"x")
     assert (tmp_path / "b.usdc").read_bytes() == b"x"
+
+
+def test_what_a_killed_run_left_is_removed_after_a_day(tmp_path):
+    for name, age in ((".a.1.part.bin", 2 * 86400), (".a.2.part.bin", 60), (".b.1.part.bin", 2 * 86400)):
+        (tmp_path / name).write_bytes(b"x")
+        os.utime(tmp_path / name, (time.time() - age,) * 2)
+    with af.atomic_write(tmp_path / "a.bin") as file:
+        file.write(b"new")
+    assert sorted(p.name for p in tmp_path.iterdir()) == [".a.2.part.bin", ".b.1.part.bin", "a.bin"]
 
 
 @pytest.mark.parametrize(("number", "word"), [(errno.ENOSPC, "disk full"), (errno.EACCES, "cannot be written")])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fluidlift.errors import InputRejected
-from fluidlift.io.images import read_camera, read_depth, read_distortion, read_mask, undistort_clip
+from fluidlift.io.images import read_camera, read_depth, read_distortion, read_mask, undistort_clip, undistort_mask
 from fluidlift.io.limits import ReadLimits
 from fluidlift.io.pictures import read_picture, write_png
 from fluidlift.types import PinholeCamera, VideoClip
@@ -175,6 +175,8 @@ def test_straight_lines_are_straight_after_the_lens_is_corrected(tmp_path):
     columns = slice(20, 300)
     found = (flat * rows).sum(0)[columns] / flat.sum(0)[columns]
     assert np.abs(found - expected).max() < 0.2  # a soft line 11 px wide: the centroid suffers only from rounding
+    mask = undistort_mask(picture[..., 0] > 127, camera, read_distortion(tmp_path / "c.json"))
+    np.testing.assert_array_equal(np.abs(rows - expected)[mask.any(axis=1)] < 4, True)  # the line, half as high: 5.5 px
     bent = (picture[..., 0] * rows).sum(0)[columns] / picture[..., 0].astype(float).sum(0)[columns]
     assert np.abs(bent - expected).max() > 3.0
 

@@ -226,6 +226,12 @@ def test_one_picture_is_refused(tmp_path, clip_frames):
     rejected(write_png(tmp_path / "a.png", clip_frames(1)[0]), "one picture", "folder")
 
 
+def test_an_unknown_codec_is_refused(make_video):
+    path = make_video()
+    path.write_bytes(path.read_bytes().replace(b"avc1", b"zzz9").replace(b"avcC", b"zzzC"))
+    rejected(path, "codec")
+
+
 def test_sound_alone_is_refused(tmp_path):
     path = tmp_path / "a.mp4"
     with av.open(str(path), "w") as container:

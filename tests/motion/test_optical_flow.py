@@ -99,11 +99,12 @@ def test_the_mean_counts_only_frames_inside_the_mask() -> None:
 
 
 def test_progress_and_an_estimator_of_ones_own() -> None:
-    frames = np.repeat(texture(32, 32)[None], 4, axis=0)
+    frames = np.repeat(texture(64, 64)[None], 4, axis=0)
     seen: list[tuple[int, int]] = []
     flow = estimate_flow(frames, method=Farneback(), progress=lambda done, total: seen.append((done, total)))
     assert seen == [(1, 3), (2, 3), (3, 3)]
-    assert np.abs(flow.displacement).max() < 0.05  # nothing moves
+    # nothing moves; polynomials fitted over the border of the picture drift a little there
+    assert np.abs(flow.displacement[:, 16:-16, 16:-16]).max() < 0.05
 
 
 def test_wrong_input_is_named() -> None:

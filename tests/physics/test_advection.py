@@ -127,5 +127,5 @@ def test_single_precision_kernel_follows_double_precision():
 
 
 def test_an_unknown_gradient_is_refused():
-    with pytest.raises(ValueError, match="exact, upwind or plain|'exact', 'upwind' or 'plain'"):
+    with pytest.raises(ValueError, match="gradient 'magic'"):
         advect(random_faces(), 0.1, spacing=H, gradient="magic")

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numba
 import numpy as np
 import pytest
 import torch
@@ -26,6 +27,17 @@ WATER = FluidParameters(
     kinematic_viscosity=3e-3, gravity=(0.8, 0.1, -9.0), inflow_velocity=(1.0, 0.1, 0.0), inflow_fluctuation=0.1,
     outflow_velocity=0.9, restitution=0.3, wall_damping=0.2, time_step=0.02,
 )  # fmt: skip
+
+
+@pytest.fixture(autouse=True, scope="module")
+def single_thread():
+    """Small arrays, torch and Numba in turn: their thread pools would only wait for each other."""
+    before = numba.get_num_threads(), torch.get_num_threads()
+    numba.set_num_threads(1)
+    torch.set_num_threads(1)
+    yield
+    numba.set_num_threads(before[0])
+    torch.set_num_threads(before[1])
 
 
 def channel(shape=(9, 6, 5), depth=4):
@@ -59,14 +71,12 @@ def test_a_pool_at_rest_stays_at_rest_under_gravity():
     types = np.full((6, 5, 5), CellType.EMPTY, np.uint8)
     types[:, :, :3] = CellType.FLUID
     domain = domain_of(types)
-    still = parameters_of(FluidParameters(time_step=0.05, restitution=0.5))
+    still = parameters_of(FluidParameters(time_step=0.05, restitution=0.5, kinematic_viscosity=0.0))
     result = rollout(torch.zeros(domain.offsets[3], dtype=torch.float64), domain, still, steps=5, options=EXACT)
     # what gravity adds in one step is 0.49 m/s; the pressure takes it back to the solver's tolerance
     assert float(result.velocity.abs().max()) < 1e-9
-    depth = 2.5 * H
-    # hydrostatic, against p = 0 in the centre of the first air cell
-    expected = 1000 * 9.81 * (depth + 0.5 * H)
-    assert result.pressure(still)[3, 2, 0] == pytest.approx(expected, rel=1e-6)
+    # hydrostatic below a surface on the faces between the cells (face fractions are single precision)
+    assert result.pressure(still)[3, 2, 0] == pytest.approx(1000 * 9.81 * 2.5 * H, rel=1e-6)
 
 
 def test_a_channel_with_open_ends_accelerates_freely_along_gravity():
@@ -79,6 +89,32 @@ def test_a_channel_with_open_ends_accelerates_freely_along_gravity():
     middle = result.faces()[0][4, 2, 2]
     # ends and surface at p = 0 and no friction: nothing holds the fluid back, dv = g dt
     assert float(middle) == pytest.approx(4 * 0.01 * 2.0, rel=1e-6)
+
+
+def test_the_pressure_operator_is_minus_divergence_of_gradient():
+    domain = domain_of(channel())
+    rng = np.random.default_rng(2)
+    q = np.where(domain.system.unknown, rng.standard_normal(domain.shape), 0.0)
+    product = -(domain.divergence.matrix @ (domain.gradient.matrix @ q.ravel())).reshape(domain.shape)
+    # weights of the system are single precision
+    np.testing.assert_allclose(product, domain.system.apply(q), atol=1e-4 * np.abs(product).max())
+
+
+def test_a_sloping_surface_along_gravity_stays_nearly_at_rest():
+    """Stairs of cells under gravity tilted by 14 degrees, so that the surface is level: with p = 0 in cell centres each
+    stair pushes with up to g; the blurred surface leaves a tenth of what a flat layout would suffer."""
+    types = np.full((24, 3, 14), CellType.EMPTY, np.uint8)
+    x, z = np.meshgrid(np.arange(24) + 0.5, np.arange(14) + 0.5, indexing="ij")
+    types[np.broadcast_to((z < 10 - 0.25 * x)[:, None, :], types.shape)] = CellType.FLUID
+    domain = domain_of(types)
+    pull = 9.81 / np.hypot(1, 0.25)
+    tilted = FluidParameters(gravity=(-0.25 * pull, 0.0, -pull), kinematic_viscosity=0.0, time_step=0.01)
+    still = torch.zeros(domain.offsets[3], dtype=torch.float64)
+    moved = rollout(still, domain, parameters_of(tilted), steps=1, options=EXACT).velocity
+    inside = torch.from_numpy(domain.dynamic)
+    residual_acceleration = float(moved[inside].abs().mean()) / 0.01
+    print(f"mean residual acceleration {residual_acceleration:.3f} m/s2")
+    assert residual_acceleration < 0.1 * 9.81
 
 
 def test_density_does_not_move_the_fluid_and_scales_the_pressure():
@@ -94,8 +130,8 @@ def test_a_rollout_is_free_of_divergence_and_leaves_walls_closed():
     domain = domain_of(channel(), mainstream=DOWNSTREAM)
     result = rollout(random_start(domain), domain, parameters_of(WATER), steps=3, options=EXACT)
     divergence = domain.divergence.matrix @ result.velocity.numpy()
-    # against velocities of 1 m/s over cells of 0.1 m
-    assert np.abs(divergence).max() < 1e-8
+    # the weights are single precision: 6e-8 of pressure corrections of some m/s over cells of 0.1 m
+    assert np.abs(divergence).max() < 1e-5
     u = result.faces()[0]
     assert float(u[4, 2, 1]) == 0.0
     assert float(u[1, 2, 2]) == 1.0

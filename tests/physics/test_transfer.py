@@ -78,7 +78,8 @@ def grid_angular_momentum(velocity, masses):
 
 
 def particle_angular_momentum(particles):
-    m, x, v, c = (np.float64(a) for a in (particles.masses, particles.positions, particles.velocities, particles.affine))
+    p = particles
+    m, x, v, c = (np.float64(a) for a in (p.masses, p.positions, p.velocities, p.affine))
     own = 0.25 * GRID.spacing**2 * np.stack(
         [c[:, 2, 1] - c[:, 1, 2], c[:, 0, 2] - c[:, 2, 0], c[:, 1, 0] - c[:, 0, 1]], axis=-1
     )

@@ -6,6 +6,7 @@ import torch
 from fluidlift.shape.losses import (
     LossWeights,
     anisotropy_loss,
+    depth_loss,
     image_loss,
     luminance_loss,
     scale_loss,
@@ -73,3 +74,14 @@ def test_the_scale_term_is_the_mean_geometric_mean():
 def test_only_oversaturated_colours_cost():
     rgb = torch.tensor([[0.0, 0.5, 1.0], [1.2, 0.5, -0.1]])
     torch.testing.assert_close(luminance_loss((rgb - 0.5) / SH_C0), torch.tensor((0.2**2 + 0.1**2) / 6))
+
+
+def test_depth_costs_where_it_is_known_and_covered():
+    before = torch.tensor([[2.0, float("nan")]])
+    light = torch.tensor([[0.5, 0.0]], requires_grad=True)
+    drawn = torch.tensor([[1.0, 7.0]], requires_grad=True)
+    assert depth_loss(drawn, light, before, 0.1) == 0, "half covered at depth 2 composites to 1"
+    cost = depth_loss(drawn + 0.05, light, before, 0.1)
+    torch.testing.assert_close(cost, torch.tensor(0.5))
+    g = torch.autograd.grad(cost, (drawn, light))
+    assert all(torch.isfinite(x).all() for x in g) and g[0][0, 1] == 0

@@ -1,5 +1,7 @@
 """What counts as fluid: change that goes somewhere, against the clip's own noise."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -7,7 +9,7 @@ from scipy.ndimage import gaussian_filter
 
 from fluidlift.errors import InputRejected
 from fluidlift.shape.background import without_background
-from fluidlift.shape.evidence import gather_evidence, noise_map, separating_level
+from fluidlift.shape.evidence import fluid_score, gather_evidence, noise_map, separating_level
 from fluidlift.shape.segment import (
     Label,
     at_full_size,
@@ -147,7 +149,7 @@ def swaying(rng: np.random.Generator) -> tuple[np.ndarray, PixelFlow]:
     where = 2.0 * np.sin(1.3 * np.arange(FRAMES))
     for t in range(FRAMES):
         moved = cv2.warpAffine(leaf, np.float32([[1, 0, where[t]], [0, 1, 0]]), (WIDTH, HEIGHT))
-        pictures[t][area] = (np.array([50.0, 110.0, 40.0]) + 10.0 * moved[..., None])[area]
+        pictures[t][area] = (np.array([50.0, 110.0, 40.0]) + 40.0 * moved[..., None])[area]
     flow.displacement[:, area[0], area[1], 0] = np.diff(where)[:, None, None]
     return pictures, flow
 
@@ -160,8 +162,13 @@ def test_motion_that_goes_nowhere_counts_as_swaying_and_the_stream_does_not():
     assert float(np.median(evidence.streaming[45:85, 10:60])) > 0.8
 
 
-def test_a_leaf_that_sways_scores_below_the_stream_by_more_than_its_activity_does():
+def test_a_leaf_that_sways_is_background_though_it_changes():
     pictures, flow = swaying(np.random.default_rng(8))
+    evidence = gather_evidence(clip_of(pictures), flow)
+    leaf = (slice(10, 25), slice(30, 110))
+    # by its activity alone the leaf would pass for fluid: it is the swaying that tells
+    assert float(np.median(fluid_score(replace(evidence, swaying=0.0 * evidence.swaying))[leaf])) > 0.0
+    assert float(np.median(fluid_score(evidence)[leaf])) < 0.0
     labels = segment(clip_of(pictures), flow)
     assert labels.fluid[0][45:85, 10:60].mean() > 0.95
     assert labels.fluid[0][10:25, 30:110].mean() < 0.1

@@ -30,7 +30,7 @@ def _seconds(entry: Any) -> float | None:
 
 
 def score_cost(manifest: Mapping[str, Any]) -> list[Figure]:
-    """Seconds per stage (`timings`) and peak memory (`peak_memory_bytes`, of the manifest or of its `metrics`)."""
+    """Seconds per stage (`timings`) and peak memory (`peak_memory_mb`, of its `metrics`)."""
     timings = manifest.get("timings")
     stages = {str(k): _seconds(v) for k, v in timings.items()} if isinstance(timings, Mapping) else {}
     known = {k: v for k, v in stages.items() if v is not None}
@@ -38,10 +38,10 @@ def score_cost(manifest: Mapping[str, Any]) -> list[Figure]:
     total = known.get("total", sum(known.values())) if known else None
     out.append(figure("cost.seconds", total, "s", "all stages" if known else "the manifest has no timings"))
     metrics = manifest.get("metrics")
-    peak = manifest.get("peak_memory_bytes", metrics.get("peak_memory_bytes") if isinstance(metrics, Mapping) else None)
+    peak = metrics.get("peak_memory_mb") if isinstance(metrics, Mapping) else None
     if isinstance(peak, int | float):
-        return [*out, figure("cost.peak_memory", peak / 2**20, "MiB")]
-    return [*out, figure("cost.peak_memory", None, "MiB", "not in the manifest")]
+        return [*out, figure("cost.peak_memory", peak, "MB")]
+    return [*out, figure("cost.peak_memory", None, "MB", "not in the manifest")]
 
 
 def evaluate_arrays(

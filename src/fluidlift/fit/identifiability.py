@@ -22,6 +22,8 @@ from fluidlift.types import Estimate
 
 IDENTIFIABLE_BELOW = 0.5
 """share of the prior's standard deviation below which the data are said to determine a parameter"""
+EXCLUDED_BEYOND = 2.5
+"""posterior standard deviations between the minimum and the prior beyond which the prior is excluded"""
 MODEL_ERROR = 0.01
 """root mean square misfit, relative to U, that no fit is trusted beyond (discretisation)"""
 
@@ -98,16 +100,25 @@ class Curvature:
         return np.linalg.inv(data + np.diag(1 / prior_sigma[fitted] ** 2))
 
 
-def determined(curvature: Curvature, prior_sigma: Float[np.ndarray, "p"]) -> Bool[np.ndarray, "p"]:
-    """Which raw variables the data determine.
+def determined(
+    curvature: Curvature, prior_sigma: Float[np.ndarray, "p"], displacement: Float[np.ndarray, "p"] | None = None
+) -> Bool[np.ndarray, "p"]:
+    """Which raw variables the data determine: clearly narrower than the prior, or clearly not at the prior.
 
     Where two variables are tied, each alone is undetermined, but fixing one determines the other. So the worst one is
-    given up first and the rest judged again, until each remaining one is clearly below its prior's width.
+    given up first and the rest judged again.
+
+    Args:
+        curvature: of all variables.
+        prior_sigma: widths of the priors.
+        displacement: raw distance of the minimum from the prior's centre. More than `EXCLUDED_BEYOND` posterior widths
+            mean that the data exclude the prior, even where they only bound the variable loosely.
     """
+    moved = np.zeros(len(prior_sigma)) if displacement is None else np.abs(displacement)
     keep = np.diag(curvature.normal) > 0
     while keep.any():
         sigma = np.sqrt(np.diag(curvature.covariance(prior_sigma, keep)))
-        ratio = sigma / prior_sigma[keep]
+        ratio = np.where(moved[keep] > EXCLUDED_BEYOND * sigma, 0.0, sigma / prior_sigma[keep])
         if ratio.max() < IDENTIFIABLE_BELOW:
             break
         keep[np.flatnonzero(keep)[ratio.argmax()]] = False

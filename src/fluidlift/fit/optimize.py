@@ -37,6 +37,8 @@ DEFAULT_FREE = (
 """The paper's without the time step: the interval between frames is known, and its division into steps is a choice."""
 MOST_CELLS = 60_000
 """layouts with more cells are coarsened by two, as often as needed"""
+BUOYANCY_SIGMA = 1.0
+"""prior width of a plume's buoyancy, in units of its scale estimate"""
 PLANNED_ITERATIONS = 7
 """Levenberg-Marquardt iterations that the number of windows leaves time for"""
 
@@ -124,14 +126,18 @@ def fit_parameters(
     with _single_thread():
         begun = time.monotonic()
         scene = _scene(targets, layouts, system_or_terrain, grid, kind, mainstream, notes)
-        plan = plan_windows(scene, interval, windows=windows, steps_per_frame=steps_per_frame, frames=frames_per_window)
+        prior, sigmas = boundary_prior(scene, initial), dict(prior_sigmas or {})
+        if kind == "plume":
+            prior, sigmas = _buoyancy_prior(prior, scene), {"gravity": BUOYANCY_SIGMA} | sigmas
+        fall = math.hypot(*prior.gravity)
+        plan = plan_windows(
+            scene, interval, windows=windows, steps_per_frame=steps_per_frame, frames=frames_per_window, fall=fall
+        )
         if plan.steady:
             notes.append("one target velocity: the flow is taken as steady")
-        prior = replace(boundary_prior(scene, initial), time_step=interval / plan.steps_per_frame)
-        if kind == "plume":
-            prior = _buoyancy_prior(prior, scene)
+        prior = replace(prior, time_step=interval / plan.steps_per_frame)
         space = parameter_space(
-            prior, free=tuple(free), speed=scene.speed, spacing=scene.grid.spacing, prior_sigmas=prior_sigmas
+            prior, free=tuple(free), speed=scene.speed, spacing=scene.grid.spacing, prior_sigmas=sigmas
         )
         problem = build_problem(scene, plan, weights=weights, options=options)
         budget = Budget(begun + max_seconds, max_rollouts, progress=progress)
@@ -222,7 +228,7 @@ def _fit(problem: FitProblem, space: ParameterSpace, budget: Budget, method: str
         notes.append("the budget ended before the first derivative: nothing was fitted")
         raw = space.prior_raw
         curvature = Curvature(np.zeros((len(raw), len(raw))), found.loss, 1.0)
-    keep = determined(curvature, space.prior_sigma)
+    keep = determined(curvature, space.prior_sigma, raw - space.prior_raw)
     held = {f.label for f, k in zip(space.fitted, keep) if not k}
     smaller, kept, final = space.keep_prior(held), curvature, found.loss
     if keep.any() and held:
@@ -251,6 +257,7 @@ def _fit(problem: FitProblem, space: ParameterSpace, budget: Budget, method: str
             "observations": kept.observations,
             "windows": float(len(problem.windows)),
             "steps_per_window": float(len(problem.windows[0].domains)),
+            "speed": problem.speed,
             "seconds": time.monotonic() - budget.started,
         },
     )

@@ -177,18 +177,26 @@ def _layout(
 
 
 def plan_windows(
-    scene: FitScene, interval: float, *, windows: int, steps_per_frame: int | None, frames: int | None = None
+    scene: FitScene,
+    interval: float,
+    *,
+    windows: int,
+    steps_per_frame: int | None = None,
+    frames: int | None = None,
+    fall: float = 0.0,
 ) -> WindowPlan:
     """Steps, length and starts of the windows from the dynamics of the targets.
 
-    A step moves the fast fluid by at most 1.5 cells (8 steps a frame at most). A window is long where the flow is
-    steady and short where it changes: until the velocity would change by its own size, but no longer than fluid needs
-    to cross half of the layout, half of the clip, nor 25 steps (paper: "longer for steady-state, shorter for highly
-    dynamic fluids").
+    A step moves the fast fluid by at most 1.5 cells, and `fall` adds at most U in it (8 steps a frame at most). A
+    window is long where the flow is steady and short where it changes: until the velocity would change by its own
+    size, but no longer than fluid needs to cross half of the layout (a quarter, for one frame), half of the clip, nor 25 steps (paper: "longer
+    for steady-state, shorter for highly dynamic fluids"). The layout is frozen within a window: where a free surface is
+    not quite in balance, `fall` (m/s^2) acts on it all along, so it may change the velocity by twice its size at most.
     """
     h = scene.grid.spacing
     courant = scene.fast * interval / h
-    steps = steps_per_frame or min(max(math.ceil(courant / 1.5), 1), 8)
+    kick = fall * interval / scene.speed
+    steps = steps_per_frame or min(max(math.ceil(courant / 1.5), math.ceil(kick), 1), 8)
     count = len(scene.targets)
     changes = [
         np.linalg.norm(b.at_centers() - a.at_centers(), axis=-1)[t == CellType.FLUID].mean()
@@ -196,8 +204,11 @@ def plan_windows(
     ]
     change = float(np.mean(changes)) / scene.speed if changes else 0.0
     extent = np.ptp(np.argwhere(scene.cell_types[0] == CellType.FLUID), axis=0).max() + 1
-    crossing = 0.5 * extent * h / max(scene.speed * interval, 1e-12)
+    # that one frame stays as it is, is an assumption: less time to be wrong
+    crossing = (0.5 if count > 1 else 0.25) * extent * h / max(scene.speed * interval, 1e-12)
     longest = max(LONGEST_WINDOW // steps, 1)
+    if fall > 0:
+        longest = max(min(longest, round(2 * scene.speed / (fall * interval))), 1)
     length = max(1, min(round(crossing), round(1 / max(change, 1e-3)), longest))
     if count > 1:
         # half of the clip at most, so that windows differ

@@ -58,7 +58,7 @@ class Bounded(Range):
 
     low: float = 0.0
     high: float = 1.0
-    margin: float = 0.02
+    margin: float = 0.05
     """share of the width that a start at an end is moved inwards: the sigmoid is flat at its ends"""
 
     def physical(self, raw: Tensor) -> Tensor:
@@ -234,13 +234,13 @@ def parameter_space(
 DEFAULT_PRIOR_SIGMAS = {
     "density": 0.1,
     "kinematic_viscosity": 3.0,
-    "gravity": 0.3,
+    "gravity": 0.2,
     "inflow_velocity": 1.0,
     "inflow_fluctuation": 1.0,
     "outflow_velocity": 1.0,
     "restitution": 1.5,
-    "wall_damping": 1.5,
+    "wall_damping": 2.5,
     "time_step": 0.3,
 }
-"""raw: a factor e^3 = 20 for viscosity, 30 % and some 17 degrees for gravity, about the whole range for wall
+"""raw: a factor e^3 = 20 for viscosity, 20 % and some 11 degrees for gravity, about the whole range for wall
 coefficients, the flow's own speed for velocities"""

@@ -56,6 +56,12 @@ def open_video(path: Path | str, limits: ReadLimits) -> Iterator[tuple[av.contai
             kinds = ", ".join(sorted({s.type for s in container.streams}))
             raise InputRejected(f"'{path.name}' has no video stream (only {kinds})", "a file with pictures")
         stream = container.streams.video[0]
+        if stream.codec_context is None:
+            raise InputRejected(
+                f"'{path.name}' uses a codec that cannot be decoded here",
+                "H.264, VP9, ProRes, ...",
+                "convert it to mp4",
+            )
         width, height = stream.codec_context.width, stream.codec_context.height
         if width * height > limits.max_pixels:
             raise InputRejected(

@@ -34,7 +34,7 @@ def read_channels(path: Path | str, *, limits: ReadLimits | None = None) -> dict
         data = path.read_bytes()
         channels, compression, (x0, y0, x1, y1), at = _header(path, data)
         width, height = x1 - x0 + 1, y1 - y0 + 1
-        if not (0 < width and 0 < height and width * height <= limits.max_pixels):
+        if width < 1 or height < 1 or width * height > limits.max_pixels:
             raise InputRejected(
                 f"'{path.name}' is {width} x {height} pixels",
                 f"1 to {limits.max_pixels} pixels",
@@ -56,7 +56,7 @@ def read_channels(path: Path | str, *, limits: ReadLimits | None = None) -> dict
                     out[name][row + i] = np.frombuffer(raw, kind, width, line)
                     line += width * kind.itemsize
         return out
-    except (struct.error, ValueError, IndexError, KeyError, zlib.error) as error:
+    except (struct.error, ValueError, IndexError, KeyError, OverflowError, zlib.error) as error:
         raise InputRejected(f"'{path.name}' is damaged ({error})", "a whole OpenEXR file", "export it again") from None
 
 
@@ -105,10 +105,7 @@ def _unpacked(block: bytes, compression: int, expected: int) -> bytes:
     """Undo the compression, the differences between neighbours, and the split into low and high bytes."""
     if compression == 0 or len(block) == expected:
         return block
-    if compression == 1:
-        packed = _run_lengths(block, expected)
-    else:
-        packed = zlib.decompressobj().decompress(block, expected)
+    packed = _run_lengths(block, expected) if compression == 1 else zlib.decompressobj().decompress(block, expected)
     steps = np.frombuffer(packed, np.uint8).astype(np.int64)
     steps[1:] -= 128
     values = (np.cumsum(steps) & 255).astype(np.uint8)

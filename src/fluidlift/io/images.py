@@ -19,7 +19,16 @@ from fluidlift.io.sequences import is_sequence, list_sequence
 from fluidlift.io.video import read_clip
 from fluidlift.types import PinholeCamera, RigidTransform, VideoClip
 
-__all__ = ["read_camera", "read_depth", "read_distortion", "read_json", "read_mask", "undistort_clip", "write_png"]
+__all__ = [
+    "read_camera",
+    "read_depth",
+    "read_distortion",
+    "read_json",
+    "read_mask",
+    "undistort_clip",
+    "undistort_mask",
+    "write_png",
+]
 
 
 def read_mask(
@@ -241,12 +250,26 @@ def undistort_clip(clip: VideoClip, camera: PinholeCamera, distortion: tuple[flo
         camera: at the size of the clip.
         distortion: k1, k2, p1, p2 (and k3), OpenCV's model, for the same camera.
     """
-    (fx, fy), (cx, cy) = camera.focal, camera.center
-    matrix = np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1.0]])  # OpenCV puts pixel centres at integers
-    maps = cv2.initUndistortRectifyMap(matrix, np.array(distortion), None, matrix, clip.size, cv2.CV_32FC1)
+    maps = _lens_maps(camera, distortion)
     frames = np.stack([cv2.remap(frame, *maps, cv2.INTER_LINEAR) for frame in clip.frames])
     alpha = None
     if clip.alpha is not None:
         alpha = np.stack([cv2.remap(layer, *maps, cv2.INTER_LINEAR) for layer in clip.alpha])
     note = "lens distortion was removed with the coefficients of the camera file"
     return replace(clip, frames=frames, alpha=alpha, warnings=(*clip.warnings, note))
+
+
+def undistort_mask(
+    mask: Bool[np.ndarray, "*t h w"], camera: PinholeCamera, distortion: tuple[float, ...]
+) -> Bool[np.ndarray, "*t h w"]:
+    """A mask that was drawn on the distorted video, moved as `undistort_clip` moves the pictures."""
+    maps = _lens_maps(camera, distortion)
+    layers = mask.reshape(-1, *mask.shape[-2:]).astype(np.uint8)
+    return np.stack([cv2.remap(layer, *maps, cv2.INTER_NEAREST) for layer in layers]).reshape(mask.shape) > 0
+
+
+def _lens_maps(camera: PinholeCamera, distortion: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Where each pixel of the corrected picture lies in the distorted one."""
+    (fx, fy), (cx, cy) = camera.focal, camera.center
+    matrix = np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1.0]])  # OpenCV puts pixel centres at integers
+    return cv2.initUndistortRectifyMap(matrix, np.array(distortion), None, matrix, camera.size, cv2.CV_32FC1)

@@ -77,7 +77,7 @@ def caption(frame: UInt8[np.ndarray, "h w 3"], text: str) -> UInt8[np.ndarray, "
     """The frame with a small label in its upper left corner."""
     import cv2
 
-    out = np.ascontiguousarray(frame)
+    out = np.array(frame, order="C")  # a copy: the frame may be the clip itself
     scale = max(0.4, out.shape[1] / 900)
     for colour, width in (((0, 0, 0), 3), ((255, 255, 255), 1)):
         cv2.putText(out, text, (8, int(24 * scale) + 6), cv2.FONT_HERSHEY_SIMPLEX, scale, colour, width, cv2.LINE_AA)

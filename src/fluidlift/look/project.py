@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from fluidlift.numerics.harmonics import basis
 from fluidlift.types.camera import PinholeCamera
-from fluidlift.types.gaussians import Gaussians
+from fluidlift.types.gaussians import SH_C0, Gaussians
 
 LARGEST = 0.25
 """largest standard deviation of a drawn Gaussian, as a share of the longer side of the picture"""
@@ -17,7 +17,7 @@ def view_colors(gaussians: Gaussians, camera: PinholeCamera) -> Float[np.ndarray
     """Colours as this camera sees them, at least 0 (harmonics may overshoot 1, as in 3D Gaussian Splatting)."""
     degree = int(round(gaussians.sh.shape[1] ** 0.5)) - 1
     if degree == 0:
-        return np.maximum(0.5 + 0.28209479177387814 * gaussians.sh[:, 0], 0.0)
+        return np.maximum(0.5 + SH_C0 * gaussians.sh[:, 0], 0.0)
     d = gaussians.means - camera.position.astype(np.float32)
     d = d / np.maximum(np.linalg.norm(d, axis=1, keepdims=True), 1e-12)
     return np.maximum(0.5 + np.einsum("nk,nkc->nc", basis(d, degree), gaussians.sh), 0.0)

@@ -9,7 +9,8 @@ from jaxtyping import Float
 
 from fluidlift.errors import require
 from fluidlift.look.project import LARGEST, bounded_scales, sound, view_colors
-from fluidlift.numerics.splatting import PAIRS_MAX, TILE, Projected, View, bin_tiles, project, rasterize
+from fluidlift.numerics.splatting import PAIRS_MAX, Projected, View, bin_tiles, project, rasterize
+from fluidlift.numerics.splatting_kernels import TILE
 from fluidlift.types.camera import PinholeCamera
 from fluidlift.types.gaussians import Gaussians
 

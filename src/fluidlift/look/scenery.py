@@ -36,9 +36,7 @@ def terrain_surfels(terrain: Terrain, *, opacity: float = 0.98) -> Gaussians:
     outer = normals[:, :, None] * normals[:, None, :]
     covariance = (0.62 * h) ** 2 * (np.eye(3) - outer) + (0.12 * h) ** 2 * outer
     quats, scales = decompose_covariances(covariance)
-    return Gaussians(
-        mesh.vertices, quats, scales, np.full(len(normals), opacity), sh_from_rgb(colors * shade[:, None])
-    )
+    return Gaussians(mesh.vertices, quats, scales, np.full(len(normals), opacity), sh_from_rgb(colors * shade[:, None]))
 
 
 def terrain_depth(terrain: Terrain, camera: PinholeCamera, *, steps: int = 96) -> Float[np.ndarray, "h w"]:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy import ndimage
 
 from fluidlift.errors import require
 from fluidlift.motion.mainstream import masked_gradient
@@ -32,9 +32,9 @@ def lift_flow(
     difference is divided by the interval. With `depth_t1` equal to `depth_t` the fluid slides along a surface at rest,
     which is right for steady flow and immune to depth that flickers from frame to frame.
 
-    Where the end lies outside the mask or the picture, depth is continued along the surface: it changes by
-    grad depth . displacement. The same holds, in part, where the change of depth is far off what the rest of the
-    surface shows (an edge between near and far fluid): it is cut back to `OUTLIER` robust deviations.
+    Where the end lies outside the mask or the picture, depth is continued along the surface, as a plane. The same
+    holds, in part, where the change of depth is far off what the rest of the surface shows (an edge between near and
+    far fluid): the change is cut back to `OUTLIER` robust deviations.
 
     Args:
         displacement: px/frame.
@@ -82,19 +82,20 @@ def depth_change(
 ) -> Float[np.ndarray, "h w"]:
     """Camera z gained by the fluid of each pixel in a frame, m (paper: v_z; see `lift_flow` for the rules)."""
     mask = np.asarray(mask, bool)
-    d = np.asarray(displacement, np.float32)
     after = mask if mask_t1 is None else np.asarray(mask_t1, bool)
-    h, w = mask.shape
-    u, v = np.meshgrid(np.arange(w, dtype=np.float32), np.arange(h, dtype=np.float32))
-    u, v = u + d[..., 0], v + d[..., 1]
-    # interpolate among fluid pixels only: depth outside the mask means nothing
-    held = after.astype(np.float32)
-    both = np.dstack([np.where(after, depth_t1, 0.0), held]).astype(np.float32)
-    end = cv2.remap(both, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(0, 0))
-    seen = end[..., 1] > 0.25
+    rows, cols = np.nonzero(mask)
+    d = np.asarray(displacement, np.float64)[rows, cols]
     z = np.asarray(depth_t, np.float64)
-    along = (d * masked_gradient(z, mask)).sum(axis=-1)
-    change = np.where(seen, end[..., 0] / np.maximum(end[..., 1], 1e-6) - z, along)
+    # 1/z is linear in the pixels of a plane, z is not; fluid pixels only: depth outside the mask means nothing
+    near = np.where(after, 1.0 / np.where(after, depth_t1, 1.0), 0.0)
+    end = np.stack([rows + d[:, 1], cols + d[:, 0]])
+    total, share = (
+        ndimage.map_coordinates(f, end, order=1, mode="constant", cval=0.0) for f in (near, after.astype(np.float64))
+    )
+    slope = masked_gradient(np.where(mask, 1.0 / np.where(mask, z, 1.0), 0.0), mask)[rows, cols]
+    along = np.maximum(1.0 / z[rows, cols] + (slope * d).sum(axis=-1), 0.1 / z[rows, cols])
+    change = np.zeros(mask.shape)
+    change[rows, cols] = 1.0 / np.where(share > 0.99, total, along) - z[rows, cols]
     middle = np.median(change[mask])
     spread = 1.4826 * np.median(np.abs(change[mask] - middle)) + 1e-3 * np.median(np.abs(z[mask]))
     return np.where(mask, np.clip(change, middle - OUTLIER * spread, middle + OUTLIER * spread), 0.0)

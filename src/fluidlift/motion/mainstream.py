@@ -105,6 +105,7 @@ def complete_flow(
     depth: Float[np.ndarray, "h w"] | None = None,
     *,
     threshold: float = OBSERVED_CONFIDENCE,
+    stall: float = 0.1,
     finest: float = 4.0,
 ) -> tuple[Float[np.ndarray, "h w 2"], Bool[np.ndarray, "h w"]]:
     """Motion of the failed pixels from their neighbours (paper: the interpolation of v_opz).
@@ -120,6 +121,9 @@ def complete_flow(
     Flow does not fail all at once: a pixel of confidence c below the threshold takes 1 - c of the neighbours' motion
     and keeps c of its own.
 
+    Flow also fails with full confidence, where the eye looks through still water onto the bed or sees a fixed
+    reflection: it finds no motion. A pixel much slower than its surroundings loses confidence for that (`stall`).
+
     With depth, motion is averaged as px times depth, that is as metres across the line of sight: the same stream far
     away moves fewer pixels.
 
@@ -130,6 +134,7 @@ def complete_flow(
         direction: n, from `mainstream_direction`.
         depth: camera z in m, positive inside the mask.
         threshold: confidence from which flow counts as observed.
+        stall: share of the surrounding speed at which confidence is halved; 0 believes in standstill.
         finest: standard deviation of the narrowest window, px.
 
     Returns:
@@ -140,7 +145,7 @@ def complete_flow(
         ValueError: an empty mask, shapes that do not fit, depth that is not positive inside the mask.
     """
     d, mask = _checked(displacement, confidence, mask)
-    confidence = np.asarray(confidence, np.float32)
+    confidence = np.asarray(confidence, np.float32) * _moving(d, np.asarray(confidence) * mask, stall, 3 * finest)
     observed = mask & (confidence >= threshold)
     failed = mask & ~observed
     if not observed.any() or not failed.any():
@@ -238,7 +243,7 @@ def project_screen_divergence(
 
     A visible surface also rises and sinks, which the screen does not show, so the constraint does not hold pixel by
     pixel: on a simulated turbulent river the true divergence hardly correlates with either form, and the hard
-    constraint drives patches between observed pixels to motion twice as wrong. It is therefore met softly, as the
+    constraint made failed patches between observed pixels half as wrong again. It is therefore met softly, as the
     least |v' - v|^2 + reach^2 (div v' - wanted)^2, that is -laplace q + q / reach^2 = wanted - div v: a pixel answers
     to divergence within `reach` of it. An infinite reach is the paper's hard constraint.
 
@@ -276,7 +281,9 @@ def project_screen_divergence(
     leak = np.where(failed, 0.5 / reach**2, 0.0).astype(np.float32)
     system = PoissonSystem(failed[..., None], *weights, np.stack([leak, leak], axis=-1), 1.0)
     excess = np.where(failed, wanted - np.diff(faces[0], axis=0) - np.diff(faces[1], axis=1), 0.0)
-    q, report = solve(system, excess[..., None].astype(np.float32), tolerance=tolerance)
+    # within a short reach plain conjugate gradients are done before a multigrid hierarchy is built
+    method = "conjugate_gradient" if reach <= 8 else "multigrid"
+    q, report = solve(system, excess[..., None].astype(np.float32), method=method, tolerance=tolerance)
     out = d.copy()
     for axis, channel in ((0, 1), (1, 0)):
         pad = [(0, 0), (0, 0)]
@@ -336,6 +343,17 @@ def _directed_mean(
         speed = (weight * np.hypot(v[..., 0], v[..., 1])).sum() / max(float(weight.sum()), 1e-12)
         out[stranded] = n[rows, cols][stranded] * speed
     return out
+
+
+def _moving(d: np.ndarray, confidence: np.ndarray, stall: float, sigma: float) -> np.ndarray:
+    """1 for pixels at the speed of their surroundings, 1/2 at `stall` times that, 0 at rest."""
+    if stall <= 0:
+        return np.ones(d.shape[:2], np.float32)
+    squared = (d**2).sum(axis=-1)
+    weight = confidence**2
+    around = _blur(np.dstack([weight * squared, weight]), sigma)
+    slow = stall**2 * around[..., 0] / np.maximum(around[..., 1], 1e-9) + 1e-6
+    return ((squared + 1e-6) / (squared + slow)).astype(np.float32)
 
 
 def _cosine(unit: np.ndarray, index: int) -> np.ndarray:

@@ -28,8 +28,10 @@ HYPOTHESES = 3
 """motions tried, each among the features that the ones before left over"""
 LEAST_CELLS = 6
 """cells of the grid that must agree on the motion of the camera"""
-LEAST_AGREEMENT = 0.2
-"""part of the features found again that must agree"""
+LEAST_AGREEMENT = 0.35
+"""part of the features found again that must agree on some motion, whichever it is"""
+LEAST_ALTERNATIVE = 0.2
+"""part of the features found again that must agree on another motion, for that to be the camera's"""
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,7 @@ def stabilise(clip: VideoClip, *, max_correction_px: float | None = None) -> tup
     warnings = [f"the clip is cut at frame {cut}: use one shot" for cut in cuts]
     motions, blind = motions_of_shots(clip.frames, cuts, limit)
     if blind:
-        warnings.append(f"no features to see the camera by in {blind} frames: assumed still")
+        warnings.append(f"no features that stay, to see the camera by, in {blind} frames: assumed still")
     shake, drift = shake_and_drift(motions, width, height, cuts)
     strong = shake > limit or drift > limit
     restless = shake > STEADY_PX or drift > STEADY_DRIFT_PX
@@ -195,8 +197,8 @@ def calmest_similarity(source: np.ndarray, target: np.ndarray, cells: np.ndarray
     left = np.ones(len(source), bool)
     best, least = None, np.inf
     cv2.setRNGSeed(0)
-    for _ in range(HYPOTHESES):
-        if left.sum() < max(3 * LEAST_CELLS, LEAST_AGREEMENT * len(source)):
+    for part in [LEAST_AGREEMENT] + [LEAST_ALTERNATIVE] * (HYPOTHESES - 1):
+        if left.sum() < max(3 * LEAST_CELLS, part * len(source)):
             break
         similarity, inliers = cv2.estimateAffinePartial2D(
             source[left], target[left], method=cv2.RANSAC, ransacReprojThreshold=0.7, maxIters=500, confidence=0.995
@@ -204,7 +206,7 @@ def calmest_similarity(source: np.ndarray, target: np.ndarray, cells: np.ndarray
         if similarity is None:
             break
         agree = np.flatnonzero(left)[inliers[:, 0] > 0]
-        if len(agree) < LEAST_AGREEMENT * len(source):
+        if len(agree) < part * len(source):
             break
         moved = float(np.linalg.norm(target[agree] - source[agree], axis=-1).mean())
         if len(np.unique(cells[agree])) >= LEAST_CELLS and moved < least:

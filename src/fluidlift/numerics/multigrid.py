@@ -12,6 +12,7 @@ unknown cells of each vertical column is visited (`first`, `last`): a river fill
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numba import njit, prange
@@ -305,7 +306,7 @@ def _sweeps(level: Level, colors: tuple[int, ...], count: int) -> None:
 
 def v_cycle(levels: list[Level]) -> None:
     """levels[0].x, 0 before, becomes an approximate solution for levels[0].rhs: linear, symmetric, positive."""
-    for fine, coarse in zip(levels[:-1], levels[1:]):
+    for fine, coarse in pairwise(levels):
         _sweeps(fine, (0, 1), SWEEPS)
         _restrict_residual(
             fine.x, fine.rhs, fine.diagonal, *fine.couplings, fine.first, fine.last, coarse.rhs, coarse.x

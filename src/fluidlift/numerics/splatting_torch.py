@@ -14,7 +14,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fluidlift.numerics import splatting
-from fluidlift.numerics.splatting import ALPHA_MAX, ALPHA_MIN, BLUR, TRANSMITTANCE_MIN, Projected, View
+from fluidlift.numerics.splatting import Projected, View
+from fluidlift.numerics.splatting_kernels import ALPHA_MAX, ALPHA_MIN, BLUR, TRANSMITTANCE_MIN
 
 
 def _array(tensor: Tensor) -> np.ndarray:
@@ -33,7 +34,8 @@ class _Project(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, g_uv: Tensor, g_conics: Tensor, *_: Tensor) -> Any:
-        gradients = splatting.project_backward(*ctx.saved, _array(g_uv), _array(g_conics))
+        view, means, quats, scales, projected = ctx.saved
+        gradients = splatting.project_backward(view, means, quats, scales, projected, _array(g_uv), _array(g_conics))
         return (*(torch.from_numpy(g) for g in gradients), None, None)
 
 
@@ -52,7 +54,10 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, g_image: Tensor, g_light: Tensor) -> Any:
-        gradients = splatting.rasterize_backward(*ctx.saved, _array(g_image), _array(g_light))
+        projected, opacities, features, bins, image, light = ctx.saved
+        gradients = splatting.rasterize_backward(
+            projected, opacities, features, bins, image, light, _array(g_image), _array(g_light)
+        )
         return (*(torch.from_numpy(g) for g in gradients), None, None, None)
 
 

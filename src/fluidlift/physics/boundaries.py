@@ -2,8 +2,9 @@
 
 Wall model (paper: b, d). The grid lets no fluid through a wall. `wall_damping` takes its share of the tangential
 velocity of particles within one cell of the wall once per nominal time step; the share fades linearly with distance.
-`restitution` gives back its share of the normal velocity to particles that still reach the wall (splashes: inside a
-body of liquid the pressure has already turned the flow along the wall).
+`restitution` gives back its share of the normal velocity that a particle had before the step if its free flight
+would end in the wall within the step (inside a
+body of liquid the pressure turns the flow along the wall before it gets there).
 """
 
 from __future__ import annotations
@@ -36,6 +37,8 @@ class Walls:
     """float32 [...,3] per face: unit vector out of the solid on closed faces, 0 on open ones"""
     solid: Bool[np.ndarray, "nx ny nz"]
     """cells without any open face"""
+    buried: Bool[np.ndarray, "nx ny nz"]
+    """other cells whose centre lies in the solid, or closer to it than a quarter of a cell"""
     regions: np.ndarray
     """u8 [nx,ny,nz]: INFLOW, OUTFLOW, SOLID or EMPTY (everywhere else)"""
     open_sides: Bool[np.ndarray, "3 2"]
@@ -74,16 +77,27 @@ def build_walls(terrain: Terrain, regions: np.ndarray, open_sides: np.ndarray) -
                 np.moveaxis(normal, axis, 0)[at][shut] = np.eye(3)[axis]
         openings.append(opening)
         normals.append(normal)
+    buried = any_open & (mean_of_corners(distance) < 0.25 * grid.spacing)
     clean = np.where(any_open & through, regions, CellType.EMPTY)
     clean = np.where(any_open, clean, CellType.SOLID).astype(np.uint8)
-    return Walls(grid, distance, tuple(openings), tuple(normals), ~any_open, clean, np.asarray(open_sides, bool))
+    return Walls(grid, distance, tuple(openings), tuple(normals), ~any_open, buried, clean, np.asarray(open_sides, bool))
+
+
+def mean_of_corners(field: Float[np.ndarray, "nx+1 ny+1 nz+1"]) -> Float[np.ndarray, "nx ny nz"]:
+    """Mean of the eight corners of each cell."""
+    for axis in range(3):
+        along = np.moveaxis(field, axis, 0)
+        field = np.moveaxis(0.5 * (along[1:] + along[:-1]), 0, axis)
+    return field
 
 
 def liquid_cells(occupied: Bool[np.ndarray, "nx ny nz"], walls: Walls) -> np.ndarray:
     """u8 cell types of this step.
 
     FLUID where there are particles, and in single empty cells that are enclosed (five of six neighbours hold liquid
-    or are solid, at least three liquid): sampling gaps, not bubbles. INFLOW cells are always INFLOW.
+    or are solid, at least three liquid): sampling gaps, not bubbles. Also beside liquid in the slivers of open space
+    that the bed leaves of its cells: particles hardly get there, and as air they would suck the liquid into the bed.
+    INFLOW cells are always INFLOW.
     """
     wet = occupied & ~walls.solid
     blocked = np.pad(wet | walls.solid, 1)
@@ -97,8 +111,14 @@ def liquid_cells(occupied: Bool[np.ndarray, "nx ny nz"], walls: Walls) -> np.nda
             around += blocked[tuple(index)]
             liquid += wide[tuple(index)]
     gap = ~wet & ~walls.solid & (around >= 5) & (liquid >= 3)
+    beside = np.zeros(wet.shape, bool)
+    for axis, opening in enumerate(walls.openings):
+        here, out = np.moveaxis(wet | gap, axis, 0), np.moveaxis(beside, axis, 0)
+        passable = np.moveaxis(opening, axis, 0)[1:-1] > 0
+        out[1:] |= passable & here[:-1]
+        out[:-1] |= passable & here[1:]
     types = walls.regions.copy()
-    types[(wet | gap) & (walls.regions == CellType.EMPTY)] = CellType.FLUID
+    types[(wet | gap | (beside & walls.buried)) & (walls.regions == CellType.EMPTY)] = CellType.FLUID
     return types
 
 
@@ -202,7 +222,7 @@ def slide_along_walls(velocity: FaceVelocity, walls: Walls) -> FaceVelocity:
 
 
 @njit(parallel=True, cache=True)
-def _collide(new, old, velocities, field, regions, low, high, h, open_sides, restitution, keep):
+def _collide(new, old, velocities, incoming, dt, field, regions, low, high, h, open_sides, restitution, keep):
     inverse = 1.0 / h
     margin = CLEARANCE * h
     for p_ in prange(len(new)):
@@ -215,12 +235,15 @@ def _collide(new, old, velocities, field, regions, low, high, h, open_sides, res
             lowest, highest = low[a] + margin, high[a] - margin
             if through:
                 continue
-            if new[p, a] < lowest and not open_sides[a, 0]:
-                new[p, a] = lowest
-                velocities[p, a] = max(velocities[p, a], -restitution * velocities[p, a])
-            elif new[p, a] > highest and not open_sides[a, 1]:
-                new[p, a] = highest
-                velocities[p, a] = min(velocities[p, a], -restitution * velocities[p, a])
+            flight = old[p, a] + dt * incoming[p, a]
+            if not open_sides[a, 0]:
+                if flight < lowest and incoming[p, a] < 0.0:
+                    velocities[p, a] = max(velocities[p, a], -restitution * incoming[p, a])
+                new[p, a] = max(new[p, a], lowest)
+            if not open_sides[a, 1]:
+                if flight > highest and incoming[p, a] > 0.0:
+                    velocities[p, a] = min(velocities[p, a], -restitution * incoming[p, a])
+                new[p, a] = min(new[p, a], highest)
         x, y, z = np.float64(new[p, 0]), np.float64(new[p, 1]), np.float64(new[p, 2])
         value, gx, gy, gz = distance_and_gradient(field, low, inverse, x, y, z)
         if value >= h:
@@ -231,9 +254,20 @@ def _collide(new, old, velocities, field, regions, low, high, h, open_sides, res
             normal = velocities[p, 0] * nx + velocities[p, 1] * ny + velocities[p, 2] * nz
             # share of the damping at this distance
             factor = 1.0 - (1.0 - keep) * min(max(1.0 - value / h, 0.0), 1.0)
-            back = normal
-            if value < margin and normal < 0.0:
-                back = -restitution * normal
+            # pressed into the wall without a flight into it: stopped
+            back = max(normal, 0.0) if value < margin else normal
+            before = incoming[p, 0] * nx + incoming[p, 1] * ny + incoming[p, 2] * nz
+            if before < 0.0 and restitution > 0.0:
+                flight, _, _, _ = distance_and_gradient(
+                    field,
+                    low,
+                    inverse,
+                    old[p, 0] + dt * incoming[p, 0],
+                    old[p, 1] + dt * incoming[p, 1],
+                    old[p, 2] + dt * incoming[p, 2],
+                )
+                if flight < margin:
+                    back = max(back, -restitution * before)
             velocities[p, 0] = factor * (velocities[p, 0] - normal * nx) + back * nx
             velocities[p, 1] = factor * (velocities[p, 1] - normal * ny) + back * ny
             velocities[p, 2] = factor * (velocities[p, 2] - normal * nz) + back * nz
@@ -264,8 +298,10 @@ def collide(
     positions: Float[np.ndarray, "n 3"],
     previous: Float[np.ndarray, "n 3"],
     velocities: Float[np.ndarray, "n 3"],
+    incoming: Float[np.ndarray, "n 3"],
     walls: Walls,
     *,
+    dt: float,
     restitution: float,
     tangential_share: float,
 ) -> None:
@@ -274,12 +310,14 @@ def collide(
     Args:
         positions: float32, moved.
         previous: where the particles were, outside the solid.
-        velocities: changed at walls.
+        velocities: after the step; changed at walls.
+        incoming: velocities before the step.
         walls: the boundaries.
+        dt: s.
         restitution: share of the normal velocity given back on impact.
         tangential_share: share of the tangential velocity that survives this step at the wall.
     """
     _collide(
-        positions, previous, velocities, walls.signed_distance, walls.regions, walls.grid.low,
+        positions, previous, velocities, incoming, float(dt), walls.signed_distance, walls.regions, walls.grid.low,
         walls.grid.high, walls.grid.spacing, walls.open_sides, float(restitution), float(tangential_share),
     )  # fmt: skip

@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from fluidlift.numerics.poisson import solve
 from fluidlift.numerics.sampling import sample_nodes
+from fluidlift.physics.boundaries import mean_of_corners
 from fluidlift.physics.pressure import PressureSystem, subtract_gradient
 from fluidlift.physics.transfer import CellOrder, deposit_to_cells, grid_to_particles
 from fluidlift.types import FaceVelocity, Grid
@@ -31,8 +32,7 @@ def cell_capacity(signed_distance: Float[np.ndarray, "nx+1 ny+1 nz+1"], grid: Gr
     """Share (0 to 1) of the trilinear kernel around each cell centre that is not solid, from 4^3 samples."""
     capacity = np.ones(grid.shape, np.float32)
     nodes = np.asarray(signed_distance)
-    near = np.abs(0.125 * sum(nodes[i : i + grid.shape[0], j : j + grid.shape[1], k : k + grid.shape[2]]
-                              for i in (0, 1) for j in (0, 1) for k in (0, 1))) < 2.0 * grid.spacing  # fmt: skip
+    near = np.abs(mean_of_corners(nodes)) < 2.0 * grid.spacing
     centers = grid.centers()[near]
     total = np.zeros(len(centers))
     offsets = np.array([-0.75, -0.25, 0.25, 0.75])
@@ -54,6 +54,7 @@ def fill_ratio(
 def spreading(
     positions: Float[np.ndarray, "n 3"],
     ratio: Float[np.ndarray, "nx ny nz"],
+    capacity: Float[np.ndarray, "nx ny nz"],
     system: PressureSystem,
     grid: Grid,
     order: CellOrder,
@@ -61,8 +62,9 @@ def spreading(
     """Displacement (m) of each particle that evens out the filling, or None where it is even."""
     excess = np.clip(ratio - 1.0 - TOLERATED, 0.0, LARGEST_EXCESS)
     surface = system.boundary_term(np.ones(grid.shape)) > 0
-    lack = np.where(surface, 0.0, np.clip(ratio - 1.0 + TOLERATED, -LARGEST_LACK, 0.0))
-    wanted = np.where(system.unknown, RELAXATION * excess + 0.5 * RELAXATION * lack, 0.0)
+    # slivers of open space between the cell and the bed never count as full: drawing into them would never end
+    lack = np.where(surface | (capacity < 0.5), 0.0, np.clip(ratio - 1.0 + TOLERATED, -LARGEST_LACK, 0.0))
+    wanted = np.where(system.unknown, RELAXATION * excess + 0.5 * RELAXATION * lack, 0.0) * capacity
     if not wanted.any():
         return None
     # a rough solution will do: what it leaves, the next step takes

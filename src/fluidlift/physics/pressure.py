@@ -82,8 +82,9 @@ def build_system(
 ) -> PressureSystem:
     """The pressure system of a cell layout.
 
-    FLUID cells are unknown (save those without any open face: buried); EMPTY and OUTFLOW cells hold p = 0; SOLID cells are closed on all faces; faces of INFLOW
-    cells have a prescribed velocity. Without a terrain, faces are open or closed by cell type alone.
+    FLUID cells are unknown (save those without any open face: buried); EMPTY and OUTFLOW cells hold p = 0; SOLID
+    cells are closed on all faces; faces of INFLOW cells have a prescribed velocity. Without a terrain, faces are open
+    or closed by cell type alone.
 
     Args:
         cell_types: u8 [nx,ny,nz], `CellType`.

@@ -90,7 +90,10 @@ def diffuse(
     wall_share: float,
     tolerance: float = 1e-5,
 ) -> tuple[FaceVelocity, tuple[SolveReport, ...]]:
-    """The velocity after dt (s) of diffusion with `viscosity` (m^2/s); masks per component as in `diffuse_component`."""
+    """The velocity after dt (s) of diffusion with `viscosity` (m^2/s).
+
+    Masks per component as in `diffuse_component`. Below `NEGLIGIBLE` nothing is done and no report given.
+    """
     number = viscosity * dt / spacing**2
     if number < NEGLIGIBLE:
         return velocity, ()

@@ -48,7 +48,7 @@ def geometry(story: Story, inputs: Inputs, config: JobConfig) -> Result:
     motion, trust = mean_flow(flow, wet_some_time)
     warnings: list[str] = []
 
-    known, pose_given = _known_camera(inputs, config, clip.size, warnings)
+    known, pose_given = _known_camera(inputs, config, clip.size)
     pitch = float(place.pose_up(known)[0].pitch) if pose_given else c.pitch
     pick = np.unique(np.linspace(0, len(clip) - 1, 8).astype(int))
     evidence = kinds.estimate_kind(clip.frames[pick], fluid[pick], motion, trust, pitch=pitch)
@@ -97,6 +97,7 @@ def geometry(story: Story, inputs: Inputs, config: JobConfig) -> Result:
         "grid": {"shape": setting.terrain.grid.shape, "spacing": setting.terrain.grid.spacing,
                  "origin": setting.terrain.grid.origin},
         "height_field": setting.surface_height is not None,
+        "pool_level": setting.pool_level,
     }  # fmt: skip
     arrays = {
         "mask": mask,
@@ -123,18 +124,13 @@ def _united(frames, fluid, start, longest, window_length) -> int:
     return int(min(window_length(frames[start:stop], fluid[start], longest=longest), len(frames) - start))
 
 
-def _known_camera(inputs: Inputs, config: JobConfig, size, warnings) -> tuple[PinholeCamera, bool]:
+def _known_camera(inputs: Inputs, config: JobConfig, size: tuple[int, int]) -> tuple[PinholeCamera, bool]:
     """The camera file's camera, or one from the field of view; and whether its pose is known."""
-    from fluidlift.io.images import read_camera, read_distortion, read_json
+    from fluidlift.io.images import read_camera, read_json
 
     if inputs.camera is None:
         return PinholeCamera.from_fov(config.shape.fov, size), False
     camera = read_camera(inputs.camera, size)
-    if read_distortion(inputs.camera) is not None:
-        warnings.append(
-            "the camera file gives lens distortion, which is not corrected: straight edges near the picture's border "
-            "bend by up to a few pixels"
-        )
     data = read_json(inputs.camera, "camera file")
     return camera, "R" in data or "frames" in data
 
@@ -251,8 +247,10 @@ def terrain_of(story: Story) -> Terrain:
 
 def setting_of(story: Story) -> terrain.Setting:
     """Terrain and cells."""
-    a = story["geometry"].arrays
-    return terrain.Setting(terrain_of(story), a["cell_types"], a.get("surface_height"), a["bed_height"])
+    a, meta = story["geometry"].arrays, story["geometry"].meta
+    return terrain.Setting(
+        terrain_of(story), a["cell_types"], a.get("surface_height"), a["bed_height"], meta["pool_level"]
+    )
 
 
 def gaussians_to_arrays(g: Gaussians, prefix: str = "") -> dict[str, np.ndarray]:
@@ -291,7 +289,10 @@ def refine(story: Story, inputs: Inputs, config: JobConfig) -> Result:
     front = unite([b for b in bodies if len(b)], spacing=max(0.35 * h, 0.6 * c.stride * _pixel(depth, camera)))
     shell, pruned = prune(_outside_solid(concatenate([front, hull]), setting), min_opacity=0.05, max_stretch=12.0)
     room = max(c.max_gaussians - len(shell), 0)
-    added = fill(shell, spacing=h / 2, rays=c.rays, rng=np.random.default_rng(config.seed), max_added=room)
+    added = fill(
+        shell, spacing=h / 2, rays=c.rays, rng=np.random.default_rng(config.seed), max_added=room,
+        closed_below=setting.terrain,
+    )  # fmt: skip
     body = _outside_solid(_bounded(concatenate([shell, added]), c.max_gaussians, config.seed), setting)
     if len(body) < 50:
         raise InputRejected(

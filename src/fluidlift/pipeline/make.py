@@ -94,7 +94,8 @@ def _run(story: Story, inputs: Inputs, folder: Path, config: JobConfig) -> dict[
             hashes[name] = [file_hash(p) for _, p in list_sequence(path)]
     seed = config.seed
     run = story.run
-    run("read", lambda: seeing.read(inputs, config), settings=[hashes["clip"], config.section("read")], after=())
+    run("read", lambda: seeing.read(inputs, config), settings=[hashes["clip"], hashes.get("camera"),
+        config.section("read")], after=())
     run("flow", lambda: seeing.flow(story, config), settings=config.motion.method, after=("read",))
     run("segment", lambda: seeing.segment(story, inputs, config), settings=hashes.get("mask"), after=("read", "flow"))
     geometry = ("kind", "fov", "pitch", "roll", "size", "depth_ratio", "cells", "cell_limit", "longest_union")

@@ -35,6 +35,7 @@ VISCOSITY_PRIOR = {"stream": 1e-5, "fall": 1e-5, "pour": 1e-4, "plume": 1e-5}
 
 def motion(story: Story, config: JobConfig) -> Result:
     """Completed flow of many frames, volume velocity of the target frames."""
+    from fluidlift.motion.free_fall import with_free_fall
     from fluidlift.motion.lift import lift_flow
     from fluidlift.motion.volume import volume_velocity
 
@@ -48,6 +49,7 @@ def motion(story: Story, config: JobConfig) -> Result:
     observed = np.zeros((pairs, *clip.frames.shape[1:3]), bool)
     arrays: dict[str, np.ndarray] = {}
     reports: list[dict[str, Any]] = []
+    replaced: list[float] = []
     depth = g.arrays["depth"]
     for done, t in enumerate(wanted):
         story.step(done, len(wanted))
@@ -60,6 +62,9 @@ def motion(story: Story, config: JobConfig) -> Result:
             continue
         on_body = mask & (depth > 0)
         lifted = lift_flow(full, seen, on_body, depth, depth, camera, clip.interval)
+        if kind in ("fall", "pour"):
+            lifted, share = with_free_fall(lifted, downhill_of(setting, lifted.points), kind=kind)
+            replaced.append(share)
         velocity, report = volume_velocity(
             lifted, setting.terrain, setting.cell_types, grid, kind=kind, mainstream=setting.terrain.mainstream
         )
@@ -70,8 +75,30 @@ def motion(story: Story, config: JobConfig) -> Result:
     warnings = []
     if reports and not all(r.get("solve", {}).get("converged", True) for r in reports):
         warnings.append("the divergence-free solve of the target velocity did not converge on every frame")
+    if replaced and max(replaced) > 0.3:
+        warnings.append(
+            f"the {kind} moves faster than optical flow can follow: on {100 * max(replaced):.0f} % of its steep part the "
+            "speed comes from free fall at the given size"
+        )
     arrays |= {"completed": completed, "observed": np.packbits(observed, axis=-1)}
     return Result(arrays, {"warnings": warnings, "targets": [r["frame"] for r in reports], "reports": reports})
+
+
+def downhill_of(setting: Any, points: np.ndarray) -> np.ndarray:
+    """Unit direction of steepest descent of the surface at points; straight down for bodies in the air."""
+    if setting.surface_height is None:
+        down = np.tile([0.0, 0.0, -1.0], (len(points), 1))
+        pool = setting.pool_level
+        if pool is not None:  # what stands in a vessel does not fall
+            down[points[:, 2] < pool] = [1.0, 0.0, 0.0]
+        return down
+    grid = setting.terrain.grid
+    gx, gy = np.gradient(setting.surface_height, grid.spacing)
+    cell = np.clip(grid.cell_of(points)[:, :2], 0, np.array(grid.shape[:2]) - 1)
+    slope = np.stack([gx[cell[:, 0], cell[:, 1]], gy[cell[:, 0], cell[:, 1]]], axis=-1)
+    squared = (slope**2).sum(axis=1)
+    steepest = np.concatenate([-slope, -squared[:, None]], axis=1)
+    return steepest / np.maximum(np.linalg.norm(steepest, axis=1, keepdims=True), 1e-12)
 
 
 def _completed(flow: PixelFlow, t: int, mask, depth, camera, config: JobConfig) -> tuple[np.ndarray, np.ndarray]:
@@ -117,6 +144,7 @@ def fit(story: Story, config: JobConfig) -> Result:
         found = fit_parameters(
             targets, setting.cell_types, setting.terrain, setting.terrain.grid, clip_of(story).interval, initial,
             kind=kind, method=config.fit.method, max_seconds=config.fit.max_seconds, progress=story.step,
+            mainstream=setting.terrain.mainstream, prior_sigmas=gravity_prior(story),
         )  # fmt: skip
     warnings = []
     if not found.converged:
@@ -137,6 +165,19 @@ def fit(story: Story, config: JobConfig) -> Result:
             "extra": {k: float(v) for k, v in found.extra.items()},
         },
     )
+
+
+def gravity_prior(story: Story) -> dict[str, float] | None:
+    """How free gravity is, relative to 9.81 m/s^2.
+
+    Where metres are known, or where the fluid falls (which nothing but gravity does), it is what it is everywhere;
+    under an assumed size it stands for the unknown scale as well.
+    """
+    g = story["geometry"].meta
+    if g["kind"] == "plume":
+        return None
+    known = g["scale"]["source"] != "assumed" or g["kind"] in ("fall", "pour")
+    return {"gravity": 0.01 if known else 0.3}
 
 
 def first_guess(story: Story, targets: list[FaceVelocity]) -> FluidParameters:

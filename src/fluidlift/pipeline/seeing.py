@@ -46,6 +46,7 @@ def read(inputs: Inputs, config: JobConfig) -> Result:
         fps=r.fps if is_sequence(inputs.clip) else None,
         limits=ReadLimits(max_pixels=r.max_pixels, max_frames=r.max_frames),
     )
+    clip = _without_distortion(clip, inputs)
     warnings = list(clip.warnings)
     arrays: dict[str, np.ndarray] = {}
     meta: dict[str, Any] = {"source": clip.source}
@@ -82,6 +83,16 @@ def read(inputs: Inputs, config: JobConfig) -> Result:
     return Result(arrays, meta)
 
 
+def _without_distortion(clip: VideoClip, inputs: Inputs) -> VideoClip:
+    """Lines that are straight in the world made straight in the picture, where a camera file knows the lens."""
+    from fluidlift.io.images import read_camera, read_distortion, undistort_clip
+
+    distortion = read_distortion(inputs.camera) if inputs.camera is not None else None
+    if inputs.camera is None or distortion is None:
+        return clip
+    return undistort_clip(clip, read_camera(inputs.camera, clip.size), distortion)
+
+
 def clip_of(story: Story) -> VideoClip:
     """The clip that later stages see."""
     r = story["read"]
@@ -110,7 +121,7 @@ def flow_of(story: Story) -> PixelFlow:
 
 def segment(story: Story, inputs: Inputs, config: JobConfig) -> Result:
     """What each pixel shows."""
-    from fluidlift.io.images import read_mask
+    from fluidlift.io.images import read_camera, read_distortion, read_mask, undistort_mask
     from fluidlift.shape.segment import segment as segment_clip
 
     clip = clip_of(story)
@@ -119,6 +130,9 @@ def segment(story: Story, inputs: Inputs, config: JobConfig) -> Result:
         user_mask = read_mask(
             inputs.mask, clip.size, len(clip), start=config.read.start, duration=config.read.duration
         )
+        distortion = read_distortion(inputs.camera) if inputs.camera is not None else None
+        if inputs.camera is not None and distortion is not None:
+            user_mask = undistort_mask(user_mask, read_camera(inputs.camera, clip.size), distortion)
     labels = segment_clip(clip, flow_of(story), user_mask=user_mask, progress=story.step)
     fluid = labels.fluid
     if not fluid.any():

@@ -14,7 +14,7 @@ from fluidlift.types.camera import PinholeCamera
 from fluidlift.types.gaussians import SH_C0, Gaussians
 
 PLAIN_COLORS = ((0, 0, 0), (1, 1, 1), (1, 0, 1), (0, 1, 0), (0, 0, 1), (1, 0, 0))
-"""candidates for the plain background, the usual ones first"""
+"""candidates for the plain background, black and white first"""
 
 NEIGHBOURS = (6.0, 14.0)
 """degrees to the side from which the refined body must still look like the frame"""
@@ -34,6 +34,8 @@ class Frame:
     """[h,w]: 1 inside the mask and near it"""
     mask: np.ndarray
     plain: tuple[float, float, float]
+    depth: np.ndarray
+    """[h,w]: camera z of the body before the refinement, m; NaN where it is not to be held"""
 
     @classmethod
     def of(cls, image: np.ndarray, mask: np.ndarray, camera: PinholeCamera, plain: tuple[float, ...]) -> Frame:
@@ -45,7 +47,13 @@ class Frame:
         near = cv2.dilate(inside.astype(np.uint8), np.ones((2 * MARGIN + 1,) * 2, np.uint8))
         pose, (cx, cy) = camera.camera_from_world, camera.center
         view = View(pose.rotation, pose.translation, camera.focal, (cx - x0, cy - y0), (int(x1 - x0), int(y1 - y0)))
-        return cls(view, picture.astype(np.float32), near.astype(np.float32), inside, tuple(map(float, plain)))
+        unknown = np.full(inside.shape, np.nan, np.float32)
+        return cls(view, picture.astype(np.float32), near.astype(np.float32), inside, tuple(map(float, plain)), unknown)
+
+    def before_another_color(self) -> Frame:
+        """The same on the complementary plain background."""
+        plain = tuple(1 - p for p in self.plain)
+        return replace(self, plain=plain, target=np.where(self.mask[..., None], self.target, np.float32(plain)))
 
 
 def plain_color(image: np.ndarray, mask: np.ndarray, background: object) -> tuple[float, ...]:
@@ -57,7 +65,8 @@ def plain_color(image: np.ndarray, mask: np.ndarray, background: object) -> tupl
                 "'black' or three numbers in [0, 1]")  # fmt: skip
         return tuple(color)
     fluid = image[mask].astype(np.float32) / 255
-    distances = [np.quantile(np.linalg.norm(fluid - np.float32(c), axis=1), 0.02) for c in PLAIN_COLORS]
+    # even the 2 % of the fluid that come nearest: before its own colour a fluid may turn transparent unnoticed
+    distances = [float(np.quantile(np.linalg.norm(fluid - np.float32(c), axis=1), 0.02)) for c in PLAIN_COLORS]
     return PLAIN_COLORS[int(np.argmax(distances))]
 
 
@@ -93,7 +102,8 @@ def neighbours(
             seen = cv2.remap(np.nan_to_num(before.depth).astype(np.float32), back_u, back_v, cv2.INTER_NEAREST)
             inside = cv2.remap(frame.mask.astype(np.float32), back_u, back_v, cv2.INTER_LINEAR) > 0.99
             shown = inside & (depth > 0) & (np.abs(z - seen) < 0.02 * before.size)
-            out.append(replace(beside, target=target, weight=shown.astype(np.float32)))
+            held = np.where(shown, depth, np.nan).astype(np.float32)
+            out.append(replace(beside, target=target, weight=shown.astype(np.float32), depth=held))
     return out
 
 

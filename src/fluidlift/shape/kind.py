@@ -68,20 +68,33 @@ def estimate_kind(
     """
     require(fluid.shape == frames.shape[:3], f"masks {fluid.shape} for frames {frames.shape}")
     f = _features(frames, fluid, displacement, confidence)
+    still = 1.0 - f["changing"]
     belief = {
-        # smoke rises, is grey and spreads; nothing else rises over most of its area
-        "plume": 3.0 * f["rising"] + 1.2 * f["grey"] * (0.3 + f["rising"]) - 2.0 * f["falling"] - 1.0 * f["sideways"],
-        # a jet falls and is slender
-        "pour": 1.6 * f["falling"] + 2.4 * f["slender"] - 1.2 * f["wide"] - 1.5 * f["rising"] - 0.8 * f["sideways"],
+        # smoke rises from below, is grey, and its outline changes; it neither hangs from above nor fills the picture
+        "plume": 2.6 * f["rising"]
+        + 1.2 * f["grey"] * (0.3 + f["rising"])
+        + 0.8 * f["changing"]
+        - 2.0 * f["falling"]
+        - 1.0 * f["sideways"]
+        - 2.5 * f["hanging"]
+        - 1.5 * (1 - f["grey"])
+        - 2.0 * still * max(f["wide"], f["ground"]),
+        # a jet hangs from above, falls and is slender
+        "pour": 1.6 * f["falling"]
+        + 2.4 * f["slender"]
+        + 1.6 * f["hanging"]
+        - 1.2 * f["wide"]
+        - 0.8 * f["rising"]
+        - 0.8 * f["sideways"],
         # a curtain falls, is not slender
         "fall": 2.8 * f["falling"] - 1.6 * f["slender"] - 1.2 * f["rising"] - 1.4 * f["sideways"] - f["foreground"],
-        # a stream runs across the picture, or towards the viewer and then fills the foreground
+        # a stream runs across the picture, or along the line of sight and then fills the foreground
         "stream": 0.6
         + 1.8 * f["sideways"]
-        + 0.8 * f["wide"]
+        + 0.8 * f["wide"] * (0.5 + still) * (1 - f["falling"])
         + 2.0 * f["foreground"] * (1 - f["slender"])
-        - 1.8 * f["falling"]
-        - 1.5 * f["rising"],
+        - 1.8 * f["falling"] * (1 - f["foreground"])
+        - 1.5 * f["rising"] * (1 - still * f["ground"]),
     }
     if pitch is not None:  # steep views of bodies in the air are rare
         belief["stream"] += 1.5 * np.clip((pitch - 20.0) / 20.0, -1.0, 1.0)
@@ -101,7 +114,10 @@ def _features(frames, fluid, displacement, confidence) -> dict[str, float]:
     weight = np.where(union, confidence * speed, 0.0)
     total = max(float(weight.sum()), 1e-9)
     angle = np.degrees(np.arctan2(displacement[..., 1], displacement[..., 0]))  # +90 is down in the picture
-    within = lambda centre, span: float(weight[np.abs((angle - centre + 180) % 360 - 180) < span].sum() / total)
+
+    def within(centre: float, span: float) -> float:
+        return float(weight[np.abs((angle - centre + 180) % 360 - 180) < span].sum() / total)
+
     falling, rising = within(90, 40), within(-90, 50)
     # the shape of what moves: still water around a jet says nothing about the jet
     moving = union & (weight > 0.25 * np.percentile(weight[union], 95))
@@ -111,6 +127,8 @@ def _features(frames, fluid, displacement, confidence) -> dict[str, float]:
     box_w = np.ptp(np.percentile(cols, [2, 98])) + 1
     typical_width = float(np.median(moving.sum(axis=1)[moving.any(axis=1)]))
     lowest = slice(int(0.93 * height), None)
+    foreground, ground = (float(m[lowest].any(axis=0).mean()) for m in (moving, union))
+    change = float(np.mean(fluid[1:] != fluid[:-1]) / max(fluid.mean(), 1e-9)) if len(fluid) > 1 else 0.0
     colours = frames[fluid].astype(np.float32) / 255.0
     if len(colours) > 20000:
         colours = colours[:: len(colours) // 20000]
@@ -121,7 +139,10 @@ def _features(frames, fluid, displacement, confidence) -> dict[str, float]:
         "sideways": max(0.0, 1.0 - falling - rising),
         "slender": float(np.clip((box_h / max(typical_width, 1.0) - 2.0) / 3.0, 0.0, 1.0)),
         "wide": float(np.clip((box_w / box_h - 0.8) / 1.2, 0.0, 1.0)),
-        "foreground": float(moving[lowest].any(axis=0).mean()),
+        "foreground": foreground,
+        "ground": ground,
+        "hanging": float(fluid[:, : max(2, height // 60)].any(axis=(1, 2)).mean() * (1 - ground)),
+        "changing": float(np.clip(change / 0.3, 0.0, 1.0)),
         "grey": float(np.clip(1.0 - chroma / 0.15, 0.0, 1.0)),
         "speed_px": float(total / max(float((confidence * union).sum()), 1e-9)),
         "area_share": float(union.sum() / (height * width)),

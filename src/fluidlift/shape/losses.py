@@ -1,4 +1,4 @@
-"""The five terms of the single-view refinement of Gaussians (paper: `loss_optGS`).
+"""The terms of the single-view refinement of Gaussians (paper: `loss_optGS`), and one on depth.
 
 The paper names the terms and gives no weights. The weights here are for lengths measured in the median scale of the
 Gaussians before the refinement, so that they hold for a jet of millimetres and a fall of metres alike.
@@ -34,6 +34,8 @@ class LossWeights:
     """"hinge" or "mean", see `volume_loss`"""
     scale: float = 0.01
     luminance: float = 1.0
+    depth: float = 0.02
+    """not in the paper, see `depth_loss`"""
 
     def __post_init__(self) -> None:
         require(self.volume_form in ("hinge", "mean"), f"volume_form {self.volume_form!r}", "'hinge' or 'mean'")
@@ -122,6 +124,24 @@ def volume_loss(scales: Float[Tensor, "n 3"], form: str = "hinge", ratio: float 
 def scale_loss(scales: Float[Tensor, "n 3"]) -> Tensor:
     """Mean of the geometric means of the three scales: asks for finer Gaussians."""
     return scales.clamp(min=1e-12).log().mean(1).exp().mean()
+
+
+def depth_loss(
+    drawn: Float[Tensor, "h w"], light: Float[Tensor, "h w"], before: Float[Tensor, "h w"], unit: float
+) -> Tensor:
+    """Mean distance between the expected depth and that before the refinement, in units of a typical scale.
+
+    The paper leaves depth to the other terms. The motion of the surface is lifted by this depth, so it is held here.
+
+    Args:
+        drawn: depth composited front to back, m.
+        light: transmittance left.
+        before: camera z, m; NaN where free.
+        unit: m.
+    """
+    known = torch.isfinite(before)
+    off = (drawn - (1 - light) * torch.where(known, before, torch.zeros_like(before))).abs()
+    return torch.where(known, off, torch.zeros_like(off)).sum() / (known.sum().clamp(min=1) * unit)
 
 
 def luminance_loss(sh: Float[Tensor, "n 3"]) -> Tensor:

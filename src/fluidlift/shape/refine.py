@@ -3,19 +3,22 @@
 One view says nothing about depth. Left alone, the optimiser buys likeness with shape: it makes the front transparent,
 pulls needles along the lines of sight and scatters Gaussians in depth. Three things hold it back: Gaussians move freely
 across the line of sight but only slightly along it; the regularising terms of the loss; and a guard that compares
-depth, extents and coverage with those before, and takes the last state that passes.
+depth, extents and coverage with those before, and takes the best state that passes. Two additions to the paper's loss
+do most of the work: every second step looks at the frame warped to a view from the side (`guard.neighbours`), and the
+expected depth is tied to that before (`losses.depth_loss`).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
+from scipy.ndimage import distance_transform_edt
 
 from fluidlift.errors import InputRejected, require
 from fluidlift.numerics.harmonics import basis
@@ -25,6 +28,7 @@ from fluidlift.shape.guard import Frame, ShapeFigures, broken, neighbours, pictu
 from fluidlift.shape.losses import (
     LossWeights,
     anisotropy_loss,
+    depth_loss,
     image_loss,
     luminance_loss,
     scale_loss,
@@ -33,7 +37,7 @@ from fluidlift.shape.losses import (
 from fluidlift.types.camera import PinholeCamera
 from fluidlift.types.gaussians import SH_C0, Gaussians, concatenate
 
-RATES = {"across": 0.08, "along": 0.01, "scales": 0.02, "quats": 0.01, "opacities": 0.05, "colors": 0.06}
+RATES = {"across": 0.08, "along": 0.01, "scales": 0.02, "quats": 0.01, "opacities": 0.1, "colors": 0.1}
 """Adam steps: pixels across and along the line of sight, logarithm, -, logit, harmonics"""
 
 REACH_ALONG = 0.5
@@ -132,7 +136,8 @@ class _Raw:
         d = d / np.maximum(np.linalg.norm(d, axis=1, keepdims=True), 1e-12)
         rest = np.einsum("nk,nkc->nc", basis(d, degree)[:, 1:], gaussians.sh[:, 1:])
         tensor = torch.from_numpy
-        largest = gaussians.scales.max(1, initial=0.0)
+        widest = 0.25 * max(view.size) * pixel[:, None]
+        largest = np.minimum(gaussians.scales, widest).max(1, initial=0.0)
         self.fixed = {
             "anchor": tensor(gaussians.means.copy()),
             "pixel": tensor(pixel.astype(np.float32)[:, None]),
@@ -145,7 +150,8 @@ class _Raw:
         self.free = {
             "across": torch.zeros(len(gaussians), 3),
             "along": torch.zeros(len(gaussians), 1),
-            "scales": tensor(np.log(np.maximum(gaussians.scales, 1e-9))),
+            # one as wide as the picture is an accident, and would be dealt to every tile
+            "scales": tensor(np.log(np.clip(gaussians.scales, 1e-9, widest.astype(np.float32)))),
             "quats": tensor(gaussians.quats.copy()),
             "opacities": tensor(np.log(opacity / (1 - opacity)).astype(np.float32)),
             "colors": tensor(gaussians.sh[:, 0].copy()),
@@ -199,6 +205,8 @@ def _run(
     rng = torch.Generator().manual_seed(seed)
     seen = _in_front(gaussians, frame.view)
     sides = neighbours(frame, gaussians.select(seen), first)
+    frame = replace(frame, depth=first.depth.astype(np.float32))
+    opposite = frame.before_another_color()
     unseen, raw = gaussians.select(~seen), _Raw(gaussians.select(seen), frame.view)
     unit = float(raw.free["scales"].exp().median())
     pushes = torch.zeros(len(raw))
@@ -210,8 +218,11 @@ def _run(
     for i in range(iterations):
         pace = 1.0 if i < iterations / 2 else 0.1 ** (2 * i / iterations - 1)
         # the frame itself and its neighbours in turn; the frame alone would be painted onto the body from one side
-        beside = sides[(i // 2) % len(sides)] if i % 2 else frame
-        history[i], push = _step(raw, beside, weights, unit, pace)
+        shown = sides[(i // 2) % len(sides)] if i % 2 else frame
+        # later on the opposite colour every other time: what is tinted by the background at the border loses its tint
+        if i % 4 == 0 and 2 * i >= iterations:
+            shown = opposite
+        history[i], push = _step(raw, shown, weights, unit, pace)
         pushes += push
         if i + 1 in density_steps:
             room = max(max_gaussians, len(gaussians)) - len(unseen)
@@ -222,6 +233,7 @@ def _run(
         if i + 1 in checks:
             if i + 1 == iterations:
                 pruned += _prune_background(raw, frame)
+                _wash_border(raw, frame)
             candidate = concatenate([raw.gaussians(), unseen]) if len(raw) else unseen
             picture, figures = picture_and_figures(candidate, frame)
             reasons = broken(first, figures)
@@ -253,8 +265,10 @@ def _step(raw: _Raw, frame: Frame, weights: LossWeights, unit: float, pace: floa
     means, scales, opacities, colors = raw.activated(free)
     uv, conics, depths, extents = project(means, free["quats"], scales, opacities, frame.view)
     uv.retain_grad()
-    drawn, light = rasterize(uv, conics, opacities, colors, depths, extents, frame.view.size)
-    picture = drawn + light[..., None] * torch.tensor(frame.plain)
+    z = means @ torch.from_numpy(np.float32(frame.view.rotation[2])) + float(frame.view.translation[2])
+    features = torch.cat([colors, z[:, None]], 1)
+    drawn, light = rasterize(uv, conics, opacities, features, depths, extents, frame.view.size)
+    picture = drawn[..., :3] + light[..., None] * torch.tensor(frame.plain)
     sizes = scales / unit
     loss = (
         weights.image * image_loss(picture, target, weight, weights.dissimilarity)
@@ -262,6 +276,7 @@ def _step(raw: _Raw, frame: Frame, weights: LossWeights, unit: float, pace: floa
         + weights.volume * volume_loss(sizes, weights.volume_form)
         + weights.scale * scale_loss(sizes)
         + weights.luminance * luminance_loss(free["colors"])
+        + weights.depth * depth_loss(drawn[..., 3], light, torch.from_numpy(frame.depth), unit)
     )
     loss.backward()
     gradients = {k: v.grad for k, v in free.items() if v.grad is not None}
@@ -343,14 +358,35 @@ def _prune_background(raw: _Raw, frame: Frame) -> int:
     taken it is no fluid (paper: pruning by the colour of the background).
     """
     means, _, opacities, colors = raw.activated(raw.free)
-    (column, row), _ = _pixels(frame.view, means.numpy())
-    height, width = frame.mask.shape
-    within = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    deep = cv2.erode(frame.mask.astype(np.uint8), np.ones((2 * BORDER + 1,) * 2, np.uint8), borderValue=1) > 0
-    outer = np.zeros(len(raw), bool)
-    outer[within] = ~deep[row[within], column[within]]
+    outer = _at_border(means.numpy(), frame)
     plain = (colors - torch.tensor(frame.plain)).norm(dim=1).numpy() < LIKE_BACKGROUND
     clear = opacities.numpy() < 0.02
     gone = outer & (plain | clear)
     raw.take(torch.from_numpy(np.flatnonzero(~gone)))
     return int(gone.sum())
+
+
+def _at_border(means: np.ndarray, frame: Frame) -> Bool[np.ndarray, "n"]:
+    """Centres within the cut-out that lie outside the mask or within `BORDER` px of its edge."""
+    (column, row), _ = _pixels(frame.view, means)
+    height, width = frame.mask.shape
+    within = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    deep = cv2.erode(frame.mask.astype(np.uint8), np.ones((2 * BORDER + 1,) * 2, np.uint8), borderValue=1) > 0
+    outer = np.zeros(len(means), bool)
+    outer[within] = ~deep[row[within], column[within]]
+    return outer
+
+
+def _wash_border(raw: _Raw, frame: Frame) -> None:
+    """Take the background's tint from Gaussians at the border: their hue is that of the nearest pixel well inside."""
+    means, _, _, colors = raw.activated(raw.free)
+    deep = cv2.erode(frame.mask.astype(np.uint8), np.ones((2 * BORDER + 1,) * 2, np.uint8), borderValue=1) > 0
+    if not deep.any():
+        return
+    outer = np.flatnonzero(_at_border(means.numpy(), frame))
+    (column, row), _ = _pixels(frame.view, means.numpy()[outer])
+    nearest = distance_transform_edt(~deep, return_distances=False, return_indices=True)
+    inner = frame.target[tuple(nearest[:, row, column])]
+    light = colors[outer].mean(1, keepdim=True)
+    hue = torch.from_numpy(inner - inner.mean(1, keepdims=True))
+    raw.free["colors"][outer] = ((light + hue) - 0.5 - raw.fixed["rest"][outer]) / SH_C0

@@ -31,6 +31,8 @@ class Setting:
     """z of the free surface over each column, m (fluids that lie on something)"""
     bed_height: Float[np.ndarray, "nx ny"]
     """z of the ground under each column, m"""
+    pool_level: float | None = None
+    """z below which a pour stands in its vessel, m"""
 
 
 @dataclass(frozen=True)
@@ -241,7 +243,8 @@ def airborne_setting(
     phi = nodes[..., 2] - low[2] + 0.5 * h
     vessel = _vessel(body) if kind == "pour" else None
     if vessel is not None:
-        (cx, cy), radius, rim = vessel
+        (cx, cy), radius, level = vessel
+        rim = level + 0.25 * (level - low[2])
         r = np.hypot(nodes[..., 0] - cx, nodes[..., 1] - cy)
         wall = np.maximum(np.abs(r - (radius + 1.5 * h)) - 1.2 * h, nodes[..., 2] - rim)
         phi = np.minimum(phi, wall)
@@ -264,7 +267,7 @@ def airborne_setting(
     cells[border & ~solid] = CellType.OUTFLOW
     terrain = Terrain(grid, phi.astype(np.float32), _unit(mainstream), _mesh(grid, phi))
     bed = np.full(grid.shape[:2], low[2] - 0.5 * h)
-    return Setting(terrain, cells, None, bed)
+    return Setting(terrain, cells, None, bed, None if vessel is None else vessel[2])
 
 
 def inside_body(
@@ -280,7 +283,7 @@ def inside_body(
 
 
 def _vessel(body: np.ndarray) -> tuple[tuple[float, float], float, float] | None:
-    """Axis, radius and rim height of a container around the lower part of a body, if that is much wider than the
+    """Axis, radius and filling height of a container around the lower part of a body, if that is much wider than the
     upper part and holds its width (a pool that a jet falls into)."""
     z = body[:, 2]
     edges = np.linspace(z.min(), z.max(), 13)
@@ -296,8 +299,7 @@ def _vessel(body: np.ndarray) -> tuple[tuple[float, float], float, float] | None
         return None
     pool = body[z <= edges[first_narrow]]
     centre = 0.5 * (np.percentile(pool[:, :2], 2, axis=0) + np.percentile(pool[:, :2], 98, axis=0))
-    rim = edges[first_narrow] + 0.25 * (edges[first_narrow] - edges[0])
-    return (float(centre[0]), float(centre[1])), 0.5 * float(widest), float(rim)
+    return (float(centre[0]), float(centre[1])), 0.5 * float(widest), float(edges[first_narrow])
 
 
 def signed_distance_from(

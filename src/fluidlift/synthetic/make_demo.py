@@ -12,7 +12,7 @@ import numpy as np
 
 from fluidlift.io.video import write_video
 from fluidlift.synthetic.demo import FILES
-from fluidlift.synthetic.record import FPS, Recording, record, write_case
+from fluidlift.synthetic.record import Recording, record, write_case
 from fluidlift.synthetic.scenes import Scene, stream
 
 SIZE, FRAMES, CELLS = (320, 208), 40, 72
@@ -41,7 +41,14 @@ def on_coarse_raster(scene: Scene, recording: Recording) -> tuple[Scene, Recordi
     return replace(scene, camera=camera), small
 
 
-def make_demo(folder: Path, *, size: tuple[int, int] = SIZE, frames: int = FRAMES, cells: int = CELLS) -> list[Path]:
+def make_demo(
+    folder: Path,
+    *,
+    size: tuple[int, int] = SIZE,
+    frames: int = FRAMES,
+    cells: int = CELLS,
+    settle: float | None = None,
+) -> list[Path]:
     """Simulate and film the demo and write its files.
 
     Args:
@@ -49,19 +56,22 @@ def make_demo(folder: Path, *, size: tuple[int, int] = SIZE, frames: int = FRAME
         size: of the picture, px, multiples of `COARSE`.
         frames: of the clip.
         cells: of the grid along x.
+        settle: s of simulation before the first frame; None: the scene's own.
 
     Returns:
         The files.
     """
     folder = Path(folder)
     scene = stream(size=size, seed=7, cells=cells)
+    if settle is not None:
+        scene = replace(scene, settle=settle)
     recording = record(scene, frames, seed=7, progress=_show)
     write_case(*on_coarse_raster(scene, recording), folder)
     (folder / "video.mp4").unlink()
     for name, target in FILES.items():
         if name != "video.mp4":
             (folder / name).replace(folder / target)
-    write_video(folder / "demo.mp4", list(recording.frames), FPS, quality=21.0)
+    write_video(folder / "demo.mp4", list(recording.frames), scene.fps, quality=21.0)
     (folder / "demo_camera.json").write_text(json.dumps(scene.camera.to_dict(), indent=1))
     return sorted(folder.glob("demo*"))
 

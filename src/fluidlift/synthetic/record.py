@@ -19,8 +19,6 @@ from fluidlift.synthetic.scenes import Scene, scene_of
 from fluidlift.synthetic.surface import Body, body_of, deposit
 from fluidlift.types import Particles
 
-FPS = 25.0
-
 Progress = Callable[[int, int], None]
 """called with frames done and frames in all"""
 
@@ -86,14 +84,14 @@ def _states(scene: Scene, frames: int, seed: int) -> Iterator[tuple[Particles, n
     )
     births = Births(scene.parameters.inflow_velocity)
     births.update(simulator.particles, 0.0)
-    before = max(0, round(scene.settle * FPS))
+    before = max(0, round(scene.settle * scene.fps))
     for k in range(before + frames + 1):
         if k >= before:
             particles = simulator.particles
             yield particles, births.origins(particles.ids)
         if k < before + frames:
-            simulator.advance(1.0 / FPS)
-            births.update(simulator.particles, (k + 1) / FPS)
+            simulator.advance(1.0 / scene.fps)
+            births.update(simulator.particles, (k + 1) / scene.fps)
 
 
 def record(scene: Scene, frames: int, *, seed: int = 0, progress: Progress | None = None) -> Recording:
@@ -154,7 +152,9 @@ def _add_motion(out, camera, last, particles: Particles, depth: np.ndarray, radi
 
 
 def _add_volume(out, scene: Scene, particles: Particles, body: Body) -> None:
-    phi = body.signed_cells(scene.grid)
+    grid = scene.grid
+    below = -scene.solid(grid.centers().reshape(-1, 3)).reshape(grid.shape) / grid.spacing
+    phi = np.maximum(body.signed_cells(grid), np.clip(below, -3, 3))  # the smoothed body reaches into the ground
     near = (phi < 1.0)[..., None]
     out["velocity"].append((cell_velocity(particles, scene) * near).astype(np.float16))
     out["phi"].append(phi.astype(np.float16))
@@ -167,8 +167,8 @@ def scene_record(scene: Scene, frames: int) -> dict[str, Any]:
         "case": scene.name,
         "kind": scene.kind,
         "simulator": "fluidlift",
-        "fps": FPS,
-        "dt": 1.0 / FPS,
+        "fps": scene.fps,
+        "dt": 1.0 / scene.fps,
         "gravity": list(p.gravity),
         "units": "metres, seconds; world right-handed, +z up",
         "domain_min": list(scene.grid.origin),
@@ -195,7 +195,7 @@ def write_case(scene: Scene, recording: Recording, folder: Path, *, quality: flo
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    write_video(folder / "video.mp4", list(recording.frames), FPS, quality=quality)
+    write_video(folder / "video.mp4", list(recording.frames), scene.fps, quality=quality)
     (folder / "camera.json").write_text(json.dumps(scene.camera.to_dict(), indent=1))
     (folder / "scene.json").write_text(json.dumps(scene_record(scene, len(recording.frames)), indent=1))
     np.savez_compressed(
@@ -237,7 +237,7 @@ def make_scene(
         name: stream, pour or honey.
         folder: the case; made if absent.
         size: width and height of the picture, px.
-        frames: at 25 per second; 2 or more.
+        frames: number of frames, 2 or more.
         seed: of all random numbers: the same seed gives the same case.
         cells: of the grid along x.
         progress: called with frames done and frames in all.

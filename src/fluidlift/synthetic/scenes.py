@@ -40,6 +40,8 @@ class Scene:
     camera: PinholeCamera
     settle: float
     """s of simulation before the first frame"""
+    fps: float = 25.0
+    """frames per second of the clip"""
     paint: LiquidPaint = field(default_factory=LiquidPaint)
     grain: tuple[float, float] = (0.10, 0.035)
     """m: size of the streaks and of the grain of the tracer"""
@@ -153,7 +155,7 @@ def stream(*, size: tuple[int, int] = (320, 208), seed: int = 0, cells: int = 72
     wet = (types != CellType.SOLID) & (centers[..., 2] < level + slope * length / 2)
     types[wet & (centers[..., 0] < grid.low[0] + 2 * h)] = CellType.INFLOW
     types[(types != CellType.SOLID) & (centers[..., 0] > grid.high[0] - 2 * h)] = CellType.OUTFLOW
-    parameters = FluidParameters(inflow_velocity=(speed, 0.0, 0.0), wall_damping=0.1, time_step=0.02)
+    parameters = FluidParameters(inflow_velocity=(speed, 0.0, 0.0), time_step=0.02)
     camera = PinholeCamera.looking((0.10, -1.28, 1.25), (0.06, 0.01, 0.16), 47.0, size)
     return Scene(
         "stream", "stream", grid, ground, shares, _terrain(solid, grid, (1.0, 0.0, 0.0)), types, parameters,
@@ -191,8 +193,8 @@ def pour(*, size: tuple[int, int] = (256, 256), seed: int = 0, cells: int = 56) 
     camera = PinholeCamera.looking((0.10, -0.52, 0.56), (0.0, 0.0, 0.15), 40.0, size)
     return Scene(
         "pour", "pour", grid, ground, shares, _terrain(solid, grid, (0.0, 0.0, -1.0)), types, parameters,
-        _moving(positions, volume, parameters, (0.0, 0.0, 0.0)), volume, camera, settle=0.6, grain=(0.04, 0.015),
-        paint=LiquidPaint(absorption=(60.0, 30.0, 28.0)),
+        _moving(positions, volume, parameters, (0.0, 0.0, 0.0)), volume, camera, settle=0.5, fps=60.0,
+        grain=(0.04, 0.015), paint=LiquidPaint(absorption=(60.0, 30.0, 28.0)),
     )  # fmt: skip
 
 

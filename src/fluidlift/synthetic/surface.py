@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from scipy import ndimage
+from scipy import ndimage, special
 from scipy.spatial import cKDTree
 
 from fluidlift.numerics.sampling import sample_centers
@@ -16,8 +16,11 @@ from fluidlift.types import Grid, PinholeCamera
 HALF = 0.5
 """the surface is where the density has fallen to this share of its value inside"""
 
-BLUR = 1.25
+BLUR = 1.6
 """standard deviation of the smoothing of the density, in fine cells (half of a cell of the simulation)"""
+
+SPREAD = 0.4
+"""standard deviation of what sharing particles out to cells adds, in fine cells"""
 
 ScalarField = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n"]]
 """values at positions in m"""
@@ -44,16 +47,15 @@ class Body:
     def signed_cells(self, grid: Grid) -> Float[np.ndarray, "nx ny nz"]:
         """Signed distance at the cell centres of `grid` in its cells, clipped to 3; exact to a fraction of a cell.
 
-        Near the surface the level over its slope (first order), elsewhere the distance to the nearest fine cell of
-        the other side.
+        Near the surface the level is that of a flat surface smoothed by a Gaussian, which is inverted; elsewhere it
+        is the distance to the nearest fine cell of the other side.
         """
         inside = self.level < 0
         away = ndimage.distance_transform_edt(~inside) if inside.any() else np.full(inside.shape, np.inf)
         within = ndimage.distance_transform_edt(inside) if not inside.all() else np.full(inside.shape, np.inf)
         coarse = np.where(inside, 0.5 - within, away - 0.5)
-        slope = np.linalg.norm(np.stack(np.gradient(self.level), -1), axis=-1)
-        near = (np.abs(coarse) <= 2) & (slope > 0.05)
-        distance = np.where(near, self.level / np.maximum(slope, 0.05), coarse)
+        flat = np.hypot(BLUR, SPREAD) * special.ndtri(np.clip(self.level + HALF, 1e-3, 1 - 1e-3))
+        distance = np.where(np.abs(coarse) <= 2, flat, coarse)
         ratio = self.grid.spacing / grid.spacing
         clipped = (np.clip(distance * ratio, -3, 3)).astype(np.float32)
         return sample_centers(clipped, self.grid, grid.centers().reshape(-1, 3)).reshape(grid.shape)

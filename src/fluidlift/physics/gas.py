@@ -1,0 +1,215 @@
+"""The gas: smoke carried by air that fills the whole box.
+
+The air is incompressible and solved on the grid: advection (MacCormack after Selle et al. 2008, limited to the values
+it interpolates), buoyancy where there is smoke, viscosity, pressure. The sides of the box are open (p = 0) except the
+ground. Particles are passive tracers of the smoke, moved with second-order Runge-Kutta steps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numba import njit, prange
+
+from fluidlift.errors import FluidliftError, require
+from fluidlift.numerics.sampling import sample_nodes
+from fluidlift.physics import boundaries, transfer
+from fluidlift.physics.crowding import fill_ratio
+from fluidlift.physics.deform import updated_deformation
+from fluidlift.physics.forces import add_buoyancy
+from fluidlift.physics.pressure import build_system, project
+from fluidlift.physics.stepping import EmitSource, Outcome, ParticleSimulator, SimulationSettings
+from fluidlift.types import CellType, FaceVelocity, FluidParameters, Grid, Particles, SolveReport, Terrain
+
+
+@njit(cache=True)
+def _mean_of_four(field, axis, other, i, j, k):
+    """Component `other` at a face across `axis`: mean of the four nearest faces, clamped to the array."""
+    mx, my, mz = field.shape
+    total = np.float32(0.0)
+    for s in range(2):
+        for t in range(2):
+            ii = i - s if axis == 0 else (i + t if other == 0 else i)
+            jj = j - s if axis == 1 else (j + t if other == 1 else j)
+            kk = k - s if axis == 2 else (k + t if other == 2 else k)
+            total += field[min(max(ii, 0), mx - 1), min(max(jj, 0), my - 1), min(max(kk, 0), mz - 1)]
+    return total * np.float32(0.25)
+
+
+@njit(parallel=True, cache=True)
+def _trace_back(q, u, v, w, axis, cells, out, low, high):
+    """out = q where the flow came from, `cells` = dt / h; low and high are the range of the eight values used."""
+    nx, ny, nz = q.shape
+    for i_ in prange(nx):
+        i = np.int64(i_)
+        for j in range(ny):
+            for k in range(nz):
+                vx = u[i, j, k] if axis == 0 else _mean_of_four(u, axis, 0, i, j, k)
+                vy = v[i, j, k] if axis == 1 else _mean_of_four(v, axis, 1, i, j, k)
+                vz = w[i, j, k] if axis == 2 else _mean_of_four(w, axis, 2, i, j, k)
+                x = min(max(i - cells * vx, 0.0), nx - 1.0)
+                y = min(max(j - cells * vy, 0.0), ny - 1.0)
+                z = min(max(k - cells * vz, 0.0), nz - 1.0)
+                a = max(min(np.int64(x), nx - 2), 0)
+                b = max(min(np.int64(y), ny - 2), 0)
+                c = max(min(np.int64(z), nz - 2), 0)
+                total = 0.0
+                least = np.float32(np.inf)
+                most = np.float32(-np.inf)
+                for di in range(2):
+                    wx = x - a if di == 1 else 1.0 - (x - a)
+                    for dj in range(2):
+                        wxy = wx * (y - b if dj == 1 else 1.0 - (y - b))
+                        for dk in range(2):
+                            value = q[min(a + di, nx - 1), min(b + dj, ny - 1), min(c + dk, nz - 1)]
+                            total += wxy * (z - c if dk == 1 else 1.0 - (z - c)) * value
+                            least = min(least, value)
+                            most = max(most, value)
+                out[i, j, k] = total
+                low[i, j, k] = least
+                high[i, j, k] = most
+
+
+def advect_maccormack(velocity: FaceVelocity, grid: Grid, dt: float) -> FaceVelocity:
+    """The velocity carried along itself for dt (s): back-trace, estimate of its error by tracing forth, correction,
+    limited to the range of the values that the back-trace interpolates."""
+    u, v, w = (np.ascontiguousarray(c, np.float32) for c in velocity.components)
+    cells = dt / grid.spacing
+    out = []
+    for axis, q in enumerate((u, v, w)):
+        once, low, high, again, low_2, high_2 = (np.empty_like(q) for _ in range(6))
+        _trace_back(q, u, v, w, axis, cells, once, low, high)
+        _trace_back(once, u, v, w, axis, -cells, again, low_2, high_2)
+        out.append(np.clip(once + np.float32(0.5) * (q - again), low, high))
+    return FaceVelocity(*out)
+
+
+class GasSimulator(ParticleSimulator):
+    """Smoke in air.
+
+    Args:
+        grid: the same as the terrain's.
+        terrain: solid ground and obstacles.
+        parameters: of the gas; gravity only gives the direction (up is against it).
+        particles: smoke tracers at the start.
+        cell_types: u8 [nx,ny,nz]; INFLOW cells emit smoke with the prescribed velocity, OUTFLOW cells hold p = 0.
+        buoyancy: acceleration of undiluted smoke against gravity, m/s^2.
+        velocity: of the air at the start; None: that of the particles around them, at rest elsewhere.
+        inflow_profile, seed, particles_per_cell, emit_source, settings: as for `LiquidSimulator`.
+
+    Raises:
+        ValueError: arguments of wrong shape, or numbers that are not finite.
+    """
+
+    def __init__(
+        self,
+        grid: Grid,
+        terrain: Terrain,
+        parameters: FluidParameters,
+        particles: Particles,
+        *,
+        cell_types: np.ndarray,
+        buoyancy: float,
+        velocity: FaceVelocity | None = None,
+        inflow_profile: FaceVelocity | None = None,
+        seed: int = 0,
+        particles_per_cell: int = 8,
+        emit_source: EmitSource | None = None,
+        settings: SimulationSettings | None = None,
+    ) -> None:
+        require(np.isfinite(buoyancy), f"buoyancy {buoyancy}", "a finite number of m/s^2")
+        open_sides = np.ones((3, 2), bool)
+        gravity = np.asarray(parameters.gravity) if np.any(parameters.gravity) else np.array([0.0, 0.0, -1.0])
+        vertical = int(np.abs(gravity).argmax())
+        open_sides[vertical, int(gravity[vertical] > 0)] = False
+        super().__init__(
+            grid, terrain, parameters, particles, cell_types=cell_types, inflow_profile=inflow_profile, seed=seed,
+            emit_source=emit_source, open_sides=open_sides,
+            settings=replace(settings or SimulationSettings(), particles_per_cell=particles_per_cell),
+        )  # fmt: skip
+        self.buoyancy = float(buoyancy)
+        types = np.where(self._walls.regions == CellType.EMPTY, CellType.FLUID, self._walls.regions)
+        self._system = build_system(types, self._walls.openings, grid, open_border=True)
+        self._open_faces = tuple(o > 0 for o in self._walls.openings)
+        # how much of a face's surroundings a wall takes, for the damping
+        self._wall_share = tuple(
+            np.clip(1.0 - sample_nodes(self._walls.signed_distance, grid, grid.faces(a).reshape(-1, 3)) / grid.spacing,
+                    0.0, 1.0).reshape(grid.face_shape(a))
+            for a in range(3)
+        )  # fmt: skip
+        if velocity is None:
+            velocity, _ = transfer.particles_to_grid(self._particles, grid)
+        require(velocity.shape == grid.shape, f"velocity on {velocity.shape} cells", str(grid.shape))
+        start = FaceVelocity(*(np.ascontiguousarray(c, np.float32) for c in velocity.components))
+        require(all(np.isfinite(c).all() for c in start.components), "an initial velocity that is not finite")
+        self._head_rate: np.ndarray | None = None
+        projected, _, _ = project(self._inlet.impose(start, 0.0), self._system)
+        self._velocity = self._continued(projected)
+
+    @property
+    def velocity(self) -> FaceVelocity:
+        """Of the air, m/s."""
+        return self._velocity
+
+    def _max_speed(self) -> float:
+        return float(np.sqrt(sum(float(np.square(c).max()) for c in self._velocity.components)))
+
+    def _speed_gain(self) -> float:
+        return abs(self.buoyancy)
+
+    def _continued(self, velocity: FaceVelocity) -> FaceVelocity:
+        """Into the solid, along its surface."""
+        return boundaries.slide_along_walls(boundaries.extrapolate(velocity, self._open_faces), self._walls)
+
+    def _next_velocity(
+        self, order: transfer.CellOrder, dt: float
+    ) -> tuple[FaceVelocity, np.ndarray, SolveReport, tuple[SolveReport, ...]]:
+        grid, parameters = self.grid, self.parameters
+        volumes = (self._particles.masses / parameters.density).astype(np.float32)
+        smoke = np.clip(fill_ratio(self._particles.positions, volumes, grid, order, self._capacity), 0.0, 1.0)
+        velocity = advect_maccormack(self._velocity, grid, dt)
+        velocity = add_buoyancy(velocity, smoke, strength=self.buoyancy, gravity=parameters.gravity, dt=dt)
+        taken = 1.0 - (1.0 - parameters.wall_damping) ** (dt / parameters.time_step)
+        if taken > 0:
+            velocity = FaceVelocity(
+                *((c * (1.0 - taken * s)).astype(np.float32) for c, s in zip(velocity.components, self._wall_share))
+            )
+        velocity = self._inlet.impose(velocity, self.time)
+        velocity, viscosity_reports = self._viscous(velocity, self._open_faces, dt, None)
+        initial = None if self._head_rate is None else self._head_rate * dt
+        velocity, q, report = project(
+            velocity, self._system, tolerance=self.settings.pressure_tolerance, initial=initial
+        )
+        return self._continued(self._inlet.impose(velocity, self.time)), q / dt, report, viscosity_reports
+
+    def _substep(self, dt: float, number: int, *, last_attempt: bool) -> Outcome | None:
+        particles, grid = self._particles, self.grid
+        order = transfer.sort_by_cell(particles.positions, grid)
+        velocity, head_rate, report, viscosity_reports = self._next_velocity(order, dt)
+        fastest = max(float(np.abs(c).max()) for c in velocity.components)
+        if not np.isfinite(fastest) or fastest * dt > 3.0 * self.settings.courant * grid.spacing:
+            if not last_attempt:
+                return None
+            raise FluidliftError(
+                f"Step {self._advances}, substep {number + 1}, t = {self.time:.4g} s: the simulation blew up (air at "
+                f"{fastest:.3g} m/s; pressure residual {report.residual:.2g}). The state before it is kept. Use a "
+                "smaller time_step, or check inflow velocity and buoyancy."
+            )
+        first, _ = transfer.grid_to_particles(velocity, grid, particles.positions, order)
+        middle = (particles.positions + 0.5 * dt * first).astype(np.float32)
+        velocities, affine = transfer.grid_to_particles(velocity, grid, middle, order)
+        positions = (particles.positions + dt * velocities).astype(np.float32)
+        boundaries.collide(
+            positions, particles.positions, velocities, particles.velocities, self._walls, dt=dt,
+            restitution=0.0, tangential_share=1.0,
+        )  # fmt: skip
+        deformation = updated_deformation(particles.deformation, affine, dt, max_stretch=self.settings.max_stretch)
+        state = replace(particles, positions=positions, velocities=velocities, affine=affine, deformation=deformation)
+        leaving = self._leaving(particles.positions, positions)
+        index = order.order[~leaving[order.order]]
+
+        def adopt() -> None:
+            self._velocity, self._head_rate = velocity, head_rate
+
+        return Outcome(state.select(index), int(leaving.sum()), report, viscosity_reports, adopt)

@@ -1,0 +1,292 @@
+"""What the liquid and the gas simulator share: time stepping, particles, inlet and outlet.
+
+A substep either completes or leaves the state as it was.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+
+from fluidlift.errors import FluidliftError, require
+from fluidlift.numerics.sampling import sample_centers
+from fluidlift.numerics.signed_distance import push_outside
+from fluidlift.physics import boundaries, transfer
+from fluidlift.physics.crowding import cell_capacity
+from fluidlift.physics.inlet import Inlet
+from fluidlift.physics.viscosity import diffuse
+from fluidlift.types import CellType, FaceVelocity, FluidParameters, Grid, Particles, SolveReport, Terrain
+
+EmitSource = Callable[[np.ndarray, float], np.ndarray]
+"""(positions [n,3] m, time s) -> index of the rest Gaussian that lends each new particle its look"""
+
+
+@dataclass(frozen=True)
+class SimulationSettings:
+    """Numerical choices, independent of the fluid."""
+
+    particles_per_cell: int = 8
+    """of the inflow; its cube root is rounded"""
+    courant: float = 1.0
+    """cells that the fastest particle may cross in a substep"""
+    pressure_tolerance: float = 1e-5
+    viscosity_tolerance: float = 1e-5
+    max_substeps: int = 1000
+    """per call of `advance`"""
+    max_stretch: float = 4.0
+    """of the deformation of a particle"""
+    spread_crowds: bool = True
+    """correct clumps of particles"""
+    prescribe_outflow: bool = False
+    """True: the outlet's faces move with `outflow_velocity` along the mainstream; False: free outflow"""
+
+
+@dataclass(frozen=True)
+class StepReport:
+    """What a call of `advance` did."""
+
+    duration: float
+    """s"""
+    substeps: int
+    max_speed: float
+    """m/s, of the particles at the end"""
+    volume: float
+    """m^3 that the particles stand for: mass / density"""
+    wet_volume: float
+    """m^3 of the cells that hold particles, cut by the terrain only in whole cells"""
+    pressure: tuple[SolveReport, ...]
+    viscosity: tuple[SolveReport, ...]
+    n_particles: int
+    emitted: int
+    removed: int
+    retries: int
+    """substeps that had to be halved"""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Of one substep, not yet adopted."""
+
+    particles: Particles
+    removed: int
+    pressure: SolveReport
+    viscosity: tuple[SolveReport, ...]
+    adopt: Callable[[], None]
+    """stores what else the simulator keeps from step to step"""
+
+
+class ParticleSimulator(ABC):
+    """Particles on a grid that move in substeps, between an inlet and an outlet.
+
+    Subclasses say what one substep does. Masses: the initial particles get the mass of the space around them (their
+    mean spacing where they are sparser than usual), since Gaussians sample a body unevenly; those given are replaced.
+
+    Args: see `LiquidSimulator`. `open_sides` bool [3,2]: sides of the box (axis, low/high) without a wall.
+    """
+
+    def __init__(
+        self,
+        grid: Grid,
+        terrain: Terrain,
+        parameters: FluidParameters,
+        particles: Particles,
+        *,
+        cell_types: np.ndarray,
+        inflow_profile: FaceVelocity | None,
+        seed: int,
+        emit_source: EmitSource | None,
+        settings: SimulationSettings,
+        open_sides: np.ndarray,
+    ) -> None:
+        require(terrain.grid == grid, "a terrain on another grid", "the grid of the simulation")
+        require(cell_types.shape == grid.shape, f"cell types {cell_types.shape}", str(grid.shape))
+        for name in ("positions", "velocities", "affine", "deformation"):
+            require(bool(np.isfinite(getattr(particles, name)).all()), f"{name} that are not finite")
+        self.grid, self.parameters, self.settings, self.time = grid, parameters, settings, 0.0
+        self._rng = np.random.default_rng(seed)
+        self._walls = boundaries.build_walls(terrain, cell_types, open_sides)
+        self._capacity = cell_capacity(terrain.signed_distance, grid)
+        self._mainstream = np.asarray(terrain.mainstream, np.float64)
+        self._inlet = Inlet(self._walls, parameters, inflow_profile, seed, settings.particles_per_cell)
+        self._particles = self._prepared(particles)
+        self._next_id = int(particles.ids.max()) + 1 if len(particles) else 0
+        self._emit_source = emit_source or self._nearest_source(particles)
+        self._advances = 0
+
+    @abstractmethod
+    def _substep(self, dt: float, number: int, *, last_attempt: bool) -> Outcome | None:
+        """The state after dt; None where dt should be halved, unless it is the last attempt."""
+
+    @property
+    def particles(self) -> Particles:
+        """The present state, in the order of the ids."""
+        return self._particles.select(np.argsort(self._particles.ids, kind="stable"))
+
+    def advance(self, duration: float) -> StepReport:
+        """Simulate `duration` seconds in substeps of at most `parameters.time_step`.
+
+        Raises:
+            FluidliftError: the simulation blew up or needs too many substeps; the state is that of the last good one.
+            ValueError: a duration that is not positive.
+        """
+        require(np.isfinite(duration) and duration > 0, f"duration {duration}", "positive seconds")
+        self._advances += 1
+        end = self.time + duration
+        substeps = emitted = removed = retries = 0
+        pressure: list[SolveReport] = []
+        viscosity: list[SolveReport] = []
+        while end - self.time > 1e-9 * duration:
+            if substeps >= self.settings.max_substeps:
+                raise FluidliftError(
+                    f"Step {self._advances}: {substeps} substeps reached t = {self.time:.4g} s of {end:.4g} s; "
+                    f"the fastest particle moves at {self._max_speed():.3g} m/s. Use a coarser grid "
+                    "or check the velocities."
+                )
+            emitted += self._fill_inlet()
+            dt = self._substep_length(end - self.time)
+            for attempt in range(7):
+                outcome = self._substep(dt, substeps, last_attempt=attempt == 6)
+                if outcome is not None:
+                    break
+                dt *= 0.5
+                retries += 1
+            self._particles = outcome.particles
+            outcome.adopt()
+            self._inlet.travel(dt)
+            self.time += dt
+            substeps += 1
+            removed += outcome.removed
+            pressure.append(outcome.pressure)
+            viscosity.extend(outcome.viscosity)
+        self.time = end
+        return StepReport(
+            duration, substeps, self._max_speed(), self.volume, self._wet_volume(), tuple(pressure), tuple(viscosity),
+            len(self._particles), emitted, removed, retries,
+        )  # fmt: skip
+
+    @property
+    def volume(self) -> float:
+        """m^3 that the particles stand for: mass / density."""
+        return float(self._particles.masses.sum(dtype=np.float64)) / self.parameters.density
+
+    def _wet_volume(self) -> float:
+        cells = np.clip(self.grid.cell_of(self._particles.positions), 0, np.asarray(self.grid.shape) - 1)
+        return len(np.unique(np.ravel_multi_index(cells.T, self.grid.shape))) * self.grid.spacing**3
+
+    def _max_speed(self) -> float:
+        """m/s, of the particles."""
+        v = self._particles.velocities
+        return float(np.sqrt(np.einsum("ni,ni->n", v, v).max(initial=0.0)))
+
+    def _speed_gain(self) -> float:
+        """m/s^2, largest acceleration by body forces."""
+        return float(np.linalg.norm(self.parameters.gravity))
+
+    def _substep_length(self, remaining: float) -> float:
+        """Equal substeps within the Courant limit, the gain of speed by body forces included."""
+        longest = min(self.parameters.time_step, remaining)
+        gain = self._speed_gain()
+        # (speed + gain dt) dt <= courant h
+        reach, speed = self.settings.courant * self.grid.spacing, self._max_speed()
+        limit = 2.0 * reach / (speed + np.sqrt(speed**2 + 4.0 * gain * reach)) if speed + gain > 0 else np.inf
+        return remaining / np.ceil(remaining / min(longest, limit) - 1e-9)
+
+    def _prepared(self, particles: Particles) -> Particles:
+        """Particles inside the box and outside the solid, with the mass of the space around them."""
+        grid = self.grid
+        clear = boundaries.CLEARANCE * grid.spacing
+        positions = np.clip(particles.positions, grid.low + clear, grid.high - clear)
+        positions, inside = push_outside(positions, self._walls.signed_distance, grid, clear)
+        inside |= ~grid.contains(particles.positions, -grid.spacing) | ~grid.contains(positions)
+        kept = replace(particles, positions=positions).select(~inside)
+        if not len(kept):
+            return kept
+        order = transfer.sort_by_cell(kept.positions, grid)
+        ones = np.ones(len(kept), np.float32)
+        crowd = sample_centers(transfer.deposit_to_cells(kept.positions, ones, grid, order), grid, kept.positions)
+        capacity = np.maximum(sample_centers(self._capacity, grid, kept.positions), 0.25)
+        per_cell = crowd / capacity
+        volumes = grid.spacing**3 / np.maximum(per_cell, np.median(per_cell))
+        as_float = {n: np.ascontiguousarray(getattr(kept, n), np.float32) for n in ("velocities", "affine")}
+        return replace(
+            kept,
+            masses=(self.parameters.density * volumes).astype(np.float32),
+            deformation=np.ascontiguousarray(kept.deformation, np.float32),
+            **as_float,
+        )
+
+    def _nearest_source(self, particles: Particles) -> EmitSource:
+        if not len(particles):
+            return lambda positions, time: np.zeros(len(positions), np.int64)
+        tree, source = cKDTree(particles.positions), particles.source.copy()
+        return lambda positions, time: source[tree.query(positions)[1]]
+
+    def _fill_inlet(self) -> int:
+        """Keep the INFLOW cells full of particles that move as prescribed; the number of new ones."""
+        inlet = self._inlet
+        if not inlet.active:
+            return 0
+        places = inlet.missing(self._particles.positions, self._rng)
+        if len(places):
+            source = np.asarray(self._emit_source(places, self.time), np.int64)
+            mass = self.parameters.density * inlet.particle_spacing**3
+            new = Particles.at_rest(places, mass, source, first_id=self._next_id)
+            self._next_id += len(places)
+            self._particles = self._particles.joined(new)
+        inside = inlet.inside(self._particles.positions)
+        velocities, affine = self._particles.velocities.copy(), self._particles.affine.copy()
+        velocities[inside] = inlet.velocity(self._particles.positions[inside], self.time)
+        affine[inside] = 0.0
+        self._particles = replace(self._particles, velocities=velocities, affine=affine)
+        return len(places)
+
+    def _wet_faces(self, wet: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        out = []
+        for axis, opening in enumerate(self._walls.openings):
+            pad = [(0, 0)] * 3
+            pad[axis] = (1, 1)
+            wide = np.moveaxis(np.pad(wet, pad), axis, 0)
+            out.append(np.moveaxis(wide[1:] | wide[:-1], 0, axis) & (opening > 0))
+        return tuple(out)
+
+    def _viscous(
+        self, velocity: FaceVelocity, wet: tuple, dt: float, prescribed: tuple | None
+    ) -> tuple[FaceVelocity, tuple[SolveReport, ...]]:
+        """Viscosity on the wet faces; inflow and other `prescribed` faces (bool per component) keep their velocity."""
+        fixed = [f.copy() for f in self._inlet.faces] if self._inlet.active else [np.zeros(w.shape, bool) for w in wet]
+        if prescribed is not None:
+            fixed = [f | o for f, o in zip(fixed, prescribed)]
+        solved = tuple(w & ~f for w, f in zip(wet, fixed))
+        head_on, beside = [], []
+        for axis, opening in enumerate(self._walls.openings):
+            closed = opening == 0
+            # a wall across the component stops it; a wall along it drags by its share
+            across = closed & (np.abs(self._walls.normals[axis][..., axis]) > 0.7)
+            head_on.append(fixed[axis] | across)
+            beside.append(closed & ~across)
+        stopped = FaceVelocity(
+            *(np.where(o == 0, np.float32(0), c) for o, c in zip(self._walls.openings, velocity.components))
+        )
+        new, reports = diffuse(
+            stopped, solved, tuple(head_on), tuple(beside), viscosity=self.parameters.kinematic_viscosity, dt=dt,
+            spacing=self.grid.spacing, wall_share=self.parameters.wall_damping,
+            tolerance=self.settings.viscosity_tolerance,
+        )  # fmt: skip
+        return (new if reports else velocity), reports
+
+    def _leaving(self, before: Float[np.ndarray, "n 3"], after: Float[np.ndarray, "n 3"]) -> np.ndarray:
+        """bool [n]: out of the box, or out of the OUTFLOW cells along the mainstream."""
+        leaving = ~self.grid.contains(after)
+        outflow = self._walls.regions == CellType.OUTFLOW
+        if not outflow.any():
+            return leaving
+        last = np.asarray(self.grid.shape) - 1
+        was, now = (outflow[tuple(np.clip(self.grid.cell_of(x), 0, last).T)] for x in (before, after))
+        crossed = was & ~now
+        leaving[crossed] |= (after - before)[crossed] @ self._mainstream > 0
+        return leaving

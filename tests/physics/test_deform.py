@@ -23,9 +23,7 @@ def random_gaussians(n=200, seed=0):
 
 def particles_of(gaussians, deformation, source=None):
     p = Particles.at_rest(gaussians.means, 1.0, np.arange(len(gaussians)) if source is None else source)
-    return Particles(
-        p.positions, p.velocities, p.affine, np.float32(deformation), p.masses, p.source, p.ids
-    )
+    return Particles(p.positions, p.velocities, p.affine, np.float32(deformation), p.masses, p.source, p.ids)
 
 
 UPDATES = [updated_deformation, updated_deformation_plain]

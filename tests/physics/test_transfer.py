@@ -47,8 +47,9 @@ def test_the_kernel_gathers_like_the_plain_formula():
     rng = np.random.default_rng(1)
     velocity = FaceVelocity(*(rng.normal(size=GRID.face_shape(a)).astype(np.float32) for a in range(3)))
     positions = cloud(margin=0.0).positions
-    fast, plain = transfer.grid_to_particles(velocity, GRID, positions), transfer.grid_to_particles_plain(
-        velocity, GRID, positions
+    fast, plain = (
+        transfer.grid_to_particles(velocity, GRID, positions),
+        transfer.grid_to_particles_plain(velocity, GRID, positions),
     )
     np.testing.assert_allclose(fast[0], plain[0], atol=1e-5)  # float32, values of order 1
     np.testing.assert_allclose(fast[1], plain[1], atol=1e-5 * 4 / GRID.spacing)
@@ -80,8 +81,10 @@ def grid_angular_momentum(velocity, masses):
 def particle_angular_momentum(particles):
     p = particles
     m, x, v, c = (np.float64(a) for a in (p.masses, p.positions, p.velocities, p.affine))
-    own = 0.25 * GRID.spacing**2 * np.stack(
-        [c[:, 2, 1] - c[:, 1, 2], c[:, 0, 2] - c[:, 2, 0], c[:, 1, 0] - c[:, 0, 1]], axis=-1
+    own = (
+        0.25
+        * GRID.spacing**2
+        * np.stack([c[:, 2, 1] - c[:, 1, 2], c[:, 0, 2] - c[:, 2, 0], c[:, 1, 0] - c[:, 0, 1]], axis=-1)
     )
     return (m[:, None] * (np.cross(x, v) + own)).sum(axis=0)
 

@@ -32,13 +32,15 @@ def ball(center, radius):
     return lambda p: np.linalg.norm(p - np.asarray(center), axis=1) < radius
 
 
-def test_a_column_at_rest_stays_at_rest(scene):
+@pytest.mark.parametrize("restitution", [0.0, 0.8])
+def test_a_column_at_rest_stays_at_rest(scene, restitution):
     grid = Grid((8, 6, 10), H)
     terrain = scene.terrain(grid, grid.nodes()[..., 2] - 0.13)  # the bed cuts through cells
     particles = scene.body(grid, lambda p: p[:, 2] < 0.7, terrain=terrain)
     simulator = LiquidSimulator(
-        grid, terrain, FluidParameters(time_step=0.02), particles, cell_types=scene.cells(grid)
-    )
+        grid, terrain, FluidParameters(time_step=0.02, restitution=restitution), particles,
+        cell_types=scene.cells(grid),
+    )  # fmt: skip
     start = center_of_mass(simulator.particles)
     for _ in range(10):
         report = simulator.advance(0.05)
@@ -108,9 +110,7 @@ def test_the_grid_velocity_is_free_of_divergence(scene):
     )
     terrain = scene.terrain(grid, distance)
     particles = scene.body(grid, lambda p: p[:, 2] < 0.8 - 0.3 * p[:, 0], terrain=terrain, velocity=(1.0, 0.2, 0.0))
-    simulator = LiquidSimulator(
-        grid, terrain, FluidParameters(time_step=0.01), particles, cell_types=scene.cells(grid)
-    )
+    simulator = LiquidSimulator(grid, terrain, FluidParameters(time_step=0.01), particles, cell_types=scene.cells(grid))
     order = transfer.sort_by_cell(simulator._particles.positions, grid)
     velocity, system, _, report, _ = simulator._grid_velocity(order, 0.01)
     assert report.converged
@@ -135,11 +135,12 @@ def channel(scene, *, speed=0.8, seed=0, fluctuation=0.05, settings=None, rock=T
         grid, lambda p: (p[:, 2] < surface) & (p[:, 0] > 2 * H), terrain=terrain, velocity=(speed, 0, 0)
     )
     parameters = FluidParameters(
-        inflow_velocity=(speed, 0, 0), inflow_fluctuation=fluctuation, time_step=0.04, outflow_velocity=speed
+        inflow_velocity=(speed, 0, 0),
+        inflow_fluctuation=fluctuation,
+        time_step=0.04,
+        outflow_velocity=speed * 0.35 / 0.46,  # the depths of the inlet (whole cells) and of the outlet
     )
-    simulator = LiquidSimulator(
-        grid, terrain, parameters, particles, cell_types=types, seed=seed, settings=settings
-    )
+    simulator = LiquidSimulator(grid, terrain, parameters, particles, cell_types=types, seed=seed, settings=settings)
     return simulator, terrain
 
 
@@ -212,9 +213,9 @@ def test_the_same_seed_gives_the_same_particles(scene):
         results.append(simulator.particles)
     np.testing.assert_array_equal(results[0].positions, results[1].positions)
     np.testing.assert_array_equal(results[0].ids, results[1].ids)
-    assert results[2].positions.shape != results[0].positions.shape or (
-        results[2].positions != results[0].positions
-    ).any()
+    assert (
+        results[2].positions.shape != results[0].positions.shape or (results[2].positions != results[0].positions).any()
+    )
 
 
 @pytest.mark.parametrize("restitution", [0.0, 0.6])
@@ -231,7 +232,7 @@ def test_a_drop_bounces_with_its_restitution(scene, restitution):
             rising = max(rising, float(simulator.particles.velocities[0, 2]))
     # the pressure of its own cell brakes the drop before it touches, but it never gains
     assert rising <= 2.0 * restitution + 1e-3
-    assert (rising > 0.2) == (restitution > 0)
+    assert (rising > 0.5) == (restitution > 0)
 
 
 def test_wall_damping_slows_the_flow_along_a_bed(scene):
@@ -242,9 +243,7 @@ def test_wall_damping_slows_the_flow_along_a_bed(scene):
         types = scene.cells(grid)
         types[0, :, 2:5] = CellType.INFLOW
         types[-1] = CellType.OUTFLOW
-        particles = scene.body(
-            grid, lambda p: (p[:, 2] < 0.5) & (p[:, 0] > H), terrain=terrain, velocity=(1.0, 0, 0)
-        )
+        particles = scene.body(grid, lambda p: (p[:, 2] < 0.5) & (p[:, 0] > H), terrain=terrain, velocity=(1.0, 0, 0))
         parameters = FluidParameters(inflow_velocity=(1.0, 0, 0), wall_damping=damping, time_step=0.02)
         simulator = LiquidSimulator(grid, terrain, parameters, particles, cell_types=types)
         for _ in range(4):
@@ -273,9 +272,7 @@ def test_honey_is_slower_than_water(scene):
 def test_a_blow_up_is_reported_and_the_state_before_it_kept(scene, monkeypatch):
     grid = Grid((6, 6, 6), H)
     particles = scene.body(grid, lambda p: p[:, 2] < 0.3)
-    simulator = LiquidSimulator(
-        grid, scene.terrain(grid), FluidParameters(), particles, cell_types=scene.cells(grid)
-    )
+    simulator = LiquidSimulator(grid, scene.terrain(grid), FluidParameters(), particles, cell_types=scene.cells(grid))
     simulator.advance(0.02)
     before = simulator.particles
 

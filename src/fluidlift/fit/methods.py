@@ -18,7 +18,9 @@ Progress = Callable[[int, int], None]
 """called with (done, total)"""
 DIFFERENCE = 0.02
 """raw step of the forward differences: a few per cent, far above the 1e-5 that pressure solves leave"""
-RESCALED_ITERATIONS = 4
+EXPLORING_ITERATIONS = 6
+EXPLORING_OBSERVATIONS = 300.0
+"""leaving the prior by three of its widths costs as much as a change that explains 3 % of the loss gains"""
 RESCALED_ADAM = (10, 20, 30, 45)
 
 
@@ -115,11 +117,13 @@ def jacobian_products(
     for p in range(len(base.raw)):
         if budget.spent:
             return None
-        # away from the prior towards it: the difference then never leaves the range between the two by itself
+        # towards the prior, where the rollout is least likely to break down
         h = DIFFERENCE if base.raw[p] <= space.prior_raw[p] else -DIFFERENCE
         moved = base.raw.copy()
         moved[p] += h
         other = evaluate(problem, space, moved, budget, base.guesses)
+        if not np.isfinite(other.loss):
+            continue  # no derivative to be had here: the variable stays
         columns[p] = (np.concatenate([x.ravel() for x in other.residuals]) - r) / h
     return columns @ columns.T, columns @ r
 
@@ -135,11 +139,13 @@ def levenberg_marquardt(
 ) -> Minimum:
     """Minimise N / (2 L) sum r^2 + prior / 2.
 
-    N and the noise L are re-estimated at the first few points only: from then on the objective stays the same, or it
-    could be lowered for ever by going back and forth.
+    Two phases. Far from the minimum the residual is signal, not noise; taken for noise (large, smooth, so few
+    observations) it would excuse the prior for ever. So first N is `EXPLORING_OBSERVATIONS`, with L that of the current
+    point, for a few iterations or until steps get small. Then N and L are estimated from the residual found there and
+    stay fixed: an objective that is re-estimated all the time can be lowered for ever by going back and forth.
 
-    Stops where a step moves no variable by more than a hundredth of its prior width, or gains less than 1e-3 in the
-    objective (a log probability), or where damping finds no better point.
+    A phase ends where a step moves no variable by more than a hundredth of its prior width, or gains less than 0.01
+    (exploring: 0.5) in the objective, a log probability, or where damping finds no better point.
 
     Args:
         longest: longest step, in prior widths.
@@ -147,15 +153,20 @@ def levenberg_marquardt(
     prior, width = space.prior_raw, space.prior_sigma
     here = evaluate(problem, space, start, budget)
     history, converged, curvature = [here.loss], False, None
-    damping, scale = 1e-2, 0.0
+    if not np.isfinite(here.loss):
+        return Minimum(here.raw, history, False, None, here.loss, here.solved)
+    damping, scale, exploring = 1e-2, 0.0, True
     for iteration in range(max_iterations):
         products = jacobian_products(problem, space, here, budget)
         if products is None:
             break
         normal, slope = products
         curvature = Curvature(normal, here.loss, here.observations(problem))
-        if iteration < RESCALED_ITERATIONS:
+        if exploring and (converged or iteration >= EXPLORING_ITERATIONS):
+            exploring, converged, damping = False, False, min(damping, 1e-2)
             scale = curvature.precision_per_loss
+        elif exploring:
+            scale = EXPLORING_OBSERVATIONS / noise_level(here.loss)
         hessian = scale * normal + np.diag(1 / width**2)
         gradient = scale * slope + (here.raw - prior) / width**2
         objective = 0.5 * scale * here.loss + 0.5 * float((((here.raw - prior) / width) ** 2).sum())
@@ -170,7 +181,7 @@ def levenberg_marquardt(
             if gain > 0:
                 better = there
                 damping = max(damping / 10, 1e-7)
-                converged = small or gain < 1e-3
+                converged = small or gain < (0.5 if exploring else 0.01)
                 break
             if small:
                 converged = True
@@ -178,12 +189,15 @@ def levenberg_marquardt(
             damping *= 8
         if better is None:
             converged = converged or damping >= 1e6
-            break
-        here = better
-        history.append(here.loss)
+            if not converged:
+                break
+        else:
+            here = better
+            history.append(here.loss)
         budget.tell()
-        if converged:
+        if converged and not exploring:
             break
+    converged = converged and not exploring
     if curvature is not None:
         curvature = Curvature(curvature.normal, here.loss, here.observations(problem))
     return Minimum(here.raw, history, converged, curvature, here.loss, here.solved)

@@ -91,7 +91,7 @@ def fit_parameters(
         initial: start and centre of the priors. Inflow velocity, fluctuation and outflow speed that are zero are first
             read off the targets. Its time step is replaced by interval / steps per frame.
         kind: "plume" is a gas: EMPTY cells are solved too, the box is open, and `gravity` acts on FLUID (smoke) cells
-            alone and upwards: its size is the buoyancy in m/s^2. All other kinds are liquids.
+            alone and upwards: its size is the buoyancy in m/s^2, also in `extra["buoyancy"]`. All others are liquids.
         mainstream: unit direction of the outflow; default: the terrain's, else the mean velocity.
         windows: most windows; fewer where time is short.
         frames_per_window: n; default from the dynamics (`problem.plan_windows`).
@@ -142,7 +142,10 @@ def fit_parameters(
         problem = build_problem(scene, plan, weights=weights, options=options)
         budget = Budget(begun + max_seconds, max_rollouts, progress=progress)
         problem = _within_budget(problem, space, budget, notes)
-        return _fit(problem, space, budget, method, notes)
+        result = _fit(problem, space, budget, method, notes)
+    if kind == "plume":
+        return replace(result, extra=result.extra | {"buoyancy": math.hypot(*result.parameters.gravity)})
+    return result
 
 
 def _scene(
@@ -225,7 +228,8 @@ def _fit(problem: FitProblem, space: ParameterSpace, budget: Budget, method: str
     history, converged = list(found.history), found.converged
     curvature, raw = found.curvature, found.raw.copy()
     if curvature is None:
-        notes.append("the budget ended before the first derivative: nothing was fitted")
+        broken = "the rollout breaks down at the start" if not math.isfinite(found.loss) else "the budget ended early"
+        notes.append(f"{broken}: nothing was fitted")
         raw = space.prior_raw
         curvature = Curvature(np.zeros((len(raw), len(raw))), found.loss, 1.0)
     keep = determined(curvature, space.prior_sigma, raw - space.prior_raw)

@@ -189,9 +189,10 @@ def plan_windows(
 
     A step moves the fast fluid by at most 1.5 cells, and `fall` adds at most U in it (8 steps a frame at most). A
     window is long where the flow is steady and short where it changes: until the velocity would change by its own
-    size, but no longer than fluid needs to cross half of the layout (a quarter, for one frame), half of the clip, nor 25 steps (paper: "longer
-    for steady-state, shorter for highly dynamic fluids"). The layout is frozen within a window: where a free surface is
-    not quite in balance, `fall` (m/s^2) acts on it all along, so it may change the velocity by twice its size at most.
+    size, but no longer than fluid needs to cross half of the layout (a quarter, for one frame), half of the clip, nor
+    25 steps (paper: "longer for steady-state, shorter for highly dynamic fluids"). The layout is frozen within a
+    window: where a free surface is not quite in balance, `fall` (m/s^2) acts on it all along, so it may change the
+    velocity by twice its size at most.
     """
     h = scene.grid.spacing
     courant = scene.fast * interval / h

@@ -234,7 +234,7 @@ def parameter_space(
 DEFAULT_PRIOR_SIGMAS = {
     "density": 0.1,
     "kinematic_viscosity": 3.0,
-    "gravity": 0.2,
+    "gravity": 0.1,
     "inflow_velocity": 1.0,
     "inflow_fluctuation": 1.0,
     "outflow_velocity": 1.0,
@@ -242,5 +242,6 @@ DEFAULT_PRIOR_SIGMAS = {
     "wall_damping": 2.5,
     "time_step": 0.3,
 }
-"""raw: a factor e^3 = 20 for viscosity, 20 % and some 11 degrees for gravity, about the whole range for wall
-coefficients, the flow's own speed for velocities"""
+"""raw: a factor e^3 = 20 for viscosity; about the whole range for wall coefficients; the flow's own speed for
+velocities; 10 % and some 6 degrees for gravity, since a slow viscous flow only knows its ratio to the viscosity, and
+errors of the free surface look like less of it"""

@@ -100,7 +100,7 @@ def orbit_camera(
         size: of the picture; None keeps the original's.
         fov: degrees across the longer side.
     """
-    low, high = np.percentile(points, 1, axis=0), np.percentile(points, 99, axis=0)
+    low, high = points.min(axis=0), points.max(axis=0)
     centre = 0.5 * (low + high)
     away = camera.position - centre
     angle = math.atan2(away[1], away[0]) + math.radians(azimuth)

@@ -170,12 +170,8 @@ class LiquidSimulator(ParticleSimulator):
             positions, particles.positions, velocities, particles.velocities, walls, dt=dt,
             restitution=self.parameters.restitution, tangential_share=keep,
         )  # fmt: skip
-        deformation = updated_deformation(
-            particles.deformation, affine, dt, max_stretch=self.settings.max_stretch
-        )
-        state = replace(
-            particles, positions=positions, velocities=velocities, affine=affine, deformation=deformation
-        )
+        deformation = updated_deformation(particles.deformation, affine, dt, max_stretch=self.settings.max_stretch)
+        state = replace(particles, positions=positions, velocities=velocities, affine=affine, deformation=deformation)
         leaving = self._leaving(particles.positions, positions)
         index = order.order[~leaving[order.order]]  # grouped by cell: neighbours stay close in memory
 

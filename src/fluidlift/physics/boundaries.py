@@ -3,7 +3,7 @@
 Wall model (paper: b, d). The grid lets no fluid through a wall. `wall_damping` takes its share of the tangential
 velocity of particles within one cell of the wall once per nominal time step; the share fades linearly with distance.
 `restitution` gives back its share of the normal velocity that a particle had before the step if its free flight
-would end in the wall within the step (inside a
+would end at the wall within the step (inside a
 body of liquid the pressure turns the flow along the wall before it gets there).
 """
 
@@ -22,6 +22,10 @@ from fluidlift.types import CellType, FaceVelocity, Grid, Terrain
 
 CLEARANCE = 0.02
 """cells: how far outside the solid a colliding particle is put"""
+
+
+CONTACT = 0.5
+"""cells: a free flight that ends closer to the wall is an impact (the pressure of its own cell would stop it there)"""
 
 
 @dataclass(frozen=True)
@@ -80,7 +84,9 @@ def build_walls(terrain: Terrain, regions: np.ndarray, open_sides: np.ndarray) -
     buried = any_open & (mean_of_corners(distance) < 0.25 * grid.spacing)
     clean = np.where(any_open & through, regions, CellType.EMPTY)
     clean = np.where(any_open, clean, CellType.SOLID).astype(np.uint8)
-    return Walls(grid, distance, tuple(openings), tuple(normals), ~any_open, buried, clean, np.asarray(open_sides, bool))
+    return Walls(
+        grid, distance, tuple(openings), tuple(normals), ~any_open, buried, clean, np.asarray(open_sides, bool)
+    )
 
 
 def mean_of_corners(field: Float[np.ndarray, "nx+1 ny+1 nz+1"]) -> Float[np.ndarray, "nx ny nz"]:
@@ -266,7 +272,7 @@ def _collide(new, old, velocities, incoming, dt, field, regions, low, high, h, o
                     old[p, 1] + dt * incoming[p, 1],
                     old[p, 2] + dt * incoming[p, 2],
                 )
-                if flight < margin:
+                if flight < CONTACT * h:
                     back = max(back, -restitution * before)
             velocities[p, 0] = factor * (velocities[p, 0] - normal * nx) + back * nx
             velocities[p, 1] = factor * (velocities[p, 1] - normal * ny) + back * ny
@@ -284,9 +290,7 @@ def _collide(new, old, velocities, incoming, dt, field, regions, low, high, h, o
             value, gx, gy, gz = distance_and_gradient(field, low, inverse, x, y, z)
         # judged as stored, in single precision; the old place was outside
         fx, fy, fz = np.float32(x), np.float32(y), np.float32(z)
-        value, gx, gy, gz = distance_and_gradient(
-            field, low, inverse, np.float64(fx), np.float64(fy), np.float64(fz)
-        )
+        value, gx, gy, gz = distance_and_gradient(field, low, inverse, np.float64(fx), np.float64(fy), np.float64(fz))
         if value > 0.0:
             new[p, 0], new[p, 1], new[p, 2] = fx, fy, fz
         else:

@@ -20,11 +20,13 @@ def water_levels(wet: Bool[np.ndarray, "nx ny nz"], walls: Walls) -> Int[np.ndar
     -1. The level counts whole cells, as the pressure of the liquid beside it does."""
     columns = (walls.regions == CellType.OUTFLOW).any(axis=2)
     wet_here, floor = wet[columns], walls.openings[2][columns] == 0
+    buried = walls.buried[columns]
     level = np.full(len(wet_here), -1, np.int64)
     below = np.zeros(len(wet_here), bool)
     for k in range(wet.shape[2]):
-        below = wet_here[:, k] & (floor[:, k] | below)
-        level[below] = k + 1
+        stands = wet_here[:, k] & (floor[:, k] | below)
+        level[stands] = k + 1
+        below = stands | buried[:, k]  # slivers above the bed count as ground
     out = np.full(wet.shape[:2], -1, np.int64)
     out[columns] = level
     return out

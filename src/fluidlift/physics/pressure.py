@@ -51,10 +51,14 @@ def face_fractions(signed_distance: Float[np.ndarray, "nx+1 ny+1 nz+1"]) -> tupl
     """Open share of every face across x, y and z, float32, from the signed distance at the nodes.
 
     Each square is cut into triangles along both diagonals, and the two results are averaged (no preferred diagonal).
+    The surface is raised by a thousandth of the largest step between nodes (one cell's width), so that a face which
+    lies in a flat surface is closed and not open by a rounding error.
     """
+    distance = np.asarray(signed_distance, np.float64)
+    step = max(float(np.abs(np.diff(distance, axis=axis)).max(initial=0.0)) for axis in range(3))
     fractions = []
     for axis in range(3):
-        phi = np.moveaxis(np.asarray(signed_distance, np.float64), axis, 0)
+        phi = np.moveaxis(distance - 1e-3 * step, axis, 0)
         a, b, c, d = phi[:, :-1, :-1], phi[:, 1:, :-1], phi[:, 1:, 1:], phi[:, :-1, 1:]
         parts = [(a, b, c), (a, c, d), (b, c, d), (a, b, d)]
         share = sum(_open_share_of_triangle(*corners) for corners in parts) / 4.0

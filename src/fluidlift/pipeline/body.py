@@ -326,7 +326,7 @@ def _refined_front(story, config, mask, depth) -> tuple[Gaussians, dict[str, Any
         )  # fmt: skip
         fitted |= {"psnr_before": found.psnr_before, "psnr_after": found.psnr_after, "kept": found.kept}
         fitted["loss_history"] = [float(x) for x in found.loss_history]
-        front = found.gaussians
+        front = generate.bounded_colours(found.gaussians, clip.frames[start], camera)
     return front, fitted
 
 

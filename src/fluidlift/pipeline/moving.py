@@ -36,6 +36,7 @@ VISCOSITY_PRIOR = {"stream": 1e-5, "fall": 1e-5, "pour": 1e-4, "plume": 1e-5}
 def motion(story: Story, config: JobConfig) -> Result:
     """Completed flow of many frames, volume velocity of the target frames."""
     from fluidlift.motion.free_fall import with_free_fall
+    from fluidlift.motion.front import front_factor
     from fluidlift.motion.lift import lift_flow
     from fluidlift.motion.volume import volume_velocity
 
@@ -50,13 +51,18 @@ def motion(story: Story, config: JobConfig) -> Result:
     arrays: dict[str, np.ndarray] = {}
     reports: list[dict[str, Any]] = []
     replaced: list[float] = []
+    factors: list[float] = []
+    fluid = labels_of(story).fluid
     depth = g.arrays["depth"]
     for done, t in enumerate(wanted):
         story.step(done, len(wanted))
-        mask = labels_of(story).fluid[t]
+        mask = fluid[t]
         if not mask.any():
             continue
         full, seen = _completed(flow, t, mask, depth, camera, config)
+        if kind == "plume":
+            factor = front_factor(full, fluid, t)
+            full, factors = full * factor, [*factors, factor]
         completed[t], observed[t] = full, seen
         if t not in targets:
             continue
@@ -81,7 +87,8 @@ def motion(story: Story, config: JobConfig) -> Result:
             "speed comes from free fall at the given size"
         )
     arrays |= {"completed": completed, "observed": np.packbits(observed, axis=-1)}
-    return Result(arrays, {"warnings": warnings, "targets": [r["frame"] for r in reports], "reports": reports})
+    return Result(arrays, {"warnings": warnings, "targets": [r["frame"] for r in reports], "reports": reports,
+                           "front_factor": float(np.median(factors)) if factors else 1.0})  # fmt: skip
 
 
 def downhill_of(setting: Any, points: np.ndarray) -> np.ndarray:

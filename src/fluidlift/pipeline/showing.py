@@ -73,8 +73,13 @@ def _panels(story: Story, folder: Path, config: JobConfig, count: int, measured)
     airborne = not g.meta["height_field"]
     ground = terrain_surfels(terrain, opacity=0.25 if airborne and _kind(story) == "pour" else 0.98)
     size = _panel_size(clip.size, config.show.width)
-    corners = np.concatenate([rest.means, terrain.mesh.vertices]) if len(terrain.mesh.vertices) else rest.means
-    side = orbit_camera(camera, corners if not airborne else rest.means, size=size)
+    grid = terrain.grid
+    # a body in the air may fill its box later; what lies on a bed stays in it
+    whole = terrain.mesh.vertices
+    if airborne:
+        inset = 0.18 * (grid.high - grid.low) * np.array([1.0, 1.0, 0.0])
+        whole = np.stack([grid.low + inset, grid.high - inset])
+    side = orbit_camera(camera, np.concatenate([rest.means, whole]), size=size)
     sky = np.linspace(0.93, 0.78, size[1], dtype=np.float32)[:, None, None] * np.ones((1, size[0], 3), np.float32)
     for k, (gaussians, _, velocity) in enumerate(splat_frames(folder, count)):
         story.step(k, count)

@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from fluidlift.errors import require
 from fluidlift.shape.terrain import Setting
-from fluidlift.types import CellType, Gaussians, PinholeCamera, decompose_covariances, sh_from_rgb
+from fluidlift.types import SH_C0, CellType, Gaussians, PinholeCamera, decompose_covariances, sh_from_rgb
 
 _WET = (CellType.FLUID, CellType.INFLOW)
 
@@ -184,6 +184,27 @@ def fluid_colour_frame(
     source = core if core.any() else mask
     index = ndimage.distance_transform_edt(~source, return_distances=False, return_indices=True)
     return np.where(mask[..., None], frame, frame[tuple(index)])
+
+
+def bounded_colours(
+    gaussians: Gaussians,
+    frame: UInt8[np.ndarray, "h w 3"],
+    camera: PinholeCamera,
+    *,
+    slack: float = 0.04,
+) -> Gaussians:
+    """Colours held within what the picture shows around each Gaussian (5 x 5 px).
+
+    An optimiser may paint a faint Gaussian at the rim in any colour, because it hardly counts there; once the fluid
+    moves it comes to the front and shows as a speck.
+    """
+    low = ndimage.minimum_filter(frame, size=(5, 5, 1))
+    high = ndimage.maximum_filter(frame, size=(5, 5, 1))
+    floor = picture_colours(low, gaussians.means, camera) - slack
+    ceiling = picture_colours(high, gaussians.means, camera) + slack
+    sh = gaussians.sh.copy()
+    sh[:, :1] = sh_from_rgb(np.clip(0.5 + SH_C0 * sh[:, 0], floor, ceiling))
+    return Gaussians(gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, sh)
 
 
 def united_mask(fluid: Bool[np.ndarray, "t h w"]) -> Bool[np.ndarray, "h w"]:

@@ -244,7 +244,7 @@ def airborne_setting(
     vessel = _vessel(body) if kind == "pour" else None
     if vessel is not None:
         (cx, cy), radius, level = vessel
-        rim = level + 0.25 * (level - low[2])
+        rim = level + 0.5 * (level - low[2])
         r = np.hypot(nodes[..., 0] - cx, nodes[..., 1] - cy)
         wall = np.maximum(np.abs(r - (radius + 1.5 * h)) - 1.2 * h, nodes[..., 2] - rim)
         phi = np.minimum(phi, wall)

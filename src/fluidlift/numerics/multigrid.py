@@ -235,7 +235,8 @@ def _level(diagonal: np.ndarray, couplings: tuple[np.ndarray, ...]) -> Level:
     unknown = diagonal > 0
     inverse = np.divide(1.0, diagonal, out=np.zeros_like(diagonal), where=unknown)
     first, last = _column_ranges(unknown)
-    return Level(diagonal, inverse, couplings, first, last, np.zeros_like(diagonal), np.zeros_like(diagonal))
+    x, y, z = couplings
+    return Level(diagonal, inverse, (x, y, z), first, last, np.zeros_like(diagonal), np.zeros_like(diagonal))
 
 
 def _finest(

@@ -16,10 +16,10 @@ def distance_of_mask(solid: Bool[np.ndarray, "..."], spacing: float) -> Float[np
     require(solid.dtype == bool, f"mask of type {solid.dtype}", "bool")
     if not solid.any():
         return np.full(solid.shape, spacing * sum(solid.shape), np.float32)
-    outside = ndimage.distance_transform_edt(~solid)
+    outside = np.asarray(ndimage.distance_transform_edt(~solid))
     if solid.all():
         return np.full(solid.shape, -spacing * sum(solid.shape), np.float32)
-    inside = ndimage.distance_transform_edt(solid)
+    inside = np.asarray(ndimage.distance_transform_edt(solid))
     return (spacing * np.where(solid, 0.5 - inside, outside - 0.5)).astype(np.float32)
 
 

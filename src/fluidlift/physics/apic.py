@@ -32,7 +32,8 @@ class LiquidSimulator(ParticleSimulator):
 
     Outlet: particles flow freely and are removed when they leave the box there, or when they leave the OUTFLOW cells
     along the mainstream. Columns of liquid that stand on the ground inside OUTFLOW cells have the hydrostatic pressure
-    of the water level they start with (see `physics.outlet`). `parameters.outflow_velocity` is used only with `settings.prescribe_outflow`.
+    of the water level they start with (see `physics.outlet`). `parameters.outflow_velocity` is used only with
+    `settings.prescribe_outflow`.
 
     Masses: the initial particles get the mass of the space around them (their mean spacing where they are sparser
     than usual), since Gaussians sample a body unevenly; the masses given are replaced.
@@ -78,6 +79,7 @@ class LiquidSimulator(ParticleSimulator):
             emit_source=emit_source, open_sides=open_sides,
             settings=replace(settings or SimulationSettings(), particles_per_cell=particles_per_cell),
         )  # fmt: skip
+        self._wall_cells = boundaries.beside_closed_faces(self._walls)
         self._outlet_faces = self._faces_between_liquid_and_outlet() if self.settings.prescribe_outflow else None
         self._head_rate: np.ndarray | None = None
         self._start_levels = self._levels_now() if (self._walls.regions == CellType.OUTFLOW).any() else None
@@ -132,14 +134,32 @@ class LiquidSimulator(ParticleSimulator):
             heads = outlet_heads(water_levels(wet, walls), self._start_levels, walls)
         known = None if heads is None else heads * max(-self.parameters.gravity[2], 0.0) * dt
         initial = None if self._head_rate is None else self._head_rate * dt
-        velocity, q, report = project(
-            velocity, system, tolerance=self.settings.pressure_tolerance, initial=initial, known=known
-        )
+        velocity, q, report, system = self._projected(velocity, system, dt, initial, known)
         if known is not None:
             velocity = hold_columns(velocity, known, walls)
         velocity = self._impose(velocity)
         velocity = boundaries.slide_along_walls(boundaries.extrapolate(velocity, wet_faces), walls)
         return velocity, system, q / dt, report, viscosity_reports
+
+    def _projected(
+        self, velocity: FaceVelocity, system: PressureSystem, dt: float, initial: np.ndarray | None, known
+    ) -> tuple[FaceVelocity, np.ndarray, SolveReport, PressureSystem]:
+        """Projection in which no wall sucks: wall cells whose pressure comes out negative are solved again as air.
+
+        A projection alone holds liquid at walls that it would leave, because nothing may fill the gap (Batty et al.
+        2007, section 5); a nappe would cling to its cliff. One correction stands for the full inequality p >= 0.
+        """
+        tolerance = self.settings.pressure_tolerance
+        new, q, report = project(velocity, system, tolerance=tolerance, initial=initial, known=known)
+        weight = float(np.linalg.norm(self.parameters.gravity)) * self.grid.spacing * dt
+        if not self.settings.separate_from_walls or weight == 0.0:
+            return new, q, report, system
+        sucked = system.unknown & self._wall_cells & (q < -0.1 * weight)
+        if not sucked.any():
+            return new, q, report, system
+        system = replace(system, unknown=system.unknown & ~sucked)
+        new, q, report = project(velocity, system, tolerance=tolerance, initial=q, known=known)
+        return new, q, report, system
 
     def _substep(self, dt: float, number: int, *, last_attempt: bool) -> Outcome | None:
         particles, grid, walls = self._particles, self.grid, self._walls

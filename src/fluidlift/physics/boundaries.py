@@ -89,6 +89,15 @@ def build_walls(terrain: Terrain, regions: np.ndarray, open_sides: np.ndarray) -
     )
 
 
+def beside_closed_faces(walls: Walls) -> Bool[np.ndarray, "nx ny nz"]:
+    """Cells with at least one face that is mostly closed."""
+    out = np.zeros(walls.grid.shape, bool)
+    for axis, opening in enumerate(walls.openings):
+        closed = np.moveaxis(opening < 0.5, axis, 0)
+        np.moveaxis(out, axis, 0)[...] |= closed[1:] | closed[:-1]
+    return out & ~walls.solid
+
+
 def mean_of_corners(field: Float[np.ndarray, "nx+1 ny+1 nz+1"]) -> Float[np.ndarray, "nx ny nz"]:
     """Mean of the eight corners of each cell."""
     for axis in range(3):
@@ -284,9 +293,9 @@ def _collide(new, old, velocities, incoming, dt, field, regions, low, high, h, o
             if value >= margin or squared < 1e-6:
                 break
             step = 1.01 * (margin - value) / squared
-            x = min(max(x + step * gx, low[0]), high[0])
-            y = min(max(y + step * gy, low[1]), high[1])
-            z = min(max(z + step * gz, low[2]), high[2])
+            x = min(max(x + step * gx, low[0] + margin), high[0] - margin)
+            y = min(max(y + step * gy, low[1] + margin), high[1] - margin)
+            z = min(max(z + step * gz, low[2] + margin), high[2] - margin)
             value, gx, gy, gz = distance_and_gradient(field, low, inverse, x, y, z)
         # judged as stored, in single precision; the old place was outside
         fx, fy, fz = np.float32(x), np.float32(y), np.float32(z)

@@ -42,6 +42,8 @@ class SimulationSettings:
     """of the deformation of a particle"""
     spread_crowds: bool = True
     """correct clumps of particles"""
+    separate_from_walls: bool = True
+    """let liquid leave a wall that would have to hold it by suction"""
     prescribe_outflow: bool = False
     """True: the outlet's faces move with `outflow_velocity` along the mainstream; False: free outflow"""
 

@@ -35,6 +35,7 @@ VISCOSITY_PRIOR = {"stream": 1e-5, "fall": 1e-5, "pour": 1e-4, "plume": 1e-5}
 
 def motion(story: Story, config: JobConfig) -> Result:
     """Completed flow of many frames, volume velocity of the target frames."""
+    from fluidlift.motion.air import with_air
     from fluidlift.motion.free_fall import with_free_fall
     from fluidlift.motion.front import front_factor
     from fluidlift.motion.lift import lift_flow
@@ -74,6 +75,8 @@ def motion(story: Story, config: JobConfig) -> Result:
         velocity, report = volume_velocity(
             lifted, setting.terrain, setting.cell_types, grid, kind=kind, mainstream=setting.terrain.mainstream
         )
+        if kind == "plume":
+            velocity, _ = with_air(velocity, setting.cell_types, setting.terrain, grid)
         k = len(reports)
         for name, component in zip("uvw", velocity.components):
             arrays[f"target_{k:03d}_{name}"] = component.astype(np.float32)
@@ -278,7 +281,7 @@ def simulator_of(story: Story, config: JobConfig, rest: Gaussians) -> Any:
         return GasSimulator(
             grid, setting.terrain, parameters, particles, cell_types=setting.cell_types, inflow_profile=velocity,
             velocity=velocity, seed=config.seed, emit_source=look,
-            buoyancy=float(np.linalg.norm(parameters.gravity)),
+            buoyancy=story["fit"].meta["extra"].get("buoyancy", float(np.linalg.norm(parameters.gravity))),
         )  # fmt: skip
     from fluidlift.physics.apic import LiquidSimulator
 

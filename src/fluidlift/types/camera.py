@@ -90,7 +90,7 @@ class PinholeCamera:
     ) -> PinholeCamera:
         """A camera at `eye` that looks at `target`, with world `up` towards the top of the picture."""
         forward = np.asarray(target, float) - np.asarray(eye, float)
-        norm = np.linalg.norm(forward)
+        norm = float(np.linalg.norm(forward))
         require(norm > 0, "eye and target at the same point")
         forward = forward / norm
         right = np.cross(forward, up)

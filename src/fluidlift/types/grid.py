@@ -84,7 +84,7 @@ class Grid:
     def contains(self, points: Float[np.ndarray, "n 3"], margin: float = 0.0) -> np.ndarray:
         """bool [n]: inside the box, at least `margin` metres from its sides."""
         p = np.asarray(points)
-        return ((p >= self.low + margin) & (p < self.high - margin)).all(axis=-1)
+        return np.all((p >= self.low + margin) & (p < self.high - margin), axis=-1)
 
 
 @dataclass(frozen=True)

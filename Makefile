@@ -1,0 +1,58 @@
+# Works on a fresh machine with make and Python 3.11 or newer:
+#   make demo    make an asset from the clip that comes with the package
+#   make test    every check that a change must pass
+# Another interpreter: make demo PYTHON=python3.12
+
+PYTHON ?= python3
+VENV ?= .venv
+OUT ?= demo.fluid
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip install --disable-pip-version-check -c constraints.txt
+
+.PHONY: help demo test lint format unit clean
+
+help:
+	@echo "make demo    make an asset from the clip that comes with the package, in $(OUT)"
+	@echo "make test    lint, types, import contracts and all tests"
+	@echo "make lint    the first three of them only"
+	@echo "make format  let ruff put the source in order"
+	@echo "make clean   remove the environment, caches and the demo asset"
+
+# Exit code 4 of fluidlift means: done, with warnings.
+demo: $(VENV)/.core
+	@$(BIN)/fluidlift demo --out $(OUT) || [ $$? -eq 4 ]
+	@echo "watch $(OUT)/preview.mp4, then open $(OUT)/report.html"
+
+test: lint unit
+
+lint: $(VENV)/.dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+	$(BIN)/lint-imports
+
+unit: $(VENV)/.dev
+	$(BIN)/python -m pytest
+
+format: $(VENV)/.dev
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+# Stamps: an installation is repeated only when what it depends on has changed.
+$(VENV)/.made:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
+	  || { echo "Python 3.11 or newer is needed, for example: make $(MAKECMDGOALS) PYTHON=python3.12"; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+	@touch $@
+
+$(VENV)/.core: $(VENV)/.made pyproject.toml constraints.txt
+	$(PIP) --quiet -e .
+	@touch $@
+
+$(VENV)/.dev: $(VENV)/.made pyproject.toml constraints.txt
+	$(PIP) --quiet -e '.[dev]'
+	@touch $(VENV)/.core $@
+
+clean:
+	rm -rf $(VENV) demo.fluid build dist src/*.egg-info .pytest_cache .ruff_cache .import_linter_cache .hypothesis
+	find src tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -178,7 +178,9 @@ class ParticleSimulator(ABC):
 
     def _wet_volume(self) -> float:
         cells = np.clip(self.grid.cell_of(self._particles.positions), 0, np.asarray(self.grid.shape) - 1)
-        return len(np.unique(np.ravel_multi_index(cells.T, self.grid.shape))) * self.grid.spacing**3
+        wet = np.zeros(self.grid.shape, bool)
+        wet[tuple(cells.T)] = True
+        return int(np.count_nonzero(wet)) * self.grid.spacing**3
 
     def _max_speed(self) -> float:
         """m/s, of the particles."""

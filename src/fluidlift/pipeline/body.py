@@ -213,7 +213,8 @@ def _setting(kind, front, labels, fluid, start, united, camera, to_world, depth,
     reach = camera.unproject(grid[later], np.full(int(later.sum()), middle))
     return terrain.airborne_setting(
         depth, back, visible, camera, np.concatenate([near, far, reach]), bulk,
-        kind=kind, longest=c.cells, cell_limit=c.cell_limit,
+        # smoke needs the whole box, and is cheap per cell: no free surface, few particles
+        kind=kind, longest=c.cells, cell_limit=c.cell_limit * (2 if kind == "plume" else 1),
     )  # fmt: skip
 
 

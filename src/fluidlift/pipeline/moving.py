@@ -300,6 +300,7 @@ def simulate(story: Story, folder: Path, config: JobConfig) -> Result:
     """Frames of the re-simulation, as splats with ids and velocities."""
     from fluidlift.io.atomic import require_free_space
     from fluidlift.io.ply import write_gaussians
+    from fluidlift.look.appearance import SteadyShading
     from fluidlift.numerics.sampling import sample_nodes
     from fluidlift.physics.deform import deform_gaussians
 
@@ -310,6 +311,10 @@ def simulate(story: Story, folder: Path, config: JobConfig) -> Result:
     require_free_space(folder, frames * len(rest) * 80)
     simulator = simulator_of(story, config, rest)
     grid = setting.terrain.grid
+    shading = None
+    if setting.surface_height is not None:  # bodies in the air change their outline: nothing about them is steady
+        mask = labels_of(story).fluid.mean(axis=0) > 0.5
+        shading = SteadyShading.of(clip.frames, mask, camera_of(story)) if mask.any() else None
     volumes, leaks, counts, substeps = [], [], [], []
     for old in (folder / "frames" / "splats").glob("*.ply"):
         old.unlink()
@@ -321,7 +326,9 @@ def simulate(story: Story, folder: Path, config: JobConfig) -> Result:
         p = simulator.particles
         if len(p) > config.simulate.max_particles * 2:
             break
-        shown = deform_gaussians(rest, p, max_stretch=MAX_STRETCH)
+        shown = deform_gaussians(rest, p, max_stretch=MAX_STRETCH, max_size=1.2 * grid.spacing)
+        if shading is not None:
+            shown = shading.moved(shown, rest.means[p.source])
         write_gaussians(frame_file(folder, 1001 + k), shown, ids=p.ids, velocities=p.velocities)
         occupied = np.unique(np.floor((p.positions - grid.low) / grid.spacing).astype(np.int64), axis=0)
         volumes.append(len(occupied) * grid.spacing**3)

@@ -121,7 +121,7 @@ def hull_gaussians(
     setting: Setting,
     camera: PinholeCamera,
     *,
-    shade: float = 0.75,
+    shade: float = 0.85,
     seed: int = 0,
 ) -> Gaussians:
     """Gaussians on the sides of the body that the camera does not see: its bed, its ends, what lies off the picture.

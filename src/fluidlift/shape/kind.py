@@ -251,7 +251,7 @@ def level_camera(camera: PinholeCamera, up: UpEvidence) -> PinholeCamera:
     right = np.array([1.0, 0.0, 0.0])
     forward = np.array([0.0, np.cos(p), -np.sin(p)])
     down = np.cross(forward, right)
-    turned_right = np.cos(r) * right + np.sin(r) * down
+    turned_right = np.cos(r) * right - np.sin(r) * down  # the picture turns clockwise when the camera turns against it
     turned_down = np.cross(forward, turned_right)
     rotation = np.stack([turned_right, turned_down, forward])
     return PinholeCamera(camera.focal, camera.center, camera.size, RigidTransform(rotation, np.zeros(3)))

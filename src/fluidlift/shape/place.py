@@ -29,7 +29,7 @@ def pose_up(camera: PinholeCamera) -> tuple[UpEvidence, float]:
     pitch = np.degrees(np.arcsin(np.clip(-forward[2], -1, 1)))
     heading = np.degrees(np.arctan2(-forward[0], forward[1]))
     level = np.array([np.cos(np.radians(heading)), np.sin(np.radians(heading)), 0.0])
-    roll = np.degrees(np.arctan2(-right[2], right @ level))
+    roll = np.degrees(np.arctan2(-right @ np.cross(forward, level), right @ level))
     return UpEvidence(float(pitch), float(roll), "camera file", 1.0), float(heading)
 
 

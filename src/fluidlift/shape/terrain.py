@@ -84,7 +84,7 @@ def channel_setting(
         spacing *= 1.05
     plan = _plan(surface, labels, camera, grid, along, reach)
     bed, water = _bed_and_banks(plan, surface, grid, depth, reach)
-    return _fill_channel(grid, plan, bed, water, along, reach, mainstream)
+    return _fill_channel(grid, plan, bed, water, along, reach, mainstream, kind)
 
 
 def _ground_direction(surface, mainstream, centre, extent) -> np.ndarray:
@@ -173,7 +173,7 @@ def _bed_and_banks(plan: _Plan, surface, grid: Grid, depth: float, reach) -> tup
     rock = plan.label == Label.SOLID
     if rock.any():
         to_water = _distance(rock, h)
-        bed = np.where(rock, plan.level + np.minimum(0.5 * h + 0.7 * to_water, 0.8 * depth), bed)
+        bed = np.where(rock, plan.level + np.minimum(1.5 * h + 1.0 * to_water, depth + 1.5 * h), bed)
     upstream = plan.along < reach[0]
     bed = np.where(upstream, np.maximum(bed, plan.level + 2.5 * h * steep), bed)  # closes the channel behind the inlet
     # one pass of smoothing in the water: steps of single cells are of the map, not of the bed
@@ -181,7 +181,7 @@ def _bed_and_banks(plan: _Plan, surface, grid: Grid, depth: float, reach) -> tup
     return np.where(wet & ~rock & ~upstream, smooth, bed), wet & ~rock & ~upstream
 
 
-def _fill_channel(grid, plan, bed, water, along, reach, mainstream) -> Setting:
+def _fill_channel(grid, plan, bed, water, along, reach, mainstream, kind) -> Setting:
     h = grid.spacing
     gx, gy = np.gradient(bed, h)
     nodes = grid.nodes()
@@ -195,10 +195,24 @@ def _fill_channel(grid, plan, bed, water, along, reach, mainstream) -> Setting:
     cells = np.full(grid.shape, CellType.EMPTY, np.uint8)
     cells[solid] = CellType.SOLID
     cells[fluid] = CellType.FLUID
-    cells[fluid & (s < reach[0] + 2.5 * h)] = CellType.INFLOW
+    entry = s < reach[0] + 2.5 * h
+    if kind == "fall":
+        entry = entry | _upper_rim(water, plan.level, along)[..., None]
+    cells[fluid & entry] = CellType.INFLOW
     cells[~solid & (s > reach[1] - 2.5 * h)] = CellType.OUTFLOW
     terrain = Terrain(grid, phi.astype(np.float32), _unit(mainstream), _mesh(grid, phi))
     return Setting(terrain, cells, plan.level, bed)
+
+
+def _upper_rim(water: np.ndarray, level: np.ndarray, along: np.ndarray) -> np.ndarray:
+    """Columns where a curtain begins: wet, dry two cells upstream, and in the upper part of the drop (the back edge of
+    a pool is dry upstream as well). A ragged curtain is fed along its whole upper edge, not at its highest point."""
+    if not water.any():
+        return water
+    step = np.round(2.0 * along / np.abs(along).max()).astype(int)
+    upstream = ndimage.shift(water.astype(np.uint8), step, order=0, cval=0).astype(bool)
+    low, high = level[water].min(), level[water].max()
+    return water & ~upstream & (level > low + 0.4 * (high - low))
 
 
 def airborne_setting(
@@ -230,7 +244,7 @@ def airborne_setting(
     extent = high - low
     spacing = extent.max() / longest
     for _ in range(80):
-        side = 0.35 * max(extent[0], extent[1]) + 4 * spacing
+        side = (0.35 if kind == "pour" else 0.2) * max(extent[0], extent[1]) + 4 * spacing
         above = (0.1 if kind == "pour" else 0.2) * extent[2] + 3 * spacing
         origin = (low[0] - side, low[1] - side, low[2] - 3 * spacing)
         size = (extent[0] + 2 * side, extent[1] + 2 * side, extent[2] + above + 3 * spacing)

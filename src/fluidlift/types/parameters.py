@@ -36,6 +36,8 @@ class FluidParameters:
     def __post_init__(self) -> None:
         object.__setattr__(self, "gravity", tuple(float(g) for g in self.gravity))
         object.__setattr__(self, "inflow_velocity", tuple(float(g) for g in self.inflow_velocity))
+        for name in ("gravity", "inflow_velocity"):
+            require(len(getattr(self, name)) == 3, f"{name} {getattr(self, name)}", "three components")
         numbers = [*self.gravity, *self.inflow_velocity] + [
             v for v in asdict(self).values() if isinstance(v, int | float)
         ]

@@ -1,0 +1,71 @@
+"""What of a fluid's look stays in place and what moves with it.
+
+Foam, bubbles and dirt are carried along; shade, depth, the white of a fall and the dark of its pool stay where they
+are although the water runs through. Carried colours alone smear the second kind downstream.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from scipy import ndimage
+
+from fluidlift.types import SH_C0, Gaussians, PinholeCamera, sh_from_rgb
+
+LARGEST_RATIO = 2.0
+"""a colour is brightened or darkened by no more than this when it moves to another place"""
+
+
+@dataclass(frozen=True)
+class SteadyShading:
+    """The slowly varying part of the mean picture of the fluid."""
+
+    image: Float[np.ndarray, "h w 3"]
+    """sRGB in (0, 1]; outside the fluid, that of the nearest fluid"""
+    camera: PinholeCamera
+
+    @classmethod
+    def of(
+        cls,
+        frames: UInt8[np.ndarray, "t h w 3"],
+        mask: Bool[np.ndarray, "h w"],
+        camera: PinholeCamera,
+        *,
+        width: float = 0.03,
+    ) -> SteadyShading:
+        """Mean over time, blurred inside the mask.
+
+        Args:
+            frames: sRGB.
+            mask: fluid.
+            camera: in the world.
+            width: standard deviation of the blur over the picture's longer side.
+        """
+        pick = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), 24)).astype(int))
+        mean = frames[pick].astype(np.float32).mean(axis=0) / 255.0
+        sigma = width * max(mask.shape)
+        weight = ndimage.gaussian_filter(mask.astype(np.float32), sigma)
+        blurred = np.stack([ndimage.gaussian_filter(mean[..., c] * mask, sigma) for c in range(3)], axis=-1)
+        smooth = blurred / np.maximum(weight, 1e-6)[..., None]
+        if mask.any():
+            index = ndimage.distance_transform_edt(~mask, return_distances=False, return_indices=True)
+            smooth = smooth[tuple(index)]
+        return cls(np.clip(smooth, 0.02, 1.0).astype(np.float32), camera)
+
+    def at(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """The shading where each point is seen; that of the nearest pixel outside the picture."""
+        uv, z = self.camera.project(points)
+        width, height = self.camera.size
+        uv = np.where(z[:, None] > 0, np.nan_to_num(uv, nan=0.0, posinf=1e9, neginf=-1e9), 0.0)
+        col = np.clip(uv[:, 0], 0, width - 1).astype(int)
+        row = np.clip(uv[:, 1], 0, height - 1).astype(int)
+        return self.image[row, col]
+
+    def moved(self, shown: Gaussians, origin: Float[np.ndarray, "n 3"]) -> Gaussians:
+        """Gaussians whose colours were taken at `origin`, shaded for where they are now."""
+        ratio = np.clip(self.at(shown.means) / self.at(origin), 1.0 / LARGEST_RATIO, LARGEST_RATIO)
+        sh = shown.sh.copy()
+        sh[:, :1] = sh_from_rgb(np.clip((0.5 + SH_C0 * sh[:, 0]) * ratio, 0.0, 1.0))
+        return Gaussians(shown.means, shown.quats, shown.scales, shown.opacities, sh)

@@ -1,0 +1,144 @@
+"""Terrain in pictures: normals, surfels, depth, what rocks hide, and a camera that walks around."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from fluidlift.look.scenery import (
+    orbit_camera,
+    terrain_depth,
+    terrain_surfels,
+    vertex_normals,
+    visible_beside_rocks,
+)
+from fluidlift.numerics.isosurface import surface_nets
+from fluidlift.types import Grid, PinholeCamera, Terrain, TriangleMesh
+
+GRID = Grid((24, 24, 16), 0.1, (-1.2, -1.2, -0.8))
+CAMERA = PinholeCamera.looking((0.0, -3.0, 2.0), (0.0, 0.0, 0.0), 35.0, (60, 48))
+BALL, RADIUS = np.array([0.0, 0.0, 0.1]), 0.35
+
+
+def ground(ball=True, colour=None):
+    """Level ground at z = 0, with a ball half buried in it."""
+    nodes = GRID.nodes()
+    phi = nodes[..., 2].copy()
+    if ball:
+        phi = np.minimum(phi, np.linalg.norm(nodes - BALL, axis=-1) - RADIUS)
+    vertices, faces = surface_nets(phi, spacing=GRID.spacing, origin=GRID.origin)
+    colors = None if colour is None else np.tile(np.float64(colour), (len(vertices), 1))
+    return Terrain(GRID, phi.astype(np.float32), np.array([1.0, 0, 0]), TriangleMesh(vertices, faces, colors))
+
+
+def test_normals_of_a_ball_point_away_from_its_middle():
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=2.0)
+    normals = vertex_normals(TriangleMesh(ball.vertices, ball.faces))
+    # triangles of about 18 degrees, of two shapes: their mean leans by a small part of that
+    assert np.degrees(np.arccos((normals * ball.vertices / 2.0).sum(axis=1).clip(-1, 1))).max() < 2.0
+
+
+def test_normals_of_ground_point_up():
+    terrain = ground(ball=False)
+    v, n = terrain.mesh.vertices, vertex_normals(terrain.mesh)
+    top = (np.abs(v[:, 2]) < 0.01) & (np.abs(v[:, :2]) < 1.0).all(axis=1)
+    np.testing.assert_allclose(n[top], np.tile([0, 0, 1.0], (top.sum(), 1)), atol=1e-5)
+
+
+def test_surfels_lie_flat_on_the_ground():
+    terrain = ground(ball=False, colour=(0.4, 0.3, 0.2))
+    surfels = terrain_surfels(terrain)
+    top = (np.abs(surfels.means[:, 2]) < 0.01) & (np.abs(surfels.means[:, :2]) < 1.0).all(axis=1)
+    c = surfels.covariances()[top]
+    assert (c[:, 2, 2] < 0.1 * c[:, 0, 0]).all()
+    np.testing.assert_allclose(c[:, 0, 0], c[:, 1, 1], rtol=1e-3)
+    # all of one colour: the light shines on level ground everywhere alike, and never brightens
+    assert np.ptp(surfels.rgb[top], axis=0).max() < 1e-4
+    assert (surfels.rgb[top] < [0.401, 0.301, 0.201]).all() and (surfels.rgb[top] > 0.05).all()
+
+
+def test_ground_without_a_surface_has_no_surfels():
+    empty = Terrain(
+        GRID, np.ones(tuple(n + 1 for n in GRID.shape)), np.array([1.0, 0, 0]),
+        TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), int)),
+    )  # fmt: skip
+    assert len(terrain_surfels(empty)) == 0
+    assert np.isinf(terrain_depth(empty, CAMERA)).all()
+
+
+def plane_depth():
+    rays = CAMERA.rays(CAMERA.pixel_grid())
+    return -CAMERA.position[2] / rays[..., 2]
+
+
+def test_the_depth_of_level_ground_is_where_rays_meet_it():
+    depth, exact = terrain_depth(ground(ball=False), CAMERA), plane_depth()
+    p = CAMERA.position + CAMERA.rays(CAMERA.pixel_grid()) * exact[..., None]
+    inner = (np.abs(p[..., :2]) < 1.1).all(axis=-1)
+    assert inner.any()
+    # a ray stops within 0.05 cells of the surface, which it meets at 25 degrees or more
+    np.testing.assert_allclose(depth[inner], exact[inner], atol=0.05 * GRID.spacing / np.sin(np.radians(25)))
+
+
+def test_a_ball_on_the_ground_is_nearer_than_the_ground_behind_it():
+    depth = terrain_depth(ground(), CAMERA)
+    uv, z = CAMERA.project(BALL[None])
+    col, row = uv[0].astype(int)
+    direction = BALL - CAMERA.position
+    # trilinear interpolation of the distance over cells of 0.1 m flattens a ball of 0.35 m by about h^2 / 4 R
+    expected = z[0] * (1 - RADIUS / np.linalg.norm(direction))
+    assert depth[row, col] == pytest.approx(expected, abs=0.02)
+    assert depth[row, col] < plane_depth()[row, col]
+
+
+def test_rays_beside_the_box_meet_nothing():
+    away = PinholeCamera.looking((0.0, -3.0, 2.0), (0.0, -6.0, 2.5), 35.0, (20, 16))
+    assert np.isinf(terrain_depth(ground(), away)).all()
+
+
+def test_what_lies_behind_a_rock_is_hidden_and_what_lies_before_or_beside_it_is_not():
+    terrain = ground()
+    depth = terrain_depth(terrain, CAMERA)
+    uv, z = CAMERA.project(BALL[None])
+    before, behind = CAMERA.unproject(uv, z - 0.6), CAMERA.unproject(uv, z + 0.8)
+    beside = CAMERA.unproject(uv + [[20.0, 0.0]], z + 0.8)
+    rock = np.zeros((48, 60), bool)
+    col, row = uv[0].astype(int)
+    rock[row - 2 : row + 3, col - 2 : col + 3] = True
+    seen = visible_beside_rocks(np.vstack([before, behind, beside]), CAMERA, depth, rock, margin=0.15)
+    np.testing.assert_array_equal(seen, [True, False, True])
+
+
+def test_points_behind_the_camera_do_no_harm():
+    seen = visible_beside_rocks(
+        np.array([CAMERA.position, [0.0, -9.0, 4.0], [np.nan] * 3]), CAMERA, np.ones((48, 60)), np.ones((48, 60), bool),
+        margin=0.1,
+    )  # fmt: skip
+    assert seen.shape == (3,)
+
+
+BODY = np.random.default_rng(0).uniform([-1, -0.3, 0], [1, 0.3, 0.2], (500, 3)) + [5.0, 2.0, 0.0]
+
+
+@pytest.mark.parametrize("azimuth", [0.0, 65.0, -120.0])
+@pytest.mark.parametrize("size", [(80, 60), (60, 80)])
+def test_a_camera_that_walks_around_sees_the_whole_body(azimuth, size):
+    view = orbit_camera(CAMERA, BODY, azimuth=azimuth, size=size)
+    uv, z = view.project(BODY)
+    assert view.size == size
+    assert (z > 0).all()
+    assert ((uv >= 0) & (uv <= size)).all()
+    # and it is not far away: the body fills a good part of the picture along one side at least
+    assert (np.ptp(uv, axis=0) / size).max() > 0.5
+
+
+def test_the_camera_walks_counter_clockwise_at_its_elevation():
+    centre = 0.5 * (BODY.min(axis=0) + BODY.max(axis=0))
+
+    def bearing(camera):
+        d = camera.position - centre
+        return np.degrees(np.arctan2(d[1], d[0])), np.degrees(np.arcsin(d[2] / np.linalg.norm(d)))
+
+    start = bearing(CAMERA)[0]
+    around, up = bearing(orbit_camera(CAMERA, BODY, azimuth=65.0, elevation=24.0))
+    assert (around - start) % 360 == pytest.approx(65.0)
+    assert up == pytest.approx(24.0)

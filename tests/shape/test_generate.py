@@ -1,0 +1,229 @@
+"""The embedded generator: Gaussians that look like the picture, a hull that stays in the body, a plate without fluid."""
+
+import cv2
+import numpy as np
+import pytest
+
+from fluidlift.look.rasterize import render
+from fluidlift.shape.generate import (
+    background_plate,
+    body_cells,
+    fluid_colour_frame,
+    front_gaussians,
+    hull_gaussians,
+    picture_colours,
+    united_mask,
+)
+from fluidlift.shape.terrain import Setting
+from fluidlift.types import CellType, Grid, PinholeCamera, Terrain, TriangleMesh
+
+H, W = 64, 96
+ROW, COL = np.mgrid[:H, :W]
+
+
+def soft_picture(seed=0, blur=2.5):
+    noise = np.random.default_rng(seed).standard_normal((H, W, 3)).astype(np.float32)
+    smooth = cv2.GaussianBlur(noise, (0, 0), blur)
+    return np.clip(128 + 50 * smooth / smooth.std(), 0, 255).astype(np.uint8)
+
+
+def water(pitch=40.0):
+    """A camera 2 m above a level surface, and the surface's depth."""
+    low = np.array([0.0, -2.0 / np.tan(np.radians(pitch)), 2.0])
+    camera = PinholeCamera.looking(low, (0.0, 0.0, 0.0), 50.0, (W, H))
+    rays = camera.rays(camera.pixel_grid())
+    return camera, -camera.position[2] / rays[..., 2]
+
+
+def psnr(a, b, where):
+    return -10 * np.log10(np.mean((a[where] - b[where]) ** 2))
+
+
+@pytest.mark.parametrize("stride", [1, 2])
+def test_front_gaussians_look_like_the_picture(stride):
+    frame, (camera, depth) = soft_picture(), water()
+    mask = (ROW > 12) & (ROW < 52)
+    front = front_gaussians(frame, mask, depth, camera, stride=stride)
+    shown = render(front, camera)
+    inner = (ROW > 16) & (ROW < 48) & (COL > 4) & (COL < W - 4)
+    truth = frame / 255.0
+    # on a surface that rises away from the viewer each splat covers half of the one behind it, which moves the picture
+    # by less than a block before refinement: it must be clearly nearer to the truth than the truth moved by a block
+    assert psnr(shown.image, truth, inner) > psnr(np.roll(truth, stride, axis=0), truth, inner) + 1.0
+    assert psnr(shown.image, truth, inner) > 25.0  # 5 % of white, a quarter of the picture's own contrast
+    assert shown.alpha[inner].min() > 0.95  # no holes
+    # expected depth is a mean over overlapping splats on a slanted surface
+    np.testing.assert_allclose(shown.depth[inner], depth[inner], rtol=0.03)
+
+
+def test_front_gaussians_lie_on_the_surface_and_along_it():
+    camera, depth = water()
+    front = front_gaussians(soft_picture(), ROW > 20, depth, camera)
+    np.testing.assert_allclose(front.means[:, 2], 0.0, atol=1e-5)
+    c = front.covariances()
+    # flat: thin across the surface (a quarter of a block of 1 px) and wider along it
+    assert (c[:, 2, 2] < 0.3 * np.maximum(c[:, 0, 0], c[:, 1, 1])).all()
+    assert (np.linalg.eigvalsh(c.astype(float)) > 0).all()
+
+
+def test_there_is_one_gaussian_per_block_inside_the_mask():
+    camera, depth = water()
+    mask = (ROW > 20) & (ROW < 50) & (COL > 10) & (COL < 80)
+    front = front_gaussians(soft_picture(), mask, depth, camera, stride=3)
+    assert len(front) == pytest.approx(mask.sum() / 9, rel=0.1)
+    uv, _ = camera.project(front.means)
+    assert mask[uv[:, 1].astype(int), uv[:, 0].astype(int)].all()
+
+
+def test_a_step_in_depth_makes_no_long_gaussians():
+    camera, _ = water()
+    depth = np.where(COL < 48, 2.0, 8.0)
+    front = front_gaussians(soft_picture(), np.ones((H, W), bool), depth, camera)
+    block = np.where(front.means @ camera.camera_from_world.rotation[2] + camera.camera_from_world.translation[2] < 5, 2, 8)
+    # edges are cut at four blocks; 0.3 is the variance of a block in its own width
+    assert (front.scales.max(axis=1) <= np.sqrt(0.3) * 4 * np.sqrt(2) * block / camera.focal[0]).all()
+
+
+def test_where_nothing_is_fluid_or_deep_there_are_no_gaussians():
+    camera, depth = water()
+    assert len(front_gaussians(soft_picture(), np.zeros((H, W), bool), depth, camera)) == 0
+    assert len(front_gaussians(soft_picture(), np.ones((H, W), bool), 0 * depth, camera)) == 0
+
+
+# the hull -------------------------------------------------------------------------------------------------------
+
+
+def trough():
+    """A block of water 12 x 6 x 4 cells in solid ground, its surface at the upper side."""
+    grid = Grid((16, 10, 8), 0.1, (-0.8, -0.5, -0.6))
+    cells = np.full(grid.shape, CellType.SOLID, np.uint8)
+    cells[:, :, 6:] = CellType.EMPTY
+    cells[2:14, 2:8, 2:6] = CellType.FLUID
+    cells[2:4, 2:8, 2:6] = CellType.INFLOW
+    terrain = Terrain(
+        grid, np.zeros((17, 11, 9), np.float32), np.array([1.0, 0, 0]), TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), int))
+    )
+    return Setting(terrain, cells, np.zeros((16, 10)), np.full((16, 10), -0.4))
+
+
+def test_the_hull_stays_within_half_a_cell_of_the_body_and_below_its_surface():
+    setting = trough()
+    grid = setting.terrain.grid
+    hull = hull_gaussians(soft_picture(), setting, water()[0])
+    assert len(hull) > 100
+    wet = body_cells(setting)
+    assert wet.sum() == 12 * 6 * 4  # the inlet belongs to the body
+    half = 0.5 * grid.spacing
+    near = np.zeros(len(hull), bool)
+    for offset in np.array(np.meshgrid(*[[-half, 0, half]] * 3)).reshape(3, -1).T:
+        cell = np.clip(grid.cell_of(hull.means + offset), 0, np.array(grid.shape) - 1)
+        near |= wet[tuple(cell.T)]
+    assert near.all()
+    assert (hull.means[:, 2] < 0).all()
+
+
+def test_the_hull_covers_every_side_but_not_the_inside():
+    setting = trough()
+    hull = hull_gaussians(soft_picture(), setting, water()[0])
+    cells = {tuple(c) for c in setting.terrain.grid.cell_of(hull.means)}
+    for side in ((5, 2, 4), (5, 7, 4), (2, 5, 4), (13, 5, 4), (5, 5, 2), (5, 5, 5)):
+        assert side in cells
+    assert (7, 4, 4) not in cells
+
+
+def test_the_hull_is_darker_below_the_surface():
+    white = np.full((H, W, 3), 200, np.uint8)
+    hull = hull_gaussians(white, trough(), water()[0], shade=0.5)
+    deep = hull.means[:, 2] < -0.11
+    np.testing.assert_allclose(hull.rgb[deep], 0.5 * 200 / 255, atol=1e-5)
+    np.testing.assert_allclose(hull.rgb[~deep & (hull.means[:, 2] > -0.09)], 200 / 255, atol=1e-5)
+
+
+def test_the_same_seed_gives_the_same_hull():
+    frame, camera = soft_picture(), water()[0]
+    a, b, c = (hull_gaussians(frame, trough(), camera, seed=s) for s in (1, 1, 2))
+    np.testing.assert_array_equal(a.means, b.means)
+    assert not np.array_equal(a.means, c.means)
+
+
+# colours --------------------------------------------------------------------------------------------------------
+
+
+def test_points_take_the_colour_of_their_pixel_or_of_the_nearest():
+    frame, (camera, depth) = soft_picture(), water()
+    uv = np.array([[10.5, 20.5], [95.5, 63.5]])
+    points = camera.unproject(uv, depth[[20, 63], [10, 95]])
+    np.testing.assert_allclose(picture_colours(frame, points, camera), frame[[20, 63], [10, 95]] / 255.0)
+    outside = camera.unproject(np.array([[-500.0, 20.5]]), np.array([2.0]))
+    np.testing.assert_allclose(picture_colours(frame, outside, camera), frame[20:21, 0] / 255.0)
+
+
+def test_fluid_colours_are_carried_beyond_the_mask():
+    frame = np.full((H, W, 3), 10, np.uint8)
+    mask = (ROW > 20) & (ROW < 40)
+    frame[mask] = (0, 100, 200)
+    carried = fluid_colour_frame(frame, mask)
+    assert (carried == (0, 100, 200)).all()
+    np.testing.assert_array_equal(fluid_colour_frame(frame, np.zeros((H, W), bool)), frame)
+
+
+def test_a_third_of_the_frames_makes_a_fluid_pixel():
+    fluid = np.zeros((3, 1, 4), bool)
+    fluid[0, 0, 1], fluid[:2, 0, 2], fluid[:, 0, 3] = True, True, True
+    np.testing.assert_array_equal(united_mask(fluid)[0], [False, False, True, True])
+    np.testing.assert_array_equal(united_mask(fluid[:2])[0], [False, True, True, True])
+
+
+# the background plate -------------------------------------------------------------------------------------------
+
+BROWN, BLUE, BLACK = (120, 90, 60), (30, 90, 200), (15, 15, 15)
+
+
+def passing_blob(rock=False):
+    """A blue blob that crosses a brown scene; with a black rock, water flows all around it at all times."""
+    frames = np.full((12, H, W, 3), BROWN, np.uint8)
+    fluid = np.zeros((12, H, W), bool)
+    for t in range(12):
+        fluid[t] = np.hypot(COL - 8 * t, ROW - 30) < 10
+    stone = np.hypot(COL - 48, ROW - 30) < 6
+    if rock:
+        fluid |= (np.hypot(COL - 48, ROW - 30) < 16)[None]
+        fluid &= ~stone
+        frames[:, stone] = BLACK
+    frames[fluid] = BLUE
+    return frames, fluid, stone
+
+
+def test_behind_a_passing_fluid_its_background_is_found():
+    frames, fluid, _ = passing_blob()
+    plate = background_plate(frames, fluid)
+    assert plate.seen.all()
+    np.testing.assert_array_equal(plate.image, np.full((H, W, 3), BROWN))
+
+
+def test_behind_a_fluid_that_never_goes_the_ground_around_it_is_painted():
+    frames, fluid, _ = passing_blob()
+    fluid[:, 40:56] = True
+    frames[:, 40:56] = BLUE
+    plate = background_plate(frames, fluid)
+    assert not plate.seen[45, 48] and plate.seen[5, 5]
+    # all ground is of one colour, so that any painting from it is; blending of bytes rounds
+    np.testing.assert_allclose(plate.image.astype(int), np.broadcast_to(BROWN, (H, W, 3)), atol=3)
+
+
+def test_rocks_stay_in_the_plate_but_do_not_colour_the_bed_beside_them():
+    frames, fluid, stone = passing_blob(rock=True)
+    plate = background_plate(frames, fluid, stone)
+    core = np.hypot(COL - 48, ROW - 30) < 3
+    # the seam is blended over 1.5 px on either side, whose tail reaches the core 3 px away with a few grey levels
+    np.testing.assert_allclose(plate.image[core].astype(int), np.broadcast_to(BLACK, (core.sum(), 3)), atol=8)
+    bed = (np.hypot(COL - 48, ROW - 30) > 10) & (np.hypot(COL - 48, ROW - 30) < 14)
+    # ground, neither fluid nor rock
+    np.testing.assert_allclose(np.median(plate.image[bed], axis=0), BROWN, atol=6)
+
+
+def test_a_picture_full_of_fluid_has_no_background():
+    frames, fluid, _ = passing_blob()
+    plate = background_plate(frames, np.ones_like(fluid))
+    assert not plate.seen.any()
+    assert plate.image.shape == frames.shape[1:]

@@ -1,0 +1,169 @@
+"""What kind of fluid it is and where up is, from moving masks whose truth is known."""
+
+import numpy as np
+import pytest
+
+from fluidlift.shape.kind import KINDS, PITCH_PRIOR, UpEvidence, estimate_kind, estimate_up, level_camera
+from fluidlift.types import PinholeCamera
+
+H, W, T = 90, 160, 6
+BLUE, GREY = (60, 110, 160), (150, 150, 150)
+ROW, COL = np.mgrid[:H, :W]
+
+
+def scene(masks, move, colour):
+    """frames, masks, mean displacement and confidence of a fluid of one colour and one motion."""
+    masks = np.broadcast_to(masks, (T, H, W)).copy()
+    frames = np.full((T, H, W, 3), 90, np.uint8)
+    frames[masks] = colour
+    wet = masks.any(axis=0)
+    displacement = np.where(wet[..., None], np.asarray(move, np.float32), 0.0)
+    return frames, masks, displacement, np.where(wet, 1.0, 0.0)
+
+
+def river(move=(3.0, 0.2)):
+    return scene((ROW > 35) & (ROW < 75), move, BLUE)
+
+
+def jet():
+    return scene((np.abs(COL - 80) < 6) & (ROW < 80), (0.0, 4.0), BLUE)
+
+
+def curtain():
+    return scene((np.abs(COL - 80) < 45) & (ROW > 12) & (ROW < 75), (0.1, 4.0), BLUE)
+
+
+def smoke():
+    """A grey blob that grows upwards from its source near the foot of the picture and billows."""
+    rng = np.random.default_rng(0)
+    masks = []
+    for t in range(T):
+        top = 70 - 9 * (t + 1)
+        edge = 10 + 6 * np.sin(ROW / 5.0 + 2.1 * t) + 0.15 * (80 - ROW) + rng.uniform(-2, 2)
+        masks.append((np.abs(COL - 80) < edge) & (ROW > top) & (ROW < 80))
+    return scene(np.stack(masks), (0.2, -2.5), GREY)
+
+
+@pytest.mark.parametrize(
+    ("clip", "kind"), [(river, "stream"), (jet, "pour"), (curtain, "fall"), (smoke, "plume")], ids=lambda x: str(x)
+)
+def test_the_kind_is_what_the_fluid_does(clip, kind):
+    found = estimate_kind(*clip())
+    assert found.kind == kind, (found.scores, found.features)
+
+
+def test_beliefs_are_shares_and_the_kind_has_the_largest():
+    found = estimate_kind(*river())
+    assert set(found.scores) == set(KINDS)
+    assert sum(found.scores.values()) == pytest.approx(1.0)
+    assert found.kind == max(found.scores, key=found.scores.get)
+
+
+@pytest.mark.parametrize(
+    ("clip", "feature"), [(river, "sideways"), (jet, "slender"), (jet, "hanging"), (curtain, "falling"), (smoke, "rising")]
+)
+def test_the_evidence_names_what_is_seen(clip, feature):
+    assert estimate_kind(*clip()).features[feature] > 0.8
+
+
+def test_the_motion_decides_not_its_direction_across_the_picture():
+    assert estimate_kind(*river((-3.0, 0.2))).kind == "stream"
+
+
+def test_a_steep_view_speaks_for_a_stream_and_a_level_one_against_it():
+    share = {p: estimate_kind(*curtain(), pitch=p).scores["stream"] for p in (None, 5.0, 60.0)}
+    assert share[5.0] < share[None] < share[60.0]
+
+
+def test_a_fluid_that_no_flow_was_found_on_still_gets_a_kind():
+    frames, masks, displacement, _ = river()
+    found = estimate_kind(frames, masks, 0 * displacement, np.zeros((H, W)))
+    assert found.kind in KINDS
+    assert np.isfinite(list(found.scores.values())).all()
+
+
+def test_masks_belong_to_their_frames():
+    frames, masks, displacement, confidence = river()
+    with pytest.raises(ValueError, match="masks"):
+        estimate_kind(frames, masks[1:], displacement, confidence)
+
+
+# up -------------------------------------------------------------------------------------------------------------
+
+CAMERA = PinholeCamera.from_fov(50.0, (W, H))
+
+
+def plane_flow(pitch, velocity=(0.02, 0.01), rows=(20, 90)):
+    """Exact image motion of a level plane one unit below a camera of known pitch: mask, displacement."""
+    camera = level_camera(CAMERA, UpEvidence(pitch, 0.0, "", 1.0))
+    grid = camera.pixel_grid()
+    down = -camera.rays(grid)[..., 2]
+    mask = (down > 0.05) & (ROW >= rows[0]) & (ROW < rows[1])
+    depth = 1.0 / np.where(mask, down, 1.0)
+    later, _ = camera.project(camera.unproject(grid, depth) + [*velocity, 0.0])
+    return mask, np.where(mask[..., None], later - grid, 0.0)
+
+
+@pytest.mark.parametrize("pitch", [20.0, 35.0, 50.0])
+@pytest.mark.parametrize("velocity", [(0.02, 0.0), (0.015, -0.015)], ids=["across", "towards"])
+def test_the_perspective_of_the_flow_gives_the_tilt(pitch, velocity):
+    mask, displacement = plane_flow(pitch, velocity)
+    up = estimate_up("stream", mask, displacement, np.ones((H, W)), CAMERA)
+    # tilts are tried in steps of 2 degrees, and the prior (35 +- 15) pulls by a few degrees even on exact flow
+    assert up.pitch == pytest.approx(pitch, abs=5.0)
+    assert up.confidence > 0.1
+    assert "perspective" in up.source
+
+
+def test_without_flow_the_usual_view_remains():
+    mask, displacement = plane_flow(20.0)
+    up = estimate_up("stream", mask, displacement, np.zeros((H, W)), CAMERA)
+    assert up.pitch == PITCH_PRIOR["stream"][0]
+    assert up.confidence == 0.0
+
+
+def test_what_the_user_says_wins():
+    mask, displacement = plane_flow(20.0)
+    up = estimate_up("stream", mask, displacement, np.ones((H, W)), CAMERA, pitch=61.5, roll=-3.0)
+    assert (up.pitch, up.roll, up.source, up.confidence) == (61.5, -3.0, "user", 1.0)
+    only_roll = estimate_up("stream", mask, displacement, np.ones((H, W)), CAMERA, roll=4.0)
+    free = estimate_up("stream", mask, displacement, np.ones((H, W)), CAMERA)
+    assert only_roll.roll == 4.0 and only_roll.pitch == free.pitch and "user" in only_roll.source
+
+
+def seen_down(roll):
+    """Direction of the vertical, downwards, in the picture of a level camera with this roll."""
+    camera = level_camera(CAMERA, UpEvidence(0.0, roll, "", 1.0))
+    middle = camera.unproject(np.array([80.0, 45.0]), 3.0)
+    uv, _ = camera.project(middle[None] - [[0, 0, 0.1]])
+    return (uv[0] - [80, 45]) / np.linalg.norm(uv[0] - [80, 45])
+
+
+def test_in_a_picture_turned_clockwise_things_fall_to_the_lower_left():
+    np.testing.assert_allclose(seen_down(0.0), [0, 1], atol=1e-12)
+    np.testing.assert_allclose(seen_down(6.0), [-np.sin(np.radians(6)), np.cos(np.radians(6))], atol=1e-12)
+
+
+@pytest.mark.parametrize(("kind", "sign"), [("pour", 1.0), ("fall", 1.0), ("plume", -1.0)])
+def test_the_direction_of_the_fall_gives_the_roll(kind, sign):
+    displacement = np.broadcast_to(sign * 3.0 * seen_down(6.0), (H, W, 2))
+    up = estimate_up(kind, np.abs(COL - 80) < 10, displacement, np.ones((H, W)), CAMERA)
+    assert up.roll == pytest.approx(3.0, abs=1e-6)  # half of the lean is believed: the other half may be the fluid's
+    assert up.pitch == PITCH_PRIOR[kind][0]
+
+
+def test_a_thrown_jet_does_not_turn_the_camera():
+    up = estimate_up("pour", np.abs(COL - 80) < 10, np.broadcast_to([2.0, 3.0], (H, W, 2)), np.ones((H, W)), CAMERA)
+    assert up.roll == 0.0
+
+
+def test_a_level_camera_sees_the_vertical_upright_and_the_horizon_at_its_pitch():
+    camera = level_camera(CAMERA, UpEvidence(30.0, 0.0, "", 1.0))
+    np.testing.assert_array_equal(camera.position, np.zeros(3))
+    forward = camera.camera_from_world.rotation[2]
+    assert np.degrees(np.arcsin(-forward[2])) == pytest.approx(30.0)
+    horizon, _ = camera.project(np.array([[0.0, 1.0, 0.0]]))  # straight ahead at eye level
+    np.testing.assert_allclose(horizon[0], [W / 2, H / 2 - CAMERA.focal[1] * np.tan(np.radians(30.0))])
+    rolled = level_camera(CAMERA, UpEvidence(30.0, 10.0, "", 1.0)).camera_from_world.rotation
+    np.testing.assert_allclose(rolled @ rolled.T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(rolled[2], forward, atol=1e-12)  # turned about the line of sight

@@ -1,0 +1,269 @@
+"""Bed, banks, rocks, inlets and outlets of a straight channel; floors and vessels of jets and smoke."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import trimesh
+
+from fluidlift.numerics.sampling import sample_nodes
+from fluidlift.shape.surface import PlaneHeight
+from fluidlift.shape.terrain import airborne_setting, channel_setting, inside_body, signed_distance_from
+from fluidlift.types import CellType, Label, PinholeCamera
+
+WIDTH = 1.2
+ROCK, ROCK_RADIUS = (0.35, 0.05), 0.18
+
+
+def channel(mainstream=(1.0, 0.0, 0.0), *, slope=0.0, rock=True, along="x", **options):
+    """Water 1.2 m wide between straight banks, seen at 45 degrees from beside it; a rock stands in it."""
+    camera = PinholeCamera.looking((0.0, -3.0, 3.0), (0.0, 0.0, 0.0), 50.0, (132, 96))
+    surface = PlaneHeight((slope, 0.0), 0.0)
+    rays = camera.rays(camera.pixel_grid())
+    depth = -camera.position[2] / (rays[..., 2] - slope * rays[..., 0])
+    ground = camera.position + rays * depth[..., None]
+    across = ground[..., 1] if along == "x" else ground[..., 0]
+    labels = np.where(np.abs(across) < WIDTH / 2, Label.FLUID, Label.BACKGROUND)
+    visible = ground[labels == Label.FLUID]
+    if rock:
+        labels[np.hypot(ground[..., 0] - ROCK[0], ground[..., 1] - ROCK[1]) < ROCK_RADIUS] = Label.SOLID
+    setting = channel_setting(
+        surface, labels.astype(np.uint8), visible, camera, np.array(mainstream),
+        **{"kind": "stream", "longest": 48, "cell_limit": 120_000} | options,
+    )  # fmt: skip
+    return SimpleNamespace(
+        setting=setting, grid=setting.terrain.grid, cells=setting.cell_types, phi=setting.terrain.signed_distance,
+        bed=setting.bed_height, level=setting.surface_height, camera=camera,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def river():
+    return channel()
+
+
+def columns(scene):
+    """x and y of each column."""
+    return np.moveaxis(scene.grid.centers()[:, :, 0, :2], -1, 0)
+
+
+def positions(scene, kind):
+    return scene.grid.centers()[scene.cells == kind]
+
+
+@pytest.mark.parametrize(("ratio", "expected"), [(None, 0.2), (0.4, 0.4)])
+def test_water_is_as_deep_in_the_middle_as_its_width_says(ratio, expected):
+    scene = channel(rock=False, depth_ratio=ratio)
+    x, y = columns(scene)
+    middle = (np.abs(y) < 0.15) & (np.abs(x) < 1.0)
+    depth = np.median((scene.level - scene.bed)[middle])
+    # the width is measured to a cell at either bank (of 1.2 m), the bed is smoothed over a cell
+    assert depth == pytest.approx(expected * WIDTH, rel=0.12)
+
+
+def test_water_is_shallow_at_the_banks(river):
+    x, y = columns(river)
+    depth = river.level - river.bed
+    inner = np.abs(x) < 1.0
+    rim = inner & (np.abs(np.abs(y) - 0.5) < 0.06)
+    clear = inner & (np.abs(y) < 0.15) & (np.hypot(x - ROCK[0], y - ROCK[1]) > 0.4)
+    assert np.median(depth[rim]) < 0.7 * np.median(depth[clear])
+
+
+def test_banks_stand_above_the_water(river):
+    x, y = columns(river)
+    h = river.grid.spacing
+    bank = (np.abs(y) > WIDTH / 2 + 2 * h) & (np.abs(x) < 1.0)
+    assert bank.any()
+    assert (river.bed[bank] > river.level[bank] + 0.3 * h).all()
+
+
+def test_a_rock_stands_out_of_the_water_and_holds_none(river):
+    x, y = columns(river)
+    rock = np.hypot(x - ROCK[0], y - ROCK[1]) < ROCK_RADIUS - river.grid.spacing
+    assert rock.any()
+    assert (river.bed[rock] > river.level[rock]).all()
+    assert not np.isin(river.cells[rock], [CellType.FLUID, CellType.INFLOW]).any()
+
+
+def test_around_the_rock_there_is_water(river):
+    x, y = columns(river)
+    distance = np.hypot(x - ROCK[0], y - ROCK[1])
+    ring = (distance > ROCK_RADIUS + 1.5 * river.grid.spacing) & (distance < ROCK_RADIUS + 3 * river.grid.spacing)
+    assert (river.cells[ring] == CellType.FLUID).any(axis=-1).all()
+
+
+@pytest.mark.parametrize("stream", [(1.0, 0, 0), (-1.0, 0, 0)], ids=["right", "left"])
+def test_water_enters_upstream_and_leaves_downstream(stream):
+    scene = channel(stream)
+    inlet, body, outlet = (positions(scene, k)[:, 0] * stream[0] for k in (CellType.INFLOW, CellType.FLUID, CellType.OUTFLOW))
+    assert len(inlet) and len(outlet)
+    assert inlet.max() < body.min() + 3 * scene.grid.spacing
+    assert inlet.mean() < np.percentile(body, 1)
+    assert outlet.min() > np.percentile(body, 99)
+    np.testing.assert_allclose(scene.setting.terrain.mainstream, stream, atol=1e-12)
+
+
+def test_a_stream_along_the_view_is_open_at_its_near_and_far_ends():
+    scene = channel((0.0, -1.0, 0.0), along="y", rock=False)
+    assert positions(scene, CellType.INFLOW)[:, 1].mean() > 0.8 * positions(scene, CellType.FLUID)[:, 1].max()
+    assert positions(scene, CellType.OUTFLOW)[:, 1].mean() < 0.8 * positions(scene, CellType.FLUID)[:, 1].min()
+
+
+def test_no_water_is_inside_the_solid_nor_above_its_level(river):
+    for kind in (CellType.FLUID, CellType.INFLOW):
+        p = positions(river, kind)
+        assert (sample_nodes(river.phi, river.grid, p) >= 0).all()
+        assert (p[:, 2] < 0).all()
+    solid = sample_nodes(river.phi, river.grid, positions(river, CellType.SOLID))
+    assert (solid < 1e-6).all()  # the wall behind the inlet ends exactly at cell centres: zero up to rounding
+
+
+def test_the_signed_distance_is_negative_below_the_bed_and_positive_above(river):
+    nodes = river.grid.nodes()
+    inner = (slice(2, -2), slice(2, -2))
+    bed = 0.25 * sum(np.pad(river.bed, ((a, 1 - a), (b, 1 - b)), mode="edge") for a in (0, 1) for b in (0, 1))
+    above = nodes[..., 2] - bed[..., None]
+    np.testing.assert_array_equal(river.phi[inner] > 0, above[inner] > 0)
+
+
+@pytest.mark.parametrize("rock", [False, True])
+def test_the_signed_distance_grows_by_one_metre_per_metre(rock):
+    scene = channel(rock=rock)
+    h = scene.grid.spacing
+    gradient = np.linalg.norm(np.stack(np.gradient(scene.phi.astype(float), h)), axis=0)
+    near = np.abs(scene.phi) < 1.5 * h
+    near[[0, 1, -1, -2]] = False
+    near[:, [0, 1, -1, -2]] = False
+    near[:, :, [0, -1]] = False
+    # height over slope length is exact on planes only: the bed is curved, and bends at the waterline and at rocks
+    assert np.median(gradient[near]) == pytest.approx(1.0, abs=0.1)
+    assert np.percentile(np.abs(gradient[near] - 1), 90) < 0.5
+
+
+def test_the_terrain_is_a_watertight_solid_that_points_outwards(river):
+    mesh = trimesh.Trimesh(river.setting.terrain.mesh.vertices, river.setting.terrain.mesh.faces, process=False)
+    assert mesh.is_watertight and mesh.is_winding_consistent
+    solid = (river.cells == CellType.SOLID).sum() * river.grid.spacing**3
+    # a cell counts as solid when its centre is: the errors of thousands of cut cells cancel, but for the closed rim
+    assert mesh.volume == pytest.approx(solid, rel=0.1)
+
+
+def test_a_tilted_surface_is_followed_by_its_bed():
+    scene = channel(slope=-0.1, rock=False)
+    x, y = columns(scene)
+    middle = (np.abs(y) < 0.15) & (np.abs(x) < 1.0)
+    np.testing.assert_allclose(scene.level[middle], -0.1 * x[middle], atol=1e-9)
+    fall = np.polyfit(x[middle], scene.bed[middle], 1)[0]
+    assert fall == pytest.approx(-0.1, abs=0.01)
+
+
+def test_the_grid_keeps_to_its_limit_and_holds_the_water():
+    scene = channel(cell_limit=8000)
+    assert scene.grid.cells <= 8000
+    assert scene.grid.contains(positions(scene, CellType.FLUID)).all()
+    assert (scene.cells == CellType.FLUID).sum() > 100
+
+
+def test_the_inlet_is_closed_behind(river):
+    inlet = river.cells == CellType.INFLOW
+    first = int(np.argwhere(inlet)[:, 0].min())
+    assert first > 0
+    behind = river.cells[first - 1][inlet[first]]
+    assert (behind == CellType.SOLID).all()
+
+
+def test_distance_above_a_slope_is_shorter_than_height():
+    x = np.linspace(0, 1, 11)
+    above = (np.linspace(-1, 1, 21)[None, None, :] - 0.75 * x[:, None, None]) * np.ones((1, 11, 1))
+    phi = signed_distance_from(above, 0.1, 1.25)
+    near = np.abs(above) < 0.15
+    np.testing.assert_allclose(phi[near], above[near] / 1.25)
+    np.testing.assert_array_equal(phi > 0, above > 0)
+
+
+# in the air -----------------------------------------------------------------------------------------------------
+
+
+def airborne(kind, parts):
+    """Round bodies about vertical axes, (radius, low, high) in metres, seen level from 3 m."""
+    camera = PinholeCamera.looking((0.0, -3.0, 0.5), (0.0, 0.0, 0.5), 30.0, (120, 120))
+    rays, eye = camera.rays(camera.pixel_grid()), camera.position
+    flat = (rays[..., :2] ** 2).sum(-1)
+    along = rays[..., 1] * eye[1]
+    front, back, mask = np.zeros((120, 120)), np.zeros((120, 120)), np.zeros((120, 120), bool)
+    for radius, low, high in parts:
+        root = along**2 - flat * (eye[1] ** 2 - radius**2)
+        near = (-along - np.sqrt(np.maximum(root, 0))) / flat
+        far = (-along + np.sqrt(np.maximum(root, 0))) / flat
+        z = eye[2] + rays[..., 2] * near
+        hit = (root > 0) & (z > low) & (z < high) & ~mask
+        front[hit], back[hit] = near[hit], far[hit]
+        mask |= hit
+    grid = camera.pixel_grid()
+    body = np.concatenate([camera.unproject(grid[mask], d[mask]) for d in (front, 0.5 * (front + back), back)])
+    down = np.array([0, 0, -1.0 if kind == "pour" else 1.0])
+    setting = airborne_setting(front, back, mask, camera, body, down, kind=kind, longest=40, cell_limit=120_000)
+    return SimpleNamespace(setting=setting, grid=setting.terrain.grid, cells=setting.cell_types, body=body)
+
+
+JET, POOL = (0.05, 0.35, 1.0), (0.4, 0.0, 0.35)
+
+
+def test_a_jet_above_a_wide_pool_gets_a_vessel():
+    scene = airborne("pour", [JET, POOL])
+    assert scene.setting.pool_level == pytest.approx(0.35, abs=0.1)  # a layer is a twelfth of 1 m high
+    h = scene.grid.spacing
+    # the wall stands around the pool: solid half way up, just outside its radius of 0.4 m, all around
+    turn = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    ring = 0.4 + 1.5 * h
+    wall = np.column_stack([ring * np.cos(turn), ring * np.sin(turn), np.full(24, 0.15)])
+    inside = np.column_stack([0.3 * np.cos(turn), 0.3 * np.sin(turn), np.full(24, 0.15)])
+    assert (sample_nodes(scene.setting.terrain.signed_distance, scene.grid, wall) < 0).mean() > 0.9
+    assert (sample_nodes(scene.setting.terrain.signed_distance, scene.grid, inside) > 0).all()
+
+
+def test_a_plain_jet_gets_none():
+    scene = airborne("pour", [(0.05, 0.0, 1.0)])
+    assert scene.setting.pool_level is None
+    # only the floor is solid
+    assert positions(scene, CellType.SOLID)[:, 2].max() < 0.0 + scene.grid.spacing
+
+
+def test_smoke_gets_no_vessel():
+    assert airborne("plume", [(0.1, 0.5, 1.0), POOL]).setting.pool_level is None
+
+
+@pytest.mark.parametrize(("kind", "sign"), [("pour", 1.0), ("plume", -1.0)])
+def test_jets_enter_from_above_and_smoke_from_below(kind, sign):
+    scene = airborne(kind, [(0.08, 0.0, 1.0)])
+    inlet, body = positions(scene, CellType.INFLOW)[:, 2], positions(scene, CellType.FLUID)[:, 2]
+    assert len(inlet) and len(body)
+    assert (sign * inlet).min() > (sign * body).max()
+    assert (scene.cells == CellType.OUTFLOW).any()
+    assert scene.setting.surface_height is None
+
+
+def test_the_cells_of_a_jet_have_its_volume():
+    scene = airborne("pour", [(0.08, 0.0, 1.0)])
+    wet = np.isin(scene.cells, [CellType.FLUID, CellType.INFLOW]).sum() * scene.grid.spacing**3
+    # 6 cells of 27 mm across: cells are counted by their centres, and the lowest layer is taken by the floor
+    assert wet == pytest.approx(np.pi * 0.08**2, rel=0.15)
+
+
+def test_the_box_holds_all_of_the_body():
+    scene = airborne("plume", [(0.1, 0.0, 1.0)])
+    assert scene.grid.contains(scene.body).mean() > 0.99
+
+
+def test_inside_is_between_the_near_and_the_far_side():
+    camera = PinholeCamera.from_fov(60.0, (10, 10))
+    front, back = np.full((10, 10), 2.0), np.full((10, 10), 3.0)
+    mask = np.zeros((10, 10), bool)
+    mask[:, :5] = True
+    left, right = [3.5, 5.5], [7.5, 5.5]
+    uv = np.array([left, left, left, right, [-50.0, 5.5]])
+    points = camera.unproject(uv, np.array([1.9, 2.5, 3.1, 2.5, 2.5]))
+    np.testing.assert_array_equal(
+        inside_body(np.vstack([points, -points[1]]), front, back, mask, camera), [0, 1, 0, 0, 0, 0]
+    )

@@ -1,0 +1,82 @@
+"""The command line answers at once and says by its exit code whose fault it was."""
+
+import subprocess
+import sys
+
+import pytest
+
+from fluidlift import __version__
+from fluidlift.cli import DONE, REJECTED, USAGE
+
+HEAVY = {"torch", "numba", "scipy", "cv2", "av", "pxr", "trimesh", "matplotlib"}
+
+ASK = """
+import sys
+from fluidlift import cli
+for command in {commands!r}:
+    try:
+        code = cli.main(command)
+    except SystemExit as stop:
+        code = stop.code
+    assert not code, (command, code)
+print("loaded:", *sorted(set(sys.modules) & {heavy!r}), file=sys.stderr)
+"""
+
+
+def fluidlift(*args: str, cwd=None) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "fluidlift.cli", *args]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=cwd)
+
+
+def test_help_and_version_load_no_heavy_package():
+    names = ["make", "inspect", "mask", "evaluate", "validate", "demo", "doctor"]
+    commands = [["--help"], ["--version"], *([n, "--help"] for n in names)]
+    code = ASK.format(commands=commands, heavy=HEAVY)
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert run.returncode == 0, run.stderr
+    assert run.stderr.strip().splitlines()[-1] == "loaded:"
+
+
+def test_the_version_is_that_of_the_package():
+    run = fluidlift("--version")
+    assert (run.returncode, run.stdout.strip()) == (DONE, f"fluidlift {__version__}")
+
+
+@pytest.mark.parametrize(
+    "args",
+    [
+        [],
+        ["brew"],
+        ["make"],
+        ["make", "clip.mp4", "--preset", "best"],
+        ["make", "clip.mp4", "--size", "wide"],
+        ["make", "clip.mp4", "--colour", "blue"],
+        ["mask", "clip.mp4"],
+        ["evaluate", "a.fluid"],
+    ],
+    ids=" ".join,
+)
+def test_wrong_usage_is_told_apart_from_wrong_input(args):
+    run = fluidlift(*args)
+    assert run.returncode == USAGE
+    assert run.stdout == "" or "usage" in run.stdout.lower()
+    assert run.stderr.strip() and "Traceback" not in run.stderr
+
+
+@pytest.mark.parametrize(
+    "args",
+    [
+        ["make", "missing.mp4"],
+        ["inspect", "missing.mp4"],
+        ["validate", "missing.fluid"],
+        ["make", "missing.mp4", "--set", "fit.colour=blue"],
+        ["make", "missing.mp4", "--config", "missing.yaml"],
+    ],
+    ids=" ".join,
+)
+def test_wrong_input_is_rejected_in_one_line_and_leaves_nothing(args, tmp_path):
+    run = fluidlift(*args, cwd=tmp_path)
+    assert run.returncode == REJECTED
+    assert run.stdout == ""
+    assert run.stderr.startswith("fluidlift: ") and len(run.stderr.strip().splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []

@@ -1,4 +1,7 @@
-"""The command line: parse, call, show. Exit codes: 0 done, 1 failed, 2 usage, 3 input rejected, 4 done with warnings."""
+"""The command line: parse, call, show.
+
+Exit codes: 0 done, 1 failed, 2 usage, 3 input rejected, 4 done with warnings.
+"""
 
 from __future__ import annotations
 
@@ -61,7 +64,7 @@ class Make:
     """largest source picture accepted, px"""
     max_frames: int | None = None
     """most frames accepted"""
-    seed: int = 0
+    seed: int | None = None
     """same clip, settings and seed: same asset"""
     config: Path | None = None
     """YAML file with settings"""

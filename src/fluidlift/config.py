@@ -106,8 +106,6 @@ class ShowConfig:
     """longer side of one preview panel, px"""
     usd: bool = True
     """write asset.usda"""
-    splats: bool = True
-    """keep frames/splats/####.ply"""
 
 
 @dataclass(frozen=True)
@@ -149,6 +147,36 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
         "show": {"width": 768},
     },
 }
+
+
+RANGES: dict[str, tuple[float, float]] = {
+    "seed": (0, 2**63 - 1),
+    "read.start": (0, 1e9),
+    "read.duration": (1e-6, 1e9),
+    "read.max_size": (16, 16384),
+    "read.fps": (1e-3, 1e5),
+    "read.max_pixels": (256, 1e12),
+    "read.max_frames": (2, 1e9),
+    "shape.fov": (2, 165),
+    "shape.pitch": (-90, 90),
+    "shape.roll": (-180, 180),
+    "shape.size": (1e-4, 1e5),
+    "shape.depth_ratio": (0.01, 10),
+    "shape.cells": (4, 2048),
+    "shape.cell_limit": (500, 1e9),
+    "shape.stride": (1, 64),
+    "shape.refine_iterations": (0, 1e6),
+    "shape.max_gaussians": (100, 1e9),
+    "shape.rays": (1, 1001),
+    "shape.longest_union": (1, 1000),
+    "motion.targets": (1, 1e6),
+    "motion.complete_every": (1, 1e6),
+    "fit.max_seconds": (0, 1e9),
+    "simulate.frames": (1, 1e6),
+    "simulate.max_particles": (100, 1e9),
+    "show.width": (16, 16384),
+}
+"""least and greatest value of each number that has a meaning: wider than what is wise"""
 
 
 def build_config(
@@ -193,7 +221,8 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     try:
         data = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise InputRejected(f"config file {path.name} cannot be read: {error}", "a YAML file") from None
+        reason = " ".join(str(error).split())  # YAML draws its complaint over several lines
+        raise InputRejected(f"config file {path.name} cannot be read: {reason}", "a YAML file") from None
     if not isinstance(data, dict):
         raise InputRejected(f"config file {path.name} holds no sections", "read:, shape:, motion:, fit:, ...")
     return data
@@ -212,7 +241,10 @@ def _flatten(data: dict[str, Any]) -> dict[str, Any]:
 def _parse(text: str) -> Any:
     import yaml
 
-    return yaml.safe_load(text)
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError:
+        raise InputRejected(f"the value '{text}'", "a number, a word, true, false or null") from None
 
 
 def _with(config: Any, path: list[str], value: Any, name: str) -> Any:
@@ -235,12 +267,30 @@ def _checked(value: Any, kind: Any, name: str) -> Any:
             return None
         if typing.get_origin(option) is Literal and value in typing.get_args(option):
             return value
-        if option is float and isinstance(value, int | float) and not isinstance(value, bool):
-            return float(value)
+        if option is float and _is_number(value):
+            return _in_range(float(value), name)
         if option in (int, bool, str) and type(value) is option:
-            return value
+            return _in_range(value, name) if option is int else value
     wanted = ", ".join(
         "/".join(map(str, typing.get_args(o))) if typing.get_origin(o) is Literal else getattr(o, "__name__", str(o))
         for o in options
     )
     raise InputRejected(f"option {name} = {value!r}", f"a value of type {wanted}")
+
+
+def _is_number(value: Any) -> bool:
+    """YAML takes 1e3 for a word: it is a number here."""
+    if isinstance(value, str):
+        try:
+            float(value)
+        except ValueError:
+            return False
+        return True
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _in_range(value: Any, name: str) -> Any:
+    low, high = RANGES.get(name, (float("-inf"), float("inf")))
+    if not low <= value <= high:
+        raise InputRejected(f"option {name} = {value:g}", f"{low:g} to {high:g}")
+    return value

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import platform
 from importlib import metadata
@@ -10,7 +9,6 @@ from importlib import metadata
 from fluidlift import __version__
 
 CORE = ("numpy", "scipy", "numba", "torch", "av", "opencv-python-headless", "usd-core", "trimesh")
-OPTIONAL = {"pysplashsurf": "surface meshes", "viser": "viewer", "warp": "CUDA particles", "gsplat": "CUDA splatting"}
 
 
 def examine() -> dict[str, str]:
@@ -26,8 +24,6 @@ def examine() -> dict[str, str]:
             found[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
             found[name] = "MISSING: pip install fluidlift again"
-    for name, use in OPTIONAL.items():
-        found[f"{name} (optional)"] = "installed" if importlib.util.find_spec(name) else f"not installed: {use}"
     found["GPU"] = _gpu()
     return found
 

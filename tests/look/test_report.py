@@ -18,7 +18,12 @@ def page(**changes):
     parts = {
         "title": "river.mp4 as a fluid asset",
         "subtitle": "kind: stream",
-        "sections": [Section("Body", [Figure(PICTURE, "front depth")], [["grid", 64], ["scale", 1.23456789]], ["what", "value"], ["a note"])],
+        "sections": [
+            Section(
+                "Body", [Figure(PICTURE, "front depth")], [["grid", 64], ["scale", 1.23456789]], ["what", "value"],
+                ["a note"],
+            )
+        ],
         "warnings": (),
         "links": {"preview": "preview.mp4"},
     } | changes  # fmt: skip
@@ -57,7 +62,16 @@ def test_nothing_is_loaded_from_elsewhere():
 
 def test_the_page_says_what_it_was_told():
     text = " ".join(Collector(page()).text)
-    for part in ("river.mp4 as a fluid asset", "kind: stream", "Body", "front depth", "grid", "64", "a note", "preview"):
+    for part in (
+        "river.mp4 as a fluid asset",
+        "kind: stream",
+        "Body",
+        "front depth",
+        "grid",
+        "64",
+        "a note",
+        "preview",
+    ):
         assert part in text
     assert "1.235" in text and "1.23456789" not in text  # four digits are enough for people
 

@@ -1,4 +1,4 @@
-"""The embedded generator: Gaussians that look like the picture, a hull that stays in the body, a plate without fluid."""
+"""The embedded generator: Gaussians that look like the picture, a hull inside the body, a plate without fluid."""
 
 import cv2
 import numpy as np
@@ -79,7 +79,9 @@ def test_a_step_in_depth_makes_no_long_gaussians():
     camera, _ = water()
     depth = np.where(COL < 48, 2.0, 8.0)
     front = front_gaussians(soft_picture(), np.ones((H, W), bool), depth, camera)
-    block = np.where(front.means @ camera.camera_from_world.rotation[2] + camera.camera_from_world.translation[2] < 5, 2, 8)
+    block = np.where(
+        front.means @ camera.camera_from_world.rotation[2] + camera.camera_from_world.translation[2] < 5, 2, 8
+    )
     # edges are cut at four blocks; 0.3 is the variance of a block in its own width
     assert (front.scales.max(axis=1) <= np.sqrt(0.3) * 4 * np.sqrt(2) * block / camera.focal[0]).all()
 
@@ -101,7 +103,10 @@ def trough():
     cells[2:14, 2:8, 2:6] = CellType.FLUID
     cells[2:4, 2:8, 2:6] = CellType.INFLOW
     terrain = Terrain(
-        grid, np.zeros((17, 11, 9), np.float32), np.array([1.0, 0, 0]), TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), int))
+        grid,
+        np.zeros((17, 11, 9), np.float32),
+        np.array([1.0, 0, 0]),
+        TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), int)),
     )
     return Setting(terrain, cells, np.zeros((16, 10)), np.full((16, 10), -0.4))
 

@@ -60,7 +60,8 @@ def test_beliefs_are_shares_and_the_kind_has_the_largest():
 
 
 @pytest.mark.parametrize(
-    ("clip", "feature"), [(river, "sideways"), (jet, "slender"), (jet, "hanging"), (curtain, "falling"), (smoke, "rising")]
+    ("clip", "feature"),
+    [(river, "sideways"), (jet, "slender"), (jet, "hanging"), (curtain, "falling"), (smoke, "rising")],
 )
 def test_the_evidence_names_what_is_seen(clip, feature):
     assert estimate_kind(*clip()).features[feature] > 0.8

@@ -96,7 +96,9 @@ def test_around_the_rock_there_is_water(river):
 @pytest.mark.parametrize("stream", [(1.0, 0, 0), (-1.0, 0, 0)], ids=["right", "left"])
 def test_water_enters_upstream_and_leaves_downstream(stream):
     scene = channel(stream)
-    inlet, body, outlet = (positions(scene, k)[:, 0] * stream[0] for k in (CellType.INFLOW, CellType.FLUID, CellType.OUTFLOW))
+    inlet, body, outlet = (
+        positions(scene, k)[:, 0] * stream[0] for k in (CellType.INFLOW, CellType.FLUID, CellType.OUTFLOW)
+    )
     assert len(inlet) and len(outlet)
     assert inlet.max() < body.min() + 3 * scene.grid.spacing
     assert inlet.mean() < np.percentile(body, 1)

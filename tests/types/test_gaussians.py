@@ -104,7 +104,14 @@ def test_fields_are_contiguous_single_precision():
 
 @pytest.mark.parametrize(
     ("name", "shape"),
-    [("quats", (8, 3)), ("scales", (7, 3)), ("opacities", (8, 1)), ("sh", (8, 2, 3)), ("sh", (8, 3)), ("sh", (7, 1, 3))],
+    [
+        ("quats", (8, 3)),
+        ("scales", (7, 3)),
+        ("opacities", (8, 1)),
+        ("sh", (8, 2, 3)),
+        ("sh", (8, 3)),
+        ("sh", (7, 1, 3)),
+    ],
 )
 def test_wrong_shapes_are_refused_by_name(name, shape):
     g = some()

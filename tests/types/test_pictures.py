@@ -22,7 +22,9 @@ def test_every_frame_has_a_later_time_than_the_one_before(times):
         VideoClip(frames(), np.array(times, float))
 
 
-@pytest.mark.parametrize("array", [frames()[..., :1], frames()[0], frames().astype(float)], ids=["gray", "one", "float"])
+@pytest.mark.parametrize(
+    "array", [frames()[..., :1], frames()[0], frames().astype(float)], ids=["gray", "one", "float"]
+)
 def test_frames_are_bytes_in_three_colours(array):
     with pytest.raises(ValueError, match="frames"):
         VideoClip(array, np.arange(len(array)) * 0.04)
@@ -65,4 +67,9 @@ def test_joined_particles_keep_order_and_selected_ones_their_ids():
     np.testing.assert_array_equal(both.ids, [0, 1, 2, 3])
     np.testing.assert_array_equal(both.select(both.masses > 2).ids, [2, 3])
     with pytest.raises(ValueError, match="masses"):
-        Particles(*(getattr(a, k) for k in ("positions", "velocities", "affine", "deformation")), a.masses[:1], a.source, a.ids)
+        Particles(
+            *(getattr(a, k) for k in ("positions", "velocities", "affine", "deformation")),
+            a.masses[:1],
+            a.source,
+            a.ids,
+        )

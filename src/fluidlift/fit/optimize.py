@@ -32,9 +32,9 @@ from fluidlift.types import FaceVelocity, FitResult, FluidParameters, Grid, Terr
 
 DEFAULT_FREE = (
     "density", "kinematic_viscosity", "gravity", "inflow_velocity", "inflow_fluctuation", "outflow_velocity",
-    "restitution", "wall_damping",
+    "restitution", "wall_damping", "time_step",
 )  # fmt: skip
-"""The paper's without the time step: the interval between frames is known, and its division into steps is a choice."""
+"""All of the paper's. The time step has a narrow prior: the interval between frames is known, its division a choice."""
 MOST_CELLS = 60_000
 """layouts with more cells are coarsened by two, as often as needed"""
 BUOYANCY_SIGMA = 1.0

@@ -240,7 +240,7 @@ DEFAULT_PRIOR_SIGMAS = {
     "outflow_velocity": 1.0,
     "restitution": 1.5,
     "wall_damping": 2.5,
-    "time_step": 0.3,
+    "time_step": 0.1,
 }
 """raw: a factor e^3 = 20 for viscosity; about the whole range for wall coefficients; the flow's own speed for
 velocities; 10 % and some 6 degrees for gravity, since a slow viscous flow only knows its ratio to the viscosity, and

@@ -80,7 +80,7 @@ def caption(frame: UInt8[np.ndarray, "h w 3"], text: str) -> UInt8[np.ndarray, "
     out = np.array(frame, order="C")  # a copy: the frame may be the clip itself
     scale = max(0.4, out.shape[1] / 900)
     x, y = 8, int(24 * scale) + 6
-    # the dark edge is the same text moved by a pixel: thicker letters are wider, and would not lie behind the white ones
+    # the dark edge is the same text moved by a pixel: thicker letters are wider and would not lie behind the white ones
     edge = [(i, j, 0) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
     for dx, dy, grey in (*edge, (0, 0, 255)):
         place, colour = (x + dx, y + dy), (grey, grey, grey)

@@ -34,9 +34,7 @@ def cap_speed(masks: Bool[np.ndarray, "t h w"], t: int, *, half_window: int = 6)
     return float(-np.median((y[j] - y[i]) / (x[j] - x[i])))
 
 
-def front_factor(
-    displacement: Float[np.ndarray, "h w 2"], masks: Bool[np.ndarray, "t h w"], t: int
-) -> float:
+def front_factor(displacement: Float[np.ndarray, "h w 2"], masks: Bool[np.ndarray, "t h w"], t: int) -> float:
     """By how much the flow of frame t must be sped up to carry the cap along: 1 to `LARGEST_FACTOR`.
 
     Args:

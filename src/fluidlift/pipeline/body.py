@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,9 +12,10 @@ from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected
 from fluidlift.pipeline.seeing import Inputs, clip_of, flow_of, labels_of
 from fluidlift.pipeline.story import Result, Story
-from fluidlift.shape import generate, place, surface, terrain
+from fluidlift.shape import generate, given, place, surface, terrain
 from fluidlift.shape import kind as kinds
 from fluidlift.types import (
+    CellType,
     Gaussians,
     Grid,
     Label,
@@ -23,6 +25,9 @@ from fluidlift.types import (
     TriangleMesh,
     concatenate,
 )
+
+FEWEST_PIXELS = 16
+"""of fluid at the first instant: fewer have no shape"""
 
 
 def rest_frame(fluid: np.ndarray) -> int:
@@ -57,28 +62,37 @@ def geometry(story: Story, inputs: Inputs, config: JobConfig) -> Result:
     if pose_given:
         up, heading = place.pose_up(known)
         eye = known.position
+    elif inputs.geometry is not None:
+        up, _ = place.pose_up(known)
     else:
         up = kinds.estimate_up(kind, mask, motion, trust, known, pitch=c.pitch, roll=c.roll)
     canonical = kinds.level_camera(known, up)
 
-    front, known_scale = _front(inputs, canonical, mask, kind, motion, trust)
+    front, known_scale = _front(inputs, canonical, mask, kind, motion, trust, start)
     visible = mask & (front.depth > 0)
+    if 0 < visible.sum() < FEWEST_PIXELS:
+        raise InputRejected(
+            f"only {int(visible.sum())} fluid pixels at frame {start}", f"at least {FEWEST_PIXELS}",
+            "check the mask, or raise --max-size",
+        )  # fmt: skip
     points, velocities = _surface_motion(canonical, visible, front.depth, motion, clip.interval)
-    level = _water_level(inputs)
-    height = float(eye[2] - level) if eye is not None and kind == "stream" else None
-    scale = place.metric_scale(
-        kind, points, velocities, size=c.size, camera_height=height, known_scale=known_scale
-    )
+    height = None
+    if eye is not None and kind == "stream":
+        height = float(eye[2] - _water_level(inputs, warnings if c.size is None else []))
+    scale = place.metric_scale(kind, points, velocities, size=c.size, camera_height=height, known_scale=known_scale)
     if scale.warning:
         warnings.append(scale.warning)
     mainstream = _mainstream(kind, velocities, trust[visible])
-    to_world, camera = place.place(
-        canonical, points, scale.value, heading=heading, eye=eye, mainstream=mainstream
-    )
+    to_world, camera = place.place(canonical, points, scale.value, heading=heading, eye=eye, mainstream=mainstream)
     depth = (front.depth * scale.value).astype(np.float32)
     half = (front.half_thickness * scale.value).astype(np.float32)
     bulk = to_world.vectors(mainstream) / to_world.scale
     setting = _setting(kind, front, labels.labels, fluid, start, united, camera, to_world, depth, half, bulk, c)
+    if not (setting.cell_types == CellType.FLUID).any():
+        raise InputRejected(
+            f"as a {kind}, the fluid fills no cell of the grid beside those of its inlet", "a larger or thicker body",
+            "check the mask and --kind, or raise --set shape.cells=...",
+        )  # fmt: skip
     meta: dict[str, Any] = {
         "warnings": warnings,
         "kind": kind,
@@ -92,6 +106,7 @@ def geometry(story: Story, inputs: Inputs, config: JobConfig) -> Result:
             "rotation": to_world.rotation.tolist(),
             "translation": to_world.translation.tolist(),
         },
+        "known_scale": known_scale,
         "rest_frame": start,
         "united_frames": united,
         "grid": {"shape": setting.terrain.grid.shape, "spacing": setting.terrain.grid.spacing,
@@ -124,10 +139,25 @@ def _united(frames, fluid, start, longest, window_length) -> int:
     return int(min(window_length(frames[start:stop], fluid[start], longest=longest), len(frames) - start))
 
 
+def given_bodies(folder: Path, size: tuple[int, int], frames: list[int]) -> tuple[list[Gaussians], Similarity3]:
+    """Gaussians of some frames from a folder of PLY files (in order of name; the last stands for all after it), and
+    the similarity that brings them into the canonical frame."""
+    from fluidlift.io.images import read_camera
+    from fluidlift.io.ply import read_gaussians
+
+    files = sorted(folder.glob("*.ply"))
+    if not files:
+        raise InputRejected(f"no PLY file in '{folder.name}'", "one Gaussian PLY per frame, or one, and camera.json")
+    bodies = [read_gaussians(files[min(t, len(files) - 1)]) for t in frames]
+    return bodies, given.canonical_from_given(read_camera(folder / "camera.json", size), bodies[0])
+
+
 def _known_camera(inputs: Inputs, config: JobConfig, size: tuple[int, int]) -> tuple[PinholeCamera, bool]:
     """The camera file's camera, or one from the field of view; and whether its pose is known."""
     from fluidlift.io.images import read_camera, read_json
 
+    if inputs.geometry is not None:  # its camera is the one that saw the body; its world is not the user's
+        return read_camera(inputs.geometry / "camera.json", size), False
     if inputs.camera is None:
         return PinholeCamera.from_fov(config.shape.fov, size), False
     camera = read_camera(inputs.camera, size)
@@ -135,24 +165,41 @@ def _known_camera(inputs: Inputs, config: JobConfig, size: tuple[int, int]) -> t
     return camera, "R" in data or "frames" in data
 
 
-def _water_level(inputs: Inputs) -> float:
+def _water_level(inputs: Inputs, warnings: list[str]) -> float:
     """z of the water, m, where a camera file says it; else the ground of its world, 0."""
     from fluidlift.io.images import read_json
 
     data = read_json(inputs.camera, "camera file") if inputs.camera is not None else {}
-    value = data.get("water_level_z", 0.0)
-    return float(value) if isinstance(value, int | float) else 0.0
+    value = data.get("water_level_z")
+    if isinstance(value, int | float):
+        return float(value)
+    warnings.append(
+        "the camera file does not say how high the water stands: z = 0 is assumed, which sets the scale; "
+        "add water_level_z (m) to it, or give --size"
+    )
+    return 0.0
 
 
-def _front(inputs, canonical, mask, kind, motion, trust) -> tuple[surface.FrontSurface, float | None]:
+def _front(inputs, canonical, mask, kind, motion, trust, start) -> tuple[surface.FrontSurface, float | None]:
     """The front surface in canonical units; metres per unit where the depth came in metres."""
+    if inputs.geometry is not None:
+        body, to_canonical = given_bodies(inputs.geometry, canonical.size, [start])
+        near, far = given.near_and_far(body[0].transformed(to_canonical), canonical, mask)
+        front = surface.given_surface(canonical, mask, near, kind)
+        depth_unit = float(np.median(near[mask]))
+        half = np.where(mask, 0.5 * np.maximum(far - near, 0.0), 0.0) / depth_unit
+        thick = half if kind in ("pour", "plume") else np.zeros_like(half)
+        return surface.FrontSurface(
+            front.depth, thick.astype(np.float32), front.height
+        ), depth_unit / to_canonical.scale
     if inputs.depth is not None:
         from fluidlift.io.images import read_depth
 
-        given = read_depth(inputs.depth, canonical.size)
-        valid = mask & np.isfinite(given) & (given > 0)
-        scale = float(np.median(given[valid])) if valid.any() else None
-        return surface.given_surface(canonical, mask, given, kind), scale
+        distance = read_depth(inputs.depth, canonical.size)
+        distance = distance[min(start, len(distance) - 1)] if distance.ndim == 3 else distance
+        valid = mask & np.isfinite(distance) & (distance > 0)
+        scale = float(np.median(distance[valid])) if valid.any() else None
+        return surface.given_surface(canonical, mask, distance, kind), scale
     if kind == "stream":
         return surface.level_surface(canonical, mask), None
     if kind == "fall":
@@ -281,10 +328,7 @@ def refine(story: Story, inputs: Inputs, config: JobConfig) -> Result:
     h = setting.terrain.grid.spacing
     depth = g.arrays["depth"]
     fluid = labels.fluid
-    first, fitted = _refined_front(story, config, fluid[start], depth)
-    bodies = [first]
-    for t in range(start + 1, start + united):
-        bodies.append(generate.front_gaussians(clip.frames[t], fluid[t], depth, camera, stride=c.stride))
+    bodies, fitted = _bodies(story, inputs, config, fluid, start, united)
     shown = generate.fluid_colour_frame(clip.frames[start], fluid[start])
     hull = generate.hull_gaussians(shown, setting, camera, seed=config.seed)
     front = unite([b for b in bodies if len(b)], spacing=max(0.35 * h, 0.6 * c.stride * _pixel(depth, camera)))
@@ -312,13 +356,29 @@ def refine(story: Story, inputs: Inputs, config: JobConfig) -> Result:
     return Result(gaussians_to_arrays(body), meta)
 
 
-def _refined_front(story, config, mask, depth) -> tuple[Gaussians, dict[str, Any]]:
-    """The front of the rest frame, optimised against its picture."""
+def _bodies(story, inputs, config, fluid, start, united) -> tuple[list[Gaussians], dict[str, Any]]:
+    """One body per united frame, the first of them refined against its picture."""
+    clip, camera, c = clip_of(story), camera_of(story), config.shape
+    depth = story["geometry"].arrays["depth"]
+    frames = list(range(start, start + united))
+    if inputs.geometry is not None:
+        given_frames, to_canonical = given_bodies(inputs.geometry, clip.size, frames)
+        scale = 1.0 / story["geometry"].meta["known_scale"]
+        moved = to_canonical.translation * (scale / to_canonical.scale)
+        to_world = placement_of(story) @ Similarity3(scale, to_canonical.rotation, moved)
+        bodies = [b.transformed(to_world) for b in given_frames]
+    else:
+        bodies = [generate.front_gaussians(clip.frames[t], fluid[t], depth, camera, stride=c.stride) for t in frames]
+    first, fitted = _refined(story, config, bodies[0], fluid[start])
+    return [first, *bodies[1:]], fitted
+
+
+def _refined(story, config, front: Gaussians, mask) -> tuple[Gaussians, dict[str, Any]]:
+    """A body optimised against the picture of the rest frame."""
     from fluidlift.shape.refine import refine as refine_view
 
     clip, camera, c = clip_of(story), camera_of(story), config.shape
     start = story["geometry"].meta["rest_frame"]
-    front = generate.front_gaussians(clip.frames[start], mask, depth, camera, stride=c.stride)
     fitted: dict[str, Any] = {"warnings": []}
     if c.refine_iterations > 0 and len(front):
         found = refine_view(

@@ -94,8 +94,12 @@ def _run(story: Story, inputs: Inputs, folder: Path, config: JobConfig) -> dict[
             hashes[name] = [file_hash(p) for _, p in list_sequence(path)]
     seed = config.seed
     run = story.run
-    run("read", lambda: seeing.read(inputs, config), settings=[hashes["clip"], hashes.get("camera"),
-        config.section("read")], after=())
+    run(
+        "read",
+        lambda: seeing.read(inputs, config),
+        settings=[hashes["clip"], hashes.get("camera"), config.section("read")],
+        after=(),
+    )
     run("flow", lambda: seeing.flow(story, config), settings=config.motion.method, after=("read",))
     run("segment", lambda: seeing.segment(story, inputs, config), settings=hashes.get("mask"), after=("read", "flow"))
     geometry = ("kind", "fov", "pitch", "roll", "size", "depth_ratio", "cells", "cell_limit", "longest_union")
@@ -113,7 +117,7 @@ def _run(story: Story, inputs: Inputs, folder: Path, config: JobConfig) -> dict[
     run(
         "simulate",
         lambda: moving.simulate(story, folder, config),
-        settings=[config.section("simulate"), seed],
+        settings=[config.section("simulate"), seed, moving.scene_of(folder)],
         after=("refine", "fit"),
         still_there=moving.frames_still_there(folder),
     )

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from fluidlift.config import JobConfig
+from fluidlift.errors import InputRejected
 from fluidlift.pipeline.body import camera_of, rest_of, setting_of
 from fluidlift.pipeline.seeing import clip_of, flow_of, labels_of
 from fluidlift.pipeline.story import Result, Story, one_torch_thread
@@ -86,12 +87,13 @@ def motion(story: Story, config: JobConfig) -> Result:
         warnings.append("the divergence-free solve of the target velocity did not converge on every frame")
     if replaced and max(replaced) > 0.3:
         warnings.append(
-            f"the {kind} moves faster than optical flow can follow: on {100 * max(replaced):.0f} % of its steep part the "
-            "speed comes from free fall at the given size"
+            f"the {kind} moves faster than optical flow can follow: on {100 * max(replaced):.0f} % of its steep part "
+            "the speed comes from free fall at the given size"
         )
     arrays |= {"completed": completed, "observed": np.packbits(observed, axis=-1)}
     return Result(arrays, {"warnings": warnings, "targets": [r["frame"] for r in reports], "reports": reports,
-                           "front_factor": float(np.median(factors)) if factors else 1.0})  # fmt: skip
+                           "front_factor": float(np.median(factors)) if factors else 1.0,
+                           "free_fall_share": max(replaced, default=0.0)})  # fmt: skip
 
 
 def downhill_of(setting: Any, points: np.ndarray) -> np.ndarray:
@@ -145,16 +147,19 @@ def targets_of(story: Story) -> list[FaceVelocity]:
 
 def fit(story: Story, config: JobConfig) -> Result:
     """Physical parameters that make the grid move like the targets."""
-    from fluidlift.fit.optimize import fit_parameters
+    from fluidlift.fit.optimize import DEFAULT_FREE, fit_parameters
 
     setting, kind = setting_of(story), story["geometry"].meta["kind"]
     targets = targets_of(story)
     initial = first_guess(story, targets)
+    # speeds that come from free fall were not measured: they say nothing about friction inside or at the walls
+    assumed = story["motion"].meta["free_fall_share"] > 0.3
+    free = ("inflow_velocity", "inflow_fluctuation", "outflow_velocity") if assumed else DEFAULT_FREE
     with one_torch_thread():
         found = fit_parameters(
             targets, setting.cell_types, setting.terrain, setting.terrain.grid, clip_of(story).interval, initial,
             kind=kind, method=config.fit.method, max_seconds=config.fit.max_seconds, progress=story.step,
-            mainstream=setting.terrain.mainstream, prior_sigmas=gravity_prior(story),
+            mainstream=setting.terrain.mainstream, prior_sigmas=gravity_prior(story), free=free,
         )  # fmt: skip
     warnings = []
     if not found.converged:
@@ -171,7 +176,9 @@ def fit(story: Story, config: JobConfig) -> Result:
             "initial": initial.to_dict(),
             "converged": found.converged,
             "rollouts": found.rollouts,
-            "notes": list(found.notes),
+            "notes": list(found.notes)
+            + ["viscosity, restitution and wall damping keep their priors: the steep part was too fast to be measured"]
+            * assumed,
             "extra": {k: float(v) for k, v in found.extra.items()},
         },
     )
@@ -234,9 +241,7 @@ def estimates_of(story: Story) -> dict[str, Estimate]:
     return found
 
 
-def emission_look(
-    rest: Gaussians, direction: np.ndarray, speed: float
-) -> Callable[[np.ndarray, float], np.ndarray]:
+def emission_look(rest: Gaussians, direction: np.ndarray, speed: float) -> Callable[[np.ndarray, float], np.ndarray]:
     """Which rest Gaussian lends its look to a particle that enters at a place and time.
 
     The fluid that enters later is taken to look like the body further downstream, mirrored at its ends: the pattern
@@ -260,12 +265,37 @@ def emission_look(
     return source
 
 
-def simulator_of(story: Story, config: JobConfig, rest: Gaussians) -> Any:
+def scene_of(folder: Path) -> dict[str, Any]:
+    """What a person changed in scene.yaml that the re-simulation heeds: `parameters` and `duration` (s).
+
+    Raises:
+        InputRejected: entries that this version cannot apply (nothing is ignored in silence), or wrong values.
+    """
+    from fluidlift.io.scene import read_scene
+
+    scene = {k: v for k, v in read_scene(folder).items() if v not in (None, {}, [], "")}
+    unknown = sorted(set(scene) - {"parameters", "duration"})
+    if unknown:
+        raise InputRejected(
+            f"scene.yaml asks for {', '.join(unknown)}, which this version cannot simulate",
+            "parameters and duration only",
+            "remove the entry, or leave it empty",
+        )
+    duration = scene.get("duration")
+    if duration is not None and not (isinstance(duration, int | float) and duration > 0):
+        raise InputRejected(f"scene.yaml: duration {duration!r}", "seconds, more than 0")
+    if not isinstance(scene.get("parameters", {}), dict):
+        raise InputRejected("scene.yaml: parameters is no mapping", "name: value lines")
+    return scene
+
+
+def simulator_of(story: Story, folder: Path, config: JobConfig, rest: Gaussians) -> Any:
     """The simulator at the first instant."""
     from fluidlift.numerics.sampling import sample_faces
 
     setting, kind = setting_of(story), story["geometry"].meta["kind"]
-    parameters, grid = parameters_of(story), setting.terrain.grid
+    changes = scene_of(folder).get("parameters", {})
+    parameters, grid = parameters_of(story).updated(changes), setting.terrain.grid
     velocity = targets_of(story)[0]
     start = sample_faces(velocity, grid, rest.means)
     # all Gaussians of a cell share its mass
@@ -281,7 +311,7 @@ def simulator_of(story: Story, config: JobConfig, rest: Gaussians) -> Any:
         return GasSimulator(
             grid, setting.terrain, parameters, particles, cell_types=setting.cell_types, inflow_profile=velocity,
             velocity=velocity, seed=config.seed, emit_source=look,
-            buoyancy=story["fit"].meta["extra"].get("buoyancy", float(np.linalg.norm(parameters.gravity))),
+            buoyancy=float(np.linalg.norm(parameters.gravity)),
         )  # fmt: skip
     from fluidlift.physics.apic import LiquidSimulator
 
@@ -307,9 +337,11 @@ def simulate(story: Story, folder: Path, config: JobConfig) -> Result:
     rest, setting = rest_of(story), setting_of(story)
     clip = clip_of(story)
     start = story["geometry"].meta["rest_frame"]
-    frames = config.simulate.frames or (len(clip) - start)
+    duration = scene_of(folder).get("duration")
+    wanted = None if duration is None else max(2, round(duration / clip.interval))
+    frames = wanted or config.simulate.frames or (len(clip) - start)
     require_free_space(folder, frames * len(rest) * 80)
-    simulator = simulator_of(story, config, rest)
+    simulator = simulator_of(story, folder, config, rest)
     grid = setting.terrain.grid
     shading = None
     if setting.surface_height is not None:  # bodies in the air change their outline: nothing about them is steady
@@ -324,7 +356,7 @@ def simulate(story: Story, folder: Path, config: JobConfig) -> Result:
             step = simulator.advance(clip.interval)
             substeps.append(int(step.substeps))
         p = simulator.particles
-        if len(p) > config.simulate.max_particles * 2:
+        if k and len(p) > config.simulate.max_particles * 2:
             break
         shown = deform_gaussians(rest, p, max_stretch=MAX_STRETCH, max_size=1.2 * grid.spacing)
         if shading is not None:
@@ -336,9 +368,15 @@ def simulate(story: Story, folder: Path, config: JobConfig) -> Result:
         distance = sample_nodes(setting.terrain.signed_distance, grid, p.positions[inside])
         leaks.append(float((distance < -0.1 * grid.spacing).mean()) if inside.any() else 0.0)
         counts.append(len(p))
+    stopped = []
+    if len(counts) < frames:
+        stopped.append(
+            f"the re-simulation stopped after {len(counts)} of {frames} frames, at twice the number of particles that "
+            f"--set simulate.max_particles={config.simulate.max_particles} allows"
+        )
     return Result(
         {"volume": np.array(volumes, np.float32), "leak": np.array(leaks, np.float32), "count": np.array(counts)},
-        {"frames": len(counts), "substeps": substeps, "warnings": _simulation_warnings(volumes, leaks)},
+        {"frames": len(counts), "substeps": substeps, "warnings": stopped + _simulation_warnings(volumes, leaks)},
     )
 
 

@@ -127,9 +127,7 @@ def segment(story: Story, inputs: Inputs, config: JobConfig) -> Result:
     clip = clip_of(story)
     user_mask = None
     if inputs.mask is not None:
-        user_mask = read_mask(
-            inputs.mask, clip.size, len(clip), start=config.read.start, duration=config.read.duration
-        )
+        user_mask = read_mask(inputs.mask, clip.size, len(clip), start=config.read.start, duration=config.read.duration)
         distortion = read_distortion(inputs.camera) if inputs.camera is not None else None
         if inputs.camera is not None and distortion is not None:
             user_mask = undistort_mask(user_mask, read_camera(inputs.camera, clip.size), distortion)

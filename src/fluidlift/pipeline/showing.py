@@ -44,7 +44,7 @@ def show(story: Story, folder: Path, config: JobConfig) -> Result:
             interval=clip.interval,
             terrain=terrain_of(story).mesh,
             camera=camera_of(story),
-            attributes={k: v for k, v in parameters_of(story).to_dict().items()} | {"kind": _kind(story)},
+            attributes=parameters_of(story).to_dict() | {"kind": _kind(story)},
         )
     arrays = {
         "resim_frames": np.stack(measured["frames"]),
@@ -85,9 +85,7 @@ def _panels(story: Story, folder: Path, config: JobConfig, count: int, measured)
         story.step(k, count)
         front = gaussians
         if solid_depth is not None:
-            keep = visible_beside_rocks(
-                gaussians.means, camera, solid_depth, rocks, margin=1.5 * terrain.grid.spacing
-            )
+            keep = visible_beside_rocks(gaussians.means, camera, solid_depth, rocks, margin=1.5 * terrain.grid.spacing)
             front, velocity = gaussians.select(keep), velocity[keep]
         rendered = render(front, camera, background=plate)
         picture = _bytes(rendered.image)
@@ -242,13 +240,24 @@ def _section_motion(story: Story) -> Section:
         cells = setting_of(story).cell_types
         wet = (cells == CellType.FLUID) | (cells == CellType.INFLOW)
         figures.append(
-            Figure(velocity_slices(targets_of(story)[0].at_centers(), wet), "speed in the volume: from above, along, across")
+            Figure(
+                velocity_slices(targets_of(story)[0].at_centers(), wet),
+                "speed in the volume: from above, along, across",
+            )
         )
     rows = [
-        [r["frame"], r.get("divergence_max", ""), r.get("divergence_mean", ""), r.get("flux_in", ""), r.get("flux_out", "")]
+        [
+            r["frame"],
+            r.get("divergence_max", ""),
+            r.get("divergence_mean", ""),
+            r.get("flux_in", ""),
+            r.get("flux_out", ""),
+        ]
         for r in meta["reports"][:12]
     ]
-    return Section("Motion", figures, rows, ["frame", "max |div| dx / speed", "mean", "flux in, m3/s", "flux out, m3/s"])
+    return Section(
+        "Motion", figures, rows, ["frame", "max |div| dx / speed", "mean", "flux in, m3/s", "flux out, m3/s"]
+    )
 
 
 def _section_parameters(story: Story) -> Section:
@@ -260,8 +269,12 @@ def _section_parameters(story: Story) -> Section:
         for name, e in estimates_of(story).items()
     ]
     loss = story["fit"].arrays["loss_history"]
-    figures = [Figure(curve(loss, title="loss of the fit", x="iteration", y="loss"), "parameter fit")] if len(loss) else []
-    return Section("Physical parameters", figures, rows, ["parameter", "value", "uncertainty", "unit", ""], meta["notes"])
+    figures = (
+        [Figure(curve(loss, title="loss of the fit", x="iteration", y="loss"), "parameter fit")] if len(loss) else []
+    )
+    return Section(
+        "Physical parameters", figures, rows, ["parameter", "value", "uncertainty", "unit", ""], meta["notes"]
+    )
 
 
 def _section_simulation(story: Story) -> Section:
@@ -269,7 +282,10 @@ def _section_simulation(story: Story) -> Section:
 
     a = story["simulate"].arrays
     figures = [
-        Figure(curve(a["volume"] / max(a["volume"][0], 1e-12), title="volume over its start", x="frame", y="ratio"), "volume"),
+        Figure(
+            curve(a["volume"] / max(a["volume"][0], 1e-12), title="volume over its start", x="frame", y="ratio"),
+            "volume",
+        ),
         Figure(curve(a["count"], title="particles", x="frame", y="count"), "particles"),
     ]
     rows = [["largest share of particles inside the terrain", f"{100 * float(a['leak'].max()):.2f} %"]]

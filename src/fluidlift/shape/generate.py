@@ -174,9 +174,7 @@ def picture_colours(
     return frame[row, col].astype(np.float32) / 255.0
 
 
-def fluid_colour_frame(
-    frame: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]
-) -> UInt8[np.ndarray, "h w 3"]:
+def fluid_colour_frame(frame: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
     """The picture with fluid colours carried to every pixel, so that look-ups beside the mask find fluid."""
     if not mask.any():
         return frame

@@ -84,6 +84,7 @@ def estimate_kind(
         + 2.4 * f["slender"]
         + 1.6 * f["hanging"]
         - 1.2 * f["wide"]
+        - 2.5 * f["bulky"]
         - 0.8 * f["rising"]
         - 0.8 * f["sideways"],
         # a curtain falls, is not slender
@@ -139,6 +140,7 @@ def _features(frames, fluid, displacement, confidence) -> dict[str, float]:
         "sideways": max(0.0, 1.0 - falling - rising),
         "slender": float(np.clip((box_h / max(typical_width, 1.0) - 2.0) / 3.0, 0.0, 1.0)),
         "wide": float(np.clip((box_w / box_h - 0.8) / 1.2, 0.0, 1.0)),
+        "bulky": float(np.clip((np.median(union.sum(axis=1)[union.any(axis=1)]) / width - 0.3) / 0.3, 0.0, 1.0)),
         "foreground": foreground,
         "ground": ground,
         "hanging": float(fluid[:, : max(2, height // 60)].any(axis=(1, 2)).mean() * (1 - ground)),

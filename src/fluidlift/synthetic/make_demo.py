@@ -72,7 +72,10 @@ def make_demo(
         if name != "video.mp4":
             (folder / name).replace(folder / target)
     write_video(folder / "demo.mp4", list(recording.frames), scene.fps, quality=21.0)
-    (folder / "demo_camera.json").write_text(json.dumps(scene.camera.to_dict(), indent=1))
+    seen = recording.mask[0] & (recording.depth[0] > 0)
+    water = scene.camera.unproject(scene.camera.pixel_grid()[seen], recording.depth[0][seen])
+    surveyed = scene.camera.to_dict() | {"water_level_z": round(float(np.median(water[:, 2])), 3)}
+    (folder / "demo_camera.json").write_text(json.dumps(surveyed, indent=1))
     return sorted(folder.glob("demo*"))
 
 

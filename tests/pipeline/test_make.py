@@ -1,0 +1,359 @@
+"""From a clip to an asset folder: everything is there, agrees with itself, and comes out the same again."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from fluidlift.cli import DONE, FAILED, REJECTED, WITH_WARNINGS, main
+from fluidlift.config import build_config
+from fluidlift.io.asset_folder import load_asset, read_manifest
+from fluidlift.io.ply import read_splats
+from fluidlift.io.stage_cache import load_stage
+from fluidlift.io.video import read_clip
+from fluidlift.numerics.sampling import sample_nodes
+from fluidlift.pipeline import STAGES, Inputs, Silence, make, moving
+from fluidlift.pipeline.story import Result, Story
+from fluidlift.types import CellType, Label
+from fluidlift.validate import validate_asset
+
+FRAMES = 10
+
+
+def story_of(folder):
+    """The story as its cache tells it."""
+    story = Story(folder, STAGES, progress=Silence())
+    for name in STAGES:
+        (facts,) = (folder / "work" / name).glob("*.json")
+        story.results[name] = Result(*load_stage(folder, name, facts.stem))
+    return story
+
+
+@pytest.fixture(scope="module")
+def story(made):
+    return story_of(made.folder)
+
+
+@pytest.fixture(scope="module")
+def asset(made):
+    return load_asset(made.folder)
+
+
+@pytest.fixture
+def copy(made, tmp_path):
+    """The asset to be changed."""
+    return shutil.copytree(made.folder, tmp_path / "stream.fluid")
+
+
+def run(made, folder, *options, quick):
+    return main(["make", str(made.clip), "-o", str(folder), "--size", "2", *quick, *options])
+
+
+# what is there --------------------------------------------------------------------------------------------------
+
+
+def test_the_exit_code_says_whether_there_were_warnings(made):
+    warnings = read_manifest(made.folder)["warnings"]
+    assert made.code == (WITH_WARNINGS if warnings else DONE), warnings
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "manifest.json", "parameters.json", "scene.yaml", "rest/gaussians.ply", "rest/terrain.glb", "rest/velocity.vdb",
+        "rest/camera.json", "frames/splats/1001.ply", f"frames/splats/{1000 + FRAMES}.ply", "asset.usda", "preview.mp4",
+        "report.html", "mask_overlay.png", "work/evaluation.npz",
+    ],
+)  # fmt: skip
+def test_every_part_of_the_asset_is_there(made, name):
+    assert (made.folder / name).stat().st_size > 0
+
+
+def test_no_temporary_files_are_left(made):
+    assert not [p for p in made.folder.rglob("*") if ".part" in p.name]
+
+
+def test_all_checks_of_the_asset_pass(made):
+    findings = validate_asset(made.folder)
+    assert len(findings) > 5
+    assert not [f for f in findings if not f.passed]
+
+
+def test_the_manifest_says_what_was_made_of_what(made):
+    manifest = read_manifest(made.folder)
+    assert manifest["frame_count"] == FRAMES
+    assert manifest["frame_interval"] == pytest.approx(0.04)
+    assert manifest["provenance"]["inputs"]["clip"]["name"] == "stream.mp4"
+    assert len(manifest["provenance"]["inputs"]["clip"]["sha256"]) == 64
+    assert manifest["provenance"]["config"]["shape"]["cells"] == 24
+    assert set(manifest["timings"]) == set(STAGES)
+    assert all((made.folder / name).is_file() for name in manifest["files"].values())
+    assert str(made.clip.parent) not in json.dumps(manifest)  # nothing about this machine
+
+
+def test_a_channel_that_runs_to_the_right_is_a_stream_to_the_right(asset):
+    assert asset.kind == "stream"
+    # the mainstream is the x axis of the world, up to the perspective of the flow
+    assert asset.terrain.mainstream[0] > 0.98
+    wet = np.isin(asset.cell_types, [CellType.FLUID, CellType.INFLOW])
+    assert (asset.velocity.at_centers()[wet][:, 0] > 0).mean() > 0.95
+
+
+def test_the_fluid_was_found_between_its_banks(story):
+    labels = story["segment"].arrays["labels"]
+    inside, outside = labels[:, 26:44, 8:40], labels[:, :10]
+    assert (inside == Label.FLUID).mean() > 0.95
+    assert (outside == Label.FLUID).mean() < 0.02
+
+
+def test_the_flow_is_two_pixels_per_frame(story):
+    flow = story["flow"].arrays["displacement"].astype(float)[:, 26:44, 8:40]
+    # compressed video of 96 px: a tenth of a pixel
+    np.testing.assert_allclose(np.median(flow, axis=(0, 1, 2)), [2.0, 0.0], atol=0.1)
+
+
+def test_the_size_is_what_was_asked_for(asset):
+    extent = np.ptp(asset.rest.means, axis=0).max()
+    # the body has a cell or two of inlet and outlet more than its visible surface, of 24 along the longest side
+    assert extent == pytest.approx(2.0, rel=0.15)
+
+
+def test_the_surface_moves_at_the_speed_of_the_picture(story, asset):
+    """2 px per frame at the distance and focal length of the camera, in metres per second."""
+    depth = float(np.median(story["geometry"].arrays["depth"][26:44, 8:40]))
+    expected = 2.0 * depth / asset.camera.focal[0] / asset.interval
+    wet = asset.cell_types == CellType.FLUID
+    top = wet & ~np.roll(wet, -1, axis=2)
+    # under the surface bed friction slows the water down; coarse cells blur the surface speed with what is below
+    assert np.median(asset.velocity.at_centers()[top][:, 0]) == pytest.approx(expected, rel=0.25)
+
+
+def test_the_rest_body_lies_in_its_grid_and_outside_the_terrain(asset):
+    assert asset.grid.contains(asset.rest.means).all()
+    distance = sample_nodes(asset.terrain.signed_distance, asset.grid, asset.rest.means)
+    assert distance.min() > -0.3 * asset.grid.spacing  # centres may sink by a quarter of a cell
+
+
+def test_the_camera_of_the_asset_sees_the_body_where_the_video_shows_it(asset, story):
+    uv, z = asset.camera.project(asset.rest.means)
+    assert (z > 0).all()
+    mask = story["geometry"].arrays["mask"]
+    ok = ((uv >= 0) & (uv < asset.camera.size)).all(axis=1)
+    col, row = uv[ok].astype(int).T
+    # the deep parts of the body project below the water line of the near bank, and rocks hide some of it
+    assert mask[row, col].mean() > 0.6
+
+
+# frames ---------------------------------------------------------------------------------------------------------
+
+
+def splats(made, k):
+    return read_splats(made.folder / "frames" / "splats" / f"{1001 + k}.ply")
+
+
+def test_the_first_frame_is_the_rest_body(made, asset):
+    first = splats(made, 0)
+    np.testing.assert_array_equal(first.extras["id"], np.arange(len(asset.rest)))
+    # the simulator pushes those that begin inside a wall out of it: few, and by less than a cell
+    moved = np.linalg.norm(first.gaussians.means - asset.rest.means, axis=1)
+    assert (moved > 0).mean() < 0.1
+    assert moved.max() < asset.grid.spacing
+    # where they stay, they keep the colour that shows
+    np.testing.assert_allclose(first.gaussians.rgb[moved == 0], asset.rest.rgb[moved == 0], atol=1e-5)
+
+
+def test_the_files_hold_what_was_simulated(made, story, asset):
+    simulator = moving.simulator_of(story, made.folder, build_config(), moving.rest_of(story))
+    for _ in range(2):
+        simulator.advance(asset.interval)
+    p, shown = simulator.particles, splats(made, 2)
+    order, written = np.argsort(p.ids), np.argsort(shown.extras["id"])
+    np.testing.assert_array_equal(shown.extras["id"][written], p.ids[order])
+    # the same program on the same numbers; sums over particles may be taken in another order by another thread
+    tolerance = 1e-4 * asset.grid.spacing
+    np.testing.assert_allclose(shown.gaussians.means[written], p.positions[order], atol=tolerance)
+    velocity = np.stack([shown.extras[k] for k in ("vx", "vy", "vz")], axis=-1)
+    np.testing.assert_allclose(velocity[written], p.velocities[order], atol=1e-3 * np.abs(p.velocities).max())
+
+
+def test_every_frame_has_as_many_splats_as_particles(made, story):
+    counts = [len(splats(made, k).gaussians) for k in range(FRAMES)]
+    assert counts == story["simulate"].arrays["count"].tolist()
+
+
+def test_particles_keep_their_ids_and_move_with_the_stream(made, asset):
+    before, after = splats(made, 0), splats(made, 3)
+    common, i, j = np.intersect1d(before.extras["id"], after.extras["id"], return_indices=True)
+    assert len(common) > 0.5 * len(before.gaussians)  # the others have left through the outlet
+    shift = np.median(after.gaussians.means[j] - before.gaussians.means[i], axis=0)
+    assert shift[0] > 0.1 * 3 * asset.interval * np.linalg.norm(asset.parameters.inflow_velocity)
+    assert abs(shift[1]) < 0.5 * shift[0]
+
+
+def test_the_scene_description_plays_the_frames(made):
+    from pxr import Usd, UsdGeom
+
+    stage = Usd.Stage.Open(str(made.folder / "asset.usda"))
+    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (1001, 1000 + FRAMES)
+    assert stage.GetTimeCodesPerSecond() == pytest.approx(25.0)
+    assert UsdGeom.GetStageUpAxis(stage) == "Z"
+    assert UsdGeom.GetStageMetersPerUnit(stage) == pytest.approx(1.0)
+
+
+def test_the_preview_shows_three_views_of_every_frame(made):
+    preview = read_clip(made.folder / "preview.mp4")
+    assert len(preview) == FRAMES
+    assert preview.size == (3 * 96, 64)
+
+
+def test_the_report_tells_the_kind_and_every_stage(made):
+    text = (made.folder / "report.html").read_text(encoding="utf-8")
+    assert "kind: stream" in text
+    for stage in STAGES:
+        assert f"<td>{stage}</td>" in text
+    assert "http" not in text
+
+
+# again ----------------------------------------------------------------------------------------------------------
+
+
+def outcome(capsys):
+    return json.loads(capsys.readouterr().out)
+
+
+def test_a_second_run_has_nothing_to_do(made, copy, quick, capsys):
+    before = {p: p.read_bytes() for p in (copy / "parameters.json", copy / "rest" / "gaussians.ply")}
+    capsys.readouterr()
+    assert run(made, copy, "--json", quick=quick) == made.code
+    found = outcome(capsys)
+    assert all(stage["cached"] for stage in found["stages"].values())
+    assert found["warnings"] == read_manifest(made.folder)["warnings"]
+    assert all(p.read_bytes() == data for p, data in before.items())
+
+
+def test_the_same_clip_settings_and_seed_give_the_same_asset(made, tmp_path, quick):
+    """Simulation and pictures are left out the second time: they follow from what is compared here."""
+    other = tmp_path / "again.fluid"
+    assert run(made, other, "--set", "simulate.frames=1", "--set", "show.usd=false", quick=quick) == made.code
+    for name in ("parameters.json", "rest/gaussians.ply", "rest/camera.json", "rest/terrain.glb"):
+        assert (other / name).read_bytes() == (made.folder / name).read_bytes(), name
+    a, b = load_asset(made.folder), load_asset(other)
+    for one, two in zip(a.velocity.components, b.velocity.components):
+        np.testing.assert_array_equal(one, two)
+
+
+def test_another_seed_gives_another_body_from_the_same_motion(made, copy, quick, capsys):
+    capsys.readouterr()
+    run(made, copy, "--seed", "1", "--json", "--set", "simulate.frames=1", "--set", "show.usd=false", quick=quick)
+    stages = outcome(capsys)["stages"]
+    assert [name for name in STAGES if not stages[name]["cached"]] == ["refine", "simulate", "show"]
+    assert (copy / "rest/gaussians.ply").read_bytes() != (made.folder / "rest/gaussians.ply").read_bytes()
+    assert (copy / "parameters.json").read_bytes() == (made.folder / "parameters.json").read_bytes()
+
+
+def test_a_lost_picture_or_frame_is_made_again_and_nothing_else(made, copy, quick, capsys):
+    (copy / "preview.mp4").unlink()
+    capsys.readouterr()
+    run(made, copy, "--json", quick=quick)
+    stages = outcome(capsys)["stages"]
+    assert [name for name in STAGES if not stages[name]["cached"]] == ["show"]
+    assert (copy / "preview.mp4").is_file()
+
+
+def test_what_a_person_wrote_into_the_scene_file_stays(made, copy, quick):
+    (copy / "scene.yaml").write_text("# my own words\n", encoding="utf-8")
+    run(made, copy, quick=quick)
+    assert (copy / "scene.yaml").read_text(encoding="utf-8") == "# my own words\n"
+
+
+def test_an_interrupted_job_goes_on_where_it_stopped(made, copy, quick, capsys, monkeypatch):
+    def stop(story, config):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(moving, "fit", stop)
+        assert run(made, copy, "--force", "fit", quick=quick) == FAILED
+    assert "goes on from there" in capsys.readouterr().err
+    assert run(made, copy, "--json", quick=quick) == made.code
+    stages = outcome(capsys)["stages"]
+    assert stages["motion"]["cached"] and stages["refine"]["cached"]
+
+
+def test_an_interrupt_in_a_fresh_folder_keeps_what_was_done(stream_clip, tmp_path, hasty, monkeypatch, capsys):
+    from fluidlift.pipeline import body
+
+    def stop(story, inputs, config):
+        raise KeyboardInterrupt
+
+    folder = tmp_path / "x.fluid"
+    with monkeypatch.context() as patch:
+        patch.setattr(body, "geometry", stop)
+        assert main(["make", str(stream_clip), "-o", str(folder), *hasty]) == FAILED
+    assert [name for name in STAGES if any((folder / "work" / name).glob("*.json"))] == ["read", "flow", "segment"]
+    assert main(["validate", str(folder)]) == REJECTED  # half an asset is none
+    capsys.readouterr()
+
+
+def test_a_full_disk_in_a_later_stage_is_said_as_such(made, copy, quick, monkeypatch, capsys):
+    import errno
+
+    def full(story, folder, config):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(moving, "simulate", full)
+    assert run(made, copy, "--force", "simulate", quick=quick) == REJECTED
+    assert "disk full" in capsys.readouterr().err
+    assert (copy / "rest" / "gaussians.ply").is_file()  # the asset that was there before stays
+
+
+# from code ------------------------------------------------------------------------------------------------------
+
+
+def test_unknown_stages_are_rejected_before_anything_is_written(stream_clip, tmp_path):
+    from fluidlift.errors import InputRejected
+
+    with pytest.raises(InputRejected, match="segment"):
+        make(Inputs(stream_clip), tmp_path / "x.fluid", build_config(), force=["segmentation"])
+    assert not (tmp_path / "x.fluid").exists()
+
+
+# validation -----------------------------------------------------------------------------------------------------
+
+
+def failed(folder):
+    return [f.check for f in validate_asset(folder) if not f.passed]
+
+
+def test_a_missing_frame_is_found(copy):
+    (copy / "frames" / "splats" / "1004.ply").unlink()
+    assert "splat frames are complete" in failed(copy)
+
+
+def test_a_damaged_frame_is_found(copy):
+    last = copy / "frames" / "splats" / f"{1000 + FRAMES}.ply"
+    last.write_bytes(last.read_bytes()[:1000])
+    assert "the last frame can be read" in failed(copy)
+
+
+def test_a_damaged_part_is_found(copy):
+    (copy / "rest" / "velocity.npz").write_bytes(b"nothing")
+    assert failed(copy) == ["parts can be read"]
+
+
+def test_a_velocity_with_divergence_is_found(copy):
+    path = copy / "rest" / "velocity.npz"
+    with np.load(path) as archive:
+        arrays = dict(archive)
+    arrays["u"] = arrays["u"] * np.linspace(0, 10, arrays["u"].shape[0], dtype=np.float32)[:, None, None]
+    np.savez(path, **arrays)
+    assert failed(copy) == ["velocity is divergence-free"]
+
+
+def test_gaussians_outside_the_grid_are_found(copy):
+    from fluidlift.io.ply import read_gaussians, write_gaussians
+    from fluidlift.types import Similarity3
+
+    path = copy / "rest" / "gaussians.ply"
+    write_gaussians(path, read_gaussians(path).transformed(Similarity3(1.0, np.eye(3), np.array([9.0, 0, 0]))))
+    assert failed(copy) == ["Gaussians lie in the grid"]

@@ -410,6 +410,16 @@ def test_the_settings_are_printed_without_touching_the_clip(tmp_path, capsys):
     assert settings["preset"] == "hero" and settings["shape"]["size"] == 3.0
 
 
+def test_what_a_config_file_says_counts_unless_an_option_says_otherwise(tmp_path, capsys):
+    file = tmp_path / "job.yaml"
+    settings = {"preset": "standard", "seed": 5, "shape": {"size": 2.0, "kind": "fall"}, "read": {"max_frames": 99}}
+    file.write_text(yaml.safe_dump(settings))
+    assert main(["make", "absent.mp4", "--config", str(file), "--size", "3", "--print-config"]) == DONE
+    found = yaml.safe_load(capsys.readouterr().out)
+    assert (found["preset"], found["seed"], found["read"]["max_frames"]) == ("standard", 5, 99)
+    assert (found["shape"]["size"], found["shape"]["kind"], found["shape"]["cells"]) == (3.0, "fall", 96)
+
+
 def test_what_the_machine_can_do_is_told(capsys):
     assert main(["doctor", "--json"]) == DONE
     assert json.loads(capsys.readouterr().out)

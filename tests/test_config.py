@@ -51,6 +51,15 @@ def test_a_file_may_choose_the_preset(tmp_path):
     assert config.preset == "hero" and config.read.max_size == 768 and config.shape.cells == 40
 
 
+@pytest.mark.parametrize("own", ["seed: 3\n", "preset: standard\n"])
+def test_an_override_of_the_preset_brings_all_its_values(tmp_path, own):
+    file = tmp_path / "job.yaml"
+    file.write_text(own)
+    assert build_config("draft", file, ["preset=hero"]) == dataclasses.replace(
+        build_config("hero"), seed=3 if "seed" in own else 0
+    )
+
+
 def test_what_is_printed_can_be_read_again(tmp_path):
     config = build_config("standard", None, ["shape.size=2.5", "shape.kind=fall", "seed=4"])
     file = tmp_path / "printed.yaml"

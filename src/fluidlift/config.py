@@ -199,16 +199,18 @@ def build_config(
     values: dict[str, Any] = {}
     if file is not None:
         values.update(_flatten(_read_yaml(file)))
-    preset = str(values.pop("preset", preset))
-    if preset not in PRESETS:
-        raise InputRejected(f"unknown preset '{preset}'", "one of " + ", ".join(PRESETS))
-    merged = _flatten(PRESETS[preset]) | values
-    merged |= {k: v for k, v in (flat or {}).items() if v is not None}
+    last: dict[str, Any] = {}
     for text in overrides:
         name, sign, value = text.partition("=")
         if not sign:
             raise InputRejected(f"override '{text}'", "section.name=value, such as fit.max_seconds=60")
-        merged[name.strip()] = _parse(value.strip())
+        last[name.strip()] = _parse(value.strip())
+    named = values.pop("preset", preset)
+    preset = str(last.pop("preset", named))
+    if preset not in PRESETS:
+        raise InputRejected(f"unknown preset '{preset}'", "one of " + ", ".join(PRESETS))
+    merged = _flatten(PRESETS[preset]) | values
+    merged |= {k: v for k, v in (flat or {}).items() if v is not None} | last
     config: Any = JobConfig(preset=typing.cast(Any, preset))
     for name, value in merged.items():
         config = _with(config, name.split("."), value, name)

@@ -267,6 +267,31 @@ def test_what_a_person_wrote_into_the_scene_file_stays(made, copy, quick):
     assert (copy / "scene.yaml").read_text(encoding="utf-8") == "# my own words\n"
 
 
+def test_an_edited_duration_is_simulated_and_nothing_before_it_runs_again(made, copy, quick, capsys):
+    (copy / "scene.yaml").write_text("duration: 0.16\n", encoding="utf-8")
+    capsys.readouterr()
+    run(made, copy, "--json", "--set", "show.usd=false", quick=quick)
+    stages = outcome(capsys)["stages"]
+    assert [name for name in STAGES if not stages[name]["cached"]] == ["simulate", "show"]
+    assert len(list((copy / "frames" / "splats").glob("*.ply"))) == 4  # 0.16 s at 25 per second
+
+
+def test_a_given_body_replaces_the_embedded_generator(made, tmp_path, hasty, asset):
+    """The body of the asset, handed in as somebody else's, comes out where it was, seen by the same camera."""
+    given = tmp_path / "given"
+    given.mkdir()
+    shutil.copyfile(made.folder / "rest" / "gaussians.ply", given / "0000.ply")
+    shutil.copyfile(made.folder / "rest" / "camera.json", given / "camera.json")
+    folder = tmp_path / "x.fluid"
+    code = main(["make", str(made.clip), "-o", str(folder), "--size", "2", "--geometry-from", str(given), *hasty])
+    assert code in (DONE, WITH_WARNINGS)
+    found = load_asset(folder)
+    assert found.camera.focal == pytest.approx(asset.camera.focal)
+    # both worlds have their origin under the middle of the fluid; cells are twice as large here
+    np.testing.assert_allclose(found.camera.position, asset.camera.position, atol=0.2)
+    np.testing.assert_allclose(np.ptp(found.rest.means, axis=0), np.ptp(asset.rest.means, axis=0), atol=0.2)
+
+
 def test_an_interrupted_job_goes_on_where_it_stopped(made, copy, quick, capsys, monkeypatch):
     def stop(story, config):
         raise KeyboardInterrupt

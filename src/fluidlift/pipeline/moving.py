@@ -185,16 +185,13 @@ def fit(story: Story, config: JobConfig) -> Result:
 
 
 def gravity_prior(story: Story) -> dict[str, float] | None:
-    """How free gravity is, relative to 9.81 m/s^2.
+    """How free gravity is, relative to 9.81 m/s^2: 2 %, for it is what it is everywhere.
 
-    Where metres are known, or where the fluid falls (which nothing but gravity does), it is what it is everywhere;
-    under an assumed size it stands for the unknown scale as well.
+    Under an assumed size it could stand for the unknown scale as well. Freed, it goes to nearly nothing wherever the
+    motion is slow for the assumed size, because the rollout's free surface is then noisier than the flow; and water
+    without weight leaves its bed. A plume's buoyancy is free.
     """
-    g = story["geometry"].meta
-    if g["kind"] == "plume":
-        return None
-    known = g["scale"]["source"] != "assumed" or g["kind"] in ("fall", "pour")
-    return {"gravity": 0.01 if known else 0.3}
+    return None if story["geometry"].meta["kind"] == "plume" else {"gravity": 0.02}
 
 
 def first_guess(story: Story, targets: list[FaceVelocity]) -> FluidParameters:

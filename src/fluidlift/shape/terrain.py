@@ -195,13 +195,28 @@ def _fill_channel(grid, plan, bed, water, along, reach, mainstream, kind) -> Set
     cells = np.full(grid.shape, CellType.EMPTY, np.uint8)
     cells[solid] = CellType.SOLID
     cells[fluid] = CellType.FLUID
-    entry = s < reach[0] + 2.5 * h
+    start, stop = _wide_ends(water, plan.along, reach, h)
+    entry = s < start + 2.5 * h
     if kind == "fall":
         entry = entry | _upper_rim(water, plan.level, along)[..., None]
     cells[fluid & entry] = CellType.INFLOW
-    cells[~solid & (s > reach[1] - 2.5 * h)] = CellType.OUTFLOW
+    cells[~solid & (s > stop - 2.5 * h)] = CellType.OUTFLOW
     terrain = Terrain(grid, phi.astype(np.float32), _unit(mainstream), _mesh(grid, phi))
     return Setting(terrain, cells, plan.level, bed)
+
+
+def _wide_ends(water: np.ndarray, along: np.ndarray, reach, spacing: float) -> tuple[float, float]:
+    """Where along the stream its ends are at least 0.4 of its typical width: a slanted or pointed end of the mask must
+    not become a nozzle. At most 15 % of the length is given up at each end."""
+    length = reach[1] - reach[0]
+    bins = max(int(length / spacing), 1)
+    width, edges = np.histogram(along[water], bins=bins, range=(reach[0], reach[1]))
+    if not width.any():
+        return float(reach[0]), float(reach[1])
+    wide = np.where(width >= 0.4 * np.median(width[width > 0]))[0]
+    start = min(edges[wide[0]], reach[0] + 0.15 * length)
+    stop = max(edges[wide[-1] + 1], reach[1] - 0.15 * length)
+    return float(start), float(stop)
 
 
 def _upper_rim(water: np.ndarray, level: np.ndarray, along: np.ndarray) -> np.ndarray:

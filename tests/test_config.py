@@ -47,7 +47,8 @@ def test_later_sources_win(tmp_path):
 def test_a_file_may_choose_the_preset(tmp_path):
     file = tmp_path / "job.yaml"
     file.write_text("preset: hero\nshape: {cells: 40}\n")
-    config = build_config("draft", file)
+    config = build_config(None, file)
+    assert build_config("draft", file).preset == "draft"  # said on the command line, it wins
     assert config.preset == "hero" and config.read.max_size == 768 and config.shape.cells == 40
 
 
@@ -64,7 +65,7 @@ def test_what_is_printed_can_be_read_again(tmp_path):
     config = build_config("standard", None, ["shape.size=2.5", "shape.kind=fall", "seed=4"])
     file = tmp_path / "printed.yaml"
     file.write_text(yaml.safe_dump(config.to_dict(), sort_keys=False))
-    assert build_config("draft", file) == config
+    assert build_config(None, file) == config
 
 
 @pytest.mark.parametrize(

@@ -32,8 +32,8 @@ class Make:
     """a video, a folder of pictures or a pattern such as frames/%04d.png"""
     out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """asset folder to write; by default the clip's name with .fluid, in the current folder"""
-    preset: Literal["draft", "standard", "hero"] = "draft"
-    """draft: minutes on a laptop; standard: finer; hero: as fine as the machine allows"""
+    preset: Literal["draft", "standard", "hero"] | None = None
+    """draft (the default): minutes on a laptop; standard: finer; hero: as fine as the machine allows"""
     kind: Literal["auto", "stream", "fall", "pour", "plume"] | None = None
     """what the fluid does; auto decides from evidence that the report shows"""
     mask: Path | None = None
@@ -197,9 +197,16 @@ def _make(c: Make) -> int:
         print(yaml.safe_dump(config.to_dict(), sort_keys=False), end="")
         return DONE
     return _run_job(
-        c.clip, c.out or Path(c.clip.stem + ".fluid"), config, mask=c.mask, camera=c.camera, depth=c.depth,
+        c.clip, c.out or default_folder(c.clip), config, mask=c.mask, camera=c.camera, depth=c.depth,
         geometry=c.geometry_from, force=c.force, as_json=c.json,
     )  # fmt: skip
+
+
+def default_folder(clip: Path) -> Path:
+    """The clip's name with .fluid, in the current folder; a pattern takes the name of the folder it is in."""
+    pattern = "%" in clip.name or "#" in clip.name
+    name = clip.absolute().parent.name if pattern else clip.stem
+    return Path((name or "clip") + ".fluid")
 
 
 def _run_job(clip: Path, out: Path, config: Any, *, force=(), as_json=False, **files: Path | None) -> int:

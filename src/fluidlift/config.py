@@ -180,7 +180,7 @@ RANGES: dict[str, tuple[float, float]] = {
 
 
 def build_config(
-    preset: str = "draft",
+    preset: str | None = None,
     file: Path | None = None,
     overrides: typing.Sequence[str] = (),
     flat: dict[str, Any] | None = None,
@@ -188,7 +188,7 @@ def build_config(
     """Preset, then file, then flat options, then `section.name=value` overrides; later ones win.
 
     Args:
-        preset: draft, standard or hero.
+        preset: draft, standard or hero; None: the file's, or draft.
         file: YAML with the sections of `JobConfig`.
         overrides: texts such as "fit.max_seconds=60".
         flat: values by dotted name, from command-line options; None values are left out.
@@ -205,8 +205,8 @@ def build_config(
         if not sign:
             raise InputRejected(f"override '{text}'", "section.name=value, such as fit.max_seconds=60")
         last[name.strip()] = _parse(value.strip())
-    named = values.pop("preset", preset)
-    preset = str(last.pop("preset", named))
+    in_file = values.pop("preset", "draft")
+    preset = str(last.pop("preset", preset or in_file))
     if preset not in PRESETS:
         raise InputRejected(f"unknown preset '{preset}'", "one of " + ", ".join(PRESETS))
     merged = _flatten(PRESETS[preset]) | values

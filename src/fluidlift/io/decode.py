@@ -128,6 +128,8 @@ def decode_frames(
         except (av.error.FFmpegError, OSError):
             notes.add("the file ends early: it is damaged or cut off; what was there is used")
             break
+        if packet.is_corrupt:  # FFmpeg marks the packet that the end of the file cuts through
+            notes.add("the file ends early: it is damaged or cut off; what was there is used")
         try:
             frames = decoder.decode(packet if packet.size else None)
         except av.error.EOFError:

@@ -70,7 +70,8 @@ def make(
             provenance = _run(story, inputs, folder, config)
             _write_asset(story, folder, config, provenance)
     except InputRejected:
-        if fresh:
+        # an input that cannot be used leaves nothing behind; work that was done before a disk ran full is kept
+        if fresh and "motion" not in story.results:
             shutil.rmtree(folder, ignore_errors=True)
         raise
     return Made(folder, tuple(story.warnings), time.perf_counter() - began, story.timings)

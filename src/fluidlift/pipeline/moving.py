@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -286,6 +286,24 @@ def scene_of(folder: Path) -> dict[str, Any]:
     return scene
 
 
+def simulation_step(parameters: FluidParameters, story: Story) -> FluidParameters:
+    """The same physics with the simulator's own longest step.
+
+    The fit's step is that of its grid, which must resolve a gravity wave over one cell. The simulator adapts
+    to the flow and only needs steps in which a wave does not cross more than a cell or so. Wall damping is a share
+    per step and is converted, so that walls take the same share per second.
+    """
+    setting, interval = setting_of(story), clip_of(story).interval
+    h = setting.terrain.grid.spacing
+    wet = (setting.cell_types == CellType.FLUID).sum(axis=2)
+    depth = h * float(np.percentile(wet[wet > 0], 90)) if (wet > 0).any() else h
+    wave = float(np.sqrt(np.linalg.norm(parameters.gravity) * depth))
+    longest = interval if story["geometry"].meta["kind"] == "plume" else h / max(wave, 1e-6)
+    step = float(np.clip(longest, interval / 8, interval))
+    damping = 1.0 - (1.0 - parameters.wall_damping) ** (step / parameters.time_step)
+    return replace(parameters, time_step=step, wall_damping=float(np.clip(damping, 0.0, 1.0)))
+
+
 def simulator_of(story: Story, folder: Path, config: JobConfig, rest: Gaussians) -> Any:
     """The simulator at the first instant."""
     from fluidlift.numerics.sampling import sample_faces
@@ -293,6 +311,7 @@ def simulator_of(story: Story, folder: Path, config: JobConfig, rest: Gaussians)
     setting, kind = setting_of(story), story["geometry"].meta["kind"]
     changes = scene_of(folder).get("parameters", {})
     parameters, grid = parameters_of(story).updated(changes), setting.terrain.grid
+    parameters = simulation_step(parameters, story)
     velocity = targets_of(story)[0]
     start = sample_faces(velocity, grid, rest.means)
     # all Gaussians of a cell share its mass

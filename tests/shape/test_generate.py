@@ -15,7 +15,7 @@ from fluidlift.shape.generate import (
     united_mask,
 )
 from fluidlift.shape.terrain import Setting
-from fluidlift.types import CellType, Grid, PinholeCamera, Terrain, TriangleMesh
+from fluidlift.types import CellType, Gaussians, Grid, PinholeCamera, Terrain, TriangleMesh
 
 H, W = 64, 96
 ROW, COL = np.mgrid[:H, :W]
@@ -232,3 +232,14 @@ def test_a_picture_full_of_fluid_has_no_background():
     plate = background_plate(frames, np.ones_like(fluid))
     assert not plate.seen.any()
     assert plate.image.shape == frames.shape[1:]
+
+
+def test_colours_stay_within_what_the_picture_shows_around():
+    from fluidlift.shape.generate import bounded_colours
+
+    camera = PinholeCamera.from_fov(50, (40, 30))
+    frame = np.full((30, 40, 3), 100, np.uint8)
+    points = camera.unproject(np.array([[20.0, 15.0]]), np.array([1.0]))
+    shrill = Gaussians.isotropic(points, 0.01, np.array([[1.0, 0.0, 1.0]]))
+    held = bounded_colours(shrill, frame, camera, slack=0.04)
+    np.testing.assert_allclose(held.rgb[0], [100 / 255 + 0.04, 100 / 255 - 0.04, 100 / 255 + 0.04], atol=1e-5)

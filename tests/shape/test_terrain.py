@@ -269,3 +269,27 @@ def test_inside_is_between_the_near_and_the_far_side():
     np.testing.assert_array_equal(
         inside_body(np.vstack([points, -points[1]]), front, back, mask, camera), [0, 1, 0, 0, 0, 0]
     )
+
+
+def test_a_pointed_end_of_the_mask_is_no_nozzle():
+    from fluidlift.shape.terrain import _wide_ends
+
+    x, y = np.meshgrid(np.arange(60) * 0.1, np.arange(20) * 0.1, indexing="ij")
+    water = np.abs(y - 0.95) < np.clip(0.25 * x, 0.0, 0.8)  # a wedge that opens over the first 3.2 m
+    start, stop = _wide_ends(water, x, (0.0, 6.0), 0.1)
+    # 0.4 of the typical width of 1.6 m is reached at x = 1.28 m, but only 15 % of the length may be given up
+    assert start == pytest.approx(0.9, abs=0.1)
+    assert stop == pytest.approx(6.0, abs=0.15)
+
+
+def test_a_ragged_curtain_is_fed_along_its_whole_edge():
+    from fluidlift.shape.terrain import _upper_rim
+
+    along = np.array([1.0, 0.0])
+    level = np.repeat(np.linspace(2.0, 0.0, 20)[:, None], 6, axis=1)
+    water = np.ones((20, 6), bool)
+    water[:2] = False
+    water[:5, 3] = False  # a notch in the edge
+    rim = _upper_rim(water, level, along)
+    assert rim[2:4, [0, 1, 2, 4, 5]].all() and rim[5:7, 3].all()
+    assert not rim[10:].any()

@@ -1,0 +1,60 @@
+"""A body from elsewhere lands where its camera saw it."""
+
+import numpy as np
+import pytest
+
+from fluidlift.errors import InputRejected
+from fluidlift.shape.given import canonical_from_given, near_and_far
+from fluidlift.types import Gaussians, PinholeCamera
+
+CENTRE, RADIUS = np.array([3.0, -2.0, 1.0]), 0.5
+
+
+def ball(n=6000):
+    direction = np.random.default_rng(0).normal(size=(n, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    return Gaussians.isotropic(CENTRE + RADIUS * direction, 0.02, np.full((n, 3), 0.5))
+
+
+def camera():
+    return PinholeCamera.looking(CENTRE + np.array([2.0, -1.0, 0.8]), CENTRE, 40, (96, 64))
+
+
+def test_the_canonical_camera_is_at_the_origin_looks_along_y_and_sees_the_body_at_depth_one():
+    body, cam = ball(), camera()
+    canonical = canonical_from_given(cam, body)
+    eye = canonical.points(cam.position[None])[0]
+    np.testing.assert_allclose(eye, 0, atol=1e-9)
+    middle = canonical.points(CENTRE[None])[0]
+    assert abs(middle[0]) < 1e-9 and middle[1] > 0
+    distance = np.linalg.norm(CENTRE - cam.position)
+    # the median depth of the ball's points is that of its centre, up to sampling
+    assert np.linalg.norm(middle) == pytest.approx(1.0, rel=0.02)
+    assert canonical.scale == pytest.approx(1.0 / distance, rel=0.02)
+
+
+def test_near_and_far_sides_are_a_diameter_apart_in_the_middle():
+    body, cam = ball(), camera()
+    uv, _ = cam.project(body.means)
+    inside = np.linalg.norm(cam.pixel_grid() - np.array(cam.center), axis=-1) < 15
+    near, far = near_and_far(body, cam, inside)
+    distance = np.linalg.norm(CENTRE - cam.position)
+    row, col = 32, 48
+    # points scattered over the sphere and the filter of a few pixels: 3 % of the distance
+    assert near[row, col] == pytest.approx(distance - RADIUS, rel=0.03)
+    assert far[row, col] == pytest.approx(distance + RADIUS, rel=0.03)
+    assert (near[~inside] == 0).all() and len(uv) == len(body)
+
+
+def test_a_body_beside_the_mask_is_rejected():
+    corner = np.zeros((64, 96), bool)
+    corner[:10, :10] = True
+    with pytest.raises(InputRejected, match="cover"):
+        near_and_far(ball(), camera(), corner)
+
+
+def test_a_camera_that_looks_away_is_rejected():
+    cam = camera()
+    away = PinholeCamera.looking(cam.position, 2 * cam.position - CENTRE, 40, (96, 64))
+    with pytest.raises(InputRejected, match="behind"):
+        canonical_from_given(away, ball())

@@ -47,7 +47,7 @@ class Make:
     size: float | None = None
     """metres across the fluid (its longest side); sets the scale"""
     fov: float | None = None
-    """field of view across the longer side, degrees (50 when nothing else is known)"""
+    """field of view across the longer side, degrees; else the file's lens metadata, else 50"""
     pitch: float | None = None
     """degrees that the camera looks below the horizon"""
     roll: float | None = None

@@ -38,8 +38,8 @@ class ShapeConfig:
 
     kind: Literal["auto", "stream", "fall", "pour", "plume"] = "auto"
     """what the fluid does; auto decides from evidence"""
-    fov: float = 50.0
-    """field of view across the longer side, degrees, where no camera file says it"""
+    fov: float | None = None
+    """field of view across the longer side, degrees; None: camera file, lens metadata, else 50"""
     pitch: float | None = None
     """degrees that the camera looks below the horizon; None estimates it"""
     roll: float | None = None

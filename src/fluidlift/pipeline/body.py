@@ -30,6 +30,10 @@ FEWEST_PIXELS = 16
 """of fluid at the first instant: fewer have no shape"""
 
 
+USUAL_FIELD_OF_VIEW = 50.0
+"""degrees across the longer side, where nothing says better: between a phone's main lens (65) and a short telephoto"""
+
+
 def rest_frame(fluid: np.ndarray) -> int:
     """First frame in which a good part of the fluid is there (smoke and pours begin with nothing)."""
     area = fluid.sum(axis=(1, 2)).astype(float)
@@ -159,7 +163,10 @@ def _known_camera(inputs: Inputs, config: JobConfig, size: tuple[int, int]) -> t
     if inputs.geometry is not None:  # its camera is the one that saw the body; its world is not the user's
         return read_camera(inputs.geometry / "camera.json", size), False
     if inputs.camera is None:
-        return PinholeCamera.from_fov(config.shape.fov, size), False
+        from fluidlift.io.lens import lens_field_of_view
+
+        fov = config.shape.fov or lens_field_of_view(inputs.clip) or USUAL_FIELD_OF_VIEW
+        return PinholeCamera.from_fov(fov, size), False
     camera = read_camera(inputs.camera, size)
     data = read_json(inputs.camera, "camera file")
     return camera, "R" in data or "frames" in data

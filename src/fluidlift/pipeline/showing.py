@@ -140,6 +140,9 @@ def write_report(story: Story, folder: Path, config: JobConfig, timings: dict[st
     clip, labels = clip_of(story), labels_of(story)
     start = story["geometry"].meta["rest_frame"]
     write_png(folder / "mask_overlay.png", overlay(clip.frames[start], labels.labels[start]))
+    write_png(folder / "rest" / "mask.png", np.where(labels.fluid[start], 255, 0).astype(np.uint8))
+    sure = np.clip(labels.confidence[start].astype(np.float32), 0.0, 1.0)
+    write_png(folder / "rest" / "mask_confidence.png", (255 * sure + 0.5).astype(np.uint8))
     sections = [
         _section_outcome(story),
         _section_seeing(story, overlay),
@@ -178,11 +181,15 @@ def _section_outcome(story: Story) -> Section:
 
 
 def _section_seeing(story: Story, overlay) -> Section:
+    from fluidlift.look.pictures import colour_map
+
     clip, labels = clip_of(story), labels_of(story)
     pick = sorted({0, len(clip) // 2, len(clip) - 1})
     figures = [
         Figure(overlay(clip.frames[t], labels.labels[t]), f"frame {t}: fluid tinted, solids in it marked") for t in pick
     ]
+    sure = labels.confidence[pick[1] if len(pick) > 1 else 0].astype(np.float32)
+    figures.append(Figure(colour_map(sure, low=0.0, high=1.0), "confidence: dark is a guess, bright is sure"))
     meta, read = story["segment"].meta, story["read"].meta
     rows = [
         ["mask", "given by the user" if meta["user_mask"] else "found from motion and colour"],

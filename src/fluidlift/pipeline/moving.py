@@ -33,6 +33,10 @@ MAX_STRETCH = 3.0
 VISCOSITY_PRIOR = {"stream": 1e-5, "fall": 1e-5, "pour": 1e-4, "plume": 1e-5}
 """m^2/s, where the fit starts"""
 
+WALL_DAMPING_PRIOR = {"stream": 0.05, "fall": 0.05, "pour": 0.2, "plume": 0.02}
+"""share of the tangential velocity that a wall takes per step of the fit, where the fit starts: water runs nearly free
+over a bed that the grid cannot resolve"""
+
 
 def motion(story: Story, config: JobConfig) -> Result:
     """Completed flow of many frames, volume velocity of the target frames."""
@@ -218,7 +222,7 @@ def first_guess(story: Story, targets: list[FaceVelocity]) -> FluidParameters:
         inflow_fluctuation=float(spread),
         outflow_velocity=max(out, 0.0),
         restitution=0.05,
-        wall_damping=0.3,
+        wall_damping=WALL_DAMPING_PRIOR[kind],
         time_step=float(np.clip(min(interval, 2.0 * courant), interval / 20, interval)),
     )
 

@@ -159,6 +159,8 @@ def fit(story: Story, config: JobConfig) -> Result:
     # speeds that come from free fall were not measured: they say nothing about friction inside or at the walls
     assumed = story["motion"].meta["free_fall_share"] > 0.3
     free = ("inflow_velocity", "inflow_fluctuation", "outflow_velocity") if assumed else DEFAULT_FREE
+    if filling_rate(story) is not None:  # the level in the vessel says how much enters
+        free = tuple(name for name in free if name != "inflow_velocity")
     with one_torch_thread():
         found = fit_parameters(
             targets, setting.cell_types, setting.terrain, setting.terrain.grid, clip_of(story).interval, initial,
@@ -198,6 +200,30 @@ def gravity_prior(story: Story) -> dict[str, float] | None:
     return None if story["geometry"].meta["kind"] == "plume" else {"gravity": 0.02}
 
 
+def filling_rate(story: Story) -> float | None:
+    """Volume (m^3/s) that a vessel gains over the clip, from its rounded silhouette; None where nothing fills.
+
+    What a jet brings is seen better in the vessel than in the jet, whose speed is a blur and whose mask is too wide.
+    """
+    from fluidlift.shape.surface import rounded_volume
+
+    g, clip = story["geometry"], clip_of(story)
+    if g.meta["kind"] != "pour" or g.meta["pool_level"] is None:
+        return None
+    camera, fluid, start = camera_of(story), labels_of(story).fluid, g.meta["rest_frame"]
+    distance = float(np.median(g.arrays["depth"][g.arrays["depth"] > 0]))
+    times, volumes = [], []
+    for t in np.unique(np.linspace(start, len(clip) - 1, 8).astype(int)):
+        if not fluid[t].any():
+            continue
+        volumes.append(rounded_volume(camera, fluid[t], distance))
+        times.append(float(clip.times[t]))
+    if len(times) < 4:
+        return None
+    rate = float(np.polyfit(times, volumes, 1)[0])
+    return rate if rate > 0 else None
+
+
 def first_guess(story: Story, targets: list[FaceVelocity]) -> FluidParameters:
     """Where the fit starts: velocities measured at the ends, the rest from what such a fluid usually has."""
     setting, kind = setting_of(story), story["geometry"].meta["kind"]
@@ -214,6 +240,11 @@ def first_guess(story: Story, targets: list[FaceVelocity]) -> FluidParameters:
         outlet = ndimage.binary_dilation(cells == CellType.OUTFLOW, iterations=2) & (cells == CellType.FLUID)
     out = float((mean[outlet] @ direction).mean()) if outlet.any() else float((mean[wet] @ direction).mean())
     speed = float(np.linalg.norm(mean[wet], axis=1).max()) if wet.any() else 0.0
+    filling = filling_rate(story)
+    if filling is not None and inlet.any():
+        # the mouth of the inlet is its cross-section across the stream, one layer of its cells
+        layer = setting.terrain.grid.spacing**2 * float(inlet.any(axis=int(np.argmax(np.abs(direction)))).sum())
+        bulk = direction * min(filling / layer, float(np.linalg.norm(bulk)))
     interval = clip_of(story).interval
     courant = setting.terrain.grid.spacing / max(speed, 1e-6)
     return FluidParameters(

@@ -194,6 +194,13 @@ def inflated_surface(camera: PinholeCamera, mask: Bool[np.ndarray, "h w"], kind:
     return FrontSurface(front.astype(np.float32), half.astype(np.float32), None)
 
 
+def rounded_volume(camera: PinholeCamera, mask: Bool[np.ndarray, "h w"], distance: float, kind: Kind = "pour") -> float:
+    """Volume (cube of the unit of `distance`) of the body inflated from a silhouette whose middle is that far away."""
+    front = inflated_surface(camera, mask, kind)
+    pixel = (front.depth + front.half_thickness) / camera.focal[0]
+    return float((2.0 * front.half_thickness * pixel**2)[mask].sum()) * distance**3
+
+
 def given_surface(
     camera: PinholeCamera, mask: Bool[np.ndarray, "h w"], depth: Float[np.ndarray, "h w"], kind: Kind
 ) -> FrontSurface:

@@ -200,8 +200,10 @@ def score_parameters(asset: FluidAsset, case: Case, alignment: Alignment) -> lis
     out = []
     gravity = case.scene.get("gravity")
     true = np.asarray(gravity, float) @ rotation if np.shape(gravity) == (3,) else None
-    mine = s * np.asarray(p.gravity)
-    out += _recovery("gravity", mine, true, vector("gravity"), "m/s2", "the case does not say")
+    mine, why = s * np.asarray(p.gravity), "the case does not say"
+    if asset.kind == "plume":
+        true, why = None, "the gravity of a plume is its buoyancy, which the case does not say in m/s2"
+    out += _recovery("gravity", mine, true, vector("gravity"), "m/s2", why)
     if true is not None:
         cosine = field_cosine(mine, true)
         angle = None if cosine is None else float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))

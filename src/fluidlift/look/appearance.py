@@ -17,6 +17,9 @@ from fluidlift.types import SH_C0, Gaussians, PinholeCamera, sh_from_rgb
 LARGEST_RATIO = 2.0
 """a colour is brightened or darkened by no more than this when it moves to another place"""
 
+LARGEST_TINT = 1.25
+"""and no channel against the others by more than this: a bank beside the mask must not colour the water"""
+
 
 @dataclass(frozen=True)
 class SteadyShading:
@@ -65,7 +68,10 @@ class SteadyShading:
 
     def moved(self, shown: Gaussians, origin: Float[np.ndarray, "n 3"]) -> Gaussians:
         """Gaussians whose colours were taken at `origin`, shaded for where they are now."""
-        ratio = np.clip(self.at(shown.means) / self.at(origin), 1.0 / LARGEST_RATIO, LARGEST_RATIO)
+        here, there = self.at(shown.means), self.at(origin)
+        bright = here.mean(axis=1, keepdims=True) / there.mean(axis=1, keepdims=True)
+        tint = np.clip(here / there / bright, 1.0 / LARGEST_TINT, LARGEST_TINT)
+        ratio = np.clip(bright, 1.0 / LARGEST_RATIO, LARGEST_RATIO) * tint
         sh = shown.sh.copy()
         sh[:, :1] = sh_from_rgb(np.clip((0.5 + SH_C0 * sh[:, 0]) * ratio, 0.0, 1.0))
         return Gaussians(shown.means, shown.quats, shown.scales, shown.opacities, sh)

@@ -427,14 +427,18 @@ def simulate(story: Story, folder: Path, config: JobConfig) -> Result:
         )
     return Result(
         {"volume": np.array(volumes, np.float32), "leak": np.array(leaks, np.float32), "count": np.array(counts)},
-        {"frames": len(counts), "substeps": substeps, "warnings": stopped + _simulation_warnings(volumes, leaks)},
+        {
+            "frames": len(counts),
+            "substeps": substeps,
+            "warnings": stopped + _simulation_warnings(story["geometry"].meta["kind"], volumes, leaks),
+        },
     )
 
 
-def _simulation_warnings(volumes: list[float], leaks: list[float]) -> list[str]:
+def _simulation_warnings(kind: str, volumes: list[float], leaks: list[float]) -> list[str]:
     warnings = []
     drift = volumes[-1] / max(volumes[0], 1e-12) - 1
-    if abs(drift) > 0.5:
+    if drift < -0.5 or (drift > 0.5 and kind in ("stream", "fall")):  # pours fill and smoke spreads
         word = "lost" if drift < 0 else "gained"
         warnings.append(f"the re-simulation {word} {100 * abs(drift):.0f} % of its volume by its last frame")
     if max(leaks) > 0.01:

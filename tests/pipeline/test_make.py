@@ -13,7 +13,7 @@ from fluidlift.io.ply import read_splats
 from fluidlift.io.stage_cache import load_stage
 from fluidlift.io.video import read_clip
 from fluidlift.numerics.sampling import sample_nodes
-from fluidlift.pipeline import STAGES, Inputs, Silence, make, moving
+from fluidlift.pipeline import STAGES, Inputs, Silence, body, make, moving, simulating
 from fluidlift.pipeline.story import Result, Story
 from fluidlift.types import CellType, Label
 from fluidlift.validate import validate_asset
@@ -164,7 +164,7 @@ def test_the_first_frame_is_the_rest_body(made, asset):
 
 
 def test_the_files_hold_what_was_simulated(made, story, asset):
-    simulator = moving.simulator_of(story, made.folder, build_config(), moving.rest_of(story))
+    simulator = simulating.simulator_of(story, made.folder, build_config(), body.rest_of(story))
     for _ in range(2):
         simulator.advance(asset.interval)
     p, shown = simulator.particles, splats(made, 2)
@@ -326,7 +326,7 @@ def test_a_full_disk_in_a_later_stage_is_said_as_such(made, copy, quick, monkeyp
     def full(story, folder, config):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(moving, "simulate", full)
+    monkeypatch.setattr(simulating, "simulate", full)
     assert run(made, copy, "--force", "simulate", quick=quick) == REJECTED
     assert "disk full" in capsys.readouterr().err
     assert (copy / "rest" / "gaussians.ply").is_file()  # the asset that was there before stays

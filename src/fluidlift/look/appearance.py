@@ -59,11 +59,7 @@ class SteadyShading:
 
     def at(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """The shading where each point is seen; that of the nearest pixel outside the picture."""
-        uv, z = self.camera.project(points)
-        width, height = self.camera.size
-        uv = np.where(z[:, None] > 0, np.nan_to_num(uv, nan=0.0, posinf=1e9, neginf=-1e9), 0.0)
-        col = np.clip(uv[:, 0], 0, width - 1).astype(int)
-        row = np.clip(uv[:, 1], 0, height - 1).astype(int)
+        row, col, _ = self.camera.nearest_pixels(points)
         return self.image[row, col]
 
     def moved(self, shown: Gaussians, origin: Float[np.ndarray, "n 3"]) -> Gaussians:

@@ -74,10 +74,7 @@ def visible_beside_rocks(
     margin: float,
 ) -> Bool[np.ndarray, "n"]:
     """False for points that lie more than `margin` (m) behind the solid seen at a pixel of `where`."""
-    uv, z = camera.project(means)
-    width, height = camera.size
-    uv = np.nan_to_num(uv, nan=-1.0, posinf=1e9, neginf=-1e9)
-    col, row = np.clip(uv[:, 0], 0, width - 1).astype(int), np.clip(uv[:, 1], 0, height - 1).astype(int)
+    row, col, z = camera.nearest_pixels(means)
     return ~(where[row, col] & (z > depth[row, col] + margin))
 
 

@@ -1,4 +1,4 @@
-"""Stages that build the body: geometry (kind, up, front surface, metres, terrain) and refine (rest Gaussians)."""
+"""The stage that builds the scene: kind, up, front surface, metres, terrain."""
 
 from __future__ import annotations
 
@@ -23,7 +23,6 @@ from fluidlift.types import (
     Similarity3,
     Terrain,
     TriangleMesh,
-    concatenate,
 )
 
 FEWEST_PIXELS = 16
@@ -58,18 +57,8 @@ def geometry(story: Story, inputs: Inputs, config: JobConfig) -> Result:
     warnings: list[str] = []
 
     known, pose_given = _known_camera(inputs, config, clip.size)
-    pitch = float(place.pose_up(known)[0].pitch) if pose_given else c.pitch
-    pick = np.unique(np.linspace(0, len(clip) - 1, 8).astype(int))
-    evidence = kinds.estimate_kind(clip.frames[pick], fluid[pick], motion, trust, pitch=pitch)
-    kind = evidence.kind if c.kind == "auto" else c.kind
-    heading = eye = None
-    if pose_given:
-        up, heading = place.pose_up(known)
-        eye = known.position
-    elif inputs.geometry is not None:
-        up, _ = place.pose_up(known)
-    else:
-        up = kinds.estimate_up(kind, mask, motion, trust, known, pitch=c.pitch, roll=c.roll)
+    evidence, kind, up, heading = _kind_and_up(story, inputs, config, known, pose_given, mask, motion, trust)
+    eye = known.position if pose_given else None
     canonical = kinds.level_camera(known, up)
 
     front, known_scale = _front(inputs, canonical, mask, kind, motion, trust, start)
@@ -97,7 +86,13 @@ def geometry(story: Story, inputs: Inputs, config: JobConfig) -> Result:
             f"as a {kind}, the fluid fills no cell of the grid beside those of its inlet", "a larger or thicker body",
             "check the mask and --kind, or raise --set shape.cells=...",
         )  # fmt: skip
-    meta: dict[str, Any] = {
+    plate = generate.background_plate(clip.frames, fluid, labels.solid.mean(axis=0) > 0.5)
+    arrays, meta = _packed(setting)
+    arrays |= {
+        "mask": mask, "depth": depth, "half_thickness": half, "mean_flow": motion, "mean_confidence": trust,
+        "plate": plate.image, "plate_seen": plate.seen,
+    }  # fmt: skip
+    meta |= {
         "warnings": warnings,
         "kind": kind,
         "kind_evidence": asdict(evidence),
@@ -113,29 +108,45 @@ def geometry(story: Story, inputs: Inputs, config: JobConfig) -> Result:
         "known_scale": known_scale,
         "rest_frame": start,
         "united_frames": united,
-        "grid": {"shape": setting.terrain.grid.shape, "spacing": setting.terrain.grid.spacing,
-                 "origin": setting.terrain.grid.origin},
-        "height_field": setting.surface_height is not None,
-        "pool_level": setting.pool_level,
-    }  # fmt: skip
+    }
+    return Result(arrays, meta)
+
+
+def _kind_and_up(story, inputs, config, known, pose_given, mask, motion, trust):
+    """Evidence for the kind, the kind, the tilt of the camera, and its heading where it was surveyed."""
+    clip, fluid, c = clip_of(story), labels_of(story).fluid, config.shape
+    surveyed, heading = place.pose_up(known)
+    pitch = float(surveyed.pitch) if pose_given else c.pitch
+    pick = np.unique(np.linspace(0, len(clip) - 1, 8).astype(int))
+    evidence = kinds.estimate_kind(clip.frames[pick], fluid[pick], motion, trust, pitch=pitch)
+    kind = evidence.kind if c.kind == "auto" else c.kind
+    if pose_given:
+        return evidence, kind, surveyed, heading
+    if inputs.geometry is not None:
+        return evidence, kind, surveyed, None
+    up = kinds.estimate_up(kind, mask, motion, trust, known, pitch=c.pitch, roll=c.roll)
+    return evidence, kind, up, None
+
+
+def _packed(setting: terrain.Setting) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """A setting as arrays and plain values; `setting_of` reads them back."""
+    solid = setting.terrain
     arrays = {
-        "mask": mask,
-        "depth": depth,
-        "half_thickness": half,
-        "mean_flow": motion,
-        "mean_confidence": trust,
-        "signed_distance": setting.terrain.signed_distance,
-        "mainstream": setting.terrain.mainstream,
-        "mesh_vertices": setting.terrain.mesh.vertices,
-        "mesh_faces": setting.terrain.mesh.faces,
+        "signed_distance": solid.signed_distance,
+        "mainstream": solid.mainstream,
+        "mesh_vertices": solid.mesh.vertices,
+        "mesh_faces": solid.mesh.faces,
         "cell_types": setting.cell_types,
         "bed_height": setting.bed_height.astype(np.float32),
     }
     if setting.surface_height is not None:
         arrays["surface_height"] = setting.surface_height.astype(np.float32)
-    plate = generate.background_plate(clip.frames, fluid, labels.solid.mean(axis=0) > 0.5)
-    arrays["plate"], arrays["plate_seen"] = plate.image, plate.seen
-    return Result(arrays, meta)
+    grid = {"shape": solid.grid.shape, "spacing": solid.grid.spacing, "origin": solid.grid.origin}
+    return arrays, {
+        "grid": grid,
+        "height_field": setting.surface_height is not None,
+        "pool_level": setting.pool_level,
+    }
 
 
 def _united(frames, fluid, start, longest, window_length) -> int:
@@ -321,102 +332,3 @@ def gaussians_from_arrays(arrays: dict[str, np.ndarray], prefix: str = "") -> Ga
 def rest_of(story: Story) -> Gaussians:
     """The rest body."""
     return gaussians_from_arrays(story["refine"].arrays)
-
-
-def refine(story: Story, inputs: Inputs, config: JobConfig) -> Result:
-    """Generate per frame, refine on the first, prune, unite, fill."""
-    from fluidlift.shape.fill import fill
-    from fluidlift.shape.prune import prune
-    from fluidlift.shape.unite import unite
-
-    clip, labels, c = clip_of(story), labels_of(story), config.shape
-    g, camera, setting = story["geometry"], camera_of(story), setting_of(story)
-    start, united = g.meta["rest_frame"], g.meta["united_frames"]
-    h = setting.terrain.grid.spacing
-    depth = g.arrays["depth"]
-    fluid = labels.fluid
-    bodies, fitted = _bodies(story, inputs, config, fluid, start, united)
-    shown = generate.fluid_colour_frame(clip.frames[start], fluid[start])
-    hull = generate.hull_gaussians(shown, setting, camera, seed=config.seed)
-    front = unite([b for b in bodies if len(b)], spacing=max(0.35 * h, 0.6 * c.stride * _pixel(depth, camera)))
-    shell, pruned = prune(_outside_solid(concatenate([front, hull]), setting), min_opacity=0.05, max_stretch=12.0)
-    room = max(c.max_gaussians - len(shell), 0)
-    added = fill(
-        shell, spacing=h / 2, rays=c.rays, rng=np.random.default_rng(config.seed), max_added=room,
-        closed_below=setting.terrain,
-    )  # fmt: skip
-    body = _outside_solid(_bounded(concatenate([shell, added]), c.max_gaussians, config.seed), setting)
-    if len(body) < 50:
-        raise InputRejected(
-            f"the body of the fluid has only {len(body)} Gaussians", "more fluid in the picture",
-            "check the mask in the report, or raise --max-size",
-        )  # fmt: skip
-    meta = {
-        "warnings": list(fitted.pop("warnings")),
-        "front": len(front),
-        "hull": len(hull),
-        "pruned": len(front) + len(hull) - len(shell),
-        "filled": len(added),
-        "total": len(body),
-        "prune_report": str(pruned),
-    } | fitted
-    return Result(gaussians_to_arrays(body), meta)
-
-
-def _bodies(story, inputs, config, fluid, start, united) -> tuple[list[Gaussians], dict[str, Any]]:
-    """One body per united frame, the first of them refined against its picture."""
-    clip, camera, c = clip_of(story), camera_of(story), config.shape
-    depth = story["geometry"].arrays["depth"]
-    frames = list(range(start, start + united))
-    if inputs.geometry is not None:
-        given_frames, to_canonical = given_bodies(inputs.geometry, clip.size, frames)
-        scale = 1.0 / story["geometry"].meta["known_scale"]
-        moved = to_canonical.translation * (scale / to_canonical.scale)
-        to_world = placement_of(story) @ Similarity3(scale, to_canonical.rotation, moved)
-        bodies = [b.transformed(to_world) for b in given_frames]
-    else:
-        bodies = [generate.front_gaussians(clip.frames[t], fluid[t], depth, camera, stride=c.stride) for t in frames]
-    first, fitted = _refined(story, config, bodies[0], fluid[start])
-    return [first, *bodies[1:]], fitted
-
-
-def _refined(story, config, front: Gaussians, mask) -> tuple[Gaussians, dict[str, Any]]:
-    """A body optimised against the picture of the rest frame."""
-    from fluidlift.shape.refine import refine as refine_view
-
-    clip, camera, c = clip_of(story), camera_of(story), config.shape
-    start = story["geometry"].meta["rest_frame"]
-    fitted: dict[str, Any] = {"warnings": []}
-    if c.refine_iterations > 0 and len(front):
-        found = refine_view(
-            front, clip.frames[start], mask, camera, iterations=c.refine_iterations, seed=config.seed,
-            max_gaussians=max(int(1.5 * len(front)), 1000), progress=story.step,
-        )  # fmt: skip
-        fitted |= {"psnr_before": found.psnr_before, "psnr_after": found.psnr_after, "kept": found.kept}
-        fitted["loss_history"] = [float(x) for x in found.loss_history]
-        front = generate.bounded_colours(found.gaussians, clip.frames[start], camera)
-    return front, fitted
-
-
-def _pixel(depth: np.ndarray, camera: PinholeCamera) -> float:
-    """Median size of a pixel on the fluid, m."""
-    return float(np.median(depth[depth > 0]) / camera.focal[0])
-
-
-def _outside_solid(g: Gaussians, setting: terrain.Setting) -> Gaussians:
-    """Those whose centre is in the box and not inside the terrain."""
-    from fluidlift.numerics.sampling import sample_nodes
-
-    grid = setting.terrain.grid
-    inside = grid.contains(g.means, margin=1e-6)
-    g = g.select(inside)
-    distance = sample_nodes(setting.terrain.signed_distance, grid, g.means)
-    return g.select(distance > -0.25 * grid.spacing)
-
-
-def _bounded(g: Gaussians, most: int, seed: int) -> Gaussians:
-    """A random subset where there are too many; each stands for more fluid then."""
-    if len(g) <= most:
-        return g
-    keep = np.sort(np.random.default_rng(seed).permutation(len(g))[:most])
-    return g.select(keep)

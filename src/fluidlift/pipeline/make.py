@@ -15,7 +15,7 @@ import numpy as np
 from fluidlift import __version__
 from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected
-from fluidlift.pipeline import body, moving, seeing, showing
+from fluidlift.pipeline import body, moving, refining, seeing, showing, simulating
 from fluidlift.pipeline.seeing import Inputs
 from fluidlift.pipeline.story import Progress, Silence, Story, file_hash, peak_memory_mb
 from fluidlift.types import FluidAsset
@@ -112,15 +112,15 @@ def _run(story: Story, inputs: Inputs, folder: Path, config: JobConfig) -> dict[
         settings=[{k: shape[k] for k in geometry}, given],
         after=("read", "flow", "segment"),
     )
-    run("refine", lambda: body.refine(story, inputs, config), settings=[shape, seed], after=("geometry",))
+    run("refine", lambda: refining.refine(story, inputs, config), settings=[shape, seed], after=("geometry",))
     run("motion", lambda: moving.motion(story, config), settings=config.section("motion"), after=("geometry",))
     run("fit", lambda: moving.fit(story, config), settings=config.section("fit"), after=("motion",))
     run(
         "simulate",
-        lambda: moving.simulate(story, folder, config),
-        settings=[config.section("simulate"), seed, moving.scene_of(folder)],
+        lambda: simulating.simulate(story, folder, config),
+        settings=[config.section("simulate"), seed, simulating.scene_of(folder)],
         after=("refine", "fit"),
-        still_there=moving.frames_still_there(folder),
+        still_there=simulating.frames_still_there(folder),
     )
     wanted = [folder / "preview.mp4"] + [folder / "asset.usda"] * config.show.usd
     run(

@@ -11,8 +11,9 @@ import numpy as np
 from fluidlift.config import JobConfig
 from fluidlift.look.report import Figure, Section, report_html
 from fluidlift.pipeline.body import camera_of, rest_of, setting_of, terrain_of
-from fluidlift.pipeline.moving import estimates_of, frame_file, parameters_of, targets_of
+from fluidlift.pipeline.moving import estimates_of, parameters_of, targets_of
 from fluidlift.pipeline.seeing import clip_of, flow_of, labels_of
+from fluidlift.pipeline.simulating import frame_file
 from fluidlift.pipeline.story import Result, Story
 from fluidlift.types import CellType, Gaussians, PinholeCamera, concatenate
 

@@ -166,11 +166,7 @@ def picture_colours(
     frame: UInt8[np.ndarray, "h w 3"], points: Float[np.ndarray, "n 3"], camera: PinholeCamera
 ) -> Float[np.ndarray, "n 3"]:
     """sRGB in [0, 1] where each point appears in a picture; the nearest pixel for points outside it."""
-    uv, z = camera.project(points)
-    height, width = frame.shape[:2]
-    uv = np.where(z[:, None] > 0, np.nan_to_num(uv, nan=0.0, posinf=1e9, neginf=-1e9), 0.0)
-    col = np.clip(uv[:, 0], 0, width - 1).astype(int)
-    row = np.clip(uv[:, 1], 0, height - 1).astype(int)
+    row, col, _ = camera.nearest_pixels(points)
     return frame[row, col].astype(np.float32) / 255.0
 
 

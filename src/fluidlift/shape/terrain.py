@@ -123,10 +123,7 @@ def _plan(surface, labels, camera, grid: Grid, along, reach) -> _Plan:
     start, stop = reach[0] + 3 * grid.spacing, reach[1] - 3 * grid.spacing
     inner = ground + (np.clip(s, min(start, stop), max(start, stop)) - s)[..., None] * along
     level = surface.height(ground)
-    uv, z = camera.project(np.concatenate([inner, surface.height(inner)[..., None]], axis=-1))
-    height, width = labels.shape
-    col = np.clip(np.nan_to_num(uv[..., 0], nan=-1.0, posinf=1e9, neginf=-1e9), 0, width - 1).astype(int)
-    row = np.clip(np.nan_to_num(uv[..., 1], nan=-1.0, posinf=1e9, neginf=-1e9), 0, height - 1).astype(int)
+    row, col, z = camera.nearest_pixels(np.concatenate([inner, surface.height(inner)[..., None]], axis=-1))
     label = np.where(z > 0, labels[row, col], Label.BACKGROUND)
     return _Plan(label, level, s)
 

@@ -59,6 +59,18 @@ class PinholeCamera:
         v = self.focal[1] * x[..., 1] / safe + self.center[1]
         return np.stack([u, v], axis=-1), z
 
+    def nearest_pixels(self, points: Float[np.ndarray, "*n 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Row and column of the pixel of the picture nearest to where each world point appears, and its camera depth.
+
+        Points outside the picture get a pixel of its edge; for points behind the camera (depth <= 0) the pixel means
+        nothing.
+        """
+        uv, z = self.project(points)
+        uv = np.where(z[..., None] > 0, np.nan_to_num(uv, nan=0.0, posinf=1e9, neginf=-1e9), 0.0)
+        col = np.clip(uv[..., 0], 0, self.size[0] - 1).astype(int)
+        row = np.clip(uv[..., 1], 0, self.size[1] - 1).astype(int)
+        return row, col, z
+
     def rays(self, uv: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 3"]:
         """World directions with unit camera depth: position + z * ray has camera depth z."""
         x = (uv[..., 0] - self.center[0]) / self.focal[0]

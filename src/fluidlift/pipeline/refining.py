@@ -1,0 +1,114 @@
+"""The stage that makes the rest Gaussians: generate per frame, refine, prune, unite, fill."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from fluidlift.config import JobConfig
+from fluidlift.errors import InputRejected
+from fluidlift.pipeline.body import camera_of, gaussians_to_arrays, given_bodies, placement_of, setting_of
+from fluidlift.pipeline.seeing import Inputs, clip_of, labels_of
+from fluidlift.pipeline.story import Result, Story
+from fluidlift.shape import generate, terrain
+from fluidlift.types import Gaussians, PinholeCamera, Similarity3, concatenate
+
+
+def refine(story: Story, inputs: Inputs, config: JobConfig) -> Result:
+    """Generate per frame, refine on the first, prune, unite, fill."""
+    from fluidlift.shape.fill import fill
+    from fluidlift.shape.prune import prune
+    from fluidlift.shape.unite import unite
+
+    clip, labels, c = clip_of(story), labels_of(story), config.shape
+    g, camera, setting = story["geometry"], camera_of(story), setting_of(story)
+    start, united = g.meta["rest_frame"], g.meta["united_frames"]
+    h = setting.terrain.grid.spacing
+    depth = g.arrays["depth"]
+    fluid = labels.fluid
+    bodies, fitted = _bodies(story, inputs, config, fluid, start, united)
+    shown = generate.fluid_colour_frame(clip.frames[start], fluid[start])
+    hull = generate.hull_gaussians(shown, setting, camera, seed=config.seed)
+    front = unite([b for b in bodies if len(b)], spacing=max(0.35 * h, 0.6 * c.stride * _pixel(depth, camera)))
+    shell, pruned = prune(_outside_solid(concatenate([front, hull]), setting), min_opacity=0.05, max_stretch=12.0)
+    room = max(c.max_gaussians - len(shell), 0)
+    added = fill(
+        shell, spacing=h / 2, rays=c.rays, rng=np.random.default_rng(config.seed), max_added=room,
+        closed_below=setting.terrain,
+    )  # fmt: skip
+    body = _outside_solid(_bounded(concatenate([shell, added]), c.max_gaussians, config.seed), setting)
+    if len(body) < 50:
+        raise InputRejected(
+            f"the body of the fluid has only {len(body)} Gaussians", "more fluid in the picture",
+            "check the mask in the report, or raise --max-size",
+        )  # fmt: skip
+    meta = {
+        "warnings": list(fitted.pop("warnings")),
+        "front": len(front),
+        "hull": len(hull),
+        "pruned": len(front) + len(hull) - len(shell),
+        "filled": len(added),
+        "total": len(body),
+        "prune_report": str(pruned),
+    } | fitted
+    return Result(gaussians_to_arrays(body), meta)
+
+
+def _bodies(story, inputs, config, fluid, start, united) -> tuple[list[Gaussians], dict[str, Any]]:
+    """One body per united frame, the first of them refined against its picture."""
+    clip, camera, c = clip_of(story), camera_of(story), config.shape
+    depth = story["geometry"].arrays["depth"]
+    frames = list(range(start, start + united))
+    if inputs.geometry is not None:
+        given_frames, to_canonical = given_bodies(inputs.geometry, clip.size, frames)
+        scale = 1.0 / story["geometry"].meta["known_scale"]
+        moved = to_canonical.translation * (scale / to_canonical.scale)
+        to_world = placement_of(story) @ Similarity3(scale, to_canonical.rotation, moved)
+        bodies = [b.transformed(to_world) for b in given_frames]
+    else:
+        bodies = [generate.front_gaussians(clip.frames[t], fluid[t], depth, camera, stride=c.stride) for t in frames]
+    first, fitted = _refined(story, config, bodies[0], fluid[start])
+    return [first, *bodies[1:]], fitted
+
+
+def _refined(story, config, front: Gaussians, mask) -> tuple[Gaussians, dict[str, Any]]:
+    """A body optimised against the picture of the rest frame."""
+    from fluidlift.shape.refine import refine as refine_view
+
+    clip, camera, c = clip_of(story), camera_of(story), config.shape
+    start = story["geometry"].meta["rest_frame"]
+    fitted: dict[str, Any] = {"warnings": []}
+    if c.refine_iterations > 0 and len(front):
+        found = refine_view(
+            front, clip.frames[start], mask, camera, iterations=c.refine_iterations, seed=config.seed,
+            max_gaussians=max(int(1.5 * len(front)), 1000), progress=story.step,
+        )  # fmt: skip
+        fitted |= {"psnr_before": found.psnr_before, "psnr_after": found.psnr_after, "kept": found.kept}
+        fitted["loss_history"] = [float(x) for x in found.loss_history]
+        front = generate.bounded_colours(found.gaussians, clip.frames[start], camera)
+    return front, fitted
+
+
+def _pixel(depth: np.ndarray, camera: PinholeCamera) -> float:
+    """Median size of a pixel on the fluid, m."""
+    return float(np.median(depth[depth > 0]) / camera.focal[0])
+
+
+def _outside_solid(g: Gaussians, setting: terrain.Setting) -> Gaussians:
+    """Those whose centre is in the box and not inside the terrain."""
+    from fluidlift.numerics.sampling import sample_nodes
+
+    grid = setting.terrain.grid
+    inside = grid.contains(g.means, margin=1e-6)
+    g = g.select(inside)
+    distance = sample_nodes(setting.terrain.signed_distance, grid, g.means)
+    return g.select(distance > -0.25 * grid.spacing)
+
+
+def _bounded(g: Gaussians, most: int, seed: int) -> Gaussians:
+    """A random subset where there are too many; each stands for more fluid then."""
+    if len(g) <= most:
+        return g
+    keep = np.sort(np.random.default_rng(seed).permutation(len(g))[:most])
+    return g.select(keep)

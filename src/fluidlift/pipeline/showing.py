@@ -277,9 +277,12 @@ def _section_parameters(story: Story) -> Section:
         for name, e in estimates_of(story).items()
     ]
     loss = story["fit"].arrays["loss_history"]
-    figures = (
-        [Figure(curve(loss, title="loss of the fit", x="iteration", y="loss"), "parameter fit")] if len(loss) else []
-    )
+    figures = []
+    if len(loss):
+        picture = curve(loss, title="data term of the fit", x="iteration", y="loss")
+        figures.append(
+            Figure(picture, "misfit of the velocities; it may rise once the noise is known and priors count")
+        )
     return Section(
         "Physical parameters", figures, rows, ["parameter", "value", "uncertainty", "unit", ""], meta["notes"]
     )

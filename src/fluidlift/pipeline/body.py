@@ -90,7 +90,7 @@ def geometry(story: Story, inputs: Inputs, config: JobConfig) -> Result:
     arrays, meta = _packed(setting)
     arrays |= {
         "mask": mask, "depth": depth, "half_thickness": half, "mean_flow": motion, "mean_confidence": trust,
-        "plate": plate.image, "plate_seen": plate.seen,
+        "plate": plate.image,
     }  # fmt: skip
     meta |= {
         "warnings": warnings,
@@ -319,14 +319,14 @@ def setting_of(story: Story) -> terrain.Setting:
     )
 
 
-def gaussians_to_arrays(g: Gaussians, prefix: str = "") -> dict[str, np.ndarray]:
+def gaussians_to_arrays(g: Gaussians) -> dict[str, np.ndarray]:
     """Fields by name."""
-    return {prefix + k: getattr(g, k) for k in ("means", "quats", "scales", "opacities", "sh")}
+    return {k: getattr(g, k) for k in ("means", "quats", "scales", "opacities", "sh")}
 
 
-def gaussians_from_arrays(arrays: dict[str, np.ndarray], prefix: str = "") -> Gaussians:
+def gaussians_from_arrays(arrays: dict[str, np.ndarray]) -> Gaussians:
     """The reverse of `gaussians_to_arrays`."""
-    return Gaussians(*(arrays[prefix + k] for k in ("means", "quats", "scales", "opacities", "sh")))
+    return Gaussians(*(arrays[k] for k in ("means", "quats", "scales", "opacities", "sh")))
 
 
 def rest_of(story: Story) -> Gaussians:

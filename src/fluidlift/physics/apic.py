@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from fluidlift.errors import FluidliftError
+from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.physics import boundaries, transfer
 from fluidlift.physics.crowding import fill_ratio, spreading
 from fluidlift.physics.deform import updated_deformation
@@ -83,6 +83,24 @@ class LiquidSimulator(ParticleSimulator):
         self._outlet_faces = self._faces_between_liquid_and_outlet() if self.settings.prescribe_outflow else None
         self._head_rate: np.ndarray | None = None
         self._start_levels = self._levels_now() if (self._walls.regions == CellType.OUTFLOW).any() else None
+
+    def state(self) -> dict[str, np.ndarray]:
+        """See `ParticleSimulator.state`; also the water levels at the outlet and the pressure as a first guess."""
+        own = {"head_rate": self._head_rate, "start_levels": self._start_levels}
+        return super().state() | {k: v.copy() for k, v in own.items() if v is not None}
+
+    def restore(self, state: dict[str, np.ndarray]) -> None:
+        """See `ParticleSimulator.restore`."""
+        rate, levels = state.get("head_rate"), state.get("start_levels")
+        if rate is not None and (rate.shape != self.grid.shape or not np.isfinite(rate).all()):
+            raise InputRejected("a simulation state of another grid", f"{self.grid.shape} cells")
+        if (levels is None) != (self._start_levels is None) or (
+            levels is not None and levels.shape != self.grid.shape[:2]
+        ):
+            raise InputRejected("a simulation state with another outlet")
+        super().restore(state)
+        self._head_rate = None if rate is None else np.array(rate)
+        self._start_levels = None if levels is None else np.array(levels)
 
     def _faces_between_liquid_and_outlet(self) -> tuple[np.ndarray, ...]:
         out = []

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numba import njit, prange
 
-from fluidlift.errors import FluidliftError, require
+from fluidlift.errors import FluidliftError, InputRejected, require
 from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.physics import boundaries, transfer
 from fluidlift.physics.crowding import fill_ratio
@@ -151,6 +151,26 @@ class GasSimulator(ParticleSimulator):
     def velocity(self) -> FaceVelocity:
         """Of the air, m/s."""
         return self._velocity
+
+    def state(self) -> dict[str, np.ndarray]:
+        """See `ParticleSimulator.state`; also the air's velocity and the pressure as a first guess."""
+        air = {f"air_{name}": c.copy() for name, c in zip("uvw", self._velocity.components)}
+        rate = {} if self._head_rate is None else {"head_rate": self._head_rate.copy()}
+        return super().state() | air | rate
+
+    def restore(self, state: dict[str, np.ndarray]) -> None:
+        """See `ParticleSimulator.restore`."""
+        air = [state.get(f"air_{name}") for name in "uvw"]
+        rate = state.get("head_rate")
+        shapes = [self.grid.face_shape(axis) for axis in range(3)]
+        fits = all(c is not None and c.shape == shape for c, shape in zip(air, shapes))
+        if not fits or (rate is not None and rate.shape != self.grid.shape):
+            raise InputRejected("a simulation state of another grid", f"{self.grid.shape} cells")
+        if not all(np.isfinite(c).all() for c in [*air, *([] if rate is None else [rate])]):
+            raise InputRejected("a simulation state with numbers that are not finite")
+        super().restore(state)
+        self._velocity = FaceVelocity(*(np.array(c, np.float32) for c in air))
+        self._head_rate = None if rate is None else np.array(rate)
 
     def _max_speed(self) -> float:
         return float(np.sqrt(sum(float(np.square(c).max()) for c in self._velocity.components)))

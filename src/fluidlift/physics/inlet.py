@@ -66,7 +66,8 @@ class Inlet:
         self._per_side = max(1, round(per_cell ** (1.0 / 3.0)))
         self.particle_spacing = grid.spacing / self._per_side
         """m"""
-        self._shift = np.zeros(3)
+        self.shift = np.zeros(3)
+        """m, by which the emission pattern has travelled"""
         self._profile, self._gain, self._offset = profile, 0.0, self.bulk
         if not self.active:
             return
@@ -121,7 +122,7 @@ class Inlet:
 
     def travel(self, dt: float) -> None:
         """Move the emission pattern along with the bulk flow, so that new particles continue the old lattice."""
-        self._shift = np.mod(self._shift + self.bulk * dt, self.particle_spacing)
+        self.shift = np.mod(self.shift + self.bulk * dt, self.particle_spacing)
 
     def missing(self, positions: Float[np.ndarray, "n 3"], rng: np.random.Generator) -> Float[np.ndarray, "n 3"]:
         """Places in INFLOW cells that lack a particle: points of the travelling lattice farther than 0.8 of its
@@ -130,7 +131,7 @@ class Inlet:
             return np.zeros((0, 3), np.float32)
         grid, s = self._walls.grid, self.particle_spacing
         counts = (self._high - self._low) * self._per_side + 1  # one more: the pattern is shifted by up to a spacing
-        start = grid.low + self._low * grid.spacing - 0.5 * s + self._shift
+        start = grid.low + self._low * grid.spacing - 0.5 * s + self.shift
         axes = [start[a] + s * np.arange(counts[a]) for a in range(3)]
         candidates = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
         candidates = candidates[grid.contains(candidates)]

@@ -5,15 +5,16 @@ A substep either completes or leaves the state as it was.
 
 from __future__ import annotations
 
+import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
-from fluidlift.errors import FluidliftError, require
+from fluidlift.errors import FluidliftError, InputRejected, require
 from fluidlift.numerics.sampling import sample_centers
 from fluidlift.numerics.signed_distance import push_outside
 from fluidlift.physics import boundaries, transfer
@@ -128,6 +129,39 @@ class ParticleSimulator(ABC):
     def particles(self) -> Particles:
         """The present state, in the order of the ids."""
         return self._particles.select(np.argsort(self._particles.ids, kind="stable"))
+
+    def state(self) -> dict[str, np.ndarray]:
+        """All that changes from step to step, as plain arrays: a simulator built with the same arguments goes on from
+        it, after `restore`, bit for bit."""
+        generator = json.dumps(self._rng.bit_generator.state).encode()
+        particles = {f"particles.{f.name}": getattr(self._particles, f.name).copy() for f in fields(Particles)}
+        return particles | {
+            "time": np.float64(self.time),
+            "counts": np.array([self._advances, self._next_id], np.int64),
+            "generator": np.frombuffer(generator, np.uint8),
+            "inlet_shift": self._inlet.shift.copy(),
+        }
+
+    def restore(self, state: dict[str, np.ndarray]) -> None:
+        """Go back, or on, to a state of `state`.
+
+        Raises:
+            InputRejected: something is missing, of the wrong shape or not finite; nothing has changed then.
+        """
+        try:
+            particles = Particles(**{f.name: np.array(state[f"particles.{f.name}"]) for f in fields(Particles)})
+            generator = json.loads(bytes(state["generator"]))
+            counts, shift, time = state["counts"], np.array(state["inlet_shift"], np.float64), float(state["time"])
+            require(counts.shape == (2,) and shift.shape == (3,), "counters of another shape")
+            for name in ("positions", "velocities", "affine", "deformation", "masses"):
+                require(bool(np.isfinite(getattr(particles, name)).all()), f"{name} that are not finite")
+            fresh = np.random.default_rng(0)
+            fresh.bit_generator.state = generator
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputRejected(f"a simulation state that does not fit: {error}") from None
+        self._particles, self._rng, self.time = particles, fresh, time
+        self._advances, self._next_id = int(counts[0]), int(counts[1])
+        self._inlet.shift = shift
 
     def advance(self, duration: float) -> StepReport:
         """Simulate `duration` seconds in substeps of at most `parameters.time_step`.

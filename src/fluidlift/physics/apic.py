@@ -18,7 +18,16 @@ from fluidlift.physics.deform import updated_deformation
 from fluidlift.physics.forces import add_gravity
 from fluidlift.physics.outlet import hold_columns, outlet_heads, water_levels
 from fluidlift.physics.pressure import PressureSystem, build_system, project
-from fluidlift.physics.stepping import EmitSource, Outcome, ParticleSimulator, SimulationSettings, StepReport
+from fluidlift.physics.reseed import inner_cells, reseed
+from fluidlift.physics.stepping import (
+    TIDY_EVERY,
+    EmitSource,
+    Outcome,
+    ParticleSimulator,
+    SimulationSettings,
+    StepReport,
+)
+from fluidlift.physics.travel import displacements, leaving
 from fluidlift.types import CellType, FaceVelocity, FluidParameters, Grid, Particles, SolveReport, Terrain
 
 __all__ = ["EmitSource", "LiquidSimulator", "SimulationSettings", "StepReport"]
@@ -180,16 +189,18 @@ class LiquidSimulator(ParticleSimulator):
         return new, q, report, system
 
     def _substep(self, dt: float, number: int, *, last_attempt: bool) -> Outcome | None:
-        particles, grid, walls = self._particles, self.grid, self._walls
-        if not len(particles):
-            return Outcome(particles, 0, SolveReport(True, 0, 0.0, "empty"), (), lambda: None)
-        order = transfer.sort_by_cell(particles.positions, grid)
+        grid, walls = self.grid, self._walls
+        if not len(self._particles):
+            return Outcome(self._particles, 0, SolveReport(True, 0, 0.0, "empty"), (), lambda: None)
+        order = transfer.sort_by_cell(self._particles.positions, grid)
+        if number % TIDY_EVERY == 0:
+            order = self._tidied(order)
+        particles = self._particles
         velocity, system, head_rate, report, viscosity_reports = self._grid_velocity(order, dt)
         velocities, affine = transfer.grid_to_particles(velocity, grid, particles.positions, order)
-        # second order in time: the velocity half way, by the particle's own gradient
-        moves = dt * (velocities + 0.5 * dt * np.einsum("nij,nj->ni", affine, velocities))
-        farthest = float(np.abs(moves).max()) / grid.spacing
-        if not np.isfinite(farthest) or not np.isfinite(affine).all() or farthest > 3.0 * self.settings.courant:
+        moves, farthest = displacements(velocities, affine, dt)
+        farthest /= grid.spacing
+        if not farthest <= 3.0 * self.settings.courant:
             if not last_attempt:
                 return None
             raise FluidliftError(
@@ -210,10 +221,27 @@ class LiquidSimulator(ParticleSimulator):
         )  # fmt: skip
         deformation = updated_deformation(particles.deformation, affine, dt, max_stretch=self.settings.max_stretch)
         state = replace(particles, positions=positions, velocities=velocities, affine=affine, deformation=deformation)
-        leaving = self._leaving(particles.positions, positions)
-        index = order.order[~leaving[order.order]]  # grouped by cell: neighbours stay close in memory
+        gone = leaving(particles.positions, positions, walls, self._mainstream)
+        if gone.any():
+            state = state.select(~gone)
 
         def adopt() -> None:
             self._head_rate = head_rate
 
-        return Outcome(state.select(index), int(leaving.sum()), report, viscosity_reports, adopt)
+        return Outcome(state, int(gone.sum()), report, viscosity_reports, adopt)
+
+    def _tidied(self, order: transfer.CellOrder) -> transfer.CellOrder:
+        """Reseed, and put the particles in the order of their cells, so that neighbours are close in memory."""
+        particles = self._particles
+        if self.settings.reseed:
+            inner = inner_cells((np.diff(order.start) > 0).reshape(self.grid.shape), self._walls.solid)
+            done = reseed(
+                particles, order, inner, self._walls, density=self.parameters.density, first_id=self._next_id,
+                rng=self._rng,
+            )  # fmt: skip
+            particles = done.particles
+            self._next_id += done.split
+            if done.split or done.merged:
+                order = transfer.sort_by_cell(particles.positions, self.grid)
+        self._particles = particles.select(order.order)
+        return transfer.CellOrder(np.arange(len(particles)), order.start)

@@ -20,6 +20,7 @@ from fluidlift.physics.deform import updated_deformation
 from fluidlift.physics.forces import add_buoyancy
 from fluidlift.physics.pressure import build_system, project
 from fluidlift.physics.stepping import EmitSource, Outcome, ParticleSimulator, SimulationSettings
+from fluidlift.physics.travel import leaving
 from fluidlift.types import CellType, FaceVelocity, FluidParameters, Grid, Particles, SolveReport, Terrain
 
 
@@ -226,10 +227,10 @@ class GasSimulator(ParticleSimulator):
         )  # fmt: skip
         deformation = updated_deformation(particles.deformation, affine, dt, max_stretch=self.settings.max_stretch)
         state = replace(particles, positions=positions, velocities=velocities, affine=affine, deformation=deformation)
-        leaving = self._leaving(particles.positions, positions)
-        index = order.order[~leaving[order.order]]
+        gone = leaving(particles.positions, positions, self._walls, self._mainstream)
+        index = order.order[~gone[order.order]]
 
         def adopt() -> None:
             self._velocity, self._head_rate = velocity, head_rate
 
-        return Outcome(state.select(index), int(leaving.sum()), report, viscosity_reports, adopt)
+        return Outcome(state.select(index), int(gone.sum()), report, viscosity_reports, adopt)

@@ -11,7 +11,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
-from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from fluidlift.errors import FluidliftError, InputRejected, require
@@ -21,7 +20,10 @@ from fluidlift.physics import boundaries, transfer
 from fluidlift.physics.crowding import cell_capacity
 from fluidlift.physics.inlet import Inlet
 from fluidlift.physics.viscosity import diffuse
-from fluidlift.types import CellType, FaceVelocity, FluidParameters, Grid, Particles, SolveReport, Terrain
+from fluidlift.types import FaceVelocity, FluidParameters, Grid, Particles, SolveReport, Terrain
+
+TIDY_EVERY = 4
+"""substeps between two tidyings: particles put in the order of their cells, thin and crowded cells reseeded"""
 
 EmitSource = Callable[[np.ndarray, float], np.ndarray]
 """(positions [n,3] m, time s) -> index of the rest Gaussian that lends each new particle its look"""
@@ -45,6 +47,8 @@ class SimulationSettings:
     """correct clumps of particles"""
     separate_from_walls: bool = True
     """let liquid leave a wall that would have to hold it by suction"""
+    reseed: bool = True
+    """split and merge particles inside the liquid where cells run empty or crowded"""
     prescribe_outflow: bool = False
     """True: the outlet's faces move with `outflow_velocity` along the mainstream; False: free outflow"""
 
@@ -316,15 +320,3 @@ class ParticleSimulator(ABC):
             tolerance=self.settings.viscosity_tolerance,
         )  # fmt: skip
         return (new if reports else velocity), reports
-
-    def _leaving(self, before: Float[np.ndarray, "n 3"], after: Float[np.ndarray, "n 3"]) -> np.ndarray:
-        """bool [n]: out of the box, or out of the OUTFLOW cells along the mainstream."""
-        leaving = ~self.grid.contains(after)
-        outflow = self._walls.regions == CellType.OUTFLOW
-        if not outflow.any():
-            return leaving
-        last = np.asarray(self.grid.shape) - 1
-        was, now = (outflow[tuple(np.clip(self.grid.cell_of(x), 0, last).T)] for x in (before, after))
-        crossed = was & ~now
-        leaving[crossed] |= (after - before)[crossed] @ self._mainstream > 0
-        return leaving

@@ -5,7 +5,7 @@ import pytest
 
 from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.physics import boundaries
-from fluidlift.physics.crowding import cell_capacity, fill_ratio, spreading
+from fluidlift.physics.crowding import cell_capacity, fill_ratio, limited_moves, limited_moves_plain, spreading
 from fluidlift.physics.forces import add_buoyancy, add_gravity
 from fluidlift.physics.inlet import Inlet, random_fluctuation
 from fluidlift.physics.outlet import hold_columns, outlet_heads, water_levels
@@ -228,3 +228,14 @@ def test_crowded_particles_spread():
     moved = points + moves
     after = fill_ratio(moved, volumes, GRID, sort_by_cell(moved, GRID), capacity)
     assert after.max() < ratio.max()
+
+
+def test_displacements_are_sampled_and_limited_as_in_the_plain_form():
+    rng = np.random.default_rng(3)
+    field = FaceVelocity(*(rng.normal(size=GRID.face_shape(a)).astype(np.float32) for a in range(3)))
+    low, high = GRID.low - 0.05, GRID.high + 0.05  # also beyond the outer faces
+    points = rng.uniform(low, high, (3000, 3)).astype(np.float32)
+    moves = limited_moves(field, GRID, points, 0.4, sort_by_cell(points, GRID))
+    plain = limited_moves_plain(field, GRID, points, 0.4)
+    np.testing.assert_allclose(moves, plain, atol=2e-5)  # single precision of coordinates in cells
+    assert 0 < (np.linalg.norm(plain, axis=1) > 0.399).sum() < len(points)

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float
+from numba import njit, prange
 
 from fluidlift.numerics.poisson import solve
-from fluidlift.numerics.sampling import sample_nodes
+from fluidlift.numerics.sampling import sample_faces, sample_nodes
 from fluidlift.physics.boundaries import mean_of_corners
 from fluidlift.physics.pressure import PressureSystem, subtract_gradient
-from fluidlift.physics.transfer import CellOrder, deposit_to_cells, grid_to_particles
+from fluidlift.physics.transfer import CellOrder, deposit_to_cells
 from fluidlift.types import FaceVelocity, Grid
 
 TOLERATED = 0.05
@@ -70,7 +71,59 @@ def spreading(
     # a rough solution will do: what it leaves, the next step takes
     psi, _ = solve(system, wanted, tolerance=0.1, max_iterations=6)
     field = subtract_gradient(FaceVelocity.zeros(grid), system, psi)
-    moves, _ = grid_to_particles(field, grid, positions, order)
-    limit = LARGEST_MOVE * grid.spacing
-    length = np.linalg.norm(moves, axis=1, keepdims=True)
-    return moves * np.minimum(1.0, limit / np.maximum(length, 1e-12))
+    return limited_moves(field, grid, positions, LARGEST_MOVE * grid.spacing, order)
+
+
+def limited_moves(
+    field: FaceVelocity, grid: Grid, positions: Float[np.ndarray, "n 3"], limit: float, order: CellOrder
+) -> Float[np.ndarray, "n 3"]:
+    """A displacement on faces (m) at positions (trilinear), shortened to at most `limit` (m)."""
+    moves = np.empty((len(positions), 3), np.float32)
+    _sample_moves(positions, order.order, grid.low, grid.spacing, *field.components, np.float32(limit), moves)
+    return moves
+
+
+def limited_moves_plain(
+    field: FaceVelocity, grid: Grid, positions: Float[np.ndarray, "n 3"], limit: float
+) -> Float[np.ndarray, "n 3"]:
+    """`limited_moves` as it reads."""
+    moves = sample_faces(field, grid, positions)
+    length = np.sqrt(np.square(moves).sum(axis=1, keepdims=True))
+    return moves * np.minimum(1.0, limit / np.maximum(length, 1e-30))
+
+
+@njit(cache=True)
+def _trilinear(field, x, y, z):
+    """Value at a place in cells of the field's own lattice, the outermost one continued."""
+    nx, ny, nz = field.shape
+    x = min(max(x, np.float32(0.0)), np.float32(nx - 1))
+    y = min(max(y, np.float32(0.0)), np.float32(ny - 1))
+    z = min(max(z, np.float32(0.0)), np.float32(nz - 1))
+    i, j, k = min(np.int64(x), nx - 2), min(np.int64(y), ny - 2), min(np.int64(z), nz - 2)
+    i, j, k = max(i, 0), max(j, 0), max(k, 0)
+    i1, j1, k1 = min(i + 1, nx - 1), min(j + 1, ny - 1), min(k + 1, nz - 1)
+    fx, fy, fz = x - np.float32(i), y - np.float32(j), z - np.float32(k)
+    one = np.float32(1.0)
+    low = (field[i, j, k] * (one - fz) + field[i, j, k1] * fz) * (one - fy)
+    low += (field[i, j1, k] * (one - fz) + field[i, j1, k1] * fz) * fy
+    high = (field[i1, j, k] * (one - fz) + field[i1, j, k1] * fz) * (one - fy)
+    high += (field[i1, j1, k] * (one - fz) + field[i1, j1, k1] * fz) * fy
+    return low * (one - fx) + high * fx
+
+
+@njit(parallel=True, cache=True)
+def _sample_moves(positions, order, low, h, u, v, w, limit, moves):
+    inverse = np.float32(1.0 / h)
+    half = np.float32(0.5)
+    x0, y0, z0 = np.float32(low[0]), np.float32(low[1]), np.float32(low[2])
+    for m in prange(len(order)):
+        p = order[np.int64(m)]
+        x = (positions[p, 0] - x0) * inverse
+        y = (positions[p, 1] - y0) * inverse
+        z = (positions[p, 2] - z0) * inverse
+        a = _trilinear(u, x, y - half, z - half)
+        b = _trilinear(v, x - half, y, z - half)
+        c = _trilinear(w, x - half, y - half, z)
+        length = np.sqrt(a * a + b * b + c * c)
+        share = limit / length if length > limit else np.float32(1.0)
+        moves[p, 0], moves[p, 1], moves[p, 2] = a * share, b * share, c * share

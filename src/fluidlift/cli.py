@@ -79,6 +79,34 @@ class Make:
 
 
 @dataclass(frozen=True)
+class Sim:
+    """Simulate a finished asset again, with its scene.yaml: longer, other frames, another liquid, obstacles."""
+
+    asset: Asset
+    """asset folder"""
+    duration: float | None = None
+    """seconds; by default what scene.yaml says, else as long as the clip; a longer one continues what is there"""
+    fps: float | None = None
+    """frames per second; by default those of the clip"""
+    extend_downstream: float | None = None
+    """metres by which the channel of a stream or a fall goes on behind its outlet"""
+    meshes: Path | None = None
+    """folder of the mesh files that scene.yaml names; by default the asset"""
+    resume: bool = False
+    """insist on going on from the checkpoint: without one that fits, stop instead of starting again"""
+    restart: bool = False
+    """start at the first frame, although a checkpoint fits"""
+    checkpoint_every: int | None = None
+    """frames between checkpoints (10)"""
+    seed: int | None = None
+    """of the inflow's variation; by default that of the asset"""
+    set: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default_factory=tuple)
+    """one setting of simulate or show, such as --set simulate.max_particles=300000; may be repeated"""
+    json: bool = False
+    """print the outcome as JSON"""
+
+
+@dataclass(frozen=True)
 class Inspect:
     """Tell what a clip is, and what would be warned about."""
 
@@ -142,7 +170,7 @@ class Doctor:
     """print as JSON"""
 
 
-Command = Make | Inspect | Mask | Evaluate | Validate | Demo | Doctor
+Command = Make | Sim | Inspect | Mask | Evaluate | Validate | Demo | Doctor
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -167,7 +195,10 @@ def main(argv: list[str] | None = None) -> int:
         print(f"fluidlift: {error}", file=sys.stderr)
         return FAILED
     except KeyboardInterrupt:
-        print("\nfluidlift: stopped. Finished stages are kept: the same command goes on from there.", file=sys.stderr)
+        print(
+            "\nfluidlift: stopped. Finished stages and frames are kept: the same command goes on from there.",
+            file=sys.stderr,
+        )
         return FAILED
 
 
@@ -214,14 +245,28 @@ def _run_job(clip: Path, out: Path, config: Any, *, force=(), as_json=False, **f
 
     with _progress() as progress:
         made = make(Inputs(clip, **files), out, config, force=force, progress=progress)
+    return _tell(made, as_json)
+
+
+def _tell(made: Any, as_json: bool) -> int:
     if as_json:
-        print(json.dumps({"asset": str(made.folder), "seconds": made.seconds, "warnings": made.warnings,
-                          "stages": made.timings}, indent=1))  # fmt: skip
+        print(json.dumps({"asset": str(made.folder), "seconds": made.seconds, "frames": made.frames,
+                          "warnings": made.warnings, "stages": made.timings}, indent=1))  # fmt: skip
     else:
         print(f"done in {made.seconds:.0f} s")
         for text, name in (("asset", ""), ("preview", "preview.mp4"), ("report", "report.html")):
             print(f"  {text:8} {made.folder / name}")
     return WITH_WARNINGS if made.warnings else DONE
+
+
+def _sim(c: Sim) -> int:
+    from fluidlift.pipeline import SimulationRequest, resimulate
+
+    request = SimulationRequest(c.duration, c.fps, c.extend_downstream, c.meshes, c.resume, c.restart)
+    flat = {"seed": c.seed, "simulate.checkpoint_every": c.checkpoint_every}
+    with _progress() as progress:
+        made = resimulate(c.asset, request=request, overrides=c.set, flat=flat, progress=progress)
+    return _tell(made, c.json)
 
 
 def _inspect(c: Inspect) -> int:
@@ -307,7 +352,7 @@ def _doctor(c: Doctor) -> int:
 
 
 _COMMANDS = {
-    Make: _make, Inspect: _inspect, Mask: _mask, Evaluate: _evaluate, Validate: _validate, Demo: _demo, Doctor: _doctor,
+    Make: _make, Sim: _sim, Inspect: _inspect, Mask: _mask, Evaluate: _evaluate, Validate: _validate, Demo: _demo, Doctor: _doctor,
 }  # fmt: skip
 
 if __name__ == "__main__":

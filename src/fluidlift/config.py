@@ -96,6 +96,8 @@ class SimulateConfig:
     """frames to simulate; None: as many as the clip has"""
     max_particles: int = 150_000
     """most particles"""
+    checkpoint_every: int = 10
+    """frames between checkpoints, from which a stopped simulation goes on"""
 
 
 @dataclass(frozen=True)
@@ -174,6 +176,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "fit.max_seconds": (0, 1e9),
     "simulate.frames": (1, 1e6),
     "simulate.max_particles": (100, 1e9),
+    "simulate.checkpoint_every": (1, 1e6),
     "show.width": (16, 16384),
 }
 """least and greatest value of each number that has a meaning: wider than what is wise"""

@@ -98,6 +98,17 @@ def beside_closed_faces(walls: Walls) -> Bool[np.ndarray, "nx ny nz"]:
     return out & ~walls.solid
 
 
+def touching_faces(cells: Bool[np.ndarray, "nx ny nz"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """bool per component: faces of the marked cells."""
+    out = []
+    for axis in range(3):
+        pad = [(0, 0)] * 3
+        pad[axis] = (1, 1)
+        wide = np.moveaxis(np.pad(cells, pad), axis, 0)
+        out.append(np.moveaxis(wide[1:] | wide[:-1], 0, axis))
+    return tuple(out)
+
+
 def mean_of_corners(field: Float[np.ndarray, "nx+1 ny+1 nz+1"]) -> Float[np.ndarray, "nx ny nz"]:
     """Mean of the eight corners of each cell."""
     for axis in range(3):

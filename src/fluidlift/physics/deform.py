@@ -9,6 +9,9 @@ from numba import njit, prange
 from fluidlift.errors import require
 from fluidlift.types import Gaussians, Particles
 
+CHUNK = 2048
+"""particles that a thread takes at a time"""
+
 
 @njit(cache=True)
 def _eigen(a, v):
@@ -45,51 +48,80 @@ def _eigen(a, v):
                     v[k, q] = s * x + c * y
 
 
+@njit(cache=True)
+def _limit_stretches(f, max_stretch, a, v, g):
+    """Bring the singular values of `f` into [1/max_stretch, max_stretch], in place; a, v, g are work space."""
+    for i in range(3):
+        for j in range(3):
+            a[i, j] = f[i, 0] * f[j, 0] + f[i, 1] * f[j, 1] + f[i, 2] * f[j, 2]
+    _eigen(a, v)
+    for e in range(3):
+        stretch = np.sqrt(max(a[e, e], 1e-12))
+        factor = min(max(stretch, 1.0 / max_stretch), max_stretch) / stretch
+        for j in range(3):
+            g[e, j] = factor * (v[0, e] * f[0, j] + v[1, e] * f[1, j] + v[2, e] * f[2, j])
+    for i in range(3):
+        for j in range(3):
+            f[i, j] = v[i, 0] * g[0, j] + v[i, 1] * g[1, j] + v[i, 2] * g[2, j]
+
+
+@njit(cache=True)
+def _inverse_cube_root(x):
+    """x^(-1/3); near 1, where determinants are, by two Newton steps from the Taylor series."""
+    d = x - 1.0
+    if abs(d) > 0.125:
+        return x ** (-1.0 / 3.0)
+    # the series is off by at most 14/81 (1/8)^3 = 3e-4, each step squares that and doubles it
+    root = 1.0 + d * (-1.0 / 3.0 + d * (2.0 / 9.0))
+    root *= 4.0 / 3.0 - 1.0 / 3.0 * x * root * root * root
+    return root * (4.0 / 3.0 - 1.0 / 3.0 * x * root * root * root)
+
+
+@njit(cache=True)
+def _advanced_row(f, c, p, i, dt):
+    """Row i of (I + dt C) F of particle p."""
+    x, y, z = dt * c[p, i, 0], dt * c[p, i, 1], dt * c[p, i, 2]
+    return (
+        f[p, i, 0] + x * f[p, 0, 0] + y * f[p, 1, 0] + z * f[p, 2, 0],
+        f[p, i, 1] + x * f[p, 0, 1] + y * f[p, 1, 1] + z * f[p, 2, 1],
+        f[p, i, 2] + x * f[p, 0, 2] + y * f[p, 1, 2] + z * f[p, 2, 2],
+    )
+
+
 @njit(parallel=True, cache=True)
-def _update(deformation, affine, dt, max_stretch):
-    for p_ in prange(len(deformation)):
-        p = np.int64(p_)
-        f = np.empty((3, 3))
-        for i in range(3):
-            for j in range(3):
-                total = np.float64(deformation[p, i, j])
-                for k in range(3):
-                    total += dt * affine[p, i, k] * deformation[p, k, j]
-                f[i, j] = total
-        det = (
-            f[0, 0] * (f[1, 1] * f[2, 2] - f[1, 2] * f[2, 1])
-            - f[0, 1] * (f[1, 0] * f[2, 2] - f[1, 2] * f[2, 0])
-            + f[0, 2] * (f[1, 0] * f[2, 1] - f[1, 1] * f[2, 0])
-        )
-        if not (det > 1e-6 and det < 1e6):
-            for i in range(3):
-                for j in range(3):
-                    deformation[p, i, j] = 1.0 if i == j else 0.0
-            continue
-        scale = det ** (-1.0 / 3.0)
-        squared = 0.0
-        for i in range(3):
-            for j in range(3):
-                f[i, j] *= scale
-                squared += f[i, j] * f[i, j]
-        # with det F = 1 and a limit s >= 2, a sum of squared stretches up to 2 s keeps all within [1/s, s]
-        if squared > 2.0 * max_stretch or max_stretch < 2.0:
-            a, v, g = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-            for i in range(3):
-                for j in range(3):
-                    a[i, j] = f[i, 0] * f[j, 0] + f[i, 1] * f[j, 1] + f[i, 2] * f[j, 2]
-            _eigen(a, v)
-            for e in range(3):
-                stretch = np.sqrt(max(a[e, e], 1e-12))
-                factor = min(max(stretch, 1.0 / max_stretch), max_stretch) / stretch
-                for j in range(3):
-                    g[e, j] = factor * (v[0, e] * f[0, j] + v[1, e] * f[1, j] + v[2, e] * f[2, j])
-            for i in range(3):
-                for j in range(3):
-                    f[i, j] = v[i, 0] * g[0, j] + v[i, 1] * g[1, j] + v[i, 2] * g[2, j]
-        for i in range(3):
-            for j in range(3):
-                deformation[p, i, j] = f[i, j]
+def _update(deformation, affine, dt, max_stretch, out):
+    n = len(deformation)
+    for chunk in prange((n + CHUNK - 1) // CHUNK):
+        f, a, v, g = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+        first = np.int64(chunk) * CHUNK
+        for p in range(first, min(first + CHUNK, n)):
+            f00, f01, f02 = _advanced_row(deformation, affine, p, 0, dt)
+            f10, f11, f12 = _advanced_row(deformation, affine, p, 1, dt)
+            f20, f21, f22 = _advanced_row(deformation, affine, p, 2, dt)
+            det = f00 * (f11 * f22 - f12 * f21) - f01 * (f10 * f22 - f12 * f20) + f02 * (f10 * f21 - f11 * f20)
+            if not (det > 1e-6 and det < 1e6):
+                for i in range(3):
+                    for j in range(3):
+                        out[p, i, j] = 1.0 if i == j else 0.0
+                continue
+            s = _inverse_cube_root(det)
+            f00, f01, f02 = s * f00, s * f01, s * f02
+            f10, f11, f12 = s * f10, s * f11, s * f12
+            f20, f21, f22 = s * f20, s * f21, s * f22
+            out[p, 0, 0], out[p, 0, 1], out[p, 0, 2] = f00, f01, f02
+            out[p, 1, 0], out[p, 1, 1], out[p, 1, 2] = f10, f11, f12
+            out[p, 2, 0], out[p, 2, 1], out[p, 2, 2] = f20, f21, f22
+            squared = f00 * f00 + f01 * f01 + f02 * f02 + f10 * f10 + f11 * f11 + f12 * f12
+            squared += f20 * f20 + f21 * f21 + f22 * f22
+            # with det F = 1 and a limit s >= 2, a sum of squared stretches up to 2 s keeps all within [1/s, s]
+            if squared > 2.0 * max_stretch or max_stretch < 2.0:
+                f[0, 0], f[0, 1], f[0, 2] = f00, f01, f02
+                f[1, 0], f[1, 1], f[1, 2] = f10, f11, f12
+                f[2, 0], f[2, 1], f[2, 2] = f20, f21, f22
+                _limit_stretches(f, max_stretch, a, v, g)
+                for i in range(3):
+                    for j in range(3):
+                        out[p, i, j] = f[i, j]
 
 
 def updated_deformation(
@@ -107,8 +139,9 @@ def updated_deformation(
         max_stretch: largest singular value, above 1.
     """
     require(max_stretch > 1, f"max_stretch {max_stretch}", "above 1")
-    out = np.array(deformation, np.float32, order="C")
-    _update(out, np.ascontiguousarray(affine, np.float32), float(dt), float(max_stretch))
+    before = np.ascontiguousarray(deformation, np.float32)
+    out = np.empty_like(before)
+    _update(before, np.ascontiguousarray(affine, np.float32), float(dt), float(max_stretch), out)
     return out
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
 from fluidlift.numerics.sampling import sample_faces, sample_nodes
-from fluidlift.physics.boundaries import CLEARANCE, Walls
+from fluidlift.physics.boundaries import CLEARANCE, Walls, touching_faces
 from fluidlift.types import CellType, FaceVelocity, FluidParameters
 
 MODES = 12
@@ -82,15 +82,12 @@ class Inlet:
         extent = float((self._high - self._low).max()) * grid.spacing
         rng = np.random.default_rng(seed)
         self._fluctuation = random_fluctuation(extent, 4 * grid.spacing, self.bulk, self._amplitude, rng)
-        self.faces = []
-        """bool per component: faces of INFLOW cells"""
-        self._face_points = []
-        for axis in range(3):
-            pad = [(0, 0)] * 3
-            pad[axis] = (1, 1)
-            wide = np.moveaxis(np.pad(self._cells, pad), axis, 0)
-            touched = np.moveaxis(wide[1:] | wide[:-1], 0, axis) & (walls.openings[axis] > 0)
-            self.faces.append(touched)
+        self.cell_range = (self._low, self._high)
+        """cells (low, high exclusive) that hold all INFLOW cells"""
+        self._faces, self._face_points = [], []
+        for axis, (touched, opening) in enumerate(zip(touching_faces(self._cells), walls.openings)):
+            touched &= opening > 0
+            self._faces.append(np.argwhere(touched))
             self._face_points.append(grid.faces(axis)[touched])
 
     def velocity(self, points: Float[np.ndarray, "n 3"], time: float) -> Float[np.ndarray, "n 3"]:
@@ -103,16 +100,26 @@ class Inlet:
             out += self._amplitude * self._fluctuation(points, time)
         return out
 
-    def impose(self, velocity: FaceVelocity, time: float) -> FaceVelocity:
-        """The velocity with the faces of INFLOW cells set."""
+    def impose(self, velocity: FaceVelocity, time: float, first: tuple[int, int, int] = (0, 0, 0)) -> FaceVelocity:
+        """The velocity with the faces of INFLOW cells set; `first` is the cell at which the arrays begin."""
         if not self.active:
             return velocity
         out = []
         for axis, component in enumerate(velocity.components):
             new = component.copy()
-            new[self.faces[axis]] = self.velocity(self._face_points[axis], time)[:, axis]
+            new[tuple((self._faces[axis] - first).T)] = self.velocity(self._face_points[axis], time)[:, axis]
             out.append(new)
         return FaceVelocity(*out)
+
+    def face_masks(
+        self, shapes: tuple[tuple[int, ...], ...], first: tuple[int, int, int] = (0, 0, 0)
+    ) -> list[np.ndarray]:
+        """bool per component, in arrays of `shapes` that begin at cell `first`: faces of INFLOW cells."""
+        masks = [np.zeros(shape, bool) for shape in shapes]
+        if self.active:
+            for mask, faces in zip(masks, self._faces):
+                mask[tuple((faces - first).T)] = True
+        return masks
 
     def inside(self, positions: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
         """Particles in INFLOW cells."""

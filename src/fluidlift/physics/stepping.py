@@ -19,7 +19,8 @@ from fluidlift.numerics.signed_distance import push_outside
 from fluidlift.physics import boundaries, transfer
 from fluidlift.physics.crowding import cell_capacity
 from fluidlift.physics.inlet import Inlet
-from fluidlift.physics.viscosity import diffuse
+from fluidlift.physics.viscosity import FaceRoles, diffuse
+from fluidlift.physics.window import Window, open_window
 from fluidlift.types import FaceVelocity, FluidParameters, Grid, Particles, SolveReport, Terrain
 
 TIDY_EVERY = 4
@@ -118,6 +119,7 @@ class ParticleSimulator(ABC):
         self._rng = np.random.default_rng(seed)
         self._walls = boundaries.build_walls(terrain, cell_types, open_sides)
         self._capacity = cell_capacity(terrain.signed_distance, grid)
+        self._window = open_window(tuple(slice(0, n) for n in grid.shape), self._walls, self._capacity)
         self._mainstream = np.asarray(terrain.mainstream, np.float64)
         self._inlet = Inlet(self._walls, parameters, inflow_profile, seed, settings.particles_per_cell)
         self._particles = self._prepared(particles)
@@ -287,36 +289,31 @@ class ParticleSimulator(ABC):
         self._particles = replace(self._particles, velocities=velocities, affine=affine)
         return len(places)
 
-    def _wet_faces(self, wet: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        out = []
-        for axis, opening in enumerate(self._walls.openings):
-            pad = [(0, 0)] * 3
-            pad[axis] = (1, 1)
-            wide = np.moveaxis(np.pad(wet, pad), axis, 0)
-            out.append(np.moveaxis(wide[1:] | wide[:-1], 0, axis) & (opening > 0))
-        return tuple(out)
+    def _wet_faces(self, wet: np.ndarray, walls: boundaries.Walls) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return tuple(t & (o > 0) for t, o in zip(boundaries.touching_faces(wet), walls.openings))
 
     def _viscous(
-        self, velocity: FaceVelocity, wet: tuple, dt: float, prescribed: tuple | None
+        self, velocity: FaceVelocity, wet: tuple, window: Window, dt: float, prescribed: tuple | None = None
     ) -> tuple[FaceVelocity, tuple[SolveReport, ...]]:
         """Viscosity on the wet faces; inflow and other `prescribed` faces (bool per component) keep their velocity."""
-        fixed = [f.copy() for f in self._inlet.faces] if self._inlet.active else [np.zeros(w.shape, bool) for w in wet]
+        walls = window.walls
+        fixed = self._inlet.face_masks(tuple(w.shape for w in wet), window.first)
         if prescribed is not None:
             fixed = [f | o for f, o in zip(fixed, prescribed)]
         solved = tuple(w & ~f for w, f in zip(wet, fixed))
         head_on, beside = [], []
-        for axis, opening in enumerate(self._walls.openings):
+        for axis, opening in enumerate(walls.openings):
             closed = opening == 0
             # a wall across the component stops it; a wall along it drags by its share
-            across = closed & (np.abs(self._walls.normals[axis][..., axis]) > 0.7)
+            across = closed & (np.abs(walls.normals[axis][..., axis]) > 0.7)
             head_on.append(fixed[axis] | across)
             beside.append(closed & ~across)
         stopped = FaceVelocity(
-            *(np.where(o == 0, np.float32(0), c) for o, c in zip(self._walls.openings, velocity.components))
+            *(np.where(o == 0, np.float32(0), c) for o, c in zip(walls.openings, velocity.components))
         )
         new, reports = diffuse(
-            stopped, solved, tuple(head_on), tuple(beside), viscosity=self.parameters.kinematic_viscosity, dt=dt,
-            spacing=self.grid.spacing, wall_share=self.parameters.wall_damping,
+            stopped, FaceRoles(solved, tuple(head_on), tuple(beside)), viscosity=self.parameters.kinematic_viscosity,
+            dt=dt, spacing=self.grid.spacing, wall_share=self.parameters.wall_damping,
             tolerance=self.settings.viscosity_tolerance,
         )  # fmt: skip
         return (new if reports else velocity), reports

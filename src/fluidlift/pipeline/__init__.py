@@ -1,7 +1,9 @@
 """The story: the only place that knows the order of the stages."""
 
-from fluidlift.pipeline.make import STAGES, Made, make
+from fluidlift.pipeline.make import STAGES, make
+from fluidlift.pipeline.resimulate import Made, resimulate
+from fluidlift.pipeline.scene import SimulationRequest
 from fluidlift.pipeline.seeing import Inputs
 from fluidlift.pipeline.story import Progress, Silence
 
-__all__ = ["STAGES", "Inputs", "Made", "Progress", "Silence", "make"]
+__all__ = ["STAGES", "Inputs", "Made", "Progress", "Silence", "SimulationRequest", "make", "resimulate"]

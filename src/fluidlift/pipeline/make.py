@@ -6,31 +6,20 @@ import platform
 import shutil
 import time
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from fluidlift import __version__
 from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected
-from fluidlift.pipeline import body, moving, refining, seeing, showing, simulating
+from fluidlift.pipeline import body, moving, refining, seeing
+from fluidlift.pipeline.resimulate import Made, play
+from fluidlift.pipeline.scene import SimulationRequest
 from fluidlift.pipeline.seeing import Inputs
-from fluidlift.pipeline.story import Progress, Silence, Story, file_hash, peak_memory_mb
+from fluidlift.pipeline.story import Progress, Silence, Story, file_hash
 from fluidlift.types import FluidAsset
 
 STAGES = ("read", "flow", "segment", "geometry", "refine", "motion", "fit", "simulate", "show")
-
-
-@dataclass(frozen=True)
-class Made:
-    """What `make` left."""
-
-    folder: Path
-    warnings: tuple[str, ...]
-    seconds: float
-    timings: dict[str, dict[str, Any]]
 
 
 def make(
@@ -53,7 +42,8 @@ def make(
     Raises:
         InputRejected: an input that cannot be used, or a folder that is not an asset. Nothing is left behind then
             where nothing was before.
-        FluidliftError: a stage failed; what was done before it is kept and the next run goes on from there.
+        FluidliftError: a stage failed; what was done before it is kept and the next run goes on from there. Where the
+            simulation broke down, the frames before it are written as an asset of fewer frames.
     """
     from fluidlift.io.asset_folder import check_output_folder
     from fluidlift.io.atomic import disk_errors
@@ -69,12 +59,13 @@ def make(
         with disk_errors(folder):
             provenance = _run(story, inputs, folder, config)
             _write_asset(story, folder, config, provenance)
+            frames = play(story, folder, config, SimulationRequest(restart="simulate" in story.force))
     except InputRejected:
         # an input that cannot be used leaves nothing behind; work that was done before a disk ran full is kept
         if fresh and "motion" not in story.results:
             shutil.rmtree(folder, ignore_errors=True)
         raise
-    return Made(folder, tuple(story.warnings), time.perf_counter() - began, story.timings)
+    return Made(folder, tuple(story.warnings), time.perf_counter() - began, story.timings, frames)
 
 
 def _run(story: Story, inputs: Inputs, folder: Path, config: JobConfig) -> dict[str, Any]:
@@ -115,30 +106,16 @@ def _run(story: Story, inputs: Inputs, folder: Path, config: JobConfig) -> dict[
     run("refine", lambda: refining.refine(story, inputs, config), settings=[shape, seed], after=("geometry",))
     run("motion", lambda: moving.motion(story, config), settings=config.section("motion"), after=("geometry",))
     run("fit", lambda: moving.fit(story, config), settings=config.section("fit"), after=("motion",))
-    run(
-        "simulate",
-        lambda: simulating.simulate(story, folder, config),
-        settings=[config.section("simulate"), seed, simulating.scene_of(folder)],
-        after=("refine", "fit"),
-        still_there=simulating.frames_still_there(folder),
-    )
-    wanted = [folder / "preview.mp4"] + [folder / "asset.usda"] * config.show.usd
-    run(
-        "show",
-        lambda: showing.show(story, folder, config),
-        settings=config.section("show"),
-        after=("simulate",),
-        still_there=lambda result: all(p.is_file() for p in wanted),
-    )
     return {"inputs": {k: {"name": inputs.existing()[k].name, "sha256": v} for k, v in hashes.items()}}
 
 
 def _write_asset(story: Story, folder: Path, config: JobConfig, provenance: dict[str, Any]) -> None:
+    """The body at rest and what moves it; simulation and pictures come after."""
     from fluidlift.io.asset_folder import save_asset
-    from fluidlift.io.atomic import atomic_write
 
     clip, g = seeing.clip_of(story), story["geometry"]
     setting = body.setting_of(story)
+    origin = {"config": config.to_dict(), "versions": versions(), "seed": config.seed, "stages": dict(story.keys)}
     asset = FluidAsset(
         kind=g.meta["kind"],
         rest=body.rest_of(story),
@@ -152,46 +129,15 @@ def _write_asset(story: Story, folder: Path, config: JobConfig, provenance: dict
         world_from_canonical=body.placement_of(story),
         interval=clip.interval,
         frame_count=len(clip),
-        provenance=provenance | {"config": config.to_dict(), "versions": versions(), "seed": config.seed},
+        provenance=provenance | origin,
     )
-    showing.write_report(story, folder, config, story.timings)
-    with atomic_write(folder / "work" / "evaluation.npz") as stream:
-        np.savez_compressed(stream, **evaluation_arrays(story))
-    present = {
-        name: file
-        for name, file in {
-            "preview": "preview.mp4", "report": "report.html", "usd": "asset.usda", "mask_overlay": "mask_overlay.png",
-        }.items()
-        if (folder / file).is_file()
-    }  # fmt: skip
     save_asset(
         folder,
         asset,
         timings={k: float(t["seconds"]) for k, t in story.timings.items()},
         metrics=_metrics(story),
         warnings=story.warnings,
-        files=present,
     )
-
-
-def evaluation_arrays(story: Story) -> dict[str, np.ndarray]:
-    """What `fluidlift evaluate` compares with a truth."""
-    g, m, s, shown = story["geometry"], story["motion"], story["simulate"], story["show"].arrays
-    targets = m.meta["targets"]
-    start = g.meta["rest_frame"]
-    return {
-        "labels": story["segment"].arrays["labels"],
-        "front_depth": g.arrays["depth"] * g.arrays["mask"],
-        "flow_raw": story["flow"].arrays["displacement"],
-        "flow_completed": m.arrays["completed"],
-        "resim_flow": shown["resim_flow"][:-1],
-        "resim_mask": shown["resim_mask"],
-        "resim_frames": shown["resim_frames"],
-        "first_frame": np.int64(start),
-        "fit_frames": np.array([targets[0], targets[-1] + 1] if targets else [0, 0]),
-        "particle_volume": s.arrays["volume"],
-        "leak_share": s.arrays["leak"],
-    }
 
 
 def _metrics(story: Story) -> dict[str, Any]:
@@ -207,8 +153,6 @@ def _metrics(story: Story) -> dict[str, Any]:
         "fit_converged": story["fit"].meta["converged"],
         "fit_rollouts": story["fit"].meta["rollouts"],
         "fit_extra": story["fit"].meta["extra"],
-        "peak_memory_mb": round(peak_memory_mb(), 1),
-        "stages": story.timings,
     }
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +10,9 @@ import numpy as np
 
 from fluidlift.config import JobConfig
 from fluidlift.look.report import Figure, Section, report_html
-from fluidlift.pipeline.body import camera_of, rest_of, setting_of, terrain_of
-from fluidlift.pipeline.moving import estimates_of, parameters_of, targets_of
+from fluidlift.pipeline.body import setting_of
+from fluidlift.pipeline.moving import estimates_of, targets_of
+from fluidlift.pipeline.scene import LYING, Footage, Scene
 from fluidlift.pipeline.seeing import clip_of, flow_of, labels_of
 from fluidlift.pipeline.simulating import frame_file
 from fluidlift.pipeline.story import Result, Story
@@ -28,25 +29,42 @@ def splat_frames(folder: Path, count: int) -> Iterator[tuple[Gaussians, np.ndarr
         yield splats.gaussians, splats.extras["id"], velocity
 
 
-def show(story: Story, folder: Path, config: JobConfig) -> Result:
-    """Render the frames, write what people open."""
+def show(
+    scene: Scene,
+    footage: Footage | None,
+    folder: Path,
+    config: JobConfig,
+    count: int,
+    *,
+    step: Callable[[int, int], None] = lambda done, total: None,
+) -> Result:
+    """Render the frames, write what people open.
+
+    Args:
+        scene: that was simulated.
+        footage: the clip; without it the preview leaves out the input, and the fluid stands before grey.
+        folder: of the asset.
+        config: its `show` section.
+        count: frames that were simulated.
+        step: told (frames done, all frames).
+    """
     from fluidlift.io.export_usd import write_usd
     from fluidlift.io.video import write_video
 
-    clip = clip_of(story)
-    count = story["simulate"].meta["frames"]
     measured: dict[str, list[np.ndarray]] = {"frames": [], "mask": [], "flow": []}
-    fps = 1.0 / clip.interval
-    write_video(folder / "preview.mp4", _panels(story, folder, config, count, measured), fps)
+    panels = _panels(scene, footage, folder, config, count, measured, step)
+    write_video(folder / "preview.mp4", panels, 1.0 / scene.interval)
     if config.show.usd:
         write_usd(
             folder / "asset.usda",
             frames=splat_frames(folder, count),
-            interval=clip.interval,
-            terrain=terrain_of(story).mesh,
-            camera=camera_of(story),
-            attributes=parameters_of(story).to_dict() | {"kind": _kind(story)},
+            interval=scene.interval,
+            terrain=scene.terrain.mesh,
+            camera=scene.camera,
+            attributes=scene.parameters.to_dict() | {"kind": scene.kind},
         )
+    if not measured["frames"]:
+        return Result({}, {"frames": count})
     arrays = {
         "resim_frames": np.stack(measured["frames"]),
         "resim_mask": np.stack(measured["mask"]),
@@ -55,51 +73,51 @@ def show(story: Story, folder: Path, config: JobConfig) -> Result:
     return Result(arrays, {"frames": count})
 
 
-def _kind(story: Story) -> str:
-    return story["geometry"].meta["kind"]
-
-
-def _panels(story: Story, folder: Path, config: JobConfig, count: int, measured) -> Iterator[np.ndarray]:
+def _panels(
+    scene: Scene, footage: Footage | None, folder: Path, config: JobConfig, count: int, measured, step
+) -> Iterator[np.ndarray]:
     """Input | re-simulation | side view, frame by frame; keeps what the evaluation needs on the way."""
     from fluidlift.look.pictures import caption
     from fluidlift.look.rasterize import render
     from fluidlift.look.scenery import orbit_camera, terrain_depth, terrain_surfels, visible_beside_rocks
 
-    clip, labels = clip_of(story), labels_of(story)
-    g, camera, terrain = story["geometry"], camera_of(story), terrain_of(story)
-    start, rest = g.meta["rest_frame"], rest_of(story)
-    plate = g.arrays["plate"].astype(np.float32) / 255.0
-    rocks = labels.solid.mean(axis=0) > 0.5
+    camera, terrain, grid = scene.camera, scene.terrain, scene.terrain.grid
+    plate = np.full((camera.size[1], camera.size[0], 3), 0.5, np.float32)
+    rocks, compared = np.zeros(plate.shape[:2], bool), 0
+    if footage is not None:
+        plate = footage.plate.astype(np.float32) / 255.0
+        rocks = footage.labels.solid.mean(axis=0) > 0.5
+        if scene.interval == scene.clip_interval:  # later frames, or those between, have no counterpart in the clip
+            compared = max(len(footage.clip) - footage.start, 1)
     solid_depth = terrain_depth(terrain, camera) if rocks.any() else None
-    airborne = not g.meta["height_field"]
-    ground = terrain_surfels(terrain, opacity=0.25 if airborne and _kind(story) == "pour" else 0.98)
-    size = _panel_size(clip.size, config.show.width)
-    grid = terrain.grid
+    airborne = scene.kind not in LYING
+    ground = terrain_surfels(terrain, opacity=0.25 if scene.kind == "pour" else 0.98)
+    size = _panel_size(camera.size, config.show.width)
     # a body in the air may fill its box later; what lies on a bed stays in it
     whole = terrain.mesh.vertices
     if airborne:
         inset = 0.18 * (grid.high - grid.low) * np.array([1.0, 1.0, 0.0])
         whole = np.stack([grid.low + inset, grid.high - inset])
-    side = orbit_camera(camera, np.concatenate([rest.means, whole]), size=size)
+    side = orbit_camera(camera, np.concatenate([scene.rest.means, whole]), size=size)
     sky = np.linspace(0.93, 0.78, size[1], dtype=np.float32)[:, None, None] * np.ones((1, size[0], 3), np.float32)
     for k, (gaussians, _, velocity) in enumerate(splat_frames(folder, count)):
-        story.step(k, count)
+        step(k, count)
         front = gaussians
         if solid_depth is not None:
-            keep = visible_beside_rocks(gaussians.means, camera, solid_depth, rocks, margin=1.5 * terrain.grid.spacing)
+            keep = visible_beside_rocks(gaussians.means, camera, solid_depth, rocks, margin=1.5 * grid.spacing)
             front, velocity = gaussians.select(keep), velocity[keep]
         rendered = render(front, camera, background=plate)
         picture = _bytes(rendered.image)
-        measured["frames"].append(picture)
-        measured["mask"].append(rendered.alpha > 0.5)
-        measured["flow"].append(_screen_velocity(front, velocity, camera, clip.interval, rendered.alpha))
+        if k < compared:
+            measured["frames"].append(picture)
+            measured["mask"].append(rendered.alpha > 0.5)
+            measured["flow"].append(_screen_velocity(front, velocity, camera, scene.interval, rendered.alpha))
         view = render(concatenate([ground, gaussians]), side, background=sky)
-        source = clip.frames[min(start + k, len(clip) - 1)]
-        panels = [
-            caption(_resized(source, size), "input"),
-            caption(_resized(picture, size), "re-simulation"),
-            caption(_bytes(view.image), "side view"),
-        ]
+        panels = [caption(_resized(picture, size), "re-simulation"), caption(_bytes(view.image), "side view")]
+        if footage is not None:
+            time = footage.start + round(k * scene.interval / scene.clip_interval)
+            source = footage.clip.frames[min(time, len(footage.clip) - 1)]
+            panels.insert(0, caption(_resized(source, size), "input"))
         yield np.concatenate(panels, axis=1)
 
 
@@ -171,11 +189,15 @@ def write_report(story: Story, folder: Path, config: JobConfig, timings: dict[st
     return write_bytes(folder / "report.html", page.encode())
 
 
+def _kind(story: Story) -> str:
+    return story["geometry"].meta["kind"]
+
+
 def _section_outcome(story: Story) -> Section:
-    clip, shown = clip_of(story), story["show"].arrays["resim_frames"]
+    clip, shown = clip_of(story), story["show"].arrays.get("resim_frames", ())
     start = story["geometry"].meta["rest_frame"]
     figures = []
-    for k in sorted({0, len(shown) // 2, len(shown) - 1}):
+    for k in sorted({0, len(shown) // 2, len(shown) - 1} if len(shown) else ()):
         pair = np.concatenate([clip.frames[min(start + k, len(clip) - 1)], shown[k]], axis=1)
         figures.append(Figure(pair, f"frame {start + k}: input and re-simulation from the same camera"))
     return Section("Input and re-simulation", figures)

@@ -1,24 +1,29 @@
-"""The stage that simulates: from the rest body and the fitted physics to frames."""
+"""The stage that simulates: from a scene to frames, with a checkpoint every few of them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from fluidlift.config import JobConfig
-from fluidlift.errors import InputRejected
-from fluidlift.pipeline.body import camera_of, rest_of, setting_of
-from fluidlift.pipeline.moving import parameters_of, targets_of
-from fluidlift.pipeline.seeing import clip_of, labels_of
-from fluidlift.pipeline.story import Result, Story
-from fluidlift.types import CellType, FluidParameters, Gaussians, Particles
+from fluidlift.errors import FluidliftError, InputRejected
+from fluidlift.io.frames import FIRST_FRAME
+from fluidlift.pipeline.scene import Scene, SimulationRequest, simulation_step
+from fluidlift.pipeline.story import Result, available_memory
+from fluidlift.types import Gaussians, Particles
+
+if TYPE_CHECKING:
+    from fluidlift.physics.stepping import ParticleSimulator
 
 MAX_STRETCH = 3.0
 """longest axis over the mean one before a Gaussian starts again round: longer ones show as hair"""
+
+BYTES_PER_SPLAT = 80
+"""of disk, in a frame's file"""
 
 
 def emission_look(rest: Gaussians, direction: np.ndarray, speed: float) -> Callable[[np.ndarray, float], np.ndarray]:
@@ -45,79 +50,41 @@ def emission_look(rest: Gaussians, direction: np.ndarray, speed: float) -> Calla
     return source
 
 
-def scene_of(folder: Path) -> dict[str, Any]:
-    """What a person changed in scene.yaml that the re-simulation heeds: `parameters` and `duration` (s).
-
-    Raises:
-        InputRejected: entries that this version cannot apply (nothing is ignored in silence), or wrong values.
-    """
-    from fluidlift.io.scene import read_scene
-
-    scene = {k: v for k, v in read_scene(folder).items() if v not in (None, {}, [], "")}
-    unknown = sorted(set(scene) - {"parameters", "duration"})
-    if unknown:
-        raise InputRejected(
-            f"scene.yaml asks for {', '.join(unknown)}, which this version cannot simulate",
-            "parameters and duration only",
-            "remove the entry, or leave it empty",
-        )
-    duration = scene.get("duration")
-    if duration is not None and not (isinstance(duration, int | float) and duration > 0):
-        raise InputRejected(f"scene.yaml: duration {duration!r}", "seconds, more than 0")
-    if not isinstance(scene.get("parameters", {}), dict):
-        raise InputRejected("scene.yaml: parameters is no mapping", "name: value lines")
-    return scene
-
-
-def simulation_step(parameters: FluidParameters, story: Story) -> FluidParameters:
-    """The same physics with the simulator's own longest step.
-
-    The fit's step is that of its grid, which must resolve a gravity wave over one cell. The simulator adapts
-    to the flow and only needs steps in which a wave does not cross more than a cell or so. Wall damping is a share
-    per step and is converted, so that walls take the same share per second.
-    """
-    setting, interval = setting_of(story), clip_of(story).interval
-    h = setting.terrain.grid.spacing
-    wet = (setting.cell_types == CellType.FLUID).sum(axis=2)
-    depth = h * float(np.percentile(wet[wet > 0], 90)) if (wet > 0).any() else h
-    wave = float(np.sqrt(np.linalg.norm(parameters.gravity) * depth))
-    longest = interval if story["geometry"].meta["kind"] == "plume" else h / max(wave, 1e-6)
-    step = float(np.clip(longest, interval / 8, interval))
-    damping = 1.0 - (1.0 - parameters.wall_damping) ** (step / parameters.time_step)
-    return replace(parameters, time_step=step, wall_damping=float(np.clip(damping, 0.0, 1.0)))
-
-
-def simulator_of(story: Story, folder: Path, config: JobConfig, rest: Gaussians) -> Any:
+def simulator_of(scene: Scene) -> ParticleSimulator:
     """The simulator at the first instant."""
-    from fluidlift.numerics.sampling import sample_faces
-
-    setting, kind = setting_of(story), story["geometry"].meta["kind"]
-    changes = scene_of(folder).get("parameters", {})
-    parameters, grid = parameters_of(story).updated(changes), setting.terrain.grid
-    parameters = simulation_step(parameters, story)
-    velocity = targets_of(story)[0]
-    start = sample_faces(velocity, grid, rest.means)
-    # all Gaussians of a cell share its mass
-    cell = np.ravel_multi_index(tuple(np.clip(grid.cell_of(rest.means), 0, np.array(grid.shape) - 1).T), grid.shape)
-    count = np.bincount(cell, minlength=grid.cells)
-    masses = parameters.density * grid.spacing**3 / np.maximum(count[cell], 1)
-    particles = Particles.at_rest(rest.means, masses, np.arange(len(rest)), start)
-    direction = setting.terrain.mainstream
-    look = emission_look(rest, direction, float(np.linalg.norm(parameters.inflow_velocity)))
-    if kind == "plume":
+    parameters = simulation_step(scene)
+    direction = scene.terrain.mainstream
+    look = emission_look(scene.rest, direction, float(np.linalg.norm(parameters.inflow_velocity)))
+    grid = scene.terrain.grid
+    if scene.kind == "plume":
         from fluidlift.physics.gas import GasSimulator
 
         return GasSimulator(
-            grid, setting.terrain, parameters, particles, cell_types=setting.cell_types, inflow_profile=velocity,
-            velocity=velocity, seed=config.seed, emit_source=look,
+            grid, scene.terrain, parameters, scene.body, cell_types=scene.cell_types, inflow_profile=scene.velocity,
+            velocity=scene.velocity, seed=scene.seed, emit_source=look,
             buoyancy=float(np.linalg.norm(parameters.gravity)),
         )  # fmt: skip
     from fluidlift.physics.apic import LiquidSimulator
 
     return LiquidSimulator(
-        grid, setting.terrain, parameters, particles, cell_types=setting.cell_types, inflow_profile=velocity,
-        seed=config.seed, emit_source=look,
+        grid, scene.terrain, parameters, scene.body, cell_types=scene.cell_types, inflow_profile=scene.velocity,
+        seed=scene.seed, emit_source=look,
     )  # fmt: skip
+
+
+def preflight(scene: Scene) -> None:
+    """What would fail on the way, said before anything is written.
+
+    Raises:
+        InputRejected: too little memory, too many frames, or an inlet that lets nothing in.
+    """
+    from fluidlift.physics.preflight import check_frames, check_inlet, check_memory
+    from fluidlift.physics.stepping import SimulationSettings
+
+    step = simulation_step(scene).time_step
+    check_frames(scene.frames, scene.interval, step, SimulationSettings().max_substeps)
+    check_memory(scene.terrain.grid, len(scene.body), available_memory())
+    check_inlet(scene.terrain, scene.cell_types, np.array(scene.parameters.inflow_velocity))
 
 
 def frame_file(folder: Path, number: int) -> Path:
@@ -125,65 +92,200 @@ def frame_file(folder: Path, number: int) -> Path:
     return folder / "frames" / "splats" / f"{number:04d}.ply"
 
 
-def simulate(story: Story, folder: Path, config: JobConfig) -> Result:
-    """Frames of the re-simulation, as splats with ids and velocities."""
+def checkpoint_file(folder: Path) -> Path:
+    """Where the state of the simulation is kept whose frames are in the folder."""
+    return folder / "work" / "checkpoint" / "simulation.npz"
+
+
+@dataclass
+class History:
+    """Figures of each frame so far."""
+
+    volume: list[float] = field(default_factory=list)
+    """m^3 of the cells that hold particles"""
+    leak: list[float] = field(default_factory=list)
+    """share of the particles inside the terrain"""
+    count: list[int] = field(default_factory=list)
+    """particles"""
+    substeps: list[int] = field(default_factory=list)
+    """of the step that led to the frame; 0 for the first"""
+
+    def __len__(self) -> int:
+        return len(self.count)
+
+    def add(self, scene: Scene, particles: Particles, substeps: int) -> None:
+        """One more frame."""
+        from fluidlift.numerics.sampling import sample_nodes
+
+        grid = scene.terrain.grid
+        occupied = np.unique(np.floor((particles.positions - grid.low) / grid.spacing).astype(np.int64), axis=0)
+        inside = grid.contains(particles.positions)
+        distance = sample_nodes(scene.terrain.signed_distance, grid, particles.positions[inside])
+        self.volume.append(len(occupied) * grid.spacing**3)
+        self.leak.append(float((distance < -0.1 * grid.spacing).mean()) if inside.any() else 0.0)
+        self.count.append(len(particles))
+        self.substeps.append(substeps)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """One entry per frame."""
+        return {
+            "volume": np.array(self.volume, np.float32),
+            "leak": np.array(self.leak, np.float32),
+            "count": np.array(self.count, np.int64),
+            "substeps": np.array(self.substeps, np.int64),
+        }
+
+    @classmethod
+    def of(cls, arrays: dict[str, np.ndarray], frames: int) -> History:
+        """The first frames of `arrays`."""
+        return cls(*(arrays[name][:frames].tolist() for name in ("volume", "leak", "count", "substeps")))
+
+
+def continued(simulator: ParticleSimulator, scene: Scene, folder: Path, request: SimulationRequest, config: JobConfig):
+    """Bring the simulator to the last checkpoint of this scene.
+
+    Returns:
+        The history up to it; empty where the simulation starts at the first frame.
+
+    Raises:
+        InputRejected: `request.resume`, and there is no checkpoint that fits; the message says what differs.
+    """
+    from fluidlift.io.checkpoint import differing_parts, read_checkpoint, read_parts
+    from fluidlift.physics.preflight import simulation_bytes
+
+    if request.restart:
+        return History()
+    path = checkpoint_file(folder)
+    try:
+        frames, parts = read_parts(path)
+        other = differing_parts(parts, scene.parts)
+        if other:
+            raise InputRejected(
+                f"the checkpoint of '{folder.name}' is of a simulation with another {', another '.join(other)}",
+                "the scene, settings and version that it was made with",
+                "undo the change, or leave out --resume to start at the first frame",
+            )
+        missing = [k for k in range(frames) if not frame_file(folder, FIRST_FRAME + k).is_file()]
+        if missing:
+            raise InputRejected(
+                f"frame {FIRST_FRAME + missing[0]}, after which the checkpoint goes on, is not there any more",
+                f"all {frames} frames before the checkpoint", "leave out --resume to start at the first frame",
+            )  # fmt: skip
+        most = len(scene.body) + 2 * config.simulate.max_particles
+        found = read_checkpoint(path, max_bytes=4 * simulation_bytes(scene.terrain.grid, most))
+        history = History.of(found.history, scene.frames)
+        if found.frames <= scene.frames:
+            simulator.restore(found.state)
+        return history
+    except (InputRejected, KeyError) as error:
+        if not request.resume:
+            return History()
+        if isinstance(error, KeyError):
+            raise InputRejected(f"the checkpoint of '{folder.name}' lacks {error}", "a whole checkpoint") from None
+        raise
+
+
+def simulate(
+    scene: Scene,
+    folder: Path,
+    config: JobConfig,
+    *,
+    request: SimulationRequest | None = None,
+    step: Callable[[int, int], None] = lambda done, total: None,
+) -> Result:
+    """Frames of a scene, as splats with ids and velocities.
+
+    A simulation that was stopped goes on from its last checkpoint; one that is finished can be made longer. Frames that
+    are there already are not computed again. Where the simulation breaks down, the frames before stay, and the result
+    says why in `meta["failed"]`.
+
+    Args:
+        scene: at the first instant.
+        folder: of the asset.
+        config: its `simulate` section.
+        request: whether to go on from a checkpoint.
+        step: told (frames done, all frames).
+
+    Raises:
+        InputRejected: a scene that cannot be simulated, said before anything is written; or the disk is full.
+    """
     from fluidlift.io.atomic import require_free_space
+
+    preflight(scene)
+    simulator = simulator_of(scene)
+    history = continued(simulator, scene, folder, request or SimulationRequest(), config)
+    first = len(history)
+    require_free_space(folder, (scene.frames - first) * len(scene.body) * BYTES_PER_SPLAT)
+    for old in (folder / "frames" / "splats").glob("*.ply"):
+        if not (old.stem.isdigit() and 0 <= int(old.stem) - FIRST_FRAME < first):
+            old.unlink()
+    if first == 0:
+        checkpoint_file(folder).unlink(missing_ok=True)
+    failed = _advance(simulator, scene, folder, config, history, step)
+    warnings = []
+    if failed is None and len(history) < scene.frames:
+        warnings.append(
+            f"the re-simulation stopped after {len(history)} of {scene.frames} frames, at twice the number of "
+            f"particles that --set simulate.max_particles={config.simulate.max_particles} allows"
+        )
+    arrays = history.arrays()
+    meta: dict[str, Any] = {
+        "frames": len(history),
+        "resumed_at": first,
+        "substeps": history.substeps[1:],
+        "warnings": warnings + _simulation_warnings(scene.kind, history.volume, history.leak),
+    }
+    if failed is not None:
+        meta["failed"] = failed
+    return Result({name: arrays[name] for name in ("volume", "leak", "count")}, meta)
+
+
+def _advance(
+    simulator: ParticleSimulator,
+    scene: Scene,
+    folder: Path,
+    config: JobConfig,
+    history: History,
+    step: Callable[[int, int], None],
+) -> str | None:
+    """Simulate and write the frames that are missing; why it broke down, if it did."""
     from fluidlift.io.ply import write_gaussians
-    from fluidlift.look.appearance import SteadyShading
-    from fluidlift.numerics.sampling import sample_nodes
     from fluidlift.physics.deform import deform_gaussians
 
-    rest, setting = rest_of(story), setting_of(story)
-    clip = clip_of(story)
-    start = story["geometry"].meta["rest_frame"]
-    duration = scene_of(folder).get("duration")
-    wanted = None if duration is None else max(2, round(duration / clip.interval))
-    frames = wanted or config.simulate.frames or (len(clip) - start)
-    require_free_space(folder, frames * len(rest) * 80)
-    simulator = simulator_of(story, folder, config, rest)
-    grid = setting.terrain.grid
-    shading = None
-    if setting.surface_height is not None:  # bodies in the air change their outline: nothing about them is steady
-        mask = labels_of(story).fluid.mean(axis=0) > 0.5
-        shading = SteadyShading.of(clip.frames, mask, camera_of(story)) if mask.any() else None
-    volumes, leaks, counts, substeps = [], [], [], []
-    for old in (folder / "frames" / "splats").glob("*.ply"):
-        old.unlink()
-    for k in range(frames):
-        story.step(k, frames)
+    size = 1.2 * scene.terrain.grid.spacing
+    for k in range(len(history), scene.frames):
+        step(k, scene.frames)
+        substeps = 0
         if k:
-            step = simulator.advance(clip.interval)
-            substeps.append(int(step.substeps))
+            try:
+                substeps = int(simulator.advance(scene.interval).substeps)
+            except InputRejected:
+                raise
+            except FluidliftError as error:
+                return f"frame {FIRST_FRAME + k} ({k} of {scene.frames}): {error}"
         p = simulator.particles
         if k and len(p) > config.simulate.max_particles * 2:
-            break
-        shown = deform_gaussians(rest, p, max_stretch=MAX_STRETCH, max_size=1.2 * grid.spacing)
-        if shading is not None:
-            shown = shading.moved(shown, rest.means[p.source])
-        write_gaussians(frame_file(folder, 1001 + k), shown, ids=p.ids, velocities=p.velocities)
-        occupied = np.unique(np.floor((p.positions - grid.low) / grid.spacing).astype(np.int64), axis=0)
-        volumes.append(len(occupied) * grid.spacing**3)
-        inside = grid.contains(p.positions)
-        distance = sample_nodes(setting.terrain.signed_distance, grid, p.positions[inside])
-        leaks.append(float((distance < -0.1 * grid.spacing).mean()) if inside.any() else 0.0)
-        counts.append(len(p))
-    stopped = []
-    if len(counts) < frames:
-        stopped.append(
-            f"the re-simulation stopped after {len(counts)} of {frames} frames, at twice the number of particles that "
-            f"--set simulate.max_particles={config.simulate.max_particles} allows"
-        )
-    return Result(
-        {"volume": np.array(volumes, np.float32), "leak": np.array(leaks, np.float32), "count": np.array(counts)},
-        {
-            "frames": len(counts),
-            "substeps": substeps,
-            "warnings": stopped + _simulation_warnings(story["geometry"].meta["kind"], volumes, leaks),
-        },
-    )
+            return None
+        shown = deform_gaussians(scene.rest, p, max_stretch=MAX_STRETCH, max_size=size)
+        if scene.shading is not None:
+            shown = scene.shading.moved(shown, scene.rest.means[p.source])
+        write_gaussians(frame_file(folder, FIRST_FRAME + k), shown, ids=p.ids, velocities=p.velocities)
+        history.add(scene, p, substeps)
+        # the first one says whose frames these are
+        if len(history) % config.simulate.checkpoint_every == 0 or len(history) in (1, scene.frames):
+            _save(simulator, scene, folder, history)
+    step(scene.frames, scene.frames)
+    return None
 
 
-def _simulation_warnings(kind: str, volumes: list[float], leaks: list[float]) -> list[str]:
+def _save(simulator: ParticleSimulator, scene: Scene, folder: Path, history: History) -> None:
+    from fluidlift.io.checkpoint import Checkpoint, write_checkpoint
+
+    kept = Checkpoint(len(history), scene.parts, simulator.state(), history.arrays())
+    write_checkpoint(checkpoint_file(folder), kept)
+
+
+def _simulation_warnings(kind: str, volumes: Sequence[float], leaks: Sequence[float]) -> list[str]:
     warnings = []
     drift = volumes[-1] / max(volumes[0], 1e-12) - 1
     if drift < -0.5 or (drift > 0.5 and kind in ("stream", "fall")):  # pours fill and smoke spreads
@@ -194,6 +296,20 @@ def _simulation_warnings(kind: str, volumes: list[float], leaks: list[float]) ->
     return warnings
 
 
-def frames_still_there(folder: Path) -> Callable[[Result], bool]:
-    """Whether the splat files of a cached simulation are complete."""
-    return lambda result: all(frame_file(folder, 1001 + k).is_file() for k in range(result.meta["frames"]))
+def frames_still_there(folder: Path, parts: dict[str, str]) -> Callable[[Result], bool]:
+    """Whether the frames of a cached simulation are complete and still its own: another scene may have been simulated
+    into the same folder since."""
+    from fluidlift.io.checkpoint import read_parts
+
+    def check(result: Result) -> bool:
+        if "failed" in result.meta or result.meta["frames"] < 1:
+            return False
+        try:
+            _, found = read_parts(checkpoint_file(folder))
+        except InputRejected:
+            return False
+        return found == parts and all(
+            frame_file(folder, FIRST_FRAME + k).is_file() for k in range(result.meta["frames"])
+        )
+
+    return check

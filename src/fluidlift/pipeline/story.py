@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import resource
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -145,6 +146,16 @@ class Story:
         self.progress.finished(name, seconds, cached)
         return result
 
+    def recall(self, name: str, key: str) -> bool:
+        """Take the result of an earlier run by its key, without knowing how to make it; whether it was there."""
+        found = load_stage(self.folder, name, key)
+        if found is None:
+            return False
+        self.results[name], self.keys[name] = Result(*found), key
+        seconds = float(self.results[name].meta.get("seconds", 0.0))
+        self.timings[name] = {"seconds": seconds, "cached": True, "peak_memory_mb": round(peak_memory_mb(), 1)}
+        return True
+
     def warn(self, text: str) -> None:
         """Tell once, and remember for the report."""
         if text not in self.warnings:
@@ -160,6 +171,21 @@ def peak_memory_mb() -> float:
     """Largest resident memory of this process so far, MB."""
     usage = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return usage / (1024.0 * 1024.0 if sys.platform == "darwin" else 1024.0)
+
+
+def available_memory() -> int:
+    """Bytes that this process can still take without swapping: what the machine or its container has left."""
+    free = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    with suppress(OSError, ValueError, IndexError, StopIteration):  # Linux: free memory and what files are cached in
+        lines = Path("/proc/meminfo").read_text().splitlines()
+        free = next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:"))
+    with suppress(OSError, ValueError, StopIteration):  # a container; "max" is no number
+        group = Path("/sys/fs/cgroup")
+        taken = int((group / "memory.current").read_text())
+        stat = (group / "memory.stat").read_text().splitlines()
+        cached = next(int(line.split()[1]) for line in stat if line.startswith("inactive_file "))
+        free = min(free, max(int((group / "memory.max").read_text()) - taken + cached, 0))
+    return free
 
 
 @contextmanager

@@ -1,0 +1,380 @@
+"""Times the liquid simulator next to its peers on the same dam break, and writes Markdown tables.
+
+    python benchmarks/simulator.py --peers PEERS --frames 4
+    python benchmarks/simulator.py --peers PEERS --only transfer blender --rounds 5
+
+Peers are looked for in a folder of environments (`--peers`); one that is missing is named with the way to get it:
+  PEERS/taichi     a virtual environment with taichi==1.7.4
+  PEERS/phiflow    a virtual environment with phiflow and jax
+  PEERS/blender    the program, or `blender` on the PATH
+Every measurement is a process of its own (`benchmarks/peers/*.py`). Within a round the simulator and its peer run one
+after the other; figures are medians over rounds, ratios medians of the ratios within a round. Peers twenty times
+slower get one round.
+
+The dam: a block of 8 particles per cell in the corner of a box of air, released at rest; frames of 1/24 s, counted
+after the first few. "whole step" is transfer, pressure, moving, everything.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import shutil
+import statistics
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+SCRIPTS = Path(__file__).resolve().parent / "peers"
+Result = dict[str, Any]
+Scene = dict[str, Any]
+HOW_TO_GET = {
+    "taichi": "python -m venv {0}/taichi && {0}/taichi/bin/pip install taichi==1.7.4",
+    "phiflow": "python -m venv {0}/phiflow && {0}/phiflow/bin/pip install phiflow 'jax[cpu]'",
+    "blender": "apt-get install blender, or unpack a release and link its program to {0}/blender",
+}
+
+
+def dam(cells: int, block: tuple[int, int, int], **more: Any) -> Scene:
+    """A cubic box of 1 m."""
+    return {"cells": [cells] * 3, "block": list(block), "spacing": 1.0 / cells, **more}
+
+
+def title(scene: Scene) -> str:
+    """Particles and box, as a table names them."""
+    b = scene["block"]
+    n = 8 * b[0] * b[1] * b[2]
+    count = f"{n / 1e6:.3g} M" if n >= 1e6 else f"{n / 1e3:.4g} k"
+    return f"{count}, {'x'.join(map(str, scene['cells']))}"
+
+
+def programs(folder: Path) -> dict[str, list[str]]:
+    """Peer -> command that runs its scripts; peers that are not there are left out."""
+    found = {}
+    for name in ("taichi", "phiflow"):
+        if (folder / name / "bin" / "python").exists():
+            found[name] = [str(folder / name / "bin" / "python")]
+    blender = next((str(p) for p in (folder / "blender", folder / "blender" / "blender") if p.is_file()), None)
+    blender = blender or shutil.which("blender")
+    if blender:
+        found["blender"] = [blender, "-b", "--factory-startup", "-t", "{threads}", "-P"]
+    return found
+
+
+class Bench:
+    """Runs scripts and collects what they print."""
+
+    def __init__(self, folder: Path, frames: int, rounds: int, threads: int) -> None:
+        self.peers, self.folder = programs(folder), folder
+        self.frames, self.rounds, self.threads = frames, rounds, threads
+        self.log: list[Result] = []
+        self.lines: list[str] = []
+
+    def run(self, peer: str, script: str, scene: Scene) -> Result:
+        """One measurement in a process of its own; {"error": ...} where it fails or the peer is missing."""
+        command = [sys.executable] if peer == "ours" else self.peers.get(peer)
+        if command is None:
+            return {"error": "missing"}
+        threads = str(scene.get("threads", self.threads))
+        scene = {"frames": self.frames, "warm": 3, "threads": int(threads), **scene}
+        command = [part.format(threads=threads) for part in command] + [str(SCRIPTS / script)]
+        command += (["--"] if peer == "blender" else []) + [json.dumps(scene)]
+        env = dict(os.environ, NUMBA_NUM_THREADS=threads, OMP_NUM_THREADS=threads, OPENBLAS_NUM_THREADS=threads)
+        done = subprocess.run(command, env=env, capture_output=True, text=True)
+        found = [line for line in done.stdout.splitlines() if line.startswith("{")]
+        if not found:
+            last = (done.stderr.strip() or done.stdout.strip() or f"exit code {done.returncode}").splitlines()[-1]
+            result = {"error": last[:160]}
+        else:
+            result = json.loads(found[-1])
+        self.log.append({"peer": peer, "script": script, "scene": scene, "result": result})
+        print(f"  {peer:8} {title(scene):20} {brief(result)}", file=sys.stderr, flush=True)
+        return result
+
+    def rounds_of(self, runs: dict[str, Callable[[], Result]], rounds: int | None = None) -> dict[str, list[Result]]:
+        """Each of the runs once per round; one that failed is not tried again."""
+        out: dict[str, list[Result]] = {name: [] for name in runs}
+        for _ in range(rounds or self.rounds):
+            for name, go in runs.items():
+                if not (out[name] and "error" in out[name][0]):
+                    out[name].append(go())
+        return out
+
+    def table(self, heading: str, columns: list[str], rows: list[list[str]], notes: str = "") -> None:
+        """Adds a Markdown table."""
+        self.lines += [f"### {heading}", ""]
+        self.lines += ["| " + " | ".join(columns) + " |", "|" + "---|" * len(columns)]
+        self.lines += ["| " + " | ".join(row) + " |" for row in rows] + [""]
+        self.lines += [notes, ""] if notes else []
+
+    def ours(self, scene: Scene) -> Result:
+        """The simulator's own figures; `scene["mode"]` says of what."""
+        return self.run("ours", "ours.py", scene)
+
+
+def brief(result: Result) -> str:
+    """The main figures of a result in one line."""
+    keys = ("ms_step", "ms_frame", "steps_per_frame", "particles", "variant", "error")
+    return ", ".join(
+        f"{k} {result[k]:.4g}" if isinstance(result[k], float) else f"{result[k]}" for k in keys if k in result
+    )
+
+
+def middle(results: list[Result], key: str) -> float | None:
+    """The median over rounds."""
+    values = [r[key] for r in results if key in r]
+    return statistics.median(values) if values else None
+
+
+def ratio(peer: list[Result], ours: list[Result], key: str) -> str:
+    """Peer over ours, the median over rounds."""
+    values = [p[key] / o[key] for p, o in zip(peer, ours) if key in p and key in o]
+    return f"{statistics.median(values):.2f}" if values else ""
+
+
+def show(value: float | None, form: str = ".3g") -> str:
+    """A figure, or a dash."""
+    if value is None:
+        return "-"
+    return f"{value:.0f}" if form == ".3g" and abs(value) >= 100 else f"{value:{form}}"
+
+
+def first_word(results: list[Result], key: str) -> str:
+    """A text that is the same in every round, or the error."""
+    return str(results[0].get(key, results[0].get("error", ""))) if results else ""
+
+
+def against_taichi(bench: Bench) -> None:
+    """Transfers alone: sort, particles to grid, gravity, grid to particles, move."""
+    rows = []
+    for cells, block in ((64, (25, 20, 25)), (128, (25, 20, 25)), (64, (50, 25, 50)), (128, (50, 25, 50))):
+        scene = dam(cells, block, frames=15, mode="transfer")
+        best: dict[str, list[str]] = {}
+
+        def taichi(grid: str, scene: Scene = scene, best: dict[str, list[str]] = best) -> Result:
+            result = bench.run("taichi", "taichi_apic.py", scene | {"grid": grid} | (
+                {"variants": best[grid]} if grid in best else {}
+            ))  # fmt: skip
+            if "variant" in result:
+                best[grid] = [result["variant"].split()[-1]]
+            return result
+
+        runs = bench.rounds_of(
+            {"ours": lambda s=scene: bench.ours(s), "mac": lambda: taichi("mac"), "nodal": lambda: taichi("nodal")}
+        )
+        for name, label in (("ours", "fluidlift"), ("mac", "Taichi"), ("nodal", "Taichi")):
+            rows.append([
+                title(scene), label, first_word(runs[name], "variant"), show(middle(runs[name], "ms_step")),
+                "" if name == "ours" else ratio(runs[name], runs["ours"], "ms_step"),
+            ])  # fmt: skip
+    bench.table(
+        "Affine transfers alone, per step", ["particles, box", "program", "how", "ms", "over ours"], rows,
+        "Taichi's figure is the fastest of its three ways to write the scatter.",
+    )  # fmt: skip
+
+
+def against_frames(
+    bench: Bench, heading: str, scenes: list[tuple[Scene, dict[str, Callable[[Result], Result]], int]]
+) -> None:
+    """Whole frames of ours and of peers. A peer gets our result of the round: it may take over the number of steps."""
+    rows = []
+    for scene, peers, rounds in scenes:
+        last: dict[str, Result] = {}
+
+        def our_turn(scene: Scene = scene, last: dict[str, Result] = last) -> Result:
+            last["ours"] = bench.ours(scene | {"mode": "frames"})
+            return last["ours"]
+
+        turns = {"fluidlift": our_turn} | {n: (lambda go=go, last=last: go(last["ours"])) for n, go in peers.items()}
+        runs = bench.rounds_of(turns, rounds)
+        for name, results in runs.items():
+            mine = name == "fluidlift"
+            rows.append([
+                title(scene), name, first_word(results, "variant"), show(middle(results, "ms_step")),
+                show(middle(results, "steps_per_frame")), show(middle(results, "ms_frame")),
+                "" if mine else ratio(results, runs["fluidlift"], "ms_step"),
+                "" if mine else ratio(results, runs["fluidlift"], "ms_frame"),
+                show((middle(results, "particles") or 0) / 1e3, ".0f"), show(middle(results, "mean_height"), ".3f"),
+            ])  # fmt: skip
+    columns = ["particles, box", "program", "how", "ms per step", "steps per frame", "ms per frame", "step over ours",
+               "frame over ours", "particles at the end, k", "mean height at the end, m"]  # fmt: skip
+    bench.table(heading, columns, rows)
+
+
+def against_blender(bench: Bench) -> None:
+    """Mantaflow at the same Courant number, by its affine and its FLIP transfer, and with Blender's default steps."""
+
+    def mantaflow(scene: Scene, **how: Any) -> Callable[[Result], Result]:
+        return lambda _ours: bench.run("blender", "blender_mantaflow.py", scene | how)
+
+    small, large = dam(48, (25, 20, 25)), dam(96, (50, 40, 50))
+    equal, default = {"courant": 1, "max_steps": 100}, {"courant": 4, "max_steps": 4}
+    scenes = []
+    for scene, rounds in ((small, bench.rounds), (large, 1)):
+        scenes.append((
+            scene | {"courant": 1.0},
+            {"Mantaflow, affine": mantaflow(scene, method="APIC", **equal),
+             "Mantaflow, FLIP": mantaflow(scene, method="FLIP", **equal)}, rounds,
+        ))  # fmt: skip
+        scenes.append((
+            scene | {"courant": 4.0}, {"Mantaflow, Blender's defaults": mantaflow(scene, method="FLIP", **default)},
+            rounds,
+        ))  # fmt: skip
+    against_frames(bench, "Whole frames next to Blender's Mantaflow", scenes)
+
+
+def against_phiflow(bench: Bench) -> None:
+    """PhiFlow's FLIP example with as many steps per frame as ours took."""
+
+    def phiflow(scene: Scene) -> Callable[[Result], Result]:
+        return lambda ours: bench.run(
+            "phiflow", "phiflow_flip.py", scene | {"steps": max(1, round(ours.get("steps_per_frame", 4)))}
+        )
+
+    small, large = dam(32, (12, 10, 12)), dam(64, (25, 20, 25))
+    scenes = [(small, {"PhiFlow, FLIP": phiflow(small)}, bench.rounds), (large, {"PhiFlow, FLIP": phiflow(large)}, 1)]
+    against_frames(bench, "Whole frames next to PhiFlow", scenes)
+
+
+def own_steps(bench: Bench) -> None:
+    """Where a step's time goes, and whether 100 000 particles reach five whole steps per second."""
+    rows = []
+    for cells, block in ((64, (25, 20, 25)), (128, (50, 25, 50))):
+        scene = dam(cells, block)
+        runs = bench.rounds_of({
+            "transfers alone": lambda s=scene: bench.ours(s | {"mode": "transfer", "frames": 15}),
+            "whole step, water": lambda s=scene: bench.ours(s | {"mode": "frames"}),
+            "whole step, 0.01 m2/s": lambda s=scene: bench.ours(s | {"mode": "frames", "viscosity": 0.01}),
+        })  # fmt: skip
+        for name, results in runs.items():
+            ms = middle(results, "ms_step")
+            rows.append([
+                title(scene), name, show(ms), show(1e3 / ms if ms else None), show(middle(results, "steps_per_frame")),
+                show(middle(results, "ms_frame")), show(middle(results, "iterations")), first_word(results, "error"),
+            ])  # fmt: skip
+    columns = ["particles, box", "what", "ms per step", "steps per s", "steps per frame", "ms per frame",
+               "pressure iterations", ""]  # fmt: skip
+    bench.table("Our step", columns, rows, "Goal: five whole steps per second with 100 k particles.")
+
+
+def short_steps(scene: Scene) -> Scene:
+    """Steps of 1/240 s: about one per report, for scaling."""
+    return scene | {"mode": "frames", "frame": 1 / 240, "time_step": 1 / 240, "warm": 4, "frames": 6}
+
+
+def scaling(bench: Bench) -> None:
+    """Cost per particle from 10 k to 2 M, in boxes that the block fills to a sixteenth."""
+    rows = []
+    for side in (11, 23, 40, 50, 63):
+        scene = short_steps({"cells": [round(2.5 * side)] * 3, "block": [side] * 3, "spacing": 1 / 64})
+        results = [bench.ours(scene) for _ in range(bench.rounds if side < 40 else 1)]
+        ms, n = middle(results, "ms_step"), 8 * side**3
+        box = scene["cells"][0] ** 3
+        rows.append([
+            title(scene), show(ms), show(1e6 * ms / n if ms else None), show(8e6 * ms / n if ms else None),
+            show(1e6 * ms / box if ms else None), show(middle(results, "iterations")),
+            show(memory(results)), first_word(results, "error"),
+        ])  # fmt: skip
+    columns = ["particles, box", "ms per step", "ns per particle", "ns per cell of the block", "ns per cell of the box",
+               "pressure iterations", "MB at the peak, above the loaded program", ""]  # fmt: skip
+    bench.table("Scaling with the liquid", columns, rows)
+
+
+def memory(results: list[Result]) -> float | None:
+    """MB at the peak beyond what the loaded and warmed-up program takes."""
+    values = [r["peak_mb"] - r["loaded_mb"] for r in results if "peak_mb" in r]
+    return statistics.median(values) if values else None
+
+
+def memory_per_particle(bench: Bench) -> None:
+    """Peak memory against the number of particles in one box: the slope is the cost of a particle."""
+    rows, before = [], None
+    for block in ((25, 20, 25), (50, 25, 50), (50, 50, 50), (100, 50, 50)):
+        scene = short_steps(dam(128, block)) | {"warm": 1, "frames": 2}
+        peak, n = memory([bench.ours(scene)]), 8 * block[0] * block[1] * block[2]
+        slope = None if before is None or peak is None else (peak - before[0]) / (n - before[1]) * 1e6 * 1.048576
+        rows.append([title(scene), show(peak), show(slope)])
+        before = None if peak is None else (peak, n)
+    bench.table("Memory", ["particles, box", "MB above the loaded program", "bytes per further particle"], rows)
+
+
+def threads(bench: Bench) -> None:
+    """One thread and two."""
+    rows = []
+    for cells, block in ((64, (25, 20, 25)), (128, (50, 25, 50))):
+        scene = short_steps(dam(cells, block))
+        runs = bench.rounds_of({str(k): (lambda s=scene, k=k: bench.ours(s | {"threads": k})) for k in (1, 2)})
+        rows.append([title(scene), *(show(middle(runs[k], "ms_step")) for k in ("1", "2")),
+                     ratio(runs["1"], runs["2"], "ms_step")])  # fmt: skip
+    bench.table("Threads", ["particles, box", "ms, one thread", "ms, two threads", "speed-up"], rows)
+
+
+def box_size(bench: Bench) -> None:
+    """The same liquid in larger boxes at the same cell width: does the cost follow the liquid or the box?"""
+    rows, scenes = (
+        [],
+        [short_steps({"cells": [n] * 3, "block": [25, 20, 25], "spacing": 1 / 64}) for n in (64, 96, 128)],
+    )
+    runs = bench.rounds_of({title(s): (lambda s=s: bench.ours(s)) for s in scenes})
+    base = runs[title(scenes[0])]
+    for scene in scenes:
+        results = runs[title(scene)]
+        rows.append(
+            [title(scene), show(middle(results, "ms_step")), ratio(results, base, "ms_step"), show(memory(results))]
+        )
+    bench.table("The same liquid in larger boxes", ["particles, box", "ms per step", "over the smallest box",
+                "MB above the loaded program"], rows)  # fmt: skip
+
+
+SECTIONS: dict[str, Callable[[Bench], None]] = {
+    "transfer": against_taichi, "blender": against_blender, "phiflow": against_phiflow, "step": own_steps,
+    "size": scaling, "memory": memory_per_particle, "threads": threads, "box": box_size,
+}  # fmt: skip
+
+
+def machine() -> str:
+    """Processor, cores, load."""
+    name = platform.processor() or platform.machine()
+    info = Path("/proc/cpuinfo")
+    if info.is_file():
+        found = [
+            line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")
+        ]
+        name = found[0] if found else name
+    load = f", load {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
+    return f"{name}, {os.cpu_count()} cores{load}"
+
+
+def main() -> int:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--peers", type=Path, default=Path("peers"), help="folder of the peers' environments")
+    parser.add_argument("--frames", type=int, default=4, help="frames that count, after three that do not")
+    parser.add_argument("--rounds", type=int, default=3, help="repetitions of what is not slow")
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--only", nargs="*", choices=list(SECTIONS), help="sections to run")
+    parser.add_argument("--output", type=Path, help="writes the tables here too, and every figure beside it as .json")
+    given = parser.parse_args()
+    bench = Bench(given.peers.absolute(), given.frames, given.rounds, given.threads)
+    missing = [f"{name} is missing. Get it: {how.format(given.peers)}" for name, how in HOW_TO_GET.items()
+               if name not in bench.peers]  # fmt: skip
+    print("\n".join(missing), file=sys.stderr)
+    bench.lines += [f"{machine()}; {given.threads} threads; medians of {given.rounds} rounds.", "", *missing, ""]
+    for name in given.only or SECTIONS:
+        print(name, file=sys.stderr, flush=True)
+        SECTIONS[name](bench)
+    bench.lines.append(f"At the end: {machine()}.")
+    text = "\n".join(bench.lines) + "\n"
+    print(text)
+    if given.output:
+        given.output.write_text(text, encoding="utf-8")
+        given.output.with_suffix(".json").write_text(json.dumps(bench.log, indent=1), encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,260 @@
+"""What rigid bodies and the liquid do to each other on the grid.
+
+After Batty, Bertails, Bridson 2007, "A fast variational framework for accurate solid-fluid coupling", section 4. The
+share a of a face that a body covers moves with the body, so that cell c loses (sum over faces +-a u_body) / h of its
+volume per second = J_c V, with V = (velocity of the centre of mass, angular velocity). The pressure q (m^2/s) gives the
+body the impulse density h^3 J^T q. With the same J in the divergence and in the impulse, liquid and bodies exchange
+momentum and energy without loss.
+
+What J leaves out is where in its cell the surface lies: J takes the pressure of the cell's centre. Over a whole body
+in liquid at rest that is the weight of the volume between the surface and the next faces, up to half a cell of draught
+for a flat bottom. `surface_force` is that part, from the gradient of the pressure of the step before.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+from numba import njit, prange
+
+from fluidlift.physics.boundaries import Walls
+from fluidlift.physics.rigid_walls import Cover, UnionWalls
+from fluidlift.types import CellType, FaceVelocity
+
+
+@dataclass(frozen=True)
+class BodyRows:
+    """J of one body on the unknown cells."""
+
+    body: int
+    cells: Int[np.ndarray, "n 3"]
+    values: Float[np.ndarray, "n 6"]
+    """divergence (1/s) per velocity (m/s; first three) and angular velocity (rad/s) of the body"""
+
+
+@njit(parallel=True, cache=True)
+def _add_flux(axis, first, low, h, share, offset, center, velocity, spin, out):
+    """out += share x normal velocity of the body at the centre of the covered part."""
+    for i_ in prange(share.shape[0]):
+        i = np.int64(i_)
+        for j in range(share.shape[1]):
+            for k in range(share.shape[2]):
+                if share[i, j, k] == 0.0:
+                    continue
+                rx, ry, rz = _arm(axis, i + first[0], j + first[1], k + first[2], low, h, offset[i, j, k], center)
+                if axis == 0:
+                    speed = velocity[0] + spin[1] * rz - spin[2] * ry
+                elif axis == 1:
+                    speed = velocity[1] + spin[2] * rx - spin[0] * rz
+                else:
+                    speed = velocity[2] + spin[0] * ry - spin[1] * rx
+                out[i + first[0], j + first[1], k + first[2]] += share[i, j, k] * speed
+
+
+@njit(cache=True)
+def _arm(axis, i, j, k, low, h, offset, center):
+    """From the centre of mass to the centre of the covered part of a face."""
+    x = low[0] + (i + (0.0 if axis == 0 else 0.5)) * h - center[0]
+    y = low[1] + (j + (0.0 if axis == 1 else 0.5)) * h - center[1]
+    z = low[2] + (k + (0.0 if axis == 2 else 0.5)) * h - center[2]
+    if axis == 0:
+        return x, y + offset[0], z + offset[1]
+    if axis == 1:
+        return x + offset[0], y, z + offset[1]
+    return x + offset[0], y + offset[1], z
+
+
+class SolidVelocity:
+    """Velocity of the solid on all faces, kept up to date around the bodies."""
+
+    def __init__(self, union: UnionWalls) -> None:
+        self._union = union
+        self._flux, self._mean = (FaceVelocity.zeros(union.static.grid) for _ in range(2))
+        self._filled: tuple[Cover, ...] = ()
+
+    def update(
+        self, center: Float[np.ndarray, "b 3"], velocity: Float[np.ndarray, "b 3"], spin: Float[np.ndarray, "b 3"]
+    ) -> FaceVelocity:
+        """m/s, mean over the closed share of each face; the terrain rests. The arrays change at the next call."""
+        grid, covers = self._union.static.grid, self._union.covers
+        for axis, (flux, mean) in enumerate(zip(self._flux.components, self._mean.components)):
+            for cover in self._filled:
+                flux[cover.faces(axis)] = 0.0
+                mean[cover.faces(axis)] = 0.0
+            for c in covers:
+                _add_flux(
+                    axis, np.array(c.low), grid.low, grid.spacing, c.share[axis], c.offset[axis], center[c.body],
+                    velocity[c.body], spin[c.body], flux,
+                )  # fmt: skip
+            for c in covers:
+                at = c.faces(axis)
+                closed = 1.0 - self._union.walls.openings[axis][at]
+                mean[at] = np.divide(flux[at], closed, out=np.zeros_like(closed), where=closed > 0)
+        self._filled = covers
+        return self._mean
+
+
+@njit(parallel=True, cache=True)
+def _gather_rows(unknown, first, low, h, sx, sy, sz, fx, fy, fz, center, rows):
+    """rows [bx,by,bz,6]: per cell of the box, sum over its faces of +-share (e, r x e) / h."""
+    inverse = 1.0 / h
+    for i_ in prange(rows.shape[0]):
+        i = np.int64(i_)
+        for j in range(rows.shape[1]):
+            for k in range(rows.shape[2]):
+                for m in range(6):
+                    rows[i, j, k, m] = 0.0
+                if not unknown[i + first[0], j + first[1], k + first[2]]:
+                    continue
+                for side in range(2):
+                    sign = inverse if side == 1 else -inverse
+                    a = sign * sx[i + side, j, k]
+                    if a != 0.0:
+                        at = fx[i + side, j, k]
+                        _, y, z = _arm(0, i + side + first[0], j + first[1], k + first[2], low, h, at, center)
+                        rows[i, j, k, 0] += a
+                        rows[i, j, k, 4] += a * z
+                        rows[i, j, k, 5] -= a * y
+                    a = sign * sy[i, j + side, k]
+                    if a != 0.0:
+                        at = fy[i, j + side, k]
+                        x, _, z = _arm(1, i + first[0], j + side + first[1], k + first[2], low, h, at, center)
+                        rows[i, j, k, 1] += a
+                        rows[i, j, k, 3] -= a * z
+                        rows[i, j, k, 5] += a * x
+                    a = sign * sz[i, j, k + side]
+                    if a != 0.0:
+                        at = fz[i, j, k + side]
+                        x, y, _ = _arm(2, i + first[0], j + first[1], k + side + first[2], low, h, at, center)
+                        rows[i, j, k, 2] += a
+                        rows[i, j, k, 3] += a * y
+                        rows[i, j, k, 4] -= a * x
+
+
+def body_rows(cover: Cover, unknown: np.ndarray, walls: Walls, center: Float[np.ndarray, "3"]) -> BodyRows:
+    """J of a body with the centre of mass `center` (m) on the cells `unknown` (bool [nx,ny,nz])."""
+    shape = tuple(b - a for a, b in zip(cover.low, cover.high))
+    rows = np.empty((*shape, 6))
+    _gather_rows(
+        unknown, np.array(cover.low), walls.grid.low, walls.grid.spacing, *cover.share, *cover.offset, center, rows
+    )
+    cells = np.argwhere((rows != 0).any(axis=-1))
+    return BodyRows(cover.body, cells + np.array(cover.low), rows[tuple(cells.T)])
+
+
+def surface_force(
+    cover: Cover, rate: Float[np.ndarray, "nx ny nz"], walls: Walls, center: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "6"]:
+    """Force and torque over the liquid's density (m^4/s^2, m^5/s^2) that J^T q leaves out; see the module's text.
+
+    By the divergence theorem over the body's part of cell c, of volume V_c: force j = - sum over c of
+    dp/dx_j (V_c - h^3 mean of the shares covered of its two faces across j). The parts of the pressure gradient along
+    the faces cancel between neighbouring cells where the gradient is uniform.
+
+    Args:
+        cover: of the body.
+        rate: q / dt (m^2/s^2) of the last solve, 0 in cells without liquid.
+        walls: union of terrain and bodies.
+        center: of mass, m.
+    """
+    h, at = walls.grid.spacing, cover.cells
+    wide = tuple(slice(max(s.start - 1, 0), s.stop + 1) for s in at)
+    pads = [(int(s.start == 0), int(s.stop == n)) for s, n in zip(at, walls.grid.shape)]
+    p = np.pad(rate[wide].astype(np.float64), pads)
+    inner = (slice(1, -1),) * 3
+    here = p[inner]
+    forces = []
+    for axis in range(3):
+        total, count = np.zeros(here.shape), np.zeros(here.shape)
+        share = np.moveaxis(cover.share[axis], axis, 0)
+        opening = np.moveaxis(walls.openings[axis][cover.faces(axis)], axis, 0)
+        for side in (0, 1):
+            beyond = list(inner)
+            beyond[axis] = slice(0, -2) if side == 0 else slice(2, None)
+            there = p[tuple(beyond)]
+            open_face = np.moveaxis(opening[side : len(opening) - 1 + side], 0, axis) > 0
+            joined = (there != 0) & (here != 0) & open_face
+            total += np.where(joined, (there - here) * (2 * side - 1) / h, 0.0)
+            count += joined
+        slope = np.divide(total, count, out=np.zeros_like(total), where=count > 0)
+        faces = 0.5 * np.moveaxis(share[1:] + share[:-1], 0, axis)
+        forces.append(-slope * h**3 * (cover.volume - faces))
+    force = np.stack(forces, axis=-1)
+    cells = np.argwhere((force != 0).any(axis=-1))
+    force = force[tuple(cells.T)]
+    arm = walls.grid.low + (cells + np.array(cover.low) + 0.5) * h - center
+    return np.concatenate([force.sum(axis=0), np.cross(arm, force).sum(axis=0)])
+
+
+@njit(parallel=True, cache=True)
+def _slide(u, v, w, axis, first, last, low, h, closed_by, normals, center, velocity, spin, out):
+    """Faces closed by a body lose the part of the local velocity, relative to the body, that is normal to it."""
+    for i_ in prange(first[0], last[0]):
+        i = np.int64(i_)
+        for j in range(first[1], last[1]):
+            for k in range(first[2], last[2]):
+                body = closed_by[i, j, k]
+                if body < 0:
+                    continue
+                x = low[0] + (i + (0.0 if axis == 0 else 0.5)) * h - center[body, 0]
+                y = low[1] + (j + (0.0 if axis == 1 else 0.5)) * h - center[body, 1]
+                z = low[2] + (k + (0.0 if axis == 2 else 0.5)) * h - center[body, 2]
+                s0 = velocity[body, 0] + spin[body, 1] * z - spin[body, 2] * y
+                s1 = velocity[body, 1] + spin[body, 2] * x - spin[body, 0] * z
+                s2 = velocity[body, 2] + spin[body, 0] * y - spin[body, 1] * x
+                away = 0.0
+                for b in range(3):
+                    other = u if b == 0 else (v if b == 1 else w)
+                    solid = s0 if b == 0 else (s1 if b == 1 else s2)
+                    if b == axis:
+                        away += normals[i, j, k, b] * (other[i, j, k] - solid)
+                        continue
+                    # mean of the four faces of component b around this face
+                    mx, my, mz = other.shape
+                    total = 0.0
+                    for s in range(2):
+                        for t in range(2):
+                            ii = i - s if axis == 0 else (i + t if b == 0 else i)
+                            jj = j - s if axis == 1 else (j + t if b == 1 else j)
+                            kk = k - s if axis == 2 else (k + t if b == 2 else k)
+                            total += other[
+                                min(max(ii, 0), mx - 1), min(max(jj, 0), my - 1), min(max(kk, 0), mz - 1)
+                            ]
+                    away += normals[i, j, k, b] * (0.25 * total - solid)
+                out[i, j, k] = out[i, j, k] - normals[i, j, k, axis] * away
+
+
+def slide_along_bodies(
+    velocity: FaceVelocity,
+    slid: FaceVelocity,
+    union: UnionWalls,
+    center: Float[np.ndarray, "b 3"],
+    speeds: tuple[np.ndarray, np.ndarray],
+) -> FaceVelocity:
+    """`slid` with the faces that bodies close made tangential to them in the bodies' own motion (free slip).
+
+    Args:
+        velocity: continued into the solids, m/s.
+        slid: the same after `boundaries.slide_along_walls`, which takes all walls to be at rest.
+        union: walls of terrain and bodies.
+        center: of mass of each body, m.
+        speeds: velocity [b,3] m/s and angular velocity [b,3] rad/s.
+    """
+    grid = union.static.grid
+    fields = [np.ascontiguousarray(c, np.float32) for c in velocity.components]
+    out = [c.copy() for c in slid.components]
+    for cover in union.covers:
+        for axis in range(3):
+            at = cover.faces(axis)
+            closed = union.closed_by[axis][at] >= 0
+            out[axis][at] = np.where(closed, fields[axis][at], out[axis][at])
+    for cover in union.covers:
+        for axis in range(3):
+            mine = np.where(union.closed_by[axis] == cover.body, union.closed_by[axis], -1)
+            _slide(
+                *fields, axis, np.array(cover.low), np.array(cover.high) + (np.arange(3) == axis), grid.low,
+                grid.spacing, mine, union.walls.normals[axis], center, *speeds, out[axis],
+            )  # fmt: skip
+    return FaceVelocity(*out)

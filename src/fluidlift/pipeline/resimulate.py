@@ -1,0 +1,238 @@
+"""The second half of the story, which `make` and `sim` share: an asset at rest becomes frames, pictures and USD."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fluidlift.config import JobConfig, build_config
+from fluidlift.errors import FluidliftError, InputRejected
+from fluidlift.pipeline import showing, simulating
+from fluidlift.pipeline.scene import Footage, Scene, SimulationRequest, footage_of, scene_of
+from fluidlift.pipeline.story import Progress, Silence, Story, peak_memory_mb
+
+FIRST_HALF = ("read", "flow", "segment", "geometry", "refine", "motion", "fit")
+"""stages that need the clip; `sim` takes their results from where `make` left them"""
+
+SECOND_HALF = ("simulate", "show")
+
+FPS_RANGE = (0.1, 10_000.0)
+"""frames per second that can be asked for"""
+
+PARTS = {
+    "preview": "preview.mp4", "report": "report.html", "usd": "asset.usda", "mask_overlay": "mask_overlay.png",
+}  # fmt: skip
+"""files that the second half writes, by their name in the manifest"""
+
+
+@dataclass(frozen=True)
+class Made:
+    """What a run left."""
+
+    folder: Path
+    warnings: tuple[str, ...]
+    seconds: float
+    timings: dict[str, dict[str, Any]]
+    frames: int
+    """simulated, the first (at rest) counted"""
+
+
+def resimulate(
+    folder: Path,
+    *,
+    request: SimulationRequest | None = None,
+    overrides: Sequence[str] = (),
+    flat: dict[str, Any] | None = None,
+    progress: Progress | None = None,
+) -> Made:
+    """Simulate a finished asset again, with its scene.yaml, its fitted parameters and its body at rest.
+
+    The clip is not needed. Where the cached stages of `make` are still in work/, preview and report show it again.
+
+    Args:
+        folder: of the asset.
+        request: what this run is asked for.
+        overrides: `simulate.name=value` and `show.name=value`.
+        flat: settings by dotted name; None values are left out.
+        progress: where progress is told.
+
+    Raises:
+        InputRejected: no asset, or a request, a scene.yaml or settings that do not fit; nothing was changed.
+        FluidliftError: the simulation broke down; the frames before are kept and shown.
+    """
+    from fluidlift.io.asset_folder import read_manifest
+    from fluidlift.io.atomic import disk_errors
+
+    request = request or SimulationRequest()
+    began = time.perf_counter()
+    manifest = read_manifest(folder)
+    config = _settings(manifest, overrides, flat or {})
+    _check(request)
+    story = Story(
+        folder, SECOND_HALF, force=frozenset(SECOND_HALF if request.restart else ()), progress=progress or Silence()
+    )
+    _recall(story, manifest)
+    with disk_errors(folder):
+        frames = play(story, folder, config, request)
+    own = tuple(story["simulate"].meta.get("warnings", ()))
+    return Made(folder, own, time.perf_counter() - began, story.timings, frames)
+
+
+def _check(request: SimulationRequest) -> None:
+    low, high = FPS_RANGE
+    if request.fps is not None and not low <= request.fps <= high:
+        raise InputRejected(f"--fps {request.fps:g}", f"{low:g} to {high:g} frames per second")
+    if request.duration is not None and not 0 < request.duration < 1e9:
+        raise InputRejected(f"--duration {request.duration:g}", "seconds, more than 0")
+    if request.extend_downstream is not None and not 0 <= request.extend_downstream < 1e6:
+        raise InputRejected(f"--extend-downstream {request.extend_downstream:g}", "metres, 0 or more")
+    if request.meshes is not None and not request.meshes.is_dir():
+        raise InputRejected(f"--meshes '{request.meshes}'", "an existing folder")
+    if request.resume and request.restart:
+        raise InputRejected("both --resume and --restart", "one of them")
+
+
+def _settings(manifest: dict[str, Any], overrides: Sequence[str], flat: dict[str, Any]) -> JobConfig:
+    """The settings that the asset was made with, and what is changed now.
+
+    Of an asset made by another version, settings that this one does not know are left out.
+    """
+    for text in overrides:
+        section = text.partition("=")[0].strip().partition(".")[0]
+        if section not in ("simulate", "show"):
+            raise InputRejected(
+                f"--set {text}, which has no effect on a simulation", "simulate.name=value or show.name=value",
+                "change it with fluidlift make",
+            )  # fmt: skip
+    provenance = manifest.get("provenance", {})
+    stored = provenance.get("config", {})
+    values: dict[str, Any] = {"seed": provenance.get("seed")}
+    for section in ("simulate", "show"):
+        part = stored.get(section, {}) if isinstance(stored, dict) else {}
+        known = JobConfig().section(section)
+        values |= {f"{section}.{k}": v for k, v in part.items() if k in known} if isinstance(part, dict) else {}
+    return build_config(None, None, overrides, values | {k: v for k, v in flat.items() if v is not None})
+
+
+def _recall(story: Story, manifest: dict[str, Any]) -> None:
+    """Results of the first half, as far as they are still cached; all of them or none."""
+    keys = manifest.get("provenance", {}).get("stages", {})
+    usable = isinstance(keys, dict) and all(
+        isinstance(keys.get(n), str) and len(keys[n]) == 64 and keys[n].isalnum() and keys[n].isascii()
+        for n in FIRST_HALF
+    )
+    if not (usable and all(story.recall(name, keys[name]) for name in FIRST_HALF)):
+        for part in (story.results, story.keys, story.timings):
+            part.clear()
+
+
+def play(story: Story, folder: Path, config: JobConfig, request: SimulationRequest) -> int:
+    """Simulate and show the asset in a folder, and bring its manifest up to date; the number of frames.
+
+    Args:
+        story: with the results of the first half, or without any of them.
+        folder: of the asset.
+        config: its `simulate` and `show` sections, and the seed.
+        request: what this run is asked for.
+
+    Raises:
+        InputRejected: a scene that does not fit.
+        FluidliftError: the simulation broke down; the frames before it are written.
+    """
+    from fluidlift.io.asset_folder import load_asset, read_manifest
+
+    manifest, asset = read_manifest(folder), load_asset(folder)
+    footage = footage_of(story)
+    scene = scene_of(asset, folder, request, config, footage=footage, start=_start(manifest, footage))
+    story.run(
+        "simulate",
+        lambda: simulating.simulate(scene, folder, config, request=request, step=story.step),
+        settings=[scene.parts, scene.frames, config.simulate.max_particles],
+        after=(),
+        still_there=simulating.frames_still_there(folder, scene.parts),
+    )
+    done = story["simulate"].meta
+    wanted = [folder / "preview.mp4"] + [folder / "asset.usda"] * config.show.usd
+    story.run(
+        "show",
+        lambda: showing.show(scene, footage, folder, config, done["frames"], step=story.step),
+        settings=[config.section("show"), done["frames"], [story.keys[s] for s in FIRST_HALF if s in story.keys]],
+        after=("simulate",),
+        still_there=lambda result: all(p.is_file() for p in wanted),
+    )
+    _finish(story, scene, footage, folder, config, manifest)
+    if "failed" in done:
+        raise FluidliftError(
+            f"{done['failed']} The {done['frames']} frames before it are kept, with their preview: '{folder}'."
+        )
+    return int(done["frames"])
+
+
+def _start(manifest: dict[str, Any], footage: Footage | None) -> int:
+    """Frame of the clip that the body at rest shows."""
+    start = manifest.get("metrics", {}).get("rest_frame", 0) if footage is None else footage.start
+    return start if type(start) is int and 0 <= start < manifest["frame_count"] else 0
+
+
+def _finish(
+    story: Story, scene: Scene, footage: Footage | None, folder: Path, config: JobConfig, manifest: dict[str, Any]
+) -> None:
+    """Report, figures for `evaluate`, manifest."""
+    from fluidlift.io.asset_folder import update_manifest
+    from fluidlift.io.atomic import atomic_write
+
+    result = story["simulate"].meta
+    before = set(manifest.get("simulation", {}).get("warnings", ()))
+    own = [*result.get("warnings", ()), *([result["failed"]] if "failed" in result else [])]
+    story.warnings[:] = [w for w in manifest.get("warnings", ()) if w not in before] + own
+    if story.results.keys() >= set(FIRST_HALF):
+        showing.write_report(story, folder, config, story.timings)
+        figures = folder / "work" / "evaluation.npz"
+        if scene.interval == scene.clip_interval:
+            with atomic_write(figures) as stream:
+                np.savez_compressed(stream, **evaluation_arrays(story))
+        else:
+            figures.unlink(missing_ok=True)  # of frames that are no longer there
+    update_manifest(
+        folder,
+        files={name: file for name, file in PARTS.items() if (folder / file).is_file()},
+        timings={k: float(t["seconds"]) for k, t in story.timings.items()},
+        metrics={"peak_memory_mb": round(peak_memory_mb(), 1), "stages": story.timings},
+        warnings=story.warnings,
+        simulation={
+            "frames": result["frames"],
+            "frame_interval": scene.interval,
+            "grid": {"shape": scene.terrain.grid.shape, "spacing": scene.terrain.grid.spacing,
+                     "origin": scene.terrain.grid.origin},
+            "parameters": scene.parameters.to_dict(),
+            "seed": scene.seed,
+            "extended_downstream": scene.extended,
+            "obstacles": [o.name for o in scene.obstacles],
+            "warnings": own,
+        },
+    )  # fmt: skip
+
+
+def evaluation_arrays(story: Story) -> dict[str, np.ndarray]:
+    """What `fluidlift evaluate` compares with a truth."""
+    g, m, s, shown = story["geometry"], story["motion"], story["simulate"], story["show"].arrays
+    targets = m.meta["targets"]
+    start = g.meta["rest_frame"]
+    return {
+        "labels": story["segment"].arrays["labels"],
+        "front_depth": g.arrays["depth"] * g.arrays["mask"],
+        "flow_raw": story["flow"].arrays["displacement"],
+        "flow_completed": m.arrays["completed"],
+        "resim_flow": shown["resim_flow"][:-1],
+        "resim_mask": shown["resim_mask"],
+        "resim_frames": shown["resim_frames"],
+        "first_frame": np.int64(start),
+        "fit_frames": np.array([targets[0], targets[-1] + 1] if targets else [0, 0]),
+        "particle_volume": s.arrays["volume"],
+        "leak_share": s.arrays["leak"],
+    }

@@ -1,0 +1,233 @@
+"""What is simulated: an asset's body in its terrain, with what a person changed."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fluidlift import __version__
+from fluidlift.config import JobConfig
+from fluidlift.errors import InputRejected
+from fluidlift.look.appearance import SteadyShading
+from fluidlift.pipeline.seeing import clip_of, labels_of
+from fluidlift.pipeline.story import Story
+from fluidlift.types import (
+    CellType,
+    FaceVelocity,
+    FluidAsset,
+    FluidParameters,
+    Gaussians,
+    Particles,
+    PinholeCamera,
+    PixelLabels,
+    Terrain,
+    VideoClip,
+)
+
+LYING = ("stream", "fall")
+"""kinds that lie on something and can be made longer; the others are free in the air"""
+
+
+@dataclass(frozen=True)
+class SimulationRequest:
+    """What one run of a simulation is asked for, beside settings and scene.yaml."""
+
+    duration: float | None = None
+    """s; None: as scene.yaml, the settings or the clip say"""
+    fps: float | None = None
+    """frames per second; None: those of the clip"""
+    extend_downstream: float | None = None
+    """m by which the channel goes on; None: as scene.yaml says"""
+    meshes: Path | None = None
+    """folder of the obstacles' mesh files; None: the asset"""
+    resume: bool = False
+    """go on from the checkpoint, or say why not"""
+    restart: bool = False
+    """begin again, although a checkpoint fits"""
+
+
+@dataclass(frozen=True)
+class Footage:
+    """The clip that an asset comes from, where it is still at hand."""
+
+    clip: VideoClip
+    labels: PixelLabels
+    plate: np.ndarray
+    """u8 [H,W,3], the picture without the fluid"""
+    start: int
+    """frame of the clip that the first simulated one shows"""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A simulation at its first instant."""
+
+    kind: str
+    """stream, fall, pour or plume"""
+    rest: Gaussians
+    """world, m"""
+    body: Particles
+    """at the first instant; `source` indexes `rest`"""
+    terrain: Terrain
+    cell_types: np.ndarray
+    """u8 [nx,ny,nz]"""
+    velocity: FaceVelocity
+    """at the first instant, m/s"""
+    parameters: FluidParameters
+    """fitted, with what scene.yaml changes; `time_step` and `wall_damping` are those of the fit"""
+    camera: PinholeCamera
+    interval: float
+    """s between frames"""
+    clip_interval: float
+    """s between frames of the clip"""
+    frames: int
+    """to simulate, the first (at rest) counted"""
+    seed: int
+    obstacles: tuple[Any, ...] = ()
+    shading: SteadyShading | None = None
+    """what of the look stays in place; None: nothing"""
+    extended: float = 0.0
+    """m"""
+
+    @cached_property
+    def parts(self) -> dict[str, str]:
+        """A hash of each part that decides how the simulation goes: two scenes with the same ones go the same way."""
+        t, v = self.terrain, self.velocity
+        found = {
+            "version": _hash(__version__),
+            "kind": _hash(self.kind),
+            "grid": _hash(t.grid),
+            "terrain": _hash(t.signed_distance, t.mainstream, self.cell_types),
+            "velocity": _hash(*v.components),
+            "body": _hash(self.body.positions, self.body.velocities, self.body.source, self.rest.means),
+            "look": _hash(self.rest.quats, self.rest.scales, self.rest.opacities, self.rest.sh,
+                          b"" if self.shading is None else self.shading.image),
+            "parameters": _hash(self.parameters),
+            "frame interval": _hash(self.interval),
+            "seed": _hash(self.seed),
+        }  # fmt: skip
+        if self.obstacles:
+            found["obstacles"] = _hash(*(x for o in self.obstacles for x in _plain_obstacle(o)))
+        return found
+
+
+def _hash(*values: Any) -> str:
+    """SHA-256 of arrays (with shape and type) and of the text of anything else."""
+    digest = hashlib.sha256()
+    for value in values:
+        if isinstance(value, np.ndarray):
+            digest.update(f"{value.dtype.str}{value.shape}".encode())
+            digest.update(np.ascontiguousarray(value).tobytes())
+        else:
+            digest.update(value if isinstance(value, bytes) else repr(value).encode())
+        digest.update(b"\0")
+    return digest.hexdigest()
+
+
+def _plain_obstacle(obstacle: Any) -> list[Any]:
+    """Its numbers; not its line in the file."""
+    keys = [x for k in obstacle.keyframes for x in (k.time, k.position, np.asarray(k.rotation))]
+    texts = [obstacle.name, obstacle.position, obstacle.motion, obstacle.density, obstacle.friction,
+             obstacle.restitution, obstacle.velocity, obstacle.angular_velocity]  # fmt: skip
+    return [*texts, np.asarray(obstacle.rotation), obstacle.mesh.vertices, obstacle.mesh.faces, *keys]
+
+
+def footage_of(story: Story) -> Footage | None:
+    """The clip as the first stages saw it, or None where their results are not at hand."""
+    if not {"read", "segment", "geometry"} <= story.results.keys():
+        return None
+    g = story["geometry"]
+    return Footage(clip_of(story), labels_of(story), g.arrays["plate"], int(g.meta["rest_frame"]))
+
+
+def scene_of(
+    asset: FluidAsset,
+    folder: Path,
+    request: SimulationRequest,
+    config: JobConfig,
+    *,
+    footage: Footage | None,
+    start: int,
+) -> Scene:
+    """The scene that an asset, its scene.yaml and a request describe.
+
+    Args:
+        asset: as `load_asset` gives it.
+        folder: of the asset.
+        request: of this run.
+        config: seed, and frames where neither request nor scene.yaml say.
+        footage: the clip, where it is at hand.
+        start: frame of the clip that the first simulated one shows.
+
+    Raises:
+        InputRejected: a scene.yaml or a request that does not fit.
+    """
+    from fluidlift.io.scene import read_edits
+    from fluidlift.numerics.sampling import sample_faces
+
+    edits = read_edits(folder, meshes=request.meshes)
+    interval = asset.interval if request.fps is None else 1.0 / request.fps
+    duration = edits.duration if request.duration is None else request.duration
+    clip_frames = max(1, round((asset.frame_count - start) * asset.interval / interval))
+    wanted = None if duration is None else max(2, round(duration / interval))
+    rest, grid = asset.rest, asset.grid
+    body = Particles.at_rest(rest.means, 1.0, np.arange(len(rest)), sample_faces(asset.velocity, grid, rest.means))
+    shading = None
+    if footage is not None and asset.kind in LYING:  # bodies in the air change their outline: nothing is steady
+        mask = footage.labels.fluid.mean(axis=0) > 0.5
+        shading = SteadyShading.of(footage.clip.frames, mask, asset.camera) if mask.any() else None
+    scene = Scene(
+        asset.kind, rest, body, asset.terrain, asset.cell_types, asset.velocity,
+        asset.parameters.updated(edits.parameters), asset.camera, interval, asset.interval,
+        wanted or config.simulate.frames or clip_frames, config.seed, edits.obstacles, shading,
+    )  # fmt: skip
+    longer = edits.extend_downstream if request.extend_downstream is None else request.extend_downstream
+    return extended(scene, longer) if longer > 0 else scene
+
+
+def extended(scene: Scene, length: float) -> Scene:
+    """The same river, `length` metres longer downstream.
+
+    Raises:
+        InputRejected: a fluid that lies on nothing, or that does not leave its box.
+    """
+    from fluidlift.physics.extend import extended_body, extended_downstream, extended_velocity, find_outlet
+
+    if scene.kind not in LYING:
+        raise InputRejected(
+            f"a {scene.kind} cannot be extended downstream", "a stream or a fall", "leave out --extend-downstream"
+        )
+    channel = (scene.terrain, scene.cell_types)
+    longer = extended_downstream(*channel, length)
+    outlet = find_outlet(*channel)
+    return replace(
+        scene,
+        terrain=longer[0],
+        cell_types=longer[1],
+        body=extended_body(scene.body, scene.velocity, channel, longer, seed=scene.seed),
+        velocity=extended_velocity(scene.velocity, outlet, longer[0].grid),
+        extended=length,
+    )
+
+
+def simulation_step(scene: Scene) -> FluidParameters:
+    """The same physics with the simulator's own longest step.
+
+    The fit's step is that of its grid, which must resolve a gravity wave over one cell. The simulator adapts
+    to the flow and only needs steps in which a wave does not cross more than a cell or so. Wall damping is a share
+    per step and is converted, so that walls take the same share per second.
+    """
+    parameters, interval = scene.parameters, min(scene.interval, scene.clip_interval)
+    h = scene.terrain.grid.spacing
+    wet = (scene.cell_types == CellType.FLUID).sum(axis=2)
+    depth = h * float(np.percentile(wet[wet > 0], 90)) if (wet > 0).any() else h
+    wave = float(np.sqrt(np.linalg.norm(parameters.gravity) * depth))
+    longest = interval if scene.kind == "plume" else h / max(wave, 1e-6)
+    step = float(np.clip(longest, interval / 8, interval))
+    damping = 1.0 - (1.0 - parameters.wall_damping) ** (step / parameters.time_step)
+    return replace(parameters, time_step=step, wall_damping=float(np.clip(damping, 0.0, 1.0)))

@@ -77,6 +77,7 @@ class StepWatch:
 
     def __init__(self) -> None:
         self.seconds: list[float] = []
+        self.busy: list[float] = []
         self._names: set[str] = set()
 
     def attach(self) -> None:
@@ -90,9 +91,10 @@ class StepWatch:
 
     def _wrapped(self, function: Any) -> Any:
         def watched(*args: Any) -> None:
-            began = time.perf_counter()
+            began, busy = time.perf_counter(), time.process_time()
             function(*args)
             self.seconds.append(time.perf_counter() - began)
+            self.busy.append(time.process_time() - busy)
 
         watched.watched = True
         return watched
@@ -129,9 +131,11 @@ def measure(scene: dict[str, Any]) -> dict[str, Any]:
         shutil.rmtree(cache, ignore_errors=True)
     kept = slice(scene["warm"] + 1, None)
     frames, total = scene["frames"], sum(steps[kept])
+    busy = sum(watch.busy[len(watch.busy) - total :])
     h = scene["spacing"]
     return {
         "ms_frame": 1e3 * sum(inside[kept]) / frames, "ms_step": 1e3 * sum(inside[kept]) / max(total, 1),
+        "cpu_ms_step": 1e3 * busy / max(total, 1),
         "ms_frame_with_cache": 1e3 * sum(times[kept]) / frames, "steps_per_frame": total / frames,
         "particles": count, "first_particles": first, "front": (front - 1) * h, "mean_height": (height - 1) * h,
         "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,

@@ -352,7 +352,8 @@ def _doctor(c: Doctor) -> int:
 
 
 _COMMANDS = {
-    Make: _make, Sim: _sim, Inspect: _inspect, Mask: _mask, Evaluate: _evaluate, Validate: _validate, Demo: _demo, Doctor: _doctor,
+    Make: _make, Sim: _sim, Inspect: _inspect, Mask: _mask, Evaluate: _evaluate, Validate: _validate, Demo: _demo,
+    Doctor: _doctor,
 }  # fmt: skip
 
 if __name__ == "__main__":

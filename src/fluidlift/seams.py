@@ -1,15 +1,20 @@
-"""The sockets that back ends fill: one abstract class, one method each."""
+"""The sockets that back ends fill: one abstract class, one method each (the transfers are a pair)."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
 from fluidlift.types import (
+    FaceVelocity,
     FluidAsset,
     Gaussians,
+    Grid,
+    Particles,
     PinholeCamera,
     PixelFlow,
     PixelLabels,
@@ -70,3 +75,147 @@ class Exporter(ABC):
     @abstractmethod
     def export(self, asset: FluidAsset, folder: Path) -> list[Path]:
         """Write below `folder`; the files written."""
+
+
+class GroupedByCell(Protocol):
+    """The particles cell by cell, x slowest (`physics.transfer.CellOrder` is one)."""
+
+    @property
+    def order(self) -> np.ndarray:
+        """int64 [n]: particle indices."""
+        ...
+
+    @property
+    def start(self) -> np.ndarray:
+        """int64 [cells+1]: where each cell begins in `order`."""
+        ...
+
+
+class ParticleTransfer(ABC):
+    """Particles to the staggered grid and back (paper: `particle_map`): one operation and its transpose.
+
+    `order`, where it is known already, may save work; the result is that of the particles as they are.
+    """
+
+    @abstractmethod
+    def particles_to_grid(
+        self, particles: Particles, grid: Grid, order: GroupedByCell | None = None
+    ) -> tuple[FaceVelocity, tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """Face velocity (m/s, 0 where no particle reaches) and face masses (kg), float32."""
+
+    @abstractmethod
+    def grid_to_particles(
+        self, velocity: FaceVelocity, grid: Grid, positions: np.ndarray, order: GroupedByCell | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Velocities [n,3] (m/s) and affine matrices [n,3,3] (1/s) at positions [n,3] (m), float32.
+
+        Beyond the outer faces the outer value continues.
+        """
+
+
+class WallShape(Protocol):
+    """What a particle can run into (`physics.boundaries.Walls` is one)."""
+
+    @property
+    def grid(self) -> Grid:
+        """The box."""
+        ...
+
+    @property
+    def signed_distance(self) -> np.ndarray:
+        """float32 [nx+1,ny+1,nz+1], m, positive outside the solid."""
+        ...
+
+    @property
+    def regions(self) -> np.ndarray:
+        """u8 [nx,ny,nz], `CellType`: the sides of the box are open at INFLOW and OUTFLOW."""
+        ...
+
+    @property
+    def open_sides(self) -> np.ndarray:
+        """bool [3,2]: sides of the box (axis, low/high) without a wall."""
+        ...
+
+
+CLEARANCE = 0.02
+"""cells: how far outside the solid a colliding particle is put"""
+CONTACT = 0.5
+"""cells: a free flight that ends closer to the wall is an impact (the pressure of its own cell would stop it there)"""
+
+
+@dataclass(frozen=True)
+class MoveRules:
+    """How particles behave at walls, and how far they may stretch, within one step."""
+
+    dt: float
+    """s"""
+    restitution: float
+    """share of the normal velocity given back on impact"""
+    tangential_share: float
+    """of the tangential velocity that survives the step at a wall"""
+    max_stretch: float
+    """largest singular value of the deformation"""
+
+
+class ParticleMover(ABC):
+    """The particles' own half of a step."""
+
+    @abstractmethod
+    def moved(
+        self,
+        particles: Particles,
+        moves: np.ndarray,
+        velocities: np.ndarray,
+        affine: np.ndarray,
+        walls: WallShape,
+        rules: MoveRules,
+    ) -> Particles:
+        """Displaced, kept out of walls and deformed; all else unchanged.
+
+        Args:
+            particles: before the step, with the velocities that they came with.
+            moves: float32 [n,3], m.
+            velocities: float32 [n,3], m/s, after the step.
+            affine: float32 [n,3,3], 1/s, after the step.
+            walls: what they may run into.
+            rules: of the step.
+        """
+
+
+class PoissonSolver(ABC):
+    """-div(w grad p) = rhs on the unknown cells of a staggered grid (conventions: `numerics.poisson`)."""
+
+    @abstractmethod
+    def solve(
+        self,
+        unknown: np.ndarray,
+        weights: tuple[np.ndarray, np.ndarray, np.ndarray],
+        spacing: float,
+        rhs: np.ndarray,
+        *,
+        initial: np.ndarray,
+        tolerance: float,
+        max_iterations: int,
+    ) -> tuple[np.ndarray, int, float]:
+        """p (float64 [nx,ny,nz], 0 outside the unknown cells), iterations, and the true relative residual.
+
+        Args:
+            unknown: bool [nx,ny,nz].
+            weights: open face fractions across x, y, z.
+            spacing: cell width, m.
+            rhs: float64 [nx,ny,nz], of zero mean over components without an open face to a known cell.
+            initial: float64 first guess.
+            tolerance: of |rhs - A p| / |rhs|.
+            max_iterations: of the solver.
+        """
+
+
+class VelocityContinuation(ABC):
+    """The velocity beyond the liquid."""
+
+    @abstractmethod
+    def continued(
+        self, velocity: FaceVelocity, valid: tuple[np.ndarray, np.ndarray, np.ndarray], layers: int = 3
+    ) -> FaceVelocity:
+        """Faces without a value (`valid` bool per face) take the mean of their neighbours that have one, layer by
+        layer; 0 farther away."""

@@ -7,7 +7,7 @@ import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdVol
 
 from fluidlift.io.export_usd import validate_usd, write_camera, write_usd
-from fluidlift.io.frames import FluidFrame
+from fluidlift.io.frames import FluidFrame, MovingMesh
 from fluidlift.io.validate_usd import frame_range
 from fluidlift.io.volume_grid import VolumeGrid, write_vdb
 from fluidlift.types import Gaussians, PinholeCamera, RigidTransform
@@ -210,3 +210,23 @@ def test_no_frames_and_wrong_lengths_are_faults_of_the_caller(tmp_path, gaussian
     with pytest.raises(ValueError, match="ids"):
         write_usd(tmp_path / "a.usda", frames=[(gaussians(5), np.arange(4), np.zeros((5, 3)))], interval=0.04)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_bodies_stand_where_they_were_at_every_frame(tmp_path, gaussians, mesh):
+    turn = np.array([[1.0, 0, 0, 0], [np.sqrt(0.5), 0, 0, np.sqrt(0.5)], [0, 0, 0, 1.0]])  # 0, 90, 180 degrees about z
+    positions = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 3]])
+    bodies = [MovingMesh(name, mesh, positions, turn) for name in ("raft", "7 seas", "7 seas")]
+    write_usd(tmp_path / "asset.usda", frames=frames_of(gaussians), interval=0.04, bodies=bodies)
+    assert validate_usd(tmp_path / "asset.usda") == []
+    stage = Usd.Stage.Open(str(tmp_path / "asset.usda"))
+    prims = list(stage.GetPrimAtPath("/Fluid/Bodies").GetChildren())
+    assert [p.GetName() for p in prims] == ["raft", "__seas", "__seas_2"]
+    for k, turned in enumerate(([1, 0, 0], [0, 1, 0], [-1, 0, 0])):
+        world = UsdGeom.Xformable(prims[0]).ComputeLocalToWorldTransform(1001 + k)
+        np.testing.assert_allclose(world.Transform(Gf.Vec3d(1, 0, 0)), positions[k] + turned, atol=1e-12)
+
+
+def test_bodies_of_another_number_of_poses_are_faults_of_the_caller(tmp_path, gaussians, mesh):
+    body = MovingMesh("raft", mesh, np.zeros((2, 3)), np.tile([1.0, 0, 0, 0], (2, 1)))
+    with pytest.raises(ValueError, match="raft"):
+        write_usd(tmp_path / "asset.usda", frames=frames_of(gaussians), interval=0.04, bodies=[body])

@@ -142,3 +142,28 @@ def test_the_camera_walks_counter_clockwise_at_its_elevation():
     around, up = bearing(orbit_camera(CAMERA, BODY, azimuth=65.0, elevation=24.0))
     assert (around - start) % 360 == pytest.approx(65.0)
     assert up == pytest.approx(24.0)
+
+
+def test_surfels_cover_every_face_of_a_mesh_and_look_outwards():
+    from fluidlift.look.scenery import mesh_surfels
+    from fluidlift.numerics.solid_mesh import box_mesh
+
+    surfels = mesh_surfels(box_mesh(np.array([1.0, 2.0, 0.5])), 0.1)
+    half = np.array([0.5, 1.0, 0.25])
+    on_face = np.abs(np.abs(surfels.means) - half) < 1e-6
+    assert (on_face.sum(axis=1) == 1).all()
+    # no place on a side is farther from a surfel than the spacing
+    side = surfels.means[on_face[:, 2] & (surfels.means[:, 2] > 0)]
+    y, x = np.mgrid[-1:1:41j, -0.5:0.5:21j]
+    places = np.stack([x, y, np.full_like(x, 0.25)], -1).reshape(-1, 3)
+    assert np.linalg.norm(places[:, None] - side[None], axis=-1).min(axis=1).max() < 0.1
+    # flat: thin across the face they lie on
+    thin = np.sqrt(np.einsum("nii->ni", surfels.covariances())[on_face])
+    assert (thin < 0.5 * np.sort(surfels.scales, axis=1)[:, 1]).all()
+
+
+def test_a_mesh_that_is_huge_for_its_spacing_gets_a_bounded_number_of_surfels():
+    from fluidlift.look.scenery import mesh_surfels
+    from fluidlift.numerics.solid_mesh import box_mesh
+
+    assert len(mesh_surfels(box_mesh(np.ones(3)), 1e-4, most=5000)) < 20_000

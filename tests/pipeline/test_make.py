@@ -13,7 +13,8 @@ from fluidlift.io.ply import read_splats
 from fluidlift.io.stage_cache import load_stage
 from fluidlift.io.video import read_clip
 from fluidlift.numerics.sampling import sample_nodes
-from fluidlift.pipeline import STAGES, Inputs, Silence, body, make, moving, simulating
+from fluidlift.pipeline import STAGES, Inputs, Silence, SimulationRequest, make, moving, simulating
+from fluidlift.pipeline.scene import footage_of, scene_of
 from fluidlift.pipeline.story import Result, Story
 from fluidlift.types import CellType, Label
 from fluidlift.validate import validate_asset
@@ -164,7 +165,8 @@ def test_the_first_frame_is_the_rest_body(made, asset):
 
 
 def test_the_files_hold_what_was_simulated(made, story, asset):
-    simulator = simulating.simulator_of(story, made.folder, build_config(), body.rest_of(story))
+    scene = scene_of(asset, made.folder, SimulationRequest(), build_config(), footage=footage_of(story), start=0)
+    simulator = simulating.simulator_of(scene)
     for _ in range(2):
         simulator.advance(asset.interval)
     p, shown = simulator.particles, splats(made, 2)
@@ -323,7 +325,7 @@ def test_an_interrupt_in_a_fresh_folder_keeps_what_was_done(stream_clip, tmp_pat
 def test_a_full_disk_in_a_later_stage_is_said_as_such(made, copy, quick, monkeypatch, capsys):
     import errno
 
-    def full(story, folder, config):
+    def full(scene, folder, config, **_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(simulating, "simulate", full)

@@ -9,7 +9,7 @@ from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.physics import apic
 from fluidlift.physics.apic import LiquidSimulator, SimulationSettings
 from fluidlift.physics.pressure import face_fractions
-from fluidlift.synthetic import tanks
+from fluidlift.synthetic import filling, tanks
 from fluidlift.synthetic.gauges import Gauge
 from fluidlift.types import CellType, FluidParameters, Grid, Particles
 
@@ -59,7 +59,7 @@ def test_an_inflow_leaves_no_gaps_at_any_speed_and_angle(velocity):
     types[:2, 4:8, 4:8] = CellType.INFLOW
     parameters = FluidParameters(gravity=(0, 0, 0), inflow_velocity=velocity, time_step=0.05)
     simulator = LiquidSimulator(
-        grid, tanks.terrain_of(grid), parameters, Particles.at_rest(np.zeros((0, 3)), 1.0), cell_types=types
+        grid, filling.terrain_of(grid), parameters, Particles.at_rest(np.zeros((0, 3)), 1.0), cell_types=types
     )
     duration = 0.45 / max(np.abs(velocity))  # the jet stays inside the box
     emitted = sum(simulator.advance(duration / 3).emitted for _ in range(3))
@@ -102,8 +102,8 @@ def test_thin_terrain_does_not_leak(thickness, angle, speed):
     def height(points):
         return (points - middle) @ normal
 
-    terrain = tanks.terrain_of(grid, lambda points: np.abs(height(points)) - half)
-    positions = tanks.inside(grid, lambda p: np.maximum(half + 0.5 * H - height(p), height(p) - 0.5))
+    terrain = filling.terrain_of(grid, lambda points: np.abs(height(points)) - half)
+    positions = filling.inside(grid, lambda p: np.maximum(half + 0.5 * H - height(p), height(p) - 0.5))
     velocities = np.tile(np.float32(-speed * normal), (len(positions), 1))
     particles = Particles.at_rest(positions, 1.0, velocities=velocities)
     parameters = FluidParameters(gravity=tuple(-G * normal), time_step=0.04)
@@ -160,8 +160,8 @@ def bucket(spin: float) -> tuple[tanks.Tank, Grid]:
     cells, radius = 20, 1.0
     h = 2.2 / cells
     grid = Grid((cells, cells, 12), h, (-1.1, -1.1, 0.0))
-    terrain = tanks.terrain_of(grid, lambda p: radius - np.hypot(p[..., 0], p[..., 1]))
-    positions, _ = tanks.between(grid, 0.0, lambda x, y: 0.6 + 0.5 * spin**2 / G * (x**2 + y**2 - 0.5))
+    terrain = filling.terrain_of(grid, lambda p: radius - np.hypot(p[..., 0], p[..., 1]))
+    positions, _ = filling.between(grid, 0.0, lambda x, y: 0.6 + 0.5 * spin**2 / G * (x**2 + y**2 - 0.5))
     positions = positions[np.hypot(*positions[:, :2].T) < radius - 0.1 * h]
     tank = tanks._tank("bucket", grid, positions, np.pi * 0.6, size=radius, terrain=terrain)
     p = tank.particles

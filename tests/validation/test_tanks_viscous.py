@@ -8,7 +8,7 @@ import pytest
 
 from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.physics.apic import LiquidSimulator
-from fluidlift.synthetic import tanks
+from fluidlift.synthetic import filling, tanks
 from fluidlift.synthetic.analytic import film_speed, on_faces, tilted_channel
 from fluidlift.types import CellType, FluidParameters, Grid, Particles
 
@@ -27,7 +27,7 @@ def one_thread():
 def simulator_of(grid, positions, *, velocities=None, terrain=None, **parameters):
     particles = Particles.at_rest(positions, 1.0, velocities=velocities)
     return LiquidSimulator(
-        grid, terrain or tanks.terrain_of(grid), FluidParameters(**parameters), particles,
+        grid, terrain or filling.terrain_of(grid), FluidParameters(**parameters), particles,
         cell_types=np.zeros(grid.shape, np.uint8),
     )  # fmt: skip
 
@@ -35,7 +35,7 @@ def simulator_of(grid, positions, *, velocities=None, terrain=None, **parameters
 def test_a_falling_sheet_of_honey_falls_as_fast_as_a_stone_and_keeps_its_thickness():
     h = 0.01
     grid = Grid((14, 10, 40), h)
-    positions = tanks.inside(grid, lambda p: np.abs(p - [0.07, 0.05, 0.32]).max(axis=-1, initial=0.0) - 0.03)
+    positions = filling.inside(grid, lambda p: np.abs(p - [0.07, 0.05, 0.32]).max(axis=-1, initial=0.0) - 0.03)
     positions = positions[np.abs(positions[:, 0] - 0.07) < 0.0101]  # two cells thick
     simulator = simulator_of(grid, positions, kinematic_viscosity=0.05, time_step=0.01)
     duration = 0.2
@@ -44,7 +44,8 @@ def test_a_falling_sheet_of_honey_falls_as_fast_as_a_stone_and_keeps_its_thickne
     # nothing strains it and nothing rubs on it: air that is treated as a wall would hold it
     np.testing.assert_allclose(p.velocities[:, 2], -G * duration, rtol=0.01)
     assert np.abs(p.velocities[:, :2]).max() < 0.01 * G * duration
-    assert np.ptp(p.positions[:, 0]) == pytest.approx(np.ptp(positions[:, 0]), abs=0.2 * h)
+    # an irregular sample may be evened out once, which moves its rims by a tenth of a cell at most
+    assert p.positions[:, 0].std() == pytest.approx(positions[:, 0].std(), rel=0.1)
 
 
 @pytest.mark.parametrize("viscosity", [1e-6, 1.0], ids=["water", "very stiff honey"])
@@ -52,7 +53,7 @@ def test_viscosity_does_not_brake_a_body_that_turns_like_a_solid(viscosity):
     h, spin = 0.02, 1.0
     grid = Grid((24, 24, 10), h)
     middle = np.array([0.24, 0.24, 0.1])
-    positions = tanks.inside(
+    positions = filling.inside(
         grid, lambda p: np.maximum(np.hypot(*np.moveaxis(p - middle, -1, 0)[:2]) - 0.14, abs(p[..., 2] - 0.1) - 0.05)
     )
     r = positions - middle
@@ -84,7 +85,7 @@ def test_a_heap_of_honey_spreads_like_a_viscous_gravity_current():
     h = tank.grid.spacing
     floor = 2.4 * h
     grid = Grid((*tank.grid.shape[:2], tank.grid.shape[2] + 3), h)
-    terrain = tanks.terrain_of(grid, lambda p: p[..., 2] - floor)
+    terrain = filling.terrain_of(grid, lambda p: p[..., 2] - floor)
     simulator = simulator_of(
         grid, tank.particles.positions + np.float32([0, 0, floor]), terrain=terrain, kinematic_viscosity=viscosity,
         wall_damping=1.0, time_step=0.02,
@@ -114,9 +115,9 @@ def test_a_film_on_a_slope_flows_as_nusselt_says():
     def above(points):
         return (points - np.array([0.0, 0.0, foot + drop])) @ normal
 
-    terrain = tanks.terrain_of(grid, above, (np.cos(angle), 0.0, -np.sin(angle)))
+    terrain = filling.terrain_of(grid, above, (np.cos(angle), 0.0, -np.sin(angle)))
     channel = tilted_channel(thickness=thickness, slope=angle, viscosity=viscosity, gravity=G, height=foot + drop)
-    positions = tanks.inside(grid, lambda p: np.maximum(above(p) - thickness, 0.1 * h - above(p)))
+    positions = filling.inside(grid, lambda p: np.maximum(above(p) - thickness, 0.1 * h - above(p)))
     mean = G * np.sin(angle) * thickness**2 / (3 * viscosity)
     along = np.array([np.cos(angle), 0.0, -np.sin(angle)])
     centers = grid.centers()
@@ -175,17 +176,24 @@ def test_a_thread_of_honey_buckles_and_one_of_water_does_not():
 
 def test_honey_on_a_slope_sticks_to_the_board():
     tank = tanks.honey_slope(cells=32)
-    simulator = tank.simulator()
-    start = simulator.particles.positions
-    simulator.advance(0.5)
-    p = simulator.particles
-    moved = np.linalg.norm(p.positions - start, axis=1)
-    depth = sample_nodes(tank.terrain.signed_distance, tank.grid, start) / tank.grid.spacing
-    # the lowest half cell hardly leaves its place while the top slides over it
-    assert np.median(moved[depth < 0.5]) < 0.35 * np.median(moved[depth > 3.0])
-    water = replace(tank, parameters=replace(tank.parameters, kinematic_viscosity=1e-6, wall_damping=0.0)).simulator()
-    water.advance(0.2)
+    first = tank.simulator().particles
+
+    def moved(simulator):
+        """How far each of the first particles that is still there has gone, and how high it was above the board."""
+        now = simulator.particles
+        _, before, after = np.intersect1d(first.ids, now.ids, return_indices=True)
+        start = first.positions[before]
+        height = sample_nodes(tank.terrain.signed_distance, tank.grid, start) / tank.grid.spacing
+        return np.linalg.norm(now.positions[after] - start, axis=1), height
+
     simulator = tank.simulator()
     simulator.advance(0.2)
-    reach = [float(s.particles.positions[:, 0].mean()) for s in (simulator, water)]
-    assert reach[0] - start[:, 0].mean() < 0.5 * (reach[1] - start[:, 0].mean())
+    way, height = moved(simulator)
+    early = np.median(way)
+    simulator.advance(0.3)
+    way, height = moved(simulator)
+    # the lowest half cell hardly leaves its place while the top slides over it
+    assert np.median(way[height < 0.5]) < 0.35 * np.median(way[height > 3.0])
+    water = replace(tank, parameters=replace(tank.parameters, kinematic_viscosity=1e-6, wall_damping=0.0)).simulator()
+    water.advance(0.2)
+    assert early < 0.5 * np.median(moved(water)[0])

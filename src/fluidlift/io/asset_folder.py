@@ -37,7 +37,7 @@ from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.io.limits import read_json
 from fluidlift.io.ply import read_gaussians, write_gaussians
 from fluidlift.io.scene import SCENE_TEMPLATE, read_scene
-from fluidlift.io.stage_cache import WORK_MARKER, load_stage, mark_work_folder, save_stage
+from fluidlift.io.stage_cache import WORK_MARKER, is_owner, load_stage, mark_owner, mark_work_folder, save_stage
 from fluidlift.io.volume_grid import VolumeGrid, velocity_grid, write_vdb
 from fluidlift.types import (
     FORMAT_VERSION,
@@ -54,9 +54,9 @@ from fluidlift.types import (
 )
 
 __all__ = [
-    "FILES", "asset_file", "atomic_path", "atomic_write", "check_output_folder", "disk_errors", "load_asset",
-    "load_stage", "read_manifest", "read_parameters", "read_scene", "require_free_space", "save_asset", "save_stage",
-    "update_manifest", "write_parameters",
+    "FILES", "asset_file", "atomic_path", "atomic_write", "check_output_folder", "disk_errors", "is_owner",
+    "load_asset", "load_stage", "mark_owner", "read_manifest", "read_parameters", "read_scene", "require_free_space",
+    "save_asset", "save_stage", "update_manifest", "write_parameters",
 ]  # fmt: skip
 
 FILES = {

@@ -88,7 +88,7 @@ def read_checkpoint(path: Path | str, *, max_bytes: int = _MAX_BYTES) -> Checkpo
         raise _damaged(path, error) from None
     state = {k.removeprefix("state."): a for k, a in arrays.items() if k.startswith("state.")}
     history = {k.removeprefix("history."): a for k, a in arrays.items() if k.startswith("history.")}
-    wrong = [k for k, a in history.items() if a.shape != (head["frames"],)]
+    wrong = [k for k, a in history.items() if a.ndim == 0 or len(a) != head["frames"]]
     if wrong:
         raise InputRejected(
             f"the checkpoint '{path.name}' has {wrong[0]} of another length", f"{head['frames']} frames"

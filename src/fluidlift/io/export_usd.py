@@ -7,18 +7,18 @@ one, show the `Points` of the same frames, with velocities and stable ids. z is 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdVol, Vt
+from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom, UsdVol, Vt
 
 from fluidlift.errors import require
 from fluidlift.io.atomic import atomic_path, write_bytes
 from fluidlift.io.color import linear_from_srgb
-from fluidlift.io.frames import FIRST_FRAME, FluidFrame
+from fluidlift.io.frames import FIRST_FRAME, FluidFrame, MovingMesh
 from fluidlift.io.validate_usd import validate_usd
 from fluidlift.types import Gaussians, PinholeCamera, TriangleMesh
 
@@ -48,6 +48,7 @@ def write_usd(
     start_frame: int = FIRST_FRAME,
     terrain: TriangleMesh | None = None,
     camera: PinholeCamera | None = None,
+    bodies: Sequence[MovingMesh] = (),
     attributes: Mapping[str, Any] | None = None,
     half: bool = True,
 ) -> list[Path]:
@@ -60,6 +61,7 @@ def write_usd(
         start_frame: time code of the first frame.
         terrain: solid surface with colours.
         camera: of the video.
+        bodies: solids in the fluid, with a pose for every frame.
         attributes: custom attributes of the asset, written as fluid:NAME (numbers, 3-vectors, text).
         half: store scales, opacities, orientations and harmonics in half precision; positions never are, because 11
             bits are a centimetre at ten metres.
@@ -78,7 +80,7 @@ def write_usd(
     payload = path.with_suffix(".usdc")
     with atomic_path(payload) as temporary:
         temporary.unlink(missing_ok=True)
-        count = _write_payload(temporary, frames, fps, start_frame, terrain, camera, half)
+        count = _write_payload(temporary, frames, fps, start_frame, (terrain, camera, bodies), half)
     _reload(payload)
     times = (start_frame, start_frame + count - 1)
     write_bytes(path, _interface(payload.name, fps, times, attributes or {}).encode())
@@ -151,17 +153,19 @@ def _write_payload(
     frames: Iterable[FluidFrame | tuple],
     fps: float,
     start_frame: int,
-    terrain: TriangleMesh | None,
-    camera: PinholeCamera | None,
+    beside: tuple[TriangleMesh | None, PinholeCamera | None, Sequence[MovingMesh]],
     half: bool,
 ) -> int:
-    """All prims; the number of frames."""
+    """All prims; the number of frames. `beside` the fluid: terrain, camera, bodies."""
+    terrain, camera, bodies = beside
     stage = Usd.Stage.CreateNew(str(path))
     root = UsdGeom.Xform.Define(stage, "/Fluid").GetPrim()
     if terrain is not None:
         _write_mesh(UsdGeom.Mesh.Define(stage, "/Fluid/Terrain"), terrain, None, Usd.TimeCode.Default())
     if camera is not None:
         write_camera(UsdGeom.Camera.Define(stage, "/Fluid/Camera"), camera)
+    for number, solid in enumerate(bodies):
+        _write_body(stage, solid, number, start_frame)
     body = _Body(stage, half)
     unsaved, count = 0, 0
     for count, frame in enumerate(frames, start=1):  # the count is the result
@@ -170,6 +174,9 @@ def _write_payload(
             stage.GetRootLayer().Save()
             unsaved = 0
     require(count > 0, "no frames to write")
+    for solid in bodies:
+        poses = (np.shape(solid.positions), np.shape(solid.orientations))
+        require(poses == ((count, 3), (count, 4)), f"poses {poses} of body '{solid.name}'", f"{count} of each")
     _set_stage(stage, root, fps, (start_frame, start_frame + count - 1))
     stage.GetRootLayer().Save()
     return count
@@ -298,6 +305,23 @@ def _write_mesh(mesh: UsdGeom.Mesh, value: TriangleMesh, velocities: np.ndarray 
         mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).Set(_vec3(linear_colors(value.colors), False), time)
     if velocities is not None:
         mesh.CreateVelocitiesAttr().Set(_vec3(np.asarray(velocities), False), time)
+
+
+def _write_body(stage: Usd.Stage, solid: MovingMesh, number: int, start_frame: int) -> None:
+    """A mesh under a transform with a sample per frame; its name, with its number where names become the same."""
+    name = Tf.MakeValidIdentifier(solid.name)
+    place = f"/Fluid/Bodies/{name}"
+    if stage.GetPrimAtPath(place):
+        place += f"_{number}"
+    prim = UsdGeom.Mesh.Define(stage, place)
+    _write_mesh(prim, solid.mesh, None, Usd.TimeCode.Default())
+    move = prim.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble)
+    turn = prim.AddOrientOp(UsdGeom.XformOp.PrecisionDouble)
+    for k, (x, q) in enumerate(zip(solid.positions, solid.orientations)):
+        position, orientation = Gf.Vec3d(*map(float, x)), Gf.Quatd(*map(float, q))
+        for time in ([Usd.TimeCode.Default()] if k == 0 else []) + [Usd.TimeCode(start_frame + k)]:
+            move.Set(position, time)
+            turn.Set(orientation, time)
 
 
 def write_camera(prim: UsdGeom.Camera, camera: PinholeCamera) -> None:

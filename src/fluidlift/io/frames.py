@@ -13,6 +13,18 @@ FIRST_FRAME = 1001
 """number of the first frame of every exported sequence, as visual-effects departments count"""
 
 
+class MovingMesh(NamedTuple):
+    """A solid that an exporter shows in its poses."""
+
+    name: str
+    mesh: TriangleMesh
+    """m, in the body's own frame"""
+    positions: np.ndarray
+    """[k,3] m, of the body frame's origin at each frame"""
+    orientations: np.ndarray
+    """[k,4] unit quaternions w, x, y, z, world from body"""
+
+
 class FluidFrame(NamedTuple):
     """What an exporter shows at one frame."""
 

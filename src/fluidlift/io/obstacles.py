@@ -14,14 +14,17 @@ from fluidlift.errors import InputRejected
 from fluidlift.io.entries import Entries
 from fluidlift.io.read_mesh import read_any_mesh
 from fluidlift.numerics.solid_mesh import box_mesh, cylinder_mesh, ellipsoid_mesh
+from fluidlift.physics.rigid_body import MOTIONS, RigidBody, Trajectory, product, rotation_by
 from fluidlift.types import TriangleMesh
 
-MOTIONS = ("static", "animated", "free")
 SHAPES = ("sphere", "ellipsoid", "box", "cylinder")
 
 _MOST = 64
 _MOST_KEYS = 10_000
 _FAR = 1e5
+_LARGEST_ARC = 2.0
+"""rad between two poses of a body that turns steadily"""
+_MOST_POSES = 200_000
 _COMMON = ("name", "shape", "mesh", "position", "rotation", "scale", "motion", "density", "friction", "restitution",
            "velocity", "angular_velocity", "keyframes")  # fmt: skip
 _SIZES = {
@@ -37,8 +40,8 @@ class Keyframe:
     """s"""
     position: tuple[float, float, float]
     """m"""
-    rotation: Float[np.ndarray, "3 3"]
-    """world_from_body"""
+    rotation: Float[np.ndarray, "4"]
+    """quaternion w, x, y, z, world from body"""
 
 
 @dataclass(frozen=True)
@@ -50,15 +53,15 @@ class Obstacle:
     """m, scaled, around the body's own origin"""
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """m, of the body's origin in the world"""
-    rotation: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))
-    """world_from_body"""
+    rotation: Float[np.ndarray, "4"] = field(default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))
+    """quaternion w, x, y, z, world from body"""
     motion: str = "static"
     """static; animated: moves as told; free: moves as fluid and gravity push it"""
     density: float = 500.0
     """kg/m^3, of a free one"""
     friction: float = 0.5
     """Coulomb's coefficient against terrain and other bodies"""
-    restitution: float = 0.0
+    restitution: float = 0.2
     """0 to 1"""
     velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """m/s, at the first instant"""
@@ -69,14 +72,56 @@ class Obstacle:
     line: str = ""
     """where it stands in the file, for later complaints"""
 
+    def plain(self) -> list[Any]:
+        """What it is, as values that can be compared; not where it stands in the file."""
+        keys = [x for k in self.keyframes for x in (k.time, k.position, k.rotation)]
+        numbers = [self.density, self.friction, self.restitution, self.velocity, self.angular_velocity]
+        shape = [np.asarray(self.mesh.vertices), np.asarray(self.mesh.faces)]
+        return [self.name, self.motion, self.position, self.rotation, *numbers, *shape, *keys]
 
-def rotation_of(degrees: tuple[float, float, float]) -> Float[np.ndarray, "3 3"]:
-    """Turned about the world's x, then y, then z axis."""
-    (cx, cy, cz), (sx, sy, sz) = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
-    about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
-    about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
-    return about_z @ about_y @ about_x
+    def body(self, duration: float) -> RigidBody:
+        """The body as physics takes it.
+
+        Args:
+            duration: s, for which a motion of constant velocity is written out.
+
+        Raises:
+            InputRejected: a mesh that does not bound a solid.
+        """
+        free = self.motion == "free"
+        try:
+            return RigidBody(
+                self.name, self.mesh, density=self.density, motion=self.motion, position=np.array(self.position),
+                orientation=self.rotation, velocity=np.array(self.velocity if free else (0.0, 0.0, 0.0)),
+                angular_velocity=np.array(self.angular_velocity if free else (0.0, 0.0, 0.0)),
+                trajectory=self._trajectory(duration) if self.motion == "animated" else None,
+                restitution=self.restitution, friction=self.friction,
+            )  # fmt: skip
+        except InputRejected as error:
+            raise InputRejected(f"{self.line}: {error.got}", error.needed, error.do) from None
+
+    def _trajectory(self, duration: float) -> Trajectory:
+        if self.keyframes:
+            times, positions, rotations = zip(*((k.time, k.position, k.rotation) for k in self.keyframes))
+            return Trajectory(np.array(times), np.array(positions), np.array(rotations))
+        # poses less than half a turn apart, so that the arc between two is the shorter one; their times do not depend
+        # on the duration, so that a longer simulation goes on as the shorter one did
+        spin = np.array(self.angular_velocity)
+        apart = _LARGEST_ARC / max(float(np.sqrt(np.square(spin).sum())), _LARGEST_ARC)
+        count = math.ceil(duration / apart) + 2
+        if count > _MOST_POSES:
+            raise InputRejected(
+                f"{self.line}: a body that turns by {duration / apart * _LARGEST_ARC:.3g} rad", "less, or keyframes"
+            )
+        times = apart * np.arange(count)
+        positions = np.array(self.position) + times[:, None] * np.array(self.velocity)
+        return Trajectory(times, positions, np.array([product(rotation_by(t * spin), self.rotation) for t in times]))
+
+
+def rotation_of(degrees: tuple[float, float, float]) -> Float[np.ndarray, "4"]:
+    """Quaternion w, x, y, z of turns about the world's x, then y, then z axis."""
+    about_x, about_y, about_z = (rotation_by(np.radians(d) * np.eye(3)[axis]) for axis, d in enumerate(degrees))
+    return product(about_z, product(about_y, about_x))
 
 
 def read_obstacles(scene: Entries, meshes: Path) -> tuple[Obstacle, ...]:
@@ -130,7 +175,7 @@ def _read(entry: Entries, number: int, meshes: Path) -> Obstacle:
         motion=motion,
         density=entry.number("density", 500.0, low=1e-3, high=1e6, unit="kg/m^3"),
         friction=entry.number("friction", 0.5, low=0.0, high=10.0, unit=""),
-        restitution=entry.number("restitution", 0.0, low=0.0, high=1.0, unit=""),
+        restitution=entry.number("restitution", 0.2, low=0.0, high=1.0, unit=""),
         velocity=entry.vector("velocity", (0.0, 0.0, 0.0), limit=1e3, unit="m/s"),
         angular_velocity=entry.vector("angular_velocity", (0.0, 0.0, 0.0), limit=1e4, unit="rad/s"),
         keyframes=keyframes,

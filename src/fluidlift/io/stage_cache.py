@@ -84,6 +84,26 @@ def load_stage(folder: Path | str, stage: str, key: str) -> tuple[dict[str, np.n
         return None
 
 
+def mark_owner(folder: Path | str, stage: str, key: str | None) -> None:
+    """Note which result the files beside the cache (frames, pictures) belong to; None: to none, they are being made."""
+    data, _ = _names(folder, stage, key or "none")
+    owner = data.with_name("owner")
+    if key is None:
+        owner.unlink(missing_ok=True)
+    else:
+        write_bytes(owner, key.encode())
+
+
+def is_owner(folder: Path | str, stage: str, key: str) -> bool:
+    """Whether the files beside the cache belong to this result."""
+    data, _ = _names(folder, stage, key)
+    owner = data.with_name("owner")
+    try:
+        return not owner.is_symlink() and owner.read_bytes()[:128] == key.encode()
+    except OSError:
+        return False
+
+
 def _forget_old(place: Path, key: str) -> None:
     """Remove all but the newest results; the one just written stays in any case."""
     others = [p for p in place.glob("*.json") if p.stem != key]

@@ -30,13 +30,50 @@ def terrain_surfels(terrain: Terrain, *, opacity: float = 0.98) -> Gaussians:
     if len(mesh.vertices) == 0:
         return Gaussians.empty()
     normals = vertex_normals(mesh)
-    light = LIGHT / np.linalg.norm(LIGHT)
-    shade = 0.55 + 0.45 * np.clip(normals @ light, 0.0, 1.0)
     colors = np.full((len(normals), 3), 0.5) if mesh.colors is None else mesh.colors
+    return _surfels(mesh.vertices, normals, h, colors, opacity)
+
+
+def _surfels(points: np.ndarray, normals: np.ndarray, spacing: np.ndarray | float, colors, opacity: float) -> Gaussians:
+    """Flat Gaussians, shaded as under `LIGHT`."""
+    shade = 0.55 + 0.45 * np.clip(normals @ (LIGHT / np.linalg.norm(LIGHT)), 0.0, 1.0)
     outer = normals[:, :, None] * normals[:, None, :]
-    covariance = (0.62 * h) ** 2 * (np.eye(3) - outer) + (0.12 * h) ** 2 * outer
-    quats, scales = decompose_covariances(covariance)
-    return Gaussians(mesh.vertices, quats, scales, np.full(len(normals), opacity), sh_from_rgb(colors * shade[:, None]))
+    h = np.broadcast_to(np.asarray(spacing, np.float64), (len(points),))[:, None, None]
+    quats, scales = decompose_covariances((0.62 * h) ** 2 * (np.eye(3) - outer) + (0.12 * h) ** 2 * outer)
+    return Gaussians(points, quats, scales, np.full(len(points), opacity), sh_from_rgb(colors * shade[:, None]))
+
+
+def mesh_surfels(
+    mesh: TriangleMesh, spacing: float, *, color: tuple[float, float, float] = (0.75, 0.35, 0.2), most: int = 60_000
+) -> Gaussians:
+    """Flat Gaussians all over the faces of a mesh, about `spacing` (m) apart, farther where there would be too many.
+
+    Args:
+        mesh: any triangles; a large one gets many surfels.
+        spacing: m.
+        color: sRGB.
+        most: surfels, about.
+    """
+    a, b, c = (np.asarray(mesh.vertices, np.float64)[mesh.faces[:, k]] for k in range(3))
+    cross = np.cross(b - a, c - a)
+    area = 0.5 * np.linalg.norm(cross, axis=1)
+    spacing = max(spacing, math.sqrt(2.0 * float(area.sum()) / most))
+    longest = np.sqrt(np.max([np.square(b - a).sum(1), np.square(c - b).sum(1), np.square(a - c).sum(1)], axis=0))
+    parts = np.clip(np.ceil(longest / spacing), 1, 200).astype(int)
+    points, normals, sizes = [], [], []
+    for n in np.unique(parts):
+        # centres of the n^2 triangles that a face is cut into: n (n + 1) / 2 upright ones and the others between them
+        i, j = (x.ravel() for x in np.meshgrid(np.arange(n), np.arange(n), indexing="ij"))
+        upright, between = i + j < n, i + j < n - 1
+        s = np.concatenate([i[upright] + 1 / 3, i[between] + 2 / 3]) / n
+        t = np.concatenate([j[upright] + 1 / 3, j[between] + 2 / 3]) / n
+        at = (parts == n) & (area > 0)
+        place = a[at][:, None] * (1 - s - t)[:, None] + b[at][:, None] * s[:, None] + c[at][:, None] * t[:, None]
+        points.append(place.reshape(-1, 3))
+        normals.append(np.repeat(0.5 * cross[at] / area[at, None], len(s), axis=0))
+        sizes.append(np.repeat(longest[at] / n, len(s)))
+    where = np.concatenate(points)
+    return _surfels(where, np.concatenate(normals), np.concatenate(sizes), np.array([color] * len(where)), 0.98)
 
 
 def terrain_depth(terrain: Terrain, camera: PinholeCamera, *, steps: int = 96) -> Float[np.ndarray, "h w"]:

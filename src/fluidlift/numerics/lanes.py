@@ -13,8 +13,11 @@ import operator
 from typing import Any
 
 from llvmlite import ir
-from numba import types
-from numba.extending import intrinsic, models, overload, register_model
+from numba import extending, types
+from numba.extending import models, overload, register_model
+
+intrinsic: Any = extending.intrinsic
+"""untyped: kernels call an intrinsic without its first argument"""
 
 
 class FloatVector(types.Type):
@@ -41,7 +44,7 @@ def _address(context: Any, builder: Any, array_type: Any, array: Any, index: Any
 
 def _load(result: FloatVector) -> Any:
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        address = _address(context, builder, signature.args[0], *args, context.get_value_type(result))
+        address = _address(context, builder, signature.args[0], args[0], args[1], context.get_value_type(result))
         return builder.load(address, align=4)
 
     return codegen
@@ -64,7 +67,7 @@ def store(typingctx, array, index, vector):
     """array[index : index + lanes] = vector."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        address = _address(context, builder, signature.args[0], *args[:2], args[2].type)
+        address = _address(context, builder, signature.args[0], args[0], args[1], args[2].type)
         builder.store(args[2], address, align=4)
         return context.get_dummy_value()
 

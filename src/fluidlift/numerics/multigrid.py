@@ -1,332 +1,238 @@
 """Conjugate gradients preconditioned by a geometric multigrid V-cycle, for the cell Poisson equation.
 
 After McAdams, Sifakis, Teran 2010, "A parallel multigrid Poisson solver for fluids simulation on large grids". The
-coarse operator is the Galerkin product with piecewise constant transfer, times one half: piecewise constant
-interpolation overestimates the energy of smooth corrections by two, and the scaling mends it (Braess 1995).
-The Krylov space is kept in double precision, the V-cycle in single.
-
-Arrays of a level carry a ring of ghost cells, and `coupling_x[i]` joins the cells i-1 and i. Only the range of
-unknown cells of each vertical column is visited (`first`, `last`): a river fills a small part of its box.
+Krylov space is kept in double precision, the V-cycle in single. `multigrid_assembly` holds the operators,
+`multigrid_kernels` the memory and its kernels, `multigrid_cycle` the iteration.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import get_num_threads, set_num_threads
 
-SWEEPS = 2
-"""red-black Gauss-Seidel sweeps before and after each coarse correction"""
-COARSEST_SWEEPS = 12
-COARSEST_CELLS = 4
-"""coarsening stops when the longest side has this many cells"""
+from fluidlift.numerics import components, multigrid_assembly, multigrid_cycle
+from fluidlift.numerics.multigrid_kernels import BASE, CELLS, HALF, PARTS, PLANES, ROW_BASE, ROWS, SEGMENT_BASE
+
+SERIAL_CELLS = 65536
+"""levels with fewer unknown cells are visited by one thread: waking another costs more"""
+
+
+@dataclass(frozen=True)
+class Hierarchy:
+    """The operator, in units of 1 / spacing^2, on ever coarser grids; memory as in `multigrid_kernels`."""
+
+    geometry: np.ndarray
+    common: np.ndarray
+    """float32 [levels,3]"""
+    corner: np.ndarray
+    """indices of the first cell of the finest level in the arrays of the whole grid"""
+    x: np.ndarray
+    rhs: np.ndarray
+    inverse: np.ndarray
+    air: np.ndarray
+    couplings: tuple[np.ndarray, np.ndarray, np.ndarray]
+    rows: tuple[np.ndarray, np.ndarray, np.ndarray]
+    segments: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+    beside_known: np.ndarray
+    """bool, in the arrays of the whole grid: unknown cells with an open face to a known cell, or an added diagonal"""
+
+    @property
+    def size(self) -> int:
+        """Length of the arrays of the finest level."""
+        return int(2 * self.geometry[0, HALF] * self.geometry[0, PLANES])
+
+    @property
+    def fine(self) -> tuple[np.ndarray, np.ndarray]:
+        """Line of the finest level and its corner."""
+        return self.geometry[0], self.corner
+
+
+class LowRank(NamedTuple):
+    """Terms J_b^T M_b^-1 J_b of the operator, b = 0 to n-1, one after the other."""
+
+    cells: np.ndarray
+    """int64 [m,3]"""
+    values: np.ndarray
+    """float64 [m,6]: J_b^T at these cells"""
+    starts: np.ndarray
+    """int64 [n+1]: term b has the lines starts[b] to starts[b+1] - 1"""
+    inverse_mass: np.ndarray
+    """float64 [n,6,6]"""
+
+
+NO_TERMS = LowRank(np.zeros((0, 3), np.int64), np.zeros((0, 6)), np.zeros(1, np.int64), np.zeros((0, 6, 6)))
+
+
+class Solution(NamedTuple):
+    """What the solver found, and how."""
+
+    p: np.ndarray
+    """[nx,ny,nz], 0 outside the unknown cells"""
+    iterations: int
+    residual: float
+    """|b - A p| / |b|, b without its means over closed components; not finite where an input is not"""
+    closed: int
+    """closed components whose constant is free or was removed"""
+    removed: float
+    """|part of the right side that no p can answer| / |b|"""
+
+
+@contextmanager
+def _threads(cells: int) -> Iterator[None]:
+    """One thread for few cells."""
+    threads = get_num_threads()
+    if cells < SERIAL_CELLS:
+        set_num_threads(1)
+    try:
+        yield
+    finally:
+        set_num_threads(threads)
+
+
+def _assemble(
+    unknown: np.ndarray,
+    weights: tuple[np.ndarray, np.ndarray, np.ndarray],
+    box: np.ndarray,
+    added_diagonal: np.ndarray | None,
+) -> Hierarchy:
+    """All levels; box from `multigrid_assembly.bounds`, with some unknown cell."""
+    planes = np.flatnonzero(box[:, 4])
+    low = np.array([planes[0], box[planes, 0].min(), box[planes, 2].min()])
+    high = np.array([planes[-1] + 1, box[:, 1].max(), box[:, 3].max()])
+    geometry = multigrid_assembly.geometry_of(tuple(int(n) for n in high - low))
+    last_level = geometry[-1]
+    cells = int(last_level[BASE] + 2 * last_level[HALF] * last_level[PLANES])
+    x, rhs, inverse, air, cx, cy, cz = (np.zeros(cells, np.float32) for _ in range(7))
+    count = int(last_level[ROW_BASE] + last_level[PLANES] * last_level[ROWS])
+    first, last, same = np.zeros(count, np.int32), np.zeros(count, np.int32), np.zeros(count, bool)
+    common = np.zeros((len(geometry), 3), np.float32)
+    blocks = [np.zeros((g[PLANES], g[HALF] // multigrid_assembly.BLOCK), np.uint8) for g in geometry]
+    offset = np.zeros(int(last_level[SEGMENT_BASE] + last_level[PLANES] + 1), np.int32)
+    most = sum(b.size for b in blocks)
+    start, stop, segment_same = np.empty(most, np.int32), np.empty(most, np.int32), np.empty(most, bool)
+    beside = np.zeros(unknown.shape, bool)
+    added = np.zeros((0, 0, 0), np.float32) if added_diagonal is None else _single(added_diagonal)
+    for level, g in enumerate(geometry):
+        if level == 0:
+            multigrid_assembly.assemble_finest(g, low, unknown, *weights, added, air, cx, cy, cz, first, last, beside)
+        else:
+            multigrid_assembly.assemble_coarse(geometry[level - 1], g, inverse, air, cx, cy, cz, first, last)
+        g[CELLS] = multigrid_assembly.invert_diagonal(g, air, cx, cy, cz, inverse, common[level])
+        multigrid_assembly.classify(g, common[level], inverse, cx, cy, cz, same, blocks[level])
+        multigrid_assembly.find_segments(g, blocks[level], offset, start, stop, segment_same)
+        if g[CELLS] >= SERIAL_CELLS:
+            g[PARTS] = max(1, min(get_num_threads(), (g[PLANES] - 2) // multigrid_cycle.LEAST_PLANES))
+    used = offset[-1]
+    segments = (offset, start[:used].copy(), stop[:used].copy(), segment_same[:used].copy())
+    rows = (first, last, same)
+    return Hierarchy(geometry, common, low, x, rhs, inverse, air, (cx, cy, cz), rows, segments, beside)
+
+
+def _single(array: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(array, np.float32)
+
+
+def _cycle(hierarchy: Hierarchy) -> None:
+    h = hierarchy
+    sums = np.zeros(h.geometry[0, PLANES])
+    multigrid_cycle.cycle(h.geometry, h.common, h.x, h.rhs, h.inverse, h.air, *h.couplings, h.rows, h.segments, sums)
 
 
 @dataclass(frozen=True)
 class Level:
-    """The operator on one grid and its work space, all padded by one ghost cell."""
+    """The finest level of a hierarchy as arrays [nx+2,ny+2,nz+2] with a ring of ghost cells, for `v_cycle`."""
 
-    diagonal: np.ndarray
     inverse: np.ndarray
     """1 / diagonal, 0 outside the unknown cells"""
-    couplings: tuple[np.ndarray, np.ndarray, np.ndarray]
-    """weight / h^2 between neighbouring unknown cells"""
-    first: np.ndarray
-    last: np.ndarray
-    """int32 per column: the unknown cells lie in first <= k < last"""
     x: np.ndarray
     rhs: np.ndarray
-
-
-@njit(parallel=True, cache=True)
-def _smooth(x, rhs, inverse, cx, cy, cz, first, last, color):
-    """One half sweep of Gauss-Seidel over the cells of one colour."""
-    nx, ny, _ = x.shape
-    for i_ in prange(1, nx - 1):
-        i = np.int64(i_)
-        for j in range(1, ny - 1):
-            start = np.int64(first[i, j])
-            start += (i + j + start + color) & 1
-            for k in range(start, np.int64(last[i, j]), 2):
-                total = (
-                    rhs[i, j, k]
-                    + cx[i, j, k] * x[i - 1, j, k]
-                    + cx[i + 1, j, k] * x[i + 1, j, k]
-                    + cy[i, j, k] * x[i, j - 1, k]
-                    + cy[i, j + 1, k] * x[i, j + 1, k]
-                    + cz[i, j, k] * x[i, j, k - 1]
-                    + cz[i, j, k + 1] * x[i, j, k + 1]
-                )
-                x[i, j, k] = total * inverse[i, j, k]
-
-
-@njit(parallel=True, cache=True)
-def _restrict_residual(x, rhs, diagonal, cx, cy, cz, first, last, coarse_rhs, coarse_x):
-    """Sum of the fine residuals in each coarse cell; the coarse guess becomes 0."""
-    nx, ny, nz = coarse_rhs.shape
-    fx, fy, _ = x.shape
-    for ci_ in prange(1, nx - 1):
-        ci = np.int64(ci_)
-        for cj in range(1, ny - 1):
-            for ck in range(1, nz - 1):
-                coarse_rhs[ci, cj, ck] = 0.0
-                coarse_x[ci, cj, ck] = 0.0
-            for i in range(2 * ci - 1, min(2 * ci + 1, fx - 1)):
-                for j in range(2 * cj - 1, min(2 * cj + 1, fy - 1)):
-                    for k in range(np.int64(first[i, j]), np.int64(last[i, j])):
-                        if diagonal[i, j, k] > 0:
-                            coarse_rhs[ci, cj, (k + 1) // 2] += (
-                                rhs[i, j, k]
-                                - diagonal[i, j, k] * x[i, j, k]
-                                + cx[i, j, k] * x[i - 1, j, k]
-                                + cx[i + 1, j, k] * x[i + 1, j, k]
-                                + cy[i, j, k] * x[i, j - 1, k]
-                                + cy[i, j + 1, k] * x[i, j + 1, k]
-                                + cz[i, j, k] * x[i, j, k - 1]
-                                + cz[i, j, k + 1] * x[i, j, k + 1]
-                            )
-
-
-@njit(parallel=True, cache=True)
-def _add_coarse(x, diagonal, first, last, coarse_x):
-    """x += the coarse correction, constant over each coarse cell."""
-    nx, ny, _ = x.shape
-    for i_ in prange(1, nx - 1):
-        i = np.int64(i_)
-        for j in range(1, ny - 1):
-            for k in range(np.int64(first[i, j]), np.int64(last[i, j])):
-                if diagonal[i, j, k] > 0:
-                    x[i, j, k] += coarse_x[(i + 1) // 2, (j + 1) // 2, (k + 1) // 2]
-
-
-@njit(parallel=True, cache=True)
-def _apply(p, out, diagonal, cx, cy, cz, first, last):
-    """out = A p; returns p . out."""
-    nx, ny, _ = p.shape
-    rows = np.zeros(nx)
-    for i_ in prange(1, nx - 1):
-        i = np.int64(i_)
-        dot = 0.0
-        for j in range(1, ny - 1):
-            for k in range(np.int64(first[i, j]), np.int64(last[i, j])):
-                total = (
-                    diagonal[i, j, k] * p[i, j, k]
-                    - cx[i, j, k] * p[i - 1, j, k]
-                    - cx[i + 1, j, k] * p[i + 1, j, k]
-                    - cy[i, j, k] * p[i, j - 1, k]
-                    - cy[i, j + 1, k] * p[i, j + 1, k]
-                    - cz[i, j, k] * p[i, j, k - 1]
-                    - cz[i, j, k + 1] * p[i, j, k + 1]
-                )
-                out[i, j, k] = total
-                dot += p[i, j, k] * total
-        rows[i] = dot
-    return rows.sum()
-
-
-@njit(parallel=True, cache=True)
-def _descend(p, r, direction, q, step, first, last):
-    """p += step direction, r -= step q; returns r . r. (Kernels of our own: threaded BLAS stalls on busy machines.)"""
-    nx, ny, _ = p.shape
-    rows = np.zeros(nx)
-    for i_ in prange(1, nx - 1):
-        i = np.int64(i_)
-        dot = 0.0
-        for j in range(1, ny - 1):
-            for k in range(np.int64(first[i, j]), np.int64(last[i, j])):
-                p[i, j, k] += step * direction[i, j, k]
-                r[i, j, k] -= step * q[i, j, k]
-                dot += r[i, j, k] * r[i, j, k]
-        rows[i] = dot
-    return rows.sum()
-
-
-@njit(parallel=True, cache=True)
-def _dot(r, z, first, last):
-    """r . z over the columns."""
-    nx, ny, _ = r.shape
-    rows = np.zeros(nx)
-    for i_ in prange(1, nx - 1):
-        i = np.int64(i_)
-        dot = 0.0
-        for j in range(1, ny - 1):
-            for k in range(np.int64(first[i, j]), np.int64(last[i, j])):
-                dot += r[i, j, k] * z[i, j, k]
-        rows[i] = dot
-    return rows.sum()
-
-
-@njit(parallel=True, cache=True)
-def _turn(direction, z, factor, first, last):
-    """direction = z + factor direction."""
-    nx, ny, _ = direction.shape
-    for i_ in prange(1, nx - 1):
-        i = np.int64(i_)
-        for j in range(1, ny - 1):
-            for k in range(np.int64(first[i, j]), np.int64(last[i, j])):
-                direction[i, j, k] = z[i, j, k] + factor * direction[i, j, k]
-
-
-@njit(parallel=True, cache=True)
-def _right_side(r, inverse, scale, cycles, rhs, x, first, last):
-    """Prepare the preconditioner: rhs = scale r, x = 0; or x = r / diagonal where there are no cycles."""
-    nx, ny, _ = r.shape
-    for i_ in prange(1, nx - 1):
-        i = np.int64(i_)
-        for j in range(1, ny - 1):
-            for k in range(np.int64(first[i, j]), np.int64(last[i, j])):
-                rhs[i, j, k] = scale * r[i, j, k]
-                x[i, j, k] = 0.0 if cycles else scale * r[i, j, k] * inverse[i, j, k]
-
-
-@njit(parallel=True, cache=True)
-def _coarse_couplings(fine, axis, coarse):
-    """Half the sum of the fine couplings across each coarse face."""
-    nx, ny, nz = coarse.shape
-    fx, fy, fz = fine.shape
-    di = 1 if axis == 0 else 2
-    dj = 1 if axis == 1 else 2
-    dk = 1 if axis == 2 else 2
-    for ci_ in prange(1, nx - 1):
-        ci = np.int64(ci_)
-        for cj in range(1, ny - 1):
-            for ck in range(1, nz - 1):
-                total = 0.0
-                for i in range(2 * ci - 1, min(2 * ci - 1 + di, fx - 1)):
-                    for j in range(2 * cj - 1, min(2 * cj - 1 + dj, fy - 1)):
-                        for k in range(2 * ck - 1, min(2 * ck - 1 + dk, fz - 1)):
-                            total += fine[i, j, k]
-                coarse[ci, cj, ck] = 0.5 * total
-
-
-@njit(parallel=True, cache=True)
-def _coarse_diagonal(diagonal, cx, cy, cz, coarse):
-    """Half of the sum of the fine diagonals less the couplings inside the coarse cell (each counts twice)."""
-    nx, ny, nz = coarse.shape
-    fx, fy, fz = diagonal.shape
-    for ci_ in prange(1, nx - 1):
-        ci = np.int64(ci_)
-        for cj in range(1, ny - 1):
-            for ck in range(1, nz - 1):
-                total = 0.0
-                for i in range(2 * ci - 1, min(2 * ci + 1, fx - 1)):
-                    for j in range(2 * cj - 1, min(2 * cj + 1, fy - 1)):
-                        for k in range(2 * ck - 1, min(2 * ck + 1, fz - 1)):
-                            total += diagonal[i, j, k]
-                            if i == 2 * ci:
-                                total -= 2.0 * cx[i, j, k]
-                            if j == 2 * cj:
-                                total -= 2.0 * cy[i, j, k]
-                            if k == 2 * ck:
-                                total -= 2.0 * cz[i, j, k]
-                coarse[ci, cj, ck] = 0.5 * total
-
-
-def _column_ranges(unknown: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    some = unknown.any(axis=2)
-    first = np.where(some, unknown.argmax(axis=2), 1)
-    last = np.where(some, unknown.shape[2] - unknown[:, :, ::-1].argmax(axis=2), 1)
-    return first.astype(np.int32), last.astype(np.int32)
-
-
-def _level(diagonal: np.ndarray, couplings: tuple[np.ndarray, ...]) -> Level:
-    unknown = diagonal > 0
-    inverse = np.divide(1.0, diagonal, out=np.zeros_like(diagonal), where=unknown)
-    first, last = _column_ranges(unknown)
-    x, y, z = couplings
-    return Level(diagonal, inverse, (x, y, z), first, last, np.zeros_like(diagonal), np.zeros_like(diagonal))
-
-
-def _finest(
-    unknown: np.ndarray, weights: tuple[np.ndarray, ...], spacing: float, added_diagonal: np.ndarray | None
-) -> Level:
-    diagonal = np.zeros(tuple(n + 2 for n in unknown.shape), np.float32)
-    inner = (slice(1, -1),) * 3
-    couplings = []
-    total = np.zeros(unknown.shape, np.float32)
-    for axis, w in enumerate(weights):
-        w = np.moveaxis(w, axis, 0)
-        sum_here = np.moveaxis(total, axis, 0)
-        sum_here += w[1:]
-        sum_here += w[:-1]
-        cell = np.moveaxis(unknown, axis, 0)
-        coupling = np.zeros(diagonal.shape, np.float32)
-        np.moveaxis(coupling[inner], axis, 0)[1:] = np.where(cell[1:] & cell[:-1], w[1:-1], 0) / spacing**2
-        couplings.append(coupling)
-    total /= spacing**2
-    if added_diagonal is not None:
-        # only faces between unknown cells carry weight here: what is known has been put into the added diagonal
-        total += added_diagonal
-    diagonal[inner] = np.where(unknown, total, 0)
-    return _level(diagonal, tuple(couplings))
-
-
-def _coarser(level: Level) -> Level:
-    shape = tuple((n - 2 + 1) // 2 + 2 for n in level.diagonal.shape)
-    couplings = []
-    for axis in range(3):
-        coarse = np.zeros(shape, np.float32)
-        _coarse_couplings(level.couplings[axis], axis, coarse)
-        couplings.append(coarse)
-    diagonal = np.zeros(shape, np.float32)
-    _coarse_diagonal(level.diagonal, *level.couplings, diagonal)
-    # A coarse cell that holds all of a closed component keeps only the rounding of its couplings: nothing to solve.
-    strength = np.zeros(shape, np.float32)
-    for axis, c in enumerate(couplings):
-        along = np.moveaxis(strength, axis, 0)
-        along += np.moveaxis(c, axis, 0)
-        along[:-1] += np.moveaxis(c, axis, 0)[1:]
-    largest = float(level.diagonal.max(initial=0.0))
-    np.maximum(diagonal, strength, out=diagonal)
-    diagonal[diagonal < 1e-5 * largest] = 0.0
-    return _level(diagonal, tuple(couplings))
+    hierarchy: Hierarchy | None
+    """None where no cell is unknown"""
 
 
 def build_levels(
     unknown: np.ndarray,
-    weights: tuple[np.ndarray, ...],
+    weights: tuple[np.ndarray, np.ndarray, np.ndarray],
     spacing: float,
     *,
     added_diagonal: np.ndarray | None = None,
-    coarsen: bool = True,
 ) -> list[Level]:
-    """The operator on ever coarser grids, finest first; only the finest without `coarsen`."""
-    levels = [_finest(unknown, weights, spacing, added_diagonal)]
-    while coarsen and max(levels[-1].diagonal.shape) - 2 > COARSEST_CELLS:
-        levels.append(_coarser(levels[-1]))
-    return levels
+    """What `v_cycle` needs to solve (added_diagonal - div(weights grad)) x = rhs roughly.
+
+    Args:
+        unknown: bool [nx,ny,nz].
+        weights: face weights across x, y, z.
+        spacing: cell width, m.
+        added_diagonal: [nx,ny,nz] added to the operator (the unit matrix of implicit diffusion).
+    """
+    inverse, x, rhs = (np.zeros(tuple(n + 2 for n in unknown.shape), np.float32) for _ in range(3))
+    box = multigrid_assembly.bounds(np.ascontiguousarray(unknown))
+    if not box.any():
+        return [Level(inverse, x, rhs, None)]
+    scaled = tuple(_single(w) / np.float32(spacing**2) for w in weights)
+    with _threads(int(box[:, 4].sum())):
+        hierarchy = _assemble(np.ascontiguousarray(unknown), scaled, box, added_diagonal)
+        g, corner = hierarchy.fine
+        multigrid_assembly.store(g, corner + 1, hierarchy.inverse, hierarchy.inverse, *hierarchy.rows[:2], inverse)
+    return [Level(inverse, x, rhs, hierarchy)]
 
 
-def _sweeps(level: Level, colors: tuple[int, ...], count: int) -> None:
-    for _ in range(count):
-        for color in colors:
-            _smooth(level.x, level.rhs, level.inverse, *level.couplings, level.first, level.last, color)
+def v_cycle(levels: Sequence[Level]) -> None:
+    """levels[0].x becomes an approximate solution for levels[0].rhs: linear, symmetric, positive."""
+    level, hierarchy = levels[0], levels[0].hierarchy
+    if hierarchy is None:
+        return
+    g, corner = hierarchy.fine
+    with _threads(int(g[CELLS])):
+        multigrid_assembly.load(g, corner + 1, level.rhs, 1.0, hierarchy.inverse, *hierarchy.rows[:2], hierarchy.rhs)
+        _cycle(hierarchy)
+        multigrid_assembly.store(g, corner + 1, hierarchy.x, hierarchy.inverse, *hierarchy.rows[:2], level.x)
 
 
-def v_cycle(levels: list[Level]) -> None:
-    """levels[0].x, 0 before, becomes an approximate solution for levels[0].rhs: linear, symmetric, positive."""
-    for fine, coarse in pairwise(levels):
-        _sweeps(fine, (0, 1), SWEEPS)
-        _restrict_residual(
-            fine.x, fine.rhs, fine.diagonal, *fine.couplings, fine.first, fine.last, coarse.rhs, coarse.x
-        )
-    _sweeps(levels[-1], (0, 1), COARSEST_SWEEPS)
-    _sweeps(levels[-1], (1, 0), COARSEST_SWEEPS)
-    for fine, coarse in zip(levels[-2::-1], levels[:0:-1]):
-        _add_coarse(fine.x, fine.diagonal, fine.first, fine.last, coarse.x)
-        _sweeps(fine, (1, 0), SWEEPS)
+def _packed(hierarchy: Hierarchy, terms: LowRank, spacing: float) -> tuple[np.ndarray, ...]:
+    """The terms as `multigrid_cycle.add_low_rank` takes them, without cells that have no equation."""
+    g, corner = hierarchy.fine
+    _, nz, length, half = g[:4]
+    shape = np.array([g[PLANES] - 2, length - 2, nz - 2])
+    i, k, j = (terms.cells - corner + 1).T
+    inside = ((terms.cells >= corner) & (terms.cells < corner + shape)).all(axis=1)
+    m = j * length + k
+    places = np.where(inside, (2 * i + (m & 1)) * half + (m >> 1), 0)
+    values = np.where((hierarchy.inverse[places] > 0)[:, None], terms.values, 0.0)
+    return places, values, terms.starts, terms.inverse_mass * spacing**2
 
 
-def _bounding_box(mask: np.ndarray) -> tuple[slice, ...] | None:
-    box = []
-    for axis in range(3):
-        hit = np.flatnonzero(mask.any(axis=tuple(a for a in range(3) if a != axis)))
-        if len(hit) == 0:
-            return None
-        box.append(slice(int(hit[0]), int(hit[-1]) + 1))
-    return tuple(box)
+class _Means:
+    """Takes the free constants of closed components from right sides and solutions."""
+
+    def __init__(self, hierarchy: Hierarchy, closed: components.ClosedComponents, terms: LowRank, shape: tuple) -> None:
+        self.place = hierarchy.fine
+        self.closed = closed
+        count, bodies = len(closed.sizes), len(terms.inverse_mass)
+        forces, magnitudes = np.zeros((2, bodies, count, 6))
+        if count and bodies:
+            component = components.component_of_cells(closed, terms.cells, shape)
+            for b in range(bodies):
+                part = slice(terms.starts[b], terms.starts[b + 1])
+                inside = component[part] >= 0
+                np.add.at(forces[b], component[part][inside], terms.values[part][inside])
+                np.add.at(magnitudes[b], component[part][inside], np.abs(terms.values[part][inside]))
+        self.constants = components.free_constants(closed.sizes, forces, magnitudes, terms.inverse_mass)
+
+    def remove(self, values: np.ndarray) -> float:
+        """values less their free constants, in place; returns the norm of what was removed."""
+        count = len(self.closed.sizes)
+        if count == 0:
+            return 0.0
+        group = (*self.place, self.closed.runs, self.closed.labels)
+        means = self.constants.means(multigrid_assembly.component_sums(*group, count, values))
+        multigrid_assembly.shift_components(*group, -means, values)
+        return float(np.sqrt((self.closed.sizes * np.square(means)).sum()))
 
 
 def solve(
@@ -337,66 +243,48 @@ def solve(
     *,
     tolerance: float,
     max_iterations: int,
-    initial: np.ndarray,
-    added_diagonal: np.ndarray | None = None,
-    cycles: bool = True,
-) -> tuple[np.ndarray, int, float]:
-    """p (float64) with |rhs - A p| <= tolerance |rhs|, the number of iterations, and the true relative residual.
+    initial: np.ndarray | None = None,
+    low_rank: LowRank = NO_TERMS,
+) -> Solution:
+    """p with |b - A p| <= tolerance |b|, where b is rhs without what no p can answer.
 
     Args:
         unknown: bool [nx,ny,nz].
-        weights: face fractions across x, y, z.
+        weights: face weights across x, y, z, >= 0; between unknown cells open fractions, towards known cells any.
         spacing: cell width, m.
-        rhs: float64 [nx,ny,nz], of zero mean over closed components.
+        rhs: [nx,ny,nz], p / m^2; values outside the unknown cells are ignored.
         tolerance: relative residual in the 2-norm.
         max_iterations: of the conjugate gradients.
-        initial: float64 first guess.
-        added_diagonal: float32 [nx,ny,nz] added to the operator (the unit matrix of implicit diffusion).
-        cycles: precondition with V-cycles; False: with the diagonal, enough where the added diagonal dominates.
+        initial: first guess [nx,ny,nz].
+        low_rank: terms that are added to A.
     """
-    box = _bounding_box(unknown)
-    if box is None:
-        return np.zeros_like(rhs), 0, 0.0
-    cropped = []
-    for axis, w in enumerate(weights):
-        cut = list(box)
-        cut[axis] = slice(box[axis].start, box[axis].stop + 1)
-        cropped.append(w[tuple(cut)])
-    added = None if added_diagonal is None else added_diagonal[box]
-    levels = build_levels(unknown[box], tuple(cropped), spacing, added_diagonal=added, coarsen=cycles)
-    fine = levels[0]
-    inner = (slice(1, -1),) * 3
-    columns = (fine.first, fine.last)
-
-    def precondition() -> None:
-        _right_side(r, fine.inverse, scale, cycles, fine.rhs, fine.x, *columns)
-        if cycles:
-            v_cycle(levels)
-
-    p, r, q, direction = (np.zeros(fine.diagonal.shape) for _ in range(4))
-    p[inner] = initial[box]
-    p[fine.diagonal <= 0] = 0.0
-    r[inner] = np.where(unknown[box], rhs[box], 0.0)
-    size = float(np.sqrt(np.square(r).sum()))
-    goal = tolerance * size
-    scale = 1.0 / max(float(np.abs(r).max()), 1e-300)  # near one: single precision neither over- nor underflows
-    _apply(p, q, fine.diagonal, *fine.couplings, *columns)
-    squared = _descend(p, r, direction, q, 1.0, *columns)
-    iterations, rz = 0, 1.0
-    while iterations < max_iterations and squared > goal * goal:
-        precondition()
-        rz, previous = _dot(r, fine.x, *columns), rz
-        if not rz > 0:
-            break
-        _turn(direction, fine.x, rz / previous if iterations else 0.0, *columns)
-        curvature = _apply(direction, q, fine.diagonal, *fine.couplings, *columns)
-        if not curvature > 0:
-            break
-        squared = _descend(p, r, direction, q, rz / curvature, *columns)
-        iterations += 1
-    _apply(p, q, fine.diagonal, *fine.couplings, *columns)
-    r[inner] = np.where(unknown[box], rhs[box], 0.0)
-    residual = float(np.sqrt(np.square(r - q).sum())) / size if size > 0 else 0.0
-    out = np.zeros_like(rhs)
-    out[box] = p[inner]
-    return out, iterations, residual
+    out = np.zeros(unknown.shape, rhs.dtype)
+    unknown = np.ascontiguousarray(unknown)
+    box = multigrid_assembly.bounds(unknown)
+    if not box.any():
+        return Solution(out, 0, 0.0, 0, 0.0)
+    single = (_single(weights[0]), _single(weights[1]), _single(weights[2]))
+    with _threads(int(box[:, 4].sum())):
+        h = _assemble(unknown, single, box, None)
+        closed = components.closed_components(unknown, single, h.beside_known)
+        count = len(closed.sizes)
+        means = _Means(h, closed, low_rank, unknown.shape)
+        b, p = np.zeros(h.size), np.zeros(h.size)
+        where = (h.inverse, *h.rows[:2])
+        squares = multigrid_assembly.load(*h.fine, np.ascontiguousarray(rhs), spacing**2, *where, b)
+        if initial is not None:
+            guess = np.ascontiguousarray(initial)
+            squares += 0.0 * multigrid_assembly.load(*h.fine, guess, 1.0, *where, p)  # not finite if the guess is not
+        if not np.isfinite(squares):
+            return Solution(out, 0, float("nan"), count, 0.0)
+        removed = means.remove(b)
+        size = float(np.sqrt(np.square(b).sum() if removed > 0 else squares))
+        if size == 0.0:
+            return Solution(out, 0, 0.0, count, removed)
+        iterations, residual = multigrid_cycle.conjugate_gradients(
+            h.geometry, h.common, p, b, tolerance * size, max_iterations, h.x, h.rhs, h.inverse, h.air, *h.couplings,
+            h.rows, h.segments, _packed(h, low_rank, spacing),
+        )  # fmt: skip
+        means.remove(p)
+        multigrid_assembly.store(*h.fine, p, *where, out)
+    return Solution(out, iterations, residual / size, count, removed / size)

@@ -1,11 +1,16 @@
 """The Poisson equation on irregular cell domains: system, plain solvers, and the door to the fast one.
 
 Discretisation: cell-centred p, -div(w grad p) = b with open face fractions w (Batty, Bertails, Bridson 2007);
-a closed face (w = 0) is a Neumann wall, a known neighbour behind an open face holds p = 0 (air).
+a closed face (w = 0) is a Neumann wall, a known neighbour behind an open face holds p = 0 (air). Where air begins
+nearer than the neighbour's centre, the weight of that face is the open fraction over the distance in cells (ghost
+fluid): weights towards known cells may exceed 1.
+
+Rigid bodies that give way to the pressure add J^T M^-1 J each (Batty, Bertails, Bridson 2007): `LowRankTerm`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +20,7 @@ from scipy.sparse.csgraph import connected_components
 
 from fluidlift.errors import require
 from fluidlift.numerics import multigrid
+from fluidlift.numerics.components import FreeConstants, free_constants
 from fluidlift.types import SolveReport
 
 
@@ -25,7 +31,7 @@ class PoissonSystem:
     unknown: Bool[np.ndarray, "nx ny nz"]
     """cells whose pressure is solved"""
     weight_x: Float[np.ndarray, "nx+1 ny nz"]
-    """open fraction of each face, 0 (wall, or velocity prescribed) to 1"""
+    """open fraction of each face, 0 (wall, or velocity prescribed) to 1; towards known cells any weight >= 0"""
     weight_y: Float[np.ndarray, "nx ny+1 nz"]
     weight_z: Float[np.ndarray, "nx ny nz+1"]
     spacing: float
@@ -37,8 +43,8 @@ class PoissonSystem:
         return (self.weight_x, self.weight_y, self.weight_z)
 
     def diagonal(self) -> Float[np.ndarray, "nx ny nz"]:
-        """Sum of the face fractions of each cell over h^2."""
-        x, y, z = self.weights
+        """Sum of the face weights of each cell over h^2, in double precision as all that the operator does."""
+        x, y, z = (np.asarray(w, np.float64) for w in self.weights)
         total = x[1:] + x[:-1] + y[:, 1:] + y[:, :-1] + z[:, :, 1:] + z[:, :, :-1]
         return np.where(self.unknown, total, 0.0) / self.spacing**2
 
@@ -64,6 +70,49 @@ class PoissonSystem:
     def apply(self, p: Float[np.ndarray, "nx ny nz"]) -> Float[np.ndarray, "nx ny nz"]:
         """A p, zero outside the unknown cells."""
         return self.diagonal() * p - self.neighbour_sum(p)
+
+
+@dataclass(frozen=True)
+class LowRankTerm:
+    """J^T M^-1 J of one rigid body: pressure p exerts the force J p on it, and it gives way with M^-1 J p."""
+
+    cells: Int[np.ndarray, "n 3"]
+    """cells where J is not zero, each once"""
+    values: Float[np.ndarray, "n 6"]
+    """J^T at these cells: force (3) and torque (3) of unit pressure"""
+    inverse_mass: Float[np.ndarray, "6 6"]
+    """M^-1, symmetric, positive semidefinite; zero rows for motions that are held"""
+
+    def __post_init__(self) -> None:
+        n = len(self.cells)
+        require(self.cells.shape == (n, 3), f"cells {self.cells.shape}", "[n, 3]")
+        require(self.values.shape == (n, 6), f"values {self.values.shape}", f"[{n}, 6], one row per cell")
+        require(self.inverse_mass.shape == (6, 6), f"inverse mass {self.inverse_mass.shape}", "[6, 6]")
+
+    def apply(self, p: Float[np.ndarray, "nx ny nz"]) -> Float[np.ndarray, "nx ny nz"]:
+        """J^T M^-1 J p."""
+        place = tuple(self.cells.T)
+        force = (self.values * p[place][:, None]).sum(axis=0)
+        out = np.zeros_like(p)
+        out[place] = (self.values * (self.inverse_mass * force).sum(axis=1)).sum(axis=1)
+        return out
+
+    def diagonal(self, shape: tuple[int, ...]) -> Float[np.ndarray, "nx ny nz"]:
+        """The diagonal of J^T M^-1 J."""
+        out = np.zeros(shape)
+        out[tuple(self.cells.T)] = np.einsum("nm,ml,nl->n", self.values, self.inverse_mass, self.values)
+        return out
+
+    def row_sums(self, shape: tuple[int, ...]) -> Float[np.ndarray, "nx ny nz"]:
+        """At least the sums of the sizes in each row of J^T M^-1 J."""
+        out = np.zeros(shape)
+        sizes = np.abs(self.values)
+        out[tuple(self.cells.T)] = np.einsum("nm,ml,l->n", sizes, np.abs(self.inverse_mass), sizes.sum(axis=0))
+        return out
+
+
+def _apply(system: PoissonSystem, low_rank: Sequence[LowRankTerm], p: np.ndarray) -> np.ndarray:
+    return system.apply(p) + sum(term.apply(p) for term in low_rank)
 
 
 def _norm(values: np.ndarray) -> float:
@@ -104,35 +153,55 @@ def label_components(system: PoissonSystem) -> tuple[Int[np.ndarray, "nx ny nz"]
     return labels, closed
 
 
-def remove_component_means(
-    values: Float[np.ndarray, "nx ny nz"], labels: Int[np.ndarray, "nx ny nz"], closed: Bool[np.ndarray, "c"]
+def constants_left_free(
+    labels: Int[np.ndarray, "nx ny nz"], closed: Bool[np.ndarray, "c"], low_rank: Sequence[LowRankTerm] = ()
+) -> FreeConstants:
+    """The constants of the closed components that bodies leave free; the other components count as if of no cell."""
+    sizes = np.where(closed, np.bincount(labels[labels >= 0], minlength=len(closed)), 0)
+    forces, magnitudes = np.zeros((2, len(low_rank), len(closed), 6))
+    for b, term in enumerate(low_rank):
+        group = labels[tuple(term.cells.T)]
+        inside = (group >= 0) & np.append(closed, False)[group]
+        np.add.at(forces[b], group[inside], term.values[inside])
+        np.add.at(magnitudes[b], group[inside], np.abs(term.values[inside]))
+    masses = np.array([term.inverse_mass for term in low_rank]).reshape(-1, 6, 6)
+    return free_constants(sizes, forces, magnitudes, masses)
+
+
+def remove_constants(
+    values: Float[np.ndarray, "nx ny nz"], labels: Int[np.ndarray, "nx ny nz"], constants: FreeConstants
 ) -> Float[np.ndarray, "nx ny nz"]:
-    """Values less their mean over each closed component; the others unchanged."""
-    if not closed.any():
+    """Values less their free constants: over a closed component that no body touches, less their mean."""
+    if not constants.sizes.any():
         return values
     inside = labels >= 0
     group = labels[inside]
-    totals = np.bincount(group, weights=values[inside], minlength=len(closed))
-    means = np.where(closed, totals / np.maximum(np.bincount(group, minlength=len(closed)), 1), 0.0)
+    sums = np.where(constants.sizes > 0, np.bincount(group, weights=values[inside], minlength=len(constants.sizes)), 0)
     out = values.copy()
-    out[inside] -= means[group]
+    out[inside] -= constants.means(sums)[group]
     return out
 
 
 def jacobi(
-    system: PoissonSystem, rhs: np.ndarray, *, tolerance: float, max_iterations: int, initial: np.ndarray
+    system: PoissonSystem,
+    rhs: np.ndarray,
+    *,
+    tolerance: float,
+    max_iterations: int,
+    initial: np.ndarray,
+    low_rank: Sequence[LowRankTerm] = (),
 ) -> tuple[np.ndarray, int]:
     """Simultaneous constraint projection (paper: `divProj`): the plain reference.
 
     The step is 0.9 of the full one (the paper's relaxation): the full step never damps the checkerboard of a closed
-    component.
+    component. Cells of a body count the whole of its rows, without which the iteration diverges for a light one.
     """
-    diagonal = system.diagonal()
-    inverse = np.divide(1.0, diagonal, out=np.zeros_like(diagonal), where=diagonal > 0)
+    diagonal = system.diagonal() + sum(np.where(system.unknown, t.row_sums(rhs.shape), 0.0) for t in low_rank)
+    inverse = np.divide(1.0, diagonal, out=np.zeros_like(diagonal), where=system.diagonal() > 0)
     goal = tolerance * _norm(rhs)
     p = initial
     for iteration in range(max_iterations):
-        residual = rhs - system.apply(p)
+        residual = rhs - _apply(system, low_rank, p)
         if _norm(residual) <= goal:
             return p, iteration
         p = p + 0.9 * inverse * residual
@@ -140,21 +209,27 @@ def jacobi(
 
 
 def conjugate_gradient(
-    system: PoissonSystem, rhs: np.ndarray, *, tolerance: float, max_iterations: int, initial: np.ndarray
+    system: PoissonSystem,
+    rhs: np.ndarray,
+    *,
+    tolerance: float,
+    max_iterations: int,
+    initial: np.ndarray,
+    low_rank: Sequence[LowRankTerm] = (),
 ) -> tuple[np.ndarray, int]:
     """Conjugate gradients with the diagonal as preconditioner: plain, converges where Jacobi crawls."""
-    diagonal = system.diagonal()
-    inverse = np.divide(1.0, diagonal, out=np.zeros_like(diagonal), where=diagonal > 0)
+    diagonal = system.diagonal() + sum(np.where(system.unknown, t.diagonal(rhs.shape), 0.0) for t in low_rank)
+    inverse = np.divide(1.0, diagonal, out=np.zeros_like(diagonal), where=system.diagonal() > 0)
     goal = tolerance * _norm(rhs)
     p = initial.copy()
-    residual = rhs - system.apply(p)
+    residual = rhs - _apply(system, low_rank, p)
     z = inverse * residual
     direction = z.copy()
     rz = float((residual * z).sum())
     for iteration in range(max_iterations):
         if _norm(residual) <= goal:
             return p, iteration
-        q = system.apply(direction)
+        q = _apply(system, low_rank, direction)
         curvature = float((direction * q).sum())
         if curvature <= 0:
             return p, iteration
@@ -166,20 +241,53 @@ def conjugate_gradient(
     return p, max_iterations
 
 
-def multigrid_conjugate_gradient(
-    system: PoissonSystem, rhs: np.ndarray, *, tolerance: float, max_iterations: int, initial: np.ndarray
-) -> tuple[np.ndarray, int]:
-    """Conjugate gradients with a multigrid V-cycle as preconditioner: the default (see `numerics.multigrid`)."""
-    p, iterations, _ = multigrid.solve(
-        system.unknown,
-        system.weights,
-        system.spacing,
-        rhs,
-        tolerance=tolerance,
-        max_iterations=max_iterations,
-        initial=initial,
+def _solve_plain(
+    system: PoissonSystem,
+    rhs: np.ndarray,
+    method: str,
+    *,
+    tolerance: float,
+    max_iterations: int,
+    initial: np.ndarray | None,
+    low_rank: Sequence[LowRankTerm],
+) -> multigrid.Solution:
+    """`multigrid.solve` with a plain method."""
+    active = system.unknown & (system.diagonal() > 0)
+    b = np.where(active, rhs, 0.0).astype(np.float64)
+    start = np.zeros_like(b) if initial is None else np.where(active, initial, 0.0).astype(np.float64)
+    labels, closed = label_components(system)
+    if not np.isfinite(b).all() or not np.isfinite(start).all():
+        return multigrid.Solution(np.zeros_like(rhs), 0, float("nan"), int(closed.sum()), 0.0)
+    inside = tuple(_restricted(term, active) for term in low_rank)
+    constants = constants_left_free(labels, closed, inside)
+    consistent = np.where(active, remove_constants(b, labels, constants), 0.0)
+    removed, norm = _norm(consistent - b), _norm(consistent)
+    if norm == 0.0:
+        return multigrid.Solution(np.zeros_like(rhs), 0, 0.0, int(closed.sum()), removed)
+    run = {"jacobi": jacobi, "conjugate_gradient": conjugate_gradient}[method]
+    p, iterations = run(
+        system, consistent, tolerance=tolerance, max_iterations=max_iterations, initial=start, low_rank=inside
     )
-    return p, iterations
+    p = remove_constants(p, labels, constants)
+    residual = _norm(consistent - _apply(system, inside, p)) / norm
+    return multigrid.Solution(p.astype(rhs.dtype), iterations, residual, int(closed.sum()), removed / norm)
+
+
+def _restricted(term: LowRankTerm, active: np.ndarray) -> LowRankTerm:
+    """The term at cells that have an equation."""
+    some = active[tuple(term.cells.T)]
+    return LowRankTerm(term.cells[some], term.values[some], term.inverse_mass)
+
+
+def _packed(terms: Sequence[LowRankTerm]) -> multigrid.LowRank:
+    if not terms:
+        return multigrid.NO_TERMS
+    return multigrid.LowRank(
+        np.concatenate([t.cells for t in terms]).astype(np.int64),
+        np.concatenate([t.values for t in terms]).astype(np.float64),
+        np.cumsum([0] + [len(t.cells) for t in terms]).astype(np.int64),
+        np.array([t.inverse_mass for t in terms], np.float64),
+    )
 
 
 def solve(
@@ -190,11 +298,13 @@ def solve(
     tolerance: float = 1e-5,
     max_iterations: int = 200,
     initial: Float[np.ndarray, "nx ny nz"] | None = None,
+    low_rank: Sequence[LowRankTerm] = (),
 ) -> tuple[Float[np.ndarray, "nx ny nz"], SolveReport]:
-    """p with A p = rhs to |rhs - A p| <= tolerance |rhs|.
+    """p with A p = rhs to |rhs - A p| <= tolerance |rhs|, where A = -div(w grad .) and the terms of rigid bodies.
 
     Closed components (no p = 0 anywhere behind an open face) determine p up to a constant and only admit a right
-    side of zero mean: the mean is removed from the right side and from p, and the report says so.
+    side of zero mean: the mean is removed from the right side and from p, and the report says so. A body that closes
+    off a component, such as a piston, determines the constant; one that floats within does not.
 
     Args:
         system: the operator.
@@ -203,6 +313,7 @@ def solve(
         tolerance: relative residual in the 2-norm.
         max_iterations: iterations of the chosen method.
         initial: first guess, for instance the pressure of the step before.
+        low_rank: rigid bodies that give way. Each costs conjugate gradients a few iterations.
 
     Returns:
         p (dtype of rhs; solved in double precision, zero outside the unknown cells) and the report with the true
@@ -211,32 +322,32 @@ def solve(
     Raises:
         ValueError: wrong shapes or an unknown method.
     """
-    require(rhs.shape == system.unknown.shape, f"rhs {rhs.shape}", str(system.unknown.shape))
-    methods = {"jacobi": jacobi, "conjugate_gradient": conjugate_gradient}
-    require(method in (*methods, "multigrid"), f"method '{method}'", "multigrid, conjugate_gradient or jacobi")
-    active = system.unknown & (system.diagonal() > 0)
-    b = np.where(active, rhs, 0.0).astype(np.float64)
-    start = np.zeros_like(b) if initial is None else np.where(active, initial, 0.0).astype(np.float64)
-    if not np.isfinite(b).all() or not np.isfinite(start).all():
-        report = SolveReport(False, 0, float("nan"), method, "the right side or the first guess is not finite")
-        return np.zeros_like(rhs), report
-    labels, closed = label_components(system)
-    consistent = np.where(active, remove_component_means(b, labels, closed), 0.0)
-    removed = _norm(consistent - b)
-    norm = _norm(consistent)
-    if norm == 0.0:
-        return np.zeros_like(rhs), SolveReport(True, 0, 0.0, method, "")
-    run = methods.get(method, multigrid_conjugate_gradient)
-    p, iterations = run(system, consistent, tolerance=tolerance, max_iterations=max_iterations, initial=start)
-    p = remove_component_means(p, labels, closed)
-    residual = _norm(consistent - system.apply(p)) / norm
-    advice = ""
-    if removed > 1e-6 * norm:
-        advice = (
-            f"{int(closed.sum())} closed component(s) whose in- and outflow do not balance: "
+    shape = system.unknown.shape
+    require(rhs.shape == shape, f"rhs {rhs.shape}", str(shape))
+    require(initial is None or initial.shape == shape, "a first guess of another shape", str(shape))
+    for axis, w in enumerate(system.weights):
+        wanted = tuple(n + (a == axis) for a, n in enumerate(shape))
+        require(w.shape == wanted, f"weights across axis {axis} {w.shape}", str(wanted))
+    known = ("multigrid", "conjugate_gradient", "jacobi")
+    require(method in known, f"method '{method}'", "multigrid, conjugate_gradient or jacobi")
+    for term in low_rank:
+        cells = term.cells
+        require(bool(((cells >= 0) & (cells < shape)).all()), "cells of a body outside the grid", f"within {shape}")
+    options = {"tolerance": tolerance, "max_iterations": max_iterations, "initial": initial}
+    if method == "multigrid":
+        terms = _packed(low_rank)
+        found = multigrid.solve(system.unknown, system.weights, system.spacing, rhs, **options, low_rank=terms)
+    else:
+        found = _solve_plain(system, rhs, method, **options, low_rank=tuple(low_rank))
+    advice = []
+    if not np.isfinite(found.residual) and found.iterations == 0:
+        advice.append("the right side or the first guess is not finite")
+    elif found.removed > 1e-6:
+        advice.append(
+            f"{found.closed} closed component(s) whose in- and outflow do not balance: "
             "the mean of the right side was removed there"
         )
-    converged = bool(np.isfinite(residual) and residual <= tolerance * (1 + 1e-6))
-    if not converged:
-        advice = "; ".join(filter(None, [advice, "raise max_iterations or the tolerance"]))
-    return p.astype(rhs.dtype), SolveReport(converged, iterations, residual, method, advice)
+    converged = bool(np.isfinite(found.residual) and found.residual <= tolerance * (1 + 1e-6))
+    if not converged and np.isfinite(found.residual):
+        advice.append("raise max_iterations or the tolerance")
+    return found.p, SolveReport(converged, found.iterations, found.residual, method, "; ".join(advice))

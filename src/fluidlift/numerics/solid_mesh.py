@@ -212,6 +212,15 @@ def cylinder_mesh(radius: float, height: float, segments: int = 64) -> TriangleM
     return TriangleMesh(vertices, np.concatenate([np.stack(f, axis=1) for f in faces]))
 
 
+def hull_points(mesh: TriangleMesh) -> Float[np.ndarray, "n 3"]:
+    """Corners of the convex hull, m."""
+    vertices = np.asarray(mesh.vertices, np.float64)
+    try:
+        return vertices[np.sort(ConvexHull(vertices).vertices)]
+    except QhullError:
+        return vertices
+
+
 def surface_points(mesh: TriangleMesh, spacing: float) -> Float[np.ndarray, "n 3"]:
     """Points on the surface, none farther than about `spacing` (m) from its neighbours.
 
@@ -219,10 +228,6 @@ def surface_points(mesh: TriangleMesh, spacing: float) -> Float[np.ndarray, "n 3
     other; then other vertices, then a lattice on every triangle, each where no point is near yet.
     """
     vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces)
-    try:
-        hull = np.sort(ConvexHull(vertices).vertices)
-    except QhullError:
-        hull = np.zeros(0, np.int64)
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     longest = np.sqrt(np.max([np.square(b - a).sum(1), np.square(c - b).sum(1), np.square(a - c).sum(1)], axis=0))
     counts = np.ceil(longest / spacing).astype(np.int64)
@@ -233,7 +238,7 @@ def surface_points(mesh: TriangleMesh, spacing: float) -> Float[np.ndarray, "n 3
         at = counts == n
         points = a[at][:, None] * (1 - i - j)[:, None] + b[at][:, None] * i[:, None] + c[at][:, None] * j[:, None]
         lattice.append(points.reshape(-1, 3))
-    points = np.concatenate([vertices[hull], vertices, *lattice])
+    points = np.concatenate([hull_points(mesh), vertices, *lattice])
     return _thinned(points, 0.5 * spacing)
 
 

@@ -15,8 +15,8 @@ from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.physics import boundaries, transfer
 from fluidlift.physics.boundaries import Walls
 from fluidlift.physics.crowding import fill_ratio, spreading
-from fluidlift.physics.deform import updated_deformation
 from fluidlift.physics.forces import add_gravity
+from fluidlift.physics.numba_particles import ParticleWork
 from fluidlift.physics.outlet import hold_columns, outlet_heads, water_levels
 from fluidlift.physics.pressure import PressureSystem, build_system, project
 from fluidlift.physics.reseed import inner_cells, reseed
@@ -30,6 +30,7 @@ from fluidlift.physics.stepping import (
 )
 from fluidlift.physics.travel import displacements, leaving
 from fluidlift.physics.window import Window, moved_to, open_window, window_around
+from fluidlift.seams import MoveRules
 from fluidlift.types import CellType, FaceVelocity, FluidParameters, Grid, Particles, SolveReport, Terrain
 
 __all__ = ["EmitSource", "LiquidSimulator", "SimulationSettings", "StepReport"]
@@ -74,6 +75,7 @@ class LiquidSimulator(ParticleSimulator):
         particles_per_cell: of the inflow.
         emit_source: looks of new particles; None: that of the nearest initial particle.
         settings: numerical choices; its `particles_per_cell` is overridden by the argument.
+        work: who does the particle half of a step; None: the CPU.
 
     Raises:
         ValueError: arguments of wrong shape, or numbers that are not finite.
@@ -92,6 +94,7 @@ class LiquidSimulator(ParticleSimulator):
         particles_per_cell: int = 8,
         emit_source: EmitSource | None = None,
         settings: SimulationSettings | None = None,
+        work: ParticleWork | None = None,
     ) -> None:
         gravity = np.asarray(parameters.gravity)
         open_sides = np.zeros((3, 2), bool)
@@ -103,6 +106,7 @@ class LiquidSimulator(ParticleSimulator):
             emit_source=emit_source, open_sides=open_sides,
             settings=replace(settings or SimulationSettings(), particles_per_cell=particles_per_cell),
         )  # fmt: skip
+        self._work = work or ParticleWork()
         self._head_rate: tuple[tuple[int, int, int], np.ndarray] | None = None
         """first cell of the window of the last substep, and there q / dt: the first guess of the pressure"""
         self._start_levels = self._levels_now() if (self._walls.regions == CellType.OUTFLOW).any() else None
@@ -168,7 +172,7 @@ class LiquidSimulator(ParticleSimulator):
     def _grid_velocity(self, window: Window, order: transfer.CellOrder, dt: float) -> GridStep:
         """From particles to the new velocity on all faces near the liquid."""
         grid, walls = window.grid, window.walls
-        velocity, _ = transfer.particles_to_grid(self._particles, grid, order)
+        velocity, _ = self._work.transfer.particles_to_grid(self._particles, grid, order)
         occupied = (np.diff(order.start) > 0).reshape(grid.shape)
         types = boundaries.liquid_cells(occupied, walls)
         wet = (types == CellType.FLUID) | (types == CellType.INFLOW) | ((types == CellType.OUTFLOW) & occupied)
@@ -222,7 +226,7 @@ class LiquidSimulator(ParticleSimulator):
             order = self._tidied(order, window)
         particles = self._particles
         step = self._grid_velocity(window, order, dt)
-        velocities, affine = transfer.grid_to_particles(step.velocity, grid, particles.positions, order)
+        velocities, affine = self._work.transfer.grid_to_particles(step.velocity, grid, particles.positions, order)
         moves, farthest = displacements(velocities, affine, dt)
         farthest /= grid.spacing
         if not farthest <= 3.0 * self.settings.courant:
@@ -239,17 +243,12 @@ class LiquidSimulator(ParticleSimulator):
             ratio = fill_ratio(particles.positions, volumes, grid, order, window.capacity)
             spread = spreading(particles.positions, ratio, window.capacity, step.system, grid, order)
             moves = moves if spread is None else moves + spread
-        positions = (particles.positions + moves).astype(np.float32)
         keep = (1.0 - self.parameters.wall_damping) ** (dt / self.parameters.time_step)
-        boundaries.collide(
-            positions, particles.positions, velocities, particles.velocities, walls, dt=dt,
-            restitution=self.parameters.restitution, tangential_share=keep,
-        )  # fmt: skip
-        deformation = updated_deformation(particles.deformation, affine, dt, max_stretch=self.settings.max_stretch)
-        state = replace(particles, positions=positions, velocities=velocities, affine=affine, deformation=deformation)
-        gone = leaving(particles.positions, positions, walls, self._mainstream)
+        rules = MoveRules(dt, self.parameters.restitution, keep, self.settings.max_stretch)
+        state = self._work.mover.moved(particles, moves, velocities, affine, walls, rules)
+        gone = leaving(particles.positions, state.positions, walls, self._mainstream)
         if gone.any():
-            state = state.select(~gone)
+            state = transfer.select_particles(state, np.flatnonzero(~gone))
 
         def adopt() -> None:
             self._head_rate = step.head_rate
@@ -269,5 +268,5 @@ class LiquidSimulator(ParticleSimulator):
             self._next_id += done.split
             if done.split or done.merged:
                 order = transfer.sort_by_cell(particles.positions, window.grid)
-        self._particles = particles.select(order.order)
+        self._particles = transfer.select_particles(particles, order.order)
         return transfer.CellOrder(np.arange(len(particles)), order.start)

@@ -18,14 +18,8 @@ from numba import njit, prange
 from fluidlift.numerics.sampling import gradient_nodes
 from fluidlift.numerics.signed_distance import distance_and_gradient
 from fluidlift.physics.pressure import face_fractions
+from fluidlift.seams import CLEARANCE, CONTACT, WallShape
 from fluidlift.types import CellType, FaceVelocity, Grid, Terrain
-
-CLEARANCE = 0.02
-"""cells: how far outside the solid a colliding particle is put"""
-
-
-CONTACT = 0.5
-"""cells: a free flight that ends closer to the wall is an impact (the pressure of its own cell would stop it there)"""
 
 
 @dataclass(frozen=True)
@@ -149,40 +143,68 @@ def liquid_cells(occupied: Bool[np.ndarray, "nx ny nz"], walls: Walls) -> np.nda
 
 
 @njit(parallel=True, cache=True)
-def _grow(field, valid, new_field, new_valid):
-    """One layer: faces without a value take the mean of their neighbours that have one."""
+def _row_ranges(layer, first, last):
+    """The marked faces of each row along z lie in first <= k < last; in a row without any, first > last."""
+    nx, ny, nz = layer.shape
+    for i_ in prange(nx):
+        i = np.int64(i_)
+        for j in range(ny):
+            low, high = 0, nz
+            while low < nz and layer[i, j, low] == 0:
+                low += 1
+            while high > 0 and layer[i, j, high - 1] == 0:
+                high -= 1
+            first[i, j], last[i, j] = low, high
+
+
+@njit(cache=True)
+def _older(layer, number):
+    return 0 < layer and layer < number
+
+
+@njit(parallel=True, cache=True)
+def _grow(field, layer, number, first, last, new_first, new_last):
+    """One layer, in place: faces without a value take the mean of their neighbours that have an older one.
+
+    `layer` says when a face got its value (1: known, 0: not yet), so it does not matter which face comes first.
+    """
     nx, ny, nz = field.shape
     for i_ in prange(nx):
         i = np.int64(i_)
         for j in range(ny):
-            for k in range(nz):
-                new_field[i, j, k] = field[i, j, k]
-                new_valid[i, j, k] = valid[i, j, k]
-                if valid[i, j, k]:
+            low, high = first[i, j] - 1, last[i, j] + 1
+            for step in range(-1, 2, 2):
+                a, b = min(max(i + step, 0), nx - 1), min(max(j + step, 0), ny - 1)
+                low = min(low, first[a, j], first[i, b])
+                high = max(high, last[a, j], last[i, b])
+            low, high = max(low, 0), min(high, nz)
+            new_first[i, j], new_last[i, j] = low, high
+            for k in range(low, high):
+                if layer[i, j, k] != 0:
                     continue
                 total = np.float32(0.0)
                 count = 0
-                if i > 0 and valid[i - 1, j, k]:
+                if i > 0 and _older(layer[i - 1, j, k], number):
                     total += field[i - 1, j, k]
                     count += 1
-                if i < nx - 1 and valid[i + 1, j, k]:
+                if i < nx - 1 and _older(layer[i + 1, j, k], number):
                     total += field[i + 1, j, k]
                     count += 1
-                if j > 0 and valid[i, j - 1, k]:
+                if j > 0 and _older(layer[i, j - 1, k], number):
                     total += field[i, j - 1, k]
                     count += 1
-                if j < ny - 1 and valid[i, j + 1, k]:
+                if j < ny - 1 and _older(layer[i, j + 1, k], number):
                     total += field[i, j + 1, k]
                     count += 1
-                if k > 0 and valid[i, j, k - 1]:
+                if k > 0 and _older(layer[i, j, k - 1], number):
                     total += field[i, j, k - 1]
                     count += 1
-                if k < nz - 1 and valid[i, j, k + 1]:
+                if k < nz - 1 and _older(layer[i, j, k + 1], number):
                     total += field[i, j, k + 1]
                     count += 1
                 if count > 0:
-                    new_field[i, j, k] = total / np.float32(count)
-                    new_valid[i, j, k] = True
+                    field[i, j, k] = total / np.float32(count)
+                    layer[i, j, k] = number
 
 
 def extrapolate(
@@ -191,12 +213,14 @@ def extrapolate(
     """Continue the velocity beyond the faces where it is known (bool per face), layer by layer; 0 farther away."""
     out = []
     for component, known in zip(velocity.components, valid):
-        field = np.where(known, component, 0).astype(np.float32)
-        mask = known.copy()
-        for _ in range(layers):
-            new_field, new_mask = np.empty_like(field), np.empty_like(mask)
-            _grow(field, mask, new_field, new_mask)
-            field, mask = new_field, new_mask
+        field = np.where(known, component, np.float32(0)).astype(np.float32, copy=False)
+        layer = known.astype(np.uint8)
+        first, last = (np.empty(known.shape[:2], np.int64) for _ in range(2))
+        _row_ranges(layer, first, last)
+        for number in range(2, layers + 2):
+            new_first, new_last = np.empty_like(first), np.empty_like(last)
+            _grow(field, layer, np.uint8(number), first, last, new_first, new_last)
+            first, last = new_first, new_last
         out.append(field)
     return FaceVelocity(*out)
 
@@ -247,6 +271,20 @@ def slide_along_walls(velocity: FaceVelocity, walls: Walls) -> FaceVelocity:
     return FaceVelocity(*out)
 
 
+@njit(cache=True)
+def _far_from_walls(field, low, inverse, x, y, z, reach):
+    """No corner of the point's cell is closer than `reach`: then no point of the cell is, by interpolation."""
+    nx, ny, nz = field.shape
+    i = min(max(np.int64((x - low[0]) * inverse), 0), nx - 2)
+    j = min(max(np.int64((y - low[1]) * inverse), 0), ny - 2)
+    k = min(max(np.int64((z - low[2]) * inverse), 0), nz - 2)
+    a = min(field[i, j, k], field[i, j, k + 1])
+    b = min(field[i, j + 1, k], field[i, j + 1, k + 1])
+    c = min(field[i + 1, j, k], field[i + 1, j, k + 1])
+    d = min(field[i + 1, j + 1, k], field[i + 1, j + 1, k + 1])
+    return min(min(a, b), min(c, d)) >= reach
+
+
 @njit(parallel=True, cache=True)
 def _collide(new, old, velocities, incoming, dt, field, regions, low, high, h, open_sides, restitution, keep):
     inverse = 1.0 / h
@@ -271,6 +309,8 @@ def _collide(new, old, velocities, incoming, dt, field, regions, low, high, h, o
                     velocities[p, a] = min(velocities[p, a], -restitution * incoming[p, a])
                 new[p, a] = min(new[p, a], highest)
         x, y, z = np.float64(new[p, 0]), np.float64(new[p, 1]), np.float64(new[p, 2])
+        if _far_from_walls(field, low, inverse, x, y, z, h):
+            continue
         value, gx, gy, gz = distance_and_gradient(field, low, inverse, x, y, z)
         if value >= h:
             continue
@@ -323,7 +363,7 @@ def collide(
     previous: Float[np.ndarray, "n 3"],
     velocities: Float[np.ndarray, "n 3"],
     incoming: Float[np.ndarray, "n 3"],
-    walls: Walls,
+    walls: WallShape,
     *,
     dt: float,
     restitution: float,

@@ -100,32 +100,61 @@ def octant_shares(distance: np.ndarray, excluded: np.ndarray) -> np.ndarray:
     return out
 
 
+@njit(parallel=True, cache=True)
+def _cell_shares(octants, excluded, out):
+    nx, ny, nz = excluded.shape
+    for i_ in prange(nx):
+        i = np.int64(i_)
+        for j in range(ny):
+            for k in range(nz):
+                total = np.float32(0.0)
+                for o in range(8):
+                    total += octants[i, j, k, o]
+                out[i, j, k] = np.float32(-1.0) if excluded[i, j, k] else np.float32(0.125) * total
+
+
+def cell_shares(octants: np.ndarray, excluded: np.ndarray) -> np.ndarray:
+    """float32 [nx,ny,nz]: liquid in the cells; -1 in those that are excluded."""
+    out = np.empty(excluded.shape, np.float32)
+    _cell_shares(octants, excluded, out)
+    return out
+
+
 @njit(cache=True)
-def control_share(octants, excluded, resistance, i, j, k, across_x, across_y, across_z):
+def control_share(octants, cells, resistance, i, j, k, across_x, across_y, across_z):
     """Liquid share of a control volume, and its viscosity.
 
     The volume of cell (i, j, k), moved down by half a cell along the axes `across` (1 or 0): face (1, 0, 0) and so on,
     edge along z (1, 1, 0). Excluded cells do not count. The viscosity is the harmonic mean over the liquid, because
     the shear stress is what is continuous between two liquids; `resistance` is 1 / viscosity per cell.
     """
-    total = 0.0
-    slack = 0.0
-    count = 0
+    least, most, slack, count = np.float32(2.0), np.float32(-1.0), 0.0, 0
+    for ci in range(i - across_x, i + 1):
+        for cj in range(j - across_y, j + 1):
+            for ck in range(k - across_z, k + 1):
+                least, most = min(least, cells[ci, cj, ck]), max(most, cells[ci, cj, ck])
+                slack += resistance[ci, cj, ck]
+                count += 1
+    if most <= 0.0:
+        return 0.0, 0.0
+    if least == 1.0:
+        return 1.0, count / slack
+    return _mixed_share(octants, cells, resistance, i, j, k, across_x, across_y, across_z)
+
+
+@njit(cache=True)
+def _mixed_share(octants, cells, resistance, i, j, k, across_x, across_y, across_z):
+    total, slack, count = 0.0, 0.0, 0
     for ox in range(2):
         ci = i - across_x * (1 - ox)
-        bx = 4 * (ox ^ across_x)
         for oy in range(2):
             cj = j - across_y * (1 - oy)
-            by = 2 * (oy ^ across_y)
             for oz in range(2):
                 ck = k - across_z * (1 - oz)
-                if excluded[ci, cj, ck]:
+                if cells[ci, cj, ck] < 0.0:
                     continue
                 count += 1
-                share = octants[ci, cj, ck, bx + by + (oz ^ across_z)]
-                if share > 0.0:
-                    total += share
-                    slack += share * resistance[ci, cj, ck]
-    if total == 0.0:
-        return 0.0, 0.0
-    return total / count, total / slack
+                share = octants[ci, cj, ck, 4 * (ox ^ across_x) + 2 * (oy ^ across_y) + (oz ^ across_z)]
+                total += share
+                slack += share * resistance[ci, cj, ck]
+    return (total / count, total / slack) if total > 0.0 else (0.0, 0.0)

@@ -8,11 +8,11 @@ from fluidlift.errors import InputRejected
 from fluidlift.physics.boundaries import build_walls
 from fluidlift.types import CellType, Grid, Terrain
 
-BYTES_PER_CELL = 700
+BYTES_PER_CELL = 200
 """peak memory of the liquid simulator per cell of its box: measured, see tests/physics/test_preflight.py"""
 
-BYTES_PER_PARTICLE = 500
-"""peak memory per particle: its state, the next one, and what is on the way between particles and grid"""
+BYTES_PER_PARTICLE = 450
+"""peak memory per particle: its state, the next one, a checkpoint, and what is on the way to the grid"""
 
 LARGEST_SHARE = 0.9
 """of the memory that is free: more would make the machine swap"""

@@ -17,7 +17,7 @@ from numba import njit
 
 from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.physics.boundaries import CLEARANCE, Walls
-from fluidlift.physics.transfer import CellOrder
+from fluidlift.physics.transfer import CellOrder, select_particles
 from fluidlift.types import Particles
 
 FEWEST = 3
@@ -111,10 +111,11 @@ def reseed(
         return Reseeded(particles, 0, 0)
     out, gone = _merged(particles, heavy[:n_merge], light[:n_merge])
     out, children = _split(out, parents[:n_split], walls, first_id, rng)
-    kept = np.ones(len(particles), bool)
-    kept[gone] = False
-    result = out.select(kept)
-    return Reseeded(result.joined(children) if len(children) else result, len(children), len(gone))
+    if len(gone):
+        kept = np.ones(len(particles), bool)
+        kept[gone] = False
+        out = select_particles(out, np.flatnonzero(kept))
+    return Reseeded(out.joined(children) if len(children) else out, len(children), len(gone))
 
 
 def _merged(particles: Particles, heavy: np.ndarray, light: np.ndarray) -> tuple[Particles, np.ndarray]:

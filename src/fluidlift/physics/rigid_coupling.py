@@ -179,6 +179,9 @@ def surface_force(
             total += np.where(joined, (there - here) * (2 * side - 1) / h, 0.0)
             count += joined
         slope = np.divide(total, count, out=np.zeros_like(total), where=count > 0)
+        if (count > 0).any():
+            # a film has no neighbours across it: it takes the mean of the others
+            slope[(count == 0) & (here != 0)] = slope[count > 0].mean()
         faces = 0.5 * np.moveaxis(share[1:] + share[:-1], 0, axis)
         forces.append(-slope * h**3 * (cover.volume - faces))
     force = np.stack(forces, axis=-1)
@@ -189,26 +192,26 @@ def surface_force(
 
 
 @njit(parallel=True, cache=True)
-def _slide(u, v, w, axis, first, last, low, h, closed_by, normals, center, velocity, spin, out):
-    """Faces closed by a body lose the part of the local velocity, relative to the body, that is normal to it."""
+def _slide(u, v, w, axis, body, first, last, low, h, closed_by, normals, center, velocity, spin, out):
+    """Faces closed by one body lose the part of the local velocity, relative to the body, that is normal to it."""
     for i_ in prange(first[0], last[0]):
         i = np.int64(i_)
         for j in range(first[1], last[1]):
             for k in range(first[2], last[2]):
-                body = closed_by[i, j, k]
-                if body < 0:
+                if closed_by[i, j, k] != body:
                     continue
-                x = low[0] + (i + (0.0 if axis == 0 else 0.5)) * h - center[body, 0]
-                y = low[1] + (j + (0.0 if axis == 1 else 0.5)) * h - center[body, 1]
-                z = low[2] + (k + (0.0 if axis == 2 else 0.5)) * h - center[body, 2]
-                s0 = velocity[body, 0] + spin[body, 1] * z - spin[body, 2] * y
-                s1 = velocity[body, 1] + spin[body, 2] * x - spin[body, 0] * z
-                s2 = velocity[body, 2] + spin[body, 0] * y - spin[body, 1] * x
-                away = 0.0
+                x = low[0] + (i + (0.0 if axis == 0 else 0.5)) * h - center[0]
+                y = low[1] + (j + (0.0 if axis == 1 else 0.5)) * h - center[1]
+                z = low[2] + (k + (0.0 if axis == 2 else 0.5)) * h - center[2]
+                s0 = velocity[0] + spin[1] * z - spin[2] * y
+                s1 = velocity[1] + spin[2] * x - spin[0] * z
+                s2 = velocity[2] + spin[0] * y - spin[1] * x
+                own, away = 0.0, 0.0
                 for b in range(3):
                     other = u if b == 0 else (v if b == 1 else w)
                     solid = s0 if b == 0 else (s1 if b == 1 else s2)
                     if b == axis:
+                        own = other[i, j, k]
                         away += normals[i, j, k, b] * (other[i, j, k] - solid)
                         continue
                     # mean of the four faces of component b around this face
@@ -219,11 +222,9 @@ def _slide(u, v, w, axis, first, last, low, h, closed_by, normals, center, veloc
                             ii = i - s if axis == 0 else (i + t if b == 0 else i)
                             jj = j - s if axis == 1 else (j + t if b == 1 else j)
                             kk = k - s if axis == 2 else (k + t if b == 2 else k)
-                            total += other[
-                                min(max(ii, 0), mx - 1), min(max(jj, 0), my - 1), min(max(kk, 0), mz - 1)
-                            ]
+                            total += other[min(max(ii, 0), mx - 1), min(max(jj, 0), my - 1), min(max(kk, 0), mz - 1)]
                     away += normals[i, j, k, b] * (0.25 * total - solid)
-                out[i, j, k] = out[i, j, k] - normals[i, j, k, axis] * away
+                out[i, j, k] = own - normals[i, j, k, axis] * away
 
 
 def slide_along_bodies(
@@ -245,16 +246,46 @@ def slide_along_bodies(
     grid = union.static.grid
     fields = [np.ascontiguousarray(c, np.float32) for c in velocity.components]
     out = [c.copy() for c in slid.components]
-    for cover in union.covers:
+    for c in union.covers:
         for axis in range(3):
-            at = cover.faces(axis)
-            closed = union.closed_by[axis][at] >= 0
-            out[axis][at] = np.where(closed, fields[axis][at], out[axis][at])
-    for cover in union.covers:
-        for axis in range(3):
-            mine = np.where(union.closed_by[axis] == cover.body, union.closed_by[axis], -1)
             _slide(
-                *fields, axis, np.array(cover.low), np.array(cover.high) + (np.arange(3) == axis), grid.low,
-                grid.spacing, mine, union.walls.normals[axis], center, *speeds, out[axis],
+                *fields, axis, c.body, np.array(c.low), np.array(c.high) + (np.arange(3) == axis), grid.low,
+                grid.spacing, union.closed_by[axis], union.walls.normals[axis], center[c.body],
+                speeds[0][c.body], speeds[1][c.body], out[axis],
             )  # fmt: skip
     return FaceVelocity(*out)
+
+
+def fill_films(types: np.ndarray, union: UnionWalls, gravity: Float[np.ndarray, "3"]) -> np.ndarray:
+    """Cell types in which thin gaps between bodies and other solids hold liquid where they are joined to liquid.
+
+    Particles do not fit into such gaps (cells mostly in the solid, see `Walls.buried`), and as air they would hold no
+    pressure: a light body would stick to the bed. Liquid spreads along them from cell to cell, but not upwards.
+    """
+    types = types.copy()
+    walls = union.walls
+    steps = [(axis, sign) for axis in range(3) for sign in (1, -1) if sign * gravity[axis] >= -1e-9]
+    for cover in union.covers:
+        at = tuple(slice(max(a - 1, 0), min(b + 1, n)) for a, b, n in zip(cover.low, cover.high, types.shape))
+        here = types[at]  # a view
+        candidates = walls.buried[at] & (here == CellType.EMPTY)
+        openings = [
+            walls.openings[axis][tuple(slice(s.start, s.stop + (d == axis)) for d, s in enumerate(at))] > 0
+            for axis in range(3)
+        ]
+        for _ in range(sum(here.shape)):
+            liquid = here == CellType.FLUID
+            reached = np.zeros(here.shape, bool)
+            for axis, sign in steps:
+                source, target = np.moveaxis(liquid, axis, 0), np.moveaxis(reached, axis, 0)
+                passable = np.moveaxis(openings[axis], axis, 0)[1:-1]
+                if sign > 0:
+                    target[1:] |= source[:-1] & passable
+                else:
+                    target[:-1] |= source[1:] & passable
+            new = reached & candidates
+            if not new.any():
+                break
+            here[new] = CellType.FLUID
+            candidates &= ~new
+    return types

@@ -1,4 +1,4 @@
-"""Terrain and rigid bodies as one solid on the grid: `Walls` for the present poses.
+"""Terrain and rigid bodies as one solid on the grid of a window: `Walls` for the present poses.
 
 Bodies and terrain do not overlap (contact sees to it), so the share of a face that a body covers comes from the body's
 distance field alone and is taken off what the terrain leaves open. That is exact for gaps much thinner than a cell,
@@ -11,14 +11,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from numba import njit, prange
 
 from fluidlift.numerics.signed_distance import distance_and_gradient
-from fluidlift.physics.boundaries import Walls, beside_closed_faces
-from fluidlift.physics.crowding import cell_capacity
 from fluidlift.physics.pressure import SMALLEST_OPENING
 from fluidlift.physics.rigid_shapes import Shapes, body_distance
+from fluidlift.physics.window import Window
 from fluidlift.types import CellType
 
 RAISED = 1e-3
@@ -246,26 +245,23 @@ def _cell_facts(distance, ox, oy, oz, first, last, low, h, solid_code, solid, bu
 
 
 class UnionWalls:
-    """Keeps `Walls` of terrain and bodies up to date. All arrays it gives out change at the next `update`."""
+    """Keeps a `Window` onto terrain and bodies up to date. All arrays it gives out change at the next `update`."""
 
-    def __init__(self, static: Walls) -> None:
-        grid = static.grid
+    def __init__(self, static: Window) -> None:
+        walls, grid = static.walls, static.grid
         self.static = static
         self.covers: tuple[Cover, ...] = ()
         self.walls = replace(
-            static, signed_distance=static.signed_distance.copy(), openings=tuple(o.copy() for o in static.openings),
-            normals=tuple(n.copy() for n in static.normals), solid=static.solid.copy(), buried=static.buried.copy(),
-            regions=static.regions.copy(),
+            walls, signed_distance=walls.signed_distance.copy(), openings=tuple(o.copy() for o in walls.openings),
+            normals=tuple(n.copy() for n in walls.normals), solid=walls.solid.copy(), buried=walls.buried.copy(),
+            regions=walls.regions.copy(),
         )  # fmt: skip
+        self.window = replace(
+            static, walls=self.walls, capacity=static.capacity.copy(), wall_cells=static.wall_cells.copy()
+        )
         self.closed_by = tuple(np.full(grid.face_shape(a), -1, np.int16) for a in range(3))
         """number of the body that closes a face which the terrain leaves open; else -1"""
         self._covered = tuple(np.zeros(grid.face_shape(a), np.float32) for a in range(3))
-        self._static_beside = beside_closed_faces(static)
-        self._static_capacity = cell_capacity(static.signed_distance, grid)
-        self.beside: Bool[np.ndarray, "nx ny nz"] = self._static_beside.copy()
-        """cells beside mostly closed faces (see `boundaries.beside_closed_faces`)"""
-        self.capacity: Float[np.ndarray, "nx ny nz"] = self._static_capacity.copy()
-        """open share of the kernel around each cell (see `crowding.cell_capacity`)"""
 
     def update(self, shapes: Shapes) -> None:
         """Walls for the poses of `shapes`."""
@@ -281,7 +277,7 @@ class UnionWalls:
         for cover in covers:
             for axis in range(3):
                 at = cover.faces(axis)
-                opening = self.static.openings[axis][at] - self._covered[axis][at]
+                opening = self.static.walls.openings[axis][at] - self._covered[axis][at]
                 self.walls.openings[axis][at] = np.where(
                     (self._covered[axis][at] > 0) & (opening < SMALLEST_OPENING), np.float32(0), opening
                 )
@@ -290,7 +286,7 @@ class UnionWalls:
             self._derive(cover, shapes)
 
     def _put_back(self, cover: Cover) -> None:
-        walls, static = self.walls, self.static
+        walls, static = self.walls, self.static.walls
         walls.signed_distance[cover.nodes] = static.signed_distance[cover.nodes]
         for axis in range(3):
             at = cover.faces(axis)
@@ -301,8 +297,8 @@ class UnionWalls:
         at = cover.cells
         for name in ("solid", "buried", "regions"):
             getattr(walls, name)[at] = getattr(static, name)[at]
-        self.beside[at] = self._static_beside[at]
-        self.capacity[at] = self._static_capacity[at]
+        self.window.wall_cells[at] = self.static.wall_cells[at]
+        self.window.capacity[at] = self.static.capacity[at]
 
     def _measured(self, shapes: Shapes, body: int) -> Cover | None:
         """Distance and covered shares on the faces around a body; None where it is out of the box."""
@@ -334,7 +330,7 @@ class UnionWalls:
         shares = []
         for axis, share in enumerate(cover.share):
             at = cover.faces(axis)
-            taken = self.static.openings[axis][at] - self.walls.openings[axis][at]
+            taken = self.static.walls.openings[axis][at] - self.walls.openings[axis][at]
             covered = self._covered[axis][at]
             shares.append(share * np.divide(taken, covered, out=np.zeros_like(share), where=covered > 0))
         return replace(cover, share=tuple(shares))
@@ -346,9 +342,9 @@ class UnionWalls:
         for axis in range(3):
             _wall_normals(
                 shapes, bodies, axis, grid.low, grid.spacing, first, last + (np.arange(3) == axis),
-                walls.openings[axis], self.static.openings[axis], self.closed_by[axis], walls.normals[axis],
+                walls.openings[axis], self.static.walls.openings[axis], self.closed_by[axis], walls.normals[axis],
             )  # fmt: skip
         _cell_facts(
             walls.signed_distance, *walls.openings, first, last, grid.low, grid.spacing, np.uint8(CellType.SOLID),
-            walls.solid, walls.buried, walls.regions, self.beside, self.capacity,
+            walls.solid, walls.buried, walls.regions, self.window.wall_cells, self.window.capacity,
         )  # fmt: skip

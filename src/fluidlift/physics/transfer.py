@@ -77,7 +77,8 @@ def particles_to_grid(
     Args:
         particles: inside the box of the grid.
         grid: the staggered grid.
-        order: from `sort_by_cell` (made here when missing).
+        order: of these very positions, from `sort_by_cell` (made here when missing): that of older ones would let
+            threads meet on a face.
     """
     order = order or sort_by_cell(particles.positions, grid)
     sums = [np.zeros((*_padded_shape(grid, axis), 2), np.float32) for axis in range(3)]
@@ -106,18 +107,6 @@ def grid_to_particles(
         kernels.pad(_float32(component), out)
     kernels.gather(_float32(positions), index, grid.low, grid.spacing, *padded, velocities, affine)
     return velocities, affine
-
-
-def displacements(
-    velocities: Float[np.ndarray, "n 3"], affine: Float[np.ndarray, "n 3 3"], dt: float
-) -> tuple[Float[np.ndarray, "n 3"], float]:
-    """dt (v + dt/2 C v), m: second order in time, by the velocity half way; and the largest entry, m.
-
-    The largest entry is infinite where a velocity or an affine matrix is not finite.
-    """
-    moves = np.empty((len(velocities), 3), np.float32)
-    farthest = kernels.displace(_float32(velocities), _float32(affine), np.float32(dt), moves)
-    return moves, float(farthest)
 
 
 def deposit_to_cells(

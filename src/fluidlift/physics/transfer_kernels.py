@@ -262,33 +262,6 @@ def deposit(positions, amounts, order, start, blocks, low, h, out):
 
 
 @njit(parallel=True, cache=True)
-def displace(velocities, affine, dt, moves):
-    """dt (v + dt/2 C v); returns the largest entry, infinite where something is not finite."""
-    n = len(velocities)
-    chunks = (n + CHUNK - 1) // CHUNK
-    farthest = np.zeros(chunks, np.float32)
-    half = np.float32(0.5) * dt
-    for chunk in prange(chunks):
-        first = np.int64(chunk) * CHUNK
-        largest = np.float32(0.0)
-        for p in range(first, min(first + CHUNK, n)):
-            vx, vy, vz = velocities[p, 0], velocities[p, 1], velocities[p, 2]
-            # 0 times anything finite is 0
-            check = np.float32(0.0)
-            for a in range(3):
-                cx, cy, cz = affine[p, a, 0], affine[p, a, 1], affine[p, a, 2]
-                move = dt * (velocities[p, a] + half * (cx * vx + cy * vy + cz * vz))
-                moves[p, a] = move
-                check += np.float32(0.0) * (cx + cy + cz)
-                largest = max(largest, abs(move))
-                check += np.float32(0.0) * move
-            if check != np.float32(0.0):
-                largest = np.float32(np.inf)
-        farthest[chunk] = largest
-    return farthest.max() if chunks else np.float32(0.0)
-
-
-@njit(parallel=True, cache=True)
 def select(
     index, positions, velocities, affine, deformation, masses, source, ids,
     new_positions, new_velocities, new_affine, new_deformation, new_masses, new_source, new_ids,

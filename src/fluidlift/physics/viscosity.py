@@ -19,25 +19,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from fluidlift.errors import require
-from fluidlift.numerics import multigrid
-from fluidlift.physics import viscosity_kernels as kernels
+from fluidlift.physics import stress_kernels as kernels
 from fluidlift.physics.liquid_fractions import octant_shares
+from fluidlift.physics.stress_multigrid import StressSystem, assemble, build_levels, v_cycle
 from fluidlift.types import FaceVelocity, SolveReport
 
 NEGLIGIBLE = 1e-4
 """dt nu / h^2 below which the step is left out: it would take 0.1 % from the finest waves of the grid, far less than
 the transfers do"""
 
-LEAST_SHARE = 0.01
-"""of a face's control volume: faces that hold less liquid get the mass of this much"""
-
 CYCLES_FROM = 2.0
 """dt nu / h^2 above which V-cycles precondition better than the diagonal, for their cost"""
-
-INNER = (slice(1, -1),) * 3
 
 
 @dataclass(frozen=True)
@@ -53,49 +48,37 @@ class FaceRoles:
 
 
 @dataclass(frozen=True)
-class StressSystem:
-    """The operator on a box around the solved faces; layout as in `viscosity_kernels`."""
+class Region:
+    """The box around the solved faces."""
 
-    low: tuple[int, int, int]
-    """index of the first node of the box, ghosts included, in the whole grid"""
-    roles: np.ndarray
-    mass: np.ndarray
-    """float32 [3,...]: liquid share of the faces that are solved, 0 elsewhere"""
-    inverse: np.ndarray
-    """1 / diagonal"""
-    normal: np.ndarray
-    """float32 [3,...]: weights of the stresses xx, yy, zz at cells"""
-    shear: np.ndarray
-    """float32 [3,...]: weights of the stresses yz, xz, xy at edges"""
-    first: np.ndarray
-    last: np.ndarray
+    low: tuple[int, ...]
+    """index of its first node, ghosts included, in the whole grid"""
+    shape: tuple[int, ...]
 
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """Nodes of the box."""
-        return self.roles.shape[1:]
+    def overlap(self, shape: tuple[int, ...]) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
+        """Slices of an array of `shape` over the whole grid, and of the box, that are the same nodes."""
+        grid, box = [], []
+        for start, length, size in zip(self.low, self.shape, shape):
+            a, b = max(start, 0), min(start + length, size)
+            grid.append(slice(a, b))
+            box.append(slice(a - start, b - start))
+        return tuple(grid), tuple(box)
 
+    def crop(self, array: np.ndarray, fill: float, dtype: type | None = None) -> np.ndarray:
+        """The values in the box, `fill` beyond the array."""
+        out = np.full(self.shape, fill, dtype or array.dtype)
+        grid, box = self.overlap(array.shape)
+        out[box] = array[grid]
+        return out
 
-def _crop(array: np.ndarray, low: tuple[int, ...], shape: tuple[int, ...], fill: float) -> np.ndarray:
-    """The box of `shape` that starts at `low`, `fill` beyond the array."""
-    out = np.full(shape, fill, array.dtype)
-    source, target = [], []
-    for start, length, size in zip(low, shape, array.shape):
-        a, b = max(start, 0), min(start + length, size)
-        source.append(slice(a, b))
-        target.append(slice(a - start, b - start))
-    out[tuple(target)] = array[tuple(source)]
-    return out
+    def crop_repeated(self, array: np.ndarray) -> np.ndarray:
+        """The values in the box, the outermost ones repeated beyond the array."""
+        index = [np.clip(np.arange(a, a + n), 0, size - 1) for a, n, size in zip(self.low, self.shape, array.shape)]
+        return array[np.ix_(*index)]
 
 
-def _clamped_crop(array: np.ndarray, low: tuple[int, ...], shape: tuple[int, ...]) -> np.ndarray:
-    """The box of `shape` that starts at `low`, the outermost values repeated beyond the array."""
-    index = [np.clip(np.arange(start, start + n), 0, size - 1) for start, n, size in zip(low, shape, array.shape)]
-    return array[np.ix_(*index)]
-
-
-def _box(solved: tuple[np.ndarray, ...]) -> tuple[tuple[int, ...], tuple[int, ...]] | None:
-    """First node and shape of the box around the solved faces, with two layers of nodes on each side."""
+def _region(solved: tuple[np.ndarray, ...]) -> Region | None:
+    """The box around the solved faces with two layers of nodes on each side."""
     low, high = [np.iinfo(int).max] * 3, [-1] * 3
     for mask in solved:
         for axis in range(3):
@@ -104,15 +87,38 @@ def _box(solved: tuple[np.ndarray, ...]) -> tuple[tuple[int, ...], tuple[int, ..
                 low[axis], high[axis] = min(low[axis], int(hit[0])), max(high[axis], int(hit[-1]))
     if high[0] < 0:
         return None
-    return tuple(a - 2 for a in low), tuple(b - a + 5 for a, b in zip(low, high))
+    return Region(tuple(a - 2 for a in low), tuple(b - a + 5 for a, b in zip(low, high)))
 
 
-def _face_roles(roles: FaceRoles, low: tuple[int, ...], shape: tuple[int, ...]) -> np.ndarray:
-    out = np.zeros((3, *shape), np.int8)
+def _face_roles(roles: FaceRoles, region: Region) -> np.ndarray:
+    out = np.zeros((3, *region.shape), np.int8)
     for a in range(3):
         for code, masks in ((kernels.WALL, roles.walls), (kernels.FIXED, roles.fixed), (kernels.SOLVED, roles.solved)):
-            out[a][_crop(masks[a], low, shape, False)] = code
+            out[a][region.crop(masks[a], False)] = code
     return out
+
+
+def _on_border(mask: np.ndarray, axis: int) -> np.ndarray:
+    """The part of the mask on the two sides of the grid that the component crosses."""
+    out = np.zeros_like(mask)
+    along, inner = np.moveaxis(out, axis, 0), np.moveaxis(mask, axis, 0)
+    along[0], along[-1] = inner[0], inner[-1]
+    return out
+
+
+def _carry_out(
+    new: np.ndarray, old: np.ndarray, solved: np.ndarray, axis: int, number: Float[np.ndarray, "nx ny nz"]
+) -> None:
+    """Faces on open sides of the grid, which lack their outer neighbours, follow the next inner ones; in place.
+
+    Their difference decays by the normal stress between them, with `number` = nu dt / h^2 per cell; they hold half a
+    cell of liquid.
+    """
+    new, old, solved, number = (np.moveaxis(x, axis, 0) for x in (new, old, solved, number))
+    for border, inner in ((0, 1), (-1, -2)):
+        both = solved[border] & solved[inner]
+        left = 0.5 / (0.5 + 2.0 * number[border])
+        new[border][both] = (new[inner] + left * (old[border] - old[inner]))[both]
 
 
 def _all_six(faces: np.ndarray) -> np.ndarray:
@@ -134,53 +140,29 @@ def build_system(
     number: float,
     wall_share: float,
     liquid_distance: Float[np.ndarray, "nx ny nz"] | None = None,
-) -> StressSystem | None:
-    """Weights of the stresses and masses of the faces; None where nothing is solved. Arguments as for `diffuse`.
+) -> tuple[StressSystem, Region] | None:
+    """The operator in a box around the solved faces; None where nothing is solved. Arguments as for `diffuse`.
 
     Args:
         number: dt / h^2.
     """
-    box = _box(roles.solved)
-    if box is None:
+    region = _region(roles.solved)
+    if region is None:
         return None
-    low, shape = box
-    nx, ny, nz = roles.solved[0].shape[0] - 1, *roles.solved[0].shape[1:]
-    faces = _face_roles(roles, low, shape)
-    inside = _crop(np.broadcast_to(True, (nx, ny, nz)), low, shape, False)
+    shape = (roles.solved[0].shape[0] - 1, *roles.solved[0].shape[1:])
+    faces = _face_roles(roles, region)
+    inside = region.crop(np.broadcast_to(True, shape), False)
     excluded = _all_six(faces >= kernels.FIXED) | ~inside
     if liquid_distance is None:
         wet = _all_six(faces != kernels.AIR) & ~excluded
         octants = np.repeat(wet[..., None].astype(np.float32), 8, axis=-1)
     else:
-        octants = octant_shares(_clamped_crop(np.asarray(liquid_distance, np.float32), low, shape), excluded)
-    slack = 1.0 / np.maximum(np.asarray(viscosity, np.float32), np.float32(1e-30))
-    resistance = _crop(np.broadcast_to(slack, (nx, ny, nz)), low, shape, 1.0)
-    mass, inverse, normal, shear = (np.zeros((3, *shape), np.float32) for _ in range(4))
-    kernels.weigh_stresses(faces, octants, excluded, resistance, number, wall_share, normal, shear)
-    kernels.weigh_faces(faces, octants, excluded, resistance, normal, shear, LEAST_SHARE, mass, inverse)
-    some = (mass > 0).any(axis=0)
-    columns = some.any(axis=2)
-    first = np.where(columns, some.argmax(axis=2), 1).astype(np.int32)
-    last = np.where(columns, shape[2] - some[:, :, ::-1].argmax(axis=2), 1).astype(np.int32)
-    return StressSystem(low, faces, mass, inverse, normal, shear, first, last)
-
-
-def _levels(system: StressSystem) -> list[list[multigrid.Level]]:
-    """A multigrid hierarchy per component, of the operator without the couplings between components."""
-    out = []
+        octants = octant_shares(region.crop_repeated(np.asarray(liquid_distance, np.float32)), excluded)
     for a in range(3):
-        weights = []
-        for axis in range(3):
-            cut = [slice(1, -1)] * 3
-            if axis == a:
-                cut[axis] = slice(0, -1)
-                weights.append(system.normal[a][tuple(cut)])
-            else:
-                cut[axis] = slice(1, None)
-                weights.append(system.shear[3 - a - axis][tuple(cut)])
-        mass = system.mass[a][INNER]
-        out.append(multigrid.build_levels(mass > 0, tuple(weights), 1.0, added_diagonal=mass))
-    return out
+        faces[a][region.crop(_on_border(roles.solved[a], a), False)] = kernels.AIR
+    slack = 1.0 / np.maximum(np.asarray(viscosity, np.float32), np.float32(1e-30))
+    resistance = region.crop(np.broadcast_to(slack, shape), 1.0)
+    return assemble(faces, octants, excluded, resistance, number, wall_share), region
 
 
 def solve(
@@ -198,45 +180,32 @@ def solve(
         max_iterations: of the conjugate gradients.
         cycles: precondition with V-cycles; False: with the diagonal.
     """
-    columns = (system.first, system.last)
-    operator = (system.mass, system.normal, system.shear, *columns)
+    levels = build_levels(system, coarsen=cycles)
+    z, rhs = levels[0].x, levels[0].rhs
     r, q, direction = momentum.copy(), np.zeros_like(x), np.zeros_like(x)
-    if cycles:
-        levels = _levels(system)
-        z = tuple(hierarchy[0].x for hierarchy in levels)
-    else:
-        levels, scaled = [], np.zeros_like(x)
-        z = tuple(scaled)
-
-    def precondition() -> None:
-        if not cycles:
-            kernels.scale_by(r, system.inverse, scaled, *columns)
-            return
-        # near one: single precision neither over- nor underflows
-        scale = 1.0 / max(float(np.sqrt(squared)), 1e-300)
-        for a, hierarchy in enumerate(levels):
-            kernels.scale_into(r, a, scale, hierarchy[0].rhs, hierarchy[0].x, *columns)
-            multigrid.v_cycle(hierarchy)
-
     before = float(np.square(momentum).sum())
-    kernels.apply(x, q, *operator)
-    squared, after = kernels.descend(x, r, direction, q, 1.0, system.mass, *columns)
+    kernels.apply(x, q, *system.operator)
+    squared, after = kernels.descend(x, r, direction, q, 1.0, system.mass, *system.columns)
     iterations, rz = 0, 1.0
     while iterations < max_iterations and squared > tolerance**2 * max(before, after):
-        precondition()
-        rz, previous = kernels.dot(r, *z, *columns), rz
+        # near one, so that single precision neither over- nor underflows; the scale drops out of the directions
+        scale = 1.0 / max(float(np.sqrt(squared)), 1e-300)
+        kernels.scale_into(r, scale, system.inverse, cycles, rhs, z, *system.columns)
+        if cycles:
+            v_cycle(levels)
+        rz, previous = kernels.dot(r, z, *system.columns), rz
         if not rz > 0:
             break
-        kernels.turn(direction, *z, rz / previous if iterations else 0.0, *columns)
-        curvature = kernels.apply(direction, q, *operator)
+        kernels.turn(direction, z, rz / previous if iterations else 0.0, *system.columns)
+        curvature = kernels.apply(direction, q, *system.operator)
         if not curvature > 0:
             break
-        squared, after = kernels.descend(x, r, direction, q, rz / curvature, system.mass, *columns)
+        squared, after = kernels.descend(x, r, direction, q, rz / curvature, system.mass, *system.columns)
         iterations += 1
-    kernels.apply(x, q, *operator)
+    kernels.apply(x, q, *system.operator)
     r[...] = momentum - q
     direction[...] = 0.0
-    squared, after = kernels.descend(x, r, direction, direction, 0.0, system.mass, *columns)
+    squared, after = kernels.descend(x, r, direction, direction, 0.0, system.mass, *system.columns)
     size = max(before, after)
     return iterations, float(np.sqrt(squared / size)) if size > 0 else 0.0
 
@@ -282,33 +251,27 @@ def diffuse(
     if float(field.max(initial=0.0)) * number < NEGLIGIBLE:
         return velocity, ()
     scaled = None if liquid_distance is None else np.asarray(liquid_distance) / spacing
-    system = build_system(
+    built = build_system(
         roles, viscosity=viscosity, number=number, wall_share=wall_share, liquid_distance=scaled
     )  # fmt: skip
-    if system is None:
+    if built is None:
         return velocity, ()
-    given = np.stack([_crop(np.asarray(c, np.float64), system.low, system.shape, 0.0) for c in velocity.components])
+    system, region = built
+    given = np.stack([region.crop(c, 0.0, np.float64) for c in velocity.components])
     x = given * (system.roles != kernels.AIR)
     if initial is not None:
         for a, c in enumerate(initial.components):
-            guess = _crop(np.asarray(c, np.float64), system.low, system.shape, 0.0)
-            np.copyto(x[a], guess, where=system.mass[a] > 0)
+            np.copyto(x[a], region.crop(c, 0.0), where=system.mass[a] > 0)
     iterations, residual = solve(
         system, x, system.mass * given, tolerance=tolerance, max_iterations=300,
         cycles=float(field.max()) * number > CYCLES_FROM,
     )  # fmt: skip
     report = SolveReport(residual <= tolerance * 1.01, iterations, residual, "viscosity")
-    return FaceVelocity(*(_pasted(c, x[a], system, a) for a, c in enumerate(velocity.components))), (report,)
-
-
-def _pasted(component: np.ndarray, x: np.ndarray, system: StressSystem, axis: int) -> np.ndarray:
-    """The component with its solved faces replaced."""
-    out = np.array(component, np.float32)
-    target, source = [], []
-    for start, length, size in zip(system.low, system.shape, out.shape):
-        a, b = max(start, 0), min(start + length, size)
-        target.append(slice(a, b))
-        source.append(slice(a - start, b - start))
-    solved = system.mass[axis][tuple(source)] > 0
-    np.copyto(out[tuple(target)], x[tuple(source)].astype(np.float32), where=solved)
-    return out
+    out = []
+    for a, component in enumerate(velocity.components):
+        new = np.array(component, np.float32)
+        grid, box = region.overlap(new.shape)
+        np.copyto(new[grid], x[a][box], where=system.mass[a][box] > 0, casting="same_kind")
+        _carry_out(new, component, roles.solved[a], a, number * np.broadcast_to(field, shape))
+        out.append(new)
+    return FaceVelocity(*out), (report,)

@@ -12,7 +12,7 @@ from typing import Any
 from fluidlift import __version__
 from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected
-from fluidlift.pipeline import body, moving, refining, seeing
+from fluidlift.pipeline import body, moving, refining, seeing, simulating
 from fluidlift.pipeline.resimulate import Made, play
 from fluidlift.pipeline.scene import SimulationRequest
 from fluidlift.pipeline.seeing import Inputs
@@ -58,6 +58,8 @@ def make(
     try:
         with disk_errors(folder):
             provenance = _run(story, inputs, folder, config)
+            frames = config.simulate.frames or len(seeing.clip_of(story)) - story["geometry"].meta["rest_frame"]
+            simulating.require_room(folder, frames, len(body.rest_of(story)))
             _write_asset(story, folder, config, provenance)
             frames = play(story, folder, config, SimulationRequest(restart="simulate" in story.force))
     except InputRejected:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from fluidlift.config import JobConfig, build_config
+from fluidlift.config import PRESETS, JobConfig, build_config
 from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.pipeline import showing, simulating
 from fluidlift.pipeline.scene import Footage, Scene, SimulationRequest, footage_of, scene_of
@@ -116,7 +116,9 @@ def _settings(manifest: dict[str, Any], overrides: Sequence[str], flat: dict[str
         part = stored.get(section, {}) if isinstance(stored, dict) else {}
         known = JobConfig().section(section)
         values |= {f"{section}.{k}": v for k, v in part.items() if k in known} if isinstance(part, dict) else {}
-    return build_config(None, None, overrides, values | {k: v for k, v in flat.items() if v is not None})
+    preset = stored.get("preset") if isinstance(stored, dict) else None
+    preset = preset if isinstance(preset, str) and preset in PRESETS else None
+    return build_config(preset, None, overrides, values | {k: v for k, v in flat.items() if v is not None})
 
 
 def _recall(story: Story, manifest: dict[str, Any]) -> None:
@@ -154,16 +156,18 @@ def play(story: Story, folder: Path, config: JobConfig, request: SimulationReque
         lambda: simulating.simulate(scene, folder, config, request=request, step=story.step),
         settings=[scene.parts, scene.frames, config.simulate.max_particles],
         after=(),
-        still_there=simulating.frames_still_there(folder, scene.parts),
+        still_there=simulating.frames_still_there(folder),
+        owns_files=True,
     )
     done = story["simulate"].meta
     wanted = [folder / "preview.mp4"] + [folder / "asset.usda"] * config.show.usd
     story.run(
         "show",
-        lambda: showing.show(scene, footage, folder, config, done["frames"], step=story.step),
+        lambda: showing.show(scene, footage, folder, config, story["simulate"].arrays["poses"], step=story.step),
         settings=[config.section("show"), done["frames"], [story.keys[s] for s in FIRST_HALF if s in story.keys]],
         after=("simulate",),
         still_there=lambda result: all(p.is_file() for p in wanted),
+        owns_files=True,
     )
     _finish(story, scene, footage, folder, config, manifest)
     if "failed" in done:
@@ -193,7 +197,7 @@ def _finish(
     if story.results.keys() >= set(FIRST_HALF):
         showing.write_report(story, folder, config, story.timings)
         figures = folder / "work" / "evaluation.npz"
-        if scene.interval == scene.clip_interval:
+        if "resim_frames" in story["show"].arrays:
             with atomic_write(figures) as stream:
                 np.savez_compressed(stream, **evaluation_arrays(story))
         else:

@@ -6,7 +6,7 @@ import hashlib
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected
 from fluidlift.look.appearance import SteadyShading
 from fluidlift.pipeline.seeing import clip_of, labels_of
-from fluidlift.pipeline.story import Story
+from fluidlift.pipeline.story import Story, available_memory
 from fluidlift.types import (
     CellType,
     FaceVelocity,
@@ -28,6 +28,10 @@ from fluidlift.types import (
     Terrain,
     VideoClip,
 )
+
+if TYPE_CHECKING:
+    from fluidlift.io.obstacles import Obstacle
+    from fluidlift.physics.rigid_body import RigidBody
 
 LYING = ("stream", "fall")
 """kinds that lie on something and can be made longer; the others are free in the air"""
@@ -88,11 +92,13 @@ class Scene:
     frames: int
     """to simulate, the first (at rest) counted"""
     seed: int
-    obstacles: tuple[Any, ...] = ()
+    obstacles: tuple[Obstacle, ...] = ()
     shading: SteadyShading | None = None
     """what of the look stays in place; None: nothing"""
     extended: float = 0.0
     """m"""
+    longest_step: float | None = None
+    """s, of the simulator, where scene.yaml gives a `time_step`"""
 
     @cached_property
     def parts(self) -> dict[str, str]:
@@ -107,13 +113,18 @@ class Scene:
             "body": _hash(self.body.positions, self.body.velocities, self.body.source, self.rest.means),
             "look": _hash(self.rest.quats, self.rest.scales, self.rest.opacities, self.rest.sh,
                           b"" if self.shading is None else self.shading.image),
-            "parameters": _hash(self.parameters),
+            "parameters": _hash(self.parameters, self.longest_step),
             "frame interval": _hash(self.interval),
             "seed": _hash(self.seed),
         }  # fmt: skip
         if self.obstacles:
-            found["obstacles"] = _hash(*(x for o in self.obstacles for x in _plain_obstacle(o)))
+            found["obstacles"] = _hash(*(x for o in self.obstacles for x in o.plain()))
         return found
+
+    @cached_property
+    def bodies(self) -> tuple[RigidBody, ...]:
+        """The obstacles as bodies; raises `InputRejected` where a mesh bounds no solid."""
+        return tuple(o.body((self.frames - 1) * self.interval) for o in self.obstacles)
 
 
 def _hash(*values: Any) -> str:
@@ -127,14 +138,6 @@ def _hash(*values: Any) -> str:
             digest.update(value if isinstance(value, bytes) else repr(value).encode())
         digest.update(b"\0")
     return digest.hexdigest()
-
-
-def _plain_obstacle(obstacle: Any) -> list[Any]:
-    """Its numbers; not its line in the file."""
-    keys = [x for k in obstacle.keyframes for x in (k.time, k.position, np.asarray(k.rotation))]
-    texts = [obstacle.name, obstacle.position, obstacle.motion, obstacle.density, obstacle.friction,
-             obstacle.restitution, obstacle.velocity, obstacle.angular_velocity]  # fmt: skip
-    return [*texts, np.asarray(obstacle.rotation), obstacle.mesh.vertices, obstacle.mesh.faces, *keys]
 
 
 def footage_of(story: Story) -> Footage | None:
@@ -181,10 +184,13 @@ def scene_of(
     if footage is not None and asset.kind in LYING:  # bodies in the air change their outline: nothing is steady
         mask = footage.labels.fluid.mean(axis=0) > 0.5
         shading = SteadyShading.of(footage.clip.frames, mask, asset.camera) if mask.any() else None
+    changes = dict(edits.parameters)
+    longest_step = changes.pop("time_step", None)
     scene = Scene(
         asset.kind, rest, body, asset.terrain, asset.cell_types, asset.velocity,
-        asset.parameters.updated(edits.parameters), asset.camera, interval, asset.interval,
+        asset.parameters.updated(changes), asset.camera, interval, asset.interval,
         wanted or config.simulate.frames or clip_frames, config.seed, edits.obstacles, shading,
+        longest_step=longest_step,
     )  # fmt: skip
     longer = edits.extend_downstream if request.extend_downstream is None else request.extend_downstream
     return extended(scene, longer) if longer > 0 else scene
@@ -194,17 +200,25 @@ def extended(scene: Scene, length: float) -> Scene:
     """The same river, `length` metres longer downstream.
 
     Raises:
-        InputRejected: a fluid that lies on nothing, or that does not leave its box.
+        InputRejected: a fluid that lies on nothing, that does not leave its box, or a length that memory cannot hold.
     """
-    from fluidlift.physics.extend import extended_body, extended_downstream, extended_velocity, find_outlet
+    from fluidlift.physics.extend import (
+        extended_body,
+        extended_downstream,
+        extended_grid,
+        extended_velocity,
+        find_outlet,
+    )
+    from fluidlift.physics.preflight import check_memory
 
     if scene.kind not in LYING:
         raise InputRejected(
             f"a {scene.kind} cannot be extended downstream", "a stream or a fall", "leave out --extend-downstream"
         )
     channel = (scene.terrain, scene.cell_types)
-    longer = extended_downstream(*channel, length)
     outlet = find_outlet(*channel)
+    check_memory(extended_grid(outlet, length), len(scene.body), available_memory())
+    longer = extended_downstream(*channel, length)
     return replace(
         scene,
         terrain=longer[0],
@@ -219,8 +233,8 @@ def simulation_step(scene: Scene) -> FluidParameters:
     """The same physics with the simulator's own longest step.
 
     The fit's step is that of its grid, which must resolve a gravity wave over one cell. The simulator adapts
-    to the flow and only needs steps in which a wave does not cross more than a cell or so. Wall damping is a share
-    per step and is converted, so that walls take the same share per second.
+    to the flow and only needs steps in which a wave does not cross more than a cell or so; a `time_step` in scene.yaml
+    is taken instead. Wall damping is a share per step and is converted, so that walls take the same share per second.
     """
     parameters, interval = scene.parameters, min(scene.interval, scene.clip_interval)
     h = scene.terrain.grid.spacing
@@ -229,5 +243,7 @@ def simulation_step(scene: Scene) -> FluidParameters:
     wave = float(np.sqrt(np.linalg.norm(parameters.gravity) * depth))
     longest = interval if scene.kind == "plume" else h / max(wave, 1e-6)
     step = float(np.clip(longest, interval / 8, interval))
+    if scene.longest_step is not None:
+        step = min(float(scene.longest_step), scene.interval)
     damping = 1.0 - (1.0 - parameters.wall_damping) ** (step / parameters.time_step)
     return replace(parameters, time_step=step, wall_damping=float(np.clip(damping, 0.0, 1.0)))

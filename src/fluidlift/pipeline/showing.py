@@ -16,7 +16,7 @@ from fluidlift.pipeline.scene import LYING, Footage, Scene
 from fluidlift.pipeline.seeing import clip_of, flow_of, labels_of
 from fluidlift.pipeline.simulating import frame_file
 from fluidlift.pipeline.story import Result, Story
-from fluidlift.types import CellType, Gaussians, PinholeCamera, concatenate
+from fluidlift.types import CellType, Gaussians, PinholeCamera, Similarity3, concatenate, matrix_from_quat
 
 
 def splat_frames(folder: Path, count: int) -> Iterator[tuple[Gaussians, np.ndarray, np.ndarray]]:
@@ -34,7 +34,7 @@ def show(
     footage: Footage | None,
     folder: Path,
     config: JobConfig,
-    count: int,
+    poses: np.ndarray,
     *,
     step: Callable[[int, int], None] = lambda done, total: None,
 ) -> Result:
@@ -45,14 +45,16 @@ def show(
         footage: the clip; without it the preview leaves out the input, and the fluid stands before grey.
         folder: of the asset.
         config: its `show` section.
-        count: frames that were simulated.
+        poses: [k,b,7] of the obstacles in the k frames that were simulated: position (m), orientation (w, x, y, z).
         step: told (frames done, all frames).
     """
     from fluidlift.io.export_usd import write_usd
+    from fluidlift.io.frames import MovingMesh
     from fluidlift.io.video import write_video
 
+    count = len(poses)
     measured: dict[str, list[np.ndarray]] = {"frames": [], "mask": [], "flow": []}
-    panels = _panels(scene, footage, folder, config, count, measured, step)
+    panels = _panels(scene, footage, folder, config, poses, measured, step)
     write_video(folder / "preview.mp4", panels, 1.0 / scene.interval)
     if config.show.usd:
         write_usd(
@@ -61,6 +63,9 @@ def show(
             interval=scene.interval,
             terrain=scene.terrain.mesh,
             camera=scene.camera,
+            bodies=[
+                MovingMesh(o.name, o.mesh, poses[:, b, :3], poses[:, b, 3:]) for b, o in enumerate(scene.obstacles)
+            ],
             attributes=scene.parameters.to_dict() | {"kind": scene.kind},
         )
     if not measured["frames"]:
@@ -74,12 +79,12 @@ def show(
 
 
 def _panels(
-    scene: Scene, footage: Footage | None, folder: Path, config: JobConfig, count: int, measured, step
+    scene: Scene, footage: Footage | None, folder: Path, config: JobConfig, poses: np.ndarray, measured, step
 ) -> Iterator[np.ndarray]:
     """Input | re-simulation | side view, frame by frame; keeps what the evaluation needs on the way."""
     from fluidlift.look.pictures import caption
     from fluidlift.look.rasterize import render
-    from fluidlift.look.scenery import orbit_camera, terrain_depth, terrain_surfels, visible_beside_rocks
+    from fluidlift.look.scenery import mesh_surfels, orbit_camera, terrain_depth, terrain_surfels, visible_beside_rocks
 
     camera, terrain, grid = scene.camera, scene.terrain, scene.terrain.grid
     plate = np.full((camera.size[1], camera.size[0], 3), 0.5, np.float32)
@@ -87,7 +92,8 @@ def _panels(
     if footage is not None:
         plate = footage.plate.astype(np.float32) / 255.0
         rocks = footage.labels.solid.mean(axis=0) > 0.5
-        if scene.interval == scene.clip_interval:  # later frames, or those between, have no counterpart in the clip
+        # frames after the clip, between its own, or with obstacles in them have no counterpart in it
+        if scene.interval == scene.clip_interval and not scene.obstacles:
             compared = max(len(footage.clip) - footage.start, 1)
     solid_depth = terrain_depth(terrain, camera) if rocks.any() else None
     airborne = scene.kind not in LYING
@@ -100,19 +106,23 @@ def _panels(
         whole = np.stack([grid.low + inset, grid.high - inset])
     side = orbit_camera(camera, np.concatenate([scene.rest.means, whole]), size=size)
     sky = np.linspace(0.93, 0.78, size[1], dtype=np.float32)[:, None, None] * np.ones((1, size[0], 3), np.float32)
-    for k, (gaussians, _, velocity) in enumerate(splat_frames(folder, count)):
-        step(k, count)
+    shapes = [mesh_surfels(o.mesh, grid.spacing) for o in scene.obstacles]
+    for k, (gaussians, _, velocity) in enumerate(splat_frames(folder, len(poses))):
+        step(k, len(poses))
+        solids = [
+            shape.transformed(Similarity3(1.0, matrix_from_quat(p[3:]), p[:3])) for shape, p in zip(shapes, poses[k])
+        ]
         front = gaussians
         if solid_depth is not None:
             keep = visible_beside_rocks(gaussians.means, camera, solid_depth, rocks, margin=1.5 * grid.spacing)
             front, velocity = gaussians.select(keep), velocity[keep]
-        rendered = render(front, camera, background=plate)
+        rendered = render(concatenate([front, *solids]), camera, background=plate)
         picture = _bytes(rendered.image)
         if k < compared:
             measured["frames"].append(picture)
             measured["mask"].append(rendered.alpha > 0.5)
             measured["flow"].append(_screen_velocity(front, velocity, camera, scene.interval, rendered.alpha))
-        view = render(concatenate([ground, gaussians]), side, background=sky)
+        view = render(concatenate([ground, *solids, gaussians]), side, background=sky)
         panels = [caption(_resized(picture, size), "re-simulation"), caption(_bytes(view.image), "side view")]
         if footage is not None:
             time = footage.start + round(k * scene.interval / scene.clip_interval)

@@ -66,9 +66,10 @@ def simulator_of(scene: Scene) -> ParticleSimulator:
         )  # fmt: skip
     from fluidlift.physics.apic import LiquidSimulator
 
+    solids: dict[str, Any] = {"bodies": scene.bodies} if scene.bodies else {}
     return LiquidSimulator(
         grid, scene.terrain, parameters, scene.body, cell_types=scene.cell_types, inflow_profile=scene.velocity,
-        seed=scene.seed, emit_source=look,
+        seed=scene.seed, emit_source=look, **solids,
     )  # fmt: skip
 
 
@@ -76,11 +77,15 @@ def preflight(scene: Scene) -> None:
     """What would fail on the way, said before anything is written.
 
     Raises:
-        InputRejected: too little memory, too many frames, or an inlet that lets nothing in.
+        InputRejected: too little memory, too many frames, an inlet that lets nothing in, or obstacles in smoke.
     """
     from fluidlift.physics.preflight import check_frames, check_inlet, check_memory
     from fluidlift.physics.stepping import SimulationSettings
 
+    if scene.obstacles and scene.kind == "plume":
+        raise InputRejected(
+            f"{scene.obstacles[0].line}: an obstacle in a plume", "obstacles in a liquid", "remove it from scene.yaml"
+        )
     step = simulation_step(scene).time_step
     check_frames(scene.frames, scene.interval, step, SimulationSettings().max_substeps)
     check_memory(scene.terrain.grid, len(scene.body), available_memory())
@@ -90,6 +95,13 @@ def preflight(scene: Scene) -> None:
 def frame_file(folder: Path, number: int) -> Path:
     """Splats of one frame; numbers start at 1001."""
     return folder / "frames" / "splats" / f"{number:04d}.ply"
+
+
+def require_room(folder: Path, frames: int, splats: int) -> None:
+    """Raise `InputRejected` where the disk cannot hold so many frames of so many splats."""
+    from fluidlift.io.atomic import require_free_space
+
+    require_free_space(folder, frames * splats * BYTES_PER_SPLAT)
 
 
 def checkpoint_file(folder: Path) -> Path:
@@ -109,14 +121,19 @@ class History:
     """particles"""
     substeps: list[int] = field(default_factory=list)
     """of the step that led to the frame; 0 for the first"""
+    poses: list[np.ndarray] = field(default_factory=list)
+    """[b,7] of the obstacles: position (m) and orientation (w, x, y, z)"""
 
     def __len__(self) -> int:
         return len(self.count)
 
-    def add(self, scene: Scene, particles: Particles, substeps: int) -> None:
+    def add(self, scene: Scene, simulator: ParticleSimulator, particles: Particles, substeps: int) -> None:
         """One more frame."""
         from fluidlift.numerics.sampling import sample_nodes
 
+        bodies = simulator.bodies if scene.obstacles else None
+        pose = np.zeros((0, 7)) if bodies is None else np.concatenate([bodies.position, bodies.orientation], axis=1)
+        self.poses.append(pose)
         grid = scene.terrain.grid
         occupied = np.unique(np.floor((particles.positions - grid.low) / grid.spacing).astype(np.int64), axis=0)
         inside = grid.contains(particles.positions)
@@ -133,12 +150,14 @@ class History:
             "leak": np.array(self.leak, np.float32),
             "count": np.array(self.count, np.int64),
             "substeps": np.array(self.substeps, np.int64),
+            "poses": np.array(self.poses, np.float64),
         }
 
     @classmethod
     def of(cls, arrays: dict[str, np.ndarray], frames: int) -> History:
         """The first frames of `arrays`."""
-        return cls(*(arrays[name][:frames].tolist() for name in ("volume", "leak", "count", "substeps")))
+        figures = (arrays[name][:frames].tolist() for name in ("volume", "leak", "count", "substeps"))
+        return cls(*figures, list(arrays["poses"][:frames]))
 
 
 def continued(simulator: ParticleSimulator, scene: Scene, folder: Path, request: SimulationRequest, config: JobConfig):
@@ -173,6 +192,8 @@ def continued(simulator: ParticleSimulator, scene: Scene, folder: Path, request:
             )  # fmt: skip
         most = len(scene.body) + 2 * config.simulate.max_particles
         found = read_checkpoint(path, max_bytes=4 * simulation_bytes(scene.terrain.grid, most))
+        if found.history["poses"].shape != (found.frames, len(scene.obstacles), 7):
+            raise InputRejected(f"the checkpoint of '{folder.name}' holds other obstacles", "a whole checkpoint")
         history = History.of(found.history, scene.frames)
         if found.frames <= scene.frames:
             simulator.restore(found.state)
@@ -209,20 +230,18 @@ def simulate(
     Raises:
         InputRejected: a scene that cannot be simulated, said before anything is written; or the disk is full.
     """
-    from fluidlift.io.atomic import require_free_space
-
     preflight(scene)
     simulator = simulator_of(scene)
     history = continued(simulator, scene, folder, request or SimulationRequest(), config)
     first = len(history)
-    require_free_space(folder, (scene.frames - first) * len(scene.body) * BYTES_PER_SPLAT)
+    require_room(folder, scene.frames - first, len(scene.body))
     for old in (folder / "frames" / "splats").glob("*.ply"):
         if not (old.stem.isdigit() and 0 <= int(old.stem) - FIRST_FRAME < first):
             old.unlink()
     if first == 0:
         checkpoint_file(folder).unlink(missing_ok=True)
     failed = _advance(simulator, scene, folder, config, history, step)
-    warnings = []
+    warnings = list(simulator.bodies.warnings) if scene.obstacles else []
     if failed is None and len(history) < scene.frames:
         warnings.append(
             f"the re-simulation stopped after {len(history)} of {scene.frames} frames, at twice the number of "
@@ -237,7 +256,7 @@ def simulate(
     }
     if failed is not None:
         meta["failed"] = failed
-    return Result({name: arrays[name] for name in ("volume", "leak", "count")}, meta)
+    return Result({name: arrays[name] for name in ("volume", "leak", "count", "poses")}, meta)
 
 
 def _advance(
@@ -270,7 +289,7 @@ def _advance(
         if scene.shading is not None:
             shown = scene.shading.moved(shown, scene.rest.means[p.source])
         write_gaussians(frame_file(folder, FIRST_FRAME + k), shown, ids=p.ids, velocities=p.velocities)
-        history.add(scene, p, substeps)
+        history.add(scene, simulator, p, substeps)
         # the first one says whose frames these are
         if len(history) % config.simulate.checkpoint_every == 0 or len(history) in (1, scene.frames):
             _save(simulator, scene, folder, history)
@@ -296,20 +315,9 @@ def _simulation_warnings(kind: str, volumes: Sequence[float], leaks: Sequence[fl
     return warnings
 
 
-def frames_still_there(folder: Path, parts: dict[str, str]) -> Callable[[Result], bool]:
-    """Whether the frames of a cached simulation are complete and still its own: another scene may have been simulated
-    into the same folder since."""
-    from fluidlift.io.checkpoint import read_parts
-
-    def check(result: Result) -> bool:
-        if "failed" in result.meta or result.meta["frames"] < 1:
-            return False
-        try:
-            _, found = read_parts(checkpoint_file(folder))
-        except InputRejected:
-            return False
-        return found == parts and all(
-            frame_file(folder, FIRST_FRAME + k).is_file() for k in range(result.meta["frames"])
-        )
-
-    return check
+def frames_still_there(folder: Path) -> Callable[[Result], bool]:
+    """Whether the splat files of a cached simulation are complete; one that broke down is tried again."""
+    return lambda result: (
+        "failed" not in result.meta
+        and all(frame_file(folder, FIRST_FRAME + k).is_file() for k in range(result.meta["frames"]))
+    )

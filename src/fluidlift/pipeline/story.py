@@ -17,7 +17,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from fluidlift import __version__
-from fluidlift.io.asset_folder import load_stage, save_stage
+from fluidlift.io.asset_folder import is_owner, load_stage, mark_owner, save_stage
 
 Arrays = dict[str, np.ndarray]
 Meta = dict[str, Any]
@@ -109,6 +109,7 @@ class Story:
         settings: Any,
         after: tuple[str, ...],
         still_there: Callable[[Result], bool] = lambda result: True,
+        owns_files: bool = False,
     ) -> Result:
         """Run a stage, or take its result from the cache where nothing it depends on has changed.
 
@@ -118,6 +119,8 @@ class Story:
             settings: plain values that its result depends on.
             after: stages whose results it uses.
             still_there: whether files that the stage wrote beside its result still exist.
+            owns_files: there are such files, and other settings would write the same ones: a cached result counts only
+                while they are its own.
         """
         key = content_hash(__version__, name, settings, [self.keys[a] for a in after])
         self.keys[name] = key
@@ -126,14 +129,18 @@ class Story:
         result, cached = None, False
         if name in self.force:
             self._stale = True
-        if not self._stale:
+        if not self._stale and (not owns_files or is_owner(self.folder, name, key)):
             found = load_stage(self.folder, name, key)
             if found is not None and still_there(Result(*found)):
                 result, cached = Result(*found), True
         if result is None:
+            if owns_files:
+                mark_owner(self.folder, name, None)
             result = work()
             result.meta["seconds"] = round(time.perf_counter() - began, 3)
             save_stage(self.folder, name, key, result.arrays, result.meta)
+            if owns_files:
+                mark_owner(self.folder, name, key)
         seconds = time.perf_counter() - began
         self.results[name] = result
         self.timings[name] = {

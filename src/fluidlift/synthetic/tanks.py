@@ -1,40 +1,28 @@
 """Standard scenes of free-surface flow, ready for the liquid simulator: the set-ups that experiments and theory know.
 
 The lengths of a scene are given relative to one of them, its `size`. Liquid between a floor and a surface is filled to
-the exact height: its layers of particles are spaced to fit. In all builders `gravity` is in m/s^2, `viscosity` kinematic
-in m^2/s, and `seed` that of the jitter of the particles.
+the exact height: its layers of particles are spaced to fit. In all builders `gravity` is in m/s^2, `viscosity` is the
+kinematic one in m^2/s, and `seed` that of the jitter of the particles.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 
 from fluidlift.errors import require
-from fluidlift.numerics.isosurface import surface_nets
 from fluidlift.physics.apic import LiquidSimulator
-from fluidlift.types import CellType, FluidParameters, Grid, Particles, Terrain, TriangleMesh
-
-if TYPE_CHECKING:
-    from fluidlift.physics.rigid import RigidBody
+from fluidlift.physics.rigid import RigidBody
+from fluidlift.synthetic.filling import PER_AXIS, between, inside, terrain_of, within
+from fluidlift.types import CellType, FluidParameters, Grid, Particles, Terrain
 
 GRAVITY = 9.81
 """m/s^2"""
 WATER, HONEY = 1e-6, 7e-3
 """kinematic viscosity, m^2/s"""
-PER_AXIS = 2
-"""particles along each axis of a cell"""
-JITTER = 0.25
-"""largest random shift of a particle from its lattice point, in spacings of the lattice"""
-
-Height = Callable[[np.ndarray, np.ndarray], np.ndarray] | float
-"""m above z = 0 at (x, y), or the same everywhere"""
-Distance = Callable[[Float[np.ndarray, "*n 3"]], Float[np.ndarray, "*n"]]
-"""signed distance (m, positive outside) at positions (m)"""
 
 
 @dataclass(frozen=True)
@@ -61,75 +49,19 @@ class Tank:
             self.grid, self.terrain, self.parameters, self.particles, cell_types=self.cell_types, **options
         )
 
+    def with_bodies(self, *bodies: RigidBody) -> Tank:
+        """The tank with bodies in it. They take the place of the liquid, whose level is not raised."""
+        taken = np.zeros(len(self.particles), bool)
+        for body in bodies:
+            taken |= within(body, self.particles.positions, 0.5 * self.grid.spacing)
+        fill = self.fill * (1.0 - taken.sum() / max(len(taken), 1))
+        return replace(self, bodies=self.bodies + bodies, particles=self.particles.select(~taken), fill=fill)
+
     @property
     def time_scale(self) -> float:
         """s: sqrt(size / g); inf without gravity."""
         pull = float(np.linalg.norm(self.parameters.gravity))
         return float(np.sqrt(self.size / pull)) if pull > 0 else float("inf")
-
-
-def terrain_of(
-    grid: Grid, distance: Distance | None = None, mainstream: tuple[float, ...] = (1.0, 0.0, 0.0)
-) -> Terrain:
-    """A terrain of a signed distance; None: nothing solid but the sides of the box."""
-    shape = tuple(n + 1 for n in grid.shape)
-    if distance is None:
-        far = float(np.linalg.norm(grid.high - grid.low))
-        mesh = TriangleMesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int64))
-        return Terrain(grid, np.full(shape, far, np.float32), np.asarray(mainstream, float), mesh)
-    values = distance(grid.nodes()).astype(np.float32)
-    vertices, faces = surface_nets(values, spacing=grid.spacing, origin=grid.origin, close=False)
-    return Terrain(grid, values, np.asarray(mainstream, float), TriangleMesh(vertices, faces))
-
-
-def between(
-    grid: Grid,
-    floor: Height,
-    surface: Height,
-    *,
-    x: tuple[float, float] | None = None,
-    y: tuple[float, float] | None = None,
-    seed: int = 0,
-) -> tuple[Float[np.ndarray, "n 3"], float]:
-    """Jittered particles between two heights, in columns that are filled exactly from the floor to the surface.
-
-    Args:
-        grid: of the scene.
-        floor: lower end of the liquid.
-        surface: upper end.
-        x: range, m; None: the whole box. It is filled exactly too.
-        y: range, m.
-
-    Returns:
-        Positions (m) and the volume of the liquid (m^3, by the midpoint rule over the columns).
-    """
-    wish = grid.spacing / PER_AXIS
-    axes, steps = [], []
-    for axis, extent in enumerate((x, y)):
-        low, high = extent or (float(grid.low[axis]), float(grid.high[axis]))
-        count = max(1, round((high - low) / wish))
-        steps.append((high - low) / count)
-        axes.append(low + (np.arange(count) + 0.5) * steps[-1])
-    columns = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
-    bottom, top = (np.broadcast_to(h(*columns.T) if callable(h) else h, len(columns)) for h in (floor, surface))
-    depth = np.maximum(top - bottom, 0.0)
-    layers = np.round(depth / wish).astype(np.int64)
-    column = np.repeat(np.arange(len(columns)), layers)
-    layer = np.arange(len(column)) - np.repeat(np.cumsum(layers) - layers, layers)
-    step = depth[column] / layers[column]
-    points = np.column_stack([columns[column], bottom[column] + (layer + 0.5) * step])
-    shift = np.random.default_rng(seed).uniform(-JITTER, JITTER, points.shape)
-    points += shift * np.column_stack([np.full(len(step), steps[0]), np.full(len(step), steps[1]), step])
-    return points, float(depth.sum() * steps[0] * steps[1])
-
-
-def inside(grid: Grid, distance: Distance, *, seed: int = 0) -> Float[np.ndarray, "n 3"]:
-    """Jittered particles (m) where a signed distance is negative."""
-    step = grid.spacing / PER_AXIS
-    axes = [grid.low[a] + (np.arange(PER_AXIS * grid.shape[a]) + 0.5) * step for a in range(3)]
-    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    points = points[distance(points) < 0]
-    return points + np.random.default_rng(seed).uniform(-JITTER, JITTER, points.shape) * step
 
 
 def _tank(
@@ -353,7 +285,7 @@ def pool(
     *, cells: int = 24, width: float = 0.6, depth: float = 0.5, headroom: float = 0.4, viscosity: float = WATER,
     seed: int = 0,
 ) -> Tank:  # fmt: skip
-    """Still water in a square box; add bodies with `dataclasses.replace(tank, bodies=...)`.
+    """Still water in a square box, to put bodies in (`Tank.with_bodies`).
 
     Args:
         cells: across the pool.

@@ -1,0 +1,323 @@
+"""Kernels of the coupled viscosity: weights of the stresses, the operator, its smoother, and vector work.
+
+All arrays share one layout: a box of nodes with a ring of ghosts. u[i,j,k] lies between the cells i-1 and i, likewise v
+and w, and the edge along z number (i, j) between u[i,j-1] and u[i,j] and between v[i-1,j] and v[i,j]. Components are
+stacked: [3, nx, ny, nz]. Only `first <= k < last` of each vertical column is visited.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+
+from fluidlift.physics.liquid_fractions import control_share
+
+AIR, SOLVED, FIXED, WALL = 0, 1, 2, 3
+"""roles of a face"""
+
+ONE, TWO, EIGHT = np.uint64(1), np.uint64(2), np.uint64(8)
+ZERO, FULL = np.float32(0.0), np.float32(1.0)
+"""Unsigned indices need no check for negative ones, and numbers of single precision do not widen what they meet: with
+both, the inner loops become vector instructions, five times as fast."""
+
+
+@njit(cache=True)
+def _pair(a, b, wall_share):
+    """Share of a normal stress between two faces; 0 unless it acts on a solved one."""
+    if a == AIR or b == AIR or (a != SOLVED and b != SOLVED):
+        return 0.0
+    return wall_share if a == WALL or b == WALL else 1.0
+
+
+@njit(cache=True)
+def _four(a, b, c, d, wall_share):
+    """Share of a shear stress between four faces. A wall lies at half a cell's distance: twice the stiffness."""
+    if a == AIR or b == AIR or c == AIR or d == AIR:
+        return 0.0
+    if a != SOLVED and b != SOLVED and c != SOLVED and d != SOLVED:
+        return 0.0
+    return 2.0 * wall_share if a == WALL or b == WALL or c == WALL or d == WALL else 1.0
+
+
+@njit(cache=True)
+def _uniform_viscosity(cells, resistance, i, j, k):
+    """Viscosity of the eight cells around a node if they are full of one liquid, else -1."""
+    here = resistance[i, j, k]
+    for o in range(EIGHT):
+        ci, cj, ck = i - (o >> TWO), j - ((o >> ONE) & ONE), k - (o & ONE)
+        if cells[ci, cj, ck] != FULL or resistance[ci, cj, ck] != here:
+            return -1.0
+    return 1.0 / here
+
+
+@njit(cache=True)
+def _stiffness(octants, cells, resistance, i, j, k, across_x, across_y, across_z):
+    """Liquid share times viscosity of a control volume, see `control_share`."""
+    share, viscosity = control_share(octants, cells, resistance, i, j, k, across_x, across_y, across_z)
+    return share * viscosity
+
+
+@njit(parallel=True, cache=True)
+def weigh_stresses(roles, octants, cells, resistance, number, wall_share, normal, shear):
+    """Weights of the normal stresses xx, yy, zz at cells and of the shear stresses yz, xz, xy at edges.
+
+    normal[a] = 2 V nu dt / h^2 and shear[a] = V nu dt / h^2, where `number` is dt / h^2. A stress that would need the
+    velocity of air is left out: the surface is free of it.
+    """
+    _, nx, ny, nz = roles.shape
+    for i_ in prange(1, nx - 1):
+        i, si = np.uint64(i_), np.int64(i_)
+        for j in range(ONE, np.uint64(ny - 1)):
+            sj = np.int64(j)
+            for k in range(ONE, np.uint64(nz - 1)):
+                sk = np.int64(k)
+                u, v, w = roles[0, i, j, k], roles[1, i, j, k], roles[2, i, j, k]
+                xx = _pair(u, roles[0, i + ONE, j, k], wall_share)
+                yy = _pair(v, roles[1, i, j + ONE, k], wall_share)
+                zz = _pair(w, roles[2, i, j, k + ONE], wall_share)
+                yz = number * _four(v, roles[1, i, j, k - ONE], w, roles[2, i, j - ONE, k], wall_share)
+                xz = number * _four(u, roles[0, i, j, k - ONE], w, roles[2, i - ONE, j, k], wall_share)
+                xy = number * _four(u, roles[0, i, j - ONE, k], v, roles[1, i - ONE, j, k], wall_share)
+                centre = xx + yy + zz
+                if centre + yz + xz + xy == 0.0:
+                    continue
+                viscosity = _uniform_viscosity(cells, resistance, i, j, k)
+                if viscosity > 0.0:
+                    c = yz_here = xz_here = xy_here = viscosity
+                else:
+                    c = _stiffness(octants, cells, resistance, si, sj, sk, 0, 0, 0) if centre > 0.0 else 0.0
+                    yz_here = _stiffness(octants, cells, resistance, si, sj, sk, 0, 1, 1) if yz > 0.0 else 0.0
+                    xz_here = _stiffness(octants, cells, resistance, si, sj, sk, 1, 0, 1) if xz > 0.0 else 0.0
+                    xy_here = _stiffness(octants, cells, resistance, si, sj, sk, 1, 1, 0) if xy > 0.0 else 0.0
+                c *= 2.0 * number
+                normal[0, i, j, k], normal[1, i, j, k], normal[2, i, j, k] = c * xx, c * yy, c * zz
+                shear[0, i, j, k], shear[1, i, j, k], shear[2, i, j, k] = yz * yz_here, xz * xz_here, xy * xy_here
+
+
+@njit(parallel=True, cache=True)
+def weigh_faces(roles, octants, cells, resistance, normal, shear, least, mass, inverse):
+    """Liquid share of the solved faces, at least `least`, and 1 / diagonal; 0 where there is no liquid."""
+    _, nx, ny, nz = roles.shape
+    for i_ in prange(1, nx - 1):
+        i = np.uint64(i_)
+        for a in range(3):
+            x, y, z = np.uint64(a == 0), np.uint64(a == 1), np.uint64(a == 2)
+            # the two kinds of edges around the face, and the axis towards which they are neighbours
+            b, c = (a + 1) % 3, (a + 2) % 3
+            bx, by, bz = np.uint64(b == 0), np.uint64(b == 1), np.uint64(b == 2)
+            cx, cy, cz = np.uint64(c == 0), np.uint64(c == 1), np.uint64(c == 2)
+            for j in range(ONE, np.uint64(ny - 1)):
+                for k in range(ONE, np.uint64(nz - 1)):
+                    if roles[a, i, j, k] != SOLVED:
+                        continue
+                    stiffness = normal[a, i, j, k] + normal[a, i - x, j - y, k - z]
+                    stiffness += shear[b, i, j, k] + shear[b, i + cx, j + cy, k + cz]
+                    stiffness += shear[c, i, j, k] + shear[c, i + bx, j + by, k + bz]
+                    if cells[i, j, k] == FULL and cells[i - x, j - y, k - z] == FULL:
+                        share = 1.0
+                    else:
+                        share, _ = control_share(
+                            octants, cells, resistance, np.int64(i), np.int64(j), np.int64(k), np.int64(x), np.int64(y),
+                            np.int64(z),
+                        )  # fmt: skip
+                    if share > 0.0 or stiffness > ZERO:
+                        mass[a, i, j, k] = max(share, least)
+                        inverse[a, i, j, k] = 1.0 / (max(share, least) + stiffness)
+
+
+@njit(cache=True)
+def _pull_u(x, normal, shear, i, j, k):
+    """What the stresses take from the momentum of u[i,j,k]."""
+    u, v, w = x[0], x[1], x[2]
+    xx, xz, xy = normal[0], shear[1], shear[2]
+    here = u[i, j, k]
+    return (
+        xx[i - ONE, j, k] * (here - u[i - ONE, j, k])
+        - xx[i, j, k] * (u[i + ONE, j, k] - here)
+        + xy[i, j, k] * (here - u[i, j - ONE, k] + (v[i, j, k] - v[i - ONE, j, k]))
+        - xy[i, j + ONE, k] * (u[i, j + ONE, k] - here + (v[i, j + ONE, k] - v[i - ONE, j + ONE, k]))
+        + xz[i, j, k] * (here - u[i, j, k - ONE] + (w[i, j, k] - w[i - ONE, j, k]))
+        - xz[i, j, k + ONE] * (u[i, j, k + ONE] - here + (w[i, j, k + ONE] - w[i - ONE, j, k + ONE]))
+    )
+
+
+@njit(cache=True)
+def _pull_v(x, normal, shear, i, j, k):
+    u, v, w = x[0], x[1], x[2]
+    yy, yz, xy = normal[1], shear[0], shear[2]
+    here = v[i, j, k]
+    return (
+        yy[i, j - ONE, k] * (here - v[i, j - ONE, k])
+        - yy[i, j, k] * (v[i, j + ONE, k] - here)
+        + xy[i, j, k] * (here - v[i - ONE, j, k] + (u[i, j, k] - u[i, j - ONE, k]))
+        - xy[i + ONE, j, k] * (v[i + ONE, j, k] - here + (u[i + ONE, j, k] - u[i + ONE, j - ONE, k]))
+        + yz[i, j, k] * (here - v[i, j, k - ONE] + (w[i, j, k] - w[i, j - ONE, k]))
+        - yz[i, j, k + ONE] * (v[i, j, k + ONE] - here + (w[i, j, k + ONE] - w[i, j - ONE, k + ONE]))
+    )
+
+
+@njit(cache=True)
+def _pull_w(x, normal, shear, i, j, k):
+    u, v, w = x[0], x[1], x[2]
+    zz, yz, xz = normal[2], shear[0], shear[1]
+    here = w[i, j, k]
+    return (
+        zz[i, j, k - ONE] * (here - w[i, j, k - ONE])
+        - zz[i, j, k] * (w[i, j, k + ONE] - here)
+        + xz[i, j, k] * (here - w[i - ONE, j, k] + (u[i, j, k] - u[i, j, k - ONE]))
+        - xz[i + ONE, j, k] * (w[i + ONE, j, k] - here + (u[i + ONE, j, k] - u[i + ONE, j, k - ONE]))
+        + yz[i, j, k] * (here - w[i, j - ONE, k] + (v[i, j, k] - v[i, j, k - ONE]))
+        - yz[i, j + ONE, k] * (w[i, j + ONE, k] - here + (v[i, j + ONE, k] - v[i, j + ONE, k - ONE]))
+    )
+
+
+@njit(cache=True, fastmath={"reassoc", "contract"})
+def _dot_column(x, y, i, j, low, high):
+    total = 0.0
+    for a in range(3):
+        for k in range(low, high):
+            total += x[a, i, j, k] * y[a, i, j, k]
+    return total
+
+
+@njit(parallel=True, cache=True)
+def apply(x, out, mass, normal, shear, first, last):
+    """out = A x on the solved faces (0 elsewhere), for x that holds the fixed velocities too; returns x . out."""
+    _, nx, ny, _ = x.shape
+    sums = np.zeros(nx)
+    for i_ in prange(1, nx - 1):
+        i = np.uint64(i_)
+        total = 0.0
+        for j in range(ONE, np.uint64(ny - 1)):
+            low, high = np.uint64(first[i, j]), np.uint64(last[i, j])
+            for k in range(low, high):
+                m = mass[0, i, j, k]
+                value = m * x[0, i, j, k] + _pull_u(x, normal, shear, i, j, k)
+                out[0, i, j, k] = value if m > ZERO else ZERO
+            for k in range(low, high):
+                m = mass[1, i, j, k]
+                value = m * x[1, i, j, k] + _pull_v(x, normal, shear, i, j, k)
+                out[1, i, j, k] = value if m > ZERO else ZERO
+            for k in range(low, high):
+                m = mass[2, i, j, k]
+                value = m * x[2, i, j, k] + _pull_w(x, normal, shear, i, j, k)
+                out[2, i, j, k] = value if m > ZERO else ZERO
+            total += _dot_column(x, out, i, j, low, high)
+        sums[i] = total
+    return sums.sum()
+
+
+@njit(parallel=True, cache=True)
+def residual(x, rhs, out, mass, normal, shear, first, last):
+    """out = rhs - A x on the solved faces, 0 elsewhere."""
+    _, nx, ny, _ = x.shape
+    for i_ in prange(1, nx - 1):
+        i = np.uint64(i_)
+        for j in range(ONE, np.uint64(ny - 1)):
+            low, high = np.uint64(first[i, j]), np.uint64(last[i, j])
+            for k in range(low, high):
+                m = mass[0, i, j, k]
+                value = rhs[0, i, j, k] - m * x[0, i, j, k] - _pull_u(x, normal, shear, i, j, k)
+                out[0, i, j, k] = value if m > ZERO else ZERO
+            for k in range(low, high):
+                m = mass[1, i, j, k]
+                value = rhs[1, i, j, k] - m * x[1, i, j, k] - _pull_v(x, normal, shear, i, j, k)
+                out[1, i, j, k] = value if m > ZERO else ZERO
+            for k in range(low, high):
+                m = mass[2, i, j, k]
+                value = rhs[2, i, j, k] - m * x[2, i, j, k] - _pull_w(x, normal, shear, i, j, k)
+                out[2, i, j, k] = value if m > ZERO else ZERO
+
+
+def _half_sweep(x, rhs, mass, inverse, normal, shear, axis, color, first, last):
+    """Gauss-Seidel on the faces of one component and colour; none of them is a neighbour of another."""
+    _, nx, ny, _ = x.shape
+    for i_ in prange(1, nx - 1):
+        i = np.uint64(i_)
+        for j in range(ONE, np.uint64(ny - 1)):
+            start, high = np.uint64(first[i, j]), np.uint64(last[i, j])
+            start += (i + j + start + np.uint64(color)) & ONE
+            if axis == 0:
+                for k in range(start, high, TWO):
+                    rest = rhs[0, i, j, k] - mass[0, i, j, k] * x[0, i, j, k] - _pull_u(x, normal, shear, i, j, k)
+                    x[0, i, j, k] += inverse[0, i, j, k] * rest
+            elif axis == 1:
+                for k in range(start, high, TWO):
+                    rest = rhs[1, i, j, k] - mass[1, i, j, k] * x[1, i, j, k] - _pull_v(x, normal, shear, i, j, k)
+                    x[1, i, j, k] += inverse[1, i, j, k] * rest
+            else:
+                for k in range(start, high, TWO):
+                    rest = rhs[2, i, j, k] - mass[2, i, j, k] * x[2, i, j, k] - _pull_w(x, normal, shear, i, j, k)
+                    x[2, i, j, k] += inverse[2, i, j, k] * rest
+
+
+half_sweep = njit(parallel=True, cache=True)(_half_sweep)
+_half_sweep_alone = njit(cache=True)(_half_sweep)
+
+
+@njit(cache=True)
+def sweeps_alone(x, rhs, mass, inverse, normal, shear, count, forward, first, last):
+    """Whole sweeps without threads, for small grids; backward ones are the adjoint of forward ones."""
+    for _ in range(count):
+        for s in range(6):
+            t = s if forward else 5 - s
+            _half_sweep_alone(x, rhs, mass, inverse, normal, shear, t // 2, t % 2, first, last)
+
+
+@njit(parallel=True, cache=True)
+def descend(x, r, direction, q, step, mass, first, last):
+    """x += step direction, r -= step q; returns r . r and |mass x|^2 of the solved faces."""
+    _, nx, ny, _ = x.shape
+    residuals, momenta = np.zeros(nx), np.zeros(nx)
+    for i_ in prange(1, nx - 1):
+        i = np.uint64(i_)
+        squared, momentum = 0.0, 0.0
+        for a in range(3):
+            for j in range(ONE, np.uint64(ny - 1)):
+                for k in range(np.uint64(first[i, j]), np.uint64(last[i, j])):
+                    x[a, i, j, k] += step * direction[a, i, j, k]
+                    r[a, i, j, k] -= step * q[a, i, j, k]
+                    squared += r[a, i, j, k] * r[a, i, j, k]
+                    moved = mass[a, i, j, k] * x[a, i, j, k]
+                    momentum += moved * moved
+        residuals[i], momenta[i] = squared, momentum
+    return residuals.sum(), momenta.sum()
+
+
+@njit(parallel=True, cache=True)
+def scale_into(r, scale, inverse, cycles, rhs, z, first, last):
+    """Prepare the preconditioner: rhs = scale r and z = 0; or z = scale r / diagonal where there are no cycles."""
+    _, nx, ny, _ = r.shape
+    for i_ in prange(1, nx - 1):
+        i = np.uint64(i_)
+        for a in range(3):
+            for j in range(ONE, np.uint64(ny - 1)):
+                for k in range(np.uint64(first[i, j]), np.uint64(last[i, j])):
+                    rhs[a, i, j, k] = scale * r[a, i, j, k]
+                    z[a, i, j, k] = 0.0 if cycles else scale * r[a, i, j, k] * inverse[a, i, j, k]
+
+
+@njit(parallel=True, cache=True)
+def dot(r, z, first, last):
+    """r . z."""
+    _, nx, ny, _ = r.shape
+    sums = np.zeros(nx)
+    for i_ in prange(1, nx - 1):
+        i = np.uint64(i_)
+        total = 0.0
+        for j in range(ONE, np.uint64(ny - 1)):
+            total += _dot_column(r, z, i, j, np.uint64(first[i, j]), np.uint64(last[i, j]))
+        sums[i] = total
+    return sums.sum()
+
+
+@njit(parallel=True, cache=True)
+def turn(direction, z, factor, first, last):
+    """direction = z + factor direction."""
+    _, nx, ny, _ = direction.shape
+    for i_ in prange(1, nx - 1):
+        i = np.uint64(i_)
+        for a in range(3):
+            for j in range(ONE, np.uint64(ny - 1)):
+                for k in range(np.uint64(first[i, j]), np.uint64(last[i, j])):
+                    direction[a, i, j, k] = z[a, i, j, k] + factor * direction[a, i, j, k]

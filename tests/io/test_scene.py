@@ -1,0 +1,146 @@
+"""scene.yaml: what a person writes is checked, entry by entry, and a complaint names the line."""
+
+import numpy as np
+import pytest
+
+from fluidlift.errors import InputRejected
+from fluidlift.io.export_mesh import write_obj
+from fluidlift.io.scene import SCENE_TEMPLATE, read_edits
+from fluidlift.numerics.solid_mesh import box_mesh, moments
+
+
+@pytest.fixture
+def edits(tmp_path):
+    """What a scene.yaml of some text changes."""
+
+    def read(text, **options):
+        (tmp_path / "scene.yaml").write_text(text)
+        return read_edits(tmp_path, **options)
+
+    return read
+
+
+def test_the_template_changes_nothing(edits):
+    found = edits(SCENE_TEMPLATE)
+    assert (found.parameters, found.duration, found.extend_downstream, found.obstacles) == ({}, None, 0.0, ())
+
+
+def test_the_examples_of_the_template_work(edits, tmp_path):
+    write_obj(tmp_path / "rock.obj", box_mesh(np.ones(3)))
+    text = SCENE_TEMPLATE.replace("obstacles: []", "obstacles:").replace("parameters: {}", "parameters:")
+    found = edits("\n".join(line.removeprefix("#").removeprefix(" d") if line.startswith("#  ") else line
+                            for line in text.splitlines()))  # fmt: skip
+    assert [o.name for o in found.obstacles] == ["sphere1", "mesh2", "box3"]
+    assert found.parameters["kinematic_viscosity"] == 1e-6
+    volumes = [moments(o.mesh).volume for o in found.obstacles]
+    # the sphere is a polyhedron of 5120 faces inside it: 0.1 % less
+    np.testing.assert_allclose(volumes, [4 / 3 * np.pi * 1e-3, 1e-3, 4e-3], rtol=2e-3)
+    assert [o.motion for o in found.obstacles] == ["static", "static", "free"]
+
+
+def test_a_turn_is_about_x_then_y_then_z(edits):
+    (found,) = edits("obstacles: [{shape: box, size: [1, 2, 3], rotation: [90, 0, 90], position: [1, 2, 3]}]").obstacles
+    body = found.body(1.0)
+    np.testing.assert_allclose(body.position, [1, 2, 3])
+    # 90 degrees about x take (x, y, z) to (x, -z, y); 90 about z then to (z, x, y): lengths 3, 1, 2
+    from fluidlift.types import matrix_from_quat
+
+    turned = body.mesh.vertices @ matrix_from_quat(body.orientation).T
+    np.testing.assert_allclose(np.ptp(turned, axis=0), [3, 1, 2], atol=1e-9)
+
+
+def test_a_body_that_moves_steadily_is_where_it_must_be(edits):
+    text = "obstacles: [{shape: sphere, radius: 1, motion: animated, velocity: [2, 0, 0], angular_velocity: [0, 0, 3]}]"
+    (obstacle,) = edits(text).obstacles
+    short, long = obstacle.body(1.0).trajectory, obstacle.body(10.0).trajectory
+    for time in (0.0, 0.3, 0.97):
+        position, turn = short.pose(time)
+        np.testing.assert_allclose(position, [2 * time, 0, 0], atol=1e-12)
+        # half the angle in the quaternion, up to its sign
+        np.testing.assert_allclose(abs(turn[0]), abs(np.cos(1.5 * time)), atol=1e-12)
+        for one, two in zip(short.pose(time), long.pose(time)):
+            np.testing.assert_array_equal(one, two)  # a longer simulation goes on as the shorter one did
+
+
+def test_keyframes_become_a_trajectory(edits):
+    (found,) = edits("""
+obstacles:
+  - shape: cylinder
+    radius: 0.1
+    height: 1
+    motion: animated
+    keyframes:
+      - {time: 0, position: [0, 0, 0]}
+      - {time: 2, position: [1, 0, 0], rotation: [0, 0, 90]}
+""").obstacles
+    position, turn = found.body(4.0).trajectory.pose(1.0)
+    np.testing.assert_allclose(position, [0.5, 0, 0])
+    np.testing.assert_allclose(turn, [np.cos(np.pi / 8), 0, 0, np.sin(np.pi / 8)], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("obstacle: []", ["line 1", "write 'obstacles'"]),
+        ("\nparameters:\n  density: 1\n  viscosity: 2\n", ["line 4", "write 'kinematic_viscosity'"]),
+        ("obstacles:\n  - shape: spere\n", ["line 2", "write 'sphere'"]),
+        ("obstacles:\n  - shape: box\n    size: [1, 1, 1]\n    densitie: 3\n", ["line 4", "write 'density'"]),
+        ("obstacles:\n  - shape: box\n    radius: 1\n", ["line 3", "unknown entry 'radius'"]),
+        ("obstacles:\n  - shape: box\n", ["line 2", "size", "None"]),
+        ("obstacles:\n  - radius: 1\n", ["line 2", "neither shape nor mesh"]),
+        ("obstacles: [{shape: box, mesh: a.obj}]", ["both shape and mesh"]),
+        ("obstacles: [{shape: sphere, radius: -1}]", ["radius", "-1"]),
+        ("obstacles: [{shape: sphere, radius: .nan}]", ["radius", "nan"]),
+        ("obstacles: [{shape: sphere, radius: true}]", ["radius", "True"]),
+        ("obstacles: [{shape: sphere, radius: 1, position: [0, 0]}]", ["position", "3 numbers"]),
+        ("obstacles: [{shape: sphere, radius: 1, scale: [1, -1, 1]}]", ["scale", "inside out"]),
+        ("obstacles: [{shape: sphere, radius: 1, motion: swim}]", ["motion", "animated"]),
+        ("obstacles: [{shape: sphere, radius: 1, motion: animated}]", ["nothing moves"]),
+        ("obstacles: [{shape: sphere, radius: 1, velocity: [1, 0, 0]}]", ["static"]),
+        ("obstacles: [{shape: sphere, radius: 1, name: a}, {shape: sphere, radius: 1, name: a}]", ["second"]),
+        ("obstacles: {shape: box}", ["a list"]),
+        ("obstacles: [3]", ["name: value"]),
+        ("duration: long", ["duration", "'long'"]),
+        ("extend_downstream: -2", ["extend_downstream", "-2"]),
+        ("look: {hue: 1}", ["look", "cannot simulate"]),
+        ("parameters: {gravity: [0, 0]}", ["line 1", "three components"]),
+        ("parameters: [1]", ["name: value"]),
+    ],
+)
+def test_a_complaint_names_the_line_and_the_nearest_name(edits, text, words):
+    with pytest.raises(InputRejected) as said:
+        edits(text)
+    assert [w for w in ["scene.yaml", *words] if w not in str(said.value)] == []
+
+
+def keys(*times):
+    return ", ".join(f"{{time: {t}, position: [0, 0, 0]}}" for t in times)
+
+
+@pytest.mark.parametrize("times", [(1, 1), (2, 1), (1,)])
+def test_keyframes_must_be_in_order(edits, times):
+    with pytest.raises(InputRejected, match="keyframe"):
+        edits(f"obstacles: [{{shape: sphere, radius: 1, motion: animated, keyframes: [{keys(*times)}]}}]")
+
+
+@pytest.mark.parametrize("name", ["../rock.obj", "/etc/passwd", "C:\\rock.obj", "sub/../../rock.obj", "link.obj"])
+def test_meshes_are_read_from_the_asset_only(edits, tmp_path, name):
+    outside = tmp_path.parent / "rock.obj"
+    write_obj(outside, box_mesh(np.ones(3)))
+    (tmp_path / "link.obj").symlink_to(outside)
+    with pytest.raises(InputRejected, match=r"--meshes|link"):
+        edits(f"obstacles: [{{mesh: '{name}'}}]")
+
+
+def test_the_user_may_name_another_folder_of_meshes(edits, tmp_path):
+    other = tmp_path / "elsewhere"
+    write_obj(other / "rock.obj", box_mesh(np.ones(3)))
+    assert len(edits("obstacles: [{mesh: rock.obj}]", meshes=other).obstacles[0].mesh.faces) == 12
+
+
+def test_an_open_mesh_is_refused_with_the_line_that_names_it(edits, tmp_path):
+    mesh = box_mesh(np.ones(3))
+    write_obj(tmp_path / "open.obj", type(mesh)(mesh.vertices, mesh.faces[:-1]))
+    (obstacle,) = edits("\nobstacles:\n  - mesh: open.obj\n").obstacles
+    with pytest.raises(InputRejected, match=r"scene\.yaml, line 3: .*open"):
+        obstacle.body(1.0)

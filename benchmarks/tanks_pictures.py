@@ -19,11 +19,15 @@ import numba
 import numpy as np
 from numba import njit, prange
 
+from fluidlift.numerics.mesh_distance import mesh_distance
+from fluidlift.numerics.sampling import sample_nodes
+from fluidlift.physics.apic import LiquidSimulator
+from fluidlift.physics.rigid import RigidBody
 from fluidlift.synthetic import tanks
 from fluidlift.synthetic.gauges import Gauge
 from fluidlift.synthetic.paint import SUN, LiquidPaint, lit, to_picture
-from fluidlift.synthetic.surface import Body, body_of
-from fluidlift.types import Particles, PinholeCamera
+from fluidlift.synthetic.surface import Body, body_of, finer
+from fluidlift.types import Grid, Particles, PinholeCamera
 
 WATER = LiquidPaint(body=(0.02, 0.12, 0.15), absorption=(9.0, 3.5, 2.5))
 AMBER = LiquidPaint(body=(0.45, 0.17, 0.015), absorption=(10.0, 40.0, 150.0))
@@ -76,8 +80,9 @@ class Stage:
     """What a ray can meet."""
 
     body: Body
+    solid_grid: Grid
     solid: np.ndarray
-    """signed distance at the nodes of the grid, bodies included"""
+    """signed distance at the nodes of that grid, bodies included"""
     body_share: np.ndarray
     """signed distance to the bodies alone"""
     tank: tanks.Tank
@@ -94,7 +99,7 @@ class Stage:
         step = 0.35 * fine.spacing / float(np.linalg.norm(rays, axis=-1).max())
         _march(
             np.ascontiguousarray(eyes), np.ascontiguousarray(rays), enter + 1e-9, leave, step, self.body.level,
-            fine.low + 0.5 * fine.spacing, 1 / fine.spacing, self.solid, grid.low, 1 / grid.spacing, out,
+            fine.low + 0.5 * fine.spacing, 1 / fine.spacing, self.solid, grid.low, 1 / self.solid_grid.spacing, out,
         )  # fmt: skip
         return out, np.where(enter < leave, enter, np.inf)
 
@@ -125,7 +130,7 @@ def face_normals(stage: Stage, points: np.ndarray) -> np.ndarray:
 def picture(stage: Stage, particles: Particles, camera: PinholeCamera, paint: LiquidPaint) -> np.ndarray:
     """u8 [h,w,3]."""
     w, h = camera.size
-    grid, fine = stage.tank.grid, stage.body.grid
+    grid, fine, node = stage.tank.grid, stage.body.grid, stage.solid_grid.spacing
     rays = camera.rays(camera.pixel_grid()).reshape(-1, 3)
     eyes = np.broadcast_to(camera.position, rays.shape)
     out, enter = stage.cast(eyes, rays)
@@ -137,11 +142,11 @@ def picture(stage: Stage, particles: Particles, camera: PinholeCamera, paint: Li
     seen = np.flatnonzero(np.isfinite(wall) & (wall < 1e3 * np.linalg.norm(grid.high - grid.low)))
     points = eyes[seen] + wall[seen, None] * rays[seen]
     ground = np.isfinite(out[seen, 1])
-    normals = slope(lambda p: sample(stage.solid, grid.low, grid.spacing, p), points, 0.4 * grid.spacing)
+    normals = slope(lambda p: sample(stage.solid, grid.low, node, p), points, 0.4 * node)
     cut = ground & (np.abs(wall[seen] - enter[seen]) < 1e-6)
     normals[cut] = face_normals(stage, points[cut])
     normals[~ground] = (0.0, 0.0, 1.0)
-    body = sample(stage.body_share, grid.low, grid.spacing, points) < 0.3 * grid.spacing
+    body = sample(stage.body_share, grid.low, node, points) < 0.6 * node
     base = np.where(ground[:, None], np.where(body[:, None], WOOD, ROCK), TABLE)
     shade, _ = stage.cast(points + 0.6 * grid.spacing * normals, np.broadcast_to(SUN, points.shape))
     shadow = np.where(np.isfinite(shade[:, 1]), 0.35, np.exp(-3.0 * shade[:, 2] / (grid.spacing * 12)) * 0.6 + 0.4)
@@ -199,14 +204,21 @@ def cameras(tank: tanks.Tank, size: tuple[int, int]) -> list[PinholeCamera]:
     ]
 
 
-def with_bodies(tank: tanks.Tank, simulator) -> tuple[np.ndarray, np.ndarray]:
-    """Signed distance (m) of terrain and bodies together, and of the bodies alone, at the grid's nodes."""
-    solid = tank.terrain.signed_distance.astype(np.float64)
-    alone = np.full(solid.shape, 1e3)
-    for body in getattr(simulator, "bodies", ()):
-        nodes = tank.grid.nodes()
-        alone = np.minimum(alone, body.distance(nodes.reshape(-1, 3)).reshape(solid.shape))
-    return np.minimum(solid, alone), alone
+def solids(tank: tanks.Tank, simulator: LiquidSimulator) -> tuple[Grid, np.ndarray, np.ndarray]:
+    """A grid twice as fine, and at its nodes the signed distance (m) of terrain and bodies, and of the bodies alone."""
+    fine = finer(tank.grid)
+    nodes = fine.nodes().reshape(-1, 3)
+    terrain = sample_nodes(tank.terrain.signed_distance, tank.grid, nodes).astype(np.float64)
+    alone = np.full(len(nodes), 1e3)
+    moving = getattr(simulator, "bodies", None)
+    for number, body in enumerate(tank.bodies):
+        shape = mesh_distance(body.mesh, fine.spacing)
+        local = np.einsum("ij,ni->nj", moving.rotation[number], nodes - moving.position[number])
+        near = np.clip(local, shape.grid.low, shape.grid.high)
+        beyond = np.linalg.norm(local - near, axis=1)
+        alone = np.minimum(alone, sample_nodes(shape.distance, shape.grid, near) + beyond)
+    size = tuple(n + 1 for n in fine.shape)
+    return fine, np.minimum(terrain, alone).reshape(size), alone.reshape(size)
 
 
 def show(name: str, tank: tanks.Tank, instants: list[float], paint: LiquidPaint, out: Path, **options) -> None:
@@ -220,14 +232,26 @@ def show(name: str, tank: tanks.Tank, instants: list[float], paint: LiquidPaint,
         particles = simulator.particles
         volumes = particles.masses.astype(np.float64) / tank.parameters.density
         body = body_of(particles.positions, volumes, tank.grid, gauge.opening)
-        solid, alone = with_bodies(tank, simulator)
-        stage = Stage(replace(body, level=body.level.astype(np.float64)), solid, alone, tank)
+        stage = Stage(replace(body, level=body.level.astype(np.float64)), *solids(tank, simulator), tank)
         frame = np.concatenate([picture(stage, particles, camera, paint) for camera in views], axis=1)
         text = f"{name}  t = {simulator.time:.3g} s  {len(particles)} particles, {steps} steps"
         cv2.putText(frame, text, (10, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (40, 40, 40), 1, cv2.LINE_AA)
         path = out / f"{name}_{number}.png"
         cv2.imwrite(str(path), frame[..., ::-1])
         print(f"{path}  {time.perf_counter() - began:.1f} s", flush=True)
+
+
+def floats(cells: int) -> tanks.Tank:
+    """A pool into which a box, a log and a stone fall."""
+    tank = tanks.pool(cells=cells, width=0.8, depth=0.4, headroom=0.6)
+    tilt = np.array([0.93, 0.25, 0.2, 0.15])
+    return tank.with_bodies(
+        RigidBody.box("box", np.array([0.2, 0.2, 0.16]), density=450.0, position=(-0.18, 0.1, 0.55), orientation=tilt),
+        RigidBody.cylinder(
+            "log", 0.06, 0.34, density=600.0, position=(0.15, -0.15, 0.45), orientation=(0.7, 0.7, 0.1, 0)
+        ),
+        RigidBody.sphere("stone", 0.07, density=2600.0, position=(0.2, 0.2, 0.6)),
+    )
 
 
 def scenes(scale: float) -> dict[str, tuple[Callable[[], tanks.Tank], list[float], LiquidPaint]]:
@@ -244,6 +268,7 @@ def scenes(scale: float) -> dict[str, tuple[Callable[[], tanks.Tank], list[float
         "river": (lambda: tanks.river(cells=n(96)), [0.0, 1.0, 3.0, 6.0], WATER),
         "slope": (lambda: tanks.honey_slope(cells=n(64)), [0.0, 0.2, 0.6, 1.2], AMBER),
         "thread": (lambda: tanks.thread(cells=n(40)), [0.15, 0.4, 0.8, 1.2], AMBER),
+        "float": (lambda: floats(n(48)), [0.0, 0.2, 0.4, 0.8, 2.5], WATER),
         "drop": (lambda: tanks.drop(cells=n(56)), [0.0, 0.01, 0.03, 0.06], WATER),
     }  # fmt: skip
 

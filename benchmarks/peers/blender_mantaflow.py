@@ -6,8 +6,9 @@
 A liquid domain without mesh, spray or viscosity, replayed frame by frame (24 per second). Blender counts one layer of
 cells on each side as wall, so the domain has two cells more than the scene along each axis. Eight particles per cell
 (2^3, between 8 and 16 kept by its own resampling), the narrow band off ("band" null): otherwise Blender drops the
-particles deeper than three cells. "method": FLIP or APIC. What is timed: the whole frame, and the solver's own step
-inside it (without Blender's cache files and its scene graph), which is the figure that counts.
+particles deeper than three cells. The first frame has felt gravity already: Mantaflow is half a frame ahead.
+"method": FLIP or APIC. What is timed: the whole frame, and the solver's own step inside it (without Blender's cache
+files and its scene graph), which is the figure that counts.
 """
 
 from __future__ import annotations
@@ -140,7 +141,7 @@ def measure(scene: dict[str, Any]) -> dict[str, Any]:
         "particles": count, "first_particles": first, "front": (front - 1) * h, "mean_height": (height - 1) * h,
         "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
         "variant": f"{scene.get('method', 'FLIP')}, courant {scene['courant']:g}, at most {scene['max_steps']} steps",
-        "version": bpy.app.version_string,
+        "version": "Blender " + bpy.app.version_string,
     }  # fmt: skip
 
 

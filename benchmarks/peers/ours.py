@@ -22,7 +22,7 @@ from fluidlift.physics import transfer
 from fluidlift.physics.apic import LiquidSimulator, SimulationSettings
 from fluidlift.physics.forces import add_gravity
 from fluidlift.physics.stepping import TIDY_EVERY
-from fluidlift.physics.transfer import displacements
+from fluidlift.physics.travel import displacements
 from fluidlift.physics.window import window_around
 from fluidlift.types import FluidParameters, Grid, Particles, Terrain, TriangleMesh
 

@@ -8,7 +8,7 @@ from fluidlift.physics import boundaries
 from fluidlift.physics.crowding import cell_capacity, fill_ratio, limited_moves, limited_moves_plain, spreading
 from fluidlift.physics.forces import add_buoyancy, add_gravity
 from fluidlift.physics.inlet import Inlet, random_fluctuation
-from fluidlift.physics.outlet import hold_columns, outlet_heads, water_levels
+from fluidlift.physics.outlet import hold_columns, outlet_heads, surface_heights, water_levels
 from fluidlift.physics.pressure import build_system
 from fluidlift.physics.transfer import sort_by_cell
 from fluidlift.types import CellType, FaceVelocity, FluidParameters, Grid, Terrain, TriangleMesh
@@ -179,7 +179,7 @@ def test_standing_columns_hold_their_head_and_hanging_ones_none():
     levels = water_levels(wet, walls)
     assert (levels[-2:, :3] == 5).all() and (levels[-2:, 3:] == -1).all() and (levels[:-2] == -1).all()
     heads = outlet_heads(levels, levels, walls)
-    np.testing.assert_allclose(heads[-1, 0, 2:], [0.3, 0.2, 0.1, 0, 0])
+    np.testing.assert_allclose(heads[-1, 0, 2:], [0.25, 0.15, 0.05, 0, 0])  # depth of the cells' centres
     assert (heads[-2:, 3:] == 0).all() and (heads[:-2] == 0).all()
     assert outlet_heads(np.full_like(levels, -1), levels, walls) is None
 
@@ -190,9 +190,22 @@ def test_the_head_cancels_gravity_inside_the_outlet():
     wet[:, :, 2:5] = True
     levels = water_levels(wet, walls)
     velocity = add_gravity(FaceVelocity.zeros(GRID), (0.0, 0.0, -9.81), 0.01)
-    new = hold_columns(velocity, outlet_heads(levels, levels, walls) * 9.81 * 0.01, walls)
+    pull = 9.81 * 0.01
+    heads = outlet_heads(levels, levels, walls)
+    new = hold_columns(velocity, heads * pull, walls, weight=pull * GRID.spacing)
     np.testing.assert_allclose(new.w[-2:, :, 3:6], 0.0, atol=1e-7)
     np.testing.assert_allclose(new.u, 0.0, atol=1e-7)
+
+
+def test_the_surface_of_a_column_lies_where_the_distance_says():
+    walls = outlet_walls()
+    wet = np.zeros(GRID.shape, bool)
+    wet[-2:, :3, 2:5] = True
+    for height in (0.41, 0.45, 0.49):
+        distance = np.broadcast_to(GRID.centers()[..., 2] - GRID.low[2] - height, GRID.shape)
+        heights = surface_heights(water_levels(wet, walls), distance, GRID.spacing)
+        np.testing.assert_allclose(heights[-2:, :3], height / GRID.spacing, rtol=1e-6)
+        assert (heights[-2:, 3:] == -1).all() and (heights[:-2] == -1).all()
 
 
 def test_buoyancy_acts_against_gravity_where_there_is_smoke():

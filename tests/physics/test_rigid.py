@@ -92,7 +92,7 @@ def test_a_tumbling_body_keeps_its_angular_momentum_and_energy():
     bodies, _ = rigid([body], gravity=(0, 0, 0))
     momentum, energy = bodies.angular_momentum.copy(), bodies.energy[0]
     tilted = 1.0
-    for _ in range(300):
+    for _ in range(400):
         bodies.predict(0.01)
         bodies.advance()
         tilted = min(tilted, bodies.rotation[0, 1, 1])
@@ -136,7 +136,7 @@ def test_an_animated_body_follows_its_poses_and_knows_its_velocity():
         np.testing.assert_allclose(bodies.spin[0], [0, 0, 0.5 * np.pi * moves], atol=1e-9)
     bodies.time = 0.95
     assert bodies.max_speed(0.1) == pytest.approx(0.2 + 0.5 * np.pi * 0.05 * np.sqrt(3))
-    assert bodies.max_speed(0.01) == 0.0
+    assert bodies.max_speed(0.01) < 1e-12
 
 
 @pytest.mark.parametrize(
@@ -179,8 +179,10 @@ def test_thin_bodies_and_bodies_in_the_terrain_are_reported():
 def test_a_state_continues_bit_for_bit():
     bodies, window = rigid(
         [
-            RigidBody.box("crate", (0.2, 0.2, 0.2), position=(0.5, 0.5, 0.104), orientation=(1, 0.02, 0, 0)),
-            RigidBody.sphere("ball", 0.1, position=(0.45, 0.5, 0.34), velocity=(0.1, 0, -1.0)),
+            RigidBody.box(
+                "crate", (0.2, 0.2, 0.2), density=2500.0, position=(0.5, 0.5, 0.104), orientation=(1, 0.02, 0, 0)
+            ),
+            RigidBody.sphere("ball", 0.1, density=2500.0, position=(0.45, 0.5, 0.34), velocity=(0.1, 0, -1.0)),
         ]
     )
 
@@ -224,9 +226,9 @@ def test_the_open_shares_beside_a_body_are_those_of_its_distance():
         inner = [slice(None)] * 3
         inner[axis] = slice(1, -1)  # the sides of the box are closed beside
         found, wanted = walls.openings[axis][tuple(inner)], plain[axis][tuple(inner)]
-        # the plain ones know the distance at the corners of the face only: a chord H long of a circle of 6.4 H leaves
-        # out H / 50, or what bulges through a face between its corners
-        assert np.abs(found - wanted).max() < 0.06
+        # the plain ones know the distance at the corners of the face only. A plane that touches a sphere of 6.4 H cuts
+        # discs out of it whose edge is missed where it bulges between corners: a tenth of a face at some places
+        assert np.abs(found - wanted).max() < 0.15
         assert np.abs(found - wanted).mean() < 1e-3
         closed = (found == 0) & (wanted == 0)
         np.testing.assert_array_equal(walls.normals[axis][tuple(inner)][~closed & (found > 0)], 0.0)
@@ -241,10 +243,11 @@ def test_what_the_simulator_knows_of_cells_follows_the_union():
     walls = union.walls
     np.testing.assert_array_equal(union.wall_cells, boundaries.beside_closed_faces(walls))
     mean = boundaries.mean_of_corners(walls.signed_distance.astype(np.float64))
-    wanted = np.where(mean <= -2.0 * H, 0.0, cell_capacity(walls.signed_distance, walls.grid))  # 1 deep in the solid
-    wanted[:, :, :1] = union.capacity[:, :, :1]  # far from the body, where the terrain's are kept
-    np.testing.assert_allclose(union.capacity, wanted, atol=1e-6)
-    np.testing.assert_array_equal(walls.buried, ~walls.solid & (mean < 0.25 * H))
+    near = np.abs(mean) < 2.0 * H  # elsewhere `cell_capacity` says 1, in the solid too
+    np.testing.assert_allclose(union.capacity[near], cell_capacity(walls.signed_distance, walls.grid)[near], atol=1e-6)
+    assert (union.capacity[mean > 2.0 * H] == 1).all()
+    clear = np.abs(mean - 0.25 * H) > 1e-6  # but for rounding
+    np.testing.assert_array_equal(walls.buried[clear], (~walls.solid & (mean < 0.25 * H))[clear])
     assert walls.solid[10, 10, 12] and (walls.regions[walls.solid] == CellType.SOLID).all()
     inside = bodies.inside(walls.grid.centers().reshape(-1, 3)).reshape(walls.grid.shape)
     assert inside[10, 10, 12] and inside.sum() * H**3 == pytest.approx(0.036, rel=0.1)
@@ -307,7 +310,7 @@ def test_a_spinning_ball_and_a_moving_box_drive_no_flux_through_their_inside():
     # the ball's surface moves along itself; what is left of 1.4 m/s comes from the surface's kinks between cells
     assert np.abs(spread[ball]).max() < 0.03
     # the box takes as much volume in front as it leaves behind
-    assert np.abs(spread[10:]).max() > 0.5 and abs(spread[10:].sum()) < 1e-3
+    assert np.abs(spread[10:]).max() > 0.5 and abs(spread[10:].sum()) < 1e-4 * np.abs(spread[10:]).sum()
 
 
 def test_rows_times_velocity_are_the_divergence_of_the_solid():
@@ -419,19 +422,19 @@ def test_a_pool_at_rest_lifts_with_the_weight_of_the_displaced_liquid(height, tu
     _, q, _ = solved(bodies, window, pool(shape, 20))
     force = bodies.pressure_forces(q)[0]
     weight = DENSITY * G * 0.036
-    # the grid sees the volume to a percent (edges); sideways only rounding
-    assert force[2] == pytest.approx(weight, rel=0.015)
+    # wherever the flat bottom lies in its cells: the rest is single precision
+    assert force[2] == pytest.approx(weight, rel=1e-3)
     assert np.abs(force[:2]).max() < 1e-5 * weight
-    # a body turned in the grid is seen a little lopsided: the arm is a few thousandths of its size
-    assert np.abs(force[3:]).max() < 0.01 * weight * 0.3
+    # no torque about the middle: an arm of a thousandth of its size
+    assert np.abs(force[3:]).max() < 1e-3 * weight * 0.3
 
 
 def test_a_neutral_body_stays_where_it_is():
     shape = (20, 20, 22)
     bodies, window = rigid([RigidBody.sphere("b", 0.2, density=DENSITY, position=(0.51, 0.52, 0.5))], shape)
     solved(bodies, window, pool(shape, 20), rounds=3)
-    # of free fall; the volume on the grid is right to half a percent
-    assert np.abs(bodies.velocity[0]).max() < 0.01 * G * 0.005
+    # of free fall
+    assert np.abs(bodies.velocity[0]).max() < 1e-4 * G * 0.005
 
 
 @pytest.mark.parametrize("density", [100.0, 2000.0, 8000.0])
@@ -454,7 +457,7 @@ def test_a_light_body_on_the_floor_of_a_pool_is_lifted():
     bodies, window = rigid([RigidBody.box("b", (0.3, 0.3, 0.2), motion="static", position=(0.4, 0.4, 0.1025))], shape)
     _, q, _ = solved(bodies, window, pool(shape, 14))
     # the film below carries the pressure of the depth
-    assert bodies.pressure_forces(q)[0, 2] == pytest.approx(DENSITY * G * 0.018, rel=0.03)
+    assert bodies.pressure_forces(q)[0, 2] == pytest.approx(DENSITY * G * 0.018, rel=0.01)
 
 
 def test_a_piston_drives_the_liquid_with_its_own_velocity():

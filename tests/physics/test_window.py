@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fluidlift.physics.apic import LiquidSimulator
+from fluidlift.physics.apic import LiquidSimulator, SimulationSettings
 from fluidlift.physics.boundaries import build_walls
 from fluidlift.physics.window import BLOCK, MARGIN, crop_walls, face_box, moved_to, window_around
 from fluidlift.types import CellType, FluidParameters, Grid, Particles, Terrain, TriangleMesh
@@ -67,14 +67,18 @@ def test_a_larger_box_does_not_change_the_liquid():
         nodes = grid.nodes()
         bowl = np.minimum(0.35 - np.linalg.norm(nodes[..., :2] - 0.4, axis=-1), nodes[..., 2] - 0.12)
         terrain = terrain_on(grid, bowl)
-        points = np.random.default_rng(2).uniform([0.15, 0.15, 0.15], [0.4, 0.65, 0.6], (6000, 3))
+        # a jittered lattice, 8 per cell, dropped from a little above the bed
+        axes = [np.arange(0.1625, stop, h / 2) for stop in (0.4, 0.65, 0.5)]
+        points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+        points += np.random.default_rng(0).uniform(-0.1, 0.1, points.shape) * h
         points = points[np.linalg.norm(points[:, :2] - 0.4, axis=1) < 0.33]
         simulator = LiquidSimulator(
             grid, terrain, FluidParameters(time_step=0.02), Particles.at_rest(points, 1.0),
-            cell_types=np.zeros(cells, np.uint8),
+            cell_types=np.zeros(cells, np.uint8), settings=SimulationSettings(reseed=False),
         )  # fmt: skip
-        simulator.advance(0.2)
+        for _ in range(3):
+            simulator.advance(0.02)
         results.append(simulator.particles)
-    assert results[0].velocities.std() > 0.2  # it moves
-    # rounding of coordinates with another origin, grown over the steps of a splash
-    np.testing.assert_allclose(results[0].positions, results[1].positions, atol=0.02 * h)
+    assert np.abs(results[0].velocities).max() > 0.5  # it moves
+    # rounding of coordinates with another origin; a splash is chaotic, and from its start on no two runs agree
+    np.testing.assert_allclose(results[0].positions, results[1].positions, atol=1e-3 * h)

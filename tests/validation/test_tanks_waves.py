@@ -75,10 +75,10 @@ def test_a_tank_sloshes_at_the_frequency_of_linear_waves(mode):
     ratio, kept = slosh(32, mode=mode, amplitude=0.03 / mode)
     # omega^2 = g k tanh(k H). The waves have k a = 0.09: the finite amplitude slows them by (k a)^2 / 8 = 0.1 %; the
     # grid, with 32 cells per one or two half waves, by (k h)^2 / 24 < 0.2 %, and the splitting in time by as much.
-    # The surface, known to a tenth of a cell of its 0.5 or 1 cell of amplitude, leaves 3 %
-    assert ratio == pytest.approx(1.0, abs=0.03)
-    # the viscosity of water takes less than 1 % per period; the transfer between particles and grid takes the rest
-    assert kept > 0.75
+    # The surface is known to a few hundredths of a cell of its 0.5 or 1 cell of amplitude: 2 %
+    assert ratio == pytest.approx(1.0, abs=0.02)
+    # water's viscosity takes 0.1 % per period; what the transfer between particles and grid takes must stay small
+    assert kept > 0.93
 
 
 def test_sloshing_gets_better_with_the_grid():
@@ -91,16 +91,18 @@ def test_sloshing_gets_better_with_the_grid():
 def test_ten_seconds_of_sloshing_keep_the_volume_and_do_not_gain_energy():
     tank = tanks.standing_wave(cells=20, amplitude=0.08, width_cells=2)
     gauge, simulator = Gauge.of(tank), tank.simulator()
+    k = np.pi / tank.size
+    period = 2 * np.pi / np.sqrt(G * k * np.tanh(0.5 * k * tank.size))
     simulator.advance(0.1)  # the jitter of the start is gone
-    volumes, energies = [gauge.volume(simulator.particles)], [energy(simulator.particles, tank.grid.spacing)]
-    for _ in range(33):
-        simulator.advance(0.3)
+    volumes, energies = [], []
+    while simulator.time < 10.0:
         volumes.append(gauge.volume(simulator.particles))
         energies.append(energy(simulator.particles, tank.grid.spacing))
+        simulator.advance(period / 8)
+    # over a whole period: the gauge rounds a steep wave, and velocities and places are known half a step apart
+    volumes, energies = (np.convolve(x, np.full(8, 1 / 8), "valid") for x in (volumes, energies))
     # of the volume that the surface encloses; the masses of the particles never change
-    drift = np.array(volumes) / volumes[0] - 1
-    # a steep wave (two cells) is rounded by the gauge by as much as 0.5 %, so the trend counts: means over a second
-    assert abs(drift[-4:].mean()) < 0.01 and abs(drift[14:18].mean()) < 0.01
+    assert np.abs(volumes / volumes[0] - 1).max() < 0.01
     # the wave has rho g a^2 / 4 of energy per area; none may appear out of nothing beyond 5 % of that
     wave = 0.25 * G * (0.08 * tank.size) ** 2 * tank.size * 2 * tank.grid.spacing * tank.parameters.density
     assert np.max(energies - np.minimum.accumulate(energies)) < 0.05 * wave

@@ -70,13 +70,13 @@ def mesh_distance(mesh: TriangleMesh, spacing: float, *, margin: float | None = 
     nodes = float(np.prod(cells + 1.0))
     require(nodes <= LARGEST_GRID, f"{nodes:.3g} nodes around the mesh", f"{LARGEST_GRID}", "use a coarser spacing")
     origin = 0.5 * (low + high) - 0.5 * cells * spacing
-    shape = tuple(int(n) for n in cells)
+    shape = (int(cells[0]), int(cells[1]), int(cells[2]))
     start, order = _triangles_of_planes(triangles, origin[0], spacing, shape[0] + 1)
     nearest = np.full(tuple(n + 1 for n in shape), -1, np.int64)
     squared = np.full(nearest.shape, np.inf)
     _measure_band(triangles, start, order, origin, spacing, BAND * spacing, nearest, squared)
-    index = ndimage.distance_transform_edt(nearest < 0, return_distances=False, return_indices=True)
-    nearest = np.where(nearest < 0, nearest[tuple(index)], nearest)
+    i, j, k = np.asarray(ndimage.distance_transform_edt(nearest < 0, return_distances=False, return_indices=True))
+    nearest = np.where(nearest < 0, nearest[i, j, k], nearest)
     for _ in range(FAR_PASSES):
         nearest = _measure_far(triangles, origin, spacing, nearest, squared)
     crossings = np.zeros(nearest.shape, np.int32)

@@ -16,40 +16,11 @@ import numpy as np
 from numba import get_num_threads, set_num_threads
 
 from fluidlift.numerics import components, multigrid_assembly, multigrid_cycle
+from fluidlift.numerics.multigrid_cycle import Hierarchy
 from fluidlift.numerics.multigrid_kernels import BASE, CELLS, HALF, PARTS, PLANES, ROW_BASE, ROWS, SEGMENT_BASE
 
 SERIAL_CELLS = 65536
 """levels with fewer unknown cells are visited by one thread: waking another costs more"""
-
-
-@dataclass(frozen=True)
-class Hierarchy:
-    """The operator, in units of 1 / spacing^2, on ever coarser grids; memory as in `multigrid_kernels`."""
-
-    geometry: np.ndarray
-    common: np.ndarray
-    """float32 [levels,3]"""
-    corner: np.ndarray
-    """indices of the first cell of the finest level in the arrays of the whole grid"""
-    x: np.ndarray
-    rhs: np.ndarray
-    inverse: np.ndarray
-    air: np.ndarray
-    couplings: tuple[np.ndarray, np.ndarray, np.ndarray]
-    rows: tuple[np.ndarray, np.ndarray, np.ndarray]
-    segments: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-    beside_known: np.ndarray
-    """bool, in the arrays of the whole grid: unknown cells with an open face to a known cell, or an added diagonal"""
-
-    @property
-    def size(self) -> int:
-        """Length of the arrays of the finest level."""
-        return int(2 * self.geometry[0, HALF] * self.geometry[0, PLANES])
-
-    @property
-    def fine(self) -> tuple[np.ndarray, np.ndarray]:
-        """Line of the finest level and its corner."""
-        return self.geometry[0], self.corner
 
 
 class LowRank(NamedTuple):
@@ -94,9 +65,9 @@ def _threads(cells: int) -> Iterator[None]:
         set_num_threads(threads)
 
 
-def _assemble(
+def assemble(
     unknown: np.ndarray,
-    weights: tuple[np.ndarray, np.ndarray, np.ndarray],
+    weights: tuple[np.ndarray, ...],
     box: np.ndarray,
     added_diagonal: np.ndarray | None,
 ) -> Hierarchy:
@@ -107,7 +78,8 @@ def _assemble(
     geometry = multigrid_assembly.geometry_of(tuple(int(n) for n in high - low))
     last_level = geometry[-1]
     cells = int(last_level[BASE] + 2 * last_level[HALF] * last_level[PLANES])
-    x, rhs, inverse, air, cx, cy, cz = (np.zeros(cells, np.float32) for _ in range(7))
+    x, rhs, inverse, cx, cy, cz = (np.zeros(cells, np.float32) for _ in range(6))
+    air = np.zeros(cells)
     count = int(last_level[ROW_BASE] + last_level[PLANES] * last_level[ROWS])
     first, last, same = np.zeros(count, np.int32), np.zeros(count, np.int32), np.zeros(count, bool)
     common = np.zeros((len(geometry), 3), np.float32)
@@ -117,9 +89,10 @@ def _assemble(
     start, stop, segment_same = np.empty(most, np.int32), np.empty(most, np.int32), np.empty(most, bool)
     beside = np.zeros(unknown.shape, bool)
     added = np.zeros((0, 0, 0), np.float32) if added_diagonal is None else _single(added_diagonal)
+    wx, wy, wz = weights
     for level, g in enumerate(geometry):
         if level == 0:
-            multigrid_assembly.assemble_finest(g, low, unknown, *weights, added, air, cx, cy, cz, first, last, beside)
+            multigrid_assembly.assemble_finest(g, low, unknown, wx, wy, wz, added, air, cx, cy, cz, first, last, beside)
         else:
             multigrid_assembly.assemble_coarse(geometry[level - 1], g, inverse, air, cx, cy, cz, first, last)
         g[CELLS] = multigrid_assembly.invert_diagonal(g, air, cx, cy, cz, inverse, common[level])
@@ -130,17 +103,11 @@ def _assemble(
     used = offset[-1]
     segments = (offset, start[:used].copy(), stop[:used].copy(), segment_same[:used].copy())
     rows = (first, last, same)
-    return Hierarchy(geometry, common, low, x, rhs, inverse, air, (cx, cy, cz), rows, segments, beside)
+    return Hierarchy(geometry, common, low, x, rhs, inverse, (air, cx, cy, cz), rows, segments, beside)
 
 
 def _single(array: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(array, np.float32)
-
-
-def _cycle(hierarchy: Hierarchy) -> None:
-    h = hierarchy
-    sums = np.zeros(h.geometry[0, PLANES])
-    multigrid_cycle.cycle(h.geometry, h.common, h.x, h.rhs, h.inverse, h.air, *h.couplings, h.rows, h.segments, sums)
 
 
 @dataclass(frozen=True)
@@ -176,9 +143,9 @@ def build_levels(
         return [Level(inverse, x, rhs, None)]
     scaled = tuple(_single(w) / np.float32(spacing**2) for w in weights)
     with _threads(int(box[:, 4].sum())):
-        hierarchy = _assemble(np.ascontiguousarray(unknown), scaled, box, added_diagonal)
+        hierarchy = assemble(np.ascontiguousarray(unknown), scaled, box, added_diagonal)
         g, corner = hierarchy.fine
-        multigrid_assembly.store(g, corner + 1, hierarchy.inverse, hierarchy.inverse, *hierarchy.rows[:2], inverse)
+        multigrid_assembly.store(g, corner + 1, hierarchy.inverse, *hierarchy.cells, inverse)
     return [Level(inverse, x, rhs, hierarchy)]
 
 
@@ -189,9 +156,9 @@ def v_cycle(levels: Sequence[Level]) -> None:
         return
     g, corner = hierarchy.fine
     with _threads(int(g[CELLS])):
-        multigrid_assembly.load(g, corner + 1, level.rhs, 1.0, hierarchy.inverse, *hierarchy.rows[:2], hierarchy.rhs)
-        _cycle(hierarchy)
-        multigrid_assembly.store(g, corner + 1, hierarchy.x, hierarchy.inverse, *hierarchy.rows[:2], level.x)
+        multigrid_assembly.load(g, corner + 1, level.rhs, 1.0, *hierarchy.cells, hierarchy.rhs)
+        multigrid_cycle.cycle(hierarchy, np.zeros(g[PLANES]))
+        multigrid_assembly.store(g, corner + 1, hierarchy.x, *hierarchy.cells, level.x)
 
 
 def _packed(hierarchy: Hierarchy, terms: LowRank, spacing: float) -> tuple[np.ndarray, ...]:
@@ -265,26 +232,23 @@ def solve(
         return Solution(out, 0, 0.0, 0, 0.0)
     single = (_single(weights[0]), _single(weights[1]), _single(weights[2]))
     with _threads(int(box[:, 4].sum())):
-        h = _assemble(unknown, single, box, None)
+        h = assemble(unknown, single, box, None)
         closed = components.closed_components(unknown, single, h.beside_known)
         count = len(closed.sizes)
         means = _Means(h, closed, low_rank, unknown.shape)
         b, p = np.zeros(h.size), np.zeros(h.size)
-        where = (h.inverse, *h.rows[:2])
-        squares = multigrid_assembly.load(*h.fine, np.ascontiguousarray(rhs), spacing**2, *where, b)
+        squares = multigrid_assembly.load(*h.fine, np.ascontiguousarray(rhs), float(spacing) ** 2, *h.cells, b)
         if initial is not None:
             guess = np.ascontiguousarray(initial)
-            squares += 0.0 * multigrid_assembly.load(*h.fine, guess, 1.0, *where, p)  # not finite if the guess is not
+            squares += 0.0 * multigrid_assembly.load(*h.fine, guess, 1.0, *h.cells, p)  # not finite if the guess is not
         if not np.isfinite(squares):
             return Solution(out, 0, float("nan"), count, 0.0)
         removed = means.remove(b)
         size = float(np.sqrt(np.square(b).sum() if removed > 0 else squares))
         if size == 0.0:
             return Solution(out, 0, 0.0, count, removed)
-        iterations, residual = multigrid_cycle.conjugate_gradients(
-            h.geometry, h.common, p, b, tolerance * size, max_iterations, h.x, h.rhs, h.inverse, h.air, *h.couplings,
-            h.rows, h.segments, _packed(h, low_rank, spacing),
-        )  # fmt: skip
+        terms = _packed(h, low_rank, spacing)
+        iterations, residual = multigrid_cycle.conjugate_gradients(h, p, b, tolerance * size, max_iterations, terms)
         means.remove(p)
-        multigrid_assembly.store(*h.fine, p, *where, out)
+        multigrid_assembly.store(*h.fine, p, *h.cells, out)
     return Solution(out, iterations, residual / size, count, removed / size)

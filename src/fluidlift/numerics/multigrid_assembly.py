@@ -31,8 +31,8 @@ LEAST_SAME = 4
 """blocks for which leaving a run of mixed couplings pays"""
 COARSEST_CELLS = 4
 """coarsening stops when the longest side has as many cells"""
-AIR_SHARE = np.float32(0.8)
-AIR_LIMIT = np.float32(3.0)
+AIR_SHARE = 0.8
+AIR_LIMIT = 3.0
 """times the largest coupling of a fine cell: what lies nearer to p = 0 than that (ghost fluid) is 0 for the fine grid,
 but the coarse cell around it reaches further"""
 
@@ -64,7 +64,7 @@ def bounds(unknown):
     return out
 
 
-def geometry_of(shape: tuple[int, int, int]) -> np.ndarray:
+def geometry_of(shape: tuple[int, ...]) -> np.ndarray:
     """int64 [levels,9], see `multigrid_kernels`; shape: cells along x, y, z of the finest level."""
     shapes = [shape]
     while max(shapes[-1]) > COARSEST_CELLS:
@@ -101,7 +101,7 @@ def assemble_finest(g, corner, unknown, wx, wy, wz, added, air, cx, cy, cz, firs
                 o = place(g, i, j, k)
                 first[first_row + j] = min(first[first_row + j], k)
                 last[first_row + j] = k + 1
-                total = added[x, y, z] if added.size > 0 else np.float32(0.0)
+                total = np.float64(added[x, y, z]) if added.size > 0 else 0.0
                 if x > 0 and unknown[x - 1, y, z]:
                     cx[o] = wx[x, y, z]
                 else:
@@ -148,7 +148,8 @@ def assemble_coarse(fine, coarse, inverse, air, cx, cy, cz, first, last):
             low, high = _range_of_coarse_row(fine, i, j, first, last)
             first[row], last[row] = low, high
             for k in range(low, high):
-                tx = ty = tz = tair = np.float32(0.0)
+                tx = ty = tz = np.float32(0.0)
+                tair = 0.0
                 for a in range(2 * i - 1, min(2 * i + 1, fine[PLANES] - 1)):
                     for b in range(2 * j - 1, min(2 * j + 1, fine[ROWS] - 1)):
                         for c in range(2 * k - 1, 2 * k + 1):
@@ -183,7 +184,7 @@ def invert_diagonal(g, air, cx, cy, cz, inverse, common):
             some = 0
             mx = my = mz = np.float32(0.0)
             for t in range(U(g[HALF] - a)):
-                total = air[o + t] + cx[o + t] + cx[f + t] + cz[o + t] + cz[u + t] + cy[o + t] + cy[r + t]
+                total = np.float32(air[o + t]) + cx[o + t] + cx[f + t] + cz[o + t] + cz[u + t] + cy[o + t] + cy[r + t]
                 inverse[o + t] = np.float32(1.0) / total if total > 0 else np.float32(0.0)
                 some += total > 0
                 mx, my, mz = max(mx, cx[o + t]), max(my, cy[o + t]), max(mz, cz[o + t])

@@ -1,17 +1,21 @@
-"""The V-cycle and the conjugate gradients of the multigrid solver, each compiled as a whole (see `multigrid_kernels`).
+"""The V-cycle and the conjugate gradients of the multigrid solver (memory: `multigrid_kernels`).
 
-A level is cut into parts of planes, one per thread. The threads run their waves at the same time, each half sweep one
-plane further from the borders of the part than the one before; then they fill in what is left around the borders. Red
-and black cells do not see their own colour, so the result is that of plain half sweeps, to the last bit.
+A level of many cells is cut into parts of planes, one per thread. First the threads run their waves at the same time,
+each half sweep one plane further from the borders of the part than the one before; then they fill in what is left
+around the borders. Red and black cells do not see their own colour, so the result is that of plain half sweeps, to the
+last bit. The levels below are visited by one thread, in one go.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from numba import njit, prange
 
 from fluidlift.numerics.multigrid_kernels import (
     BLACK,
+    HALF,
     PARTS,
     PLANES,
     RED,
@@ -34,76 +38,88 @@ RESTARTS = 3
 """times that conjugate gradients begin again where rounding has parted their residual from the true one"""
 
 
+@dataclass(frozen=True)
+class Hierarchy:
+    """The operator, in units of 1 / spacing^2, on ever coarser grids; memory as in `multigrid_kernels`."""
+
+    geometry: np.ndarray
+    common: np.ndarray
+    """float32 [levels,3]"""
+    corner: np.ndarray
+    """indices of the first cell of the finest level in the arrays of the whole grid"""
+    x: np.ndarray
+    rhs: np.ndarray
+    inverse: np.ndarray
+    operator: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+    """air, cx, cy, cz"""
+    rows: tuple[np.ndarray, np.ndarray, np.ndarray]
+    segments: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+    beside_known: np.ndarray
+    """bool, in the arrays of the whole grid: unknown cells with an open face to a known cell, or an added diagonal"""
+
+    @property
+    def size(self) -> int:
+        """Length of the arrays of the finest level."""
+        return int(2 * self.geometry[0, HALF] * self.geometry[0, PLANES])
+
+    @property
+    def fine(self) -> tuple[np.ndarray, np.ndarray]:
+        """Line of the finest level and its corner."""
+        return self.geometry[0], self.corner
+
+    @property
+    def cells(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What tells the unknown cells: inverse, and the first and last of each row."""
+        return self.inverse, self.rows[0], self.rows[1]
+
+
 @njit(cache=True)
-def _cut(c, parts, g):
-    """First plane of a part."""
-    return 1 + c * (g[PLANES] - 2) // parts
-
-
-@njit(parallel=True, cache=True)
-def _down_in_parts(fine, coarse, common, x, rhs, inverse, air, cx, cy, cz, rows, segments):
-    parts = fine[PARTS]
-    for c_ in prange(parts):
-        c = np.int64(c_)
-        a, b = _cut(c, parts, fine), _cut(c + 1, parts, fine)
-        wave_down(a, b, int(c > 0), -int(c < parts - 1), (a + 6) // 2 if c > 0 else 1,
-                  (b - 3) // 2 if c < parts - 1 else coarse[PLANES] - 1,
-                  fine, coarse, common, x, rhs, inverse, air, cx, cy, cz, rows, segments)  # fmt: skip
-    for c_ in prange(1, parts):
-        b = _cut(np.int64(c_), parts, fine)
-        wave_down(b, b, -1, 1, (b - 3) // 2, (b + 6) // 2,
-                  fine, coarse, common, x, rhs, inverse, air, cx, cy, cz, rows, segments)  # fmt: skip
-
-
-@njit(parallel=True, cache=True)
-def _up_in_parts(fine, coarse, common, x, rhs, inverse, cx, cy, cz, rows, segments, sums):
-    parts = fine[PARTS]
-    for c_ in prange(parts):
-        c = np.int64(c_)
-        a, b = _cut(c, parts, fine), _cut(c + 1, parts, fine)
-        wave_up(a, b, int(c > 0), -int(c < parts - 1),
-                fine, coarse, common, x, rhs, inverse, cx, cy, cz, rows, segments, sums)  # fmt: skip
-    for c_ in prange(1, parts):
-        b = _cut(np.int64(c_), parts, fine)
-        wave_up(b, b, -1, 1, fine, coarse, common, x, rhs, inverse, cx, cy, cz, rows, segments, sums)
-
-
-@njit(parallel=True, cache=True)
-def _turn_in_parts(g, direction, z, factor, q, air, cx, cy, cz, segments, sums):
+def _part(c, border, g):
+    """Planes a to b - 1 of part c, and by how much these ends move per half sweep; or those around its upper border."""
     parts = g[PARTS]
-    for c_ in prange(parts):
-        c = np.int64(c_)
-        a, b = _cut(c, parts, g), _cut(c + 1, parts, g)
-        wave_turn(a, b, int(c > 0), -int(c < parts - 1), g, direction, z, factor, q, air, cx, cy, cz, segments, sums)
-    for c_ in prange(1, parts):
-        b = _cut(np.int64(c_), parts, g)
-        wave_turn(b, b, -1, 1, g, direction, z, factor, q, air, cx, cy, cz, segments, sums)
+    a, b = 1 + c * (g[PLANES] - 2) // parts, 1 + (c + 1) * (g[PLANES] - 2) // parts
+    return (b, b, -1, 1) if border else (a, b, int(c > 0), -int(c < parts - 1))
 
 
 @njit(parallel=True, cache=True)
-def _apply(g, p, q, air, cx, cy, cz, segments, sums):
-    parts = g[PARTS]
-    for c_ in prange(parts):
-        c = np.int64(c_)
-        for i in range(_cut(c, parts, g), _cut(c + 1, parts, g)):
-            sums[i] = apply_plane(i, g, p, q, air, cx, cy, cz, *segments)
+def _down(border, fine, coarse, common, x, rhs, inverse, operator, rows, segments):
+    for c_ in prange(fine[PARTS] - border):
+        a, b, da, db = _part(np.int64(c_), border, fine)
+        # coarse planes whose fine planes and their neighbours are done
+        c0 = (b - 3) // 2 if border else ((a + 6) // 2 if da else 1)
+        c1 = (b + 6) // 2 if border else ((b - 3) // 2 if db else coarse[PLANES] - 1)
+        wave_down(a, b, da, db, c0, c1, fine, coarse, common, x, rhs, inverse, *operator, rows, segments)
 
 
 @njit(parallel=True, cache=True)
-def _subtract(g, b, q, r, segments, sums):
-    parts = g[PARTS]
-    for c_ in prange(parts):
-        c = np.int64(c_)
-        for i in range(_cut(c, parts, g), _cut(c + 1, parts, g)):
+def _up(border, fine, coarse, common, x, rhs, inverse, operator, rows, segments, sums):
+    for c_ in prange(fine[PARTS] - border):
+        a, b, da, db = _part(np.int64(c_), border, fine)
+        wave_up(a, b, da, db, fine, coarse, common, x, rhs, inverse, *operator[1:], rows, segments, sums)
+
+
+@njit(parallel=True, cache=True)
+def _turn(border, g, direction, z, factor, q, operator, segments, sums):
+    for c_ in prange(g[PARTS] - border):
+        a, b, da, db = _part(np.int64(c_), border, g)
+        wave_turn(a, b, da, db, g, direction, z, factor, q, *operator, segments, sums)
+
+
+@njit(parallel=True, cache=True)
+def _residual(g, p, b, q, r, operator, segments, sums):
+    """q = A p; r = b - q."""
+    for c_ in prange(g[PARTS]):
+        first, last, _, _ = _part(np.int64(c_), 0, g)
+        for i in range(first, last):
+            apply_plane(i, g, p, q, *operator, *segments)
             sums[i] = residual_plane(i, g, b, q, r, *segments)
 
 
 @njit(parallel=True, cache=True)
 def _descend(g, p, r, direction, q, step, scale, rhs, segments, sums):
-    parts = g[PARTS]
-    for c_ in prange(parts):
-        c = np.int64(c_)
-        for i in range(_cut(c, parts, g), _cut(c + 1, parts, g)):
+    for c_ in prange(g[PARTS]):
+        first, last, _, _ = _part(np.int64(c_), 0, g)
+        for i in range(first, last):
             sums[i] = descend_plane(i, g, p, r, direction, q, step, scale, rhs, *segments)
 
 
@@ -123,27 +139,35 @@ def _sweep_coarsest(g, common, x, rhs, inverse, cx, cy, cz, segments, sums):
 
 
 @njit(cache=True)
-def cycle(geometry, common, x, rhs, inverse, air, cx, cy, cz, rows, segments, sums):
-    """One V-cycle on rhs of level 0 from x = 0: linear, symmetric, positive. sums gets x . rhs of each plane.
-
-    Two sweeps before each coarse correction (red, black, red, black), two after it in the opposite order.
-    """
+def _cycle_alone(geometry, common, x, rhs, inverse, operator, rows, segments, sums):
+    """A V-cycle by one thread. sums gets x . rhs of each plane of its finest level."""
     levels = len(geometry)
     for l in range(levels - 1):
         fine, coarse = geometry[l], geometry[l + 1]
-        if fine[PARTS] == 1:
-            wave_down(1, fine[PLANES] - 1, 0, 0, 1, coarse[PLANES] - 1,
-                      fine, coarse, common[l], x, rhs, inverse, air, cx, cy, cz, rows, segments)  # fmt: skip
-        else:
-            _down_in_parts(fine, coarse, common[l], x, rhs, inverse, air, cx, cy, cz, rows, segments)
-    _sweep_coarsest(geometry[levels - 1], common[levels - 1], x, rhs, inverse, cx, cy, cz, segments, sums)
+        wave_down(1, fine[PLANES] - 1, 0, 0, 1, coarse[PLANES] - 1, fine, coarse, common[l],
+                  x, rhs, inverse, *operator, rows, segments)  # fmt: skip
+    _sweep_coarsest(geometry[levels - 1], common[levels - 1], x, rhs, inverse, *operator[1:], segments, sums)
     for l in range(levels - 2, -1, -1):
         fine, coarse = geometry[l], geometry[l + 1]
-        if fine[PARTS] == 1:
-            wave_up(1, fine[PLANES] - 1, 0, 0,
-                    fine, coarse, common[l], x, rhs, inverse, cx, cy, cz, rows, segments, sums)  # fmt: skip
-        else:
-            _up_in_parts(fine, coarse, common[l], x, rhs, inverse, cx, cy, cz, rows, segments, sums)
+        wave_up(1, fine[PLANES] - 1, 0, 0, fine, coarse, common[l],
+                x, rhs, inverse, *operator[1:], rows, segments, sums)  # fmt: skip
+
+
+def cycle(h: Hierarchy, sums: np.ndarray) -> float:
+    """One V-cycle on rhs of the finest level from x = 0: linear, symmetric, positive. Returns x . rhs.
+
+    Two sweeps before each coarse correction (red, black, red, black), two after it in the opposite order.
+    """
+    shared = int(np.argmax(np.append(h.geometry[:, PARTS], 1) == 1))  # levels that threads share
+    work = (h.x, h.rhs, h.inverse, h.operator, h.rows, h.segments)
+    for l in range(shared):
+        for border in (0, 1):
+            _down(border, h.geometry[l], h.geometry[l + 1], h.common[l], *work)
+    _cycle_alone(h.geometry[shared:], h.common[shared:], *work, sums)
+    for l in range(shared - 1, -1, -1):
+        for border in (0, 1):
+            _up(border, h.geometry[l], h.geometry[l + 1], h.common[l], *work, sums)
+    return float(sums.sum())
 
 
 @njit(cache=True)
@@ -169,19 +193,9 @@ def add_low_rank(p, q, places, values, starts, inverse_mass):
     return dot
 
 
-@njit(cache=True)
-def _true_residual(g, p, b, q, r, air, cx, cy, cz, segments, low_rank, sums):
-    """r = b - A p; returns r . r. q is scratch."""
-    _apply(g, p, q, air, cx, cy, cz, segments, sums)
-    add_low_rank(p, q, *low_rank)
-    _subtract(g, b, q, r, segments, sums)
-    return sums.sum()
-
-
-@njit(cache=True)
 def conjugate_gradients(
-    geometry, common, p, b, goal, max_iterations, x, rhs, inverse, air, cx, cy, cz, rows, segments, low_rank
-):
+    h: Hierarchy, p: np.ndarray, b: np.ndarray, goal: float, max_iterations: int, low_rank: tuple[np.ndarray, ...]
+) -> tuple[int, float]:
     """Solve A p = b in place, preconditioned by V-cycles; returns the number of iterations and |b - A p|.
 
     Residual and solution are kept in double precision. Directions are single: what is subtracted from the residual is
@@ -193,33 +207,43 @@ def conjugate_gradients(
         goal: for |b - A p|.
         low_rank: places, values, starts and inverse masses for `add_low_rank`.
     """
-    g = geometry[0]
+    g = h.geometry[0]
     sums = np.zeros(g[PLANES])
     q, r, direction = np.zeros_like(b), np.zeros_like(b), np.zeros(len(b), np.float32)
-    squared = _true_residual(g, p, b, q, r, air, cx, cy, cz, segments, low_rank, sums)
-    iterations = 0
+
+    with_terms = len(low_rank[0]) > 0
+
+    def true_residual() -> float:
+        _residual(g, p, b, q, r, h.operator, h.segments, sums)
+        if not with_terms:
+            return float(sums.sum())
+        add_low_rank(p, q, *low_rank)
+        np.subtract(b, q, out=r)
+        return float(np.square(r).sum())
+
+    squared, iterations = true_residual(), 0
     for _ in range(RESTARTS):
-        if iterations == max_iterations or not squared > goal * goal:
+        if iterations == max_iterations or not squared > goal**2:
             break
-        before = squared
+        before, rz, fresh = squared, 1.0, True
         # near one: single precision neither over- nor underflows
         scale = 1.0 / np.sqrt(squared)
-        _descend(g, p, r, direction, q, 0.0, scale, rhs, segments, sums)
-        rz, factor = 1.0, np.float32(0.0)
-        while iterations < max_iterations and squared > goal * goal:
-            cycle(geometry, common, x, rhs, inverse, air, cx, cy, cz, rows, segments, sums)
-            previous, rz = rz, sums.sum()
+        _descend(g, p, r, direction, q, 0.0, scale, h.rhs, h.segments, sums)
+        while iterations < max_iterations and squared > goal**2:
+            previous, rz = rz, cycle(h, sums)
             if not rz > 0:
                 break
-            _turn_in_parts(g, direction, x, factor * np.float32(rz / previous), q, air, cx, cy, cz, segments, sums)
-            curvature = sums.sum() + add_low_rank(direction, q, *low_rank)
+            factor = np.float32(0.0 if fresh else rz / previous)
+            for border in range(min(g[PARTS], 2)):
+                _turn(border, g, direction, h.x, factor, q, h.operator, h.segments, sums)
+            curvature = float(sums.sum()) + (add_low_rank(direction, q, *low_rank) if with_terms else 0.0)
             if not curvature > 0:
                 break
             # rz and the direction belong to the scaled residual
-            _descend(g, p, r, direction, q, rz / (scale * curvature), scale, rhs, segments, sums)
-            squared, factor = sums.sum(), np.float32(1.0)
+            _descend(g, p, r, direction, q, rz / (scale * curvature), scale, h.rhs, h.segments, sums)
+            squared, fresh = float(sums.sum()), False
             iterations += 1
-        squared = _true_residual(g, p, b, q, r, air, cx, cy, cz, segments, low_rank, sums)
+        squared = true_residual()
         if not squared < 0.25 * before:
             break
-    return iterations, np.sqrt(squared)
+    return iterations, float(np.sqrt(squared))

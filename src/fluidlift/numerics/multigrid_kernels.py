@@ -14,8 +14,9 @@ couplings to them.
 Each sum over cells is kept per plane and the planes are added in order: the result is the same for any number of
 threads. Indices are unsigned, since signed ones cost a test each against counting from the end.
 
-Arrays: x, rhs, inverse (1 / diagonal, 0 outside the unknown cells), air (what the diagonal holds beyond the couplings)
-and cx, cy, cz (coupling with the neighbour on the low side), all float32 and one-dimensional with the levels in a row.
+Arrays: x, rhs, inverse (1 / diagonal, 0 outside the unknown cells) and cx, cy, cz (coupling with the neighbour on the
+low side) in float32, air (what the diagonal holds beyond the couplings) in float64: sums of weights, which residuals see
+in full. All are one-dimensional with the levels in a row.
 rows = (first, last, same): the cells of each row from first to last - 1. segments = (offset, start, stop, same). `same`
 marks where all couplings between unknown cells have the values `common` (along x, y, z), which is nearly everywhere:
 neighbours that are not unknown hold x = 0, so there the couplings need not be read.
@@ -74,10 +75,7 @@ def relax_plane(i, color, g, common, x, rhs, inverse, cx, cy, cz, offset, start,
         if same[n]:
             for t in range(U(stop[n] - start[n])):
                 x[o + t] = inverse[o + t] * (
-                    rhs[o + t]
-                    + wx * (x[b + t] + x[f + t])
-                    + wz * (x[d + t] + x[u + t])
-                    + wy * (x[l + t] + x[r + t])
+                    rhs[o + t] + wx * (x[b + t] + x[f + t]) + wz * (x[d + t] + x[u + t]) + wy * (x[l + t] + x[r + t])
                 )
             continue
         for t in range(U(stop[n] - start[n])):
@@ -124,7 +122,7 @@ def restrict_plane(i, fine, coarse, common, x, rhs, inverse, air, cx, cy, cz, fi
                 here = x[o + t]
                 total[c + t] += (
                     rhs[o + t]
-                    - air[o + t] * here
+                    - np.float32(air[o + t]) * here
                     + cx[o + t] * (x[b + t] - here)
                     + cx[f + t] * (x[f + t] - here)
                     + cz[o + t] * (x[d + t] - here)
@@ -199,7 +197,7 @@ def apply_plane(i, g, p, out, air, cx, cy, cz, offset, start, stop, same):
             for t in range(U(stop[n] - start[n])):
                 here = np.float64(p[o + t])
                 value = (
-                    np.float64(air[o + t]) * here
+                    air[o + t] * here
                     + np.float64(cx[o + t]) * (here - np.float64(p[b + t]))
                     + np.float64(cx[f + t]) * (here - np.float64(p[f + t]))
                     + np.float64(cz[o + t]) * (here - np.float64(p[d + t]))

@@ -33,14 +33,15 @@ class PlainLevel:
 
     def diagonal(self) -> np.ndarray:
         """At the inner cells."""
-        return self.air + sum(_towards(c, a, 0) + _towards(c, a, 1) for a, c in enumerate(self.couplings))
+        return self.air + np.sum([_towards(c, a, s) for a, c in enumerate(self.couplings) for s in (0, 1)], axis=0)
 
     def neighbours(self, x: np.ndarray) -> np.ndarray:
         """Sum of coupling times x over the neighbours of the inner cells."""
-        return sum(
+        parts = [
             _towards(c, a, 0) * _towards(x, a, -1) + _towards(c, a, 1) * _towards(x, a, 1)
             for a, c in enumerate(self.couplings)
-        )
+        ]
+        return np.sum(parts, axis=0)
 
 
 def finest_level(

@@ -333,6 +333,7 @@ def solve(
     for term in low_rank:
         cells = term.cells
         require(bool(((cells >= 0) & (cells < shape)).all()), "cells of a body outside the grid", f"within {shape}")
+    rhs = rhs if np.issubdtype(rhs.dtype, np.floating) else rhs.astype(np.float64)
     options = {"tolerance": tolerance, "max_iterations": max_iterations, "initial": initial}
     if method == "multigrid":
         terms = _packed(low_rank)

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import ConvexHull, QhullError, cKDTree
+from scipy.spatial import ConvexHull, KDTree, QhullError
 
 from fluidlift.errors import InputRejected, require
 from fluidlift.types import TriangleMesh
@@ -70,7 +70,7 @@ def welded(mesh: TriangleMesh) -> TriangleMesh:
     n = len(vertices)
     if n == 0:
         return mesh
-    pairs = cKDTree(vertices).query_pairs(SEAM * float(np.ptp(vertices, axis=0).max()), output_type="ndarray")
+    pairs = KDTree(vertices).query_pairs(SEAM * float(np.ptp(vertices, axis=0).max()), output_type="ndarray")
     joined = coo_matrix((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
     _, group = connected_components(joined, directed=False)
     first = np.unique(group, return_index=True)[1]
@@ -248,7 +248,7 @@ def _thinned(points: np.ndarray, distance: float) -> np.ndarray:
     cubes = np.floor(points / (0.5 * distance)).astype(np.int64)
     points = points[np.sort(np.unique(cubes, axis=0, return_index=True)[1])]
     kept = np.ones(len(points), bool)
-    near = cKDTree(points).query_pairs(distance * (1 - 1e-9), output_type="ndarray")
+    near = KDTree(points).query_pairs(distance * (1 - 1e-9), output_type="ndarray")
     near = np.sort(near, axis=1)
     near = near[np.lexsort((near[:, 1], near[:, 0]))]
     for first, second in near:

@@ -7,19 +7,33 @@ or leaves the state as it was.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.physics import boundaries, transfer
 from fluidlift.physics.boundaries import Walls
 from fluidlift.physics.crowding import fill_ratio, spreading
 from fluidlift.physics.forces import add_gravity
+from fluidlift.physics.free_surface import (
+    SPRAY_DEPTH,
+    Faces,
+    LiquidSurface,
+    continue_velocity,
+    liquid_surface,
+    pressure_cells,
+    solid_shares,
+    surface_gaps,
+)
 from fluidlift.physics.numba_particles import ParticleWork
-from fluidlift.physics.outlet import hold_columns, outlet_heads, water_levels
+from fluidlift.physics.outlet import hold_columns, outlet_heads, surface_heights, water_levels
 from fluidlift.physics.pressure import PressureSystem, build_system, project
 from fluidlift.physics.reseed import inner_cells, reseed
+from fluidlift.physics.rigid import RigidBodies, RigidBody
 from fluidlift.physics.stepping import (
     TIDY_EVERY,
     EmitSource,
@@ -28,6 +42,7 @@ from fluidlift.physics.stepping import (
     SimulationSettings,
     StepReport,
 )
+from fluidlift.physics.surface_tension import capillary_time_step, surface_tension_jumps
 from fluidlift.physics.travel import displacements, leaving
 from fluidlift.physics.window import Window, moved_to, open_window, window_around
 from fluidlift.seams import MoveRules
@@ -47,6 +62,20 @@ class GridStep:
     """first cell of the window, and q / dt (m^2/s^2)"""
     report: SolveReport
     viscosity: tuple[SolveReport, ...]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where the liquid is in a substep."""
+
+    surface: LiquidSurface
+    holding: np.ndarray
+    """u8 [nx,ny,nz]: cell types by the particles"""
+    types: np.ndarray
+    """u8 [nx,ny,nz]: FLUID where there is a pressure to solve for"""
+    distance: Float[np.ndarray, "nx ny nz"]
+    """m, negative in all FLUID cells"""
+    wet: Bool[np.ndarray, "nx ny nz"]
 
 
 class LiquidSimulator(ParticleSimulator):
@@ -76,6 +105,7 @@ class LiquidSimulator(ParticleSimulator):
         emit_source: looks of new particles; None: that of the nearest initial particle.
         settings: numerical choices; its `particles_per_cell` is overridden by the argument.
         work: who does the particle half of a step; None: the CPU.
+        bodies: rigid bodies, at rest, animated or free; particles inside them at the start are removed.
 
     Raises:
         ValueError: arguments of wrong shape, or numbers that are not finite.
@@ -95,6 +125,7 @@ class LiquidSimulator(ParticleSimulator):
         emit_source: EmitSource | None = None,
         settings: SimulationSettings | None = None,
         work: ParticleWork | None = None,
+        bodies: Sequence[RigidBody] = (),
     ) -> None:
         gravity = np.asarray(parameters.gravity)
         open_sides = np.zeros((3, 2), bool)
@@ -107,6 +138,12 @@ class LiquidSimulator(ParticleSimulator):
             settings=replace(settings or SimulationSettings(), particles_per_cell=particles_per_cell),
         )  # fmt: skip
         self._work = work or ParticleWork()
+        self._bodies: RigidBodies | None = None
+        if bodies:
+            self._bodies = RigidBodies(bodies, self._walls, density=parameters.density, gravity=gravity)
+            self._particles = self._particles.select(~self._bodies.inside(self._particles.positions))
+        self._solids = solid_shares(self._walls.signed_distance, grid)
+        self._window_solids = self._solids.inside(self._window.box)
         self._head_rate: tuple[tuple[int, int, int], np.ndarray] | None = None
         """first cell of the window of the last substep, and there q / dt: the first guess of the pressure"""
         self._start_levels = self._levels_now() if (self._walls.regions == CellType.OUTFLOW).any() else None
@@ -116,6 +153,8 @@ class LiquidSimulator(ParticleSimulator):
         own = {} if self._start_levels is None else {"start_levels": self._start_levels.copy()}
         if self._head_rate is not None:
             own |= {"head_rate": self._head_rate[1].copy(), "head_first": np.array(self._head_rate[0], np.int64)}
+        if self._bodies is not None:
+            own |= {f"bodies.{name}": value for name, value in self._bodies.state().items()}
         return super().state() | own
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
@@ -129,19 +168,49 @@ class LiquidSimulator(ParticleSimulator):
             fits = rate.ndim == 3 and first is not None and first.shape == (3,) and (first >= 0).all()
             if not fits or (first + rate.shape > self.grid.shape).any() or not np.isfinite(rate).all():
                 raise InputRejected("a simulation state of another grid", f"{self.grid.shape} cells")
+        before = super().state()
         super().restore(state)
+        if self._bodies is not None:
+            try:
+                prefix = "bodies."
+                self._bodies.restore({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
+            except InputRejected:
+                super().restore(before)
+                raise
         self._head_rate = None if rate is None else (tuple(int(i) for i in first), np.array(rate))
         self._start_levels = None if levels is None else np.array(levels)
 
+    @property
+    def bodies(self) -> RigidBodies | None:
+        """The rigid bodies, where there are any."""
+        return self._bodies
+
+    def _max_speed(self) -> float:
+        own = super()._max_speed()
+        return own if self._bodies is None else max(own, self._bodies.max_speed(self.parameters.time_step))
+
     def _levels_now(self) -> np.ndarray:
-        occupied = np.diff(transfer.sort_by_cell(self._particles.positions, self.grid).start) > 0
-        return water_levels(occupied.reshape(self.grid.shape), self._walls)
+        order = transfer.sort_by_cell(self._particles.positions, self.grid)
+        levels = water_levels((np.diff(order.start) > 0).reshape(self.grid.shape), self._walls)
+        surface = liquid_surface(self._particles.positions, self._volumes(), self.grid, order, self._solids)
+        return surface_heights(levels, surface.distance, self.grid.spacing)
+
+    def _volumes(self) -> np.ndarray:
+        """m^3 of each particle."""
+        return (self._particles.masses / self.parameters.density).astype(np.float32)
+
+    def _substep_length(self, remaining: float) -> float:
+        """See `ParticleSimulator`; also within the limit of surface tension."""
+        longest = capillary_time_step(self.parameters.density, self.parameters.surface_tension, self.grid.spacing)
+        step = super()._substep_length(remaining)
+        return step if step <= longest else remaining / np.ceil(remaining / longest - 1e-9)
 
     def _look(self, positions: np.ndarray) -> Window:
         """The window around the particles and the inlet."""
         box = window_around(positions, self.grid, self._inlet.cell_range if self._inlet.active else None)
         if box != self._window.box:
             self._window = open_window(box, self._walls, self._capacity)
+            self._window_solids = self._solids.inside(box)
         return self._window
 
     def _outlet_faces(self, walls: Walls) -> tuple[np.ndarray, ...] | None:
@@ -159,52 +228,109 @@ class LiquidSimulator(ParticleSimulator):
         speed = self.parameters.outflow_velocity * self._mainstream
         return FaceVelocity(*(np.where(f, np.float32(s), c) for f, s, c in zip(outlet, speed, velocity.components)))
 
-    def _known(self, wet: np.ndarray, window: Window, dt: float) -> np.ndarray | None:
+    def _known(self, layout: Layout, window: Window, dt: float) -> np.ndarray | None:
         """q (m^2/s) of the columns of liquid that stand in the outlet, in cells of the window."""
         if self._start_levels is None or self.settings.prescribe_outflow:
             return None
         lowest = window.first[2]
         start = self._start_levels[window.box[:2]]
-        start = np.where(start >= 0, np.maximum(start - lowest, 0), -1)
-        heads = outlet_heads(water_levels(wet, window.walls), start, window.walls)
+        start = np.where(start >= 0, np.maximum(start - lowest, 0.0), -1.0)
+        levels = water_levels(layout.wet, window.walls)
+        levels = surface_heights(levels, layout.surface.distance, self.grid.spacing)
+        heads = outlet_heads(levels, start, window.walls)
         return None if heads is None else heads * max(-self.parameters.gravity[2], 0.0) * dt
+
+    def _layout(self, window: Window, order: transfer.CellOrder) -> Layout:
+        """Which cells hold liquid, and where its surface lies."""
+        grid, walls = window.grid, window.walls
+        occupied = (np.diff(order.start) > 0).reshape(grid.shape)
+        solids = self._window_solids if self._bodies is None else solid_shares(walls.signed_distance, grid)
+        surface = liquid_surface(
+            self._particles.positions, self._volumes(), grid, order, solids,
+            curved=self.parameters.surface_tension > 0,
+        )  # fmt: skip
+        holding = boundaries.liquid_cells(occupied, walls)
+        types, distance = pressure_cells(holding, surface.distance, walls.openings, grid.spacing)
+        if self._bodies is not None:
+            types = self._bodies.fill_films(types)
+            shallow = np.float32(-SPRAY_DEPTH * grid.spacing)
+            distance = np.where(types == CellType.FLUID, np.minimum(distance, shallow), distance)
+        wet = (types == CellType.FLUID) | (types == CellType.INFLOW) | ((types == CellType.OUTFLOW) & occupied)
+        return Layout(surface, holding, types, distance, wet)
 
     def _grid_velocity(self, window: Window, order: transfer.CellOrder, dt: float) -> GridStep:
         """From particles to the new velocity on all faces near the liquid."""
-        grid, walls = window.grid, window.walls
-        velocity, _ = self._work.transfer.particles_to_grid(self._particles, grid, order)
-        occupied = (np.diff(order.start) > 0).reshape(grid.shape)
-        types = boundaries.liquid_cells(occupied, walls)
-        wet = (types == CellType.FLUID) | (types == CellType.INFLOW) | ((types == CellType.OUTFLOW) & occupied)
-        wet_faces, outlet = self._wet_faces(wet, walls), self._outlet_faces(walls)
-        velocity = self._impose(add_gravity(velocity, self.parameters.gravity, dt), window, outlet)
-        velocity, viscosity_reports = self._viscous(velocity, wet_faces, window, dt, outlet)
-        # the walls have closed the sides of the box already
-        system = build_system(types, walls.openings, grid, open_border=True)
-        if outlet is not None:
-            closed = [np.where(f, np.float32(0), w) for f, w in zip(outlet, system.weights)]
-            system = replace(system, weight_x=closed[0], weight_y=closed[1], weight_z=closed[2])
-        known = self._known(wet, window, dt)
-        velocity, q, report, system = self._projected(velocity, system, window, dt, known)
+        grid, walls, bodies = window.grid, window.walls, self._bodies
+        carried, masses = self._work.transfer.particles_to_grid(self._particles, grid, order)
+        layout = self._layout(window, order)
+        wet_faces, outlet = self._wet_faces(layout.wet, walls), self._outlet_faces(walls)
+        rate, solid = self._last_rate(window), None
+        if bodies is not None:
+            bodies.predict(dt, rate)
+            solid = bodies.face_velocity()
+        velocity = self._impose(add_gravity(carried, self.parameters.gravity, dt), window, outlet)
+        moving = self._wet_faces(layout.wet | (layout.holding == CellType.FLUID), walls)
+        velocity, viscosity_reports = self._viscous(velocity, moving, window, dt, outlet, layout.distance, solid)
+        known = self._known(layout, window, dt)
+        system = self._system(layout, window, outlet)
+        velocity, q, report, system = self._projected(
+            velocity, system, window, dt, None if rate is None else rate * dt,
+            known=known, jumps=self._jumps(layout, dt), solid_velocity=solid,
+        )  # fmt: skip
         if known is not None:
-            velocity = hold_columns(velocity, known, walls)
+            weight = max(-self.parameters.gravity[2], 0.0) * grid.spacing * dt
+            velocity = hold_columns(velocity, known, walls, weight=weight)
         velocity = self._impose(velocity, window, outlet)
-        velocity = boundaries.slide_along_walls(boundaries.extrapolate(velocity, wet_faces), walls)
+        skin = (layout.holding == CellType.FLUID) & (layout.types == CellType.EMPTY)
+        velocity = continue_velocity(velocity, carried, masses, wet_faces, skin, walls.openings)
+        if bodies is None:
+            velocity = boundaries.slide_along_walls(velocity, walls)
+        else:
+            bodies.apply_pressure(q)
+            velocity = bodies.slide(velocity)
         return GridStep(velocity, system, (window.first, q / dt), report, viscosity_reports)
 
+    def _last_rate(self, window: Window) -> np.ndarray | None:
+        """q / dt (m^2/s^2) of the substep before, on this window."""
+        if self._head_rate is None:
+            return None
+        first, rate = self._head_rate
+        return moved_to(rate, first, window.first, window.grid.shape)
+
+    def _system(self, layout: Layout, window: Window, outlet: tuple[np.ndarray, ...] | None) -> PressureSystem:
+        gaps = surface_gaps(layout.distance, layout.types)
+        # the walls have closed the sides of the box already
+        system = build_system(layout.types, window.walls.openings, window.grid, open_border=True, gaps=gaps)
+        if outlet is None:
+            return system
+        closed = [np.where(f, np.float32(0), w) for f, w in zip(outlet, system.weights)]
+        return replace(system, weight_x=closed[0], weight_y=closed[1], weight_z=closed[2])
+
+    def _jumps(self, layout: Layout, dt: float) -> Faces | None:
+        """Of q at the surface, by surface tension."""
+        if self.parameters.surface_tension == 0:
+            return None
+        strength = self.parameters.surface_tension * dt / self.parameters.density
+        return surface_tension_jumps(layout.surface, layout.types, strength)
+
     def _projected(
-        self, velocity: FaceVelocity, system: PressureSystem, window: Window, dt: float, known: np.ndarray | None
-    ) -> tuple[FaceVelocity, np.ndarray, SolveReport, PressureSystem]:
+        self, velocity: FaceVelocity, system: PressureSystem, window: Window, dt: float, initial: np.ndarray | None,
+        **given: Any,
+    ) -> tuple[FaceVelocity, np.ndarray, SolveReport, PressureSystem]:  # fmt: skip
         """Projection in which no wall sucks: wall cells whose pressure comes out negative are solved again as air.
 
         A projection alone holds liquid at walls that it would leave, because nothing may fill the gap (Batty et al.
         2007, section 5); a nappe would cling to its cliff. One correction stands for the full inequality p >= 0.
+        `given` goes to `pressure.project`.
         """
-        tolerance, initial = self.settings.pressure_tolerance, None
-        if self._head_rate is not None:
-            first, rate = self._head_rate
-            initial = moved_to(rate, first, window.first, window.grid.shape) * dt
-        new, q, report = project(velocity, system, tolerance=tolerance, initial=initial, known=known)
+
+        def solved(system: PressureSystem, initial: np.ndarray | None) -> tuple[FaceVelocity, np.ndarray, SolveReport]:
+            # coupling also tells the bodies which cells press on them: it has to follow the system
+            coupling = () if self._bodies is None else self._bodies.coupling(system.unknown)
+            tolerance = self.settings.pressure_tolerance
+            return project(velocity, system, tolerance=tolerance, initial=initial, low_rank=coupling, **given)
+
+        new, q, report = solved(system, initial)
         weight = float(np.linalg.norm(self.parameters.gravity)) * self.grid.spacing * dt
         if not self.settings.separate_from_walls or weight == 0.0:
             return new, q, report, system
@@ -212,14 +338,19 @@ class LiquidSimulator(ParticleSimulator):
         if not sucked.any():
             return new, q, report, system
         system = replace(system, unknown=system.unknown & ~sucked)
-        new, q, report = project(velocity, system, tolerance=tolerance, initial=q, known=known)
-        return new, q, report, system
+        return *solved(system, q), system
 
     def _substep(self, dt: float, number: int, *, last_attempt: bool) -> Outcome | None:
-        walls = self._walls
+        walls, bodies = self._walls, self._bodies
+        before = None if bodies is None else bodies.state()
         if not len(self._particles):
+            if bodies is not None:
+                bodies.predict(dt)
+                bodies.advance()
             return Outcome(self._particles, 0, SolveReport(True, 0, 0.0, "empty"), (), lambda: None)
         window = self._look(self._particles.positions)
+        if bodies is not None:
+            window = bodies.enter(window)
         grid = window.grid
         order = transfer.sort_by_cell(self._particles.positions, grid)
         if number % TIDY_EVERY == 0:
@@ -230,6 +361,8 @@ class LiquidSimulator(ParticleSimulator):
         moves, farthest = displacements(velocities, affine, dt)
         farthest /= grid.spacing
         if not farthest <= 3.0 * self.settings.courant:
+            if bodies is not None:
+                bodies.restore(before)
             if not last_attempt:
                 return None
             raise FluidliftError(
@@ -247,6 +380,9 @@ class LiquidSimulator(ParticleSimulator):
         rules = MoveRules(dt, self.parameters.restitution, keep, self.settings.max_stretch)
         state = self._work.mover.moved(particles, moves, velocities, affine, walls, rules)
         gone = leaving(particles.positions, state.positions, walls, self._mainstream)
+        if bodies is not None:
+            bodies.advance()
+            gone |= bodies.push_out(state.positions, state.velocities, tangential_share=keep)
         if gone.any():
             state = transfer.select_particles(state, np.flatnonzero(~gone))
 

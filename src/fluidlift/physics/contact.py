@@ -223,7 +223,18 @@ class ContactSolver:
             self._sweep(slice(None), closing, bounce, friction, tolerance, self.impulses, m.velocity, m.spin)
         return impact
 
-    def _sweep(self, index, closing, bounce, friction, tolerance, impulses, velocity, spin) -> None:
+    def _sweep(
+        self,
+        index: slice | np.ndarray,
+        closing: np.ndarray,
+        bounce: np.ndarray,
+        friction: np.ndarray,
+        tolerance: float,
+        impulses: np.ndarray,
+        velocity: np.ndarray,
+        spin: np.ndarray,
+    ) -> None:
+        """`_solve` on some of the contacts."""
         c = self.contacts
         _solve(
             c.first[index], c.second[index], self._frames[index], self._levers[index], self._turns[index],

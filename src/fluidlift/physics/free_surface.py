@@ -19,12 +19,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
-from scipy.special import erfc, erfinv
 
 from fluidlift.errors import require
-from fluidlift.numerics.bspline import quadratic
 from fluidlift.physics import boundaries, surface_kernels
-from fluidlift.physics.surface_kernels import DEPTH, LEAST_FILL, RELAXATION, SOLID_DEPTH, VARIANCE
 from fluidlift.physics.transfer import CellOrder
 from fluidlift.types import CellType, FaceVelocity, Grid
 
@@ -35,16 +32,17 @@ BAND = 1.5
 """cells: distances are cut there; farther away the noise of the fill outweighs them"""
 ROUNDS = 2
 """how often the virtual liquid in solids is improved; what is left are some hundredths of a cell"""
-SMOOTHINGS = (2, 4)
-"""binomial filters before the curvature is taken, to tame its noise; what they take from a bent surface is found by
-comparing two numbers of them"""
+SMOOTHINGS = 2
+"""binomial filters before the curvature is taken: its noise on a flat surface becomes 0.01 / h"""
+MORE_SMOOTHINGS = 2
+"""binomial filters more, to find out what smoothing takes from the curvature"""
 SPRAY_DEPTH = 0.1
 """cells: how deep in the liquid the centres of cells of spray count"""
 SKIN = 0.75
 """cells: farther above the surface no partly filled cell has its centre (0.5 where level, 0.87 at a corner)"""
 SMALLEST_GAP = 1e-3
-"""cells: a surface nearer to the centre of a cell is put there. The solver does not mind (3 iterations with 0.25 or with
-5e-4), but the water does: 0.05 makes a pool at rest in a tilted box move at 0.05 m/s and more, 0.01 at 0.01 m/s"""
+"""cells: a surface nearer to the centre of a cell is put there. The solver does not mind (3 iterations, as with 0.25),
+but the water does: with 0.05 a pool at rest in a tilted box moves at 0.05 m/s and more, with this at 0.01 m/s"""
 SURE_OPENING = 0.25
 """open share of faces whose velocity is continued beyond the liquid. Particles hardly reach what is below it: its
 velocity is extrapolated by their affine matrices, and fed back to them it would grow"""
@@ -70,8 +68,8 @@ class LiquidSurface:
 
     distance: Float[np.ndarray, "nx ny nz"]
     """m, negative inside the liquid, within `BAND` cells of the surface; continued into solids"""
-    curvature: Float[np.ndarray, "nx ny nz"]
-    """1/m, sum of the principal curvatures (2 / R for a drop); 0 away from the surface"""
+    curvature: Float[np.ndarray, "nx ny nz"] | None
+    """1/m, sum of the principal curvatures (2 / R for a drop), 0 away from the surface; None where not asked for"""
 
 
 def solid_shares(signed_distance: Float[np.ndarray, "nx+1 ny+1 nz+1"], grid: Grid) -> SolidShares:
@@ -106,6 +104,8 @@ def liquid_surface(
     grid: Grid,
     order: CellOrder,
     solids: SolidShares,
+    *,
+    curved: bool = False,
 ) -> LiquidSurface:
     """The surface around the particles.
 
@@ -115,6 +115,7 @@ def liquid_surface(
         grid: of the simulation.
         order: from `transfer.sort_by_cell`.
         solids: from `solid_shares`.
+        curved: find the curvature, too (for surface tension).
 
     Drops and sheets thinner than about 1.2 cells reach F = 1/2 nowhere: their distance is positive everywhere (see
     `pressure_cells`).
@@ -131,11 +132,16 @@ def liquid_surface(
     points = np.ascontiguousarray(positions, np.float32)
     surface_kernels.deposit(points, amounts, order.order, slab_start, grid.low, grid.spacing, share)
     fill = _fill(share, solids)
-    curvature = mean_curvature(fill)
+    smooth = fill
+    for _ in range(SMOOTHINGS):
+        smooth = _binomial(smooth)
+    bend = mean_curvature(fill, smooth)
     distance = np.empty_like(fill)
-    surface_kernels.distance(fill, curvature, BAND, distance)
+    surface_kernels.distance(fill, bend, BAND, distance)
     h = np.float32(grid.spacing)
-    return LiquidSurface(distance * h, curvature / h)
+    if curved:
+        bend = _sharpened(bend, fill, smooth)
+    return LiquidSurface(distance * h, bend / h if curved else None)
 
 
 def _binomial(field: np.ndarray) -> np.ndarray:
@@ -162,23 +168,38 @@ def _fill(share: Float[np.ndarray, "nx ny nz"], solids: SolidShares) -> Float[np
     return _binomial(share + (1.0 - open_share) * virtual)
 
 
-def mean_curvature(fill: Float[np.ndarray, "nx ny nz"]) -> Float[np.ndarray, "nx ny nz"]:
-    """Sum of the principal curvatures (1 / cells) near the surface of the fill, at most 1; 0 elsewhere.
+def mean_curvature(
+    fill: Float[np.ndarray, "nx ny nz"], smooth: Float[np.ndarray, "nx ny nz"]
+) -> Float[np.ndarray, "nx ny nz"]:
+    """Sum of the principal curvatures (1 / cells, at most 1) of the smoothed fill, near the surface; 0 elsewhere."""
+    out = np.empty_like(smooth)
+    surface_kernels.curvature(smooth, fill, out)
+    return out
 
-    Smoothing makes a bent surface flatter, in proportion to the variance of the blur: the values of two blurs are
-    extrapolated to none. A drop of 4 cells' radius would swing 20 % too slowly without that, 9 % with it.
+
+def _sharpened(bend: np.ndarray, fill: np.ndarray, smooth: np.ndarray) -> np.ndarray:
+    """Curvature without what the blur takes from it.
+
+    A bent surface becomes flatter in proportion to the variance of the blur: the values of two blurs are extrapolated
+    to none. A drop of 4 cells' radius would swing 20 % too slowly without that, 9 % with it.
     """
-    smooth = np.ascontiguousarray(fill, np.float32)
-    values, variances = [], []
-    for count in range(1, SMOOTHINGS[1] + 1):
+    for _ in range(MORE_SMOOTHINGS):
         smooth = _binomial(smooth)
-        if count in SMOOTHINGS:
-            values.append(np.empty_like(smooth))
-            variances.append(surface_kernels.VARIANCE + 0.5 * count)
-            surface_kernels.curvature(smooth, fill, values[-1])
-    gain = variances[0] / (variances[1] - variances[0])
+    gain = (surface_kernels.VARIANCE + 0.5 * SMOOTHINGS) / (0.5 * MORE_SMOOTHINGS)
     largest = surface_kernels.LARGEST_CURVATURE
-    return np.clip(values[0] + np.float32(gain) * (values[0] - values[1]), -largest, largest)
+    return np.clip(bend + np.float32(gain) * (bend - mean_curvature(fill, smooth)), -largest, largest)
+
+
+def _beside_liquid(types: np.ndarray, below: np.ndarray, openings: Faces) -> np.ndarray:
+    """Cells joined through an open face with one that holds liquid and has its centre below the surface."""
+    inside = below & ((types == CellType.FLUID) | (types == CellType.INFLOW) | (types == CellType.OUTFLOW))
+    out = np.zeros(types.shape, bool)
+    for axis, opening in enumerate(openings):
+        here, there = np.moveaxis(inside, axis, 0), np.moveaxis(out, axis, 0)
+        passable = np.moveaxis(opening, axis, 0)[1:-1] > 0
+        there[1:] |= passable & here[:-1]
+        there[:-1] |= passable & here[1:]
+    return out
 
 
 def pressure_cells(
@@ -202,17 +223,11 @@ def pressure_cells(
     Returns:
         the types, and the distance, negative in all FLUID cells (-`SPRAY_DEPTH` cells in spray).
     """
-    full = (types == CellType.FLUID) | (types == CellType.INFLOW) | (types == CellType.OUTFLOW)
     below = distance < 0
-    beside = np.zeros(types.shape, bool)
-    for axis, opening in enumerate(openings):
-        here, there = np.moveaxis(full & below, axis, 0), np.moveaxis(beside, axis, 0)
-        passable = np.moveaxis(opening, axis, 0)[1:-1] > 0
-        there[1:] |= passable & here[:-1]
-        there[:-1] |= passable & here[1:]
     new = types.copy()
-    new[(types == CellType.FLUID) & beside & ~below & (distance < SKIN * spacing)] = CellType.EMPTY
-    new[(types == CellType.EMPTY) & beside & below] = CellType.FLUID
+    new[(types == CellType.EMPTY) & below & _beside_liquid(types, below, openings)] = CellType.FLUID
+    near = ~below & (distance < SKIN * spacing)
+    new[(types == CellType.FLUID) & near & _beside_liquid(new, below, openings)] = CellType.EMPTY
     spray = (new == CellType.FLUID) & ~below
     return new, np.where(spray, np.float32(-SPRAY_DEPTH * spacing), distance)
 
@@ -255,16 +270,16 @@ def continue_velocity(
         skin: cells that `pressure_cells` made EMPTY.
         openings: open share of the faces.
     """
-    sure = tuple(w & (o >= SURE_OPENING) for w, o in zip(wet, openings))
-    change = FaceVelocity(*(new - old for new, old in zip(velocity.components, carried.components)))
-    change = boundaries.extrapolate(change, sure, layers=1)
-    faces, valid, known = [], [], []
+    fields, sources, kept = [], [], []
     for axis, beside in enumerate(boundaries.touching_faces(skin)):
-        own = beside & ~wet[axis] & (openings[axis] > 0) & (masses[axis] > 0)
-        faces.append(
-            np.where(own, carried.components[axis] + change.components[axis], velocity.components[axis]),
-        )
-        valid.append(sure[axis] | (own & (openings[axis] >= SURE_OPENING)))
-        known.append(wet[axis] | own)
-    continued = boundaries.extrapolate(FaceVelocity(*faces), tuple(valid))
-    return FaceVelocity(*(np.where(k, f, c) for k, f, c in zip(known, faces, continued.components)))
+        new = velocity.components[axis]
+        field, known, valid = np.empty_like(new), np.empty(new.shape, bool), np.empty(new.shape, bool)
+        surface_kernels.carry(
+            new, carried.components[axis], masses[axis], wet[axis], beside, openings[axis], SURE_OPENING, field, known,
+            valid,
+        )  # fmt: skip
+        fields.append(field)
+        kept.append(known)
+        sources.append(known & (openings[axis] >= SURE_OPENING))
+    continued = boundaries.extrapolate(FaceVelocity(*fields), tuple(sources))
+    return FaceVelocity(*(np.where(k, f, c) for k, f, c in zip(kept, fields, continued.components)))

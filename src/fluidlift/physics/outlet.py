@@ -17,7 +17,7 @@ from fluidlift.types import CellType, FaceVelocity
 
 def water_levels(wet: Bool[np.ndarray, "nx ny nz"], walls: Walls) -> Int[np.ndarray, "nx ny"]:
     """Index of the first cell of air above the liquid that stands on the ground, in columns with OUTFLOW cells; else
-    -1. The level counts whole cells, as the pressure of the liquid beside it does."""
+    -1. See `surface_heights` for the rest of the way to the surface."""
     columns = (walls.regions == CellType.OUTFLOW).any(axis=2)
     wet_here, floor = wet[columns], walls.openings[2][columns] == 0
     buried = walls.buried[columns]
@@ -32,13 +32,28 @@ def water_levels(wet: Bool[np.ndarray, "nx ny nz"], walls: Walls) -> Int[np.ndar
     return out
 
 
+def surface_heights(
+    levels: Int[np.ndarray, "nx ny"], distance: Float[np.ndarray, "nx ny nz"], spacing: float
+) -> Float[np.ndarray, "nx ny"]:
+    """Height of the surface above the bottom of the box, in cells, where it lies in its cell; -1 without a level.
+
+    Args:
+        levels: of `water_levels`.
+        distance: of `free_surface.LiquidSurface`, m.
+        spacing: cell width, m.
+    """
+    top = np.maximum(levels - 1, 0)
+    above = np.take_along_axis(distance, top[:, :, None], axis=2)[:, :, 0] / spacing
+    return np.where(levels < 0, -1.0, top + 0.5 - np.clip(above, -0.5, 0.5))
+
+
 def outlet_heads(
-    levels: Int[np.ndarray, "nx ny"], start: Int[np.ndarray, "nx ny"], walls: Walls
+    levels: Float[np.ndarray, "nx ny"], start: Float[np.ndarray, "nx ny"], walls: Walls
 ) -> Float[np.ndarray, "nx ny nz"] | None:
     """Depth (m) of OUTFLOW cells below the water level, in columns that hold standing liquid now; else 0.
 
     Args:
-        levels: of `water_levels` now.
+        levels: of `surface_heights` now.
         start: the same at the start.
         walls: the boundaries.
 
@@ -47,13 +62,19 @@ def outlet_heads(
     """
     if (levels < 0).all():
         return None
-    stage = np.where(levels < 0, -1, np.where(start >= 0, start, levels))
-    depth = np.maximum(stage[:, :, None] - np.arange(walls.grid.shape[2]), 0) * walls.grid.spacing
+    stage = np.where(levels < 0, -1.0, np.where(start >= 0, start, levels))
+    centers = np.arange(walls.grid.shape[2]) + 0.5
+    depth = np.maximum(stage[:, :, None] - centers, 0.0) * walls.grid.spacing
     return np.where(walls.regions == CellType.OUTFLOW, depth, 0.0)
 
 
-def hold_columns(velocity: FaceVelocity, known: Float[np.ndarray, "nx ny nz"], walls: Walls) -> FaceVelocity:
-    """Subtract the gradient of the given q (m^2/s) on open faces between OUTFLOW cells."""
+def hold_columns(
+    velocity: FaceVelocity, known: Float[np.ndarray, "nx ny nz"], walls: Walls, *, weight: float
+) -> FaceVelocity:
+    """Subtract the gradient of the given q (m^2/s) on open faces between OUTFLOW cells.
+
+    `weight` is q below one cell of liquid: at the top of a column q falls to 0 at the surface, inside the cell.
+    """
     out = []
     outflow = walls.regions == CellType.OUTFLOW
     for axis, component in enumerate(velocity.components):
@@ -61,6 +82,9 @@ def hold_columns(velocity: FaceVelocity, known: Float[np.ndarray, "nx ny nz"], w
         opening = np.moveaxis(walls.openings[axis], axis, 0)
         new = component.copy()
         inner = np.moveaxis(new, axis, 0)[1:-1]
-        inner -= np.where(here[1:] & here[:-1] & (opening[1:-1] > 0), np.diff(q, axis=0) / walls.grid.spacing, 0.0)
+        change = np.diff(q, axis=0)
+        if axis == 2 and weight > 0:
+            change = np.where((q[:-1] > 0) & (q[1:] == 0), -weight, change)
+        inner -= np.where(here[1:] & here[:-1] & (opening[1:-1] > 0), change / walls.grid.spacing, 0.0)
         out.append(new)
     return FaceVelocity(*out)

@@ -18,7 +18,7 @@ from fluidlift.numerics.poisson import LowRankTerm
 from fluidlift.numerics.solid_mesh import hull_points, moments, surface_points
 from fluidlift.physics import rigid_coupling
 from fluidlift.physics.boundaries import Walls, slide_along_walls
-from fluidlift.physics.contact import REST_GAP, ContactSolver, Motion
+from fluidlift.physics.contact import ContactSolver, Motion
 from fluidlift.physics.contact_search import Contacts, find_contacts, spread_points
 from fluidlift.physics.rigid_body import RigidBody, Trajectory, material_pairs
 from fluidlift.physics.rigid_coupling import BodyRows, SolidVelocity
@@ -30,6 +30,9 @@ from fluidlift.physics.window import Window
 from fluidlift.types import FaceVelocity, matrix_from_quat
 
 __all__ = ["RigidBodies", "RigidBody", "Trajectory"]
+
+SAFE_REACH = 0.2
+"""cells: more than the gap at rest, and room for what the pressure adds to the speed in a step"""
 
 
 class RigidBodies:
@@ -65,7 +68,8 @@ class RigidBodies:
         integrals = [moments(b.mesh) for b in self.bodies]
         self._offset = np.array([m.center for m in integrals]).reshape(n, 3)
         """centres of mass in the body frames, m"""
-        self.mass = np.array([m.volume * b.density for m, b in zip(integrals, self.bodies)])
+        self._volume = np.array([m.volume for m in integrals])
+        self.mass = self._volume * [b.density for b in self.bodies]
         """kg"""
         inertia = np.array([m.inertia * b.density for m, b in zip(integrals, self.bodies)]).reshape(n, 3, 3)
         self._inertia = inertia
@@ -182,7 +186,7 @@ class RigidBodies:
         if self._union is None or self._union.static is not window:
             self._union = UnionWalls(window)
             self._solid = SolidVelocity(self._union)
-        self._union.update(self._shapes)
+        self._union.update(self._shapes, self._volume, self.center)
         return self._union.window
 
     def predict(self, dt: float, pressure_rate: Float[np.ndarray, "nx ny nz"] | None = None) -> None:
@@ -213,7 +217,7 @@ class RigidBodies:
         """Contacts of this step, and the impulses that the step before lets expect."""
         spin, h = self.spin, self._static.grid.spacing
         speed = np.sqrt(np.square(self.velocity).sum(1)) + self._radius * np.sqrt(np.square(spin).sum(1))
-        reach = np.where(self.active, 2.0 * REST_GAP * h + dt * speed, -np.inf)
+        reach = np.where(self.active, SAFE_REACH * h + dt * speed, -np.inf)
         contacts = find_contacts(self._shapes, self._surface, moving, self._static, reach)
         motion = Motion(
             self.center, self.velocity.copy(), spin, np.where(moving, 1.0 / self.mass, 0.0),
@@ -366,18 +370,17 @@ class RigidBodies:
             "center": (n, 3), "orientation": (n, 4), "velocity": (n, 3), "angular_momentum": (n, 3),
             "prescribed_spin": (n, 3), "active": (n,), "time": (), "contact_step": (), "removed": (),
         }  # fmt: skip
+        keys = np.asarray(state.get("contact_keys", 0))
+        shapes |= {"contact_keys": (keys.size,), "contact_impulses": (keys.size, 3)}
         for name, shape in shapes.items():
             if name not in state or np.shape(state[name]) != shape or not np.isfinite(state[name]).all():
                 raise InputRejected(f"the state of rigid bodies: '{name}' is missing or does not fit", f"{n} bodies")
-        keys, impulses = np.asarray(state["contact_keys"]), np.asarray(state["contact_impulses"])
-        if impulses.shape != (len(keys), 3) or not np.isfinite(impulses).all():
-            raise InputRejected("the state of rigid bodies: contacts that do not fit", "one impulse per contact")
         self.time, self.removed = float(state["time"]), int(state["removed"])
         for name in ("center", "orientation", "velocity", "angular_momentum"):
             setattr(self, name, np.array(state[name], np.float64))
         self._prescribed_spin = np.array(state["prescribed_spin"], np.float64)
         self.active = np.array(state["active"], bool)
-        self._known_keys, self._known_impulses = keys.astype(np.int64), np.array(impulses, np.float64)
+        self._known_keys, self._known_impulses = keys.astype(np.int64), np.array(state["contact_impulses"], np.float64)
         self._known_step = float(state["contact_step"])
         self._solver, self._rows = None, ()
         self._pose()

@@ -144,14 +144,74 @@ def body_rows(cover: Cover, unknown: np.ndarray, walls: Walls, center: Float[np.
     return BodyRows(cover.body, cells + np.array(cover.low), rows[tuple(cells.T)])
 
 
+@njit(cache=True)
+def _slope(rate, openings, axis, i, j, k, h):
+    """d rate / dx_axis from the neighbours with liquid behind open faces; the last value: how many there are."""
+    a, b, c = 1 if axis == 0 else 0, 1 if axis == 1 else 0, 1 if axis == 2 else 0
+    here, total, count = rate[i, j, k], 0.0, 0
+    index = i if axis == 0 else (j if axis == 1 else k)
+    if index > 0 and openings[i, j, k] > 0.0:
+        there = rate[i - a, j - b, k - c]
+        if there != 0.0:
+            total += (here - there) / h
+            count += 1
+    if index + 1 < rate.shape[axis] and openings[i + a, j + b, k + c] > 0.0:
+        there = rate[i + a, j + b, k + c]
+        if there != 0.0:
+            total += (there - here) / h
+            count += 1
+    return (total / count if count > 0 else 0.0), count
+
+
+@njit(cache=True)
+def _add_surface_force(rate, solid, openings, axis, first, low, h, share, offset, volume, middle, center, out):
+    a, b, c = 1 if axis == 0 else 0, 1 if axis == 1 else 0, 1 if axis == 2 else 0
+    arm = np.zeros(3)
+    d0, d1 = (1, 2) if axis == 0 else ((0, 2) if axis == 1 else (0, 1))
+    mean, known = 0.0, 0
+    for sweep in range(2):
+        for i in range(volume.shape[0]):
+            for j in range(volume.shape[1]):
+                for k in range(volume.shape[2]):
+                    wet = rate[i + first[0], j + first[1], k + first[2]] != 0.0
+                    if not wet and not solid[i + first[0], j + first[1], k + first[2]]:
+                        continue
+                    below, above, filled = share[i, j, k], share[i + a, j + b, k + c], volume[i, j, k]
+                    if filled == 0.0 and below == 0.0 and above == 0.0:
+                        continue
+                    if sweep == 0:
+                        if not wet:
+                            continue
+                        slope, count = _slope(rate, openings, axis, i + first[0], j + first[1], k + first[2], h)
+                        mean += slope
+                        known += min(count, 1)
+                        continue
+                    # volume less half of both faces, and its first moments about the centre of mass
+                    force = -mean * h**3 * (filled - 0.5 * (below + above))
+                    for d in range(3):
+                        cell = (i + first[0]) if d == 0 else ((j + first[1]) if d == 1 else (k + first[2]))
+                        arm[d] = (low[d] + (cell + 0.5) * h - center[d]) * force
+                        arm[d] += -mean * h**3 * filled * middle[i, j, k, d]
+                    for n in range(2):
+                        d = d0 if n == 0 else d1
+                        shifted = below * offset[i, j, k, n] + above * offset[i + a, j + b, k + c, n]
+                        arm[d] += 0.5 * mean * h**3 * shifted
+                    out[axis] += force
+                    # arm x e_axis
+                    out[3 + (axis + 1) % 3] += arm[(axis + 2) % 3]
+                    out[3 + (axis + 2) % 3] -= arm[(axis + 1) % 3]
+        mean = mean / known if known > 0 else 0.0
+
+
 def surface_force(
     cover: Cover, rate: Float[np.ndarray, "nx ny nz"], walls: Walls, center: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "6"]:
     """Force and torque over the liquid's density (m^4/s^2, m^5/s^2) that J^T q leaves out; see the module's text.
 
     By the divergence theorem over the body's part of cell c, of volume V_c: force j = - sum over c of
-    dp/dx_j (V_c - h^3 mean of the shares covered of its two faces across j). The parts of the pressure gradient along
-    the faces cancel between neighbouring cells where the gradient is uniform.
+    dp/dx_j (V_c - h^3 mean of the shares covered of its two faces across j), and its torque with the centres of these
+    parts. The slope of the pressure is its mean over the liquid cells at the body, since the parts of single cells
+    cancel only under a uniform one.
 
     Args:
         cover: of the body.
@@ -159,36 +219,13 @@ def surface_force(
         walls: union of terrain and bodies.
         center: of mass, m.
     """
-    h, at = walls.grid.spacing, cover.cells
-    wide = tuple(slice(max(s.start - 1, 0), s.stop + 1) for s in at)
-    pads = [(int(s.start == 0), int(s.stop == n)) for s, n in zip(at, walls.grid.shape)]
-    p = np.pad(rate[wide].astype(np.float64), pads)
-    inner = (slice(1, -1),) * 3
-    here = p[inner]
-    forces = []
+    out = np.zeros(6)
     for axis in range(3):
-        total, count = np.zeros(here.shape), np.zeros(here.shape)
-        share = np.moveaxis(cover.share[axis], axis, 0)
-        opening = np.moveaxis(walls.openings[axis][cover.faces(axis)], axis, 0)
-        for side in (0, 1):
-            beyond = list(inner)
-            beyond[axis] = slice(0, -2) if side == 0 else slice(2, None)
-            there = p[tuple(beyond)]
-            open_face = np.moveaxis(opening[side : len(opening) - 1 + side], 0, axis) > 0
-            joined = (there != 0) & (here != 0) & open_face
-            total += np.where(joined, (there - here) * (2 * side - 1) / h, 0.0)
-            count += joined
-        slope = np.divide(total, count, out=np.zeros_like(total), where=count > 0)
-        if (count > 0).any():
-            # a film has no neighbours across it: it takes the mean of the others
-            slope[(count == 0) & (here != 0)] = slope[count > 0].mean()
-        faces = 0.5 * np.moveaxis(share[1:] + share[:-1], 0, axis)
-        forces.append(-slope * h**3 * (cover.volume - faces))
-    force = np.stack(forces, axis=-1)
-    cells = np.argwhere((force != 0).any(axis=-1))
-    force = force[tuple(cells.T)]
-    arm = walls.grid.low + (cells + np.array(cover.low) + 0.5) * h - center
-    return np.concatenate([force.sum(axis=0), np.cross(arm, force).sum(axis=0)])
+        _add_surface_force(
+            np.asarray(rate, np.float32), walls.solid, walls.openings[axis], axis, np.array(cover.low), walls.grid.low,
+            walls.grid.spacing, cover.share[axis], cover.offset[axis], cover.volume, cover.middle, center, out,
+        )  # fmt: skip
+    return out
 
 
 @njit(parallel=True, cache=True)

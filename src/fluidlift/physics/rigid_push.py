@@ -19,6 +19,8 @@ TRIES = 12
 """moves out of the deepest solid before the way sideways is tried"""
 SIDESTEP = 0.25
 """cells"""
+TOUCHING = 0.1
+"""cells: particles that have been moved touch what is closer than this"""
 
 
 @njit(cache=True)
@@ -58,10 +60,11 @@ def _settle(shapes, field, low, high, inverse, open_sides, x, y, z, margin, trie
     value = 0.0
     for _ in range(tries):
         value, gx, gy, gz, _ = _deepest(shapes, field, low, inverse, x, y, z, margin)
-        squared = gx * gx + gy * gy + gz * gz
-        if value >= margin or squared < 1e-6:
+        length = np.sqrt(gx * gx + gy * gy + gz * gz)
+        if value >= margin or length < 1e-3:
             return x, y, z, value
-        step = 1.01 * (margin - value) / squared
+        # the distance, not a Newton step: where the gradient is short (deep inside) that would go too far
+        step = 1.01 * (margin - value) / length
         x = _clamped(x + step * gx, low[0], high[0], open_sides[0, 0], open_sides[0, 1], margin)
         y = _clamped(y + step * gy, low[1], high[1], open_sides[1, 0], open_sides[1, 1], margin)
         z = _clamped(z + step * gz, low[2], high[2], open_sides[2, 0], open_sides[2, 1], margin)
@@ -106,12 +109,12 @@ def _sideways(shapes, field, low, high, inverse, open_sides, x, y, z, margin, bo
 
 
 @njit(cache=True)
-def _stop(velocities, p, nx, ny, nz, sx, sy, sz, value, margin, h, keep):
-    """The particle's velocity relative to a solid (s): not into it, and slower along it near it."""
+def _stop(velocities, p, nx, ny, nz, sx, sy, sz, value, touching, h, keep):
+    """The particle's velocity relative to a solid (s): not into it where it touches, and slower along it near it."""
     rx, ry, rz = velocities[p, 0] - sx, velocities[p, 1] - sy, velocities[p, 2] - sz
     normal = rx * nx + ry * ny + rz * nz
     factor = 1.0 - (1.0 - keep) * min(max(1.0 - value / h, 0.0), 1.0)
-    back = max(normal, 0.0) if value < 1.5 * margin else normal
+    back = max(normal, 0.0) if value < touching else normal
     velocities[p, 0] = sx + factor * (rx - normal * nx) + back * nx
     velocities[p, 1] = sy + factor * (ry - normal * ny) + back * ny
     velocities[p, 2] = sz + factor * (rz - normal * nz) + back * nz
@@ -135,6 +138,7 @@ def _push(positions, velocities, shapes, center, speed, spin, field, low, high, 
                     n[0], n[1], n[2] = gx, gy, gz
         if body < 0 or (nearest >= margin and keep >= 1.0):
             continue
+        touching = TOUCHING * h if nearest < margin else margin
         if nearest < margin:
             x, y, z, value = _settle(shapes, field, low, high, inverse, open_sides, x, y, z, margin, TRIES)
             fx, fy, fz = np.float32(x), np.float32(y), np.float32(z)
@@ -164,12 +168,12 @@ def _push(positions, velocities, shapes, center, speed, spin, field, low, high, 
                 speed[b, 0] + spin[b, 1] * rz - spin[b, 2] * ry,
                 speed[b, 1] + spin[b, 2] * rx - spin[b, 0] * rz,
                 speed[b, 2] + spin[b, 0] * ry - spin[b, 1] * rx,
-                value, margin, h, keep,
+                value, touching, h, keep,
             )  # fmt: skip
         value, gx, gy, gz = distance_and_gradient(field, low, inverse, x, y, z)
         length = np.sqrt(gx * gx + gy * gy + gz * gz)
-        if value < 1.5 * margin and length > 1e-3:
-            _stop(velocities, p, gx / length, gy / length, gz / length, 0.0, 0.0, 0.0, value, margin, h, 1.0)
+        if value < touching and length > 1e-3:
+            _stop(velocities, p, gx / length, gy / length, gz / length, 0.0, 0.0, 0.0, value, touching, h, 1.0)
 
 
 def push_out(

@@ -44,7 +44,9 @@ class Cover:
     offset: tuple[np.ndarray, np.ndarray, np.ndarray]
     """float32 [...,2] per axis: centre of the covered part less the face's centre along the face's two axes, m"""
     volume: Float[np.ndarray, "bx by bz"]
-    """float32: share of each cell that the body fills"""
+    """float32: share of each cell that the body fills; the sum is the body's true volume where it is in the grid"""
+    middle: Float[np.ndarray, "bx by bz 3"]
+    """float32: centre of that part less the cell's centre, m"""
 
     def faces(self, axis: int) -> tuple[slice, slice, slice]:
         """Where the box's faces across `axis` lie in an array of the grid."""
@@ -149,29 +151,40 @@ def _cover_faces(shapes, body, low, axis, h, distance, share, offset):
 
 
 @njit(parallel=True, cache=True)
-def _fill_cells(shapes, body, low, h, distance, out):
-    """Share of each cell inside the body: eight parts, in each of which the surface is a plane.
+def _fill_cells(shapes, body, low, h, distance, volume, middle):
+    """Share of each cell inside the body and the centre of that part: eight parts, cut by a plane each.
 
-    The share of a cube below a plane is taken as linear in the plane's distance, which is exact for planes along the
-    grid.
+    The share of a cube below a plane is taken as linear in the plane's distance, and the centre of what is below as
+    on the normal; both are exact for planes along the grid.
     """
-    for i_ in prange(out.shape[0]):
+    for i_ in prange(volume.shape[0]):
         i = np.int64(i_)
-        for j in range(out.shape[1]):
-            for k in range(out.shape[2]):
+        for j in range(volume.shape[1]):
+            for k in range(volume.shape[2]):
                 corner = distance[i, j, k]
+                middle[i, j, k, 0], middle[i, j, k, 1], middle[i, j, k, 2] = 0.0, 0.0, 0.0
                 if abs(corner) > 2.0 * h:
-                    out[i, j, k] = 1.0 if corner < 0.0 else 0.0
+                    volume[i, j, k] = 1.0 if corner < 0.0 else 0.0
                     continue
-                total = 0.0
+                total, mx, my, mz = 0.0, 0.0, 0.0, 0.0
                 for part in range(8):
-                    x = low[0] + (i + (0.25 if part & 1 == 0 else 0.75)) * h
-                    y = low[1] + (j + (0.25 if part & 2 == 0 else 0.75)) * h
-                    z = low[2] + (k + (0.25 if part & 4 == 0 else 0.75)) * h
-                    value, gx, gy, gz = body_distance(shapes, body, x, y, z)
-                    reach = 0.5 * h * max(abs(gx) + abs(gy) + abs(gz), 0.1)
-                    total += min(max(0.5 - value / reach, 0.0), 1.0)
-                out[i, j, k] = 0.125 * total
+                    fx = 0.25 if part & 1 == 0 else 0.75
+                    fy = 0.25 if part & 2 == 0 else 0.75
+                    fz = 0.25 if part & 4 == 0 else 0.75
+                    value, gx, gy, gz = body_distance(
+                        shapes, body, low[0] + (i + fx) * h, low[1] + (j + fy) * h, low[2] + (k + fz) * h
+                    )
+                    wide = max(abs(gx) + abs(gy) + abs(gz), 0.1)
+                    share = min(max(0.5 - value / (0.5 * h * wide), 0.0), 1.0)
+                    length = max(np.sqrt(gx * gx + gy * gy + gz * gz), 0.1)
+                    back = -0.25 * h * (1.0 - share) * (wide / length) / length
+                    total += share
+                    mx += share * ((fx - 0.5) * h + back * gx)
+                    my += share * ((fy - 0.5) * h + back * gy)
+                    mz += share * ((fz - 0.5) * h + back * gz)
+                volume[i, j, k] = 0.125 * total
+                if total > 0.0:
+                    middle[i, j, k, 0], middle[i, j, k, 1], middle[i, j, k, 2] = mx / total, my / total, mz / total
 
 
 @njit(parallel=True, cache=True)
@@ -263,11 +276,11 @@ class UnionWalls:
         """number of the body that closes a face which the terrain leaves open; else -1"""
         self._covered = tuple(np.zeros(grid.face_shape(a), np.float32) for a in range(3))
 
-    def update(self, shapes: Shapes) -> None:
-        """Walls for the poses of `shapes`."""
+    def update(self, shapes: Shapes, volumes: Float[np.ndarray, "b"], centers: Float[np.ndarray, "b 3"]) -> None:
+        """Walls for the poses of `shapes`; the bodies' true volumes (m^3) and centres of mass (m) correct `Cover`."""
         for cover in self.covers:
             self._put_back(cover)
-        covers = [self._measured(shapes, b) for b in range(len(shapes.start))]
+        covers = [self._measured(shapes, b, float(volumes[b]), centers[b]) for b in range(len(shapes.start))]
         covers = [c for c in covers if c is not None]
         for cover in covers:
             nodes = self.walls.signed_distance[cover.nodes]
@@ -300,7 +313,7 @@ class UnionWalls:
         self.window.wall_cells[at] = self.static.wall_cells[at]
         self.window.capacity[at] = self.static.capacity[at]
 
-    def _measured(self, shapes: Shapes, body: int) -> Cover | None:
+    def _measured(self, shapes: Shapes, body: int, true_volume: float, center: np.ndarray) -> Cover | None:
         """Distance and covered shares on the faces around a body; None where it is out of the box."""
         grid, h = self.static.grid, self.static.grid.spacing
         limits = np.asarray(grid.shape)
@@ -320,10 +333,19 @@ class UnionWalls:
             _cover_faces(shapes, body, grid.low + first * h, axis, h, distance, share, offset)
             shares.append(share)
             offsets.append(offset)
-        volume = np.empty(tuple(size), np.float32)
-        _fill_cells(shapes, body, grid.low + first * h, h, distance, volume)
+        volume, middle = np.empty(tuple(size), np.float32), np.empty((*size, 3), np.float32)
+        _fill_cells(shapes, body, grid.low + first * h, h, distance, volume, middle)
+        if (low >= 0).all() and (high <= limits).all():
+            # as a whole the body is known exactly: it neither rises nor turns for what cells make of its edges
+            seen = float(volume.sum(dtype=np.float64))
+            if seen > 0.5 * true_volume / h**3:
+                cells = [grid.low[a] + (np.arange(first[a], last[a]) + 0.5) * h - center[a] for a in range(3)]
+                arms = np.stack(np.meshgrid(*cells, indexing="ij"), axis=-1) + middle
+                shift = (volume[..., None] * arms).sum(axis=(0, 1, 2)) / seen
+                middle -= shift.astype(np.float32)
+                volume *= np.float32(true_volume / (h**3 * seen))
         ends = tuple(int(x) for x in first), tuple(int(x) for x in last)
-        return Cover(body, *ends, distance, tuple(shares), tuple(offsets), volume)
+        return Cover(body, *ends, distance, tuple(shares), tuple(offsets), volume, middle)
 
     def _fitted(self, cover: Cover) -> Cover:
         """Shares scaled so that bodies and liquid together fill what the terrain leaves open."""

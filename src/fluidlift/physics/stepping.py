@@ -293,9 +293,19 @@ class ParticleSimulator(ABC):
         return tuple(t & (o > 0) for t, o in zip(boundaries.touching_faces(wet), walls.openings))
 
     def _viscous(
-        self, velocity: FaceVelocity, wet: tuple, window: Window, dt: float, prescribed: tuple | None = None
+        self,
+        velocity: FaceVelocity,
+        wet: tuple,
+        window: Window,
+        dt: float,
+        prescribed: tuple | None = None,
+        distance: np.ndarray | None = None,
+        solid: FaceVelocity | None = None,
     ) -> tuple[FaceVelocity, tuple[SolveReport, ...]]:
-        """Viscosity on the wet faces; inflow and other `prescribed` faces (bool per component) keep their velocity."""
+        """Viscosity on the wet faces; inflow and other `prescribed` faces (bool per component) keep their velocity.
+
+        `distance` to the liquid's surface as for `viscosity.diffuse`; closed faces move with `solid`, or rest.
+        """
         walls = window.walls
         fixed = self._inlet.face_masks(tuple(w.shape for w in wet), window.first)
         if prescribed is not None:
@@ -308,12 +318,13 @@ class ParticleSimulator(ABC):
             across = closed & (np.abs(walls.normals[axis][..., axis]) > 0.7)
             head_on.append(fixed[axis] | across)
             beside.append(closed & ~across)
+        resting = FaceVelocity.zeros(walls.grid) if solid is None else solid
         stopped = FaceVelocity(
-            *(np.where(o == 0, np.float32(0), c) for o, c in zip(walls.openings, velocity.components))
+            *(np.where(o == 0, r, c) for o, r, c in zip(walls.openings, resting.components, velocity.components))
         )
         new, reports = diffuse(
             stopped, FaceRoles(solved, tuple(head_on), tuple(beside)), viscosity=self.parameters.kinematic_viscosity,
             dt=dt, spacing=self.grid.spacing, wall_share=self.parameters.wall_damping,
-            tolerance=self.settings.viscosity_tolerance,
+            liquid_distance=distance, tolerance=self.settings.viscosity_tolerance,
         )  # fmt: skip
         return (new if reports else velocity), reports

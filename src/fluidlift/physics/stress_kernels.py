@@ -15,6 +15,9 @@ from fluidlift.physics.liquid_fractions import control_share
 AIR, SOLVED, FIXED, WALL = 0, 1, 2, 3
 """roles of a face"""
 
+LEAST_GAP = 0.05
+"""cells: faces nearer to a wall count as this far from it (conditioning)"""
+
 ONE, TWO, EIGHT = np.uint64(1), np.uint64(2), np.uint64(8)
 ZERO, FULL = np.float32(0.0), np.float32(1.0)
 """Unsigned indices need no check for negative ones, and numbers of single precision do not widen what they meet: with
@@ -22,21 +25,59 @@ both, the inner loops become vector instructions, five times as fast."""
 
 
 @njit(cache=True)
-def _pair(a, b, wall_share):
-    """Share of a normal stress between two faces; 0 unless it acts on a solved one."""
-    if a == AIR or b == AIR or (a != SOLVED and b != SOLVED):
-        return 0.0
-    return wall_share if a == WALL or b == WALL else 1.0
+def _gap(role_a, role_b, a, b):
+    """Cells from a face to the wall that its neighbour lies in, by their clearances; 1 with no wall between them."""
+    if (role_a == WALL) == (role_b == WALL):
+        return 1.0
+    outside, behind = (b, a) if role_a == WALL else (a, b)
+    if outside <= behind:
+        return 0.5
+    return min(max(outside / (outside - behind), LEAST_GAP), 1.0)
 
 
 @njit(cache=True)
-def _four(a, b, c, d, wall_share):
-    """Share of a shear stress between four faces. A wall lies at half a cell's distance: twice the stiffness."""
-    if a == AIR or b == AIR or c == AIR or d == AIR:
+def _normal_factor(roles, clearance, wall_share, a, i, j, k, i1, j1, k1):
+    """Of the normal stress between two faces of component a; 0 unless it acts on a solved one."""
+    r, s = roles[a, i, j, k], roles[a, i1, j1, k1]
+    if r == AIR or s == AIR or (r != SOLVED and s != SOLVED):
         return 0.0
-    if a != SOLVED and b != SOLVED and c != SOLVED and d != SOLVED:
+    if r != WALL and s != WALL:
+        return 1.0
+    return wall_share / _gap(r, s, clearance[a, i, j, k], clearance[a, i1, j1, k1])
+
+
+@njit(cache=True)
+def _shear_factor(roles, clearance, wall_share, a, b, i, j, k, ia, ja, ka, ib, jb, kb):
+    """Of the shear stress between the faces (i, j, k) and (ia, ja, ka) of component a, and those of b likewise.
+
+    Beside a wall the velocity drops to the wall's within the gap, and only the liquid in the gap is strained:
+    1 / gap in all.
+    """
+    p, q, r, s = roles[a, i, j, k], roles[a, ia, ja, ka], roles[b, i, j, k], roles[b, ib, jb, kb]
+    if p == AIR or q == AIR or r == AIR or s == AIR:
         return 0.0
-    return 2.0 * wall_share if a == WALL or b == WALL or c == WALL or d == WALL else 1.0
+    if p != SOLVED and q != SOLVED and r != SOLVED and s != SOLVED:
+        return 0.0
+    if p != WALL and q != WALL and r != WALL and s != WALL:
+        return 1.0
+    gap = min(
+        _gap(p, q, clearance[a, i, j, k], clearance[a, ia, ja, ka]),
+        _gap(r, s, clearance[b, i, j, k], clearance[b, ib, jb, kb]),
+    )
+    return wall_share / gap
+
+
+@njit(cache=True)
+def _acts(roles, i, j, k):
+    """Whether a solved face is among those that the stresses of node (i, j, k) join."""
+    for a in range(3):
+        if roles[a, i, j, k] == SOLVED:
+            return True
+    if roles[0, i + ONE, j, k] == SOLVED or roles[1, i, j + ONE, k] == SOLVED or roles[2, i, j, k + ONE] == SOLVED:
+        return True
+    if roles[0, i, j - ONE, k] == SOLVED or roles[0, i, j, k - ONE] == SOLVED or roles[1, i - ONE, j, k] == SOLVED:
+        return True
+    return roles[1, i, j, k - ONE] == SOLVED or roles[2, i - ONE, j, k] == SOLVED or roles[2, i, j - ONE, k] == SOLVED
 
 
 @njit(cache=True)
@@ -58,11 +99,12 @@ def _stiffness(octants, cells, resistance, i, j, k, across_x, across_y, across_z
 
 
 @njit(parallel=True, cache=True)
-def weigh_stresses(roles, octants, cells, resistance, number, wall_share, normal, shear):
+def weigh_stresses(roles, clearance, octants, cells, resistance, number, wall_share, normal, shear):
     """Weights of the normal stresses xx, yy, zz at cells and of the shear stresses yz, xz, xy at edges.
 
     normal[a] = 2 V nu dt / h^2 and shear[a] = V nu dt / h^2, where `number` is dt / h^2. A stress that would need the
-    velocity of air is left out: the surface is free of it.
+    velocity of air is left out: the surface is free of it. `clearance` is the distance of the faces from walls, in
+    cells, negative inside.
     """
     _, nx, ny, nz = roles.shape
     for i_ in prange(1, nx - 1):
@@ -71,13 +113,15 @@ def weigh_stresses(roles, octants, cells, resistance, number, wall_share, normal
             sj = np.int64(j)
             for k in range(ONE, np.uint64(nz - 1)):
                 sk = np.int64(k)
-                u, v, w = roles[0, i, j, k], roles[1, i, j, k], roles[2, i, j, k]
-                xx = _pair(u, roles[0, i + ONE, j, k], wall_share)
-                yy = _pair(v, roles[1, i, j + ONE, k], wall_share)
-                zz = _pair(w, roles[2, i, j, k + ONE], wall_share)
-                yz = number * _four(v, roles[1, i, j, k - ONE], w, roles[2, i, j - ONE, k], wall_share)
-                xz = number * _four(u, roles[0, i, j, k - ONE], w, roles[2, i - ONE, j, k], wall_share)
-                xy = number * _four(u, roles[0, i, j - ONE, k], v, roles[1, i - ONE, j, k], wall_share)
+                if not _acts(roles, i, j, k):
+                    continue
+                u, d, l = i - ONE, j - ONE, k - ONE
+                xx = _normal_factor(roles, clearance, wall_share, 0, i, j, k, i + ONE, j, k)
+                yy = _normal_factor(roles, clearance, wall_share, 1, i, j, k, i, j + ONE, k)
+                zz = _normal_factor(roles, clearance, wall_share, 2, i, j, k, i, j, k + ONE)
+                yz = number * _shear_factor(roles, clearance, wall_share, 1, 2, i, j, k, i, j, l, i, d, k)
+                xz = number * _shear_factor(roles, clearance, wall_share, 0, 2, i, j, k, i, j, l, u, j, k)
+                xy = number * _shear_factor(roles, clearance, wall_share, 0, 1, i, j, k, i, d, k, u, j, k)
                 centre = xx + yy + zz
                 if centre + yz + xz + xy == 0.0:
                     continue
@@ -321,3 +365,31 @@ def turn(direction, z, factor, first, last):
             for j in range(ONE, np.uint64(ny - 1)):
                 for k in range(np.uint64(first[i, j]), np.uint64(last[i, j])):
                     direction[a, i, j, k] = z[a, i, j, k] + factor * direction[a, i, j, k]
+
+
+@njit(parallel=True, cache=True)
+def continue_behind_walls(x, clearance, mass, wall_share, buried):
+    """Velocities of the `buried` faces (bool [3,...], role WALL), linear through the wall's; in place.
+
+    Before, they hold the velocity of the wall. Without friction they take over that of the liquid beside them.
+    """
+    _, nx, ny, nz = x.shape
+    for i_ in prange(1, nx - 1):
+        i = np.int64(i_)
+        for a in range(3):
+            for j in range(1, ny - 1):
+                for k in range(1, nz - 1):
+                    if not buried[a, i, j, k]:
+                        continue
+                    here, wall = clearance[a, i, j, k], x[a, i, j, k]
+                    total, weight = 0.0, 0.0
+                    for n in range(6):
+                        step = 1 if n & 1 else -1
+                        p, q, r = i + step * (n // 2 == 0), j + step * (n // 2 == 1), k + step * (n // 2 == 2)
+                        there = clearance[a, p, q, r]
+                        if mass[a, p, q, r] > 0.0 and there > here and there > 0.0:
+                            kept = 1.0 - wall_share * (1.0 - max(here / there, -1.0))
+                            total += (there - here) * kept * (x[a, p, q, r] - wall)
+                            weight += there - here
+                    if weight > 0.0:
+                        x[a, i, j, k] = wall + total / weight

@@ -13,11 +13,13 @@ gradients).
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numba import njit, prange
+from numba import get_num_threads, njit, prange, set_num_threads
 
 from fluidlift.physics import stress_kernels as kernels
 from fluidlift.physics.liquid_fractions import cell_shares
@@ -30,7 +32,7 @@ COARSEST_SWEEPS = 10
 COARSEST_NODES = 4
 """coarsening stops when the longest side has this many nodes with solved faces"""
 SMALL = 30_000
-"""nodes: smaller grids are swept without threads, which would cost more than they gain"""
+"""nodes: smaller grids are left to one thread, since waiting for others costs more than they gain"""
 
 
 CHILDREN = np.array([[0.5, 1.0, 0.5, 0.0], [0.25, 0.75, 0.75, 0.25]], np.float32)
@@ -55,6 +57,8 @@ class StressSystem:
     number: float
     """dt / h^2"""
     wall_share: float
+    clearance: np.ndarray
+    """float32 [3,...]: distance of the faces from walls in cells, negative inside"""
     mass: np.ndarray
     """float32 [3,...]: liquid share of the faces that are solved, 0 elsewhere"""
     inverse: np.ndarray
@@ -102,18 +106,21 @@ def assemble(
     resistance: np.ndarray,
     number: float,
     wall_share: float,
+    clearance: np.ndarray | None = None,
 ) -> StressSystem:
-    """The operator; arguments as in `StressSystem`."""
+    """The operator; arguments as in `StressSystem`. Without `clearance` walls lie half way between faces."""
+    if clearance is None:
+        clearance = np.where(roles == kernels.WALL, np.float32(-0.5), np.float32(0.5))
     mass, inverse, normal, shear = (np.zeros(roles.shape, np.float32) for _ in range(4))
     cells = cell_shares(octants, excluded)
-    kernels.weigh_stresses(roles, octants, cells, resistance, number, wall_share, normal, shear)
+    kernels.weigh_stresses(roles, clearance, octants, cells, resistance, number, wall_share, normal, shear)
     kernels.weigh_faces(roles, octants, cells, resistance, normal, shear, LEAST_SHARE, mass, inverse)
     some = (mass > 0).any(axis=0)
     columns = some.any(axis=2)
     first = np.where(columns, some.argmax(axis=2), 1).astype(np.int32)
     last = np.where(columns, some.shape[2] - some[:, :, ::-1].argmax(axis=2), 1).astype(np.int32)
     return StressSystem(
-        roles, octants, excluded, resistance, number, wall_share, mass, inverse, normal, shear, first, last
+        roles, octants, excluded, resistance, number, wall_share, clearance, mass, inverse, normal, shear, first, last
     )
 
 
@@ -261,6 +268,18 @@ def _gather(rest, reach, coarse_mass, coarse_rhs, coarse_x, first, last):
                     coarse_x[a, i, j, k] = ZERO
 
 
+@contextmanager
+def fitting_threads(nodes: int) -> Iterator[None]:
+    """One thread for small grids. The results do not depend on their number."""
+    before = get_num_threads()
+    if nodes < SMALL:
+        set_num_threads(1)
+    try:
+        yield
+    finally:
+        set_num_threads(before)
+
+
 def build_levels(system: StressSystem, *, coarsen: bool = True) -> list[Level]:
     """The system on ever coarser grids, finest first; only the finest without `coarsen`."""
     systems = [system]
@@ -287,14 +306,20 @@ def _sweep(level: Level, count: int, *, forward: bool) -> None:
             )  # fmt: skip
 
 
+def _descend(fine: Level, coarse: Level) -> None:
+    _sweep(fine, SWEEPS, forward=True)
+    kernels.residual(fine.x, fine.rhs, fine.rest, *fine.system.operator)
+    _gather(fine.rest, fine.reach, coarse.system.mass, coarse.rhs, coarse.x, *coarse.system.columns)
+
+
 def v_cycle(levels: list[Level]) -> None:
     """levels[0].x, 0 before, becomes an approximate solution for levels[0].rhs: linear, symmetric, positive."""
     for fine, coarse in pairwise(levels):
-        _sweep(fine, SWEEPS, forward=True)
-        kernels.residual(fine.x, fine.rhs, fine.rest, *fine.system.operator)
-        _gather(fine.rest, fine.reach, coarse.system.mass, coarse.rhs, coarse.x, *coarse.system.columns)
+        with fitting_threads(fine.system.excluded.size):
+            _descend(fine, coarse)
     _sweep(levels[-1], COARSEST_SWEEPS, forward=True)
     _sweep(levels[-1], COARSEST_SWEEPS, forward=False)
     for fine, coarse in zip(levels[-2::-1], levels[:0:-1]):
-        _add_coarse(fine.x, fine.reach, coarse.x, *fine.system.columns)
-        _sweep(fine, SWEEPS, forward=False)
+        with fitting_threads(fine.system.excluded.size):
+            _add_coarse(fine.x, fine.reach, coarse.x, *fine.system.columns)
+            _sweep(fine, SWEEPS, forward=False)

@@ -267,3 +267,39 @@ def distance(fill, bend, band, out):
             for k in range(nz):
                 d = flat_distance(fill[i, j, k]) - 0.5 * VARIANCE * bend[i, j, k]
                 out[i, j, k] = min(max(d, -band), band)
+
+
+@njit(cache=True)
+def _change_beside(new, old, sure, i, j, k):
+    """Mean of new - old over the sure neighbours, 0 without one."""
+    nx, ny, nz = new.shape
+    total, count = np.float32(0.0), 0
+    for axis in range(3):
+        for side in (-1, 1):
+            a = i + side if axis == 0 else i
+            b = j + side if axis == 1 else j
+            c = k + side if axis == 2 else k
+            if 0 <= a < nx and 0 <= b < ny and 0 <= c < nz and sure[a, b, c]:
+                total += new[a, b, c] - old[a, b, c]
+                count += 1
+    return total / np.float32(max(count, 1))
+
+
+@njit(parallel=True, cache=True)
+def carry(new, old, mass, wet, beside_skin, opening, least, out, known, valid):
+    """One component of the velocity on wet faces and on faces of the skin: see `free_surface.continue_velocity`."""
+    nx, ny, nz = new.shape
+    for i_ in prange(nx):
+        i = np.int64(i_)
+        for j in range(ny):
+            for k in range(nz):
+                valid[i, j, k] = wet[i, j, k] and opening[i, j, k] >= least
+    for i_ in prange(nx):
+        i = np.int64(i_)
+        for j in range(ny):
+            for k in range(nz):
+                out[i, j, k] = new[i, j, k]
+                known[i, j, k] = wet[i, j, k]
+                if beside_skin[i, j, k] and not wet[i, j, k] and opening[i, j, k] > 0 and mass[i, j, k] > 0:
+                    out[i, j, k] = old[i, j, k] + _change_beside(new, old, valid, i, j, k)
+                    known[i, j, k] = True

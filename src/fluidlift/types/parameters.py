@@ -18,6 +18,8 @@ class FluidParameters:
     """kg/m^3"""
     kinematic_viscosity: float = 1e-6
     """m^2/s"""
+    surface_tension: float = 0.0
+    """N/m; 0: none. It limits the time step (`surface_tension.capillary_time_step`)"""
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
     """m/s^2"""
     inflow_velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -44,6 +46,7 @@ class FluidParameters:
         require(bool(np.isfinite(numbers).all()), "a parameter that is not a finite number")
         require(self.density > 0, f"density {self.density}", "positive kg/m^3")
         require(self.kinematic_viscosity >= 0, f"kinematic viscosity {self.kinematic_viscosity}", "0 or more m^2/s")
+        require(self.surface_tension >= 0, f"surface tension {self.surface_tension}", "0 or more N/m")
         require(0 <= self.restitution <= 1, f"restitution {self.restitution}", "0 to 1")
         require(0 <= self.wall_damping <= 1, f"wall damping {self.wall_damping}", "0 to 1")
         require(self.time_step > 0, f"time step {self.time_step}", "positive seconds")

@@ -28,14 +28,14 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse import linalg
 
-from fluidlift.numerics import multigrid, multigrid_assembly
+from fluidlift.numerics import multigrid
 from fluidlift.numerics.poisson import PoissonSystem, solve
 
 ROOT = Path(__file__).resolve().parent.parent
 TOLERANCE = 1e-5
 SLOW = 5.0
 """s, of a solve that is not repeated"""
-MOST_ITERATIONS = 5000
+MOST_ITERATIONS = 2000
 
 
 @dataclass(frozen=True)
@@ -114,8 +114,9 @@ def ours(problem: Problem, repeats: int, threads: int) -> Iterator[Result]:
     system, rhs = problem.system, problem.rhs
 
     def setup() -> None:
-        box = multigrid_assembly.bounds(system.unknown)
-        multigrid.assemble(system.unknown, system.weights, box, None)
+        box = multigrid.bounding_box(system.unknown)
+        assert box is not None
+        multigrid.assemble(system.unknown, system.weights, box)
 
     solve(system, rhs)  # compiles
     setup_time, _ = median(setup, repeats)
@@ -212,7 +213,7 @@ def main() -> int:
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2], help="threads of ours")
     parser.add_argument("--domains", nargs="+", choices=names, default=names)
     parser.add_argument("--peers", nargs="+", choices=["ours", "scipy", "pyamg"], default=["ours", "scipy", "pyamg"])
-    parser.add_argument("--ilu-cells", type=int, default=300000, help="largest system that is factorised by ILU")
+    parser.add_argument("--ilu-cells", type=int, default=200000, help="largest system that is factorised by ILU")
     options = parser.parse_args()
     options.threads = [n for n in options.threads if n <= numba.config.NUMBA_NUM_THREADS]
     if "pyamg" in options.peers and not importlib.util.find_spec("pyamg"):

@@ -91,7 +91,9 @@ def test_particles_collide_like_the_plain_model(collide, grid, shape, seed):
     # the states have touched every branch
     changed = (x != new).any(axis=1)
     assert 0.02 < changed.mean() < 0.9 and (v != velocities).any(axis=1).mean() > 0.05
-    assert sample_nodes(walls.signed_distance, grid, got_x).min() >= 0
+    # those that left the box are on their way to be removed; no terrain is known there
+    inside = grid.contains(got_x)
+    assert sample_nodes(walls.signed_distance, grid, got_x[inside]).min() >= 0 and inside.mean() > 0.5
 
 
 def warp_extrapolate(velocity, valid, layers=3):

@@ -56,7 +56,7 @@ def places(distance, exact):
 
 
 def test_the_kernels_agree_with_the_formulas():
-    grid = Grid((10, 9, 11), 0.1, (-0.3, 0.2, 0.1))
+    grid = Grid((12, 9, 13), 0.1, (-0.3, 0.2, -0.1))
     x, rng = grid.nodes(), np.random.default_rng(0)
     bed = x[..., 2] - 0.33 - 0.4 * (x[..., 0] - 0.2)
     solid = np.minimum(bed, np.linalg.norm(x - np.array([0.3, 0.7, 0.5]), axis=-1) - 0.17).astype(np.float32)

@@ -1,6 +1,5 @@
 """Obstacles of scene.yaml reach the simulation, its checkpoints, the USD file and the preview."""
 
-import inspect
 import shutil
 
 import numpy as np
@@ -11,13 +10,9 @@ from fluidlift.io.asset_folder import load_asset, read_manifest
 from fluidlift.io.export_mesh import write_obj
 from fluidlift.io.video import read_clip
 from fluidlift.numerics.solid_mesh import box_mesh
-from fluidlift.physics.apic import LiquidSimulator
 from fluidlift.physics.stepping import ParticleSimulator
 
 WELL = (DONE, WITH_WARNINGS)
-takes_bodies = pytest.mark.skipif(
-    "bodies" not in inspect.signature(LiquidSimulator.__init__).parameters, reason="the simulator takes no bodies yet"
-)
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +78,6 @@ def test_a_checkpoint_without_obstacles_is_refused_once_there_are_some(asset, ca
     assert "another obstacles" in capsys.readouterr().err
 
 
-@takes_bodies
 def test_a_raft_floats_and_the_usd_file_shows_where(asset):
     from pxr import Gf, Usd, UsdGeom
 
@@ -100,7 +94,6 @@ def test_a_raft_floats_and_the_usd_file_shows_where(asset):
     assert not (asset / "work" / "evaluation.npz").exists()  # there is no raft in the clip to compare with
 
 
-@takes_bodies
 def test_a_simulation_with_a_raft_that_was_stopped_goes_on_bit_for_bit(asset, monkeypatch):
     raft(asset, velocity="[0.5, 0, 0]", angular_velocity="[0, 2, 0]")
     command = ["sim", str(asset), "--set", "show.usd=false", "--duration", "0.24", "--checkpoint-every", "2"]
@@ -121,7 +114,6 @@ def test_a_simulation_with_a_raft_that_was_stopped_goes_on_bit_for_bit(asset, mo
     assert frames(asset) == whole
 
 
-@takes_bodies
 def test_a_raft_outside_the_box_is_rejected_before_anything_is_written(asset, capsys):
     put(asset, "obstacles: [{shape: sphere, name: moon, radius: 0.1, position: [0, 0, 900], motion: free}]")
     before = frames(asset)

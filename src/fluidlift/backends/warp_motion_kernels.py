@@ -149,8 +149,11 @@ def move_particles(
                 x[a] = wp.min(x[a], highest)
     x = rounded(x)
     v = rounded(v)
+    inside = bool(True)  # no terrain is known out of the box
+    for a in range(3):
+        inside = inside and x[a] >= box.low[a] and x[a] < box.high[a]
     there = distance_and_gradient(box, x)
-    if there[3] < box.spacing:
+    if inside and there[3] < box.spacing:
         v = off_the_walls(box, v, before, old, there)
         if there[3] < box.clearance:
             x = pushed_out(box, x, there, old)

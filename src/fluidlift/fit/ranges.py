@@ -220,7 +220,8 @@ def parameter_space(
     floors = {"kinematic_viscosity": 1e-7, "inflow_fluctuation": 0.02 * speed}
     sigmas = DEFAULT_PRIOR_SIGMAS | (prior_sigmas or {})
     fitted, fixed = [], []
-    for name, values in prior.to_dict().items():
+    # what the rollout knows: surface tension is not part of it
+    for name, values in ((n, v) for n, v in prior.to_dict().items() if n in UNITS):
         components = enumerate(values) if name in VECTORS else [(None, values)]
         for component, value in components:
             if name in free:

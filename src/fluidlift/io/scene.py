@@ -20,6 +20,7 @@ SCENE_TEMPLATE = """\
 parameters: {}
 #  density: 1000            # kg/m^3
 #  kinematic_viscosity: 1e-6  # m^2/s
+#  surface_tension: 0.072   # N/m; matters to drops and thin jets
 #  gravity: [0, 0, -9.81]   # m/s^2
 #  inflow_velocity: [1, 0, 0]  # m/s
 

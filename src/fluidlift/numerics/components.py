@@ -77,14 +77,14 @@ def free_constants(
 
 
 @njit(parallel=True, cache=True)
-def _count_runs(unknown, wz):
-    """int64 [nx, ny]: runs of unknown cells along z, cut at closed faces."""
-    nx, ny, nz = unknown.shape
-    out = np.zeros((nx, ny), np.int64)
-    for i in prange(nx):
-        for j in range(ny):
+def _count_runs(unknown, wz, low, high):
+    """int64 [nx,ny]: runs of unknown cells along z, cut at closed faces; only looked for from low to high - 1."""
+    out = np.zeros(unknown.shape[:2], np.int64)
+    for i_ in prange(low[0], high[0]):
+        i = np.int64(i_)
+        for j in range(low[1], high[1]):
             count = 0
-            for k in range(nz):
+            for k in range(low[2], high[2]):
                 if unknown[i, j, k] and not (k > 0 and unknown[i, j, k - 1] and wz[i, j, k] > 0):
                     count += 1
             out[i, j] = count
@@ -169,19 +169,24 @@ def _closed_labels(wx, wy, offset, runs, grounded):
 
 
 def closed_components(
-    unknown: np.ndarray, weights: tuple[np.ndarray, np.ndarray, np.ndarray], beside_known: np.ndarray
+    unknown: np.ndarray,
+    weights: tuple[np.ndarray, np.ndarray, np.ndarray],
+    beside_known: np.ndarray,
+    box: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> ClosedComponents:
     """The closed components, numbered in the order of their first cells.
 
     Args:
         unknown: bool [nx,ny,nz].
         weights: face fractions across x, y, z.
-        beside_known: bool [nx,ny,nz], unknown cells with an open face to a known cell or out of the box.
+        beside_known: bool [nx,ny,nz], unknown cells with an open face to a known cell or out of the grid.
+        box: first index and last + 1 of the unknown cells along each axis, which saves time.
     """
     wx, wy, wz = weights
     if unknown.size == 0:
         return ClosedComponents(np.zeros((0, 4), np.int64), np.zeros(0, np.int64), np.zeros(0, np.int64))
-    offset = np.concatenate([[0], np.cumsum(_count_runs(unknown, wz))])
+    low, high = box if box is not None else (np.zeros(3, np.int64), np.array(unknown.shape))
+    offset = np.concatenate([[0], np.cumsum(_count_runs(unknown, wz, low, high))])
     runs, grounded = np.empty((offset[-1], 4), np.int64), np.zeros(offset[-1], bool)
     _fill_runs(unknown, wz, beside_known, offset, runs, grounded)
     if grounded.all():

@@ -20,7 +20,7 @@ from fluidlift.numerics.multigrid_cycle import Hierarchy
 from fluidlift.numerics.multigrid_kernels import BASE, CELLS, HALF, PARTS, PLANES, ROW_BASE, ROWS, SEGMENT_BASE
 
 SERIAL_CELLS = 65536
-"""levels with fewer unknown cells are visited by one thread: waking another costs more"""
+"""levels of which fewer cells are visited have one thread: waking another costs more"""
 
 
 class LowRank(NamedTuple):
@@ -65,16 +65,24 @@ def _threads(cells: int) -> Iterator[None]:
         set_num_threads(threads)
 
 
+def bounding_box(unknown: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """First index and last + 1 of the unknown cells along each axis; None where there are none."""
+    planes = multigrid_assembly.bounds(unknown)
+    some = np.flatnonzero(planes[:, 1])
+    if len(some) == 0:
+        return None
+    low = np.array([some[0], planes[some, 0].min(), planes[some, 2].min()])
+    return low, np.array([some[-1] + 1, planes[:, 1].max(), planes[:, 3].max()])
+
+
 def assemble(
     unknown: np.ndarray,
     weights: tuple[np.ndarray, ...],
-    box: np.ndarray,
-    added_diagonal: np.ndarray | None,
+    box: tuple[np.ndarray, np.ndarray],
+    added_diagonal: np.ndarray | None = None,
 ) -> Hierarchy:
-    """All levels; box from `multigrid_assembly.bounds`, with some unknown cell."""
-    planes = np.flatnonzero(box[:, 4])
-    low = np.array([planes[0], box[planes, 0].min(), box[planes, 2].min()])
-    high = np.array([planes[-1] + 1, box[:, 1].max(), box[:, 3].max()])
+    """All levels of the operator on the `bounding_box`; arrays contiguous, weights float32."""
+    low, high = box
     geometry = multigrid_assembly.geometry_of(tuple(int(n) for n in high - low))
     last_level = geometry[-1]
     cells = int(last_level[BASE] + 2 * last_level[HALF] * last_level[PLANES])
@@ -89,21 +97,20 @@ def assemble(
     start, stop, segment_same = np.empty(most, np.int32), np.empty(most, np.int32), np.empty(most, bool)
     beside = np.zeros(unknown.shape, bool)
     added = np.zeros((0, 0, 0), np.float32) if added_diagonal is None else _single(added_diagonal)
-    wx, wy, wz = weights
+    operator, ranges, work = (air, cx, cy, cz), (first, last), (x, rhs, inverse)
     for level, g in enumerate(geometry):
         if level == 0:
-            multigrid_assembly.assemble_finest(g, low, unknown, wx, wy, wz, added, air, cx, cy, cz, first, last, beside)
+            multigrid_assembly.assemble_finest(g, low, unknown, tuple(weights), added, operator, ranges, beside)
         else:
-            multigrid_assembly.assemble_coarse(geometry[level - 1], g, inverse, air, cx, cy, cz, first, last)
-        g[CELLS] = multigrid_assembly.invert_diagonal(g, air, cx, cy, cz, inverse, common[level])
-        multigrid_assembly.classify(g, common[level], inverse, cx, cy, cz, same, blocks[level])
-        multigrid_assembly.find_segments(g, blocks[level], offset, start, stop, segment_same)
+            multigrid_assembly.assemble_coarse(geometry[level - 1], g, inverse, operator, ranges)
+        multigrid_assembly.invert_diagonal(g, operator, ranges, inverse, common[level])
+        multigrid_assembly.classify(g, common[level], inverse, operator, ranges, same, blocks[level])
+        g[CELLS] = multigrid_assembly.find_segments(g, blocks[level], offset, start, stop, segment_same)
         if g[CELLS] >= SERIAL_CELLS:
             g[PARTS] = max(1, min(get_num_threads(), (g[PLANES] - 2) // multigrid_cycle.LEAST_PLANES))
     used = offset[-1]
     segments = (offset, start[:used].copy(), stop[:used].copy(), segment_same[:used].copy())
-    rows = (first, last, same)
-    return Hierarchy(geometry, common, low, x, rhs, inverse, (air, cx, cy, cz), rows, segments, beside)
+    return Hierarchy(geometry, common, low, work, operator, (*ranges, same), segments, beside)
 
 
 def _single(array: np.ndarray) -> np.ndarray:
@@ -138,14 +145,14 @@ def build_levels(
         added_diagonal: [nx,ny,nz] added to the operator (the unit matrix of implicit diffusion).
     """
     inverse, x, rhs = (np.zeros(tuple(n + 2 for n in unknown.shape), np.float32) for _ in range(3))
-    box = multigrid_assembly.bounds(np.ascontiguousarray(unknown))
-    if not box.any():
+    box = bounding_box(np.ascontiguousarray(unknown))
+    if box is None:
         return [Level(inverse, x, rhs, None)]
     scaled = tuple(_single(w) / np.float32(spacing**2) for w in weights)
-    with _threads(int(box[:, 4].sum())):
+    with _threads(int(np.prod(box[1] - box[0]))):
         hierarchy = assemble(np.ascontiguousarray(unknown), scaled, box, added_diagonal)
         g, corner = hierarchy.fine
-        multigrid_assembly.store(g, corner + 1, hierarchy.inverse, *hierarchy.cells, inverse)
+        multigrid_assembly.store(g, corner + 1, hierarchy.work[2], hierarchy.cells, inverse)
     return [Level(inverse, x, rhs, hierarchy)]
 
 
@@ -156,9 +163,9 @@ def v_cycle(levels: Sequence[Level]) -> None:
         return
     g, corner = hierarchy.fine
     with _threads(int(g[CELLS])):
-        multigrid_assembly.load(g, corner + 1, level.rhs, 1.0, *hierarchy.cells, hierarchy.rhs)
+        multigrid_assembly.load(g, corner + 1, level.rhs, 1.0, hierarchy.cells, hierarchy.work[1])
         multigrid_cycle.cycle(hierarchy, np.zeros(g[PLANES]))
-        multigrid_assembly.store(g, corner + 1, hierarchy.x, *hierarchy.cells, level.x)
+        multigrid_assembly.store(g, corner + 1, hierarchy.work[0], hierarchy.cells, level.x)
 
 
 def _packed(hierarchy: Hierarchy, terms: LowRank, spacing: float) -> tuple[np.ndarray, ...]:
@@ -170,7 +177,7 @@ def _packed(hierarchy: Hierarchy, terms: LowRank, spacing: float) -> tuple[np.nd
     inside = ((terms.cells >= corner) & (terms.cells < corner + shape)).all(axis=1)
     m = j * length + k
     places = np.where(inside, (2 * i + (m & 1)) * half + (m >> 1), 0)
-    values = np.where((hierarchy.inverse[places] > 0)[:, None], terms.values, 0.0)
+    values = np.where((hierarchy.work[2][places] > 0)[:, None], terms.values, 0.0)
     return places, values, terms.starts, terms.inverse_mass * spacing**2
 
 
@@ -227,20 +234,20 @@ def solve(
     """
     out = np.zeros(unknown.shape, rhs.dtype)
     unknown = np.ascontiguousarray(unknown)
-    box = multigrid_assembly.bounds(unknown)
-    if not box.any():
+    box = bounding_box(unknown)
+    if box is None:
         return Solution(out, 0, 0.0, 0, 0.0)
     single = (_single(weights[0]), _single(weights[1]), _single(weights[2]))
-    with _threads(int(box[:, 4].sum())):
-        h = assemble(unknown, single, box, None)
-        closed = components.closed_components(unknown, single, h.beside_known)
+    with _threads(int(np.prod(box[1] - box[0]))):
+        h = assemble(unknown, single, box)
+        closed = components.closed_components(unknown, single, h.beside_known, box)
         count = len(closed.sizes)
         means = _Means(h, closed, low_rank, unknown.shape)
         b, p = np.zeros(h.size), np.zeros(h.size)
-        squares = multigrid_assembly.load(*h.fine, np.ascontiguousarray(rhs), float(spacing) ** 2, *h.cells, b)
+        squares = multigrid_assembly.load(*h.fine, np.ascontiguousarray(rhs), float(spacing) ** 2, h.cells, b)
         if initial is not None:
             guess = np.ascontiguousarray(initial)
-            squares += 0.0 * multigrid_assembly.load(*h.fine, guess, 1.0, *h.cells, p)  # not finite if the guess is not
+            squares += 0.0 * multigrid_assembly.load(*h.fine, guess, 1.0, h.cells, p)  # not finite if the guess is not
         if not np.isfinite(squares):
             return Solution(out, 0, float("nan"), count, 0.0)
         removed = means.remove(b)
@@ -250,5 +257,5 @@ def solve(
         terms = _packed(h, low_rank, spacing)
         iterations, residual = multigrid_cycle.conjugate_gradients(h, p, b, tolerance * size, max_iterations, terms)
         means.remove(p)
-        multigrid_assembly.store(*h.fine, p, *h.cells, out)
+        multigrid_assembly.store(*h.fine, p, h.cells, out)
     return Solution(out, iterations, residual / size, count, removed / size)

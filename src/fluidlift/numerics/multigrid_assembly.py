@@ -39,17 +39,16 @@ but the coarse cell around it reaches further"""
 
 @njit(parallel=True, cache=True)
 def bounds(unknown):
-    """int64 [nx,5]: first j, last j + 1, first k, last k + 1, and number of the unknown cells of each plane."""
+    """int64 [nx,4]: first j, last j + 1, first k, last k + 1 of the unknown cells of each plane; 0 where none is."""
     nx, ny, nz = unknown.shape
-    out = np.zeros((nx, 5), np.int64)
+    out = np.zeros((nx, 4), np.int64)
     for i in prange(nx):
-        j0, j1, k0, k1, total = ny, 0, nz, 0, 0
+        j0, j1, k0, k1 = ny, 0, nz, 0
         for j in range(ny):
             count = 0
             for k in range(nz):
                 count += unknown[i, j, k]
             if count > 0:
-                total += count
                 j0, j1 = min(j0, j), j + 1
                 k = 0
                 while not unknown[i, j, k]:
@@ -59,8 +58,8 @@ def bounds(unknown):
                 while not unknown[i, j, k - 1]:
                     k -= 1
                 k1 = max(k1, k)
-        if total > 0:
-            out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4] = j0, j1, k0, k1, total
+        if j1 > 0:
+            out[i, 0], out[i, 1], out[i, 2], out[i, 3] = j0, j1, k0, k1
     return out
 
 
@@ -81,12 +80,15 @@ def geometry_of(shape: tuple[int, ...]) -> np.ndarray:
 
 
 @njit(parallel=True, cache=True)
-def assemble_finest(g, corner, unknown, wx, wy, wz, added, air, cx, cy, cz, first, last, beside_known):
+def assemble_finest(g, corner, unknown, weights, added, operator, ranges, beside_known):
     """Couplings between unknown cells, weights towards known cells, the rows' ranges, and whether air is not 0.
 
     corner: indices of the first cell of the level in the arrays of the whole grid. added: of size 0 for none.
     """
     nx, ny, nz = unknown.shape
+    wx, wy, wz = weights
+    air, cx, cy, cz = operator
+    first, last = ranges
     for i_ in prange(1, g[PLANES] - 1):
         i = np.int64(i_)
         x = corner[0] + i - 1
@@ -126,8 +128,9 @@ def assemble_finest(g, corner, unknown, wx, wy, wz, added, air, cx, cy, cz, firs
 
 
 @njit(cache=True)
-def _range_of_coarse_row(fine, i, j, first, last):
+def _range_of_coarse_row(fine, i, j, ranges):
     """The range of cells of a coarse row that hold the ranges of its four fine rows; (1, 1) where these are empty."""
+    first, last = ranges
     low, high = fine[LENGTH], np.int64(0)
     for a in range(2 * i - 1, min(2 * i + 1, fine[PLANES] - 1)):
         for b in range(2 * j - 1, min(2 * j + 1, fine[ROWS] - 1)):
@@ -138,14 +141,16 @@ def _range_of_coarse_row(fine, i, j, first, last):
 
 
 @njit(parallel=True, cache=True)
-def assemble_coarse(fine, coarse, inverse, air, cx, cy, cz, first, last):
+def assemble_coarse(fine, coarse, inverse, operator, ranges):
     """Sums over the fine cells of each coarse cell: of the couplings across its low sides, and of air."""
     half = np.float32(0.5)
+    air, cx, cy, cz = operator
+    first, last = ranges
     for i_ in prange(1, coarse[PLANES] - 1):
         i = np.int64(i_)
         for j in range(1, coarse[ROWS] - 1):
             row = coarse[ROW_BASE] + i * coarse[ROWS] + j
-            low, high = _range_of_coarse_row(fine, i, j, first, last)
+            low, high = _range_of_coarse_row(fine, i, j, ranges)
             first[row], last[row] = low, high
             for k in range(low, high):
                 tx = ty = tz = np.float32(0.0)
@@ -170,45 +175,57 @@ def assemble_coarse(fine, coarse, inverse, air, cx, cy, cz, first, last):
                 cx[o], cy[o], cz[o], air[o] = half * tx, half * ty, half * tz, AIR_SHARE * tair
 
 
+@njit(cache=True)
+def _span(g, i, ranges):
+    """First t and last + 1 of plane i, in whole blocks, in rows with unknown cells; 0, 0 where there are none."""
+    first, last = ranges
+    begin, end = np.int64(0), np.int64(0)
+    for j in range(1, g[ROWS] - 1):
+        row = g[ROW_BASE] + i * g[ROWS] + j
+        if last[row] > first[row]:
+            if end == 0:
+                begin = j * g[LENGTH] // (2 * BLOCK) * BLOCK
+            end = ((j + 1) * g[LENGTH] // (2 * BLOCK) + 1) * BLOCK
+    return begin, min(end, g[HALF])
+
+
 @njit(parallel=True, cache=True, error_model="numpy")
-def invert_diagonal(g, air, cx, cy, cz, inverse, common):
-    """inverse = 1 / diagonal; common [3]: the largest couplings along x, y, z. Returns the number of unknown cells."""
-    count = np.zeros(g[PLANES], np.int64)
+def invert_diagonal(g, operator, ranges, inverse, common):
+    """inverse = 1 / diagonal; common [3]: the largest couplings along x, y, z."""
+    air, cx, cy, cz = operator
     largest = np.zeros((g[PLANES], 3), np.float32)
     for i_ in prange(1, g[PLANES] - 1):
         i = np.int64(i_)
+        a, end = _span(g, i, ranges)
         for s in range(2):
             own, _low, high, _left, right = neighbour_starts(g, i, s)
-            a = g[LENGTH] // (2 * BLOCK) * BLOCK
             o, f, u, r = U(own + a), U(own + 2 * g[HALF] + a), U(high + a), U(right + a)
-            some = 0
             mx = my = mz = np.float32(0.0)
-            for t in range(U(g[HALF] - a)):
+            for t in range(U(end - a)):
                 total = np.float32(air[o + t]) + cx[o + t] + cx[f + t] + cz[o + t] + cz[u + t] + cy[o + t] + cy[r + t]
                 inverse[o + t] = np.float32(1.0) / total if total > 0 else np.float32(0.0)
-                some += total > 0
                 mx, my, mz = max(mx, cx[o + t]), max(my, cy[o + t]), max(mz, cz[o + t])
-            count[i] += some
             largest[i, 0] = max(largest[i, 0], mx)
             largest[i, 1] = max(largest[i, 1], my)
             largest[i, 2] = max(largest[i, 2], mz)
     for axis in range(3):
         common[axis] = largest[:, axis].max()
-    return count.sum()
 
 
 @njit(parallel=True, cache=True)
-def classify(g, common, inverse, cx, cy, cz, same, blocks):
+def classify(g, common, inverse, operator, ranges, same, blocks):
     """What each block of t holds: nothing, `SAME` or `MIXED` couplings; whether all blocks of a row are `SAME`.
 
     Only pairs of unknown cells count: a closed face between two makes their blocks `MIXED`.
     """
+    _, cx, cy, cz = operator
     wx, wy, wz = common[0], common[1], common[2]
     for i_ in prange(1, g[PLANES] - 1):
         i = np.int64(i_)
+        begin, end = _span(g, i, ranges)
         for s in range(2):
             own, low, high, left, right = neighbour_starts(g, i, s)
-            for a in range(g[LENGTH] // (2 * BLOCK) * BLOCK, g[HALF], BLOCK):
+            for a in range(begin, end, BLOCK):
                 o, b, f = U(own + a), U(own - 2 * g[HALF] + a), U(own + 2 * g[HALF] + a)
                 d, u, l, r = U(low + a), U(high + a), U(left + a), U(right + a)
                 cells = mixed = 0
@@ -233,8 +250,12 @@ def classify(g, common, inverse, cx, cy, cz, same, blocks):
 
 @njit(cache=True)
 def find_segments(g, blocks, offset, start, stop, same):
-    """Runs of blocks, offset per plane, start and stop in t. Gaps of one block and short runs of `SAME` are closed."""
-    used = offset[g[SEGMENT_BASE] - 1] if g[SEGMENT_BASE] > 0 else np.int32(0)
+    """Runs of blocks, offset per plane, start and stop in t. Gaps of one block and short runs of `SAME` are closed.
+
+    Returns how many cells lie in them.
+    """
+    begun = offset[g[SEGMENT_BASE] - 1] if g[SEGMENT_BASE] > 0 else np.int32(0)
+    used = begun
     for i in range(g[PLANES]):
         offset[g[SEGMENT_BASE] + i] = used
         n = 0
@@ -255,11 +276,13 @@ def find_segments(g, blocks, offset, start, stop, same):
                 start[used], stop[used], same[used] = begin * BLOCK, (last + 1) * BLOCK, kind == SAME
                 used += 1
     offset[g[SEGMENT_BASE] + g[PLANES]] = used
+    return 2 * (stop[begun:used] - start[begun:used]).sum()
 
 
 @njit(parallel=True, cache=True)
-def load(g, corner, values, factor, inverse, first, last, out):
+def load(g, corner, values, factor, cells, out):
     """out = factor * values at the unknown cells. Returns the sum of squares; not finite where some value is not."""
+    inverse, first, last = cells
     sums = np.zeros(g[PLANES])
     for i_ in prange(1, g[PLANES] - 1):
         i = np.int64(i_)
@@ -275,8 +298,9 @@ def load(g, corner, values, factor, inverse, first, last, out):
 
 
 @njit(parallel=True, cache=True)
-def store(g, corner, values, inverse, first, last, out):
+def store(g, corner, values, cells, out):
     """out at the unknown cells = values."""
+    inverse, first, last = cells
     for i_ in prange(1, g[PLANES] - 1):
         i = np.int64(i_)
         for j in range(1, g[ROWS] - 1):

@@ -47,9 +47,8 @@ class Hierarchy:
     """float32 [levels,3]"""
     corner: np.ndarray
     """indices of the first cell of the finest level in the arrays of the whole grid"""
-    x: np.ndarray
-    rhs: np.ndarray
-    inverse: np.ndarray
+    work: tuple[np.ndarray, np.ndarray, np.ndarray]
+    """x, rhs, inverse"""
     operator: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     """air, cx, cy, cz"""
     rows: tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -70,7 +69,7 @@ class Hierarchy:
     @property
     def cells(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """What tells the unknown cells: inverse, and the first and last of each row."""
-        return self.inverse, self.rows[0], self.rows[1]
+        return self.work[2], self.rows[0], self.rows[1]
 
 
 @njit(cache=True)
@@ -82,75 +81,76 @@ def _part(c, border, g):
 
 
 @njit(parallel=True, cache=True)
-def _down(border, fine, coarse, common, x, rhs, inverse, operator, rows, segments):
+def _down(border, levels, work, operator, rows, segments):
+    fine, coarse, _ = levels
     for c_ in prange(fine[PARTS] - border):
-        a, b, da, db = _part(np.int64(c_), border, fine)
-        # coarse planes whose fine planes and their neighbours are done
-        c0 = (b - 3) // 2 if border else ((a + 6) // 2 if da else 1)
-        c1 = (b + 6) // 2 if border else ((b - 3) // 2 if db else coarse[PLANES] - 1)
-        wave_down(a, b, da, db, c0, c1, fine, coarse, common, x, rhs, inverse, *operator, rows, segments)
+        reach = _part(np.int64(c_), border, fine)
+        a, b, da, db = reach
+        # coarse planes whose fine planes and the neighbours of these are done
+        first = (b - 3) // 2 if border else ((a + 6) // 2 if da else 1)
+        last = (b + 6) // 2 if border else ((b - 3) // 2 if db else coarse[PLANES] - 1)
+        wave_down(reach, (first, last), levels, work, operator, rows, segments)
 
 
 @njit(parallel=True, cache=True)
-def _up(border, fine, coarse, common, x, rhs, inverse, operator, rows, segments, sums):
+def _up(border, levels, work, operator, rows, segments, sums):
+    fine, _, _ = levels
     for c_ in prange(fine[PARTS] - border):
-        a, b, da, db = _part(np.int64(c_), border, fine)
-        wave_up(a, b, da, db, fine, coarse, common, x, rhs, inverse, *operator[1:], rows, segments, sums)
+        wave_up(_part(np.int64(c_), border, fine), levels, work, operator, rows, segments, sums)
 
 
 @njit(parallel=True, cache=True)
-def _turn(border, g, direction, z, factor, q, operator, segments, sums):
+def _turn(border, g, vectors, factor, operator, segments, sums):
     for c_ in prange(g[PARTS] - border):
-        a, b, da, db = _part(np.int64(c_), border, g)
-        wave_turn(a, b, da, db, g, direction, z, factor, q, *operator, segments, sums)
+        wave_turn(_part(np.int64(c_), border, g), g, vectors, factor, operator, segments, sums)
 
 
 @njit(parallel=True, cache=True)
-def _residual(g, p, b, q, r, operator, segments, sums):
-    """q = A p; r = b - q."""
+def _residual(g, vectors, operator, segments, sums):
+    """q = A p, r = b - q, where vectors = (p, b, q, r)."""
+    p, b, q, r = vectors
     for c_ in prange(g[PARTS]):
         first, last, _, _ = _part(np.int64(c_), 0, g)
         for i in range(first, last):
-            apply_plane(i, g, p, q, *operator, *segments)
-            sums[i] = residual_plane(i, g, b, q, r, *segments)
+            apply_plane(i, g, p, q, operator, segments)
+            sums[i] = residual_plane(i, g, b, q, r, segments)
 
 
 @njit(parallel=True, cache=True)
-def _descend(g, p, r, direction, q, step, scale, rhs, segments, sums):
+def _descend(g, vectors, step, scale, segments, sums):
     for c_ in prange(g[PARTS]):
         first, last, _, _ = _part(np.int64(c_), 0, g)
         for i in range(first, last):
-            sums[i] = descend_plane(i, g, p, r, direction, q, step, scale, rhs, *segments)
+            sums[i] = descend_plane(i, g, vectors, step, scale, segments)
 
 
 @njit(cache=True)
-def _sweep_coarsest(g, common, x, rhs, inverse, cx, cy, cz, segments, sums):
+def _sweep_coarsest(g, common, work, operator, segments, sums):
     """Many sweeps, forth and back."""
     half_sweeps = 4 * COARSEST_SWEEPS
     for k in range(half_sweeps):
         color = (RED + k) & 1 if k < half_sweeps // 2 else (BLACK + k) & 1
         for i in range(1, g[PLANES] - 1):
             if k == 0:
-                divide_plane(i, color, g, x, rhs, inverse, *segments)
+                divide_plane(i, color, g, work, segments)
             else:
-                relax_plane(i, color, g, common, x, rhs, inverse, cx, cy, cz, *segments)
+                relax_plane(i, color, g, common, work, operator, segments)
     for i in range(1, g[PLANES] - 1):
-        sums[i] = dot_plane(i, g, x, rhs, *segments)
+        sums[i] = dot_plane(i, g, work, segments)
 
 
 @njit(cache=True)
-def _cycle_alone(geometry, common, x, rhs, inverse, operator, rows, segments, sums):
+def _cycle_alone(geometry, common, work, operator, rows, segments, sums):
     """A V-cycle by one thread. sums gets x . rhs of each plane of its finest level."""
-    levels = len(geometry)
-    for l in range(levels - 1):
-        fine, coarse = geometry[l], geometry[l + 1]
-        wave_down(1, fine[PLANES] - 1, 0, 0, 1, coarse[PLANES] - 1, fine, coarse, common[l],
-                  x, rhs, inverse, *operator, rows, segments)  # fmt: skip
-    _sweep_coarsest(geometry[levels - 1], common[levels - 1], x, rhs, inverse, *operator[1:], segments, sums)
-    for l in range(levels - 2, -1, -1):
-        fine, coarse = geometry[l], geometry[l + 1]
-        wave_up(1, fine[PLANES] - 1, 0, 0, fine, coarse, common[l],
-                x, rhs, inverse, *operator[1:], rows, segments, sums)  # fmt: skip
+    coarsest = len(geometry) - 1
+    for l in range(coarsest):
+        levels = (geometry[l], geometry[l + 1], common[l])
+        whole = (1, geometry[l, PLANES] - 1, 0, 0)
+        wave_down(whole, (1, geometry[l + 1, PLANES] - 1), levels, work, operator, rows, segments)
+    _sweep_coarsest(geometry[coarsest], common[coarsest], work, operator, segments, sums)
+    for l in range(coarsest - 1, -1, -1):
+        levels = (geometry[l], geometry[l + 1], common[l])
+        wave_up((1, geometry[l, PLANES] - 1, 0, 0), levels, work, operator, rows, segments, sums)
 
 
 def cycle(h: Hierarchy, sums: np.ndarray) -> float:
@@ -159,14 +159,15 @@ def cycle(h: Hierarchy, sums: np.ndarray) -> float:
     Two sweeps before each coarse correction (red, black, red, black), two after it in the opposite order.
     """
     shared = int(np.argmax(np.append(h.geometry[:, PARTS], 1) == 1))  # levels that threads share
-    work = (h.x, h.rhs, h.inverse, h.operator, h.rows, h.segments)
-    for l in range(shared):
+    pairs = [(h.geometry[l], h.geometry[l + 1], h.common[l]) for l in range(shared)]
+    arrays = (h.work, h.operator, h.rows, h.segments)
+    for pair in pairs:
         for border in (0, 1):
-            _down(border, h.geometry[l], h.geometry[l + 1], h.common[l], *work)
-    _cycle_alone(h.geometry[shared:], h.common[shared:], *work, sums)
-    for l in range(shared - 1, -1, -1):
+            _down(border, pair, *arrays)
+    _cycle_alone(h.geometry[shared:], h.common[shared:], *arrays, sums)
+    for pair in pairs[::-1]:
         for border in (0, 1):
-            _up(border, h.geometry[l], h.geometry[l + 1], h.common[l], *work, sums)
+            _up(border, pair, *arrays, sums)
     return float(sums.sum())
 
 
@@ -211,10 +212,12 @@ def conjugate_gradients(
     sums = np.zeros(g[PLANES])
     q, r, direction = np.zeros_like(b), np.zeros_like(b), np.zeros(len(b), np.float32)
 
+    x, rhs, _ = h.work
+    turned, moved = (direction, x, q), (p, r, direction, q, rhs)
     with_terms = len(low_rank[0]) > 0
 
     def true_residual() -> float:
-        _residual(g, p, b, q, r, h.operator, h.segments, sums)
+        _residual(g, (p, b, q, r), h.operator, h.segments, sums)
         if not with_terms:
             return float(sums.sum())
         add_low_rank(p, q, *low_rank)
@@ -228,19 +231,19 @@ def conjugate_gradients(
         before, rz, fresh = squared, 1.0, True
         # near one: single precision neither over- nor underflows
         scale = 1.0 / np.sqrt(squared)
-        _descend(g, p, r, direction, q, 0.0, scale, h.rhs, h.segments, sums)
+        _descend(g, moved, 0.0, scale, h.segments, sums)
         while iterations < max_iterations and squared > goal**2:
             previous, rz = rz, cycle(h, sums)
             if not rz > 0:
                 break
             factor = np.float32(0.0 if fresh else rz / previous)
             for border in range(min(g[PARTS], 2)):
-                _turn(border, g, direction, h.x, factor, q, h.operator, h.segments, sums)
+                _turn(border, g, turned, factor, h.operator, h.segments, sums)
             curvature = float(sums.sum()) + (add_low_rank(direction, q, *low_rank) if with_terms else 0.0)
             if not curvature > 0:
                 break
             # rz and the direction belong to the scaled residual
-            _descend(g, p, r, direction, q, rz / (scale * curvature), scale, h.rhs, h.segments, sums)
+            _descend(g, moved, rz / (scale * curvature), scale, h.segments, sums)
             squared, fresh = float(sums.sum()), False
             iterations += 1
         squared = true_residual()

@@ -14,9 +14,10 @@ couplings to them.
 Each sum over cells is kept per plane and the planes are added in order: the result is the same for any number of
 threads. Indices are unsigned, since signed ones cost a test each against counting from the end.
 
-Arrays: x, rhs, inverse (1 / diagonal, 0 outside the unknown cells) and cx, cy, cz (coupling with the neighbour on the
-low side) in float32, air (what the diagonal holds beyond the couplings) in float64: sums of weights, which residuals see
-in full. All are one-dimensional with the levels in a row.
+Arrays are one-dimensional, with the levels in a row, and come in tuples:
+work = (x, rhs, inverse), float32; inverse is 1 / diagonal, 0 outside the unknown cells.
+operator = (air, cx, cy, cz): couplings with the neighbour on the low side along x, y, z, float32; and what the diagonal
+holds beyond them, float64: it sums weights, and residuals must see these in full.
 rows = (first, last, same): the cells of each row from first to last - 1. segments = (offset, start, stop, same). `same`
 marks where all couplings between unknown cells have the values `common` (along x, y, z), which is nearly everywhere:
 neighbours that are not unknown hold x = 0, so there the couplings need not be read.
@@ -31,7 +32,7 @@ FAST = {"contract", "nsz", "reassoc"}
 """sums may be reordered for vector registers; not-a-number stays what it is"""
 PLANES, ROWS, LENGTH, HALF, BASE, ROW_BASE, SEGMENT_BASE, CELLS, PARTS = range(9)
 """columns of `geometry`, which has a line g per level: planes, rows and cells per row with ghosts, size of half a
-plane, where the level starts in the arrays of cells, rows and segment offsets, unknown cells, parts for threads"""
+plane, where the level starts in the arrays of cells, rows and segment offsets, cells in segments, parts for threads"""
 RED, BLACK = 0, 1
 
 U = np.uint64
@@ -54,8 +55,10 @@ def neighbour_starts(g, i, s):
 
 
 @njit(cache=True, fastmath=FAST, forceinline=True)
-def divide_plane(i, color, g, x, rhs, inverse, offset, start, stop, same):
+def divide_plane(i, color, g, work, segments):
     """One half sweep from x = 0."""
+    x, rhs, inverse = work
+    offset, start, stop, _ = segments
     own = g[BASE] + (2 * i + ((i + color) & 1)) * g[HALF]
     for n in range(offset[g[SEGMENT_BASE] + i], offset[g[SEGMENT_BASE] + i + 1]):
         o = U(own + start[n])
@@ -64,8 +67,11 @@ def divide_plane(i, color, g, x, rhs, inverse, offset, start, stop, same):
 
 
 @njit(cache=True, fastmath=FAST, forceinline=True)
-def relax_plane(i, color, g, common, x, rhs, inverse, cx, cy, cz, offset, start, stop, same):
+def relax_plane(i, color, g, common, work, operator, segments):
     """One half sweep of Gauss-Seidel over the cells of one colour."""
+    x, rhs, inverse = work
+    _, cx, cy, cz = operator
+    offset, start, stop, same = segments
     wx, wy, wz = common[0], common[1], common[2]
     own, low, high, left, right = neighbour_starts(g, i, (i + color) & 1)
     for n in range(offset[g[SEGMENT_BASE] + i], offset[g[SEGMENT_BASE] + i + 1]):
@@ -91,8 +97,12 @@ def relax_plane(i, color, g, common, x, rhs, inverse, cx, cy, cz, offset, start,
 
 
 @njit(cache=True, fastmath=FAST, forceinline=True, error_model="numpy")
-def restrict_plane(i, fine, coarse, common, x, rhs, inverse, air, cx, cy, cz, first, last, same):
+def restrict_plane(i, levels, work, operator, rows):
     """rhs of coarse plane i: the sum of the fine residuals in each cell. Black cells, relaxed last, have none."""
+    fine, coarse, common = levels
+    x, rhs, inverse = work
+    air, cx, cy, cz = operator
+    first, last, same = rows
     wx, wy, wz = common[0], common[1], common[2]
     total = np.zeros(coarse[ROWS] * coarse[LENGTH], np.float32)
     for fi in range(2 * i - 1, min(2 * i + 1, fine[PLANES] - 1)):
@@ -140,8 +150,11 @@ def restrict_plane(i, fine, coarse, common, x, rhs, inverse, air, cx, cy, cz, fi
 
 
 @njit(cache=True, fastmath=FAST, forceinline=True)
-def prolong_plane(i, fine, coarse, x, inverse, first, last, same):
+def prolong_plane(i, levels, work, rows):
     """x += the coarse correction, constant over each coarse cell; red cells only: the black ones follow from them."""
+    fine, coarse, _ = levels
+    x, _, inverse = work
+    first, last, _ = rows
     value = np.empty(coarse[LENGTH], np.float32)
     ci, half = (i + 1) // 2, (i + RED) & 1
     for j in range(1, coarse[ROWS] - 1):
@@ -161,8 +174,10 @@ def prolong_plane(i, fine, coarse, x, inverse, first, last, same):
 
 
 @njit(cache=True, fastmath=FAST, forceinline=True)
-def dot_plane(i, g, x, rhs, offset, start, stop, same):
+def dot_plane(i, g, work, segments):
     """x . rhs."""
+    x, rhs, _ = work
+    offset, start, stop, _ = segments
     total = 0.0
     for s in range(2):
         own = g[BASE] + (2 * i + s) * g[HALF]
@@ -174,8 +189,9 @@ def dot_plane(i, g, x, rhs, offset, start, stop, same):
 
 
 @njit(cache=True, fastmath=FAST, forceinline=True)
-def turn_plane(i, g, direction, z, factor, offset, start, stop, same):
+def turn_plane(i, g, direction, z, factor, segments):
     """direction = z + factor direction."""
+    offset, start, stop, _ = segments
     for s in range(2):
         own = g[BASE] + (2 * i + s) * g[HALF]
         for n in range(offset[g[SEGMENT_BASE] + i], offset[g[SEGMENT_BASE] + i + 1]):
@@ -185,8 +201,10 @@ def turn_plane(i, g, direction, z, factor, offset, start, stop, same):
 
 
 @njit(cache=True, fastmath=FAST, forceinline=True)
-def apply_plane(i, g, p, out, air, cx, cy, cz, offset, start, stop, same):
+def apply_plane(i, g, p, out, operator, segments):
     """out = A p in double precision, by differences: a constant leaves no rounding. Returns p . out."""
+    air, cx, cy, cz = operator
+    offset, start, stop, _ = segments
     dot = 0.0
     for s in range(2):
         own, low, high, left, right = neighbour_starts(g, i, s)
@@ -211,8 +229,9 @@ def apply_plane(i, g, p, out, air, cx, cy, cz, offset, start, stop, same):
 
 
 @njit(cache=True, fastmath=FAST, forceinline=True)
-def residual_plane(i, g, b, q, r, offset, start, stop, same):
+def residual_plane(i, g, b, q, r, segments):
     """r = b - q. Returns r . r."""
+    offset, start, stop, _ = segments
     dot = 0.0
     for s in range(2):
         own = g[BASE] + (2 * i + s) * g[HALF]
@@ -226,8 +245,10 @@ def residual_plane(i, g, b, q, r, offset, start, stop, same):
 
 
 @njit(cache=True, fastmath=FAST, forceinline=True)
-def descend_plane(i, g, p, r, direction, q, step, scale, rhs, offset, start, stop, same):
-    """p += step direction, r -= step q, rhs = scale r. Returns r . r."""
+def descend_plane(i, g, vectors, step, scale, segments):
+    """p += step direction, r -= step q, rhs = scale r. Returns r . r. vectors = (p, r, direction, q, rhs)."""
+    p, r, direction, q, rhs = vectors
+    offset, start, stop, _ = segments
     dot = 0.0
     for s in range(2):
         own = g[BASE] + (2 * i + s) * g[HALF]
@@ -243,49 +264,58 @@ def descend_plane(i, g, p, r, direction, q, step, scale, rhs, offset, start, sto
 
 
 @njit(cache=True)
-def wave_down(a, b, da, db, c0, c1, fine, coarse, common, x, rhs, inverse, air, cx, cy, cz, rows, segments):
-    """Four half sweeps from x = 0, then the residual on the coarse planes c0 to c1 - 1.
+def wave_down(reach, coarse_planes, levels, work, operator, rows, segments):
+    """Four half sweeps from x = 0, then the residual on the coarse planes from the first to the last - 1.
 
-    Half sweep k visits the planes a + k da to b + k db - 1, one plane behind half sweep k - 1: the wave keeps a plane
-    in cache until all is done with it.
+    reach = (a, b, da, db): half sweep k visits the planes a + k da to b + k db - 1, one plane behind half sweep k - 1.
+    The wave keeps a plane in cache until all is done with it.
     """
-    c = c0
+    a, b, da, db = reach
+    c, last = coarse_planes
+    fine, _, common = levels
     for front in range(min(a, a + 3 * da), max(b, b + 3 * db) + 3):
         for k in range(4):
             i = front - k
             if a + k * da <= i < b + k * db:
                 if k == 0:
-                    divide_plane(i, RED, fine, x, rhs, inverse, *segments)
+                    divide_plane(i, RED, fine, work, segments)
                 else:
-                    relax_plane(i, k & 1, fine, common, x, rhs, inverse, cx, cy, cz, *segments)
-        while c < c1 and 2 * c + 1 <= front - 3:
-            restrict_plane(c, fine, coarse, common, x, rhs, inverse, air, cx, cy, cz, *rows)
+                    relax_plane(i, k & 1, fine, common, work, operator, segments)
+        while c < last and 2 * c + 1 <= front - 3:
+            restrict_plane(c, levels, work, operator, rows)
             c += 1
-    while c < c1:
-        restrict_plane(c, fine, coarse, common, x, rhs, inverse, air, cx, cy, cz, *rows)
+    while c < last:
+        restrict_plane(c, levels, work, operator, rows)
         c += 1
 
 
 @njit(cache=True)
-def wave_up(a, b, da, db, fine, coarse, common, x, rhs, inverse, cx, cy, cz, rows, segments, sums):
+def wave_up(reach, levels, work, operator, rows, segments, sums):
     """The coarse correction and four half sweeps, in a wave as `wave_down`; sums gets x . rhs of each plane."""
+    a, b, da, db = reach
+    fine, _, common = levels
     for front in range(min(a, a + 4 * da), max(b, b + 4 * db) + 4):
         for k in range(5):
             i = front - k
             if a + k * da <= i < b + k * db:
                 if k == 0:
-                    prolong_plane(i, fine, coarse, x, inverse, *rows)
+                    prolong_plane(i, levels, work, rows)
                 else:
-                    relax_plane(i, k & 1, fine, common, x, rhs, inverse, cx, cy, cz, *segments)
+                    relax_plane(i, k & 1, fine, common, work, operator, segments)
                 if k == 4:
-                    sums[i] = dot_plane(i, fine, x, rhs, *segments)
+                    sums[i] = dot_plane(i, fine, work, segments)
 
 
 @njit(cache=True)
-def wave_turn(a, b, da, db, g, direction, z, factor, q, air, cx, cy, cz, segments, sums):
-    """direction = z + factor direction and q = A direction, in a wave; sums gets direction . q of each plane."""
+def wave_turn(reach, g, vectors, factor, operator, segments, sums):
+    """direction = z + factor direction and q = A direction, in a wave; sums gets direction . q of each plane.
+
+    vectors = (direction, z, q).
+    """
+    a, b, da, db = reach
+    direction, z, q = vectors
     for front in range(min(a, a + da), max(b, b + db) + 1):
         if a <= front < b:
-            turn_plane(front, g, direction, z, factor, *segments)
+            turn_plane(front, g, direction, z, factor, segments)
         if a + da <= front - 1 < b + db:
-            sums[front - 1] = apply_plane(front - 1, g, direction, q, air, cx, cy, cz, *segments)
+            sums[front - 1] = apply_plane(front - 1, g, direction, q, operator, segments)

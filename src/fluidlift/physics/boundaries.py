@@ -308,6 +308,11 @@ def _collide(new, old, velocities, incoming, dt, field, regions, low, high, h, o
                 if flight > highest and incoming[p, a] > 0.0:
                     velocities[p, a] = min(velocities[p, a], -restitution * incoming[p, a])
                 new[p, a] = min(new[p, a], highest)
+        gone = False
+        for a in range(3):
+            gone |= new[p, a] < low[a] or new[p, a] >= high[a]
+        if gone:  # out of the box, where no terrain is known: pushed back it would pile up at the outlet
+            continue
         x, y, z = np.float64(new[p, 0]), np.float64(new[p, 1]), np.float64(new[p, 2])
         if _far_from_walls(field, low, inverse, x, y, z, h):
             continue

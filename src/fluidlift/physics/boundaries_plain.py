@@ -91,8 +91,9 @@ def collide_plain(
     kept = 1.0 - (1.0 - tangential_share) * share
     at_wall = (distance < grid.spacing) & (length > 1e-3)
     changed = kept[:, None] * (v - outward[:, None] * normal) + back[:, None] * normal
-    v = np.where(at_wall[:, None], changed, v)
-    return _pushed_out(x, old, walls, clearance), v
+    gone = ~grid.contains(x)  # no terrain is known out of the box
+    v = np.where((at_wall & ~gone)[:, None], changed, v)
+    return np.where(gone[:, None], x.astype(np.float32), _pushed_out(x, old, walls, clearance)), v
 
 
 def _kept_in_the_box(

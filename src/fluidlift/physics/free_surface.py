@@ -30,7 +30,9 @@ Faces = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 BAND = 1.5
 """cells: distances are cut there; farther away the noise of the fill outweighs them"""
-ROUNDS = 2
+LAYERS = 3
+"""of cells into the solid that virtual liquid may fill"""
+ROUNDS = 3
 """how often the virtual liquid in solids is improved; what is left are some hundredths of a cell"""
 SMOOTHINGS = 2
 """binomial filters before the curvature is taken: its noise on a flat surface becomes 0.01 / h"""
@@ -55,11 +57,13 @@ class SolidShares:
     open_share: Float[np.ndarray, "nx ny nz"]
     """0 (solid) to 1"""
     layer: UInt8[np.ndarray, "nx ny nz"]
-    """0: open; 1: mostly open; 2: more solid, beside one of 0 or 1; 3: beside one of 2; 4: deep in the solid"""
+    """0: open; 1: mostly open; 2: more solid, beside one of 0 or 1; 3: beside one of 2; ...; `LAYERS` + 1: deep"""
+    clear: Float[np.ndarray, "nx ny nz"]
+    """0 within a cell of a wall, where no curvature is taken back, to 1 at three cells from it"""
 
     def inside(self, box: tuple[slice, slice, slice]) -> SolidShares:
         """Those of a box of cells."""
-        return SolidShares(np.ascontiguousarray(self.open_share[box]), np.ascontiguousarray(self.layer[box]))
+        return SolidShares(*(np.ascontiguousarray(a[box]) for a in (self.open_share, self.layer, self.clear)))
 
 
 @dataclass(frozen=True)
@@ -88,14 +92,16 @@ def solid_shares(signed_distance: Float[np.ndarray, "nx+1 ny+1 nz+1"], grid: Gri
     surface_kernels.open_volumes(nodes, grid.low, grid.spacing, volume)
     # the spline is the cell's box, blurred with the variance 1/6
     surface_kernels.three_point(volume, 1.0 / 12.0, share)
-    open_cells = share > 0.5
-    layer = np.full(grid.shape, 4, np.uint8)
-    beside = ndimage.binary_dilation(open_cells, np.ones((3, 3, 3)))
-    layer[ndimage.binary_dilation(beside, np.ones((3, 3, 3)))] = 3
-    layer[beside] = 2
-    layer[open_cells] = 1
-    layer[share > 0.999] = 0
-    return SolidShares(share, layer)
+    reached = share > 0.5
+    layer = np.where(reached, np.where(share > 0.999, 0, 1), LAYERS + 1).astype(np.uint8)
+    for number in range(2, LAYERS + 1):
+        wider = ndimage.binary_dilation(reached, np.ones((3, 3, 3)))
+        layer[wider & ~reached] = number
+        reached = wider
+    wide = share
+    for _ in range(SMOOTHINGS + 1):
+        wide = _binomial(wide)
+    return SolidShares(share, layer, np.maximum(1.0 - 4.0 * (1.0 - wide), 0.0).astype(np.float32))
 
 
 def liquid_surface(
@@ -137,7 +143,7 @@ def liquid_surface(
         smooth = _binomial(smooth)
     bend = mean_curvature(fill, smooth)
     distance = np.empty_like(fill)
-    surface_kernels.distance(fill, bend, BAND, distance)
+    surface_kernels.distance(fill, bend * solids.clear, BAND, distance)
     h = np.float32(grid.spacing)
     if curved:
         bend = _sharpened(bend, fill, smooth)
@@ -162,9 +168,9 @@ def _fill(share: Float[np.ndarray, "nx ny nz"], solids: SolidShares) -> Float[np
     distance, normal = np.zeros_like(share), np.zeros((*share.shape, 3), np.float32)
     for _ in range(ROUNDS):
         fill = _binomial(share + (1.0 - open_share) * virtual)
-        for want in (1, 2, 3):
+        for want in range(1, LAYERS + 1):
             surface_kernels.continue_into_solid(layer, want, open_share, fill, distance, normal)
-        surface_kernels.fill_solid(layer, open_share, distance, normal, virtual)
+        surface_kernels.fill_solid(layer, LAYERS, open_share, distance, normal, virtual)
     return _binomial(share + (1.0 - open_share) * virtual)
 
 

@@ -124,8 +124,14 @@ class Inlet:
     def inside(self, positions: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
         """Particles in INFLOW cells."""
         grid = self._walls.grid
-        cells = np.clip(grid.cell_of(positions), 0, np.asarray(grid.shape) - 1)
-        return self._cells[tuple(cells.T)]
+        low, high = (grid.low + np.asarray(c) * grid.spacing for c in self.cell_range)
+        out = np.ones(len(positions), bool)
+        for axis in range(3):
+            out &= (positions[:, axis] >= low[axis]) & (positions[:, axis] <= high[axis])
+        near = np.flatnonzero(out)
+        cells = np.clip(grid.cell_of(positions[near]), 0, np.asarray(grid.shape) - 1)
+        out[near] = self._cells[tuple(cells.T)]
+        return out
 
     def travel(self, dt: float) -> None:
         """Move the emission pattern along with the bulk flow, so that new particles continue the old lattice."""
@@ -143,8 +149,9 @@ class Inlet:
         candidates = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
         candidates = candidates[grid.contains(candidates)]
         candidates = candidates[self.inside(candidates)]
-        outside_solid = sample_nodes(self._walls.signed_distance, grid, candidates) > 0.25 * s
-        candidates = candidates[outside_solid]
+        # every lattice point outside the solid: a wider berth would emit less than what flows through the opening
+        clear = CLEARANCE * grid.spacing
+        candidates = candidates[sample_nodes(self._walls.signed_distance, grid, candidates) > clear]
         margin = 2 * grid.spacing
         box_low, box_high = grid.low + self._low * grid.spacing - margin, grid.low + self._high * grid.spacing + margin
         near = positions[((positions > box_low) & (positions < box_high)).all(axis=1)]
@@ -152,5 +159,6 @@ class Inlet:
             distance, _ = cKDTree(near).query(candidates, distance_upper_bound=0.8 * s)
             candidates = candidates[~np.isfinite(distance)]
         jittered = candidates + rng.uniform(-0.1, 0.1, candidates.shape) * s
-        clear = CLEARANCE * grid.spacing
+        inside = sample_nodes(self._walls.signed_distance, grid, jittered) <= clear
+        jittered[inside] = candidates[inside]
         return np.clip(jittered, grid.low + clear, grid.high - clear).astype(np.float32)

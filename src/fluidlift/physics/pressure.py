@@ -14,17 +14,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
 
 from fluidlift.errors import require
-from fluidlift.numerics.poisson import PoissonSystem, solve
+from fluidlift.numerics.poisson import LowRankTerm, PoissonSystem, solve
 from fluidlift.types import CellType, FaceVelocity, Grid, SolveReport, Terrain
-
-if TYPE_CHECKING:
-    from fluidlift.numerics.poisson import LowRankTerm
 
 Faces = tuple[np.ndarray, np.ndarray, np.ndarray]
 """one array per axis: [nx+1,ny,nz], [nx,ny+1,nz], [nx,ny,nz+1]"""
@@ -284,9 +280,9 @@ def project(
         rhs = rhs + system.boundary_term(known)
     if jumps is not None:
         rhs = rhs + jump_term(system, jumps)
-    options: dict[str, Any] = {"low_rank": tuple(low_rank)} if low_rank else {}
     q, report = solve(
-        system, rhs, method=method, tolerance=tolerance, max_iterations=max_iterations, initial=initial, **options
-    )
+        system, rhs, method=method, tolerance=tolerance, max_iterations=max_iterations, initial=initial,
+        low_rank=tuple(low_rank),
+    )  # fmt: skip
     new = subtract_gradient(velocity, system, q, known, jumps=jumps, solid_velocity=solid_velocity)
     return new, q.astype(np.float32), report

@@ -1,7 +1,8 @@
 """Rigid bodies in the liquid: their state, and what a substep of the simulator asks of them.
 
-A substep calls, in this order (see `RigidBodies`): `enter`, `predict`, `face_velocity` and `coupling` before the
-pressure solve, `apply_pressure` and `slide` after it, `advance`, and `push_out` for the particles that have moved.
+A substep calls, in this order (see `RigidBodies`): `enter`, `predict`, `dragged` and `apply_viscosity` around the
+viscous solve, `face_velocity` and `coupling` before the pressure solve, `apply_pressure` and `slide` after it,
+`advance`, and `push_out` for the particles that have moved.
 `state` and `restore` undo a substep that fails.
 """
 
@@ -26,6 +27,7 @@ from fluidlift.physics.rigid_push import push_out
 from fluidlift.physics.rigid_shapes import distances, pack, posed
 from fluidlift.physics.rigid_walls import UnionWalls
 from fluidlift.physics.rotation import product, rotation_by, turned
+from fluidlift.physics.viscous_bodies import DraggedBody
 from fluidlift.physics.window import Window
 from fluidlift.types import FaceVelocity, matrix_from_quat
 
@@ -244,6 +246,25 @@ class RigidBodies:
     def face_velocity(self) -> FaceVelocity:
         """Velocity of the solid on all faces, m/s: mean over the closed share. The arrays change at the next call."""
         return self._solid.update(self.center, self.velocity, self.spin)
+
+    def dragged(self) -> tuple[DraggedBody, ...]:
+        """The free bodies for `viscosity.diffuse_with_bodies`; their faces move as `face_velocity` says."""
+        out, scale = [], self._density * self._static.grid.spacing**3
+        inertia = np.einsum("nij,njk,nlk->nil", self.rotation, self._inertia, self.rotation)
+        for c in self._union.covers:
+            if self.free[c.body] and self.active[c.body]:
+                mass = np.zeros((6, 6))
+                mass[:3, :3], mass[3:, 3:] = np.eye(3) * self.mass[c.body] / scale, inertia[c.body] / scale
+                faces, values = rigid_coupling.moving_faces(c, self._union.walls, self.center[c.body])
+                out.append(DraggedBody(c.body, faces, values, mass))
+        return tuple(out)
+
+    def apply_viscosity(self, dragged: Sequence[DraggedBody], change: Float[np.ndarray, "d 6"]) -> None:
+        """Take over the changes of velocity and angular velocity that viscosity gave the `dragged` bodies."""
+        scale = self._density * self._static.grid.spacing**3
+        for body, six in zip(dragged, change):
+            self.velocity[body.body] += six[:3]
+            self.angular_momentum[body.body] += scale * (body.mass[3:, 3:] * six[3:]).sum(axis=1)
 
     def coupling(self, unknown: Bool[np.ndarray, "nx ny nz"]) -> tuple[LowRankTerm, ...]:
         """How the pressure of the unknown cells moves the free bodies, for `pressure.project`.

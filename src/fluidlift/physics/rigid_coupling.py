@@ -145,6 +145,55 @@ def body_rows(cover: Cover, unknown: np.ndarray, walls: Walls, center: Float[np.
 
 
 @njit(cache=True)
+def _add_moving_faces(axis, first, low, h, share, offset, opening, distance, center, faces, rows):
+    """Rows of the faces that the body covers and that are closed or have their centre inside; their number."""
+    b, c, count = (axis + 1) % 3, (axis + 2) % 3, 0
+    near = 1e-3 * h
+    for i in range(share.shape[0]):
+        for j in range(share.shape[1]):
+            for k in range(share.shape[2]):
+                if share[i, j, k] == 0.0:
+                    continue
+                p, q, r = i + first[0], j + first[1], k + first[2]
+                if opening[p, q, r] > 0.0:
+                    mean = 0.0
+                    for s in range(2):
+                        for t in range(2):
+                            dq = s if axis != 1 else 0
+                            dr = t if axis != 2 else 0
+                            dp = 0 if axis == 0 else (s if axis == 1 else t)
+                            mean += 0.25 * distance[p + dp, q + dq, r + dr]
+                    if mean > near:
+                        continue
+                arm = _arm(axis, p, q, r, low, h, offset[i, j, k], center)
+                part = share[i, j, k] / (1.0 - opening[p, q, r])
+                faces[count, 0], faces[count, 1], faces[count, 2], faces[count, 3] = axis, p, q, r
+                rows[count, axis] = part
+                rows[count, 3 + b] = part * arm[c]
+                rows[count, 3 + c] = -part * arm[b]
+                count += 1
+    return count
+
+
+def moving_faces(
+    cover: Cover, walls: Walls, center: Float[np.ndarray, "3"]
+) -> tuple[Int[np.ndarray, "n 4"], Float[np.ndarray, "n 6"]]:
+    """Faces that count as solid and are covered by a body (component and index), and J: how much of their velocity
+    (`SolidVelocity`) it gives them per velocity and angular velocity. `center` of mass, m.
+    """
+    found = []
+    for axis in range(3):
+        size = cover.share[axis].size
+        faces, rows = np.zeros((size, 4), np.int64), np.zeros((size, 6))
+        count = _add_moving_faces(
+            axis, np.array(cover.low), walls.grid.low, walls.grid.spacing, cover.share[axis], cover.offset[axis],
+            walls.openings[axis], walls.signed_distance, center, faces, rows,
+        )  # fmt: skip
+        found.append((faces[:count], rows[:count]))
+    return np.concatenate([f for f, _ in found]), np.concatenate([r for _, r in found])
+
+
+@njit(cache=True)
 def _slope(rate, openings, axis, i, j, k, h):
     """d rate / dx_axis from the neighbours with liquid behind open faces; the last value: how many there are."""
     a, b, c = 1 if axis == 0 else 0, 1 if axis == 1 else 0, 1 if axis == 2 else 0

@@ -22,7 +22,7 @@ rest by transposes and autograd.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -56,8 +56,9 @@ class RolloutParameters:
 
     @classmethod
     def of(cls, parameters: FluidParameters, dtype: torch.dtype = torch.float32) -> RolloutParameters:
-        """Constants from plain numbers."""
-        return cls(**{k: torch.tensor(v, dtype=dtype) for k, v in parameters.to_dict().items()})
+        """Constants from plain numbers. Surface tension is left out: the rollout has none."""
+        values = parameters.to_dict()
+        return cls(**{f.name: torch.tensor(values[f.name], dtype=dtype) for f in fields(cls)})
 
     def fluid_parameters(self) -> FluidParameters:
         """Plain numbers."""

@@ -322,9 +322,9 @@ class ParticleSimulator(ABC):
         stopped = FaceVelocity(
             *(np.where(o == 0, r, c) for o, r, c in zip(walls.openings, resting.components, velocity.components))
         )
+        roles = FaceRoles(solved, tuple(head_on), tuple(beside), distance, walls.signed_distance, solid)
         new, reports = diffuse(
-            stopped, FaceRoles(solved, tuple(head_on), tuple(beside)), viscosity=self.parameters.kinematic_viscosity,
-            dt=dt, spacing=self.grid.spacing, wall_share=self.parameters.wall_damping,
-            liquid_distance=distance, tolerance=self.settings.viscosity_tolerance,
+            stopped, roles, viscosity=self.parameters.kinematic_viscosity, dt=dt, spacing=self.grid.spacing,
+            wall_share=self.parameters.wall_damping, tolerance=self.settings.viscosity_tolerance,
         )  # fmt: skip
         return (new if reports else velocity), reports

@@ -215,12 +215,34 @@ def _pull_w(x, normal, shear, i, j, k):
     )
 
 
+@njit(cache=True)
+def pull_faces(x, normal, shear, axes, i, j, k, out):
+    """What the stresses take from the momentum of single faces, given by component and index."""
+    for n in range(len(axes)):
+        p, q, r = np.uint64(i[n]), np.uint64(j[n]), np.uint64(k[n])
+        if axes[n] == 0:
+            out[n] = _pull_u(x, normal, shear, p, q, r)
+        elif axes[n] == 1:
+            out[n] = _pull_v(x, normal, shear, p, q, r)
+        else:
+            out[n] = _pull_w(x, normal, shear, p, q, r)
+
+
 @njit(cache=True, fastmath={"reassoc", "contract"})
 def _dot_column(x, y, i, j, low, high):
     total = 0.0
     for a in range(3):
         for k in range(low, high):
             total += x[a, i, j, k] * y[a, i, j, k]
+    return total
+
+
+@njit(cache=True)
+def _in_order(sums):
+    """Their sum, in the same order for any number of threads."""
+    total = 0.0
+    for n in range(len(sums)):
+        total += sums[n]
     return total
 
 
@@ -248,7 +270,7 @@ def apply(x, out, mass, normal, shear, first, last):
                 out[2, i, j, k] = value if m > ZERO else ZERO
             total += _dot_column(x, out, i, j, low, high)
         sums[i] = total
-    return sums.sum()
+    return _in_order(sums)
 
 
 @njit(parallel=True, cache=True)
@@ -325,7 +347,7 @@ def descend(x, r, direction, q, step, mass, first, last):
                     moved = mass[a, i, j, k] * x[a, i, j, k]
                     momentum += moved * moved
         residuals[i], momenta[i] = squared, momentum
-    return residuals.sum(), momenta.sum()
+    return _in_order(residuals), _in_order(momenta)
 
 
 @njit(parallel=True, cache=True)
@@ -352,7 +374,7 @@ def dot(r, z, first, last):
         for j in range(ONE, np.uint64(ny - 1)):
             total += _dot_column(r, z, i, j, np.uint64(first[i, j]), np.uint64(last[i, j]))
         sums[i] = total
-    return sums.sum()
+    return _in_order(sums)
 
 
 @njit(parallel=True, cache=True)
@@ -365,31 +387,3 @@ def turn(direction, z, factor, first, last):
             for j in range(ONE, np.uint64(ny - 1)):
                 for k in range(np.uint64(first[i, j]), np.uint64(last[i, j])):
                     direction[a, i, j, k] = z[a, i, j, k] + factor * direction[a, i, j, k]
-
-
-@njit(parallel=True, cache=True)
-def continue_behind_walls(x, clearance, mass, wall_share, buried):
-    """Velocities of the `buried` faces (bool [3,...], role WALL), linear through the wall's; in place.
-
-    Before, they hold the velocity of the wall. Without friction they take over that of the liquid beside them.
-    """
-    _, nx, ny, nz = x.shape
-    for i_ in prange(1, nx - 1):
-        i = np.int64(i_)
-        for a in range(3):
-            for j in range(1, ny - 1):
-                for k in range(1, nz - 1):
-                    if not buried[a, i, j, k]:
-                        continue
-                    here, wall = clearance[a, i, j, k], x[a, i, j, k]
-                    total, weight = 0.0, 0.0
-                    for n in range(6):
-                        step = 1 if n & 1 else -1
-                        p, q, r = i + step * (n // 2 == 0), j + step * (n // 2 == 1), k + step * (n // 2 == 2)
-                        there = clearance[a, p, q, r]
-                        if mass[a, p, q, r] > 0.0 and there > here and there > 0.0:
-                            kept = 1.0 - wall_share * (1.0 - max(here / there, -1.0))
-                            total += (there - here) * kept * (x[a, p, q, r] - wall)
-                            weight += there - here
-                    if weight > 0.0:
-                        x[a, i, j, k] = wall + total / weight

@@ -201,14 +201,14 @@ def continue_into_solid(layer, want, open_share, fill, distance, normal):
 
 
 @njit(parallel=True, cache=True)
-def fill_solid(layer, open_share, distance, normal, virtual):
+def fill_solid(layer, deepest, open_share, distance, normal, virtual):
     """Virtual liquid: the share of each cell's solid part that lies below the continued surface."""
     nx, ny, nz = virtual.shape
     for i_ in prange(nx):
         i = np.int64(i_)
         for j in range(ny):
             for k in range(nz):
-                if layer[i, j, k] == 0 or layer[i, j, k] == 4:
+                if layer[i, j, k] == 0 or layer[i, j, k] > deepest:
                     continue
                 # the more of the cell is open, the farther from its centre is the middle of its solid part
                 x, y, z = _slopes(open_share, i, j, k)

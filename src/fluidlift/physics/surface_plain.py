@@ -15,6 +15,7 @@ from fluidlift.numerics.sampling import gradient_nodes, sample_nodes
 from fluidlift.physics import boundaries
 from fluidlift.physics.free_surface import (
     BAND,
+    LAYERS,
     MORE_SMOOTHINGS,
     ROUNDS,
     SMOOTHINGS,
@@ -48,7 +49,7 @@ def liquid_surface_plain(
     fill = fill_plain(shares_plain(positions, volumes, grid), solids)
     h = grid.spacing
     bend = curvature_plain(smoothed_plain(fill, SMOOTHINGS), fill)
-    distance = np.clip(flat_distance_plain(fill) - 0.5 * VARIANCE * bend, -BAND, BAND)
+    distance = np.clip(flat_distance_plain(fill) - 0.5 * VARIANCE * bend * solids.clear, -BAND, BAND)
     if not curved:
         return LiquidSurface(h * distance, None)
     flatter = curvature_plain(smoothed_plain(fill, SMOOTHINGS + MORE_SMOOTHINGS), fill)
@@ -144,12 +145,12 @@ def fill_plain(share: np.ndarray, solids: SolidShares) -> np.ndarray:
         slope = slopes_plain(fill)
         direct, outward = flat_distance_plain(fill), -slope / np.maximum(_length(slope), 1e-3)
         distance, normal = np.where(layer <= 1, direct, distance), np.where(layer[..., None] <= 1, outward, normal)
-        for want in (2, 3):
+        for want in range(2, LAYERS + 1):
             for cell in np.argwhere(layer == want):
                 _extrapolate(tuple(cell), want, layer, open_share, distance, normal)
         middle = distance - SOLID_DEPTH * open_share * np.einsum("...a,...a->...", normal, toward_open)
         step = RELAXATION * (0.5 * erfc(middle / np.sqrt(0.5)) - virtual)
-        virtual = np.where((layer > 0) & (layer < 4), np.clip(virtual + step, 0.0, 1.0), virtual)
+        virtual = np.where((layer > 0) & (layer <= LAYERS), np.clip(virtual + step, 0.0, 1.0), virtual)
     return smoothed_plain(share + (1.0 - open_share) * virtual, 1)
 
 

@@ -22,11 +22,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
+from numba import njit, prange
 
 from fluidlift.errors import require
 from fluidlift.physics import stress_kernels as kernels
 from fluidlift.physics.liquid_fractions import octant_shares
 from fluidlift.physics.stress_multigrid import StressSystem, assemble, build_levels, fitting_threads, v_cycle
+from fluidlift.physics.viscous_bodies import BodyUnknowns, DraggedBody
 from fluidlift.types import FaceVelocity, SolveReport
 
 NEGLIGIBLE = 1e-4
@@ -54,8 +56,12 @@ class FaceRoles:
     """m, signed distance to the liquid's surface at cell centres, negative inside, continued into solids. None: cells
     are full of liquid if none of their six faces is air"""
     solid_distance: Float[np.ndarray, "nx+1 ny+1 nz+1"] | None = None
-    """m, at nodes, positive outside. With it, walls lie where they are, and faces whose centre is in the solid take part
-    as walls at rest. None: walls lie half way between faces"""
+    """m, at nodes, positive outside. With it, walls lie where they are, and faces whose centre is in the solid count as
+    walls. None: walls lie half way between faces"""
+    solid_velocity: FaceVelocity | None = None
+    """m/s, of the solid at those faces; None: at rest"""
+    bodies: tuple[DraggedBody, ...] = ()
+    """free bodies, for `diffuse_with_bodies`; their faces are among the fixed and the walls"""
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -132,6 +138,11 @@ def _face_roles(roles: FaceRoles, region: Region) -> np.ndarray:
     return out
 
 
+def _stacked(velocity: FaceVelocity, region: Region) -> np.ndarray:
+    """float64 [3,...]: the components in the box."""
+    return np.stack([region.crop(c, 0.0, np.float64) for c in velocity.components])
+
+
 def _on_border(mask: np.ndarray, axis: int) -> np.ndarray:
     """The part of the mask on the two sides of the grid that the component crosses."""
     out = np.zeros_like(mask)
@@ -178,6 +189,34 @@ def _clearance(solid_distance: np.ndarray, region: Region) -> np.ndarray:
     return np.stack([mean_with_next(mean_with_next(nodes, (a + 1) % 3), (a + 2) % 3) for a in range(3)])
 
 
+@njit(parallel=True, cache=True)
+def _continue_behind_walls(x, clearance, mass, wall_share, buried):
+    """Velocities of the `buried` faces (bool [3,...], role WALL), linear through the wall's; in place.
+
+    Before, they hold the velocity of the wall. Without friction they take over that of the liquid beside them.
+    """
+    _, nx, ny, nz = x.shape
+    for i_ in prange(1, nx - 1):
+        i = np.int64(i_)
+        for a in range(3):
+            for j in range(1, ny - 1):
+                for k in range(1, nz - 1):
+                    if not buried[a, i, j, k]:
+                        continue
+                    here, wall = clearance[a, i, j, k], x[a, i, j, k]
+                    total, weight = 0.0, 0.0
+                    for n in range(6):
+                        step = 1 if n & 1 else -1
+                        p, q, r = i + step * (n // 2 == 0), j + step * (n // 2 == 1), k + step * (n // 2 == 2)
+                        there = clearance[a, p, q, r]
+                        if mass[a, p, q, r] > 0.0 and there > here and there > 0.0:
+                            kept = 1.0 - wall_share * (1.0 - max(here / there, -1.0))
+                            total += (there - here) * kept * (x[a, p, q, r] - wall)
+                            weight += there - here
+                    if weight > 0.0:
+                        x[a, i, j, k] = wall + total / weight
+
+
 def build_system(
     roles: FaceRoles, *, viscosity: float | Float[np.ndarray, "nx ny nz"], dt: float, spacing: float, wall_share: float
 ) -> tuple[StressSystem, Region, np.ndarray] | None:
@@ -210,7 +249,14 @@ def build_system(
 
 
 def solve(
-    system: StressSystem, x: np.ndarray, momentum: np.ndarray, *, tolerance: float, max_iterations: int, cycles: bool
+    system: StressSystem,
+    x: np.ndarray,
+    momentum: np.ndarray,
+    bodies: BodyUnknowns,
+    *,
+    tolerance: float,
+    max_iterations: int,
+    cycles: bool,
 ) -> tuple[int, float]:
     """Conjugate gradients for A x = momentum, in place; the number of iterations and the relative residual.
 
@@ -220,6 +266,7 @@ def solve(
     Args:
         x: float64 [3,...], first guess on the solved faces, given velocities on the others.
         momentum: float64 [3,...], mass times the velocity before.
+        bodies: that move with the liquid; of this x.
         tolerance: relative residual in the 2-norm.
         max_iterations: of the conjugate gradients.
         cycles: precondition with V-cycles; False: with the diagonal.
@@ -230,6 +277,7 @@ def solve(
     before = float(np.square(momentum).sum())
     kernels.apply(x, q, *system.operator)
     squared, after = kernels.descend(x, r, direction, q, 1.0, system.mass, *system.columns)
+    squared += bodies.start(x)
     iterations, rz = 0, 1.0
     while iterations < max_iterations and squared > tolerance**2 * max(before, after):
         # near one, so that single precision neither over- nor underflows; the scale drops out of the directions
@@ -237,19 +285,23 @@ def solve(
         kernels.scale_into(r, scale, system.inverse, cycles, rhs, z, *system.columns)
         if cycles:
             v_cycle(levels)
-        rz, previous = kernels.dot(r, z, *system.columns), rz
+        rz, previous = kernels.dot(r, z, *system.columns) + bodies.steepness(scale), rz
         if not rz > 0:
             break
-        kernels.turn(direction, z, rz / previous if iterations else 0.0, *system.columns)
-        curvature = kernels.apply(direction, q, *system.operator)
+        factor = rz / previous if iterations else 0.0
+        kernels.turn(direction, z, factor, *system.columns)
+        bodies.turn(direction, factor, scale)
+        curvature = kernels.apply(direction, q, *system.operator) + bodies.curvature(direction)
         if not curvature > 0:
             break
         squared, after = kernels.descend(x, r, direction, q, rz / curvature, system.mass, *system.columns)
+        squared += bodies.descend(x, rz / curvature)
         iterations += 1
     kernels.apply(x, q, *system.operator)
     r[...] = momentum - q
     direction[...] = 0.0
     squared, after = kernels.descend(x, r, direction, direction, 0.0, system.mass, *system.columns)
+    squared += bodies.start(x)
     size = max(before, after)
     return iterations, float(np.sqrt(squared / size)) if size > 0 else 0.0
 
@@ -265,7 +317,7 @@ def diffuse(
     initial: FaceVelocity | None = None,
     tolerance: float = 1e-5,
 ) -> tuple[FaceVelocity, tuple[SolveReport, ...]]:
-    """The velocity after dt (s) of viscosity.
+    """The velocity after dt (s) of viscosity; solids move as given.
 
     Below `NEGLIGIBLE` nothing is done and no report given.
 
@@ -282,6 +334,30 @@ def diffuse(
     Raises:
         ValueError: arguments of wrong shape or range.
     """
+    require(not roles.bodies, "bodies, whose motion would be lost", "diffuse_with_bodies")
+    new, _, reports = diffuse_with_bodies(
+        velocity, roles, viscosity=viscosity, dt=dt, spacing=spacing, wall_share=wall_share, initial=initial,
+        tolerance=tolerance,
+    )  # fmt: skip
+    return new, reports
+
+
+def diffuse_with_bodies(
+    velocity: FaceVelocity,
+    roles: FaceRoles,
+    *,
+    viscosity: float | Float[np.ndarray, "nx ny nz"],
+    dt: float,
+    spacing: float,
+    wall_share: float,
+    initial: FaceVelocity | None = None,
+    tolerance: float = 1e-5,
+) -> tuple[FaceVelocity, Float[np.ndarray, "b 6"], tuple[SolveReport, ...]]:
+    """As `diffuse`, while the liquid drags `roles.bodies` along.
+
+    On the bodies' faces `velocity` holds their motion before. Also returned: how much the velocity (m/s) and angular
+    velocity (rad/s) of each body have changed.
+    """
     shape, field = velocity.shape, np.asarray(viscosity)
     require(roles.shape == shape, f"roles of faces for {roles.shape} cells", str(shape))
     require(field.shape in ((), shape), f"viscosity {field.shape}", f"a number or {shape}")
@@ -293,24 +369,26 @@ def diffuse(
     if largest >= NEGLIGIBLE:
         built = build_system(roles, viscosity=viscosity, dt=dt, spacing=spacing, wall_share=wall_share)
     if built is None:
-        return velocity, ()
+        return velocity, np.zeros((len(roles.bodies), 6)), ()
     system, region, buried = built
-    given = np.stack([region.crop(c, 0.0, np.float64) for c in velocity.components])
-    given[buried] = 0.0
-    x = given * (system.roles != kernels.AIR)
+    given = _stacked(velocity, region)
+    given[buried] = 0.0 if roles.solid_velocity is None else _stacked(roles.solid_velocity, region)[buried]
+    x = np.where(system.roles != kernels.AIR, given, 0.0)
+    momentum = np.where(system.mass > 0, system.mass * given, 0.0)
     if initial is not None:
-        for a, c in enumerate(initial.components):
-            np.copyto(x[a], region.crop(c, 0.0), where=system.mass[a] > 0)
+        np.copyto(x, _stacked(initial, region), where=system.mass > 0)
+    bodies = BodyUnknowns(roles.bodies, region.low, system.roles >= kernels.FIXED, system.operator, x)
     with fitting_threads(system.excluded.size):
         iterations, residual = solve(
-            system, x, system.mass * given, tolerance=tolerance, max_iterations=300, cycles=largest > CYCLES_FROM
+            system, x, momentum, bodies, tolerance=tolerance, max_iterations=300, cycles=largest > CYCLES_FROM
         )
         if buried.any():
-            kernels.continue_behind_walls(x, system.clearance, system.mass, wall_share, buried)
+            _continue_behind_walls(x, system.clearance, system.mass, wall_share, buried)
     report = SolveReport(residual <= tolerance * 1.01, iterations, residual, "viscosity")
-    out = []
+    changed, out = (system.mass > 0) | buried, []
+    bodies.mark(changed)
     for a, component in enumerate(velocity.components):
-        new = region.paste(component, x[a], (system.mass[a] > 0) | buried[a])
+        new = region.paste(component, x[a], changed[a])
         _carry_out(new, component, roles.solved[a], a, number)
         out.append(new)
-    return FaceVelocity(*out), (report,)
+    return FaceVelocity(*out), bodies.change, (report,)

@@ -66,10 +66,9 @@ def simulator_of(scene: Scene) -> ParticleSimulator:
         )  # fmt: skip
     from fluidlift.physics.apic import LiquidSimulator
 
-    solids: dict[str, Any] = {"bodies": scene.bodies} if scene.bodies else {}
     return LiquidSimulator(
         grid, scene.terrain, parameters, scene.body, cell_types=scene.cell_types, inflow_profile=scene.velocity,
-        seed=scene.seed, emit_source=look, **solids,
+        seed=scene.seed, emit_source=look, bodies=scene.bodies,
     )  # fmt: skip
 
 
@@ -81,15 +80,18 @@ def preflight(scene: Scene) -> None:
     """
     from fluidlift.physics.preflight import check_frames, check_inlet, check_memory
     from fluidlift.physics.stepping import SimulationSettings
+    from fluidlift.physics.surface_tension import capillary_time_step
 
     if scene.obstacles and scene.kind == "plume":
         raise InputRejected(
             f"{scene.obstacles[0].line}: an obstacle in a plume", "obstacles in a liquid", "remove it from scene.yaml"
         )
-    step = simulation_step(scene).time_step
+    p, step = scene.parameters, simulation_step(scene).time_step
+    if p.surface_tension > 0:
+        step = min(step, capillary_time_step(p.density, p.surface_tension, scene.terrain.grid.spacing))
     check_frames(scene.frames, scene.interval, step, SimulationSettings().max_substeps)
     check_memory(scene.terrain.grid, len(scene.body), available_memory())
-    check_inlet(scene.terrain, scene.cell_types, np.array(scene.parameters.inflow_velocity))
+    check_inlet(scene.terrain, scene.cell_types, np.array(p.inflow_velocity))
 
 
 def frame_file(folder: Path, number: int) -> Path:

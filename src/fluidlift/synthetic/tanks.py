@@ -64,7 +64,7 @@ class Tank:
         return float(np.sqrt(self.size / pull)) if pull > 0 else float("inf")
 
 
-def _tank(
+def tank_of(
     name: str,
     grid: Grid,
     positions: np.ndarray,
@@ -115,7 +115,7 @@ def dam_break(
     nx, nz = _counts(length * base, 1.25 * aspect * base, spacing=h)
     grid = Grid((nx, width_cells, nz), h)
     positions, fill = between(grid, 0.0, aspect * base, x=(0.0, base), seed=seed)
-    return _tank("dam break", grid, positions, fill, size=base, kinematic_viscosity=WATER, gravity=(0, 0, -gravity))
+    return tank_of("dam break", grid, positions, fill, size=base, kinematic_viscosity=WATER, gravity=(0, 0, -gravity))
 
 
 def standing_wave(
@@ -150,7 +150,7 @@ def standing_wave(
         return length * (depth + (amplitude * np.cos(mode * np.pi * x / length) if mode else 0.0))
 
     positions, fill = between(grid, 0.0, surface, seed=seed)
-    return _tank(
+    return tank_of(
         "standing wave", grid, positions, fill, size=length, kinematic_viscosity=viscosity, gravity=(0, 0, -gravity)
     )
 
@@ -207,7 +207,7 @@ def river(
     types = np.zeros(grid.shape, np.uint8)
     types[:2][wet[:2]] = CellType.INFLOW
     types[-2:] = CellType.OUTFLOW
-    return _tank(
+    return tank_of(
         "river", grid, positions, fill, size=length, terrain=terrain, cell_types=types, kinematic_viscosity=WATER,
         inflow_velocity=(speed, 0.0, -speed * slope),
     )  # fmt: skip
@@ -240,7 +240,7 @@ def honey_slope(*, cells: int = 64, length: float = 0.32, angle: float = 20.0, s
 
     positions = inside(grid, lump, seed=seed)
     fill = len(positions) * (h / PER_AXIS) ** 3
-    return _tank(
+    return tank_of(
         "honey on a slope", grid, positions, fill, size=length,
         terrain=terrain_of(grid, solid, (np.cos(tilt), 0.0, -np.sin(tilt))), density=1400.0,
         kinematic_viscosity=HONEY, wall_damping=1.0,
@@ -275,7 +275,7 @@ def thread(
     types = np.zeros(grid.shape, np.uint8)
     types[nozzle] = CellType.INFLOW
     terrain = terrain_of(grid, lambda points: points[..., 2] - plate, (0.0, 0.0, -1.0))
-    return _tank(
+    return tank_of(
         "thread", grid, np.zeros((0, 3)), 0.0, size=width, terrain=terrain, cell_types=types, density=1400.0,
         kinematic_viscosity=viscosity, inflow_velocity=(0.0, 0.0, -speed), wall_damping=1.0,
     )  # fmt: skip
@@ -297,7 +297,7 @@ def pool(
     (nz,) = _counts((depth + headroom) * width, spacing=h)
     grid = Grid((cells, cells, nz), h, (-width / 2, -width / 2, 0.0))
     positions, fill = between(grid, 0.0, depth * width, seed=seed)
-    return _tank("pool", grid, positions, fill, size=width, kinematic_viscosity=viscosity)
+    return tank_of("pool", grid, positions, fill, size=width, kinematic_viscosity=viscosity)
 
 
 def drop(
@@ -328,7 +328,7 @@ def drop(
     still, volume = between(grid, 0.0, depth * width, seed=seed + 1) if depth > 0 else (np.zeros((0, 3)), 0.0)
     fill = volume + 4.0 / 3.0 * np.pi * (radius * width) ** 3
     pull = gravity if gravity > 0 else GRAVITY
-    tank = _tank(
+    tank = tank_of(
         "drop", grid, np.concatenate([ball, still]), fill, size=width, gravity=(0, 0, -gravity),
         kinematic_viscosity=viscosity, time_step=0.5 * float(np.sqrt(h / pull)),
     )  # fmt: skip

@@ -205,8 +205,8 @@ def turned(affine: bool) -> tuple[float, np.ndarray]:
 def test_a_spinning_bucket_keeps_turning_and_its_surface_hollow():
     kept, rings = turned(affine=True)
     # In a step of dt the particles go straight on before the pressure turns them: that takes (omega dt)^2 / 2, which is
-    # 4 % in half a turn of these steps. The wall is frictionless, but the velocity continued into it is constant and not
-    # that of a turning body: particles beside it lose a share at every step, another 4 % with nine cells of radius
+    # 4 % in half a turn of these steps. The wall is frictionless, but the velocity continued into it is constant and
+    # not that of a turning body: particles beside it lose a share at every step, 4 % more with nine cells of radius
     assert kept > 0.91
     # omega^2 r^2 / 2 g: 0.2 m from the middle to the rim at 2 rad/s; measured between rings at 0.1 and 0.8 m
     assert rings[-1] - rings[0] == pytest.approx(0.5 * 4.0 / G * (0.8**2 - 0.12**2), rel=0.2)

@@ -149,9 +149,9 @@ def move_particles(
                 x[a] = wp.min(x[a], highest)
     x = rounded(x)
     v = rounded(v)
-    inside = bool(True)  # no terrain is known out of the box
-    for a in range(3):
-        inside = inside and x[a] >= box.low[a] and x[a] < box.high[a]
+    # no terrain is known out of the box
+    inside = x[0] >= box.low[0] and x[1] >= box.low[1] and x[2] >= box.low[2]
+    inside = inside and x[0] < box.high[0] and x[1] < box.high[1] and x[2] < box.high[2]
     there = distance_and_gradient(box, x)
     if inside and there[3] < box.spacing:
         v = off_the_walls(box, v, before, old, there)

@@ -22,7 +22,7 @@ def _eigen(a, v):
     for _ in range(12):
         off = a[0, 1] * a[0, 1] + a[0, 2] * a[0, 2] + a[1, 2] * a[1, 2]
         trace = a[0, 0] * a[0, 0] + a[1, 1] * a[1, 1] + a[2, 2] * a[2, 2]
-        if off <= 1e-24 * trace:
+        if off <= 1e-18 * trace:  # angles to 1e-9: the results are kept in single precision
             break
         for p in range(2):
             for q in range(p + 1, 3):
@@ -49,11 +49,23 @@ def _eigen(a, v):
 
 
 @njit(cache=True)
+def _positive(a, sign, shift):
+    """Whether sign a + shift (unit matrix) is positive definite: its leading minors are positive (Sylvester)."""
+    xx, yy, zz = sign * a[0, 0] + shift, sign * a[1, 1] + shift, sign * a[2, 2] + shift
+    xy, xz, yz = sign * a[0, 1], sign * a[0, 2], sign * a[1, 2]
+    plane = xx * yy - xy * xy
+    return xx > 0.0 and plane > 0.0 and zz * plane - xx * yz * yz - yy * xz * xz + 2.0 * xy * xz * yz > 0.0
+
+
+@njit(cache=True)
 def _limit_stretches(f, max_stretch, a, v, g):
     """Bring the singular values of `f` into [1/max_stretch, max_stretch], in place; a, v, g are work space."""
     for i in range(3):
         for j in range(3):
             a[i, j] = f[i, 0] * f[j, 0] + f[i, 1] * f[j, 1] + f[i, 2] * f[j, 2]
+    least, most = 1.0 / (max_stretch * max_stretch), max_stretch * max_stretch
+    if _positive(a, 1.0, -least) and _positive(a, -1.0, most):
+        return  # nothing to limit, and no eigenvectors needed to see it
     _eigen(a, v)
     for e in range(3):
         stretch = np.sqrt(max(a[e, e], 1e-12))

@@ -64,8 +64,8 @@ class RigidBodies:
         self._density, self._gravity = float(density), np.asarray(gravity, np.float64)
         self.time, self.removed = float(time), 0
         """s, and particles that found no place beside the bodies"""
-        h = walls.grid.spacing
-        n = len(self.bodies)
+        h, n = walls.grid.spacing, len(self.bodies)
+        self._cell_mass = self._density * h**3  # of liquid, kg
         self.free = np.array([b.motion == "free" for b in self.bodies], bool)
         integrals = [moments(b.mesh) for b in self.bodies]
         self._offset = np.array([m.center for m in integrals]).reshape(n, 3)
@@ -170,12 +170,7 @@ class RigidBodies:
         speed = np.where(self.free & self.active, speed, 0.0)
         for n, body in enumerate(self.bodies):
             if body.trajectory is not None:
-                at = body.trajectory.times
-                at = np.unique([self.time, *at[(at > self.time) & (at < self.time + horizon)], self.time + horizon])
-                for start, end in zip(at[:-1], at[1:]):
-                    v, w = body.trajectory.velocity(start, end - start, self._offset[n])
-                    size = float(np.sqrt(np.square(v).sum()) + self._radius[n] * np.sqrt(np.square(w).sum()))
-                    speed[n] = max(speed[n], size)
+                speed[n] = body.trajectory.max_speed(self.time, horizon, self._offset[n], self._radius[n])
         return float(speed.max(initial=0.0))
 
     # --- a substep, in the order of the calls -----------------------------------------------------------------------
@@ -249,22 +244,20 @@ class RigidBodies:
 
     def dragged(self) -> tuple[DraggedBody, ...]:
         """The free bodies for `viscosity.diffuse_with_bodies`; their faces move as `face_velocity` says."""
-        out, scale = [], self._density * self._static.grid.spacing**3
+        out = []
         inertia = np.einsum("nij,njk,nlk->nil", self.rotation, self._inertia, self.rotation)
         for c in self._union.covers:
             if self.free[c.body] and self.active[c.body]:
-                mass = np.zeros((6, 6))
-                mass[:3, :3], mass[3:, 3:] = np.eye(3) * self.mass[c.body] / scale, inertia[c.body] / scale
-                faces, values = rigid_coupling.moving_faces(c, self._union.walls, self.center[c.body])
-                out.append(DraggedBody(c.body, faces, values, mass))
+                mass = rigid_coupling.mass_matrix(self.mass[c.body], inertia[c.body]) / self._cell_mass
+                rows = rigid_coupling.moving_faces(c, self._union.walls, self.center[c.body])
+                out.append(DraggedBody(c.body, *rows, mass))
         return tuple(out)
 
     def apply_viscosity(self, dragged: Sequence[DraggedBody], change: Float[np.ndarray, "d 6"]) -> None:
-        """Take over the changes of velocity and angular velocity that viscosity gave the `dragged` bodies."""
-        scale = self._density * self._static.grid.spacing**3
+        """Take over how viscosity changed the velocities and angular velocities of the `dragged` bodies."""
         for body, six in zip(dragged, change):
             self.velocity[body.body] += six[:3]
-            self.angular_momentum[body.body] += scale * (body.mass[3:, 3:] * six[3:]).sum(axis=1)
+            self.angular_momentum[body.body] += self._cell_mass * (body.mass[3:, 3:] * six[3:]).sum(axis=1)
 
     def coupling(self, unknown: Bool[np.ndarray, "nx ny nz"]) -> tuple[LowRankTerm, ...]:
         """How the pressure of the unknown cells moves the free bodies, for `pressure.project`.
@@ -275,15 +268,11 @@ class RigidBodies:
         self._rows = tuple(
             rigid_coupling.body_rows(c, unknown, self._union.walls, self.center[c.body]) for c in self._union.covers
         )
-        scale = self._density * self._static.grid.spacing**3
-        inertia = self._inverse_world_inertia()
-        terms = []
+        inertia, terms = self._inverse_world_inertia(), []
         for rows in self._rows:
             if self.free[rows.body] and self.active[rows.body] and len(rows.cells):
-                inverse = np.zeros((6, 6))
-                inverse[:3, :3] = np.eye(3) * scale / self.mass[rows.body]
-                inverse[3:, 3:] = scale * inertia[rows.body]
-                terms.append(LowRankTerm(rows.cells, rows.values, inverse))
+                inverse = rigid_coupling.mass_matrix(1.0 / self.mass[rows.body], inertia[rows.body])
+                terms.append(LowRankTerm(rows.cells, rows.values, self._cell_mass * inverse))
         return tuple(terms)
 
     def pressure_forces(self, q: Float[np.ndarray, "nx ny nz"]) -> Float[np.ndarray, "b 6"]:
@@ -298,12 +287,11 @@ class RigidBodies:
 
     def apply_pressure(self, q: Float[np.ndarray, "nx ny nz"]) -> None:
         """Free bodies after the solve for q (m^2/s), whose `low_rank` was the last `coupling`."""
-        h = self._static.grid.spacing
         for rows in self._rows:
             n = rows.body
             if self.free[n] and self.active[n]:
                 pressed = (rows.values * q[tuple(rows.cells.T)].astype(np.float64)[:, None]).sum(axis=0)
-                impulse = self._density * h**3 * pressed
+                impulse = self._cell_mass * pressed
                 self.velocity[n] += impulse[:3] / self.mass[n]
                 self.angular_momentum[n] += impulse[3:]
 

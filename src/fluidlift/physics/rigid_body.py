@@ -75,6 +75,13 @@ class Trajectory:
         moved = x1 + (r1 * point).sum(axis=1) - x0 - (r0 * point).sum(axis=1)
         return moved / dt, rotation_vector(product(q1, q0 * [1, -1, -1, -1])) / dt
 
+    def max_speed(self, start: float, horizon: float, point: Float[np.ndarray, "3"], radius: float) -> float:
+        """m/s that nothing within `radius` (m) of a point of the body frame exceeds within `horizon` s from `start`."""
+        at = self.times[(self.times > start) & (self.times < start + horizon)]
+        at = np.unique([start, *at, start + horizon])
+        motions = [self.velocity(a, b - a, point) for a, b in zip(at[:-1], at[1:])]
+        return max(float(np.sqrt(np.square(v).sum()) + radius * np.sqrt(np.square(w).sum())) for v, w in motions)
+
 
 @dataclass(frozen=True)
 class RigidBody:

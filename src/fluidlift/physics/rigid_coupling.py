@@ -193,6 +193,13 @@ def moving_faces(
     return np.concatenate([f for f, _ in found]), np.concatenate([r for _, r in found])
 
 
+def mass_matrix(mass: float, inertia: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "6 6"]:
+    """Of velocity and angular velocity about the centre of mass."""
+    out = np.zeros((6, 6))
+    out[:3, :3], out[3:, 3:] = mass * np.eye(3), inertia
+    return out
+
+
 @njit(cache=True)
 def _slope(rate, openings, axis, i, j, k, h):
     """d rate / dx_axis from the neighbours with liquid behind open faces; the last value: how many there are."""

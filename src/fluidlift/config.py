@@ -96,6 +96,8 @@ class SimulateConfig:
     """frames to simulate; None: as many as the clip has"""
     max_particles: int = 150_000
     """most particles"""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """who moves the particles of a liquid: the CPU (Numba), or a GPU (NVIDIA Warp, `pip install "fluidlift[cuda]"`)"""
     checkpoint_every: int = 10
     """frames between checkpoints, from which a stopped simulation goes on"""
 

@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fluidlift.physics import boundaries, rigid_coupling
+from fluidlift.physics import boundaries
+from fluidlift.physics import stress_kernels as kernels
 from fluidlift.physics.crowding import cell_capacity
 from fluidlift.physics.face_clearance import face_clearance
-from fluidlift.physics.rigid import RigidBodies, RigidBody, Trajectory
+from fluidlift.physics.rigid import RigidBodies, RigidBody
 from fluidlift.physics.viscosity import FaceRoles, build_system, diffuse, diffuse_with_bodies
 from fluidlift.physics.viscous_bodies import DraggedBody
 from fluidlift.physics.window import open_window
@@ -61,6 +62,17 @@ class Scene:
         assert report.converged
         return new, change, report
 
+    def diffused_beside(self, dragged, change, number):
+        """Velocity after a step in which the only body is made to change its motion."""
+        solid = [c.astype(np.float64) for c in self.bodies.face_velocity().components]
+        for (a, i, j, k), row, shift in zip(dragged.faces, dragged.values, dragged.shift):
+            solid[a][i, j, k] += row @ change + shift
+        solid = [c.astype(np.float32) for c in solid]
+        start = zip(self.walls.openings, solid, self.start.components)
+        roles = replace(self.roles, bodies=(), solid_velocity=FaceVelocity(*solid))
+        velocity = FaceVelocity(*(np.where(o == 0, c, s) for o, c, s in start))
+        return diffuse(velocity, roles, viscosity=number * H**2 / ARGUMENTS["dt"], **ARGUMENTS)[0]
+
     def mass(self):
         """Liquid shares of the solved faces, on the whole grid."""
         system, region, _ = build_system(self.roles, viscosity=1.0, dt=0.01, spacing=H, wall_share=1.0)
@@ -98,10 +110,9 @@ def test_liquid_and_body_exchange_momentum_without_loss(density, cut):
 
 
 def test_liquid_and_body_exchange_angular_momentum_without_loss():
-    # a box along the grid: its faces are closed as a whole, so that the centres of their covered parts are their own
-    body = RigidBody.box("box", (6 * H, 4 * H, 4 * H), density=500.0, position=(8 * H, 8 * H, 8 * H),
+    body = RigidBody.box("box", (6.3 * H, 4.2 * H, 4 * H), density=500.0, position=(8.1 * H, 8 * H, 8 * H),
                          velocity=(0.0, 0.5, 0.0), angular_velocity=(3.0, -1.0, 2.0))  # fmt: skip
-    scene = Scene(body, drop=0.33, cut=False)
+    scene = Scene(body, drop=0.33)
     new, change, _ = scene.diffused(5.0)
     gained, arms, mass = np.zeros(3), scene.bodies.center[0], scene.mass()
     for a, component in enumerate(difference(new, scene.start).components):
@@ -118,10 +129,10 @@ def test_a_drop_with_its_body_turns_on_rigidly():
                   drop=0.33)  # fmt: skip
     spun = [np.cross((0.0, 0.0, 2.0), scene.grid.faces(a) - 0.4)[..., a].astype(np.float32) for a in range(3)]
     start = scene.closed_in(FaceVelocity(*spun))
-    new, change, _ = scene.diffused(20.0, start)
-    # no strain, no stress; 2e-3: the bodies' faces move as the centre of their covered part does
-    assert np.abs(change[0, :3]).max() < 2e-3 * 2.0 * 0.16
-    assert np.abs(change[0, 3:]).max() < 2e-3 * 2.0
+    _, change, _ = scene.diffused(20.0, start)
+    # no strain, no stress; 1e-5: velocities of single precision, times nu dt / h^2
+    assert np.abs(change[0, :3]).max() < 1e-5 * 2.0 * 0.16
+    assert np.abs(change[0, 3:]).max() < 1e-5 * 2.0
 
 
 @pytest.mark.parametrize("density", [1.4, 140.0, 14000.0])
@@ -138,7 +149,7 @@ def test_a_body_ten_and_more_times_lighter_than_honey_is_only_slowed_down_howeve
     after = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0]) + change[0]
     assert energy + after @ mass @ after < mass[2, 2]
     # one solve, not one per body and direction
-    assert report.iterations < 60
+    assert report.iterations < 100
 
 
 def test_bodies_of_very_different_mass_and_touching_boxes_keep_the_momentum():
@@ -156,8 +167,7 @@ def test_bodies_of_very_different_mass_and_touching_boxes_keep_the_momentum():
 def test_a_very_heavy_body_is_like_one_with_a_given_motion():
     scene = Scene(ball(1e9, velocity=(0.5, 0.0, 1.0), angular_velocity=(0.0, 2.0, 0.0)))
     new, change, _ = scene.diffused(2.0)
-    roles = replace(scene.roles, bodies=())
-    given, _ = diffuse(scene.start, roles, viscosity=2.0 * H**2 / 0.01, **ARGUMENTS)
+    given = scene.diffused_beside(scene.bodies.dragged()[0], np.zeros(6), 2.0)
     assert np.abs(change).max() < 1e-4
     for a, b in zip(new.components, given.components):
         np.testing.assert_allclose(a, b, atol=1e-4)
@@ -169,15 +179,8 @@ def test_the_motion_is_the_minimum_of_the_energy():
     found = scene.diffused(3.0)[1][0]
 
     def reaction(change):
-        """What a body that is made to change its motion thus gives to the liquid: minus what stays of the balance."""
-        solid = scene.start.components
-        moved = [c.astype(np.float64) for c in solid]
-        for (a, i, j, k), row in zip(dragged.faces, dragged.values):
-            moved[a][i, j, k] += row @ change
-        own = FaceVelocity(*(c.astype(np.float32) for c in moved))
-        roles = replace(scene.roles, bodies=(), solid_velocity=FaceVelocity(*_prescribed(scene, dragged, change)))
-        start = FaceVelocity(*(np.where(o == 0, n, s) for o, n, s in zip(scene.walls.openings, own.components, solid)))
-        new, _ = diffuse(start, roles, viscosity=3.0 * H**2 / 0.01, **ARGUMENTS)
+        """What the liquid gains from a body that is made to change its motion thus."""
+        new = scene.diffused_beside(dragged, change, 3.0)
         return scene.momentum(difference(new, scene.start))
 
     # with the motion found, prescribed, the liquid gains what the body loses (exact to float32) and with any other not
@@ -187,20 +190,13 @@ def test_the_motion_is_the_minimum_of_the_energy():
     assert np.abs(reaction(other) + dragged.mass[:3, :3] @ other[:3]).max() > 1e-2 * np.abs(found[2])
 
 
-def _prescribed(scene, dragged, change):
-    out = [c.copy() for c in scene.bodies.face_velocity().components]
-    for (a, i, j, k), row in zip(dragged.faces, dragged.values):
-        out[a][i, j, k] += row @ change
-    return out
-
-
 def test_the_faces_of_a_body_move_as_its_solid_velocity_says():
     scene = Scene(ball(velocity=(0.3, -0.2, 1.0), angular_velocity=(2.0, 1.0, -1.0)))
     bodies, solid = scene.bodies, scene.bodies.face_velocity()
     (dragged,) = bodies.dragged()
     motion = np.concatenate([bodies.velocity[0], bodies.spin[0]])
     given = np.array([solid.components[a][i, j, k] for a, i, j, k in dragged.faces])
-    np.testing.assert_allclose(dragged.values @ motion, given, atol=1e-6)
+    np.testing.assert_allclose(dragged.values @ motion - dragged.shift, given, atol=1e-6)
     clearance, seen = (
         face_clearance(scene.walls.signed_distance),
         [np.zeros(o.shape, bool) for o in scene.walls.openings],
@@ -226,6 +222,18 @@ def test_a_body_takes_over_its_changes_and_others_are_not_asked():
     assert not bodies.velocity[0].any() and not bodies.spin[0].any()
 
 
+def test_what_stresses_take_from_single_faces_is_what_the_operator_takes():
+    scene = Scene(ball(), drop=0.33)
+    system, _, _ = build_system(scene.roles, viscosity=0.3, dt=0.01, spacing=H, wall_share=1.0)
+    x, out = np.random.default_rng(0).normal(size=system.mass.shape), np.zeros(system.mass.shape)
+    kernels.apply(x, out, *system.operator)
+    at = tuple(np.ascontiguousarray(a) for a in np.nonzero(system.mass > 0))
+    pulls = np.zeros(len(at[0]))
+    kernels.pull_faces(x, system.normal, system.shear, *at, pulls)
+    # sums in another order; weights are of order one
+    np.testing.assert_allclose(system.mass[at] * x[at] + pulls, out[at], atol=1e-12)
+
+
 def test_diffuse_refuses_bodies_whose_motion_would_be_lost():
     scene = Scene(ball())
     with pytest.raises(ValueError, match="diffuse_with_bodies"):
@@ -240,4 +248,4 @@ def test_nearly_no_viscosity_leaves_bodies_alone():
 
 def test_a_dragged_body_needs_rows_that_fit():
     with pytest.raises(ValueError, match="values"):
-        DraggedBody(0, np.zeros((3, 4), np.int64), np.zeros((2, 6)), np.eye(6))
+        DraggedBody(0, np.eye(6), np.zeros((3, 4), np.int64), np.zeros((2, 6)), np.zeros(3))

@@ -23,8 +23,8 @@ from fluidlift.types import Particles
 FEWEST = 2
 """particles in an inner cell below which its heaviest one splits"""
 MOST = 16
-"""above which its two lightest ones merge, pair by pair. Of eight per cell on the average, chance alone leaves one cell in
-400 with fewer than FEWEST and one in 300 with more than MOST: few are touched, and about as many split as merge"""
+"""above which its two lightest ones merge, pair by pair. Of eight per cell on the average, chance alone leaves one
+cell in 400 with fewer than FEWEST and one in 300 with more than MOST: few are touched, about as many split as merge"""
 LIGHTEST_PARENT = 0.25
 """of the mass of an eighth of a cell: lighter particles do not split"""
 SPLIT_DISTANCE = 0.25

@@ -243,14 +243,14 @@ class RigidBodies:
         return self._solid.update(self.center, self.velocity, self.spin)
 
     def dragged(self) -> tuple[DraggedBody, ...]:
-        """The free bodies for `viscosity.diffuse_with_bodies`; their faces move as `face_velocity` says."""
+        """The free bodies for `viscosity.diffuse_with_bodies`; on their faces it wants `face_velocity`."""
         out = []
-        inertia = np.einsum("nij,njk,nlk->nil", self.rotation, self._inertia, self.rotation)
+        inertia, spin = np.einsum("nij,njk,nlk->nil", self.rotation, self._inertia, self.rotation), self.spin
         for c in self._union.covers:
             if self.free[c.body] and self.active[c.body]:
                 mass = rigid_coupling.mass_matrix(self.mass[c.body], inertia[c.body]) / self._cell_mass
-                rows = rigid_coupling.moving_faces(c, self._union.walls, self.center[c.body])
-                out.append(DraggedBody(c.body, *rows, mass))
+                rows = rigid_coupling.moving_faces(c, self._union.walls, self.center[c.body], spin[c.body])
+                out.append(DraggedBody(c.body, mass, *rows))
         return tuple(out)
 
     def apply_viscosity(self, dragged: Sequence[DraggedBody], change: Float[np.ndarray, "d 6"]) -> None:

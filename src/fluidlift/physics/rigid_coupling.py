@@ -145,10 +145,10 @@ def body_rows(cover: Cover, unknown: np.ndarray, walls: Walls, center: Float[np.
 
 
 @njit(cache=True)
-def _add_moving_faces(axis, first, low, h, share, offset, opening, distance, center, faces, rows):
+def _add_moving_faces(axis, first, low, h, share, offset, opening, distance, center, spin, faces, rows, shift):
     """Rows of the faces that the body covers and that are closed or have their centre inside; their number."""
     b, c, count = (axis + 1) % 3, (axis + 2) % 3, 0
-    near = 1e-3 * h
+    near, middle = 1e-3 * h, np.zeros(2, offset.dtype)
     for i in range(share.shape[0]):
         for j in range(share.shape[1]):
             for k in range(share.shape[2]):
@@ -165,32 +165,37 @@ def _add_moving_faces(axis, first, low, h, share, offset, opening, distance, cen
                             mean += 0.25 * distance[p + dp, q + dq, r + dr]
                     if mean > near:
                         continue
-                arm = _arm(axis, p, q, r, low, h, offset[i, j, k], center)
+                arm, own = (
+                    _arm(axis, p, q, r, low, h, middle, center),
+                    _arm(axis, p, q, r, low, h, offset[i, j, k], center),
+                )
                 part = share[i, j, k] / (1.0 - opening[p, q, r])
                 faces[count, 0], faces[count, 1], faces[count, 2], faces[count, 3] = axis, p, q, r
                 rows[count, axis] = part
                 rows[count, 3 + b] = part * arm[c]
                 rows[count, 3 + c] = -part * arm[b]
+                shift[count] = part * (spin[b] * (arm[c] - own[c]) - spin[c] * (arm[b] - own[b]))
                 count += 1
     return count
 
 
 def moving_faces(
-    cover: Cover, walls: Walls, center: Float[np.ndarray, "3"]
-) -> tuple[Int[np.ndarray, "n 4"], Float[np.ndarray, "n 6"]]:
-    """Faces that count as solid and are covered by a body (component and index), and J: how much of their velocity
-    (`SolidVelocity`) it gives them per velocity and angular velocity. `center` of mass, m.
+    cover: Cover, walls: Walls, center: Float[np.ndarray, "3"], spin: Float[np.ndarray, "3"]
+) -> tuple[Int[np.ndarray, "n 4"], Float[np.ndarray, "n 6"], Float[np.ndarray, "n"]]:
+    """Faces that count as solid and are covered by a body, and how their centres move with it: see `DraggedBody`.
+
+    `center` of mass (m), `spin` in rad/s.
     """
     found = []
     for axis in range(3):
         size = cover.share[axis].size
-        faces, rows = np.zeros((size, 4), np.int64), np.zeros((size, 6))
+        faces, rows, shift = np.zeros((size, 4), np.int64), np.zeros((size, 6)), np.zeros(size)
         count = _add_moving_faces(
             axis, np.array(cover.low), walls.grid.low, walls.grid.spacing, cover.share[axis], cover.offset[axis],
-            walls.openings[axis], walls.signed_distance, center, faces, rows,
+            walls.openings[axis], walls.signed_distance, center, spin, faces, rows, shift,
         )  # fmt: skip
-        found.append((faces[:count], rows[:count]))
-    return np.concatenate([f for f, _ in found]), np.concatenate([r for _, r in found])
+        found.append((faces[:count], rows[:count], shift[:count]))
+    return tuple(np.concatenate(parts) for parts in zip(*found))
 
 
 def mass_matrix(mass: float, inertia: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "6 6"]:

@@ -14,6 +14,8 @@ Pressure is not part of the minimum. Where nu dt is not small against h^2, subtr
 before first and project the rest afterwards (incremental pressure correction, van Kan 1986): a thread under tension
 then stretches as it should, with three times its viscosity. Without, it stretches 1.1 (nu dt / h^2 = 1/4) to 1.5 times
 too fast, since pressure acts only when the viscous step is over.
+
+Free rigid bodies join in the minimum with their own energy (`diffuse_with_bodies`, see `viscous_bodies`).
 """
 
 from __future__ import annotations

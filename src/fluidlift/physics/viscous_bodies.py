@@ -27,17 +27,21 @@ class DraggedBody:
 
     body: int
     """number, for the caller"""
+    mass: Float[np.ndarray, "6 6"]
+    """mass (kg) and inertia about the centre of mass (kg m^2, world axes), over liquid density h^3"""
     faces: Int[np.ndarray, "n 4"]
     """component and index of the faces that move with it; only those with the role FIXED or WALL count"""
     values: Float[np.ndarray, "n 6"]
-    """J: velocity of the face per velocity (m/s) and angular velocity (rad/s) of the body"""
-    mass: Float[np.ndarray, "6 6"]
-    """mass (kg) and inertia about the centre of mass (kg m^2, world axes), over liquid density h^3"""
+    """J: velocity of the face's centre per velocity (m/s) and angular velocity (rad/s) of the body"""
+    shift: Float[np.ndarray, "n"]
+    """m/s: velocity of the centre less that given. The pressure wants the mean over the covered part, but only faces
+    that move as their centres do are without strain when body and liquid turn together"""
 
     def __post_init__(self) -> None:
         n = len(self.faces)
         require(self.faces.shape == (n, 4), f"faces {self.faces.shape}", "(n, 4)")
         require(self.values.shape == (n, 6), f"values {self.values.shape}", f"({n}, 6)")
+        require(self.shift.shape == (n,), f"shifts {self.shift.shape}", f"({n},)")
         require(self.mass.shape == (6, 6), f"mass {self.mass.shape}", "(6, 6)")
 
 
@@ -64,7 +68,7 @@ class BodyUnknowns:
         low: first node of the box of the solve, in the grid of the bodies' faces.
         moved: bool [3,...] in the box: faces that may move with bodies.
         operator: `StressSystem.operator`.
-        x: float64 [3,...], velocities with the bodies in the motion they had before.
+        x: float64 [3,...], velocities with the bodies in the motion they had before; `shift` is added.
     """
 
     def __init__(
@@ -88,6 +92,7 @@ class BodyUnknowns:
             acts = moved[at] & strained[at]
             number[tuple(a[acts] for a in at)] = 0
             chosen.append((tuple(a[acts] for a in at), body.values[inside[acts]]))
+            x[chosen[-1][0]] += body.shift[inside[acts]]
         self._at = tuple(np.ascontiguousarray(a, np.int64) for a in np.nonzero(number == 0))
         number[self._at] = np.arange(len(self._at[0]))
         self._rows = [(number[at], values) for at, values in chosen]

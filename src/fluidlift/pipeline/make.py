@@ -52,6 +52,7 @@ def make(
     if unknown:
         raise InputRejected(f"unknown stage '{sorted(unknown)[0]}'", "one of " + ", ".join(STAGES))
     check_output_folder(folder)
+    simulating.particle_work(config.simulate.device)  # a device that is not there is said now, not after the fit
     fresh = not folder.exists()
     began = time.perf_counter()
     story = Story(folder, STAGES, force=frozenset(force), progress=progress or Silence())

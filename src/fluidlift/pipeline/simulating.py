@@ -17,6 +17,7 @@ from fluidlift.pipeline.story import Result, available_memory
 from fluidlift.types import Gaussians, Particles
 
 if TYPE_CHECKING:
+    from fluidlift.physics.numba_particles import ParticleWork
     from fluidlift.physics.stepping import ParticleSimulator
 
 MAX_STRETCH = 3.0
@@ -50,8 +51,24 @@ def emission_look(rest: Gaussians, direction: np.ndarray, speed: float) -> Calla
     return source
 
 
-def simulator_of(scene: Scene) -> ParticleSimulator:
-    """The simulator at the first instant."""
+def particle_work(device: str) -> ParticleWork:
+    """The back end that moves particles on a device, "cpu" or "cuda".
+
+    Raises:
+        MissingPackage: NVIDIA Warp is not installed.
+        FluidliftError: there is no such GPU.
+    """
+    from fluidlift.physics.numba_particles import ParticleWork
+
+    if device == "cpu":
+        return ParticleWork()
+    from fluidlift.backends.warp_particles import WarpMover, WarpTransfer
+
+    return ParticleWork(WarpTransfer(device), WarpMover(device))
+
+
+def simulator_of(scene: Scene, device: str = "cpu") -> ParticleSimulator:
+    """The simulator at the first instant. Smoke is simulated on the CPU."""
     parameters = simulation_step(scene)
     direction = scene.terrain.mainstream
     look = emission_look(scene.rest, direction, float(np.linalg.norm(parameters.inflow_velocity)))
@@ -68,7 +85,7 @@ def simulator_of(scene: Scene) -> ParticleSimulator:
 
     return LiquidSimulator(
         grid, scene.terrain, parameters, scene.body, cell_types=scene.cell_types, inflow_profile=scene.velocity,
-        seed=scene.seed, emit_source=look, bodies=scene.bodies,
+        seed=scene.seed, emit_source=look, bodies=scene.bodies, work=particle_work(device),
     )  # fmt: skip
 
 
@@ -233,7 +250,7 @@ def simulate(
         InputRejected: a scene that cannot be simulated, said before anything is written; or the disk is full.
     """
     preflight(scene)
-    simulator = simulator_of(scene)
+    simulator = simulator_of(scene, config.simulate.device)
     history = continued(simulator, scene, folder, request or SimulationRequest(), config)
     first = len(history)
     require_room(folder, scene.frames - first, len(scene.body))

@@ -19,7 +19,8 @@ from fluidlift.numerics.signed_distance import push_outside
 from fluidlift.physics import boundaries, transfer
 from fluidlift.physics.crowding import cell_capacity
 from fluidlift.physics.inlet import Inlet
-from fluidlift.physics.viscosity import FaceRoles, diffuse
+from fluidlift.physics.rigid import RigidBodies
+from fluidlift.physics.viscosity import NEGLIGIBLE, FaceRoles, diffuse_with_bodies
 from fluidlift.physics.window import Window, open_window
 from fluidlift.types import FaceVelocity, FluidParameters, Grid, Particles, SolveReport, Terrain
 
@@ -301,10 +302,12 @@ class ParticleSimulator(ABC):
         prescribed: tuple | None = None,
         distance: np.ndarray | None = None,
         solid: FaceVelocity | None = None,
+        bodies: RigidBodies | None = None,
     ) -> tuple[FaceVelocity, tuple[SolveReport, ...]]:
         """Viscosity on the wet faces; inflow and other `prescribed` faces (bool per component) keep their velocity.
 
         `distance` to the liquid's surface as for `viscosity.diffuse`; closed faces move with `solid`, or rest.
+        The liquid drags free `bodies`.
         """
         walls = window.walls
         fixed = self._inlet.face_masks(tuple(w.shape for w in wet), window.first)
@@ -322,9 +325,13 @@ class ParticleSimulator(ABC):
         stopped = FaceVelocity(
             *(np.where(o == 0, r, c) for o, r, c in zip(walls.openings, resting.components, velocity.components))
         )
-        roles = FaceRoles(solved, tuple(head_on), tuple(beside), distance, walls.signed_distance, solid)
-        new, reports = diffuse(
+        number = self.parameters.kinematic_viscosity * dt / self.grid.spacing**2
+        dragged = bodies.dragged() if bodies is not None and number >= NEGLIGIBLE else ()
+        roles = FaceRoles(solved, tuple(head_on), tuple(beside), distance, walls.signed_distance, solid, dragged)
+        new, change, reports = diffuse_with_bodies(
             stopped, roles, viscosity=self.parameters.kinematic_viscosity, dt=dt, spacing=self.grid.spacing,
             wall_share=self.parameters.wall_damping, tolerance=self.settings.viscosity_tolerance,
         )  # fmt: skip
+        if bodies is not None and dragged:
+            bodies.apply_viscosity(dragged, change)
         return (new if reports else velocity), reports

@@ -1,6 +1,6 @@
 """Pictures of the standard scenes, to look at: does the liquid move and look like a liquid?
 
-    python benchmarks/tanks_pictures.py --out /tmp/tanks dam river slope thread pool drop --scale 1.0
+    python benchmarks/tanks_pictures.py --out pictures dam river slope thread pool drop --scale 1.0
 
 For each scene a few instants, from the side and from above. The box is cut open like an aquarium; single drops that the
 smoothed surface does not hold are drawn as dots.

@@ -40,9 +40,9 @@ def test_a_minute_of_channel_flow_loses_no_water():
         emitted.append(report.emitted * tank.grid.spacing**3 / 8)
         volumes.append(gauge.volume(simulator.particles))
         masses.append(simulator.volume)
-    # what comes in is the section of the inlet times its speed; lattice points within a quarter of their spacing of the
-    # bed stay empty: an eighth of a cell along 9 cells of bed, of a section of 16.5 cells, is 7 %
-    assert np.sum(emitted) / 60.0 == pytest.approx(wanted, rel=0.08)
+    # what comes in is the section of the inlet times its speed. The bed cuts the lattice of particles: a fiftieth of a
+    # cell of clearance along 9 cells of bed, of a section of 16.5 cells, is 1.1 %
+    assert np.sum(emitted) / 60.0 == pytest.approx(wanted, rel=0.02)
     # the water swings along the reach (a seiche of about 8 s), so means over 20 s count; at the same level in the same
     # bed there must be the same water
     first, last = np.mean(volumes[5:15]), np.mean(volumes[20:30])

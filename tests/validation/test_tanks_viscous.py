@@ -177,8 +177,11 @@ def test_a_thread_of_honey_buckles_and_one_of_water_does_not():
     # 1969): it lays itself down in loops wider than itself. The inertia of water only spreads it
     assert honey > 0.5
     assert water < 0.25
-    # honey heaps up where water has run to the walls
-    assert heap < 0.85 * puddle
+    # liquid that covers the square plate evenly has a width of sqrt(2) rms = side / sqrt(3): water has run to the
+    # walls, honey heaps up
+    even = 0.036 / 0.003 / np.sqrt(3.0)
+    assert heap < 0.65 * even
+    assert puddle > 0.7 * even
 
 
 def test_honey_on_a_slope_sticks_to_the_board():

@@ -12,6 +12,8 @@ from fluidlift.numerics.sampling import sample_faces, sample_nodes
 from fluidlift.physics.boundaries import CLEARANCE, Walls, touching_faces
 from fluidlift.types import CellType, FaceVelocity, FluidParameters
 
+PHASES = np.array([0.7548776662466927, 0.5698402909980532])
+"""phases of neighbouring columns of the emission lattice, in spacings: Roberts' evenly spread sequence in the plane"""
 MODES = 12
 """plane waves that make up the inflow fluctuation"""
 
@@ -135,7 +137,27 @@ class Inlet:
 
     def travel(self, dt: float) -> None:
         """Move the emission pattern along with the bulk flow, so that new particles continue the old lattice."""
-        self.shift = np.mod(self.shift + self.bulk * dt, self.particle_spacing)
+        self.shift = self.shift + self.bulk * dt
+
+    def _lattice(self) -> Float[np.ndarray, "n 3"]:
+        """Points of the travelling lattice around the INFLOW cells.
+
+        Each column along the flow has a phase of its own, which travels with it: particles arrive one by one and not
+        layer by layer.
+        """
+        s, grid = self.particle_spacing, self._walls.grid
+        turns = np.floor(self.shift / s)
+        start = grid.low + self._low * grid.spacing - 0.5 * s + self.shift - turns * s
+        along = int(np.abs(self.bulk).argmax())
+        beside = [a for a in range(3) if a != along]
+        # shifts and phases are up to a spacing long: a layer more at the end, and one at the beginning of each column
+        index = [
+            np.arange(-1 if a == along else 0, n + 1) for a, n in enumerate((self._high - self._low) * self._per_side)
+        ]
+        lattice = np.stack(np.meshgrid(*index, indexing="ij"), axis=-1).reshape(-1, 3)
+        points = start + s * lattice
+        points[:, along] += s * np.mod((lattice - turns)[:, beside] @ PHASES, 1.0)
+        return points
 
     def missing(self, positions: Float[np.ndarray, "n 3"], rng: np.random.Generator) -> Float[np.ndarray, "n 3"]:
         """Places in INFLOW cells that lack a particle: points of the travelling lattice farther than 0.8 of its
@@ -143,10 +165,7 @@ class Inlet:
         if not self.active:
             return np.zeros((0, 3), np.float32)
         grid, s = self._walls.grid, self.particle_spacing
-        counts = (self._high - self._low) * self._per_side + 1  # one more: the pattern is shifted by up to a spacing
-        start = grid.low + self._low * grid.spacing - 0.5 * s + self.shift
-        axes = [start[a] + s * np.arange(counts[a]) for a in range(3)]
-        candidates = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+        candidates = self._lattice()
         candidates = candidates[grid.contains(candidates)]
         candidates = candidates[self.inside(candidates)]
         # every lattice point outside the solid: a wider berth would emit less than what flows through the opening
@@ -159,6 +178,6 @@ class Inlet:
             distance, _ = cKDTree(near).query(candidates, distance_upper_bound=0.8 * s)
             candidates = candidates[~np.isfinite(distance)]
         jittered = candidates + rng.uniform(-0.1, 0.1, candidates.shape) * s
-        inside = sample_nodes(self._walls.signed_distance, grid, jittered) <= clear
-        jittered[inside] = candidates[inside]
+        astray = ~self.inside(jittered) | (sample_nodes(self._walls.signed_distance, grid, jittered) <= clear)
+        jittered[astray] = candidates[astray]
         return np.clip(jittered, grid.low + clear, grid.high - clear).astype(np.float32)

@@ -207,6 +207,7 @@ class ParticleSimulator(ABC):
             pressure.append(outcome.pressure)
             viscosity.extend(outcome.viscosity)
         self.time = end
+        emitted += self._fill_inlet()  # what the last substep carried away leaves no gap in the frame
         return StepReport(
             duration, substeps, self._max_speed(), self.volume, self._wet_volume(), tuple(pressure), tuple(viscosity),
             len(self._particles), emitted, removed, retries,

@@ -8,16 +8,10 @@ import pytest
 import torch
 
 from fluidlift.physics.pressure import build_system
-from fluidlift.physics.rollout import (
-    RolloutOptions,
-    RolloutParameters,
-    apply_walls,
-    diffuse,
-    flatten,
-    project,
-    rollout,
-)
+from fluidlift.physics.rollout import RolloutParameters, apply_walls, flatten, rollout
 from fluidlift.physics.rollout_domain import extrapolation_matrix, prepare_domain
+from fluidlift.physics.rollout_operators import implicit_diffusion
+from fluidlift.physics.rollout_pressure import RolloutOptions, project
 from fluidlift.types import CellType, FaceVelocity, FluidParameters, Grid
 
 H = 0.1
@@ -27,6 +21,10 @@ WATER = FluidParameters(
     kinematic_viscosity=3e-3, gravity=(0.8, 0.1, -9.0), inflow_velocity=(1.0, 0.1, 0.0), inflow_fluctuation=0.1,
     outflow_velocity=0.9, restitution=0.3, wall_damping=0.2, time_step=0.02,
 )  # fmt: skip
+
+
+def diffuse(velocity, domain, p):
+    return implicit_diffusion(velocity, domain, p.kinematic_viscosity, p.wall_damping, p.time_step)
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -27,7 +27,7 @@ from fluidlift.fit.methods import Budget, Minimum, Progress, adam, evaluate, lev
 from fluidlift.fit.problem import FitProblem, FitScene, boundary_prior, build_problem, build_scene, plan_windows
 from fluidlift.fit.ranges import ParameterSpace, parameter_space
 from fluidlift.numerics.poisson import PoissonSystem
-from fluidlift.physics.rollout import RolloutOptions
+from fluidlift.physics.rollout_pressure import RolloutOptions
 from fluidlift.types import FaceVelocity, FitResult, FluidParameters, Grid, Terrain
 
 DEFAULT_FREE = (

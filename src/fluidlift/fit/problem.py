@@ -15,8 +15,9 @@ from fluidlift.errors import require
 from fluidlift.fit.loss import LossWeights, cell_velocity, grid_mask, residuals, velocity_loss
 from fluidlift.numerics.poisson import PoissonSystem
 from fluidlift.physics.pressure import build_system
-from fluidlift.physics.rollout import Rollout, RolloutOptions, RolloutParameters, flatten, rollout, unflatten
+from fluidlift.physics.rollout import Rollout, RolloutParameters, flatten, rollout, unflatten
 from fluidlift.physics.rollout_domain import RolloutDomain, prepare_domain
+from fluidlift.physics.rollout_pressure import RolloutOptions
 from fluidlift.types import CellType, FaceVelocity, FluidParameters, Grid, Terrain
 
 LONGEST_WINDOW = 25

@@ -23,18 +23,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy import sparse
 from torch import Tensor
 
 from fluidlift.errors import require
-from fluidlift.numerics.poisson import PoissonSystem, solve
 from fluidlift.physics.advection import Faces, advect
-from fluidlift.physics.rollout_domain import LinearMap, RolloutDomain
+from fluidlift.physics.rollout_domain import RolloutDomain
+from fluidlift.physics.rollout_operators import apply_linear, implicit_diffusion
+from fluidlift.physics.rollout_pressure import RolloutOptions, project
 from fluidlift.types import FaceVelocity, FluidParameters, SolveReport
 
 
@@ -63,19 +62,6 @@ class RolloutParameters:
     def fluid_parameters(self) -> FluidParameters:
         """Plain numbers."""
         return FluidParameters(**{k: v.detach().double().tolist() for k, v in vars(self).items()})
-
-
-@dataclass(frozen=True)
-class RolloutOptions:
-    """How a step is computed."""
-
-    projection: str = "implicit"
-    """"implicit": solved to `tolerance`, differentiated implicitly; "jacobi": exactly `sweeps` sweeps, self-adjoint"""
-    tolerance: float = 1e-5
-    sweeps: int = 100
-    advection_gradient: str = "exact"
-    """"exact", "upwind" (the paper's surrogate) or "plain" """
-    max_iterations: int = 200
 
 
 @dataclass(frozen=True)
@@ -113,101 +99,6 @@ def unflatten(flat: Float[Tensor, "f"], domain: RolloutDomain) -> Faces:
     return (u, v, w)
 
 
-class _Apply(torch.autograd.Function):
-    """A sparse matrix; backward is its transpose."""
-
-    @staticmethod
-    def forward(ctx: Any, x: Tensor, linear: LinearMap) -> Tensor:
-        ctx.linear = linear
-        return torch.from_numpy(linear.matrix @ x.detach().numpy())
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> Any:
-        return torch.from_numpy(ctx.linear.transpose @ gradients[0].contiguous().numpy()), None
-
-
-class _Pressure(torch.autograd.Function):
-    """q with A q = rhs. A is symmetric, so the adjoint is the same solve (or the same sweeps) of the gradient.
-
-    K Jacobi sweeps from zero are a polynomial in the scaled operator times its diagonal: symmetric as well.
-    """
-
-    @staticmethod
-    def forward(
-        ctx: Any,
-        rhs: Tensor,
-        system: PoissonSystem,
-        options: RolloutOptions,
-        guess: np.ndarray | None,
-        kept: list[tuple[np.ndarray, SolveReport]],
-    ) -> Tensor:
-        ctx.system, ctx.options = system, options
-        q, report = _solve_pressure(rhs, system, options, guess)
-        kept.append((q, report))
-        return torch.from_numpy(q.ravel())
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> Any:
-        q, _ = _solve_pressure(gradients[0], ctx.system, ctx.options, None)
-        return torch.from_numpy(q.ravel()), None, None, None, None
-
-
-def _solve_pressure(
-    rhs: Tensor, system: PoissonSystem, options: RolloutOptions, guess: np.ndarray | None
-) -> tuple[np.ndarray, SolveReport]:
-    b = np.where(system.unknown, rhs.detach().contiguous().numpy().reshape(system.unknown.shape), 0)
-    if options.projection == "jacobi":
-        return solve(system, b, method="jacobi", tolerance=0.0, max_iterations=options.sweeps)
-    return solve(system, b, tolerance=options.tolerance, max_iterations=options.max_iterations, initial=guess)
-
-
-class _Diffuse(torch.autograd.Function):
-    """x with (1 - c L + e W) x = b, L symmetric, W diagonal (given as a vector).
-
-    The adjoint l = (1 - c L + e W)^-1 g gives db = l, dc = l . L x, de = -l . W x.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, b: Tensor, c: Tensor, e: Tensor, laplacian: sparse.csr_matrix, drag: np.ndarray) -> Tensor:
-        ctx.operator = (float(c), float(e), laplacian, drag)
-        x = _solve_diffusion(b.detach().numpy(), *ctx.operator)
-        ctx.save_for_backward(torch.from_numpy(x))
-        return torch.from_numpy(x)
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> Any:
-        x = ctx.saved_tensors[0].numpy()
-        _, _, laplacian, drag = ctx.operator
-        adjoint = _solve_diffusion(gradients[0].contiguous().numpy(), *ctx.operator)
-        wide = adjoint.astype(float)
-        gc, ge = float(np.vdot(wide, laplacian @ x)), -float(np.vdot(wide, drag * x))
-        dtype = gradients[0].dtype
-        return torch.from_numpy(adjoint), torch.tensor(gc, dtype=dtype), torch.tensor(ge, dtype=dtype), None, None
-
-
-def _solve_diffusion(
-    b: np.ndarray, c: float, e: float, laplacian: sparse.csr_matrix, drag: np.ndarray, max_iterations: int = 500
-) -> np.ndarray:
-    """Conjugate gradients for (1 - c L + e W) x = b; the diagonal varies little, so no preconditioner is needed."""
-    tolerance = 1e-6 if b.dtype == np.float32 else 1e-13
-    friction = b.dtype.type(e) * drag
-    x = b.copy()
-    residual = c * (laplacian @ b) - friction * b
-    direction = residual.copy()
-    rr = float(np.vdot(residual, residual))
-    goal = (tolerance * float(np.linalg.norm(b))) ** 2
-    for _ in range(max_iterations):
-        if rr <= goal:
-            break
-        image = direction - c * (laplacian @ direction) + friction * direction
-        alpha = rr / float(np.vdot(direction, image))
-        x += b.dtype.type(alpha) * direction
-        residual -= b.dtype.type(alpha) * image
-        rr, previous = float(np.vdot(residual, residual)), rr
-        direction = residual + b.dtype.type(rr / previous) * direction
-    return x
-
-
 def apply_walls(
     velocity: Float[Tensor, "f"], domain: RolloutDomain, parameters: RolloutParameters
 ) -> Float[Tensor, "f"]:
@@ -218,29 +109,6 @@ def apply_walls(
     arriving = (velocity.abs() * parameters.time_step / domain.system.spacing).clamp(max=1)
     ahead = torch.where(velocity.detach() < 0, below, above)
     return velocity * (1 - parameters.restitution * ahead * arriving)
-
-
-def diffuse(velocity: Float[Tensor, "f"], domain: RolloutDomain, parameters: RolloutParameters) -> Float[Tensor, "f"]:
-    """One backward Euler step of viscosity; prescribed faces act as boundary values, walls by their damping."""
-    c = parameters.kinematic_viscosity * parameters.time_step
-    b = velocity + c * _Apply.apply(velocity, domain.boundary_laplacian)
-    e = c * parameters.wall_damping * (2 / float(domain.system.spacing) ** 2)
-    return _Diffuse.apply(b, c, e, domain.laplacian, domain.wall_count)
-
-
-def project(
-    velocity: Float[Tensor, "f"],
-    domain: RolloutDomain,
-    *,
-    options: RolloutOptions | None = None,
-    guess: np.ndarray | None = None,
-    kept: list[tuple[np.ndarray, SolveReport]] | None = None,
-) -> Float[Tensor, "f"]:
-    """The velocity without its divergence; appends the potential and the report of the solve to `kept`."""
-    options = options or RolloutOptions()
-    rhs = -_Apply.apply(velocity, domain.divergence)
-    q = _Pressure.apply(rhs, domain.system, options, guess, [] if kept is None else kept)
-    return velocity - _Apply.apply(q, domain.gradient)
 
 
 def set_inflow(
@@ -270,7 +138,7 @@ def step(
     """One time step of the flat face velocity; see the module for the order of terms."""
     options = options or RolloutOptions()
     o, h, dt = domain.offsets, float(domain.system.spacing), parameters.time_step
-    velocity = _Apply.apply(velocity, domain.extrapolation)
+    velocity = apply_linear(velocity, domain.extrapolation)
     moved = advect(
         unflatten(velocity, domain), dt, spacing=h, gradient=options.advection_gradient, active=domain.active()
     )
@@ -278,7 +146,7 @@ def step(
     force = torch.cat([parameters.gravity[a].expand(o[a + 1] - o[a]) for a in range(3)])
     velocity = velocity + dt * force * torch.from_numpy(domain.force)
     velocity = set_inflow(velocity, domain, parameters, pattern)
-    velocity = diffuse(velocity, domain, parameters)
+    velocity = implicit_diffusion(velocity, domain, parameters.kinematic_viscosity, parameters.wall_damping, dt)
     leaving = torch.from_numpy(domain.outflow_faces)
     velocity = velocity * (1 - leaving) + parameters.outflow_velocity * torch.from_numpy(domain.outflow)
     return project(velocity, domain, options=options, guess=guess, kept=kept)
@@ -322,6 +190,6 @@ def rollout(
     for i, (domain, pattern) in enumerate(zip(layouts, fields)):
         guess = guesses[i] if guesses is not None else None
         flat = step(flat, domain, parameters, pattern=pattern, options=options, guess=guess, kept=kept)
-    flat = _Apply.apply(flat, layouts[-1].extrapolation)
+    flat = apply_linear(flat, layouts[-1].extrapolation)
     potentials, reports = zip(*kept)
     return Rollout(flat, layouts[-1], potentials, reports)

@@ -10,11 +10,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy import ndimage, sparse
+from scipy import sparse
 
 from fluidlift.errors import require
 from fluidlift.numerics.poisson import PoissonSystem
 from fluidlift.physics.pressure import PressureSystem
+from fluidlift.physics.rollout_surface import sides, surface_distances
 from fluidlift.types import CellType
 
 
@@ -87,15 +88,6 @@ class RolloutDomain:
         return tuple(np.ascontiguousarray(self.dynamic[o[a] : o[a + 1]]) for a in range(3))
 
 
-def _sides(cells: np.ndarray, axis: int, outside: float = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Value of the cell on the low and on the high side of every face across `axis`."""
-    pad = [(0, 0)] * 3
-    pad[axis] = (1, 1)
-    wide = np.pad(cells, pad, constant_values=outside)
-    n = cells.shape[axis]
-    return np.take(wide, range(n + 1), axis), np.take(wide, range(1, n + 2), axis)
-
-
 def _shift(faces: np.ndarray, axis: int, by: int) -> np.ndarray:
     """The neighbour's value along `axis`, 0 beyond the array."""
     out = np.zeros_like(faces)
@@ -161,38 +153,6 @@ def _viscous_matrices(
     return assemble(inner) - sparse.diags(diagonal / h**2), assemble(outer)
 
 
-SMOOTHING = 1.0
-"""cells: standard deviation of the blur that turns a staircase of cells into a surface"""
-NEAREST_SURFACE = 0.25
-"""cells: distance of the surface from a fluid cell's centre is not taken smaller (conditioning)"""
-
-
-def surface_distances(cell_types: np.ndarray) -> list[Float[np.ndarray, "fx fy fz"]]:
-    """Where the surface lies on the way from a FLUID to an EMPTY cell's centre, in cells: 1 on all other faces.
-
-    p = 0 at the centres of EMPTY cells would make stairs of a sloping surface, each of which pushes with a full g. The
-    share of fluid is blurred instead (solids left out), and p = 0 where it passes one half (ghost fluid method, Enright
-    et al. 2003; Gibou et al. 2002).
-    """
-    fluid = np.isin(cell_types, (CellType.FLUID, CellType.INFLOW, CellType.OUTFLOW)).astype(float)
-    open_space = (cell_types != CellType.SOLID).astype(float)
-    weight = ndimage.gaussian_filter(open_space, SMOOTHING, mode="nearest")
-    share = ndimage.gaussian_filter(fluid * open_space, SMOOTHING, mode="nearest") / np.maximum(weight, 1e-6)
-    level = 0.5 - share
-    out = []
-    for axis in range(3):
-        low, high = _sides(level, axis)
-        wet_low, wet_high = _sides(cell_types == CellType.FLUID, axis)
-        # outside the box there is neither
-        dry_low, dry_high = _sides(cell_types == CellType.EMPTY, axis)
-        inner, outer = np.where(wet_low, low, high), np.where(wet_low, high, low)
-        crossing = (inner < 0) & (outer > 0)
-        distance = np.where(crossing, -inner / np.where(crossing, outer - inner, 1.0), 0.5)
-        surface = (wet_low & dry_high) | (dry_low & wet_high)
-        out.append(np.where(surface, np.clip(distance, NEAREST_SURFACE, 1.0), 1.0))
-    return out
-
-
 def _pressure_matrices(
     dynamic: np.ndarray, opening: np.ndarray, unknown: np.ndarray, distance: np.ndarray, axis: int, h: float
 ) -> tuple[sparse.csr_matrix, sparse.csr_matrix]:
@@ -241,8 +201,8 @@ def prepare_domain(
     types = np.asarray(cell_types)
     require(types.shape == system.unknown.shape, f"cell types {types.shape}", str(system.unknown.shape))
     h, unknown = float(system.spacing), system.unknown
-    touching = [np.logical_or(*_sides(unknown, a)) for a in range(3)]
-    is_inflow = [np.logical_or(*_sides(types == CellType.INFLOW, a)) for a in range(3)]
+    touching = [np.logical_or(*sides(unknown, a)) for a in range(3)]
+    is_inflow = [np.logical_or(*sides(types == CellType.INFLOW, a)) for a in range(3)]
     openings = _openings(system, is_inflow)
     closed_share = [np.where(t, 1.0 - o, 0.0) for t, o in zip(touching, openings)]
     distances = surface_distances(types) if smoke is None else [np.ones(t.shape) for t in touching]
@@ -253,7 +213,7 @@ def prepare_domain(
         dynamic = (system.weights[axis] > 0) & touching[axis]
         inflow = is_inflow[axis] & (opening > 0)
         wall = (opening == 0) & touching[axis]
-        low_out, high_out = _sides(types == CellType.OUTFLOW, axis)
+        low_out, high_out = sides(types == CellType.OUTFLOW, axis)
         leaving = dynamic & (low_out | high_out)
         along = 0.0 if mainstream is None else float(mainstream[axis])
         side, count = np.zeros(types.shape), np.zeros(types.shape)
@@ -263,8 +223,8 @@ def prepare_domain(
                 for ends in (range(n), range(1, n + 1)):
                     closed = np.take(closed_share[other], ends, other)
                     side, count = np.maximum(side, closed), count + closed
-        share = dynamic if smoke is None else dynamic * -0.5 * np.add(*_sides(np.asarray(smoke, float), axis))
-        below, above = _sides(unknown, axis)
+        share = dynamic if smoke is None else dynamic * -0.5 * np.add(*sides(np.asarray(smoke, float), axis))
+        below, above = sides(unknown, axis)
         inner, outer = _viscous_matrices(dynamic, inflow, wall, axis, h)
         divergence, gradient = _pressure_matrices(dynamic, opening, unknown, distances[axis], axis, h)
         new = {
@@ -274,8 +234,8 @@ def prepare_domain(
             "outflow_faces": leaving & (mainstream is not None),
             "interior": ~(inflow | wall),
             "force": share,
-            "wall_share": dynamic * np.maximum(*_sides(side, axis)),
-            "wall_count": dynamic * 0.5 * np.add(*_sides(count * unknown, axis)),
+            "wall_share": dynamic * np.maximum(*sides(side, axis)),
+            "wall_count": dynamic * 0.5 * np.add(*sides(count * unknown, axis)),
             "wall_below": dynamic * below * _shift(closed_share[axis], axis, -1),
             "wall_above": dynamic * above * _shift(closed_share[axis], axis, 1),
             "extrapolation": extrapolation_matrix(dynamic | inflow | wall, sweeps),

@@ -29,7 +29,7 @@ def fluidlift(*args: str, cwd=None) -> subprocess.CompletedProcess[str]:
 
 
 def test_help_and_version_load_no_heavy_package():
-    names = ["make", "inspect", "mask", "evaluate", "validate", "demo", "doctor"]
+    names = ["make", "fit", "sim", "inspect", "mask", "evaluate", "validate", "demo", "doctor"]
     commands = [["--help"], ["--version"], *([n, "--help"] for n in names)]
     code = ASK.format(commands=commands, heavy=HEAVY)
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
@@ -53,6 +53,8 @@ def test_the_version_is_that_of_the_package():
         ["make", "clip.mp4", "--colour", "blue"],
         ["mask", "clip.mp4"],
         ["evaluate", "a.fluid"],
+        ["fit"],
+        ["fit", "a.fluid", "--method", "guess"],
     ],
     ids=" ".join,
 )
@@ -69,6 +71,8 @@ def test_wrong_usage_is_told_apart_from_wrong_input(args):
         ["make", "missing.mp4"],
         ["inspect", "missing.mp4"],
         ["validate", "missing.fluid"],
+        ["fit", "missing.fluid"],
+        ["make", "missing.mp4", "--set", "fit.hold=[viscosty=1e-6]"],
         ["make", "missing.mp4", "--set", "fit.colour=blue"],
         ["make", "missing.mp4", "--config", "missing.yaml"],
     ],

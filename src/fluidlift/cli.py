@@ -107,6 +107,30 @@ class Sim:
 
 
 @dataclass(frozen=True)
+class Fit:
+    """Fit the physical parameters of a finished asset again; fluidlift sim then plays the new values."""
+
+    asset: Asset
+    """asset folder, with the work/ folder that make left"""
+    method: Literal["lm", "adam"] | None = None
+    """lm: Levenberg-Marquardt (the default); adam: as in the paper, slower"""
+    free: str | None = None
+    """parameters to fit, with commas between them, such as gravity,viscosity; by default all that the clip can tell"""
+    hold: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default_factory=tuple)
+    """a value that is known, such as --hold viscosity=1e-6; it is not fitted; may be repeated"""
+    restarts: int | None = None
+    """further fits from other initial values, whose spread is reported"""
+    seed: int | None = None
+    """of the restarts; by default that of the asset"""
+    max_seconds: float | None = None
+    """s that the fit may take; by default as in make"""
+    set: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default_factory=tuple)
+    """one setting of fit, such as --set fit.method=adam; may be repeated"""
+    json: bool = False
+    """print the outcome as JSON"""
+
+
+@dataclass(frozen=True)
 class Inspect:
     """Tell what a clip is, and what would be warned about."""
 
@@ -170,7 +194,7 @@ class Doctor:
     """print as JSON"""
 
 
-Command = Make | Sim | Inspect | Mask | Evaluate | Validate | Demo | Doctor
+Command = Make | Fit | Sim | Inspect | Mask | Evaluate | Validate | Demo | Doctor
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -257,6 +281,24 @@ def _tell(made: Any, as_json: bool) -> int:
         for text, name in (("asset", ""), ("preview", "preview.mp4"), ("report", "report.html")):
             print(f"  {text:8} {made.folder / name}")
     return WITH_WARNINGS if made.warnings else DONE
+
+
+def _fit(c: Fit) -> int:
+    from fluidlift.pipeline import refit
+
+    flat = {
+        "seed": c.seed, "fit.method": c.method, "fit.free": c.free, "fit.hold": c.hold or None,
+        "fit.restarts": c.restarts, "fit.max_seconds": c.max_seconds,
+    }  # fmt: skip
+    with _progress() as progress:
+        found = refit(c.asset, overrides=c.set, flat=flat, progress=progress)
+    if c.json:
+        print(json.dumps({"asset": str(found.folder), "seconds": found.seconds, "status": found.status,
+                          "reason": found.reason, "parameters": found.rows, "notes": found.notes,
+                          "warnings": found.warnings}, indent=1))  # fmt: skip
+    else:
+        print("\n".join(found.lines()))
+    return WITH_WARNINGS if found.warnings else DONE
 
 
 def _sim(c: Sim) -> int:
@@ -352,8 +394,8 @@ def _doctor(c: Doctor) -> int:
 
 
 _COMMANDS = {
-    Make: _make, Sim: _sim, Inspect: _inspect, Mask: _mask, Evaluate: _evaluate, Validate: _validate, Demo: _demo,
-    Doctor: _doctor,
+    Make: _make, Fit: _fit, Sim: _sim, Inspect: _inspect, Mask: _mask, Evaluate: _evaluate, Validate: _validate,
+    Demo: _demo, Doctor: _doctor,
 }  # fmt: skip
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import types
 import typing
 from dataclasses import dataclass, field
@@ -86,6 +87,12 @@ class FitConfig:
     """time budget"""
     method: Literal["lm", "adam"] = "lm"
     """Levenberg-Marquardt, or Adam as in the paper"""
+    free: tuple[str, ...] = ()
+    """parameters to fit, such as gravity,viscosity; none: all that the clip can tell something about"""
+    hold: tuple[str, ...] = ()
+    """values that are known, such as viscosity=1e-6: they are taken as they are"""
+    restarts: int = 0
+    """further fits from other initial values, whose spread is reported"""
 
 
 @dataclass(frozen=True)
@@ -176,6 +183,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "motion.targets": (1, 1e6),
     "motion.complete_every": (1, 1e6),
     "fit.max_seconds": (0, 1e9),
+    "fit.restarts": (0, 100),
     "simulate.frames": (1, 1e6),
     "simulate.max_particles": (100, 1e9),
     "simulate.checkpoint_every": (1, 1e6),
@@ -276,6 +284,8 @@ def _checked(value: Any, kind: Any, name: str) -> Any:
             return value
         if option is float and _is_number(value):
             return _in_range(float(value), name)
+        if typing.get_origin(option) is tuple:
+            return _words(value, name)
         if option in (int, bool, str) and type(value) is option:
             return _in_range(value, name) if option is int else value
     wanted = ", ".join(
@@ -283,6 +293,16 @@ def _checked(value: Any, kind: Any, name: str) -> Any:
         for o in options
     )
     raise InputRejected(f"option {name} = {value!r}", f"a value of type {wanted}")
+
+
+def _words(value: Any, name: str) -> tuple[str, ...]:
+    """A list of words, words between commas (those in brackets stay together), or names with values."""
+    if isinstance(value, dict):
+        value = [f"{k}={v}" for k, v in value.items()]
+    parts = re.split(r",(?![^\[(]*[\])])", value) if isinstance(value, str) else value or ()
+    if not isinstance(parts, list | tuple) or not all(isinstance(p, str) for p in parts):
+        raise InputRejected(f"option {name} = {value!r}", "words with commas between them, or a list of words")
+    return tuple(p.strip() for p in parts if p.strip())
 
 
 def _is_number(value: Any) -> bool:

@@ -233,14 +233,15 @@ def test_the_projection_gradient_is_that_of_finite_differences_at_its_working_to
     assert abs(slope - (b - a)) < bound * size
 
 
-def loss_of_rollout(values, domain, start, pattern, options):
+def loss_of_rollout(values, domain, start, pattern, options, steps=4):
     physical = parameters_of(WATER, **values)
-    result = rollout(start, domain, physical, steps=4, patterns=pattern, options=options)
+    result = rollout(start, domain, physical, steps=steps, patterns=pattern, options=options)
     inside = torch.from_numpy(domain.dynamic)
     return (result.velocity[inside] ** 2).mean() + result.velocity[inside].mean()
 
 
-def test_taylor_remainder_of_a_four_step_rollout_falls_with_the_square_of_the_step():
+@pytest.mark.parametrize("length", [4, 25])
+def test_taylor_remainder_of_a_rollout_falls_with_the_square_of_the_step(length):
     """f(x + e d) - f(x) - e f'(x) d is second order in e where the gradient is right, first order where it is not."""
     domain = domain_of(channel(), mainstream=DOWNSTREAM)
     # smooth start: kinks of the back-trace and of the walls are then not crossed by small steps
@@ -249,7 +250,7 @@ def test_taylor_remainder_of_a_four_step_rollout_falls_with_the_square_of_the_st
     pattern = torch.tensor(rng.standard_normal(domain.offsets[3]))
     base = vars(parameters_of(WATER))
     values = {k: v.clone().requires_grad_() for k, v in base.items() if k != "density"}
-    value = loss_of_rollout(values, domain, start, pattern, EXACT)
+    value = loss_of_rollout(values, domain, start, pattern, EXACT, length)
     value.backward()
     directions = {k: torch.tensor(rng.standard_normal(v.shape)) * (v.detach().abs() + 1e-3) for k, v in values.items()}
     slope = sum(float((values[k].grad * directions[k]).sum()) for k in values)
@@ -257,7 +258,7 @@ def test_taylor_remainder_of_a_four_step_rollout_falls_with_the_square_of_the_st
     remainders = []
     for e in steps:
         moved = {k: v.detach() + e * directions[k] for k, v in values.items()}
-        change = float((loss_of_rollout(moved, domain, start, pattern, EXACT) - value).detach())
+        change = float((loss_of_rollout(moved, domain, start, pattern, EXACT, length) - value).detach())
         remainders.append(abs(change - e * slope))
     order = np.polyfit(np.log(steps), np.log(remainders), 1)[0]
     print(f"order {order:.3f}, remainders {remainders}")
@@ -294,8 +295,31 @@ def test_first_guesses_change_nothing_but_the_work():
     torch.testing.assert_close(warm.velocity, cold.velocity, rtol=0, atol=1e-4)
 
 
+@pytest.mark.parametrize(("steps", "every"), [(7, 1), (7, 3), (25, 5), (100, 10)])
+def test_checkpoints_change_no_bit_of_the_gradient(steps, every):
+    domain = domain_of(channel(), dtype=np.float32, mainstream=DOWNSTREAM)
+    rng = np.random.default_rng(5)
+    pattern = torch.tensor(rng.standard_normal(domain.offsets[3]).astype(np.float32))
+    results = []
+    for checkpoint_every in (None, every):
+        values = {k: v.clone().requires_grad_() for k, v in vars(RolloutParameters.of(WATER)).items()}
+        start = torch.full((domain.offsets[3],), 0.5, requires_grad=True)
+        result = rollout(
+            start, domain, RolloutParameters(**values), steps=steps, patterns=pattern, checkpoint_every=checkpoint_every
+        )
+        assert len(result.reports) == len(result.potentials) == steps
+        (result.velocity**2).mean().backward()
+        grads = [v.grad for k, v in values.items() if k != "density"]
+        assert all(bool(torch.isfinite(g).all()) for g in grads)
+        results.append([result.velocity.detach(), start.grad, *grads])
+    for plain, checkpointed in zip(*results):
+        assert torch.equal(plain, checkpointed)
+
+
 def test_counts_that_do_not_match_are_refused():
     domain = domain_of(channel())
     flat = torch.zeros(domain.offsets[3], dtype=torch.float64)
     with pytest.raises(ValueError, match="2 domains for 3 steps"):
         rollout(flat, [domain, domain], parameters_of(WATER), steps=3)
+    with pytest.raises(ValueError, match="checkpoints every 0 steps"):
+        rollout(flat, domain, parameters_of(WATER), steps=3, checkpoint_every=0)

@@ -2,30 +2,39 @@
 
 The loss L = sum of r^2 is turned into a log likelihood by its own size at the minimum: N effective observations with
 the noise that the remaining residual shows, so -log p = N / (2 L) sum of r^2 + prior. With J = dr / d raw and prior
-widths s, the covariance of the raw variables is (N / L J^T J + diag(1 / s^2))^-1 (Gauss-Newton, Laplace).
+widths s, H = N / L J^T J + diag(1 / s^2) and the covariance of the raw variables is H^-1 (Gauss-Newton, Laplace).
 
 Targets come from pictures: neighbouring cells share their errors, and so do windows of a steady flow. N is the number
 of cells reduced by the correlation seen in the residual itself, so a misfit of the model (which is smooth in space)
-widens the uncertainty instead of hiding it.
+widens the uncertainty instead of hiding it. Beside it stands the cluster-robust covariance H^-1 M H^-1 (White 1980;
+Liang & Zeger 1986), M the scatter of what blocks of cells, over all times, contribute to the gradient: it knows where
+the errors are and how they are tied within a block. The wider of the two is reported.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
+from scipy import stats
 
-from fluidlift.fit.ranges import UNITS, FittedParameter, ParameterSpace
+from fluidlift.fit.ranges import UNITS, ParameterSpace
 from fluidlift.types import Estimate
 
 IDENTIFIABLE_BELOW = 0.5
 """share of the prior's standard deviation below which the data are said to determine a parameter"""
+PRECISE_WITHIN = 0.05
+"""standard deviation, relative to the value (a vector's component: to its size), up to which a parameter is reported as
+identifiable: its 95 % interval is then within 10 %"""
+BLOCK = 4
+"""cells along a side of a block whose errors are taken as tied"""
 EXCLUDED_BEYOND = 2.5
 """posterior standard deviations between the minimum and the prior beyond which the prior is excluded"""
-MODEL_ERROR = 0.01
-"""root mean square misfit, relative to U, that no fit is trusted beyond (discretisation)"""
+MODEL_ERROR = 0.002
+"""root mean square misfit, relative to U, that no fit is trusted beyond (single precision, pressure to a tolerance)"""
 
 
 def noise_level(loss: float) -> float:
@@ -89,6 +98,9 @@ class Curvature:
     observations: float
     """N"""
 
+    scatter: Float[np.ndarray, "p p"] | None = None
+    """sum over blocks of g g^T, g the block's part of J^T r, corrected for their number; None: unknown"""
+
     @property
     def precision_per_loss(self) -> float:
         """N / L: turns the loss into twice a negative log likelihood."""
@@ -96,8 +108,37 @@ class Curvature:
 
     def covariance(self, prior_sigma: Float[np.ndarray, "p"], fitted: Bool[np.ndarray, "p"]) -> np.ndarray:
         """[f,f] covariance of the fitted raw variables, the others held."""
-        data = self.precision_per_loss * self.normal[np.ix_(fitted, fitted)]
-        return np.linalg.inv(data + np.diag(1 / prior_sigma[fitted] ** 2))
+        part, prior = np.ix_(fitted, fitted), np.diag(1 / prior_sigma[fitted] ** 2)
+        laplace = np.linalg.inv(self.precision_per_loss * self.normal[part] + prior)
+        if self.scatter is None:
+            return laplace
+        robust = laplace @ (self.precision_per_loss**2 * self.scatter[part] + prior) @ laplace
+        wider = np.sqrt(np.maximum(np.diag(laplace) / np.maximum(np.diag(robust), 1e-300), 1.0))
+        return robust * np.outer(wider, wider)
+
+
+def block_scatter(
+    parts: list[tuple[Float[np.ndarray, "p n"], Float[np.ndarray, "n"], Int[np.ndarray, "n"]]], parameters: int
+) -> Float[np.ndarray, "p p"]:
+    """Sum of g g^T over blocks, g = J^T r of a block less the mean, for a Gaussian reading of its square root.
+
+    B blocks and p parameters: B / (B - p) for the freedom that the fit took, and the square of Student's quantile of
+    B - p degrees over the normal one, since the scatter itself is an estimate.
+
+    Args:
+        parts: columns of J, residuals and number of the block, per row; a number means the same block in all parts.
+        parameters: p.
+    """
+    count = 1 + max(int(block.max()) for _, _, block in parts)
+    sums, used = np.zeros((count, parameters)), np.zeros(count, bool)
+    for columns, rest, block in parts:
+        for p in range(parameters):
+            sums[:, p] += np.bincount(block, weights=columns[p].astype(float) * rest, minlength=count)
+        used |= np.bincount(block, weights=rest**2, minlength=count) > 0
+    sums = sums[used] - sums[used].mean(axis=0)
+    freedom = max(len(sums) - parameters, 2)
+    student = stats.t.ppf(0.975, freedom) / stats.norm.ppf(0.975)
+    return student**2 * len(sums) / freedom * np.einsum("bi,bj->ij", sums, sums)
 
 
 def determined(
@@ -125,47 +166,58 @@ def determined(
     return keep
 
 
-def _estimate(parameter: FittedParameter, raw: float, sigma: float, identifiable: bool) -> Estimate:
-    fitted = float(parameter.range.physical(torch.tensor(raw, dtype=torch.float64)))
-    return Estimate(
-        value=fitted if identifiable else parameter.prior,
-        sigma=sigma * parameter.range.slope(raw) if np.isfinite(sigma) else float("inf"),
-        identifiable=identifiable,
-        prior=parameter.prior,
-        unit=UNITS[parameter.name],
-    )
+def precise(space: ParameterSpace, raw: Float[np.ndarray, "p"], sigma: Float[np.ndarray, "p"]) -> Bool[np.ndarray, "p"]:
+    """Which variables are known to `PRECISE_WITHIN`; `sigma` is physical."""
+    values = [float(f.range.physical(torch.tensor(x, dtype=torch.float64))) for f, x in zip(space.fitted, raw)]
+    size: dict[str, float] = {}
+    for f, value in zip(space.fitted, values):
+        size[f.name] = math.hypot(size.get(f.name, 0.0), value)
+    for f in space.fixed:
+        if f.component is not None and f.name in size:
+            size[f.name] = math.hypot(size[f.name], f.value)
+    return np.array([s <= PRECISE_WITHIN * size[f.name] for f, s in zip(space.fitted, sigma)], bool)
 
 
 def estimates(
     space: ParameterSpace,
     raw: Float[np.ndarray, "p"],
     keep: Bool[np.ndarray, "p"],
+    curvature: Curvature,
     *,
-    everything: Curvature,
-    kept: Curvature,
+    also: dict[str, float] | None = None,
 ) -> dict[str, Estimate]:
     """Value and standard deviation per parameter, by label (`gravity_z`, `restitution`, ...).
 
-    Identifiable ones: uncertainty with the undetermined ones held at their prior. Undetermined ones: their prior, with
-    the uncertainty that they have when everything is free (inf where no data depend on them). Fixed ones: inf.
+    Determined ones: the fitted value, its uncertainty with the undetermined ones held at their prior; identifiable
+    where that is precise. Undetermined ones: their prior, with the uncertainty that they have when everything is free
+    (inf where no data depend on them). Fixed ones: inf.
 
     Args:
         space: of all fitted parameters.
         raw: their values.
         keep: which the data determine.
-        everything: curvature where all were free.
-        kept: curvature at the end, of the same size; only the kept block is used.
+        curvature: at the end.
+        also: physical standard deviations from elsewhere, by label, added in squares.
     """
     sigma = np.full(len(raw), np.inf)
-    felt = np.diag(everything.normal) > 0
-    if felt.any():
-        sigma[felt] = np.sqrt(np.diag(everything.covariance(space.prior_sigma, felt)))
-    if keep.any():
-        sigma[keep] = np.sqrt(np.diag(kept.covariance(space.prior_sigma, keep)))
+    felt = np.diag(curvature.normal) > 0
+    for some in (felt, keep & felt):
+        if some.any():
+            sigma[some] = np.sqrt(np.diag(curvature.covariance(space.prior_sigma, some)))
+    slopes = np.array([f.range.slope(float(x)) for f, x in zip(space.fitted, raw)])
+    more = np.array([(also or {}).get(f.label, 0.0) for f in space.fitted])
+    physical = np.where(np.isfinite(sigma), np.hypot(np.where(np.isfinite(sigma), sigma, 0) * slopes, more), np.inf)
+    sure = precise(space, raw, physical) & keep
     out = {}
     for i, parameter in enumerate(space.fitted):
-        value = float(raw[i]) if keep[i] else parameter.prior_raw
-        out[parameter.label] = _estimate(parameter, value, float(sigma[i]), bool(keep[i]))
+        fitted = float(parameter.range.physical(torch.tensor(float(raw[i]), dtype=torch.float64)))
+        out[parameter.label] = Estimate(
+            value=fitted if keep[i] else parameter.prior,
+            sigma=float(physical[i]),
+            identifiable=bool(sure[i]),
+            prior=parameter.prior,
+            unit=UNITS[parameter.name],
+        )
     for fixed in space.fixed:
         out[fixed.label] = Estimate(fixed.value, float("inf"), False, fixed.value, UNITS[fixed.name])
     return out

@@ -48,8 +48,10 @@ def surface_cells(cell_types: np.ndarray) -> np.ndarray:
     return fluid & beside
 
 
-def grid_mask(cell_types: np.ndarray, weights: LossWeights | None = None) -> Float[np.ndarray, "nx ny nz"]:
-    """Weight of each cell (paper: gridMask), summing to 1; SOLID, INFLOW and OUTFLOW cells count 0.
+def grid_mask(
+    cell_types: np.ndarray, weights: LossWeights | None = None, observed: np.ndarray | None = None
+) -> Float[np.ndarray, "nx ny nz"]:
+    """Weight of each cell (paper: gridMask), summing to 1; SOLID, INFLOW, OUTFLOW and hidden cells count 0.
 
     Raises:
         ValueError: no cell has a weight.
@@ -59,6 +61,8 @@ def grid_mask(cell_types: np.ndarray, weights: LossWeights | None = None) -> Flo
     mask = np.where(fluid, weights.occupied, 0.0)
     mask = np.where(surface_cells(cell_types), weights.surface, mask)
     mask = np.where(cell_types == CellType.EMPTY, weights.empty, mask)
+    if observed is not None:
+        mask = np.where(observed, mask, 0.0)
     require(mask.sum() > 0, "no fluid cell to compare velocities in", "at least one FLUID cell")
     return (mask / mask.sum()).astype(np.float32)
 

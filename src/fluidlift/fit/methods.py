@@ -2,73 +2,21 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
-from fluidlift.fit.identifiability import Curvature, effective_observations, noise_level
+from fluidlift.fit.evaluation import BACKWARD, Budget, Evaluation, Jacobian, evaluate, jacobian, products
+from fluidlift.fit.identifiability import Curvature, noise_level
 from fluidlift.fit.problem import FitProblem
 from fluidlift.fit.ranges import ParameterSpace
 
-Progress = Callable[[int, int], None]
-"""called with (done, total)"""
-DIFFERENCE = 0.02
-"""raw step of the forward differences: a few per cent, far above the 1e-5 that pressure solves leave"""
 EXPLORING_ITERATIONS = 6
 EXPLORING_OBSERVATIONS = 300.0
 """leaving the prior by three of its widths costs as much as a change that explains 3 % of the loss gains"""
 RESCALED_ADAM = (10, 20, 30, 45)
-
-
-@dataclass
-class Budget:
-    """What may be spent; counts as it goes."""
-
-    deadline: float
-    """of `time.monotonic`"""
-    max_rollouts: int
-    rollouts: int = 0
-    progress: Progress | None = None
-    started: float = field(default_factory=time.monotonic)
-
-    @property
-    def spent(self) -> bool:
-        """Nothing is left."""
-        return time.monotonic() >= self.deadline or self.rollouts >= self.max_rollouts
-
-    def tell(self) -> None:
-        """Report the share of the budget that is used."""
-        if self.progress is not None:
-            whole = max(self.deadline - self.started, 1e-9)
-            used = max((time.monotonic() - self.started) / whole, self.rollouts / self.max_rollouts)
-            self.progress(round(100 * min(used, 1.0)), 100)
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """Residuals of all windows at one point."""
-
-    raw: Float[np.ndarray, "p"]
-    residuals: list[np.ndarray]
-    guesses: list[tuple[np.ndarray, ...]]
-    solved: bool
-    """all pressure solves converged"""
-
-    @property
-    def loss(self) -> float:
-        """Sum of squares; inf where the rollout blew up."""
-        total = float(sum(np.vdot(r, r) for r in self.residuals))
-        return total if np.isfinite(total) else float("inf")
-
-    def observations(self, problem: FitProblem) -> float:
-        """Effective number of observations, from the magnitude terms."""
-        return effective_observations(
-            [r[..., 3:] for r in self.residuals], [w.mask.double().numpy() for w in problem.windows]
-        )
 
 
 @dataclass(frozen=True)
@@ -82,50 +30,84 @@ class Minimum:
     """None where the budget ended before the first Jacobian"""
     loss: float
     solved: bool
+    scale: float = 0.0
+    """weight of the loss against the prior at the end"""
+    jacobian: Jacobian | None = None
+    """the last one"""
+    at: Evaluation | None = None
+    """residuals at `raw`"""
 
 
-def evaluate(
-    problem: FitProblem,
-    space: ParameterSpace,
-    raw: Float[np.ndarray, "p"],
-    budget: Budget,
-    guesses: Sequence[Sequence[np.ndarray]] | None = None,
-) -> Evaluation:
-    """Roll all windows out."""
-    found, potentials, solved = [], [], True
-    with torch.no_grad():
-        parameters = space.physical(torch.as_tensor(raw, dtype=torch.float32))
-        for i in range(len(problem.windows)):
-            result = problem.roll(i, parameters, guesses[i] if guesses is not None else None)
-            found.append(problem.residual(i, result))
-            potentials.append(result.potentials)
-            solved &= all(r.converged for r in result.reports) or problem.options.projection == "jacobi"
-            budget.rollouts += 1
-    return Evaluation(np.array(raw, float), found, potentials, solved)
+@dataclass(frozen=True)
+class _Objective:
+    """scale / 2 sum r^2 + prior / 2: a negative log probability."""
+
+    space: ParameterSpace
+    scale: float
+
+    def value(self, there: Evaluation) -> float:
+        away = (there.raw - self.space.prior_raw) / self.space.prior_sigma
+        return 0.5 * self.scale * there.loss + 0.5 * float(np.square(away).sum())
+
+    def step(self, slopes: Jacobian, at: np.ndarray, damping: float, longest: float) -> tuple[np.ndarray, float]:
+        """The damped Gauss-Newton step, and the gain it predicts."""
+        width = self.space.prior_sigma
+        hessian = self.scale * slopes.normal + np.diag(1 / width**2)
+        gradient = self.scale * slopes.slope + (at - self.space.prior_raw) / width**2
+        step = -np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), gradient)
+        step *= min(1.0, longest / max(float(np.abs(step / width).max()), 1e-12))
+        return step, -float(step @ gradient + 0.5 * step @ hessian @ step)
 
 
-def jacobian_products(
-    problem: FitProblem, space: ParameterSpace, base: Evaluation, budget: Budget
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """J^T J and J^T r by forward differences; None where the budget ends first.
+@dataclass
+class _Search:
+    """The state of Levenberg-Marquardt."""
 
-    A dozen global parameters against many thousand residuals: one rollout per parameter, started from the pressures
-    of the base rollout, costs less than one adjoint per residual or than carrying tangents.
-    """
-    r = np.concatenate([x.ravel() for x in base.residuals])
-    columns = np.zeros((len(base.raw), r.size))
-    for p in range(len(base.raw)):
-        if budget.spent:
-            return None
-        # towards the prior, where the rollout is least likely to break down
-        h = DIFFERENCE if base.raw[p] <= space.prior_raw[p] else -DIFFERENCE
-        moved = base.raw.copy()
-        moved[p] += h
-        other = evaluate(problem, space, moved, budget, base.guesses)
-        if not np.isfinite(other.loss):
-            continue  # no derivative to be had here: the variable stays
-        columns[p] = (np.concatenate([x.ravel() for x in other.residuals]) - r) / h
-    return columns @ columns.T, columns @ r
+    here: Evaluation
+    damping: float = 1e-2
+    slopes: Jacobian | None = None
+    fresh: bool = False
+    """`slopes` are differences at `here`, and not carried on from the point before"""
+    small: bool = False
+    """the last step gained little or was short"""
+
+    def advance(
+        self, problem: FitProblem, objective: _Objective, budget: Budget, *, longest: float, enough: float
+    ) -> bool:
+        """One step to a better point; False where damping finds none."""
+        width, before = objective.space.prior_sigma, objective.value(self.here)
+        assert self.slopes is not None
+        while self.damping < 1e6 and not budget.spent:
+            step, predicted = objective.step(self.slopes, self.here.raw, self.damping, longest)
+            there = evaluate(problem, objective.space, self.here.raw + step, budget, self.here.guesses)
+            gain = before - objective.value(there)
+            short = float(np.abs(step / width).max()) < 0.01
+            if gain > 0:
+                self.small = short or gain < enough
+                self.damping = max(self.damping / 10, 1e-7)
+                # a model that foretold the gain is good for one more step
+                trusted = self.fresh and gain > 0.5 * predicted and not self.small
+                self.slopes = carried_on(self.slopes, step, self.here, there) if trusted else None
+                self.fresh, self.here = False, there
+                return True
+            if not self.fresh:
+                # the model may be at fault, not the length
+                self.slopes = None
+                return True
+            if short:
+                break
+            self.damping *= 8
+        self.small = self.small or not budget.spent
+        return False
+
+
+def carried_on(slopes: Jacobian, step: np.ndarray, before: Evaluation, after: Evaluation) -> Jacobian:
+    """The Jacobian changed least so that it explains the last step (Broyden 1965)."""
+    columns, square = [], float(step @ step)
+    for c, r0, r1 in zip(slopes.columns, before.residuals, after.residuals):
+        missed = (r1 - r0).ravel() - step @ c
+        columns.append((c + np.outer(step / square, missed)).astype(np.float32))
+    return Jacobian(columns, *products(columns, after.residuals))
 
 
 def levenberg_marquardt(
@@ -136,6 +118,7 @@ def levenberg_marquardt(
     *,
     max_iterations: int = 20,
     longest: float = 2.0,
+    explore: bool = True,
 ) -> Minimum:
     """Minimise N / (2 L) sum r^2 + prior / 2.
 
@@ -144,63 +127,52 @@ def levenberg_marquardt(
     point, for a few iterations or until steps get small. Then N and L are estimated from the residual found there and
     stay fixed: an objective that is re-estimated all the time can be lowered for ever by going back and forth.
 
-    A phase ends where a step moves no variable by more than a hundredth of its prior width, or gains less than 0.01
-    (exploring: 0.5) in the objective, a log probability, or where damping finds no better point.
+    Every other Jacobian is carried on by Broyden's update where the step went as foretold. A phase ends where a step
+    moves no variable by more than a hundredth of its prior width, or gains less than 0.01 (exploring: 0.5) in the
+    objective, a log probability, or where damping finds no better point.
 
     Args:
         longest: longest step, in prior widths.
+        explore: False begins with the second phase.
     """
-    prior, width = space.prior_raw, space.prior_sigma
-    here = evaluate(problem, space, start, budget)
-    history, converged, curvature = [here.loss], False, None
-    if not np.isfinite(here.loss):
-        return Minimum(here.raw, history, False, None, here.loss, here.solved)
-    damping, scale, exploring = 1e-2, 0.0, True
+    search = _Search(evaluate(problem, space, start, budget))
+    history, converged, scale = [search.here.loss], False, 0.0
+    if not np.isfinite(search.here.loss):
+        return Minimum(search.here.raw, history, False, None, search.here.loss, search.here.solved(problem))
+    exploring = explore
+    if not explore:
+        scale = precision(problem, search.here)
+    last: Jacobian | None = None
     for iteration in range(max_iterations):
-        products = jacobian_products(problem, space, here, budget)
-        if products is None:
-            break
-        normal, slope = products
-        curvature = Curvature(normal, here.loss, here.observations(problem))
+        if search.slopes is None:
+            search.slopes, search.fresh = jacobian(problem, space, search.here, budget), True
+            if search.slopes is None:
+                break
+            last = search.slopes
         if exploring and (converged or iteration >= EXPLORING_ITERATIONS):
-            exploring, converged, damping = False, False, min(damping, 1e-2)
-            scale = curvature.precision_per_loss
+            exploring, converged, search.damping = False, False, min(search.damping, 1e-2)
+            scale = precision(problem, search.here)
         elif exploring:
-            scale = EXPLORING_OBSERVATIONS / noise_level(here.loss)
-        hessian = scale * normal + np.diag(1 / width**2)
-        gradient = scale * slope + (here.raw - prior) / width**2
-        objective = 0.5 * scale * here.loss + 0.5 * float((((here.raw - prior) / width) ** 2).sum())
-        better = None
-        while damping < 1e6 and not budget.spent:
-            step = -np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), gradient)
-            step *= min(1.0, longest / max(float(np.abs(step / width).max()), 1e-12))
-            there = evaluate(problem, space, here.raw + step, budget, here.guesses)
-            value = 0.5 * scale * there.loss + 0.5 * float((((there.raw - prior) / width) ** 2).sum())
-            gain = objective - value
-            small = float(np.abs(step / width).max()) < 0.01
-            if gain > 0:
-                better = there
-                damping = max(damping / 10, 1e-7)
-                converged = small or gain < (0.5 if exploring else 0.01)
-                break
-            if small:
-                converged = True
-                break
-            damping *= 8
-        if better is None:
-            converged = converged or damping >= 1e6
-            if not converged:
-                break
-        else:
-            here = better
-            history.append(here.loss)
+            scale = EXPLORING_OBSERVATIONS / noise_level(search.here.loss)
+        objective, before = _Objective(space, scale), search.here
+        found = search.advance(problem, objective, budget, longest=longest, enough=0.5 if exploring else 0.01)
+        if search.here is not before:
+            history.append(search.here.loss)
         budget.tell()
-        if converged and not exploring:
+        converged = search.small
+        search.small = False
+        if (converged and not exploring) or (not found and not converged):
             break
-    converged = converged and not exploring
-    if curvature is not None:
-        curvature = Curvature(curvature.normal, here.loss, here.observations(problem))
-    return Minimum(here.raw, history, converged, curvature, here.loss, here.solved)
+    here = search.here
+    curvature = None if last is None else Curvature(last.normal, here.loss, here.observations(problem))
+    return Minimum(
+        here.raw, history, converged and not exploring, curvature, here.loss, here.solved(problem), scale, last, here
+    )
+
+
+def precision(problem: FitProblem, here: Evaluation) -> float:
+    """N / L: turns the loss into twice a negative log likelihood."""
+    return here.observations(problem) / noise_level(here.loss)
 
 
 def adam(
@@ -240,10 +212,11 @@ def adam(
             loss = problem.loss(i, problem.roll(i, space.physical(prior + width * z)))
             loss.backward()
             data += float(loss.detach())
-            budget.rollouts += 1
+        budget.count(problem, 1 + BACKWARD)
         # the windows' gradients are in z.grad; the prior's is added in closed form, in units of the loss
         with torch.no_grad():
             value = data + float((z**2).sum()) / scale
+            assert z.grad is not None
             z.grad += 2 * z / scale
             if value < best_value:
                 best, best_value = (prior + width * z).double().numpy().copy(), value
@@ -257,6 +230,8 @@ def adam(
             converged = True
             break
     here = evaluate(problem, space, best, budget)
-    products = jacobian_products(problem, space, here, budget)
-    curvature = None if products is None else Curvature(products[0], here.loss, here.observations(problem))
-    return Minimum(best, history or [first.loss], converged, curvature, here.loss, here.solved)
+    slopes = jacobian(problem, space, here, budget)
+    curvature = None if slopes is None else Curvature(slopes.normal, here.loss, here.observations(problem))
+    return Minimum(
+        best, history or [first.loss], converged, curvature, here.loss, here.solved(problem), scale, slopes, here
+    )

@@ -2,7 +2,7 @@
 
     v_sim^{i+n} = DiffSim^n(v_target^i; v_in, v~_in, v_out, rho, nu, b, d, g, dt)
 
-Windows of frames are rolled out from the target velocity at their start and compared with the target at their end.
+Windows of frames are rolled out from the target velocity at their start and compared with the targets along them.
 Weak priors around the initial values keep what the data cannot determine in place, and the curvature of the loss says
 what that is.
 """
@@ -10,50 +10,80 @@ what that is.
 from __future__ import annotations
 
 import math
+import os
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
-import numba
 import numpy as np
-import torch
 
 from fluidlift.errors import require
-from fluidlift.fit.coarsen import coarse_grid, coarsen_cells, coarsen_terrain, coarsen_velocity
-from fluidlift.fit.identifiability import Curvature, determined, estimates
-from fluidlift.fit.loss import LossWeights
-from fluidlift.fit.methods import Budget, Minimum, Progress, adam, evaluate, levenberg_marquardt
-from fluidlift.fit.problem import FitProblem, FitScene, boundary_prior, build_problem, build_scene, plan_windows
-from fluidlift.fit.ranges import ParameterSpace, parameter_space
+from fluidlift.fit.coarsen import coarse_grid, coarsen_cells, coarsen_distance, coarsen_terrain, coarsen_velocity
+from fluidlift.fit.evaluation import Budget, Progress, evaluate, single_thread
+from fluidlift.fit.identifiability import estimates
+from fluidlift.fit.inlet import boundary_prior, fluctuation_error
+from fluidlift.fit.minimise import Found, first_point, minimise
+from fluidlift.fit.problem import FitProblem, build_problem
+from fluidlift.fit.ranges import UNITS, VECTORS, ParameterSpace, parameter_space
+from fluidlift.fit.scene import FitScene, WindowPlan, build_scene, plan_windows
+from fluidlift.fit.settings import DEFAULT_FREE, FitOptions
 from fluidlift.numerics.poisson import PoissonSystem
-from fluidlift.physics.rollout_pressure import RolloutOptions
-from fluidlift.types import FaceVelocity, FitResult, FluidParameters, Grid, Terrain
+from fluidlift.types import CellType, Estimate, FaceVelocity, FitResult, FluidParameters, Grid, Terrain
 
-DEFAULT_FREE = (
-    "density", "kinematic_viscosity", "gravity", "inflow_velocity", "inflow_fluctuation", "outflow_velocity",
-    "restitution", "wall_damping", "time_step",
-)  # fmt: skip
-"""All of the paper's. The time step has a narrow prior: the interval between frames is known, its division a choice."""
-MOST_CELLS = 60_000
-"""layouts with more cells are coarsened by two, as often as needed"""
+__all__ = ["DEFAULT_FREE", "FitOptions", "fit_parameters"]
+
 BUOYANCY_SIGMA = 1.0
 """prior width of a plume's buoyancy, in units of its scale estimate"""
 PLANNED_ITERATIONS = 7
-"""Levenberg-Marquardt iterations that the number of windows leaves time for"""
+"""Levenberg-Marquardt iterations that the number of windows leaves work for"""
+ERRORS_BEYOND = 0.02
+"""standard deviation of a face's error, in units of U, from which the starts of windows are corrected"""
+SCALES = ((1.0, 1.0), (0.05, 0.5), (20.0, 2.0), (0.2, 1.5), (5.0, 0.7))
+"""factors of viscosity and of the velocities at the ends, of restarts"""
+APART = 3.0
+"""standard deviations between two ends that count as different"""
 
 
-@contextmanager
-def _single_thread() -> Iterator[None]:
-    """torch and Numba alternate in short kernels here: their thread pools would wait for each other by spinning."""
-    before = torch.get_num_threads(), numba.get_num_threads()
-    torch.set_num_threads(1)
-    numba.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before[0])
-        numba.set_num_threads(before[1])
+@dataclass(frozen=True)
+class _Data:
+    """What a fit is given, at one resolution."""
+
+    targets: Sequence[FaceVelocity]
+    layouts: Sequence[np.ndarray]
+    solid: PoissonSystem | Terrain | None
+    grid: Grid
+    kind: str
+    mainstream: np.ndarray | None
+    observed: Sequence[np.ndarray] | None
+    distances: Sequence[np.ndarray] | None
+
+    def scene(self) -> FitScene:
+        return build_scene(
+            self.targets, self.layouts, self.solid, self.grid, kind=self.kind, mainstream=self.mainstream,
+            observed=self.observed, distances=self.distances,
+        )  # fmt: skip
+
+    def coarser(self) -> _Data:
+        """Cells twice as wide."""
+        cells = {id(c): coarsen_cells(c) for c in self.layouts}
+        levels = None if self.distances is None else {id(d): coarsen_distance(d) for d in self.distances}
+        return replace(
+            self,
+            targets=[coarsen_velocity(t) for t in self.targets],
+            layouts=[cells[id(c)] for c in self.layouts],
+            solid=coarsen_terrain(self.solid) if isinstance(self.solid, Terrain) else None,
+            grid=coarse_grid(self.grid),
+            observed=None if self.observed is None else [_coarse_view(o) for o in self.observed],
+            distances=None if levels is None or self.distances is None else [levels[id(d)] for d in self.distances],
+        )
+
+
+def _coarse_view(observed: np.ndarray) -> np.ndarray:
+    """All of a block must be seen: a mean with hidden faces in it is none."""
+    even = np.pad(observed, [(0, n % 2) for n in observed.shape], mode="edge")
+    nx, ny, nz = (n // 2 for n in even.shape)
+    return np.asarray(even.reshape(nx, 2, ny, 2, nz, 2).all(axis=(1, 3, 5)))
 
 
 def fit_parameters(
@@ -66,18 +96,13 @@ def fit_parameters(
     *,
     kind: str = "stream",
     mainstream: np.ndarray | None = None,
-    windows: int = 3,
-    frames_per_window: int | None = None,
-    steps_per_frame: int | None = None,
-    max_rollouts: int = 600,
-    max_seconds: float = 60.0,
-    method: str = "lm",
-    free: Sequence[str] = DEFAULT_FREE,
-    prior_sigmas: dict[str, float] | None = None,
-    weights: LossWeights | None = None,
-    options: RolloutOptions | None = None,
-    device: str = "cpu",
+    observed: Sequence[np.ndarray] | np.ndarray | None = None,
+    liquid_distance: Sequence[np.ndarray] | np.ndarray | None = None,
+    restarts: int = 1,
+    seed: int = 0,
+    settings: FitOptions | None = None,
     progress: Progress | None = None,
+    **changes: Any,
 ) -> FitResult:
     """Fit the global parameters of a flow to its estimated velocities.
 
@@ -93,78 +118,253 @@ def fit_parameters(
         kind: "plume" is a gas: EMPTY cells are solved too, the box is open, and `gravity` acts on FLUID (smoke) cells
             alone and upwards: its size is the buoyancy in m/s^2, also in `extra["buoyancy"]`. All others are liquids.
         mainstream: unit direction of the outflow; default: the terrain's, else the mean velocity.
-        windows: most windows; fewer where time is short.
-        frames_per_window: n; default from the dynamics (`problem.plan_windows`).
-        steps_per_frame: default from the Courant number.
-        max_rollouts: rollouts of one window, all told.
-        max_seconds: wall clock; the best point so far is returned then. First-time compilation is not counted.
-        method: "lm" (Levenberg-Marquardt, finite differences) or "adam" (analytic gradient; the paper's way).
-        free: parameters to fit.
-        prior_sigmas: raw prior widths instead of `ranges.DEFAULT_PRIOR_SIGMAS`.
-        weights: of the loss.
-        options: of the rollout.
-        device: "cpu".
-        progress: called with (done, total): per cent of the budget used.
+        observed: bool [nx,ny,nz], one for all frames or one per target: cells whose velocity was seen. Others do not
+            count, and what the targets hold on faces of hidden cells alone does not matter. None: all.
+        liquid_distance: m [nx,ny,nz], one for all frames or one per target: distance of cell centres to the liquid's
+            surface, negative inside; None: estimated from the cell types.
+        restarts: starts from this many initial scales (viscosity by decades, velocities at the ends); the best counts
+            and `FitResult.ends` holds all of them.
+        seed: not used: scales of restarts are a fixed list.
+        settings: everything else.
+        progress: called with (done, total): per cent of the work used.
+        **changes: fields of `FitOptions`, replacing those of `settings`.
 
     Returns:
         parameters, one `Estimate` per number (`gravity_z`, `restitution`, ...), the loss history, and what happened.
-        Parameters that the data do not determine have their prior value and `identifiable=False`; their sigma may be
-        inf.
+        Identifiable ones are known to some 5 %. Ones that are known less well, but clearly better than before, have
+        their fitted value and `identifiable=False`. What the data do not determine has its prior value and
+        `identifiable=False`; its sigma may be inf. A fit that failed has `reason`, and its parameters are the initial
+        ones.
 
     Raises:
         ValueError: arguments that do not fit together.
     """
-    require(device == "cpu", f"device '{device}'", "'cpu'")
-    require(method in ("lm", "adam"), f"method '{method}'", "'lm' or 'adam'")
+    options = replace(settings or FitOptions(), **({"restarts": max(restarts, 1)} | changes))
     require(len(targets) >= 1, "no target velocity", "one or more")
     require(np.isfinite(interval) and interval > 0, f"interval {interval}", "positive seconds")
-    layouts = [cell_types] * len(targets) if isinstance(cell_types, np.ndarray) else list(cell_types)
-    require(len(layouts) == len(targets), f"{len(layouts)} layouts, {len(targets)} targets", "one, or one per target")
+    n = len(targets)
+    layouts = _each(cell_types, n, grid, "layouts")
+    assert layouts is not None
     require(all(t.shape == grid.shape for t in targets), "targets of another shape than the grid", str(grid.shape))
-    require(all(c.shape == grid.shape for c in layouts), "cell types of another shape than the grid", str(grid.shape))
-    notes: list[str] = []
-    with _single_thread():
-        begun = time.monotonic()
-        scene = _scene(targets, layouts, system_or_terrain, grid, kind, mainstream, notes)
-        prior, sigmas = boundary_prior(scene, initial), dict(prior_sigmas or {})
-        if kind == "plume":
-            prior, sigmas = _buoyancy_prior(prior, scene), {"gravity": BUOYANCY_SIGMA} | sigmas
-        fall = math.hypot(*prior.gravity)
-        plan = plan_windows(
-            scene, interval, windows=windows, steps_per_frame=steps_per_frame, frames=frames_per_window, fall=fall
-        )
-        if plan.steady:
-            notes.append("one target velocity: the flow is taken as steady")
-        prior = replace(prior, time_step=interval / plan.steps_per_frame)
-        space = parameter_space(
-            prior, free=tuple(free), speed=scene.speed, spacing=scene.grid.spacing, prior_sigmas=sigmas
-        )
-        problem = build_problem(scene, plan, weights=weights, options=options)
-        budget = Budget(begun + max_seconds, max_rollouts, progress=progress)
-        problem = _within_budget(problem, space, budget, notes)
-        result = _fit(problem, space, budget, method, notes)
+    views, levels = _each(observed, n, grid, "observed cells"), _each(liquid_distance, n, grid, "distances")
+    data = _Data(targets, layouts, system_or_terrain, grid, kind, mainstream, views, levels)
+    nothing = _no_flow(data)
+    if nothing:
+        return _failure(initial, nothing)
+    workers = options.workers or os.cpu_count() or 1
+    budget = Budget(time.monotonic() + options.max_seconds, options.max_rollouts, options.max_work, workers, progress)
+    with single_thread():
+        result = _Fit(data, interval, initial, options, budget).run()
     if kind == "plume":
         return replace(result, extra=result.extra | {"buoyancy": math.hypot(*result.parameters.gravity)})
     return result
 
 
-def _scene(
-    targets: Sequence[FaceVelocity],
-    layouts: Sequence[np.ndarray],
-    solid: PoissonSystem | Terrain | None,
-    grid: Grid,
-    kind: str,
-    mainstream: np.ndarray | None,
-    notes: list[str],
-) -> FitScene:
-    """The scene, coarsened until it is small enough."""
-    while grid.cells > MOST_CELLS and not isinstance(solid, PoissonSystem):
-        known = {id(c): coarsen_cells(c) for c in layouts}
-        targets, layouts = [coarsen_velocity(t) for t in targets], [known[id(c)] for c in layouts]
-        solid = coarsen_terrain(solid) if isinstance(solid, Terrain) else None
-        grid = coarse_grid(grid)
-        notes.append(f"fitted on {grid.shape} cells of {grid.spacing:.3g} m, coarsened by two")
-    return build_scene(targets, layouts, solid, grid, kind=kind, mainstream=mainstream)
+def _each(values: Any, count: int, grid: Grid, what: str) -> list[np.ndarray] | None:
+    """One array per target."""
+    if values is None:
+        return None
+    out = [values] * count if isinstance(values, np.ndarray) else list(values)
+    require(len(out) == count, f"{len(out)} {what}, {count} targets", "one, or one per target")
+    require(all(v.shape == grid.shape for v in out), f"{what} of another shape than the grid", str(grid.shape))
+    return out
+
+
+def _no_flow(data: _Data) -> str:
+    """Why there is nothing to fit; empty where there is."""
+    views = data.observed if data.observed is not None else [np.ones(data.grid.shape, bool)] * len(data.targets)
+    fluid = [(np.asarray(c) == CellType.FLUID) & v for c, v in zip(data.layouts, views)]
+    if not all(f.any() for f in fluid):
+        return "no fluid cell was seen"
+    moving = sum(float(np.abs(t.at_centers()[f]).sum()) for t, f in zip(data.targets, fluid))
+    return "" if moving > 0 or not math.isfinite(moving) else "the targets are at rest"
+
+
+def _failure(initial: FluidParameters, reason: str) -> FitResult:
+    """The initial values, of which nothing was learnt."""
+    values, known = initial.to_dict(), {}
+    for name, unit in UNITS.items():
+        numbers = zip(("_x", "_y", "_z"), values[name]) if name in VECTORS else [("", values[name])]
+        known |= {name + end: Estimate(float(v), math.inf, False, float(v), unit) for end, v in numbers}
+    return FitResult(
+        initial, known, np.zeros(0), False, 0, (f"{reason}: nothing was fitted",), {"loss": math.inf}, reason
+    )
+
+
+@dataclass
+class _Fit:
+    """One call of `fit_parameters`."""
+
+    data: _Data
+    interval: float
+    initial: FluidParameters
+    options: FitOptions
+    budget: Budget
+
+    def __post_init__(self) -> None:
+        self.notes: list[str] = []
+
+    def run(self) -> FitResult:
+        options = self.options
+        while self.data.grid.cells > options.most_cells and not isinstance(self.data.solid, PoissonSystem):
+            self.data = self.data.coarser()
+            grid = self.data.grid
+            self.notes.append(f"fitted on {grid.shape} cells of {grid.spacing:.3g} m, coarsened by two")
+        scene = self.data.scene()
+        plan, space = self.plan(scene)
+        problem = self.problem(scene, plan, space)
+        at_prior = evaluate(problem, space, space.prior_raw, self.budget)
+        if not math.isfinite(at_prior.loss):
+            self.notes.append("the rollout breaks down at the start: nothing was fitted")
+            failed = _failure(space.fluid_parameters(space.prior_raw), "the rollout breaks down at the start")
+            return replace(failed, notes=tuple(self.notes), rollouts=self.budget.rollouts)
+        ends = [
+            self.one(scene, plan, problem, space, np.array(start))
+            for start in self.starts(space)
+            if not self.budget.spent or start is None or np.array_equal(start, space.prior_raw)
+        ]
+        best = min(ends, key=lambda e: (bool(e.reason), e.objective(space)))
+        return self.result(scene, problem, space, best, ends, at_prior.loss)
+
+    def plan(self, scene: FitScene) -> tuple[WindowPlan, ParameterSpace]:
+        """Windows and variables."""
+        prior, sigmas = boundary_prior(scene, self.initial), dict(self.options.prior_sigmas or {})
+        if self.data.kind == "plume":
+            prior, sigmas = _buoyancy_prior(prior, scene), {"gravity": BUOYANCY_SIGMA} | sigmas
+        plan = plan_windows(
+            scene, self.interval, windows=self.options.windows, steps_per_frame=self.options.steps_per_frame,
+            frames=self.options.frames_per_window, fall=math.hypot(*prior.gravity),
+        )  # fmt: skip
+        if plan.steady:
+            self.notes.append("one target velocity: the flow is taken as steady")
+        prior = replace(prior, time_step=self.interval / plan.steps_per_frame)
+        space = parameter_space(
+            prior, free=tuple(self.options.free), speed=scene.speed, spacing=scene.grid.spacing, prior_sigmas=sigmas
+        )
+        return plan, space
+
+    def problem(self, scene: FitScene, plan: WindowPlan, space: ParameterSpace, tell: bool = True) -> FitProblem:
+        """The windows, fewer where all of them are too much work for a handful of iterations."""
+        o = self.options
+        problem = build_problem(scene, plan, weights=o.weights, options=o.options, compare=o.compare, device=o.device)
+        columns, n = len(space.fitted) + 2, len(problem.windows)
+        room = min(o.max_work / (problem.work / n), float(o.max_rollouts))
+        affordable = max(int(room / (PLANNED_ITERATIONS * columns)), 1)
+        if affordable >= n:
+            return problem
+        chosen = np.unique(np.linspace(0, n - 1, affordable).round().astype(int))
+        if tell:
+            self.notes.append(f"{len(chosen)} of {n} windows, to keep within the budget")
+        return replace(problem, windows=tuple(problem.windows[i] for i in chosen))
+
+    def starts(self, space: ParameterSpace) -> list[np.ndarray]:
+        """The prior, and other scales of viscosity and of the velocities at the ends."""
+        out = []
+        for viscosity, ends in SCALES[: self.options.restarts]:
+            raw = space.prior_raw.copy()
+            for i, f in enumerate(space.fitted):
+                if f.name == "kinematic_viscosity":
+                    raw[i] += math.log(viscosity)
+                elif f.name in ("inflow_velocity", "outflow_velocity"):
+                    raw[i] *= ends
+                elif f.name == "wall_damping":
+                    raw[i] += math.log(ends)
+            out.append(raw)
+        return out
+
+    def one(
+        self, scene: FitScene, plan: WindowPlan, problem: FitProblem, space: ParameterSpace, start: np.ndarray
+    ) -> Found:
+        """The minimum from one start, first on wider cells where the layout is large."""
+        errors = scene.noise > ERRORS_BEYOND * scene.speed or any(o is not None and not o.all() for o in scene.observed)
+        begun, explore = start, True
+        coarse = scene.grid.cells > self.options.coarse_first and not isinstance(self.data.solid, PoissonSystem)
+        if coarse and not self.budget.spent:
+            wide = self.data.coarser().scene()
+            rough = self.problem(wide, plan, space, tell=False)
+            begun = first_point(rough, space, begun, self.budget)
+            near = minimise(rough, space, begun, self.budget, replace(self.options, start_rounds=0), errors=False)
+            if not near.reason:
+                begun, explore = near.raw, False
+        elif not self.budget.spent:
+            begun = first_point(problem, space, begun, self.budget)
+        return minimise(problem, space, begun, self.budget, self.options, errors=errors, explore=explore)
+
+    def result(
+        self, scene: FitScene, problem: FitProblem, space: ParameterSpace, best: Found, ends: list[Found],
+        at_prior: float,
+    ) -> FitResult:  # fmt: skip
+        """Numbers with their uncertainties, and what is to be said about them."""
+        rest = problem.loss_at_rest()
+        reason = best.reason
+        if not reason and best.loss >= rest:
+            reason = (
+                f"the simulated flow is no nearer to the targets than a fluid at rest ({best.loss:.3g}, {rest:.3g})"
+            )
+        if not reason and best.loss > at_prior * (1 + 1e-6):
+            reason = f"no values explain the motion better than the initial ones ({best.loss:.3g}, {at_prior:.3g})"
+        if not reason and not best.keep.any():
+            reason = "the data determine none of the parameters"
+        if reason:
+            self.notes.append(f"{reason}: nothing was fitted")
+            best = replace(best, raw=space.prior_raw, keep=np.zeros(len(best.raw), bool))
+        known = estimates(space, best.raw, best.keep, best.curvature, also=fluctuation_error(scene))
+        self._tell(space, best, known)
+        spread = self._ends(space, best, ends, known)
+        plan = problem.windows[0].domains
+        return FitResult(
+            parameters=space.fluid_parameters(best.raw),
+            estimates=known,
+            loss_history=np.asarray(best.history),
+            converged=best.converged and not reason,
+            rollouts=self.budget.rollouts,
+            notes=tuple(self.notes),
+            extra={
+                "loss": best.loss,
+                "loss_at_prior": at_prior,
+                "loss_at_rest": rest,
+                "observations": best.curvature.observations,
+                "windows": float(len(problem.windows)),
+                "steps_per_window": float(len(plan)),
+                "speed": problem.speed,
+                "noise": scene.noise / scene.speed,
+                "work": self.budget.work,
+                "seconds": time.monotonic() - self.budget.started,
+            },
+            reason=reason,
+            ends=spread,
+        )
+
+    def _tell(self, space: ParameterSpace, best: Found, known: dict[str, Estimate]) -> None:
+        labels = [f.label for f in space.fitted]
+        held = [label for label, keep in zip(labels, best.keep) if not keep]
+        loose = [label for label, keep in zip(labels, best.keep) if keep and not known[label].identifiable]
+        if self.budget.stopped_by_clock:
+            self.notes.append("stopped by the clock: not reproducible")
+        if not best.converged and not best.reason:
+            self.notes.append(f"not converged after {self.budget.rollouts} rollouts")
+        if not best.solved:
+            self.notes.append("some pressure solves did not reach their tolerance")
+        if loose:
+            self.notes.append("known loosely, fitted value used: " + ", ".join(sorted(loose)))
+        if held:
+            self.notes.append("not determined by the data, kept at the prior: " + ", ".join(sorted(held)))
+
+    def _ends(
+        self, space: ParameterSpace, best: Found, ends: list[Found], known: dict[str, Estimate]
+    ) -> tuple[FluidParameters, ...]:
+        if len(ends) < 2:
+            return ()
+        apart = []
+        for i, f in enumerate(space.fitted):
+            sigma = known[f.label].sigma
+            if best.keep[i] and math.isfinite(sigma):
+                slope = f.range.slope(float(best.raw[i]))
+                away = max(abs(e.raw[i] - best.raw[i]) for e in ends) * slope
+                apart += [f.label] if away > APART * sigma else []
+        if apart:
+            self.notes.append("restarts end at different values of " + ", ".join(sorted(apart)))
+        return tuple(space.fluid_parameters(e.raw) for e in ends)
 
 
 def _buoyancy_prior(prior: FluidParameters, scene: FitScene) -> FluidParameters:
@@ -175,102 +375,3 @@ def _buoyancy_prior(prior: FluidParameters, scene: FitScene) -> FluidParameters:
     size = float(np.linalg.norm(down))
     down = down / size if size > 0 else np.array([0.0, 0.0, -1.0])
     return replace(prior, gravity=tuple(strength * down))
-
-
-def _within_budget(problem: FitProblem, space: ParameterSpace, budget: Budget, notes: list[str]) -> FitProblem:
-    """Fewer windows where all of them would take too long for a handful of iterations."""
-    one = replace(problem, windows=problem.windows[:1])
-    evaluate(one, space, space.prior_raw, budget)
-    # the first call compiles; that is paid once per machine and not the fit's
-    began = time.monotonic()
-    budget.deadline += began - budget.started
-    evaluate(one, space, space.prior_raw, budget)
-    each = max(time.monotonic() - began, 1e-6)
-    columns = len(space.fitted) + 2
-    room = min((budget.deadline - began) / each, budget.max_rollouts - budget.rollouts)
-    affordable = max(int(room / (PLANNED_ITERATIONS * columns)), 1)
-    if affordable >= len(problem.windows):
-        return problem
-    chosen = np.unique(np.linspace(0, len(problem.windows) - 1, affordable).round().astype(int))
-    notes.append(f"{len(chosen)} of {len(problem.windows)} windows, to keep within the budget")
-    return replace(problem, windows=tuple(problem.windows[i] for i in chosen))
-
-
-def _start(problem: FitProblem, space: ParameterSpace, budget: Budget) -> np.ndarray:
-    """The prior, with the viscosity of the lowest loss among a few.
-
-    Viscosity spans decades, and below what the grid resolves the loss is flat in it: a start there would never move.
-    """
-    best = space.prior_raw
-    index = [i for i, f in enumerate(space.fitted) if f.name == "kinematic_viscosity"]
-    if not index:
-        return best
-    one = replace(problem, windows=problem.windows[:1])
-    lowest = math.inf
-    for value in (space.prior_raw[index[0]], *np.log([0.01, 0.1, 1.0])):
-        raw = space.prior_raw.copy()
-        raw[index[0]] = value
-        if budget.spent:
-            break
-        loss = evaluate(one, space, raw, budget).loss
-        # a hundredth better, or the prior stays
-        if loss < 0.99 * lowest:
-            best, lowest = raw, loss
-    return best
-
-
-def _fit(problem: FitProblem, space: ParameterSpace, budget: Budget, method: str, notes: list[str]) -> FitResult:
-    """Minimise, hold what is not determined at its prior, and minimise the rest again."""
-    minimise = levenberg_marquardt if method == "lm" else adam
-    at_prior = evaluate(problem, space, space.prior_raw, budget).loss
-    start = _start(problem, space, budget)
-    found = minimise(problem, space, start, budget)
-    history, converged = list(found.history), found.converged
-    curvature, raw = found.curvature, found.raw.copy()
-    if curvature is None:
-        broken = "the rollout breaks down at the start" if not math.isfinite(found.loss) else "the budget ended early"
-        notes.append(f"{broken}: nothing was fitted")
-        raw = space.prior_raw
-        curvature = Curvature(np.zeros((len(raw), len(raw))), found.loss, 1.0)
-    keep = determined(curvature, space.prior_sigma, raw - space.prior_raw)
-    held = {f.label for f, k in zip(space.fitted, keep) if not k}
-    smaller, kept, final = space.keep_prior(held), curvature, found.loss
-    if keep.any() and held:
-        again = levenberg_marquardt(problem, smaller, raw[keep], budget, max_iterations=8)
-        raw[keep] = again.raw
-        history += again.history[1:]
-        converged, final = converged and again.converged, again.loss
-        kept = _widened(again, keep) or curvature
-    if not converged:
-        notes.append(f"not converged after {budget.rollouts} rollouts")
-    if not found.solved:
-        notes.append("some pressure solves did not reach their tolerance")
-    if held:
-        notes.append("not determined by the data, kept at the prior: " + ", ".join(sorted(held)))
-    return FitResult(
-        parameters=smaller.fluid_parameters(raw[keep]),
-        estimates=estimates(space, raw, keep, everything=curvature, kept=kept),
-        loss_history=np.asarray(history),
-        converged=converged,
-        rollouts=budget.rollouts,
-        notes=tuple(notes),
-        extra={
-            "loss": final,
-            "loss_at_prior": at_prior,
-            "loss_at_rest": problem.loss_at_rest(),
-            "observations": kept.observations,
-            "windows": float(len(problem.windows)),
-            "steps_per_window": float(len(problem.windows[0].domains)),
-            "speed": problem.speed,
-            "seconds": time.monotonic() - budget.started,
-        },
-    )
-
-
-def _widened(minimum: Minimum, keep: np.ndarray) -> Curvature | None:
-    """The curvature of some parameters in the matrix of all."""
-    if minimum.curvature is None:
-        return None
-    normal = np.zeros((keep.size, keep.size))
-    normal[np.ix_(keep, keep)] = minimum.curvature.normal
-    return Curvature(normal, minimum.curvature.loss, minimum.curvature.observations)

@@ -1,53 +1,64 @@
-"""A fit as a least-squares problem: windows of frames, rolled out and compared with their last frame."""
+"""A fit as a least-squares problem: windows of frames, rolled out and compared with the frames along them."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from fluidlift.errors import require
+from fluidlift.fit.inlet import inflow_patterns
 from fluidlift.fit.loss import LossWeights, cell_velocity, grid_mask, residuals, velocity_loss
-from fluidlift.numerics.poisson import PoissonSystem
-from fluidlift.physics.pressure import build_system
-from fluidlift.physics.rollout import Rollout, RolloutParameters, flatten, rollout, unflatten
-from fluidlift.physics.rollout_domain import RolloutDomain, prepare_domain
+from fluidlift.fit.scene import FitScene, WindowPlan, build_scene, plan_windows
+from fluidlift.fit.states import divergence_free, fill_hidden, smooth_in_time
+from fluidlift.physics.rollout import RolloutParameters, rollout, unflatten
+from fluidlift.physics.rollout_domain import RolloutDomain
 from fluidlift.physics.rollout_pressure import RolloutOptions
-from fluidlift.types import CellType, FaceVelocity, FluidParameters, Grid, Terrain
+from fluidlift.types import SolveReport
 
-LONGEST_WINDOW = 25
-"""steps; the paper's longest"""
+__all__ = ["FitProblem", "Run", "Window", "build_problem", "build_scene", "plan_windows"]
 
-
-@dataclass(frozen=True)
-class WindowPlan:
-    """How frames are cut into windows."""
-
-    starts: tuple[int, ...]
-    """first frames"""
-    frames: int
-    """length n: frame i is rolled out to frame i + n"""
-    steps_per_frame: int
-    steady: bool
-    """one target only: it must stay as it is"""
+UNSEEN = 0.5
+"""weight of the fill of a hidden face, relative to that of a seen one: between neighbours it is not much worse"""
 
 
 @dataclass(frozen=True)
 class Window:
-    """One rollout to be compared with one target."""
+    """One rollout to be compared with targets along it."""
 
     start: Float[Tensor, "f"]
+    """open-face velocity; the rollout begins with its divergence-free part"""
+    measured: Float[Tensor, "f"]
+    """the start as it was measured"""
+    trust: Float[Tensor, "f"]
+    """weight of the measured start per face, in units of the loss over (m/s)^2; 0 where it was not seen"""
     domains: tuple[RolloutDomain, ...]
     """one per step"""
     patterns: tuple[Tensor | None, ...]
     """one per step"""
-    target: Float[Tensor, "nx ny nz 3"]
-    mask: Float[Tensor, "nx ny nz"]
+    marks: tuple[int, ...]
+    """numbers of steps after which it is compared, ascending"""
+    targets: tuple[Float[Tensor, "m 3"], ...]
+    """one per mark, at its cells"""
+    masks: tuple[Float[Tensor, "m"], ...]
+    """weights, summing to 1"""
+    cells: tuple[Int[Tensor, "m"], ...]
+    """flat indices of the cells with a weight"""
+
+
+@dataclass(frozen=True)
+class Run:
+    """A window rolled out."""
+
+    velocities: tuple[Float[Tensor, "m 3"], ...]
+    """one per mark, at its cells, m/s"""
+    potentials: tuple[np.ndarray, ...]
+    """of all steps: first guesses for a neighbouring rollout"""
+    reports: tuple[SolveReport, ...]
 
 
 @dataclass(frozen=True)
@@ -59,246 +70,159 @@ class FitProblem:
     """U, mean speed of the targets in the fluid, m/s"""
     weights: LossWeights
     options: RolloutOptions
+    device: str = "cpu"
 
-    def roll(self, index: int, parameters: RolloutParameters, guesses: Sequence[np.ndarray] | None = None) -> Rollout:
-        """DiffSim^n of one window."""
+    @property
+    def work(self) -> float:
+        """Cells times steps of one rollout of all windows."""
+        return float(sum(int(d.system.unknown.sum()) for w in self.windows for d in w.domains))
+
+    def roll(
+        self,
+        index: int,
+        parameters: RolloutParameters,
+        guesses: Sequence[np.ndarray] | None = None,
+        start: Float[Tensor, "f"] | None = None,
+    ) -> Run:
+        """DiffSim^n of one window, cut at its marks; differentiable in the parameters and in `start`."""
         w = self.windows[index]
-        return rollout(
-            w.start, w.domains, parameters, steps=len(w.domains), patterns=w.patterns, options=self.options,
-            guesses=guesses,
-        )  # fmt: skip
+        flat = divergence_free(w.start if start is None else start, w.domains[0], self.options)
+        velocities, potentials, reports, begin = [], [], [], 0
+        for mark, cells in zip(w.marks, w.cells):
+            part = slice(begin, mark)
+            result = rollout(
+                flat, w.domains[part], parameters, steps=mark - begin, patterns=w.patterns[part],
+                options=self.options, guesses=None if guesses is None else guesses[part],
+            )  # fmt: skip
+            flat, begin = result.velocity, mark
+            velocities.append(cell_velocity(result.faces()).reshape(-1, 3)[cells])
+            potentials += result.potentials
+            reports += result.reports
+        return Run(tuple(velocities), tuple(potentials), tuple(reports))
 
-    def residual(self, index: int, result: Rollout) -> Float[np.ndarray, "nx ny nz 6"]:
-        """float64; squares add up to the window's share of the loss."""
+    def residual(self, index: int, run: Run) -> Float[Tensor, "m 6"]:
+        """Marks one after another; squares add up to the window's share of the loss; differentiable."""
         w = self.windows[index]
-        r = residuals(cell_velocity(result.faces()), w.target, w.mask, speed=self.speed, weights=self.weights)
-        return r.detach().double().numpy() / math.sqrt(len(self.windows))
+        parts = [
+            residuals(v, t, m, speed=self.speed, weights=self.weights)
+            for v, t, m in zip(run.velocities, w.targets, w.masks)
+        ]
+        return torch.cat(parts) / math.sqrt(len(self.windows) * len(w.marks))
 
-    def loss(self, index: int, result: Rollout) -> Tensor:
+    def loss(self, index: int, run: Run) -> Tensor:
         """The window's share of the loss; differentiable."""
         w = self.windows[index]
-        value = velocity_loss(cell_velocity(result.faces()), w.target, w.mask, speed=self.speed, weights=self.weights)
-        return value / len(self.windows)
+        parts = [
+            velocity_loss(v, t, m, speed=self.speed, weights=self.weights)
+            for v, t, m in zip(run.velocities, w.targets, w.masks)
+        ]
+        return torch.stack(parts).mean() / len(self.windows)
+
+    def start_weight(self, index: int) -> Float[Tensor, "f"]:
+        """What a square of 1 (m/s)^2 between a face's start and its measured value adds to the loss."""
+        w = self.windows[index]
+        return w.trust / (len(self.windows) * len(w.marks))
+
+    def departure(self, index: int, start: Float[Tensor, "f"]) -> Tensor:
+        """What leaving the measured start costs, in units of the loss; differentiable."""
+        return (self.start_weight(index) * (start - self.windows[index].measured) ** 2).sum()
 
     def loss_at_rest(self) -> float:
         """The loss of a simulation that does not move: what a fit must beat."""
         parts = [
-            velocity_loss(torch.zeros_like(w.target), w.target, w.mask, speed=self.speed, weights=self.weights)
+            velocity_loss(torch.zeros_like(t), t, m, speed=self.speed, weights=self.weights)
             for w in self.windows
+            for t, m in zip(w.targets, w.masks)
         ]
         return float(torch.stack(parts).mean())
 
-
-@dataclass(frozen=True)
-class FitScene:
-    """Targets and layouts at the resolution of the fit."""
-
-    targets: tuple[FaceVelocity, ...]
-    cell_types: tuple[np.ndarray, ...]
-    """one per target"""
-    domains: tuple[RolloutDomain, ...]
-    """one per target; frames of equal layout share one"""
-    grid: Grid
-    mainstream: np.ndarray
-    speed: float
-    """U, m/s"""
-    fast: float
-    """95th percentile of the speed, m/s"""
-
-    def inflow_values(self) -> Float[np.ndarray, "t f"]:
-        """Targets as flat vectors, NaN off the inflow faces."""
-        rows = []
-        for target, domain in zip(self.targets, self.domains):
-            flat = flatten(target, torch.float64).numpy()
-            rows.append(np.where(domain.inflow > 0, flat, np.nan))
-        return np.stack(rows)
-
-
-def gas_layout(cell_types: np.ndarray) -> np.ndarray:
-    """Air beside smoke moves as well: EMPTY cells are solved."""
-    return np.where(cell_types == CellType.EMPTY, CellType.FLUID, cell_types).astype(np.uint8)
-
-
-def build_scene(
-    targets: Sequence[FaceVelocity],
-    cell_types: Sequence[np.ndarray],
-    system_or_terrain: PoissonSystem | Terrain | None,
-    grid: Grid,
-    *,
-    kind: str,
-    mainstream: np.ndarray | None = None,
-    sweeps: int = 5,
-) -> FitScene:
-    """Layouts, operators and scales of the targets.
-
-    Raises:
-        ValueError: shapes that do not match, or targets at rest.
-    """
-    centers = [np.asarray(t.at_centers(), float) for t in targets]
-    fluid = [np.asarray(c) == CellType.FLUID for c in cell_types]
-    inside = np.concatenate([c[f] for c, f in zip(centers, fluid)])
-    speeds = np.linalg.norm(inside, axis=-1)
-    require(speeds.size > 0, "no FLUID cell in any frame", "cell types with fluid")
-    require(bool(np.isfinite(speeds).all()), "target velocities that are not finite", "finite m/s")
-    speed = float(speeds.mean())
-    require(speed > 0, "targets at rest", "a flow that moves")
-    if mainstream is None and isinstance(system_or_terrain, Terrain):
-        mainstream = system_or_terrain.mainstream
-    if mainstream is None:
-        mean = inside.mean(axis=0)
-        mainstream = mean / max(float(np.linalg.norm(mean)), 1e-12)
-    known: dict[bytes, RolloutDomain] = {}
-    domains = []
-    for types in cell_types:
-        types = np.ascontiguousarray(types, np.uint8)
-        key = types.tobytes()
-        if key not in known:
-            known[key] = _layout(types, system_or_terrain, grid, kind, mainstream, sweeps)
-        domains.append(known[key])
-    fast = float(np.percentile(speeds, 95))
-    return FitScene(tuple(targets), tuple(cell_types), tuple(domains), grid, np.asarray(mainstream, float), speed, fast)
-
-
-def _layout(
-    types: np.ndarray,
-    system_or_terrain: PoissonSystem | Terrain | None,
-    grid: Grid,
-    kind: str,
-    mainstream: np.ndarray,
-    sweeps: int,
-) -> RolloutDomain:
-    gas = kind == "plume"
-    if isinstance(system_or_terrain, PoissonSystem):
-        system = system_or_terrain
-    else:
-        system = build_system(gas_layout(types) if gas else types, system_or_terrain, grid, open_border=gas)
-    smoke = (types == CellType.FLUID).astype(float) if gas else None
-    outlet = mainstream if (types == CellType.OUTFLOW).any() else None
-    return prepare_domain(types, system, mainstream=outlet, smoke=smoke, sweeps=sweeps)
-
-
-def plan_windows(
-    scene: FitScene,
-    interval: float,
-    *,
-    windows: int,
-    steps_per_frame: int | None = None,
-    frames: int | None = None,
-    fall: float = 0.0,
-) -> WindowPlan:
-    """Steps, length and starts of the windows from the dynamics of the targets.
-
-    A step moves the fast fluid by at most 1.5 cells, and `fall` adds at most U in it (8 steps a frame at most). A
-    window is long where the flow is steady and short where it changes: until the velocity would change by its own
-    size, but no longer than fluid needs to cross half of the layout (a quarter, for one frame), half of the clip, nor
-    25 steps (paper: "longer for steady-state, shorter for highly dynamic fluids"). The layout is frozen within a
-    window: where a free surface is not quite in balance, `fall` (m/s^2) acts on it all along, so it may change the
-    velocity by twice its size at most.
-    """
-    h = scene.grid.spacing
-    courant = scene.fast * interval / h
-    kick = fall * interval / scene.speed
-    steps = steps_per_frame or min(max(math.ceil(courant / 1.5), math.ceil(kick), 1), 8)
-    count = len(scene.targets)
-    changes = [
-        np.linalg.norm(b.at_centers() - a.at_centers(), axis=-1)[t == CellType.FLUID].mean()
-        for a, b, t in zip(scene.targets[:-1], scene.targets[1:], scene.cell_types)
-    ]
-    change = float(np.mean(changes)) / scene.speed if changes else 0.0
-    extent = np.ptp(np.argwhere(scene.cell_types[0] == CellType.FLUID), axis=0).max() + 1
-    # that one frame stays as it is, is an assumption: less time to be wrong
-    crossing = (0.5 if count > 1 else 0.25) * extent * h / max(scene.speed * interval, 1e-12)
-    longest = max(LONGEST_WINDOW // steps, 1)
-    if fall > 0:
-        longest = max(min(longest, round(2 * scene.speed / (fall * interval))), 1)
-    length = max(1, min(round(crossing), round(1 / max(change, 1e-3)), longest))
-    if count > 1:
-        # half of the clip at most, so that windows differ
-        length = min(length, count // 2)
-    length = frames or length
-    if count == 1:
-        return WindowPlan((0,), length, steps, True)
-    require(length < count, f"windows of {length} frames in {count} targets", "shorter windows")
-    last = count - 1 - length
-    starts = sorted({round(x) for x in np.linspace(0, last, min(windows, last + 1))})
-    return WindowPlan(tuple(starts), length, steps, False)
-
-
-def boundary_prior(scene: FitScene, initial: FluidParameters) -> FluidParameters:
-    """Inlet and outlet values read off the targets where `initial` gives none (paper: "reasonable initialization").
-
-    Bulk inflow is the mean over inlet and time of each component, the fluctuation the root mean square about it, the
-    outflow the mean speed through the outlet along the mainstream.
-    """
-    changes: dict[str, object] = {}
-    values = scene.inflow_values()
-    if any(d.inflow.any() for d in scene.domains):
-        o = scene.domains[0].offsets
-        parts = [values[:, o[a] : o[a + 1]] for a in range(3)]
-        bulk = [float(np.nanmean(p)) if np.isfinite(p).any() else 0.0 for p in parts]
-        if not any(initial.inflow_velocity):
-            changes["inflow_velocity"] = tuple(bulk)
-        if initial.inflow_fluctuation == 0:
-            changes["inflow_fluctuation"] = _inflow_deviation(scene)[1]
-    if initial.outflow_velocity == 0:
-        through = []
-        for target, domain in zip(scene.targets, scene.domains):
-            at = domain.outflow != 0
-            flat = flatten(target, torch.float64).numpy()
-            if at.any():
-                through.append(float((flat * domain.outflow)[at].sum() / (domain.outflow[at] ** 2).sum()))
-        if through:
-            changes["outflow_velocity"] = float(np.mean(through))
-    return initial.updated(changes)
-
-
-def inflow_patterns(scene: FitScene) -> tuple[Tensor | None, ...]:
-    """Deviation of the inlet velocity from its bulk, per frame, scaled to a root mean square of one.
-
-    None where the inlet is uniform and steady.
-    """
-    rest, size = _inflow_deviation(scene)
-    if size < 1e-6 * scene.speed:
-        return (None,) * len(scene.targets)
-    return tuple(torch.from_numpy((row / size).astype(np.float32)) for row in rest)
-
-
-def _inflow_deviation(scene: FitScene) -> tuple[Float[np.ndarray, "t f"], float]:
-    """Inlet velocity less the mean of each component over inlet and time (0 off the inlet), and its size.
-
-    The size is that of the vector: the root of the components' mean squares added up.
-    """
-    values = scene.inflow_values()
-    o = scene.domains[0].offsets
-    rest, power = np.zeros_like(values), 0.0
-    for a in range(3):
-        part = values[:, o[a] : o[a + 1]]
-        if np.isfinite(part).any():
-            change = part - np.nanmean(part)
-            power += float(np.nanmean(change**2))
-            rest[:, o[a] : o[a + 1]] = np.nan_to_num(change)
-    return rest, math.sqrt(power)
+    def with_starts(self, starts: Sequence[Float[Tensor, "f"]]) -> FitProblem:
+        """The same windows from other states."""
+        return replace(self, windows=tuple(replace(w, start=s) for w, s in zip(self.windows, starts)))
 
 
 def build_problem(
-    scene: FitScene, plan: WindowPlan, *, weights: LossWeights | None = None, options: RolloutOptions | None = None
+    scene: FitScene,
+    plan: WindowPlan,
+    *,
+    weights: LossWeights | None = None,
+    options: RolloutOptions | None = None,
+    compare: str = "all",
+    device: str = "cpu",
 ) -> FitProblem:
-    """The windows of a plan."""
-    weights = weights or LossWeights()
+    """The windows of a plan.
+
+    Args:
+        scene: targets and layouts.
+        plan: of the windows.
+        weights: of the loss.
+        options: of the rollout.
+        compare: "all" frames of a window count, or its "last" (paper).
+        device: of the rollouts.
+    """
+    weights, options = weights or LossWeights(), options or RolloutOptions()
+    # a direction within the errors is noise
+    floor = max(weights.stagnant, 2 * scene.noise / scene.speed)
+    weights = replace(weights, stagnant=floor)
     patterns = inflow_patterns(scene)
-    windows = []
-    for start in plan.starts:
-        frames = [start if plan.steady else start + i for i in range(plan.frames)]
-        end = start if plan.steady else start + plan.frames
-        steps = [f for f in frames for _ in range(plan.steps_per_frame)]
-        target = flatten(scene.targets[end])
-        windows.append(
-            Window(
-                start=flatten(scene.targets[start]),
-                domains=tuple(scene.domains[f] for f in steps),
-                patterns=tuple(patterns[f] for f in steps),
-                target=cell_velocity(unflatten(target, scene.domains[end])),
-                mask=torch.from_numpy(grid_mask(scene.cell_types[end], weights)),
-            )
-        )
-    return FitProblem(tuple(windows), scene.speed, weights, options or RolloutOptions())
+    windows = [_window(scene, plan, start, patterns, weights, compare) for start in plan.starts]
+    return FitProblem(tuple(windows), scene.speed, weights, options, device)
+
+
+def _window(
+    scene: FitScene,
+    plan: WindowPlan,
+    start: int,
+    patterns: tuple[Tensor | None, ...],
+    weights: LossWeights,
+    compare: str,
+) -> Window:
+    frames = [start if plan.steady else start + i for i in range(plan.frames + 1)]
+    steps = [f for f in frames[:-1] for _ in range(plan.steps_per_frame)]
+    compared = range(1, plan.frames + 1) if compare == "all" else [plan.frames]
+    targets, masks, cells = [], [], []
+    for i in compared:
+        f = frames[i]
+        mask = grid_mask(scene.cell_types[f], weights, scene.observed[f]).ravel()
+        at = np.flatnonzero(mask > 0)
+        velocity = cell_velocity(unflatten(torch.from_numpy(scene.flat[f]).float(), scene.domains[f]))
+        cells.append(torch.from_numpy(at))
+        targets.append(velocity.reshape(-1, 3)[cells[-1]])
+        masks.append(torch.from_numpy(mask[at]))
+    smooth, known = (
+        smooth_in_time(scene.flat, scene.seen, start)
+        if scene.noise > 0.02 * scene.speed
+        else (scene.flat[start], scene.seen[start])
+    )
+    domain = scene.domains[start]
+    return Window(
+        start=torch.from_numpy(fill_hidden(smooth, known, domain)).float(),
+        measured=torch.from_numpy(fill_hidden(scene.flat[start], scene.seen[start], domain)).float(),
+        trust=torch.from_numpy(_trust(scene, start, weights)).float(),
+        domains=tuple(scene.domains[f] for f in steps),
+        patterns=tuple(patterns[f] for f in steps),
+        marks=tuple(i * plan.steps_per_frame for i in compared),
+        targets=tuple(targets),
+        masks=tuple(masks),
+        cells=tuple(cells),
+    )
+
+
+def _trust(scene: FitScene, frame: int, weights: LossWeights) -> Float[np.ndarray, "f"]:
+    """Weight of the measured start: that of the loss for the cells beside the face.
+
+    So a smooth error costs the same in the start as in a target, whether or not faces err independently. A direction
+    adds about half of its weight.
+    """
+    mask = grid_mask(scene.cell_types[frame], weights, scene.observed[frame])
+    typical = float(mask[mask > 0].mean())
+    mask = np.where(mask > 0, mask, typical)
+    out = []
+    for axis in range(3):
+        wide = np.pad(mask, [(int(a == axis),) * 2 for a in range(3)], mode="edge")
+        n = mask.shape[axis]
+        out.append(0.5 * (np.take(wide, range(n + 1), axis) + np.take(wide, range(1, n + 2), axis)).ravel())
+    face = np.concatenate(out) * (weights.magnitude + 0.5 * weights.direction)
+    domain, seen = scene.domains[frame], scene.seen[frame]
+    is_open = domain.dynamic | (domain.inflow > 0)
+    return np.where(seen, 1.0, UNSEEN * is_open) * face / scene.speed**2

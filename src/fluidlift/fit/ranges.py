@@ -49,6 +49,7 @@ class Range(ABC):
         """d physical / d raw: turns a raw standard deviation into a physical one."""
         x = torch.tensor(raw, dtype=torch.float64, requires_grad=True)
         self.physical(x).backward()
+        assert x.grad is not None
         return abs(float(x.grad))
 
 

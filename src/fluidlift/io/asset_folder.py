@@ -305,7 +305,10 @@ def read_parameters(path: Path | str) -> tuple[FluidParameters, dict[str, Estima
     for name, e in data["estimates"].items():
         sigma = np.inf if e["sigma"] is None else float(e["sigma"])
         prior = np.nan if e["prior"] is None else float(e["prior"])
-        estimates[name] = Estimate(float(e["value"]), sigma, e["identifiable"], prior, e.get("unit", ""))
+        interval = (float(e["interval"][0]), float(e["interval"][1])) if e.get("interval") else None
+        estimates[name] = Estimate(
+            float(e["value"]), sigma, e["identifiable"], prior, e.get("unit", ""), interval, e.get("source", "")
+        )
     return FluidParameters().updated(data["values"]), estimates
 
 

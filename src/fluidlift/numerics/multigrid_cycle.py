@@ -153,6 +153,15 @@ def _cycle_alone(geometry, common, work, operator, rows, segments, sums):
         wave_up((1, geometry[l, PLANES] - 1, 0, 0), levels, work, operator, rows, segments, sums)
 
 
+@njit(cache=True, nogil=True)
+def _in_order(sums):
+    """Their sum, one after the other: the same in and out of compiled code."""
+    total = 0.0
+    for value in sums:
+        total += value
+    return total
+
+
 def cycle(h: Hierarchy, sums: np.ndarray) -> float:
     """One V-cycle on rhs of the finest level from x = 0: linear, symmetric, positive. Returns x . rhs.
 
@@ -168,7 +177,7 @@ def cycle(h: Hierarchy, sums: np.ndarray) -> float:
     for pair in pairs[::-1]:
         for border in (0, 1):
             _up(border, pair, *arrays, sums)
-    return float(sums.sum())
+    return _in_order(sums)
 
 
 @njit(cache=True)
@@ -219,7 +228,7 @@ def conjugate_gradients(
     def true_residual() -> float:
         _residual(g, (p, b, q, r), h.operator, h.segments, sums)
         if not with_terms:
-            return float(sums.sum())
+            return _in_order(sums)
         add_low_rank(p, q, *low_rank)
         np.subtract(b, q, out=r)
         return float(np.square(r).sum())
@@ -239,14 +248,66 @@ def conjugate_gradients(
             factor = np.float32(0.0 if fresh else rz / previous)
             for border in range(min(g[PARTS], 2)):
                 _turn(border, g, turned, factor, h.operator, h.segments, sums)
-            curvature = float(sums.sum()) + (add_low_rank(direction, q, *low_rank) if with_terms else 0.0)
+            curvature = _in_order(sums) + (add_low_rank(direction, q, *low_rank) if with_terms else 0.0)
             if not curvature > 0:
                 break
             # rz and the direction belong to the scaled residual
             _descend(g, moved, rz / (scale * curvature), scale, h.segments, sums)
-            squared, fresh = float(sums.sum()), False
+            squared, fresh = _in_order(sums), False
             iterations += 1
         squared = true_residual()
         if not squared < 0.25 * before:
             break
     return iterations, float(np.sqrt(squared))
+
+
+@njit(cache=True, nogil=True)
+def _true_residual(g, vectors, operator, segments):
+    p, b, q, r = vectors
+    total = 0.0
+    for i in range(1, g[PLANES] - 1):
+        apply_plane(i, g, p, q, operator, segments)
+        total += residual_plane(i, g, b, q, r, segments)
+    return total
+
+
+@njit(cache=True, nogil=True)
+def conjugate_gradients_alone(level_arrays, p, b, goal, max_iterations, vectors):
+    """`conjugate_gradients` without low-rank terms on one thread and without the interpreter's lock: the same bits.
+
+    level_arrays = (geometry, common, work, operator, rows, segments) of a `Hierarchy`; vectors = (q, r, direction) as
+    there, of which direction must be 0.
+    """
+    geometry, common, work, operator, rows, segments = level_arrays
+    g = geometry[0]
+    q, r, direction = vectors
+    x, rhs, _ = work
+    sums = np.zeros(g[PLANES])
+    whole = (1, g[PLANES] - 1, 0, 0)
+    moved = (p, r, direction, q, rhs)
+    squared, iterations = _true_residual(g, (p, b, q, r), operator, segments), 0
+    for _ in range(RESTARTS):
+        if iterations == max_iterations or not squared > goal**2:
+            break
+        before, rz, fresh = squared, 1.0, True
+        scale = 1.0 / np.sqrt(squared)
+        for i in range(1, g[PLANES] - 1):
+            descend_plane(i, g, moved, 0.0, scale, segments)
+        while iterations < max_iterations and squared > goal**2:
+            _cycle_alone(geometry, common, work, operator, rows, segments, sums)
+            previous, rz = rz, _in_order(sums)
+            if not rz > 0:
+                break
+            factor = np.float32(0.0 if fresh else rz / previous)
+            wave_turn(whole, g, (direction, x, q), factor, operator, segments, sums)
+            curvature = _in_order(sums)
+            if not curvature > 0:
+                break
+            for i in range(1, g[PLANES] - 1):
+                sums[i] = descend_plane(i, g, moved, rz / (scale * curvature), scale, segments)
+            squared, fresh = _in_order(sums), False
+            iterations += 1
+        squared = _true_residual(g, (p, b, q, r), operator, segments)
+        if not squared < 0.25 * before:
+            break
+    return iterations, np.sqrt(squared)

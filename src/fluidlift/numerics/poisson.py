@@ -11,7 +11,8 @@ Rigid bodies that give way to the pressure add J^T M^-1 J each (Batty, Bertails,
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import ClassVar, Self
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -21,6 +22,7 @@ from scipy.sparse.csgraph import connected_components
 from fluidlift.errors import require
 from fluidlift.numerics import multigrid
 from fluidlift.numerics.components import FreeConstants, free_constants
+from fluidlift.numerics.multigrid_prepared import PreparedSystem
 from fluidlift.types import SolveReport
 
 
@@ -36,6 +38,13 @@ class PoissonSystem:
     weight_z: Float[np.ndarray, "nx ny nz+1"]
     spacing: float
     """cell width, m"""
+    _prepared: ClassVar[PreparedSystem | None] = None
+
+    def prepared(self) -> Self:
+        """The same system for many solves: the multigrid solver keeps its levels. The arrays must not change."""
+        out = replace(self)
+        object.__setattr__(out, "_prepared", PreparedSystem(self.unknown, self.weights, self.spacing))
+        return out
 
     @property
     def weights(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -335,7 +344,9 @@ def solve(
         require(bool(((cells >= 0) & (cells < shape)).all()), "cells of a body outside the grid", f"within {shape}")
     rhs = rhs if np.issubdtype(rhs.dtype, np.floating) else rhs.astype(np.float64)
     options = {"tolerance": tolerance, "max_iterations": max_iterations, "initial": initial}
-    if method == "multigrid":
+    if method == "multigrid" and system._prepared is not None and not low_rank:
+        found = system._prepared.solve(rhs, **options)
+    elif method == "multigrid":
         terms = _packed(low_rank)
         found = multigrid.solve(system.unknown, system.weights, system.spacing, rhs, **options, low_rank=terms)
     else:

@@ -4,7 +4,7 @@ A face at x takes the value that the flow carried there: q_new(x) = q(x - dt v(x
 back-trace, back-traced points clamped to the box. Two gradients are offered:
 
 * "exact": the derivative of what is computed, weights and back-trace included. The fast path is a Numba kernel with a
-  hand-written adjoint; `advect_plain` is its readable twin in torch operations.
+  hand-written adjoint (`advection_kernels`); `advect_plain` is its readable twin in torch operations.
 * "upwind": the paper's surrogate. Forward is the same back-trace; backward differentiates one explicit first-order
   upwind step q - dt (v . grad) q instead. It is not the derivative of the forward pass.
 
@@ -15,13 +15,14 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from fluidlift.errors import require
+from fluidlift.physics.advection_kernels import advect_component, advect_component_adjoint
+from fluidlift.physics.rollout_kernels import find_runs
 
 Faces = tuple[Tensor, Tensor, Tensor]
 """u [nx+1,ny,nz], v [nx,ny+1,nz], w [nx,ny,nz+1]"""
@@ -88,104 +89,6 @@ def upwind_step(velocity: Faces, k: Tensor) -> Faces:
     return (out[0], out[1], out[2])
 
 
-@numba.njit(cache=True)
-def _advect_kernel(q, b, c, n, sq, sb, sc, k, active, out):
-    """Faces across the first of the axes (a, b, c); arrays are flat, `s*` their strides along a, b, c; n cells."""
-    na, nb, nc = n[0], n[1], n[2]
-    for i in range(na + 1):
-        i0, i1 = max(i - 1, 0), min(i, na - 1)
-        for j in range(nb):
-            for m in range(nc):
-                f = i * sq[0] + j * sq[1] + m * sq[2]
-                if not active[f]:
-                    out[f] = q[f]
-                    continue
-                low, high = i0 * sb[0] + j * sb[1] + m * sb[2], i1 * sb[0] + j * sb[1] + m * sb[2]
-                vb = 0.25 * (b[low] + b[high] + b[low + sb[1]] + b[high + sb[1]])
-                low, high = i0 * sc[0] + j * sc[1] + m * sc[2], i1 * sc[0] + j * sc[1] + m * sc[2]
-                vc = 0.25 * (c[low] + c[high] + c[low + sc[2]] + c[high + sc[2]])
-                x = min(max(i - k * q[f], 0.0), np.float64(na))
-                y = min(max(j - k * vb, 0.0), np.float64(nb - 1))
-                z = min(max(m - k * vc, 0.0), np.float64(nc - 1))
-                x0, y0, z0 = min(int(x), na - 1), min(int(y), max(nb - 2, 0)), min(int(z), max(nc - 2, 0))
-                fx, fy, fz = x - x0, y - y0, z - z0
-                dy, dz = min(nb - 1 - y0, 1) * sq[1], min(nc - 1 - z0, 1) * sq[2]
-                o = x0 * sq[0] + y0 * sq[1] + z0 * sq[2]
-                p = o + sq[0]
-                near = (q[o] * (1 - fy) + q[o + dy] * fy) * (1 - fz) + (q[o + dz] * (1 - fy) + q[o + dy + dz] * fy) * fz
-                far = (q[p] * (1 - fy) + q[p + dy] * fy) * (1 - fz) + (q[p + dz] * (1 - fy) + q[p + dy + dz] * fy) * fz
-                out[f] = near * (1 - fx) + far * fx
-
-
-@numba.njit(cache=True)
-def _advect_adjoint_kernel(q, b, c, n, sq, sb, sc, k, active, g, gq, gb, gc):
-    """Adds the adjoint of `_advect_kernel` to gq, gb, gc; returns the derivative with respect to k. Serial scatter."""
-    na, nb, nc = n[0], n[1], n[2]
-    gk = 0.0
-    for i in range(na + 1):
-        i0, i1 = max(i - 1, 0), min(i, na - 1)
-        for j in range(nb):
-            for m in range(nc):
-                f = i * sq[0] + j * sq[1] + m * sq[2]
-                s = np.float64(g[f])
-                if s == 0.0:
-                    continue
-                if not active[f]:
-                    gq[f] += s
-                    continue
-                bl, bh = i0 * sb[0] + j * sb[1] + m * sb[2], i1 * sb[0] + j * sb[1] + m * sb[2]
-                vb = 0.25 * (b[bl] + b[bh] + b[bl + sb[1]] + b[bh + sb[1]])
-                cl, ch = i0 * sc[0] + j * sc[1] + m * sc[2], i1 * sc[0] + j * sc[1] + m * sc[2]
-                vc = 0.25 * (c[cl] + c[ch] + c[cl + sc[2]] + c[ch + sc[2]])
-                rx, ry, rz = i - k * q[f], j - k * vb, m - k * vc
-                x = min(max(rx, 0.0), np.float64(na))
-                y = min(max(ry, 0.0), np.float64(nb - 1))
-                z = min(max(rz, 0.0), np.float64(nc - 1))
-                x0, y0, z0 = min(int(x), na - 1), min(int(y), max(nb - 2, 0)), min(int(z), max(nc - 2, 0))
-                fx, fy, fz = x - x0, y - y0, z - z0
-                dx, dy, dz = sq[0], min(nb - 1 - y0, 1) * sq[1], min(nc - 1 - z0, 1) * sq[2]
-                o = x0 * sq[0] + y0 * sq[1] + z0 * sq[2]
-                ex, ey, ez = 1 - fx, 1 - fy, 1 - fz
-                q000, q100, q010, q110 = q[o], q[o + dx], q[o + dy], q[o + dx + dy]
-                q001, q101, q011, q111 = q[o + dz], q[o + dx + dz], q[o + dy + dz], q[o + dx + dy + dz]
-                gq[o] += s * ex * ey * ez
-                gq[o + dx] += s * fx * ey * ez
-                gq[o + dy] += s * ex * fy * ez
-                gq[o + dx + dy] += s * fx * fy * ez
-                gq[o + dz] += s * ex * ey * fz
-                gq[o + dx + dz] += s * fx * ey * fz
-                gq[o + dy + dz] += s * ex * fy * fz
-                gq[o + dx + dy + dz] += s * fx * fy * fz
-                tx = ((q100 - q000) * ey + (q110 - q010) * fy) * ez + ((q101 - q001) * ey + (q111 - q011) * fy) * fz
-                ty = ((q010 - q000) * ex + (q110 - q100) * fx) * ez + ((q011 - q001) * ex + (q111 - q101) * fx) * fz
-                tz = ((q001 - q000) * ex + (q101 - q100) * fx) * ey + ((q011 - q010) * ex + (q111 - q110) * fx) * fy
-                # a clamped coordinate does not move with the velocity
-                tx = s * tx if rx == x else 0.0
-                ty = s * ty if ry == y else 0.0
-                tz = s * tz if rz == z else 0.0
-                gk -= tx * q[f] + ty * vb + tz * vc
-                gq[f] -= k * tx
-                r = -0.25 * k * ty
-                gb[bl] += r
-                gb[bh] += r
-                gb[bl + sb[1]] += r
-                gb[bh + sb[1]] += r
-                r = -0.25 * k * tz
-                gc[cl] += r
-                gc[ch] += r
-                gc[cl + sc[2]] += r
-                gc[ch + sc[2]] += r
-    return gk
-
-
-def _views(arrays: list[np.ndarray], axis: int) -> tuple[list[int], np.ndarray, list[np.ndarray]]:
-    """Order of axes starting at `axis`, cells along them, and element strides of the three arrays along them."""
-    order = [axis, (axis + 1) % 3, (axis + 2) % 3]
-    cells = np.array([arrays[a].shape[a] - 1 for a in order], dtype=np.int64)
-    strides = [np.array([arrays[o].strides[a] // arrays[o].itemsize for a in order], dtype=np.int64) for o in order]
-    return order, cells, strides
-
-
 class _AdvectExact(torch.autograd.Function):
     """Back-trace by Numba kernels, derivative of exactly that."""
 
@@ -193,29 +96,26 @@ class _AdvectExact(torch.autograd.Function):
     def forward(ctx: Any, u: Tensor, v: Tensor, w: Tensor, k: Tensor, active: tuple[np.ndarray, ...]) -> Any:
         tensors = [t.detach().contiguous() for t in (u, v, w)]
         ctx.save_for_backward(*tensors, k)
+        ctx.shapes = tuple(tuple(t.shape) for t in tensors)
         ctx.active = active
-        arrays = [t.numpy() for t in tensors]
-        out = [np.empty_like(a) for a in arrays]
+        ctx.runs = [find_runs(m.reshape(s), a == 2)[0] for a, (m, s) in enumerate(zip(active, ctx.shapes))]
+        parts = tuple(t.numpy().ravel() for t in tensors)
+        out = [p.copy() for p in parts]
         for axis in range(3):
-            order, cells, strides = _views(arrays, axis)
-            flat = [arrays[o].ravel() for o in order]
-            _advect_kernel(*flat, cells, *strides, float(k), active[axis], out[axis].ravel())
-        return tuple(torch.from_numpy(o) for o in out)
+            advect_component(axis, parts, ctx.shapes, parts[0].dtype.type(float(k)), ctx.runs[axis], out[axis])
+        return tuple(torch.from_numpy(o.reshape(s)) for o, s in zip(out, ctx.shapes))
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> Any:
         *tensors, k = ctx.saved_tensors
-        arrays = [t.numpy() for t in tensors]
-        # accumulated in float64: many small contributions meet on one face
-        total = [np.zeros(a.shape) for a in arrays]
-        gk = 0.0
+        parts = tuple(t.numpy().ravel() for t in tensors)
+        incoming = [g.contiguous().numpy().ravel() for g in gradients]
+        totals = tuple(np.where(a, g.dtype.type(0), g) for a, g in zip(ctx.active, incoming))
+        real, gk = parts[0].dtype.type, 0.0
         for axis in range(3):
-            order, cells, strides = _views(arrays, axis)
-            flat = [arrays[o].ravel() for o in order]
-            sums = [total[o].ravel() for o in order]
-            g = gradients[axis].contiguous().numpy().ravel()
-            gk += _advect_adjoint_kernel(*flat, cells, *strides, float(k), ctx.active[axis], g, *sums)
-        grads = [torch.from_numpy(t).to(s.dtype) for t, s in zip(total, tensors)]
+            arguments = (axis, parts, ctx.shapes, real(float(k)), ctx.runs[axis], incoming[axis], totals)
+            gk += advect_component_adjoint(*arguments)
+        grads = [torch.from_numpy(t.reshape(s)) for t, s in zip(totals, ctx.shapes)]
         return (*grads, torch.as_tensor(gk, dtype=k.dtype).reshape(k.shape), None)
 
 

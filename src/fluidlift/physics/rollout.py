@@ -16,7 +16,7 @@ that is there and not what gravity adds before the pressure takes it back, so a 
   corrects them as it does all others.
 
 Gradients: pressure and viscosity by implicit differentiation (one more solve with the same symmetric operator), the
-rest by transposes and autograd.
+rest by hand-written adjoints. `explicit_terms_plain` and the matrices of `RolloutDomain` are their readable twins.
 """
 
 from __future__ import annotations
@@ -28,11 +28,12 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.utils.checkpoint import checkpoint
 
 from fluidlift.errors import require
 from fluidlift.physics.advection import Faces, advect
 from fluidlift.physics.rollout_domain import RolloutDomain
-from fluidlift.physics.rollout_operators import apply_linear, implicit_diffusion
+from fluidlift.physics.rollout_operators import ExplicitTerms, apply_linear, implicit_diffusion, set_outflow
 from fluidlift.physics.rollout_pressure import RolloutOptions, project
 from fluidlift.types import FaceVelocity, FluidParameters, SolveReport
 
@@ -125,6 +126,34 @@ def set_inflow(
     return velocity * torch.from_numpy(domain.interior) + given * torch.from_numpy(domain.inflow)
 
 
+def explicit_terms_plain(
+    velocity: Float[Tensor, "f"],
+    domain: RolloutDomain,
+    parameters: RolloutParameters,
+    pattern: Float[Tensor, "f"] | None = None,
+    advection_gradient: str = "exact",
+) -> Float[Tensor, "f"]:
+    """Advection, walls, body force, inflow of an extrapolated velocity, term by term."""
+    o, h, dt = domain.offsets, float(domain.system.spacing), parameters.time_step
+    moved = advect(unflatten(velocity, domain), dt, spacing=h, gradient=advection_gradient, active=domain.active())
+    velocity = apply_walls(torch.cat([m.reshape(-1) for m in moved]), domain, parameters)
+    force = torch.cat([parameters.gravity[a].expand(o[a + 1] - o[a]) for a in range(3)])
+    velocity = velocity + dt * force * torch.from_numpy(domain.force)
+    return set_inflow(velocity, domain, parameters, pattern)
+
+
+def explicit_terms(
+    velocity: Float[Tensor, "f"],
+    domain: RolloutDomain,
+    parameters: RolloutParameters,
+    pattern: Float[Tensor, "f"] | None = None,
+) -> Float[Tensor, "f"]:
+    """`explicit_terms_plain` with the exact gradient, in one go."""
+    p = parameters
+    moving = (p.time_step, p.wall_damping, p.restitution, p.gravity, p.inflow_velocity, p.inflow_fluctuation)
+    return ExplicitTerms.apply(velocity, *moving, pattern, domain)
+
+
 def step(
     velocity: Float[Tensor, "f"],
     domain: RolloutDomain,
@@ -135,20 +164,19 @@ def step(
     guess: np.ndarray | None = None,
     kept: list[tuple[np.ndarray, SolveReport]] | None = None,
 ) -> Float[Tensor, "f"]:
-    """One time step of the flat face velocity; see the module for the order of terms."""
+    """One time step of the flat face velocity; see the module for the order of terms.
+
+    Faces beyond the fluid and its walls keep what the extrapolation gave them.
+    """
     options = options or RolloutOptions()
-    o, h, dt = domain.offsets, float(domain.system.spacing), parameters.time_step
+    p = parameters
     velocity = apply_linear(velocity, domain.extrapolation)
-    moved = advect(
-        unflatten(velocity, domain), dt, spacing=h, gradient=options.advection_gradient, active=domain.active()
-    )
-    velocity = apply_walls(torch.cat([m.reshape(-1) for m in moved]), domain, parameters)
-    force = torch.cat([parameters.gravity[a].expand(o[a + 1] - o[a]) for a in range(3)])
-    velocity = velocity + dt * force * torch.from_numpy(domain.force)
-    velocity = set_inflow(velocity, domain, parameters, pattern)
-    velocity = implicit_diffusion(velocity, domain, parameters.kinematic_viscosity, parameters.wall_damping, dt)
-    leaving = torch.from_numpy(domain.outflow_faces)
-    velocity = velocity * (1 - leaving) + parameters.outflow_velocity * torch.from_numpy(domain.outflow)
+    if options.advection_gradient == "exact":
+        velocity = explicit_terms(velocity, domain, p, pattern)
+    else:
+        velocity = explicit_terms_plain(velocity, domain, p, pattern, options.advection_gradient)
+    velocity = implicit_diffusion(velocity, domain, p.kinematic_viscosity, p.wall_damping, p.time_step)
+    velocity = set_outflow(velocity, domain, p.outflow_velocity)
     return project(velocity, domain, options=options, guess=guess, kept=kept)
 
 
@@ -161,6 +189,7 @@ def rollout(
     patterns: Float[Tensor, "f"] | Sequence[Float[Tensor, "f"] | None] | None = None,
     options: RolloutOptions | None = None,
     guesses: Sequence[np.ndarray] | None = None,
+    checkpoint_every: int | None = None,
 ) -> Rollout:
     """DiffSim^n of the paper (`optLoss`): the face velocity after `steps` steps.
 
@@ -172,6 +201,9 @@ def rollout(
         patterns: flat fluctuation of the inflow of unit root mean square, or one per step (None: bulk velocity only).
         options: see there.
         guesses: potentials of an earlier, similar rollout (`Rollout.potentials`), first guesses of the solves.
+        checkpoint_every: for the backward pass keep the velocity every so many steps only, and compute the steps
+            between again from there, by the same solves from the same guesses: gradients are the same to the last
+            bit. None keeps all steps.
 
     Returns:
         the last velocity and the reports; a pressure solve that failed is seen in the reports.
@@ -186,10 +218,25 @@ def rollout(
     dtype = torch.from_numpy(layouts[0].inflow).dtype
     flat = start if isinstance(start, Tensor) else flatten(start, dtype)
     require(flat.shape == (layouts[0].offsets[3],), f"{tuple(flat.shape)} faces", str(layouts[0].offsets[3]))
-    kept: list[tuple[np.ndarray, SolveReport]] = []
-    for i, (domain, pattern) in enumerate(zip(layouts, fields)):
-        guess = guesses[i] if guesses is not None else None
-        flat = step(flat, domain, parameters, pattern=pattern, options=options, guess=guess, kept=kept)
+    length = steps if checkpoint_every is None else checkpoint_every
+    require(length >= 1, f"checkpoints every {length} steps", "1 or more")
+    guess_of = [None] * steps if guesses is None else list(guesses)
+    kept: dict[int, tuple[np.ndarray, SolveReport]] = {}
+
+    def segment(velocity: Tensor, begin: int) -> Tensor:
+        """Steps `begin` to `begin + length`, the first time or again for the backward pass."""
+        for i in range(begin, min(begin + length, steps)):
+            solved: list[tuple[np.ndarray, SolveReport]] = []
+            given = {"pattern": fields[i], "guess": guess_of[i], "kept": solved}
+            velocity = step(velocity, layouts[i], parameters, options=options, **given)
+            kept.setdefault(i, solved[0])
+        return velocity
+
+    for begin in range(0, steps, length):
+        if checkpoint_every is None or not torch.is_grad_enabled():
+            flat = segment(flat, begin)
+        else:
+            flat = checkpoint(segment, flat, begin, use_reentrant=False, preserve_rng_state=False)
     flat = apply_linear(flat, layouts[-1].extrapolation)
-    potentials, reports = zip(*kept)
+    potentials, reports = zip(*(kept[i] for i in range(steps)))
     return Rollout(flat, layouts[-1], potentials, reports)

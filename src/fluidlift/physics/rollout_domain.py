@@ -1,47 +1,92 @@
-"""The fixed linear operators of a differentiable rollout, assembled once per cell layout.
+"""The cell layout of a differentiable rollout: which face does what, assembled once.
 
-Velocity is one flat vector here: all faces across x, then y, then z, each raveled in C order. Extrapolation, viscous
-Laplacian, divergence and pressure gradient are sparse matrices over it, so that the adjoint of each is its transpose.
+Velocity is one flat vector here: all faces across x, then y, then z, each raveled in C order. `RolloutLists` holds the
+same facts as compact lists for the kernels; sparse matrices of the linear operators are built when asked for.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy import sparse
 
 from fluidlift.errors import require
 from fluidlift.numerics.poisson import PoissonSystem
+from fluidlift.physics import rollout_kernels as kernels
 from fluidlift.physics.pressure import PressureSystem
+from fluidlift.physics.rollout_diffusion import add_boundary
+from fluidlift.physics.rollout_matrices import extrapolation_matrix, pressure_matrices, viscous_matrices
 from fluidlift.physics.rollout_surface import sides, surface_distances
 from fluidlift.types import CellType
+
+WEIGHTS = ("weight_x", "weight_y", "weight_z")
+"""fields of `PoissonSystem`"""
 
 
 @dataclass(frozen=True)
 class LinearMap:
-    """A sparse matrix beside its transpose (both CSR, so that both products are fast)."""
+    """A linear map and its transpose by kernels; its sparse matrix is built when asked for."""
 
-    matrix: sparse.csr_matrix
-    transpose: sparse.csr_matrix
+    forward: Callable[[np.ndarray], np.ndarray]
+    adjoint: Callable[[np.ndarray], np.ndarray]
+    build: Callable[[], sparse.csr_matrix]
 
-    @classmethod
-    def of(cls, matrix: sparse.spmatrix, dtype: np.dtype) -> LinearMap:
-        """The map in one number type."""
-        m = sparse.csr_matrix(matrix, dtype=dtype)
-        return cls(m, m.T.tocsr())
+    @cached_property
+    def matrix(self) -> sparse.csr_matrix:
+        """The readable form."""
+        return self.build()
+
+    @cached_property
+    def transpose(self) -> sparse.csr_matrix:
+        """Of the matrix."""
+        return self.matrix.T.tocsr()
+
+
+@dataclass(frozen=True)
+class RolloutLists:
+    """Faces by what happens to them, as indices into the flat vector; see `rollout_kernels` for runs and components."""
+
+    known: Bool[np.ndarray, "f"]
+    """faces that extrapolation starts from"""
+    components: tuple[tuple[int, tuple[int, int, int]], ...]
+    runs: tuple[tuple[np.ndarray, np.ndarray], ...]
+    """dynamic faces of each component: runs, and where those of each plane begin"""
+    extrapolation: tuple[np.ndarray, np.ndarray, np.ndarray]
+    """faces in the order of filling, where the neighbours of each begin, neighbours"""
+    walls: Int[np.ndarray, "w"]
+    """faces on which a wall acts"""
+    wall_layout: tuple[np.ndarray, np.ndarray, np.ndarray]
+    """their `wall_share`, `wall_below`, `wall_above`"""
+    inflow: Int[np.ndarray, "i"]
+    inflow_ends: tuple[int, int, int, int]
+    """the inflow faces across axis a are inflow[ends[a]:ends[a + 1]]"""
+    closed: Int[np.ndarray, "c"]
+    """walls: faces whose velocity is 0"""
+    outflow: Int[np.ndarray, "o"]
+    couplings: Float[np.ndarray, "f"]
+    """neighbours that a dynamic face is coupled with by viscosity, walls ahead and behind included"""
+    boundary: tuple[np.ndarray, np.ndarray]
+    """pairs of a dynamic face and a prescribed neighbour"""
 
 
 @dataclass(frozen=True)
 class RolloutDomain:
-    """Which face does what, for one cell layout."""
+    """Which face does what, for one cell layout. Operators among `LinearMap`s have their kernels behind them."""
 
     shape: tuple[int, int, int]
     system: PoissonSystem
     """faces to air weigh more the nearer the surface is, see `surface_distances`"""
+    sweeps: int
+    """of the extrapolation"""
     dynamic: Bool[np.ndarray, "f"]
     """faces whose velocity the momentum equation and the pressure change"""
+    wall: Bool[np.ndarray, "f"]
+    """closed faces beside cells whose pressure is solved"""
     inflow: Float[np.ndarray, "f"]
     """1 on faces with the prescribed inflow velocity"""
     outflow: Float[np.ndarray, "f"]
@@ -60,32 +105,170 @@ class RolloutDomain:
     wall_below: Float[np.ndarray, "f"]
     wall_above: Float[np.ndarray, "f"]
     """0 to 1: closed share of the next face towards lower / higher index, where a wall stands across the motion"""
-    extrapolation: LinearMap
-    """faces to faces: fills unknown faces from known ones"""
-    laplacian: sparse.csr_matrix
-    """1/m^2, between dynamic faces only, symmetric"""
-    boundary_laplacian: LinearMap
-    """1/m^2, from prescribed faces to dynamic ones"""
-    divergence: LinearMap
-    """faces to cells, 1/m, open shares included"""
-    gradient: LinearMap
-    """cells to dynamic faces, 1/m; system = - divergence gradient"""
+    opening: Float[np.ndarray, "f"]
+    """open share"""
+    reach: Float[np.ndarray, "f"]
+    """1 / distance of the pressures on both sides of a dynamic face in cells, 0 on other faces"""
 
     @property
     def face_shapes(self) -> tuple[tuple[int, int, int], ...]:
         """Shapes of u, v, w."""
-        return tuple(tuple(n + (a == axis) for a, n in enumerate(self.shape)) for axis in range(3))
+        nx, ny, nz = self.shape
+        return ((nx + 1, ny, nz), (nx, ny + 1, nz), (nx, ny, nz + 1))
 
-    @property
+    @cached_property
     def offsets(self) -> tuple[int, int, int, int]:
         """Where u, v, w begin in the flat vector, and its length."""
-        sizes = [int(np.prod(s)) for s in self.face_shapes]
+        sizes = [a * b * c for a, b, c in self.face_shapes]
         return (0, sizes[0], sizes[0] + sizes[1], sum(sizes))
+
+    def component(self, flat: np.ndarray, axis: int) -> np.ndarray:
+        """One component of a flat vector as an array."""
+        return flat[self.offsets[axis] : self.offsets[axis + 1]].reshape(self.face_shapes[axis])
 
     def active(self) -> tuple[np.ndarray, ...]:
         """`dynamic` split by component."""
-        o = self.offsets
-        return tuple(np.ascontiguousarray(self.dynamic[o[a] : o[a + 1]]) for a in range(3))
+        return tuple(np.ascontiguousarray(self.component(self.dynamic, a).ravel()) for a in range(3))
+
+    @cached_property
+    def lists(self) -> RolloutLists:
+        """For the kernels."""
+        return _compact_lists(self)
+
+    @cached_property
+    def extrapolation(self) -> LinearMap:
+        """Faces to faces: fills unknown faces from known ones."""
+        return LinearMap(self._extrapolate, self._extrapolate_adjoint, self._extrapolation_matrix)
+
+    @cached_property
+    def divergence(self) -> LinearMap:
+        """Faces to cells, 1/m, open shares included."""
+        return LinearMap(
+            partial(self._to_cells, weight=self.opening, sign=1.0),
+            partial(self._to_faces, weight=self.opening, sign=-1.0),
+            partial(self._pressure_matrix, 0),
+        )
+
+    @cached_property
+    def gradient(self) -> LinearMap:
+        """Cells to dynamic faces, 1/m; system = - divergence gradient."""
+        return LinearMap(
+            partial(self._to_faces, weight=self.reach, sign=1.0),
+            partial(self._to_cells, weight=self.reach, sign=-1.0),
+            partial(self._pressure_matrix, 1),
+        )
+
+    @cached_property
+    def laplacian(self) -> sparse.csr_matrix:
+        """1/m^2, between dynamic faces only, symmetric: the readable form of `rollout_diffusion`."""
+        return self._viscous_matrix(0)
+
+    @cached_property
+    def boundary_laplacian(self) -> LinearMap:
+        """1/m^2, from prescribed faces to dynamic ones."""
+        rows, cols = self.lists.boundary
+        rate = 1.0 / float(self.system.spacing) ** 2
+        return LinearMap(
+            partial(_scattered, rows=rows, cols=cols, rate=rate),
+            partial(_scattered, rows=cols, cols=rows, rate=rate),
+            partial(self._viscous_matrix, 1),
+        )
+
+    def _matrix(self, matrix: Any) -> sparse.csr_matrix:
+        return sparse.csr_matrix(matrix, dtype=self.inflow.dtype)
+
+    def _extrapolate(self, v: np.ndarray) -> np.ndarray:
+        out = np.empty_like(v)
+        faces, first, neighbours = self.lists.extrapolation
+        kernels.extrapolate(v, self.lists.known, faces, first, neighbours, out)
+        return out
+
+    def _extrapolate_adjoint(self, g: np.ndarray) -> np.ndarray:
+        out = np.empty_like(g)
+        faces, first, neighbours = self.lists.extrapolation
+        kernels.extrapolate_adjoint(g, self.lists.known, faces, first, neighbours, out)
+        return out
+
+    def _extrapolation_matrix(self) -> sparse.csr_matrix:
+        known = self.lists.known
+        return self._matrix(
+            sparse.block_diag([extrapolation_matrix(self.component(known, a), self.sweeps) for a in range(3)])
+        )
+
+    def _to_cells(self, v: np.ndarray, weight: np.ndarray, sign: float) -> np.ndarray:
+        out = np.empty(self.shape, v.dtype)
+        scale = v.dtype.type(sign / float(self.system.spacing))
+        kernels.cells_from_faces(v, weight, self.system.unknown, scale, out)
+        return out.reshape(-1)
+
+    def _to_faces(self, q: np.ndarray, weight: np.ndarray, sign: float) -> np.ndarray:
+        out = np.zeros(self.offsets[3], q.dtype)
+        # the kernel's sign: cell above less cell below
+        scale = q.dtype.type(sign / float(self.system.spacing))
+        kernels.faces_from_cells(q.reshape(self.shape), weight, self.system.unknown, scale, out)
+        return out
+
+    def _viscous_matrix(self, which: int) -> sparse.csr_matrix:
+        masks = (self.dynamic, self.inflow > 0, self.wall)
+        h = float(self.system.spacing)
+        pairs = [viscous_matrices(*(self.component(m, a) for m in masks), a, h) for a in range(3)]
+        return self._matrix(sparse.block_diag([pair[which] for pair in pairs]))
+
+    def _pressure_matrix(self, which: int) -> sparse.csr_matrix:
+        h, unknown = float(self.system.spacing), self.system.unknown
+        pairs = [
+            pressure_matrices(self.component(self.reach, a), self.component(self.opening, a), unknown, a, h)
+            for a in range(3)
+        ]
+        join = (sparse.hstack, sparse.vstack)[which]
+        return self._matrix(join([pair[which] for pair in pairs]))
+
+
+def _scattered(v: np.ndarray, rows: np.ndarray, cols: np.ndarray, rate: float) -> np.ndarray:
+    out = np.zeros_like(v)
+    add_boundary(out, v, rows, cols, v.dtype.type(rate))
+    return out
+
+
+def _compact_lists(domain: RolloutDomain) -> RolloutLists:
+    inflow_mask = domain.inflow > 0
+    known = domain.dynamic | inflow_mask | domain.wall
+    components = tuple(zip(domain.offsets[:3], domain.face_shapes))
+    runs, fills, rows, cols = [], [], [], []
+    couplings = np.empty(domain.offsets[3], domain.inflow.dtype)
+    for axis, (start, shape) in enumerate(components):
+        dynamic, given, wall, here = (
+            domain.component(m, axis) for m in (domain.dynamic, inflow_mask, domain.wall, known)
+        )
+        runs.append(kernels.find_runs(dynamic, axis == 2))
+        fills.append(kernels.extrapolation_lists(here.ravel(), shape, start, domain.sweeps))
+        count, row, col = kernels.count_couplings(dynamic, given, wall, axis, start)
+        domain.component(couplings, axis)[...] = count
+        rows.append(row)
+        cols.append(col)
+    begins = np.cumsum([0] + [len(f[2]) for f in fills])
+    first = [np.zeros(1, np.int32)] + [f[1][1:] + np.int32(b) for f, b in zip(fills, begins)]
+    walls = np.flatnonzero((domain.wall_share != 0) | (domain.wall_below != 0) | (domain.wall_above != 0))
+    inflow = np.flatnonzero(inflow_mask)
+    ends = np.searchsorted(inflow, domain.offsets)
+    return RolloutLists(
+        known=known,
+        components=components,
+        runs=tuple(runs),
+        extrapolation=(
+            np.concatenate([f[0] for f in fills]),
+            np.concatenate(first),
+            np.concatenate([f[2] for f in fills]),
+        ),
+        walls=walls.astype(np.int32),
+        wall_layout=(domain.wall_share[walls], domain.wall_below[walls], domain.wall_above[walls]),
+        inflow=inflow.astype(np.int32),
+        inflow_ends=(int(ends[0]), int(ends[1]), int(ends[2]), int(ends[3])),
+        closed=np.flatnonzero(domain.wall & ~inflow_mask).astype(np.int32),
+        outflow=np.flatnonzero(domain.outflow_faces).astype(np.int32),
+        couplings=couplings,
+        boundary=(np.concatenate(rows), np.concatenate(cols)),
+    )
 
 
 def _shift(faces: np.ndarray, axis: int, by: int) -> np.ndarray:
@@ -97,86 +280,11 @@ def _shift(faces: np.ndarray, axis: int, by: int) -> np.ndarray:
     return out
 
 
-def _neighbour_pairs(shape: tuple[int, int, int], axis: int) -> tuple[np.ndarray, np.ndarray]:
-    """Flat indices of all entries that have a neighbour at +1 along `axis`, and of that neighbour."""
-    index = np.arange(int(np.prod(shape))).reshape(shape)
-    n = shape[axis]
-    return np.take(index, range(n - 1), axis).ravel(), np.take(index, range(1, n), axis).ravel()
-
-
-def extrapolation_matrix(known: Bool[np.ndarray, "a b c"], sweeps: int) -> sparse.csr_matrix:
-    """Each sweep gives unknown entries the mean of their known neighbours, which then count as known.
-
-    Entries that no sweep reaches become 0.
-    """
-    flat = known.ravel().copy()
-    low, high = zip(*(_neighbour_pairs(known.shape, axis) for axis in range(3)))
-    rows, cols = np.concatenate([*low, *high]), np.concatenate([*high, *low])
-    total = sparse.diags(flat.astype(float)).tocsr()
-    for _ in range(sweeps):
-        use = ~flat[rows] & flat[cols]
-        if not use.any():
-            break
-        count = np.bincount(rows[use], minlength=flat.size)
-        mean = sparse.csr_matrix((1.0 / count[rows[use]], (rows[use], cols[use])), shape=total.shape)
-        total = total + mean @ total
-        flat |= count > 0
-    return total
-
-
-def _viscous_matrices(
-    dynamic: np.ndarray, prescribed: np.ndarray, wall: np.ndarray, axis: int, h: float
-) -> tuple[sparse.csr_matrix, sparse.csr_matrix]:
-    """Laplacian of one component: among dynamic faces (with its diagonal), and from prescribed faces.
-
-    A wall face ahead or behind holds the normal velocity 0; walls beside a face are left to `wall_count`; towards air
-    the derivative is 0.
-    """
-    n = dynamic.size
-    d, b, z = dynamic.ravel(), prescribed.ravel(), wall.ravel()
-    inner, outer = [], []
-    diagonal = np.zeros(n)
-    for direction in range(3):
-        low, high = _neighbour_pairs(dynamic.shape, direction)
-        for row, col in ((low, high), (high, low)):
-            use = d[row] & d[col]
-            inner.append((row[use], col[use]))
-            given = d[row] & b[col]
-            outer.append((row[given], col[given]))
-            zero = d[row] & z[col] if direction == axis else np.zeros(row.size, bool)
-            np.add.at(diagonal, row[use | given | zero], 1.0)
-
-    def assemble(parts: list[tuple[np.ndarray, np.ndarray]]) -> sparse.csr_matrix:
-        rows, cols = (np.concatenate(side) for side in zip(*parts))
-        return sparse.csr_matrix((np.full(rows.size, 1 / h**2), (rows, cols)), shape=(n, n))
-
-    return assemble(inner) - sparse.diags(diagonal / h**2), assemble(outer)
-
-
-def _pressure_matrices(
-    dynamic: np.ndarray, opening: np.ndarray, unknown: np.ndarray, distance: np.ndarray, axis: int, h: float
-) -> tuple[sparse.csr_matrix, sparse.csr_matrix]:
-    """Divergence (cells from faces) and gradient (faces from cells, over the distance to the surface) of one axis."""
-    faces = np.arange(dynamic.size).reshape(dynamic.shape)
-    n = unknown.shape[axis]
-    cells = np.arange(unknown.size)
-    low, high = np.take(faces, range(n), axis).ravel(), np.take(faces, range(1, n + 1), axis).ravel()
-    use = unknown.ravel()
-    cells, low, high = cells[use], low[use], high[use]
-    area = opening.ravel()
-    values = np.concatenate([area[high], -area[low]]) / h
-    shape = (unknown.size, dynamic.size)
-    divergence = sparse.csr_matrix((values, (np.tile(cells, 2), np.concatenate([high, low]))), shape=shape)
-    signs = np.concatenate([-np.ones(cells.size), np.ones(cells.size)]) / h
-    gradient = sparse.csr_matrix((signs, (np.concatenate([high, low]), np.tile(cells, 2))), shape=shape[::-1])
-    return divergence, sparse.diags((dynamic / distance).ravel()) @ gradient
-
-
 def _openings(system: PoissonSystem, inflow: list[np.ndarray]) -> list[np.ndarray]:
     """Open share of every face; a plain system counts inflow faces as fully open."""
     if isinstance(system, PressureSystem):
-        return [np.asarray(o, float) for o in system.openings]
-    return [np.where(w > 0, w, i.astype(float)) for w, i in zip(system.weights, inflow)]
+        return [np.asarray(o) for o in system.openings]
+    return [np.where(w > 0, w, i.astype(w.dtype)) for w, i in zip(system.weights, inflow)]
 
 
 def prepare_domain(
@@ -185,82 +293,85 @@ def prepare_domain(
     *,
     mainstream: Float[np.ndarray, "3"] | None = None,
     smoke: Float[np.ndarray, "nx ny nz"] | None = None,
+    distance: Float[np.ndarray, "nx ny nz"] | None = None,
     sweeps: int = 4,
     dtype: type = np.float32,
 ) -> RolloutDomain:
-    """Assemble the operators of one cell layout.
+    """Assemble what a rollout needs to know of one cell layout.
 
     Args:
         cell_types: u8 [nx,ny,nz], `CellType`.
         system: pressure system of the same layout (`pressure.build_system`).
         mainstream: unit direction of the outflow; None leaves the outlet free.
         smoke: share of smoke per cell in [0, 1] for a gas, whose body force acts there alone; None for a liquid.
+        distance: m, of cell centres to a liquid's surface (`rollout_surface.surface_cells`); None: from the types.
         sweeps: cells that velocity is extrapolated beyond the fluid; at least the Courant number plus one.
         dtype: number type of the rollout.
+
+    Raises:
+        ValueError: cell types of another shape than the system.
     """
     types = np.asarray(cell_types)
     require(types.shape == system.unknown.shape, f"cell types {types.shape}", str(system.unknown.shape))
-    h, unknown = float(system.spacing), system.unknown
+    unknown = np.ascontiguousarray(system.unknown)
     touching = [np.logical_or(*sides(unknown, a)) for a in range(3)]
     is_inflow = [np.logical_or(*sides(types == CellType.INFLOW, a)) for a in range(3)]
     openings = _openings(system, is_inflow)
-    closed_share = [np.where(t, 1.0 - o, 0.0) for t, o in zip(touching, openings)]
-    distances = surface_distances(types) if smoke is None else [np.ones(t.shape) for t in touching]
-    nearer = [np.asarray(w / d, np.float32) for w, d in zip(system.weights, distances)]
-    parts: dict[str, list] = {name: [] for name in _PARTS}
+    closed_share = [np.where(t, 1 - o, 0).astype(dtype) for t, o in zip(touching, openings)]
+    distances = surface_distances(types, distance) if smoke is None else [np.ones(t.shape) for t in touching]
+    parts: dict[str, list[np.ndarray]] = {}
     for axis in range(3):
-        opening = openings[axis]
         dynamic = (system.weights[axis] > 0) & touching[axis]
-        inflow = is_inflow[axis] & (opening > 0)
-        wall = (opening == 0) & touching[axis]
-        low_out, high_out = sides(types == CellType.OUTFLOW, axis)
-        leaving = dynamic & (low_out | high_out)
+        inflow, wall = is_inflow[axis] & (openings[axis] > 0), (openings[axis] == 0) & touching[axis]
+        leaving = dynamic & np.logical_or(*sides(types == CellType.OUTFLOW, axis))
         along = 0.0 if mainstream is None else float(mainstream[axis])
-        side, count = np.zeros(types.shape), np.zeros(types.shape)
-        for other in range(3):
-            if other != axis:
-                n = types.shape[other]
-                for ends in (range(n), range(1, n + 1)):
-                    closed = np.take(closed_share[other], ends, other)
-                    side, count = np.maximum(side, closed), count + closed
         share = dynamic if smoke is None else dynamic * -0.5 * np.add(*sides(np.asarray(smoke, float), axis))
-        below, above = sides(unknown, axis)
-        inner, outer = _viscous_matrices(dynamic, inflow, wall, axis, h)
-        divergence, gradient = _pressure_matrices(dynamic, opening, unknown, distances[axis], axis, h)
         new = {
             "dynamic": dynamic,
+            "wall": wall,
             "inflow": inflow,
             "outflow": leaving * along,
             "outflow_faces": leaving & (mainstream is not None),
             "interior": ~(inflow | wall),
             "force": share,
-            "wall_share": dynamic * np.maximum(*sides(side, axis)),
-            "wall_count": dynamic * 0.5 * np.add(*sides(count * unknown, axis)),
-            "wall_below": dynamic * below * _shift(closed_share[axis], axis, -1),
-            "wall_above": dynamic * above * _shift(closed_share[axis], axis, 1),
-            "extrapolation": extrapolation_matrix(dynamic | inflow | wall, sweeps),
-            "laplacian": inner,
-            "boundary": outer,
-            "divergence": divergence,
-            "gradient": gradient,
+            "opening": openings[axis],
+            "reach": dynamic / distances[axis],
         }
-        for name, value in new.items():
-            parts[name].append(value)
-    flat = {n: np.concatenate([np.asarray(x).ravel() for x in parts[n]]).astype(dtype) for n in _PARTS[1:10]}
+        for name, value in (new | _walls_beside(dynamic, unknown, closed_share, axis)).items():
+            parts.setdefault(name, []).append(np.asarray(value).ravel())
+    flat = {n: np.concatenate(p) for n, p in parts.items()}
+    nearer = (np.asarray(w / d, np.float32) for w, d in zip(system.weights, distances))
     return RolloutDomain(
         shape=types.shape,
-        system=replace(system, weight_x=nearer[0], weight_y=nearer[1], weight_z=nearer[2]),
-        dynamic=np.concatenate([x.ravel() for x in parts["dynamic"]]),
-        extrapolation=LinearMap.of(sparse.block_diag(parts["extrapolation"]), dtype),
-        laplacian=sparse.csr_matrix(sparse.block_diag(parts["laplacian"]), dtype=dtype),
-        boundary_laplacian=LinearMap.of(sparse.block_diag(parts["boundary"]), dtype),
-        divergence=LinearMap.of(sparse.hstack(parts["divergence"]), dtype),
-        gradient=LinearMap.of(sparse.vstack(parts["gradient"]), dtype),
-        **flat,
+        system=replace(system, unknown=unknown, **dict(zip(WEIGHTS, nearer))).prepared(),
+        sweeps=sweeps,
+        **{n: v if n in ("dynamic", "wall") else v.astype(dtype) for n, v in flat.items()},
     )
 
 
-_PARTS = (
-    "dynamic", "inflow", "outflow", "outflow_faces", "interior", "force", "wall_share", "wall_count", "wall_below",
-    "wall_above", "extrapolation", "laplacian", "boundary", "divergence", "gradient",
-)  # fmt: skip
+def _walls_beside(
+    dynamic: np.ndarray, unknown: np.ndarray, closed_share: list[np.ndarray], axis: int
+) -> dict[str, np.ndarray]:
+    """The fields of `RolloutDomain` about walls, of one component."""
+    # of a cell's faces along the other two axes: the largest closed share, and the sum of these shares
+    side, count = (
+        np.zeros_like(closed_share[0], shape=unknown.shape),
+        np.zeros_like(closed_share[0], shape=unknown.shape),
+    )
+    for other in range(3):
+        if other == axis:
+            continue
+        n = unknown.shape[other]
+        for ends in (slice(0, n), slice(1, n + 1)):
+            cut = [slice(None)] * 3
+            cut[other] = ends
+            closed = closed_share[other][tuple(cut)]
+            np.maximum(side, closed, out=side)
+            count += closed
+    below, above = sides(unknown, axis)
+    return {
+        "wall_share": dynamic * np.maximum(*sides(side, axis)),
+        "wall_count": dynamic * 0.5 * np.add(*sides(count * unknown, axis)),
+        "wall_below": dynamic * below * _shift(closed_share[axis], axis, -1),
+        "wall_above": dynamic * above * _shift(closed_share[axis], axis, 1),
+    }

@@ -1,17 +1,34 @@
-"""Where the free surface lies between the cells of a rollout's layout."""
+"""Where the free surface of a liquid lies between the cells of a rollout's layout.
+
+p = 0 holds on the surface, a share of a cell away from the centre of the liquid's last cell: ghost fluid, second order
+(Enright et al. 2003; Gibou et al. 2002), as in `pressure`. With a distance that is linear near the surface the weight
+of the liquid is balanced exactly, whatever the tilt of the surface against the grid, so a pool at rest stays at rest.
+A surface that is wrong by e(x) instead drives the flow by g grad e, and no later step can tell that from gravity.
+
+The distance is given where it is known (`distance_of_level`, a level set). Else it is estimated from the cell types:
+`liquid_distance`. Cells tell the surface to half a cell; a surface inclined by 1 : n leaves stairs n cells long.
+"""
 
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from scipy import ndimage
 
-from fluidlift.types import CellType
+from fluidlift.errors import require
+from fluidlift.physics.free_surface import Faces, pressure_cells, surface_gaps
+from fluidlift.types import CellType, Grid
 
-SMOOTHING = 1.0
-"""cells: standard deviation of the blur that turns a staircase of cells into a surface"""
-NEAREST_SURFACE = 0.25
-"""cells: distance of the surface from a fluid cell's centre is not taken smaller (conditioning)"""
+NEIGHBOURHOOD = 2.0
+"""cells: standard deviation of the weights in the local fit of a plane; stairs up to about ten cells become a slope"""
+ROUNDS = 10
+"""of fitting planes: more change little (mean residual acceleration within a fifth of 20 rounds')"""
+FLATTEST, STEEPEST = 0.25, 2.0
+"""a fitted distance is divided by its slope within these bounds; below them the fit sees both sides of a sheet"""
+SPREAD = 1e-9
+"""cells^2, added to the variance of positions: a layout one cell thick has none"""
+INSIDE = 1e-3
+"""cells: a liquid cell's centre is at least so far inside, an empty one's outside"""
 
 
 def sides(cells: np.ndarray, axis: int, outside: float = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -23,27 +40,120 @@ def sides(cells: np.ndarray, axis: int, outside: float = 0) -> tuple[np.ndarray,
     return np.take(wide, range(n + 1), axis), np.take(wide, range(1, n + 2), axis)
 
 
-def surface_distances(cell_types: np.ndarray) -> list[Float[np.ndarray, "fx fy fz"]]:
+def distance_of_level(surface_height: Float[np.ndarray, "nx ny"], grid: Grid) -> Float[np.ndarray, "nx ny nz"]:
+    """Distance (m, negative in the liquid) of cell centres to a height field, z in m: vertical distance over slope.
+
+    Raises:
+        ValueError: heights of another shape than the grid's columns.
+    """
+    require(surface_height.shape == grid.shape[:2], f"heights {surface_height.shape}", str(grid.shape[:2]))
+    heights = np.asarray(surface_height, float)
+    slope = [np.gradient(heights, grid.spacing, axis=a) if heights.shape[a] > 1 else 0.0 for a in range(2)]
+    z = grid.low[2] + (np.arange(grid.shape[2]) + 0.5) * grid.spacing
+    steep = np.sqrt(1.0 + slope[0] ** 2 + slope[1] ** 2)
+    return ((z - heights[..., None]) / np.broadcast_to(steep, heights.shape)[..., None]).astype(np.float32)
+
+
+def surface_cells(
+    cell_types: UInt8[np.ndarray, "nx ny nz"],
+    distance: Float[np.ndarray, "nx ny nz"],
+    openings: Faces,
+    spacing: float,
+) -> tuple[UInt8[np.ndarray, "nx ny nz"], Float[np.ndarray, "nx ny nz"]]:
+    """The layout that goes with a known surface, by `free_surface.pressure_cells`.
+
+    FLUID cells with their centre above the surface become EMPTY (they move with the liquid below), EMPTY cells with
+    their centre below it FLUID.
+
+    Args:
+        cell_types: `CellType`.
+        distance: m, to the surface, negative in the liquid.
+        openings: open share of the faces (`pressure.face_fractions`, or of `pressure.build_system`).
+        spacing: cell width, m.
+
+    Returns:
+        the types, and the distance to hand to `prepare_domain` with them, m.
+
+    Raises:
+        ValueError: a distance of the wrong shape, or one that is not finite.
+    """
+    types, level = np.asarray(cell_types, np.uint8), np.asarray(distance, np.float32)
+    require(level.shape == types.shape, f"distance {level.shape}", str(types.shape))
+    require(bool(np.isfinite(level).all()), "a distance that is not finite", "finite metres")
+    return pressure_cells(types, level, openings, spacing)
+
+
+def surface_distances(
+    cell_types: np.ndarray, distance: Float[np.ndarray, "nx ny nz"] | None = None
+) -> list[Float[np.ndarray, "fx fy fz"]]:
     """Where the surface lies on the way from a FLUID to an EMPTY cell's centre, in cells: 1 on all other faces.
 
-    p = 0 at the centres of EMPTY cells would make stairs of a sloping surface, each of which pushes with a full g. The
-    share of fluid is blurred instead (solids left out), and p = 0 where it passes one half (ghost fluid method, Enright
-    et al. 2003; Gibou et al. 2002).
+    Args:
+        cell_types: u8 [nx,ny,nz], `CellType`.
+        distance: of cell centres to the surface in any unit, from `surface_cells`; None: estimated from the types.
+
+    Raises:
+        ValueError: a distance of the wrong shape.
     """
-    fluid = np.isin(cell_types, (CellType.FLUID, CellType.INFLOW, CellType.OUTFLOW)).astype(float)
-    open_space = (cell_types != CellType.SOLID).astype(float)
-    weight = ndimage.gaussian_filter(open_space, SMOOTHING, mode="nearest")
-    share = ndimage.gaussian_filter(fluid * open_space, SMOOTHING, mode="nearest") / np.maximum(weight, 1e-6)
-    level = 0.5 - share
-    out = []
-    for axis in range(3):
-        low, high = sides(level, axis)
-        wet_low, wet_high = sides(cell_types == CellType.FLUID, axis)
-        # outside the box there is neither
-        dry_low, dry_high = sides(cell_types == CellType.EMPTY, axis)
-        inner, outer = np.where(wet_low, low, high), np.where(wet_low, high, low)
-        crossing = (inner < 0) & (outer > 0)
-        distance = np.where(crossing, -inner / np.where(crossing, outer - inner, 1.0), 0.5)
-        surface = (wet_low & dry_high) | (dry_low & wet_high)
-        out.append(np.where(surface, np.clip(distance, NEAREST_SURFACE, 1.0), 1.0))
-    return out
+    types = np.asarray(cell_types)
+    if distance is None:
+        distance = liquid_distance(types)
+    require(distance.shape == types.shape, f"distance {distance.shape}", str(types.shape))
+    return [np.asarray(gap, float) for gap in surface_gaps(distance, types)]
+
+
+def liquid_distance(cell_types: np.ndarray) -> Float[np.ndarray, "nx ny nz"]:
+    """Distance (cells, negative in the liquid) to the smoothest surface that parts liquid cells from empty ones.
+
+    A binary volume shows its surface as stairs. As in Whitaker 2000, "Reducing aliasing artifacts in iso-surfaces of
+    binary volumes", the surface relaxes as long as no cell changes sides; here towards local planes instead of least
+    area, so that inclined surfaces keep their slope up to walls. Each round replaces the distance by a linear fit to
+    its Gaussian neighbourhood (solids and what is outside the box left out), divided by its slope.
+    """
+    types = np.asarray(cell_types)
+    wet = np.isin(types, (CellType.FLUID, CellType.INFLOW, CellType.OUTFLOW))
+    dry = types == CellType.EMPTY
+    if not (wet.any() and dry.any()):
+        return np.full(types.shape, -1.0 if wet.any() else 1.0)
+    to_dry = np.asarray(ndimage.distance_transform_edt(~dry))
+    to_wet = np.asarray(ndimage.distance_transform_edt(~wet))
+    low = np.where(wet, -to_dry, np.where(dry, INSIDE, -np.inf))
+    high = np.where(wet, -INSIDE, np.where(dry, to_wet, np.inf))
+    distance = np.where(wet, 0.5 - to_dry, to_wet - 0.5)
+    plane = _LocalPlane(types != CellType.SOLID)
+    for _ in range(ROUNDS):
+        distance = np.clip(plane.fit(distance), low, high)
+    return distance
+
+
+class _LocalPlane:
+    """Weighted linear regression of a field around every cell; the moments of the weights are found once."""
+
+    def __init__(self, known: np.ndarray) -> None:
+        self.known = known.astype(float)
+        axes = np.meshgrid(*(np.arange(n, dtype=float) for n in known.shape), indexing="ij", sparse=True)
+        # about the middle: second moments are differences, and would cancel far from the origin
+        self.at = [np.broadcast_to(a - 0.5 * (n - 1), known.shape) for a, n in zip(axes, known.shape)]
+        self.mass = np.maximum(self._blur(self.known), 1e-9)
+        self.mean = [self._blur(self.known * a) / self.mass for a in self.at]
+        spread = np.empty((*known.shape, 3, 3))
+        for i in range(3):
+            for j in range(i, 3):
+                product = self._blur(self.known * self.at[i] * self.at[j]) / self.mass
+                spread[..., i, j] = spread[..., j, i] = product - self.mean[i] * self.mean[j]
+            spread[..., i, i] += SPREAD
+        self.inverse = np.linalg.inv(spread)
+        self.offset = np.stack([a - m for a, m in zip(self.at, self.mean)], axis=-1)
+
+    @staticmethod
+    def _blur(field: np.ndarray) -> np.ndarray:
+        return ndimage.gaussian_filter(field, NEIGHBOURHOOD, mode="constant", truncate=3.0)
+
+    def fit(self, field: np.ndarray) -> np.ndarray:
+        """The plane's value at each cell over its slope: a distance."""
+        weighted = self.known * field
+        mean = self._blur(weighted) / self.mass
+        covariance = [self._blur(weighted * a) / self.mass - m * mean for a, m in zip(self.at, self.mean)]
+        slope = np.einsum("...ij,...j->...i", self.inverse, np.stack(covariance, axis=-1))
+        value = mean + (self.offset * slope).sum(axis=-1)
+        return value / np.clip(np.linalg.norm(slope, axis=-1), FLATTEST, STEEPEST)

@@ -72,7 +72,10 @@ def geometry(story: Story, inputs: Inputs, config: JobConfig) -> Result:
     height = None
     if eye is not None and kind == "stream":
         height = float(eye[2] - _water_level(inputs, warnings if c.size is None else []))
-    scale = place.metric_scale(kind, points, velocities, size=c.size, camera_height=height, known_scale=known_scale)
+    scale = place.metric_scale(
+        kind, points, velocities, size=c.size, camera_height=height, known_scale=known_scale,
+        seen=place.Sighting(trust[visible], clip.interval, up.pitch),
+    )  # fmt: skip
     if scale.warning:
         warnings.append(scale.warning)
     mainstream = _mainstream(kind, velocities, trust[visible])
@@ -98,7 +101,7 @@ def geometry(story: Story, inputs: Inputs, config: JobConfig) -> Result:
         "kind_evidence": asdict(evidence),
         "kind_source": "evidence" if c.kind == "auto" else "user",
         "up": asdict(up),
-        "scale": asdict(scale),
+        "scale": asdict(scale) | {"sentence": scale.sentence},
         "camera": camera.to_dict(),
         "world_from_canonical": {
             "scale": to_world.scale,

@@ -13,6 +13,7 @@ from fluidlift import __version__
 from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected
 from fluidlift.pipeline import body, moving, refining, seeing, simulating
+from fluidlift.pipeline.fit_request import request_of
 from fluidlift.pipeline.resimulate import Made, play
 from fluidlift.pipeline.scene import SimulationRequest
 from fluidlift.pipeline.seeing import Inputs
@@ -53,6 +54,7 @@ def make(
         raise InputRejected(f"unknown stage '{sorted(unknown)[0]}'", "one of " + ", ".join(STAGES))
     check_output_folder(folder)
     simulating.particle_work(config.simulate.device)  # a device that is not there is said now, not after the fit
+    request_of(config.fit)  # so is a parameter that is not known
     fresh = not folder.exists()
     began = time.perf_counter()
     story = Story(folder, STAGES, force=frozenset(force), progress=progress or Silence())
@@ -108,7 +110,7 @@ def _run(story: Story, inputs: Inputs, folder: Path, config: JobConfig) -> dict[
     )
     run("refine", lambda: refining.refine(story, inputs, config), settings=[shape, seed], after=("geometry",))
     run("motion", lambda: moving.motion(story, config), settings=config.section("motion"), after=("geometry",))
-    run("fit", lambda: moving.fit(story, config), settings=config.section("fit"), after=("motion",))
+    run("fit", lambda: moving.fit(story, config), settings=fit_settings(config), after=("motion",))
     return {"inputs": {k: {"name": inputs.existing()[k].name, "sha256": v} for k, v in hashes.items()}}
 
 
@@ -156,7 +158,19 @@ def _metrics(story: Story) -> dict[str, Any]:
         "fit_converged": story["fit"].meta["converged"],
         "fit_rollouts": story["fit"].meta["rollouts"],
         "fit_extra": story["fit"].meta["extra"],
+        "fit": fit_figures(story),
     }
+
+
+def fit_settings(config: JobConfig) -> dict[str, Any]:
+    """What the result of the fit depends on; the seed only where there are restarts."""
+    return config.section("fit") | ({"seed": config.seed} if config.fit.restarts else {})
+
+
+def fit_figures(story: Story) -> dict[str, Any]:
+    """How the fit ended, and its table, for the manifest."""
+    meta = story["fit"].meta
+    return {k: meta[k] for k in ("status", "reason", "warnings", "notes", "table")}
 
 
 def versions() -> dict[str, str]:

@@ -2,19 +2,35 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+import inspect
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 
 from fluidlift.config import JobConfig
+from fluidlift.errors import InputRejected
 from fluidlift.pipeline.body import camera_of, setting_of
+from fluidlift.pipeline.fit_outcome import (
+    AT_THE_ENDS,
+    Verdict,
+    as_given,
+    family,
+    first_guess_as_result,
+    labelled,
+    size_estimate,
+    size_row,
+    table,
+    verdict,
+)
+from fluidlift.pipeline.fit_request import request_of, startable
 from fluidlift.pipeline.seeing import clip_of, flow_of, labels_of
 from fluidlift.pipeline.story import Result, Story, one_torch_thread
 from fluidlift.types import (
     CellType,
     Estimate,
     FaceVelocity,
+    FitResult,
     FluidParameters,
     PixelFlow,
 )
@@ -142,44 +158,82 @@ def targets_of(story: Story) -> list[FaceVelocity]:
 
 
 def fit(story: Story, config: JobConfig) -> Result:
-    """Physical parameters that make the grid move like the targets."""
-    from fluidlift.fit.optimize import DEFAULT_FREE, fit_parameters
+    """Physical parameters that make the grid move like the targets; the first guess where the fit fails."""
+    from fluidlift.fit.optimize import DEFAULT_FREE
+    from fluidlift.fit.ranges import UNITS
 
     setting, kind = setting_of(story), story["geometry"].meta["kind"]
+    request, along = request_of(config.fit), setting.terrain.mainstream
+    if kind == "plume" and "gravity" in request.held:
+        raise InputRejected(
+            "a known gravity for a plume, whose gravity stands for its buoyancy", "another parameter",
+            "give gravity in scene.yaml, for the simulation",
+        )  # fmt: skip
     targets = targets_of(story)
-    initial = first_guess(story, targets)
+    initial = request.applied(first_guess(story, targets), along=along)
     # speeds that come from free fall were not measured: they say nothing about friction inside or at the walls
     assumed = story["motion"].meta["free_fall_share"] > 0.3
-    free = ("inflow_velocity", "inflow_fluctuation", "outflow_velocity") if assumed else DEFAULT_FREE
+    usual = AT_THE_ENDS if assumed else DEFAULT_FREE
     if filling_rate(story) is not None:  # the level in the vessel says how much enters
-        free = tuple(name for name in free if name != "inflow_velocity")
-    with one_torch_thread():
-        found = fit_parameters(
-            targets, setting.cell_types, setting.terrain, setting.terrain.grid, clip_of(story).interval, initial,
-            kind=kind, method=config.fit.method, max_seconds=config.fit.max_seconds, progress=story.step,
-            mainstream=setting.terrain.mainstream, prior_sigmas=gravity_prior(story), free=free,
-        )  # fmt: skip
-    warnings = []
-    if not found.converged:
-        warnings.append(
-            "the parameter fit stopped before it converged: its values are the best found so far "
-            "(--set fit.max_seconds=... gives it more time)"
+        usual = tuple(name for name in usual if name != "inflow_velocity")
+    free = request.free_of(usual)
+    found, judged = _attempt(story, config, targets, startable(initial, request.held), free)
+    parameters, estimates = found.parameters, dict(found.estimates)
+    if not judged.usable:
+        parameters, estimates = initial, first_guess_as_result(initial, UNITS)
+    known = {name: getattr(initial, name) for name in request.held}
+    parameters = replace(parameters, **known)
+    estimates = {n: as_given(n, e, initial) if family(n) in known else e for n, e in estimates.items()}
+    rows = table(estimates, held=set(known), free=set(free), measured=set(AT_THE_ENDS))
+    size = size_row(story["geometry"].meta["scale"])
+    if size is not None:
+        rows, estimates = [*rows, size], estimates | {"size": size_estimate(size)}
+    notes = list(found.notes)
+    if assumed and not request.free:
+        notes.append(
+            "viscosity, restitution and wall damping keep their priors: the steep part was too fast to be measured"
         )
     return Result(
         {"loss_history": np.asarray(found.loss_history, np.float64)},
         {
-            "warnings": warnings,
-            "parameters": found.parameters.to_dict(),
-            "estimates": {k: asdict(e) for k, e in found.estimates.items()},
+            "warnings": judged.warnings(),
+            "parameters": parameters.to_dict(),
+            "estimates": {r["name"]: asdict(labelled(estimates[r["name"]], r)) for r in rows},
+            "table": rows,
             "initial": initial.to_dict(),
             "converged": found.converged,
+            "status": judged.status,
+            "reason": judged.reason,
             "rollouts": found.rollouts,
-            "notes": list(found.notes)
-            + ["viscosity, restitution and wall damping keep their priors: the steep part was too fast to be measured"]
-            * assumed,
+            "notes": notes,
             "extra": {k: float(v) for k, v in found.extra.items()},
         },
     )
+
+
+def _attempt(
+    story: Story, config: JobConfig, targets: list[FaceVelocity], initial: FluidParameters, free: tuple[str, ...]
+) -> tuple[FitResult, Verdict]:
+    """One fit, judged; equations without a solution are a failure like others."""
+    from fluidlift.fit.optimize import fit_parameters
+
+    setting = setting_of(story)
+    more: dict[str, Any] = {}
+    if config.fit.restarts:
+        if "restarts" not in inspect.signature(fit_parameters).parameters:
+            raise InputRejected(f"fit.restarts = {config.fit.restarts}", "0: this version fits once")
+        more = {"restarts": config.fit.restarts, "seed": config.seed}
+    try:
+        with one_torch_thread():
+            found = fit_parameters(
+                targets, setting.cell_types, setting.terrain, setting.terrain.grid, clip_of(story).interval, initial,
+                kind=story["geometry"].meta["kind"], method=config.fit.method, max_seconds=config.fit.max_seconds,
+                progress=story.step, mainstream=setting.terrain.mainstream, prior_sigmas=gravity_prior(story),
+                free=free, **more,
+            )  # fmt: skip
+    except (np.linalg.LinAlgError, FloatingPointError) as error:
+        return FitResult(initial, {}, np.zeros(0), False, 0), Verdict("failed", f"no solution ({error})")
+    return found, verdict(found)
 
 
 def gravity_prior(story: Story) -> dict[str, float] | None:
@@ -241,7 +295,7 @@ def first_guess(story: Story, targets: list[FaceVelocity]) -> FluidParameters:
     courant = setting.terrain.grid.spacing / max(speed, 1e-6)
     return FluidParameters(
         kinematic_viscosity=VISCOSITY_PRIOR[kind],
-        inflow_velocity=tuple(float(x) for x in bulk),
+        inflow_velocity=(float(bulk[0]), float(bulk[1]), float(bulk[2])),
         inflow_fluctuation=float(spread),
         outflow_velocity=max(out, 0.0),
         restitution=0.05,
@@ -252,14 +306,13 @@ def first_guess(story: Story, targets: list[FaceVelocity]) -> FluidParameters:
 
 def parameters_of(story: Story) -> FluidParameters:
     """The fitted parameters."""
-    p = dict(story["fit"].meta["parameters"])
-    return FluidParameters(**{k: tuple(v) if isinstance(v, list) else v for k, v in p.items()})
+    return FluidParameters().updated(story["fit"].meta["parameters"])
 
 
 def estimates_of(story: Story) -> dict[str, Estimate]:
     """The fitted parameters with their uncertainties."""
-    found = {}
-    for name, e in story["fit"].meta["estimates"].items():
-        sigma = float("inf") if e["sigma"] is None else e["sigma"]  # JSON has no infinity
-        found[name] = Estimate(e["value"], sigma, e["identifiable"], e["prior"], e["unit"])
-    return found
+    # JSON has no infinity
+    return {
+        name: Estimate(**(e | {"sigma": float("inf") if e["sigma"] is None else e["sigma"]}))
+        for name, e in story["fit"].meta["estimates"].items()
+    }

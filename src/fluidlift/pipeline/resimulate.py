@@ -21,6 +21,9 @@ FIRST_HALF = ("read", "flow", "segment", "geometry", "refine", "motion", "fit")
 
 SECOND_HALF = ("simulate", "show")
 
+SECOND_HALF_SECTIONS = ("simulate", "show")
+"""settings that the second half depends on"""
+
 FPS_RANGE = (0.1, 10_000.0)
 """frames per second that can be asked for"""
 
@@ -71,7 +74,7 @@ def resimulate(
     request = request or SimulationRequest()
     began = time.perf_counter()
     manifest = read_manifest(folder)
-    config = _settings(manifest, overrides, flat or {})
+    config = settings_of(manifest, overrides, flat or {}, sections=SECOND_HALF_SECTIONS, work="a simulation")
     _check(request)
     story = Story(
         folder, SECOND_HALF, force=frozenset(SECOND_HALF if request.restart else ()), progress=progress or Silence()
@@ -97,22 +100,33 @@ def _check(request: SimulationRequest) -> None:
         raise InputRejected("both --resume and --restart", "one of them")
 
 
-def _settings(manifest: dict[str, Any], overrides: Sequence[str], flat: dict[str, Any]) -> JobConfig:
+def settings_of(
+    manifest: dict[str, Any], overrides: Sequence[str], flat: dict[str, Any], *, sections: Sequence[str], work: str
+) -> JobConfig:
     """The settings that the asset was made with, and what is changed now.
 
     Of an asset made by another version, settings that this one does not know are left out.
+
+    Args:
+        manifest: of the asset.
+        overrides: `section.name=value`.
+        flat: settings by dotted name; None values are left out.
+        sections: that matter for the work.
+        work: a word for it.
+
+    Raises:
+        InputRejected: a setting of another section, an unknown one, or a wrong value.
     """
     for text in overrides:
-        section = text.partition("=")[0].strip().partition(".")[0]
-        if section not in ("simulate", "show"):
+        if text.partition("=")[0].strip().partition(".")[0] not in sections:
             raise InputRejected(
-                f"--set {text}, which has no effect on a simulation", "simulate.name=value or show.name=value",
+                f"--set {text}, which has no effect on {work}", " or ".join(f"{s}.name=value" for s in sections),
                 "change it with fluidlift make",
             )  # fmt: skip
     provenance = manifest.get("provenance", {})
     stored = provenance.get("config", {})
     values: dict[str, Any] = {"seed": provenance.get("seed")}
-    for section in ("simulate", "show"):
+    for section in sections:
         part = stored.get(section, {}) if isinstance(stored, dict) else {}
         known = JobConfig().section(section)
         values |= {f"{section}.{k}": v for k, v in part.items() if k in known} if isinstance(part, dict) else {}
@@ -123,14 +137,21 @@ def _settings(manifest: dict[str, Any], overrides: Sequence[str], flat: dict[str
 
 def _recall(story: Story, manifest: dict[str, Any]) -> None:
     """Results of the first half, as far as they are still cached; all of them or none."""
-    keys = manifest.get("provenance", {}).get("stages", {})
-    usable = isinstance(keys, dict) and all(
-        isinstance(keys.get(n), str) and len(keys[n]) == 64 and keys[n].isalnum() and keys[n].isascii()
-        for n in FIRST_HALF
-    )
-    if not (usable and all(story.recall(name, keys[name]) for name in FIRST_HALF)):
+    keys = stage_keys(manifest)
+    if not all(name in keys and story.recall(name, keys[name]) for name in FIRST_HALF):
         for part in (story.results, story.keys, story.timings):
             part.clear()
+
+
+def stage_keys(manifest: dict[str, Any]) -> dict[str, str]:
+    """Keys of the cached results that an asset was made from; those that are none are left out."""
+    keys = manifest.get("provenance", {}).get("stages", {})
+    return {n: k for n, k in keys.items() if is_key(k)} if isinstance(keys, dict) else {}
+
+
+def is_key(text: Any) -> bool:
+    """Whether this can be the key of a result."""
+    return isinstance(text, str) and len(text) == 64 and text.isalnum() and text.isascii()
 
 
 def play(story: Story, folder: Path, config: JobConfig, request: SimulationRequest) -> int:

@@ -11,7 +11,8 @@ import numpy as np
 from fluidlift.config import JobConfig
 from fluidlift.look.report import Figure, Section, report_html
 from fluidlift.pipeline.body import setting_of
-from fluidlift.pipeline.moving import estimates_of, targets_of
+from fluidlift.pipeline.fit_outcome import TIES, how_sure, in_words
+from fluidlift.pipeline.moving import targets_of
 from fluidlift.pipeline.scene import LYING, Footage, Scene
 from fluidlift.pipeline.seeing import clip_of, flow_of, labels_of
 from fluidlift.pipeline.simulating import frame_file
@@ -245,7 +246,7 @@ def _section_body(story: Story) -> Section:
         ["belief per kind", ", ".join(f"{k} {v:.2f}" for k, v in evidence["scores"].items())],
         ["evidence", ", ".join(f"{k} {v:.2f}" for k, v in evidence["features"].items())],
         ["camera looks down by", f"{m['up']['pitch']:.1f} degrees, rolled {m['up']['roll']:.1f} ({m['up']['source']})"],
-        ["scale", f"{m['scale']['value']:.4g} m per unit ({m['scale']['source']})"],
+        ["scale", m["scale"].get("sentence", "").removeprefix("scale: ")],
         ["grid", f"{' x '.join(map(str, m['grid']['shape']))} cells of {1000 * m['grid']['spacing']:.2f} mm"],
         ["frames united", m["united_frames"]],
         ["Gaussians", f"{fitted['total']} ({fitted['front']} seen, {fitted['hull']} hull, {fitted['filled']} inside, "
@@ -303,11 +304,10 @@ def _section_motion(story: Story) -> Section:
 def _section_parameters(story: Story) -> Section:
     from fluidlift.look.pictures import curve
 
-    meta = story["fit"].meta
-    rows = [
-        [name, e.value, f"± {e.sigma:.2g}", e.unit, "fitted" if e.identifiable else "not identifiable: keeps its prior"]
-        for name, e in estimates_of(story).items()
-    ]
+    meta, g = story["fit"].meta, story["geometry"].meta
+    # an asset of an earlier version has no such table
+    table = meta.get("table", ())
+    rows = [[r["name"], r["value"], r["unit"], in_words(r), how_sure(r), r["prior"], r["source"]] for r in table]
     loss = story["fit"].arrays["loss_history"]
     figures = []
     if len(loss):
@@ -315,9 +315,15 @@ def _section_parameters(story: Story) -> Section:
         figures.append(
             Figure(picture, "misfit of the velocities; it may rise once the noise is known and priors count")
         )
+    how = {"fitted": "The fit converged.", "unfinished": "The fit did not converge: best values so far."}
+    status = meta.get("status", "fitted" if meta["converged"] else "unfinished")
+    said = how.get(status, f"The fit failed: {meta.get('reason', '')}. The first guess is kept.")
+    scale = g["scale"].get("sentence", f"scale: {g['scale']['source']}")
     return Section(
-        "Physical parameters", figures, rows, ["parameter", "value", "uncertainty", "unit", ""], meta["notes"]
-    )
+        "Physical parameters", figures, rows,
+        ["parameter", "value", "unit", "between (95 %)", "how sure", "first guess", "where it comes from"],
+        [said, scale[:1].upper() + scale[1:] + ".", *TIES, *meta["notes"]],
+    )  # fmt: skip
 
 
 def _section_simulation(story: Story) -> Section:

@@ -7,10 +7,58 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from fluidlift.shape.kind import Kind, UpEvidence
+from fluidlift.shape.kind import PITCH_PRIOR, Kind, UpEvidence
 from fluidlift.types import PinholeCamera, RigidTransform, Similarity3
 
 STANDARD_GRAVITY = 9.81
+FEWEST_FALLING = 120
+"""points that a free fall is read from: fewer are one blur"""
+LONGEST_FALL = 100.0
+SHORTEST_FALL = 0.02
+"""m across the fluid, between which a scale from free fall is believed"""
+STEEP = 0.7
+"""share of its speed that is downwards, from which something falls"""
+LEAST_EXPLAINED = 0.8
+"""share of the variance of the squared speed, over heights, that a straight line must explain"""
+MEANT = 0.3
+"""the same share, from which the bend of the line is looked at"""
+UNSURE = 0.3
+"""relative standard error of the acceleration from which it is no measurement"""
+LEFT_OUT = 0.03
+"""relative error of a scale from free fall for what the law leaves out: drag, a jet that widens, pictures in time"""
+LEAN = np.radians(PITCH_PRIOR["pour"][1])
+"""rad, how far camera and jet are off the tilt that they are taken for; seen from above, that changes the drop"""
+BENT = 2.0
+"""ratio of the accelerations of the lower and the upper half from which the law is not that of free fall"""
+DISAGREEING = 1.25
+"""ratio of a given size to a surveyed camera's from which one of them is wrong"""
+
+
+@dataclass(frozen=True)
+class FreeFall:
+    """What the speeds of a fluid say about its free fall."""
+
+    acceleration: float
+    """length/s^2; 0 where nothing could be read"""
+    standard_error: float
+    """of the acceleration, length/s^2"""
+    explained: float
+    """share of the variance of the squared speed, over heights"""
+    refusal: str = ""
+    """why it is no measurement; empty: it is one"""
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """How velocities were seen."""
+
+    trust: Float[np.ndarray, "n"] | None = None
+    """0 to 1, of each; None: all alike"""
+    interval: float = 0.0
+    """s between the two pictures that a velocity comes from. It is the mean over that time, so it belongs to the middle
+    of the way."""
+    pitch: float = 0.0
+    """degrees that the camera looks below the horizon"""
 
 
 @dataclass(frozen=True)
@@ -19,8 +67,22 @@ class MetricScale:
 
     value: float
     source: str
-    """size, camera, free fall, or assumed"""
+    """size, depth, camera, free fall, or assumed"""
     warning: str = ""
+    relative_error: float | None = None
+    """standard error over value; None: not known (nothing was measured, or what was given is taken as it is)"""
+    across: float = 0.0
+    """m across the fluid, along the longest side of its box"""
+    refusal: str = ""
+    """why free fall was not used, where it was looked for"""
+
+    @property
+    def sentence(self) -> str:
+        """For people: `scale: 0.42 m across the fluid, from free fall, ± 12 %`."""
+        words = {"size": "as given", "depth": "from the given depth", "camera": "from the surveyed camera",
+                 "free fall": "from free fall", "assumed": "assumed"}  # fmt: skip
+        error = "" if self.relative_error is None else f", ± {100 * 1.96 * self.relative_error:.0f} % (95 %)"
+        return f"scale: {self.across:.3g} m across the fluid, {words[self.source]}{error}"
 
 
 def pose_up(camera: PinholeCamera) -> tuple[UpEvidence, float]:
@@ -33,33 +95,156 @@ def pose_up(camera: PinholeCamera) -> tuple[UpEvidence, float]:
     return UpEvidence(float(pitch), float(roll), "camera file", 1.0), float(heading)
 
 
-def free_fall_acceleration(
-    points: Float[np.ndarray, "n 3"], velocities: Float[np.ndarray, "n 3"], *, bins: int = 12
-) -> tuple[float, float]:
-    """Acceleration (length/s^2) of what falls, from v^2 = v0^2 + 2 g (z0 - z), and the share of variance explained.
+def fit_free_fall(
+    points: Float[np.ndarray, "n 3"],
+    velocities: Float[np.ndarray, "n 3"],
+    *,
+    seen: Sighting | None = None,
+    bands: int = 12,
+) -> FreeFall:
+    """Acceleration of what falls, from v^2 = v0^2 + 2 g (z0 - z) (energy; no drag, no friction, steady in time).
+
+    A straight line through v^2 over height, on the stretch where most of it goes down, by iterated least squares with
+    Tukey's biweight, started from the medians of bands of height (Theil-Sen). The standard error is that of the bands
+    as clusters (sandwich): the flow of neighbouring pixels shares its errors. Where the line explains too little, its
+    two halves disagree, or the fluid would have started with a negative energy, the motion is not free fall (drag and a
+    flow that saturates bend it down, viscous threads bend it up), and the result says so in `refusal`.
 
     Args:
         points: positions, any unit of length.
-        velocities: in that unit per second.
-        bins: heights at which the median is taken, against outliers.
+        velocities: in that unit per second, z up.
+        seen: how.
+        bands: of height, with equal numbers of points.
     """
-    speed2 = np.where(velocities[:, 2] < 0, (velocities**2).sum(1), np.nan)
-    ok = np.isfinite(speed2)
-    if ok.sum() < 10 * bins:
-        return 0.0, 0.0
-    z, s = points[ok, 2], speed2[ok]
-    edges = np.quantile(z, np.linspace(0.05, 0.95, bins + 1))
-    centre, median = [], []
-    for low, high in zip(edges[:-1], edges[1:]):
-        inside = (z >= low) & (z <= high)
-        if inside.sum() >= 5:
-            centre.append(z[inside].mean())
-            median.append(np.median(s[inside]))
-    if len(centre) < 4 or np.ptp(centre) <= 0:
-        return 0.0, 0.0
-    slope, _ = np.polyfit(centre, median, 1)
-    r = np.corrcoef(centre, median)[0, 1]
-    return float(-slope / 2.0), float(r * r) if np.isfinite(r) else 0.0
+    seen = seen or Sighting()
+    weight = np.ones(len(points)) if seen.trust is None else np.asarray(seen.trust, float)
+    falls = _free_part(points[:, 2], velocities, weight)
+    if falls.sum() < max(FEWEST_FALLING, 10 * bands):
+        return FreeFall(0.0, 0.0, 0.0, "too little of it falls")
+    z = points[falls, 2] + 0.5 * seen.interval * velocities[falls, 2]
+    moving, weight = velocities[falls], weight[falls]
+    edges = np.quantile(z, np.linspace(0.0, 1.0, bands + 1))
+    band = np.clip(np.searchsorted(edges, z, side="right") - 1, 0, bands - 1)
+    filled = [k for k in range(bands) if (band == k).sum() >= 5]
+    if len(filled) < bands // 2 or edges[-1] <= edges[0]:
+        return FreeFall(0.0, 0.0, 0.0, "its fall spans too little height")
+    drop = edges[-1] - z
+    kept, given = np.ones(len(drop), bool), weight
+    for _ in range(3):
+        # again without the outliers, which shift medians too
+        speed = (moving * _direction(drop, moving, np.where(kept, band, -1), filled)).sum(axis=1)
+        line, weight = _robust_line(drop, speed, given, band, filled)
+        kept = weight > 0
+    # twice: an error of the speed counts twice in its square
+    rest = 2.0 * (speed * np.sqrt(_positive(line, drop)) - _positive(line, drop))
+    acceleration, error = 0.5 * line[1], 0.5 * _band_error(drop, rest, weight, band)
+    centre, level = (np.array([np.average(x[band == k], weights=weight[band == k] + 1e-9) for k in filled])
+                     for x in (drop, speed))  # fmt: skip
+    level = level**2
+    spread = np.square(level - level.mean()).sum()
+    explained = 1.0 - float(np.square(level - line[0] - line[1] * centre).sum() / max(spread, 1e-300))
+    refusal = _not_free(line, acceleration, error, explained, centre, level)
+    return FreeFall(float(acceleration), error, max(explained, 0.0), refusal)
+
+
+def _free_part(z, velocities, weight) -> np.ndarray:
+    """bool [n], points of the longest stretch of height whose motion is mostly down: no pool below, no lip above."""
+    known = np.isfinite(velocities).all(axis=1) & (weight > 0)
+    if not known.any():
+        return known
+    steep = known & (-velocities[:, 2] > STEEP * np.linalg.norm(np.nan_to_num(velocities), axis=1))
+    low, high = np.percentile(z[known], [0.5, 99.5])
+    edges = np.linspace(low, high, 25)
+    layer = np.clip(np.searchsorted(edges, z, side="right") - 1, 0, 23)
+    count, down = (np.bincount(layer[x], minlength=24) for x in (known, steep))
+    falls, best, run = down > 0.5 * np.maximum(count, 1), (0, 0), 0
+    for k in range(24):
+        run = run + 1 if falls[k] else 0
+        if run > best[1] - best[0]:
+            best = (k + 1 - run, k + 1)
+    low, high = best
+    if high - low > 6:  # where it dives in, and where it begins to fall, it is half something else
+        low, high = low + (low > 0), high - (high < 24)
+    return steep & (layer >= low) & (layer < high)
+
+
+def _direction(drop, velocities, band, filled) -> np.ndarray:
+    """Unit direction of the fall as a cubic of the drop through the medians of the bands. Speeds are measured along it:
+    the square of the whole velocity would take the noise across it for energy."""
+    bands = [k for k in filled if (band == k).any()]
+    centre = np.array([np.median(drop[band == k]) for k in bands])
+    medians = np.array([np.median(velocities[band == k], axis=0) for k in bands])
+    medians /= np.maximum(np.linalg.norm(medians, axis=1, keepdims=True), 1e-300)
+    smooth = np.polynomial.polynomial.polyval(drop, np.polynomial.polynomial.polyfit(centre, medians, 3)).T
+    return smooth / np.maximum(np.linalg.norm(smooth, axis=1, keepdims=True), 1e-300)
+
+
+def _positive(line, drop) -> np.ndarray:
+    """v^2 on the line, kept positive."""
+    return np.maximum(line[0] + line[1] * drop, 0.02 * max(np.abs(line[0] + line[1] * drop).max(), 1e-300))
+
+
+def _robust_line(drop, speed, weight, band, filled) -> tuple[np.ndarray, np.ndarray]:
+    """(v0^2, 2 g) of the line through (drop, v^2), and the weights that the points end with.
+
+    The observed v^2 is speed times the root of the line, not the square of the speed, whose mean noise would raise.
+    """
+    centre = np.array([np.median(drop[band == k]) for k in filled])
+    level = np.array([np.median(speed[band == k]) ** 2 for k in filled])
+    i, j = np.triu_indices(len(filled), 1)
+    apart = np.abs(centre[j] - centre[i]) > 1e-12
+    slope = np.median((level[j] - level[i])[apart] / (centre[j] - centre[i])[apart])
+    line = np.array([np.median(level - slope * centre), slope])
+    columns, robust = np.stack([np.ones_like(drop), drop], axis=1), weight
+    for _ in range(50):
+        size = _positive(line, drop)
+        energy = speed * np.sqrt(size)
+        # v scatters in proportion to itself
+        rest = energy / size - 1.0
+        u = np.clip(rest / (4.685 * max(1.4826 * np.median(np.abs(rest)), 1e-6)), -1.0, 1.0)
+        robust = weight * np.square(1.0 - u * u) / size**2
+        normal = (columns * robust[:, None]).T @ columns
+        if np.linalg.cond(normal) > 1e14:
+            break
+        new = np.linalg.solve(normal, (columns * robust[:, None]).T @ energy)
+        done = np.abs(new - line).max() < 1e-7 * np.abs(new).max()
+        line = new
+        if done:
+            break
+    return line, robust
+
+
+def _band_error(drop, rest, weight, band) -> float:
+    """Standard error of the slope of a weighted line whose errors are shared inside a band (cluster sandwich)."""
+    columns = np.stack([np.ones_like(drop), drop], axis=1)
+    bread = np.linalg.pinv((columns * weight[:, None]).T @ columns)
+    scores = np.stack([(columns * (weight * rest)[:, None])[band == k].sum(axis=0) for k in np.unique(band)])
+    count = len(scores)
+    # two numbers were fitted to the bands
+    meat = scores.T @ scores * count / max(count - 2, 1)
+    return float(np.sqrt(max((bread @ meat @ bread)[1, 1], 0.0)))
+
+
+def _not_free(line, acceleration: float, error: float, explained: float, centre, level) -> str:
+    """Why this is no free fall; empty where it may be one."""
+    if acceleration <= 0:
+        return "it does not get faster as it falls"
+    half = len(centre) // 2
+    order = np.argsort(centre)
+    upper, lower = (np.polyfit(centre[order][part], level[order][part], 1)[0]
+                    for part in (slice(None, half + 1), slice(half, None)))  # fmt: skip
+    if explained > MEANT:
+        if lower * BENT < upper:
+            return "it stops getting faster on the way down, as under drag, or where optical flow cannot follow"
+        if upper * BENT < lower:
+            return "it hardly gets faster at first, as a viscous thread, or where it is still held"
+    if error > UNSURE * acceleration:
+        return f"its speed scatters too much (acceleration known to ± {100 * 1.96 * error / acceleration:.0f} %)"
+    if explained < LEAST_EXPLAINED:
+        return f"its speed does not follow the height (only {100 * explained:.0f} % of it does)"
+    if line[0] < -0.1 * line[1] * centre.max():
+        return "its speed would vanish below its top: the fluid is held back there"
+    return ""
 
 
 def metric_scale(
@@ -70,8 +255,12 @@ def metric_scale(
     size: float | None = None,
     camera_height: float | None = None,
     known_scale: float | None = None,
+    seen: Sighting | None = None,
 ) -> MetricScale:
     """Metres per canonical unit (design: a single view has no scale of its own).
+
+    In this order: a given size (what a person asks for wins; where a camera says clearly otherwise, there is a
+    warning), metric depth, a surveyed camera, free fall at 9.81 m/s^2 for falls and pours, one metre.
 
     Args:
         kind: of the fluid.
@@ -80,27 +269,43 @@ def metric_scale(
         size: metres across the fluid (the longest side of its bounding box), from the user.
         camera_height: metres of a surveyed camera above the level of a stream.
         known_scale: metres per canonical unit, where the depth came in metres.
+        seen: how the velocities were seen.
     """
     extent = float(np.ptp(np.percentile(points, [0.5, 99.5], axis=0), axis=0).max())
+    drop = float(-np.median(points[:, 2])) if camera_height is not None else 0.0
+    surveyed = camera_height / drop if camera_height is not None and camera_height > 0 and drop > 0 else None
     if size is not None:
-        return MetricScale(size / extent, "size")
+        scale, warning = size / extent, ""
+        if surveyed is not None and not 1 / DISAGREEING < surveyed / scale < DISAGREEING:
+            warning = (
+                f"the given size, {size:.3g} m across the fluid, is taken, but the camera file makes it "
+                f"{surveyed * extent:.3g} m; leave out --size to use the camera's"
+            )
+        return MetricScale(scale, "size", warning, across=size)
     if known_scale is not None:
-        return MetricScale(known_scale, "depth")
-    if camera_height is not None and camera_height > 0:
-        drop = float(-np.median(points[:, 2]))
-        if drop > 0:
-            return MetricScale(camera_height / drop, "camera")
+        return MetricScale(known_scale, "depth", across=known_scale * extent)
+    if surveyed is not None:
+        return MetricScale(surveyed, "camera", across=surveyed * extent)
+    refusal = ""
     if kind in ("fall", "pour"):
-        acceleration, explained = free_fall_acceleration(points, velocities)
-        if acceleration > 0 and explained > 0.5:
-            scale = STANDARD_GRAVITY / acceleration
-            if 0.02 < scale * extent < 100.0:
-                return MetricScale(scale, "free fall")
+        fall = fit_free_fall(points, velocities, seen=seen)
+        refusal = fall.refusal
+        if not refusal:
+            across = STANDARD_GRAVITY / fall.acceleration * extent
+            if SHORTEST_FALL < across < LONGEST_FALL:
+                # the scale goes with the inverse of the acceleration: the relative errors are the same
+                lean = LEAN * np.tan(np.radians(abs(seen.pitch if seen else 0.0)))
+                relative = float(np.linalg.norm([fall.standard_error / fall.acceleration, LEFT_OUT, lean]))
+                return MetricScale(across / extent, "free fall", relative_error=relative, across=across)
+            refusal = f"it would be {across:.3g} m across"
+    because = f" (free fall does not tell: {refusal})" if refusal else ""
     return MetricScale(
         1.0 / extent,
         "assumed",
-        "the size of the fluid is unknown: 1 m across is assumed, and speeds and gravity follow from it; "
+        f"the size of the fluid is unknown{because}: 1 m across is assumed, and speeds and gravity follow from it; "
         "give --size METRES (or a camera file with a pose) for true units",
+        across=1.0,
+        refusal=refusal,
     )
 
 

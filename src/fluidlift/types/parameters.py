@@ -84,3 +84,7 @@ class Estimate:
     """False: the data cannot determine it and it keeps its prior"""
     prior: float
     unit: str = ""
+    interval: tuple[float, float] | None = None
+    """holds the value with 95 %; None where nothing is known"""
+    source: str = ""
+    """where the value comes from, in words: fitted, measured, given, or a prior (docs/fit.md)"""

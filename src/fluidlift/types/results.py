@@ -35,3 +35,7 @@ class FitResult:
     notes: tuple[str, ...] = ()
     extra: dict[str, float] = field(default_factory=dict)
     """figures for the report, such as the loss of a fluid at rest"""
+    reason: str = ""
+    """why the fit failed and the parameters are the initial ones; empty where it did not"""
+    ends: tuple[FluidParameters, ...] = ()
+    """where fits from several initial scales ended, the given one's first; empty where there was one"""

@@ -1,0 +1,209 @@
+"""Rolling all windows out: residuals, their derivatives by parameter, and what that costs.
+
+A rollout runs on one thread; rollouts run side by side. So results are the same bits for any number of workers.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from fluidlift.fit.identifiability import effective_observations
+from fluidlift.fit.problem import FitProblem
+from fluidlift.fit.ranges import ParameterSpace
+from fluidlift.types import SolveReport
+
+Progress = Callable[[int, int], None]
+"""called with (done, total)"""
+DIFFERENCE = 0.02
+"""raw step of the forward differences: a few per cent, far above the 1e-5 that pressure solves leave"""
+BACKWARD = 2.0
+"""cost of a gradient beyond that of its rollout"""
+
+
+def _one_thread() -> None:
+    torch.set_num_threads(1)
+    numba.set_num_threads(1)
+
+
+@contextmanager
+def single_thread() -> Iterator[None]:
+    """torch and Numba alternate in short kernels here: their thread pools would wait for each other by spinning."""
+    before = torch.get_num_threads(), numba.get_num_threads()
+    _one_thread()
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before[0])
+        numba.set_num_threads(before[1])
+
+
+@dataclass
+class Budget:
+    """What may be spent; counts as it goes. Rollouts and work end a fit at the same point on every machine."""
+
+    deadline: float = float("inf")
+    """of `time.monotonic`: the last resort, since where it strikes depends on the machine"""
+    max_rollouts: int = 1_000_000
+    """rollouts of one window"""
+    max_work: float = float("inf")
+    """cells times steps; a gradient counts as three rollouts"""
+    workers: int = 1
+    progress: Progress | None = None
+    rollouts: int = 0
+    work: float = 0.0
+    stopped_by_clock: bool = False
+    started: float = field(default_factory=time.monotonic)
+
+    @property
+    def spent(self) -> bool:
+        """Nothing is left."""
+        if self.rollouts >= self.max_rollouts or self.work >= self.max_work:
+            return True
+        self.stopped_by_clock |= time.monotonic() >= self.deadline
+        return self.stopped_by_clock
+
+    def count(self, problem: FitProblem, times: float = 1.0) -> None:
+        """Rollouts of all windows that were made."""
+        self.rollouts += round(times * len(problem.windows))
+        self.work += times * problem.work
+
+    def tell(self) -> None:
+        """Report the share of the budget that is used."""
+        if self.progress is not None:
+            used = max(self.rollouts / self.max_rollouts, self.work / self.max_work)
+            self.progress(round(100 * min(used, 1.0)), 100)
+
+    def each(self, task: Callable[..., Any], *arguments: Sequence[Any]) -> list[Any]:
+        """The task for each set of arguments, side by side, results in order."""
+        if self.workers <= 1:
+            return [task(*a) for a in zip(*arguments)]
+        with ThreadPoolExecutor(self.workers, initializer=_one_thread) as pool:
+            return list(pool.map(task, *arguments))
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Residuals of all windows at one point."""
+
+    raw: Float[np.ndarray, "p"]
+    residuals: list[Float[np.ndarray, "m 6"]]
+    """per window"""
+    guesses: list[tuple[np.ndarray, ...]]
+    reports: tuple[SolveReport, ...]
+
+    @property
+    def loss(self) -> float:
+        """Sum of squares; inf where the rollout blew up."""
+        total = float(sum(np.square(r).sum() for r in self.residuals))
+        return total if np.isfinite(total) else float("inf")
+
+    def solved(self, problem: FitProblem) -> bool:
+        """All pressure solves that have a tolerance reached it."""
+        return problem.options.fixed_work or all(r.converged for r in self.reports)
+
+    def observations(self, problem: FitProblem) -> float:
+        """Effective number of observations, from the magnitude terms."""
+        fields, masks = [], []
+        for window, found in zip(problem.windows, self.residuals):
+            shape, row = window.domains[0].shape, 0
+            for cells, weights in zip(window.cells, window.masks):
+                at, n = cells.numpy(), len(cells)
+                dense, mask = np.zeros((int(np.prod(shape)), 3)), np.zeros(int(np.prod(shape)))
+                dense[at], mask[at] = found[row : row + n, 3:], weights.double().numpy()
+                fields.append(dense.reshape(*shape, 3))
+                masks.append(mask.reshape(shape))
+                row += n
+        return effective_observations(fields, masks)
+
+
+@dataclass(frozen=True)
+class Jacobian:
+    """d residuals / d raw, and the products that a step needs."""
+
+    columns: list[Float[np.ndarray, "p n"]]
+    """float32, per window; n residuals in the order of `Evaluation.residuals`, flattened"""
+    normal: Float[np.ndarray, "p p"]
+    """J^T J"""
+    slope: Float[np.ndarray, "p"]
+    """J^T r"""
+
+
+def evaluate(
+    problem: FitProblem,
+    space: ParameterSpace,
+    raw: Float[np.ndarray, "p"],
+    budget: Budget,
+    guesses: Sequence[Sequence[np.ndarray]] | None = None,
+) -> Evaluation:
+    """Roll all windows out."""
+    return evaluate_many(problem, space, [raw], budget, guesses)[0]
+
+
+def evaluate_many(
+    problem: FitProblem,
+    space: ParameterSpace,
+    points: Sequence[Float[np.ndarray, "p"]],
+    budget: Budget,
+    guesses: Sequence[Sequence[np.ndarray]] | None = None,
+) -> list[Evaluation]:
+    """Roll all windows out at several points, side by side."""
+
+    def one(point: int, window: int) -> tuple[np.ndarray, tuple[np.ndarray, ...], tuple[SolveReport, ...]]:
+        with torch.no_grad():
+            parameters = space.physical(torch.as_tensor(points[point], dtype=torch.float32))
+            run = problem.roll(window, parameters, None if guesses is None else guesses[window])
+            return problem.residual(window, run).double().numpy(), run.potentials, run.reports
+
+    n = len(problem.windows)
+    rows = budget.each(one, [p for p in range(len(points)) for _ in range(n)], list(range(n)) * len(points))
+    budget.count(problem, len(points))
+    out = []
+    for p, raw in enumerate(points):
+        found, potentials, reports = zip(*rows[p * n : (p + 1) * n])
+        out.append(Evaluation(np.array(raw, float), list(found), list(potentials), sum(reports, ())))
+    return out
+
+
+def products(columns: list[np.ndarray], residuals: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """J^T J and J^T r, summed in double precision."""
+    p = columns[0].shape[0]
+    normal, slope = np.zeros((p, p)), np.zeros(p)
+    for c, r in zip(columns, residuals):
+        wide, flat = c.astype(float), r.ravel()
+        for i in range(p):
+            slope[i] += float((wide[i] * flat).sum())
+            for j in range(i, p):
+                normal[i, j] += float((wide[i] * wide[j]).sum())
+    return np.triu(normal) + np.triu(normal, 1).T, slope
+
+
+def jacobian(problem: FitProblem, space: ParameterSpace, base: Evaluation, budget: Budget) -> Jacobian | None:
+    """By forward differences; None where the budget is spent.
+
+    A dozen global parameters against many thousand residuals: one rollout per parameter, started from the pressures
+    of the base rollout, costs less than one adjoint per residual or than carrying tangents.
+    """
+    if budget.spent:
+        return None
+    # towards the prior, where the rollout is least likely to break down
+    h = np.where(base.raw <= space.prior_raw, DIFFERENCE, -DIFFERENCE)
+    points = [base.raw + np.where(np.arange(len(h)) == p, h, 0.0) for p in range(len(h))]
+    others = evaluate_many(problem, space, points, budget, base.guesses)
+    # where the rollout breaks down there is no derivative to be had: the variable stays
+    sound = [np.isfinite(o.loss) for o in others]
+    columns = [
+        np.stack([(o.residuals[w] - r).ravel() / h[p] if sound[p] else np.zeros(r.size) for p, o in enumerate(others)])
+        .astype(np.float32)
+        for w, r in enumerate(base.residuals)
+    ]  # fmt: skip
+    return Jacobian(columns, *products(columns, base.residuals))

@@ -1,0 +1,65 @@
+"""How a fit is done, as one value."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from fluidlift.errors import require
+from fluidlift.fit.loss import LossWeights
+from fluidlift.physics.rollout_pressure import RolloutOptions
+
+DEFAULT_FREE = (
+    "density", "kinematic_viscosity", "gravity", "inflow_velocity", "inflow_fluctuation", "outflow_velocity",
+    "restitution", "wall_damping", "time_step",
+)  # fmt: skip
+"""All of the paper's. The time step has a narrow prior: the interval between frames is known, its division a choice."""
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """Everything about a fit that is not data."""
+
+    method: str = "lm"
+    """"lm" (Levenberg-Marquardt, finite differences) or "adam" (analytic gradient; the paper's way)"""
+    free: Sequence[str] = DEFAULT_FREE
+    """parameters to fit"""
+    prior_sigmas: dict[str, float] | None = None
+    """raw prior widths instead of `ranges.DEFAULT_PRIOR_SIGMAS`"""
+    weights: LossWeights | None = None
+    """of the loss"""
+    options: RolloutOptions | None = None
+    """of the rollout: way through the pressure solve and gradient of advection"""
+    windows: int = 3
+    """most windows; fewer where the work does not allow them"""
+    frames_per_window: int | None = None
+    """n; default from the dynamics (`problem.plan_windows`)"""
+    steps_per_frame: int | None = None
+    """default from the Courant number"""
+    compare: str = "all"
+    """"all" frames of a window count, or its "last" (paper)"""
+    start_rounds: int = 2
+    """times that the starts of windows are corrected where targets have errors or hidden cells; 0 trusts them"""
+    restarts: int = 1
+    """starts from this many initial scales; the best end counts"""
+    most_cells: int = 300_000
+    """layouts with more cells are coarsened by two, as often as needed"""
+    coarse_first: int = 30_000
+    """layouts with more cells are first fitted on cells twice as wide"""
+    max_rollouts: int = 5000
+    """rollouts of one window, all told"""
+    max_work: float = 4e9
+    """cells times steps, all told: minutes on two cores. A fit that ends by it ends at the same point everywhere"""
+    max_seconds: float = 600.0
+    """wall clock, the last resort: a fit that it ends is not reproducible"""
+    workers: int | None = None
+    """threads that roll windows out side by side; default: the cores. Results do not depend on it"""
+    device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        require(self.device == "cpu", f"device '{self.device}'", "'cpu'")
+        require(self.method in ("lm", "adam"), f"method '{self.method}'", "'lm' or 'adam'")
+        require(self.compare in ("all", "last"), f"comparison of '{self.compare}' frames", "'all' or 'last'")
+        require(self.windows >= 1, f"{self.windows} windows", "one or more")
+        require(self.restarts >= 1, f"{self.restarts} starts", "one or more")
+        require(self.workers is None or self.workers >= 1, f"{self.workers} workers", "one or more")

@@ -1,0 +1,151 @@
+"""Errors in what a rollout begins with are errors of the data too: the start of a window as an unknown.
+
+The start is an unknown beside the parameters, with the measured one as its prior (strong-constraint 4D-Var). For a
+linear model and errors of known ratio this is total least squares, which unlike a fit that trusts a noisy start is
+consistent (Fuller, Measurement Error Models, 1987): trusted, the errors of a start pass for shear, and viscosity is
+raised to damp them.
+
+* `corrected_starts` finds the start by L-BFGS on the adjoint gradient, at fixed parameters.
+* `profile` finds how that start moves with each parameter, and so the derivative of all residuals along it (variable
+  projection; Golub & Pereyra 1973). What is left of a column says how much the data know of a parameter once the
+  start has explained what it can.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from fluidlift.fit.evaluation import BACKWARD, Budget, Evaluation, Jacobian, products
+from fluidlift.fit.problem import FitProblem
+from fluidlift.fit.ranges import ParameterSpace
+
+PROBE = 0.02
+"""largest change of a face, in units of U, that a directional derivative is measured with"""
+
+
+def corrected_starts(
+    problem: FitProblem, space: ParameterSpace, raw: Float[np.ndarray, "p"], budget: Budget, *, iterations: int = 8
+) -> FitProblem:
+    """The problem from starts that fit their windows better, at fixed parameters."""
+    parameters = space.physical(torch.as_tensor(raw, dtype=torch.float32))
+    calls = [0] * len(problem.windows)
+
+    def one(index: int) -> Tensor:
+        begin, unit = problem.windows[index].start.clone(), problem.speed
+        move = torch.zeros_like(begin, requires_grad=True)
+        optimizer = torch.optim.LBFGS(
+            [move], lr=1.0, max_iter=iterations, max_eval=2 * iterations, history_size=iterations,
+            line_search_fn="strong_wolfe", tolerance_grad=0.0, tolerance_change=0.0,
+        )  # fmt: skip
+
+        def closure() -> Tensor:
+            optimizer.zero_grad()
+            start = begin + unit * move
+            total = problem.loss(index, problem.roll(index, parameters, start=start)) + problem.departure(index, start)
+            # single precision: the gradient of a mean over many faces would be tiny
+            total = total * begin.numel()
+            total.backward()
+            calls[index] += 1
+            return total
+
+        optimizer.step(closure)
+        found = (begin + unit * move).detach()
+        return found if bool(torch.isfinite(found).all()) else begin
+
+    starts = budget.each(one, list(range(len(problem.windows))))
+    budget.count(problem, (1 + BACKWARD) * float(np.mean(calls)))
+    return problem.with_starts(starts)
+
+
+@dataclass(frozen=True)
+class Profile:
+    """Residuals of loss and start together, and their derivatives along the best start."""
+
+    slopes: Jacobian
+    """columns: the loss's residuals, then one row per face of the start"""
+    moves: list[Float[np.ndarray, "p f"]]
+    """d start / d raw, per window"""
+
+
+def start_residuals(problem: FitProblem) -> list[Float[np.ndarray, "f"]]:
+    """Squares add up to the departures from the measured starts, per window."""
+    return [
+        (torch.sqrt(problem.start_weight(i)) * (w.start - w.measured)).double().numpy()
+        for i, w in enumerate(problem.windows)
+    ]
+
+
+def profile(
+    problem: FitProblem, space: ParameterSpace, here: Evaluation, slopes: Jacobian, budget: Budget, *, iterations: int
+) -> Profile:
+    """Derivatives along the best start, by conjugate gradients on the start's normal equations.
+
+    Args:
+        problem: from corrected starts.
+        space: of the parameters.
+        here: residuals of the loss from these starts.
+        slopes: their derivatives at fixed starts.
+        budget: counts the work.
+        iterations: of the conjugate gradients; eigenvalues lie between 1 and about one plus the number of frames.
+    """
+    n = len(problem.windows)
+    found = budget.each(
+        lambda i: _window_profile(problem, space, here.raw, i, slopes.columns[i], iterations), list(range(n))
+    )
+    budget.count(problem, len(here.raw) * iterations * (1 + BACKWARD))
+    columns, moves = [f[0] for f in found], [f[1] for f in found]
+    together = [np.concatenate([r.ravel(), s]) for r, s in zip(here.residuals, start_residuals(problem))]
+    return Profile(Jacobian(columns, *products(columns, together)), moves)
+
+
+def _window_profile(
+    problem: FitProblem, space: ParameterSpace, raw: np.ndarray, index: int, columns: np.ndarray, iterations: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """[p, n + f] columns along the best start and [p, f] how it moves."""
+    parameters = space.physical(torch.as_tensor(raw, dtype=torch.float32))
+    start = problem.windows[index].start.clone().requires_grad_()
+    run = problem.roll(index, parameters, start=start)
+    at = problem.residual(index, run).reshape(-1)
+    weight = problem.start_weight(index)
+    # hidden faces are nearly free: as scale serves what a seen one weighs
+    scale = weight.clamp(min=float(weight.max()) * 0.5)
+
+    def forward(direction: Tensor) -> Tensor:
+        size = float(direction.abs().max())
+        if size == 0:
+            return torch.zeros_like(at)
+        step = PROBE * problem.speed / size
+        with torch.no_grad():
+            there = problem.roll(index, parameters, run.potentials, start=start + step * direction)
+            return (problem.residual(index, there).reshape(-1) - at.detach()) / step
+
+    def adjoint(rows: Tensor) -> Tensor:
+        return torch.autograd.grad(at, start, rows, retain_graph=True)[0]
+
+    out, moves = [], []
+    for column in columns:
+        target = torch.from_numpy(column)
+        move, image = torch.zeros_like(weight), torch.zeros_like(at)
+        rest = -adjoint(target)
+        eased = rest / scale
+        direction, power = eased.clone(), float((rest * eased).sum())
+        first = power
+        for _ in range(iterations):
+            if power <= 1e-4 * first or power == 0:
+                break
+            moved = forward(direction)
+            back = weight * direction + adjoint(moved)
+            alpha = power / float((direction * back).sum())
+            move, image = move + alpha * direction, image + alpha * moved
+            rest = rest - alpha * back
+            eased = rest / scale
+            power, before = float((rest * eased).sum()), power
+            direction = eased + power / before * direction
+        out.append(torch.cat([target + image.detach(), torch.sqrt(weight) * move]).detach().numpy())
+        moves.append(move.numpy())
+    return np.stack(out), np.stack(moves)

@@ -33,7 +33,7 @@ BLOCK = 4
 """cells along a side of a block whose errors are taken as tied"""
 EXCLUDED_BEYOND = 2.5
 """posterior standard deviations between the minimum and the prior beyond which the prior is excluded"""
-MODEL_ERROR = 0.002
+MODEL_ERROR = 0.001
 """root mean square misfit, relative to U, that no fit is trusted beyond (single precision, pressure to a tolerance)"""
 
 

@@ -21,6 +21,9 @@ PROFILE_ITERATIONS = 3
 """conjugate gradients per parameter: the rest changes a standard deviation by some per cent"""
 FIRST_CORRECTION, LATER_CORRECTION = 12, 6
 """L-BFGS steps of the starts"""
+SECOND_ORDER = 1.25
+"""widening of standard deviations where starts have errors: those act on derivatives too, which the linear theory leaves
+out, and the conjugate gradients are cut short"""
 VISCOSITIES = (0.01, 0.1, 1.0)
 """first guesses beside the given one, in units of U h: below what a grid resolves the loss is flat"""
 
@@ -182,7 +185,8 @@ def curvature_of(problem: FitProblem, here: Evaluation, slopes: Jacobian, *, wit
             for faces in window.domains[0].face_shapes:
                 blocks.append(_block_of(np.stack(np.unravel_index(np.arange(math.prod(faces)), faces)), shape, edge))
         parts.append((columns, rest, np.concatenate(blocks)))
-    return Curvature(slopes.normal, here.loss, here.observations(problem), block_scatter(parts, p))
+    scatter = block_scatter(parts, p) * (SECOND_ORDER**2 if with_starts else 1.0)
+    return Curvature(slopes.normal, here.loss, here.observations(problem), scatter)
 
 
 def _block_of(index: np.ndarray, shape: tuple[int, int, int], edge: int) -> np.ndarray:

@@ -19,7 +19,7 @@ SMALL = {"cells": (16, 8, 8), "frames": 8}
 
 
 def fit(twin, **options):
-    options = {"free": FREE, "windows": 2, "steps_per_frame": twin.steps_per_frame} | options
+    options = {"free": FREE, "windows": 2, "precise_within": 0.05, "steps_per_frame": twin.steps_per_frame} | options
     return fit_parameters(
         twin.frames, twin.cell_types, None, twin.grid, twin.interval, twin.start, kind=twin.kind,
         mainstream=twin.mainstream, observed=twin.observed, **options,
@@ -147,7 +147,13 @@ def test_starts_from_other_scales_end_at_the_same_values():
 def test_options_are_one_value_or_keywords(rough):
     first = fit(rough, start_rounds=0, compare="last", workers=1)
     chosen = FitOptions(
-        free=FREE, windows=2, steps_per_frame=rough.steps_per_frame, start_rounds=0, compare="last", workers=1
+        free=FREE,
+        windows=2,
+        precise_within=0.05,
+        steps_per_frame=rough.steps_per_frame,
+        start_rounds=0,
+        compare="last",
+        workers=1,
     )
     second = fit_parameters(
         rough.frames, rough.cell_types, None, rough.grid, rough.interval, rough.start, kind=rough.kind,

@@ -26,9 +26,6 @@ from fluidlift.types import Estimate
 
 IDENTIFIABLE_BELOW = 0.5
 """share of the prior's standard deviation below which the data are said to determine a parameter"""
-PRECISE_WITHIN = 0.05
-"""standard deviation, relative to the value (a vector's component: to its size), up to which a parameter is reported as
-identifiable: its 95 % interval is then within 10 %"""
 BLOCK = 4
 """cells along a side of a block whose errors are taken as tied"""
 EXCLUDED_BEYOND = 2.5
@@ -166,8 +163,10 @@ def determined(
     return keep
 
 
-def precise(space: ParameterSpace, raw: Float[np.ndarray, "p"], sigma: Float[np.ndarray, "p"]) -> Bool[np.ndarray, "p"]:
-    """Which variables are known to `PRECISE_WITHIN`; `sigma` is physical."""
+def precise(
+    space: ParameterSpace, raw: Float[np.ndarray, "p"], sigma: Float[np.ndarray, "p"], within: float
+) -> Bool[np.ndarray, "p"]:
+    """Which variables are known to `within` of their value (components: of the size); `sigma` is physical."""
     values = [float(f.range.physical(torch.tensor(x, dtype=torch.float64))) for f, x in zip(space.fitted, raw)]
     size: dict[str, float] = {}
     for f, value in zip(space.fitted, values):
@@ -175,7 +174,7 @@ def precise(space: ParameterSpace, raw: Float[np.ndarray, "p"], sigma: Float[np.
     for f in space.fixed:
         if f.component is not None and f.name in size:
             size[f.name] = math.hypot(size[f.name], f.value)
-    return np.array([s <= PRECISE_WITHIN * size[f.name] for f, s in zip(space.fitted, sigma)], bool)
+    return np.array([s <= within * size[f.name] for f, s in zip(space.fitted, sigma)], bool)
 
 
 def estimates(
@@ -185,6 +184,7 @@ def estimates(
     curvature: Curvature,
     *,
     also: dict[str, float] | None = None,
+    within: float = math.inf,
 ) -> dict[str, Estimate]:
     """Value and standard deviation per parameter, by label (`gravity_z`, `restitution`, ...).
 
@@ -198,6 +198,7 @@ def estimates(
         keep: which the data determine.
         curvature: at the end.
         also: physical standard deviations from elsewhere, by label, added in squares.
+        within: relative standard deviation up to which a determined one is called identifiable.
     """
     sigma = np.full(len(raw), np.inf)
     felt = np.diag(curvature.normal) > 0
@@ -207,7 +208,7 @@ def estimates(
     slopes = np.array([f.range.slope(float(x)) for f, x in zip(space.fitted, raw)])
     more = np.array([(also or {}).get(f.label, 0.0) for f in space.fitted])
     physical = np.where(np.isfinite(sigma), np.hypot(np.where(np.isfinite(sigma), sigma, 0) * slopes, more), np.inf)
-    sure = precise(space, raw, physical) & keep
+    sure = keep & precise(space, raw, physical, within) if math.isfinite(within) else keep
     out = {}
     for i, parameter in enumerate(space.fitted):
         fitted = float(parameter.range.physical(torch.tensor(float(raw[i]), dtype=torch.float64)))

@@ -22,8 +22,8 @@ PROFILE_ITERATIONS = 3
 FIRST_CORRECTION, LATER_CORRECTION = 12, 6
 """L-BFGS steps of the starts"""
 SECOND_ORDER = 1.25
-"""widening of standard deviations where starts have errors: those act on derivatives too, which the linear theory leaves
-out, and the conjugate gradients are cut short"""
+"""widening of standard deviations where starts have errors: those act on derivatives too, which the linear theory
+leaves out, and the conjugate gradients are cut short"""
 VISCOSITIES = (0.01, 0.1, 1.0)
 """first guesses beside the given one, in units of U h: below what a grid resolves the loss is flat"""
 

@@ -131,7 +131,7 @@ def fit_parameters(
 
     Returns:
         parameters, one `Estimate` per number (`gravity_z`, `restitution`, ...), the loss history, and what happened.
-        Identifiable ones are known to some 5 %. Ones that are known less well, but clearly better than before, have
+        Identifiable ones are determined by the data. Ones that are known less well than `precise_within` have
         their fitted value and `identifiable=False`. What the data do not determine has its prior value and
         `identifiable=False`; its sigma may be inf. A fit that failed has `reason`, and its parameters are the initial
         ones.
@@ -308,7 +308,14 @@ class _Fit:
         if reason:
             self.notes.append(f"{reason}: nothing was fitted")
             best = replace(best, raw=space.prior_raw, keep=np.zeros(len(best.raw), bool))
-        known = estimates(space, best.raw, best.keep, best.curvature, also=fluctuation_error(scene))
+        known = estimates(
+            space,
+            best.raw,
+            best.keep,
+            best.curvature,
+            also=fluctuation_error(scene),
+            within=self.options.precise_within,
+        )
         self._tell(space, best, known)
         spread = self._ends(space, best, ends, known)
         plan = problem.windows[0].domains

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -40,6 +41,9 @@ class FitOptions:
     """"all" frames of a window count, or its "last" (paper)"""
     start_rounds: int = 2
     """times that the starts of windows are corrected where targets have errors or hidden cells; 0 trusts them"""
+    precise_within: float = math.inf
+    """standard deviation, relative to the value (a vector's component: to its size), up to which a determined parameter
+    is called identifiable: 0.05 keeps its 95 % interval within 10 %. Ones known less well keep their fitted value"""
     restarts: int = 1
     """starts from this many initial scales; the best end counts"""
     most_cells: int = 300_000

@@ -120,8 +120,6 @@ class Fit:
     """a value that is known, such as --hold viscosity=1e-6; it is not fitted; may be repeated"""
     restarts: int | None = None
     """further fits from other initial values, whose spread is reported"""
-    seed: int | None = None
-    """of the restarts; by default that of the asset"""
     max_seconds: float | None = None
     """s that the fit may take; by default as in make"""
     set: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default_factory=tuple)
@@ -287,7 +285,7 @@ def _fit(c: Fit) -> int:
     from fluidlift.pipeline import refit
 
     flat = {
-        "seed": c.seed, "fit.method": c.method, "fit.free": c.free, "fit.hold": c.hold or None,
+        "fit.method": c.method, "fit.free": c.free, "fit.hold": c.hold or None,
         "fit.restarts": c.restarts, "fit.max_seconds": c.max_seconds,
     }  # fmt: skip
     with _progress() as progress:

@@ -68,3 +68,21 @@ def test_the_mask_weighs_surface_over_depth_and_ignores_walls():
 def test_a_layout_without_fluid_is_refused():
     with pytest.raises(ValueError, match="no fluid cell"):
         grid_mask(np.zeros((2, 2, 2), np.uint8))
+
+
+def test_errors_of_a_target_do_not_pass_for_friction():
+    """Targets of one velocity with errors: the mean gradient of the direction term at the true one is zero."""
+    rng = np.random.default_rng(0)
+    weights = LossWeights(magnitude=0.0, stagnant=0.4)
+    slopes = {}
+    for size in (0.1, 0.4, 1.0):
+        target = torch.tensor([size, 0.0, 0.0]) + 0.14 * torch.tensor(rng.standard_normal((200_000, 3)))
+        mask = torch.full((200_000,), 1 / 200_000, dtype=torch.float64)
+        for error in (0.0, 0.14):
+            stretch = torch.tensor(1.0, dtype=torch.float64, requires_grad=True)
+            there = (stretch * torch.tensor([size, 0.0, 0.0], dtype=torch.float64)).expand(200_000, 3)
+            velocity_loss(there, target, mask, speed=1.0, weights=weights, error=error).backward()
+            slopes[size, error] = abs(float(stretch.grad))
+    for size in (0.1, 0.4, 1.0):
+        # what is left is of fourth order in 0.14 / 0.4, and scatter of 1 / sqrt(200000)
+        assert slopes[size, 0.14] < 0.25 * slopes[size, 0.0]

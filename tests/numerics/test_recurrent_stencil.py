@@ -104,6 +104,34 @@ def test_the_true_pressure_is_where_every_stencil_rests():
     np.testing.assert_allclose(many, q, atol=1e-8 * np.abs(q).max())
 
 
+def near_surface(seed=0):
+    """A surface as near to cells' centres as is allowed, `SMALLEST_GAP`: weights from 1 to 1000 side by side."""
+    system = irregular(seed=seed)
+    gaps = np.random.default_rng(seed).choice([1e-3, 0.02, 0.3, 1.0], system.weight_z[:, :, -1].shape)
+    system.weight_z[:, :, -1] = 1 / gaps
+    return system
+
+
+@pytest.mark.parametrize(
+    "stencil", [FittedStencil.jacobi(8000), replace(GENERAL, sub_steps=4000)], ids=["jacobi", "kernel"]
+)
+def test_a_surface_a_thousandth_of_a_cell_away_does_not_hinder_convergence(stencil):
+    """Scaled by the diagonal no eigenvalue leaves the bound, however large a weight towards air is."""
+    system = near_surface()
+    ((_, rhs, q),) = samples_of(system, count=1)
+    # thousands of sub-steps reach the solution to its own rounding
+    np.testing.assert_allclose(recurrent_solve(stencil, stencil_domain(system), rhs), q, atol=1e-8 * np.abs(q).max())
+
+
+def test_a_stencil_fitted_beside_a_near_surface_is_accepted_there():
+    found = fit_stencil(samples_of(near_surface()), sub_steps=24, iterations=30, seed=0)
+    validation = validate(found.stencil, samples_of(near_surface(seed=3), seed=4))
+    print(f"errors {validation.errors}, Jacobi {validation.jacobi_errors}")
+    assert validation.accepted
+    # as on the domain without such weights
+    assert (validation.errors < 0.2 * validation.jacobi_errors).all()
+
+
 def test_the_spectrum_stays_below_the_bound():
     """Power iteration on S K S A finds its largest eigenvalue: the bound holds and is not ten times too large."""
     system = irregular()

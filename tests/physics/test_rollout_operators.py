@@ -1,5 +1,6 @@
 """The kernels of a rollout's terms against their readable twins, forward and backward, and against differences."""
 
+import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -125,6 +126,58 @@ def test_diffusion_solves_its_sparse_system_and_so_does_its_adjoint(scene, visco
     adjoint = spsolve(matrix, g.numpy())
     expected = adjoint + c * (domain.boundary_laplacian.transpose @ adjoint)
     np.testing.assert_allclose(torch.autograd.grad(out, v, g)[0].numpy(), expected, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("rate", [0.01, 1.0, 50.0])
+def test_diffusion_in_single_precision_meets_its_tolerance_at_any_viscosity(rate):
+    """rate = c / h^2. The residual counts in the norm of D^-1, D the diagonal, in which Chebyshev's bound holds."""
+    domain = channel(np.float32)
+    v = random_faces(domain).float()
+    dt, none = torch.tensor(0.02), torch.tensor(0.0)
+    failed = []
+    out = implicit_diffusion(v, domain, torch.tensor(rate * H**2 / 0.02), none, dt, failed).double().numpy()
+    start = v.double().numpy()
+    matrix = (identity(v.numel()) - rate * H**2 * domain.laplacian.astype(float)).tocsc()
+    b = start + rate * H**2 * (domain.boundary_laplacian.matrix.astype(float) @ start)
+    weight = domain.dynamic / matrix.diagonal()
+    left = np.sqrt((weight * (b - matrix @ out) ** 2).sum() / (weight * b**2).sum())
+    print(f"c / h^2 = {rate}: residual {left:.2e}")
+    # the solve's 1e-6, and as much again from rounding: x to 6e-8, times D / sqrt(D) = 17 for the stiffest
+    assert not failed and left < 2e-6
+    # the inverse has a norm of 1 at most
+    np.testing.assert_allclose(out, spsolve(matrix, b), rtol=0, atol=1e-5 * np.abs(b).max())
+
+
+def test_a_viscosity_that_the_sweeps_do_not_reach_is_told_and_not_hidden():
+    """c / h^2 = 1e6 is a million times what a step resolves."""
+    domain = channel(np.float32)
+    start = random_faces(domain).float()
+    for viscosity, fine in ((1.0, True), (5e5, False)):
+        physical = RolloutParameters.of(replace(WATER, kinematic_viscosity=viscosity))
+        for options in (RolloutOptions(), RolloutOptions(projection="jacobi", sweeps=5)):
+            found = rollout(start, domain, physical, steps=2, options=options)
+            methods = [r.method for r in found.reports]
+            assert len(methods) == 2 and ("viscosity" in methods) != fine
+        if not fine:
+            worst = found.reports[0]
+            assert not worst.converged and worst.residual > 1e-6 and "shorten" in worst.advice
+
+
+def test_lists_that_two_threads_ask_for_at_once_are_the_same():
+    """Both may build them; whoever reads, reads what one thread alone would have built."""
+    barrier = threading.Barrier(4)
+    for _ in range(5):
+        domain, alone = channel(), channel()
+
+        def ask(domain=domain):
+            barrier.wait()
+            velocity = random_faces(domain)
+            return project(apply_linear(velocity, domain.extrapolation), domain, options=EXACT)
+
+        expected = project(apply_linear(random_faces(alone), alone.extrapolation), alone, options=EXACT)
+        with ThreadPoolExecutor(4, initializer=numba.set_num_threads, initargs=(1,)) as pool:
+            found = [f.result() for f in [pool.submit(ask) for _ in range(4)]]
+        assert all(torch.equal(f, expected) for f in found)
 
 
 def test_diffusion_without_viscosity_changes_nothing_and_tells_how_viscosity_would():

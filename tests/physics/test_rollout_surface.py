@@ -119,3 +119,23 @@ def test_a_rollout_below_a_known_surface_keeps_a_tilted_pool_at_rest():
     moved = rollout(still, domain, water, steps=10, options=RolloutOptions(tolerance=1e-9))
     # 0.2 s of gravity are 2 m/s; distances are single precision, and gaps a thousandth of a cell at least
     assert float(moved.velocity.abs().max()) < 1e-4 * 2.0
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("end", [0, -1])
+def test_water_at_rest_before_an_outlet_does_not_run_out(axis, end):
+    """The cut carries on the pool: its pressure is that of the water above, not that of air."""
+    types = np.full((10, 10, 8), CellType.FLUID, np.uint8)
+    types[:, :, 0], types[:, :, 6:] = CellType.SOLID, CellType.EMPTY
+    cut = [slice(None)] * 3
+    cut[axis], cut[2] = end, slice(1, 6)
+    types[tuple(cut)] = CellType.OUTFLOW
+    grid = Grid(types.shape, 0.1)
+    z = (np.arange(8) + 0.5) * 0.1
+    level = np.broadcast_to(z - 0.57, types.shape).astype(np.float32)
+    flow = np.eye(3)[axis] * (1 if end == -1 else -1)
+    domain = prepare_domain(types, build_system(types, None, grid), mainstream=flow, distance=level, dtype=np.float64)
+    at_rest = RolloutParameters.of(FluidParameters(gravity=(0.0, 0.0, -9.81), time_step=0.02), torch.float64)
+    out = rollout(torch.zeros(domain.offsets[3], dtype=torch.float64), domain, at_rest, steps=5).velocity
+    # without the head the lowest cell would gain half of 9.81 m/s^2 times 0.1 s or more
+    assert float(out.abs().max()) < 1e-4

@@ -335,6 +335,16 @@ def test_all_tensors_of_a_layout_go_to_its_device():
     assert placed.system.diagonal.device.type == "meta"
 
 
+def test_a_viscosity_beyond_the_iterations_is_told():
+    """c / h^2 = 2e7 in double precision: 500 iterations do not reach 1e-13."""
+    domain = river()
+    for viscosity, fine in ((1.0, True), (1e7, False)):
+        physical = replace(RolloutParameters.of(WATER, torch.float64), kinematic_viscosity=torch.tensor(viscosity))
+        found = rollout_on_device(random_faces(domain), domain, physical, steps=2)
+        methods = [r.method for r in found.reports]
+        assert len(methods) == 2 and ("viscosity" in methods) != fine, found.reports
+
+
 def test_what_the_device_does_not_know_is_refused():
     domain = river()
     physical = RolloutParameters.of(WATER, torch.float64)

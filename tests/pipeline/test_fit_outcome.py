@@ -35,7 +35,7 @@ def test_a_fit_that_explains_more_than_the_first_guess_is_used():
         (result(loss=math.inf), "breaks down"),
         (result(loss=math.nan), "breaks down"),
         (result(estimates={"density": UNKNOWN}), "determines none"),
-        (result(estimates={"density": UNKNOWN}, converged=False, notes=("the budget ended early",)), "time was up"),
+        (result(estimates={"density": UNKNOWN}, converged=False, notes=("the budget ended early",)), "cut off"),
     ],
 )
 def test_a_fit_that_explains_nothing_has_failed_and_says_why(found, reason):

@@ -100,11 +100,11 @@ def test_what_the_velocities_cannot_say_is_what_such_a_fluid_usually_has(guess, 
 
 @pytest.mark.parametrize(("kind", "width"), [("stream", 0.02), ("fall", 0.02), ("pour", 0.02)])
 def test_gravity_is_nearly_known_for_what_has_weight(kind, width):
-    assert moving.gravity_prior({"geometry": SimpleNamespace(meta={"kind": kind})}) == {"gravity": width}
+    assert moving.prior_widths({"geometry": SimpleNamespace(meta={"kind": kind})})["gravity"] == width
 
 
 def test_the_buoyancy_of_smoke_is_free():
-    assert moving.gravity_prior({"geometry": SimpleNamespace(meta={"kind": "plume"})}) is None
+    assert moving.prior_widths({"geometry": SimpleNamespace(meta={"kind": "plume"})}) == {"time_step": 0.01}
 
 
 def test_the_gravity_of_smoke_cannot_be_known_since_it_stands_for_buoyancy(monkeypatch):

@@ -148,7 +148,7 @@ def score_divergence(asset: FluidAsset) -> list[Figure]:
 
 
 def _sigma(estimate: Estimate | None) -> float | None:
-    if estimate is None or not estimate.identifiable or not np.isfinite(estimate.sigma):
+    if estimate is None or not estimate.fitted:
         return None
     return float(estimate.sigma)
 
@@ -169,8 +169,8 @@ def _recovery(
     if error is None:
         note += "; the truth is 0"
     if not known:
-        note += "; not identifiable"
-        return [figure(keys[0], error, "", note), figure(keys[1], None, "", "not identifiable")]
+        note += "; not determined"
+        return [figure(keys[0], error, "", note), figure(keys[1], None, "", "not determined")]
     inside = all(within(value[i], truth[i], sigmas[i] or 0.0) for i in known)
     spread = ", ".join("-" if s is None else f"{s:.2g}" for s in sigmas)
     return [figure(keys[0], error, "", note), figure(keys[1], float(inside), "", f"1 = yes; sigma {spread} {unit}")]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from fluidlift.types import CellType, FaceVelocity, Grid, Terrain
 
@@ -50,6 +50,33 @@ def coarsen_velocity(velocity: FaceVelocity) -> FaceVelocity:
                 kept = 0.5 * (np.take(kept, range(0, n, 2), other) + np.take(kept, range(1, n, 2), other))
         out.append(np.ascontiguousarray(kept, q.dtype))
     return FaceVelocity(*out)
+
+
+def coarsen_seen(
+    velocity: FaceVelocity, observed: Bool[np.ndarray, "nx ny nz"]
+) -> tuple[FaceVelocity, Bool[np.ndarray, "mx my mz"]]:
+    """Coarse velocity from seen faces alone, and the coarse cells that count as seen.
+
+    A face is seen where a cell beside it is. A coarse face takes the mean of the seen ones among its four (0 where
+    there are none); a coarse cell is seen where at least half of its cells are, and each of its faces has a seen one.
+    """
+    if observed.all():
+        return coarsen_velocity(velocity), np.ones([(n + 1) // 2 for n in observed.shape], bool)
+    marks = []
+    for axis, n in enumerate(observed.shape):
+        wide = np.pad(observed, [(int(a == axis),) * 2 for a in range(3)])
+        marks.append((np.take(wide, range(n + 1), axis) | np.take(wide, range(1, n + 2), axis)).astype(float))
+    shares = coarsen_velocity(FaceVelocity(*marks)).components
+    shown = [np.where(m > 0, q, 0.0) for q, m in zip(velocity.components, marks)]
+    sums = coarsen_velocity(FaceVelocity(*shown)).components
+    means = [np.where(m > 0, q / np.maximum(m, 0.25), 0.0) for q, m in zip(sums, shares)]
+    even = _even(observed)
+    nx, ny, nz = (n // 2 for n in even.shape)
+    seen = even.reshape(nx, 2, ny, 2, nz, 2).sum(axis=(1, 3, 5)) >= 4
+    for axis, n in enumerate(seen.shape):
+        known = shares[axis] > 0
+        seen &= np.take(known, range(n), axis) & np.take(known, range(1, n + 1), axis)
+    return FaceVelocity(*(q.astype(c.dtype) for q, c in zip(means, velocity.components))), seen
 
 
 def coarsen_terrain(terrain: Terrain) -> Terrain:

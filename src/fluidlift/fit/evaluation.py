@@ -26,6 +26,8 @@ Progress = Callable[[int, int], None]
 """called with (done, total)"""
 DIFFERENCE = 0.02
 """raw step of the forward differences: a few per cent, far above the 1e-5 that pressure solves leave"""
+CHUNK = 1 << 16
+"""residuals that are widened to double precision at a time"""
 BACKWARD = 2.0
 """cost of a gradient beyond that of its rollout"""
 
@@ -65,6 +67,15 @@ class Budget:
     started: float = field(default_factory=time.monotonic)
 
     @property
+    def ended_by(self) -> str:
+        """What ran out, and the option that gives more of it; empty where something is left."""
+        if self.work >= self.max_work:
+            return "the work (fit.max_work)"
+        if self.rollouts >= self.max_rollouts:
+            return "the number of rollouts (max_rollouts)"
+        return "the clock (fit.max_seconds)" if self.stopped_by_clock else ""
+
+    @property
     def spent(self) -> bool:
         """Nothing is left."""
         if self.rollouts >= self.max_rollouts or self.work >= self.max_work:
@@ -97,14 +108,15 @@ class Evaluation:
 
     raw: Float[np.ndarray, "p"]
     residuals: list[Float[np.ndarray, "m 6"]]
-    """per window"""
+    """per window, as the rollout gives them (single precision)"""
     guesses: list[tuple[np.ndarray, ...]]
+    """potentials per window; empty where they were not kept"""
     reports: tuple[SolveReport, ...]
 
     @property
     def loss(self) -> float:
         """Sum of squares; inf where the rollout blew up."""
-        total = float(sum(np.square(r).sum() for r in self.residuals))
+        total = float(sum(np.square(r, dtype=float).sum() for r in self.residuals))
         return total if np.isfinite(total) else float("inf")
 
     def solved(self, problem: FitProblem) -> bool:
@@ -118,8 +130,9 @@ class Evaluation:
             shape, row = window.domains[0].shape, 0
             for cells, weights in zip(window.cells, window.masks):
                 at, n = cells.numpy(), len(cells)
-                dense, mask = np.zeros((int(np.prod(shape)), 3)), np.zeros(int(np.prod(shape)))
-                dense[at], mask[at] = found[row : row + n, 3:], weights.double().numpy()
+                count = int(np.prod(shape))
+                dense, mask = np.zeros((count, 3), np.float32), np.zeros(count, np.float32)
+                dense[at], mask[at] = found[row : row + n, 3:], weights.numpy()
                 fields.append(dense.reshape(*shape, 3))
                 masks.append(mask.reshape(shape))
                 row += n
@@ -131,7 +144,8 @@ class Jacobian:
     """d residuals / d raw, and the products that a step needs."""
 
     columns: list[Float[np.ndarray, "p n"]]
-    """float32, per window; n residuals in the order of `Evaluation.residuals`, flattened"""
+    """float32, per window; n residuals in the order of `Evaluation.residuals`, flattened. Most of a fit's memory: empty
+    where only the products are known"""
     normal: Float[np.ndarray, "p p"]
     """J^T J"""
     slope: Float[np.ndarray, "p"]
@@ -146,49 +160,65 @@ def evaluate(
     guesses: Sequence[Sequence[np.ndarray]] | None = None,
 ) -> Evaluation:
     """Roll all windows out."""
-    return evaluate_many(problem, space, [raw], budget, guesses)[0]
+    rows = budget.each(lambda w: _rolled(problem, space, raw, w, guesses), list(range(len(problem.windows))))
+    budget.count(problem)
+    found, potentials, reports = zip(*rows)
+    return Evaluation(np.array(raw, float), list(found), list(potentials), sum(reports, ()))
 
 
-def evaluate_many(
-    problem: FitProblem,
-    space: ParameterSpace,
-    points: Sequence[Float[np.ndarray, "p"]],
-    budget: Budget,
-    guesses: Sequence[Sequence[np.ndarray]] | None = None,
-) -> list[Evaluation]:
-    """Roll all windows out at several points, side by side."""
+def losses(
+    problem: FitProblem, space: ParameterSpace, points: Sequence[Float[np.ndarray, "p"]], budget: Budget
+) -> list[float]:
+    """The loss at several points, side by side; inf or NaN where the rollout blew up."""
 
-    def one(point: int, window: int) -> tuple[np.ndarray, tuple[np.ndarray, ...], tuple[SolveReport, ...]]:
-        with torch.no_grad():
-            parameters = space.physical(torch.as_tensor(points[point], dtype=torch.float32))
-            run = problem.roll(window, parameters, None if guesses is None else guesses[window])
-            return problem.residual(window, run).double().numpy(), run.potentials, run.reports
+    def one(point: int, window: int) -> float:
+        found, _, _ = _rolled(problem, space, points[point], window, None)
+        return float(np.square(found, dtype=float).sum())
 
     n = len(problem.windows)
-    rows = budget.each(one, [p for p in range(len(points)) for _ in range(n)], list(range(n)) * len(points))
+    found = budget.each(one, [p for p in range(len(points)) for _ in range(n)], list(range(n)) * len(points))
     budget.count(problem, len(points))
-    out = []
-    for p, raw in enumerate(points):
-        found, potentials, reports = zip(*rows[p * n : (p + 1) * n])
-        out.append(Evaluation(np.array(raw, float), list(found), list(potentials), sum(reports, ())))
-    return out
+    return [sum(found[p * n : (p + 1) * n]) for p in range(len(points))]
+
+
+def _rolled(
+    problem: FitProblem,
+    space: ParameterSpace,
+    raw: Float[np.ndarray, "p"],
+    window: int,
+    guesses: Sequence[Sequence[np.ndarray]] | None,
+) -> tuple[np.ndarray, tuple[np.ndarray, ...], tuple[SolveReport, ...]]:
+    """Residuals, potentials and reports of one window."""
+    with torch.no_grad():
+        parameters = space.physical(torch.as_tensor(raw, dtype=torch.float32))
+        run = problem.roll(window, parameters, None if guesses is None else guesses[window])
+        return problem.residual(window, run).numpy(), run.potentials, run.reports
 
 
 def products(columns: list[np.ndarray], residuals: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """J^T J and J^T r, summed in double precision."""
+    """J^T J and J^T r, summed in double precision, `CHUNK` residuals at a time."""
     p = columns[0].shape[0]
     normal, slope = np.zeros((p, p)), np.zeros(p)
     for c, r in zip(columns, residuals):
-        wide, flat = c.astype(float), r.ravel()
-        for i in range(p):
-            slope[i] += float((wide[i] * flat).sum())
-            for j in range(i, p):
-                normal[i, j] += float((wide[i] * wide[j]).sum())
+        flat = r.ravel()
+        for part in chunks(flat.size):
+            wide, rest = c[:, part].astype(float), flat[part].astype(float)
+            for i in range(p):
+                slope[i] += float((wide[i] * rest).sum())
+                for j in range(i, p):
+                    normal[i, j] += float((wide[i] * wide[j]).sum())
     return np.triu(normal) + np.triu(normal, 1).T, slope
 
 
-def jacobian(problem: FitProblem, space: ParameterSpace, base: Evaluation, budget: Budget) -> Jacobian | None:
-    """By forward differences; None where the budget is spent.
+def chunks(size: int) -> list[slice]:
+    """Slices of `CHUNK` that cover a size."""
+    return [slice(begin, begin + CHUNK) for begin in range(0, size, CHUNK)]
+
+
+def jacobian(
+    problem: FitProblem, space: ParameterSpace, base: Evaluation, budget: Budget, reuse: Jacobian | None = None
+) -> Jacobian | None:
+    """By forward differences; None where the budget is spent. The columns of `reuse` are overwritten.
 
     A dozen global parameters against many thousand residuals: one rollout per parameter, started from the pressures
     of the base rollout, costs less than one adjoint per residual or than carrying tangents.
@@ -197,13 +227,18 @@ def jacobian(problem: FitProblem, space: ParameterSpace, base: Evaluation, budge
         return None
     # towards the prior, where the rollout is least likely to break down
     h = np.where(base.raw <= space.prior_raw, DIFFERENCE, -DIFFERENCE)
-    points = [base.raw + np.where(np.arange(len(h)) == p, h, 0.0) for p in range(len(h))]
-    others = evaluate_many(problem, space, points, budget, base.guesses)
-    # where the rollout breaks down there is no derivative to be had: the variable stays
-    sound = [np.isfinite(o.loss) for o in others]
-    columns = [
-        np.stack([(o.residuals[w] - r).ravel() / h[p] if sound[p] else np.zeros(r.size) for p, o in enumerate(others)])
-        .astype(np.float32)
-        for w, r in enumerate(base.residuals)
-    ]  # fmt: skip
+    columns = [np.empty((len(h), r.size), np.float32) for r in base.residuals] if reuse is None else reuse.columns
+
+    def one(p: int, w: int) -> None:
+        there, _, _ = _rolled(problem, space, base.raw + np.where(np.arange(len(h)) == p, h, 0.0), w, base.guesses)
+        columns[w][p] = (there.ravel() - base.residuals[w].ravel()) / h[p]
+
+    n = len(problem.windows)
+    budget.each(one, [p for p in range(len(h)) for _ in range(n)], list(range(n)) * len(h))
+    budget.count(problem, len(h))
+    for p in range(len(h)):
+        # where the rollout breaks down there is no derivative to be had: the variable stays
+        if not all(np.isfinite(c[p]).all() for c in columns):
+            for c in columns:
+                c[p] = 0
     return Jacobian(columns, *products(columns, base.residuals))

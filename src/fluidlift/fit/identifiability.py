@@ -48,8 +48,9 @@ def _lag_correlation(field: np.ndarray, inside: np.ndarray, axis: int) -> float:
     both = np.take(inside, range(n - 1), axis) & np.take(inside, range(1, n), axis)
     if both.sum() < 8:
         return 0.0
-    power = np.sqrt((a[both] ** 2).sum() * (b[both] ** 2).sum())
-    return float((a[both] * b[both]).sum() / power) if power > 0 else 0.0
+    a, b = a[both], b[both]
+    power = np.sqrt(np.square(a, dtype=float).sum() * np.square(b, dtype=float).sum())
+    return float((a * b).sum(dtype=float) / power) if power > 0 else 0.0
 
 
 def effective_observations(
@@ -67,18 +68,19 @@ def effective_observations(
     counts = []
     for r, w in zip(residuals, masks):
         # the mask's root is in the residual: undone, so that weights do not pass for structure
-        field = r / np.sqrt(np.where(w > 0, w, 1.0))[..., None]
-        count = 3.0 * w.sum() ** 2 / (w**2).sum()
+        field = r / np.sqrt(np.where(w > 0, w, np.ones_like(w)))[..., None]
+        count = 3.0 * w.sum(dtype=float) ** 2 / np.square(w, dtype=float).sum()
         for axis in range(3):
             rho = min(max(_lag_correlation(field, w > 0, axis), 0.0), 0.98)
             count *= (1 - rho) / (1 + rho)
         counts.append(count)
     m = len(residuals)
     if m > 1:
-        stack = np.stack([r.ravel() for r in residuals])
-        stack = stack / np.maximum(np.linalg.norm(stack, axis=1, keepdims=True), 1e-300)
-        products = stack @ stack.T
-        between = min(max(float(products[~np.eye(m, dtype=bool)].mean()), 0.0), 1.0)
+        # sum over pairs of unit vectors, from the size of their sum
+        sizes = [float(np.square(r, dtype=float).sum()) ** 0.5 for r in residuals]
+        total = sum(r / max(size, 1e-300) for r, size in zip(residuals, sizes))
+        pairs = float(np.square(total, dtype=float).sum()) - sum(size > 0 for size in sizes)
+        between = min(max(pairs / (m * (m - 1)), 0.0), 1.0)
     else:
         between = 0.0
     return max(float(np.mean(counts)) * m / (1 + (m - 1) * between), 3.0)

@@ -75,8 +75,17 @@ def cell_velocity(faces: Faces) -> Float[Tensor, "nx ny nz 3"]:
     )
 
 
-def _unit(velocity: Tensor, floor: float) -> Tensor:
-    return velocity / torch.sqrt((velocity**2).sum(-1, keepdim=True) + floor**2)
+def _unit(velocity: Tensor, floor: float, error: float = 0.0) -> Tensor:
+    """v / sqrt(|v|^2 + floor^2); with an error, its mean over v + n, n of variance error^2 per component.
+
+    To second order, mean u(v + n) = u + error^2 / 2 lap u, which a floor^2 larger by
+    error^2 (5 - 3 |v|^2 / (|v|^2 + floor^2)) gives, and gives without overshoot where the error is large.
+    """
+    square = (velocity**2).sum(-1, keepdim=True)
+    shorter = square + floor**2
+    if error > 0:
+        shorter = shorter + error**2 * (5 - 3 * square / shorter)
+    return velocity / torch.sqrt(shorter)
 
 
 def velocity_loss(
@@ -86,6 +95,7 @@ def velocity_loss(
     *,
     speed: float,
     weights: LossWeights | None = None,
+    error: float = 0.0,
 ) -> Tensor:
     """The loss: 0 where equal; alpha / 2 + beta or more for a simulation at rest.
 
@@ -95,10 +105,11 @@ def velocity_loss(
         mask: weight per cell, summing to 1.
         speed: U, m/s.
         weights: alpha, beta and the stagnation floor.
+        error: standard deviation of the error of a component of the target, m/s.
     """
     weights = weights or LossWeights()
     floor = weights.stagnant * speed
-    a, b = _unit(simulated, floor), _unit(target, floor)
+    a, b = _unit(simulated, floor, error), _unit(target, floor)
     # 1 - cos, in the form that stays exact when the floor makes a and b shorter than 1
     misdirection = 0.5 * ((a - b) ** 2).sum(-1)
     difference = ((simulated - target) ** 2).sum(-1) / speed**2
@@ -112,11 +123,12 @@ def residuals(
     *,
     speed: float,
     weights: LossWeights | None = None,
+    error: float = 0.0,
 ) -> Float[Tensor, "*n 6"]:
     """Terms whose squares add up to `velocity_loss`: three of direction, three of magnitude per cell."""
     weights = weights or LossWeights()
     floor = weights.stagnant * speed
     root = torch.sqrt(mask)[..., None]
-    turn = (0.5 * weights.direction) ** 0.5 * (_unit(simulated, floor) - _unit(target, floor))
+    turn = (0.5 * weights.direction) ** 0.5 * (_unit(simulated, floor, error) - _unit(target, floor))
     change = weights.magnitude**0.5 / speed * (simulated - target)
     return root * torch.cat([turn, change], dim=-1)

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from fluidlift.fit.evaluation import BACKWARD, Budget, Evaluation, Jacobian, evaluate, jacobian, products
+from fluidlift.fit.evaluation import BACKWARD, Budget, Evaluation, Jacobian, chunks, evaluate, jacobian
 from fluidlift.fit.identifiability import Curvature, noise_level
 from fluidlift.fit.problem import FitProblem
 from fluidlift.fit.ranges import ParameterSpace
@@ -102,12 +102,22 @@ class _Search:
 
 
 def carried_on(slopes: Jacobian, step: np.ndarray, before: Evaluation, after: Evaluation) -> Jacobian:
-    """The Jacobian changed least so that it explains the last step (Broyden 1965)."""
-    columns, square = [], float(step @ step)
+    """The products of the Jacobian changed least so that it explains the last step (Broyden 1965).
+
+    J' = J + m u^T, with m = r1 - r0 - J s what it missed and u = s / |s|^2. J' itself is not made.
+    """
+    along, square = step / float(step @ step), 0.0
+    missed_by, slope, last = np.zeros(len(step)), np.zeros(len(step)), 0.0
     for c, r0, r1 in zip(slopes.columns, before.residuals, after.residuals):
-        missed = (r1 - r0).ravel() - step @ c
-        columns.append((c + np.outer(step / square, missed)).astype(np.float32))
-    return Jacobian(columns, *products(columns, after.residuals))
+        for part in chunks(r0.size):
+            wide, now = c[:, part].astype(float), r1.ravel()[part].astype(float)
+            missed = now - r0.ravel()[part] - (step[:, None] * wide).sum(axis=0)
+            missed_by += (wide * missed).sum(axis=1)
+            slope += (wide * now).sum(axis=1)
+            square += float(np.square(missed).sum())
+            last += float((missed * now).sum())
+    tied = np.outer(along, missed_by)
+    return Jacobian([], slopes.normal + tied + tied.T + square * np.outer(along, along), slope + last * along)
 
 
 def levenberg_marquardt(
@@ -145,7 +155,7 @@ def levenberg_marquardt(
     last: Jacobian | None = None
     for iteration in range(max_iterations):
         if search.slopes is None:
-            search.slopes, search.fresh = jacobian(problem, space, search.here, budget), True
+            search.slopes, search.fresh = jacobian(problem, space, search.here, budget, last), True
             if search.slopes is None:
                 break
             last = search.slopes

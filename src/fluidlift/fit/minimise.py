@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from fluidlift.fit.evaluation import Budget, Evaluation, Jacobian, evaluate, evaluate_many, jacobian, products
+from fluidlift.fit.evaluation import Budget, Evaluation, Jacobian, evaluate, jacobian, losses, products
 from fluidlift.fit.identifiability import BLOCK, Curvature, block_scatter, determined
 from fluidlift.fit.methods import adam, levenberg_marquardt, precision
 from fluidlift.fit.problem import FitProblem
@@ -59,10 +59,10 @@ def first_point(
     points = [raw] + [np.where(np.arange(len(raw)) == index[0], math.log(v), raw) for v in VISCOSITIES]
     one = replace(problem, windows=problem.windows[:1])
     best, lowest = raw, math.inf
-    for point, found in zip(points, evaluate_many(one, space, points, budget)):
+    for point, loss in zip(points, losses(one, space, points, budget)):
         # a hundredth better, or the given one stays
-        if found.loss < 0.99 * lowest:
-            best, lowest = point, found.loss
+        if loss < 0.99 * lowest:
+            best, lowest = point, loss
     return best
 
 
@@ -102,7 +102,7 @@ def minimise(
         problem = corrected_starts(problem, space, raw, budget, iterations=steps)
         here = evaluate(problem, space, raw, budget)
         if moves is None:
-            slopes = jacobian(problem, space, here, budget) or slopes
+            slopes = jacobian(problem, space, here, budget, slopes) or slopes
             along = profile(problem, space, here, slopes, budget, iterations=PROFILE_ITERATIONS)
             slopes, moves = along.slopes, along.moves
         problem, raw, here = _stepped(problem, space, here, Profile(slopes, moves), budget, np.ones(len(raw), bool))

@@ -19,7 +19,14 @@ from typing import Any
 import numpy as np
 
 from fluidlift.errors import require
-from fluidlift.fit.coarsen import coarse_grid, coarsen_cells, coarsen_distance, coarsen_terrain, coarsen_velocity
+from fluidlift.fit.coarsen import (
+    coarse_grid,
+    coarsen_cells,
+    coarsen_distance,
+    coarsen_seen,
+    coarsen_terrain,
+    coarsen_velocity,
+)
 from fluidlift.fit.evaluation import Budget, Progress, evaluate, single_thread
 from fluidlift.fit.identifiability import estimates
 from fluidlift.fit.inlet import boundary_prior, fluctuation_error
@@ -68,22 +75,18 @@ class _Data:
         """Cells twice as wide."""
         cells = {id(c): coarsen_cells(c) for c in self.layouts}
         levels = None if self.distances is None else {id(d): coarsen_distance(d) for d in self.distances}
+        targets, views = [coarsen_velocity(t) for t in self.targets], None
+        if self.observed is not None:
+            targets, views = map(list, zip(*(coarsen_seen(t, o) for t, o in zip(self.targets, self.observed))))
         return replace(
             self,
-            targets=[coarsen_velocity(t) for t in self.targets],
+            targets=targets,
             layouts=[cells[id(c)] for c in self.layouts],
             solid=coarsen_terrain(self.solid) if isinstance(self.solid, Terrain) else None,
             grid=coarse_grid(self.grid),
-            observed=None if self.observed is None else [_coarse_view(o) for o in self.observed],
+            observed=views,
             distances=None if levels is None or self.distances is None else [levels[id(d)] for d in self.distances],
         )
-
-
-def _coarse_view(observed: np.ndarray) -> np.ndarray:
-    """All of a block must be seen: a mean with hidden faces in it is none."""
-    even = np.pad(observed, [(0, n % 2) for n in observed.shape], mode="edge")
-    nx, ny, nz = (n // 2 for n in even.shape)
-    return np.asarray(even.reshape(nx, 2, ny, 2, nz, 2).all(axis=(1, 3, 5)))
 
 
 def fit_parameters(
@@ -99,42 +102,32 @@ def fit_parameters(
     observed: Sequence[np.ndarray] | np.ndarray | None = None,
     liquid_distance: Sequence[np.ndarray] | np.ndarray | None = None,
     restarts: int = 1,
-    seed: int = 0,
     settings: FitOptions | None = None,
     progress: Progress | None = None,
     **changes: Any,
 ) -> FitResult:
-    """Fit the global parameters of a flow to its estimated velocities.
+    """Fit the global parameters of a flow to its estimated velocities; see `FitOptions` for `settings`.
 
     Args:
         targets: velocities of consecutive frames, m/s; one alone is taken as a steady flow.
         cell_types: u8 [nx,ny,nz], one for all frames or one per target.
-        system_or_terrain: terrain (pressure systems are built per layout), a finished system for one layout, or None
-            (walls by cell type).
-        grid: of the targets.
-        interval: s between frames.
-        initial: start and centre of the priors. Inflow velocity, fluctuation and outflow speed that are zero are first
-            read off the targets. Its time step is replaced by interval / steps per frame.
+        system_or_terrain: terrain, a finished system for one layout, or None (walls by cell type).
+        grid: of the targets, which are `interval` (s) apart.
+        initial: start and centre of the priors; its time step becomes interval / steps per frame. Values at the inlet
+            and the outlet that are zero are first read off the targets.
         kind: "plume" is a gas: EMPTY cells are solved too, the box is open, and `gravity` acts on FLUID (smoke) cells
-            alone and upwards: its size is the buoyancy in m/s^2, also in `extra["buoyancy"]`. All others are liquids.
-        mainstream: unit direction of the outflow; default: the terrain's, else the mean velocity.
-        observed: bool [nx,ny,nz], one for all frames or one per target: cells whose velocity was seen. Others do not
-            count, and what the targets hold on faces of hidden cells alone does not matter. None: all.
-        liquid_distance: m [nx,ny,nz], one for all frames or one per target: distance of cell centres to the liquid's
-            surface, negative inside; None: estimated from the cell types.
-        restarts: starts from this many initial scales (viscosity by decades, velocities at the ends); the best counts
-            and `FitResult.ends` holds all of them.
-        seed: not used: scales of restarts are a fixed list.
-        settings: everything else.
+            alone: its size is the buoyancy, m/s^2, also in `extra["buoyancy"]`. All others are liquids.
+        mainstream: unit direction of the outflow; default: the terrain's, or the mean velocity.
+        observed: bool [nx,ny,nz], one or one per target: cells whose velocity was seen; what the targets hold elsewhere
+            does not matter. None: all.
+        liquid_distance: m [nx,ny,nz], one or one per target: distance of cell centres to the liquid's surface, negative
+            inside; None: estimated from the cell types.
+        restarts: starts from this many initial scales; the best counts, `FitResult.ends` holds all.
+        settings: everything else; `changes` are fields of it, replaced.
         progress: called with (done, total): per cent of the work used.
-        **changes: fields of `FitOptions`, replacing those of `settings`.
 
     Returns:
-        parameters, one `Estimate` per number (`gravity_z`, `restitution`, ...), the loss history, and what happened.
-        Identifiable ones are determined by the data. Ones that are known less well than `precise_within` have
-        their fitted value and `identifiable=False`. What the data do not determine has its prior value and
-        `identifiable=False`; its sigma may be inf. A fit that failed has `reason`, and its parameters are the initial
-        ones.
+        see there; a fit that failed has `reason`, and the initial parameters.
 
     Raises:
         ValueError: arguments that do not fit together.
@@ -151,13 +144,17 @@ def fit_parameters(
     nothing = _no_flow(data)
     if nothing:
         return _failure(initial, nothing)
-    workers = options.workers or os.cpu_count() or 1
-    budget = Budget(time.monotonic() + options.max_seconds, options.max_rollouts, options.max_work, workers, progress)
     with single_thread():
-        result = _Fit(data, interval, initial, options, budget).run()
+        result = _Fit(data, interval, initial, options, _budget(options, progress)).run()
     if kind == "plume":
         return replace(result, extra=result.extra | {"buoyancy": math.hypot(*result.parameters.gravity)})
     return result
+
+
+def _budget(options: FitOptions, progress: Progress | None) -> Budget:
+    # a device is busy with one window
+    workers = 1 if options.device != "cpu" else options.workers or os.cpu_count() or 1
+    return Budget(time.monotonic() + options.max_seconds, options.max_rollouts, options.max_work, workers, progress)
 
 
 def _each(values: Any, count: int, grid: Grid, what: str) -> list[np.ndarray] | None:
@@ -208,7 +205,9 @@ class _Fit:
         options = self.options
         while self.data.grid.cells > options.most_cells and not isinstance(self.data.solid, PoissonSystem):
             self.data = self.data.coarser()
-            grid = self.data.grid
+            grid, nothing = self.data.grid, _no_flow(self.data)
+            if nothing:
+                return _failure(self.initial, f"{nothing} on {grid.shape} cells, coarsened by two")
             self.notes.append(f"fitted on {grid.shape} cells of {grid.spacing:.3g} m, coarsened by two")
         scene = self.data.scene()
         plan, space = self.plan(scene)
@@ -279,9 +278,9 @@ class _Fit:
         errors = scene.noise > ERRORS_BEYOND * scene.speed or any(o is not None and not o.all() for o in scene.observed)
         begun, explore = start, True
         coarse = scene.grid.cells > self.options.coarse_first and not isinstance(self.data.solid, PoissonSystem)
-        if coarse and not self.budget.spent:
-            wide = self.data.coarser().scene()
-            rough = self.problem(wide, plan, space, tell=False)
+        wide = self.data.coarser() if coarse and not self.budget.spent else None
+        if wide is not None and not _no_flow(wide):
+            rough = self.problem(wide.scene(), plan, space, tell=False)
             begun = first_point(rough, space, begun, self.budget)
             near = minimise(rough, space, begun, self.budget, replace(self.options, start_rounds=0), errors=False)
             if not near.reason:
@@ -349,7 +348,9 @@ class _Fit:
         if self.budget.stopped_by_clock:
             self.notes.append("stopped by the clock: not reproducible")
         if not best.converged and not best.reason:
-            self.notes.append(f"not converged after {self.budget.rollouts} rollouts")
+            ended = self.budget.ended_by
+            more = f": {ended} ran out, more of it gives a better fit" if ended else ""
+            self.notes.append(f"not converged after {self.budget.rollouts} rollouts{more}")
         if not best.solved:
             self.notes.append("some pressure solves did not reach their tolerance")
         if loose:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -15,15 +15,18 @@ from fluidlift.fit.inlet import inflow_patterns
 from fluidlift.fit.loss import LossWeights, cell_velocity, grid_mask, residuals, velocity_loss
 from fluidlift.fit.scene import FitScene, WindowPlan, build_scene, plan_windows
 from fluidlift.fit.states import divergence_free, fill_hidden, smooth_in_time
-from fluidlift.physics.rollout import RolloutParameters, rollout, unflatten
+from fluidlift.physics import rollout_torch
+from fluidlift.physics.rollout import Rollout, RolloutParameters, rollout, unflatten
 from fluidlift.physics.rollout_domain import RolloutDomain
 from fluidlift.physics.rollout_pressure import RolloutOptions
+from fluidlift.physics.rollout_torch_domain import TorchDomain, box_to_flat, flat_to_box
 from fluidlift.types import SolveReport
 
 __all__ = ["FitProblem", "Run", "Window", "build_problem", "build_scene", "plan_windows"]
 
-UNSEEN = 0.5
-"""weight of the fill of a hidden face, relative to that of a seen one: between neighbours it is not much worse"""
+UNSEEN = 0.05
+"""weight of the fill of a hidden face, relative to that of a seen one. What a fill misses is one error for a whole
+hidden region and not one per face: trusted like measured faces it would outvote what the flow around it says"""
 
 
 @dataclass(frozen=True)
@@ -71,6 +74,11 @@ class FitProblem:
     weights: LossWeights
     options: RolloutOptions
     device: str = "cpu"
+    """"cpu": compiled kernels; any other of torch's: `rollout_torch`"""
+    error: float = 0.0
+    """standard deviation of the error of a component of a cell's target velocity, m/s"""
+    placed: dict[int, TorchDomain] = field(default_factory=dict)
+    """layouts on the device, by `id`; empty on "cpu" """
 
     @property
     def work(self) -> float:
@@ -86,25 +94,42 @@ class FitProblem:
     ) -> Run:
         """DiffSim^n of one window, cut at its marks; differentiable in the parameters and in `start`."""
         w = self.windows[index]
-        flat = divergence_free(w.start if start is None else start, w.domains[0], self.options)
+        flat = self._divergence_free(w.start if start is None else start, w.domains[0])
         velocities, potentials, reports, begin = [], [], [], 0
         for mark, cells in zip(w.marks, w.cells):
             part = slice(begin, mark)
-            result = rollout(
-                flat, w.domains[part], parameters, steps=mark - begin, patterns=w.patterns[part],
-                options=self.options, guesses=None if guesses is None else guesses[part],
-            )  # fmt: skip
+            known = None if guesses is None else guesses[part]
+            result = self._rollout(flat, w.domains[part], parameters, w.patterns[part], known)
             flat, begin = result.velocity, mark
             velocities.append(cell_velocity(result.faces()).reshape(-1, 3)[cells])
             potentials += result.potentials
             reports += result.reports
         return Run(tuple(velocities), tuple(potentials), tuple(reports))
 
+    def _rollout(
+        self, flat: Tensor, domains: Sequence[RolloutDomain], parameters: RolloutParameters,
+        patterns: Sequence[Tensor | None], guesses: Sequence[np.ndarray] | None,
+    ) -> Rollout:  # fmt: skip
+        """On the device; the result is back on the host."""
+        given = {"steps": len(domains), "patterns": patterns, "options": self.options, "guesses": guesses}
+        if not self.placed:
+            return rollout(flat, domains, parameters, **given)
+        layouts = [self.placed[id(d)] for d in domains]
+        return rollout_torch.rollout_on_device(flat, layouts, parameters, device=self.device, **given)
+
+    def _divergence_free(self, flat: Tensor, domain: RolloutDomain) -> Tensor:
+        if not self.placed:
+            return divergence_free(flat, domain, self.options)
+        layout = self.placed[id(domain)]
+        box = flat_to_box(flat.to(layout.device, layout.dtype), domain)
+        is_open = torch.maximum(layout.dynamic, (layout.inflow > 0).to(layout.dtype))
+        return box_to_flat(rollout_torch.project(box * is_open, layout, options=self.options), domain).to(flat.device)
+
     def residual(self, index: int, run: Run) -> Float[Tensor, "m 6"]:
         """Marks one after another; squares add up to the window's share of the loss; differentiable."""
         w = self.windows[index]
         parts = [
-            residuals(v, t, m, speed=self.speed, weights=self.weights)
+            residuals(v, t, m, speed=self.speed, weights=self.weights, error=self.error)
             for v, t, m in zip(run.velocities, w.targets, w.masks)
         ]
         return torch.cat(parts) / math.sqrt(len(self.windows) * len(w.marks))
@@ -113,7 +138,7 @@ class FitProblem:
         """The window's share of the loss; differentiable."""
         w = self.windows[index]
         parts = [
-            velocity_loss(v, t, m, speed=self.speed, weights=self.weights)
+            velocity_loss(v, t, m, speed=self.speed, weights=self.weights, error=self.error)
             for v, t, m in zip(run.velocities, w.targets, w.masks)
         ]
         return torch.stack(parts).mean() / len(self.windows)
@@ -158,7 +183,7 @@ def build_problem(
         weights: of the loss.
         options: of the rollout.
         compare: "all" frames of a window count, or its "last" (paper).
-        device: of the rollouts.
+        device: of the rollouts: "cpu" (compiled kernels), or a device of torch's.
     """
     weights, options = weights or LossWeights(), options or RolloutOptions()
     # a direction within the errors is noise
@@ -166,7 +191,11 @@ def build_problem(
     weights = replace(weights, stagnant=floor)
     patterns = inflow_patterns(scene)
     windows = [_window(scene, plan, start, patterns, weights, compare) for start in plan.starts]
-    return FitProblem(tuple(windows), scene.speed, weights, options, device)
+    layouts = {} if device == "cpu" else {id(d): d for w in windows for d in w.domains}
+    placed = {key: TorchDomain.of(domain, device) for key, domain in layouts.items()}
+    # a cell's velocity is the mean of two faces
+    error = scene.noise / math.sqrt(2)
+    return FitProblem(tuple(windows), scene.speed, weights, options, device, error, placed)
 
 
 def _window(

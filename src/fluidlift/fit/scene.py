@@ -16,6 +16,7 @@ from fluidlift.numerics.poisson import PoissonSystem
 from fluidlift.physics.pressure import build_system
 from fluidlift.physics.rollout import flatten
 from fluidlift.physics.rollout_domain import RolloutDomain, prepare_domain
+from fluidlift.physics.rollout_surface import surface_cells
 from fluidlift.types import CellType, FaceVelocity, Grid, Terrain
 
 LONGEST_WINDOW = 25
@@ -76,6 +77,25 @@ def gas_layout(cell_types: np.ndarray) -> np.ndarray:
     return np.where(cell_types == CellType.EMPTY, CellType.FLUID, cell_types).astype(np.uint8)
 
 
+def with_surface(
+    cell_types: Sequence[np.ndarray],
+    distances: Sequence[np.ndarray | None],
+    terrain: Terrain | None,
+    grid: Grid,
+) -> tuple[list[np.ndarray], list[np.ndarray | None]]:
+    """Layouts that agree with the surfaces that are known (`rollout_surface.surface_cells`), and their distances, m."""
+    found: dict[tuple[int, int], tuple[np.ndarray, np.ndarray | None]] = {}
+    for types, level in zip(cell_types, distances):
+        if (id(types), id(level)) not in found:
+            known = (types, None)
+            if level is not None:
+                openings = build_system(np.asarray(types), terrain, grid).openings
+                known = surface_cells(types, level, openings, grid.spacing)
+            found[id(types), id(level)] = known
+    pairs = [found[id(t), id(d)] for t, d in zip(cell_types, distances)]
+    return [t for t, _ in pairs], [d for _, d in pairs]
+
+
 def build_scene(
     targets: Sequence[FaceVelocity],
     cell_types: Sequence[np.ndarray],
@@ -88,12 +108,14 @@ def build_scene(
     distances: Sequence[np.ndarray | None] | None = None,
     sweeps: int = 5,
 ) -> FitScene:
-    """Layouts, operators and scales of the targets.
+    """Layouts, operators and scales of the targets. Known surfaces (`distances`) decide which cells hold liquid.
 
     Raises:
         ValueError: shapes that do not match, or targets at rest.
     """
     views = [None] * len(targets) if observed is None else list(observed)
+    if distances is not None and kind != "plume" and not isinstance(system_or_terrain, PoissonSystem):
+        cell_types, distances = with_surface(cell_types, distances, system_or_terrain, grid)
     centers = [np.asarray(t.at_centers(), float) for t in targets]
     fluid = [np.asarray(c) == CellType.FLUID for c in cell_types]
     fluid = [f if v is None else f & v for f, v in zip(fluid, views)]

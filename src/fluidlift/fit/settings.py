@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+
+import torch
 
 from fluidlift.errors import require
 from fluidlift.fit.loss import LossWeights
@@ -15,6 +16,14 @@ DEFAULT_FREE = (
     "restitution", "wall_damping", "time_step",
 )  # fmt: skip
 """All of the paper's. The time step has a narrow prior: the interval between frames is known, its division a choice."""
+
+
+def there(device: str) -> bool:
+    """Whether torch computes in double precision on the device."""
+    try:
+        return float(torch.zeros((), dtype=torch.float64, device=device)) == 0.0
+    except (RuntimeError, AssertionError, TypeError, NotImplementedError):
+        return False
 
 
 @dataclass(frozen=True)
@@ -41,9 +50,10 @@ class FitOptions:
     """"all" frames of a window count, or its "last" (paper)"""
     start_rounds: int = 2
     """times that the starts of windows are corrected where targets have errors or hidden cells; 0 trusts them"""
-    precise_within: float = math.inf
-    """standard deviation, relative to the value (a vector's component: to its size), up to which a determined parameter
-    is called identifiable: 0.05 keeps its 95 % interval within 10 %. Ones known less well keep their fitted value"""
+    precise_within: float = 0.05
+    """standard deviation, relative to the value (a vector's component: to its size; a value of about 0: to its natural
+    scale), up to which a parameter that the data determine is called identifiable: its 95 % interval is within 10 %.
+    Ones known less well, "known loosely", have their fitted value all the same"""
     restarts: int = 1
     """starts from this many initial scales; the best end counts"""
     most_cells: int = 300_000
@@ -59,9 +69,16 @@ class FitOptions:
     workers: int | None = None
     """threads that roll windows out side by side; default: the cores. Results do not depend on it"""
     device: str = "cpu"
+    """"cpu" rolls out in compiled kernels; any other device of torch's ("cuda", "cuda:1") in torch operations, one
+    window at a time, with the projections "implicit" and "jacobi" """
 
     def __post_init__(self) -> None:
-        require(self.device == "cpu", f"device '{self.device}'", "'cpu'")
+        require(
+            there(self.device), f"device '{self.device}'", "'cpu', or a device with double precision that torch sees"
+        )
+        route = "implicit" if self.options is None else self.options.projection
+        known = self.device == "cpu" or route in ("implicit", "jacobi")
+        require(known, f"projection '{route}' on device '{self.device}'", "'implicit' or 'jacobi'")
         require(self.method in ("lm", "adam"), f"method '{self.method}'", "'lm' or 'adam'")
         require(self.compare in ("all", "last"), f"comparison of '{self.compare}' frames", "'all' or 'last'")
         require(self.windows >= 1, f"{self.windows} windows", "one or more")

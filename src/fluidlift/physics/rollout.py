@@ -12,8 +12,8 @@ that is there and not what gravity adds before the pressure takes it back, so a 
   over a cell of a share that fades linearly with the distance from the wall, as for the particles in `boundaries`.
 * `restitution` b: of the fluid that moves to a wall one cell ahead, the share dt |v| / h arrives within a step and
   has its normal velocity v answered by -b v. The wall itself stays closed: no volume is made.
-* Outflow: faces to OUTFLOW cells take `outflow_velocity` along the mainstream, then the pressure (p = 0 outside)
-  corrects them as it does all others.
+* Outflow: faces to OUTFLOW cells take `outflow_velocity` along the mainstream, then the pressure corrects them as it
+  does all others. Behind them it is hydrostatic: the outlet cuts a stream that goes on.
 
 Gradients: pressure and viscosity by implicit differentiation (one more solve with the same symmetric operator), the
 rest by hand-written adjoints. `explicit_terms_plain` and the matrices of `RolloutDomain` are their readable twins.
@@ -33,7 +33,13 @@ from torch.utils.checkpoint import checkpoint
 from fluidlift.errors import require
 from fluidlift.physics.advection import Faces, advect
 from fluidlift.physics.rollout_domain import RolloutDomain
-from fluidlift.physics.rollout_operators import ExplicitTerms, apply_linear, implicit_diffusion, set_outflow
+from fluidlift.physics.rollout_operators import (
+    ExplicitTerms,
+    apply_linear,
+    implicit_diffusion,
+    push_outlet,
+    set_outflow,
+)
 from fluidlift.physics.rollout_pressure import RolloutOptions, project
 from fluidlift.types import FaceVelocity, FluidParameters, SolveReport
 
@@ -76,7 +82,7 @@ class Rollout:
     potentials: tuple[np.ndarray, ...]
     """p dt / density of every step, m^2/s: good first guesses for a neighbouring rollout"""
     reports: tuple[SolveReport, ...]
-    """of the pressure solves, forward"""
+    """one per step, forward: of the pressure solve, or of the viscous one (method "viscosity") where that failed"""
 
     def faces(self) -> Faces:
         """u, v, w."""
@@ -175,9 +181,14 @@ def step(
         velocity = explicit_terms(velocity, domain, p, pattern)
     else:
         velocity = explicit_terms_plain(velocity, domain, p, pattern, options.advection_gradient)
-    velocity = implicit_diffusion(velocity, domain, p.kinematic_viscosity, p.wall_damping, p.time_step)
+    failed: list[SolveReport] = []
+    velocity = implicit_diffusion(velocity, domain, p.kinematic_viscosity, p.wall_damping, p.time_step, failed)
     velocity = set_outflow(velocity, domain, p.outflow_velocity)
-    return project(velocity, domain, options=options, guess=guess, kept=kept)
+    velocity = push_outlet(velocity, domain, p.gravity, p.time_step)
+    velocity = project(velocity, domain, options=options, guess=guess, kept=kept)
+    if failed and kept:
+        kept[-1] = (kept[-1][0], max(failed, key=lambda report: report.residual))
+    return velocity
 
 
 def rollout(
@@ -206,7 +217,7 @@ def rollout(
             bit. None keeps all steps.
 
     Returns:
-        the last velocity and the reports; a pressure solve that failed is seen in the reports.
+        the last velocity and the reports; a solve that failed is seen in the reports.
 
     Raises:
         ValueError: counts that do not match.

@@ -21,7 +21,7 @@ from fluidlift.physics import rollout_kernels as kernels
 from fluidlift.physics.pressure import PressureSystem
 from fluidlift.physics.rollout_diffusion import add_boundary
 from fluidlift.physics.rollout_matrices import extrapolation_matrix, pressure_matrices, viscous_matrices
-from fluidlift.physics.rollout_surface import sides, surface_distances
+from fluidlift.physics.rollout_surface import depth_at_outlet, liquid_distance, outlet_head, sides, surface_distances
 from fluidlift.types import CellType
 
 WEIGHTS = ("weight_x", "weight_y", "weight_z")
@@ -68,6 +68,8 @@ class RolloutLists:
     closed: Int[np.ndarray, "c"]
     """walls: faces whose velocity is 0"""
     outflow: Int[np.ndarray, "o"]
+    outlet: Int[np.ndarray, "o"]
+    """faces that a head pushes"""
     couplings: Float[np.ndarray, "f"]
     """neighbours that a dynamic face is coupled with by viscosity, walls ahead and behind included"""
     boundary: tuple[np.ndarray, np.ndarray]
@@ -93,6 +95,8 @@ class RolloutDomain:
     """component of the mainstream along the face's axis on faces between fluid and OUTFLOW cells, else 0"""
     outflow_faces: Float[np.ndarray, "f"]
     """1 on those faces"""
+    outlet_head: Float[np.ndarray, "3 f"]
+    """times gravity: acceleration by the weight of the liquid behind the outlet (`rollout_surface.outlet_head`)"""
     interior: Float[np.ndarray, "f"]
     """1 on faces that keep a free value before the projection (neither wall nor inflow)"""
     force: Float[np.ndarray, "f"]
@@ -266,6 +270,7 @@ def _compact_lists(domain: RolloutDomain) -> RolloutLists:
         inflow_ends=(int(ends[0]), int(ends[1]), int(ends[2]), int(ends[3])),
         closed=np.flatnonzero(domain.wall & ~inflow_mask).astype(np.int32),
         outflow=np.flatnonzero(domain.outflow_faces).astype(np.int32),
+        outlet=np.flatnonzero(domain.outlet_head.any(axis=0)).astype(np.int32),
         couplings=couplings,
         boundary=(np.concatenate(rows), np.concatenate(cols)),
     )
@@ -318,7 +323,12 @@ def prepare_domain(
     is_inflow = [np.logical_or(*sides(types == CellType.INFLOW, a)) for a in range(3)]
     openings = _openings(system, is_inflow)
     closed_share = [np.where(t, 1 - o, 0).astype(dtype) for t, o in zip(touching, openings)]
-    distances = surface_distances(types, distance) if smoke is None else [np.ones(t.shape) for t in touching]
+    depth, normal = np.zeros(types.shape), np.zeros(3)
+    distances = [np.ones(t.shape) for t in touching]
+    if smoke is None:
+        level = liquid_distance(types) if distance is None else distance / system.spacing
+        distances = surface_distances(types, level)
+        depth, normal = depth_at_outlet(types, level)
     parts: dict[str, list[np.ndarray]] = {}
     for axis in range(3):
         dynamic = (system.weights[axis] > 0) & touching[axis]
@@ -332,14 +342,15 @@ def prepare_domain(
             "inflow": inflow,
             "outflow": leaving * along,
             "outflow_faces": leaving & (mainstream is not None),
+            "outlet_head": dynamic * outlet_head(types, depth, normal, axis),
             "interior": ~(inflow | wall),
             "force": share,
             "opening": openings[axis],
             "reach": dynamic / distances[axis],
         }
         for name, value in (new | _walls_beside(dynamic, unknown, closed_share, axis)).items():
-            parts.setdefault(name, []).append(np.asarray(value).ravel())
-    flat = {n: np.concatenate(p) for n, p in parts.items()}
+            parts.setdefault(name, []).append(np.asarray(value).reshape(*value.shape[:-3], -1))
+    flat = {n: np.concatenate(p, axis=-1) for n, p in parts.items()}
     nearer = (np.asarray(w / d, np.float32) for w, d in zip(system.weights, distances))
     return RolloutDomain(
         shape=types.shape,

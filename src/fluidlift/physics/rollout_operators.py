@@ -16,6 +16,9 @@ from torch import Tensor
 from fluidlift.physics import rollout_diffusion, rollout_kernels
 from fluidlift.physics.advection_kernels import advect_component, advect_component_adjoint
 from fluidlift.physics.rollout_domain import LinearMap, RolloutDomain
+from fluidlift.types import SolveReport
+
+TOO_VISCOUS = "too viscous for one time step: shorten it"
 
 
 def _array(tensor: Tensor) -> np.ndarray:
@@ -155,7 +158,9 @@ class _Diffuse(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, velocity: Tensor, c: Tensor, e: Tensor, domain: RolloutDomain) -> Tensor:
+    def forward(
+        ctx: Any, velocity: Tensor, c: Tensor, e: Tensor, domain: RolloutDomain, failed: list[SolveReport] | None
+    ) -> Tensor:
         x = _array(velocity).copy()
         real, h = x.dtype.type, float(domain.system.spacing)
         ctx.rates, ctx.domain = (real(float(c) / h**2), real(float(e))), domain
@@ -164,7 +169,11 @@ class _Diffuse(torch.autograd.Function):
         rollout_diffusion.add_boundary(x, x, rows, cols, ctx.rates[0])
         for component, (runs, _) in zip(lists.components, lists.runs):
             layout = (lists.couplings, domain.wall_count)
-            rollout_diffusion.diffuse(x, component, runs, layout, ctx.rates, _tolerance(x), _work(domain, x.dtype))
+            work = _work(domain, x.dtype)
+            found = rollout_diffusion.diffuse(x, component, runs, layout, ctx.rates, _tolerance(x), work)
+            # a bound at the tolerance may round to above it
+            if failed is not None and found[1] > 1.01 * _tolerance(x):
+                failed.append(SolveReport(False, *found, "viscosity", TOO_VISCOUS))
         out = torch.from_numpy(x)
         ctx.save_for_backward(out)
         return out
@@ -185,7 +194,7 @@ class _Diffuse(torch.autograd.Function):
         rollout_diffusion.add_boundary(g, g, cols, rows, ctx.rates[0])
         to_c = to_a / float(domain.system.spacing) ** 2
         dtype = gradients[0].dtype
-        return torch.from_numpy(g), torch.tensor(to_c, dtype=dtype), torch.tensor(to_e, dtype=dtype), None
+        return torch.from_numpy(g), torch.tensor(to_c, dtype=dtype), torch.tensor(to_e, dtype=dtype), None, None
 
 
 _threads = threading.local()
@@ -207,12 +216,20 @@ def _tolerance(values: np.ndarray) -> float:
 
 
 def implicit_diffusion(
-    velocity: Float[Tensor, "f"], domain: RolloutDomain, viscosity: Tensor, wall_damping: Tensor, time_step: Tensor
+    velocity: Float[Tensor, "f"],
+    domain: RolloutDomain,
+    viscosity: Tensor,
+    wall_damping: Tensor,
+    time_step: Tensor,
+    failed: list[SolveReport] | None = None,
 ) -> Float[Tensor, "f"]:
-    """One backward Euler step of viscosity; prescribed faces act as boundary values, walls by their damping."""
+    """One backward Euler step of viscosity; prescribed faces act as boundary values, walls by their damping.
+
+    A component whose solve misses its tolerance appends a report to `failed`.
+    """
     c = viscosity * time_step
     e = c * wall_damping * (2 / float(domain.system.spacing) ** 2)
-    return _Diffuse.apply(velocity, c, e, domain)
+    return _Diffuse.apply(velocity, c, e, domain, failed)
 
 
 class _Outflow(torch.autograd.Function):
@@ -234,3 +251,14 @@ class _Outflow(torch.autograd.Function):
 def set_outflow(velocity: Float[Tensor, "f"], domain: RolloutDomain, speed: Tensor) -> Float[Tensor, "f"]:
     """Faces to OUTFLOW cells take `speed` along the mainstream."""
     return _Outflow.apply(velocity, speed, domain) if len(domain.lists.outflow) else velocity
+
+
+def push_outlet(
+    velocity: Float[Tensor, "f"], domain: RolloutDomain, gravity: Float[Tensor, "3"], time_step: Tensor
+) -> Float[Tensor, "f"]:
+    """Faces to OUTFLOW cells feel the weight of the liquid behind them for one step."""
+    faces = domain.lists.outlet
+    if not len(faces):
+        return velocity
+    push = time_step * (gravity @ torch.from_numpy(domain.outlet_head[:, faces]))
+    return velocity.index_add(0, torch.from_numpy(faces), push)

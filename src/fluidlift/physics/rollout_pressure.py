@@ -46,6 +46,7 @@ from fluidlift.physics.rollout_operators import apply_linear, subtract_gradient
 from fluidlift.types import SolveReport
 
 ROUTES = ("implicit", "jacobi", "unrolled", "recurrent", "recurrent_unrolled")
+ADVECTION_GRADIENTS = ("exact", "upwind", "plain")
 
 
 class PressureRoute(ABC):
@@ -196,6 +197,12 @@ class RolloutOptions:
 
     def __post_init__(self) -> None:
         require(self.projection in ROUTES, f"projection '{self.projection}'", " or ".join(ROUTES))
+        gradients = ADVECTION_GRADIENTS
+        require(
+            self.advection_gradient in gradients,
+            f"advection gradient '{self.advection_gradient}'",
+            " or ".join(gradients),
+        )
         needs = self.projection.startswith("recurrent")
         require(
             not needs or self.stencil is not None, f"projection '{self.projection}' without a stencil",

@@ -19,6 +19,8 @@ from fluidlift.errors import require
 from fluidlift.physics.free_surface import Faces, pressure_cells, surface_gaps
 from fluidlift.types import CellType, Grid
 
+NEAR_OUTLET = 4
+"""cells: as far before the outlet the surface is looked at for its normal"""
 NEIGHBOURHOOD = 2.0
 """cells: standard deviation of the weights in the local fit of a plane; stairs up to about ten cells become a slope"""
 ROUNDS = 10
@@ -100,6 +102,65 @@ def surface_distances(
         distance = liquid_distance(types)
     require(distance.shape == types.shape, f"distance {distance.shape}", str(types.shape))
     return [np.asarray(gap, float) for gap in surface_gaps(distance, types)]
+
+
+def depth_at_outlet(
+    cell_types: np.ndarray, distance: Float[np.ndarray, "nx ny nz"]
+) -> tuple[Float[np.ndarray, "nx ny nz"], Float[np.ndarray, "3"]]:
+    """Depth of FLUID cells below the surface over them, in cells, and the surface's normal near the outlet.
+
+    The depth is counted along the axis nearest to the normal: that is how the pressure of liquid at rest adds up on the
+    grid. It is 0 where there is no surface above, and everywhere where there is no outlet.
+
+    Args:
+        cell_types: u8 [nx,ny,nz], `CellType`.
+        distance: of cell centres to the surface in cells, negative in the liquid.
+    """
+    types = np.asarray(cell_types)
+    depths, normal = np.zeros(types.shape), np.zeros(3)
+    behind, fluid, dry = (types == t for t in (CellType.OUTFLOW, CellType.FLUID, CellType.EMPTY))
+    near = np.asarray(ndimage.binary_dilation(behind, iterations=NEAR_OUTLET)) & fluid if behind.any() else behind
+    for axis in range(3):
+        low, high = [slice(None)] * 3, [slice(None)] * 3
+        low[axis], high[axis] = slice(None, -1), slice(1, None)
+        below, above = tuple(low), tuple(high)
+        # the steps of a staircase add up to the area of the slope, seen along each axis
+        normal[axis] = float((near[below] & dry[above]).sum()) - float((near[above] & dry[below]).sum())
+    size = float(np.sqrt(np.square(normal).sum()))
+    if size == 0:
+        return depths, normal
+    normal = normal / size
+    up = int(np.abs(normal).argmax())
+    order = slice(None, None, -1 if normal[up] > 0 else 1)
+    # from the air downwards; not a number where the way to the air is not through liquid
+    depth, air = np.full(fluid.shape[:up] + fluid.shape[up + 1 :], np.nan), False
+    for wet, open_air, level, out in zip(*(np.moveaxis(a, up, 0)[order] for a in (fluid, dry, distance, depths))):
+        depth = np.where(air, np.maximum(-level, 0.0), depth + abs(normal[up]))
+        depth, air = np.where(wet, depth, np.nan), open_air
+        out[...] = np.nan_to_num(depth)
+    return depths, normal
+
+
+def outlet_head(
+    cell_types: np.ndarray, depth: Float[np.ndarray, "nx ny nz"], normal: Float[np.ndarray, "3"], axis: int
+) -> Float[np.ndarray, "3 fx fy fz"]:
+    """Share of gravity by which the liquid behind an outlet pushes each face across `axis` of FLUID beside OUTFLOW.
+
+    An outlet cuts a stream that goes on: behind it p / density = -(g . n) depth, as under a flat surface with the
+    normal n. With p = 0 there the section would be sucked out by the weight of the liquid in it.
+
+    Args:
+        cell_types: u8 [nx,ny,nz], `CellType`.
+        depth: of FLUID cells, cells, from `depth_at_outlet`.
+        normal: from there, too.
+        axis: of the faces.
+    """
+    types = np.asarray(cell_types)
+    (fluid_low, fluid_high), (out_low, out_high) = (sides(types == t, axis) for t in (CellType.FLUID, CellType.OUTFLOW))
+    depth_low, depth_high = sides(depth, axis)
+    ahead = np.where(fluid_low & out_high & (depth_low > 0), np.maximum(depth_low - normal[axis], 0.0), 0.0)
+    back = np.where(fluid_high & out_low & (depth_high > 0), np.maximum(depth_high + normal[axis], 0.0), 0.0)
+    return normal[:, None, None, None] * (ahead - back)
 
 
 def liquid_distance(cell_types: np.ndarray) -> Float[np.ndarray, "nx ny nz"]:

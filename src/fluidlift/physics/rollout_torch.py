@@ -10,6 +10,7 @@ On CUDA two runs may differ by rounding, because sums over scattered indices are
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -25,6 +26,7 @@ from fluidlift.numerics import torch_multigrid
 from fluidlift.physics.advection import Faces, upwind_step
 from fluidlift.physics.rollout import Rollout, RolloutParameters, flatten
 from fluidlift.physics.rollout_domain import RolloutDomain
+from fluidlift.physics.rollout_operators import TOO_VISCOUS
 from fluidlift.physics.rollout_pressure import RolloutOptions
 from fluidlift.physics.rollout_torch_domain import (
     TorchDomain,
@@ -37,6 +39,8 @@ from fluidlift.physics.rollout_torch_domain import (
 from fluidlift.types import FaceVelocity, SolveReport
 
 Box = Float[Tensor, "3 X Y Z"]
+MOST_DIFFUSION_ITERATIONS = 500
+"""of conjugate gradients; c / h^2 = 50 takes some 100"""
 
 
 @dataclass
@@ -128,8 +132,10 @@ class _Diffuse(torch.autograd.Function):
     """x with (1 - c L + e W) x = b; gradients as `rollout_operators`."""
 
     @staticmethod
-    def forward(ctx: Any, b: Tensor, c: Tensor, e: Tensor, domain: TorchDomain) -> Tensor:
-        x = _solve_diffusion(b, c, e, domain)
+    def forward(
+        ctx: Any, b: Tensor, c: Tensor, e: Tensor, domain: TorchDomain, failed: list[SolveReport] | None
+    ) -> Tensor:
+        x = _solve_diffusion(b, c, e, domain, failed)
         ctx.save_for_backward(x, c, e)
         ctx.domain = domain
         return x
@@ -142,7 +148,7 @@ class _Diffuse(torch.autograd.Function):
         wide = adjoint.double()
         gc = (wide * _laplacian(x, domain)).sum().to(c.dtype)
         ge = -(wide * domain.wall_count * x).sum().to(e.dtype)
-        return adjoint, gc, ge, None
+        return adjoint, gc, ge, None, None
 
 
 def _laplacian(x: Box, domain: TorchDomain) -> Box:
@@ -151,8 +157,11 @@ def _laplacian(x: Box, domain: TorchDomain) -> Box:
     return domain.dynamic * inside - domain.neighbours * x
 
 
-def _solve_diffusion(b: Box, c: Tensor, e: Tensor, domain: TorchDomain, max_iterations: int = 500) -> Box:
-    """Conjugate gradients for (1 - c L + e W) x = b; the diagonal varies little, so no preconditioner is needed."""
+def _solve_diffusion(b: Box, c: Tensor, e: Tensor, domain: TorchDomain, failed: list[SolveReport] | None = None) -> Box:
+    """Conjugate gradients for (1 - c L + e W) x = b; the diagonal varies little, so no preconditioner is needed.
+
+    Where they miss the tolerance a report is appended to `failed`.
+    """
     tolerance = 1e-6 if b.dtype == torch.float32 else 1e-13
     every = torch_multigrid.check_every(b.device)
 
@@ -166,7 +175,7 @@ def _solve_diffusion(b: Box, c: Tensor, e: Tensor, domain: TorchDomain, max_iter
     rr = (residual * residual).sum()
     zero = torch.zeros_like(rr)
     goal = (tolerance**2) * (b * b).sum()
-    for iteration in range(max_iterations):
+    for iteration in range(MOST_DIFFUSION_ITERATIONS):
         if iteration % every == 0 and not torch_multigrid.host_value(rr - goal) > 0:
             break
         image = torch.addcmul(keep * direction, rate, neighbour_sum(direction), value=-1)
@@ -176,15 +185,21 @@ def _solve_diffusion(b: Box, c: Tensor, e: Tensor, domain: TorchDomain, max_iter
         residual.addcmul_(image, -alpha)
         rr, previous = (residual * residual).sum(), rr
         direction = torch.addcmul(residual, direction, torch.where(previous > 0, rr / previous, zero))
+    else:
+        left = tolerance * math.sqrt(torch_multigrid.host_value(rr / goal))
+        if failed is not None and not left <= tolerance:
+            failed.append(SolveReport(False, MOST_DIFFUSION_ITERATIONS, left, "viscosity", TOO_VISCOUS))
     return x
 
 
-def diffuse(velocity: Box, domain: TorchDomain, parameters: RolloutParameters) -> Box:
-    """One backward Euler step of viscosity; prescribed faces act as boundary values, walls by their damping."""
+def diffuse(
+    velocity: Box, domain: TorchDomain, parameters: RolloutParameters, failed: list[SolveReport] | None = None
+) -> Box:
+    """One backward Euler step of viscosity, as `rollout_operators.implicit_diffusion`."""
     c = parameters.kinematic_viscosity * parameters.time_step
     prescribed = neighbour_sum(velocity * domain.inflow) * domain.dynamic / domain.spacing**2
     e = c * parameters.wall_damping * (2 / domain.spacing**2)
-    return _Diffuse.apply(velocity + c * prescribed, c, e, domain)
+    return _Diffuse.apply(velocity + c * prescribed, c, e, domain, failed)
 
 
 class _Pressure(torch.autograd.Function):
@@ -245,9 +260,14 @@ def step(
     velocity = apply_walls(velocity, domain, parameters)
     velocity = velocity + dt * parameters.gravity[:, None, None, None] * domain.force
     velocity = set_inflow(velocity, domain, parameters, pattern)
-    velocity = diffuse(velocity, domain, parameters)
+    failed: list[SolveReport] = []
+    velocity = diffuse(velocity, domain, parameters, failed)
     velocity = velocity * (1 - domain.outflow_faces) + parameters.outflow_velocity * domain.outflow
-    return project(velocity, domain, options=options, solved=solved)
+    velocity = velocity + dt * torch.einsum("g,gaxyz->axyz", parameters.gravity, domain.outlet_head)
+    velocity = project(velocity, domain, options=options, solved=solved)
+    if failed and solved is not None:
+        solved.report = failed[0]
+    return velocity
 
 
 def rollout_on_device(

@@ -66,6 +66,8 @@ class TorchDomain:
     inflow: Float[Tensor, "3 X Y Z"]
     outflow: Float[Tensor, "3 X Y Z"]
     outflow_faces: Float[Tensor, "3 X Y Z"]
+    outlet_head: Float[Tensor, "3 3 X Y Z"]
+    """times gravity (first index)"""
     interior: Float[Tensor, "3 X Y Z"]
     force: Float[Tensor, "3 X Y Z"]
     wall_share: Float[Tensor, "3 X Y Z"]
@@ -117,6 +119,7 @@ class TorchDomain:
         }
         boxes = {k: flat_to_box(torch.from_numpy(np.ascontiguousarray(v)), domain) for k, v in on_faces.items()}
         dynamic = boxes["dynamic"]
+        boxes["outlet_head"] = torch.stack([flat_to_box(torch.from_numpy(h), domain) for h in domain.outlet_head])
         boxes["dynamic"] = dynamic.to(boxes["inflow"].dtype)
         neighbours = _viscous_neighbours(dynamic, boxes["inflow"], boxes.pop("wall")) / h**2
         return cls(

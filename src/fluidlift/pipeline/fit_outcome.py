@@ -10,6 +10,7 @@ from typing import Any, Literal
 from fluidlift.types import Estimate, FitResult, FluidParameters
 
 FITTED = "fitted"
+LOOSE = "fitted, known loosely"
 UNDETERMINED = "prior: not determined by the clip"
 LEFT_OUT = "prior: not fitted"
 GIVEN = "given"
@@ -22,6 +23,8 @@ POSITIVE = ("density", "kinematic_viscosity", "inflow_fluctuation", "time_step")
 """fitted as logarithms"""
 SHARES = ("restitution", "wall_damping")
 """fitted as logits"""
+MORE = "--set fit.max_work=... and --set fit.max_seconds=... give it more"
+"""what helps a fit that was cut off"""
 WIDTH = 1.96
 """standard deviations on either side that hold 95 %"""
 
@@ -57,7 +60,7 @@ class Verdict:
         if self.status == "unfinished":
             return [
                 f"{SUBJECT} stopped before it converged ({self.reason}): its values are the best found so far, "
-                "better than the first guess (--set fit.max_seconds=... gives it more time)"
+                f"better than the first guess ({MORE})"
             ]
         return []
 
@@ -67,9 +70,11 @@ def verdict(found: FitResult) -> Verdict:
     loss, first, rest = (float(found.extra.get(k, math.nan)) for k in ("loss", "loss_at_prior", "loss_at_rest"))
     if not math.isfinite(loss):
         return Verdict("failed", "the simulated flow breaks down at the first guess")
-    if not any(e.identifiable for e in found.estimates.values()):
+    if found.reason and "budget" not in found.reason:
+        return Verdict("failed", found.reason)
+    if not any(e.fitted for e in found.estimates.values()):
         if not found.converged and any("budget" in note for note in found.notes):
-            return Verdict("failed", "its time was up before it had begun (--set fit.max_seconds=... gives it more)")
+            return Verdict("failed", f"it was cut off before it had begun ({MORE})")
         return Verdict("failed", "the clip determines none of the parameters")
     # equal is no failure: the first guess may have been right
     if loss > first * (1.0 + 1e-6):
@@ -131,6 +136,8 @@ def source_of(
         return GIVEN
     if e.identifiable:
         return FITTED
+    if e.fitted:
+        return LOOSE
     if name in measured:
         return MEASURED
     return UNDETERMINED if name in free else LEFT_OUT

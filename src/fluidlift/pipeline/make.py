@@ -110,7 +110,7 @@ def _run(story: Story, inputs: Inputs, folder: Path, config: JobConfig) -> dict[
     )
     run("refine", lambda: refining.refine(story, inputs, config), settings=[shape, seed], after=("geometry",))
     run("motion", lambda: moving.motion(story, config), settings=config.section("motion"), after=("geometry",))
-    run("fit", lambda: moving.fit(story, config), settings=fit_settings(config), after=("motion",))
+    run("fit", lambda: moving.fit(story, config), settings=config.section("fit"), after=("motion",))
     return {"inputs": {k: {"name": inputs.existing()[k].name, "sha256": v} for k, v in hashes.items()}}
 
 
@@ -160,11 +160,6 @@ def _metrics(story: Story) -> dict[str, Any]:
         "fit_extra": story["fit"].meta["extra"],
         "fit": fit_figures(story),
     }
-
-
-def fit_settings(config: JobConfig) -> dict[str, Any]:
-    """What the result of the fit depends on; the seed only where there are restarts."""
-    return config.section("fit") | ({"seed": config.seed} if config.fit.restarts else {})
 
 
 def fit_figures(story: Story) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -218,32 +217,30 @@ def _attempt(
     from fluidlift.fit.optimize import fit_parameters
 
     setting = setting_of(story)
-    more: dict[str, Any] = {}
-    if config.fit.restarts:
-        if "restarts" not in inspect.signature(fit_parameters).parameters:
-            raise InputRejected(f"fit.restarts = {config.fit.restarts}", "0: this version fits once")
-        more = {"restarts": config.fit.restarts, "seed": config.seed}
     try:
         with one_torch_thread():
             found = fit_parameters(
                 targets, setting.cell_types, setting.terrain, setting.terrain.grid, clip_of(story).interval, initial,
-                kind=story["geometry"].meta["kind"], method=config.fit.method, max_seconds=config.fit.max_seconds,
-                progress=story.step, mainstream=setting.terrain.mainstream, prior_sigmas=gravity_prior(story),
-                free=free, **more,
+                kind=story["geometry"].meta["kind"], mainstream=setting.terrain.mainstream, method=config.fit.method,
+                free=free, prior_sigmas=prior_widths(story), restarts=config.fit.restarts + 1,
+                max_work=config.fit.max_work, max_seconds=config.fit.max_seconds, device=config.fit.device,
+                progress=story.step,
             )  # fmt: skip
     except (np.linalg.LinAlgError, FloatingPointError) as error:
         return FitResult(initial, {}, np.zeros(0), False, 0), Verdict("failed", f"no solution ({error})")
     return found, verdict(found)
 
 
-def gravity_prior(story: Story) -> dict[str, float] | None:
-    """How free gravity is, relative to 9.81 m/s^2: 2 %, for it is what it is everywhere.
+def prior_widths(story: Story) -> dict[str, float]:
+    """Relative widths of what is known before the fit looks: the time step to 1 %, gravity to 2 % of 9.81 m/s^2.
 
-    Under an assumed size it could stand for the unknown scale as well. Freed, it goes to nearly nothing wherever the
-    motion is slow for the assumed size, because the rollout's free surface is then noisier than the flow; and water
-    without weight leaves its bed. A plume's buoyancy is free.
+    The time between two frames is on record; a fit that may stretch it makes up for errors of the velocities with it.
+    Gravity is what it is everywhere. Under an assumed size it could stand for the unknown scale as well: freed, it goes
+    to nearly nothing wherever the motion is slow for the assumed size, and water without weight leaves its bed. A
+    plume's buoyancy is free.
     """
-    return None if story["geometry"].meta["kind"] == "plume" else {"gravity": 0.02}
+    known = {"time_step": 0.01}
+    return known if story["geometry"].meta["kind"] == "plume" else known | {"gravity": 0.02}
 
 
 def filling_rate(story: Story) -> float | None:

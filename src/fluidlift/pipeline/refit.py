@@ -15,7 +15,7 @@ from fluidlift.errors import InputRejected
 from fluidlift.pipeline import moving, showing
 from fluidlift.pipeline.fit_outcome import SUBJECT, in_words
 from fluidlift.pipeline.fit_request import request_of
-from fluidlift.pipeline.make import fit_figures, fit_settings
+from fluidlift.pipeline.make import fit_figures
 from fluidlift.pipeline.resimulate import is_key, settings_of, stage_keys
 from fluidlift.pipeline.story import Progress, Silence, Story, peak_memory_mb
 
@@ -87,7 +87,7 @@ def refit(
     _recall(story, manifest)
     before = load_asset(folder)
     with disk_errors(folder):
-        story.run("fit", lambda: moving.fit(story, config), settings=fit_settings(config), after=("motion",))
+        story.run("fit", lambda: moving.fit(story, config), settings=config.section("fit"), after=("motion",))
         own = story["fit"].meta["warnings"]
         story.warnings[:] = [w for w in manifest.get("warnings", ()) if not str(w).startswith(SUBJECT)] + own
         parameters = moving.parameters_of(story)

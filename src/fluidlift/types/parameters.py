@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -81,10 +82,16 @@ class Estimate:
     sigma: float
     """standard deviation, in the unit of the value; inf where the data say nothing"""
     identifiable: bool
-    """False: the data cannot determine it and it keeps its prior"""
+    """determined by the data, and sigma at most 5 % (`precise_within`) of the value, of a vector for its components.
+    Else it is known loosely (`value` is the fitted one all the same), or not determined (`value` is the prior)"""
     prior: float
     unit: str = ""
     interval: tuple[float, float] | None = None
     """holds the value with 95 %; None where nothing is known"""
     source: str = ""
     """where the value comes from, in words: fitted, measured, given, or a prior (docs/fit.md)"""
+
+    @property
+    def fitted(self) -> bool:
+        """The value is the data's, well or loosely known: what they say nothing about keeps its prior to the digit."""
+        return math.isfinite(self.sigma) and (self.identifiable or self.value != self.prior)

@@ -27,11 +27,14 @@ class FitResult:
 
     parameters: FluidParameters
     estimates: dict[str, Estimate]
+    """by label (`gravity_z`, `restitution`, ...): identifiable (sigma within 5 %), known loosely (fitted all the same),
+    or not determined by the data (the prior)"""
     loss_history: np.ndarray
     """float [iterations]"""
     converged: bool
+    """False with an empty `reason`: better than the first guess, but not at the minimum; `notes` say what ended it"""
     rollouts: int
-    """number of value-and-gradient evaluations"""
+    """of one window, all told; a gradient counts as three"""
     notes: tuple[str, ...] = ()
     extra: dict[str, float] = field(default_factory=dict)
     """figures for the report, such as the loss of a fluid at rest"""

@@ -194,8 +194,10 @@ def test_reports_tell_what_a_fixed_number_of_sub_steps_leaves():
     assert kept[1][1].residual == pytest.approx(kept[2][1].residual, rel=1e-9)
 
 
-def test_unknown_routes_are_refused():
+def test_unknown_routes_and_gradients_are_refused():
     with pytest.raises(ValueError, match="projection 'multigrid'"):
         RolloutOptions("multigrid")
     with pytest.raises(ValueError, match="without a stencil"):
         RolloutOptions("recurrent")
+    with pytest.raises(ValueError, match="advection gradient 'downwind'"):
+        RolloutOptions(advection_gradient="downwind")

@@ -351,6 +351,10 @@ def solve(
         found = multigrid.solve(system.unknown, system.weights, system.spacing, rhs, **options, low_rank=terms)
     else:
         found = _solve_plain(system, rhs, method, **options, low_rank=tuple(low_rank))
+    return found.p, _judged(found, tolerance, method)
+
+
+def _judged(found: multigrid.Solution, tolerance: float, method: str) -> SolveReport:
     advice = []
     if not np.isfinite(found.residual) and found.iterations == 0:
         advice.append("the right side or the first guess is not finite")
@@ -362,4 +366,4 @@ def solve(
     converged = bool(np.isfinite(found.residual) and found.residual <= tolerance * (1 + 1e-6))
     if not converged and np.isfinite(found.residual):
         advice.append("raise max_iterations or the tolerance")
-    return found.p, SolveReport(converged, found.iterations, found.residual, method, "; ".join(advice))
+    return SolveReport(converged, found.iterations, found.residual, method, "; ".join(advice))

@@ -179,7 +179,9 @@ def fit(story: Story, config: JobConfig) -> Result:
     found, judged = _attempt(story, config, targets, startable(initial, request.held), free)
     parameters, estimates = found.parameters, dict(found.estimates)
     if not judged.usable:
-        parameters, estimates = initial, first_guess_as_result(initial, UNITS)
+        # the buoyancy of smoke was guessed from its speed by the fit
+        parameters = replace(initial, gravity=parameters.gravity) if kind == "plume" else initial
+        estimates = first_guess_as_result(parameters, UNITS)
     known = {name: getattr(initial, name) for name in request.held}
     parameters = replace(parameters, **known)
     estimates = {n: as_given(n, e, initial) if family(n) in known else e for n, e in estimates.items()}

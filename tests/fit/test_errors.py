@@ -118,6 +118,8 @@ def test_what_stands_in_hidden_cells_does_not_matter(rough, rough_fit):
 def test_a_fit_that_its_work_ends_repeats_itself_and_one_that_the_clock_ends_says_so(rough):
     first, second = (fit(rough, max_work=2e5, workers=w) for w in (1, 2))
     assert same(first, second)
+    assert not first.converged and not first.reason
+    assert any("fit.max_work" in note for note in first.notes)
     late = fit(rough, max_seconds=0.0)
     assert not late.converged
     assert any("clock" in note for note in late.notes)

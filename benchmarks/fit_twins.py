@@ -157,12 +157,12 @@ def tell(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-def recover(scenes: Sequence[str], seeds: int, **options: Any) -> tuple[list[Recovery], list[Run]]:
+def recover(scenes: Sequence[str], seeds: Sequence[int], **options: Any) -> tuple[list[Recovery], list[Run]]:
     """All fits of the first part."""
     rows, runs = [], []
     for condition in CONDITIONS:
         for scene in scenes:
-            for seed in range(seeds):
+            for seed in seeds:
                 twin = twin_of(scene, seed, condition)
                 began = time.perf_counter()
                 found = fit_twin(twin, **options)
@@ -352,6 +352,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", nargs="+", default=SCENES, choices=sorted(PLANS))
     parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--parts", nargs="+", default=("recovery", "restarts", "large"))
     parser.add_argument("--every", action="store_true", help="a line for every number")
     parser.add_argument("--json", type=Path)
@@ -362,7 +363,7 @@ def main() -> None:
         return
     lines, log = [], {}
     if "recovery" in chosen.parts:
-        rows, runs = recover(chosen.scenes, chosen.seeds)
+        rows, runs = recover(chosen.scenes, range(chosen.first_seed, chosen.first_seed + chosen.seeds))
         lines += recovery_tables(rows, runs, chosen.every)
         log |= {"recovery": [asdict(r) for r in rows], "runs": [asdict(r) for r in runs]}
     if "restarts" in chosen.parts:

@@ -111,5 +111,5 @@ def test_the_python_example_of_the_readme_uses_what_there_is():
     beginning = example.split("made = ")[0]  # what follows takes minutes
     names: dict[str, object] = {}
     exec(beginning, names)
-    assert names["config"] == build_config("draft", overrides=["fit.max_seconds=20"])
+    assert names["config"] == build_config("draft", overrides=["fit.max_work=2e8"])
     assert callable(names["make"]) and callable(names["Inputs"]) and callable(names["load_asset"])

@@ -180,7 +180,8 @@ def test_tied_parameters_are_given_up_one_at_a_time():
 
 
 def test_a_loose_bound_far_from_the_prior_counts_as_knowledge():
-    curvature = Curvature(np.array([[1e-4]]), loss=0.01, observations=100.0)
+    # sigma is 0.88 of the prior's
+    curvature = Curvature(np.array([[3e-5]]), loss=0.01, observations=100.0)
     width = np.array([1.0])
     assert not determined(curvature, width, np.array([0.5]))[0]
     assert determined(curvature, width, np.array([4.0]))[0]

@@ -24,8 +24,9 @@ from scipy import stats
 from fluidlift.fit.ranges import UNITS, ParameterSpace
 from fluidlift.types import Estimate
 
-IDENTIFIABLE_BELOW = 0.5
-"""share of the prior's standard deviation below which the data are said to determine a parameter"""
+DETERMINED_BELOW = 0.8
+"""share of the prior's standard deviation below which the data are said to determine a parameter. What is held at its
+prior instead pulls those tied to it away from the minimum, so a little knowledge is used"""
 BLOCK = 4
 """cells along a side of a block whose errors are taken as tied"""
 EXCLUDED_BEYOND = 2.5
@@ -115,6 +116,22 @@ class Curvature:
         wider = np.sqrt(np.maximum(np.diag(laplace) / np.maximum(np.diag(robust), 1e-300), 1.0))
         return robust * np.outer(wider, wider)
 
+    def covariance_beside(
+        self, prior_sigma: Float[np.ndarray, "p"], fitted: Bool[np.ndarray, "p"], held: Bool[np.ndarray, "p"]
+    ) -> np.ndarray:
+        """[f,f] covariance of the fitted raw variables where others are held at priors that may be wrong.
+
+        An error e of the held ones moves the minimum of the others by -(A_ff + P)^-1 A_fh e, with A the data's precision
+        and P that of the priors; e is as large as its prior allows.
+        """
+        covariance = self.covariance(prior_sigma, fitted)
+        if not held.any():
+            return covariance
+        data = self.precision_per_loss * self.normal
+        stiff = data[np.ix_(fitted, fitted)] + np.diag(1 / prior_sigma[fitted] ** 2)
+        moved = np.linalg.solve(stiff, data[np.ix_(fitted, held)] * prior_sigma[held])
+        return covariance + moved @ moved.T
+
 
 def block_scatter(
     parts: list[tuple[Float[np.ndarray, "p n"], Float[np.ndarray, "n"], Int[np.ndarray, "n"]]], parameters: int
@@ -159,7 +176,7 @@ def determined(
     while keep.any():
         sigma = np.sqrt(np.diag(curvature.covariance(prior_sigma, keep)))
         ratio = np.where(moved[keep] > EXCLUDED_BEYOND * sigma, 0.0, sigma / prior_sigma[keep])
-        if ratio.max() < IDENTIFIABLE_BELOW:
+        if ratio.max() < DETERMINED_BELOW:
             break
         keep[np.flatnonzero(keep)[ratio.argmax()]] = False
     return keep
@@ -190,8 +207,8 @@ def estimates(
 ) -> dict[str, Estimate]:
     """Value and standard deviation per parameter, by label (`gravity_z`, `restitution`, ...).
 
-    Determined ones: the fitted value, its uncertainty with the undetermined ones held at their prior; identifiable
-    where that is precise. Undetermined ones: their prior, with the uncertainty that they have when everything is free
+    Determined ones: the fitted value, and its uncertainty with the undetermined ones held at their prior, right or
+    wrong; identifiable where that is precise. Undetermined ones: their prior, with the uncertainty that they have when everything is free
     (inf where no data depend on them). Fixed ones: inf.
 
     Args:
@@ -204,9 +221,9 @@ def estimates(
     """
     sigma = np.full(len(raw), np.inf)
     felt = np.diag(curvature.normal) > 0
-    for some in (felt, keep & felt):
+    for some, held in ((felt, ~felt), (keep & felt, felt & ~keep)):
         if some.any():
-            sigma[some] = np.sqrt(np.diag(curvature.covariance(space.prior_sigma, some)))
+            sigma[some] = np.sqrt(np.diag(curvature.covariance_beside(space.prior_sigma, some, held & felt)))
     slopes = np.array([f.range.slope(float(x)) for f, x in zip(space.fitted, raw)])
     more = np.array([(also or {}).get(f.label, 0.0) for f in space.fitted])
     physical = np.where(np.isfinite(sigma), np.hypot(np.where(np.isfinite(sigma), sigma, 0) * slopes, more), np.inf)

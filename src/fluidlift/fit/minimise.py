@@ -68,7 +68,7 @@ def first_point(
 
 def minimise(
     problem: FitProblem, space: ParameterSpace, start: Float[np.ndarray, "p"], budget: Budget, options: FitOptions,
-    *, errors: bool, explore: bool = True,
+    *, errors: bool,
 ) -> Found:  # fmt: skip
     """Minimise, correct the starts, hold what is not determined at its prior, and minimise the rest again.
 
@@ -79,12 +79,11 @@ def minimise(
         budget: what may be spent.
         options: of the fit.
         errors: the targets have errors or hidden cells, so starts are corrected.
-        explore: False: the start is already near the minimum.
     """
     if options.method == "adam":
         found = adam(problem, space, start, budget)
     else:
-        found = levenberg_marquardt(problem, space, start, budget, explore=explore)
+        found = levenberg_marquardt(problem, space, start, budget)
     none = np.zeros(len(start), bool)
     if found.curvature is None or found.jacobian is None or found.at is None:
         broken = not math.isfinite(found.loss)

@@ -276,7 +276,7 @@ class _Fit:
     ) -> Found:
         """The minimum from one start, first on wider cells where the layout is large."""
         errors = scene.noise > ERRORS_BEYOND * scene.speed or any(o is not None and not o.all() for o in scene.observed)
-        begun, explore = start, True
+        begun = start
         coarse = scene.grid.cells > self.options.coarse_first and not isinstance(self.data.solid, PoissonSystem)
         wide = self.data.coarser() if coarse and not self.budget.spent else None
         if wide is not None and not _no_flow(wide):
@@ -284,10 +284,10 @@ class _Fit:
             begun = first_point(rough, space, begun, self.budget)
             near = minimise(rough, space, begun, self.budget, replace(self.options, start_rounds=0), errors=False)
             if not near.reason:
-                begun, explore = near.raw, False
+                begun = near.raw
         elif not self.budget.spent:
             begun = first_point(problem, space, begun, self.budget)
-        return minimise(problem, space, begun, self.budget, self.options, errors=errors, explore=explore)
+        return minimise(problem, space, begun, self.budget, self.options, errors=errors)
 
     def result(
         self, scene: FitScene, problem: FitProblem, space: ParameterSpace, best: Found, ends: list[Found],

@@ -79,7 +79,7 @@ def effective_observations(
     if m > 1:
         # sum over pairs of unit vectors, from the size of their sum
         sizes = [float(np.square(r, dtype=float).sum()) ** 0.5 for r in residuals]
-        total = sum(r / max(size, 1e-300) for r, size in zip(residuals, sizes))
+        total = sum((r / size for r, size in zip(residuals, sizes) if size > 0), np.zeros_like(residuals[0]))
         pairs = float(np.square(total, dtype=float).sum()) - sum(size > 0 for size in sizes)
         between = min(max(pairs / (m * (m - 1)), 0.0), 1.0)
     else:

@@ -104,3 +104,17 @@ def made(stream_clip: Path, tmp_path_factory: pytest.TempPathFactory) -> Job:
     folder = tmp_path_factory.mktemp("made") / "stream.fluid"
     code = main(["make", str(stream_clip), "-o", str(folder), "--size", "2", *QUICK])
     return Job(stream_clip, folder, code)
+
+
+@pytest.fixture(scope="module")
+def single_thread():
+    """Small arrays, torch and Numba in turn: their thread pools would only wait for each other."""
+    import numba
+    import torch
+
+    before = numba.get_num_threads(), torch.get_num_threads()
+    numba.set_num_threads(1)
+    torch.set_num_threads(1)
+    yield
+    numba.set_num_threads(before[0])
+    torch.set_num_threads(before[1])

@@ -23,13 +23,7 @@ GENERAL = FittedStencil(
 )
 
 
-@pytest.fixture(autouse=True, scope="module")
-def single_thread():
-    """Small arrays: threads would only wait for each other."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("single_thread")
 
 
 def irregular(shape=(10, 8, 7), seed=0, lid=False):

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import numba
 import numpy as np
 import pytest
 import torch
@@ -27,15 +26,7 @@ def diffuse(velocity, domain, p):
     return implicit_diffusion(velocity, domain, p.kinematic_viscosity, p.wall_damping, p.time_step)
 
 
-@pytest.fixture(autouse=True, scope="module")
-def single_thread():
-    """Small arrays, torch and Numba in turn: their thread pools would only wait for each other."""
-    before = numba.get_num_threads(), torch.get_num_threads()
-    numba.set_num_threads(1)
-    torch.set_num_threads(1)
-    yield
-    numba.set_num_threads(before[0])
-    torch.set_num_threads(before[1])
+pytestmark = pytest.mark.usefixtures("single_thread")
 
 
 def channel(shape=(9, 6, 5), depth=4):

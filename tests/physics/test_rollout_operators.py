@@ -33,15 +33,7 @@ WATER = FluidParameters(
 )  # fmt: skip
 
 
-@pytest.fixture(autouse=True, scope="module")
-def single_thread():
-    """Small arrays, torch and Numba in turn: their thread pools would only wait for each other."""
-    before = numba.get_num_threads(), torch.get_num_threads()
-    numba.set_num_threads(1)
-    torch.set_num_threads(1)
-    yield
-    numba.set_num_threads(before[0])
-    torch.set_num_threads(before[1])
+pytestmark = pytest.mark.usefixtures("single_thread")
 
 
 def channel(dtype=np.float64):

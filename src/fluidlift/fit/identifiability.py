@@ -121,8 +121,8 @@ class Curvature:
     ) -> np.ndarray:
         """[f,f] covariance of the fitted raw variables where others are held at priors that may be wrong.
 
-        An error e of the held ones moves the minimum of the others by -(A_ff + P)^-1 A_fh e, with A the data's precision
-        and P that of the priors; e is as large as its prior allows.
+        An error e of the held ones moves the minimum of the others by -(A_ff + P)^-1 A_fh e, with A the precision of
+        the data and P that of the priors; e is as large as its prior allows.
         """
         covariance = self.covariance(prior_sigma, fitted)
         if not held.any():
@@ -208,8 +208,8 @@ def estimates(
     """Value and standard deviation per parameter, by label (`gravity_z`, `restitution`, ...).
 
     Determined ones: the fitted value, and its uncertainty with the undetermined ones held at their prior, right or
-    wrong; identifiable where that is precise. Undetermined ones: their prior, with the uncertainty that they have when everything is free
-    (inf where no data depend on them). Fixed ones: inf.
+    wrong; identifiable where that is precise. Undetermined ones: their prior, with the uncertainty that they have when
+    everything is free (inf where no data depend on them). Fixed ones: inf.
 
     Args:
         space: of all fitted parameters.

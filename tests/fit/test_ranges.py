@@ -54,6 +54,18 @@ def test_the_prior_comes_back_and_held_parameters_keep_it_to_the_digit():
     assert found.gravity == pytest.approx(prior.gravity)
 
 
+def test_what_is_not_kept_has_its_prior_to_the_digit_also_at_an_end_of_its_range():
+    prior = FluidParameters(restitution=0.0, wall_damping=0.02, kinematic_viscosity=1e-5)
+    space = parameter_space(prior, free=("restitution", "wall_damping", "kinematic_viscosity"), speed=1.0, spacing=0.1)
+    assert space.fluid_parameters(space.prior_raw, np.zeros(3, bool)) == prior
+    # the sigmoid reaches neither 0 nor 0.02
+    assert space.fluid_parameters(space.prior_raw).restitution > 0.04
+    labels = [f.label for f in space.fitted]
+    kept = space.fluid_parameters(space.prior_raw + 1.0, np.array([name == "kinematic_viscosity" for name in labels]))
+    assert (kept.restitution, kept.wall_damping) == (0.0, 0.02)
+    assert kept.kinematic_viscosity > 2e-5
+
+
 def test_an_unknown_name_is_refused():
     with pytest.raises(ValueError, match="surface_tension"):
         parameter_space(FluidParameters(), free=("surface_tension",), speed=1.0, spacing=0.1)

@@ -215,7 +215,10 @@ class _Fit:
         at_prior = evaluate(problem, space, space.prior_raw, self.budget)
         if not math.isfinite(at_prior.loss):
             self.notes.append("the rollout breaks down at the start: nothing was fitted")
-            failed = _failure(space.fluid_parameters(space.prior_raw), "the rollout breaks down at the start")
+            failed = _failure(
+                space.fluid_parameters(space.prior_raw, np.zeros(len(space.prior_raw), bool)),
+                "the rollout breaks down at the start",
+            )
             return replace(failed, notes=tuple(self.notes), rollouts=self.budget.rollouts)
         ends = [
             self.one(scene, plan, problem, space, np.array(start))
@@ -319,7 +322,7 @@ class _Fit:
         spread = self._ends(space, best, ends, known)
         plan = problem.windows[0].domains
         return FitResult(
-            parameters=space.fluid_parameters(best.raw),
+            parameters=space.fluid_parameters(best.raw, best.keep),
             estimates=known,
             loss_history=np.asarray(best.history),
             converged=best.converged and not reason,
@@ -372,7 +375,7 @@ class _Fit:
                 apart += [f.label] if away > APART * sigma else []
         if apart:
             self.notes.append("restarts end at different values of " + ", ".join(sorted(apart)))
-        return tuple(space.fluid_parameters(e.raw) for e in ends)
+        return tuple(space.fluid_parameters(e.raw, e.keep) for e in ends)
 
 
 def _buoyancy_prior(prior: FluidParameters, scene: FitScene) -> FluidParameters:

@@ -173,8 +173,11 @@ class ParameterSpace:
             values[name] = torch.stack([parts[name, a] for a in range(3)]) if is_vector else parts[name, None]
         return RolloutParameters(**values)
 
-    def fluid_parameters(self, raw: np.ndarray) -> FluidParameters:
-        """Plain numbers of the raw vector."""
+    def fluid_parameters(self, raw: np.ndarray, keep: np.ndarray | None = None) -> FluidParameters:
+        """Plain numbers of the raw vector; those not kept have their prior to the digit, also where it is at an end."""
+        if keep is not None:
+            held = {f.label for f, k in zip(self.fitted, keep) if not k}
+            return self.keep_prior(held).fluid_parameters(raw[keep])
         return self.physical(torch.as_tensor(raw, dtype=torch.float64)).fluid_parameters()
 
     def keep_prior(self, labels: set[str]) -> ParameterSpace:

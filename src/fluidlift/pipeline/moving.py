@@ -45,6 +45,11 @@ WALL_DAMPING_PRIOR = {"stream": 0.05, "fall": 0.05, "pour": 0.2, "plume": 0.02}
 over a bed that the grid cannot resolve"""
 
 
+AT_WALLS = ("restitution", "wall_damping")
+"""not fitted unless asked for: what the velocity does beside a wall under water was not seen but assumed (`motion.bed`),
+and a steady flow whose slope the geometry lacks is best explained by walls without friction, everywhere it was tried"""
+
+
 def motion(story: Story, config: JobConfig) -> Result:
     """Completed flow of many frames, volume velocity of the target frames."""
     from fluidlift.motion.air import with_air
@@ -172,7 +177,7 @@ def fit(story: Story, config: JobConfig) -> Result:
     initial = request.applied(first_guess(story, targets), along=along)
     # speeds that come from free fall were not measured: they say nothing about friction inside or at the walls
     assumed = story["motion"].meta["free_fall_share"] > 0.3
-    usual = AT_THE_ENDS if assumed else DEFAULT_FREE
+    usual = AT_THE_ENDS if assumed else tuple(name for name in DEFAULT_FREE if name not in AT_WALLS)
     if filling_rate(story) is not None:  # the level in the vessel says how much enters
         usual = tuple(name for name in usual if name != "inflow_velocity")
     free = request.free_of(usual)

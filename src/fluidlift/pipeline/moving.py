@@ -46,8 +46,8 @@ over a bed that the grid cannot resolve"""
 
 
 AT_WALLS = ("restitution", "wall_damping")
-"""not fitted unless asked for: what the velocity does beside a wall under water was not seen but assumed (`motion.bed`),
-and a steady flow whose slope the geometry lacks is best explained by walls without friction, everywhere it was tried"""
+"""not fitted unless asked for: how the velocity falls off towards a wall under water was not seen but assumed
+(`motion.bed`), and a steady flow whose slope the geometry lacks is best explained by walls without friction"""
 
 
 def motion(story: Story, config: JobConfig) -> Result:

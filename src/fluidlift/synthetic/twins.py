@@ -365,7 +365,7 @@ PLANS = {
             density=1400.0, kinematic_viscosity=1e-3, inflow_velocity=(0.1, 0.0, 0.0), outflow_velocity=0.15,
             restitution=0.0, wall_damping=0.5,
         ),
-        mainstream=(1.0, 0.0, 0.0), early=0.5,
+        mainstream=(1.0, 0.0, 0.0), early=0.4,
     ),
 }  # fmt: skip
 """river and pour: water whose eddies are smaller than cells. honey: ten times as viscous as the grid itself is"""

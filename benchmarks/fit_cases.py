@@ -20,7 +20,6 @@ of 0 is shown, but no error.
 from __future__ import annotations
 
 import argparse
-import inspect
 import json
 import math
 import os
@@ -240,7 +239,7 @@ def fit_exact(case: Case, args: argparse.Namespace, key: int, noise: float, prio
     x, y, z = case.scene["gravity"] if prior == "known" else WRONG_GRAVITY
     initial = FluidParameters(kinematic_viscosity=WATER, gravity=(x, y, z), wall_damping=0.3, restitution=0.05)
     options: dict[str, Any] = {}
-    if exact.distances is not None and "liquid_distance" in inspect.signature(fit_parameters).parameters:
+    if exact.distances is not None:
         options["liquid_distance"] = exact.distances if args.surface == "known" else None
     began = time.perf_counter()
     result = fit_parameters(

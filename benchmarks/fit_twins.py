@@ -352,7 +352,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", nargs="+", default=SCENES, choices=sorted(PLANS))
     parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--first-seed", type=int, default=0)
+    parser.add_argument("--first-seed", type=int, default=0, help="seeds from here on")
     parser.add_argument("--parts", nargs="+", default=("recovery", "restarts", "large"))
     parser.add_argument("--every", action="store_true", help="a line for every number")
     parser.add_argument("--json", type=Path)

@@ -119,7 +119,7 @@ class Fit:
     hold: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default_factory=tuple)
     """a value that is known, such as --hold viscosity=1e-6; it is not fitted; may be repeated"""
     restarts: int | None = None
-    """further fits from other initial values, whose spread is reported"""
+    """further fits from other initial values, 4 at most, whose spread is reported"""
     max_seconds: float | None = None
     """s that the fit may take; by default as in make"""
     set: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default_factory=tuple)

@@ -96,7 +96,7 @@ class FitConfig:
     hold: tuple[str, ...] = ()
     """values that are known, such as viscosity=1e-6: they are taken as they are"""
     restarts: int = 0
-    """further fits from other initial values, whose spread is reported"""
+    """further fits from other initial values, 4 at most, whose spread is reported"""
 
 
 @dataclass(frozen=True)
@@ -188,7 +188,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "motion.complete_every": (1, 1e6),
     "fit.max_work": (0, 1e18),
     "fit.max_seconds": (0, 1e9),
-    "fit.restarts": (0, 100),
+    "fit.restarts": (0, 4),
     "simulate.frames": (1, 1e6),
     "simulate.max_particles": (100, 1e9),
     "simulate.checkpoint_every": (1, 1e6),

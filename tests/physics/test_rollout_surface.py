@@ -9,7 +9,6 @@ from fluidlift.physics.rollout import RolloutParameters, rollout
 from fluidlift.physics.rollout_domain import prepare_domain
 from fluidlift.physics.rollout_pressure import RolloutOptions
 from fluidlift.physics.rollout_surface import (
-    distance_of_level,
     liquid_distance,
     surface_cells,
     surface_distances,
@@ -87,16 +86,6 @@ def test_layouts_without_a_surface_have_none():
             assert (gap == 1.0).all()
 
 
-def test_a_height_field_gives_the_distance_to_an_inclined_plane():
-    grid = Grid((8, 6, 7), 0.1, (-0.3, 0.2, 0.5))
-    x, y = grid.centers()[:, :, 0, 0], grid.centers()[:, :, 0, 1]
-    heights = 0.8 + 0.3 * x - 0.2 * y
-    normal = np.array([-0.3, 0.2, 1.0]) / np.sqrt(1 + 0.3**2 + 0.2**2)
-    expected = (grid.centers() - np.array([0.0, 0.0, 0.8])) @ normal
-    # single precision
-    np.testing.assert_allclose(distance_of_level(heights, grid), expected, atol=1e-6)
-
-
 def test_wrong_distances_are_rejected():
     types = np.full((4, 3, 5), CellType.FLUID, np.uint8)
     openings = build_system(types, None, Grid(types.shape, 0.1)).openings
@@ -104,8 +93,6 @@ def test_wrong_distances_are_rejected():
         surface_distances(types, np.zeros((4, 3, 4)))
     with pytest.raises(ValueError, match="finite"):
         surface_cells(types, np.full(types.shape, np.nan), openings, 0.1)
-    with pytest.raises(ValueError, match="heights"):
-        distance_of_level(np.zeros((3, 3)), Grid((4, 3, 5), 0.1))
 
 
 def test_a_rollout_below_a_known_surface_keeps_a_tilted_pool_at_rest():

@@ -202,6 +202,14 @@ def test_only_what_is_asked_for_is_fitted(asset, outcome):
     assert rows(asset)["gravity_z"]["source"] == "prior: not fitted"
 
 
+def test_walls_are_fitted_only_where_asked_for(asset, outcome):
+    calls = []
+    outcome(calls=calls)
+    fit(asset)
+    fit(asset, "--free", "wall_damping")
+    assert [("wall_damping" in free, "restitution" in free) for _, free, _ in calls] == [(False, False), (True, False)]
+
+
 def test_restarts_are_further_fits(asset, outcome):
     calls = []
     outcome(calls=calls)
@@ -325,6 +333,7 @@ def test_a_report_that_cannot_be_made_again_is_left_as_it_is(asset, outcome):
         (["--hold", "viscosty=1"], "viscosty"), (["--hold", "viscosity"], "name=value"), (["--free", "velocity"], "or"),
         (["--free", "density", "--hold", "density=1"], "--hold"), (["--set", "simulate.frames=3"], "no effect"),
         (["--max-seconds", "-1"], "fit.max_seconds"), (["--restarts", "-1"], "fit.restarts"),
+        (["--restarts", "5"], "fit.restarts"), (["--set", "fit.device=abacus"], "fit.device"),
     ],
     ids=lambda x: " ".join(x) if isinstance(x, list) else "",
 )  # fmt: skip

@@ -34,7 +34,7 @@ from fluidlift.fit.minimise import Found, first_point, minimise
 from fluidlift.fit.problem import FitProblem, build_problem
 from fluidlift.fit.ranges import UNITS, VECTORS, ParameterSpace, parameter_space
 from fluidlift.fit.scene import FitScene, WindowPlan, build_scene, plan_windows
-from fluidlift.fit.settings import DEFAULT_FREE, FitOptions
+from fluidlift.fit.settings import DEFAULT_FREE, SCALES, FitOptions
 from fluidlift.numerics.poisson import PoissonSystem
 from fluidlift.types import CellType, Estimate, FaceVelocity, FitResult, FluidParameters, Grid, Terrain
 
@@ -46,8 +46,6 @@ PLANNED_ITERATIONS = 7
 """Levenberg-Marquardt iterations that the number of windows leaves work for"""
 ERRORS_BEYOND = 0.02
 """standard deviation of a face's error, in units of U, from which the starts of windows are corrected"""
-SCALES = ((1.0, 1.0), (0.05, 0.5), (20.0, 2.0), (0.2, 1.5), (5.0, 0.7))
-"""factors of viscosity and of the velocities at the ends, of restarts"""
 APART = 3.0
 """standard deviations between two ends that count as different"""
 

@@ -17,6 +17,9 @@ DEFAULT_FREE = (
 )  # fmt: skip
 """All of the paper's. The time step has a narrow prior: the interval between frames is known, its division a choice."""
 
+SCALES = ((1.0, 1.0), (0.05, 0.5), (20.0, 2.0), (0.2, 1.5), (5.0, 0.7))
+"""factors of viscosity and of the velocities at the ends, of restarts"""
+
 
 def there(device: str) -> bool:
     """Whether torch computes in double precision on the device."""
@@ -82,5 +85,5 @@ class FitOptions:
         require(self.method in ("lm", "adam"), f"method '{self.method}'", "'lm' or 'adam'")
         require(self.compare in ("all", "last"), f"comparison of '{self.compare}' frames", "'all' or 'last'")
         require(self.windows >= 1, f"{self.windows} windows", "one or more")
-        require(self.restarts >= 1, f"{self.restarts} starts", "one or more")
+        require(1 <= self.restarts <= len(SCALES), f"{self.restarts} starts", f"1 to {len(SCALES)}")
         require(self.workers is None or self.workers >= 1, f"{self.workers} workers", "one or more")

@@ -5,7 +5,7 @@ p = 0 holds on the surface, a share of a cell away from the centre of the liquid
 of the liquid is balanced exactly, whatever the tilt of the surface against the grid, so a pool at rest stays at rest.
 A surface that is wrong by e(x) instead drives the flow by g grad e, and no later step can tell that from gravity.
 
-The distance is given where it is known (`distance_of_level`, a level set). Else it is estimated from the cell types:
+The distance is given where it is known (a level set, for instance). Else it is estimated from the cell types:
 `liquid_distance`. Cells tell the surface to half a cell; a surface inclined by 1 : n leaves stairs n cells long.
 """
 
@@ -17,7 +17,7 @@ from scipy import ndimage
 
 from fluidlift.errors import require
 from fluidlift.physics.free_surface import Faces, pressure_cells, surface_gaps
-from fluidlift.types import CellType, Grid
+from fluidlift.types import CellType
 
 NEAR_OUTLET = 4
 """cells: as far before the outlet the surface is looked at for its normal"""
@@ -40,20 +40,6 @@ def sides(cells: np.ndarray, axis: int, outside: float = 0) -> tuple[np.ndarray,
     wide = np.pad(cells, pad, constant_values=outside)
     n = cells.shape[axis]
     return np.take(wide, range(n + 1), axis), np.take(wide, range(1, n + 2), axis)
-
-
-def distance_of_level(surface_height: Float[np.ndarray, "nx ny"], grid: Grid) -> Float[np.ndarray, "nx ny nz"]:
-    """Distance (m, negative in the liquid) of cell centres to a height field, z in m: vertical distance over slope.
-
-    Raises:
-        ValueError: heights of another shape than the grid's columns.
-    """
-    require(surface_height.shape == grid.shape[:2], f"heights {surface_height.shape}", str(grid.shape[:2]))
-    heights = np.asarray(surface_height, float)
-    slope = [np.gradient(heights, grid.spacing, axis=a) if heights.shape[a] > 1 else 0.0 for a in range(2)]
-    z = grid.low[2] + (np.arange(grid.shape[2]) + 0.5) * grid.spacing
-    steep = np.sqrt(1.0 + slope[0] ** 2 + slope[1] ** 2)
-    return ((z - heights[..., None]) / np.broadcast_to(steep, heights.shape)[..., None]).astype(np.float32)
 
 
 def surface_cells(

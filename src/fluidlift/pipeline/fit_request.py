@@ -60,8 +60,15 @@ def request_of(config: FitConfig) -> FitRequest:
 
     Raises:
         InputRejected: an unknown or ambiguous name, a value that is no number or out of range, a parameter that is to
-            be fitted and known at once.
+            be fitted and known at once, a device that is not there.
     """
+    if config.device != "cpu":
+        from fluidlift.fit.settings import there
+
+        if not there(config.device):
+            raise InputRejected(
+                f"fit.device = {config.device}", "cpu, or a device with double precision that torch sees, such as cuda"
+            )
     held: dict[str, Value] = {}
     for text in config.hold:
         word, sign, value = text.partition("=")

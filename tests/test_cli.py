@@ -249,7 +249,7 @@ def test_too_little_room_is_told_before_the_long_work_and_nothing_is_half_writte
     assert "MB free" in said
     # whole stage results are kept for the next run; no frame, no manifest, nothing under a temporary name
     assert not list(out.rglob("*.ply")) and not (out / "manifest.json").exists()
-    assert {p.suffix for p in out.rglob("*") if p.is_file()} <= {".npz", ".json", ""}
+    assert {p.suffix for p in out.rglob("*") if p.is_file()} <= {".npz", ".npy", ".json", ""}
 
 
 # warnings -------------------------------------------------------------------------------------------------------

@@ -29,7 +29,7 @@ def fluidlift(*args: str, cwd=None) -> subprocess.CompletedProcess[str]:
 
 
 def test_help_and_version_load_no_heavy_package():
-    names = ["make", "fit", "sim", "inspect", "mask", "evaluate", "validate", "demo", "doctor"]
+    names = ["make", "fit", "sim", "inspect", "mask", "motion", "evaluate", "validate", "demo", "doctor"]
     commands = [["--help"], ["--version"], *([n, "--help"] for n in names)]
     code = ASK.format(commands=commands, heavy=HEAVY)
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
@@ -52,6 +52,8 @@ def test_the_version_is_that_of_the_package():
         ["make", "clip.mp4", "--size", "wide"],
         ["make", "clip.mp4", "--colour", "blue"],
         ["mask", "clip.mp4"],
+        ["motion", "clip.mp4"],
+        ["motion", "clip.mp4", "-o", "out", "--format", "tiff"],
         ["evaluate", "a.fluid"],
         ["fit"],
         ["fit", "a.fluid", "--method", "guess"],
@@ -72,6 +74,9 @@ def test_wrong_usage_is_told_apart_from_wrong_input(args):
         ["inspect", "missing.mp4"],
         ["validate", "missing.fluid"],
         ["fit", "missing.fluid"],
+        ["mask", "missing.mp4", "-o", "out"],
+        ["motion", "missing.mp4", "-o", "out"],
+        ["motion", "missing.mp4", "-o", "out", "--set", "motion.half_window=-1"],
         ["make", "missing.mp4", "--set", "fit.hold=[viscosty=1e-6]"],
         ["make", "missing.mp4", "--set", "fit.colour=blue"],
         ["make", "missing.mp4", "--config", "missing.yaml"],

@@ -14,6 +14,7 @@ from fluidlift.evaluate.images import (
     depth_error,
     depth_scale,
     end_point_error,
+    end_point_percentile,
     mask_iou,
     mean_cosine,
     psnr,
@@ -104,6 +105,7 @@ def a_run(case: Case, depth_scale: float = 1.0) -> dict[str, np.ndarray]:
         "front_depth": (case.depth[0] * depth_scale).astype(np.float32),
         "flow_raw": case.flow[:-1],
         "flow_completed": case.flow[:-1],
+        "flow_observed": np.arange(SIZE[0])[None, None, :] % 2 * np.ones((FRAMES - 1, SIZE[1], 1), np.uint8),
         "resim_flow": case.flow[:-1],
         "resim_mask": case.mask,
         "resim_frames": rng.integers(0, 255, (FRAMES, SIZE[1], SIZE[0], 3), dtype=np.uint8),
@@ -116,6 +118,8 @@ def a_run(case: Case, depth_scale: float = 1.0) -> dict[str, np.ndarray]:
 
 PERFECT = {
     "segmentation.iou": 1, "flow.raw.epe": 0, "flow.completed.epe": 0, "flow.resimulated.epe": 0,
+    "flow.raw.epe_p90": 0, "flow.completed.epe_observed": 0, "flow.completed.epe_filled": 0,
+    "surface.velocity.error": 0, "surface.velocity.relative_error": 0, "surface.velocity.share_found": 1,
     "flow.raw.cosine": 1, "flow.raw.share": 1, "geometry.depth_error": 0, "geometry.occupancy_iou": 1,
     "volume.overlap": 1, "volume.relative_l2": 0, "volume.cosine": 1, "divergence.max": 0,
     "parameters.gravity.relative_error": 0, "parameters.gravity.angle": 0, "parameters.viscosity.relative_error": 0,
@@ -187,6 +191,8 @@ def test_errors_of_a_known_size_are_reported_as_such():
     run["resim_flow"] = 0.5 * case.flow[:-1]
     run["particle_volume"] = np.array([1.0, 1.2, 0.9])
     run["leak_share"] = np.array([0.0, 0.02, 0.01])
+    observed = run["flow_observed"].astype(bool)
+    run["flow_completed"] = case.flow[:-1] + np.where(observed[..., None], [0.0, 0.0], [0.0, 2.0])  # filled: 2 px off
     asset = an_asset()
     halved = replace(asset, velocity=FaceVelocity(*(0.5 * c for c in asset.velocity.components)))
     heavier = replace(halved, parameters=replace(asset.parameters, kinematic_viscosity=0.003, gravity=(0, 0, -4.905)))
@@ -196,6 +202,10 @@ def test_errors_of_a_known_size_are_reported_as_such():
     del run["labels"]
     sheet = evaluate_arrays(heavier, run, {}, case)
     assert sheet["flow.raw.epe"] == pytest.approx(5.0, abs=1e-6)
+    assert sheet["flow.raw.epe_p90"] == pytest.approx(5.0, abs=1e-6)
+    assert sheet["flow.completed.epe_observed"] == pytest.approx(0.0, abs=1e-6)
+    assert sheet["flow.completed.epe_filled"] == pytest.approx(2.0, abs=1e-6)
+    assert sheet["flow.completed.filled_share"] == pytest.approx(0.5, abs=0.1)  # every other column of the mask
     speed = np.linalg.norm(case.flow[case.mask], axis=-1).mean()
     assert sheet["flow.resimulated.epe"] == pytest.approx(0.5 * speed, rel=1e-5)
     assert sheet["flow.resimulated.cosine"] == pytest.approx(1.0)
@@ -401,3 +411,24 @@ def test_cases_of_another_simulator_are_read_and_agree_with_themselves(name):
     run = {"labels": case.mask.astype(np.uint8), "flow_raw": case.flow[:-1]}
     sheet = evaluate_arrays(an_asset(), run, {}, case)
     assert sheet["segmentation.iou"] == 1 and sheet["flow.raw.epe"] == 0
+
+
+def test_nine_of_ten_errors_lie_below_the_ninetieth_percentile():
+    truth = np.zeros((1, 101, 2))
+    flow = truth + np.arange(101.0)[None, :, None] * [0.6, 0.8]  # lengths 0 to 100
+    every = np.ones((1, 101), bool)
+    assert end_point_percentile(flow, truth, every) == pytest.approx(90.0)
+    assert end_point_percentile(flow, truth, ~every) is None
+
+
+def test_a_surface_at_half_speed_has_half_its_speed_as_error():
+    case = a_case()
+    run = a_run(case)
+    # halved on the screen is halved in the world only to first order: the pool moves 20 mm at 0.9 m, hence 2 %
+    run["flow_completed"] = 0.5 * case.flow[:-1]
+    sheet = evaluate_arrays(an_asset(), run, {}, case)
+    assert sheet["surface.velocity.relative_error"] == pytest.approx(0.5, abs=0.02)
+    assert sheet["surface.velocity.error"] == pytest.approx(0.5 * np.linalg.norm(VELOCITY), abs=0.01)
+    assert sheet["surface.velocity.share_found"] == pytest.approx(0.5, abs=0.02)
+    del run["flow_completed"]
+    assert evaluate_arrays(an_asset(), run, {}, case)["surface.velocity.error"] is None

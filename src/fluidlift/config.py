@@ -66,11 +66,41 @@ class ShapeConfig:
 
 
 @dataclass(frozen=True)
+class SegmentConfig:
+    """What is fluid."""
+
+    method: Literal["auto", "sam2", "sam3"] = "auto"
+    """auto: evidence of change and motion; sam2, sam3: learned, started from that evidence; they need weights"""
+    weights: str | None = None
+    """folder (or name on the hub, where a download is allowed) of the weights of a learned method"""
+    device: str = "cpu"
+    """where a learned method runs: cpu, or cuda"""
+    download: bool = False
+    """whether weights may be fetched"""
+    words: tuple[str, ...] = ("water",)
+    """what sam3 looks for"""
+
+
+@dataclass(frozen=True)
 class MotionConfig:
     """Velocities."""
 
-    method: Literal["dis", "farneback"] = "dis"
-    """optical flow"""
+    method: Literal["multiframe", "dis", "farneback", "raft", "sea-raft"] = "multiframe"
+    """optical flow: of what moves over several frames, of single pairs (dis, farneback), or learned (raft, sea-raft)"""
+    weights: str | None = None
+    """file with the weights of a learned method"""
+    device: str = "cpu"
+    """where a learned method runs: cpu, or cuda"""
+    download: bool = False
+    """whether weights may be fetched, where a package knows where from"""
+    half_window: int = 1
+    """frames on either side whose flow is averaged into one frame's motion"""
+    reach: int = 6
+    """frames on either side that are asked where the near ones fail"""
+    along_paths: bool = True
+    """average along the fluid's paths too; false: at fixed pixels, over half_window alone"""
+    wall: Literal["cubic", "log"] = "cubic"
+    """how the velocity falls off towards the bed: third-order, or the log law of rivers"""
     divergence: Literal["paper", "exact"] = "exact"
     """form of the screen-divergence constraint"""
     targets: int = 8
@@ -131,6 +161,7 @@ class JobConfig:
     seed: int = 0
     read: ReadConfig = field(default_factory=ReadConfig)
     shape: ShapeConfig = field(default_factory=ShapeConfig)
+    segment: SegmentConfig = field(default_factory=SegmentConfig)
     motion: MotionConfig = field(default_factory=MotionConfig)
     fit: FitConfig = field(default_factory=FitConfig)
     simulate: SimulateConfig = field(default_factory=SimulateConfig)
@@ -184,6 +215,8 @@ RANGES: dict[str, tuple[float, float]] = {
     "shape.max_gaussians": (100, 1e9),
     "shape.rays": (1, 1001),
     "shape.longest_union": (1, 1000),
+    "motion.half_window": (0, 50),
+    "motion.reach": (0, 200),
     "motion.targets": (1, 1e6),
     "motion.complete_every": (1, 1e6),
     "fit.max_work": (0, 1e18),
@@ -202,14 +235,17 @@ def build_config(
     file: Path | None = None,
     overrides: typing.Sequence[str] = (),
     flat: dict[str, Any] | None = None,
+    *,
+    base: dict[str, Any] | None = None,
 ) -> JobConfig:
-    """Preset, then file, then flat options, then `section.name=value` overrides; later ones win.
+    """Base, preset, then file, then flat options, then `section.name=value` overrides; later ones win.
 
     Args:
         preset: draft, standard or hero; None: the file's, or draft.
         file: YAML with the sections of `JobConfig`.
         overrides: texts such as "fit.max_seconds=60".
         flat: values by dotted name, from command-line options; None values are left out.
+        base: values by dotted name that a command starts from where others have another default.
 
     Raises:
         InputRejected: an unknown name or a value of the wrong type.
@@ -227,7 +263,7 @@ def build_config(
     preset = str(last.pop("preset", preset or in_file))
     if preset not in PRESETS:
         raise InputRejected(f"unknown preset '{preset}'", "one of " + ", ".join(PRESETS))
-    merged = _flatten(PRESETS[preset]) | values
+    merged = (base or {}) | _flatten(PRESETS[preset]) | values
     merged |= {k: v for k, v in (flat or {}).items() if v is not None} | last
     config: Any = JobConfig(preset=typing.cast(Any, preset))
     for name, value in merged.items():

@@ -27,8 +27,16 @@ class Segmenter(ABC):
     """Which pixels are fluid."""
 
     @abstractmethod
-    def segment(self, clip: VideoClip, flow: PixelFlow) -> PixelLabels:
-        """Labels of every frame of the clip."""
+    def segment(
+        self, clip: VideoClip, flow: PixelFlow, *, out: tuple[np.ndarray, np.ndarray] | None = None
+    ) -> PixelLabels:
+        """Labels of every frame of the clip.
+
+        Args:
+            clip: its frames may be mapped from disk; they are read one by one.
+            flow: of the clip.
+            out: labels (u8 [T,H,W]) and confidence (float16 [T,H,W]) to fill, such as mapped files; None: new ones.
+        """
 
 
 class Generator(ABC):
@@ -51,6 +59,11 @@ class FlowEstimator(ABC):
     @abstractmethod
     def displacement(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
         """float32 [H,W,2], px: where each pixel of `first` (u8 [H,W,3]) went in `second`."""
+
+    def estimate(self, first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+        """The displacement, and how far the estimator itself trusts it: float32 [H,W] from 0 to 1, or None where it
+        cannot say (most cannot; a caller then has the round trip and the texture to go by)."""
+        return self.displacement(first, second), None
 
 
 class DepthEstimator(ABC):

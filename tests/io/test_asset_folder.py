@@ -15,6 +15,7 @@ from fluidlift.errors import InputRejected
 from fluidlift.io import asset_folder as af
 from fluidlift.io.atomic import atomic_path
 from fluidlift.io.export_mesh import write_glb, write_obj
+from fluidlift.io.stage_cache import Scratch
 from fluidlift.types import FluidAsset, TriangleMesh
 
 
@@ -276,6 +277,80 @@ def test_damaged_caches_count_as_absent(tmp_path, suffix, damage):
         flipped = data[:middle] + bytes([data[middle] ^ 0xFF]) + data[middle + 1 :]
         path.write_bytes({"cut": data[:middle], "flip": flipped, "empty": b""}[damage])
     assert af.load_stage(tmp_path, "s", "k") is None
+
+
+def scratched(folder, key="k"):
+    """A stage that wrote its array in parts."""
+    scratch = Scratch(folder, "flow")
+    flow = scratch.array("flow", (5, 3), np.float16)
+    for t in range(5):
+        flow[t] = t
+    scratch.array("notes", (7,), np.uint8)
+    af.save_stage(folder, "flow", key, {"flow": flow, "few": np.arange(3)}, {"n": 5}, scratch=scratch)
+    return folder / "work" / "flow"
+
+
+def test_arrays_that_were_written_in_parts_come_back_mapped(tmp_path):
+    place = scratched(tmp_path)
+    arrays, meta = af.load_stage(tmp_path, "flow", "k")
+    assert isinstance(arrays["flow"], np.memmap) and not isinstance(arrays["few"], np.memmap)
+    np.testing.assert_array_equal(arrays["flow"], np.repeat(np.arange(5), 3).reshape(5, 3))
+    assert meta == {"n": 5}
+    # what was not a result is gone, and nothing has a temporary name
+    assert sorted(p.name for p in place.iterdir()) == ["k.flow.npy", "k.json", "k.npz"]
+
+
+def test_writing_into_a_mapped_array_does_not_change_the_cache(tmp_path):
+    scratched(tmp_path)
+    af.load_stage(tmp_path, "flow", "k")[0]["flow"][:] = 9
+    assert af.load_stage(tmp_path, "flow", "k")[0]["flow"][1, 0] == 1
+
+
+@pytest.mark.parametrize("damage", ["cut", "gone", "empty", "other", "link"])
+def test_a_damaged_mapped_array_counts_as_absent(tmp_path, damage):
+    path = scratched(tmp_path) / "k.flow.npy"
+    data = path.read_bytes()
+    path.unlink()
+    if damage == "other":
+        np.save(path, np.zeros((5, 4), np.float16))
+    elif damage == "link":
+        (tmp_path / "elsewhere.npy").write_bytes(data)
+        path.symlink_to(tmp_path / "elsewhere.npy")
+    elif damage != "gone":
+        path.write_bytes({"cut": data[:-4], "empty": b""}[damage])
+    assert af.load_stage(tmp_path, "flow", "k") is None
+
+
+def test_old_mapped_arrays_go_with_their_result(tmp_path):
+    for i in range(4):
+        place = scratched(tmp_path, f"k{i}")
+        os.utime(place / f"k{i}.json", (i, i))
+    assert sorted(p.name for p in place.glob("*.npy")) == ["k2.flow.npy", "k3.flow.npy"]
+
+
+def test_a_scratch_keeps_its_own_files_and_copies_others(tmp_path):
+    scratch = Scratch(tmp_path, "read")
+    growing = scratch.growing("decoded", (2, 3), np.uint8)
+    for t in range(4):
+        growing.append(np.full((2, 3), t))
+    whole = growing.close()
+    assert whole.shape == (4, 2, 3) and len(growing) == 4
+    assert scratch.keep("frames", whole) is whole  # renamed
+    part = scratch.keep("part", whole[1:3])
+    assert part is not whole and part.shape == (2, 2, 3)
+    np.testing.assert_array_equal(part, whole[1:3])
+    again = scratch.keep("part", part[1:])  # under a name that was taken
+    np.testing.assert_array_equal(again, whole[2:3])
+    assert len(list((tmp_path / "work" / "read").iterdir())) == 2
+    with pytest.raises(ValueError, match="item"):
+        scratch.growing("other", (2, 3), np.uint8).append(np.zeros((3, 3)))
+    scratch.discard()
+    assert not list((tmp_path / "work" / "read").iterdir())
+
+
+def test_a_scratch_asks_for_room_before_it_takes_it(tmp_path):
+    with pytest.raises(InputRejected, match="MB free"):
+        Scratch(tmp_path, "read").array("frames", (10**9, 10**9), np.uint8)
 
 
 def test_only_the_last_results_of_a_stage_are_kept(tmp_path):

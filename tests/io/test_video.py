@@ -13,7 +13,8 @@ import pytest
 from fluidlift.errors import InputRejected
 from fluidlift.io.limits import ReadLimits
 from fluidlift.io.pictures import write_png
-from fluidlift.io.video import probe, read_clip, write_video
+from fluidlift.io.stage_cache import Scratch
+from fluidlift.io.video import frames_before, probe, read_clip, write_video
 
 
 def rejected(path, *words: str, **options) -> InputRejected:
@@ -296,3 +297,41 @@ def test_a_failed_video_leaves_nothing_behind(tmp_path):
     assert list(tmp_path.iterdir()) == []
     with pytest.raises(ValueError, match="no frames"):
         write_video(tmp_path / "out.mp4", [], 25)
+
+
+@pytest.fixture
+def woven_frames():
+    """u8 [8,96,160,3]: a texture that goes 3 px to the right per instant, two instants in alternate rows."""
+    rng = np.random.default_rng(0)
+    grey = np.repeat(np.repeat(rng.integers(40, 220, (24, 60)), 4, axis=0), 4, axis=1).astype(np.uint8)
+    instants = [np.repeat(grey[:, 60 - 3 * t : 220 - 3 * t, None], 3, axis=-1) for t in range(16)]
+    frames = np.stack(instants[::2])
+    frames[:, 1::2] = np.stack(instants[1::2])[:, 1::2]
+    return frames, np.stack(instants[::2])
+
+
+def test_of_interlaced_frames_one_instant_is_used(make_video, woven_frames):
+    woven, first = woven_frames
+    clip = read_clip(make_video(frames=woven, options={"crf": "6"}))
+    assert clip.size == (160, 96) and any("interlaced" in w for w in clip.warnings)
+    assert any("interlaced" in w for w in probe(make_video(frames=woven, options={"crf": "6"})).warnings)
+    # rows that were left out are interpolated: squares of 4 px keep their sides, their upper edges move by a pixel
+    inside = np.abs(clip.frames[3].astype(int) - first[3])[1::4]
+    assert np.median(inside) < 6  # levels, of the compression
+
+
+def test_whole_frames_are_not_taken_for_interlaced(make_video, woven_frames):
+    clip = read_clip(make_video(frames=woven_frames[1], options={"crf": "6"}))
+    assert not any("interlaced" in w for w in clip.warnings)
+
+
+def test_frames_in_a_store_are_those_in_memory(make_video, tmp_path):
+    path = make_video()
+    stored = read_clip(path, store=Scratch(tmp_path, "read"), limits=ReadLimits(max_bytes=1000))
+    assert isinstance(stored.frames, np.memmap)
+    np.testing.assert_array_equal(stored.frames, read_clip(path).frames)
+
+
+@pytest.mark.parametrize(("start", "frames"), [(0.0, 0), (0.08, 2), (0.1, 3)])
+def test_frames_before_the_start_are_counted_without_decoding(make_video, start, frames):
+    assert frames_before(make_video(), start, 25.0) == frames

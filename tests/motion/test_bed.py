@@ -5,7 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fluidlift.motion.bed import bed_velocity, laminar_layer_thickness, layer_thickness, wall_profile
+from fluidlift.motion.bed import (
+    SURFACE_COEFFICIENT,
+    bed_velocity,
+    film_profile,
+    laminar_layer_thickness,
+    layer_thickness,
+    log_profile,
+    speed_share,
+    wall_profile,
+)
 
 KINDS = ("stream", "fall", "pour", "plume")
 
@@ -64,3 +73,73 @@ def test_the_bed_takes_the_mainstream_in_its_tangent_plane_with_the_surface_spee
     assert np.allclose(v[1], 2 * share * np.array([0.8, 0.0, 0.6]))
     assert np.allclose(v[2], 0.0)  # the mainstream runs into the wall
     assert np.abs((v * normal).sum(axis=-1)).max() < 1e-12
+
+
+def viscous_film(cells: int) -> np.ndarray:
+    """Speed at the cell centres of a film of unit depth and surface speed, solved by finite differences on 2000 layers.
+
+    nu u'' = -g, no slip at the bed, no shear at the surface.
+    """
+    n = 2000
+    h = 1.0 / n
+    a = (np.diag(np.full(n, -2.0)) + np.diag(np.ones(n - 1), 1) + np.diag(np.ones(n - 1), -1)) / h**2
+    a[0, 0] = -3.0 / h**2  # u = 0 half a layer below
+    a[-1, -1] = -1.0 / h**2
+    u = np.linalg.solve(a, -np.ones(n))
+    y = (np.arange(n) + 0.5) * h
+    return np.interp((np.arange(cells) + 0.5) / cells, y, u / u[-1])
+
+
+@pytest.mark.parametrize("cells", [2, 3, 5, 8, 16])
+def test_a_viscous_film_has_its_speed_at_every_cell_on_every_grid(cells: int) -> None:
+    exact = viscous_film(cells)
+    y = (np.arange(cells) + 0.5) / cells
+    film = speed_share(y, kind="pour", spacing=1.0 / cells, depth=1.0, wall="film")
+    assert np.abs(film - exact).max() < 1e-3  # second order on 2000 layers
+    # the paper's cubic with the layer of a whole depth: eta (1 - eta)^2 / 2 below, 2/27 at most, whatever the grid
+    assert 0 <= (film - wall_profile(y, 1.0)).min() and (exact - wall_profile(y, 1.0)).max() < 2 / 27 + 1e-3
+
+
+@pytest.mark.parametrize("cells", [2, 4, 8])
+def test_both_halves_of_plane_poiseuille_flow_are_films(cells: int) -> None:
+    # u / U = 1 - (2 y / H - 1)^2 across a gap H; the wall distance counts from the nearer side
+    y = (np.arange(2 * cells) + 0.5) / (2 * cells)
+    share = film_profile(np.minimum(y, 1 - y), 0.5)
+    assert np.allclose(share, 1 - (2 * y - 1) ** 2, atol=1e-12)
+
+
+def test_a_laminar_layer_is_seen_by_the_cells_that_resolve_it_and_not_by_coarse_ones() -> None:
+    # Blasius: u/U = 0.32979 at eta = 1 and 0.62977 at 2 (Schlichting); the cubic has d = 4.64 in eta
+    for spacing, exact in ((2.0, 0.32979), (4.0, 0.62977)):
+        assert wall_profile(0.5 * spacing, 4.64) == pytest.approx(exact, abs=0.03)
+    assert wall_profile(0.5 * 12.0, 4.64) == 1.0  # eta = 6: 0.9990
+
+
+def test_the_log_law_has_its_mean_at_85_percent_of_the_surface_and_nothing_below_its_roughness() -> None:
+    y = (np.arange(200_000) + 0.5) / 200_000
+    # 1 - 1 / ln(h / y0) leaves out the layer below y0, a thousandth of the depth
+    assert log_profile(y, 1.0).mean() == pytest.approx(SURFACE_COEFFICIENT, abs=2e-3)
+    rough = log_profile(y, 1.0, roughness=0.01)
+    assert rough.mean() == pytest.approx(1 - 0.99 / np.log(100), abs=2e-3)
+    assert (rough[y < 0.01] == 0).all() and rough[-1] == pytest.approx(1.0, abs=1e-4)
+    # equal steps of speed for equal factors of height
+    steps = np.diff(log_profile(np.array([0.05, 0.1, 0.2, 0.4, 0.8]), 1.0, roughness=0.01))
+    assert np.allclose(steps, np.log(2) / np.log(100))
+
+
+def test_a_rough_bed_slows_the_stream_more_than_a_smooth_one() -> None:
+    assert log_profile(0.1, 1.0, 0.03) < log_profile(0.1, 1.0, 0.003) < log_profile(0.1, 1.0, 0.0003)
+    with pytest.raises(ValueError, match="roughness"):
+        log_profile(0.1, 1.0, 2.0)
+
+
+def test_bed_cells_take_the_wall_function_and_the_depth_of_their_own_column() -> None:
+    surface = np.tile([1.0, 0.0, 0.0], (3, 1))
+    depth = np.array([0.2, 0.4, 0.8])
+    for wall, profile in (("log", log_profile), ("film", film_profile)):
+        v = bed_velocity(surface, np.array([1.0, 0.0, 0.0]), kind="stream", spacing=0.1, depth=depth, wall=wall)
+        assert np.allclose(v[:, 0], profile(np.full(3, 0.05), depth))
+    with pytest.raises(ValueError, match="depth"):
+        bed_velocity(surface, np.array([1.0, 0.0, 0.0]), kind="stream", spacing=0.1, wall="log")
+    with pytest.raises(ValueError, match="plug"):
+        speed_share(np.array(0.1), kind="stream", spacing=0.1, wall="plug")

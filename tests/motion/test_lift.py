@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from fluidlift.motion.lift import depth_change, lift_flow
+from fluidlift.motion.lift import depth_change, follow_depth, lift_flow
 from fluidlift.types import PinholeCamera
 
 CAMERA = PinholeCamera.looking((0.3, -2.0, 1.5), (0.0, 0.0, 0.0), 50.0, (96, 72))
@@ -79,6 +81,77 @@ def test_depth_change_is_what_the_material_gains() -> None:
     gained = CAMERA.camera_from_world.vectors(v)[2] * INTERVAL
     change = depth_change(flow_of(v, depth), mask, depth, depth)
     assert np.abs(change[8:-8, 8:-8] - gained).max() < 0.02 * abs(gained)
+
+
+def turning_flow(camera: PinholeCamera) -> tuple[np.ndarray, np.ndarray]:
+    """Flow and depth of the plane z = 0 that turns about the vertical through (0.2, 0.1) and rises."""
+    uv = camera.pixel_grid()
+    rays = camera.rays(uv)
+    depth = -camera.position[2] / rays[..., 2]
+    x = camera.unproject(uv, depth)
+    velocity = np.stack([-(x[..., 1] - 0.1), x[..., 0] - 0.2, np.full(depth.shape, 0.05)], axis=-1)
+    moved, _ = camera.project(x + velocity * INTERVAL)
+    return moved - uv, depth
+
+
+def test_a_cropped_and_enlarged_picture_with_its_camera_gives_the_same_velocities() -> None:
+    x0, y0, size, scale = 17, 9, (54, 40), 3
+    cut = replace(CAMERA, center=(CAMERA.center[0] - x0, CAMERA.center[1] - y0), size=size)
+    working = cut.resized((scale * size[0], scale * size[1]))
+    found = []
+    for camera in (CAMERA, working):
+        flow, depth = turning_flow(camera)
+        mask = np.ones(depth.shape, bool)
+        rising = depth + 0.05 * INTERVAL / camera.rays(camera.pixel_grid())[..., 2]
+        motion = lift_flow(flow, mask, mask, depth, rising, camera, INTERVAL)
+        found.append([a.reshape(*mask.shape, 3) for a in (motion.points, motion.velocities)])
+    # the centre of pixel i of the source is that of pixel 3 i + 1 of the enlarged cut
+    source = [a[y0 : y0 + size[1], x0 : x0 + size[0]] for a in found[0]]
+    there = [a[1::scale, 1::scale] for a in found[1]]
+    inner = (slice(2, -2), slice(2, -2))  # at the rim of the cut fluid leaves the picture, which the source shows
+    assert np.abs(source[0] - there[0]).max() < 1e-5
+    # both interpolate the depth of a plane, linearly in 1/z: float32 of metres over an interval
+    assert np.abs(source[1] - there[1])[inner].max() < 2e-4
+    assert np.linalg.norm(source[1], axis=-1).max() > 0.3
+
+
+def test_fluid_that_passes_behind_nearer_fluid_is_not_observed_and_keeps_its_own_motion() -> None:
+    v = np.array([0.8, 0.0, 0.0])
+    depth = plane()
+    mask = np.ones(depth.shape, bool)
+    flow = flow_of(v, depth)
+    after = depth.copy()
+    after[:, 40:44] -= 0.3  # a crest comes in front of what was seen a frame before
+    _, followed = follow_depth(flow, mask, depth, after)
+    end, row = np.moveaxis(CAMERA.pixel_grid() + flow, -1, 0)
+    inside = (row > 1.0) & (row < 71.0)
+    behind = inside & (end > 40.5) & (end < 43.5)  # both columns that are interpolated belong to the crest
+    clear = inside & ((end < 39.0) | ((end > 45.0) & (end < 95.0)))
+    assert not followed[behind].any()
+    assert followed[clear].all()
+    motion = lift_flow(flow, mask, mask, depth, after, CAMERA, INTERVAL)
+    assert (motion.observed == followed.ravel()).all()
+    # depth goes on along the plane, one-sided gradients at the border of the picture are exact on it: float32
+    assert np.abs(motion.velocities.reshape(*mask.shape, 3)[behind] - v).max() < 0.01
+
+
+def test_fluid_that_leaves_the_fluid_or_the_picture_is_not_observed() -> None:
+    v = np.array([0.8, 0.0, 0.0])
+    depth = plane()
+    flow = flow_of(v, depth)
+    mask = np.zeros(depth.shape, bool)
+    mask[10:60, 10:96] = True
+    after = mask.copy()
+    after[10:30, 60:] = False  # dry a frame later
+    motion = lift_flow(flow, mask, mask, depth, depth, CAMERA, INTERVAL, mask_t1=after)
+    u, w = np.moveaxis(CAMERA.pixel_grid() + flow - 0.5, -1, 0)
+    rows, cols = np.clip(np.rint(w).astype(int), 0, 71), np.clip(np.rint(u).astype(int), 0, 95)
+    leaves = (u > 95.0) | ~after[rows, cols]
+    observed = np.zeros(mask.shape, bool)
+    observed[mask] = motion.observed
+    assert not observed[mask & leaves].any()
+    assert observed[30:58, 12:80].all()
+    assert (mask & leaves).sum() > 300
 
 
 def test_wrong_input_is_named() -> None:

@@ -5,20 +5,17 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, shift
 
 from fluidlift.errors import InputRejected
+from fluidlift.shape.advancing import median_over_time
 from fluidlift.shape.background import without_background
+from fluidlift.shape.colour_growth import colour_odds, grown_from_streams, with_quiet_water
 from fluidlift.shape.evidence import fluid_score, gather_evidence, noise_map, separating_level
-from fluidlift.shape.segment import (
-    Label,
-    at_full_size,
-    grows,
-    median_over_time,
-    overlay,
-    segment,
-    solids_in,
-)
+from fluidlift.shape.hints import clicks_at, polygon_mask
+from fluidlift.shape.presence import Presence, grows
+from fluidlift.shape.region import solids_in
+from fluidlift.shape.segment import Label, LabelWriter, doubts, overlay, segment
 from fluidlift.types.clip import VideoClip
 from fluidlift.types.flow import PixelFlow
 
@@ -195,13 +192,22 @@ def test_smoke_that_rises_is_outlined_in_every_frame():
         assert overlap(labels.fluid[t], truth[t]) > 0.85, t
 
 
+def presence_of(active: np.ndarray) -> Presence:
+    """First and last activity of bool [T,h,w]."""
+    frames, ever = len(active), active.any(axis=0)
+    first = np.where(ever, active.argmax(axis=0), frames)
+    last = np.where(ever, frames - 1 - active[::-1].argmax(axis=0), -1)
+    return Presence(frames, first, last, (0,), active[:1])
+
+
 def test_a_front_grows_and_foam_that_comes_back_does_not():
     front = np.zeros((20, 30, 30), bool)
     for t in range(20):
         front[t, : t + 1] = True
     foam = np.random.default_rng(0).random((20, 30, 30)) < 0.4
-    assert grows(front) and grows(front[::-1])
-    assert not grows(foam)
+    everywhere = np.ones((30, 30), bool)
+    assert grows(presence_of(front), everywhere) and grows(presence_of(front[::-1]), everywhere)
+    assert not grows(presence_of(foam), everywhere)
 
 
 def test_the_mask_of_the_user_wins_with_confidence_one(river):
@@ -276,9 +282,12 @@ def test_small_holes_are_filled_still_ones_are_solid_and_open_bays_stay_outside(
 
 
 def test_the_median_over_time_drops_a_single_frame():
-    odds = np.zeros((5, 2, 2), np.float16)
+    odds = np.zeros((5, 2, 2), np.float32)
     odds[2] = 9.0
-    assert not median_over_time(odds).any()
+    smooth = list(median_over_time(iter(odds)))
+    assert len(smooth) == 5 and not np.any(smooth)
+    for frames in (1, 2):
+        assert np.array_equal(list(median_over_time(iter(odds[:frames]))), odds[:frames])
 
 
 def test_background_that_shows_between_the_fluid_is_taken_out_of_its_colours():
@@ -293,7 +302,9 @@ def test_background_that_shows_between_the_fluid_is_taken_out_of_its_colours():
 def test_labels_at_full_size_keep_their_areas():
     labels = np.zeros((1, 30, 40), np.uint8)
     labels[0, 10:20, 10:30] = Label.FLUID
-    full, sure = at_full_size(labels, np.full((1, 30, 40), 0.5, np.float32), 90, 120)
+    writer = LabelWriter((1, 90, 120))
+    writer.write(0, labels[0], np.full((30, 40), 0.5, np.float32))
+    full, sure = writer.labels, writer.confidence
     # an outline of 180 px, off by at most half a px
     assert abs(int((full == Label.FLUID).sum()) - 30 * 60) < 90
     assert sure.shape == (1, 90, 120) and sure.dtype == np.float16
@@ -309,3 +320,183 @@ def test_the_overlay_tints_fluid_hatches_solids_and_leaves_the_rest():
     assert picture[12, 12, 2] > picture[12, 12, 0]
     assert len(np.unique(picture[27:33, 27:33].reshape(-1, 3), axis=0)) == 2
     assert (frame == 100).all(), "the frame itself is not drawn on"
+
+
+# what the user says
+
+
+@pytest.fixture(scope="module")
+def brook_and_screen() -> tuple[VideoClip, PixelFlow]:
+    """The stream, and above it a screen with a red pattern that changes as lively as the water."""
+    rng = np.random.default_rng(11)
+    pictures, flow = stream(rng)
+    for t in range(FRAMES):
+        change = 30.0 * texture(rng, (HEIGHT, WIDTH), sigma=3.0)[..., None]
+        pictures[t][5:30, 20:120] = (np.array([170.0, 60.0, 50.0]) + change)[5:30, 20:120]
+    return clip_of(pictures), flow
+
+
+def test_a_click_takes_away_what_moves_and_is_no_fluid(brook_and_screen):
+    screen = (slice(8, 27), slice(25, 115))
+    water = (slice(45, 85), slice(5, 60))
+    before = segment(*brook_and_screen).fluid[0]
+    after = segment(*brook_and_screen, points=[(70, 17, 0)]).fluid[0]
+    assert before[screen].mean() > 0.9, "else there is nothing to take away"
+    assert after[screen].mean() < 0.1
+    assert after[water].mean() > 0.95
+
+
+def test_a_click_adds_a_pool_that_does_not_move():
+    rng = np.random.default_rng(12)
+    pictures, flow = stream(rng)
+    pool = (slice(95, 115), slice(30, 130))
+    pictures[:, pool[0], pool[1]] = np.array([40.0, 120.0, 60.0]) + rng.normal(size=(FRAMES, 20, 100, 3))
+    clip = clip_of(pictures)
+    assert segment(clip, flow).fluid[0][pool].mean() < 0.1
+    labels = segment(clip, flow, points=[(80, 105, 1)])
+    assert labels.fluid[0][pool].mean() > 0.9
+    assert labels.fluid[0][:35].mean() < 0.05, "the bank on the other side is not the pool's like"
+
+
+def test_the_pixel_of_a_click_has_its_label_where_clicks_lie_side_by_side(brook_and_screen):
+    fluid = segment(*brook_and_screen, points=[(40, 17, 0), (40, 60, 1), (100, 17, 1)]).fluid[0]
+    assert not fluid[17, 40] and fluid[60, 40] and fluid[17, 100]
+
+
+def test_a_click_that_agrees_leaves_the_mask_nearly_as_it_was(brook_and_screen):
+    clip, flow = brook_and_screen
+    before, after = segment(clip, flow).fluid[0], segment(clip, flow, points=[(30, 65, 1)]).fluid[0]
+    # the outline is cut anew, by another energy: a px or two on an outline of about 600 px around 10000 px
+    assert overlap(before, after) > 0.9
+
+
+def test_a_click_beside_smoke_takes_its_place_out_of_every_frame():
+    pictures, truth = smoke(np.random.default_rng(9))
+    rng = np.random.default_rng(3)
+    for t in range(len(pictures)):  # a red lamp that flickers in a corner
+        pictures[t][85:110, 10:40] = np.array([190.0, 40.0, 30.0]) * rng.uniform(0.5, 1.2)
+    clip = clip_of(pictures)
+    lamp = (slice(None), slice(88, 107), slice(13, 37))
+    before, after = segment(clip, no_flow(24)).fluid, segment(clip, no_flow(24), points=[(25, 97, 0)]).fluid
+    assert before[lamp].mean() > 0.3, "else there is nothing to take away"
+    assert after[lamp].mean() < 0.02
+    assert overlap(after[20], truth[20]) > 0.8
+
+
+def test_clicks_find_fluid_where_nothing_else_does():
+    rng = np.random.default_rng(5)
+    pictures = still_room(rng)
+    pictures[:, 40:90] = np.array([60.0, 90.0, 130.0]) + rng.normal(size=(FRAMES, 50, WIDTH, 3))
+    labels = segment(clip_of(pictures), no_flow(), points=[(80, 65, 1), (80, 10, 0)])
+    assert overlap(labels.fluid[0], stream_mask()) > 0.9
+
+
+def test_points_outside_or_with_a_strange_label_are_rejected(brook_and_screen):
+    with pytest.raises(InputRejected, match="outside"):
+        segment(*brook_and_screen, points=[(WIDTH, 3, 1)])
+    with pytest.raises(InputRejected, match="label"):
+        segment(*brook_and_screen, points=[(3, 3, 2)])
+
+
+def test_points_are_read_in_px_of_the_clip_and_used_at_working_size():
+    clicks = clicks_at([(511.9, 0.0, 1), (256, 144, 0)], (512, 288), (216, 384))
+    assert clicks.fluid.tolist() == [[383, 0]] and clicks.other.tolist() == [[192, 108]]
+    assert not clicks_at([], (512, 288), (216, 384))
+
+
+def test_a_polygon_holds_its_area_and_nonsense_is_rejected():
+    mask = polygon_mask([[(10, 10), (30, 10), (30, 20), (10, 20)], [(50, 30), (60, 30), (60, 40)]], 60, 80)
+    # corners lie on the outline, half a px either way: the rim of 60 px and of 34 px
+    assert abs(int(mask.sum()) - (200 + 50)) < 0.5 * (60 + 34) + 2
+    assert mask[15, 20] and not mask[15, 40]
+    with pytest.raises(InputRejected, match="polygon"):
+        polygon_mask([[(1, 1), (2, 2)]], 60, 80)
+    with pytest.raises(InputRejected, match="no pixel"):
+        polygon_mask([[(-30, -30), (-20, -30), (-20, -20)]], 60, 80)
+
+
+# colour where motion says too little
+
+
+def test_colour_odds_are_those_of_the_two_histograms_and_bounded():
+    picture = np.zeros((10, 10, 3), np.float32)
+    picture[:, 5:, 0] = 200.0
+    right = np.zeros((10, 10))
+    right[:, 5:] = 1.0
+    odds = colour_odds(picture, right, 1.0 - right)
+    assert (odds[:, 5:] > 3.0).all() and (odds[:, :5] < -3.0).all()
+    even = colour_odds(picture, np.ones((10, 10)), np.ones((10, 10)))
+    assert np.abs(even).max() < 1e-5
+
+
+def test_water_that_moves_too_little_to_tell_joins_by_its_colour_and_the_banks_do_not():
+    rng = np.random.default_rng(3)
+    pictures, flow = stream(rng)
+    ripples = 12.0 * texture(rng, (HEIGHT, WIDTH), sigma=3.0)[..., None]
+    for t in range(FRAMES):  # less than half of the contrast of the stream
+        calm = np.array([60.0, 90.0, 130.0]) + np.roll(ripples, t, axis=1) + rng.normal(size=ripples.shape)
+        pictures[t, 90:105] = calm[90:105]
+    evidence = gather_evidence(clip_of(pictures), flow)
+    lively = np.zeros((HEIGHT, WIDTH), bool)
+    lively[42:88] = True
+    score = fluid_score(evidence)
+    found = with_quiet_water(evidence, score, lively)
+    assert float(np.median(score[92:103])) < 0.0, "else motion alone would tell"
+    assert found[92:103].mean() > 0.85
+    assert found[:35].mean() < 0.05 and found[110:].mean() < 0.05
+    assert found[lively].all(), "nothing is taken away"
+
+
+def shaken_honey() -> tuple[np.ndarray, np.ndarray]:
+    """A hand-held picture of a yellow puddle on a patterned grey tray; some of the puddle streams. And its mask."""
+    rng = np.random.default_rng(7)
+    rows, columns = np.mgrid[0:HEIGHT, 0:WIDTH]
+    puddle = ((rows - 60) / 40.0) ** 2 + ((columns - 80) / 55.0) ** 2 < 1.0
+    tray = np.array([120.0, 120.0, 125.0]) + 40.0 * texture(rng, (HEIGHT, WIDTH), sigma=1.2)[..., None]
+    honey = np.array([170.0, 120.0, 40.0]) + 10.0 * texture(rng, (HEIGHT, WIDTH), sigma=1.2)[..., None]
+    still = np.where(puddle[..., None], honey, tray)
+    pattern = 25.0 * texture(rng, (HEIGHT, WIDTH), sigma=2.0)[..., None]
+    pictures = still_room(rng)
+    for t in range(FRAMES):
+        picture = still.copy()
+        picture[50:70, 60:110] += np.roll(pattern, 2 * t, axis=1)[50:70, 60:110]
+        hand = rng.normal(scale=0.8, size=2)
+        pictures[t] = shift(picture, (*hand, 0.0), order=1, mode="nearest")
+    return pictures, puddle
+
+
+def test_in_a_shaken_picture_the_fluid_grows_from_where_it_streams():
+    pictures, puddle = shaken_honey()
+    flow = no_flow()
+    flow.displacement[:, 50:70, 60:110, 0] = 2.0
+    evidence = gather_evidence(clip_of(pictures), flow)
+    grown = grown_from_streams(evidence, np.ones((HEIGHT, WIDTH), bool))
+    assert grown is not None
+    # the picture trembles by a px either way on an outline of 300 px around 6900 px
+    assert overlap(grown, puddle) > 0.85
+
+
+def test_without_anything_that_streams_nothing_grows():
+    evidence = gather_evidence(clip_of(shaken_honey()[0]), no_flow())
+    assert grown_from_streams(evidence, np.ones((HEIGHT, WIDTH), bool)) is None
+
+
+def test_doubt_is_told_where_the_picture_shakes():
+    pictures, _ = shaken_honey()
+    flow = no_flow()
+    flow.displacement[:, 50:70, 60:110, 0] = 2.0
+    labels = segment(clip_of(pictures), flow)
+    assert any("--mask" in warning for warning in labels.warnings)
+
+
+def test_the_more_of_the_picture_could_be_either_the_stronger_the_warning():
+    score = np.full((100, 100), -6.0, np.float32)
+    score[:40] = 6.0
+    assert doubts(0.4, score) == ()
+    score[40:60] = -0.5  # half as large as the fluid
+    (mild,) = doubts(0.4, score)
+    assert "50 %" in mild and "--click" in mild
+    score[40:90] = -0.5
+    (strong,) = doubts(0.4, score)
+    assert "more of the picture is doubtful than is fluid" in strong
+    assert any("nearly the whole" in warning for warning in doubts(0.95, score))

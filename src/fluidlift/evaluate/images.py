@@ -42,6 +42,19 @@ def end_point_error(
     return float(np.linalg.norm(flow[mask].astype(np.float64) - truth[mask], axis=-1).mean())
 
 
+def end_point_percentile(
+    flow: Float[np.ndarray, "*t h w 2"],
+    truth: Float[np.ndarray, "*t h w 2"],
+    mask: Bool[np.ndarray, "*t h w"],
+    percent: float = 90.0,
+) -> float | None:
+    """The length (px/frame) that so many per cent of the differences stay below; None where the mask is empty."""
+    require(flow.shape == truth.shape, f"flow {flow.shape}", str(truth.shape))
+    if not mask.any():
+        return None
+    return float(np.percentile(np.linalg.norm(flow[mask].astype(np.float64) - truth[mask], axis=-1), percent))
+
+
 def mean_cosine(
     flow: Float[np.ndarray, "*t h w 2"],
     truth: Float[np.ndarray, "*t h w 2"],

@@ -9,6 +9,7 @@ import numpy as np
 from fluidlift.evaluate.case import Case
 from fluidlift.evaluate.images import (
     end_point_error,
+    end_point_percentile,
     mask_iou,
     mean_cosine,
     psnr,
@@ -76,10 +77,11 @@ def _scored_pixels(arrays: Arrays, case: Case, start: int, n: int, size: tuple[i
 
 
 def score_flow(arrays: Arrays, case: Case, rows: tuple[int, int] | None = None) -> list[Figure]:
-    """End-point error and cosine of the raw, the completed and the re-simulated planar velocity.
+    """End-point error (mean, 90th percentile) and cosine of the raw, the completed and the re-simulated velocity.
 
     Raw and completed flow are scored where truth and run both say fluid (segmentation is scored by itself),
     the re-simulation where truth and re-simulation are both fluid; `share` says how much of the truth that is.
+    The completed flow is also scored apart where it was observed and where it was filled in.
 
     Args:
         arrays: of the run.
@@ -96,7 +98,8 @@ def score_flow(arrays: Arrays, case: Case, rows: tuple[int, int] | None = None) 
         flow, why = picked(arrays, name, 4, 2)
         n = 0 if flow is None else min(len(flow), len(case) - start)
         if flow is None or n <= 0:
-            out += [figure(f"{group}.{k}", None, "", why or "no common frames") for k in ("epe", "cosine", "share")]
+            keys = ("epe", "epe_p90", "cosine", "share")
+            out += [figure(f"{group}.{k}", None, "", why or "no common frames") for k in keys]
             continue
         size = (flow.shape[2], flow.shape[1])
         fluid = truth_mask(case, slice(start, start + n), size)
@@ -113,9 +116,32 @@ def score_flow(arrays: Arrays, case: Case, rows: tuple[int, int] | None = None) 
         mean = float(np.linalg.norm(truth[mask], axis=-1).mean()) if mask.any() else 0.0
         note = f"{n} frames; the truth moves {mean:.2f} px/frame"
         out.append(figure(f"{group}.epe", end_point_error(flow[:n], truth, mask), "px/frame", note))
+        out.append(
+            figure(f"{group}.epe_p90", end_point_percentile(flow[:n], truth, mask), "px/frame", "90 % lie below")
+        )
         out.append(figure(f"{group}.cosine", mean_cosine(flow[:n], truth, mask)))
         out.append(figure(f"{group}.share", mask.sum() / max(fluid.sum(), 1), "", "of the truth's fluid pixels scored"))
+        if name == "flow_completed":
+            out += _observed_and_filled(arrays, flow[:n], truth, mask)
     return out
+
+
+def _observed_and_filled(arrays: Arrays, flow: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> list[Figure]:
+    """Error of the completed flow apart where it was observed and where it was filled in."""
+    names = tuple(f"flow.completed.{k}" for k in ("epe_observed", "epe_filled", "filled_share"))
+    observed, why = picked(arrays, "flow_observed", 3)
+    if observed is not None and (len(observed) < len(flow) or observed.shape[1:] != flow.shape[1:3]):
+        observed, why = None, f"'flow_observed' has shape {observed.shape}"
+    if observed is None:
+        return [figure(k, None, "", why) for k in names]
+    seen = mask & observed[: len(flow)].astype(bool)
+    filled = mask & ~seen
+    none = "no such pixel"
+    return [
+        figure(names[0], end_point_error(flow, truth, seen), "px/frame", "" if seen.any() else none),
+        figure(names[1], end_point_error(flow, truth, filled), "px/frame", "" if filled.any() else none),
+        figure(names[2], filled.sum() / max(mask.sum(), 1), "", "of the scored pixels took their neighbours' motion"),
+    ]
 
 
 def _windows(arrays: Arrays, first: int, n: int) -> dict[str, np.ndarray]:

@@ -19,7 +19,14 @@ from fluidlift.evaluate.planar import (
     score_segmentation,
 )
 from fluidlift.evaluate.report import Evaluation, Figure, figure
-from fluidlift.evaluate.space import align, score_depth, score_divergence, score_parameters, score_volume
+from fluidlift.evaluate.space import (
+    align,
+    score_depth,
+    score_divergence,
+    score_parameters,
+    score_surface_velocity,
+    score_volume,
+)
 from fluidlift.types import FluidAsset
 
 
@@ -58,9 +65,10 @@ def evaluate_arrays(
     Args:
         asset: the product.
         arrays: of the run: labels u8 [T,H,W], front_depth f [H,W] (m), flow_raw and flow_completed f [T-1,H,W,2]
-            (px/frame), first_frame, fit_frames [first, last), and of the re-simulation, whose index k shows frame
-            first_frame + k: resim_flow f [K-1,H,W,2], resim_mask [K,H,W], resim_frames u8 [K,H,W,3],
-            particle_volume [K] (m^3), leak_share [K]. The raster may differ from the truth's. Each may be missing.
+            (px/frame), flow_observed [T-1,H,W] (0 where filled in), first_frame, fit_frames [first, last), and of the
+            re-simulation, whose index k shows frame first_frame + k: resim_flow f [K-1,H,W,2], resim_mask [K,H,W],
+            resim_frames u8 [K,H,W,3], particle_volume [K] (m^3), leak_share [K]. The raster may differ from the
+            truth's. Each may be missing.
         manifest: timings and peak memory.
         case: the truth.
         video: u8 [T,H,W,3], the clip of the case on the raster of resim_frames.
@@ -72,10 +80,11 @@ def evaluate_arrays(
     if scale is None:
         why = "no scale: " + depth[0].note
         names = ("geometry.occupancy_iou", "geometry.chamfer", "volume.overlap", "volume.relative_l2", "volume.cosine")
-        space = [figure(n, None, "", why) for n in (*names, "parameters")]
+        space = [figure(n, None, "", why) for n in ("surface.velocity.error", *names, "parameters")]
     else:
         alignment = align(asset, case, scale, frame)
-        space = score_volume(asset, case, alignment) + score_parameters(asset, case, alignment)
+        space = score_surface_velocity(arrays, asset, case, alignment)
+        space += score_volume(asset, case, alignment) + score_parameters(asset, case, alignment)
     pictures, more = score_resimulation(arrays, case, video)
     figures = [*segmentation, *flow, *depth, *space, *score_divergence(asset), *pictures]
     figures += [*score_conservation(arrays, case), *score_cost(manifest)]

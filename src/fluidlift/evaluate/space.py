@@ -28,6 +28,7 @@ from fluidlift.evaluate.volumes import (
     sample_cells,
     within,
 )
+from fluidlift.motion.lift import lift_flow
 from fluidlift.physics.pressure import build_system, divergence
 from fluidlift.types import CellType, Estimate, FluidAsset, Similarity3
 
@@ -73,6 +74,46 @@ def align(asset: FluidAsset, case: Case, scale: float, frame: int) -> Alignment:
     """Lay the asset, at rest at `frame`, over the truth with `scale` truth metres per asset metre."""
     key = int(np.argmin(np.abs(case.key_frames - frame)))
     return Alignment(align_cameras(case.camera, asset.camera, scale), frame, key)
+
+
+def score_surface_velocity(arrays: Arrays, asset: FluidAsset, case: Case, alignment: Alignment) -> list[Figure]:
+    """Velocity of the visible surface at the rest frame in m/s, lifted with the run's own depth and camera.
+
+    Scored at the pixels where run and truth both see fluid, in the truth's world; `share_found` is the factor of the
+    truth nearest to the run's velocity, 1 where speeds are neither low nor high in the mean.
+    """
+    keys = tuple(f"surface.velocity.{k}" for k in ("error", "relative_error", "share_found"))
+    depth, why = picked(arrays, "front_depth", 2)
+    flow, why_flow = picked(arrays, "flow_completed", 4, 2)
+    t = alignment.frame
+    if depth is None or flow is None or flow.shape[1:3] != depth.shape:
+        return [figure(k, None, "", why or why_flow or "depth and flow of unlike size") for k in keys]
+    t = min(t, len(flow) - 1)
+    size = (depth.shape[1], depth.shape[0])
+    mask = (depth > 0) & np.isfinite(flow[t]).all(axis=-1)
+    both = mask & truth_mask(case, slice(t, t + 1), size)[0]
+    if not both.any():
+        return [figure(k, None, "", f"run and truth share no moving pixel of frame {t}") for k in keys]
+    moved = np.where(mask[..., None], flow[t], 0.0)
+    lifted = lift_flow(moved, mask, mask, depth, depth, asset.camera.resized(size), case.interval)
+    mine = alignment.truth_from_asset.vectors(lifted.velocities[both[mask]].astype(np.float64))
+    true = resample_nearest(true_surface_velocity(case, t), size, axes=(0, 1))[both]
+    error, speed = np.linalg.norm(mine - true, axis=-1).mean(), np.linalg.norm(true, axis=-1).mean()
+    found = float((mine * true).sum() / max(float((true**2).sum()), 1e-12))
+    return [
+        figure(keys[0], error, "m/s", f"mean over the fluid of frame {t}; the truth moves {speed:.3g} m/s"),
+        figure(keys[1], error / max(speed, 1e-12), "", "of the mean true speed"),
+        figure(keys[2], found, "", "1 = speeds neither low nor high"),
+    ]
+
+
+def true_surface_velocity(case: Case, t: int) -> np.ndarray:
+    """float64 [H,W,3], m/s in the truth's world, of the surface seen at each pixel of frame t; 0 outside the mask."""
+    mask, uv = case.mask[t], case.camera.pixel_grid()
+    z = np.where(mask, case.depth[t], 1.0).astype(np.float64)
+    first = case.camera.unproject(uv, z)
+    second = case.camera.unproject(uv + case.flow[t], z + case.depth_change[t])
+    return np.where(mask[..., None], (second - first) / case.interval, 0.0)
 
 
 def score_volume(asset: FluidAsset, case: Case, alignment: Alignment) -> list[Figure]:

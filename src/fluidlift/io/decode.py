@@ -172,8 +172,6 @@ def picture_of(frame: av.VideoFrame, notes: Notes) -> tuple[np.ndarray, np.ndarr
         rgb, alpha = rgba[..., :3], rgba[..., 3]
     else:
         rgb = frame.reformat(format="rgb24", **options).to_ndarray()
-    if frame.interlaced_frame:
-        notes.add("the video is interlaced; combing harms the motion estimate: deinterlace it first (ffmpeg -vf bwdif)")
     turns = quarter_turns(frame, notes)
     rgb = np.ascontiguousarray(np.rot90(rgb, turns))
     return rgb, None if alpha is None else np.ascontiguousarray(np.rot90(alpha, turns))

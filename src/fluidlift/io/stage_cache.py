@@ -2,21 +2,27 @@
 
 The JSON file is written last and names the arrays: without it, or when anything does not match, there is no cache.
 Arrays are not compressed, because writing must cost little beside the stage itself.
+
+Arrays that grow with the clip (frames, flow, labels) lie in files of their own, <key>.<name>.npy. A stage writes them
+part by part through `Scratch`, and they are mapped, not read, when they come back: memory does not grow with the clip.
+Their size and header are checked, their content is not (that would mean to read them).
 """
 
 from __future__ import annotations
 
 import json
+import os
 import re
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from fluidlift.errors import require
-from fluidlift.io.atomic import atomic_write, plain, write_bytes, write_json
+from fluidlift.io.atomic import atomic_write, disk_errors, plain, require_free_space, write_bytes, write_json
 
 WORK_MARKER = ".fluidlift"
 """file in work/ that says whose folder this is"""
@@ -34,6 +40,139 @@ def mark_work_folder(folder: Path | str) -> Path:
     return work
 
 
+PART_BYTES = 2**25
+"""of an array on disk that are copied or looked at in one go"""
+
+
+class GrowingArray:
+    """An array on disk whose length is known only at its end: items are appended, then it is closed.
+
+    Args:
+        path: of the .npy file.
+        shape: of one item.
+        dtype: of the numbers.
+    """
+
+    def __init__(self, path: Path, shape: tuple[int, ...], dtype: Any) -> None:
+        self.path, self.shape, self.dtype, self.count = path, tuple(shape), np.dtype(dtype), 0
+        self._file = path.open("wb")
+        self._head()
+
+    def __len__(self) -> int:
+        return self.count
+
+    def append(self, item: np.ndarray) -> None:
+        """One more item."""
+        require(np.shape(item) == self.shape, f"an item {np.shape(item)}", str(self.shape))
+        self._file.write(np.ascontiguousarray(item, self.dtype).tobytes())
+        self.count += 1
+
+    def close(self) -> np.ndarray:
+        """The whole array, mapped."""
+        self._file.seek(0)
+        self._head()
+        self._file.close()
+        return np.load(self.path, mmap_mode="r+", allow_pickle=False)
+
+    def _head(self) -> None:
+        """NumPy pads its header so that the first axis can grow without moving what follows."""
+        facts = {"descr": self.dtype.str, "fortran_order": False, "shape": (self.count, *self.shape)}
+        np.lib.format.write_array_header_1_0(self._file, facts)
+
+
+class Scratch:
+    """Arrays on disk of a stage that is at work, under temporary names; `save_stage` keeps those that are its result.
+
+    Args:
+        folder: of the asset.
+        stage: letters, digits, `-` and `_`.
+    """
+
+    def __init__(self, folder: Path | str, stage: str) -> None:
+        self.folder, self.place = Path(folder), _names(folder, stage, "none")[0].parent
+        self._made: dict[str, Path] = {}
+        self._copies = 0
+
+    def array(self, name: str, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
+        """A new array of zeros.
+
+        Raises:
+            InputRejected: the disk has no room for it.
+        """
+        path, size = self._path(name), int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
+        require_free_space(path, size)
+        with disk_errors(self.folder):
+            array = np.lib.format.open_memmap(path, "w+", np.dtype(dtype), tuple(shape))
+            # all of it now: a disk that fills later would end the process, not raise
+            if hasattr(os, "posix_fallocate"):
+                with path.open("r+b") as file:
+                    os.posix_fallocate(file.fileno(), 0, path.stat().st_size)
+        self._register(name, path)
+        return array
+
+    def growing(self, name: str, shape: tuple[int, ...], dtype: Any) -> GrowingArray:
+        """A new array of items of `shape`, without any yet. Once closed, give it back through `keep`."""
+        with disk_errors(self.folder):
+            growing = GrowingArray(self._path(name), shape, dtype)
+        self._register(name, growing.path)
+        return growing
+
+    def keep(self, name: str, array: np.ndarray) -> np.ndarray:
+        """The array as one of this scratch under `name`: renamed where it lies here already, else copied."""
+        mapped = _whole_file(array)
+        for made, path in self._made.items():
+            if mapped is not None and mapped.samefile(path):
+                if made != name:
+                    del self._made[made]
+                    self._register(name, path)
+                return array
+        out = self.array(name, array.shape, array.dtype)
+        for part in parts_of(array):
+            out[part] = array[part]
+        return out
+
+    def path_of(self, name: str) -> Path | None:
+        """Where an array lies; None for one that is not here."""
+        return self._made.get(name)
+
+    def discard(self) -> None:
+        """Remove what was not kept."""
+        for path in self._made.values():
+            with suppress(OSError):
+                path.unlink(missing_ok=True)
+        self._made = {}
+
+    def _register(self, name: str, path: Path) -> None:
+        """Remember where an array lies; one that had the name before is gone (who maps it still has it)."""
+        before = self._made.get(name)
+        if before is not None:
+            with suppress(OSError):
+                before.unlink(missing_ok=True)
+        self._made[name] = path
+
+    def _path(self, name: str) -> Path:
+        require(re.fullmatch(r"[A-Za-z0-9_-]{1,64}", name) is not None, f"array '{name}'", "letters and digits")
+        with disk_errors(self.folder):
+            mark_work_folder(self.folder)
+            self.place.mkdir(parents=True, exist_ok=True)
+        self._copies += 1
+        return self.place / f".{name}.{os.getpid()}.{self._copies}.part.npy"
+
+
+def _whole_file(array: np.ndarray) -> Path | None:
+    """The file that a mapped array is all of; None for one in memory and for a slice."""
+    if not isinstance(array, np.memmap) or isinstance(array.base, np.ndarray) or array.filename is None:
+        return None
+    return Path(array.filename)
+
+
+def parts_of(array: np.ndarray, *, size: int = PART_BYTES) -> Iterator[slice]:
+    """Slices along the first axis that cover an array, each of about `size` bytes."""
+    step = max(1, size // max(1, array[:1].nbytes))
+    for first in range(0, len(array), step):
+        yield slice(first, min(first + step, len(array)))
+
+
 def _names(folder: Path | str, stage: str, key: str) -> tuple[Path, Path]:
     for name in (stage, key):
         require(re.fullmatch(r"[A-Za-z0-9_-]{1,128}", name) is not None, f"stage or key '{name}'", "letters and digits")
@@ -42,7 +181,13 @@ def _names(folder: Path | str, stage: str, key: str) -> tuple[Path, Path]:
 
 
 def save_stage(
-    folder: Path | str, stage: str, key: str, arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]
+    folder: Path | str,
+    stage: str,
+    key: str,
+    arrays: Mapping[str, np.ndarray],
+    meta: Mapping[str, Any],
+    *,
+    scratch: Scratch | None = None,
 ) -> None:
     """Keep the result of a stage; older results beyond the last two are removed.
 
@@ -51,6 +196,7 @@ def save_stage(
         stage, key: letters, digits, `-` and `_`.
         arrays: any number of arrays of numbers.
         meta: plain data (what JSON can hold; arrays become lists, inf and nan null).
+        scratch: where some of the arrays lie already; the rest of it is removed.
 
     Raises:
         InputRejected: the disk is full or may not be written.
@@ -60,15 +206,32 @@ def save_stage(
         require(np.asarray(array).dtype.kind in "fiubcU", f"array '{name}' of {np.asarray(array).dtype}", "numbers")
     mark_work_folder(folder)
     facts.unlink(missing_ok=True)
+    mapped = {} if scratch is None else {n: p for n in arrays if (p := scratch.path_of(n)) is not None}
     with atomic_write(data) as file:
-        np.savez(file, **{f"{name}.": array for name, array in arrays.items()})
+        np.savez(file, **{f"{name}.": array for name, array in arrays.items() if name not in mapped})
+    with disk_errors(folder):
+        for name, path in mapped.items():
+            made = arrays[name]
+            if isinstance(made, np.memmap):
+                made.flush()
+            os.replace(path, _mapped(data, name))
+    if scratch is not None:
+        scratch.discard()
     shapes = {name: [list(np.shape(a)), np.asarray(a).dtype.str] for name, a in arrays.items()}
-    write_json(facts, {"stage": stage, "key": key, "arrays": shapes, "meta": plain(meta)})
+    write_json(facts, {"stage": stage, "key": key, "arrays": shapes, "mapped": sorted(mapped), "meta": plain(meta)})
     _forget_old(data.parent, key)
 
 
+def _mapped(data: Path, name: str) -> Path:
+    """The file of an array that is mapped."""
+    return data.with_name(f"{data.stem}.{name}.npy")
+
+
 def load_stage(folder: Path | str, stage: str, key: str) -> tuple[dict[str, np.ndarray], dict[str, Any]] | None:
-    """Arrays and meta of a stage, or None where there are none or they are damaged."""
+    """Arrays and meta of a stage, or None where there are none or they are damaged.
+
+    Arrays in files of their own come mapped, copied where they are written to.
+    """
     data, facts = _names(folder, stage, key)
     if not (data.is_file() and facts.is_file()) or data.is_symlink() or facts.is_symlink():
         return None
@@ -76,6 +239,11 @@ def load_stage(folder: Path | str, stage: str, key: str) -> tuple[dict[str, np.n
         known = json.loads(facts.read_text(encoding="utf-8"))
         with np.load(data, allow_pickle=False) as archive:
             arrays = {name.removesuffix("."): archive[name] for name in archive.files}
+        for name in known.get("mapped", ()):
+            path = _mapped(data, name)
+            if path.is_symlink() or not re.fullmatch(r"[A-Za-z0-9_-]{1,64}", name):
+                return None
+            arrays[name] = np.load(path, mmap_mode="c", allow_pickle=False)
         shapes = {name: [list(a.shape), a.dtype.str] for name, a in arrays.items()}
         if known["key"] != key or known["stage"] != stage or known["arrays"] != shapes:
             return None
@@ -111,3 +279,5 @@ def _forget_old(place: Path, key: str) -> None:
     for facts in others[_KEPT - 1 :]:
         facts.unlink(missing_ok=True)
         facts.with_suffix(".npz").unlink(missing_ok=True)
+        for mapped in place.glob(f"{facts.stem}.*.npy"):
+            mapped.unlink(missing_ok=True)

@@ -11,6 +11,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from fractions import Fraction
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ import av
 import numpy as np
 
 from fluidlift.errors import InputRejected, require
+from fluidlift.io.collect import MIN_SIDE, Collector, FrameStore, Wanted, is_variable
 from fluidlift.io.decode import (
     Notes,
     decode_frames,
@@ -28,15 +30,13 @@ from fluidlift.io.decode import (
     quarter_turns,
 )
 from fluidlift.io.encode import write_video
+from fluidlift.io.interlace import first_field, is_combed
 from fluidlift.io.limits import ReadLimits
-from fluidlift.io.pictures import eight_bit, fitted_size, read_picture, resample_with_alpha, same_shape
+from fluidlift.io.pictures import eight_bit, read_picture
 from fluidlift.io.sequences import is_sequence, list_sequence
 from fluidlift.types import VideoClip
 
-__all__ = ["ClipInfo", "ReadLimits", "probe", "read_clip", "write_video"]
-
-MIN_SIDE = 16
-"""px; below it nothing can be seen to move"""
+__all__ = ["ClipInfo", "ReadLimits", "frames_before", "probe", "read_clip", "write_video"]
 
 
 def read_clip(
@@ -47,6 +47,7 @@ def read_clip(
     max_size: int = 512,
     fps: float | None = None,
     limits: ReadLimits | None = None,
+    store: FrameStore | None = None,
 ) -> VideoClip:
     """Decode a clip, scaled down so that its long side has at most `max_size` px (area average).
 
@@ -57,6 +58,8 @@ def read_clip(
         max_size: px.
         fps: frames per second of pictures. Not used for videos, which have their own times.
         limits: on frame size, number of frames and memory.
+        store: where frames and alpha are collected, under the names decoded and alpha; None: in memory. In a store, the
+            limit on memory does not count.
 
     Returns:
         A clip whose `times` count from the first frame of the file.
@@ -71,7 +74,8 @@ def read_clip(
         raise InputRejected(f"a duration of {duration} s", "more than 0 seconds", "change --duration")
     require(max_size >= MIN_SIDE, f"max_size {max_size}", f"at least {MIN_SIDE} px")
     path, notes = Path(path), Notes()
-    collector = _Collector(path.name, start, duration, max_size, limits, notes)
+    wanted = Wanted(path.name, start, math.inf if duration is None else start + duration, max_size)
+    collector = Collector(wanted, limits, notes, store)
     if is_sequence(path):
         _read_sequence(path, fps, limits, collector, notes)
     else:
@@ -81,111 +85,35 @@ def read_clip(
     return collector.clip()
 
 
-class _Collector:
-    """Keeps the wanted frames, small; everything else passes by."""
+INTERLACED_HEIGHT = 1088
+"""px: interlaced formats have at most so many rows (1080, in whole blocks); taller videos are not looked at"""
+LOOKED_AT = 12
+"""frames at the beginning of which combing is looked for"""
+COMBED_NOTE = (
+    "the video is interlaced (two instants in each frame): the rows of the first one are used; a deinterlaced copy "
+    "(ffmpeg -vf bwdif) has finer pictures"
+)
 
-    def __init__(
-        self, name: str, start: float, duration: float | None, max_size: int, limits: ReadLimits, notes: Notes
-    ) -> None:
-        self.name, self.start, self.limits, self.notes = name, start, limits, notes
-        self.end = math.inf if duration is None else start + duration
-        self.max_size = max_size
-        self.frames: list[np.ndarray] = []
-        self.alphas: list[np.ndarray] = []
-        self.times: list[float] = []
-        self.last_seen = -math.inf
-        self.size: tuple[int, int] | None = None
-        self.repeated = 0
 
-    def wants(self, time: float) -> bool:
-        """Whether the frame at `time` (s) is to be kept. Half a microsecond absorbs the rounding of time stamps."""
-        if time <= self.last_seen:
-            self.notes.add("frames with times that do not increase were left out")
+def _is_interlaced(path: Path, limits: ReadLimits, start: float) -> bool:
+    """Whether the first frames from `start` (s) on are combed; what the file says of itself is often wrong."""
+    with open_video(path, limits) as (container, stream):
+        if stream.codec_context.height > INTERLACED_HEIGHT:
             return False
-        self.last_seen = time
-        return self.start - 5e-7 <= time < self.end - 5e-7
-
-    def add(self, time: float, rgb: np.ndarray, alpha: np.ndarray | None, shape: tuple[int, int]) -> None:
-        """Keep a frame; `shape` is its size (width, height) with square pixels."""
-        if self.size is None:
-            self.size = fitted_size(shape, self.max_size)
-            if min(self.size) < MIN_SIDE:
-                raise InputRejected(f"the frames of '{self.name}' are {shape[0]} x {shape[1]} px", f"{MIN_SIDE} px")
-        elif not same_shape(shape, self.size):
-            self.notes.add("the frame size changes inside the clip; later frames were stretched to the first size")
-        self._require_room()
-        rgb, alpha = resample_with_alpha(rgb, alpha, self.size)
-        self.repeated += bool(self.frames) and np.array_equal(rgb, self.frames[-1])
-        self.frames.append(rgb)
-        self.times.append(time)
-        if alpha is not None:
-            self.alphas.append(alpha)
-
-    def _require_room(self) -> None:
-        n = len(self.frames) + 1
-        advice = "cut the clip with --start and --duration"
-        if n > self.limits.max_frames:
-            raise InputRejected(
-                f"'{self.name}' has more than {self.limits.max_frames} frames",
-                f"at most {self.limits.max_frames} frames",
-                f"{advice}, or raise the limit with --max-frames",
-            )
-        if n * self.size[0] * self.size[1] * 4 > self.limits.max_bytes:
-            raise InputRejected(
-                f"the frames of '{self.name}' need more than {self.limits.max_bytes / 1e6:.0f} MB",
-                "less",
-                f"{advice}, lower --max-size, or raise the limit with --max-bytes",
-            )
-
-    def clip(self) -> VideoClip:
-        """All that was kept."""
-        if self.start > 0 and self.last_seen < self.start:
-            last = f" (last frame at {self.last_seen:.3f} s)" if math.isfinite(self.last_seen) else ""
-            raise InputRejected(
-                f"a start of {self.start:g} s, past the end of '{self.name}'{last}",
-                "a start inside the clip",
-                "lower --start",
-            )
-        if len(self.frames) < 2:
-            found = "no frame" if not self.frames else "only one frame"
-            raise InputRejected(
-                f"{found} that decodes in '{self.name}' between {self.start:g} s and "
-                + ("its end" if math.isinf(self.end) else f"{self.end:g} s"),
-                "at least two frames, because motion is measured between frames",
-                "give a longer clip, or change --start and --duration",
-            )
-        times = np.asarray(self.times, np.float64)
-        if _is_variable(times):
-            steps = np.diff(times)
-            self.notes.add(
-                f"variable frame rate: {1000 * steps.min():.1f} to {1000 * steps.max():.1f} ms between frames; "
-                "the real times are used"
-            )
-        if self.repeated:
-            self.notes.add(f"{self.repeated} of {len(times)} frames repeat the one before (a converted frame rate?)")
-        alpha = self._stacked(self.alphas) if len(self.alphas) == len(times) else None
-        if alpha is not None and int(alpha.min()) == 255:
-            alpha = None  # an alpha channel that hides nothing says nothing
-        return VideoClip(self._stacked(self.frames), times, self.name, alpha, tuple(self.notes.lines))
-
-    @staticmethod
-    def _stacked(pictures: list[np.ndarray]) -> np.ndarray:
-        """One array; each picture is let go as soon as it is copied, so that memory is not needed twice."""
-        out = np.empty((len(pictures), *pictures[0].shape), np.uint8)
-        for i in range(len(pictures)):
-            out[i], pictures[i] = pictures[i], None
-        return out
+        if start > 10.0 and stream.time_base:
+            with contextlib.suppress(av.error.FFmpegError):
+                container.seek(int(start / stream.time_base) + (stream.start_time or 0), stream=stream)
+        frames = islice(decode_frames(container, stream, limits, Notes()), LOOKED_AT)
+        first = next(frames, None)
+        if first is None or quarter_turns(first[1], Notes()) % 2 or has_alpha(first[1]):
+            return False
+        return bool(is_combed(picture_of(frame, Notes())[0] for _, frame in chain([first], frames)))
 
 
-def _is_variable(times: np.ndarray) -> bool:
-    """Steps that differ by more than the rounding of time stamps to milliseconds explains."""
-    if len(times) < 3:
-        return False
-    steps = np.diff(times)
-    return bool(steps.max() - steps.min() > max(0.1 * np.median(steps), 0.0021))
-
-
-def _read_video(path: Path, limits: ReadLimits, collector: _Collector, notes: Notes) -> None:
+def _read_video(path: Path, limits: ReadLimits, collector: Collector, notes: Notes) -> None:
+    combed = _is_interlaced(path, limits, collector.start)
+    if combed:
+        notes.add(COMBED_NOTE)
     with open_video(path, limits) as (container, stream):
         rate = stream.average_rate or stream.guessed_rate
         origin = None if stream.start_time is None else stream.start_time * stream.time_base
@@ -204,7 +132,8 @@ def _read_video(path: Path, limits: ReadLimits, collector: _Collector, notes: No
                 break
             if collector.wants(seconds):
                 rgb, alpha = picture_of(frame, notes)
-                collector.add(seconds, rgb, alpha, _square(rgb, _pixel_aspect(stream), quarter_turns(frame, notes)))
+                shape = _square(rgb, _pixel_aspect(stream), quarter_turns(frame, notes))
+                collector.add(seconds, first_field(rgb) if combed else rgb, alpha, shape)
 
 
 def _pixel_aspect(stream: av.VideoStream) -> Fraction:
@@ -221,7 +150,7 @@ def _square(rgb: np.ndarray, aspect: Fraction, turns: int) -> tuple[int, int]:
     return round(width * aspect), height
 
 
-def _read_sequence(path: Path, fps: float | None, limits: ReadLimits, collector: _Collector, notes: Notes) -> None:
+def _read_sequence(path: Path, fps: float | None, limits: ReadLimits, collector: Collector, notes: Notes) -> None:
     files = list_sequence(path)
     if fps is None:
         raise InputRejected(f"pictures ('{path.name}') without a frame rate", "frames per second", "give --fps 25")
@@ -288,12 +217,14 @@ def probe(path: Path | str, *, fps: float | None = None, limits: ReadLimits | No
         alpha = has_alpha(first) or stream.metadata.get("alpha_mode") == "1"
         info = {"pixel_format": first.format.name, "hdr": is_hdr(first), "alpha": alpha, "rotation": 90 * turns}
         size = _square(rgb, aspect, turns)
+    if _is_interlaced(path, limits, 0.0):
+        notes.add(COMBED_NOTE)
     with open_video(path, limits) as (container, stream):  # again from the start: seeking is not always possible
         times = sorted({float(p.pts * p.time_base) for p in _packets(container, stream, notes) if p.pts is not None})
         rate = stream.average_rate or stream.guessed_rate
     steps = np.diff(times)
     step = float(np.median(steps)) if len(steps) else (float(1 / rate) if rate else 0.0)
-    variable = _is_variable(np.asarray(times))
+    variable = is_variable(np.asarray(times))
     if variable:
         notes.add(f"variable frame rate: {1000 * steps.min():.1f} to {1000 * steps.max():.1f} ms between frames")
     if len(times) < 2:
@@ -309,6 +240,26 @@ def probe(path: Path | str, *, fps: float | None = None, limits: ReadLimits | No
         warnings=tuple(notes.lines),
         **info,
     )
+
+
+def frames_before(path: Path | str, start: float, fps: float, limits: ReadLimits | None = None) -> int:
+    """Number of frames of a clip before `start` (s), by their time stamps alone.
+
+    Args:
+        path: as in `read_clip`.
+        start: s from the first frame.
+        fps: frames per second of pictures.
+        limits: as in `read_clip`.
+    """
+    path = Path(path)
+    if is_sequence(path):
+        numbers = [number for number, _ in list_sequence(path)]
+        times = [(number - numbers[0]) / fps for number in numbers]
+    else:
+        with open_video(path, limits or ReadLimits()) as (container, stream):
+            stamps = {float(p.pts * p.time_base) for p in _packets(container, stream, Notes()) if p.pts is not None}
+        times = [stamp - min(stamps) for stamp in stamps]
+    return sum(time < start - 5e-7 for time in times)
 
 
 def _packets(container: av.container.InputContainer, stream: av.VideoStream, notes: Notes) -> Iterator[av.Packet]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import UInt8
 
-from fluidlift.motion.volume import weighted_projection
+from fluidlift.motion.volume_projection import weighted_projection
 from fluidlift.physics.pressure import build_system
 from fluidlift.types import CellType, FaceVelocity, Grid, SolveReport, Terrain
 

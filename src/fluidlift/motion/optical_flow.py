@@ -1,34 +1,34 @@
-"""Optical flow between neighbouring frames (paper: V_2D), how far to trust it, and its mean over steady motion.
+"""Optical flow between neighbouring frames (paper: V_2D): the estimators, and the one door to all of them.
 
-Flow fails where the picture is smooth: it then returns something near zero, or what its smoothness term makes up.
-Two tests, both soft, find such places without any knowledge of the scene: following the flow forward and then
-backward must lead home (Sundaram, Brox, Keutzer 2010), and there must be texture to follow in every direction
-(smaller eigenvalue of the structure tensor; Shi, Tomasi 1994).
+What several frames say together is in `motion.multiframe`, how far flow is trusted in `motion.confidence`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from typing import Any
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from fluidlift.errors import require
+from fluidlift.motion.confidence import flow_confidence, grey, texture_strength
+from fluidlift.motion.multiframe import Progress, mean_flow, multiframe_flow, running_window
 from fluidlift.seams import FlowEstimator
 from fluidlift.types import PixelFlow
 
-Progress = Callable[[int, int], None]
-"""called with (steps done, steps in all)"""
-
-ROUND_TRIP_FLOOR = 0.3
-"""px: forward-backward error that even good flow shows (noise, compression)"""
-ROUND_TRIP_SHARE = 0.2
-"""part of the motion by which forward and backward flow may disagree: a fluid deforms within a frame"""
-TEXTURE_FLOOR = 1.5
-"""grey levels per px: gradients of this size are compression and camera noise"""
-TEXTURE_WINDOW = 15
-"""px, side of the window in which texture is gathered; about the patch that the estimators look at"""
+__all__ = [
+    "ESTIMATORS",
+    "METHODS",
+    "DenseInverseSearch",
+    "Farneback",
+    "estimate_flow",
+    "flow_confidence",
+    "flow_of_pair",
+    "flow_picture",
+    "mean_flow",
+    "texture_strength",
+]
 
 
 class DenseInverseSearch(FlowEstimator):
@@ -39,13 +39,14 @@ class DenseInverseSearch(FlowEstimator):
     """
 
     def __init__(self) -> None:
-        self._algorithm = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        self._algorithm = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
         self._algorithm.setFinestScale(0)
         self._algorithm.setPatchStride(3)
 
     def displacement(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
         """float32 [H,W,2], px: where each pixel of `first` (u8 [H,W,3] or grey [H,W]) went in `second`."""
-        return self._algorithm.calc(_grey(first), _grey(second), None)
+        nothing: Any = None  # an array would be taken for a first guess
+        return self._algorithm.calc(grey(first), grey(second), nothing)
 
 
 class Farneback(FlowEstimator):
@@ -53,26 +54,31 @@ class Farneback(FlowEstimator):
 
     def displacement(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
         """float32 [H,W,2], px: where each pixel of `first` (u8 [H,W,3] or grey [H,W]) went in `second`."""
-        return cv2.calcOpticalFlowFarneback(
-            _grey(first), _grey(second), None, 0.5, 5, 21, 5, 5, 1.1, cv2.OPTFLOW_FARNEBACK_GAUSSIAN
-        )
+        a, b = grey(first), grey(second)
+        room = np.empty((*a.shape, 2), np.float32)
+        return cv2.calcOpticalFlowFarneback(a, b, room, 0.5, 5, 21, 5, 5, 1.1, cv2.OPTFLOW_FARNEBACK_GAUSSIAN)
 
 
 ESTIMATORS: dict[str, type[FlowEstimator]] = {"dis": DenseInverseSearch, "farneback": Farneback}
+"""of single pairs"""
+METHODS = ("multiframe", *ESTIMATORS)
+"""names that `estimate_flow` knows"""
 
 
 def estimate_flow(
     frames: UInt8[np.ndarray, "t h w 3"],
     *,
-    method: str | FlowEstimator = "dis",
+    method: str | FlowEstimator = "multiframe",
     progress: Progress | None = None,
 ) -> PixelFlow:
     """Forward flow of every neighbouring pair with its confidence.
 
     Args:
-        frames: sRGB.
-        method: "dis", "farneback", or an estimator of one's own.
-        progress: called after each pair.
+        frames: sRGB; may be memory-mapped, a few are read at a time.
+        method: "multiframe" (dense inverse search on what moves, see `motion.multiframe`), "dis" or "farneback" on the
+            pictures as they are, or an estimator of one's own. A clip too short for a running mean is measured as it
+            is.
+        progress: called with (steps done, steps in all).
 
     Returns:
         displacement float32 [T-1,H,W,2] px/frame, confidence float16 [T-1,H,W]. Beyond the result, memory is that of
@@ -81,118 +87,34 @@ def estimate_flow(
     Raises:
         ValueError: fewer than two frames, frames of the wrong type, or an unknown method.
     """
-    frames = np.asarray(frames)
+    frames = np.asanyarray(frames)
     require(
         frames.ndim == 4 and frames.shape[-1] == 3 and frames.dtype == np.uint8,
         f"frames {frames.shape} {frames.dtype}",
         "u8 [T,H,W,3]",
     )
     require(len(frames) >= 2, f"{len(frames)} frame", "at least two")
-    if isinstance(method, FlowEstimator):
-        estimator = method
-    else:
-        require(method in ESTIMATORS, f"flow method '{method}'", "one of " + ", ".join(ESTIMATORS))
-        estimator = ESTIMATORS[method]()
+    if not isinstance(method, FlowEstimator):
+        require(method in METHODS, f"flow method '{method}'", "one of " + ", ".join(METHODS))
+    estimator = method if isinstance(method, FlowEstimator) else ESTIMATORS.get(method, DenseInverseSearch)()
+    if method == "multiframe" and running_window(0, len(frames)) is not None:
+        return multiframe_flow(frames, estimator, progress)
     pairs, (h, w) = len(frames) - 1, frames.shape[1:3]
     displacement = np.empty((pairs, h, w, 2), np.float32)
     confidence = np.empty((pairs, h, w), np.float16)
     for t in range(pairs):
-        forward = estimator.displacement(frames[t], frames[t + 1])
-        backward = estimator.displacement(frames[t + 1], frames[t])
-        displacement[t] = np.nan_to_num(forward, nan=0.0, posinf=0.0, neginf=0.0)
-        confidence[t] = flow_confidence(frames[t], displacement[t], backward)
+        displacement[t], confidence[t] = flow_of_pair(frames[t], frames[t + 1], estimator)
         if progress is not None:
             progress(t + 1, pairs)
     return PixelFlow(displacement, confidence)
 
 
-def flow_confidence(
-    first: UInt8[np.ndarray, "h w 3"],
-    forward: Float[np.ndarray, "h w 2"],
-    backward: Float[np.ndarray, "h w 2"],
-) -> Float[np.ndarray, "h w"]:
-    """Trust in `forward`, float32 from 0 (failed) to 1.
-
-    The product of two terms of the form 1 / (1 + error^2 / tolerance^2): the round trip error against a tolerance
-    that grows with the motion, and noise against the texture at hand. Flow that leaves the picture has confidence 0.
-    """
-    h, w = forward.shape[:2]
-    u, v = np.meshgrid(np.arange(w, dtype=np.float32), np.arange(h, dtype=np.float32))
-    u, v = u + forward[..., 0], v + forward[..., 1]
-    back = cv2.remap(np.ascontiguousarray(backward), u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    error = ((forward + back) ** 2).sum(axis=-1)
-    tolerance = ROUND_TRIP_FLOOR**2 + ROUND_TRIP_SHARE**2 * (forward**2).sum(axis=-1)
-    texture = texture_strength(first) ** 2
-    inside = (u >= -0.5) & (u <= w - 0.5) & (v >= -0.5) & (v <= h - 0.5)
-    return (inside * tolerance / (tolerance + error) * texture / (texture + TEXTURE_FLOOR**2)).astype(np.float32)
-
-
-def texture_strength(image: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w"]:
-    """Root mean square gradient in the direction with least texture, grey levels per px, float32.
-
-    It is the root of the smaller eigenvalue of the structure tensor over `TEXTURE_WINDOW`; an edge without texture
-    along it counts as nothing (aperture problem).
-    """
-    grey = cv2.GaussianBlur(_grey(image), (0, 0), 1.0).astype(np.float32)
-    gx = cv2.Scharr(grey, cv2.CV_32F, 1, 0, scale=1 / 32)
-    gy = cv2.Scharr(grey, cv2.CV_32F, 0, 1, scale=1 / 32)
-    side = (TEXTURE_WINDOW, TEXTURE_WINDOW)
-    xx, yy, xy = (cv2.boxFilter(p, cv2.CV_32F, side) for p in (gx * gx, gy * gy, gx * gy))
-    smaller = 0.5 * (xx + yy - np.sqrt((xx - yy) ** 2 + 4 * xy**2))
-    return np.sqrt(np.maximum(smaller, 0.0))
-
-
-def mean_flow(
-    flow: PixelFlow,
-    mask: Bool[np.ndarray, "*t h w"] | None = None,
-    *,
-    trim: float = 2.5,
-    evidence: float = 0.5,
+def flow_of_pair(
+    first: UInt8[np.ndarray, "h w 3"], second: UInt8[np.ndarray, "h w 3"], estimator: FlowEstimator
 ) -> tuple[Float[np.ndarray, "h w 2"], Float[np.ndarray, "h w"]]:
-    """The mean motion of a steady fluid over all pairs of `flow`, robust against failures of single frames.
-
-    The mean at a pixel is weighted with confidence; then frames further than `trim` times the pixel's own spread from
-    it are left out, and the mean is taken once more. Spread, and not a fixed distance, decides: real fluctuation
-    widens the spread and stays in, so a turbulent mean is not dragged to its mode.
-
-    Args:
-        flow: the window of frames.
-        mask: the fluid [H,W] or [T',H,W] with T' at least the number of pairs; where absent the pixel counts nothing.
-        trim: in standard deviations.
-        evidence: sum of confidences at which the mean deserves a confidence of one half. A pixel that is textured in
-            a few frames only, as foam passes, is known from those frames.
-
-    Returns:
-        displacement float32 [H,W,2] px/frame and confidence float32 [H,W]: that of the frames which count, lowered
-        where they add up to little evidence and where the standard error of the mean is large.
-    """
-    d = flow.displacement
-    weight = flow.confidence.astype(np.float32)
-    if mask is not None:
-        mask = np.asarray(mask, bool)
-        weight = weight * (mask[: len(d)] if mask.ndim == 3 else mask[None])
-    # failures are many and alike (near zero motion): squaring keeps a crowd of them from outvoting good frames
-    weight **= 2
-    mean = _weighted_mean(d, weight)
-    for _ in range(2):
-        distance = ((d - mean) ** 2).sum(axis=-1)
-        total = np.maximum(weight.sum(axis=0), 1e-6)
-        spread = (weight * distance).sum(axis=0) / total
-        kept = np.where(distance <= trim**2 * np.maximum(spread, 0.05**2), weight, 0.0)
-        mean = _weighted_mean(d, kept)
-    total = kept.sum(axis=0)
-    held = np.maximum(total, 1e-6)
-    typical = (kept * flow.confidence).sum(axis=0) / held
-    deviation = (kept * ((d - mean) ** 2).sum(axis=-1)).sum(axis=0) / held
-    frames = total**2 / np.maximum((kept**2).sum(axis=0), 1e-6)
-    tolerance = ROUND_TRIP_FLOOR**2 + ROUND_TRIP_SHARE**2 * (mean**2).sum(axis=-1)
-    certain = tolerance / (tolerance + deviation / np.maximum(frames, 1.0))
-    return mean, (typical * certain * total / (total + evidence**2)).astype(np.float32)
-
-
-def _weighted_mean(d: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    total = np.maximum(weight.sum(axis=0), 1e-6)
-    return np.stack([(weight * d[..., c]).sum(axis=0) / total for c in (0, 1)], axis=-1).astype(np.float32)
+    """Displacement (px, values that are not finite put to 0) and confidence between two pictures as they are."""
+    forward = np.nan_to_num(estimator.displacement(first, second), nan=0.0, posinf=0.0, neginf=0.0)
+    return forward, flow_confidence(first, forward, estimator.displacement(second, first))
 
 
 def flow_picture(
@@ -219,7 +141,3 @@ def flow_picture(
     if mask is not None:
         picture[~np.asarray(mask, bool)] = 96
     return picture
-
-
-def _grey(image: np.ndarray) -> np.ndarray:
-    return image if image.ndim == 2 else cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY)

@@ -7,6 +7,7 @@ that fills most of the picture does not pass for the camera.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -14,6 +15,7 @@ import cv2
 import numpy as np
 
 from fluidlift.errors import require
+from fluidlift.motion.align import refined_similarity
 from fluidlift.types.clip import VideoClip
 
 GRID = (8, 6)
@@ -28,6 +30,9 @@ HYPOTHESES = 3
 """motions tried, each among the features that the ones before left over"""
 LEAST_CELLS = 6
 """cells of the grid that must agree on the motion of the camera"""
+LEAST_FIT = 0.5
+"""part of the textured pixels that must agree with a motion refined on all pixels: where the fluid has more than half
+of them, those that fit by chance pull it off by some tenths of a pixel, and features do better"""
 LEAST_AGREEMENT = 0.35
 """part of the features found again that must agree on some motion, whichever it is"""
 LEAST_ALTERNATIVE = 0.2
@@ -49,12 +54,31 @@ class ShakeReport:
     warnings: tuple[str, ...] = ()
 
 
-def stabilise(clip: VideoClip, *, max_correction_px: float | None = None) -> tuple[VideoClip, ShakeReport]:
+class GreyFrames(Sequence[np.ndarray]):
+    """The frames u8 [T,H,W,3] of a clip in grey, made when they are asked for: a long clip never lies in memory."""
+
+    def __init__(self, frames: np.ndarray, first: int = 0, last: int | None = None) -> None:
+        self.frames, self.first = frames, first
+        self.last = len(frames) if last is None else last
+
+    def __len__(self) -> int:
+        return self.last - self.first
+
+    def __getitem__(self, index):
+        if not 0 <= index < len(self):
+            raise IndexError(index)
+        return cv2.cvtColor(np.ascontiguousarray(self.frames[self.first + index]), cv2.COLOR_RGB2GRAY)
+
+
+def stabilise(
+    clip: VideoClip, *, max_correction_px: float | None = None, out: np.ndarray | None = None
+) -> tuple[VideoClip, ShakeReport]:
     """The clip as from a camera that stands still, and how the camera moved.
 
     Args:
-        clip: any number of frames.
+        clip: any number of frames; they are read one after the other and may lie in a file.
         max_correction_px: a larger motion is reported but not corrected; default 4% of the longer side.
+        out: u8 [T,H,W,3], where steady frames are written if there are any (such as a memory map); None: a new array.
 
     Returns:
         The same clip when nothing was to mend, or nothing could be.
@@ -62,7 +86,7 @@ def stabilise(clip: VideoClip, *, max_correction_px: float | None = None) -> tup
     width, height = clip.size
     limit = 0.04 * max(width, height) if max_correction_px is None else max_correction_px
     require(limit > 0, f"max_correction_px {limit}", "above 0")
-    cuts = find_cuts([cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in clip.frames])
+    cuts = find_cuts(GreyFrames(clip.frames))
     warnings = [f"the clip is cut at frame {cut}: use one shot" for cut in cuts]
     motions, blind = motions_of_shots(clip.frames, cuts, limit)
     if blind:
@@ -73,7 +97,7 @@ def stabilise(clip: VideoClip, *, max_correction_px: float | None = None) -> tup
     if strong:
         warnings.append(f"the camera moves by up to {max(shake, drift):.1f} px: use a clip from a tripod")
     if restless and not strong:
-        steady = warp_back(clip, motions)
+        steady = warp_back(clip, motions, out)
         left, _ = shake_and_drift(motions_of_shots(steady.frames, cuts, limit)[0], width, height, cuts)
         if left < max(MENDED * shake, STEADY_PX):
             return steady, ShakeReport(shake, drift, True, cuts, tuple(warnings))
@@ -83,11 +107,10 @@ def stabilise(clip: VideoClip, *, max_correction_px: float | None = None) -> tup
 
 def motions_of_shots(frames: np.ndarray, cuts: tuple[int, ...], limit: float) -> tuple[np.ndarray, int]:
     """Similarities [T,2,3], frame from the reference of its shot, and in how many frames none could be found."""
-    grey = [cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in frames]
-    motions = np.tile(np.eye(2, 3), (len(grey), 1, 1))
+    motions = np.tile(np.eye(2, 3), (len(frames), 1, 1))
     blind = 0
-    for start, stop in zip((0, *cuts), (*cuts, len(grey))):
-        found = camera_motion(grey[start:stop], limit=4.0 * limit)
+    for start, stop in zip((0, *cuts), (*cuts, len(frames))):
+        found = camera_motion(GreyFrames(frames, start, stop), limit=4.0 * limit)
         if found is None:
             blind += stop - start
         else:
@@ -95,7 +118,7 @@ def motions_of_shots(frames: np.ndarray, cuts: tuple[int, ...], limit: float) ->
     return motions, blind
 
 
-def find_cuts(grey: list[np.ndarray], *, least: float = 0.45) -> tuple[int, ...]:
+def find_cuts(grey: Sequence[np.ndarray], *, least: float = 0.45) -> tuple[int, ...]:
     """First frames of new shots, from u8 [H,W] pictures.
 
     Two pictures differ by as much as the correlation of their layouts (32 x 18 px, so brightness and contrast do not
@@ -148,13 +171,14 @@ def spread_features(picture: np.ndarray, *, per_cell: int = 8) -> np.ndarray:
     return np.concatenate(found) if found else np.zeros((0, 1, 2), np.float32)
 
 
-def camera_motion(grey: list[np.ndarray], *, limit: float) -> np.ndarray | None:
+def camera_motion(grey: Sequence[np.ndarray], *, limit: float) -> np.ndarray | None:
     """Similarities [T,2,3], frame from reference (the middle frame), or None where there is too little to go by."""
     middle = len(grey) // 2
-    features = spread_features(grey[middle])
+    reference = grey[middle]
+    features = spread_features(reference)
     if len(features) < 4 * LEAST_CELLS:
         return None
-    height, width = grey[middle].shape
+    height, width = reference.shape
     places = features[:, 0] * np.array(GRID, np.float32) / np.array([width, height], np.float32)
     columns, rows = places.astype(int).T
     cells = rows * GRID[0] + columns
@@ -163,13 +187,27 @@ def camera_motion(grey: list[np.ndarray], *, limit: float) -> np.ndarray | None:
     for order in (range(middle + 1, len(grey)), range(middle - 1, -1, -1)):
         last = np.eye(2, 3)
         for t in order:
-            found = similarity_to(grey[middle], grey[t], features, cells, last, limit)
-            if found is None:
-                weak += 1
-            else:
-                last = found
+            picture = grey[t]
+            found = similarity_to(reference, picture, features, cells, last, limit)
+            weak += found is None
+            last = _settled(reference, picture, last if found is None else found, last)
             motions[t] = last
     return None if weak > 0.5 * (len(grey) - 1) else motions
+
+
+def _settled(reference: np.ndarray, picture: np.ndarray, found: np.ndarray, last: np.ndarray) -> np.ndarray:
+    """The similarity refined on all pixels, from the features' guess or from the frame before, whichever fits more.
+
+    Where too little of the picture agrees with either to be refined by it, the better guess stays as it is.
+    """
+    best, most = found, LEAST_FIT
+    for guess in (found, last):
+        refined, fit, cells = refined_similarity(reference, picture, guess)
+        if cells >= LEAST_CELLS and fit > most:
+            best, most = refined, fit
+    if most > LEAST_FIT:
+        return best
+    return max((found, last), key=lambda guess: refined_similarity(reference, picture, guess, iterations=1)[1])
 
 
 def similarity_to(
@@ -229,10 +267,12 @@ def shake_and_drift(motions: np.ndarray, width: int, height: int, cuts: tuple[in
     return shake, float(np.linalg.norm(moved, axis=-1).mean(axis=-1).max())
 
 
-def warp_back(clip: VideoClip, motions: np.ndarray) -> VideoClip:
+def warp_back(clip: VideoClip, motions: np.ndarray, out: np.ndarray | None = None) -> VideoClip:
     """The clip with every frame carried back to its reference; what comes in from outside repeats the rim."""
     options = {"flags": cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP, "borderMode": cv2.BORDER_REPLICATE}
-    frames = np.stack([cv2.warpAffine(f, m, clip.size, **options) for f, m in zip(clip.frames, motions)])
+    frames = np.empty(clip.frames.shape, np.uint8) if out is None else out
+    for t, motion in enumerate(motions):
+        frames[t] = cv2.warpAffine(clip.frames[t], motion, clip.size, **options)
     alpha = clip.alpha
     if alpha is not None:
         alpha = np.stack([cv2.warpAffine(a, m, clip.size, **options) for a, m in zip(alpha, motions)])

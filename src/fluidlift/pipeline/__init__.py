@@ -1,21 +1,28 @@
 """The story: the only place that knows the order of the stages."""
 
 from fluidlift.pipeline.make import STAGES, make
+from fluidlift.pipeline.mask_files import find_masks
+from fluidlift.pipeline.motion_files import MotionFiles, measure_motion
+from fluidlift.pipeline.reading import Inputs
 from fluidlift.pipeline.refit import Refitted, refit
 from fluidlift.pipeline.resimulate import Made, resimulate
 from fluidlift.pipeline.scene import SimulationRequest
-from fluidlift.pipeline.seeing import Inputs
+from fluidlift.pipeline.seeing import Hints
 from fluidlift.pipeline.story import Progress, Silence
 
 __all__ = [
     "STAGES",
+    "Hints",
     "Inputs",
     "Made",
+    "MotionFiles",
     "Progress",
     "Refitted",
     "Silence",
     "SimulationRequest",
+    "find_masks",
     "make",
+    "measure_motion",
     "refit",
     "resimulate",
 ]

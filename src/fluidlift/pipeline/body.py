@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected
-from fluidlift.pipeline.seeing import Inputs, clip_of, flow_of, labels_of
+from fluidlift.io.stage_cache import parts_of
+from fluidlift.pipeline.reading import Inputs, clip_of
+from fluidlift.pipeline.seeing import masks_of, mean_motion
 from fluidlift.pipeline.story import Result, Story
 from fluidlift.shape import generate, given, place, surface, terrain
 from fluidlift.shape import kind as kinds
@@ -33,27 +35,23 @@ USUAL_FIELD_OF_VIEW = 50.0
 """degrees across the longer side, where nothing says better: between a phone's main lens (65) and a short telephoto"""
 
 
-def rest_frame(fluid: np.ndarray) -> int:
-    """First frame in which a good part of the fluid is there (smoke and pours begin with nothing)."""
-    area = fluid.sum(axis=(1, 2)).astype(float)
+def rest_frame(area: np.ndarray) -> int:
+    """First frame in which a good part of the fluid is there (smoke and pours begin with nothing), of areas [T]."""
     enough = area >= 0.3 * np.percentile(area, 90)
     return int(np.argmax(enough)) if enough.any() else int(np.argmax(area))
 
 
 def geometry(story: Story, inputs: Inputs, config: JobConfig) -> Result:
     """Kind, camera, front surface, scale, terrain, cells."""
-    from fluidlift.motion.optical_flow import mean_flow
     from fluidlift.shape.unite import window_length
 
-    clip, labels, flow, c = clip_of(story), labels_of(story), flow_of(story), config.shape
-    fluid = labels.fluid
-    start = rest_frame(fluid)
+    clip, fluid, c = clip_of(story), masks_of(story), config.shape
+    start = rest_frame(fluid.areas())
     united = _united(clip.frames, fluid, start, c.longest_union, window_length)
     mask = generate.united_mask(fluid[start : start + united])
     if not mask.any():
         mask = fluid[start]
-    wet_some_time = fluid.any(axis=0)
-    motion, trust = mean_flow(flow, wet_some_time)
+    motion, trust = mean_motion(story, fluid.any_frame())
     warnings: list[str] = []
 
     known, pose_given = _known_camera(inputs, config, clip.size)
@@ -83,13 +81,14 @@ def geometry(story: Story, inputs: Inputs, config: JobConfig) -> Result:
     depth = (front.depth * scale.value).astype(np.float32)
     half = (front.half_thickness * scale.value).astype(np.float32)
     bulk = to_world.vectors(mainstream) / to_world.scale
-    setting = _setting(kind, front, labels.labels, fluid, start, united, camera, to_world, depth, half, bulk, c)
+    setting = _setting(kind, front, fluid, start, united, camera, to_world, depth, half, bulk, c)
     if not (setting.cell_types == CellType.FLUID).any():
         raise InputRejected(
             f"as a {kind}, the fluid fills no cell of the grid beside those of its inlet", "a larger or thicker body",
             "check the mask and --kind, or raise --set shape.cells=...",
         )  # fmt: skip
-    plate = generate.background_plate(clip.frames, fluid, labels.solid.mean(axis=0) > 0.5)
+    # the plate looks at a few frames only
+    plate = generate.background_plate(clip.frames, cast(Any, fluid), _solid(fluid.labels) > 0.5)
     arrays, meta = _packed(setting)
     arrays |= {
         "mask": mask, "depth": depth, "half_thickness": half, "mean_flow": motion, "mean_confidence": trust,
@@ -117,7 +116,7 @@ def geometry(story: Story, inputs: Inputs, config: JobConfig) -> Result:
 
 def _kind_and_up(story, inputs, config, known, pose_given, mask, motion, trust):
     """Evidence for the kind, the kind, the tilt of the camera, and its heading where it was surveyed."""
-    clip, fluid, c = clip_of(story), labels_of(story).fluid, config.shape
+    clip, fluid, c = clip_of(story), masks_of(story), config.shape
     surveyed, heading = place.pose_up(known)
     pitch = float(surveyed.pitch) if pose_given else c.pitch
     pick = np.unique(np.linspace(0, len(clip) - 1, 8).astype(int))
@@ -260,14 +259,20 @@ def _mainstream(kind: str, velocities: np.ndarray, trust: np.ndarray) -> np.ndar
     return bulk / norm if norm > 1e-12 else np.array([1.0, 0.0, 0.0])
 
 
-def _setting(kind, front, labels, fluid, start, united, camera, to_world, depth, half, bulk, c) -> terrain.Setting:
+def _solid(labels: np.ndarray) -> np.ndarray:
+    """float [H,W]: share of the frames, u8 [T,H,W], in which a pixel shows something solid."""
+    parts = (labels[part] == Label.SOLID for part in parts_of(labels))
+    return np.sum([part.sum(axis=0) for part in parts], axis=0) / len(labels)
+
+
+def _setting(kind, front, fluid, start, united, camera, to_world, depth, half, bulk, c) -> terrain.Setting:
     window = slice(start, start + united)
     mask = generate.united_mask(fluid[window])
     visible = mask & (depth > 0)
     grid = camera.pixel_grid()
     near = camera.unproject(grid[visible], depth[visible])
     if front.height is not None:
-        solid = (labels[window] == Label.SOLID).mean(axis=0) > 0.5
+        solid = _solid(fluid.labels[window]) > 0.5
         seen = np.where(mask, Label.FLUID, np.where(solid, Label.SOLID, Label.BACKGROUND)).astype(np.uint8)
         return terrain.channel_setting(
             place.PlacedHeight(front.height, to_world), seen, near, camera, bulk,
@@ -276,7 +281,7 @@ def _setting(kind, front, labels, fluid, start, united, camera, to_world, depth,
     back = depth + 2 * half
     far = camera.unproject(grid[visible], back[visible])
     # the box holds what the clip shows later, in the same vertical plane
-    later = fluid.any(axis=0)
+    later = fluid.any_frame()
     middle = np.median((depth + half)[visible])
     reach = camera.unproject(grid[later], np.full(int(later.sum()), middle))
     return terrain.airborne_setting(

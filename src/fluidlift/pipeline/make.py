@@ -12,12 +12,13 @@ from typing import Any
 from fluidlift import __version__
 from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected
-from fluidlift.pipeline import body, moving, refining, seeing, simulating
+from fluidlift.pipeline import begin, body, lifting, moving, refining, simulating
+from fluidlift.pipeline.begin import input_hashes, provenance_of
 from fluidlift.pipeline.fit_request import request_of
+from fluidlift.pipeline.reading import Inputs, clip_of
 from fluidlift.pipeline.resimulate import Made, play
 from fluidlift.pipeline.scene import SimulationRequest
-from fluidlift.pipeline.seeing import Inputs
-from fluidlift.pipeline.story import Progress, Silence, Story, file_hash
+from fluidlift.pipeline.story import Progress, Silence, Story
 from fluidlift.types import FluidAsset
 
 STAGES = ("read", "flow", "segment", "geometry", "refine", "motion", "fit", "simulate", "show")
@@ -61,7 +62,7 @@ def make(
     try:
         with disk_errors(folder):
             provenance = _run(story, inputs, folder, config)
-            frames = config.simulate.frames or len(seeing.clip_of(story)) - story["geometry"].meta["rest_frame"]
+            frames = config.simulate.frames or len(clip_of(story)) - story["geometry"].meta["rest_frame"]
             simulating.require_room(folder, frames, len(body.rest_of(story)))
             _write_asset(story, folder, config, provenance)
             frames = play(story, folder, config, SimulationRequest(restart="simulate" in story.force))
@@ -74,51 +75,21 @@ def make(
 
 
 def _run(story: Story, inputs: Inputs, folder: Path, config: JobConfig) -> dict[str, Any]:
-    from fluidlift.io.limits import require_file
-    from fluidlift.io.sequences import is_sequence
-
-    if not is_sequence(inputs.clip):
-        require_file(inputs.clip, "video")
-    hashes = {}
-    for name, path in inputs.existing().items():
-        if name != "clip" or path.exists():
-            if not path.exists():
-                raise InputRejected(f"no such {name} file: '{path.name}'", "an existing file", f"check --{name}")
-            hashes[name] = file_hash(path)
-        else:
-            from fluidlift.io.sequences import list_sequence
-
-            hashes[name] = [file_hash(p) for _, p in list_sequence(path)]
-    seed = config.seed
-    run = story.run
-    run(
-        "read",
-        lambda: seeing.read(inputs, config),
-        settings=[hashes["clip"], hashes.get("camera"), config.section("read")],
-        after=(),
-    )
-    run("flow", lambda: seeing.flow(story, config), settings=config.motion.method, after=("read",))
-    run("segment", lambda: seeing.segment(story, inputs, config), settings=hashes.get("mask"), after=("read", "flow"))
-    geometry = ("kind", "fov", "pitch", "roll", "size", "depth_ratio", "cells", "cell_limit", "longest_union")
-    given = {k: hashes.get(k) for k in ("camera", "depth", "geometry")}
-    shape = config.section("shape")
-    run(
-        "geometry",
-        lambda: body.geometry(story, inputs, config),
-        settings=[{k: shape[k] for k in geometry}, given],
-        after=("read", "flow", "segment"),
-    )
+    hashes = input_hashes(inputs)
+    seed, run, shape = config.seed, story.run, config.section("shape")
+    begin.look(story, inputs, config, hashes)
+    begin.shape(story, inputs, config, hashes)
     run("refine", lambda: refining.refine(story, inputs, config), settings=[shape, seed], after=("geometry",))
-    run("motion", lambda: moving.motion(story, config), settings=config.section("motion"), after=("geometry",))
+    run("motion", lambda: lifting.motion(story, config), settings=config.section("motion"), after=("geometry",))
     run("fit", lambda: moving.fit(story, config), settings=config.section("fit"), after=("motion",))
-    return {"inputs": {k: {"name": inputs.existing()[k].name, "sha256": v} for k, v in hashes.items()}}
+    return provenance_of(inputs, hashes)
 
 
 def _write_asset(story: Story, folder: Path, config: JobConfig, provenance: dict[str, Any]) -> None:
     """The body at rest and what moves it; simulation and pictures come after."""
     from fluidlift.io.asset_folder import save_asset
 
-    clip, g = seeing.clip_of(story), story["geometry"]
+    clip, g = clip_of(story), story["geometry"]
     setting = body.setting_of(story)
     origin = {"config": config.to_dict(), "versions": versions(), "seed": config.seed, "stages": dict(story.keys)}
     asset = FluidAsset(
@@ -127,7 +98,7 @@ def _write_asset(story: Story, folder: Path, config: JobConfig, provenance: dict
         terrain=setting.terrain,
         grid=setting.terrain.grid,
         cell_types=setting.cell_types,
-        velocity=moving.targets_of(story)[0],
+        velocity=lifting.targets_of(story)[0],
         parameters=moving.parameters_of(story),
         estimates=moving.estimates_of(story),
         camera=body.camera_of(story),

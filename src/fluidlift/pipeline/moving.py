@@ -1,9 +1,8 @@
-"""Stages that find how it moves: motion (velocity targets) and fit (parameters)."""
+"""The stage that fits the physics: what the parameters are, and what was known of them before."""
 
 from __future__ import annotations
 
 from dataclasses import asdict, replace
-from typing import Any
 
 import numpy as np
 
@@ -23,7 +22,9 @@ from fluidlift.pipeline.fit_outcome import (
     verdict,
 )
 from fluidlift.pipeline.fit_request import request_of, startable
-from fluidlift.pipeline.seeing import clip_of, flow_of, labels_of
+from fluidlift.pipeline.lifting import targets_of
+from fluidlift.pipeline.reading import clip_of
+from fluidlift.pipeline.seeing import masks_of
 from fluidlift.pipeline.story import Result, Story, one_torch_thread
 from fluidlift.types import (
     CellType,
@@ -31,11 +32,7 @@ from fluidlift.types import (
     FaceVelocity,
     FitResult,
     FluidParameters,
-    PixelFlow,
 )
-
-HALF_WINDOW = 2
-"""frames on either side whose flow is averaged into one target: turbulence of single pairs is mostly flow noise"""
 
 VISCOSITY_PRIOR = {"stream": 1e-5, "fall": 1e-5, "pour": 1e-4, "plume": 1e-5}
 """m^2/s, where the fit starts"""
@@ -48,117 +45,6 @@ over a bed that the grid cannot resolve"""
 AT_WALLS = ("restitution", "wall_damping")
 """not fitted unless asked for: how the velocity falls off towards a wall under water was not seen but assumed
 (`motion.bed`), and a steady flow whose slope the geometry lacks is best explained by walls without friction"""
-
-
-def motion(story: Story, config: JobConfig) -> Result:
-    """Completed flow of many frames, volume velocity of the target frames."""
-    from fluidlift.motion.air import with_air
-    from fluidlift.motion.free_fall import with_free_fall
-    from fluidlift.motion.front import front_factor
-    from fluidlift.motion.lift import lift_flow
-    from fluidlift.motion.volume import volume_velocity
-
-    clip, flow, g = clip_of(story), flow_of(story), story["geometry"]
-    camera, setting = camera_of(story), setting_of(story)
-    grid, kind = setting.terrain.grid, g.meta["kind"]
-    pairs, start = len(flow), min(g.meta["rest_frame"], len(flow) - 1)
-    targets = list(range(start, min(start + config.motion.targets, pairs)))
-    wanted = sorted(set(targets) | set(range(0, pairs, config.motion.complete_every)))
-    completed = np.full((pairs, *clip.frames.shape[1:3], 2), np.nan, np.float16)
-    observed = np.zeros((pairs, *clip.frames.shape[1:3]), bool)
-    arrays: dict[str, np.ndarray] = {}
-    reports: list[dict[str, Any]] = []
-    replaced: list[float] = []
-    factors: list[float] = []
-    fluid = labels_of(story).fluid
-    depth = g.arrays["depth"]
-    for done, t in enumerate(wanted):
-        story.step(done, len(wanted))
-        mask = fluid[t]
-        if not mask.any():
-            continue
-        full, seen = _completed(flow, t, mask, depth, camera, config)
-        if kind == "plume":
-            factor = front_factor(full, fluid, t)
-            full, factors = full * factor, [*factors, factor]
-        completed[t], observed[t] = full, seen
-        if t not in targets:
-            continue
-        on_body = mask & (depth > 0)
-        lifted = lift_flow(full, seen, on_body, depth, depth, camera, clip.interval)
-        if kind in ("fall", "pour"):
-            lifted, share = with_free_fall(lifted, downhill_of(setting, lifted.points), kind=kind)
-            replaced.append(share)
-        velocity, report = volume_velocity(
-            lifted, setting.terrain, setting.cell_types, grid, kind=kind, mainstream=setting.terrain.mainstream
-        )
-        if kind == "plume":
-            velocity, _ = with_air(velocity, setting.cell_types, setting.terrain, grid)
-        k = len(reports)
-        for name, component in zip("uvw", velocity.components):
-            arrays[f"target_{k:03d}_{name}"] = component.astype(np.float32)
-        reports.append({"frame": t, **_plain(report)})
-    warnings = []
-    if reports and not all(r.get("solve", {}).get("converged", True) for r in reports):
-        warnings.append("the divergence-free solve of the target velocity did not converge on every frame")
-    if replaced and max(replaced) > 0.3:
-        warnings.append(
-            f"the {kind} moves faster than optical flow can follow: on {100 * max(replaced):.0f} % of its steep part "
-            "the speed comes from free fall at the given size"
-        )
-    arrays |= {"completed": completed, "observed": np.packbits(observed, axis=-1)}
-    return Result(arrays, {"warnings": warnings, "targets": [r["frame"] for r in reports], "reports": reports,
-                           "front_factor": float(np.median(factors)) if factors else 1.0,
-                           "free_fall_share": max(replaced, default=0.0)})  # fmt: skip
-
-
-def downhill_of(setting: Any, points: np.ndarray) -> np.ndarray:
-    """Unit direction of steepest descent of the surface at points; straight down for bodies in the air."""
-    if setting.surface_height is None:
-        down = np.tile([0.0, 0.0, -1.0], (len(points), 1))
-        pool = setting.pool_level
-        if pool is not None:  # what stands in a vessel does not fall
-            down[points[:, 2] < pool] = [1.0, 0.0, 0.0]
-        return down
-    grid = setting.terrain.grid
-    gx, gy = np.gradient(setting.surface_height, grid.spacing)
-    cell = np.clip(grid.cell_of(points)[:, :2], 0, np.array(grid.shape[:2]) - 1)
-    slope = np.stack([gx[cell[:, 0], cell[:, 1]], gy[cell[:, 0], cell[:, 1]]], axis=-1)
-    squared = (slope**2).sum(axis=1)
-    steepest = np.concatenate([-slope, -squared[:, None]], axis=1)
-    return steepest / np.maximum(np.linalg.norm(steepest, axis=1, keepdims=True), 1e-12)
-
-
-def _completed(flow: PixelFlow, t: int, mask, depth, camera, config: JobConfig) -> tuple[np.ndarray, np.ndarray]:
-    """Mean of the flow around frame t, failed regions filled in along the mainstream."""
-    from fluidlift.motion.mainstream import complete_flow, mainstream_direction, project_screen_divergence
-    from fluidlift.motion.optical_flow import mean_flow
-
-    window = slice(max(t - HALF_WINDOW, 0), min(t + HALF_WINDOW + 1, len(flow)))
-    mean, trust = mean_flow(PixelFlow(flow.displacement[window], flow.confidence[window]), mask)
-    direction = mainstream_direction(mean, trust, mask)
-    with_depth = bool((depth[mask] > 0).all())
-    full, seen = complete_flow(mean, trust, mask, direction, depth if with_depth else None)
-    on_body = mask & (depth > 0)
-    if on_body.any() and (on_body & ~seen).any():
-        projected, _ = project_screen_divergence(
-            full, on_body, seen & on_body, np.where(on_body, depth, 1.0), np.zeros_like(depth), camera,
-            form=config.motion.divergence,
-        )  # fmt: skip
-        full = np.where(on_body[..., None], projected, full)
-    return full, seen
-
-
-def _plain(report: Any) -> dict[str, Any]:
-    """A report as plain values for JSON."""
-    return {k: v for k, v in asdict(report).items() if isinstance(v, int | float | str | bool | dict)}
-
-
-def targets_of(story: Story) -> list[FaceVelocity]:
-    """Target velocities of consecutive frames."""
-    a = story["motion"].arrays
-    count = len(story["motion"].meta["targets"])
-    return [FaceVelocity(*(a[f"target_{k:03d}_{name}"] for name in "uvw")) for k in range(count)]
 
 
 def fit(story: Story, config: JobConfig) -> Result:
@@ -260,7 +146,7 @@ def filling_rate(story: Story) -> float | None:
     g, clip = story["geometry"], clip_of(story)
     if g.meta["kind"] != "pour" or g.meta["pool_level"] is None:
         return None
-    camera, fluid, start = camera_of(story), labels_of(story).fluid, g.meta["rest_frame"]
+    camera, fluid, start = camera_of(story), masks_of(story), g.meta["rest_frame"]
     distance = float(np.median(g.arrays["depth"][g.arrays["depth"] > 0]))
     times, volumes = [], []
     for t in np.unique(np.linspace(start, len(clip) - 1, 8).astype(int)):

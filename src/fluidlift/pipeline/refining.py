@@ -9,7 +9,8 @@ import numpy as np
 from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected
 from fluidlift.pipeline.body import camera_of, gaussians_to_arrays, given_bodies, placement_of, setting_of
-from fluidlift.pipeline.seeing import Inputs, clip_of, labels_of
+from fluidlift.pipeline.reading import Inputs, clip_of
+from fluidlift.pipeline.seeing import labels_of
 from fluidlift.pipeline.story import Result, Story
 from fluidlift.shape import generate, terrain
 from fluidlift.types import Gaussians, PinholeCamera, Similarity3, concatenate

@@ -14,7 +14,8 @@ from fluidlift import __version__
 from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected
 from fluidlift.look.appearance import SteadyShading
-from fluidlift.pipeline.seeing import clip_of, labels_of
+from fluidlift.pipeline.reading import clip_of
+from fluidlift.pipeline.seeing import labels_of
 from fluidlift.pipeline.story import Story, available_memory
 from fluidlift.types import (
     CellType,

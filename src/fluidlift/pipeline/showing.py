@@ -13,8 +13,9 @@ from fluidlift.look.report import Figure, Section, report_html
 from fluidlift.pipeline.body import setting_of
 from fluidlift.pipeline.fit_outcome import TIES, how_sure, in_words
 from fluidlift.pipeline.moving import targets_of
+from fluidlift.pipeline.reading import clip_of
 from fluidlift.pipeline.scene import LYING, Footage, Scene
-from fluidlift.pipeline.seeing import clip_of, flow_of, labels_of
+from fluidlift.pipeline.seeing import flow_of, labels_of
 from fluidlift.pipeline.simulating import frame_file
 from fluidlift.pipeline.story import Result, Story
 from fluidlift.types import CellType, Gaussians, PinholeCamera, Similarity3, concatenate, matrix_from_quat
@@ -271,7 +272,7 @@ def _section_motion(story: Story) -> Section:
     figures = []
     if meta["targets"]:
         t = meta["targets"][0]
-        raw, full = flow_of(story).displacement[t], a["completed"][t].astype(np.float32)
+        raw, full = (np.asarray(x[t], np.float32) for x in (flow_of(story).displacement, a["completed"]))
         mask = labels_of(story).fluid[t]
         scale = float(np.percentile(np.linalg.norm(full[mask], axis=-1), 95)) if mask.any() else 1.0
         figures = [

@@ -18,6 +18,7 @@ import numpy as np
 
 from fluidlift import __version__
 from fluidlift.io.asset_folder import is_owner, load_stage, mark_owner, save_stage
+from fluidlift.io.stage_cache import Scratch
 
 Arrays = dict[str, np.ndarray]
 Meta = dict[str, Any]
@@ -96,6 +97,8 @@ class Story:
         self.keys: dict[str, str] = {}
         self.timings: dict[str, dict[str, Any]] = {}
         self.warnings: list[str] = []
+        self.scratch = Scratch(folder, "none")
+        """for large arrays of the stage that is at work"""
         self._stale = False
 
     def __getitem__(self, name: str) -> Result:
@@ -134,13 +137,7 @@ class Story:
             if found is not None and still_there(Result(*found)):
                 result, cached = Result(*found), True
         if result is None:
-            if owns_files:
-                mark_owner(self.folder, name, None)
-            result = work()
-            result.meta["seconds"] = round(time.perf_counter() - began, 3)
-            save_stage(self.folder, name, key, result.arrays, result.meta)
-            if owns_files:
-                mark_owner(self.folder, name, key)
+            result = self._worked(name, key, work, began, owns_files)
         seconds = time.perf_counter() - began
         self.results[name] = result
         self.timings[name] = {
@@ -151,6 +148,21 @@ class Story:
         for text in result.meta.get("warnings", ()):
             self.warn(text)
         self.progress.finished(name, seconds, cached)
+        return result
+
+    def _worked(self, name: str, key: str, work: Callable[[], Result], began: float, owns_files: bool) -> Result:
+        """Do the work of a stage and keep its result."""
+        if owns_files:
+            mark_owner(self.folder, name, None)
+        self.scratch = Scratch(self.folder, name)
+        try:
+            result = work()
+            result.meta["seconds"] = round(time.perf_counter() - began, 3)
+            save_stage(self.folder, name, key, result.arrays, result.meta, scratch=self.scratch)
+        finally:
+            self.scratch.discard()
+        if owns_files:
+            mark_owner(self.folder, name, key)
         return result
 
     def recall(self, name: str, key: str) -> bool:

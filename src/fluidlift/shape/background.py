@@ -6,15 +6,17 @@ from collections.abc import Callable
 
 import cv2
 import numpy as np
+from scipy.ndimage import convolve1d
 
 from fluidlift.shape.evidence import Evidence
+from fluidlift.shape.presence import Presence
 
 DECISIVE = 3.5
 """log odds at which colour alone is held to say no more"""
 
 
 def still_background(
-    evidence: Evidence, active: np.ndarray, domain: np.ndarray
+    evidence: Evidence, presence: Presence, domain: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, Callable[[np.ndarray], np.ndarray]]:
     """The picture behind the fluid, float32 [h,w,3], where it is known, bool [h,w], and a colour test of fluid.
 
@@ -23,20 +25,16 @@ def still_background(
     extended, in place, over such quiet fluid where it touches the moving one. Colour is trusted as far as the moving
     places have colours of their own: clear water shows those of the background.
     """
-    frames = len(active)
-    ever = active.any(axis=0)
-    first = np.where(ever, active.argmax(axis=0), frames)
-    last = np.where(ever, frames - 1 - active[::-1].argmax(axis=0), -1)
     total, count = np.zeros((*domain.shape, 3), np.float32), np.zeros(domain.shape, np.float32)
-    for t in range(frames):
-        free = ((t < first - 1) | (t > last + 1)).astype(np.float32)
-        total += free[..., None] * evidence.pictures[t].astype(np.float32)
+    for t in range(presence.frames):
+        free = ((t < presence.first - 1) | (t > presence.last + 1)).astype(np.float32)
+        total += free[..., None] * evidence.source[t].astype(np.float32)
         count += free
     background = total / np.maximum(count, 1.0)[..., None]
-    pick = np.unique(np.linspace(0, frames - 1, min(frames, 15)).round().astype(int))
-    moving = colour_histogram(evidence.pictures[pick][active[pick]])
-    domain |= quiet_fluid(background, domain, moving, colour_histogram(evidence.pictures[pick][:, ~domain]))
-    around = colour_histogram(evidence.pictures[pick][:, ~domain])
+    pictures = np.stack([evidence.source[t] for t in presence.picked])
+    moving = colour_histogram(pictures[presence.active])
+    domain |= quiet_fluid(background, domain, moving, colour_histogram(pictures[:, ~domain]))
+    around = colour_histogram(pictures[:, ~domain])
     fluid = without_background(moving, around)
     rare = 1e-5 * (around.sum() + fluid.sum())
     trust = float(np.clip((fluid.sum() / max(moving.sum(), 1.0) - 0.3) / 0.4, 0.0, 1.0))
@@ -59,7 +57,7 @@ def quiet_fluid(picture: np.ndarray, domain: np.ndarray, moving: np.ndarray, aro
 
 
 def typical_contrast(
-    evidence: Evidence, active: np.ndarray, background: np.ndarray, known: np.ndarray
+    evidence: Evidence, presence: Presence, background: np.ndarray, known: np.ndarray
 ) -> tuple[float, float]:
     """Median difference between the moving fluid and what is behind it, grey levels, and its sign.
 
@@ -67,8 +65,8 @@ def typical_contrast(
     with a clear sign, the opposite change is a shadow or a reflection of the fluid.
     """
     values = [
-        (evidence.pictures[t].astype(np.float32) - background)[active[t] & known]
-        for t in range(0, len(active), max(1, len(active) // 15))
+        (evidence.source[t].astype(np.float32) - background)[active & known]
+        for t, active in zip(presence.picked, presence.active, strict=True)
     ]
     together = np.concatenate(values)
     if len(together) == 0:
@@ -91,7 +89,7 @@ def colour_histogram(colours: np.ndarray, *, bins: int = 16) -> np.ndarray:
     np.add.at(counts, colour_bins(colours.reshape(-1, 3), bins=bins), 1.0)
     kernel = np.array([0.25, 0.5, 0.25], np.float32)
     for axis in range(3):
-        counts = np.apply_along_axis(np.convolve, axis, counts, kernel, mode="same")
+        counts = convolve1d(counts, kernel, axis=axis, mode="constant")
     return counts.astype(np.float32)
 
 

@@ -7,11 +7,20 @@ slightest tremble of the camera or of the codec changes the brightness.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
+from fluidlift.shape.frame_pictures import (
+    FramePictures,
+    burst_length,
+    sampled_frames,
+    shrink,
+    typical_picture,
+    working_scale,
+)
 from fluidlift.types.clip import VideoClip
 from fluidlift.types.flow import PixelFlow
 
@@ -30,10 +39,11 @@ LARGEST_TREMBLE = 0.25
 class Evidence:
     """Maps at working size [h,w], smaller than the clip by `scale`."""
 
-    pictures: np.ndarray
-    """float16 [T,h,w,3], brightness and two colour differences, global flicker removed"""
-    change: np.ndarray
-    """float16 [T,h,w], change around each frame in units of the noise"""
+    source: FramePictures
+    """picture of any frame"""
+    lively: float
+    """mean change between neighbouring frames over the picture, in units of the noise; less than a tenth of it is a
+    frame that was repeated"""
     activity: np.ndarray
     """float32 [h,w], log of the mean change in units of the noise, pooled over neighbours"""
     fine_activity: np.ndarray
@@ -48,49 +58,10 @@ class Evidence:
     """float32 [h,w], mean absolute change that a still thing would show, grey levels"""
     scale: float
 
-
-def opponent(frames: np.ndarray) -> np.ndarray:
-    """Brightness and two colour differences, float32 [...,3] of u8 [...,3] sRGB; linear, so noise stays noise."""
-    matrix = np.array([[0.299, 0.587, 0.114], [0.5, 0.0, -0.5], [-0.25, 0.5, -0.25]], np.float32)
-    return cv2.transform(frames.astype(np.float32), matrix)
-
-
-def working_scale(height: int, width: int, *, longest: int = 384) -> float:
-    """Factor (at most 1) that brings the longer side to `longest` px."""
-    return min(1.0, longest / max(height, width))
-
-
-def shrink(picture: np.ndarray, scale: float) -> np.ndarray:
-    """The picture at working size (area mean)."""
-    if scale == 1.0:
-        return picture
-    height, width = picture.shape[:2]
-    size = (max(round(width * scale), 8), max(round(height * scale), 8))
-    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
-
-
-def small_pictures(frames: np.ndarray, scale: float) -> np.ndarray:
-    """float16 [T,h,w,3]: opponent colours at working size, lightly smoothed, without global flicker.
-
-    A lamp that flickers multiplies every pixel by nearly the same factor: the median ratio to the median picture.
-    """
-    pictures = np.stack(
-        [cv2.GaussianBlur(opponent(shrink(frame, scale)), (0, 0), 0.8).astype(np.float16) for frame in frames]
-    )
-    reference = typical_picture(pictures)[..., 0]
-    lit = reference > 16.0
-    if lit.mean() > 0.1:
-        for picture in pictures:
-            gain = float(np.median(picture[..., 0][lit] / reference[lit]))
-            if abs(gain - 1.0) > 0.004 and 0.25 < gain < 4.0:
-                picture /= np.float16(gain)
-    return pictures
-
-
-def typical_picture(pictures: np.ndarray, *, most: int = 31) -> np.ndarray:
-    """Temporal median, float32 [h,w,3], of at most `most` evenly spaced pictures."""
-    pick = np.unique(np.linspace(0, len(pictures) - 1, min(most, len(pictures))).round().astype(int))
-    return np.median(pictures[pick].astype(np.float32), axis=0)
+    @property
+    def pictures(self) -> np.ndarray:
+        """float16 [S,h,w,3], brightness and two colour differences of the sampled frames, global flicker removed."""
+        return self.source.kept
 
 
 def distance_of_pictures(first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -135,40 +106,46 @@ def noise_map(change: np.ndarray, steep: np.ndarray, *, bins: int = 10) -> np.nd
     return (max(base, QUANTISATION) + min(trembles) * steep).astype(np.float32)
 
 
-def lagged_change(pictures: np.ndarray, lag: int) -> np.ndarray:
-    """float32 [h,w]: mean absolute difference of pictures `lag` frames apart."""
+def lagged_change(pictures: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    """float32 [h,w]: mean absolute difference of pairs (int [n,2]) of pictures."""
     total = np.zeros(pictures.shape[1:3], np.float32)
-    starts = range(len(pictures) - lag)
-    for start in starts:
-        total += distance_of_pictures(pictures[start], pictures[start + lag])
-    return total / len(starts)
+    for first, second in pairs:
+        total += distance_of_pictures(pictures[first], pictures[second])
+    return total / max(len(pairs), 1)
 
 
-def change_over_time(pictures: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """float16 [T,h,w]: mean change over the intervals before and after each frame, in units of the noise.
+def change_between(first: np.ndarray, second: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """float32 [h,w]: change in units of the noise, at least those of its own quiet part (a hand that trembles)."""
+    ratio = distance_of_pictures(first, second) / noise
+    return np.minimum(ratio / max(1.0, float(np.quantile(ratio, QUIET_QUANTILE))), 1e4)
 
-    Each interval is also measured against its own quiet part (a hand that trembles now and then), and a repeated
-    frame (an interval without any change) takes the change of its neighbours.
+
+def change_over_time(evidence: Evidence) -> Iterator[np.ndarray]:
+    """float32 [h,w] for every frame: mean change over the intervals before and after it, in units of the noise.
+
+    A repeated frame (an interval without any change) takes the change of the interval before.
     """
-    frames = len(pictures)
-    between = np.empty((frames - 1, *noise.shape), np.float16)
-    for t in range(frames - 1):
-        ratio = distance_of_pictures(pictures[t], pictures[t + 1]) / noise
-        between[t] = np.minimum(ratio / max(1.0, float(np.quantile(ratio, QUIET_QUANTILE))), 1e4)
-    energy = between.mean(axis=(1, 2), dtype=np.float32)
-    live = np.flatnonzero(energy > 0.1 * np.median(energy))
-    if 0 < len(live) < frames - 1:
-        between = between[live[np.abs(np.arange(frames - 1)[:, None] - live).argmin(axis=1)]]
-    around = np.empty((frames, *noise.shape), np.float16)
-    around[0], around[-1] = between[0], between[-1]
-    around[1:-1] = (between[1:] + between[:-1]) * np.float16(0.5)
-    return around
+    source = evidence.source
+    before = None
+    here = source[0]
+    for t in range(len(source)):
+        after = before
+        if t + 1 < len(source):
+            following = source[t + 1]
+            after = change_between(here, following, evidence.noise)
+            here = following
+            if before is not None and float(after.mean()) < 0.1 * evidence.lively:
+                after = before
+        if after is None:
+            raise ValueError("a single frame has no change")
+        yield after if before is None else 0.5 * (before + after)
+        before = after
 
 
 def flow_evidence(
-    pictures: np.ndarray, displacement: np.ndarray, confidence: np.ndarray, scale: float, noise: np.ndarray
+    source: FramePictures, flow: PixelFlow, scale: float, noise: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Swaying and streaming, both float32 [h,w] in [0,1].
+    """Swaying and streaming, both float32 [h,w] in [0,1], over the sampled frames.
 
     A leaf moves to and fro: its flow explains the change of brightness well (small residual after warping) but sums
     to nearly nothing. A stream either goes somewhere (large sum) or changes in ways that no motion explains.
@@ -179,10 +156,12 @@ def flow_evidence(
     walked = np.zeros((height, width, 2), np.float32)
     farthest, path = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32)
     before, after = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32)
-    for t, step in enumerate(displacement):
-        sure = shrink(confidence[t].astype(np.float32), scale)[..., None]
-        step = shrink(np.nan_to_num(step.astype(np.float32)), scale) * scale
-        first, second = pictures[t].astype(np.float32), pictures[t + 1].astype(np.float32)
+    pairs = source.pairs(1)
+    for one, other in pairs:
+        t = source.sampled[one]
+        sure = shrink(np.asarray(flow.confidence[t], np.float32), scale)[..., None]
+        step = shrink(np.nan_to_num(np.asarray(flow.displacement[t], np.float32)), scale) * scale
+        first, second = source.kept[one].astype(np.float32), source.kept[other].astype(np.float32)
         warped = cv2.remap(
             second, columns + step[..., 0], rows + step[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
         )
@@ -191,7 +170,7 @@ def flow_evidence(
         walked += step * np.clip(sure, 0.0, 1.0)
         path += np.hypot(step[..., 0], step[..., 1])
         np.maximum(farthest, np.hypot(walked[..., 0], walked[..., 1]), out=farthest)
-    floor = noise * len(displacement)
+    floor = noise * len(pairs)
     before, after = (cv2.GaussianBlur(np.maximum(x - floor, 0.0), (0, 0), sigma) for x in (before, after))
     explained = np.clip(1.0 - after / (before + 0.2 * floor), 0.0, 1.0)
     gone = farthest / (0.04 * max(height, width))
@@ -202,21 +181,24 @@ def flow_evidence(
 
 
 def gather_evidence(clip: VideoClip, flow: PixelFlow) -> Evidence:
-    """All maps of one clip of at least 2 frames."""
+    """All maps of one clip of at least 2 frames; a long clip is looked at in bursts (`sampled_frames`)."""
     frames, height, width = clip.frames.shape[:3]
     scale = working_scale(height, width)
-    pictures = small_pictures(clip.frames, scale)
+    source = FramePictures(clip.frames, sampled_frames(frames, clip.interval), scale)
+    pictures = source.kept
     steep = sharpness(typical_picture(pictures))
-    slow_lag = int(np.clip(round(0.2 / clip.interval), 1, max(1, frames // 3)))
-    quick, slow = lagged_change(pictures, 1), lagged_change(pictures, slow_lag)
+    longest = max(1, burst_length(frames, clip.interval) // 3)
+    slow_lag = int(np.clip(round(0.2 / clip.interval), 1, longest))
+    quick, slow = lagged_change(pictures, source.pairs(1)), lagged_change(pictures, source.pairs(slow_lag))
     noise, slow_noise = noise_map(quick, steep), noise_map(slow, steep)
     fine = 0.5 * (np.log(np.maximum(quick, 1e-3) / noise) + np.log(np.maximum(slow, 1e-3) / slow_noise))
     fine = np.maximum(fine, 0.0).astype(np.float32)
-    pooled = pool(fine, POOLING * max(pictures.shape[1:3]))
-    swaying, streaming = flow_evidence(pictures, flow.displacement, flow.confidence, scale, noise)
+    pooled = pool(fine, POOLING * max(noise.shape))
+    swaying, streaming = flow_evidence(source, flow, scale, noise)
+    energy = [float(change_between(pictures[i], pictures[j], noise).mean()) for i, j in source.pairs(1)]
     return Evidence(
-        pictures=pictures,
-        change=change_over_time(pictures, noise),
+        source=source,
+        lively=float(np.median(energy)),
         activity=pooled,
         fine_activity=pool(fine, 1.0),
         swaying=swaying,

@@ -1,0 +1,257 @@
+"""The command line: parse, call, show.
+
+Exit codes: 0 done, 1 failed, 2 usage, 3 input rejected, 4 done with warnings.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from fluidlift import __version__
+from fluidlift.cli.options import (
+    Command,
+    Demo,
+    Doctor,
+    Evaluate,
+    Fit,
+    Inspect,
+    Make,
+    Mask,
+    Motion,
+    Sim,
+    Validate,
+)
+from fluidlift.errors import FluidliftError, InputRejected
+
+DONE, FAILED, USAGE, REJECTED, WITH_WARNINGS = 0, 1, 2, 3, 4
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run one command; the exit code."""
+    args = list(sys.argv[1:] if argv is None else argv)
+    if args in (["--version"], ["-V"]):
+        print(f"fluidlift {__version__}")
+        return DONE
+    command = tyro.cli(
+        Command,  # type: ignore[arg-type]
+        args=args,
+        prog="fluidlift",
+        description="Lift a fluid out of a single-view video: an editable, simulation-ready 3D asset.",
+        config=(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitSubcommandPrefixes),
+    )
+    try:
+        return _COMMANDS[type(command)](command)
+    except InputRejected as error:
+        print(f"fluidlift: {error}", file=sys.stderr)
+        return REJECTED
+    except FluidliftError as error:
+        print(f"fluidlift: {error}", file=sys.stderr)
+        return FAILED
+    except KeyboardInterrupt:
+        print(
+            "\nfluidlift: stopped. Finished stages and frames are kept: the same command goes on from there.",
+            file=sys.stderr,
+        )
+        return FAILED
+
+
+@contextlib.contextmanager
+def _progress():
+    from fluidlift.progress import BarProgress, PlainProgress
+
+    if sys.stderr.isatty():
+        with BarProgress() as bar:
+            yield bar
+    else:
+        yield PlainProgress()
+
+
+def _make(c: Make) -> int:
+    from fluidlift.config import build_config
+
+    flat = {
+        "seed": c.seed, "shape.kind": c.kind, "shape.size": c.size, "shape.fov": c.fov, "shape.pitch": c.pitch,
+        "shape.roll": c.roll, "read.start": c.start, "read.duration": c.duration, "read.fps": c.fps,
+        "read.max_size": c.max_size, "read.max_pixels": c.max_pixels, "read.max_frames": c.max_frames,
+    }  # fmt: skip
+    config = build_config(c.preset, c.config, c.set, flat)
+    if c.print_config:
+        import yaml
+
+        print(yaml.safe_dump(config.to_dict(), sort_keys=False), end="")
+        return DONE
+    return _run_job(
+        c.clip, c.out or default_folder(c.clip), config, mask=c.mask, camera=c.camera, depth=c.depth,
+        geometry=c.geometry_from, flow=c.flow, force=c.force, as_json=c.json,
+    )  # fmt: skip
+
+
+def default_folder(clip: Path) -> Path:
+    """The clip's name with .fluid, in the current folder; a pattern takes the name of the folder it is in."""
+    pattern = "%" in clip.name or "#" in clip.name
+    name = clip.absolute().parent.name if pattern else clip.stem
+    return Path((name or "clip") + ".fluid")
+
+
+def _run_job(clip: Path, out: Path, config: Any, *, force=(), as_json=False, **files: Path | None) -> int:
+    from fluidlift.pipeline import Inputs, make
+
+    with _progress() as progress:
+        made = make(Inputs(clip, **files), out, config, force=force, progress=progress)
+    return _tell(made, as_json)
+
+
+def _tell(made: Any, as_json: bool) -> int:
+    if as_json:
+        print(json.dumps({"asset": str(made.folder), "seconds": made.seconds, "frames": made.frames,
+                          "warnings": made.warnings, "stages": made.timings}, indent=1))  # fmt: skip
+    else:
+        print(f"done in {made.seconds:.0f} s")
+        for text, name in (("asset", ""), ("preview", "preview.mp4"), ("report", "report.html")):
+            print(f"  {text:8} {made.folder / name}")
+    return WITH_WARNINGS if made.warnings else DONE
+
+
+def _fit(c: Fit) -> int:
+    from fluidlift.pipeline import refit
+
+    flat = {
+        "fit.method": c.method, "fit.free": c.free, "fit.hold": c.hold or None,
+        "fit.restarts": c.restarts, "fit.max_seconds": c.max_seconds,
+    }  # fmt: skip
+    with _progress() as progress:
+        found = refit(c.asset, overrides=c.set, flat=flat, progress=progress)
+    if c.json:
+        print(json.dumps({"asset": str(found.folder), "seconds": found.seconds, "status": found.status,
+                          "reason": found.reason, "parameters": found.rows, "notes": found.notes,
+                          "warnings": found.warnings}, indent=1))  # fmt: skip
+    else:
+        print("\n".join(found.lines()))
+    return WITH_WARNINGS if found.warnings else DONE
+
+
+def _sim(c: Sim) -> int:
+    from fluidlift.pipeline import SimulationRequest, resimulate
+
+    request = SimulationRequest(c.duration, c.fps, c.extend_downstream, c.meshes, c.resume, c.restart)
+    flat = {"seed": c.seed, "simulate.checkpoint_every": c.checkpoint_every}
+    with _progress() as progress:
+        made = resimulate(c.asset, request=request, overrides=c.set, flat=flat, progress=progress)
+    return _tell(made, c.json)
+
+
+def _inspect(c: Inspect) -> int:
+    from fluidlift.io.video import probe
+
+    info = probe(c.clip, fps=c.fps).to_dict()
+    if c.json:
+        print(json.dumps(info, indent=1, default=str))
+        return DONE
+    for name, value in info.items():
+        if name != "warnings":
+            print(f"{name.replace('_', ' '):16} {value}")
+    for text in info.get("warnings", ()):
+        print(f"warning: {text}")
+    return WITH_WARNINGS if info.get("warnings") else DONE
+
+
+LONGEST = {"read.max_frames": 20_000}
+"""of commands whose memory does not grow with the clip"""
+
+
+def _mask(c: Mask) -> int:
+    from fluidlift.config import build_config
+    from fluidlift.pipeline import Hints, Inputs, find_masks
+
+    flat = {"read.start": c.start, "read.duration": c.duration, "read.fps": c.fps, "read.max_size": c.max_size}
+    config = build_config(None, None, c.set, flat, base=LONGEST)
+    hints = Hints.of(c.roi, c.click, c.not_here)
+    with _progress() as progress:
+        found = find_masks(
+            Inputs(c.clip, camera=c.camera), c.out, config, hints=hints, force=c.force, progress=progress
+        )
+    return _told(found, c.json)
+
+
+def _motion(c: Motion) -> int:
+    from fluidlift.config import build_config
+    from fluidlift.pipeline import Inputs, MotionFiles, measure_motion
+
+    flat = {
+        "shape.kind": c.kind, "shape.size": c.size, "read.start": c.start, "read.duration": c.duration,
+        "read.fps": c.fps, "read.max_size": c.max_size,
+    }  # fmt: skip
+    config = build_config(None, c.config, c.set, flat, base=LONGEST)
+    inputs = Inputs(c.clip, mask=c.mask, camera=c.camera, depth=c.depth, flow=c.flow)
+    with _progress() as progress:
+        found = measure_motion(
+            inputs, c.out, config, files=MotionFiles(c.format, c.raw), force=c.force, progress=progress
+        )
+    return _told(found, c.json)
+
+
+def _told(found: Any, as_json: bool) -> int:
+    """What a command that writes files for other tools has found."""
+    print(json.dumps(found.to_dict(), indent=1) if as_json else "\n".join(found.lines()))
+    return WITH_WARNINGS if found.warnings else DONE
+
+
+def _evaluate(c: Evaluate) -> int:
+    from fluidlift.evaluate import evaluate_asset
+
+    found = evaluate_asset(c.asset, c.truth)
+    if c.json:
+        print(found.to_json())
+        return DONE
+    rows = found.table()
+    width = max(len(row[0]) for row in rows)
+    for name, value, unit, note in rows:
+        print(f"{name:{width}}  {value:>10} {unit:9} {note}".rstrip())
+    return DONE
+
+
+def _validate(c: Validate) -> int:
+    from fluidlift.validate import validate_asset
+
+    findings = validate_asset(c.asset)
+    if c.json:
+        print(json.dumps([dataclasses.asdict(f) for f in findings], indent=1))
+    else:
+        for f in findings:
+            print(f"{'ok     ' if f.passed else 'FAILED '} {f.check}{': ' + f.detail if f.detail else ''}")
+    return DONE if all(f.passed for f in findings) else FAILED
+
+
+def _demo(c: Demo) -> int:
+    from importlib import resources
+
+    from fluidlift.config import build_config
+
+    data = resources.files("fluidlift.synthetic") / "data"
+    with resources.as_file(data / "demo.mp4") as clip, resources.as_file(data / "demo_camera.json") as camera:
+        return _run_job(clip, c.out, build_config("draft"), camera=camera)
+
+
+def _doctor(c: Doctor) -> int:
+    from fluidlift.doctor import examine
+
+    found = examine()
+    if c.json:
+        print(json.dumps(found, indent=1))
+    else:
+        for name, value in found.items():
+            print(f"{name:24} {value}")
+    return DONE
+
+
+_COMMANDS = {
+    Make: _make, Fit: _fit, Sim: _sim, Inspect: _inspect, Mask: _mask, Motion: _motion, Evaluate: _evaluate,
+    Validate: _validate, Demo: _demo, Doctor: _doctor,
+}  # fmt: skip

@@ -1,0 +1,245 @@
+"""What the command line can be told: one class per command, one field per option."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+Clip = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CLIP")]
+Asset = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="ASSET")]
+
+
+@dataclass(frozen=True)
+class Make:
+    """Turn a clip into a fluid asset."""
+
+    clip: Clip
+    """a video, a folder of pictures or a pattern such as frames/%04d.png"""
+    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """asset folder to write; by default the clip's name with .fluid, in the current folder"""
+    preset: Literal["draft", "standard", "hero"] | None = None
+    """draft (the default): minutes on a laptop; standard: finer; hero: as fine as the machine allows"""
+    kind: Literal["auto", "stream", "fall", "pour", "plume"] | None = None
+    """what the fluid does; auto decides from evidence that the report shows"""
+    mask: Path | None = None
+    """where the fluid is: one picture, a folder of pictures or a video; white is fluid"""
+    camera: Path | None = None
+    """camera JSON: width, height, K, and R, t where the pose is known"""
+    depth: Path | None = None
+    """depth map of the first used frame (EXR, 16-bit PNG, npz): replaces the estimated front depth"""
+    flow: Path | None = None
+    """optical flow of the clip, made elsewhere: a folder or pattern of .flo, .exr, .npz or KITTI .png, or one .npz"""
+    geometry_from: Path | None = None
+    """folder of Gaussian PLY files and camera.json: replaces the embedded generator"""
+    size: float | None = None
+    """metres across the fluid (its longest side); sets the scale"""
+    fov: float | None = None
+    """field of view across the longer side, degrees; else the file's lens metadata, else 50"""
+    pitch: float | None = None
+    """degrees that the camera looks below the horizon"""
+    roll: float | None = None
+    """degrees that the picture is turned clockwise"""
+    start: float | None = None
+    """seconds into the clip"""
+    duration: float | None = None
+    """seconds to use"""
+    fps: float | None = None
+    """frames per second of an image sequence"""
+    max_size: int | None = None
+    """longer side of the working pictures, px"""
+    max_pixels: int | None = None
+    """largest source picture accepted, px"""
+    max_frames: int | None = None
+    """most frames accepted"""
+    seed: int | None = None
+    """same clip, settings and seed: same asset"""
+    config: Path | None = None
+    """YAML file with settings"""
+    set: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default_factory=tuple)
+    """one setting, such as --set fit.max_seconds=60; may be repeated"""
+    force: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default_factory=tuple)
+    """run this stage and all after it again; may be repeated"""
+    print_config: bool = False
+    """show the settings and stop"""
+    json: bool = False
+    """print the outcome as JSON"""
+
+
+@dataclass(frozen=True)
+class Sim:
+    """Simulate a finished asset again, with its scene.yaml: longer, other frames, another liquid, obstacles."""
+
+    asset: Asset
+    """asset folder"""
+    duration: float | None = None
+    """seconds; by default what scene.yaml says, else as long as the clip; a longer one continues what is there"""
+    fps: float | None = None
+    """frames per second; by default those of the clip"""
+    extend_downstream: float | None = None
+    """metres by which the channel of a stream or a fall goes on behind its outlet"""
+    meshes: Path | None = None
+    """folder of the mesh files that scene.yaml names; by default the asset"""
+    resume: bool = False
+    """insist on going on from the checkpoint: without one that fits, stop instead of starting again"""
+    restart: bool = False
+    """start at the first frame, although a checkpoint fits"""
+    checkpoint_every: int | None = None
+    """frames between checkpoints (10)"""
+    seed: int | None = None
+    """of the inflow's variation; by default that of the asset"""
+    set: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default_factory=tuple)
+    """one setting of simulate or show, such as --set simulate.max_particles=300000; may be repeated"""
+    json: bool = False
+    """print the outcome as JSON"""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Fit the physical parameters of a finished asset again; fluidlift sim then plays the new values."""
+
+    asset: Asset
+    """asset folder, with the work/ folder that make left"""
+    method: Literal["lm", "adam"] | None = None
+    """lm: Levenberg-Marquardt (the default); adam: as in the paper, slower"""
+    free: str | None = None
+    """parameters to fit, with commas between them, such as gravity,viscosity; by default all that the clip can tell"""
+    hold: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default_factory=tuple)
+    """a value that is known, such as --hold viscosity=1e-6; it is not fitted; may be repeated"""
+    restarts: int | None = None
+    """further fits from other initial values, 4 at most, whose spread is reported"""
+    max_seconds: float | None = None
+    """s that the fit may take; by default as in make"""
+    set: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default_factory=tuple)
+    """one setting of fit, such as --set fit.method=adam; may be repeated"""
+    json: bool = False
+    """print the outcome as JSON"""
+
+
+@dataclass(frozen=True)
+class Inspect:
+    """Tell what a clip is, and what would be warned about."""
+
+    clip: Clip
+    """a video, a folder of pictures or a pattern"""
+    fps: float | None = None
+    """frames per second of an image sequence"""
+    json: bool = False
+    """print as JSON"""
+
+
+@dataclass(frozen=True)
+class Mask:
+    """Find the fluid only: write masks and overlays, to be corrected and given to make or motion with --mask."""
+
+    clip: Clip
+    """a video, a folder of pictures or a pattern"""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """folder for mask/####.png and overlay/####.png (numbers from 1001)"""
+    camera: Path | None = None
+    """camera JSON, as for make: lens distortion is taken out before"""
+    roi: str | None = None
+    """x,y,width,height in px of the overlay: fluid is only looked for inside"""
+    click: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default_factory=tuple)
+    """x,y in px of the overlay: there is fluid here; may be repeated"""
+    not_here: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default_factory=tuple)
+    """x,y in px of the overlay: there is none here; may be repeated"""
+    start: float | None = None
+    """seconds into the clip"""
+    duration: float | None = None
+    """seconds to use"""
+    fps: float | None = None
+    """frames per second of an image sequence"""
+    max_size: int | None = None
+    """longer side of the working pictures, px (512)"""
+    set: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default_factory=tuple)
+    """one setting of read, segment or motion, such as --set segment.method=sam2; may be repeated"""
+    force: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default_factory=tuple)
+    """run this stage (read, flow, segment, masks) and all after it again; may be repeated"""
+    json: bool = False
+    """print the outcome as JSON"""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Measure how the fluid moves, for every frame: flow, surface and volume velocity as files for other tools."""
+
+    clip: Clip
+    """a video, a folder of pictures or a pattern"""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """folder for mask/, flow/, velocity/ and more (numbers from 1001), camera.json and motion.json"""
+    mask: Path | None = None
+    """where the fluid is: one picture, a folder of pictures or a video; white is fluid"""
+    camera: Path | None = None
+    """camera JSON: width, height, K, and R, t where the pose is known"""
+    depth: Path | None = None
+    """depth map of the first used frame (EXR, 16-bit PNG, npz): replaces the estimated front depth"""
+    flow: Path | None = None
+    """optical flow of the clip, made elsewhere: a folder or pattern of .flo, .exr, .npz or KITTI .png, or one .npz"""
+    format: Literal["flo", "exr", "npz"] = "exr"
+    """of the flow files; .flo has no place for confidence"""
+    raw: bool = False
+    """write the flow of single pairs as well, before averaging and completion"""
+    kind: Literal["auto", "stream", "fall", "pour", "plume"] | None = None
+    """what the fluid does; auto decides from evidence"""
+    size: float | None = None
+    """metres across the fluid (its longest side); sets the scale"""
+    start: float | None = None
+    """seconds into the clip"""
+    duration: float | None = None
+    """seconds to use"""
+    fps: float | None = None
+    """frames per second of an image sequence"""
+    max_size: int | None = None
+    """longer side of the working pictures, px (512)"""
+    config: Path | None = None
+    """YAML file with settings"""
+    set: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default_factory=tuple)
+    """one setting of read, segment, shape or motion, such as --set motion.wall=log; may be repeated"""
+    force: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default_factory=tuple)
+    """run this stage (read, flow, segment, geometry, velocities) and all after it again; may be repeated"""
+    json: bool = False
+    """print the outcome as JSON"""
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Measure an asset against a case with known truth."""
+
+    asset: Asset
+    """asset folder"""
+    truth: Path
+    """case folder: video, camera.json, truth.npz, scene.json"""
+    json: bool = False
+    """print as JSON"""
+
+
+@dataclass(frozen=True)
+class Validate:
+    """Check an asset: manifest, schema, arrays, USD."""
+
+    asset: Asset
+    """asset folder"""
+    json: bool = False
+    """print as JSON"""
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Make an asset from the clip that comes with the package."""
+
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("demo.fluid")
+    """asset folder to write"""
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """Tell what is installed and what this machine can do."""
+
+    json: bool = False
+    """print as JSON"""
+
+
+Command = Make | Fit | Sim | Inspect | Mask | Motion | Evaluate | Validate | Demo | Doctor

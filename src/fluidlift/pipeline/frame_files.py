@@ -1,0 +1,231 @@
+"""The files of one frame's motion, and a journal of those that are written, so that a stopped run goes on."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from fluidlift.io.frames import FIRST_FRAME
+from fluidlift.pipeline.body import camera_of, grid_of, setting_of
+from fluidlift.pipeline.lifting import FAST_FALL, plain_report
+from fluidlift.pipeline.reading import clip_of
+from fluidlift.pipeline.seeing import TRUSTED, masks_of, pairs_of
+from fluidlift.pipeline.story import Story
+from fluidlift.pipeline.written import cleared, numbered
+from fluidlift.types import CellType, FaceVelocity, SurfaceMotion
+
+if TYPE_CHECKING:
+    from fluidlift.motion.sequence import FrameMotion
+
+OVERLAY_SHARE = 0.65
+"""of the flow's colour in the overlay; the rest is the picture"""
+LEGEND_SIDE = 161
+"""px of the colour wheel"""
+
+
+@dataclass(frozen=True)
+class MotionFiles:
+    """Which files are written."""
+
+    format: Literal["flo", "exr", "npz"] = "exr"
+    """of the flow"""
+    raw: bool = False
+    """also the flow of single pairs, before averaging and completion"""
+
+    def of_frame(self, folder: Path, t: int) -> list[Path]:
+        """The files of frame t."""
+        flow = f"flow.{FIRST_FRAME + t:04d}.{self.format}"
+        found = [folder / "flow" / flow, numbered(folder / "mask", t, ".png"), numbered(folder / "observed", t, ".png")]
+        found += [numbered(folder / "overlay", t, ".png"), numbered(folder / "velocity", t, ".vdb")]
+        found.append(numbered(folder / "surface", t, ".ply"))
+        return [*found, folder / "raw_flow" / flow] if self.raw else found
+
+
+class FrameWriter:
+    """Writes frames one after the other and remembers what it has written.
+
+    Args:
+        story: with the geometry done.
+        folder: to write.
+        files: which.
+        again: write all frames again.
+    """
+
+    def __init__(self, story: Story, folder: Path, files: MotionFiles, *, again: bool) -> None:
+        self.story, self.folder, self.files = story, folder, files
+        self.clip, self.masks, self.pairs = clip_of(story), masks_of(story), pairs_of(story)
+        self.grid, self.cells = grid_of(story), setting_of(story).cell_types
+        self.scale = self._flow_scale()
+        self.journal = folder / "work" / "velocities" / f"{story.keys['velocities']}.rows"
+        self.rows: dict[int, dict[str, Any]] = {} if again else self._written_before()
+        if not self.rows:
+            self._clear()
+        self._write_once()
+
+    @cached_property
+    def wet(self) -> np.ndarray:
+        """bool [nx,ny,nz]: cells that hold fluid at rest."""
+        return np.isin(self.cells, (CellType.FLUID, CellType.INFLOW, CellType.OUTFLOW))
+
+    def write(self, t: int, found: FrameMotion | None) -> None:
+        """The files of a frame, and its row in the journal; `found` is None where it shows no fluid."""
+        from fluidlift.io.flow_files import write_flow
+        from fluidlift.io.images import write_png
+
+        mask, (width, height) = self.masks[t], self.clip.size
+        displacement = np.zeros((height, width, 2), np.float32) if found is None else found.displacement
+        trust = np.zeros((height, width), np.float32) if found is None else found.confidence
+        seen = np.zeros((height, width), bool) if found is None else found.observed & mask
+        write_png(numbered(self.folder / "mask", t, ".png"), _white(mask))
+        write_png(numbered(self.folder / "observed", t, ".png"), _white(seen))
+        # outside the fluid nothing is known: NaN, which .flo marks as unknown
+        known = np.where(mask[..., None], displacement, np.nan) if self.files.format == "flo" else displacement
+        write_flow(self.folder / "flow", t, known, np.where(mask, trust, 0.0), self.files.format)
+        if self.files.raw:
+            pair = self.pairs(t, t + 1)
+            write_flow(self.folder / "raw_flow", t, pair.displacement[0], pair.confidence[0], self.files.format)
+        write_png(numbered(self.folder / "overlay", t, ".png"), self._overlay(t, displacement, mask))
+        self._write_space(t, None if found is None else found.surface, None if found is None else found.velocity)
+        row = {
+            "frame": t,
+            "number": FIRST_FRAME + t,
+            "time": float(self.clip.times[t]),
+            **_row(found, mask, seen, trust),
+        }
+        self.rows[t] = row
+        with self.journal.open("a", encoding="utf-8") as journal:
+            journal.write(json.dumps(_plain(row)) + "\n")
+
+    def finish(self, pairs: int) -> list[dict[str, Any]]:
+        """The mask of the last frame, from which no flow goes on; the rows in order. The journal is done with."""
+        from fluidlift.io.images import write_png
+
+        write_png(numbered(self.folder / "mask", pairs, ".png"), _white(self.masks[pairs]))
+        self.journal.unlink(missing_ok=True)
+        return [self.rows[t] for t in range(pairs)]
+
+    def _written_before(self) -> dict[int, dict[str, Any]]:
+        """Rows of frames whose files are all there; a line that was cut off ends the list."""
+        rows: dict[int, dict[str, Any]] = {}
+        if not self.journal.is_file() or self.journal.is_symlink():
+            return rows
+        for line in self.journal.read_text(encoding="utf-8").splitlines():
+            try:
+                row = json.loads(line)
+                t = int(row["frame"])
+            except (ValueError, KeyError, TypeError):
+                break
+            if all(path.is_file() for path in self.files.of_frame(self.folder, t)):
+                rows[t] = row
+        return rows
+
+    def _clear(self) -> None:
+        self.journal.parent.mkdir(parents=True, exist_ok=True)
+        for old in self.journal.parent.glob("*.rows"):
+            old.unlink()
+        suffixes = {"flow": (".flo", ".exr", ".npz"), "raw_flow": (".flo", ".exr", ".npz"), "velocity": (".vdb",)}
+        suffixes |= {"surface": (".ply",), "mask": (".png",), "observed": (".png",), "overlay": (".png",)}
+        for name, kinds in suffixes.items():
+            if name != "raw_flow" or self.files.raw:
+                cleared(self.folder / name, kinds)
+
+    def _write_once(self) -> None:
+        """What does not change from frame to frame: camera, colour wheel."""
+        from fluidlift.io.atomic import write_json
+        from fluidlift.io.images import write_png
+        from fluidlift.motion.optical_flow import flow_picture
+        from fluidlift.pipeline.mask_files import MASK_FACTS
+
+        write_json(self.folder / "camera.json", camera_of(self.story).to_dict())
+        facts = {"of": self.clip.source, "size": self.clip.size, "frames": len(self.clip), "undistorted": True}
+        write_json(self.folder / "mask" / MASK_FACTS, facts)
+        across = np.linspace(-self.scale, self.scale, LEGEND_SIDE, dtype=np.float32)
+        wheel = np.stack(np.meshgrid(across, across), axis=-1)
+        disc = np.hypot(wheel[..., 0], wheel[..., 1]) <= self.scale
+        write_png(self.folder / "colour_wheel.png", flow_picture(wheel, disc, self.scale))
+
+    def _flow_scale(self) -> float:
+        """px per frame of full brightness, the same for the whole clip: a little above its mean motion."""
+        g = self.story["geometry"].arrays
+        speed = np.linalg.norm(g["mean_flow"], axis=-1)[(g["mean_confidence"] > TRUSTED) & g["mask"]]
+        return max(1.3 * float(np.percentile(speed, 99)), 0.5) if speed.size else 1.0
+
+    def _overlay(self, t: int, displacement: np.ndarray, mask: np.ndarray) -> np.ndarray:
+        from fluidlift.motion.optical_flow import flow_picture
+
+        picture = np.asarray(self.clip.frames[t])
+        colour = flow_picture(displacement, mask, self.scale)
+        blended = OVERLAY_SHARE * colour + (1 - OVERLAY_SHARE) * picture
+        return np.where(mask[..., None], blended, picture).astype(np.uint8)
+
+    def _write_space(self, t: int, surface: SurfaceMotion | None, velocity: FaceVelocity | None) -> None:
+        """Points on the surface with their velocities, and the volume."""
+        from fluidlift.io.ply import write_points
+        from fluidlift.io.volume_grid import velocity_grid, write_vdb
+
+        points = np.zeros((0, 3)) if surface is None else surface.points
+        speeds = np.zeros((0, 3)) if surface is None else surface.velocities
+        seen = np.zeros(0, bool) if surface is None else surface.observed
+        extras: dict[str, np.ndarray] = {"observed": seen.astype(np.uint8)}
+        for i, name in enumerate(("vx", "vy", "vz")):
+            extras[name] = speeds[:, i].astype(np.float32)
+        write_points(numbered(self.folder / "surface", t, ".ply"), points, extras=extras)
+        still = FaceVelocity.zeros(self.grid) if velocity is None else velocity
+        # a plume moves the air around it, too: there the whole box is stored
+        moving = self.wet if velocity is None else self.wet | (np.abs(velocity.at_centers()).max(axis=-1) > 0)
+        grid = velocity_grid(still, self.grid, active=moving)
+        write_vdb(numbered(self.folder / "velocity", t, ".vdb"), [grid])
+
+
+def _white(mask: np.ndarray) -> np.ndarray:
+    return np.where(mask, 255, 0).astype(np.uint8)
+
+
+def _row(found: FrameMotion | None, mask: np.ndarray, seen: np.ndarray, trust: np.ndarray) -> dict[str, Any]:
+    """What is known of one frame, as plain values."""
+    row: dict[str, Any] = {"fluid_share": float(mask.mean())}
+    if found is None:
+        return row
+    speed = np.linalg.norm(found.displacement[mask], axis=-1)
+    row |= {
+        "observed_share": float(seen[mask].mean()),
+        "trusted_share": float((trust[mask] > TRUSTED).mean()),
+        "flow_median": float(np.median(speed)),
+        "flow_p99": float(np.percentile(speed, 99)),
+        "free_fall_share": found.free_fall_share,
+        "front_factor": found.front_factor,
+        "warnings": _doubts(found),
+    }
+    if found.surface is not None and len(found.surface.velocities):
+        fast = np.linalg.norm(found.surface.velocities, axis=1)
+        row |= {
+            "surface_speed_mean": float(fast.mean()),
+            "surface_speed_median": float(np.median(fast)),
+            "surface_speed_p90": float(np.percentile(fast, 90)),
+        }
+    return row | plain_report(found)
+
+
+def _doubts(found: FrameMotion) -> list[str]:
+    """What is wrong with one frame."""
+    doubts = []
+    if not found.observed.any():
+        doubts.append("nothing of the flow was trusted: all of it is filled in")
+    if found.surface is None:
+        doubts.append("none of its fluid lies on the body: no velocities in space")
+    if found.report is not None and not found.report.solve.converged:
+        doubts.append("the divergence-free solve did not converge")
+    if (found.free_fall_share or 0.0) > FAST_FALL:
+        doubts.append("much of the steep part moves at the speed of free fall, which was not measured")
+    return doubts
+
+
+def _plain(row: dict[str, Any]) -> dict[str, Any]:
+    from fluidlift.io.atomic import plain
+
+    return plain(row)

@@ -1,0 +1,79 @@
+"""The user's own optical flow in place of the estimated one.
+
+It belongs to the frames of the clip's file: `--start`, `--duration`, cuts and left-out frames select from it. Flow that
+was made for the frames that are used alone (as `fluidlift motion` writes it) is taken as well, and said so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fluidlift.config import JobConfig
+from fluidlift.errors import InputRejected
+from fluidlift.io.video import frames_before
+from fluidlift.pipeline.reading import Inputs, clip_of
+from fluidlift.pipeline.seeing import Pair
+from fluidlift.pipeline.story import Story
+
+if TYPE_CHECKING:
+    from fluidlift.io.flow_files import FlowFiles
+
+
+def given_flow(story: Story, inputs: Inputs, config: JobConfig) -> tuple[Iterable[Pair], list[str]]:
+    """The user's displacement and confidence of each pair of the used frames, and warnings.
+
+    Raises:
+        InputRejected: a flow of another shape, or too few pairs, with the first frame that lacks one.
+    """
+    from fluidlift.io.images import read_distortion
+
+    read = story["read"]
+    kept = np.asarray(read.arrays["kept"])
+    files, places, warnings = _opened(story, inputs, config, kept)
+    warnings += files.warnings
+    if read.meta["stabilised"]:
+        warnings.append("the clip was steadied, the given flow was not: it should be that of steady pictures")
+    if inputs.camera is not None and read_distortion(inputs.camera) is not None:
+        warnings.append("lens distortion was taken out of the clip: the given flow should be that of such pictures")
+
+    return (_between(files, first, last) for first, last in pairwise(places.tolist())), warnings
+
+
+def _opened(
+    story: Story, inputs: Inputs, config: JobConfig, kept: np.ndarray
+) -> tuple[FlowFiles, np.ndarray, list[str]]:
+    """The files, and the pair of theirs that begins at each used frame."""
+    from fluidlift.io.flow_files import open_flow
+
+    assert inputs.flow is not None
+    size, decoded = clip_of(story).size, int(story["read"].meta["decoded_frames"])
+    before = frames_before(inputs.clip, config.read.start, config.read.fps) if config.read.start > 0 else 0
+    used = np.arange(len(kept))
+    ways = [(before, decoded - 1, kept, "")]
+    if before:
+        ways.append((0, decoded - 1, kept, f"it is taken to begin where --start does, with frame {before} of the file"))
+    if decoded > len(kept):
+        ways.append((0, len(kept) - 1, used, "it is taken to be that of the frames that are used alone"))
+    refusal: InputRejected | None = None
+    for start, pairs, places, words in ways:
+        try:
+            files = open_flow(inputs.flow, size, pairs, start=start)
+        except InputRejected as error:
+            refusal = refusal or error
+            continue
+        return files, places, [f"the given flow is shorter than the clip's file: {words}"] if words else []
+    assert refusal is not None
+    raise refusal
+
+
+def _between(files: FlowFiles, first: int, last: int) -> Pair:
+    """Displacement and confidence from one used frame to the next; frames between that were left out stood still."""
+    displacement, confidence = files.pair(first)
+    for k in range(first + 1, last):
+        more, sure = files.pair(k)
+        displacement, confidence = displacement + more, np.minimum(confidence, sure)
+    return displacement, confidence

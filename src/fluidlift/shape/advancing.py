@@ -1,0 +1,79 @@
+"""The outline, frame by frame, of a fluid that moves through the picture: smoke that rises, a jet that arrives."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+
+from fluidlift.shape.background import still_background, typical_contrast
+from fluidlift.shape.evidence import POOLING, Evidence, change_over_time, pool
+from fluidlift.shape.min_cut import disc
+from fluidlift.shape.presence import Presence
+from fluidlift.shape.region import clean_region, solids_in, still_pixels
+from fluidlift.types.clip import Label
+
+SHADOW = 0.2
+"""factor on changes of brightness against the sign of the fluid's own contrast"""
+FAINTEST = 0.3
+"""of the fluid's typical contrast with the background: what is fainter is not counted as fluid"""
+
+
+def advancing_labels(
+    evidence: Evidence, score: np.ndarray, presence: Presence, told: np.ndarray | None = None
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Labels u8 and confidence f32 [h,w] of every frame.
+
+    Args:
+        evidence: of the clip.
+        score: float32 [h,w], log odds of fluid over the whole clip.
+        presence: of activity.
+        told: float32 [h,w], log odds that the user added; None: none.
+    """
+    hint = np.zeros_like(score) if told is None else told
+    sure_of = score + hint
+    domain = cv2.dilate(clean_region(sure_of > -1.0).astype(np.uint8), disc(0.01 * max(score.shape))) > 0
+    domain &= hint > -2.0
+    still = still_pixels(evidence)
+    for odds in median_over_time(odds_over_time(evidence, presence, domain, hint)):
+        region, solid = solids_in(clean_region(odds > 0.0), still)
+        labels = np.zeros(score.shape, np.uint8)
+        labels[region], labels[solid] = Label.FLUID, Label.SOLID
+        yield labels, np.tanh(0.5 * np.abs(odds))
+
+
+def odds_over_time(
+    evidence: Evidence, presence: Presence, domain: np.ndarray, hint: np.ndarray
+) -> Iterator[np.ndarray]:
+    """float32 [h,w], log odds of fluid in every frame: it differs from what is behind it, moves, has its colour."""
+    background, known, like_fluid = still_background(evidence, presence, domain)
+    contrast, brightens = typical_contrast(evidence, presence, background, known)
+    threshold = np.maximum(4.0 * evidence.noise, FAINTEST * contrast)
+    sigma = POOLING * max(evidence.noise.shape)
+    for t, change in enumerate(change_over_time(evidence)):
+        picture = evidence.source[t].astype(np.float32)
+        moved = (pool(np.log(np.maximum(change, 1.0)), sigma) - evidence.level) / 0.3
+        change_of_colour = picture - background
+        size = np.abs(change_of_colour).sum(axis=-1)
+        differs = size / threshold
+        differs[change_of_colour[..., 0] * brightens < -0.5 * size] *= SHADOW
+        stands_out = np.log(np.maximum(differs, 1e-3)) / 0.3
+        seen = stands_out + 0.25 * np.clip(moved, -4.0, 4.0)
+        best = np.where(known, seen, np.clip(moved, -3.0, 3.0) + like_fluid(picture)) + hint
+        yield np.clip(np.where(domain, best, -12.0), -12.0, 12.0).astype(np.float32)
+
+
+def median_over_time(odds: Iterator[np.ndarray]) -> Iterator[np.ndarray]:
+    """Median of three neighbouring frames, ends kept; only three are held at a time."""
+    before = next(odds, None)
+    if before is None:
+        return
+    yield before
+    here = next(odds, None)
+    if here is None:
+        return
+    for after in odds:
+        yield np.maximum(np.minimum(before, here), np.minimum(np.maximum(before, here), after))
+        before, here = here, after
+    yield here

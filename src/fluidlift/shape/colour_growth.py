@@ -1,0 +1,114 @@
+"""Colour where motion says too little: quiet water beside lively water, and clips where everything moves a little."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from scipy.ndimage import convolve1d
+
+from fluidlift.shape.background import colour_bins
+from fluidlift.shape.evidence import Evidence
+from fluidlift.shape.frame_pictures import typical_picture
+from fluidlift.shape.min_cut import edge_weights, min_cut
+
+STIFFNESS = 4.0
+"""log odds per px of outline in a smooth place"""
+RARE = 1e-4
+"""share of a colour below which it is held to be unknown"""
+DECISIVE = 4.0
+"""log odds at which colour alone is held to say no more"""
+QUIET = 1.0
+"""log odds of motion below which colour may add a place"""
+STEADY = 3.0
+"""log odds at which motion is held to say no more against quiet water"""
+GIVEN = 4.0
+"""log odds by which what motion has decided is kept"""
+DIRECT = 0.15
+"""streaming at which a place counts fully as a seed: flow that goes somewhere, in a clip where everything shakes"""
+RIM = 0.04
+"""part of the longer side: a stabilised picture is made up at its rim, nothing there is a seed"""
+SCARCE = 1.0
+"""log odds against fluid of a place that does not stream"""
+CLEAR = 2.0
+"""weight of colour against streaming, which marks few places"""
+SEEDED = 0.25
+"""parts with fewer seeds than this share of the best part's are not the fluid"""
+
+
+def colour_odds(picture: np.ndarray, fluid: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """float32 [h,w]: log odds of fluid from colour, within +-`DECISIVE`.
+
+    Args:
+        picture: float32 [h,w,3], opponent colours.
+        fluid: float [h,w], weight of each pixel in the histogram of the fluid.
+        other: float [h,w], the same of the rest.
+    """
+    bins = colour_bins(picture)
+    shares = []
+    for weight in (fluid, other):
+        counts = np.zeros((16, 16, 16), np.float32)
+        np.add.at(counts, bins, weight.astype(np.float32))
+        for axis in range(3):
+            counts = convolve1d(counts, np.array([0.25, 0.5, 0.25], np.float32), axis=axis, mode="constant")
+        shares.append(counts[bins] / max(float(counts.sum()), 1e-6) + RARE)
+    return np.clip(np.log(shares[0] / shares[1]), -DECISIVE, DECISIVE).astype(np.float32)
+
+
+def with_quiet_water(evidence: Evidence, score: np.ndarray, region: np.ndarray, *, rounds: int = 3) -> np.ndarray:
+    """The region, bool [h,w], and what is quiet beside it and has its colours.
+
+    Nothing is taken away, and nothing that moves is added: motion has decided there.
+
+    Args:
+        evidence: of the clip.
+        score: float32 [h,w], log odds of fluid.
+        region: bool [h,w], what motion and edges gave.
+        rounds: in which the colours are read anew from the larger region.
+    """
+    picture = typical_picture(evidence.pictures)
+    across, down = edge_weights(picture, STIFFNESS)
+    chance = 1.0 / (1.0 + np.exp(-score))
+    found = region
+    for _ in range(rounds):
+        colour = colour_odds(picture, found * chance, ~found * (1.0 - chance))
+        odds = np.clip(score, -STEADY, STEADY) + colour
+        odds[score > QUIET] = -GIVEN
+        odds[region] = GIVEN
+        found = min_cut(odds, across, down) | region
+    return found
+
+
+def grown_from_streams(evidence: Evidence, inside: np.ndarray, *, rounds: int = 10) -> np.ndarray | None:
+    """bool [h,w]: what has the colours of the places that stream and hangs together with them; None without any.
+
+    For clips in which the camera or its stabilisation moves everything a little: change tells nothing there, but
+    only a fluid goes on in one direction.
+
+    Args:
+        evidence: of the clip.
+        inside: bool [h,w], where to look.
+        rounds: at most, in which the colours are read anew.
+    """
+    picture = typical_picture(evidence.pictures)
+    rim = max(1, round(RIM * max(inside.shape)))
+    middle = np.zeros_like(inside)
+    middle[rim:-rim, rim:-rim] = True
+    streaming = np.where(middle & inside, evidence.streaming, 0.0)
+    if float(streaming.max()) < DIRECT or (streaming > DIRECT).mean() < 1e-3:
+        return None
+    seeds = np.clip(streaming / DIRECT, 0.0, 1.0)
+    motion = 6.0 * streaming / float(streaming.max()) - SCARCE
+    across, down = edge_weights(picture, STIFFNESS)
+    fluid, other = seeds, (streaming < 0.1 * DIRECT).astype(np.float32)
+    before = None
+    for _ in range(rounds):
+        odds = motion + CLEAR * colour_odds(picture, fluid, other)
+        found = min_cut(np.where(inside, odds, -100.0), across, down)
+        count, parts = cv2.connectedComponents(found.astype(np.uint8), connectivity=4)
+        held = np.bincount(parts.ravel(), weights=(seeds * found).ravel(), minlength=count)
+        held[0] = 0.0
+        found = ((held > 0.0) & (held >= SEEDED * held.max()))[parts]
+        if before is not None and np.array_equal(found, before):
+            break
+        before, fluid, other = found, found + 2.0 * seeds, (~found).astype(np.float32)
+    return before if before is not None and before.any() else None

@@ -1,0 +1,62 @@
+"""The velocities that the fit gets, and what was seen of them."""
+
+import numpy as np
+import pytest
+
+from fluidlift.config import build_config
+from fluidlift.io.stage_cache import load_stage
+from fluidlift.motion.sequence import MotionOptions
+from fluidlift.pipeline import STAGES, Silence
+from fluidlift.pipeline.lifting import motion_options, motion_warnings, seen_cells, seen_of, targets_of
+from fluidlift.pipeline.story import Result, Story
+from fluidlift.types import Grid, SurfaceMotion
+
+GRID = Grid((4, 3, 2), 0.5, (0.0, 0.0, 0.0))
+
+
+@pytest.fixture(scope="module")
+def story(made):
+    story = Story(made.folder, STAGES, progress=Silence())
+    for name in ("read", "segment", "geometry", "motion"):
+        (facts,) = (made.folder / "work" / name).glob("*.json")
+        story.results[name] = Result(*load_stage(made.folder, name, facts.stem))
+    return story
+
+
+def test_the_settings_say_what_the_motion_does_by_itself():
+    assert motion_options(build_config()) == MotionOptions()
+
+
+def test_the_settings_reach_the_motion():
+    found = motion_options(
+        build_config(overrides=["motion.wall=log", "motion.half_window=9", "motion.divergence=paper"])
+    )
+    assert (found.wall, found.half_window, found.divergence) == ("log", 9, "paper")
+    assert found.reach >= found.half_window
+
+
+def test_cells_with_an_observed_point_are_seen():
+    points = np.array([[0.1, 0.1, 0.1], [1.6, 1.2, 0.9], [9.0, 0.0, 0.0], [0.6, 0.6, 0.6]])
+    surface = SurfaceMotion(points, np.zeros((4, 3)), np.array([True, True, True, False]))
+    assert np.argwhere(seen_cells(surface, GRID)).tolist() == [[0, 0, 0], [3, 2, 1]]
+
+
+def test_every_target_says_which_cells_were_seen(story):
+    targets, seen = targets_of(story), seen_of(story)
+    assert len(targets) == len(seen) == 2
+    for target, cells in zip(targets, seen):
+        assert cells.shape == target.shape and 0 < cells.sum() < cells.size
+
+
+def test_completed_flow_is_kept_for_the_wanted_frames_alone(story):
+    completed = story["motion"].arrays["completed"]
+    known = np.isfinite(np.asarray(completed, np.float32)).all(axis=(1, 2, 3))
+    assert set(story["motion"].meta["targets"]) <= set(np.flatnonzero(known)) != set(range(len(completed)))
+
+
+def test_frames_whose_solve_failed_are_named():
+    reports = [{"frame": t, "solve": {"converged": t != 3}} for t in range(5)]
+    (said,) = motion_warnings(reports, "stream", 0.0)
+    assert "1 of 5, the first is 3" in said
+    assert motion_warnings(reports[:3], "stream", 0.0) == []
+    assert "free fall" in motion_warnings([], "fall", 0.5)[0]

@@ -88,7 +88,7 @@ def test_commands_and_settings_in_the_documents_exist(page):
     code = code_of(page.read_text(encoding="utf-8"))
     used = set(re.findall(r"(?:^|[\s/`])fluidlift ([a-z]+)\b", code))
     assert used <= set(COMMANDS)
-    for setting in set(re.findall(r"--set ([\w.]+=[\w.]+)", code)) - {"section.name=value"}:
+    for setting in set(re.findall(r"--set ([\w.]+=[\w.-]+)", code)) - {"section.name=value"}:
         build_config(overrides=[setting])  # raises on an unknown name or a wrong value
 
 

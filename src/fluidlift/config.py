@@ -93,14 +93,20 @@ class MotionConfig:
     """where a learned method runs: cpu, or cuda"""
     download: bool = False
     """whether weights may be fetched, where a package knows where from"""
+    flow_channels: tuple[str, ...] = ()
+    """names of the two OpenEXR channels of a flow that is given, such as R,G; none: those that are known"""
+    flow_v_up: bool | None = None
+    """whether v of a flow that is given points up; null: as its format has it"""
+    flow_scale: float = 1.0
+    """px of its own picture per stored unit of a flow that is given, such as 0.04 for px per second at 25 per second"""
     half_window: int = 1
     """frames on either side whose flow is averaged into one frame's motion"""
     reach: int = 6
     """frames on either side that are asked where the near ones fail"""
     along_paths: bool = True
     """average along the fluid's paths too; false: at fixed pixels, over half_window alone"""
-    wall: Literal["cubic", "log"] = "cubic"
-    """how the velocity falls off towards the bed: third-order, or the log law of rivers"""
+    wall: Literal["cubic", "log", "film"] = "cubic"
+    """how the velocity falls off towards the bed: third-order, the log law of rivers, or a laminar film"""
     divergence: Literal["paper", "exact"] = "exact"
     """form of the screen-divergence constraint"""
     targets: int = 8
@@ -215,6 +221,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "shape.max_gaussians": (100, 1e9),
     "shape.rays": (1, 1001),
     "shape.longest_union": (1, 1000),
+    "motion.flow_scale": (-1e9, 1e9),
     "motion.half_window": (0, 50),
     "motion.reach": (0, 200),
     "motion.targets": (1, 1e6),

@@ -77,7 +77,7 @@ def test_the_forward_layer_wins_and_backward_alone_is_refused(tmp_path):
     path = write_channels(tmp_path / "a.exr", {"R": zero + 9, "G": zero + 9, "forward.u": zero + 2, "forward.v": zero})
     assert (read_flow(path, SIZE, 1).displacement[0, ..., 0] == 2).all()
     path = write_channels(tmp_path / "b.exr", {"backward.u": zero, "backward.v": zero})
-    with pytest.raises(InputRejected, match=r"backward\.u.*name the two channels"):
+    with pytest.raises(InputRejected, match=r"backward\.u.*name the two that hold"):
         read_flow(path, SIZE, 1)
     layout = FlowLayout(channels=("backward.u", "backward.v"), scale=-1.0, v_up=True)
     assert read_flow(path, SIZE, 1, layout=layout).displacement.shape == (1, 23, 37, 2)
@@ -88,7 +88,7 @@ def test_vectors_to_and_from_a_frame_in_one_layer_are_not_guessed_at(tmp_path):
     zero = np.zeros(SIZE[::-1], np.float32)
     names = {f"ViewLayer.Vector.{c}": zero + k for k, c in enumerate("XYZW")}
     path = write_channels(tmp_path / "a.exr", names)
-    with pytest.raises(InputRejected, match="name the two channels"):
+    with pytest.raises(InputRejected, match="name the two that hold"):
         read_flow(path, SIZE, 1)
     layout = FlowLayout(channels=("ViewLayer.Vector.Z", "ViewLayer.Vector.W"), scale=-1.0, v_up=True)
     assert (read_flow(path, SIZE, 1, layout=layout).displacement[0] == [-2.0, 3.0]).all()

@@ -42,6 +42,19 @@ def test_noise_of_the_camera_is_not_taken_for_combing():
     assert is_combed([rng.integers(0, 256, (64, 64, 3), np.uint8) for _ in range(4)]) is False
 
 
+def test_sharpened_frames_are_not_taken_for_combing():
+    """Sharpening raises the curvature of rows beyond that of noise, and that of columns as much."""
+    sharp = [
+        np.clip(4.0 * p - 3.0 * cv2.GaussianBlur(p, (0, 0), 1.0), 0, 255).astype(np.uint8)
+        for p in moving(8, 4.0, sigma=0.4)
+    ]
+    assert is_combed(sharp) is False
+
+
+def test_slow_motion_between_the_fields_is_seen_in_fine_texture():
+    assert is_combed(woven(moving(12, 2.0, sigma=1.0, noise=0.0))) is True
+
+
 def test_a_still_picture_tells_nothing():
     picture = moving(1, 0.0, noise=0.0)[0]
     assert is_combed([picture, picture, picture]) is None

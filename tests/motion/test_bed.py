@@ -9,7 +9,7 @@ from fluidlift.motion.bed import (
     SURFACE_COEFFICIENT,
     bed_velocity,
     film_profile,
-    laminar_layer_thickness,
+    film_share,
     layer_thickness,
     log_profile,
     speed_share,
@@ -39,18 +39,10 @@ def test_the_profile_is_near_the_exact_laminar_layer() -> None:
     assert abs(1.5 / 4.64 - 0.332) < 0.01
 
 
-def test_laminar_layers_grow_with_the_root_of_the_way() -> None:
-    one = laminar_layer_thickness(1e-6, 1.0, 1.0)
-    assert one == pytest.approx(4.64e-3)
-    assert laminar_layer_thickness(1e-6, 4.0, 1.0) == pytest.approx(2 * one)
-    assert laminar_layer_thickness(4e-6, 1.0, 1.0) == pytest.approx(2 * one)
-    assert laminar_layer_thickness(0.0, 1.0, 1.0) == 0.0
-
-
 def test_layers_scale_with_the_cell_and_stay_within_the_fluid() -> None:
     for kind in KINDS:
         assert layer_thickness(kind, 0.02) == pytest.approx(2 * layer_thickness(kind, 0.01))
-        assert layer_thickness(kind, 0.1, depth=0.03) <= 0.03
+        assert speed_share(0.03, kind=kind, spacing=0.1, depth=0.03) == pytest.approx(1.0)
     assert layer_thickness("pour", 0.01) > layer_thickness("stream", 0.01) > layer_thickness("plume", 0.01)
     with pytest.raises(ValueError, match="lava"):
         layer_thickness("lava", 0.01)
@@ -143,3 +135,33 @@ def test_bed_cells_take_the_wall_function_and_the_depth_of_their_own_column() ->
         bed_velocity(surface, np.array([1.0, 0.0, 0.0]), kind="stream", spacing=0.1, wall="log")
     with pytest.raises(ValueError, match="plug"):
         speed_share(np.array(0.1), kind="stream", spacing=0.1, wall="plug")
+
+
+def sloping_surface(slope: float, speed: float) -> tuple[np.ndarray, np.ndarray]:
+    """Points (m) and velocities (m/s) of a plane that falls along x."""
+    x, y = (a.ravel() for a in np.meshgrid(np.linspace(0, 2, 21), np.linspace(0, 0.6, 7), indexing="ij"))
+    along = np.array([1.0, 0.0, -slope]) / np.hypot(1.0, slope)
+    return np.stack([x, y, -slope * x], axis=-1), np.tile(speed * along, (x.size, 1))
+
+
+def test_films_of_honey_are_told_from_rivers_by_their_speed_for_slope_and_depth() -> None:
+    angle, depth, viscosity = np.radians(22), 0.04, 0.007
+    film = 9.81 * np.sin(angle) * depth**2 / (2 * viscosity)  # Nusselt 1916; Re = 2.4, so sqrt(Re / 2) = 1.1
+    points, velocities = sloping_surface(np.tan(angle), film)
+    shares = [film_share(size * points, size * velocities, size * depth) for size in (0.5, 1.0, 2.0)]
+    assert shares[0] == 1.0 and shares[1] > 0.85
+    assert shares[2] > 0.5  # a size twice too large makes the ratio 1.4 times as large
+    # Manning's n = 0.035, a stony brook of 0.3 m on a slope of 2 %: 1.8 m/s; and a torrent of boulders at 10 %, n = 0.1
+    for slope, n in ((0.02, 0.035), (0.1, 0.1)):
+        speed = 0.3 ** (2 / 3) * np.sqrt(slope) / n
+        points, velocities = sloping_surface(slope, speed)
+        assert film_share(points, velocities, 0.3) < 0.3
+    level, still = sloping_surface(0.0, 0.01)
+    assert film_share(level, still, 0.3) == 0.0
+
+
+def test_a_stream_that_gains_speed_as_it_falls_has_no_friction_to_explain() -> None:
+    points, velocities = sloping_surface(0.3, 1.0)
+    fast = np.sqrt(0.05**2 + 2 * 9.81 * 0.3 * points[:, :1])  # z + v^2 / 2g is the same everywhere
+    assert film_share(points, fast * velocities, 0.3) == 0.0
+    assert film_share(points, 0.2 * velocities, 0.3) == 1.0

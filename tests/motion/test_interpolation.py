@@ -72,6 +72,19 @@ def test_a_constant_stays_constant_however_far_it_has_to_go() -> None:
     assert report.converged and reached.all() and np.abs(out - 2.5).max() < 1e-4
 
 
+def test_a_small_mask_in_a_large_picture_is_filled_as_if_it_were_alone() -> None:
+    rng = np.random.default_rng(4)
+    weight, values = np.where(rng.random((20, 30)) < 0.1, 1.0, 0.0), rng.standard_normal((20, 30, 2))
+    alone, _, _ = diffusion_interpolation(values, weight, np.ones((20, 30), bool), tolerance=1e-6)
+    around = ((41, 7), (13, 90))
+    out, reached, _ = diffusion_interpolation(
+        np.pad(values, (*around, (0, 0))), np.pad(weight, around), np.pad(np.ones((20, 30), bool), around),
+        tolerance=1e-6,
+    )  # fmt: skip
+    assert reached.sum() == 600 and (out[~reached] == 0).all()
+    np.testing.assert_array_equal(out[reached].reshape(20, 30, 2), alone)
+
+
 def test_between_two_ends_values_change_evenly() -> None:
     mask = np.ones((9, 41), bool)
     weight, values = np.zeros(mask.shape), np.zeros((*mask.shape, 1))

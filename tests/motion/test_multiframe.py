@@ -264,16 +264,40 @@ def test_frames_on_disk_are_read_a_few_at_a_time(tmp_path: Path) -> None:
     # the first call pays for what is loaded once
     multiframe_flow(frames[:8], DenseInverseSearch())
 
-    def beyond_the_result(count: int) -> float:
+    def mapped(name: str, dtype: type, shape: tuple[int, ...]) -> np.memmap:
+        return np.memmap(tmp_path / name, dtype, "w+", shape=shape)
+
+    def most_memory(count: int, out: tuple[np.ndarray, np.ndarray] | None) -> float:
         tracemalloc.start()
-        flow = multiframe_flow(frames[:count], DenseInverseSearch())
+        multiframe_flow(frames[:count], DenseInverseSearch(), out=out)
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
-        return peak - flow.displacement.nbytes - flow.confidence.nbytes
+        return peak
 
-    short, long = beyond_the_result(20), beyond_the_result(60)
     picture = H * W * 4
-    assert long - short < 2 * picture  # 40 frames more
+    grown = most_memory(60, None) - most_memory(20, None)
+    assert grown < 40 * 2.5 * picture + 2 * picture  # 40 results more: two floats and a half float per pixel
+    files = {
+        n: (mapped(f"d{n}", np.float16, (n - 1, H, W, 2)), mapped(f"c{n}", np.float16, (n - 1, H, W))) for n in (20, 60)
+    }
+    # what is written to files is not in memory: not one picture of the 40 more
+    assert most_memory(60, files[60]) - most_memory(20, files[20]) < picture
+
+
+@pytest.mark.parametrize("method", ["multiframe", "dis"])
+def test_flow_is_written_into_the_arrays_that_are_given(method: str) -> None:
+    frames = pictures(128 + 35 * drifting((2.0, 0.0), 9))
+    plain = estimate_flow(frames, method=method)
+    out = np.full((8, H, W, 2), np.nan, np.float32), np.full((8, H, W), np.nan, np.float16)
+    given = estimate_flow(frames, method=method, out=out)
+    assert given.displacement is out[0] and given.confidence is out[1]
+    assert np.array_equal(out[0], plain.displacement) and np.array_equal(out[1], plain.confidence)
+    half = estimate_flow(frames, method=method, out=(out[0].astype(np.float16), out[1]))
+    # float16 holds 2 px to 1/1000; the mean of the neighbours and the pair are rounded before they are used
+    assert np.abs(half.displacement[:, *INNER] - plain.displacement[:, *INNER]).max() < 0.02
+    for displacement, confidence in ((out[0][1:], out[1]), (out[0], out[1][:, 1:]), (out[0].astype(np.int16), out[1])):
+        with pytest.raises(ValueError, match="to fill"):
+            estimate_flow(frames, method=method, out=(displacement, confidence))
 
 
 def test_a_short_clip_is_measured_as_it_is_and_progress_is_told() -> None:

@@ -107,6 +107,38 @@ def test_progress_and_an_estimator_of_ones_own() -> None:
     assert np.abs(flow.displacement[:, 16:-16, 16:-16]).max() < 0.05
 
 
+class SureOfTheLeftHalf(DenseInverseSearch):
+    """An estimator that says itself how far it trusts its answer."""
+
+    def estimate(self, first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+        d = self.displacement(first, second)
+        own = np.ones(d.shape[:2], np.float32)
+        own[:, d.shape[1] // 2 :] = 0.25
+        return d, own
+
+
+def test_an_estimators_own_doubt_lowers_the_trust_and_nothing_else() -> None:
+    frames = np.stack([shifted(texture(64, 96), 2.0 * t, 0.0) for t in range(2)])
+    plain, doubting = (estimate_flow(frames, method=m()) for m in (DenseInverseSearch, SureOfTheLeftHalf))
+    assert np.array_equal(plain.displacement, doubting.displacement)
+    share = doubting.confidence[0, 16:-16, 16:-16] / plain.confidence[0, 16:-16, 16:-16]
+    assert (share[:, :32] == 1.0).all()
+    assert np.allclose(share[:, 32:], 0.25, rtol=1e-3)  # float16
+
+
+def test_values_that_are_not_finite_become_rest_without_trust() -> None:
+    class WithHoles(DenseInverseSearch):
+        def displacement(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+            d = super().displacement(first, second)
+            d[20:30, 20:30] = np.nan
+            return d
+
+    frames = np.stack([shifted(texture(64, 96), 3.0 * t, 0.0) for t in range(2)])
+    flow = estimate_flow(frames, method=WithHoles())
+    assert (flow.displacement[0, 20:30, 20:30] == 0.0).all() and (flow.confidence[0, 20:30, 20:30] == 0.0).all()
+    assert np.isfinite(flow.confidence).all() and flow.confidence[0, 40:56, 16:80].mean() > 0.8
+
+
 def test_wrong_input_is_named() -> None:
     with pytest.raises(ValueError, match="at least two"):
         estimate_flow(np.zeros((1, 16, 16, 3), np.uint8))

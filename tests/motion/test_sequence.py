@@ -106,6 +106,26 @@ def test_a_uniform_stream_has_its_speed_on_the_screen_on_the_surface_and_below()
     assert found.report.solve.converged
 
 
+def test_ground_that_was_dry_a_moment_ago_does_not_slow_a_front() -> None:
+    fluid, columns = still_mask(0), np.arange(CAMERA.size[0])
+    clip = Clip(9, noise=0.0)
+
+    def advancing(frame: int) -> np.ndarray:
+        return fluid & (columns < 20 + 3 * frame)
+
+    def with_ground(first: int, last: int) -> PixelFlow:
+        seen = clip(first, last)
+        dry = np.stack([~advancing(t) for t in range(first, last)])
+        return PixelFlow(np.where(dry[..., None], 0.0, seen.displacement).astype(np.float32), seen.confidence)
+
+    scene = MotionScene(CAMERA, None, None, None, "stream", INTERVAL)
+    (found,) = motion_sequence(with_ground, advancing, 9, scene, frames=[4])
+    new = advancing(4) & ~advancing(3)
+    assert new.sum() > 20
+    # the truth is smooth; the mean of a wet and a dry pair, both trusted, would be at most 2/3 of it
+    assert np.abs(found.displacement - clip.truth)[new].max() < 0.05 * np.abs(clip.truth[new]).max()
+
+
 def test_only_a_window_of_the_clip_is_in_memory_however_long_it_is() -> None:
     most = []
     for pairs in (30, 150):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fluidlift.motion.volume import VolumeOptions, VolumeSolver, volume_velocity
+from fluidlift.motion.volume import DOUBT, VolumeOptions, VolumeSolver, volume_velocity
 from fluidlift.types import CellType, FaceVelocity, Grid, SurfaceMotion
 
 
@@ -179,6 +179,43 @@ def test_the_log_law_carries_less_than_a_thin_layer_and_smoke_knows_neither() ->
     assert (plume.u == same.u).all()
     with pytest.raises(ValueError, match="wall"):
         volume_velocity(surface, None, types, grid, kind="stream", wall="brick")
+
+
+def test_a_stream_too_slow_for_its_slope_drags_through_its_depth_like_a_viscous_film() -> None:
+    types, grid = channel(36, 6, 9, 6)
+    height = 6 - np.arange(36) // 12  # one in twelve
+    for i, n in enumerate(height):
+        types[i, :, 1 + n :] = CellType.EMPTY
+    surface = surface_of(grid, 0.0, [1.0, 0, 0])
+    surface.points[:, 2] = 0.1 * (height[grid.cell_of(surface.points)[:, 0]] + 0.9)
+
+    def share(speed: float, wall: str = "cubic") -> float:
+        motion = SurfaceMotion(surface.points, speed * surface.velocities, surface.observed)
+        _, report = volume_velocity(motion, None, types, grid, kind="stream", wall=wall)
+        return report.flux_out / speed
+
+    # the shear velocity of this depth and slope is 0.4 m/s: 0.2 m/s is half of it, 2 m/s five times that
+    assert share(0.2) == pytest.approx(share(0.2, "film"), rel=1e-3)
+    assert share(2.0) > 1.2 * share(0.2)  # a thin layer carries 0.95 of the surface speed, a film 2/3
+    assert share(2.0) > share(0.6) > share(0.2)  # by degrees
+
+
+def test_an_outlet_that_is_too_small_lets_the_surface_yield_before_it_speeds_up() -> None:
+    types, grid = channel(30)
+    types[24:, :, 4:] = CellType.EMPTY
+    types[24:, :, 1:3] = CellType.SOLID  # one cell in five is left at the end
+    types[24:-1, :, 3], types[-1, :, 3] = CellType.FLUID, CellType.OUTFLOW
+    surface = surface_of(grid, 0.59, [0.8, 0, 0])
+    surface.points[surface.points[:, 0] > 2.4, 2] = 0.39
+    _, report = volume_velocity(surface, None, types, grid, kind="stream")
+    closed = VolumeOptions(surface_mobility=1e-4)
+    _, fast = volume_velocity(surface, None, types, grid, kind="stream", options=closed)
+    area = 8 * 0.01
+    assert fast.flux_out / area > 1.2 * DOUBT * 0.8
+    assert report.flux_out / area <= DOUBT * 0.8 * 1.001  # float32 sums
+    assert report.divergence_max < 1e-3
+    assert report.change_observed < fast.change_observed
+    assert report.flux_in > report.flux_out
 
 
 def test_a_solver_gives_each_frame_what_a_single_call_gives() -> None:

@@ -12,6 +12,9 @@ from fluidlift.motion.volume_projection import (
     end_faces,
     face_mobility,
     faces_from_centers,
+    flux_through,
+    mouths_of,
+    outward_openings,
     passed_through,
     weighted_projection,
 )
@@ -198,3 +201,16 @@ def test_ends_take_what_flows_beside_them() -> None:
     out = continue_through_ends(v, end_faces(types))
     assert (out.u[[0, -1], :, 1] == 2.0).all() and (out.u[[0, -1], :, 2] == 3.0).all()
     assert (out.u[1:-1] == v.u[1:-1]).all() and (out.w[:, :, 0] == 0).all()
+
+
+def test_fluxes_out_of_the_fluid_count_positive_at_both_ends() -> None:
+    types, grid = channel(10, 3, 5, 2)
+    system = build_system(types, None, grid)
+    v = FaceVelocity(*(np.zeros(grid.face_shape(a), np.float32) for a in range(3)))
+    v.u[...] = 2.0
+    inlet, outlet = mouths_of(types, system, reach=0.2)
+    assert inlet.area == outlet.area == 6.0
+    assert flux_through(v, inlet.outward) == -12.0 and flux_through(v, outlet.outward) == 12.0
+    assert inlet.near[:3, :, 1:3].all() and not inlet.near[3:].any()  # two cells on, at the height of the fluid
+    assert outlet.near[7:, :, 1:3].all() and not outlet.near[:7].any()
+    assert flux_through(v, outward_openings(types, CellType.EMPTY, system.openings)) == 0.0  # along the surface

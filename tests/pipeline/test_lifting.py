@@ -7,7 +7,7 @@ from fluidlift.config import build_config
 from fluidlift.io.stage_cache import load_stage
 from fluidlift.motion.sequence import MotionOptions
 from fluidlift.pipeline import STAGES, Silence
-from fluidlift.pipeline.lifting import motion_options, motion_warnings, seen_cells, seen_of, targets_of
+from fluidlift.pipeline.lifting import motion_options, motion_scene, motion_warnings, seen_cells, seen_of, targets_of
 from fluidlift.pipeline.story import Result, Story
 from fluidlift.types import Grid, SurfaceMotion
 
@@ -60,3 +60,21 @@ def test_frames_whose_solve_failed_are_named():
     assert "1 of 5, the first is 3" in said
     assert motion_warnings(reports[:3], "stream", 0.0) == []
     assert "free fall" in motion_warnings([], "fall", 0.5)[0]
+
+
+def test_a_surface_that_the_volume_contradicts_is_said():
+    def said(*changes):
+        return motion_warnings([{"frame": 0, "change_observed": c} for c in changes], "stream", 0.0)
+
+    assert "do not agree on one discharge" in said(0.4, 0.6, 0.9)[0]
+    assert said(0.4, 0.2, 0.9) == [] == said()  # the median counts
+
+
+def test_the_mean_motion_of_the_clip_stands_by(story):
+    scene = motion_scene(story)
+    assert scene.prior is not None
+    np.testing.assert_array_equal(scene.prior[0], story["geometry"].arrays["mean_flow"])
+
+
+def test_the_film_is_a_wall_that_can_be_chosen():
+    assert motion_options(build_config(overrides=["motion.wall=film"])).wall == "film"

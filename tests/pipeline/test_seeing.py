@@ -1,19 +1,22 @@
 """What the first stages see of a clip, and that it does not depend on how it was cut into parts."""
 
-import weakref
+from dataclasses import replace
+from fractions import Fraction
 
+import av
 import numpy as np
 import pytest
 
 from fluidlift.config import build_config
 from fluidlift.errors import InputRejected
-from fluidlift.io.stage_cache import parts_of
+from fluidlift.io.stage_cache import Scratch, parts_of
 from fluidlift.motion.optical_flow import estimate_flow, mean_flow
-from fluidlift.pipeline import pair_flow, reading, seeing
-from fluidlift.pipeline.reading import Inputs, clip_of
+from fluidlift.pipeline import reading, seeing
+from fluidlift.pipeline.reading import Inputs, clip_of, spans_of
 from fluidlift.pipeline.seeing import NO_HINTS, FluidMasks, Hints, flow_of, mean_motion, pairs_of
 from fluidlift.pipeline.story import Result, Silence, Story
-from fluidlift.types import Label, PixelFlow
+from fluidlift.seams import Segmenter
+from fluidlift.types import Label, PixelFlow, PixelLabels
 
 
 def told(clip, folder, *overrides):
@@ -31,39 +34,64 @@ def seen(stream_clip, tmp_path_factory):
     return story
 
 
-@pytest.mark.parametrize("method", ["multiframe", "dis"])
-def test_flow_in_windows_is_that_of_the_whole_clip(stream_clip, tmp_path, method, monkeypatch):
-    """The halo of each window is longer than this clip, so that every pair has all its neighbours in time."""
-    monkeypatch.setattr(pair_flow, "windows", lambda pairs, room: [(t, min(t + 4, pairs)) for t in range(0, pairs, 4)])
+@pytest.mark.parametrize("method", ["multiframe", "farneback"])
+def test_the_flow_on_disk_is_that_of_the_estimator_in_half_precision(stream_clip, tmp_path, method):
     story, config = told(stream_clip, tmp_path / "x", f"motion.method={method}")
     story.run("flow", lambda: seeing.flow(story, Inputs(stream_clip), config), settings=None, after=("read",))
-    whole, found = estimate_flow(np.asarray(clip_of(story).frames), method=method), flow_of(story)
-    np.testing.assert_array_equal(found.displacement, whole.displacement.astype(np.float16))
-    np.testing.assert_array_equal(found.confidence, whole.confidence)
+    frames, found = np.asarray(clip_of(story).frames), flow_of(story)
+    shape = (len(frames) - 1, *frames.shape[1:3])
+    expected = np.empty((*shape, 2), np.float16), np.empty(shape, np.float16)
+    estimate_flow(frames, method=method, out=expected)
+    np.testing.assert_array_equal(found.displacement, expected[0])
+    np.testing.assert_array_equal(found.confidence, expected[1])
+    assert isinstance(story["flow"].arrays["displacement"], np.memmap)
 
 
-@pytest.mark.parametrize(("pairs", "room"), [(10, 10), (11, 10), (500, 100), (37, 1)])
-def test_windows_of_flow_cover_every_pair_once_within_the_room(pairs, room):
-    found = pair_flow.windows(pairs, room)
-    assert [t for first, last in found for t in range(first, last)] == list(range(pairs))
-    assert len(found) == 1 or max(b - a for a, b in found) + 2 * pair_flow.HALO <= max(room, 3 * pair_flow.HALO)
+UNEVEN = np.cumsum([0, 1, 1, 2, 1, 3, 1, 1, 1, 2, 1])
+"""ticks of 0.04 s at which frames are shown"""
 
 
-def test_one_window_of_flow_is_in_memory_at_a_time(monkeypatch):
-    held = []
+@pytest.fixture
+def uneven(pictures, tmp_path):
+    """A stream of steady speed, 2 px per tick to the right, whose frames are not shown at every tick."""
+    clip = written_at(tmp_path / "uneven.mp4", pictures(int(UNEVEN[-1]) + 1)[UNEVEN], UNEVEN)
+    story, config = told(clip, tmp_path / "x")
+    story.run("flow", lambda: seeing.flow(story, Inputs(clip), config), settings=None, after=("read",))
+    return story
 
-    def estimate(frames, **_):
-        assert [ref() for ref in held if ref() is not None] == []
-        shape = (len(frames) - 1, *frames.shape[1:3])
-        found = PixelFlow(np.zeros((*shape, 2), np.float32), np.zeros(shape, np.float16))
-        held.append(weakref.ref(found.displacement))
-        return found
 
-    monkeypatch.setattr(pair_flow, "estimate_flow", estimate)
-    monkeypatch.setattr(pair_flow, "WINDOW_BYTES", 1)
-    for last in pair_flow.each_pair(np.zeros((101, 4, 6, 3), np.uint8), "dis"):  # noqa: B007  a reader holds the last one
-        pass
-    assert len(held) == -(-100 // pair_flow.HALO) and last[0].shape == (4, 6, 2)
+def written_at(path, frames, ticks, rate=25):
+    """A video whose frames are shown at given ticks of 1 / rate s."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=rate)
+        stream.height, stream.width, stream.pix_fmt, stream.options = *frames.shape[1:3], "yuv444p", {"crf": "6"}
+        for picture, tick in zip(frames, ticks):
+            frame = av.VideoFrame.from_ndarray(picture, "rgb24")
+            frame.pts, frame.time_base = int(tick), Fraction(1, rate)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    return path
+
+
+def test_frames_that_lie_farther_apart_do_not_make_the_fluid_faster(uneven):
+    """The middle of the channel moves by 2 px per tick; half a pixel is what the estimator errs by on 6 px steps."""
+    flow, spans = pairs_of(uneven)(0, len(UNEVEN) - 1), np.diff(UNEVEN)
+    np.testing.assert_allclose(spans_of(clip_of(uneven)), spans, rtol=1e-6)
+    middle = flow.displacement[:, 26:44, 8:40, 0]
+    np.testing.assert_allclose(np.median(middle, axis=(1, 2)), 2.0, atol=0.5)
+    between = np.median(np.asarray(flow_of(uneven).displacement, float)[:, 26:44, 8:40, 0], axis=(1, 2))
+    np.testing.assert_allclose(between, 2.0 * spans, atol=0.5 * spans.max())
+
+
+def test_the_mean_motion_is_that_of_a_steady_frame_rate(uneven):
+    mean, _ = mean_motion(uneven, np.ones((64, 96), bool))
+    assert np.median(mean[26:44, 8:40, 0]) == pytest.approx(2.0, abs=0.2)  # px: averaged over ten pairs
+
+
+def test_times_that_are_only_rounded_do_not_change_the_flow(seen):
+    """A container with milliseconds shows 30 frames per second as steps of 33 and 34 ms."""
+    clip = replace(clip_of(seen), times=np.round(np.arange(10) / 30, 3))
+    assert (spans_of(clip) == 1).all()
 
 
 def test_the_mean_motion_in_bands_is_that_of_the_whole_picture(seen):
@@ -77,6 +105,7 @@ def test_pairs_are_read_as_they_were_stored(seen):
     part = pairs_of(seen)(3, 5)
     assert part.displacement.dtype == np.float32
     np.testing.assert_array_equal(part.displacement, flow_of(seen).displacement[3:5])
+    np.testing.assert_array_equal(part.confidence, flow_of(seen).confidence[3:5])
 
 
 def test_what_lies_on_disk_is_mapped_after_a_second_look(seen, stream_clip):
@@ -151,3 +180,34 @@ def test_a_stage_that_fails_leaves_no_large_file_behind(stream_clip, tmp_path):
         story.run("flow", fails, settings=None, after=("read",))
     assert not list((tmp_path / "x" / "work" / "flow").glob(".*"))
     assert story.results.keys() == {"read"} and isinstance(story["read"], Result)
+
+
+class Recorder(Segmenter):
+    """Stands for SAM 2: says what its first guess says."""
+
+    def __init__(self, guess):
+        self.guess = guess
+
+    def segment(self, clip, flow, *, out=None):
+        labels, confidence = out
+        found = self.guess(clip, flow)
+        labels[:], confidence[:] = found.labels, found.confidence
+        return PixelLabels(labels, confidence)
+
+
+def test_hints_reach_a_learned_method_through_its_first_guess(seen, stream_clip, monkeypatch):
+    monkeypatch.setattr(seeing, "make_segmenter", lambda name, choice, *, guess, **_: Recorder(guess))
+    config = build_config(overrides=["segment.method=sam2"])
+    seen.scratch = Scratch(seen.folder, "segment")
+    whole = seeing.segment(seen, Inputs(stream_clip), config).arrays["labels"] == Label.FLUID
+    seen.scratch = Scratch(seen.folder, "segment")
+    hints = Hints.of("0,0,48,64", [], [])
+    found = seeing.segment(seen, Inputs(stream_clip), config, hints).arrays["labels"] == Label.FLUID
+    assert whole[:, 26:44, 70:].any() and found[:, 26:44, 8:40].any() and not found[:, :, 50:].any()
+
+
+def test_a_method_that_goes_by_words_takes_no_hints(seen, stream_clip):
+    with pytest.raises(InputRejected, match="sam3"):
+        seeing.segment(
+            seen, Inputs(stream_clip), build_config(overrides=["segment.method=sam3"]), Hints.of("0,0,48,64", [], [])
+        )

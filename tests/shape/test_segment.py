@@ -8,13 +8,8 @@ import pytest
 from scipy.ndimage import gaussian_filter, shift
 
 from fluidlift.errors import InputRejected
-from fluidlift.shape.advancing import median_over_time
-from fluidlift.shape.background import without_background
 from fluidlift.shape.colour_growth import colour_odds, grown_from_streams, with_quiet_water
-from fluidlift.shape.evidence import fluid_score, gather_evidence, noise_map, separating_level
-from fluidlift.shape.hints import clicks_at, polygon_mask
-from fluidlift.shape.presence import Presence, grows
-from fluidlift.shape.region import solids_in
+from fluidlift.shape.evidence import fluid_score, gather_evidence
 from fluidlift.shape.segment import Label, LabelWriter, doubts, overlay, segment
 from fluidlift.types.clip import VideoClip
 from fluidlift.types.flow import PixelFlow
@@ -192,22 +187,16 @@ def test_smoke_that_rises_is_outlined_in_every_frame():
         assert overlap(labels.fluid[t], truth[t]) > 0.85, t
 
 
-def presence_of(active: np.ndarray) -> Presence:
-    """First and last activity of bool [T,h,w]."""
-    frames, ever = len(active), active.any(axis=0)
-    first = np.where(ever, active.argmax(axis=0), frames)
-    last = np.where(ever, frames - 1 - active[::-1].argmax(axis=0), -1)
-    return Presence(frames, first, last, (0,), active[:1])
-
-
-def test_a_front_grows_and_foam_that_comes_back_does_not():
-    front = np.zeros((20, 30, 30), bool)
-    for t in range(20):
-        front[t, : t + 1] = True
-    foam = np.random.default_rng(0).random((20, 30, 30)) < 0.4
-    everywhere = np.ones((30, 30), bool)
-    assert grows(presence_of(front), everywhere) and grows(presence_of(front[::-1]), everywhere)
-    assert not grows(presence_of(foam), everywhere)
+def test_the_trembling_shadow_of_smoke_is_no_smoke():
+    rng = np.random.default_rng(9)
+    pictures, truth = smoke(rng)
+    shadow = (slice(None), slice(98, 116), slice(101, 150))
+    for t in range(len(pictures)):
+        pictures[t, 90:] += ~truth[t, 90:, :, None] * 70.0  # a lit floor
+        pictures[t][shadow[1:]] *= 0.55 + 0.1 * texture(rng, (HEIGHT, WIDTH), sigma=3.0)[shadow[1:]][..., None]
+    fluid = segment(clip_of(pictures), no_flow(24)).fluid
+    assert fluid[shadow].mean() < 0.1
+    assert overlap(fluid[20], truth[20]) > 0.85  # as without a shadow
 
 
 def test_the_mask_of_the_user_wins_with_confidence_one(river):
@@ -247,56 +236,6 @@ def test_outside_the_region_of_interest_there_is_no_fluid(river):
 def test_flow_of_another_length_is_an_error(river):
     with pytest.raises(ValueError, match="flow"):
         segment(river[0], no_flow(FRAMES + 3))
-
-
-def test_two_populations_are_divided_between_them_and_one_is_not_divided_below_the_floor():
-    rng = np.random.default_rng(1)
-    activity = np.concatenate([rng.normal(0.2, 0.1, 3000), rng.normal(3.0, 0.3, 1000)]).clip(0)
-    assert 0.6 < separating_level(activity) < 2.4
-    # half of a normal distribution lies above its mean: a still clip must not be divided there
-    assert separating_level(rng.normal(0.2, 0.1, 3000).clip(0)) >= np.log(1.8)
-
-
-def test_the_noise_follows_the_tremble_of_edges_and_not_the_fluid():
-    rng = np.random.default_rng(2)
-    steep = rng.uniform(0.0, 40.0, (100, 100)).astype(np.float32)
-    change = 1.0 + 0.1 * steep
-    change[:40] += 60.0
-    noise = noise_map(change, steep)
-    # the base is read from a class of finite width, as is the slope: a fifth either way
-    assert np.allclose(noise, 1.0 + 0.1 * steep, rtol=0.35)
-
-
-def test_small_holes_are_filled_still_ones_are_solid_and_open_bays_stay_outside():
-    region = np.zeros((60, 60), bool)
-    region[10:50, 10:50] = True
-    region[20:30, 20:30] = False
-    region[40, 40] = False
-    region[10:20, 45:50] = False
-    still = np.ones_like(region)
-    filled, solid = solids_in(np.kron(region, np.ones((2, 2))) > 0, np.kron(still, np.ones((2, 2))) > 0)
-    filled, solid = filled[::2, ::2], solid[::2, ::2]
-    assert solid.sum() == 100 and solid[20:30, 20:30].all()
-    assert filled[40, 40] and not filled[12, 47] and not solid[12, 47]
-    assert solids_in(region, ~still)[0][25, 25], "a hole that moves is fluid"
-
-
-def test_the_median_over_time_drops_a_single_frame():
-    odds = np.zeros((5, 2, 2), np.float32)
-    odds[2] = 9.0
-    smooth = list(median_over_time(iter(odds)))
-    assert len(smooth) == 5 and not np.any(smooth)
-    for frames in (1, 2):
-        assert np.array_equal(list(median_over_time(iter(odds[:frames]))), odds[:frames])
-
-
-def test_background_that_shows_between_the_fluid_is_taken_out_of_its_colours():
-    around = np.zeros((4, 4, 4), np.float32)
-    around[0, 0, 0] = 1000.0
-    mixed = np.zeros_like(around)
-    mixed[0, 0, 0], mixed[3, 3, 3] = 200.0, 50.0
-    own = without_background(mixed, around)
-    assert own[0, 0, 0] == 0.0 and own[3, 3, 3] == 50.0
 
 
 def test_labels_at_full_size_keep_their_areas():
@@ -396,23 +335,6 @@ def test_points_outside_or_with_a_strange_label_are_rejected(brook_and_screen):
         segment(*brook_and_screen, points=[(WIDTH, 3, 1)])
     with pytest.raises(InputRejected, match="label"):
         segment(*brook_and_screen, points=[(3, 3, 2)])
-
-
-def test_points_are_read_in_px_of_the_clip_and_used_at_working_size():
-    clicks = clicks_at([(511.9, 0.0, 1), (256, 144, 0)], (512, 288), (216, 384))
-    assert clicks.fluid.tolist() == [[383, 0]] and clicks.other.tolist() == [[192, 108]]
-    assert not clicks_at([], (512, 288), (216, 384))
-
-
-def test_a_polygon_holds_its_area_and_nonsense_is_rejected():
-    mask = polygon_mask([[(10, 10), (30, 10), (30, 20), (10, 20)], [(50, 30), (60, 30), (60, 40)]], 60, 80)
-    # corners lie on the outline, half a px either way: the rim of 60 px and of 34 px
-    assert abs(int(mask.sum()) - (200 + 50)) < 0.5 * (60 + 34) + 2
-    assert mask[15, 20] and not mask[15, 40]
-    with pytest.raises(InputRejected, match="polygon"):
-        polygon_mask([[(1, 1), (2, 2)]], 60, 80)
-    with pytest.raises(InputRejected, match="no pixel"):
-        polygon_mask([[(-30, -30), (-20, -30), (-20, -20)]], 60, 80)
 
 
 # colour where motion says too little

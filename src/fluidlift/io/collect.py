@@ -156,8 +156,8 @@ class Collector:
         if is_variable(times):
             steps = np.diff(times)
             self.notes.add(
-                f"variable frame rate: {1000 * steps.min():.1f} to {1000 * steps.max():.1f} ms between frames; "
-                "the real times are used"
+                f"variable frame rate: {1000 * steps.min():.1f} to {1000 * steps.max():.1f} ms between frames, the "
+                f"longest after frame {int(np.argmax(steps))}; the real times are used"
             )
         if self.repeated:
             self.notes.add(f"{self.repeated} of {len(times)} frames repeat the one before (a converted frame rate?)")

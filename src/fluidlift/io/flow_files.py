@@ -62,8 +62,15 @@ class FlowLayout:
 class FlowFiles:
     """The flow of a clip on disk, read pair by pair."""
 
-    def __init__(self, source: FlowArray | list[Path], size: tuple[int, int], layout: FlowLayout, limits: ReadLimits):
-        self._source, self._size, self._layout, self._limits = source, size, layout, limits
+    def __init__(
+        self,
+        source: FlowArray | list[Path],
+        size: tuple[int, int],
+        layout: FlowLayout,
+        limits: ReadLimits,
+        start: int = 0,
+    ) -> None:
+        self._source, self._size, self._layout, self._limits, self._start = source, size, layout, limits, start
         self.warnings: tuple[str, ...] = ()
         """what the user should know"""
         first, own = self._stored(0)
@@ -76,7 +83,7 @@ class FlowFiles:
             raise InputRejected(
                 f"'{first}' holds no usable flow (unknown, not finite, or longer than the picture)",
                 "displacements in px per frame",
-                "check what the file holds; the option scale turns other units into px",
+                "check what the file holds; --set motion.flow_scale turns other units into px",
             )
 
     def __len__(self) -> int:
@@ -110,11 +117,11 @@ class FlowFiles:
     def _read(self, t: int) -> tuple[str, tuple[int, int], np.ndarray, np.ndarray | None]:
         """Name, (width, height), and the numbers as they are stored but for axis and scale."""
         if isinstance(self._source, FlowArray):
-            name = f"{self._source.name} (pair {t})"
+            name = f"{self._source.name} (frame {self._start + t})"
             displacement, confidence = self._source.pair(t)
             up = bool(self._layout.v_up)
         else:
-            name = self._source[t].name
+            name = f"{self._source[t].name} (frame {self._start + t})"
             displacement, confidence, up = read_pair(self._source[t], self._layout, self._limits)
         displacement = displacement.astype(np.float32)
         known = np.abs(displacement) < UNKNOWN  # before the scale, which must not bring the marker into reach
@@ -149,8 +156,8 @@ def open_flow(
     require(pairs >= 1 and start >= 0, f"{pairs} pairs from frame {start}", "at least one pair from 0 on")
     layout, limits = layout or FlowLayout(), limits or ReadLimits()
     if is_array(path):
-        return FlowFiles(open_array(path, pairs, start, limits), size, layout, limits)
-    return FlowFiles(numbered_flow(path, pairs, start, layout.first_number), size, layout, limits)
+        return FlowFiles(open_array(path, pairs, start, limits), size, layout, limits, start)
+    return FlowFiles(numbered_flow(path, pairs, start, layout.first_number), size, layout, limits, start)
 
 
 def read_flow(
@@ -241,7 +248,7 @@ def _known_channels(path: Path, names: list[str]) -> tuple[str, str]:
     raise InputRejected(
         f"'{path.name}' has the channels {', '.join(names)}",
         "forward.u and forward.v, u and v, x and y, or R and G",
-        "name the two channels that hold the motion to the next frame",
+        "name the two that hold the motion to the next frame: --set motion.flow_channels=R,G",
     )
 
 

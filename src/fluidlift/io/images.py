@@ -56,25 +56,27 @@ def read_mask(
     """
     path = Path(path)
     if is_sequence(path):
-        masks = [_binary(read_picture(file, limits=limits)) for _, file in list_sequence(path)]
+        files = [file for _, file in list_sequence(path)]
+        count, pictures = len(files), (read_picture(file, limits=limits) for file in files)
     elif path.suffix.lower() in PICTURE_SUFFIXES:
-        masks = [_binary(read_picture(path, limits=limits))]
+        count, pictures = 1, iter((read_picture(path, limits=limits),))
     else:
         clip = read_clip(path, start=start, duration=duration, max_size=max(*size, 16), limits=limits)
-        pictures = clip.frames if clip.alpha is None else clip.alpha
-        masks = [_binary(picture) for picture in pictures]
-    if len(masks) not in (1, frames):
+        count, pictures = len(clip), iter(clip.frames if clip.alpha is None else clip.alpha)
+    if count not in (1, frames):
         raise InputRejected(
-            f"'{path.name}' has {len(masks)} masks", f"one, or {frames} (one per frame)", "cut it as the clip is cut"
+            f"'{path.name}' has {count} masks", f"one, or {frames} (one per frame)", "cut it as the clip is cut"
         )
-    fitted = np.stack([_fitted_mask(mask, size, path.name) for mask in masks])
+    fitted = np.empty((count, size[1], size[0]), bool)
+    for t, picture in enumerate(pictures):
+        fitted[t] = _fitted_mask(_binary(picture), size, path.name)
     if not fitted.any():
         raise InputRejected(
             f"the mask '{path.name}' is empty (nothing is white or opaque)",
             "white (255) where the fluid is, black elsewhere",
             "check that it is not inverted to black and that the layer was exported",
         )
-    return fitted[0] if len(masks) == 1 else fitted
+    return fitted[0] if count == 1 else fitted
 
 
 def _binary(picture: np.ndarray) -> np.ndarray:

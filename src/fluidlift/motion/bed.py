@@ -14,6 +14,16 @@ SURFACE_COEFFICIENT = 0.85
 """mean speed over depth by speed at the surface of a stream on a natural bed, where its roughness is not known: what
 gauging with floats uses (Rantz 1982, USGS Water-Supply Paper 2175: 0.85 to 0.86)"""
 
+GRAVITY = 9.81
+"""m/s^2"""
+SLOPE_ERROR = 0.05
+"""slope that a stream must exceed to count: 3 degrees, the error of a pitch that was estimated from one view"""
+VISCOUS_RATIO, TURBULENT_RATIO = 1.0, 2.5
+"""Surface speed over the shear velocity sqrt(g h S), up to which a stream is surely a viscous film, and from which on
+it is taken to be turbulent. Water is faster than the first for its slope and depth even among boulders twice as tall
+as it is deep: 1.2 there, 2.3 where they are as tall (Ferguson 2007, Water Resources Research 43, W05427). At the
+second, 1 / 0.4, the log law ends: its mean over the depth is 0. In a film the ratio is sqrt(Re / 2)."""
+
 LAYER_CELLS = {"stream": 1.0, "fall": 0.75, "pour": 2.0, "plume": 0.4}
 """Thickness of the layer in cells. Water is turbulent: beside the bed of a river some 10 cells deep its speed at half
 a cell is about 0.7 of the surface speed (1/7 power law), which a layer of one cell gives; films from a fall are
@@ -103,35 +113,50 @@ def speed_share(
     if wall == "cubic":
         thickness = np.asarray(layer_thickness(kind, spacing))
         if depth is not None:
-            thickness = np.minimum(thickness, np.maximum(depth, 0.25 * spacing))
+            thickness = np.minimum(thickness, np.maximum(depth, 0.25 * spacing))  # not thicker than the fluid
         return wall_profile(distance, thickness)
     require(depth is not None, f"wall function '{wall}' without a depth", "metres of fluid above the bed")
     profile = log_profile if wall == "log" else film_profile
     return profile(distance, np.asarray(depth, np.float64))
 
 
-def layer_thickness(kind: str, spacing: float, depth: float | None = None) -> float:
+def film_share(points: Float[np.ndarray, "n 3"], velocities: Float[np.ndarray, "n 3"], depth: float) -> float:
+    """How surely a stream is a viscous film, 0 to 1: whether it is too slow for its slope to be turbulent.
+
+    The energy line z + v^2 / 2g over the surface falls along the stream by what friction takes; its slope S, the depth
+    h and gravity give the shear velocity sqrt(g h S) of a steady stream, and the surface speed over that is compared
+    with `VISCOUS_RATIO` and `TURBULENT_RATIO`. It goes with the root of the scale, so an assumed size does little.
+
+    Args:
+        points: of the surface, m, z up.
+        velocities: m/s.
+        depth: typical, m.
+    """
+    speed = np.linalg.norm(velocities, axis=-1).astype(np.float64)
+    along = np.asarray(velocities, np.float64)[:, :2].sum(axis=0)
+    along = along / max(float(np.linalg.norm(along)), 1e-12)
+    head = points[:, 2] + speed**2 / (2.0 * GRAVITY)
+    flat = np.asarray(points, np.float64)[:, :2]
+    fall, *_ = np.linalg.lstsq(flat - flat.mean(axis=0), head - head.mean(), rcond=None)
+    slope = -float(fall @ along) - SLOPE_ERROR
+    if slope <= 0:
+        return 0.0
+    ratio = float(np.median(speed)) / np.sqrt(GRAVITY * depth * slope)
+    return float(np.clip((TURBULENT_RATIO - ratio) / (TURBULENT_RATIO - VISCOUS_RATIO), 0.0, 1.0))
+
+
+def layer_thickness(kind: str, spacing: float) -> float:
     """Thickness d of the layer, m, by fluid type and grid (paper: "dynamically decided by the fluid type").
 
     It is set in cells and not from a Reynolds number: the wall function stands for the part of the slowing that the
-    grid cannot show, and the fluid's own viscosity acts beyond it. A layer cannot be thicker than the fluid.
+    grid cannot show, and the fluid's own viscosity acts beyond it.
 
     Args:
         kind: "stream", "fall", "pour" or "plume".
         spacing: cell width, m.
-        depth: typical thickness of the fluid above the bed, m.
     """
     require(kind in LAYER_CELLS, f"kind '{kind}'", "one of " + ", ".join(LAYER_CELLS))
-    thickness = LAYER_CELLS[kind] * spacing
-    return thickness if depth is None else min(thickness, max(depth, 0.25 * spacing))
-
-
-def laminar_layer_thickness(viscosity: float, length: float, speed: float) -> float:
-    """Thickness of the laminar layer of the cubic profile, 4.64 sqrt(nu x / U), m, at x metres from its beginning."""
-    require(
-        speed > 0 and length >= 0 and viscosity >= 0, "a layer without flow", "speed > 0, length and viscosity >= 0"
-    )
-    return 4.64 * float(np.sqrt(viscosity * length / speed))
+    return LAYER_CELLS[kind] * spacing
 
 
 def bed_velocity(

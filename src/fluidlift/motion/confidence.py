@@ -12,6 +12,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from fluidlift.seams import FlowEstimator
+
 ROUND_TRIP_FLOOR = 0.3
 """px: forward-backward error that even good flow shows (noise, compression)"""
 ROUND_TRIP_SHARE = 0.2
@@ -28,6 +30,23 @@ they were independent (exponent 1), their geometric mean as if they were the sam
 def grey(image: np.ndarray) -> np.ndarray:
     """Luma u8 [H,W] of an sRGB picture; a picture that is grey already is returned as it is."""
     return image if image.ndim == 2 else cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY)
+
+
+def there_and_back(
+    estimator: FlowEstimator, first: np.ndarray, second: np.ndarray
+) -> tuple[Float[np.ndarray, "h w 2"], Float[np.ndarray, "h w 2"], Float[np.ndarray, "h w"]]:
+    """Flow from `first` to `second`, back again (px), and what the estimator says of the former (0 to 1), float32.
+
+    What is not finite becomes rest, and forward it is not trusted. An estimator without an opinion says 1.
+    """
+    forward, own = estimator.estimate(first, second)
+    trust = np.asarray(np.isfinite(forward).all(axis=-1), np.float32)
+    return finite(forward), finite(estimator.displacement(second, first)), trust if own is None else trust * own
+
+
+def finite(displacement: Float[np.ndarray, "h w 2"]) -> Float[np.ndarray, "h w 2"]:
+    """What is not a number, or infinite, put to 0."""
+    return np.nan_to_num(displacement, nan=0.0, posinf=0.0, neginf=0.0)
 
 
 def flow_confidence(

@@ -85,7 +85,6 @@ def harmonic_extension(
     spacing: float,
     *,
     tolerance: float = 1e-4,
-    initial: Float[np.ndarray, "nx ny nz c"] | None = None,
 ) -> Float[np.ndarray, "nx ny nz c"]:
     """The smoothest continuation: laplace f = 0 in the domain, f = values where known, no flux through its rim.
 
@@ -98,7 +97,6 @@ def harmonic_extension(
         domain: where to continue to.
         spacing: cell width, m.
         tolerance: relative residual.
-        initial: first guess, such as the result of the frame before; None: the nearest known value.
     """
     known = known & domain
     label, count = ndimage.label(domain)
@@ -111,15 +109,14 @@ def harmonic_extension(
         low, high = sides_of_faces(domain, axis)
         weights.append((low & high).astype(np.float32))
     system = PoissonSystem(unknown, *weights, spacing).prepared()  # one hierarchy for all components
-    if initial is None:
-        nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
-        initial = out[tuple(nearest)]
+    nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
+    first_guess = out[tuple(nearest)]
     for c in range(values.shape[-1]):
         rhs = np.zeros(domain.shape, np.float32)
         for axis, w in enumerate(weights):
             low, high = sides_of_faces(out[..., c], axis)
             rhs += cells_of_faces(w * low, axis, low=True) + cells_of_faces(w * high, axis, low=False)
-        guess = np.where(unknown, initial[..., c], 0.0).astype(np.float32)
+        guess = np.where(unknown, first_guess[..., c], 0.0).astype(np.float32)
         f, _ = solve(system, np.where(unknown, rhs, 0.0) / spacing**2, tolerance=tolerance, initial=guess)
         out[..., c] = np.where(unknown, f, out[..., c])
     adrift = domain & ~touched[label]

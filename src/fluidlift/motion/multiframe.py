@@ -29,10 +29,12 @@ from fluidlift.motion.confidence import (
     SHARED_FAILURE,
     TEXTURE_FLOOR,
     agreement_over_time,
+    finite,
     grey,
     photometric_agreement,
     round_trip,
     texture_strength,
+    there_and_back,
 )
 from fluidlift.seams import FlowEstimator
 from fluidlift.types import PixelFlow
@@ -142,15 +144,14 @@ def flow_of_detail(
         step: frames from the first to the second.
     """
     first, second = as_pictures(detail)
-    forward, backward = estimator.displacement(first, second), estimator.displacement(second, first)
-    forward, backward = (np.nan_to_num(d, nan=0.0, posinf=0.0, neginf=0.0) for d in (forward, backward))
+    forward, backward, own = there_and_back(estimator, first, second)
     texture = _texture_in_grey_levels(detail[0], picture)
     tests = (
         round_trip(forward, backward)
         * photometric_agreement(*detail, forward)
         * (texture / (texture + NOISE_GRADIENT**2))
     )
-    return Reading(forward / step, moving_share(detail[0], picture), tests**SHARED_FAILURE)
+    return Reading(forward / step, moving_share(detail[0], picture), own * tests**SHARED_FAILURE)
 
 
 def moving_share(detail: Float[np.ndarray, "h w"], picture: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w"]:
@@ -187,8 +188,33 @@ def _texture_in_grey_levels(detail: np.ndarray, picture: np.ndarray) -> np.ndarr
     return (texture_strength(detail) * (grey(picture).astype(np.float32) + DARK)) ** 2
 
 
+def result_arrays(
+    frames: UInt8[np.ndarray, "t h w 3"], out: tuple[np.ndarray, np.ndarray] | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where the flow of a clip goes: displacement [T-1,H,W,2] and confidence [T-1,H,W], `out` or new arrays.
+
+    Raises:
+        ValueError: `out` of another shape, or not of a floating type.
+    """
+    shape = (len(frames) - 1, *frames.shape[1:3])
+    if out is None:
+        return np.empty((*shape, 2), np.float32), np.empty(shape, np.float16)
+    for array, name, wanted in zip(out, ("displacement", "confidence"), ((*shape, 2), shape), strict=True):
+        require(
+            array.shape == wanted and np.issubdtype(array.dtype, np.floating),
+            f"{name} to fill {array.shape} {array.dtype}",
+            f"a floating type, {wanted}",
+        )
+    return out
+
+
 def multiframe_flow(
-    frames: UInt8[np.ndarray, "t h w 3"], estimator: FlowEstimator, progress: Progress | None = None
+    frames: UInt8[np.ndarray, "t h w 3"],
+    estimator: FlowEstimator,
+    progress: Progress | None = None,
+    *,
+    refiner: FlowEstimator | None = None,
+    out: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> PixelFlow:
     """Flow of every neighbouring pair, each measured with its neighbours in time.
 
@@ -199,29 +225,35 @@ def multiframe_flow(
         frames: sRGB, possibly memory-mapped; a few are read at a time.
         estimator: of flow between two pictures.
         progress: called after each step.
+        refiner: measures what is left in the moving frame; None: `estimator`.
+        out: as for `optical_flow.estimate_flow`; it holds what is still to be refined, so that nothing else grows with
+            the clip. float16 rounds that by 1/2000.
 
     Raises:
-        ValueError: fewer than `SHORTEST` + 1 frames.
+        ValueError: fewer than `SHORTEST` + 1 frames, or an `out` that does not fit.
     """
     require(running_window(0, len(frames)) is not None, f"{len(frames)} frames", f"at least {SHORTEST + 1}")
-    pairs, (h, w) = len(frames) - 1, frames.shape[1:3]
-    displacement = np.empty((pairs, h, w, 2), np.float32)
-    confidence = np.empty((pairs, h, w), np.float16)
+    displacement, confidence = result_arrays(frames, out)
+    pairs = len(displacement)
     for t in range(pairs):
         displacement[t], confidence[t] = flow_with_rest(frames, t, estimator)
         if progress is not None:
             progress(t + 1, 2 * pairs)
     earlier: deque[np.ndarray] = deque(maxlen=REACH)
     for t in range(pairs):
-        window = [*earlier, *displacement[t : t + REACH + 1]]
+        own = np.array(displacement[t], np.float32)  # a copy: the array's own is overwritten below
+        window = [*earlier, own, *displacement[t + 1 : t + REACH + 1]]
         surroundings = _trusted_mean(window, confidence[t - len(earlier) : t + REACH + 1])
-        earlier.append(displacement[t].copy())
-        displacement[t] = refined(frames, t, displacement[t], surroundings, estimator)
+        earlier.append(own)
+        displacement[t] = refined(frames, t, own, surroundings, refiner or estimator)
         if progress is not None:
             progress(pairs + t + 1, 2 * pairs)
     for t in range(pairs):
-        before, after = displacement[t - 1] if t else None, displacement[t + 1] if t + 1 < pairs else None
-        confidence[t] *= agreement_over_time(before, displacement[t], after).astype(np.float16)
+        before, here, after = (
+            np.asarray(displacement[k], np.float32) if 0 <= k < pairs else None for k in (t - 1, t, t + 1)
+        )
+        assert here is not None
+        confidence[t] *= agreement_over_time(before, here, after).astype(np.float16)
     return PixelFlow(displacement, confidence)
 
 
@@ -286,7 +318,7 @@ def refined(
     u, v = np.meshgrid(np.arange(w, dtype=np.float32), np.arange(h, dtype=np.float32))
     back = cv2.remap(detail[1], u + mean[..., 0], v + mean[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     first, second = as_pictures((detail[0], back))
-    remainder = np.nan_to_num(estimator.displacement(first, second), nan=0.0, posinf=0.0, neginf=0.0)
+    remainder = finite(estimator.displacement(first, second))
     found = mean + remainder
     tolerance = ROUND_TRIP_FLOOR**2 + ROUND_TRIP_SHARE**2 * (mean**2).sum(axis=-1)
     doubt = np.minimum((remainder**2).sum(axis=-1), ((found - displacement) ** 2).sum(axis=-1))

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from fluidlift.errors import require
-from fluidlift.motion.confidence import flow_confidence, grey, texture_strength
-from fluidlift.motion.multiframe import Progress, mean_flow, multiframe_flow, running_window
+from fluidlift.motion.confidence import flow_confidence, grey, texture_strength, there_and_back
+from fluidlift.motion.multiframe import Progress, mean_flow, multiframe_flow, result_arrays, running_window
 from fluidlift.seams import FlowEstimator
 from fluidlift.types import PixelFlow
 
@@ -36,12 +36,19 @@ class DenseInverseSearch(FlowEstimator):
 
     OpenCV's medium preset stops at half resolution; eddies are small, so the search goes on to full resolution with
     denser patches (about 10 % less end-point error on simulated rivers and honey).
+
+    Args:
+        patch: side of the patches that are matched, px.
+        stride: from one patch to the next, px.
+        smoothness: weight of even flow against like pictures in the last step, OpenCV's alpha.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, patch: int = 8, stride: int = 3, smoothness: float = 20.0) -> None:
         self._algorithm = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
         self._algorithm.setFinestScale(0)
-        self._algorithm.setPatchStride(3)
+        self._algorithm.setPatchSize(patch)
+        self._algorithm.setPatchStride(stride)
+        self._algorithm.setVariationalRefinementAlpha(smoothness)
 
     def displacement(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
         """float32 [H,W,2], px: where each pixel of `first` (u8 [H,W,3] or grey [H,W]) went in `second`."""
@@ -65,11 +72,19 @@ METHODS = ("multiframe", *ESTIMATORS)
 """names that `estimate_flow` knows"""
 
 
+def _remainder_search() -> DenseInverseSearch:
+    """For what is left in a frame that moves with the fluid: small and even, so that larger patches and more smoothness
+    lose nothing of it and take the noise out. On seven simulated clips each has 1 to 4 % less error than with the
+    settings of the first search; patches of 12 or 16 px and smoothness 60 or 120 are alike within 1 %."""
+    return DenseInverseSearch(patch=12, stride=4, smoothness=60.0)
+
+
 def estimate_flow(
     frames: UInt8[np.ndarray, "t h w 3"],
     *,
     method: str | FlowEstimator = "multiframe",
     progress: Progress | None = None,
+    out: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> PixelFlow:
     """Forward flow of every neighbouring pair with its confidence.
 
@@ -79,13 +94,15 @@ def estimate_flow(
             pictures as they are, or an estimator of one's own. A clip too short for a running mean is measured as it
             is.
         progress: called with (steps done, steps in all).
+        out: displacement [T-1,H,W,2] and confidence [T-1,H,W] of a floating type to fill, such as mapped files;
+            None: new ones, float32 and float16.
 
     Returns:
-        displacement float32 [T-1,H,W,2] px/frame, confidence float16 [T-1,H,W]. Beyond the result, memory is that of
-        a few pictures.
+        displacement px/frame and confidence, those of `out` where given. Beyond the result, memory is that of a few
+        pictures, however long the clip.
 
     Raises:
-        ValueError: fewer than two frames, frames of the wrong type, or an unknown method.
+        ValueError: fewer than two frames, frames or `out` of the wrong shape or type, or an unknown method.
     """
     frames = np.asanyarray(frames)
     require(
@@ -98,10 +115,9 @@ def estimate_flow(
         require(method in METHODS, f"flow method '{method}'", "one of " + ", ".join(METHODS))
     estimator = method if isinstance(method, FlowEstimator) else ESTIMATORS.get(method, DenseInverseSearch)()
     if method == "multiframe" and running_window(0, len(frames)) is not None:
-        return multiframe_flow(frames, estimator, progress)
-    pairs, (h, w) = len(frames) - 1, frames.shape[1:3]
-    displacement = np.empty((pairs, h, w, 2), np.float32)
-    confidence = np.empty((pairs, h, w), np.float16)
+        return multiframe_flow(frames, estimator, progress, refiner=_remainder_search(), out=out)
+    displacement, confidence = result_arrays(frames, out)
+    pairs = len(displacement)
     for t in range(pairs):
         displacement[t], confidence[t] = flow_of_pair(frames[t], frames[t + 1], estimator)
         if progress is not None:
@@ -112,9 +128,12 @@ def estimate_flow(
 def flow_of_pair(
     first: UInt8[np.ndarray, "h w 3"], second: UInt8[np.ndarray, "h w 3"], estimator: FlowEstimator
 ) -> tuple[Float[np.ndarray, "h w 2"], Float[np.ndarray, "h w"]]:
-    """Displacement (px, values that are not finite put to 0) and confidence between two pictures as they are."""
-    forward = np.nan_to_num(estimator.displacement(first, second), nan=0.0, posinf=0.0, neginf=0.0)
-    return forward, flow_confidence(first, forward, estimator.displacement(second, first))
+    """Displacement (px, values that are not finite put to 0) and confidence between two pictures as they are.
+
+    Where the estimator has an opinion of its own, trust is the product of that and of the round trip and the texture.
+    """
+    forward, backward, own = there_and_back(estimator, first, second)
+    return forward, own * flow_confidence(first, forward, backward)
 
 
 def flow_picture(

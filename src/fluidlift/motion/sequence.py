@@ -171,7 +171,7 @@ def _sequence(
     flow: FlowReader, mask: MaskReader, pairs: int, scene: MotionScene, options: MotionOptions, wanted: list[int],
     volumes: frozenset[int],
 ) -> Iterator[FrameMotion]:  # fmt: skip
-    window, clip = FlowWindow(flow, pairs), _Clip.of(flow, mask, pairs, scene, options)
+    window, clip = FlowWindow(flow, pairs, mask), _Clip.of(flow, mask, pairs, scene, options)
     solver = _solver(scene, options) if volumes else None
     for t in wanted:
         found = _frame_motion(window, mask, t, scene, options, clip, solver if t in volumes else None)
@@ -180,10 +180,15 @@ def _sequence(
 
 
 class FlowWindow:
-    """Reads pairs of a flow as they are needed and forgets those that a later frame cannot need."""
+    """Reads pairs of a flow as they are needed and forgets those that a later frame cannot need.
 
-    def __init__(self, flow: FlowReader, pairs: int) -> None:
+    Where a frame has no fluid its flow is that of the ground, and has no confidence: a front comes to pixels that were
+    dry, and seen to be at rest, a moment ago.
+    """
+
+    def __init__(self, flow: FlowReader, pairs: int, mask: MaskReader) -> None:
         self._flow = flow
+        self._mask = mask
         self.pairs = pairs
         self._held: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
@@ -196,7 +201,7 @@ class FlowWindow:
             if k not in self._held:
                 read = self._flow(k, k + 1)
                 require(len(read) == 1, f"{len(read)} pairs of flow", f"1, that of frame {k}")
-                self._held[k] = (read.displacement[0], read.confidence[0])
+                self._held[k] = (read.displacement[0], read.confidence[0] * np.asarray(self._mask(k), bool))
         part = [self._held[k] for k in range(first, last)]
         return PixelFlow(np.stack([d for d, _ in part]), np.stack([c for _, c in part])), t - first
 
@@ -247,7 +252,7 @@ class _Clip:
             body, body_after = now.on_body()
             if not body.any() or now.depth is None or now.depth_after is None:
                 continue
-            full, seen, _ = _filled(FlowWindow(flow, pairs), t, now, scene, options, downhill)
+            full, seen, _ = _filled(FlowWindow(flow, pairs, mask), t, now, scene, options, downhill)
             rate = depth_change(full, body, now.depth, now.depth_after, mask_t1=body_after)
             near = np.where(body, now.depth, 1.0)
             return cls(

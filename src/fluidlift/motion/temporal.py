@@ -5,8 +5,8 @@ pixel an eddy that is carried past is lost in the mean; along the fluid's own pa
 go with the texture, and a wrong path asks the wrong fluid. The two means are weighted with the inverse of the scatter
 of what they average: where the stream is steady the pixel wins, where eddies are carried past the path.
 
-Where neither is trusted, the pixel's mean over a longer time answers: foam that passed by a moment ago was carried by
-the same stream.
+Where neither is trusted, the pixel's mean over a longer time is at hand: foam that passed by a moment ago was carried
+by the same stream. It is a guess for the mainstream to weigh, not an observation.
 
 On a simulated turbulent river, where flow is trusted, before filling (single pairs, five pairs at fixed pixels, this):
 
@@ -27,13 +27,18 @@ from numba import njit
 
 from fluidlift.errors import require
 from fluidlift.motion.confidence import ROUND_TRIP_FLOOR, ROUND_TRIP_SHARE
+from fluidlift.motion.multiframe import NO_TRUST
 from fluidlift.types import PixelFlow
 
 TRUSTED = 0.4
 """confidence from which the near pairs stand alone; at half of it and below the longer mean takes their place.
 It is the threshold of the mainstream (`mainstream.OBSERVED_CONFIDENCE`)."""
-TRIM, EVIDENCE, LEAST_SPREAD, NO_TRUST = 2.5, 0.5, 0.05, 1e-4
+TRIM, EVIDENCE, LEAST_SPREAD = 2.5, 0.5, 0.05
 """as in `multiframe.mean_flow`, the plain twin of `mean_of_samples`"""
+OTHER_TIMES = 0.5
+"""Trust in the longer mean over that in the near pairs. What was seen at other times is evidence for the filling, below
+the threshold of the mainstream, and no observation of this frame. 0.3 to 0.7 give the same error within 1 % on eight
+simulated clips; with 1 it is from 0.5 % smaller to 2 % larger (a pour)."""
 SMALLEST_SCATTER = 0.15
 """px: of good flow, below which scatter says nothing"""
 ROUNDS = 3
@@ -76,7 +81,7 @@ def smoothed_flow(
         long, long_trust, _ = mean_of_samples(*listed(window, rows[failed], cols[failed]))
         share = np.clip(2.0 * trust[failed] / TRUSTED - 1.0, 0.0, 1.0)[:, None]
         values[failed] = share * values[failed] + (1.0 - share) * long
-        trust[failed] = np.maximum(trust[failed], long_trust)
+        trust[failed] = np.maximum(trust[failed], OTHER_TIMES * long_trust)
     mean, confidence = np.zeros((*mask.shape, 2), np.float32), np.zeros(mask.shape, np.float32)
     mean[rows, cols], confidence[rows, cols] = values, trust
     return mean, confidence

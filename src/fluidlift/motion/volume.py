@@ -9,20 +9,21 @@ lighter where it was filled in or lies out of sight, and between liquid and air 
 A stream that comes in and goes out is taken as steady over the frames that were averaged: the same discharge Q passes
 every cross-section. The surface is then balanced (no net flux through it) and closed but for a small leak, in- and
 outlet are free, and Q follows from the well observed cross-sections; badly seen ones, in the shade or out of the
-picture, follow it. In a vessel that fills or empties the surface must give way, and does. The surface of smoke is no
-barrier.
+picture, follow it. No end carries more than the fastest surface seen near it allows: where the geometry asks for that
+(a body too thick, an end too small), the surface yields as far as it must. In a vessel that fills or empties the
+surface must give way, and does. The surface of smoke is no barrier.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 
 from fluidlift.errors import require
-from fluidlift.motion.bed import WALLS, bed_velocity, speed_share
+from fluidlift.motion.bed import WALLS, bed_velocity, film_share, speed_share
 from fluidlift.motion.extension import (
     SNAP_CELLS,
     harmonic_extension,
@@ -33,12 +34,17 @@ from fluidlift.motion.extension import (
     wall_distance,
 )
 from fluidlift.motion.volume_projection import (
+    OBSERVED_ERROR,
+    PROFILE_ERROR,
     balance_surface,
     continue_through_ends,
     end_faces,
     face_mobility,
     faces_from_centers,
+    flux_through,
+    mouths_of,
     net_outflow,
+    outward_openings,
     passed_through,
     sides_of_faces,
     weighted_projection,
@@ -60,11 +66,16 @@ YIELDING_SURFACE = 0.02
 """the same where the fluid only comes in or only goes out, and its level must change, and for smoke"""
 REACH = 2.0
 """depths of fluid over which confidence fades (1/e) away from the columns that were seen"""
+FAST = 95.0
+"""percentile of the observed speeds that counts as the fastest: a few samples always are wrong"""
+DOUBT = 1.0 + 2.0 * float(np.hypot(OBSERVED_ERROR, PROFILE_ERROR))
+"""mean speed through an end over the fastest surface observed near it, at most: two standard errors above 1. More says
+that the geometry is wrong there: the fluid must then pass through the surface instead of speeding up"""
 
 
 @dataclass(frozen=True)
 class VolumeOptions:
-    """How the volume follows from its surface. None: as the kind and the ends of the flow ask for."""
+    """How the volume follows from its surface. None: as the kind, the ends and the speed of the flow ask for."""
 
     extension: str | None = None
     """harmonic, or layered: speed constant below the surface but for a layer at the walls"""
@@ -128,9 +139,13 @@ class VolumeSolver:
         self._bed = _Bed(types, terrain, grid, kind, mainstream, wall, _typical_depth(types, grid.spacing))
         self._extension = options.extension or ("layered" if layered else "harmonic")
         self._share = self._bed.share() if self._extension == "layered" else None
+        # the paper's layer is for fluid that is not viscous; whether a stream is shows only in its motion
+        asked = kind == "stream" and wall == "cubic" and self._share is not None
+        self._film = replace(self._bed, wall="film").share() if asked else None
         # fluid passes freely through both ends
         self._system = build_system(np.where(types == CellType.INFLOW, CellType.OUTFLOW, types), terrain, grid)
         self._nearest, self._ends = nearest_cells(carrying), end_faces(types)
+        self._mouths = mouths_of(types, self._system, REACH * self._bed.depth)
         self._balanced = options.balanced if options.balanced is not None else kind != "plume"
         if options.surface_mobility is not None:
             self._leak = np.full(grid.shape, options.surface_mobility, np.float32)
@@ -158,12 +173,18 @@ class VolumeSolver:
         require(
             bool(seen.any()), "no surface sample near a fluid cell", f"samples within {SNAP_CELLS} cells of the fluid"
         )
-        centers, confidence = self._extended(values, seen)
+        centers, confidence = self._extended(values, seen, self._share_of(surface))
         extended = faces_from_centers(centers, self._carrying)
         start = balance_surface(extended, types, system.openings) if self._balanced else extended
         certain = np.ones_like(confidence) if self._options.even else confidence
         mobility = face_mobility(types, seen, certain, self._leak)
         velocity, solve = weighted_projection(start, system, mobility, tolerance=tolerance)
+        limits = self._end_limits(values, seen) if self._options.surface_mobility is None else []
+        if any(abs(flux_through(velocity, e.outward)) > limit for e, limit in zip(self._mouths, limits)):
+            mobility = face_mobility(types, seen, certain, np.ones_like(self._leak))
+            leaking, other = weighted_projection(extended, system, mobility, tolerance=tolerance)
+            velocity = self._within(limits, velocity, leaking)
+            solve = max(solve, other, key=lambda report: report.residual)
         velocity = continue_through_ends(velocity, self._ends)
         change = _change(extended, velocity, seen & (confidence > 0.5))
         return velocity, _report(velocity, system, types, solve, change)
@@ -174,20 +195,53 @@ class VolumeSolver:
         length = max(int(np.count_nonzero(fluid.any(axis=a))) for a in ((1, 2), (0, 2), (0, 1)))
         return min(CLOSED_SURFACE * self._bed.depth / self._bed.grid.spacing / max(length, 1) ** 2, YIELDING_SURFACE)
 
+    def _share_of(self, surface: SurfaceMotion) -> Float[np.ndarray, "nx ny nz"] | None:
+        """Share of the free speed in each cell, by what the surface says of the fluid; None: harmonic."""
+        if self._share is None or self._film is None:
+            return self._share
+        known = surface.observed if surface.observed.any() else slice(None)
+        viscous = film_share(surface.points[known], surface.velocities[known], self._bed.depth)
+        return (viscous * self._film + (1.0 - viscous) * self._share).astype(np.float32)
+
+    def _end_limits(self, values: Float[np.ndarray, "nx ny nz 4"], seen: Bool[np.ndarray, "nx ny nz"]) -> list[float]:
+        """Flux that each end can carry, in face areas times m/s, from the fastest surface observed near it.
+
+        Whatever the profile, the mean of a section is below that, but for errors (`DOUBT`).
+        """
+        observed = seen & (values[..., 3] > 0.5)
+        speed = np.linalg.norm(values[..., :3], axis=-1)
+        limits = []
+        for end in self._mouths:
+            witnesses = observed & end.near if (observed & end.near).any() else observed
+            limits.append(
+                DOUBT * end.area * float(np.percentile(speed[witnesses], FAST)) if witnesses.any() else np.inf
+            )
+        return limits
+
+    def _within(self, limits: list[float], closed: FaceVelocity, leaking: FaceVelocity) -> FaceVelocity:
+        """The mixture nearest to `closed` whose ends carry no more than they can; every mixture is divergence-free."""
+        share = 0.0
+        for end, limit in zip(self._mouths, limits):
+            before, after = (abs(flux_through(v, end.outward)) for v in (closed, leaking))
+            if before > limit:
+                share = max(share, (before - limit) / (before - min(after, limit)))
+        mixed = ((1.0 - share) * a + share * b for a, b in zip(closed.components, leaking.components))
+        return FaceVelocity(*mixed)
+
     def _extended(
-        self, values: Float[np.ndarray, "nx ny nz 4"], seen: Bool[np.ndarray, "nx ny nz"]
+        self, values: Float[np.ndarray, "nx ny nz 4"], seen: Bool[np.ndarray, "nx ny nz"], share: np.ndarray | None
     ) -> tuple[Float[np.ndarray, "nx ny nz 3"], Float[np.ndarray, "nx ny nz"]]:
         """Velocity and confidence of all cells from those of the surface's cells."""
         bed, known = self._bed, seen
-        if self._share is None:
+        if share is None:
             beside = _bed_cells(bed.types) & ~seen
             if beside.any() and bed.slows():
                 values[beside] = _beside_bed(values, seen, beside, bed)
                 known = seen | beside
         out = harmonic_extension(values, known, self._carrying, bed.grid.spacing)
         centers, confidence = out[..., :3], out[..., 3]
-        if self._share is not None:
-            centers = layered_extension(centers, seen, self._share, bed.mainstream)
+        if share is not None:
+            centers = layered_extension(centers, seen, share, bed.mainstream)
         away = ndimage.distance_transform_edt(~seen.any(axis=2)) * bed.grid.spacing / (REACH * bed.depth)
         return centers, confidence * np.exp(-away)[..., None].astype(np.float32)
 
@@ -213,7 +267,8 @@ def volume_velocity(
         grid: of the cells.
         kind: fluid type, decides the layer at the bed (`motion.bed`) and the extension.
         mainstream: unit direction of the bulk flow; None: that of the nearest surface.
-        wall: wall function, one of `motion.bed.WALLS`; a plume keeps "cubic".
+        wall: wall function, one of `motion.bed.WALLS`; a plume keeps "cubic". A stream with "cubic" that is too slow
+            for its slope takes "film" instead, by degrees (`motion.bed.film_share`).
         tolerance: relative residual of the projection.
         options: see there; None: the usual ones.
 
@@ -316,21 +371,7 @@ def _report(
     speed = np.linalg.norm(velocity.at_centers()[fluid], axis=-1)
     scale = system.spacing / max(float(speed.mean()) if speed.size else 0.0, 1e-12)
     excess = np.abs(net_outflow(velocity, system)[fluid]) * scale
-    fluxes = {}
-    for kind in (CellType.INFLOW, CellType.OUTFLOW, CellType.EMPTY):
-        total = 0.0
-        for axis, (component, opening) in enumerate(zip(velocity.components, system.openings)):
-            fluid_low, fluid_high = sides_of_faces(fluid, axis)
-            other_low, other_high = sides_of_faces(types == kind, axis)
-            out = (fluid_low & other_high).astype(float) - (other_low & fluid_high)
-            total += float((component * opening * out).sum()) * system.spacing**2
-        fluxes[kind] = total
-    return VolumeReport(
-        report,
-        float(excess.max()) if excess.size else 0.0,
-        float(excess.mean()) if excess.size else 0.0,
-        -fluxes[CellType.INFLOW],
-        fluxes[CellType.OUTFLOW],
-        fluxes[CellType.EMPTY],
-        change,
-    )
+    kinds, area = (CellType.INFLOW, CellType.OUTFLOW, CellType.EMPTY), system.spacing**2
+    inflow, outflow, up = (area * flux_through(velocity, outward_openings(types, k, system.openings)) for k in kinds)
+    worst, mean = (float(excess.max()), float(excess.mean())) if excess.size else (0.0, 0.0)
+    return VolumeReport(report, worst, mean, -inflow, outflow, up, change)

@@ -11,6 +11,8 @@ discharge of a stream follow from all its cross-sections, those that were seen w
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from scipy import ndimage
@@ -239,6 +241,46 @@ def constraint_projection(
             low, high = sides_of_faces(multiplier, axis)
             faces[axis] = faces[axis] + gradient * (low - high)
     return FaceVelocity(*faces)
+
+
+def outward_openings(types: UInt8[np.ndarray, "nx ny nz"], kind: CellType, openings: Faces) -> Faces:
+    """Open share of the faces between the fluid and cells of a kind, negative where out of the fluid is against the
+    axis, so that the flux out of the fluid is the sum of these times the velocity."""
+    out = []
+    for axis, opening in enumerate(openings):
+        fluid_low, fluid_high = sides_of_faces(types == CellType.FLUID, axis)
+        other_low, other_high = sides_of_faces(types == kind, axis)
+        out.append(opening * ((fluid_low & other_high).astype(np.float32) - (other_low & fluid_high)))
+    return out[0], out[1], out[2]
+
+
+def flux_through(velocity: FaceVelocity, outward: Faces) -> float:
+    """Sum over faces of velocity times `outward_openings`; m^3/s when multiplied by the area of a face."""
+    return sum(float((c * o).sum(dtype=np.float64)) for c, o in zip(velocity.components, outward))
+
+
+@dataclass(frozen=True)
+class Mouth:
+    """An end of the flow: all of its inlet, or all of its outlet."""
+
+    outward: Faces
+    """see `outward_openings`"""
+    area: float
+    """open, in faces of cells"""
+    near: Bool[np.ndarray, "nx ny nz"]
+    """cells beside it"""
+
+
+def mouths_of(types: UInt8[np.ndarray, "nx ny nz"], system: PressureSystem, reach: float) -> list[Mouth]:
+    """Inlet and outlet, where there are some, and the cells within `reach` (m) of each."""
+    found = []
+    for kind in (CellType.INFLOW, CellType.OUTFLOW):
+        outward = outward_openings(types, kind, system.openings)
+        area = sum(float(np.abs(o).sum()) for o in outward)
+        if area > 0:
+            near = ndimage.distance_transform_edt(types != kind)
+            found.append(Mouth(outward, area, np.asarray(near) * system.spacing <= reach))
+    return found
 
 
 def net_outflow(velocity: FaceVelocity, system: PressureSystem) -> np.ndarray:

@@ -66,7 +66,9 @@ def look(story: Story, inputs: Inputs, config: JobConfig, hashes: Hashes, hints:
     story.run(
         "flow",
         lambda: seeing.flow(story, inputs, config),
-        settings=hashes["flow"] if "flow" in hashes else [motion["method"], weights_hash(motion["weights"])],
+        settings=[hashes["flow"], {k: motion[k] for k in ("flow_channels", "flow_v_up", "flow_scale")}]
+        if "flow" in hashes
+        else [motion["method"], weights_hash(motion["weights"])],
         after=("read",),
     )
     story.run(

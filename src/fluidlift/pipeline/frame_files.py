@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from fluidlift.io.atomic import plain, write_json
 from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.pipeline.body import camera_of, grid_of, setting_of
 from fluidlift.pipeline.lifting import FAST_FALL, plain_report
-from fluidlift.pipeline.reading import clip_of
-from fluidlift.pipeline.seeing import TRUSTED, masks_of, pairs_of
+from fluidlift.pipeline.reading import clip_of, spans_of
+from fluidlift.pipeline.seeing import TRUSTED, flow_of, masks_of
 from fluidlift.pipeline.story import Story
 from fluidlift.pipeline.written import cleared, numbered
 from fluidlift.types import CellType, FaceVelocity, SurfaceMotion
@@ -58,7 +59,8 @@ class FrameWriter:
 
     def __init__(self, story: Story, folder: Path, files: MotionFiles, *, again: bool) -> None:
         self.story, self.folder, self.files = story, folder, files
-        self.clip, self.masks, self.pairs = clip_of(story), masks_of(story), pairs_of(story)
+        self.clip, self.masks, self.measured = clip_of(story), masks_of(story), flow_of(story)
+        self.spans = spans_of(self.clip)
         self.grid, self.cells = grid_of(story), setting_of(story).cell_types
         self.scale = self._flow_scale()
         self.journal = folder / "work" / "velocities" / f"{story.keys['velocities']}.rows"
@@ -84,22 +86,23 @@ class FrameWriter:
         write_png(numbered(self.folder / "mask", t, ".png"), _white(mask))
         write_png(numbered(self.folder / "observed", t, ".png"), _white(seen))
         # outside the fluid nothing is known: NaN, which .flo marks as unknown
-        known = np.where(mask[..., None], displacement, np.nan) if self.files.format == "flo" else displacement
+        moved = self.spans[t] * displacement  # files say what happened between two frames
+        known = np.where(mask[..., None], moved, np.nan) if self.files.format == "flo" else moved
         write_flow(self.folder / "flow", t, known, np.where(mask, trust, 0.0), self.files.format)
         if self.files.raw:
-            pair = self.pairs(t, t + 1)
-            write_flow(self.folder / "raw_flow", t, pair.displacement[0], pair.confidence[0], self.files.format)
+            pair = self.measured.displacement[t], self.measured.confidence[t]
+            write_flow(self.folder / "raw_flow", t, *pair, self.files.format)
         write_png(numbered(self.folder / "overlay", t, ".png"), self._overlay(t, displacement, mask))
         self._write_space(t, None if found is None else found.surface, None if found is None else found.velocity)
         row = {
             "frame": t,
             "number": FIRST_FRAME + t,
             "time": float(self.clip.times[t]),
-            **_row(found, mask, seen, trust),
+            **_row(found, moved, mask, seen, trust),
         }
         self.rows[t] = row
         with self.journal.open("a", encoding="utf-8") as journal:
-            journal.write(json.dumps(_plain(row)) + "\n")
+            journal.write(json.dumps(plain(row)) + "\n")
 
     def finish(self, pairs: int) -> list[dict[str, Any]]:
         """The mask of the last frame, from which no flow goes on; the rows in order. The journal is done with."""
@@ -136,7 +139,6 @@ class FrameWriter:
 
     def _write_once(self) -> None:
         """What does not change from frame to frame: camera, colour wheel."""
-        from fluidlift.io.atomic import write_json
         from fluidlift.io.images import write_png
         from fluidlift.motion.optical_flow import flow_picture
         from fluidlift.pipeline.mask_files import MASK_FACTS
@@ -186,12 +188,14 @@ def _white(mask: np.ndarray) -> np.ndarray:
     return np.where(mask, 255, 0).astype(np.uint8)
 
 
-def _row(found: FrameMotion | None, mask: np.ndarray, seen: np.ndarray, trust: np.ndarray) -> dict[str, Any]:
+def _row(
+    found: FrameMotion | None, moved: np.ndarray, mask: np.ndarray, seen: np.ndarray, trust: np.ndarray
+) -> dict[str, Any]:
     """What is known of one frame, as plain values."""
     row: dict[str, Any] = {"fluid_share": float(mask.mean())}
     if found is None:
         return row
-    speed = np.linalg.norm(found.displacement[mask], axis=-1)
+    speed = np.linalg.norm(moved[mask], axis=-1)
     row |= {
         "observed_share": float(seen[mask].mean()),
         "trusted_share": float((trust[mask] > TRUSTED).mean()),
@@ -223,9 +227,3 @@ def _doubts(found: FrameMotion) -> list[str]:
     if (found.free_fall_share or 0.0) > FAST_FALL:
         doubts.append("much of the steep part moves at the speed of free fall, which was not measured")
     return doubts
-
-
-def _plain(row: dict[str, Any]) -> dict[str, Any]:
-    from fluidlift.io.atomic import plain
-
-    return plain(row)

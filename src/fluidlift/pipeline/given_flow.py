@@ -16,11 +16,10 @@ from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected
 from fluidlift.io.video import frames_before
 from fluidlift.pipeline.reading import Inputs, clip_of
-from fluidlift.pipeline.seeing import Pair
 from fluidlift.pipeline.story import Story
 
 if TYPE_CHECKING:
-    from fluidlift.io.flow_files import FlowFiles
+    from fluidlift.io.flow_files import FlowFiles, FlowLayout, Pair
 
 
 def given_flow(story: Story, inputs: Inputs, config: JobConfig) -> tuple[Iterable[Pair], list[str]]:
@@ -52,7 +51,7 @@ def _opened(
     assert inputs.flow is not None
     size, decoded = clip_of(story).size, int(story["read"].meta["decoded_frames"])
     before = frames_before(inputs.clip, config.read.start, config.read.fps) if config.read.start > 0 else 0
-    used = np.arange(len(kept))
+    used, layout = np.arange(len(kept)), flow_layout(config)
     ways = [(before, decoded - 1, kept, "")]
     if before:
         ways.append((0, decoded - 1, kept, f"it is taken to begin where --start does, with frame {before} of the file"))
@@ -61,13 +60,30 @@ def _opened(
     refusal: InputRejected | None = None
     for start, pairs, places, words in ways:
         try:
-            files = open_flow(inputs.flow, size, pairs, start=start)
+            files = open_flow(inputs.flow, size, pairs, start=start, layout=layout)
         except InputRejected as error:
             refusal = refusal or error
             continue
         return files, places, [f"the given flow is shorter than the clip's file: {words}"] if words else []
     assert refusal is not None
     raise refusal
+
+
+def flow_layout(config: JobConfig) -> FlowLayout:
+    """What the numbers of the user's flow mean, from the settings.
+
+    Raises:
+        InputRejected: other than two channels, or a scale of 0.
+    """
+    from fluidlift.io.flow_files import FlowLayout
+
+    m = config.motion
+    if len(m.flow_channels) not in (0, 2):
+        raise InputRejected(f"motion.flow_channels = {','.join(m.flow_channels)}", "two names, such as R,G")
+    if m.flow_scale == 0:
+        raise InputRejected("motion.flow_scale = 0", "px per stored unit, not 0")
+    u_v = (m.flow_channels[0], m.flow_channels[1]) if m.flow_channels else None
+    return FlowLayout(u_v, m.flow_v_up, m.flow_scale)
 
 
 def _between(files: FlowFiles, first: int, last: int) -> Pair:

@@ -9,7 +9,7 @@ import numpy as np
 
 from fluidlift.config import JobConfig
 from fluidlift.pipeline.body import camera_of, setting_of
-from fluidlift.pipeline.reading import clip_of
+from fluidlift.pipeline.reading import clip_of, spans_of
 from fluidlift.pipeline.seeing import masks_of, pairs_of
 from fluidlift.pipeline.story import Result, Story
 from fluidlift.types import FaceVelocity, Grid, SurfaceMotion
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 FAST_FALL = 0.3
 """share of the steep part whose speed is that of free fall, from which the user is told"""
+DISAGREEMENT = 0.5
+"""share by which the projection changes what was seen on the surface, from which the user is told"""
 
 
 def motion(story: Story, config: JobConfig) -> Result:
@@ -30,6 +32,7 @@ def motion(story: Story, config: JobConfig) -> Result:
     start = min(g.meta["rest_frame"], pairs - 1)
     targets = range(start, min(start + config.motion.targets, pairs))
     wanted = sorted(set(targets) | set(range(0, pairs, config.motion.complete_every)))
+    spans = spans_of(clip_of(story))
     completed = story.scratch.array("completed", (pairs, height, width, 2), np.float16)
     observed = story.scratch.array("observed", (pairs, height, -(-width // 8)), np.uint8)
     for t in range(pairs):
@@ -42,7 +45,8 @@ def motion(story: Story, config: JobConfig) -> Result:
         frames=wanted, volume_frames=targets,
     ):  # fmt: skip
         story.step(wanted.index(found.frame), len(wanted))
-        completed[found.frame], observed[found.frame] = found.displacement, np.packbits(found.observed, axis=-1)
+        completed[found.frame] = spans[found.frame] * found.displacement
+        observed[found.frame] = np.packbits(found.observed, axis=-1)
         if found.velocity is None or found.surface is None:
             continue
         for name, component in zip("uvw", found.velocity.components):
@@ -72,6 +76,7 @@ def motion_scene(story: Story) -> MotionScene:
     return MotionScene(
         camera_of(story), g.arrays["depth"], setting.terrain, setting.cell_types, g.meta["kind"],
         clip_of(story).interval, setting.surface_height, setting.pool_level,
+        prior=(g.arrays["mean_flow"], g.arrays["mean_confidence"]),
     )  # fmt: skip
 
 
@@ -94,6 +99,11 @@ def motion_warnings(reports: list[dict[str, Any]], kind: str, free_fall_share: f
         warnings.append(
             "the divergence-free solve of the target velocity did not converge on every frame: "
             f"{len(stuck)} of {len(reports)}, the first is {stuck[0]}"
+        )
+    if reports and np.median([r.get("change_observed", 0.0) for r in reports]) > DISAGREEMENT:
+        warnings.append(
+            "the shape and the measured motion do not agree on one discharge: velocities of the seen surface were "
+            "changed by more than half"
         )
     if free_fall_share > FAST_FALL:
         warnings.append(

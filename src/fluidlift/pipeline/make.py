@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import platform
-import shutil
 import time
 from collections.abc import Iterable
 from pathlib import Path
@@ -11,14 +10,14 @@ from typing import Any
 
 from fluidlift import __version__
 from fluidlift.config import JobConfig
-from fluidlift.errors import InputRejected
 from fluidlift.pipeline import begin, body, lifting, moving, refining, simulating
 from fluidlift.pipeline.begin import input_hashes, provenance_of
 from fluidlift.pipeline.fit_request import request_of
 from fluidlift.pipeline.reading import Inputs, clip_of
 from fluidlift.pipeline.resimulate import Made, play
 from fluidlift.pipeline.scene import SimulationRequest
-from fluidlift.pipeline.story import Progress, Silence, Story
+from fluidlift.pipeline.story import Progress, Silence, Story, gone_if_refused
+from fluidlift.pipeline.written import require_stages
 from fluidlift.types import FluidAsset
 
 STAGES = ("read", "flow", "segment", "geometry", "refine", "motion", "fit", "simulate", "show")
@@ -48,33 +47,23 @@ def make(
             simulation broke down, the frames before it are written as an asset of fewer frames.
     """
     from fluidlift.io.asset_folder import check_output_folder
-    from fluidlift.io.atomic import disk_errors
 
-    unknown = set(force) - set(STAGES)
-    if unknown:
-        raise InputRejected(f"unknown stage '{sorted(unknown)[0]}'", "one of " + ", ".join(STAGES))
+    require_stages(force, STAGES)
     check_output_folder(folder)
     simulating.particle_work(config.simulate.device)  # a device that is not there is said now, not after the fit
     request_of(config.fit)  # so is a parameter that is not known
-    fresh = not folder.exists()
     began = time.perf_counter()
     story = Story(folder, STAGES, force=frozenset(force), progress=progress or Silence())
-    try:
-        with disk_errors(folder):
-            provenance = _run(story, inputs, folder, config)
-            frames = config.simulate.frames or len(clip_of(story)) - story["geometry"].meta["rest_frame"]
-            simulating.require_room(folder, frames, len(body.rest_of(story)))
-            _write_asset(story, folder, config, provenance)
-            frames = play(story, folder, config, SimulationRequest(restart="simulate" in story.force))
-    except InputRejected:
-        # an input that cannot be used leaves nothing behind; work that was done before a disk ran full is kept
-        if fresh and "motion" not in story.results:
-            shutil.rmtree(folder, ignore_errors=True)
-        raise
+    with gone_if_refused(story, "motion"):
+        provenance = _run(story, inputs, config)
+        frames = config.simulate.frames or len(clip_of(story)) - story["geometry"].meta["rest_frame"]
+        simulating.require_room(folder, frames, len(body.rest_of(story)))
+        _write_asset(story, folder, config, provenance)
+        frames = play(story, folder, config, SimulationRequest(restart="simulate" in story.force))
     return Made(folder, tuple(story.warnings), time.perf_counter() - began, story.timings, frames)
 
 
-def _run(story: Story, inputs: Inputs, folder: Path, config: JobConfig) -> dict[str, Any]:
+def _run(story: Story, inputs: Inputs, config: JobConfig) -> dict[str, Any]:
     hashes = input_hashes(inputs)
     seed, run, shape = config.seed, story.run, config.section("shape")
     begin.look(story, inputs, config, hashes)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import time
 from collections.abc import Iterable
 from pathlib import Path
@@ -15,7 +14,7 @@ from fluidlift.errors import InputRejected
 from fluidlift.pipeline import begin
 from fluidlift.pipeline.reading import Inputs, clip_of
 from fluidlift.pipeline.seeing import NO_HINTS, Hints, labels_of
-from fluidlift.pipeline.story import Progress, Result, Silence, Story
+from fluidlift.pipeline.story import Progress, Result, Silence, Story, gone_if_refused
 from fluidlift.pipeline.written import Written, cleared, digest_of, numbered, require_stages
 from fluidlift.types import Label
 
@@ -48,30 +47,24 @@ def find_masks(
             has changed.
     """
     from fluidlift.io.asset_folder import check_output_folder
-    from fluidlift.io.atomic import disk_errors
 
     require_stages(force, MASK_STAGES)
     check_output_folder(folder)
-    fresh, began = not folder.exists(), time.perf_counter()
+    began = time.perf_counter()
     story = Story(folder, MASK_STAGES, force=frozenset(force), progress=progress or Silence())
-    try:
-        with disk_errors(folder):
-            begin.look(story, inputs, config, begin.input_hashes(inputs), hints)
-            found = story.run(
-                "masks",
-                lambda: _write(story, folder, "masks" in story.force, inputs.camera is not None),
-                settings=inputs.camera is not None,
-                after=("read", "segment"),
-                still_there=lambda result: all(
-                    numbered(folder / name, t, ".png").is_file()
-                    for name in ("mask", "overlay") for t in range(result.meta["frames"])
-                ),
-                owns_files=True,
-            )  # fmt: skip
-    except InputRejected:
-        if fresh and "segment" not in story.results:
-            shutil.rmtree(folder, ignore_errors=True)
-        raise
+    with gone_if_refused(story, "segment"):
+        begin.look(story, inputs, config, begin.input_hashes(inputs), hints)
+        found = story.run(
+            "masks",
+            lambda: _write(story, folder, "masks" in story.force, inputs.camera is not None),
+            settings=inputs.camera is not None,
+            after=("read", "segment"),
+            still_there=lambda result: all(
+                numbered(folder / name, t, ".png").is_file()
+                for name in ("mask", "overlay") for t in range(result.meta["frames"])
+            ),
+            owns_files=True,
+        )  # fmt: skip
     return Written(
         folder, time.perf_counter() - began, tuple(story.warnings), story.timings,
         _facts(story, folder, found), _words(story, folder, found),

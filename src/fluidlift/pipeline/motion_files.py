@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import time
 from collections.abc import Iterable
 from dataclasses import asdict
@@ -12,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from fluidlift.config import JobConfig
-from fluidlift.errors import InputRejected
 from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.pipeline import begin
 from fluidlift.pipeline.body import grid_of
@@ -20,7 +18,7 @@ from fluidlift.pipeline.frame_files import FrameWriter, MotionFiles
 from fluidlift.pipeline.lifting import motion_options, motion_scene, motion_warnings
 from fluidlift.pipeline.reading import Inputs, clip_of
 from fluidlift.pipeline.seeing import masks_of, pairs_of
-from fluidlift.pipeline.story import Progress, Result, Silence, Story
+from fluidlift.pipeline.story import Progress, Result, Silence, Story, gone_if_refused
 from fluidlift.pipeline.written import Written, numbered, require_stages
 
 MOTION_STAGES = ("read", "flow", "segment", "geometry", "velocities")
@@ -52,32 +50,27 @@ def measure_motion(
         InputRejected: an input that cannot be used, or a folder with other things in it.
     """
     from fluidlift.io.asset_folder import check_output_folder
-    from fluidlift.io.atomic import disk_errors
+    from fluidlift.io.atomic import write_json
 
     files = files or MotionFiles()
     require_stages(force, MOTION_STAGES)
     check_output_folder(folder)
-    fresh, began = not folder.exists(), time.perf_counter()
+    began = time.perf_counter()
     story = Story(folder, MOTION_STAGES, force=frozenset(force), progress=progress or Silence())
-    try:
-        with disk_errors(folder):
-            hashes = begin.input_hashes(inputs)
-            begin.look(story, inputs, config, hashes)
-            begin.shape(story, inputs, config, hashes)
-            found = story.run(
-                "velocities",
-                lambda: _velocities(story, folder, config, files),
-                settings=[asdict(motion_options(config)), asdict(files)],
-                after=("read", "flow", "segment", "geometry"),
-                still_there=lambda result: _all_there(folder, files, result),
-                owns_files=True,
-            )
-            facts = _facts(story, found, begin.provenance_of(inputs, hashes))
-            _write_facts(folder, facts)
-    except InputRejected:
-        if fresh and "geometry" not in story.results:
-            shutil.rmtree(folder, ignore_errors=True)
-        raise
+    with gone_if_refused(story, "geometry"):
+        hashes = begin.input_hashes(inputs)
+        begin.look(story, inputs, config, hashes)
+        begin.shape(story, inputs, config, hashes)
+        found = story.run(
+            "velocities",
+            lambda: _velocities(story, folder, config, files),
+            settings=[asdict(motion_options(config)), asdict(files)],
+            after=("read", "flow", "segment", "geometry"),
+            still_there=lambda result: _all_there(folder, files, result),
+            owns_files=True,
+        )
+        facts = _facts(story, found, begin.provenance_of(inputs, hashes))
+        write_json(folder / "motion.json", facts)
     return Written(
         folder, time.perf_counter() - began, tuple(story.warnings), story.timings, facts, _words(folder, facts)
     )
@@ -160,12 +153,6 @@ def _facts(story: Story, found: Result, provenance: dict[str, Any]) -> dict[str,
 def _median(rows: list[dict[str, Any]], name: str) -> float | None:
     values = [r[name] for r in rows if r.get(name) is not None]
     return float(np.median(values)) if values else None
-
-
-def _write_facts(folder: Path, facts: dict[str, Any]) -> None:
-    from fluidlift.io.atomic import write_json
-
-    write_json(folder / "motion.json", facts)
 
 
 def _words(folder: Path, facts: dict[str, Any]) -> tuple[str, ...]:

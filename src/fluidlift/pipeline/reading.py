@@ -13,6 +13,7 @@ import numpy as np
 
 from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected
+from fluidlift.io.collect import is_variable
 from fluidlift.io.stage_cache import Scratch, parts_of
 from fluidlift.pipeline.story import Result, Story
 from fluidlift.types import VideoClip
@@ -160,6 +161,12 @@ def _longest_shot(cuts: list[int], frames: int, source: str, kept: np.ndarray) -
         last,
         [f"the clip has {len(cuts)} cut(s), at frame {where}: only frames {kept[first]} to {kept[last - 1]} are used"],
     )
+
+
+def spans_of(clip: VideoClip) -> np.ndarray:
+    """Time that each pair of frames spans, in `clip.interval`, float32 [T-1]; rounded time stamps count as even."""
+    steps = np.diff(clip.times)
+    return (steps / clip.interval if is_variable(clip.times) else np.ones(len(steps))).astype(np.float32)
 
 
 def clip_of(story: Story) -> VideoClip:

@@ -253,6 +253,7 @@ def evaluation_arrays(story: Story) -> dict[str, np.ndarray]:
         "front_depth": g.arrays["depth"] * g.arrays["mask"],
         "flow_raw": story["flow"].arrays["displacement"],
         "flow_completed": m.arrays["completed"],
+        "flow_observed": np.unpackbits(m.arrays["observed"], axis=-1)[..., : m.arrays["completed"].shape[2]],
         "resim_flow": shown["resim_flow"][:-1],
         "resim_mask": shown["resim_mask"],
         "resim_frames": shown["resim_frames"],

@@ -12,19 +12,15 @@ from fluidlift.backends.learned import FLOW_METHODS, MASK_METHODS, ModelChoice, 
 from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected
 from fluidlift.io.stage_cache import parts_of
-from fluidlift.pipeline.reading import Inputs, clip_of
+from fluidlift.pipeline.reading import Inputs, clip_of, spans_of
 from fluidlift.pipeline.story import Result, Story
 from fluidlift.seams import FlowEstimator, Segmenter
-from fluidlift.types import Label, PixelFlow, PixelLabels
+from fluidlift.types import Label, PixelFlow, PixelLabels, VideoClip
 
 MOST_PAIRS = 600
 """of a clip from which its mean motion is taken, evenly spread where there are more"""
 TRUSTED = 0.3
 """confidence from which flow counts as measured"""
-
-
-Pair = tuple[np.ndarray, np.ndarray]
-"""displacement [H,W,2], px, and confidence [H,W]"""
 
 
 @dataclass(frozen=True)
@@ -47,6 +43,10 @@ class Hints:
         points = [(*_numbers(text, 2, "--click", "x,y"), True) for text in here]
         points += [(*_numbers(text, 2, "--not-here", "x,y"), False) for text in not_here]
         return cls(None if box is None else tuple(round(v) for v in box), tuple(points))  # type: ignore[arg-type]
+
+    def clicks(self) -> list[tuple[float, float, int]]:
+        """The points as `shape.segment` takes them."""
+        return [(x, y, int(there)) for x, y, there in self.points]
 
     def plain(self) -> list[Any] | None:
         """For the cache; None where nothing is said."""
@@ -95,28 +95,23 @@ class FluidMasks:
 
 def flow(story: Story, inputs: Inputs, config: JobConfig) -> Result:
     """Optical flow of every pair of frames: the user's, or estimated."""
+    from fluidlift.motion.optical_flow import estimate_flow
+    from fluidlift.pipeline.given_flow import given_flow
+
     clip = clip_of(story)
     count, (width, height) = len(clip) - 1, clip.size
-    found, warnings = _pairs(story, inputs, config)
+    # float16 ends at 65504, far beyond any picture
     displacement = story.scratch.array("displacement", (count, height, width, 2), np.float16)
     confidence = story.scratch.array("confidence", (count, height, width), np.float16)
-    for t, pair in enumerate(found):
-        # float16 ends at 65504, far beyond any picture
-        displacement[t], confidence[t] = pair
-        if inputs.flow is not None:
+    warnings: list[str] = []
+    if inputs.flow is None:
+        estimate_flow(clip.frames, method=flow_method(config), progress=story.step, out=(displacement, confidence))
+    else:
+        pairs, warnings = given_flow(story, inputs, config)
+        for t, pair in enumerate(pairs):
+            displacement[t], confidence[t] = pair
             story.step(t + 1, count)
     return Result({"displacement": displacement, "confidence": confidence}, {"warnings": warnings})
-
-
-def _pairs(story: Story, inputs: Inputs, config: JobConfig) -> tuple[Iterable[Pair], list[str]]:
-    """Displacement and confidence of each pair, and what the user should know of them."""
-    if inputs.flow is not None:
-        from fluidlift.pipeline.given_flow import given_flow
-
-        return given_flow(story, inputs, config)
-    from fluidlift.pipeline.pair_flow import each_pair
-
-    return each_pair(clip_of(story).frames, flow_method(config), story.step), []
 
 
 def flow_method(config: JobConfig) -> str | FlowEstimator:
@@ -128,38 +123,46 @@ def flow_method(config: JobConfig) -> str | FlowEstimator:
 
 
 def flow_of(story: Story) -> PixelFlow:
-    """The flow that later stages see, float16, mapped; `pairs_of` gives parts of it as float32."""
+    """The flow between neighbouring frames, px, float16, mapped; `pairs_of` gives parts of it at a steady rate."""
     r = story["flow"].arrays
     return PixelFlow(r["displacement"], r["confidence"])
 
 
 def pairs_of(story: Story) -> Callable[[int, int], PixelFlow]:
-    """Reads the flow of the pairs first to last - 1, float32."""
-    r = story["flow"].arrays
+    """Reads the flow of the pairs first to last - 1, float32, px per `clip.interval`, as `_steady_flow` gives it."""
+    read = _steady_flow(story)
+    return lambda first, last: read(range(first, last), slice(None))
 
-    def read(first: int, last: int) -> PixelFlow:
-        part = slice(first, last)
-        return PixelFlow(np.asarray(r["displacement"][part], np.float32), np.asarray(r["confidence"][part], np.float32))
+
+def _steady_flow(story: Story) -> Callable[[Iterable[int], slice], PixelFlow]:
+    """Reads rows of the flow of some pairs, float32, as it would be at a steady frame rate.
+
+    What was measured is a displacement between two frames. Where these lie farther apart in time than others (a
+    variable frame rate, frames left out), it is scaled to the clip's interval: equal values are equal velocities then.
+    """
+    r, spans = story["flow"].arrays, spans_of(clip_of(story))
+
+    def read(pairs: Iterable[int], rows: slice) -> PixelFlow:
+        chosen = list(pairs)
+        return PixelFlow(
+            np.stack([np.asarray(r["displacement"][t, rows], np.float32) / spans[t] for t in chosen]),
+            np.stack([np.asarray(r["confidence"][t, rows], np.float32) for t in chosen]),
+        )
 
     return read
 
 
 def mean_motion(story: Story, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean flow of the whole clip (px per frame) and its confidence, in bands of rows to bound memory."""
+    """Mean flow of the whole clip (px per `clip.interval`) and its confidence, in bands of rows to bound memory."""
     from fluidlift.motion.optical_flow import mean_flow
 
-    whole = flow_of(story)
-    pairs, height, width = whole.confidence.shape
+    read, (pairs, height, width) = _steady_flow(story), story["flow"].arrays["confidence"].shape
     pick = np.unique(np.linspace(0, pairs - 1, min(pairs, MOST_PAIRS)).round().astype(int))
     rows = max(1, int(2**21 // (len(pick) * width)))
     mean, trust = np.zeros((height, width, 2), np.float32), np.zeros((height, width), np.float32)
     for top in range(0, height, rows):
         band = slice(top, top + rows)
-        part = PixelFlow(
-            np.stack([np.asarray(whole.displacement[t, band], np.float32) for t in pick]),
-            np.stack([np.asarray(whole.confidence[t, band], np.float32) for t in pick]),
-        )
-        mean[band], trust[band] = mean_flow(part, mask[band])
+        mean[band], trust[band] = mean_flow(read(pick, band), mask[band])
     return mean, trust
 
 
@@ -171,11 +174,10 @@ def segment(story: Story, inputs: Inputs, config: JobConfig, hints: Hints = NO_H
     mask, shape = _user_mask(story, inputs, config), clip.frames.shape[:3]
     out = story.scratch.array("labels", shape, np.uint8), story.scratch.array("confidence", shape, np.float16)
     if mask is None and config.segment.method in MASK_METHODS:
-        labels = _learned(config, hints).segment(clip, flow_of(story), out=out)
+        labels = _learned(story, config, hints).segment(clip, flow_of(story), out=out)
     else:
         labels = segment_clip(
-            clip, flow_of(story), user_mask=mask, roi=hints.roi,
-            points=[(x, y, int(there)) for x, y, there in hints.points],
+            clip, flow_of(story), user_mask=mask, roi=hints.roi, points=hints.clicks(),
             progress=lambda part, _: story.step(round(100 * part), 100), out=out,
         )  # fmt: skip
     fluid = FluidMasks(labels.labels)
@@ -206,15 +208,23 @@ def segment(story: Story, inputs: Inputs, config: JobConfig, hints: Hints = NO_H
     )
 
 
-def _learned(config: JobConfig, hints: Hints) -> Segmenter:
-    """A learned segmentation with its weights."""
-    s = config.segment
-    if hints != NO_HINTS:
+def _learned(story: Story, config: JobConfig, hints: Hints) -> Segmenter:
+    """A learned segmentation with its weights; one that starts from our own is given the hints through it."""
+    from fluidlift.shape.segment import segment as segment_clip
+
+    s, shape = config.segment, clip_of(story).frames.shape[:3]
+    if hints != NO_HINTS and s.method == "sam3":
         raise InputRejected(
-            f"--roi, --click or --not-here with {s.method}", "hints for segment.method=auto alone",
-            "leave them out, or the method",
+            "--roi, --click or --not-here with sam3, which goes by words", "hints for segment.method=auto or sam2",
+            "leave them out, or choose another method",
         )  # fmt: skip
-    return make_segmenter(s.method, ModelChoice(s.weights, s.device, s.download), words=s.words)
+
+    def guess(clip: VideoClip, flow: PixelFlow) -> PixelLabels:
+        room = story.scratch.array("guess", shape, np.uint8), story.scratch.array("guess_trust", shape, np.float16)
+        return segment_clip(clip, flow, roi=hints.roi, points=hints.clicks(), out=room)
+
+    choice = ModelChoice(s.weights, s.device, s.download)
+    return make_segmenter(s.method, choice, words=s.words, guess=guess, progress=story.step)
 
 
 def _halved(story: Story, confidence: np.ndarray) -> np.ndarray:

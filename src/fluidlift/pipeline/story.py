@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import resource
+import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -17,7 +18,9 @@ from typing import Any, Protocol
 import numpy as np
 
 from fluidlift import __version__
+from fluidlift.errors import InputRejected
 from fluidlift.io.asset_folder import is_owner, load_stage, mark_owner, save_stage
+from fluidlift.io.atomic import disk_errors
 from fluidlift.io.stage_cache import Scratch
 
 Arrays = dict[str, np.ndarray]
@@ -184,6 +187,25 @@ class Story:
     def step(self, done: int, total: int) -> None:
         """Progress inside the current stage."""
         self.progress.update(done, total)
+
+
+@contextmanager
+def gone_if_refused(story: Story, until: str) -> Iterator[None]:
+    """Where an input is refused before the stage `until` is done, a folder that was not there before goes again.
+
+    Work that was done before, such as before a disk ran full, is kept.
+
+    Raises:
+        InputRejected: as what is done inside, and for errors of the disk.
+    """
+    fresh = not story.folder.exists()
+    try:
+        with disk_errors(story.folder):
+            yield
+    except InputRejected:
+        if fresh and until not in story.results:
+            shutil.rmtree(story.folder, ignore_errors=True)
+        raise
 
 
 def peak_memory_mb() -> float:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import cv2
 import numpy as np
 
-from fluidlift.shape.background import still_background, typical_contrast
+from fluidlift.shape.background import DECISIVE, filled_in, still_background, typical_contrast
 from fluidlift.shape.evidence import POOLING, Evidence, change_over_time, pool
 from fluidlift.shape.min_cut import disc
 from fluidlift.shape.presence import Presence
@@ -16,8 +16,10 @@ from fluidlift.types.clip import Label
 
 SHADOW = 0.2
 """factor on changes of brightness against the sign of the fluid's own contrast"""
-FAINTEST = 0.3
-"""of the fluid's typical contrast with the background: what is fainter is not counted as fluid"""
+FAINTEST = 0.5
+"""of the fluid's typical contrast with the background: an outline lies where fluid and background mix half and half"""
+GAP = 0.012
+"""part of the longer side: gaps between puffs that are narrower (radius) are fluid in the shade of other fluid"""
 
 
 def advancing_labels(
@@ -37,7 +39,7 @@ def advancing_labels(
     domain &= hint > -2.0
     still = still_pixels(evidence)
     for odds in median_over_time(odds_over_time(evidence, presence, domain, hint)):
-        region, solid = solids_in(clean_region(odds > 0.0), still)
+        region, solid = solids_in(clean_region(odds > 0.0, gap=GAP), still)
         labels = np.zeros(score.shape, np.uint8)
         labels[region], labels[solid] = Label.FLUID, Label.SOLID
         yield labels, np.tanh(0.5 * np.abs(odds))
@@ -46,10 +48,15 @@ def advancing_labels(
 def odds_over_time(
     evidence: Evidence, presence: Presence, domain: np.ndarray, hint: np.ndarray
 ) -> Iterator[np.ndarray]:
-    """float32 [h,w], log odds of fluid in every frame: it differs from what is behind it, moves, has its colour."""
+    """float32 [h,w], log odds of fluid in every frame: it differs from what is behind it, moves, has its colour.
+
+    Where the background was never seen, what is filled in from around it only tells a shadow: a clear change against
+    the sign of the fluid's contrast, though it moves as the fluid does.
+    """
     background, known, like_fluid = still_background(evidence, presence, domain)
     contrast, brightens = typical_contrast(evidence, presence, background, known)
     threshold = np.maximum(4.0 * evidence.noise, FAINTEST * contrast)
+    background = filled_in(background, known)
     sigma = POOLING * max(evidence.noise.shape)
     for t, change in enumerate(change_over_time(evidence)):
         picture = evidence.source[t].astype(np.float32)
@@ -57,10 +64,13 @@ def odds_over_time(
         change_of_colour = picture - background
         size = np.abs(change_of_colour).sum(axis=-1)
         differs = size / threshold
-        differs[change_of_colour[..., 0] * brightens < -0.5 * size] *= SHADOW
+        shaded = change_of_colour[..., 0] * brightens < -0.5 * size
+        differs[shaded] *= SHADOW
         stands_out = np.log(np.maximum(differs, 1e-3)) / 0.3
         seen = stands_out + 0.25 * np.clip(moved, -4.0, 4.0)
-        best = np.where(known, seen, np.clip(moved, -3.0, 3.0) + like_fluid(picture)) + hint
+        guessed = np.clip(moved, -3.0, 3.0) + like_fluid(picture)
+        guessed[shaded & (2.0 * size > threshold)] = -DECISIVE
+        best = np.where(known, seen, guessed) + hint
         yield np.clip(np.where(domain, best, -12.0), -12.0, 12.0).astype(np.float32)
 
 

@@ -13,6 +13,10 @@ from fluidlift.shape.presence import Presence
 
 DECISIVE = 3.5
 """log odds at which colour alone is held to say no more"""
+FAINT = 0.25
+"""of the activity that separates still from moving: what is less is noise; 0.5 loses 3 % of a noisy or a small plume"""
+RARE = 20.0
+"""times rarer around the fluid than in it is a colour that tells fluid without any activity"""
 
 
 def still_background(
@@ -33,7 +37,8 @@ def still_background(
     background = total / np.maximum(count, 1.0)[..., None]
     pictures = np.stack([evidence.source[t] for t in presence.picked])
     moving = colour_histogram(pictures[presence.active])
-    domain |= quiet_fluid(background, domain, moving, colour_histogram(pictures[:, ~domain]))
+    faint = evidence.activity > FAINT * evidence.level
+    domain |= quiet_fluid(background, domain, moving, colour_histogram(pictures[:, ~domain]), faint)
     around = colour_histogram(pictures[:, ~domain])
     fluid = without_background(moving, around)
     rare = 1e-5 * (around.sum() + fluid.sum())
@@ -47,11 +52,34 @@ def still_background(
     return background, (count >= 3) & ~suspect, like_fluid
 
 
-def quiet_fluid(picture: np.ndarray, domain: np.ndarray, moving: np.ndarray, around: np.ndarray) -> np.ndarray:
-    """bool [h,w]: what touches the domain and has a colour that is common in the moving fluid, rare around it."""
+def filled_in(picture: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """The picture, float32 [h,w,c], with what is not known, bool [h,w], guessed from its rim.
+
+    Means over ever larger neighbourhoods of what is known, coarse to fine (Gortler et al. 1996, "The lumigraph",
+    push-pull); all zero where nothing is known.
+    """
+    if known.all() or min(known.shape) < 2:
+        return np.where(known[..., None], picture, 0.0).astype(np.float32)
+    height, width = known.shape
+    size = ((width + 1) // 2, (height + 1) // 2)
+    weight = known.astype(np.float32)
+    share = cv2.resize(weight, size, interpolation=cv2.INTER_AREA)
+    mean = cv2.resize(picture * weight[..., None], size, interpolation=cv2.INTER_AREA)
+    coarse = filled_in(mean / np.maximum(share, 1e-6)[..., None], share > 0.0)
+    smooth = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR)
+    return np.where(known[..., None], picture, smooth).astype(np.float32)
+
+
+def quiet_fluid(
+    picture: np.ndarray, domain: np.ndarray, moving: np.ndarray, around: np.ndarray, faint: np.ndarray
+) -> np.ndarray:
+    """bool [h,w]: what touches the domain and has a colour of the moving fluid that is rare around it.
+
+    Where there is `faint` activity, bool [h,w], the colour need only be more common in the fluid than around.
+    """
     bins = colour_bins(picture)
     share_moving, share_around = moving[bins] / max(moving.sum(), 1.0), around[bins] / max(around.sum(), 1.0)
-    alien = share_moving + 1e-5 > 20.0 * (share_around + 1e-5)
+    alien = share_moving + 1e-5 > np.where(faint, 1.0, RARE) * (share_around + 1e-5)
     parts = cv2.connectedComponents((domain | alien).astype(np.uint8), connectivity=4)[1]
     return alien & np.isin(parts, np.unique(parts[domain]))
 

@@ -42,10 +42,11 @@ def cut_along_edges(picture: np.ndarray, activity: np.ndarray, level: float, sco
     return np.isin(trimap, (cv2.GC_FGD, cv2.GC_PR_FGD))
 
 
-def clean_region(region: np.ndarray) -> np.ndarray:
-    """bool [h,w]: gaps closed, threads and specks gone, only components that matter beside the largest."""
+def clean_region(region: np.ndarray, *, gap: float = 0.008) -> np.ndarray:
+    """bool [h,w]: gaps (radius in parts of the longer side) closed, threads and specks gone, only components that
+    matter beside the largest."""
     longest = max(region.shape)
-    mask = cv2.morphologyEx(region.astype(np.uint8), cv2.MORPH_CLOSE, disc(0.008 * longest))
+    mask = cv2.morphologyEx(region.astype(np.uint8), cv2.MORPH_CLOSE, disc(gap * longest))
     mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, disc(0.004 * longest))
     count, parts, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
     if count <= 1:

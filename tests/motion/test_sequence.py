@@ -224,6 +224,19 @@ def test_a_plume_is_held_against_its_silhouette_and_a_pour_against_free_fall() -
     assert pour.free_fall_share is not None
 
 
+def test_flow_and_surface_tell_the_same_motion_where_free_fall_took_the_place_of_flow() -> None:
+    (pour,) = motion_sequence(Clip(4), still_mask, 4, channel("pour"), frames=(), volume_frames=[1])
+    assert pour.surface is not None and pour.free_fall_share
+    start, _ = CAMERA.project(pour.surface.points)
+    ends, z = CAMERA.project(pour.surface.points + INTERVAL * pour.surface.velocities)
+    falls = (pour.surface.velocities[:, :2] == 0).all(axis=1) & (pour.surface.velocities[:, 2] < 0) & (z > 0)
+    assert falls.sum() > 50
+    rows, cols = (np.floor(start[falls, k]).astype(int) for k in (1, 0))
+    # float32 points of a metre at a thousandth of a pixel
+    assert np.abs(pour.displacement[rows, cols] - (ends - start)[falls]).max() < 0.02
+    assert not pour.observed[rows, cols].any() and pour.confidence[rows, cols].max() == 0.0
+
+
 def test_frames_without_fluid_are_left_out() -> None:
     def mask(frame: int) -> np.ndarray:
         return still_mask(frame) & (frame != 2)

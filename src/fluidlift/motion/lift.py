@@ -30,7 +30,6 @@ def lift_flow(
     interval: float,
     *,
     mask_t1: Bool[np.ndarray, "h w"] | None = None,
-    stride: int = 1,
 ) -> SurfaceMotion:
     """Velocity of the visible surface.
 
@@ -55,7 +54,6 @@ def lift_flow(
         camera: of the picture that the flow was measured on: resized and cropped as that was.
         interval: s per frame.
         mask_t1: the fluid one frame later; `mask` where None.
-        stride: take every stride-th pixel in both directions.
 
     Returns:
         points (where the fluid is at t) and velocities, float32, in world axes; observed: flow was, and the fluid was
@@ -71,15 +69,12 @@ def lift_flow(
     require(bool(mask.any()), "an empty mask", "at least one fluid pixel")
     require(bool((np.asarray(depth_t)[mask] > 0).all()), "depth that is not positive inside the mask")
     change, followed = follow_depth(d, mask, depth_t, depth_t1, mask_t1=mask_t1)
-    taken = np.zeros_like(mask)
-    taken[::stride, ::stride] = True
-    taken &= mask
-    start = camera.pixel_grid()[taken]
-    z = np.asarray(depth_t, np.float64)[taken]
+    start = camera.pixel_grid()[mask]
+    z = np.asarray(depth_t, np.float64)[mask]
     first = camera.unproject(start, z)
-    second = camera.unproject(start + d[taken], np.maximum(z + change[taken], 1e-6 * z))
+    second = camera.unproject(start + d[mask], np.maximum(z + change[mask], 1e-6 * z))
     seen = np.asarray(observed, bool) & followed
-    return SurfaceMotion(first.astype(np.float32), ((second - first) / interval).astype(np.float32), seen[taken])
+    return SurfaceMotion(first.astype(np.float32), ((second - first) / interval).astype(np.float32), seen[mask])
 
 
 def depth_change(

@@ -54,6 +54,12 @@ SLOW = 1.0
 DARK = 20.0
 """grey levels added before the logarithm: below, noise and black level are larger than what light does. 7 and 40 give
 the same error within 1 %"""
+TRIM = 2.5
+"""standard deviations of a pixel's own spread beyond which a frame is left out of its mean"""
+EVIDENCE = 0.5
+"""sum of confidences at which a mean deserves a confidence of one half"""
+LEAST_SPREAD = 0.05
+"""px; frames that agree better than that are not told apart"""
 NOISE_GRADIENT = 0.5
 """grey levels per px: root mean square gradient, smoothed as `texture_strength` does, of white noise of 2.5 levels"""
 STILL_SHARE = 0.25
@@ -213,7 +219,6 @@ def multiframe_flow(
     estimator: FlowEstimator,
     progress: Progress | None = None,
     *,
-    refiner: FlowEstimator | None = None,
     out: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> PixelFlow:
     """Flow of every neighbouring pair, each measured with its neighbours in time.
@@ -225,7 +230,6 @@ def multiframe_flow(
         frames: sRGB, possibly memory-mapped; a few are read at a time.
         estimator: of flow between two pictures.
         progress: called after each step.
-        refiner: measures what is left in the moving frame; None: `estimator`.
         out: as for `optical_flow.estimate_flow`; it holds what is still to be refined, so that nothing else grows with
             the clip. float16 rounds that by 1/2000.
 
@@ -245,7 +249,7 @@ def multiframe_flow(
         window = [*earlier, own, *displacement[t + 1 : t + REACH + 1]]
         surroundings = _trusted_mean(window, confidence[t - len(earlier) : t + REACH + 1])
         earlier.append(own)
-        displacement[t] = refined(frames, t, own, surroundings, refiner or estimator)
+        displacement[t] = refined(frames, t, own, surroundings, estimator)
         if progress is not None:
             progress(pairs + t + 1, 2 * pairs)
     for t in range(pairs):
@@ -341,8 +345,8 @@ def mean_flow(
     flow: PixelFlow,
     mask: Bool[np.ndarray, "*t h w"] | None = None,
     *,
-    trim: float = 2.5,
-    evidence: float = 0.5,
+    trim: float = TRIM,
+    evidence: float = EVIDENCE,
 ) -> tuple[Float[np.ndarray, "h w 2"], Float[np.ndarray, "h w"]]:
     """The mean motion of a steady fluid over all pairs of `flow`, robust against failures of single frames.
 
@@ -373,7 +377,7 @@ def mean_flow(
         distance = ((d - mean) ** 2).sum(axis=-1)
         total = np.maximum(weight.sum(axis=0), 1e-6)
         spread = (weight * distance).sum(axis=0) / total
-        kept = np.where(distance <= trim**2 * np.maximum(spread, 0.05**2), weight, 0.0)
+        kept = np.where(distance <= trim**2 * np.maximum(spread, LEAST_SPREAD**2), weight, 0.0)
         mean = _weighted_mean(d, kept)
     total = kept.sum(axis=0)
     held = np.maximum(total, 1e-6)

@@ -100,8 +100,6 @@ class MotionOptions:
     """form of the screen-divergence constraint: exact or paper"""
     wall: str = "cubic"
     """wall function, one of `motion.bed.WALLS`"""
-    stride: int = 1
-    """of the pixels that are lifted"""
     tolerance: float = 1e-4
     """relative residual of the volume's projection"""
 
@@ -110,7 +108,6 @@ class MotionOptions:
         require(self.reach >= 0, f"a reach of {self.reach} frames", "0 or more")
         require(self.wall in WALLS, f"wall function '{self.wall}'", "one of " + ", ".join(WALLS))
         require(self.divergence in ("exact", "paper"), f"form '{self.divergence}'", "exact or paper")
-        require(self.stride >= 1, f"stride {self.stride}", "1 or more")
 
 
 @dataclass(frozen=True)
@@ -284,7 +281,9 @@ def _frame_motion(
         full, factor = _with_front(full, mask, t, window)
     surface = velocity = report = share = None
     if solver is not None:
-        surface, velocity, report, share = _lifted(full, seen, now, scene, options, solver)
+        before, surface, velocity, report, share = _lifted(full, seen, now, scene, options, solver)
+        if share and surface is not None:
+            full, seen, trust = _as_it_falls(full, seen, trust, before, surface, now, scene)
     return FrameMotion(t, full, trust, seen, surface, velocity, report, share, factor)
 
 
@@ -328,17 +327,16 @@ def _with_front(full: np.ndarray, mask: MaskReader, t: int, window: FlowWindow) 
 
 def _lifted(
     full: np.ndarray, seen: np.ndarray, now: _Instant, scene: MotionScene, options: MotionOptions, solver: VolumeSolver
-) -> tuple[SurfaceMotion | None, FaceVelocity | None, VolumeReport | None, float | None]:
-    """Surface and volume velocity of a frame; nothing where none of its fluid lies on the body."""
+) -> tuple[SurfaceMotion | None, SurfaceMotion | None, FaceVelocity | None, VolumeReport | None, float | None]:
+    """Surface motion as measured and as it must fall, and volume velocity; nothing where no fluid lies on the body."""
     terrain, cells = scene.terrain, scene.cell_types
     assert terrain is not None and cells is not None and now.depth is not None and now.depth_after is not None
     body, body_after = now.on_body()
     if not body.any():
-        return None, None, None, None
-    surface = lift_flow(
-        full, seen, body, now.depth, now.depth_after, scene.camera, scene.interval, mask_t1=body_after,
-        stride=options.stride,
-    )  # fmt: skip
+        return None, None, None, None, None
+    measured = surface = lift_flow(
+        full, seen, body, now.depth, now.depth_after, scene.camera, scene.interval, mask_t1=body_after
+    )
     share = None
     if scene.kind in ("fall", "pour"):
         down = downhill_of(surface.points, terrain.grid, scene.surface_height, scene.pool_level)
@@ -346,7 +344,23 @@ def _lifted(
     velocity, report = solver.velocity(surface, tolerance=options.tolerance)
     if scene.kind == "plume":
         velocity, _ = with_air(velocity, cells, terrain, terrain.grid)
-    return surface, velocity, report, share
+    return measured, surface, velocity, report, share
+
+
+def _as_it_falls(
+    full: np.ndarray, seen: np.ndarray, trust: np.ndarray, measured: SurfaceMotion | None, surface: SurfaceMotion,
+    now: _Instant, scene: MotionScene,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+    """Displacement, observed and confidence where free fall took the place of flow: what that fall looks like."""
+    assert measured is not None
+    replaced = (surface.velocities != measured.velocities).any(axis=1)
+    rows, cols = (index[replaced] for index in np.nonzero(now.on_body()[0]))
+    ends, z = scene.camera.project(surface.points[replaced] + scene.interval * surface.velocities[replaced])
+    full, seen, trust = full.copy(), seen.copy(), trust.copy()
+    start = scene.camera.pixel_grid()[rows, cols]
+    full[rows, cols] = np.where((z > 0)[:, None], ends - start, full[rows, cols])
+    seen[rows, cols], trust[rows, cols] = False, 0.0
+    return full, seen, trust
 
 
 def downhill_of(

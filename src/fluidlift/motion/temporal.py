@@ -27,14 +27,12 @@ from numba import njit
 
 from fluidlift.errors import require
 from fluidlift.motion.confidence import ROUND_TRIP_FLOOR, ROUND_TRIP_SHARE
-from fluidlift.motion.multiframe import NO_TRUST
+from fluidlift.motion.multiframe import EVIDENCE, LEAST_SPREAD, NO_TRUST, TRIM
 from fluidlift.types import PixelFlow
 
 TRUSTED = 0.4
 """confidence from which the near pairs stand alone; at half of it and below the longer mean takes their place.
 It is the threshold of the mainstream (`mainstream.OBSERVED_CONFIDENCE`)."""
-TRIM, EVIDENCE, LEAST_SPREAD = 2.5, 0.5, 0.05
-"""as in `multiframe.mean_flow`, the plain twin of `mean_of_samples`"""
 OTHER_TIMES = 0.5
 """Trust in the longer mean over that in the near pairs. What was seen at other times is evidence for the filling, below
 the threshold of the mainstream, and no observation of this frame. 0.3 to 0.7 give the same error within 1 % on eight

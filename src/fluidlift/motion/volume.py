@@ -37,11 +37,15 @@ from fluidlift.motion.volume_projection import (
     OBSERVED_ERROR,
     PROFILE_ERROR,
     balance_surface,
+    bounded_ends,
     continue_through_ends,
     end_faces,
     face_mobility,
     faces_from_centers,
     flux_through,
+    held_ends,
+    inward_only,
+    median_discharge,
     mouths_of,
     net_outflow,
     outward_openings,
@@ -146,11 +150,15 @@ class VolumeSolver:
         self._system = build_system(np.where(types == CellType.INFLOW, CellType.OUTFLOW, types), terrain, grid)
         self._nearest, self._ends = nearest_cells(carrying), end_faces(types)
         self._mouths = mouths_of(types, self._system, REACH * self._bed.depth)
+        self._steady = kind == "stream" and len(self._mouths) == 2 and mainstream is not None
+        self._rim = [end for end in self._mouths if end.inlet] if kind == "fall" else []
         self._balanced = options.balanced if options.balanced is not None else kind != "plume"
         if options.surface_mobility is not None:
             self._leak = np.full(grid.shape, options.surface_mobility, np.float32)
         else:
-            steady = 0.0 if kind == "plume" else passed_through(types, self._system.openings)
+            steady = (
+                0.0 if kind == "plume" else passed_through(types, self._system.openings, however_narrow=self._steady)
+            )
             # between the two by ratio: they differ by orders of magnitude
             leak = self._closed() ** steady * YIELDING_SURFACE ** (1.0 - steady)
             self._leak = np.broadcast_to(leak, grid.shape).astype(np.float32)
@@ -175,17 +183,26 @@ class VolumeSolver:
         )
         centers, confidence = self._extended(values, seen, self._share_of(surface))
         extended = faces_from_centers(centers, self._carrying)
+        extended = inward_only(extended, self._rim)
         start = balance_surface(extended, types, system.openings) if self._balanced else extended
         certain = np.ones_like(confidence) if self._options.even else confidence
-        mobility = face_mobility(types, seen, certain, self._leak)
+        mobility = held_ends(face_mobility(types, seen, certain, self._leak), self._rim)
         velocity, solve = weighted_projection(start, system, mobility, tolerance=tolerance)
         limits = self._end_limits(values, seen) if self._options.surface_mobility is None else []
-        if any(abs(flux_through(velocity, e.outward)) > limit for e, limit in zip(self._mouths, limits)):
-            mobility = face_mobility(types, seen, certain, np.ones_like(self._leak))
+        if self._steady and limits:
+            if any(abs(flux_through(velocity, e.outward)) > limit for e, limit in zip(self._mouths, limits)):
+                # one end is wrong: the other carries what the body does, not what one fast patch beside it asks for
+                body = median_discharge(centers, types == CellType.FLUID, self._bed.mainstream)
+                limits = [min(limit, body) for limit in limits]
+            velocity, other = self._believed(limits, velocity, seen, certain, tolerance)
+            solve = max(solve, other or solve, key=lambda report: report.residual)
+        elif any(abs(flux_through(velocity, e.outward)) > limit for e, limit in zip(self._mouths, limits)):
+            mobility = held_ends(face_mobility(types, seen, certain, np.ones_like(self._leak)), self._rim)
             leaking, other = weighted_projection(extended, system, mobility, tolerance=tolerance)
             velocity = self._within(limits, velocity, leaking)
             solve = max(solve, other, key=lambda report: report.residual)
-        velocity = continue_through_ends(velocity, self._ends)
+        if not self._rim:
+            velocity = continue_through_ends(velocity, self._ends)
         change = _change(extended, velocity, seen & (confidence > 0.5))
         return velocity, _report(velocity, system, types, solve, change)
 
@@ -213,10 +230,22 @@ class VolumeSolver:
         limits = []
         for end in self._mouths:
             witnesses = observed & end.near if (observed & end.near).any() else observed
-            limits.append(
-                DOUBT * end.area * float(np.percentile(speed[witnesses], FAST)) if witnesses.any() else np.inf
-            )
+            fastest = DOUBT * end.area * float(np.percentile(speed[witnesses], FAST)) if witnesses.any() else np.inf
+            limits.append(fastest)
         return limits
+
+    def _believed(
+        self, limits: list[float], closed: FaceVelocity, seen: np.ndarray, certain: np.ndarray, tolerance: float
+    ) -> tuple[FaceVelocity, SolveReport | None]:
+        """`closed` with ends that carry 0 to `limits` in their own direction; the surface takes the rest.
+
+        What changes is a divergence-free field that vanishes with the excess, so that no frame jumps.
+        """
+        bounded = bounded_ends(closed, self._mouths, limits)
+        if bounded is closed:
+            return closed, None
+        leaking = face_mobility(self._types, seen, certain, np.ones_like(self._leak))
+        return weighted_projection(bounded, self._system, held_ends(leaking, self._mouths), tolerance=tolerance)
 
     def _within(self, limits: list[float], closed: FaceVelocity, leaking: FaceVelocity) -> FaceVelocity:
         """The mixture nearest to `closed` whose ends carry no more than they can; every mixture is divergence-free."""

@@ -72,11 +72,14 @@ def face_mobility(
     return out[0], out[1], out[2]
 
 
-def passed_through(types: UInt8[np.ndarray, "nx ny nz"], openings: Faces) -> Float[np.ndarray, "nx ny nz"]:
+def passed_through(
+    types: UInt8[np.ndarray, "nx ny nz"], openings: Faces, *, however_narrow: bool = False
+) -> Float[np.ndarray, "nx ny nz"]:
     """How surely each body of fluid has an in- and an outlet that take what it carries, so that no level need change.
 
     1 where the open area of both ends is at least `WIDE_END` of the body's mean cross-section (its volume over its
     length), 0 at `NARROW_END` and below, where an end is a gap in the geometry and not the way all the fluid takes.
+    `however_narrow`: 1 wherever there are both ends.
     """
     label, count = ndimage.label(types == CellType.FLUID)
     section = np.ones(count + 1)
@@ -90,7 +93,7 @@ def passed_through(types: UInt8[np.ndarray, "nx ny nz"], openings: Faces) -> Flo
             area += np.bincount(low[end_high], opening[end_high], count + 1)
             area += np.bincount(high[end_low], opening[end_low], count + 1)
         wide = (area / section - NARROW_END) / (WIDE_END - NARROW_END)
-        through = np.minimum(through, np.clip(wide, 0.0, 1.0))
+        through = np.minimum(through, area > 0 if however_narrow else np.clip(wide, 0.0, 1.0))
     through[0] = 0.0
     return through[label]
 
@@ -269,6 +272,7 @@ class Mouth:
     """open, in faces of cells"""
     near: Bool[np.ndarray, "nx ny nz"]
     """cells beside it"""
+    inlet: bool = False
 
 
 def mouths_of(types: UInt8[np.ndarray, "nx ny nz"], system: PressureSystem, reach: float) -> list[Mouth]:
@@ -279,8 +283,58 @@ def mouths_of(types: UInt8[np.ndarray, "nx ny nz"], system: PressureSystem, reac
         area = sum(float(np.abs(o).sum()) for o in outward)
         if area > 0:
             near = ndimage.distance_transform_edt(types != kind)
-            found.append(Mouth(outward, area, np.asarray(near) * system.spacing <= reach))
+            found.append(Mouth(outward, area, np.asarray(near) * system.spacing <= reach, kind == CellType.INFLOW))
     return found
+
+
+def bounded_ends(velocity: FaceVelocity, mouths: list[Mouth], limits: list[float]) -> FaceVelocity:
+    """The ends scaled to carry between 0 and their limit, in at the inlet and out at the outlet.
+
+    Returns `velocity` itself where they do already.
+
+    Args:
+        velocity: m/s.
+        mouths: the ends.
+        limits: of the flux through each, in face areas times m/s.
+    """
+    faces = list(velocity.components)
+    for mouth, limit in zip(mouths, limits):
+        carried = flux_through(velocity, mouth.outward) * (-1.0 if mouth.inlet else 1.0)
+        if 0.0 <= carried <= limit:
+            continue
+        share = np.float32(max(min(carried, limit), 0.0) / carried)
+        faces = [np.where(o != 0, share * c, c) for c, o in zip(faces, mouth.outward)]
+        velocity = FaceVelocity(*faces)
+    return velocity
+
+
+def median_discharge(
+    centers: Float[np.ndarray, "nx ny nz 3"], fluid: Bool[np.ndarray, "nx ny nz"], mainstream: Float[np.ndarray, "3"]
+) -> float:
+    """Discharge of the median cross-section, 0 at least, in face areas times m/s; sections are one cell thick.
+
+    Args:
+        centers: velocity of the cells, m/s.
+        fluid: cells that count.
+        mainstream: unit direction across which the sections lie.
+    """
+    along = np.rint(np.argwhere(fluid) @ np.asarray(mainstream, np.float64)).astype(int)
+    flux = np.bincount(along - along.min(), centers[fluid].astype(np.float64) @ np.asarray(mainstream))
+    return max(float(np.median(flux)), 0.0)
+
+
+def inward_only(velocity: FaceVelocity, inlets: list[Mouth]) -> FaceVelocity:
+    """Nothing leaves through a face of an inlet."""
+    faces = list(velocity.components)
+    for mouth in inlets:
+        faces = [np.where(c * o > 0, np.float32(0.0), c) for c, o in zip(faces, mouth.outward)]
+    return FaceVelocity(*faces)
+
+
+def held_ends(mobility: Faces, mouths: list[Mouth]) -> Faces:
+    """Mobility with none at the faces of the ends."""
+    x, y, z = (np.where(sum(np.abs(m.outward[a]) for m in mouths) > 0, 0.0, part) for a, part in enumerate(mobility))
+    return x.astype(np.float32), y.astype(np.float32), z.astype(np.float32)
 
 
 def net_outflow(velocity: FaceVelocity, system: PressureSystem) -> np.ndarray:

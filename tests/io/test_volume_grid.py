@@ -193,3 +193,11 @@ def test_openvdb_itself_reads_the_file(tmp_path):
     got = np.zeros_like(values)
     openvdb.readAll(str(path))[0][0].copyToArray(got)
     np.testing.assert_array_equal(got, values)
+
+
+def test_equal_grids_give_equal_files_and_other_ones_another_identifier(tmp_path):
+    values = np.random.default_rng(0).random((9, 8, 7, 3)).astype(np.float32)
+    files = [write_vdb(tmp_path / f"{k}.vdb", [VolumeGrid("vel", v, 0.1)]).read_bytes() for k, v in
+             enumerate((values, values.copy(), values + 1))]  # fmt: skip
+    assert files[0] == files[1]
+    assert files[0][21:57] != files[2][21:57]  # after magic number, three versions and a flag

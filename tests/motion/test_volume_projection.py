@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from fluidlift.motion.volume_projection import (
+    agreed_limits,
     balance_surface,
     constraint_projection,
     continue_through_ends,
@@ -214,3 +215,15 @@ def test_fluxes_out_of_the_fluid_count_positive_at_both_ends() -> None:
     assert inlet.near[:3, :, 1:3].all() and not inlet.near[3:].any()  # two cells on, at the height of the fluid
     assert outlet.near[7:, :, 1:3].all() and not outlet.near[:7].any()
     assert flux_through(v, outward_openings(types, CellType.EMPTY, system.openings)) == 0.0  # along the surface
+
+
+def test_two_ends_that_disagree_meet_at_the_geometric_mean() -> None:
+    types, grid = channel()
+    system = build_system(types, None, grid)
+    mouths = mouths_of(types, system, 0.2)
+    v = FaceVelocity.zeros(grid)
+    v.u[:] = 1.0
+    carried = mouths[0].area
+    assert agreed_limits(v, mouths, [2 * carried, 3 * carried]) == [2 * carried, 3 * carried]
+    limits = agreed_limits(v, mouths, [2 * carried, 0.25 * carried])
+    assert limits == pytest.approx([0.5 * carried, 0.25 * carried])

@@ -7,8 +7,11 @@ import numpy as np
 import pytest
 
 from fluidlift.cli import DONE, REJECTED, WITH_WARNINGS, main
+from fluidlift.errors import MissingPackage
 from fluidlift.io.pictures import read_picture, write_png
 from fluidlift.io.stage_cache import load_stage
+from fluidlift.motion import optical_flow
+from fluidlift.pipeline import seeing
 from fluidlift.types import PinholeCamera
 
 FRAMES = 10
@@ -125,3 +128,38 @@ def test_a_folder_with_other_things_is_left_alone(stream_clip, tmp_path, capsys)
     (tmp_path / "notes.txt").write_text("mine")
     assert main(["mask", str(stream_clip), "-o", str(tmp_path)]) == REJECTED
     assert "other things" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["mask", "--click", "9999,20"],
+        ["mask", "--roi", "0,0,0,0"],
+        ["mask", "--set", "segment.method=sam2"],
+        ["motion", "--mask", "text.png"],
+        ["motion", "--depth", "text.exr"],
+    ],
+)
+def test_what_cannot_be_used_is_refused_before_the_flow_is_computed(stream_clip, tmp_path, options, monkeypatch):
+    for name in ("text.png", "text.exr"):
+        (tmp_path / name).write_text("no picture")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(optical_flow, "estimate_flow", lambda *_, **__: pytest.fail("the flow was computed"))
+    assert main([options[0], str(stream_clip), "-o", "out", *options[1:]]) == REJECTED
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("command", ["mask", "motion"])
+def test_a_setting_that_changes_nothing_is_refused(stream_clip, tmp_path, capsys, command):
+    code = main([command, str(stream_clip), "-o", str(tmp_path / "out"), "--set", "fit.max_work=3"])
+    assert code == REJECTED and "fit.max_work=3" in capsys.readouterr().err
+
+
+def test_a_missing_package_leaves_no_folder_behind(stream_clip, tmp_path, monkeypatch, capsys):
+    def missing(*_, **__):
+        raise MissingPackage("torchvision is not installed")
+
+    monkeypatch.setattr(seeing, "make_estimator", missing)
+    code = main(["mask", str(stream_clip), "-o", str(tmp_path / "out"), "--set", "motion.method=raft"])
+    assert code == 1 and "torchvision" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

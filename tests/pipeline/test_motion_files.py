@@ -1,8 +1,11 @@
 """`fluidlift motion`: flow and velocities of every frame, in files that other tools read."""
 
 import json
+import shutil
 import struct
 from importlib import resources
+from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -11,8 +14,10 @@ import pytest
 from fluidlift.cli import DONE, REJECTED, WITH_WARNINGS, main
 from fluidlift.io.exr import read_channels
 from fluidlift.io.flow_files import write_flow
-from fluidlift.io.pictures import read_picture
-from fluidlift.pipeline import frame_files
+from fluidlift.io.pictures import read_picture, write_png
+from fluidlift.pipeline import frame_files, motion_files
+from fluidlift.pipeline.frame_files import FrameWriter
+from fluidlift.pipeline.mask_files import is_straight
 
 FRAMES = 5
 PAIRS = FRAMES - 1
@@ -128,6 +133,10 @@ def test_flow_with_too_few_pairs_is_refused_with_the_frame(demo, tmp_path, capsy
     assert main(["motion", *demo, "-o", str(out), "--max-size", "160", "--flow", str(tmp_path / "flow")]) == REJECTED
     assert f"frame {PAIRS - 1} to {PAIRS}" in capsys.readouterr().err
     assert not out.exists()
+    text = tmp_path / "text.flo"
+    text.write_text("no flow")
+    assert main(["motion", *demo, "-o", str(out), "--flow", str(text)]) == REJECTED
+    assert "does not begin as a .flo file does" in capsys.readouterr().err
 
 
 def test_flow_of_another_shape_is_refused(demo, tmp_path, capsys):
@@ -171,3 +180,128 @@ def test_a_lost_file_is_written_again_and_the_rest_is_cached(demo, tmp_path, cap
 def test_an_unknown_stage_is_refused(demo, tmp_path, capsys):
     assert main(["motion", *demo, "-o", str(tmp_path / "out"), "--force", "fit"]) == REJECTED
     assert "velocities" in capsys.readouterr().err
+
+
+def test_masks_that_a_person_has_changed_are_not_written_over(demo, tmp_path, capsys):
+    folder = measure(demo, tmp_path / "out")
+    mask = folder / "mask" / "1003.png"
+    corrected = np.full_like(read_picture(mask), 255)
+    write_png(mask, corrected)
+    again = ["motion", *demo, "-o", str(folder), "--max-size", "160", *COARSE, "--set", "motion.half_window=0"]
+    capsys.readouterr()
+    assert main(again) == REJECTED
+    said = capsys.readouterr().err
+    assert "changed" in said and "--force velocities" in said
+    np.testing.assert_array_equal(read_picture(mask), corrected)
+    # given back, they are taken and stay as they are, file by file
+    before = {p: p.read_bytes() for p in (folder / "mask").iterdir()}
+    assert main([*again, "--mask", str(folder / "mask")]) in (DONE, WITH_WARNINGS)
+    assert {p: p.read_bytes() for p in (folder / "mask").iterdir()} == before
+    assert main([*again, "--force", "velocities"]) in (DONE, WITH_WARNINGS)
+    assert not read_picture(mask).all()
+
+
+def test_mask_goes_into_a_folder_of_motion_and_motion_back(demo, measured, tmp_path):
+    """Both write mask/ and overlay/: each takes the other's files for its own only as long as nobody edits them."""
+    folder = shutil.copytree(measured, tmp_path / "out")
+    overlay = (folder / "overlay" / "1001.png").read_bytes()
+    assert main(["mask", *demo, "-o", str(folder), "--max-size", "160"]) in (DONE, WITH_WARNINGS)
+    assert (folder / "overlay" / "1001.png").read_bytes() != overlay
+    measure(demo, folder, "--raw")
+    assert (folder / "overlay" / "1001.png").read_bytes() == overlay
+
+
+def test_masks_of_a_clip_without_a_camera_file_are_not_said_to_be_straight(demo, measured, tmp_path):
+    assert is_straight(measured / "mask")
+    folder = measure([demo[0], *demo[3:]], tmp_path / "out")
+    assert not is_straight(folder / "mask")
+
+
+@pytest.mark.parametrize(
+    ("flux_in", "flux_out", "words"),
+    [
+        (0.405, -0.178, "flows in at both ends (0.405 and 0.178 m3/s, medians), and 0.583"),
+        (-0.1, 0.2, "flows out at both ends"),
+        (-0.1, -0.2, "taken for each other"),
+        (0.1, 0.175, "0.1 m3/s flow in and 0.175 m3/s flow out"),
+    ],
+)
+def test_fluxes_that_do_not_agree_are_told_with_their_direction(flux_in, flux_out, words):
+    (told,) = motion_files._unbalanced([{"flux_in": flux_in, "flux_out": flux_out}] * 3)
+    assert words in told
+
+
+def test_fluxes_that_agree_are_not_told():
+    assert not motion_files._unbalanced([{"flux_in": 0.1, "flux_out": 0.12}, {}])
+
+
+def test_a_fluid_that_was_hardly_measured_is_told():
+    rows = [{"observed_share": 0.04}, {"observed_share": 0.03}, {"observed_share": 0.9}]
+    (told,) = motion_files._little_seen(rows)
+    assert "4 % of the fluid only" in told
+    assert not motion_files._little_seen([{"observed_share": 0.3}])
+
+
+def test_a_scale_that_hangs_on_an_assumed_level_says_so(demo, tmp_path, capsys):
+    camera = json.loads(Path(demo[2]).read_text())
+    for level, assumed in ((None, True), (0.0, False)):
+        given = {k: v for k, v in camera.items() if k != "water_level_z"}
+        given |= {} if level is None else {"water_level_z": level}
+        (tmp_path / "camera.json").write_text(json.dumps(given))
+        folder = tmp_path / f"out{level}"
+        measure([demo[0], "--camera", str(tmp_path / "camera.json"), *demo[3:]], folder, "--kind", "stream")
+        facts = facts_of(folder)
+        assert facts["scale"]["source"] == "camera"
+        assert ("z = 0 is assumed" in facts["scale"]["warning"]) == assumed
+        assert facts["scale_sentence"].endswith("with the water at z = 0, assumed") == assumed
+
+
+def test_a_folder_that_cannot_be_made_is_refused_before_anything_is_decoded(demo, tmp_path, capsys, monkeypatch):
+    """Root may write everywhere: a system call that fails stands for the disk."""
+
+    def no(*_, **__):
+        raise FileNotFoundError(2, "No such file or directory")
+
+    monkeypatch.setattr(Path, "mkdir", no)
+    for command in ("mask", "motion", "make"):
+        assert main([command, *demo, "-o", str(tmp_path / "out")]) == REJECTED
+        said = capsys.readouterr().err
+        assert "cannot be written" in said and "read" not in said.split("fluidlift:")[0]
+    assert not (tmp_path / "out").exists()
+
+
+def test_no_raw_flow_of_an_earlier_run_stays_beside_the_new_files(demo, measured, tmp_path):
+    folder = shutil.copytree(measured, tmp_path / "out")
+    measure(demo, folder, "--format", "npz")
+    assert not list((folder / "raw_flow").iterdir())
+    # but the one that is given is the user's
+    folder = shutil.copytree(measured, tmp_path / "given")
+    measure(demo, folder, "--format", "npz", "--flow", str(folder / "raw_flow"))
+    assert len(list((folder / "raw_flow").iterdir())) == PAIRS
+
+
+def test_the_tilt_of_the_camera_can_be_told(demo, tmp_path):
+    folder = measure([demo[0], *demo[3:]], tmp_path / "out", "--pitch", "30", "--fov", "60", "--roll", "0")
+    _, _, forward = json.loads((folder / "camera.json").read_text())["R"]
+    assert forward[2] == pytest.approx(-0.5, abs=1e-6)  # sin 30
+
+
+def test_flow_without_confidence_is_said_to_be_trusted_as_given(demo, measured, tmp_path, capsys):
+    for t in range(PAIRS):
+        write_flow(tmp_path / "flow", t, np.ones((104, 160, 2), np.float32), None, "flo")
+    capsys.readouterr()
+    folder = measure(demo, tmp_path / "out", "--flow", str(tmp_path / "flow"))
+    assert "trusted as given" in capsys.readouterr().out
+    assert facts_of(folder)["flow_trusted_as_given"] and not facts_of(measured)["flow_trusted_as_given"]
+
+
+def test_the_overlay_shows_the_picture_where_the_fluid_is_slow_and_the_colour_where_it_is_fast():
+    picture = np.full((1, 4, 3), 100, np.uint8)
+    writer = SimpleNamespace(clip=SimpleNamespace(frames=[picture]), scale=2.0)
+    flow = np.array([[[0.0, 0.0], [0.5, 0.0], [2.0, 0.0], [2.0, 0.0]]], np.float32)
+    fluid = np.array([[True, True, True, False]])
+    still, slow, fast, outside = FrameWriter._overlay(writer, 0, flow, fluid)[0].astype(int)
+    assert (still == 100).all() and (outside == 100).all()
+    # red is to the right: a quarter of the speed has a quarter of the fast one's colour, to a level
+    np.testing.assert_allclose(slow - 100, (fast - 100) / 4, atol=1)
+    assert fast[0] > 150 > 100 > fast[2]

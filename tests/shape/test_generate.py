@@ -7,6 +7,7 @@ import pytest
 from fluidlift.look.rasterize import render
 from fluidlift.shape.generate import (
     background_plate,
+    beneath_front,
     body_cells,
     fluid_colour_frame,
     front_gaussians,
@@ -15,7 +16,7 @@ from fluidlift.shape.generate import (
     united_mask,
 )
 from fluidlift.shape.terrain import Setting
-from fluidlift.types import CellType, Gaussians, Grid, PinholeCamera, Terrain, TriangleMesh
+from fluidlift.types import CellType, Gaussians, Grid, PinholeCamera, Terrain, TriangleMesh, concatenate
 
 H, W = 64, 96
 ROW, COL = np.mgrid[:H, :W]
@@ -151,6 +152,53 @@ def test_the_same_seed_gives_the_same_hull():
     assert not np.array_equal(a.means, c.means)
 
 
+# below the visible surface --------------------------------------------------------------------------------------
+
+
+def test_no_splat_of_the_inside_shows_through_the_surface_above_it():
+    camera, depth = water(pitch=25.0)
+    mask = ROW > 12
+    front = front_gaussians(np.full((H, W, 3), 200, np.uint8), mask, depth, camera)
+    rng = np.random.default_rng(0)
+    points = camera.unproject(camera.pixel_grid(), depth)[(ROW > 20) & (ROW < 60) & (COL > 6) & (COL < 90)]
+    points = rng.permutation(points)[:300] - [0, 0, 1] * rng.uniform(0.02, 0.2, (300, 1))
+    dark = Gaussians.isotropic(points, 0.1, np.zeros((300, 3)), 0.8)
+    inner = (ROW > 22) & (ROW < 52) & (COL > 10) & (COL < 86)
+
+    def error(inside):
+        shown = render(concatenate([front, inside]), camera)
+        return float(np.sqrt(np.mean((shown.image[inner] - 200 / 255) ** 2)))
+
+    # standing out by less than exp(-2) at the rim of a splat, the black ones darken the picture by a few per cent
+    assert error(dark) > 0.2
+    assert error(beneath_front(dark, depth, mask, camera)) < 0.05
+
+
+def test_splats_get_half_their_distance_from_the_surface_and_keep_their_places():
+    camera, depth = water()
+    deep = np.array([[0.0, 0.0, -z] for z in (0.001, 0.1, 0.5)])
+    g = Gaussians.isotropic(deep, 0.1, np.zeros((3, 3)), 0.8)
+    small = beneath_front(g, depth, ROW >= 0, camera, smallest=0.3)
+    np.testing.assert_allclose(small.scales[:, 0], [0.03, 0.05, 0.1], rtol=0.02)  # depth between pixels is not linear
+    np.testing.assert_array_equal(small.means, g.means)
+
+
+def test_what_the_camera_does_not_see_from_above_keeps_its_size():
+    camera, depth = water()
+    g = Gaussians.isotropic(np.array([[0.0, 0.0, -0.05], [50.0, 0.0, -0.05]]), 0.1, np.zeros((2, 3)), 0.8)
+    beside = beneath_front(g, depth, ROW >= 0, camera)
+    assert beside.scales[0, 0] < 0.05 and beside.scales[1, 0] == g.scales[1, 0]
+    np.testing.assert_array_equal(beneath_front(g, depth, ROW < 0, camera).scales, g.scales)
+
+
+def test_what_lies_before_the_visible_surface_can_be_dropped():
+    camera, depth = water()
+    g = Gaussians.isotropic(np.array([[0.0, 0.0, 0.05], [0.0, 0.0, -0.05]]), 0.1, np.zeros((2, 3)), 0.8)
+    assert len(beneath_front(g, depth, ROW >= 0, camera)) == 2
+    left = beneath_front(g, depth, ROW >= 0, camera, drop_above=True)
+    np.testing.assert_array_equal(left.means, g.means[1:])
+
+
 # colours --------------------------------------------------------------------------------------------------------
 
 
@@ -161,6 +209,17 @@ def test_points_take_the_colour_of_their_pixel_or_of_the_nearest():
     np.testing.assert_allclose(picture_colours(frame, points, camera), frame[[20, 63], [10, 95]] / 255.0)
     outside = camera.unproject(np.array([[-500.0, 20.5]]), np.array([2.0]))
     np.testing.assert_allclose(picture_colours(frame, outside, camera), frame[20:21, 0] / 255.0)
+
+
+def test_a_large_splat_takes_the_mean_of_what_it_covers_and_no_single_glint():
+    camera, depth = water()
+    frame = np.full((H, W, 3), 100, np.uint8)
+    frame[32, 48] = 255
+    point = camera.unproject(np.array([[48.5, 32.5]]), depth[32, 48][None])
+    size = 4.0 * depth[32, 48] / camera.focal[0]  # 4 px in the picture
+    assert picture_colours(frame, point, camera)[0, 0] == 1.0
+    # a pixel has 1 / (2 pi 4^2) = 1 % of the weight of a splat of 4 px
+    np.testing.assert_allclose(picture_colours(frame, point, camera, size=size)[0], 100 / 255, atol=0.01)
 
 
 def test_fluid_colours_are_carried_beyond_the_mask():

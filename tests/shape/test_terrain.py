@@ -93,6 +93,17 @@ def test_around_the_rock_there_is_water(river):
     assert (river.cells[ring] == CellType.FLUID).any(axis=-1).all()
 
 
+def test_what_is_seen_of_the_water_is_not_inside_the_bank():
+    scene = channel(rock=False)
+    grid = scene.grid
+    rays = scene.camera.rays(scene.camera.pixel_grid())
+    ground = scene.camera.position + rays * (-scene.camera.position[2] / rays[..., 2])[..., None]
+    seen = ground[(np.abs(ground[..., 1]) < WIDTH / 2) & (np.abs(ground[..., 0]) < 1.0)]
+    # bed and bank meet the surface a third of a cell outside the middle of the last column that holds fluid, and a
+    # seen point may be half a cell from it; the slope there is below 2
+    assert sample_nodes(scene.phi, grid, seen).min() > -0.25 * grid.spacing
+
+
 @pytest.mark.parametrize("stream", [(1.0, 0, 0), (-1.0, 0, 0)], ids=["right", "left"])
 def test_water_enters_upstream_and_leaves_downstream(stream):
     scene = channel(stream)

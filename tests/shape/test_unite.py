@@ -58,6 +58,14 @@ def test_more_per_voxel_keeps_more():
     assert counts == sorted(counts) and counts[-1] == 5000
 
 
+def test_a_first_body_that_is_kept_whole_loses_nothing_and_the_others_only_close_what_it_lacks():
+    near = ball(0, red=1.0)
+    united = unite([near, ball(1, center=(1.0, 0, 0), red=0.0)], spacing=0.2, whole_first=True)
+    red = united.rgb[:, 0] > 0.5
+    np.testing.assert_array_equal(united.means[red], near.means)
+    assert 0 < (~red).sum() < 700  # a ball of radius 1 has 520 voxels of 0.2 m, and those that it cuts
+
+
 def test_broken_positions_are_left_out():
     g = ball(count=100)
     g.means[3] = np.nan

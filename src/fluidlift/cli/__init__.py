@@ -166,11 +166,24 @@ LONGEST = {"read.max_frames": 20_000}
 """of commands whose memory does not grow with the clip"""
 
 
+def _require_sections(overrides: tuple[str, ...], sections: tuple[str, ...]) -> None:
+    """Raise `InputRejected` for a setting that would change nothing here."""
+    from fluidlift.config import JobConfig
+
+    for text in overrides:
+        section = text.partition("=")[0].strip().partition(".")[0]
+        if section in vars(JobConfig()) and section not in sections:
+            raise InputRejected(
+                f"--set {text}, which changes nothing here", f"a setting of {', '.join(sections)}", "leave it out"
+            )
+
+
 def _mask(c: Mask) -> int:
     from fluidlift.config import build_config
     from fluidlift.pipeline import Hints, Inputs, find_masks
 
     flat = {"read.start": c.start, "read.duration": c.duration, "read.fps": c.fps, "read.max_size": c.max_size}
+    _require_sections(c.set, ("read", "segment", "motion"))
     config = build_config(None, None, c.set, flat, base=LONGEST)
     hints = Hints.of(c.roi, c.click, c.not_here)
     with _progress() as progress:
@@ -185,9 +198,10 @@ def _motion(c: Motion) -> int:
     from fluidlift.pipeline import Inputs, MotionFiles, measure_motion
 
     flat = {
-        "shape.kind": c.kind, "shape.size": c.size, "read.start": c.start, "read.duration": c.duration,
-        "read.fps": c.fps, "read.max_size": c.max_size,
+        "shape.kind": c.kind, "shape.size": c.size, "shape.fov": c.fov, "shape.pitch": c.pitch, "shape.roll": c.roll,
+        "read.start": c.start, "read.duration": c.duration, "read.fps": c.fps, "read.max_size": c.max_size,
     }  # fmt: skip
+    _require_sections(c.set, ("read", "segment", "shape", "motion"))
     config = build_config(None, c.config, c.set, flat, base=LONGEST)
     inputs = Inputs(c.clip, mask=c.mask, camera=c.camera, depth=c.depth, flow=c.flow)
     with _progress() as progress:

@@ -186,6 +186,12 @@ class Motion:
     """what the fluid does; auto decides from evidence"""
     size: float | None = None
     """metres across the fluid (its longest side); sets the scale"""
+    fov: float | None = None
+    """field of view across the longer side, degrees; else the file's lens metadata, else 50"""
+    pitch: float | None = None
+    """degrees that the camera looks below the horizon"""
+    roll: float | None = None
+    """degrees that the picture is turned clockwise"""
     start: float | None = None
     """seconds into the clip"""
     duration: float | None = None

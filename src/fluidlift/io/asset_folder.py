@@ -79,19 +79,23 @@ def check_output_folder(path: Path | str) -> Path:
     """The path, if an asset may be written there: it does not exist, is an empty folder, or holds an asset already.
 
     Raises:
-        InputRejected: it is a file, or a folder with other things in it.
+        InputRejected: it is a file, a folder with other things in it, or one that may not be looked into.
     """
-    path = Path(path)
+    with disk_errors(path):
+        return _checked_folder(Path(path))
+
+
+def _checked_folder(path: Path) -> Path:
     if path.is_symlink() and not path.exists():
         raise InputRejected(f"'{path}' is a broken link", "a new name or an existing asset")
     if not path.exists():
         return path
     if not path.is_dir():
-        raise InputRejected(f"'{path}' is a file", "a folder", "choose another name with -o, such as river.fluid")
+        raise InputRejected(f"'{path}' is a file", "a folder", "choose another name with -o")
     if any(path.iterdir()) and not _is_asset(path):
         raise InputRejected(
             f"the folder '{path}' holds other things",
-            "a new name, an empty folder, or an earlier asset",
+            "a new name, an empty folder, or one of an earlier run",
             "choose another folder with -o; nothing was changed",
         )
     return path

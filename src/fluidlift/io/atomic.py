@@ -8,6 +8,7 @@ import json
 import math
 import os
 import shutil
+import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -38,6 +39,23 @@ def disk_errors(path: Path | str) -> Iterator[None]:
                 f"'{path}' cannot be written ({error.strerror})", "permission to write there", "choose another folder"
             ) from error
         raise
+
+
+def require_writable(folder: Path | str) -> None:
+    """Make a folder and see that files can be written in it, before hours of work are done for it.
+
+    Raises:
+        InputRejected: whatever the operating system has against it.
+    """
+    try:
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise InputRejected(
+            f"'{folder}' cannot be written ({error.strerror or error})", "a folder that can be written",
+            "choose another one with -o",
+        ) from error  # fmt: skip
 
 
 def require_free_space(path: Path | str, needed: int) -> None:

@@ -27,7 +27,7 @@ from fluidlift.io.atomic import atomic_write, write_bytes
 from fluidlift.io.exr import read_channels
 from fluidlift.io.exr_write import write_channels
 from fluidlift.io.flow_arrays import FlowArray, open_array
-from fluidlift.io.flow_sequence import is_array, numbered_flow
+from fluidlift.io.flow_sequence import FLOW_SUFFIXES, is_array, numbered_flow
 from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.io.limits import ReadLimits, require_file
 from fluidlift.io.pictures import read_picture, same_shape
@@ -88,6 +88,11 @@ class FlowFiles:
 
     def __len__(self) -> int:
         return len(self._source)
+
+    @property
+    def has_confidence(self) -> bool:
+        """Whether the first pair says how sure it is; all finite values are trusted where not."""
+        return self._read(0)[3] is not None
 
     def pair(self, t: int) -> Pair:
         """Flow from frame t to t+1 of the clip and its confidence, at the size asked for.
@@ -157,6 +162,8 @@ def open_flow(
     layout, limits = layout or FlowLayout(), limits or ReadLimits()
     if is_array(path):
         return FlowFiles(open_array(path, pairs, start, limits), size, layout, limits, start)
+    if Path(path).is_file() and Path(path).suffix.lower() in FLOW_SUFFIXES:
+        read_pair(Path(path), layout, limits)  # that it is no flow is said before that there is only one
     return FlowFiles(numbered_flow(path, pairs, start, layout.first_number), size, layout, limits, start)
 
 

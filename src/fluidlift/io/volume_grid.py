@@ -7,6 +7,7 @@ translation + spacing (i, j, k).
 
 from __future__ import annotations
 
+import hashlib
 import struct
 import uuid
 import zlib
@@ -63,7 +64,7 @@ def velocity_grid(
 
 
 def write_vdb(path: Path | str, grids: Sequence[VolumeGrid]) -> Path:
-    """Write grids with different names into one VDB file.
+    """Write grids with different names into one VDB file; equal grids give equal files.
 
     Raises:
         InputRejected: the disk is full or may not be written.
@@ -71,12 +72,24 @@ def write_vdb(path: Path | str, grids: Sequence[VolumeGrid]) -> Path:
     require(len({g.name for g in grids}) == len(grids), "grids with the same name")
     with atomic_write(path) as file:
         file.write(struct.pack("<q3IB", 0x56444220, _FILE_VERSION, *_LIBRARY_VERSION, 1))
-        file.write(str(uuid.uuid4()).encode())
+        file.write(str(_identity(grids)).encode())
         file.write(_metadata({"creator": "fluidlift"}))
         file.write(struct.pack("<i", len(grids)))
         for grid in grids:
             _write_grid(file, grid)
     return Path(path)
+
+
+def _identity(grids: Sequence[VolumeGrid]) -> uuid.UUID:
+    """The file's identifier, by which readers tell files apart: from what is in it."""
+    digest = hashlib.sha256()
+    for grid in grids:
+        values = np.ascontiguousarray(grid.values, np.float32)
+        active = b"" if grid.active is None else np.packbits(grid.active).tobytes()
+        facts = (grid.name, grid.spacing, grid.origin, values.shape, grid.active is None)
+        for part in (repr(facts).encode(), values.tobytes(), active):
+            digest.update(part)
+    return uuid.UUID(bytes=digest.digest()[:16], version=4)
 
 
 def _write_grid(file: IO[bytes], grid: VolumeGrid) -> None:

@@ -9,9 +9,10 @@ lighter where it was filled in or lies out of sight, and between liquid and air 
 A stream that comes in and goes out is taken as steady over the frames that were averaged: the same discharge Q passes
 every cross-section. The surface is then balanced (no net flux through it) and closed but for a small leak, in- and
 outlet are free, and Q follows from the well observed cross-sections; badly seen ones, in the shade or out of the
-picture, follow it. No end carries more than the fastest surface seen near it allows: where the geometry asks for that
-(a body too thick, an end too small), the surface yields as far as it must. In a vessel that fills or empties the
-surface must give way, and does. The surface of smoke is no barrier.
+picture, follow it. No end carries more than the fastest surface seen near it allows, nor flows against its sense: where
+the geometry asks for that (a body too thick, an end too small), the surface yields as far as it must. A fall thins as
+it speeds up: its surface yields, and what enters at its rim runs as the surface there. In a vessel that fills or
+empties the surface must give way, and does. The surface of smoke is no barrier.
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ from fluidlift.motion.extension import (
 from fluidlift.motion.volume_projection import (
     OBSERVED_ERROR,
     PROFILE_ERROR,
+    agreed_limits,
     balance_surface,
     bounded_ends,
     continue_through_ends,
@@ -45,7 +47,6 @@ from fluidlift.motion.volume_projection import (
     flux_through,
     held_ends,
     inward_only,
-    median_discharge,
     mouths_of,
     net_outflow,
     outward_openings,
@@ -112,7 +113,7 @@ class VolumeReport:
     flux_surface: float
     """m^3/s up and out through the free surface, net"""
     change_observed: float = 0.0
-    """relative change (2-norm) that the divergence-free solve made to the faces between observed cells"""
+    """relative change (2-norm) that the divergence-free solve made to the faces between observed cells, 0 to 1"""
 
 
 class VolumeSolver:
@@ -150,7 +151,7 @@ class VolumeSolver:
         self._system = build_system(np.where(types == CellType.INFLOW, CellType.OUTFLOW, types), terrain, grid)
         self._nearest, self._ends = nearest_cells(carrying), end_faces(types)
         self._mouths = mouths_of(types, self._system, REACH * self._bed.depth)
-        self._steady = kind == "stream" and len(self._mouths) == 2 and mainstream is not None
+        self._steady = kind == "stream" and len(self._mouths) == 2
         self._rim = [end for end in self._mouths if end.inlet] if kind == "fall" else []
         self._balanced = options.balanced if options.balanced is not None else kind != "plume"
         if options.surface_mobility is not None:
@@ -190,10 +191,6 @@ class VolumeSolver:
         velocity, solve = weighted_projection(start, system, mobility, tolerance=tolerance)
         limits = self._end_limits(values, seen) if self._options.surface_mobility is None else []
         if self._steady and limits:
-            if any(abs(flux_through(velocity, e.outward)) > limit for e, limit in zip(self._mouths, limits)):
-                # one end is wrong: the other carries what the body does, not what one fast patch beside it asks for
-                body = median_discharge(centers, types == CellType.FLUID, self._bed.mainstream)
-                limits = [min(limit, body) for limit in limits]
             velocity, other = self._believed(limits, velocity, seen, certain, tolerance)
             solve = max(solve, other or solve, key=lambda report: report.residual)
         elif any(abs(flux_through(velocity, e.outward)) > limit for e, limit in zip(self._mouths, limits)):
@@ -201,8 +198,7 @@ class VolumeSolver:
             leaking, other = weighted_projection(extended, system, mobility, tolerance=tolerance)
             velocity = self._within(limits, velocity, leaking)
             solve = max(solve, other, key=lambda report: report.residual)
-        if not self._rim:
-            velocity = continue_through_ends(velocity, self._ends)
+        velocity = velocity if self._rim else continue_through_ends(velocity, self._ends)
         change = _change(extended, velocity, seen & (confidence > 0.5))
         return velocity, _report(velocity, system, types, solve, change)
 
@@ -221,10 +217,8 @@ class VolumeSolver:
         return (viscous * self._film + (1.0 - viscous) * self._share).astype(np.float32)
 
     def _end_limits(self, values: Float[np.ndarray, "nx ny nz 4"], seen: Bool[np.ndarray, "nx ny nz"]) -> list[float]:
-        """Flux that each end can carry, in face areas times m/s, from the fastest surface observed near it.
-
-        Whatever the profile, the mean of a section is below that, but for errors (`DOUBT`).
-        """
+        """Flux that each end can carry, in face areas times m/s, from the fastest surface observed near it: whatever
+        the profile, the mean of a section is below that, but for errors (`DOUBT`)."""
         observed = seen & (values[..., 3] > 0.5)
         speed = np.linalg.norm(values[..., :3], axis=-1)
         limits = []
@@ -239,9 +233,8 @@ class VolumeSolver:
     ) -> tuple[FaceVelocity, SolveReport | None]:
         """`closed` with ends that carry 0 to `limits` in their own direction; the surface takes the rest.
 
-        What changes is a divergence-free field that vanishes with the excess, so that no frame jumps.
-        """
-        bounded = bounded_ends(closed, self._mouths, limits)
+        What changes is a divergence-free field that vanishes with the excess, so that no frame jumps."""
+        bounded = bounded_ends(closed, self._mouths, agreed_limits(closed, self._mouths, limits))
         if bounded is closed:
             return closed, None
         leaking = face_mobility(self._types, seen, certain, np.ones_like(self._leak))
@@ -383,14 +376,14 @@ def _beside_bed(
 
 
 def _change(before: FaceVelocity, after: FaceVelocity, observed: np.ndarray) -> float:
-    """Relative change of the faces between observed cells."""
+    """Relative change of the faces between observed cells, 1 at most: what stood still cannot change relatively."""
     changed = total = 0.0
     for axis, (a, b) in enumerate(zip(before.components, after.components)):
         low, high = sides_of_faces(observed, axis)
         both = low & high
         changed += float(np.square(b[both] - a[both], dtype=np.float64).sum())
         total += float(np.square(a[both], dtype=np.float64).sum())
-    return float(np.sqrt(changed / total)) if total > 0 else 0.0
+    return float(np.sqrt(changed / max(total, changed))) if changed > 0 else 0.0
 
 
 def _report(

@@ -273,6 +273,7 @@ class Mouth:
     near: Bool[np.ndarray, "nx ny nz"]
     """cells beside it"""
     inlet: bool = False
+    """fluid comes in here"""
 
 
 def mouths_of(types: UInt8[np.ndarray, "nx ny nz"], system: PressureSystem, reach: float) -> list[Mouth]:
@@ -285,6 +286,17 @@ def mouths_of(types: UInt8[np.ndarray, "nx ny nz"], system: PressureSystem, reac
             near = ndimage.distance_transform_edt(types != kind)
             found.append(Mouth(outward, area, np.asarray(near) * system.spacing <= reach, kind == CellType.INFLOW))
     return found
+
+
+def agreed_limits(velocity: FaceVelocity, mouths: list[Mouth], limits: list[float]) -> list[float]:
+    """Limits of both ends of a steady stream, which takes in what leaves it.
+
+    Where one end can carry only a share of the discharge, two witnesses disagree on one number and may be wrong by the
+    same factor: the other end carries the geometric mean at most.
+    """
+    carried = [abs(flux_through(velocity, mouth.outward)) for mouth in mouths]
+    share = min(1.0, *(limit / max(c, 1e-12) for c, limit in zip(carried, limits)))
+    return limits if share == 1.0 else [min(limit, float(np.sqrt(share)) * c) for c, limit in zip(carried, limits)]
 
 
 def bounded_ends(velocity: FaceVelocity, mouths: list[Mouth], limits: list[float]) -> FaceVelocity:
@@ -306,21 +318,6 @@ def bounded_ends(velocity: FaceVelocity, mouths: list[Mouth], limits: list[float
         faces = [np.where(o != 0, share * c, c) for c, o in zip(faces, mouth.outward)]
         velocity = FaceVelocity(*faces)
     return velocity
-
-
-def median_discharge(
-    centers: Float[np.ndarray, "nx ny nz 3"], fluid: Bool[np.ndarray, "nx ny nz"], mainstream: Float[np.ndarray, "3"]
-) -> float:
-    """Discharge of the median cross-section, 0 at least, in face areas times m/s; sections are one cell thick.
-
-    Args:
-        centers: velocity of the cells, m/s.
-        fluid: cells that count.
-        mainstream: unit direction across which the sections lie.
-    """
-    along = np.rint(np.argwhere(fluid) @ np.asarray(mainstream, np.float64)).astype(int)
-    flux = np.bincount(along - along.min(), centers[fluid].astype(np.float64) @ np.asarray(mainstream))
-    return max(float(np.median(flux)), 0.0)
 
 
 def inward_only(velocity: FaceVelocity, inlets: list[Mouth]) -> FaceVelocity:

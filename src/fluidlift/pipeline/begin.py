@@ -10,7 +10,7 @@ from fluidlift.errors import InputRejected
 from fluidlift.pipeline import body, reading, seeing
 from fluidlift.pipeline.reading import Inputs
 from fluidlift.pipeline.seeing import NO_HINTS, Hints
-from fluidlift.pipeline.story import Story, file_hash
+from fluidlift.pipeline.story import Result, Story, file_hash
 
 Hashes = dict[str, Any]
 """SHA-256 of the input files by name"""
@@ -57,6 +57,11 @@ def look(story: Story, inputs: Inputs, config: JobConfig, hashes: Hashes, hints:
     segment["weights"] = weights_hash(segment["weights"])
     # limits guard the reading and do not change what is read
     read = {k: v for k, v in config.section("read").items() if k not in ("max_frames", "max_pixels")}
+
+    def flow() -> Result:
+        seeing.require_usable(story, inputs, config, hints)
+        return seeing.flow(story, inputs, config)
+
     story.run(
         "read",
         lambda: reading.read(story, inputs, config),
@@ -65,7 +70,7 @@ def look(story: Story, inputs: Inputs, config: JobConfig, hashes: Hashes, hints:
     )
     story.run(
         "flow",
-        lambda: seeing.flow(story, inputs, config),
+        flow,
         settings=[hashes["flow"], {k: motion[k] for k in ("flow_channels", "flow_v_up", "flow_scale")}]
         if "flow" in hashes
         else [motion["method"], weights_hash(motion["weights"])],

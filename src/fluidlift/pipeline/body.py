@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -67,13 +67,17 @@ def geometry(story: Story, inputs: Inputs, config: JobConfig) -> Result:
             "check the mask, or raise --max-size",
         )  # fmt: skip
     points, velocities = _surface_motion(canonical, visible, front.depth, motion, clip.interval)
-    height = None
+    height, unsure = None, ""
     if eye is not None and kind == "stream":
-        height = float(eye[2] - _water_level(inputs, warnings if c.size is None else []))
+        level, unsure = _water_level(inputs)
+        height = float(eye[2] - level)
     scale = place.metric_scale(
         kind, points, velocities, size=c.size, camera_height=height, known_scale=known_scale,
         seen=place.Sighting(trust[visible], clip.interval, up.pitch),
     )  # fmt: skip
+    sentence = scale.sentence
+    if unsure and scale.source == "camera":
+        scale, sentence = replace(scale, warning=unsure), f"{sentence}, with the water at z = 0, assumed"
     if scale.warning:
         warnings.append(scale.warning)
     mainstream = _mainstream(kind, velocities, trust[visible])
@@ -100,7 +104,7 @@ def geometry(story: Story, inputs: Inputs, config: JobConfig) -> Result:
         "kind_evidence": asdict(evidence),
         "kind_source": "evidence" if c.kind == "auto" else "user",
         "up": asdict(up),
-        "scale": asdict(scale) | {"sentence": scale.sentence},
+        "scale": asdict(scale) | {"sentence": sentence},
         "camera": camera.to_dict(),
         "world_from_canonical": {
             "scale": to_world.scale,
@@ -185,19 +189,18 @@ def _known_camera(inputs: Inputs, config: JobConfig, size: tuple[int, int]) -> t
     return camera, "R" in data or "frames" in data
 
 
-def _water_level(inputs: Inputs, warnings: list[str]) -> float:
-    """z of the water, m, where a camera file says it; else the ground of its world, 0."""
+def _water_level(inputs: Inputs) -> tuple[float, str]:
+    """z of the water, m, where a camera file says it; else the ground of its world, 0, and a warning."""
     from fluidlift.io.images import read_json
 
     data = read_json(inputs.camera, "camera file") if inputs.camera is not None else {}
     value = data.get("water_level_z")
     if isinstance(value, int | float):
-        return float(value)
-    warnings.append(
+        return float(value), ""
+    return 0.0, (
         "the camera file does not say how high the water stands: z = 0 is assumed, which sets the scale; "
         "add water_level_z (m) to it, or give --size"
     )
-    return 0.0
 
 
 def _front(inputs, canonical, mask, kind, motion, trust, start) -> tuple[surface.FrontSurface, float | None]:

@@ -10,11 +10,13 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from fluidlift.io.asset_folder import mark_owner
 from fluidlift.io.atomic import plain, write_json
 from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.pipeline.body import camera_of, grid_of, setting_of
 from fluidlift.pipeline.lifting import FAST_FALL, plain_report
-from fluidlift.pipeline.reading import clip_of, spans_of
+from fluidlift.pipeline.mask_files import MASK_FACTS, cleared_masks, require_unchanged, sealed
+from fluidlift.pipeline.reading import Inputs, clip_of, spans_of
 from fluidlift.pipeline.seeing import TRUSTED, flow_of, masks_of
 from fluidlift.pipeline.story import Story
 from fluidlift.pipeline.written import cleared, numbered
@@ -24,7 +26,7 @@ if TYPE_CHECKING:
     from fluidlift.motion.sequence import FrameMotion
 
 OVERLAY_SHARE = 0.65
-"""of the flow's colour in the overlay; the rest is the picture"""
+"""of the flow's colour in the overlay where it is fast; the rest is the picture"""
 LEGEND_SIDE = 161
 """px of the colour wheel"""
 
@@ -54,18 +56,26 @@ class FrameWriter:
         story: with the geometry done.
         folder: to write.
         files: which.
-        again: write all frames again.
+        inputs: of the job.
+        again: write all frames again, over masks that a person has changed, too.
+
+    Raises:
+        InputRejected: a person has changed the masks of the run before, and has not given them back.
     """
 
-    def __init__(self, story: Story, folder: Path, files: MotionFiles, *, again: bool) -> None:
-        self.story, self.folder, self.files = story, folder, files
+    def __init__(self, story: Story, folder: Path, files: MotionFiles, inputs: Inputs, *, again: bool) -> None:
+        self.story, self.folder, self.files, self.inputs = story, folder, files, inputs
         self.clip, self.masks, self.measured = clip_of(story), masks_of(story), flow_of(story)
         self.spans = spans_of(self.clip)
         self.grid, self.cells = grid_of(story), setting_of(story).cell_types
         self.scale = self._flow_scale()
+        self.keeps_masks = _same(inputs.mask, folder / "mask")
+        """the masks there are those that were given: they stay as they are"""
         self.journal = folder / "work" / "velocities" / f"{story.keys['velocities']}.rows"
         self.rows: dict[int, dict[str, Any]] = {} if again else self._written_before()
         if not self.rows:
+            if not again and not self.keeps_masks:
+                require_unchanged(folder / "mask", "velocities")
             self._clear()
         self._write_once()
 
@@ -83,7 +93,7 @@ class FrameWriter:
         displacement = np.zeros((height, width, 2), np.float32) if found is None else found.displacement
         trust = np.zeros((height, width), np.float32) if found is None else found.confidence
         seen = np.zeros((height, width), bool) if found is None else found.observed & mask
-        write_png(numbered(self.folder / "mask", t, ".png"), _white(mask))
+        self._write_mask(t)
         write_png(numbered(self.folder / "observed", t, ".png"), _white(seen))
         # outside the fluid nothing is known: NaN, which .flo marks as unknown
         moved = self.spans[t] * displacement  # files say what happened between two frames
@@ -106,9 +116,9 @@ class FrameWriter:
 
     def finish(self, pairs: int) -> list[dict[str, Any]]:
         """The mask of the last frame, from which no flow goes on; the rows in order. The journal is done with."""
-        from fluidlift.io.images import write_png
-
-        write_png(numbered(self.folder / "mask", pairs, ".png"), _white(self.masks[pairs]))
+        self._write_mask(pairs)
+        if not self.keeps_masks:
+            sealed(self.folder / "mask", self._mask_facts())
         self.journal.unlink(missing_ok=True)
         return [self.rows[t] for t in range(pairs)]
 
@@ -127,32 +137,47 @@ class FrameWriter:
                 rows[t] = row
         return rows
 
+    def _write_mask(self, t: int) -> None:
+        from fluidlift.io.images import write_png
+
+        file = numbered(self.folder / "mask", t, ".png")
+        if not (self.keeps_masks and file.is_file()):
+            write_png(file, _white(self.masks[t]))
+
+    def _mask_facts(self) -> dict[str, Any]:
+        """What the masks belong to."""
+        straight = self.inputs.camera is not None
+        return {"of": self.clip.source, "size": self.clip.size, "frames": len(self.clip), "undistorted": straight}
+
     def _clear(self) -> None:
+        """Nothing of an earlier run may stand beside what is written now, but the flow that was given."""
+        mark_owner(self.folder, "masks", None)  # `fluidlift mask` has masks and overlays of the same names
         self.journal.parent.mkdir(parents=True, exist_ok=True)
         for old in self.journal.parent.glob("*.rows"):
             old.unlink()
         suffixes = {"flow": (".flo", ".exr", ".npz"), "raw_flow": (".flo", ".exr", ".npz"), "velocity": (".vdb",)}
-        suffixes |= {"surface": (".ply",), "mask": (".png",), "observed": (".png",), "overlay": (".png",)}
+        suffixes |= {"surface": (".ply",), "observed": (".png",), "overlay": (".png",)}
         for name, kinds in suffixes.items():
-            if name != "raw_flow" or self.files.raw:
+            if not _same(self.inputs.flow, self.folder / name):
                 cleared(self.folder / name, kinds)
+        if not self.keeps_masks:
+            cleared_masks(self.folder / "mask")
 
     def _write_once(self) -> None:
         """What does not change from frame to frame: camera, colour wheel."""
         from fluidlift.io.images import write_png
         from fluidlift.motion.optical_flow import flow_picture
-        from fluidlift.pipeline.mask_files import MASK_FACTS
 
         write_json(self.folder / "camera.json", camera_of(self.story).to_dict())
-        facts = {"of": self.clip.source, "size": self.clip.size, "frames": len(self.clip), "undistorted": True}
-        write_json(self.folder / "mask" / MASK_FACTS, facts)
+        if not self.keeps_masks:
+            write_json(self.folder / "mask" / MASK_FACTS, self._mask_facts())
         across = np.linspace(-self.scale, self.scale, LEGEND_SIDE, dtype=np.float32)
         wheel = np.stack(np.meshgrid(across, across), axis=-1)
         disc = np.hypot(wheel[..., 0], wheel[..., 1]) <= self.scale
         write_png(self.folder / "colour_wheel.png", flow_picture(wheel, disc, self.scale))
 
     def _flow_scale(self) -> float:
-        """px per frame of full brightness, the same for the whole clip: a little above its mean motion."""
+        """px per frame of full colour, the same for the whole clip: a little above its mean motion."""
         g = self.story["geometry"].arrays
         speed = np.linalg.norm(g["mean_flow"], axis=-1)[(g["mean_confidence"] > TRUSTED) & g["mask"]]
         return max(1.3 * float(np.percentile(speed, 99)), 0.5) if speed.size else 1.0
@@ -161,8 +186,11 @@ class FrameWriter:
         from fluidlift.motion.optical_flow import flow_picture
 
         picture = np.asarray(self.clip.frames[t])
-        colour = flow_picture(displacement, mask, self.scale)
-        blended = OVERLAY_SHARE * colour + (1 - OVERLAY_SHARE) * picture
+        # what hardly moves shows the picture: dark colours would hide it
+        speed = np.linalg.norm(displacement, axis=-1, keepdims=True)
+        colour = flow_picture(displacement / np.maximum(speed, 1e-6), mask, 1.0)
+        share = OVERLAY_SHARE * np.clip(speed / self.scale, 0.0, 1.0)
+        blended = share * colour + (1 - share) * picture
         return np.where(mask[..., None], blended, picture).astype(np.uint8)
 
     def _write_space(self, t: int, surface: SurfaceMotion | None, velocity: FaceVelocity | None) -> None:
@@ -182,6 +210,11 @@ class FrameWriter:
         moving = self.wet if velocity is None else self.wet | (np.abs(velocity.at_centers()).max(axis=-1) > 0)
         grid = velocity_grid(still, self.grid, active=moving)
         write_vdb(numbered(self.folder / "velocity", t, ".vdb"), [grid])
+
+
+def _same(given: Path | None, folder: Path) -> bool:
+    """Whether a path that was given is this folder: what stands in it has been read then."""
+    return given is not None and given.absolute() == folder.absolute()
 
 
 def _white(mask: np.ndarray) -> np.ndarray:

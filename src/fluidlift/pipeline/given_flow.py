@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from fluidlift.io.flow_files import FlowFiles, FlowLayout, Pair
 
 
-def given_flow(story: Story, inputs: Inputs, config: JobConfig) -> tuple[Iterable[Pair], list[str]]:
-    """The user's displacement and confidence of each pair of the used frames, and warnings.
+def given_flow(story: Story, inputs: Inputs, config: JobConfig) -> tuple[Iterable[Pair], bool, list[str]]:
+    """The user's displacement and confidence of each pair of the used frames, whether the files have one, warnings.
 
     Raises:
         InputRejected: a flow of another shape, or too few pairs, with the first frame that lacks one.
@@ -39,7 +39,7 @@ def given_flow(story: Story, inputs: Inputs, config: JobConfig) -> tuple[Iterabl
     if inputs.camera is not None and read_distortion(inputs.camera) is not None:
         warnings.append("lens distortion was taken out of the clip: the given flow should be that of such pictures")
 
-    return (_between(files, first, last) for first, last in pairwise(places.tolist())), warnings
+    return (_between(files, first, last) for first, last in pairwise(places.tolist())), files.has_confidence, warnings
 
 
 def _opened(

@@ -73,14 +73,15 @@ def find_masks(
 
 def _write(story: Story, folder: Path, overwrite: bool, undistorted: bool) -> Result:
     """The pictures, and beside them what they belong to."""
-    from fluidlift.io.atomic import write_json
+    from fluidlift.io.asset_folder import mark_owner
     from fluidlift.io.images import write_png
     from fluidlift.shape.segment import overlay
 
     clip, labels = clip_of(story), labels_of(story)
     if not overwrite:
-        require_unchanged(folder / "mask")
-    masks, overlays = cleared(folder / "mask", (".png",)), cleared(folder / "overlay", (".png",))
+        require_unchanged(folder / "mask", MASK_STAGES[-1])
+    mark_owner(folder, "velocities", None)  # motion has masks and overlays of the same names
+    masks, overlays = cleared_masks(folder / "mask"), cleared(folder / "overlay", (".png",))
     for t in range(len(clip)):
         story.step(t, len(clip))
         seen = np.asarray(labels.labels[t])
@@ -93,24 +94,44 @@ def _write(story: Story, folder: Path, overwrite: bool, undistorted: bool) -> Re
         "frames": len(clip),
         "first_frame_of_clip": int(kept[0]),
         "undistorted": undistorted,
-        "sha256": digest_of(numbered(masks, t, ".png") for t in range(len(clip))),
     }
+    return Result({}, sealed(masks, facts))
+
+
+def cleared_masks(masks: Path) -> Path:
+    """The folder without the masks of an earlier run; their facts go first, so that a run cut off here is not taken
+    for a person's change."""
+    (masks / MASK_FACTS).unlink(missing_ok=True)
+    return cleared(masks, (".png",))
+
+
+def sealed(masks: Path, facts: dict[str, Any]) -> dict[str, Any]:
+    """Write what finished masks belong to, with the digest by which a person's change is seen later."""
+    from fluidlift.io.atomic import write_json
+
+    digest = digest_of(numbered(masks, t, ".png") for t in range(facts["frames"]))
+    facts = facts | {"sha256": digest}
     write_json(masks / MASK_FACTS, facts)
-    return Result({}, facts)
+    return facts
 
 
-def require_unchanged(masks: Path) -> None:
-    """Raise `InputRejected` where a person has changed the masks of an earlier run."""
+def require_unchanged(masks: Path, stage: str) -> None:
+    """Raise `InputRejected` where a person has changed the masks of an earlier run; `stage` writes them anew.
+
+    Masks without a digest are those of a run that was stopped: nothing is known of them.
+    """
     from fluidlift.io.limits import read_json
 
     if not (masks / MASK_FACTS).is_file():
         return
     facts = read_json(masks / MASK_FACTS, "mask facts")
-    count = facts.get("frames", 0) if isinstance(facts, dict) else 0
-    if count and digest_of(numbered(masks, t, ".png") for t in range(count)) != facts.get("sha256"):
+    facts = facts if isinstance(facts, dict) else {}
+    if "sha256" not in facts:
+        return
+    if digest_of(numbered(masks, t, ".png") for t in range(facts.get("frames", 0))) != facts["sha256"]:
         raise InputRejected(
             f"the masks in '{masks}' were changed since they were written", "another folder",
-            "choose another one with -o, or write over them with --force masks",
+            f"choose another one with -o, or write over them with --force {stage}",
         )  # fmt: skip
 
 

@@ -24,7 +24,9 @@ from fluidlift.pipeline.written import Written, numbered, require_stages
 MOTION_STAGES = ("read", "flow", "segment", "geometry", "velocities")
 
 SPREAD_OF_FLUX = 0.5
-"""difference of what flows in and out, relative to the larger one, from which the user is told"""
+"""difference of what flows in and out, relative to the smaller one, from which the user is told"""
+LITTLE_SEEN = 0.25
+"""share of the fluid below which the result is more the completion's than the clip's, and the user is told"""
 
 
 def measure_motion(
@@ -63,7 +65,7 @@ def measure_motion(
         begin.shape(story, inputs, config, hashes)
         found = story.run(
             "velocities",
-            lambda: _velocities(story, folder, config, files),
+            lambda: _velocities(story, folder, config, files, inputs),
             settings=[asdict(motion_options(config)), asdict(files)],
             after=("read", "flow", "segment", "geometry"),
             still_there=lambda result: _all_there(folder, files, result),
@@ -76,13 +78,13 @@ def measure_motion(
     )
 
 
-def _velocities(story: Story, folder: Path, config: JobConfig, files: MotionFiles) -> Result:
+def _velocities(story: Story, folder: Path, config: JobConfig, files: MotionFiles, inputs: Inputs) -> Result:
     """Write the files of every frame; what was written by a run that was stopped is kept."""
     from fluidlift.motion.sequence import motion_sequence
 
     clip, options = clip_of(story), motion_options(config)
     pairs, g = len(clip) - 1, story["geometry"].meta
-    writer = FrameWriter(story, folder, files, again="velocities" in story.force)
+    writer = FrameWriter(story, folder, files, inputs, again="velocities" in story.force)
     wanted = [t for t in range(pairs) if t not in writer.rows]
     found = motion_sequence(
         pairs_of(story), masks_of(story).__getitem__, pairs, motion_scene(story), options,
@@ -98,16 +100,42 @@ def _velocities(story: Story, folder: Path, config: JobConfig, files: MotionFile
     rows = writer.finish(pairs)
     shares = [r["free_fall_share"] for r in rows if r.get("free_fall_share") is not None]
     warnings = motion_warnings([r for r in rows if "solve" in r], g["kind"], float(max(shares, default=0.0)))
-    return Result({}, {"warnings": warnings + _unbalanced(rows), "rows": rows})
+    return Result({}, {"warnings": warnings + _little_seen(rows) + _unbalanced(rows), "rows": rows})
+
+
+def _little_seen(rows: list[dict[str, Any]]) -> list[str]:
+    """A warning where most of the motion was not measured."""
+    seen = _median(rows, "observed_share")
+    if seen is None or seen >= LITTLE_SEEN:
+        return []
+    return [
+        f"the motion was measured on {100 * seen:.0f} % of the fluid only; the rest is filled in: speeds there are a "
+        "guess; look at observed/, and at a larger --max-size, more texture or a higher frame rate"
+    ]
 
 
 def _unbalanced(rows: list[dict[str, Any]]) -> list[str]:
-    """A warning where what flows in and what flows out do not agree."""
-    both = [(abs(r["flux_in"]), abs(r["flux_out"])) for r in rows if r.get("flux_in") and r.get("flux_out")]
+    """A warning where what flows in at the inlet and out at the outlet do not agree, or run the wrong way."""
+    both = [(r["flux_in"], r["flux_out"]) for r in rows if r.get("flux_in") and r.get("flux_out")]
     if not both:
         return []
-    entering, leaving = np.median(both, axis=0)
-    if abs(entering - leaving) <= SPREAD_OF_FLUX * max(entering, leaving):
+    entering, leaving = (float(v) for v in np.median(both, axis=0))
+    if entering > 0 > leaving:
+        return [
+            f"fluid flows in at both ends ({entering:.3g} and {-leaving:.3g} m3/s, medians), and "
+            f"{entering - leaving:.3g} m3/s leave through the surface: the outlet is badly seen, look at the mask"
+        ]
+    if leaving > 0 > entering:
+        return [
+            f"fluid flows out at both ends ({-entering:.3g} and {leaving:.3g} m3/s, medians), and "
+            f"{leaving - entering:.3g} m3/s come through the surface: the inlet is badly seen, look at the mask"
+        ]
+    if entering < 0 and leaving < 0:
+        return [
+            f"fluid flows in at the outlet ({-leaving:.3g} m3/s) and out at the inlet ({-entering:.3g} m3/s, medians): "
+            "inlet and outlet are taken for each other, look at the overlay"
+        ]
+    if abs(entering - leaving) <= SPREAD_OF_FLUX * min(entering, leaving):
         return []
     return [
         f"{entering:.3g} m3/s flow in and {leaving:.3g} m3/s flow out (medians): the difference passes through the "
@@ -139,6 +167,7 @@ def _facts(story: Story, found: Result, provenance: dict[str, Any]) -> dict[str,
         "scale_sentence": g["scale"].get("sentence", ""),
         "grid": {"shape": list(grid.shape), "spacing": grid.spacing, "origin": list(grid.origin)},
         "fluid_share": story["segment"].meta["fluid_share"],
+        "flow_trusted_as_given": bool(story["flow"].meta.get("trusted_as_given")),
         "flow_trusted": story["segment"].meta["flow_trusted"],
         "observed_share": _median(wet, "observed_share"),
         "surface_speed": _median(wet, "surface_speed_median"),
@@ -168,8 +197,10 @@ def _words(folder: Path, facts: dict[str, Any]) -> tuple[str, ...]:
     if facts["scale_sentence"]:
         lines.append(facts["scale_sentence"])
     if facts["observed_share"] is not None:
+        seen = "trusted as given (without confidence)" if facts["flow_trusted_as_given"] else "measured"
         lines.append(
-            f"measured on {100 * facts['observed_share']:.0f} % of the fluid, filled in along the mainstream elsewhere"
+            f"{seen} on {100 * facts['observed_share']:.0f} % of the fluid; the other "
+            f"{100 - round(100 * facts['observed_share'])} % are filled in along the mainstream"
         )
     if facts["divergence_max"] is not None:
         lines.append(f"largest |div v| dx / mean speed {facts['divergence_max']:.2g}")

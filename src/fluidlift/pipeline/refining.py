@@ -29,16 +29,24 @@ def refine(story: Story, inputs: Inputs, config: JobConfig) -> Result:
     depth = g.arrays["depth"]
     fluid = labels.fluid
     bodies, fitted = _bodies(story, inputs, config, fluid, start, united)
-    shown = generate.fluid_colour_frame(clip.frames[start], fluid[start])
-    hull = generate.hull_gaussians(shown, setting, camera, seed=config.seed)
-    front = unite([b for b in bodies if len(b)], spacing=max(0.35 * h, 0.6 * c.stride * _pixel(depth, camera)))
-    shell, pruned = prune(_outside_solid(concatenate([front, hull]), setting), min_opacity=0.05, max_stretch=12.0)
-    room = max(c.max_gaussians - len(shell), 0)
+    colours = generate.fluid_colour_frame(clip.frames[start], fluid[start])
+    hull = generate.hull_gaussians(colours, setting, camera, seed=config.seed)
+    step = max(0.35 * h, 0.6 * c.stride * _pixel(depth, camera))
+    front = unite([b for b in bodies if len(b)], spacing=step, whole_first=True)
+    # what is seen is kept before what is hidden
+    front = _bounded(front, int(0.75 * c.max_gaussians), config.seed)
+    hull = _bounded(hull, c.max_gaussians - len(front), config.seed)
+    generated = len(front) + len(hull)
+    shown, pruned = prune(_outside_solid(front, setting), min_opacity=0.05, max_stretch=12.0)
+    shell = concatenate([shown, _outside_solid(hull, setting)])
     added = fill(
-        shell, spacing=h / 2, rays=c.rays, rng=np.random.default_rng(config.seed), max_added=room,
-        closed_below=setting.terrain,
+        shell, spacing=h / 2, rays=c.rays, rng=np.random.default_rng(config.seed),
+        max_added=max(c.max_gaussians - len(shell), 0), closed_below=setting.terrain,
     )  # fmt: skip
-    body = _outside_solid(_bounded(concatenate([shell, added]), c.max_gaussians, config.seed), setting)
+    mask, hull = g.arrays["mask"], shell.select(slice(len(shown), None))
+    hull = generate.beneath_front(hull, depth, mask, camera)
+    added = generate.beneath_front(_outside_solid(added, setting), depth, mask, camera, drop_above=True)
+    body = concatenate([shown, hull, added])
     if len(body) < 50:
         raise InputRejected(
             f"the body of the fluid has only {len(body)} Gaussians", "more fluid in the picture",
@@ -48,7 +56,7 @@ def refine(story: Story, inputs: Inputs, config: JobConfig) -> Result:
         "warnings": list(fitted.pop("warnings")),
         "front": len(front),
         "hull": len(hull),
-        "pruned": len(front) + len(hull) - len(shell),
+        "pruned": generated - len(shell),
         "filled": len(added),
         "total": len(body),
         "prune_report": str(pruned),

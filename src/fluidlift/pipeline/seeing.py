@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,6 +16,9 @@ from fluidlift.pipeline.reading import Inputs, clip_of, spans_of
 from fluidlift.pipeline.story import Result, Story
 from fluidlift.seams import FlowEstimator, Segmenter
 from fluidlift.types import Label, PixelFlow, PixelLabels, VideoClip
+
+if TYPE_CHECKING:
+    from fluidlift.shape.evidence import PairReader
 
 MOST_PAIRS = 600
 """of a clip from which its mean motion is taken, evenly spread where there are more"""
@@ -104,14 +107,17 @@ def flow(story: Story, inputs: Inputs, config: JobConfig) -> Result:
     displacement = story.scratch.array("displacement", (count, height, width, 2), np.float16)
     confidence = story.scratch.array("confidence", (count, height, width), np.float16)
     warnings: list[str] = []
+    as_given = False
     if inputs.flow is None:
         estimate_flow(clip.frames, method=flow_method(config), progress=story.step, out=(displacement, confidence))
     else:
-        pairs, warnings = given_flow(story, inputs, config)
+        pairs, sure, warnings = given_flow(story, inputs, config)
+        as_given = not sure
         for t, pair in enumerate(pairs):
             displacement[t], confidence[t] = pair
             story.step(t + 1, count)
-    return Result({"displacement": displacement, "confidence": confidence}, {"warnings": warnings})
+    meta = {"warnings": warnings, "trusted_as_given": as_given}
+    return Result({"displacement": displacement, "confidence": confidence}, meta)
 
 
 def flow_method(config: JobConfig) -> str | FlowEstimator:
@@ -177,7 +183,7 @@ def segment(story: Story, inputs: Inputs, config: JobConfig, hints: Hints = NO_H
         labels = _learned(story, config, hints).segment(clip, flow_of(story), out=out)
     else:
         labels = segment_clip(
-            clip, flow_of(story), user_mask=mask, roi=hints.roi, points=hints.clicks(),
+            clip, _flow_for_masks(story, inputs, config), user_mask=mask, roi=hints.roi, points=hints.clicks(),
             progress=lambda part, _: story.step(round(100 * part), 100), out=out,
         )  # fmt: skip
     fluid = FluidMasks(labels.labels)
@@ -208,16 +214,54 @@ def segment(story: Story, inputs: Inputs, config: JobConfig, hints: Hints = NO_H
     )
 
 
+def require_usable(story: Story, inputs: Inputs, config: JobConfig, hints: Hints) -> None:
+    """Look at everything that is given, before the flow is computed for nothing.
+
+    Raises:
+        InputRejected: a hint outside the picture, a mask or a depth map that cannot be used, a learned segmentation
+            without weights or with hints that it does not take.
+    """
+    from fluidlift.io.images import read_depth
+    from fluidlift.shape.hints import clicks_at
+    from fluidlift.shape.segment import region_of_interest
+
+    width, height = size = clip_of(story).size
+    region_of_interest(hints.roi, height, width)
+    clicks_at(hints.clicks(), size, (height, width))
+    if inputs.depth is not None:
+        read_depth(inputs.depth, size)
+    if inputs.mask is not None:
+        _user_mask(story, inputs, config)
+    elif config.segment.method in MASK_METHODS:
+        _require_hints(config, hints)
+        if config.segment.weights is None:
+            make_segmenter(config.segment.method, ModelChoice())  # says which are needed
+
+
+def _require_hints(config: JobConfig, hints: Hints) -> None:
+    if hints != NO_HINTS and config.segment.method == "sam3":
+        raise InputRejected(
+            "--roi, --click or --not-here with sam3, which goes by words", "hints for segment.method=auto or sam2",
+            "leave them out, or choose another method",
+        )  # fmt: skip
+
+
+def _flow_for_masks(story: Story, inputs: Inputs, config: JobConfig) -> PixelFlow | PairReader:
+    """Flow of single pairs as they are, where ours is blind to what stands still: to a mask, rest is a finding."""
+    from fluidlift.motion.optical_flow import DenseInverseSearch, flow_of_pair
+
+    if inputs.flow is not None or config.motion.method != "multiframe":
+        return flow_of(story)
+    frames, estimator = clip_of(story).frames, DenseInverseSearch()
+    return lambda t: flow_of_pair(frames[t], frames[t + 1], estimator)
+
+
 def _learned(story: Story, config: JobConfig, hints: Hints) -> Segmenter:
     """A learned segmentation with its weights; one that starts from our own is given the hints through it."""
     from fluidlift.shape.segment import segment as segment_clip
 
     s, shape = config.segment, clip_of(story).frames.shape[:3]
-    if hints != NO_HINTS and s.method == "sam3":
-        raise InputRejected(
-            "--roi, --click or --not-here with sam3, which goes by words", "hints for segment.method=auto or sam2",
-            "leave them out, or choose another method",
-        )  # fmt: skip
+    _require_hints(config, hints)
 
     def guess(clip: VideoClip, flow: PixelFlow) -> PixelLabels:
         room = story.scratch.array("guess", shape, np.uint8), story.scratch.array("guess_trust", shape, np.float16)

@@ -18,9 +18,9 @@ from typing import Any, Protocol
 import numpy as np
 
 from fluidlift import __version__
-from fluidlift.errors import InputRejected
+from fluidlift.errors import InputRejected, MissingPackage
 from fluidlift.io.asset_folder import is_owner, load_stage, mark_owner, save_stage
-from fluidlift.io.atomic import disk_errors
+from fluidlift.io.atomic import disk_errors, require_writable
 from fluidlift.io.stage_cache import Scratch
 
 Arrays = dict[str, np.ndarray]
@@ -193,16 +193,18 @@ class Story:
 def gone_if_refused(story: Story, until: str) -> Iterator[None]:
     """Where an input is refused before the stage `until` is done, a folder that was not there before goes again.
 
-    Work that was done before, such as before a disk ran full, is kept.
+    Work that was done before, such as before a disk ran full, is kept. That the folder can be written is tried first.
 
     Raises:
         InputRejected: as what is done inside, and for errors of the disk.
+        MissingPackage: as what is done inside.
     """
     fresh = not story.folder.exists()
     try:
+        require_writable(story.folder)
         with disk_errors(story.folder):
             yield
-    except InputRejected:
+    except (InputRejected, MissingPackage):
         if fresh and until not in story.results:
             shutil.rmtree(story.folder, ignore_errors=True)
         raise

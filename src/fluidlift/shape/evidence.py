@@ -7,7 +7,7 @@ slightest tremble of the camera or of the codec changes the brightness.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -23,6 +23,9 @@ from fluidlift.shape.frame_pictures import (
 )
 from fluidlift.types.clip import VideoClip
 from fluidlift.types.flow import PixelFlow
+
+PairReader = Callable[[int], tuple[np.ndarray, np.ndarray]]
+"""displacement [H,W,2] (px) and confidence [H,W] from frame t to t + 1"""
 
 QUANTISATION = 0.3
 """mean absolute change between two 8-bit readings of the same brightness, grey levels: a floor for the noise"""
@@ -143,7 +146,7 @@ def change_over_time(evidence: Evidence) -> Iterator[np.ndarray]:
 
 
 def flow_evidence(
-    source: FramePictures, flow: PixelFlow, scale: float, noise: np.ndarray
+    source: FramePictures, flow: PairReader, scale: float, noise: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Swaying and streaming, both float32 [h,w] in [0,1], over the sampled frames.
 
@@ -159,8 +162,9 @@ def flow_evidence(
     pairs = source.pairs(1)
     for one, other in pairs:
         t = source.sampled[one]
-        sure = shrink(np.asarray(flow.confidence[t], np.float32), scale)[..., None]
-        step = shrink(np.nan_to_num(np.asarray(flow.displacement[t], np.float32)), scale) * scale
+        displacement, confidence = flow(t)
+        sure = shrink(np.asarray(confidence, np.float32), scale)[..., None]
+        step = shrink(np.nan_to_num(np.asarray(displacement, np.float32)), scale) * scale
         first, second = source.kept[one].astype(np.float32), source.kept[other].astype(np.float32)
         warped = cv2.remap(
             second, columns + step[..., 0], rows + step[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
@@ -180,8 +184,9 @@ def flow_evidence(
     return swaying.astype(np.float32), streaming.astype(np.float32)
 
 
-def gather_evidence(clip: VideoClip, flow: PixelFlow) -> Evidence:
+def gather_evidence(clip: VideoClip, flow: PixelFlow | PairReader) -> Evidence:
     """All maps of one clip of at least 2 frames; a long clip is looked at in bursts (`sampled_frames`)."""
+    pair = flow if callable(flow) else (lambda t: (flow.displacement[t], flow.confidence[t]))
     frames, height, width = clip.frames.shape[:3]
     scale = working_scale(height, width)
     source = FramePictures(clip.frames, sampled_frames(frames, clip.interval), scale)
@@ -194,7 +199,7 @@ def gather_evidence(clip: VideoClip, flow: PixelFlow) -> Evidence:
     fine = 0.5 * (np.log(np.maximum(quick, 1e-3) / noise) + np.log(np.maximum(slow, 1e-3) / slow_noise))
     fine = np.maximum(fine, 0.0).astype(np.float32)
     pooled = pool(fine, POOLING * max(noise.shape))
-    swaying, streaming = flow_evidence(source, flow, scale, noise)
+    swaying, streaming = flow_evidence(source, pair, scale, noise)
     energy = [float(change_between(pictures[i], pictures[j], noise).mean()) for i, j in source.pairs(1)]
     return Evidence(
         source=source,

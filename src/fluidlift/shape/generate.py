@@ -127,7 +127,8 @@ def hull_gaussians(
     """Gaussians on the sides of the body that the camera does not see: its bed, its ends, what lies off the picture.
 
     The cells of the body next to another kind of cell are sampled at half the grid spacing; colours come from the
-    picture along the line of sight (the nearest pixel for what lies outside it), darkened a little below the surface.
+    picture along the line of sight (the nearest pixel for what lies outside it), as wide a mean as the Gaussian looks,
+    darkened a little below the surface.
     """
     grid = setting.terrain.grid
     wet = body_cells(setting)
@@ -144,7 +145,7 @@ def hull_gaussians(
         column = np.repeat(base[:, :2], 8, axis=0)
         level = setting.surface_height[column[:, 0], column[:, 1]]
         points, below = points[points[:, 2] < level], (level - points[:, 2])[points[:, 2] < level]
-    colours = picture_colours(frame, points, camera)
+    colours = picture_colours(frame, points, camera, size=0.42 * grid.spacing)
     if below is not None:
         colours = colours * np.where(below > grid.spacing, shade, 1.0)[:, None]
     return Gaussians.isotropic(points, 0.42 * grid.spacing, colours, 0.8)
@@ -163,11 +164,74 @@ def body_cells(setting: Setting) -> Bool[np.ndarray, "nx ny nz"]:
 
 
 def picture_colours(
-    frame: UInt8[np.ndarray, "h w 3"], points: Float[np.ndarray, "n 3"], camera: PinholeCamera
+    frame: UInt8[np.ndarray, "h w 3"], points: Float[np.ndarray, "n 3"], camera: PinholeCamera, *, size: float = 0.0
 ) -> Float[np.ndarray, "n 3"]:
-    """sRGB in [0, 1] where each point appears in a picture; the nearest pixel for points outside it."""
-    row, col, _ = camera.nearest_pixels(points)
-    return frame[row, col].astype(np.float32) / 255.0
+    """sRGB in [0, 1] where each point appears in a picture; the nearest pixel for points outside it.
+
+    Args:
+        frame: the picture.
+        points: world, m.
+        camera: of the picture, in the world.
+        size: standard deviation (m) of what gets the colour. The picture is averaged as widely as that looks from the
+            camera (to the next power of two, px): a glint of one pixel is not the colour of a large splat. 0: a pixel.
+    """
+    row, col, z = camera.nearest_pixels(points)
+    if size <= 0.0:
+        return frame[row, col].astype(np.float32) / 255.0
+    picture = frame.astype(np.float32) / 255.0
+    wide = size * camera.focal[0] / np.maximum(z, 1e-9)
+    level = np.clip(np.round(np.log2(np.maximum(wide, 0.5))) + 1, 0, np.log2(max(frame.shape[:2]))).astype(int)
+    colours = np.empty((len(points), 3), np.float32)
+    for step in np.unique(level):
+        here = level == step
+        seen = ndimage.gaussian_filter(picture, (2.0 ** (step - 1),) * 2 + (0,), mode="nearest") if step else picture
+        colours[here] = seen[row[here], col[here]]
+    return colours
+
+
+def beneath_front(
+    gaussians: Gaussians,
+    depth: Float[np.ndarray, "h w"],
+    mask: Bool[np.ndarray, "h w"],
+    camera: PinholeCamera,
+    *,
+    smallest: float = 0.3,
+    drop_above: bool = False,
+) -> Gaussians:
+    """Splats of the inside made small enough not to show through the visible surface above them.
+
+    One at distance d below the surface gets a standard deviation of d / 2 at most, so that what stands out weighs less
+    than exp(-2). Their places stay, because they are also what is simulated.
+
+    Args:
+        gaussians: of the hull and the filling, world.
+        depth: camera z of the visible surface, m.
+        mask: where it is seen; what lies elsewhere stays as it is.
+        camera: in the world.
+        smallest: part of its size that a splat keeps at least: it may come to the surface later.
+        drop_above: those whose centre is nearer than the visible surface go.
+    """
+    ok = mask & (depth > 0)
+    if not ok.any() or len(gaussians) == 0:
+        return gaussians
+    index = ndimage.distance_transform_edt(~ok, return_distances=False, return_indices=True)
+    whole = depth[tuple(index)]
+    points = camera.unproject(camera.pixel_grid(), whole)
+    normal = np.cross(np.gradient(points, axis=1), np.gradient(points, axis=0))
+    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+    row, col, z = camera.nearest_pixels(gaussians.means)
+    uv, _ = camera.project(gaussians.means)
+    inside = (uv >= 0).all(1) & (uv[:, 0] < mask.shape[1]) & (uv[:, 1] < mask.shape[0])
+    seen = inside & ok[row, col] & (z > 0)
+    where = np.where(seen[:, None], uv, 0.5)[:, ::-1].T - 0.5  # at grazing sight a pixel is long: between its middles
+    gap = z - ndimage.map_coordinates(whole, where, order=1, mode="nearest")
+    facing = np.abs((normal * (points - camera.position)).sum(-1)) / whole
+    below = np.maximum(gap, 0.0) * facing[row, col]
+    largest = gaussians.scales.max(axis=1)
+    share = np.clip(0.5 * below / np.maximum(largest, 1e-12), smallest, 1.0)
+    scales = gaussians.scales * np.where(seen, share, 1.0)[:, None].astype(gaussians.scales.dtype)
+    small = Gaussians(gaussians.means, gaussians.quats, scales, gaussians.opacities, gaussians.sh)
+    return small.select(~seen | (gap >= 0)) if drop_above else small
 
 
 def fluid_colour_frame(frame: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:

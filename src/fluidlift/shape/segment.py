@@ -19,7 +19,7 @@ import numpy as np
 from fluidlift.errors import InputRejected, require
 from fluidlift.shape.advancing import advancing_labels
 from fluidlift.shape.colour_growth import grown_from_streams, with_quiet_water
-from fluidlift.shape.evidence import Evidence, fluid_score, gather_evidence
+from fluidlift.shape.evidence import Evidence, PairReader, fluid_score, gather_evidence
 from fluidlift.shape.frame_pictures import typical_picture
 from fluidlift.shape.hints import Point, clicks_at, heed
 from fluidlift.shape.presence import Presence, always, grows, stay, watch
@@ -69,7 +69,7 @@ class LabelWriter:
 
 def segment(
     clip: VideoClip,
-    flow: PixelFlow,
+    flow: PixelFlow | PairReader,
     *,
     user_mask: np.ndarray | None = None,
     roi: tuple[int, int, int, int] | None = None,
@@ -81,7 +81,8 @@ def segment(
 
     Args:
         clip: at least 2 frames from a camera that stands still (see `motion.stabilize`), unless a mask is given.
-        flow: optical flow of the clip, px per frame; its confidence weighs the motion evidence.
+        flow: optical flow of the clip, px per frame, or what reads it for a pair (only some are asked for). Flow of
+            single pairs as they are tells most: one that is blind to still things cannot say that they are.
         user_mask: bool [H,W] or [T,H,W], True where there is fluid; taken as it is, with confidence 1.
         roi: x, y, width, height in px: fluid is only looked for inside.
         points: (x, y, label) in px, label 1 where there is fluid and 0 where there is none: they correct the mask
@@ -101,11 +102,9 @@ def segment(
         return labels_from_mask(given, LabelWriter((frames, height, width), out), inside)
     if frames < 2:
         raise InputRejected("nothing moves in a clip of one frame", "two frames or more", "give a --mask")
-    require(
-        flow.displacement.shape == (frames - 1, height, width, 2),
-        f"flow {flow.displacement.shape}",
-        f"{(frames - 1, height, width, 2)}",
-    )
+    if not callable(flow):
+        found = flow.displacement.shape
+        require(found == (frames - 1, height, width, 2), f"flow {found}", f"{(frames - 1, height, width, 2)}")
     tell(0.0, "evidence")
     evidence = gather_evidence(clip, flow)
     small_inside = shrink_mask(inside, evidence.noise.shape)

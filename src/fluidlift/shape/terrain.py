@@ -4,7 +4,7 @@ with which cells hold fluid and where it enters and leaves.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -82,7 +82,7 @@ def channel_setting(
         if grid.cells <= cell_limit:
             break
         spacing *= 1.05
-    plan = _plan(surface, labels, camera, grid, along, reach)
+    plan = _with_seen(_plan(surface, labels, camera, grid, along, reach), visible, grid)
     bed, water = _bed_and_banks(plan, surface, grid, depth, reach)
     return _fill_channel(grid, plan, bed, water, along, reach, mainstream, kind)
 
@@ -126,6 +126,18 @@ def _plan(surface, labels, camera, grid: Grid, along, reach) -> _Plan:
     row, col, z = camera.nearest_pixels(np.concatenate([inner, surface.height(inner)[..., None]], axis=-1))
     label = np.where(z > 0, labels[row, col], Label.BACKGROUND)
     return _Plan(label, level, s)
+
+
+def _with_seen(plan: _Plan, visible, grid: Grid) -> _Plan:
+    """Every column in which fluid is seen is wet, although its centre may be on the bank: nothing that is seen may be
+    inside the terrain. Rocks stay."""
+    cell = grid.cell_of(visible)[:, :2]
+    cell = cell[((cell >= 0) & (cell < grid.shape[:2])).all(axis=1)]
+    label = plan.label.copy()
+    seen = np.zeros(label.shape, bool)
+    seen[tuple(cell.T)] = True
+    label[seen & (label == Label.BACKGROUND)] = Label.FLUID
+    return replace(plan, label=label)
 
 
 def _channel_width(surface, labels, camera, low, high, along, reach) -> float:

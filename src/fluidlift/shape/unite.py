@@ -54,7 +54,7 @@ def window_length(
     return min(max(n, shortest), longest, count)
 
 
-def unite(bodies: Sequence[Gaussians], *, spacing: float, per_voxel: int = 1) -> Gaussians:
+def unite(bodies: Sequence[Gaussians], *, spacing: float, per_voxel: int = 1, whole_first: bool = False) -> Gaussians:
     """The union of bodies on a grid of fine voxels.
 
     A voxel belongs to the first body that has a Gaussian in it, and keeps that body's `per_voxel` most opaque ones (the
@@ -65,6 +65,8 @@ def unite(bodies: Sequence[Gaussians], *, spacing: float, per_voxel: int = 1) ->
         bodies: nearest frame first; world, m.
         spacing: of the voxels, m. At or below the distance of neighbouring Gaussians the first body stays as it is.
         per_voxel: Gaussians per voxel at most.
+        whole_first: the first body keeps all of its Gaussians. Where the camera is near, they are closer together than
+            the voxels, and a surface of small splats that is thinned has holes.
     """
     require(len(bodies) > 0, "no body to unite", "one at least")
     require(np.isfinite(spacing) and spacing > 0, f"spacing {spacing}", "positive metres")
@@ -83,4 +85,6 @@ def unite(bodies: Sequence[Gaussians], *, spacing: float, per_voxel: int = 1) ->
     first = np.r_[True, voxel[1:] != voxel[:-1]]
     start = np.flatnonzero(first)[np.cumsum(first) - 1]
     kept = (number == number[start]) & (np.arange(len(order)) - start < per_voxel)
+    if whole_first:
+        kept |= number == 0
     return everything.select(np.sort(order[kept]))

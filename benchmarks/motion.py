@@ -41,6 +41,7 @@ from motion_steps import (
 from motion_subjects import ROOT, Subject, Truth, default_shared, prepare, read_truth, real_clip, subjects
 
 from fluidlift.evaluate.images import mask_iou
+from fluidlift.motion.cadence import examine_cadence, without_duplicates
 from fluidlift.motion.optical_flow import estimate_flow, flow_picture
 from fluidlift.motion.stabilize import stabilise
 from fluidlift.shape.segment import segment
@@ -82,7 +83,8 @@ def measure_case(subject: Subject, work: Path, publish: bool) -> dict[str, Any]:
     record["surface"] = {"as made": surface_summary(lifted), "Farneback": surface_summary(first_lifted)}
     record["volume"] = volume(subject, truth, flow)
     clip = VideoClip(truth.frames, np.arange(len(truth.frames)) * truth.case.interval, subject.name)
-    iou = mask_iou(segment(clip, flow).fluid, truth.mask[: len(truth.frames)])
+    # as `fluidlift make` does: masks from the flow of single pairs
+    iou = mask_iou(segment(clip, estimate_flow(truth.frames, method="dis")).fluid, truth.mask[: len(truth.frames)])
     record["mask"] = {"iou": float(iou.mean()), "worst": float(iou.min())}
     return record
 
@@ -101,11 +103,10 @@ def volume(subject: Subject, truth: Truth, flow: PixelFlow) -> dict[str, Any]:
 def measure_clip(subject: Subject) -> dict[str, Any]:
     """Mask of a real clip next to the one that a person drew."""
     clip, drawn = real_clip(subject)
-    steady, _ = stabilise(clip)
-    flow = estimate_flow(steady.frames)
-    fluid = segment(steady, flow).fluid.mean(axis=0) > 0.5
+    steady, _ = stabilise(without_duplicates(clip, examine_cadence(clip.frames, clip.times)))
+    fluid = segment(steady, estimate_flow(steady.frames, method="dis")).fluid.mean(axis=0) > 0.5
     drawn = drawn if drawn.ndim == 2 else drawn.mean(axis=0) > 0.5
-    picture = steady.frames[len(clip) // 2].copy()
+    picture = steady.frames[len(steady) // 2].copy()
     picture[fluid] = (0.6 * picture[fluid] + 0.4 * np.array([255, 60, 60])).astype(np.uint8)
     edge = cv2.morphologyEx(drawn.astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) > 0
     picture[edge] = (255, 255, 255)

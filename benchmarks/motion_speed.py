@@ -88,7 +88,9 @@ def speed() -> dict[str, float]:
 
     reach = 4.0  # a clip whose constraint is met at all: the dearer case
     out["mainstream"], (full, seen) = median_seconds(mainstream)
-    out["once per clip"], _ = median_seconds(lambda _: validated_reach(full, mask, seen, depth, still, camera), frames=2)
+    out["once per clip"], _ = median_seconds(
+        lambda _: validated_reach(full, mask, seen, depth, still, camera), frames=2
+    )
     out["lift"], surface = median_seconds(lambda _: lift_flow(full, seen, mask, depth, depth, camera, 0.04))
     solver = VolumeSolver(terrain, types, grid, kind="stream", mainstream=terrain.mainstream)
     out["volume"], _ = median_seconds(lambda _: solver.velocity(surface))

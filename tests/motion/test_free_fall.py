@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from fluidlift.motion.free_fall import with_free_fall
-from fluidlift.types import SurfaceMotion
+from fluidlift.motion.free_fall import downhill_of, with_free_fall
+from fluidlift.types import Grid, SurfaceMotion
 
 
 def column(speed):
@@ -37,3 +37,12 @@ def test_level_water_does_not_fall():
     moved, share = with_free_fall(surface, np.tile([1.0, 0.0, 0.0], (50, 1)), kind="fall")
     assert share == 0.0
     assert np.abs(moved.velocities).max() == 0.0
+
+
+def test_downhill_follows_the_surface_or_points_down_and_stands_in_a_vessel() -> None:
+    grid = Grid((8, 4, 4), 0.5)
+    height = np.repeat(4.0 - 0.5 * np.arange(8)[:, None], 4, axis=1)  # one down for one along x
+    down = downhill_of(np.array([[2.0, 1.0, 2.0]]), grid, height)
+    assert down[0] == pytest.approx([np.sqrt(0.5), 0.0, -np.sqrt(0.5)])
+    points = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 0.1]])
+    np.testing.assert_array_equal(downhill_of(points, grid, None, 0.3), [[0, 0, -1], [1, 0, 0]])

@@ -12,7 +12,6 @@ from fluidlift.motion.sequence import (
     FrameMotion,
     MotionOptions,
     MotionScene,
-    downhill_of,
     motion_sequence,
     screen_downhill,
 )
@@ -243,15 +242,6 @@ def test_frames_without_fluid_are_left_out() -> None:
 
     scene = MotionScene(CAMERA, None, None, None, "stream", INTERVAL)
     assert [m.frame for m in motion_sequence(Clip(5), mask, 5, scene, frames=range(5))] == [0, 1, 3, 4]
-
-
-def test_downhill_follows_the_surface_or_points_down_and_stands_in_a_vessel() -> None:
-    grid = Grid((8, 4, 4), 0.5)
-    height = np.repeat(4.0 - 0.5 * np.arange(8)[:, None], 4, axis=1)  # one down for one along x
-    down = downhill_of(np.array([[2.0, 1.0, 2.0]]), grid, height)
-    assert down[0] == pytest.approx([np.sqrt(0.5), 0.0, -np.sqrt(0.5)])
-    points = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 0.1]])
-    np.testing.assert_array_equal(downhill_of(points, grid, None, 0.3), [[0, 0, -1], [1, 0, 0]])
 
 
 def test_a_slope_descends_on_the_screen_as_its_points_do_and_a_level_surface_nowhere() -> None:

@@ -10,13 +10,40 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from fluidlift.errors import require
-from fluidlift.types import SurfaceMotion
+from fluidlift.types import Grid, SurfaceMotion
 
 BELIEVABLE = 0.3
 """share of the expected speed below which a measured motion counts as failed: friction takes at most half (below)"""
 
 ENERGY_SHARE = {"pour": 0.95, "fall": 0.35}
 """share of the drop's energy that is left: almost all in the air, a third over rock (a choice)"""
+
+
+def downhill_of(
+    points: Float[np.ndarray, "n 3"],
+    grid: Grid,
+    surface_height: Float[np.ndarray, "nx ny"] | None,
+    pool_level: float | None = None,
+) -> Float[np.ndarray, "n 3"]:
+    """Unit direction of steepest descent of the surface at points; straight down for bodies in the air.
+
+    Args:
+        points: m.
+        grid: of the columns.
+        surface_height: z of the surface over each column, m; None for what is in the air.
+        pool_level: z below which a body in the air stands in its vessel and does not fall, m.
+    """
+    if surface_height is None:
+        down = np.tile([0.0, 0.0, -1.0], (len(points), 1))
+        if pool_level is not None:
+            down[points[:, 2] < pool_level] = [1.0, 0.0, 0.0]
+        return down
+    gx, gy = np.gradient(surface_height, grid.spacing)
+    cell = np.clip(grid.cell_of(points)[:, :2], 0, np.array(grid.shape[:2]) - 1)
+    slope = np.stack([gx[cell[:, 0], cell[:, 1]], gy[cell[:, 0], cell[:, 1]]], axis=-1)
+    squared = (slope**2).sum(axis=1)
+    steepest = np.concatenate([-slope, -squared[:, None]], axis=1)
+    return steepest / np.maximum(np.linalg.norm(steepest, axis=1, keepdims=True), 1e-12)
 
 
 def falling_share(

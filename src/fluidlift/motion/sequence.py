@@ -16,14 +16,14 @@ from fluidlift.errors import require
 from fluidlift.motion.air import with_air
 from fluidlift.motion.bed import WALLS
 from fluidlift.motion.direction import mainstream_direction
-from fluidlift.motion.free_fall import with_free_fall
+from fluidlift.motion.free_fall import downhill_of, with_free_fall
 from fluidlift.motion.front import raised_flow
 from fluidlift.motion.lift import depth_change, lift_flow
 from fluidlift.motion.mainstream import complete_flow
 from fluidlift.motion.screen_divergence import project_screen_divergence, validated_reach
 from fluidlift.motion.temporal import smoothed_flow
 from fluidlift.motion.volume import VolumeReport, VolumeSolver
-from fluidlift.types import FaceVelocity, Grid, PinholeCamera, PixelFlow, SurfaceMotion, Terrain
+from fluidlift.types import FaceVelocity, PinholeCamera, PixelFlow, SurfaceMotion, Terrain
 
 FlowReader = Callable[[int, int], PixelFlow]
 """(first, last) -> the flow of the pairs first to last - 1"""
@@ -361,33 +361,6 @@ def _as_it_falls(
     full[rows, cols] = np.where((z > 0)[:, None], ends - start, full[rows, cols])
     seen[rows, cols], trust[rows, cols] = False, 0.0
     return full, seen, trust
-
-
-def downhill_of(
-    points: Float[np.ndarray, "n 3"],
-    grid: Grid,
-    surface_height: Float[np.ndarray, "nx ny"] | None,
-    pool_level: float | None = None,
-) -> Float[np.ndarray, "n 3"]:
-    """Unit direction of steepest descent of the surface at points; straight down for bodies in the air.
-
-    Args:
-        points: m.
-        grid: of the columns.
-        surface_height: z of the surface over each column, m; None for what is in the air.
-        pool_level: z below which a body in the air stands in its vessel and does not fall, m.
-    """
-    if surface_height is None:
-        down = np.tile([0.0, 0.0, -1.0], (len(points), 1))
-        if pool_level is not None:
-            down[points[:, 2] < pool_level] = [1.0, 0.0, 0.0]
-        return down
-    gx, gy = np.gradient(surface_height, grid.spacing)
-    cell = np.clip(grid.cell_of(points)[:, :2], 0, np.array(grid.shape[:2]) - 1)
-    slope = np.stack([gx[cell[:, 0], cell[:, 1]], gy[cell[:, 0], cell[:, 1]]], axis=-1)
-    squared = (slope**2).sum(axis=1)
-    steepest = np.concatenate([-slope, -squared[:, None]], axis=1)
-    return steepest / np.maximum(np.linalg.norm(steepest, axis=1, keepdims=True), 1e-12)
 
 
 def screen_downhill(scene: MotionScene) -> Float[np.ndarray, "h w 2"] | None:

@@ -15,6 +15,10 @@ from fluidlift.pipeline.story import Result, Story
 from fluidlift.shape import generate, terrain
 from fluidlift.types import Gaussians, PinholeCamera, Similarity3, concatenate
 
+KEPT = 0.6
+"""part of its size that a splat of the inside keeps at least: at 0.3 the first frame is a little cleaner, but once the
+surface is drawn apart, dark dots of what lies below show between its splats"""
+
 
 def refine(story: Story, inputs: Inputs, config: JobConfig) -> Result:
     """Generate per frame, refine on the first, prune, unite, fill."""
@@ -44,8 +48,9 @@ def refine(story: Story, inputs: Inputs, config: JobConfig) -> Result:
         max_added=max(c.max_gaussians - len(shell), 0), closed_below=setting.terrain,
     )  # fmt: skip
     mask, hull = g.arrays["mask"], shell.select(slice(len(shown), None))
-    hull = generate.beneath_front(hull, depth, mask, camera)
-    added = generate.beneath_front(_outside_solid(added, setting), depth, mask, camera, drop_above=True)
+    hull = generate.beneath_front(hull, depth, mask, camera, smallest=KEPT)
+    added = _outside_solid(added, setting)
+    added = generate.beneath_front(added, depth, mask, camera, smallest=KEPT, drop_above=True)
     body = concatenate([shown, hull, added])
     if len(body) < 50:
         raise InputRejected(

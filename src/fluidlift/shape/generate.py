@@ -195,7 +195,7 @@ def beneath_front(
     mask: Bool[np.ndarray, "h w"],
     camera: PinholeCamera,
     *,
-    smallest: float = 0.6,
+    smallest: float = 0.3,
     drop_above: bool = False,
 ) -> Gaussians:
     """Splats of the inside made small enough not to show through the visible surface above them.

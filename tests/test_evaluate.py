@@ -21,6 +21,7 @@ from fluidlift.evaluate.images import (
     resample_nearest,
     ssim,
 )
+from fluidlift.evaluate.solid import solid_depth
 from fluidlift.evaluate.volumes import (
     align_cameras,
     field_cosine,
@@ -219,6 +220,41 @@ def test_errors_of_a_known_size_are_reported_as_such():
     assert sheet["resimulation.leak_share"] == pytest.approx(0.02)
 
 
+def test_the_bed_is_compared_along_the_lines_of_sight():
+    camera = a_camera()
+    rays = camera.rays(camera.pixel_grid())
+    floor = GRID.origin[2] + 0.5 * GRID.spacing
+    bed = (floor - camera.position[2]) / rays[..., 2]
+    case, asset = replace(a_case(), static_depth=bed), an_asset()
+    asset = replace(asset, terrain=replace(asset.terrain, signed_distance=GRID.nodes()[..., 2] - floor))
+    sheet = evaluate_arrays(asset, a_run(case), {}, case)
+    # float32 depths of 1 m; the signed distance is linear, so that the crossing is exact
+    assert sheet["geometry.bed_error"] == pytest.approx(0.0, abs=1e-5)
+    assert sheet["geometry.up_angle"] == pytest.approx(0.0, abs=1e-4)
+    deeper = replace(case, static_depth=1.1 * bed)
+    sheet = evaluate_arrays(asset, a_run(deeper), {}, deeper)
+    assert sheet["geometry.bed_error_relative"] == pytest.approx(0.1 / 1.1, abs=1e-5)
+    bare = replace(case, static_depth=np.zeros_like(bed))
+    assert evaluate_arrays(asset, a_run(bare), {}, bare)["geometry.bed_error"] is None
+
+
+def test_rays_that_miss_the_solid_have_no_depth():
+    camera, terrain = a_camera(), an_asset().terrain
+    start = np.full(SIZE[::-1], 0.1)
+    raised = replace(terrain, signed_distance=np.ones_like(terrain.signed_distance))
+    assert (solid_depth(raised, camera, start) == 0).all()
+    assert (solid_depth(terrain, camera, np.zeros_like(start)) == 0).all()
+
+
+def test_a_camera_that_is_taken_for_steeper_than_it_is_tilts_the_vertical():
+    case = a_case()
+    tilt = np.radians(12.0)
+    pose = case.camera.camera_from_world
+    turn = np.array([[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]])
+    camera = replace(case.camera, camera_from_world=RigidTransform(turn @ pose.rotation, pose.translation))
+    assert evaluate_arrays(an_asset(camera), a_run(case), {}, case)["geometry.up_angle"] == pytest.approx(12.0)
+
+
 def test_a_resimulation_that_starts_later_is_compared_with_the_frames_it_shows():
     case = a_case()
     case.mask[0] = False
@@ -279,8 +315,8 @@ def test_depth_is_compared_after_the_median_ratio():
     depth = np.array([[1.0, 2.0, 4.0, 7.0]])
     mask = truth > 0
     assert depth_scale(depth, truth, mask) == pytest.approx(2.0)
-    error, over_relief = depth_error(depth, truth, mask, 2.0)
-    assert error == pytest.approx(2 / 3)
+    error, over_relief, relative = depth_error(depth, truth, mask, 2.0)
+    assert error == pytest.approx(2 / 3) and relative == 0.0  # two of three are right: the median is
     assert over_relief == pytest.approx((2 / 3) / (4 / 3))
     assert depth_scale(np.full((1, 4), np.nan), truth, mask) is None
 

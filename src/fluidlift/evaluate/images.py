@@ -115,8 +115,9 @@ def depth_scale(
 
 def depth_error(
     depth: Float[np.ndarray, "h w"], truth: Float[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"], scale: float
-) -> tuple[float, float] | None:
-    """Mean |scale depth - truth| in m, and the same over the mean absolute deviation of the truth from its median.
+) -> tuple[float, float, float] | None:
+    """Mean |scale depth - truth| in m; the same over the mean absolute deviation of the truth from its median; and the
+    median of |scale depth - truth| / truth.
 
     The second figure is 1 for a flat picture (one depth everywhere) and 0 for a perfect relief.
     """
@@ -124,6 +125,6 @@ def depth_error(
     if not known.any():
         return None
     t = truth[known].astype(np.float64)
-    error = float(np.abs(scale * depth[known] - t).mean())
-    relief = float(np.abs(t - np.median(t)).mean())
-    return error, error / max(relief, 1e-9)
+    off = np.abs(scale * depth[known] - t)
+    error, relief = float(off.mean()), float(np.abs(t - np.median(t)).mean())
+    return error, error / max(relief, 1e-9), float(np.median(off / t))

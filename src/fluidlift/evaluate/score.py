@@ -19,6 +19,7 @@ from fluidlift.evaluate.planar import (
     score_segmentation,
 )
 from fluidlift.evaluate.report import Evaluation, Figure, figure
+from fluidlift.evaluate.solid import score_bed, score_up
 from fluidlift.evaluate.space import (
     align,
     score_depth,
@@ -84,6 +85,7 @@ def evaluate_arrays(
     else:
         alignment = align(asset, case, scale, frame)
         space = score_surface_velocity(arrays, asset, case, alignment)
+        space += score_bed(arrays, asset, case, alignment) + score_up(case, alignment)
         space += score_volume(asset, case, alignment) + score_parameters(asset, case, alignment)
     pictures, more = score_resimulation(arrays, case, video)
     figures = [*segmentation, *flow, *depth, *space, *score_divergence(asset), *pictures]

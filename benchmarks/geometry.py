@@ -1,0 +1,233 @@
+"""Measures the shape that the embedded generator finds, with the camera of a case and with nothing given, and draws it.
+
+    python benchmarks/geometry.py --work runs
+    python benchmarks/geometry.py --work runs --only river --sheets sheets
+    python benchmarks/geometry.py --work runs --page docs/results.md
+
+Subjects are the demo of the package, scenes that the package simulates and films (kept in --work), and the cases below
+FLUIDLIFT_SHARED or a folder `shared` beside the repository. Masks and motion are the pipeline's own estimates; only the
+stages up to the geometry run, those before it from their cache (`--again` runs them too). Next to it stand bodies that
+need no thought: one depth for all, a level plane, the inflated silhouette. `--sheets` also draws every clip: the input,
+its Gaussians from the camera and from two sides, the bed alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from motion_page import replace_section
+from motion_subjects import default_shared, prepare, subjects
+from results import subjects as runs
+from results import table
+from scipy import ndimage
+
+from fluidlift.config import build_config
+from fluidlift.evaluate.case import Case, read_case
+from fluidlift.evaluate.images import depth_error, depth_scale, resample_nearest
+from fluidlift.evaluate.score import score_bed, score_depth, score_up, score_volume
+from fluidlift.evaluate.space import align
+from fluidlift.evaluate.volumes import align_cameras, behind, in_picture, occupancy_iou
+from fluidlift.look.pictures import caption
+from fluidlift.look.rasterize import render
+from fluidlift.look.scenery import orbit_camera, terrain_surfels
+from fluidlift.pipeline import begin, body, refining
+from fluidlift.pipeline.make import STAGES
+from fluidlift.pipeline.reading import Inputs, clip_of
+from fluidlift.pipeline.story import Silence, Story
+from fluidlift.shape.airborne import inside_body
+from fluidlift.shape.kind import PITCH_PRIOR
+from fluidlift.shape.surface import inflated_surface, level_surface
+from fluidlift.types import FaceVelocity, FluidAsset, FluidParameters, Gaussians, PinholeCamera, concatenate
+
+BEGIN, END = "<!-- geometry:begin -->", "<!-- geometry:end -->"
+FIGURES = {
+    "depth": "geometry.depth_error_relative", "relief": "geometry.depth_error_over_relief",
+    "iou": "geometry.occupancy_iou", "bed": "geometry.bed_error_relative", "up": "geometry.up_angle",
+}  # fmt: skip
+THICKNESS = 0.2
+"""of the width: how thick the bodies without thought are taken to be"""
+
+
+@dataclass(frozen=True)
+class Shaped:
+    """A clip up to its geometry."""
+
+    story: Story
+    inputs: Inputs
+    seconds: float
+    """of the geometry alone"""
+
+
+def shaped(clip: Path, camera: Path | None, folder: Path, again: bool) -> Shaped:
+    """Run the stages up to the geometry; those before it may come from the cache."""
+    config, inputs = build_config(preset="draft"), Inputs(clip, camera=camera)
+    folder.mkdir(parents=True, exist_ok=True)
+    force = frozenset({"read", "geometry"} if again else {"geometry"})
+    story, hashes = Story(folder, STAGES, force=force, progress=Silence()), begin.input_hashes(inputs)
+    begin.look(story, inputs, config, hashes)
+    began = time.perf_counter()
+    begin.shape(story, inputs, config, hashes)
+    return Shaped(story, inputs, time.perf_counter() - began)
+
+
+def still_asset(story: Story) -> FluidAsset:
+    """The geometry as an asset at rest: what the figures of space need."""
+    setting, clip = body.setting_of(story), clip_of(story)
+    grid = setting.terrain.grid
+    velocity = FaceVelocity(*(np.zeros(grid.face_shape(axis), np.float32) for axis in range(3)))
+    return FluidAsset(
+        story["geometry"].meta["kind"], Gaussians.empty(), setting.terrain, grid, setting.cell_types, velocity,
+        FluidParameters(), {}, body.camera_of(story), body.placement_of(story), clip.interval, len(clip),
+    )  # fmt: skip
+
+
+def measured(found: Shaped, case: Case) -> dict[str, Any]:
+    """Figures of the geometry, and of the bodies without thought."""
+    g = found.story["geometry"]
+    front = np.where(g.arrays["mask"], g.arrays["depth"], 0.0)
+    arrays, asset = {"front_depth": front, "rest_frame": g.meta["rest_frame"]}, still_asset(found.story)
+    figures, scale, frame = score_depth(arrays, case)
+    if scale is not None:
+        alignment = align(asset, case, scale, frame)
+        figures += score_bed(arrays, asset, case, alignment) + score_up(case, alignment)
+        figures += score_volume(asset, case, alignment)
+    values = {f.key: f.value for f in figures}
+    record: dict[str, Any] = {name: values.get(key) for name, key in FIGURES.items()}
+    record |= {"kind": g.meta["kind"], "seconds": round(found.seconds, 2), "warnings": g.meta["warnings"]}
+    record["plain"] = plain_bodies(g.arrays["mask"], asset, case, frame, g.meta["kind"])
+    return record
+
+
+def plain_bodies(mask: np.ndarray, asset: FluidAsset, case: Case, frame: int, kind: str) -> dict[str, Any]:
+    """Depth error and IoU of one depth for all, a level plane (tilt as known, else the usual one), an inflation."""
+    camera, size = asset.camera, asset.camera.size
+    distance = ndimage.distance_transform_edt(mask)
+    ridge = mask & (distance >= ndimage.maximum_filter(distance, size=5) - 1e-9)
+    thick = np.full(mask.shape, THICKNESS * 2 * float(np.median(distance[ridge])) / camera.focal[0])
+    plane = level_surface(_tilted(camera, kind), mask).depth
+    round_ = inflated_surface(camera, mask, "pour")
+    bodies = {
+        "one depth": (np.ones(mask.shape), thick),
+        "plane": (plane, thick * plane),
+        "inflation": (round_.depth, 2 * round_.half_thickness),
+    }
+    truth = resample_nearest(case.depth[frame].astype(np.float32), size)
+    out: dict[str, Any] = {}
+    for name, (depth, half) in bodies.items():
+        seen = mask & (depth > 0)
+        scale = depth_scale(np.where(seen, depth, 0.0), truth, seen)
+        error = None if scale is None else depth_error(np.where(seen, depth, 0.0), truth, seen, scale)
+        iou = None if scale is None else plain_iou((depth, half, seen), camera, case, frame, scale)
+        out[name] = {"depth": None if error is None else error[2], "iou": iou}
+    return out
+
+
+def _tilted(camera: PinholeCamera, kind: str) -> PinholeCamera:
+    """The camera in a world that is level where it is known to be, and where people usually hold it else."""
+    forward = camera.camera_from_world.rotation[2]
+    pitch = float(np.degrees(np.arcsin(np.clip(-forward[2], -1, 1))))
+    pitch = pitch if pitch > 5.0 else PITCH_PRIOR[kind][0]
+    ahead = (0.0, float(np.cos(np.radians(pitch))), -float(np.sin(np.radians(pitch))))
+    posed = PinholeCamera.looking((0.0, 0.0, 0.0), ahead, 50.0, camera.size)
+    return PinholeCamera(camera.focal, camera.center, camera.size, posed.camera_from_world)
+
+
+def plain_iou(shape: tuple[np.ndarray, ...], camera: PinholeCamera, case: Case, frame: int, scale: float) -> float:
+    """Occupancy IoU of the body between a depth and that much behind it, on the truth's cells in the picture."""
+    depth, thick, seen = shape
+    key = int(np.argmin(np.abs(case.key_frames - frame)))
+    centers = case.grid.centers().reshape(-1, 3)
+    truth = case.occupied(key).reshape(-1)
+    posed = align_cameras(case.camera, camera, 1.0).inverse()
+    eye = case.camera.position
+    mine = inside_body(posed.points(eye + (centers - eye) / scale), depth, depth + thick, seen, camera)
+    hidden = truth & behind(centers, case.static_depth, case.camera, case.grid.spacing)
+    return occupancy_iou(mine, truth, ~in_picture(centers, case.camera) | hidden) or 0.0
+
+
+def sheet(found: Shaped, out: Path) -> None:
+    """Input, Gaussians in the input view and from two sides, the bed alone: one row."""
+    story, config = found.story, build_config(preset="draft")
+    story.results["refine"] = refining.refine(story, found.inputs, config)
+    rest, camera, g = body.rest_of(story), body.camera_of(story), story["geometry"]
+    ground = terrain_surfels(body.terrain_of(story))
+    left, right = (orbit_camera(camera, rest.means, azimuth=a) for a in (-60.0, 60.0))
+    sky = (0.82, 0.86, 0.9)
+    clip = clip_of(story).frames[g.meta["rest_frame"]]
+    views = [clip, _drawn(rest, camera, g.arrays["plate"] / 255.0)]
+    views += [_drawn(concatenate([ground, rest]), c, sky) for c in (left, right)]
+    views.append(_drawn(ground, left, sky))
+    titles = ("input", "input view", "side view", "other side", "bed")
+    height = clip.shape[0]
+    row = [
+        caption(cv2.resize(v, (v.shape[1] * height // v.shape[0], height), interpolation=cv2.INTER_AREA), t)
+        for v, t in zip(views, titles, strict=True)
+    ]
+    cv2.imwrite(str(out), np.concatenate(row, axis=1)[..., ::-1])
+
+
+def _drawn(gaussians: Gaussians, camera: PinholeCamera, background: Any) -> np.ndarray:
+    image = render(gaussians, camera, background=background).image
+    return (np.clip(image, 0, 1) * 255).astype(np.uint8)
+
+
+def page_section(records: list[dict[str, Any]]) -> str:
+    """The tables."""
+    head = ["subject", "given", "kind", "depth", "depth over relief", "IoU", "bed", "up, degrees", "one depth",
+            "plane", "inflation", "s"]  # fmt: skip
+    rows = []
+    for r in records:
+        plain = [f"{_number(p['depth'])} / {_number(p['iou'])}" for p in r["plain"].values()]
+        mine = [_number(r[k]) for k in ("depth", "relief", "iou", "bed", "up")]
+        rows.append([r["name"], r["given"], r["kind"], *mine, *plain, _number(r["seconds"])])
+    return "\n".join(table(head, rows))
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3g}"
+
+
+def main() -> None:
+    """Measure, draw, write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--work", type=Path, required=True, help="folder for stages and results")
+    parser.add_argument("--only", action="append", default=[], help="a subject; may be repeated")
+    parser.add_argument("--again", action="store_true", help="masks and motion too")
+    parser.add_argument("--sheets", type=Path, help="folder for contact sheets of every clip and case")
+    parser.add_argument("--page", type=Path, help=f"page with the markers {BEGIN} and {END}")
+    a = parser.parse_args()
+    cv2.setNumThreads(1)
+    a.work.mkdir(parents=True, exist_ok=True)
+    records = []
+    for subject in subjects(a.work, default_shared()):
+        if subject.case is None or (a.only and subject.name not in a.only):
+            continue
+        prepare(subject)
+        case = read_case(subject.case)
+        for given, camera in (("camera", subject.case / "camera.json"), ("nothing", None)):
+            found = shaped(subject.video, camera, a.work / f"{subject.name}.{given}.fluid", a.again)
+            records.append({"name": subject.name, "given": given} | measured(found, case))
+            print(json.dumps(records[-1]), flush=True)
+    (a.work / "geometry.json").write_text(json.dumps(records, indent=1), encoding="utf-8")
+    if a.page is not None:
+        replace_section(a.page, page_section(records), BEGIN, END)
+    if a.sheets is not None:
+        a.sheets.mkdir(parents=True, exist_ok=True)
+        for run in runs(default_shared(), a.work):
+            if a.only and run.name not in a.only:
+                continue
+            camera = Path(run.options[1]) if run.options else None
+            name = run.name.replace(" ", "_")
+            sheet(shaped(run.clip, camera, a.work / f"{name}.sheet.fluid", a.again), a.sheets / f"{name}.png")
+            print(f"drew {name}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

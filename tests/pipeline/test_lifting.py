@@ -54,6 +54,18 @@ def test_completed_flow_is_kept_for_the_wanted_frames_alone(story):
     assert set(story["motion"].meta["targets"]) <= set(np.flatnonzero(known)) != set(range(len(completed)))
 
 
+def test_a_fluid_that_was_hardly_measured_is_told():
+    rows = [{"frame": t, "observed_share": share} for t, share in enumerate((0.04, 0.03, 0.9))]
+    (told,) = motion_warnings(rows, "stream", 0.0)
+    assert "4 % of the fluid only" in told
+    assert not motion_warnings([{"frame": 0, "observed_share": 0.3}, {"frame": 1, "observed_share": None}], "fall", 0.0)
+
+
+def test_every_target_says_how_much_of_the_fluid_was_measured(story):
+    shares = [r["observed_share"] for r in story["motion"].meta["reports"]]
+    assert len(shares) == 2 and all(0.0 < share <= 1.0 for share in shares)
+
+
 def test_frames_whose_solve_failed_are_named():
     reports = [{"frame": t, "solve": {"converged": t != 3}} for t in range(5)]
     (said,) = motion_warnings(reports, "stream", 0.0)

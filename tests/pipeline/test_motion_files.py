@@ -235,13 +235,6 @@ def test_fluxes_that_agree_are_not_told():
     assert not motion_files._unbalanced([{"flux_in": 0.1, "flux_out": 0.12}, {}])
 
 
-def test_a_fluid_that_was_hardly_measured_is_told():
-    rows = [{"observed_share": 0.04}, {"observed_share": 0.03}, {"observed_share": 0.9}]
-    (told,) = motion_files._little_seen(rows)
-    assert "4 % of the fluid only" in told
-    assert not motion_files._little_seen([{"observed_share": 0.3}])
-
-
 def test_a_scale_that_hangs_on_an_assumed_level_says_so(demo, tmp_path, capsys):
     camera = json.loads(Path(demo[2]).read_text())
     for level, assumed in ((None, True), (0.0, False)):

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 FAST_FALL = 0.3
 """share of the steep part whose speed is that of free fall, from which the user is told"""
+LITTLE_SEEN = 0.25
+"""share of the fluid below which the result is more the completion's than the clip's, and the user is told"""
 DISAGREEMENT = 0.5
 """share by which the projection changes what was seen on the surface, from which the user is told"""
 
@@ -52,7 +54,9 @@ def motion(story: Story, config: JobConfig) -> Result:
         for name, component in zip("uvw", found.velocity.components):
             arrays[f"target_{len(reports):03d}_{name}"] = component.astype(np.float32)
         arrays[f"target_{len(reports):03d}_seen"] = np.packbits(seen_cells(found.surface, grid), axis=-1)
-        reports.append({"frame": found.frame, **plain_report(found)})
+        wet = masks_of(story)[found.frame]
+        share = float(found.observed[wet].mean()) if wet.any() else None
+        reports.append({"frame": found.frame, "observed_share": share, **plain_report(found)})
         seen.append(found)
     shares = [s.free_fall_share for s in seen if s.free_fall_share is not None]
     factors = [s.front_factor for s in seen if s.front_factor is not None]
@@ -100,7 +104,15 @@ def motion_warnings(reports: list[dict[str, Any]], kind: str, free_fall_share: f
             "the divergence-free solve of the target velocity did not converge on every frame: "
             f"{len(stuck)} of {len(reports)}, the first is {stuck[0]}"
         )
-    if reports and np.median([r.get("change_observed", 0.0) for r in reports]) > DISAGREEMENT:
+    shares = [r["observed_share"] for r in reports if r.get("observed_share") is not None]
+    if shares and np.median(shares) < LITTLE_SEEN:
+        warnings.append(
+            f"the motion was measured on {100 * np.median(shares):.0f} % of the fluid only; the rest is filled in: "
+            "speeds there are a guess; look at observed/ of fluidlift motion, and at a larger --max-size, more texture "
+            "or a higher frame rate"
+        )
+    changes = [r["change_observed"] for r in reports if "change_observed" in r]
+    if changes and np.median(changes) > DISAGREEMENT:
         warnings.append(
             "the shape and the measured motion do not agree on one discharge: velocities of the seen surface were "
             "changed by more than half"

@@ -25,8 +25,6 @@ MOTION_STAGES = ("read", "flow", "segment", "geometry", "velocities")
 
 SPREAD_OF_FLUX = 0.5
 """difference of what flows in and out, relative to the smaller one, from which the user is told"""
-LITTLE_SEEN = 0.25
-"""share of the fluid below which the result is more the completion's than the clip's, and the user is told"""
 
 
 def measure_motion(
@@ -99,19 +97,8 @@ def _velocities(story: Story, folder: Path, config: JobConfig, files: MotionFile
         writer.write(t, here)
     rows = writer.finish(pairs)
     shares = [r["free_fall_share"] for r in rows if r.get("free_fall_share") is not None]
-    warnings = motion_warnings([r for r in rows if "solve" in r], g["kind"], float(max(shares, default=0.0)))
-    return Result({}, {"warnings": warnings + _little_seen(rows) + _unbalanced(rows), "rows": rows})
-
-
-def _little_seen(rows: list[dict[str, Any]]) -> list[str]:
-    """A warning where most of the motion was not measured."""
-    seen = _median(rows, "observed_share")
-    if seen is None or seen >= LITTLE_SEEN:
-        return []
-    return [
-        f"the motion was measured on {100 * seen:.0f} % of the fluid only; the rest is filled in: speeds there are a "
-        "guess; look at observed/, and at a larger --max-size, more texture or a higher frame rate"
-    ]
+    warnings = motion_warnings(rows, g["kind"], float(max(shares, default=0.0)))
+    return Result({}, {"warnings": warnings + _unbalanced(rows), "rows": rows})
 
 
 def _unbalanced(rows: list[dict[str, Any]]) -> list[str]:

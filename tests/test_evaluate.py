@@ -21,7 +21,6 @@ from fluidlift.evaluate.images import (
     resample_nearest,
     ssim,
 )
-from fluidlift.evaluate.solid import solid_depth
 from fluidlift.evaluate.volumes import (
     align_cameras,
     field_cosine,
@@ -228,22 +227,15 @@ def test_the_bed_is_compared_along_the_lines_of_sight():
     case, asset = replace(a_case(), static_depth=bed), an_asset()
     asset = replace(asset, terrain=replace(asset.terrain, signed_distance=GRID.nodes()[..., 2] - floor))
     sheet = evaluate_arrays(asset, a_run(case), {}, case)
-    # float32 depths of 1 m; the signed distance is linear, so that the crossing is exact
-    assert sheet["geometry.bed_error"] == pytest.approx(0.0, abs=1e-5)
+    # sphere tracing ends within a twentieth of a cell of the floor, and rays are up to twice as long as they are deep
+    ends = 2 * 0.05 * GRID.spacing
+    assert sheet["geometry.bed_error"] == pytest.approx(0.0, abs=ends)
     assert sheet["geometry.up_angle"] == pytest.approx(0.0, abs=1e-4)
     deeper = replace(case, static_depth=1.1 * bed)
     sheet = evaluate_arrays(asset, a_run(deeper), {}, deeper)
-    assert sheet["geometry.bed_error_relative"] == pytest.approx(0.1 / 1.1, abs=1e-5)
+    assert sheet["geometry.bed_error_relative"] == pytest.approx(0.1 / 1.1, abs=ends)
     bare = replace(case, static_depth=np.zeros_like(bed))
     assert evaluate_arrays(asset, a_run(bare), {}, bare)["geometry.bed_error"] is None
-
-
-def test_rays_that_miss_the_solid_have_no_depth():
-    camera, terrain = a_camera(), an_asset().terrain
-    start = np.full(SIZE[::-1], 0.1)
-    raised = replace(terrain, signed_distance=np.ones_like(terrain.signed_distance))
-    assert (solid_depth(raised, camera, start) == 0).all()
-    assert (solid_depth(terrain, camera, np.zeros_like(start)) == 0).all()
 
 
 def test_a_camera_that_is_taken_for_steeper_than_it_is_tilts_the_vertical():

@@ -25,6 +25,7 @@ from fluidlift.cli.options import (
     Make,
     Mask,
     Motion,
+    Render,
     Sim,
     Validate,
 )
@@ -147,6 +148,27 @@ def _sim(c: Sim) -> int:
     return _tell(made, c.json)
 
 
+def _render(c: Render) -> int:
+    from fluidlift.pipeline import RenderRequest, render_asset
+
+    request = RenderRequest(
+        c.view, _pair(c.size, "x", "--size", "1920x1080"), _pair(c.frames, "-", "--frames", "1001-1024"),
+        c.background, c.format,
+    )  # fmt: skip
+    with _progress() as progress:
+        return _told(render_asset(c.asset, c.out, request, progress=progress), c.json)
+
+
+def _pair(text: str | None, mark: str, option: str, example: str) -> tuple[int, int] | None:
+    """Two whole numbers with a mark between them."""
+    if text is None:
+        return None
+    parts = text.lower().split(mark)
+    if len(parts) != 2 or not all(p.strip().isdecimal() for p in parts):
+        raise InputRejected(f"{option} '{text}'", f"two numbers, such as {example}")
+    return int(parts[0]), int(parts[1])
+
+
 def _inspect(c: Inspect) -> int:
     from fluidlift.io.video import probe
 
@@ -266,6 +288,6 @@ def _doctor(c: Doctor) -> int:
 
 
 _COMMANDS = {
-    Make: _make, Fit: _fit, Sim: _sim, Inspect: _inspect, Mask: _mask, Motion: _motion, Evaluate: _evaluate,
-    Validate: _validate, Demo: _demo, Doctor: _doctor,
+    Make: _make, Fit: _fit, Sim: _sim, Render: _render, Inspect: _inspect, Mask: _mask, Motion: _motion,
+    Evaluate: _evaluate, Validate: _validate, Demo: _demo, Doctor: _doctor,
 }  # fmt: skip

@@ -119,6 +119,28 @@ class Fit:
 
 
 @dataclass(frozen=True)
+class Render:
+    """Draw a finished asset from any camera: a film, or pictures with transparency or depth."""
+
+    asset: Asset
+    """asset folder"""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """a film (.mp4, .mov), or a folder for pictures (numbers from 1001)"""
+    view: str = "input"
+    """input, side, top, turn (once around), or a JSON file: a camera, or keyed views"""
+    size: str | None = None
+    """width and height in px, such as 1920x1080; by default those of the clip"""
+    frames: str | None = None
+    """first and last, such as 1001-1024; by default all"""
+    background: Literal["auto", "plate", "terrain", "none"] = "auto"
+    """plate: the clip without its fluid (view input only); terrain: bed and sky; none: transparent"""
+    format: Literal["png", "exr"] = "png"
+    """of pictures: png (8 bits, alpha), exr (linear, alpha, camera depth in metres)"""
+    json: bool = False
+    """print the outcome as JSON"""
+
+
+@dataclass(frozen=True)
 class Inspect:
     """Tell what a clip is, and what would be warned about."""
 
@@ -248,4 +270,4 @@ class Doctor:
     """print as JSON"""
 
 
-Command = Make | Fit | Sim | Inspect | Mask | Motion | Evaluate | Validate | Demo | Doctor
+Command = Make | Fit | Sim | Render | Inspect | Mask | Motion | Evaluate | Validate | Demo | Doctor

@@ -262,14 +262,19 @@ def mark_owner(folder: Path | str, stage: str, key: str | None) -> None:
         write_bytes(owner, key.encode())
 
 
+def owner_of(folder: Path | str, stage: str) -> str | None:
+    """Key of the result that the files beside the cache belong to; None where that is not known."""
+    owner = _names(folder, stage, "none")[0].with_name("owner")
+    try:
+        key = "" if owner.is_symlink() else owner.read_bytes()[:128].decode("ascii")
+    except (OSError, UnicodeDecodeError):
+        return None
+    return key if re.fullmatch(r"[A-Za-z0-9_-]{1,128}", key) else None
+
+
 def is_owner(folder: Path | str, stage: str, key: str) -> bool:
     """Whether the files beside the cache belong to this result."""
-    data, _ = _names(folder, stage, key)
-    owner = data.with_name("owner")
-    try:
-        return not owner.is_symlink() and owner.read_bytes()[:128] == key.encode()
-    except OSError:
-        return False
+    return owner_of(folder, stage) == key
 
 
 def _forget_old(place: Path, key: str) -> None:

@@ -5,6 +5,7 @@ from fluidlift.pipeline.mask_files import find_masks
 from fluidlift.pipeline.motion_files import MotionFiles, measure_motion
 from fluidlift.pipeline.reading import Inputs
 from fluidlift.pipeline.refit import Refitted, refit
+from fluidlift.pipeline.rendering import RenderRequest, render_asset
 from fluidlift.pipeline.resimulate import Made, resimulate
 from fluidlift.pipeline.scene import SimulationRequest
 from fluidlift.pipeline.seeing import Hints
@@ -18,11 +19,13 @@ __all__ = [
     "MotionFiles",
     "Progress",
     "Refitted",
+    "RenderRequest",
     "Silence",
     "SimulationRequest",
     "find_masks",
     "make",
     "measure_motion",
     "refit",
+    "render_asset",
     "resimulate",
 ]

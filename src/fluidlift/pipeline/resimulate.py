@@ -79,7 +79,7 @@ def resimulate(
     story = Story(
         folder, SECOND_HALF, force=frozenset(SECOND_HALF if request.restart else ()), progress=progress or Silence()
     )
-    _recall(story, manifest)
+    recall_first_half(story, manifest)
     with disk_errors(folder):
         frames = play(story, folder, config, request)
     own = tuple(story["simulate"].meta.get("warnings", ()))
@@ -135,7 +135,7 @@ def settings_of(
     return build_config(preset, None, overrides, values | {k: v for k, v in flat.items() if v is not None})
 
 
-def _recall(story: Story, manifest: dict[str, Any]) -> None:
+def recall_first_half(story: Story, manifest: dict[str, Any]) -> None:
     """Results of the first half, as far as they are still cached; all of them or none."""
     keys = stage_keys(manifest)
     if not all(name in keys and story.recall(name, keys[name]) for name in FIRST_HALF):

@@ -1,7 +1,7 @@
 """Floor 0: frozen values that check themselves."""
 
 from fluidlift.types.asset import FORMAT_VERSION, FluidAsset
-from fluidlift.types.camera import PinholeCamera
+from fluidlift.types.camera import PinholeCamera, ViewKey
 from fluidlift.types.clip import Label, PixelLabels, VideoClip
 from fluidlift.types.flow import PixelFlow, SurfaceMotion
 from fluidlift.types.gaussians import SH_C0, Gaussians, concatenate, decompose_covariances, sh_from_rgb
@@ -15,6 +15,6 @@ from fluidlift.types.transforms import RigidTransform, Similarity3, matrix_from_
 __all__ = [
     "FORMAT_VERSION", "SH_C0", "CellType", "Estimate", "FaceVelocity", "FitResult", "FluidAsset", "FluidParameters",
     "Gaussians", "Grid", "Label", "Particles", "PinholeCamera", "PixelFlow", "PixelLabels", "RigidTransform",
-    "Similarity3", "SolveReport", "SurfaceMotion", "Terrain", "TriangleMesh", "VideoClip", "concatenate",
+    "Similarity3", "SolveReport", "SurfaceMotion", "Terrain", "TriangleMesh", "VideoClip", "ViewKey", "concatenate",
     "decompose_covariances", "matrix_from_quat", "quat_from_matrix", "sh_from_rgb",
 ]  # fmt: skip

@@ -144,3 +144,17 @@ class PinholeCamera:
                 f"a camera JSON that cannot be read ({type(error).__name__}: {error})",
                 "width, height, K (3x3, px) and, for a known pose, R (3x3) and t (3) with x_cam = R x_world + t",
             ) from None
+
+
+@dataclass(frozen=True)
+class ViewKey:
+    """What a camera does at one frame."""
+
+    frame: float
+    """counted from 0"""
+    eye: tuple[float, float, float]
+    """m, world"""
+    target: tuple[float, float, float]
+    """m, world: what it looks at"""
+    fov: float
+    """degrees across the longer side"""

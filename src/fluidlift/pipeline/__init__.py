@@ -1,5 +1,6 @@
 """The story: the only place that knows the order of the stages."""
 
+from fluidlift.pipeline.exporting import ExportRequest, export_asset
 from fluidlift.pipeline.make import STAGES, make
 from fluidlift.pipeline.mask_files import find_masks
 from fluidlift.pipeline.motion_files import MotionFiles, measure_motion
@@ -13,6 +14,7 @@ from fluidlift.pipeline.story import Progress, Silence
 
 __all__ = [
     "STAGES",
+    "ExportRequest",
     "Hints",
     "Inputs",
     "Made",
@@ -22,6 +24,7 @@ __all__ = [
     "RenderRequest",
     "Silence",
     "SimulationRequest",
+    "export_asset",
     "find_masks",
     "make",
     "measure_motion",

@@ -74,7 +74,7 @@ def render_asset(
     longer = float(played.get("extended_downstream", 0.0))
     made_with = SimulationRequest(fps=1.0 / interval, extend_downstream=longer)
     scene = scene_of(asset, folder, made_with, config, footage=None, start=0)
-    numbers = _numbers(folder, int(played.get("frames", 0)), request)
+    numbers = frame_numbers(folder, int(played.get("frames", 0)), request.frames)
     poses, warnings = _poses(folder, scene, len(numbers) + numbers[0])
     stage = _Stage(scene, footage, request, _cameras(scene, request, len(numbers)), numbers, poses)
     progress.stage("render", 1, 1)
@@ -127,15 +127,20 @@ def _check(request: RenderRequest, out: Path) -> None:
         raise InputRejected(f"'{out.name}', which is a file", "a folder, or a film that ends in .mp4 or .mov")
 
 
-def _numbers(folder: Path, count: int, request: RenderRequest) -> range:
-    """Frames to draw, from 0."""
+def frame_numbers(folder: Path, count: int, wanted: tuple[int, int] | None) -> range:
+    """Frames of an asset, from 0: of the `count` that were simulated those whose files are there, or those wanted
+    (first and last number, from 1001).
+
+    Raises:
+        InputRejected: none are there, or not those.
+    """
     there = next((k for k in range(count) if not frame_file(folder, FIRST_FRAME + k).is_file()), count)
     if there == 0:
         raise InputRejected(f"'{folder.name}' has no simulated frames", "frames/splats/1001.ply and so on",
                             f"fluidlift sim {folder}")  # fmt: skip
-    if request.frames is None:
+    if wanted is None:
         return range(there)
-    first, last = request.frames
+    first, last = wanted
     if not FIRST_FRAME <= first <= last < FIRST_FRAME + there:
         raise InputRejected(f"frames {first} to {last}", f"numbers from {FIRST_FRAME} to {FIRST_FRAME + there - 1}",
                             "the first frame of an asset is 1001")  # fmt: skip

@@ -1,0 +1,66 @@
+"""Surfaces of particles by splashsurf: marching cubes on the SPH density, weighted Laplacian smoothing (Loeschner,
+Boettcher, Jeske and Bender 2023)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, final
+
+import numpy as np
+
+from fluidlift.errors import MissingPackage, require
+from fluidlift.seams import Mesher
+from fluidlift.types import TriangleMesh
+
+KERNEL = 2.0
+"""smoothing length, radii: the support then spans four neighbours"""
+CUBE = 0.8
+"""cell of the marching cubes, radii"""
+INSIDE = 0.6
+"""share of the density of the full fluid at which the surface lies"""
+SMOOTHING = 15
+"""passes over the mesh; the weights keep flat parts from shrinking and take the lattice out of sprays"""
+FEWEST = 4
+"""particles with neighbours: fewer bound nothing"""
+
+
+@final
+class SplashsurfMesher(Mesher):
+    """Through the package `pysplashsurf`.
+
+    Raises:
+        MissingPackage: it is not installed.
+    """
+
+    def __init__(self) -> None:
+        try:
+            import pysplashsurf
+        except ImportError:
+            raise MissingPackage("Surface meshes need pysplashsurf: pip install pysplashsurf") from None
+        self._package: Any = pysplashsurf
+
+    def surface(
+        self, positions: np.ndarray, radius: float, attributes: Mapping[str, np.ndarray]
+    ) -> tuple[TriangleMesh, dict[str, np.ndarray]]:
+        """See `Mesher.surface`. Particles with a number that is not finite are left out; no particles, no triangles."""
+        require(np.isfinite(radius) and radius > 0, f"a radius of {radius}", "positive metres")
+        points = np.ascontiguousarray(positions, np.float64)
+        sound = np.isfinite(points).all(axis=1)
+        values = {k: np.ascontiguousarray(np.asarray(v, np.float64)[sound]) for k, v in attributes.items()}
+        if sound.sum() < FEWEST:
+            return _nothing(values)
+        found, _ = self._package.reconstruction_pipeline(
+            np.ascontiguousarray(points[sound]), attributes_to_interpolate=values, particle_radius=radius,
+            smoothing_length=KERNEL, cube_size=CUBE, iso_surface_threshold=INSIDE, mesh_cleanup=True,
+            decimate_barnacles=True, mesh_smoothing_iters=SMOOTHING, mesh_smoothing_weights=True,
+        )  # fmt: skip
+        vertices, faces = np.asarray(found.mesh.vertices, np.float32), np.asarray(found.mesh.triangles, np.int64)
+        if len(faces) == 0:
+            return _nothing(values)
+        carried = {k: np.asarray(found.point_attributes[k], np.float32) for k in values}
+        return TriangleMesh(vertices, faces), carried
+
+
+def _nothing(values: Mapping[str, np.ndarray]) -> tuple[TriangleMesh, dict[str, np.ndarray]]:
+    mesh = TriangleMesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int64))
+    return mesh, {k: np.zeros((0, v.shape[1]), np.float32) for k, v in values.items()}

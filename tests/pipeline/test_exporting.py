@@ -1,0 +1,107 @@
+"""A finished asset is written for other tools."""
+
+import json
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial import cKDTree
+
+from fluidlift.cli import DONE, REJECTED, WITH_WARNINGS, main
+from fluidlift.io.asset_folder import load_asset, read_manifest
+from fluidlift.io.ply import read_mesh, read_splats
+from fluidlift.io.validate_usd import validate_usd
+from fluidlift.numerics.sampling import sample_nodes
+
+WELL = (DONE, WITH_WARNINGS)
+
+
+def export(made, out, *options):
+    return main(["export", str(made.folder), "-o", str(out), "--frames", "1001-1002", *options])
+
+
+def test_the_surface_holds_the_particles_and_stays_out_of_the_bed(made, tmp_path):
+    assert export(made, tmp_path / "out") in WELL
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["1001.ply", "1002.ply", "terrain.glb"]
+    mesh, asset = read_mesh(tmp_path / "out" / "1002.ply"), load_asset(made.folder)
+    splats = read_splats(made.folder / "frames" / "splats" / "1002.ply").gaussians
+    h = asset.grid.spacing
+    low, high = np.percentile(splats.means, [1, 99], axis=0)
+    assert (mesh.vertices.min(0) < low + h).all() and (mesh.vertices.max(0) > high - h).all()
+    inside = asset.terrain.grid.contains(mesh.vertices)
+    depth = sample_nodes(asset.terrain.signed_distance, asset.terrain.grid, mesh.vertices[inside])
+    assert np.percentile(depth, 1) > -0.2 * h  # the stored distance is not exact beside edges
+
+
+def test_other_tools_read_the_surface_with_its_velocities(made, tmp_path):
+    assert export(made, tmp_path / "out") in WELL
+    other = trimesh.load(tmp_path / "out" / "1001.ply", process=False)
+    data = other.metadata["_ply_raw"]["vertex"]["data"]
+    own = read_splats(made.folder / "frames" / "splats" / "1001.ply")
+    _, nearest = cKDTree(own.gaussians.means).query(np.asarray(other.vertices), k=8)
+    beside = own.extras["vx"][nearest].mean(axis=1)
+    # both are means over the neighbourhood, with other weights
+    assert np.median(np.abs(data["vx"] - beside)) < 0.25 * np.std(own.extras["vx"])
+    assert len(other.visual.vertex_colors) == len(other.vertices)
+
+
+def test_axes_and_units_turn_positions_and_velocities_alike(made, tmp_path):
+    assert export(made, tmp_path / "a") in WELL
+    assert export(made, tmp_path / "b", "--up-axis", "y", "--meters-per-unit", "0.01") in WELL
+    first, second = (trimesh.load(tmp_path / n / "1001.ply", process=False) for n in "ab")
+    x, y, z = np.asarray(first.vertices).T
+    np.testing.assert_allclose(np.asarray(second.vertices), 100 * np.stack([x, z, -y], 1), atol=1e-3)
+    data = [m.metadata["_ply_raw"]["vertex"]["data"] for m in (first, second)]
+    np.testing.assert_allclose(data[1]["vy"], 100 * data[0]["vz"], rtol=1e-4, atol=1e-3)
+    header = (tmp_path / "b" / "1001.ply").read_bytes()[:400]
+    assert b"0.01 m" in header and b"y up" in header
+
+
+def test_obj_files_hold_the_same_surface(made, tmp_path):
+    assert export(made, tmp_path / "ply") in WELL and export(made, tmp_path / "obj", "--to", "obj") in WELL
+    obj = trimesh.load(tmp_path / "obj" / "1001.obj", process=False)
+    ply = read_mesh(tmp_path / "ply" / "1001.ply")
+    assert len(obj.faces) == len(ply.faces)
+    np.testing.assert_allclose(np.sort(obj.vertices[:, 2]), np.sort(ply.vertices[:, 2]), atol=1e-5)
+
+
+def test_splats_come_back_as_they_were(made, tmp_path):
+    assert export(made, tmp_path / "out", "--to", "splats", "--up-axis", "y") in WELL
+    back = read_splats(tmp_path / "out" / "1001.ply")
+    own = read_splats(made.folder / "frames" / "splats" / "1001.ply")
+    np.testing.assert_allclose(back.gaussians.means, own.gaussians.means, atol=1e-5)
+    np.testing.assert_array_equal(back.extras["id"], own.extras["id"])
+
+
+def test_usd_holds_the_surface_at_every_frame(made, tmp_path):
+    from pxr import Usd, UsdGeom
+
+    assert export(made, tmp_path / "out", "--to", "usd") in WELL
+    assert validate_usd(tmp_path / "out" / "fluid.usda") == []
+    stage = Usd.Stage.Open(str(tmp_path / "out" / "fluid.usda"))
+    moving = [
+        UsdGeom.Mesh(p).GetPointsAttr() for p in stage.Traverse()
+        if p.IsA(UsdGeom.Mesh) and UsdGeom.Mesh(p).GetPointsAttr().GetNumTimeSamples()
+    ]  # fmt: skip
+    assert [m.GetTimeSamples() for m in moving] == [[1001.0, 1002.0]]
+
+
+def test_the_outcome_is_told_in_json(made, tmp_path, capsys):
+    assert export(made, tmp_path / "out", "--to", "splats", "--json") in WELL
+    told = json.loads(capsys.readouterr().out)
+    assert told["frames"] == 2 and told["first"] == 1001 and told["fps"] == pytest.approx(25)
+    assert read_manifest(made.folder)["simulation"]["frames"] > 2
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--to", "objj"), "did you mean obj"),
+        (("--meters-per-unit", "0"), "0.01 for centimetres"),
+        (("--frames", "2000-2001"), "numbers from 1001"),
+    ],
+)
+def test_what_cannot_be_written_is_refused(made, tmp_path, capsys, options, words):
+    assert main(["export", str(made.folder), "-o", str(tmp_path / "out"), *options]) == REJECTED
+    assert words in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

@@ -13,7 +13,7 @@ from fluidlift.config import build_config
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "SECURITY.md")]
-PAGES += sorted((ROOT / "docs").glob("*.md"))
+PAGES += sorted((ROOT / "docs").glob("**/*.md"))
 COMMANDS = {c.__name__.lower(): c for c in typing.get_args(cli.Command)}
 
 

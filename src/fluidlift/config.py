@@ -63,6 +63,54 @@ class ShapeConfig:
     """random rays of the inside test"""
     longest_union: int = 6
     """most frames united into one body"""
+    rasterizer: Literal["auto", "cpu", "gsplat"] = "auto"
+    """what draws while Gaussians are refined; auto takes gsplat where it runs, on an NVIDIA GPU"""
+
+
+@dataclass(frozen=True)
+class DepthConfig:
+    """Depth from a file (`--depth`) or from a learned model."""
+
+    model: Literal["none", "moge", "depth-anything", "depth-anything-3", "depth-pro"] = "none"
+    """which model looks at the pictures; they need weights"""
+    weights: str | None = None
+    """file or folder (or name on the hub, where a download is allowed) of the weights of a model"""
+    device: str = "cpu"
+    """where a model runs: cpu, or cuda"""
+    download: bool = False
+    """whether weights may be fetched"""
+    frames: int = 7
+    """pictures that a model looks at; their median counts"""
+    holds: Literal["auto", "metres", "relative", "disparity"] = "auto"
+    """what a depth file holds: metres, depth up to a factor, or inverse depth up to factor and offset; auto: metres"""
+    scale: float | None = None
+    """m per stored unit of a depth file; None: 0.001 (millimetres) for 16-bit pictures, 1 for floats"""
+
+
+@dataclass(frozen=True)
+class GenerateConfig:
+    """Bodies by a third-party generator (`fluidlift generators` lists them)."""
+
+    name: str | None = None
+    """of the generator; none: the embedded one, which needs nothing"""
+    python: str | None = None
+    """of the environment in which it is installed; none: this one"""
+    code: str | None = None
+    """folder of its own code, where that is a checkout"""
+    weights: str | None = None
+    """file or folder of its weights; none: what it takes from the hub's cache"""
+    device: str = "auto"
+    """cpu, cuda, or cuda:1; auto: a GPU where there is one"""
+    download: bool = False
+    """whether it may fetch weights"""
+    accept_licence: tuple[str, ...] = ()
+    """names of generators whose licence you have read and accept"""
+    use: Literal["research", "commercial"] | None = None
+    """what the asset is for, where a generator's terms forbid commercial use"""
+    frame_seconds: float = 1800.0
+    """s that one frame may take in a process of its own, the loading of the weights with the first"""
+    runner: str | None = None
+    """script of your own that speaks the runner protocol (docs/generators/index.md)"""
 
 
 @dataclass(frozen=True)
@@ -167,7 +215,9 @@ class JobConfig:
     seed: int = 0
     read: ReadConfig = field(default_factory=ReadConfig)
     shape: ShapeConfig = field(default_factory=ShapeConfig)
+    depth: DepthConfig = field(default_factory=DepthConfig)
     segment: SegmentConfig = field(default_factory=SegmentConfig)
+    generate: GenerateConfig = field(default_factory=GenerateConfig)
     motion: MotionConfig = field(default_factory=MotionConfig)
     fit: FitConfig = field(default_factory=FitConfig)
     simulate: SimulateConfig = field(default_factory=SimulateConfig)
@@ -221,6 +271,9 @@ RANGES: dict[str, tuple[float, float]] = {
     "shape.max_gaussians": (100, 1e9),
     "shape.rays": (1, 1001),
     "shape.longest_union": (1, 1000),
+    "depth.frames": (1, 1000),
+    "depth.scale": (1e-9, 1e9),
+    "generate.frame_seconds": (0.01, 1e7),
     "motion.flow_scale": (-1e9, 1e9),
     "motion.half_window": (0, 50),
     "motion.reach": (0, 200),
@@ -324,7 +377,8 @@ def _with(config: Any, path: list[str], value: Any, name: str) -> Any:
 
 
 def _checked(value: Any, kind: Any, name: str) -> Any:
-    options = typing.get_args(kind) if isinstance(kind, types.UnionType) else (kind,)
+    several = isinstance(kind, types.UnionType) or typing.get_origin(kind) is typing.Union  # the latter with Literal
+    options = typing.get_args(kind) if several else (kind,)
     for option in options:
         if option is type(None) and value is None:
             return None

@@ -10,6 +10,7 @@ LABELS = {
     "read": "reading the clip",
     "flow": "optical flow",
     "segment": "finding the fluid",
+    "generate": "bodies by the generator",
     "geometry": "shape, camera and terrain",
     "refine": "Gaussians",
     "masks": "writing the masks",

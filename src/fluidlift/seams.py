@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 
@@ -21,6 +22,9 @@ from fluidlift.types import (
     TriangleMesh,
     VideoClip,
 )
+
+Tensor: TypeAlias = Any
+"""a torch tensor; torch itself is not imported here, because the command line needs this module at its start"""
 
 
 class Segmenter(ABC):
@@ -74,12 +78,96 @@ class DepthEstimator(ABC):
         """float32 [H,W], camera z in m up to one factor, of a u8 [H,W,3] picture."""
 
 
+class SplatView(Protocol):
+    """A pinhole camera as plain numbers (`numerics.splatting.View` is one): x_cam = rotation @ x + translation."""
+
+    @property
+    def rotation(self) -> np.ndarray:
+        """[3,3]."""
+        ...
+
+    @property
+    def translation(self) -> np.ndarray:
+        """[3], m."""
+        ...
+
+    @property
+    def focal(self) -> tuple[float, float]:
+        """px."""
+        ...
+
+    @property
+    def center(self) -> tuple[float, float]:
+        """px, from the upper left corner of the picture."""
+        ...
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width, height, px."""
+        ...
+
+    @property
+    def near(self) -> float:
+        """m of camera z; Gaussians with their centre nearer than this are not drawn."""
+        ...
+
+
+@dataclass(frozen=True)
+class Splatted:
+    """A picture of Gaussians that knows its gradients."""
+
+    image: Tensor
+    """[h,w,c], features composited front to back before black"""
+    light: Tensor
+    """[h,w], what is left of the light behind all Gaussians"""
+    centers: Tensor
+    """[n,2] or [1,n,2], px: where the centres lie in the picture; it keeps its gradient, if there is one"""
+
+    def pull(self) -> Tensor:
+        """[n,2]: after `backward`, the gradient of the loss at the centres in the picture, 1/px."""
+        if self.centers.grad is None:
+            raise ValueError(
+                "No gradient at the centres. Needed: backward() through image or light. Do: call it first."
+            )
+        return self.centers.grad.reshape(-1, 2).to(self.image.device)
+
+
+class Rasterizer(ABC):
+    """Gaussians to a picture of any features, in one pass, with gradients to all five operands.
+
+    Conventions are those of gsplat (see `numerics.splatting`), whatever the implementation.
+    """
+
+    @abstractmethod
+    def splat(
+        self, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, features: Tensor, view: SplatView
+    ) -> Splatted:
+        """The picture, on the device of `means`.
+
+        Args:
+            means: float32 [n,3], world, m.
+            quats: [n,4], w x y z, normalised here.
+            scales: [n,3], standard deviations along the axes, m.
+            opacities: [n], 0 to 1.
+            features: [n,c], any c: colour, depth, normal, velocity side by side.
+            view: who looks.
+        """
+
+
 class Mesher(ABC):
     """Particles to a surface."""
 
     @abstractmethod
-    def surface(self, positions: np.ndarray, radius: float) -> TriangleMesh:
-        """The free surface of particles at `positions` (float [n,3], m) with `radius` (m)."""
+    def surface(
+        self, positions: np.ndarray, radius: float, attributes: Mapping[str, np.ndarray]
+    ) -> tuple[TriangleMesh, dict[str, np.ndarray]]:
+        """The surface of particles, and what they carry interpolated to its vertices.
+
+        Args:
+            positions: float [n,3], m.
+            radius: m, half the distance between neighbours inside the fluid.
+            attributes: float [n,k] by name.
+        """
 
 
 class Exporter(ABC):

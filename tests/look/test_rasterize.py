@@ -82,7 +82,7 @@ def test_rubbish_does_not_spoil_the_picture():
 def test_thousands_of_giants_are_drawn_in_bounded_memory(monkeypatch):
     import fluidlift.look.rasterize as module
 
-    monkeypatch.setattr(module, "PAIRS_MAX", 20_000)
+    monkeypatch.setattr(module, "PAIRS_DRAWN_MAX", 20_000)
     g = ball()
     giants = Gaussians.isotropic(g.means, 1e6, g.rgb, 0.5)
     rendered = render(giants, CAMERA)
@@ -104,3 +104,33 @@ def test_wrong_shapes_are_refused():
         render(ball(10), CAMERA, features=np.ones((9, 3)))
     with pytest.raises(ValueError, match="background"):
         render(ball(10), CAMERA, background=(1.0, 1.0))
+
+
+def test_more_gaussians_than_can_be_numbered_are_refused(monkeypatch):
+    import fluidlift.look.rasterize as module
+
+    monkeypatch.setattr(module, "COUNT_MAX", 1000)
+    with pytest.raises(ValueError, match=r"2000 Gaussians.*at most 1000.*prune"):
+        render(ball(), CAMERA)
+
+
+def test_only_what_is_seen_gets_colours(monkeypatch):
+    import fluidlift.look.rasterize as module
+
+    g = ball()
+    away = g.select(np.arange(1000))
+    away = Gaussians(away.means + np.float32([0, -100, 0]), away.quats, away.scales, away.opacities, away.sh)
+    counts = []
+    monkeypatch.setattr(module, "view_colors", lambda g, c: counts.append(len(g)) or view_colors(g, c))
+    drawn = render(concatenate([away, g]), CAMERA)
+    np.testing.assert_array_equal(drawn.image, render(g, CAMERA).image)
+    assert counts == [len(g)] * 2, "those behind the camera cost no colours"
+
+
+def test_bands_of_tiles_change_no_bit_of_a_picture(monkeypatch):
+    from fluidlift.numerics import splatting
+
+    whole = render(ball(), CAMERA)
+    monkeypatch.setattr(splatting, "PAIRS_MAX", 500)
+    parts = render(ball(), CAMERA)
+    assert np.array_equal(parts.image, whole.image) and np.array_equal(parts.depth, whole.depth)

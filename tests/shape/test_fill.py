@@ -1,6 +1,7 @@
 """Inside is inside, also behind a leaky hull, and filling makes hollow bodies whole."""
 
 import time
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -139,3 +140,88 @@ def test_no_more_are_added_than_asked_for():
 def test_the_same_seed_fills_alike():
     a, b = (fill(shell(torus), spacing=SPACING, rng=np.random.default_rng(5)) for _ in range(2))
     np.testing.assert_array_equal(a.means, b.means)
+
+
+def hits(g: Gaussians, spacing: float = SPACING) -> tuple[float, float]:
+    """Shares of the points well inside the unit ball, and well outside it, that are taken for inside."""
+    rng = np.random.default_rng(1)
+    points = rng.uniform(-1.5, 1.5, (4000, 3))
+    depth = DEPTHS[sphere](points)
+    found = inside(points, g, spacing=spacing, rays=9, rng=rng)
+    return float(found[depth > 1.5 * spacing].mean()), float(found[depth < -1.5 * spacing].mean())
+
+
+def test_a_wide_hole_costs_its_share_of_the_rays_and_not_the_body():
+    p = sphere(20_000, np.random.default_rng(0))
+    opened = p[np.linalg.norm(p - [0, 0, 1], axis=1) > 0.5]  # a sixteenth of the surface
+    within, without = hits(Gaussians.isotropic(opened.astype(np.float32), 0.02, np.full((len(opened), 3), 0.5)))
+    # from the rim of the hole it fills half of the sky: a per cent of the volume lies that near
+    assert within > 0.98 and without < 0.01
+
+
+def test_a_sieve_holds_the_fluid():
+    p = sphere(20_000, np.random.default_rng(0))
+    key = np.floor(p / 0.16).astype(int) @ np.array([1, 1000, 1_000_000])
+    kinds, which = np.unique(key, return_inverse=True)
+    torn = p[np.random.default_rng(3).random(len(kinds))[which] > 0.3]  # 30 % of the patches of two voxels
+    within, without = hits(Gaussians.isotropic(torn.astype(np.float32), 0.02, np.full((len(torn), 3), 0.5)))
+    assert within > 0.97 and without < 0.01
+
+
+def test_half_a_body_is_not_filled_beyond_its_rim():
+    p = sphere(20_000, np.random.default_rng(0))
+    bowl = p[p[:, 2] < 0]
+    added = fill(
+        Gaussians.isotropic(bowl.astype(np.float32), 0.02, np.full((len(bowl), 3), 0.5)), spacing=SPACING,
+        rng=np.random.default_rng(0),
+    )  # fmt: skip
+    assert (added.means[:, 2] < 2 * SPACING).all(), "an open bowl holds what lies below its rim"
+
+
+@pytest.mark.parametrize("share", [0.01, 0.1])
+def test_a_few_huge_radii_do_not_swell_the_body(share):
+    g = shell(sphere)
+    huge = g.select(slice(0, int(share * len(g))))
+    huge = Gaussians(huge.means, huge.quats, np.full_like(huge.scales, 1e3), huge.opacities, huge.sh)
+    within, without = hits(concatenate([g, huge]))
+    assert within > 0.98 and without < 0.02
+
+
+def test_needles_do_not_swell_the_body():
+    g, rng = shell(sphere), np.random.default_rng(0)
+    n = len(g) // 10
+    needles = Gaussians(
+        g.means[:n], rng.normal(size=(n, 4)), np.tile([5.0, 1e-3, 1e-3], (n, 1)), np.full(n, 0.9), g.sh[:n]
+    )
+    within, without = hits(concatenate([g, needles]))
+    assert within > 0.98 and without < 0.02
+
+
+def test_the_hull_does_not_grow_with_the_number_of_gaussians():
+    coarse, fine = shell(sphere, count=6000), shell(sphere, count=60_000)
+    fine = Gaussians(fine.means, fine.quats, fine.scales / np.sqrt(10), fine.opacities, fine.sh)
+    volumes = [(hull(g, spacing=SPACING).voxels == 1).sum() for g in (coarse, fine)]
+    # the same surface with ten times as many Gaussians of a tenth of the area: one layer of voxels, 6 % of steps in it
+    assert abs(volumes[1] / volumes[0] - 1) < 0.25
+
+
+def test_ten_times_the_gaussians_take_less_than_ten_times_the_memory():
+    peaks = []
+    for count in (100_000, 1_000_000):
+        p = np.random.default_rng(0).uniform(-1, 1, (count, 3)).astype(np.float32)
+        g = Gaussians.isotropic(p, 1e9, np.full((count, 3), 0.5))
+        tracemalloc.start()
+        hull(g, spacing=0.05)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    # scales, centres, cells and masks grow with the number, 250 bytes each; the matrices are made in parts
+    assert peaks[1] < 350e6 and peaks[1] < 10 * peaks[0]
+
+
+def test_points_that_are_as_far_from_all_of_the_shell_find_a_colour_in_bounded_work():
+    # a search tree has to look at every Gaussian of a shell for a point at its centre; here colours come from voxels
+    p = sphere(200_000, np.random.default_rng(0)).astype(np.float32)
+    g = Gaussians.isotropic(p, 0.01, np.where(p[:, :1] > 0, [1.0, 0, 0], [0, 0, 1.0]), 0.7)
+    added = fill(g, spacing=0.04, rng=np.random.default_rng(0), rays=3)
+    side = np.abs(added.means[:, 0]) > 0.08
+    assert np.mean((added.rgb[side, 0] > 0.5) == (added.means[side, 0] > 0)) > 0.99

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from fluidlift.shape.unite import unite, window_length
 from fluidlift.types.gaussians import Gaussians
@@ -64,6 +65,16 @@ def test_a_first_body_that_is_kept_whole_loses_nothing_and_the_others_only_close
     red = united.rgb[:, 0] > 0.5
     np.testing.assert_array_equal(united.means[red], near.means)
     assert 0 < (~red).sum() < 700  # a ball of radius 1 has 520 voxels of 0.2 m, and those that it cuts
+
+
+def test_splats_of_other_frames_do_not_lie_over_a_first_body_that_is_kept_whole():
+    near = ball(0, red=1.0)
+    shifted = ball(0, center=(0.04, 0.03, 0.0), red=0.0)  # the same surface, found a little beside it
+    united = unite([near, shifted], spacing=0.1, whole_first=True)
+    other = united.select(united.rgb[:, 0] < 0.5)
+    gap = cKDTree(near.means).query(other.means)[0] if len(other) else np.full(1, np.inf)
+    assert gap.min() > 0.1, "a whole voxel away"
+    assert len(united) < 1.01 * len(near)
 
 
 def test_broken_positions_are_left_out():

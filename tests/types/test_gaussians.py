@@ -9,6 +9,7 @@ from fluidlift.types import (
     Similarity3,
     concatenate,
     decompose_covariances,
+    harmonics,
     matrix_from_quat,
     sh_from_rgb,
 )
@@ -42,6 +43,26 @@ def test_a_moved_body_has_moved_covariances():
     np.testing.assert_allclose(moved.covariances(), TURN.covariances(g.covariances()), atol=2e-5)
     np.testing.assert_array_equal(moved.opacities, g.opacities)
     np.testing.assert_array_equal(moved.sh, g.sh)
+
+
+@pytest.mark.parametrize("coefficients", [4, 9, 16])
+def test_a_turned_body_shows_the_same_colour_to_a_viewer_who_turned_with_it(coefficients):
+    g, degree = some(k=coefficients), round(coefficients**0.5) - 1
+    moved = g.transformed(TURN)
+    directions = np.random.default_rng(1).normal(size=(len(g), 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    here = np.einsum("nk,nkc->nc", harmonics.basis(directions, degree), g.sh)
+    there = np.einsum("nk,nkc->nc", harmonics.basis(directions @ TURN.rotation.T, degree), moved.sh)
+    np.testing.assert_allclose(there, here, atol=2e-5)  # float32 sums of up to 16 terms of size up to 3
+    assert np.abs(moved.sh[:, 1:] - g.sh[:, 1:]).max() > 0.1  # which the unturned coefficients would not have done
+    np.testing.assert_array_equal(moved.sh[:, 0], g.sh[:, 0])
+
+
+def test_a_turn_mixes_harmonics_of_one_degree_only_and_keeps_their_lengths():
+    turn = harmonics.harmonics_rotation(TURN.rotation, 3)
+    np.testing.assert_allclose(turn @ turn.T, np.eye(16), atol=1e-12)  # an orthonormal basis stays one
+    degree = np.repeat([0, 1, 2, 3], [1, 3, 5, 7])
+    assert np.abs(turn[degree[:, None] != degree]).max() < 1e-12
 
 
 def test_a_body_moved_there_and_back_is_the_same():

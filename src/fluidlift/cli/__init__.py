@@ -20,7 +20,9 @@ from fluidlift.cli.options import (
     Demo,
     Doctor,
     Evaluate,
+    Export,
     Fit,
+    Generators,
     Inspect,
     Make,
     Mask,
@@ -81,6 +83,10 @@ def _make(c: Make) -> int:
         "seed": c.seed, "shape.kind": c.kind, "shape.size": c.size, "shape.fov": c.fov, "shape.pitch": c.pitch,
         "shape.roll": c.roll, "read.start": c.start, "read.duration": c.duration, "read.fps": c.fps,
         "read.max_size": c.max_size, "read.max_pixels": c.max_pixels, "read.max_frames": c.max_frames,
+        "depth.model": c.depth_model, "depth.weights": text_of(c.depth_weights),
+        "generate.name": c.generator, "generate.use": c.use,
+        "generate.python": text_of(c.generator_python), "generate.code": text_of(c.generator_code),
+        "generate.accept_licence": c.accept_licence or None,
     }  # fmt: skip
     config = build_config(c.preset, c.config, c.set, flat)
     if c.print_config:
@@ -88,10 +94,19 @@ def _make(c: Make) -> int:
 
         print(yaml.safe_dump(config.to_dict(), sort_keys=False), end="")
         return DONE
+    if config.generate.name is not None:
+        from fluidlift.cli.generators import accepted_by_asking
+
+        config = accepted_by_asking(config)
     return _run_job(
         c.clip, c.out or default_folder(c.clip), config, mask=c.mask, camera=c.camera, depth=c.depth,
         geometry=c.geometry_from, flow=c.flow, force=c.force, as_json=c.json,
     )  # fmt: skip
+
+
+def text_of(path: Path | None) -> str | None:
+    """For a setting."""
+    return None if path is None else str(path)
 
 
 def default_folder(clip: Path) -> Path:
@@ -159,6 +174,15 @@ def _render(c: Render) -> int:
         return _told(render_asset(c.asset, c.out, request, progress=progress), c.json)
 
 
+def _export(c: Export) -> int:
+    from fluidlift.pipeline import ExportRequest, export_asset
+
+    frames = _pair(c.frames, "-", "--frames", "1001-1024")
+    request = ExportRequest(c.to, c.up_axis, c.meters_per_unit, frames)
+    with _progress() as progress:
+        return _told(export_asset(c.asset, c.out, request, progress=progress), c.json)
+
+
 def _pair(text: str | None, mark: str, option: str, example: str) -> tuple[int, int] | None:
     """Two whole numbers with a mark between them."""
     if text is None:
@@ -223,7 +247,7 @@ def _motion(c: Motion) -> int:
         "shape.kind": c.kind, "shape.size": c.size, "shape.fov": c.fov, "shape.pitch": c.pitch, "shape.roll": c.roll,
         "read.start": c.start, "read.duration": c.duration, "read.fps": c.fps, "read.max_size": c.max_size,
     }  # fmt: skip
-    _require_sections(c.set, ("read", "segment", "shape", "motion"))
+    _require_sections(c.set, ("read", "segment", "shape", "depth", "motion"))
     config = build_config(None, c.config, c.set, flat, base=LONGEST)
     inputs = Inputs(c.clip, mask=c.mask, camera=c.camera, depth=c.depth, flow=c.flow)
     with _progress() as progress:
@@ -275,6 +299,12 @@ def _demo(c: Demo) -> int:
         return _run_job(clip, c.out, build_config("draft"), camera=camera)
 
 
+def _generators(c: Generators) -> int:
+    from fluidlift.cli.generators import show
+
+    return show(c)
+
+
 def _doctor(c: Doctor) -> int:
     from fluidlift.doctor import examine
 
@@ -288,6 +318,7 @@ def _doctor(c: Doctor) -> int:
 
 
 _COMMANDS = {
-    Make: _make, Fit: _fit, Sim: _sim, Render: _render, Inspect: _inspect, Mask: _mask, Motion: _motion,
-    Evaluate: _evaluate, Validate: _validate, Demo: _demo, Doctor: _doctor,
+    Make: _make, Fit: _fit, Sim: _sim, Render: _render, Export: _export, Inspect: _inspect, Mask: _mask,
+    Motion: _motion,
+    Evaluate: _evaluate, Validate: _validate, Demo: _demo, Generators: _generators, Doctor: _doctor,
 }  # fmt: skip

@@ -29,11 +29,25 @@ class Make:
     camera: Path | None = None
     """camera JSON: width, height, K, and R, t where the pose is known"""
     depth: Path | None = None
-    """depth map of the first used frame (EXR, 16-bit PNG, npz): replaces the estimated front depth"""
+    """depth map of the first used frame, or of all (EXR, 16-bit PNG, npz): replaces the estimated front depth"""
+    depth_model: Literal["none", "moge", "depth-anything", "depth-anything-3", "depth-pro"] | None = None
+    """learned depth, moge advised; it needs --depth-weights (docs/depth.md)"""
+    depth_weights: Path | None = None
+    """file or folder of the weights of --depth-model"""
     flow: Path | None = None
     """optical flow of the clip, made elsewhere: a folder or pattern of .flo, .exr, .npz or KITTI .png, or one .npz"""
     geometry_from: Path | None = None
     """folder of Gaussian PLY files and camera.json: replaces the embedded generator"""
+    generator: str | None = None
+    """third-party generator that makes the body of each frame, such as triposplat; `fluidlift generators` lists them"""
+    generator_python: Path | None = None
+    """Python of the environment in which the generator is installed; by default this one"""
+    generator_code: Path | None = None
+    """folder of the generator's own code, where that is a checkout and not installed"""
+    accept_licence: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default_factory=tuple)
+    """name of a generator whose licence you have read and accept; remembered; may be repeated"""
+    use: Literal["research", "commercial"] | None = None
+    """what the asset is for; a generator whose terms forbid that is refused"""
     size: float | None = None
     """metres across the fluid (its longest side); sets the scale"""
     fov: float | None = None
@@ -136,6 +150,26 @@ class Render:
     """plate: the clip without its fluid (view input only); terrain: bed and sky; none: transparent"""
     format: Literal["png", "exr"] = "png"
     """of pictures: png (8 bits, alpha), exr (linear, alpha, camera depth in metres)"""
+    json: bool = False
+    """print the outcome as JSON"""
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write files of a finished asset for other tools: surface meshes, splats, USD."""
+
+    asset: Asset
+    """asset folder"""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """folder for the files (numbers from 1001)"""
+    to: str = "mesh"
+    """mesh (surface, PLY with colours and velocities), obj, splats (PLY), usd (one file with all of it)"""
+    up_axis: Literal["z", "y"] = "z"
+    """of the files; USD states its own"""
+    meters_per_unit: float = 1.0
+    """such as 0.01 for centimetres; USD states its own"""
+    frames: str | None = None
+    """first and last, such as 1001-1024; by default all"""
     json: bool = False
     """print the outcome as JSON"""
 
@@ -263,6 +297,20 @@ class Demo:
 
 
 @dataclass(frozen=True)
+class Generators:
+    """List third-party generators and what is there of them, or explain one: licence, hardware, installation."""
+
+    name: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")] = None
+    """generator to explain; by default all are listed"""
+    python: Path | None = None
+    """Python of the environment to look at; by default this one"""
+    code: Path | None = None
+    """folder of the generator's own code, where that is a checkout"""
+    json: bool = False
+    """print as JSON"""
+
+
+@dataclass(frozen=True)
 class Doctor:
     """Tell what is installed and what this machine can do."""
 
@@ -270,4 +318,6 @@ class Doctor:
     """print as JSON"""
 
 
-Command = Make | Fit | Sim | Render | Inspect | Mask | Motion | Evaluate | Validate | Demo | Doctor
+Command = (
+    Make | Fit | Sim | Render | Export | Inspect | Mask | Motion | Evaluate | Validate | Demo | Generators | Doctor
+)

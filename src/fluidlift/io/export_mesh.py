@@ -34,14 +34,15 @@ def write_glb(path: Path | str, mesh: TriangleMesh, *, name: str = "terrain") ->
     return write_bytes(path, scene.export(file_type="glb"))
 
 
-def write_obj(path: Path | str, mesh: TriangleMesh) -> Path:
-    """Write a Wavefront OBJ in world axes (z up, metres); vertex colours follow the coordinates."""
+def write_obj(path: Path | str, mesh: TriangleMesh, *, comment: str = "metres, z up") -> Path:
+    """Write a Wavefront OBJ as it stands; vertex colours follow the coordinates. The comment says in which axes and
+    units it stands."""
     columns = [np.asarray(mesh.vertices, np.float64)]
     if mesh.colors is not None:
         columns.append(np.clip(np.asarray(mesh.colors, np.float64), 0, 1))
     table = np.concatenate(columns, axis=1)
     with atomic_write(path) as file:
-        file.write(b"# metres, z up\n")
+        file.write(f"# {comment}\n".encode())
         np.savetxt(file, table, fmt="v" + " %.7g" * table.shape[1])
         np.savetxt(file, np.asarray(mesh.faces, np.int64) + 1, fmt="f %d %d %d")
     return Path(path)

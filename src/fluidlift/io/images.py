@@ -106,8 +106,9 @@ def _require_shape(got: tuple[int, int], size: tuple[int, int], what: str) -> No
 
 
 def read_depth(
-    path: Path | str, size: tuple[int, int], *, scale: float | None = None, limits: ReadLimits | None = None
-) -> Float[np.ndarray, "*t h w"]:
+    path: Path | str, size: tuple[int, int], *, scale: float | None = None, positive: bool = True,
+    limits: ReadLimits | None = None,
+) -> Float[np.ndarray, "*t h w"]:  # fmt: skip
     """Camera depth z (not ray length), float32 [H,W] or, from arrays, [T,H,W]; nan where the file says nothing.
 
     Depth is taken from the nearest pixel: averages across an edge lie where nothing is.
@@ -116,6 +117,7 @@ def read_depth(
         path: OpenEXR, a 16-bit PNG or TIFF, a float TIFF, .npy, or .npz (its array `depth`, or its only array).
         size: width, height of the clip in px.
         scale: m per stored unit. None: 0.001 (millimetres) for 16-bit pictures, 1 for floats.
+        positive: what is not positive says nothing; False: any number is meant (disparity with an offset).
 
     Raises:
         InputRejected: an unreadable file, another aspect ratio, 8-bit samples, or no valid depth.
@@ -140,9 +142,9 @@ def read_depth(
     _require_shape(depth.shape[:-3:-1], size, f"the depth '{path.name}'")
     layers = depth.reshape(-1, *depth.shape[-2:]).astype(np.float32) * np.float32(scale)
     fitted = np.stack([cv2.resize(layer, size, interpolation=cv2.INTER_NEAREST_EXACT) for layer in layers])
-    fitted[~(np.isfinite(fitted) & (fitted > 0))] = np.nan
+    fitted[~(np.isfinite(fitted) & ((fitted > 0) | (not positive)))] = np.nan
     if not np.isfinite(fitted).any():
-        raise InputRejected(f"no valid depth in '{path.name}'", "positive metres", "check --depth-scale")
+        raise InputRejected(f"no valid depth in '{path.name}'", "positive metres", "look at it: is it black?")
     return fitted[0] if depth.ndim == 2 else fitted
 
 

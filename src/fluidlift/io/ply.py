@@ -8,8 +8,6 @@ header says which. Further properties carry the stable id and the velocity of ea
 
 from __future__ import annotations
 
-import math
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,9 +16,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from fluidlift.errors import InputRejected, require
-from fluidlift.io.atomic import atomic_write
 from fluidlift.io.limits import require_file
-from fluidlift.numerics import harmonics
+from fluidlift.io.ply_records import Element, named_records, open_ply, read_elements, write_elements
 from fluidlift.types import Gaussians, Similarity3, TriangleMesh
 
 AXES = {
@@ -30,25 +27,17 @@ AXES = {
 }
 """rotations file_from_world: the world's own axes; glTF's (y up, z back); those of splat viewers (y down, z forward)"""
 
+MAX_SPLATS = 30_000_000
+"""of one file. Read, they take 56 bytes each, and 12 more for every harmonic above degree 0"""
+PART = 2**18
+"""splats that are read at a time"""
+
 _OPACITY_EDGE = 1e-6
 """opacities are kept this far from 0 and 1, where the logit is infinite"""
-
-_TYPES = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
-    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
-    "double": "f8", "float64": "f8",
-}  # fmt: skip
-_NAMES = {
-    "i1": "char",
-    "u1": "uchar",
-    "i2": "short",
-    "u2": "ushort",
-    "i4": "int",
-    "u4": "uint",
-    "f4": "float",
-    "f8": "double",
-}
-_MAX_HEADER = 2**16
+_LARGEST_LOG = 60.0
+"""of a scale: e^60 is finite in single precision, and no splat"""
+_FEWEST_TO_JUDGE = 16
+"""splats, from which on their numbers tell whether they are activated"""
 
 
 @dataclass(frozen=True)
@@ -83,7 +72,7 @@ def write_gaussians(
     """
     n = len(gaussians)
     require(axes in AXES, f"axes '{axes}'", "one of " + ", ".join(AXES))
-    turned = _turned(gaussians, AXES[axes])
+    turned = gaussians if axes == "z_up" else gaussians.transformed(Similarity3(rotation=AXES[axes]))
     columns: dict[str, np.ndarray] = dict(zip(("x", "y", "z"), turned.means.T))
     columns |= {name: np.zeros(n, np.float32) for name in ("nx", "ny", "nz")}
     columns |= {f"f_dc_{c}": turned.sh[:, 0, c] for c in range(3)}
@@ -102,59 +91,57 @@ def write_gaussians(
         columns |= dict(zip(("vx", "vy", "vz"), v.T))
     columns |= extras or {}
     note = f"fluidlift splats, metres, axes {axes}"
-    _write(path, [("vertex", _records(columns, n))], [note, *comments])
+    write_elements(path, [("vertex", named_records(columns, n))], [note, *comments])
     return Path(path)
 
 
-def read_splats(path: Path | str) -> SplatFile:
-    """Read a splat PLY; axes other than z-up are turned back where our own header comment names them.
+def read_splats(
+    path: Path | str,
+    *,
+    axes: str | None = None,
+    coefficient_major: bool = False,
+    activated: bool = False,
+    drop_broken: bool = False,
+) -> SplatFile:
+    """Read a splat PLY into z-up axes, part by part: the memory needed is that of the result.
+
+    Args:
+        path: of the file.
+        axes: of the file, one of `AXES`; None: those that our own header comment names, else z-up as they stand.
+        coefficient_major: harmonics lie coefficient by coefficient (red, green, blue of each), as TriplaneGaussian
+            writes them, in place of channel by channel.
+        activated: scales and opacities are what they say, in place of their logarithms and logits.
+        drop_broken: leave out splats that are not finite or have no rotation, in place of refusing the file.
 
     Raises:
         InputRejected: no such file, not a binary PLY, a header that promises more than the file holds, missing
-            properties, or numbers that are not finite.
+            properties, more than `MAX_SPLATS`, numbers that are not finite, or scales or opacities that are already
+            activated.
     """
     path = require_file(path, "PLY file")
-    elements, comments = _read(path)
+    require(axes is None or axes in AXES, f"axes '{axes}'", "one of " + ", ".join(AXES))
+    elements, comments = open_ply(path)
     if "vertex" not in elements:
         raise InputRejected(f"'{path.name}' has no vertices", "a Gaussian splat PLY")
     vertex = elements["vertex"]
-    names = vertex.dtype.names or ()
-    needed = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
-    needed += [f"scale_{a}" for a in range(3)] + [f"rot_{a}" for a in range(4)]
-    missing = [name for name in needed if name not in names]
-    rest = [name for name in names if name.startswith("f_rest_")]
-    if missing or len(rest) not in (0, 9, 24, 45) or any(f"f_rest_{i}" not in names for i in range(len(rest))):
-        raise InputRejected(
-            f"'{path.name}' is not a splat file (missing {', '.join(missing) or 'harmonics'})",
-            "a PLY with f_dc, opacity, scale and rot, and 0, 9, 24 or 45 of f_rest",
-            "convert it to the uncompressed PLY of 3D Gaussian splatting",
-        )
-
-    def stacked(columns: Sequence[str]) -> np.ndarray:
-        return np.stack([vertex[name].astype(np.float32) for name in columns], axis=-1)
-
-    n = len(vertex)
-    sh = stacked(["f_dc_0", "f_dc_1", "f_dc_2"])[:, None]
-    if rest:
-        higher = stacked([f"f_rest_{i}" for i in range(len(rest))]).reshape(n, 3, len(rest) // 3).transpose(0, 2, 1)
-        sh = np.concatenate([sh, higher], axis=1)
-    quats = stacked([f"rot_{a}" for a in range(4)])
-    norm = np.linalg.norm(quats, axis=1, keepdims=True)
-    logit, log_scales = vertex["opacity"].astype(np.float64), stacked([f"scale_{a}" for a in range(3)])
-    means = stacked(["x", "y", "z"])
-    finite = all(np.isfinite(a).all() for a in (means, sh, quats, logit, log_scales))
-    if not finite or (n and (norm.min() < 1e-6 or log_scales.max() > 60)):
-        raise InputRejected(f"'{path.name}' holds numbers that are not finite or no rotations", "finite splats")
-    opacities = 1.0 / (1.0 + np.exp(-np.clip(logit, -60, 60)))
-    gaussians = Gaussians(means, quats / np.maximum(norm, 1e-12), np.exp(log_scales), opacities, sh)
-    known = {*needed, *rest, "nx", "ny", "nz"}
-    extras = {name: np.ascontiguousarray(vertex[name]) for name in names if name not in known}
-    axes = next((c.rsplit(" ", 1)[1] for c in comments if c.startswith("fluidlift splats") and " axes " in c), "z_up")
-    world_from_file = AXES.get(axes, AXES["z_up"]).T
+    rest = _require_splats(path, vertex)
+    columns = _SplatColumns.of(vertex, rest, coefficient_major)
+    for where, records in vertex.parts(PART):
+        columns.take(where, records)
+    if not activated:
+        _require_raw(path, columns)
+    keep = _sound(path, columns, activated=activated, drop=drop_broken)
+    named = next((c.rsplit(" ", 1)[1] for c in comments if c.startswith("fluidlift splats") and " axes " in c), "z_up")
+    world_from_file = AXES.get(axes or named, AXES["z_up"]).T
+    extras = {name: column if keep is None else column[keep] for name, column in columns.extras.items()}
     if {"vx", "vy", "vz"} <= extras.keys():
         turned = np.stack([extras[v] for v in ("vx", "vy", "vz")], axis=-1) @ world_from_file.T.astype(np.float32)
         extras |= {v: np.ascontiguousarray(turned[:, i]) for i, v in enumerate(("vx", "vy", "vz"))}
-    return SplatFile(_turned(gaussians, world_from_file), extras, tuple(comments))
+    gaussians = columns.gaussians(activated)
+    gaussians = gaussians if keep is None else gaussians.select(keep)
+    if not np.array_equal(world_from_file, np.eye(3)):
+        gaussians = gaussians.transformed(Similarity3(rotation=world_from_file))
+    return SplatFile(gaussians, extras, tuple(comments))
 
 
 def read_gaussians(path: Path | str) -> Gaussians:
@@ -171,18 +158,25 @@ def write_points(
 ) -> Path:
     """Write a point cloud in world axes; colours are sRGB in [0, 1]."""
     columns = _vertex_columns(points, colors) | dict(extras or {})
-    _write(path, [("vertex", _records(columns, len(points)))], ["metres, z up"])
+    write_elements(path, [("vertex", named_records(columns, len(points)))], ["metres, z up"])
     return Path(path)
 
 
-def write_mesh(path: Path | str, mesh: TriangleMesh, *, velocities: Float[np.ndarray, "v 3"] | None = None) -> Path:
-    """Write a triangle mesh in world axes; velocities (m/s) become vx, vy, vz of the vertices for motion blur."""
+def write_mesh(
+    path: Path | str,
+    mesh: TriangleMesh,
+    *,
+    velocities: Float[np.ndarray, "v 3"] | None = None,
+    comment: str = "metres, z up",
+) -> Path:
+    """Write a triangle mesh as it stands; velocities (m/s) become vx, vy, vz of the vertices for motion blur. The
+    comment says in which axes and units it stands."""
     columns = _vertex_columns(mesh.vertices, mesh.colors)
     if velocities is not None:
         columns |= dict(zip(("vx", "vy", "vz"), np.asarray(velocities, np.float32).reshape(-1, 3).T))
     faces = np.empty(len(mesh.faces), np.dtype([("count", "u1"), ("vertex_indices", "<i4", (3,))]))
     faces["count"], faces["vertex_indices"] = 3, mesh.faces
-    _write(path, [("vertex", _records(columns, len(mesh.vertices))), ("face", faces)], ["metres, z up"])
+    write_elements(path, [("vertex", named_records(columns, len(mesh.vertices))), ("face", faces)], [comment])
     return Path(path)
 
 
@@ -193,134 +187,174 @@ def read_mesh(path: Path | str) -> TriangleMesh:
         InputRejected: no such file, another kind of PLY, or indices that name no vertex.
     """
     path = require_file(path, "PLY file")
-    elements, _ = _read(path)
-    if "vertex" not in elements or "face" not in elements or "vertex_indices" not in elements["face"].dtype.names:
+    elements, _ = read_elements(path)
+    if (
+        "vertex" not in elements
+        or "face" not in elements
+        or "vertex_indices" not in (elements["face"].dtype.names or ())
+    ):
         raise InputRejected(f"'{path.name}' holds no mesh", "a binary PLY with vertices and triangles")
     vertex, faces = elements["vertex"], elements["face"]["vertex_indices"].astype(np.int64)
     if len(faces) and (faces.min() < 0 or faces.max() >= len(vertex)):
         raise InputRejected(f"'{path.name}' has faces that name missing vertices", "a whole mesh")
     points = np.stack([vertex[a].astype(np.float32) for a in "xyz"], axis=-1)
     colors = None
-    if {"red", "green", "blue"} <= set(vertex.dtype.names):
+    if {"red", "green", "blue"} <= set(vertex.dtype.names or ()):
         colors = np.stack([vertex[c] for c in ("red", "green", "blue")], axis=-1).astype(np.float32) / 255.0
     return TriangleMesh(points, faces, colors)
 
 
-def _turned(gaussians: Gaussians, rotation: np.ndarray) -> Gaussians:
-    if np.array_equal(rotation, np.eye(3)):
-        return gaussians
-    turned = gaussians.transformed(Similarity3(rotation=rotation))
-    if gaussians.sh.shape[1] == 1:
-        return turned
-    sh = np.einsum("ij,njc->nic", harmonics_rotation(rotation, math.isqrt(gaussians.sh.shape[1]) - 1), gaussians.sh)
-    return Gaussians(turned.means, turned.quats, turned.scales, turned.opacities, sh)
+@dataclass(frozen=True)
+class _SplatColumns:
+    """The numbers of a splat file as they stand in it, column by column."""
+
+    means: np.ndarray
+    quats: np.ndarray
+    scales: np.ndarray
+    opacities: np.ndarray
+    sh: np.ndarray
+    rest: tuple[str, ...]
+    coefficient_major: bool
+    extras: dict[str, np.ndarray]
+
+    @classmethod
+    def of(cls, vertex: Element, rest: tuple[str, ...], coefficient_major: bool) -> _SplatColumns:
+        n, names = vertex.count, vertex.dtype.names or ()
+        known = {*_NEEDED, *rest, "nx", "ny", "nz"}
+        extras = {
+            x: np.empty((n, *vertex.dtype[x].shape), vertex.dtype[x].base.newbyteorder("="))
+            for x in names
+            if x not in known
+        }
+        means, quats, scales = (np.empty((n, k), np.float32) for k in (3, 4, 3))
+        sh = np.empty((n, 1 + len(rest) // 3, 3), np.float32)
+        return cls(means, quats, scales, np.empty(n, np.float32), sh, rest, coefficient_major, extras)
+
+    def take(self, where: slice, records: np.ndarray) -> None:
+        """Fill in one part."""
+        for target, names in (
+            (self.means, ("x", "y", "z")),
+            (self.quats, _numbered("rot", 4)),
+            (self.scales, _numbered("scale", 3)),
+            (self.sh[:, 0], _numbered("f_dc", 3)),
+        ):
+            for i, name in enumerate(names):
+                target[where, i] = records[name]
+        self.opacities[where] = records["opacity"]
+        higher = len(self.rest) // 3
+        for i in range(len(self.rest)):
+            coefficient, channel = divmod(i, 3) if self.coefficient_major else divmod(i, higher)[::-1]
+            self.sh[where, 1 + coefficient, channel] = records[f"f_rest_{i}"]
+        for name, column in self.extras.items():
+            column[where] = records[name]
+
+    def gaussians(self, activated: bool) -> Gaussians:
+        """Activated, with unit quaternions, in the file's axes; the columns are used up."""
+        norm = np.linalg.norm(self.quats, axis=1, keepdims=True)
+        np.divide(self.quats, np.maximum(norm, 1e-12), out=self.quats)
+        if not activated:
+            np.exp(np.clip(self.scales, -_LARGEST_LOG, _LARGEST_LOG, out=self.scales), out=self.scales)
+            self.opacities[:] = 1.0 / (1.0 + np.exp(-np.clip(self.opacities.astype(np.float64), -60, 60)))
+        return Gaussians(self.means, self.quats, self.scales, self.opacities, self.sh)
 
 
-def harmonics_rotation(rotation: Float[np.ndarray, "3 3"], degree: int) -> Float[np.ndarray, "k k"]:
-    """The matrix that turns spherical harmonic coefficients with the body: new(R d) = old(d) for every direction d.
+def _numbered(stem: str, count: int) -> tuple[str, ...]:
+    return tuple(f"{stem}_{i}" for i in range(count))
 
-    Found by least squares over many directions; exact, because each degree is closed under rotation.
+
+_NEEDED = ("x", "y", "z", *_numbered("f_dc", 3), "opacity", *_numbered("scale", 3), *_numbered("rot", 4))
+
+
+def _require_splats(path: Path, vertex: Element) -> tuple[str, ...]:
+    """The names of the higher harmonics of what is a splat file of bearable size."""
+    names = vertex.dtype.names or ()
+    missing = [name for name in _NEEDED if name not in names]
+    rest = tuple(name for name in names if name.startswith("f_rest_"))
+    if missing or len(rest) not in (0, 9, 24, 45) or any(f"f_rest_{i}" not in names for i in range(len(rest))):
+        what = f"missing {', '.join(missing)}" if missing else f"{len(rest)} of f_rest"
+        raise InputRejected(
+            f"'{path.name}' is not a splat file ({what})",
+            "a PLY with f_dc, opacity, scale and rot, and 0, 9, 24 or 45 of f_rest",
+            "convert it to the uncompressed PLY of 3D Gaussian splatting",
+        )
+    lists = [name for name in (*_NEEDED, *rest) if vertex.dtype[name].shape]
+    if lists:
+        raise InputRejected(f"'{path.name}' has lists as {', '.join(lists[:3])}", "one number per property")
+    if vertex.count > MAX_SPLATS:
+        raise InputRejected(
+            f"'{path.name}' holds {vertex.count} splats", f"at most {MAX_SPLATS}", "thin it in a splat editor"
+        )
+    return rest
+
+
+def _sound(path: Path, columns: _SplatColumns, *, activated: bool, drop: bool) -> np.ndarray | None:
+    """None if every splat is sound; else which are, or a refusal that says what is wrong with how many."""
+    faults: dict[str, np.ndarray] = {}
+    for what, array in (
+        ("positions", columns.means), ("rotations", columns.quats), ("scales", columns.scales),
+        ("opacities", columns.opacities), ("colours", columns.sh),
+    ):  # fmt: skip
+        whole = ~np.isnan(array) if what == "opacities" and not activated else np.isfinite(array)  # logit 1 is infinite
+        broken = np.asarray(~whole.all(axis=tuple(range(1, array.ndim))))
+        if what == "rotations":
+            broken |= np.abs(columns.quats).max(1, initial=0.0) < 1e-6
+        if what == "scales":
+            broken |= np.any(columns.scales <= 0 if activated else columns.scales > _LARGEST_LOG, axis=1)
+        if broken.any():
+            faults[what] = broken
+    if not faults:
+        return None
+    keep = ~np.any(list(faults.values()), axis=0)
+    if not drop:
+        parts = ", ".join(f"{int(b.sum())} with broken {what}" for what, b in faults.items())
+        raise InputRejected(
+            f"'{path.name}' holds {int((~keep).sum())} of {len(keep)} splats that are not finite or have no rotation "
+            f"({parts})",
+            "finite splats",
+            "remove them in a splat editor, or make the body again",
+        )
+    return keep
+
+
+def _require_raw(path: Path, columns: _SplatColumns) -> None:
+    """Refuse a file whose scales or opacities were written without the logarithm and the logit.
+
+    Such a file is found by what it would mean: scales that are all positive would be logarithms of standard
+    deviations above 1. They are refused if half of the splats were then wider than a quarter of the body, or lay
+    100-fold over each other (a filled body has about one layer, many united frames some tens), although as plain
+    numbers they would not. Opacities that all lie in [0, 1] would mean 0.5 to 0.73 everywhere; they are refused if they
+    spread over more than half of that range, or the scales give the file away.
     """
-    i = np.arange(64) + 0.5
-    polar, azimuth = np.arccos(1 - 2 * i / 64), np.pi * (1 + 5**0.5) * i
-    old = np.stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], axis=-1)
-    new = old @ np.asarray(rotation).T
-    return np.linalg.lstsq(harmonics.basis(new, degree), harmonics.basis(old, degree), rcond=None)[0]
+    if len(columns.means) < _FEWEST_TO_JUDGE:
+        return
+    body = columns.means[np.isfinite(columns.means).all(1)]
+    scales, logit = columns.scales[np.isfinite(columns.scales)], columns.opacities[np.isfinite(columns.opacities)]
+    if not len(body) or not len(scales) or not len(logit):
+        return
+    low, high = np.percentile(body, [5, 95], axis=0)
+
+    def absurd(width: float) -> bool:
+        room = float(np.prod(np.maximum(high - low, width)))
+        return width > 0.25 * float(np.linalg.norm(high - low)) or len(body) * 4.19 * width**3 > 100 * room
+
+    middle = float(np.median(scales))
+    plain_scales = bool(scales.min() >= 0) and absurd(float(np.exp(min(middle, _LARGEST_LOG)))) and not absurd(middle)
+    within = bool(logit.min() >= 0 and logit.max() <= 1)
+    plain_opacities = within and (plain_scales or float(logit.max() - logit.min()) > 0.5)
+    if plain_scales or plain_opacities:
+        which = " and ".join(["scales"] * plain_scales + ["opacities"] * plain_opacities)
+        raise InputRejected(
+            f"the {which} of '{path.name}' are already activated (from {float(scales.min()):.3g} to "
+            f"{float(scales.max()):.3g}, and {float(logit.min()):.3g} to {float(logit.max()):.3g})",
+            "logarithms of the scales and logits of the opacities, as 3D Gaussian splatting writes them",
+            "save it again with them (LGM: compatible=True)",
+        )
 
 
 def _vertex_columns(points: np.ndarray, colors: np.ndarray | None) -> dict[str, np.ndarray]:
-    columns = dict(zip(("x", "y", "z"), np.asarray(points, np.float32).T))
+    columns: dict[str, np.ndarray] = {}
+    columns |= dict(zip(("x", "y", "z"), np.asarray(points, np.float32).T))
     if colors is not None:
         eight = np.round(255 * np.clip(np.asarray(colors), 0, 1)).astype(np.uint8)
         columns |= dict(zip(("red", "green", "blue"), eight.T))
     return columns
-
-
-def _records(columns: Mapping[str, np.ndarray], n: int) -> np.ndarray:
-    """One structured array of named columns; kinds that PLY does not know become int or float."""
-    kinds = {}
-    for name, column in columns.items():
-        column = np.asarray(column)
-        require(column.shape == (n,), f"property '{name}' of shape {column.shape}", f"({n},)")
-        kind = column.dtype.str[1:]
-        kinds[name] = "<" + (kind if kind in _NAMES else ("f4" if column.dtype.kind == "f" else "i4"))
-    records = np.empty(n, np.dtype(list(kinds.items())))
-    for name, column in columns.items():
-        records[name] = column
-    return records
-
-
-def _write(path: Path | str, elements: Sequence[tuple[str, np.ndarray]], comments: Sequence[str]) -> None:
-    lines = ["ply", "format binary_little_endian 1.0"]
-    lines += ["comment " + " ".join(comment.split()) for comment in comments]
-    for name, records in elements:
-        lines.append(f"element {name} {len(records)}")
-        if name == "face":
-            lines.append("property list uchar int vertex_indices")
-        else:
-            lines += [f"property {_NAMES[records.dtype[p].str[1:]]} {p}" for p in records.dtype.names]
-    with atomic_write(path) as file:
-        file.write(("\n".join([*lines, "end_header"]) + "\n").encode("ascii", "replace"))
-        for _, records in elements:
-            file.write(records.tobytes())
-
-
-def _read(path: Path) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Elements by name and comments; nothing is allocated before the header is checked against the file's size."""
-    with path.open("rb") as file:
-        head = file.read(_MAX_HEADER)
-        end = head.find(b"end_header")
-        if not head.startswith(b"ply") or end < 0 or (newline := head.find(b"\n", end)) < 0:
-            raise InputRejected(f"'{path.name}' is not a PLY file", "a binary PLY", "check the file")
-        order, layout, comments = _parse(path, head[:end].decode("ascii", "replace").splitlines())
-        left = os.fstat(file.fileno()).st_size - (newline + 1)
-        needed = sum(count * dtype.itemsize for _, count, dtype in layout)
-        if needed > left:
-            raise InputRejected(
-                f"'{path.name}' promises {needed} bytes of data and has {left}", "a whole file", "copy it again"
-            )
-        file.seek(newline + 1)
-        elements = {name: np.fromfile(file, dtype, count) for name, count, dtype in layout}
-    for name, records in elements.items():
-        lists = [f for f in records.dtype.names if f.startswith("count of ")]
-        if any((records[f] != 3).any() for f in lists):
-            raise InputRejected(f"'{path.name}' has elements '{name}' that are not triangles", "triangles only")
-    return {name: r.astype(r.dtype.newbyteorder("=")) if order == ">" else r for name, r in elements.items()}, comments
-
-
-def _parse(path: Path, lines: Sequence[str]) -> tuple[str, list[tuple[str, int, np.dtype]], list[str]]:
-    """Byte order, (name, count, record) of each element, comments."""
-    order, layout, comments = "", [], []
-    try:
-        for line in lines[1:]:
-            words = line.split()
-            if not words or words[0] == "obj_info":
-                continue
-            if words[0] == "comment":
-                comments.append(line[len("comment") :].strip())
-            elif words[0] == "format":
-                order = {"binary_little_endian": "<", "binary_big_endian": ">"}[words[1]]
-            elif words[0] == "element":
-                count = int(words[2])
-                if count < 0:
-                    raise ValueError(f"{count} elements")
-                layout.append((words[1], count, []))
-            elif words[:2] == ["property", "list"]:
-                name = "vertex_indices" if words[4] == "vertex_index" else words[4]
-                count_kind, item_kind = order + _TYPES[words[2]], order + _TYPES[words[3]]
-                layout[-1][2].extend([(f"count of {name}", count_kind), (name, item_kind, (3,))])
-            elif words[0] == "property":
-                layout[-1][2].append((words[2], order + _TYPES[words[1]]))
-            else:
-                raise ValueError(f"the line '{line[:60]}'")
-        if not order:
-            raise ValueError("no format line")
-        if any(count and not fields for _, count, fields in layout):
-            raise ValueError("an element without properties")
-        return order, [(name, count, np.dtype(fields)) for name, count, fields in layout], comments
-    except (KeyError, IndexError, ValueError, TypeError) as error:
-        raise InputRejected(
-            f"the header of '{path.name}' cannot be understood ({error})",
-            "a binary PLY (little or big endian)",
-            "save it as binary PLY",
-        ) from None

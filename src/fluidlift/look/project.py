@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from fluidlift.numerics.harmonics import basis
+from fluidlift.numerics.splatting_colors import colors
 from fluidlift.types.camera import PinholeCamera
-from fluidlift.types.gaussians import SH_C0, Gaussians
+from fluidlift.types.gaussians import Gaussians
 
 LARGEST = 0.25
 """largest standard deviation of a drawn Gaussian, as a share of the longer side of the picture"""
@@ -15,20 +15,21 @@ LARGEST = 0.25
 
 def view_colors(gaussians: Gaussians, camera: PinholeCamera) -> Float[np.ndarray, "n 3"]:
     """Colours as this camera sees them, at least 0 (harmonics may overshoot 1, as in 3D Gaussian Splatting)."""
-    degree = int(round(gaussians.sh.shape[1] ** 0.5)) - 1
-    if degree == 0:
-        return np.maximum(0.5 + SH_C0 * gaussians.sh[:, 0], 0.0)
-    d = gaussians.means - camera.position.astype(np.float32)
-    d = d / np.maximum(np.linalg.norm(d, axis=1, keepdims=True), 1e-12)
-    return np.maximum(0.5 + np.einsum("nk,nkc->nc", basis(d, degree), gaussians.sh), 0.0)
+    return colors(gaussians.means, gaussians.sh, camera.position)
 
 
-def sound(gaussians: Gaussians) -> Float[np.ndarray, "n"]:
-    """bool [n]: every number finite, scales not negative, a quaternion that is not zero."""
+def sound(gaussians: Gaussians) -> Bool[np.ndarray, "n"]:
+    """Every number finite, scales not negative, a quaternion that is not zero."""
     g = gaussians
     ok = np.isfinite(g.means).all(1) & np.isfinite(g.quats).all(1) & np.isfinite(g.scales).all(1)
     ok &= np.isfinite(g.opacities) & np.isfinite(g.sh).all((1, 2))
     return ok & (g.scales >= 0).all(1) & (np.abs(g.quats).max(1, initial=0.0) > 1e-12)
+
+
+def camera_depths(means: Float[np.ndarray, "n 3"], camera: PinholeCamera) -> Float[np.ndarray, "n"]:
+    """Camera z (float32, m) of world points, without double precision copies of them."""
+    pose = camera.camera_from_world
+    return means @ np.float32(pose.rotation[2]) + np.float32(pose.translation[2])
 
 
 def bounded_scales(
@@ -39,5 +40,5 @@ def bounded_scales(
     A Gaussian that fills the picture is an accident of its maker, and near the camera the affine approximation of the
     projection no longer holds.
     """
-    limit = largest * max(camera.size) / max(camera.focal) * np.maximum(depths, 0.0)
-    return np.minimum(scales, limit[:, None].astype(np.float32))
+    limit = np.float32(largest * max(camera.size) / max(camera.focal)) * np.maximum(depths, np.float32(0.0))
+    return np.minimum(scales, limit[:, None].astype(np.float32, copy=False))

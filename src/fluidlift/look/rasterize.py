@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 
 from fluidlift.errors import require
-from fluidlift.look.project import LARGEST, bounded_scales, sound, view_colors
-from fluidlift.numerics.splatting import PAIRS_MAX, Projected, View, bin_tiles, project, rasterize
-from fluidlift.numerics.splatting_kernels import TILE
+from fluidlift.look.project import LARGEST, bounded_scales, camera_depths, sound, view_colors
+from fluidlift.numerics.splatting import Bins, Projected, View, bin_tiles, project, rasterize, tiles_met
 from fluidlift.types.camera import PinholeCamera
 from fluidlift.types.gaussians import Gaussians
+
+PAIRS_DRAWN_MAX = 400_000_000
+"""largest number of pairs of tile and Gaussian that a picture may take (some ten seconds; memory is bounded anyway)"""
+COUNT_MAX = 2**31 - 1
+"""Gaussians in one picture: their indices are 32 bits"""
 
 
 @dataclass(frozen=True)
@@ -50,21 +54,35 @@ def render(
     """
     width, height = camera.size
     n = len(gaussians)
-    require(features is None or (np.ndim(features) == 2 and len(features) == n), f"features of {np.shape(features)}",
-            f"({n}, c)")  # fmt: skip
+    require(n <= COUNT_MAX, f"{n} Gaussians", f"at most {COUNT_MAX}", "draw them in parts, or prune them")
+    shape = (n, 3) if features is None else np.shape(features)
+    require(len(shape) == 2 and shape[0] == n, f"features of {shape}", f"({n}, c)")
+    channels = shape[1]
+    behind = _background(background, (height, width, channels))
+
     ok = sound(gaussians)
     if features is not None:
         ok &= np.isfinite(features).all(1)
-    g = gaussians if ok.all() else gaussians.select(ok)
-    colors = view_colors(g, camera) if features is None else np.asarray(features, np.float32)[ok]
-    behind = _background(background, (height, width, colors.shape[1]))
-
-    projected, opacities = _project_bounded(g, camera)
-    drawn = np.concatenate([colors, projected.depths[:, None]], axis=1).astype(np.float32)
-    image, light = rasterize(projected, opacities, drawn, bin_tiles(projected, camera.size), camera.size)
+    projected, opacities, bins = _project_bounded(gaussians, np.where(ok, gaussians.opacities, np.float32(0)), camera)
+    # of millions of Gaussians far from all are drawn: only those get colours and depth
+    index = np.sort(bins.order)
+    drawn = np.empty((len(index), channels + 1), np.float32)
+    drawn[:, :-1] = view_colors(gaussians.select(index), camera) if features is None else features[index]
+    drawn[:, -1] = projected.depths[index]
+    image, light = rasterize(*_only(index, projected, opacities), drawn, _renumbered(bins, index), camera.size)
     alpha = 1.0 - light
     depth = np.where(alpha > 1e-3, image[..., -1] / np.maximum(alpha, 1e-3), 0.0)
     return Rendered(image[..., :-1] + light[..., None] * behind, depth.astype(np.float32), alpha)
+
+
+def _only(index: np.ndarray, projected: Projected, opacities: np.ndarray) -> tuple[Projected, np.ndarray]:
+    p = projected
+    return Projected(p.means[index], p.conics[index], p.depths[index], p.extents[index]), opacities[index]
+
+
+def _renumbered(bins: Bins, index: np.ndarray) -> Bins:
+    """The same lists for Gaussians of which only those of `index` (sorted) are kept."""
+    return replace(bins, order=np.searchsorted(index, bins.order).astype(np.int32))
 
 
 def _background(background: tuple[float, ...] | np.ndarray | None, shape: tuple[int, int, int]) -> np.ndarray:
@@ -74,16 +92,15 @@ def _background(background: tuple[float, ...] | np.ndarray | None, shape: tuple[
     return behind
 
 
-def _project_bounded(g: Gaussians, camera: PinholeCamera) -> tuple[Projected, np.ndarray]:
-    """Projection whose pairs of tile and Gaussian fit into memory: the bound on the widths halves until they do."""
+def _project_bounded(g: Gaussians, opacities: np.ndarray, camera: PinholeCamera) -> tuple[Projected, np.ndarray, Bins]:
+    """Projection whose pairs of tile and Gaussian are not too many: the bound on the widths halves until they fit."""
     view = View.of(camera)
-    depths = camera.camera_from_world.points(g.means)[:, 2]
-    opacities = np.clip(g.opacities, 0.0, 1.0)
+    depths = camera_depths(g.means, camera)
+    opacities = np.clip(opacities, 0.0, 1.0)
     largest = LARGEST
     while True:
         scales = bounded_scales(g.scales, depths, camera, largest)
         projected = project(view, g.means, g.quats, scales, opacities)
-        spans = np.minimum(2 * projected.extents / TILE + 2, np.asarray(camera.size) / TILE + 1)
-        if spans[projected.extents[:, 0] > 0].prod(1).sum(dtype=np.float64) <= PAIRS_MAX or largest < 1e-3:
-            return projected, opacities
+        if tiles_met(projected, camera.size) <= PAIRS_DRAWN_MAX or largest < 1e-3:
+            return projected, opacities, bin_tiles(projected, camera.size)
         largest /= 2

@@ -25,13 +25,23 @@ def vertex_normals(mesh: TriangleMesh) -> Float[np.ndarray, "v 3"]:
 
 
 def terrain_surfels(terrain: Terrain, *, opacity: float = 0.98) -> Gaussians:
-    """One flat, shaded Gaussian per vertex of the terrain's surface, so that one rasteriser draws everything."""
-    mesh, h = terrain.mesh, terrain.grid.spacing
+    """One flat, shaded Gaussian per vertex of the terrain's surface, so that one rasteriser draws everything; as large
+    as the surface that the vertex stands for, a cell at most."""
+    mesh = terrain.mesh
     if len(mesh.vertices) == 0:
         return Gaussians.empty()
     normals = vertex_normals(mesh)
+    h = np.clip(np.sqrt(_vertex_areas(mesh)), 0.25 * terrain.grid.spacing, terrain.grid.spacing)
     colors = np.full((len(normals), 3), 0.5) if mesh.colors is None else mesh.colors
-    return _surfels(mesh.vertices, normals, h, colors, opacity)
+    seen = normals[:, 2] > -0.3  # nobody looks at the underside, and its large faces stick out at the rim
+    return _surfels(mesh.vertices[seen], normals[seen], h[seen], colors[seen], opacity)
+
+
+def _vertex_areas(mesh: TriangleMesh) -> np.ndarray:
+    """m^2 of each vertex: a third of the faces that meet in it."""
+    a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
+    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    return np.bincount(mesh.faces.ravel(), np.repeat(area / 3.0, 3), len(mesh.vertices))
 
 
 def _surfels(points: np.ndarray, normals: np.ndarray, spacing: np.ndarray | float, colors, opacity: float) -> Gaussians:

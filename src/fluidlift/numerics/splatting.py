@@ -3,35 +3,45 @@
 Sources: Zwicker et al. 2001 (EWA splatting), Kerbl et al. 2023 (3D Gaussian Splatting). The constants are those of
 gsplat, so that pictures agree: 0.3 px^2 is added to the diagonal of every 2D covariance, alpha is clamped to 0.999 and
 cut below 1/255, a pixel is finished when less than 1e-4 of the light would pass, and pixel (row i, column j)
-has its centre at u = j + 0.5, v = i + 0.5. Beyond sqrt(2 ln(255 o)) standard deviations a Gaussian of opacity o lies
-under the cut, so that the boxes used for binning lose nothing.
+has its centre at u = j + 0.5, v = i + 0.5. Beyond sqrt(2 ln(255 o)) standard deviations, at most 3.33, a Gaussian of
+opacity o lies under the cut, so that the ellipses used for binning lose nothing.
 
-Arrays only: float32, C-contiguous, n Gaussians, c feature channels, h x w pixels. The torch functions on top of this
-module are in `splatting_torch`.
+Arrays only: float32 (or all float64, for exact comparisons), C-contiguous, n Gaussians, c feature channels, h x w
+pixels. The torch functions on top of this module are in `splatting_torch`, the compiled loops in
+`splatting_projection`, `splatting_binning` and `splatting_kernels`.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from fluidlift.errors import require
+from fluidlift.numerics.splatting_binning import (
+    LEAD,
+    count_kernel,
+    fill_kernel,
+    pack_kernel,
+    places_kernel,
+    sketch_kernel,
+)
 from fluidlift.numerics.splatting_kernels import (
+    SUMS,
     TILE,
-    bin_kernel,
     gather_kernel,
-    project_backward_kernel,
-    project_kernel,
     raster_backward_kernel,
     raster_kernel,
 )
+from fluidlift.numerics.splatting_projection import project_backward_kernel, project_kernel
 from fluidlift.types.camera import PinholeCamera
 
-PAIRS_MAX = 60_000_000
-"""largest number of (tile, Gaussian) pairs held at once: about 0.5 GB"""
+PAIRS_MAX = 16_000_000
+"""largest number of (tile, Gaussian) pairs held at once, about 0.8 GB with their gradients; a picture that needs more
+is drawn in bands of tiles"""
 
 
 @dataclass(frozen=True)
@@ -56,9 +66,9 @@ class View:
         return cls(pose.rotation, pose.translation, camera.focal, camera.center, camera.size, near)
 
     def flat(self) -> Float[np.ndarray, "19"]:
-        """One array for the kernels."""
+        """One array (float64) for the kernels."""
         numbers = [*np.ravel(self.rotation), *self.translation, *self.focal, *self.center, *self.size, self.near]
-        return np.asarray(numbers, np.float32)
+        return np.asarray(numbers, np.float64)
 
 
 @dataclass(frozen=True)
@@ -76,17 +86,42 @@ class Projected:
 
 
 @dataclass(frozen=True)
+class Pairs:
+    """The lists of the tiles of one band, one after the other."""
+
+    first: int
+    last: int
+    """tiles first <= t < last"""
+    gaussians: Int[np.ndarray, "pairs"]
+    """place in `Bins.order` of the Gaussian of every pair, tile by tile, nearest first"""
+    slots: Int[np.ndarray, "pairs"]
+    """where in `gaussians` the pairs of the k-th drawn Gaussian are: slots[offsets[k]:offsets[k + 1]]"""
+    offsets: Int[np.ndarray, "m+1"]
+
+
+@dataclass(frozen=True)
 class Bins:
     """Which Gaussians meet which tile, front to back."""
 
+    tile: int
+    """px"""
+    tiles: tuple[int, int]
+    """across, down"""
     starts: Int[np.ndarray, "tiles+1"]
-    gaussians: Int[np.ndarray, "pairs"]
-    """index of the Gaussian of every pair, tile by tile"""
-    slots: Int[np.ndarray, "pairs"]
-    """place in `gaussians` of the pairs of Gaussian `order[k]`: slots[offsets[k]:offsets[k + 1]]"""
-    offsets: Int[np.ndarray, "m+1"]
+    """where each tile's list begins, tiles row by row"""
     order: Int[np.ndarray, "m"]
     """drawn Gaussians, nearest first"""
+    sketch: Float[np.ndarray, "m 8"]
+    """their ellipses, as `sketch_kernel` writes them"""
+    bands: tuple[tuple[int, int], ...]
+    """tiles first <= t < last that are held in memory together"""
+    whole: Pairs | None = None
+    """the lists, if there is but one band"""
+
+    @property
+    def pairs(self) -> int:
+        """How many there are."""
+        return int(self.starts[-1])
 
 
 def project(
@@ -100,9 +135,9 @@ def project(
 
     Those behind the near plane, outside the picture, under the alpha cut or with any non-finite number are not drawn.
     """
-    n = len(means)
-    uv, conics = np.empty((n, 2), np.float32), np.empty((n, 3), np.float32)
-    depths, extents = np.empty(n, np.float32), np.empty((n, 2), np.float32)
+    n, dtype = len(means), means.dtype
+    uv, conics = np.empty((n, 2), dtype), np.empty((n, 3), dtype)
+    depths, extents = np.empty(n, dtype), np.empty((n, 2), dtype)
     project_kernel(view.flat(), means, quats, scales, opacities, uv, conics, depths, extents)
     return Projected(uv, conics, depths, extents)
 
@@ -123,33 +158,87 @@ def project_backward(
     return gradients
 
 
-def bin_tiles(projected: Projected, size: tuple[int, int]) -> Bins:
+def bin_tiles(projected: Projected, size: tuple[int, int], tile: int = TILE) -> Bins:
     """Deal the drawn Gaussians to the tiles of a picture of `size` (width, height), nearest first; ties by index.
 
     Raises:
-        ValueError: more than `PAIRS_MAX` pairs (many Gaussians as large as the picture).
+        ValueError: a tile of less than a pixel.
     """
-    tiles_x, tiles_y = (-(-s // TILE) for s in size)
+    require(tile >= 1, f"tiles of {tile} px", "1 px or more")
+    order = _order(projected)
+    sketch = np.empty((len(order), 8), np.float32)
+    sketch_kernel(projected.means, projected.conics, projected.extents, order, sketch)
+    tiles_x, tiles_y = (-(-s // tile) for s in size)
+    counts, pairs = _count(sketch, tile, (tiles_x, tiles_y), (0, tiles_x * tiles_y))
+    starts = np.concatenate([[0], np.cumsum(counts.sum(0, dtype=np.int64))])
+    bins = Bins(tile, (tiles_x, tiles_y), starts, order, sketch, _bands(starts))
+    return replace(bins, whole=_dealt(bins, bins.bands[0], counts, pairs)) if len(bins.bands) == 1 else bins
+
+
+def tiles_met(projected: Projected, size: tuple[int, int], tile: int = TILE) -> float:
+    """About how many pairs of tile and Gaussian a picture has (an upper bound, nearly)."""
+    e = projected.extents[projected.extents[:, 0] > 0]
+    across = np.minimum(e * np.float32(2 / tile) + np.float32(1), np.asarray(size, np.float32) / tile + 1)
+    return float((across[:, 0] * across[:, 1]).sum(dtype=np.float64))
+
+
+def _order(projected: Projected) -> Int[np.ndarray, "m"]:
     drawn = np.flatnonzero(projected.extents[:, 0] > 0)
+    depths = projected.depths[drawn]
+    if depths.dtype != np.float32:
+        return drawn[np.argsort(depths, kind="stable")].astype(np.int32)
     # the bits of positive floats sort like the floats; the index below them breaks ties
-    keys = (projected.depths[drawn].view(np.int32).astype(np.int64) << 32) | drawn
+    keys = (depths.view(np.int32).astype(np.int64) << 32) | drawn
     keys.sort()
-    order = (keys & 0xFFFFFFFF).astype(np.int32)
-    counts = np.zeros(tiles_x * tiles_y, np.int64)
-    offsets = np.empty(len(order) + 1, np.int64)
-    none = np.empty(0, np.int32)
-    uv, extents = projected.means, projected.extents
-    total = bin_kernel(uv, extents, order, tiles_x, tiles_y, counts, offsets, none, none, False)
-    require(
-        total <= PAIRS_MAX,
-        f"{total} pairs of tile and Gaussian",
-        f"at most {PAIRS_MAX}",
-        "prune or shrink Gaussians that are as large as the picture",
-    )
-    starts = np.concatenate([[0], np.cumsum(counts)])
-    gaussians, slots = np.empty(total, np.int32), np.empty(total, np.int32)
-    bin_kernel(uv, extents, order, tiles_x, tiles_y, starts[:-1].copy(), offsets, gaussians, slots, True)
-    return Bins(starts, gaussians, slots, offsets, order)
+    return (keys & 0xFFFFFFFF).astype(np.int32)
+
+
+def _count(
+    sketch: np.ndarray, tile: int, tiles: tuple[int, int], band: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Gaussians per chunk and tile, and tiles per Gaussian, of a band of tiles."""
+    chunks = min(64, len(sketch) // 2048 + 1)  # by the number of Gaussians alone: the same for any number of threads
+    counts, pairs = np.zeros((chunks, tiles[0] * tiles[1]), np.int32), np.empty(len(sketch), np.int32)
+    count_kernel(sketch, tile, *tiles, *band, counts, pairs)
+    return counts, pairs
+
+
+def _bands(starts: Int[np.ndarray, "tiles+1"]) -> tuple[tuple[int, int], ...]:
+    """Runs of tiles of at most `PAIRS_MAX` pairs (a single tile may have more)."""
+    bands, first = [], 0
+    while first < len(starts) - 1:
+        last = int(np.searchsorted(starts, starts[first] + PAIRS_MAX, side="right")) - 1
+        last = min(max(last, first + 1), len(starts) - 1)
+        bands.append((first, last))
+        first = last
+    return tuple(bands)
+
+
+def _dealt(bins: Bins, band: tuple[int, int], counts: np.ndarray, pairs: np.ndarray) -> Pairs:
+    """The lists of one band, of which `counts` and `pairs` were counted."""
+    first, last = band
+    low, high = bins.starts[first], bins.starts[last]
+    places_kernel(counts, np.clip(bins.starts[:-1], low, high) - low)
+    offsets = np.concatenate([[0], np.cumsum(pairs, dtype=np.int64)])
+    gaussians, slots = np.empty(high - low, np.int32), np.empty(high - low, np.int32)
+    fill_kernel(bins.sketch, bins.tile, *bins.tiles, first, last, counts, offsets, gaussians, slots)
+    return Pairs(first, last, gaussians, slots, offsets)
+
+
+def _each_band(bins: Bins) -> Iterator[Pairs]:
+    if bins.whole is not None:
+        yield bins.whole
+        return
+    for band in bins.bands:
+        yield _dealt(bins, band, *_count(bins.sketch, bins.tile, bins.tiles, band))
+
+
+def _packed(projected: Projected, opacities: np.ndarray, features: np.ndarray, bins: Bins) -> np.ndarray:
+    """What the loops over pixels read, in order of depth; never fewer than four channels (those added are 0)."""
+    p = projected
+    packed = np.empty((len(bins.order), LEAD + max(features.shape[1], 4)), p.means.dtype)
+    pack_kernel(p.means, p.conics, opacities, p.extents, features, bins.order, packed)
+    return packed
 
 
 def _stride(tiles: int) -> int:
@@ -169,14 +258,12 @@ def rasterize(
 ) -> tuple[Float[np.ndarray, "h w c"], Float[np.ndarray, "h w"]]:
     """Composite front to back: sum of weight x feature (black behind), and the transmittance that is left."""
     width, height = size
-    image = np.empty((height, width, features.shape[1]), np.float32)
-    light = np.empty((height, width), np.float32)
-    p = projected
-    stride = _stride(len(bins.starts) - 1)
-    raster_kernel(
-        p.means, p.conics, opacities, features, p.extents, bins.starts, bins.gaussians, width, height, stride,
-        image, light,
-    )  # fmt: skip
+    packed = _packed(projected, opacities, features, bins)
+    image = np.empty((height, width, features.shape[1]), packed.dtype)
+    light = np.empty((height, width), packed.dtype)
+    for band in _each_band(bins):
+        span = band.first, band.last, bins.tile, _stride(band.last - band.first)
+        raster_kernel(packed, bins.starts, band.gaussians, *span, width, height, image, light)
     return image, light
 
 
@@ -191,15 +278,13 @@ def rasterize_backward(
     g_light: Float[np.ndarray, "h w"],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Gradients of means [n,2], conics [n,3], opacities [n] and features [n,c] from those of picture and light."""
-    p = projected
+    packed = _packed(projected, opacities, features, bins)
     n, channels = features.shape
-    records = np.zeros((len(bins.gaussians), 6 + channels), np.float32)
-    stride = _stride(len(bins.starts) - 1)
-    raster_backward_kernel(
-        p.means, p.conics, opacities, features, p.extents, bins.starts, bins.gaussians, stride,
-        image, light, g_image, g_light, records,
-    )  # fmt: skip
-    gradients = (np.zeros((n, 2), np.float32), np.zeros((n, 3), np.float32), np.zeros(n, np.float32),
-                 np.zeros((n, channels), np.float32))  # fmt: skip
-    gather_kernel(p.conics, opacities, bins.order, bins.offsets, bins.slots, records, *gradients)
+    gradients = (np.zeros((n, 2), packed.dtype), np.zeros((n, 3), packed.dtype), np.zeros(n, packed.dtype),
+                 np.zeros((n, channels), packed.dtype))  # fmt: skip
+    for band in _each_band(bins):
+        records = np.zeros((len(band.gaussians), SUMS + channels), packed.dtype)
+        span = band.first, band.last, bins.tile, _stride(band.last - band.first)
+        raster_backward_kernel(packed, bins.starts, band.gaussians, *span, image, light, g_image, g_light, records)
+        gather_kernel(packed, bins.order, band.offsets, band.slots, records, *gradients)
     return gradients

@@ -15,11 +15,15 @@ from torch import Tensor
 
 from fluidlift.numerics import splatting
 from fluidlift.numerics.splatting import Projected, View
-from fluidlift.numerics.splatting_kernels import ALPHA_MAX, ALPHA_MIN, BLUR, TRANSMITTANCE_MIN
+from fluidlift.numerics.splatting_kernels import ALPHA_MAX, TRANSMITTANCE_MIN
+from fluidlift.numerics.splatting_projection import ALPHA_MIN, BLUR
+from fluidlift.seams import Rasterizer, Splatted, SplatView
 
 
 def _array(tensor: Tensor) -> np.ndarray:
-    return np.ascontiguousarray(tensor.detach().numpy(), dtype=np.float32)
+    """float64 stays (for exact comparisons), all else is drawn in float32."""
+    values = tensor.detach().numpy()
+    return np.ascontiguousarray(values, np.float64 if values.dtype == np.float64 else np.float32)
 
 
 class _Project(torch.autograd.Function):
@@ -101,6 +105,22 @@ def splat(
     return rasterize(uv, conics, opacities, features, depths, extents, view.size)
 
 
+class NumbaRasterizer(Rasterizer):
+    """The kernels of `splatting` behind the seam: on the CPU, whatever device the operands are on."""
+
+    def splat(
+        self, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, features: Tensor, view: SplatView
+    ) -> Splatted:
+        """See `seams.Rasterizer`."""
+        numbers = View(view.rotation, view.translation, view.focal, view.center, view.size, view.near)
+        o = opacities.cpu()
+        uv, conics, depths, extents = project(means.cpu(), quats.cpu(), scales.cpu(), o, numbers)
+        if uv.requires_grad:
+            uv.retain_grad()
+        image, light = rasterize(uv, conics, o, features.cpu(), depths, extents, view.size)
+        return Splatted(image.to(means.device), light.to(means.device), uv)
+
+
 def splat_dense(
     means: Float[Tensor, "n 3"],
     quats: Float[Tensor, "n 4"],
@@ -111,12 +131,11 @@ def splat_dense(
 ) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
     """The plain twin of `splat`: n x h x w numbers, for small scenes and for reading."""
     dtype = means.dtype
-    rotation = torch.as_tensor(view.rotation, dtype=dtype)
-    x = means @ rotation.T + torch.as_tensor(view.translation, dtype=dtype)
-    order = torch.argsort(x[:, 2].detach(), stable=True)
-    order = order[x[order, 2] > view.near]
-    x, quats, scales, opacities, features = (a[order] for a in (x, quats, scales, opacities, features))
-    uv, covariance = _ellipses(x, quats, scales, rotation, view)
+    z = means.detach() @ torch.as_tensor(view.rotation[2], dtype=dtype) + float(view.translation[2])
+    order = torch.argsort(z, stable=True)
+    order = order[z[order] > view.near]
+    means, quats, scales, opacities, features = (a[order] for a in (means, quats, scales, opacities, features))
+    uv, covariance = ellipses(means, quats, scales, view)
     conic = torch.linalg.inv(covariance)
 
     width, height = view.size
@@ -126,18 +145,23 @@ def splat_dense(
     d = torch.stack([u, v], -1)[None] - uv[:, None, None, :]
     power = 0.5 * torch.einsum("nhwi,nij,nhwj->nhw", d, conic, d)
     raw = opacities[:, None, None] * torch.exp(-power)
-    alpha = torch.where(raw >= ALPHA_MIN, raw.clamp(max=ALPHA_MAX), torch.zeros_like(raw))
+    alpha = torch.where(raw >= float(ALPHA_MIN), raw.clamp(max=float(ALPHA_MAX)), torch.zeros_like(raw))
 
     passed = torch.cumprod(1 - alpha, 0)
     before = torch.cat([torch.ones_like(passed[:1]), passed[:-1]])
-    live = (passed > TRANSMITTANCE_MIN).cummin(0).values  # finished at the first Gaussian that would pass too little
+    # finished at the first Gaussian that would pass too little
+    live = (passed > float(TRANSMITTANCE_MIN)).cummin(0).values
     weights = torch.where(live, alpha * before, torch.zeros_like(alpha))
     light = torch.where(live, 1 - alpha, torch.ones_like(alpha)).prod(0)
     return torch.einsum("nhw,nc->hwc", weights, features), light
 
 
-def _ellipses(x: Tensor, quats: Tensor, scales: Tensor, rotation: Tensor, view: View) -> tuple[Tensor, Tensor]:
-    """Picture means [n,2] and covariances [n,2,2] of Gaussians at camera positions x."""
+def ellipses(
+    means: Float[Tensor, "n 3"], quats: Float[Tensor, "n 4"], scales: Float[Tensor, "n 3"], view: View
+) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2 2"]]:
+    """Centres (px) and covariances (px^2) in the picture: the plain twin of `project`."""
+    rotation = torch.as_tensor(view.rotation, dtype=means.dtype)
+    x = means @ rotation.T + torch.as_tensor(view.translation, dtype=means.dtype)
     z = x[:, 2]
     focal = torch.tensor(view.focal, dtype=x.dtype)
     center = torch.tensor(view.center, dtype=x.dtype)
@@ -153,7 +177,7 @@ def _ellipses(x: Tensor, quats: Tensor, scales: Tensor, rotation: Tensor, view: 
         1,
     )
     half = jacobian @ rotation @ rotation_matrices(quats) * scales[:, None, :]
-    covariance = half @ half.transpose(1, 2) + BLUR * torch.eye(2, dtype=x.dtype)
+    covariance = half @ half.transpose(1, 2) + float(BLUR) * torch.eye(2, dtype=x.dtype)
     return x[:, :2] / z[:, None] * focal + center, covariance
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected
-from fluidlift.pipeline import body, reading, seeing
+from fluidlift.pipeline import body, depths, reading, seeing
 from fluidlift.pipeline.reading import Inputs
 from fluidlift.pipeline.seeing import NO_HINTS, Hints
 from fluidlift.pipeline.story import Result, Story, file_hash
@@ -92,6 +92,6 @@ def shape(story: Story, inputs: Inputs, config: JobConfig, hashes: Hashes) -> No
     story.run(
         "geometry",
         lambda: body.geometry(story, inputs, config),
-        settings=[{k: section[k] for k in names}, given],
+        settings=[{k: section[k] for k in names}, given, depths.key_parts(config)],
         after=("read", "flow", "segment"),
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import asdict, replace
-from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -11,11 +10,15 @@ import numpy as np
 from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected
 from fluidlift.io.stage_cache import parts_of
+from fluidlift.pipeline import composite, depths, given_body
 from fluidlift.pipeline.reading import Inputs, clip_of
 from fluidlift.pipeline.seeing import masks_of, mean_motion
 from fluidlift.pipeline.story import Result, Story
-from fluidlift.shape import generate, given, place, surface, terrain
+from fluidlift.shape import airborne, channel, generate, ground_mesh, place, surface, terrain
 from fluidlift.shape import kind as kinds
+from fluidlift.shape.framing import framing_warnings
+from fluidlift.shape.given_depth import DepthPictures
+from fluidlift.shape.jets import lying_pixels
 from fluidlift.types import (
     CellType,
     Gaussians,
@@ -43,23 +46,39 @@ def rest_frame(area: np.ndarray) -> int:
 
 def geometry(story: Story, inputs: Inputs, config: JobConfig) -> Result:
     """Kind, camera, front surface, scale, terrain, cells."""
-    from fluidlift.shape.unite import window_length
-
     clip, fluid, c = clip_of(story), masks_of(story), config.shape
-    start = rest_frame(fluid.areas())
-    united = _united(clip.frames, fluid, start, c.longest_union, window_length)
+    start, united = united_range(story, config)
     mask = generate.united_mask(fluid[start : start + united])
     if not mask.any():
         mask = fluid[start]
     motion, trust = mean_motion(story, fluid.any_frame())
-    warnings: list[str] = []
+    warnings = framing_warnings(mask, fluid.areas())
 
     known, pose_given = _known_camera(inputs, config, clip.size)
-    evidence, kind, up, heading = _kind_and_up(story, inputs, config, known, pose_given, mask, motion, trust)
+    pictures, known = _depth_pictures(story, inputs, config, known, start)
+    evidence, kind, parts, up, heading = _kind_and_up(story, inputs, config, known, pose_given, mask, motion, trust)
     eye = known.position if pose_given else None
     canonical = kinds.level_camera(known, up)
 
-    front, known_scale = _front(inputs, canonical, mask, kind, motion, trust, start)
+    height, unsure = None, ""
+    if eye is not None and kind == "stream":
+        level, unsure = _water_level(inputs)
+        height = float(eye[2] - level)
+    front, known_scale = _front(
+        inputs, canonical, parts.lying, kind, motion, trust * ~parts.falling, start, clip.interval, height,
+        tilt_known=pose_given or c.pitch is not None,
+    )  # fmt: skip
+    if parts.puddle:
+        front = surface.level_surface(canonical, parts.lying)
+    seen_depth = None
+    if pictures is not None:
+        seen_depth = depths.depth_front(
+            pictures, fluid, known, up, kind, parts.lying, motion, trust * ~parts.falling, expected=front,
+            tilt_known=pose_given or c.pitch is not None,
+        )  # fmt: skip
+        up, front, known_scale = seen_depth.up, seen_depth.front, seen_depth.known_scale
+        canonical = kinds.level_camera(known, up)
+    front, falling = composite.standing(front, parts, canonical, mask)
     visible = mask & (front.depth > 0)
     if 0 < visible.sum() < FEWEST_PIXELS:
         raise InputRejected(
@@ -67,25 +86,30 @@ def geometry(story: Story, inputs: Inputs, config: JobConfig) -> Result:
             "check the mask, or raise --max-size",
         )  # fmt: skip
     points, velocities = _surface_motion(canonical, visible, front.depth, motion, clip.interval)
-    height, unsure = None, ""
-    if eye is not None and kind == "stream":
-        level, unsure = _water_level(inputs)
-        height = float(eye[2] - level)
     scale = place.metric_scale(
         kind, points, velocities, size=c.size, camera_height=height, known_scale=known_scale,
         seen=place.Sighting(trust[visible], clip.interval, up.pitch),
     )  # fmt: skip
+    if seen_depth is not None:
+        scale = depths.with_learned_scale(scale, seen_depth, points)
+        warnings += depths.size_warnings(scale.across, seen_depth, height, points)
+    falls = falling.pixels[visible]
+    scale = composite.with_fall(
+        scale, points, velocities, falls, place.Sighting(trust[visible], clip.interval, up.pitch)
+    )
     sentence = scale.sentence
     if unsure and scale.source == "camera":
         scale, sentence = replace(scale, warning=unsure), f"{sentence}, with the water at z = 0, assumed"
     if scale.warning:
         warnings.append(scale.warning)
-    mainstream = _mainstream(kind, velocities, trust[visible])
+    mainstream = _mainstream(kind, velocities[~falls], trust[visible][~falls])
     to_world, camera = place.place(canonical, points, scale.value, heading=heading, eye=eye, mainstream=mainstream)
     depth = (front.depth * scale.value).astype(np.float32)
     half = (front.half_thickness * scale.value).astype(np.float32)
     bulk = to_world.vectors(mainstream) / to_world.scale
-    setting = _setting(kind, front, fluid, start, united, camera, to_world, depth, half, bulk, c)
+    speed = _seen_speed(visible, velocities * scale.value, trust)
+    setting = _setting(kind, front, fluid, start, united, camera, to_world, depth, half, bulk, c, falling.pixels, speed)
+    setting = composite.composed(setting, falling, to_world, points[~falls], velocities[~falls], camera)
     if not (setting.cell_types == CellType.FLUID).any():
         raise InputRejected(
             f"as a {kind}, the fluid fills no cell of the grid beside those of its inlet", "a larger or thicker body",
@@ -112,6 +136,9 @@ def geometry(story: Story, inputs: Inputs, config: JobConfig) -> Result:
             "translation": to_world.translation.tolist(),
         },
         "known_scale": known_scale,
+        "depth_source": None if seen_depth is None else seen_depth.meta,
+        "jets": falling.plain(to_world),
+        "slope": None if front.slope is None else asdict(front.slope),
         "rest_frame": start,
         "united_frames": united,
     }
@@ -126,12 +153,23 @@ def _kind_and_up(story, inputs, config, known, pose_given, mask, motion, trust):
     pick = np.unique(np.linspace(0, len(clip) - 1, 8).astype(int))
     evidence = kinds.estimate_kind(clip.frames[pick], fluid[pick], motion, trust, pitch=pitch)
     kind = evidence.kind if c.kind == "auto" else c.kind
+    if inputs.geometry is None:
+        kind, parts = composite.split(
+            kind, known, surveyed if pose_given else None, mask, motion, trust, free=c.kind == "auto"
+        )
+    else:
+        parts = composite.Parts((), mask)
     if pose_given:
-        return evidence, kind, surveyed, heading
-    if inputs.geometry is not None:
-        return evidence, kind, surveyed, None
-    up = kinds.estimate_up(kind, mask, motion, trust, known, pitch=c.pitch, roll=c.roll)
-    return evidence, kind, up, None
+        return evidence, kind, parts, surveyed, heading
+    generated = given_body.note_of(inputs.geometry) is not None
+    if inputs.geometry is not None and not (generated and (c.pitch is not None or c.roll is not None)):
+        upright = given_body.up_of(inputs.geometry, surveyed, kind, rest_frame(fluid.areas()), clip.size)
+        if upright is not None:
+            return evidence, kind, parts, upright, None
+    up = kinds.estimate_up(kind, parts.lying, motion, trust * ~parts.falling, known, pitch=c.pitch, roll=c.roll)
+    if c.roll is None:
+        up = composite.with_roll(up, parts, known)
+    return evidence, kind, parts, up, None
 
 
 def _packed(setting: terrain.Setting) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -155,29 +193,31 @@ def _packed(setting: terrain.Setting) -> tuple[dict[str, np.ndarray], dict[str, 
     }
 
 
-def _united(frames, fluid, start, longest, window_length) -> int:
+def united_range(story: Story, config: JobConfig) -> tuple[int, int]:
+    """First frame whose body is wanted, and how many in all become one."""
+    from fluidlift.shape.unite import window_length
+
+    frames, fluid, longest = clip_of(story).frames, masks_of(story), config.shape.longest_union
+    start = rest_frame(fluid.areas())
     stop = min(len(frames), start + 2 * longest + 1)
-    return int(min(window_length(frames[start:stop], fluid[start], longest=longest), len(frames) - start))
+    return start, int(min(window_length(frames[start:stop], fluid[start], longest=longest), len(frames) - start))
 
 
-def given_bodies(folder: Path, size: tuple[int, int], frames: list[int]) -> tuple[list[Gaussians], Similarity3]:
-    """Gaussians of some frames from a folder of PLY files (in order of name; the last stands for all after it), and
-    the similarity that brings them into the canonical frame."""
-    from fluidlift.io.images import read_camera
-    from fluidlift.io.ply import read_gaussians
+def known_field_of_view(inputs: Inputs, config: JobConfig, size: tuple[int, int]) -> tuple[float, bool]:
+    """Degrees across the longer side, and whether that was told: by the user, a camera file or the lens."""
+    from fluidlift.io.lens import lens_field_of_view
 
-    files = sorted(folder.glob("*.ply"))
-    if not files:
-        raise InputRejected(f"no PLY file in '{folder.name}'", "one Gaussian PLY per frame, or one, and camera.json")
-    bodies = [read_gaussians(files[min(t, len(files) - 1)]) for t in frames]
-    return bodies, given.canonical_from_given(read_camera(folder / "camera.json", size), bodies[0])
+    focal = max(_known_camera(inputs, config, size)[0].focal)
+    told = inputs.camera is not None or config.shape.fov or lens_field_of_view(inputs.clip)
+    return float(2 * np.degrees(np.arctan(0.5 * max(size) / focal))), bool(told)
 
 
 def _known_camera(inputs: Inputs, config: JobConfig, size: tuple[int, int]) -> tuple[PinholeCamera, bool]:
     """The camera file's camera, or one from the field of view; and whether its pose is known."""
     from fluidlift.io.images import read_camera, read_json
 
-    if inputs.geometry is not None:  # its camera is the one that saw the body; its world is not the user's
+    if inputs.geometry is not None and given_body.note_of(inputs.geometry) is None:
+        # its camera is the one that saw the body; its world is not the user's
         return read_camera(inputs.geometry / "camera.json", size), False
     if inputs.camera is None:
         from fluidlift.io.lens import lens_field_of_view
@@ -187,6 +227,17 @@ def _known_camera(inputs: Inputs, config: JobConfig, size: tuple[int, int]) -> t
     camera = read_camera(inputs.camera, size)
     data = read_json(inputs.camera, "camera file")
     return camera, "R" in data or "frames" in data
+
+
+def _depth_pictures(story, inputs, config, known, start) -> tuple[DepthPictures | None, PinholeCamera]:
+    """Depth from a file or a model, and the camera with the model's field of view where nothing else says it."""
+    from fluidlift.io.lens import lens_field_of_view
+
+    told = inputs.camera is not None or config.shape.fov or lens_field_of_view(inputs.clip)
+    pictures = depths.pictures_of(story, inputs, config, known if told else None, start)
+    if pictures is not None and not told and pictures.field_of_view is not None:
+        known = PinholeCamera.from_fov(pictures.field_of_view, known.size)
+    return pictures, known
 
 
 def _water_level(inputs: Inputs) -> tuple[float, str]:
@@ -203,28 +254,15 @@ def _water_level(inputs: Inputs) -> tuple[float, str]:
     )
 
 
-def _front(inputs, canonical, mask, kind, motion, trust, start) -> tuple[surface.FrontSurface, float | None]:
-    """The front surface in canonical units; metres per unit where the depth came in metres."""
+def _front(inputs, canonical, mask, kind, motion, trust, start, interval, height, *, tilt_known):
+    """The front surface in canonical units; metres per unit where the depth came in metres, else None."""
     if inputs.geometry is not None:
-        body, to_canonical = given_bodies(inputs.geometry, canonical.size, [start])
-        near, far = given.near_and_far(body[0].transformed(to_canonical), canonical, mask)
-        front = surface.given_surface(canonical, mask, near, kind)
-        depth_unit = float(np.median(near[mask]))
-        half = np.where(mask, 0.5 * np.maximum(far - near, 0.0), 0.0) / depth_unit
-        thick = half if kind in ("pour", "plume") else np.zeros_like(half)
-        return surface.FrontSurface(
-            front.depth, thick.astype(np.float32), front.height
-        ), depth_unit / to_canonical.scale
-    if inputs.depth is not None:
-        from fluidlift.io.images import read_depth
-
-        distance = read_depth(inputs.depth, canonical.size)
-        distance = distance[min(start, len(distance) - 1)] if distance.ndim == 3 else distance
-        valid = mask & np.isfinite(distance) & (distance > 0)
-        scale = float(np.median(distance[valid])) if valid.any() else None
-        return surface.given_surface(canonical, mask, distance, kind), scale
+        return given_body.given_front(inputs.geometry, canonical, mask, kind, start)
     if kind == "stream":
-        return surface.level_surface(canonical, mask), None
+        front = surface.stream_surface(
+            canonical, mask, motion, trust, interval, camera_height=height, tilt_known=tilt_known
+        )
+        return front, None
     if kind == "fall":
         return surface.falling_surface(canonical, mask, motion, trust), None
     return surface.inflated_surface(canonical, mask, kind), None
@@ -262,24 +300,33 @@ def _mainstream(kind: str, velocities: np.ndarray, trust: np.ndarray) -> np.ndar
     return bulk / norm if norm > 1e-12 else np.array([1.0, 0.0, 0.0])
 
 
+def _seen_speed(visible, velocities, trust) -> np.ndarray:
+    """m/s of the surface at each pixel; nan where there is none, or its motion is a guess."""
+    speed = np.full(visible.shape, np.nan)
+    speed[visible] = np.where(trust[visible] > 0.3, np.linalg.norm(velocities, axis=1), np.nan)
+    return speed
+
+
 def _solid(labels: np.ndarray) -> np.ndarray:
     """float [H,W]: share of the frames, u8 [T,H,W], in which a pixel shows something solid."""
     parts = (labels[part] == Label.SOLID for part in parts_of(labels))
     return np.sum([part.sum(axis=0) for part in parts], axis=0) / len(labels)
 
 
-def _setting(kind, front, fluid, start, united, camera, to_world, depth, half, bulk, c) -> terrain.Setting:
+def _setting(
+    kind, front, fluid, start, united, camera, to_world, depth, half, bulk, c, falls, speed
+) -> terrain.Setting:
     window = slice(start, start + united)
     mask = generate.united_mask(fluid[window])
     visible = mask & (depth > 0)
     grid = camera.pixel_grid()
-    near = camera.unproject(grid[visible], depth[visible])
+    near = camera.unproject(grid[visible & ~falls], depth[visible & ~falls])
     if front.height is not None:
-        solid = _solid(fluid.labels[window]) > 0.5
-        seen = np.where(mask, Label.FLUID, np.where(solid, Label.SOLID, Label.BACKGROUND)).astype(np.uint8)
-        return terrain.channel_setting(
+        solid, lying = _solid(fluid.labels[window]) > 0.5, lying_pixels(mask, falls)
+        seen = np.where(lying, Label.FLUID, np.where(solid, Label.SOLID, Label.BACKGROUND)).astype(np.uint8)
+        return channel.channel_setting(
             place.PlacedHeight(front.height, to_world), seen, near, camera, bulk,
-            kind=kind, longest=c.cells, cell_limit=c.cell_limit, depth_ratio=c.depth_ratio,
+            kind=kind, longest=c.cells, cell_limit=c.cell_limit, depth_ratio=c.depth_ratio, speed=speed,
         )  # fmt: skip
     back = depth + 2 * half
     far = camera.unproject(grid[visible], back[visible])
@@ -287,7 +334,7 @@ def _setting(kind, front, fluid, start, united, camera, to_world, depth, half, b
     later = fluid.any_frame()
     middle = np.median((depth + half)[visible])
     reach = camera.unproject(grid[later], np.full(int(later.sum()), middle))
-    return terrain.airborne_setting(
+    return airborne.airborne_setting(
         depth, back, visible, camera, np.concatenate([near, far, reach]), bulk,
         # smoke needs the whole box, and is cheap per cell: no free surface, few particles
         kind=kind, longest=c.cells, cell_limit=c.cell_limit * (2 if kind == "plume" else 1),
@@ -317,8 +364,9 @@ def placement_of(story: Story) -> Similarity3:
 def terrain_of(story: Story) -> Terrain:
     """The solid, textured from the background plate."""
     a = story["geometry"].arrays
-    colors = generate.picture_colours(a["plate"], a["mesh_vertices"], camera_of(story))
-    mesh = TriangleMesh(a["mesh_vertices"], a["mesh_faces"], colors)
+    mesh = TriangleMesh(a["mesh_vertices"], a["mesh_faces"])
+    if len(mesh.faces):
+        mesh = replace(mesh, colors=ground_mesh.ground_colours(mesh, a["plate"], camera_of(story)))
     return Terrain(grid_of(story), a["signed_distance"], a["mainstream"], mesh)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from fluidlift import __version__
 from fluidlift.config import JobConfig
-from fluidlift.pipeline import begin, body, lifting, moving, refining, simulating
+from fluidlift.pipeline import begin, body, generating, lifting, moving, refining, simulating
 from fluidlift.pipeline.begin import input_hashes, provenance_of
 from fluidlift.pipeline.fit_request import request_of
 from fluidlift.pipeline.reading import Inputs, clip_of
@@ -48,12 +48,16 @@ def make(
     """
     from fluidlift.io.asset_folder import check_output_folder
 
-    require_stages(force, STAGES)
+    stages = generating.stages_of(STAGES, config)
+    require_stages(force, stages)
     check_output_folder(folder)
     simulating.particle_work(config.simulate.device)  # a device that is not there is said now, not after the fit
     request_of(config.fit)  # so is a parameter that is not known
+    warnings = generating.require_usable(inputs, config, folder)
     began = time.perf_counter()
-    story = Story(folder, STAGES, force=frozenset(force), progress=progress or Silence())
+    story = Story(folder, stages, force=frozenset(force), progress=progress or Silence())
+    for text in warnings:
+        story.warn(text)
     with gone_if_refused(story, "motion"):
         provenance = _run(story, inputs, config)
         frames = config.simulate.frames or len(clip_of(story)) - story["geometry"].meta["rest_frame"]
@@ -67,8 +71,9 @@ def _run(story: Story, inputs: Inputs, config: JobConfig) -> dict[str, Any]:
     hashes = input_hashes(inputs)
     seed, run, shape = config.seed, story.run, config.section("shape")
     begin.look(story, inputs, config, hashes)
-    begin.shape(story, inputs, config, hashes)
-    run("refine", lambda: refining.refine(story, inputs, config), settings=[shape, seed], after=("geometry",))
+    given, known = generating.run(story, inputs, config, hashes)
+    begin.shape(story, given, config, known)
+    run("refine", lambda: refining.refine(story, given, config), settings=[shape, seed], after=("geometry",))
     run("motion", lambda: lifting.motion(story, config), settings=config.section("motion"), after=("geometry",))
     run("fit", lambda: moving.fit(story, config), settings=config.section("fit"), after=("motion",))
     return provenance_of(inputs, hashes)

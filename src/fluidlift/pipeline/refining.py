@@ -6,18 +6,24 @@ from typing import Any
 
 import numpy as np
 
+from fluidlift.backends.gsplat_rasterizer import best_rasterizer
 from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected
-from fluidlift.pipeline.body import camera_of, gaussians_to_arrays, given_bodies, placement_of, setting_of
+from fluidlift.pipeline.body import camera_of, gaussians_to_arrays, placement_of, setting_of
+from fluidlift.pipeline.given_body import placed_bodies
 from fluidlift.pipeline.reading import Inputs, clip_of
 from fluidlift.pipeline.seeing import labels_of
 from fluidlift.pipeline.story import Result, Story
+from fluidlift.seams import Rasterizer
 from fluidlift.shape import generate, terrain
-from fluidlift.types import Gaussians, PinholeCamera, Similarity3, concatenate
+from fluidlift.types import Gaussians, PinholeCamera, concatenate
 
 KEPT = 0.6
 """part of its size that a splat of the inside keeps at least: at 0.3 the first frame is a little cleaner, but once the
 surface is drawn apart, dark dots of what lies below show between its splats"""
+
+LATER = 5
+"""how much fewer steps the frames after the first take, as they start from the last"""
 
 
 def refine(story: Story, inputs: Inputs, config: JobConfig) -> Result:
@@ -36,7 +42,9 @@ def refine(story: Story, inputs: Inputs, config: JobConfig) -> Result:
     colours = generate.fluid_colour_frame(clip.frames[start], fluid[start])
     hull = generate.hull_gaussians(colours, setting, camera, seed=config.seed)
     step = max(0.35 * h, 0.6 * c.stride * _pixel(depth, camera))
-    front = unite([b for b in bodies if len(b)], spacing=step, whole_first=True)
+    # what another frame has nearer to the camera would hide the picture of the first
+    others = [generate.beneath_front(b, depth, fluid[start], camera, smallest=1.0, drop_above=True) for b in bodies[1:]]
+    front = unite([b for b in (bodies[0], *others) if len(b)], spacing=step, whole_first=True)
     # what is seen is kept before what is hidden
     front = _bounded(front, int(0.75 * c.max_gaussians), config.seed)
     hull = _bounded(hull, c.max_gaussians - len(front), config.seed)
@@ -70,23 +78,49 @@ def refine(story: Story, inputs: Inputs, config: JobConfig) -> Result:
 
 
 def _bodies(story, inputs, config, fluid, start, united) -> tuple[list[Gaussians], dict[str, Any]]:
-    """One body per united frame, the first of them refined against its picture."""
+    """One body per united frame, each refined against its picture; those after the first start from the last."""
+    from fluidlift.shape.prune import prune
+
     clip, camera, c = clip_of(story), camera_of(story), config.shape
     depth = story["geometry"].arrays["depth"]
     frames = list(range(start, start + united))
     if inputs.geometry is not None:
-        given_frames, to_canonical = given_bodies(inputs.geometry, clip.size, frames)
-        scale = 1.0 / story["geometry"].meta["known_scale"]
-        moved = to_canonical.translation * (scale / to_canonical.scale)
-        to_world = placement_of(story) @ Similarity3(scale, to_canonical.rotation, moved)
-        bodies = [b.transformed(to_world) for b in given_frames]
+        given = placed_bodies(story, inputs.geometry, frames, camera, placement_of(story))
+        # strays in front of the fluid would count as its shape, which the refinement must not change
+        bodies = [prune(b, min_opacity=0.05, max_stretch=12.0)[0] for b in given]
     else:
         bodies = [generate.front_gaussians(clip.frames[t], fluid[t], depth, camera, stride=c.stride) for t in frames]
-    first, fitted = _refined(story, config, bodies[0], fluid[start])
-    return [first, *bodies[1:]], fitted
+    draws = best_rasterizer(c.rasterizer, story.warn)
+    first, fitted = _refined(story, config, bodies[0], fluid[start], draws)
+    later, fitted["psnr_later"] = _followed(story, config, first, bodies[1:], fluid, frames[1:], draws)
+    return [first, *later], fitted
 
 
-def _refined(story, config, front: Gaussians, mask) -> tuple[Gaussians, dict[str, Any]]:
+def _followed(story, config, last: Gaussians, bodies: list[Gaussians], fluid, frames, draws: Rasterizer):
+    """Bodies of the frames after the first, each from the one before; and their likeness before and after, dB."""
+    from fluidlift.shape.follow import follow
+
+    clip, camera, c = clip_of(story), camera_of(story), config.shape
+    if c.refine_iterations == 0 or len(last) == 0:
+        return bodies, []
+    depth, flow = story["geometry"].arrays["depth"], story["flow"].arrays["displacement"]
+    out, likeness = [], []
+    for t, fresh in zip(frames, bodies, strict=True):
+        if not fluid[t].any() or len(fresh) == 0:
+            out.append(fresh)
+            continue
+        found = follow(
+            last, fresh, clip.frames[t], fluid[t], camera, motion=np.asarray(flow[t - 1], np.float32),
+            depths=(depth, depth), iterations=max(c.refine_iterations // LATER, 1), seed=config.seed,
+            max_gaussians=max(int(1.5 * len(fresh)), 1000), rasterizer=draws,
+        )  # fmt: skip
+        last = generate.bounded_colours(found.gaussians, clip.frames[t], camera)
+        out.append(last)
+        likeness.append([found.psnr_before, found.psnr_after])
+    return out, likeness
+
+
+def _refined(story, config, front: Gaussians, mask, draws: Rasterizer) -> tuple[Gaussians, dict[str, Any]]:
     """A body optimised against the picture of the rest frame."""
     from fluidlift.shape.refine import refine as refine_view
 
@@ -96,7 +130,7 @@ def _refined(story, config, front: Gaussians, mask) -> tuple[Gaussians, dict[str
     if c.refine_iterations > 0 and len(front):
         found = refine_view(
             front, clip.frames[start], mask, camera, iterations=c.refine_iterations, seed=config.seed,
-            max_gaussians=max(int(1.5 * len(front)), 1000), progress=story.step,
+            max_gaussians=max(int(1.5 * len(front)), 1000), rasterizer=draws, progress=story.step,
         )  # fmt: skip
         fitted |= {"psnr_before": found.psnr_before, "psnr_after": found.psnr_after, "kept": found.kept}
         fitted["loss_history"] = [float(x) for x in found.loss_history]

@@ -229,7 +229,7 @@ def require_usable(story: Story, inputs: Inputs, config: JobConfig, hints: Hints
     region_of_interest(hints.roi, height, width)
     clicks_at(hints.clicks(), size, (height, width))
     if inputs.depth is not None:
-        read_depth(inputs.depth, size)
+        read_depth(inputs.depth, size, scale=config.depth.scale, positive=config.depth.holds != "disparity")
     if inputs.mask is not None:
         _user_mask(story, inputs, config)
     elif config.segment.method in MASK_METHODS:

@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 MAX_STRETCH = 3.0
 """longest axis over the mean one before a Gaussian starts again round: longer ones show as hair"""
 
+MIXED = 0.42
+"""standard deviation up to which splats close up with their neighbours, cells: that of a splat of the inside"""
+
 BYTES_PER_SPLAT = 80
 """of disk, in a frame's file"""
 
@@ -288,6 +291,7 @@ def _advance(
 ) -> str | None:
     """Simulate and write the frames that are missing; why it broke down, if it did."""
     from fluidlift.io.ply import write_gaussians
+    from fluidlift.look.mixing import mixed
     from fluidlift.physics.deform import deform_gaussians
 
     size = 1.2 * scene.terrain.grid.spacing
@@ -305,6 +309,8 @@ def _advance(
         if k and len(p) > config.simulate.max_particles * 2:
             return None
         shown = deform_gaussians(scene.rest, p, max_stretch=MAX_STRETCH, max_size=size)
+        if k:  # at rest nothing is drawn out
+            shown = mixed(shown, p.deformation, widest=MIXED * scene.terrain.grid.spacing)
         if scene.shading is not None:
             shown = scene.shading.moved(shown, scene.rest.means[p.source])
         write_gaussians(frame_file(folder, FIRST_FRAME + k), shown, ids=p.ids, velocities=p.velocities)

@@ -17,10 +17,10 @@ import numba as nb
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
-from scipy.spatial import cKDTree
 
 from fluidlift.errors import require
 from fluidlift.numerics.sampling import sample_nodes
+from fluidlift.shape.prune import body_size
 from fluidlift.types.gaussians import Gaussians
 from fluidlift.types.grid import Grid
 from fluidlift.types.terrain import Terrain
@@ -35,8 +35,15 @@ THRESHOLD = 0.25
 RADIUS_MAX = 12
 """voxels that a Gaussian reaches at most in the field"""
 
+WIDE = 0.1
+"""share of the size of the body above which a Gaussian is no piece of its surface: only its centre counts then. A few
+huge ones would swell the hull by `RADIUS_MAX`"""
+
 WORK_MAX = 200_000_000
 """visits of voxels by Gaussians at most; radii shrink until they fit"""
+
+CHUNK = 500_000
+"""Gaussians whose matrices are made at a time"""
 
 _EMPTY, _HULL, _SOLID = np.uint8(0), np.uint8(1), np.uint8(2)
 
@@ -71,7 +78,7 @@ def _splat_field(low, spacing, means, precisions, opacities, reach, field):
 
 @nb.njit(cache=True, parallel=True)
 def _odd_rays(voxels, starts, directions, rays, odd):
-    """How many of the rays from each start (voxel units) cross the hull an odd number of times.
+    """How many of the rays from each start (voxel units) cross the hull an odd number of times, until that is decided.
 
     A ray is mirrored where it meets the face of a terrain voxel: a surface over a bed is closed by its mirror image.
     """
@@ -85,37 +92,44 @@ def _odd_rays(voxels, starts, directions, rays, odd):
             d0, d1, d2 = directions[m, 0], directions[m, 1], directions[m, 2]
             x, y, z = starts[n, 0], starts[n, 1], starts[n, 2]
             i, j, k = int(math.floor(x)), int(math.floor(y)), int(math.floor(z))
+            # lengths along the ray to the next face across each axis, and between faces (Amanatides and Woo 1987)
+            e0, e1, e2 = abs(1.0 / d0), abs(1.0 / d1), abs(1.0 / d2)
+            s0, s1, s2 = (1 if d0 > 0 else -1), (1 if d1 > 0 else -1), (1 if d2 > 0 else -1)
+            t0 = e0 * ((i + 1 - x) if d0 > 0 else (x - i))
+            t1 = e1 * ((j + 1 - y) if d1 > 0 else (y - j))
+            t2 = e2 * ((k + 1 - z) if d2 > 0 else (z - k))
             runs, before = 0, False
             for _ in range(limit):
-                tx = ((i + 1 if d0 > 0 else i) - x) / d0
-                ty = ((j + 1 if d1 > 0 else j) - y) / d1
-                tz = ((k + 1 if d2 > 0 else k) - z) / d2
-                t = min(tx, ty, tz)
-                x, y, z = x + t * d0, y + t * d1, z + t * d2
                 a, b, c = i, j, k
-                if t == tx:
-                    a += 1 if d0 > 0 else -1
-                elif t == ty:
-                    b += 1 if d1 > 0 else -1
+                if t0 <= t1 and t0 <= t2:
+                    a += s0
+                    t0 += e0
+                elif t1 <= t2:
+                    b += s1
+                    t1 += e1
                 else:
-                    c += 1 if d2 > 0 else -1
+                    c += s2
+                    t2 += e2
                 if a < 0 or a >= shape[0] or b < 0 or b >= shape[1] or c < 0 or c >= shape[2]:
                     break
-                if voxels[a, b, c] == _SOLID:
-                    d0, d1, d2 = (-d0 if a != i else d0), (-d1 if b != j else d1), (-d2 if c != k else d2)
+                if voxels[a, b, c] == _SOLID:  # mirrored: the way to the next face stays as long
+                    s0, s1, s2 = (-s0 if a != i else s0), (-s1 if b != j else s1), (-s2 if c != k else s2)
                     continue
                 i, j, k = a, b, c
                 hull = voxels[i, j, k] == _HULL
                 runs += 1 if hull and not before else 0
                 before = hull
             count += runs % 2
+            if 2 * count > rays or 2 * (count + rays - 1 - r) <= rays:
+                break  # the others cannot turn the vote
         odd[n] = count
 
 
 def hull(gaussians: Gaussians, *, spacing: float, closed_below: Terrain | None = None) -> Hull:
     """Voxelise a body.
 
-    A Gaussian counts as at least half a voxel wide, so that fine ones leave no gaps, and gaps of one voxel are closed.
+    A Gaussian counts as at least half a voxel wide, and fainter in return, so that the hull of a surface does not swell
+    with the number of its Gaussians; its own voxel is hull in any case. Gaps of one voxel are closed.
 
     Args:
         gaussians: any Gaussians; those with non-finite numbers or hardly any opacity are left out.
@@ -130,15 +144,24 @@ def hull(gaussians: Gaussians, *, spacing: float, closed_below: Terrain | None =
         return Hull(Grid((1, 1, 1), spacing), np.zeros((1, 1, 1), np.uint8))
     grid = _hull_grid(g.means, spacing, closed_below)
     scales = np.clip(g.scales, 0.5 * grid.spacing, RADIUS_MAX / 3.46 * grid.spacing)
+    scales[g.scales.max(1) > max(WIDE * body_size(g.means), grid.spacing)] = 0.5 * grid.spacing
     reach = np.ceil(3.46 * scales.max(1) / grid.spacing).astype(np.int64)
     while ((2 * reach + 1.0) ** 3).sum() > WORK_MAX and reach.max() > 2:
         reach = np.minimum(reach, reach.max() - 1)
     scales = np.minimum(scales, np.maximum(reach / 3.46, 0.5)[:, None] * grid.spacing)
-    axes = matrix_from_quat(g.quats) / scales[:, None, :]
-    p = axes @ np.swapaxes(axes, 1, 2)
-    precisions = np.ascontiguousarray(p[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]], dtype=np.float32)
+    ordered = np.sort(g.scales, axis=1)
+    spread = np.minimum(ordered[:, 1] * ordered[:, 2] / (0.5 * grid.spacing) ** 2, 1.0)
     field = np.zeros(grid.shape, np.float32)
-    _splat_field(grid.low, grid.spacing, g.means, precisions, np.clip(g.opacities, 0, 1), reach, field)
+    for first in range(0, len(g), CHUNK):  # matrices in double precision of ten million would take gigabytes
+        part = slice(first, first + CHUNK)
+        axes = matrix_from_quat(g.quats[part]) / scales[part, None, :]
+        p = axes @ np.swapaxes(axes, 1, 2)
+        precisions = np.ascontiguousarray(p[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]], dtype=np.float32)
+        opacities = np.clip(g.opacities[part], 0, 1) * spread[part]
+        _splat_field(grid.low, grid.spacing, g.means[part], precisions, opacities, reach[part], field)
+    cells = grid.cell_of(g.means)
+    within = ((cells >= 0) & (cells < grid.shape)).all(1)
+    np.maximum.at(field, tuple(cells[within].T), g.opacities[within])
     solid = np.pad(field > THRESHOLD, 2)
     solid = ndimage.binary_closing(solid, ndimage.generate_binary_structure(3, 2))[2:-2, 2:-2, 2:-2]
     voxels = solid.astype(np.uint8) * _HULL
@@ -229,10 +252,16 @@ def fill(
     """
     shell = hull(gaussians, spacing=spacing, closed_below=closed_below)
     grid, voxels = shell.grid, shell.voxels
-    held = np.zeros(grid.shape, bool)
-    cells = grid.cell_of(gaussians.means[np.isfinite(gaussians.means).all(1) & (np.abs(gaussians.means) < 1e6).all(1)])
-    cells = cells[((cells >= 0) & (cells < grid.shape)).all(1)]
-    held[tuple(cells.T)] = True
+    sound = np.isfinite(gaussians.means).all(1) & (np.abs(gaussians.means) < 1e6).all(1)
+    usable = np.flatnonzero(sound & np.isfinite(gaussians.sh).all((1, 2)))
+    cells = grid.cell_of(gaussians.means[usable])
+    within = ((cells >= 0) & (cells < grid.shape)).all(1)
+    cells, usable = cells[within], usable[within]
+    if len(usable) == 0:
+        return Gaussians.empty(gaussians.sh.shape[1])
+    holder = np.full(grid.shape, -1, np.int64)
+    holder[tuple(cells[::-1].T)] = usable[::-1]  # the first of those that share a voxel
+    held = holder >= 0
 
     wanted = np.zeros(grid.shape, bool)
     free = np.argwhere(voxels == _EMPTY)
@@ -253,11 +282,12 @@ def fill(
     if len(chosen) == 0:
         return Gaussians.empty(gaussians.sh.shape[1])
     means = (grid.low + (chosen + 0.5) * grid.spacing).astype(np.float32)
-    usable = gaussians.select(np.isfinite(gaussians.means).all(1) & np.isfinite(gaussians.sh).all((1, 2)))
-    nearest = cKDTree(usable.means).query(means)[1]
+    # by the distances of voxels: a search tree visits all of a shell for each point near its centre
+    index = ndimage.distance_transform_edt(~held, return_distances=False, return_indices=True)
+    nearest = holder[tuple(index[(slice(None), *chosen.T)])]
     quats = np.tile(np.float32([1, 0, 0, 0]), (len(means), 1))
-    opacities = np.nan_to_num(usable.opacities[nearest])
-    return Gaussians(means, quats, np.full((len(means), 3), width), opacities, usable.sh[nearest])
+    opacities = np.nan_to_num(gaussians.opacities[nearest])
+    return Gaussians(means, quats, np.full((len(means), 3), width), opacities, gaussians.sh[nearest])
 
 
 def _boxed(shell: np.ndarray, cells: np.ndarray, open_below: bool) -> Bool[np.ndarray, "n"]:

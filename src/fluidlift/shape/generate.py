@@ -144,7 +144,10 @@ def hull_gaussians(
     if setting.surface_height is not None:
         column = np.repeat(base[:, :2], 8, axis=0)
         level = setting.surface_height[column[:, 0], column[:, 1]]
-        points, below = points[points[:, 2] < level], (level - points[:, 2])[points[:, 2] < level]
+        middle = grid.low[2] + (np.repeat(base[:, 2], 8) + 0.5) * grid.spacing
+        falls = middle >= level  # cells above the surface belong to jets
+        keep = falls | (points[:, 2] < level)
+        points, below = points[keep], np.where(falls, 0.0, level - points[:, 2])[keep]
     colours = picture_colours(frame, points, camera, size=0.42 * grid.spacing)
     if below is not None:
         colours = colours * np.where(below > grid.spacing, shade, 1.0)[:, None]

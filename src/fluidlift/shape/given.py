@@ -61,4 +61,51 @@ def near_and_far(
             "check the axes (z up) and the camera of --geometry-from, or the mask",
         )
     index = ndimage.distance_transform_edt(~seen, return_distances=False, return_indices=True)
+    assert index is not None
     return np.where(mask, near[tuple(index)], 0.0), np.where(mask, far[tuple(index)], 0.0)
+
+
+def into_view(
+    means: Float[np.ndarray, "n 3"], camera: PinholeCamera, view: PinholeCamera, *, depth: float = 1.0
+) -> Similarity3:
+    """Brings a body that `camera` saw to where `view` sees it at the same place, as large, from the same side.
+
+    Generators have cameras of their own: always 40 degrees wide, say, on a cut-out as large as the fluid is in that
+    frame. Their middle comes to the depth asked for along the ray of its pixel; the scale makes up for the focal
+    lengths (weak perspective: exact for a body that is small beside its distance). For cameras of the same focal
+    length and principal point it is exact for every body: a turn and a scaling about the camera.
+
+    Args:
+        means: of the Gaussians, in the generator's world.
+        camera: that saw them there, with the size of the whole picture.
+        view: the clip's camera, in the world that the body comes to.
+        depth: camera z of the body's middle (median) in that world.
+
+    Raises:
+        InputRejected: the camera does not see the body.
+    """
+    seen = camera.camera_from_world.points(means)
+    if len(seen) == 0 or (seen[:, 2] > 0).mean() < 0.5:
+        raise InputRejected(
+            "most Gaussians lie behind the camera that came with them", "x_cam = R x_world + t with z forward"
+        )
+    middle = np.median(seen[seen[:, 2] > 0], axis=0)
+    before = middle / middle[2]
+    pixel = np.array(camera.focal) * before[:2] + np.array(camera.center)
+    pixel = pixel * np.array(view.size) / np.array(camera.size)
+    after = np.append((pixel - np.array(view.center)) / np.array(view.focal), 1.0)
+    focal = float(np.sqrt(np.prod(camera.focal) * np.prod(view.size) / np.prod(camera.size)))
+    scale = focal / middle[2] * depth / float(np.sqrt(np.prod(view.focal)))
+    turn = _rotation_between(before, after)
+    world_from_view = view.camera_from_world.inverse()
+    rotation = world_from_view.rotation @ turn @ camera.camera_from_world.rotation
+    moved = turn @ (camera.camera_from_world.translation - middle) * scale + depth * after
+    return Similarity3(scale, rotation, world_from_view.points(moved))
+
+
+def _rotation_between(a: np.ndarray, b: np.ndarray) -> Float[np.ndarray, "3 3"]:
+    """The shortest turn from the direction of one ray to that of another (Rodrigues; both look forward)."""
+    a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
+    x, y, z = np.cross(a, b)
+    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + skew + skew @ skew / (1.0 + float(a @ b))

@@ -10,13 +10,14 @@ from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 
 from fluidlift.errors import require
+from fluidlift.shape import slope
 from fluidlift.types import PinholeCamera, RigidTransform
 
 Kind = Literal["stream", "fall", "pour", "plume"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 
 PITCH_PRIOR: dict[str, tuple[float, float]] = {
-    "stream": (35.0, 15.0),
+    "stream": (40.0, 13.0),
     "fall": (8.0, 8.0),
     "pour": (8.0, 8.0),
     "plume": (2.0, 6.0),
@@ -163,9 +164,9 @@ def estimate_up(
 ) -> UpEvidence:
     """The camera's tilt from the fluid.
 
-    A stream is taken as a level plane in uniform motion: its image velocity changes over the picture as perspective
-    says, and the tilt with the least misfit wins, weighed against how people hold cameras. What falls or rises does
-    so along the vertical, which gives the roll; its pitch keeps the prior.
+    Over a stream, the perspective of its motion shows the tilt (`slope.estimate_tilt`), weighed against how people
+    hold cameras: how much it had to say is the confidence, and where it runs across the picture that is little. What
+    falls or rises does so along the vertical, which gives the roll; its pitch keeps the prior.
 
     Args:
         kind: of the fluid.
@@ -179,8 +180,13 @@ def estimate_up(
     mean, sigma = PITCH_PRIOR[kind]
     found_pitch, found_roll, source, trust = mean, 0.0, f"usual view of a {kind}", 0.0
     if kind == "stream":
-        found_pitch, trust = _pitch_of_plane(mask, displacement, confidence, camera, mean, sigma)
-        source = "perspective of the flow on a level surface"
+        patches = slope.flow_patches(mask, displacement, confidence)
+        if patches is not None:
+            tilt = slope.estimate_tilt(
+                camera, patches, lambda p, r: level_camera(camera, UpEvidence(p, r, "", 0.0)), (mean, sigma)
+            )
+            found_pitch, found_roll, trust = tilt.pitch, tilt.roll, tilt.gained
+            source = "perspective of the flow"
     else:
         weight = np.where(mask, confidence * np.linalg.norm(displacement, axis=-1), 0.0)
         down = (weight[..., None] * displacement).sum((0, 1)) * (-1.0 if kind == "plume" else 1.0)
@@ -195,56 +201,6 @@ def estimate_up(
     return UpEvidence(
         float(found_pitch if pitch is None else pitch), float(found_roll if roll is None else roll), source, trust
     )
-
-
-def _pitch_of_plane(mask, displacement, confidence, camera, mean, sigma) -> tuple[float, float]:
-    """Best pitch (degrees) of a level plane in uniform motion, and how much the flow had to say (0 to 1).
-
-    For a plane with unit normal n in camera axes, inverse depth is n.r / h along the ray r = (x, y, 1), so a plane
-    velocity (a, b) in units of h per frame moves the picture by f n.r ((t1 - x t1z) a + (t2 - ...) b): linear in a, b.
-    """
-    inner = ndimage.binary_erosion(mask, iterations=2) if mask.sum() > 2000 else mask
-    weight = np.where(inner, confidence, 0.0)
-    rows, cols = np.where(weight > 0.3)
-    if len(rows) < 200:
-        return mean, 0.0
-    pick = np.linspace(0, len(rows) - 1, min(len(rows), 4000)).astype(int)
-    rows, cols = rows[pick], cols[pick]
-    flow, w = displacement[rows, cols], weight[rows, cols]
-    x = (cols + 0.5 - camera.center[0]) / camera.focal[0]
-    y = (rows + 0.5 - camera.center[1]) / camera.focal[1]
-    all_rows = np.where(mask.any(axis=1))[0]
-    y_top = (all_rows.min() + 0.5 - camera.center[1]) / camera.focal[1]
-    y_bottom = (all_rows.max() + 0.5 - camera.center[1]) / camera.focal[1]
-    pitches, cost = np.arange(8.0, 81.0, 2.0), []
-    energy = float((w * (flow**2).sum(1)).sum()) + 1e-12
-    for degrees in pitches:
-        s, c = np.sin(np.radians(degrees)), np.cos(np.radians(degrees))
-        near, far = s + y_bottom * c, s + y_top * c
-        if far < near / 12.0:  # the surface would reach the horizon inside the mask
-            cost.append(np.inf)
-            continue
-        inverse = s + y * c
-        # plane axes in camera coordinates: right (1,0,0), away (0,-s,c)
-        basis = np.stack([np.stack([inverse, 0 * x], 1), np.stack([-x * c * inverse, (-s - y * c) * inverse], 1)], 2)
-        a = (basis * np.sqrt(w)[:, None, None]).reshape(-1, 2) * camera.focal[0]
-        b = (flow * np.sqrt(w)[:, None]).reshape(-1)
-        solution, *_ = np.linalg.lstsq(a, b, rcond=None)
-        misfit = float(((a @ solution - b) ** 2).sum()) / energy
-        cost.append(misfit)
-    cost = np.asarray(cost)
-    finite = np.isfinite(cost)
-    if not finite.any():
-        return float(pitches[-1]), 0.0
-    # the least misfit says how far the motion is from uniform; flow errors are correlated over the picture, so that
-    # thousands of pixels are some tens of independent looks
-    looks, floor = 40.0, 0.02
-    least = float(cost[finite].min())
-    log_likelihood = 0.5 * looks * (cost - least) / (least + floor)
-    posterior = log_likelihood + 0.5 * ((pitches - mean) / sigma) ** 2
-    best = int(np.argmin(np.where(finite, posterior, np.inf)))
-    spread = float(np.ptp(log_likelihood[finite]))
-    return float(pitches[best]), float(np.clip(spread / 10.0, 0.0, 0.8))
 
 
 def level_camera(camera: PinholeCamera, up: UpEvidence) -> PinholeCamera:

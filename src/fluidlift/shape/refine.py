@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -23,7 +24,8 @@ from scipy.ndimage import distance_transform_edt
 from fluidlift.errors import InputRejected, require
 from fluidlift.numerics.harmonics import basis
 from fluidlift.numerics.splatting import View
-from fluidlift.numerics.splatting_torch import project, rasterize, rotation_matrices
+from fluidlift.numerics.splatting_torch import NumbaRasterizer, rotation_matrices
+from fluidlift.seams import Rasterizer
 from fluidlift.shape.guard import Frame, ShapeFigures, broken, neighbours, picture_and_figures, plain_color, psnr
 from fluidlift.shape.losses import (
     LossWeights,
@@ -79,6 +81,7 @@ def refine(
     seed: int = 0,
     max_gaussians: int = 60_000,
     weights: LossWeights | None = None,
+    rasterizer: Rasterizer | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> RefineResult:
     """Fit Gaussians to one frame; split where the picture asks for it, prune what belongs to rocks and banks.
@@ -94,6 +97,7 @@ def refine(
         seed: of the shifts between the copies of cloned Gaussians.
         max_gaussians: densification stops here (never fewer than came in).
         weights: of the loss.
+        rasterizer: draws; None: the CPU's.
         progress: called with (done, total).
 
     Raises:
@@ -118,7 +122,8 @@ def refine(
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # torch's spinning threads would slow the kernels, which use all cores themselves
     try:
-        return _run(gaussians, frame, first, before, iterations, weights, seed, max_gaussians, progress)
+        step = partial(_step, weights=weights, rasterizer=rasterizer or NumbaRasterizer())
+        return _run(gaussians, frame, first, before, iterations, step, seed, max_gaussians, progress)
     finally:
         torch.set_num_threads(threads)
 
@@ -200,7 +205,8 @@ class _Raw:
 
 def _run(
     gaussians: Gaussians, frame: Frame, first: ShapeFigures, before: float, iterations: int,
-    weights: LossWeights, seed: int, max_gaussians: int, progress: Callable[[int, int], None] | None,
+    step: Callable[..., tuple[float, torch.Tensor]], seed: int, max_gaussians: int,
+    progress: Callable[[int, int], None] | None,
 ) -> RefineResult:  # fmt: skip
     rng = torch.Generator().manual_seed(seed)
     seen = _in_front(gaussians, frame.view)
@@ -222,7 +228,7 @@ def _run(
         # later on the opposite colour every other time: what is tinted by the background at the border loses its tint
         if i % 4 == 0 and 2 * i >= iterations:
             shown = opposite
-        history[i], push = _step(raw, shown, weights, unit, pace)
+        history[i], push = step(raw, shown, unit, pace)
         pushes += push
         if i + 1 in density_steps:
             room = max(max_gaussians, len(gaussians)) - len(unseen)
@@ -258,16 +264,17 @@ def _in_front(gaussians: Gaussians, view: View) -> np.ndarray:
     return finite & np.isfinite(gaussians.quats).all(1) & np.isfinite(gaussians.sh).all((1, 2)) & (z > view.near)
 
 
-def _step(raw: _Raw, frame: Frame, weights: LossWeights, unit: float, pace: float) -> tuple[float, torch.Tensor]:
+def _step(
+    raw: _Raw, frame: Frame, unit: float, pace: float, *, weights: LossWeights, rasterizer: Rasterizer
+) -> tuple[float, torch.Tensor]:
     """One iteration; the loss and how hard the picture pulls at each Gaussian's centre (normalised coordinates)."""
     free = {k: v.detach().requires_grad_() for k, v in raw.free.items()}
     target, weight = torch.from_numpy(frame.target), torch.from_numpy(frame.weight)
     means, scales, opacities, colors = raw.activated(free)
-    uv, conics, depths, extents = project(means, free["quats"], scales, opacities, frame.view)
-    uv.retain_grad()
     z = means @ torch.from_numpy(np.float32(frame.view.rotation[2])) + float(frame.view.translation[2])
     features = torch.cat([colors, z[:, None]], 1)
-    drawn, light = rasterize(uv, conics, opacities, features, depths, extents, frame.view.size)
+    splatted = rasterizer.splat(means, free["quats"], scales, opacities, features, frame.view)
+    drawn, light = splatted.image, splatted.light
     picture = drawn[..., :3] + light[..., None] * torch.tensor(frame.plain)
     sizes = scales / unit
     loss = (
@@ -281,7 +288,7 @@ def _step(raw: _Raw, frame: Frame, weights: LossWeights, unit: float, pace: floa
     loss.backward()
     gradients = {k: v.grad for k, v in free.items() if v.grad is not None}
     raw.step(gradients, pace)
-    return float(loss.detach()), uv.grad.norm(dim=1) * (0.5 * max(frame.view.size))
+    return float(loss.detach()), splatted.pull().to(means.device).norm(dim=1) * (0.5 * max(frame.view.size))
 
 
 def _densify(raw: _Raw, pushes: torch.Tensor, room: int, view: View, depth: np.ndarray, rng: torch.Generator) -> None:

@@ -6,7 +6,7 @@ which the fluid is about 1 away. `place` (shape/place.py) turns that into metres
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -15,7 +15,9 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from fluidlift.errors import InputRejected, require
+from fluidlift.shape import slope
 from fluidlift.shape.kind import Kind
+from fluidlift.shape.slope import SlopeEvidence
 from fluidlift.types import PinholeCamera
 
 FAR = 12.0
@@ -58,6 +60,24 @@ class ProfileHeight:
 
 
 @dataclass(frozen=True)
+class ProfileAlongHeight:
+    """A surface that is level across a stream: z depends on the distance along it alone."""
+
+    ahead: tuple[float, float]
+    """unit vector that points downstream over the ground"""
+    along: Float[np.ndarray, "k"]
+    """increasing distances (x, y) . ahead"""
+    z: Float[np.ndarray, "k"]
+
+    def height(self, xy: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
+        """z above the ground positions; straight on beyond both ends."""
+        s = xy[..., 0] * self.ahead[0] + xy[..., 1] * self.ahead[1]
+        first, last = np.diff(self.z)[[0, -1]] / np.diff(self.along)[[0, -1]]
+        before, after = np.minimum(s - self.along[0], 0.0), np.maximum(s - self.along[-1], 0.0)
+        return np.interp(s, self.along, self.z) + first * before + last * after
+
+
+@dataclass(frozen=True)
 class SampledHeight:
     """A surface through given points: inverse-distance mean of the nearest four."""
 
@@ -83,6 +103,8 @@ class FrontSurface:
     """half the extent along the view for bodies in the air; 0 for a fluid that lies on something"""
     height: HeightModel | None
     """for a fluid that lies on something"""
+    slope: SlopeEvidence | None = None
+    """where its motion was asked how steep it runs"""
 
 
 def level_surface(camera: PinholeCamera, mask: Bool[np.ndarray, "h w"]) -> FrontSurface:
@@ -99,6 +121,84 @@ def level_surface(camera: PinholeCamera, mask: Bool[np.ndarray, "h w"]) -> Front
         )
     drop = float(np.median(down[mask & visible]))
     return _from_height(camera, PlaneHeight((0.0, 0.0), -drop), np.where(visible, drop / np.maximum(down, 1e-6), 0.0))
+
+
+def stream_surface(
+    camera: PinholeCamera,
+    mask: Bool[np.ndarray, "h w"],
+    motion: Float[np.ndarray, "h w 2"],
+    trust: Float[np.ndarray, "h w"],
+    interval: float,
+    *,
+    camera_height: float | None = None,
+    tilt_known: bool = True,
+) -> FrontSurface:
+    """The surface of a stream or a film: as steep as its motion shows, and lower where it has become faster.
+
+    The plane comes from `slope.estimate_slope`. Where the camera's height over the water is known, so are metres per
+    second, and along a streamline of the surface, at the pressure of the air, v^2 / 2g + z falls by friction alone
+    (Bernoulli): the water that speeds up stands lower, and it slopes at least as Manning's formula says. A stream that
+    slows down is taken to lose that energy in eddies instead of rising.
+
+    Args:
+        camera: canonical, z up.
+        mask: fluid pixels.
+        motion: mean optical flow, px per interval.
+        trust: of the flow, 0 to 1.
+        interval: s.
+        camera_height: m above the water, where surveyed.
+        tilt_known: the camera's tilt was given.
+
+    Raises:
+        InputRejected: the camera does not look down at the surface.
+    """
+    patches = slope.flow_patches(mask, motion, trust)
+    evidence = slope.estimate_slope(camera, patches, tilt_known=tilt_known)
+    front = level_surface(camera, mask) if evidence.slope == 0 else _sloping_plane(camera, mask, evidence)
+    front = replace(front, slope=evidence)
+    if patches is None or camera_height is None or camera_height <= 0:
+        return front
+    return _with_energy(camera, mask, front, patches, evidence, camera_height, interval)
+
+
+def _sloping_plane(camera: PinholeCamera, mask: np.ndarray, evidence: SlopeEvidence) -> FrontSurface:
+    """A plane at depth 1 in the median over the fluid."""
+    axes = slope.plane_axes(np.radians(evidence.slope), np.radians(evidence.heading))
+    facing = -camera.rays(camera.pixel_grid()) @ axes[2]
+    visible = facing > max(float(np.percentile(facing[mask], 99)) / FAR, 1e-3)
+    drop = float(np.median(facing[mask & visible]))
+    normal = axes[2]
+    plane = PlaneHeight((-normal[0] / normal[2], -normal[1] / normal[2]), -drop / normal[2])
+    return _from_height(camera, plane, np.where(visible, drop / np.maximum(facing, 1e-6), 0.0))
+
+
+def _with_energy(camera, mask, front, patches, evidence, camera_height, interval):
+    """The same surface, bent along the stream by what its speeds say (m, s), and the evidence completed."""
+    angle, heading = np.radians(evidence.slope), np.radians(evidence.heading)
+    axes = slope.plane_axes(angle, heading)
+    seen = mask & (front.depth > 0)
+    points = camera.unproject(camera.pixel_grid()[seen], front.depth[seen].astype(np.float64))
+    metres = camera_height / -float(np.median(points[:, 2]))
+    drop = -float(np.median(points @ axes[2]))
+    along, speed = slope.speed_along(camera, patches, axes, drop)
+    across = points @ axes[1]
+    width = metres * float(np.ptp(np.percentile(across, [5.0, 95.0])))
+    run, fall = slope.energy_profile(
+        metres * along, metres * speed / interval, patches.weight, slope.Channel(width, evidence.slope)
+    )
+    # distances along the slope, seen over the ground
+    ground = run / metres * np.cos(angle)
+    middle = np.median(points[:, :2] @ axes[0, :2]) / max(np.cos(angle), 1e-9)
+    start = float(np.median(points[:, 2]))
+    z = start - (fall - np.interp(middle, ground, fall)) / metres
+    ahead = (float(np.cos(heading)), float(np.sin(heading)))
+    profile = ProfileAlongHeight(ahead, ground, z)
+    bent = _from_height(camera, profile, intersect_height(camera, profile, 0.2, FAR))
+    if not (bent.depth[seen] > 0).mean() > 0.98:
+        return front
+    mean = float(np.degrees(np.arctan2(fall[-1] - fall[0], run[-1] - run[0])))
+    source = evidence.source if evidence.slope > 0 else "energy of the motion, and friction"
+    return replace(bent, slope=replace(evidence, slope=mean, source=source))
 
 
 def falling_surface(

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Int, UInt8
+from scipy.spatial import cKDTree
 
 from fluidlift.errors import require
 from fluidlift.types.gaussians import Gaussians, concatenate
@@ -65,8 +66,9 @@ def unite(bodies: Sequence[Gaussians], *, spacing: float, per_voxel: int = 1, wh
         bodies: nearest frame first; world, m.
         spacing: of the voxels, m. At or below the distance of neighbouring Gaussians the first body stays as it is.
         per_voxel: Gaussians per voxel at most.
-        whole_first: the first body keeps all of its Gaussians. Where the camera is near, they are closer together than
-            the voxels, and a surface of small splats that is thinned has holes.
+        whole_first: the first body keeps all of its Gaussians, and the others give only what lies a whole voxel away
+            from it. Where the camera is near, its Gaussians are closer together than the voxels, and a surface of small
+            splats that is thinned has holes; one over which the splats of other frames lie is blurred.
     """
     require(len(bodies) > 0, "no body to unite", "one at least")
     require(np.isfinite(spacing) and spacing > 0, f"spacing {spacing}", "positive metres")
@@ -86,5 +88,17 @@ def unite(bodies: Sequence[Gaussians], *, spacing: float, per_voxel: int = 1, wh
     start = np.flatnonzero(first)[np.cumsum(first) - 1]
     kept = (number == number[start]) & (np.arange(len(order)) - start < per_voxel)
     if whole_first:
-        kept |= number == 0
+        own = number == 0
+        kept = own | (kept & ~_beside(cells[order], own))
     return everything.select(np.sort(order[kept]))
+
+
+def _beside(cells: Int[np.ndarray, "n 3"], own: Bool[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
+    """Whether a cell of the others is, or touches, one of `own` (with its faces, edges or corners)."""
+    out = np.zeros(len(cells), bool)
+    others = np.flatnonzero(~own)
+    if len(others) == 0 or not own.any():
+        return out
+    near, _ = cKDTree(np.unique(cells[own], axis=0)).query(cells[others], distance_upper_bound=1.9)
+    out[others] = np.isfinite(near)  # the corners are sqrt(3) away, the next but one 2
+    return out

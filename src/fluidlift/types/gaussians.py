@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fluidlift.errors import require
+from fluidlift.types import harmonics
 from fluidlift.types.transforms import Similarity3, matrix_from_quat, quat_from_matrix
 
 SH_C0 = 0.28209479177387814
@@ -87,9 +88,15 @@ class Gaussians:
         )
 
     def transformed(self, target_from_source: Similarity3) -> Gaussians:
-        """Moved, turned and scaled as one body. View-dependent harmonics (degree > 0) are kept as they are."""
+        """Moved, turned and scaled as one body: it looks the same from a camera that was moved with it."""
         t = target_from_source
-        return replace(self, means=t.points(self.means), quats=t.quats(self.quats), scales=self.scales * t.scale)
+        return replace(
+            self,
+            means=t.points(self.means),
+            quats=t.quats(self.quats),
+            scales=self.scales * t.scale,
+            sh=harmonics.rotated(self.sh, t.rotation),
+        )
 
 
 def sh_from_rgb(rgb: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 1 3"]:

@@ -1,0 +1,72 @@
+"""The look of fluid that was drawn out further than its splats can show.
+
+A splat that is sheared becomes a needle, and starts again round (`physics.deform`). What it stood for is a filament by
+then, folded between those of other colours, finer than the splats. Round splats that keep their colours show that as
+grain and as dotted lines. Their mean is what such a mixture looks like.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+
+from fluidlift.errors import require
+from fluidlift.types.gaussians import Gaussians
+
+RESOLVED = (2.0, 3.0)
+"""a splat stretched by the first keeps its colour; by the second, where it is made round, it shows the mean"""
+
+NEIGHBOURS = 12
+"""splats that share a colour: those of two shells of a lattice"""
+
+APART = (3.0, 4.0)
+"""distance to the sixth neighbour, in largest standard deviations, from which a splat is taken to stand alone: a sheet
+of splats at its pixels has 2.6"""
+
+
+def mixed_share(deformation: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n"]:
+    """How far the colour of a particle is that of its surroundings, 0 to 1, from its deformation F (no unit).
+
+    The measure is the root mean square stretch |F| / sqrt(3): 1 at rest, and what a pure shear with the limits of
+    `RESOLVED` as its longest axis gives (s, 1, 1/s).
+    """
+    rms = np.sqrt((np.asarray(deformation, np.float64) ** 2).sum(axis=(1, 2)) / 3)
+    low, high = (np.sqrt((s * s + 1 + 1 / (s * s)) / 3) for s in RESOLVED)
+    return np.clip((np.nan_to_num(rms, nan=low) - low) / (high - low), 0.0, 1.0)
+
+
+def mixed(shown: Gaussians, deformation: Float[np.ndarray, "n 3 3"], *, widest: float) -> Gaussians:
+    """Splats that were drawn out show the mean of the colours around them, and close up with their neighbours.
+
+    Weights fall to zero at the last of the neighbours, so that colours change smoothly while neighbours come and go.
+    A splat that does not reach its neighbours (drawn out, or small and set into the coarse rows of an inlet) grows to
+    half the distance to the sixth of them, at which round splats in a regular lattice leave no gaps.
+
+    Args:
+        shown: the splats now, m.
+        deformation: F of each of them.
+        widest: standard deviation to which they may grow, m: that of a splat of the inside.
+
+    Raises:
+        ValueError: another number of deformations than of splats, or `widest` not positive.
+    """
+    require(len(shown) == len(deformation), f"{len(deformation)} deformations", f"{len(shown)}, one per splat")
+    require(widest > 0, f"widest {widest}", "positive metres")
+    sound = np.isfinite(shown.means).all(1)
+    share, size = mixed_share(deformation), shown.scales.max(axis=1, initial=0.0)
+    at = np.flatnonzero(sound & ((share > 0) | (size < 0.5 * widest)))
+    if len(at) == 0 or sound.sum() <= NEIGHBOURS:
+        return shown
+    around = np.flatnonzero(sound)
+    distance, near = cKDTree(shown.means[around]).query(shown.means[at], k=NEIGHBOURS + 1, workers=-1)
+    weight = (1 - (distance / np.maximum(distance[:, -1:], 1e-12)) ** 2) ** 2 + 1e-9
+    weight /= weight.sum(axis=1, keepdims=True)
+    share, colours = share[at], shown.sh[:, 0]
+    sh, grown = shown.sh.copy(), shown.scales.copy()
+    sh[at, 0] += share[:, None] * (np.einsum("nk,nkc->nc", weight, colours[around[near]]) - colours[at])
+    gap = distance[:, 6] / np.maximum(size[at], 1e-12)
+    alone = np.clip((gap - APART[0]) / (APART[1] - APART[0]), 0.0, 1.0)
+    least = np.maximum(share, alone) * np.minimum(0.5 * distance[:, 6], widest)
+    grown[at] = np.maximum(shown.scales[at], least[:, None])
+    return Gaussians(shown.means, shown.quats, grown, shown.opacities, sh)

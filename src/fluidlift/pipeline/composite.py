@@ -1,0 +1,139 @@
+"""A body of two parts in the geometry: what lies, and the jets that fall onto it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from fluidlift.shape import airborne, jets, place
+from fluidlift.shape.jet_column import Jet, with_columns
+from fluidlift.shape.kind import PITCH_PRIOR, Kind, UpEvidence, level_camera
+from fluidlift.shape.surface import FrontSurface
+from fluidlift.shape.terrain import Setting
+from fluidlift.types import PinholeCamera, Similarity3
+
+
+@dataclass(frozen=True)
+class Parts:
+    """What lies and what falls onto it, in the picture."""
+
+    outlines: tuple[jets.Outline, ...]
+    lying: Bool[np.ndarray, "h w"]
+    """the mask without what falls, and with what that hides"""
+    puddle: bool = False
+    """whether the lying part is a puddle: it has no downstream, so it is level"""
+
+    @property
+    def falling(self) -> Bool[np.ndarray, "h w"]:
+        """Pixels of the jets."""
+        return jets.airborne_pixels(list(self.outlines), self.lying.shape)
+
+
+def split(
+    kind: Kind,
+    camera: PinholeCamera,
+    up: UpEvidence | None,
+    mask: Bool[np.ndarray, "h w"],
+    motion: Float[np.ndarray, "h w 2"],
+    trust: Float[np.ndarray, "h w"],
+    *,
+    free: bool,
+) -> tuple[Kind, Parts]:
+    """The kind of the lying part, and the parts.
+
+    A pour whose mask is a wide puddle below narrow threads is a stream with jets: a puddle does not stand on edge.
+
+    Args:
+        kind: as it was found or given.
+        camera: of the picture.
+        up: its tilt, where that is known.
+        mask: fluid pixels.
+        motion: mean over the clip, px per frame.
+        trust: of it.
+        free: whether the kind may change (the user did not give it).
+    """
+    tilt = up or UpEvidence(PITCH_PRIOR["stream"][0], 0.0, "", 0.0)
+    found: list[jets.Outline] = []
+    neck = None
+    if kind == "stream":
+        found = jets.find_jets(level_camera(camera, tilt), mask, motion, trust)
+    elif kind == "pour" and free:
+        neck = jets.find_neck(mask, pitch=tilt.pitch)
+        kind, found = ("stream", [neck]) if neck is not None else (kind, [])
+    lying = jets.lying_pixels(mask, jets.airborne_pixels(found, mask.shape))
+    return kind, Parts(tuple(found), lying, puddle=neck is not None)
+
+
+def with_roll(up: UpEvidence, parts: Parts, camera: PinholeCamera) -> UpEvidence:
+    """The tilt, with the roll that the jets show."""
+    if not parts.outlines:
+        return up
+    roll = jets.roll_of(list(parts.outlines), level_camera(camera, replace(up, roll=0.0)))
+    return replace(up, roll=roll, source=f"{up.source}; roll from the direction of a jet")
+
+
+@dataclass(frozen=True)
+class Composite:
+    """The jets in space."""
+
+    jets: tuple[Jet, ...]
+    """canonical"""
+    pixels: Bool[np.ndarray, "h w"]
+    """where they are seen"""
+
+    def plain(self, world_from_canonical: Similarity3) -> list[dict[str, Any]]:
+        """For the stage's meta: in the world, m."""
+        return [jet.transformed(world_from_canonical).to_dict() for jet in self.jets]
+
+
+def standing(
+    front: FrontSurface, parts: Parts, camera: PinholeCamera, mask: Bool[np.ndarray, "h w"]
+) -> tuple[FrontSurface, Composite]:
+    """The visible side with the jets on it."""
+    front, found, pixels = with_columns(front, list(parts.outlines), camera, mask)
+    return front, Composite(tuple(found), pixels)
+
+
+def with_fall(
+    scale: place.MetricScale,
+    points: Float[np.ndarray, "n 3"],
+    velocities: Float[np.ndarray, "n 3"],
+    falls: Bool[np.ndarray, "n"],
+    seen: place.Sighting,
+) -> place.MetricScale:
+    """The scale from the jets' free fall, where nothing else gives one."""
+    if scale.source != "assumed" or not falls.any():
+        return scale
+    part = place.Sighting(None if seen.trust is None else seen.trust[falls], seen.interval, seen.pitch)
+    found = place.metric_scale("pour", points[falls], velocities[falls], seen=part)
+    if found.source != "free fall":
+        return scale
+    return replace(found, across=scale.across * found.value / scale.value)
+
+
+def composed(
+    setting: Setting,
+    composite: Composite,
+    world_from_canonical: Similarity3,
+    points: Float[np.ndarray, "n 3"],
+    velocities: Float[np.ndarray, "n 3"],
+    camera: PinholeCamera,
+) -> Setting:
+    """The setting with the jets' cells.
+
+    Args:
+        setting: of the lying part.
+        composite: canonical.
+        world_from_canonical: to metres.
+        points: of the lying part's surface, canonical.
+        velocities: there, canonical units per second.
+        camera: in the world.
+    """
+    if not composite.jets:
+        return setting
+    t = world_from_canonical
+    columns = [jet.transformed(t) for jet in composite.jets]
+    return airborne.with_jets(setting, columns, t.points(points), t.vectors(velocities), camera)

@@ -1,0 +1,208 @@
+"""Depth of the pictures, from the user's file or from a learned model, and the fluid's surface that it makes."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fluidlift.backends.monocular_depth import Guess, ModelWeights, make_depth_estimator
+from fluidlift.config import JobConfig
+from fluidlift.errors import InputRejected
+from fluidlift.io.stage_cache import load_stage, save_stage
+from fluidlift.pipeline.reading import Inputs, clip_of
+from fluidlift.pipeline.seeing import FluidMasks
+from fluidlift.pipeline.story import Story, content_hash, file_hash
+from fluidlift.shape import depth_surface, given_depth
+from fluidlift.shape import kind as kinds
+from fluidlift.shape.given_depth import DepthPictures, SceneDepth
+from fluidlift.shape.place import DISAGREEING, MetricScale
+from fluidlift.shape.surface import FrontSurface
+from fluidlift.types import PinholeCamera
+
+LEARNED_SCALE = 0.15
+"""relative standard error of a model's metres (published errors on unseen scenes are 5 to 30 per cent)"""
+FILE_FLOOR, MODEL_FLOOR = 0.003, 0.02
+"""relative error of depth that changes slowly over the picture, at least: a sensor or a renderer; a learned model (one
+to four per cent over a surface after its factor was taken out)"""
+HUGE, TINY = 300.0, 1e-3
+"""m across a fluid that a depth file must not make it without a word"""
+
+
+@dataclass(frozen=True)
+class DepthFront:
+    """What the pictures' depth says about a fluid."""
+
+    scene: SceneDepth
+    up: kinds.UpEvidence
+    front: FrontSurface
+    unit: float | None
+    """m per canonical unit, where the depth is in metres"""
+    learned: bool
+    meta: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def known_scale(self) -> float | None:
+        """m per canonical unit that can be relied on: a file's, not a model's."""
+        return None if self.learned else self.unit
+
+
+def wanted(inputs: Inputs, config: JobConfig) -> bool:
+    """Whether there is a depth to go by."""
+    return inputs.geometry is None and (inputs.depth is not None or config.depth.model != "none")
+
+
+def key_parts(config: JobConfig) -> dict[str, Any]:
+    """Plain values that the geometry depends on: the section, with the weights by their content."""
+    section = config.section("depth")
+    weights = section["weights"]
+    if weights is not None and Path(weights).exists():
+        section["weights"] = file_hash(Path(weights))
+    return section
+
+
+def pictures_of(
+    story: Story, inputs: Inputs, config: JobConfig, camera: PinholeCamera | None, start: int
+) -> DepthPictures | None:
+    """Depth of some frames from `start` on: of the file that was given, or of a model; None where there is neither.
+
+    Args:
+        story: with the clip.
+        inputs: the depth file.
+        config: the model.
+        camera: where it is known; some models take it, and all others say how wide they see.
+        start: first frame in which there is enough fluid.
+
+    Raises:
+        InputRejected: a file that does not fit, or weights that do not.
+        MissingPackage: of a model.
+    """
+    if not wanted(inputs, config):
+        return None
+    if inputs.depth is not None:
+        return _from_file(story, inputs.depth, config, start)
+    return _from_model(story, config, camera, start)
+
+
+def _frames(count: int, start: int, most: int) -> list[int]:
+    return [int(t) for t in np.unique(np.linspace(start, count - 1, min(most, count - start)).round())]
+
+
+def _from_file(story: Story, path: Path, config: JobConfig, start: int) -> DepthPictures:
+    from fluidlift.io.images import read_depth
+
+    clip, d = clip_of(story), config.depth
+    holds = "metres" if d.holds == "auto" else d.holds
+    values = read_depth(path, clip.size, scale=d.scale, positive=holds != "disparity")
+    if values.ndim == 2:
+        return DepthPictures(values[None], (start,), holds, "depth file", FILE_FLOOR)
+    kept = np.asarray(story["read"].arrays["kept"])
+    if len(values) != len(clip):
+        if len(values) <= kept.max(initial=0):
+            raise InputRejected(
+                f"'{path.name}' has {len(values)} pictures for {len(clip)} frames", "one, or one per frame",
+                "cut it as the clip is cut",
+            )  # fmt: skip
+        values = values[kept]
+    pick = _frames(len(clip), start, d.frames)
+    return DepthPictures(values[pick], tuple(pick), holds, "depth file", FILE_FLOOR)
+
+
+def _from_model(story: Story, config: JobConfig, camera: PinholeCamera | None, start: int) -> DepthPictures:
+    """The model's pictures, from the cache where it has seen them before: it is the slowest part of the geometry."""
+    clip, d = clip_of(story), config.depth
+    pick = _frames(len(clip), start, d.frames)
+    known = None if camera is None else camera.to_dict()
+    key = content_hash("depth", key_parts(config), story.keys.get("read"), pick, known)
+    found = load_stage(story.folder, "depth", key)
+    if found is None:
+        model = make_depth_estimator(d.model, ModelWeights(d.weights, d.device, d.download))
+        guesses: list[Guess] = []
+        for t in pick:
+            guesses.append(model.guess(np.ascontiguousarray(clip.frames[t]), camera))
+            story.step(len(guesses), len(pick))
+        views = [g.field_of_view for g in guesses if g.field_of_view is not None]
+        arrays = {"values": np.stack([g.values for g in guesses])}
+        meta = {"holds": guesses[0].holds, "field_of_view": float(np.median(views)) if views else None}
+        save_stage(story.folder, "depth", key, arrays, meta)
+        found = arrays, meta
+    arrays, meta = found
+    return DepthPictures(
+        np.asarray(arrays["values"]),
+        tuple(pick),
+        meta["holds"],
+        f"depth of {d.model}",
+        MODEL_FLOOR,
+        meta["field_of_view"],
+    )
+
+
+def depth_front(
+    pictures: DepthPictures, fluid: FluidMasks, camera: PinholeCamera, up: kinds.UpEvidence, kind: kinds.Kind,
+    mask: np.ndarray, motion: np.ndarray, trust: np.ndarray, *, expected: FrontSurface, tilt_known: bool,
+) -> DepthFront:  # fmt: skip
+    """Surface, tilt and scale by the depth.
+
+    Args:
+        pictures: of some frames.
+        fluid: masks of the clip.
+        camera: pose not used.
+        up: as it is known, or taken to be without the depth.
+        kind: of the fluid.
+        mask: the fluid whose surface is wanted.
+        motion: mean optical flow, px per frame.
+        trust: of the flow.
+        expected: surface that the fluid would be taken to have otherwise, for what the pictures cannot say.
+        tilt_known: whether `up` is surveyed or the user's.
+
+    Raises:
+        InputRejected: a depth that says nothing about the fluid, or cannot be of this view.
+    """
+    fused = given_depth.fuse(pictures, np.stack([fluid[t] for t in pictures.frames]), mask)
+    scene = given_depth.scene_depth(fused, expected.depth, mask)
+    meta: dict[str, Any] = {
+        "source": scene.source, "frames": scene.frames, "flicker": scene.flicker, "holds": fused.holds,
+    }  # fmt: skip
+    slopes, usual = depth_surface.slopes_by_motion(expected.slope), expected.height
+    if kind == "stream" and not tilt_known and fused.holds != "disparity":
+        up, slope = depth_surface.up_from_depth(scene, camera, mask, motion, trust)
+        slopes, usual = ((1.0, slope, 0.5),), None
+    level = kinds.level_camera(camera, up)
+    if kind == "stream":
+        front, evidence = depth_surface.stream_surface(scene, level, mask, motion, trust, slopes=slopes, usual=usual)
+        meta["slope"] = asdict(evidence)
+    elif kind == "fall":
+        front = depth_surface.fall_surface(scene, level, mask)
+    else:
+        front = depth_surface.airborne_surface(scene, level, mask, kind)
+    learned = pictures.source != "depth file"
+    return DepthFront(scene, up, front, scene.unit, learned, meta)
+
+
+def with_learned_scale(scale: MetricScale, found: DepthFront, points: np.ndarray) -> MetricScale:
+    """The scale, from a model's metres where nothing else is known: they are right to some ten per cent or so."""
+    if scale.source != "assumed" or found.unit is None or not found.learned:
+        return scale
+    extent = float(np.ptp(np.percentile(points, [0.5, 99.5], axis=0), axis=0).max())
+    return MetricScale(found.unit, "depth", relative_error=LEARNED_SCALE, across=found.unit * extent)
+
+
+def size_warnings(across: float, found: DepthFront, camera_height: float | None, points: np.ndarray) -> list[str]:
+    """What to say about a depth file whose metres are hardly meant, or not those of the surveyed camera."""
+    if found.learned or found.unit is None:
+        return []
+    told = []
+    if not TINY < across < HUGE:
+        likely = "millimetres: set depth.scale=0.001" if across >= HUGE else "kilometres: set depth.scale=1000"
+        told.append(f"the depth file makes the fluid {across:.3g} m across; is it in {likely}?")
+    drop = float(-np.median(points[:, 2]))
+    if camera_height is not None and camera_height > 0 and drop > 0:
+        ratio = found.unit * drop / camera_height
+        if not 1 / DISAGREEING < ratio < DISAGREEING:
+            told.append(
+                f"the depth file puts the camera {found.unit * drop:.3g} m above the water, the camera file "
+                f"{camera_height:.3g} m: one of them has another unit; the depth is taken"
+            )
+    return told

@@ -1,0 +1,202 @@
+"""The place of a body that moves through the air: a jet above its pool, a plume above a floor."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from fluidlift.shape.jet_column import Jet
+from fluidlift.shape.kind import Kind
+from fluidlift.shape.terrain import Setting, at_cells, terrain_mesh, unit
+from fluidlift.types import CellType, Grid, PinholeCamera, Terrain
+
+PASSING = 0.25
+"""speed along the stream at one of its ends over that of its swift part (90th percentile), above which fluid enters or
+leaves there. On the cases at hand dead ends have 0.1 to 0.2 of it, live ones 0.4 and more"""
+AT_THE_END = 0.25
+"""share of the length of the lying part within which a jet stands at its upstream end: what moves there spreads from
+it"""
+
+
+def airborne_setting(
+    front: Float[np.ndarray, "h w"],
+    back: Float[np.ndarray, "h w"],
+    mask: Bool[np.ndarray, "h w"],
+    camera: PinholeCamera,
+    body: Float[np.ndarray, "n 3"],
+    mainstream: Float[np.ndarray, "3"],
+    *,
+    kind: Kind,
+    longest: int,
+    cell_limit: int,
+) -> Setting:
+    """A jet or a plume: free in the air above a floor; a jet that ends in a wider pool gets a vessel to hold it.
+
+    Args:
+        front: camera depth of the near side, m.
+        back: of the far side, m.
+        mask: fluid pixels of the first instant.
+        camera: in the world.
+        body: points of the fluid over the whole clip, world (the box must hold all of it).
+        mainstream: direction of the bulk flow, world.
+        kind: pour or plume.
+        longest: cells along the longest side.
+        cell_limit: most cells of the grid.
+    """
+    low, high = np.percentile(body, 0.2, axis=0), np.percentile(body, 99.8, axis=0)
+    extent = high - low
+    spacing = extent.max() / longest
+    for _ in range(80):
+        side = (0.35 if kind == "pour" else 0.2) * max(extent[0], extent[1]) + 4 * spacing
+        above = (0.1 if kind == "pour" else 0.2) * extent[2] + 3 * spacing
+        origin = (low[0] - side, low[1] - side, low[2] - 3 * spacing)
+        size = (extent[0] + 2 * side, extent[1] + 2 * side, extent[2] + above + 3 * spacing)
+        nx, ny, nz = (int(np.ceil(v / spacing)) for v in size)
+        grid = Grid((nx, ny, nz), spacing, origin)
+        if grid.cells <= cell_limit:
+            break
+        spacing *= 1.05
+    h = grid.spacing
+    nodes, centers = grid.nodes(), grid.centers()
+    phi = nodes[..., 2] - low[2] + 0.5 * h
+    vessel = _vessel(body) if kind == "pour" else None
+    if vessel is not None:
+        (cx, cy), radius, level = vessel
+        rim = level + 0.5 * (level - low[2])
+        r = np.hypot(nodes[..., 0] - cx, nodes[..., 1] - cy)
+        wall = np.maximum(np.abs(r - (radius + 1.5 * h)) - 1.2 * h, nodes[..., 2] - rim)
+        phi = np.minimum(phi, wall)
+    solid = at_cells(phi) < 0
+    fluid = inside_body(centers.reshape(-1, 3), front, back, mask, camera).reshape(grid.shape) & ~solid
+    cells = np.full(grid.shape, CellType.EMPTY, np.uint8)
+    cells[solid] = CellType.SOLID
+    cells[fluid] = CellType.FLUID
+    if fluid.any():
+        z = centers[..., 2]
+        if kind == "pour":
+            cells[fluid & (z > z[fluid].max() - 2.0 * h)] = CellType.INFLOW
+        else:
+            cells[fluid & (z < z[fluid].min() + 3.0 * h)] = CellType.INFLOW
+    border = np.ones(grid.shape, bool)
+    border[2:-2, 2:-2, :-2] = False
+    if kind == "pour":
+        border[:, :, -2:] = False  # what pours leaves sideways over the floor
+        border[2:-2, 2:-2] = False
+    cells[border & ~solid] = CellType.OUTFLOW
+    terrain = Terrain(grid, phi.astype(np.float32), unit(mainstream), terrain_mesh(grid, phi))
+    bed = np.full(grid.shape[:2], low[2] - 0.5 * h)
+    return Setting(terrain, cells, None, bed, None if vessel is None else vessel[2])
+
+
+def inside_body(
+    points: Float[np.ndarray, "n 3"], front: np.ndarray, back: np.ndarray, mask: np.ndarray, camera: PinholeCamera
+) -> Bool[np.ndarray, "n"]:
+    """Which world points lie between the near and the far side of the body seen by the camera."""
+    uv, z = camera.project(points)
+    height, width = mask.shape
+    col, row = np.floor(uv[:, 0]).astype(int), np.floor(uv[:, 1]).astype(int)
+    ok = (col >= 0) & (col < width) & (row >= 0) & (row < height) & (z > 0)
+    col, row = np.clip(col, 0, width - 1), np.clip(row, 0, height - 1)
+    return ok & mask[row, col] & (z >= front[row, col]) & (z <= back[row, col])
+
+
+def _vessel(body: np.ndarray) -> tuple[tuple[float, float], float, float] | None:
+    """Axis, radius and filling height of a container around the lower part of a body, if that is much wider than the
+    upper part and holds its width (a pool that a jet falls into)."""
+    z = body[:, 2]
+    edges = np.linspace(z.min(), z.max(), 13)
+    widths = np.zeros(12)
+    for i in range(12):
+        layer = (z >= edges[i]) & (z <= edges[i + 1])
+        if layer.sum() > 5:
+            widths[i] = np.ptp(np.percentile(body[layer, 0], [2, 98]))
+    widest = np.percentile(widths, 90)
+    wide = widths > 0.6 * widest
+    first_narrow = int(np.argmin(wide)) if not wide.all() else 12
+    if first_narrow < 2 or first_narrow > 10 or np.median(widths[first_narrow:]) > 0.55 * widest:
+        return None
+    pool = body[z <= edges[first_narrow]]
+    centre = 0.5 * (np.percentile(pool[:, :2], 2, axis=0) + np.percentile(pool[:, :2], 98, axis=0))
+    return (float(centre[0]), float(centre[1])), 0.5 * float(widest), float(edges[first_narrow])
+
+
+def with_jets(
+    setting: Setting,
+    jets: list[Jet],
+    points: Float[np.ndarray, "n 3"],
+    velocities: Float[np.ndarray, "n 3"],
+    camera: PinholeCamera,
+) -> Setting:
+    """A lying fluid with jets above it: cells for them, and the inlet at their tops.
+
+    The upstream end of the lying part stays an inlet where the picture's edge cuts it, or where fluid moves in
+    (`PASSING`) and no jet stands there; else it is a dead end that the jets feed. What is fed by jets alone and hardly
+    moves at its downstream end is a puddle, and closed.
+
+    Args:
+        setting: of the lying part.
+        jets: world, m.
+        points: of the lying part's visible surface, world, m.
+        velocities: there, m/s.
+        camera: in the world.
+    """
+    grid = setting.terrain.grid
+    h = grid.spacing
+    jets = [j for j in jets if (j.radius.max() > 0.5 * h) & grid.contains(np.array([[*j.axis, grid.low[2] + h]]))[0]]
+    if not jets:
+        return setting
+    top = max(j.top for j in jets)
+    # a jet that would double the height of the box is cut
+    extra = int(np.clip(np.ceil((top - grid.high[2]) / h) + 3, 0, grid.shape[2]))
+    taller = Grid((grid.shape[0], grid.shape[1], grid.shape[2] + extra), h, grid.origin)
+    above = setting.terrain.signed_distance[..., -1:] + h * np.arange(1, extra + 1, dtype=np.float32)
+    phi = np.concatenate([setting.terrain.signed_distance, above], axis=2).astype(np.float32)
+    lid = np.where(setting.cell_types[..., -1:] == CellType.OUTFLOW, CellType.OUTFLOW, CellType.EMPTY)
+    cells = np.concatenate([setting.cell_types, np.repeat(lid, extra, axis=2)], axis=2).astype(np.uint8)
+    centers = taller.centers()
+    below = centers[..., 2] < np.asarray(setting.surface_height)[..., None]
+    for kind in (CellType.INFLOW, CellType.OUTFLOW):
+        if _is_open(setting, kind, jets, (points, velocities), camera):
+            break
+        cells = np.where(cells == kind, np.where(below, CellType.FLUID, CellType.EMPTY), cells).astype(np.uint8)
+    for jet in jets:
+        inside = jet.contains(centers, least=0.75 * h) & np.isin(cells, (CellType.EMPTY, CellType.FLUID))
+        if not inside.any():
+            continue
+        end = centers[inside][:, 2].max()
+        cells[inside] = CellType.FLUID
+        cells[inside & (centers[..., 2] > end - 2.5 * h)] = CellType.INFLOW
+    solid = setting.terrain
+    terrain = Terrain(taller, phi, solid.mainstream, solid.mesh)
+    return replace(setting, terrain=terrain, cell_types=cells)
+
+
+def _is_open(setting: Setting, kind: CellType, jets: list[Jet], seen, camera: PinholeCamera) -> bool:
+    """Whether fluid passes through the end of a lying fluid: it is cut by the picture's edge, or moves there."""
+    grid = setting.terrain.grid
+    z = grid.centers()[..., 2]
+    low = (setting.cell_types == kind) & (z < np.asarray(setting.surface_height)[..., None])
+    columns = low.any(axis=2)
+    if not columns.any():
+        return False
+    place = np.concatenate([grid.centers()[:, :, 0, :2], np.asarray(setting.surface_height)[..., None]], axis=-1)[
+        columns
+    ]
+    uv, _ = camera.project(place)
+    size = np.array(camera.size)
+    margin = 0.01 * size
+    if kind == CellType.INFLOW and ((uv < margin) | (uv > size - margin)).any(axis=1).mean() > 0.3:
+        return True
+    points, velocities = seen
+    flow = unit(setting.terrain.mainstream[:2]) if np.any(setting.terrain.mainstream[:2]) else np.array([1.0, 0.0])
+    s = points[:, :2] @ flow
+    first = min(float(np.asarray(j.axis) @ flow) for j in jets)
+    if kind == CellType.INFLOW and first < s.min() + AT_THE_END * np.ptp(s):
+        return False
+    known = np.isfinite(velocities).all(axis=1)
+    along = velocities[known] @ setting.terrain.mainstream
+    gap = np.linalg.norm(points[known][:, None, :2] - place[None, :: max(len(place) // 60, 1), :2], axis=-1).min(axis=1)
+    near = gap < 3.0 * grid.spacing
+    return not near.any() or float(np.median(along[near])) > PASSING * float(np.percentile(along, 90))

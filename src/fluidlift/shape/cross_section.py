@@ -1,0 +1,136 @@
+"""How deep water is where only its surface is seen: a typical depth, how it changes along the stream, and the shape of
+bed, banks and rocks across it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import ndimage
+
+from fluidlift.shape.kind import Kind
+
+DEPTH_SHARE: dict[str, float] = {"stream": 0.2, "fall": 0.1}
+"""greatest water depth over the full width: a single view does not show the bed (a choice; --depth-ratio overrides)"""
+
+REPOSE = 0.7
+"""slope of a bank under water: the tangent of 35 degrees, the angle of repose of gravel and soil (30 to 40 degrees)"""
+
+ROCK_FLANK = 2.0
+"""slope of a rock under water; a sphere that is half out of the water has steeper ones, a slab flatter ones"""
+
+CONTINUITY = 0.6
+"""exponent on 1 / (speed x width): the share of what the discharge says about the depth that is believed. Depth varies
+by about 35 % along a reach, and a surface speed misjudges the mean one by about 30 %: 0.35^2 / (0.35^2 + 0.3^2)"""
+
+STRAIGHT = 0.5
+"""how far the bed is drawn to a straight line along the stream: a reach's bed is straighter than its water"""
+
+
+@dataclass(frozen=True)
+class Reach:
+    """What is known of the water from above, one entry per column."""
+
+    wet: Bool[np.ndarray, "nx ny"]
+    """water, and the rocks that stand in it"""
+    rock: Bool[np.ndarray, "nx ny"]
+    level: Float[np.ndarray, "nx ny"]
+    """z of the water's surface, m"""
+    along: Float[np.ndarray, "nx ny"]
+    """distance along the stream, m"""
+    speed: Float[np.ndarray, "nx ny"]
+    """of the surface, m/s; nan where it is not known"""
+    spacing: float
+    """width of a column, m"""
+
+
+def distance_inside(inside: Bool[np.ndarray, "nx ny"], spacing: float) -> Float[np.ndarray, "nx ny"]:
+    """Distance (m) of each true cell to the nearest false one; the map's edge is no bank."""
+    if inside.all():
+        return np.full(inside.shape, spacing * max(inside.shape) / 2)
+    pad = max(inside.shape)
+    return ndimage.distance_transform_edt(np.pad(inside, pad, mode="edge"))[pad:-pad, pad:-pad] * spacing
+
+
+def depth_along(reach: Reach, depth: float, width: float, kind: Kind) -> Float[np.ndarray, "nx ny"]:
+    """Greatest depth (m) of the section that each column lies in.
+
+    The same discharge passes every section, so that depth x width x speed is the same in all of them: a narrow or fast
+    part is shallower than its neighbours say, by `CONTINUITY`. Then the bed is drawn to a straight line.
+
+    Args:
+        reach: the water from above.
+        depth: of a typical section, m.
+        width: typical, m; what changes over less than half of it along the stream does not count.
+        kind: of a fall, the bed is not straight.
+    """
+    h = reach.spacing
+    free = reach.wet & ~reach.rock
+    if not free.any():
+        return np.full(reach.wet.shape, depth)
+    start = float(reach.along[free].min())
+    station = np.floor((reach.along - start) / h + 0.5).astype(int)
+    count = int(station[free].max()) + 1
+    blur = max(0.5 * width / h, 1.0)
+
+    def smooth(values, where) -> np.ndarray:
+        sums = np.bincount(station[where], values[where], count)
+        return ndimage.gaussian_filter1d(sums, blur, mode="nearest")
+
+    ones = np.ones(free.shape)
+    columns = smooth(ones, free)
+    level = smooth(reach.level, free) / np.maximum(columns, 1e-9)
+    measured = free & np.isfinite(reach.speed)
+    factor = np.ones(count)
+    if measured.sum() >= 0.2 * free.sum():
+        seen = smooth(ones, measured)
+        flux = columns * smooth(reach.speed, measured) / np.maximum(seen, 1e-9)
+        good = (seen > 0.1 * np.median(seen)) & (flux > 0)
+        if good.any():
+            flux = np.interp(np.arange(count), np.flatnonzero(good), flux[good])
+            factor = np.clip((np.median(flux) / flux) ** CONTINUITY, 0.5, 2.0)
+    section = depth * factor
+    if kind == "stream" and count > 2:
+        bed = level - section
+        line = np.polyval(np.polyfit(np.arange(count), bed, 1, w=np.sqrt(columns)), np.arange(count))
+        section = np.clip(level - (STRAIGHT * line + (1 - STRAIGHT) * bed), 0.4 * depth, 2.5 * depth)
+    return section[np.clip(station, 0, count - 1)]
+
+
+def thickness(
+    reach: Reach, section: Float[np.ndarray, "nx ny"], width: float, slope: float = REPOSE
+) -> Float[np.ndarray, "nx ny"]:
+    """Depth (m) of the water in each column: banks at their slope, down to a flat bed; 0 where it is dry.
+
+    Args:
+        reach: the water from above.
+        section: greatest depth of the section that each column lies in, m.
+        width: typical, m: a section that is deep for its width has steeper banks, or its bed would never be reached.
+        slope: of the banks under water.
+    """
+    bank = distance_inside(reach.wet, reach.spacing)
+    share = bank * np.maximum(slope, section / (0.4 * width)) / np.maximum(section, 1e-12)
+    below = section * share / (1.0 + share**6) ** (1 / 6)  # the smaller of both, with a rounded foot
+    if reach.rock.any():
+        beside = ndimage.distance_transform_edt(~reach.rock) * reach.spacing
+        below = np.minimum(below, ROCK_FLANK * beside)
+    return np.where(reach.wet, below, 0.0)
+
+
+def rock_height(reach: Reach) -> Float[np.ndarray, "nx ny"]:
+    """How far the rocks stand out of the water, m; 0 elsewhere.
+
+    Domes seven tenths as high as half of them is wide, on a step as high as the water climbs when it stops at them,
+    v^2 / 2g (Bernoulli), and a cell: a rock that stands out in the picture is not run over.
+    """
+    if not reach.rock.any():
+        return np.zeros(reach.rock.shape)
+    h, known = reach.spacing, np.isfinite(reach.speed)
+    climb = float(np.median(reach.speed[known]) ** 2) / (2 * 9.81) if known.any() else 0.0
+    label, count = ndimage.label(reach.rock, structure=np.ones((3, 3)))
+    inner = distance_inside(reach.rock, h)
+    radius = np.concatenate([[0.0], np.atleast_1d(ndimage.maximum(inner, label, range(1, count + 1)))])[label]
+    dome = 0.7 * np.sqrt(np.maximum(2 * radius * inner - inner**2, 0.0))
+    return np.where(reach.rock, h + min(climb, 3.0 * h) + dome, 0.0)

@@ -1,0 +1,247 @@
+"""A fluid that lies on something, seen from above: which columns of a grid are water, rock or bank."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from fluidlift.errors import require
+from fluidlift.shape.cross_section import distance_inside
+from fluidlift.shape.surface import HeightModel
+from fluidlift.types import Grid, Label, PinholeCamera
+
+COARSE = 96
+"""columns along the longer side of the plan that extent and width are taken from"""
+
+TAIL = 0.05
+"""of the width: what is thinner than twice this is a tail of the mask, not a part of the stream"""
+
+GRAZING = 8.0
+"""a column's pixel may be so many times longer along the view than the median one: beyond, rows of pixels on the far
+side decide on metres of water"""
+
+
+@dataclass(frozen=True)
+class Footage:
+    """What the picture says about a fluid that lies on something."""
+
+    surface: HeightModel
+    """height of the free surface, world"""
+    labels: UInt8[np.ndarray, "h w"]
+    """what each pixel shows"""
+    visible: Float[np.ndarray, "n 3"]
+    """points on the visible fluid, world"""
+    camera: PinholeCamera
+    """in the world"""
+    along: Float[np.ndarray, "2"]
+    """horizontal direction of the flow"""
+    speed: Float[np.ndarray, "h w"] | None = None
+    """of the seen surface, m/s; nan where it is not known"""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Maps seen from above, one entry per column."""
+
+    label: UInt8[np.ndarray, "nx ny"]
+    """values of `Label`"""
+    level: Float[np.ndarray, "nx ny"]
+    """z of the free surface, m"""
+    along: Float[np.ndarray, "nx ny"]
+    """distance along the stream, m"""
+    speed: Float[np.ndarray, "nx ny"]
+    """of the surface, m/s; nan where it is not known"""
+    known: Bool[np.ndarray, "nx ny"]
+    """in the picture; the others go on as the nearest of these along the stream"""
+
+    @property
+    def wet(self) -> Bool[np.ndarray, "nx ny"]:
+        """Water, and the rocks that stand in it."""
+        return self.label != Label.BACKGROUND
+
+
+@dataclass(frozen=True)
+class Extent:
+    """Where the stream is, without the tails of its mask."""
+
+    low: Float[np.ndarray, "3"]
+    high: Float[np.ndarray, "3"]
+    """corners of the box around its surface, m"""
+    reach: tuple[float, float]
+    """its ends along the stream, m"""
+    width: float
+    """typical, m"""
+    visible: Float[np.ndarray, "n 3"]
+    """the seen points in it"""
+
+
+def extent_of(seen: Footage) -> Extent:
+    """Extent of a stream from a coarse plan, opened by a disc of a twentieth of its width.
+
+    Threads at the rim of a mask, and what a grazing view stretches, would otherwise decide how large the box is.
+
+    Raises:
+        ValueError: no fluid on the ground.
+    """
+    low, high = np.percentile(seen.visible, 0.5, axis=0), np.percentile(seen.visible, 99.5, axis=0)
+    h = max(float((high - low)[:2].max()), 1e-9) / COARSE
+    shape = tuple(int(np.ceil((high[a] - low[a]) / h)) + 8 for a in (0, 1))
+    grid = Grid((*shape, 1), h, (low[0] - 4 * h, low[1] - 4 * h, low[2]))
+    plan = plan_of(seen, grid)
+    wet = plan.wet & plan.known & _not_grazing(seen, plan, grid)
+    require(bool(wet.any()), "no fluid on the ground")
+    whole = ndimage.binary_fill_holes(ndimage.binary_closing(np.pad(wet, 2), iterations=2))[2:-2, 2:-2]
+    whole &= plan.known
+    stream = _without_tails(whole, TAIL * _width(whole, h) / h)
+    width = _width(_continued(stream, plan.known, grid, seen.along), h)
+    cell = grid.cell_of(seen.visible)[:, :2]
+    inside = ((cell >= 0) & (cell < grid.shape[:2])).all(axis=1)
+    cell = np.clip(cell, 0, np.array(grid.shape[:2]) - 1)
+    near = ndimage.binary_dilation(stream, iterations=1)
+    kept = inside & near[tuple(cell.T)]
+    require(bool(kept.any()), "no fluid on the ground")
+    points = seen.visible[kept]
+    # the box of the columns is a column wide too large, that of the points misses what few pixels show
+    ground = grid.centers()[:, :, 0, :2][stream]
+    corner = np.stack([ground.min(axis=0) - 0.5 * h, ground.max(axis=0) + 0.5 * h])
+    z = np.percentile(points[:, 2], [0.5, 99.5])
+    s = plan.along[stream]
+    return Extent(
+        np.array([*np.maximum(corner[0], points[:, :2].min(axis=0)), z[0]]),
+        np.array([*np.minimum(corner[1], points[:, :2].max(axis=0)), z[1]]),
+        (float(max(s.min(), (points[:, :2] @ seen.along).min())), float(s.max())),
+        width,
+        points,
+    )
+
+
+def _not_grazing(seen: Footage, plan: Plan, grid: Grid) -> np.ndarray:
+    """Columns that are seen steeply enough."""
+    points = np.concatenate([grid.centers()[:, :, 0, :2], plan.level[..., None]], axis=-1)
+    # of the surface at large: its waves do not decide
+    gx, gy = np.gradient(ndimage.gaussian_filter(plan.level, COARSE / 12), grid.spacing)
+    normal = np.stack([-gx, -gy, np.ones_like(gx)], -1) / np.sqrt(1 + gx**2 + gy**2)[..., None]
+    view = points - seen.camera.position
+    distance = np.linalg.norm(view, axis=-1)
+    # length of a pixel along the view on the surface: distance / focal length / cosine to the normal
+    length = distance**2 / np.maximum(np.abs((view * normal).sum(-1)), 1e-9 * distance)
+    wet = plan.wet & plan.known
+    return length <= GRAZING * float(np.median(length[wet])) if wet.any() else wet
+
+
+def _without_tails(wet: np.ndarray, radius: float) -> np.ndarray:
+    """Opened by a disc (columns); pieces of at least a tenth of the largest."""
+    reach = int(np.ceil(radius))
+    pad = reach + 1
+    padded = np.pad(wet, pad, mode="edge")  # the map's edge cuts no tail
+    inner = ndimage.distance_transform_edt(padded) > radius
+    opened = (ndimage.distance_transform_edt(~inner) <= radius)[pad:-pad, pad:-pad] & wet if inner.any() else wet
+    label, count = ndimage.label(opened, structure=np.ones((3, 3)))
+    sizes = np.bincount(label.ravel(), minlength=count + 1)
+    sizes[0] = 0
+    return (sizes >= 0.1 * sizes.max())[label] & opened
+
+
+def _width(wet: np.ndarray, spacing: float) -> float:
+    """Typical width across the stream, m. In a channel of half width a the distances to the bank are spread evenly over
+    0 to a, whose 90th percentile is 0.9 a; that holds on when a bank is ragged or an island stands in the stream."""
+    return 2.0 / 0.9 * float(np.percentile(distance_inside(wet, spacing)[wet], 90))
+
+
+def plan_of(seen: Footage, grid: Grid, extent: Extent | None = None) -> Plan:
+    """Look up each column of a grid in the picture.
+
+    Args:
+        seen: the picture and the surface.
+        grid: its columns are looked up.
+        extent: of the stream. Its mask is cleaned, and near its ends the channel goes on straight, as it is three cells
+            before them, or further inside where it has its width (a pointed or ragged end of the mask is no funnel).
+    """
+    ground = grid.centers()[:, :, 0, :2]
+    s = ground @ seen.along
+    level = seen.surface.height(ground)
+    points = np.concatenate([ground, level[..., None]], axis=-1)
+    uv, _ = seen.camera.project(points)
+    row, col, z = seen.camera.nearest_pixels(points)
+    size = np.array(seen.camera.size)
+    known = (z > 0) & (uv >= 0).all(axis=-1) & (uv < size).all(axis=-1)
+    label = np.where(known, seen.labels[row, col], Label.BACKGROUND).astype(np.uint8)
+    speed = np.full(label.shape, np.nan)
+    if seen.speed is not None:
+        speed = np.where(known & (label == Label.FLUID), seen.speed[row, col], np.nan)
+    source = known
+    if extent is not None:
+        reach = extent.reach
+        start, stop = wide_ends(known & (label != Label.BACKGROUND), s, reach, grid.spacing, share=0.8)
+        start, stop = max(start, reach[0] + 3 * grid.spacing), min(stop, reach[1] - 3 * grid.spacing)
+        source = known & (s >= min(start, stop)) & (s <= max(start, stop))
+    label = _continued(label, source, grid, seen.along)
+    if extent is not None:
+        label = cleaned(label, extent.width, grid.spacing)
+    return Plan(label, level, s, speed, known)
+
+
+def wide_ends(
+    water: Bool[np.ndarray, "nx ny"],
+    along: Float[np.ndarray, "nx ny"],
+    reach: tuple[float, float],
+    spacing: float,
+    *,
+    share: float,
+) -> tuple[float, float]:
+    """Where along the stream its ends have at least a share of its typical width: a slanted or pointed end of the mask
+    must not become a nozzle. At most 15 % of the length is given up at each end."""
+    length = reach[1] - reach[0]
+    bins = max(int(length / spacing), 1)
+    width, edges = np.histogram(along[water], bins=bins, range=(reach[0], reach[1]))
+    if not width.any():
+        return float(reach[0]), float(reach[1])
+    wide = np.where(width >= share * np.median(width[width > 0]))[0]
+    start = min(edges[wide[0]], reach[0] + 0.15 * length)
+    stop = max(edges[wide[-1] + 1], reach[1] - 0.15 * length)
+    return float(start), float(stop)
+
+
+def cleaned(label: UInt8[np.ndarray, "nx ny"], width: float, spacing: float) -> UInt8[np.ndarray, "nx ny"]:
+    """Labels without the tails of the mask, and without dry spots thinner than a fifth of the width (m): these are gaps
+    in the mask, not islands, and become water."""
+    wet = label != Label.BACKGROUND
+    if wet.any():
+        label = np.where(wet & ~_without_tails(wet, TAIL * width / spacing), Label.BACKGROUND, label)
+    radius = width / 10 / spacing
+    if radius >= 1.0 and wet.any():
+        pad = int(np.ceil(radius)) + 1
+        grown = ndimage.distance_transform_edt(~np.pad(label != Label.BACKGROUND, pad, mode="edge")) <= radius
+        closed = (ndimage.distance_transform_edt(grown) > radius)[pad:-pad, pad:-pad]
+        label = np.where(closed & (label == Label.BACKGROUND), Label.FLUID, label)
+    return label.astype(np.uint8)
+
+
+def _continued(label: np.ndarray, source: np.ndarray, grid: Grid, along: np.ndarray) -> np.ndarray:
+    """Columns outside `source` get the label of the nearest one inside it, nearness across the stream counting four
+    times as much: a channel goes on along the stream."""
+    if source.all() or not source.any():
+        return label
+    ground = grid.centers()[:, :, 0, :2]
+    across = np.array([-along[1], along[0]])
+    place = np.stack([ground @ along, 4.0 * (ground @ across)], axis=-1)
+    nearest = cKDTree(place[source]).query(place[~source])[1]
+    out = label.copy()
+    out[~source] = label[source][nearest]
+    return out
+
+
+def with_seen(plan: Plan, visible: Float[np.ndarray, "n 3"], grid: Grid) -> Plan:
+    """Every column in which fluid is seen is wet, although its centre may be on the bank: nothing that is seen may be
+    inside the terrain. Rocks stay."""
+    cell = grid.cell_of(visible)[:, :2]
+    cell = cell[((cell >= 0) & (cell < grid.shape[:2])).all(axis=1)]
+    label = plan.label.copy()
+    seen = np.zeros(label.shape, bool)
+    seen[tuple(cell.T)] = True
+    label[seen & (label == Label.BACKGROUND)] = Label.FLUID
+    return replace(plan, label=label)

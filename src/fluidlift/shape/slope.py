@@ -1,0 +1,391 @@
+"""How steep a stream or a film runs, and how the camera is tilted over it, from the perspective of its motion.
+
+Model: a plane that is level across the stream. Motion in it, at the distances l along and c across (both -1 to 1 over
+the fluid), is a smooth field V(l, c) = V_l d + V_c e: a profile across, a gain along, banks that open or close, a
+bend. A point at depth Z = h / (n.r) on the ray r = (x, y, 1) moves in the picture by f / Z (V_xy - x V_z). Every such
+field is linear in its coefficients, so their prior and the noise are integrated out exactly (Bayesian linear
+regression), and what is left is the evidence for the plane alone. Streamlines that are parallel in space meet in a
+vanishing point, and the speed along them grows as they come nearer: both are in it, weighed by how free the field is
+to do the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import ndimage
+from scipy.special import logsumexp
+
+from fluidlift.types import PinholeCamera
+
+PATCHES = 160
+"""pieces that the fluid's picture is cut into"""
+LOOKS = 0.18
+"""independent looks per patch: errors of optical flow, and what the model leaves out, reach over two to three patches.
+Chosen with `USUAL` among 16 settings on 150 made streams with eddies; from 0.12 to 0.25 the error of the slope hardly
+changes (6.0 to 6.4 degrees there). On 150 others it is 6.2 (+- 0.8); 16 if all are taken as level"""
+FEWEST = 12
+"""patches that a plane is read from"""
+FARTHEST = 12.0
+"""ratio of the largest and the smallest depth that a surface is believed to have"""
+STEEPEST = 50.0
+"""degrees; what is steeper is a fall"""
+LEVEL = 0.6
+"""prior share of streams that are level within a degree or two (rivers, channels; the others are films and chutes)"""
+STEEP = 20.0
+"""degrees, scale of the half-normal prior of the slope of the others"""
+UNMODELLED = 2.0
+"""actual over computed standard error of the slope, on made streams with eddies, bends and uneven profiles"""
+ROLL = 2.5
+"""degrees, standard deviation of how far people hold a camera off the level"""
+FREEDOM = np.array([0.08, 0.25, 0.6, 1.2])
+"""how far the field may be from uniform, as multiples of `USUAL`; each as likely"""
+NOISE = np.array([0.015, 0.03, 0.06, 0.12, 0.24])
+"""px over the mean displacement; each as likely"""
+MANNING = 0.035
+"""s/m^(1/3), roughness of natural streams (Chow 1959, table 5-6: 0.03 clean and straight, 0.04 winding, 0.05 stony)"""
+HYDRAULIC = 0.6
+"""hydraulic radius over greatest depth of a parabolic bed five times as wide as deep (area 2/3, wetted width 1.1)"""
+MEAN_OF_SURFACE = 0.85
+"""mean speed over a column of water over that of its surface (the usual figure of image velocimetry)"""
+GRAVITY = 9.81
+LEAST_NOISE = 0.05
+"""px, of optical flow at its best"""
+USUAL = np.array([1.0, 0.25, 0.5, 0.2, 0.3, 0.18, 0.15, 0.2, 0.05, 0.08, 0.2, 0.1, 0.1])
+"""standard deviations over the mean speed of V_l: 1, c, c^2, c^3, c^4, l, lc, l^2, and V_c: 1, c, l, lc, l^2. A
+parabola across has -0.5 to -1 in c^2; a stream that gets half as fast again along the view 0.2 in l; banks that close
+by 5 degrees 0.09 in c of V_c, a bend by 10 degrees 0.18 in its l. What changes along the stream must be rarer than what
+changes across it, or perspective says nothing: twice the deviations of l and of c in V_c cost about one degree"""
+
+
+@dataclass(frozen=True)
+class FlowPatches:
+    """Motion of pieces of the fluid's picture."""
+
+    at: Float[np.ndarray, "n 2"]
+    """px, the middle of the way that was seen"""
+    motion: Float[np.ndarray, "n 2"]
+    """px per frame, medians"""
+    weight: Float[np.ndarray, "n"]
+    """0 to 1"""
+
+
+@dataclass(frozen=True)
+class SlopeEvidence:
+    """What the motion says about the slope of a stream."""
+
+    slope: float
+    """degrees that the surface falls along the stream; 0 where the evidence is weak"""
+    standard_error: float
+    """degrees, of a slope that is not level (of the likeliest one, where level is taken)"""
+    heading: float
+    """degrees from the canonical x axis towards y, where the stream runs to"""
+    level_share: float
+    """probability that the stream is level"""
+    likeliest: float
+    """degrees, mean over the slopes that are not level"""
+    source: str
+    """what the slope was taken from"""
+
+
+@dataclass(frozen=True)
+class TiltEvidence:
+    """What the motion of a stream says about the tilt of the camera."""
+
+    pitch: float
+    roll: float
+    """degrees, posterior means"""
+    pitch_error: float
+    """degrees, standard deviation of the posterior"""
+    gained: float
+    """0 to 1: share of the prior's variance of the pitch that the motion took away"""
+
+
+@dataclass(frozen=True)
+class Channel:
+    """A stream in its bed."""
+
+    width: float
+    """m"""
+    slope: float
+    """degrees, as its perspective shows it; 0 where it does not"""
+    depth_share: float = 0.2
+    """depth over width"""
+
+
+def flow_patches(
+    mask: Bool[np.ndarray, "h w"], motion: Float[np.ndarray, "h w 2"], trust: Float[np.ndarray, "h w"]
+) -> FlowPatches | None:
+    """Medians of the motion over squares of the picture; None where too little is known."""
+    inner = np.asarray(ndimage.binary_erosion(mask, iterations=2) if mask.sum() > 2000 else mask, bool)
+    rows, cols = np.where(inner & (trust > 0.3))
+    if len(rows) < 10 * FEWEST:
+        return None
+    size = max(3, round(np.sqrt(mask.sum() / PATCHES)))
+    _, patch, count = np.unique(rows // size * mask.shape[1] + cols // size, return_inverse=True, return_counts=True)
+    ends = np.cumsum(count)
+    middle = np.stack([ends - count + (count - 1) // 2, ends - count + count // 2])
+    values = np.stack([cols + 0.5, rows + 0.5, motion[rows, cols, 0], motion[rows, cols, 1]])
+    medians = np.stack([v[np.lexsort((v, patch))][middle].mean(axis=0) for v in values], axis=-1)
+    share = np.bincount(patch, trust[rows, cols]) / size**2
+    kept = (count >= 0.3 * size**2) & np.isfinite(medians).all(axis=1)
+    if kept.sum() < FEWEST:
+        return None
+    at, flow = medians[kept, :2], medians[kept, 2:]
+    weight = _robust_weights(at, flow, np.clip(share[kept], 0.0, 1.0))
+    return FlowPatches(at + 0.5 * flow, flow, weight)
+
+
+def estimate_slope(camera: PinholeCamera, patches: FlowPatches | None, *, tilt_known: bool = True) -> SlopeEvidence:
+    """Slope of a stream under a camera whose tilt is known, or was estimated by `estimate_tilt`.
+
+    A choice between two models by their posterior odds: level, with the prior share `LEVEL`; or falling by an angle
+    whose prior is half-normal. Where falling wins, its slope is the posterior's mean. Under an estimated tilt, which is
+    a mean over both models, so is the slope: what the motion shows is their sum.
+
+    Args:
+        camera: canonical, z up.
+        patches: of the motion; None: nothing is known, and level is taken.
+        tilt_known: the camera's tilt was given.
+    """
+    if patches is None:
+        return SlopeEvidence(0.0, STEEP, 0.0, 1.0, 0.0, "prior: too little motion to tell")
+    slopes = np.arange(0.0, STEEPEST + 1.0, 2.0)
+    best = [_best_heading(camera, patches, np.radians(s)) for s in slopes]
+    log = np.array([b[0] for b in best])
+    if not np.isfinite(log).any():
+        return SlopeEvidence(0.0, STEEP, 0.0, 1.0, 0.0, "prior: no plane is seen by the camera in all of it")
+    likelihood = np.exp(log - log.max())
+    share = likelihood * _falling_prior(slopes)
+    falling = float(share.sum())
+    level = LEVEL * likelihood[0] / (LEVEL * likelihood[0] + (1.0 - LEVEL) * falling)
+    mean = float((share * slopes).sum() / max(falling, 1e-300))
+    error = float(np.sqrt((share * (slopes - mean) ** 2).sum() / max(falling, 1e-300)))
+    slope = mean if level < 0.5 else 0.0
+    if not tilt_known:
+        slope = (1.0 - level) * mean
+    heading = best[int(np.argmin(np.abs(slopes - slope)))][1]
+    source = "perspective of the motion" if slope > 0 else "prior: the motion does not speak against a level stream"
+    return SlopeEvidence(slope, UNMODELLED * max(error, 1.0), float(np.degrees(heading)), float(level), mean, source)
+
+
+def estimate_tilt(
+    camera: PinholeCamera, patches: FlowPatches, tilted: Callable[[float, float], PinholeCamera],
+    pitch_prior: tuple[float, float],
+) -> TiltEvidence:  # fmt: skip
+    """Pitch and roll of the camera over a stream of unknown slope: means of their posterior.
+
+    The motion shows the plane's tilt against the camera, not against gravity: what is the camera's and what is the
+    stream's is shared out by the priors. Level streams are the likelier ones.
+
+    Args:
+        camera: for its focal length.
+        patches: of the motion.
+        tilted: camera for a pitch and a roll, degrees.
+        pitch_prior: mean and standard deviation, degrees.
+    """
+    pitches, rolls = np.arange(8.0, 81.0, 4.0), np.array([-4.0, 0.0, 4.0])
+    slopes = np.array([0.0, 5.0, 10.0, 16.0, 22.0, 30.0, 38.0])
+    prior = (1.0 - LEVEL) * _falling_prior(slopes)
+    prior[0] = LEVEL
+    log = np.array([[[_best_heading(tilted(p, r), patches, np.radians(s))[0] for s in slopes] for r in rolls]
+                    for p in pitches])  # fmt: skip
+    log += np.log(prior)
+    log -= 0.5 * (((pitches - pitch_prior[0]) / pitch_prior[1]) ** 2)[:, None, None]
+    log -= 0.5 * ((rolls / ROLL) ** 2)[None, :, None]
+    if not np.isfinite(log).any():
+        return TiltEvidence(pitch_prior[0], 0.0, pitch_prior[1], 0.0)
+    share = np.exp(log - log.max())
+    share /= share.sum()
+    pitch = float((share.sum((1, 2)) * pitches).sum())
+    error = float(np.sqrt((share.sum((1, 2)) * (pitches - pitch) ** 2).sum()))
+    gained = 1.0 - min(error / pitch_prior[1], 1.0) ** 2
+    return TiltEvidence(pitch, float((share.sum((0, 2)) * rolls).sum()), error, gained)
+
+
+def speed_along(
+    camera: PinholeCamera, patches: FlowPatches, axes: Float[np.ndarray, "3 3"], drop: float
+) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+    """Distance along the stream and downstream speed (per frame) of each patch, in the unit of `drop`.
+
+    Args:
+        camera: canonical.
+        patches: of the motion.
+        axes: of the plane, as from `plane_axes`.
+        drop: distance of the plane from the camera, along its normal.
+    """
+    _, ray, along, across = _basis(camera, patches.at, axes)
+    depth = drop / np.maximum(-ray @ axes[2], 1e-9)
+    return (ray @ axes[0]) * depth, _downstream(patches.motion, along, across) * depth
+
+
+def energy_profile(
+    along: Float[np.ndarray, "n"], speed: Float[np.ndarray, "n"], weight: Float[np.ndarray, "n"], channel: Channel
+) -> tuple[Float[np.ndarray, "k"], Float[np.ndarray, "k"]]:
+    """How far (m) the surface has fallen at distances along it (m), the first of them 0.
+
+    Args:
+        along: m down the stream, of each patch.
+        speed: m/s there.
+        weight: 0 to 1.
+        channel: what is known of it.
+    """
+    low, high = np.percentile(along, [2.0, 98.0])
+    run = np.linspace(low, high, 25)
+    # the head of the middle of the stream: medians over slices, and a cubic through them (rocks, eddies)
+    slices = np.clip(((along - low) / max(high - low, 1e-9) * 10).astype(int), 0, 9)
+    filled = [k for k in range(10) if (slices == k).sum() >= 3]
+    centre = np.array([np.average(along[slices == k], weights=weight[slices == k] + 1e-9) for k in filled])
+    typical = np.array([np.median(speed[slices == k]) for k in filled])
+    degree = min(3, len(filled) - 1)
+    fitted = np.polyval(np.polyfit(centre, typical, max(degree, 0)), np.clip(run, centre[0], centre[-1]))
+    head = np.square(np.clip(fitted, 0.0, typical.max())) / (2.0 * GRAVITY)
+    gained = np.concatenate([[0.0], np.cumsum(np.maximum(np.diff(head), 0.0))])
+    # as deep as continuity lets it be: half the radius where it is twice as fast
+    usual = max(float(np.median(typical)), 1e-9)
+    pace = np.clip(fitted / usual, 0.3, 3.0)
+    radius = np.maximum(HYDRAULIC * channel.depth_share * channel.width / pace, 1e-3)
+    friction = np.square(MANNING * MEAN_OF_SURFACE * usual * pace) / radius ** (4.0 / 3.0)
+    friction = np.minimum(friction, np.tan(np.radians(STEEPEST)))
+    step = np.diff(run)
+    fall = gained + np.concatenate([[0.0], np.cumsum(0.5 * (friction[1:] + friction[:-1]) * step)])
+    missing = np.sin(np.radians(channel.slope)) * (run[-1] - run[0]) - fall[-1]
+    return run, fall + max(missing, 0.0) * (run - run[0]) / max(run[-1] - run[0], 1e-9)
+
+
+def _basis(camera: PinholeCamera, at: np.ndarray, axes: np.ndarray):
+    """Points (x, y) of the picture, their rays, and the image motion of unit velocities along and across at depth 1."""
+    rotation, focal = camera.camera_from_world.rotation, np.asarray(camera.focal)
+    x = (at - np.asarray(camera.center)) / focal
+    ray = np.concatenate([x, np.ones((len(x), 1))], axis=1) @ rotation
+    along, across = (focal * (v[:2] - x * v[2]) for v in (rotation @ axes[0], rotation @ axes[1]))
+    return x, ray, along, across
+
+
+def _downstream(motion: np.ndarray, along: np.ndarray, across: np.ndarray) -> np.ndarray:
+    """Share of `along` in motion = a along + b across, for each row."""
+    determinant = along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0]
+    return (motion[:, 0] * across[:, 1] - motion[:, 1] * across[:, 0]) / determinant
+
+
+def _falling_prior(slopes: np.ndarray) -> np.ndarray:
+    """Half-normal over slopes > 0 (degrees), per step of the grid; sums to 1."""
+    prior = np.exp(-0.5 * (slopes / STEEP) ** 2) * np.gradient(slopes) * (slopes > 0)
+    return prior / prior.sum()
+
+
+def _best_heading(camera: PinholeCamera, patches: FlowPatches, slope: float) -> tuple[float, float]:
+    """(log evidence, heading in rad) of the better of the headings that fit the mean motion."""
+    found = [(plane_evidence(camera, patches, plane_axes(slope, h))[0], h) for h in headings(camera, patches, slope)]
+    return max(found, default=(-np.inf, 0.0))
+
+
+def plane_axes(slope: float, heading: float) -> Float[np.ndarray, "3 3"]:
+    """Rows: downstream, across (to the left), normal of a plane that falls by `slope` (rad) towards `heading` (rad)."""
+    s, c = np.sin(slope), np.cos(slope)
+    ahead = np.array([np.cos(heading), np.sin(heading), 0.0])
+    return np.stack([c * ahead - [0, 0, s], [-ahead[1], ahead[0], 0.0], s * ahead + [0, 0, c]])
+
+
+def headings(camera: PinholeCamera, patches: FlowPatches, slope: float) -> list[float]:
+    """Headings (rad) of streams of that slope (rad) that run as the mean motion does in the picture."""
+    x, mean = _middle(camera, patches)
+    normal = np.cross(x, [*mean, 0.0]) @ camera.camera_from_world.rotation
+    flat = np.hypot(normal[0], normal[1])
+    cosine = np.tan(slope) * normal[2] / max(flat, 1e-12)
+    if abs(cosine) > 1.0:
+        return []
+    base, turn = np.arctan2(normal[1], normal[0]), np.arccos(cosine)
+    found = []
+    for heading in (base + turn, base - turn):
+        ahead = camera.camera_from_world.rotation @ plane_axes(slope, heading)[0]
+        if (ahead[:2] - x[:2] * ahead[2]) @ mean > 0:
+            found.append(float(heading))
+    return found
+
+
+def plane_evidence(
+    camera: PinholeCamera, patches: FlowPatches, axes: Float[np.ndarray, "3 3"]
+) -> tuple[float, Float[np.ndarray, "k"]]:
+    """Logarithm of the evidence for a plane with these axes, and the coefficients of the field over its mean speed.
+
+    Minus infinity where the camera does not see such a plane in all patches.
+    """
+    columns = _columns(camera, patches, axes)
+    if columns is None:
+        return -np.inf, np.zeros(len(USUAL))
+    first, motion, weight = columns[..., 0], patches.motion, LOOKS * patches.weight
+    speed = float((weight[:, None] * first * motion).sum() / (weight[:, None] * first * first).sum())
+    if speed <= 0:
+        return -np.inf, np.zeros(len(USUAL))
+    columns = columns * speed
+    rest = motion - columns[..., 0]  # the prior mean is a uniform field
+    normal = np.einsum("nik,n,nij->kj", columns, weight, columns)
+    moment = np.einsum("nik,n,ni->k", columns, weight, rest)
+    energy = float((weight[:, None] * rest**2).sum())
+    looks = 2.0 * weight.sum()
+    size = max(float(np.average(np.linalg.norm(motion, axis=1), weights=patches.weight)), 1e-9)
+    noise = np.maximum(NOISE * size, LEAST_NOISE)
+    spread = USUAL * np.concatenate([np.ones((len(FREEDOM), 1)), np.repeat(FREEDOM[:, None], len(USUAL) - 1, 1)], 1)
+    variance = noise[:, None, None, None] ** 2
+    # in units of the prior: I + S (A'WA / noise^2) S
+    scaled = spread[None, :, :, None] * normal * spread[None, :, None, :] / variance + np.eye(len(USUAL))
+    right = spread[None] * moment / variance[..., 0]
+    found = np.linalg.solve(scaled, right[..., None])[..., 0]
+    misfit = energy / noise[:, None] ** 2 - (right * found).sum(-1)
+    log = -looks * np.log(noise)[:, None] - 0.5 * misfit - 0.5 * np.linalg.slogdet(scaled)[1]
+    share = np.exp(log - log.max())
+    share /= share.sum()
+    field = np.einsum("ab,abk->k", share, spread[None] * found)
+    field[0] += 1.0
+    return float(logsumexp(log) - np.log(log.size)), field / max(abs(field[0]), 1e-9)
+
+
+def _robust_weights(at: np.ndarray, motion: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Less weight for what no smooth field explains (a jet above a film, the wake of a rock): Student's t with four
+    degrees of freedom about a quadratic in the picture, which stands for any plane and any field on it."""
+    x = (at - at.mean(axis=0)) / np.maximum(at.std(axis=0), 1e-9)
+    columns = np.stack([np.ones(len(x)), *x.T, *(x**2).T, x[:, 0] * x[:, 1]], axis=1)
+    robust = weight
+    for _ in range(8):
+        root = np.sqrt(robust)[:, None]
+        fit, *_ = np.linalg.lstsq(columns * root, motion * root, rcond=None)
+        square = ((motion - columns @ fit) ** 2).sum(axis=1)
+        variance = max(float(np.median(square)) / 1.39, LEAST_NOISE**2)  # 1.39: median of chi^2, two degrees of freedom
+        robust = weight * 6.0 / (6.0 + square / variance)
+    return robust
+
+
+def _middle(camera: PinholeCamera, patches: FlowPatches) -> tuple[np.ndarray, np.ndarray]:
+    mean = np.average(patches.motion, axis=0, weights=patches.weight)
+    at = np.average(patches.at, axis=0, weights=patches.weight)
+    x = (at - np.asarray(camera.center)) / np.asarray(camera.focal)
+    return np.array([*x, 1.0]), mean / max(float(np.linalg.norm(mean)), 1e-12)
+
+
+def _columns(camera: PinholeCamera, patches: FlowPatches, axes: np.ndarray) -> np.ndarray | None:
+    """[n, 2, k] px: image motion of the fields of `USUAL` at unit speed, median depth 1."""
+    _, ray, along, across = _basis(camera, patches.at, axes)
+    facing = -ray @ axes[2]
+    if facing.min() <= facing.max() / FARTHEST:
+        return None
+    inverse = facing / np.median(facing)
+    points = ray / inverse[:, None]
+    l, c = _to_unit(points @ axes[0]), _to_unit(points @ axes[1])
+    along, across = along * inverse[:, None], across * inverse[:, None]
+    one = np.ones_like(l)
+    # centred powers, so that their priors mean little to each other
+    fields = [one, c, c**2 - 1 / 3, c**3 - 0.6 * c, c**4 - 0.2, l, l * c, l**2 - 1 / 3]
+    # a bend turns the whole profile: what is smooth is the direction, V_c / V_l
+    speed = _downstream(patches.motion, along, across)
+    speed = np.clip(speed / max(float(np.median(speed)), 1e-12), 0.0, 3.0)
+    turned = [speed * f for f in (one, c, l, l * c, l**2 - 1 / 3)]
+    return np.stack([along * f[:, None] for f in fields] + [across * f[:, None] for f in turned], axis=-1)
+
+
+def _to_unit(values: np.ndarray) -> np.ndarray:
+    low, high = np.percentile(values, [2.0, 98.0])
+    return (values - 0.5 * (low + high)) / max(0.5 * (high - low), 1e-9)

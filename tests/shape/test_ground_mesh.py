@@ -1,0 +1,58 @@
+"""The ground as a closed block with colours."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from fluidlift.shape.ground_mesh import ground_colours, ground_mesh
+from fluidlift.types import Grid, PinholeCamera
+
+GRID = Grid((12, 8, 6), 0.25, (-1.5, -1.0, -1.0))
+
+
+def hills():
+    nodes = GRID.nodes()[:, :, 0]
+    return 0.3 * np.sin(2 * nodes[..., 0]) * np.cos(nodes[..., 1])
+
+
+@pytest.mark.parametrize("parts", [1, 3])
+def test_every_edge_belongs_to_two_faces_and_the_block_has_the_volume_of_its_columns(parts):
+    z = hills()
+    mesh = ground_mesh(GRID, z, parts=parts)
+    body = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    assert body.is_watertight and body.is_winding_consistent
+    floor = body.bounds[0, 2]
+    assert floor < z.min()
+    corners = 0.25 * (z[:-1, :-1] + z[1:, :-1] + z[:-1, 1:] + z[1:, 1:])
+    columns = (corners - floor).sum() * GRID.spacing**2
+    assert body.volume == pytest.approx(columns, rel=0.01)  # the smooth surface bulges a little between the nodes
+
+
+def test_the_top_passes_through_the_heights():
+    z = hills()
+    mesh = ground_mesh(GRID, z, parts=2)
+    top = mesh.vertices[: 25 * 17].reshape(25, 17, 3)[::2, ::2]
+    np.testing.assert_allclose(top[..., 2], z, atol=1e-6)
+    np.testing.assert_allclose(top[..., :2], GRID.nodes()[:, :, 0, :2], atol=1e-6)
+
+
+@pytest.mark.parametrize("heights", [np.zeros((12, 8)), np.full((13, 9), np.nan)])
+def test_heights_that_are_none_are_refused(heights):
+    with pytest.raises(ValueError):
+        ground_mesh(GRID, heights)
+
+
+def test_seen_ground_has_the_colours_of_the_picture_and_cut_sides_those_of_earth():
+    camera = PinholeCamera.looking((0.0, -0.01, 4.0), (0.0, 0.0, 0.0), 30.0, (80, 80))
+    plate = np.zeros((80, 80, 3), np.uint8)
+    plate[:, :40], plate[:, 40:] = (200, 40, 40), (40, 40, 200)
+    mesh = ground_mesh(GRID, np.zeros((13, 9)))
+    colours = ground_colours(mesh, plate, camera)
+    top = mesh.vertices[:, 2] > -1e-6
+    x, y = mesh.vertices[:, 0], mesh.vertices[:, 1]
+    seen = top & (np.abs(x) < 1.0) & (np.abs(y) < 0.9)
+    for side, colour in ((x < -0.1, (200, 40, 40)), (x > 0.1, (40, 40, 200))):
+        np.testing.assert_allclose(colours[seen & side], np.tile(np.array(colour) / 255, ((seen & side).sum(), 1)))
+        beyond = top & side & (np.abs(x) > 1.2)  # out of the picture: as the ground beside it
+        np.testing.assert_allclose(colours[beyond], np.tile(np.array(colour) / 255, (beyond.sum(), 1)), atol=1e-6)
+    assert np.ptp(colours[~top], axis=0).max() == 0

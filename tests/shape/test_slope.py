@@ -1,0 +1,126 @@
+"""The slope of a stream and the tilt of the camera, from exact motion on planes."""
+
+import numpy as np
+import pytest
+
+from fluidlift.shape.kind import UpEvidence, level_camera
+from fluidlift.shape.slope import (
+    Channel,
+    energy_profile,
+    estimate_slope,
+    estimate_tilt,
+    flow_patches,
+    plane_axes,
+)
+from fluidlift.shape.surface import ProfileAlongHeight, stream_surface
+from fluidlift.types import PinholeCamera
+
+SIZE = (128, 96)
+
+
+def tilted(pitch, roll=0.0, fov=50.0):
+    return level_camera(PinholeCamera.from_fov(fov, SIZE), UpEvidence(pitch, roll, "", 1.0))
+
+
+def film(slope, heading, pitch, profile=0.0):
+    """Exact image motion of a straight stream on a plane: camera, mask, px per frame. Its speed over the width is
+    1 - profile s^2."""
+    camera = tilted(pitch)
+    axes = plane_axes(np.radians(slope), np.radians(heading))
+    grid = camera.pixel_grid()
+    rays = camera.rays(grid)
+    middle = camera.rays(np.array(SIZE) / 2)
+    facing = -rays @ axes[2]
+    depth = np.where(facing > 0.05, -(middle @ axes[2]) / np.maximum(facing, 0.05), 0.0)
+    points = rays * depth[..., None]
+    along, across = ((points - middle) @ a for a in axes[:2])
+    mask = (facing > 0.1) & (np.abs(across) < 0.22) & (np.abs(along) < 0.45)
+    velocity = 0.02 * (1 - profile * (across / 0.22) ** 2)[..., None] * axes[0]
+    later, _ = camera.project(np.where(mask[..., None], points + velocity, middle))
+    return camera, mask, np.where(mask[..., None], later - grid, 0.0)
+
+
+def evidence_of(camera, mask, motion, **options):
+    return estimate_slope(camera, flow_patches(mask, motion, np.ones(mask.shape)), **options)
+
+
+@pytest.mark.parametrize(("slope", "heading", "pitch"), [(20.0, -20.0, 30.0), (30.0, 200.0, 45.0), (15.0, -60.0, 40.0)])
+@pytest.mark.parametrize("profile", [0.0, 0.75], ids=["plug", "parabola"])
+def test_the_perspective_of_a_film_shows_how_steep_it_runs(slope, heading, pitch, profile):
+    found = evidence_of(*film(slope, heading, pitch, profile))
+    assert found.level_share < 0.5
+    # slopes are tried in steps of 2 degrees and the prior pulls towards level; twice its own standard error at most
+    assert abs(found.slope - slope) < max(4.0, 2.0 * found.standard_error)
+    assert found.slope == pytest.approx(slope, abs=10.0)  # far from level
+
+
+@pytest.mark.parametrize("pitch", [25.0, 40.0, 55.0])
+def test_a_level_stream_stays_level(pitch):
+    found = evidence_of(*film(0.0, -20.0, pitch, 0.5))
+    assert found.slope == 0.0
+    assert found.level_share > 0.5
+
+
+def test_without_motion_a_stream_is_level_and_says_why():
+    found = estimate_slope(tilted(30.0), None)
+    assert (found.slope, found.level_share) == (0.0, 1.0)
+    assert found.source.startswith("prior")
+
+
+def test_under_an_estimated_tilt_the_slope_is_the_mean_over_both_models():
+    scene = film(8.0, 0.0, 35.0, 0.75)
+    found, sure = evidence_of(*scene, tilt_known=False), evidence_of(*scene)
+    assert found.slope == pytest.approx((1 - sure.level_share) * sure.likeliest)
+
+
+def test_a_uniform_stream_towards_the_viewer_shows_the_tilt_better_than_the_prior():
+    camera, mask, motion = film(0.0, -60.0, 25.0)
+    patches = flow_patches(mask, motion, np.ones(mask.shape))
+    assert patches is not None
+    found = estimate_tilt(camera, patches, tilted, (40.0, 13.0))
+    assert abs(found.pitch - 25.0) < 7.5  # half of the prior's error
+    assert found.pitch_error < 13.0
+    assert 0.0 < found.gained <= 1.0
+
+
+def test_frictionless_water_that_speeds_up_falls_by_its_gain_of_velocity_head():
+    along = np.linspace(0.0, 10.0, 200)
+    speed = 1.0 + 0.2 * along
+    # a channel so wide, and so deep, that it has no friction
+    run, fall = energy_profile(along, speed, np.ones(200), Channel(1e6, 0.0))
+    # Bernoulli; slices take the middle of their speeds, so the ends are known to a twentieth of the way
+    expected = ((1 + 0.2 * run[-1]) ** 2 - (1 + 0.2 * run[0]) ** 2) / (2 * 9.81)
+    assert fall[-1] == pytest.approx(expected, rel=0.15)
+    assert (np.diff(fall) >= 0).all()
+
+
+def test_uniform_water_falls_as_manning_says():
+    along = np.linspace(0.0, 10.0, 200)
+    run, fall = energy_profile(along, np.ones(200), np.ones(200), Channel(5.0, 0.0))
+    radius = 0.6 * 0.2 * 5.0
+    gradient = (0.035 * 0.85) ** 2 / radius ** (4 / 3)
+    np.testing.assert_allclose(fall, gradient * (run - run[0]), rtol=1e-6, atol=1e-9)
+
+
+def test_water_that_slows_down_does_not_rise():
+    along = np.linspace(0.0, 10.0, 200)
+    _, fall = energy_profile(along, 3.0 - 0.2 * along, np.ones(200), Channel(1e6, 0.0))
+    assert (np.diff(fall) >= 0).all()
+
+
+def test_a_stream_surface_lies_on_the_plane_that_was_filmed():
+    camera, mask, motion = film(22.0, -20.0, 31.0, 0.75)
+    front = stream_surface(camera, mask, motion, np.ones(mask.shape), 0.04)
+    normal = plane_axes(np.radians(22.0), np.radians(-20.0))[2]
+    true = 1.0 / np.maximum(-camera.rays(camera.pixel_grid()) @ normal, 1e-3)
+    ratio = front.depth[mask] / true[mask]
+    error = np.abs(ratio / np.median(ratio) - 1.0)
+    # a level plane is off by more than this in the middle of the pixels
+    assert np.median(error) < 0.03
+    assert front.slope is not None and front.slope.slope > 0
+
+
+def test_a_profile_along_a_stream_goes_straight_on_and_is_level_across():
+    model = ProfileAlongHeight((0.0, 1.0), np.array([0.0, 1.0, 2.0]), np.array([0.0, -0.1, -0.4]))
+    xy = np.array([[0.0, 0.5], [7.0, 0.5], [0.0, -1.0], [0.0, 3.0]])
+    np.testing.assert_allclose(model.height(xy), [-0.05, -0.05, 0.1, -0.7])

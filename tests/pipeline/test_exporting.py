@@ -9,9 +9,12 @@ from scipy.spatial import cKDTree
 
 from fluidlift.cli import DONE, REJECTED, WITH_WARNINGS, main
 from fluidlift.io.asset_folder import load_asset, read_manifest
+from fluidlift.io.frames import FluidFrame
 from fluidlift.io.ply import read_mesh, read_splats
 from fluidlift.io.validate_usd import validate_usd
 from fluidlift.numerics.sampling import sample_nodes
+from fluidlift.pipeline.exporting import gridded, level_set
+from fluidlift.types import TriangleMesh
 
 WELL = (DONE, WITH_WARNINGS)
 
@@ -105,3 +108,39 @@ def test_what_cannot_be_written_is_refused(made, tmp_path, capsys, options, word
     assert main(["export", str(made.folder), "-o", str(tmp_path / "out"), *options]) == REJECTED
     assert words in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_volumes_hold_the_motion_and_the_amount_of_the_fluid(made):
+    asset, splats = load_asset(made.folder), read_splats(made.folder / "frames" / "splats" / "1002.ply")
+    velocities = np.stack([splats.extras[v] for v in ("vx", "vy", "vz")], axis=-1)
+    frame = FluidFrame(splats.gaussians, splats.extras["id"], velocities)
+    velocity, density, grid = gridded(frame, asset.grid)
+    filled = density > 0
+    offset = (grid.low - asset.grid.low) / asset.grid.spacing
+    np.testing.assert_allclose(offset, np.round(offset), atol=1e-6)  # on the cells of the simulation
+    assert filled[tuple(grid.cell_of(splats.gaussians.means).T)].all() and density.max() == 1.0
+    # a cell's velocity is a mean of what is in it and beside it
+    mean = velocity.at_centers()[filled].mean(axis=0)
+    np.testing.assert_allclose(mean, velocities.mean(axis=0), atol=0.5 * velocities.std())
+
+
+def test_the_level_set_of_a_ball_is_its_distance_and_knows_its_inside():
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.3)
+    grid = level_set(TriangleMesh(np.asarray(ball.vertices), np.asarray(ball.faces)), 0.05)
+    index = np.stack(np.meshgrid(*(np.arange(n) for n in grid.values.shape), indexing="ij"), -1)
+    distance = np.linalg.norm(np.asarray(grid.origin) + (index + 0.5) * 0.05, axis=-1) - 0.3
+    near = np.abs(distance) < 0.1
+    np.testing.assert_allclose(grid.values[near], distance[near], atol=0.002)  # the ball is made of flat triangles
+    assert grid.active is not None and grid.active[distance < 0].all() and (grid.values[distance < -0.01] < 0).all()
+    assert grid.background == pytest.approx(0.15)
+
+
+def test_vdb_files_are_numbered_and_refuse_other_axes(made, tmp_path, capsys):
+    assert export(made, tmp_path / "out", "--to", "vdb") in WELL
+    files = sorted((tmp_path / "out").iterdir())
+    assert [f.name for f in files] == ["1001.vdb", "1002.vdb"]
+    data = files[0].read_bytes()
+    for name in (b"vel", b"density", b"surface", b"level set"):
+        assert name in data
+    assert export(made, tmp_path / "other", "--to", "vdb", "--up-axis", "y") == REJECTED
+    assert "z up and metres" in capsys.readouterr().err

@@ -163,11 +163,12 @@ class Export:
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """folder for the files (numbers from 1001)"""
     to: str = "mesh"
-    """mesh (surface, PLY with colours and velocities), obj, splats (PLY), usd (one file with all of it)"""
+    """mesh (surface, PLY with colours and velocities), obj, splats (PLY), vdb (velocity, density, level set), usd (one
+    file with surface, splats, terrain and camera)"""
     up_axis: Literal["z", "y"] = "z"
-    """of the files; USD states its own"""
+    """of mesh, obj and splats; the others are z up"""
     meters_per_unit: float = 1.0
-    """such as 0.01 for centimetres; USD states its own"""
+    """of mesh, obj and splats, such as 0.01 for centimetres; the others are in metres"""
     frames: str | None = None
     """first and last, such as 1001-1024; by default all"""
     json: bool = False

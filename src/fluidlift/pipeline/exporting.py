@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,10 +17,19 @@ from fluidlift.pipeline.rendering import frame_numbers
 from fluidlift.pipeline.showing import splat_frames
 from fluidlift.pipeline.story import Progress, Silence
 from fluidlift.pipeline.written import Written, cleared, numbered
-from fluidlift.types import FluidAsset, Gaussians, Similarity3, Terrain, TriangleMesh
+from fluidlift.types import FaceVelocity, FluidAsset, Gaussians, Grid, Similarity3, Terrain, TriangleMesh
 
-FORMATS = ("mesh", "obj", "splats", "usd")
+if TYPE_CHECKING:
+    from fluidlift.io.volume_grid import VolumeGrid
+
+FORMATS = ("mesh", "obj", "splats", "vdb", "usd")
 AXES = ("z", "y")
+OWN_AXES = ("vdb", "usd")
+"""formats whose files are z up and in metres whatever is asked for"""
+BAND = 3.0
+"""half width of the level set, voxels: what OpenVDB's own tools expect"""
+FULL = 50.0
+"""percentile of the cells' amounts that counts as a full cell"""
 RADIUS = 0.4
 """of a particle in the mesh, cells of the simulation: neighbours lie half a cell apart after reseeding, and a little
 more keeps drops whole and flat water flat"""
@@ -31,9 +41,10 @@ class ExportRequest:
 
     to: str
     """mesh: surface as PLY with colours and velocities; obj: the same as OBJ, without velocities; splats: Gaussians as
-    splat viewers take them; usd: one OpenUSD file with surface, splats, terrain and camera"""
+    splat viewers take them; vdb: OpenVDB with velocity, density and, of liquids, the level set; usd: one OpenUSD file
+    with surface, splats, terrain and camera"""
     up_axis: str = "z"
-    """z or y; USD states its axis itself and stays z up"""
+    """z or y; USD states its axis itself and stays z up, and OpenVDB files stay z up, in metres"""
     meters_per_unit: float = 1.0
     """m that one unit of the files is; USD states its unit itself and stays in metres"""
     frames: tuple[int, int] | None = None
@@ -68,11 +79,13 @@ def export_asset(folder: Path, out: Path, request: ExportRequest, *, progress: P
         out.mkdir(parents=True, exist_ok=True)
         if request.to == "usd":
             _usd(out, frames, asset, interval, numbers)
+        elif request.to == "vdb":
+            _volumes(out, frames, asset, numbers)
         else:
             _files(out, frames, asset, request, numbers)
     seconds = time.perf_counter() - began
     progress.finished("export", seconds, False)
-    own = request.to == "usd"
+    own = request.to in OWN_AXES
     facts = {
         "frames": len(numbers), "first": FIRST_FRAME + numbers[0], "fps": round(1.0 / interval, 6), "to": request.to,
         "up_axis": "z" if own else request.up_axis, "meters_per_unit": 1.0 if own else request.meters_per_unit,
@@ -88,6 +101,10 @@ def _check(request: ExportRequest, out: Path) -> None:
         raise InputRejected(f"no format '{request.to}'", ", ".join(FORMATS), f"did you mean {near[0]}?" if near else "")
     if request.up_axis not in AXES:
         raise InputRejected(f"an up axis '{request.up_axis}'", " or ".join(AXES))
+    if request.to in OWN_AXES and (request.up_axis != "z" or request.meters_per_unit != 1.0):
+        raise InputRejected(
+            f"{request.to} with other axes or units", "z up and metres", "leave out --up-axis and --meters-per-unit"
+        )
     if not (np.isfinite(request.meters_per_unit) and 1e-6 <= request.meters_per_unit <= 1e6):
         raise InputRejected(f"{request.meters_per_unit:g} m per unit", "1e-6 to 1e6, such as 0.01 for centimetres")
     if out.exists() and not out.is_dir():
@@ -99,7 +116,7 @@ def _frames(
 ) -> Iterator[FluidFrame]:
     """Frame by frame, with the surface where the format has one."""
     mesher = None
-    if request.to != "splats":
+    if request.to in ("mesh", "obj", "usd") or (request.to == "vdb" and asset.kind != "plume"):
         from fluidlift.backends.splashsurf import SplashsurfMesher
 
         mesher = SplashsurfMesher()
@@ -170,3 +187,51 @@ def _usd(out: Path, frames: Iterator[FluidFrame], asset: FluidAsset, interval: f
         out / "fluid.usda", frames=frames, interval=interval, start_frame=FIRST_FRAME + numbers[0],
         terrain=asset.terrain.mesh, camera=asset.camera, attributes=asset.parameters.to_dict() | {"kind": asset.kind},
     )  # fmt: skip
+
+
+def _volumes(out: Path, frames: Iterator[FluidFrame], asset: FluidAsset, numbers: range) -> None:
+    """Numbered OpenVDB files: `vel` (m/s) and `density` on cells of the simulation, `surface` (m) on half of them."""
+    from fluidlift.io.volume_grid import VolumeGrid, velocity_grid, write_vdb
+
+    cleared(out, [".vdb"])
+    h = asset.grid.spacing
+    for k, frame in zip(numbers, frames, strict=True):
+        velocity, density, grid = gridded(frame, asset.grid)
+        filled = density > 0
+        grids = [velocity_grid(velocity, grid, active=filled), VolumeGrid("density", density, h, grid.origin, filled)]
+        if frame.surface is not None and len(frame.surface.faces):
+            grids.append(level_set(frame.surface, 0.5 * h))
+        write_vdb(numbered(out, k, ".vdb"), grids)
+
+
+def level_set(mesh: TriangleMesh, spacing: float) -> VolumeGrid:
+    """Signed distance (m) of a closed mesh as OpenVDB's tools take it: cut at three voxels, the inside stored as well,
+    because the writer knows no tiles and what is not stored counts as outside."""
+    from fluidlift.io.volume_grid import VolumeGrid
+    from fluidlift.numerics.mesh_distance import mesh_distance
+
+    found, band = mesh_distance(mesh, spacing), BAND * spacing
+    low = tuple(float(v) - 0.5 * spacing for v in found.grid.origin)  # the voxels' middles lie on the nodes
+    values, stored = np.clip(found.distance, -band, band), found.distance < band
+    return VolumeGrid("surface", values, spacing, low, stored, grid_class="level set", background=band)
+
+
+def gridded(frame: FluidFrame, cells: Grid) -> tuple[FaceVelocity, np.ndarray, Grid]:
+    """Velocity and density of a frame on cells that lie on those of the simulation, as far as its particles reach.
+
+    Density is the opacity of the splats in a cell next to that of a full one, at most 1: the share of a cell that a
+    liquid fills, and how thick smoke is.
+    """
+    from fluidlift.physics.transfer import particles_to_grid
+    from fluidlift.types import Particles
+
+    points, h = frame.gaussians.means.astype(np.float64), cells.spacing
+    first = np.floor((points.min(axis=0) - cells.low) / h).astype(int) - 1
+    last = np.floor((points.max(axis=0) - cells.low) / h).astype(int) + 2
+    shape = tuple(int(v) for v in last - first)
+    grid = Grid(shape, h, tuple(float(v) for v in cells.low + first * h))  # type: ignore[arg-type]
+    velocity, _ = particles_to_grid(Particles.at_rest(points, 1.0, velocities=frame.velocities), grid)
+    flat = np.ravel_multi_index(tuple(grid.cell_of(points).T), grid.shape)
+    amount = np.bincount(flat, weights=frame.gaussians.opacities, minlength=grid.cells).reshape(grid.shape)
+    full = np.percentile(amount[amount > 0], FULL)
+    return velocity, np.clip(amount / max(float(full), 1e-12), 0.0, 1.0).astype(np.float32), grid

@@ -247,6 +247,19 @@ def test_a_camera_that_is_taken_for_steeper_than_it_is_tilts_the_vertical():
     assert evaluate_arrays(an_asset(camera), a_run(case), {}, case)["geometry.up_angle"] == pytest.approx(12.0)
 
 
+def test_a_body_that_is_moved_turned_and_scaled_as_a_whole_keeps_its_shape():
+    case, run = a_case(), a_run(a_case())
+    tilt = np.array([[1, 0, 0], [0, np.cos(0.2), -np.sin(0.2)], [0, np.sin(0.2), np.cos(0.2)]])
+    pose = case.camera.camera_from_world
+    wrong = replace(case.camera, camera_from_world=RigidTransform(tilt @ pose.rotation, tilt @ pose.translation))
+    run["front_depth"] = 1.2 * run["front_depth"]
+    sheet = evaluate_arrays(an_asset(wrong), run, {}, case)
+    assert sheet["geometry.occupancy_iou"] < 0.8
+    # cells of 1/4 of the depth of the pool, turned against each other, cannot agree exactly
+    assert sheet["geometry.occupancy_iou_aligned"] > 0.9
+    assert evaluate_arrays(an_asset(), a_run(case), {}, case)["geometry.occupancy_iou_aligned"] == pytest.approx(1.0)
+
+
 def test_a_resimulation_that_starts_later_is_compared_with_the_frames_it_shows():
     case = a_case()
     case.mask[0] = False

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from fluidlift.errors import FluidliftError
+from fluidlift.evaluate.alignment import score_aligned
 from fluidlift.evaluate.case import Case, read_arrays, read_case, read_json
 from fluidlift.evaluate.planar import (
     Arrays,
@@ -86,6 +87,7 @@ def evaluate_arrays(
         alignment = align(asset, case, scale, frame)
         space = score_surface_velocity(arrays, asset, case, alignment)
         space += score_bed(arrays, asset, case, alignment) + score_up(case, alignment)
+        space += score_aligned(asset, case, alignment)
         space += score_volume(asset, case, alignment) + score_parameters(asset, case, alignment)
     pictures, more = score_resimulation(arrays, case, video)
     figures = [*segmentation, *flow, *depth, *space, *score_divergence(asset), *pictures]

@@ -2,13 +2,15 @@
 
     python benchmarks/geometry.py --work runs
     python benchmarks/geometry.py --work runs --only river --sheets sheets
-    python benchmarks/geometry.py --work runs --page docs/results.md
+    python benchmarks/geometry.py --work runs --page docs/results.md --before before.json
 
 Subjects are the demo of the package, scenes that the package simulates and films (kept in --work), and the cases below
 FLUIDLIFT_SHARED or a folder `shared` beside the repository. Masks and motion are the pipeline's own estimates; only the
 stages up to the geometry run, those before it from their cache (`--again` runs them too). Next to it stand bodies that
-need no thought: one depth for all, a level plane, the inflated silhouette. `--sheets` also draws every clip: the input,
-its Gaussians from the camera and from two sides, the bed alone.
+need no thought: one depth for all, a level plane, the inflated silhouette; and what the true lens (`--fov`) and the
+true tilt (`--pitch`, `--roll`) alone would change. Figures stay in --work (`geometry.json`), so that `--only` measures
+some subjects again and the page shows all; `--before` takes such a file of older code, and the page shows old > new.
+`--sheets` also draws every clip: the input, its Gaussians from the camera and from two sides, the bed alone.
 """
 
 from __future__ import annotations
@@ -16,14 +18,14 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from motion_page import replace_section
-from motion_subjects import default_shared, prepare, subjects
+from motion_subjects import Subject, default_shared, prepare, subjects
 from results import subjects as runs
 from results import table
 from scipy import ndimage
@@ -43,6 +45,7 @@ from fluidlift.pipeline.reading import Inputs, clip_of
 from fluidlift.pipeline.story import Silence, Story
 from fluidlift.shape.airborne import inside_body
 from fluidlift.shape.kind import PITCH_PRIOR
+from fluidlift.shape.place import pose_up
 from fluidlift.shape.surface import inflated_surface, level_surface
 from fluidlift.types import FaceVelocity, FluidAsset, FluidParameters, Gaussians, PinholeCamera, concatenate
 
@@ -51,6 +54,10 @@ FIGURES = {
     "depth": "geometry.depth_error_relative", "relief": "geometry.depth_error_over_relief",
     "iou": "geometry.occupancy_iou", "bed": "geometry.bed_error_relative", "up": "geometry.up_angle",
 }  # fmt: skip
+GOAL_IOU, GOAL_DEPTH = 0.7, 0.05
+"""of streams and films with their camera"""
+GOAL_IOU_ALONE, GOAL_UP = 0.5, 10.0
+"""with nothing given; degrees"""
 THICKNESS = 0.2
 """of the width: how thick the bodies without thought are taken to be"""
 
@@ -62,19 +69,20 @@ class Shaped:
     story: Story
     inputs: Inputs
     seconds: float
-    """of the geometry alone"""
+    """of processor time, of the geometry alone"""
 
 
-def shaped(clip: Path, camera: Path | None, folder: Path, again: bool) -> Shaped:
-    """Run the stages up to the geometry; those before it may come from the cache."""
+def shaped(clip: Path, camera: Path | None, folder: Path, again: bool, **told: float) -> Shaped:
+    """Run the stages up to the geometry; those before it may come from the cache. `told`: settings of the shape."""
     config, inputs = build_config(preset="draft"), Inputs(clip, camera=camera)
+    config = replace(config, shape=replace(config.shape, **told))
     folder.mkdir(parents=True, exist_ok=True)
     force = frozenset({"read", "geometry"} if again else {"geometry"})
     story, hashes = Story(folder, STAGES, force=force, progress=Silence()), begin.input_hashes(inputs)
     begin.look(story, inputs, config, hashes)
-    began = time.perf_counter()
+    began = time.process_time()
     begin.shape(story, inputs, config, hashes)
-    return Shaped(story, inputs, time.perf_counter() - began)
+    return Shaped(story, inputs, time.process_time() - began)
 
 
 def still_asset(story: Story) -> FluidAsset:
@@ -91,7 +99,7 @@ def still_asset(story: Story) -> FluidAsset:
 def measured(found: Shaped, case: Case) -> dict[str, Any]:
     """Figures of the geometry, and of the bodies without thought."""
     g = found.story["geometry"]
-    front = np.where(g.arrays["mask"], g.arrays["depth"], 0.0)
+    front = np.where(g.arrays["mask"], g.arrays["sighted_depth"], 0.0)
     arrays, asset = {"front_depth": front, "rest_frame": g.meta["rest_frame"]}, still_asset(found.story)
     figures, scale, frame = score_depth(arrays, case)
     if scale is not None:
@@ -103,6 +111,14 @@ def measured(found: Shaped, case: Case) -> dict[str, Any]:
     record |= {"kind": g.meta["kind"], "seconds": round(found.seconds, 2), "warnings": g.meta["warnings"]}
     record["plain"] = plain_bodies(g.arrays["mask"], asset, case, frame, g.meta["kind"])
     return record
+
+
+def hints(camera: PinholeCamera) -> dict[str, dict[str, float]]:
+    """The settings of a true camera that a user may know: the lens alone, the tilt alone, both."""
+    up, _ = pose_up(camera)
+    lens = {"fov": float(np.degrees(2 * np.arctan(0.5 * max(camera.size) / max(camera.focal))))}
+    tilt = {"pitch": up.pitch, "roll": up.roll}
+    return {"lens": lens, "tilt": tilt, "lens and tilt": lens | tilt}
 
 
 def plain_bodies(mask: np.ndarray, asset: FluidAsset, case: Case, frame: int, kind: str) -> dict[str, Any]:
@@ -178,20 +194,82 @@ def _drawn(gaussians: Gaussians, camera: PinholeCamera, background: Any) -> np.n
     return (np.clip(image, 0, 1) * 255).astype(np.uint8)
 
 
-def page_section(records: list[dict[str, Any]]) -> str:
-    """The tables."""
-    head = ["subject", "given", "kind", "depth", "depth over relief", "IoU", "bed", "up, degrees", "one depth",
-            "plane", "inflation", "s"]  # fmt: skip
-    rows = []
-    for r in records:
-        plain = [f"{_number(p['depth'])} / {_number(p['iou'])}" for p in r["plain"].values()]
-        mine = [_number(r[k]) for k in ("depth", "relief", "iou", "bed", "up")]
-        rows.append([r["name"], r["given"], r["kind"], *mine, *plain, _number(r["seconds"])])
-    return "\n".join(table(head, rows))
+Records = list[dict[str, Any]]
+
+
+def page_section(records: Records, before: Records) -> str:
+    """The tables: against the truth, against bodies without thought, what hints would change."""
+    old = {(r["name"], r["given"]): r for r in before}
+    whole = [r for r in records if "plain" in r]
+    rows, plain = [], []
+    for r in whole:
+        was = old.get((r["name"], r["given"]), {})
+        figures = [_change(was.get(k), r[k]) for k in ("depth", "relief", "iou", "bed", "up")]
+        rows.append([r["name"], r["given"], r["kind"], *figures, _number(r["seconds"]), _met(r)])
+        mine = f"{_number(r['depth'])} / {_number(r['iou'])}"
+        bodies = [f"{_number(p['depth'])} / {_number(p['iou'])}" for p in r["plain"].values()]
+        plain.append([r["name"], r["given"], mine, *bodies, _beaten(r)])
+    head = ["subject", "given", "kind", "depth", "depth over relief", "IoU", "bed", "up, degrees", "s", "goals"]
+    lines = table(head, rows)
+    lines += ["Depth / IoU of bodies that need no thought:", ""]
+    lines += table(["subject", "given", "ours", "one depth", "plane", "inflation", "ours is better in both"], plain)
+    told = [r for r in records if "plain" not in r or r["given"] == "nothing"]
+    by_name: dict[str, dict[str, str]] = {}
+    for r in told:
+        shown = f"{_number(r['up'])} / {_number(r['depth'])} / {_number(r['iou'])}"
+        by_name.setdefault(r["name"], {})[r["given"]] = shown
+    columns = ["nothing", "lens", "tilt", "lens and tilt"]
+    if any(len(row) > 1 for row in by_name.values()):
+        lines += ["Up (degrees off) / depth / IoU where the true lens or tilt alone is told:", ""]
+        lines += table(["subject", *columns], [[n, *(row.get(c, "-") for c in columns)] for n, row in by_name.items()])
+    return "\n".join(lines)
+
+
+def _met(record: dict[str, Any]) -> str:
+    """Goals are set for what lies; with nothing given the tilt must be found as well."""
+    alone = record["given"] == "nothing"
+    if alone:
+        met = [("up", (record["up"] or 0.0) <= GOAL_UP), ("IoU", (record["iou"] or 0.0) >= GOAL_IOU_ALONE)]
+    elif record["kind"] == "stream":
+        depth = np.inf if record["depth"] is None else record["depth"]
+        met = [("depth", depth < GOAL_DEPTH), ("IoU", (record["iou"] or 0.0) >= GOAL_IOU)]
+    else:
+        return "-"
+    missed = [name for name, good in met if not good]
+    return "met" if not missed else f"**not: {', '.join(missed)}**"
+
+
+def _beaten(record: dict[str, Any]) -> str:
+    """Which plain bodies are at least as good, in what."""
+    lost = [
+        f"{title} of {name}" for name, p in record["plain"].items()
+        for key, title, sign in (("depth", "depth", 1), ("iou", "IoU", -1))
+        if record[key] is None or (p[key] is not None and sign * record[key] >= sign * p[key])
+    ]  # fmt: skip
+    return "yes" if not lost else f"**no**: not {', '.join(lost)}"
 
 
 def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3g}"
+    return "-" if value is None else f"{value if abs(value) >= 5e-4 else 0.0:.3g}"
+
+
+def _change(before: float | None, now: float | None) -> str:
+    return _number(now) if before is None else f"{_number(before)} > {_number(now)}"
+
+
+def measure(subject: Subject, work: Path, again: bool) -> Records:
+    """With its camera, with nothing, and with what may be told of the camera."""
+    assert subject.case is not None
+    prepare(subject)
+    case, records = read_case(subject.case), []
+    for given, camera in (("camera", subject.case / "camera.json"), ("nothing", None)):
+        found = shaped(subject.video, camera, work / f"{subject.name}.{given}.fluid", again)
+        records.append({"name": subject.name, "given": given} | measured(found, case))
+    for given, told in hints(case.camera).items():
+        found = shaped(subject.video, None, work / f"{subject.name}.nothing.fluid", False, **told)
+        figures = {k: v for k, v in measured(found, case).items() if k != "plain"}
+        records.append({"name": subject.name, "given": given} | figures)
+    return records
 
 
 def main() -> None:
@@ -202,22 +280,24 @@ def main() -> None:
     parser.add_argument("--again", action="store_true", help="masks and motion too")
     parser.add_argument("--sheets", type=Path, help="folder for contact sheets of every clip and case")
     parser.add_argument("--page", type=Path, help=f"page with the markers {BEGIN} and {END}")
+    parser.add_argument("--before", type=Path, help="geometry.json of older code")
     a = parser.parse_args()
     cv2.setNumThreads(1)
     a.work.mkdir(parents=True, exist_ok=True)
-    records = []
+    kept = a.work / "geometry.json"
+    records: dict[str, Records] = {}
+    for r in json.loads(kept.read_text("utf-8")) if kept.is_file() and a.only else []:
+        records.setdefault(r["name"], []).append(r)
     for subject in subjects(a.work, default_shared()):
         if subject.case is None or (a.only and subject.name not in a.only):
             continue
-        prepare(subject)
-        case = read_case(subject.case)
-        for given, camera in (("camera", subject.case / "camera.json"), ("nothing", None)):
-            found = shaped(subject.video, camera, a.work / f"{subject.name}.{given}.fluid", a.again)
-            records.append({"name": subject.name, "given": given} | measured(found, case))
-            print(json.dumps(records[-1]), flush=True)
-    (a.work / "geometry.json").write_text(json.dumps(records, indent=1), encoding="utf-8")
+        records[subject.name] = measure(subject, a.work, a.again)
+        for record in records[subject.name]:
+            print(json.dumps(record), flush=True)
+        kept.write_text(json.dumps([r for rs in records.values() for r in rs], indent=1), encoding="utf-8")
     if a.page is not None:
-        replace_section(a.page, page_section(records), BEGIN, END)
+        before = json.loads(a.before.read_text("utf-8")) if a.before else []
+        replace_section(a.page, page_section([r for rs in records.values() for r in rs], before), BEGIN, END)
     if a.sheets is not None:
         a.sheets.mkdir(parents=True, exist_ok=True)
         for run in runs(default_shared(), a.work):

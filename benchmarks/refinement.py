@@ -3,13 +3,15 @@
     python benchmarks/refinement.py --work runs
     python benchmarks/refinement.py --work runs --only demo --publish
     python benchmarks/refinement.py --work runs --only speed
+    python benchmarks/refinement.py --work runs --only none --page docs/results.md
 
 Subjects are those of `motion.py` that have a truth: the demo of the package, its own scenes, and the cases below
 FLUIDLIFT_SHARED or a folder `shared` beside the repository. The body that comes in is what a generator would give: a
 coarse front on the true surface that bridges the rocks, the hollow shell of the true volume behind it, and rubbish
 (faint ones, needles, strays), so that the shape is right and what a step spoils can be seen. Every step is scored on
-the input view, on the true depth, on the true cells, and from a camera beside. Figures stay in --work
-(`refinement_NAME.json`), with their tables in `refinement.md`.
+the input view, on the true depth, on the true cells, and from a camera beside. The same is then asked of the pipeline
+as it is, with the case's camera and everything else estimated. Figures stay in --work (`refinement_NAME.json`), with
+their tables in `refinement.md`; `--page` puts those of all subjects there into a page.
 """
 
 from __future__ import annotations
@@ -23,12 +25,18 @@ from typing import Any
 
 import cv2
 import numpy as np
+from geometry import shaped, still_asset
+from motion_page import replace_section
 from motion_subjects import ROOT, SCENES, Subject, Truth, default_shared, prepare, read_truth, subjects
 from refinement_page import page
 from refinement_scores import Scored, flicker, score, side_camera
 from scipy import ndimage
 
+from fluidlift.config import build_config
+from fluidlift.evaluate.score import score_depth
+from fluidlift.evaluate.space import align
 from fluidlift.look.rasterize import render
+from fluidlift.pipeline import body, refining
 from fluidlift.shape.fill import fill
 from fluidlift.shape.follow import follow
 from fluidlift.shape.generate import beneath_front, bounded_colours, front_gaussians, picture_colours
@@ -38,6 +46,7 @@ from fluidlift.shape.refine import refine
 from fluidlift.shape.unite import unite, window_length
 from fluidlift.types import Gaussians, PinholeCamera, concatenate
 
+BEGIN, END = "<!-- refinement:begin -->", "<!-- refinement:end -->"
 PICTURES = ROOT / "docs" / "pictures"
 COARSE = 4
 """px between the Gaussians of the body that comes in"""
@@ -49,7 +58,7 @@ LOSSES = ("image", "anisotropy", "volume", "scale", "luminance", "depth")
 """terms that are left out one at a time; the last is not in the paper"""
 
 
-def measure(subject: Subject, publish: bool) -> dict[str, Any]:
+def measure(subject: Subject, publish: bool, work: Path) -> dict[str, Any]:
     """All figures of one subject."""
     cv2.setNumThreads(1)
     prepare(subject)
@@ -61,6 +70,7 @@ def measure(subject: Subject, publish: bool) -> dict[str, Any]:
     record["steps"], record["later"], record["window"] = steps(truth, scored, key, t)
     record["losses"] = losses(truth, scored, t, subject.name if publish and subject.own else None)
     record["flicker"] = flicker(truth, t)
+    record["estimated"] = estimated(subject, truth, work)
     return record
 
 
@@ -86,14 +96,14 @@ def steps(truth: Truth, scored: Scored, key: int, t: int) -> tuple[list[dict[str
     shell = _shell(truth, key, t)
     rubbish = _rubbish(fronts[0], rng)
     rows = [score("generated", concatenate([fronts[0], rubbish]), scored, shell=shell)]
-    began = time.perf_counter()
+    began = time.process_time()
     clean, report = prune(concatenate([fronts[0], rubbish]), max_stretch=12.0)
-    rows.append(score("prune", clean, scored, time.perf_counter() - began, (str(report),), shell))
-    began = time.perf_counter()
+    rows.append(score("prune", clean, scored, time.process_time() - began, (str(report),), shell))
+    began = time.process_time()
     first = refine(clean, truth.frames[t], truth.mask[t], camera, iterations=STEPS)
     bodies, later = [bounded_colours(first.gaussians, truth.frames[t], camera)], []
-    rows.append(score("refine", bodies[0], scored, time.perf_counter() - began, first.notes, shell))
-    began = time.perf_counter()
+    rows.append(score("refine", bodies[0], scored, time.process_time() - began, first.notes, shell))
+    began = time.process_time()
     for s, fresh in zip(range(t + 1, t + window), fronts[1:]):
         options: dict[str, Any] = {"iterations": STEPS // 5}
         warm = follow(
@@ -108,15 +118,50 @@ def steps(truth: Truth, scored: Scored, key: int, t: int) -> tuple[list[dict[str
         beneath_front(b, truth.depth[t], truth.mask[t], camera, smallest=1.0, drop_above=True) for b in bodies[1:]
     ]
     united = unite([bodies[0], *others], spacing=max(0.35 * h, 1.2 * pixel), whole_first=True)
-    rows.append(score(f"unite ({window})", united, scored, time.perf_counter() - began, shell=shell))
-    began = time.perf_counter()
+    rows.append(score(f"unite ({window})", united, scored, time.process_time() - began, shell=shell))
+    began = time.process_time()
     clean, report = prune(united, max_stretch=12.0)
-    rows.append(score("prune again", clean, scored, time.perf_counter() - began, (str(report),), shell))
-    began = time.perf_counter()
+    rows.append(score("prune again", clean, scored, time.process_time() - began, (str(report),), shell))
+    began = time.process_time()
     added = fill(concatenate([clean, shell]), spacing=h, rng=rng)
     added = beneath_front(added, truth.depth[t], truth.mask[t], camera, smallest=0.6, drop_above=True)
-    rows.append(score("fill", clean, scored, time.perf_counter() - began, shell=concatenate([shell, added])))
+    rows.append(score("fill", clean, scored, time.process_time() - began, shell=concatenate([shell, added])))
     return rows, later, window
+
+
+def estimated(subject: Subject, truth: Truth, work: Path) -> list[dict[str, Any]]:
+    """Figures of the pipeline's own body, laid over the truth: not refined, refined, and united over frames.
+
+    All are pruned and filled; only the case's camera is given.
+    """
+    assert subject.case is not None
+    found = shaped(subject.video, subject.case / "camera.json", work / f"{subject.name}.camera.fluid", False)
+    story, config = found.story, build_config(preset="draft")
+    g = story["geometry"]
+    arrays = {
+        "front_depth": np.where(g.arrays["mask"], g.arrays["sighted_depth"], 0.0),
+        "rest_frame": g.meta["rest_frame"],
+    }
+    _, scale, frame = score_depth(arrays, truth.case)
+    if scale is None:
+        return []
+    alignment = align(still_asset(story), truth.case, scale, frame)
+    scored = Scored.of(truth, alignment.key, frame, None)
+    rows, frames = [], g.meta["united_frames"]
+    for name, united, iterations in (
+        ("generated", 1, 0), ("refine", 1, config.shape.refine_iterations),
+        (f"unite ({frames})", frames, config.shape.refine_iterations),
+    ):  # fmt: skip
+        g.meta["united_frames"] = united
+        began = time.process_time()
+        made = refining.refine(
+            story, found.inputs, replace(config, shape=replace(config.shape, refine_iterations=iterations))
+        )
+        seconds = time.process_time() - began
+        laid = body.gaussians_from_arrays(made.arrays).transformed(alignment.truth_from_asset)
+        # without its terrain, what lies behind a rock is seen through it
+        rows.append(score(name, laid, scored, seconds, shell=Gaussians.empty()) | {"rocks": None})
+    return rows
 
 
 def _coarse_front(truth: Truth, t: int) -> Gaussians:
@@ -200,7 +245,7 @@ def _write_tiles(tiles: list[np.ndarray], path: Path) -> None:
 
 
 def speed(side: int = 512, count: int = 50_000, iterations: int = 100) -> dict[str, Any]:
-    """Seconds of the refinement of one frame of a textured ball that fills most of a square picture."""
+    """Seconds of processor time to refine one frame of a textured ball that fills most of a square picture."""
     camera = PinholeCamera.looking(np.array([0.0, -3.0, 0.6]), np.zeros(3), 35, (side, side))
     rng = np.random.default_rng(0)
     p = rng.normal(size=(3 * count, 3))
@@ -214,9 +259,9 @@ def speed(side: int = 512, count: int = 50_000, iterations: int = 100) -> dict[s
     image = (np.clip(seen.image, 0, 1) * 255).astype(np.uint8)
     dull = Gaussians.isotropic(p.astype(np.float32), 1.3 * sigma, 0.5 + 0.3 * (colours - 0.5), 0.8)
     refine(dull.select(slice(0, None, 50)), image, seen.alpha > 0.5, camera, iterations=2)
-    began = time.perf_counter()
+    began = time.process_time()
     found = refine(dull, image, seen.alpha > 0.5, camera, iterations=iterations, max_gaussians=count)
-    seconds = time.perf_counter() - began
+    seconds = time.process_time() - began
     return {
         "gaussians": len(dull), "side": side, "iterations": iterations, "seconds": round(seconds, 1),
         "psnr_before": found.psnr_before, "psnr_after": found.psnr_after, "kept": found.kept,
@@ -228,21 +273,24 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--work", type=Path, default=Path("runs"))
     parser.add_argument("--shared", type=Path, default=default_shared())
-    parser.add_argument("--only", action="append", help="name of a subject, or speed")
+    parser.add_argument("--only", action="append", help="name of a subject, speed, or none")
     parser.add_argument("--publish", action="store_true", help="pictures of own scenes into docs/pictures")
+    parser.add_argument("--page", type=Path, help=f"page with the markers {BEGIN} and {END}")
     options = parser.parse_args()
     options.work.mkdir(parents=True, exist_ok=True)
     for subject in subjects(options.work, options.shared):
         if subject.case is None or (options.only and subject.name not in options.only):
             continue
         began = time.perf_counter()
-        record = measure(subject, options.publish)
+        record = measure(subject, options.publish, options.work)
         record["seconds"] = round(time.perf_counter() - began, 1)
         (options.work / f"refinement_{subject.name}.json").write_text(json.dumps(record, indent=1), encoding="utf-8")
     if not options.only or "speed" in options.only:
         (options.work / "refinement_speed.json").write_text(json.dumps({"speed": speed()}, indent=1), encoding="utf-8")
     text = page([json.loads(p.read_text("utf-8")) for p in sorted(options.work.glob("refinement_*.json"))])
     (options.work / "refinement.md").write_text(text, encoding="utf-8")
+    if options.page is not None:
+        replace_section(options.page, text, BEGIN, END)
     print(text)
 
 

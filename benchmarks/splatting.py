@@ -1,6 +1,6 @@
 """The rasteriser: our kernels, a vectorised torch rasteriser, and (where installed) Mitsuba's ellipsoids and gsplat.
 
-    python benchmarks/splatting.py [--repeats 7] [--peers torch mitsuba gsplat] [--only forward|gradient]
+    python benchmarks/splatting.py [--repeats 7] [--peers torch mitsuba gsplat] [--only forward|gradient] [--page PAGE]
 
 Gaussians fill a ball ("volume") or lie on its shell ("surface"), standard deviation about half their spacing with
 lognormal anisotropy, opacity 0.2 to 0.95; the ball covers a little over half of the picture. Four channels: colour and
@@ -19,11 +19,13 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
+from motion_page import replace_section
 
 from fluidlift.errors import FluidliftError
 from fluidlift.numerics.splatting import View, bin_tiles, project, rasterize
@@ -31,6 +33,7 @@ from fluidlift.numerics.splatting_kernels import ALPHA_MAX, ALPHA_MIN
 from fluidlift.numerics.splatting_torch import NumbaRasterizer, ellipses
 from fluidlift.seams import Rasterizer, Splatted, SplatView
 
+BEGIN, END = "<!-- splatting:begin -->", "<!-- splatting:end -->"
 GRADIENT = [(20_000, 256), (20_000, 512), (50_000, 256), (50_000, 512)]
 FORWARD = [100_000, 300_000, 1_000_000]
 
@@ -220,6 +223,31 @@ def peer_times(name: str, scene: Scene, gradients: bool, repeats: int) -> str:
     return f"{median(lambda: rasterizer.splat(*operands, scene.view).light.sum().item(), repeats, wall):.0f}"
 
 
+def gradient_table(repeats: int, peers: list[str], peer_repeats: int) -> Iterator[str]:
+    """Lines of the table of forward and backward passes."""
+    yield "| forward + backward, ms | ours |" + "".join(f" {p} |" for p in peers)
+    yield "|---|---|" + "---|" * len(peers)
+    for kind in ("volume", "surface"):
+        for count, side in GRADIENT:
+            scene = Scene.ball(count, (side, side), kind)
+            ours = median(with_gradients(NumbaRasterizer(), scene), repeats)
+            rest = [peer_times(p, scene, True, peer_repeats) for p in peers]
+            yield f"| {kind} {count // 1000}k, {side}^2 | {ours:.0f} |" + "".join(f" {r} |" for r in rest)
+
+
+def forward_table(repeats: int, peers: list[str], peer_repeats: int) -> Iterator[str]:
+    """Lines of the table of pictures."""
+    yield "| forward 1280 x 720, ms | projection | binning | pixels | ours |" + "".join(f" {p} |" for p in peers)
+    yield "|---|---|---|---|---|" + "---|" * len(peers)
+    for kind in ("volume", "surface"):
+        for count in FORWARD:
+            scene = Scene.ball(count, (1280, 720), kind)
+            parts = forward_parts(scene, repeats)
+            rest = [peer_times(p, scene, False, peer_repeats) for p in peers]
+            cells = [f"{p:.0f}" for p in (*parts, sum(parts))] + rest
+            yield f"| {kind} {count // 1000}k |" + "".join(f" {c} |" for c in cells)
+
+
 def main() -> None:
     """Prints the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -227,30 +255,20 @@ def main() -> None:
     parser.add_argument("--peers", nargs="*", default=["torch"], choices=["torch", "mitsuba", "gsplat"])
     parser.add_argument("--peer-repeats", type=int, default=3)
     parser.add_argument("--only", choices=["forward", "gradient"])
+    parser.add_argument("--page", type=Path, help=f"page with the markers {BEGIN} and {END}")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    peers = options.peers
-    if options.only != "forward":
-        print("| forward + backward, ms | ours |" + "".join(f" {p} |" for p in peers))
-        print("|---|---|" + "---|" * len(peers))
-        for kind in ("volume", "surface"):
-            for count, side in GRADIENT:
-                scene = Scene.ball(count, (side, side), kind)
-                ours = median(with_gradients(NumbaRasterizer(), scene), options.repeats)
-                rest = [peer_times(p, scene, True, options.peer_repeats) for p in peers]
-                print(
-                    f"| {kind} {count // 1000}k, {side}^2 | {ours:.0f} |" + "".join(f" {r} |" for r in rest), flush=True
-                )
-    if options.only != "gradient":
-        print("\n| forward 1280 x 720, ms | projection | binning | pixels | ours |" + "".join(f" {p} |" for p in peers))
-        print("|---|---|---|---|---|" + "---|" * len(peers))
-        for kind in ("volume", "surface"):
-            for count in FORWARD:
-                scene = Scene.ball(count, (1280, 720), kind)
-                parts = forward_parts(scene, options.repeats)
-                rest = [peer_times(p, scene, False, options.peer_repeats) for p in peers]
-                cells = [f"{p:.0f}" for p in (*parts, sum(parts))] + rest
-                print(f"| {kind} {count // 1000}k |" + "".join(f" {c} |" for c in cells), flush=True)
+    lines: list[str] = []
+    for name, rows in (("gradient", gradient_table), ("forward", forward_table)):
+        if options.only not in (None, name):
+            continue
+        if lines:
+            lines.append("")
+        for line in rows(options.repeats, options.peers, options.peer_repeats):
+            lines.append(line)
+            print(line, flush=True)
+    if options.page is not None:
+        replace_section(options.page, "\n".join(lines), BEGIN, END)
 
 
 if __name__ == "__main__":

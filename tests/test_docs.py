@@ -113,3 +113,52 @@ def test_the_python_example_of_the_readme_uses_what_there_is():
     exec(beginning, names)
     assert names["config"] == build_config("draft", overrides=["fit.max_work=2e8"])
     assert callable(names["make"]) and callable(names["Inputs"]) and callable(names["load_asset"])
+
+
+SECTIONS = (
+    "shape",
+    "motion",
+    "fit",
+    "look",
+    "io",
+    "numerics",
+    "physics",
+    "pipeline",
+    "backends",
+    "evaluate",
+    "segment",
+)
+
+
+def is_setting(name: str) -> bool:
+    section, _, field = name.partition(".")
+    return hasattr(getattr(build_config(), section, None), field)
+
+
+@pytest.mark.parametrize("page", [p for p in PAGES if p.name != "CHANGELOG.md"], ids=lambda p: p.name)
+def test_dotted_names_in_the_documents_are_modules_functions_or_settings(page):
+    """Such as `shape.slope`, `motion.optical_flow.estimate_flow` and `fit.method`."""
+    spans = set(re.findall(rf"`((?:{'|'.join(SECTIONS)})\.[a-z_][\w.]*)`", page.read_text(encoding="utf-8")))
+    missing = []
+    for name in sorted(n for n in spans if not n.endswith(".json") and not is_setting(n)):
+        try:
+            resolve(f"fluidlift.{name}")
+        except AttributeError:
+            missing.append(name)
+    assert missing == []
+
+
+@pytest.mark.parametrize("package", ["shape", "motion", "fit", "look", "pipeline"])
+def test_the_drawing_of_the_house_names_every_module(package):
+    text = (ROOT / "docs" / "design.md").read_text(encoding="utf-8")
+    (drawing,) = re.findall(r"^```\nsrc/fluidlift/\n.*?^```", text, flags=re.M | re.S)
+    (room,) = re.findall(rf"^  {package}/ .*?(?=^  \w+/ |^```)", drawing, flags=re.M | re.S)
+    modules = {p.stem for p in (ROOT / "src" / "fluidlift" / package).glob("*.py")} - {"__init__"}
+    assert modules - set(re.findall(r"\w+", room)) == set()
+
+
+def test_sections_that_programs_fill_have_both_markers_in_order():
+    text = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
+    markers = re.findall(r"^<!-- ([\w-]+):(begin|end) -->$", text, flags=re.M)
+    assert len(markers) >= 10
+    assert all(a == (b[0], "begin") and b[1] == "end" for a, b in zip(markers[::2], markers[1::2], strict=True))

@@ -6,6 +6,7 @@ import errno
 import json
 import os
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -378,6 +379,48 @@ def test_the_terrain_glb_is_y_up_and_keeps_its_size(tmp_path, mesh):
     assert grey == pytest.approx(0.214, abs=0.003)  # sRGB 0.5 in linear light, 8 bits
     with pytest.raises(ValueError, match="empty mesh"):
         write_glb(tmp_path / "e.glb", TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), int)))
+
+
+def quilt():
+    """A square of two faces in z = 0 with a texture of four colours: red and green above (y = 2), blue and grey below;
+    its back, on a seam, shows grey."""
+    vertices = np.array([[0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0]], np.float32)
+    faces = np.array([[0, 1, 2], [0, 2, 3], [0, 2, 1], [0, 3, 2]])
+    corner = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], np.float32)
+    uv = corner[faces]
+    uv[2:] = (0.9, 0.9)
+    texture = np.zeros((40, 40, 3), np.uint8)
+    texture[:20, :20], texture[:20, 20:] = (255, 0, 0), (0, 255, 0)
+    texture[20:, :20], texture[20:, 20:] = (0, 0, 255), (90, 90, 90)
+    return TriangleMesh(vertices, faces, np.full((4, 3), 0.5, np.float32), uv, texture)
+
+
+def test_the_texture_in_a_glb_lies_where_it_belongs(tmp_path):
+    quilted = quilt()
+    loaded = trimesh.load(write_glb(tmp_path / "t.glb", quilted), force="mesh", process=False)
+    picture = np.asarray(loaded.visual.material.baseColorTexture.convert("RGB"))
+    np.testing.assert_array_equal(picture, quilted.texture)
+    assert loaded.visual.material.metallicFactor == 0.0
+    assert len(loaded.vertices) == 8  # those of the seam twice
+    front = loaded.faces[:2]
+    for (x, y), colour in {(0.3, 1.7): (255, 0, 0), (1.7, 1.7): (0, 255, 0), (0.3, 0.3): (0, 0, 255)}.items():
+        # y up: z of the file is -y; barycentric coordinates in the face that holds the point
+        for face in front:
+            corners = loaded.vertices[face]
+            share = np.linalg.solve(np.stack([corners[:, 0], -corners[:, 2], np.ones(3)]), [x, y, 1.0])
+            if (share > -1e-9).all():
+                u, v = share @ loaded.visual.uv[face]  # trimesh counts v from below
+                np.testing.assert_array_equal(picture[int((1 - v) * 40), int(u * 40)], colour)
+    assert loaded.vertex_normals[front].reshape(-1, 3)[:, 1].min() > 0.99
+
+
+def test_a_textured_terrain_comes_back_and_one_without_a_texture_still_opens(tmp_path, asset):
+    terrain = replace(asset.terrain, mesh=quilt())
+    back = af.load_asset(af.save_asset(tmp_path / "a.fluid", replace(asset, terrain=terrain))).terrain.mesh
+    np.testing.assert_array_equal(back.texture, terrain.mesh.texture)
+    np.testing.assert_array_equal(back.uv, terrain.mesh.uv)
+    older = af.load_asset(af.save_asset(tmp_path / "b.fluid", asset)).terrain.mesh
+    assert older.uv is None and older.texture is None
 
 
 def test_the_obj_is_z_up(tmp_path, mesh):

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdVol
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdVol
 
 from fluidlift.io.export_usd import validate_usd, write_camera, write_usd
 from fluidlift.io.frames import FluidFrame, MovingMesh
 from fluidlift.io.validate_usd import frame_range
 from fluidlift.io.volume_grid import VolumeGrid, write_vdb
-from fluidlift.types import Gaussians, PinholeCamera, RigidTransform
+from fluidlift.types import Gaussians, PinholeCamera, RigidTransform, TriangleMesh
 
 
 def frames_of(gaussians, mesh=None, count=3):
@@ -230,3 +230,27 @@ def test_bodies_of_another_number_of_poses_are_faults_of_the_caller(tmp_path, ga
     body = MovingMesh("raft", mesh, np.zeros((2, 3)), np.tile([1.0, 0, 0, 0], (2, 1)))
     with pytest.raises(ValueError, match="raft"):
         write_usd(tmp_path / "asset.usda", frames=frames_of(gaussians), interval=0.04, bodies=[body])
+
+
+def test_the_ground_stands_still_and_carries_its_texture(tmp_path, gaussians):
+    vertices = np.array([[0, 0, 0], [2, 0, 0], [2, 2, 0]], np.float32)
+    uv = np.array([[[0, 1], [1, 1], [1, 0]]], np.float32)
+    texture = np.full((6, 8, 3), (10, 120, 240), np.uint8)
+    ground = TriangleMesh(vertices, np.array([[0, 1, 2]]), np.full((3, 3), 0.5, np.float32), uv, texture)
+    count = 4
+    frames = [(gaussians(5), np.arange(5), np.zeros((5, 3))) for _ in range(count)]
+    files = write_usd(tmp_path / "a.usda", frames=frames, interval=0.04, terrain=ground)
+    assert [f.name for f in files] == ["a.usda", "a.usdc", "a.terrain.png"]
+    assert validate_usd(tmp_path / "a.usda") == []
+    stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
+    prim = stage.GetPrimAtPath("/Fluid/Terrain")
+    # the same bed in every frame of the asset: it has no samples in time, the fluid has
+    assert all(a.GetNumTimeSamples() == 0 for a in prim.GetAttributes())
+    assert stage.GetPrimAtPath("/Fluid/Splats").GetAttribute("positions").GetNumTimeSamples() == count
+    st = UsdGeom.PrimvarsAPI(prim).GetPrimvar("st")
+    assert st.GetInterpolation() == "faceVarying"
+    np.testing.assert_allclose(st.Get(), [[0, 0], [1, 0], [1, 1]])  # v from below
+    material = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()[0]
+    shader = UsdShade.Shader(material.GetPrim().GetChild("Texture"))
+    assert shader.GetInput("file").Get().resolvedPath.endswith("a.terrain.png")
+    assert shader.GetInput("sourceColorSpace").Get() == "sRGB"

@@ -56,6 +56,23 @@ def test_surfels_lie_flat_on_the_ground():
     assert (surfels.rgb[top] < [0.401, 0.301, 0.201]).all() and (surfels.rgb[top] > 0.05).all()
 
 
+def test_a_textured_ground_shows_what_is_finer_than_its_faces():
+    vertices = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    uv = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], np.float32)[faces]
+    texture = np.zeros((64, 64, 3), np.uint8)
+    texture[:, :32, 0] = texture[:, 32:, 2] = 200
+    mesh = TriangleMesh(vertices, faces, np.full((4, 3), 0.5), uv, texture)
+    surfels = terrain_surfels(Terrain(GRID, np.ones((25, 25, 17), np.float32), np.array([1.0, 0, 0]), mesh), most=5000)
+    assert 2000 < len(surfels) <= 5000
+    left, right = (surfels.rgb[sign * surfels.means[:, 0] > 0.1] for sign in (-1, 1))
+    assert (left[:, 0] > 0.4).all() and (left[:, 2] < 0.01).all()
+    assert (right[:, 2] > 0.4).all() and (right[:, 0] < 0.01).all()
+    # discs of 0.62 of a leg on triangles of half its square: together 2.4 times the ground
+    area = np.pi * surfels.scales.max(axis=1) ** 2
+    assert area.sum() / 4.0 == pytest.approx(2 * np.pi * 0.62**2, rel=0.02)
+
+
 def test_ground_without_a_surface_has_no_surfels():
     empty = Terrain(
         GRID, np.ones(tuple(n + 1 for n in GRID.shape)), np.array([1.0, 0, 0]),

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from fluidlift.errors import InputRejected
+from fluidlift.numerics.ground_block import ground_mesh
 from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.physics.apic import LiquidSimulator
 from fluidlift.physics.extend import extended_body, extended_downstream, extended_velocity, find_outlet
@@ -106,6 +107,24 @@ def test_the_colours_of_the_bed_go_on():
     longer, _ = extended_downstream(*channel(), 1.0)
     assert len(longer.mesh.colors) == len(longer.mesh.vertices) > 0
     np.testing.assert_allclose(longer.mesh.colors, 0.25)
+
+
+def test_the_longer_ground_is_a_closed_block_without_a_wall_at_the_inlet():
+    terrain, cells = channel(slope=0.1)
+    low, h = terrain.grid.low, terrain.grid.spacing
+    nodes = terrain.grid.nodes()
+    shown = np.where(terrain.signed_distance > 0, -np.inf, nodes[..., 2]).max(axis=2)  # without the wall
+    walled = np.array(terrain.signed_distance)
+    walled[:2] = np.minimum(walled[:2], nodes[:2, ..., 2] - (low[2] + 0.7))  # solid up to 0.7 m behind the inlet
+    block = Terrain(terrain.grid, walled, terrain.mainstream, ground_mesh(terrain.grid, shown))
+    mesh = extended_downstream(block, cells, 1.0)[0].mesh
+    edges = np.sort(np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]]), axis=1)
+    assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()
+    across = np.abs(mesh.vertices[:, 1] - (low[1] + 0.4))
+    behind = (mesh.vertices[:, 0] < low[0] + 2 * h) & (across < 0.2)
+    # heights are of nodes, and the spline through them swings by less than a cell
+    assert mesh.vertices[behind, 2].max() < shown[:2].min() + 1.5 * h
+    assert mesh.vertices[:, 0].max() == pytest.approx(terrain.grid.high[0] + 1.0, abs=h)
 
 
 def test_the_added_water_is_as_dense_and_as_fast_as_what_it_repeats():

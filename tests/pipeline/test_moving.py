@@ -112,3 +112,14 @@ def test_the_gravity_of_smoke_cannot_be_known_since_it_stands_for_buoyancy(monke
     story = {"geometry": SimpleNamespace(meta={"kind": "plume"})}
     with pytest.raises(InputRejected, match="buoyancy"):
         moving.fit(story, build_config(overrides=["fit.hold=gravity=3"]))
+
+
+def test_water_slips_over_its_bed_and_a_viscous_film_sticks_to_it():
+    def stick(*viscous):
+        return moving.sticking("stream", [{"viscous": v} for v in viscous])
+
+    water = moving.WALL_DAMPING_PRIOR["stream"]
+    assert stick() == water
+    assert stick(0.0, 0.0, 1.0) == water  # one frame of three is an outlier
+    assert stick(1.0, 1.0, 0.9) == 1.0
+    assert water < stick(0.5) < 0.5

@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from fluidlift.look.rasterize import render
 from fluidlift.shape.generate import (
@@ -14,6 +15,7 @@ from fluidlift.shape.generate import (
     hull_gaussians,
     picture_colours,
     united_mask,
+    within_silhouette,
 )
 from fluidlift.shape.terrain import Setting
 from fluidlift.types import CellType, Gaussians, Grid, PinholeCamera, Terrain, TriangleMesh, concatenate
@@ -197,6 +199,44 @@ def test_what_lies_before_the_visible_surface_can_be_dropped():
     assert len(beneath_front(g, depth, ROW >= 0, camera)) == 2
     left = beneath_front(g, depth, ROW >= 0, camera, drop_above=True)
     np.testing.assert_array_equal(left.means, g.means[1:])
+
+
+# within the silhouette ------------------------------------------------------------------------------------------
+
+
+def test_nothing_of_the_inside_shows_beside_the_silhouette():
+    camera, depth = water()
+    fluid = (np.abs(COL - 48) < 25) & (np.abs(ROW - 32) < 15)
+    # one splat on 16 px, 3.3 px wide: as dense as the hull of a grid
+    drawn = np.random.default_rng(0).uniform(size=fluid.shape) < 1 / 16
+    points = camera.unproject(camera.pixel_grid(), depth)[drawn & (np.abs(COL - 48) < 35) & (np.abs(ROW - 32) < 25)]
+    body = Gaussians.isotropic(points, 0.1, np.ones((len(points), 3)), 0.8)
+    away = ndimage.distance_transform_edt(~fluid)
+    beside = (away > 1.5) & (away < 7.0)
+    assert render(body, camera).alpha[beside].mean() > 0.9
+    shown = render(within_silhouette(body, fluid, camera, smallest=0.0), camera).alpha
+    # what stands out of a single splat weighs less than exp(-2), a seventh, and the rasteriser blurs by half a pixel
+    assert shown[beside].mean() < 0.05
+    assert shown[ndimage.binary_erosion(fluid, iterations=6)].mean() > 0.9
+
+
+def test_splats_get_half_their_distance_from_the_edge_of_the_silhouette():
+    camera, depth = water()
+    places = camera.unproject(np.array([[20.5, 32.5], [24.5, 32.5], [60.5, 32.5]]), np.full(3, depth[32, 48]))
+    g = Gaussians.isotropic(places, 0.1, np.zeros((3, 3)), 0.8)
+    small = within_silhouette(g, COL >= 20, camera)
+    pixel = depth[32, 48] / camera.focal[0]
+    # half a pixel and four and a half from the edge; and far from it
+    np.testing.assert_allclose(small.scales[:, 0], [0.03, 2.25 * pixel, 0.1], rtol=1e-4)
+    np.testing.assert_array_equal(small.means, g.means)
+
+
+def test_what_is_off_the_picture_does_not_contradict_its_silhouette():
+    camera, _ = water()
+    g = Gaussians.isotropic(np.array([[50.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, -9.0, 3.0]]), 0.1, np.zeros((3, 3)), 0.8)
+    left = within_silhouette(g, COL > 70, camera)
+    np.testing.assert_array_equal(left.means, g.means[[0, 2]])
+    np.testing.assert_array_equal(left.scales, g.scales[[0, 2]])
 
 
 # colours --------------------------------------------------------------------------------------------------------

@@ -130,6 +130,20 @@ def test_the_depth_of_jet_and_film_is_that_of_the_scene(view):
     np.testing.assert_allclose(front.depth[film], s.depth[film], rtol=1e-5)  # stored in single precision
 
 
+@pytest.mark.parametrize("view", ["usual", "low", "steep", "turned"])
+def test_a_jet_whose_top_is_hidden_by_a_nozzle_does_not_stand_out_before_it(view):
+    s = scene(**VIEWS[view])
+    row = np.arange(s.mask.shape[0])[:, None]
+    nozzle = s.falls & (row < np.flatnonzero(s.falls.any(axis=1))[0] + 12)
+    found = jets.find_jets(s.camera, s.mask & ~nozzle, s.motion, s.trust * ~nozzle)
+    _, (jet,), _ = with_columns(s.front, found, s.camera, s.mask & ~nozzle)
+    near, _ = jet.seen(s.camera)
+    # the column is fitted to an outline that is blurred over 4 px
+    high = np.flatnonzero((near > 0).any(axis=1))[0]
+    assert high > np.flatnonzero((s.falls & ~nozzle).any(axis=1))[0] - 4
+    assert jet.top - s.foot > 0.5 * 0.15  # of its length
+
+
 LYING = {
     "a film": {},
     "a film towards the viewer": {"downhill": (0.0, -1.0), "slope": 20.0},
@@ -207,6 +221,19 @@ def test_a_neck_above_a_wide_puddle_is_seen_in_the_silhouette():
     # it ends inside the puddle: below the far edge (75) by its foreshortened width
     assert 80 < found.centers[-1, 1] < 100
     assert jets.find_neck(puddle) is None
+
+
+def test_the_far_edge_of_a_puddle_does_not_widen_the_threads_above_it():
+    y, x = np.mgrid[:200, :240]
+    # a bank lifts the far edge towards the threads
+    puddle = (((x - 120) / 100) ** 2 + ((y - 130) / 55) ** 2 < 1) & (y > 85)
+    edge = (np.abs(x - 120) < 22 - 0.8 * (85 - y)) & (y > 65) & (y < 90)
+    neck = (np.abs(x - 120) < 10) & (y > 40) & (y < 130)
+    found = jets.find_neck(puddle | edge | neck)
+    assert found is not None
+    # 19 pixels wide
+    np.testing.assert_allclose(found.half_widths, 9.5, atol=1.0)
+    assert not (found.pixels & (np.abs(x - 120) > 15)).any()
 
 
 def test_a_jet_into_a_glass_seen_from_the_side_is_no_neck():

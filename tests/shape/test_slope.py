@@ -83,6 +83,16 @@ def test_a_uniform_stream_towards_the_viewer_shows_the_tilt_better_than_the_prio
     assert 0.0 < found.gained <= 1.0
 
 
+def test_a_stream_across_the_view_leaves_the_tilt_to_the_prior():
+    # its streamlines stay parallel in the picture at any pitch; a profile across it looks like a little perspective
+    camera, mask, motion = film(0.0, 0.0, 40.0, 0.75)
+    patches = flow_patches(mask, motion, np.ones(mask.shape))
+    assert patches is not None
+    found = estimate_tilt(camera, patches, tilted, (40.0, 13.0))
+    assert abs(found.pitch - 40.0) < 6.5  # half of the prior's error; 13 where the evidence counts in full
+    assert found.gained < 0.25  # of the variance: less than a seventh of the error
+
+
 def test_frictionless_water_that_speeds_up_falls_by_its_gain_of_velocity_head():
     along = np.linspace(0.0, 10.0, 200)
     speed = 1.0 + 0.2 * along

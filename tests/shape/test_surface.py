@@ -5,6 +5,7 @@ import pytest
 
 from fluidlift.errors import InputRejected
 from fluidlift.shape.kind import UpEvidence, level_camera
+from fluidlift.shape.plume import SIGHT
 from fluidlift.shape.surface import (
     PlaneHeight,
     ProfileHeight,
@@ -148,10 +149,18 @@ def test_a_round_silhouette_is_inflated_to_a_ball():
     assert (front.depth[~mask] == 0).all() and (front.half_thickness[~mask] == 0).all()
 
 
-def test_smoke_is_a_little_flatter_than_a_jet():
-    mask = np.hypot(COL - 54, ROW - 36) < 20
-    jet, smoke = (inflated_surface(view(0.0), mask, kind).half_thickness for kind in ("pour", "plume"))
-    np.testing.assert_allclose(smoke, 0.85 * jet, rtol=1e-5)
+def test_smoke_is_seen_within_its_body_and_a_jet_on_its_near_side():
+    mask = np.abs(COL - 54) < 20
+    jet, smoke = (inflated_surface(view(0.0), mask, kind) for kind in ("pour", "plume"))
+    np.testing.assert_array_equal(jet.sighted, jet.depth)
+    inside = (smoke.sighted - smoke.depth) / np.where(mask, 2 * smoke.half_thickness, 1.0)
+    np.testing.assert_allclose(inside[mask], SIGHT, rtol=1e-3)  # float32
+
+
+def test_a_given_depth_of_smoke_lies_within_its_body():
+    mask = np.abs(COL - 54) < 20
+    front = given_surface(view(0.0), mask, np.full(mask.shape, 3.0), "plume")
+    np.testing.assert_allclose(front.sighted[mask], 1.0, rtol=1e-6)
 
 
 def test_a_jet_that_hangs_from_the_upper_edge_is_as_thick_there_as_below():

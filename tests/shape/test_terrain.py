@@ -9,7 +9,8 @@ import trimesh
 from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.physics.apic import LiquidSimulator
 from fluidlift.shape.airborne import airborne_setting, inside_body
-from fluidlift.shape.channel import channel_setting
+from fluidlift.shape.channel import ChannelConfig, channel_setting
+from fluidlift.shape.plan import Footage
 from fluidlift.shape.surface import PlaneHeight
 from fluidlift.shape.terrain import signed_distance_from
 from fluidlift.types import CellType, FluidParameters, Label, Particles, PinholeCamera
@@ -34,10 +35,9 @@ def channel(mainstream=(1.0, 0.0, 0.0), *, slope=0.0, rock=True, along="x", tail
         labels[rock(ground[..., 0], ground[..., 1])] = Label.SOLID
     elif rock:
         labels[np.hypot(ground[..., 0] - ROCK[0], ground[..., 1] - ROCK[1]) < ROCK_RADIUS] = Label.SOLID
-    setting = channel_setting(
-        surface, labels.astype(np.uint8), visible, camera, np.array(mainstream),
-        **{"kind": "stream", "longest": 48, "cell_limit": 120_000} | options,
-    )  # fmt: skip
+    told = {k: options.pop(k) for k in ("speed", "scene_depth", "closed") if k in options}
+    seen = Footage(surface, labels.astype(np.uint8), visible, camera, np.array(mainstream), **told)
+    setting = channel_setting(seen, ChannelConfig(**{"kind": "stream", "longest": 48, "cell_limit": 120_000} | options))
     return SimpleNamespace(
         setting=setting, grid=setting.terrain.grid, cells=setting.cell_types, phi=setting.terrain.signed_distance,
         bed=setting.bed_height, level=setting.surface_height, camera=camera,
@@ -226,6 +226,66 @@ def test_a_rock_at_the_inlet_splits_it():
     inlet = (scene.cells == CellType.INFLOW).any(axis=2)
     assert not inlet[ridge].any()
     assert inlet[(y > 0.35) & (y < 0.5)].any() and inlet[(y < -0.35) & (y > -0.5)].any()
+
+
+def scene_depth(camera, height):
+    """Camera depth of ground at `height` (m) beyond the banks, nan on the water."""
+    rays = camera.rays(camera.pixel_grid())
+    depth = (height - camera.position[2]) / rays[..., 2]
+    y = (camera.position + rays * depth[..., None])[..., 1]
+    return np.where(np.abs(y) > 0.62, depth, np.nan)
+
+
+def test_banks_are_as_high_as_the_scenes_depth_shows_them():
+    plain = channel(rock=False)
+    scene = channel(rock=False, scene_depth=scene_depth(plain.camera, 0.5))
+    x, y = columns(scene)
+    h = scene.grid.spacing
+    far = (y > 0.62 + h) & (np.abs(x) < 0.8)
+    assert far.any() and not np.allclose(plain.bed[far], 0.5, atol=h)
+    np.testing.assert_allclose(scene.bed[far], 0.5, atol=0.1 * h)  # a median over the pixels of a column
+    water = (np.abs(y) < 0.4) & (np.abs(x) < 1.0)
+    np.testing.assert_array_equal(scene.bed[water], plain.bed[water])
+
+
+def test_a_bank_that_the_depth_puts_below_the_water_still_holds_it():
+    plain = channel(rock=False)
+    scene = channel(rock=False, scene_depth=scene_depth(plain.camera, -0.5))
+    x, y = columns(scene)
+    h = scene.grid.spacing
+    bank = (np.abs(y) > WIDTH / 2 + 2 * h) & (np.abs(x) < 1.0)
+    assert (scene.bed[bank] > scene.level[bank] + 0.25 * h).all()
+
+
+def test_a_closed_puddle_has_a_bank_on_all_sides():
+    camera = PinholeCamera.looking((0.0, -3.0, 3.0), (0.0, 0.0, 0.0), 50.0, (132, 96))
+    rays = camera.rays(camera.pixel_grid())
+    ground = camera.position - rays * (camera.position[2] / rays[..., 2])[..., None]
+    labels = np.where(np.hypot(ground[..., 0], ground[..., 1]) < 0.7, Label.FLUID, Label.BACKGROUND).astype(np.uint8)
+    seen = Footage(
+        PlaneHeight((0.0, 0.0), 0.0), labels, ground[labels == Label.FLUID], camera, np.array([1.0, 0, 0]), closed=True
+    )
+    setting = channel_setting(seen, ChannelConfig("stream", 48, 120_000))
+    cells, grid = setting.cell_types, setting.terrain.grid
+    assert set(np.unique(cells)) == {CellType.EMPTY, CellType.SOLID, CellType.FLUID}
+    x, y = np.moveaxis(grid.centers()[:, :, 0, :2], -1, 0)
+    rim = np.hypot(x, y) > 0.7 + 2 * grid.spacing
+    assert (setting.bed_height[rim] > 0.3 * grid.spacing).all()
+    box = np.ones(rim.shape, bool)
+    box[1:-1, 1:-1] = False
+    assert (setting.bed_height[box] > 0).all()
+
+
+def test_a_dry_corner_beyond_the_end_of_the_stream_is_no_bank():
+    from fluidlift.shape.plan import _without_corners
+
+    label = np.full((12, 10), Label.FLUID, np.uint8)
+    label[:, :2] = Label.BACKGROUND  # a bank all along
+    label[9:, 8:] = Label.BACKGROUND  # a corner of its own
+    source = np.zeros(label.shape, bool)
+    source[2:8] = True
+    out = _without_corners(label, source)
+    assert (out[:, :2] == Label.BACKGROUND).all() and (out[:, 2:] == Label.FLUID).all()
 
 
 def test_a_thread_of_the_mask_does_not_widen_the_box():

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
+import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from typing import Any
 import tyro
 
 from fluidlift import __version__
+from fluidlift.cli.optional import REGISTRY
 from fluidlift.cli.options import (
     Command,
     Demo,
@@ -38,17 +40,28 @@ DONE, FAILED, USAGE, REJECTED, WITH_WARNINGS = 0, 1, 2, 3, 4
 
 def main(argv: list[str] | None = None) -> int:
     """Run one command; the exit code."""
-    args = list(sys.argv[1:] if argv is None else argv)
+    try:
+        code = _run(list(sys.argv[1:] if argv is None else argv))
+        sys.stdout.flush()
+        return code
+    except BrokenPipeError:  # who reads along, such as head, has seen enough; what is buffered goes nowhere
+        with contextlib.suppress(OSError, ValueError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return FAILED
+
+
+def _run(args: list[str]) -> int:
     if args in (["--version"], ["-V"]):
         print(f"fluidlift {__version__}")
         return DONE
-    command = tyro.cli(
-        Command,  # type: ignore[arg-type]
-        args=args,
-        prog="fluidlift",
-        description="Lift a fluid out of a single-view video: an editable, simulation-ready 3D asset.",
-        config=(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitSubcommandPrefixes),
-    )
+    with REGISTRY:
+        command = tyro.cli(
+            Command,  # type: ignore[arg-type]
+            args=args,
+            prog="fluidlift",
+            description="Lift a fluid out of a single-view video: an editable, simulation-ready 3D asset.",
+            config=(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitSubcommandPrefixes),
+        )
     try:
         return _COMMANDS[type(command)](command)
     except InputRejected as error:

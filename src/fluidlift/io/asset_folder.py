@@ -206,11 +206,9 @@ def read_manifest(folder: Path | str) -> dict[str, Any]:
     """
     folder = Path(folder)
     if not (folder / "manifest.json").is_file():
-        raise InputRejected(
-            f"'{folder}' is not a fluidlift asset (it has no manifest.json)",
-            "a folder made with 'fluidlift make'",
-            "check the name, or run 'fluidlift make' to its end",
-        )
+        what = "is not a fluidlift asset (it has no manifest.json)" if folder.exists() else "is not there"
+        do = "check the name, or run 'fluidlift make' to its end"
+        raise InputRejected(f"'{folder}' {what}", "a folder made with 'fluidlift make'", do)
     manifest = read_json(asset_file(folder, "manifest.json"), "manifest", _MAX_JSON)
     version = manifest.get("format_version") if isinstance(manifest, dict) else None
     if isinstance(version, int) and version > FORMAT_VERSION:
@@ -348,8 +346,7 @@ def _write_terrain(folder: Path, asset: FluidAsset) -> None:
         "vertices": terrain.mesh.vertices,
         "faces": terrain.mesh.faces,
     }
-    if terrain.mesh.colors is not None:
-        arrays["colors"] = terrain.mesh.colors
+    arrays |= {k: v for k in ("colors", "uv", "texture") if (v := getattr(terrain.mesh, k)) is not None}
     with atomic_write(folder / FILES["terrain"]) as file:
         np.savez(file, **arrays)
     glb = folder / FILES["terrain_mesh"]
@@ -367,7 +364,8 @@ def _read_terrain(path: Path) -> Terrain:
     faces = a["faces"]
     if len(faces) and (faces.min() < 0 or faces.max() >= len(a["vertices"])):
         raise ValueError("terrain faces that name missing vertices")
-    return Terrain(grid, a["signed_distance"], a["mainstream"], TriangleMesh(a["vertices"], faces, a.get("colors")))
+    mesh = TriangleMesh(a["vertices"], faces, a.get("colors"), a.get("uv"), a.get("texture"))
+    return Terrain(grid, a["signed_distance"], a["mainstream"], mesh)
 
 
 def _write_velocity(folder: Path, asset: FluidAsset) -> None:

@@ -13,12 +13,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom, UsdVol, Vt
+from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom, UsdShade, UsdVol, Vt
 
 from fluidlift.errors import require
 from fluidlift.io.atomic import atomic_path, write_bytes
 from fluidlift.io.color import linear_from_srgb
 from fluidlift.io.frames import FIRST_FRAME, FluidFrame, MovingMesh
+from fluidlift.io.pictures import write_png
 from fluidlift.io.validate_usd import validate_usd
 from fluidlift.types import Gaussians, PinholeCamera, TriangleMesh
 
@@ -28,6 +29,9 @@ SIGMAS = 3.0
 """standard deviations that the extent of a Gaussian spans"""
 
 _NOTHING = TriangleMesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int64), np.zeros((0, 3), np.float32))
+
+_TEXTURE = ".terrain.png"
+"""in place of the suffix: the texture lies beside the files that use it"""
 
 _SAVE_AFTER = 128 * 2**20
 """bytes of samples; saved samples are read from the disk again only when needed, so memory stays bounded"""
@@ -52,14 +56,14 @@ def write_usd(
     attributes: Mapping[str, Any] | None = None,
     half: bool = True,
 ) -> list[Path]:
-    """Write `path` (asset.usda) and, beside it, its payload with the suffix .usdc.
+    """Write `path` (asset.usda) and, beside it, its payload with the suffix .usdc and the terrain's texture.
 
     Args:
         path: ends in .usda.
         frames: `FluidFrame`s or tuples (gaussians, ids, velocities); taken one by one, never all in memory.
         interval: s between frames; frames per second is its inverse.
         start_frame: time code of the first frame.
-        terrain: solid surface with colours.
+        terrain: solid surface with colours, or with a texture.
         camera: of the video.
         bodies: solids in the fluid, with a pose for every frame.
         attributes: custom attributes of the asset, written as fluid:NAME (numbers, 3-vectors, text).
@@ -78,14 +82,19 @@ def write_usd(
     require(interval > 0, f"interval {interval}", "positive seconds")
     fps = _rate(interval)
     payload = path.with_suffix(".usdc")
+    pictures = []
+    if terrain is not None and terrain.texture is not None:
+        pictures = [write_png(path.with_suffix(_TEXTURE), terrain.texture)]
     with atomic_path(payload) as temporary:
         temporary.unlink(missing_ok=True)
-        count = _write_payload(temporary, frames, fps, start_frame, (terrain, camera, bodies), half)
+        count = _write_payload(
+            temporary, frames, fps, start_frame, (terrain, camera, bodies), half, path.stem + _TEXTURE
+        )
     _reload(payload)
     times = (start_frame, start_frame + count - 1)
     write_bytes(path, _interface(payload.name, fps, times, attributes or {}).encode())
     _reload(path)
-    return [path, payload]
+    return [path, payload, *pictures]
 
 
 def _rate(interval: float) -> float:
@@ -155,13 +164,17 @@ def _write_payload(
     start_frame: int,
     beside: tuple[TriangleMesh | None, PinholeCamera | None, Sequence[MovingMesh]],
     half: bool,
+    picture: str = "",
 ) -> int:
-    """All prims; the number of frames. `beside` the fluid: terrain, camera, bodies."""
+    """All prims; the number of frames. `beside` the fluid: terrain, camera, bodies; `picture`: of the terrain."""
     terrain, camera, bodies = beside
     stage = Usd.Stage.CreateNew(str(path))
     root = UsdGeom.Xform.Define(stage, "/Fluid").GetPrim()
     if terrain is not None:
-        _write_mesh(UsdGeom.Mesh.Define(stage, "/Fluid/Terrain"), terrain, None, Usd.TimeCode.Default())
+        ground = UsdGeom.Mesh.Define(stage, "/Fluid/Terrain")
+        _write_mesh(ground, terrain, None, Usd.TimeCode.Default())
+        if terrain.uv is not None:
+            _write_texture(stage, ground, terrain.uv, picture)
     if camera is not None:
         write_camera(UsdGeom.Camera.Define(stage, "/Fluid/Camera"), camera)
     for number, solid in enumerate(bodies):
@@ -305,6 +318,36 @@ def _write_mesh(mesh: UsdGeom.Mesh, value: TriangleMesh, velocities: np.ndarray 
         mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).Set(_vec3(linear_colors(value.colors), False), time)
     if velocities is not None:
         mesh.CreateVelocitiesAttr().Set(_vec3(np.asarray(velocities), False), time)
+
+
+def _write_texture(stage: Usd.Stage, mesh: UsdGeom.Mesh, uv: np.ndarray, picture: str) -> None:
+    """A preview material with the picture, on a mesh with texture coordinates; USD counts v from below."""
+    place = mesh.GetPath().AppendChild("Material")
+    corners = np.ascontiguousarray(uv.reshape(-1, 2) * (1.0, -1.0) + (0.0, 1.0), np.float32)
+    primvar = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar(
+        "st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.faceVarying
+    )
+    primvar.Set(Vt.Vec2fArray.FromNumpy(corners))
+    material = UsdShade.Material.Define(stage, place)
+    reader, texture, surface = (
+        UsdShade.Shader.Define(stage, place.AppendChild(name)) for name in ("Coordinates", "Texture", "Surface")
+    )
+    kinds = Sdf.ValueTypeNames
+    reader.CreateIdAttr("UsdPrimvarReader_float2")
+    reader.CreateInput("varname", kinds.String).Set("st")
+    found = reader.CreateOutput("result", kinds.Float2)
+    texture.CreateIdAttr("UsdUVTexture")
+    texture.CreateInput("file", kinds.Asset).Set(Sdf.AssetPath(f"./{picture}"))
+    texture.CreateInput("sourceColorSpace", kinds.Token).Set("sRGB")
+    texture.CreateInput("st", kinds.Float2).ConnectToSource(found)
+    for wrap in ("wrapS", "wrapT"):
+        texture.CreateInput(wrap, kinds.Token).Set("clamp")
+    colour = texture.CreateOutput("rgb", kinds.Float3)
+    surface.CreateIdAttr("UsdPreviewSurface")
+    surface.CreateInput("diffuseColor", kinds.Color3f).ConnectToSource(colour)
+    surface.CreateInput("roughness", kinds.Float).Set(1.0)
+    material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", kinds.Token))
+    UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(material)
 
 
 def _write_body(stage: Usd.Stage, solid: MovingMesh, number: int, start_frame: int) -> None:

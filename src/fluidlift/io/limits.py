@@ -57,7 +57,9 @@ def _suggestion(path: Path) -> str:
     parent = path.parent
     if not parent.is_dir():
         return f"check the folder: '{parent}' does not exist either"
-    near = difflib.get_close_matches(path.name, [p.name for p in parent.iterdir()], n=3, cutoff=0.6)
+    # an asset that a run is about to write has the name of its clip
+    names = [p.name for p in parent.iterdir() if p.suffix != ".fluid" or path.suffix == ".fluid"]
+    near = difflib.get_close_matches(path.name, names, n=3, cutoff=0.6)
     return f"check the name; similar ones there: {', '.join(near)}" if near else "check the name"
 
 

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy import ndimage
 
 from fluidlift.numerics.sampling import sample_nodes
+from fluidlift.numerics.textures import sample_texture
 from fluidlift.types import Gaussians, PinholeCamera, Terrain, TriangleMesh, decompose_covariances, sh_from_rgb
 
 LIGHT = np.array([0.35, -0.45, 0.82])
 """direction towards a high light beside the viewer, world"""
+
+TEXTURED = 60_000
+"""surfels of a textured ground, at most: what a preview's panel shows; large stills take more"""
 
 
 def vertex_normals(mesh: TriangleMesh) -> Float[np.ndarray, "v 3"]:
@@ -24,17 +30,48 @@ def vertex_normals(mesh: TriangleMesh) -> Float[np.ndarray, "v 3"]:
     return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
 
 
-def terrain_surfels(terrain: Terrain, *, opacity: float = 0.98) -> Gaussians:
-    """One flat, shaded Gaussian per vertex of the terrain's surface, so that one rasteriser draws everything; as large
-    as the surface that the vertex stands for, a cell at most."""
+def terrain_surfels(terrain: Terrain, *, opacity: float = 0.98, most: int = TEXTURED) -> Gaussians:
+    """Flat, shaded Gaussians on the terrain's surface, so that one rasteriser draws everything.
+
+    One per vertex, as large as the surface that it stands for, a cell at most. Where there is a texture, they lie on
+    the faces, and these are cut up as far as `most` surfels allow.
+    """
     mesh = terrain.mesh
     if len(mesh.vertices) == 0:
         return Gaussians.empty()
+    if mesh.texture is not None:
+        return _textured_surfels(mesh, opacity, most)
     normals = vertex_normals(mesh)
     h = np.clip(np.sqrt(_vertex_areas(mesh)), 0.25 * terrain.grid.spacing, terrain.grid.spacing)
     colors = np.full((len(normals), 3), 0.5) if mesh.colors is None else mesh.colors
     seen = normals[:, 2] > -0.3  # nobody looks at the underside, and its large faces stick out at the rim
     return _surfels(mesh.vertices[seen], normals[seen], h[seen], colors[seen], opacity)
+
+
+def _textured_surfels(mesh: TriangleMesh, opacity: float, most: int) -> Gaussians:
+    assert mesh.uv is not None and mesh.texture is not None
+    a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
+    cross = np.cross(b - a, c - a)
+    area = 0.5 * np.linalg.norm(cross, axis=1)
+    seen = cross[:, 2] > -0.6 * area
+    spacing = math.sqrt(2.0 * float(area[seen].sum()) / most)
+    while float(np.square(_parts((a, b, c), spacing))[seen].sum()) > most and spacing < np.ptp(mesh.vertices):
+        spacing *= 1.1  # faces are cut into whole numbers of parts
+    normals = vertex_normals(mesh)[mesh.faces]
+    at = _cut(np.where(seen, area, 0.0), (a, b, c), spacing)
+    share = np.stack([1 - at.s - at.t, at.s, at.t], -1)[..., None]
+    where, uv, normal = ((v[at.face] * share).sum(axis=1) for v in (np.stack([a, b, c], 1), mesh.uv, normals))
+    # smooth across faces, but a side's edge at the top stays an edge
+    flat = (cross / np.maximum(2 * area, 1e-20)[:, None])[at.face]
+    normal = np.where(((normal * flat).sum(axis=1) > 0.8)[:, None], normal, flat)
+    normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-20)
+    # a surfel shows the mean of the texels about its middle: its overlap with its neighbours evens out the rest
+    texel = float(np.ptp(mesh.vertices[:, 0])) / mesh.texture.shape[1]
+    covered = max(round(0.25 * float(np.median(at.size)) / texel), 1)
+    # a leg of a right triangle: its hypotenuse would make the picture soft
+    size = at.size * np.maximum(np.sqrt(2.0 * area) / np.maximum(_longest((a, b, c)), 1e-20), 0.5)[at.face]
+    even = ndimage.uniform_filter(mesh.texture, (covered, covered, 0), mode="nearest")
+    return _surfels(where, normal, size, sample_texture(even, uv), opacity)
 
 
 def _vertex_areas(mesh: TriangleMesh) -> np.ndarray:
@@ -68,22 +105,47 @@ def mesh_surfels(
     cross = np.cross(b - a, c - a)
     area = 0.5 * np.linalg.norm(cross, axis=1)
     spacing = max(spacing, math.sqrt(2.0 * float(area.sum()) / most))
-    longest = np.sqrt(np.max([np.square(b - a).sum(1), np.square(c - b).sum(1), np.square(a - c).sum(1)], axis=0))
-    parts = np.clip(np.ceil(longest / spacing), 1, 200).astype(int)
-    points, normals, sizes = [], [], []
+    at = _cut(area, (a, b, c), spacing)
+    share = np.stack([1 - at.s - at.t, at.s, at.t], -1)[..., None]
+    where = (np.stack([a, b, c], 1)[at.face] * share).sum(axis=1)
+    normals = 0.5 * cross[at.face] / area[at.face, None]
+    return _surfels(where, normals, at.size, np.array([color] * len(where)), 0.98)
+
+
+@dataclass(frozen=True)
+class _Places:
+    """Points on faces: a + s (b - a) + t (c - a)."""
+
+    face: np.ndarray
+    s: np.ndarray
+    t: np.ndarray
+    size: np.ndarray
+    """m that each stands for"""
+
+
+def _longest(corners: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
+    a, b, c = corners
+    return np.sqrt(np.max([np.square(b - a).sum(1), np.square(c - b).sum(1), np.square(a - c).sum(1)], axis=0))
+
+
+def _parts(corners: tuple[np.ndarray, np.ndarray, np.ndarray], spacing: float) -> np.ndarray:
+    """Into how many parts the longest side of each face is cut."""
+    return np.clip(np.ceil(_longest(corners) / spacing), 1, 200).astype(int)
+
+
+def _cut(area: np.ndarray, corners: tuple[np.ndarray, np.ndarray, np.ndarray], spacing: float) -> _Places:
+    """Centres of the n^2 triangles that each face with an area is cut into, at most `spacing` long."""
+    parts, longest, found = _parts(corners, spacing), _longest(corners), []
     for n in np.unique(parts):
-        # centres of the n^2 triangles that a face is cut into: n (n + 1) / 2 upright ones and the others between them
+        # n (n + 1) / 2 upright ones and the others between them
         i, j = (x.ravel() for x in np.meshgrid(np.arange(n), np.arange(n), indexing="ij"))
         upright, between = i + j < n, i + j < n - 1
         s = np.concatenate([i[upright] + 1 / 3, i[between] + 2 / 3]) / n
         t = np.concatenate([j[upright] + 1 / 3, j[between] + 2 / 3]) / n
-        at = (parts == n) & (area > 0)
-        place = a[at][:, None] * (1 - s - t)[:, None] + b[at][:, None] * s[:, None] + c[at][:, None] * t[:, None]
-        points.append(place.reshape(-1, 3))
-        normals.append(np.repeat(0.5 * cross[at] / area[at, None], len(s), axis=0))
-        sizes.append(np.repeat(longest[at] / n, len(s)))
-    where = np.concatenate(points)
-    return _surfels(where, np.concatenate(normals), np.concatenate(sizes), np.array([color] * len(where)), 0.98)
+        face = np.flatnonzero((parts == n) & (area > 0))
+        each, k = np.repeat(face, len(s)), len(face)
+        found.append((each, np.tile(s, k), np.tile(t, k), longest[each] / n))
+    return _Places(*(np.concatenate(column) for column in zip(*found, strict=True)))
 
 
 def terrain_depth(terrain: Terrain, camera: PinholeCamera, *, steps: int = 96) -> Float[np.ndarray, "h w"]:

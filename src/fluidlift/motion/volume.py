@@ -89,7 +89,7 @@ class VolumeOptions:
     balanced: bool | None = None
     """whether the net flux through the surface is taken off before the projection"""
     even: bool = False
-    """all faces but those towards air resist alike: the projection without knowledge of what was seen"""
+    """all faces but those towards air resist alike, whatever was seen"""
 
     def __post_init__(self) -> None:
         require(self.extension in (None, "harmonic", "layered"), f"extension '{self.extension}'", "harmonic or layered")
@@ -114,6 +114,8 @@ class VolumeReport:
     """m^3/s up and out through the free surface, net"""
     change_observed: float = 0.0
     """relative change (2-norm) that the divergence-free solve made to the faces between observed cells, 0 to 1"""
+    viscous: float = 0.0
+    """how surely a stream is a viscous film, 0 to 1 (`motion.bed.film_share`)"""
 
 
 class VolumeSolver:
@@ -182,7 +184,10 @@ class VolumeSolver:
         require(
             bool(seen.any()), "no surface sample near a fluid cell", f"samples within {SNAP_CELLS} cells of the fluid"
         )
-        centers, confidence = self._extended(values, seen, self._share_of(surface))
+        viscous, share = self._viscous(surface), self._share
+        if share is not None and self._film is not None:
+            share = (viscous * self._film + (1.0 - viscous) * share).astype(np.float32)
+        centers, confidence = self._extended(values, seen, share)
         extended = faces_from_centers(centers, self._carrying)
         extended = inward_only(extended, self._rim)
         start = balance_surface(extended, types, system.openings) if self._balanced else extended
@@ -200,7 +205,7 @@ class VolumeSolver:
             solve = max(solve, other, key=lambda report: report.residual)
         velocity = velocity if self._rim else continue_through_ends(velocity, self._ends)
         change = _change(extended, velocity, seen & (confidence > 0.5))
-        return velocity, _report(velocity, system, types, solve, change)
+        return velocity, replace(_report(velocity, system, types, solve, change), viscous=viscous)
 
     def _closed(self) -> float:
         """Mobility of a closed surface."""
@@ -208,13 +213,11 @@ class VolumeSolver:
         length = max(int(np.count_nonzero(fluid.any(axis=a))) for a in ((1, 2), (0, 2), (0, 1)))
         return min(CLOSED_SURFACE * self._bed.depth / self._bed.grid.spacing / max(length, 1) ** 2, YIELDING_SURFACE)
 
-    def _share_of(self, surface: SurfaceMotion) -> Float[np.ndarray, "nx ny nz"] | None:
-        """Share of the free speed in each cell, by what the surface says of the fluid; None: harmonic."""
-        if self._share is None or self._film is None:
-            return self._share
+    def _viscous(self, surface: SurfaceMotion) -> float:
+        """How surely this is a viscous film, 0 to 1; 0 where it is not asked."""
         known = surface.observed if surface.observed.any() else slice(None)
-        viscous = film_share(surface.points[known], surface.velocities[known], self._bed.depth)
-        return (viscous * self._film + (1.0 - viscous) * self._share).astype(np.float32)
+        points, velocities = surface.points[known], surface.velocities[known]
+        return 0.0 if self._film is None else film_share(points, velocities, self._bed.depth)
 
     def _end_limits(self, values: Float[np.ndarray, "nx ny nz 4"], seen: Bool[np.ndarray, "nx ny nz"]) -> list[float]:
         """Flux that each end can carry, in face areas times m/s, from the fastest surface observed near it: whatever
@@ -322,14 +325,12 @@ class _Bed:
         spacing = self.grid.spacing
         depth = np.clip(_column_depth(self.types, spacing), spacing, 2.0 * self.depth)[..., None]
         distance = wall_distance(self.types, self.terrain, self.grid)
-        share = speed_share(distance, kind=self.kind, spacing=spacing, depth=depth, wall=self.wall)
-        return share.astype(np.float32)
+        return speed_share(distance, kind=self.kind, spacing=spacing, depth=depth, wall=self.wall).astype(np.float32)
 
     def slows(self) -> bool:
         """Whether the layer reaches the centres of the cells at the wall; else a wall only turns the flow."""
-        half = np.asarray(0.5 * self.grid.spacing)
-        share = speed_share(half, kind=self.kind, spacing=self.grid.spacing, depth=self.depth, wall=self.wall)
-        return bool(share < 1.0)
+        half, h = np.asarray(0.5 * self.grid.spacing), self.grid.spacing
+        return bool(speed_share(half, kind=self.kind, spacing=h, depth=self.depth, wall=self.wall) < 1.0)
 
 
 def _bed_cells(types: np.ndarray) -> np.ndarray:

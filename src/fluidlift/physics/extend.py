@@ -16,7 +16,7 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from fluidlift.errors import InputRejected, require
-from fluidlift.numerics.isosurface import surface_nets
+from fluidlift.numerics.ground_block import ground_mesh
 from fluidlift.numerics.sampling import sample_faces, sample_nodes
 from fluidlift.types import CellType, FaceVelocity, Grid, Particles, Terrain, TriangleMesh
 
@@ -161,13 +161,33 @@ def _extended_distance(terrain: Terrain, outlet: Outlet, grid: Grid) -> np.ndarr
 
 
 def _extended_mesh(terrain: Terrain, outlet: Outlet, grid: Grid, distance: np.ndarray) -> TriangleMesh:
-    vertices, faces = surface_nets(distance, spacing=grid.spacing, origin=grid.origin)
-    old = terrain.mesh
-    if old.colors is None or not len(old.vertices) or not len(vertices):
-        return TriangleMesh(vertices, faces)
+    """The block of the longer ground, in the colours of the place that is repeated.
+
+    It is as high as the solid, but not higher than the old mesh: the wall that closes the channel behind its inlet is
+    solid, and not shown.
+    """
+    longer = Terrain(grid, distance.astype(np.float32), terrain.mainstream, terrain.mesh)
+    old, heights = terrain.mesh, _ground_height(longer)
+    if len(old.vertices):
+        heights = np.minimum(heights, _shown_height(old, outlet, grid))
+    block = ground_mesh(grid, heights)
+    if old.colors is None or not len(old.vertices):
+        return block
     side = terrain.grid.shape[outlet.axis] * terrain.grid.spacing
-    nearest = cKDTree(old.vertices).query(outlet.image(vertices, 0.5 * side))[1]
-    return TriangleMesh(vertices, faces, old.colors[nearest])
+    nearest = cKDTree(old.vertices).query(outlet.image(block.vertices, 0.5 * side))[1]
+    return TriangleMesh(block.vertices, block.faces, old.colors[nearest])
+
+
+def _shown_height(mesh: TriangleMesh, outlet: Outlet, grid: Grid) -> Float[np.ndarray, "nx+1 ny+1"]:
+    """z of the top of the old mesh over each node column, and of its end beyond, lowered with the slope; m."""
+    top = mesh.vertices[np.argsort(-mesh.vertices[:, 2], kind="stable")].astype(np.float64)
+    columns = np.round((top[:, :2] - outlet.grid.low[:2]) / grid.spacing).astype(np.int64)
+    highest = top[np.unique(columns, axis=0, return_index=True)[1]]
+    nodes = grid.nodes()[:, :, 0].reshape(-1, 3)
+    past = np.maximum(outlet.beyond(nodes), 0.0)
+    nodes[:, outlet.axis] -= outlet.sign * past
+    nearest = cKDTree(highest[:, :2]).query(nodes[:, :2])[1]
+    return (highest[nearest, 2] - outlet.slope * past).reshape(grid.shape[0] + 1, grid.shape[1] + 1)
 
 
 def _embedded(cells: np.ndarray, outlet: Outlet, grid: Grid) -> tuple[np.ndarray, tuple[slice, ...]]:

@@ -9,10 +9,27 @@ its present one. Liquid that hangs over air (a fall that leaves the box) has p =
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
+from scipy import ndimage
 
 from fluidlift.physics.boundaries import Walls
 from fluidlift.types import CellType, FaceVelocity
+
+OUTLET_CELLS = 3.0
+"""cells of OUTFLOW that liquid passes before it is taken away: one for its level, one each side of it for gradients"""
+
+
+def thin_outlet(cell_types: UInt8[np.ndarray, "nx ny nz"]) -> UInt8[np.ndarray, "nx ny nz"]:
+    """The cells with an outlet that is `OUTLET_CELLS` thick; what lies behind is EMPTY.
+
+    An outlet that reaches on to the side of its box would carry liquid past the end that was seen.
+    """
+    outflow = cell_types == CellType.OUTFLOW
+    before = ~outflow & (cell_types != CellType.SOLID)
+    if not outflow.any() or not before.any():
+        return cell_types
+    behind = outflow & (ndimage.distance_transform_edt(~before) > OUTLET_CELLS)
+    return np.where(behind, CellType.EMPTY, cell_types).astype(np.uint8)
 
 
 def water_levels(wet: Bool[np.ndarray, "nx ny nz"], walls: Walls) -> Int[np.ndarray, "nx ny"]:

@@ -7,13 +7,15 @@ from typing import Any
 
 from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected
-from fluidlift.pipeline import body, depths, reading, seeing
+from fluidlift.pipeline import body, depths, given_body, reading, seeing
 from fluidlift.pipeline.reading import Inputs
 from fluidlift.pipeline.seeing import NO_HINTS, Hints
 from fluidlift.pipeline.story import Result, Story, file_hash
 
 Hashes = dict[str, Any]
 """SHA-256 of the input files by name"""
+_OPTIONS = {"geometry": ("--geometry-from", "folder")}
+"""option and what it takes, where they are not --name and a file"""
 
 
 def input_hashes(inputs: Inputs) -> Hashes:
@@ -36,7 +38,8 @@ def input_hashes(inputs: Inputs) -> Hashes:
         elif name in ("flow", "mask") and is_sequence(path):  # a pattern
             hashes[name] = file_hash(path.parent)
         else:
-            raise InputRejected(f"no such {name} file: '{path.name}'", "an existing file", f"check --{name}")
+            option, what = _OPTIONS.get(name, (f"--{name}", "file"))
+            raise InputRejected(f"no such {name} {what}: '{path}'", f"an existing {what}", f"check {option}")
     return hashes
 
 
@@ -52,7 +55,8 @@ def weights_hash(weights: str | None) -> str | None:
 
 
 def look(story: Story, inputs: Inputs, config: JobConfig, hashes: Hashes, hints: Hints = NO_HINTS) -> None:
-    """Run read, flow and segment."""
+    """Run read, flow and segment; what later stages are given is looked at before the slow ones."""
+    depths.require_weights(config)
     motion, segment = config.section("motion"), config.section("segment")
     segment["weights"] = weights_hash(segment["weights"])
     # limits guard the reading and do not change what is read
@@ -60,6 +64,9 @@ def look(story: Story, inputs: Inputs, config: JobConfig, hashes: Hashes, hints:
 
     def flow() -> Result:
         seeing.require_usable(story, inputs, config, hints)
+        depths.require_file(story, inputs, config)
+        if inputs.geometry is not None:
+            given_body.given_bodies(inputs.geometry, reading.clip_of(story).size, [0])
         return seeing.flow(story, inputs, config)
 
     story.run(

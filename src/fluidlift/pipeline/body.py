@@ -9,21 +9,26 @@ import numpy as np
 
 from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected
-from fluidlift.io.stage_cache import parts_of
-from fluidlift.pipeline import composite, depths, given_body
+from fluidlift.pipeline import composite, depths, given_body, ground
 from fluidlift.pipeline.reading import Inputs, clip_of
 from fluidlift.pipeline.seeing import masks_of, mean_motion
 from fluidlift.pipeline.story import Result, Story
-from fluidlift.shape import airborne, channel, generate, ground_mesh, place, surface, terrain
+from fluidlift.shape import (
+    generate,
+    ground_mesh,
+    ground_texture,
+    place,
+    puddle,
+    surface,
+    terrain,
+)
 from fluidlift.shape import kind as kinds
 from fluidlift.shape.framing import framing_warnings
 from fluidlift.shape.given_depth import DepthPictures
-from fluidlift.shape.jets import lying_pixels
 from fluidlift.types import (
     CellType,
     Gaussians,
     Grid,
-    Label,
     PinholeCamera,
     Similarity3,
     Terrain,
@@ -65,7 +70,7 @@ def geometry(story: Story, inputs: Inputs, config: JobConfig) -> Result:
         level, unsure = _water_level(inputs)
         height = float(eye[2] - level)
     front, known_scale = _front(
-        inputs, canonical, parts.lying, kind, motion, trust * ~parts.falling, start, clip.interval, height,
+        inputs, canonical, parts.lying, kind, motion, trust * ~parts.falling, start, clip.interval, height, up.roll,
         tilt_known=pose_given or c.pitch is not None,
     )  # fmt: skip
     if parts.puddle:
@@ -85,7 +90,7 @@ def geometry(story: Story, inputs: Inputs, config: JobConfig) -> Result:
             f"only {int(visible.sum())} fluid pixels at frame {start}", f"at least {FEWEST_PIXELS}",
             "check the mask, or raise --max-size",
         )  # fmt: skip
-    points, velocities = _surface_motion(canonical, visible, front.depth, motion, clip.interval)
+    points, velocities = _surface_motion(canonical, visible, front.sighted, motion, clip.interval)
     scale = place.metric_scale(
         kind, points, velocities, size=c.size, camera_height=height, known_scale=known_scale,
         seen=place.Sighting(trust[visible], clip.interval, up.pitch),
@@ -108,7 +113,11 @@ def geometry(story: Story, inputs: Inputs, config: JobConfig) -> Result:
     half = (front.half_thickness * scale.value).astype(np.float32)
     bulk = to_world.vectors(mainstream) / to_world.scale
     speed = _seen_speed(visible, velocities * scale.value, trust)
-    setting = _setting(kind, front, fluid, start, united, camera, to_world, depth, half, bulk, c, falling.pixels, speed)
+    scene = None if seen_depth is None else np.where(mask, np.nan, seen_depth.scene.depth * scale.value)
+    setting = ground.setting_around(
+        kind, front, fluid, start, united, camera, to_world, depth, half, bulk, c, falling.pixels,
+        speed=speed, scene_depth=scene, closed=parts.puddle,
+    )  # fmt: skip
     setting = composite.composed(setting, falling, to_world, points[~falls], velocities[~falls], camera)
     if not (setting.cell_types == CellType.FLUID).any():
         raise InputRejected(
@@ -116,11 +125,16 @@ def geometry(story: Story, inputs: Inputs, config: JobConfig) -> Result:
             "check the mask and --kind, or raise --set shape.cells=...",
         )  # fmt: skip
     # the plate looks at a few frames only
-    plate = generate.background_plate(clip.frames, cast(Any, fluid), _solid(fluid.labels) > 0.5)
-    arrays, meta = _packed(setting)
+    plate = generate.background_plate(clip.frames, cast(Any, fluid), ground.solid_share(fluid.labels) > 0.5)
+    if setting.surface_height is not None:
+        view = ground_texture.View(
+            plate.image, camera, ground.seen_labels(fluid, start, united, falling.pixels), np.asarray(plate.seen)
+        )
+        setting = ground.textured(setting, view)
+    arrays, meta = ground.packed(setting)
     arrays |= {
         "mask": mask, "depth": depth, "half_thickness": half, "mean_flow": motion, "mean_confidence": trust,
-        "plate": plate.image,
+        "sighted_depth": (front.sighted * scale.value).astype(np.float32), "plate": plate.image,
     }  # fmt: skip
     meta |= {
         "warnings": warnings,
@@ -157,6 +171,10 @@ def _kind_and_up(story, inputs, config, known, pose_given, mask, motion, trust):
         kind, parts = composite.split(
             kind, known, surveyed if pose_given else None, mask, motion, trust, free=c.kind == "auto"
         )
+        if kind == "pour" and c.kind == "auto":
+            poured = puddle.jets_into_puddle(known, surveyed if pose_given else None, mask, motion, trust)
+            if poured is not None:
+                kind, parts = "stream", composite.Parts(poured.jets, poured.lying, puddle=True)
     else:
         parts = composite.Parts((), mask)
     if pose_given:
@@ -167,30 +185,11 @@ def _kind_and_up(story, inputs, config, known, pose_given, mask, motion, trust):
         if upright is not None:
             return evidence, kind, parts, upright, None
     up = kinds.estimate_up(kind, parts.lying, motion, trust * ~parts.falling, known, pitch=c.pitch, roll=c.roll)
+    if parts.puddle and c.pitch is None:
+        up = puddle.puddle_tilt(parts.lying, up)
     if c.roll is None:
         up = composite.with_roll(up, parts, known)
     return evidence, kind, parts, up, None
-
-
-def _packed(setting: terrain.Setting) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """A setting as arrays and plain values; `setting_of` reads them back."""
-    solid = setting.terrain
-    arrays = {
-        "signed_distance": solid.signed_distance,
-        "mainstream": solid.mainstream,
-        "mesh_vertices": solid.mesh.vertices,
-        "mesh_faces": solid.mesh.faces,
-        "cell_types": setting.cell_types,
-        "bed_height": setting.bed_height.astype(np.float32),
-    }
-    if setting.surface_height is not None:
-        arrays["surface_height"] = setting.surface_height.astype(np.float32)
-    grid = {"shape": solid.grid.shape, "spacing": solid.grid.spacing, "origin": solid.grid.origin}
-    return arrays, {
-        "grid": grid,
-        "height_field": setting.surface_height is not None,
-        "pool_level": setting.pool_level,
-    }
 
 
 def united_range(story: Story, config: JobConfig) -> tuple[int, int]:
@@ -254,7 +253,7 @@ def _water_level(inputs: Inputs) -> tuple[float, str]:
     )
 
 
-def _front(inputs, canonical, mask, kind, motion, trust, start, interval, height, *, tilt_known):
+def _front(inputs, canonical, mask, kind, motion, trust, start, interval, height, roll, *, tilt_known):
     """The front surface in canonical units; metres per unit where the depth came in metres, else None."""
     if inputs.geometry is not None:
         return given_body.given_front(inputs.geometry, canonical, mask, kind, start)
@@ -265,7 +264,7 @@ def _front(inputs, canonical, mask, kind, motion, trust, start, interval, height
         return front, None
     if kind == "fall":
         return surface.falling_surface(canonical, mask, motion, trust), None
-    return surface.inflated_surface(canonical, mask, kind), None
+    return surface.inflated_surface(canonical, mask, kind, roll), None
 
 
 def _surface_motion(camera, visible, depth, motion, interval) -> tuple[np.ndarray, np.ndarray]:
@@ -307,40 +306,6 @@ def _seen_speed(visible, velocities, trust) -> np.ndarray:
     return speed
 
 
-def _solid(labels: np.ndarray) -> np.ndarray:
-    """float [H,W]: share of the frames, u8 [T,H,W], in which a pixel shows something solid."""
-    parts = (labels[part] == Label.SOLID for part in parts_of(labels))
-    return np.sum([part.sum(axis=0) for part in parts], axis=0) / len(labels)
-
-
-def _setting(
-    kind, front, fluid, start, united, camera, to_world, depth, half, bulk, c, falls, speed
-) -> terrain.Setting:
-    window = slice(start, start + united)
-    mask = generate.united_mask(fluid[window])
-    visible = mask & (depth > 0)
-    grid = camera.pixel_grid()
-    near = camera.unproject(grid[visible & ~falls], depth[visible & ~falls])
-    if front.height is not None:
-        solid, lying = _solid(fluid.labels[window]) > 0.5, lying_pixels(mask, falls)
-        seen = np.where(lying, Label.FLUID, np.where(solid, Label.SOLID, Label.BACKGROUND)).astype(np.uint8)
-        return channel.channel_setting(
-            place.PlacedHeight(front.height, to_world), seen, near, camera, bulk,
-            kind=kind, longest=c.cells, cell_limit=c.cell_limit, depth_ratio=c.depth_ratio, speed=speed,
-        )  # fmt: skip
-    back = depth + 2 * half
-    far = camera.unproject(grid[visible], back[visible])
-    # the box holds what the clip shows later, in the same vertical plane
-    later = fluid.any_frame()
-    middle = np.median((depth + half)[visible])
-    reach = camera.unproject(grid[later], np.full(int(later.sum()), middle))
-    return airborne.airborne_setting(
-        depth, back, visible, camera, np.concatenate([near, far, reach]), bulk,
-        # smoke needs the whole box, and is cheap per cell: no free surface, few particles
-        kind=kind, longest=c.cells, cell_limit=c.cell_limit * (2 if kind == "plume" else 1),
-    )  # fmt: skip
-
-
 # what later stages see ------------------------------------------------------------------------------------------
 
 
@@ -364,8 +329,10 @@ def placement_of(story: Story) -> Similarity3:
 def terrain_of(story: Story) -> Terrain:
     """The solid, textured from the background plate."""
     a = story["geometry"].arrays
-    mesh = TriangleMesh(a["mesh_vertices"], a["mesh_faces"])
-    if len(mesh.faces):
+    mesh = TriangleMesh(
+        a["mesh_vertices"], a["mesh_faces"], a.get("mesh_colours"), a.get("mesh_uv"), a.get("mesh_texture")
+    )
+    if len(mesh.faces) and mesh.colors is None:
         mesh = replace(mesh, colors=ground_mesh.ground_colours(mesh, a["plate"], camera_of(story)))
     return Terrain(grid_of(story), a["signed_distance"], a["mainstream"], mesh)
 

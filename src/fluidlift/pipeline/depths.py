@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -84,6 +84,37 @@ def pictures_of(
     if inputs.depth is not None:
         return _from_file(story, inputs.depth, config, start)
     return _from_model(story, config, camera, start)
+
+
+def require_weights(config: JobConfig) -> None:
+    """Say before the clip is read that a model lacks its weights.
+
+    Raises:
+        InputRejected: a model without weights, or weights that are not there and may not be fetched.
+    """
+    d = config.depth
+    if d.model == "none":
+        return
+    if d.weights is None:
+        raise InputRejected(
+            f"--depth-model {d.model} without its weights", "a file or folder with them",
+            "--depth-weights PATH; docs/depth.md says where to get them",
+        )  # fmt: skip
+    if not d.download and not Path(d.weights).expanduser().exists():
+        raise InputRejected(
+            f"weights '{d.weights}' that are not there", "an existing file or folder",
+            "check --depth-weights, or --set depth.download=true for a name on the hub",
+        )  # fmt: skip
+
+
+def require_file(story: Story, inputs: Inputs, config: JobConfig) -> None:
+    """Say before the flow is computed that a depth file cannot be of this clip; needs the stage read.
+
+    Raises:
+        InputRejected: a file that cannot be read, or does not fit.
+    """
+    if inputs.depth is not None and wanted(inputs, config):
+        _from_file(story, inputs.depth, config, 0)
 
 
 def _frames(count: int, start: int, most: int) -> list[int]:
@@ -178,6 +209,10 @@ def depth_front(
     else:
         front = depth_surface.airborne_surface(scene, level, mask, kind)
     learned = pictures.source != "depth file"
+    if not learned and kind in ("stream", "fall") and fused.holds != "disparity":
+        # a file is believed to its last wave, where it says something; what lies below follows the smooth surface
+        known = mask & np.isfinite(scene.depth) & (scene.depth > 0)
+        front = replace(front, depth=np.where(known, scene.depth, front.depth).astype(np.float32))
     return DepthFront(scene, up, front, scene.unit, learned, meta)
 
 
@@ -195,7 +230,7 @@ def size_warnings(across: float, found: DepthFront, camera_height: float | None,
         return []
     told = []
     if not TINY < across < HUGE:
-        likely = "millimetres: set depth.scale=0.001" if across >= HUGE else "kilometres: set depth.scale=1000"
+        likely = "millimetres: --set depth.scale=0.001" if across >= HUGE else "kilometres: --set depth.scale=1000"
         told.append(f"the depth file makes the fluid {across:.3g} m across; is it in {likely}?")
     drop = float(-np.median(points[:, 2]))
     if camera_height is not None and camera_height > 0 and drop > 0:

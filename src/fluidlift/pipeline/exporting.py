@@ -13,7 +13,7 @@ import numpy as np
 
 from fluidlift.errors import InputRejected
 from fluidlift.io.frames import FIRST_FRAME, FluidFrame
-from fluidlift.pipeline.rendering import frame_numbers
+from fluidlift.pipeline.rendering import frame_numbers, frames_told
 from fluidlift.pipeline.showing import splat_frames
 from fluidlift.pipeline.story import Progress, Silence
 from fluidlift.pipeline.written import Written, cleared, numbered
@@ -90,7 +90,7 @@ def export_asset(folder: Path, out: Path, request: ExportRequest, *, progress: P
         "frames": len(numbers), "first": FIRST_FRAME + numbers[0], "fps": round(1.0 / interval, 6), "to": request.to,
         "up_axis": "z" if own else request.up_axis, "meters_per_unit": 1.0 if own else request.meters_per_unit,
     }  # fmt: skip
-    words = (f"{len(numbers)} frames as {request.to}: {out}", f"{facts['fps']:g} frames per second, from "
+    words = (f"{frames_told(len(numbers))} as {request.to}: {out}", f"{facts['fps']:g} frames per second, from "
              f"{facts['first']}, {facts['up_axis']} up, {facts['meters_per_unit']:g} m per unit")  # fmt: skip
     return Written(out, seconds, (), {"export": {"seconds": round(seconds, 3)}}, facts, words)
 
@@ -211,9 +211,9 @@ def level_set(mesh: TriangleMesh, spacing: float) -> VolumeGrid:
     from fluidlift.numerics.mesh_distance import mesh_distance
 
     found, band = mesh_distance(mesh, spacing), BAND * spacing
-    low = tuple(float(v) - 0.5 * spacing for v in found.grid.origin)  # the voxels' middles lie on the nodes
+    x, y, z = (float(v) - 0.5 * spacing for v in found.grid.origin)  # the voxels' middles lie on the nodes
     values, stored = np.clip(found.distance, -band, band), found.distance < band
-    return VolumeGrid("surface", values, spacing, low, stored, grid_class="level set", background=band)
+    return VolumeGrid("surface", values, spacing, (x, y, z), stored, grid_class="level set", background=band)
 
 
 def gridded(frame: FluidFrame, cells: Grid) -> tuple[FaceVelocity, np.ndarray, Grid]:

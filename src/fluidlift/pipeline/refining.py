@@ -16,7 +16,7 @@ from fluidlift.pipeline.seeing import labels_of
 from fluidlift.pipeline.story import Result, Story
 from fluidlift.seams import Rasterizer
 from fluidlift.shape import generate, terrain
-from fluidlift.types import Gaussians, PinholeCamera, concatenate
+from fluidlift.types import Gaussians, Label, PinholeCamera, concatenate
 
 KEPT = 0.6
 """part of its size that a splat of the inside keeps at least: at 0.3 the first frame is a little cleaner, but once the
@@ -56,9 +56,11 @@ def refine(story: Story, inputs: Inputs, config: JobConfig) -> Result:
         max_added=max(c.max_gaussians - len(shell), 0), closed_below=setting.terrain,
     )  # fmt: skip
     mask, hull = g.arrays["mask"], shell.select(slice(len(shown), None))
-    hull = generate.beneath_front(hull, depth, mask, camera, smallest=KEPT)
-    added = _outside_solid(added, setting)
-    added = generate.beneath_front(added, depth, mask, camera, smallest=KEPT, drop_above=True)
+    # what the picture contradicts goes: cells reach a little before the visible surface and beyond the silhouette
+    allowed = (labels.labels[start : start + united] != Label.BACKGROUND).any(axis=0) | mask
+    inside = [hull, _outside_solid(added, setting)]
+    inside = [generate.beneath_front(part, depth, mask, camera, smallest=KEPT, drop_above=True) for part in inside]
+    hull, added = (generate.within_silhouette(part, allowed, camera, smallest=KEPT) for part in inside)
     body = concatenate([shown, hull, added])
     if len(body) < 50:
         raise InputRejected(

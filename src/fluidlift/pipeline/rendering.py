@@ -24,6 +24,8 @@ VIEWS = ("input", "side", "top", "turn")
 BACKGROUNDS = ("auto", "plate", "terrain", "none")
 FILMS = (".mp4", ".mov")
 PICTURES = (".png", ".exr")
+SURFELS = 200_000
+"""of the terrain: stills are looked at longer than the preview"""
 SIZES = (16, 8192)
 """px, of a side of the picture"""
 
@@ -87,7 +89,7 @@ def render_asset(
     size = stage.cameras[0].size
     facts = {"frames": len(numbers), "first": FIRST_FRAME + numbers[0], "size": list(size), "view": request.view,
              "out": str(out)}  # fmt: skip
-    words = (f"{len(numbers)} frames of {size[0]} x {size[1]} px: {out}",)
+    words = (f"{frames_told(len(numbers))} of {size[0]} x {size[1]} px: {out}",)
     return Written(out, seconds, tuple(warnings), {"render": {"seconds": round(seconds, 3)}}, facts, words)
 
 
@@ -127,6 +129,11 @@ def _check(request: RenderRequest, out: Path) -> None:
         raise InputRejected(f"'{out.name}', which is a file", "a folder, or a film that ends in .mp4 or .mov")
 
 
+def frames_told(count: int) -> str:
+    """A number of frames in words."""
+    return f"{count} frame" + ("s" if count != 1 else "")
+
+
 def frame_numbers(folder: Path, count: int, wanted: tuple[int, int] | None) -> range:
     """Frames of an asset, from 0: of the `count` that were simulated those whose files are there, or those wanted
     (first and last number, from 1001).
@@ -143,7 +150,7 @@ def frame_numbers(folder: Path, count: int, wanted: tuple[int, int] | None) -> r
     first, last = wanted
     if not FIRST_FRAME <= first <= last < FIRST_FRAME + there:
         raise InputRejected(f"frames {first} to {last}", f"numbers from {FIRST_FRAME} to {FIRST_FRAME + there - 1}",
-                            "the first frame of an asset is 1001")  # fmt: skip
+                            "the first frame of an asset is 1001" if first < FIRST_FRAME else "")  # fmt: skip
     return range(first - FIRST_FRAME, last - FIRST_FRAME + 1)
 
 
@@ -238,7 +245,7 @@ def _drawn(stage: _Stage, folder: Path, step: Callable[[int], None]) -> Iterator
     from fluidlift.look.scenery import mesh_surfels, terrain_surfels
 
     scene, way, wanted = stage.scene, _background(stage), stage.numbers
-    ground = Gaussians.empty() if way == "plate" else terrain_surfels(scene.terrain)
+    ground = Gaussians.empty() if way == "plate" else terrain_surfels(scene.terrain, most=SURFELS)
     shapes = [mesh_surfels(o.mesh, scene.terrain.grid.spacing) for o in scene.obstacles]
     before_rocks = _rocks(stage) if way == "plate" else None
     for k, (fluid, _, _) in enumerate(splat_frames(folder, wanted.stop)):

@@ -250,7 +250,7 @@ def evaluation_arrays(story: Story) -> dict[str, np.ndarray]:
     start = g.meta["rest_frame"]
     return {
         "labels": story["segment"].arrays["labels"],
-        "front_depth": g.arrays["depth"] * g.arrays["mask"],
+        "front_depth": g.arrays["sighted_depth"] * g.arrays["mask"],
         "flow_raw": story["flow"].arrays["displacement"],
         "flow_completed": m.arrays["completed"],
         "flow_observed": np.unpackbits(m.arrays["observed"], axis=-1)[..., : m.arrays["completed"].shape[2]],

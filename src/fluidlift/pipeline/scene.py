@@ -179,8 +179,8 @@ def scene_of(
     duration = edits.duration if request.duration is None else request.duration
     clip_frames = max(1, round((asset.frame_count - start) * asset.interval / interval))
     wanted = None if duration is None else max(2, round(duration / interval))
-    rest, grid = asset.rest, asset.grid
-    body = Particles.at_rest(rest.means, 1.0, np.arange(len(rest)), sample_faces(asset.velocity, grid, rest.means))
+    rest, grid, velocity = asset.rest, asset.grid, beyond_surface(asset)
+    body = Particles.at_rest(rest.means, 1.0, np.arange(len(rest)), sample_faces(velocity, grid, rest.means))
     shading = None
     if footage is not None and asset.kind in LYING:  # bodies in the air change their outline: nothing is steady
         mask = footage.labels.fluid.mean(axis=0) > 0.5
@@ -188,13 +188,27 @@ def scene_of(
     changes = dict(edits.parameters)
     longest_step = changes.pop("time_step", None)
     scene = Scene(
-        asset.kind, rest, body, asset.terrain, asset.cell_types, asset.velocity,
+        asset.kind, rest, body, asset.terrain, asset.cell_types, velocity,
         asset.parameters.updated(changes), asset.camera, interval, asset.interval,
         wanted or config.simulate.frames or clip_frames, config.seed, edits.obstacles, shading,
         longest_step=longest_step,
     )  # fmt: skip
     longer = edits.extend_downstream if request.extend_downstream is None else request.extend_downstream
     return extended(scene, longer) if longer > 0 else scene
+
+
+def beyond_surface(asset: FluidAsset) -> FaceVelocity:
+    """The velocity at the first instant, continued from the liquid into air and walls, where it is stored as 0.
+
+    The body's surface lies inside a layer of cells: what is there would take up to half of its speed from the air, and
+    a stream of five cells would lose a fifth of its momentum before it moves. The air around smoke has its own.
+    """
+    from fluidlift.physics.boundaries import extrapolate, touching_faces
+
+    if asset.kind == "plume":
+        return asset.velocity
+    liquid = np.isin(asset.cell_types, (CellType.FLUID, CellType.INFLOW, CellType.OUTFLOW))
+    return extrapolate(asset.velocity, touching_faces(liquid))
 
 
 def extended(scene: Scene, length: float) -> Scene:

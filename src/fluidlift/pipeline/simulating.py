@@ -12,9 +12,9 @@ import numpy as np
 from fluidlift.config import JobConfig
 from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.io.frames import FIRST_FRAME
-from fluidlift.pipeline.scene import Scene, SimulationRequest, simulation_step
+from fluidlift.pipeline.scene import LYING, Scene, SimulationRequest, simulation_step
 from fluidlift.pipeline.story import Result, available_memory
-from fluidlift.types import Gaussians, Particles
+from fluidlift.types import CellType, Gaussians, Particles
 
 if TYPE_CHECKING:
     from fluidlift.physics.numba_particles import ParticleWork
@@ -86,10 +86,23 @@ def simulator_of(scene: Scene, device: str = "cpu") -> ParticleSimulator:
         )  # fmt: skip
     from fluidlift.physics.apic import LiquidSimulator
 
+    cells, body = within_outlet(scene)
     return LiquidSimulator(
-        grid, scene.terrain, parameters, scene.body, cell_types=scene.cell_types, inflow_profile=scene.velocity,
+        grid, scene.terrain, parameters, body, cell_types=cells, inflow_profile=scene.velocity,
         seed=scene.seed, emit_source=look, bodies=scene.bodies, work=particle_work(device),
     )  # fmt: skip
+
+
+def within_outlet(scene: Scene) -> tuple[np.ndarray, Particles]:
+    """Cells and body of what lies on something, without what is behind its outlet; all of those of other fluids."""
+    from fluidlift.physics.outlet import thin_outlet
+
+    if scene.kind not in LYING:
+        return scene.cell_types, scene.body
+    cells, grid = thin_outlet(scene.cell_types), scene.terrain.grid
+    behind = (scene.cell_types == CellType.OUTFLOW) & (cells != CellType.OUTFLOW)
+    at = np.clip(grid.cell_of(scene.body.positions), 0, np.asarray(grid.shape) - 1)
+    return cells, scene.body.select(~behind[tuple(at.T)])
 
 
 def preflight(scene: Scene) -> None:

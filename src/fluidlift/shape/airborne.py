@@ -148,8 +148,8 @@ def with_jets(
     if not jets:
         return setting
     top = max(j.top for j in jets)
-    # a jet that would double the height of the box is cut
-    extra = int(np.clip(np.ceil((top - grid.high[2]) / h) + 3, 0, grid.shape[2]))
+    # a jet that would make the box taller than it is long is cut
+    extra = int(np.clip(np.ceil((top - grid.high[2]) / h) + 3, 0, max(max(grid.shape) - grid.shape[2], grid.shape[2])))
     taller = Grid((grid.shape[0], grid.shape[1], grid.shape[2] + extra), h, grid.origin)
     above = setting.terrain.signed_distance[..., -1:] + h * np.arange(1, extra + 1, dtype=np.float32)
     phi = np.concatenate([setting.terrain.signed_distance, above], axis=2).astype(np.float32)

@@ -5,17 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, UInt8
 from scipy import ndimage
 
 from fluidlift.shape import cross_section
 from fluidlift.shape.cross_section import distance_inside
+from fluidlift.shape.depth_surface import solid_heights
 from fluidlift.shape.ground_mesh import ground_mesh
 from fluidlift.shape.kind import Kind
 from fluidlift.shape.plan import Extent, Footage, Plan, extent_of, plan_of, wide_ends, with_seen
-from fluidlift.shape.surface import HeightModel
 from fluidlift.shape.terrain import Setting, at_cells, signed_distance_from, to_corners, unit
-from fluidlift.types import CellType, Grid, Label, PinholeCamera, Terrain
+from fluidlift.types import CellType, Grid, Label, Terrain
 
 
 @dataclass(frozen=True)
@@ -30,60 +29,47 @@ class _Ground:
     """True where there is water"""
 
 
-def channel_setting(
-    surface: HeightModel,
-    labels: UInt8[np.ndarray, "h w"],
-    visible: Float[np.ndarray, "n 3"],
-    camera: PinholeCamera,
-    mainstream: Float[np.ndarray, "3"],
-    *,
-    kind: Kind,
-    longest: int,
-    cell_limit: int,
-    depth_ratio: float | None = None,
-    speed: Float[np.ndarray, "h w"] | None = None,
-) -> Setting:
+@dataclass(frozen=True)
+class ChannelConfig:
+    """How a fluid that lies on something is built."""
+
+    kind: Kind
+    """stream or fall"""
+    longest: int
+    """cells along the longest side"""
+    cell_limit: int
+    """most cells of the grid"""
+    depth_ratio: float | None = None
+    """greatest depth over the full width; None: usual for the kind"""
+
+
+def channel_setting(seen: Footage, config: ChannelConfig) -> Setting:
     """A fluid that lies on something: water depth grows from the banks, rocks stand out, the ends are open.
 
+    Banks and rocks are as high as the scene's depth shows them, where there is one; else banks rise from the water and
+    rocks are domes.
+
     Args:
-        surface: height of the free surface, world.
-        labels: what each pixel shows (fluid and the solids in it over the united frames).
-        visible: points on the visible fluid, world.
-        camera: in the world.
-        mainstream: direction of the bulk flow, world.
-        kind: stream or fall.
-        longest: cells along the longest side.
-        cell_limit: most cells of the grid.
-        depth_ratio: greatest depth over the full width.
-        speed: of the seen surface, m/s; nan where it is not known.
+        seen: the picture, the surface and the flow.
+        config: how it is built.
+
+    Raises:
+        ValueError: no fluid on the ground.
     """
-    low, high = np.percentile(visible, 0.5, axis=0), np.percentile(visible, 99.5, axis=0)
-    along = _ground_direction(surface, mainstream, 0.5 * (low + high), high - low)
-    seen = Footage(surface, labels, visible, camera, along, speed)
     extent = extent_of(seen)
-    depth = (cross_section.DEPTH_SHARE[kind] if depth_ratio is None else depth_ratio) * extent.width
-    spacing = max((extent.high - extent.low).max() / longest, depth / 10)
+    share = cross_section.DEPTH_SHARE[config.kind] if config.depth_ratio is None else config.depth_ratio
+    depth = share * extent.width
+    spacing = max((extent.high - extent.low).max() / config.longest, depth / 10)
     spacing = min(spacing, depth / 4)  # fewer than four cells hold no velocity profile
     for _ in range(60):
-        grid = _channel_grid(surface, extent.low, extent.high, depth, spacing)
-        if grid.cells <= cell_limit:
+        grid = _channel_grid(seen.surface, extent.low, extent.high, depth, spacing)
+        if grid.cells <= config.cell_limit:
             break
         spacing *= 1.05
     plan = with_seen(plan_of(seen, grid, extent), extent.visible, grid)
-    ground = _bed_and_banks(plan, grid, depth, extent, kind)
-    return _fill_channel(grid, plan, ground, along, extent.reach, mainstream, kind)
-
-
-def _ground_direction(surface, mainstream, centre, extent) -> np.ndarray:
-    """Horizontal direction of the flow; straight downhill for what falls."""
-    flat = np.asarray(mainstream[:2], float)
-    if np.linalg.norm(flat) < 0.3:
-        h = 0.1 * max(float(extent.max()), 1e-6)
-        steps = np.array([[h, 0], [-h, 0], [0, h], [0, -h]])
-        z = surface.height(centre[:2] + steps)
-        flat = -np.array([z[0] - z[1], z[2] - z[3]])
-    norm = np.linalg.norm(flat)
-    return flat / norm if norm > 1e-9 else np.array([1.0, 0.0])
+    ground = _bed_and_banks(plan, grid, depth, extent, config.kind)
+    ground = _as_seen(ground, plan, grid, seen, extent)
+    return _fill_channel(grid, plan, ground, extent.reach, seen, config.kind)
 
 
 def _channel_grid(surface, low, high, depth, spacing) -> Grid:
@@ -121,12 +107,35 @@ def _bed_and_banks(plan: Plan, grid: Grid, depth: float, extent: Extent, kind: K
     smooth = np.minimum(ndimage.gaussian_filter(shown, 0.7), plan.level - 0.5 * h * steep)
     shown = np.where(wet & ~rock, smooth, shown)
     shown = np.where(rock, plan.level + cross_section.rock_height(reach), shown)
+    return _Ground(shown, shown, wet & ~rock)
+
+
+def _as_seen(ground: _Ground, plan: Plan, grid: Grid, seen: Footage, extent: Extent) -> _Ground:
+    """Banks and rocks as high as the scene's depth shows them, and the wall that closes the channel behind its inlet.
+
+    Beside what is seen, the difference to the usual ground fades away over two cells. What stands higher over the
+    water than that is wide (trees, people) is cut there.
+    """
+    h, shown = grid.spacing, ground.shown
+    gx, gy = np.gradient(plan.level, h)
+    steep = np.sqrt(1 + gx**2 + gy**2)
+    dry = ~ground.water
+    if seen.scene_depth is not None:
+        found = solid_heights(seen.scene_depth, seen.labels, seen.camera, grid)
+        least = plan.level + np.where(plan.label == Label.SOLID, 1.0, 0.3) * h * steep
+        change = np.clip(found, least, plan.level + extent.width) - shown
+        known = dry & np.isfinite(change)
+        share = ndimage.gaussian_filter(known.astype(float), 2.0)
+        spread = ndimage.gaussian_filter(np.where(known, change, 0.0), 2.0) / (share + 0.05)
+        shown = np.where(known, shown + change, np.where(dry, np.maximum(shown + spread, least), shown))
+    if seen.closed:
+        return _Ground(shown, shown, ground.water)
     upstream = plan.along < extent.reach[0]
-    bed = np.where(upstream, np.maximum(shown, plan.level + 2.5 * h * steep), shown)  # closes it behind the inlet
-    return _Ground(bed, shown, wet & ~rock & ~upstream)
+    bed = np.where(upstream, np.maximum(shown, plan.level + 2.5 * h * steep), shown)
+    return _Ground(bed, shown, ground.water & ~upstream)
 
 
-def _fill_channel(grid, plan, ground: _Ground, along, reach, mainstream, kind) -> Setting:
+def _fill_channel(grid, plan, ground: _Ground, reach, seen: Footage, kind) -> Setting:
     h, bed, water = grid.spacing, ground.bed, ground.water
     gx, gy = np.gradient(bed, h)
     nodes = grid.nodes()
@@ -140,13 +149,15 @@ def _fill_channel(grid, plan, ground: _Ground, along, reach, mainstream, kind) -
     cells = np.full(grid.shape, CellType.EMPTY, np.uint8)
     cells[solid] = CellType.SOLID
     cells[fluid] = CellType.FLUID
+    terrain = Terrain(grid, phi.astype(np.float32), unit(seen.mainstream), ground_mesh(grid, to_corners(ground.shown)))
+    if seen.closed:
+        return Setting(terrain, cells, plan.level, bed)
     start, stop = wide_ends(water, plan.along, reach, h, share=0.4)
     entry = s < start + 2.5 * h
     if kind == "fall":
-        entry = entry | _upper_rim(water, plan.level, along)[..., None]
+        entry = entry | _upper_rim(water, plan.level, seen.along)[..., None]
     cells[fluid & entry] = CellType.INFLOW
     cells[~solid & (s > stop - 2.5 * h)] = CellType.OUTFLOW
-    terrain = Terrain(grid, phi.astype(np.float32), unit(mainstream), ground_mesh(grid, to_corners(ground.shown)))
     return Setting(terrain, cells, plan.level, bed)
 
 

@@ -18,6 +18,7 @@ from scipy.linalg import solve
 from fluidlift.errors import InputRejected
 from fluidlift.shape.given_depth import SceneDepth, robust_plane, without_rim
 from fluidlift.shape.kind import PITCH_PRIOR, Kind, UpEvidence
+from fluidlift.shape.plume import SIGHT
 from fluidlift.shape.slope import SlopeEvidence
 from fluidlift.shape.surface import FrontSurface, HeightModel, ProfileHeight, inflated_surface, intersect_height
 from fluidlift.types import Grid, Label, PinholeCamera
@@ -366,11 +367,11 @@ def airborne_surface(
     near, far = np.nanpercentile(1.0 / scene.depth[use], [99, 1])
     plane = 1.0 / np.clip(inverse, far, near)
     round_body = inflated_surface(camera, mask, kind)
-    # a smoke's mean depth is that of its middle; of a jet the front is seen
-    share = 1.0 if kind == "plume" else np.pi / 4
+    # smoke is seen where enough of it lies in front; of a jet the front is seen
+    share = 2.0 * SIGHT if kind == "plume" else np.pi / 4
     half = round_body.half_thickness * plane
     front = np.where(mask, plane - share * half, 0.0)
-    return FrontSurface(front.astype(np.float32), half.astype(np.float32), None)
+    return FrontSurface(front.astype(np.float32), half.astype(np.float32), None, kind=kind)
 
 
 def solid_heights(

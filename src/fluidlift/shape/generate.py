@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -235,6 +236,41 @@ def beneath_front(
     scales = gaussians.scales * np.where(seen, share, 1.0)[:, None].astype(gaussians.scales.dtype)
     small = Gaussians(gaussians.means, gaussians.quats, scales, gaussians.opacities, gaussians.sh)
     return small.select(~seen | (gap >= 0)) if drop_above else small
+
+
+def within_silhouette(
+    gaussians: Gaussians,
+    allowed: Bool[np.ndarray, "h w"],
+    camera: PinholeCamera,
+    *,
+    smallest: float = 0.3,
+) -> Gaussians:
+    """What does not contradict the silhouette: splats of the inside that would be seen where the picture shows no fluid
+    go, and those near the edge are made small enough not to stick out.
+
+    One at distance d from the edge gets a standard deviation of d / 2 at most, as in `beneath_front`. What lies off the
+    picture or behind the camera stays as it is. The cells of a grid, the far side of a fall and the top of a jet all
+    reach a little beyond the silhouette; nothing else hides them there.
+
+    Args:
+        gaussians: of the hull and the filling, world.
+        allowed: pixels that show fluid, or something solid that may hide it.
+        camera: in the world.
+        smallest: part of its size that a splat keeps at least.
+    """
+    if len(gaussians) == 0 or allowed.all() or not allowed.any():
+        return gaussians
+    row, col, z = camera.nearest_pixels(gaussians.means)
+    uv, _ = camera.project(gaussians.means)
+    inside = (z > 0) & (uv >= 0).all(1) & (uv[:, 0] < allowed.shape[1]) & (uv[:, 1] < allowed.shape[0])
+    # to the edge between two pixels, not to the middle of the next one
+    distance = cast(np.ndarray, ndimage.distance_transform_edt(allowed))
+    away = np.maximum(distance[row, col] - 0.5, 0.0)
+    wide = gaussians.scales.max(axis=1) * camera.focal[0] / np.maximum(z, 1e-9)
+    share = np.where(inside, np.clip(0.5 * away / np.maximum(wide, 1e-12), smallest, 1.0), 1.0)
+    scales = gaussians.scales * share[:, None].astype(gaussians.scales.dtype)
+    small = Gaussians(gaussians.means, gaussians.quats, scales, gaussians.opacities, gaussians.sh)
+    return small.select(~inside | allowed[row, col])
 
 
 def fluid_colour_frame(frame: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:

@@ -220,11 +220,11 @@ def _require_order(fused: FusedDepth, expected: np.ndarray, known: np.ndarray) -
     if fused.holds == "disparity":
         raise InputRejected(
             f"a {fused.source} in which the far end of the fluid has the larger numbers", "disparity, larger when near",
-            "set depth.holds=relative if it is depth, or depth.holds=metres",
+            "--set depth.holds=relative if it is depth, or depth.holds=metres",
         )  # fmt: skip
     raise InputRejected(
         f"a {fused.source} in which the far end of the fluid has the smaller numbers: it looks like disparity "
-        "(inverse depth)", "depth, larger when far", "set depth.holds=disparity, or invert it",
+        "(inverse depth)", "depth, larger when far", "--set depth.holds=disparity, or invert it",
     )  # fmt: skip
 
 

@@ -13,9 +13,6 @@ from fluidlift.shape.jets import Outline
 from fluidlift.shape.surface import FrontSurface
 from fluidlift.types import PinholeCamera, Similarity3
 
-LID = 0.4
-"""rounding of the far rim of a round top over the sine of the camera's pitch: 1 - sqrt(1 - 0.8^2)"""
-
 
 @dataclass(frozen=True)
 class Jet:
@@ -102,8 +99,9 @@ def stand(outline: Outline, camera: PinholeCamera, front: FrontSurface) -> Jet |
     rays, eye = camera.rays(outline.centers), camera.position
     # the vertical plane through the axis that faces the viewer
     middle = ((axis - eye[:2]) @ away) / np.maximum(rays[:, :2] @ away, 1e-9)
-    if outline.rounding > 0.5 * LID * abs(camera.camera_from_world.rotation[2, 2]):
-        # the upper edge is the far rim of the top
+    if not outline.cut:
+        # the upper edge is the far rim of the top. Where a nozzle hides that, the jet ends lower than it does, by its
+        # foreshortened width, instead of standing out before the nozzle
         middle[0] += float(outline.half_widths[0]) * middle[0] / focal / max(float(rays[0, :2] @ away), 1e-9)
     z = eye[2] + middle * rays[:, 2]
     z[1:] = np.minimum(z[1:], z[0])

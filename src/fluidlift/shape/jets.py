@@ -7,7 +7,7 @@ part. All of that must hold, otherwise everything is taken to lie. Where they st
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import cast
 
 import numpy as np
@@ -61,9 +61,6 @@ class Outline:
     """px"""
     cut: bool
     """whether its top lies at the picture's edge"""
-    rounding: float = 0.0
-    """how much lower its upper edge is at 0.8 of its half width than in the middle, over the half width: 0.4 of the
-    sine of the camera's pitch where the far rim of a round top is seen, 0 or less where a nozzle hides it"""
 
 
 def projected_vertical(camera: PinholeCamera) -> Float[np.ndarray, "h w 2"]:
@@ -212,20 +209,7 @@ def _stations(whole: np.ndarray, direction: np.ndarray, across: np.ndarray, midd
     height, width = whole.shape
     u, v = points[0] - 1.5 * direction
     cut = not (1.0 < u < width - 1.0 and 1.0 < v < height - 1.0)
-    edge = _upper_edge(s, x - np.polyval(line, s), halves[0])
-    return Outline(whole, points, np.array([halves[0], *halves, halves[-1]]), cut, 0.0 if cut else edge)
-
-
-def _upper_edge(s: np.ndarray, x: np.ndarray, half: float) -> float:
-    """The rounding of an outline's upper edge; s along its axis, x across it, px."""
-    parts = (np.abs(x) < 0.3 * half), (np.abs(x) > 0.7 * half) & (np.abs(x) < 0.9 * half)
-    heights = []
-    for part in parts:
-        column = np.round(x[part]).astype(int)
-        if len(column) == 0:
-            return 0.0
-        heights.append(np.median([s[part][column == k].min() for k in np.unique(column)]))
-    return float(heights[1] - heights[0]) / half
+    return Outline(whole, points, np.array([halves[0], *halves, halves[-1]]), cut)
 
 
 def _lands(outline: Outline, mask: np.ndarray, falls: np.ndarray, trust: np.ndarray) -> bool:
@@ -278,14 +262,14 @@ def find_neck(mask: Bool[np.ndarray, "h w"], *, pitch: float = 35.0) -> Outline 
     if not lies or first < max(6, 0.02 * mask.shape[0]):
         return None
     neck = mask & ~body
-    v, u = (index + 0.5 for index in np.nonzero(neck))
-    near = v > v.max() - 3.0
-    width = float(np.ptp(u[near])) + 1.0
+    middle, width = float(np.median(np.nonzero(neck)[1]) + 0.5), float(np.median(neck.sum(axis=1)[rows[:first]]))
     foot = float(rows[first]) + width * float(np.sin(np.radians(pitch)))
-    middle = float(np.median(u[near]))
     y, x = np.mgrid[0.5 : mask.shape[0], 0.5 : mask.shape[1]]
     over = body & (y < foot) & (np.abs(x - middle) < 0.5 * width)
-    return _stations(neck | over, np.array([0.0, 1.0]), np.array([-1.0, 0.0]), -middle, (float(rows[0]), foot, foot))
+    # the far edge of the puddle shows on both sides of the threads; what falls gets narrower, not wider
+    neck &= np.abs(x - middle) < 0.75 * width
+    outline = _stations(neck | over, np.array([0.0, 1.0]), np.array([-1.0, 0.0]), -middle, (float(rows[0]), foot, foot))
+    return replace(outline, half_widths=np.minimum.accumulate(outline.half_widths))
 
 
 def airborne_pixels(outlines: list[Outline], shape: tuple[int, int]) -> Bool[np.ndarray, "h w"]:

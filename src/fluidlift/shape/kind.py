@@ -166,7 +166,7 @@ def estimate_up(
 
     Over a stream, the perspective of its motion shows the tilt (`slope.estimate_tilt`), weighed against how people
     hold cameras: how much it had to say is the confidence, and where it runs across the picture that is little. What
-    falls or rises does so along the vertical, which gives the roll; its pitch keeps the prior.
+    falls does so along the vertical, which gives the roll; its pitch keeps the prior, as all of a plume's tilt does.
 
     Args:
         kind: of the fluid.
@@ -187,14 +187,14 @@ def estimate_up(
             )
             found_pitch, found_roll, trust = tilt.pitch, tilt.roll, tilt.gained
             source = "perspective of the flow"
-    else:
+    elif kind != "plume":  # wind leans smoke more often than hands turn cameras
         weight = np.where(mask, confidence * np.linalg.norm(displacement, axis=-1), 0.0)
-        down = (weight[..., None] * displacement).sum((0, 1)) * (-1.0 if kind == "plume" else 1.0)
+        down = (weight[..., None] * displacement).sum((0, 1))
         if down[1] > 0 and weight.sum() > 0:
             lean = float(np.degrees(np.arctan2(-down[0], down[1])))
             if abs(lean) < 10.0:  # a larger lean is a thrown jet or wind, not a turned camera
                 found_roll, trust = 0.5 * lean, 0.3
-                source = "direction of the rise" if kind == "plume" else "direction of the fall"
+                source = "direction of the fall"
     if pitch is not None or roll is not None:
         source = "user" if pitch is not None and roll is not None else f"user and {source}"
         trust = 1.0 if pitch is not None else trust

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -37,10 +38,27 @@ class Footage:
     """points on the visible fluid, world"""
     camera: PinholeCamera
     """in the world"""
-    along: Float[np.ndarray, "2"]
-    """horizontal direction of the flow"""
+    mainstream: Float[np.ndarray, "3"]
+    """direction of the bulk flow, world"""
     speed: Float[np.ndarray, "h w"] | None = None
     """of the seen surface, m/s; nan where it is not known"""
+    scene_depth: Float[np.ndarray, "h w"] | None = None
+    """camera depth of the whole picture, m; nan where it is not known"""
+    closed: bool = False
+    """a puddle: it ends where it is seen to end, on all sides"""
+
+    @cached_property
+    def along(self) -> Float[np.ndarray, "2"]:
+        """Horizontal direction of the flow; straight downhill for what falls."""
+        flat = np.asarray(self.mainstream[:2], float)
+        if np.linalg.norm(flat) < 0.3:
+            low, high = np.percentile(self.visible, 0.5, axis=0), np.percentile(self.visible, 99.5, axis=0)
+            h = 0.1 * max(float((high - low).max()), 1e-6)
+            steps = np.array([[h, 0], [-h, 0], [0, h], [0, -h]])
+            z = self.surface.height(0.5 * (low + high)[:2] + steps)
+            flat = -np.array([z[0] - z[1], z[2] - z[3]])
+        norm = np.linalg.norm(flat)
+        return flat / norm if norm > 1e-9 else np.array([1.0, 0.0])
 
 
 @dataclass(frozen=True)
@@ -97,7 +115,7 @@ def extent_of(seen: Footage) -> Extent:
     whole = ndimage.binary_fill_holes(ndimage.binary_closing(np.pad(wet, 2), iterations=2))[2:-2, 2:-2]
     whole &= plan.known
     stream = _without_tails(whole, TAIL * _width(whole, h) / h)
-    width = _width(_continued(stream, plan.known, grid, seen.along), h)
+    width = _width(stream if seen.closed else _continued(stream, plan.known, grid, seen.along), h)
     cell = grid.cell_of(seen.visible)[:, :2]
     inside = ((cell >= 0) & (cell < grid.shape[:2])).all(axis=1)
     cell = np.clip(cell, 0, np.array(grid.shape[:2]) - 1)
@@ -174,14 +192,17 @@ def plan_of(seen: Footage, grid: Grid, extent: Extent | None = None) -> Plan:
     if seen.speed is not None:
         speed = np.where(known & (label == Label.FLUID), seen.speed[row, col], np.nan)
     source = known
-    if extent is not None:
+    if extent is not None and not seen.closed:
         reach = extent.reach
         start, stop = wide_ends(known & (label != Label.BACKGROUND), s, reach, grid.spacing, share=0.8)
         start, stop = max(start, reach[0] + 3 * grid.spacing), min(stop, reach[1] - 3 * grid.spacing)
         source = known & (s >= min(start, stop)) & (s <= max(start, stop))
-    label = _continued(label, source, grid, seen.along)
+    if not seen.closed:
+        label = _continued(label, source, grid, seen.along)
     if extent is not None:
         label = cleaned(label, extent.width, grid.spacing)
+        if not seen.closed:
+            label = _without_corners(label, source)
     return Plan(label, level, s, speed, known)
 
 
@@ -233,6 +254,14 @@ def _continued(label: np.ndarray, source: np.ndarray, grid: Grid, along: np.ndar
     out = label.copy()
     out[~source] = label[source][nearest]
     return out
+
+
+def _without_corners(label: np.ndarray, source: np.ndarray) -> np.ndarray:
+    """A bank goes on from a seen one: a dry corner of its own beyond the ends of the stream is water."""
+    piece, count = ndimage.label(label == Label.BACKGROUND, structure=np.ones((3, 3)))
+    begun = np.zeros(count + 1, bool)
+    begun[piece[source]] = True
+    return np.where((piece > 0) & ~begun[piece], Label.FLUID, label).astype(np.uint8)
 
 
 def with_seen(plan: Plan, visible: Float[np.ndarray, "n 3"], grid: Grid) -> Plan:

@@ -261,7 +261,8 @@ def doubts(share: float, score: np.ndarray) -> tuple[str, ...]:
     elif doubtful_part(score) > MUCH_DOUBT:
         warnings.append(
             f"what is fluid is doubtful in places as large as {100 * doubtful_part(score):.0f} % of it (still water, "
-            "noise, strong compression): look at the overlay; a --roi, a --click or a --mask would help"
+            "noise, strong compression): look at the overlay; a --mask would help "
+            "(fluidlift mask finds one, with --roi and --click)"
         )
     if share > 0.9:
         warnings.append("nearly the whole picture was taken for fluid: was the camera moving?")

@@ -38,7 +38,11 @@ LEVEL = 0.6
 STEEP = 20.0
 """degrees, scale of the half-normal prior of the slope of the others"""
 UNMODELLED = 2.0
-"""actual over computed standard error of the slope, on made streams with eddies, bends and uneven profiles"""
+"""actual over computed standard error of the slope, on made streams with eddies, bends and uneven profiles."""
+BELIEF = 0.5
+"""power that the evidence for the tilt is taken to: as it stands, the error of the pitch is 1.2 to 1.5 times what the
+posterior says on three sets of made streams (238, of which 58 with measured optical flow), so weighed 1.0 to 1.06
+times. The motion still draws the pitch up by some 4 degrees: no motion speaks against a steep view"""
 ROLL = 2.5
 """degrees, standard deviation of how far people hold a camera off the level"""
 FREEDOM = np.array([0.08, 0.25, 0.6, 1.2])
@@ -193,7 +197,7 @@ def estimate_tilt(
     prior[0] = LEVEL
     log = np.array([[[_best_heading(tilted(p, r), patches, np.radians(s))[0] for s in slopes] for r in rolls]
                     for p in pitches])  # fmt: skip
-    log += np.log(prior)
+    log = BELIEF * log + np.log(prior)
     log -= 0.5 * (((pitches - pitch_prior[0]) / pitch_prior[1]) ** 2)[:, None, None]
     log -= 0.5 * ((rolls / ROLL) ** 2)[None, :, None]
     if not np.isfinite(log).any():

@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 from fluidlift.errors import InputRejected, require
 from fluidlift.shape import slope
 from fluidlift.shape.kind import Kind
+from fluidlift.shape.plume import SIGHT, section_half_thickness
 from fluidlift.shape.slope import SlopeEvidence
 from fluidlift.types import PinholeCamera
 
@@ -105,6 +106,13 @@ class FrontSurface:
     """for a fluid that lies on something"""
     slope: SlopeEvidence | None = None
     """where its motion was asked how steep it runs"""
+    kind: Kind | None = None
+    """of a body in the air"""
+
+    @property
+    def sighted(self) -> Float[np.ndarray, "h w"]:
+        """Camera z at which the fluid is seen in the mean: of smoke within it, of all else on its near side."""
+        return self.depth + (2.0 * SIGHT * self.half_thickness if self.kind == "plume" else 0.0)
 
 
 def level_surface(camera: PinholeCamera, mask: Bool[np.ndarray, "h w"]) -> FrontSurface:
@@ -272,26 +280,40 @@ def intersect_height(
     return depth
 
 
-def inflated_surface(camera: PinholeCamera, mask: Bool[np.ndarray, "h w"], kind: Kind) -> FrontSurface:
+def inflated_surface(
+    camera: PinholeCamera, mask: Bool[np.ndarray, "h w"], kind: Kind, roll: float = 0.0
+) -> FrontSurface:
     """A rounded body in the air: its middle in a vertical plane facing the viewer, its thickness from the silhouette.
 
-    Where the silhouette is 2R wide the body is taken to be a circle across (pour), a little flatter for smoke.
+    Where the silhouette is 2R wide the body is taken to be a circle across: about its middle line (pour), or in level
+    sections (plume).
+
+    Args:
+        camera: level, its tilt as known.
+        mask: fluid pixels.
+        kind: of the body.
+        roll: degrees that the picture is turned clockwise.
     """
     require(bool(mask.any()), "an empty mask")
     ray = camera.rays(camera.pixel_grid())
     middle = 1.0 / np.maximum(ray[..., 1], 0.2)  # plane y = 1: depth z with z * ray_y = 1
     middle /= np.median(middle[mask])
+    thickness = section_half_thickness(mask, roll) if kind == "plume" else _half_thickness(mask)
+    flatness = {"pour": 1.0, "plume": 1.0, "fall": 0.3, "stream": 0.3}[kind]
+    half = flatness * thickness * middle / camera.focal[0]
+    front = np.where(mask, middle - half, 0.0)
+    return FrontSurface(front.astype(np.float32), half.astype(np.float32), None, kind=kind)
+
+
+def _half_thickness(mask: np.ndarray) -> np.ndarray:
+    """Half the extent along the view, px, of a body that is round about its middle line."""
     padded = np.pad(mask, 2, mode="edge")  # a body cut by the picture's edge goes on beyond it
     distance = ndimage.distance_transform_edt(padded)[2:-2, 2:-2]
     ridge = (distance == ndimage.maximum_filter(distance, size=5)) & mask
     index = ndimage.distance_transform_edt(~ridge, return_distances=False, return_indices=True)
     radius = np.maximum(ndimage.gaussian_filter(distance[tuple(index)], 3.0), distance)
     thickness = np.sqrt(np.maximum(2 * radius * distance - distance**2, 0.0))
-    thickness = ndimage.gaussian_filter(thickness, 1.5) * mask
-    flatness = {"pour": 1.0, "plume": 0.85, "fall": 0.3, "stream": 0.3}[kind]
-    half = flatness * thickness * middle / camera.focal[0]
-    front = np.where(mask, middle - half, 0.0)
-    return FrontSurface(front.astype(np.float32), half.astype(np.float32), None)
+    return ndimage.gaussian_filter(thickness, 1.5) * mask
 
 
 def rounded_volume(camera: PinholeCamera, mask: Bool[np.ndarray, "h w"], distance: float, kind: Kind = "pour") -> float:
@@ -318,8 +340,9 @@ def given_surface(
     index = ndimage.distance_transform_edt(~valid, return_distances=False, return_indices=True)
     filled = depth[tuple(index)] / np.median(depth[valid])
     if kind in ("pour", "plume"):
-        inflated = inflated_surface(camera, mask, kind)
-        return FrontSurface(np.where(mask, filled, 0.0).astype(np.float32), inflated.half_thickness, None)
+        half = inflated_surface(camera, mask, kind).half_thickness
+        front = filled - (2.0 * SIGHT * half if kind == "plume" else 0.0)
+        return FrontSurface(np.where(mask, front, 0.0).astype(np.float32), half, None, kind=kind)
     rows, cols = np.where(valid)
     pick = np.linspace(0, len(rows) - 1, min(len(rows), 20000)).astype(int)
     points = camera.unproject(np.stack([cols[pick] + 0.5, rows[pick] + 0.5], -1), filled[rows[pick], cols[pick]])

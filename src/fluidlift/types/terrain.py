@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 
 from fluidlift.errors import require
 from fluidlift.types.grid import Grid
@@ -13,7 +13,7 @@ from fluidlift.types.grid import Grid
 
 @dataclass(frozen=True)
 class TriangleMesh:
-    """Triangles with vertex colours."""
+    """Triangles with vertex colours, and with a texture where there is one."""
 
     vertices: Float[np.ndarray, "v 3"]
     """m"""
@@ -21,10 +21,20 @@ class TriangleMesh:
     """counter-clockwise seen from outside"""
     colors: Float[np.ndarray, "v 3"] | None = None
     """sRGB in [0, 1]"""
+    uv: Float[np.ndarray, "f 3 2"] | None = None
+    """texture coordinates of each face's corners: (0, 0) is the texture's upper left corner, (1, 1) its lower right"""
+    texture: UInt8[np.ndarray, "h w 3"] | None = None
+    """sRGB; finer than the vertices' colours, which are for whom has no textures"""
 
     def __post_init__(self) -> None:
         require(self.vertices.ndim == 2 and self.vertices.shape[1] == 3, f"vertices {self.vertices.shape}", "[v,3]")
         require(self.faces.ndim == 2 and self.faces.shape[1] == 3, f"faces {self.faces.shape}", "[f,3]")
+        require((self.uv is None) == (self.texture is None), "uv without a texture, or a texture without uv", "both")
+        if self.uv is not None and self.texture is not None:
+            require(self.uv.shape == (len(self.faces), 3, 2), f"uv {self.uv.shape}", f"[{len(self.faces)},3,2]")
+            shape, kind = self.texture.shape, self.texture.dtype
+            require(len(shape) == 3 and shape[2] == 3 and min(shape) > 0, f"texture {shape}", "[h,w,3]")
+            require(kind == np.uint8, f"texture of {kind}", "8 bits")
 
 
 @dataclass(frozen=True)

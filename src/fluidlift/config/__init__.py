@@ -1,0 +1,32 @@
+"""What a job can be told: typed sections, presets, YAML files and single overrides."""
+
+from fluidlift.config.build import build_config
+from fluidlift.config.presets import PRESETS, RANGES
+from fluidlift.config.sections import (
+    DepthConfig,
+    FitConfig,
+    GenerateConfig,
+    JobConfig,
+    MotionConfig,
+    ReadConfig,
+    SegmentConfig,
+    ShapeConfig,
+    ShowConfig,
+    SimulateConfig,
+)
+
+__all__ = [
+    "PRESETS",
+    "RANGES",
+    "DepthConfig",
+    "FitConfig",
+    "GenerateConfig",
+    "JobConfig",
+    "MotionConfig",
+    "ReadConfig",
+    "SegmentConfig",
+    "ShapeConfig",
+    "ShowConfig",
+    "SimulateConfig",
+    "build_config",
+]

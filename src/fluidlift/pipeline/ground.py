@@ -1,0 +1,81 @@
+"""What a fluid rests in: cells and terrain from its surface, the texture of the ground, and how both are stored."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, cast
+
+import numpy as np
+
+from fluidlift.io.stage_cache import parts_of
+from fluidlift.shape import airborne, channel, generate, ground_texture, place, plan, terrain
+from fluidlift.shape.jets import lying_pixels
+from fluidlift.types import Label
+
+
+def setting_around(
+    kind, front, fluid, start, united, camera, to_world, depth, half, bulk, c, falls, **known
+) -> terrain.Setting:
+    """Terrain and cells around a surface; what is known beside it goes to `plan.Footage`."""
+    mask = generate.united_mask(fluid[start : start + united])
+    visible = mask & (depth > 0)
+    grid = camera.pixel_grid()
+    near = camera.unproject(grid[visible & ~falls], depth[visible & ~falls])
+    if front.height is not None:
+        labels, height = seen_labels(fluid, start, united, falls), place.PlacedHeight(front.height, to_world)
+        seen = plan.Footage(height, labels, near, camera, bulk, **known)
+        return channel.channel_setting(seen, channel.ChannelConfig(kind, c.cells, c.cell_limit, c.depth_ratio))
+    back = depth + 2 * half
+    far = camera.unproject(grid[visible], back[visible])
+    # the box holds what the clip shows later, in the same vertical plane
+    later = fluid.any_frame()
+    middle = np.median((depth + half)[visible])
+    reach = camera.unproject(grid[later], np.full(int(later.sum()), middle))
+    return airborne.airborne_setting(
+        depth, back, visible, camera, np.concatenate([near, far, reach]), bulk,
+        # smoke needs the whole box, and is cheap per cell: no free surface, few particles
+        kind=kind, longest=c.cells, cell_limit=c.cell_limit * (2 if kind == "plume" else 1),
+    )  # fmt: skip
+
+
+def seen_labels(fluid, start: int, united: int, falls: np.ndarray) -> np.ndarray:
+    """`Label` of each pixel over the united frames."""
+    window = slice(start, start + united)
+    solid, lying = solid_share(fluid.labels[window]) > 0.5, lying_pixels(generate.united_mask(fluid[window]), falls)
+    return np.where(lying, Label.FLUID, np.where(solid, Label.SOLID, Label.BACKGROUND)).astype(np.uint8)
+
+
+def textured(setting: terrain.Setting, view: ground_texture.View) -> terrain.Setting:
+    """The setting, its terrain with the picture on it."""
+    solid = setting.terrain
+    mesh = ground_texture.textured(solid.mesh, solid.grid, cast(np.ndarray, setting.surface_height), view)
+    return replace(setting, terrain=replace(solid, mesh=mesh))
+
+
+def solid_share(labels: np.ndarray) -> np.ndarray:
+    """float [H,W]: share of the frames, u8 [T,H,W], in which a pixel shows something solid."""
+    parts = (labels[part] == Label.SOLID for part in parts_of(labels))
+    return np.sum([part.sum(axis=0) for part in parts], axis=0) / len(labels)
+
+
+def packed(setting: terrain.Setting) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """A setting as arrays and plain values; `setting_of` reads them back."""
+    solid = setting.terrain
+    arrays = {
+        "signed_distance": solid.signed_distance,
+        "mainstream": solid.mainstream,
+        "mesh_vertices": solid.mesh.vertices,
+        "mesh_faces": solid.mesh.faces,
+        "cell_types": setting.cell_types,
+        "bed_height": setting.bed_height.astype(np.float32),
+    }
+    if setting.surface_height is not None:
+        arrays["surface_height"] = setting.surface_height.astype(np.float32)
+    if solid.mesh.uv is not None and solid.mesh.texture is not None:
+        arrays |= {"mesh_uv": solid.mesh.uv, "mesh_texture": solid.mesh.texture, "mesh_colours": solid.mesh.colors}
+    grid = {"shape": solid.grid.shape, "spacing": solid.grid.spacing, "origin": solid.grid.origin}
+    return arrays, {
+        "grid": grid,
+        "height_field": setting.surface_height is not None,
+        "pool_level": setting.pool_level,
+    }

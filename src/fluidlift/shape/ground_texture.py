@@ -1,0 +1,228 @@
+"""The ground's texture: the picture laid on a terrain as a map seen from above, as fine as the picture itself.
+
+What the camera does not see (behind rocks and banks, beyond the picture) is no part of the picture: it goes on as the
+seen ground beside it, and a rock is not painted on what lies behind it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from scipy import ndimage
+
+from fluidlift.numerics.textures import sample_texture
+from fluidlift.shape.background import filled_in
+from fluidlift.shape.ground_mesh import PARTS
+from fluidlift.types import Grid, Label, PinholeCamera, TriangleMesh
+
+LONGEST = 2048
+"""texels along the longer side: what any program and graphics card takes"""
+
+STRIP = 8
+"""rows of plain earth below the map, for the block's sides and floor: wide enough for three smaller copies of the
+texture, as graphics cards make them, before map and earth run into each other"""
+
+FINE = 10.0
+"""percentile of the pixels' widths on the ground that counts: the near ground keeps its detail"""
+
+SAMPLES = 2.0
+"""texels along a pixel of that width: a picture that is turned and sheared on the way needs more than one"""
+
+PER_PIXEL = 8
+"""texels for each pixel of the picture, at most: a view along the ground would spread it over many more"""
+
+RIM = 0.05
+"""of the map's longer side: as far from the water, dry ground says what its bed is made of"""
+
+ODD = 3.0
+"""standard deviations (robust) from the rim's middle colour: that is grass, or water that the mask has missed"""
+
+GRAIN = 0.005
+"""of the map's longer side: colours are compared without what is finer"""
+
+EVEN = 0.02
+"""of the map's longer side: over this, ground that is not seen is evened out"""
+
+
+@dataclass(frozen=True)
+class View:
+    """What the ground was seen as."""
+
+    plate: UInt8[np.ndarray, "h w 3"]
+    """sRGB, the scene without its fluid"""
+    camera: PinholeCamera
+    """in the world"""
+    labels: UInt8[np.ndarray, "h w"]
+    """what each pixel shows"""
+    seen: Bool[np.ndarray, "h w"]
+    """pixels of the plate that some frame shows without fluid"""
+
+
+@dataclass(frozen=True)
+class _Map:
+    """The ground from above, y up."""
+
+    image: np.ndarray
+    """float32 [h,w,3], 0 to 255"""
+    known: np.ndarray
+    """bool [h,w]: the picture shows it"""
+    rock: np.ndarray
+    """bool [h,w]"""
+    drowned: np.ndarray
+    """bool [h,w]: bed under the water"""
+
+
+def textured(
+    mesh: TriangleMesh, grid: Grid, level: Float[np.ndarray, "nx ny"], view: View, *, longest: int = LONGEST
+) -> TriangleMesh:
+    """A terrain's block with a texture, and with vertex colours taken from it.
+
+    Args:
+        mesh: made by `ground_mesh` on this grid.
+        grid: of the terrain.
+        level: z of the water's surface over each column (also where it is dry), m: rocks were found on it.
+        view: the picture.
+        longest: most texels along the longer side.
+    """
+    nodes = (grid.shape[0] * PARTS + 1, grid.shape[1] * PARTS + 1)
+    top = mesh.vertices[: nodes[0] * nodes[1]].reshape(*nodes, 3).astype(np.float64)
+    found = _map(top, level, view, _texel(top, view.camera, longest))
+    image = _continued(found)
+    earth = 0.75 * np.median(image[found.known if found.known.any() else ~found.known], axis=0)
+    strip = np.broadcast_to(earth, (STRIP, image.shape[1], 3))
+    texture = np.clip(np.round(np.concatenate([image, strip])), 0, 255).astype(np.uint8)
+    uv = _coordinates(mesh, top, image.shape[0])
+    return replace(mesh, uv=uv, texture=texture, colors=_vertex_colours(mesh, uv, texture))
+
+
+def _texel(top: np.ndarray, camera: PinholeCamera, longest: int) -> float:
+    """Width of a texel, m."""
+    points = top.reshape(-1, 3)
+    uv, depth = camera.project(points)
+    inside = (depth > 0) & (uv >= 0).all(-1) & (uv < np.array(camera.size)).all(-1)
+    size = np.ptp(points[:, :2], axis=0).max()
+    fine = np.percentile(depth[inside], FINE) / max(camera.focal) / SAMPLES if inside.any() else 0.0
+    area = float(np.prod(np.ptp(points[:, :2], axis=0)))
+    return float(max(fine, size / longest, np.sqrt(area / (PER_PIXEL * camera.size[0] * camera.size[1]))))
+
+
+def _map(top: np.ndarray, level: np.ndarray, view: View, texel: float) -> _Map:
+    """What the picture shows of the ground."""
+    camera = view.camera
+    low, size = top[0, 0, :2], top[-1, -1, :2] - top[0, 0, :2]
+    width, height = (max(int(np.ceil(s / texel)), 2) for s in size)
+    x, y = (np.arange(width) + 0.5) / width, 1.0 - (np.arange(height) + 0.5) / height
+    place = np.stack(np.broadcast_arrays(x[None, :], y[:, None]), -1)  # share of the box
+
+    def looked_up(values: np.ndarray, at_centres: bool) -> np.ndarray:
+        index = place * (np.array(values.shape) - (0 if at_centres else 1)) - (0.5 if at_centres else 0.0)
+        return ndimage.map_coordinates(values, [index[..., 0], index[..., 1]], order=1, mode="nearest")
+
+    ground = np.concatenate([low + place * size, looked_up(top[..., 2], False)[..., None]], -1).reshape(-1, 3)
+    uv, depth = camera.project(ground)
+    inside = (depth > 0) & (uv >= 0).all(-1) & (uv < np.array(camera.size)).all(-1)
+    at = np.where(inside[:, None], uv, 0.0).astype(np.float32).reshape(height, width, 2) - np.float32(0.5)
+    image = cv2.remap(view.plate, at[..., 0], at[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    hidden = looked_up(hidden_ground(top, camera.position).astype(np.float32), False) > 0.5
+    # a column is rock where the water's surface over it is covered by one, as the plan has it
+    surface = np.concatenate([ground[:, :2], looked_up(level, True).reshape(-1, 1)], axis=1)
+    row, col, z = camera.nearest_pixels(surface)
+    rock = ((z > 0) & (view.labels[row, col] == Label.SOLID)).reshape(height, width)
+    row, col, _ = camera.nearest_pixels(ground)
+    painted = (view.labels[row, col] == Label.SOLID).reshape(height, width)
+    # the rim of a rock's picture is mixed with what is behind it
+    painted_well = cv2.erode(painted.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    drowned = (ground[:, 2] < surface[:, 2]).reshape(height, width) & ~rock
+    known = inside.reshape(height, width) & ~hidden & np.where(rock, painted_well, ~painted)
+    known &= ~drowned | view.seen[row, col].reshape(height, width)
+    return _Map(image.astype(np.float32), known, rock, drowned)
+
+
+def hidden_ground(top: Float[np.ndarray, "nx ny 3"], eye: Float[np.ndarray, "3"]) -> Bool[np.ndarray, "nx ny"]:
+    """Nodes of a height field that other ground hides from a point above it.
+
+    Args:
+        top: points on even steps in x and y, m.
+        eye: the point, m.
+    """
+    h = float(top[1, 0, 0] - top[0, 0, 0])
+    z = top[..., 2]
+    toward = eye - top
+    away = np.linalg.norm(toward[..., :2], axis=-1)
+    step = toward[..., :2] / np.maximum(away, 1e-12)[..., None]
+    rise = toward[..., 2] / np.maximum(away, 1e-12)  # of the ray, per m on the ground
+    hidden = np.zeros(z.shape, bool)
+    column, row = np.meshgrid(*(np.arange(n, dtype=float) for n in z.shape), indexing="ij")
+    highest = float(z.max())
+    for k in range(1, sum(z.shape)):
+        i, j, ray = column + k * step[..., 0], row + k * step[..., 1], z + k * h * rise
+        going = ~hidden & (k * h < away) & (ray < highest)
+        going &= (i >= 0) & (j >= 0) & (i <= z.shape[0] - 1) & (j <= z.shape[1] - 1)
+        if not going.any():
+            break
+        met = ndimage.map_coordinates(z, [i[going], j[going]], order=1)
+        hidden[going] = met > ray[going] + 0.1 * h  # less is the rounding of the field between its nodes
+    return hidden
+
+
+def _continued(found: _Map) -> np.ndarray:
+    """Unknown texels from the known ones: rock from rock, the bed from itself and its rim, dry ground from dry."""
+    dry = ~found.rock & ~found.drowned
+    out = found.image
+    for part, beside in ((found.rock, found.rock), (found.drowned, _of_the_bed(found, dry)), (dry, dry)):
+        source = found.known & beside
+        hole = part & ~source
+        if not source.any():
+            source = found.known
+        if hole.any() and source.any():
+            out = np.where(hole[..., None], _filled(found.image, source), out)
+    return out
+
+
+def _of_the_bed(found: _Map, dry: np.ndarray) -> np.ndarray:
+    """bool [h,w]: bed, and dry ground close to it, in colours that are usual there."""
+    if not found.drowned.any():
+        return found.drowned
+    near = ndimage.distance_transform_edt(~found.drowned) < RIM * max(dry.shape)
+    rim = found.known & dry & near
+    if rim.sum() < 50:
+        return found.drowned
+    colour = _mean(found.image, found.known, GRAIN * max(dry.shape))
+    middle = np.median(colour[rim], axis=0)
+    spread = np.maximum(1.4826 * np.median(np.abs(colour[rim] - middle), axis=0), 2.0)
+    usual = (np.abs(colour - middle) < ODD * spread).all(axis=-1)
+    # between odd and usual colours lie mixed ones
+    usual = ndimage.binary_erosion(usual, iterations=max(round(2.0 * GRAIN * max(dry.shape)), 1), border_value=1)
+    return usual & (found.drowned | (dry & near))
+
+
+def _filled(image: np.ndarray, source: np.ndarray) -> np.ndarray:
+    """Evened-out colours of the source everywhere."""
+    sigma = EVEN * max(source.shape)
+    return cv2.GaussianBlur(filled_in(_mean(image, source, sigma), source), (0, 0), 0.5 * sigma)
+
+
+def _mean(image: np.ndarray, source: np.ndarray, sigma: float) -> np.ndarray:
+    """Gaussian mean over the texels of a source."""
+    weight = cv2.GaussianBlur(source.astype(np.float32), (0, 0), sigma)
+    return cv2.GaussianBlur(image * source[..., None], (0, 0), sigma) / np.maximum(weight, 1e-6)[..., None]
+
+
+def _coordinates(mesh: TriangleMesh, top: np.ndarray, rows: int) -> np.ndarray:
+    """uv [f,3,2]: the map on the faces of the top, the strip of earth on the sides and the floor."""
+    low, size = top[0, 0, :2], top[-1, -1, :2] - top[0, 0, :2]
+    share = np.clip((mesh.vertices[:, :2] - low) / size, 0.0, 1.0)
+    v = (1.0 - share[:, 1]) * rows / (rows + STRIP)
+    uv = np.stack([share[:, 0], v], axis=-1)[mesh.faces]
+    uv[2 * (top.shape[0] - 1) * (top.shape[1] - 1) :] = (0.5, (rows + 0.6 * STRIP) / (rows + STRIP))
+    return uv.astype(np.float32)
+
+
+def _vertex_colours(mesh: TriangleMesh, uv: np.ndarray, texture: np.ndarray) -> np.ndarray:
+    """sRGB [v,3]; a vertex of the rim has the colour of the top."""
+    corner = np.zeros((len(mesh.vertices), 2), np.float32)
+    corner[mesh.faces[::-1].ravel()] = uv[::-1].reshape(-1, 2)  # the last one stays: faces of the top come first
+    return sample_texture(texture, corner)

@@ -1,0 +1,139 @@
+"""The picture on the ground: where it shows it, behind what hides it, under water, and on the cut sides."""
+
+import numpy as np
+import pytest
+
+from fluidlift.numerics.textures import sample_texture
+from fluidlift.shape.ground_mesh import ground_mesh
+from fluidlift.shape.ground_texture import STRIP, View, hidden_ground, textured
+from fluidlift.types import Grid, Label, PinholeCamera
+
+GRID = Grid((24, 16, 6), 0.125, (-1.5, -1.0, -1.0))
+CAMERA = PinholeCamera.looking((0.0, -3.0, 3.0), (0.0, 0.0, 0.0), 50.0, (200, 150))
+DRY = np.full((24, 16), -10.0)
+"""level of water far below the ground"""
+
+
+def pattern(points):
+    """A colour for each place: smooth, but finer than the grid's cells."""
+    x, y = points[..., 0], points[..., 1]
+    waves = [np.sin(30 * x) * np.cos(4 * y), np.cos(5 * x), np.sin(12 * y + 2 * x)]
+    return 127.0 + 90.0 * np.stack(waves, axis=-1)
+
+
+def picture():
+    """What the camera sees of the pattern on level ground."""
+    rays = CAMERA.rays(CAMERA.pixel_grid())
+    return np.clip(pattern(CAMERA.position - rays * (CAMERA.position[2] / rays[..., 2])[..., None]), 0, 255)
+
+
+def seen_on(heights, *, plate=None, labels=None, level=DRY, seen=None):
+    plate = picture() if plate is None else plate
+    labels = np.full(plate.shape[:2], Label.BACKGROUND) if labels is None else labels
+    view = View(
+        plate.astype(np.uint8), CAMERA, labels.astype(np.uint8), np.ones(labels.shape, bool) if seen is None else seen
+    )
+    return textured(ground_mesh(GRID, heights), GRID, level, view)
+
+
+def colour_at(mesh, x, y):
+    """0 to 255, of the top at places: found through the faces and their texture coordinates."""
+    a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(float) for k in range(3))
+    top = np.cross(b - a, c - a)[:, 2] > 0
+    middle, uv = mesh.vertices[mesh.faces[top]].mean(axis=1), mesh.uv[top].mean(axis=1)
+    found = [np.hypot(middle[:, 0] - px, middle[:, 1] - py).argmin() for px, py in zip(np.ravel(x), np.ravel(y))]
+    return 255.0 * sample_texture(mesh.texture, uv[found]), middle[found]
+
+
+@pytest.fixture(scope="module")
+def level_ground():
+    return seen_on(np.zeros((25, 17)))
+
+
+def test_seen_ground_has_the_colours_of_the_picture_finer_than_its_faces(level_ground):
+    x, y = np.random.default_rng(1).uniform([-1.1, -0.8], [1.1, 0.8], (200, 2)).T
+    colour, place = colour_at(level_ground, x, y)
+    # 8 bits, and looked up between pixels, of which the finest wave (90 grey levels high) has more than ten
+    assert np.abs(colour - pattern(place)).max() < 6.0
+
+
+def test_the_sides_and_the_floor_are_of_one_earthy_colour(level_ground):
+    a, b, c = (level_ground.vertices[level_ground.faces[:, k]].astype(float) for k in range(3))
+    cut = np.cross(b - a, c - a)[:, 2] < 1e-9
+    assert cut.sum() > 100
+    colours = sample_texture(level_ground.texture, level_ground.uv[cut])
+    assert np.ptp(colours.reshape(-1, 3), axis=0).max() == 0
+    assert np.ptp(level_ground.texture[-STRIP:].reshape(-1, 3), axis=0).max() == 0
+
+
+def test_a_texture_is_not_larger_than_it_may_be(level_ground):
+    view = View(picture().astype(np.uint8), CAMERA, np.zeros((150, 200), np.uint8), np.ones((150, 200), bool))
+    small = textured(ground_mesh(GRID, np.zeros((25, 17))), GRID, DRY, view, longest=64)
+    assert max(small.texture.shape) == 64 and max(level_ground.texture.shape) > 200
+
+
+def ridge():
+    """A wall along x, 0.4 m high, between y = 0.1 and 0.3."""
+    y = GRID.nodes()[:, :, 0, 1]
+    return 0.4 * ((y > 0.1) & (y < 0.3))
+
+
+def test_ground_behind_a_ridge_is_hidden_from_the_camera_and_the_rest_is_not():
+    nodes = GRID.nodes()[:, :, 0]
+    top = np.concatenate([nodes[..., :2], ridge()[..., None]], axis=-1)
+    hidden = hidden_ground(top, np.array([0.0, -3.0, 3.0]))
+    y = nodes[..., 1]
+    # seen at 42 degrees, 0.4 m hide about 0.44 m of ground
+    assert hidden[(y > 0.4) & (y < 0.6)].all()
+    assert not hidden[(y < 0.05) | (y > 0.9)].any()
+
+
+def test_a_ridge_is_not_painted_on_the_ground_behind_it():
+    rays = CAMERA.rays(CAMERA.pixel_grid())
+    ground = CAMERA.position - rays * (CAMERA.position[2] / rays[..., 2])[..., None]
+    plate = np.full((150, 200, 3), 60.0)
+    plate[(ground[..., 1] > 0.1) & (ground[..., 1] < 0.73)] = (220, 40, 40)  # the ridge, as it covers the picture
+    mesh = seen_on(ridge(), plate=plate)
+    x = np.linspace(-0.6, 0.6, 13)
+    colour, _ = colour_at(mesh, x, np.full(13, 0.85))
+    np.testing.assert_allclose(colour, 60.0, atol=2.0)
+
+
+def test_a_rock_is_painted_on_itself_and_not_on_what_lies_behind_it():
+    nodes = GRID.nodes()[:, :, 0]
+    rays = CAMERA.rays(CAMERA.pixel_grid())
+    ground = CAMERA.position - rays * (CAMERA.position[2] / rays[..., 2])[..., None]
+    # the rock is taller than its model: its picture reaches 0.3 m past its foot, where the model is level ground
+    labels = np.full(ground.shape[:2], Label.BACKGROUND)
+    rock = (np.abs(ground[..., 0]) < 0.3) & (np.abs(ground[..., 1]) < 0.2)
+    labels[rock] = Label.SOLID
+    plate = np.full((150, 200, 3), 60.0)
+    plate[rock] = (220, 200, 190)
+    level = np.full((24, 16), -0.02)
+    heights = 0.25 * ((np.abs(nodes[..., 0]) < 0.25) & (np.abs(nodes[..., 1]) < 0.15)) - 0.1
+    mesh = seen_on(heights, plate=plate, labels=labels, level=level)
+    on_rock, _ = colour_at(mesh, [0.0, 0.1], [0.05, 0.1])
+    beside, _ = colour_at(mesh, [0.0, 0.1, -0.1], [0.5, 0.45, 0.6])
+    assert (on_rock[:, 0] > 180).all()
+    np.testing.assert_allclose(beside, 60.0, atol=3.0)
+
+
+def test_the_bed_under_water_is_of_the_stuff_of_its_rim_and_not_of_specks_that_the_mask_missed():
+    y = GRID.nodes()[:, :, 0, 1]
+    heights = np.where(np.abs(y) < 0.4, -0.2, 0.02)
+    rays = CAMERA.rays(CAMERA.pixel_grid())
+    ground = CAMERA.position - rays * (CAMERA.position[2] / rays[..., 2])[..., None]
+    plate = np.full((150, 200, 3), (110.0, 90.0, 60.0)) + np.random.default_rng(0).normal(0, 4, (150, 200, 1))
+    wet = np.abs(ground[..., 1]) < 0.45
+    plate[wet] = (20, 140, 160)  # whatever was painted there
+    plate[(np.abs(ground[..., 0]) < 0.06) & (np.abs(ground[..., 1] - 0.48) < 0.06)] = (20, 140, 160)
+    mesh = seen_on(heights, plate=plate, level=np.zeros((24, 16)), seen=~wet)
+    colour, _ = colour_at(mesh, np.linspace(-1, 1, 9), np.zeros(9))
+    np.testing.assert_allclose(colour, np.tile([110.0, 90.0, 60.0], (9, 1)), atol=8.0)
+
+
+def test_vertex_colours_are_those_of_the_texture(level_ground):
+    top = level_ground.vertices[:, 2] > -1e-6
+    inner = top & (np.abs(level_ground.vertices[:, :2]) < 0.7).all(axis=1)
+    expected = pattern(level_ground.vertices[inner]) / 255.0
+    np.testing.assert_allclose(level_ground.colors[inner], expected, atol=6.0 / 255)

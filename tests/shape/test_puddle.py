@@ -1,0 +1,86 @@
+import numpy as np
+import pytest
+
+from fluidlift.shape.jets import Outline
+from fluidlift.shape.kind import PITCH_PRIOR, UpEvidence
+from fluidlift.shape.puddle import down_to_landing, fit_ellipse, jets_into_puddle, puddle_tilt
+from fluidlift.types import PinholeCamera
+
+H, W = 160, 160
+CAMERA = PinholeCamera.from_fov(40.0, (W, H))
+ROW, COL = np.mgrid[:H, :W] + 0.5
+JET = (np.abs(COL - 80) < 7) & (ROW < 100)
+
+
+def pool(height, width=50.0):
+    return ((COL - 80) / width) ** 2 + ((ROW - 100) / height) ** 2 < 1
+
+
+def scene(body):
+    """Mask, motion (10 px down in the jet, still below) and trust."""
+    motion = np.zeros((H, W, 2))
+    motion[JET, 1] = 10.0
+    return JET | body, motion, np.where(JET | body, 0.8, 0.0)
+
+
+def test_a_jet_into_a_round_pool_seen_from_above_is_a_puddle_with_a_jet():
+    found = jets_into_puddle(CAMERA, UpEvidence(40.0, 0.0, "", 1.0), *scene(pool(32.0)))
+    assert found is not None and len(found.jets) == 1
+    assert found.lying[130, 80] and not found.lying[20, 80]
+
+
+def test_a_glass_seen_from_the_side_is_no_puddle():
+    glass = (np.abs(COL - 80) < 32) & (ROW > 60) & (ROW < 150)
+    assert jets_into_puddle(CAMERA, None, *scene(glass)) is None
+
+
+def test_a_round_vessel_seen_level_is_no_puddle():
+    body = scene(pool(40.0))
+    assert jets_into_puddle(CAMERA, UpEvidence(5.0, 0.0, "", 1.0), *body) is None
+    assert jets_into_puddle(CAMERA, None, *body) is not None  # nothing says that the camera is level
+
+
+def test_without_a_jet_there_is_no_puddle():
+    mask, motion, trust = scene(pool(32.0))
+    assert jets_into_puddle(CAMERA, None, mask, 0 * motion, trust) is None
+
+
+def test_the_ellipse_of_an_ellipse_is_itself():
+    found = fit_ellipse(pool(30.0))
+    assert found is not None
+    assert found.flatness == pytest.approx(0.6, abs=0.01)  # pixels at the rim
+    assert found.likeness > 0.98
+
+
+@pytest.mark.parametrize("pitch", [25.0, 40.0, 60.0])
+def test_a_flatter_pool_is_seen_at_a_lower_angle(pitch):
+    habit = UpEvidence(10.0, 2.0, "", 0.0)
+    found = puddle_tilt(pool(50.0 * np.sin(np.radians(pitch))), habit)
+    usual = PITCH_PRIOR["stream"][0]
+    # between the usual view and what a round pool says, as a pool may be out of round
+    assert min(pitch, usual) - 0.5 <= found.pitch <= max(pitch, usual) + 0.5
+    assert found.roll == habit.roll
+
+
+def test_a_flat_pool_says_more_than_one_that_is_seen_from_high_above():
+    habit = UpEvidence(10.0, 2.0, "", 0.0)
+    low, high = (puddle_tilt(pool(50.0 * np.sin(np.radians(p))), habit).confidence for p in (25.0, 60.0))
+    assert low > 2.0 * high
+
+
+def test_a_puddle_of_another_shape_says_nothing_of_the_tilt():
+    habit = UpEvidence(10.0, 2.0, "", 0.0)
+    cross = (np.abs(COL - 80) < 8) | (np.abs(ROW - 80) < 8)
+    assert puddle_tilt(cross, habit) is habit
+
+
+@pytest.mark.parametrize(("below", "reach"), [(0.0, 12.0), (0.8, 0.0), (0.4, 6.0)])
+def test_a_jet_goes_on_over_the_way_on_which_its_flow_is_lost(below, reach):
+    """Flow of 12 px a frame ends 12 px above the landing; where it is still trusted, the jet has ended."""
+    pixels = (np.abs(COL - 80) < 6) & (ROW < 90)
+    outline = Outline(pixels, np.array([[80.0, 0.0], [80.0, 90.0]]), np.array([6.0, 6.0]), True)
+    motion = np.zeros((H, W, 2))
+    motion[pixels, 1] = 12.0
+    drawn = down_to_landing(outline, np.ones((H, W), bool), motion, np.where(pixels, 0.8, below))
+    assert drawn.centers[-1][1] == pytest.approx(90.0 + reach, abs=1e-6)
+    assert drawn.pixels.any(axis=1).sum() == pytest.approx(90 + reach, abs=1)

@@ -206,9 +206,9 @@ def read_manifest(folder: Path | str) -> dict[str, Any]:
     """
     folder = Path(folder)
     if not (folder / "manifest.json").is_file():
-        what = "is not a fluidlift asset (it has no manifest.json)" if folder.exists() else "is not there"
+        why = "it has no manifest.json" if folder.exists() else "there is nothing of that name"
         do = "check the name, or run 'fluidlift make' to its end"
-        raise InputRejected(f"'{folder}' {what}", "a folder made with 'fluidlift make'", do)
+        raise InputRejected(f"'{folder}' is not a fluidlift asset ({why})", "a folder made with 'fluidlift make'", do)
     manifest = read_json(asset_file(folder, "manifest.json"), "manifest", _MAX_JSON)
     version = manifest.get("format_version") if isinstance(manifest, dict) else None
     if isinstance(version, int) and version > FORMAT_VERSION:

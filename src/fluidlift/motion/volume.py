@@ -12,8 +12,7 @@ outlet are free, and Q follows from the well observed cross-sections; badly seen
 picture, follow it. No end carries more than the fastest surface seen near it allows, nor flows against its sense: where
 the geometry asks for that (a body too thick, an end too small), the surface yields as far as it must. A fall thins as
 it speeds up: its surface yields, and what enters at its rim runs as the surface there. In a vessel that fills or
-empties the surface must give way, and does. The surface of smoke is no barrier.
-"""
+empties the surface must give way, and does. The surface of smoke is no barrier."""
 
 from __future__ import annotations
 

@@ -3,8 +3,7 @@
 Learned depth has slow errors of some per cent, which turn level water into a hill, and its noise is larger than waves.
 A stream, however, is level across: what its depth shows to be uneven across is error, and measures the error of its
 slope. So a stream's surface is a smooth function of the way along it, and its slope is weighed against what streams
-have. Everything lives in the canonical frame of `shape.surface`.
-"""
+have. Everything lives in the canonical frame of `shape.surface`."""
 
 from __future__ import annotations
 

@@ -6,13 +6,14 @@ import trimesh
 
 from fluidlift.look.scenery import (
     orbit_camera,
+    side_camera,
     terrain_depth,
     terrain_surfels,
     vertex_normals,
     visible_beside_rocks,
 )
 from fluidlift.numerics.isosurface import surface_nets
-from fluidlift.types import Grid, PinholeCamera, Terrain, TriangleMesh
+from fluidlift.types import Gaussians, Grid, PinholeCamera, Terrain, TriangleMesh
 
 GRID = Grid((24, 24, 16), 0.1, (-1.2, -1.2, -0.8))
 CAMERA = PinholeCamera.looking((0.0, -3.0, 2.0), (0.0, 0.0, 0.0), 35.0, (60, 48))
@@ -184,3 +185,21 @@ def test_a_mesh_that_is_huge_for_its_spacing_gets_a_bounded_number_of_surfels():
     from fluidlift.numerics.solid_mesh import box_mesh
 
     assert len(mesh_surfels(box_mesh(np.ones(3)), 1e-4, most=5000)) < 20_000
+
+
+def test_the_side_is_the_one_from_which_the_ground_hides_little():
+    camera = PinholeCamera.looking((0.0, -3.0, 1.5), (0.0, 0.0, 0.0), 50.0, (96, 72))
+    rng = np.random.default_rng(0)
+    fluid = Gaussians.isotropic(rng.uniform((-0.5, -0.5, 0.0), (0.5, 0.5, 0.05), (800, 3)), 0.05, np.ones((800, 3)))
+    points = np.array([[-1.0, -1, 0], [1.0, 1, 1]])
+
+    def wall(x: float) -> Gaussians:
+        place = rng.uniform((x, -1.0, 0.0), (x + 0.02, 1.0, 1.0), (3000, 3))
+        return Gaussians.isotropic(place, 0.04, np.ones((3000, 3)))
+
+    usual = side_camera(camera, fluid, Gaussians.empty(), points)
+    side = float(np.sign(usual.position[0]))
+    assert side == np.sign(orbit_camera(camera, points).position[0])
+    # a wall on that side: the other one is taken; it stands behind the fluid from there
+    assert np.sign(side_camera(camera, fluid, wall(0.9 * side), points).position[0]) == -side
+    np.testing.assert_allclose(side_camera(camera, fluid, wall(-0.9 * side), points).position, usual.position)

@@ -11,8 +11,22 @@ from scipy import ndimage
 
 from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.numerics.textures import sample_texture
-from fluidlift.types import Gaussians, PinholeCamera, Terrain, TriangleMesh, decompose_covariances, sh_from_rgb
+from fluidlift.types import (
+    Gaussians,
+    PinholeCamera,
+    Terrain,
+    TriangleMesh,
+    concatenate,
+    decompose_covariances,
+    sh_from_rgb,
+)
 
+SIDES = ((24.0, 65.0), (24.0, -65.0), (45.0, 65.0), (45.0, -65.0))
+"""elevation and azimuth, degrees, of views from the side, the usual one first"""
+SEEN = 0.6
+"""share of the fluid's picture that the ground may not hide, from which a view will do"""
+SKETCH = 96
+"""px, width of the pictures in which that is looked at"""
 LIGHT = np.array([0.35, -0.45, 0.82])
 """direction towards a high light beside the viewer, world"""
 
@@ -221,3 +235,40 @@ def orbit_camera(
     distance = float((np.abs(seen[:, :2]) / half - seen[:, 2:]).max())
     distance = max(distance, 1.5 * float(-seen[:, 2].min()))
     return PinholeCamera.looking(centre + distance * toward, centre, fov, size)
+
+
+def side_camera(
+    camera: PinholeCamera,
+    fluid: Gaussians,
+    ground: Gaussians,
+    points: Float[np.ndarray, "n 3"],
+    *,
+    size: tuple[int, int] | None = None,
+) -> PinholeCamera:
+    """The first of some views from the side in which the ground hides little of the fluid, else the one in which it
+    hides least: a bank or the wall of a steep bed may stand before it on one side.
+
+    Args:
+        camera: the original view.
+        fluid: what should be seen.
+        ground: what may hide it.
+        points: what must be in the picture, m.
+        size: of the picture; None keeps the original's.
+    """
+    from fluidlift.look.rasterize import render
+
+    whole = orbit_camera(camera, points, size=size)
+    small = (SKETCH, max(16, round(SKETCH * whole.size[1] / whole.size[0])))
+    best, most = whole, -1.0
+    marks = np.concatenate([np.ones(len(fluid), np.float32), np.zeros(len(ground), np.float32)])[:, None]
+    both = concatenate([fluid, ground])
+    for elevation, azimuth in SIDES:
+        view = orbit_camera(camera, points, azimuth=azimuth, elevation=elevation, size=size)
+        sketch = view.resized(small)
+        alone = float(render(fluid, sketch).alpha.sum())
+        seen = float(render(both, sketch, features=marks).image.sum()) / max(alone, 1e-6)
+        if seen > most + 0.05:
+            best, most = view, seen
+        if most >= SEEN:
+            break
+    return best

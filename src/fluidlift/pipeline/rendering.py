@@ -172,7 +172,7 @@ def _cameras(scene: Scene, request: RenderRequest, count: int) -> list[PinholeCa
     """One per frame."""
     from fluidlift.io.views import read_view
     from fluidlift.look.camera_path import keyed_path, orbit_path
-    from fluidlift.look.scenery import orbit_camera
+    from fluidlift.look.scenery import orbit_camera, side_camera, terrain_surfels
 
     camera = scene.camera
     size = request.size or camera.size
@@ -180,7 +180,7 @@ def _cameras(scene: Scene, request: RenderRequest, count: int) -> list[PinholeCa
     if request.view == "input":
         return [_fitted(camera, size)] * count
     if request.view == "side":
-        return [orbit_camera(camera, around, size=size)] * count
+        return [side_camera(camera, scene.rest, terrain_surfels(scene.terrain), around, size=size)] * count
     if request.view == "top":
         return [orbit_camera(camera, around, azimuth=0.0, elevation=89.0, size=size)] * count
     if request.view == "turn":

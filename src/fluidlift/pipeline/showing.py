@@ -86,7 +86,7 @@ def _panels(
     """Input | re-simulation | side view, frame by frame; keeps what the evaluation needs on the way."""
     from fluidlift.look.pictures import caption
     from fluidlift.look.rasterize import render
-    from fluidlift.look.scenery import mesh_surfels, orbit_camera, terrain_depth, terrain_surfels, visible_beside_rocks
+    from fluidlift.look.scenery import mesh_surfels, side_camera, terrain_depth, terrain_surfels, visible_beside_rocks
 
     camera, terrain, grid = scene.camera, scene.terrain, scene.terrain.grid
     plate = np.full((camera.size[1], camera.size[0], 3), 0.5, np.float32)
@@ -106,7 +106,7 @@ def _panels(
     if airborne:
         inset = 0.18 * (grid.high - grid.low) * np.array([1.0, 1.0, 0.0])
         whole = np.stack([grid.low + inset, grid.high - inset])
-    side = orbit_camera(camera, np.concatenate([scene.rest.means, whole]), size=size)
+    side = side_camera(camera, scene.rest, ground, np.concatenate([scene.rest.means, whole]), size=size)
     sky = np.linspace(0.93, 0.78, size[1], dtype=np.float32)[:, None, None] * np.ones((1, size[0], 3), np.float32)
     shapes = [mesh_surfels(o.mesh, grid.spacing) for o in scene.obstacles]
     for k, (gaussians, _, velocity) in enumerate(splat_frames(folder, len(poses))):

@@ -78,7 +78,7 @@ def motion_scene(story: Story) -> MotionScene:
 
     setting, g = setting_of(story), story["geometry"]
     return MotionScene(
-        camera_of(story), g.arrays["depth"], setting.terrain, setting.cell_types, g.meta["kind"],
+        camera_of(story), g.arrays["sighted_depth"], setting.terrain, setting.cell_types, g.meta["kind"],
         clip_of(story).interval, setting.surface_height, setting.pool_level,
         prior=(g.arrays["mean_flow"], g.arrays["mean_confidence"]),
     )  # fmt: skip

@@ -183,7 +183,8 @@ def mitsuba_pass(scene: Scene, gradients: bool) -> Callable[[], object] | None:
         }
     )
     parameters = mi.traverse(world)
-    keys = [k for k in parameters.keys() if k.startswith("body.") and k.split(".")[1] in shape]  # noqa: SIM118
+    names = parameters.keys()  # the package's own mapping: it cannot be walked itself
+    keys = [k for k in names if k.startswith("body.") and k.split(".")[1] in shape]
 
     def run() -> object:
         if not gradients:

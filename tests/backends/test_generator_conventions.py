@@ -205,17 +205,18 @@ class Theirs:
     """What the two of them return: raw numbers with biases, and getters that activate them."""
 
     def __init__(self, body: Gaussians, getters: bool) -> None:
-        softplus_inverse = lambda x: x + torch.log(-torch.expm1(-x))  # noqa: E731
-        logit = lambda p: torch.log(p / (1 - p))  # noqa: E731
+        def softplus_inverse(x):
+            return x + torch.log(-torch.expm1(-x))
+
         self.rots_bias = torch.tensor([1.0, 0, 0, 0])
         self.least, self.scale_bias = 9e-4, softplus_inverse(torch.tensor(0.004))
-        self.opacity_bias = logit(torch.tensor(0.1))
+        self.opacity_bias = torch.logit(torch.tensor(0.1))
         self._xyz = torch.from_numpy(body.means) + 0.5
         self._features_dc = torch.from_numpy(body.sh)
         scales = torch.sqrt(torch.from_numpy(body.scales).double() ** 2 - self.least**2)
         self._scaling = (softplus_inverse(scales) - self.scale_bias).float()
         self._rotation = 1.7 * torch.from_numpy(body.quats) - self.rots_bias  # of any length
-        self._opacity = logit(torch.from_numpy(body.opacities)[:, None]) - self.opacity_bias
+        self._opacity = torch.logit(torch.from_numpy(body.opacities)[:, None]) - self.opacity_bias
         if getters:
             self.get_rotation = torch.nn.functional.normalize(self._rotation + self.rots_bias)
             self.get_features = self._features_dc

@@ -208,7 +208,10 @@ def test_triposplat_is_asked_stage_by_stage_and_keeps_its_camera(module, picture
         get_xyz=b["xyz"], get_scaling=b["scaling"], get_opacity=b["opacity"], _rotation=0 * b["rotation"],
         rots_bias=torch.tensor([1.0, 0, 0, 0]), _features_dc=b["features"],
     )  # fmt: skip
-    load = lambda path, device, dtype: asked.setdefault("files", []).append(path)  # noqa: E731
+
+    def load(path, device, dtype):
+        return asked.setdefault("files", []).append(path)
+
     decoder = SimpleNamespace(decode=lambda latent, num_gaussians: body)
     module(
         "triposplat", load_dinov3=load, load_vae_encoder=load, load_flow_model=load, encode_image=encode_image,

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from fluidlift.backends.depth_pictures import (
+    TransformersDepth,
     longer_field_of_view,
     multiple_near,
     require_answer,
@@ -17,7 +18,7 @@ from fluidlift.backends.depth_pictures import (
 from fluidlift.backends.model_weights import Announce, say
 from fluidlift.backends.monocular_depth import DepthModel, Guess
 from fluidlift.backends.pair_network import memory_errors, torch_device
-from fluidlift.backends.sam2_video import MEAN, SPREAD, loaded_model
+from fluidlift.backends.sam2_video import MEAN, SPREAD
 from fluidlift.errors import InputRejected, MissingPackage
 from fluidlift.types import PinholeCamera
 
@@ -35,29 +36,16 @@ CANONICAL_FOCAL = 300.0
 """px, for which version 3's metric model gives metres: metres = answer x focal length / 300, at the size it looks at"""
 
 
-class DepthAnything(DepthModel):
-    """Depth Anything V2 (V1's files fit as well).
+class DepthAnything(TransformersDepth):
+    """Depth Anything V2 (V1's files fit as well)."""
 
-    Args:
-        weights: folder with config.json and .safetensors, or its name on the hub where downloads are allowed.
-        device: "cpu", "cuda", "cuda:1"...
-        allow_download: whether files may be fetched.
-        announce: is told the licence before the weights are touched.
+    licence = LICENCE
+    network = ("depth_anything", "DepthAnythingForDepthEstimation")
 
-    Raises:
-        MissingPackage: transformers is missing.
-        InputRejected: no such folder, or weights of another model.
-        FluidliftError: no such device.
-    """
-
-    def __init__(
-        self, weights: Path | str, *, device: str = "cpu", allow_download: bool = False, announce: Announce = say
-    ) -> None:
-        self._device = torch_device(device)
-        announce(LICENCE)
-        model = loaded_model(weights, "depth_anything", "DepthAnythingForDepthEstimation", allow_download)
-        self._model = model.to(self._device)
-        self.metric = model.config.depth_estimation_type == "metric"
+    @property
+    def metric(self) -> bool:
+        """Whether it gives metres."""
+        return self._model.config.depth_estimation_type == "metric"
 
     def guess(self, image: np.ndarray, camera: PinholeCamera | None) -> Guess:
         """Disparity, or metres of the models that give them. It does not see how wide the view is.

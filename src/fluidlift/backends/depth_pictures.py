@@ -2,11 +2,43 @@
 
 from __future__ import annotations
 
-from typing import Any
+from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 
+from fluidlift.backends.model_weights import Announce, say
+from fluidlift.backends.monocular_depth import DepthModel
+from fluidlift.backends.pair_network import torch_device
+from fluidlift.backends.sam2_video import loaded_model
 from fluidlift.errors import InputRejected, require
+
+
+class TransformersDepth(DepthModel):
+    """A model of depth that transformers knows.
+
+    Args:
+        weights: folder with config.json and .safetensors, or its name on the hub where downloads are allowed.
+        device: "cpu", "cuda", "cuda:1"...
+        allow_download: whether files may be fetched.
+        announce: is told the licence before the weights are touched.
+
+    Raises:
+        MissingPackage: transformers is missing.
+        InputRejected: no such folder, or weights of another model.
+        FluidliftError: no such device.
+    """
+
+    licence: ClassVar[str]
+    network: ClassVar[tuple[str, str]]
+    """kind and class by which transformers knows it"""
+
+    def __init__(
+        self, weights: Path | str, *, device: str = "cpu", allow_download: bool = False, announce: Announce = say
+    ) -> None:
+        self._device = torch_device(device)
+        announce(self.licence)
+        self._model = loaded_model(weights, *self.network, allow_download).to(self._device)
 
 
 def require_picture(image: np.ndarray) -> None:

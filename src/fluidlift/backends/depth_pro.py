@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
 from fluidlift.backends.depth_pictures import (
+    TransformersDepth,
     longer_field_of_view,
     require_answer,
     require_picture,
     to_picture,
     to_tensor,
 )
-from fluidlift.backends.model_weights import Announce, say
-from fluidlift.backends.monocular_depth import DepthModel, Guess
-from fluidlift.backends.pair_network import memory_errors, torch_device
-from fluidlift.backends.sam2_video import loaded_model
+from fluidlift.backends.monocular_depth import Guess
+from fluidlift.backends.pair_network import memory_errors
 from fluidlift.types import PinholeCamera
 
 LICENCE = "Depth Pro: code and weights are under Apple's own licences (apple-amlr for the weights: research only)."
@@ -26,27 +23,11 @@ NEAREST, FARTHEST = 1e-4, 1e4
 """m, between which its inverse depth is cut"""
 
 
-class DepthPro(DepthModel):
-    """Depth by Depth Pro.
+class DepthPro(TransformersDepth):
+    """Depth by Depth Pro."""
 
-    Args:
-        weights: folder with config.json and .safetensors, or its name on the hub where downloads are allowed.
-        device: "cpu", "cuda", "cuda:1"...
-        allow_download: whether files may be fetched.
-        announce: is told the licence before the weights are touched.
-
-    Raises:
-        MissingPackage: transformers is missing.
-        InputRejected: no such folder, or weights of another model.
-        FluidliftError: no such device.
-    """
-
-    def __init__(
-        self, weights: Path | str, *, device: str = "cpu", allow_download: bool = False, announce: Announce = say
-    ) -> None:
-        self._device = torch_device(device)
-        announce(LICENCE)
-        self._model = loaded_model(weights, "depth_pro", "DepthProForDepthEstimation", allow_download).to(self._device)
+    licence = LICENCE
+    network = ("depth_pro", "DepthProForDepthEstimation")
 
     @property
     def side(self) -> int:

@@ -33,14 +33,15 @@ def read_view(path: Path | str) -> PinholeCamera | list[ViewKey]:
     for number, key in enumerate(keys, 1):
         unknown = set(key) - {"frame", "eye", "target", "fov"}
         try:
-            eye, target = (tuple(float(v) for v in key[n]) for n in ("eye", "target"))
+            (ex, ey, ez), (tx, ty, tz) = (map(float, key[n]) for n in ("eye", "target"))
+            eye, target = (ex, ey, ez), (tx, ty, tz)
             fov, frame = float(key.get("fov", 40.0)), float(key["frame"]) - FIRST_FRAME
-            sound = np.isfinite([*eye, *target, fov, frame]).all() and len(eye) == len(target) == 3 and 1 < fov < 170
+            sound = bool(np.isfinite([*eye, *target, fov, frame]).all()) and 1 < fov < 170
         except (KeyError, TypeError, ValueError):
-            sound, eye, target, fov, frame = False, (), (), 0.0, 0.0
+            sound, eye, target, fov, frame = False, (0.0,) * 3, (0.0,) * 3, 0.0, 0.0
         if unknown or not sound or eye == target:
             raise InputRejected(f"key {number} of '{name}'", f"numbers as in {VIEW}, with an eye beside its target")
-        found.append(ViewKey(frame, eye, target, fov))  # type: ignore[arg-type]
+        found.append(ViewKey(frame, eye, target, fov))
     if len({k.frame for k in found}) < len(found):
         raise InputRejected(f"'{name}' has two keys of one frame", "one key per frame")
     return found

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any, cast
 
 import numpy as np
@@ -49,74 +49,72 @@ def rest_frame(area: np.ndarray) -> int:
     return int(np.argmax(enough)) if enough.any() else int(np.argmax(area))
 
 
+@dataclass(frozen=True)
+class _Sight:
+    """What the stages before have seen, and how the camera is taken to stand."""
+
+    start: int
+    """frame of the body at rest"""
+    united: int
+    """frames in all that become one body"""
+    mask: np.ndarray
+    motion: np.ndarray
+    trust: np.ndarray
+    known: PinholeCamera
+    """its pose counts where `pose_given`"""
+    pose_given: bool
+    evidence: kinds.KindEvidence
+    kind: kinds.Kind
+    parts: composite.Parts
+    up: kinds.UpEvidence
+    heading: float | None
+    tilt_known: bool
+    height: float | None
+    """of the camera above the water, in the units of its file, where that is known"""
+    unsure: str
+    """what to say of that height; empty: nothing"""
+
+    @property
+    def lying_trust(self) -> np.ndarray:
+        """Trust in the motion of what lies."""
+        return self.trust * ~self.parts.falling
+
+
 def geometry(story: Story, inputs: Inputs, config: JobConfig) -> Result:
     """Kind, camera, front surface, scale, terrain, cells."""
     clip, fluid, c = clip_of(story), masks_of(story), config.shape
-    start, united = united_range(story, config)
-    mask = generate.united_mask(fluid[start : start + united])
-    if not mask.any():
-        mask = fluid[start]
-    motion, trust = mean_motion(story, fluid.any_frame())
+    seen, pictures = _seen(story, inputs, config)
+    kind, parts, mask = seen.kind, seen.parts, seen.mask
     warnings = framing_warnings(mask, fluid.areas())
-
-    known, pose_given = _known_camera(inputs, config, clip.size)
-    pictures, known = _depth_pictures(story, inputs, config, known, start)
-    evidence, kind, parts, up, heading = _kind_and_up(story, inputs, config, known, pose_given, mask, motion, trust)
-    eye = known.position if pose_given else None
-    canonical = kinds.level_camera(known, up)
-
-    height, unsure = None, ""
-    if eye is not None and kind == "stream":
-        level, unsure = _water_level(inputs)
-        height = float(eye[2] - level)
-    front, known_scale = _front(
-        inputs, canonical, parts.lying, kind, motion, trust * ~parts.falling, start, clip.interval, height, up.roll,
-        tilt_known=pose_given or c.pitch is not None,
-    )  # fmt: skip
-    if parts.puddle:
-        front = surface.level_surface(canonical, parts.lying)
-    seen_depth = None
-    if pictures is not None:
-        seen_depth = depths.depth_front(
-            pictures, fluid, known, up, kind, parts.lying, motion, trust * ~parts.falling, expected=front,
-            tilt_known=pose_given or c.pitch is not None,
-        )  # fmt: skip
-        up, front, known_scale = seen_depth.up, seen_depth.front, seen_depth.known_scale
-        canonical = kinds.level_camera(known, up)
+    up, canonical, front, known_scale, seen_depth = _surface(seen, pictures, fluid, inputs, clip.interval)
     front, falling = composite.standing(front, parts, canonical, mask)
     visible = mask & (front.depth > 0)
     if 0 < visible.sum() < FEWEST_PIXELS:
         raise InputRejected(
-            f"only {int(visible.sum())} fluid pixels at frame {start}", f"at least {FEWEST_PIXELS}",
+            f"only {int(visible.sum())} fluid pixels at frame {seen.start}", f"at least {FEWEST_PIXELS}",
             "check the mask, or raise --max-size",
         )  # fmt: skip
-    points, velocities = _surface_motion(canonical, visible, front.sighted, motion, clip.interval)
+    points, velocities = _surface_motion(canonical, visible, front.sighted, seen.motion, clip.interval)
+    falls, trust = falling.pixels[visible], seen.trust[visible]
+    sighting = place.Sighting(trust, clip.interval, up.pitch)
     scale = place.metric_scale(
-        kind, points, velocities, size=c.size, camera_height=height, known_scale=known_scale,
-        seen=place.Sighting(trust[visible], clip.interval, up.pitch),
-    )  # fmt: skip
+        kind, points, velocities, size=c.size, camera_height=seen.height, known_scale=known_scale, seen=sighting
+    )
     if seen_depth is not None:
         scale = depths.with_learned_scale(scale, seen_depth, points)
-        warnings += depths.size_warnings(scale.across, seen_depth, height, points)
-    falls = falling.pixels[visible]
-    scale = composite.with_fall(
-        scale, points, velocities, falls, place.Sighting(trust[visible], clip.interval, up.pitch)
-    )
-    sentence = scale.sentence
-    if unsure and scale.source == "camera":
-        scale, sentence = replace(scale, warning=unsure), f"{sentence}, with the water at z = 0, assumed"
-    if scale.warning:
-        warnings.append(scale.warning)
-    mainstream = _mainstream(kind, velocities[~falls], trust[visible][~falls])
-    to_world, camera = place.place(canonical, points, scale.value, heading=heading, eye=eye, mainstream=mainstream)
+        warnings += depths.size_warnings(scale.across, seen_depth, seen.height, points)
+    scale, sentence = _told(composite.with_fall(scale, points, velocities, falls, sighting), seen.unsure)
+    warnings += [scale.warning] * bool(scale.warning)
+    mainstream = _mainstream(kind, velocities[~falls], trust[~falls])
+    eye = seen.known.position if seen.pose_given else None
+    to_world, camera = place.place(canonical, points, scale.value, heading=seen.heading, eye=eye, mainstream=mainstream)
     depth = (front.depth * scale.value).astype(np.float32)
     half = (front.half_thickness * scale.value).astype(np.float32)
     bulk = to_world.vectors(mainstream) / to_world.scale
-    speed = _seen_speed(visible, velocities * scale.value, trust)
     scene = None if seen_depth is None else np.where(mask, np.nan, seen_depth.scene.depth * scale.value)
     setting = ground.setting_around(
-        kind, front, fluid, start, united, camera, to_world, depth, half, bulk, c, falling.pixels,
-        speed=speed, scene_depth=scene, closed=parts.puddle,
+        kind, front, fluid, seen.start, seen.united, camera, to_world, depth, half, bulk, c, falling.pixels,
+        speed=_seen_speed(visible, velocities * scale.value, seen.trust), scene_depth=scene, closed=parts.puddle,
     )  # fmt: skip
     setting = composite.composed(setting, falling, to_world, points[~falls], velocities[~falls], camera)
     if not (setting.cell_types == CellType.FLUID).any():
@@ -127,36 +125,73 @@ def geometry(story: Story, inputs: Inputs, config: JobConfig) -> Result:
     # the plate looks at a few frames only
     plate = generate.background_plate(clip.frames, cast(Any, fluid), ground.solid_share(fluid.labels) > 0.5)
     if setting.surface_height is not None:
-        view = ground_texture.View(
-            plate.image, camera, ground.seen_labels(fluid, start, united, falling.pixels), np.asarray(plate.seen)
-        )
+        labels = ground.seen_labels(fluid, seen.start, seen.united, falling.pixels)
+        view = ground_texture.View(plate.image, camera, labels, np.asarray(plate.seen))
         setting = ground.textured(setting, view)
     arrays, meta = ground.packed(setting)
     arrays |= {
-        "mask": mask, "depth": depth, "half_thickness": half, "mean_flow": motion, "mean_confidence": trust,
+        "mask": mask, "depth": depth, "half_thickness": half, "mean_flow": seen.motion, "mean_confidence": seen.trust,
         "sighted_depth": (front.sighted * scale.value).astype(np.float32), "plate": plate.image,
     }  # fmt: skip
     meta |= {
-        "warnings": warnings,
-        "kind": kind,
-        "kind_evidence": asdict(evidence),
-        "kind_source": "evidence" if c.kind == "auto" else "user",
-        "up": asdict(up),
-        "scale": asdict(scale) | {"sentence": sentence},
-        "camera": camera.to_dict(),
+        "warnings": warnings, "kind": kind, "kind_evidence": asdict(seen.evidence),
+        "kind_source": "evidence" if c.kind == "auto" else "user", "up": asdict(up),
+        "scale": asdict(scale) | {"sentence": sentence}, "camera": camera.to_dict(),
         "world_from_canonical": {
-            "scale": to_world.scale,
-            "rotation": to_world.rotation.tolist(),
+            "scale": to_world.scale, "rotation": to_world.rotation.tolist(),
             "translation": to_world.translation.tolist(),
         },
-        "known_scale": known_scale,
-        "depth_source": None if seen_depth is None else seen_depth.meta,
-        "jets": falling.plain(to_world),
-        "slope": None if front.slope is None else asdict(front.slope),
-        "rest_frame": start,
-        "united_frames": united,
-    }
+        "known_scale": known_scale, "depth_source": None if seen_depth is None else seen_depth.meta,
+        "jets": falling.plain(to_world), "slope": None if front.slope is None else asdict(front.slope),
+        "rest_frame": seen.start, "united_frames": seen.united,
+    }  # fmt: skip
     return Result(arrays, meta)
+
+
+def _seen(story: Story, inputs: Inputs, config: JobConfig) -> tuple[_Sight, DepthPictures | None]:
+    """Mask, motion, kind and camera; and depth pictures where there are some."""
+    clip, fluid, c = clip_of(story), masks_of(story), config.shape
+    start, united = united_range(story, config)
+    mask = generate.united_mask(fluid[start : start + united])
+    if not mask.any():
+        mask = fluid[start]
+    motion, trust = mean_motion(story, fluid.any_frame())
+    known, pose_given = _known_camera(inputs, config, clip.size)
+    pictures, known = _depth_pictures(story, inputs, config, known, start)
+    evidence, kind, parts, up, heading = _kind_and_up(story, inputs, config, known, pose_given, mask, motion, trust)
+    height, unsure = None, ""
+    if pose_given and kind == "stream":
+        level, unsure = _water_level(inputs)
+        height = float(known.position[2] - level)
+    tilt_known = pose_given or c.pitch is not None
+    seen = _Sight(
+        start, united, mask, motion, trust, known, pose_given, evidence, kind, parts, up, heading, tilt_known, height,
+        unsure,
+    )  # fmt: skip
+    return seen, pictures
+
+
+def _surface(seen: _Sight, pictures: DepthPictures | None, fluid, inputs: Inputs, interval: float):
+    """Up, the level camera, the surface of what lies, metres per unit where they are known, and the depth behind it."""
+    lying, up = seen.parts.lying, seen.up
+    canonical = kinds.level_camera(seen.known, up)
+    front, known_scale = _front(seen, inputs, canonical, interval)
+    if seen.parts.puddle:
+        front = surface.level_surface(canonical, lying)
+    if pictures is None:
+        return up, canonical, front, known_scale, None
+    found = depths.depth_front(
+        pictures, fluid, seen.known, up, seen.kind, lying, seen.motion, seen.lying_trust, expected=front,
+        tilt_known=seen.tilt_known,
+    )  # fmt: skip
+    return found.up, kinds.level_camera(seen.known, found.up), found.front, found.known_scale, found
+
+
+def _told(scale: place.MetricScale, unsure: str) -> tuple[place.MetricScale, str]:
+    """The scale with its warning, and its sentence, where the water's level was assumed."""
+    if unsure and scale.source == "camera":
+        return replace(scale, warning=unsure), f"{scale.sentence}, with the water at z = 0, assumed"
+    return scale, scale.sentence
 
 
 def _kind_and_up(story, inputs, config, known, pose_given, mask, motion, trust):
@@ -253,18 +288,19 @@ def _water_level(inputs: Inputs) -> tuple[float, str]:
     )
 
 
-def _front(inputs, canonical, mask, kind, motion, trust, start, interval, height, roll, *, tilt_known):
+def _front(seen: _Sight, inputs: Inputs, canonical: PinholeCamera, interval: float):
     """The front surface in canonical units; metres per unit where the depth came in metres, else None."""
+    lying, motion, trust = seen.parts.lying, seen.motion, seen.lying_trust
     if inputs.geometry is not None:
-        return given_body.given_front(inputs.geometry, canonical, mask, kind, start)
-    if kind == "stream":
+        return given_body.given_front(inputs.geometry, canonical, lying, seen.kind, seen.start)
+    if seen.kind == "stream":
         front = surface.stream_surface(
-            canonical, mask, motion, trust, interval, camera_height=height, tilt_known=tilt_known
+            canonical, lying, motion, trust, interval, camera_height=seen.height, tilt_known=seen.tilt_known
         )
         return front, None
-    if kind == "fall":
-        return surface.falling_surface(canonical, mask, motion, trust), None
-    return surface.inflated_surface(canonical, mask, kind, roll), None
+    if seen.kind == "fall":
+        return surface.falling_surface(canonical, lying, motion, trust), None
+    return surface.inflated_surface(canonical, lying, seen.kind, seen.up.roll), None
 
 
 def _surface_motion(camera, visible, depth, motion, interval) -> tuple[np.ndarray, np.ndarray]:

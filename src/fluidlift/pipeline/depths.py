@@ -23,10 +23,10 @@ from fluidlift.shape.surface import FrontSurface
 from fluidlift.types import PinholeCamera
 
 LEARNED_SCALE = 0.15
-"""relative standard error of a model's metres (published errors on unseen scenes are 5 to 30 per cent)"""
+"""relative standard error of a model's metres: assumed, as no trained model was measured here"""
 FILE_FLOOR, MODEL_FLOOR = 0.003, 0.02
-"""relative error of depth that changes slowly over the picture, at least: a sensor or a renderer; a learned model (one
-to four per cent over a surface after its factor was taken out)"""
+"""relative error of depth that changes slowly over the picture, at least: a sensor or a renderer; a learned model
+(assumed)"""
 HUGE, TINY = 300.0, 1e-3
 """m across a fluid that a depth file must not make it without a word"""
 

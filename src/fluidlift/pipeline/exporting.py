@@ -228,8 +228,8 @@ def gridded(frame: FluidFrame, cells: Grid) -> tuple[FaceVelocity, np.ndarray, G
     points, h = frame.gaussians.means.astype(np.float64), cells.spacing
     first = np.floor((points.min(axis=0) - cells.low) / h).astype(int) - 1
     last = np.floor((points.max(axis=0) - cells.low) / h).astype(int) + 2
-    shape = tuple(int(v) for v in last - first)
-    grid = Grid(shape, h, tuple(float(v) for v in cells.low + first * h))  # type: ignore[arg-type]
+    (nx, ny, nz), (x, y, z) = (last - first).tolist(), (cells.low + first * h).tolist()
+    grid = Grid((nx, ny, nz), h, (x, y, z))
     velocity, _ = particles_to_grid(Particles.at_rest(points, 1.0, velocities=frame.velocities), grid)
     flat = np.ravel_multi_index(tuple(grid.cell_of(points).T), grid.shape)
     amount = np.bincount(flat, weights=frame.gaussians.opacities, minlength=grid.cells).reshape(grid.shape)

@@ -215,6 +215,13 @@ def test_the_preview_shows_three_views_of_every_frame(made):
     assert preview.size == (3 * 96, 64)
 
 
+def test_the_report_says_what_the_surface_was_taken_from_and_how_sure_that_is(made, story):
+    text = (made.folder / "report.html").read_text(encoding="utf-8")
+    slope, up = story["geometry"].meta["slope"], story["geometry"].meta["up"]
+    assert f"level with a probability of {slope['level_share']:.2f}" in text
+    assert f"± {slope['standard_error']:.1f} degrees" in text and f"confidence {up['confidence']:.2f}" in text
+
+
 def test_the_report_tells_the_kind_and_every_stage(made):
     text = (made.folder / "report.html").read_text(encoding="utf-8")
     assert "kind: stream" in text

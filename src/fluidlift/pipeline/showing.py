@@ -246,7 +246,7 @@ def _section_body(story: Story) -> Section:
         ["kind", f"{m['kind']} ({m['kind_source']})"],
         ["belief per kind", ", ".join(f"{k} {v:.2f}" for k, v in evidence["scores"].items())],
         ["evidence", ", ".join(f"{k} {v:.2f}" for k, v in evidence["features"].items())],
-        ["camera looks down by", f"{m['up']['pitch']:.1f} degrees, rolled {m['up']['roll']:.1f} ({m['up']['source']})"],
+        *_surface_rows(m),
         ["scale", m["scale"].get("sentence", "").removeprefix("scale: ")],
         ["grid", f"{' x '.join(map(str, m['grid']['shape']))} cells of {1000 * m['grid']['spacing']:.2f} mm"],
         ["frames united", m["united_frames"]],
@@ -262,6 +262,22 @@ def _section_body(story: Story) -> Section:
     figures = [Figure(colour_map(depth, mask & (depth > 0)), "front depth (dark is near)")]
     figures.append(Figure(g.arrays["plate"], "background without the fluid: texture of the terrain"))
     return Section("Body", figures, rows)
+
+
+def _surface_rows(geometry: dict[str, Any]) -> list[list[str]]:
+    """How the camera stands and what the surface was taken from, and how sure both are."""
+    up, slope, jets, depth = (geometry.get(k) for k in ("up", "slope", "jets", "depth_source"))
+    tilt = f"{up['pitch']:.1f} degrees, rolled {up['roll']:.1f} ({up['source']}, confidence {up['confidence']:.2f})"
+    rows = [["camera looks down by", tilt]]
+    if depth is not None:
+        rows.append(["surface", f"by the {depth['source']}"])
+    elif slope is not None:
+        level = f"level with a probability of {slope['level_share']:.2f}"
+        steep = f"{slope['slope']:.1f} ± {slope['standard_error']:.1f} degrees, {level} ({slope['source']})"
+        rows.append(["slope of the surface", steep])
+    if jets:
+        rows.append(["jets above it", str(len(jets))])
+    return rows
 
 
 def _section_motion(story: Story) -> Section:

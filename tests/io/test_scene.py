@@ -1,11 +1,14 @@
 """scene.yaml: what a person writes is checked, entry by entry, and a complaint names the line."""
 
+import re
+
 import numpy as np
 import pytest
 
 from fluidlift.errors import InputRejected
 from fluidlift.io.export_mesh import write_obj
-from fluidlift.io.scene import SCENE_TEMPLATE, read_edits
+from fluidlift.io.scene import SCENE_TEMPLATE, SceneEdits, read_edits
+from fluidlift.io.scene_look import Look
 from fluidlift.numerics.solid_mesh import box_mesh, moments
 
 
@@ -22,20 +25,24 @@ def edits(tmp_path):
 
 def test_the_template_changes_nothing(edits):
     found = edits(SCENE_TEMPLATE)
-    assert (found.parameters, found.duration, found.extend_downstream, found.obstacles) == ({}, None, 0.0, ())
+    assert found == SceneEdits()
 
 
 def test_the_examples_of_the_template_work(edits, tmp_path):
     write_obj(tmp_path / "rock.obj", box_mesh(np.ones(3)))
-    text = SCENE_TEMPLATE.replace("obstacles: []", "obstacles:").replace("parameters: {}", "parameters:")
-    found = edits("\n".join(line.removeprefix("#").removeprefix(" d") if line.startswith("#  ") else line
-                            for line in text.splitlines()))  # fmt: skip
+    text = re.sub(r"^(\w+): [\[{][\]}]$", r"\1:", SCENE_TEMPLATE, flags=re.M)
+    found = edits(re.sub(r"^#(?=  )|^# (?=duration|extend|loop)", "", text, flags=re.M))
     assert [o.name for o in found.obstacles] == ["sphere1", "mesh2", "box3"]
     assert found.parameters["kinematic_viscosity"] == 1e-6
     volumes = [moments(o.mesh).volume for o in found.obstacles]
     # the sphere is a polyhedron of 5120 faces inside it: 0.1 % less
     np.testing.assert_allclose(volumes, [4 / 3 * np.pi * 1e-3, 1e-3, 4e-3], rtol=2e-3)
     assert [o.motion for o in found.obstacles] == ["static", "static", "free"]
+    assert (found.emitters[0].velocity, found.emitters[0].end) == ((0.0, 0.0, -1.0), 2.5)
+    assert (found.terrain[0].offset, found.terrain[1].degrees_per_metre) == ((0.0, 0.0, 0.1), 20.0)
+    assert (found.inflow.keyframes, found.inflow.fluctuation) == (((0.0, 1.5),), 0.1)
+    assert found.look == Look("surface", "honey", "sky")
+    assert (found.duration, found.extend_downstream, found.loop) == (4.0, 2.0, True)
 
 
 def test_a_turn_is_about_x_then_y_then_z(edits):
@@ -102,8 +109,8 @@ obstacles:
         ("obstacles: [3]", ["name: value"]),
         ("duration: long", ["duration", "'long'"]),
         ("extend_downstream: -2", ["extend_downstream", "-2"]),
-        ("look: {hue: 1}", ["look", "cannot simulate"]),
-        ("parameters: {gravity: [0, 0]}", ["line 1", "three components"]),
+        ("look: {hue: 1}", ["line 1", "unknown entry 'hue' of look"]),
+        ("parameters: {gravity: [0, 0]}", ["line 1", "3 numbers", "m/s^2"]),
         ("parameters: [1]", ["name: value"]),
     ],
 )

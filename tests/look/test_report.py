@@ -52,6 +52,19 @@ class Collector(HTMLParser):
         self.text.append(data)
 
 
+def test_every_picture_says_what_good_looks_like_and_the_page_knows_the_dark():
+    text = page(sections=[Section("Body", [Figure(PICTURE, "Front depth", "a smooth slope & no holes")])])
+    assert "Good: a smooth slope &amp; no holes." in text
+    assert "prefers-color-scheme:dark" in text
+
+
+def test_the_film_is_inside_the_page():
+    whole = report_html("t", "s", [], warnings=(), links={}, film=b"\x00\x01film")
+    sources = Collector(whole).sources
+    assert sources == ["data:video/mp4;base64," + base64.b64encode(b"\x00\x01film").decode()]
+    assert "<video" not in page()
+
+
 def test_nothing_is_loaded_from_elsewhere():
     found = Collector(page())
     assert found.sources and all(s.startswith("data:image/png;base64,") for s in found.sources)

@@ -1,16 +1,19 @@
 """A finished asset is written for other tools."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
 import trimesh
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from fluidlift.cli import DONE, REJECTED, WITH_WARNINGS, main
 from fluidlift.io.asset_folder import load_asset, read_manifest
 from fluidlift.io.frames import FluidFrame
 from fluidlift.io.ply import read_mesh, read_splats
+from fluidlift.io.stage_cache import mark_owner, save_stage
 from fluidlift.io.validate_usd import validate_usd
 from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.pipeline.exporting import gridded, level_set
@@ -144,3 +147,51 @@ def test_vdb_files_are_numbered_and_refuse_other_axes(made, tmp_path, capsys):
         assert name in data
     assert export(made, tmp_path / "other", "--to", "vdb", "--up-axis", "y") == REJECTED
     assert "z up and metres" in capsys.readouterr().err
+
+
+@pytest.fixture
+def floating(made, tmp_path):
+    """The small asset with a turned box that the simulation carried a metre along x in its two first frames."""
+    folder = shutil.copytree(made.folder, tmp_path / "floating.fluid")
+    entry = "{name: a/b, shape: box, size: [0.1, 0.2, 0.3], position: [0, 0, 1], motion: free, density: 400}"
+    (folder / "scene.yaml").write_text(f"obstacles:\n  - {entry}\n")
+    poses = np.zeros((2, 1, 7))
+    poses[:, 0, 0], poses[:, 0, 2] = (0.0, 1.0), 1.0
+    poses[:, 0, 3], poses[:, 0, 6] = np.sqrt(0.5), np.sqrt(0.5)  # a quarter turn about z
+    save_stage(folder, "simulate", "k", {"poses": poses}, {})
+    mark_owner(folder, "simulate", "k")
+    return folder
+
+
+def test_obstacles_lie_beside_the_meshes_where_the_simulation_had_them(floating, tmp_path):
+    out = tmp_path / "out"
+    assert main(["export", str(floating), "-o", str(out), "--frames", "1001-1002"]) in WELL
+    (body,) = json.loads((out / "bodies.json").read_text())["bodies"]
+    assert body["name"] == "a/b" and body["mesh"] == "bodies/a_b.ply" and body["first"] == 1001
+    half = np.sqrt(0.5)
+    np.testing.assert_allclose(body["poses"], [[0, 0, 1, half, 0, 0, half], [1, 0, 1, half, 0, 0, half]], atol=1e-12)
+    mesh = read_mesh(out / body["mesh"])
+    np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), [0.1, 0.2, 0.3], atol=1e-6)
+    (floating / "scene.yaml").write_text("")
+    assert main(["export", str(floating), "-o", str(out), "--frames", "1001-1002"]) in WELL
+    assert not (out / "bodies.json").exists() and not list(out.glob("bodies/*"))  # of an earlier run
+
+
+def test_obstacles_turn_with_the_axes_and_take_the_units_of_the_meshes(floating, tmp_path):
+    command = ["export", str(floating), "--frames", "1001-1002"]
+    assert main([*command, "-o", str(tmp_path / "z")]) in WELL
+    assert main([*command, "-o", str(tmp_path / "y"), "--up-axis", "y", "--meters-per-unit", "0.01"]) in WELL
+    placed = []
+    for name in "zy":
+        (body,) = json.loads((tmp_path / name / "bodies.json").read_text())["bodies"]
+        pose = np.array(body["poses"][1])
+        turn = Rotation.from_quat(pose[3:], scalar_first=True)
+        placed.append(turn.apply(read_mesh(tmp_path / name / body["mesh"]).vertices) + pose[:3])
+    x, y, z = placed[0].T
+    np.testing.assert_allclose(placed[1], 100 * np.stack([x, z, -y], 1), atol=1e-4)
+
+
+def test_obstacles_whose_motion_is_not_known_are_told(floating, tmp_path, capsys):
+    mark_owner(floating, "simulate", None)
+    assert main(["export", str(floating), "-o", str(tmp_path / "out"), "--frames", "1001-1002"]) == WITH_WARNINGS
+    assert "fluidlift sim" in capsys.readouterr().err and not (tmp_path / "out" / "bodies.json").exists()

@@ -16,9 +16,9 @@ from typing import Any
 import tyro
 
 from fluidlift import __version__
+from fluidlift.cli.edit import Edit
 from fluidlift.cli.optional import REGISTRY
 from fluidlift.cli.options import (
-    Command,
     Demo,
     Doctor,
     Evaluate,
@@ -33,8 +33,26 @@ from fluidlift.cli.options import (
     Sim,
     Validate,
 )
+from fluidlift.cli.view import View
 from fluidlift.errors import FluidliftError, InputRejected
 
+Command = (
+    Make
+    | Edit
+    | Sim
+    | View
+    | Render
+    | Export
+    | Fit
+    | Inspect
+    | Mask
+    | Motion
+    | Evaluate
+    | Validate
+    | Demo
+    | Generators
+    | Doctor
+)
 DONE, FAILED, USAGE, REJECTED, WITH_WARNINGS = 0, 1, 2, 3, 4
 
 
@@ -176,12 +194,24 @@ def _sim(c: Sim) -> int:
     return _tell(made, c.json)
 
 
+def _edit(c: Edit) -> int:
+    from fluidlift.cli.edit import run
+
+    return run(c)
+
+
+def _view(c: View) -> int:
+    from fluidlift.cli.view import run
+
+    return run(c)
+
+
 def _render(c: Render) -> int:
     from fluidlift.pipeline import RenderRequest, render_asset
 
     request = RenderRequest(
         c.view, _pair(c.size, "x", "--size", "1920x1080"), _pair(c.frames, "-", "--frames", "1001-1024"),
-        c.background, c.format,
+        c.background, c.format, c.look, c.material, c.environment, c.exposure, c.engine, c.samples,
     )  # fmt: skip
     with _progress() as progress:
         return _told(render_asset(c.asset, c.out, request, progress=progress), c.json)
@@ -191,7 +221,7 @@ def _export(c: Export) -> int:
     from fluidlift.pipeline import ExportRequest, export_asset
 
     frames = _pair(c.frames, "-", "--frames", "1001-1024")
-    request = ExportRequest(c.to, c.up_axis, c.meters_per_unit, frames)
+    request = ExportRequest(c.to, c.up_axis, c.meters_per_unit, frames, c.fps)
     with _progress() as progress:
         return _told(export_asset(c.asset, c.out, request, progress=progress), c.json)
 
@@ -298,7 +328,7 @@ def _validate(c: Validate) -> int:
         print(json.dumps([dataclasses.asdict(f) for f in findings], indent=1))
     else:
         for f in findings:
-            print(f"{'ok     ' if f.passed else 'FAILED '} {f.check}{': ' + f.detail if f.detail else ''}")
+            print(f.line())
     return DONE if all(f.passed for f in findings) else FAILED
 
 
@@ -331,7 +361,7 @@ def _doctor(c: Doctor) -> int:
 
 
 _COMMANDS = {
-    Make: _make, Fit: _fit, Sim: _sim, Render: _render, Export: _export, Inspect: _inspect, Mask: _mask,
-    Motion: _motion,
-    Evaluate: _evaluate, Validate: _validate, Demo: _demo, Generators: _generators, Doctor: _doctor,
+    Make: _make, Fit: _fit, Sim: _sim, Edit: _edit, View: _view, Render: _render, Export: _export, Inspect: _inspect,
+    Mask: _mask, Motion: _motion, Evaluate: _evaluate, Validate: _validate, Demo: _demo, Generators: _generators,
+    Doctor: _doctor,
 }  # fmt: skip

@@ -150,27 +150,42 @@ class Render:
     """plate: the clip without its fluid (view input only); terrain: bed and sky; none: transparent"""
     format: Literal["png", "exr"] = "png"
     """of pictures: png (8 bits, alpha), exr (linear, alpha, camera depth in metres)"""
+    look: str | None = None
+    """splats (as lifted), relit, transparent, surface; by default as scene.yaml says"""
+    material: str | None = None
+    """of the other looks: source (the clip's colours), water, muddy_water, honey, lava, milk, oil, chocolate"""
+    environment: str | None = None
+    """their light: sky, studio, white, or a .hdr or .exr file"""
+    exposure: float | None = None
+    """stops by which they are brightened"""
+    engine: str = "mesh"
+    """of the look surface: mesh; screen (faster, softer); mitsuba (path tracing, for final frames)"""
+    samples: int = 64
+    """light paths per pixel, of mitsuba"""
     json: bool = False
     """print the outcome as JSON"""
 
 
 @dataclass(frozen=True)
 class Export:
-    """Write files of a finished asset for other tools: surface meshes, splats, USD."""
+    """Write files of a finished asset for other tools: meshes, splats, volumes, USD, glTF, a page to share."""
 
     asset: Asset
     """asset folder"""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """folder for the files (numbers from 1001)"""
+    """folder for the files (numbers from 1001); a name that ends in .html will do for a page"""
     to: str = "mesh"
-    """mesh (surface, PLY with colours and velocities), obj, splats (PLY), vdb (velocity, density, level set), usd (one
-    file with surface, splats, terrain and camera)"""
+    """mesh (surface, PLY with colours and velocities), obj, splats (PLY), spz (small splats), gltf (one frame, GLB),
+    html (a page that plays offline), vdb (velocity, density, level set), usd (one file with surface, splats, terrain
+    and camera), usd-clips (a file per frame), camera (JSON), flow (EXR), flo, masks (PNG)"""
     up_axis: Literal["z", "y"] = "z"
-    """of mesh, obj and splats; the others are z up"""
+    """of mesh, obj, splats and usd; the others have their own"""
     meters_per_unit: float = 1.0
-    """of mesh, obj and splats, such as 0.01 for centimetres; the others are in metres"""
+    """of mesh, obj, splats and usd, such as 0.01 for centimetres; the others have their own"""
     frames: str | None = None
     """first and last, such as 1001-1024; by default all"""
+    fps: float | None = None
+    """frames per second of the files: those of the asset over a whole number; every second, third ... frame is taken"""
     json: bool = False
     """print the outcome as JSON"""
 
@@ -317,8 +332,3 @@ class Doctor:
 
     json: bool = False
     """print as JSON"""
-
-
-Command = (
-    Make | Fit | Sim | Render | Export | Inspect | Mask | Motion | Evaluate | Validate | Demo | Generators | Doctor
-)

@@ -14,8 +14,8 @@ from __future__ import annotations
 
 import importlib.resources
 import json
-import zipfile
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from functools import cache
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
@@ -24,6 +24,7 @@ import jsonschema
 import numpy as np
 
 from fluidlift.errors import InputRejected
+from fluidlift.io.array_archive import read_arrays
 from fluidlift.io.atomic import (
     atomic_path,
     atomic_write,
@@ -34,6 +35,7 @@ from fluidlift.io.atomic import (
     write_json,
 )
 from fluidlift.io.frames import FIRST_FRAME
+from fluidlift.io.hashes import digests
 from fluidlift.io.limits import read_json
 from fluidlift.io.ply import read_gaussians, write_gaussians
 from fluidlift.io.scene import SCENE_TEMPLATE, read_scene
@@ -71,8 +73,10 @@ FILES = {
 }
 """where the parts lie, relative to the folder"""
 
+_HASHED = frozenset(FILES) - {"scene"} | {"usd"}
+"""parts whose SHA-256 the manifest keeps: all but what a person edits, and what is large"""
+
 _MAX_JSON = 16 * 2**20
-_MAX_ARRAYS = 8 * 2**30
 
 
 def check_output_folder(path: Path | str) -> Path:
@@ -152,6 +156,7 @@ def save_asset(
         present = {name: file for name, file in FILES.items() if (folder / file).is_file()}
         manifest = _manifest(asset, start_frame) | {
             "files": present | dict(files or {}),
+            "hashes": _hashes(folder, present | dict(files or {})),
             "timings": dict(timings or {}),
             "metrics": dict(metrics or {}),
             "warnings": list(warnings),
@@ -194,8 +199,13 @@ def update_manifest(folder: Path | str, **changes: Any) -> dict[str, Any]:
     for key, value in changes.items():
         merge = isinstance(value, Mapping) and isinstance(manifest.get(key), dict)
         manifest[key] = {**manifest[key], **value} if merge else value
+    manifest["hashes"] = manifest.get("hashes", {}) | _hashes(Path(folder), changes.get("files", {}))
     _write_manifest(Path(folder), manifest)
     return plain(manifest)
+
+
+def _hashes(folder: Path, files: Mapping[str, str]) -> dict[str, str]:
+    return digests(folder, (file for name, file in files.items() if name in _HASHED))
 
 
 def read_manifest(folder: Path | str) -> dict[str, Any]:
@@ -236,7 +246,7 @@ def load_asset(folder: Path | str) -> FluidAsset:
     parameters, estimates = read_parameters(part["parameters"])
     camera = read_json(part["camera"], "camera JSON", _MAX_JSON)
     canonical = manifest["world_from_canonical"]
-    moving = _arrays(part["velocity"], ("u", "v", "w", "cell_types"))
+    moving = read_arrays(part["velocity"], ("u", "v", "w", "cell_types"))
     try:
         velocity = FaceVelocity(moving["u"], moving["v"], moving["w"])
         if velocity.shape != grid.shape or moving["cell_types"].shape != grid.shape:
@@ -286,10 +296,13 @@ def asset_file(folder: Path | str, name: str) -> Path:
 
 
 def write_parameters(folder: Path | str, parameters: FluidParameters, estimates: Mapping[str, Estimate]) -> Path:
-    """Write parameters.json. A sigma of infinity becomes null."""
+    """Write parameters.json, and its hash in the manifest if there is one. A sigma of infinity becomes null."""
     data = plain({"values": parameters.to_dict(), "estimates": {k: vars(e) for k, e in estimates.items()}})
     _validate(data, "parameters", ValueError)
-    return write_json(Path(folder) / FILES["parameters"], data)
+    path = write_json(Path(folder) / FILES["parameters"], data)
+    with suppress(InputRejected):  # no manifest yet, or one that is about to be replaced
+        update_manifest(folder, hashes=digests(folder, [FILES["parameters"]]))
+    return path
 
 
 def read_parameters(path: Path | str) -> tuple[FluidParameters, dict[str, Estimate]]:
@@ -359,7 +372,7 @@ def _write_terrain(folder: Path, asset: FluidAsset) -> None:
 
 
 def _read_terrain(path: Path) -> Terrain:
-    a = _arrays(path, ("shape", "spacing", "origin", "signed_distance", "mainstream", "vertices", "faces"))
+    a = read_arrays(path, ("shape", "spacing", "origin", "signed_distance", "mainstream", "vertices", "faces"))
     grid = Grid(tuple(a["shape"].tolist()), float(a["spacing"]), tuple(a["origin"].tolist()))
     faces = a["faces"]
     if len(faces) and (faces.min() < 0 or faces.max() >= len(a["vertices"])):
@@ -375,24 +388,3 @@ def _write_velocity(folder: Path, asset: FluidAsset) -> None:
     fluid = np.isin(asset.cell_types, (CellType.FLUID, CellType.INFLOW, CellType.OUTFLOW))
     density = VolumeGrid("density", fluid.astype(np.float32), asset.grid.spacing, asset.grid.origin)
     write_vdb(folder / FILES["velocity_volume"], [density, velocity_grid(v, asset.grid, active=fluid)])
-
-
-def _arrays(path: Path, needed: Sequence[str]) -> dict[str, np.ndarray]:
-    """The arrays of an npz; pickles and oversize content are refused before anything is unpacked."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            if sum(member.file_size for member in archive.infolist()) > _MAX_ARRAYS:
-                raise InputRejected(f"'{path.name}' unpacks to too much", f"at most {_MAX_ARRAYS} bytes")
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, NotImplementedError, MemoryError) as error:
-        raise InputRejected(f"'{path.name}' cannot be read ({error})", "an undamaged asset", "make it again") from None
-    missing = [name for name in needed if name not in arrays]
-    if missing:
-        raise InputRejected(f"'{path.name}' lacks {', '.join(missing)}", "a whole asset", "make it again")
-    bad = [
-        n for n, a in arrays.items() if a.dtype.kind not in "fiub" or (a.dtype.kind == "f" and not np.isfinite(a).all())
-    ]
-    if bad:
-        raise InputRejected(f"'{path.name}' holds {', '.join(bad)} with no finite numbers", "a whole asset")
-    return arrays

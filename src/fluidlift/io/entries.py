@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import difflib
-import math
 from collections.abc import Iterable, Mapping
+from functools import lru_cache
 from typing import Any
 
 import yaml
@@ -13,6 +13,16 @@ from fluidlift.errors import InputRejected
 
 Path = tuple[Any, ...]
 """keys and indices from the top of the file"""
+
+
+@lru_cache(maxsize=4)
+def composed(text: str) -> yaml.Node | None:
+    """The nodes of a YAML text, with the places where they stand; not to be changed.
+
+    Raises:
+        yaml.YAMLError: broken YAML.
+    """
+    return yaml.compose(text, Loader=yaml.SafeLoader)
 
 
 def line_numbers(text: str) -> dict[Path, int]:
@@ -25,7 +35,9 @@ def line_numbers(text: str) -> dict[Path, int]:
         lines.setdefault(path, node.start_mark.line + 1)
         if isinstance(node, yaml.MappingNode):
             for key, value in node.value:
-                name = (*path, getattr(key, "value", None))
+                if not isinstance(key, yaml.ScalarNode):
+                    continue
+                name = (*path, key.value)
                 lines[name] = key.start_mark.line + 1
                 walk(value, name)
         elif isinstance(node, yaml.SequenceNode):
@@ -33,7 +45,7 @@ def line_numbers(text: str) -> dict[Path, int]:
                 walk(value, (*path, i))
 
     try:
-        walk(yaml.compose(text, Loader=yaml.SafeLoader), ())
+        walk(composed(text), ())
     except (yaml.YAMLError, RecursionError):
         return {}
     return lines
@@ -94,21 +106,42 @@ class Entries:
         needed = f"a number from {low:g} to {high:g} {unit}".strip()
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise self.wrong(name, f"{name} of {self.what} is {value!r}", needed)
-        if not math.isfinite(value) or not low <= value <= high:
-            raise self.wrong(name, f"{name} of {self.what} is {value:g}", needed)
+        if not low <= value <= high:  # a nan fails the comparison
+            raise self.wrong(name, f"{name} of {self.what} is {str(value)[:20]}", needed)
         return float(value)
 
-    def vector(self, name: str, default: tuple[float, ...] | None, *, limit: float, unit: str, size: int = 3) -> tuple:
-        """`size` finite numbers of at most `limit`."""
-        value = self.data.get(name)
+    def vector(
+        self, name: str, default: tuple[float, ...] | None, *, limit: float, unit: str, low: float | None = None,
+        example: str = "[0, 0, 1]",
+    ) -> tuple:  # fmt: skip
+        """Three finite numbers of at most `limit` in size; not below `low` where that is given."""
+        value, least = self.data.get(name), -limit if low is None else low
         if value is None and default is not None:
             return default
-        good = isinstance(value, list) and len(value) == size
-        good = good and all(isinstance(v, int | float) and not isinstance(v, bool) and abs(v) <= limit for v in value)
+        good = isinstance(value, list) and len(value) == 3
+        good = good and all(
+            isinstance(v, int | float) and not isinstance(v, bool) and least <= v <= limit for v in value
+        )
         if not good:  # a nan fails the comparison
-            needed = f"{size} numbers of at most {limit:g} {unit}, such as [0, 0, 1]".replace(" ,", ",")
+            unit = f" {unit}" if unit else ""
+            needed = f"3 numbers from {least:g} to {limit:g}{unit}, such as {example}"
             raise self.wrong(name, f"{name} of {self.what} is {value!r}", needed)
         return tuple(float(v) for v in value)
+
+    def flag(self, name: str, default: bool) -> bool:
+        """true or false."""
+        value = self.data.get(name)
+        if value is None:
+            return default
+        if not isinstance(value, bool):
+            raise self.wrong(name, f"{name} of {self.what} is {value!r}", "true or false")
+        return value
+
+    @property
+    def place(self) -> str:
+        """Where it stands, for later complaints: file and line."""
+        line = self.lines.get(self.path)
+        return self.file if line is None else f"{self.file}, line {line}"
 
     def word(self, name: str, default: str | None, options: Iterable[str]) -> str:
         """One of some words."""

@@ -5,13 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import trimesh
-from PIL import Image
 
 from fluidlift.errors import require
-from fluidlift.io.atomic import atomic_write, write_bytes
-from fluidlift.io.color import linear_from_srgb
-from fluidlift.io.ply import AXES, write_mesh
+from fluidlift.io.atomic import atomic_write
+from fluidlift.io.export_gltf import write_gltf
+from fluidlift.io.ply import write_mesh
 from fluidlift.types import TriangleMesh
 
 __all__ = ["write_glb", "write_mesh", "write_obj"]
@@ -25,34 +23,7 @@ def write_glb(path: Path | str, mesh: TriangleMesh, *, name: str = "terrain") ->
         ValueError: a mesh without faces, which glTF does not allow.
     """
     require(len(mesh.faces) > 0 and len(mesh.vertices) > 0, "an empty mesh", "at least one triangle")
-    body = _textured(mesh) if mesh.texture is not None else _coloured(mesh)
-    scene = trimesh.Scene()
-    scene.add_geometry(body, node_name=name, geom_name=name)
-    # normals are written: without them a viewer has to show every triangle flat
-    return write_bytes(path, scene.export(file_type="glb", include_normals=mesh.texture is not None))
-
-
-def _coloured(mesh: TriangleMesh) -> trimesh.Trimesh:
-    vertices = np.asarray(mesh.vertices, np.float64) @ AXES["y_up"].T
-    colors = None
-    if mesh.colors is not None:
-        linear = np.round(255 * linear_from_srgb(np.asarray(mesh.colors, np.float64))).astype(np.uint8)
-        colors = np.concatenate([linear, np.full((len(linear), 1), 255, np.uint8)], axis=1)
-    return trimesh.Trimesh(vertices, np.asarray(mesh.faces), vertex_colors=colors, process=False)
-
-
-def _textured(mesh: TriangleMesh) -> trimesh.Trimesh:
-    """glTF knows one texture coordinate per vertex: a vertex on a seam is written once for each side."""
-    assert mesh.uv is not None and mesh.texture is not None
-    corners = np.concatenate([mesh.faces.reshape(-1, 1), mesh.uv.reshape(-1, 2)], axis=1, dtype=np.float64)
-    once, number = np.unique(corners, axis=0, return_inverse=True)
-    vertices = np.asarray(mesh.vertices, np.float64)[once[:, 0].astype(np.int64)] @ AXES["y_up"].T
-    uv = once[:, 1:] * (1.0, -1.0) + (0.0, 1.0)  # trimesh counts v from below and turns it over again
-    material = trimesh.visual.material.PBRMaterial(
-        name="terrain", baseColorTexture=Image.fromarray(mesh.texture), metallicFactor=0.0, roughnessFactor=1.0
-    )
-    visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
-    return trimesh.Trimesh(vertices, number.reshape(-1, 3), visual=visual, process=False)
+    return write_gltf(path, meshes={name: mesh})
 
 
 def write_obj(path: Path | str, mesh: TriangleMesh, *, comment: str = "metres, z up") -> Path:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,7 @@ from jaxtyping import Float
 from fluidlift.errors import InputRejected
 from fluidlift.io.entries import Entries
 from fluidlift.io.read_mesh import read_any_mesh
-from fluidlift.numerics.solid_mesh import box_mesh, cylinder_mesh, ellipsoid_mesh
+from fluidlift.numerics.solid_mesh import box_mesh, cylinder_mesh, ellipsoid_mesh, flipped
 from fluidlift.physics.rigid_body import MOTIONS, RigidBody, Trajectory, product, rotation_by
 from fluidlift.types import TriangleMesh
 
@@ -21,14 +23,16 @@ SHAPES = ("sphere", "ellipsoid", "box", "cylinder")
 
 _MOST = 64
 _MOST_KEYS = 10_000
-_FAR = 1e5
+FAR = 1e5
+"""m, of any place and length"""
 _LARGEST_ARC = 2.0
 """rad between two poses of a body that turns steadily"""
 _MOST_POSES = 200_000
 _COMMON = ("name", "shape", "mesh", "position", "rotation", "scale", "motion", "density", "friction", "restitution",
-           "velocity", "angular_velocity", "keyframes")  # fmt: skip
-_SIZES = {
-    "sphere": ("radius",), "ellipsoid": ("size",), "box": ("size",), "cylinder": ("radius", "height"), "mesh": (),
+           "velocity", "angular_velocity", "keyframes", "color")  # fmt: skip
+SIZES = {
+    "sphere": ("radius",), "ellipsoid": ("size",), "box": ("size",), "cylinder": ("radius", "height"),
+    "mesh": ("flip",),
 }  # fmt: skip
 
 
@@ -50,7 +54,7 @@ class Obstacle:
 
     name: str
     mesh: TriangleMesh
-    """m, scaled, around the body's own origin"""
+    """m, scaled, around the body's own origin; with the colours it is drawn in, where it has any"""
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """m, of the body's origin in the world"""
     rotation: Float[np.ndarray, "4"] = field(default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))
@@ -73,7 +77,7 @@ class Obstacle:
     """where it stands in the file, for later complaints"""
 
     def plain(self) -> list[Any]:
-        """What it is, as values that can be compared; not where it stands in the file."""
+        """What it is, as values that can be compared; not its colours, nor where it stands in the file."""
         keys = [x for k in self.keyframes for x in (k.time, k.position, k.rotation)]
         numbers = [self.density, self.friction, self.restitution, self.velocity, self.angular_velocity]
         shape = [np.asarray(self.mesh.vertices), np.asarray(self.mesh.faces)]
@@ -98,7 +102,8 @@ class Obstacle:
                 restitution=self.restitution, friction=self.friction,
             )  # fmt: skip
         except InputRejected as error:
-            raise InputRejected(f"{self.line}: {error.got}", error.needed, error.do) from None
+            do = "write flip: true, which turns it over" if "inside-out" in error.got else error.do
+            raise InputRejected(f"{self.line}: {error.got}", error.needed, do) from None
 
     def _trajectory(self, duration: float) -> Trajectory:
         if self.keyframes:
@@ -148,13 +153,8 @@ def _read(entry: Entries, number: int, meshes: Path) -> Obstacle:
         if "position" in entry.data:
             raise entry.wrong("center", "both center and position", "position")
         entry.data = {("position" if k == "center" else k): v for k, v in entry.data.items()}
-    if entry.given("mesh") == entry.given("shape"):
-        raise entry.wrong(
-            None, "an obstacle with " + ("both shape and mesh" if entry.given("mesh") else "neither shape nor mesh"),
-            "one of them: shape: " + "/".join(SHAPES) + ", or mesh: name of an .obj, .ply or .glb file",
-        )  # fmt: skip
-    kind = "mesh" if entry.given("mesh") else entry.word("shape", None, SHAPES)
-    entry.only((*_COMMON, *_SIZES[kind]))
+    kind = shape_kind(entry, "an obstacle")
+    entry.only((*_COMMON, *SIZES[kind]))
     motion = entry.word("motion", "static", MOTIONS)
     keyframes = _keyframes(entry)
     if keyframes and motion != "animated":
@@ -166,10 +166,10 @@ def _read(entry: Entries, number: int, meshes: Path) -> Obstacle:
         raise entry.wrong(
             "motion", "an animated obstacle that nothing moves", "keyframes, velocity or angular_velocity"
         )
-    position = entry.vector("position", (0.0, 0.0, 0.0), limit=_FAR, unit="m")
+    position = entry.vector("position", (0.0, 0.0, 0.0), limit=FAR, unit="m")
     return Obstacle(
         name=entry.text("name") if entry.given("name") else f"{kind}{number + 1}",
-        mesh=_mesh(entry, kind, meshes),
+        mesh=_painted(entry, shape_mesh(entry, kind, meshes)),
         position=position,
         rotation=rotation_of(entry.vector("rotation", (0.0, 0.0, 0.0), limit=1e6, unit="degrees")),
         motion=motion,
@@ -179,13 +179,27 @@ def _read(entry: Entries, number: int, meshes: Path) -> Obstacle:
         velocity=entry.vector("velocity", (0.0, 0.0, 0.0), limit=1e3, unit="m/s"),
         angular_velocity=entry.vector("angular_velocity", (0.0, 0.0, 0.0), limit=1e4, unit="rad/s"),
         keyframes=keyframes,
-        line=_line(entry),
+        line=entry.place,
     )
 
 
-def _line(entry: Entries) -> str:
-    line = entry.lines.get(entry.path)
-    return entry.file if line is None else f"{entry.file}, line {line}"
+def _painted(entry: Entries, mesh: TriangleMesh) -> TriangleMesh:
+    """In the entry's `color` (sRGB); without one in the colours of its file, if it has any."""
+    if not entry.given("color"):
+        return mesh
+    color = entry.vector("color", None, limit=1.0, low=0.0, unit="", example="[1, 0.8, 0.1]")
+    return TriangleMesh(mesh.vertices, mesh.faces, np.tile(np.array(color, np.float32), (len(mesh.vertices), 1)))
+
+
+def color_mark(obstacles: tuple[Obstacle, ...]) -> dict[str, str]:
+    """What pictures depend on beside a look's own mark: a hash of the colours, or nothing where none has any."""
+    painted = [(o.name, o.mesh.colors) for o in obstacles if o.mesh.colors is not None]
+    if not painted:
+        return {}
+    digest = hashlib.sha256()
+    for name, colors in painted:
+        digest.update(name.encode() + b"\0" + np.ascontiguousarray(colors, np.float32).tobytes())
+    return {"obstacle_colors_sha256": digest.hexdigest()}
 
 
 def _keyframes(entry: Entries) -> tuple[Keyframe, ...]:
@@ -195,7 +209,7 @@ def _keyframes(entry: Entries) -> tuple[Keyframe, ...]:
         time = key.number("time", None, low=0.0, high=1e6, unit="s")
         if keys and time <= keys[-1].time:
             raise key.wrong("time", f"time {time:g} s after {keys[-1].time:g} s", "keyframes in order of time")
-        position = key.vector("position", None, limit=_FAR, unit="m")
+        position = key.vector("position", None, limit=FAR, unit="m")
         keys.append(
             Keyframe(time, position, rotation_of(key.vector("rotation", (0.0, 0.0, 0.0), limit=1e6, unit="degrees")))
         )
@@ -204,43 +218,67 @@ def _keyframes(entry: Entries) -> tuple[Keyframe, ...]:
     return tuple(keys)
 
 
-def _mesh(entry: Entries, kind: str, meshes: Path) -> TriangleMesh:
-    scale = _scale(entry)
+def shape_kind(entry: Entries, what: str) -> str:
+    """Which of `SHAPES` an entry describes, or "mesh"."""
+    if entry.given("mesh") == entry.given("shape"):
+        raise entry.wrong(
+            None, f"{what} with " + ("both shape and mesh" if entry.given("mesh") else "neither shape nor mesh"),
+            "one of them: shape: " + "/".join(SHAPES) + ", or mesh: name of an .obj, .ply or .glb file",
+        )  # fmt: skip
+    return "mesh" if entry.given("mesh") else entry.word("shape", None, SHAPES)
+
+
+def shape_mesh(entry: Entries, kind: str, meshes: Path) -> TriangleMesh:
+    """The mesh of a shape around its own origin, m, scaled."""
+    scale = scale_of(entry)
     if kind == "mesh":
-        mesh = _mesh_file(entry, meshes)
+        mesh = mesh_file(entry, meshes)
     elif kind in ("box", "ellipsoid"):
-        size = entry.vector("size", None, limit=_FAR, unit="m")
+        size = entry.vector("size", None, limit=FAR, unit="m", low=0.0, example="[0.2, 0.2, 0.1]")
         if min(size) <= 0:
             raise entry.wrong("size", f"size of {entry.what} is {list(size)}", "three positive lengths, m")
         mesh = box_mesh(np.array(size)) if kind == "box" else ellipsoid_mesh(0.5 * np.array(size))
     else:
-        radius = entry.number("radius", None, low=1e-6, high=_FAR, unit="m")
+        radius = entry.number("radius", None, low=1e-6, high=FAR, unit="m")
         if kind == "sphere":
             mesh = ellipsoid_mesh(np.full(3, radius))
         else:
-            mesh = cylinder_mesh(radius, entry.number("height", None, low=1e-6, high=_FAR, unit="m"))
-    return TriangleMesh(np.asarray(mesh.vertices, np.float64) * scale, mesh.faces)
+            mesh = cylinder_mesh(radius, entry.number("height", None, low=1e-6, high=FAR, unit="m"))
+    return TriangleMesh(np.asarray(mesh.vertices, np.float64) * scale, mesh.faces, mesh.colors)
 
 
-def _scale(entry: Entries) -> np.ndarray:
+def scale_of(entry: Entries, *, low: float = 1e-6, high: float = 1e6) -> np.ndarray:
+    """The entry `scale`: one positive factor or three, each within low..high."""
     value: Any = entry.data.get("scale")
-    if isinstance(value, list):
-        scale = entry.vector("scale", None, limit=1e6, unit="")
-    else:
-        scale = (entry.number("scale", 1.0, low=1e-6, high=1e6, unit=""),) * 3
-    if min(scale) <= 0 or not math.isfinite(sum(scale)):
-        raise entry.wrong("scale", f"scale {list(scale)}", "positive factors (a mirror would turn it inside out)")
+    if not isinstance(value, list):
+        return np.full(3, entry.number("scale", 1.0, low=low, high=high, unit=""))
+    scale = entry.vector("scale", None, limit=high, unit="", example="[1, 1, 1.5]")
+    if min(scale) < low:
+        needed = f"factors from {low:g} to {high:g} (a mirror would turn it inside out)"
+        raise entry.wrong("scale", f"scale {list(scale)}", needed)
     return np.array(scale)
 
 
-def _mesh_file(entry: Entries, meshes: Path) -> TriangleMesh:
-    """A mesh whose file lies in the folder `meshes`, by a relative name without `..` and links."""
+@lru_cache(maxsize=8)
+def _read_once(path: Path, changed: int, size: int) -> TriangleMesh:
+    """A mesh file while it stays as it is: a scene is read again after every edit, its meshes need not be."""
+    return read_any_mesh(path)
+
+
+def mesh_file(entry: Entries, meshes: Path) -> TriangleMesh:
+    """The mesh of the entry `mesh`, whose file lies in the folder `meshes`, by a relative name without `..` and links.
+
+    It is turned inside out where the entry says `flip: true`.
+    """
     from fluidlift.io.asset_folder import asset_file
 
     name = entry.text("mesh")
     try:
-        return read_any_mesh(asset_file(meshes, name))
+        path = asset_file(meshes, name)
+        facts = path.stat() if path.is_file() else None
+        mesh = read_any_mesh(path) if facts is None else _read_once(path, facts.st_mtime_ns, facts.st_size)
     except InputRejected as error:
         outside = "names inside its own folder" in error.needed
         do = "copy it into the asset, or give its folder with --meshes" if outside else error.do
         raise entry.wrong("mesh", error.got, error.needed, do) from None
+    return flipped(mesh) if entry.flag("flip", False) else mesh

@@ -24,10 +24,10 @@ _JSON, _BINARY = 0x4E4F534A, 0x004E4942
 
 
 def read_any_mesh(path: Path | str) -> TriangleMesh:
-    """A mesh in metres with z up, without colours.
+    """A mesh in metres with z up, with the vertex colours (sRGB) of an OBJ or PLY that has them.
 
     OBJ and PLY are taken as they are (metres, z up); glTF is y up by definition and is turned. Polygons of an OBJ
-    become fans of triangles. Materials, normals and texture coordinates are left out.
+    become fans of triangles. Materials, normals, texture coordinates and colours of a glTF are left out.
 
     Raises:
         InputRejected: no such file, another format, larger than 256 MB, damaged, without triangles, or with what this
@@ -55,12 +55,16 @@ def read_any_mesh(path: Path | str) -> TriangleMesh:
 
 def _read_ply(path: Path) -> TriangleMesh:
     mesh = read_mesh(path)
-    return TriangleMesh(mesh.vertices.astype(np.float64), mesh.faces)
+    return TriangleMesh(mesh.vertices.astype(np.float64), mesh.faces, mesh.colors)
 
 
 def _read_obj(path: Path) -> TriangleMesh:
-    """`v` and `f` lines; `f` counts from 1, or backwards from the last vertex where it is negative."""
+    """`v` and `f` lines; `f` counts from 1, or backwards from the last vertex where it is negative.
+
+    A vertex may be followed by its colour: three more numbers from 0 to 1. Taken where all of them have one.
+    """
     vertices: list[list[float]] = []
+    colors: list[list[float]] = []
     faces: list[tuple[int, int, int]] = []
     with path.open("r", encoding="utf-8", errors="replace") as file:
         for number, line in enumerate(file, start=1):
@@ -72,6 +76,8 @@ def _read_obj(path: Path) -> TriangleMesh:
                     vertices.append([float(w) for w in words[1:4]])
                     if len(vertices[-1]) != 3:
                         raise ValueError("a vertex of fewer than three numbers")
+                    if len(words) == 7:
+                        colors.append([float(w) for w in words[4:7]])
                 elif words[0] == "f":
                     corner = [_obj_index(w, len(vertices)) for w in words[1:]]
                     if len(corner) < 3:
@@ -79,7 +85,10 @@ def _read_obj(path: Path) -> TriangleMesh:
                     faces += [(corner[0], corner[i], corner[i + 1]) for i in range(1, len(corner) - 1)]
             except ValueError as error:
                 raise ValueError(f"line {number}: {error}") from None
-    return TriangleMesh(np.array(vertices, np.float64).reshape(-1, 3), np.array(faces, np.int64).reshape(-1, 3))
+    places, triangles = np.array(vertices, np.float64).reshape(-1, 3), np.array(faces, np.int64).reshape(-1, 3)
+    painted = np.array(colors, np.float32).reshape(-1, 3)
+    whole = len(painted) == len(places) > 0 and bool(((painted >= 0) & (painted <= 1)).all())
+    return TriangleMesh(places, triangles, painted if whole else None)
 
 
 def _obj_index(word: str, count: int) -> int:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+import copy
+from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,12 @@ from fluidlift.errors import InputRejected
 from fluidlift.io.entries import Entries, line_numbers
 from fluidlift.io.limits import require_file, require_size
 from fluidlift.io.obstacles import Obstacle, read_obstacles
-from fluidlift.types import FluidParameters
+from fluidlift.io.scene_emitters import read_emitters, read_inflow
+from fluidlift.io.scene_look import Look, read_look
+from fluidlift.io.scene_terrain import read_terrain
+from fluidlift.physics.emitter import Emitter
+from fluidlift.physics.inflow_schedule import InflowSchedule
+from fluidlift.physics.terrain_edit import TerrainEdit
 
 SCENE_TEMPLATE = """\
 # What to change when this fluid is simulated again. SI units, z up. Remove a '#' to use a line.
@@ -30,18 +37,60 @@ obstacles: []
 #  - {shape: box, position: [0, 0, 1], size: [0.2, 0.2, 0.1], motion: free, density: 400}  # kg/m^3; floats
 
 emitters: []
+#  - {shape: cylinder, radius: 0.05, height: 0.02, position: [0, 0, 1], velocity: [0, 0, -1], end: 2.5}  # m, m/s, s
+
 terrain: []
+#  - {move: [0, 0, 0.1]}    # m
+#  - {twist: 20}            # degrees per metre along the stream; also rotate (degrees), scale, mesh (a file)
+
+inflow: {}
+#  factor: 1.5              # times the inflow's velocity
+#  fluctuation: 0.1         # share by which it comes and goes; with period: 1.0, in s
+
 look: {}
+#  style: surface           # splats, relit, transparent or surface
+#  material: honey          # source, water, muddy_water, honey, lava, milk, oil or chocolate
+#  environment: sky         # sky, studio, white, or an .hdr or .exr file in this folder
 
 # duration: 4.0   # s
 # extend_downstream: 2.0   # m by which the channel of a stream or a fall goes on
+# loop: true   # the last frame leads into the first
 """
 
+PARAMETERS = {
+    "density": (1e-3, 1e6, "kg/m^3"),
+    "kinematic_viscosity": (0.0, 1e6, "m^2/s"),
+    "surface_tension": (0.0, 10.0, "N/m"),
+    "gravity": (-1e3, 1e3, "m/s^2"),
+    "inflow_velocity": (-1e3, 1e3, "m/s"),
+    "inflow_fluctuation": (0.0, 1e3, "m/s"),
+    "outflow_velocity": (-1e3, 1e3, "m/s"),
+    "restitution": (0.0, 1.0, ""),
+    "wall_damping": (0.0, 1.0, ""),
+    "time_step": (1e-9, 1e3, "s"),
+}
+"""least, most and unit of what can stand under `parameters`; vectors: of each component"""
+VECTORS = ("gravity", "inflow_velocity")
+
 _MAX_BYTES = 2**20
+_BROKEN = (yaml.YAMLError, RecursionError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError)
+"""what PyYAML raises for text that is no YAML; the last five for odd scalars, such as a date in month 13"""
 
 
 class _PlainLoader(yaml.SafeLoader):
-    """YAML without aliases: a few lines of nested ones can describe more data than any machine holds."""
+    """YAML without aliases: a few lines of nested ones can describe more data than any machine holds.
+
+    A name that is there twice is an error: of two values, one would be ignored in silence.
+    """
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+        seen: set[str] = set()
+        for key, _ in getattr(node, "value", ()):
+            if isinstance(key, yaml.ScalarNode):
+                if key.value in seen:
+                    raise yaml.constructor.ConstructorError(None, None, f"'{key.value}' twice", key.start_mark)
+                seen.add(key.value)
+        return super().construct_mapping(node, deep=deep)
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         if self.check_event(yaml.AliasEvent):
@@ -55,15 +104,15 @@ def parse_yaml(text: str) -> Any:
     Raises:
         yaml.YAMLError: broken YAML or an alias.
     """
-    return _numbers(yaml.load(text, Loader=_PlainLoader))
+    return as_numbers(yaml.load(text, Loader=_PlainLoader))
 
 
-def _numbers(data: Any) -> Any:
-    """YAML 1.1 takes 1e-6 for a word, because it has no point."""
+def as_numbers(data: Any) -> Any:
+    """The same data with `1e-6` as a number: YAML 1.1 takes it for a word, because it has no point."""
     if isinstance(data, dict):
-        return {k: _numbers(v) for k, v in data.items()}
+        return {k: as_numbers(v) for k, v in data.items()}
     if isinstance(data, list):
-        return [_numbers(v) for v in data]
+        return [as_numbers(v) for v in data]
     if isinstance(data, str) and data[:1] in "+-.0123456789" and "e" in data.lower():
         try:
             return float(data)
@@ -83,10 +132,16 @@ class SceneEdits:
     extend_downstream: float = 0.0
     """m"""
     obstacles: tuple[Obstacle, ...] = ()
+    emitters: tuple[Emitter, ...] = ()
+    terrain: tuple[TerrainEdit, ...] = ()
+    """in the order in which they are done"""
+    inflow: InflowSchedule = field(default_factory=InflowSchedule)
+    look: Look = field(default_factory=Look)
+    loop: bool = False
+    """the last frame leads into the first"""
 
 
-SIMULATED = ("parameters", "obstacles", "duration", "extend_downstream")
-_NOT_YET = ("emitters", "terrain", "look")
+SECTIONS = ("parameters", "obstacles", "emitters", "terrain", "inflow", "look", "duration", "extend_downstream", "loop")
 
 
 def read_edits(folder: Path | str, *, meshes: Path | None = None) -> SceneEdits:
@@ -94,65 +149,96 @@ def read_edits(folder: Path | str, *, meshes: Path | None = None) -> SceneEdits:
 
     Args:
         folder: of the asset.
-        meshes: folder of the obstacles' mesh files; None: the asset.
+        meshes: folder of the mesh files of obstacles, emitters and terrain; None: the asset.
 
     Raises:
-        InputRejected: as `read_scene`, and entries that are unknown, out of range, or beyond what this version
-            simulates (nothing is ignored in silence); the message names the line and the nearest valid name.
+        InputRejected: as `read_scene`, and entries that are unknown or out of range (nothing is ignored in silence);
+            the message names the line and the nearest valid name.
     """
-    text = _scene_text(Path(folder))
-    scene = Entries(_plain_scene(text), "the scene", file="scene.yaml", lines=line_numbers(text))
-    scene.only((*SIMULATED, *_NOT_YET))
-    for name in _NOT_YET:
-        if scene.data.get(name) not in (None, {}, [], ""):
-            raise scene.wrong(
-                name,
-                f"{name}, which this version cannot simulate",
-                ", ".join(SIMULATED),
-                "remove the entry, or empty it",
-            )
-    changes = scene.part("parameters", "parameters")
-    changes.only(asdict(FluidParameters()))
-    duration = scene.number("duration", None, low=1e-6, high=1e9, unit="s") if scene.given("duration") else None
-    try:
-        FluidParameters().updated(changes.data)
-    except InputRejected as error:
-        raise scene.wrong("parameters", error.got, error.needed, error.do) from None
+    return edits_of(scene_text(folder), folder, meshes=meshes)
+
+
+def edits_of(text: str, folder: Path | str, *, meshes: Path | None = None) -> SceneEdits:
+    """What a text changes, were it the scene.yaml of an asset.
+
+    Raises:
+        InputRejected: as `read_edits`.
+    """
+    scene = Entries(plain_scene(text), "the scene", file="scene.yaml", lines=line_numbers(text))
+    scene.only(SECTIONS)
+    place = Path(folder) if meshes is None else meshes
     return SceneEdits(
-        changes.data,
-        duration,
+        _parameters(scene.part("parameters", "parameters")),
+        scene.number("duration", None, low=1e-6, high=1e9, unit="s") if scene.given("duration") else None,
         scene.number("extend_downstream", 0.0, low=0.0, high=1e6, unit="m"),
-        read_obstacles(scene, Path(folder) if meshes is None else meshes),
+        read_obstacles(scene, place),
+        read_emitters(scene, place),
+        read_terrain(scene, place),
+        read_inflow(scene),
+        read_look(scene, Path(folder)),
+        scene.flag("loop", False),
     )
 
 
+def _parameters(changes: Entries) -> dict[str, Any]:
+    """Those that are given: numbers, and tuples of three."""
+    changes.only(PARAMETERS)
+    found: dict[str, Any] = {}
+    for name in changes.data:
+        low, high, unit = PARAMETERS[name]
+        if name in VECTORS:
+            found[name] = changes.vector(name, None, limit=high, unit=unit)
+        else:
+            found[name] = changes.number(name, None, low=low, high=high, unit=unit)
+    return found
+
+
 def read_scene(folder: Path | str) -> dict[str, Any]:
-    """The content of an asset's scene.yaml; empty where there is no such file.
+    """The content of an asset's scene.yaml; "" where there is no such file.
 
     Raises:
         InputRejected: a link, a file of more than a megabyte, or broken YAML.
     """
-    return _plain_scene(_scene_text(Path(folder)))
+    return plain_scene(scene_text(folder))
 
 
-def _scene_text(folder: Path) -> str:
-    path = folder / "scene.yaml"
+def scene_text(folder: Path | str) -> str:
+    """The text of an asset's scene.yaml, its line ends as they are; "" where there is no such file.
+
+    Raises:
+        InputRejected: a link, a file of more than a megabyte, or one that is no text.
+    """
+    path = Path(folder) / "scene.yaml"
     if path.is_symlink():
         raise InputRejected("scene.yaml is a link", "a plain file", "do not trust this asset")
-    if not path.exists():
+    if not path.exists() or (path.is_file() and path.stat().st_size == 0):
         return ""
     require_size(require_file(path, "scene file"), _MAX_BYTES, "scene file")
     try:
-        return path.read_text(encoding="utf-8")
+        return path.read_bytes().decode("utf-8")
     except UnicodeDecodeError as error:
         raise InputRejected(f"scene.yaml is not text ({error})", "UTF-8") from None
 
 
-def _plain_scene(text: str) -> dict[str, Any]:
+@lru_cache(maxsize=4)
+def _parsed(text: str) -> Any:
+    """`parse_yaml`, once for each of the last texts: an edit looks at the same one many times."""
+    return parse_yaml(text)
+
+
+def plain_scene(text: str) -> dict[str, Any]:
+    """The sections of a scene.yaml's text, not checked.
+
+    Raises:
+        InputRejected: broken YAML, or no sections.
+    """
     try:
-        data = parse_yaml(text)
-    except (yaml.YAMLError, RecursionError) as error:
-        raise InputRejected(f"scene.yaml is not valid YAML ({' '.join(str(error).split())})", "YAML") from None
+        data = copy.deepcopy(_parsed(text))
+    except _BROKEN as error:
+        mark = getattr(error, "problem_mark", None)
+        place = "scene.yaml" if mark is None else f"scene.yaml, line {mark.line + 1}"
+        why = getattr(error, "problem", None) or error
+        raise InputRejected(f"{place}: not valid YAML ({' '.join(str(why).split())[:200]})", "YAML") from None
     if data is None:
         return {}
     if not isinstance(data, dict):

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import importlib.util
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
-import numpy as np
-from pxr import Sdf, Tf, Usd, UsdGeom, UsdUtils, UsdValidation, UsdVol
+from pxr import Sdf, Tf, Usd, UsdGeom, UsdUtils, UsdValidation
 
+from fluidlift.errors import MissingPackage
 from fluidlift.io.limits import require_file
+from fluidlift.io.usd_checks import prim_faults
 
 
 def validate_usd(path: Path | str) -> list[str]:
     """Faults of a USD file, one line each; an empty list means none.
 
-    Besides OpenUSD's own validators: asset paths must stay inside the folder of the file, and at every time code the
-    arrays of splats, points and meshes must have matching lengths and values in their ranges.
+    Besides OpenUSD's own validators: asset paths must stay inside the folder of the file, the stage must say its axes,
+    units, rate and frames, and at every time code the arrays of splats, points and meshes must have matching lengths
+    and values in their ranges, with ids that stay with their particles.
 
     Raises:
         InputRejected: no such file.
@@ -25,21 +30,66 @@ def validate_usd(path: Path | str) -> list[str]:
     except Tf.ErrorException as error:
         return [f"cannot be opened: {' '.join(str(error).split())}"]
     faults = _foreign_paths(path)
-    context = UsdValidation.ValidationContext(UsdValidation.ValidationRegistry().GetOrLoadAllValidators())
-    for error in context.Validate(stage):
+    with _quiet():
+        context = UsdValidation.ValidationContext(UsdValidation.ValidationRegistry().GetOrLoadAllValidators())
+        errors = context.Validate(stage)
+    for error in errors:
         sites = ", ".join(str(s.GetPrim().GetPath()) for s in error.GetSites() if s.IsPrim())
         faults.append(f"{error.GetName()}: {error.GetMessage()} {sites}".strip())
-    if not stage.GetDefaultPrim():
-        faults.append("no default prim")
+    faults += _stage_faults(stage)
+    codes = range(int(stage.GetStartTimeCode()), int(stage.GetEndTimeCode()) + 1)
     for prim in stage.Traverse():
-        faults += _check_prim(prim)
+        faults += prim_faults(prim, codes)
     return faults
+
+
+def splat_rule_faults(path: Path | str) -> list[str]:
+    """What NVIDIA's rule for splats (VG.035) says of a file, one line each. It looks at the default values.
+
+    Raises:
+        InputRejected: no such file.
+        MissingPackage: usd-validation-nvidia is not installed.
+    """
+    path = require_file(path, "USD file")
+    if not has_splat_rule():
+        raise MissingPackage("NVIDIA's splat rule needs usd-validation-nvidia: pip install usd-validation-nvidia")
+    from usd_validation_nvidia import ValidationEngine
+    from usd_validation_nvidia.rules import GaussianSplatSchemaChecker
+
+    engine = ValidationEngine(init_rules=False)
+    engine.enable_rule(GaussianSplatSchemaChecker)  # it is registered as one to skip, so only code can ask for it
+    with _quiet():
+        issues = list(engine.validate(str(path)).issues())
+    return list(dict.fromkeys(str(issue.message) for issue in issues))  # each is told once per variant of the file
+
+
+def has_splat_rule() -> bool:
+    """Whether `splat_rule_faults` can be asked."""
+    return importlib.util.find_spec("usd_validation_nvidia") is not None
+
+
+def frame_range(path: Path | str) -> tuple[int, int]:
+    """First and last time code of a USD file."""
+    layer = Sdf.Layer.FindOrOpen(str(path))
+    return int(layer.startTimeCode), int(layer.endTimeCode)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Without OpenUSD's warnings on stderr: it takes the template of value clips for a file that is missing. Clips
+    that are missing are told by `_missing_clips`."""
+    heard = UsdUtils.CoalescingDiagnosticDelegate()
+    try:
+        yield
+    finally:
+        heard.TakeUncoalescedDiagnostics()
 
 
 def _foreign_paths(path: Path) -> list[str]:
     """Dependencies that are absolute, missing, or outside the folder."""
     folder = path.resolve().parent
-    layers, assets, unresolved = UsdUtils.ComputeAllDependencies(str(path))
+    with _quiet():
+        layers, assets, unresolved = UsdUtils.ComputeAllDependencies(str(path))
     faults = [f"missing file: {name}" for name in unresolved]
     for name in [layer.realPath for layer in layers] + list(assets):
         if folder not in Path(name).resolve().parents:
@@ -51,107 +101,34 @@ def _foreign_paths(path: Path) -> list[str]:
     return faults
 
 
-def _check_prim(prim: Usd.Prim) -> list[str]:
-    checks = (
-        (UsdVol.ParticleField3DGaussianSplat, _splat_faults),
-        (UsdGeom.Points, _points_faults),
-        (UsdGeom.Mesh, _mesh_faults),
-    )
-    for schema, check in checks:
-        if prim.IsA(schema):
-            codes = sorted({t for a in prim.GetAttributes() for t in a.GetTimeSamples()})
-            times = [Usd.TimeCode.Default(), *map(Usd.TimeCode, codes)]
-            return [f"{prim.GetPath()} at {time}: {fault}" for time in times for fault in check(prim, time)]
-    return []
+def _stage_faults(stage: Usd.Stage) -> list[str]:
+    """What a stage must say of itself."""
+    faults = [] if stage.GetDefaultPrim() else ["no default prim"]
+    if not UsdGeom.StageHasAuthoredMetersPerUnit(stage):
+        faults.append("no metersPerUnit: readers take centimetres")
+    if not stage.HasAuthoredMetadata(UsdGeom.Tokens.upAxis):
+        faults.append("no upAxis: readers take y")
+    if not stage.HasAuthoredTimeCodeRange():
+        faults.append("no startTimeCode and endTimeCode")
+    elif stage.GetStartTimeCode() > stage.GetEndTimeCode():
+        faults.append("an endTimeCode before the startTimeCode")
+    if not stage.GetTimeCodesPerSecond() > 0:
+        faults.append("no positive timeCodesPerSecond")
+    return faults + _missing_clips(stage)
 
 
-def _array(prim: Usd.Prim, time: Usd.TimeCode, *names: str) -> np.ndarray | None:
-    """The first attribute of these names that has a value."""
-    for name in names:
-        attribute = prim.GetAttribute(name)
-        if attribute and (value := attribute.Get(time)) is not None:
-            return np.asarray(value)
-    return None
-
-
-def _splat_faults(prim: Usd.Prim, time: Usd.TimeCode) -> list[str]:
-    positions = _array(prim, time, "positions", "positionsh")
-    if positions is None:
-        return ["no positions"]
-    n, faults = len(positions), []
-    degree = prim.GetAttribute("radiance:sphericalHarmonicsDegree").Get(time)
-    per_splat = (int(degree) + 1) ** 2
-    harmonics = "radiance:sphericalHarmonicsCoefficients"
-    arrays = {
-        "scales": (_array(prim, time, "scales", "scalesh"), n),
-        "orientations": (_array(prim, time, "orientations", "orientationsh"), n),
-        "opacities": (_array(prim, time, "opacities", "opacitiesh"), n),
-        "harmonics": (_array(prim, time, harmonics, harmonics + "h"), n * per_splat),
-    }
-    for name, (values, length) in arrays.items():
-        if values is None:
-            faults.append(f"no {name}")
-        elif len(values) != length:
-            faults.append(f"{len(values)} {name} for {n} splats, not {length}")
-        elif not np.isfinite(values.astype(np.float32)).all():
-            faults.append(f"{name} that are not finite")
-    if faults or n == 0:
-        return faults
-    if not np.isfinite(positions).all():
-        faults.append("positions that are not finite")
-    if arrays["scales"][0].min() < 0:
-        faults.append("negative scales")
-    opacities = arrays["opacities"][0]
-    if opacities.min() < 0 or opacities.max() > 1:
-        faults.append("opacities outside 0 to 1")
-    norms = np.linalg.norm(arrays["orientations"][0].astype(np.float32), axis=-1)
-    if np.abs(norms - 1).max() > 5e-3:  # half precision rounds each part by up to 2.5e-4
-        faults.append("orientations that are not unit quaternions")
-    return faults + _extent_faults(prim, time, positions)
-
-
-def _extent_faults(prim: Usd.Prim, time: Usd.TimeCode, positions: np.ndarray) -> list[str]:
-    extent = _array(prim, time, "extent")
-    if extent is None or extent.shape != (2, 3):
-        return ["no extent"]
-    room = 1e-5 * max(1.0, float(np.abs(positions).max()))
-    inside = (positions >= extent[0] - room).all() and (positions <= extent[1] + room).all()
-    return [] if inside else ["positions outside the extent"]
-
-
-def _points_faults(prim: Usd.Prim, time: Usd.TimeCode) -> list[str]:
-    points = _array(prim, time, "points")
-    if points is None:
-        return ["no points"]
+def _missing_clips(stage: Usd.Stage) -> list[str]:
+    """Frames whose clip is not there: the stage would hold the one before, and say nothing."""
     faults = []
-    for name in ("widths", "ids", "velocities", "primvars:displayColor"):
-        values = _array(prim, time, name)
-        if values is not None and len(values) != len(points):
-            faults.append(f"{len(values)} {name} for {len(points)} points")
-    ids = _array(prim, time, "ids")
-    if ids is not None and len(np.unique(ids)) != len(ids):
-        faults.append("ids that occur twice")
-    return faults + (_extent_faults(prim, time, points) if len(points) else [])
-
-
-def _mesh_faults(prim: Usd.Prim, time: Usd.TimeCode) -> list[str]:
-    points, counts = _array(prim, time, "points"), _array(prim, time, "faceVertexCounts")
-    indices = _array(prim, time, "faceVertexIndices")
-    if points is None or counts is None or indices is None:
-        return ["a mesh without points or faces"]
-    faults = []
-    if counts.sum() != len(indices):
-        faults.append("face counts that do not match the indices")
-    if len(indices) and (indices.min() < 0 or indices.max() >= len(points)):
-        faults.append("indices that name no point")
-    for name in ("velocities", "primvars:displayColor"):
-        values = _array(prim, time, name)
-        if values is not None and len(values) not in (1, len(points)):
-            faults.append(f"{len(values)} {name} for {len(points)} points")
+    for prim in stage.Traverse():
+        for name, info in (Usd.ClipsAPI(prim).GetClips() or {}).items():
+            template, spec = info.get("templateAssetPath", ""), prim.GetPrimStack()[0]
+            start, end, step = (info.get(f"template{k}", 1.0) for k in ("StartTime", "EndTime", "Stride"))
+            width = template.count("#")
+            if not width or not step > 0 or not 0 <= (end - start) / step < 1e6:
+                continue
+            for k in range(round((end - start) / step) + 1):
+                file = template.replace("#" * width, f"{round(start + k * step):0{width}d}")
+                if not Path(spec.layer.ComputeAbsolutePath(file)).is_file():
+                    faults.append(f"missing clip of '{name}': {file}")
     return faults
-
-
-def frame_range(path: Path | str) -> tuple[int, int]:
-    """First and last time code of a USD file."""
-    layer = Sdf.Layer.FindOrOpen(str(path))
-    return int(layer.startTimeCode), int(layer.endTimeCode)

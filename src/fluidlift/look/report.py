@@ -12,23 +12,35 @@ import numpy as np
 from jaxtyping import UInt8
 
 _STYLE = """
-body{font:15px/1.5 system-ui,sans-serif;margin:0 auto;max-width:1080px;padding:24px;color:#1c2733;background:#fbfcfd}
-h1{font-size:26px;margin:0 0 4px}h2{font-size:19px;margin:32px 0 8px;border-bottom:1px solid #d5dde5;padding-bottom:4px}
-figure{display:inline-block;margin:0 12px 14px 0;vertical-align:top}img,video{max-width:100%;border-radius:4px}
-figcaption{color:#526272;font-size:13px;max-width:520px}table{border-collapse:collapse;margin:8px 0}
-td,th{padding:4px 12px 4px 0;text-align:left;border-bottom:1px solid #e6ebf0;font-variant-numeric:tabular-nums}
-.warn{background:#fff4d6;border-left:4px solid #e0a100;padding:8px 12px;margin:6px 0}
-.ok{background:#e5f5ea;border-left:4px solid #2e9e5b;padding:8px 12px;margin:6px 0}
-.sub{color:#526272;margin:0 0 12px}
+:root{color-scheme:light dark;--ink:#1c2733;--soft:#526272;--paper:#fbfcfd;--card:#fff;--line:#d9e1e8;--link:#0b62a8;
+--warn:#fff4d6;--warn-edge:#e0a100;--ok:#e5f5ea;--ok-edge:#2e9e5b}
+@media(prefers-color-scheme:dark){:root{--ink:#dfe6ed;--soft:#98a6b5;--paper:#14191f;--card:#1b222a;--line:#313c48;
+--link:#74b6ee;--warn:#3b2f0c;--warn-edge:#d9a514;--ok:#12301f;--ok-edge:#3fb171}}
+body{font:15px/1.55 system-ui,sans-serif;margin:0 auto;max-width:1120px;padding:24px;color:var(--ink);
+background:var(--paper)}a{color:var(--link)}
+h1{font-size:27px;margin:0 0 4px}h2{font-size:19px;margin:36px 0 10px;border-bottom:1px solid var(--line);
+padding-bottom:4px}
+.figures{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(100%,320px),1fr));gap:16px;margin:12px 0}
+figure{margin:0;background:var(--card);border:1px solid var(--line);border-radius:8px;overflow:hidden}
+figure img{display:block;width:100%;height:auto;image-rendering:auto}
+figcaption{padding:8px 12px 10px;font-size:13.5px}figcaption .good{color:var(--soft);display:block;margin-top:2px}
+video{width:100%;border-radius:8px;background:#000}
+.table{overflow-x:auto}table{border-collapse:collapse;margin:8px 0}
+td,th{padding:4px 14px 4px 0;text-align:left;border-bottom:1px solid var(--line);font-variant-numeric:tabular-nums}
+.warn{background:var(--warn);border-left:4px solid var(--warn-edge);padding:8px 12px;margin:6px 0}
+.ok{background:var(--ok);border-left:4px solid var(--ok-edge);padding:8px 12px;margin:6px 0}
+.sub{color:var(--soft);margin:0 0 12px}
 """
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A picture with a sentence below it."""
+    """A picture with what it shows below it."""
 
     picture: UInt8[np.ndarray, "h w 3"]
     text: str
+    good: str = ""
+    """what it looks like where all is well"""
 
 
 @dataclass(frozen=True)
@@ -43,7 +55,13 @@ class Section:
 
 
 def report_html(
-    title: str, subtitle: str, sections: Sequence[Section], *, warnings: Sequence[str], links: Mapping[str, str]
+    title: str,
+    subtitle: str,
+    sections: Sequence[Section],
+    *,
+    warnings: Sequence[str],
+    links: Mapping[str, str],
+    film: bytes = b"",
 ) -> str:
     """A self-contained page: pictures are inside it, nothing is loaded from elsewhere.
 
@@ -53,6 +71,7 @@ def report_html(
         sections: in order.
         warnings: what the user should know, shown first.
         links: text to relative path of files beside the report.
+        film: an MP4 file that is shown first; empty: none.
     """
     parts = [
         "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content='width=device-width'>",
@@ -65,19 +84,23 @@ def report_html(
         parts.append("<div class=ok>No warnings.</div>")
     anchors = " · ".join(f"<a href='{html.escape(path)}'>{html.escape(text)}</a>" for text, path in links.items())
     parts.append(f"<p>{anchors}</p>")
+    if film:
+        source = "data:video/mp4;base64," + base64.b64encode(film).decode()
+        parts.append(f"<video controls loop muted autoplay playsinline src='{source}'></video>")
     for section in sections:
         parts.append(f"<h2>{html.escape(section.title)}</h2>")
         parts += [f"<p>{html.escape(note)}</p>" for note in section.notes]
         if section.rows:
             parts.append(_table(section.header, section.rows))
-        parts += [_figure(figure) for figure in section.figures]
+        if section.figures:
+            parts.append("<div class=figures>" + "".join(_figure(figure) for figure in section.figures) + "</div>")
     return "\n".join(parts) + "</html>\n"
 
 
 def _table(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
     head = "<tr>" + "".join(f"<th>{html.escape(str(c))}</th>" for c in header) + "</tr>" if header else ""
     body = "".join("<tr>" + "".join(f"<td>{html.escape(_text(c))}</td>" for c in row) + "</tr>" for row in rows)
-    return f"<table>{head}{body}</table>"
+    return f"<div class=table><table>{head}{body}</table></div>"
 
 
 def _text(value: Any) -> str:
@@ -91,7 +114,9 @@ def _text(value: Any) -> str:
 def _figure(figure: Figure) -> str:
     data = base64.b64encode(png_bytes(figure.picture)).decode()
     alt = html.escape(figure.text)
-    return f"<figure><img alt='{alt}' src='data:image/png;base64,{data}'><figcaption>{alt}</figcaption></figure>"
+    good = f"<span class=good>Good: {html.escape(figure.good)}.</span>" if figure.good else ""
+    picture = f"<img alt='{alt}' src='data:image/png;base64,{data}'>"
+    return f"<figure>{picture}<figcaption>{alt}.{good}</figcaption></figure>"
 
 
 def png_bytes(picture: UInt8[np.ndarray, "h w 3"]) -> bytes:

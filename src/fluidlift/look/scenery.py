@@ -67,7 +67,7 @@ def _textured_surfels(mesh: TriangleMesh, opacity: float, most: int) -> Gaussian
     a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
     cross = np.cross(b - a, c - a)
     area = 0.5 * np.linalg.norm(cross, axis=1)
-    seen = cross[:, 2] > -0.6 * area
+    seen = cross[:, 2] > -1.4 * area  # steeper than 45 degrees from below: the floor, which nobody looks at
     spacing = math.sqrt(2.0 * float(area[seen].sum()) / most)
     while float(np.square(_parts((a, b, c), spacing))[seen].sum()) > most and spacing < np.ptp(mesh.vertices):
         spacing *= 1.1  # faces are cut into whole numbers of parts
@@ -112,7 +112,7 @@ def mesh_surfels(
     Args:
         mesh: any triangles; a large one gets many surfels.
         spacing: m.
-        color: sRGB.
+        color: sRGB, of a mesh without colours of its own.
         most: surfels, about.
     """
     a, b, c = (np.asarray(mesh.vertices, np.float64)[mesh.faces[:, k]] for k in range(3))
@@ -123,7 +123,10 @@ def mesh_surfels(
     share = np.stack([1 - at.s - at.t, at.s, at.t], -1)[..., None]
     where = (np.stack([a, b, c], 1)[at.face] * share).sum(axis=1)
     normals = 0.5 * cross[at.face] / area[at.face, None]
-    return _surfels(where, normals, at.size, np.array([color] * len(where)), 0.98)
+    painted = np.array([color] * len(where))
+    if mesh.colors is not None:
+        painted = (np.asarray(mesh.colors, np.float64)[mesh.faces[at.face]] * share).sum(axis=1)
+    return _surfels(where, normals, at.size, painted, 0.98)
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,8 @@ import numpy as np
 from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.physics import transfer
 from fluidlift.physics.crowding import fill_ratio, spreading
-from fluidlift.physics.liquid_grid import LiquidGrid
+from fluidlift.physics.emitter import Supply
+from fluidlift.physics.liquid_grid import Layout, LiquidGrid
 from fluidlift.physics.numba_particles import ParticleWork
 from fluidlift.physics.pressure import build_system
 from fluidlift.physics.reseed import inner_cells, reseed
@@ -30,16 +31,40 @@ from fluidlift.physics.stepping import (
 from fluidlift.physics.travel import displacements, leaving
 from fluidlift.physics.window import Window
 from fluidlift.seams import MoveRules
-from fluidlift.types import FaceVelocity, FluidParameters, Grid, Particles, SolveReport, Terrain
+from fluidlift.types import CellType, FaceVelocity, FluidParameters, Grid, Particles, SolveReport, Terrain
 
 __all__ = ["EmitSource", "LiquidSimulator", "SimulationSettings", "StepReport"]
+
+
+TURNED = 0.5
+"""share of gravity along an axis from which its side of the box is one that liquid falls out of: 30 degrees"""
+
+
+def sides_open_to_air(gravity: tuple[float, float, float]) -> np.ndarray:
+    """bool [3,2] (axis, low/high): sides of the box without a wall.
+
+    The one that gravity points away from (the sky of the clip) and, once gravity is turned, those that it points to:
+    no ground was seen there, and what falls must not pile up at an invisible wall. The low side of z is the ground.
+    """
+    out = np.zeros((3, 2), bool)
+    g = np.asarray(gravity, np.float64)
+    if not g.any():
+        return out
+    up = int(np.abs(g).argmax())
+    out[up, int(g[up] < 0)] = True
+    for axis in range(3):
+        down = int(g[axis] > 0)
+        if abs(g[axis]) > TURNED * np.linalg.norm(g) and (axis, down) != (2, 0):
+            out[axis, down] = True
+            out[2, 1] = True  # the sky stays open, whatever falls
+    return out
 
 
 class LiquidSimulator(LiquidGrid):
     """A body of liquid on a terrain, with an inlet and an outlet.
 
-    The sides of the box are frictionless walls, except in INFLOW and OUTFLOW cells and on top (against gravity),
-    where particles that leave are removed. The terrain's signed distance decides what is solid.
+    The sides of the box are frictionless walls, except in INFLOW and OUTFLOW cells and where `sides_open_to_air` says
+    so: particles that leave there are removed. The terrain's signed distance decides what is solid.
 
     Outlet: particles flow freely and are removed when they leave the box there, or when they leave the OUTFLOW cells
     along the mainstream. Columns of liquid that stand on the ground inside OUTFLOW cells have the hydrostatic pressure
@@ -63,6 +88,7 @@ class LiquidSimulator(LiquidGrid):
         settings: numerical choices; its `particles_per_cell` is overridden by the argument.
         work: who does the particle half of a step; None: the CPU.
         bodies: rigid bodies, at rest, animated or free; particles inside them at the start are removed.
+        supply: how the inflow changes over time, and emitters; None: a steady inlet alone.
 
     Raises:
         ValueError: arguments of wrong shape, or numbers that are not finite.
@@ -83,15 +109,12 @@ class LiquidSimulator(LiquidGrid):
         settings: SimulationSettings | None = None,
         work: ParticleWork | None = None,
         bodies: Sequence[RigidBody] = (),
+        supply: Supply | None = None,
     ) -> None:
-        gravity = np.asarray(parameters.gravity)
-        open_sides = np.zeros((3, 2), bool)
-        if gravity.any():
-            top = int(np.abs(gravity).argmax())
-            open_sides[top, int(gravity[top] < 0)] = True
+        open_sides = sides_open_to_air(parameters.gravity)
         super().__init__(
             grid, terrain, parameters, particles, cell_types=cell_types, inflow_profile=inflow_profile, seed=seed,
-            emit_source=emit_source, open_sides=open_sides,
+            emit_source=emit_source, open_sides=open_sides, supply=supply,
             settings=replace(settings or SimulationSettings(), particles_per_cell=particles_per_cell),
         )  # fmt: skip
         self._prepare_grid(work or ParticleWork(), bodies)
@@ -192,13 +215,22 @@ class LiquidSimulator(LiquidGrid):
         return Outcome(state, int(gone.sum()), step.report, step.viscosity, adopt)
 
     def _carry_inlet(self, velocities: np.ndarray, affine: np.ndarray) -> None:
-        """Particles in INFLOW cells move as prescribed, in place: walls beside the inlet would hold back its rim."""
-        if not self._inlet.active:
-            return
-        positions = self._particles.positions
-        inside = np.flatnonzero(self._inlet.inside(positions))
-        velocities[inside] = self._inlet.velocity(positions[inside], self.time)
-        affine[inside] = 0.0
+        """Particles in the inlet move as prescribed, in place: walls beside it would hold back its rim."""
+        self._inlet.carry(self._particles.positions, velocities, affine, self.time)
+
+    def _layout(self, window: Window, order: transfer.CellOrder) -> Layout:
+        """With the cells of emitters as inflow."""
+        layout = super()._layout(window, order)
+        if not self._inlet.running:
+            return layout
+        cells = self._inlet.emitter_cells(window.grid.shape, window.first)
+        inflow = np.uint8(CellType.INFLOW)
+        return replace(
+            layout,
+            holding=np.where(cells, inflow, layout.holding),
+            types=np.where(cells, inflow, layout.types),
+            wet=layout.wet | cells,
+        )
 
     def _tidied(self, order: transfer.CellOrder, window: Window) -> transfer.CellOrder:
         """Reseed, and put the particles in the order of their cells, so that neighbours are close in memory."""

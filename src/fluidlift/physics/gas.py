@@ -17,6 +17,7 @@ from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.physics import boundaries, transfer
 from fluidlift.physics.crowding import fill_ratio
 from fluidlift.physics.deform import updated_deformation
+from fluidlift.physics.emitter import Supply
 from fluidlift.physics.forces import add_buoyancy
 from fluidlift.physics.pressure import build_system, project
 from fluidlift.physics.stepping import EmitSource, Outcome, ParticleSimulator, SimulationSettings
@@ -97,7 +98,7 @@ class GasSimulator(ParticleSimulator):
         cell_types: u8 [nx,ny,nz]; INFLOW cells emit smoke with the prescribed velocity, OUTFLOW cells hold p = 0.
         buoyancy: acceleration of undiluted smoke against gravity, m/s^2.
         velocity: of the air at the start; None: that of the particles around them, at rest elsewhere.
-        inflow_profile, seed, particles_per_cell, emit_source, settings: as for `LiquidSimulator`.
+        inflow_profile, seed, particles_per_cell, emit_source, settings, supply: as for `LiquidSimulator`.
 
     Raises:
         ValueError: arguments of wrong shape, or numbers that are not finite.
@@ -118,20 +119,18 @@ class GasSimulator(ParticleSimulator):
         particles_per_cell: int = 8,
         emit_source: EmitSource | None = None,
         settings: SimulationSettings | None = None,
+        supply: Supply | None = None,
     ) -> None:
         require(np.isfinite(buoyancy), f"buoyancy {buoyancy}", "a finite number of m/s^2")
         open_sides = np.ones((3, 2), bool)
-        gravity = np.asarray(parameters.gravity) if np.any(parameters.gravity) else np.array([0.0, 0.0, -1.0])
-        vertical = int(np.abs(gravity).argmax())
-        open_sides[vertical, int(gravity[vertical] > 0)] = False
+        open_sides[2, 0] = False  # the ground stays below, wherever gravity is turned to
         super().__init__(
             grid, terrain, parameters, particles, cell_types=cell_types, inflow_profile=inflow_profile, seed=seed,
-            emit_source=emit_source, open_sides=open_sides,
+            emit_source=emit_source, open_sides=open_sides, supply=supply,
             settings=replace(settings or SimulationSettings(), particles_per_cell=particles_per_cell),
         )  # fmt: skip
         self.buoyancy = float(buoyancy)
-        types = np.where(self._walls.regions == CellType.EMPTY, CellType.FLUID, self._walls.regions)
-        self._system = build_system(types, self._walls.openings, grid, open_border=True)
+        self._emitters_switched()
         self._open_faces = tuple(o > 0 for o in self._walls.openings)
         # how much of a face's surroundings a wall takes, for the damping
         self._wall_share = tuple(
@@ -147,6 +146,11 @@ class GasSimulator(ParticleSimulator):
         self._head_rate: np.ndarray | None = None
         projected, _, _ = project(self._inlet.impose(start, 0.0), self._system)
         self._velocity = self._continued(projected)
+
+    def _emitters_switched(self) -> None:
+        types = np.where(self._walls.regions == CellType.EMPTY, CellType.FLUID, self._walls.regions)
+        types[self._inlet.emitter_cells(self.grid.shape) & ~self._walls.solid] = CellType.INFLOW
+        self._system = build_system(types, self._walls.openings, self.grid, open_border=True)
 
     @property
     def velocity(self) -> FaceVelocity:

@@ -55,6 +55,12 @@ class InflowSchedule:
         surge = float(_SHARES @ np.sin(2 * math.pi * time / self.period * _HARMONICS + _PHASES))
         return own * max(0.0, 1.0 + self.fluctuation * surge)
 
+    def run(self, time: float) -> float:
+        """s at factor 1 that bring as much as comes in from 0 to `time` (s), without the surge."""
+        times, factors = (np.array(v) for v in zip(*self.keyframes))
+        inner = np.unique(np.concatenate([[0.0, time], times[(times > 0) & (times < time)]]))
+        return float(np.trapezoid(np.interp(inner, times, factors), inner))
+
     def travelled(self, start: float, duration: float) -> float:
         """The mean factor from `start` (s) over `duration` (s), by Simpson's rule."""
         ends = self.factor(start) + self.factor(start + duration)

@@ -10,10 +10,9 @@ from scipy.spatial import cKDTree
 
 from fluidlift.numerics.sampling import sample_faces, sample_nodes
 from fluidlift.physics.boundaries import CLEARANCE, Walls, touching_faces
+from fluidlift.physics.emitter import PHASES, Emission, Supply
 from fluidlift.types import CellType, FaceVelocity, FluidParameters
 
-PHASES = np.array([0.7548776662466927, 0.5698402909980532])
-"""phases of neighbouring columns of the emission lattice, in spacings: Roberts' evenly spread sequence in the plane"""
 MODES = 12
 """plane waves that make up the inflow fluctuation"""
 
@@ -54,15 +53,24 @@ def random_fluctuation(
 
 
 class Inlet:
-    """What flows in: velocity as a function of place and time, and where new particles are due."""
+    """What flows in: velocity as a function of place and time, and where new particles are due.
+
+    INFLOW cells make up the inlet proper; the emitters of the `supply` come and go.
+    """
 
     def __init__(
-        self, walls: Walls, parameters: FluidParameters, profile: FaceVelocity | None, seed: int, per_cell: int
+        self,
+        walls: Walls,
+        parameters: FluidParameters,
+        profile: FaceVelocity | None,
+        seed: int,
+        per_cell: int,
+        supply: Supply | None = None,
     ) -> None:
         grid = walls.grid
-        self._walls = walls
+        self._walls, self.supply = walls, supply or Supply()
         self._cells = walls.regions == CellType.INFLOW
-        self.active = bool(self._cells.any())
+        self._steady = bool(self._cells.any())
         self.bulk = np.asarray(parameters.inflow_velocity, np.float64)
         self._amplitude = parameters.inflow_fluctuation
         self._per_side = max(1, round(per_cell ** (1.0 / 3.0)))
@@ -70,8 +78,11 @@ class Inlet:
         """m"""
         self.shift = np.zeros(3)
         """m, by which the emission pattern has travelled"""
+        self.emissions = tuple(Emission(e, walls, self.particle_spacing) for e in self.supply.emitters)
+        self.running: tuple[Emission, ...] = ()
+        """emissions that are on"""
         self._profile, self._gain, self._offset = profile, 0.0, self.bulk
-        if not self.active:
+        if not self._steady:
             return
         index = np.argwhere(self._cells)
         self._low, self._high = index.min(axis=0), index.max(axis=0) + 1
@@ -84,49 +95,92 @@ class Inlet:
         extent = float((self._high - self._low).max()) * grid.spacing
         rng = np.random.default_rng(seed)
         self._fluctuation = random_fluctuation(extent, 4 * grid.spacing, self.bulk, self._amplitude, rng)
-        self.cell_range = (self._low, self._high)
-        """cells (low, high exclusive) that hold all INFLOW cells"""
         self._faces, self._face_points = [], []
         for axis, (touched, opening) in enumerate(zip(touching_faces(self._cells), walls.openings)):
             touched &= opening > 0
             self._faces.append(np.argwhere(touched))
             self._face_points.append(grid.faces(axis)[touched])
 
+    @property
+    def active(self) -> bool:
+        """Whether anything flows in now."""
+        return self._steady or bool(self.running)
+
+    @property
+    def cell_range(self) -> tuple[np.ndarray, np.ndarray]:
+        """Cells (low, high exclusive) that hold all cells with a prescribed velocity."""
+        lows = [self._low] if self._steady else []
+        highs = [self._high] if self._steady else []
+        for e in self.running:
+            if len(e.cells):
+                lows.append(e.cells.min(axis=0))
+                highs.append(e.cells.max(axis=0) + 1)
+        if not lows:  # emitters thinner than a cell: their particles say where they are
+            return np.array(self._walls.grid.shape), np.zeros(3, int)
+        return np.min(lows, axis=0), np.max(highs, axis=0)
+
+    def switch(self, time: float) -> bool:
+        """Turn emitters on and off as due at a time (s); whether that changed anything."""
+        running = tuple(e for e in self.emissions if e.emitter.on(time))
+        changed = running != self.running
+        self.running = running
+        return changed
+
+    def emitter_cells(self, shape: tuple[int, ...], first: tuple[int, int, int] = (0, 0, 0)) -> np.ndarray:
+        """bool, of `shape`, from cell `first` on: cells of the emitters that are on."""
+        out = np.zeros(shape, bool)
+        for e in self.running:
+            out[tuple((e.cells - first).T)] = True
+        return out
+
+    def carry(self, positions: np.ndarray, velocities: np.ndarray, affine: np.ndarray, time: float) -> None:
+        """Particles in INFLOW cells and in emitters move as prescribed, in place."""
+        if self._steady:
+            inside = np.flatnonzero(self.inside(positions))
+            velocities[inside] = self.velocity(positions[inside], time)
+            affine[inside] = 0.0
+        for e in self.running:
+            inside = e.inside(positions)
+            velocities[inside], affine[inside] = e.velocity, 0.0
+
     def velocity(self, points: Float[np.ndarray, "n 3"], time: float) -> Float[np.ndarray, "n 3"]:
-        """Prescribed velocity, m/s: the profile, scaled and shifted so that its mean over the INFLOW cells is the
-        bulk velocity, plus the fluctuation."""
+        """Prescribed velocity of INFLOW cells, m/s: the profile, scaled and shifted so that its mean over them is the
+        bulk velocity, plus the fluctuation; all of it times the schedule's factor."""
         out = np.broadcast_to(self._offset, (len(points), 3)).copy()
         if self._profile is not None and self._gain > 0:
             out += self._gain * sample_faces(self._profile, self._walls.grid, points)
         if self._amplitude > 0:
             out += self._amplitude * self._fluctuation(points, time)
-        return out
+        return out * self.supply.schedule.factor(time)
 
     def impose(self, velocity: FaceVelocity, time: float, first: tuple[int, int, int] = (0, 0, 0)) -> FaceVelocity:
-        """The velocity with the faces of INFLOW cells set; `first` is the cell at which the arrays begin."""
+        """The velocity with the prescribed faces set; `first` is the cell at which the arrays begin."""
         if not self.active:
             return velocity
-        out = []
-        for axis, component in enumerate(velocity.components):
-            new = component.copy()
-            new[tuple((self._faces[axis] - first).T)] = self.velocity(self._face_points[axis], time)[:, axis]
-            out.append(new)
+        out = [component.copy() for component in velocity.components]
+        if self._steady:
+            for axis, new in enumerate(out):
+                new[tuple((self._faces[axis] - first).T)] = self.velocity(self._face_points[axis], time)[:, axis]
+        for e in self.running:
+            e.impose(out, first)
         return FaceVelocity(*out)
 
     def face_masks(
         self, shapes: tuple[tuple[int, ...], ...], first: tuple[int, int, int] = (0, 0, 0)
     ) -> list[np.ndarray]:
-        """bool per component, in arrays of `shapes` that begin at cell `first`: faces of INFLOW cells."""
+        """bool per component, in arrays of `shapes` that begin at cell `first`: faces with a prescribed velocity."""
         masks = [np.zeros(shape, bool) for shape in shapes]
-        if self.active:
+        if self._steady:
             for mask, faces in zip(masks, self._faces):
                 mask[tuple((faces - first).T)] = True
+        for e in self.running:
+            e.mark(masks, first)
         return masks
 
     def inside(self, positions: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
         """Particles in INFLOW cells."""
         grid = self._walls.grid
-        low, high = (grid.low + np.asarray(c) * grid.spacing for c in self.cell_range)
+        low, high = (grid.low + c * grid.spacing for c in (self._low, self._high))
         out = np.ones(len(positions), bool)
         for axis in range(3):
             out &= (positions[:, axis] >= low[axis]) & (positions[:, axis] <= high[axis])
@@ -135,9 +189,10 @@ class Inlet:
         out[near] = self._cells[tuple(cells.T)]
         return out
 
-    def travel(self, dt: float) -> None:
-        """Move the emission pattern along with the bulk flow, so that new particles continue the old lattice."""
-        self.shift = self.shift + self.bulk * dt
+    def travel(self, dt: float, time: float = 0.0) -> None:
+        """Move the emission pattern along with the bulk flow from `time` on, so that new particles continue the old
+        lattice."""
+        self.shift = self.shift + self.bulk * (dt * self.supply.schedule.travelled(time, dt))
 
     def _lattice(self) -> Float[np.ndarray, "n 3"]:
         """Points of the travelling lattice around the INFLOW cells.
@@ -162,7 +217,7 @@ class Inlet:
     def missing(self, positions: Float[np.ndarray, "n 3"], rng: np.random.Generator) -> Float[np.ndarray, "n 3"]:
         """Places in INFLOW cells that lack a particle: points of the travelling lattice farther than 0.8 of its
         spacing from every particle, slightly jittered."""
-        if not self.active:
+        if not self._steady:
             return np.zeros((0, 3), np.float32)
         grid, s = self._walls.grid, self.particle_spacing
         candidates = self._lattice()

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from fluidlift.errors import InputRejected
+from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.physics.boundaries import build_walls
+from fluidlift.physics.emitter import Emitter, emitter_distance
 from fluidlift.types import CellType, Grid, Terrain
 
 BYTES_PER_CELL = 200
@@ -94,6 +98,41 @@ def check_inlet(terrain: Terrain, cell_types: np.ndarray, velocity: np.ndarray) 
             f"{int(open_inlet.sum())} open cells", "a direction in which the inlet is open",
             "check inflow_velocity in scene.yaml",
         )  # fmt: skip
+
+
+MOST_AT_ONCE = 1_000_000
+"""particles that an emitter may hold: more would rather be a mesh in the wrong unit"""
+
+
+def check_emitters(emitters: Sequence[Emitter], terrain: Terrain) -> None:
+    """Whether every emitter has room to emit.
+
+    Raises:
+        InputRejected: one whose mesh bounds no solid, or that is huge, lies outside the box or inside the ground; the
+            message names its line.
+    """
+    grid = terrain.grid
+    for emitter in emitters:
+        extent = np.ptp(np.asarray(emitter.mesh.vertices, np.float64), axis=0)
+        if float(np.prod(2 * extent / grid.spacing)) > MOST_AT_ONCE:
+            raise InputRejected(
+                f"{emitter.line}: emitter '{emitter.name}' is {' x '.join(f'{x:.3g}' for x in extent)} m large",
+                f"at most {MOST_AT_ONCE:,} particles at once, {0.5 * grid.spacing:.3g} m apart", "make it smaller",
+            )  # fmt: skip
+        found = emitter_distance(emitter, grid.spacing)
+        inside = found.grid.nodes()[found.distance <= 0].reshape(-1, 3)
+        box = " to ".join(str(tuple(round(float(x), 2) for x in corner)) for corner in (grid.low, grid.high))
+        name, middle = f"{emitter.line}: emitter '{emitter.name}'", np.round(inside.mean(axis=0), 3).tolist()
+        within = inside[grid.contains(inside)]
+        if not len(within):
+            raise InputRejected(
+                f"{name} around {middle} lies outside the simulated box", f"a place within {box} m",
+                "change its position",
+            )  # fmt: skip
+        if not (sample_nodes(terrain.signed_distance, grid, within) > 0).any():
+            raise InputRejected(
+                f"{name} around {middle} lies inside the ground", "a place in the open", "lift its position"
+            )
 
 
 def _outward_flux(inlet: np.ndarray, openings: tuple, solid: np.ndarray, velocity: np.ndarray, spacing: float) -> float:

@@ -18,6 +18,7 @@ from fluidlift.numerics.sampling import sample_centers
 from fluidlift.numerics.signed_distance import push_outside
 from fluidlift.physics import boundaries, transfer
 from fluidlift.physics.crowding import cell_capacity
+from fluidlift.physics.emitter import Supply
 from fluidlift.physics.inlet import Inlet
 from fluidlift.physics.rigid import RigidBodies
 from fluidlift.physics.viscosity import NEGLIGIBLE, FaceRoles, diffuse_with_bodies
@@ -111,6 +112,7 @@ class ParticleSimulator(ABC):
         emit_source: EmitSource | None,
         settings: SimulationSettings,
         open_sides: np.ndarray,
+        supply: Supply | None = None,
     ) -> None:
         require(terrain.grid == grid, "a terrain on another grid", "the grid of the simulation")
         require(cell_types.shape == grid.shape, f"cell types {cell_types.shape}", str(grid.shape))
@@ -122,7 +124,8 @@ class ParticleSimulator(ABC):
         self._capacity = cell_capacity(terrain.signed_distance, grid)
         self._window = open_window(tuple(slice(0, n) for n in grid.shape), self._walls, self._capacity)
         self._mainstream = np.asarray(terrain.mainstream, np.float64)
-        self._inlet = Inlet(self._walls, parameters, inflow_profile, seed, settings.particles_per_cell)
+        self._inlet = Inlet(self._walls, parameters, inflow_profile, seed, settings.particles_per_cell, supply)
+        self._inlet.switch(0.0)
         self._particles = self._prepared(particles)
         self._next_id = int(particles.ids.max()) + 1 if len(particles) else 0
         self._emit_source = emit_source or self._nearest_source(particles)
@@ -147,6 +150,7 @@ class ParticleSimulator(ABC):
             "counts": np.array([self._advances, self._next_id], np.int64),
             "generator": np.frombuffer(generator, np.uint8),
             "inlet_shift": self._inlet.shift.copy(),
+            "emitted_until": np.array([e.last for e in self._inlet.emissions], np.float64),
         }
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
@@ -159,7 +163,9 @@ class ParticleSimulator(ABC):
             particles = Particles(**{f.name: np.array(state[f"particles.{f.name}"]) for f in fields(Particles)})
             generator = json.loads(bytes(state["generator"]))
             counts, shift, time = state["counts"], np.array(state["inlet_shift"], np.float64), float(state["time"])
+            emitted = np.array(state.get("emitted_until", np.zeros(0)), np.float64)
             require(counts.shape == (2,) and shift.shape == (3,), "counters of another shape")
+            require(emitted.shape == (len(self._inlet.emissions),), "a simulation state with other emitters")
             for name in ("positions", "velocities", "affine", "deformation", "masses"):
                 require(bool(np.isfinite(getattr(particles, name)).all()), f"{name} that are not finite")
             fresh = np.random.default_rng(0)
@@ -169,6 +175,10 @@ class ParticleSimulator(ABC):
         self._particles, self._rng, self.time = particles, fresh, time
         self._advances, self._next_id = int(counts[0]), int(counts[1])
         self._inlet.shift = shift
+        for emission, last in zip(self._inlet.emissions, emitted):
+            emission.last = float(last)
+        if self._inlet.switch(time):
+            self._emitters_switched()
 
     def advance(self, duration: float) -> StepReport:
         """Simulate `duration` seconds in substeps of at most `parameters.time_step`.
@@ -200,7 +210,7 @@ class ParticleSimulator(ABC):
                 retries += 1
             self._particles = outcome.particles
             outcome.adopt()
-            self._inlet.travel(dt)
+            self._inlet.travel(dt, self.time)
             self.time += dt
             substeps += 1
             removed += outcome.removed
@@ -273,23 +283,39 @@ class ParticleSimulator(ABC):
         return lambda positions, time: source[tree.query(positions)[1]]
 
     def _fill_inlet(self) -> int:
-        """Keep the INFLOW cells full of particles that move as prescribed; the number of new ones."""
-        inlet = self._inlet
+        """Keep INFLOW cells and emitters full of particles that move as prescribed; the number of new ones."""
+        inlet, before = self._inlet, self._next_id
+        if inlet.switch(self.time):
+            self._emitters_switched()
+        self._add(inlet.missing(self._particles.positions, self._rng), inlet.particle_spacing**3)
+        for number, emission in enumerate(inlet.emissions):
+            places = emission.due(self.time, self._particles.positions)
+            look = inlet.supply.looks[number] if inlet.supply.looks else None
+            self._add(places, emission.volume, look, emission.velocity)
         if not inlet.active:
-            return 0
-        places = inlet.missing(self._particles.positions, self._rng)
-        if len(places):
-            source = np.asarray(self._emit_source(places, self.time), np.int64)
-            mass = self.parameters.density * inlet.particle_spacing**3
-            new = Particles.at_rest(places, mass, source, first_id=self._next_id)
-            self._next_id += len(places)
-            self._particles = self._particles.joined(new)
-        inside = inlet.inside(self._particles.positions)
+            return self._next_id - before
         velocities, affine = self._particles.velocities.copy(), self._particles.affine.copy()
-        velocities[inside] = inlet.velocity(self._particles.positions[inside], self.time)
-        affine[inside] = 0.0
+        inlet.carry(self._particles.positions, velocities, affine, self.time)
         self._particles = replace(self._particles, velocities=velocities, affine=affine)
-        return len(places)
+        return self._next_id - before
+
+    def _add(
+        self, places: np.ndarray, volume: float, look: np.ndarray | None = None, velocity: np.ndarray | None = None
+    ) -> None:
+        """New particles of one volume (m^3), with the rest Gaussians of `look` in turn, or as at the inlet."""
+        if not len(places):
+            return
+        if look is None or not len(look):
+            source = np.asarray(self._emit_source(places, self.time), np.int64)
+        else:
+            source = np.asarray(look, np.int64)[np.arange(self._next_id, self._next_id + len(places)) % len(look)]
+        moves = None if velocity is None else np.broadcast_to(velocity, places.shape)
+        new = Particles.at_rest(places, self.parameters.density * volume, source, moves, first_id=self._next_id)
+        self._next_id += len(places)
+        self._particles = self._particles.joined(new)
+
+    def _emitters_switched(self) -> None:  # noqa: B027
+        """An emitter has come on or gone off; for simulators that keep what depends on it."""
 
     def _wet_faces(self, wet: np.ndarray, walls: boundaries.Walls) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         return tuple(t & (o > 0) for t, o in zip(boundaries.touching_faces(wet), walls.openings))

@@ -1,5 +1,6 @@
 """The story: the only place that knows the order of the stages."""
 
+from fluidlift.pipeline.editing import EditSession
 from fluidlift.pipeline.exporting import ExportRequest, export_asset
 from fluidlift.pipeline.make import STAGES, make
 from fluidlift.pipeline.mask_files import find_masks
@@ -14,6 +15,7 @@ from fluidlift.pipeline.story import Progress, Silence
 
 __all__ = [
     "STAGES",
+    "EditSession",
     "ExportRequest",
     "Hints",
     "Inputs",

@@ -1,20 +1,30 @@
-"""Files of a finished asset for other tools: surface meshes, splats, USD, in the axes and units that they take."""
+"""Files of a finished asset for other tools: meshes, splats, volumes, USD, glTF, a page, what the clip showed."""
 
 from __future__ import annotations
 
-import difflib
+import json
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fluidlift.errors import InputRejected
 from fluidlift.io.frames import FIRST_FRAME, FluidFrame
+from fluidlift.pipeline.export_job import (
+    FORMATS,
+    OF_CLIP,
+    OWN_AXES,
+    PICTURES,
+    ExportJob,
+    ExportRequest,
+    Outcome,
+    checked,
+    every,
+    frames_of,
+)
 from fluidlift.pipeline.rendering import frame_numbers, frames_told
-from fluidlift.pipeline.showing import splat_frames
 from fluidlift.pipeline.story import Progress, Silence
 from fluidlift.pipeline.written import Written, cleared, numbered
 from fluidlift.types import FaceVelocity, FluidAsset, Gaussians, Grid, Similarity3, Terrain, TriangleMesh
@@ -22,10 +32,10 @@ from fluidlift.types import FaceVelocity, FluidAsset, Gaussians, Grid, Similarit
 if TYPE_CHECKING:
     from fluidlift.io.volume_grid import VolumeGrid
 
-FORMATS = ("mesh", "obj", "splats", "vdb", "usd")
-AXES = ("z", "y")
-OWN_AXES = ("vdb", "usd")
-"""formats whose files are z up and in metres whatever is asked for"""
+__all__ = ["FORMATS", "ExportRequest", "export_asset", "gridded", "level_set", "outside_solid"]
+
+MESHED = ("mesh", "obj", "usd", "usd-clips", "gltf")
+"""formats with the surface of the fluid; of a liquid's volumes it makes the level set"""
 BAND = 3.0
 """half width of the level set, voxels: what OpenVDB's own tools expect"""
 FULL = 50.0
@@ -35,95 +45,122 @@ RADIUS = 0.4
 more keeps drops whole and flat water flat"""
 
 
-@dataclass(frozen=True)
-class ExportRequest:
-    """What is written, and how."""
-
-    to: str
-    """mesh: surface as PLY with colours and velocities; obj: the same as OBJ, without velocities; splats: Gaussians as
-    splat viewers take them; vdb: OpenVDB with velocity, density and, of liquids, the level set; usd: one OpenUSD file
-    with surface, splats, terrain and camera"""
-    up_axis: str = "z"
-    """z or y; USD states its axis itself and stays z up, and OpenVDB files stay z up, in metres"""
-    meters_per_unit: float = 1.0
-    """m that one unit of the files is; USD states its unit itself and stays in metres"""
-    frames: tuple[int, int] | None = None
-    """first and last number, from 1001; None: all"""
-
-
 def export_asset(folder: Path, out: Path, request: ExportRequest, *, progress: Progress | None = None) -> Written:
-    """Write the frames of an asset below `out`, with terrain.glb beside them.
+    """Write the frames of an asset below `out`, with terrain.glb beside meshes and splats.
 
     Args:
         folder: of the asset.
-        out: folder for the files; numbered ones of an earlier run are replaced.
+        out: folder for the files; numbered ones of an earlier run are replaced. For a page, a name that ends in .html
+            will do.
         request: what is written.
         progress: where progress is told.
 
     Raises:
-        InputRejected: no asset, no frames, or a request that does not fit it.
+        InputRejected: no asset, no frames, a request that does not fit it, or a disk that does not take it.
         MissingPackage: a mesh without pysplashsurf.
     """
     from fluidlift.io.asset_folder import load_asset, read_manifest
     from fluidlift.io.atomic import disk_errors
 
     progress, began = progress or Silence(), time.perf_counter()
-    _check(request, out)
+    checked(request, out)
     manifest, asset = read_manifest(folder), load_asset(folder)
-    played = manifest.get("simulation", {})
-    numbers = frame_numbers(folder, int(played.get("frames", 0)), request.frames)
-    interval = float(played.get("frame_interval", asset.interval))
     progress.stage("export", 1, 1)
-    frames = _frames(folder, numbers, asset, request, progress)
-    with disk_errors(out):
-        out.mkdir(parents=True, exist_ok=True)
-        if request.to == "usd":
-            _usd(out, frames, asset, interval, numbers)
-        elif request.to == "vdb":
-            _volumes(out, frames, asset, numbers)
-        else:
-            _files(out, frames, asset, request, numbers)
+    if request.to in OF_CLIP:
+        from fluidlift.pipeline.export_clip import write_clip_files
+
+        interval = asset.interval
+        with disk_errors(out):
+            outcome = write_clip_files(folder, out, asset, request, manifest, progress)
+    else:
+        job = _job(folder, out, asset, request, manifest, progress)
+        interval = job.interval
+        with disk_errors(out):
+            (out.parent if out.suffix.lower() == ".html" and request.to == "html" else out).mkdir(
+                parents=True, exist_ok=True
+            )
+            outcome = _written(job)
+        outcome = replace(outcome, warnings=(*_missing(job, manifest), *outcome.warnings))
+        outcome = replace(outcome, facts={"frames": len(job.picked), "first": FIRST_FRAME + job.picked.start}
+                          | (outcome.facts or {}))  # fmt: skip
     seconds = time.perf_counter() - began
     progress.finished("export", seconds, False)
-    own = request.to in OWN_AXES
+    for text in outcome.warnings:
+        progress.warn(text)
+    return _told(out, request, outcome, interval, seconds)
+
+
+def _job(
+    folder: Path, out: Path, asset: FluidAsset, request: ExportRequest, manifest: dict[str, Any], progress: Progress
+) -> ExportJob:
+    """Which frames of the asset are written, and how fast they follow each other."""
+    played = manifest.get("simulation", {})
+    interval = float(played.get("frame_interval", asset.interval))
+    numbers = frame_numbers(folder, int(played.get("frames", 0)), request.frames)
+    step = every(request.fps, interval)
+    return ExportJob(folder, out, asset, request, numbers[::step], step * interval, progress)
+
+
+def _missing(job: ExportJob, manifest: dict[str, Any]) -> tuple[str, ...]:
+    """A warning where frames of the simulation have gone."""
+    simulated = int(manifest.get("simulation", {}).get("frames", 0))
+    last = job.picked[-1] + 1
+    if job.request.frames is not None or last >= simulated - (job.picked.step - 1):
+        return ()
+    return (f"frame {FIRST_FRAME + last} is missing: {last} of {simulated} frames are exported; "
+            f"fluidlift sim {job.folder} makes the others",)  # fmt: skip
+
+
+def _told(out: Path, request: ExportRequest, outcome: Outcome, interval: float, seconds: float) -> Written:
     facts = {
-        "frames": len(numbers), "first": FIRST_FRAME + numbers[0], "fps": round(1.0 / interval, 6), "to": request.to,
-        "up_axis": "z" if own else request.up_axis, "meters_per_unit": 1.0 if own else request.meters_per_unit,
-    }  # fmt: skip
-    words = (f"{frames_told(len(numbers))} as {request.to}: {out}", f"{facts['fps']:g} frames per second, from "
-             f"{facts['first']}, {facts['up_axis']} up, {facts['meters_per_unit']:g} m per unit")  # fmt: skip
-    return Written(out, seconds, (), {"export": {"seconds": round(seconds, 3)}}, facts, words)
+        "fps": round(1.0 / interval, 6), "to": request.to, "up_axis": OWN_AXES.get(request.to, request.up_axis),
+        "meters_per_unit": request.meters_per_unit,
+    } | (outcome.facts or {})  # fmt: skip
+    axes = f", {facts['up_axis']} up, {facts['meters_per_unit']:g} m per unit"
+    words = (f"{frames_told(facts['frames'])} as {request.to}: {out}", f"{facts['fps']:g} frames per second, from "
+             f"{facts['first']}{axes * (request.to not in PICTURES)}", *outcome.words)  # fmt: skip
+    return Written(out, seconds, outcome.warnings, {"export": {"seconds": round(seconds, 3)}}, facts, words)
 
 
-def _check(request: ExportRequest, out: Path) -> None:
-    if request.to not in FORMATS:
-        near = difflib.get_close_matches(request.to, FORMATS, 1)
-        raise InputRejected(f"no format '{request.to}'", ", ".join(FORMATS), f"did you mean {near[0]}?" if near else "")
-    if request.up_axis not in AXES:
-        raise InputRejected(f"an up axis '{request.up_axis}'", " or ".join(AXES))
-    if request.to in OWN_AXES and (request.up_axis != "z" or request.meters_per_unit != 1.0):
-        raise InputRejected(
-            f"{request.to} with other axes or units", "z up and metres", "leave out --up-axis and --meters-per-unit"
-        )
-    if not (np.isfinite(request.meters_per_unit) and 1e-6 <= request.meters_per_unit <= 1e6):
-        raise InputRejected(f"{request.meters_per_unit:g} m per unit", "1e-6 to 1e6, such as 0.01 for centimetres")
-    if out.exists() and not out.is_dir():
-        raise InputRejected(f"'{out.name}', which is a file", "a folder")
+def _written(job: ExportJob) -> Outcome:
+    """Hand the frames to the writer of the format."""
+    to, asset = job.request.to, job.asset
+    if to == "html":
+        from fluidlift.pipeline.export_page import write_page_of
+
+        return write_page_of(job)
+    if to == "spz":
+        from fluidlift.pipeline.export_web import write_spz_frames
+
+        return write_spz_frames(job)
+    if to == "gltf":
+        from fluidlift.pipeline.export_web import write_hero
+
+        return write_hero(job, lambda picked: next(_frames(replace(job, picked=picked))))
+    frames = _frames(job)
+    if to in ("usd", "usd-clips"):
+        return _usd(job, frames)
+    if to == "vdb":
+        _volumes(job.out, frames, asset, job.numbers)
+    else:
+        _files(job.out, frames, asset, job.request, job.numbers)
+        if to == "mesh":
+            return Outcome(warnings=_bodies(job))
+    return Outcome()
 
 
-def _frames(
-    folder: Path, numbers: range, asset: FluidAsset, request: ExportRequest, progress: Progress
-) -> Iterator[FluidFrame]:
+def _frames(job: ExportJob) -> Iterator[FluidFrame]:
     """Frame by frame, with the surface where the format has one."""
-    mesher = None
-    if request.to in ("mesh", "obj", "usd") or (request.to == "vdb" and asset.kind != "plume"):
+    mesher, asset = None, job.asset
+    smoke = asset.kind == "plume"  # its volumes say it all; as a surface it would be a lump
+    if (job.request.to in MESHED and not (smoke and job.request.to in ("usd", "usd-clips"))) or (
+        job.request.to == "vdb" and not smoke
+    ):
         from fluidlift.backends.splashsurf import SplashsurfMesher
 
         mesher = SplashsurfMesher()
-    for k, (gaussians, ids, velocities) in enumerate(splat_frames(folder, numbers.stop)):
-        if k < numbers.start:
-            continue
-        progress.update(k - numbers.start, len(numbers))
+    for done, (gaussians, ids, velocities) in enumerate(frames_of(job.folder, job.picked)):
+        job.progress.update(done, len(job.picked))
         if mesher is None:
             yield FluidFrame(gaussians, ids, velocities)
             continue
@@ -179,14 +216,52 @@ def _files(out: Path, frames: Iterator[FluidFrame], asset: FluidAsset, request: 
         write_glb(out / "terrain.glb", asset.terrain.mesh)
 
 
-def _usd(out: Path, frames: Iterator[FluidFrame], asset: FluidAsset, interval: float, numbers: range) -> None:
-    """One file with all of it."""
-    from fluidlift.io.export_usd import write_usd
+def _bodies(job: ExportJob) -> tuple[str, ...]:
+    """Obstacles beside the meshes of the fluid, in the same axes and units; warnings.
 
-    write_usd(
-        out / "fluid.usda", frames=frames, interval=interval, start_frame=FIRST_FRAME + numbers[0],
-        terrain=asset.terrain.mesh, camera=asset.camera, attributes=asset.parameters.to_dict() | {"kind": asset.kind},
-    )  # fmt: skip
+    bodies/NAME.ply has one around its own origin, bodies.json where it is in every frame: "poses" [frames][7], place of
+    the origin and unit quaternion w x y z, from the frame "first" on.
+    """
+    from fluidlift.io.atomic import atomic_write
+    from fluidlift.io.export_mesh import write_mesh
+    from fluidlift.io.ply import AXES as ROTATIONS
+    from fluidlift.pipeline.usd_exporting import bodies_of
+
+    request, listed = job.request, job.out / "bodies.json"
+    listed.unlink(missing_ok=True)
+    if (job.out / "bodies").is_dir():
+        cleared(job.out / "bodies", [".ply"])
+    bodies, warnings = bodies_of(job.folder, job.picked)
+    place = Similarity3(1.0 / request.meters_per_unit, ROTATIONS[f"{request.up_axis}_up"], np.zeros(3))
+    entries: list[dict[str, Any]] = []
+    for body in bodies:
+        stem = "".join(c if c.isalnum() or c in "-_" else "_" for c in body.name)
+        path = f"bodies/{stem}.ply"
+        if any(e["mesh"].lower() == path.lower() for e in entries):  # names that differ only in what no file may have
+            path = f"bodies/{stem}_{len(entries) + 1}.ply"
+        (job.out / "bodies").mkdir(exist_ok=True)
+        write_mesh(job.out / path, TriangleMesh(place.points(body.mesh.vertices), body.mesh.faces, body.mesh.colors))
+        # turned on both sides, R q R^-1 keeps the angle and turns the axis
+        turned = np.concatenate([body.orientations[:, :1], body.orientations[:, 1:] @ place.rotation.T], axis=1)
+        poses = np.concatenate([place.points(body.positions), turned], axis=1).astype(float)
+        first = FIRST_FRAME + job.numbers.start
+        entries.append({"name": body.name, "mesh": path, "first": first, "poses": poses.tolist()})
+    if entries:
+        facts = {"up_axis": request.up_axis, "meters_per_unit": request.meters_per_unit, "bodies": entries}
+        with atomic_write(listed) as file:
+            file.write(json.dumps(facts).encode())
+    return warnings
+
+
+def _usd(job: ExportJob, frames: Iterator[FluidFrame]) -> Outcome:
+    """One file with all of it, or one with a clip per frame."""
+    from fluidlift.io.export_usd import UsdSettings
+    from fluidlift.pipeline.usd_exporting import write_usd_asset
+
+    layout = "clips" if job.request.to == "usd-clips" else "file"
+    axes, unit = job.request.up_axis, job.request.meters_per_unit
+    settings = UsdSettings(FIRST_FRAME + job.numbers.start, axes, unit, layout)
+    return Outcome(warnings=write_usd_asset(job, frames, settings))
 
 
 def _volumes(out: Path, frames: Iterator[FluidFrame], asset: FluidAsset, numbers: range) -> None:

@@ -47,6 +47,7 @@ def make(
             simulation broke down, the frames before it are written as an asset of fewer frames.
     """
     from fluidlift.io.asset_folder import check_output_folder
+    from fluidlift.io.asset_lock import writing
 
     stages = generating.stages_of(STAGES, config)
     require_stages(force, stages)
@@ -58,7 +59,7 @@ def make(
     story = Story(folder, stages, force=frozenset(force), progress=progress or Silence())
     for text in warnings:
         story.warn(text)
-    with gone_if_refused(story, "motion"):
+    with gone_if_refused(story, "motion"), writing(folder, "fluidlift make"):
         provenance = _run(story, inputs, config)
         frames = config.simulate.frames or len(clip_of(story)) - story["geometry"].meta["rest_frame"]
         simulating.require_room(folder, frames, len(body.rest_of(story)))

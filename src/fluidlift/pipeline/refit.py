@@ -12,7 +12,7 @@ from typing import Any
 from fluidlift import __version__
 from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected
-from fluidlift.pipeline import moving, showing
+from fluidlift.pipeline import moving
 from fluidlift.pipeline.fit_outcome import SUBJECT, in_words
 from fluidlift.pipeline.fit_request import request_of
 from fluidlift.pipeline.make import fit_figures
@@ -77,6 +77,7 @@ def refit(
             that do not fit; nothing was changed.
     """
     from fluidlift.io.asset_folder import load_asset, read_manifest, update_manifest, write_parameters
+    from fluidlift.io.asset_lock import writing
     from fluidlift.io.atomic import disk_errors
 
     began = time.perf_counter()
@@ -86,7 +87,7 @@ def refit(
     story = Story(folder, ("fit",), force=frozenset({"fit"}), progress=progress or Silence())
     _recall(story, manifest)
     before = load_asset(folder)
-    with disk_errors(folder):
+    with disk_errors(folder), writing(folder, "a fit"):
         story.run("fit", lambda: moving.fit(story, config), settings=config.section("fit"), after=("motion",))
         own = story["fit"].meta["warnings"]
         story.warnings[:] = [w for w in manifest.get("warnings", ()) if not str(w).startswith(SUBJECT)] + own
@@ -161,7 +162,7 @@ def _write_report(story: Story, folder: Path, config: JobConfig, manifest: dict[
     known = {
         k: t for k, t in timings.items() if isinstance(t, dict) and {"seconds", "cached", "peak_memory_mb"} <= t.keys()
     }
-    showing.write_report(story, folder, config, known | fresh)
+    reporting.write_report(story, folder, config, known | fresh)
 
 
 def _number(asset: Any, label: str) -> float | None:

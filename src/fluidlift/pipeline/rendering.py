@@ -4,28 +4,27 @@ from __future__ import annotations
 
 import difflib
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from fluidlift.errors import InputRejected
 from fluidlift.io.frames import FIRST_FRAME
+from fluidlift.pipeline.drawing import Stage, drawn
+from fluidlift.pipeline.looks import Painter
 from fluidlift.pipeline.resimulate import FIRST_HALF, recall_first_half, settings_of
-from fluidlift.pipeline.scene import Footage, Scene, SimulationRequest, footage_of, scene_of
-from fluidlift.pipeline.showing import splat_frames
+from fluidlift.pipeline.scene import Scene, SimulationRequest, footage_of, scene_of
 from fluidlift.pipeline.simulating import frame_file
 from fluidlift.pipeline.story import Progress, Silence, Story
 from fluidlift.pipeline.written import Written, cleared, numbered
-from fluidlift.types import Gaussians, PinholeCamera, Similarity3, concatenate, matrix_from_quat
+from fluidlift.types import PinholeCamera
 
 VIEWS = ("input", "side", "top", "turn")
 BACKGROUNDS = ("auto", "plate", "terrain", "none")
 FILMS = (".mp4", ".mov")
 PICTURES = (".png", ".exr")
-SURFELS = 200_000
-"""of the terrain: stills are looked at longer than the preview"""
 SIZES = (16, 8192)
 """px, of a side of the picture"""
 
@@ -45,6 +44,18 @@ class RenderRequest:
     of these that can be had"""
     format: str = "png"
     """of pictures: png (8 bits, sRGB, with alpha) or exr (linear, premultiplied, alpha A and camera depth Z in m)"""
+    look: str | None = None
+    """splats, relit, transparent or surface; None: as scene.yaml says"""
+    material: str | None = None
+    """a preset of `look.materials`; None: as scene.yaml says"""
+    environment: str | None = None
+    """sky, studio, white, or a .hdr or .exr file; None: as scene.yaml says"""
+    exposure: float | None = None
+    """stops; None: as scene.yaml says"""
+    engine: str = "mesh"
+    """of the look surface: mesh, screen or mitsuba"""
+    samples: int = 64
+    """light paths per pixel, of mitsuba"""
 
 
 def render_asset(
@@ -78,33 +89,71 @@ def render_asset(
     scene = scene_of(asset, folder, made_with, config, footage=None, start=0)
     numbers = frame_numbers(folder, int(played.get("frames", 0)), request.frames)
     poses, warnings = _poses(folder, scene, len(numbers) + numbers[0])
-    stage = _Stage(scene, footage, request, _cameras(scene, request, len(numbers)), numbers, poses)
+    painter = _painter(scene, folder, request)
+    stage = Stage(
+        scene, footage, request.background, request.view == "input", _cameras(scene, request, len(numbers)), numbers,
+        poses, painter,
+    )  # fmt: skip
     progress.stage("render", 1, 1)
     with disk_errors(out):
-        _write(stage, folder, out, 1.0 / interval, lambda done: progress.update(done, len(numbers)))
+        _write(stage, folder, out, request.format, 1.0 / interval, lambda done: progress.update(done, len(numbers)))
     seconds = time.perf_counter() - began
     progress.finished("render", seconds, False)
     for text in warnings:
         progress.warn(text)
     size = stage.cameras[0].size
     facts = {"frames": len(numbers), "first": FIRST_FRAME + numbers[0], "size": list(size), "view": request.view,
-             "out": str(out)}  # fmt: skip
+             "look": "splats" if painter is None else painter.look.style, "out": str(out)}  # fmt: skip
     words = (f"{frames_told(len(numbers))} of {size[0]} x {size[1]} px: {out}",)
     return Written(out, seconds, tuple(warnings), {"render": {"seconds": round(seconds, 3)}}, facts, words)
 
 
-@dataclass(frozen=True)
-class _Stage:
-    """All that one run draws."""
+def _painter(scene: Scene, folder: Path, request: RenderRequest) -> Painter | None:
+    """Of the look that is asked for or that scene.yaml names; None: the splats as they were lifted."""
+    from fluidlift.io.scene import read_edits
 
-    scene: Scene
-    footage: Footage | None
-    request: RenderRequest
-    cameras: list[PinholeCamera]
-    numbers: range
-    """frames, from 0"""
-    poses: np.ndarray | None
-    """[k,b,7] of the obstacles, from frame 0"""
+    asked = {"style": request.look, "material": request.material, "environment": request.environment,
+             "exposure": request.exposure}  # fmt: skip
+    _check_look(request)
+    look = read_edits(folder).look
+    if request.engine != "mesh" and request.look is None:
+        asked["style"] = "surface"
+    if request.environment is not None and Path(request.environment).is_file():
+        asked["environment"] = str(Path(request.environment).resolve())
+    look = replace(look, **{k: v for k, v in asked.items() if v is not None})
+    if look.style == "splats":
+        if request.material is not None or request.environment is not None:
+            raise InputRejected(
+                "a material or an environment for splats as they were lifted", "another look",
+                "add --look relit, transparent or surface",
+            )  # fmt: skip
+        return None
+    if request.engine == "mitsuba" and request.background == "none":
+        raise InputRejected("Mitsuba without the ground", "--background plate or terrain", "or use --engine mesh")
+    return Painter(look, scene.terrain, folder, kind=scene.kind, engine=request.engine, samples=request.samples)
+
+
+def _check_look(request: RenderRequest) -> None:
+    from fluidlift.io.scene_look import EXPOSURE, STYLES
+    from fluidlift.look.environment import BUILT_IN
+    from fluidlift.look.materials import material_named
+
+    if request.look is not None and request.look not in STYLES:
+        near = difflib.get_close_matches(request.look, STYLES, 1)
+        raise InputRejected(f"no look '{request.look}'", ", ".join(STYLES), f"did you mean {near[0]}?" if near else "")
+    if request.material is not None:
+        material_named(request.material)
+    name = request.environment
+    if name is not None and name not in BUILT_IN and not Path(name).is_file():
+        near = difflib.get_close_matches(name, BUILT_IN, 1)
+        raise InputRejected(
+            f"no environment '{name}'", f"{', '.join(BUILT_IN)}, or an existing .hdr or .exr file",
+            f"did you mean {near[0]}?" if near else "",
+        )  # fmt: skip
+    if request.exposure is not None and not abs(request.exposure) <= EXPOSURE:
+        raise InputRejected(f"an exposure of {request.exposure:g} stops", f"-{EXPOSURE:g} to {EXPOSURE:g}")
+    if not 1 <= request.samples <= 100_000:
+        raise InputRejected(f"{request.samples} samples per pixel", "1 to 100000")
 
 
 def _check(request: RenderRequest, out: Path) -> None:
@@ -208,118 +257,23 @@ def _fitted(camera: PinholeCamera, size: tuple[int, int]) -> PinholeCamera:
     return PinholeCamera(focal, center, (int(size[0]), int(size[1])), camera.camera_from_world)
 
 
-def _write(stage: _Stage, folder: Path, out: Path, fps: float, step: Callable[[int], None]) -> None:
+def _write(stage: Stage, folder: Path, out: Path, form: str, fps: float, step: Callable[[int], None]) -> None:
     from fluidlift.io.exr_write import write_channels
     from fluidlift.io.images import write_png
     from fluidlift.io.video import write_video
 
-    drawn = _drawn(stage, folder, step)
+    pictures = drawn(stage, folder, step)
     if out.suffix.lower() in FILMS:
         out.parent.mkdir(parents=True, exist_ok=True)
-        write_video(out, (np.clip(rgb, 0, 1) for rgb, _, _ in drawn), fps)
+        write_video(out, (p.shown for p in pictures), fps)
         return
-    suffix = "." + stage.request.format
+    suffix = "." + form
     cleared(out, [suffix])
-    for k, (rgb, alpha, depth) in zip(stage.numbers, drawn, strict=True):
+    for k, p in zip(stage.numbers, pictures, strict=True):
         path = numbered(out, k, suffix)
         if suffix == ".exr":
-            linear = _linear(rgb, alpha)
-            write_channels(path, {**{c: linear[..., i] for i, c in enumerate("RGB")}, "A": alpha, "Z": depth})
+            write_channels(path, {**{c: p.image[..., i] for i, c in enumerate("RGB")}, "A": p.alpha, "Z": p.depth})
         else:
-            straight = rgb / np.maximum(alpha, 1e-4)[..., None]
-            picture = np.concatenate([np.clip(straight, 0, 1), np.clip(alpha, 0, 1)[..., None]], axis=-1)
+            straight = p.shown / np.maximum(p.alpha, 1e-4)[..., None]
+            picture = np.concatenate([np.clip(straight, 0, 1), np.clip(p.alpha, 0, 1)[..., None]], axis=-1)
             write_png(path, (255 * picture + 0.5).astype(np.uint8))
-
-
-def _linear(rgb: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """Premultiplied sRGB to premultiplied linear light: compositing programs multiply linear values."""
-    from fluidlift.io.color import linear_from_srgb
-
-    covered = np.maximum(alpha, 1e-4)[..., None]
-    return (linear_from_srgb(np.clip(rgb / covered, 0.0, 1.0)) * alpha[..., None]).astype(np.float32)
-
-
-def _drawn(stage: _Stage, folder: Path, step: Callable[[int], None]) -> Iterator[tuple[np.ndarray, ...]]:
-    """(premultiplied sRGB [H,W,3], alpha [H,W], camera depth [H,W] m) of each frame; depth 0 where nothing is."""
-    from fluidlift.look.rasterize import render
-    from fluidlift.look.scenery import mesh_surfels, terrain_surfels
-
-    scene, way, wanted = stage.scene, _background(stage), stage.numbers
-    ground = Gaussians.empty() if way == "plate" else terrain_surfels(scene.terrain, most=SURFELS)
-    shapes = [mesh_surfels(o.mesh, scene.terrain.grid.spacing) for o in scene.obstacles]
-    before_rocks = _rocks(stage) if way == "plate" else None
-    for k, (fluid, _, _) in enumerate(splat_frames(folder, wanted.stop)):
-        if k < wanted.start:
-            continue
-        step(k - wanted.start)
-        camera = stage.cameras[k - wanted.start]
-        bodies = [] if stage.poses is None else [
-            s.transformed(Similarity3(1.0, matrix_from_quat(p[3:]), p[:3])) for s, p in zip(shapes, stage.poses[k])
-        ]  # fmt: skip
-        seen = concatenate([fluid if before_rocks is None else before_rocks(fluid), *bodies])
-        if way == "none":
-            yield _held_out(seen, ground, camera)
-            continue
-        found = render(concatenate([ground, seen]), camera, background=_behind(way, stage, camera))
-        yield found.image, np.ones(found.alpha.shape, np.float32), found.depth
-
-
-def _held_out(seen: Gaussians, ground: Gaussians, camera: PinholeCamera) -> tuple[np.ndarray, ...]:
-    """What is seen of the fluid beside the ground: the ground hides, and is not drawn itself."""
-    from fluidlift.look.project import view_colors
-    from fluidlift.look.rasterize import render
-
-    both = concatenate([seen, ground])
-    shown = (np.arange(len(both)) < len(seen)).astype(np.float32)[:, None]
-    depth = camera.camera_from_world.points(both.means)[:, 2:]
-    drawn = render(both, camera, features=shown * np.concatenate([view_colors(both, camera), shown, depth], axis=1))
-    rgb, alpha, z = drawn.image[..., :3], drawn.image[..., 3], drawn.image[..., 4]
-    return rgb, alpha, np.where(alpha > 1e-3, z / np.maximum(alpha, 1e-3), 0.0).astype(np.float32)
-
-
-def _rocks(stage: _Stage) -> Callable[[Gaussians], Gaussians] | None:
-    """Takes away what rocks of the plate hide; None where the clip shows none."""
-    from fluidlift.look.scenery import terrain_depth, visible_beside_rocks
-
-    scene, footage = stage.scene, stage.footage
-    rocks = None if footage is None else footage.labels.solid.mean(axis=0) > 0.5
-    if rocks is None or not rocks.any():
-        return None
-    depth, margin = terrain_depth(scene.terrain, scene.camera), 1.5 * scene.terrain.grid.spacing
-    return lambda g: g.select(visible_beside_rocks(g.means, scene.camera, depth, rocks, margin=margin))
-
-
-def _background(stage: _Stage) -> str:
-    """The kind of background: what was asked for, or the best that there is."""
-    way, has_plate = stage.request.background, stage.footage is not None
-    if way == "plate" and not has_plate:
-        raise InputRejected(
-            "the clip's background, which is no longer at hand", "the asset's folder work/, as make left it",
-            "use --background terrain or none, or run fluidlift make again",
-        )  # fmt: skip
-    if way != "auto":
-        return way
-    return "plate" if stage.request.view == "input" and has_plate else "terrain"
-
-
-def _behind(way: str, stage: _Stage, camera: PinholeCamera) -> np.ndarray:
-    """sRGB [H,W,3] behind everything."""
-    width, height = camera.size
-    if way == "terrain" or stage.footage is None:
-        return np.linspace(0.93, 0.78, height, dtype=np.float32)[:, None, None] * np.ones((1, width, 3), np.float32)
-    return _placed(stage.footage.plate, stage.scene.camera, camera)
-
-
-def _placed(plate: np.ndarray, source: PinholeCamera, camera: PinholeCamera) -> np.ndarray:
-    """The plate as a camera of the same place with another picture size sees it; its edge goes on beyond it."""
-    import cv2
-
-    scale = np.array(camera.focal) / np.array(source.focal)
-    # OpenCV counts from the middle of the first pixel
-    shift = np.array(camera.center) - 0.5 - scale * (np.array(source.center) - 0.5)
-    move = np.array([[scale[0], 0.0, shift[0]], [0.0, scale[1], shift[1]]])
-    way = cv2.INTER_AREA if scale[0] < 1 else cv2.INTER_CUBIC
-    if (scale == 1).all() and camera.size == source.size:
-        return plate.astype(np.float32) / 255.0
-    moved = cv2.warpAffine(plate, move, camera.size, flags=way, borderMode=cv2.BORDER_REPLICATE)
-    return moved.astype(np.float32) / 255.0

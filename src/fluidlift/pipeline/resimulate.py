@@ -12,7 +12,7 @@ import numpy as np
 
 from fluidlift.config import PRESETS, JobConfig, build_config
 from fluidlift.errors import FluidliftError, InputRejected
-from fluidlift.pipeline import showing, simulating
+from fluidlift.pipeline import reporting, showing, simulating
 from fluidlift.pipeline.scene import Footage, Scene, SimulationRequest, footage_of, scene_of
 from fluidlift.pipeline.story import Progress, Silence, Story, peak_memory_mb
 
@@ -69,6 +69,7 @@ def resimulate(
         FluidliftError: the simulation broke down; the frames before are kept and shown.
     """
     from fluidlift.io.asset_folder import read_manifest
+    from fluidlift.io.asset_lock import writing
     from fluidlift.io.atomic import disk_errors
 
     request = request or SimulationRequest()
@@ -80,7 +81,7 @@ def resimulate(
         folder, SECOND_HALF, force=frozenset(SECOND_HALF if request.restart else ()), progress=progress or Silence()
     )
     recall_first_half(story, manifest)
-    with disk_errors(folder):
+    with disk_errors(folder), writing(folder, "a simulation"):
         frames = play(story, folder, config, request)
     own = tuple(story["simulate"].meta.get("warnings", ()))
     return Made(folder, own, time.perf_counter() - began, story.timings, frames)
@@ -168,10 +169,17 @@ def play(story: Story, folder: Path, config: JobConfig, request: SimulationReque
         FluidliftError: the simulation broke down; the frames before it are written.
     """
     from fluidlift.io.asset_folder import load_asset, read_manifest
+    from fluidlift.io.obstacles import color_mark
+    from fluidlift.io.scene import read_edits
+    from fluidlift.io.scene_domain import require_inside
 
     manifest, asset = read_manifest(folder), load_asset(folder)
-    footage = footage_of(story)
-    scene = scene_of(asset, folder, request, config, footage=footage, start=_start(manifest, footage))
+    footage, edits = footage_of(story), read_edits(folder, meshes=request.meshes)
+    scene = scene_of(asset, folder, request, config, footage=footage, start=rest_frame_of(manifest, footage))
+    outside = require_inside(edits, scene.terrain.grid)
+    look = edits.look.mark(folder) | color_mark(edits.obstacles)
+    for text in outside:
+        story.progress.warn(text)
     story.run(
         "simulate",
         lambda: simulating.simulate(scene, folder, config, request=request, step=story.step),
@@ -184,13 +192,15 @@ def play(story: Story, folder: Path, config: JobConfig, request: SimulationReque
     wanted = [folder / "preview.mp4"] + [folder / "asset.usda"] * config.show.usd
     story.run(
         "show",
-        lambda: showing.show(scene, footage, folder, config, story["simulate"].arrays["poses"], step=story.step),
-        settings=[config.section("show"), done["frames"], [story.keys[s] for s in FIRST_HALF if s in story.keys]],
+        lambda: showing.show(
+            scene, footage, folder, config, story["simulate"].arrays["poses"], look=edits.look, step=story.step
+        ),
+        settings=[config.section("show"), done["frames"], look, [story.keys[s] for s in FIRST_HALF if s in story.keys]],
         after=("simulate",),
         still_there=lambda result: all(p.is_file() for p in wanted),
         owns_files=True,
     )
-    _finish(story, scene, footage, folder, config, manifest)
+    _finish(story, scene, config, manifest, {"look": look, "loop": edits.loop, "warnings": outside})
     if "failed" in done:
         raise FluidliftError(
             f"{done['failed']} The {done['frames']} frames before it are kept, with their preview: '{folder}'."
@@ -198,25 +208,32 @@ def play(story: Story, folder: Path, config: JobConfig, request: SimulationReque
     return int(done["frames"])
 
 
-def _start(manifest: dict[str, Any], footage: Footage | None) -> int:
+def rest_frame_of(manifest: dict[str, Any], footage: Footage | None) -> int:
     """Frame of the clip that the body at rest shows."""
     start = manifest.get("metrics", {}).get("rest_frame", 0) if footage is None else footage.start
     return start if type(start) is int and 0 <= start < manifest["frame_count"] else 0
 
 
-def _finish(
-    story: Story, scene: Scene, footage: Footage | None, folder: Path, config: JobConfig, manifest: dict[str, Any]
-) -> None:
-    """Report, figures for `evaluate`, manifest."""
+def _finish(story: Story, scene: Scene, config: JobConfig, manifest: dict[str, Any], edited: dict[str, Any]) -> None:
+    """Report, figures for `evaluate`, manifest.
+
+    Args:
+        story: of the run.
+        scene: that was simulated.
+        config: its `simulate` and `show` sections.
+        manifest: as it was before.
+        edited: what of scene.yaml is noted beside the scene, and warnings about it.
+    """
     from fluidlift.io.asset_folder import update_manifest
     from fluidlift.io.atomic import atomic_write
 
+    folder = story.folder
     result = story["simulate"].meta
     before = set(manifest.get("simulation", {}).get("warnings", ()))
-    own = [*result.get("warnings", ()), *([result["failed"]] if "failed" in result else [])]
+    own = [*edited["warnings"], *result.get("warnings", ()), *([result["failed"]] if "failed" in result else [])]
     story.warnings[:] = [w for w in manifest.get("warnings", ()) if w not in before] + own
     if story.results.keys() >= set(FIRST_HALF):
-        showing.write_report(story, folder, config, story.timings)
+        reporting.write_report(story, folder, config, story.timings)
         figures = folder / "work" / "evaluation.npz"
         if "resim_frames" in story["show"].arrays:
             with atomic_write(figures) as stream:
@@ -238,6 +255,8 @@ def _finish(
             "seed": scene.seed,
             "extended_downstream": scene.extended,
             "obstacles": [o.name for o in scene.obstacles],
+            "look": edited["look"],
+            "loop": edited["loop"],
             "warnings": own,
         },
     )  # fmt: skip

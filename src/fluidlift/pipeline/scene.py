@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +14,9 @@ from fluidlift import __version__
 from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected
 from fluidlift.look.appearance import SteadyShading
+from fluidlift.physics.inflow_schedule import InflowSchedule
 from fluidlift.pipeline.reading import clip_of
+from fluidlift.pipeline.reshaping import changed_parameters, with_emitters, with_terrain
 from fluidlift.pipeline.seeing import labels_of
 from fluidlift.pipeline.story import Story, available_memory
 from fluidlift.types import (
@@ -32,10 +34,15 @@ from fluidlift.types import (
 
 if TYPE_CHECKING:
     from fluidlift.io.obstacles import Obstacle
+    from fluidlift.physics.emitter import Emitter
     from fluidlift.physics.rigid_body import RigidBody
 
 LYING = ("stream", "fall")
 """kinds that lie on something and can be made longer; the others are free in the air"""
+
+
+LOOP_FADE = (0.4, 1.5)
+"""s: a shorter fade shows as a jump, a longer one as a double exposure"""
 
 
 @dataclass(frozen=True)
@@ -91,7 +98,7 @@ class Scene:
     clip_interval: float
     """s between frames of the clip"""
     frames: int
-    """to simulate, the first (at rest) counted"""
+    """to show, the first (at rest) counted"""
     seed: int
     obstacles: tuple[Obstacle, ...] = ()
     shading: SteadyShading | None = None
@@ -100,6 +107,25 @@ class Scene:
     """m"""
     longest_step: float | None = None
     """s, of the simulator, where scene.yaml gives a `time_step`"""
+    inflow: InflowSchedule = field(default_factory=InflowSchedule)
+    emitters: tuple[Emitter, ...] = ()
+    emitter_looks: tuple[np.ndarray, ...] = ()
+    """indices into `rest` of the Gaussians that each emitter's particles take their look from"""
+    painted: np.ndarray | None = None
+    """[n,3] m: where the colours of `rest` were taken, not a number where no shade changes them; None: its means"""
+    reshaped: bool = False
+    """whether scene.yaml edits the terrain: the clip's picture no longer shows it"""
+    changes: tuple[str, ...] = ()
+    """parameters that scene.yaml changes, in words"""
+    notes: tuple[str, ...] = ()
+    """what was done to what scene.yaml gives, for whom it concerns"""
+    overlap: int = 0
+    """frames simulated beyond `frames`, that a loop is closed with"""
+
+    @property
+    def simulated(self) -> int:
+        """Frames to simulate."""
+        return self.frames + self.overlap
 
     @cached_property
     def parts(self) -> dict[str, str]:
@@ -120,12 +146,18 @@ class Scene:
         }  # fmt: skip
         if self.obstacles:
             found["obstacles"] = _hash(*(x for o in self.obstacles for x in o.plain()))
+        if self.emitters:
+            found["emitters"] = _hash(*(x for e in self.emitters for x in e.plain()))
+        if self.inflow != InflowSchedule():
+            found["inflow"] = _hash(self.inflow)
+        if self.overlap:
+            found["loop"] = _hash(self.frames, self.overlap)
         return found
 
     @cached_property
     def bodies(self) -> tuple[RigidBody, ...]:
         """The obstacles as bodies; raises `InputRejected` where a mesh bounds no solid."""
-        return tuple(o.body((self.frames - 1) * self.interval) for o in self.obstacles)
+        return tuple(o.body((self.simulated - 1) * self.interval) for o in self.obstacles)
 
 
 def _hash(*values: Any) -> str:
@@ -160,6 +192,9 @@ def scene_of(
 ) -> Scene:
     """The scene that an asset, its scene.yaml and a request describe.
 
+    The channel is made longer first, then its terrain is edited, then emitters are put into it: each in the world as
+    the one before left it.
+
     Args:
         asset: as `load_asset` gives it.
         folder: of the asset.
@@ -191,10 +226,13 @@ def scene_of(
         asset.kind, rest, body, asset.terrain, asset.cell_types, velocity,
         asset.parameters.updated(changes), asset.camera, interval, asset.interval,
         wanted or config.simulate.frames or clip_frames, config.seed, edits.obstacles, shading,
-        longest_step=longest_step,
+        longest_step=longest_step, inflow=edits.inflow, changes=changed_parameters(asset.parameters, changes),
     )  # fmt: skip
     longer = edits.extend_downstream if request.extend_downstream is None else request.extend_downstream
-    return extended(scene, longer) if longer > 0 else scene
+    if longer > 0:
+        scene = extended(scene, longer)
+    scene = with_emitters(with_terrain(scene, edits.terrain), edits.emitters)
+    return replace(scene, overlap=loop_overlap(scene)) if edits.loop else scene
 
 
 def beyond_surface(asset: FluidAsset) -> FaceVelocity:
@@ -242,6 +280,24 @@ def extended(scene: Scene, length: float) -> Scene:
         velocity=extended_velocity(scene.velocity, outlet, longer[0].grid),
         extended=length,
     )
+
+
+def loop_overlap(scene: Scene) -> int:
+    """Frames over which a loop's end fades into its beginning.
+
+    A quarter of the time that the fluid takes to pass, within `LOOP_FADE`, and not more than half of the clip.
+
+    Raises:
+        InputRejected: fewer than four frames.
+    """
+    if scene.frames < 4:
+        raise InputRejected(f"a loop of {scene.frames} frames", "4 frames or more", "give a longer duration")
+    along = scene.body.positions @ np.asarray(scene.terrain.mainstream, np.float32)
+    length = float(np.ptp(np.percentile(along, [5, 95]))) if len(along) else 0.0
+    speed = float(np.linalg.norm(scene.body.velocities, axis=1).mean()) if len(along) else 0.0
+    speed = max(speed, float(np.linalg.norm(scene.parameters.inflow_velocity)), 1e-6)
+    fade = float(np.clip(0.25 * length / speed, *LOOP_FADE))
+    return int(np.clip(round(fade / scene.interval), 2, scene.frames // 2))
 
 
 def simulation_step(scene: Scene) -> FluidParameters:

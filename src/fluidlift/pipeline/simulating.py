@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,11 +12,14 @@ import numpy as np
 from fluidlift.config import JobConfig
 from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.io.frames import FIRST_FRAME
+from fluidlift.pipeline.looping import close_loop
+from fluidlift.pipeline.reshaping import in_words
 from fluidlift.pipeline.scene import LYING, Scene, SimulationRequest, simulation_step
 from fluidlift.pipeline.story import Result, available_memory
 from fluidlift.types import CellType, Gaussians, Particles
 
 if TYPE_CHECKING:
+    from fluidlift.physics.inflow_schedule import InflowSchedule
     from fluidlift.physics.numba_particles import ParticleWork
     from fluidlift.physics.stepping import ParticleSimulator
 
@@ -30,7 +33,9 @@ BYTES_PER_SPLAT = 80
 """of disk, in a frame's file"""
 
 
-def emission_look(rest: Gaussians, direction: np.ndarray, speed: float) -> Callable[[np.ndarray, float], np.ndarray]:
+def emission_look(
+    rest: Gaussians, direction: np.ndarray, speed: float, schedule: InflowSchedule | None = None
+) -> Callable[[np.ndarray, float], np.ndarray]:
     """Which rest Gaussian lends its look to a particle that enters at a place and time.
 
     The fluid that enters later is taken to look like the body further downstream, mirrored at its ends: the pattern
@@ -45,7 +50,7 @@ def emission_look(rest: Gaussians, direction: np.ndarray, speed: float) -> Calla
     length = max(float(high - low), 1e-9)
 
     def source(positions: np.ndarray, time: float) -> np.ndarray:
-        run = (speed * time) % (2 * length)
+        run = speed * (time if schedule is None else schedule.run(time)) % (2 * length)
         shift = run if run < length else 2 * length - run
         inlet = positions @ direction
         target = np.clip(inlet + shift, low, high)
@@ -72,24 +77,27 @@ def particle_work(device: str) -> ParticleWork:
 
 def simulator_of(scene: Scene, device: str = "cpu") -> ParticleSimulator:
     """The simulator at the first instant. Smoke is simulated on the CPU."""
+    from fluidlift.physics.emitter import Supply
+
     parameters = simulation_step(scene)
     direction = scene.terrain.mainstream
-    look = emission_look(scene.rest, direction, float(np.linalg.norm(parameters.inflow_velocity)))
-    grid = scene.terrain.grid
+    own = scene.rest.select(np.arange(len(scene.rest) - sum(map(len, scene.emitter_looks))))
+    look = emission_look(own, direction, float(np.linalg.norm(parameters.inflow_velocity)), scene.inflow)
+    grid, supply = scene.terrain.grid, Supply(scene.inflow, scene.emitters, scene.emitter_looks)
     if scene.kind == "plume":
         from fluidlift.physics.gas import GasSimulator
 
         return GasSimulator(
             grid, scene.terrain, parameters, scene.body, cell_types=scene.cell_types, inflow_profile=scene.velocity,
             velocity=scene.velocity, seed=scene.seed, emit_source=look,
-            buoyancy=float(np.linalg.norm(parameters.gravity)),
+            buoyancy=float(np.linalg.norm(parameters.gravity)), supply=supply,
         )  # fmt: skip
     from fluidlift.physics.apic import LiquidSimulator
 
     cells, body = within_outlet(scene)
     return LiquidSimulator(
         grid, scene.terrain, parameters, body, cell_types=cells, inflow_profile=scene.velocity,
-        seed=scene.seed, emit_source=look, bodies=scene.bodies, work=particle_work(device),
+        seed=scene.seed, emit_source=look, bodies=scene.bodies, work=particle_work(device), supply=supply,
     )  # fmt: skip
 
 
@@ -122,7 +130,7 @@ def preflight(scene: Scene) -> None:
     p, step = scene.parameters, simulation_step(scene).time_step
     if p.surface_tension > 0:
         step = min(step, capillary_time_step(p.density, p.surface_tension, scene.terrain.grid.spacing))
-    check_frames(scene.frames, scene.interval, step, SimulationSettings().max_substeps)
+    check_frames(scene.simulated, scene.interval, step, SimulationSettings().max_substeps)
     check_memory(scene.terrain.grid, len(scene.body), available_memory())
     check_inlet(scene.terrain, scene.cell_types, np.array(p.inflow_velocity))
 
@@ -229,8 +237,8 @@ def continued(simulator: ParticleSimulator, scene: Scene, folder: Path, request:
         found = read_checkpoint(path, max_bytes=4 * simulation_bytes(scene.terrain.grid, most))
         if found.history["poses"].shape != (found.frames, len(scene.obstacles), 7):
             raise InputRejected(f"the checkpoint of '{folder.name}' holds other obstacles", "a whole checkpoint")
-        history = History.of(found.history, scene.frames)
-        if found.frames <= scene.frames:
+        history = History.of(found.history, scene.simulated)
+        if found.frames <= scene.simulated:
             simulator.restore(found.state)
         return history
     except (InputRejected, KeyError) as error:
@@ -269,19 +277,21 @@ def simulate(
     simulator = simulator_of(scene, config.simulate.device)
     history = continued(simulator, scene, folder, request or SimulationRequest(), config)
     first = len(history)
-    require_room(folder, scene.frames - first, len(scene.body))
+    require_room(folder, scene.simulated - first, len(scene.body))
     for old in (folder / "frames" / "splats").glob("*.ply"):
         if not (old.stem.isdigit() and 0 <= int(old.stem) - FIRST_FRAME < first):
             old.unlink()
     if first == 0:
         checkpoint_file(folder).unlink(missing_ok=True)
     failed = _advance(simulator, scene, folder, config, history, step)
-    warnings = list(simulator.bodies.warnings) if scene.obstacles else []
-    if failed is None and len(history) < scene.frames:
+    warnings = list(scene.notes) + (list(simulator.bodies.warnings) if scene.obstacles else [])
+    if failed is None and len(history) < scene.simulated:
         warnings.append(
-            f"the re-simulation stopped after {len(history)} of {scene.frames} frames, at twice the number of "
+            f"the re-simulation stopped after {len(history)} of {scene.simulated} frames, at twice the number of "
             f"particles that --set simulate.max_particles={config.simulate.max_particles} allows"
         )
+    if scene.overlap:
+        warnings += close_loop(scene, history, lambda k: frame_file(folder, FIRST_FRAME + k), checkpoint_file(folder))
     arrays = history.arrays()
     meta: dict[str, Any] = {
         "frames": len(history),
@@ -308,8 +318,8 @@ def _advance(
     from fluidlift.physics.deform import deform_gaussians
 
     size = 1.2 * scene.terrain.grid.spacing
-    for k in range(len(history), scene.frames):
-        step(k, scene.frames)
+    for k in range(len(history), scene.simulated):
+        step(k, scene.simulated)
         substeps = 0
         if k:
             try:
@@ -317,22 +327,31 @@ def _advance(
             except InputRejected:
                 raise
             except FluidliftError as error:
-                return f"frame {FIRST_FRAME + k} ({k} of {scene.frames}): {error}"
+                return f"frame {FIRST_FRAME + k} ({k} of {scene.simulated}): {error} {in_words(scene)}".rstrip()
         p = simulator.particles
         if k and len(p) > config.simulate.max_particles * 2:
             return None
         shown = deform_gaussians(scene.rest, p, max_stretch=MAX_STRETCH, max_size=size)
         if k:  # at rest nothing is drawn out
             shown = mixed(shown, p.deformation, widest=MIXED * scene.terrain.grid.spacing)
-        if scene.shading is not None:
-            shown = scene.shading.moved(shown, scene.rest.means[p.source])
+        shown = shaded(scene, shown, p.source)
         write_gaussians(frame_file(folder, FIRST_FRAME + k), shown, ids=p.ids, velocities=p.velocities)
         history.add(scene, simulator, p, substeps)
         # the first one says whose frames these are
-        if len(history) % config.simulate.checkpoint_every == 0 or len(history) in (1, scene.frames):
+        if len(history) % config.simulate.checkpoint_every == 0 or len(history) in (1, scene.simulated):
             _save(simulator, scene, folder, history)
-    step(scene.frames, scene.frames)
+    step(scene.simulated, scene.simulated)
     return None
+
+
+def shaded(scene: Scene, shown: Gaussians, source: np.ndarray) -> Gaussians:
+    """The splats with the shade of the places where they are now; those with a colour of their own keep it."""
+    if scene.shading is None:
+        return shown
+    painted = (scene.rest.means if scene.painted is None else scene.painted)[source]
+    own = ~np.isfinite(painted).all(axis=1)
+    moved = scene.shading.moved(shown, np.where(own[:, None], shown.means, painted))
+    return moved if not own.any() else replace(moved, sh=np.where(own[:, None, None], shown.sh, moved.sh))
 
 
 def _save(simulator: ParticleSimulator, scene: Scene, folder: Path, history: History) -> None:

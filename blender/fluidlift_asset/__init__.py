@@ -1,0 +1,344 @@
+"""fluidlift assets in Blender: import a folder, change the fluid, simulate it again, refresh.
+
+Files are read here; everything that computes is done by the command `fluidlift` in its own Python.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import bpy
+from bpy.app.handlers import persistent
+
+from . import build
+from .command import Call, find_command, run
+
+bl_info = {
+    "name": "fluidlift assets",
+    "author": "The fluidlift authors",
+    "version": (0, 1, 0),
+    "blender": (3, 4, 0),
+    "location": "3D View > Sidebar > fluidlift",
+    "description": "Bring in, change and simulate fluids lifted out of videos",
+    "category": "Import-Export",
+}
+
+NAME = "fluidlift asset"
+MATERIALS = ("source", *build.LIQUIDS)
+
+
+class Preferences(bpy.types.AddonPreferences):
+    """Where the command is."""
+
+    bl_idname = __package__ or "fluidlift_asset"
+    command: bpy.props.StringProperty(  # pyright: ignore[reportInvalidTypeForm]
+        name="fluidlift command",
+        subtype="FILE_PATH",
+        default="",
+        description="Path of the program; empty: as found by the system",
+    )
+
+    def draw(self, context: bpy.types.Context) -> None:
+        self.layout.prop(self, "command")
+
+
+class Settings(bpy.types.PropertyGroup):
+    """The asset at hand, and what is changed about it."""
+
+    asset: bpy.props.StringProperty(name="Asset", subtype="DIR_PATH", description="Folder that ends in .fluid")
+    command: bpy.props.StringProperty(name="Command", subtype="FILE_PATH", description="Overrides the preferences")
+    viscosity: bpy.props.FloatProperty(
+        name="Viscosity", description="Kinematic, m²/s: water 1e-6, oil 1e-4, honey 5e-3",
+        default=1e-6, min=0.0, max=10.0, precision=6,
+    )  # fmt: skip
+    density: bpy.props.FloatProperty(name="Density", description="kg/m³", default=1000.0, min=0.001, max=20000.0)
+    gravity: bpy.props.FloatVectorProperty(
+        name="Gravity", description="m/s²", subtype="ACCELERATION", size=3, default=(0.0, 0.0, -9.81)
+    )
+    inflow: bpy.props.FloatVectorProperty(
+        name="Inflow", description="Velocity at the inlet, m/s", subtype="VELOCITY", size=3, default=(0.0, 0.0, 0.0)
+    )
+    duration: bpy.props.FloatProperty(
+        name="Duration", description="Seconds; 0: as long as the clip", default=0.0, min=0.0
+    )
+    material: bpy.props.EnumProperty(
+        name="Look", items=[(m, m.replace("_", " "), "") for m in MATERIALS], default="source"
+    )
+    motion: bpy.props.EnumProperty(
+        name="Obstacle",
+        items=[("static", "stands still", ""), ("free", "moves with the fluid", "")],
+    )
+    body_density: bpy.props.FloatProperty(
+        name="Its density", description="kg/m³; less than the fluid floats", default=400.0, min=1.0
+    )
+    told: bpy.props.StringProperty(name="Said")
+
+
+def command_of(context: bpy.types.Context) -> str:
+    """Path of the command; raises RuntimeError where there is none."""
+    own = context.scene.fluidlift.command
+    addon = context.preferences.addons.get(__package__ or "")
+    return find_command(own or (addon.preferences.command if addon is not None and addon.preferences else ""))
+
+
+def asset_of(context: bpy.types.Context) -> Path:
+    """Folder of the asset; raises RuntimeError where it is none."""
+    text = context.scene.fluidlift.asset.strip()
+    folder = Path(bpy.path.abspath(text)) if text else None
+    if folder is None or not (folder / "manifest.json").is_file():
+        raise RuntimeError("Choose an asset first: a folder that ends in .fluid, with a manifest.json in it.")
+    return folder
+
+
+class Guarded:
+    """Errors are told in one sentence instead of a traceback."""
+
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012  (Blender reads it from the class)
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        try:
+            return self.work(context)
+        except (RuntimeError, OSError, ValueError, KeyError) as error:
+            context.scene.fluidlift.told = str(error)
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+
+
+class ImportAsset(Guarded, bpy.types.Operator):
+    """Bring an asset in: surface with velocities, splats as points, terrain, camera, volumes, obstacles"""
+
+    bl_idname, bl_label = "fluidlift.import_asset", "Import fluid asset"
+    directory: bpy.props.StringProperty(subtype="DIR_PATH")  # pyright: ignore[reportInvalidTypeForm]
+    volumes: bpy.props.BoolProperty(
+        name="Volumes", default=False, description="OpenVDB velocity, density and level set"
+    )
+    splats: bpy.props.BoolProperty(name="Splats as points", default=True)
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def work(self, context: bpy.types.Context) -> set[str]:
+        if self.directory:
+            context.scene.fluidlift.asset = self.directory
+        folder = asset_of(context)
+        export(context, folder, self.volumes)
+        objects = assemble(context, folder, self.splats)
+        self.report({"INFO"}, f"{folder.name}: {', '.join(objects)}")
+        return {"FINISHED"}
+
+
+def export(context: bpy.types.Context, folder: Path, volumes: bool) -> None:
+    """Have the command write what Blender reads, where that is older than the frames."""
+    into, source = folder / build.FOLDER, folder / "frames" / "splats"
+    wanted = [("surface", "mesh", ".ply")] + ([("volume", "vdb", ".vdb")] if volumes else [])
+    for name, form, suffix in wanted:
+        if not build.up_to_date(into / name, source, suffix):
+            run([command_of(context), "export", str(folder), "-o", str(into / name), "--to", form])
+
+
+def assemble(context: bpy.types.Context, folder: Path, splats: bool) -> list[str]:
+    """The objects, in a collection of their own; their names."""
+    into, settings = build.collection(NAME), context.scene.fluidlift
+    read_settings(settings, folder)
+    surface = build.sequence(into, "fluid surface", "surface", folder / build.FOLDER / "surface")
+    if surface is None:
+        raise RuntimeError(f"{folder.name} has no simulated frames: run fluidlift sim")
+    surface.data.materials.append(build.liquid_material(settings.material))
+    if splats:
+        points = build.sequence(into, "fluid splats", "splats", folder / "frames" / "splats")
+        if points is not None:
+            points.hide_render = True
+    ground = folder / "rest" / "terrain.glb"
+    if ground.is_file():
+        build.terrain_of(into, ground)
+    build.camera_of(into, folder / "rest" / "camera.json")
+    build.bodies_of(into, folder / build.FOLDER / "surface")
+    build.volume_of(into, folder / build.FOLDER / "volume")
+    set_timeline(context.scene, folder, surface)
+    follow_timeline(context.scene)
+    return [o.name for o in into.objects]
+
+
+def set_timeline(scene: bpy.types.Scene, folder: Path, surface: bpy.types.Object) -> None:
+    """Frames from 1001, at the rate of the asset."""
+    facts = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
+    interval = float(facts.get("simulation", {}).get("frame_interval", facts["frame_interval"]))
+    rate = 1.0 / interval
+    scene.render.fps = max(1, round(rate))
+    scene.render.fps_base = scene.render.fps / rate
+    scene.frame_start, scene.frame_end = surface["fluidlift_frames"]
+    scene.frame_set(scene.frame_start)
+
+
+def read_settings(settings: Settings, folder: Path) -> None:
+    """What the frames were simulated with, into the panel."""
+    facts = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
+    values = dict(json.loads((folder / "parameters.json").read_text(encoding="utf-8"))["values"])
+    values |= facts.get("simulation", {}).get("parameters", {})
+    settings.viscosity, settings.density = values["kinematic_viscosity"], values["density"]
+    settings.gravity, settings.inflow = values["gravity"], values["inflow_velocity"]
+
+
+class Simulate(Guarded, bpy.types.Operator):
+    """Write the changes into scene.yaml and simulate again, in the background; Esc stops"""
+
+    bl_idname, bl_label = "fluidlift.simulate", "Simulate again"
+    wait: bpy.props.BoolProperty(default=False, options={"SKIP_SAVE"}, description="Hold Blender until it is done")
+
+    def work(self, context: bpy.types.Context) -> set[str]:
+        folder, program, s = asset_of(context), command_of(context), context.scene.fluidlift
+        run([program, "edit", str(folder), *changes(s)])
+        self.call = Call([program, "sim", str(folder), "--set", "show.usd=false"])
+        if self.wait or bpy.app.background:
+            self.call.wait()
+            return self.finish(context)
+        self.timer = context.window_manager.event_timer_add(0.5, window=context.window)
+        context.window_manager.modal_handler_add(self)
+        return {"RUNNING_MODAL"}
+
+    def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        if event.type == "ESC":
+            self.call.stop()
+            self.call.wait()
+            context.scene.fluidlift.told = "stopped; the frames that were there are kept"
+            context.window_manager.event_timer_remove(self.timer)
+            return {"CANCELLED"}
+        if event.type != "TIMER":
+            return {"PASS_THROUGH"}
+        if self.call.running():
+            context.scene.fluidlift.told = self.call.last_line()[:80]
+            for area in context.screen.areas:
+                area.tag_redraw()
+            return {"PASS_THROUGH"}
+        context.window_manager.event_timer_remove(self.timer)
+        try:
+            return self.finish(context)
+        except (RuntimeError, OSError, ValueError, KeyError) as error:
+            context.scene.fluidlift.told = str(error)
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+
+    def finish(self, context: bpy.types.Context) -> set[str]:
+        self.call.check()
+        refresh(context)
+        context.scene.fluidlift.told = "done"
+        return {"FINISHED"}
+
+
+def changes(s: Settings) -> list[str]:
+    """Options of `fluidlift edit` for what the panel says."""
+
+    def numbers(values) -> str:
+        return "[" + ", ".join(f"{v:.9g}" for v in values) + "]"
+
+    words = [
+        f"parameters.kinematic_viscosity={s.viscosity:.9g}", f"parameters.density={s.density:.9g}",
+        f"parameters.gravity={numbers(s.gravity)}", f"parameters.inflow_velocity={numbers(s.inflow)}",
+        f"look.material={s.material}",
+    ]  # fmt: skip
+    if s.duration > 0:
+        words.append(f"duration={s.duration:.9g}")
+    return [x for word in words for x in ("--set", word)]
+
+
+def refresh(context: bpy.types.Context) -> None:
+    """Export the frames again and replace the objects."""
+    folder = asset_of(context)
+    had = {o.name for o in build.collection_objects(NAME)}
+    export(context, folder, "fluid volume" in had)
+    chosen = context.scene.fluidlift.material
+    assemble(context, folder, "fluid splats" in had or not had)
+    context.scene.fluidlift.material = chosen
+
+
+class Refresh(Guarded, bpy.types.Operator):
+    """Read the asset again, after it was simulated elsewhere"""
+
+    bl_idname, bl_label = "fluidlift.refresh", "Refresh"
+
+    def work(self, context: bpy.types.Context) -> set[str]:
+        refresh(context)
+        return {"FINISHED"}
+
+
+class AddObstacle(Guarded, bpy.types.Operator):
+    """Give the active mesh object to the fluid as an obstacle, where it stands"""
+
+    bl_idname, bl_label = "fluidlift.add_obstacle", "Add active object"
+
+    def work(self, context: bpy.types.Context) -> set[str]:
+        folder, thing, s = asset_of(context), context.active_object, context.scene.fluidlift
+        if thing is None or thing.type != "MESH":
+            raise RuntimeError("Select a mesh object first.")
+        name = "".join(c if c.isalnum() else "_" for c in thing.name)
+        build.write_obj(folder / f"{name}.obj", thing)
+        where = ", ".join(f"{v:.6g}" for v in thing.matrix_world.translation)
+        entry = f"{{name: {name}, mesh: {name}.obj, position: [{where}], motion: {s.motion}"
+        entry += f", density: {s.body_density:.6g}}}" if s.motion == "free" else "}"
+        run([command_of(context), "edit", str(folder), "--add", f"obstacles={entry}"])
+        thing.hide_set(True)  # the imported one takes its place after the simulation
+        s.told = f"{name} is in scene.yaml: simulate again"
+        return {"FINISHED"}
+
+
+class Panel(bpy.types.Panel):
+    """The sidebar."""
+
+    bl_idname, bl_label = "FLUIDLIFT_PT_asset", "fluidlift"
+    bl_space_type, bl_region_type, bl_category = "VIEW_3D", "UI", "fluidlift"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout, s = self.layout, context.scene.fluidlift
+        layout.prop(s, "asset")
+        layout.operator(ImportAsset.bl_idname).directory = s.asset
+        box = layout.box()
+        box.label(text="Fluid")
+        for name in ("viscosity", "density", "gravity", "inflow", "duration", "material"):
+            box.prop(s, name)
+        box = layout.box()
+        box.label(text="Obstacles")
+        box.prop(s, "motion")
+        if s.motion == "free":
+            box.prop(s, "body_density")
+        box.operator(AddObstacle.bl_idname)
+        row = layout.row(align=True)
+        row.operator(Simulate.bl_idname)
+        row.operator(Refresh.bl_idname)
+        if s.told:
+            layout.label(text=s.told)
+
+
+@persistent
+def follow_timeline(scene: bpy.types.Scene, *_) -> None:
+    """Put the current frame's files into the sequences."""
+    for thing in scene.objects:
+        if "fluidlift_folder" in thing:
+            try:
+                build.show_frame(thing, scene.frame_current)
+            except (OSError, ValueError) as error:  # a frame that is just being written: the last one stays
+                print(f"fluidlift: {error}")
+
+
+def menu(self, context: bpy.types.Context) -> None:
+    self.layout.operator(ImportAsset.bl_idname, text="Fluid asset (.fluid folder)")
+
+
+CLASSES = (Preferences, Settings, ImportAsset, Simulate, Refresh, AddObstacle, Panel)
+
+
+def register() -> None:
+    for cls in CLASSES:
+        bpy.utils.register_class(cls)
+    bpy.types.Scene.fluidlift = bpy.props.PointerProperty(type=Settings)
+    bpy.types.TOPBAR_MT_file_import.append(menu)
+    bpy.app.handlers.frame_change_pre.append(follow_timeline)
+
+
+def unregister() -> None:
+    bpy.app.handlers.frame_change_pre.remove(follow_timeline)
+    bpy.types.TOPBAR_MT_file_import.remove(menu)
+    del bpy.types.Scene.fluidlift
+    for cls in reversed(CLASSES):
+        bpy.utils.unregister_class(cls)

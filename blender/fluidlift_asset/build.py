@@ -1,0 +1,292 @@
+"""Objects in Blender for the parts of an asset. All are in metres with z up, as the asset is."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import bpy
+import numpy as np
+from mathutils import Matrix
+
+from .ply import columns, read_ply
+
+START = 1001
+"""number of the first frame"""
+FOLDER = "blender"
+"""of the asset: what is exported for Blender"""
+
+LIQUIDS = {
+    "water": ((0.82, 0.95, 1.0), 1.333, 0.02), "muddy_water": ((0.42, 0.30, 0.16), 1.333, 0.15),
+    "honey": ((0.95, 0.55, 0.08), 1.49, 0.05), "lava": ((0.9, 0.16, 0.02), 1.5, 0.7),
+    "milk": ((0.95, 0.93, 0.88), 1.35, 0.2), "oil": ((0.9, 0.8, 0.3), 1.47, 0.02),
+    "chocolate": ((0.16, 0.07, 0.03), 1.5, 0.25),
+}  # fmt: skip
+"""colour (linear), index of refraction, roughness"""
+OPAQUE = ("lava", "milk", "chocolate", "muddy_water", "source")
+
+
+def collection(name: str) -> bpy.types.Collection:
+    """An empty collection of this name in the scene; what an earlier import put there is removed."""
+    found = bpy.data.collections.get(name)
+    if found is None:
+        found = bpy.data.collections.new(name)
+        bpy.context.scene.collection.children.link(found)
+    for thing in list(found.objects):
+        data = thing.data
+        bpy.data.objects.remove(thing, do_unlink=True)
+        if isinstance(data, bpy.types.Mesh) and data.users == 0:
+            bpy.data.meshes.remove(data)
+    return found
+
+
+def frames(folder: Path, suffix: str = ".ply") -> list[int]:
+    """Numbers of the files of a sequence."""
+    return sorted(int(p.stem) for p in folder.glob(f"*{suffix}") if p.stem.isdigit())
+
+
+def up_to_date(made: Path, source: Path, suffix: str) -> bool:
+    """Whether every frame of `source` has a younger file in `made`."""
+    numbers = frames(source)
+    return bool(numbers) and frames(made, suffix) == numbers and all(
+        (made / f"{n}{suffix}").stat().st_mtime >= (source / f"{n}.ply").stat().st_mtime for n in numbers
+    )  # fmt: skip
+
+
+def liquid_material(name: str) -> bpy.types.Material:
+    """A material after the asset's look; its colour is that of the vertices where the look is the clip's own."""
+    title = f"fluidlift {name}"
+    material = bpy.data.materials.get(title) or bpy.data.materials.new(title)
+    material.use_nodes = True
+    tree = material.node_tree
+    shader = next(n for n in tree.nodes if n.type == "BSDF_PRINCIPLED")
+    color, index, roughness = LIQUIDS.get(name, ((0.5, 0.6, 0.65), 1.333, 0.2))
+    _set(shader, ("Base Color",), (*color, 1.0))
+    _set(shader, ("IOR",), index)
+    _set(shader, ("Roughness",), roughness)
+    _set(shader, ("Transmission Weight", "Transmission"), 0.0 if name in OPAQUE else 1.0)
+    if name == "lava":
+        _set(shader, ("Emission Color", "Emission"), (1.0, 0.25, 0.03, 1.0))
+        _set(shader, ("Emission Strength",), 6.0)
+    if name == "source":
+        attribute = next((n for n in tree.nodes if n.type == "ATTRIBUTE"), None) or tree.nodes.new(
+            "ShaderNodeAttribute"
+        )
+        attribute.attribute_name = "color"
+        tree.links.new(attribute.outputs["Color"], shader.inputs["Base Color"])
+    return material
+
+
+def _set(shader: bpy.types.ShaderNode, names: tuple[str, ...], value) -> None:
+    """The first input of these names that this version of Blender has."""
+    for name in names:
+        if name in shader.inputs:
+            shader.inputs[name].default_value = value
+            return
+
+
+def fill_surface(mesh: bpy.types.Mesh, file: Path) -> None:
+    """The mesh of one frame, with `velocity` (m/s, as Cycles takes it for motion blur) and `color`."""
+    vertices, faces = read_ply(file)
+    material = mesh.materials[0] if mesh.materials else None
+    mesh.clear_geometry()
+    points = columns(vertices, "x", "y", "z")
+    if points is None or len(faces) == 0:
+        return
+    mesh.vertices.add(len(points))
+    mesh.vertices.foreach_set("co", points.ravel())
+    mesh.loops.add(3 * len(faces))
+    mesh.loops.foreach_set("vertex_index", faces.astype(np.int32).ravel())
+    mesh.polygons.add(len(faces))
+    mesh.polygons.foreach_set("loop_start", np.arange(0, 3 * len(faces), 3, dtype=np.int32))
+    if bpy.app.version < (4, 1):  # later versions take the length from the next start
+        mesh.polygons.foreach_set("loop_total", np.full(len(faces), 3, np.int32))
+    mesh.polygons.foreach_set("use_smooth", np.ones(len(faces), bool))
+    attributes(mesh, vertices)
+    if material is not None and not mesh.materials:
+        mesh.materials.append(material)
+    mesh.update(calc_edges=True)
+
+
+def attributes(mesh: bpy.types.Mesh, table: np.ndarray) -> None:
+    """What the vertices carry: velocity, colour, and of splats size, opacity and id."""
+    velocity = columns(table, "vx", "vy", "vz")
+    if velocity is not None:
+        _attribute(mesh, "velocity", "FLOAT_VECTOR").data.foreach_set("vector", velocity.ravel())
+    color = columns(table, "red", "green", "blue")
+    if color is not None:
+        color = color / 255.0
+    else:
+        harmonic = columns(table, "f_dc_0", "f_dc_1", "f_dc_2")
+        color = None if harmonic is None else np.clip(0.5 + 0.28209479 * harmonic, 0.0, 1.0)
+    if color is not None:
+        linear = np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
+        full = np.concatenate([linear, np.ones((len(linear), 1))], axis=1).astype(np.float32)
+        _attribute(mesh, "color", "FLOAT_COLOR").data.foreach_set("color", full.ravel())
+    scale, opacity, number = (
+        columns(table, "scale_0", "scale_1", "scale_2"),
+        columns(table, "opacity"),
+        columns(table, "id"),
+    )
+    if scale is not None:
+        _attribute(mesh, "radius", "FLOAT").data.foreach_set("value", np.exp(scale).mean(axis=1).astype(np.float32))
+    if opacity is not None:
+        _attribute(mesh, "opacity", "FLOAT").data.foreach_set(
+            "value", (1 / (1 + np.exp(-opacity[:, 0]))).astype(np.float32)
+        )
+    if number is not None:
+        _attribute(mesh, "id", "INT").data.foreach_set("value", table["id"].astype(np.int32))
+
+
+def _attribute(mesh: bpy.types.Mesh, name: str, kind: str):
+    found = mesh.attributes.get(name)
+    return mesh.attributes.new(name, kind, "POINT") if found is None else found
+
+
+def fill_points(mesh: bpy.types.Mesh, file: Path) -> None:
+    """The splats of one frame as points with attributes."""
+    table, _ = read_ply(file)
+    mesh.clear_geometry()
+    points = columns(table, "x", "y", "z")
+    if points is None:
+        return
+    mesh.vertices.add(len(points))
+    mesh.vertices.foreach_set("co", points.ravel())
+    attributes(mesh, table)
+    mesh.update()
+
+
+FILLERS = {"surface": fill_surface, "splats": fill_points}
+"""how the sequences that follow the timeline are read"""
+
+
+def sequence(into: bpy.types.Collection, name: str, kind: str, folder: Path) -> bpy.types.Object | None:
+    """An object whose mesh follows the timeline; None where there are no files."""
+    numbers = frames(folder)
+    if not numbers:
+        return None
+    mesh = bpy.data.meshes.new(name)
+    thing = bpy.data.objects.new(name, mesh)
+    into.objects.link(thing)
+    thing["fluidlift_folder"], thing["fluidlift_kind"] = str(folder), kind
+    thing["fluidlift_frames"] = [numbers[0], numbers[-1]]
+    return thing
+
+
+def show_frame(thing: bpy.types.Object, number: int) -> None:
+    """Put the frame's file into an object of a sequence; before the first and after the last, these stay."""
+    first, last = thing["fluidlift_frames"]
+    number = min(max(number, first), last)
+    file = Path(thing["fluidlift_folder"]) / f"{number}.ply"
+    if thing.get("fluidlift_shown") == str(file) or not file.is_file():
+        return
+    FILLERS[thing["fluidlift_kind"]](thing.data, file)
+    thing["fluidlift_shown"] = str(file)
+
+
+def camera_of(into: bpy.types.Collection, file: Path) -> bpy.types.Object:
+    """The clip's camera: focal length, principal point and pose."""
+    facts = json.loads(Path(file).read_text(encoding="utf-8"))
+    width, height, k = facts["width"], facts["height"], facts["K"]
+    data = bpy.data.cameras.new("clip camera")
+    data.sensor_fit, data.sensor_width = "HORIZONTAL", 36.0
+    data.lens = k[0][0] * 36.0 / width
+    # shifts are counted in the longer side of the picture, which is the width here whatever its shape
+    data.shift_x = (0.5 * width - k[0][2]) / width
+    data.shift_y = (k[1][2] - 0.5 * height) / width
+    data.clip_start = 0.01
+    thing = bpy.data.objects.new("clip camera", data)
+    rotation, translation = np.array(facts["R"]), np.array(facts["t"])
+    pose = np.eye(4)
+    pose[:3, :3] = rotation.T @ np.diag([1.0, -1.0, -1.0])  # Blender's cameras look along -z with y up
+    pose[:3, 3] = -rotation.T @ translation
+    thing.matrix_world = Matrix(pose.tolist())
+    into.objects.link(thing)
+    render = bpy.context.scene.render
+    render.resolution_x, render.resolution_y = width, height
+    render.pixel_aspect_x, render.pixel_aspect_y = 1.0, k[0][0] / k[1][1]
+    bpy.context.scene.camera = thing
+    return thing
+
+
+def moved_in(into: bpy.types.Collection, importer) -> list[bpy.types.Object]:
+    """Objects that an importer adds, moved into a collection."""
+    before = set(bpy.data.objects)
+    importer()
+    added = [o for o in bpy.data.objects if o not in before]
+    for thing in added:
+        for old in list(thing.users_collection):
+            old.objects.unlink(thing)
+        into.objects.link(thing)
+    return added
+
+
+def terrain_of(into: bpy.types.Collection, file: Path) -> list[bpy.types.Object]:
+    """Bed and banks."""
+    if not hasattr(np, "bool"):  # the importer of Blender 3.4 still asks for the name that NumPy 1.24 has dropped
+        np.bool = bool
+    return moved_in(into, lambda: bpy.ops.import_scene.gltf(filepath=str(file)))
+
+
+def volume_of(into: bpy.types.Collection, folder: Path) -> bpy.types.Object | None:
+    """The OpenVDB sequence, hidden in pictures: what it is for are forces and further work."""
+    numbers = frames(folder, ".vdb")
+    if not numbers:
+        return None
+    data = bpy.data.volumes.new("fluid volume")
+    data.filepath = str(folder / f"{numbers[0]}.vdb")
+    data.is_sequence = len(numbers) > 1
+    data.frame_duration, data.frame_start, data.frame_offset = len(numbers), numbers[0], numbers[0] - 1
+    thing = bpy.data.objects.new("fluid volume", data)
+    thing.hide_render = True
+    into.objects.link(thing)
+    return thing
+
+
+def bodies_of(into: bpy.types.Collection, folder: Path) -> list[bpy.types.Object]:
+    """Obstacles, with a key on every frame where they move."""
+    file = folder / "bodies.json"
+    if not file.is_file():
+        return []
+    made = []
+    for body in json.loads(file.read_text(encoding="utf-8"))["bodies"]:
+        vertices, faces = read_ply(folder / body["mesh"])
+        mesh = bpy.data.meshes.new(body["name"])
+        points = columns(vertices, "x", "y", "z")
+        mesh.from_pydata([] if points is None else points.tolist(), [], faces.tolist())
+        thing = bpy.data.objects.new(body["name"], mesh)
+        thing.rotation_mode = "QUATERNION"
+        into.objects.link(thing)
+        poses = body["poses"]
+        still = all(p == poses[0] for p in poses)
+        for number, pose in zip(range(body["first"], body["first"] + len(poses)), poses):
+            thing.location, thing.rotation_quaternion = pose[:3], pose[3:]
+            if still:
+                break
+            thing.keyframe_insert("location", frame=number)
+            thing.keyframe_insert("rotation_quaternion", frame=number)
+        made.append(thing)
+    return made
+
+
+def collection_objects(name: str) -> list[bpy.types.Object]:
+    """Objects of a collection; none where there is no such."""
+    found = bpy.data.collections.get(name)
+    return [] if found is None else list(found.objects)
+
+
+def write_obj(path: Path, thing: bpy.types.Object) -> None:
+    """The mesh of an object as it is seen, with its scale and rotation, around its own origin."""
+    shown = thing.evaluated_get(bpy.context.evaluated_depsgraph_get())
+    mesh = shown.to_mesh()
+    try:
+        mesh.calc_loop_triangles()
+        turn = thing.matrix_world.to_3x3()
+        lines = ["v {:.7g} {:.7g} {:.7g}".format(*(turn @ v.co)) for v in mesh.vertices]
+        flip = turn.determinant() < 0  # a mirrored object would be inside out
+        for triangle in mesh.loop_triangles:
+            corners = [i + 1 for i in triangle.vertices]
+            lines.append("f {} {} {}".format(*(reversed(corners) if flip else corners)))
+    finally:
+        shown.to_mesh_clear()
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")

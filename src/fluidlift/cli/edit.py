@@ -1,0 +1,194 @@
+"""The command `edit`: change an asset's scene.yaml, undo, redo, look at what changed."""
+
+from __future__ import annotations
+
+import json as json_module
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from fluidlift.errors import FluidliftError, InputRejected
+
+if TYPE_CHECKING:
+    from fluidlift.pipeline.edit_history import Edit as Done
+    from fluidlift.pipeline.editing import Change, EditSession
+
+_DONE, _WITH_WARNINGS = 0, 4
+
+
+@dataclass(frozen=True)
+class Edit:
+    """Change a finished asset: parameters, inflow, terrain, obstacles, emitters, look. Every edit can be undone."""
+
+    asset: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="ASSET")]
+    """asset folder; without further options its edits are shown"""
+    material: Literal["source", "water", "muddy_water", "honey", "lava", "milk", "oil", "chocolate"] | None = None
+    """make it that liquid: density, viscosity and look; --set look.material=honey changes the look alone"""
+    remove: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default_factory=tuple)
+    """take something away, such as --remove obstacles.sphere1; may be repeated"""
+    add: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default_factory=tuple)
+    """one more of obstacles, emitters or terrain, such as --add obstacles='{shape: sphere, radius: 0.1}'; may be
+    repeated"""
+    set: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default_factory=tuple)
+    """another value, such as --set parameters.kinematic_viscosity=1e-3; may be repeated: all are one edit"""
+    undo: bool = False
+    """take the last edit back"""
+    redo: bool = False
+    """bring back what was undone last"""
+    reset: bool = False
+    """back to the fluid as lifted; this can be undone as well"""
+    diff: bool = False
+    """show what differs from the fluid as lifted"""
+    history: bool = False
+    """list all edits"""
+    meshes: Path | None = None
+    """folder of the mesh files that scene.yaml names; by default the asset"""
+    simulate: bool = False
+    """then do what the edit makes necessary: simulate, or only draw again"""
+    json: bool = False
+    """print the outcome as JSON"""
+
+
+def run(command: Edit) -> int:
+    """Do what the command says; the exit code.
+
+    Raises:
+        InputRejected: an edit that does not fit; nothing was changed.
+        FluidliftError: the simulation after the edit broke down; the edit stands.
+    """
+    from fluidlift.pipeline.editing import EditSession
+
+    session = EditSession.open(command.asset, meshes=command.meshes)
+    wanted = _wanted(command)
+    edit = _done(session, command) if wanted else None
+    if edit is not None and not command.json:  # before a simulation takes its time
+        print(f"{edit.what}\n{edit.diff()}", end="", flush=True)
+    if command.simulate:
+        _simulate(session, command)
+    told = _outcome(session, command, edit)
+    if command.json:
+        print(json_module.dumps(told, indent=1))
+    else:
+        print("\n".join(_lines(session, command, told, bool(wanted) and edit is None)))
+    return _WITH_WARNINGS if told["warnings"] else _DONE
+
+
+def changes_of(session: EditSession, command: Edit) -> list[Change]:
+    """What `--material`, `--remove`, `--add` and `--set` ask for, in this order.
+
+    Raises:
+        InputRejected: an option that is not of the form path=value, or a value that is no YAML.
+    """
+    from fluidlift.pipeline.editing import Add, Remove, Set
+
+    changes: list[Change] = [] if command.material is None else session.made_of(command.material)
+    changes += [Remove(path) for path in command.remove]
+    for text in command.add:
+        section, value = _pair(text, "--add", "obstacles='{shape: sphere, radius: 0.1}'")
+        changes.append(Add(section, value))
+    return changes + [Set(*_pair(text, "--set", "parameters.gravity='[0, 0, -9.81]'")) for text in command.set]
+
+
+def _wanted(command: Edit) -> str:
+    """Which kind of edit is asked for; "" for none."""
+    changes = bool(command.material or command.remove or command.add or command.set)
+    asked = [n for n in ("undo", "redo", "reset") if getattr(command, n)] + ["changes"] * changes
+    if len(asked) > 1:
+        options = " and ".join("--material, --remove, --add or --set" if n == "changes" else f"--{n}" for n in asked)
+        raise InputRejected(f"{options} at once", "one of them", "use one command for each")
+    return asked[0] if asked else ""
+
+
+def _done(session: EditSession, command: Edit) -> Done | None:
+    if command.undo:
+        return session.undo()
+    if command.redo:
+        return session.redo()
+    return session.reset() if command.reset else session.apply(changes_of(session, command))
+
+
+def _pair(text: str, option: str, example: str) -> tuple[str, Any]:
+    """The place and the YAML value of `place=value`."""
+    import yaml
+
+    from fluidlift.io.scene import parse_yaml
+
+    place, mark, value = text.partition("=")
+    if not mark or not place.strip():
+        raise InputRejected(f"{option} {text}", f"place=value, such as {option} {example}")
+    try:
+        return place.strip(), parse_yaml(value)
+    except (yaml.YAMLError, ValueError, TypeError, LookupError, RecursionError, AttributeError) as error:
+        why = getattr(error, "problem", None) or error
+        raise InputRejected(
+            f"{option} {text}: '{value}' is no value ({why})", "a number, a text, [a list] or {name: value}",
+            f"put it into quotes for the shell: {option} {example}",
+        ) from None  # fmt: skip
+
+
+def _simulate(session: EditSession, command: Edit) -> None:
+    from fluidlift.cli import _progress
+    from fluidlift.pipeline import SimulationRequest, resimulate
+
+    try:
+        with _progress() as progress:
+            resimulate(session.folder, request=SimulationRequest(meshes=command.meshes), progress=progress)
+    except FluidliftError as error:  # most likely by the last edit
+        done = [e for e in session.history() if not e.undone]
+        if not done:
+            raise
+        undo = f"fluidlift edit {_quoted(session.folder)} --undo"
+        raise type(error)(f"{error} The last edit was: {done[-1].what}. It stands; to take it back: {undo}") from None
+
+
+def _outcome(session: EditSession, command: Edit, edit: Done | None) -> dict[str, Any]:
+    """All that is to be told, as plain values."""
+    warnings = session.warnings()
+    try:
+        stale = sorted(session.stale())
+    except InputRejected as error:  # the edit is done, and can be undone
+        stale, warnings = ["simulate"], [*warnings, f"this scene cannot be simulated as it is: {error}"]
+    told = {
+        "asset": str(session.folder),
+        "edit": None if edit is None else edit.to_dict(),
+        "stale": stale,
+        "warnings": warnings,
+        "can_undo": session.can_undo,
+        "can_redo": session.can_redo,
+        "scene": session.scene,
+    }
+    if command.diff:
+        told["diff"] = session.diff()
+    if command.history:
+        told["history"] = [e.to_dict() | {"undone": e.undone} for e in session.history()]
+    return told
+
+
+def _lines(session: EditSession, command: Edit, told: dict[str, Any], nothing: bool) -> list[str]:
+    lines = ["nothing to change: scene.yaml says so already"] * nothing
+    if command.history:
+        edits = session.history()
+        lines += [f"{e.number:4}  {e.time[:19]:19}  {e.what}{'  (undone)' if e.undone else ''}" for e in edits]
+        lines += ["no edits yet"] * (not edits)
+    if command.diff or not (told["edit"] or nothing or command.history or command.simulate):
+        lines.append(session.diff().rstrip("\n") or "nothing differs from the fluid as lifted")
+    return lines + [f"warning: {text}" for text in told["warnings"]] + _next(session.folder, told["stale"])
+
+
+def _next(folder: Path, stale: list[str]) -> list[str]:
+    """What has become stale, and what to run."""
+    if "simulate" in stale:
+        return ["the frames on disk show another scene; next:", f"  fluidlift sim {_quoted(folder)}"]
+    if "look" in stale:
+        film = _quoted(Path(folder.stem + ".mp4"))
+        return ["only the look is another one, and nothing has to be simulated again; next:",
+                f"  fluidlift render {_quoted(folder)} -o {film}"]  # fmt: skip
+    return ["the frames on disk show this scene"]
+
+
+def _quoted(folder: Path) -> str:
+    import shlex
+
+    return shlex.quote(str(folder))

@@ -1,0 +1,153 @@
+"""One HTML file that plays an asset offline: frames, terrain, script and poster inside, nothing is fetched."""
+
+from __future__ import annotations
+
+import base64
+import html
+import importlib.resources
+import json
+import zlib
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fluidlift.errors import require
+from fluidlift.io.atomic import atomic_write, plain
+from fluidlift.io.export_gltf import encoded, once_per_corner
+from fluidlift.io.page_frames import FrameEncoder, Range
+from fluidlift.types import Gaussians, PinholeCamera, TriangleMesh
+
+TEXTURE_MAX = 1024
+"""px, longer side of the terrain's texture in the page"""
+BASE64 = 4 / 3
+"""characters of the page per byte of its data"""
+
+
+@dataclass(frozen=True)
+class PageScene:
+    """What a page shows beside the frames."""
+
+    title: str
+    camera: PinholeCamera
+    """where the view starts"""
+    target: tuple[float, float, float]
+    """m: what the view turns about"""
+    interval: float
+    """s between the frames of the page"""
+    numbers: tuple[int, ...]
+    """of the frames, from 1001"""
+    poster: np.ndarray
+    """u8 [h,w,3] sRGB, shown until the first frame is there"""
+    terrain: TriangleMesh | None = None
+    terrain_opacity: float = 1.0
+    """0 to 1; a vessel must not hide what it holds"""
+    warnings: tuple[str, ...] = ()
+    """what was left out, for who looks at it"""
+    facts: tuple[str, ...] = field(default_factory=tuple)
+    """short ones, for the line under the title"""
+
+
+def write_page(
+    path: Path | str, frames: Iterable[tuple[Gaussians, np.ndarray]], held: Range, scene: PageScene
+) -> tuple[Path, int]:
+    """Write the page; frames (with ids int [n], each once) are taken one by one, and memory does not grow with them.
+
+    Args:
+        path: of the .html file.
+        frames: as many as `scene.numbers`.
+        held: range of all of them.
+        scene: the rest.
+
+    Returns:
+        The path, and the size of the file in bytes.
+
+    Raises:
+        InputRejected: the disk does not take it.
+        ValueError: another number of frames.
+    """
+    encoder, count = FrameEncoder(held), 0
+    viewer = _part("viewer.js")
+    with atomic_write(path) as file:
+        file.write(_head(scene, held).encode())
+        terrain = _shown(scene.terrain)
+        file.writelines(line.encode() for line in ([] if terrain is None else _terrain(terrain)))
+        for gaussians, ids in frames:
+            data = base64.b64encode(encoder.encode(gaussians, ids))
+            file.write(b'<script type="text/plain" class="frame">' + data + b"</script>\n")
+            count += 1
+        require(count == len(scene.numbers), f"{count} frames", f"{len(scene.numbers)}")
+        tail = f"<script>\n{viewer}</script>\n</body>\n</html>\n".encode()
+        size = file.tell() + len(tail) + 80
+        told = json.dumps(f" · {size / 1e6:.1f} MB")
+        file.write(f'<script type="application/json" id="size">{told}</script>\n'.encode() + tail)
+    return Path(path), Path(path).stat().st_size
+
+
+def _part(name: str) -> str:
+    return (importlib.resources.files("fluidlift.io") / "page" / name).read_text(encoding="utf-8")
+
+
+def _head(scene: PageScene, held: Range) -> str:
+    terrain = _shown(scene.terrain)
+    about: dict[str, Any] = {
+        "range": held.to_dict(), "frames": len(scene.numbers), "numbers": scene.numbers, "interval": scene.interval,
+        "camera": scene.camera.to_dict(), "target": scene.target, "extent": _extent(held, scene), "terrain": None,
+    }  # fmt: skip
+    if terrain is not None:
+        about["terrain"] = {"vertices": len(once_per_corner(terrain)[0]), "faces": len(terrain.faces),
+                            "textured": terrain.texture is not None, "opacity": scene.terrain_opacity}  # fmt: skip
+    poster = base64.b64encode(encoded(scene.poster, "JPEG", quality=85)).decode()
+    fields = {
+        "TITLE": html.escape(scene.title),
+        "POSTER_ALT": html.escape(f"first frame of {scene.title}"),
+        "POSTER": f"data:image/jpeg;base64,{poster}",
+        "FACTS": html.escape(" · ".join(scene.facts)),
+        "WARNINGS": "".join(f'<p class="warn">{html.escape(text)}</p>' for text in scene.warnings),
+        "PAGE": json.dumps(plain(about), allow_nan=False).replace("</", "<\\/"),
+    }
+    text = _part("page.html")
+    for name, value in fields.items():
+        text = text.replace(f"@{name}@", value)
+    return text
+
+
+def _extent(held: Range, scene: PageScene) -> float:
+    """m, about the size of all that is seen."""
+    reach = float(np.linalg.norm(np.subtract(scene.target, scene.camera.position)))
+    terrain = _shown(scene.terrain)
+    if terrain is None:
+        return max(reach, 65535 * held.step)
+    return max(reach, float(np.linalg.norm(np.ptp(terrain.vertices, axis=0))))
+
+
+def _shown(terrain: TriangleMesh | None) -> TriangleMesh | None:
+    return terrain if terrain is not None and len(terrain.faces) else None
+
+
+def _terrain(mesh: TriangleMesh) -> list[str]:
+    """The ground as the script reads it: points, texture coordinates or colours (float32), faces (uint32); deflated."""
+    vertices, faces, uv = once_per_corner(mesh)
+    points = np.asarray(mesh.vertices, np.float32)[vertices]
+    if uv is not None and mesh.texture is not None:
+        look = uv
+    else:
+        grey = np.full((len(mesh.vertices), 3), 0.55, np.float32)
+        look = (grey if mesh.colors is None else np.clip(np.asarray(mesh.colors, np.float32), 0, 1))[vertices]
+    parts = b"".join(np.ascontiguousarray(p).tobytes() for p in (points, look.astype("<f4"), faces.astype("<u4")))
+    data = base64.b64encode(zlib.compress(parts, 9)).decode()
+    lines = [f'<script type="text/plain" id="terrain">{data}</script>\n']
+    if mesh.texture is not None:
+        picture = base64.b64encode(encoded(_smaller(mesh.texture), "JPEG", quality=85)).decode()
+        lines.append(f'<script type="text/plain" id="texture">data:image/jpeg;base64,{picture}</script>\n')
+    return lines
+
+
+def _smaller(picture: np.ndarray) -> np.ndarray:
+    from PIL import Image
+
+    image = Image.fromarray(picture)
+    image.thumbnail((TEXTURE_MAX, TEXTURE_MAX))
+    return np.asarray(image)

@@ -1,0 +1,26 @@
+"""SHA-256 of files: whether they are still what was written."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+
+def digest(path: Path) -> str:
+    """SHA-256 of a file's content, 64 hexadecimal digits."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def digests(folder: Path | str, names: Iterable[str]) -> dict[str, str]:
+    """SHA-256 of those of the files that are there, by name relative to the folder."""
+    folder = Path(folder)
+    return {name: digest(folder / name) for name in sorted(set(names)) if (folder / name).is_file()}
+
+
+def altered(folder: Path | str, recorded: Mapping[str, str]) -> tuple[list[str], list[str]]:
+    """Names of files that are missing, and of those whose content is not what was recorded."""
+    found = digests(folder, recorded)
+    missing = [name for name in recorded if name not in found]
+    return missing, [name for name, value in found.items() if value != recorded[name]]

@@ -1,0 +1,97 @@
+"""Whether what a person put into a scene lies where the simulation takes place."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fluidlift.errors import InputRejected
+from fluidlift.io.obstacles import Obstacle
+from fluidlift.io.scene import SceneEdits
+from fluidlift.physics.terrain_edit import Replace
+from fluidlift.types import Grid, TriangleMesh, matrix_from_quat
+
+HUGE = 20.0
+"""times the domain's longest side above which a mesh is taken to be in other units"""
+MOSTLY = 0.5
+"""share of a mesh's extent outside the domain above which one is warned"""
+
+
+def require_inside(edits: SceneEdits, grid: Grid, *, reach: float = 0.0) -> list[str]:
+    """See that obstacles, emitters and a new terrain touch the simulation's box.
+
+    Args:
+        edits: of scene.yaml.
+        grid: that is simulated on.
+        reach: m by which the box may become longer than that to each side (a channel that is extended).
+
+    Returns:
+        Warnings about those that lie mostly outside.
+
+    Raises:
+        InputRejected: one that lies wholly outside, or is many times larger than the box; the message names its line.
+    """
+    low = np.asarray(grid.low, float) - [reach, reach, 0.0]
+    high = np.asarray(grid.high, float) + [reach, reach, 0.0]
+    warnings = []
+    for obstacle in edits.obstacles:
+        what = f"{obstacle.line}: obstacle '{obstacle.name}'"
+        warnings += _judged(what, _all_places(obstacle), (low, high), still=obstacle.motion == "static")
+    for emitter in edits.emitters:
+        warnings += _judged(f"{emitter.line}: emitter '{emitter.name}'", [_points(emitter.mesh)], (low, high))
+    for edit in edits.terrain:
+        if isinstance(edit, Replace):  # a bed may go on far beyond the box
+            _judged(f"{edit.line}: the terrain's mesh", [_points(edit.mesh)], (low, high), still=False)
+    return warnings
+
+
+def _points(mesh: TriangleMesh) -> np.ndarray:
+    return np.asarray(mesh.vertices, float)
+
+
+def _all_places(obstacle: Obstacle) -> list[np.ndarray]:
+    """The vertices in the world, m, at the start and at each keyframe."""
+    points = _points(obstacle.mesh)
+    poses = [(k.rotation, k.position) for k in obstacle.keyframes] or [(obstacle.rotation, obstacle.position)]
+    return [points @ matrix_from_quat(turn).T + np.asarray(at, float) for turn, at in poses]
+
+
+def _judged(
+    what: str, places: list[np.ndarray], box: tuple[np.ndarray, np.ndarray], *, still: bool = True
+) -> list[str]:
+    low, high = box
+    size = float(max(np.ptp(p, axis=0).max() for p in places))
+    side = float((high - low).max())
+    if size > HUGE * side:
+        raise InputRejected(
+            f"{what} is {size:.3g} m long, in a domain of {side:.3g} m", f"metres, at most {HUGE:g} times the domain",
+            f"is it in millimetres or centimetres? write scale: {_unit(size / side):g}",
+        )  # fmt: skip
+    touching = [p for p in places if ((p.max(axis=0) > low) & (p.min(axis=0) < high)).all()]
+    if not touching and len(places) > 1:  # it may pass through between two keyframes
+        together = np.concatenate(places)
+        touching = [together] * bool(((together.max(axis=0) > low) & (together.min(axis=0) < high)).all())
+    if not touching:
+        start = places[0]
+        raise InputRejected(
+            f"{what} from {_place(start.min(axis=0))} to {_place(start.max(axis=0))} m lies outside the domain",
+            f"a place within {_place(low)} to {_place(high)} m", "change its position or scale",
+        )  # fmt: skip
+    outside = min(1.0 - _share_inside(p, low, high) for p in touching)
+    if still and outside > MOSTLY:
+        return [f"{what} lies outside the domain with {100 * outside:.0f} % of its extent: only the rest acts"]
+    return []
+
+
+def _share_inside(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> float:
+    """Of the volume of the box around some points."""
+    first, last = points.min(axis=0), points.max(axis=0)
+    common = np.minimum(last, high) - np.maximum(first, low)
+    return float(np.prod(np.clip(common, 0.0, None) / np.maximum(last - first, 1e-12)))
+
+
+def _unit(ratio: float) -> float:
+    return 0.001 if ratio > 200 else 0.01
+
+
+def _place(point: np.ndarray) -> str:
+    return "(" + ", ".join(f"{x:.3g}" for x in point) + ")"

@@ -1,0 +1,273 @@
+"""A liquid's surface as a camera sees it, and the light that it sends there.
+
+One surface per pixel: light is mirrored at it, or enters, is bent, absorbed and scattered on its way and leaves on the
+far side, where the picture of what lies behind is taken (Wyman 2005, image-space refraction through two interfaces;
+van der Laan, Green and Sainz 2009). Everything is linear light.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from fluidlift.errors import require
+from fluidlift.look.environment import LEVELS, LUMINANCE, Environment
+from fluidlift.look.liquid_kernels import (
+    COLOR,
+    INWARD,
+    MIRROR,
+    NUMBERS,
+    OUTSIDE,
+    PATH,
+    SHARE,
+    SPREAD,
+    THROUGH,
+    TURNED,
+    follow,
+    shade,
+)
+from fluidlift.look.materials import Material
+from fluidlift.look.optics import fresnel, transmittance
+from fluidlift.types.camera import PinholeCamera
+
+SHARP = 0.004
+"""GGX's alpha up to which a mirror shows what a pixel of the environment's picture can hold"""
+WAVELENGTHS = np.array([611e-9, 549e-9, 465e-9])
+"""m, dominant of the primaries of sRGB"""
+SECOND_RADIATION = 0.014388
+"""m K, Planck's law"""
+COOL, HOT = 900.0, 1430.0
+"""K, of black liquid that glows and of the brightest"""
+WARM = 0.62
+"""how hot a colour of the usual luminance is, from `COOL` (0) to `HOT` (1)"""
+CONTRAST = 1.5
+"""power of the luminance over the usual one, from which heat rises towards `HOT` without ever being cut off there"""
+DIM = 0.5
+"""roughness at which surroundings are seen by light that is mirrored at the far side: from there it leaves through other
+sides of the liquid, into many directions"""
+DULL = 0.9
+"""share of the reflection at grazing angles, above that straight on, that a rough surface lacks: its slopes hide each
+other there"""
+
+
+@dataclass(frozen=True)
+class LiquidSurface:
+    """The nearest surface of a liquid in every pixel."""
+
+    depth: Float[np.ndarray, "h w"]
+    """camera z, m; 0 where there is no liquid"""
+    normal: Float[np.ndarray, "h w 3"]
+    """unit, world, towards the viewer"""
+    thickness: Float[np.ndarray, "h w"]
+    """m of liquid along the straight line of sight"""
+    albedo: Float[np.ndarray, "h w 3"]
+    """linear colour that the liquid carries (of its splats)"""
+    covered: Float[np.ndarray, "h w"]
+    """share of the pixel, 0 to 1"""
+    back_normal: Float[np.ndarray, "h w 3"] | None = None
+    """unit, world, away from the liquid on its far side; None: as if the far side were parallel to the near one"""
+
+    def __post_init__(self) -> None:
+        shape = self.depth.shape
+        shapes = {"normal": (*shape, 3), "thickness": shape, "albedo": (*shape, 3), "covered": shape}
+        if self.back_normal is not None:
+            shapes["back_normal"] = (*shape, 3)
+        for name, wanted in (("depth", shape), *shapes.items()):
+            array = np.ascontiguousarray(getattr(self, name), np.float32)
+            require(array.ndim >= 2 and array.shape == wanted, f"{name} of shape {array.shape}", str(wanted))
+            object.__setattr__(self, name, array)
+
+
+@dataclass(frozen=True)
+class Behind:
+    """The picture without the liquid."""
+
+    image: Float[np.ndarray, "h w 3"]
+    """linear"""
+    depth: Float[np.ndarray, "h w"]
+    """camera z, m; 0: infinitely far"""
+
+    def __post_init__(self) -> None:
+        shape = np.shape(self.depth)
+        for name, wanted in (("depth", shape), ("image", (*shape, 3))):
+            array = np.ascontiguousarray(getattr(self, name), np.float32)
+            require(array.ndim >= 2 and array.shape == wanted, f"{name} of shape {array.shape}", str(wanted))
+            object.__setattr__(self, name, array)
+
+
+def shaded(
+    surface: LiquidSurface,
+    behind: Behind,
+    camera: PinholeCamera,
+    material: Material,
+    environment: Environment,
+    *,
+    usual: float | None = None,
+) -> Float[np.ndarray, "h w 3"]:
+    """The finished picture: `behind`, with the liquid before it where it is nearer.
+
+    Light mirrored at the surface comes from the environment, wider with the roughness and where the surface is
+    curved within a pixel. What enters is bent after Snell, runs to the far side (a plane through the end of the
+    straight line of sight, with `back_normal`), leaves it bent again and meets what lies behind, which is looked up in
+    the picture. The share that is mirrored on the far side (Fresnel's, up to all of it), and light that comes from
+    outside the picture, is the environment's. On the way exp(-(absorption + scattering) d) is left, and
+    1 - exp(-scattering d) of the body's own colour is added, lit by the environment's irradiance (single scattering;
+    `Material.albedo` is the limit of a deep body). A clear liquid in a uniformly white world is white, whatever its
+    shape.
+
+    Not there: reflections of the ground in the liquid, shadows on the liquid, caustics.
+
+    Args:
+        surface: of the liquid.
+        behind: the picture without it, of the same size. What is nearer than the liquid hides it.
+        camera: who looks.
+        material: the liquid.
+        environment: the light.
+        usual: luminance (linear) of the carried colour that is `WARM`, for what glows; None: the mean of this picture.
+            One number for a whole film keeps the glow of things that stay.
+
+    Returns:
+        Linear float32.
+
+    Raises:
+        ValueError: pictures of different sizes.
+    """
+    _check(surface, behind, camera)
+    picture = behind.image.copy()
+    if usual is None:
+        usual = _usual(surface, behind) if max(material.emission) > 0 else 1.0
+    pictures, steps = _pictures(environment)
+    back = surface.normal if surface.back_normal is None else surface.back_normal
+    numbers = np.array([
+        material.refractive_index, material.roughness, material.scattering, _straight(material), DULL, material.carried,
+        SHARP, max(usual, 1e-6), COOL, HOT, WARM, CONTRAST, *material.absorption, *material.albedo, *material.emission,
+    ])  # fmt: skip
+    shade(
+        surface.covered, surface.depth, surface.normal, back, surface.back_normal is not None, surface.thickness,
+        surface.albedo, behind.image, behind.depth, *_eye(camera), pictures, steps, _DIM, environment.diffuse, numbers,
+        LUMINANCE, SECOND_RADIATION / WAVELENGTHS, picture,
+    )  # fmt: skip
+    return picture
+
+
+def shaded_plain(
+    surface: LiquidSurface, behind: Behind, camera: PinholeCamera, material: Material, environment: Environment
+) -> Float[np.ndarray, "h w 3"]:
+    """What `shaded` does, in NumPy, for reading."""
+    _check(surface, behind, camera)
+    rows, columns = np.nonzero(_seen(surface, behind))
+    picture = behind.image.copy()
+    rays = followed(surface, behind, camera, np.stack([rows, columns], axis=-1), material.refractive_index)
+    # slopes within a pixel widen the lobe like roughness: else they sparkle (Kaplanyan et al. 2016)
+    spread = np.maximum(rays.spread - SHARP, 0.0)
+    mirrored = environment.blurred(rays.mirror, (material.roughness**4 + spread**2) ** 0.25)
+    through = np.where(rays.surroundings[:, None], environment.toward(rays.through), rays.color)
+    through += rays.turned[:, None] * (environment.blurred(rays.inward, DIM) - through)
+    inside = through * transmittance(np.asarray(material.absorption) + material.scattering, rays.path)
+    seen = -np.expm1(-material.scattering * rays.path)[:, None]
+    carried = surface.albedo[rows, columns]
+    albedo = np.asarray(material.albedo, np.float32) * (1.0 - material.carried) + material.carried * carried
+    inside += seen * albedo * environment.irradiance(surface.normal[rows, columns])
+    inside += seen * np.asarray(material.emission, np.float32) * glow(carried, _usual(surface, behind))
+    straight = _straight(material)
+    share = (straight + (rays.share - straight) * (1.0 - DULL * material.roughness))[:, None]
+    light = share * mirrored + (1.0 - share) * inside
+    picture[rows, columns] += surface.covered[rows, columns][:, None] * (light - picture[rows, columns])
+    return picture
+
+
+def _check(surface: LiquidSurface, behind: Behind, camera: PinholeCamera) -> None:
+    width, height = camera.size
+    require(surface.depth.shape == (height, width), f"a surface of {surface.depth.shape}", f"({height}, {width})")
+    require(behind.depth.shape == (height, width), f"a background of {behind.depth.shape}", f"({height}, {width})")
+
+
+def _seen(surface: LiquidSurface, behind: Behind) -> np.ndarray:
+    """bool [h,w]: the liquid is there, and nothing before it."""
+    there = (surface.covered > 0) & (surface.depth > 0)
+    return there & ((behind.depth <= 0) | (surface.depth < behind.depth))
+
+
+def _usual(surface: LiquidSurface, behind: Behind) -> float:
+    carried = surface.albedo[_seen(surface, behind)]
+    return float((carried @ LUMINANCE).mean()) if len(carried) else 1.0
+
+
+def _straight(material: Material) -> float:
+    return float(fresnel(np.ones(1), material.refractive_index)[0])
+
+
+def _eye(camera: PinholeCamera) -> tuple[np.ndarray, np.ndarray]:
+    lens = np.array([*camera.focal, *camera.center], np.float64)
+    return lens, np.ascontiguousarray(camera.camera_from_world.rotation, np.float64)
+
+
+_STEPS = np.array([0.0, *(roughness for roughness, _ in LEVELS)])
+_DIM = int(np.argmin(np.abs(_STEPS - DIM)))
+
+
+def _pictures(environment: Environment) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
+    """The environment and its prefiltered pictures, and their roughnesses."""
+    pictures = [environment.between(float(roughness))[0] for roughness in _STEPS[:-1]]
+    return (*pictures, environment.between(1.0)[1]), _STEPS
+
+
+@dataclass(frozen=True)
+class Followed:
+    """Where the light of n pixels comes from."""
+
+    share: Float[np.ndarray, "n"]
+    """mirrored, 0 to 1"""
+    mirror: Float[np.ndarray, "n 3"]
+    """world direction of the mirrored ray"""
+    through: Float[np.ndarray, "n 3"]
+    """world direction of the ray behind the liquid"""
+    path: Float[np.ndarray, "n"]
+    """m in the liquid"""
+    surroundings: np.ndarray
+    """bool [n]: what comes through is the environment's"""
+    turned: Float[np.ndarray, "n"]
+    """share of what comes through, 0 to 1, that was mirrored at the far side"""
+    inward: Float[np.ndarray, "n 3"]
+    """world direction from which that comes"""
+    color: Float[np.ndarray, "n 3"]
+    """linear, what comes through where it is the picture's"""
+    spread: Float[np.ndarray, "n"]
+    """of the normals in the pixel, GGX's alpha"""
+
+
+def followed(
+    surface: LiquidSurface, behind: Behind, camera: PinholeCamera, pixels: np.ndarray, refractive_index: float
+) -> Followed:
+    """Follow the light of `pixels` (int [n,2]: row, column) back through the liquid."""
+    rays = np.zeros((len(pixels), NUMBERS))
+    back = surface.normal if surface.back_normal is None else surface.back_normal
+    follow(
+        np.ascontiguousarray(pixels, np.int64), surface.depth, surface.normal, back, surface.back_normal is not None,
+        surface.thickness, behind.image, behind.depth, *_eye(camera), float(refractive_index), rays,
+    )  # fmt: skip
+    r = rays.astype(np.float32)
+
+    def three(at: int) -> np.ndarray:
+        return r[:, at : at + 3]
+
+    return Followed(
+        r[:, SHARE], three(MIRROR), three(THROUGH), r[:, PATH], r[:, OUTSIDE] > 0, r[:, TURNED], three(INWARD),
+        three(COLOR), r[:, SPREAD],
+    )  # fmt: skip
+
+
+def glow(carried: Float[np.ndarray, "n 3"], usual: float) -> Float[np.ndarray, "n 3"]:
+    """Share of the full emission, 0 to 1, of liquid with these linear colours: what is brighter than usual is hot.
+
+    Wien's law between `COOL` and `HOT` kelvin: a cooler body is darker, and redder, as in the world.
+
+    Args:
+        carried: linear colours.
+        usual: luminance of the colour that is `WARM` of the way from cool to hot.
+    """
+    warmth = 1.0 - (1.0 - WARM) ** ((carried @ LUMINANCE) / max(usual, 1e-6)) ** CONTRAST
+    kelvin = COOL + (HOT - COOL) * warmth
+    return np.exp((1.0 / HOT - 1.0 / kelvin)[:, None] * (SECOND_RADIATION / WAVELENGTHS)).astype(np.float32)

@@ -1,0 +1,273 @@
+"""Frames of an asset in another look than its splats' own: relit, transparent, or as the surface of a liquid."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fluidlift.errors import InputRejected
+from fluidlift.io.color import linear_from_srgb, srgb_from_linear
+from fluidlift.io.scene_look import Look
+from fluidlift.look.display import displayed
+from fluidlift.look.environment import BUILT_IN, Environment, built_in
+from fluidlift.look.fluid_normals import fluid_normals
+from fluidlift.look.ground_picture import ground_picture
+from fluidlift.look.liquid import Behind, LiquidSurface, shaded
+from fluidlift.look.materials import Material, material_named
+from fluidlift.look.rasterize import render
+from fluidlift.look.relight import relit
+from fluidlift.look.screen_space import mesh_surface, particle_surface
+from fluidlift.look.transparent import splat_surface
+from fluidlift.pipeline.scene import LYING
+from fluidlift.pipeline.surfacing import RADIUS, surface_of
+from fluidlift.types import Gaussians, PinholeCamera, Similarity3, Terrain, TriangleMesh, matrix_from_quat
+
+if TYPE_CHECKING:
+    from fluidlift.backends.mitsuba_renderer import MitsubaRenderer
+    from fluidlift.io.obstacles import Obstacle
+    from fluidlift.seams import Mesher
+
+ENGINES = ("mesh", "screen", "mitsuba")
+"""of the look surface: its mesh drawn in one pass; the particles themselves in screen space, several times faster and
+softer; path tracing of the mesh"""
+MARGIN = 1.5
+"""cells behind a solid over which a splat fades: its middle may lie a little inside the bed"""
+SKY_BLUR = 0.5
+"""roughness at which a studio is seen behind everything: lamps are for light, not to look at"""
+
+FLOOR = 0.45
+"""linear grey seen straight below"""
+HORIZON = 0.08
+"""sine of the angle over which floor and sky flow into each other"""
+
+
+@dataclass(frozen=True)
+class Lit:
+    """One picture in linear light."""
+
+    image: np.ndarray
+    """[h,w,3]; premultiplied by `alpha` where the fluid is cut out"""
+    alpha: np.ndarray
+    """[h,w], share that is covered"""
+    depth: np.ndarray
+    """[h,w] camera z, m; 0 where nothing is"""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What stands before the camera in one frame."""
+
+    fluid: Gaussians
+    velocities: np.ndarray
+    """[n,3], m/s"""
+    bodies: Sequence[TriangleMesh] = ()
+    """obstacles, in the world"""
+
+
+@dataclass(frozen=True)
+class Backdrop:
+    """What is behind the fluid."""
+
+    picture: np.ndarray | None = None
+    """[h,w,3] linear, which shows the ground as well; None: the terrain before the environment"""
+    depth: np.ndarray | None = None
+    """[h,w] camera z (m) at which the picture hides the fluid, 0 where it does not; None: nowhere"""
+    cut_out: bool = False
+    """the terrain hides the fluid and the obstacles, and is not drawn itself"""
+
+
+def placed_bodies(obstacles: Sequence[Obstacle], poses: np.ndarray) -> list[TriangleMesh]:
+    """Meshes of obstacles where they are: poses [b,7], position (m) and orientation (w, x, y, z)."""
+    return [
+        TriangleMesh(
+            Similarity3(1.0, matrix_from_quat(p[3:]), p[:3]).points(o.mesh.vertices), o.mesh.faces, o.mesh.colors
+        )
+        for o, p in zip(obstacles, poses, strict=True)
+    ]
+
+
+def environment_of(folder: Path, name: str) -> Environment:
+    """A built-in environment, or a .hdr or .exr file in the asset's folder (or any, by an absolute path).
+
+    Raises:
+        InputRejected: an unknown name, or a file that is no environment.
+    """
+    from fluidlift.io.asset_folder import asset_file
+    from fluidlift.io.environments import read_environment_image
+
+    if Path(name).suffix.lower() not in (".hdr", ".exr"):
+        return built_in(name)
+    path = Path(name) if Path(name).is_absolute() else asset_file(folder, name)
+    return Environment(read_environment_image(path))
+
+
+class Painter:
+    """Draws the frames of one asset in one look.
+
+    Args:
+        look: its style is relit, transparent or surface.
+        terrain: of the asset.
+        folder: of the asset, where environments lie.
+        kind: of the fluid; what lies on a bed has no surface towards it.
+        engine: of the look surface, one of `ENGINES`.
+        samples: per pixel, of Mitsuba.
+
+    Raises:
+        InputRejected: an unknown material, environment or engine.
+        MissingPackage: the engine or the mesher is not installed.
+    """
+
+    def __init__(
+        self,
+        look: Look,
+        terrain: Terrain,
+        folder: Path,
+        *,
+        kind: str = "stream",
+        engine: str = "mesh",
+        samples: int = 64,
+    ) -> None:
+        if engine not in ENGINES:
+            near = difflib.get_close_matches(engine, ENGINES, 1)
+            raise InputRejected(f"no engine '{engine}'", ", ".join(ENGINES), f"did you mean {near[0]}?" if near else "")
+        if engine != "mesh" and look.style != "surface":
+            raise InputRejected(
+                f"the engine {engine} with the look {look.style}", "the look surface", "add --look surface"
+            )
+        self.look, self.terrain, self.engine = look, terrain, engine
+        self.material: Material = material_named(look.material).tinted(look.tint)
+        self.environment = environment_of(folder, look.environment)
+        self._samples, self._bed = samples, terrain if kind in LYING else None
+        _ = self._final if engine == "mitsuba" else self._mesher  # what is missing is said before anything is drawn
+
+    @cached_property
+    def _mesher(self) -> Mesher | None:
+        if self.look.style != "surface" or self.engine == "screen":
+            return None
+        from fluidlift.backends.splashsurf import SplashsurfMesher
+
+        return SplashsurfMesher()
+
+    @cached_property
+    def _final(self) -> MitsubaRenderer | None:
+        if self.engine != "mitsuba":
+            return None
+        from fluidlift.backends.mitsuba_renderer import MitsubaRenderer
+
+        return MitsubaRenderer()
+
+    def picture(self, frame: Frame, camera: PinholeCamera, backdrop: Backdrop) -> Lit:
+        """One frame.
+
+        Args:
+            frame: what is in it.
+            camera: who looks.
+            backdrop: what stands behind it.
+        """
+        if self._final is not None:
+            return self._traced(frame, camera, backdrop)
+        mesh = None
+        if self._mesher is not None:
+            mesh, _ = surface_of(frame.fluid, frame.velocities, self.terrain, self._mesher)
+        behind = self._behind(frame, mesh, camera, backdrop)
+        if self.look.style == "relit":
+            return self._relit(frame.fluid, camera, behind, cut_out=backdrop.cut_out)
+        surface = self._liquid(frame.fluid, mesh, camera, behind)
+        image = shaded(surface, behind, camera, self.material, self.environment)
+        if backdrop.cut_out:
+            light = np.maximum(image - (1.0 - surface.covered[..., None]) * behind.image, 0.0)
+            return Lit(light, surface.covered, surface.depth)
+        return Lit(image, np.ones_like(surface.covered), np.where(surface.covered > 0.5, surface.depth, behind.depth))
+
+    def display(self, linear: np.ndarray) -> np.ndarray:
+        """Light of `picture` for a display, linear in [0, 1], with the look's exposure."""
+        return displayed(linear, exposure=self.look.exposure)
+
+    def shown(self, frame: Frame, camera: PinholeCamera, backdrop: Backdrop) -> np.ndarray:
+        """A picture as u8 [h,w,3], sRGB."""
+        light = self.display(self.picture(frame, camera, backdrop).image)
+        return (255.0 * srgb_from_linear(light) + 0.5).astype(np.uint8)
+
+    def seen_behind(self, camera: PinholeCamera) -> np.ndarray:
+        """Linear [h,w,3] behind everything: a file's environment as it is; of a built-in one the sky, and below the
+        horizon a pale floor, before which a dark liquid and a dark ground both stand out."""
+        rays = camera.rays(camera.pixel_grid())
+        if self.look.environment not in BUILT_IN:
+            return self.environment.toward(rays)
+        rise = rays[..., 2:] / np.linalg.norm(rays, axis=-1, keepdims=True)
+        sky = self.environment.blurred(rays, SKY_BLUR) if self.look.environment == "studio" else (
+            self.environment.toward(rays)
+        )  # fmt: skip
+        above = np.clip(rise / HORIZON + 0.5, 0.0, 1.0)
+        return (sky * above + (FLOOR + 0.2 * np.clip(rise + 1.0, 0.0, 1.0)) * (1.0 - above)).astype(np.float32)
+
+    def _behind(self, frame: Frame, mesh: TriangleMesh | None, camera: PinholeCamera, backdrop: Backdrop) -> Behind:
+        """The picture without the fluid."""
+        far = self.seen_behind(camera) if backdrop.picture is None else backdrop.picture
+        solids = list(frame.bodies)
+        if backdrop.picture is None and len(self.terrain.mesh.faces):
+            solids.append(self.terrain.mesh)
+        depth = np.zeros(far.shape[:2], np.float32) if backdrop.depth is None else backdrop.depth
+        if not solids:
+            return Behind(far, depth)
+        return ground_picture(solids, camera, self.environment, Behind(far, depth), caster=mesh, material=self.material)
+
+    def _visible(self, fluid: Gaussians, camera: PinholeCamera, behind: Behind) -> np.ndarray:
+        """[n], 0 to 1: how much of each splat solids leave to be seen."""
+        row, col, z = camera.nearest_pixels(fluid.means)
+        wall = behind.depth[row, col]
+        return 1.0 - np.clip((z - wall) / (MARGIN * self.terrain.grid.spacing), 0.0, 1.0) * (wall > 0)
+
+    def _relit(self, fluid: Gaussians, camera: PinholeCamera, behind: Behind, *, cut_out: bool) -> Lit:
+        """Splats under other light."""
+        normals, share = fluid_normals(fluid, 0.5 * self.terrain.grid.spacing, self._bed)
+        light = relit(fluid, normals, share, camera, self.material, self.environment)
+        seen = (fluid.opacities * self._visible(fluid, camera, behind)).astype(np.float32)
+        shown = Gaussians(fluid.means, fluid.quats, fluid.scales, seen, fluid.sh)
+        drawn = render(shown, camera, features=light)
+        if cut_out:
+            return Lit(drawn.image, drawn.alpha, drawn.depth)
+        image = drawn.image + (1.0 - drawn.alpha)[..., None] * behind.image
+        return Lit(image, np.ones_like(drawn.alpha), np.where(drawn.alpha > 0.5, drawn.depth, behind.depth))
+
+    def _liquid(
+        self, fluid: Gaussians, mesh: TriangleMesh | None, camera: PinholeCamera, behind: Behind
+    ) -> LiquidSurface:
+        if mesh is not None:
+            return mesh_surface(mesh, camera)
+        if self.look.style == "transparent":
+            normals = fluid_normals(fluid, 0.5 * self.terrain.grid.spacing, self._bed)[0]
+            seen = self._visible(fluid, camera, behind) > 0.5
+            return splat_surface(fluid.select(seen), normals[seen], camera)
+        radius = RADIUS * self.terrain.grid.spacing
+        return particle_surface(fluid.means, radius, camera, linear_from_srgb(np.clip(fluid.rgb, 0.0, 1.0)))
+
+    def _traced(self, frame: Frame, camera: PinholeCamera, backdrop: Backdrop) -> Lit:
+        """By light paths through the mesh, which reaches into the ground here: a gap would be a film of air."""
+        from fluidlift.backends.mitsuba_scene import FinalScene
+
+        assert self._final is not None
+        mesh, _ = surface_of(frame.fluid, frame.velocities, self.terrain, self._need_mesher(), clamped=False)
+        ground = [self.terrain.mesh] if len(self.terrain.mesh.faces) else []
+        image, alpha = self._final.picture_and_alpha(
+            FinalScene(
+                mesh, self.material, camera, self.environment.radiance, (*ground, *frame.bodies),
+                samples=self._samples, show_environment=False,
+            )
+        )  # fmt: skip
+        behind = self._behind(frame, None, camera, Backdrop(backdrop.picture))
+        far = self.seen_behind(camera) if backdrop.picture is None else backdrop.picture
+        depth = mesh_surface(mesh, camera).depth
+        nearer = (depth > 0) & ((behind.depth == 0) | (depth < behind.depth))
+        whole = image + (1.0 - alpha)[..., None] * far
+        return Lit(whole, np.ones_like(alpha), np.where(nearer, depth, behind.depth))
+
+    def _need_mesher(self) -> Mesher:
+        assert self._mesher is not None
+        return self._mesher

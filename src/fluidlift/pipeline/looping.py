@@ -1,0 +1,151 @@
+"""Loops without a visible seam: the frames after the last one fade into the first ones.
+
+A clip of N frames is simulated M frames longer. Frame k < M then shows both frame N + k, which goes on where the clip
+ends, and frame k; the first fades out while the second fades in. So frame 0 is the one that follows frame N - 1, and
+frame M the one that follows the last faded one: nothing jumps anywhere.
+
+What fades is optical depth. A splat of opacity a takes -ln(1 - a exp(-r^2 / 2)) from the light at r standard deviations
+from its centre; over its whole footprint that is the dilogarithm of a (times its area). At weight w it gets the opacity
+with w times as much: two bodies at w and 1 - w then take as much light as one, and the fluid does not turn transparent
+on the way.
+
+Limits. While it fades, fine patterns of two instants lie over each other, with up to 30 % less contrast. A fluid
+whose level has changed between beginning and end (a vessel that fills, a flood) shows two levels for that time; a
+warning says so. Bodies that float glide back to where they were. Particles of the end get new ids there, since those
+of the beginning live on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from fluidlift.types import Gaussians, concatenate
+
+if TYPE_CHECKING:
+    from fluidlift.pipeline.scene import Scene
+    from fluidlift.pipeline.simulating import History
+
+FAINTEST = 1 / 255
+"""opacity below which a splat is not drawn"""
+DRIFT = 0.15
+"""share of the fluid's volume that the end may have more or less than the beginning"""
+
+
+class SplatFrame(NamedTuple):
+    """What lies on disk of one frame."""
+
+    gaussians: Gaussians
+    ids: np.ndarray
+    velocities: np.ndarray
+
+
+def faded(opacities: Float[np.ndarray, "n"], weight: float) -> Float[np.ndarray, "n"]:
+    """Opacities with `weight` times the optical depth over the whole splat."""
+    from scipy.special import spence
+
+    # denser where the dilogarithm is steep
+    table = 1.0 - np.linspace(1.0, 0.0, 4096) ** 2
+    depth = spence(1.0 - table)
+    wanted = weight * np.interp(opacities, table, depth)
+    return np.interp(wanted, depth, table).astype(np.float32)
+
+
+def blended(head: SplatFrame, tail: SplatFrame, share: float) -> SplatFrame:
+    """Two frames over each other.
+
+    Args:
+        head: of the beginning.
+        tail: that goes on after the end.
+        share: of the tail, 0 to 1.
+    """
+    parts = []
+    for frame, weight in ((head, 1.0 - share), (tail, share)):
+        opacities = faded(frame.gaussians.opacities, weight)
+        seen = opacities >= FAINTEST
+        shown = replace(frame.gaussians, opacities=opacities).select(seen)
+        parts.append(SplatFrame(shown, frame.ids[seen], frame.velocities[seen]))
+    first, second = parts
+    apart = int(max(head.ids.max(initial=-1), tail.ids.max(initial=-1))) + 1
+    both = 0.0 < share < 1.0
+    return SplatFrame(
+        concatenate([first.gaussians, second.gaussians]),
+        np.concatenate([first.ids, second.ids + apart * both]),
+        np.concatenate([first.velocities, second.velocities]),
+    )
+
+
+def blended_poses(head: Float[np.ndarray, "b 7"], tail: Float[np.ndarray, "b 7"], share: float) -> np.ndarray:
+    """Positions (m) on a line, orientations (w, x, y, z) on the shorter arc between those of two frames."""
+    a, b = head[:, 3:], tail[:, 3:]
+    b = np.where((a * b).sum(axis=1, keepdims=True) < 0, -b, b)
+    turn = (1.0 - share) * a + share * b
+    turn /= np.maximum(np.linalg.norm(turn, axis=1, keepdims=True), 1e-12)
+    return np.concatenate([(1.0 - share) * head[:, :3] + share * tail[:, :3], turn], axis=1)
+
+
+def close_loop(scene: Scene, history: History, file: Callable[[int], Path], checkpoint: Path) -> list[str]:
+    """Fade the end of a simulation into its beginning, on disk; what to tell about it.
+
+    The checkpoint goes first: should this be interrupted, the next run starts at the first frame.
+
+    Args:
+        scene: with an `overlap`.
+        history: of all frames; brought down to those that stay.
+        file: of each frame.
+        checkpoint: of the simulation.
+    """
+    from fluidlift.io.ply import write_gaussians
+
+    count, fade = scene.frames, scene.overlap
+    if len(history) < scene.simulated:
+        return ["the loop is not closed: the simulation ended early"]
+    checkpoint.unlink(missing_ok=True)
+    volume = np.array(history.volume)
+    before, after = volume[:fade].mean(), volume[count:].mean()
+    poses = list(history.poses)
+    for k in range(fade):
+        # a double exposure changes less from frame to frame than either of its two: most of the fade goes there
+        share = 0.5 * (1.0 + np.cos(np.pi * k / fade))
+        shown = blended(read_frame(file(k)), read_frame(file(count + k)), share)
+        write_gaussians(file(k), shown.gaussians, ids=shown.ids, velocities=shown.velocities)
+        history.volume[k] = float((1 - share) * volume[k] + share * volume[count + k])
+        history.count[k] = len(shown.ids)
+        history.leak[k] = max(history.leak[k], history.leak[count + k])
+        history.poses[k] = blended_poses(poses[k], poses[count + k], share)
+    for k in range(count, scene.simulated):
+        file(k).unlink()
+    for figures in (history.volume, history.leak, history.count, history.substeps, history.poses):
+        del figures[count:]
+    drift = after / max(before, 1e-12) - 1.0
+    if abs(drift) <= DRIFT:
+        return []
+    return [
+        f"the loop fades over {100 * abs(drift):.0f} % {'more' if drift > 0 else 'less'} fluid at its end than at its "
+        "beginning: choose a duration after which the level is the same again"
+    ]
+
+
+def read_frame(path: Path) -> SplatFrame:
+    """A frame from disk."""
+    from fluidlift.io.ply import read_splats
+
+    found = read_splats(path)
+    return SplatFrame(
+        found.gaussians, found.extras["id"], np.stack([found.extras[v] for v in ("vx", "vy", "vz")], axis=-1)
+    )
+
+
+def seam(pictures: Float[np.ndarray, "t h w c"]) -> tuple[float, float, float]:
+    """How much a loop's pictures change from the last to the first, and from each to the next: mean and largest.
+
+    Mean absolute difference over the pixels, in the unit of the pictures.
+    """
+    steps = np.array([np.abs(b.astype(np.float64) - a).mean() for a, b in zip(pictures[:-1], pictures[1:])])
+    across = float(np.abs(pictures[0].astype(np.float64) - pictures[-1]).mean())
+    return across, float(steps.mean()), float(steps.max())

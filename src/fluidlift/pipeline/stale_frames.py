@@ -1,0 +1,85 @@
+"""Which frames on disk still show what scene.yaml says."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from fluidlift.errors import InputRejected
+from fluidlift.io.asset_folder import load_asset, read_manifest
+from fluidlift.io.checkpoint import differing_parts, read_parts
+from fluidlift.io.obstacles import color_mark
+from fluidlift.io.scene import SceneEdits
+from fluidlift.io.scene_look import Look
+from fluidlift.pipeline.resimulate import (
+    SECOND_HALF,
+    SECOND_HALF_SECTIONS,
+    recall_first_half,
+    rest_frame_of,
+    settings_of,
+)
+from fluidlift.pipeline.scene import Scene, SimulationRequest, footage_of, scene_of
+from fluidlift.pipeline.simulating import checkpoint_file
+from fluidlift.pipeline.story import Silence, Story
+
+
+def stale_parts(folder: Path, edits: SceneEdits, *, meshes: Path | None = None) -> set[str]:
+    """What would have to be done anew for the frames to show an asset's scene.yaml.
+
+    Args:
+        folder: of the asset.
+        edits: its scene.yaml, read.
+        meshes: folder of its mesh files; None: the asset.
+
+    Returns:
+        "simulate" where the particles would go another way, or further; "look" where they would only be drawn
+        otherwise; both, or neither. Frames of which nothing is known any more (without a checkpoint) count as stale.
+
+    Raises:
+        InputRejected: no asset, or a scene that does not fit it.
+    """
+    manifest = read_manifest(folder)
+    done = manifest.get("simulation")
+    if not done:
+        return {"simulate", "look"}
+    found = set()
+    if done.get("look", Look().mark(folder)) != edits.look.mark(folder) | color_mark(edits.obstacles):
+        found.add("look")
+    if _moved(folder, edits, manifest, meshes):
+        found.add("simulate")
+    return found
+
+
+def _moved(folder: Path, edits: SceneEdits, manifest: dict[str, Any], meshes: Path | None) -> bool:
+    """Whether a simulation of scene.yaml would give other frames, or more."""
+    done = manifest["simulation"]
+    try:
+        _, parts = read_parts(checkpoint_file(folder))
+        scene = scene_now(folder, manifest, meshes)
+    except InputRejected:
+        if not checkpoint_file(folder).is_file():
+            return True
+        raise
+    if differing_parts(parts, scene.parts):
+        return True
+    more = done["frames"] > scene.frames
+    return done["frames"] < scene.frames or (more and edits.duration is not None)
+
+
+def scene_now(folder: Path, manifest: dict[str, Any], meshes: Path | None) -> Scene:
+    """The scene that `resimulate` would simulate, at the frame rate and with the seed of the frames on disk.
+
+    Raises:
+        InputRejected: a scene that does not fit.
+    """
+    done = manifest["simulation"]
+    config = settings_of(manifest, (), {"seed": done.get("seed")}, sections=SECOND_HALF_SECTIONS, work="a simulation")
+    story = Story(folder, SECOND_HALF, progress=Silence())
+    recall_first_half(story, manifest)
+    footage, interval = footage_of(story), done["frame_interval"]
+    fps = None if interval == manifest["frame_interval"] else 1.0 / interval
+    request = SimulationRequest(fps=fps, meshes=meshes)
+    start = rest_frame_of(manifest, footage)
+    scene = scene_of(load_asset(folder), folder, request, config, footage=footage, start=start)
+    return replace(scene, interval=interval)  # 1 / fps may be another by its last bit

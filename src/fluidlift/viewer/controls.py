@@ -1,0 +1,210 @@
+"""Which parameters can be moved, how far, and how they are told: units, ranges and words."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from fluidlift.errors import require
+from fluidlift.types import FluidParameters
+
+STEPS = 200
+"""of a slider, about"""
+EARTH = 9.81
+"""m/s^2"""
+
+INFLOW = "inflow.factor"
+
+Values = dict[str, Any]
+"""of `FluidParameters`, by name, and `inflow.factor`"""
+
+
+def path_of(name: str) -> str:
+    """Where a value stands in scene.yaml."""
+    return name if "." in name else f"parameters.{name}"
+
+
+@dataclass(frozen=True)
+class Control:
+    """One number that a slider moves."""
+
+    key: str
+    """of itself"""
+    label: str
+    unit: str
+    low: float
+    high: float
+    fitted: float
+    """what the asset was lifted with, inside the range"""
+    read: Callable[[Values], float]
+    """the number, from the parameters"""
+    write: Callable[[Values, float], Values]
+    """parameters that change when it is set"""
+    log: bool = False
+    """the slider moves the power of ten"""
+    hint: str = ""
+
+    def __post_init__(self) -> None:
+        require(self.low < self.high, f"{self.key} from {self.low} to {self.high}", "an ascending range")
+        require(not self.log or self.low > 0, f"{self.key}: a logarithm of {self.low}", "a positive low end")
+
+    def clamped(self, value: float) -> float:
+        """Inside the range."""
+        return min(max(float(value), self.low), self.high)
+
+    @property
+    def slider(self) -> tuple[float, float, float]:
+        """Low end, high end and step of the slider: in the unit itself, or powers of ten."""
+        low, high = (math.log10(self.low), math.log10(self.high)) if self.log else (self.low, self.high)
+        step = (high - low) / STEPS
+        power = 10.0 ** math.floor(math.log10(step))
+        step = power * min((1, 2, 5, 10), key=lambda m: abs(m * power - step))
+        return _digits(low, 4), _digits(high, 4), _digits(step, 1)
+
+    def slider_of(self, value: float) -> float:
+        """Position of the slider."""
+        low, high, _ = self.slider
+        value = self.clamped(value)
+        return min(max(_digits(math.log10(value) if self.log else value, 4), low), high)
+
+    def value_of(self, slider: float) -> float:
+        """The number at a position of the slider; the fitted one exactly where that is within half a step."""
+        low, high, step = self.slider
+        if abs(self.slider_of(self.fitted) - slider) < 0.5 * step:
+            return self.fitted
+        slider = min(max(slider, low), high)
+        return self.clamped(_digits(10.0**slider if self.log else slider, 4))
+
+    def told(self, value: float) -> str:
+        """With its unit, such as `1.3e-05 m²/s`."""
+        return f"{value:.4g} {self.unit}".strip()
+
+    def typed(self, text: str) -> tuple[float | None, str]:
+        """What a person typed: the number, clamped, or None; and what to tell, empty where all is well."""
+        words = text.strip().replace(",", ".").removesuffix(self.unit).strip()
+        try:
+            value = float(words)
+        except ValueError:
+            return None, f"{self.label}: '{text[:40]}' is no number. Needed: {self.range_told()}."
+        if not math.isfinite(value):
+            return None, f"{self.label}: {value:g} is no finite number. Needed: {self.range_told()}."
+        kept = self.clamped(value)
+        if kept != value:
+            return kept, f"{self.label}: {self.told(value)} is outside {self.range_told()}; {self.told(kept)} is taken."
+        return kept, ""
+
+    def range_told(self) -> str:
+        """Such as `0 to 30 m/s²`."""
+        return f"{self.low:.3g} to {self.high:.3g} {self.unit}".strip()
+
+
+def _digits(value: float, digits: int) -> float:
+    """Rounded to so many of them."""
+    return float(f"{value:.{digits}g}")
+
+
+def controls_of(fitted: FluidParameters, kind: str) -> tuple[Control, ...]:
+    """The controls of an asset, in the order in which they are shown. Ranges hold what its kind is like and reach past
+    the fitted value.
+
+    Args:
+        fitted: of the asset, before any edit.
+        kind: stream, fall, pour or plume.
+    """
+    speed = _length(fitted.inflow_velocity)
+    liquid = kind != "plume"
+    found = []
+    if liquid:
+        found.append(_plain("kinematic_viscosity", "viscosity", "m²/s", fitted, (1e-7, 1.0), log=True,
+                            hint="kinematic: water 1e-6, oil 1e-4, honey 7e-3, lava 0.1 m²/s and more"))  # fmt: skip
+    found += _gravity(fitted, liquid)
+    if speed > 0:
+        found.append(_inflow(speed))
+        found.append(_plain("inflow_fluctuation", "inflow fluctuation", "m/s", fitted, (0.0, max(speed, 0.1)),
+                            hint="root mean square of how the speed at the inlet varies"))  # fmt: skip
+    if liquid:
+        found += [
+            _plain("density", "density", "kg/m³", fitted, (200.0, 5000.0), log=True,
+                   hint="matters to what floats in it, and to surface tension"),
+            _plain("surface_tension", "surface tension", "N/m", fitted, (0.0, 0.5),
+                   hint="water 0.072 N/m; drops and thin jets only; small cells then need short steps"),
+            _plain("wall_damping", "wall friction", "", fitted, (0.0, 1.0),
+                   hint="0: slips along walls freely; 1: sticks to them"),
+            _plain("restitution", "bounce", "", fitted, (0.0, 1.0), hint="share of the speed that a wall gives back"),
+        ]  # fmt: skip
+    return tuple(found)
+
+
+def _length(vector: Any) -> float:
+    return math.sqrt(sum(float(x) ** 2 for x in vector))
+
+
+def _plain(
+    name: str, label: str, unit: str, fitted: FluidParameters, span: tuple[float, float], *, log: bool = False,
+    hint: str = "",
+) -> Control:  # fmt: skip
+    value = float(getattr(fitted, name))
+    low, high = min(span[0], value) if value > 0 or not log else span[0], max(span[1], 2 * value)
+    if name in ("wall_damping", "restitution"):
+        high = span[1]
+    return Control(
+        name, label, unit, low, high, min(max(value, low), high), lambda p: float(p[name]), lambda p, v: {name: v},
+        log=log, hint=hint,
+    )  # fmt: skip
+
+
+def _gravity(fitted: FluidParameters, liquid: bool) -> list[Control]:
+    """Strength, tilt from straight down and heading of the tilt; three numbers that are one vector."""
+    word = "gravity" if liquid else "buoyancy"
+    strength = _length(fitted.gravity)
+    controls = [
+        Control("gravity", word, "m/s²", 0.0, max(30.0, 2 * strength), strength, lambda p: _length(p["gravity"]),
+                lambda p, v: {"gravity": turned(v, *direction(p["gravity"], fitted.gravity))},
+                hint="earth 9.81, moon 1.62 m/s²"),
+    ]  # fmt: skip
+    if not liquid:
+        return controls
+    tilt, heading = direction(fitted.gravity, fitted.gravity)
+    return [
+        *controls,
+        Control("gravity_tilt", "gravity tilt", "°", 0.0, 180.0, tilt,
+                lambda p: direction(p["gravity"], fitted.gravity)[0],
+                lambda p, v: {"gravity": turned(_length(p["gravity"]), v, _heading(p, fitted))},
+                hint="0: straight down; 90: sideways; 180: up"),
+        Control("gravity_heading", "tilt towards", "°", -180.0, 180.0, heading,
+                lambda p: direction(p["gravity"], fitted.gravity)[1],
+                lambda p, v: {"gravity": turned(_length(p["gravity"]), direction(p["gravity"], fitted.gravity)[0], v)},
+                hint="0: along x, the mainstream; 90: along y; only with a tilt"),
+    ]  # fmt: skip
+
+
+def _heading(p: Values, fitted: FluidParameters) -> float:
+    return direction(p["gravity"], fitted.gravity)[1]
+
+
+def direction(gravity: Any, otherwise: Any) -> tuple[float, float]:
+    """Tilt from straight down (0 to 180) and its heading from x towards y (-180 to 180), degrees; those of another
+    vector where the first one is zero. Straight down has the heading 0."""
+    strength = _length(gravity)
+    if strength == 0:
+        return (0.0, 0.0) if _length(otherwise) == 0 else direction(otherwise, otherwise)
+    x, y, z = (float(c) / strength for c in gravity)
+    across = math.hypot(x, y)
+    tilt = math.degrees(math.atan2(across, -z))
+    return tilt, math.degrees(math.atan2(y, x)) if across > 1e-6 else 0.0
+
+
+def turned(strength: float, tilt: float, heading: float) -> list[float]:
+    """Gravity, m/s², of so many m/s², tilted from straight down by so many degrees towards a heading."""
+    t, h = math.radians(tilt), math.radians(heading)
+    vector = (math.sin(t) * math.cos(h), math.sin(t) * math.sin(h), -math.cos(t))
+    return [float(f"{strength * c:.6g}") + 0.0 for c in vector]
+
+
+def _inflow(speed: float) -> Control:
+    return Control(
+        INFLOW, "inflow", "x", 0.0, 4.0, 1.0, lambda p: float(p[INFLOW]), lambda p, v: {INFLOW: v},
+        hint=f"times the clip's own, {speed:.3g} m/s",
+    )  # fmt: skip

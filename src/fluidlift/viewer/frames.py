@@ -1,0 +1,154 @@
+"""Frames as the browser takes them, read when they are wanted and forgotten when there are too many."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Generic, Protocol, TypeVar
+
+import numpy as np
+
+from fluidlift.errors import FluidliftError, InputRejected, require
+from fluidlift.io.frames import FIRST_FRAME
+from fluidlift.types import Gaussians
+
+CACHE_BYTES = 192 * 2**20
+"""of frames that are kept, in memory"""
+
+
+class FrameMissing(FluidliftError):
+    """A frame that is not there, or cannot be read."""
+
+
+class Sized(Protocol):
+    """What a cache can hold."""
+
+    @property
+    def nbytes(self) -> int:
+        """Of memory."""
+        ...
+
+
+@dataclass(frozen=True)
+class SplatFrame:
+    """The splats of one frame."""
+
+    centers: np.ndarray
+    """f32 [n,3], m"""
+    covariances: np.ndarray
+    """f32 [n,3,3], m^2"""
+    rgb: np.ndarray
+    """u8 [n,3], sRGB: the part of the colour that does not depend on the view"""
+    opacities: np.ndarray
+    """u8 [n,1]"""
+    velocities: np.ndarray
+    """f32 [n,3], m/s"""
+    poses: np.ndarray | None = None
+    """[b,7] of the obstacles: position (m), orientation (w, x, y, z); None: not known"""
+
+    @property
+    def nbytes(self) -> int:
+        """Of memory."""
+        parts = (self.centers, self.covariances, self.rgb, self.opacities, self.velocities)
+        return sum(a.nbytes for a in parts)
+
+    @property
+    def fastest(self) -> float:
+        """m/s that 99 % of the splats do not exceed."""
+        if not len(self.velocities):
+            return 0.0
+        return float(np.percentile(np.sqrt(np.square(self.velocities).sum(axis=1)), 99))
+
+
+def splat_frame(gaussians: Gaussians, velocities: np.ndarray, poses: np.ndarray | None = None) -> SplatFrame:
+    """What is shown of splats; those that are not finite are left out."""
+    sound = np.isfinite(gaussians.means).all(axis=1) & np.isfinite(gaussians.scales).all(axis=1)
+    if not sound.all():
+        gaussians, velocities = gaussians.select(sound), velocities[sound]
+    return SplatFrame(
+        gaussians.means,
+        gaussians.covariances().astype(np.float32),
+        np.round(255 * gaussians.rgb).astype(np.uint8),
+        np.round(255 * np.clip(gaussians.opacities, 0, 1)).astype(np.uint8)[:, None],
+        np.asarray(velocities, np.float32),
+        poses,
+    )
+
+
+def read_frame(folder: Path, index: int) -> SplatFrame:
+    """Frame `index` (from 0) of an asset.
+
+    Raises:
+        FrameMissing: it is not there, or not (yet) whole.
+    """
+    from fluidlift.io.ply import read_splats
+    from fluidlift.pipeline.simulating import frame_file
+
+    try:
+        splats = read_splats(frame_file(folder, FIRST_FRAME + index))
+    except (InputRejected, OSError) as error:
+        raise FrameMissing(f"Frame {FIRST_FRAME + index} is not there: {error}") from None
+    names = ("vx", "vy", "vz")
+    known = all(v in splats.extras for v in names)
+    still = np.zeros((len(splats.gaussians), 3), np.float32)
+    return splat_frame(splats.gaussians, np.stack([splats.extras[v] for v in names], axis=-1) if known else still)
+
+
+T = TypeVar("T", bound=Sized)
+
+
+class FrameCache(Generic[T]):
+    """The frames that were wanted last, as many as fit into `most_bytes`. Safe to use from several threads.
+
+    Args:
+        load: makes frame `index`; what it raises is passed on, and nothing is kept of it.
+        most_bytes: of memory; a single larger frame is kept all the same.
+    """
+
+    def __init__(self, load: Callable[[int], T], most_bytes: int = CACHE_BYTES) -> None:
+        require(most_bytes > 0, f"{most_bytes} bytes", "a positive number")
+        self._load, self._most = load, most_bytes
+        self._kept: OrderedDict[int, T] = OrderedDict()
+        self._bytes = 0
+        self._lock = threading.Lock()
+        self._loading = threading.Lock()
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    @property
+    def nbytes(self) -> int:
+        """Of what is kept."""
+        return self._bytes
+
+    def get(self, index: int) -> T:
+        """Frame `index`, from memory or loaded."""
+        found = self._seen(index)
+        if found is not None:
+            return found
+        with self._loading:  # one at a time: two threads that want the same frame read it once
+            found = self._seen(index)
+            if found is not None:
+                return found
+            frame = self._load(index)
+        with self._lock:
+            self._kept[index] = frame
+            self._bytes += frame.nbytes
+            while self._bytes > self._most and len(self._kept) > 1:
+                self._bytes -= self._kept.popitem(last=False)[1].nbytes
+        return frame
+
+    def _seen(self, index: int) -> T | None:
+        with self._lock:
+            if index in self._kept:
+                self._kept.move_to_end(index)
+            return self._kept.get(index)
+
+    def clear(self) -> None:
+        """Forget all of them."""
+        with self._lock:
+            self._kept.clear()
+            self._bytes = 0

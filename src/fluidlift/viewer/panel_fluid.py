@@ -1,0 +1,154 @@
+"""What the fluid is: parameters and look."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Any
+
+from fluidlift.viewer.controls import Control, path_of
+
+if TYPE_CHECKING:
+    from fluidlift.viewer.app import Viewer
+
+STOPS = 4.0
+"""of exposure, up or down"""
+
+
+class FluidPanel:
+    """Sliders for the parameters, one place to type exact values, and the look."""
+
+    def __init__(self, viewer: Viewer) -> None:
+        self._viewer, self._gui = viewer, viewer.server.gui
+        self._sliders: dict[str, Any] = {}
+        self._by_label: dict[str, Control] = {}
+        values = viewer.draft.parameters
+        with self._gui.add_folder("Parameters"):
+            for control in viewer.controls:
+                self._add_slider(control, control.read(values))
+        with self._gui.add_folder("Type a value", expand_by_default=False):
+            self._add_typing()
+        with self._gui.add_folder("Look"):
+            self._add_look()
+
+    def _add_slider(self, control: Control, value: float) -> None:
+        marks = ((control.slider_of(control.fitted), "fitted"),)
+        low, high, step = control.slider
+        power = " The slider shows the power of ten." if control.log else ""
+        slider = self._gui.add_slider(
+            _label(control, value), low, high, step, control.slider_of(value), marks=marks,
+            hint=f"{control.range_told()}. {control.hint}.{power}",
+        )  # fmt: skip
+        slider.on_update(lambda event: self._slid(event, control))
+        self._sliders[control.key] = slider
+        self._by_label[control.label] = control
+
+    def _slid(self, event: Any, control: Control) -> None:
+        if event.client is None:
+            return
+        self._set(control, control.value_of(float(self._sliders[control.key].value)))
+
+    def _set(self, control: Control, value: float) -> None:
+        viewer = self._viewer
+        told = f"{control.label} {control.told(value)}"
+        fitted = viewer.draft.fitted
+        for name, part in control.write(viewer.draft.parameters, value).items():
+            part = None if part == fitted.get(name) else part
+            viewer.draft.move(path_of(name), part, told, time.monotonic())
+        self._sliders[control.key].label = _label(control, value)
+        viewer.messages = ""
+        viewer.changed()
+
+    def _add_typing(self) -> None:
+        self._which = self._gui.add_dropdown("parameter", tuple(self._by_label))
+        self._text = self._gui.add_text("value", "", hint="such as 1e-5")
+        self._gui.add_button("Set", icon="check").on_click(self._typed)
+
+    def _typed(self, _: Any) -> None:
+        control = self._by_label[self._which.value]
+        value, problem = control.typed(self._text.value)
+        if value is not None:
+            self._set(control, value)
+            self._sliders[control.key].value = control.slider_of(value)
+        self._viewer.say(problem)
+
+    # look
+
+    def _add_look(self) -> None:
+        from fluidlift.io.scene_look import ENVIRONMENTS, MATERIALS, STYLES
+
+        look, gui = self._viewer.draft.look, self._gui
+        self._style = gui.add_dropdown(
+            "style", STYLES, initial_value=_known(look.get("style"), STYLES), hint="of rendered pictures"
+        )
+        self._material = gui.add_dropdown("material", MATERIALS, initial_value=_known(look.get("material"), MATERIALS))
+        self._light = gui.add_dropdown(
+            "environment", ENVIRONMENTS, initial_value=_known(look.get("environment"), ENVIRONMENTS)
+        )
+        self._exposure = gui.add_slider("exposure, stops", -STOPS, STOPS, 0.25, _stops(look))
+        self._tint = gui.add_rgb("tint", _bytes(look.get("tint")))
+        gui.add_markdown(
+            "Colours are shown here; reflections, refraction and light in rendered pictures ('Save and run')."
+        )
+        self._style.on_update(lambda e: self._looked(e, "style", self._style.value))
+        self._material.on_update(lambda e: self._materialised(e))
+        self._light.on_update(lambda e: self._looked(e, "environment", self._light.value))
+        self._exposure.on_update(lambda e: self._looked(e, "exposure", float(self._exposure.value)))
+        self._tint.on_update(lambda e: self._looked(e, "tint", [round((c / 255) ** 2.2, 4) for c in self._tint.value]))
+
+    def _looked(self, event: Any, name: str, value: Any) -> None:
+        if event.client is None:
+            return
+        told = f"{name} {value}"
+        self._viewer.draft.move(f"look.{name}", value, told, time.monotonic())
+        self._viewer.redraw()
+
+    def _materialised(self, event: Any) -> None:
+        """The liquid of another material: its look, its density and its viscosity. Splats as they were lifted have no
+        material: with one, they are lit."""
+        if event.client is None:
+            return
+        viewer, name = self._viewer, self._material.value
+        viewer.edited(lambda: viewer.draft.make_of(name), f"material {name}")
+
+    # state
+
+    def tick(self) -> None:
+        """Nothing moves by itself."""
+
+    def refresh(self) -> None:
+        """Show the values of the scene."""
+        values, look = self._viewer.draft.parameters, self._viewer.draft.look
+        for control in self._viewer.controls:
+            slider, value = self._sliders[control.key], control.read(values)
+            if slider.label != _label(control, value):
+                slider.label = _label(control, value)
+            place = control.slider_of(value)
+            if slider.value != place:
+                slider.value = place
+        for handle, name in ((self._style, "style"), (self._material, "material"), (self._light, "environment")):
+            value = _known(look.get(name), handle.options)
+            if handle.value != value:
+                handle.value = value
+        if self._exposure.value != _stops(look):
+            self._exposure.value = _stops(look)
+        if tuple(self._tint.value) != _bytes(look.get("tint")):
+            self._tint.value = _bytes(look.get("tint"))
+
+
+def _label(control: Control, value: float) -> str:
+    return f"{control.label} {control.told(value)}"
+
+
+def _known(name: Any, options: tuple[str, ...]) -> str:
+    """The option, or the first one."""
+    return name if name in options else options[0]
+
+
+def _stops(look: dict[str, Any]) -> float:
+    return min(max(float(look.get("exposure", 0.0)), -STOPS), STOPS)
+
+
+def _bytes(tint: Any) -> tuple[int, int, int]:
+    """sRGB, near enough, of a linear tint."""
+    r, g, b = (round(255 * min(max(float(c), 0.0), 1.0) ** (1 / 2.2)) for c in (tint or (1, 1, 1)))
+    return r, g, b

@@ -1,0 +1,180 @@
+"""What becomes of the edits: undone, written, simulated in full, drawn, handed on."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from fluidlift.errors import FluidliftError, InputRejected
+from fluidlift.io.frames import FIRST_FRAME
+from fluidlift.types import PinholeCamera, RigidTransform
+from fluidlift.viewer.jobs import JobProgress
+
+if TYPE_CHECKING:
+    from fluidlift.viewer.app import Viewer
+
+STILL = (960, 540)
+"""px of a drawn picture"""
+
+
+class RunPanel:
+    """Undo, save, export, simulate, draw."""
+
+    def __init__(self, viewer: Viewer) -> None:
+        from fluidlift.pipeline.exporting import FORMATS
+
+        self._viewer, self._gui = viewer, viewer.server.gui
+        gui = self._gui
+        self._history = gui.add_button_group("edits", ("undo", "redo", "reset"))
+        self._history.on_click(self._back)
+        gui.add_button("Save (scene.yaml)", icon="device-floppy").on_click(self._save)
+        self._diff = gui.add_markdown("")
+        with gui.add_folder("Simulate in full"):
+            self._state = gui.add_markdown("")
+            self._bar = gui.add_progress_bar(0.0, visible=False)
+            self._begin = gui.add_button("Simulate in full", icon="player-play", color="green")
+            self._stop = gui.add_button("Stop", icon="player-stop", color="red", visible=False)
+            self._begin.on_click(self._simulate)
+            self._stop.on_click(lambda _: viewer.jobs.stop())
+        with gui.add_folder("Export", expand_by_default=False):
+            self._format = gui.add_dropdown("format", tuple(FORMATS))
+            self._out = gui.add_text("folder", str(viewer.folder.absolute().parent / "export"))
+            gui.add_button("Export", icon="package-export").on_click(self._export)
+        with gui.add_folder("Draw a picture", expand_by_default=False):
+            gui.add_markdown("This frame from here, in the chosen look.")
+            gui.add_button("Draw", icon="photo").on_click(self._draw)
+            self._picture = gui.add_image(np.full((4, 6, 3), 230, np.uint8), format="jpeg", visible=False)
+        self.refresh()
+
+    # history
+
+    def _back(self, _: Any) -> None:
+        viewer, what = self._viewer, str(self._history.value)
+        viewer.edited(getattr(viewer.draft, what), f"{what}: done")
+
+    def _save(self, _: Any) -> None:
+        viewer = self._viewer
+        if not viewer.refused():
+            viewer.edited(viewer.draft.commit, f"written: {viewer.folder / 'scene.yaml'}", moves=False)
+
+    # long work
+
+    def _simulate(self, _: Any) -> None:
+        from fluidlift.pipeline.resimulate import resimulate
+
+        viewer = self._viewer
+        if viewer.refused() or not viewer.edited(viewer.draft.commit, moves=False):
+            return
+
+        def work(progress: JobProgress) -> str:
+            made = resimulate(viewer.folder, progress=progress)
+            said = f" Warnings: {'; '.join(w.rstrip('.') for w in made.warnings)}." if made.warnings else ""
+            return f"simulated {made.frames} frames in {made.seconds:.0f} s.{said}"
+
+        viewer.preview.stop()
+        viewer.preview.hold(True)
+        if not viewer.jobs.start("full simulation", work):
+            viewer.preview.hold(False)
+            viewer.say("Something else is being done already.")
+            return
+        viewer.set_source("saved frames")
+
+    def _export(self, _: Any) -> None:
+        from fluidlift.pipeline.exporting import ExportRequest, export_asset
+
+        viewer, out = self._viewer, Path(self._out.value.strip()).expanduser()
+        if viewer.refused():
+            return
+        if not self._out.value.strip():
+            viewer.say("Export: no folder. Needed: a name for a new one.")
+            return
+        if "simulate" in (viewer.stale or ()):
+            viewer.say("Export: the saved frames are from before the last edits: press 'Simulate in full' first.")
+            return
+        request = ExportRequest(to=self._format.value)
+
+        def work(progress: JobProgress) -> str:
+            return "; ".join(export_asset(viewer.folder, out, request, progress=progress).lines())
+
+        if not viewer.jobs.start("export", work):
+            viewer.say("Something else is being done already.")
+
+    def _draw(self, event: Any) -> None:
+        viewer = self._viewer
+        if event.client is None or viewer.refused() or not viewer.edited(viewer.draft.commit, moves=False):
+            return
+        if viewer.source != "saved frames":
+            viewer.say("Pictures are drawn of saved frames: choose them above, or simulate in full first.")
+            return
+        camera, number = _camera_of(event.client), FIRST_FRAME + viewer.timeline.frame
+
+        def work(progress: JobProgress) -> str:
+            self._picture.image = _drawn(viewer.folder, camera, number, progress)
+            self._picture.visible = True
+            return f"frame {number} drawn"
+
+        viewer.preview.hold(True)
+        if not viewer.jobs.start("picture", work):
+            viewer.preview.hold(False)
+            viewer.say("Something else is being done already.")
+
+    # state
+
+    def tick(self) -> None:
+        """How far the work is."""
+        state = self._viewer.jobs.state
+        if self._stop.visible != state.running:
+            self._stop.visible, self._bar.visible = state.running, state.running
+            self._begin.disabled = state.running
+        if state.running and abs(self._bar.value - state.share) >= 1:
+            self._bar.value = round(state.share)
+        text = state.told if state.running else self._frames_told()
+        if self._state.content != text:
+            self._state.content = text
+
+    def refresh(self) -> None:
+        """Show what has been edited."""
+        try:
+            diff = self._viewer.draft.diff().strip()
+        except (FluidliftError, OSError) as error:
+            diff = str(error)
+        self._diff.content = f"```diff\n{diff[-4000:]}\n```" if diff else "No edits."
+        self._viewer.compare()
+
+    def _frames_told(self) -> str:
+        stale = self._viewer.stale
+        if stale is None:
+            return "comparing the saved frames with the scene ..."
+        return f"The saved frames are {'from before the last edits' if 'simulate' in stale else 'of this scene'}."
+
+
+def _camera_of(client: Any) -> PinholeCamera:
+    """The camera of a browser, with the shape of a drawn picture."""
+    from fluidlift.types import matrix_from_quat
+
+    view, (width, height) = client.camera, STILL
+    focal = 0.5 * height / np.tan(0.5 * view.fov)
+    rotation = matrix_from_quat(np.asarray(view.wxyz, float)[None])[0].T
+    pose = RigidTransform(rotation, -rotation @ np.asarray(view.position, float))
+    return PinholeCamera((focal, focal), (width / 2, height / 2), (width, height), pose)
+
+
+def _drawn(folder: Path, camera: PinholeCamera, number: int, progress: JobProgress) -> np.ndarray:
+    """u8 [h,w,3] of one frame of the asset, in its look."""
+    import cv2
+
+    from fluidlift.pipeline.rendering import RenderRequest, render_asset
+
+    with tempfile.TemporaryDirectory(prefix="fluidlift-view-") as name:
+        place = Path(name)
+        (place / "camera.json").write_text(json.dumps(camera.to_dict()))
+        request = RenderRequest(view=str(place / "camera.json"), frames=(number, number), background="terrain")
+        render_asset(folder, place / "out", request, progress=progress)
+        found = cv2.imread(str(place / "out" / f"{number}.png"), cv2.IMREAD_COLOR)
+    if found is None:
+        raise InputRejected(f"frame {number} could not be drawn")
+    return np.ascontiguousarray(found[..., ::-1])

@@ -1,0 +1,144 @@
+"""Lit ground: where shadows lie, how dark they are, what light a liquid lets through, and what hides what."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from fluidlift.look.environment import Environment
+from fluidlift.look.ground_picture import GroundLight, ground_picture, received, spread_directions
+from fluidlift.look.liquid import Behind
+from fluidlift.look.materials import Material
+from fluidlift.look.screen_space import linear_from_srgb
+from fluidlift.types import PinholeCamera, TriangleMesh
+
+CAMERA = PinholeCamera.looking((0.0, -3.0, 3.0), (0.0, 0.0, 0.0), 45.0, (120, 90))
+WHITE = Environment.white()
+NO_AMBIENT = GroundLight(directions=0, soft=0.0)
+
+
+def floor(half=4.0, height=0.0, color=(0.5, 0.5, 0.5)):
+    v = np.array([[-half, -half, height], [half, -half, height], [half, half, height], [-half, half, height]])
+    return TriangleMesh(v, np.array([[0, 1, 2], [0, 2, 3]]), np.tile(np.asarray(color, float), (4, 1)))
+
+
+def body(mesh):
+    return TriangleMesh(np.array(mesh.vertices), np.array(mesh.faces))
+
+
+def lamp(direction=(0.6, 0.0, 0.8), brightness=300.0, around=0.2):
+    """A small bright light in a gray world."""
+    from fluidlift.look.environment_lookup import grid_directions
+
+    d = np.asarray(direction) / np.linalg.norm(direction)
+    return Environment(np.where((grid_directions(64) @ d > 0.997)[..., None], brightness, around) * np.ones(3))
+
+
+def test_open_ground_in_a_white_world_has_its_own_colour():
+    picture = ground_picture([floor(color=(0.8, 0.4, 0.1))], CAMERA, WHITE)
+    expected = linear_from_srgb(np.array([0.8, 0.4, 0.1]))
+    # of light along the ground a pixel of the shadow map more or less is lost: 0.3 %
+    np.testing.assert_allclose(picture.image[picture.depth > 0], np.broadcast_to(expected, (120 * 90, 3)), rtol=3e-3)
+    assert (picture.depth > 0).all()
+
+
+def test_a_texture_lies_where_its_coordinates_say():
+    texture = np.zeros((64, 64, 3), np.uint8)
+    texture[:, 32:] = 255
+    plain = floor()
+    uv = np.stack([plain.vertices[plain.faces][..., 0] / 8 + 0.5, 0.5 - plain.vertices[plain.faces][..., 1] / 8], -1)
+    mesh = TriangleMesh(plain.vertices, plain.faces, plain.colors, uv, texture)
+    image = ground_picture([mesh], CAMERA, WHITE).image
+    # white to the right of x = 0, the middle column; half a texel of 0.125 m, 3 px in front, is between
+    assert image[:, :56].max() < 0.01 and image[:, 64:].min() > 0.99
+
+
+def test_the_shadow_of_a_ball_lies_where_the_light_throws_it():
+    d = np.array([0.6, 0.0, 0.8])
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.4)
+    ball.apply_translation([0.0, 0.0, 1.2])
+    x, y = (a.ravel() for a in np.meshgrid(np.linspace(-2, 1, 61), np.linspace(-1, 1, 41)))
+    points = np.stack([x, y, 0 * x], axis=-1)
+    up = np.tile([0.0, 0.0, 1.0], (len(x), 1))
+    light = lamp(d)
+    got = received(points, up, [floor(), body(ball)], light, lit=NO_AMBIENT)[:, 1]
+    toward, _, share = light.light()
+    assert share > 0.5 and np.degrees(np.arccos(toward @ d)) < 1.0
+    away = np.linalg.norm(np.cross(points - [0, 0, 1.2], d), axis=1)
+    lit_up, dark = got[away > 0.45].min(), got[(away < 0.35)].max()  # a texel of 0.01 m, and the polyhedron
+    assert dark < 0.45 * lit_up
+    # what is left in the shadow is the light from all around: 0.2 with the lamp taken out
+    assert got[away < 0.35].mean() == pytest.approx(0.2, rel=0.15)
+
+
+@pytest.mark.parametrize("soft", [0.0, 0.02])
+def test_flat_ground_and_balls_do_not_shade_themselves(soft):
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=1.0)
+    normals = np.array(ball.vertices) / np.linalg.norm(ball.vertices, axis=1, keepdims=True)
+    light = lamp((0.1, 0.0, 1.0))
+    facing = normals @ light.light()[0] > 0.3
+    lit = GroundLight(directions=0, soft=soft)
+    got = received(np.array(ball.vertices)[facing], normals[facing], [body(ball)], light, lit=lit)
+    # where a soft edge looks beside the point, the ball curves away: nothing else may be missing
+    np.testing.assert_allclose(got, light.irradiance(normals[facing]), rtol=0.02)
+
+
+def test_a_liquid_lets_its_own_colour_of_light_through():
+    slab = trimesh.creation.box((2.0, 2.0, 0.1))
+    slab.apply_translation([0.0, 0.0, 0.5])
+    light = lamp((0.0, 0.0, 1.0), around=0.0)
+    point, up = np.array([[0.0, 0.0, 0.0], [1.8, 0.0, 0.0]]), np.tile([0.0, 0.0, 1.0], (2, 1))
+    a = np.array([1.0, 5.0, 40.0])
+    material = Material("dye", 1.0, absorption=tuple(a))  # index 1: nothing is mirrored
+    scene = {"caster": body(slab), "lit": NO_AMBIENT}
+    under, beside = received(point, up, [floor()], light, material=material, **scene)
+    # the light stands within a degree of the vertical
+    np.testing.assert_allclose(under / beside, np.exp(-0.1 * a), rtol=5e-3)
+    opaque, _ = received(point, up, [floor()], light, **scene)
+    assert opaque.max() < 0.02 * beside.min()
+
+
+def test_below_a_body_near_the_ground_it_is_darker_the_nearer_it_is():
+    plate = trimesh.creation.box((1.0, 1.0, 0.05))
+    middle, up = np.array([[0.0, 0.0, 0.0]]), np.array([[0.0, 0.0, 1.0]])
+    light = []
+    for height in (0.1, 0.5, 2.0):
+        raised = plate.copy()
+        raised.apply_translation([0.0, 0.0, height])
+        lit = GroundLight(directions=64)
+        light.append(received(middle, up, [floor()], WHITE, caster=body(raised), lit=lit)[0, 0])
+    assert light[0] < light[1] < light[2] < 1.0
+    # a plate of half width a at height h hides about a^2 / (a^2 + h^2) of the cosine-weighted sky (of a disk, exactly)
+    assert light[0] < 0.1
+    assert light[2] == pytest.approx(1 - 0.32 / (0.32 + 4.0), abs=0.08)  # the disk of equal area; 64 directions
+
+
+def test_directions_are_spread_evenly_and_seldom_look_up_from_below():
+    d = spread_directions(200)
+    np.testing.assert_allclose(np.linalg.norm(d, axis=1), 1.0, atol=1e-6)
+    assert np.linalg.norm(d[:, :2].mean(axis=0)) < 0.02 and d[:, 2].min() > -0.16
+
+
+def test_nearer_meshes_and_nearer_things_behind_hide_ground():
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.5)
+    red = TriangleMesh(np.array(ball.vertices), np.array(ball.faces), np.tile([1.0, 0, 0], (len(ball.vertices), 1)))
+    for meshes in ([floor(), red], [red, floor()]):
+        picture = ground_picture(meshes, CAMERA, WHITE, lit=NO_AMBIENT)
+        assert picture.image[40, 60, 1] < 0.01 < picture.image[40, 60, 0]
+        assert picture.depth[40, 60] < np.linalg.norm(CAMERA.position) - 0.4
+    depth = np.zeros((90, 120))
+    depth[:, :60] = 0.5  # a curtain
+    behind = Behind(np.full((90, 120, 3), 7.0), depth)
+    picture = ground_picture([floor()], CAMERA, WHITE, behind, lit=NO_AMBIENT)
+    assert (picture.image[:, :60] == 7.0).all() and (picture.depth[:, :60] == 0.5).all()
+    assert (picture.image[:, 60:] < 1.0).all()
+
+
+def test_without_meshes_the_environment_is_seen_and_with_small_ones_around_them():
+    sky = lamp()
+    empty = ground_picture([], CAMERA, sky)
+    np.testing.assert_array_equal(empty.image, sky.toward(CAMERA.rays(CAMERA.pixel_grid())))
+    assert not empty.depth.any()
+    tile = ground_picture([floor(half=0.3)], CAMERA, sky)
+    np.testing.assert_array_equal(tile.image[tile.depth == 0], empty.image[tile.depth == 0])
+    with pytest.raises(ValueError, match="background"):
+        ground_picture([floor()], CAMERA, sky, Behind(np.zeros((5, 5, 3)), np.zeros((5, 5))))

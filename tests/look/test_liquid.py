@@ -1,0 +1,209 @@
+"""A liquid's light: energy, Snell's offset and Beer's law of a slab, what lies before and what lies behind."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from fluidlift.look.environment import Environment
+from fluidlift.look.liquid import COOL, HOT, WARM, Behind, LiquidSurface, followed, glow, shaded, shaded_plain
+from fluidlift.look.materials import PRESETS, Material
+from fluidlift.look.optics import fresnel, refract
+from fluidlift.look.screen_space import mesh_surface
+from fluidlift.types import PinholeCamera, TriangleMesh
+
+SIZE = (80, 60)
+CAMERA = PinholeCamera.looking((0.0, -2.0, 3.0), (0.0, 0.0, 0.0), 40.0, SIZE)
+WHITE = Environment.white()
+CLEAR = Material("clear", 1.333)
+
+
+def level(height):
+    """Camera z (m) of the level plane at a height, everywhere before the camera here."""
+    rays = CAMERA.rays(CAMERA.pixel_grid())
+    return (height - CAMERA.position[2]) / rays[..., 2]
+
+
+def slab(top=0.3, thick=0.25, **more):
+    """A level layer of liquid that fills the picture."""
+    rays = CAMERA.rays(CAMERA.pixel_grid())
+    along = thick * np.linalg.norm(rays, axis=-1) / -rays[..., 2]
+    shape = SIZE[::-1]
+    normal = np.broadcast_to([0.0, 0.0, 1.0], (*shape, 3))
+    return LiquidSurface(level(top), normal, along, np.full((*shape, 3), 0.5), np.ones(shape), **more)
+
+
+def every_pixel():
+    return np.stack(np.nonzero(np.ones(SIZE[::-1], bool)), axis=-1)
+
+
+def snell(top, thick, floor):
+    """Points of the floor that are seen through the slab, and the cosine in the liquid."""
+    rays = CAMERA.rays(CAMERA.pixel_grid()).reshape(-1, 3)
+    entry = CAMERA.position + rays * level(top).reshape(-1, 1)
+    d = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    t, _ = refract(d, np.broadcast_to([0.0, 0.0, 1.0], d.shape), 1 / 1.333)
+    leave = entry + t * (thick / -t[:, 2:])
+    return leave + d * ((leave[:, 2:] - floor) / -d[:, 2:]), -t[:, 2]
+
+
+@pytest.mark.parametrize("floor", [0.05, -0.6])  # the slab lies on it, and floats above it
+def test_through_a_slab_one_sees_the_point_that_snells_law_says(floor):
+    z = level(floor)
+    points = CAMERA.unproject(CAMERA.pixel_grid(), z)
+    behind = Behind(points + 10.0, z)  # its colours are places
+    seen = followed(slab(), behind, CAMERA, every_pixel(), 1.333).color - 10.0
+    expected, _ = snell(0.3, 0.25, floor)
+    got, _ = CAMERA.project(seen)
+    wanted, _ = CAMERA.project(expected)
+    inside = ((wanted > 1) & (wanted < np.array(SIZE) - 1)).all(axis=1)
+    straight = CAMERA.pixel_grid().reshape(-1, 2)
+    assert np.abs(wanted - straight)[inside].max() > 1.5  # px: there is something to see
+    # places are not quite linear between pixels, and the depth behind is looked up in whole pixels
+    assert np.abs(got - wanted)[inside].max() < 0.1
+
+
+def test_a_slab_absorbs_by_the_way_of_the_bent_ray():
+    z = level(-0.6)
+    behind = Behind(np.ones((*SIZE[::-1], 3)), z)
+    a = np.array([0.5, 2.0, 8.0])
+    picture = shaded(slab(), behind, CAMERA, Material("dye", 1.333, absorption=tuple(a)), WHITE)
+    _, cos = snell(0.3, 0.25, -0.6)
+    rays = CAMERA.rays(CAMERA.pixel_grid()).reshape(-1, 3)
+    mirrored = fresnel(-rays[:, 2] / np.linalg.norm(rays, axis=1), 1.333)[:, None]
+    expected = mirrored + (1 - mirrored) * np.exp(-a * 0.25 / cos[:, None])
+    np.testing.assert_allclose(picture.reshape(-1, 3), expected, atol=3e-6)  # float32
+
+
+@pytest.mark.parametrize("index", [1.0, 1.333, 1.5, 2.4])
+def test_a_clear_body_of_any_shape_in_a_white_world_is_white(index):
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.6)
+    ball.vertices *= [1.5, 0.7, 1.0]
+    surface = mesh_surface(TriangleMesh(np.array(ball.vertices), np.array(ball.faces)), CAMERA)
+    behind = Behind(np.ones((*SIZE[::-1], 3)), np.zeros(SIZE[::-1]))
+    picture = shaded(surface, behind, CAMERA, Material("glass", index), WHITE)
+    np.testing.assert_allclose(picture, 1.0, atol=2e-5)  # float32, through the environment's filters
+    cloudy = Material("white", index, scattering=3.0, albedo=(1.0, 1.0, 1.0), roughness=0.3)
+    np.testing.assert_allclose(shaded(surface, behind, CAMERA, cloudy, WHITE), 1.0, atol=2e-5)
+
+
+def test_no_preset_gives_more_light_than_it_gets_unless_it_glows():
+    behind = Behind(np.ones((*SIZE[::-1], 3)), level(-0.6))
+    for material in PRESETS.values():
+        picture = shaded(slab(), behind, CAMERA, material, WHITE)
+        assert np.isfinite(picture).all() and picture.min() >= 0
+        if max(material.emission) == 0:
+            assert picture.max() <= 1.0 + 2e-5  # float32, through the environment's filters
+        else:
+            cold = shaded(slab(), behind, CAMERA, replace(material, emission=(0.0, 0.0, 0.0)), WHITE)
+            assert (picture[..., 0] > cold[..., 0] + 0.1).all()
+
+
+def test_a_deep_turbid_body_shows_its_albedo_and_a_carrying_one_the_splats_colour():
+    behind = Behind(np.zeros((*SIZE[::-1], 3)), level(-0.6))
+    for carried, expected in ((0.0, (0.2, 0.4, 0.6)), (1.0, (0.5, 0.5, 0.5)), (0.5, (0.35, 0.45, 0.55))):
+        material = Material("paint", 1.0, scattering=1e4, albedo=(0.2, 0.4, 0.6), carried=carried)
+        picture = shaded(slab(), behind, CAMERA, material, WHITE)  # index 1: nothing is mirrored
+        np.testing.assert_allclose(picture, np.broadcast_to(expected, picture.shape), atol=1e-5)
+
+
+def test_what_lies_before_the_liquid_hides_it_and_is_never_seen_through_it():
+    z, image = level(-0.6), np.full((*SIZE[::-1], 3), 0.25)
+    post = np.zeros(SIZE[::-1], bool)
+    post[:, 36:44] = True
+    image[post] = [9.0, 0.0, 0.0]
+    z = np.where(post, 0.5 * level(0.3), z)
+    picture = shaded(slab(), Behind(image, z), CAMERA, CLEAR, WHITE)
+    np.testing.assert_array_equal(picture[post], image[post].astype(np.float32))
+    assert picture[~post].max() <= 1.0
+    # but what stands behind it is
+    z = np.where(post, level(0.0), level(-0.6))
+    through = shaded(slab(), Behind(image, z), CAMERA, CLEAR, WHITE)
+    assert through[30, 40, 0] > 8.0
+
+
+def test_the_ground_cuts_the_thickness_off():
+    # the layer reaches below the floor: light meets the floor first
+    behind = Behind(np.ones((*SIZE[::-1], 3)), level(0.2))
+    deep, cut = (followed(slab(thick=t), behind, CAMERA, every_pixel(), 1.0).path for t in (0.5, 0.1))
+    np.testing.assert_allclose(deep, cut, rtol=1e-5)
+
+
+def test_a_share_of_a_pixel_gets_a_share_of_the_liquids_light():
+    surface = slab()
+    part = LiquidSurface(surface.depth, surface.normal, surface.thickness, surface.albedo, 0.25 * surface.covered)
+    behind = Behind(np.zeros((*SIZE[::-1], 3)), level(-0.6))
+    whole = shaded(surface, behind, CAMERA, PRESETS["milk"], WHITE)
+    np.testing.assert_allclose(shaded(part, behind, CAMERA, PRESETS["milk"], WHITE), 0.25 * whole, rtol=1e-5)
+
+
+def test_normals_that_turn_within_a_pixel_are_as_rough_as_they_are():
+    surface = slab()
+    tilt = 0.05 * np.arange(SIZE[0]) * np.ones((SIZE[1], 1))
+    bent = np.stack([np.sin(tilt), 0 * tilt, np.cos(tilt)], axis=-1)
+    curved = LiquidSurface(surface.depth, bent, surface.thickness, surface.albedo, surface.covered)
+    behind = Behind(np.zeros((*SIZE[::-1], 3)), level(-0.6))
+    assert followed(surface, behind, CAMERA, every_pixel(), 1.3).spread.max() < 1e-3
+    spread = followed(curved, behind, CAMERA, every_pixel(), 1.3).spread.reshape(SIZE[::-1])
+    # half the step of the normal, of the mean square over four neighbours of which two step
+    np.testing.assert_allclose(spread[1:-1, 1:-1], 0.5 * 0.05 / np.sqrt(2), rtol=1e-2)
+
+
+def test_bright_lava_is_hotter_and_dull_lava_redder():
+    shine = glow(np.array([[0.0, 0, 0], [0.1, 0.1, 0.1], [0.9, 0.9, 0.9]]), 0.1)
+    np.testing.assert_allclose(shine[2], 1.0, rtol=1e-5)  # nine times the usual luminance: all but melted
+    warm = COOL + (HOT - COOL) * WARM
+    np.testing.assert_allclose(shine[1, 0], np.exp(0.014388 / 611e-9 * (1 / HOT - 1 / warm)), rtol=1e-5)
+    assert (np.diff(shine, axis=0) > 0).all()
+    assert shine[0, 1] / shine[0, 0] < shine[1, 1] / shine[1, 0] < 1.0
+    wien = np.exp(0.014388 / 611e-9 * (1 / HOT - 1 / COOL))
+    np.testing.assert_allclose(shine[0, 0], wien, rtol=1e-5)
+    # of a clip that is darker as a whole, the same: what counts is the contrast
+    np.testing.assert_allclose(glow(np.full((1, 3), 0.02), 0.02), glow(np.full((1, 3), 0.5), 0.5), rtol=1e-5)
+
+
+def test_total_reflection_at_the_far_side_sets_in_without_a_step():
+    # a layer whose far side is tilted more and more from left to right, until no light leaves through it
+    tilt = np.linspace(0.0, 1.4, SIZE[0]) * np.ones((SIZE[1], 1))
+    back = np.stack([np.sin(tilt), 0 * tilt, -np.cos(tilt)], axis=-1)
+    behind = Behind(np.zeros((*SIZE[::-1], 3)), np.zeros(SIZE[::-1]))  # far away: nothing lies at the far side
+    rays = followed(slab(back_normal=back), behind, CAMERA, every_pixel(), 1.333)
+    turned = rays.turned.reshape(SIZE[::-1])[30]
+    assert turned[0] < 0.03 and turned.max() > 0.99
+    # Fresnel's rise is steep at the end: from pixel to pixel of 1 degree it never jumps by more than half
+    assert 0.1 < np.diff(turned).max() < 0.5
+    # and where the ray would run along in the far side, it goes on through without a step too
+    assert np.abs(np.diff(turned)).max() < 0.5
+
+
+@pytest.mark.parametrize("name", ["water", "honey", "lava", "source"])
+def test_the_compiled_light_is_that_of_the_formulas(name):
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.6)
+    ball.vertices *= [1.5, 0.7, 1.0]
+    rng = np.random.default_rng(0)
+    colors = rng.uniform(0.1, 1.0, (len(ball.vertices), 3))
+    surface = mesh_surface(TriangleMesh(np.array(ball.vertices), np.array(ball.faces), colors), CAMERA)
+    behind = Behind(rng.uniform(0, 1, (*SIZE[::-1], 3)), np.where(level(-0.6) > 3.5, 0.0, level(-0.6)))
+    one, other = (f(surface, behind, CAMERA, PRESETS[name], Environment.sky()) for f in (shaded, shaded_plain))
+    # float32 directions into a picture with a sun: a rounded place beside it is another brightness
+    np.testing.assert_allclose(one, other, rtol=2e-3, atol=2e-4)
+
+
+def test_one_measure_of_heat_keeps_the_glow_of_what_stays():
+    behind = Behind(np.zeros((*SIZE[::-1], 3)), level(-0.6))
+    albedo = np.full((*SIZE[::-1], 3), 0.5)
+    albedo[:, 40:] = 0.05  # a cold half that leaves the picture
+    both = LiquidSurface(*(getattr(slab(), k) for k in ("depth", "normal", "thickness")), albedo, slab().covered)
+    alone = slab()
+    first, second = (shaded(s, behind, CAMERA, PRESETS["lava"], WHITE, usual=0.3)[:, :40] for s in (both, alone))
+    np.testing.assert_array_equal(first, second)
+    changed = shaded(both, behind, CAMERA, PRESETS["lava"], WHITE)[:, :40]
+    assert np.abs(changed - shaded(alone, behind, CAMERA, PRESETS["lava"], WHITE)[:, :40]).max() > 0.1
+
+
+def test_pictures_of_other_sizes_are_refused():
+    with pytest.raises(ValueError, match="background"):
+        shaded(slab(), Behind(np.zeros((10, 10, 3)), np.zeros((10, 10))), CAMERA, CLEAR, WHITE)
+    with pytest.raises(ValueError, match="normal of shape"):
+        LiquidSurface(np.ones((4, 4)), np.ones((4, 4)), np.ones((4, 4)), np.ones((4, 4, 3)), np.ones((4, 4)))

@@ -1,0 +1,176 @@
+"""Liquid surfaces in pictures, of particles and of meshes: where they lie, how thick they are, which way they face."""
+
+import numba
+import numpy as np
+import pytest
+import trimesh
+
+from fluidlift.look.screen_space import linear_from_srgb, mesh_surface, particle_surface
+from fluidlift.look.screen_space_kernels import narrow_range, plane_normals
+from fluidlift.types import PinholeCamera, TriangleMesh
+
+RADIUS = 0.032
+"""m, the usual share of the spacing of 0.04 m"""
+CAMERA = PinholeCamera.looking((0.3, -3.0, 1.0), (0.0, 0.0, 0.0), 45.0, (160, 120))
+
+
+def box(size=(1.6, 0.48, 0.8), spacing=0.04, jitter=0.0):
+    """Particles that fill a box about the origin."""
+    axes = [np.arange(-0.5 * s + 0.5 * spacing, 0.5 * s, spacing) for s in size]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    return points + jitter * spacing * np.random.default_rng(0).uniform(-1, 1, points.shape)
+
+
+def ball_depths(camera, centre, radius):
+    """Camera z of a ball's front (m) and length of the ray in it; nan beside it."""
+    rays = camera.rays(camera.pixel_grid())
+    away = camera.position - centre
+    a, b, c = (rays**2).sum(-1), rays @ away, away @ away - radius**2
+    with np.errstate(invalid="ignore"):
+        root = np.sqrt(b * b - a * c)
+    return (-b - root) / a, 2 * root / np.sqrt(a)
+
+
+def test_one_sphere_lies_where_the_formula_says_before_it_is_smoothed():
+    from fluidlift.look.screen_space import _sphere_depth
+
+    centre, radius = np.array([0.2, 0.1, -0.1]), 0.4
+    depth, _ = _sphere_depth(centre[None].astype(np.float32), radius, CAMERA)
+    expected, _ = ball_depths(CAMERA, centre, radius)
+    inner = ball_depths(CAMERA, centre, 0.999 * radius)[0]
+    sure = np.isfinite(inner)  # on the outline itself rounding decides
+    np.testing.assert_allclose(depth[sure], expected[sure], rtol=2e-5)  # root of a small float32 at the outline
+    outer = np.isfinite(ball_depths(CAMERA, centre, 1.001 * radius)[0])
+    assert not np.isfinite(depth[~outer]).any()
+
+
+def test_a_box_of_particles_is_as_thick_as_the_box():
+    # seen from straight before it, 0.48 m deep; parallel enough at 20 m
+    camera = PinholeCamera.looking((0.0, -20.0, 0.0), (0.0, 0.0, 0.0), 5.0, (120, 90))
+    for jitter in (0.0, 0.3):
+        surface = particle_surface(box(jitter=jitter), RADIUS, camera)
+        middle = slice(35, 55), slice(40, 80)
+        # spheres stand for their volume, so that the mean is the box's; what is seen of the lattice or of the jitter is
+        # evened out to 5 % by the smoothing over 0.8 radii
+        thickness = surface.thickness[middle]
+        assert thickness.mean() == pytest.approx(0.48, rel=0.02)
+        assert thickness.std() < 0.05 * 0.48
+        # the outermost particles lie half a spacing (0.6 radii) within the box and the spheres reach a radius out
+        front = surface.depth[middle] - (20.0 - 0.24)
+        assert -0.5 * RADIUS - jitter * 0.04 < front.min() and front.max() < 0.3 * RADIUS + jitter * 0.04
+        assert np.ptp(front) < (0.1 if jitter == 0 else 0.6) * RADIUS  # spheres next to each other: 0.22 radii
+        assert (surface.covered[middle] == 1).all()
+        assert (surface.normal[middle] @ np.array([0.0, -1.0, 0.0])).min() > (0.999 if jitter == 0 else 0.9)
+
+
+def test_thickness_is_the_same_at_any_resolution():
+    # at the larger size it is summed at half the resolution
+    small = particle_surface(box(jitter=0.2), RADIUS, CAMERA)
+    large = particle_surface(box(jitter=0.2), RADIUS, CAMERA.resized((640, 480)))
+    coarse = large.thickness.reshape(120, 4, 160, 4).mean(axis=(1, 3))
+    both = (small.covered == 1) & (coarse > 0.2)
+    assert both.sum() > 2000
+    assert np.median(np.abs(coarse - small.thickness)[both] / coarse[both]) < 0.03
+
+
+def test_a_mesh_is_as_thick_and_as_far_as_the_ball_it_is_of():
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=0.7)
+    colors = np.tile([0.5, 0.25, 1.0], (len(ball.vertices), 1))
+    surface = mesh_surface(TriangleMesh(np.array(ball.vertices), np.array(ball.faces), colors), CAMERA)
+    expected, chord = ball_depths(CAMERA, np.zeros(3), 0.7)
+    sure = chord > 0.3  # near the outline the chord of a polyhedron differs without bound
+    np.testing.assert_allclose(surface.depth[sure], expected[sure], atol=2e-3)  # the sagitta of its faces, slanted
+    np.testing.assert_allclose(surface.thickness[sure], chord[sure], atol=4e-3)
+    points = CAMERA.unproject(CAMERA.pixel_grid(), surface.depth)
+    np.testing.assert_allclose(surface.normal[sure], (points / 0.7)[sure], atol=5e-3)
+    np.testing.assert_allclose(
+        surface.albedo[sure], np.broadcast_to(linear_from_srgb(colors[0]), (sure.sum(), 3)), rtol=1e-5
+    )
+    assert surface.back_normal is not None
+    ends = points + surface.thickness[..., None] * _unit(CAMERA.rays(CAMERA.pixel_grid()))
+    np.testing.assert_allclose(surface.back_normal[sure], (ends / 0.7)[sure], atol=1e-2)
+
+
+def _unit(v):
+    return v / np.linalg.norm(v, axis=-1, keepdims=True)
+
+
+def test_the_outline_of_a_mesh_is_soft_and_what_it_covers_in_part_looks_like_it():
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.7)
+    surface = mesh_surface(TriangleMesh(np.array(ball.vertices), np.array(ball.faces)), CAMERA)
+    part = (surface.covered > 0) & (surface.covered < 1)
+    assert part.any() and (surface.depth[part] > 0).all()
+    np.testing.assert_allclose(np.linalg.norm(surface.normal[part], axis=-1), 1.0, atol=1e-5)
+    # what is covered in all is what the ball covers
+    rays = CAMERA.rays(CAMERA.pixel_grid())
+    inside = np.isfinite(ball_depths(CAMERA, np.zeros(3), 0.7)[0]).sum()
+    assert rays.size and surface.covered.sum() == pytest.approx(inside, rel=0.01)
+
+
+def test_smoothing_keeps_planes_and_steps_and_evens_bumps_out():
+    u, v = np.meshgrid(np.arange(80.0), np.arange(60.0))
+    plane = (0.5 + 0.001 * u + 0.002 * v).astype(np.float32)  # inverse depths of a plane
+    focal, width, limit, fall = 100.0, np.float32(0.08), np.float32(0.3), np.float32(0.1)
+
+    def passes(q):
+        a, b = np.empty_like(q), np.empty_like(q)
+        narrow_range(q, a, 0, 1, focal, width, limit, fall)
+        narrow_range(a, b, 1, 0, focal, width, limit, fall)
+        return b
+
+    np.testing.assert_allclose(passes(plane), plane, rtol=1e-6)  # up to the picture's rim
+    rough = plane + np.float32(0.01) * np.random.default_rng(0).standard_normal(plane.shape).astype(np.float32)
+    assert (passes(rough) - plane)[10:-10, 10:-10].std() < 0.2 * 0.01
+    step = np.where(u < 40, plane, plane + 0.5).astype(np.float32)  # another surface, much nearer
+    after = passes(step)
+    np.testing.assert_allclose(after[:, 60:], step[:, 60:], rtol=1e-6)
+    # nothing lies between the two: the nearer one falls off at its rim by half of `fall` at most, 0.05 m at 1 / 1.2 m
+    assert (np.abs(after - step) < 0.5 * fall * 1.2**2).all()
+    gone = np.where(u < 40, plane, 0).astype(np.float32)
+    np.testing.assert_array_equal(passes(gone) > 0, gone > 0)
+
+
+def test_normals_of_a_plane_are_exact_at_any_slant():
+    normal = np.array([0.3, -0.7, 0.6]) / np.linalg.norm([0.3, -0.7, 0.6])
+    rays = CAMERA.rays(CAMERA.pixel_grid())
+    z = -(CAMERA.position @ normal) / (rays @ normal)
+    lens = np.array([*CAMERA.focal, *CAMERA.center])
+    out = np.zeros((120, 160, 3), np.float32)
+    rotation = np.asarray(CAMERA.camera_from_world.rotation, np.float64)
+    plane_normals((1 / z).astype(np.float32), lens, rotation, np.float32(10.0), out)
+    # differences of float32 over a pixel of 1/190 rad
+    np.testing.assert_allclose(out, np.broadcast_to(normal, out.shape), atol=1e-4)
+
+
+def test_particles_carry_the_colours_of_those_that_are_seen():
+    points = box()
+    colors = np.where(points[:, 1:2] < 0, [1.0, 0.0, 0.0], [0.0, 0.0, 1.0])  # red in front, blue behind
+    camera = PinholeCamera.looking((0.0, -20.0, 0.0), (0.0, 0.0, 0.0), 5.0, (120, 90))
+    albedo = particle_surface(points, RADIUS, camera, colors).albedo[35:55, 40:80]
+    np.testing.assert_allclose(albedo, np.broadcast_to([1.0, 0.0, 0.0], albedo.shape), atol=1e-5)
+
+
+def test_nothing_far_and_broken_particles_draw_nothing():
+    points = np.array([[np.nan, 0, 0], [0.0, -4.0, 1.5], [0.3, -3.0, 1.02]])  # no number, behind, around the camera
+    for some in (points, np.zeros((0, 3))):
+        surface = particle_surface(some, RADIUS, CAMERA)
+        assert not surface.covered.any() and not surface.depth.any()
+    empty = mesh_surface(TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), int)), CAMERA)
+    assert not empty.covered.any()
+    with pytest.raises(ValueError, match="radius"):
+        particle_surface(points, 0.0, CAMERA)
+    with pytest.raises(ValueError, match="colours"):
+        particle_surface(points, 0.1, CAMERA, np.zeros((2, 3)))
+
+
+def test_pictures_are_the_same_bits_with_any_number_of_threads():
+    points, colors = box(jitter=0.3), np.random.default_rng(0).uniform(0, 1, (len(box()), 3))
+    many = particle_surface(points, RADIUS, CAMERA, colors)
+    threads = numba.get_num_threads()
+    numba.set_num_threads(1)
+    try:
+        one = particle_surface(points, RADIUS, CAMERA, colors)
+    finally:
+        numba.set_num_threads(threads)
+    for name in ("depth", "normal", "thickness", "albedo", "covered"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(many, name))

@@ -1,0 +1,158 @@
+"""A finished asset is drawn in other looks, from the command line and by scene.yaml."""
+
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+
+from fluidlift.cli import DONE, REJECTED, WITH_WARNINGS, main
+from fluidlift.io.asset_folder import load_asset
+from fluidlift.io.exr import read_channels
+from fluidlift.io.exr_write import write_channels
+from fluidlift.io.scene_look import Look
+from fluidlift.pipeline.looks import Backdrop, Frame, Painter
+from fluidlift.pipeline.showing import splat_frames
+
+WELL = (DONE, WITH_WARNINGS)
+SMALL = ("--size", "120x80", "--frames", "1002-1002")
+
+
+def drawn(folder, out, *options):
+    """RGBA of frame 1002."""
+    assert main(["render", str(folder), "-o", str(out), *SMALL, *options]) in WELL
+    found = cv2.imread(str(out / "1002.png"), cv2.IMREAD_UNCHANGED)
+    assert found is not None
+    return found[..., [2, 1, 0, 3]].astype(int)
+
+
+@pytest.fixture(scope="module")
+def cut_out(made, tmp_path_factory):
+    """Where the splats are, seen from the side."""
+    return drawn(made.folder, tmp_path_factory.mktemp("cut"), "--view", "side", "--background", "none")[..., 3] > 128
+
+
+@pytest.mark.parametrize("look", ["relit", "transparent", "surface"])
+def test_each_look_shows_the_same_body_in_the_same_place(made, cut_out, tmp_path, look):
+    found = drawn(made.folder, tmp_path, "--view", "side", "--background", "none", "--look", look)[..., 3] > 128
+    overlap = (found & cut_out).sum() / (found | cut_out).sum()
+    # a surface stands a radius outside the middles of its particles, splats reach farther still: a pixel or two
+    assert overlap > 0.7, overlap
+
+
+def test_a_material_changes_the_fluid_and_little_else(made, cut_out, tmp_path):
+    options = ("--view", "side", "--background", "terrain", "--look", "surface", "--material")
+    milk, lava = (drawn(made.folder, tmp_path / m, *options, m)[..., :3] for m in ("milk", "lava"))
+    apart = np.abs(milk - lava).mean(axis=-1)
+    far = cv2.dilate(cut_out.astype(np.uint8), np.ones((15, 15))) == 0
+    assert apart[cut_out].mean() > 30
+    assert np.median(apart[far]) <= 2  # the ground beyond the shadow and the glow is the same
+    assert milk[cut_out].mean() > lava[cut_out].mean()
+
+
+def test_the_engines_agree_on_where_the_liquid_is(made, tmp_path):
+    options = ("--view", "side", "--background", "terrain", "--look", "surface", "--material", "milk", "--engine")
+    mesh, screen = (drawn(made.folder, tmp_path / e, *options, e)[..., :3] for e in ("mesh", "screen"))
+    # an opaque white liquid on the same ground: what differs are its edges and ripples
+    assert np.abs(mesh - screen).mean() < 25
+
+
+def test_exposure_counts_in_stops(made, tmp_path):
+    options = (
+        "--view",
+        "side",
+        "--background",
+        "none",
+        "--look",
+        "surface",
+        "--material",
+        "chocolate",
+        "--format",
+        "exr",
+    )
+    for name, stops in (("a", "0"), ("b", "-1")):
+        assert (
+            main(["render", str(made.folder), "-o", str(tmp_path / name), *SMALL, *options, "--exposure", stops])
+            in WELL
+        )
+    first, second = (read_channels(tmp_path / n / "1002.exr") for n in "ab")
+    # scene light is what an EXR holds: the exposure is for displays
+    np.testing.assert_allclose(first["G"], second["G"], atol=1e-6)
+    a, b = (drawn(made.folder, tmp_path / f"p{n}", *options[:-2], "--exposure", n)[..., :3] for n in ("0", "-1"))
+    assert b.mean() < a.mean()
+
+
+def test_scene_yaml_names_the_look_and_options_override_it(made, tmp_path):
+    folder = shutil.copytree(made.folder, tmp_path / "copy.fluid")
+    (folder / "scene.yaml").write_text("look: {style: relit, material: lava}\n")
+    view = ("--view", "side", "--background", "none")
+    by_file = drawn(folder, tmp_path / "file", *view)
+    by_option = drawn(made.folder, tmp_path / "option", *view, "--look", "relit", "--material", "lava")
+    np.testing.assert_array_equal(by_file, by_option)
+    plain = drawn(folder, tmp_path / "plain", *view, "--look", "splats")
+    np.testing.assert_array_equal(plain, drawn(made.folder, tmp_path / "own", *view))
+
+
+def test_light_comes_from_a_file(made, tmp_path):
+    red = {c: np.full((8, 16), 1.0 if c == "R" else 0.05, np.float32) for c in "RGB"}
+    write_channels(tmp_path / "red.exr", red)
+    options = ("--view", "side", "--background", "none", "--look", "relit", "--environment", str(tmp_path / "red.exr"))
+    found = drawn(made.folder, tmp_path / "out", *options)
+    seen = found[found[..., 3] > 200]
+    assert seen[:, 0].mean() > 3 * seen[:, 2].mean()
+
+
+def test_looks_stand_before_the_clips_own_background(made, tmp_path):
+    plate = drawn(made.folder, tmp_path / "splats")
+    surface = drawn(made.folder, tmp_path / "surface", "--look", "surface", "--material", "milk")
+    same = np.abs(plate[..., :3] - surface[..., :3]).max(axis=-1) <= 1
+    assert 0.15 < same.mean() < 0.95  # the banks are the plate in both; the fluid is not
+
+
+def test_the_same_frame_gives_the_same_picture(made, tmp_path):
+    asset = load_asset(made.folder)
+    fluid, _, velocities = next(iter(splat_frames(made.folder, 1)))
+    painter = Painter(Look("surface", "honey"), asset.terrain, made.folder)
+    once, twice = (
+        painter.picture(Frame(fluid, velocities), asset.camera.resized((96, 64)), Backdrop()).image for _ in range(2)
+    )
+    np.testing.assert_array_equal(once, twice)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--look", "surfce"), "did you mean surface"),
+        (("--look", "relit", "--material", "hony"), "did you mean honey"),
+        (("--look", "relit", "--environment", "studo"), "did you mean studio"),
+        (("--look", "relit", "--engine", "screen"), "the look surface"),
+        (("--look", "surface", "--engine", "mitsubi"), "did you mean mitsuba"),
+        (("--look", "splats", "--material", "honey"), "add --look relit"),
+        (("--look", "relit", "--exposure", "99"), "-20 to 20"),
+        (("--engine", "mitsuba", "--background", "none"), "--background plate or terrain"),
+        (("--look", "surface", "--engine", "mitsuba", "--samples", "0"), "1 to 100000"),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused_before_anything_is_written(made, tmp_path, capsys, options, words):
+    assert main(["render", str(made.folder), "-o", str(tmp_path / "out"), *options]) == REJECTED
+    assert words in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_final_frame_is_traced(made, tmp_path):
+    pytest.importorskip("mitsuba", reason="Mitsuba is not installed")
+    options = ("--engine", "mitsuba", "--samples", "4", "--view", "side", "--material", "milk")
+    assert (
+        main(["render", str(made.folder), "-o", str(tmp_path), "--size", "60x40", "--frames", "1002-1002", *options])
+        in WELL
+    )
+    found = cv2.imread(str(tmp_path / "1002.png"))
+    quick = tmp_path / "quick"
+    options = ("--look", "surface", "--view", "side", "--material", "milk")
+    assert (
+        main(["render", str(made.folder), "-o", str(quick), "--size", "60x40", "--frames", "1002-1002", *options])
+        in WELL
+    )
+    other = cv2.imread(str(quick / "1002.png"))
+    # the same opaque white body on the same ground under the same sky; noise, and light between ground and liquid
+    assert np.abs(found.astype(int) - other).mean() < 35

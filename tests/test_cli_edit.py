@@ -1,0 +1,131 @@
+"""`fluidlift edit`: what it prints, what it changes, how it ends."""
+
+import json
+import shutil
+
+import pytest
+
+from fluidlift.cli import DONE, FAILED, REJECTED, WITH_WARNINGS, main
+
+WELL = (DONE, WITH_WARNINGS)
+
+
+@pytest.fixture
+def asset(tmp_path):
+    """A folder that is an asset as far as editing goes."""
+    place = {"scale": 1.0, "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "translation": [0, 0, 0]}
+    files = {name: f"rest/{name}" for name in ("gaussians", "terrain", "velocity", "camera", "parameters")}
+    manifest = {
+        "format": "fluidlift asset", "format_version": 1, "kind": "stream",
+        "units": {"length": "m", "time": "s", "mass": "kg", "up": "z"},
+        "frame_interval": 0.04, "frame_count": 10, "start_frame": 1001,
+        "grid": {"shape": [10, 10, 5], "spacing": 0.1, "origin": [0, 0, 0]},
+        "world_from_canonical": place, "files": files,
+    }  # fmt: skip
+    folder = tmp_path / "my river.fluid"
+    folder.mkdir()
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    return folder
+
+
+def edit(asset, *options):
+    return main(["edit", str(asset), *options])
+
+
+def test_an_edit_is_shown_as_lines_with_what_to_do_next(asset, capsys):
+    assert edit(asset, "--set", "parameters.gravity=[0, 0, -1]", "--set", "look.exposure=1") in WELL
+    said = capsys.readouterr().out
+    assert "set parameters.gravity = [0, 0, -1]; set look.exposure = 1" in said
+    assert "+  gravity: [0, 0, -1]" in said
+    assert f"fluidlift sim '{asset}'" in said  # quoted for the shell, as the name has a space
+
+
+def test_undo_redo_reset_and_history(asset, capsys):
+    for value in (900, 800):
+        assert edit(asset, "--set", f"parameters.density={value}") in WELL
+    assert edit(asset, "--undo") in WELL
+    capsys.readouterr()
+    assert edit(asset, "--history", "--diff") in WELL
+    said = capsys.readouterr().out
+    assert "set parameters.density = 800  (undone)" in said
+    assert "+  density: 900" in said
+    assert edit(asset, "--redo") in WELL
+    assert "density: 800" in (asset / "scene.yaml").read_text()
+    assert edit(asset, "--reset") in WELL
+    assert "density: 800" not in (asset / "scene.yaml").read_text()
+
+
+def test_all_as_json(asset, capsys):
+    assert edit(asset, "--material", "honey", "--json", "--diff", "--history") in WELL
+    said = json.loads(capsys.readouterr().out)
+    assert said["scene"]["look"] == {"style": "surface", "material": "honey"}
+    assert set(said["stale"]) == {"simulate", "look"}
+    assert (said["can_undo"], said["can_redo"], len(said["history"])) == (True, False, 1)
+    assert said["edit"]["what"] == said["history"][0]["what"]
+
+
+def test_a_value_after_a_material_stands_over_it(asset):
+    assert edit(asset, "--set", "parameters.density=1500", "--material", "honey") in WELL
+    text = (asset / "scene.yaml").read_text()
+    assert "density: 1500" in text
+    assert "kinematic_viscosity: 0.00704" in text
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--set", "parameters.density"), ["place=value"]),
+        (("--set", "parameters.density=-3"), ["-3", "kg/m^3"]),
+        (("--set", "parameters.gravity=[0, 0"), ["no value", "quotes"]),
+        (("--set", "parameters.densty=3"), ["write 'parameters.density'"]),
+        (("--add", "obstacles=duck"), ["'duck'"]),
+        (("--remove", "obstacles.duck"), ["no 'duck' in obstacles"]),
+        (("--undo",), ["no edit to undo"]),
+        (("--redo",), ["nothing to redo"]),
+        (("--undo", "--redo"), ["--undo and --redo at once"]),
+        (("--reset", "--set", "duration=3"), ["at once"]),
+        (("--meshes", "nowhere", "--add", "obstacles={mesh: a.obj}"), ["a.obj"]),
+    ],
+)
+def test_nonsense_is_refused_with_what_is_needed(asset, capsys, options, words):
+    before = sorted(asset.rglob("*.yaml"))
+    assert edit(asset, *options) == REJECTED
+    said = capsys.readouterr().err
+    assert [w for w in words if w not in said] == []
+    assert sorted(asset.rglob("*.yaml")) == before
+
+
+def test_a_folder_that_is_no_asset_is_refused(tmp_path, capsys):
+    assert edit(tmp_path / "nothing.fluid") == REJECTED
+    assert "is not a fluidlift asset" in capsys.readouterr().err
+
+
+def test_a_folder_of_edits_that_is_a_link_is_refused(asset, tmp_path, capsys):
+    (tmp_path / "elsewhere").mkdir()
+    (asset / "edits").symlink_to(tmp_path / "elsewhere")
+    assert edit(asset, "--set", "duration=3") == REJECTED
+    assert "link" in capsys.readouterr().err
+    shutil.rmtree(tmp_path / "elsewhere")
+
+
+def test_simulate_does_what_the_edit_makes_necessary(asset, monkeypatch):
+    from fluidlift import pipeline
+
+    called = []
+    monkeypatch.setattr(pipeline, "resimulate", lambda folder, **options: called.append(folder))
+    assert edit(asset, "--set", "duration=3", "--simulate") in WELL
+    assert called == [asset]
+
+
+def test_a_simulation_that_breaks_down_names_the_edit_before_it(asset, monkeypatch, capsys):
+    from fluidlift import pipeline
+    from fluidlift.errors import FluidliftError
+
+    def blow_up(folder, **options):
+        raise FluidliftError("frame 1003: the simulation blew up.")
+
+    monkeypatch.setattr(pipeline, "resimulate", blow_up)
+    assert edit(asset, "--set", "parameters.gravity=[0, 0, -900]", "--simulate") == FAILED
+    said = capsys.readouterr().err
+    assert "blew up. The last edit was: set parameters.gravity = [0, 0, -900]" in said
+    assert "--undo" in said

@@ -1,0 +1,131 @@
+"""The page in a real browser, headless: it loads, plays, an edit changes the picture, and nothing complains.
+
+A software renderer draws it, so the asset is a tank of a few hundred splats.
+"""
+
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("viser", reason="viser is not installed: pip install 'fluidlift[view]'")
+api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+
+CHROMIUM = Path("/usr/bin/chromium")
+FLAGS = ["--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+HARMLESS = ("THREE.Clock", "WebGL", "GPU stall", "GL Driver Message", "computeBoundingSphere")
+"""what the renderer itself says of its software; the last one viser 1.1.1 says of every cloud of splats, whose centres
+it keeps in a texture"""
+
+pytestmark = pytest.mark.skipif(not CHROMIUM.exists(), reason=f"there is no {CHROMIUM}")
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with api.sync_playwright() as p:
+        started = p.chromium.launch(executable_path=str(CHROMIUM), args=FLAGS)
+        yield started
+        started.close()
+
+
+class Visit:
+    """One browser that looks at a viewer."""
+
+    def __init__(self, browser, viewer):
+        self.viewer, self.complaints, self.strangers = viewer, [], []
+        self.page = browser.new_page(viewport={"width": 900, "height": 700})
+        self.page.set_default_timeout(90_000)
+        self.page.on("console", lambda m: self.complaints.append(m.text) if m.type == "error" else None)
+        self.page.on("pageerror", lambda e: self.complaints.append(str(e)))
+        self.page.on("request", self._requested)
+        self.page.goto(viewer.address)
+        self.page.locator("strong", has_text="Saved frames").first.wait_for()
+
+    def _requested(self, request):
+        if not request.url.startswith((self.viewer.address, "data:", "blob:", "ws://127.0.0.1")):
+            self.strangers.append(request.url)
+
+    def picture(self):
+        """u8 [h,w,3] of the page left of the controls."""
+        import cv2
+
+        data = np.frombuffer(self.page.screenshot(timeout=90_000), np.uint8)
+        return cv2.imdecode(data, cv2.IMREAD_COLOR)[250:, :480]
+
+    def until(self, condition, seconds=90.0):
+        end = time.monotonic() + seconds
+        while not condition():
+            assert time.monotonic() < end, "it did not happen"
+            self.page.wait_for_timeout(50)
+
+    def tab(self, name):
+        self.page.get_by_role("tab", name=name).click()
+
+    def label(self):
+        """Number of the frame that the page tells."""
+        return int(self.page.locator("strong", has_text="·").first.inner_text().split("·")[0])
+
+
+@pytest.fixture
+def viewer(tank_folder):
+    from fluidlift.viewer.app import Viewer, ViewRequest
+    from fluidlift.viewer.ports import free_port
+
+    made = Viewer(tank_folder, ViewRequest(port=free_port("127.0.0.1", 18080)))
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def visit(browser, viewer):
+    made = Visit(browser, viewer)
+    yield made
+    made.page.close()
+
+
+def test_it_loads_plays_and_an_edit_changes_the_picture(visit, viewer):
+    visit.until(lambda: viewer.preview.phase == "ready")
+    assert visit.label() == 1001
+    visit.until(lambda: np.ptp(visit.picture().reshape(-1, 3), axis=0).max() > 60)  # something is drawn
+    before = visit.picture()
+
+    visit.page.get_by_role("button", name="Play").click()
+    visit.until(lambda: visit.label() not in (1001,))
+    visit.page.get_by_role("button", name="Pause").click()
+
+    visit.tab("Fluid")
+    fluid = viewer.panels.fluid
+    for text, told in (("many", "is no number"), ("-4e9", "is outside")):
+        fluid._text.value = text
+        fluid._typed(None)
+        visit.page.get_by_text(told).wait_for()
+    visit.until(lambda: viewer.preview.shown is not None and not viewer.preview.busy)
+    visit.page.locator("strong", has_text="Live preview").first.wait_for()
+    viewer.edited(lambda: viewer.draft.move("parameters.gravity", [3.0, 0, 6.0], "gravity up", time.monotonic()))
+    visit.until(lambda: viewer.take is not None and viewer.take.wish.told == "gravity up" and viewer.take.complete)
+    with viewer.lock:
+        viewer.timeline.pause()
+        viewer.timeline.seek(7)
+    visit.until(lambda: visit.label() == 1008)
+    visit.page.wait_for_timeout(1500)  # the renderer sorts and draws
+    changed = np.abs(visit.picture().astype(int) - before).max(axis=2)
+    assert (changed > 30).mean() > 0.01  # the water has left its place
+
+    assert [c for c in visit.complaints if not any(h in c for h in HARMLESS)] == []
+    assert visit.strangers == []
+
+
+def test_a_second_browser_sees_the_same_and_one_may_close_in_the_middle(browser, visit, viewer):
+    other = Visit(browser, viewer)
+    visit.until(lambda: len(viewer.server.get_clients()) == 2 and viewer.preview.phase == "ready")
+    viewer.edited(lambda: viewer.draft.move("parameters.gravity", [0, 0, -3.0], "gravity 3", time.monotonic()))
+    visit.page.close()
+    other.until(lambda: viewer.preview.shown is not None and viewer.preview.shown.complete)
+    other.until(lambda: "Live preview" in other.page.inner_text("body"))
+    other.page.close()
+    end = time.monotonic() + 30
+    while viewer.server.get_clients():
+        assert time.monotonic() < end, "the server still counts browsers that are closed"
+        time.sleep(0.1)
+    assert viewer.alive

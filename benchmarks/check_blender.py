@@ -17,6 +17,11 @@ import sys
 from pathlib import Path
 
 FRAMES = (1001, 1003)
+FORMATS = {
+    "mesh": (), "obj": ("--to", "obj"), "vdb": ("--to", "vdb"), "usd": ("--to", "usd"),
+    "usd-y": ("--to", "usd", "--up-axis", "y", "--meters-per-unit", "0.01"), "clips": ("--to", "usd-clips"),
+}  # fmt: skip
+"""folders, and the options of the export that fills them"""
 TOLERANCE = 1e-3
 """m; the files hold float32"""
 
@@ -27,7 +32,7 @@ def export(asset: Path, folder: Path) -> None:
 
     from fluidlift.io.ply import read_mesh
 
-    for name, options in {"mesh": (), "obj": ("--to", "obj"), "usd": ("--to", "usd"), "vdb": ("--to", "vdb")}.items():
+    for name, options in FORMATS.items():
         command = [sys.executable, "-m", "fluidlift.cli", "export", str(asset), "-o", str(folder / name), *options]
         subprocess.run([*command, "--frames", f"{FRAMES[0]}-{FRAMES[1]}"], check=True, stdout=subprocess.DEVNULL)
     expected = {}
@@ -66,7 +71,9 @@ def read(folder: Path) -> int:
     bpy.ops.wm.read_factory_settings(use_empty=True)
     facts = json.loads((folder / "expected.json").read_text(encoding="utf-8"))
     print(f"Blender {bpy.app.version_string}")
-    faults = sum(check(bpy, folder, facts["frames"]) for check in (check_ply, check_obj, check_usd, check_glb))
+    faults = sum(check(bpy, folder, facts["frames"]) for check in (check_ply, check_obj, check_glb, check_bodies))
+    for layout in ("usd", "usd-y", "clips"):
+        faults += check_usd(bpy, folder, facts["frames"], layout)
     return faults + check_vdb(bpy, folder, facts["frames"], facts["spacing"])
 
 
@@ -105,22 +112,48 @@ def check_obj(bpy, folder: Path, expected: dict) -> int:
     return told("OBJ", "" if worst < TOLERANCE else f"{worst:.3g} m off", f"upright, within {worst:.1e} m")
 
 
-def check_usd(bpy, folder: Path, expected: dict) -> int:
-    """The surface at every frame of the timeline."""
+def check_usd(bpy, folder: Path, expected: dict, layout: str) -> int:
+    """The surface at every frame of the timeline, whatever the file's axes and units are."""
+    name, file = {"usd": "USD", "usd-y": "USDy", "clips": "USDc"}[layout], str(folder / layout / "fluid.usda")
     try:
-        things = imported(bpy, lambda: bpy.ops.wm.usd_import(filepath=str(folder / "usd" / "fluid.usda"), scale=1.0))
+        things = imported(bpy, lambda: bpy.ops.wm.usd_import(filepath=file, scale=1.0))
     except AttributeError:
-        print("USD   not checked: this Blender is built without it")
+        print(f"{name:5} not checked: this Blender is built without it")
         return 0
     moving = [t for t in things if t.type == "MESH" and any(m.type == "MESH_SEQUENCE_CACHE" for m in t.modifiers)]
     if len(moving) != 1:
-        return told("USD", f"{len(moving)} meshes that move among {[t.name for t in things]}", "")
+        return told(name, f"{len(moving)} meshes that move among {[t.name for t in things]}", "")
     worst = 0.0
     for number, box in expected.items():
         bpy.context.scene.frame_set(int(number))
         worst = max(worst, off(bounds(bpy, moving[0]), box))
     kinds = sorted({t.type for t in things})
-    return told("USD", "" if worst < TOLERANCE else f"{worst:.3g} m off", f"{kinds}, every frame within {worst:.1e} m")
+    return told(name, "" if worst < TOLERANCE else f"{worst:.3g} m off", f"{kinds}, every frame within {worst:.1e} m")
+
+
+def check_bodies(bpy, folder: Path, expected: dict) -> int:
+    """Every obstacle has a mesh around its origin and a pose in every frame; as the extension brings them in."""
+    import numpy as np
+
+    listed = folder / "mesh" / "bodies.json"
+    if not listed.is_file():
+        print("BODY  not checked: this asset has no obstacles")
+        return 0
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "blender"))
+    from fluidlift_asset import build  # pyright: ignore[reportMissingImports]
+
+    into, worst = build.collection(), 0.0
+    things = build.bodies_of(into, folder / "mesh")
+    told_of = json.loads(listed.read_text(encoding="utf-8"))["bodies"]
+    for thing, body in zip(things, told_of):
+        if len(body["poses"]) != len(expected):
+            return told("BODY", f"{len(body['poses'])} poses of {body['name']} for {len(expected)} frames", "")
+        for number, pose in zip(expected, body["poses"]):
+            bpy.context.scene.frame_set(int(number))
+            matrix = np.array(thing.matrix_world)
+            worst = max(worst, float(np.abs(matrix[:3, 3] - pose[:3]).max()))
+    faults = "" if worst < TOLERANCE and len(things) == len(told_of) else f"{worst:.3g} m off"
+    return told("BODY", faults, f"{[t.name for t in things]}, every frame within {worst:.1e} m")
 
 
 def check_vdb(bpy, folder: Path, expected: dict, spacing: float) -> int:
@@ -145,7 +178,7 @@ def check_glb(bpy, folder: Path, expected: dict) -> int:
     """The terrain below the surface: Blender turns glTF's y up back."""
     import numpy as np
 
-    if not hasattr(np, "bool"):
+    if "bool" not in vars(np):
         np.bool = bool  # Blender 3.4's importer names an alias that later NumPy has dropped
     things = imported(bpy, lambda: bpy.ops.import_scene.gltf(filepath=str(folder / "mesh" / "terrain.glb")))
     low, high = bounds(bpy, next(t for t in things if t.type == "MESH"))

@@ -12,19 +12,22 @@ from workbench import bench, end
 from fluidlift.pipeline import EditSession
 
 b = bench("honey_and_water", __doc__)
-b.simulate()
 edits = EditSession.open(b.folder)
 text = (b.folder / "scene.yaml").read_bytes()
-water, speed = b.last()
-mean = float(np.linalg.norm(speed, axis=1).mean())
+if not b.dry:
+    b.simulate()
+    water, speed = b.last()
+    mean = float(np.linalg.norm(speed, axis=1).mean())
 
 edits.apply(edits.made_of("honey"))
-print(edits.diff())
+b.edited(edits)
 b.simulate()
-b.picture("04_honey", background="terrain")
+b.picture("04_honey")
 _, slow = b.last()
 thick = float(np.linalg.norm(slow, axis=1).mean())
-b.check("honey is slower", thick < 0.9 * mean, f"{thick:.2f} m/s, water {mean:.2f} m/s")
+# what comes in is the same; the film at the bed, where viscosity holds the honey, reaches through the whole depth
+b.check("honey is slower", thick < 0.9 * mean, f"{thick:.2f} m/s on the mean, water {mean:.2f} m/s")
+b.divergence_free()
 b.solids_stay_dry()
 
 edits.undo()
@@ -34,7 +37,7 @@ again, _ = b.last()
 b.check(
     "and the same water",
     len(again) == len(water) and np.array_equal(again.means, water.means),
-    f"{len(again)} splats in the same places",
+    f"{len(again)} splats in the same places, to the bit",
 )
-b.picture("04_water", background="terrain")
+b.picture("04_water", look="surface", material="water")
 end(b)

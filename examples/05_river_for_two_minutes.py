@@ -11,43 +11,51 @@ Two minutes of the demo at its own resolution take a while; `--frames 200` shows
 import numpy as np
 from workbench import FIRST, bench, end
 
-from fluidlift.io.asset_folder import load_asset, read_manifest
 from fluidlift.look.rasterize import render
 from fluidlift.pipeline import EditSession
+from fluidlift.pipeline.looping import seam
+
+LONG, LOOP = 120.0, 1.5
+"""s"""
 
 b = bench("two_minutes", __doc__)
-asset = load_asset(b.folder)
-b.simulate(120.0)
+asset, footage = b.asset, b.footage()
+assert footage is not None, "the loop is held against the clip: give an asset with its folder work/"
+edits = EditSession.open(b.folder)
+edits.set("duration", LONG)
+b.edited(edits)
+b.simulate(LONG)
+
 volume = b.history()["volume"]
 late = volume[len(volume) // 2 :]
 drift = float(np.abs(late / late.mean() - 1).max())
+# the inflow is steady but for the fitted fluctuation, so what is left are waves: a few per cent of the depth
 b.check("steady to the end", drift < 0.1, f"volume of the second half within {100 * drift:.1f} % of its mean")
-seconds = len(volume) * asset.interval
+seconds = (len(volume) - 1) * asset.interval
+# the level finds its own balance of inflow, slope and outlet, which need not be that of the first frame
 b.check(
     "the river does not run dry",
-    float(volume[-1]) > 0.6 * volume[0],
+    float(volume[-1]) > 0.7 * volume[0],
     f"{volume[-1] / volume[0]:.2f} of the start after {seconds:.0f} s",
 )
+b.divergence_free()
 b.solids_stay_dry()
-b.picture("05_after", background="terrain")
+b.picture("05_after")
 
-edits = EditSession.open(b.folder)
+edits.set("duration", LOOP)
 edits.set("loop", True)
-b.simulate(1.5)
-count = read_manifest(b.folder)["simulation"]["frames"]
-
-
-def seen(number: int) -> np.ndarray:
-    """The fluid from the clip's camera."""
-    return render(b.splats(number)[0], asset.camera).image
-
-
-seam = float(np.abs(seen(FIRST + count - 1) - seen(FIRST)).mean())
-steps = [float(np.abs(seen(FIRST + k) - seen(FIRST + k + 1)).mean()) for k in range(0, count - 1, max(1, count // 8))]
+b.simulate(LOOP)
+plate, mask = footage.plate.astype(np.float32) / 255.0, footage.labels.fluid.mean(axis=0) > 0.5
+shown = [render(b.splats(FIRST + k)[0], asset.camera, background=plate).image[mask] for k in range(b.count)]
+across, between, _ = seam(np.clip(np.stack(shown), 0.0, 1.0)[:, None])
+clip = np.stack([f[mask] for f in footage.clip.frames])[:, None] / 255.0
+own = seam(clip)[1]
+# inside the clip's mask, from the clip's camera: from the last frame to the first the loop may not change more than
+# the clip does from one frame to the next
 b.check(
     "the loop has no seam",
-    seam <= 1.25 * max(steps),
-    f"change at the seam {seam:.4f}, between frames {np.mean(steps):.4f}",
+    across <= own,
+    f"change at the seam {across:.4f}, between frames of the clip {own:.4f}, of the loop {between:.4f} (sRGB, 0 to 1)",
 )
-b.film("05_loop", background="terrain")
+b.film("05_loop")
 end(b)

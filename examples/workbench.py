@@ -5,19 +5,28 @@ from __future__ import annotations
 import argparse
 import shutil
 import sys
+import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from scipy import ndimage
 
 from fluidlift.config import build_config
 from fluidlift.io.asset_folder import load_asset, read_manifest
 from fluidlift.io.ply import read_splats
 from fluidlift.io.stage_cache import load_stage, owner_of
-from fluidlift.pipeline import Inputs, RenderRequest, SimulationRequest, make, render_asset, resimulate
+from fluidlift.physics.transfer import particles_to_grid, sort_by_cell
+from fluidlift.pipeline import EditSession, Inputs, RenderRequest, SimulationRequest, make, render_asset, resimulate
+from fluidlift.pipeline.resimulate import FIRST_HALF, recall_first_half
+from fluidlift.pipeline.scene import Footage, footage_of
+from fluidlift.pipeline.story import Silence, Story
 from fluidlift.synthetic.demo import demo_clip
+from fluidlift.types import FluidAsset, Grid, Particles
 
 FIRST = 1001
+WIDTH = 640
+"""px, of the pictures"""
 
 
 @dataclass
@@ -27,20 +36,43 @@ class Bench:
     folder: Path
     out: Path
     frames: int | None
+    dry: bool
     failed: list[str] = field(default_factory=list)
+    began: float = field(default_factory=time.perf_counter)
+
+    @property
+    def asset(self) -> FluidAsset:
+        """As it lies on disk."""
+        return load_asset(self.folder)
+
+    def edited(self, session: EditSession) -> None:
+        """Show an edit; with `--dry` this is all."""
+        print(session.diff())
+        if self.dry:
+            print(f"stale: {', '.join(sorted(session.stale())) or 'nothing'}")
+            sys.exit(0)
 
     def simulate(self, seconds: float | None = None) -> None:
         """The scene as it is edited now; `--frames` shortens it."""
-        interval = load_asset(self.folder).interval
+        interval = self.asset.interval
         if self.frames is not None:
             longest = (self.frames + 0.01) * interval
             seconds = longest if seconds is None else min(seconds, longest)
-        resimulate(self.folder, request=SimulationRequest(duration=seconds), overrides=["show.usd=false"])
+        began = time.perf_counter()
+        made = resimulate(self.folder, request=SimulationRequest(duration=seconds), overrides=["show.usd=false"])
+        print(f"simulated: {made.frames} frames in {time.perf_counter() - began:.0f} s, with the preview")
 
-    def picture(self, name: str, view: str = "side", **told) -> Path:
-        """The last frame as PNG, named after the example."""
-        number = FIRST + read_manifest(self.folder)["simulation"]["frames"] - 1
-        request = RenderRequest(view=view, frames=(number, number), **told)
+    @property
+    def count(self) -> int:
+        """Frames that were simulated."""
+        return read_manifest(self.folder)["simulation"]["frames"]
+
+    def picture(self, name: str, view: str = "side", frame: int | None = None, **told) -> Path:
+        """A frame (counted from 0; the last one) as PNG, named after the example."""
+        number = FIRST + (self.count - 1 if frame is None else frame)
+        width, height = self.asset.camera.size
+        size = (WIDTH, 2 * round(0.5 * WIDTH * height / width))
+        request = RenderRequest(view=view, frames=(number, number), size=size, background="terrain", **told)
         made = render_asset(self.folder, self.out / "frame", request)
         path = self.out / f"{name}.png"
         shutil.move(made.folder / f"{number}.png", path)
@@ -51,7 +83,7 @@ class Bench:
     def film(self, name: str, view: str = "side", **told) -> Path:
         """All frames as MP4."""
         path = self.out / f"{name}.mp4"
-        render_asset(self.folder, path, RenderRequest(view=view, **told))
+        render_asset(self.folder, path, RenderRequest(view=view, background="terrain", **told))
         print(f"film: {path}")
         return path
 
@@ -62,14 +94,20 @@ class Bench:
         assert found is not None, "the simulation's figures are gone"
         return found[0]
 
+    def footage(self) -> Footage | None:
+        """The clip as `make` read it, with its mask; None where work/ is gone."""
+        story = Story(self.folder, FIRST_HALF, progress=Silence())
+        recall_first_half(story, read_manifest(self.folder))
+        return footage_of(story)
+
     def splats(self, number: int):
-        """Positions [n,3] and velocities [n,3] of a frame."""
+        """Gaussians and velocities [n,3] (m/s) of a frame."""
         found = read_splats(self.folder / "frames" / "splats" / f"{number}.ply")
         return found.gaussians, np.stack([found.extras[v] for v in ("vx", "vy", "vz")], axis=-1)
 
     def last(self):
         """Those of the last frame."""
-        return self.splats(FIRST + read_manifest(self.folder)["simulation"]["frames"] - 1)
+        return self.splats(FIRST + self.count - 1)
 
     def check(self, what: str, passed: bool, measured: str) -> None:
         """One line per check."""
@@ -77,29 +115,69 @@ class Bench:
         if not passed:
             self.failed.append(what)
 
-    def solids_stay_dry(self, most: float = 0.01) -> None:
-        """Few particles inside the terrain at any time."""
-        leak = float(self.history()["leak"].max())
-        self.check("nothing inside solids", leak <= most, f"{100 * leak:.2f} % of the particles at worst")
+    def solids_stay_dry(self, most: float = 0.001) -> None:
+        """No particles inside the terrain, at any time.
 
-    def volume_kept(self, most: float = 0.25) -> None:
-        """The volume stays near that of the first frame: what flows in flows out."""
+        Each step ends with pushing particles out of the ground. A particle counts as inside from a tenth of a cell on;
+        one in a thousand is left for clefts narrower than a cell, which the grid cannot tell from solid.
+        """
+        leak = float(self.history()["leak"].max())
+        self.check("nothing inside solids", leak <= most, f"{100 * leak:.3f} % of the particles at worst")
+
+    def volume_kept(self, most: float) -> None:
+        """The volume stays near that of the first frame: what flows in flows out. The bound is each example's own."""
         volume = self.history()["volume"]
         drift = float(np.abs(volume / volume[0] - 1).max())
         self.check("volume kept", drift <= most, f"{100 * drift:.1f} % from the first frame at worst")
 
+    def divergence_free(self, most: float = 0.03) -> None:
+        """What flows into a cell flows out of it, from the last frame's splats alone.
+
+        Their velocities are brought to a grid again and looked at inside the liquid, where all cells around hold
+        particles too. The velocity that moved them has no divergence (the solver's tolerance is 1e-5); on the way
+        through the particles about 1 % of the mean speed per cell comes back, as measured on the demo. A field with
+        these differences between neighbouring faces in each direction that did not cancel would have 4 to 6 %.
+        """
+        grid = self.simulated_grid()
+        fluid, velocities = self.last()
+        points = fluid.means
+        there = grid.contains(points)
+        body = Particles.at_rest(points[there], 1.0, np.flatnonzero(there), velocities[there])
+        order = sort_by_cell(body.positions, grid)
+        velocity, _ = particles_to_grid(body, grid, order)
+        count = np.diff(order.start).reshape(grid.shape)
+        inner = ndimage.binary_erosion(count >= 4, np.ones((3, 3, 3)))
+        speed = float(np.linalg.norm(velocities, axis=1).mean())
+        change = sum(np.diff(c, axis=a) for a, c in enumerate(velocity.components))
+        left = float(np.abs(change[inner]).mean()) / speed if inner.any() else 0.0
+        self.check(
+            "divergence", left <= most, f"{100 * left:.1f} % of the mean speed per cell, in {inner.sum()} inner cells"
+        )
+
+    def simulated_grid(self) -> Grid:
+        """Of the frames on disk."""
+        found = read_manifest(self.folder)["simulation"]["grid"]
+        return Grid(tuple(found["shape"]), found["spacing"], tuple(found["origin"]))
+
     def done(self) -> int:
         """The exit code."""
-        print(f"{len(self.failed)} checks failed" if self.failed else "all checks passed")
+        print(f"{len(self.failed)} checks failed" if self.failed else "all checks passed", end="")
+        print(f", {time.perf_counter() - self.began:.0f} s in all")
         return int(bool(self.failed))
+
+
+def places(values) -> list[float]:
+    """Numbers as a person would write them: to the millimetre."""
+    return [round(float(v), 3) for v in values]
 
 
 def bench(name: str, description: str | None) -> Bench:
     """Read the options, copy the asset, or make the demo's."""
-    parser = argparse.ArgumentParser(description=description)
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--asset", type=Path, help="a finished asset of a stream; by default the demo's is made")
     parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the copy and the pictures")
     parser.add_argument("--frames", type=int, help="at most so many")
+    parser.add_argument("--dry", action="store_true", help="make the edit and show it, but do not simulate")
     a = parser.parse_args()
     a.out.mkdir(parents=True, exist_ok=True)
     source = a.asset
@@ -110,7 +188,7 @@ def bench(name: str, description: str | None) -> Bench:
     folder = a.out / f"{name}.fluid"
     shutil.rmtree(folder, ignore_errors=True)
     shutil.copytree(source, folder)
-    return Bench(folder, a.out, a.frames)
+    return Bench(folder, a.out, a.frames, a.dry)
 
 
 def end(made: Bench) -> None:

@@ -13,6 +13,8 @@ from bpy.app.handlers import persistent
 
 from . import build
 from .command import Call, find_command, run
+from .facts import EXPORTED, Facts, read_facts, require_asset, up_to_date
+from .materials import LIQUIDS, liquid_material
 
 bl_info = {
     "name": "fluidlift assets",
@@ -24,8 +26,8 @@ bl_info = {
     "category": "Import-Export",
 }
 
-NAME = "fluidlift asset"
-MATERIALS = ("source", *build.LIQUIDS)
+KEPT = ("fluid surface", "fluid splats", "terrain", "clip camera")
+"""objects that a refresh leaves, with what a person did to them; the sequences among them get the new frames"""
 
 
 class Preferences(bpy.types.AddonPreferences):
@@ -41,6 +43,14 @@ class Preferences(bpy.types.AddonPreferences):
 
     def draw(self, context: bpy.types.Context) -> None:
         self.layout.prop(self, "command")
+
+
+def show_material(settings: Settings, context: bpy.types.Context) -> None:
+    """Put the chosen look on the surface, at once."""
+    surface = next((o for o in build.objects() if o.name == "fluid surface"), None)
+    if surface is not None:
+        surface.data.materials.clear()
+        surface.data.materials.append(liquid_material(settings.material, tuple(settings.tint)))
 
 
 class Settings(bpy.types.PropertyGroup):
@@ -63,7 +73,11 @@ class Settings(bpy.types.PropertyGroup):
         name="Duration", description="Seconds; 0: as long as the clip", default=0.0, min=0.0
     )
     material: bpy.props.EnumProperty(
-        name="Look", items=[(m, m.replace("_", " "), "") for m in MATERIALS], default="source"
+        name="Look", items=[(m, m.replace("_", " "), "") for m in LIQUIDS], default="source", update=show_material,
+        description="Material of the surface; source: the clip's own colours. Viscosity and density stay",
+    )  # fmt: skip
+    tint: bpy.props.FloatVectorProperty(
+        name="Tint", subtype="COLOR", size=3, default=(1.0, 1.0, 1.0), min=0.0, max=1.0, update=show_material
     )
     motion: bpy.props.EnumProperty(
         name="Obstacle",
@@ -73,6 +87,7 @@ class Settings(bpy.types.PropertyGroup):
         name="Its density", description="kg/m³; less than the fluid floats", default=400.0, min=1.0
     )
     told: bpy.props.StringProperty(name="Said")
+    loaded: bpy.props.StringProperty(description="What the panel said when the asset was read, as JSON")
 
 
 def command_of(context: bpy.types.Context) -> str:
@@ -85,10 +100,7 @@ def command_of(context: bpy.types.Context) -> str:
 def asset_of(context: bpy.types.Context) -> Path:
     """Folder of the asset; raises RuntimeError where it is none."""
     text = context.scene.fluidlift.asset.strip()
-    folder = Path(bpy.path.abspath(text)) if text else None
-    if folder is None or not (folder / "manifest.json").is_file():
-        raise RuntimeError("Choose an asset first: a folder that ends in .fluid, with a manifest.json in it.")
-    return folder
+    return require_asset(Path(bpy.path.abspath(text)) if text else None)
 
 
 class Guarded:
@@ -99,7 +111,7 @@ class Guarded:
     def execute(self, context: bpy.types.Context) -> set[str]:
         try:
             return self.work(context)
-        except (RuntimeError, OSError, ValueError, KeyError) as error:
+        except (RuntimeError, OSError, ValueError) as error:
             context.scene.fluidlift.told = str(error)
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
@@ -122,63 +134,78 @@ class ImportAsset(Guarded, bpy.types.Operator):
     def work(self, context: bpy.types.Context) -> set[str]:
         if self.directory:
             context.scene.fluidlift.asset = self.directory
-        folder = asset_of(context)
+        folder, settings = asset_of(context), context.scene.fluidlift
+        facts = read_facts(folder)
         export(context, folder, self.volumes)
-        objects = assemble(context, folder, self.splats)
-        self.report({"INFO"}, f"{folder.name}: {', '.join(objects)}")
+        into = build.collection()
+        assemble(context, folder, into, self.splats)
+        build.terrain_of(into, folder / "rest" / "terrain.glb")
+        build.camera_of(into, folder / "rest" / "camera.json")
+        settings.tint, settings.material = facts.tint, facts.material
+        read_settings(settings, facts)
+        settings.told = f"{folder.name}: {', '.join(o.name for o in into.objects)}"
+        self.report({"INFO"}, settings.told)
         return {"FINISHED"}
 
 
 def export(context: bpy.types.Context, folder: Path, volumes: bool) -> None:
     """Have the command write what Blender reads, where that is older than the frames."""
-    into, source = folder / build.FOLDER, folder / "frames" / "splats"
+    into, source = folder / EXPORTED, folder / "frames" / "splats"
     wanted = [("surface", "mesh", ".ply")] + ([("volume", "vdb", ".vdb")] if volumes else [])
     for name, form, suffix in wanted:
-        if not build.up_to_date(into / name, source, suffix):
+        if not up_to_date(into / name, source, suffix):
             run([command_of(context), "export", str(folder), "-o", str(into / name), "--to", form])
 
 
-def assemble(context: bpy.types.Context, folder: Path, splats: bool) -> list[str]:
-    """The objects, in a collection of their own; their names."""
-    into, settings = build.collection(NAME), context.scene.fluidlift
-    read_settings(settings, folder)
-    surface = build.sequence(into, "fluid surface", "surface", folder / build.FOLDER / "surface")
+def assemble(context: bpy.types.Context, folder: Path, into: bpy.types.Collection, splats: bool) -> None:
+    """What a simulation changes: the sequences, obstacles, volumes and the timeline."""
+    surface = build.sequence(into, "fluid surface", "surface", folder / EXPORTED / "surface")
     if surface is None:
         raise RuntimeError(f"{folder.name} has no simulated frames: run fluidlift sim")
-    surface.data.materials.append(build.liquid_material(settings.material))
     if splats:
         points = build.sequence(into, "fluid splats", "splats", folder / "frames" / "splats")
         if points is not None:
             points.hide_render = True
-    ground = folder / "rest" / "terrain.glb"
-    if ground.is_file():
-        build.terrain_of(into, ground)
-    build.camera_of(into, folder / "rest" / "camera.json")
-    build.bodies_of(into, folder / build.FOLDER / "surface")
-    build.volume_of(into, folder / build.FOLDER / "volume")
-    set_timeline(context.scene, folder, surface)
-    follow_timeline(context.scene)
-    return [o.name for o in into.objects]
-
-
-def set_timeline(scene: bpy.types.Scene, folder: Path, surface: bpy.types.Object) -> None:
-    """Frames from 1001, at the rate of the asset."""
-    facts = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
-    interval = float(facts.get("simulation", {}).get("frame_interval", facts["frame_interval"]))
-    rate = 1.0 / interval
+    build.bodies_of(into, folder / EXPORTED / "surface")
+    build.volume_of(into, folder / EXPORTED / "volume")
+    scene, rate = context.scene, 1.0 / read_facts(folder).interval
     scene.render.fps = max(1, round(rate))
     scene.render.fps_base = scene.render.fps / rate
     scene.frame_start, scene.frame_end = surface["fluidlift_frames"]
-    scene.frame_set(scene.frame_start)
+    scene.render.use_lock_interface = True  # the sequences change meshes while Blender draws pictures
+    scene.frame_set(min(max(scene.frame_current, scene.frame_start), scene.frame_end))
+    follow_timeline(scene)
 
 
-def read_settings(settings: Settings, folder: Path) -> None:
+def read_settings(settings: Settings, facts: Facts) -> None:
     """What the frames were simulated with, into the panel."""
-    facts = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
-    values = dict(json.loads((folder / "parameters.json").read_text(encoding="utf-8"))["values"])
-    values |= facts.get("simulation", {}).get("parameters", {})
+    values = facts.parameters
     settings.viscosity, settings.density = values["kinematic_viscosity"], values["density"]
     settings.gravity, settings.inflow = values["gravity"], values["inflow_velocity"]
+    settings.loaded = json.dumps(panel_values(settings))
+
+
+def panel_values(s: Settings) -> dict[str, object]:
+    """Places in scene.yaml, and what the panel says for them; single precision, rounded to what that holds."""
+
+    def numbers(values) -> list[float]:
+        return [float(f"{v:.7g}") for v in values]
+
+    return {
+        "parameters.kinematic_viscosity": numbers([s.viscosity])[0], "parameters.density": numbers([s.density])[0],
+        "parameters.gravity": numbers(s.gravity), "parameters.inflow_velocity": numbers(s.inflow),
+        "duration": numbers([s.duration])[0] or None, "look.material": s.material, "look.tint": numbers(s.tint),
+    }  # fmt: skip
+
+
+def changes(s: Settings) -> list[str]:
+    """Options of `fluidlift edit` for what was changed in the panel; what was fitted and left alone stays as it is, in
+    full precision."""
+    before = json.loads(s.loaded or "{}")
+    words = {k: v for k, v in panel_values(s).items() if before.get(k) != v}
+    if words.get("look.material", "source") != "source" and before.get("look.material") == "source":
+        words["look.style"] = "surface"  # splats as they were lifted have no material
+    return [x for k, v in words.items() for x in ("--set", f"{k}={json.dumps(v)}")]
 
 
 class Simulate(Guarded, bpy.types.Operator):
@@ -189,7 +216,10 @@ class Simulate(Guarded, bpy.types.Operator):
 
     def work(self, context: bpy.types.Context) -> set[str]:
         folder, program, s = asset_of(context), command_of(context), context.scene.fluidlift
-        run([program, "edit", str(folder), *changes(s)])
+        options = changes(s)
+        if options:
+            run([program, "edit", str(folder), *options])
+            s.loaded = json.dumps(panel_values(s))
         self.call = Call([program, "sim", str(folder), "--set", "show.usd=false"])
         if self.wait or bpy.app.background:
             self.call.wait()
@@ -215,7 +245,7 @@ class Simulate(Guarded, bpy.types.Operator):
         context.window_manager.event_timer_remove(self.timer)
         try:
             return self.finish(context)
-        except (RuntimeError, OSError, ValueError, KeyError) as error:
+        except (RuntimeError, OSError, ValueError) as error:
             context.scene.fluidlift.told = str(error)
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
@@ -227,30 +257,15 @@ class Simulate(Guarded, bpy.types.Operator):
         return {"FINISHED"}
 
 
-def changes(s: Settings) -> list[str]:
-    """Options of `fluidlift edit` for what the panel says."""
-
-    def numbers(values) -> str:
-        return "[" + ", ".join(f"{v:.9g}" for v in values) + "]"
-
-    words = [
-        f"parameters.kinematic_viscosity={s.viscosity:.9g}", f"parameters.density={s.density:.9g}",
-        f"parameters.gravity={numbers(s.gravity)}", f"parameters.inflow_velocity={numbers(s.inflow)}",
-        f"look.material={s.material}",
-    ]  # fmt: skip
-    if s.duration > 0:
-        words.append(f"duration={s.duration:.9g}")
-    return [x for word in words for x in ("--set", word)]
-
-
 def refresh(context: bpy.types.Context) -> None:
-    """Export the frames again and replace the objects."""
-    folder = asset_of(context)
-    had = {o.name for o in build.collection_objects(NAME)}
+    """Export the frames again and show them, with the camera and the materials as they are by now."""
+    folder, had = asset_of(context), {o.name for o in build.objects()}
+    facts = read_facts(folder)
     export(context, folder, "fluid volume" in had)
-    chosen = context.scene.fluidlift.material
-    assemble(context, folder, "fluid splats" in had or not had)
-    context.scene.fluidlift.material = chosen
+    assemble(context, folder, build.collection(KEPT), "fluid splats" in had or not had)
+    if not had:
+        show_material(context.scene.fluidlift, context)
+    read_settings(context.scene.fluidlift, facts)
 
 
 class Refresh(Guarded, bpy.types.Operator):
@@ -272,14 +287,50 @@ class AddObstacle(Guarded, bpy.types.Operator):
         folder, thing, s = asset_of(context), context.active_object, context.scene.fluidlift
         if thing is None or thing.type != "MESH":
             raise RuntimeError("Select a mesh object first.")
-        name = "".join(c if c.isalnum() else "_" for c in thing.name)
-        build.write_obj(folder / f"{name}.obj", thing)
+        if build.BODY in thing:
+            raise RuntimeError(f"{thing[build.BODY]} is an obstacle already: remove it first.")
+        name = "".join(c if c.isascii() and c.isalnum() else "_" for c in thing.name)
+        file = folder / f"{name}.obj"
+        if file.exists():  # perhaps of an obstacle that an undo brings back
+            raise RuntimeError(f"{file.name} is in the asset already: give the object another name.")
+        build.write_obj(file, thing)
         where = ", ".join(f"{v:.6g}" for v in thing.matrix_world.translation)
         entry = f"{{name: {name}, mesh: {name}.obj, position: [{where}], motion: {s.motion}"
         entry += f", density: {s.body_density:.6g}}}" if s.motion == "free" else "}"
-        run([command_of(context), "edit", str(folder), "--add", f"obstacles={entry}"])
+        try:
+            run([command_of(context), "edit", str(folder), "--add", f"obstacles={entry}"])
+        except RuntimeError:
+            file.unlink()
+            raise
         thing.hide_set(True)  # the imported one takes its place after the simulation
         s.told = f"{name} is in scene.yaml: simulate again"
+        return {"FINISHED"}
+
+
+class RemoveObstacle(Guarded, bpy.types.Operator):
+    """Take the active obstacle out of the fluid"""
+
+    bl_idname, bl_label = "fluidlift.remove_obstacle", "Remove active obstacle"
+
+    def work(self, context: bpy.types.Context) -> set[str]:
+        folder, thing = asset_of(context), context.active_object
+        if thing is None or build.BODY not in thing:
+            raise RuntimeError("Select an obstacle of the fluid first.")
+        name = thing[build.BODY]
+        run([command_of(context), "edit", str(folder), "--remove", f"obstacles.{name}"])
+        bpy.data.objects.remove(thing, do_unlink=True)
+        context.scene.fluidlift.told = f"{name} is out of scene.yaml: simulate again"
+        return {"FINISHED"}
+
+
+class Undo(Guarded, bpy.types.Operator):
+    """Take the last change of the asset back; Blender's own undo does not reach it"""
+
+    bl_idname, bl_label = "fluidlift.undo", "Undo change of asset"
+
+    def work(self, context: bpy.types.Context) -> set[str]:
+        run([command_of(context), "edit", str(asset_of(context)), "--undo"])
+        context.scene.fluidlift.told = "undone in scene.yaml: simulate again"
         return {"FINISHED"}
 
 
@@ -295,7 +346,7 @@ class Panel(bpy.types.Panel):
         layout.operator(ImportAsset.bl_idname).directory = s.asset
         box = layout.box()
         box.label(text="Fluid")
-        for name in ("viscosity", "density", "gravity", "inflow", "duration", "material"):
+        for name in ("viscosity", "density", "gravity", "inflow", "duration", "material", "tint"):
             box.prop(s, name)
         box = layout.box()
         box.label(text="Obstacles")
@@ -303,9 +354,11 @@ class Panel(bpy.types.Panel):
         if s.motion == "free":
             box.prop(s, "body_density")
         box.operator(AddObstacle.bl_idname)
+        box.operator(RemoveObstacle.bl_idname)
         row = layout.row(align=True)
         row.operator(Simulate.bl_idname)
         row.operator(Refresh.bl_idname)
+        layout.operator(Undo.bl_idname)
         if s.told:
             layout.label(text=s.told)
 
@@ -313,6 +366,8 @@ class Panel(bpy.types.Panel):
 @persistent
 def follow_timeline(scene: bpy.types.Scene, *_) -> None:
     """Put the current frame's files into the sequences."""
+    if scene.frame_subframe:  # Cycles looks between frames for motion blur; `velocity` tells it, the mesh stays
+        return
     for thing in scene.objects:
         if "fluidlift_folder" in thing:
             try:
@@ -325,7 +380,7 @@ def menu(self, context: bpy.types.Context) -> None:
     self.layout.operator(ImportAsset.bl_idname, text="Fluid asset (.fluid folder)")
 
 
-CLASSES = (Preferences, Settings, ImportAsset, Simulate, Refresh, AddObstacle, Panel)
+CLASSES = (Preferences, Settings, ImportAsset, Simulate, Refresh, AddObstacle, RemoveObstacle, Undo, Panel)
 
 
 def register() -> None:

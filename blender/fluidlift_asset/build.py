@@ -9,30 +9,24 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
+from .facts import frames
 from .ply import columns, read_ply
 
-START = 1001
-"""number of the first frame"""
-FOLDER = "blender"
-"""of the asset: what is exported for Blender"""
-
-LIQUIDS = {
-    "water": ((0.82, 0.95, 1.0), 1.333, 0.02), "muddy_water": ((0.42, 0.30, 0.16), 1.333, 0.15),
-    "honey": ((0.95, 0.55, 0.08), 1.49, 0.05), "lava": ((0.9, 0.16, 0.02), 1.5, 0.7),
-    "milk": ((0.95, 0.93, 0.88), 1.35, 0.2), "oil": ((0.9, 0.8, 0.3), 1.47, 0.02),
-    "chocolate": ((0.16, 0.07, 0.03), 1.5, 0.25),
-}  # fmt: skip
-"""colour (linear), index of refraction, roughness"""
-OPAQUE = ("lava", "milk", "chocolate", "muddy_water", "source")
+COLLECTION = "fluid asset"
+BODY = "fluidlift_body"
+"""property of obstacles: their name in scene.yaml"""
 
 
-def collection(name: str) -> bpy.types.Collection:
-    """An empty collection of this name in the scene; what an earlier import put there is removed."""
-    found = bpy.data.collections.get(name)
+def collection(keep: tuple[str, ...] = ()) -> bpy.types.Collection:
+    """The collection of the asset in the scene; what an earlier import put there is removed but for those names."""
+    found = bpy.data.collections.get(COLLECTION)
     if found is None:
-        found = bpy.data.collections.new(name)
+        found = bpy.data.collections.new(COLLECTION)
+    if found.name not in bpy.context.scene.collection.children:
         bpy.context.scene.collection.children.link(found)
     for thing in list(found.objects):
+        if thing.name in keep:
+            continue
         data = thing.data
         bpy.data.objects.remove(thing, do_unlink=True)
         if isinstance(data, bpy.types.Mesh) and data.users == 0:
@@ -40,49 +34,10 @@ def collection(name: str) -> bpy.types.Collection:
     return found
 
 
-def frames(folder: Path, suffix: str = ".ply") -> list[int]:
-    """Numbers of the files of a sequence."""
-    return sorted(int(p.stem) for p in folder.glob(f"*{suffix}") if p.stem.isdigit())
-
-
-def up_to_date(made: Path, source: Path, suffix: str) -> bool:
-    """Whether every frame of `source` has a younger file in `made`."""
-    numbers = frames(source)
-    return bool(numbers) and frames(made, suffix) == numbers and all(
-        (made / f"{n}{suffix}").stat().st_mtime >= (source / f"{n}.ply").stat().st_mtime for n in numbers
-    )  # fmt: skip
-
-
-def liquid_material(name: str) -> bpy.types.Material:
-    """A material after the asset's look; its colour is that of the vertices where the look is the clip's own."""
-    title = f"fluidlift {name}"
-    material = bpy.data.materials.get(title) or bpy.data.materials.new(title)
-    material.use_nodes = True
-    tree = material.node_tree
-    shader = next(n for n in tree.nodes if n.type == "BSDF_PRINCIPLED")
-    color, index, roughness = LIQUIDS.get(name, ((0.5, 0.6, 0.65), 1.333, 0.2))
-    _set(shader, ("Base Color",), (*color, 1.0))
-    _set(shader, ("IOR",), index)
-    _set(shader, ("Roughness",), roughness)
-    _set(shader, ("Transmission Weight", "Transmission"), 0.0 if name in OPAQUE else 1.0)
-    if name == "lava":
-        _set(shader, ("Emission Color", "Emission"), (1.0, 0.25, 0.03, 1.0))
-        _set(shader, ("Emission Strength",), 6.0)
-    if name == "source":
-        attribute = next((n for n in tree.nodes if n.type == "ATTRIBUTE"), None) or tree.nodes.new(
-            "ShaderNodeAttribute"
-        )
-        attribute.attribute_name = "color"
-        tree.links.new(attribute.outputs["Color"], shader.inputs["Base Color"])
-    return material
-
-
-def _set(shader: bpy.types.ShaderNode, names: tuple[str, ...], value) -> None:
-    """The first input of these names that this version of Blender has."""
-    for name in names:
-        if name in shader.inputs:
-            shader.inputs[name].default_value = value
-            return
+def objects() -> list[bpy.types.Object]:
+    """What an import made; nothing where there was none."""
+    found = bpy.data.collections.get(COLLECTION)
+    return [] if found is None else list(found.objects)
 
 
 def fill_surface(mesh: bpy.types.Mesh, file: Path) -> None:
@@ -161,27 +116,33 @@ FILLERS = {"surface": fill_surface, "splats": fill_points}
 
 
 def sequence(into: bpy.types.Collection, name: str, kind: str, folder: Path) -> bpy.types.Object | None:
-    """An object whose mesh follows the timeline; None where there are no files."""
+    """An object whose mesh follows the timeline: that of an earlier import with its materials and modifiers, or a new
+    one. None where there are no files."""
     numbers = frames(folder)
     if not numbers:
         return None
-    mesh = bpy.data.meshes.new(name)
-    thing = bpy.data.objects.new(name, mesh)
-    into.objects.link(thing)
+    thing = into.objects.get(name)
+    if thing is None:
+        thing = bpy.data.objects.new(name, bpy.data.meshes.new(name))
+        into.objects.link(thing)
     thing["fluidlift_folder"], thing["fluidlift_kind"] = str(folder), kind
     thing["fluidlift_frames"] = [numbers[0], numbers[-1]]
     return thing
 
 
 def show_frame(thing: bpy.types.Object, number: int) -> None:
-    """Put the frame's file into an object of a sequence; before the first and after the last, these stay."""
+    """Put the frame's file into an object of a sequence; before the first and after the last, these stay.
+
+    Raises:
+        OSError, ValueError: the file has gone, or is none; what was shown stays.
+    """
     first, last = thing["fluidlift_frames"]
-    number = min(max(number, first), last)
-    file = Path(thing["fluidlift_folder"]) / f"{number}.ply"
-    if thing.get("fluidlift_shown") == str(file) or not file.is_file():
+    file = Path(thing["fluidlift_folder"]) / f"{min(max(number, first), last)}.ply"
+    shown = f"{file} {file.stat().st_mtime_ns}"
+    if thing.get("fluidlift_shown") == shown:
         return
     FILLERS[thing["fluidlift_kind"]](thing.data, file)
-    thing["fluidlift_shown"] = str(file)
+    thing["fluidlift_shown"] = shown
 
 
 def camera_of(into: bpy.types.Collection, file: Path) -> bpy.types.Object:
@@ -222,8 +183,10 @@ def moved_in(into: bpy.types.Collection, importer) -> list[bpy.types.Object]:
 
 
 def terrain_of(into: bpy.types.Collection, file: Path) -> list[bpy.types.Object]:
-    """Bed and banks."""
-    if not hasattr(np, "bool"):  # the importer of Blender 3.4 still asks for the name that NumPy 1.24 has dropped
+    """Bed and banks; nothing where the fluid has none."""
+    if not file.is_file():
+        return []
+    if "bool" not in vars(np):  # the importer of Blender 3.4 still asks for the name that NumPy 1.24 has dropped
         np.bool = bool
     return moved_in(into, lambda: bpy.ops.import_scene.gltf(filepath=str(file)))
 
@@ -255,6 +218,7 @@ def bodies_of(into: bpy.types.Collection, folder: Path) -> list[bpy.types.Object
         points = columns(vertices, "x", "y", "z")
         mesh.from_pydata([] if points is None else points.tolist(), [], faces.tolist())
         thing = bpy.data.objects.new(body["name"], mesh)
+        thing[BODY] = body["name"]
         thing.rotation_mode = "QUATERNION"
         into.objects.link(thing)
         poses = body["poses"]
@@ -267,12 +231,6 @@ def bodies_of(into: bpy.types.Collection, folder: Path) -> list[bpy.types.Object
             thing.keyframe_insert("rotation_quaternion", frame=number)
         made.append(thing)
     return made
-
-
-def collection_objects(name: str) -> list[bpy.types.Object]:
-    """Objects of a collection; none where there is no such."""
-    found = bpy.data.collections.get(name)
-    return [] if found is None else list(found.objects)
 
 
 def write_obj(path: Path, thing: bpy.types.Object) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 import tempfile
@@ -20,7 +21,7 @@ def find_command(given: str) -> str:
         RuntimeError: there is none.
     """
     found = given.strip() or shutil.which("fluidlift")
-    if not found or not Path(found).exists():
+    if not found or not Path(found).is_file() or not os.access(found, os.X_OK):
         raise RuntimeError(
             f"The command fluidlift was not found ({given or 'not on the PATH'}). Install it (pip install fluidlift) "
             "and give its path in Edit > Preferences > Add-ons > fluidlift assets."

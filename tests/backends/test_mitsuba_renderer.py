@@ -11,13 +11,13 @@ import pytest
 
 from fluidlift.backends import mitsuba_renderer
 from fluidlift.backends.mitsuba_renderer import MitsubaRenderer, square_pixels, trial
-from fluidlift.backends.mitsuba_scene import FinalScene, linear, mean_chord, medium, scattering_albedo
+from fluidlift.backends.mitsuba_scene import FinalScene, linear, mean_chord, medium, resting, scattering_albedo
 from fluidlift.errors import FluidliftError, MissingPackage
 from fluidlift.look.environment import Environment
 from fluidlift.look.environment_lookup import grid_directions
 from fluidlift.look.materials import PRESETS, Material
 from fluidlift.numerics.solid_mesh import box_mesh, ellipsoid_mesh
-from fluidlift.types import PinholeCamera, TriangleMesh
+from fluidlift.types import Grid, PinholeCamera, Terrain, TriangleMesh
 
 needs_mitsuba = pytest.mark.skipif(
     importlib.util.find_spec("mitsuba") is None, reason="needs mitsuba: pip install 'fluidlift[mitsuba]'"
@@ -263,3 +263,20 @@ def test_a_variant_that_would_end_the_process_is_tried_in_another_one(monkeypatc
         assert MitsubaRenderer("auto").variant == "llvm_ad_rgb"
     finally:
         trial.cache_clear()
+
+
+def test_the_underside_of_a_liquid_reaches_into_the_bed_that_it_nearly_touches():
+    """A gap of a part of a cell would be a film of air; a drop that hangs above the bed stays as it is."""
+    grid = Grid((20, 20, 20), 0.1, (0.0, 0.0, 0.0))
+    height = np.arange(21) * 0.1 - 0.5
+    terrain = Terrain(
+        grid, np.broadcast_to(height, (21, 21, 21)).astype(np.float32), np.float32([1, 0, 0]),
+        TriangleMesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int64)),
+    )  # fmt: skip
+    for gap, sunk in ((0.04, True), (0.5, False)):
+        box = box_mesh(np.array([0.6, 0.6, 0.4]))
+        standing = TriangleMesh(np.asarray(box.vertices, np.float32) + [1.0, 1.0, 0.7 + gap], box.faces)
+        moved = resting(standing, terrain)
+        low, top = moved.vertices[:, 2].min(), moved.vertices[:, 2].max()
+        assert (low < 0.5) == sunk
+        assert top == pytest.approx(0.9 + gap, abs=1e-6)

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import bpy
+import numpy as np
 
 extension, asset, command = sys.argv[sys.argv.index("--") + 1 :][:3]
 sys.path.insert(0, str(Path(extension).parent))
@@ -35,33 +36,95 @@ def look() -> dict:
     return found
 
 
-out: dict = {"version": bpy.app.version_string}
+def refused(call) -> str:
+    """What an operator says that cannot do its work; in the background its report is raised."""
+    try:
+        call()
+    except RuntimeError as error:
+        return str(error)
+    return "not refused"
+
+
+def picture() -> np.ndarray:
+    """A small one by Cycles from the clip's camera, with motion blur."""
+    render = scene.render
+    render.engine, render.resolution_percentage, render.use_motion_blur, render.motion_blur_shutter = (
+        "CYCLES",
+        50,
+        True,
+        1,
+    )
+    scene.cycles.samples, scene.cycles.use_denoising, scene.cycles.use_adaptive_sampling = 4, False, False
+    render.filepath = str(Path(asset).with_name("picture.png"))
+    bpy.ops.render.render(write_still=True)
+    found = bpy.data.images.load(render.filepath)
+    pixels = np.array(found.pixels[:]).reshape(-1, 4)[:, :3]
+    bpy.data.images.remove(found)
+    return pixels
+
+
+def blurred_by_velocity() -> float:
+    """Mean difference of the picture with the surface's velocities and without any."""
+    scene.world = bpy.data.worlds.new("light")
+    if scene.world.node_tree is None:  # later versions make it by themselves
+        scene.world.use_nodes = True
+    moving, mesh = picture(), bpy.data.objects["fluid surface"].data
+    mesh.attributes["velocity"].data.foreach_set("vector", np.zeros(3 * len(mesh.vertices), np.float32))
+    still = picture()
+    del bpy.data.objects["fluid surface"]["fluidlift_shown"]
+    return float(np.abs(moving - still).mean())
+
+
+def surface_material() -> str:
+    return bpy.data.objects["fluid surface"].data.materials[0].name
+
+
+out: dict = {"version": bpy.app.version_string, "refused": {}}
+settings.command = "/no/such/command"
+out["refused"]["command"] = refused(lambda: bpy.ops.fluidlift.import_asset(directory=asset))
+out["refused"]["folder"] = refused(lambda: bpy.ops.fluidlift.import_asset(directory=str(Path(extension))))
+settings.command = command
 bpy.ops.fluidlift.import_asset(directory=asset)
 out["objects"] = sorted(o.name for o in scene.objects)
 out["range"] = [scene.frame_start, scene.frame_end]
 out["rate"] = scene.render.fps / scene.render.fps_base
 out["viscosity"] = settings.viscosity
+out["material"] = [surface_material()]
 out["first"] = look()
 scene.frame_set(scene.frame_end)
 out["last"] = look()
 camera = scene.camera
 out["camera"] = {"matrix": [list(row) for row in camera.matrix_world], "lens": camera.data.lens}
+out["blur"] = blurred_by_velocity()
 
-bpy.ops.mesh.primitive_uv_sphere_add(radius=0.02, location=tuple(out["first"]["surface"]["high"]))
+bpy.data.objects["fluid surface"].modifiers.new("mine", "SMOOTH")
+low, high = out["first"]["surface"]["low"], out["first"]["surface"]["high"]
+bpy.ops.mesh.primitive_uv_sphere_add(
+    radius=0.06, location=(0.5 * (low[0] + high[0]), 0.5 * (low[1] + high[1]), high[2] + 0.05)
+)
 bpy.context.active_object.name = "ball"
+settings.motion = "free"
 bpy.ops.fluidlift.add_obstacle()
+out["refused"]["twice"] = refused(bpy.ops.fluidlift.add_obstacle)
+settings.material = "honey"
+out["material"].append(surface_material())
 settings.viscosity = 0.01
 settings.duration = 3 / out["rate"]
 bpy.ops.fluidlift.simulate(wait=True)
 out["told"] = settings.told
 out["after"] = [scene.frame_start, scene.frame_end]
-scene.frame_set(scene.frame_end)
+body = next((o for o in scene.objects if o.get("fluidlift_body") == "ball"), None)
+out["ball"] = []
+for number in out["after"]:
+    scene.frame_set(number)
+    out["ball"].append(None if body is None else list(body.matrix_world.translation))
 out["changed"] = look()
-out["bodies"] = sorted(o.name for o in scene.objects)
+out["material"].append(surface_material())
+out["modifiers"] = [m.name for m in bpy.data.objects["fluid surface"].modifiers]
+bpy.context.view_layer.objects.active = body
+bpy.ops.fluidlift.remove_obstacle()
+bpy.ops.fluidlift.undo()
 settings.command = "/no/such/command"
-try:
-    bpy.ops.fluidlift.simulate(wait=True)
-except RuntimeError as error:  # in the background an operator's report is raised
-    out["refused"] = str(error)
+out["refused"]["simulate"] = refused(lambda: bpy.ops.fluidlift.simulate(wait=True))
 fluidlift_asset.unregister()
 print("RESULT " + json.dumps(out))

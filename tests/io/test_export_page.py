@@ -103,6 +103,11 @@ def test_the_page_names_no_other_file_and_says_its_size(tmp_path):
     assert about["frames"] == 6 == text.count('class="frame"')
 
 
+def test_a_title_that_reads_like_a_part_of_the_page_stays_a_title(tmp_path):
+    text = page_of(tmp_path / "page.html", moving(2), title="@PAGE@ @FACTS@", facts=("3 splats",)).read_text()
+    assert "<title>@PAGE@ @FACTS@</title>" in text and text.count("3 splats") == 1
+
+
 def test_a_page_with_another_number_of_frames_is_not_left_behind(tmp_path):
     frames = moving()
     with pytest.raises(ValueError, match="6 frames"):

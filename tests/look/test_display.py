@@ -20,9 +20,16 @@ def test_brighter_light_stays_brighter_and_below_one():
     assert np.abs(np.diff(slope)).max() < 0.02
 
 
-def test_hue_is_kept():
-    lava = np.array([[6.0, 1.5, 0.2]])
-    np.testing.assert_allclose(displayed(lava)[0] / displayed(lava)[0, 0], lava[0] / 6.0, rtol=1e-5)
+def test_hue_is_kept_up_to_the_knee_and_turns_towards_white_above_it():
+    lava = np.array([1.0, 0.25, 0.04])
+    moderate = displayed(KNEE * lava[None])[0]
+    np.testing.assert_allclose(moderate, KNEE * lava, rtol=1e-6)
+    # like film: the brighter, the paler, without ever changing which channel is the brightest
+    shown = displayed(np.geomspace(KNEE, 200, 50)[:, None] * lava)
+    assert (np.diff(shown[:, 1] / shown[:, 0]) > 0).all()
+    assert (shown[:, 0] > shown[:, 1]).all() and (shown[:, 1] > shown[:, 2]).all()
+    white = displayed(np.full((1, 3), 7.0))[0]
+    assert np.ptp(white) == 0
 
 
 def test_exposure_counts_in_stops():

@@ -119,6 +119,24 @@ def test_the_same_frame_gives_the_same_picture(made, tmp_path):
     np.testing.assert_array_equal(once, twice)
 
 
+def test_a_finer_picture_averaged_is_the_same_picture_with_smooth_edges(made):
+    asset = load_asset(made.folder)
+    fluid, _, velocities = next(iter(splat_frames(made.folder, 1)))
+    camera = asset.camera.resized((96, 64))
+    look = Look("relit", "honey")
+    plain, fine = (Painter(look, asset.terrain, made.folder, supersample=k) for k in (1, 2))
+    a, b = (p.picture(Frame(fluid, velocities), camera, Backdrop(cut_out=True)) for p in (plain, fine))
+    assert b.image.shape == a.image.shape and b.alpha.shape == a.alpha.shape == b.depth.shape
+    # edges apart, the same light and the same share of every pixel
+    assert np.median(np.abs(a.image - b.image)) < 0.01 and abs(float(a.alpha.mean() - b.alpha.mean())) < 0.01
+    plate = np.random.default_rng(0).uniform(0, 1, (64, 96, 3)).astype(np.float32)
+    kept = fine.picture(Frame(fluid, velocities), camera, Backdrop(plate))
+    bare = b.alpha == 0
+    np.testing.assert_allclose(kept.image[bare], plate[bare], atol=1e-6)  # float32 means of four equal numbers
+    with pytest.raises(ValueError, match="supersample"):
+        Painter(look, asset.terrain, made.folder, supersample=0)
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from fluidlift.cli import DONE, REJECTED, WITH_WARNINGS, main
+from fluidlift.errors import InputRejected
 from fluidlift.io.asset_folder import read_manifest
 from fluidlift.io.exr import read_channels
 from fluidlift.io.video import read_clip
+from fluidlift.pipeline.rendering import RenderRequest, render_asset
 
 WELL = (DONE, WITH_WARNINGS)
 
@@ -98,6 +100,11 @@ def test_what_cannot_be_drawn_is_refused(made, tmp_path, capsys, options, words)
     assert render(made, tmp_path / "out", *options) == REJECTED
     assert words in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_a_background_that_there_is_not_is_refused_before_anything_is_read(tmp_path):
+    with pytest.raises(InputRejected, match="auto, plate, terrain, none"):
+        render_asset(tmp_path / "no asset", tmp_path / "out", RenderRequest(background="sky"))
 
 
 def test_a_target_that_cannot_hold_the_pictures_is_refused(made, tmp_path, capsys):

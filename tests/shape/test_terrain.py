@@ -9,7 +9,7 @@ import trimesh
 from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.physics.apic import LiquidSimulator
 from fluidlift.shape.airborne import airborne_setting, inside_body
-from fluidlift.shape.channel import ChannelConfig, channel_setting
+from fluidlift.shape.channel import ChannelConfig, channel_setting, upper_rim
 from fluidlift.shape.plan import Footage
 from fluidlift.shape.surface import PlaneHeight
 from fluidlift.shape.terrain import signed_distance_from
@@ -433,13 +433,38 @@ def test_a_pointed_end_of_the_mask_is_no_nozzle():
 
 
 def test_a_ragged_curtain_is_fed_along_its_whole_edge():
-    from fluidlift.shape.channel import _upper_rim
-
     along = np.array([1.0, 0.0])
     level = np.repeat(np.linspace(2.0, 0.0, 20)[:, None], 6, axis=1)
     water = np.ones((20, 6), bool)
     water[:2] = False
     water[:5, 3] = False  # a notch in the edge
-    rim = _upper_rim(water, level, along)
+    rim = upper_rim(water, level, along, 0.1)
     assert rim[2:4, [0, 1, 2, 4, 5]].all() and rim[5:7, 3].all()
     assert not rim[10:].any()
+
+
+@pytest.mark.parametrize(("slope", "deep"), [(4.0, 1), (1.0, 2), (0.0, 2)])
+def test_a_curtain_is_fed_by_a_cross_section_at_its_rim_and_not_down_its_face(slope, deep):
+    """Water that falls is faster below: an inlet down the face would bring in more than passes the rim."""
+    h, n = 0.1, 12
+    i = np.arange(n)[:, None] + np.zeros((1, 9))
+    water = (i >= 2) & (np.arange(9) > 0) & (np.arange(9) < 8)
+    level = -slope * h * i
+    if slope == 0.0:  # flat, then over a lip: the bulk flow says where it comes from
+        level = np.where(i > 8, -3.0 * h * (i - 8), 0.0)
+    rim = upper_rim(water, level, np.array([1.0, 0.0]), h)
+    assert rim[2 : 2 + deep, 2:7].all()
+    assert not rim[2 + deep :].any()  # 2.5 cells on the surface are 0.6, 1.8 and 2.5 columns; one at least
+
+
+def test_a_ragged_curtain_is_fed_along_its_whole_upper_edge_whichever_way_the_pool_runs():
+    h = 0.1
+    i, j = np.indices((16, 12))
+    water = i >= 2 + np.abs(j - 6) // 2
+    level = -3.0 * h * np.minimum(i, 9).astype(float)
+    rim = upper_rim(water, level, np.array([0.6, 0.8]), h)  # the pool leads off to the side
+    inner = slice(2, 10)  # sides are where the picture ends
+    first = water[:, inner].argmax(axis=0)
+    assert rim[first, np.arange(2, 10)].all()
+    assert rim[:, inner].sum(axis=0).max() <= 2
+    assert not rim[8:, inner].any()

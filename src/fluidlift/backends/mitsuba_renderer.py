@@ -15,6 +15,7 @@ from typing import Any, final
 import numpy as np
 from jaxtyping import Float
 
+from fluidlift.backends.mitsuba_denoise import denoised, without_sparks
 from fluidlift.backends.mitsuba_scene import FinalScene, described
 from fluidlift.errors import FluidliftError, MissingPackage, require
 from fluidlift.types import PinholeCamera
@@ -22,6 +23,8 @@ from fluidlift.types import PinholeCamera
 VARIANTS = ("auto", "scalar_rgb", "llvm_ad_rgb", "cuda_ad_rgb")
 PATHS_AT_ONCE = 16_000_000
 """light paths that a compiled variant keeps in memory together, about 4 GB"""
+PARTS = 8
+"""of a picture, each of light paths of its own: where they differ there is grain"""
 PROBE_SECONDS = 120.0
 _INSTALL = "pip install 'fluidlift[mitsuba]'"
 _PROBE = """
@@ -88,14 +91,16 @@ class MitsubaRenderer:
         self._mi.set_log_level(self._mi.LogLevel.Error)  # else it tells of every number of samples that it rounds up
         camera, across, down = square_pixels(scene.camera)
         world = self._mi.load_dict(described(self._mi, scene, camera))
-        each = max(1, min(scene.samples, PATHS_AT_ONCE // (camera.size[0] * camera.size[1])))
-        total, done = np.zeros((camera.size[1], camera.size[0], 4)), 0
-        for k in range(math.ceil(scene.samples / each)):
-            count = min(each, scene.samples - done)
+        most = max(1, PATHS_AT_ONCE // (camera.size[0] * camera.size[1]))
+        counts = _parts(scene.samples, most)
+        parts = []
+        for k, count in enumerate(counts):
             # seeds of the parts of one picture must not be those of the next picture
             part = np.asarray(self._mi.render(world, spp=count, seed=(scene.seed * 7919 + k) % 2**31))
-            total, done = total + count * _finite(part), done + count
-        mean = total / scene.samples
+            parts.append(_finite(part))
+            if len(parts) > PARTS:  # of a long row of them, as many as tell the grain are kept
+                parts[k % PARTS] = parts[k % PARTS] + parts.pop()
+        mean = _together(np.stack(parts), counts, denoise=scene.denoise)
         if across is not None and down is not None:
             mean = np.einsum("hi,wj,ijc->hwc", down, across, mean, optimize=True)
         mean = mean.astype(np.float32)
@@ -116,6 +121,28 @@ def trial(variant: str) -> str:
     lines = [x.strip() for x in ran.stderr.splitlines() if x.strip()]
     told = [x for x in lines if "error" in x.lower()] or lines[-1:] or [f"exit code {ran.returncode}"]
     return told[0][:200]
+
+
+def _parts(samples: int, most: int) -> list[int]:
+    """Paths per pixel of each part of a picture, `most` at once: alike, and a multiple of `PARTS` where there are
+    enough to tell grain."""
+    if samples < 2 * PARTS:
+        return [min(most, samples - k) for k in range(0, samples, most)]
+    rounds = math.ceil(samples / (PARTS * most))
+    count = rounds * PARTS
+    return [samples // count + (k < samples % count) for k in range(count)]
+
+
+def _together(parts: Float[np.ndarray, "k h w 4"], counts: list[int], *, denoise: bool) -> Float[np.ndarray, "h w 4"]:
+    """One picture of its parts (sums of those `counts` of paths that fell to them)."""
+    shares = np.zeros((len(parts), 2))
+    for k, count in enumerate(counts):
+        shares[k % len(parts)] += (count, 1)
+    parts = parts / shares[:, 1, None, None, None]
+    mean = np.average(parts, axis=0, weights=shares[:, 0])
+    if denoise and len(counts) >= PARTS:
+        mean[..., :3] = denoised(without_sparks(parts[..., :3]))
+    return mean
 
 
 def _finite(part: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ from fluidlift.look.environment_lookup import grid_directions
 from fluidlift.look.liquid import LUMINANCE, glow
 from fluidlift.look.materials import Material
 from fluidlift.look.scenery import vertex_normals
-from fluidlift.types import PinholeCamera, TriangleMesh
+from fluidlift.types import PinholeCamera, Terrain, TriangleMesh
 
 OPAQUE_DEPTH = 8.0
 """scattering events on the mean chord of the body from which it is drawn as a painted surface: a random walk through
@@ -24,6 +24,9 @@ SMOOTH = 0.01
 """width of slopes under which a surface is a mirror"""
 CREASE = 0.8
 """cosine between a face and its smoothed normal under which an edge stays an edge"""
+NEAR, SUNK, DOWN = 1.0, 0.3, -0.3
+"""cells between a liquid and ground that count as touching; cells that it is drawn into the ground then; cosine between
+its normal and the ground's from which it looks down"""
 HEATS = 16
 """kinds of glow on one surface"""
 SOFT_ROWS = 128
@@ -55,6 +58,9 @@ class FinalScene:
     and a sun of its true size by one in a thousand, as sparks. 0: as it is"""
     show_environment: bool = True
     """False: black with alpha 0 where the camera looks past everything, for compositing; it lights all the same"""
+    denoise: bool = True
+    """whether grain is taken out, of 16 samples and more: sparks are cut, which costs a few per cent of the light, and
+    what is alike is averaged. False: the unbiased mean"""
     opaque: bool | None = field(default=None)
     """whether the body is drawn as a painted surface; None: if light is scattered in it often (`OPAQUE_DEPTH`)"""
 
@@ -88,6 +94,26 @@ def mean_chord(mesh: TriangleMesh) -> float:
     origin = a.mean(axis=0)
     volume = abs(float(((a - origin) * np.cross(b - origin, c - origin)).sum())) / 6.0
     return 4.0 * volume / max(area, 1e-30)
+
+
+def resting(mesh: TriangleMesh, terrain: Terrain) -> TriangleMesh:
+    """The surface of a liquid with its underside in the ground wherever that is nearly touched.
+
+    A surface of particles rests on the bed here and stands off it by a part of a cell there, and each gap would be a
+    film of air, which mirrors. What looks down at ground less than `NEAR` cells away is moved `SUNK` cells into it.
+    """
+    from fluidlift.numerics.sampling import gradient_nodes, sample_nodes
+
+    vertices = np.array(mesh.vertices, np.float32)
+    cell, grid = terrain.grid.spacing, terrain.grid
+    distance = sample_nodes(terrain.signed_distance, grid, vertices)
+    normals = vertex_normals(mesh)
+    up = gradient_nodes(terrain.signed_distance, grid, vertices)
+    up /= np.maximum(np.linalg.norm(up, axis=1, keepdims=True), 1e-6)
+    down = (normals * up).sum(axis=1) < DOWN
+    moved = down & (distance < NEAR * cell) & (distance > -SUNK * cell) & grid.contains(vertices)
+    vertices[moved] -= (distance[moved, None] + SUNK * cell) * up[moved]
+    return TriangleMesh(vertices, mesh.faces, mesh.colors)
 
 
 def scattering_albedo(color: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:

@@ -6,6 +6,7 @@ import base64
 import html
 import importlib.resources
 import json
+import re
 import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -22,6 +23,8 @@ from fluidlift.types import Gaussians, PinholeCamera, TriangleMesh
 
 TEXTURE_MAX = 1024
 """px, longer side of the terrain's texture in the page"""
+SIZE_ELEMENT = 80
+"""bytes, about, of the element in the page that tells the page's size"""
 BASE64 = 4 / 3
 """characters of the page per byte of its data"""
 
@@ -80,7 +83,7 @@ def write_page(
             count += 1
         require(count == len(scene.numbers), f"{count} frames", f"{len(scene.numbers)}")
         tail = f"<script>\n{viewer}</script>\n</body>\n</html>\n".encode()
-        size = file.tell() + len(tail) + 80
+        size = file.tell() + len(tail) + SIZE_ELEMENT
         told = json.dumps(f" · {size / 1e6:.1f} MB")
         file.write(f'<script type="application/json" id="size">{told}</script>\n'.encode() + tail)
     return Path(path), Path(path).stat().st_size
@@ -108,10 +111,8 @@ def _head(scene: PageScene, held: Range) -> str:
         "WARNINGS": "".join(f'<p class="warn">{html.escape(text)}</p>' for text in scene.warnings),
         "PAGE": json.dumps(plain(about), allow_nan=False).replace("</", "<\\/"),
     }
-    text = _part("page.html")
-    for name, value in fields.items():
-        text = text.replace(f"@{name}@", value)
-    return text
+    # all at once: a title that reads like a field stays a title
+    return re.sub("@([A-Z_]+)@", lambda found: fields[found[1]], _part("page.html"))
 
 
 def _extent(held: Range, scene: PageScene) -> float:

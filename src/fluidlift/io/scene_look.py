@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any
 
 from fluidlift.errors import InputRejected, require
 from fluidlift.io.entries import Entries
+from fluidlift.io.hashes import digest
 
 STYLES = ("splats", "relit", "transparent", "surface")
 MATERIALS = ("source", "water", "muddy_water", "honey", "lava", "milk", "oil", "chocolate")
@@ -61,7 +61,7 @@ class Look:
             return {"style": self.style}
         found, path = self.to_dict(), Path(folder) / self.environment
         if self.environment not in ENVIRONMENTS and path.is_file():
-            found["environment_sha256"] = hashlib.sha256(path.read_bytes()).hexdigest()
+            found["environment_sha256"] = digest(path)
         return found
 
     def warning(self) -> str | None:

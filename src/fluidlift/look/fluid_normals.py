@@ -21,9 +21,9 @@ from fluidlift.types.terrain import Terrain
 
 NODES_APART = 2.0
 """distance of the grid's nodes, in spacings of the splats"""
-BLUR = 1.0
+BLUR = 1.22
 """standard deviation of the blur of the density, in distances of the nodes: variances of 1/4 for each of the two
-splines and 1/2 for `_blurred`. Less shows the rows of splats as ripples"""
+splines and 1/2 for each of two passes of `_blurred`. Less shows the rows of splats as ripples"""
 NODES_MAX = 30_000_000
 """of the grid; a body that is larger gets a coarser one"""
 FULL = 0.8
@@ -62,7 +62,7 @@ def fluid_normals(
     density = _held(density * np.float32((spacing / h) ** 3 / FULL))
     if terrain is not None:
         add_solid_kernel(terrain.signed_distance, terrain.grid.low, terrain.grid.spacing, low, h, density)
-    density = _blurred(density)
+    density = _blurred(_blurred(density))
     normals_kernel(points, low, h, density, normals, share)
     return normals, share
 
@@ -93,8 +93,8 @@ def _nodes(points: np.ndarray, spacing: float) -> tuple[np.ndarray, float, tuple
     h = NODES_APART * spacing
     low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
     for attempt in range(200):
-        first = np.floor(low / h) - 2  # room for the blur
-        shape = np.ceil(high / h) + 3 - first
+        first = np.floor(low / h) - 3  # room for the blur
+        shape = np.ceil(high / h) + 4 - first
         if np.prod(shape) <= NODES_MAX:
             break
         if attempt == 0 and len(points) > 100:

@@ -13,7 +13,18 @@ MARGIN = 0.3
 """pixels of the light's picture by which a surface may lie behind itself"""
 STEEPEST = 0.05
 """cosine of the light beyond which a surface is taken to be no steeper"""
+TILE = 8
+"""px of a shadow map whose nearest depth is kept: where it lies behind a point, nothing shades it"""
 _TURN = math.pi * (3.0 - math.sqrt(5.0))
+
+
+def tap_places(reach: float) -> np.ndarray:
+    """Places [taps,2] (px) around a point that are looked at for a soft edge of half width `reach` (px)."""
+    if reach <= 0.0:
+        return np.zeros((1, 2))
+    t = np.arange(TAPS)
+    away = reach * np.sqrt((t + 0.5) / TAPS)
+    return np.stack([away * np.cos(_TURN * t), away * np.sin(_TURN * t)], axis=-1)
 
 
 @nb.njit(cache=True)
@@ -96,13 +107,14 @@ def world_points(pixels, depth, view, eye, points):
 
 
 @nb.njit(cache=True, parallel=True, error_model="numpy")
-def shadowed(points, normals, sun, toward, bias, solid, first, left, reach, lit):
+def shadowed(points, normals, sun, toward, bias, solid, first, left, tiles, places, reach, lit):
     """Share [n,3] of light from one direction at points, by the light's own picture of the scene.
 
     sun: f, cx, cy, rotation (row by row) and translation of the light's camera. bias: m, width of its pixels:
     points are lifted off their surface by a part of that. solid: depth of what lets
-    nothing pass (0: none). first: depth at which the liquid begins (0: none), left [h,w,3]: share behind it. reach: px,
-    half width of edges; 0: the four texels around, weighted, which is the least that does not show the texels.
+    nothing pass (0: none). first: depth at which the liquid begins (0: none), left [h,w,3]: share behind it. tiles:
+    nearest depth of both in and around each tile. places: of `tap_places`; reach: px, half width of edges; 0: the four
+    texels around, weighted, which is the least that does not show the texels.
     """
     h, w = solid.shape
     for n in nb.prange(points.shape[0]):
@@ -122,11 +134,18 @@ def shadowed(points, normals, sun, toward, bias, solid, first, left, reach, lit)
         ny = sun[6] * normals[n, 0] + sun[7] * normals[n, 1] + sun[8] * normals[n, 2]
         steep = bias / max(cos, STEEPEST)
         across, down, limit = steep * nx, steep * ny, far - MARGIN * bias
-        taps = TAPS if reach > 0.0 else 1
+        over = reach + 1.5
+        if u < -over or v < -over or u > w + over or v > h + over:
+            lit[n, 0], lit[n, 1], lit[n, 2] = 1.0, 1.0, 1.0
+            continue
+        i, j = min(max(int(v), 0), h - 1) // TILE, min(max(int(u), 0), w - 1) // TILE
+        if tiles[i, j] >= limit + over * (abs(across) + abs(down)):
+            lit[n, 0], lit[n, 1], lit[n, 2] = 1.0, 1.0, 1.0
+            continue
+        taps = places.shape[0]
         r, g, b = 0.0, 0.0, 0.0
         for t in range(taps):
-            away = reach * math.sqrt((t + 0.5) / taps) if reach > 0.0 else 0.0
-            x, y = u + away * math.cos(_TURN * t) - 0.5, v + away * math.sin(_TURN * t) - 0.5
+            x, y = u + places[t, 0] - 0.5, v + places[t, 1] - 0.5
             j0, i0 = int(math.floor(x)), int(math.floor(y))
             a, c = x - j0, y - i0
             for k in range(4):

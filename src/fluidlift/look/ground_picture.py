@@ -1,71 +1,43 @@
 """Ground and obstacles in a picture, in the light of an environment, with the shadows that they and the liquid cast.
 
-The environment is taken apart: its strongest light casts one shadow with a soft edge (Williams 1978; Fernando 2005),
-and the rest comes from some directions all around, each with a shadow map of its own, which together are the ambient
-occlusion. Through a liquid light passes: it is absorbed along its way, so that honey throws an amber shadow.
+What stays is prepared once (`Ground`): its shadow maps, and for a camera that stands still all of its picture. In every
+frame only what moves is drawn, with its shadow. Where light comes from is told in `ground_light`.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
 
 from fluidlift.errors import require
-from fluidlift.look.ground_kernels import filled_in, paint, shadowed, world_points
+from fluidlift.look.ground_kernels import filled_in, paint, world_points
+from fluidlift.look.ground_light import Around, Casters, GroundLight, direct_light, spread_directions
 from fluidlift.look.liquid import Behind
 from fluidlift.look.materials import Material
-from fluidlift.look.optics import fresnel, transmittance
 from fluidlift.look.screen_space import linear_from_srgb
 from fluidlift.look.screen_space_kernels import smooth_normals, unit_rows
-from fluidlift.numerics.triangles import rasterize_closed, rasterize_triangles
+from fluidlift.numerics.triangles import rasterize_triangles
 from fluidlift.types.camera import PinholeCamera
 from fluidlift.types.terrain import TriangleMesh
 
 if TYPE_CHECKING:
     from fluidlift.look.environment import Environment
 
-AWAY = 100.0
-"""radii of the scene between it and a light: near enough to parallel light, and exact enough in float32"""
-SHADOW = 1024
-"""px, width of the strongest light's map"""
-AMBIENT = 256
-"""px, width of the maps of the directions all around"""
-DIRECTIONS = 12
-"""from which the rest of the light comes"""
+__all__ = ["Ground", "GroundLight", "ground_picture", "place_of", "received", "spread_directions", "surroundings"]
+
 STEP = 3
 """px between pixels whose ambient light is found"""
 ALIKE = 0.01
 """share of the depth within which pixels belong to the same surface"""
-FAINT = 0.02
-"""share of the strongest light under which it is no light of its own"""
-SOFT = 0.012
-"""half width of the strongest light's shadow edge, of the scene's radius"""
 GRAY = 0.5
 """sRGB of meshes without colours"""
 CREASE = 0.7
 """cosine between a face and its smooth normal below which the face's own is taken: edges stay edges"""
-
-
-@dataclass(frozen=True)
-class GroundLight:
-    """How ground is lit."""
-
-    directions: int = DIRECTIONS
-    """from which ambient light comes, each with a shadow map; 0: no ambient occlusion"""
-    shadow: int = SHADOW
-    """px, width of the shadow map of the strongest light"""
-    soft: float = SOFT
-    """half width of its edge, of the scene's radius"""
-
-    def __post_init__(self) -> None:
-        require(0 <= self.directions <= 256, f"{self.directions} directions", "0 to 256")
-        require(16 <= self.shadow <= 8192, f"a shadow map of {self.shadow} px", "16 to 8192")
-        require(np.isfinite(self.soft) and self.soft >= 0, f"a shadow edge of {self.soft}", "0 or more")
 
 
 def ground_picture(
@@ -78,7 +50,7 @@ def ground_picture(
     material: Material | None = None,
     lit: GroundLight | None = None,
 ) -> Behind:
-    """Meshes lit by the environment, before what lies behind them.
+    """Meshes lit by the environment, before what lies behind them. For many pictures: `Ground.picture`.
 
     Args:
         meshes: terrain and obstacles, with textures or vertex colours (sRGB), which are taken for the albedo of matt
@@ -96,22 +68,139 @@ def ground_picture(
     Raises:
         ValueError: `behind` of another size.
     """
-    width, height = camera.size
-    lit = lit or GroundLight()
-    behind = behind or surroundings(camera, environment)
-    require(behind.depth.shape == (height, width), f"a background of {behind.depth.shape}", f"({height}, {width})")
-    meshes = [m for m in meshes if len(m.faces)]
-    if not meshes:
-        return behind
-    depth, albedo, normal = _drawn(meshes, camera)
-    drawn = (depth > 0) & ((behind.depth <= 0) | (depth < behind.depth))
-    depth = np.where(drawn, depth, 0.0).astype(np.float32)
-    scene = _Scene.of(meshes, caster, material)
-    image = behind.image.copy()
-    ambient = _ambient_picture(scene, camera, environment, depth, normal, lit)[drawn]
-    points = _points(np.argwhere(drawn), depth, camera)
-    image[drawn] = albedo[drawn] * _received(points, normal[drawn], scene, environment, ambient, lit)
-    return Behind(image, np.where(drawn, depth, behind.depth))
+    return Ground(meshes, environment, lit).picture(camera, behind, caster, material=material)
+
+
+class Ground:
+    """Meshes that stay where they are, prepared for pictures.
+
+    Args:
+        meshes, environment, lit: as of `ground_picture`.
+    """
+
+    def __init__(
+        self, meshes: Sequence[TriangleMesh], environment: Environment, lit: GroundLight | None = None
+    ) -> None:
+        self.meshes, self.environment, self.lit = [m for m in meshes if len(m.faces)], environment, lit or GroundLight()
+        self.casters = Casters.of(self.meshes)
+        self.around = Around.of(environment, self.lit.directions)
+        self._last: tuple[tuple, _Surfaces] | None = None
+
+    def picture(
+        self,
+        camera: PinholeCamera,
+        behind: Behind | None = None,
+        caster: TriangleMesh | None = None,
+        *,
+        material: Material | None = None,
+        bodies: Sequence[TriangleMesh] = (),
+    ) -> Behind:
+        """`ground_picture` of these meshes and of `bodies`, which move. What is found of the meshes alone is kept for
+        the last camera: the picture is the same, and the next one costs what moves.
+        """
+        width, height = camera.size
+        behind = behind or surroundings(camera, self.environment)
+        require(behind.depth.shape == (height, width), f"a background of {behind.depth.shape}", f"({height}, {width})")
+        bodies = [m for m in bodies if len(m.faces)]
+        if not self.meshes and not bodies:
+            return behind
+        moving = Casters.of(bodies, caster, material, beside=self.casters)
+        seen = self._seen(camera)
+        layers = [seen]
+        if bodies:
+            depth, albedo, normal = seen.depth.copy(), seen.albedo.copy(), seen.normal.copy()
+            _draw(bodies, camera, depth, albedo, normal)
+            moved = depth != seen.depth
+            layers.append(_Surfaces(self, camera, np.where(moved, depth, 0.0).astype(np.float32), albedo, normal))
+        image, before = behind.image.copy(), behind.depth.copy()
+        for layer in layers:
+            drawn = (layer.depth > 0) & ((before <= 0) | (layer.depth < before))
+            np.copyto(image, layer.image(moving), where=drawn[..., None])
+            np.copyto(before, layer.depth, where=drawn)
+        return Behind(image, before)
+
+    def _seen(self, camera: PinholeCamera) -> _Surfaces:
+        key = place_of(camera)
+        if self._last is None or self._last[0] != key:
+            width, height = camera.size
+            depth = np.zeros((height, width), np.float32)
+            albedo, normal = np.zeros((height, width, 3), np.float32), np.zeros((height, width, 3), np.float32)
+            _draw(self.meshes, camera, depth, albedo, normal)
+            self._last = key, _Surfaces(self, camera, depth, albedo, normal)
+        return self._last[1]
+
+
+@dataclass(frozen=True)
+class _Surfaces:
+    """What a camera sees of surfaces, and how much light what stays leaves them."""
+
+    ground: Ground
+    camera: PinholeCamera
+    depth: np.ndarray
+    """[h,w] camera z, m; 0 where there are none"""
+    albedo: np.ndarray
+    normal: np.ndarray
+
+    @cached_property
+    def _pixels(self) -> tuple[np.ndarray, ...]:
+        """Where surfaces are; there: points, normals, all light, the strongest light and its share that what stays
+        lets through."""
+        there = self.depth > 0
+        points, normals = _points(np.argwhere(there), self.depth, self.camera), self.normal[there]
+        whole, direct, toward = direct_light(normals, self.ground.environment)
+        share = None if direct is None else self._sun(self.ground.casters, points, normals, toward)
+        return there, points, normals, whole, direct, share
+
+    def _sun(self, casters: Casters | None, points: np.ndarray, normals: np.ndarray, toward: np.ndarray):
+        if casters is None:
+            return np.float32(1.0)
+        lit, stays = self.ground.lit, self.ground.casters or casters
+        return casters.light_left(points, normals, toward, lit.shadow, lit.soft * stays.radius)
+
+    @cached_property
+    def _coarse(self) -> tuple[np.ndarray, ...]:
+        """Every `STEP`-th pixel where surfaces are; there: points, normals, and the shares of what stays."""
+        some = self.depth[::STEP, ::STEP] > 0
+        pixels = STEP * np.argwhere(some)
+        points, normals = _points(pixels, self.depth, self.camera), self.normal[pixels[:, 0], pixels[:, 1]]
+        return some, points, normals, self.ground.around.shares(points, normals, self.ground.casters)
+
+    def _ambient(self, moving: Casters | None) -> np.ndarray:
+        """Share [h,w,3] of the ambient light, found in some of the pixels: it changes slowly."""
+        out, around = np.ones((*self.depth.shape, 3), np.float32), self.ground.around
+        some, points, normals, shares = self._coarse
+        if not len(around.ways) or not some.any():
+            return out
+        coarse = np.ones((*some.shape, 3), np.float32)
+        coarse[some] = around.left(normals, shares, around.shares(points, normals, moving))
+        filled_in(coarse, STEP, self.depth, self.normal, ALIKE, out)
+        return out
+
+    def image(self, moving: Casters | None) -> np.ndarray:
+        """Linear light [h,w,3]; 0 where there are no surfaces."""
+        return self._standing if moving is None else self._lit(moving)
+
+    @cached_property
+    def _standing(self) -> np.ndarray:
+        return self._lit(None)
+
+    def _lit(self, moving: Casters | None) -> np.ndarray:
+        there, points, normals, whole, direct, share = self._pixels
+        ambient = self._ambient(moving)[there]
+        light = whole * ambient
+        if direct is not None:
+            toward = self.ground.environment.light()[0]
+            left = share if moving is None else share * self._sun(moving, points, normals, toward)
+            light = (whole - direct) * ambient + direct * left
+        image = np.zeros_like(self.albedo)
+        image[there] = self.albedo[there] * light
+        return image
+
+
+def place_of(camera: PinholeCamera) -> tuple:
+    """What tells two cameras apart."""
+    pose = camera.camera_from_world
+    return camera.size, *camera.focal, *camera.center, *np.ravel(pose.rotation), *np.ravel(pose.translation)
 
 
 def surroundings(camera: PinholeCamera, environment: Environment) -> Behind:
@@ -119,42 +208,6 @@ def surroundings(camera: PinholeCamera, environment: Environment) -> Behind:
     width, height = camera.size
     rays = camera.rays(camera.pixel_grid())
     return Behind(environment.toward(rays), np.zeros((height, width), np.float32))
-
-
-def _drawn(meshes: Sequence[TriangleMesh], camera: PinholeCamera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Depth, linear albedo and unit normals towards the viewer of the nearest mesh."""
-    width, height = camera.size
-    depth = np.zeros((height, width), np.float32)
-    albedo, normal = np.zeros((height, width, 3), np.float32), np.zeros((height, width, 3), np.float32)
-    for mesh in meshes:
-        found = rasterize_triangles(mesh.vertices, mesh.faces, camera)
-        vertices, faces = np.ascontiguousarray(mesh.vertices, np.float64), np.ascontiguousarray(mesh.faces, np.int64)
-        smooth = np.zeros(vertices.shape)
-        smooth_normals(vertices, faces, smooth)
-        unit_rows(smooth)
-        textured = mesh.uv is not None and mesh.texture is not None
-        uv = np.asarray(mesh.uv, np.float32) if textured else np.zeros((1, 3, 2), np.float32)
-        texture = _LINEAR[mesh.texture] if textured else np.zeros((1, 1, 3), np.float32)
-        colors = np.full(vertices.shape, GRAY) if mesh.colors is None else mesh.colors
-        paint(
-            found.face, found.barycentric, found.depth, vertices, faces, smooth, linear_from_srgb(colors),
-            np.ascontiguousarray(uv), texture, textured, _view(camera), CREASE, depth, albedo, normal,
-        )  # fmt: skip
-    return depth, albedo, normal
-
-
-_LINEAR = linear_from_srgb(np.arange(256) / 255.0).astype(np.float32)
-
-
-def _view(camera: PinholeCamera) -> np.ndarray:
-    return np.array([*camera.focal, *camera.center, *np.ravel(camera.camera_from_world.rotation)], np.float64)
-
-
-def _points(pixels: np.ndarray, depth: np.ndarray, camera: PinholeCamera) -> np.ndarray:
-    """World points [n,3] (m) of pixels (row, column)."""
-    points = np.empty((len(pixels), 3))
-    world_points(np.ascontiguousarray(pixels), depth, _view(camera), np.asarray(camera.position, float), points)
-    return points
 
 
 def received(
@@ -176,119 +229,48 @@ def received(
     """
     lit = lit or GroundLight()
     p, n = np.asarray(points, np.float64), np.asarray(normals, np.float32)
-    scene = _Scene.of(meshes, caster, material)
-    return _received(p, n, scene, environment, _ambient(p, n, scene, environment, lit), lit)
-
-
-def _received(
-    points: np.ndarray, normals: np.ndarray, scene: _Scene, environment: Environment, ambient: np.ndarray,
-    lit: GroundLight,
-) -> np.ndarray:  # fmt: skip
-    toward, strength, share = environment.light()
-    whole = environment.irradiance(normals)
-    if share <= FAINT or len(points) == 0:
+    stays = Casters.of(meshes)
+    both = [c for c in (stays, Casters.of([], caster, material, beside=stays)) if c is not None]
+    around = Around.of(environment, lit.directions)
+    ambient = around.left(n, *(around.shares(p, n, c) for c in both))
+    whole, direct, toward = direct_light(n, environment)
+    if direct is None:
         return whole * ambient
-    direct = np.minimum(np.clip(normals @ toward, 0.0, None)[:, None] * strength, whole)
-    left = scene.light_left(points, normals, toward, lit.shadow, lit.soft * scene.radius)
+    left = np.ones((len(p), 3), np.float32)
+    for c in both:
+        left *= c.light_left(p, n, toward, lit.shadow, lit.soft * both[0].radius)
     return (whole - direct) * ambient + direct * left
 
 
-def _ambient_picture(
-    scene: _Scene, camera: PinholeCamera, environment: Environment, depth: np.ndarray, normal: np.ndarray,
-    lit: GroundLight,
-) -> np.ndarray:  # fmt: skip
-    """`_ambient` for the pixels with a depth, found in some of them: it changes slowly."""
-    out = np.ones((*depth.shape, 3), np.float32)
-    some = depth[::STEP, ::STEP] > 0
-    if not lit.directions or not some.any():
-        return out
-    coarse = np.ones((*some.shape, 3), np.float32)
-    pixels = STEP * np.argwhere(some)
-    coarse[some] = _ambient(_points(pixels, depth, camera), normal[pixels[:, 0], pixels[:, 1]], scene, environment, lit)
-    filled_in(coarse, STEP, depth, normal, ALIKE, out)
-    return out
+def _draw(
+    meshes: Sequence[TriangleMesh], camera: PinholeCamera, depth: np.ndarray, albedo: np.ndarray, normal: np.ndarray
+) -> None:
+    """Depth, linear albedo and unit normals towards the viewer, where meshes are nearer than what is there."""
+    for mesh in meshes:
+        found = rasterize_triangles(mesh.vertices, mesh.faces, camera)
+        vertices, faces = np.ascontiguousarray(mesh.vertices, np.float64), np.ascontiguousarray(mesh.faces, np.int64)
+        smooth = np.zeros(vertices.shape)
+        smooth_normals(vertices, faces, smooth)
+        unit_rows(smooth)
+        textured = mesh.uv is not None and mesh.texture is not None
+        uv = np.asarray(mesh.uv, np.float32) if textured else np.zeros((1, 3, 2), np.float32)
+        texture = _LINEAR[mesh.texture] if textured else np.zeros((1, 1, 3), np.float32)
+        colors = np.full(vertices.shape, GRAY) if mesh.colors is None else mesh.colors
+        paint(
+            found.face, found.barycentric, found.depth, vertices, faces, smooth, linear_from_srgb(colors),
+            np.ascontiguousarray(uv), texture, textured, _view(camera), CREASE, depth, albedo, normal,
+        )  # fmt: skip
 
 
-def _ambient(
-    points: np.ndarray, normals: np.ndarray, scene: _Scene, environment: Environment, lit: GroundLight
-) -> np.ndarray:
-    """Share [n,3] of the ambient light that reaches points: what comes from each direction, weighted as it falls in."""
-    if not lit.directions:
-        return np.ones((len(points), 3), np.float32)
-    ways = spread_directions(lit.directions)
-    radiance = np.maximum(environment.blurred(ways, 0.7), 1e-4)
-    toward, _, share = environment.light()
-    around = ways @ toward > math.cos(math.radians(35.0))
-    if share > FAINT and around.any() and not around.all():  # the strongest light has a shadow of its own
-        radiance[around] = np.minimum(radiance[around], radiance[~around].mean(axis=0))
-    total, left = np.zeros((len(points), 3), np.float32), np.zeros((len(points), 3), np.float32)
-    for way, color in zip(ways, radiance, strict=True):
-        weight = np.maximum(normals @ way, 0.0).astype(np.float32)[:, None] * color
-        total += weight
-        left += weight * scene.light_left(points, normals, way, AMBIENT, 0.0)
-    # undersides that none of the directions reaches stay as they are
-    return np.where(total > 1e-5, left / np.maximum(total, 1e-5), 1.0).astype(np.float32)
+_LINEAR = linear_from_srgb(np.arange(256) / 255.0).astype(np.float32)
 
 
-def spread_directions(count: int) -> Float[np.ndarray, "n 3"]:
-    """Unit directions spread evenly over the part of the sphere from a little below the horizon up (a spiral)."""
-    z = 1.0 - (np.arange(count) + 0.5) / count * 1.15
-    azimuth = math.pi * (1.0 + math.sqrt(5.0)) * (np.arange(count) + 0.5)
-    r = np.sqrt(1.0 - z * z)
-    return np.stack([r * np.cos(azimuth), r * np.sin(azimuth), z], axis=-1).astype(np.float32)
+def _view(camera: PinholeCamera) -> np.ndarray:
+    return np.array([*camera.focal, *camera.center, *np.ravel(camera.camera_from_world.rotation)], np.float64)
 
 
-@dataclass(frozen=True)
-class _Scene:
-    """What casts shadows."""
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    caster: TriangleMesh | None
-    material: Material | None
-    middle: np.ndarray
-    radius: float
-
-    @classmethod
-    def of(cls, meshes: Sequence[TriangleMesh], caster: TriangleMesh | None, material: Material | None) -> _Scene:
-        counts = np.cumsum([0, *(len(m.vertices) for m in meshes)])
-        vertices = np.concatenate([np.asarray(m.vertices, np.float64) for m in meshes])
-        faces = np.concatenate([np.asarray(m.faces) + first for m, first in zip(meshes, counts)])
-        caster = caster if caster is not None and len(caster.faces) else None
-        low, high = vertices.min(axis=0), vertices.max(axis=0)
-        if caster is not None:
-            low, high = np.minimum(low, caster.vertices.min(axis=0)), np.maximum(high, caster.vertices.max(axis=0))
-        radius = max(0.5 * float(np.linalg.norm(high - low)), 1e-9)
-        return cls(vertices, faces, caster, material, 0.5 * (low + high), radius)
-
-    def light_left(
-        self, points: np.ndarray, normals: np.ndarray, toward: np.ndarray, size: int, soft: float
-    ) -> np.ndarray:
-        """Share [n,3] of the light from one direction that reaches points; `soft` (m): half width of the edges."""
-        eye = self.middle + AWAY * self.radius * np.asarray(toward, float)
-        pose = PinholeCamera.looking(eye, self.middle, 2.0, (1, 1)).camera_from_world
-        focal = 0.5 * size * (AWAY - 1.0)
-        sun = PinholeCamera((focal, focal), (size / 2, size / 2), (size, size), pose)
-        solid = rasterize_triangles(self.vertices, self.faces, sun).depth
-        first, left = np.zeros_like(solid), np.ones((*solid.shape, 3), np.float32)
-        if self.caster is not None:
-            first, left = self._through_caster(sun)
-        texel = 2.0 * self.radius / size
-        numbers = np.array([focal, size / 2, size / 2, *np.ravel(pose.rotation), *pose.translation], np.float64)
-        lit = np.empty((len(points), 3), np.float32)
-        way = np.asarray(toward, np.float64)
-        shadowed(points, normals, numbers, way, texel, solid, first, left, soft / texel, lit)
-        return lit
-
-    def _through_caster(self, sun: PinholeCamera) -> tuple[np.ndarray, np.ndarray]:
-        """Depth at which the caster begins (0: nowhere), and the share of light left behind it."""
-        assert self.caster is not None
-        if self.material is None:
-            found = rasterize_triangles(self.caster.vertices, self.caster.faces, sun)
-            return found.depth, np.where(found.hit, 0.0, 1.0)[..., None].repeat(3, axis=-1).astype(np.float32)
-        closed = rasterize_closed(self.caster.vertices, self.caster.faces, sun)
-        m = self.material
-        through = transmittance(np.asarray(m.absorption) + m.scattering, closed.inside)
-        through *= float(1.0 - fresnel(np.ones(1), m.refractive_index)[0])
-        hit = closed.front.hit
-        return closed.front.depth, np.where(hit[..., None], through, 1.0).astype(np.float32)
+def _points(pixels: np.ndarray, depth: np.ndarray, camera: PinholeCamera) -> np.ndarray:
+    """World points [n,3] (m) of pixels (row, column)."""
+    points = np.empty((len(pixels), 3))
+    world_points(np.ascontiguousarray(pixels), depth, _view(camera), np.asarray(camera.position, float), points)
+    return points

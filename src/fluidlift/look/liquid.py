@@ -45,8 +45,8 @@ WARM = 0.62
 CONTRAST = 1.5
 """power of the luminance over the usual one, from which heat rises towards `HOT` without ever being cut off there"""
 DIM = 0.5
-"""roughness at which surroundings are seen by light that is mirrored at the far side: from there it leaves through other
-sides of the liquid, into many directions"""
+"""roughness at which surroundings are seen by light that is mirrored at the far side: from there it leaves through
+other sides of the liquid, into many directions"""
 DULL = 0.9
 """share of the reflection at grazing angles, above that straight on, that a rough surface lacks: its slopes hide each
 other there"""
@@ -67,7 +67,8 @@ class LiquidSurface:
     covered: Float[np.ndarray, "h w"]
     """share of the pixel, 0 to 1"""
     back_normal: Float[np.ndarray, "h w 3"] | None = None
-    """unit, world, away from the liquid on its far side; None: as if the far side were parallel to the near one"""
+    """unit, world, away from the liquid on its far side; None: as if the far side were parallel to the near one, and
+    mirrored nothing"""
 
     def __post_init__(self) -> None:
         shape = self.depth.shape

@@ -146,7 +146,9 @@ def _leaving(tx, ty, tz, bx, by, bz, vx, vy, vz, index, free):
 
 
 @nb.njit(cache=True, error_model="numpy")
-def _follow(i, j, surface_depth, normals, back_normals, has_back, thickness, picture, depth, lens, rotation, index, ray):
+def _follow(
+    i, j, surface_depth, normals, back_normals, has_back, thickness, picture, depth, lens, rotation, index, ray
+):
     """One pixel of `follow`."""
     x, y = (j + 0.5 - lens[2]) / lens[0], (i + 0.5 - lens[3]) / lens[1]
     length = math.sqrt(x * x + y * y + 1.0)
@@ -185,7 +187,8 @@ def _follow(i, j, surface_depth, normals, back_normals, has_back, thickness, pic
     if behind > 0.0:
         gap = (behind - q[2]) - 0.5 * thick
         free = min(max(gap / max(thick + ROOM * z0 / lens[0], 1e-9), 0.0), 1.0)
-    ox, oy, oz, ray[TURNED], mx, my, mz = _leaving(tx, ty, tz, bx, by, bz, vx, vy, vz, index, free)
+    ox, oy, oz, back, mx, my, mz = _leaving(tx, ty, tz, bx, by, bz, vx, vy, vz, index, free)
+    ray[TURNED] = back if has_back else 0.0
     u, v, held = _behind(q, (ox, oy, oz), (j + 0.5, i + 0.5), depth, z0, lens, rotation[:, 2])
     ray[OUTSIDE] = 0.0 if held else 1.0
     _turned(rotation, ox, oy, oz, ray, THROUGH)

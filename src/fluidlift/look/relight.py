@@ -55,6 +55,7 @@ def relit(
     camera: PinholeCamera,
     material: Material,
     environment: Environment,
+    among: Float[np.ndarray, "m 3"] | None = None,
 ) -> Float[np.ndarray, "n 3"]:
     """Linear radiance of every splat towards the camera, to be drawn as its feature.
 
@@ -65,6 +66,8 @@ def relit(
         material: what the fluid is taken for. What it does not hide by scattering, and what it carries, shows the
             clip's own colours.
         environment: the light.
+        among: linear colours against which the clip's are hot or cold, if the material glows; None: these splats' own.
+            The same ones for a whole film keep the glow of what stays.
 
     Returns:
         float32, at least 0. Without glow, no material gives more than the brightest light around.
@@ -80,7 +83,7 @@ def relit(
     pictures, numbers = _prepared(material, environment, camera.position)
     out = np.empty((n, 3), np.float32)
     shade_kernel(gaussians.means, normals, share, body, pictures, numbers, out)
-    return out + glow(own, material) if max(material.emission) > 0 else out
+    return out + glow(own, material, among) if max(material.emission) > 0 else out
 
 
 def relit_plain(
@@ -252,22 +255,27 @@ def _brdf_table(roughness: float) -> Float[np.ndarray, "k 2"]:
     return np.stack([(weight * (1 - schlick)).mean(axis=(1, 2)), (weight * schlick).mean(axis=(1, 2))], axis=1)
 
 
-def heat(colors_linear: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-    """0 to 1: how hot each splat is where a material glows: the brighter in the clip, the hotter."""
+def heat(
+    colors_linear: Float[np.ndarray, "n 3"], among: Float[np.ndarray, "m 3"] | None = None
+) -> Float[np.ndarray, "n"]:
+    """0 to 1: how hot each splat is where a material glows: the brighter in the clip, the hotter, `among` these."""
     bright = colors_linear @ LUMINANCE
     if len(bright) == 0:
         return bright
+    ranked = bright if among is None or len(among) == 0 else among @ LUMINANCE
     shares = np.linspace(*HEAT, 16)  # by rank, between these, so that any clip gives crust, glow and melt
-    steps = np.quantile(bright[:: max(len(bright) // 20_000, 1)], shares) + 1e-7 * np.arange(16)
+    steps = np.quantile(ranked[:: max(len(ranked) // 20_000, 1)], shares) + 1e-7 * np.arange(16)
     return np.interp(bright, steps, (shares - HEAT[0]) / (HEAT[1] - HEAT[0])).astype(np.float32)
 
 
-def glow(colors_linear: Float[np.ndarray, "n 3"], material: Material) -> Float[np.ndarray, "n 3"]:
+def glow(
+    colors_linear: Float[np.ndarray, "n 3"], material: Material, among: Float[np.ndarray, "m 3"] | None = None
+) -> Float[np.ndarray, "n 3"]:
     """Linear radiance of a material with emission: that of a black body which cools where `heat` is less.
 
     In Wien's law a channel falls by exp(-x (T_hot / T - 1)), x = h c / (wavelength k T_hot): blue first, red last.
     """
-    cooler = 1.0 / (COLD + (1.0 - COLD) * heat(colors_linear)) - 1.0
+    cooler = 1.0 / (COLD + (1.0 - COLD) * heat(colors_linear, among)) - 1.0
     return np.exp(-WIEN * cooler[:, None]) * np.asarray(material.emission, np.float32)
 
 

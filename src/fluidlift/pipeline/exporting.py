@@ -26,13 +26,14 @@ from fluidlift.pipeline.export_job import (
 )
 from fluidlift.pipeline.rendering import frame_numbers, frames_told
 from fluidlift.pipeline.story import Progress, Silence
+from fluidlift.pipeline.surfacing import surface_of
 from fluidlift.pipeline.written import Written, cleared, numbered
-from fluidlift.types import FaceVelocity, FluidAsset, Gaussians, Grid, Similarity3, Terrain, TriangleMesh
+from fluidlift.types import FaceVelocity, FluidAsset, Gaussians, Grid, Similarity3, TriangleMesh
 
 if TYPE_CHECKING:
     from fluidlift.io.volume_grid import VolumeGrid
 
-__all__ = ["FORMATS", "ExportRequest", "export_asset", "gridded", "level_set", "outside_solid"]
+__all__ = ["FORMATS", "ExportRequest", "export_asset", "gridded", "level_set"]
 
 MESHED = ("mesh", "obj", "usd", "usd-clips", "gltf")
 """formats with the surface of the fluid; of a liquid's volumes it makes the level set"""
@@ -40,9 +41,6 @@ BAND = 3.0
 """half width of the level set, voxels: what OpenVDB's own tools expect"""
 FULL = 50.0
 """percentile of the cells' amounts that counts as a full cell"""
-RADIUS = 0.4
-"""of a particle in the mesh, cells of the simulation: neighbours lie half a cell apart after reseeding, and a little
-more keeps drops whole and flat water flat"""
 
 
 def export_asset(folder: Path, out: Path, request: ExportRequest, *, progress: Progress | None = None) -> Written:
@@ -164,29 +162,8 @@ def _frames(job: ExportJob) -> Iterator[FluidFrame]:
         if mesher is None:
             yield FluidFrame(gaussians, ids, velocities)
             continue
-        carried = {"velocity": velocities, "rgb": gaussians.rgb}
-        mesh, found = mesher.surface(gaussians.means, RADIUS * asset.grid.spacing, carried)
-        mesh = TriangleMesh(outside_solid(mesh.vertices, asset.terrain), mesh.faces, np.clip(found["rgb"], 0.0, 1.0))
-        yield FluidFrame(gaussians, ids, velocities, mesh, found["velocity"])
-
-
-def outside_solid(points: np.ndarray, terrain: Terrain) -> np.ndarray:
-    """Points [n,3] (m) inside the terrain moved to its surface along the gradient of the distance; the others stay.
-
-    A surface of particles stands a radius outside them and would dip into the bed.
-    """
-    from fluidlift.numerics.sampling import gradient_nodes, sample_nodes
-
-    moved = np.array(points, np.float32)
-    for _ in range(2):  # the distance is not exact beside edges: once more brings most of the rest out
-        distance = sample_nodes(terrain.signed_distance, terrain.grid, moved)
-        inside = (distance < 0) & terrain.grid.contains(moved)
-        if not inside.any():
-            break
-        normal = gradient_nodes(terrain.signed_distance, terrain.grid, moved[inside])
-        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-6)
-        moved[inside] -= distance[inside, None] * normal
-    return moved
+        mesh, moving = surface_of(gaussians, velocities, asset.terrain, mesher)
+        yield FluidFrame(gaussians, ids, velocities, mesh, moving)
 
 
 def _files(out: Path, frames: Iterator[FluidFrame], asset: FluidAsset, request: ExportRequest, numbers: range) -> None:

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fluidlift.errors import InputRejected
+from fluidlift.errors import InputRejected, require
 from fluidlift.io.color import linear_from_srgb, srgb_from_linear
 from fluidlift.io.scene_look import Look
 from fluidlift.look.display import displayed
-from fluidlift.look.environment import BUILT_IN, Environment, built_in
+from fluidlift.look.environment import BUILT_IN, LUMINANCE, Environment, built_in
 from fluidlift.look.fluid_normals import fluid_normals
-from fluidlift.look.ground_picture import ground_picture
+from fluidlift.look.ground_picture import Ground, place_of
 from fluidlift.look.liquid import Behind, LiquidSurface, shaded
 from fluidlift.look.materials import Material, material_named
 from fluidlift.look.rasterize import render
@@ -38,6 +38,8 @@ ENGINES = ("mesh", "screen", "mitsuba")
 softer; path tracing of the mesh"""
 MARGIN = 1.5
 """cells behind a solid over which a splat fades: its middle may lie a little inside the bed"""
+INNER = 0.02
+"""weight of the normals of splats inside the fluid next to those at its surface"""
 SKY_BLUR = 0.5
 """roughness at which a studio is seen behind everything: lamps are for light, not to look at"""
 
@@ -108,7 +110,8 @@ def environment_of(folder: Path, name: str) -> Environment:
 
 
 class Painter:
-    """Draws the frames of one asset in one look.
+    """Draws the frames of one asset in one look. What stays from frame to frame is kept: the ground's shadows, and for
+    a camera that stands still the ground's picture.
 
     Args:
         look: its style is relit, transparent or surface.
@@ -117,8 +120,11 @@ class Painter:
         kind: of the fluid; what lies on a bed has no surface towards it.
         engine: of the look surface, one of `ENGINES`.
         samples: per pixel, of Mitsuba.
+        supersample: pictures are drawn this many times as wide and as high, and averaged in linear light: edges become
+            smooth, at the price of so many pixels. Mitsuba's are smooth as they are.
 
     Raises:
+        ValueError: a factor that is not 1 to 8.
         InputRejected: an unknown material, environment or engine.
         MissingPackage: the engine or the mesher is not installed.
     """
@@ -132,7 +138,9 @@ class Painter:
         kind: str = "stream",
         engine: str = "mesh",
         samples: int = 64,
+        supersample: int = 1,
     ) -> None:
+        require(1 <= supersample <= 8, f"a supersample of {supersample}", "1 to 8")
         if engine not in ENGINES:
             near = difflib.get_close_matches(engine, ENGINES, 1)
             raise InputRejected(f"no engine '{engine}'", ", ".join(ENGINES), f"did you mean {near[0]}?" if near else "")
@@ -144,6 +152,8 @@ class Painter:
         self.material: Material = material_named(look.material).tinted(look.tint)
         self.environment = environment_of(folder, look.environment)
         self._samples, self._bed = samples, terrain if kind in LYING else None
+        self._finer, self._folder = 1 if engine == "mitsuba" else int(supersample), folder
+        self._far: tuple[tuple, np.ndarray] | None = None
         _ = self._final if engine == "mitsuba" else self._mesher  # what is missing is said before anything is drawn
 
     @cached_property
@@ -172,6 +182,15 @@ class Painter:
         """
         if self._final is not None:
             return self._traced(frame, camera, backdrop)
+        if self._finer == 1:
+            return self._drawn(frame, camera, backdrop)
+        k = self._finer
+        wide = camera.resized((k * camera.size[0], k * camera.size[1]))
+        finer = replace(backdrop, picture=_enlarged(backdrop.picture, k), depth=_enlarged(backdrop.depth, k))
+        return _averaged(self._drawn(frame, wide, finer), k)
+
+    def _drawn(self, frame: Frame, camera: PinholeCamera, backdrop: Backdrop) -> Lit:
+        """One frame, with the pixels of the camera."""
         mesh = None
         if self._mesher is not None:
             mesh, _ = surface_of(frame.fluid, frame.velocities, self.terrain, self._mesher)
@@ -179,7 +198,7 @@ class Painter:
         if self.look.style == "relit":
             return self._relit(frame.fluid, camera, behind, cut_out=backdrop.cut_out)
         surface = self._liquid(frame.fluid, mesh, camera, behind)
-        image = shaded(surface, behind, camera, self.material, self.environment)
+        image = shaded(surface, behind, camera, self.material, self.environment, usual=self._usual)
         if backdrop.cut_out:
             light = np.maximum(image - (1.0 - surface.covered[..., None]) * behind.image, 0.0)
             return Lit(light, surface.covered, surface.depth)
@@ -197,6 +216,12 @@ class Painter:
     def seen_behind(self, camera: PinholeCamera) -> np.ndarray:
         """Linear [h,w,3] behind everything: a file's environment as it is; of a built-in one the sky, and below the
         horizon a pale floor, before which a dark liquid and a dark ground both stand out."""
+        key = place_of(camera)
+        if self._far is None or self._far[0] != key:
+            self._far = key, self._surroundings(camera)
+        return self._far[1]
+
+    def _surroundings(self, camera: PinholeCamera) -> np.ndarray:
         rays = camera.rays(camera.pixel_grid())
         if self.look.environment not in BUILT_IN:
             return self.environment.toward(rays)
@@ -210,13 +235,35 @@ class Painter:
     def _behind(self, frame: Frame, mesh: TriangleMesh | None, camera: PinholeCamera, backdrop: Backdrop) -> Behind:
         """The picture without the fluid."""
         far = self.seen_behind(camera) if backdrop.picture is None else backdrop.picture
-        solids = list(frame.bodies)
-        if backdrop.picture is None and len(self.terrain.mesh.faces):
-            solids.append(self.terrain.mesh)
         depth = np.zeros(far.shape[:2], np.float32) if backdrop.depth is None else backdrop.depth
-        if not solids:
-            return Behind(far, depth)
-        return ground_picture(solids, camera, self.environment, Behind(far, depth), caster=mesh, material=self.material)
+        ground = self._ground if backdrop.picture is None else self._no_ground
+        return ground.picture(camera, Behind(far, depth), mesh, material=self.material, bodies=frame.bodies)
+
+    @cached_property
+    def _ground(self) -> Ground:
+        return Ground([self.terrain.mesh], self.environment)
+
+    @cached_property
+    def _no_ground(self) -> Ground:
+        return Ground([], self.environment)
+
+    @cached_property
+    def _clip_colors(self) -> np.ndarray | None:
+        """Linear colours of the asset's fluid at rest, against which things glow: the same for all frames. None: there
+        is no asset in the folder, or nothing that glows."""
+        from fluidlift.io.asset_folder import load_asset
+
+        if max(self.material.emission) == 0:
+            return None
+        try:
+            colors = load_asset(self._folder).rest.rgb
+        except InputRejected:
+            return None
+        return linear_from_srgb(np.clip(colors, 0.0, 1.0)) if len(colors) else None
+
+    @property
+    def _usual(self) -> float | None:
+        return None if self._clip_colors is None else float((self._clip_colors @ LUMINANCE).mean())
 
     def _visible(self, fluid: Gaussians, camera: PinholeCamera, behind: Behind) -> np.ndarray:
         """[n], 0 to 1: how much of each splat solids leave to be seen."""
@@ -227,7 +274,7 @@ class Painter:
     def _relit(self, fluid: Gaussians, camera: PinholeCamera, behind: Behind, *, cut_out: bool) -> Lit:
         """Splats under other light."""
         normals, share = fluid_normals(fluid, 0.5 * self.terrain.grid.spacing, self._bed)
-        light = relit(fluid, normals, share, camera, self.material, self.environment)
+        light = relit(fluid, normals, share, camera, self.material, self.environment, self._clip_colors)
         seen = (fluid.opacities * self._visible(fluid, camera, behind)).astype(np.float32)
         shown = Gaussians(fluid.means, fluid.quats, fluid.scales, seen, fluid.sh)
         drawn = render(shown, camera, features=light)
@@ -242,18 +289,23 @@ class Painter:
         if mesh is not None:
             return mesh_surface(mesh, camera)
         if self.look.style == "transparent":
-            normals = fluid_normals(fluid, 0.5 * self.terrain.grid.spacing, self._bed)[0]
+            apart = 0.5 * self.terrain.grid.spacing
+            normals, share = fluid_normals(fluid, apart, self._bed)
+            normals = normals * np.maximum(share, INNER)[:, None]
             seen = self._visible(fluid, camera, behind) > 0.5
-            return splat_surface(fluid.select(seen), normals[seen], camera)
+            # what lies on a bed has its far side there: no second surface to bend light at
+            free = self._bed is None
+            return splat_surface(fluid.select(seen), normals[seen], camera, volume=apart**3, far_side=free)
         radius = RADIUS * self.terrain.grid.spacing
         return particle_surface(fluid.means, radius, camera, linear_from_srgb(np.clip(fluid.rgb, 0.0, 1.0)))
 
     def _traced(self, frame: Frame, camera: PinholeCamera, backdrop: Backdrop) -> Lit:
         """By light paths through the mesh, which reaches into the ground here: a gap would be a film of air."""
-        from fluidlift.backends.mitsuba_scene import FinalScene
+        from fluidlift.backends.mitsuba_scene import FinalScene, resting
 
         assert self._final is not None
         mesh, _ = surface_of(frame.fluid, frame.velocities, self.terrain, self._need_mesher(), clamped=False)
+        mesh = resting(mesh, self.terrain)
         ground = [self.terrain.mesh] if len(self.terrain.mesh.faces) else []
         image, alpha = self._final.picture_and_alpha(
             FinalScene(
@@ -271,3 +323,18 @@ class Painter:
     def _need_mesher(self) -> Mesher:
         assert self._mesher is not None
         return self._mesher
+
+
+def _enlarged(picture: np.ndarray | None, k: int) -> np.ndarray | None:
+    """Every pixel k x k times."""
+    return None if picture is None else picture.repeat(k, axis=0).repeat(k, axis=1)
+
+
+def _averaged(lit: Lit, k: int) -> Lit:
+    """A picture of k x k as many pixels, averaged; its depth is the nearest of each."""
+    h, w = lit.alpha.shape[0] // k, lit.alpha.shape[1] // k
+    depth = np.where(lit.depth > 0, lit.depth, np.inf).reshape(h, k, w, k).min(axis=(1, 3))
+    return Lit(
+        lit.image.reshape(h, k, w, k, 3).mean(axis=(1, 3)), lit.alpha.reshape(h, k, w, k).mean(axis=(1, 3)),
+        np.where(np.isfinite(depth), depth, 0.0).astype(np.float32),
+    )  # fmt: skip

@@ -1,7 +1,7 @@
 """Simulation while somebody edits: a coarse copy of the scene, frame by frame, the newest wish first.
 
-The copy has cells twice as wide as often as it takes to follow a hand, and its particles are thinned with them. It is a
-sketch: thin films and small drops are below its cells, and the frames that are kept come from `resimulate`.
+The copy has cells twice as wide as often as it takes to follow a hand on this machine, and its particles are thinned
+with them. It is a sketch: thin films and small drops are below its cells, and what is kept comes from `resimulate`.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import tempfile
 import threading
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -32,6 +33,14 @@ MOST_SUBSTEPS = 60
 """of one frame: more than that is a blow-up, or too slow to be called live"""
 SUBSTEPS_AT_ONCE = 3
 """between two looks at whether somebody wants something else"""
+SECONDS_PER_FRAME = 0.2
+"""that the copy is to take at most: five frames per second"""
+TIMED = 3
+"""frames, at the start, by whose time the copy's size is chosen"""
+FEWEST_PARTICLES = 1000
+"""of a copy that is made coarser because this machine is slow: fewer show no flow"""
+FEWEST_LAYERS = 6
+"""cells of the thinnest side of such a copy: with fewer a stream is one cell deep"""
 
 
 @dataclass(frozen=True)
@@ -65,18 +74,28 @@ def coarse_asset(asset: FluidAsset, size: PreviewSize | None = None) -> FluidAss
     Cells double until both limits hold. Where they do, of the Gaussians in each cell at most `PER_CELL` stay, and grow
     so that together they fill the space of all.
     """
-    from fluidlift.fit.coarsen import coarsen_cells, coarsen_terrain, coarsen_velocity
-
     size = size or PreviewSize()
     while len(asset.rest) > size.particles or asset.grid.cells > size.cells:
-        terrain = coarsen_terrain(asset.terrain)
-        if min(terrain.grid.shape) < 2:
+        if min(asset.grid.shape) < 4:
             break
-        asset = replace(
-            asset, terrain=terrain, grid=terrain.grid, cell_types=coarsen_cells(asset.cell_types),
-            velocity=coarsen_velocity(asset.velocity), rest=thinned(asset.rest, terrain.grid, PER_CELL),
-        )  # fmt: skip
+        asset = coarser(asset)
     return asset
+
+
+def coarser(asset: FluidAsset) -> FluidAsset:
+    """The asset on cells twice as wide."""
+    from fluidlift.fit.coarsen import coarsen_cells, coarsen_terrain, coarsen_velocity
+
+    terrain = coarsen_terrain(asset.terrain)
+    return replace(
+        asset, terrain=terrain, grid=terrain.grid, cell_types=coarsen_cells(asset.cell_types),
+        velocity=coarsen_velocity(asset.velocity), rest=thinned(asset.rest, terrain.grid, PER_CELL),
+    )  # fmt: skip
+
+
+def bears_coarser(asset: FluidAsset) -> bool:
+    """Whether a copy on cells twice as wide would still show a flow."""
+    return len(asset.rest) >= 8 * FEWEST_PARTICLES and min(asset.grid.shape) >= 2 * FEWEST_LAYERS
 
 
 def thinned(rest: Gaussians, grid: Any, per_cell: int) -> Gaussians:
@@ -137,7 +156,9 @@ def preview_scene(asset: FluidAsset, folder: Path, edits: dict[str, Any], frames
     """
     with _written(edits) as place:
         scene = scene_of(asset, place, SimulationRequest(meshes=folder), JobConfig(), footage=None, start=0)
-    scene = replace(scene, frames=min(scene.frames, frames))
+    # one step per frame where the flow allows it: waves are damped more than in frames that are kept
+    step = scene.interval if scene.longest_step is None else scene.longest_step
+    scene = replace(scene, frames=min(scene.frames, frames), longest_step=step)
     preflight(scene)
     return scene
 
@@ -277,11 +298,6 @@ class LivePreview:
             self._asked += 1
             self._news.notify_all()
 
-    def drop(self) -> None:
-        """Want nothing more, and forget what is there."""
-        self.stop()
-        self.shown, self.problem = None, ""
-
     def hold(self, held: bool) -> None:
         """Leave the machine to somebody else for a while. A wish that was not finished begins again afterwards."""
         with self._news:
@@ -311,8 +327,10 @@ class LivePreview:
 
     def _work(self) -> None:
         coarse = coarse_asset(self._asset, self._size)
-        self.particles = len(coarse.rest)
         self._warm(coarse)
+        while self._slow(coarse) and bears_coarser(coarse):
+            coarse = coarser(coarse)
+        self.particles = len(coarse.rest)
         while True:
             self._tell("held" if self._held else "ready")
             with self._news:
@@ -332,6 +350,16 @@ class LivePreview:
                 pass
         except FluidliftError as error:
             self.problem = f"this asset cannot be simulated live: {error}"
+
+    def _slow(self, coarse: FluidAsset) -> bool:
+        """Whether this machine, as busy as it is now, takes longer for a frame than a live preview may."""
+        if self.problem or self._closed:
+            return False
+        ends = []
+        for frame in preview_frames(preview_scene(coarse, self._folder, {}, 1 + TIMED), lambda: self._closed):
+            self._keep(frame)
+            ends.append(time.perf_counter())
+        return len(ends) > 1 and float(np.median(np.diff(ends))) > SECONDS_PER_FRAME
 
     def _serve(self, coarse: FluidAsset, wish: Wish, number: int) -> None:
         """Work on a wish until it is done, or another one is there."""

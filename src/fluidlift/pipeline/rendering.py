@@ -56,6 +56,8 @@ class RenderRequest:
     """of the look surface: mesh, screen or mitsuba"""
     samples: int = 64
     """light paths per pixel, of mitsuba"""
+    supersample: int = 2
+    """of other looks than splats: they are drawn so many times finer and averaged"""
 
 
 def render_asset(
@@ -130,7 +132,15 @@ def _painter(scene: Scene, folder: Path, request: RenderRequest) -> Painter | No
         return None
     if request.engine == "mitsuba" and request.background == "none":
         raise InputRejected("Mitsuba without the ground", "--background plate or terrain", "or use --engine mesh")
-    return Painter(look, scene.terrain, folder, kind=scene.kind, engine=request.engine, samples=request.samples)
+    return Painter(
+        look,
+        scene.terrain,
+        folder,
+        kind=scene.kind,
+        engine=request.engine,
+        samples=request.samples,
+        supersample=request.supersample,
+    )
 
 
 def _check_look(request: RenderRequest) -> None:
@@ -163,6 +173,8 @@ def _check(request: RenderRequest, out: Path) -> None:
             f"no view '{request.view}'", f"{', '.join(VIEWS)}, or a file with a camera or keyed views",
             f"did you mean {near[0]}?" if near else "check --view",
         )  # fmt: skip
+    if request.background not in BACKGROUNDS:
+        raise InputRejected(f"no background '{request.background}'", ", ".join(BACKGROUNDS))
     if request.background == "plate" and request.view != "input":
         raise InputRejected(
             f"the clip's background in the view '{request.view}'", "the view input: a plate is a flat picture",

@@ -9,21 +9,16 @@ import numpy as np
 
 from fluidlift.config import JobConfig
 from fluidlift.io.scene_look import Look
+from fluidlift.pipeline.export_job import frames_of
 from fluidlift.pipeline.looks import Backdrop, Frame, Painter, placed_bodies
 from fluidlift.pipeline.scene import LYING, Footage, Scene
-from fluidlift.pipeline.simulating import frame_file
 from fluidlift.pipeline.story import Result
 from fluidlift.types import Gaussians, PinholeCamera, Similarity3, concatenate, matrix_from_quat
 
 
 def splat_frames(folder: Path, count: int) -> Iterator[tuple[Gaussians, np.ndarray, np.ndarray]]:
     """(gaussians, ids, velocities) of each simulated frame."""
-    from fluidlift.io.ply import read_splats
-
-    for k in range(count):
-        splats = read_splats(frame_file(folder, 1001 + k))
-        velocity = np.stack([splats.extras[v] for v in ("vx", "vy", "vz")], axis=-1)
-        yield splats.gaussians, splats.extras["id"], velocity
+    return frames_of(folder, range(count))
 
 
 def show(
@@ -68,6 +63,9 @@ def show(
             ],
             attributes=scene.parameters.to_dict() | {"kind": scene.kind},
         )
+    else:
+        for name in ("asset.usda", "asset.usdc"):  # of frames that are no longer there
+            (folder / name).unlink(missing_ok=True)
     if not measured["frames"]:
         return Result({}, {"frames": count})
     arrays = {

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from fluidlift.shape import cross_section
@@ -15,6 +16,11 @@ from fluidlift.shape.kind import Kind
 from fluidlift.shape.plan import Extent, Footage, Plan, extent_of, plan_of, wide_ends, with_seen
 from fluidlift.shape.terrain import Setting, at_cells, signed_distance_from, to_corners, unit
 from fluidlift.types import CellType, Grid, Label, Terrain
+
+INLET = 2.5
+"""cells along the flow that an inlet is long"""
+FLAT = 0.3
+"""slope at which a surface says as much as the bulk flow about where its water runs"""
 
 
 @dataclass(frozen=True)
@@ -153,20 +159,37 @@ def _fill_channel(grid, plan, ground: _Ground, reach, seen: Footage, kind) -> Se
     if seen.closed:
         return Setting(terrain, cells, plan.level, bed)
     start, stop = wide_ends(water, plan.along, reach, h, share=0.4)
-    entry = s < start + 2.5 * h
-    if kind == "fall":
-        entry = entry | _upper_rim(water, plan.level, seen.along)[..., None]
+    # on a curtain that much of its plan may be most of its height, full of faster and faster water
+    entry = upper_rim(water, plan.level, seen.along, h)[..., None] if kind == "fall" else s < start + INLET * h
     cells[fluid & entry] = CellType.INFLOW
     cells[~solid & (s > stop - 2.5 * h)] = CellType.OUTFLOW
     return Setting(terrain, cells, plan.level, bed)
 
 
-def _upper_rim(water: np.ndarray, level: np.ndarray, along: np.ndarray) -> np.ndarray:
-    """Columns where a curtain begins: wet, dry two cells upstream, and in the upper part of the drop (the back edge of
-    a pool is dry upstream as well). A ragged curtain is fed along its whole upper edge, not at its highest point."""
+def upper_rim(
+    water: Bool[np.ndarray, "nx ny"], level: Float[np.ndarray, "nx ny"], along: Float[np.ndarray, "2"], spacing: float
+) -> Bool[np.ndarray, "nx ny"]:
+    """Columns where a curtain begins: wet, and dry `INLET` cells further up, in the upper part of the drop (the back
+    edge of a pool is dry upstream as well). A ragged curtain is fed along its whole upper edge, not at its highest
+    point.
+
+    The way up is measured on the surface: a steep curtain is only a few columns deep. As an inlet it must be no longer
+    than a cross-section is thick: cells are kept full there, and water that falls thins.
+
+    Args:
+        water: wet columns.
+        level: z of the surface, m.
+        along: horizontal direction of the bulk flow, taken where the surface is flat; where it is steep, water runs
+            down it.
+        spacing: width of a column, m.
+    """
     if not water.any():
         return water
-    step = np.round(2.0 * along / np.abs(along).max()).astype(int)
-    upstream = ndimage.shift(water.astype(np.uint8), step, order=0, cval=0).astype(bool)
+    gx, gy = np.gradient(ndimage.gaussian_filter(level, 1.0), spacing)
+    down = FLAT * np.asarray(along, float) - np.stack([gx, gy], axis=-1)
+    down /= np.maximum(np.linalg.norm(down, axis=-1, keepdims=True), 1e-12)
+    columns = np.maximum(INLET / np.sqrt(1 + gx**2 + gy**2), 1.0)
+    up = np.moveaxis(np.indices(water.shape), 0, -1) - np.rint(down * columns[..., None])
+    upstream = ndimage.map_coordinates(water.astype(np.uint8), np.moveaxis(up, -1, 0), order=0, cval=0) > 0
     low, high = level[water].min(), level[water].max()
     return water & ~upstream & (level > low + 0.4 * (high - low))

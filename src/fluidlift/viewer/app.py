@@ -119,7 +119,7 @@ class Viewer:
         self.jobs = Jobs(self._job_ended)
         port = free_port(request.host, request.port)
         self.server = open_server(request.host, port, f"fluidlift · {folder.name}")
-        self.stage = Stage(self.server, folder, self.asset)
+        self.stage = Stage(self.server, folder, self.asset, self.redraw)
         self.panels = Panels(self)
         self._set_first_view()
         self._thread = threading.Thread(target=self._run, name="viewer", daemon=True)

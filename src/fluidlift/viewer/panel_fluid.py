@@ -136,7 +136,8 @@ class FluidPanel:
 
 
 def _label(control: Control, value: float) -> str:
-    return f"{control.label} {control.told(value)}"
+    """With three digits: more would wrap. The box beside the slider, and typing, have them all."""
+    return f"{control.label} {value:.3g} {control.unit}".strip().replace(" °", "°")
 
 
 def _known(name: Any, options: tuple[str, ...]) -> str:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from fluidlift.errors import MissingPackage
 from fluidlift.types import FluidAsset, PinholeCamera, TriangleMesh, quat_from_matrix
 from fluidlift.viewer.frames import SplatFrame
+from fluidlift.viewer.surfacing import Surfacer
 
 ARROWS = 1200
 """at most"""
@@ -48,13 +49,15 @@ class Stage:
         server: of viser.
         folder: of the asset.
         asset: as lifted.
+        told: is called, from another thread, when something has become ready to be shown.
     """
 
-    def __init__(self, server: Any, folder: Path, asset: FluidAsset) -> None:
+    def __init__(self, server: Any, folder: Path, asset: FluidAsset, told: Callable[[], None] = lambda: None) -> None:
         self._scene, self._asset = server.scene, asset
         self._splats: Any = None
         self._unit = 1.0
-        self._mesher: Any = None
+        self._surfacer = Surfacer(told)
+        self._shown_surface: TriangleMesh | None = None
         self._bodies: dict[str, Any] = {}
         self._shown_bodies: dict[str, tuple[Any, bool]] = {}
         self._ground: Any = None
@@ -134,8 +137,11 @@ class Stage:
         self._frustum.visible = parts.camera
         if not parts.surface:
             self._take_away("/surface")
+            self._surfacer.forget()
+            self._shown_surface = None
             return ""
-        return self._show_surface(frame, rgb, spacing)
+        self._surfacer.ask(frame, frame.centers, RADIUS * spacing)
+        return self._show_surface(rgb)
 
     def _take_away(self, name: str) -> None:
         found = self._scene.get_handle_by_name(name)
@@ -178,20 +184,20 @@ class Stage:
             "/velocity", ends, colors, shaft_radius=thick, head_radius=2.5 * thick, head_length=6 * thick
         )
 
-    def _show_surface(self, frame: SplatFrame, rgb: np.ndarray, spacing: float) -> str:
-        try:
-            if self._mesher is None:
-                from fluidlift.backends.splashsurf import SplashsurfMesher
-
-                self._mesher = SplashsurfMesher()
-            mesh, _ = self._mesher.surface(frame.centers, RADIUS * spacing, {})
-        except MissingPackage as error:
-            return str(error)
-        if not len(mesh.faces):
+    def _show_surface(self, rgb: np.ndarray) -> str:
+        """The surface that was made last: while frames pass, it is some frames late."""
+        made = self._surfacer.made
+        if made is None:
+            return ""
+        _, mesh, problem = made
+        if mesh is None or problem:
             self._take_away("/surface")
-            return "This frame has no surface."
-        color = tuple(int(c) for c in rgb.mean(axis=0))
-        self._scene.add_mesh_simple("/surface", mesh.vertices, mesh.faces, color=color, side="double")
+            self._shown_surface = None
+            return problem
+        if mesh is not self._shown_surface:
+            self._shown_surface = mesh
+            color = tuple(int(c) for c in rgb.mean(axis=0))
+            self._scene.add_mesh_simple("/surface", mesh.vertices, mesh.faces, color=color, side="double")
         return ""
 
     # obstacles

@@ -1,0 +1,130 @@
+"""What a liquid looks like in Cycles and EEVEE: the numbers of `fluidlift.look.materials`, as nodes.
+
+Bodies that light passes get a refracting surface and their absorption and scattering as a volume, in 1/m; bodies that
+are opaque within millimetres get their colour. Colours are linear.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import bpy
+
+OPAQUE = 300.0
+"""1/m of scattering, from which on nothing is seen through a few millimetres"""
+DYED, LEAST = 0.1, 1e-3
+"""m through which light takes on a tint in full, and what a channel of it counts at least"""
+
+Color = tuple
+
+
+class Liquid(NamedTuple):
+    """A preset of fluidlift."""
+
+    refractive_index: float
+    roughness: float
+    absorption: Color
+    """1/m"""
+    scattering: float
+    """1/m"""
+    albedo: Color
+    """of a body so deep that one sees nothing behind it"""
+    emission: Color = (0.0, 0.0, 0.0)
+
+
+LIQUIDS = {
+    "source": Liquid(1.333, 0.12, (0.0, 0.0, 0.0), 400.0, (0.8, 0.8, 0.8)),
+    "water": Liquid(1.333, 0.0, (0.27, 0.056, 0.010), 0.0, (0.8, 0.8, 0.8)),
+    "muddy_water": Liquid(1.334, 0.0, (0.9, 1.6, 3.4), 22.0, (0.30, 0.185, 0.085)),
+    "honey": Liquid(1.49, 0.04, (5.0, 26.0, 110.0), 4.0, (0.80, 0.40, 0.03)),
+    "lava": Liquid(1.58, 0.45, (300.0, 300.0, 300.0), 3000.0, (0.035, 0.030, 0.028), (4.5, 0.60, 0.006)),
+    "milk": Liquid(1.35, 0.05, (1.1, 2.4, 14.0), 3200.0, (0.91, 0.88, 0.76)),
+    "oil": Liquid(1.47, 0.02, (9.0, 7.0, 150.0), 0.8, (0.75, 0.66, 0.10)),
+    "chocolate": Liquid(1.457, 0.22, (400.0, 900.0, 1500.0), 4000.0, (0.105, 0.042, 0.018)),
+}
+
+
+def liquid_material(name: str, tint: Color = (1.0, 1.0, 1.0)) -> bpy.types.Material:
+    """The material of a preset, made anew; of "source" the colour is that of the vertices."""
+    title = f"fluidlift {name}"
+    material = bpy.data.materials.get(title) or bpy.data.materials.new(title)
+    if material.node_tree is None:
+        material.use_nodes = True
+    liquid = LIQUIDS.get(name, LIQUIDS["source"])
+    nodes, links = material.node_tree.nodes, material.node_tree.links
+    nodes.clear()
+    output, shader = nodes.new("ShaderNodeOutputMaterial"), nodes.new("ShaderNodeBsdfPrincipled")
+    output.location = (320, 0)
+    links.new(shader.outputs[0], output.inputs["Surface"])
+    opaque = liquid.scattering >= OPAQUE
+    color = tuple(a * t for a, t in zip(liquid.albedo, tint))
+    material.diffuse_color = (*color, 1.0) if opaque or name == "honey" else (*color, 0.6)
+    _set(shader, ("Base Color",), (*color, 1.0) if opaque else (1.0, 1.0, 1.0, 1.0))
+    _set(shader, ("IOR",), liquid.refractive_index)
+    _set(shader, ("Roughness",), liquid.roughness)
+    _set(shader, ("Transmission Weight", "Transmission"), 0.0 if opaque else 1.0)
+    strength = max(liquid.emission)
+    if strength > 0:
+        glow = tuple(e / strength * t for e, t in zip(liquid.emission, tint))
+        _set(shader, ("Emission Color", "Emission"), (*glow, 1.0))
+        _set(shader, ("Emission Strength",), strength)
+    if name == "source":
+        _colors_of_vertices(material, shader, tint)
+    if not opaque:
+        _lit_through(material, output, shader)
+        _body(material, output, liquid, tint)
+    return material
+
+
+def _set(shader: bpy.types.ShaderNode, names: tuple, value) -> None:
+    """The first input of these names that this version of Blender has."""
+    for name in names:
+        if name in shader.inputs:
+            shader.inputs[name].default_value = value
+            return
+
+
+def _colors_of_vertices(material: bpy.types.Material, shader: bpy.types.ShaderNode, tint: Color) -> None:
+    nodes, links = material.node_tree.nodes, material.node_tree.links
+    attribute, dye = nodes.new("ShaderNodeAttribute"), nodes.new("ShaderNodeVectorMath")
+    attribute.location, dye.location = (-420, 0), (-220, 0)
+    attribute.attribute_name = "color"
+    dye.operation = "MULTIPLY"
+    dye.inputs[1].default_value = tuple(tint)
+    links.new(attribute.outputs["Color"], dye.inputs[0])
+    links.new(dye.outputs[0], shader.inputs["Base Color"])
+
+
+def _lit_through(material: bpy.types.Material, output: bpy.types.ShaderNode, shader: bpy.types.ShaderNode) -> None:
+    """Lamps shine straight through the surface: Cycles finds next to no light that is refracted on its way to the bed,
+    which would lie in the dark. The volume still takes its share of it."""
+    nodes, links = material.node_tree.nodes, material.node_tree.links
+    path, clear, mix = (nodes.new(f"ShaderNode{n}") for n in ("LightPath", "BsdfTransparent", "MixShader"))
+    path.location, clear.location, mix.location = (-220, 420), (-220, 120), (140, 120)
+    links.new(path.outputs["Is Shadow Ray"], mix.inputs[0])
+    links.new(shader.outputs[0], mix.inputs[1])
+    links.new(clear.outputs[0], mix.inputs[2])
+    links.new(mix.outputs[0], output.inputs["Surface"])
+
+
+def _body(material: bpy.types.Material, output: bpy.types.ShaderNode, liquid: Liquid, tint: Color) -> None:
+    """Absorption and scattering. Blender's nodes take a density (1/m) and a colour: what is absorbed is the density
+    times what the colour lacks to white, what is scattered the density times the colour."""
+    nodes, links = material.node_tree.nodes, material.node_tree.links
+    absorbed = [a - math.log(max(t, LEAST)) / DYED for a, t in zip(liquid.absorption, tint)]
+    absorption = nodes.new("ShaderNodeVolumeAbsorption")
+    absorption.location = (-220, -400)
+    density = max(absorbed)
+    absorption.inputs["Density"].default_value = density
+    absorption.inputs["Color"].default_value = (*(1.0 - a / density if density > 0 else 1.0 for a in absorbed), 1.0)
+    last = absorption.outputs[0]
+    if liquid.scattering > 0:
+        scatter, both = nodes.new("ShaderNodeVolumeScatter"), nodes.new("ShaderNodeAddShader")
+        scatter.location, both.location = (-220, -560), (60, -400)
+        scatter.inputs["Color"].default_value = (1.0, 1.0, 1.0, 1.0)
+        scatter.inputs["Density"].default_value = liquid.scattering
+        links.new(last, both.inputs[0])
+        links.new(scatter.outputs[0], both.inputs[1])
+        last = both.outputs[0]
+    links.new(last, output.inputs["Volume"])

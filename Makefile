@@ -1,11 +1,12 @@
 # Works on a fresh machine with make and Python 3.11 or newer:
 #   make demo    make an asset from the clip that comes with the package
 #   make test    every check that a change must pass
-# Another interpreter: make demo PYTHON=python3.12
+# Another interpreter: make demo PYTHON=python3.12; tests in another number of processes: make test WORKERS=4
 
 PYTHON ?= python3
 VENV ?= .venv
 OUT ?= demo.fluid
+WORKERS ?= 2
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --disable-pip-version-check -c constraints.txt
 
@@ -32,7 +33,7 @@ lint: $(VENV)/.dev
 	$(BIN)/lint-imports
 
 unit: $(VENV)/.dev
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
 format: $(VENV)/.dev
 	$(BIN)/ruff check --fix .

@@ -55,6 +55,19 @@ def test_undo_redo_reset_and_history(asset, capsys):
     assert "density: 800" not in (asset / "scene.yaml").read_text()
 
 
+def test_an_idle_look_is_told_once_and_edits_are_counted_without_gaps(asset, capsys):
+    assert edit(asset, "--set", "parameters.density=900") in WELL
+    assert edit(asset, "--undo") in WELL
+    capsys.readouterr()
+    assert edit(asset, "--set", "look.material=honey") == WITH_WARNINGS
+    said = capsys.readouterr().out
+    assert "look.material changes nothing while look.style is splats: set it to relit, transparent or surface" in said
+    assert edit(asset, "--history") in WELL
+    said = capsys.readouterr().out
+    assert "look.style is splats" not in said
+    assert [line.split()[0] for line in said.splitlines() if "  set " in line] == ["1", "2"]
+
+
 def test_all_as_json(asset, capsys):
     assert edit(asset, "--material", "honey", "--json", "--diff", "--history") in WELL
     said = json.loads(capsys.readouterr().out)

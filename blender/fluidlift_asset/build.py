@@ -9,8 +9,8 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
-from .facts import frames
-from .ply import columns, read_ply
+from .facts import frames, read_bodies
+from .ply import columns, read_ply, whole_numbers
 
 COLLECTION = "fluid asset"
 BODY = "fluidlift_body"
@@ -78,11 +78,8 @@ def attributes(mesh: bpy.types.Mesh, table: np.ndarray) -> None:
         linear = np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
         full = np.concatenate([linear, np.ones((len(linear), 1))], axis=1).astype(np.float32)
         _attribute(mesh, "color", "FLOAT_COLOR").data.foreach_set("color", full.ravel())
-    scale, opacity, number = (
-        columns(table, "scale_0", "scale_1", "scale_2"),
-        columns(table, "opacity"),
-        columns(table, "id"),
-    )
+    scale, opacity = columns(table, "scale_0", "scale_1", "scale_2"), columns(table, "opacity")
+    number = whole_numbers(table, "id")
     if scale is not None:
         _attribute(mesh, "radius", "FLOAT").data.foreach_set("value", np.exp(scale).mean(axis=1).astype(np.float32))
     if opacity is not None:
@@ -90,7 +87,7 @@ def attributes(mesh: bpy.types.Mesh, table: np.ndarray) -> None:
             "value", (1 / (1 + np.exp(-opacity[:, 0]))).astype(np.float32)
         )
     if number is not None:
-        _attribute(mesh, "id", "INT").data.foreach_set("value", table["id"].astype(np.int32))
+        _attribute(mesh, "id", "INT").data.foreach_set("value", number)
 
 
 def _attribute(mesh: bpy.types.Mesh, name: str, kind: str):
@@ -207,23 +204,24 @@ def volume_of(into: bpy.types.Collection, folder: Path) -> bpy.types.Object | No
 
 
 def bodies_of(into: bpy.types.Collection, folder: Path) -> list[bpy.types.Object]:
-    """Obstacles, with a key on every frame where they move."""
-    file = folder / "bodies.json"
-    if not file.is_file():
-        return []
+    """Obstacles, with a key on every frame where they move.
+
+    Raises:
+        RuntimeError: bodies.json is damaged, or names files elsewhere.
+        OSError, ValueError: a mesh that is not there, or is none.
+    """
     made = []
-    for body in json.loads(file.read_text(encoding="utf-8"))["bodies"]:
-        vertices, faces = read_ply(folder / body["mesh"])
-        mesh = bpy.data.meshes.new(body["name"])
+    for body in read_bodies(folder):
+        vertices, faces = read_ply(body.mesh)
+        mesh = bpy.data.meshes.new(body.name)
         points = columns(vertices, "x", "y", "z")
         mesh.from_pydata([] if points is None else points.tolist(), [], faces.tolist())
-        thing = bpy.data.objects.new(body["name"], mesh)
-        thing[BODY] = body["name"]
+        thing = bpy.data.objects.new(body.name, mesh)
+        thing[BODY] = body.name
         thing.rotation_mode = "QUATERNION"
         into.objects.link(thing)
-        poses = body["poses"]
-        still = all(p == poses[0] for p in poses)
-        for number, pose in zip(range(body["first"], body["first"] + len(poses)), poses):
+        still = all(p == body.poses[0] for p in body.poses)
+        for number, pose in enumerate(body.poses, body.first):
             thing.location, thing.rotation_quaternion = pose[:3], pose[3:]
             if still:
                 break

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
+import math
+from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
 FIRST = 1001
@@ -60,10 +61,58 @@ def read_facts(folder: Path) -> Facts:
         raise RuntimeError(f"{folder.name} does not say what an asset says ({error}): is it damaged?") from None
 
 
+class Body(NamedTuple):
+    """An obstacle beside the meshes of the fluid."""
+
+    name: str
+    mesh: Path
+    first: int
+    """number of the frame of the first pose"""
+    poses: list[list[float]]
+    """place and unit quaternion w x y z, one per frame"""
+
+
+def read_bodies(folder: Path) -> list[Body]:
+    """What bodies.json lists; nothing where there is none.
+
+    Raises:
+        RuntimeError: it cannot be read, an entry is not whole, or a mesh is elsewhere than below bodies/.
+    """
+    file = folder / "bodies.json"
+    if not file.is_file():
+        return []
+    told = _json(file)
+    listed = told.get("bodies") if isinstance(told, dict) else None
+    if not isinstance(listed, list):
+        raise RuntimeError(f"{file} has no list of bodies: export the meshes again.")
+    return [_body(entry, k, folder) for k, entry in enumerate(listed, 1)]
+
+
+def _body(entry: Any, number: int, folder: Path) -> Body:
+    try:
+        found = Body(str(entry["name"]), _mesh_file(entry["mesh"], folder), int(entry["first"]),
+                     [[float(v) for v in pose] for pose in entry["poses"]])  # fmt: skip
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise RuntimeError(f"bodies.json, body {number} is not whole ({error}): export the meshes again.") from None
+    if not found.poses or any(len(p) != 7 or not all(map(math.isfinite, p)) for p in found.poses):
+        raise RuntimeError(f"bodies.json, body {number} '{found.name}': poses that are not seven finite numbers each.")
+    return found
+
+
+def _mesh_file(told: Any, folder: Path) -> Path:
+    """A file in bodies/, also after links are followed: an asset may come from a stranger."""
+    path = PurePosixPath(told)
+    file = folder / path
+    inside = not path.is_absolute() and len(path.parts) == 2 and path.parts[0] == "bodies" and path.suffix == ".ply"
+    if not inside or "\\" in told or not file.resolve().is_relative_to(folder.resolve()):
+        raise RuntimeError(f"bodies.json names the mesh {told!r}: only files bodies/*.ply beside it are read.")
+    return file
+
+
 def _json(file: Path) -> Any:
     try:
         return json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise RuntimeError(f"{file} cannot be read ({error}): is the asset damaged?") from None
 
 

@@ -38,6 +38,8 @@ def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
             if count and (table["corners"] != 3).any():
                 raise ValueError(f"{path}: faces that are no triangles")
             faces = table["index"].astype(np.int64).reshape(-1, 3)
+    if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):  # Blender would read beyond its memory
+        raise ValueError(f"{path}: faces of vertices that it does not have")
     return vertices, faces
 
 
@@ -62,3 +64,11 @@ def columns(table: np.ndarray, *names: str) -> np.ndarray | None:
     if table.dtype.names is None or any(n not in table.dtype.names for n in names):
         return None
     return np.stack([table[n] for n in names], axis=1).astype(np.float32)
+
+
+def whole_numbers(table: np.ndarray, name: str) -> np.ndarray | None:
+    """int32 [n] of a column, held at the ends of that range; None where it is missing."""
+    if table.dtype.names is None or name not in table.dtype.names:
+        return None
+    ends, exact = np.iinfo(np.int32), np.nan_to_num(table[name].astype(np.float64))
+    return np.clip(exact, ends.min, ends.max).astype(np.int32)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import time
+from collections.abc import Iterator
 from typing import TextIO
 
 LABELS = {
@@ -119,3 +121,13 @@ class BarProgress:
     def warn(self, text: str) -> None:
         """Something the user should know."""
         self.console.print(f"warning: {text}", style="yellow", markup=False, highlight=False)
+
+
+@contextlib.contextmanager
+def shown_progress() -> Iterator[BarProgress | PlainProgress]:
+    """A bar where standard error is a terminal, plain lines elsewhere."""
+    if sys.stderr.isatty():
+        with BarProgress() as bar:
+            yield bar
+    else:
+        yield PlainProgress()

@@ -63,16 +63,17 @@ def picture() -> np.ndarray:
     return pixels
 
 
-def blurred_by_velocity() -> float:
-    """Mean difference of the picture with the surface's velocities and without any."""
+def blurred_by_velocity() -> list[float]:
+    """Mean differences to a picture with the surface at rest: of one with its velocities, and of one more at rest."""
     scene.world = bpy.data.worlds.new("light")
     if scene.world.node_tree is None:  # later versions make it by themselves
         scene.world.use_nodes = True
+    scene.world.node_tree.nodes["Background"].inputs["Color"].default_value = (1.0, 1.0, 1.0, 1.0)
     moving, mesh = picture(), bpy.data.objects["fluid surface"].data
     mesh.attributes["velocity"].data.foreach_set("vector", np.zeros(3 * len(mesh.vertices), np.float32))
-    still = picture()
+    still, again = picture(), picture()
     del bpy.data.objects["fluid surface"]["fluidlift_shown"]
-    return float(np.abs(moving - still).mean())
+    return [float(np.abs(p - still).mean()) for p in (moving, again)]
 
 
 def surface_material() -> str:

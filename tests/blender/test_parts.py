@@ -107,6 +107,61 @@ def test_the_look_of_the_frames_is_read(tmp_path):
         assert found.tint == ((1.0, 0.5, 1.0) if material == "honey" else (1.0, 1.0, 1.0))
 
 
+BODY = {"name": "ball", "mesh": "bodies/01_ball.ply", "first": 1001, "poses": [[0, 0, 1, 1, 0, 0, 0]]}
+
+
+@pytest.mark.parametrize(
+    ("told", "words"),
+    [
+        ("{", "cannot be read"),
+        ("[1]", "no list of bodies"),
+        ('{"bodies": 3}', "no list of bodies"),
+        ({"name": "ball"}, "body 1 is not whole"),
+        (BODY | {"poses": []}, "seven finite numbers"),
+        (BODY | {"poses": [[0, 0, 1]]}, "seven finite numbers"),
+        (BODY | {"poses": [[float("nan")] * 7]}, "seven finite numbers"),
+        (BODY | {"first": "soon"}, "body 1 is not whole"),
+        (BODY | {"mesh": 3}, "body 1 is not whole"),
+        *((BODY | {"mesh": m}, "only files bodies") for m in (
+            "/etc/passwd", "../a.ply", "bodies/../a.ply", "bodies/../../a.ply", "/bodies/a.ply", "bodies/a.obj",
+            "a.ply", "bodies/deep/a.ply", "bodies\\..\\..\\a.ply", "bodies/link.ply",
+        )),
+    ],
+)  # fmt: skip
+def test_a_list_of_obstacles_that_is_damaged_or_leads_elsewhere_is_refused(tmp_path, told, words):
+    folder = tmp_path / "surface"
+    (folder / "bodies").mkdir(parents=True)
+    (tmp_path / "a.ply").write_text("")
+    (folder / "bodies" / "link.ply").symlink_to(tmp_path / "a.ply")
+    (folder / "bodies.json").write_text(told if isinstance(told, str) else json.dumps({"bodies": [told]}))
+    with pytest.raises(RuntimeError, match=words):
+        part("facts").read_bodies(folder)
+
+
+def test_a_sound_list_of_obstacles_is_read(tmp_path):
+    facts = part("facts")
+    assert facts.read_bodies(tmp_path) == []
+    (tmp_path / "bodies.json").write_text(json.dumps({"bodies": [BODY]}))
+    (body,) = facts.read_bodies(tmp_path)
+    assert body == ("ball", tmp_path / "bodies" / "01_ball.ply", 1001, [[0, 0, 1, 1, 0, 0, 0]])
+
+
+def test_faces_of_vertices_that_are_not_there_are_refused(tmp_path):
+    data = write_mesh(tmp_path / "a.ply", TriangleMesh(np.eye(3), np.array([[0, 1, 2]]))).read_bytes()
+    (tmp_path / "a.ply").write_bytes(data[:-4] + np.int32(7).tobytes())
+    with pytest.raises(ValueError, match="vertices that it does not have"):
+        part("ply").read_ply(tmp_path / "a.ply")
+
+
+def test_numbers_beyond_32_bits_are_held_at_the_ends_and_not_wrapped():
+    table = np.array([(2**40,), (-(2**40),), (5,)], [("id", "<i8")])
+    got = part("ply").whole_numbers(table, "id")
+    assert got.dtype == np.int32 and got.tolist() == [2**31 - 1, -(2**31), 5]
+    real = part("ply").whole_numbers(np.array([(3e9,), (np.nan,)], [("id", "<f4")]), "id")
+    assert real.tolist() == [2**31 - 1, 0]
+    assert part("ply").whole_numbers(table, "number") is None
+
+
 def test_liquids_are_those_of_fluidlift():
     tree = ast.parse((FOLDER / "fluidlift_asset" / "materials.py").read_text())
     (table,) = (

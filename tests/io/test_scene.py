@@ -10,6 +10,7 @@ from fluidlift.io.export_mesh import write_obj
 from fluidlift.io.scene import SCENE_TEMPLATE, SceneEdits, read_edits
 from fluidlift.io.scene_look import Look
 from fluidlift.numerics.solid_mesh import box_mesh, moments
+from fluidlift.types import TriangleMesh
 
 
 @pytest.fixture
@@ -23,6 +24,24 @@ def edits(tmp_path):
     return read
 
 
+EXAMPLE = r"^#(?! )|^#(?=  )"
+"""the mark before a line that can be used; prose has one space behind it"""
+
+
+@pytest.mark.parametrize("line", [x for x in SCENE_TEMPLATE.splitlines() if re.match(EXAMPLE, x)])
+def test_each_line_of_the_template_can_be_used_alone(edits, tmp_path, line):
+    write_obj(tmp_path / "rock.obj", box_mesh(np.ones(3)))
+    assert edits(SCENE_TEMPLATE.replace(line, line[1:])) != SceneEdits()
+
+
+def test_the_template_of_earlier_versions_still_works(edits):
+    old = re.sub(r"^(parameters|inflow|look):$", r"\1: {}", SCENE_TEMPLATE, flags=re.M)
+    old = re.sub(r"^(obstacles|emitters|terrain):$", r"\1: []", old, flags=re.M)
+    assert edits(old) == SceneEdits()
+    with pytest.raises(InputRejected, match=r"line 5.*Do: write 'parameters:' without the \{\}"):
+        edits(old.replace("#  density", "  density"))
+
+
 def test_the_template_changes_nothing(edits):
     found = edits(SCENE_TEMPLATE)
     assert found == SceneEdits()
@@ -30,8 +49,7 @@ def test_the_template_changes_nothing(edits):
 
 def test_the_examples_of_the_template_work(edits, tmp_path):
     write_obj(tmp_path / "rock.obj", box_mesh(np.ones(3)))
-    text = re.sub(r"^(\w+): [\[{][\]}]$", r"\1:", SCENE_TEMPLATE, flags=re.M)
-    found = edits(re.sub(r"^#(?=  )|^# (?=duration|extend|loop)", "", text, flags=re.M))
+    found = edits(re.sub(EXAMPLE, "", SCENE_TEMPLATE, flags=re.M))
     assert [o.name for o in found.obstacles] == ["sphere1", "mesh2", "box3"]
     assert found.parameters["kinematic_viscosity"] == 1e-6
     volumes = [moments(o.mesh).volume for o in found.obstacles]
@@ -41,7 +59,7 @@ def test_the_examples_of_the_template_work(edits, tmp_path):
     assert (found.emitters[0].velocity, found.emitters[0].end) == ((0.0, 0.0, -1.0), 2.5)
     assert (found.terrain[0].offset, found.terrain[1].degrees_per_metre) == ((0.0, 0.0, 0.1), 20.0)
     assert (found.inflow.keyframes, found.inflow.fluctuation) == (((0.0, 1.5),), 0.1)
-    assert found.look == Look("surface", "honey", "sky")
+    assert found.look == Look("surface", "honey", "studio")
     assert (found.duration, found.extend_downstream, found.loop) == (4.0, 2.0, True)
 
 
@@ -89,6 +107,15 @@ obstacles:
     ("text", "words"),
     [
         ("obstacle: []", ["line 1", "write 'obstacles'"]),
+        ("gravity: [0, 0, -1]", ["line 1", "write it under parameters"]),
+        ("parameters:\n  material: honey", ["line 2", "write it under look"]),
+        ("parameters: {gravity: -9.8}", ["such as [0, 0, -9.81]"]),
+        ("obstacles: [{shape: sphere, size: [1, 1, 1]}]", ["a sphere has radius"]),
+        ("- a\n- b", ["is a list", "sections", "Do: write each name"]),
+        ("look:\n\tstyle: surface", ["line 2", "spaces", "no tabs"]),
+        ("parameters: {density: 3\nlook: {}", ["close the '{' of line 1"]),
+        ("obstacles: [3", ["close the '[' of line 1"]),
+        ("parameters:\n density: 3\n  gravity: 3", ["same column"]),
         ("\nparameters:\n  density: 1\n  viscosity: 2\n", ["line 4", "write 'kinematic_viscosity'"]),
         ("obstacles:\n  - shape: spere\n", ["line 2", "write 'sphere'"]),
         ("obstacles:\n  - shape: box\n    size: [1, 1, 1]\n    densitie: 3\n", ["line 4", "write 'density'"]),
@@ -148,6 +175,17 @@ def test_the_user_may_name_another_folder_of_meshes(edits, tmp_path):
 def test_an_open_mesh_is_refused_with_the_line_that_names_it(edits, tmp_path):
     mesh = box_mesh(np.ones(3))
     write_obj(tmp_path / "open.obj", type(mesh)(mesh.vertices, mesh.faces[:-1]))
-    (obstacle,) = edits("\nobstacles:\n  - mesh: open.obj\n").obstacles
     with pytest.raises(InputRejected, match=r"scene\.yaml, line 3: .*open"):
-        obstacle.body(1.0)
+        edits("\nobstacles:\n  - mesh: open.obj\n")
+
+
+@pytest.mark.parametrize("section", ["obstacles", "emitters"])
+def test_a_flat_mesh_is_told_as_flat_until_its_file_is_another(edits, tmp_path, section):
+    square = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0.0]])
+    both = np.array([[0, 1, 2], [1, 3, 2], [0, 2, 1], [1, 2, 3]])
+    write_obj(tmp_path / "a.obj", TriangleMesh(square, both))
+    for _ in range(2):
+        with pytest.raises(InputRejected, match=r"line 1: .*flat"):
+            edits(f"{section}: [{{mesh: a.obj, position: [0, 0, 99]}}]")
+    write_obj(tmp_path / "a.obj", box_mesh(np.ones(3)))
+    assert len(getattr(edits(f"{section}: [{{mesh: a.obj}}]"), section)) == 1

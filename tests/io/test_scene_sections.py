@@ -137,6 +137,13 @@ def test_what_lies_outside_the_domain_is_refused_or_warned_about(edits, section)
         require_inside(edits(text % 0.56), GRID)
 
 
+def test_an_emitter_may_be_above_the_box_as_far_as_it_is_raised(edits):
+    text = "emitters: [{shape: box, size: [0.1, 0.1, 0.1], position: [0.5, 0.5, %s]}]"
+    assert require_inside(edits(text % 2.4), GRID, above=2.0) == []  # its top at 2.45 m, the box ends at 0.5 m
+    with pytest.raises(InputRejected, match=r"line 1.*outside the domain.*\(.*2\.5\) m"):
+        require_inside(edits(text % 2.6), GRID, above=2.0)
+
+
 def test_a_channel_that_is_extended_has_room_for_more(edits):
     far = edits("obstacles: [{shape: sphere, radius: 0.1, position: [2, 0.5, 0.2]}]")
     with pytest.raises(InputRejected, match="outside"):

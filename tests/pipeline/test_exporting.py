@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from fluidlift.cli import DONE, REJECTED, WITH_WARNINGS, main
+from fluidlift.errors import InputRejected
 from fluidlift.io.asset_folder import load_asset, read_manifest
 from fluidlift.io.frames import FluidFrame
 from fluidlift.io.ply import read_mesh, read_splats
@@ -17,6 +18,7 @@ from fluidlift.io.stage_cache import mark_owner, save_stage
 from fluidlift.io.validate_usd import validate_usd
 from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.pipeline.exporting import gridded, level_set
+from fluidlift.pipeline.rendering import frame_numbers
 from fluidlift.types import TriangleMesh
 
 WELL = (DONE, WITH_WARNINGS)
@@ -113,6 +115,30 @@ def test_what_cannot_be_written_is_refused(made, tmp_path, capsys, options, word
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("command", ["export", "render"])
+def test_a_place_that_cannot_be_written_is_refused(made, capsys, command):
+    assert main([command, str(made.folder), "-o", "/proc/no", "--frames", "1001-1001"]) == REJECTED
+    said = capsys.readouterr().err
+    assert "cannot be written" in said and "a folder that can be written" in said
+
+
+def test_a_frame_that_is_missing_in_the_middle_is_named(tmp_path):
+    for k in (1001, 1002, 1004):
+        (tmp_path / "frames" / "splats").mkdir(parents=True, exist_ok=True)
+        (tmp_path / "frames" / "splats" / f"{k}.ply").touch()
+    with pytest.raises(InputRejected, match=r"frame 1003 is missing: frames/splats/1003\.ply.*--restart"):
+        frame_numbers(tmp_path, 4, (1002, 1004))
+    assert frame_numbers(tmp_path, 4, (1004, 1004)) == range(3, 4)
+    assert frame_numbers(tmp_path, 4, None) == range(2)
+    with pytest.raises(InputRejected, match="numbers from 1001 to 1004"):
+        frame_numbers(tmp_path, 4, (1001, 1005))
+
+
+def test_a_page_that_was_not_asked_for_says_how(made, tmp_path, capsys):
+    assert export(made, tmp_path / "river.html") == REJECTED
+    assert "add --to html" in capsys.readouterr().err
+
+
 def test_volumes_hold_the_motion_and_the_amount_of_the_fluid(made):
     asset, splats = load_asset(made.folder), read_splats(made.folder / "frames" / "splats" / "1002.ply")
     velocities = np.stack([splats.extras[v] for v in ("vx", "vy", "vz")], axis=-1)
@@ -167,7 +193,7 @@ def test_obstacles_lie_beside_the_meshes_where_the_simulation_had_them(floating,
     out = tmp_path / "out"
     assert main(["export", str(floating), "-o", str(out), "--frames", "1001-1002"]) in WELL
     (body,) = json.loads((out / "bodies.json").read_text())["bodies"]
-    assert body["name"] == "a/b" and body["mesh"] == "bodies/a_b.ply" and body["first"] == 1001
+    assert body["name"] == "a/b" and body["mesh"] == "bodies/01_a_b.ply" and body["first"] == 1001
     half = np.sqrt(0.5)
     np.testing.assert_allclose(body["poses"], [[0, 0, 1, half, 0, 0, half], [1, 0, 1, half, 0, 0, half]], atol=1e-12)
     mesh = read_mesh(out / body["mesh"])

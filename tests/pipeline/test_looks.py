@@ -127,8 +127,9 @@ def test_a_finer_picture_averaged_is_the_same_picture_with_smooth_edges(made):
     plain, fine = (Painter(look, asset.terrain, made.folder, supersample=k) for k in (1, 2))
     a, b = (p.picture(Frame(fluid, velocities), camera, Backdrop(cut_out=True)) for p in (plain, fine))
     assert b.image.shape == a.image.shape and b.alpha.shape == a.alpha.shape == b.depth.shape
-    # edges apart, the same light and the same share of every pixel
-    assert np.median(np.abs(a.image - b.image)) < 0.01 and abs(float(a.alpha.mean() - b.alpha.mean())) < 0.01
+    # edges apart, the same light; the rasteriser's blur of half a pixel is half as wide in the finer picture, and the
+    # outline of some 300 px moves in by up to a quarter of a pixel of 6144
+    assert np.median(np.abs(a.image - b.image)) < 0.01 and abs(float(a.alpha.mean() - b.alpha.mean())) < 0.0125
     plate = np.random.default_rng(0).uniform(0, 1, (64, 96, 3)).astype(np.float32)
     kept = fine.picture(Frame(fluid, velocities), camera, Backdrop(plate))
     bare = b.alpha == 0

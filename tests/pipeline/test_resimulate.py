@@ -261,7 +261,7 @@ def test_what_cannot_work_is_said_before_anything_is_written(asset, made, capsys
     ("scene", "word"),
     [
         ("parameters: {viscosity: 1}", "kinematic_viscosity"), ("obstacles: [{shape: cube}]", "line 1"),
-        ("emitters: [{rate: 1}]", "emitters"), ("\n\nduraton: 3", "line 3"),
+        ("emitters: [{rate: 1}]", "line 1: an emitter"), ("\n\nduraton: 3", "line 3"),
         ("parameters: {density: -1}", "density"),
     ],
 )  # fmt: skip

@@ -15,8 +15,8 @@ api = pytest.importorskip("playwright.sync_api", reason="playwright is not insta
 CHROMIUM = Path("/usr/bin/chromium")
 FLAGS = ["--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 HARMLESS = ("THREE.Clock", "WebGL", "GPU stall", "GL Driver Message", "computeBoundingSphere")
-"""what the renderer itself says of its software; the last one viser 1.1.1 says of every cloud of splats, whose centres
-it keeps in a texture"""
+"""what the renderer itself says of its software; the last one three.js says of the node of splats, whatever is in it:
+viser 1.1.1 keeps the centres in a texture and draws one square [4,2], whose missing third coordinate is NaN"""
 
 pytestmark = pytest.mark.skipif(not CHROMIUM.exists(), reason=f"there is no {CHROMIUM}")
 
@@ -69,10 +69,11 @@ class Visit:
 
 @pytest.fixture
 def viewer(tank_folder):
+    from fluidlift.pipeline.preview import PreviewSize
     from fluidlift.viewer.app import Viewer, ViewRequest
     from fluidlift.viewer.ports import free_port
 
-    made = Viewer(tank_folder, ViewRequest(port=free_port("127.0.0.1", 18080)))
+    made = Viewer(tank_folder, ViewRequest(port=free_port("127.0.0.1", 18080)), size=PreviewSize(seconds=None))
     yield made
     made.close()
 

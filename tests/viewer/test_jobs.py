@@ -59,3 +59,16 @@ def test_an_error_is_told_and_the_next_piece_can_begin():
     jobs.start("export", surprising)
     assert jobs.wait(5)
     assert ended == ["export: The disk is full.", "export: unexpected ZeroDivisionError: oh"]
+
+
+def test_an_error_after_the_end_and_one_nobody_expected_are_logged_and_the_next_piece_can_begin(caplog):
+    def ended():
+        raise KeyError("panel")
+
+    def surprising(progress):
+        raise ZeroDivisionError("oh")
+
+    jobs = Jobs(ended)
+    assert jobs.start("export", surprising) and jobs.wait(5)
+    assert [r.exc_info[0] for r in caplog.records] == [ZeroDivisionError, KeyError]
+    assert jobs.start("again", lambda progress: "fine") and jobs.wait(5) and jobs.state.outcome == "fine"

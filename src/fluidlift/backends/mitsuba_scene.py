@@ -14,7 +14,7 @@ from fluidlift.look.environment import Environment
 from fluidlift.look.environment_lookup import grid_directions
 from fluidlift.look.liquid import LUMINANCE, glow
 from fluidlift.look.materials import Material
-from fluidlift.look.scenery import vertex_normals
+from fluidlift.numerics.mesh_normals import vertex_normals
 from fluidlift.types import PinholeCamera, Terrain, TriangleMesh
 
 OPAQUE_DEPTH = 8.0

@@ -35,6 +35,7 @@ from fluidlift.cli.options import (
 )
 from fluidlift.cli.view import View
 from fluidlift.errors import FluidliftError, InputRejected
+from fluidlift.progress import shown_progress
 
 Command = (
     Make
@@ -96,17 +97,6 @@ def _run(args: list[str]) -> int:
         return FAILED
 
 
-@contextlib.contextmanager
-def _progress():
-    from fluidlift.progress import BarProgress, PlainProgress
-
-    if sys.stderr.isatty():
-        with BarProgress() as bar:
-            yield bar
-    else:
-        yield PlainProgress()
-
-
 def _make(c: Make) -> int:
     from fluidlift.config import build_config
 
@@ -150,7 +140,7 @@ def default_folder(clip: Path) -> Path:
 def _run_job(clip: Path, out: Path, config: Any, *, force=(), as_json=False, **files: Path | None) -> int:
     from fluidlift.pipeline import Inputs, make
 
-    with _progress() as progress:
+    with shown_progress() as progress:
         made = make(Inputs(clip, **files), out, config, force=force, progress=progress)
     return _tell(made, as_json)
 
@@ -173,7 +163,7 @@ def _fit(c: Fit) -> int:
         "fit.method": c.method, "fit.free": c.free, "fit.hold": c.hold or None,
         "fit.restarts": c.restarts, "fit.max_seconds": c.max_seconds,
     }  # fmt: skip
-    with _progress() as progress:
+    with shown_progress() as progress:
         found = refit(c.asset, overrides=c.set, flat=flat, progress=progress)
     if c.json:
         print(json.dumps({"asset": str(found.folder), "seconds": found.seconds, "status": found.status,
@@ -189,7 +179,7 @@ def _sim(c: Sim) -> int:
 
     request = SimulationRequest(c.duration, c.fps, c.extend_downstream, c.meshes, c.resume, c.restart)
     flat = {"seed": c.seed, "simulate.checkpoint_every": c.checkpoint_every}
-    with _progress() as progress:
+    with shown_progress() as progress:
         made = resimulate(c.asset, request=request, overrides=c.set, flat=flat, progress=progress)
     return _tell(made, c.json)
 
@@ -213,7 +203,7 @@ def _render(c: Render) -> int:
         c.view, _pair(c.size, "x", "--size", "1920x1080"), _pair(c.frames, "-", "--frames", "1001-1024"),
         c.background, c.format, c.look, c.material, c.environment, c.exposure, c.engine, c.samples,
     )  # fmt: skip
-    with _progress() as progress:
+    with shown_progress() as progress:
         return _told(render_asset(c.asset, c.out, request, progress=progress), c.json)
 
 
@@ -222,7 +212,7 @@ def _export(c: Export) -> int:
 
     frames = _pair(c.frames, "-", "--frames", "1001-1024")
     request = ExportRequest(c.to, c.up_axis, c.meters_per_unit, frames, c.fps)
-    with _progress() as progress:
+    with shown_progress() as progress:
         return _told(export_asset(c.asset, c.out, request, progress=progress), c.json)
 
 
@@ -275,7 +265,7 @@ def _mask(c: Mask) -> int:
     _require_sections(c.set, ("read", "segment", "motion"))
     config = build_config(None, None, c.set, flat, base=LONGEST)
     hints = Hints.of(c.roi, c.click, c.not_here)
-    with _progress() as progress:
+    with shown_progress() as progress:
         found = find_masks(
             Inputs(c.clip, camera=c.camera), c.out, config, hints=hints, force=c.force, progress=progress
         )
@@ -293,7 +283,7 @@ def _motion(c: Motion) -> int:
     _require_sections(c.set, ("read", "segment", "shape", "depth", "motion"))
     config = build_config(None, c.config, c.set, flat, base=LONGEST)
     inputs = Inputs(c.clip, mask=c.mask, camera=c.camera, depth=c.depth, flow=c.flow)
-    with _progress() as progress:
+    with shown_progress() as progress:
         found = measure_motion(
             inputs, c.out, config, files=MotionFiles(c.format, c.raw), force=c.force, progress=progress
         )

@@ -61,13 +61,16 @@ def run(command: Edit) -> int:
     from fluidlift.pipeline.editing import EditSession
 
     session = EditSession.open(command.asset, meshes=command.meshes)
-    wanted = _wanted(command)
+    wanted, look = _wanted(command), _look(session)
     edit = _done(session, command) if wanted else None
     if edit is not None and not command.json:  # before a simulation takes its time
         print(f"{edit.what}\n{edit.diff()}", end="", flush=True)
     if command.simulate:
         _simulate(session, command)
     told = _outcome(session, command, edit)
+    idle = session.edits.look.warning()
+    if edit is None or _look(session) == look:  # said once, of the edit that does it
+        told["warnings"] = [text for text in told["warnings"] if text != idle]
     if command.json:
         print(json_module.dumps(told, indent=1))
     else:
@@ -129,11 +132,11 @@ def _pair(text: str, option: str, example: str) -> tuple[str, Any]:
 
 
 def _simulate(session: EditSession, command: Edit) -> None:
-    from fluidlift.cli import _progress
     from fluidlift.pipeline import SimulationRequest, resimulate
+    from fluidlift.progress import shown_progress
 
     try:
-        with _progress() as progress:
+        with shown_progress() as progress:
             resimulate(session.folder, request=SimulationRequest(meshes=command.meshes), progress=progress)
     except FluidliftError as error:  # most likely by the last edit
         done = [e for e in session.history() if not e.undone]
@@ -170,7 +173,7 @@ def _lines(session: EditSession, command: Edit, told: dict[str, Any], nothing: b
     lines = ["nothing to change: scene.yaml says so already"] * nothing
     if command.history:
         edits = session.history()
-        lines += [f"{e.number:4}  {e.time[:19]:19}  {e.what}{'  (undone)' if e.undone else ''}" for e in edits]
+        lines += [f"{n:4}  {e.time[:19]:19}  {e.what}{'  (undone)' * e.undone}" for n, e in enumerate(edits, start=1)]
         lines += ["no edits yet"] * (not edits)
     if command.diff or not (told["edit"] or nothing or command.history or command.simulate):
         lines.append(session.diff().rstrip("\n") or "nothing differs from the fluid as lifted")
@@ -186,6 +189,14 @@ def _next(folder: Path, stale: list[str]) -> list[str]:
         return ["only the look is another one, and nothing has to be simulated again; next:",
                 f"  fluidlift render {_quoted(folder)} -o {film}"]  # fmt: skip
     return ["the frames on disk show this scene"]
+
+
+def _look(session: EditSession) -> Any:
+    """The section look as it is now; None where scene.yaml is broken."""
+    try:
+        return session.scene.get("look") or None
+    except InputRejected:
+        return None
 
 
 def _quoted(folder: Path) -> str:

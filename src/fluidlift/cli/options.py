@@ -296,7 +296,7 @@ class Evaluate:
 
 @dataclass(frozen=True)
 class Validate:
-    """Check an asset: manifest, schema, arrays, USD."""
+    """Check an asset: schema, hashes, every frame, scene.yaml, USD, preview; say what to do."""
 
     asset: Asset
     """asset folder"""

@@ -85,14 +85,13 @@ class Entries:
         place = self.file if line is None else f"{self.file}, line {line}"
         return InputRejected(f"{place}: {got}", needed, do)
 
-    def only(self, known: Iterable[str]) -> None:
-        """No other entries than these."""
+    def only(self, known: Iterable[str], hints: Mapping[Any, str] | None = None) -> None:
+        """No other entries than these; `hints` says what to do about some others."""
         known = sorted(known)
         for name in self.data:
             if name not in known:
-                raise self.wrong(
-                    name, f"unknown entry '{name}' of {self.what}", "one of " + ", ".join(known), nearest(name, known)
-                )
+                do = (hints or {}).get(name) or nearest(name, known)
+                raise self.wrong(name, f"unknown entry '{name}' of {self.what}", "one of " + ", ".join(known), do)
 
     def given(self, name: str) -> bool:
         """Whether an entry is there and not empty."""

@@ -17,6 +17,7 @@ from fluidlift.errors import require
 from fluidlift.io.color import linear_from_srgb
 from fluidlift.io.glb import INDICES, Glb
 from fluidlift.io.ply import AXES
+from fluidlift.numerics.mesh_normals import vertex_normals
 from fluidlift.types import Gaussians, PinholeCamera, Similarity3, TriangleMesh, quat_from_matrix
 
 SPLATS = "KHR_gaussian_splatting"
@@ -84,7 +85,7 @@ def _mesh(glb: Glb, mesh: TriangleMesh, name: str) -> int:
     there is none, vertex colours in linear light."""
     vertices, faces, uv = once_per_corner(mesh)
     points = (np.asarray(mesh.vertices, np.float64) @ _GLTF_FROM_WORLD.T).astype(np.float32)
-    normals = _normals(points, np.asarray(mesh.faces))
+    normals = (vertex_normals(mesh) @ _GLTF_FROM_WORLD.T).astype(np.float32)
     attributes = {
         "POSITION": glb.array(points[vertices], bounds=True),
         "NORMAL": glb.array(normals[vertices]),
@@ -114,17 +115,6 @@ def once_per_corner(mesh: TriangleMesh) -> tuple[np.ndarray, np.ndarray, np.ndar
     corners = np.concatenate([mesh.faces.reshape(-1, 1), mesh.uv.reshape(-1, 2)], axis=1, dtype=np.float64)
     once, number = np.unique(corners, axis=0, return_inverse=True)
     return once[:, 0].astype(np.int64), number.reshape(-1, 3), once[:, 1:].astype(np.float32)
-
-
-def _normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Unit normals of the vertices, weighted with the area of their triangles; up where there is none."""
-    a, b, c = (points[faces[:, k]].astype(np.float64) for k in range(3))
-    across = np.cross(b - a, c - a)
-    total = np.zeros((len(points), 3))
-    for k in range(3):
-        np.add.at(total, faces[:, k], across)
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    return np.where(length > 1e-20, total / np.maximum(length, 1e-20), [0.0, 1.0, 0.0]).astype(np.float32)
 
 
 def encoded(picture: np.ndarray, kind: str, **options: Any) -> bytes:

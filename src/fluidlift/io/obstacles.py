@@ -15,7 +15,7 @@ from jaxtyping import Float
 from fluidlift.errors import InputRejected
 from fluidlift.io.entries import Entries
 from fluidlift.io.read_mesh import read_any_mesh
-from fluidlift.numerics.solid_mesh import box_mesh, cylinder_mesh, ellipsoid_mesh, flipped
+from fluidlift.numerics.solid_mesh import box_mesh, closed_mesh, cylinder_mesh, ellipsoid_mesh, flipped
 from fluidlift.physics.rigid_body import MOTIONS, RigidBody, Trajectory, product, rotation_by
 from fluidlift.types import TriangleMesh
 
@@ -154,7 +154,7 @@ def _read(entry: Entries, number: int, meshes: Path) -> Obstacle:
             raise entry.wrong("center", "both center and position", "position")
         entry.data = {("position" if k == "center" else k): v for k, v in entry.data.items()}
     kind = shape_kind(entry, "an obstacle")
-    entry.only((*_COMMON, *SIZES[kind]))
+    entry.only((*_COMMON, *SIZES[kind]), size_hints(kind))
     motion = entry.word("motion", "static", MOTIONS)
     keyframes = _keyframes(entry)
     if keyframes and motion != "animated":
@@ -169,7 +169,7 @@ def _read(entry: Entries, number: int, meshes: Path) -> Obstacle:
     position = entry.vector("position", (0.0, 0.0, 0.0), limit=FAR, unit="m")
     return Obstacle(
         name=entry.text("name") if entry.given("name") else f"{kind}{number + 1}",
-        mesh=_painted(entry, shape_mesh(entry, kind, meshes)),
+        mesh=_painted(entry, solid_of(entry, kind, meshes, "obstacle")),
         position=position,
         rotation=rotation_of(entry.vector("rotation", (0.0, 0.0, 0.0), limit=1e6, unit="degrees")),
         motion=motion,
@@ -226,6 +226,50 @@ def shape_kind(entry: Entries, what: str) -> str:
             "one of them: shape: " + "/".join(SHAPES) + ", or mesh: name of an .obj, .ply or .glb file",
         )  # fmt: skip
     return "mesh" if entry.given("mesh") else entry.word("shape", None, SHAPES)
+
+
+def size_hints(kind: str) -> dict[str, str]:
+    """What to do about the sizes of another shape."""
+    own = " and ".join(SIZES[kind]) if kind != "mesh" else "scale, its size is that of the file"
+    do = f"{'an' if kind[0] in 'aeiou' else 'a'} {kind} has {own}"
+    return {name: do for names in SIZES.values() for name in names if name not in SIZES[kind]}
+
+
+def solid_of(entry: Entries, kind: str, meshes: Path, what: str) -> TriangleMesh:
+    """The mesh of a shape; one from a file must bound a solid, as the simulation wants it."""
+    mesh = shape_mesh(entry, kind, meshes)
+    if kind == "mesh":
+        faults = _faults(_Solid(mesh))
+        if faults is not None:
+            got, needed, do = faults
+            do = "write flip: true, which turns it over" if "inside-out" in got else do
+            raise entry.wrong("mesh", f"the {what}'s {got}", needed, do)
+    return mesh
+
+
+class _Solid:
+    """A mesh that is known by its vertices and faces."""
+
+    def __init__(self, mesh: TriangleMesh) -> None:
+        self.mesh = mesh
+        parts = (np.ascontiguousarray(x).tobytes() for x in (mesh.vertices, mesh.faces))
+        self.key = hashlib.sha256(b"".join(parts)).digest()
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Solid) and self.key == other.key
+
+
+@lru_cache(maxsize=64)
+def _faults(solid: _Solid) -> tuple[str, str, str] | None:
+    """Got, needed and do of a mesh that bounds no solid; judged once while its file stays as it is."""
+    try:
+        closed_mesh(solid.mesh)
+    except InputRejected as error:
+        return error.got, error.needed, error.do
+    return None
 
 
 def shape_mesh(entry: Entries, kind: str, meshes: Path) -> TriangleMesh:

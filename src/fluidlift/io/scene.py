@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import re
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -22,39 +23,40 @@ from fluidlift.physics.inflow_schedule import InflowSchedule
 from fluidlift.physics.terrain_edit import TerrainEdit
 
 SCENE_TEMPLATE = """\
-# What to change when this fluid is simulated again. SI units, z up. Remove a '#' to use a line.
+# What to change when this fluid is simulated again. SI units, z up.
+# Remove a '#', and nothing else, to use a line.
 
-parameters: {}
+parameters:
 #  density: 1000            # kg/m^3
 #  kinematic_viscosity: 1e-6  # m^2/s
 #  surface_tension: 0.072   # N/m; matters to drops and thin jets
 #  gravity: [0, 0, -9.81]   # m/s^2
 #  inflow_velocity: [1, 0, 0]  # m/s
 
-obstacles: []
+obstacles:
 #  - {shape: sphere, position: [0, 0, 0.2], radius: 0.1}                    # m; stands still
 #  - {mesh: rock.obj, position: [0.5, 0, 0], rotation: [0, 0, 90], scale: 0.1}  # a file in this folder; degrees
-#  - {shape: box, position: [0, 0, 1], size: [0.2, 0.2, 0.1], motion: free, density: 400}  # kg/m^3; floats
+#  - {shape: box, position: [0, 0, 0.3], size: [0.2, 0.2, 0.1], motion: free, density: 400}  # kg/m^3; floats
 
-emitters: []
+emitters:
 #  - {shape: cylinder, radius: 0.05, height: 0.02, position: [0, 0, 1], velocity: [0, 0, -1], end: 2.5}  # m, m/s, s
 
-terrain: []
+terrain:
 #  - {move: [0, 0, 0.1]}    # m
 #  - {twist: 20}            # degrees per metre along the stream; also rotate (degrees), scale, mesh (a file)
 
-inflow: {}
+inflow:
 #  factor: 1.5              # times the inflow's velocity
 #  fluctuation: 0.1         # share by which it comes and goes; with period: 1.0, in s
 
-look: {}
+look:
 #  style: surface           # splats, relit, transparent or surface
 #  material: honey          # source, water, muddy_water, honey, lava, milk, oil or chocolate
-#  environment: sky         # sky, studio, white, or an .hdr or .exr file in this folder
+#  environment: studio      # sky, studio, white, or an .hdr or .exr file in this folder
 
-# duration: 4.0   # s
-# extend_downstream: 2.0   # m by which the channel of a stream or a fall goes on
-# loop: true   # the last frame leads into the first
+#duration: 4.0   # s
+#extend_downstream: 2.0   # m by which the channel of a stream or a fall goes on
+#loop: true   # the last frame leads into the first
 """
 
 PARAMETERS = {
@@ -70,7 +72,8 @@ PARAMETERS = {
     "time_step": (1e-9, 1e3, "s"),
 }
 """least, most and unit of what can stand under `parameters`; vectors: of each component"""
-VECTORS = ("gravity", "inflow_velocity")
+VECTORS = {"gravity": "[0, 0, -9.81]", "inflow_velocity": "[1, 0, 0]"}
+"""those with three numbers, with an example"""
 
 _MAX_BYTES = 2**20
 _BROKEN = (yaml.YAMLError, RecursionError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError)
@@ -143,6 +146,18 @@ class SceneEdits:
 
 SECTIONS = ("parameters", "obstacles", "emitters", "terrain", "inflow", "look", "duration", "extend_downstream", "loop")
 
+NAMES = {
+    "parameters": tuple(PARAMETERS), "look": tuple(Look().to_dict()),
+    "inflow": ("factor", "keyframes", "fluctuation", "period"),
+}  # fmt: skip
+"""what can stand in the sections whose entries have names of their own"""
+
+
+def home_of(name: Any) -> str:
+    """Where a name that stands in a wrong place belongs, in words; "" where it is known nowhere."""
+    sections = [section for section, names in NAMES.items() if name in names]
+    return f"write it under {sections[0]}" if sections else "write it at the left margin" * (name in SECTIONS)
+
 
 def read_edits(folder: Path | str, *, meshes: Path | None = None) -> SceneEdits:
     """What an asset's scene.yaml changes, checked.
@@ -165,7 +180,7 @@ def edits_of(text: str, folder: Path | str, *, meshes: Path | None = None) -> Sc
         InputRejected: as `read_edits`.
     """
     scene = Entries(plain_scene(text), "the scene", file="scene.yaml", lines=line_numbers(text))
-    scene.only(SECTIONS)
+    scene.only(SECTIONS, {n: home_of(n) for n in scene.data})
     place = Path(folder) if meshes is None else meshes
     return SceneEdits(
         _parameters(scene.part("parameters", "parameters")),
@@ -182,24 +197,26 @@ def edits_of(text: str, folder: Path | str, *, meshes: Path | None = None) -> Sc
 
 def _parameters(changes: Entries) -> dict[str, Any]:
     """Those that are given: numbers, and tuples of three."""
-    changes.only(PARAMETERS)
+    changes.only(PARAMETERS, {n: home_of(n) for n in changes.data})
     found: dict[str, Any] = {}
     for name in changes.data:
         low, high, unit = PARAMETERS[name]
         if name in VECTORS:
-            found[name] = changes.vector(name, None, limit=high, unit=unit)
+            found[name] = changes.vector(name, None, limit=high, unit=unit, example=VECTORS[name])
         else:
             found[name] = changes.number(name, None, low=low, high=high, unit=unit)
     return found
 
 
 def read_scene(folder: Path | str) -> dict[str, Any]:
-    """The content of an asset's scene.yaml; "" where there is no such file.
+    """The content of an asset's scene.yaml, nothing where there is no such file; a section without entries is empty.
 
     Raises:
         InputRejected: a link, a file of more than a megabyte, or broken YAML.
     """
-    return plain_scene(scene_text(folder))
+    scene = plain_scene(scene_text(folder))
+    empty = {name: {} for name in NAMES} | {name: [] for name in ("obstacles", "emitters", "terrain")}
+    return {name: empty.get(name) if value is None else value for name, value in scene.items()}
 
 
 def scene_text(folder: Path | str) -> str:
@@ -226,6 +243,26 @@ def _parsed(text: str) -> Any:
     return parse_yaml(text)
 
 
+def _mending(error: BaseException, text: str) -> str:
+    """What to do about a text that is no YAML."""
+    why, mark = str(getattr(error, "problem", "") or ""), getattr(error, "problem_mark", None)
+    lines = text.splitlines()
+    line = lines[mark.line] if mark is not None and mark.line < len(lines) else ""
+    if "'\\t'" in why or "\t" in line[: len(line) - len(line.lstrip())]:
+        return "indent with spaces: YAML takes no tabs"
+    opened = getattr(error, "context_mark", None)
+    if opened is not None and "flow" in str(getattr(error, "context", "")):
+        pair = "[]" if "sequence" in error.context else "{}"
+        return f"close the '{pair[0]}' of line {opened.line + 1} with a '{pair[1]}'"
+    above = [x for x in lines[: mark.line if mark is not None else 0] if x.strip() and not x.lstrip().startswith("#")]
+    empty = re.match(r"(\w+): *(\{\}|\[\])", above[-1]) if above else None
+    if empty is not None and line[:1] in " -":
+        return f"write '{empty[1]}:' without the {empty[2]}: entries follow it"
+    if mark is None or "twice" in why:
+        return ""
+    return "check this line and the one above it: the entries of a section begin in the same column"
+
+
 def plain_scene(text: str) -> dict[str, Any]:
     """The sections of a scene.yaml's text, not checked.
 
@@ -238,9 +275,14 @@ def plain_scene(text: str) -> dict[str, Any]:
         mark = getattr(error, "problem_mark", None)
         place = "scene.yaml" if mark is None else f"scene.yaml, line {mark.line + 1}"
         why = getattr(error, "problem", None) or error
-        raise InputRejected(f"{place}: not valid YAML ({' '.join(str(why).split())[:200]})", "YAML") from None
+        got = f"{place}: not valid YAML ({' '.join(str(why).split())[:200]})"
+        raise InputRejected(got, "YAML", _mending(error, text)) from None
     if data is None:
         return {}
     if not isinstance(data, dict):
-        raise InputRejected("scene.yaml holds no sections", "parameters, obstacles, emitters, ...")
+        kind = "a list" if isinstance(data, list) else f"{str(data)[:40]!r}"
+        raise InputRejected(
+            f"scene.yaml is {kind}, where sections with names should stand", "one of " + ", ".join(SECTIONS),
+            "write each name with a colon at the left margin, and its entries below it",
+        )  # fmt: skip
     return data

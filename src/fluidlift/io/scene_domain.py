@@ -16,13 +16,14 @@ MOSTLY = 0.5
 """share of a mesh's extent outside the domain above which one is warned"""
 
 
-def require_inside(edits: SceneEdits, grid: Grid, *, reach: float = 0.0) -> list[str]:
+def require_inside(edits: SceneEdits, grid: Grid, *, reach: float = 0.0, above: float = 0.0) -> list[str]:
     """See that obstacles, emitters and a new terrain touch the simulation's box.
 
     Args:
         edits: of scene.yaml.
         grid: that is simulated on.
         reach: m by which the box may become longer than that to each side (a channel that is extended).
+        above: m by which it may become higher for emitters.
 
     Returns:
         Warnings about those that lie mostly outside.
@@ -37,7 +38,10 @@ def require_inside(edits: SceneEdits, grid: Grid, *, reach: float = 0.0) -> list
         what = f"{obstacle.line}: obstacle '{obstacle.name}'"
         warnings += _judged(what, _all_places(obstacle), (low, high), still=obstacle.motion == "static")
     for emitter in edits.emitters:
-        warnings += _judged(f"{emitter.line}: emitter '{emitter.name}'", [_points(emitter.mesh)], (low, high))
+        points = _points(emitter.mesh)
+        most = high + [0.0, 0.0, above]  # the box is made higher for a whole emitter only
+        box = (low, most if points[:, 2].max() < most[2] else high)
+        warnings += _judged(f"{emitter.line}: emitter '{emitter.name}'", [points], box, room=most)
     for edit in edits.terrain:
         if isinstance(edit, Replace):  # a bed may go on far beyond the box
             _judged(f"{edit.line}: the terrain's mesh", [_points(edit.mesh)], (low, high), still=False)
@@ -56,8 +60,9 @@ def _all_places(obstacle: Obstacle) -> list[np.ndarray]:
 
 
 def _judged(
-    what: str, places: list[np.ndarray], box: tuple[np.ndarray, np.ndarray], *, still: bool = True
-) -> list[str]:
+    what: str, places: list[np.ndarray], box: tuple[np.ndarray, np.ndarray], *, still: bool = True,
+    room: np.ndarray | None = None,
+) -> list[str]:  # fmt: skip
     low, high = box
     size = float(max(np.ptp(p, axis=0).max() for p in places))
     side = float((high - low).max())
@@ -74,8 +79,9 @@ def _judged(
         start = places[0]
         raise InputRejected(
             f"{what} from {_place(start.min(axis=0))} to {_place(start.max(axis=0))} m lies outside the domain",
-            f"a place within {_place(low)} to {_place(high)} m", "change its position or scale",
-        )  # fmt: skip
+            f"a place within {_place(low)} to {_place(high if room is None else room)} m",
+            "change its position or scale",
+        )
     outside = min(1.0 - _share_inside(p, low, high) for p in touching)
     if still and outside > MOSTLY:
         return [f"{what} lies outside the domain with {100 * outside:.0f} % of its extent: only the rest acts"]

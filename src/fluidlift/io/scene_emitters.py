@@ -8,8 +8,8 @@ import numpy as np
 
 from fluidlift.errors import InputRejected
 from fluidlift.io.entries import Entries
-from fluidlift.io.obstacles import FAR, SIZES, rotation_of, shape_kind, shape_mesh
-from fluidlift.numerics.solid_mesh import closed_mesh
+from fluidlift.io.obstacles import FAR, SIZES, rotation_of, shape_kind, size_hints, solid_of
+from fluidlift.numerics.solid_mesh import welded
 from fluidlift.physics.emitter import Emitter
 from fluidlift.physics.inflow_schedule import InflowSchedule
 from fluidlift.types import TriangleMesh, matrix_from_quat
@@ -42,7 +42,7 @@ def read_emitters(scene: Entries, meshes: Path) -> tuple[Emitter, ...]:
 
 def _read(entry: Entries, number: int, meshes: Path) -> Emitter:
     kind = shape_kind(entry, "an emitter")
-    entry.only((*_COMMON, *SIZES[kind]))
+    entry.only((*_COMMON, *SIZES[kind]), size_hints(kind))
     start = entry.number("start", 0.0, low=0.0, high=_LATEST, unit="s")
     end = entry.number("end", None, low=0.0, high=_LATEST, unit="s") if entry.given("end") else None
     if end is not None and end <= start:
@@ -63,13 +63,9 @@ def _read(entry: Entries, number: int, meshes: Path) -> Emitter:
 
 def _placed(entry: Entries, kind: str, meshes: Path) -> TriangleMesh:
     """The closed mesh of a shape in the world, m."""
-    mesh = shape_mesh(entry, kind, meshes)
+    mesh = solid_of(entry, kind, meshes, "emitter")
     if kind == "mesh":
-        try:
-            mesh = closed_mesh(mesh, name="the emitter's mesh")
-        except InputRejected as error:
-            do = "write flip: true" if "inside-out" in error.got else error.do
-            raise entry.wrong("mesh", error.got, error.needed, do) from None
+        mesh = welded(mesh)
     turn = matrix_from_quat(rotation_of(entry.vector("rotation", (0.0, 0.0, 0.0), limit=1e6, unit="degrees")))
     at = np.array(entry.vector("position", (0.0, 0.0, 0.0), limit=FAR, unit="m"))
     return TriangleMesh(np.asarray(mesh.vertices, np.float64) @ turn.T + at, mesh.faces)

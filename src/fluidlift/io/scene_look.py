@@ -70,7 +70,8 @@ class Look:
         idle = [k for k in ("material", "environment", "tint", "exposure") if getattr(self, k) != getattr(plain, k)]
         if self.style != "splats" or not idle:
             return None
-        return f"look.{' and look.'.join(idle)} change nothing while look.style is splats: set relit or surface"
+        what = f"look.{' and look.'.join(idle)} change{'s' * (len(idle) == 1)} nothing while look.style is splats"
+        return f"{what}: set it to relit, transparent or surface"
 
 
 def read_look(scene: Entries, folder: Path) -> Look:

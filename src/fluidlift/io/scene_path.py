@@ -6,17 +6,12 @@ from typing import Any
 
 from fluidlift.errors import InputRejected
 from fluidlift.io.entries import nearest
-from fluidlift.io.scene import PARAMETERS, SECTIONS
-from fluidlift.io.scene_look import Look
+from fluidlift.io.scene import NAMES, SECTIONS
 from fluidlift.io.scene_terrain import TERRAIN_EDITS
 from fluidlift.io.scene_text import Path
 
 LISTS = ("obstacles", "emitters", "terrain")
 PLAIN = ("duration", "extend_downstream", "loop")
-_NAMES = {
-    "parameters": tuple(PARAMETERS), "look": tuple(Look().to_dict()),
-    "inflow": ("factor", "keyframes", "fluctuation", "period"),
-}  # fmt: skip
 
 
 def place_of(scene: dict[str, Any], dotted: str, *, new: bool = True) -> Path:
@@ -35,7 +30,7 @@ def place_of(scene: dict[str, Any], dotted: str, *, new: bool = True) -> Path:
     """
     section, _, rest = dotted.strip().partition(".")
     if section not in SECTIONS:
-        known = [f"{s}.{n}" for s, names in _NAMES.items() for n in names if n == section]
+        known = [f"{s}.{n}" for s, names in NAMES.items() for n in names if n == section]
         do = f"write '{known[0]}'" if known else nearest(section, SECTIONS)
         raise InputRejected(
             f"there is no section '{section}'", "one of " + ", ".join(SECTIONS), do.replace("remove it", "")
@@ -45,8 +40,8 @@ def place_of(scene: dict[str, Any], dotted: str, *, new: bool = True) -> Path:
         return (section,)
     if section in PLAIN:
         raise InputRejected(f"'{dotted}', but {section} has no entries of its own", f"{section}=value")
-    if section in _NAMES:
-        known = _NAMES[section]
+    if section in NAMES:
+        known = NAMES[section]
         first = rest.partition(".")[0]
         if first not in known:
             do = nearest(first, known)

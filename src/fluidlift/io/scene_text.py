@@ -44,7 +44,10 @@ def without(text: str, path: Path) -> str:
     """
 
     def change(data: dict[str, Any]) -> None:
-        del _parent(data, path)[path[-1]]
+        place = _parent(data, path)
+        del place[path[-1]]
+        if len(path) == 2 and not place:  # the name alone: lines below it can be used again
+            data[str(path[0])] = None
 
     return _changed(text, path, change, lambda root: _remove(text, root, path))
 
@@ -151,7 +154,8 @@ def _remove(text: str, root: yaml.Node | None, path: Path) -> str:
     if parent is None or node is None:
         raise _NotHere
     if len(parent.value) == 1 and len(path) > 1:
-        return _replaced(text, root, path[:-1], {} if isinstance(parent, yaml.MappingNode) else [])
+        empty = None if len(path) == 2 else {} if isinstance(parent, yaml.MappingNode) else []
+        return _replaced(text, root, path[:-1], empty)
     spans = [(k.start_mark.index, _end(text, v)) for k, v in _pairs(parent)]
     number = next(i for i, (_, v) in enumerate(_pairs(parent)) if v is node)
     start, end = spans[number]
@@ -178,6 +182,8 @@ def _replaced(text: str, root: yaml.Node | None, path: Path, value: Any) -> str:
     between = text[key.end_mark.index : start]
     colon = key.end_mark.index + between.find(":") + 1
     new = _pretty(value, parent.start_mark.column + _INDENT, _newline(text))
+    if value is None and len(path) == 1 and ":" in between:
+        return text[:start].rstrip() + text[end:]
     if "#" in between or ":" not in between:
         return text[:start] + one_line(value) + text[end:]
     if new.startswith(("\n", "\r")):  # what stands behind the old value on its line goes with the name: a comment

@@ -10,6 +10,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdVol, Vt
 from fluidlift.errors import require
 from fluidlift.io.color import linear_from_srgb
 from fluidlift.io.frames import FluidFrame
+from fluidlift.numerics.mesh_normals import vertex_normals
 from fluidlift.types import Gaussians, Similarity3, TriangleMesh, matrix_from_quat
 
 SIGMAS = 3.0
@@ -135,17 +136,6 @@ def write_mesh(mesh: UsdGeom.Mesh, value: TriangleMesh, velocities: np.ndarray |
         mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).Set(vec3(linear_colors(value.colors)), time)
     if velocities is not None:
         mesh.CreateVelocitiesAttr().Set(vec3(velocities), time)
-
-
-def vertex_normals(mesh: TriangleMesh) -> np.ndarray:
-    """[v,3] outward unit normals, those of the faces around weighed by area; z where there is no face."""
-    points, faces = mesh.vertices.astype(np.float64), mesh.faces
-    a, b, c = (points[faces[:, k]] for k in range(3))
-    across = np.cross(b - a, c - a)
-    n = len(points)
-    sums = sum(np.stack([np.bincount(faces[:, k], across[:, axis], n) for axis in range(3)], axis=-1) for k in range(3))
-    length = np.linalg.norm(sums, axis=1, keepdims=True)
-    return np.where(length > 0, sums / np.maximum(length, 1e-300), (0.0, 0.0, 1.0)).astype(np.float32)
 
 
 def linear_colors(rgb: np.ndarray) -> np.ndarray:

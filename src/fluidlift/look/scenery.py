@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
+from fluidlift.numerics.mesh_normals import vertex_normals
 from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.numerics.textures import sample_texture
 from fluidlift.types import (
@@ -32,16 +33,6 @@ LIGHT = np.array([0.35, -0.45, 0.82])
 
 TEXTURED = 60_000
 """surfels of a textured ground, at most: what a preview's panel shows; large stills take more"""
-
-
-def vertex_normals(mesh: TriangleMesh) -> Float[np.ndarray, "v 3"]:
-    """Area-weighted unit normals."""
-    a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
-    face = np.cross(b - a, c - a)
-    normals = np.zeros((len(mesh.vertices), 3))
-    for k in range(3):
-        np.add.at(normals, mesh.faces[:, k], face)
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
 
 
 def terrain_surfels(terrain: Terrain, *, opacity: float = 0.98, most: int = TEXTURED) -> Gaussians:

@@ -265,7 +265,3 @@ class Emission:
         """Set the mask of its faces, in place."""
         for mask, faces in zip(masks, self._faces):
             mask[tuple((faces - first).T)] = True
-
-    def places_at_start(self) -> int:
-        """Particles that fill it, as far as it lies in the box and in the open."""
-        return len(self._clear(self._standing(0.0)))

@@ -228,7 +228,7 @@ def append(folder: Path, edit: Edit, *, base: str) -> None:
             size = _whole_length(file)
             file.truncate(size)  # what a killed process had begun to write
             if size == 0:
-                first = {"time": edit.time, "what": "scene.yaml as lifted", "text": base}
+                first = {"time": edit.time, "what": "scene.yaml as found", "text": base}
                 lines = _line(first) + lines
             file.write(lines)
             file.flush()

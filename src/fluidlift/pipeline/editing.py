@@ -6,24 +6,23 @@ leads back to it. Each edit is checked before it is written; a wrong one changes
 
 from __future__ import annotations
 
-import hashlib
 import re
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.io.asset_folder import asset_file, read_manifest, read_scene
 from fluidlift.io.asset_lock import editing
-from fluidlift.io.scene import SCENE_TEMPLATE, SceneEdits, edits_of, plain_scene, read_edits, scene_text
+from fluidlift.io.scene import SCENE_TEMPLATE, SECTIONS, SceneEdits, edits_of, plain_scene, read_edits, scene_text
 from fluidlift.io.scene_domain import require_inside
 from fluidlift.io.scene_look import Look
-from fluidlift.io.scene_path import names_of
+from fluidlift.io.scene_path import PLAIN, names_of
+from fluidlift.io.scene_text import with_value, without
 from fluidlift.pipeline import edit_history
 from fluidlift.pipeline.edit_history import BY_HAND, Edit, History, text_hash, unified
+from fluidlift.pipeline.reshaping import HIGHEST
 from fluidlift.pipeline.scene import LYING
 from fluidlift.pipeline.scene_changes import Add, Change, Remove, Set
 from fluidlift.pipeline.substances import SUBSTANCES
@@ -46,7 +45,6 @@ class EditSession:
 
     def __init__(self, folder: Path | str, *, meshes: Path | None = None) -> None:
         self.folder, self.meshes = Path(folder), meshes
-        self._closed: set[bytes] = set()
         read_manifest(self.folder)
         asset_file(self.folder, edit_history.HISTORY)  # a link on the way is refused
 
@@ -135,7 +133,9 @@ class EditSession:
 
         def back(text: str, history: History) -> tuple[str, str, dict[str, int]]:
             if not history.undoable:
-                raise InputRejected("there is no edit to undo", "an edit")
+                changed = not _empty(text)
+                do = "use reset (--reset) to take away what was there before the first edit" if changed else ""
+                raise InputRejected("there is no edit to undo", "", do)
             edit = history[history.undoable[-1]]
             return edit.taken_from(text), f"undo: {edit.what}", {"undoes": edit.number}
 
@@ -157,17 +157,17 @@ class EditSession:
         return self._changed(again)
 
     def reset(self) -> Edit | None:
-        """Back to the fluid as lifted: scene.yaml as `make` wrote it. It can be undone."""
+        """Back to the fluid as lifted: scene.yaml without what changes it. It can be undone."""
 
         def original(text: str, history: History) -> tuple[str, str, dict[str, int]]:
-            return history.base if _empty(history.base) else SCENE_TEMPLATE, "reset", {}
+            return _as_lifted(history.base), "reset", {}
 
         return self._change(original)
 
     def diff(self) -> str:
         """What differs from scene.yaml as lifted, in the manner of diff -u; empty where nothing does."""
         text, history = self._seen()
-        return unified(history.base, text)
+        return unified(_as_lifted(history.base), text)
 
     def history(self) -> tuple[Edit, ...]:
         """All edits, the oldest first; each says whether it is undone."""
@@ -193,6 +193,7 @@ class EditSession:
         """What is odd about the scene as it is: things mostly outside the domain, a look that is not drawn."""
         edits = self.edits
         idle = edits.look.warning()
+        self._require_kind(edits)
         return self._inside(edits) + ([] if idle is None else [idle])
 
     # --- inside -----------------------------------------------------------------------------------------------------
@@ -253,7 +254,7 @@ class EditSession:
         """scene.yaml and its history, with what was changed by hand since as a last edit; nothing is written."""
         text, history = scene_text(self.folder), edit_history.read_history(self.folder)
         if history is None:
-            history = History(text if _empty(text) else SCENE_TEMPLATE)
+            history = History(text)  # as it was found, whatever a person or an earlier version wrote
         if text_hash(text) != history.now:
             edit = Edit.of(len(history.edits) + 1, BY_HAND, history.text(), text)
             history = history.with_edit(edit)
@@ -280,12 +281,6 @@ class EditSession:
 
     def _require_fit(self, text: str) -> None:
         edits = edits_of(text, self.folder, meshes=self.meshes)
-        for obstacle in edits.obstacles:
-            parts = (np.asarray(x) for x in (obstacle.mesh.vertices, obstacle.mesh.faces))
-            key = hashlib.sha256(b"".join(x.tobytes() for x in parts)).digest()
-            if key not in self._closed:
-                obstacle.body(1.0)
-                self._closed.add(key)
         self._require_kind(edits)
         self._inside(edits)
 
@@ -303,7 +298,20 @@ class EditSession:
             return []
         data = read_manifest(self.folder)["grid"]
         grid = Grid(tuple(data["shape"]), data["spacing"], tuple(data["origin"]))
-        return require_inside(edits, grid, reach=edits.extend_downstream)
+        above = HIGHEST * float((grid.high - grid.low).max())
+        return require_inside(edits, grid, reach=edits.extend_downstream, above=above)
+
+
+def _as_lifted(text: str) -> str:
+    """A scene.yaml without what changes the fluid; its comments stay."""
+    found = text
+    try:
+        for name in {} if _empty(text) else plain_scene(text):
+            here = name in SECTIONS and name not in PLAIN
+            found = with_value(found, (name,), None) if here else without(found, (name,))
+    except InputRejected:
+        return SCENE_TEMPLATE
+    return found if _empty(found) else SCENE_TEMPLATE
 
 
 def _empty(text: str) -> bool:

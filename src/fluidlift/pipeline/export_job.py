@@ -96,6 +96,8 @@ def checked(request: ExportRequest, out: Path) -> None:
         raise InputRejected(f"{request.meters_per_unit:g} m per unit", "1e-6 to 1e6, such as 0.01 for centimetres")
     if request.fps is not None and to in OF_CLIP:
         raise InputRejected(f"{to} at another frame rate", "the clip's own", "leave out --fps")
+    if to != "html" and out.suffix.lower() == ".html" and not out.is_dir():
+        raise InputRejected(f"{to} as '{out.name}'", "a folder", "add --to html")
     if to == "html" and out.suffix.lower() == ".html":
         if out.is_dir():
             raise InputRejected(f"'{out.name}', which is a folder", "a file name or another folder")

@@ -58,25 +58,25 @@ def export_asset(folder: Path, out: Path, request: ExportRequest, *, progress: P
         MissingPackage: a mesh without pysplashsurf.
     """
     from fluidlift.io.asset_folder import load_asset, read_manifest
-    from fluidlift.io.atomic import disk_errors
+    from fluidlift.io.atomic import disk_errors, require_writable
 
     progress, began = progress or Silence(), time.perf_counter()
     checked(request, out)
     manifest, asset = read_manifest(folder), load_asset(folder)
+    page = out.suffix.lower() == ".html" and request.to == "html"
     progress.stage("export", 1, 1)
     if request.to in OF_CLIP:
         from fluidlift.pipeline.export_clip import write_clip_files
 
         interval = asset.interval
+        require_writable(out)
         with disk_errors(out):
             outcome = write_clip_files(folder, out, asset, request, manifest, progress)
     else:
         job = _job(folder, out, asset, request, manifest, progress)
         interval = job.interval
+        require_writable(out.parent if page else out)
         with disk_errors(out):
-            (out.parent if out.suffix.lower() == ".html" and request.to == "html" else out).mkdir(
-                parents=True, exist_ok=True
-            )
             outcome = _written(job)
         outcome = replace(outcome, warnings=(*_missing(job, manifest), *outcome.warnings))
         outcome = replace(outcome, facts={"frames": len(job.picked), "first": FIRST_FRAME + job.picked.start}
@@ -196,8 +196,8 @@ def _files(out: Path, frames: Iterator[FluidFrame], asset: FluidAsset, request: 
 def _bodies(job: ExportJob) -> tuple[str, ...]:
     """Obstacles beside the meshes of the fluid, in the same axes and units; warnings.
 
-    bodies/NAME.ply has one around its own origin, bodies.json where it is in every frame: "poses" [frames][7], place of
-    the origin and unit quaternion w x y z, from the frame "first" on.
+    bodies/NUMBER_NAME.ply has one around its own origin, bodies.json where it is in every frame: "poses" [frames][7],
+    place of the origin and unit quaternion w x y z, from the frame "first" on.
     """
     from fluidlift.io.atomic import atomic_write
     from fluidlift.io.export_mesh import write_mesh
@@ -211,11 +211,9 @@ def _bodies(job: ExportJob) -> tuple[str, ...]:
     bodies, warnings = bodies_of(job.folder, job.picked)
     place = Similarity3(1.0 / request.meters_per_unit, ROTATIONS[f"{request.up_axis}_up"], np.zeros(3))
     entries: list[dict[str, Any]] = []
-    for body in bodies:
-        stem = "".join(c if c.isalnum() or c in "-_" else "_" for c in body.name)
-        path = f"bodies/{stem}.ply"
-        if any(e["mesh"].lower() == path.lower() for e in entries):  # names that differ only in what no file may have
-            path = f"bodies/{stem}_{len(entries) + 1}.ply"
+    for k, body in enumerate(bodies, 1):
+        stem = "".join(c if (c.isascii() and c.isalnum()) or c in "-_" else "_" for c in body.name)
+        path = f"bodies/{k:02d}_{stem[:60]}.ply"
         (job.out / "bodies").mkdir(exist_ok=True)
         write_mesh(job.out / path, TriangleMesh(place.points(body.mesh.vertices), body.mesh.faces, body.mesh.colors))
         # turned on both sides, R q R^-1 keeps the angle and turns the axis

@@ -7,6 +7,7 @@ with them. It is a sketch: thin films and small drops are below its cells, and w
 from __future__ import annotations
 
 import contextlib
+import logging
 import tempfile
 import threading
 import time
@@ -20,6 +21,7 @@ import yaml
 
 from fluidlift.config import JobConfig
 from fluidlift.errors import FluidliftError, InputRejected
+from fluidlift.pipeline.coarse_copy import PreviewSize, bears_coarser, coarse_asset, coarser, thinned
 from fluidlift.pipeline.scene import Scene, SimulationRequest, scene_of
 from fluidlift.pipeline.simulating import MAX_STRETCH, MIXED, preflight, simulator_of
 from fluidlift.types import FluidAsset, Gaussians, TriangleMesh
@@ -27,32 +29,18 @@ from fluidlift.types import FluidAsset, Gaussians, TriangleMesh
 if TYPE_CHECKING:
     from fluidlift.io.obstacles import Obstacle
 
-PER_CELL = 8
-"""Gaussians of a coarse cell that are kept: what the inlet fills its cells with"""
+__all__ = [
+    "LivePreview", "PreviewFrame", "PreviewSize", "Take", "Wish", "coarse_asset", "obstacles_of", "preview_frames",
+    "preview_scene", "thinned",
+]  # fmt: skip
+
+LOG = logging.getLogger(__name__)
 MOST_SUBSTEPS = 60
 """of one frame: more than that is a blow-up, or too slow to be called live"""
 SUBSTEPS_AT_ONCE = 3
 """between two looks at whether somebody wants something else"""
-SECONDS_PER_FRAME = 0.2
-"""that the copy is to take at most: five frames per second"""
 TIMED = 3
 """frames, at the start, by whose time the copy's size is chosen"""
-FEWEST_PARTICLES = 1000
-"""of a copy that is made coarser because this machine is slow: fewer show no flow"""
-FEWEST_LAYERS = 6
-"""cells of the thinnest side of such a copy: with fewer a stream is one cell deep"""
-
-
-@dataclass(frozen=True)
-class PreviewSize:
-    """How coarse the copy is."""
-
-    particles: int = 20_000
-    """at most, at the first instant"""
-    cells: int = 40_000
-    """at most, of the grid"""
-    frames: int = 120
-    """at most; the state of a longer simulation is not shown live"""
 
 
 class PreviewFrame(NamedTuple):
@@ -66,55 +54,6 @@ class PreviewFrame(NamedTuple):
     """[n,3], m/s"""
     poses: np.ndarray
     """[b,7] of the obstacles: position (m) and orientation (w, x, y, z)"""
-
-
-def coarse_asset(asset: FluidAsset, size: PreviewSize | None = None) -> FluidAsset:
-    """The asset on cells so wide, and with so few Gaussians, that it can be simulated live.
-
-    Cells double until both limits hold. Where they do, of the Gaussians in each cell at most `PER_CELL` stay, and grow
-    so that together they fill the space of all.
-    """
-    size = size or PreviewSize()
-    while len(asset.rest) > size.particles or asset.grid.cells > size.cells:
-        if min(asset.grid.shape) < 4:
-            break
-        asset = coarser(asset)
-    return asset
-
-
-def coarser(asset: FluidAsset) -> FluidAsset:
-    """The asset on cells twice as wide."""
-    from fluidlift.fit.coarsen import coarsen_cells, coarsen_terrain, coarsen_velocity
-
-    terrain = coarsen_terrain(asset.terrain)
-    return replace(
-        asset, terrain=terrain, grid=terrain.grid, cell_types=coarsen_cells(asset.cell_types),
-        velocity=coarsen_velocity(asset.velocity), rest=thinned(asset.rest, terrain.grid, PER_CELL),
-    )  # fmt: skip
-
-
-def bears_coarser(asset: FluidAsset) -> bool:
-    """Whether a copy on cells twice as wide would still show a flow."""
-    return len(asset.rest) >= 8 * FEWEST_PARTICLES and min(asset.grid.shape) >= 2 * FEWEST_LAYERS
-
-
-def thinned(rest: Gaussians, grid: Any, per_cell: int) -> Gaussians:
-    """At most `per_cell` Gaussians of each cell of the grid, drawn evenly and with a fixed seed; what stays grows by
-    the cube root of how many it stands for."""
-    if not len(rest):
-        return rest
-    cells = np.clip(grid.cell_of(rest.means), 0, np.asarray(grid.shape) - 1)
-    key = np.ravel_multi_index(tuple(cells.T), grid.shape)
-    order = np.random.default_rng(0).permutation(len(key))
-    order = order[np.argsort(key[order], kind="stable")]
-    _, first, count = np.unique(key[order], return_index=True, return_counts=True)
-    rank = np.arange(len(key)) - np.repeat(first, count)
-    kept = order[rank < per_cell]
-    stands_for = (
-        np.repeat(count, count)[rank < per_cell] / np.minimum(np.repeat(count, count), per_cell)[rank < per_cell]
-    )
-    grown = rest.select(kept)
-    return replace(grown, scales=grown.scales * np.cbrt(stands_for)[:, None].astype(np.float32))
 
 
 @contextlib.contextmanager
@@ -328,7 +267,7 @@ class LivePreview:
     def _work(self) -> None:
         coarse = coarse_asset(self._asset, self._size)
         self._warm(coarse)
-        while self._slow(coarse) and bears_coarser(coarse):
+        while bears_coarser(coarse) and self._slow(coarse):
             coarse = coarser(coarse)
         self.particles = len(coarse.rest)
         while True:
@@ -348,18 +287,23 @@ class LivePreview:
         try:
             for _ in preview_frames(preview_scene(coarse, self._folder, {}, 2), lambda: self._closed):
                 pass
-        except FluidliftError as error:
+        except Exception as error:
+            if not isinstance(error, FluidliftError):
+                LOG.exception("live preview")
             self.problem = f"this asset cannot be simulated live: {error}"
 
     def _slow(self, coarse: FluidAsset) -> bool:
         """Whether this machine, as busy as it is now, takes longer for a frame than a live preview may."""
-        if self.problem or self._closed:
+        if self._size.seconds is None or self.problem or self._closed:
             return False
         ends = []
-        for frame in preview_frames(preview_scene(coarse, self._folder, {}, 1 + TIMED), lambda: self._closed):
-            self._keep(frame)
-            ends.append(time.perf_counter())
-        return len(ends) > 1 and float(np.median(np.diff(ends))) > SECONDS_PER_FRAME
+        try:
+            for frame in preview_frames(preview_scene(coarse, self._folder, {}, 1 + TIMED), lambda: self._closed):
+                self._keep(frame)
+                ends.append(time.perf_counter())
+        except Exception:  # a wish meets it as well, and tells it
+            LOG.exception("time of a live frame")
+        return len(ends) > 1 and float(np.median(np.diff(ends))) > self._size.seconds
 
     def _serve(self, coarse: FluidAsset, wish: Wish, number: int) -> None:
         """Work on a wish until it is done, or another one is there."""
@@ -384,6 +328,9 @@ class LivePreview:
         except (FluidliftError, ValueError, FloatingPointError, np.linalg.LinAlgError) as error:
             if not other():
                 self._failed(take, error)
+        except Exception as error:  # the worker lives on for the next wish
+            LOG.exception("live preview")
+            self._failed(take, error)
         with self._news:
             if self._asked == number:
                 self._done = number

@@ -12,7 +12,7 @@ from typing import Any
 from fluidlift import __version__
 from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected
-from fluidlift.pipeline import moving
+from fluidlift.pipeline import moving, reporting
 from fluidlift.pipeline.fit_outcome import SUBJECT, in_words
 from fluidlift.pipeline.fit_request import request_of
 from fluidlift.pipeline.make import fit_figures

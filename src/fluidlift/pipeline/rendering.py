@@ -75,7 +75,7 @@ def render_asset(
         InputRejected: no asset, no frames, or a request that does not fit it.
     """
     from fluidlift.io.asset_folder import load_asset, read_manifest
-    from fluidlift.io.atomic import disk_errors
+    from fluidlift.io.atomic import disk_errors, require_writable
 
     request, progress, began = request or RenderRequest(), progress or Silence(), time.perf_counter()
     _check(request, out)
@@ -96,6 +96,7 @@ def render_asset(
         scene, footage, request.background, request.view == "input", _cameras(scene, request, len(numbers)), numbers,
         poses, painter,
     )  # fmt: skip
+    require_writable(out.parent if out.suffix.lower() in FILMS else out)
     progress.stage("render", 1, 1)
     with disk_errors(out):
         _write(stage, folder, out, request.format, 1.0 / interval, lambda done: progress.update(done, len(numbers)))
@@ -202,17 +203,22 @@ def frame_numbers(folder: Path, count: int, wanted: tuple[int, int] | None) -> r
     Raises:
         InputRejected: none are there, or not those.
     """
-    there = next((k for k in range(count) if not frame_file(folder, FIRST_FRAME + k).is_file()), count)
-    if there == 0:
+    gaps = [k for k in range(count) if not frame_file(folder, FIRST_FRAME + k).is_file()]
+    if len(gaps) == count:
         raise InputRejected(f"'{folder.name}' has no simulated frames", "frames/splats/1001.ply and so on",
                             f"fluidlift sim {folder}")  # fmt: skip
-    if wanted is None:
-        return range(there)
-    first, last = wanted
-    if not FIRST_FRAME <= first <= last < FIRST_FRAME + there:
-        raise InputRejected(f"frames {first} to {last}", f"numbers from {FIRST_FRAME} to {FIRST_FRAME + there - 1}",
+    if wanted is None and gaps[:1] != [0]:
+        return range(gaps[0] if gaps else count)
+    first, last = wanted or (FIRST_FRAME, FIRST_FRAME + count - 1)
+    if not FIRST_FRAME <= first <= last < FIRST_FRAME + count:
+        raise InputRejected(f"frames {first} to {last}", f"numbers from {FIRST_FRAME} to {FIRST_FRAME + count - 1}",
                             "the first frame of an asset is 1001" if first < FIRST_FRAME else "")  # fmt: skip
-    return range(first - FIRST_FRAME, last - FIRST_FRAME + 1)
+    numbers = range(first - FIRST_FRAME, last - FIRST_FRAME + 1)
+    gone = next((FIRST_FRAME + k for k in gaps if k in numbers), None)
+    if gone is not None:
+        raise InputRejected(f"frame {gone} is missing: frames/splats/{gone}.ply", "every frame of the range",
+                            f"fluidlift sim {folder} --restart, or --frames with a range without it")  # fmt: skip
+    return numbers
 
 
 def _poses(folder: Path, scene: Scene, frames: int) -> tuple[np.ndarray | None, list[str]]:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from fluidlift.errors import InputRejected
+from fluidlift.io.entries import nearest
 from fluidlift.io.scene import plain_scene
 from fluidlift.io.scene_path import LISTS, free_name, place_of
 from fluidlift.io.scene_text import one_line, with_item, with_value, without
@@ -50,7 +51,9 @@ class Add:
     def done(self, text: str) -> str:
         """The text of scene.yaml with it."""
         if self.section not in LISTS:
-            raise InputRejected(f"nothing can be added to '{self.section}'", "one of " + ", ".join(LISTS), "set it")
+            near = nearest(self.section, LISTS)
+            do = near if near != "remove it" else "set it"
+            raise InputRejected(f"nothing can be added to '{self.section}'", "one of " + ", ".join(LISTS), do)
         entry = plain_value(self.entry, self.section)
         if not isinstance(entry, dict):
             raise InputRejected(f"{self.section} of {entry!r}", "name: value entries", "such as {shape: sphere, ...}")

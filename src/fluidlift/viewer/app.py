@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import threading
 import time
 import webbrowser
@@ -11,10 +12,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from fluidlift.errors import FluidliftError, InputRejected
-from fluidlift.pipeline.preview import LivePreview, PreviewFrame, Take, Wish, obstacles_of
+from fluidlift.pipeline.preview import LivePreview, PreviewFrame, PreviewSize, Take, Wish, obstacles_of
 from fluidlift.viewer.coloring import colored
 from fluidlift.viewer.controls import controls_of
 from fluidlift.viewer.draft import Draft, Session
@@ -24,9 +23,10 @@ from fluidlift.viewer.jobs import Jobs
 from fluidlift.viewer.panels import Panels
 from fluidlift.viewer.ports import FIRST_PORT, free_port, is_local, open_server, require_viser
 from fluidlift.viewer.saved import SavedFrames
-from fluidlift.viewer.stage import Parts, Stage, vertical_fov, world_from_camera
+from fluidlift.viewer.stage import Parts, Stage
 from fluidlift.viewer.timeline import Timeline
 
+LOG = logging.getLogger(__name__)
 TICKS = 30.0
 """1/s: how often the page is brought up to date"""
 WATCHED = 1.0
@@ -86,11 +86,14 @@ class Viewer:
         folder: of the asset.
         request: where it is shown.
         session: of edits; None: the asset's own.
+        size: of the live preview; None: as this machine bears it.
 
     Raises: as `view_asset`.
     """
 
-    def __init__(self, folder: Path, request: ViewRequest, session: Session | None = None) -> None:
+    def __init__(
+        self, folder: Path, request: ViewRequest, session: Session | None = None, size: PreviewSize | None = None
+    ) -> None:
         require_viser()
         self.folder, self.request, self.lock = folder, request, threading.RLock()
         self.saved = SavedFrames(folder)
@@ -115,13 +118,13 @@ class Viewer:
         self.stale: set[str] | None = None
         """what the saved frames no longer show of the scene; None: not known yet"""
         self._compare = threading.Event()
-        self.preview = LivePreview(self.asset, folder, keep=_kept, told=self._preview_told)
+        self.preview = LivePreview(self.asset, folder, size=size, keep=_kept, told=self._preview_told)
         self.jobs = Jobs(self._job_ended)
         port = free_port(request.host, request.port)
         self.server = open_server(request.host, port, f"fluidlift · {folder.name}")
         self.stage = Stage(self.server, folder, self.asset, self.redraw)
         self.panels = Panels(self)
-        self._set_first_view()
+        self.stage.look_from_input(self.server.initial_camera)
         self._thread = threading.Thread(target=self._run, name="viewer", daemon=True)
         self._thread.start()
         self.preview.start()
@@ -223,7 +226,7 @@ class Viewer:
                 self._tick(began)
             except Exception as error:
                 self._failures += 1
-                self.say(f"unexpected {type(error).__name__}: {error}")
+                self._surprised("drawing the page", error, trace=self._failures == 1)
                 time.sleep(min(0.1 * self._failures, 2.0))
             time.sleep(max(1.0 / TICKS - (time.monotonic() - began), 0.002))
 
@@ -334,6 +337,15 @@ class Viewer:
         self.panels.job_ended()
         self._dirty = True
 
+    def _surprised(self, doing: str, error: Exception, *, trace: bool = True) -> None:
+        """Tell an error that a thread meets: in words where it is one of ours, else also with its trace in the log."""
+        if isinstance(error, (FluidliftError, OSError)):
+            self.say(f"{doing}: {error}")
+            return
+        self.say(f"{doing}: unexpected {type(error).__name__}: {error}")
+        if trace:
+            LOG.error("%s", doing, exc_info=error)
+
     def compare(self) -> None:
         """The scene or the frames have changed: find out whether they still belong together."""
         self.stale = None
@@ -347,32 +359,21 @@ class Viewer:
             self._compare.clear()
             try:
                 found = self.draft.stale()
-            except (FluidliftError, OSError, KeyError, ValueError):
+            except Exception as error:  # what cannot be compared counts as older than the scene
+                self._surprised("comparing the frames with the scene", error)
                 found = {"simulate", "look"}
             if not self._compare.is_set():
                 self.stale = found
 
     def _find_pictures(self) -> None:
         try:
-            found = input_pictures(self.folder, self.saved.manifest, self.asset.camera, self.saved.interval)
+            self.pictures = input_pictures(self.folder, self.saved.manifest, self.asset.camera, self.saved.interval)
         except (FluidliftError, OSError, ValueError):
-            found = None
-        self.pictures, self.looking_for_pictures = found, False
-        self._dirty = True
-
-    def _set_first_view(self) -> None:
-        camera, view = self.asset.camera, self.server.initial_camera
-        forward = world_from_camera(camera)[:, 2]
-        view.position = np.asarray(camera.position, float)
-        view.look_at = np.asarray(camera.position + self.distance() * forward, float)
-        view.fov = vertical_fov(camera)
-        view.near, view.far = 2e-3 * self.stage.size, 200.0 * self.stage.size
-
-    def distance(self) -> float:
-        """m along the axis of the video's camera to the middle of the fluid."""
-        forward = world_from_camera(self.asset.camera)[:, 2]
-        ahead = float((self.stage.middle - self.asset.camera.position) @ forward)
-        return max(ahead, 0.1 * self.stage.size)
+            pass  # the panel says that there are none
+        except Exception as error:
+            self._surprised("looking for the input video", error)
+        finally:
+            self.looking_for_pictures, self._dirty = False, True
 
     def close(self) -> None:
         """Stop everything; what was edited stays in the history."""

@@ -12,9 +12,6 @@ from fluidlift.types import FluidParameters
 
 STEPS = 200
 """of a slider, about"""
-EARTH = 9.81
-"""m/s^2"""
-
 INFLOW = "inflow.factor"
 
 Values = dict[str, Any]

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from fluidlift.errors import FluidliftError
 
+LOG = logging.getLogger(__name__)
 WORDS = {"simulate": "simulating", "show": "rendering the preview film", "export": "exporting", "render": "drawing"}
 
 
@@ -108,7 +110,8 @@ class Jobs:
     def _told(self, **changes: Any) -> None:
         if self._stop.is_set():
             raise Stopped("stopped")
-        self.state = JobState(**(self.state.__dict__ | changes))
+        with self._lock:
+            self.state = replace(self.state, **changes)
 
     def _run(self, name: str, work: Callable[[JobProgress], str]) -> None:
         failed, outcome = True, ""
@@ -119,7 +122,12 @@ class Jobs:
         except FluidliftError as error:
             outcome = f"{name}: {error}"
         except Exception as error:
+            LOG.exception("%s", name)
             outcome = f"{name}: unexpected {type(error).__name__}: {error}"
         finally:
-            self.state = JobState(name, running=False, outcome=outcome, failed=failed)
-            self._ended()
+            with self._lock:
+                self.state = JobState(name, running=False, outcome=outcome, failed=failed)
+            try:
+                self._ended()
+            except Exception:
+                LOG.exception("after %s", name)

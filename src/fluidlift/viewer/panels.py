@@ -121,7 +121,9 @@ class Panels:
         up = -axes[:, 1]
         if abs(axes[2, 0]) < LEVEL and abs(axes[2, 2]) < 0.99:  # level: orbiting then keeps the horizon level too
             up = np.array([0.0, 0.0, 1.0])
-        self._look(event.client, np.asarray(camera.position), viewer.distance() * axes[:, 2], up, vertical_fov(camera))
+        self._look(
+            event.client, np.asarray(camera.position), viewer.stage.distance() * axes[:, 2], up, vertical_fov(camera)
+        )
 
     def _side_view(self, event: Any) -> None:
         if event.client is None:
@@ -189,7 +191,7 @@ class Panels:
         if self._legend.visible != viewer.parts.arrows:
             self._legend.visible = viewer.parts.arrows
         if viewer.parts.arrows:
-            _assign(self._legend, "content", f"arrows: blue is still, yellow is {viewer.fastest:.2g} m/s")
+            _assign(self._legend, "content", f"arrows: violet is still, yellow is {viewer.fastest:.2g} m/s")
 
     def _state_told(self) -> str:
         viewer = self._viewer

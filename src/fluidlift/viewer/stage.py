@@ -10,19 +10,16 @@ from typing import Any
 
 import numpy as np
 
+from fluidlift.physics.rotation import product
 from fluidlift.types import FluidAsset, PinholeCamera, TriangleMesh, quat_from_matrix
+from fluidlift.viewer.arrows import HEAD, THICK, arrows
 from fluidlift.viewer.frames import SplatFrame
 from fluidlift.viewer.surfacing import Surfacer
 
-ARROWS = 1200
-"""at most"""
-LONGEST_ARROW = 0.12
-"""share of the size of the fluid: of the arrow of the fastest 1 %"""
 RADIUS = 0.4
 """of a particle of the surface, cells"""
-SLOW, FAST = np.array([40, 70, 190]), np.array([255, 210, 40])
-"""colours of arrows, sRGB"""
 GROUND, BODY, CHOSEN = (150, 140, 125), (190, 95, 55), (240, 150, 40)
+"""sRGB of what has no colours of its own; of obstacles, those that are not edited and the one that is"""
 Y_UP = (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0)
 """turns glTF's axes into ours"""
 SMALLEST = 1e-6
@@ -94,19 +91,13 @@ class Stage:
         """Another ground, such as one that edits made longer; None or the same: nothing changes."""
         if mesh is None or mesh is self._ground_mesh:
             return
-        import tempfile
-
-        from fluidlift.io.export_mesh import write_glb
-
         self._ground_mesh = mesh
         if self._ground is not None:
             self._ground.remove()
         if not len(mesh.faces):
             self._ground = None
             return
-        with tempfile.TemporaryDirectory(prefix="fluidlift-view-") as place:
-            body = write_glb(Path(place) / "ground.glb", mesh).read_bytes()
-        self._ground = self._scene.add_glb("/ground", body, wxyz=Y_UP)
+        self._ground = self._scene.add_glb("/ground", glb_of(mesh), wxyz=Y_UP)
 
     def _place_camera(self, camera: PinholeCamera) -> Any:
         width, height = camera.size
@@ -116,6 +107,19 @@ class Stage:
             thickness=0.001 * self.size, color=(230, 120, 30), wxyz=facing,
             position=camera.position,
         )  # fmt: skip
+
+    def distance(self) -> float:
+        """m along the axis of the video's camera to the middle of the fluid."""
+        camera = self._asset.camera
+        return max(float((self.middle - camera.position) @ world_from_camera(camera)[:, 2]), 0.1 * self.size)
+
+    def look_from_input(self, view: Any) -> None:
+        """Put a camera of viser where that of the video stood."""
+        camera = self._asset.camera
+        view.position = np.asarray(camera.position, float)
+        view.look_at = np.asarray(camera.position + self.distance() * world_from_camera(camera)[:, 2], float)
+        view.fov = vertical_fov(camera)
+        view.near, view.far = 2e-3 * self.size, 200.0 * self.size
 
     # the fluid
 
@@ -179,10 +183,10 @@ class Stage:
             self._take_away("/velocity")
             return
         ends, colors = found
-        thick = 0.0015 * self.size
         self._scene.add_arrows(
-            "/velocity", ends, colors, shaft_radius=thick, head_radius=2.5 * thick, head_length=6 * thick
-        )
+            "/velocity", ends, colors, shaft_radius=THICK * self.size, head_radius=3 * THICK * self.size,
+            head_length=HEAD * self.size,
+        )  # fmt: skip
 
     def _show_surface(self, rgb: np.ndarray) -> str:
         """The surface that was made last: while frames pass, it is some frames late."""
@@ -220,36 +224,50 @@ class Stage:
             look = (o.mesh, o.name == chosen)
             before = self._shown_bodies.get(o.name)
             if before is None or not _same(before, look):
-                self._bodies[o.name] = self._scene.add_mesh_simple(
-                    f"/obstacles/{o.name}", np.asarray(o.mesh.vertices, np.float32), np.asarray(o.mesh.faces),
-                    color=CHOSEN if look[1] else BODY, flat_shading=len(o.mesh.faces) < 100,
-                )  # fmt: skip
+                if before is not None:
+                    self._bodies[o.name].remove()
+                self._bodies[o.name] = self._add_body(o.name, *look)
                 self._shown_bodies[o.name] = look
             body = self._bodies[o.name]
             body.position = np.asarray(poses[b, :3] if known else o.position, float)
-            body.wxyz = np.asarray(poses[b, 3:] if known else o.rotation, float)
+            turn = np.asarray(poses[b, 3:] if known else o.rotation, float)
+            body.wxyz = product(turn, np.array(Y_UP)) if is_painted(o.mesh) else turn
             body.visible = parts.obstacles
+
+    def _add_body(self, name: str, mesh: TriangleMesh, chosen: bool) -> Any:
+        if is_painted(mesh):
+            return self._scene.add_glb(f"/obstacles/{name}", glb_of(mesh))
+        color = CHOSEN if chosen else BODY
+        if mesh.colors is not None and len(mesh.colors):
+            color = tuple(int(c) for c in np.round(255 * np.clip(mesh.colors[0], 0, 1)))
+        return self._scene.add_mesh_simple(
+            f"/obstacles/{name}", np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces), color=color,
+            flat_shading=len(mesh.faces) < 100,
+        )  # fmt: skip
 
 
 def _same(before: tuple[Any, bool], look: tuple[Any, bool]) -> bool:
     a, b = before[0], look[0]
     alike = np.shape(a.vertices) == np.shape(b.vertices) and np.shape(a.faces) == np.shape(b.faces)
-    return before[1] == look[1] and alike and np.array_equal(a.vertices, b.vertices)
+    same_colors = a.colors is b.colors or np.array_equal(a.colors, b.colors)
+    return before[1] == look[1] and alike and np.array_equal(a.vertices, b.vertices) and same_colors
 
 
-def arrows(frame: SplatFrame, size: float) -> tuple[np.ndarray, np.ndarray] | None:
-    """Ends [m,2,3] (m) and colours u8 [m,3] of velocity arrows of at most `ARROWS` splats; None where nothing moves."""
-    fastest = frame.fastest
-    if fastest <= 0:
-        return None
-    few = np.linspace(0, len(frame.centers) - 1, min(ARROWS, len(frame.centers))).astype(int)
-    velocity = frame.velocities[few]
-    speed = np.sqrt(np.square(velocity).sum(axis=1))
-    share = np.clip(speed / fastest, 0, 1.5)
-    scale = LONGEST_ARROW * size / fastest * (np.minimum(share, 1.5) / np.maximum(share, 1e-9))
-    tips = frame.centers[few] + velocity * scale[:, None]
-    mixed = np.clip(share, 0, 1)[:, None]
-    return np.stack([frame.centers[few], tips], axis=1), np.round((1 - mixed) * SLOW + mixed * FAST).astype(np.uint8)
+def is_painted(mesh: TriangleMesh) -> bool:
+    """Whether a mesh has more than one colour: a texture, or vertices of different colours."""
+    if not len(mesh.faces):
+        return False
+    return mesh.texture is not None or (mesh.colors is not None and bool(np.ptp(mesh.colors, axis=0).max() > 1 / 255))
+
+
+def glb_of(mesh: TriangleMesh) -> bytes:
+    """A mesh with its colours, as a binary glTF."""
+    import tempfile
+
+    from fluidlift.io.export_mesh import write_glb
+
+    with tempfile.TemporaryDirectory(prefix="fluidlift-view-") as place:
+        return write_glb(Path(place) / "mesh.glb", mesh).read_bytes()
 
 
 def vertical_fov(camera: PinholeCamera) -> float:

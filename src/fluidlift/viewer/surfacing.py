@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -11,6 +12,7 @@ import numpy as np
 from fluidlift.errors import FluidliftError
 from fluidlift.types import TriangleMesh
 
+LOG = logging.getLogger(__name__)
 Maker = Callable[[np.ndarray, float], TriangleMesh]
 """(positions [n,3] m, radius m) -> the surface"""
 
@@ -75,6 +77,9 @@ class Surfacer:
                 problem = "" if len(mesh.faces) else "This frame has no surface."
             except (FluidliftError, ValueError, RuntimeError) as error:
                 problem = str(error)
+            except Exception as error:
+                LOG.exception("surface of a frame")
+                problem = f"The surface could not be made: unexpected {type(error).__name__}: {error}"
             with self._news:
                 if self._asked is not None:
                     self._made = (frame, mesh, problem)

@@ -1,0 +1,99 @@
+"""What is put into the 3D view, with a scene that only notes it."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from fluidlift.io.asset_folder import load_asset
+from fluidlift.io.obstacles import Obstacle
+from fluidlift.numerics.solid_mesh import box_mesh
+from fluidlift.types import Gaussians, TriangleMesh
+from fluidlift.viewer.arrows import LONGEST, SHORTEST, arrows
+from fluidlift.viewer.frames import splat_frame
+from fluidlift.viewer.stage import Parts, Stage
+
+TURN = np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])
+"""a quarter about z"""
+
+
+class Notes:
+    """Stands in for viser's scene."""
+
+    def __init__(self):
+        self.nodes = {}
+
+    def __getattr__(self, kind):
+        def add(name, *parts, **options):
+            node = SimpleNamespace(kind=kind, parts=parts, **options)
+            node.remove = lambda: self.nodes.pop(name)
+            self.nodes[name] = node
+            return node
+
+        return add
+
+
+@pytest.fixture
+def stage(tmp_path, finished_tank):
+    return Stage(SimpleNamespace(scene=Notes()), tmp_path, load_asset(finished_tank))
+
+
+def obstacle(colors=None):
+    mesh = box_mesh((0.1, 0.1, 0.1))
+    return Obstacle("box", TriangleMesh(mesh.vertices, mesh.faces, colors), (0.3, 0.2, 0.1), TURN)
+
+
+def shown(stage, *found, **more):
+    stage.obstacles(found, None, Parts(), **more)
+    return stage._scene.nodes["/obstacles/box"]
+
+
+def test_an_obstacle_of_one_colour_has_it_and_one_without_is_marked_while_it_is_edited(stage):
+    count = len(box_mesh((1, 1, 1)).vertices)
+    assert shown(stage, obstacle(np.tile([1.0, 0.8, 0.1], (count, 1)))).color == (255, 204, 26)
+    assert shown(stage, obstacle(np.tile([0.0, 0.0, 1.0], (count, 1)))).color == (0, 0, 255)  # painted anew
+    plain = shown(stage, obstacle()).color
+    assert shown(stage, obstacle(), chosen="box").color != plain
+
+
+def test_an_obstacle_of_many_colours_arrives_with_them_in_its_pose(stage):
+    colors = np.random.default_rng(0).uniform(size=(len(box_mesh((1, 1, 1)).vertices), 3))
+    node = shown(stage, obstacle(colors))
+    assert node.kind == "add_glb" and node.parts[0][:4] == b"glTF"
+    # the y axis of glTF is our z, and the quarter turn leaves that where it is
+    up = Rotation.from_quat(node.wxyz, scalar_first=True).apply([0, 1, 0])
+    np.testing.assert_allclose(up, [0, 0, 1], atol=1e-12)
+    np.testing.assert_allclose(node.position, [0.3, 0.2, 0.1])
+
+
+def test_nothing_without_points_is_put_into_the_view(stage):
+    empty = splat_frame(Gaussians.isotropic(np.zeros((0, 3)), 0.1, np.zeros((0, 3))), np.zeros((0, 3), np.float32))
+    before = set(stage._scene.nodes)
+    stage._scene.get_handle_by_name = lambda name: None
+    stage.show(empty, Parts(points=True, arrows=True), 0.1)
+    assert set(stage._scene.nodes) == before
+
+
+def block(velocity):
+    """A block of water one metre wide, under way at some velocity where x is above a half, and half of it elsewhere."""
+    at = np.stack(np.meshgrid(*[np.linspace(0, 1, 20)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    share = np.where(at[:, :1] > 0.5, 1.0, 0.5)
+    return splat_frame(Gaussians.isotropic(at, 0.02, np.full((8000, 3), 0.5)), (share * velocity).astype(np.float32))
+
+
+def test_arrows_stand_outside_the_fluid_along_its_velocity_and_tell_the_speed_by_colour_and_length():
+    ends, colors = arrows(block([2.0, 0.0, 0.0]), 1.0)
+    along = ends[:, 1] - ends[:, 0]
+    np.testing.assert_allclose(along[:, 1:], 0, atol=1e-9)
+    inside = ((ends[:, 0] > 0.1) & (ends[:, 0] < 0.9)).all(axis=1)
+    assert not inside.any() and (ends[:, 0, 2] > 1.0).sum() > 100  # above the upper side
+    fast = ends[:, 0, 0] > 0.6
+    # the means of blocks that lie across the step in speed are between the two
+    np.testing.assert_allclose(along[fast, 0], LONGEST, rtol=1e-6)
+    assert along[ends[:, 0, 0] < 0.4, 0] == pytest.approx(0.5 * (LONGEST + SHORTEST), rel=1e-6)
+    assert (colors[fast] == [255, 235, 60]).all() and (colors[ends[:, 0, 0] < 0.4] == [225, 60, 100]).all()
+
+
+def test_a_frame_at_rest_has_no_arrows():
+    assert arrows(block([0.0, 0.0, 0.0]), 1.0) is None

@@ -26,7 +26,7 @@ from results import table as rows_of
 
 from fluidlift.evaluate.images import psnr, ssim
 from fluidlift.io.asset_folder import load_asset, read_manifest
-from fluidlift.io.color import srgb_from_linear
+from fluidlift.io.color import linear_from_srgb, srgb_from_linear
 from fluidlift.io.scene_look import Look
 from fluidlift.look.materials import PRESETS
 from fluidlift.look.pictures import caption
@@ -93,22 +93,23 @@ def measured(folder: Path) -> list[str]:
     near, alike = [], []
     for first in picked(count):
         series: dict[str, list[np.ndarray]] = {name: [] for name in noise}
+        still = clip.frames[start + first]  # behind the fluid nothing moves: what is seen through it must not flicker
         for k in range(first, first + GROUP):
             fluid, _, velocities = frames[k]
             mask, truth = masks[start + k], clip.frames[start + k]
-            plain = (255 * np.clip(render(fluid, asset.camera, background=truth / 255.0).image, 0, 1)).astype(np.uint8)
+            plain = (255 * np.clip(render(fluid, asset.camera, background=still / 255.0).image, 0, 1)).astype(np.uint8)
             if k == first:
                 near.append(psnr(plain, truth, mask))
                 alike.append(ssim(plain, truth))
             series["clip"].append(truth)
             series["splats"].append(plain)
             for style, painter in painters.items():
-                behind = Backdrop((truth.astype(np.float32) / 255.0) ** 2.2)
+                behind = Backdrop(linear_from_srgb(still / 255.0).astype(np.float32))
                 lit = painter.picture(Frame(fluid, velocities), asset.camera, behind)
                 series[style].append(shown(lit.image, painter))
-        still = masks[start + first : start + first + GROUP].all(axis=0)
+        wet = masks[start + first : start + first + GROUP].all(axis=0)
         for name, pictures in series.items():
-            noise[name].append(flicker(pictures, still))
+            noise[name].append(flicker(pictures, wet))
     means = {name: statistics.mean(values) for name, values in noise.items()}
     own = max(means["clip"], 1e-9)
     compared = [f"{means[name]:.1f} ({means[name] / own:.2f})" for name in ("splats", *painters)]

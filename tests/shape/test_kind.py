@@ -45,7 +45,8 @@ def smoke():
 
 
 @pytest.mark.parametrize(
-    ("clip", "kind"), [(river, "stream"), (jet, "pour"), (curtain, "fall"), (smoke, "plume")], ids=lambda x: str(x)
+    ("clip", "kind"),
+    [(river, "stream"), (jet, "pour"), (curtain, "fall"), (smoke, "plume")],
 )
 def test_the_kind_is_what_the_fluid_does(clip, kind):
     found = estimate_kind(*clip())

@@ -119,6 +119,14 @@ def heed(clicks: Clicks, evidence: Evidence, score: np.ndarray, region: np.ndarr
     return min_cut((1.0 - reach) * automatic + vote, across, down), vote.astype(np.float32)
 
 
+def holes_asked_for(region: np.ndarray, clicks: Clicks) -> np.ndarray:
+    """bool [h,w]: the holes that a person pointed at, which tidying up must not fill again."""
+    _, parts = cv2.connectedComponents((~region).astype(np.uint8))
+    open_ended = np.concatenate([parts[0], parts[-1], parts[:, 0], parts[:, -1]])
+    wanted = parts[discs(clicks.other, 0, region.shape) & ~region]
+    return np.isin(parts, wanted[~np.isin(wanted, open_ended)])
+
+
 def look(evidence: Evidence) -> np.ndarray:
     """float32 [h,w,4]: smoothed colours of the typical picture and activity, in grey levels."""
     colours = cv2.GaussianBlur(typical_picture(evidence.pictures), (0, 0), 1.0)

@@ -4,7 +4,7 @@ The same from the shell; any closed mesh will do for the duck (duck.py wrote thi
 
     cp duck.obj demo.fluid/
     fluidlift edit demo.fluid --set extend_downstream=0.8 \\
-        --add obstacles='{name: duck, mesh: duck.obj, position: [-0.4, 0, 0.3], motion: free, density: 350}'
+        --add obstacles='{name: duck, mesh: duck.obj, position: [-0.4, 0, 0.2], motion: free, density: 350}'
     fluidlift sim demo.fluid --duration 2
     fluidlift render demo.fluid -o duck.mp4 --view side
 """

@@ -42,14 +42,16 @@ def disk_errors(path: Path | str) -> Iterator[None]:
 
 
 def require_writable(folder: Path | str) -> None:
-    """Make a folder and see that files can be written in it, before hours of work are done for it.
+    """See that files can be written in a folder, which need not exist yet, before hours of work are done for it.
 
     Raises:
         InputRejected: whatever the operating system has against it.
     """
+    place = Path(folder).absolute()
+    while not place.exists() and place != place.parent:
+        place = place.parent
     try:
-        Path(folder).mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
+        with tempfile.TemporaryFile(dir=place):  # nothing is left behind where the work is refused later
             pass
     except OSError as error:
         raise InputRejected(

@@ -36,8 +36,9 @@ from fluidlift.types import CellType, FaceVelocity, FluidParameters, Grid, Parti
 __all__ = ["EmitSource", "LiquidSimulator", "SimulationSettings", "StepReport"]
 
 
-TURNED = 0.5
-"""share of gravity along an axis from which its side of the box is one that liquid falls out of: 30 degrees"""
+TURNED = 0.7
+"""share of gravity along an axis from which its side of the box is one that liquid falls out of: from 45 degrees
+on it is as much below as the floor; a tank that is tilted less stays a tank"""
 
 
 def sides_open_to_air(gravity: tuple[float, float, float]) -> np.ndarray:

@@ -26,12 +26,12 @@ from results import table as rows_of
 
 from fluidlift.evaluate.images import psnr, ssim
 from fluidlift.io.asset_folder import load_asset, read_manifest
-from fluidlift.io.color import linear_from_srgb, srgb_from_linear
 from fluidlift.io.scene_look import Look
 from fluidlift.look.materials import PRESETS
 from fluidlift.look.pictures import caption
 from fluidlift.look.rasterize import render
 from fluidlift.look.scenery import orbit_camera, side_camera, terrain_surfels
+from fluidlift.numerics.srgb import linear_from_srgb, srgb_from_linear
 from fluidlift.pipeline.looks import Backdrop, Frame, Painter
 from fluidlift.pipeline.reading import clip_of
 from fluidlift.pipeline.resimulate import FIRST_HALF, recall_first_half

@@ -245,7 +245,7 @@ def main() -> None:
         if a.pictures is not None:
             from PIL import Image
 
-            from fluidlift.io.color import srgb_from_linear
+            from fluidlift.numerics.srgb import srgb_from_linear
 
             a.pictures.mkdir(parents=True, exist_ok=True)
             row = np.concatenate([pictures[k] for k in ("mitsuba", "mesh", "splats", "none")], axis=1)

@@ -11,12 +11,13 @@ import pytest
 
 from fluidlift.backends import mitsuba_renderer
 from fluidlift.backends.mitsuba_renderer import MitsubaRenderer, square_pixels, trial
-from fluidlift.backends.mitsuba_scene import FinalScene, linear, mean_chord, medium, resting, scattering_albedo
+from fluidlift.backends.mitsuba_scene import FinalScene, mean_chord, medium, resting, scattering_albedo
 from fluidlift.errors import FluidliftError, MissingPackage
 from fluidlift.look.environment import Environment
 from fluidlift.look.environment_lookup import grid_directions
 from fluidlift.look.materials import PRESETS, Material
 from fluidlift.numerics.solid_mesh import box_mesh, ellipsoid_mesh
+from fluidlift.numerics.srgb import linear_from_srgb
 from fluidlift.types import Grid, PinholeCamera, Terrain, TriangleMesh
 
 needs_mitsuba = pytest.mark.skipif(
@@ -97,7 +98,7 @@ def test_a_texture_lies_as_it_does_in_our_own_pictures():
     picture = rendered(FinalScene(NOTHING, Material("none"), camera, WHITE, (table,), samples=32))
     seen = np.array([[picture[11, 11], picture[11, 20]], [picture[20, 11], picture[20, 20]]])
     # a flat white body under white light of 1 shows its own linear colour
-    assert np.abs(seen - linear(texture / 255.0)).max() < 0.02
+    assert np.abs(seen - linear_from_srgb(texture / 255.0)).max() < 0.02
 
 
 @needs_mitsuba
@@ -128,7 +129,7 @@ def test_a_painted_body_is_as_bright_as_its_colour_and_a_glowing_one_as_its_glow
     middle = np.s_[9:15, 9:15]
     assert np.abs(rendered(scene)[middle].mean((0, 1)) - (0.2, 0.4, 0.6)).max() < 0.02  # noise of 64 x 36 samples
     carried = rendered(replace(scene, material=replace(paint, carried=1.0)))[middle].mean((0, 1))
-    assert np.abs(carried - linear(np.array([0.9, 0.2, 0.2]))).max() < 0.02
+    assert np.abs(carried - linear_from_srgb(np.array([0.9, 0.2, 0.2]))).max() < 0.02
     black = replace(paint, albedo=(0.0, 0.0, 0.0), emission=(3.0, 1.0, 0.5))
     scene = replace(scene, surface=TriangleMesh(body.vertices, body.faces))  # without colours all of it is hot
     assert np.abs(rendered(replace(scene, material=black))[middle].mean((0, 1)) - (3.0, 1.0, 0.5)).max() < 1e-3

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from fluidlift.errors import InputRejected
-from fluidlift.io.color import linear_from_srgb
 from fluidlift.io.export_gltf import write_gltf
 from fluidlift.io.ply import AXES
 from fluidlift.look.rasterize import render
+from fluidlift.numerics.srgb import linear_from_srgb
 from fluidlift.types import Gaussians, PinholeCamera, Similarity3, TriangleMesh, matrix_from_quat
 
 KINDS = {5126: "<f4", 5125: "<u4", 5123: "<u2", 5121: "u1"}

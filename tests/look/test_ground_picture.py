@@ -8,7 +8,7 @@ from fluidlift.look.environment import Environment
 from fluidlift.look.ground_picture import Ground, GroundLight, ground_picture, received, spread_directions
 from fluidlift.look.liquid import Behind
 from fluidlift.look.materials import Material
-from fluidlift.look.screen_space import linear_from_srgb
+from fluidlift.numerics.srgb import linear_from_srgb
 from fluidlift.types import PinholeCamera, TriangleMesh
 
 CAMERA = PinholeCamera.looking((0.0, -3.0, 3.0), (0.0, 0.0, 0.0), 45.0, (120, 90))

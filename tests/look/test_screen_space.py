@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from fluidlift.look.screen_space import linear_from_srgb, mesh_surface, particle_surface
+from fluidlift.look.screen_space import mesh_surface, particle_surface
 from fluidlift.look.screen_space_kernels import narrow_range, plane_normals
+from fluidlift.numerics.srgb import linear_from_srgb
 from fluidlift.types import PinholeCamera, TriangleMesh
 
 RADIUS = 0.032

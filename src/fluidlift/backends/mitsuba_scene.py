@@ -15,6 +15,7 @@ from fluidlift.look.environment_lookup import grid_directions
 from fluidlift.look.liquid import LUMINANCE, glow
 from fluidlift.look.materials import Material
 from fluidlift.numerics.mesh_normals import vertex_normals
+from fluidlift.numerics.srgb import linear_from_srgb
 from fluidlift.types import PinholeCamera, Terrain, TriangleMesh
 
 OPAQUE_DEPTH = 8.0
@@ -149,12 +150,6 @@ def medium(material: Material, carried: Float[np.ndarray, "3"]) -> tuple[np.ndar
     )
 
 
-def linear(srgb: np.ndarray) -> np.ndarray:
-    """Linear light of sRGB values in [0, 1]."""
-    x = np.clip(np.asarray(srgb, np.float32), 0.0, 1.0)
-    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4).astype(np.float32)
-
-
 def described(mi: Any, scene: FinalScene, camera: PinholeCamera) -> dict[str, Any]:
     """The scene as `mitsuba.load_dict` takes it.
 
@@ -223,7 +218,7 @@ def _glowing(scene: FinalScene) -> list[tuple[np.ndarray, np.ndarray]]:
     whole = np.asarray(mesh.faces)
     if emission.max() <= 0 or mesh.colors is None:
         return [(whole, emission)]
-    carried = linear(mesh.colors)
+    carried = linear_from_srgb(mesh.colors)
     hot = glow(carried, float((carried @ LUMINANCE).mean()))[whole].mean(axis=1)
     if not scene.painted:
         return [(whole, emission * hot.mean(axis=0))]
@@ -233,7 +228,7 @@ def _glowing(scene: FinalScene) -> list[tuple[np.ndarray, np.ndarray]]:
 
 def _liquid(mi: Any, scene: FinalScene, faces: np.ndarray, emission: np.ndarray) -> Any:
     mesh, material = scene.surface, scene.material
-    colors = linear(np.broadcast_to(0.5, mesh.vertices.shape) if mesh.colors is None else mesh.colors)
+    colors = linear_from_srgb(np.broadcast_to(0.5, mesh.vertices.shape) if mesh.colors is None else mesh.colors)
     properties, attributes = mi.Properties(), {}
     if scene.painted:
         carried = 0.0 if mesh.colors is None else material.carried
@@ -285,11 +280,11 @@ def _solid(mi: Any, mesh: TriangleMesh) -> Any:
     normals = np.where(((smooth * flat).sum(axis=1) > CREASE)[:, None], smooth, flat)
     uv, attributes, paint = None, {}, {}
     if mesh.texture is not None and mesh.uv is not None:
-        texture = mi.Bitmap(linear(mesh.texture.astype(np.float32) / 255.0))
+        texture = mi.Bitmap(linear_from_srgb(mesh.texture.astype(np.float32) / 255.0))
         paint, uv = {"type": "bitmap", "bitmap": texture, "raw": True, "wrap_mode": "clamp"}, mesh.uv.reshape(-1, 2)
     else:
         colors = np.broadcast_to(GROUND, mesh.vertices.shape) if mesh.colors is None else mesh.colors
-        attributes["vertex_color"] = linear(colors)[corner]
+        attributes["vertex_color"] = linear_from_srgb(colors)[corner]
         paint = {"type": "mesh_attribute", "name": "vertex_color"}
     properties = mi.Properties()
     # the ground is seen from either side: nobody closes it below

@@ -47,12 +47,15 @@ def require_writable(folder: Path | str) -> None:
     Raises:
         InputRejected: whatever the operating system has against it.
     """
-    place = Path(folder).absolute()
-    while not place.exists() and place != place.parent:
-        place = place.parent
+    folder = Path(folder)
+    new = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
-        with tempfile.TemporaryFile(dir=place):  # nothing is left behind where the work is refused later
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
             pass
+        for path in new:  # nothing is left behind where the work is refused later
+            with suppress(OSError):
+                path.rmdir()
     except OSError as error:
         raise InputRejected(
             f"'{folder}' cannot be written ({error.strerror or error})", "a folder that can be written",

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 
+from fluidlift.numerics.srgb import srgb_from_linear
+
 PQ, HLG = 16, 18
 """transfer characteristics of ITU-T H.273: SMPTE ST 2084 and ARIB STD-B67"""
 
@@ -15,18 +17,6 @@ REC709_FROM_REC2020 = np.array(
     [[1.660491, -0.587641, -0.072850], [-0.124550, 1.132900, -0.008349], [-0.018151, -0.100579, 1.118730]], np.float32
 )
 """linear light (ITU-R BT.2087)"""
-
-
-def srgb_from_linear(linear: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-    """The sRGB curve (IEC 61966-2-1) of linear light in [0, 1]."""
-    x = np.clip(linear, 0.0, 1.0)
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(x, 1 / 2.4) - 0.055)
-
-
-def linear_from_srgb(encoded: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-    """Linear light of sRGB values in [0, 1]."""
-    x = np.clip(encoded, 0.0, 1.0)
-    return np.where(x <= 0.04045, x / 12.92, np.power((x + 0.055) / 1.055, 2.4))
 
 
 def light_from_pq(signal: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from fluidlift.errors import require
-from fluidlift.io.color import linear_from_srgb
 from fluidlift.io.glb import INDICES, Glb
 from fluidlift.io.ply import AXES
 from fluidlift.numerics.mesh_normals import vertex_normals
+from fluidlift.numerics.srgb import linear_from_srgb
 from fluidlift.types import Gaussians, PinholeCamera, Similarity3, TriangleMesh, quat_from_matrix
 
 SPLATS = "KHR_gaussian_splatting"

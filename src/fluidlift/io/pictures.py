@@ -10,9 +10,9 @@ import numpy as np
 
 from fluidlift.errors import InputRejected
 from fluidlift.io.atomic import write_bytes
-from fluidlift.io.color import srgb_from_linear
 from fluidlift.io.exr import read_channels
 from fluidlift.io.limits import ReadLimits, require_file
+from fluidlift.numerics.srgb import srgb_from_linear
 
 PICTURE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".exr"})
 

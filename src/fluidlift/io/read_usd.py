@@ -9,11 +9,11 @@ import numpy as np
 from pxr import Tf, Usd, UsdGeom, UsdVol
 
 from fluidlift.errors import InputRejected
-from fluidlift.io.color import srgb_from_linear
 from fluidlift.io.frames import FluidFrame
 from fluidlift.io.limits import require_file
 from fluidlift.io.ply import AXES
 from fluidlift.io.usd_camera import read_camera
+from fluidlift.numerics.srgb import srgb_from_linear
 from fluidlift.types import Gaussians, PinholeCamera, Similarity3, TriangleMesh
 
 

@@ -8,9 +8,9 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdVol, Vt
 
 from fluidlift.errors import require
-from fluidlift.io.color import linear_from_srgb
 from fluidlift.io.frames import FluidFrame
 from fluidlift.numerics.mesh_normals import vertex_normals
+from fluidlift.numerics.srgb import linear_from_srgb
 from fluidlift.types import Gaussians, Similarity3, TriangleMesh, matrix_from_quat
 
 SIGMAS = 3.0

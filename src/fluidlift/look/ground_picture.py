@@ -19,8 +19,8 @@ from fluidlift.look.ground_kernels import filled_in, paint, world_points
 from fluidlift.look.ground_light import Around, Casters, GroundLight, direct_light, spread_directions
 from fluidlift.look.liquid import Behind
 from fluidlift.look.materials import Material
-from fluidlift.look.screen_space import linear_from_srgb
 from fluidlift.look.screen_space_kernels import smooth_normals, unit_rows
+from fluidlift.numerics.srgb import linear_from_srgb
 from fluidlift.numerics.triangles import rasterize_triangles
 from fluidlift.types.camera import PinholeCamera
 from fluidlift.types.terrain import TriangleMesh

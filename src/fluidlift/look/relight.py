@@ -22,6 +22,7 @@ from fluidlift.look.environment import LUMINANCE, Environment
 from fluidlift.look.environment_lookup import picture_place, picture_value
 from fluidlift.look.fluid_normals import fluid_normals
 from fluidlift.look.materials import Material
+from fluidlift.numerics.srgb import linear_from_srgb
 from fluidlift.types.camera import PinholeCamera
 from fluidlift.types.gaussians import Gaussians
 
@@ -78,7 +79,7 @@ def relit(
     n = len(gaussians)
     require(np.shape(normals) == (n, 3) and np.shape(share) == (n,), f"normals {np.shape(normals)}", f"({n}, 3)")
     normals, share = np.ascontiguousarray(normals, np.float32), np.ascontiguousarray(share, np.float32)
-    own = _linear(gaussians.rgb)
+    own = linear_from_srgb(gaussians.rgb)
     body = body_color(gaussians, own_albedo(own, normals, share), material)
     pictures, numbers = _prepared(material, environment, camera.position)
     out = np.empty((n, 3), np.float32)
@@ -277,11 +278,6 @@ def glow(
     """
     cooler = 1.0 / (COLD + (1.0 - COLD) * heat(colors_linear, among)) - 1.0
     return np.exp(-WIEN * cooler[:, None]) * np.asarray(material.emission, np.float32)
-
-
-def _linear(srgb: np.ndarray) -> np.ndarray:
-    """Linear light of sRGB in [0, 1] (IEC 61966-2-1)."""
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
 def _step(values: np.ndarray, low: float, high: float) -> np.ndarray:

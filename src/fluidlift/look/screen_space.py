@@ -24,6 +24,7 @@ from fluidlift.look.screen_space_kernels import (
     spread_edges,
     unit_rows,
 )
+from fluidlift.numerics.srgb import linear_from_srgb
 from fluidlift.numerics.triangles import NEAR, banded, interpolated, rasterize_closed
 from fluidlift.types.camera import PinholeCamera
 from fluidlift.types.terrain import TriangleMesh
@@ -172,9 +173,3 @@ def mesh_surface(mesh: TriangleMesh, camera: PinholeCamera) -> LiquidSurface:
     covered, depth = np.zeros_like(thickness), found.front.depth
     spread_edges(found.front.hit, depth, normal, thickness, albedo, back, covered)
     return LiquidSurface(depth, normal, thickness, albedo, covered, back)
-
-
-def linear_from_srgb(srgb: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-    """Linear light of sRGB colours in [0, 1] (IEC 61966-2-1); `io` has the same for pictures."""
-    x = np.clip(srgb, 0.0, 1.0)
-    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)

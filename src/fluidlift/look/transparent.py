@@ -23,6 +23,7 @@ from fluidlift.look.project import sound
 from fluidlift.numerics.splatting import Bins, Projected, View, bin_tiles, project
 from fluidlift.numerics.splatting_kernels import TILE, _exp_negative
 from fluidlift.numerics.splatting_projection import REACH_MAX
+from fluidlift.numerics.srgb import linear_from_srgb
 from fluidlift.types.camera import PinholeCamera
 from fluidlift.types.gaussians import Gaussians
 
@@ -88,7 +89,7 @@ def splat_surface(
     if len(g) == 0 or volume <= 0:
         return _nothing(height, width)
     spacing = volume ** (1.0 / 3.0)
-    carried = _linear(g.rgb) if colors is None else np.asarray(colors, np.float32)[ok]
+    carried = linear_from_srgb(g.rgb) if colors is None else np.asarray(colors, np.float32)[ok]
     features = np.concatenate([np.asarray(normals, np.float32)[ok], carried], axis=1)
     total, skin = splatted_thickness(g, features, camera, volume, SKIN * spacing)
     seen = _surface(total, skin, camera, spacing)
@@ -289,11 +290,6 @@ def _facing(vectors: np.ndarray, toward: np.ndarray) -> np.ndarray:
 def _unit(vectors: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return np.where(length > 1e-9, vectors / np.maximum(length, 1e-9), otherwise)
-
-
-def _linear(srgb: np.ndarray) -> np.ndarray:
-    x = np.clip(srgb, 0.0, 1.0)
-    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
 def _nothing(height: int, width: int) -> LiquidSurface:

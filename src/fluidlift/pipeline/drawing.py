@@ -83,7 +83,7 @@ def _own_look(stage: Stage, folder: Path, step: Callable[[int], None]) -> Iterat
 
 def _encoded(rgb: np.ndarray, alpha: np.ndarray, depth: np.ndarray) -> Drawn:
     """Of sRGB colours, premultiplied; linear light beside them, because compositing programs multiply linear values."""
-    from fluidlift.io.color import linear_from_srgb
+    from fluidlift.numerics.srgb import linear_from_srgb
 
     rgb = np.clip(rgb, 0.0, 1.0)
     straight = np.clip(rgb / np.maximum(alpha, 1e-4)[..., None], 0.0, 1.0)
@@ -92,7 +92,7 @@ def _encoded(rgb: np.ndarray, alpha: np.ndarray, depth: np.ndarray) -> Drawn:
 
 def _other_look(stage: Stage, folder: Path, step: Callable[[int], None]) -> Iterator[Drawn]:
     """Lit by an environment, or as a liquid."""
-    from fluidlift.io.color import linear_from_srgb, srgb_from_linear
+    from fluidlift.numerics.srgb import linear_from_srgb, srgb_from_linear
 
     assert stage.painter is not None
     scene, wanted, way = stage.scene, stage.numbers, _background(stage)

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fluidlift.errors import InputRejected, require
-from fluidlift.io.color import linear_from_srgb, srgb_from_linear
 from fluidlift.io.scene_look import Look
 from fluidlift.look.display import displayed
 from fluidlift.look.environment import BUILT_IN, LUMINANCE, Environment, built_in
@@ -24,6 +23,7 @@ from fluidlift.look.rasterize import render
 from fluidlift.look.relight import relit
 from fluidlift.look.screen_space import mesh_surface, particle_surface
 from fluidlift.look.transparent import splat_surface
+from fluidlift.numerics.srgb import linear_from_srgb, srgb_from_linear
 from fluidlift.pipeline.scene import LYING
 from fluidlift.pipeline.surfacing import RADIUS, surface_of
 from fluidlift.types import Gaussians, PinholeCamera, Similarity3, Terrain, TriangleMesh, matrix_from_quat

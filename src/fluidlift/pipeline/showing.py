@@ -87,10 +87,10 @@ def _panels(
     scene: Scene, footage: Footage | None, folder: Path, config: JobConfig, poses: np.ndarray, measured, step, painter
 ) -> Iterator[np.ndarray]:
     """Input | re-simulation | side view, frame by frame; keeps what the evaluation needs on the way."""
-    from fluidlift.io.color import linear_from_srgb
     from fluidlift.look.pictures import caption
     from fluidlift.look.rasterize import render
     from fluidlift.look.scenery import mesh_surfels, side_camera, terrain_depth, terrain_surfels, visible_beside_rocks
+    from fluidlift.numerics.srgb import linear_from_srgb
 
     camera, terrain, grid = scene.camera, scene.terrain, scene.terrain.grid
     plate = np.full((camera.size[1], camera.size[0], 3), 0.5, np.float32)

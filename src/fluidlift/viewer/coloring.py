@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from fluidlift.errors import FluidliftError
-from fluidlift.io.color import linear_from_srgb, srgb_from_linear
+from fluidlift.numerics.srgb import linear_from_srgb, srgb_from_linear
 
 
 def colored(rgb: np.ndarray, look: dict[str, Any]) -> np.ndarray | None:

@@ -102,6 +102,7 @@ def test_it_loads_plays_and_an_edit_changes_the_picture(visit, viewer):
     visit.page.locator("strong", has_text="Live preview").first.wait_for()
     viewer.edited(lambda: viewer.draft.move("parameters.gravity", [3.0, 0, 6.0], "gravity up", time.monotonic()))
     visit.until(lambda: viewer.take is not None and viewer.take.wish.told == "gravity up" and viewer.take.complete)
+    visit.until(lambda: viewer.timeline.count == len(viewer.take.frames) > 7)  # the drawing thread follows a tick later
     with viewer.lock:
         viewer.timeline.pause()
         viewer.timeline.seek(7)

@@ -2,10 +2,11 @@
 
 The same from the shell:
 
-    fluidlift sim demo.fluid --duration 120
+    fluidlift sim demo.fluid --duration 120 --set show.preview=false --set show.usd=false
     fluidlift edit demo.fluid --set duration=1.5 --set loop=true --simulate
 
-Two minutes of the demo at its own resolution take a while; `--frames 200` shows the same in short.
+Two minutes of the demo at its own resolution take half an hour and 19 GB; `--coarse` takes cells twice as wide, and
+`--frames 200` shows the same in short. Nobody watches a preview of 3000 frames: it would take as long again.
 """
 
 import numpy as np
@@ -24,7 +25,7 @@ assert footage is not None, "the loop is held against the clip: give an asset wi
 edits = EditSession.open(b.folder)
 edits.set("duration", LONG)
 b.edited(edits)
-b.simulate(LONG)
+b.simulate(LONG, preview=False)
 
 volume = b.history()["volume"]
 late = volume[len(volume) // 2 :]

@@ -88,6 +88,9 @@ b.check(
     abs(share - wanted) < tolerance,
     f"{share:.2f} of it below the water (from {min(shares):.2f} to {max(shares):.2f}), {wanted:.2f} by weight",
 )
+upright = np.array([matrix_from_quat(p[3:])[2, 2] for p in poses[half:]])
+# waves of a third of its length rock it; a duck on its side has 0, one on its head -1
+b.check("keel down", upright.min() > 0.5, f"leaning by {np.degrees(np.arccos(upright.min())):.0f} degrees at most")
 grid, distance = asset.terrain.grid, asset.terrain.signed_distance
 skin = [mesh.vertices @ matrix_from_quat(p[3:]).T + p[:3] for p in poses]
 depth = min(float(sample_nodes(distance, grid, v[grid.contains(v)]).min(initial=np.inf)) for v in skin)

@@ -11,18 +11,19 @@ from fluidlift.numerics.isosurface import surface_nets
 from fluidlift.types import TriangleMesh
 
 PARTS = (
-    ((0.0, 0.0, 0.0), (0.50, 0.34, 0.26)),  # body
-    ((0.34, 0.0, 0.34), (0.21, 0.20, 0.21)),  # head
-    ((0.58, 0.0, 0.30), (0.13, 0.10, 0.045)),  # beak
-    ((-0.46, 0.0, 0.16), (0.16, 0.14, 0.10)),  # tail
+    ((0.0, 0.0, 0.0), (0.50, 0.42, 0.22)),  # body
+    ((0.32, 0.0, 0.34), (0.17, 0.16, 0.17)),  # head
+    ((0.54, 0.0, 0.31), (0.13, 0.09, 0.035)),  # beak
+    ((-0.46, 0.0, 0.13), (0.16, 0.16, 0.09)),  # tail
 )
-"""centre and half axes; the duck looks along +x and is about 1.2 long"""
-MELT = 0.08
+"""centre and half axes; the duck looks along +x and is about 1.2 long. It is as dense everywhere, without the weight
+that a toy has in its keel: with a narrower body, or a larger head, it would float upside down"""
+MELT = 0.05
 """width over which parts flow into each other"""
 YELLOW, ORANGE, BLACK = (1.0, 0.78, 0.06), (0.95, 0.38, 0.05), (0.04, 0.04, 0.05)
 """sRGB"""
-EYES = ((0.49, 0.115, 0.40), (0.49, -0.115, 0.40))
-EYE = 0.055
+EYES = ((0.445, 0.105, 0.405), (0.445, -0.105, 0.405))
+EYE = 0.048
 """radius"""
 
 

@@ -13,8 +13,11 @@ from bpy.app.handlers import persistent
 
 from . import build
 from .command import Call, find_command, run
-from .facts import EXPORTED, Facts, read_facts, require_asset, up_to_date
-from .materials import LIQUIDS, liquid_material
+from .edits import changes, panel_values, read_settings
+from .facts import EXPORTED, read_facts, require_asset, up_to_date
+from .ground import rest_on
+from .light import SUN, light_up
+from .materials import LIQUIDS, liquid_material, turns_in_volumes
 
 bl_info = {
     "name": "fluidlift assets",
@@ -26,7 +29,7 @@ bl_info = {
     "category": "Import-Export",
 }
 
-KEPT = ("fluid surface", "fluid splats", "terrain", "clip camera")
+KEPT = ("fluid surface", "fluid splats", build.TERRAIN, "clip camera", SUN)
 """objects that a refresh leaves, with what a person did to them; the sequences among them get the new frames"""
 
 
@@ -51,6 +54,7 @@ def show_material(settings: Settings, context: bpy.types.Context) -> None:
     if surface is not None:
         surface.data.materials.clear()
         surface.data.materials.append(liquid_material(settings.material, tuple(settings.tint)))
+        turns_in_volumes(context.scene, settings.material)
 
 
 class Settings(bpy.types.PropertyGroup):
@@ -126,6 +130,9 @@ class ImportAsset(Guarded, bpy.types.Operator):
         name="Volumes", default=False, description="OpenVDB velocity, density and level set"
     )
     splats: bpy.props.BoolProperty(name="Splats as points", default=True)
+    light: bpy.props.BoolProperty(
+        name="Light", default=True, description="Sun and sky, where the scene has only what Blender starts with"
+    )
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         context.window_manager.fileselect_add(self)
@@ -139,8 +146,9 @@ class ImportAsset(Guarded, bpy.types.Operator):
         export(context, folder, self.volumes)
         into = build.collection()
         assemble(context, folder, into, self.splats)
-        build.terrain_of(into, folder / "rest" / "terrain.glb")
         build.camera_of(into, folder / "rest" / "camera.json")
+        if self.light:
+            light_up(context.scene, into)
         settings.tint, settings.material = facts.tint, facts.material
         read_settings(settings, facts)
         settings.told = f"{folder.name}: {', '.join(o.name for o in into.objects)}"
@@ -163,9 +171,13 @@ def assemble(context: bpy.types.Context, folder: Path, into: bpy.types.Collectio
     if surface is None:
         raise RuntimeError(f"{folder.name} has no simulated frames: run fluidlift sim")
     if splats:
+        first = "fluid splats" not in into.objects
         points = build.sequence(into, "fluid splats", "splats", folder / "frames" / "splats")
-        if points is not None:
+        if points is not None and first:
             points.hide_render = True
+            points.hide_set(True)  # as dots they would cover the surface in every view
+    ground = build.terrain_of(into, folder / EXPORTED / "surface" / "terrain.glb")
+    rest_on(surface, ground, read_facts(folder).cell)
     build.bodies_of(into, folder / EXPORTED / "surface")
     build.volume_of(into, folder / EXPORTED / "volume")
     scene, rate = context.scene, 1.0 / read_facts(folder).interval
@@ -175,37 +187,6 @@ def assemble(context: bpy.types.Context, folder: Path, into: bpy.types.Collectio
     scene.render.use_lock_interface = True  # the sequences change meshes while Blender draws pictures
     scene.frame_set(min(max(scene.frame_current, scene.frame_start), scene.frame_end))
     follow_timeline(scene)
-
-
-def read_settings(settings: Settings, facts: Facts) -> None:
-    """What the frames were simulated with, into the panel."""
-    values = facts.parameters
-    settings.viscosity, settings.density = values["kinematic_viscosity"], values["density"]
-    settings.gravity, settings.inflow = values["gravity"], values["inflow_velocity"]
-    settings.loaded = json.dumps(panel_values(settings))
-
-
-def panel_values(s: Settings) -> dict[str, object]:
-    """Places in scene.yaml, and what the panel says for them; single precision, rounded to what that holds."""
-
-    def numbers(values) -> list[float]:
-        return [float(f"{v:.7g}") for v in values]
-
-    return {
-        "parameters.kinematic_viscosity": numbers([s.viscosity])[0], "parameters.density": numbers([s.density])[0],
-        "parameters.gravity": numbers(s.gravity), "parameters.inflow_velocity": numbers(s.inflow),
-        "duration": numbers([s.duration])[0] or None, "look.material": s.material, "look.tint": numbers(s.tint),
-    }  # fmt: skip
-
-
-def changes(s: Settings) -> list[str]:
-    """Options of `fluidlift edit` for what was changed in the panel; what was fitted and left alone stays as it is, in
-    full precision."""
-    before = json.loads(s.loaded or "{}")
-    words = {k: v for k, v in panel_values(s).items() if before.get(k) != v}
-    if words.get("look.material", "source") != "source" and before.get("look.material") == "source":
-        words["look.style"] = "surface"  # splats as they were lifted have no material
-    return [x for k, v in words.items() for x in ("--set", f"{k}={json.dumps(v)}")]
 
 
 class Simulate(Guarded, bpy.types.Operator):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from .facts import frames, read_bodies
 from .ply import columns, read_ply, whole_numbers
 
 COLLECTION = "fluid asset"
+TERRAIN = "terrain"
 BODY = "fluidlift_body"
 """property of obstacles: their name in scene.yaml"""
 
@@ -179,13 +181,28 @@ def moved_in(into: bpy.types.Collection, importer) -> list[bpy.types.Object]:
     return added
 
 
-def terrain_of(into: bpy.types.Collection, file: Path) -> list[bpy.types.Object]:
-    """Bed and banks; nothing where the fluid has none."""
-    if not file.is_file():
-        return []
+def terrain_of(into: bpy.types.Collection, file: Path) -> bpy.types.Object | None:
+    """Bed and banks, None where the fluid has none. What an earlier import made stays, with what a person did to it,
+    as long as the ground is the same; another one takes its place, and stands where it was put."""
+    had = into.objects.get(TERRAIN)
+    told = hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else ""
+    if had is not None and had.get("fluidlift_file") == told:
+        return had
+    place = None if had is None else had.matrix_world.copy()
+    if had is not None:
+        bpy.data.objects.remove(had, do_unlink=True)
+    if not told:
+        return None
     if "bool" not in vars(np):  # the importer of Blender 3.4 still asks for the name that NumPy 1.24 has dropped
         np.bool = bool
-    return moved_in(into, lambda: bpy.ops.import_scene.gltf(filepath=str(file)))
+    added = moved_in(into, lambda: bpy.ops.import_scene.gltf(filepath=str(file)))
+    ground = next((o for o in added if o.type == "MESH"), None)
+    if ground is not None:
+        ground.name = TERRAIN
+        ground["fluidlift_file"] = told
+        if place is not None:
+            ground.matrix_world = place
+    return ground
 
 
 def volume_of(into: bpy.types.Collection, folder: Path) -> bpy.types.Object | None:

@@ -23,6 +23,8 @@ class Facts(NamedTuple):
     material: str
     """source: the clip's own colours"""
     tint: tuple[float, ...]
+    cell: float
+    """m, of the simulation's grid"""
 
 
 def require_asset(folder: Path | None) -> Path:
@@ -56,6 +58,7 @@ def read_facts(folder: Path) -> Facts:
             dict(fitted["values"]) | dict(played.get("parameters", {})),
             str(look.get("material", "source")) if styled else "source",
             tuple(float(t) for t in look.get("tint", (1.0, 1.0, 1.0))) if styled else (1.0, 1.0, 1.0),
+            float((played.get("grid") or manifest["grid"])["spacing"]),
         )
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise RuntimeError(f"{folder.name} does not say what an asset says ({error}): is it damaged?") from None

@@ -15,6 +15,8 @@ OPAQUE = 300.0
 """1/m of scattering, from which on nothing is seen through a few millimetres"""
 DYED, LEAST = 0.1, 1e-3
 """m through which light takes on a tint in full, and what a channel of it counts at least"""
+TURNS = 8
+"""of light in a body that scatters it, that Cycles follows at least"""
 
 Color = tuple
 
@@ -37,10 +39,10 @@ LIQUIDS = {
     "source": Liquid(1.333, 0.12, (0.0, 0.0, 0.0), 400.0, (0.8, 0.8, 0.8)),
     "water": Liquid(1.333, 0.0, (0.27, 0.056, 0.010), 0.0, (0.8, 0.8, 0.8)),
     "muddy_water": Liquid(1.334, 0.0, (0.9, 1.6, 3.4), 22.0, (0.30, 0.185, 0.085)),
-    "honey": Liquid(1.49, 0.04, (5.0, 26.0, 110.0), 4.0, (0.80, 0.40, 0.03)),
+    "honey": Liquid(1.49, 0.04, (3.0, 16.0, 70.0), 6.0, (0.110, 0.0277, 0.0068)),
     "lava": Liquid(1.58, 0.45, (300.0, 300.0, 300.0), 3000.0, (0.035, 0.030, 0.028), (4.5, 0.60, 0.006)),
     "milk": Liquid(1.35, 0.05, (1.1, 2.4, 14.0), 3200.0, (0.91, 0.88, 0.76)),
-    "oil": Liquid(1.47, 0.02, (9.0, 7.0, 150.0), 0.8, (0.75, 0.66, 0.10)),
+    "oil": Liquid(1.47, 0.02, (9.0, 7.0, 150.0), 0.8, (0.0073, 0.0093, 0.0004)),
     "chocolate": Liquid(1.457, 0.22, (400.0, 900.0, 1500.0), 4000.0, (0.105, 0.042, 0.018)),
 }
 
@@ -59,7 +61,10 @@ def liquid_material(name: str, tint: Color = (1.0, 1.0, 1.0)) -> bpy.types.Mater
     links.new(shader.outputs[0], output.inputs["Surface"])
     opaque = liquid.scattering >= OPAQUE
     color = tuple(a * t for a, t in zip(liquid.albedo, tint))
-    material.diffuse_color = (*color, 1.0) if opaque or name == "honey" else (*color, 0.6)
+    if opaque:
+        material.diffuse_color = (*color, 1.0)
+    else:  # in plain views of Blender: what comes through five centimetres
+        material.diffuse_color = (*(math.exp(-0.05 * a) * t for a, t in zip(liquid.absorption, tint)), 0.6)
     _set(shader, ("Base Color",), (*color, 1.0) if opaque else (1.0, 1.0, 1.0, 1.0))
     _set(shader, ("IOR",), liquid.refractive_index)
     _set(shader, ("Roughness",), liquid.roughness)
@@ -71,6 +76,9 @@ def liquid_material(name: str, tint: Color = (1.0, 1.0, 1.0)) -> bpy.types.Mater
         _set(shader, ("Emission Strength",), strength)
     if name == "source":
         _colors_of_vertices(material, shader, tint)
+    for name_of_flag in ("use_screen_refraction", "use_raytrace_refraction"):  # EEVEE's, of older and newer versions
+        if hasattr(material, name_of_flag):
+            setattr(material, name_of_flag, not opaque)
     if not opaque:
         _lit_through(material, output, shader)
         _body(material, output, liquid, tint)
@@ -108,23 +116,63 @@ def _lit_through(material: bpy.types.Material, output: bpy.types.ShaderNode, sha
     links.new(mix.outputs[0], output.inputs["Surface"])
 
 
+def medium(liquid: Liquid, tint: Color) -> tuple[list[float], list[float]]:
+    """Absorption and scattering, 1/m for each channel, of a body that shows its colour where it is deep.
+
+    What a clear one absorbs is its own. In others light is lost at the same rate, and the share of it that goes on is
+    that with which a half space has the colour: van de Hulst's R = (1 - s)(1 - 0.139 s) / (1 + 1.17 s) with
+    s = sqrt(1 - share) (Multiple Light Scattering, 1980), of which the surface throws a part back inside.
+    """
+    absorbed = [a - math.log(max(t, LEAST)) / DYED for a, t in zip(liquid.absorption, tint)]
+    if liquid.scattering == 0:
+        return absorbed, [0.0, 0.0, 0.0]
+    scattered, inside = [], held_inside(liquid.refractive_index)
+    for k, (color, t) in enumerate(zip(liquid.albedo, tint)):
+        r = color * t / (1.0 - inside + inside * color * t)
+        b, c = 1.139 + 1.17 * r, 1.0 - r
+        s = (b - math.sqrt(b * b - 4 * 0.139 * c)) / (2 * 0.139)
+        lost = absorbed[k] + liquid.scattering
+        scattered.append((1.0 - s * s) * lost)
+        absorbed[k] = lost - scattered[k]
+    return absorbed, scattered
+
+
+def held_inside(index: float, steps: int = 500) -> float:
+    """Share of even light inside a body that its surface throws back, by reciprocity from what it mirrors outside."""
+    mirrored = 0.0
+    for k in range(steps):
+        cos = (k + 0.5) / steps
+        bent = math.sqrt(1.0 - (1.0 - cos * cos) / index**2)
+        across, along = (cos - index * bent) / (cos + index * bent), (bent - index * cos) / (bent + index * cos)
+        mirrored += cos * (across**2 + along**2) / steps
+    return 1.0 - (1.0 - mirrored) / index**2
+
+
 def _body(material: bpy.types.Material, output: bpy.types.ShaderNode, liquid: Liquid, tint: Color) -> None:
     """Absorption and scattering. Blender's nodes take a density (1/m) and a colour: what is absorbed is the density
     times what the colour lacks to white, what is scattered the density times the colour."""
     nodes, links = material.node_tree.nodes, material.node_tree.links
-    absorbed = [a - math.log(max(t, LEAST)) / DYED for a, t in zip(liquid.absorption, tint)]
+    absorbed, scattered = medium(liquid, tint)
     absorption = nodes.new("ShaderNodeVolumeAbsorption")
     absorption.location = (-220, -400)
     density = max(absorbed)
     absorption.inputs["Density"].default_value = density
     absorption.inputs["Color"].default_value = (*(1.0 - a / density if density > 0 else 1.0 for a in absorbed), 1.0)
-    last = absorption.outputs[0]
-    if liquid.scattering > 0:
+    last, density = absorption.outputs[0], max(scattered)
+    if density > 0:
         scatter, both = nodes.new("ShaderNodeVolumeScatter"), nodes.new("ShaderNodeAddShader")
         scatter.location, both.location = (-220, -560), (60, -400)
-        scatter.inputs["Color"].default_value = (1.0, 1.0, 1.0, 1.0)
-        scatter.inputs["Density"].default_value = liquid.scattering
+        scatter.inputs["Color"].default_value = (*(v / density for v in scattered), 1.0)
+        scatter.inputs["Density"].default_value = density
         links.new(last, both.inputs[0])
         links.new(scatter.outputs[0], both.inputs[1])
         last = both.outputs[0]
     links.new(last, output.inputs["Volume"])
+
+
+def turns_in_volumes(scene: bpy.types.Scene, name: str) -> None:
+    """Let Cycles follow light through a body that scatters it: by default it stops at the first turn, and honey is as
+    dark as what it absorbs."""
+    liquid = LIQUIDS.get(name, LIQUIDS["source"])
+    if 0 < liquid.scattering < OPAQUE and hasattr(scene, "cycles"):
+        scene.cycles.volume_bounces = max(scene.cycles.volume_bounces, TURNS)

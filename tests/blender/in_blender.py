@@ -4,6 +4,7 @@ extension, asset, command. Prints one JSON line."""
 import json
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import bpy
 import numpy as np
@@ -80,6 +81,52 @@ def surface_material() -> str:
     return bpy.data.objects["fluid surface"].data.materials[0].name
 
 
+class Layout:
+    """Takes what a panel draws, and wants every property and operator to be there."""
+
+    def __init__(self) -> None:
+        self.drawn: list[str] = []
+
+    def prop(self, data, name: str) -> None:
+        self.drawn.append(data.bl_rna.properties[name].name)
+
+    def operator(self, name: str, text: str = ""):
+        group, short = name.split(".")
+        self.drawn.append(text or getattr(getattr(bpy.ops, group), short).get_rna_type().name)
+        return SimpleNamespace()
+
+    def label(self, text: str = "") -> None:
+        self.drawn.append(text)
+
+    def box(self) -> "Layout":
+        return self
+
+    def row(self, align: bool = False) -> "Layout":
+        return self
+
+
+def panel() -> list[str]:
+    """What the sidebar and the menu draw."""
+    layout = Layout()
+    fluidlift_asset.Panel.draw(SimpleNamespace(layout=layout), bpy.context)
+    fluidlift_asset.menu(SimpleNamespace(layout=layout), bpy.context)
+    return layout.drawn
+
+
+def contact() -> dict:
+    """How far the modifier moves points, m, and whether those that it moves end inside the ground."""
+    surface, ground = bpy.data.objects["fluid surface"], bpy.data.objects["terrain"]
+    shown = surface.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
+    ways = [(a.co - b.co).length for a, b in zip(shown.vertices, surface.data.vertices)]
+    moved = [v.co for v, way in zip(shown.vertices, ways) if way > 1e-7]
+    into = ground.matrix_world.inverted()
+    inside = []
+    for place in moved:
+        _, at, normal, _ = ground.closest_point_on_mesh(into @ place)
+        inside.append((into @ place - at).dot(normal) < 0)
+    return {"points": len(ways), "moved": len(moved), "farthest": max(ways), "inside": sum(inside)}
+
+
 out: dict = {"version": bpy.app.version_string, "refused": {}}
 settings.command = "/no/such/command"
 out["refused"]["command"] = refused(lambda: bpy.ops.fluidlift.import_asset(directory=asset))
@@ -96,6 +143,9 @@ scene.frame_set(scene.frame_end)
 out["last"] = look()
 camera = scene.camera
 out["camera"] = {"matrix": [list(row) for row in camera.matrix_world], "lens": camera.data.lens}
+out["light"] = [scene.world.name, sum(o.type == "LIGHT" for o in scene.objects)]
+out["panel"] = panel()
+out["contact"] = contact()
 out["blur"] = blurred_by_velocity()
 
 bpy.data.objects["fluid surface"].modifiers.new("mine", "SMOOTH")
@@ -105,10 +155,17 @@ bpy.ops.mesh.primitive_uv_sphere_add(
 )
 bpy.context.active_object.name = "ball"
 settings.motion = "free"
+out["panel"] += panel()
 bpy.ops.fluidlift.add_obstacle()
 out["refused"]["twice"] = refused(bpy.ops.fluidlift.add_obstacle)
 settings.material = "honey"
 out["material"].append(surface_material())
+nodes = bpy.data.objects["fluid surface"].data.materials[0].node_tree.nodes
+out["honey"] = {
+    n.bl_idname: [n.inputs["Density"].default_value, *n.inputs["Color"].default_value]
+    for n in nodes
+    if "Volume" in n.bl_idname
+}
 settings.viscosity = 0.01
 settings.duration = 3 / out["rate"]
 bpy.ops.fluidlift.simulate(wait=True)

@@ -14,9 +14,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fluidlift.backends.mitsuba_scene import medium
 from fluidlift.io.asset_folder import load_asset, read_manifest, update_manifest
 from fluidlift.io.ply import read_mesh, read_splats
 from fluidlift.io.scene import read_edits
+from fluidlift.look.materials import HONEY
 
 ROOT = Path(__file__).resolve().parents[2]
 FRAMES = 4
@@ -114,6 +116,38 @@ def test_cycles_blurs_the_surface_by_its_velocities(seen):
     assert moving > 1e-4
 
 
+def test_honey_is_the_medium_that_our_own_path_tracer_is_given(seen):
+    extinction, share = medium(HONEY, np.zeros(3))
+    found = seen[0]["honey"]
+    density, *color, _ = found["ShaderNodeVolumeScatter"]
+    scattered = density * np.array(color)
+    density, *color, _ = found["ShaderNodeVolumeAbsorption"]
+    absorbed = density * (1 - np.array(color))
+    # single precision, of 1 - color where that is near 1
+    np.testing.assert_allclose(scattered, extinction * share, rtol=1e-4)
+    np.testing.assert_allclose(absorbed, extinction * (1 - share), rtol=1e-4)
+
+
+def test_an_unlit_scene_gets_sun_and_sky(seen):
+    assert seen[0]["light"] == ["fluidlift sky", 1]
+
+
+def test_the_panel_and_the_menu_draw_what_they_offer(seen):
+    drawn = seen[0]["panel"]
+    assert {"Viscosity", "Density", "Gravity", "Inflow", "Duration", "Look", "Tint", "Simulate again"} <= set(drawn)
+    assert drawn.count("Its density") == 1  # only of an obstacle that moves
+    assert "Fluid asset (.fluid folder)" in drawn
+
+
+def test_the_underside_of_the_liquid_lies_in_the_ground(seen, made):
+    """Else a film of air is left between them, which throws the light back."""
+    found, cell = seen[0]["contact"], load_asset(made.folder).grid.spacing
+    assert 0.05 * found["points"] < found["moved"] < 0.7 * found["points"]  # of a shallow body about half looks down
+    # at most one cell to the ground and three tenths of one into it, in single precision
+    assert found["farthest"] < 1.301 * cell
+    assert found["inside"] > 0.95 * found["moved"]  # beside creases the nearest place is on the other side
+
+
 def test_the_panel_changes_what_was_changed_in_it_and_nothing_else(seen):
     found, folder, _, before = seen
     edits = read_edits(folder)
@@ -130,7 +164,7 @@ def test_the_new_simulation_is_shown_and_what_a_person_did_to_the_objects_stays(
     assert found["after"] == [1001, 1003]
     assert found["changed"]["splats"]["vertices"] != found["last"]["splats"]["vertices"]
     assert found["material"] == ["fluidlift source", "fluidlift honey", "fluidlift honey"]
-    assert found["modifiers"] == ["mine"]
+    assert found["modifiers"] == ["fluidlift rests on the ground", "mine"]
 
 
 def test_a_floating_obstacle_moves_as_it_was_simulated(seen):

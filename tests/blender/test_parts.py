@@ -101,8 +101,10 @@ def test_the_look_of_the_frames_is_read(tmp_path):
         (None, "source"),
     ):
         played = {"frame_interval": 0.04, "parameters": {"density": 900}} | ({"look": look} if look else {})
-        (tmp_path / "manifest.json").write_text(json.dumps({"frame_interval": 0.02, "simulation": played}))
+        told = {"frame_interval": 0.02, "grid": {"spacing": 0.1}, "simulation": played}
+        (tmp_path / "manifest.json").write_text(json.dumps(told))
         found = facts.read_facts(tmp_path)
+        assert found.cell == 0.1
         assert (found.material, found.interval, found.parameters["density"]) == (material, 0.04, 900)
         assert found.tint == ((1.0, 0.5, 1.0) if material == "honey" else (1.0, 1.0, 1.0))
 

@@ -144,6 +144,26 @@ def test_an_emitter_may_be_above_the_box_as_far_as_it_is_raised(edits):
         require_inside(edits(text % 2.6), GRID, above=2.0)
 
 
+def test_a_free_obstacle_may_be_dropped_from_above_the_box_where_it_falls_in(edits):
+    text = "obstacles: [{shape: sphere, radius: 0.1, motion: %s, position: %s}]\n%s"
+    assert require_inside(edits(text % ("free", [0.5, 0.5, 2.0], "")), GRID) == []
+    # 1.4 m above the box: 0.53 s on its way
+    (warning,) = require_inside(edits(text % ("free", [0.5, 0.5, 2.0], "")), GRID, seconds=0.5)
+    assert "line 1: obstacle 'sphere1' falls for 0.53 s" in warning and "after the last frame" in warning
+    assert require_inside(edits(text % ("free", [0.5, 0.5, 2.0], "")), GRID, seconds=0.6) == []
+    moon = "parameters: {gravity: [0, 0, -1.62]}"
+    (warning,) = require_inside(edits(text % ("free", [0.5, 0.5, 2.0], moon)), GRID, seconds=0.6)
+    assert "falls for 1.3 s" in warning
+    for motion, place, more in (
+        ("free", [0.5, 0.5, 3.0], ""),  # more than two box lengths above
+        ("free", [2.0, 0.5, 1.0], ""),  # beside it
+        ("free", [0.5, 0.5, 2.0], "parameters: {gravity: [0, 0, 9.81]}"),
+        ("static", [0.5, 0.5, 2.0], ""),
+    ):
+        with pytest.raises(InputRejected, match=r"line 1.*outside the domain"):
+            require_inside(edits(text % (motion, place, more)), GRID)
+
+
 def test_a_channel_that_is_extended_has_room_for_more(edits):
     far = edits("obstacles: [{shape: sphere, radius: 0.1, position: [2, 0.5, 0.2]}]")
     with pytest.raises(InputRejected, match="outside"):

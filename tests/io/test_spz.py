@@ -2,11 +2,13 @@
 
 import gzip
 import struct
+import tracemalloc
 
 import numpy as np
 import pytest
 
 from fluidlift.errors import InputRejected
+from fluidlift.io import spz
 from fluidlift.io.spz import fractional_bits, read_spz, write_spz
 from fluidlift.look.rasterize import render
 from fluidlift.types import Gaussians, PinholeCamera, matrix_from_quat
@@ -82,3 +84,20 @@ def test_files_that_are_none_are_refused(tmp_path, gaussians):
         (tmp_path / "b.spz").write_bytes(data)
         with pytest.raises(InputRejected, match=words):
             read_spz(tmp_path / "b.spz")
+
+
+def test_a_file_too_large_is_refused_before_it_is_read(tmp_path, gaussians, monkeypatch):
+    path = write_spz(tmp_path / "a.spz", gaussians(10))
+    monkeypatch.setattr(spz, "MAX_BYTES", path.stat().st_size - 1)
+    with pytest.raises(InputRejected, match="bytes in a SPZ file"):
+        read_spz(path)
+
+
+def test_no_more_is_unpacked_than_the_splats_that_the_header_claims(tmp_path, gaussians):
+    whole = gzip.decompress(write_spz(tmp_path / "a.spz", gaussians(10)).read_bytes())
+    (tmp_path / "b.spz").write_bytes(gzip.compress(whole + bytes(200_000_000), 9))  # 0.2 MB that unpack to 200
+    tracemalloc.start()
+    assert len(read_spz(tmp_path / "b.spz")) == 10
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 5e6  # the file itself, some copies of 10 splats, and buffers of zlib

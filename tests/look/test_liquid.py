@@ -7,7 +7,18 @@ import pytest
 import trimesh
 
 from fluidlift.look.environment import Environment
-from fluidlift.look.liquid import COOL, HOT, WARM, Behind, LiquidSurface, followed, glow, shaded, shaded_plain
+from fluidlift.look.liquid import (
+    COOL,
+    HOT,
+    WARM,
+    Behind,
+    LiquidSurface,
+    film_shown,
+    followed,
+    glow,
+    shaded,
+    shaded_plain,
+)
 from fluidlift.look.materials import PRESETS, Material
 from fluidlift.look.optics import fresnel, refract
 from fluidlift.look.screen_space import mesh_surface
@@ -207,3 +218,37 @@ def test_pictures_of_other_sizes_are_refused():
         shaded(slab(), Behind(np.zeros((10, 10, 3)), np.zeros((10, 10))), CAMERA, CLEAR, WHITE)
     with pytest.raises(ValueError, match="normal of shape"):
         LiquidSurface(np.ones((4, 4)), np.ones((4, 4)), np.ones((4, 4)), np.ones((4, 4, 3)), np.ones((4, 4)))
+
+
+def test_a_film_fades_with_its_height_over_the_ground_however_slanting_it_is_seen():
+    z, rays = level(0.0), CAMERA.rays(CAMERA.pixel_grid())
+    behind = Behind(np.full((*SIZE[::-1], 3), 0.25), z)
+    for height, share in ((0.0, 0.0), (0.005, 0.5), (0.01, 1.0), (0.5, 1.0)):
+        film = slab(top=height, thick=1.0, grain=0.01)
+        # heights of a hundredth at 4 m, in float32: 1e-4 of the grain and its slope of 1.5
+        np.testing.assert_allclose(film_shown(film, behind, CAMERA), share, atol=2e-3)
+        found = shaded(film, behind, CAMERA, PRESETS["milk"], WHITE)
+        whole = shaded(slab(top=height, thick=1.0), behind, CAMERA, PRESETS["milk"], WHITE)
+        if height > 0:
+            np.testing.assert_allclose(found, 0.25 + share * (whole - 0.25), atol=5e-3)
+    assert rays[..., 2].max() < -0.5  # it is seen from 20 to 60 degrees off the vertical
+
+
+def test_round_a_rock_in_a_pond_there_is_no_bright_ring():
+    # a wall stands in a pond 0.3 m deep that its mesh reaches into: the far side is the bed or the wall
+    top, bed = level(0.0), level(-0.3)
+    wall = np.zeros(SIZE[::-1], bool)
+    wall[20:35, 30:50] = True
+    rock = np.where(wall, 0.98 * top, bed)  # it stands out of the pond there
+    below = np.broadcast_to([0.0, 0.0, -1.0], (*SIZE[::-1], 3)).copy()
+    below[15:40, 25:55] = [0.0, 0.8, -0.6]  # the mesh follows the rock's flank, which would mirror all light in air
+    surface = slab(top=0.0, thick=0.5, back_normal=below)
+    behind = Behind(np.full((*SIZE[::-1], 3), 0.05), rock)
+    picture = shaded(surface, behind, CAMERA, CLEAR, WHITE)[..., 0]
+    around = np.zeros_like(wall)
+    around[15:40, 25:55] = True
+    share = fresnel(-CAMERA.rays(CAMERA.pixel_grid())[..., 2] / np.linalg.norm(
+        CAMERA.rays(CAMERA.pixel_grid()), axis=-1), 1.333)  # fmt: skip
+    expected = share + (1 - share) * 0.05
+    np.testing.assert_allclose(picture[around & ~wall], expected[around & ~wall], atol=1e-4)
+    np.testing.assert_array_equal(picture[wall], np.float32(0.05))

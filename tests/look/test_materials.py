@@ -49,3 +49,11 @@ def test_a_tint_is_taken_on_by_white_light_after_the_depth_that_is_said():
     assert np.isfinite(WATER.tinted((0.0, 1.0, 1.0)).absorption).all()
     with pytest.raises(ValueError, match="tint"):
         WATER.tinted((2.0, 0.0, 0.0))
+
+
+def test_a_spoon_of_honey_is_gold_and_a_barrel_brown():
+    honey = PRESETS["honey"]
+    spoon, barrel = honey.before_white(0.01), honey.before_white(1.0)
+    assert spoon[0] > 0.8 and spoon[0] > 1.1 * spoon[1] > 1.2 * spoon[2]
+    np.testing.assert_allclose(barrel, honey.albedo, rtol=2e-3)  # exp(-9) of the white is left
+    np.testing.assert_allclose(PRESETS["water"].before_white(0.0), 1.0)

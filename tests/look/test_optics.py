@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from fluidlift.look.optics import fresnel, mirrored, refract, transmittance
+from fluidlift.look.materials import PRESETS
+from fluidlift.look.optics import deep_color, fresnel, held_inside, mirrored, refract, scattering_share, transmittance
 
 RNG = np.random.default_rng(3)
 
@@ -87,3 +88,39 @@ def test_light_is_absorbed_layer_by_layer():
 def test_an_index_that_is_none_is_refused():
     with pytest.raises(ValueError, match="refractive index"):
         fresnel(np.array(1.0), 0.0)
+
+
+def test_a_deep_body_returns_what_chandrasekhar_says():
+    # 1960: a half space of albedo w under light from everywhere reflects 1 - 2 sqrt(1 - w) int H mu dmu
+    nodes, weights = np.polynomial.legendre.leggauss(32)
+    mu, weights = 0.5 * (nodes + 1), 0.5 * weights
+    for share in (0.3, 0.9, 0.99):
+        h = np.ones(32)
+        for _ in range(400):
+            h = 1 / (np.sqrt(1 - share) + 0.5 * share * (weights * mu * h / (mu[:, None] + mu)).sum(1))
+        reflected = 1 - 2 * np.sqrt(1 - share) * (weights * mu * h).sum()
+        assert scattering_share(np.array([reflected])) == pytest.approx([share], abs=0.01)  # of the fit
+        assert deep_color(np.array([1 - share]), share) == pytest.approx([reflected], abs=0.01)
+    assert scattering_share(np.array([0.0, 1.0])) == pytest.approx([0.0, 1.0], abs=1e-9)
+
+
+def test_the_colour_of_a_deep_body_and_the_share_that_it_scatters_are_inverse():
+    absorption = np.array([0.5, 3.0, 40.0])
+    for index in (1.0, 1.333, 1.5):
+        share = scattering_share(deep_color(absorption, 6.0, index), index)
+        np.testing.assert_allclose(share, 6.0 / (absorption + 6.0), rtol=1e-9)
+    assert (deep_color((1.0, 2.0, 3.0), 0.0, 1.3) == 0).all() and deep_color((0.0, 0.0, 0.0), 1.0)[0] == 1.0
+
+
+def test_more_than_half_of_the_even_light_in_glass_does_not_get_out():
+    # a smooth surface of index 1.5 mirrors 9.18 % of even light from outside (Walsh 1926), and 59.6 % from inside
+    assert held_inside(1.5) == pytest.approx(0.596, abs=1e-3)
+    assert held_inside(1.0) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_presets_of_liquids_show_in_the_deep_what_their_numbers_make():
+    for name, allowed in (("honey", 0.001), ("oil", 0.0001), ("milk", 0.015)):
+        m = PRESETS[name]
+        # honey and oil are rounded; milk was measured for itself (Jensen et al. 2001: 0.91, 0.88, 0.76)
+        found = deep_color(m.absorption, m.scattering, m.refractive_index)
+        np.testing.assert_allclose(found, m.albedo, atol=allowed)

@@ -7,7 +7,11 @@ from fluidlift.look.environment import Environment, built_in
 from fluidlift.look.fluid_normals import (
     add_solid_kernel,
     add_solid_plain,
+    depths_kernel,
+    depths_plain,
+    fluid_depths,
     fluid_normals,
+    fluid_surface,
     gather_kernel,
     gather_plain,
     normals_kernel,
@@ -128,6 +132,52 @@ def test_the_kernel_that_adds_the_bed_is_its_twin():
     add_solid_plain(terrain, low, h, plain)
     np.testing.assert_allclose(compiled, plain, atol=1e-5)
     assert plain.max() > 0.5 and plain.min() == np.float32(0.2)
+
+
+def layer(thick, wide=0.4):
+    """Splats of a level layer, m, on a shaken lattice."""
+    n = (int(wide / SPACING), int(wide / SPACING), int(round(thick / SPACING)))
+    p = (np.stack(np.meshgrid(*map(np.arange, n), indexing="ij"), -1).reshape(-1, 3) + 0.5) * SPACING
+    p = p - (wide / 2, wide / 2, thick) + np.random.default_rng(0).uniform(-0.2, 0.2, p.shape) * SPACING
+    return Gaussians.isotropic(p.astype(np.float32), SPACING / 2, np.full((len(p), 3), 0.5))
+
+
+@pytest.mark.parametrize("thick", [0.06, 0.16, 0.32])
+def test_a_layer_is_as_deep_as_it_is(thick):
+    g = layer(thick)
+    middle = np.abs(g.means[:, :2]).max(axis=1) < 0.08
+    found = fluid_depths(g, np.broadcast_to([0.0, 0.0, 1.0], g.means.shape), SPACING)[middle]
+    # the density is held at 0.92 inside, and its blur adds at both ends
+    assert np.median(found) == pytest.approx(thick, rel=0.06, abs=0.5 * SPACING)
+    aslant = fluid_depths(g, np.broadcast_to([0.0, np.sqrt(0.5), np.sqrt(0.5)], g.means.shape), SPACING)[middle]
+    if thick < 0.1:  # else it leaves through the sides
+        assert np.median(aslant) == pytest.approx(thick * np.sqrt(2), abs=SPACING)
+
+
+def test_the_kernel_of_depths_is_its_twin():
+    rng = np.random.default_rng(0)
+    density = rng.random((14, 13, 12)).astype(np.float32) ** 0.3
+    points = rng.uniform(0.3, 1.0, (200, 3)).astype(np.float32)
+    normals = rng.normal(size=(200, 3)).astype(np.float32)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    out = np.zeros(200, np.float32)
+    depths_kernel(points, normals, np.zeros(3), 0.1, density, out)
+    plain = depths_plain(points, normals, np.zeros(3), 0.1, density)
+    # a place at which the density is that of the end within float32 may count or not: one of them, if any
+    assert np.mean(np.abs(out - plain) < 1e-4) > 0.99 and plain.max() > 0.2
+    broken = np.full((1, 3), np.nan, np.float32)
+    assert fluid_depths(Gaussians.isotropic(broken, 0.1, np.ones((1, 3))), np.ones((1, 3)), SPACING)[0] == 0.0
+
+
+def test_the_surface_for_shadows_is_closed_and_as_large_as_the_body():
+    mesh = fluid_surface(ball(), SPACING)
+    a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(float) for k in range(3))
+    volume = (a * np.cross(b, c)).sum() / 6  # positive: outward
+    assert np.abs((np.cross(b - a, c - a)).sum(axis=0)).max() < 1e-4  # no hole: the areas cancel
+    # it stands off by up to a node's distance, two spacings
+    assert 4 / 3 * np.pi * 0.25**3 < volume < 4 / 3 * np.pi * (0.25 + 2 * SPACING) ** 3
+    assert len(fluid_surface(layer(SPACING), SPACING).faces) > 0  # one layer of splats throws a shadow
+    assert len(fluid_surface(Gaussians.empty(), SPACING).faces) == 0
 
 
 def test_a_small_move_changes_normals_little():
@@ -286,6 +336,22 @@ def test_clear_liquids_show_the_clip_and_cloudy_ones_themselves():
     np.testing.assert_allclose(body_color(g, own, PRESETS["source"]), own)
     red, _, blue = body_color(g, own, PRESETS["honey"])[0]
     assert red > 3 * blue
+
+
+def test_honey_is_light_where_it_is_thin_and_dark_and_red_where_it_is_deep():
+    g = layer(0.2)
+    own = np.full((len(g), 3), 0.6, np.float32)
+    normals, share = np.tile(np.float32([0, 0, 1]), (len(g), 1)), np.ones(len(g), np.float32)
+    depths = np.linspace(0.0, 1.0, len(g))
+    body = body_color(g, own, PRESETS["honey"], depths)
+    np.testing.assert_allclose(body[0], own[0], rtol=1e-5)  # what is behind no honey is as it was
+    assert (np.diff(body[:, 0]) <= 1e-6).all()  # darker and darker; float32
+    np.testing.assert_allclose(body[-1], PRESETS["honey"].albedo, rtol=0.02)  # and in the end its own brown
+    middle = body[3 * len(g) // 100]  # 3 cm
+    assert body[0, 1] > 1.4 * middle[1] and middle[0] / middle[2] > 4 * body[0, 0] / body[0, 2]
+    args = (normals, share, CAMERA, PRESETS["honey"], Environment.white())
+    thin, thick = (relit(g, *args, depths=np.full(len(g), d)).mean(axis=0) for d in (0.003, 0.05))
+    assert thin @ (1, 1, 1) > 1.5 * thick @ (1, 1, 1)
 
 
 def test_hot_parts_glow_yellow_and_cool_ones_red_or_not_at_all():

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from fluidlift.look.screen_space import mesh_surface, particle_surface
+from fluidlift.look.liquid import Behind, film_shown
+from fluidlift.look.screen_space import GRAIN, mesh_surface, particle_surface
 from fluidlift.look.screen_space_kernels import narrow_range, plane_normals
 from fluidlift.numerics.srgb import linear_from_srgb
 from fluidlift.types import PinholeCamera, TriangleMesh
@@ -175,3 +176,102 @@ def test_pictures_are_the_same_bits_with_any_number_of_threads():
         numba.set_num_threads(threads)
     for name in ("depth", "normal", "thickness", "albedo", "covered"):
         np.testing.assert_array_equal(getattr(one, name), getattr(many, name))
+
+
+def narrow_range_plain(q, down, across, focal, width, limit, fall, lanes=32):
+    """What `narrow_range` does, pixel by pixel; the distance of the pairs is that of the smallest bell of its lanes."""
+    out, (h, w) = q.astype(np.float64), q.shape
+    wide = np.where(q > 0, focal * width * q, 0.0)
+    wide[wide <= 0.3] = 0.0
+    for row in range(h):
+        for first in range(0, w, lanes):
+            some = wide[row, first : first + lanes]
+            if not some.any():
+                continue
+            stride = max(int(some[some > 0].min() / 2.6), 1)
+            steps = min(max(int(2.0 * some.max() / stride), 1), 40)
+            for col in np.flatnonzero(some) + first:
+                own = float(q[row, col])
+                low, high = own - limit * own**2, own + limit * own**2
+                total, weights = own, 1.0
+                for k in range(1, steps + 1):
+                    r, c = k * stride * down, k * stride * across
+                    if row < r or col < c or row + r >= h or col + c >= w:
+                        break
+                    pair = abs(np.array([q[row - r, col - c], q[row + r, col + c]], np.float64))
+                    if pair.max() > high:
+                        break
+                    near = pair > low
+                    pair = np.where(near, pair, own - fall * own**2)
+                    if near.all():
+                        low, high = min(low, pair.min() - limit * own**2), max(high, pair.max() + limit * own**2)
+                    weight = np.exp(-0.5 * (k * stride / wide[row, col]) ** 2)
+                    total, weights = total + weight * pair.sum(), weights + 2 * weight
+                out[row, col] = total / weights
+    return out
+
+
+@pytest.mark.parametrize(("down", "across"), [(0, 1), (1, 0)])
+def test_the_compiled_smoothing_is_that_of_the_formula(down, across):
+    rng = np.random.default_rng(0)
+    u, v = np.meshgrid(np.arange(75.0), np.arange(50.0))
+    q = 0.5 + 0.002 * u + 0.001 * v + 0.01 * rng.standard_normal(u.shape)
+    q[10:20, 30:50] += 0.6  # something nearer
+    q[30:, 20:40] = 0.0  # nothing
+    q[40:, 50:] *= -1.0  # ground
+    q = q.astype(np.float32)
+    settings = down, across, 100.0, np.float32(0.08), np.float32(0.3), np.float32(0.1)
+    out = np.empty_like(q)
+    narrow_range(q, out, *settings)
+    # float32, and a bell that is a power of 64 of a short series: 1e-5
+    np.testing.assert_allclose(out, narrow_range_plain(q, *settings), rtol=3e-5)
+
+
+SLOPE = np.radians(15.0)
+"""of a beach, rising towards +x, whose shoreline is x = 0"""
+
+
+def beach(camera, slope=SLOPE):
+    """Camera z of the beach z = x tan(slope)."""
+    normal = np.array([-np.sin(slope), 0.0, np.cos(slope)])
+    rays = camera.rays(camera.pixel_grid())
+    return -(camera.position @ normal) / (rays @ normal)
+
+
+def pond(spacing=0.04):
+    """Particles of a pond with its level at z = 0 on the beach: half a spacing below the level and above the bed."""
+    points = box((2.4, 1.6, 0.6), spacing) - [1.2, 0.0, 0.3]
+    over = points[:, 2] - points[:, 0] * np.tan(SLOPE)
+    return points[over > 0.5 * spacing]
+
+
+SHORE = PinholeCamera.looking((-0.4, -1.2, 1.6), (-0.3, 0.0, 0.0), 40.0, (320, 240))
+
+
+def test_a_pond_ends_on_its_beach_without_a_rim_and_thins_out_to_nothing():
+    ground = beach(SHORE).astype(np.float32)
+    surface = particle_surface(pond(), RADIUS, SHORE, ground=ground)
+    shown = surface.covered * film_shown(surface, Behind(np.zeros((240, 320, 3)), ground), SHORE)
+    place = SHORE.unproject(SHORE.pixel_grid(), ground)
+    inside = (np.abs(place[..., 1]) < 0.4) & (place[..., 0] > -0.9)
+    wet = inside & (shown > 0.5)
+    # it ends within a diameter of the outermost particles, which lie up to a spacing short of where the level meets
+    # the bed, and their spheres stand a radius out of both
+    ends = place[..., 0][wet].max()
+    assert -2 * RADIUS / np.tan(SLOPE) < ends < 2 * RADIUS / np.tan(SLOPE)
+    # where it ends, it is thin: nothing of more than two grains over the bed stops short
+    rim = wet & ~(np.roll(wet, 1, 1) & np.roll(wet, -1, 1))
+    over = SHORE.unproject(SHORE.pixel_grid(), surface.depth) @ np.array([-np.sin(SLOPE), 0, np.cos(SLOPE)])
+    assert np.median(over[rim & (place[..., 0] > -0.2)]) < 2 * GRAIN * RADIUS
+    # and it faces upwards up to there: the outermost layer ends in steps of half a sphere, 30 degrees when evened out,
+    # on top of the beach's own slope
+    up = np.percentile(surface.normal[wet][:, 2], 1)
+    assert up > np.cos(SLOPE + np.radians(30.0))
+
+
+def test_what_lies_in_the_ground_is_not_seen_and_ground_in_front_hides():
+    ground = np.full((120, 160), 2.0, np.float32)
+    surface = particle_surface(box(), RADIUS, CAMERA, ground=ground)
+    assert not surface.depth.any() and not surface.covered.any()
+    with pytest.raises(ValueError, match="ground of shape"):
+        particle_surface(box(), RADIUS, CAMERA, ground=ground[:50])

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from fluidlift.errors import InputRejected
 from fluidlift.physics import boundaries
 from fluidlift.physics.contact import REST_GAP, SLACK
 from fluidlift.physics.rigid import RigidBodies, RigidBody, Trajectory
@@ -158,6 +159,35 @@ def test_bodies_bounce_off_closed_sides_and_leave_through_open_ones():
     run(bodies, 0.4)
     assert bodies.center[0, 0] > 1.1 and not bodies.active[0]
     assert bodies.max_speed(DT) == 0.0  # what has left does not shorten the steps
+
+
+@pytest.mark.parametrize("bank", [False, True])
+def test_a_body_from_above_the_box_falls_freely_and_lands_as_from_inside(bank):
+    """A bank reaches up to a centimetre below the open top: its distance field ends there, with a small value."""
+    ground = (lambda x: np.minimum(x[..., 2] - 0.3, 100.0)) if not bank else (lambda x: x[..., 2] - 0.99)
+    ball = RigidBody.sphere("ball", 0.1, position=(0.5, 0.5, 3.0), restitution=0.0)
+    bodies = world([ball], distance=ground)
+    assert bodies.active[0] and not bodies.warnings
+    low = 0.99 if bank else 0.3
+    landing = np.sqrt(2 * (2.9 - low) / G)
+    steps = int(0.95 * landing / DT)
+    run(bodies, steps * DT)
+    # symplectic Euler falls dt / 2 times the speed farther than t^2 says; nothing in the air holds it back
+    assert bodies.center[0, 2] == pytest.approx(3.0 - 0.5 * G * (steps * DT) * (steps + 1) * DT, abs=1e-9)
+    run(bodies, 1.0)
+    assert bodies.center[0, 2] == pytest.approx(low + 0.1, abs=0.2 * H)
+    assert bodies.active[0]
+
+
+def test_a_body_that_is_thrown_out_of_the_open_top_comes_back_but_not_one_beside_the_box():
+    ball = RigidBody.sphere("ball", 0.1, position=(0.5, 0.5, 0.8), velocity=(0, 0, 6.0))
+    bodies = world([ball])
+    heights = run(bodies, 2.0, lambda b: b.center[0, 2])
+    assert heights.max() > 2.0 and heights[-1] < 0.5 and bodies.active[0]
+    with pytest.raises(InputRejected, match="outside the simulation's box"):
+        world([RigidBody.sphere("ball", 0.1, position=(0.5, 0.5, 3.0))], gravity=(0, 0, G))  # it would fall up
+    with pytest.raises(InputRejected, match="outside the simulation's box"):
+        world([RigidBody.sphere("ball", 0.1, position=(0.5, 0.5, 3.0), motion="static")])
 
 
 def test_an_animated_ram_pushes_a_crate_ahead():

@@ -413,7 +413,12 @@ VALUES = {
     "terrain.twist": st.floats(-90, 90),
     "terrain.move": st.lists(st.floats(-1, 1), min_size=3, max_size=3),
     "duration": st.one_of(st.none(), st.floats(0.1, 100)),
+    "extend_downstream": st.one_of(st.none(), st.floats(0, 3)),
     "loop": st.booleans(),
+    "look.style": st.sampled_from(["splats", "relit", "surface", None]),
+    "terrain.scale": st.one_of(st.floats(0.1, 3), st.lists(st.floats(0.1, 3), min_size=3, max_size=3)),
+    "obstacles.duck.color": st.lists(st.floats(0, 1), min_size=3, max_size=3),
+    "obstacles.duck.name": st.sampled_from(["duck", "swan"]),
     "obstacles.duck.radius": st.floats(0.01, 0.3),
 }
 
@@ -481,21 +486,31 @@ def test_any_sequence_of_edits_undone_and_redone_gives_the_same_bytes(lifted, se
         assert scene_bytes(folder) == first
 
 
-def test_by_hand_by_command_and_in_python_give_the_same_simulation(lifted, tmp_path):
+def test_by_hand_by_command_in_python_and_in_the_viewer_give_the_same_simulation(lifted, tmp_path):
     from fluidlift.cli import DONE, WITH_WARNINGS, main
     from fluidlift.config import JobConfig
     from fluidlift.pipeline.scene import SimulationRequest, scene_of
+    from fluidlift.pipeline.simulating import simulate
+    from fluidlift.viewer.draft import Draft
 
-    hand, command, python = (shutil.copytree(lifted, tmp_path / f"{n}.fluid") for n in ("hand", "command", "python"))
+    ways = ("hand", "command", "python", "viewer")
+    hand, command, python, viewer = (shutil.copytree(lifted, tmp_path / f"{n}.fluid") for n in ways)
     (hand / "scene.yaml").write_text(
-        "obstacles:\n  - name: duck\n    shape: sphere\n    radius: 0.1\n    position: [0.4, 0.3, 0.2]\n"
-        "parameters: {gravity: [0, 1e0, -9], kinematic_viscosity: 1e-3}\nduration: 0.4\ninflow:\n  factor: 2\n"
+        "obstacles:\n  - name: duck\n    shape: sphere\n    radius: 0.1\n"
+        "    position: [0.4, 0.3, 0.2]\n    motion: free\n"
+        "emitters:\n  - {name: tap, shape: sphere, radius: 0.05, position: [0.2, 0.3, 0.4], velocity: [0, 0, -1]}\n"
+        "terrain:\n  - twist: 10\n"
+        "parameters: {gravity: [0, 1e0, -9], kinematic_viscosity: 1e-3}\nduration: 0.12\ninflow:\n  factor: 2\n"
         "look: {material: honey}\n"
     )
+    tap = {"name": "tap", "shape": "sphere", "radius": 0.05, "position": [0.2, 0.3, 0.4], "velocity": [0, 0, -1]}
     code = main([
-        "edit", str(command), "--add", "obstacles={name: duck, shape: sphere, radius: 0.1, position: [0.4, 0.3, 0.2]}",
+        "edit", str(command), "--add",
+        "obstacles={name: duck, shape: sphere, radius: 0.1, position: [0.4, 0.3, 0.2], motion: free}",
+        "--add", "emitters={name: tap, shape: sphere, radius: 0.05, position: [0.2, 0.3, 0.4], velocity: [0, 0, -1]}",
+        "--add", "terrain={twist: 10}",
         "--set", "parameters.gravity=[0, 1, -9]", "--set", "parameters.kinematic_viscosity=1e-3",
-        "--set", "duration=0.4", "--set", "inflow.factor=2", "--set", "look.material=honey",
+        "--set", "duration=0.12", "--set", "inflow.factor=2", "--set", "look.material=honey",
     ])  # fmt: skip
     assert code in (DONE, WITH_WARNINGS)
     session = EditSession.open(python)
@@ -503,15 +518,31 @@ def test_by_hand_by_command_and_in_python_give_the_same_simulation(lifted, tmp_p
     session.set("inflow.factor", 2.0)
     session.set("parameters.gravity", np.array([0.0, 1.0, -9.0]))
     session.set("parameters.kinematic_viscosity", np.float64(1e-3))
-    session.add("obstacles", DUCK | {"position": (0.4, 0.3, 0.2)})
-    session.set("duration", 0.4)
-    plain = []
-    for folder in (hand, command, python):
+    session.add("emitters", tap)
+    session.set("terrain.twist", 10)
+    session.add("obstacles", DUCK | {"position": (0.4, 0.3, 0.2), "motion": "free"})
+    session.set("duration", 0.12)
+    draft = Draft(EditSession.open(viewer), FluidParameters(inflow_velocity=(0.5, 0, 0)))
+    draft.apply(
+        [Add("obstacles", DUCK | {"position": [0.1, 0.3, 0.2], "motion": "free"}), Add("emitters", tap)], "added"
+    )
+    for k, x in enumerate((0.2, 0.3, 0.4)):  # a drag
+        draft.move("obstacles.duck.position", [x, 0.3, 0.2], "moved", 0.1 * k)
+    draft.move("parameters.gravity", [0, 1, -9], "gravity", 1.0)
+    draft.move("parameters.kinematic_viscosity", 1e-3, "viscosity", 1.1)
+    draft.move("inflow.factor", 2.0, "inflow", 1.2)
+    draft.move("look.material", "honey", "look", 1.3)
+    draft.apply([Add("terrain", {"twist": 10.0}), Set("duration", 0.12)], "bed and length")
+    plain, shown = [], []
+    for folder in (hand, command, python, viewer):
         edits = read_edits(folder)
         scene = scene_of(load_asset(folder), folder, SimulationRequest(), JobConfig(), footage=None, start=0)
         rest = edits.parameters, edits.duration, edits.inflow, edits.look, edits.loop
         plain.append((rest, [repr(x) for o in edits.obstacles for x in o.plain()], scene.parts, scene.frames))
-    assert plain[0] == plain[1] == plain[2]
+        simulate(scene, folder, JobConfig())
+        shown.append([p.read_bytes() for p in sorted((folder / "frames" / "splats").glob("*.ply"))])
+    assert plain[0] == plain[1] == plain[2] == plain[3]
+    assert len(shown[0]) == 3 and shown[0] == shown[1] == shown[2] == shown[3]
 
 
 def test_only_what_an_edit_touches_is_stale(folder):

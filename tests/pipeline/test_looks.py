@@ -5,6 +5,7 @@ import shutil
 import cv2
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from fluidlift.cli import DONE, REJECTED, WITH_WARNINGS, main
 from fluidlift.io.asset_folder import load_asset
@@ -13,6 +14,7 @@ from fluidlift.io.exr_write import write_channels
 from fluidlift.io.scene_look import Look
 from fluidlift.pipeline.looks import Backdrop, Frame, Painter
 from fluidlift.pipeline.showing import splat_frames
+from fluidlift.types import Gaussians, Grid, PinholeCamera, Terrain, TriangleMesh
 
 WELL = (DONE, WITH_WARNINGS)
 SMALL = ("--size", "120x80", "--frames", "1002-1002")
@@ -127,16 +129,46 @@ def test_a_finer_picture_averaged_is_the_same_picture_with_smooth_edges(made):
     plain, fine = (Painter(look, asset.terrain, made.folder, supersample=k) for k in (1, 2))
     a, b = (p.picture(Frame(fluid, velocities), camera, Backdrop(cut_out=True)) for p in (plain, fine))
     assert b.image.shape == a.image.shape and b.alpha.shape == a.alpha.shape == b.depth.shape
-    # edges apart, the same light; the rasteriser's blur of half a pixel is half as wide in the finer picture, and the
-    # outline of some 300 px moves in by up to a quarter of a pixel of 6144
-    assert np.median(np.abs(a.image - b.image)) < 0.01 and abs(float(a.alpha.mean() - b.alpha.mean())) < 0.0125
+    # it is the finer picture, averaged
+    wide = plain.picture(Frame(fluid, velocities), camera.resized((192, 128)), Backdrop(cut_out=True))
+    np.testing.assert_allclose(b.image, wide.image.reshape(64, 2, 96, 2, 3).mean(axis=(1, 3)), atol=1e-6)
+    np.testing.assert_allclose(b.alpha, wide.alpha.reshape(64, 2, 96, 2).mean(axis=(1, 3)), atol=1e-6)
+    # and edges apart the same light: the rasteriser's blur of half a pixel is half as wide in the finer picture, so
+    # that outlines lie elsewhere
+    inside, outside = (ndimage.binary_erosion(m, iterations=2) for m in (a.alpha > 0.98, a.alpha < 0.02))
+    assert inside.sum() > 300 and outside.sum() > 300
+    assert np.median(np.abs(a.image - b.image)) < 0.01
+    assert np.abs(a.alpha - b.alpha)[inside | outside].mean() < 0.01
     plate = np.random.default_rng(0).uniform(0, 1, (64, 96, 3)).astype(np.float32)
+    lit = fine.picture(Frame(fluid, velocities), camera, Backdrop(np.zeros_like(plate)))
     kept = fine.picture(Frame(fluid, velocities), camera, Backdrop(plate))
-    bare = b.alpha == 0
-    # where no sample of a pixel meets a splat the plate is kept; a splat of 1/255 that the terrain hides is not in `b`
-    np.testing.assert_allclose(kept.image[bare], plate[bare], atol=1 / 255)
+    bare = lit.image.max(axis=-1) == 0  # no sample of the pixel meets a splat
+    assert bare.mean() > 0.1
+    np.testing.assert_allclose(kept.image[bare], plate[bare], atol=1e-6)
     with pytest.raises(ValueError, match="supersample"):
         Painter(look, asset.terrain, made.folder, supersample=0)
+
+
+@pytest.mark.parametrize("look", [Look("relit", "source"), Look("transparent", "milk")], ids=lambda look: look.style)
+def test_splats_throw_a_shadow_on_the_ground_and_none_on_a_clip(tmp_path, look):
+    grid = Grid((20, 20, 12), 0.1, (-1.0, -1.0, -0.1))
+    height = np.broadcast_to(-0.1 + 0.1 * np.arange(13.0), (21, 21, 13)).astype(np.float32)
+    floor = TriangleMesh(np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]]))
+    inside = np.stack(np.meshgrid(*[np.arange(-6, 7)] * 3, indexing="ij"), -1).reshape(-1, 3) * 0.05
+    ball = inside[np.linalg.norm(inside, axis=1) < 0.25] + (0.0, 0.0, 0.6)
+    fluid = Gaussians.isotropic(ball.astype(np.float32), 0.025, np.full((len(ball), 3), 0.6))
+    frame, none = (Frame(g, np.zeros((len(g), 3), np.float32)) for g in (fluid, Gaussians.empty()))
+    camera = PinholeCamera.looking(np.array([0.0, -2.0, 3.0]), np.array([0.0, 0.0, 0.2]), 45.0, (64, 48))
+    painter = Painter(look, Terrain(grid, height, np.array([1.0, 0, 0]), floor), tmp_path, kind="pour")
+    full, empty = (painter.picture(f, camera, Backdrop()).image for f in (frame, none))
+    outline = painter.picture(frame, camera, Backdrop(cut_out=True)).alpha
+    beside = ndimage.maximum_filter(outline, 3) == 0
+    darker = 1.0 - full[beside].mean(axis=-1) / np.maximum(empty[beside].mean(axis=-1), 1e-6)
+    # nothing gets brighter, and where the sun (0.7 of the light) is hidden there is less than half
+    assert darker.min() > -1e-4 and darker.max() > 0.5 and (darker > 0.02).sum() > 50
+    # a clip's plate has the shadows of its own fluid
+    plate = np.full((48, 64, 3), 0.5, np.float32)
+    np.testing.assert_allclose(painter.picture(frame, camera, Backdrop(plate)).image[beside], 0.5, atol=1e-6)
 
 
 @pytest.mark.parametrize(

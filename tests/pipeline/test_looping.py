@@ -1,6 +1,6 @@
 """A loop's last frame leads into its first one, and the fluid stays as opaque as it is while it fades."""
 
-from dataclasses import replace
+import shutil
 
 import numpy as np
 import pytest
@@ -9,55 +9,17 @@ from fluidlift.config import build_config
 from fluidlift.errors import InputRejected
 from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.look.rasterize import render
+from fluidlift.pipeline.editing import EditSession
 from fluidlift.pipeline.looping import SplatFrame, blended, blended_poses, faded, read_frame, seam
-from fluidlift.pipeline.scene import Scene, loop_overlap
+from fluidlift.pipeline.resimulate import resimulate
+from fluidlift.pipeline.scene import loop_overlap
 from fluidlift.pipeline.simulating import checkpoint_file, frame_file, simulate
-from fluidlift.types import (
-    CellType,
-    FaceVelocity,
-    FluidParameters,
-    Gaussians,
-    Grid,
-    Particles,
-    PinholeCamera,
-    RigidTransform,
-    Terrain,
-    TriangleMesh,
-)
-
-H = 0.1
+from fluidlift.types import CellType, Gaussians
 
 
-def camera():
-    """Looks straight down on the middle from 2 m above."""
-    down = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
-    return PinholeCamera((96.0, 96.0), (32.0, 24.0), (64, 48), RigidTransform(down, -down @ np.array([0.6, 0.4, 2.4])))
-
-
-def channel(frames, **more):
-    """Striped water that flows along a flat channel."""
-    grid = Grid((12, 8, 6), H)
-    nodes = grid.nodes()
-    mesh = TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), int))
-    terrain = Terrain(grid, (nodes[..., 2] - 0.1).astype(np.float32), np.array([1.0, 0.0, 0.0]), mesh)
-    cells = np.zeros(grid.shape, np.uint8)
-    cells[:, :, 0], cells[:, :, 1:3] = CellType.SOLID, CellType.FLUID
-    cells[:2, :, 1:3], cells[-3:, :, 1:3] = CellType.INFLOW, CellType.OUTFLOW
-    axes = [(np.arange(2 * n) + 0.5) * 0.5 * H for n in (12, 8, 2)]
-    places = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3) + [0.0, 0.0, 0.1]
-    shade = 0.5 + 0.4 * np.sin(17 * places[:, :1]) * np.cos(11 * places[:, 1:2])
-    rest = Gaussians.isotropic(places, 0.04, np.repeat(shade, 3, axis=1), 0.9)
-    velocity = FaceVelocity.zeros(grid)
-    velocity = FaceVelocity(np.full_like(velocity.u, 0.6), velocity.v, velocity.w)
-    body = Particles.at_rest(places, 1.0, np.arange(len(places)), np.broadcast_to([0.6, 0.0, 0.0], places.shape))
-    parameters = FluidParameters(inflow_velocity=(0.6, 0.0, 0.0), time_step=0.04)
-    scene = Scene("stream", rest, body, terrain, cells, velocity, parameters, camera(), 0.04, 0.04, frames, 0)
-    return replace(scene, **more)
-
-
-def pictures(folder, count):
+def pictures(folder, count, camera):
     frames = [read_frame(frame_file(folder, FIRST_FRAME + k)).gaussians for k in range(count)]
-    return np.stack([render(g, camera()).image for g in frames])
+    return np.stack([render(g, camera).image for g in frames])
 
 
 def frame(ids, opacity=0.9, shift=0.0):
@@ -68,7 +30,7 @@ def frame(ids, opacity=0.9, shift=0.0):
 
 
 @pytest.mark.parametrize("share", [0.0, 0.2, 0.5, 0.9, 1.0])
-def test_two_bodies_that_fade_into_each_other_let_through_as_much_light_as_one(share):
+def test_two_bodies_that_fade_into_each_other_let_through_as_much_light_as_one(share, camera):
     rng = np.random.default_rng(0)
 
     def clouds():
@@ -82,7 +44,7 @@ def test_two_bodies_that_fade_into_each_other_let_through_as_much_light_as_one(s
             yield SplatFrame(gaussians, np.arange(n), np.zeros((n, 3), np.float32))
 
     def opacity(gaussians):
-        return render(gaussians, camera()).alpha[16:32, 24:40].mean()
+        return render(gaussians, camera).alpha[16:32, 24:40].mean()
 
     found = [
         (opacity(tail.gaussians), opacity(blended(head, tail, share).gaussians))
@@ -117,14 +79,14 @@ def test_a_body_glides_back_on_the_shorter_way():
     np.testing.assert_allclose(half[0], [0.5, 0, 0, np.cos(0.25), 0, 0, np.sin(0.25)], atol=1e-12)
 
 
-def test_the_fade_lasts_a_quarter_of_the_passage_within_bounds():
+def test_the_fade_lasts_a_quarter_of_the_passage_within_bounds(channel):
     assert loop_overlap(channel(100)) == round(0.25 * 0.9 * 1.15 / 0.6 / 0.04)  # 1.035 m at 0.6 m/s
     assert loop_overlap(channel(10)) == 5
     with pytest.raises(InputRejected, match="4 frames or more"):
         loop_overlap(channel(3))
 
 
-def test_the_seam_of_a_loop_is_no_larger_than_the_clips_own_steps(tmp_path):
+def test_the_seam_of_a_loop_is_no_larger_than_the_clips_own_steps(tmp_path, channel, camera):
     config = build_config(None, None, (), {})
     plain, loop = channel(20), channel(20, overlap=6)
     simulate(plain, tmp_path / "plain", config)
@@ -133,18 +95,18 @@ def test_the_seam_of_a_loop_is_no_larger_than_the_clips_own_steps(tmp_path):
     assert result.meta["warnings"] == []
     assert {len(v) for v in result.arrays.values()} == {20}
     assert len(list((tmp_path / "loop" / "frames" / "splats").glob("*.ply"))) == 20
-    across, mean, largest = seam(pictures(tmp_path / "loop", 20))
-    before, usual, _ = seam(pictures(tmp_path / "plain", 20))
+    across, mean, largest = seam(pictures(tmp_path / "loop", 20, camera))
+    before, usual, _ = seam(pictures(tmp_path / "plain", 20, camera))
     assert across < 1.2 * usual  # the frame that follows the last one is the next of the simulation: a step like any
     assert before > 2 * usual  # without the fade it jumps
     # while it fades, up to a quarter of the difference between two unlike frames (pi / 2 of a sixth) comes on top
     assert largest < usual + before / 4
     assert mean < 1.5 * usual
     # frames after the fade are those of the simulation without a loop
-    np.testing.assert_array_equal(*(pictures(tmp_path / n, 20)[6:] for n in ("plain", "loop")))
+    np.testing.assert_array_equal(*(pictures(tmp_path / n, 20, camera)[6:] for n in ("plain", "loop")))
 
 
-def test_a_closed_loop_has_no_checkpoint_to_go_on_from(tmp_path):
+def test_a_closed_loop_has_no_checkpoint_to_go_on_from(tmp_path, channel):
     config = build_config(None, None, (), {})
     simulate(channel(8, overlap=2), tmp_path, config)
     assert not checkpoint_file(tmp_path).exists()
@@ -154,7 +116,7 @@ def test_a_closed_loop_has_no_checkpoint_to_go_on_from(tmp_path):
     assert frame_file(tmp_path, FIRST_FRAME).read_bytes() == first
 
 
-def test_a_loop_that_was_interrupted_before_it_was_closed_is_closed_by_the_next_run(tmp_path):
+def test_a_loop_that_was_interrupted_before_it_was_closed_is_closed_by_the_next_run(tmp_path, channel):
     config = build_config(None, None, ("simulate.checkpoint_every=1",), {})
     scene, calls = channel(8, overlap=2), []
 
@@ -173,8 +135,29 @@ def test_a_loop_that_was_interrupted_before_it_was_closed_is_closed_by_the_next_
         assert files[0] == files[1]
 
 
-def test_a_vessel_that_fills_is_said_to_show_two_levels(tmp_path):
-    scene = channel(12, overlap=4)
-    cells = np.where(scene.cell_types == CellType.OUTFLOW, np.uint8(CellType.FLUID), scene.cell_types)
-    result = simulate(channel(12, overlap=4, cell_types=cells), tmp_path, build_config(None, None, (), {}))
-    assert any("more fluid at its end" in w for w in result.meta["warnings"])
+def test_a_vessel_that_fills_has_no_loop_and_keeps_its_frames(tmp_path, channel):
+    config = build_config(None, None, (), {})
+    cells = channel(12).cell_types
+    cells = np.where(cells == CellType.OUTFLOW, np.uint8(CellType.FLUID), cells)
+    result = simulate(channel(12, overlap=4, cell_types=cells), tmp_path / "loop", config)
+    assert any("not closed" in w and "more fluid at its end" in w for w in result.meta["warnings"])
+    simulate(channel(12, cell_types=cells), tmp_path / "plain", config)
+    files = [sorted((tmp_path / n / "frames" / "splats").glob("*.ply")) for n in ("loop", "plain")]
+    assert len(files[0]) == 12
+    assert [p.read_bytes() for p in files[0]] == [p.read_bytes() for p in files[1]]
+
+
+def test_the_frames_of_a_closed_loop_are_known_to_show_it(made, tmp_path):
+    folder = shutil.copytree(made.folder, tmp_path / "stream.fluid")
+    session = EditSession.open(folder)
+    session.set("loop", True)
+    assert session.stale() == {"simulate"}
+    resimulate(folder, overrides=["show.usd=false"])
+    assert not checkpoint_file(folder).exists()
+    assert session.stale() == set()
+    session.set("inflow.factor", 1.1)
+    assert session.stale() == {"simulate"}
+    session.undo()
+    assert session.stale() == set()
+    session.undo()
+    assert session.stale() == {"simulate"}

@@ -8,57 +8,25 @@ import pytest
 from fluidlift.config import build_config
 from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.io.frames import FIRST_FRAME
+from fluidlift.io.obstacles import Obstacle
 from fluidlift.numerics.solid_mesh import box_mesh
 from fluidlift.physics.emitter import Emitter
 from fluidlift.physics.inflow_schedule import InflowSchedule
 from fluidlift.physics.stepping import ParticleSimulator
 from fluidlift.physics.terrain_edit import Rotate
 from fluidlift.pipeline.looping import read_frame
-from fluidlift.pipeline.reshaping import changed_parameters, in_words, with_emitters, with_terrain
-from fluidlift.pipeline.scene import Scene
-from fluidlift.pipeline.simulating import frame_file, simulate
-from fluidlift.types import (
-    CellType,
-    FaceVelocity,
-    FluidParameters,
-    Gaussians,
-    Grid,
-    Particles,
-    PinholeCamera,
-    RigidTransform,
-    Terrain,
-    TriangleMesh,
+from fluidlift.pipeline.reshaping import (
+    changed_parameters,
+    in_words,
+    sides_open_to_air,
+    slow_edits,
+    with_emitters,
+    with_terrain,
 )
+from fluidlift.pipeline.simulating import frame_file, simulate, simulator_of
+from fluidlift.types import FluidParameters, TriangleMesh
 
-H = 0.1
 CONFIG = build_config(None, None, (), {})
-
-
-def camera():
-    """Looks straight down on the middle from 2 m above."""
-    down = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
-    return PinholeCamera((96.0, 96.0), (32.0, 24.0), (64, 48), RigidTransform(down, -down @ np.array([0.6, 0.4, 2.4])))
-
-
-def channel(frames, **more):
-    """Striped water that flows along a flat channel."""
-    grid = Grid((12, 8, 6), H)
-    nodes = grid.nodes()
-    mesh = TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), int))
-    terrain = Terrain(grid, (nodes[..., 2] - 0.1).astype(np.float32), np.array([1.0, 0.0, 0.0]), mesh)
-    cells = np.zeros(grid.shape, np.uint8)
-    cells[:, :, 0], cells[:, :, 1:3] = CellType.SOLID, CellType.FLUID
-    cells[:2, :, 1:3], cells[-3:, :, 1:3] = CellType.INFLOW, CellType.OUTFLOW
-    axes = [(np.arange(2 * n) + 0.5) * 0.5 * H for n in (12, 8, 2)]
-    places = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3) + [0.0, 0.0, 0.1]
-    shade = 0.5 + 0.4 * np.sin(17 * places[:, :1]) * np.cos(11 * places[:, 1:2])
-    rest = Gaussians.isotropic(places, 0.04, np.repeat(shade, 3, axis=1), 0.9)
-    velocity = FaceVelocity.zeros(grid)
-    velocity = FaceVelocity(np.full_like(velocity.u, 0.6), velocity.v, velocity.w)
-    body = Particles.at_rest(places, 1.0, np.arange(len(places)), np.broadcast_to([0.6, 0.0, 0.0], places.shape))
-    parameters = FluidParameters(inflow_velocity=(0.6, 0.0, 0.0), time_step=0.04)
-    scene = Scene("stream", rest, body, terrain, cells, velocity, parameters, camera(), 0.04, 0.04, frames, 0)
-    return replace(scene, **more)
 
 
 def tap(at=(0.6, 0.4, 0.9), **more):
@@ -66,7 +34,7 @@ def tap(at=(0.6, 0.4, 0.9), **more):
     return Emitter("tap", TriangleMesh(mesh.vertices + np.array(at), mesh.faces), (0.0, 0.0, -1.0), **more)
 
 
-def test_a_red_tap_above_the_box_pours_red_water_into_the_frames(tmp_path):
+def test_a_red_tap_above_the_box_pours_red_water_into_the_frames(tmp_path, channel):
     scene = with_emitters(channel(6), [tap(color=(0.9, 0.1, 0.1))])
     assert scene.terrain.grid.high[2] > 1.0  # the box was 0.6 m high
     assert simulate(scene, tmp_path, CONFIG).meta["frames"] == 6
@@ -77,7 +45,7 @@ def test_a_red_tap_above_the_box_pours_red_water_into_the_frames(tmp_path):
     assert not (shown.rgb[~new][:, 0] > 0.8).all()
 
 
-def test_a_tap_without_a_colour_takes_that_of_the_nearest_water():
+def test_a_tap_without_a_colour_takes_that_of_the_nearest_water(channel):
     scene = with_emitters(channel(6), [tap((0.2, 0.2, 0.3)), tap((1.0, 0.6, 0.3))])
     first, second = scene.emitter_looks
     own = scene.rest.select(np.arange(first[0]))
@@ -92,12 +60,12 @@ def test_a_tap_without_a_colour_takes_that_of_the_nearest_water():
     [((5.0, 0.4, 0.4), "outside the simulated box"), ((0.6, 0.4, 90.0), "outside the simulated box"),
      ((0.6, 0.4, -0.04), "inside the ground")],
 )  # fmt: skip
-def test_a_tap_without_room_is_refused_with_its_line(at, words):
+def test_a_tap_without_room_is_refused_with_its_line(at, words, channel):
     with pytest.raises(InputRejected, match=rf"scene\.yaml, line 3: emitter 'tap'.*{words}"):
         with_emitters(channel(6), [tap(at, line="scene.yaml, line 3")])
 
 
-def test_a_checkpoint_knows_its_emitters_inflow_and_terrain():
+def test_a_checkpoint_knows_its_emitters_inflow_and_terrain(channel):
     plain = channel(6)
     scenes = [
         with_emitters(plain, [tap()]), with_emitters(plain, [tap(end=1.0)]), with_terrain(plain, [Rotate(10.0)]),
@@ -108,7 +76,7 @@ def test_a_checkpoint_knows_its_emitters_inflow_and_terrain():
     assert with_emitters(plain, []) is plain
 
 
-def test_a_turned_channel_has_a_turned_inflow():
+def test_a_turned_channel_has_a_turned_inflow(channel):
     scene = with_terrain(channel(6), [Rotate(90.0)])
     np.testing.assert_allclose(scene.parameters.inflow_velocity, [0.0, 0.6, 0.0], atol=1e-6)
     np.testing.assert_allclose(scene.painted, channel(6).rest.means)
@@ -123,7 +91,7 @@ def test_the_edit_farthest_from_the_fit_is_named_first():
     assert words == ("kinematic_viscosity 1e+03 (fitted: 1e-06)", "inflow_velocity [2, 0, 0] (fitted: [1, 0, 0])")
 
 
-def test_a_simulation_that_breaks_down_names_the_edits_and_keeps_its_frames(tmp_path, monkeypatch):
+def test_a_simulation_that_breaks_down_names_the_edits_and_keeps_its_frames(tmp_path, monkeypatch, channel):
     scene = replace(channel(6), changes=("kinematic_viscosity 1e+03 (fitted: 1e-06)",))
     advance, calls = ParticleSimulator.advance, []
 
@@ -140,8 +108,74 @@ def test_a_simulation_that_breaks_down_names_the_edits_and_keeps_its_frames(tmp_
     assert in_words(channel(6)) == ""
 
 
-def test_too_many_particles_end_a_simulation_with_its_frames_and_a_word(tmp_path):
+def test_too_many_particles_end_a_simulation_with_its_frames_and_a_word(tmp_path, channel):
     few = build_config(None, None, ("simulate.max_particles=780",), {})
     result = simulate(with_emitters(channel(8), [tap(color=(1.0, 0.0, 0.0))]), tmp_path, few)
     assert 0 < result.meta["frames"] < 8
     assert "max_particles=780" in result.meta["warnings"][0]
+
+
+@pytest.mark.parametrize(
+    ("gravity", "open_sides"),
+    [
+        ((0.0, 0.0, -9.81), [[2, 1]]),
+        ((1.7, 0.3, -9.66), [[2, 1]]),  # a slope that was filmed level
+        ((0.0, 6.0, -8.0), [[2, 1]]),  # tilted by less than 45 degrees: still a tank
+        ((0.0, 8.0, -6.0), [[1, 0], [1, 1], [2, 1]]),  # it falls to high y, and the sky stays open
+        ((-9.81, 0.0, 0.0), [[0, 0], [0, 1], [2, 1]]),
+        ((0.0, 0.0, 9.81), [[2, 0], [2, 1]]),
+        ((0.0, 0.0, 0.0), [[2, 1]]),  # what drifts up leaves: there never was a lid
+    ],
+)
+def test_a_box_is_open_to_the_sky_and_where_turned_gravity_points_to(gravity, open_sides):
+    assert np.argwhere(sides_open_to_air(gravity)).tolist() == open_sides
+
+
+def test_the_simulator_is_told_which_sides_are_open(channel):
+    turned = replace(channel(6).parameters, gravity=(0.0, 8.0, -6.0))
+    simulator = simulator_of(channel(6, parameters=turned))
+    np.testing.assert_array_equal(simulator._walls.open_sides, sides_open_to_air(turned.gravity))
+
+
+def obstacle(**more):
+    return Obstacle("block", box_mesh(np.array([0.3, 1.0, 1.0])), line="scene.yaml, line 7", **more)
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        ({"changes": ("inflow_velocity [100, 0, 0] (fitted: [1, 0, 0])",)}, "the inflow at 100 m/s"),
+        ({"inflow": InflowSchedule(((0.0, 1.0), (1.0, 0.5)))}, "the inflow at 100 m/s"),
+        ({"emitters": (replace(tap(), velocity=(0.0, 0.0, -100.0)),)}, "emitter 'tap' at 100 m/s"),
+        ({"obstacles": (obstacle(motion="free", velocity=(0.0, 100.0, 0.0)),)}, "obstacle 'block' at 100 m/s"),
+        ({"longest_step": 0.001}, "time_step 0.001 s needs about 40 steps"),
+    ],
+)
+def test_an_edit_that_takes_long_says_so_before_it_does(channel, more, words):
+    fast = replace(channel(6).parameters, inflow_velocity=(100.0, 0.0, 0.0))
+    (said,) = slow_edits(channel(6, parameters=fast, **more))
+    assert words in said and "this may take very long" in said  # 40 cells of 0.1 m from frame to frame
+    assert slow_edits(channel(6)) == []
+    assert slow_edits(channel(6, parameters=fast)) == []  # as it was fitted: nothing to undo
+
+
+def test_what_no_machine_would_finish_is_refused_by_name(channel):
+    with pytest.raises(InputRejected, match=r"emitter 'tap' at 9e\+03 m/s needs 3,600 steps .* at most 1,000"):
+        slow_edits(channel(6, emitters=(replace(tap(), velocity=(0.0, 0.0, -9e3)),)))
+
+
+def test_nothing_flows_out_of_an_obstacle_that_covers_the_inlet_and_that_is_said(channel, tmp_path):
+    dammed = channel(6, obstacles=(obstacle(position=(0.1, 0.4, 0.3)),))
+    result = simulate(dammed, tmp_path, CONFIG)
+    assert "line 7: obstacle 'block' over the whole inlet: nothing flows in" in result.meta["warnings"][0]
+    frames = [read_frame(frame_file(tmp_path, FIRST_FRAME + k)) for k in (0, 5)]
+    assert set(frames[1].ids) <= set(frames[0].ids)  # no new particle
+    half = obstacle(position=(0.1, 0.0, 0.3))
+    assert simulate(channel(6, obstacles=(half,)), tmp_path / "half", CONFIG).meta["warnings"] == []
+
+
+def test_an_obstacle_in_the_place_of_all_of_the_fluid_is_refused(channel, tmp_path):
+    whole = Obstacle("block", box_mesh(np.full(3, 4.0)), line="scene.yaml, line 7")
+    with pytest.raises(InputRejected, match="line 7: obstacle 'block' in the place of all of the fluid"):
+        simulate(channel(6, obstacles=(whole,)), tmp_path, CONFIG)
+    assert not list(tmp_path.rglob("*.ply"))

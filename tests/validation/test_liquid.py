@@ -7,7 +7,9 @@ from fluidlift.errors import FluidliftError
 from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.physics import apic, transfer
 from fluidlift.physics.apic import LiquidSimulator, SimulationSettings
+from fluidlift.physics.inlet import inlet_to_surface
 from fluidlift.physics.pressure import divergence
+from fluidlift.physics.stepping import Emitted
 from fluidlift.types import CellType, FluidParameters, Grid, Particles
 
 H = 0.1
@@ -197,7 +199,7 @@ def test_new_particles_ask_for_their_look(scene):
 
     def source(positions, time):
         asked.append(time)
-        return np.full(len(positions), 7)
+        return Emitted.one_each(np.full(len(positions), 7))
 
     simulator = LiquidSimulator(
         grid, scene.terrain(grid), FluidParameters(inflow_velocity=(1, 0, 0)), Particles.at_rest(np.zeros((0, 3)), 1.0),
@@ -205,6 +207,47 @@ def test_new_particles_ask_for_their_look(scene):
     )  # fmt: skip
     simulator.advance(0.1)
     assert (simulator.particles.source == 7).all() and asked[0] == 0.0 and len(asked) > 1
+
+
+def test_several_particles_that_fill_a_place_share_its_mass(scene):
+    grid = Grid((8, 4, 4), H)
+    types = scene.cells(grid)
+    types[:2] = CellType.INFLOW
+
+    def one(places, time):
+        return Emitted.one_each(np.zeros(len(places), int))
+
+    def four(places, time):
+        """The last of each place lies outside the inlet: it stays out, and the mass goes to the others."""
+        offset = np.tile(np.float32([[0.01, 0, 0], [0, 0.01, 0], [0, 0, 0.01], [5.0, 0, 0]]), (len(places), 1))
+        return Emitted(np.repeat(np.arange(len(places)), 4), offset, np.tile(np.arange(4), len(places)))
+
+    def none(places, time):
+        return Emitted(np.zeros(0, int), np.zeros((0, 3), np.float32), np.zeros(0, int))
+
+    made = {}
+    for source in (one, four, none):
+        simulator = LiquidSimulator(
+            grid, scene.terrain(grid), FluidParameters(inflow_velocity=(1, 0, 0), gravity=(0, 0, 0)),
+            Particles.at_rest(np.zeros((0, 3)), 1.0), cell_types=types, emit_source=source,
+        )  # fmt: skip
+        simulator._fill_inlet()  # before anything moves
+        made[source] = simulator.particles
+    assert len(made[none]) == 0
+    assert made[four].masses.sum() == pytest.approx(made[one].masses.sum(), rel=1e-6)  # float32
+    assert set(made[four].source) == {0, 1, 2}
+    assert len(made[four]) > 2.5 * len(made[one])  # those next to a wall or the rim take fewer
+
+
+def test_an_inlet_reaches_up_to_the_surface_of_the_body(scene):
+    grid = Grid((4, 2, 6), H)
+    types = scene.cells(grid)
+    types[:2, :, :3], types[2:, :, :3] = CellType.INFLOW, CellType.FLUID
+    body = np.array([[0.05, 0.05, 0.32], [0.05, 0.05, 0.55], [0.35, 0.05, 0.32]])
+    cells = inlet_to_surface(types, body, grid)
+    changed = np.argwhere(cells != types)
+    # above the inlet where something is: not beside it, not across a gap, not downstream
+    assert changed.tolist() == [[0, 0, 3]] and cells[0, 0, 3] == CellType.INFLOW
 
 
 def test_the_same_seed_gives_the_same_particles(scene):

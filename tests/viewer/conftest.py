@@ -1,5 +1,8 @@
 """A tank of water with a few frames, as an asset on disk: small enough for a browser without a graphics card."""
 
+import math
+import re
+import time
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +22,13 @@ from fluidlift.types import (
 )
 
 FRAMES, INTERVAL = 8, 0.04
+CHROMIUM = Path("/usr/bin/chromium")
+FLAGS = ["--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+HARMLESS = ("THREE.Clock", "WebGL", "GPU stall", "GL Driver Message", "computeBoundingSphere")
+"""what the renderer itself says of its software; the last one three.js says of the node of splats, whatever is in it:
+viser 1.1.1 keeps the centres in a texture and draws one square [4,2], whose missing third coordinate is NaN"""
+PATIENCE = 240.0
+"""s that anything may take: a hundred times what it takes on a machine that does nothing else"""
 
 
 def tank(cells=(12, 8, 8), spacing=0.05) -> FluidAsset:
@@ -76,3 +86,102 @@ def tank_folder(finished_tank, tmp_path) -> Path:
     import shutil
 
     return shutil.copytree(finished_tank, tmp_path / "tank.fluid")
+
+
+@pytest.fixture(scope="module")
+def visitor():
+    """Opens pages of viewers, in one browser."""
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as p:
+        started = p.chromium.launch(executable_path=str(CHROMIUM), args=FLAGS)
+        yield lambda viewer: Visit(started, viewer)
+        started.close()
+
+
+class Visit:
+    """One browser that looks at a viewer."""
+
+    def __init__(self, browser, viewer, size=(760, 640)):
+        self.browser, self.viewer, self.complaints, self.strangers = browser, viewer, [], []
+        self.page = browser.new_page(viewport={"width": size[0], "height": size[1]})
+        self.page.set_default_timeout(1000 * PATIENCE)
+        self.page.on("console", lambda m: self.complaints.append(m.text) if m.type == "error" else None)
+        self.page.on("pageerror", lambda e: self.complaints.append(str(e)))
+        self.page.on("request", self._requested)
+        self.page.goto(f"{viewer.address}/?fixedDpr=0.5")
+        self.page.locator("strong", has_text="frames").first.wait_for()
+
+    def _requested(self, request):
+        if not request.url.startswith((self.viewer.address, "data:", "blob:", "ws://127.0.0.1")):
+            self.strangers.append(request.url)
+
+    def worries(self):
+        return [c for c in self.complaints if not any(h in c for h in HARMLESS)]
+
+    def picture(self):
+        """u8 [h,w,3] of the page left of the controls and below the input video."""
+        import cv2
+
+        data = np.frombuffer(self.page.screenshot(timeout=1000 * PATIENCE), np.uint8)
+        return cv2.imdecode(data, cv2.IMREAD_COLOR)[200:, :360]
+
+    def until(self, condition, what="it"):
+        end = time.monotonic() + PATIENCE
+        while not condition():
+            assert time.monotonic() < end, f"{what} did not happen; the page says: {self.page.inner_text('body')[:600]}"
+            self.page.wait_for_timeout(30)
+
+    def says(self, text):
+        self.page.get_by_text(text).locator("visible=true").first.wait_for()
+
+    def tab(self, name):
+        self.page.get_by_role("tab", name=name).click()
+
+    def press(self, name):
+        self.page.get_by_role("button", name=name, exact=True).click()
+
+    def unfold(self, folder, inside):
+        """Open a folder unless it is open: a button inside it tells."""
+        button = self.page.get_by_role("button", name=inside, exact=True)
+        if not button.is_visible():
+            self.page.get_by_text(folder, exact=True).first.click()
+        button.wait_for()
+
+    def field(self, label):
+        """The last input of the line with a label: a slider's is its box."""
+        found = self.page.locator("label", has_text=re.compile(rf"^{re.escape(label)}"))
+        line = found.locator("visible=true").first.locator("xpath=ancestor::*[contains(@class,'mantine-Flex-root')][1]")
+        return line.locator("input:not([type=hidden])").last
+
+    def choose(self, label, option):
+        self.field(label).click()
+        self.page.get_by_role("option", name=option, exact=True).click()
+
+    def label(self):
+        """Number of the frame that the page tells."""
+        return int(self.page.locator("strong", has_text="·").first.inner_text().split("·")[0])
+
+    def live(self, told):
+        """Wait until the page has taken over all frames of a live simulation of an edit."""
+        viewer = self.viewer
+        self.until(lambda: not viewer.draft.pending, "taking over the edit")
+        self.until(lambda: viewer.take is not None and told in viewer.take.wish.told, f"live frames of {told}")
+        # the drawing thread follows the simulation a tick later
+        self.until(lambda: viewer.take.complete and viewer.timeline.count == len(viewer.take.frames), "the whole take")
+
+    def another(self, size):
+        """A second browser's page."""
+        return Visit(self.browser, self.viewer, size)
+
+    def on_screen(self, point):
+        """px of a place in the world."""
+        from scipy.spatial.transform import Rotation
+
+        view, size = self.client().camera, self.page.viewport_size
+        eye = Rotation.from_quat(view.wxyz, scalar_first=True).inv().apply(np.subtract(point, view.position))
+        focal = 0.5 * size["height"] / math.tan(0.5 * view.fov)
+        return 0.5 * size["width"] + focal * eye[0] / eye[2], 0.5 * size["height"] + focal * eye[1] / eye[2]
+
+    def client(self):
+        return next(iter(self.viewer.server.get_clients().values()))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fluidlift.types import FluidParameters
-from fluidlift.viewer.controls import INFLOW, controls_of, direction, path_of, turned
+from fluidlift.viewer.controls import INFLOW, controls_of, direction, number, path_of, turned
 
 FITTED = FluidParameters(
     kinematic_viscosity=3e-5, gravity=(0.2, 0.1, -9.7), inflow_velocity=(0.4, 0.0, -0.1), wall_damping=0.3
@@ -94,8 +94,16 @@ def test_what_is_typed_is_clamped_or_refused_with_the_range_in_the_message(text,
     found, message = control("kinematic_viscosity").typed(text)
     assert found == value
     assert complaint in message and bool(message) == bool(complaint)
-    assert not message or "1e-07 to 1 m²/s" in message
+    assert not message or "1e-7 to 1 m²/s" in message
 
 
 def test_values_stand_under_their_section_of_the_scene():
     assert path_of("gravity") == "parameters.gravity" and path_of(INFLOW) == INFLOW
+
+
+@pytest.mark.parametrize(("value", "text"), [
+    (1000.0, "1000"), (1e-5, "1e-5"), (1.2345e-5, "1.23e-5"), (0.0, "0"), (-1.7, "-1.7"), (9.811, "9.81"), (2e7, "2e7"),
+    (0.00261, "0.00261"), (12345.0, "12300"),
+])  # fmt: skip
+def test_numbers_are_told_as_a_person_writes_them(value, text):
+    assert number(value, 3) == text

@@ -83,7 +83,7 @@ def test_two_threads_that_want_one_frame_read_it_once():
 
     def load(index):
         read.append(index)
-        gate.wait(5)
+        gate.wait(60)
         return Block(index)
 
     cache = FrameCache(load, 1000)
@@ -92,7 +92,7 @@ def test_two_threads_that_want_one_frame_read_it_once():
         t.start()
     gate.set()
     for t in threads:
-        t.join(5)
+        t.join(60)
     assert read == [7]
 
 

@@ -8,6 +8,8 @@ import pytest
 from fluidlift.errors import InputRejected
 from fluidlift.io.asset_folder import update_manifest
 from fluidlift.io.asset_lock import Holder
+from fluidlift.io.stage_cache import mark_owner, save_stage
+from fluidlift.pipeline.simulating import simulated_poses
 from fluidlift.viewer import saved
 from fluidlift.viewer.footage import InputPictures, input_pictures
 from fluidlift.viewer.saved import SavedFrames
@@ -62,3 +64,16 @@ def test_the_picture_is_that_of_the_simulated_time():
     pictures = InputPictures("the clip", frames, interval=0.1, start=2)
     shown = [(int(p.max()), over) for p, over in map(pictures.at, (0.0, 0.31, 0.7, 5.0))]
     assert shown == [(2, False), (5, False), (9, False), (9, True)]
+
+
+def test_poses_of_obstacles_are_those_of_the_last_simulation_and_of_so_many_bodies_and_frames(tank_folder):
+    poses = np.arange(3 * 2 * 7, dtype=float).reshape(3, 2, 7)
+    assert simulated_poses(tank_folder) is None
+    save_stage(tank_folder, "simulate", "0" * 16, {"poses": poses}, {})
+    mark_owner(tank_folder, "simulate", "0" * 16)
+    np.testing.assert_array_equal(simulated_poses(tank_folder, 2, 3), poses)
+    assert simulated_poses(tank_folder, 1) is None  # of another scene
+    assert simulated_poses(tank_folder, 2, 4) is None  # of a shorter one
+    found = SavedFrames(tank_folder)
+    np.testing.assert_array_equal(found.poses(2), poses[2])
+    assert found.poses(3) is None

@@ -10,7 +10,7 @@ from fluidlift.io.asset_folder import load_asset
 from fluidlift.io.obstacles import Obstacle
 from fluidlift.numerics.solid_mesh import box_mesh
 from fluidlift.types import Gaussians, TriangleMesh
-from fluidlift.viewer.arrows import LONGEST, SHORTEST, arrows
+from fluidlift.viewer.arrows import LONGEST, SHORTEST, arrows, barbed
 from fluidlift.viewer.frames import splat_frame
 from fluidlift.viewer.stage import Parts, Stage
 
@@ -97,3 +97,17 @@ def test_arrows_stand_outside_the_fluid_along_its_velocity_and_tell_the_speed_by
 
 def test_a_frame_at_rest_has_no_arrows():
     assert arrows(block([0.0, 0.0, 0.0]), 1.0) is None
+
+
+@pytest.mark.parametrize("way", [(1.0, 0, 0), (0, 0, -1.0), (0.6, -0.64, 0.48)])
+def test_an_arrow_is_a_shaft_and_four_barbs_that_lie_behind_its_tip_and_around_its_axis(way):
+    tail, way = np.array([0.3, 0.2, 0.1]), np.array(way)
+    lines, colors = barbed(np.stack([tail, tail + way])[None], np.array([[1, 2, 3]], np.uint8), 0.1)
+    assert lines.shape == (5, 2, 3) and (colors == [1, 2, 3]).all()
+    np.testing.assert_allclose(lines[0], [tail, tail + way])
+    barbs = lines[1:, 1] - (tail + way)
+    np.testing.assert_allclose(barbs @ way, -0.1)
+    across = barbs - (barbs @ way)[:, None] * way
+    np.testing.assert_allclose(np.linalg.norm(across, axis=1), 0.04)
+    np.testing.assert_allclose(across.sum(axis=0), 0, atol=1e-12)
+    np.testing.assert_allclose(across[0] @ across[2], 0, atol=1e-12)

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fluidlift.backends.mitsuba_denoise import denoised, without_sparks
-from fluidlift.backends.mitsuba_scene import FinalScene, described
+from fluidlift.backends.mitsuba_scene import FinalScene, cut_out, described
 from fluidlift.errors import FluidliftError, MissingPackage, require
 from fluidlift.types import PinholeCamera
 
@@ -25,6 +25,8 @@ PATHS_AT_ONCE = 16_000_000
 """light paths that a compiled variant keeps in memory together, about 4 GB"""
 PARTS = 8
 """of a picture, each of light paths of its own: where they differ there is grain"""
+EDGE_SAMPLES = 16
+"""at least, of what a glowing liquid covers"""
 PROBE_SECONDS = 120.0
 _INSTALL = "pip install 'fluidlift[mitsuba]'"
 _PROBE = """
@@ -101,6 +103,15 @@ class MitsubaRenderer:
             if len(parts) > PARTS:  # of a long row of them, as many as tell the grain are kept
                 parts[k % PARTS] = parts[k % PARTS] + parts.pop()
         mean = _together(np.stack(parts), counts, denoise=scene.denoise)
+        apart = cut_out(self._mi, scene, camera)
+        if apart is not None:
+            count, seed = min(max(scene.samples, EDGE_SAMPLES), most), (scene.seed * 7919) % 2**31
+            covered, bare = (
+                _finite(np.asarray(self._mi.render(self._mi.load_dict(s), spp=count, seed=seed))) for s in apart
+            )
+            mean[..., 3] = np.clip(covered[..., 3], 0.0, 1.0)
+            light = np.maximum(mean[..., :3] - (1.0 - mean[..., 3:]) * bare[..., :3], 0.0)
+            mean[..., :3] = np.where(mean[..., 3:] > 0, light, 0.0)
         if across is not None and down is not None:
             mean = np.einsum("hi,wj,ijc->hwc", down, across, mean, optimize=True)
         mean = mean.astype(np.float32)

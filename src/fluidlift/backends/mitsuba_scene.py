@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from fluidlift.look.environment import Environment
 from fluidlift.look.environment_lookup import grid_directions
 from fluidlift.look.liquid import LUMINANCE, glow
 from fluidlift.look.materials import Material
+from fluidlift.look.optics import scattering_share
 from fluidlift.numerics.mesh_normals import vertex_normals
 from fluidlift.numerics.srgb import linear_from_srgb
 from fluidlift.types import PinholeCamera, Terrain, TriangleMesh
@@ -62,6 +63,9 @@ class FinalScene:
     denoise: bool = True
     """whether grain is taken out, of 16 samples and more: sparks are cut, which costs a few per cent of the light, and
     what is alike is averaged. False: the unbiased mean"""
+    usual: float | None = None
+    """luminance (linear) of the carried colour that is usual, for what glows (`look.liquid.glow`); None: the mean of
+    the surface's"""
     opaque: bool | None = field(default=None)
     """whether the body is drawn as a painted surface; None: if light is scattered in it often (`OPAQUE_DEPTH`)"""
 
@@ -117,24 +121,12 @@ def resting(mesh: TriangleMesh, terrain: Terrain) -> TriangleMesh:
     return TriangleMesh(vertices, mesh.faces, mesh.colors)
 
 
-def scattering_albedo(color: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-    """Share of light that goes on after each collision in a deep body of this diffuse colour (linear, 0 to 1).
-
-    The inverse of van de Hulst's fit for isotropic scattering in a half space, R = (1 - s)(1 - 0.139 s) / (1 + 1.17 s)
-    with s = sqrt(1 - albedo) (Multiple Light Scattering, 1980).
-    """
-    r = np.clip(np.asarray(color, np.float64), 0.0, 1.0)
-    # 0.139 s^2 - (1.139 + 1.17 R) s + (1 - R) = 0
-    b, c = 1.139 + 1.17 * r, 1.0 - r
-    s = (b - np.sqrt(b * b - 4 * 0.139 * c)) / (2 * 0.139)
-    return 1.0 - np.clip(s, 0.0, 1.0) ** 2
-
-
 def medium(material: Material, carried: Float[np.ndarray, "3"]) -> tuple[np.ndarray, np.ndarray] | None:
     """Extinction (1/m) and share of it that goes on in another direction, per channel; None of a clear body.
 
-    A deep body shows the material's colour, which is how materials define it; a thin one takes from the light behind it
-    what the screen-space picture takes. Without scattering a body only absorbs.
+    A deep body shows the material's colour under its surface, which is how materials define it; a thin one takes from
+    the light behind it what the screen-space picture takes. Without scattering a body only absorbs. Where the colour is
+    `optics.deep_color` of the other two, that is the material's own absorption and scattering.
 
     Args:
         material: of the body.
@@ -145,9 +137,25 @@ def medium(material: Material, carried: Float[np.ndarray, "3"]) -> tuple[np.ndar
         return None
     if material.scattering == 0:
         return extinction, np.zeros(3)
-    return extinction, scattering_albedo(
-        (1 - material.carried) * np.asarray(material.albedo) + material.carried * carried
-    )
+    color = (1 - material.carried) * np.asarray(material.albedo) + material.carried * carried
+    return extinction, scattering_share(color, material.refractive_index)
+
+
+def cut_out(mi: Any, scene: FinalScene, camera: PinholeCamera) -> tuple[dict[str, Any], dict[str, Any]] | None:
+    """For a liquid that glows and stands before black (`show_environment`): the scene whose alpha is what is covered,
+    and the environment alone. None otherwise.
+
+    An integrator that hides emitters from the camera hides the glowing liquid with them, all of it. So the environment
+    is shown, and taken away where nothing stands before it.
+    """
+    if scene.show_environment or max(scene.material.emission) <= 0 or not len(scene.surface.faces):
+        return None
+    covered = described(mi, replace(scene, show_environment=True), camera)
+    bare = {k: covered[k] for k in ("type", "sensor", "light")}
+    del covered["light"]
+    # one turn for what does not glow: where a path ends at once only emitters count as covering
+    covered["integrator"], bare["integrator"] = ({"type": "path", "max_depth": k} for k in (2, 1))
+    return covered, bare
 
 
 def described(mi: Any, scene: FinalScene, camera: PinholeCamera) -> dict[str, Any]:
@@ -162,7 +170,7 @@ def described(mi: Any, scene: FinalScene, camera: PinholeCamera) -> dict[str, An
     # with distances drawn for one channel alone, as volpath does, liquids that absorb one colour most turn to confetti
     out["integrator"] = {
         "type": "volpathmis", "max_depth": scene.depth, "rr_depth": max(scene.depth // 2, 5),
-        "hide_emitters": not scene.show_environment,
+        "hide_emitters": not scene.show_environment and max(scene.material.emission) <= 0,
     }  # fmt: skip
     if len(scene.surface.faces):
         for k, (faces, emission) in enumerate(_glowing(scene)):
@@ -219,7 +227,8 @@ def _glowing(scene: FinalScene) -> list[tuple[np.ndarray, np.ndarray]]:
     if emission.max() <= 0 or mesh.colors is None:
         return [(whole, emission)]
     carried = linear_from_srgb(mesh.colors)
-    hot = glow(carried, float((carried @ LUMINANCE).mean()))[whole].mean(axis=1)
+    usual = float((carried @ LUMINANCE).mean()) if scene.usual is None else scene.usual
+    hot = glow(carried, usual)[whole].mean(axis=1)
     if not scene.painted:
         return [(whole, emission * hot.mean(axis=0))]
     kind = (np.argsort(np.argsort(hot[:, 0], kind="stable")) * HEATS) // len(hot)

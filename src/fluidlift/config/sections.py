@@ -199,6 +199,8 @@ class ShowConfig:
     """longer side of one preview panel, px"""
     usd: bool = True
     """write asset.usda"""
+    preview: bool = True
+    """write preview.mp4; of minutes of simulation it takes as long as they do"""
 
 
 @dataclass(frozen=True)

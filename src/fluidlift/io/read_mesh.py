@@ -11,7 +11,17 @@ import numpy as np
 
 from fluidlift.errors import InputRejected
 from fluidlift.io.limits import require_file, require_size
+from fluidlift.io.mesh_textures import (
+    MAX_MATERIALS,
+    Paint,
+    corner_colors,
+    materials_of,
+    one_picture,
+    picture_bytes,
+    vertex_colors,
+)
 from fluidlift.io.ply import AXES, read_mesh
+from fluidlift.numerics.srgb import srgb_from_linear
 from fluidlift.types import TriangleMesh
 
 SUFFIXES = (".obj", ".ply", ".glb")
@@ -24,14 +34,16 @@ _JSON, _BINARY = 0x4E4F534A, 0x004E4942
 
 
 def read_any_mesh(path: Path | str) -> TriangleMesh:
-    """A mesh in metres with z up, with the vertex colours (sRGB) of an OBJ or PLY that has them.
+    """A mesh in metres with z up, with its vertex colours (sRGB), and with one texture where it has pictures.
 
     OBJ and PLY are taken as they are (metres, z up); glTF is y up by definition and is turned. Polygons of an OBJ
-    become fans of triangles. Materials, normals, texture coordinates and colours of a glTF are left out.
+    become fans of triangles. Of materials, the colour and its picture are taken: `Kd` and `map_Kd` of the .mtl beside
+    an OBJ, base colours and their PNG or JPEG inside a binary glTF. Pictures of several materials become one, and the
+    vertices have its colours for what shows no textures. All else of a material, and normals, are left out.
 
     Raises:
-        InputRejected: no such file, another format, larger than 256 MB, damaged, without triangles, or with what this
-            reader does not know (compressed or sparse glTF, ASCII PLY).
+        InputRejected: no such file, another format, larger than 256 MB, damaged, without triangles, with what this
+            reader does not know (compressed or sparse glTF, ASCII PLY), or with pictures that are missing or too large.
     """
     path = require_file(path, "mesh file")
     if path.suffix.lower() not in SUFFIXES:
@@ -59,36 +71,88 @@ def _read_ply(path: Path) -> TriangleMesh:
 
 
 def _read_obj(path: Path) -> TriangleMesh:
-    """`v` and `f` lines; `f` counts from 1, or backwards from the last vertex where it is negative.
+    """`v`, `vt`, `f`, `usemtl` and `mtllib` lines; `f` counts from 1, or backwards from the last one where negative.
 
     A vertex may be followed by its colour: three more numbers from 0 to 1. Taken where all of them have one.
     """
-    vertices: list[list[float]] = []
-    colors: list[list[float]] = []
-    faces: list[tuple[int, int, int]] = []
+    obj = _Obj()
     with path.open("r", encoding="utf-8", errors="replace") as file:
         for number, line in enumerate(file, start=1):
-            words = line.split()
-            if not words:
-                continue
             try:
-                if words[0] == "v":
-                    vertices.append([float(w) for w in words[1:4]])
-                    if len(vertices[-1]) != 3:
-                        raise ValueError("a vertex of fewer than three numbers")
-                    if len(words) == 7:
-                        colors.append([float(w) for w in words[4:7]])
-                elif words[0] == "f":
-                    corner = [_obj_index(w, len(vertices)) for w in words[1:]]
-                    if len(corner) < 3:
-                        raise ValueError("a face of fewer than three corners")
-                    faces += [(corner[0], corner[i], corner[i + 1]) for i in range(1, len(corner) - 1)]
+                obj.take(line)
             except ValueError as error:
                 raise ValueError(f"line {number}: {error}") from None
-    places, triangles = np.array(vertices, np.float64).reshape(-1, 3), np.array(faces, np.int64).reshape(-1, 3)
-    painted = np.array(colors, np.float32).reshape(-1, 3)
-    whole = len(painted) == len(places) > 0 and bool(((painted >= 0) & (painted <= 1)).all())
-    return TriangleMesh(places, triangles, painted if whole else None)
+    places, triangles = np.array(obj.vertices, np.float64).reshape(-1, 3), np.array(obj.faces, np.int64).reshape(-1, 3)
+    colors = np.array(obj.colors, np.float32).reshape(-1, 3)
+    whole = len(colors) == len(places) > 0 and bool(((colors >= 0) & (colors <= 1)).all())
+    materials = materials_of(path.parent, obj.library) if obj.library and len(triangles) else {}
+    if not materials or not set(obj.names) & materials.keys():
+        return TriangleMesh(places, triangles, colors if whole else None)
+    paints = [materials.get(name, Paint()) for name in obj.names]
+    uv = np.array([(0.0, 0.0), *obj.coordinates], np.float64)[np.array(obj.corners) + 1].reshape(-1, 3, 2)
+    uv[..., 1] = 1.0 - uv[..., 1]  # an OBJ counts from the lower left corner
+    return _painted(places, triangles, paints, np.array(obj.materials), uv)
+
+
+class _Obj:
+    """What the lines of an OBJ add up to."""
+
+    def __init__(self) -> None:
+        self.vertices: list[list[float]] = []
+        self.colors: list[list[float]] = []
+        self.coordinates: list[tuple[float, float]] = []
+        self.faces: list[tuple[int, int, int]] = []
+        self.corners: list[tuple[int, int, int]] = []
+        """of faces: indices of coordinates, -1 where there are none"""
+        self.materials: list[int] = []
+        """of faces: indices of names"""
+        self.names: list[str] = [""]
+        self.library = ""
+        self._material = 0
+
+    def take(self, line: str) -> None:
+        """One line; raises ValueError."""
+        words = line.split()
+        if not words:
+            return
+        if words[0] == "v":
+            self.vertices.append([float(w) for w in words[1:4]])
+            if len(self.vertices[-1]) != 3:
+                raise ValueError("a vertex of fewer than three numbers")
+            if len(words) == 7:
+                self.colors.append([float(w) for w in words[4:7]])
+        elif words[0] == "vt":
+            self.coordinates.append((float(words[1]), float(words[2]) if len(words) > 2 else 0.0))
+        elif words[0] == "f":
+            self._face(words[1:])
+        elif words[0] == "usemtl":
+            name = line.split(None, 1)[1].strip() if len(words) > 1 else ""
+            if name not in self.names:
+                if len(self.names) > 16 * MAX_MATERIALS:
+                    raise ValueError(f"more than {16 * MAX_MATERIALS} materials")
+                self.names.append(name)
+            self._material = self.names.index(name)
+        elif words[0] == "mtllib" and len(words) > 1 and not self.library:
+            self.library = line.split(None, 1)[1].strip()
+
+    def _face(self, words: list[str]) -> None:
+        corner = [_obj_index(w, len(self.vertices)) for w in words]
+        if len(corner) < 3:
+            raise ValueError("a face of fewer than three corners")
+        at = [_obj_coordinate(w, len(self.coordinates)) for w in words]
+        for i in range(1, len(corner) - 1):
+            self.faces.append((corner[0], corner[i], corner[i + 1]))
+            self.corners.append((at[0], at[i], at[i + 1]))
+            self.materials.append(self._material)
+
+
+def _painted(
+    places: np.ndarray, faces: np.ndarray, paints: list[Paint], which: np.ndarray, uv: np.ndarray
+) -> TriangleMesh:
+    """The mesh with the pictures and colours of its materials."""
+    texture, at = one_picture(paints, which, uv)
+    colors = vertex_colors(len(places), faces, corner_colors(paints, which, uv if at is None else at, texture))
+    return TriangleMesh(places, faces, colors, at, texture)
 
 
 def _obj_index(word: str, count: int) -> int:
@@ -99,39 +163,131 @@ def _obj_index(word: str, count: int) -> int:
     return index
 
 
+def _obj_coordinate(word: str, count: int) -> int:
+    """Index of a corner's texture coordinate, -1 where it has none or names one that is not there."""
+    parts = word.split("/")
+    if len(parts) < 2 or not parts[1]:
+        return -1
+    index = int(parts[1])
+    index = index - 1 if index > 0 else count + index
+    return index if 0 <= index < count else -1
+
+
 def _read_glb(path: Path) -> TriangleMesh:
     scene, binary = _chunks(path.read_bytes())
     required = scene.get("extensionsRequired", [])
     if required:
         raise ValueError(f"it needs the extension {str(required[0])[:40]}, which this reader does not know")
-    vertices: list[np.ndarray] = []
-    faces: list[np.ndarray] = []
-    count = 0
+    parts: list[tuple[np.ndarray, ...]] = []
+    paints = _glb_paints(scene, binary)
+    count, colored = 0, False
     for node, world in _placed_nodes(scene):
         if "mesh" not in node:
             continue
         for primitive in scene["meshes"][_index(node["mesh"])]["primitives"]:
             if primitive.get("mode", 4) != 4:
                 continue  # points and lines bound nothing
-            points = _accessor(scene, binary, primitive["attributes"]["POSITION"], "VEC3")
-            points = points.astype(np.float64) @ world[:3, :3].T + world[:3, 3]
-            if "indices" in primitive:
-                corner = _accessor(scene, binary, primitive["indices"], "SCALAR").astype(np.int64).ravel()
-            else:
-                corner = np.arange(len(points))
-            if len(corner) and corner.max() >= len(points):
-                raise ValueError("faces that name missing vertices")
-            triangles = corner[: len(corner) // 3 * 3].reshape(-1, 3) + count
-            if np.linalg.det(world[:3, :3]) < 0:  # a mirror turns the surface inside out
-                triangles = triangles[:, ::-1]
-            vertices.append(points)
-            faces.append(triangles)
+            part = _glb_part(scene, binary, primitive, world)
+            material = _index(primitive["material"]) + 1 if "material" in primitive else 0
+            if material >= len(paints):
+                raise ValueError("a material that is not there")
+            points, triangles, colors, uv = part
+            colored = colored or material > 0 or "COLOR_0" in primitive["attributes"]
+            parts.append((points, triangles + count, colors, uv, np.full(len(triangles), material)))
             count += len(points)
             if count > _MAX_VERTICES:
                 raise ValueError(f"more than {_MAX_VERTICES} vertices")
-    if not vertices:
+    if not parts:
         raise ValueError("no triangles")
-    return TriangleMesh(np.concatenate(vertices) @ AXES["y_up"], np.concatenate(faces))
+    points, faces, colors, uv, which = (np.concatenate(p) for p in zip(*parts, strict=True))
+    points = points @ AXES["y_up"]
+    if not colored or not len(faces):
+        return TriangleMesh(points, faces)
+    mesh = _painted(points, faces, paints, which, uv)
+    if mesh.texture is not None or mesh.colors is None:
+        return mesh
+    # colours of vertices are a factor of the material's, in linear light
+    plain = np.array([_linear(p.color) for p in paints])
+    factor = vertex_colors(len(points), faces, np.repeat(plain[which][:, None], 3, axis=1))
+    return TriangleMesh(points, faces, srgb_from_linear(np.clip(colors * factor, 0, 1)).astype(np.float32))
+
+
+def _linear(color: tuple[float, float, float]) -> np.ndarray:
+    from fluidlift.numerics.srgb import linear_from_srgb
+
+    return linear_from_srgb(np.array(color, np.float64))
+
+
+def _glb_part(
+    scene: dict[str, Any], binary: bytes, primitive: dict[str, Any], world: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Places in the scene, triangles, linear colours of vertices, and texture coordinates of corners."""
+    attributes = primitive["attributes"]
+    points = _accessor(scene, binary, attributes["POSITION"], "VEC3")
+    if points.dtype.kind != "f":
+        raise ValueError("positions that are not floating-point numbers")
+    points = points.astype(np.float64) @ world[:3, :3].T + world[:3, 3]
+    if "indices" in primitive:
+        corner = _accessor(scene, binary, primitive["indices"], "SCALAR").astype(np.int64).ravel()
+    else:
+        corner = np.arange(len(points))
+    if len(corner) and corner.max() >= len(points):
+        raise ValueError("faces that name missing vertices")
+    triangles = corner[: len(corner) // 3 * 3].reshape(-1, 3)
+    if np.linalg.det(world[:3, :3]) < 0:  # a mirror turns the surface inside out
+        triangles = triangles[:, ::-1]
+    colors, uv = np.ones((len(points), 3)), np.zeros((len(points), 2))
+    if "COLOR_0" in attributes:
+        colors = _shares(scene, binary, attributes["COLOR_0"], ("VEC3", "VEC4"))[:, :3]
+    if "TEXCOORD_0" in attributes:
+        uv = _shares(scene, binary, attributes["TEXCOORD_0"], ("VEC2",))
+    if len(colors) != len(points) or len(uv) != len(points):
+        raise ValueError("colours or texture coordinates of another number than its vertices")
+    return points, triangles, colors, uv[triangles]
+
+
+def _shares(scene: dict[str, Any], binary: bytes, number: Any, kinds: tuple[str, ...]) -> np.ndarray:
+    """Numbers of an accessor as float64; of whole ones, shares of their largest."""
+    kind = scene["accessors"][_index(number)]["type"]
+    if kind not in kinds:
+        raise ValueError(f"an accessor of the type {str(kind)[:20]}")
+    values = _accessor(scene, binary, number, kind)
+    return values / np.iinfo(values.dtype).max if values.dtype.kind == "u" else values.astype(np.float64)
+
+
+def _glb_paints(scene: dict[str, Any], binary: bytes) -> list[Paint]:
+    """The one of primitives without a material (white), then the materials."""
+    paints = [Paint((1.0, 1.0, 1.0))]
+    materials = scene.get("materials", [])
+    if len(materials) > 16 * MAX_MATERIALS:
+        raise ValueError(f"{len(materials)} materials")
+    decoded: dict[int, np.ndarray] = {}
+    for material in materials:
+        told = material.get("pbrMetallicRoughness", {})
+        factor = np.clip(np.array(told.get("baseColorFactor", [1, 1, 1, 1]), np.float64)[:3], 0, 1)
+        r, g, b = srgb_from_linear(factor).tolist()
+        picture = None
+        if "baseColorTexture" in told:
+            source = scene["textures"][_index(told["baseColorTexture"]["index"])].get("source")
+            if source is not None:
+                if len(decoded) >= MAX_MATERIALS and _index(source) not in decoded:
+                    raise ValueError(f"more than {MAX_MATERIALS} pictures")
+                if source not in decoded:
+                    decoded[source] = _glb_picture(scene, binary, source)
+                picture = decoded[source]
+                if (factor < 1).any():
+                    picture = np.round(picture * np.array([r, g, b])).astype(np.uint8)  # nearly: a power law's factor
+        paints.append(Paint((r, g, b), picture))
+    return paints
+
+
+def _glb_picture(scene: dict[str, Any], binary: bytes, number: int) -> np.ndarray:
+    image = scene["images"][number]
+    if "bufferView" not in image:
+        raise ValueError("a texture in another file")
+    view = scene["bufferViews"][_index(image["bufferView"])]
+    start = _index(view.get("byteOffset", 0))
+    return picture_bytes(binary[start : start + _index(view["byteLength"])], image.get("mimeType", ""))
 
 
 def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
@@ -205,12 +361,10 @@ def _accessor(scene: dict[str, Any], binary: bytes, number: Any, kind: str) -> n
     if accessor["type"] != kind or "sparse" in accessor or "bufferView" not in accessor:
         raise ValueError("a sparse or empty accessor, or one of another type")
     dtype = _KINDS[accessor["componentType"]]
-    if kind == "VEC3" and dtype.kind != "f":
-        raise ValueError("positions that are not floating-point numbers")
     view = scene["bufferViews"][_index(accessor["bufferView"])]
     if _index(view.get("buffer", 0)) != 0 or "uri" in scene["buffers"][0]:
         raise ValueError("data in another file")
-    width = 3 if kind == "VEC3" else 1
+    width = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}[kind]
     count, item = _index(accessor["count"]), dtype.itemsize * width
     stride = _index(view.get("byteStride", item)) or item
     offset = _index(view.get("byteOffset", 0)) + _index(accessor.get("byteOffset", 0))

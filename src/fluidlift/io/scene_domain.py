@@ -14,9 +14,15 @@ HUGE = 20.0
 """times the domain's longest side above which a mesh is taken to be in other units"""
 MOSTLY = 0.5
 """share of a mesh's extent outside the domain above which one is warned"""
+DROP = 2.0
+"""longest sides of the domain above it from which a free obstacle may be dropped"""
+PULL = (0.0, 0.0, -9.81)
+"""m/s^2, where scene.yaml gives no gravity: which way is down matters, not how strong"""
 
 
-def require_inside(edits: SceneEdits, grid: Grid, *, reach: float = 0.0, above: float = 0.0) -> list[str]:
+def require_inside(
+    edits: SceneEdits, grid: Grid, *, reach: float = 0.0, above: float = 0.0, seconds: float | None = None
+) -> list[str]:
     """See that obstacles, emitters and a new terrain touch the simulation's box.
 
     Args:
@@ -24,9 +30,10 @@ def require_inside(edits: SceneEdits, grid: Grid, *, reach: float = 0.0, above: 
         grid: that is simulated on.
         reach: m by which the box may become longer than that to each side (a channel that is extended).
         above: m by which it may become higher for emitters.
+        seconds: that are simulated; None: they do not matter.
 
     Returns:
-        Warnings about those that lie mostly outside.
+        Warnings about those that lie mostly outside, or fall in only after the end.
 
     Raises:
         InputRejected: one that lies wholly outside, or is many times larger than the box; the message names its line.
@@ -36,6 +43,11 @@ def require_inside(edits: SceneEdits, grid: Grid, *, reach: float = 0.0, above: 
     warnings = []
     for obstacle in edits.obstacles:
         what = f"{obstacle.line}: obstacle '{obstacle.name}'"
+        fall = _fall(obstacle, (low, high), edits.parameters.get("gravity", PULL)[2])
+        if fall is not None:
+            late = seconds is not None and fall > seconds
+            warnings += [f"{what} falls for {fall:.2g} s before it is in the domain, after the last frame"] * late
+            continue
         warnings += _judged(what, _all_places(obstacle), (low, high), still=obstacle.motion == "static")
     for emitter in edits.emitters:
         points = _points(emitter.mesh)
@@ -46,6 +58,18 @@ def require_inside(edits: SceneEdits, grid: Grid, *, reach: float = 0.0, above: 
         if isinstance(edit, Replace):  # a bed may go on far beyond the box
             _judged(f"{edit.line}: the terrain's mesh", [_points(edit.mesh)], (low, high), still=False)
     return warnings
+
+
+def _fall(obstacle: Obstacle, box: tuple[np.ndarray, np.ndarray], pull: float) -> float | None:
+    """Seconds in which a free obstacle falls into the box from straight above it; None where it is no such one."""
+    points = _all_places(obstacle)[0]
+    (low, high), first, last = box, points.min(axis=0), points.max(axis=0)
+    way = float(first[2] - high[2])
+    over = ((last > low) & (first < high))[:2].all() and 0 <= way < DROP * float((high - low).max())
+    if obstacle.motion != "free" or not over or pull >= 0:
+        return None
+    rise = float(obstacle.velocity[2])
+    return (rise + (rise * rise - 2.0 * pull * way) ** 0.5) / -pull
 
 
 def _points(mesh: TriangleMesh) -> np.ndarray:

@@ -21,7 +21,7 @@ import numpy as np
 
 from fluidlift.errors import InputRejected, require
 from fluidlift.io.atomic import write_bytes
-from fluidlift.io.limits import require_file
+from fluidlift.io.limits import require_file, require_size
 from fluidlift.io.ply import AXES, MAX_SPLATS
 from fluidlift.types import Gaussians, Similarity3
 
@@ -33,6 +33,9 @@ _COLOR_SCALE = 0.15
 """of the degree-0 harmonics; leaves room for colours a little outside 0 to 1"""
 _FINEST = 16
 """most fractional bits of a position (0.015 mm)"""
+MAX_BYTES = 2**31
+"""of a file: `MAX_SPLATS` of degree 3 are less than that before they are packed. What comes out is bounded by the
+number of splats that the header claims, and that by `MAX_SPLATS`"""
 _COMPONENT = 511
 """largest size of a stored quaternion component, which stands for sqrt(1/2)"""
 
@@ -76,9 +79,11 @@ def read_spz(path: Path | str) -> Gaussians:
     """Read an SPZ file of version 2 or 3 into world axes (z up).
 
     Raises:
-        InputRejected: no such file, not SPZ, another version, cut off, or more than `MAX_SPLATS` splats.
+        InputRejected: no such file, not SPZ, another version, cut off, larger than `MAX_BYTES`, or more than
+            `MAX_SPLATS` splats.
     """
     path = require_file(path, "SPZ file")
+    require_size(path, MAX_BYTES, "SPZ file")
     data = path.read_bytes()
     version, n, degree, bits = _header(path, data)
     higher, turn = (degree + 1) ** 2 - 1, 3 if version == 2 else 4

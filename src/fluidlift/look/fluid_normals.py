@@ -3,7 +3,8 @@
 The shortest axis of a splat, which GaussianShader (arXiv:2311.17977) takes, means nothing for the nearly round splats
 of a fluid. Here the density is gathered on a coarse grid with quadratic B-splines, held at that of a full body, and its
 downward slope at each splat is the outward normal: it changes smoothly while splats move, come and go.
-`gather_kernel`, `add_solid_kernel` and `normals_kernel` have twins for reading, whose names end in `_plain`.
+`gather_kernel`, `add_solid_kernel`, `normals_kernel` and `depths_kernel` have twins for reading, whose names end in
+`_plain`.
 """
 
 from __future__ import annotations
@@ -13,11 +14,13 @@ import math
 import numba as nb
 import numpy as np
 from jaxtyping import Float
+from scipy import ndimage
 
 from fluidlift.errors import require
+from fluidlift.numerics.isosurface import surface_nets
 from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.types.gaussians import Gaussians
-from fluidlift.types.terrain import Terrain
+from fluidlift.types.terrain import Terrain, TriangleMesh
 
 NODES_APART = 2.0
 """distance of the grid's nodes, in spacings of the splats"""
@@ -31,6 +34,12 @@ FULL = 0.8
 AT_SURFACE = (0.08, 0.35)
 """slope, as a share of that of a flat surface at its middle, from which a splat begins to belong to the surface, and
 from which it does in full"""
+SHADOWED = 0.35
+"""share of a full body's density where the surface for shadows lies: a layer of one splat has half of it"""
+STEPS = 48
+"""nodes' distances that the depth of a body is followed to each side of a splat"""
+EMPTY = 0.2
+"""share of a full body's density under which the body has ended"""
 _CHUNK = 2048
 
 
@@ -52,19 +61,49 @@ def fluid_normals(
     Raises:
         ValueError: a spacing that is not positive.
     """
-    require(np.isfinite(spacing) and spacing > 0, f"spacing {spacing}", "positive metres")
     points = gaussians.means
     normals, share = np.empty((len(points), 3), np.float32), np.empty(len(points), np.float32)
-    sound = points if np.isfinite(points).all() else points[np.isfinite(points).all(axis=1)]
-    low, h, shape = _nodes(sound, spacing) if len(sound) else (np.zeros(3), spacing, (4, 4, 4))
-    density = np.zeros(shape, np.float32)
-    gather_kernel(sound, low, h, density)
-    density = _held(density * np.float32((spacing / h) ** 3 / FULL))
+    low, h, density = _body(points, spacing)
     if terrain is not None:
         add_solid_kernel(terrain.signed_distance, terrain.grid.low, terrain.grid.spacing, low, h, density)
     density = _blurred(_blurred(density))
     normals_kernel(points, low, h, density, normals, share)
     return normals, share
+
+
+def fluid_depths(gaussians: Gaussians, normals: Float[np.ndarray, "n 3"], spacing: float) -> Float[np.ndarray, "n"]:
+    """Metres of fluid on the line through each splat along its normal, float32: how deep the body is there.
+
+    The bed is no fluid here. Splats with a number that is not finite have 0.
+
+    Args:
+        gaussians, spacing: as of `fluid_normals`.
+        normals: unit.
+    """
+    low, h, density = _body(gaussians.means, spacing)
+    out = np.zeros(len(gaussians), np.float32)
+    depths_kernel(gaussians.means, np.ascontiguousarray(normals, np.float32), low, h, density, out)
+    return out
+
+
+def fluid_surface(gaussians: Gaussians, spacing: float) -> TriangleMesh:
+    """A closed, coarse surface of the fluid, for shadows: films of one layer of splats are in it, single drops are not.
+
+    Its edges are a few spacings long, and it stands off the fluid by about one.
+    """
+    low, h, density = _body(gaussians.means, spacing)
+    vertices, faces = surface_nets(SHADOWED - density, spacing=h, origin=(float(low[0]), float(low[1]), float(low[2])))
+    return TriangleMesh(vertices.astype(np.float32), faces)
+
+
+def _body(points: np.ndarray, spacing: float) -> tuple[np.ndarray, float, np.ndarray]:
+    """Low corner, distance and densities (1: full) of the nodes around the splats."""
+    require(np.isfinite(spacing) and spacing > 0, f"spacing {spacing}", "positive metres")
+    sound = points if np.isfinite(points).all() else points[np.isfinite(points).all(axis=1)]
+    low, h, shape = _nodes(sound, spacing) if len(sound) else (np.zeros(3), spacing, (4, 4, 4))
+    density = np.zeros(shape, np.float32)
+    gather_kernel(sound, low, h, density)
+    return low, h, _held(density * np.float32((spacing / h) ** 3 / FULL))
 
 
 def _held(density: np.ndarray) -> np.ndarray:
@@ -196,6 +235,56 @@ def normals_kernel(points, low, h, density, normals, share):
                 normals[p, 0], normals[p, 1], normals[p, 2] = -gx / slope, -gy / slope, -gz / slope
             s = min(max((slope * flat - AT_SURFACE[0]) / (AT_SURFACE[1] - AT_SURFACE[0]), 0.0), 1.0)
             share[p] = s * s * (3.0 - 2.0 * s)
+
+
+@nb.njit(cache=True, inline="always")
+def _density_at(x, y, z, density):
+    """Trilinear, at a place in nodes; 0 outside."""
+    i, j, k = np.int64(math.floor(x)), np.int64(math.floor(y)), np.int64(math.floor(z))
+    if i < 0 or j < 0 or k < 0 or i + 1 >= density.shape[0] or j + 1 >= density.shape[1] or k + 1 >= density.shape[2]:
+        return 0.0
+    a, b, c = x - i, y - j, z - k
+    value = 0.0
+    for corner in range(8):
+        u, v, t = corner // 4, corner // 2 % 2, corner % 2
+        weight = (a if u else 1 - a) * (b if v else 1 - b) * (c if t else 1 - c)
+        value += weight * density[i + u, j + v, k + t]
+    return value
+
+
+@nb.njit(cache=True, nogil=True, parallel=True, error_model="numpy")
+def depths_kernel(points, normals, low, h, density, out):
+    """Adds up the density along each normal, half a node at a time, to both sides until it ends."""
+    n = points.shape[0]
+    for chunk in nb.prange(-(-n // _CHUNK)):
+        for p in range(np.int64(chunk) * _CHUNK, min((np.int64(chunk) + 1) * _CHUNK, n)):
+            total = 0.0
+            x, y, z = (points[p, 0] - low[0]) / h, (points[p, 1] - low[1]) / h, (points[p, 2] - low[2]) / h
+            if not math.isfinite(x + y + z):
+                continue
+            for side in (-0.5, 0.5):
+                for step in range(2 * STEPS):
+                    s = side * (step + 0.5)
+                    here = _density_at(x + s * normals[p, 0], y + s * normals[p, 1], z + s * normals[p, 2], density)
+                    if here < EMPTY:
+                        break
+                    total += here
+            out[p] = 0.5 * h * total
+
+
+def depths_plain(
+    points: np.ndarray, normals: np.ndarray, low: np.ndarray, h: float, density: np.ndarray
+) -> Float[np.ndarray, "n"]:
+    """The twin of `depths_kernel`, for finite points."""
+    total = np.zeros(len(points))
+    for side in (-0.5, 0.5):
+        goes_on = np.ones(len(points), bool)
+        for step in range(2 * STEPS):
+            at = (points - low) / h + side * (step + 0.5) * normals
+            here = ndimage.map_coordinates(density, at.T, order=1, mode="constant", prefilter=False)
+            goes_on &= here >= EMPTY
+            total += np.where(goes_on, here, 0.0)
+    return (0.5 * h * total).astype(np.float32)
 
 
 def _splines(points: np.ndarray, low: np.ndarray, h: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

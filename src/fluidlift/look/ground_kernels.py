@@ -193,3 +193,15 @@ def filled_in(coarse, step, depth, normal, alike, out):
                 x, y, z = x + weight * coarse[r, c, 0], y + weight * coarse[r, c, 1], z + weight * coarse[r, c, 2]
             if total > 0.0:
                 out[i, j, 0], out[i, j, 1], out[i, j, 2] = x / total, y / total, z / total
+
+
+@nb.njit(cache=True, parallel=True)
+def lay_over(layer, layer_depth, image, depth):
+    """A picture laid over another where its depth (m; 0: none) is smaller, in place."""
+    for row in nb.prange(depth.shape[0]):
+        for j in range(depth.shape[1]):
+            z = layer_depth[row, j]
+            if z > 0.0 and (depth[row, j] <= 0.0 or z < depth[row, j]):
+                depth[row, j] = z
+                for k in range(3):
+                    image[row, j, k] = layer[row, j, k]

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fluidlift.errors import require
-from fluidlift.look.ground_kernels import filled_in, paint, world_points
+from fluidlift.look.ground_kernels import filled_in, lay_over, paint, world_points
 from fluidlift.look.ground_light import Around, Casters, GroundLight, direct_light, spread_directions
 from fluidlift.look.liquid import Behind
 from fluidlift.look.materials import Material
@@ -114,10 +114,12 @@ class Ground:
             layers.append(_Surfaces(self, camera, np.where(moved, depth, 0.0).astype(np.float32), albedo, normal))
         image, before = behind.image.copy(), behind.depth.copy()
         for layer in layers:
-            drawn = (layer.depth > 0) & ((before <= 0) | (layer.depth < before))
-            np.copyto(image, layer.image(moving), where=drawn[..., None])
-            np.copyto(before, layer.depth, where=drawn)
+            lay_over(layer.image(moving), layer.depth, image, before)
         return Behind(image, before)
+
+    def depth(self, camera: PinholeCamera) -> Float[np.ndarray, "h w"]:
+        """Camera z (m; 0: none) of these meshes: of the ground that a photograph in place of its picture shows."""
+        return self._seen(camera).depth
 
     def _seen(self, camera: PinholeCamera) -> _Surfaces:
         key = place_of(camera)

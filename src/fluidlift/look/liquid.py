@@ -15,12 +15,15 @@ from jaxtyping import Float
 from fluidlift.errors import require
 from fluidlift.look.environment import LEVELS, LUMINANCE, Environment
 from fluidlift.look.liquid_kernels import (
+    BEYOND,
     COLOR,
+    FARTHER,
     INWARD,
     MIRROR,
     NUMBERS,
     OUTSIDE,
     PATH,
+    SECOND,
     SHARE,
     SPREAD,
     THROUGH,
@@ -28,6 +31,7 @@ from fluidlift.look.liquid_kernels import (
     follow,
     shade,
 )
+from fluidlift.look.liquid_lookup import SLANTED
 from fluidlift.look.materials import Material
 from fluidlift.look.optics import fresnel, transmittance
 from fluidlift.types.camera import PinholeCamera
@@ -69,6 +73,9 @@ class LiquidSurface:
     back_normal: Float[np.ndarray, "h w 3"] | None = None
     """unit, world, away from the liquid on its far side; None: as if the far side were parallel to the near one, and
     mirrored nothing"""
+    grain: float = 0.0
+    """m, height over what it lies on from which liquid is seen in full: a thinner film fades out, and its edge with it.
+    0: every film is taken as it is"""
 
     def __post_init__(self) -> None:
         shape = self.depth.shape
@@ -79,6 +86,7 @@ class LiquidSurface:
             array = np.ascontiguousarray(getattr(self, name), np.float32)
             require(array.ndim >= 2 and array.shape == wanted, f"{name} of shape {array.shape}", str(wanted))
             object.__setattr__(self, name, array)
+        require(np.isfinite(self.grain) and self.grain >= 0, f"a grain of {self.grain}", "0 m or more")
 
 
 @dataclass(frozen=True)
@@ -89,6 +97,9 @@ class Behind:
     """linear"""
     depth: Float[np.ndarray, "h w"]
     """camera z, m; 0: infinitely far"""
+    goes_on: bool = False
+    """it stands for what lies beyond its rim, too: first the rim, then the mean. For the plate of a clip, around which
+    nobody knows the world; else that is the environment's"""
 
     def __post_init__(self) -> None:
         shape = np.shape(self.depth)
@@ -96,6 +107,15 @@ class Behind:
             array = np.ascontiguousarray(getattr(self, name), np.float32)
             require(array.ndim >= 2 and array.shape == wanted, f"{name} of shape {array.shape}", str(wanted))
             object.__setattr__(self, name, array)
+
+    @property
+    def rest(self) -> Float[np.ndarray, "4"]:
+        """Linear mean of what is far away and 1, if it goes on beyond the rim; else 0."""
+        if not self.goes_on:
+            return np.zeros(4)
+        far = self.depth <= 0
+        mean = (self.image[far] if far.any() else self.image.reshape(-1, 3)).mean(axis=0, dtype=np.float64)
+        return np.append(mean, 1.0)
 
 
 def shaded(
@@ -110,13 +130,13 @@ def shaded(
     """The finished picture: `behind`, with the liquid before it where it is nearer.
 
     Light mirrored at the surface comes from the environment, wider with the roughness and where the surface is
-    curved within a pixel. What enters is bent after Snell, runs to the far side (a plane through the end of the
-    straight line of sight, with `back_normal`), leaves it bent again and meets what lies behind, which is looked up in
-    the picture. The share that is mirrored on the far side (Fresnel's, up to all of it), and light that comes from
-    outside the picture, is the environment's. On the way exp(-(absorption + scattering) d) is left, and
-    1 - exp(-scattering d) of the body's own colour is added, lit by the environment's irradiance (single scattering;
-    `Material.albedo` is the limit of a deep body). A clear liquid in a uniformly white world is white, whatever its
-    shape.
+    curved within a pixel. What enters is bent after Snell, runs to the far side (of `thickness` and `back_normal` where
+    the bent ray gets there), leaves it bent again and meets what lies behind, which is looked up in the picture. The
+    share that is mirrored on the far side (Fresnel's, up to all of it) is followed on inside to where it gets out, and
+    looked up there. Light that comes from outside the picture is the environment's. On the way
+    exp(-(absorption + scattering) d) is left, and if it scatters, the rest is the body's own colour, lit by the
+    environment's irradiance (`Material.albedo` is the limit of a deep body). A clear liquid in a uniformly white world
+    is white, whatever its shape.
 
     Not there: reflections of the ground in the liquid, shadows on the liquid, caustics.
 
@@ -140,17 +160,25 @@ def shaded(
     if usual is None:
         usual = _usual(surface, behind) if max(material.emission) > 0 else 1.0
     pictures, steps = _pictures(environment)
-    back = surface.normal if surface.back_normal is None else surface.back_normal
     numbers = np.array([
         material.refractive_index, material.roughness, material.scattering, _straight(material), DULL, material.carried,
         SHARP, max(usual, 1e-6), COOL, HOT, WARM, CONTRAST, *material.absorption, *material.albedo, *material.emission,
+        *LUMINANCE,
     ])  # fmt: skip
-    shade(
-        surface.covered, surface.depth, surface.normal, back, surface.back_normal is not None, surface.thickness,
-        surface.albedo, behind.image, behind.depth, *_eye(camera), pictures, steps, _DIM, environment.diffuse, numbers,
-        LUMINANCE, SECOND_RADIATION / WAVELENGTHS, picture,
-    )  # fmt: skip
+    world = (pictures, steps, _DIM, environment.diffuse, SECOND_RADIATION / WAVELENGTHS)
+    shade(_arrays(surface), _scene(behind), _eye(camera), world, numbers, picture)
     return picture
+
+
+def _arrays(surface: LiquidSurface) -> tuple:
+    back = np.zeros((0, 0, 3), np.float32) if surface.back_normal is None else surface.back_normal
+    return (
+        surface.covered, surface.depth, surface.normal, back, surface.thickness, surface.albedo, float(surface.grain)
+    )  # fmt: skip
+
+
+def _scene(behind: Behind) -> tuple:
+    return behind.image, behind.depth, behind.rest
 
 
 def shaded_plain(
@@ -165,9 +193,14 @@ def shaded_plain(
     spread = np.maximum(rays.spread - SHARP, 0.0)
     mirrored = environment.blurred(rays.mirror, (material.roughness**4 + spread**2) ** 0.25)
     through = np.where(rays.surroundings[:, None], environment.toward(rays.through), rays.color)
-    through += rays.turned[:, None] * (environment.blurred(rays.inward, DIM) - through)
-    inside = through * transmittance(np.asarray(material.absorption) + material.scattering, rays.path)
-    seen = -np.expm1(-material.scattering * rays.path)[:, None]
+    extinction = np.asarray(material.absorption) + material.scattering
+    second = np.where(rays.beyond[:, None], environment.blurred(rays.inward, DIM), rays.second)
+    second = second * transmittance(extinction, rays.farther)
+    through += rays.turned[:, None] * (second - through)
+    inside = through * transmittance(extinction, rays.path)
+    # the body's own colour takes the place of the light that is lost on the way
+    left = rays.turned[:, None] * transmittance(extinction, rays.farther) + 1.0 - rays.turned[:, None]
+    seen = (1.0 - transmittance(extinction, rays.path) * left) * (material.scattering > 0)
     carried = surface.albedo[rows, columns]
     albedo = np.asarray(material.albedo, np.float32) * (1.0 - material.carried) + material.carried * carried
     inside += seen * albedo * environment.irradiance(surface.normal[rows, columns])
@@ -175,8 +208,34 @@ def shaded_plain(
     straight = _straight(material)
     share = (straight + (rays.share - straight) * (1.0 - DULL * material.roughness))[:, None]
     light = share * mirrored + (1.0 - share) * inside
-    picture[rows, columns] += surface.covered[rows, columns][:, None] * (light - picture[rows, columns])
+    part = surface.covered[rows, columns] * film_shown(surface, behind, camera)[rows, columns]
+    picture[rows, columns] += part[:, None] * (light - picture[rows, columns])
     return picture
+
+
+def film_shown(surface: LiquidSurface, behind: Behind, camera: PinholeCamera) -> Float[np.ndarray, "h w"]:
+    """Share, 0 to 1, that is seen of the liquid, from 0 where it has no height over what it lies on to 1 at its grain.
+
+    The plane that the picture behind shows in a pixel is n . p = 1, with the slopes of its inverse depth for n (of the
+    side on which it changes less): a point p lies (1 - n . p) / |n| over it.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = np.where(behind.depth > 0, 1.0 / behind.depth.astype(np.float64), np.nan)
+        slopes = []
+        for axis, focal in ((1, camera.focal[0]), (0, camera.focal[1])):
+            room = [(1, 1) if k == axis else (0, 0) for k in (0, 1)]
+            steps = np.nan_to_num(np.diff(np.pad(inverse, room, constant_values=np.nan), axis=axis), nan=np.inf)
+            left, right = (
+                np.moveaxis(np.moveaxis(steps, axis, 0)[cut], 0, axis) for cut in (slice(-1), slice(1, None))
+            )
+            slope = np.where(np.abs(left) < np.abs(right), left, right)
+            slopes.append(focal * np.where(np.isfinite(slope), slope, 0.0))
+        place = (camera.pixel_grid() - camera.center) / camera.focal
+        along = inverse - place[..., 0] * slopes[0] - place[..., 1] * slopes[1]
+        height = (1.0 - surface.depth * inverse) / np.sqrt(slopes[0] ** 2 + slopes[1] ** 2 + along**2)
+        share = np.clip(height / surface.grain, 0.0, 1.0) if surface.grain > 0 else np.ones(inverse.shape)
+    thick = np.isnan(inverse) | (behind.depth - surface.depth > SLANTED * surface.grain) | (surface.grain <= 0)
+    return np.where(thick, 1.0, share * share * (3.0 - 2.0 * share))
 
 
 def _check(surface: LiquidSurface, behind: Behind, camera: PinholeCamera) -> None:
@@ -232,7 +291,13 @@ class Followed:
     turned: Float[np.ndarray, "n"]
     """share of what comes through, 0 to 1, that was mirrored at the far side"""
     inward: Float[np.ndarray, "n 3"]
-    """world direction from which that comes"""
+    """world direction from which that comes, outside the liquid"""
+    farther: Float[np.ndarray, "n"]
+    """m that it goes on in the liquid"""
+    beyond: np.ndarray
+    """bool [n]: it is the environment's"""
+    second: Float[np.ndarray, "n 3"]
+    """linear, that where it is the picture's"""
     color: Float[np.ndarray, "n 3"]
     """linear, what comes through where it is the picture's"""
     spread: Float[np.ndarray, "n"]
@@ -244,11 +309,8 @@ def followed(
 ) -> Followed:
     """Follow the light of `pixels` (int [n,2]: row, column) back through the liquid."""
     rays = np.zeros((len(pixels), NUMBERS))
-    back = surface.normal if surface.back_normal is None else surface.back_normal
-    follow(
-        np.ascontiguousarray(pixels, np.int64), surface.depth, surface.normal, back, surface.back_normal is not None,
-        surface.thickness, behind.image, behind.depth, *_eye(camera), float(refractive_index), rays,
-    )  # fmt: skip
+    there = np.ascontiguousarray(pixels, np.int64)
+    follow(there, _arrays(surface), _scene(behind), _eye(camera), float(refractive_index), rays)
     r = rays.astype(np.float32)
 
     def three(at: int) -> np.ndarray:
@@ -256,7 +318,7 @@ def followed(
 
     return Followed(
         r[:, SHARE], three(MIRROR), three(THROUGH), r[:, PATH], r[:, OUTSIDE] > 0, r[:, TURNED], three(INWARD),
-        three(COLOR), r[:, SPREAD],
+        r[:, FARTHER], r[:, BEYOND] > 0, three(SECOND), three(COLOR), r[:, SPREAD],
     )  # fmt: skip
 
 

@@ -1,5 +1,8 @@
 """The compiled loops of `liquid`: where the light of each pixel comes from, and how bright it is (Numba). Camera axes,
 metres, float32 out. `shade` in NumPy is `liquid.shaded_plain`.
+
+What works on one pixel makes no arrays and is compiled without counting who holds them (`_nrt`): that counting, of a
+dozen arrays in every call, takes longer than the light.
 """
 
 from __future__ import annotations
@@ -10,6 +13,8 @@ import numba as nb
 import numpy as np
 
 from fluidlift.look.environment_lookup import picture_place, picture_value
+from fluidlift.look.liquid_lookup import eased, fetch_beyond, shown_of_film
+from fluidlift.look.transparent_rays import far_side, onward, seen_from
 
 STEPS = 3
 """times that the ray behind the liquid looks up how far away what it meets is"""
@@ -18,10 +23,19 @@ FACING = 0.02
 LEAST = 0.15
 """cosine below which a ray is less and less bent or mirrored at the far side: it would run along in it"""
 ROOM = 16.0
-"""px: a liquid that is less than this and its thickness from what lies behind it rests on it, in part"""
+"""px: a liquid that is less than this from what lies behind it rests on it, in part"""
+RESTS = 0.25
+"""of its thickness: likewise"""
+LEGS = 3
+"""times that light which is mirrored inside is followed on"""
+TRACED = 0.02
+"""share of the light from which that is worth it"""
+FAR_AWAY = 1e6
+"""px, beyond any rim"""
 SHARE, MIRROR, THROUGH, PATH, OUTSIDE, TURNED, INWARD, COLOR, SPREAD = 0, 1, 4, 7, 8, 9, 10, 13, 16
+FARTHER, BEYOND, SECOND = 17, 18, 19
 """places in the numbers of a ray: see `follow`"""
-NUMBERS = 17
+NUMBERS = 22
 """of a ray"""
 
 
@@ -40,49 +54,34 @@ def _onto(x, y, z, lens):
     return lens[0] * x / z + lens[2], lens[1] * y / z + lens[3]
 
 
-@nb.njit(cache=True)
-def _fetch(image, u, v, out, at):
-    """Bilinear, held at the rim."""
-    h, w = image.shape[0], image.shape[1]
-    x, y = min(max(u - 0.5, 0.0), w - 1.0), min(max(v - 0.5, 0.0), h - 1.0)
-    j, i = min(int(x), max(w - 2, 0)), min(int(y), max(h - 2, 0))
-    a, b = x - j, y - i
-    j1, i1 = min(j + 1, w - 1), min(i + 1, h - 1)
-    for k in range(3):
-        upper = (1.0 - a) * image[i, j, k] + a * image[i, j1, k]
-        lower = (1.0 - a) * image[i1, j, k] + a * image[i1, j1, k]
-        out[at + k] = (1.0 - b) * upper + b * lower
-
-
-@nb.njit(cache=True)
-def _behind(q, o, start, depth, front, lens, up):
+@nb.njit(cache=True, error_model="numpy", _nrt=False)
+def _behind(q, o, start, depth, front, lens, up, goes_on):
     """Where a ray that leaves the liquid at q towards o meets what lies behind: u, v (px) and whether the picture holds
-    it. `start`: u, v of the straight line; `front`: z of the liquid; `up`: world z in camera axes."""
+    it. `start`: u, v of the straight line; `front`: z of the liquid; `up`: world z in camera axes; `goes_on`: whether
+    the picture stands for what lies beyond its rim."""
     h, w = depth.shape
     u, v = start
+    if o[2] < 0.05:  # back to the viewer
+        return FAR_AWAY, FAR_AWAY, goes_on
     for _ in range(STEPS):
         row, col = min(max(int(v), 0), h - 1), min(max(int(u), 0), w - 1)
         z = depth[row, col]
         if z > 0.0:
-            if o[2] < 0.05:
-                return u, v, False
             s = max(z - q[2], 0.0) / o[2]
             u, v = _onto(q[0] + s * o[0], q[1] + s * o[1], max(q[2] + s * o[2], 1e-6), lens)
         else:
-            if o[2] < 0.05:
-                return u, v, False
             u, v = _onto(o[0], o[1], o[2], lens)
     row, col = min(max(int(v), 0), h - 1), min(max(int(u), 0), w - 1)
     z = depth[row, col]
     if z > 0.0 and z < front:  # something before the liquid: the straight line's
         return start[0], start[1], True
     # beyond the rim ground goes on, and the sky is known all around
-    outside = u < 0.0 or v < 0.0 or u > w or v > h
+    outside = (u < 0.0 or v < 0.0 or u > w or v > h) and not goes_on
     upward = o[0] * up[0] + o[1] * up[1] + o[2] * up[2] > 0.0
     return u, v, not (outside and (z == 0.0 or upward))
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, error_model="numpy", _nrt=False)
 def _turned(rotation, x, y, z, out, at):
     """A direction of camera axes in the world."""
     for k in range(3):
@@ -127,8 +126,7 @@ def _leaving(tx, ty, tz, bx, by, bz, vx, vy, vz, index, free):
     free: 0 to 1; where the liquid rests on something there is no far side: the line of sight v goes straight on.
     """
     leaving = tx * bx + ty * by + tz * bz
-    near = min(max(leaving / LEAST, 0.0), 1.0)
-    free *= near * near * (3.0 - 2.0 * near)
+    free *= eased(leaving / LEAST)
     if free <= 0.0:
         return vx, vy, vz, 0.0, tx, ty, tz
     mx, my, mz = tx - 2.0 * leaving * bx, ty - 2.0 * leaving * by, tz - 2.0 * leaving * bz
@@ -145,18 +143,78 @@ def _leaving(tx, ty, tz, bx, by, bz, vx, vy, vz, index, free):
     return ox / norm, oy / norm, oz / norm, back, mx, my, mz
 
 
-@nb.njit(cache=True, error_model="numpy")
-def _follow(
-    i, j, surface_depth, normals, back_normals, has_back, thickness, picture, depth, lens, rotation, index, ray
-):
+@nb.njit(cache=True, error_model="numpy", _nrt=False)
+def _inner(q, m, share, thick, surface, behind, eye, index, ray):
+    """What is seen by light that is mirrored at q, on the far side, into m: fills FARTHER, BEYOND, INWARD, SECOND."""
+    _, surface_depth, normals, back_normals, thickness, _, _ = surface
+    picture, depth, rest = behind
+    lens, rotation = eye
+    o, more = m, 0.0
+    if share > TRACED:
+        for _ in range(LEGS):
+            found, s, bx, by, bz = onward(
+                q, m, thick, surface_depth, normals, back_normals, thickness, depth, lens, rotation
+            )
+            if not found:  # it was last seen on its way there
+                o = m
+                break
+            more += s
+            q = (q[0] + s * m[0], q[1] + s * m[1], q[2] + s * m[2])
+            ox, oy, oz, back, mx, my, mz = _leaving(m[0], m[1], m[2], bx, by, bz, m[0], m[1], m[2], index, 1.0)
+            o, m = (ox, oy, oz), (mx, my, mz)
+            if back < 0.5:
+                break
+            o = m
+    ray[FARTHER] = more
+    start = _onto(q[0], q[1], max(q[2], 1e-6), lens)
+    u, v, held = _behind(q, o, start, depth, 0.0, lens, (rotation[0, 2], rotation[1, 2], rotation[2, 2]), rest[3] > 0.0)
+    ray[BEYOND] = 0.0 if held else 1.0
+    _turned(rotation, o[0], o[1], o[2], ray, INWARD)
+    if held:
+        fetch_beyond(picture, u, v, rest, ray, SECOND)
+
+
+@nb.njit(cache=True, inline="always")
+def _to_far_side(i, j, p, v, t, n, surface, depth, eye):
+    """Metres from p, on the near side with normal n, along the bent ray t to the far side; the outward normal there;
+    metres of liquid along the line of sight v; and how free its end is, from 0, where it rests on something, to 1.
+    """
+    _, surface_depth, _, back_normals, thickness, _, _ = surface
+    lens, rotation = eye
+    bx, by, bz = -n[0], -n[1], -n[2]
+    known = False
+    if back_normals.shape[0] > 0:
+        x, y, z = seen_from(back_normals, i, j, rotation)
+        known = x * x + y * y + z * z > 0.5
+        if known:
+            bx, by, bz = x, y, z
+    thick, end = np.float64(thickness[i, j]), depth[i, j]
+    if end > 0.0:
+        thick = min(thick, max(end - p[2], 0.0) / v[2])
+    way, straight = thick, v[0] * bx + v[1] * by + v[2] * bz
+    leaving = t[0] * bx + t[1] * by + t[2] * bz
+    if leaving > LEAST and straight > 0.0:
+        way = min(thick * straight / leaving, 2.0 * thick)
+    free = 1.0
+    if end > 0.0:
+        free = min(max((end - p[2] - thick * v[2]) / max(RESTS * thick, ROOM * p[2] / lens[0], 1e-9), 0.0), 1.0)
+    if known and free > 0.0:
+        way, bx, by, bz = far_side(
+            p, t, way, (bx, by, bz), surface_depth, thickness, back_normals, depth, lens, rotation
+        )
+    return way, bx, by, bz, thick, free
+
+
+@nb.njit(cache=True, error_model="numpy", _nrt=False)
+def _follow(i, j, surface, behind, eye, index, ray):
     """One pixel of `follow`."""
+    _, surface_depth, normals, back_normals, _, _, _ = surface
+    picture, depth, rest = behind
+    lens, rotation = eye
     x, y = (j + 0.5 - lens[2]) / lens[0], (i + 0.5 - lens[3]) / lens[1]
     length = math.sqrt(x * x + y * y + 1.0)
     vx, vy, vz = x / length, y / length, 1.0 / length
-    wx, wy, wz = normals[i, j, 0], normals[i, j, 1], normals[i, j, 2]
-    nx = rotation[0, 0] * wx + rotation[0, 1] * wy + rotation[0, 2] * wz
-    ny = rotation[1, 0] * wx + rotation[1, 1] * wy + rotation[1, 2] * wz
-    nz = rotation[2, 0] * wx + rotation[2, 1] * wy + rotation[2, 2] * wz
+    nx, ny, nz = seen_from(normals, i, j, rotation)
     nx, ny, nz, cos = _towards_viewer(nx, ny, nz, vx, vy, vz)
     ray[SHARE] = reflectance(cos, index)
     _turned(rotation, vx + 2.0 * cos * nx, vy + 2.0 * cos * ny, vz + 2.0 * cos * nz, ray, MIRROR)
@@ -164,139 +222,156 @@ def _follow(
     far = math.sqrt(max(1.0 - (1.0 - cos * cos) / (index * index), 0.0))
     bend = cos / index - far
     tx, ty, tz = vx / index + bend * nx, vy / index + bend * ny, vz / index + bend * nz
-    # the far side: a plane through the straight line's end
-    bx, by, bz = -nx, -ny, -nz
-    if has_back:
-        wx, wy, wz = back_normals[i, j, 0], back_normals[i, j, 1], back_normals[i, j, 2]
-        if wx * wx + wy * wy + wz * wz > 0.5:
-            bx = rotation[0, 0] * wx + rotation[0, 1] * wy + rotation[0, 2] * wz
-            by = rotation[1, 0] * wx + rotation[1, 1] * wy + rotation[1, 2] * wz
-            bz = rotation[2, 0] * wx + rotation[2, 1] * wy + rotation[2, 2] * wz
-    straight = max(vx * bx + vy * by + vz * bz, 0.0)
-    leaving = tx * bx + ty * by + tz * bz
-    z0, thick, behind = surface_depth[i, j], thickness[i, j], depth[i, j]
-    if behind > 0.0:
-        thick = min(thick, max(behind - z0, 0.0) * length)
-    way = thick
-    if leaving > LEAST and straight > 0.0:
-        way = min(thick * straight / leaving, 2.0 * thick)
+    z0 = np.float64(surface_depth[i, j])
+    p = (x * z0, y * z0, z0)
+    way, bx, by, bz, thick, free = _to_far_side(
+        i, j, p, (vx, vy, vz), (tx, ty, tz), (nx, ny, nz), surface, depth, eye
+    )  # fmt: skip
     ray[PATH] = way
-    q = (x * z0 + way * tx, y * z0 + way * ty, z0 + way * tz)
+    q = (p[0] + way * tx, p[1] + way * ty, p[2] + way * tz)
     # out again; where the liquid rests on something, light meets that at once, and there is no other surface
-    free = 1.0
-    if behind > 0.0:
-        gap = (behind - q[2]) - 0.5 * thick
-        free = min(max(gap / max(thick + ROOM * z0 / lens[0], 1e-9), 0.0), 1.0)
+    if free > 0.0 and q[2] > 1e-6:
+        u, v = _onto(q[0], q[1], q[2], lens)
+        end = depth[min(max(int(v), 0), depth.shape[0] - 1), min(max(int(u), 0), depth.shape[1] - 1)]
+        if end > 0.0:
+            free = min(free, max((end - q[2]) / max(RESTS * thick, ROOM * z0 / lens[0], 1e-9), 0.0))
     ox, oy, oz, back, mx, my, mz = _leaving(tx, ty, tz, bx, by, bz, vx, vy, vz, index, free)
-    ray[TURNED] = back if has_back else 0.0
-    u, v, held = _behind(q, (ox, oy, oz), (j + 0.5, i + 0.5), depth, z0, lens, rotation[:, 2])
+    ray[TURNED] = back if back_normals.shape[0] > 0 else 0.0
+    if ray[TURNED] > 0.0:
+        _inner(q, (mx, my, mz), back, thick, surface, behind, eye, index, ray)
+    up = (rotation[0, 2], rotation[1, 2], rotation[2, 2])
+    u, v, held = _behind(q, (ox, oy, oz), (j + 0.5, i + 0.5), depth, z0, lens, up, rest[3] > 0.0)
     ray[OUTSIDE] = 0.0 if held else 1.0
     _turned(rotation, ox, oy, oz, ray, THROUGH)
-    _turned(rotation, mx, my, mz, ray, INWARD)
     if held:
-        _fetch(picture, u, v, ray, COLOR)
+        fetch_beyond(picture, u, v, rest, ray, COLOR)
     ray[SPREAD] = _spread(surface_depth, normals, i, j)
 
 
 @nb.njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def follow(
-    pixels, surface_depth, normals, back_normals, has_back, thickness, picture, depth, lens, rotation, index, rays
-):
+def follow(pixels, surface, behind, eye, index, rays):
     """The numbers [n, NUMBERS] of every pixel of `pixels` (row, column): the share of light mirrored; the directions
     (world) of the mirrored ray and of the one that comes through; metres in the liquid; whether the latter's light is
     the environment's (1) or the picture's (0); the share of it that is mirrored at the far side instead, and the
-    direction from which that comes; the picture's colour; and the spread of normals, in the units of GGX's alpha."""
+    direction in which that is seen; the picture's colour; the spread of normals, in the units of GGX's alpha; and of
+    what is mirrored at the far side the metres that it goes on inside, whether it is the environment's (1), and the
+    picture's colour.
+
+    surface, behind, eye: as of `shade`.
+    """
     for m in nb.prange(pixels.shape[0]):
-        _follow(
-            pixels[m, 0], pixels[m, 1], surface_depth, normals, back_normals, has_back, thickness, picture, depth, lens,
-            rotation, index, rays[m],
-        )  # fmt: skip
+        _follow(pixels[m, 0], pixels[m, 1], surface, behind, eye, index, rays[m])
 
 
 @nb.njit(cache=True, inline="always")
-def _looked_up(picture, x, y, z):
-    across, down = picture_place(x, y, z)
+def _looked_up(picture, ray, at):
+    across, down = picture_place(np.float32(ray[at]), np.float32(ray[at + 1]), np.float32(ray[at + 2]))
     return picture_value(picture, across, down)
 
 
-@nb.njit(cache=True)
-def _mirrored(pictures, steps, roughness, x, y, z):
-    """`Environment.blurred` for one direction."""
+@nb.njit(cache=True, error_model="numpy", _nrt=False)
+def _mirrored(pictures, steps, roughness, ray):
+    """`Environment.blurred` for the mirrored ray."""
     last = len(pictures) - 1
     k = 0
     while k < last - 1 and roughness >= steps[k + 1]:
         k += 1
     share = min(max((roughness - steps[k]) / (steps[k + 1] - steps[k]), 0.0), 1.0)
-    across, down = picture_place(x, y, z)
-    if share <= 0.0:
-        return picture_value(pictures[k], across, down)
+    across, down = picture_place(np.float32(ray[MIRROR]), np.float32(ray[MIRROR + 1]), np.float32(ray[MIRROR + 2]))
     r0, g0, b0 = picture_value(pictures[k], across, down)
+    if share <= 0.0:
+        return r0, g0, b0
     r1, g1, b1 = picture_value(pictures[k + 1], across, down)
     s = np.float32(share)
     return r0 + s * (r1 - r0), g0 + s * (g1 - g0), b0 + s * (b1 - b0)
 
 
-@nb.njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def shade(
-    covered, surface_depth, normals, back_normals, has_back, thickness, carried, image, depth, lens, rotation,
-    pictures, steps, dim, diffuse, numbers, luminance, waves, out,
-):  # fmt: skip
-    """Adds the liquid to `out`, a copy of `image`; what the numbers are says `liquid.shaded_plain`.
+@nb.njit(cache=True, error_model="numpy", _nrt=False)
+def _come_through(ray, pictures, dim, numbers, light):
+    """What comes through, of the picture behind or the environment, and of what is mirrored at the far side, after its
+    way inside; and the share of light, of each colour, that scattering and absorption take from both together."""
+    back = ray[TURNED]
+    light[0], light[1], light[2] = ray[COLOR], ray[COLOR + 1], ray[COLOR + 2]
+    if ray[OUTSIDE] > 0.0 and back < 1.0:
+        light[0], light[1], light[2] = _looked_up(pictures[0], ray, THROUGH)
+    r, g, b = ray[SECOND], ray[SECOND + 1], ray[SECOND + 2]
+    if back > 0.0 and ray[BEYOND] > 0.0:
+        r, g, b = _looked_up(pictures[dim], ray, INWARD)
+    for k in range(3):
+        lost = numbers[12 + k] + numbers[2]
+        inner, left = (r if k == 0 else (g if k == 1 else b)), 1.0
+        if back > 0.0:
+            left = math.exp(-lost * ray[FARTHER])
+            # all of it: what would come through was not looked up
+            light[k] = inner * left if back >= 1.0 else light[k] + back * (inner * left - light[k])
+            left = back * left + 1.0 - back
+        along = math.exp(-lost * ray[PATH])
+        light[k] *= along
+        light[3 + k] = 1.0 - along * left
 
-    pictures, steps: of the environment, ever duller, and their roughnesses; dim: of them the one that is seen by what
-    was mirrored at the far side. numbers: index, roughness, scattering, straight, dull, carried share, sharp, usual,
-    cool, hot, warm, contrast, then absorption, albedo and emission. waves: second radiation constant over wavelengths.
+
+@nb.njit(cache=True, error_model="numpy", _nrt=False)
+def _body(carried, given, numbers, waves, light):
+    """Adds what the body scatters and gives off itself, in place of the light that is lost on the way."""
+    keeps, usual, cool, hot, warm, contrast = numbers[5], numbers[7], numbers[8], numbers[9], numbers[10], numbers[11]
+    bright = 0.0
+    for k in range(3):
+        light[k] += light[3 + k] * (numbers[15 + k] * (1.0 - keeps) + keeps * carried[k]) * given[k]
+        bright += numbers[21 + k] * carried[k]
+    if numbers[18] + numbers[19] + numbers[20] > 0.0:
+        warmth = 1.0 - (1.0 - warm) ** ((max(bright, 0.0) / usual) ** contrast)
+        kelvin = cool + (hot - cool) * warmth
+        for k in range(3):
+            light[k] += light[3 + k] * numbers[18 + k] * math.exp((1.0 / hot - 1.0 / kelvin) * waves[k])
+
+
+@nb.njit(cache=True, inline="always")
+def _pixel(i, j, surface, behind, eye, world, numbers, ray, light):
+    """One pixel of `shade`: the light of its liquid."""
+    pictures, steps, dim, diffuse, waves = world
+    index, roughness, scattering, straight, dull, _, sharp = numbers[:7]
+    _follow(i, j, surface, behind, eye, index, ray)
+    _come_through(ray, pictures, dim, numbers, light)
+    if scattering > 0.0:
+        normals, carried = surface[2], surface[5]
+        across, down = picture_place(normals[i, j, 0], normals[i, j, 1], normals[i, j, 2])
+        own = (carried[i, j, 0], carried[i, j, 1], carried[i, j, 2])
+        _body(own, picture_value(diffuse, across, down), numbers, waves, light)
+    spread = max(ray[SPREAD] - sharp, 0.0)
+    wide = roughness if spread == 0.0 else math.sqrt(math.sqrt(roughness**4 + spread * spread))
+    mirror = _mirrored(pictures, steps, wide, ray)
+    share = straight + (ray[SHARE] - straight) * (1.0 - dull * roughness)
+    for k in range(3):
+        light[k] = share * mirror[k] + (1.0 - share) * light[k]
+
+
+@nb.njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+def shade(surface, behind, eye, world, numbers, out):
+    """Adds the liquid to `out`, a copy of the picture; what the numbers are says `liquid.shaded_plain`.
+
+    surface: covered, depth, normals, normals of the far side (of no rows: none), thickness, carried colour, grain.
+    behind: picture, depth, and what it is beyond its rim. eye: lens (fx, fy, cx, cy) and rotation. world: pictures of
+    the environment, ever duller, and their roughnesses; which of them is seen by what was mirrored at the far side;
+    irradiance; second radiation constant over wavelengths. numbers: index, roughness, scattering, straight, dull,
+    carried share, sharp, usual, cool, hot, warm, contrast, then absorption, albedo, emission and weights of luminance.
     """
-    index, roughness, scattering, straight, dull, keeps, sharp = numbers[:7]
-    usual, cool, hot, warm, contrast = numbers[7:12]
+    covered, surface_depth, normals, back_normals, thickness, carried, grain = surface
+    image, depth, rest = behind
+    lens, rotation = eye
+    pictures, steps, dim, diffuse, waves = world
     for row in nb.prange(covered.shape[0]):
         i = np.int64(row)
-        ray, light = np.empty(NUMBERS), np.empty(3)
+        ray, light = np.empty(NUMBERS), np.empty(6)
+        # made once: to bundle arrays costs as much as a pixel
+        liquid = (covered, surface_depth, normals, back_normals, thickness, carried, grain)
+        scene, lens_and_pose, lights = (image, depth, rest), (lens, rotation), (pictures, steps, dim, diffuse, waves)
         for j in range(covered.shape[1]):
             part, z = covered[i, j], surface_depth[i, j]
             if not (part > 0.0 and z > 0.0 and (depth[i, j] <= 0.0 or z < depth[i, j])):
                 continue
-            _follow(
-                i, j, surface_depth, normals, back_normals, has_back, thickness, image, depth, lens, rotation, index,
-                ray,
-            )  # fmt: skip
-            back = ray[TURNED]
-            light[0], light[1], light[2] = ray[COLOR], ray[COLOR + 1], ray[COLOR + 2]
-            if ray[OUTSIDE] > 0.0 and back < 1.0:
-                light[0], light[1], light[2] = _looked_up(
-                    pictures[0], np.float32(ray[THROUGH]), np.float32(ray[THROUGH + 1]), np.float32(ray[THROUGH + 2])
-                )
-            if back > 0.0:
-                r, g, b = _looked_up(
-                    pictures[dim], np.float32(ray[INWARD]), np.float32(ray[INWARD + 1]), np.float32(ray[INWARD + 2])
-                )
-                if back >= 1.0:
-                    light[0], light[1], light[2] = r, g, b
-                else:
-                    light[0] += back * (r - light[0])
-                    light[1] += back * (g - light[1])
-                    light[2] += back * (b - light[2])
+            part *= shown_of_film(i, j, z, depth, lens, grain)
+            if part <= 0.0:
+                continue
+            _pixel(i, j, liquid, scene, lens_and_pose, lights, numbers, ray, light)
             for k in range(3):
-                light[k] *= math.exp(-(numbers[12 + k] + scattering) * ray[PATH])
-            if scattering > 0.0:
-                seen = -math.expm1(-scattering * ray[PATH])
-                given = _looked_up(diffuse, normals[i, j, 0], normals[i, j, 1], normals[i, j, 2])
-                bright = 0.0
-                for k in range(3):
-                    albedo = numbers[15 + k] * (1.0 - keeps) + keeps * carried[i, j, k]
-                    light[k] += seen * albedo * given[k]
-                    bright += luminance[k] * carried[i, j, k]
-                if numbers[18] + numbers[19] + numbers[20] > 0.0:
-                    warmth = 1.0 - (1.0 - warm) ** ((max(bright, 0.0) / usual) ** contrast)
-                    kelvin = cool + (hot - cool) * warmth
-                    for k in range(3):
-                        light[k] += seen * numbers[18 + k] * math.exp((1.0 / hot - 1.0 / kelvin) * waves[k])
-            spread = max(ray[SPREAD] - sharp, 0.0)
-            wide = roughness if spread == 0.0 else math.sqrt(math.sqrt(roughness**4 + spread * spread))
-            mirror = _mirrored(
-                pictures, steps, wide, np.float32(ray[MIRROR]), np.float32(ray[MIRROR + 1]), np.float32(ray[MIRROR + 2])
-            )
-            share = straight + (ray[SHARE] - straight) * (1.0 - dull * roughness)
-            for k in range(3):
-                value = share * mirror[k] + (1.0 - share) * light[k]
-                out[i, j, k] += part * (value - out[i, j, k])
+                out[i, j, k] += part * (light[k] - out[i, j, k])

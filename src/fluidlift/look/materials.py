@@ -2,7 +2,8 @@
 
 All colours are linear light with the primaries of sRGB. Spectra were rounded to three numbers at the dominant
 wavelengths of those primaries (611, 549 and 465 nm). Lengths are metres: a material looks thin in a small body and
-deep in a large one, as in the world. `carried` says how much of the splats' own colour is kept.
+deep in a large one, as in the world. `carried` says how much of the splats' own colour is kept. Where absorption and
+scattering are both measured, the colour of a deep body follows from them (`optics.deep_color`).
 """
 
 from __future__ import annotations
@@ -56,6 +57,14 @@ class Material:
         require(0.0 <= self.roughness <= 1.0, f"{one} roughness {self.roughness}", "0 to 1")
         require(0.0 <= self.carried <= 1.0, f"{one} carried colour {self.carried}", "0 to 1")
 
+    def before_white(self, depth: float) -> np.ndarray:
+        """Linear colour [3] of `depth` metres of it before a white ground, for previews without rays: a spoon of honey
+        is gold, though a barrel is brown. Without the mirror of its surface, its glow and what it carries."""
+        absorption = np.asarray(self.absorption)
+        left = np.exp(-(absorption + self.scattering) * depth)
+        own = (1.0 - left) * np.asarray(self.albedo) if self.scattering > 0 else 0.0
+        return left + own
+
     def tinted(self, tint: Color) -> Material:
         """The same liquid dyed: body and glow times `tint` (linear, 0 to 1), and light through `TINT_DEPTH` as well.
 
@@ -85,10 +94,12 @@ MUDDY_WATER = Material(
 take more blue than red."""
 
 HONEY = Material(
-    "honey", 1.49, absorption=(5.0, 26.0, 110.0), scattering=4.0, albedo=(0.80, 0.40, 0.03), roughness=0.04
+    "honey", 1.49, absorption=(3.0, 16.0, 70.0), scattering=6.0, albedo=(0.110, 0.0277, 0.0068), roughness=0.04
 )
 """Index at 18 % water. White to extra light amber, by the USDA's colour standard (absorbance of 0.19 to 0.6 through
-3.15 cm at 560 nm, so 14 to 43 per metre); red and blue after the usual fall of brown spectra with wavelength."""
+3.15 cm at 560 nm, so 14 to 43 per metre); red and blue after the usual fall of brown spectra with wavelength. A little
+cloudy, by eye. What comes through a spoon of it is gold; a deep body returns little, and that is brown: its albedo is
+`optics.deep_color` of the rest."""
 
 LAVA = Material(
     "lava", 1.58, absorption=(300.0, 300.0, 300.0), scattering=3000.0, albedo=(0.035, 0.030, 0.028), roughness=0.45,
@@ -100,8 +111,11 @@ MILK = Material("milk", 1.35, absorption=(1.1, 2.4, 14.0), scattering=3200.0, al
 """Whole milk, Jensen, Marschner, Levoy and Hanrahan 2001 (table 2): absorption, reduced scattering and diffuse
 reflectance."""
 
-OIL = Material("oil", 1.47, absorption=(9.0, 7.0, 150.0), scattering=0.8, albedo=(0.75, 0.66, 0.10), roughness=0.02)
-"""Olive oil: carotenes take the blue (absorbance near 0.7 through 1 cm at 465 nm), chlorophyll some of the red."""
+OIL = Material(
+    "oil", 1.47, absorption=(9.0, 7.0, 150.0), scattering=0.8, albedo=(0.0073, 0.0093, 0.0004), roughness=0.02
+)
+"""Olive oil: carotenes take the blue (absorbance near 0.7 through 1 cm at 465 nm), chlorophyll some of the red. All but
+clear: its colour is that of the light behind it, and a deep body is as dark as `optics.deep_color` says."""
 
 CHOCOLATE = Material(
     "chocolate", 1.457, absorption=(400.0, 900.0, 1500.0), scattering=4000.0, albedo=(0.105, 0.042, 0.018),

@@ -1,6 +1,9 @@
-"""Light at the surface of a transparent body and inside it: Fresnel, Snell, Beer and Lambert (Born and Wolf 1999)."""
+"""Light at the surface of a transparent body and inside it: Fresnel, Snell, Beer and Lambert (Born and Wolf 1999), and
+the colour of a deep body that scatters (van de Hulst 1980)."""
 
 from __future__ import annotations
+
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -68,3 +71,43 @@ def transmittance(
     """Share of the light left after `thickness` metres (Beer and Lambert): exp(-absorption thickness)."""
     depth = np.maximum(np.asarray(thickness), 0.0)
     return np.exp(-depth[..., None] * np.asarray(absorption, depth.dtype))
+
+
+def deep_color(
+    absorption: Float[np.ndarray, "3"] | tuple[float, float, float], scattering: float, refractive_index: float = 1.0
+) -> Float[np.ndarray, "3"]:
+    """Linear colour, under white light, of a body so deep that nothing is seen behind it.
+
+    Of light in a half space with isotropic scattering the share R = (1 - s)(1 - 0.139 s) / (1 + 1.17 s) returns, where
+    s = sqrt(absorption / (absorption + scattering)) (van de Hulst, Multiple Light Scattering, 1980). A surface throws a
+    share I of that back inside, again and again: (1 - I) R / (1 - I R) gets out. What the surface mirrors is not in it.
+
+    Args:
+        absorption, scattering: 1/m; scattering as if it were isotropic (reduced).
+        refractive_index: of the body, next to air; 1: no surface.
+    """
+    absorbed = np.asarray(absorption, float)
+    s = np.sqrt(absorbed / np.maximum(absorbed + scattering, 1e-30))
+    returned = (1 - s) * (1 - 0.139 * s) / (1 + 1.17 * s) if scattering > 0 else np.zeros(3)
+    inside = held_inside(refractive_index)
+    return (1 - inside) * returned / (1 - inside * returned)
+
+
+def scattering_share(color: Float[np.ndarray, "3"], refractive_index: float = 1.0) -> Float[np.ndarray, "3"]:
+    """scattering / (absorption + scattering) of a deep body of this linear colour (0 to 1): the inverse of
+    `deep_color`."""
+    c, inside = np.clip(np.asarray(color, float), 0.0, 1.0), held_inside(refractive_index)
+    r = c / (1 - inside + inside * c)
+    # 0.139 s^2 - (1.139 + 1.17 R) s + (1 - R) = 0
+    b, left = 1.139 + 1.17 * r, 1.0 - r
+    s = (b - np.sqrt(b * b - 4 * 0.139 * left)) / (2 * 0.139)
+    return 1.0 - np.clip(s, 0.0, 1.0) ** 2
+
+
+@lru_cache(maxsize=64)
+def held_inside(refractive_index: float) -> float:
+    """Share of even light inside a body that its surface throws back: by reciprocity 1 - (1 - E) / n^2, where E is the
+    share of even light outside that is mirrored."""
+    cos = (np.arange(2000) + 0.5) / 2000
+    outside = float((2 * cos * fresnel(cos, refractive_index)).mean())
+    return 1.0 - (1.0 - outside) / refractive_index**2

@@ -57,6 +57,7 @@ def relit(
     material: Material,
     environment: Environment,
     among: Float[np.ndarray, "m 3"] | None = None,
+    depths: Float[np.ndarray, "n"] | None = None,
 ) -> Float[np.ndarray, "n 3"]:
     """Linear radiance of every splat towards the camera, to be drawn as its feature.
 
@@ -69,6 +70,7 @@ def relit(
         environment: the light.
         among: linear colours against which the clip's are hot or cold, if the material glows; None: these splats' own.
             The same ones for a whole film keep the glow of what stays.
+        depths: m of fluid at each splat (`fluid_depths`): thin parts are clearer than deep ones; None: alike.
 
     Returns:
         float32, at least 0. Without glow, no material gives more than the brightest light around.
@@ -80,7 +82,7 @@ def relit(
     require(np.shape(normals) == (n, 3) and np.shape(share) == (n,), f"normals {np.shape(normals)}", f"({n}, 3)")
     normals, share = np.ascontiguousarray(normals, np.float32), np.ascontiguousarray(share, np.float32)
     own = linear_from_srgb(gaussians.rgb)
-    body = body_color(gaussians, own_albedo(own, normals, share), material)
+    body = body_color(gaussians, own_albedo(own, normals, share), material, depths)
     pictures, numbers = _prepared(material, environment, camera.position)
     out = np.empty((n, 3), np.float32)
     shade_kernel(gaussians.means, normals, share, body, pictures, numbers, out)
@@ -182,16 +184,25 @@ def own_albedo(
     return np.minimum(colors_linear * (np.float32(exposure) / light)[:, None], np.float32(LARGEST_ALBEDO))
 
 
-def body_color(gaussians: Gaussians, own: Float[np.ndarray, "n 3"], material: Material) -> Float[np.ndarray, "n 3"]:
+def body_color(
+    gaussians: Gaussians,
+    own: Float[np.ndarray, "n 3"],
+    material: Material,
+    depths: Float[np.ndarray, "n"] | None = None,
+) -> Float[np.ndarray, "n 3"]:
     """Linear albedo of the body: the material's where it scatters, the clip's own through it where it is clear.
 
-    The depth of the liquid is taken to be that of a slab as spread as the splats are along their thinnest direction;
-    of what is clear, the light that comes back has gone through half of it twice.
+    Where no depths are given, that of the liquid is taken to be that of a slab as spread as the splats are along their
+    thinnest direction; of what is clear, the light that comes back has gone through half of it twice.
     """
-    depth = _thickness(gaussians)
-    hidden = (1 - material.carried) * (1 - math.exp(-material.scattering * depth))
-    through = np.exp(-np.asarray(material.absorption) * depth * (1 - material.carried)).astype(np.float32)
-    return np.float32(1 - hidden) * through * own + np.float32(hidden) * np.asarray(material.albedo, np.float32)
+    depth = np.asarray(_thickness(gaussians) if depths is None else depths, np.float32)[..., None]
+    absorption, shows = np.asarray(material.absorption, np.float32), np.float32(1 - material.carried)
+    left = (1 + shows * np.expm1(np.float32(-material.scattering) * depth)) * np.exp(-absorption * (depth * shows))
+    if material.scattering == 0:
+        return left * own
+    # as in a liquid's picture, the body's own colour takes the place of all that is lost
+    lost = -shows * np.expm1(-(absorption + np.float32(material.scattering)) * depth)
+    return left * own + lost * np.asarray(material.albedo, np.float32)
 
 
 def splat_roughness(roughness: float) -> float:

@@ -10,11 +10,12 @@ import math
 
 import numpy as np
 from jaxtyping import Float
-from scipy import ndimage
 
 from fluidlift.errors import require
 from fluidlift.look.liquid import LiquidSurface
 from fluidlift.look.screen_space_kernels import (
+    depths_and_cover,
+    inverse_depths,
     narrow_range,
     place_spheres,
     plane_normals,
@@ -41,6 +42,11 @@ EVEN = 0.8
 """radii: standard deviation of the smoothing of thickness and colour"""
 THIN = 0.35
 """radii of thickness from which a pixel counts as covered"""
+RIM = (0.42, 0.67)
+"""share of what is around a pixel that spheres cover, from which on it belongs to the liquid in part and whole: half at
+an outline, which is then smoother than that of the spheres; a sphere alone has 0.54"""
+GRAIN = 0.5
+"""radii: thinner liquid on the ground is no more than the place of its particles can tell, and fades out"""
 COARSE = 5.0
 """px: from this median radius on, thickness and colour are summed at half the resolution"""
 GRAY = 0.5
@@ -54,6 +60,7 @@ def particle_surface(
     colors_linear: Float[np.ndarray, "n 3"] | None = None,
     *,
     spacing: float | None = None,
+    ground: Float[np.ndarray, "h w"] | None = None,
 ) -> LiquidSurface:
     """The surface of particles.
 
@@ -65,6 +72,8 @@ def particle_surface(
         colors_linear: of each particle; None: gray.
         spacing: m between neighbours, which sets what a sphere counts for in the thickness (spheres overlap); None:
             `SPACING` radii.
+        ground: camera z (m; 0: none) of what the liquid lies on. It hides particles, and the surface runs out on it;
+            None: every outline is rounded, as of a drop in the air.
 
     Raises:
         ValueError: arrays of the wrong shape or a radius that is not positive.
@@ -76,18 +85,21 @@ def particle_surface(
     require(colors.shape == points.shape, f"colours of shape {colors.shape}", str(points.shape))
     spacing = SPACING * radius if spacing is None else spacing
     require(spacing > 0, f"a spacing of {spacing}", "positive metres")
-    depth, scale = _sphere_depth(points, radius, camera)
-    thickness, albedo = _through_spheres(points, radius, camera, depth, np.ascontiguousarray(colors), scale)
+    height, width = camera.size[1], camera.size[0]
+    bed = np.zeros((height, width), np.float32) if ground is None else np.ascontiguousarray(ground, np.float32)
+    require(bed.shape == (height, width), f"ground of shape {bed.shape}", f"({height}, {width})")
+    depth, typical = _sphere_depth(points, radius, camera)
+    thickness, albedo, near = _through_spheres(points, radius, camera, depth, np.ascontiguousarray(colors), typical)
     # spheres overlap: each stands for the volume of a cube of the spacing
     thickness *= np.float32(spacing**3 / (4.0 / 3.0 * math.pi * radius**3))
-    inverse = np.where(np.isfinite(depth), 1.0 / np.maximum(depth, NEAR), 0.0).astype(np.float32)
+    inverse, normal = np.empty_like(depth), np.zeros((height, width, 3), np.float32)
+    inverse_depths(depth, bed, np.float32(NEAR), inverse)
     inverse = _smoothed(inverse, radius, camera)
-    covered = np.where(inverse > 0, np.clip(thickness / (THIN * radius), 0.0, 1.0), 0.0)
-    normal = np.zeros((*depth.shape, 3), np.float32)
     rotation = np.asarray(camera.camera_from_world.rotation, np.float64)
     plane_normals(inverse, _lens(camera), rotation, np.float32(LIMIT * radius), normal)
-    front = np.divide(1.0, inverse, out=np.zeros_like(inverse), where=inverse > 0)
-    return LiquidSurface(front, normal, thickness, albedo, covered)
+    covered = np.empty_like(depth)
+    depths_and_cover(inverse, thickness, near, np.array([THIN * radius, *RIM], np.float32), depth, covered)
+    return LiquidSurface(depth, normal, thickness, albedo, covered, grain=GRAIN * radius)
 
 
 def _lens(camera: PinholeCamera) -> np.ndarray:
@@ -106,42 +118,49 @@ def _placed(points: np.ndarray, radius: float, camera: PinholeCamera) -> tuple[n
     return centres, box, starts, listed, across, down
 
 
-def _sphere_depth(points: np.ndarray, radius: float, camera: PinholeCamera) -> tuple[np.ndarray, int]:
-    """Depth of the nearest sphere (m; infinite: none), and by how much coarser thickness may be summed."""
+def _sphere_depth(points: np.ndarray, radius: float, camera: PinholeCamera) -> tuple[np.ndarray, float]:
+    """Depth of the nearest sphere (m; infinite: none), and the median depth of what is drawn (m; 0: nothing is)."""
     centres, box, starts, listed, across, down = _placed(points, radius, camera)
     depth = np.full((camera.size[1], camera.size[0]), np.inf, np.float32)
     sphere_depths(centres, box, starts, listed, radius, across, down, depth)
     drawn = centres[box[:, 4] > 0, 2]
-    wide = len(drawn) > 0 and camera.focal[0] * radius / float(np.median(drawn)) >= COARSE
-    return depth, 2 if wide and min(camera.size) >= 16 else 1
+    return depth, float(np.median(drawn)) if len(drawn) else 0.0
 
 
 def _through_spheres(
-    points: np.ndarray, radius: float, camera: PinholeCamera, depth: np.ndarray, colors: np.ndarray, scale: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Sum of all lengths in spheres (m), and the mean colour near the surface, both evened out."""
-    width, height = camera.size
-    small = camera if scale == 1 else camera.resized((width // scale, height // scale))
-    centres, box, starts, listed, across, down = _placed(points, radius, small)
-    sums = np.zeros((5, small.size[1], small.size[0]), np.float32)
-    sphere_chords(centres, box, starts, listed, radius, across, down, depth, colors, sums)
-    near = depth[np.isfinite(depth)]
-    if len(near) == 0:
-        return np.zeros(depth.shape, np.float32), np.zeros((*depth.shape, 3), np.float32)
-    sigma = min(EVEN * radius * small.focal[0] / float(np.median(near)), 20.0)
-    for picture in sums:
-        ndimage.gaussian_filter(picture, sigma, output=picture, mode="constant", truncate=2.5)
-    sums[1:4] /= np.maximum(sums[4], 1e-12)
-    if scale > 1:
-        import cv2
+    points: np.ndarray, radius: float, camera: PinholeCamera, depth: np.ndarray, colors: np.ndarray, typical: float
+) -> tuple[np.ndarray, ...]:
+    """Sum of all lengths in spheres (m), the mean colour near the surface, and the share of what is around a pixel that
+    spheres cover, all evened out; they change slowly, so that large spheres are summed at half the resolution. typical:
+    median depth, m."""
+    import cv2
 
-        whole = [cv2.resize(picture, (width, height), interpolation=cv2.INTER_LINEAR) for picture in sums[:4]]
-        return whole[0], np.stack(whole[1:], axis=-1)
-    return sums[0], np.ascontiguousarray(np.moveaxis(sums[1:4], 0, -1))
+    width, height = camera.size
+    if typical <= 0:
+        return np.zeros(depth.shape, np.float32), np.zeros((*depth.shape, 3), np.float32), np.zeros_like(depth)
+    coarse = camera.focal[0] * radius / typical >= COARSE and min(camera.size) >= 16
+    small = camera.resized((width // 2, height // 2)) if coarse else camera
+    centres, box, starts, listed, across, down = _placed(points, radius, small)
+    sums = np.zeros((6, small.size[1], small.size[0]), np.float32)
+    sphere_chords(centres, box, starts, listed, radius, across, down, depth, colors, sums)
+    step = 2 if coarse else 1
+    sums[5] = np.isfinite(depth[: step * small.size[1] : step, : step * small.size[0] : step])
+    near = depth[::4, ::4]
+    near = near[np.isfinite(near)]
+    sigma = min(EVEN * radius * small.focal[0] / (float(np.median(near)) if len(near) else typical), 20.0)
+    reach = 2 * int(2.5 * sigma + 0.5) + 1
+    for picture in sums:
+        cv2.GaussianBlur(picture, (reach, reach), sigma, dst=picture, borderType=cv2.BORDER_CONSTANT)
+    carried = np.empty((*sums.shape[1:], 3), np.float32)
+    np.divide(np.moveaxis(sums[1:4], 0, -1), np.maximum(sums[4], 1e-12)[..., None], out=carried)
+    if not coarse:
+        return sums[0], carried, sums[5]
+    whole = (sums[0], carried, sums[5])
+    return tuple(cv2.resize(p, (width, height), interpolation=cv2.INTER_LINEAR) for p in whole)
 
 
 def _smoothed(inverse: np.ndarray, radius: float, camera: PinholeCamera) -> np.ndarray:
-    """Inverse depth (1/m; 0: none) without the bumps of the spheres."""
+    """Inverse depth as of `inverse_depths` without the bumps of the spheres."""
     limit, fall, other = np.float32(LIMIT * radius), np.float32(FALL * radius), np.empty_like(inverse)
     for share in SMOOTHING:
         narrow_range(inverse, other, 0, 1, camera.focal[0], share * radius, limit, fall)
@@ -149,11 +168,17 @@ def _smoothed(inverse: np.ndarray, radius: float, camera: PinholeCamera) -> np.n
     return inverse
 
 
-def mesh_surface(mesh: TriangleMesh, camera: PinholeCamera) -> LiquidSurface:
+def mesh_surface(mesh: TriangleMesh, camera: PinholeCamera, *, radius: float = 0.0) -> LiquidSurface:
     """The surface of a closed mesh, with its smooth normals; the colours of its vertices are what it carries.
 
     Thickness is all of the liquid along the ray, in however many parts. A mesh with holes gives wrong ones there.
+
+    Args:
+        mesh: m, world.
+        camera: who looks.
+        radius: m, of the particles that the mesh was made of: it knows nothing finer. 0: it is exact.
     """
+    require(np.isfinite(radius) and radius >= 0, f"a radius of {radius}", "0 m or more")
     found = rasterize_closed(mesh.vertices, mesh.faces, camera)
     vertices = np.ascontiguousarray(mesh.vertices, np.float32)
     faces = np.ascontiguousarray(mesh.faces, np.int32)
@@ -172,4 +197,4 @@ def mesh_surface(mesh: TriangleMesh, camera: PinholeCamera) -> LiquidSurface:
     thickness = np.maximum(found.inside, 0.0) * along
     covered, depth = np.zeros_like(thickness), found.front.depth
     spread_edges(found.front.hit, depth, normal, thickness, albedo, back, covered)
-    return LiquidSurface(depth, normal, thickness, albedo, covered, back)
+    return LiquidSurface(depth, normal, thickness, albedo, covered, back, GRAIN * radius)

@@ -16,8 +16,14 @@ from fluidlift.numerics.triangles import BAND, scattered
 _FUSED = {"contract"}
 LARGEST_WINDOW = 40
 """pairs of pixels that one pass of the smoothing averages, however near the liquid is"""
-APART = 2.6
+APART = np.float32(2.6)
 """pairs per standard deviation of the smoothing: of wide bells every second, third ... pixel is enough"""
+LEAST = np.float32(0.3)
+"""px: a narrower bell averages nothing"""
+LANES = 32
+"""pixels side by side that are smoothed at a time, with pairs equally far apart"""
+HIGH, TOTAL, WEIGHTS, WEIGHT, FADE, FADING = (np.uint64(k * LANES) for k in range(1, 7))
+"""places in the state of `_take_pair`, after the lowest at 0"""
 
 
 @nb.njit(cache=True, parallel=True, error_model="numpy")
@@ -110,58 +116,128 @@ def sphere_chords(centres, box, starts, listed, radius, across, down, depth, col
                         sums[4, row, k] += chord
 
 
-@nb.njit(cache=True, inline="always")
-def _evened(q, row, col, down, across, width, limit, fall):
-    """Mean of the inverse depths about a pixel in one direction, weighted with a bell; see `narrow_range`."""
-    own = q[row, col]
-    narrow, drop = limit * own * own, fall * own * own
-    low, high = own - narrow, own + narrow
-    total, weights = own, np.float32(1.0)
-    stride = max(np.int64(width / APART), 1)
-    bell = width / np.float32(stride)
-    steps = min(max(int(2.0 * bell), 1), LARGEST_WINDOW)
-    # exp(-k^2 / (2 bell^2)) from the one before: by a factor that itself shrinks by a factor
-    w = np.float32(1.0)
-    fade = np.float32(math.exp(np.float32(-0.5) / (bell * bell)))
-    fading = fade * fade
-    down, across = stride * down, stride * across
-    for k in range(1, steps + 1):
-        r0, c0, r1, c1 = row - k * down, col - k * across, row + k * down, col + k * across
-        if r0 < 0 or c0 < 0 or r1 >= q.shape[0] or c1 >= q.shape[1]:
-            break
-        one, two = q[r0, c0], q[r1, c1]
-        if one > high or two > high:
-            break
-        if one > low and two > low:
-            high = max(high, max(one, two) + narrow)
-            low = min(low, min(one, two) - narrow)
-        else:
-            one = one if one > low else own - drop
-            two = two if two > low else own - drop
-        w *= fade
-        fade *= fading
-        total += w * (one + two)
-        weights += w + w
-    return total / weights
-
-
 @nb.njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+def inverse_depths(depth, ground, near, q):
+    """Inverse depth (1/m) of the nearest spheres (m; infinite: none) where they are not hidden by the ground, else the
+    negative one of the ground (m; 0: none), or 0: what the smoothing takes."""
+    one = np.float32(1.0)
+    for row in nb.prange(q.shape[0]):
+        for col in range(q.shape[1]):
+            z, bed = depth[row, col], ground[row, col]
+            if z < np.inf and (bed <= 0 or z < bed):
+                q[row, col] = one / max(z, near)
+            elif bed > 0:
+                q[row, col] = -one / max(bed, near)
+            else:
+                q[row, col] = 0.0
+
+
+@nb.njit(cache=True, fastmath=_FUSED, error_model="numpy")
+def _begin(own, stride, factor, limit, state):
+    """What `_take_pair` goes on from, for some pixels side by side: see the offsets there."""
+    one, three = np.float32(1.0), np.float32(1.0 / 3.0)
+    for k in range(np.uint64(own.shape[0])):
+        bell = max(factor * own[k], LEAST) / stride
+        # exp(-1 / (2 bell^2)) as a power of 64, without a call: lanes side by side
+        x = np.float32(0.5 / 64.0) / (bell * bell)
+        fade = one - x * (one - np.float32(0.5) * x * (one - three * x))
+        for _ in range(6):
+            fade = fade * fade
+        narrow = limit * own[k] * own[k]
+        state[k] = own[k] - narrow
+        state[k + HIGH] = own[k] + narrow if factor * own[k] > LEAST else -one
+        state[k + TOTAL] = own[k]
+        state[k + WEIGHTS] = one
+        state[k + WEIGHT] = one
+        state[k + FADE] = fade
+        state[k + FADING] = fade * fade
+
+
+@nb.njit(cache=True, fastmath=_FUSED, error_model="numpy")
+def _take_pair(before, after, own, limit, fall, state):
+    """One pair of neighbours of each of some pixels side by side. state: lowest and highest inverse depth met, sum and
+    weights so far, the last weight and its factor, and that one's: exp(-k^2 / (2 bell^2)) from the one before. A
+    highest of -1 lets nothing more in. One buffer with fixed offsets: the compiler sees that lanes do not touch.
+    """
+    zero = np.float32(0.0)
+    for k in range(np.uint64(own.shape[0])):
+        narrow, dropped = limit * own[k] * own[k], own[k] - fall * own[k] * own[k]
+        one, two = abs(before[k]), abs(after[k])
+        low, high = state[k], state[k + HIGH]
+        weight = state[k + WEIGHT] * state[k + FADE]
+        state[k + WEIGHT] = weight
+        state[k + FADE] = state[k + FADE] * state[k + FADING]
+        top, bottom = max(one, two), min(one, two)
+        goes, both = top <= high, bottom > low
+        weight = weight if goes else zero
+        higher = max(high, top + narrow) if both else high
+        state[k + HIGH] = higher if goes else np.float32(-1.0)
+        state[k] = min(low, bottom - narrow) if (both and goes) else low
+        one = one if (both or one > low) else dropped
+        two = two if (both or two > low) else dropped
+        state[k + TOTAL] = state[k + TOTAL] + weight * (one + two)
+        state[k + WEIGHTS] = state[k + WEIGHTS] + (weight + weight)
+
+
+@nb.njit(cache=True, inline="always")
+def _stride_and_steps(own, factor):
+    """Pixels between pairs, and how many pairs, for some pixels side by side; none where nothing is to be smoothed."""
+    least, most = np.float32(np.inf), np.float32(0.0)
+    for k in range(own.shape[0]):
+        wide = factor * own[k]
+        if wide > LEAST:
+            least, most = min(least, wide), max(most, wide)
+    if most <= 0:
+        return 1, 0
+    stride = max(int(least / APART), 1)
+    return stride, min(max(int(np.float32(2.0) * most / np.float32(stride)), 1), LARGEST_WINDOW)
+
+
+@nb.njit(cache=True, parallel=True, nogil=True, error_model="numpy", fastmath=_FUSED)
 def narrow_range(q, out, down, across, focal, width, limit, fall):
-    """One pass of smoothing along rows (across = 1) or columns (down = 1) of inverse depth q (1/m; 0: nothing there).
+    """One pass of smoothing along rows (across = 1) or columns (down = 1) of inverse depth q (1/m; negative: of ground
+    beside the liquid, 0: nothing there).
 
     After the narrow-range filter of Truong and Yuksel 2018: depths within `limit` (m) of what was met so far are
     averaged; what lies nearer ends the window; what lies farther counts as if it fell off by `fall` (m), which rounds
-    outlines. Two changes: inverse depth is averaged, which is linear across the picture of a plane, and pixels come in
-    pairs from both sides, so that planes stay as they are. `width` (m) is the standard deviation of the weights.
+    outlines. Three changes: inverse depth is averaged, which is linear across the picture of a plane; pixels come in
+    pairs from both sides, so that planes stay as they are; and ground close behind an outline is averaged like liquid,
+    so that the surface runs out on it instead of ending in a rim. `width` (m) is the standard deviation of the weights.
     """
-    for row in nb.prange(q.shape[0]):
-        for col in range(q.shape[1]):
-            own = q[row, col]
-            wide = np.float32(focal * width * own)
-            if own > 0 and wide > np.float32(0.3):
-                out[row, col] = _evened(q, np.int64(row), col, down, across, wide, limit, fall)
-            else:
-                out[row, col] = own
+    h, w = q.shape
+    factor = np.float32(focal * width)
+    for r in nb.prange(h):
+        row = np.int64(r)
+        state = np.empty(7 * LANES, np.float32)
+        for first in range(0, w, LANES):
+            last = min(first + LANES, w)
+            own = q[row, first:last]
+            out[row, first:last] = own
+            stride, steps = _stride_and_steps(own, factor)
+            if steps == 0:
+                continue
+            _begin(own, np.float32(stride), factor, limit, state)
+            for k in range(1, steps + 1):
+                d = k * stride
+                if across:
+                    begin, end = max(d, first), min(w - d, last)  # lanes whose pairs lie in the picture
+                    for n in range(first, min(begin, last)):
+                        state[n - first + HIGH] = -1.0
+                    for n in range(max(end, first), last):
+                        state[n - first + HIGH] = -1.0
+                    if begin >= end:
+                        break
+                    lanes = state[begin - first :]
+                    _take_pair(
+                        q[row, begin - d : end - d], q[row, begin + d : end + d], q[row, begin:end], limit, fall, lanes
+                    )
+                elif row - d < 0 or row + d >= h:
+                    break
+                else:
+                    _take_pair(q[row - d, first:last], q[row + d, first:last], own, limit, fall, state)
+            for k in range(last - first):
+                if own[k] > 0:
+                    out[row, first + k] = state[np.uint64(k) + TOTAL] / state[np.uint64(k) + WEIGHTS]
 
 
 @nb.njit(cache=True, inline="always")
@@ -180,7 +256,7 @@ def _slope(before, own, after, limit):
 
 @nb.njit(cache=True, parallel=True, nogil=True, error_model="numpy")
 def plane_normals(q, lens, rotation, limit, normal):
-    """Unit normals (world, towards the viewer) of the surface of inverse depth q (1/m; 0: none).
+    """Unit normals (world, towards the viewer) of the surface of inverse depth q (1/m; 0 or less: none).
 
     On the plane n . p = 1 the inverse depth is n . (x/z, y/z, 1): its slopes in the picture are n, without error.
     limit: m, steps from pixel to pixel beyond which they belong to different surfaces.
@@ -205,6 +281,23 @@ def plane_normals(q, lens, rotation, limit, normal):
             x, y, z = x / length, y / length, z / length
             for k in range(3):
                 normal[row, col, k] = rotation[0, k] * x + rotation[1, k] * y + rotation[2, k] * z
+
+
+@nb.njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+def depths_and_cover(q, thickness, near, limits, depth, covered):
+    """Depth (m; 0: no liquid) of inverse depths q, and the share of each pixel that liquid of this thickness covers.
+
+    near: share of what is around that spheres cover. limits: thickness (m) of full cover, and shares `near` of none and
+    of full cover.
+    """
+    zero, one = np.float32(0.0), np.float32(1.0)
+    thin, none, whole = limits[0], limits[1], limits[2]
+    for row in nb.prange(q.shape[0]):
+        for col in range(q.shape[1]):
+            there = q[row, col] > zero
+            depth[row, col] = one / q[row, col] if there else zero
+            share = min(thickness[row, col] / thin, (near[row, col] - none) / (whole - none))
+            covered[row, col] = min(max(share, zero), one) if there else zero
 
 
 @nb.njit(cache=True)

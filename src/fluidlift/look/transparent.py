@@ -21,7 +21,7 @@ from fluidlift.errors import require
 from fluidlift.look.liquid import LiquidSurface
 from fluidlift.look.project import sound
 from fluidlift.numerics.splatting import Bins, Projected, View, bin_tiles, project
-from fluidlift.numerics.splatting_kernels import TILE, _exp_negative
+from fluidlift.numerics.splatting_kernels import TILE, exp_negative
 from fluidlift.numerics.splatting_projection import REACH_MAX
 from fluidlift.numerics.srgb import linear_from_srgb
 from fluidlift.types.camera import PinholeCamera
@@ -37,6 +37,8 @@ GRAIN = 1.0
 COVERED = (0.15, 0.8)
 """spacings of liquid on the ray at which a pixel begins to be, and is, covered: a lone particle has 0.6 in its middle,
 a film of one layer 1. Outlines of thick bodies stand out by most of a spacing"""
+FILM = 0.5
+"""spacings: thinner liquid on the ground is no more than the place of its splats can tell, and fades out"""
 AWAY = (-0.3, 0.1)
 """cosine to the viewer of the splatted normal up to which nothing is seen (the blurred rim of a body, or its far side
 through a gap), and from which all is"""
@@ -151,8 +153,7 @@ def splatted_thickness(
     found = _projected(gaussians, camera, volume)
     for part, bins, pairs in _in_order(found, np.flatnonzero(found.extents[:, 0] > 0), camera.size, far):
         packed = _packed(found, part, features, camera, volume)
-        across = bins.tiles[0]
-        thickness_kernel(packed, bins.starts, pairs, across, far, np.float32(skin), stretch, total, first)
+        thickness_kernel(packed, bins.starts, pairs, far, np.float32(skin), stretch, total, first)
     return total, first
 
 
@@ -191,10 +192,11 @@ def _packed(
 
 
 @nb.njit(cache=True, nogil=True, parallel=True, fastmath={"contract", "reassoc"}, error_model="numpy")
-def thickness_kernel(packed, starts, gaussians, tiles_x, backwards, skin, stretch, total, first):
+def thickness_kernel(packed, starts, gaussians, backwards, skin, stretch, total, first):
     """`thickness_plain`, tile by tile, in rows of 16 pixels without branches (see `numerics.splatting_kernels`).
     `backwards`: the farthest first."""
     height, width = total.shape
+    tiles_x = -(-width // TILE)
     half, none, channels = np.float32(0.5), np.float32(0.0), first.shape[2]
     for t0 in nb.prange(len(starts) - 1):
         t = np.int64(t0)
@@ -222,7 +224,7 @@ def thickness_kernel(packed, starts, gaussians, tiles_x, backwards, skin, stretc
                 for j in range(np.uint64(TILE)):
                     dx = np.float32(np.int32(j)) + px
                     power = (half * a * dx + bend) * dx + rise
-                    metres = most * _exp_negative(min(max(power, none), FARTHEST)) * away[i, j]
+                    metres = most * exp_negative(min(max(power, none), FARTHEST)) * away[i, j]
                     metres = metres if power <= FARTHEST else none
                     found[i, j] += metres
                     share[j] = max(min(metres, skin - sums[i, 0, j]), none)
@@ -270,7 +272,8 @@ def _surface(total: np.ndarray, skin: np.ndarray, camera: PinholeCamera, spacing
     normal = _facing(skin[..., 2:5], toward)
     albedo = np.clip(skin[..., 5:8] / found[..., None], 0.0, 1.0) * there[..., None]
     even = _even(total, depth, camera, spacing)
-    return LiquidSurface(np.maximum(depth, 0.0), normal, np.where(there, even, 0.0), albedo, covered)
+    thickness = np.where(there, even, 0.0)
+    return LiquidSurface(np.maximum(depth, 0.0), normal, thickness, albedo, covered, grain=FILM * spacing)
 
 
 def _cosine(vectors: np.ndarray, toward: np.ndarray) -> np.ndarray:

@@ -40,12 +40,12 @@ _C1, _C2, _C3 = np.float32(0.99999472), np.float32(0.49989989), np.float32(0.166
 _C4, _C5 = np.float32(0.03985597), np.float32(0.00589132)
 
 
-def _exp_negative(p):
+def exp_negative(p):
     """exp(-p) for 0 <= p <= ln 255, the largest that counts."""
     return np.exp(-p)
 
 
-@overload(_exp_negative, inline="always")
+@overload(exp_negative, inline="always")
 def _exp_negative_compiled(p):
     if p == nb.float64:
         return lambda p: math.exp(-p)
@@ -139,7 +139,7 @@ def raster_kernel(packed, starts, gaussians, first, last, tile, stride, width, h
                     for lane in range(np.uint64(LANES)):
                         dx = np.float32(np.int32(lane)) + px - u
                         p = (a * dx + bend) * dx + rise
-                        raw = o * _exp_negative(min(max(p, np.float32(0.0)), _FALLOFF_MAX))
+                        raw = o * exp_negative(min(max(p, np.float32(0.0)), _FALLOFF_MAX))
                         alpha = min(raw, ALPHA_MAX) if raw >= ALPHA_MIN else np.float32(0.0)
                         kept = buf[base + lane]
                         passed = max(kept, np.float32(0.0))
@@ -203,7 +203,7 @@ def _backward_block(buf, base, sums, packed, k, dy, px):
     for lane in range(np.uint64(LANES)):
         dx = np.float32(np.int32(lane)) + px - u
         p = (a * dx + bend) * dx + rise
-        raw = o * _exp_negative(min(max(p, np.float32(0.0)), _FALLOFF_MAX))
+        raw = o * exp_negative(min(max(p, np.float32(0.0)), _FALLOFF_MAX))
         alpha = min(raw, ALPHA_MAX) if raw >= ALPHA_MIN else np.float32(0.0)
         kept = buf[base + lane]
         passed = max(kept, np.float32(0.0))

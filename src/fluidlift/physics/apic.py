@@ -36,36 +36,20 @@ from fluidlift.types import CellType, FaceVelocity, FluidParameters, Grid, Parti
 __all__ = ["EmitSource", "LiquidSimulator", "SimulationSettings", "StepReport"]
 
 
-TURNED = 0.7
-"""share of gravity along an axis from which its side of the box is one that liquid falls out of: from 45 degrees
-on it is as much below as the floor; a tank that is tilted less stays a tank"""
-
-
-def sides_open_to_air(gravity: tuple[float, float, float]) -> np.ndarray:
-    """bool [3,2] (axis, low/high): sides of the box without a wall.
-
-    The one that gravity points away from (the sky of the clip) and, once gravity is turned, those that it points to:
-    no ground was seen there, and what falls must not pile up at an invisible wall. The low side of z is the ground.
-    """
-    out = np.zeros((3, 2), bool)
-    g = np.asarray(gravity, np.float64)
-    if not g.any():
-        return out
-    up = int(np.abs(g).argmax())
-    out[up, int(g[up] < 0)] = True
-    for axis in range(3):
-        down = int(g[axis] > 0)
-        if abs(g[axis]) > TURNED * np.linalg.norm(g) and (axis, down) != (2, 0):
-            out[axis, down] = True
-            out[2, 1] = True  # the sky stays open, whatever falls
+def open_sky(gravity: tuple[float, float, float]) -> np.ndarray:
+    """bool [3,2] (axis, low/high): the side that gravity points away from, as open; none without gravity."""
+    out, g = np.zeros((3, 2), bool), np.asarray(gravity, np.float64)
+    if g.any():
+        up = int(np.abs(g).argmax())
+        out[up, int(g[up] < 0)] = True
     return out
 
 
 class LiquidSimulator(LiquidGrid):
     """A body of liquid on a terrain, with an inlet and an outlet.
 
-    The sides of the box are frictionless walls, except in INFLOW and OUTFLOW cells and where `sides_open_to_air` says
-    so: particles that leave there are removed. The terrain's signed distance decides what is solid.
+    The sides of the box are frictionless walls, except in INFLOW and OUTFLOW cells and where `open_sides` says so:
+    particles that leave there are removed. The terrain's signed distance decides what is solid.
 
     Outlet: particles flow freely and are removed when they leave the box there, or when they leave the OUTFLOW cells
     along the mainstream. Columns of liquid that stand on the ground inside OUTFLOW cells have the hydrostatic pressure
@@ -90,6 +74,7 @@ class LiquidSimulator(LiquidGrid):
         work: who does the particle half of a step; None: the CPU.
         bodies: rigid bodies, at rest, animated or free; particles inside them at the start are removed.
         supply: how the inflow changes over time, and emitters; None: a steady inlet alone.
+        open_sides: bool [3,2] (axis, low/high) of the box without a wall; None: `open_sky`.
 
     Raises:
         ValueError: arguments of wrong shape, or numbers that are not finite.
@@ -111,11 +96,12 @@ class LiquidSimulator(LiquidGrid):
         work: ParticleWork | None = None,
         bodies: Sequence[RigidBody] = (),
         supply: Supply | None = None,
+        open_sides: np.ndarray | None = None,
     ) -> None:
-        open_sides = sides_open_to_air(parameters.gravity)
         super().__init__(
             grid, terrain, parameters, particles, cell_types=cell_types, inflow_profile=inflow_profile, seed=seed,
-            emit_source=emit_source, open_sides=open_sides, supply=supply,
+            emit_source=emit_source, supply=supply,
+            open_sides=open_sky(parameters.gravity) if open_sides is None else np.asarray(open_sides, bool),
             settings=replace(settings or SimulationSettings(), particles_per_cell=particles_per_cell),
         )  # fmt: skip
         self._prepare_grid(work or ParticleWork(), bodies)
@@ -214,6 +200,14 @@ class LiquidSimulator(LiquidGrid):
             self._head_rate = step.head_rate
 
         return Outcome(state, int(gone.sum()), step.report, step.viscosity, adopt)
+
+    def _add(
+        self, places: np.ndarray, volume: float, look: np.ndarray | None = None, velocity: np.ndarray | None = None
+    ) -> None:
+        """See `ParticleSimulator`; nothing comes out of inlets and emitters where a body is."""
+        if self._bodies is not None and len(places):
+            places = places[~self._bodies.inside(places)]
+        super()._add(places, volume, look, velocity)
 
     def _carry_inlet(self, velocities: np.ndarray, affine: np.ndarray) -> None:
         """Particles in the inlet move as prescribed, in place: walls beside it would hold back its rim."""

@@ -102,12 +102,26 @@ def spread_points(shapes: Shapes, points: list[np.ndarray], spacing: Float[np.nd
 
 
 @njit(cache=True)
-def _meet(shapes, partner, x, y, z, field, low, high, inverse, out):
+def _beyond(x, y, z, low, high, open_sides):
+    """How far (m) a point is outside of the box's open sides; 0 inside."""
+    out = 0.0
+    for axis in range(3):
+        along = x if axis == 0 else (y if axis == 1 else z)
+        if open_sides[axis, 0]:
+            out += max(low[axis] - along, 0.0)
+        if open_sides[axis, 1]:
+            out += max(along - high[axis], 0.0)
+    return out
+
+
+@njit(cache=True)
+def _meet(shapes, partner, x, y, z, field, low, high, inverse, open_sides, out):
     """Gap (m) between a point and a partner; its gradient goes to `out`."""
     if partner >= FIXED:
         gap, out[0], out[1], out[2] = body_distance(shapes, partner - FIXED, x, y, z)
     elif partner == 0:
         gap, out[0], out[1], out[2] = distance_and_gradient(field, low, inverse, x, y, z)
+        gap += _beyond(x, y, z, low, high, open_sides)  # the field ends at the box, with the value of its last node
     else:
         axis, side = (partner - 1) // 2, (partner - 1) % 2
         along = x if axis == 0 else (y if axis == 1 else z)
@@ -169,7 +183,7 @@ def _find(shapes, points, start, normals, radii, cosines, free, reach, field, re
                 limit = reach[a] + (reach[partner - FIXED] if partner >= FIXED else 0.0)
                 if partner >= FIXED and not near_body(shapes, partner - FIXED, x, y, z, limit + lower):
                     continue
-                gap = _meet(shapes, partner, x, y, z, field, low, high, inverse, n)
+                gap = _meet(shapes, partner, x, y, z, field, low, high, inverse, open_sides, n)
                 length = np.sqrt(n[0] * n[0] + n[1] * n[1] + n[2] * n[2])
                 # in the middle of a solid no way out is to be seen
                 if gap >= limit + lower or length < 0.3:
@@ -180,7 +194,7 @@ def _find(shapes, points, start, normals, radii, cosines, free, reach, field, re
                     mx, my, mz = _turned_by(r, normals[p])
                     if -(mx * n[0] + my * n[1] + mz * n[2]) > cosines[p]:
                         px, py, pz = x - ball * (mx + n[0]), y - ball * (my + n[1]), z - ball * (mz + n[2])
-                        gap = _meet(shapes, partner, px, py, pz, field, low, high, inverse, n)
+                        gap = _meet(shapes, partner, px, py, pz, field, low, high, inverse, open_sides, n)
                         n /= max(np.sqrt(n[0] * n[0] + n[1] * n[1] + n[2] * n[2]), 0.1)
                 if gap >= limit or (0 < partner < FIXED and _region(regions, low, inverse, px, py, pz) >= 3):
                     continue  # bodies leave through inlet and outlet

@@ -5,16 +5,19 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from scipy.spatial import cKDTree
 
 from fluidlift.numerics.sampling import sample_faces, sample_nodes
 from fluidlift.physics.boundaries import CLEARANCE, Walls, touching_faces
 from fluidlift.physics.emitter import PHASES, Emission, Supply
-from fluidlift.types import CellType, FaceVelocity, FluidParameters
+from fluidlift.types import CellType, FaceVelocity, FluidParameters, Grid, Terrain
 
 MODES = 12
 """plane waves that make up the inflow fluctuation"""
+
+SHORE = 1.5
+"""cells from what stands out of a fluid within which its splats have the colours of rocks and banks"""
 
 
 @dataclass(frozen=True)
@@ -50,6 +53,38 @@ def random_fluctuation(
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     own = rng.uniform(0.5, 1.0, MODES) * max(float(np.linalg.norm(bulk)), amplitude) * 2 * np.pi / lengths
     return Fluctuation(k, k @ bulk + 0.5 * own, directions, rng.uniform(0, 2 * np.pi, MODES))
+
+
+def inlet_to_surface(
+    cell_types: UInt8[np.ndarray, "nx ny nz"], positions: Float[np.ndarray, "n 3"], grid: Grid
+) -> UInt8[np.ndarray, "nx ny nz"]:
+    """The cells with an inlet that reaches up to the surface of the body: EMPTY cells above INFLOW that hold particles.
+
+    A cell that the surface leaves less than half full counts as EMPTY at the start. Without it, all that flows in
+    does so below the surface, and rises behind the inlet.
+    """
+    cells = cell_types.copy()
+    held = np.zeros(grid.shape, bool)
+    held[tuple(np.clip(grid.cell_of(positions), 0, np.asarray(grid.shape) - 1).T)] = True
+    for k in range(1, grid.shape[2]):
+        above = (cells[:, :, k - 1] == CellType.INFLOW) & (cells[:, :, k] == CellType.EMPTY) & held[:, :, k]
+        cells[:, :, k][above] = CellType.INFLOW
+    return cells
+
+
+def clear_of_shore(
+    points: Float[np.ndarray, "n 3"], level: Float[np.ndarray, "n"], terrain: Terrain
+) -> Bool[np.ndarray, "n"]:
+    """Whether points (m) of a fluid whose surface stands at a level (z, m) are away from rocks and banks.
+
+    Those that rise by less than `SHORE` above the surface, and its bed, do not count.
+    """
+    reach = SHORE * terrain.grid.spacing
+    above = np.concatenate(
+        [np.asarray(points, np.float64)[:, :2], np.asarray(level, np.float64)[:, None] + reach], axis=1
+    )
+    above[:, 2] = np.minimum(above[:, 2], terrain.grid.high[2])
+    return sample_nodes(terrain.signed_distance, terrain.grid, above) > reach
 
 
 class Inlet:
@@ -187,6 +222,14 @@ class Inlet:
         near = np.flatnonzero(out)
         cells = np.clip(grid.cell_of(positions[near]), 0, np.asarray(grid.shape) - 1)
         out[near] = self._cells[tuple(cells.T)]
+        return out
+
+    def holds(self, positions: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
+        """Whether a particle may be put there: in INFLOW cells, clear of walls."""
+        if not self._steady:
+            return np.zeros(len(positions), bool)
+        out, grid = self.inside(positions), self._walls.grid
+        out[out] = sample_nodes(self._walls.signed_distance, grid, positions[out]) > CLEARANCE * grid.spacing
         return out
 
     def travel(self, dt: float, time: float = 0.0) -> None:

@@ -21,7 +21,7 @@ from fluidlift.physics import rigid_coupling
 from fluidlift.physics.boundaries import Walls, slide_along_walls
 from fluidlift.physics.contact import ContactSolver, Motion
 from fluidlift.physics.contact_search import Contacts, find_contacts, spread_points
-from fluidlift.physics.rigid_body import RigidBody, Trajectory, material_pairs
+from fluidlift.physics.rigid_body import RigidBody, Trajectory, material_pairs, within_reach
 from fluidlift.physics.rigid_coupling import BodyRows, SolidVelocity
 from fluidlift.physics.rigid_push import push_out
 from fluidlift.physics.rigid_shapes import distances, pack, posed
@@ -48,7 +48,7 @@ class RigidBodies:
         time: s, at the start.
 
     Raises:
-        InputRejected: a body outside the box, or two of one name.
+        InputRejected: a body outside the box that does not fall into it, or two of one name.
     """
 
     def __init__(
@@ -102,7 +102,7 @@ class RigidBodies:
         """kg m^2/s about the centres of mass, world axes"""
         self._prescribed_spin = np.zeros((n, 3))
         self.active = np.ones(n, bool)
-        """False once a free body has left the box"""
+        """False once a free body has left the box for good"""
         self._known_keys, self._known_impulses, self._known_step = np.zeros(0, np.int64), np.zeros((0, 3)), 1.0
         self._solver: ContactSolver | None = None
         self._rows: tuple[BodyRows, ...] = ()
@@ -114,9 +114,10 @@ class RigidBodies:
         for name in names:
             if names.count(name) > 1:
                 raise InputRejected(f"{names.count(name)} bodies named '{name}'", "different names")
+        near = within_reach(self._shapes, self._static, self._gravity, self.free)
         for n, body in enumerate(self.bodies):
             low, high = self._shapes.box_low[n], self._shapes.box_high[n]
-            if body.motion != "animated" and not ((high > grid.low) & (low < grid.high)).all():
+            if body.motion != "animated" and not near[n]:
                 raise InputRejected(
                     f"body '{body.name}' from {_place(low)} to {_place(high)} m, outside the simulation's box",
                     f"a place within {_place(grid.low)} to {_place(grid.high)} m", "move the body or enlarge the box",
@@ -337,9 +338,7 @@ class RigidBodies:
                 quat = product(rotation_by(dt * turn[n]), quat) if turn[n].any() else quat
                 self.orientation[n] = quat / np.sqrt(np.square(quat).sum())
         self._pose()
-        grid = self._static.grid
-        inside = ((self._shapes.box_high > grid.low) & (self._shapes.box_low < grid.high)).all(axis=1)
-        self.active &= inside | ~self.free
+        self.active &= ~self.free | within_reach(self._shapes, self._static, self._gravity, self.free)
 
     # --- particles --------------------------------------------------------------------------------------------------
 

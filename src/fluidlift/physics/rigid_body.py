@@ -7,11 +7,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from fluidlift.errors import require
 from fluidlift.numerics.mesh_distance import MeshDistance, mesh_distance
 from fluidlift.numerics.solid_mesh import box_mesh, closed_mesh, cylinder_mesh, ellipsoid_mesh
+from fluidlift.physics.boundaries import Walls
+from fluidlift.physics.rigid_shapes import Shapes
 from fluidlift.physics.rotation import product, rotation_by, rotation_vector
 from fluidlift.types import TriangleMesh, matrix_from_quat
 
@@ -162,6 +164,20 @@ class RigidBody:
         cells = float(np.ptp(self.mesh.vertices, axis=0).max()) / spacing
         share = 0.25 if cells <= 16 else (0.5 if cells <= 100 else 1.0)
         return mesh_distance(self.mesh, share * spacing, margin=1.5 * spacing)
+
+
+def within_reach(
+    shapes: Shapes, walls: Walls, gravity: Float[np.ndarray, "3"], falls: Bool[np.ndarray, "b"]
+) -> Bool[np.ndarray, "b"]:
+    """Which bodies touch the walls' box, or, of those that fall, hang where gravity brings them in by an open side."""
+    grid, low, high = walls.grid, shapes.box_low, shapes.box_high
+    beside = (high > grid.low) & (low < grid.high)
+    out = beside.all(axis=1)
+    for axis, side in np.argwhere(walls.open_sides):
+        if gravity[axis] * (-1 if side else 1) > 0:
+            above = low[:, axis] >= grid.high[axis] if side else high[:, axis] <= grid.low[axis]
+            out |= falls & above & np.delete(beside, axis, axis=1).all(axis=1)
+    return out
 
 
 def material_pairs(bodies: Sequence[RigidBody]) -> tuple[np.ndarray, np.ndarray]:

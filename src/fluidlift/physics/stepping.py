@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
+from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 from fluidlift.errors import FluidliftError, InputRejected, require
@@ -28,8 +29,26 @@ from fluidlift.types import FaceVelocity, FluidParameters, Grid, Particles, Solv
 TIDY_EVERY = 4
 """substeps between two tidyings: particles put in the order of their cells, thin and crowded cells reseeded"""
 
-EmitSource = Callable[[np.ndarray, float], np.ndarray]
-"""(positions [n,3] m, time s) -> index of the rest Gaussian that lends each new particle its look"""
+
+@dataclass(frozen=True)
+class Emitted:
+    """Particles that fill the places where one is due. A place may take none, one or several, which share its mass."""
+
+    place: Int[np.ndarray, "m"]
+    """index of the place that each belongs to"""
+    offset: Float[np.ndarray, "m 3"]
+    """m, from there"""
+    source: Int[np.ndarray, "m"]
+    """index of the rest Gaussian that lends it its look"""
+
+    @classmethod
+    def one_each(cls, source: Int[np.ndarray, "n"]) -> Emitted:
+        """One particle in each place."""
+        return cls(np.arange(len(source)), np.zeros((len(source), 3), np.float32), source)
+
+
+EmitSource = Callable[[np.ndarray, float], Emitted]
+"""(places [n,3] m, time s) -> the particles that enter there"""
 
 
 @dataclass(frozen=True)
@@ -278,9 +297,9 @@ class ParticleSimulator(ABC):
 
     def _nearest_source(self, particles: Particles) -> EmitSource:
         if not len(particles):
-            return lambda positions, time: np.zeros(len(positions), np.int64)
+            return lambda places, time: Emitted.one_each(np.zeros(len(places), np.int64))
         tree, source = cKDTree(particles.positions), particles.source.copy()
-        return lambda positions, time: source[tree.query(positions)[1]]
+        return lambda places, time: Emitted.one_each(source[tree.query(places)[1]])
 
     def _fill_inlet(self) -> int:
         """Keep INFLOW cells and emitters full of particles that move as prescribed; the number of new ones."""
@@ -306,13 +325,22 @@ class ParticleSimulator(ABC):
         if not len(places):
             return
         if look is None or not len(look):
-            source = np.asarray(self._emit_source(places, self.time), np.int64)
+            new = self._emit_source(places, self.time)
         else:
-            source = np.asarray(look, np.int64)[np.arange(self._next_id, self._next_id + len(places)) % len(look)]
-        moves = None if velocity is None else np.broadcast_to(velocity, places.shape)
-        new = Particles.at_rest(places, self.parameters.density * volume, source, moves, first_id=self._next_id)
-        self._next_id += len(places)
-        self._particles = self._particles.joined(new)
+            new = Emitted.one_each(
+                np.asarray(look, np.int64)[np.arange(self._next_id, self._next_id + len(places)) % len(look)]
+            )
+        positions = places[new.place] + new.offset
+        astray = ~self._inlet.holds(positions) & new.offset.any(axis=1)
+        kept = ~astray
+        kept[np.unique(new.place, return_index=True)[1]] = True  # one of each place stays, at the place itself
+        positions = np.where((astray & kept)[:, None], places[new.place], positions)[kept].astype(np.float32)
+        place, source = new.place[kept], np.asarray(new.source, np.int64)[kept]
+        mass = self.parameters.density * volume / np.bincount(place, minlength=len(places))[place]
+        moves = None if velocity is None else np.broadcast_to(velocity, positions.shape)
+        made = Particles.at_rest(positions, mass, source, moves, first_id=self._next_id)
+        self._next_id += len(positions)
+        self._particles = self._particles.joined(made)
 
     def _emitters_switched(self) -> None:  # noqa: B027
         """An emitter has come on or gone off; for simulators that keep what depends on it."""

@@ -296,10 +296,13 @@ class EditSession:
         """Warnings about what lies mostly outside the domain, which the terrain's edits may move elsewhere."""
         if edits.terrain:
             return []
-        data = read_manifest(self.folder)["grid"]
+        manifest = read_manifest(self.folder)
+        data, clip = manifest["grid"], manifest["frame_count"] * manifest["frame_interval"]
         grid = Grid(tuple(data["shape"]), data["spacing"], tuple(data["origin"]))
         above = HIGHEST * float((grid.high - grid.low).max())
-        return require_inside(edits, grid, reach=edits.extend_downstream, above=above)
+        return require_inside(
+            edits, grid, reach=edits.extend_downstream, above=above, seconds=edits.duration or clip
+        )  # fmt: skip
 
 
 def _as_lifted(text: str) -> str:

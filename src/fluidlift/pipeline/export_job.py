@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -124,6 +124,29 @@ def every(fps: float | None, interval: float) -> int:
             f"simulate at that rate: fluidlift sim ASSET --fps {fps:g}",
         )  # fmt: skip
     return step
+
+
+def as_simulated(folder: Path, asset: FluidAsset, manifest: dict[str, Any]) -> FluidAsset:
+    """The asset on the ground that its frames flow over: scene.yaml may have moved, twisted, replaced or lengthened it.
+
+    Raises:
+        InputRejected: a scene.yaml that does not fit.
+    """
+    from fluidlift.io.scene import read_edits
+    from fluidlift.pipeline.resimulate import settings_of
+    from fluidlift.pipeline.scene import SimulationRequest, scene_of
+
+    played, edits = manifest.get("simulation", {}), read_edits(folder)
+    longer = float(played.get("extended_downstream", 0.0))
+    if not (edits.terrain or edits.emitters or longer > 0):
+        return asset
+    interval = float(played.get("frame_interval", asset.interval))
+    config = settings_of(manifest, (), {}, sections=("simulate", "show"), work="an export")
+    request = SimulationRequest(fps=1.0 / interval, extend_downstream=longer)
+    scene = scene_of(asset, folder, request, config, footage=None, start=0)
+    return replace(
+        asset, terrain=scene.terrain, grid=scene.terrain.grid, cell_types=scene.cell_types, velocity=scene.velocity
+    )
 
 
 def frames_of(folder: Path, picked: range) -> Iterator[tuple[Gaussians, np.ndarray, np.ndarray]]:

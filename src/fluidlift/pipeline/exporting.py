@@ -20,6 +20,7 @@ from fluidlift.pipeline.export_job import (
     ExportJob,
     ExportRequest,
     Outcome,
+    as_simulated,
     checked,
     every,
     frames_of,
@@ -91,11 +92,12 @@ def export_asset(folder: Path, out: Path, request: ExportRequest, *, progress: P
 def _job(
     folder: Path, out: Path, asset: FluidAsset, request: ExportRequest, manifest: dict[str, Any], progress: Progress
 ) -> ExportJob:
-    """Which frames of the asset are written, and how fast they follow each other."""
+    """Which frames of the asset are written, how fast they follow each other, and the ground that they flow over."""
     played = manifest.get("simulation", {})
     interval = float(played.get("frame_interval", asset.interval))
     numbers = frame_numbers(folder, int(played.get("frames", 0)), request.frames)
     step = every(request.fps, interval)
+    asset = as_simulated(folder, asset, manifest)
     return ExportJob(folder, out, asset, request, numbers[::step], step * interval, progress)
 
 

@@ -15,7 +15,7 @@ from fluidlift.errors import InputRejected, require
 from fluidlift.io.scene_look import Look
 from fluidlift.look.display import displayed
 from fluidlift.look.environment import BUILT_IN, LUMINANCE, Environment, built_in
-from fluidlift.look.fluid_normals import fluid_normals
+from fluidlift.look.fluid_normals import fluid_depths, fluid_normals, fluid_surface
 from fluidlift.look.ground_picture import Ground, place_of
 from fluidlift.look.liquid import Behind, LiquidSurface, shaded
 from fluidlift.look.materials import Material, material_named
@@ -194,7 +194,7 @@ class Painter:
         mesh = None
         if self._mesher is not None:
             mesh, _ = surface_of(frame.fluid, frame.velocities, self.terrain, self._mesher)
-        behind = self._behind(frame, mesh, camera, backdrop)
+        behind = self._behind(frame, mesh or self._caster(frame, backdrop), camera, backdrop)
         if self.look.style == "relit":
             return self._relit(frame.fluid, camera, behind, cut_out=backdrop.cut_out)
         surface = self._liquid(frame.fluid, mesh, camera, behind)
@@ -237,7 +237,19 @@ class Painter:
         far = self.seen_behind(camera) if backdrop.picture is None else backdrop.picture
         depth = np.zeros(far.shape[:2], np.float32) if backdrop.depth is None else backdrop.depth
         ground = self._ground if backdrop.picture is None else self._no_ground
-        return ground.picture(camera, Behind(far, depth), mesh, material=self.material, bodies=frame.bodies)
+        # what is drawn as splats hides what is behind it, and lets no light through to the ground either
+        clear = None if self.look.style == "relit" else self.material
+        found = ground.picture(camera, Behind(far, depth), mesh, material=clear, bodies=frame.bodies)
+        # nobody knows what is around a clip: its own rim and mean fit it better than another world's sky
+        return replace(found, goes_on=backdrop.picture is not None)
+
+    def _caster(self, frame: Frame, backdrop: Backdrop) -> TriangleMesh | None:
+        """The splats as a body that throws a shadow. Not on the plate of a clip: the clip's fluid has thrown its own
+        there, and which of them are shadows nobody knows."""
+        bare = backdrop.picture is not None or (backdrop.cut_out and self.look.style == "relit")
+        if self.look.style == "surface" or (bare and not frame.bodies):
+            return None
+        return fluid_surface(frame.fluid, 0.5 * self.terrain.grid.spacing)
 
     @cached_property
     def _ground(self) -> Ground:
@@ -273,8 +285,10 @@ class Painter:
 
     def _relit(self, fluid: Gaussians, camera: PinholeCamera, behind: Behind, *, cut_out: bool) -> Lit:
         """Splats under other light."""
-        normals, share = fluid_normals(fluid, 0.5 * self.terrain.grid.spacing, self._bed)
-        light = relit(fluid, normals, share, camera, self.material, self.environment, self._clip_colors)
+        apart = 0.5 * self.terrain.grid.spacing
+        normals, share = fluid_normals(fluid, apart, self._bed)
+        deep = fluid_depths(fluid, normals, apart)
+        light = relit(fluid, normals, share, camera, self.material, self.environment, self._clip_colors, deep)
         seen = (fluid.opacities * self._visible(fluid, camera, behind)).astype(np.float32)
         shown = Gaussians(fluid.means, fluid.quats, fluid.scales, seen, fluid.sh)
         drawn = render(shown, camera, features=light)
@@ -310,7 +324,7 @@ class Painter:
         image, alpha = self._final.picture_and_alpha(
             FinalScene(
                 mesh, self.material, camera, self.environment.radiance, (*ground, *frame.bodies),
-                samples=self._samples, show_environment=False,
+                samples=self._samples, show_environment=False, usual=self._usual,
             )
         )  # fmt: skip
         behind = self._behind(frame, None, camera, Backdrop(backdrop.picture))

@@ -10,9 +10,9 @@ with w times as much: two bodies at w and 1 - w then take as much light as one, 
 on the way.
 
 Limits. While it fades, fine patterns of two instants lie over each other, with up to 30 % less contrast. A fluid
-whose level has changed between beginning and end (a vessel that fills, a flood) shows two levels for that time; a
-warning says so. Bodies that float glide back to where they were. Particles of the end get new ids there, since those
-of the beginning live on.
+whose level has changed between beginning and end (a vessel that fills, a flood, smoke that still spreads) is not
+faded: a warning says so. Bodies that float glide back to where they were. Particles of the end get new ids there,
+since those of the beginning live on.
 """
 
 from __future__ import annotations
@@ -90,9 +90,11 @@ def blended_poses(head: Float[np.ndarray, "b 7"], tail: Float[np.ndarray, "b 7"]
 
 
 def close_loop(scene: Scene, history: History, file: Callable[[int], Path], checkpoint: Path) -> list[str]:
-    """Fade the end of a simulation into its beginning, on disk; what to tell about it.
+    """Fade the end of a simulation into its beginning, on disk; why it was not done, or nothing.
 
-    The checkpoint goes first: should this be interrupted, the next run starts at the first frame.
+    A fluid that is not the same at both ends is left as it was simulated: a vessel that fills has no loop, and two
+    levels over each other would be seen. The checkpoint goes first: should this be interrupted, the next run starts
+    at the first frame.
 
     Args:
         scene: with an `overlap`.
@@ -100,15 +102,33 @@ def close_loop(scene: Scene, history: History, file: Callable[[int], Path], chec
         file: of each frame.
         checkpoint: of the simulation.
     """
-    from fluidlift.io.ply import write_gaussians
-
     count, fade = scene.frames, scene.overlap
     if len(history) < scene.simulated:
         return ["the loop is not closed: the simulation ended early"]
     checkpoint.unlink(missing_ok=True)
     volume = np.array(history.volume)
-    before, after = volume[:fade].mean(), volume[count:].mean()
-    poses = list(history.poses)
+    drift = volume[count:].mean() / max(volume[:fade].mean(), 1e-12) - 1.0
+    steady = abs(drift) <= DRIFT
+    if steady:
+        _fade(history, count, fade, file)
+    for k in range(count, scene.simulated):
+        file(k).unlink()
+    for figures in (history.volume, history.leak, history.count, history.substeps, history.poses):
+        del figures[count:]
+    if steady:
+        return []
+    change = f"{100 * abs(drift):.0f} % {'more' if drift > 0 else 'less'} fluid at its end than at its beginning"
+    return [
+        f"the loop is not closed: there is {change}, and no more than {100 * DRIFT:.0f} % goes unseen. Choose a "
+        "duration after which the level is the same again; what fills or spreads for ever has none"
+    ]
+
+
+def _fade(history: History, count: int, fade: int, file: Callable[[int], Path]) -> None:
+    """Lay the `fade` frames after the first `count` over those from the beginning."""
+    from fluidlift.io.ply import write_gaussians
+
+    volume, poses = np.array(history.volume), list(history.poses)
     for k in range(fade):
         # a double exposure changes less from frame to frame than either of its two: most of the fade goes there
         share = 0.5 * (1.0 + np.cos(np.pi * k / fade))
@@ -118,17 +138,6 @@ def close_loop(scene: Scene, history: History, file: Callable[[int], Path], chec
         history.count[k] = len(shown.ids)
         history.leak[k] = max(history.leak[k], history.leak[count + k])
         history.poses[k] = blended_poses(poses[k], poses[count + k], share)
-    for k in range(count, scene.simulated):
-        file(k).unlink()
-    for figures in (history.volume, history.leak, history.count, history.substeps, history.poses):
-        del figures[count:]
-    drift = after / max(before, 1e-12) - 1.0
-    if abs(drift) <= DRIFT:
-        return []
-    return [
-        f"the loop fades over {100 * abs(drift):.0f} % {'more' if drift > 0 else 'less'} fluid at its end than at its "
-        "beginning: choose a duration after which the level is the same again"
-    ]
 
 
 def read_frame(path: Path) -> SplatFrame:

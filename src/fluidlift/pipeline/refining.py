@@ -29,6 +29,7 @@ LATER = 5
 def refine(story: Story, inputs: Inputs, config: JobConfig) -> Result:
     """Generate per frame, refine on the first, prune, unite, fill."""
     from fluidlift.shape.fill import fill
+    from fluidlift.shape.off_picture import continued
     from fluidlift.shape.prune import prune
     from fluidlift.shape.unite import unite
 
@@ -50,7 +51,9 @@ def refine(story: Story, inputs: Inputs, config: JobConfig) -> Result:
     hull = _bounded(hull, c.max_gaussians - len(front), config.seed)
     generated = len(front) + len(hull)
     shown, pruned = prune(_outside_solid(front, setting), min_opacity=0.05, max_stretch=12.0)
-    shell = concatenate([shown, _outside_solid(hull, setting)])
+    beyond, hull = continued(shown, _outside_solid(hull, setting), setting, camera)
+    beyond = _bounded(_outside_solid(beyond, setting), c.max_gaussians - len(shown) - len(hull), config.seed)
+    shell = concatenate([shown, beyond, hull])
     added = fill(
         shell, spacing=h / 2, rays=c.rays, rng=np.random.default_rng(config.seed),
         max_added=max(c.max_gaussians - len(shell), 0), closed_below=setting.terrain,

@@ -16,7 +16,7 @@ from fluidlift.pipeline.drawing import Stage, drawn
 from fluidlift.pipeline.looks import Painter
 from fluidlift.pipeline.resimulate import FIRST_HALF, recall_first_half, settings_of
 from fluidlift.pipeline.scene import Scene, SimulationRequest, footage_of, scene_of
-from fluidlift.pipeline.simulating import frame_file
+from fluidlift.pipeline.simulating import frame_file, simulated_poses
 from fluidlift.pipeline.story import Progress, Silence, Story
 from fluidlift.pipeline.written import Written, cleared, numbered
 from fluidlift.types import PinholeCamera
@@ -223,14 +223,10 @@ def frame_numbers(folder: Path, count: int, wanted: tuple[int, int] | None) -> r
 
 def _poses(folder: Path, scene: Scene, frames: int) -> tuple[np.ndarray | None, list[str]]:
     """Where the obstacles are in every frame, from the simulation's own result."""
-    from fluidlift.io.stage_cache import load_stage, owner_of
-
     if not scene.obstacles:
         return None, []
-    key = owner_of(folder, "simulate")
-    found = load_stage(folder, "simulate", key) if key is not None else None
-    poses = found[0].get("poses") if found is not None else None
-    if poses is None or poses.shape[0] < frames or poses.shape[1:] != (len(scene.obstacles), 7):
+    poses = simulated_poses(folder, len(scene.obstacles), frames)
+    if poses is None:
         return None, ["the obstacles' motion is not at hand and they are not drawn: run fluidlift sim again"]
     return poses, []
 

@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from fluidlift.errors import InputRejected
 from fluidlift.types import FluidParameters, Gaussians, Grid, concatenate, sh_from_rgb
 
 if TYPE_CHECKING:
     from fluidlift.physics.emitter import Emitter
+    from fluidlift.physics.stepping import ParticleSimulator
     from fluidlift.physics.terrain_edit import TerrainEdit
     from fluidlift.pipeline.scene import Scene
 
@@ -24,6 +26,34 @@ SHADE = 0.04
 """by which they are lighter or darker than the colour: water without any pattern does not show that it moves"""
 HIGHEST = 2.0
 """longest sides of the box above it at which an emitter may be"""
+TURNED = 0.7
+"""share of gravity along an axis from which its side of the box is one that liquid falls out of: from 45 degrees
+on it is as much below as the floor; a tank that is tilted less stays a tank"""
+
+
+def sides_open_to_air(gravity: tuple[float, float, float]) -> np.ndarray:
+    """bool [3,2] (axis, low/high): sides of an asset's box without a wall.
+
+    The sky of the clip, which is the side that gravity points away from (the top where there is none), and, once
+    gravity is turned, those that it points to: no ground was seen there, and what falls must not pile up at an
+    invisible wall. The low side of z is the ground.
+    """
+    from fluidlift.physics.apic import open_sky
+
+    g = np.asarray(gravity, np.float64)
+    if not g.any():
+        return open_sky((0.0, 0.0, -1.0))
+    out = open_sky(gravity)
+    for axis in range(3):
+        down = int(g[axis] > 0)
+        if abs(g[axis]) > TURNED * np.linalg.norm(g) and (axis, down) != (2, 0):
+            out[axis, down] = True
+            out[2, 1] = True  # the sky stays open, whatever falls
+    return out
+
+
+SLOW = 20.0
+"""steps from one frame to the next from which a simulation takes many times as long as usual: two or three"""
 
 
 def with_terrain(scene: Scene, edits: Sequence[TerrainEdit]) -> Scene:
@@ -153,6 +183,76 @@ def _size(value: Any) -> float:
 def _shown(value: Any) -> str:
     numbers = [f"{v:.3g}" for v in np.atleast_1d(value)]
     return numbers[0] if len(numbers) == 1 else f"[{', '.join(numbers)}]"
+
+
+def demands(scene: Scene) -> list[tuple[float, str]]:
+    """What scene.yaml asks of the clock: (steps from one frame to the next, in words), the most demanding first."""
+    from fluidlift.physics.surface_tension import capillary_time_step
+
+    p, interval, h = scene.parameters, scene.interval, scene.terrain.grid.spacing
+    changed = {text.partition(" ")[0] for text in scene.changes}
+    speeds = [(_size(e.velocity), f"emitter '{e.name}'") for e in scene.emitters]
+    for o in scene.obstacles:
+        size = _size(np.ptp(np.asarray(o.mesh.vertices), axis=0))
+        speeds.append((_size(o.velocity) + 0.5 * size * _size(o.angular_velocity), f"obstacle '{o.name}'"))
+    if "inflow_velocity" in changed or scene.inflow != type(scene.inflow)():
+        surge = max(f for _, f in scene.inflow.keyframes) * (1.0 + 2.0 * scene.inflow.fluctuation)
+        speeds.append((_size(p.inflow_velocity) * surge, "the inflow"))
+    found = [(v * interval / h, f"{what} at {v:.3g} m/s") for v, what in speeds]
+    if "gravity" in changed:
+        pull, high = _size(p.gravity), scene.terrain.grid.shape[2] * h
+        found.append((math.sqrt(2.0 * pull * high) * interval / h, f"gravity of {pull:.3g} m/s^2"))
+    if scene.longest_step is not None:
+        found.append((interval / scene.longest_step, f"time_step {scene.longest_step:.3g} s"))
+    if p.surface_tension > 0 and changed & {"surface_tension", "density"}:
+        step = capillary_time_step(p.density, p.surface_tension, h)
+        found.append((interval / step, f"surface_tension {p.surface_tension:.3g} N/m on cells of {h:.3g} m"))
+    return sorted(found, key=lambda d: -d[0])
+
+
+def slow_edits(scene: Scene) -> list[str]:
+    """A word about edits that make a simulation take far longer than usual, before it begins.
+
+    Raises:
+        InputRejected: one that needs more steps from one frame to the next than the simulator takes.
+    """
+    from fluidlift.physics.stepping import SimulationSettings
+
+    most = SimulationSettings().max_substeps
+    steps, what = next(iter(demands(scene)), (0.0, ""))
+    if steps > most:
+        raise InputRejected(
+            f"{what} needs {steps:,.0f} steps from one frame to the next", f"at most {most:,}",
+            "weaken it in scene.yaml, or give a higher --fps",
+        )  # fmt: skip
+    if steps < SLOW:
+        return []
+    return [f"{what} needs about {steps:.0f} steps from one frame to the next, where two or three are usual: this may "
+            "take very long"]  # fmt: skip
+
+
+def closed_inlet(scene: Scene, simulator: ParticleSimulator) -> list[str]:
+    """See that the obstacles leave the fluid a place and a way in; warnings where they close the inlet.
+
+    Raises:
+        InputRejected: they take the place of all of the fluid; the message names their lines.
+    """
+    from fluidlift.numerics.sampling import sample_nodes
+    from fluidlift.types import CellType
+
+    if not scene.obstacles:
+        return []
+    named = ", ".join(f"{o.line}: obstacle '{o.name}'" for o in scene.obstacles)
+    if len(scene.body) and not len(simulator.particles):
+        raise InputRejected(
+            f"{named} in the place of all of the fluid", "room for the fluid", "make it smaller, or move it"
+        )
+    grid = scene.terrain.grid
+    inlet = grid.low + (np.argwhere(scene.cell_types == CellType.INFLOW) + 0.5) * grid.spacing
+    inlet = inlet[sample_nodes(scene.terrain.signed_distance, grid, inlet) > 0]
+    if not len(inlet) or not simulator.bodies.inside(inlet).all():
+        return []
+    return [f"{named} over the whole inlet: nothing flows in while it is there"]
 
 
 def in_words(scene: Scene) -> str:

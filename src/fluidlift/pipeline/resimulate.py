@@ -13,6 +13,7 @@ import numpy as np
 from fluidlift.config import PRESETS, JobConfig, build_config
 from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.pipeline import reporting, showing, simulating
+from fluidlift.pipeline.reshaping import slow_edits
 from fluidlift.pipeline.scene import Footage, Scene, SimulationRequest, footage_of, scene_of
 from fluidlift.pipeline.story import Progress, Silence, Story, peak_memory_mb
 
@@ -176,7 +177,7 @@ def play(story: Story, folder: Path, config: JobConfig, request: SimulationReque
     manifest, asset = read_manifest(folder), load_asset(folder)
     footage, edits = footage_of(story), read_edits(folder, meshes=request.meshes)
     scene = scene_of(asset, folder, request, config, footage=footage, start=rest_frame_of(manifest, footage))
-    outside = require_inside(edits, scene.terrain.grid)
+    outside = require_inside(edits, scene.terrain.grid, seconds=scene.frames * scene.interval) + slow_edits(scene)
     look = edits.look.mark(folder) | color_mark(edits.obstacles)
     for text in outside:
         story.progress.warn(text)
@@ -189,7 +190,7 @@ def play(story: Story, folder: Path, config: JobConfig, request: SimulationReque
         owns_files=True,
     )
     done = story["simulate"].meta
-    wanted = [folder / "preview.mp4"] + [folder / "asset.usda"] * config.show.usd
+    wanted = [folder / "preview.mp4"] * config.show.preview + [folder / "asset.usda"] * config.show.usd
     story.run(
         "show",
         lambda: showing.show(
@@ -200,7 +201,8 @@ def play(story: Story, folder: Path, config: JobConfig, request: SimulationReque
         still_there=lambda result: all(p.is_file() for p in wanted),
         owns_files=True,
     )
-    _finish(story, scene, config, manifest, {"look": look, "loop": edits.loop, "warnings": outside})
+    closed = edits.loop and not any("loop is not closed" in text for text in done.get("warnings", ()))
+    _finish(story, scene, config, manifest, {"look": look, "loop": closed, "warnings": outside})
     if "failed" in done:
         raise FluidliftError(
             f"{done['failed']} The {done['frames']} frames before it are kept, with their preview: '{folder}'."
@@ -257,6 +259,7 @@ def _finish(story: Story, scene: Scene, config: JobConfig, manifest: dict[str, A
             "obstacles": [o.name for o in scene.obstacles],
             "look": edited["look"],
             "loop": edited["loop"],
+            "parts": scene.parts,
             "warnings": own,
         },
     )  # fmt: skip

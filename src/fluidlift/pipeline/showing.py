@@ -50,7 +50,10 @@ def show(
     measured: dict[str, list[np.ndarray]] = {"frames": [], "mask": [], "flow": []}
     painter = _painter(scene, folder, look)
     panels = _panels(scene, footage, folder, config, poses, measured, step, painter)
-    write_video(folder / "preview.mp4", panels, 1.0 / scene.interval)
+    if config.show.preview:
+        write_video(folder / "preview.mp4", panels, 1.0 / scene.interval)
+    else:
+        (folder / "preview.mp4").unlink(missing_ok=True)  # of frames that are no longer there
     if config.show.usd:
         write_usd(
             folder / "asset.usda",

@@ -13,13 +13,13 @@ from fluidlift.config import JobConfig
 from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.pipeline.looping import close_loop
-from fluidlift.pipeline.reshaping import in_words
+from fluidlift.pipeline.reshaping import closed_inlet, in_words, sides_open_to_air
 from fluidlift.pipeline.scene import LYING, Scene, SimulationRequest, simulation_step
 from fluidlift.pipeline.story import Result, available_memory
 from fluidlift.types import CellType, Gaussians, Particles
 
 if TYPE_CHECKING:
-    from fluidlift.physics.inflow_schedule import InflowSchedule
+    from fluidlift.look.inflow import InflowLook
     from fluidlift.physics.numba_particles import ParticleWork
     from fluidlift.physics.stepping import ParticleSimulator
 
@@ -31,32 +31,6 @@ MIXED = 0.42
 
 BYTES_PER_SPLAT = 80
 """of disk, in a frame's file"""
-
-
-def emission_look(
-    rest: Gaussians, direction: np.ndarray, speed: float, schedule: InflowSchedule | None = None
-) -> Callable[[np.ndarray, float], np.ndarray]:
-    """Which rest Gaussian lends its look to a particle that enters at a place and time.
-
-    The fluid that enters later is taken to look like the body further downstream, mirrored at its ends: the pattern
-    goes on without a seam at the inlet and never shows one colour for long.
-    """
-    from scipy.spatial import cKDTree
-
-    tree = cKDTree(rest.means)
-    reach = rest.means @ direction
-    # the ends of a body are often shaded by what stands there (a gate, a lip): the pattern comes from between them
-    low, high = np.percentile(reach, [12, 90])
-    length = max(float(high - low), 1e-9)
-
-    def source(positions: np.ndarray, time: float) -> np.ndarray:
-        run = speed * (time if schedule is None else schedule.run(time)) % (2 * length)
-        shift = run if run < length else 2 * length - run
-        inlet = positions @ direction
-        target = np.clip(inlet + shift, low, high)
-        return tree.query(positions + (target - inlet)[:, None] * direction)[1].astype(np.int64)
-
-    return source
 
 
 def particle_work(device: str) -> ParticleWork:
@@ -80,9 +54,8 @@ def simulator_of(scene: Scene, device: str = "cpu") -> ParticleSimulator:
     from fluidlift.physics.emitter import Supply
 
     parameters = simulation_step(scene)
-    direction = scene.terrain.mainstream
     own = scene.rest.select(np.arange(len(scene.rest) - sum(map(len, scene.emitter_looks))))
-    look = emission_look(own, direction, float(np.linalg.norm(parameters.inflow_velocity)), scene.inflow)
+    look = inflow_look(scene, own, float(np.linalg.norm(parameters.inflow_velocity)))
     grid, supply = scene.terrain.grid, Supply(scene.inflow, scene.emitters, scene.emitter_looks)
     if scene.kind == "plume":
         from fluidlift.physics.gas import GasSimulator
@@ -98,16 +71,34 @@ def simulator_of(scene: Scene, device: str = "cpu") -> ParticleSimulator:
     return LiquidSimulator(
         grid, scene.terrain, parameters, body, cell_types=cells, inflow_profile=scene.velocity,
         seed=scene.seed, emit_source=look, bodies=scene.bodies, work=particle_work(device), supply=supply,
+        open_sides=sides_open_to_air(parameters.gravity),
     )  # fmt: skip
+
+
+def inflow_look(scene: Scene, own: Gaussians, speed: float) -> InflowLook:
+    """What flows in at a speed (m/s) looks like the body's own Gaussians; of what lies, as the clip shows it away from
+    rocks and banks."""
+    from fluidlift.look.inflow import InflowLook, surface_level
+    from fluidlift.physics.inlet import clear_of_shore
+
+    terrain, lying, usable = scene.terrain, scene.kind in LYING, None
+    spacing = 0.5 * terrain.grid.spacing
+    if lying and len(own):
+        uv, z = scene.camera.project(own.means)
+        usable = (z > 0) & (uv >= 0).all(axis=1) & (uv < scene.camera.size).all(axis=1)
+        usable &= clear_of_shore(own.means, surface_level(own.means, spacing)(own.means[:, :2]), terrain)
+    return InflowLook(own, terrain.mainstream, speed, spacing, usable=usable, run=scene.inflow.run, lying=lying)
 
 
 def within_outlet(scene: Scene) -> tuple[np.ndarray, Particles]:
     """Cells and body of what lies on something, without what is behind its outlet; all of those of other fluids."""
+    from fluidlift.physics.inlet import inlet_to_surface
     from fluidlift.physics.outlet import thin_outlet
 
     if scene.kind not in LYING:
         return scene.cell_types, scene.body
     cells, grid = thin_outlet(scene.cell_types), scene.terrain.grid
+    cells = inlet_to_surface(cells, scene.body.positions, grid)
     behind = (scene.cell_types == CellType.OUTFLOW) & (cells != CellType.OUTFLOW)
     at = np.clip(grid.cell_of(scene.body.positions), 0, np.asarray(grid.shape) - 1)
     return cells, scene.body.select(~behind[tuple(at.T)])
@@ -145,6 +136,21 @@ def require_room(folder: Path, frames: int, splats: int) -> None:
     from fluidlift.io.atomic import require_free_space
 
     require_free_space(folder, frames * splats * BYTES_PER_SPLAT)
+
+
+def simulated_poses(folder: Path, bodies: int | None = None, frames: int = 0) -> np.ndarray | None:
+    """[k,b,7] of the obstacles in the k frames that were simulated last: position (m) and orientation (w, x, y, z).
+
+    None where they are not at hand, not of so many `bodies` (None: any number), or of fewer than `frames`.
+    """
+    from fluidlift.io.stage_cache import load_stage, owner_of
+
+    key = owner_of(folder, "simulate")
+    found = None if key is None else load_stage(folder, "simulate", key)
+    poses = None if found is None else found[0].get("poses")
+    if poses is None or len(poses) < frames:
+        return None
+    return poses if bodies is None or poses.shape[1:] == (bodies, 7) else None
 
 
 def checkpoint_file(folder: Path) -> Path:
@@ -275,6 +281,7 @@ def simulate(
     """
     preflight(scene)
     simulator = simulator_of(scene, config.simulate.device)
+    closed = closed_inlet(scene, simulator)
     history = continued(simulator, scene, folder, request or SimulationRequest(), config)
     first = len(history)
     require_room(folder, scene.simulated - first, len(scene.body))
@@ -284,7 +291,7 @@ def simulate(
     if first == 0:
         checkpoint_file(folder).unlink(missing_ok=True)
     failed = _advance(simulator, scene, folder, config, history, step)
-    warnings = list(scene.notes) + (list(simulator.bodies.warnings) if scene.obstacles else [])
+    warnings = [*scene.notes, *closed] + (list(simulator.bodies.warnings) if scene.obstacles else [])
     if failed is None and len(history) < scene.simulated:
         warnings.append(
             f"the re-simulation stopped after {len(history)} of {scene.simulated} frames, at twice the number of "

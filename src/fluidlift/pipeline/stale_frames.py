@@ -6,12 +6,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from fluidlift.errors import InputRejected
 from fluidlift.io.asset_folder import load_asset, read_manifest
 from fluidlift.io.checkpoint import differing_parts, read_parts
 from fluidlift.io.obstacles import color_mark
 from fluidlift.io.scene import SceneEdits
 from fluidlift.io.scene_look import Look
+from fluidlift.io.stage_cache import owner_of
 from fluidlift.pipeline.resimulate import (
     SECOND_HALF,
     SECOND_HALF_SECTIONS,
@@ -34,7 +34,7 @@ def stale_parts(folder: Path, edits: SceneEdits, *, meshes: Path | None = None) 
 
     Returns:
         "simulate" where the particles would go another way, or further; "look" where they would only be drawn
-        otherwise; both, or neither. Frames of which nothing is known any more (without a checkpoint) count as stale.
+        otherwise; both, or neither. Frames of which nothing is known any more count as stale.
 
     Raises:
         InputRejected: no asset, or a scene that does not fit it.
@@ -53,14 +53,14 @@ def stale_parts(folder: Path, edits: SceneEdits, *, meshes: Path | None = None) 
 
 def _moved(folder: Path, edits: SceneEdits, manifest: dict[str, Any], meshes: Path | None) -> bool:
     """Whether a simulation of scene.yaml would give other frames, or more."""
-    done = manifest["simulation"]
-    try:
+    done, parts = manifest["simulation"], None
+    if checkpoint_file(folder).is_file():
         _, parts = read_parts(checkpoint_file(folder))
-        scene = scene_now(folder, manifest, meshes)
-    except InputRejected:
-        if not checkpoint_file(folder).is_file():
-            return True
-        raise
+    elif owner_of(folder, "simulate") is not None:  # a closed loop has no checkpoint; frames half written, no owner
+        parts = done.get("parts")
+    if not isinstance(parts, dict):
+        return True
+    scene = scene_now(folder, manifest, meshes)
     if differing_parts(parts, scene.parts):
         return True
     more = done["frames"] > scene.frames

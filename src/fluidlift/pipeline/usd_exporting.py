@@ -48,14 +48,13 @@ def write_usd_asset(job: ExportJob, frames: Iterable[FluidFrame], settings: UsdS
 def bodies_of(folder: Path, picked: range) -> tuple[list[MovingMesh], tuple[str, ...]]:
     """The obstacles in the poses that the simulation gave them in the frames that are picked, and warnings."""
     from fluidlift.io.scene import read_edits
-    from fluidlift.io.stage_cache import load_stage, owner_of
+    from fluidlift.pipeline.simulating import simulated_poses
 
-    obstacles, key = read_edits(folder).obstacles, owner_of(folder, "simulate")
+    obstacles = read_edits(folder).obstacles
     if not obstacles:
         return [], ()
-    found = load_stage(folder, "simulate", key) if key is not None else None
-    poses = found[0].get("poses") if found is not None else None
-    if poses is None or len(poses) <= picked[-1] or poses.shape[1:] != (len(obstacles), 7):
+    poses = simulated_poses(folder, len(obstacles), picked[-1] + 1)
+    if poses is None:
         return [], ("the obstacles' motion is not at hand and they are left out: run fluidlift sim again",)
     shown = np.asarray(poses)[list(picked)]
     return [MovingMesh(o.name, o.mesh, shown[:, k, :3], shown[:, k, 3:]) for k, o in enumerate(obstacles)], ()

@@ -167,7 +167,9 @@ class Viewer:
 
     def set_parts(self, **changes: bool) -> None:
         """Show more or less."""
-        self.parts = replace(self.parts, **changes)
+        with self.lock:
+            self.parts = replace(self.parts, **changes)
+        self.panels.show_parts(changes)
         self._dirty = True
 
     def set_source(self, source: str) -> None:

@@ -14,8 +14,12 @@ FAR = 3 * ACROSS
 """blocks from the middle of the fluid: a drop that flew farther has none"""
 LONGEST, SHORTEST = 0.16, 0.04
 """share of the size of the fluid: an arrow of the fastest 1 %, and of what hardly moves; colours tell the speed"""
-THICK, HEAD = 0.0022, 0.026
-"""share of the size of the fluid: radius of a shaft, length of a head"""
+THICK = 3.0
+"""px of an arrow's lines on the screen, whatever the distance"""
+HEAD = 0.026
+"""share of the size of the fluid: length of a head, where the arrow is more than twice as long"""
+SPREAD = 0.4
+"""half the width of a head over its length"""
 STILL = 0.01
 """share of the fastest 1 %: what is slower has no arrow"""
 COLORS = np.array([[95, 20, 160], [225, 60, 100], [255, 235, 60]])
@@ -60,6 +64,29 @@ def arrows(frame: SplatFrame, size: float) -> tuple[np.ndarray, np.ndarray] | No
     tips = tails + velocity[shown] * (length / speed[shown])[:, None]
     colors = np.stack([np.interp(share, [0, 0.5, 1], COLORS[:, c]) for c in range(3)], axis=1)
     return np.stack([tails, tips], axis=1), np.round(colors).astype(np.uint8)
+
+
+def barbed(ends: np.ndarray, colors: np.ndarray, head: float) -> tuple[np.ndarray, np.ndarray]:
+    """Arrows as lines: segments [5m,2,3] (m) and their colours u8 [5m,2,3].
+
+    Lines are not lit, so that their colours are those of the legend. Each arrow is its shaft and four barbs
+    in two planes across each other: from any side a head is seen.
+
+    Args:
+        ends: [m,2,3], tail and tip, m.
+        colors: u8 [m,3].
+        head: m, length of a head; at most half the arrow.
+    """
+    tips, along = ends[:, 1], ends[:, 1] - ends[:, 0]
+    length = np.sqrt(np.square(along).sum(axis=1, keepdims=True))
+    along = along / np.maximum(length, 1e-12)
+    # the axis that an arrow is least along is never parallel to it
+    one = np.cross(along, np.eye(3)[np.abs(along).argmin(axis=1)])
+    one /= np.maximum(np.sqrt(np.square(one).sum(axis=1, keepdims=True)), 1e-12)
+    back = np.minimum(head, 0.5 * length)
+    barbs = [tips - back * (along + SPREAD * side) for side in (one, -one, np.cross(along, one), -np.cross(along, one))]
+    lines = np.concatenate([ends, *(np.stack([tips, barb], axis=1) for barb in barbs)])
+    return lines, np.repeat(np.tile(colors, (5, 1))[:, None], 2, axis=1)
 
 
 def _means(values: np.ndarray, which: np.ndarray, count: np.ndarray) -> np.ndarray:

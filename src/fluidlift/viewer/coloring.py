@@ -9,6 +9,9 @@ import numpy as np
 from fluidlift.errors import FluidliftError
 from fluidlift.numerics.srgb import linear_from_srgb, srgb_from_linear
 
+SPOON = 0.03
+"""m of a material before white, that its colour is shown by: more of honey or oil is nearly black"""
+
 
 def colored(rgb: np.ndarray, look: dict[str, Any]) -> np.ndarray | None:
     """u8 [n,3] sRGB of splats in a look; None: their own. Reflections and refraction are for rendered pictures.
@@ -36,4 +39,4 @@ def _material(name: str) -> tuple[np.ndarray, np.ndarray, float]:
         m = material_named(name)
     except (FluidliftError, ValueError):
         return np.full(3, 0.5, np.float32), np.zeros(3, np.float32), 1.0
-    return np.asarray(m.albedo, np.float32), np.asarray(m.emission, np.float32), float(m.carried)
+    return m.before_white(SPOON).astype(np.float32), np.asarray(m.emission, np.float32), float(m.carried)

@@ -75,8 +75,8 @@ class Control:
         return self.clamped(_digits(10.0**slider if self.log else slider, 4))
 
     def told(self, value: float) -> str:
-        """With its unit, such as `1.3e-05 m²/s`."""
-        return f"{value:.4g} {self.unit}".strip()
+        """With its unit, such as `1.3e-5 m²/s`."""
+        return f"{number(value)} {self.unit}".strip()
 
     def typed(self, text: str) -> tuple[float | None, str]:
         """What a person typed: the number, clamped, or None; and what to tell, empty where all is well."""
@@ -94,7 +94,16 @@ class Control:
 
     def range_told(self) -> str:
         """Such as `0 to 30 m/s²`."""
-        return f"{self.low:.3g} to {self.high:.3g} {self.unit}".strip()
+        return f"{number(self.low, 3)} to {number(self.high, 3)} {self.unit}".strip()
+
+
+def number(value: float, digits: int = 4) -> str:
+    """With so many digits, as a person writes it: 1000 and 1e-5, not 1e+03 and 1e-05."""
+    if value and not 1e-3 <= abs(value) < 1e6:
+        mantissa, power = f"{value:.{digits - 1}e}".split("e")
+        short = mantissa.rstrip("0").rstrip(".") if "." in mantissa else mantissa
+        return f"{short}e{int(power)}"
+    return f"{float(f'{value:.{digits}g}'):.10g}"
 
 
 def _digits(value: float, digits: int) -> float:
@@ -123,7 +132,7 @@ def controls_of(fitted: FluidParameters, kind: str) -> tuple[Control, ...]:
                             hint="root mean square of how the speed at the inlet varies"))  # fmt: skip
     if liquid:
         found += [
-            _plain("density", "density", "kg/m³", fitted, (200.0, 5000.0), log=True,
+            _plain("density", "density", "kg/m³", fitted, (200.0, 5000.0),
                    hint="matters to what floats in it, and to surface tension"),
             _plain("surface_tension", "surface tension", "N/m", fitted, (0.0, 0.5),
                    hint="water 0.072 N/m; drops and thin jets only; small cells then need short steps"),
@@ -202,6 +211,6 @@ def turned(strength: float, tilt: float, heading: float) -> list[float]:
 
 def _inflow(speed: float) -> Control:
     return Control(
-        INFLOW, "inflow", "x", 0.0, 4.0, 1.0, lambda p: float(p[INFLOW]), lambda p, v: {INFLOW: v},
+        INFLOW, "inflow", "×", 0.0, 4.0, 1.0, lambda p: float(p[INFLOW]), lambda p, v: {INFLOW: v},
         hint=f"times the clip's own, {speed:.3g} m/s",
     )  # fmt: skip

@@ -175,26 +175,27 @@ class Draft:
         with self._lock:
             self.apply(self._session.made_of(material), f"material {material}")
 
-    def undo(self) -> None:
-        """Back by one edit; raises `InputRejected` where there is none."""
-        self._turn(self._session.undo, "undo")
+    def undo(self) -> str:
+        """Back by one edit, told in words; raises `InputRejected` where there is none."""
+        return self._turn(self._session.undo, "undo")
 
-    def redo(self) -> None:
+    def redo(self) -> str:
         """The edit that was undone last; raises `InputRejected` where there is none."""
-        self._turn(self._session.redo, "redo")
+        return self._turn(self._session.redo, "redo")
 
-    def reset(self) -> None:
-        """The scene as it was lifted; one edit, which can be undone."""
-        self._turn(self._session.reset, "reset")
+    def reset(self) -> str:
+        """The scene as it was lifted; one edit, which can be undone. Empty where it is that already."""
+        return self._turn(self._session.reset, "reset")
 
-    def _turn(self, act: Any, told: str) -> None:
+    def _turn(self, act: Any, told: str) -> str:
         with self._lock:
             self.commit()
             try:
-                act()
+                done = act()
             finally:
                 self._base = None
             self.last = told
+            return "" if done is None else str(done.what)
 
     def diff(self) -> str:
         """All edits so far, as a unified diff."""

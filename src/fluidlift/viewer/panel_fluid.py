@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import asyncio
+import logging
 import time
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from fluidlift.viewer.controls import Control, path_of
+from fluidlift.viewer.controls import Control, number, path_of
+
+LOG = logging.getLogger(__name__)
 
 if TYPE_CHECKING:
     from fluidlift.viewer.app import Viewer
 
 STOPS = 4.0
 """of exposure, up or down"""
+ROOM = 0.25
+"""share of a slider that two of its marks must lie apart to be read"""
 
 
 class FluidPanel:
@@ -31,21 +38,20 @@ class FluidPanel:
             self._add_look()
 
     def _add_slider(self, control: Control, value: float) -> None:
-        marks = ((control.slider_of(control.fitted), "fitted"),)
         low, high, step = control.slider
-        power = " The slider shows the power of ten." if control.log else ""
+        power = " The slider and its box hold x of 10^x; 'Type a value' takes the value itself." if control.log else ""
         slider = self._gui.add_slider(
-            _label(control, value), low, high, step, control.slider_of(value), marks=marks,
+            _label(control, value), low, high, step, control.slider_of(value), marks=_marks(control),
             hint=f"{control.range_told()}. {control.hint}.{power}",
         )  # fmt: skip
-        slider.on_update(lambda event: self._slid(event, control))
+        _heard(slider, lambda event, at: self._slid(event, control, at))
         self._sliders[control.key] = slider
         self._by_label[control.label] = control
 
-    def _slid(self, event: Any, control: Control) -> None:
+    def _slid(self, event: Any, control: Control, at: float) -> None:
         if event.client is None:
             return
-        self._set(control, control.value_of(float(self._sliders[control.key].value)))
+        self._set(control, control.value_of(float(at)))
 
     def _set(self, control: Control, value: float) -> None:
         viewer = self._viewer
@@ -78,22 +84,33 @@ class FluidPanel:
 
         look, gui = self._viewer.draft.look, self._gui
         self._style = gui.add_dropdown(
-            "style", STYLES, initial_value=_known(look.get("style"), STYLES), hint="of rendered pictures"
+            "style",
+            STYLES,
+            initial_value=_known(look.get("style"), STYLES),
+            hint="of rendered pictures; splats: as lifted, without light of their own",
         )
-        self._material = gui.add_dropdown("material", MATERIALS, initial_value=_known(look.get("material"), MATERIALS))
+        self._material = gui.add_dropdown(
+            "material",
+            MATERIALS,
+            initial_value=_known(look.get("material"), MATERIALS),
+            hint="source: as in the clip; the others change look, density and viscosity",
+        )
         self._light = gui.add_dropdown(
-            "environment", ENVIRONMENTS, initial_value=_known(look.get("environment"), ENVIRONMENTS)
+            "environment",
+            ENVIRONMENTS,
+            initial_value=_known(look.get("environment"), ENVIRONMENTS),
+            hint="light of rendered pictures, of all styles but splats",
         )
         self._exposure = gui.add_slider("exposure, stops", -STOPS, STOPS, 0.25, _stops(look))
         self._tint = gui.add_rgb("tint", _bytes(look.get("tint")))
         gui.add_markdown(
             "Colours are shown here; reflections, refraction and light in rendered pictures ('Save and run')."
         )
-        self._style.on_update(lambda e: self._looked(e, "style", self._style.value))
-        self._material.on_update(lambda e: self._materialised(e))
-        self._light.on_update(lambda e: self._looked(e, "environment", self._light.value))
-        self._exposure.on_update(lambda e: self._looked(e, "exposure", float(self._exposure.value)))
-        self._tint.on_update(lambda e: self._looked(e, "tint", [round((c / 255) ** 2.2, 4) for c in self._tint.value]))
+        _heard(self._style, lambda e, value: self._looked(e, "style", value))
+        _heard(self._material, self._materialised)
+        _heard(self._light, lambda e, value: self._looked(e, "environment", value))
+        _heard(self._exposure, lambda e, value: self._looked(e, "exposure", float(value)))
+        _heard(self._tint, lambda e, value: self._looked(e, "tint", [round((c / 255) ** 2.2, 4) for c in value]))
 
     def _looked(self, event: Any, name: str, value: Any) -> None:
         if event.client is None:
@@ -102,18 +119,15 @@ class FluidPanel:
         self._viewer.draft.move(f"look.{name}", value, told, time.monotonic())
         self._viewer.redraw()
 
-    def _materialised(self, event: Any) -> None:
+    def _materialised(self, event: Any, name: str) -> None:
         """The liquid of another material: its look, its density and its viscosity. Splats as they were lifted have no
         material: with one, they are lit."""
         if event.client is None:
             return
-        viewer, name = self._viewer, self._material.value
+        viewer = self._viewer
         viewer.edited(lambda: viewer.draft.make_of(name), f"material {name}")
 
     # state
-
-    def tick(self) -> None:
-        """Nothing moves by itself."""
 
     def refresh(self) -> None:
         """Show the values of the scene."""
@@ -135,9 +149,38 @@ class FluidPanel:
             self._tint.value = _bytes(look.get("tint"))
 
 
+def _heard(handle: Any, act: Callable[[Any, Any], None]) -> None:
+    """Have `act(event, value)` called with what a person chose.
+
+    The value is taken where the message arrives: by the time a thread is free for `act`, an edit that ended meanwhile
+    may have set the control back to what the scene holds.
+    """
+
+    async def heard(event: Any) -> None:
+        # not awaited: an edit that waits for another one would keep all other messages waiting
+        asyncio.get_running_loop().run_in_executor(None, act, event, handle.value).add_done_callback(_surprised)
+
+    handle.on_update(heard)
+
+
+def _surprised(done: asyncio.Future[None]) -> None:
+    error = done.exception()
+    if error is not None:
+        LOG.error("a control of the page", exc_info=error)
+
+
 def _label(control: Control, value: float) -> str:
     """With three digits: more would wrap. The box beside the slider, and typing, have them all."""
-    return f"{control.label} {value:.3g} {control.unit}".strip().replace(" °", "°")
+    name = f"{control.label} (10^x)" if control.log else control.label
+    return f"{name} {number(value, 3)} {control.unit}".strip().replace(" °", "°")
+
+
+def _marks(control: Control) -> tuple[tuple[float, str], ...]:
+    """The fitted value, and those ends of the range whose numbers have room beside it."""
+    low, high, _ = control.slider
+    fitted = control.slider_of(control.fitted)
+    ends = ((low, number(control.low, 3)), (high, number(control.high, 3)))
+    return ((fitted, "fitted"), *((at, told) for at, told in ends if abs(at - fitted) > ROOM * (high - low)))
 
 
 def _known(name: Any, options: tuple[str, ...]) -> str:

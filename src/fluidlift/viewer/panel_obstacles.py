@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import time
+from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from fluidlift.errors import FluidliftError
 from fluidlift.pipeline.editing import Add, Remove
+from fluidlift.viewer.mesh_files import MOST_BYTES, UNITS, kept_mesh, mesh_entry
 
 if TYPE_CHECKING:
     from fluidlift.viewer.app import Viewer
@@ -34,7 +37,9 @@ class ObstaclePanel:
         self._size_now = max(SIZE * viewer.stage.size, CELLS * viewer.asset.grid.spacing)
         self._shape = gui.add_dropdown("shape", SHAPES, initial_value="sphere")
         gui.add_button("Add to the scene", icon="plus").on_click(self._add)
-        self._chosen = gui.add_dropdown("chosen", (NONE,), initial_value=NONE)
+        with gui.add_folder("From a mesh file", expand_by_default=False):
+            self._mesh_controls()
+        self._chosen = gui.add_dropdown("chosen", (NONE,), initial_value=NONE, hint="the one that is edited below")
         self._chosen.on_update(self._choose)
         self._where = gui.add_markdown("No obstacle is chosen.")
         low, high = self._size_now / RANGE, self._size_now * RANGE
@@ -52,22 +57,73 @@ class ObstaclePanel:
             gui.add_markdown("Smoke flows through obstacles: they are simulated in liquids only.")
         self.refresh()
 
+    def _mesh_controls(self) -> None:
+        gui = self._gui
+        self._unit = gui.add_dropdown("file is in", tuple(UNITS), hint="the unit of the lengths in the file")
+        self._over = gui.add_checkbox("turn over", False, hint="for a mesh whose faces look inwards")
+        self._upload = gui.add_upload_button(
+            "Upload and add", icon="upload", mime_type=".obj,.ply,.glb",
+            hint=f".obj, binary .ply (z up) or .glb; closed; at most {MOST_BYTES // 2**20} MB; kept in the asset",
+        )  # fmt: skip
+        self._file = gui.add_text("file in asset", "", hint="name inside the asset's folder, such as duck.obj")
+        self._named = gui.add_button("Add this file", icon="plus")
+        self._upload.on_upload(self._uploaded)
+        self._named.on_click(self._add_named)
+
+    def _uploaded(self, _: Any) -> None:
+        viewer, file = self._viewer, self._upload.value
+        if viewer.refused():
+            return
+        try:
+            inside, take_away = kept_mesh(viewer.folder, file.name, file.content)
+        except (FluidliftError, OSError) as error:
+            viewer.say(str(error))
+            return
+        if not self._add_mesh(inside):
+            take_away()
+
+    def _add_named(self, _: Any) -> None:
+        name = self._file.value.strip()
+        if name:
+            self._add_mesh(name)
+        else:
+            self._viewer.say("Add this file: no name. Needed: a mesh file inside the asset's folder, such as duck.obj.")
+
+    def _add_mesh(self, inside: str) -> bool:
+        viewer = self._viewer
+        stage, unit, over = viewer.stage, UNITS[self._unit.value], bool(self._over.value)
+        try:
+            place = np.array([*stage.middle[:2], stage.top])
+            entry = mesh_entry(viewer.folder, inside, unit, turned_over=over, over=place)
+        except (FluidliftError, OSError) as error:
+            viewer.say(str(error))
+            return False
+        stem = PurePosixPath(inside).stem.replace(".", "_")
+        return self._put(stem, {"name": "", **entry})
+
+    def _put(self, stem: str, entry: dict[str, Any]) -> bool:
+        """Add an entry under the first free name, and choose it; whether it went well."""
+        viewer = self._viewer
+        names = {o["name"] for o in viewer.draft.obstacles}
+        name = next(f"{stem}{k}" for k in range(1, 1000) if f"{stem}{k}" not in names)
+        before, viewer.chosen = viewer.chosen, name
+        added = viewer.edited(
+            lambda: viewer.draft.apply([Add("obstacles", entry | {"name": name})], f"{name} added"),
+            "Drag it with the arrows and rings.",
+        )
+        if not added:
+            viewer.chosen = before
+            self.refresh()
+        return added
+
     def _entry(self) -> dict[str, Any] | None:
         return next((o for o in self._viewer.draft.obstacles if o["name"] == self._viewer.chosen), None)
 
     def _add(self, _: Any) -> None:
         viewer, shape = self._viewer, self._shape.value
-        names = {o["name"] for o in viewer.draft.obstacles}
-        name = next(f"{shape}{k}" for k in range(1, 1000) if f"{shape}{k}" not in names)
         place = (*viewer.stage.middle[:2], viewer.stage.top + 0.5 * self._size_now)
-        entry = {"name": name, "shape": shape, "position": [_short(float(c)) for c in place]}
-        entry |= _extent(shape, self._size_now)
-        viewer.chosen = name
-        if not viewer.edited(
-            lambda: viewer.draft.apply([Add("obstacles", entry)], f"{name} added"), "Drag it with the arrows."
-        ):
-            viewer.chosen = ""
-            self.refresh()
+        entry = {"name": "", "shape": shape, "position": [_short(float(c)) for c in place]}
+        self._put(shape, entry | _extent(shape, self._size_now))
 
     def _choose(self, event: Any) -> None:
         if event.client is None:
@@ -96,10 +152,19 @@ class ObstaclePanel:
         if entry is None or event.client is None:
             return
         if "mesh" in entry:
-            self._viewer.say("The size of a mesh is its scale in scene.yaml.")
+            now = self._mesh_width(entry)
+            if now is not None:
+                scale = np.multiply(entry.get("scale", 1.0), width / now)
+                scale = [_short(float(c)) for c in scale] if np.ndim(scale) else _short(float(scale))
+                self._set(event, "scale", scale, f"{entry['name']}: {width:.3g} m wide")
             return
         for key, value in _extent(entry["shape"], width).items():
             self._set(event, key, value, f"{entry['name']}: {width:.3g} m wide")
+
+    def _mesh_width(self, entry: dict[str, Any]) -> float | None:
+        """m, longest side of a mesh as it is now; None where it cannot be read."""
+        body = next((o for o in self._viewer.bodies() if o.name == entry["name"]), None)
+        return None if body is None else float(np.ptp(body.mesh.vertices, axis=0).max())
 
     def _moves(self, event: Any) -> None:
         self._set(event, "motion", "free" if self._motion.value == FLOATS else "static")
@@ -128,7 +193,7 @@ class ObstaclePanel:
         if self._motion.value != motion:
             self._motion.value = motion
         self._density.value = min(max(float(entry.get("density", 500.0)), 20.0), 3000.0)
-        width = _width(entry)
+        width = self._mesh_width(entry) if "mesh" in entry else _width(entry)
         if width is not None:
             self._size.value = min(max(width, self._size.min), self._size.max)
 

@@ -33,13 +33,14 @@ class RunPanel:
         self._history.on_click(self._back)
         gui.add_button("Save (scene.yaml)", icon="device-floppy").on_click(self._save)
         self._diff = gui.add_markdown("")
+        # of whatever is being done: simulation, export or picture
+        self._bar = gui.add_progress_bar(0.0, visible=False)
+        self._stop = gui.add_button("Stop", icon="player-stop", color="red", visible=False)
+        self._stop.on_click(self._stopped)
         with gui.add_folder("Simulate in full"):
             self._state = gui.add_markdown("")
-            self._bar = gui.add_progress_bar(0.0, visible=False)
             self._begin = gui.add_button("Simulate in full", icon="player-play", color="green")
-            self._stop = gui.add_button("Stop", icon="player-stop", color="red", visible=False)
             self._begin.on_click(self._simulate)
-            self._stop.on_click(lambda _: viewer.jobs.stop())
         with gui.add_folder("Export", expand_by_default=False):
             self._format = gui.add_dropdown("format", tuple(FORMATS))
             self._out = gui.add_text("folder", str(viewer.folder.absolute().parent / "export"))
@@ -54,12 +55,20 @@ class RunPanel:
 
     def _back(self, _: Any) -> None:
         viewer, what = self._viewer, str(self._history.value)
-        viewer.edited(getattr(viewer.draft, what), f"{what}: done")
+        if viewer.refused():
+            return
+        told: list[str] = []
+        if viewer.edited(lambda: told.append(getattr(viewer.draft, what)())):
+            viewer.say(told[0] or "There is nothing to reset: this is the fluid as lifted.")
+
+    def _stopped(self, _: Any) -> None:
+        self._viewer.jobs.stop()
+        self._viewer.say("Stopping after this frame ...")
 
     def _save(self, _: Any) -> None:
         viewer = self._viewer
         if not viewer.refused():
-            viewer.edited(viewer.draft.commit, f"written: {viewer.folder / 'scene.yaml'}", moves=False)
+            viewer.edited(viewer.draft.commit, f"All edits are in {viewer.folder / 'scene.yaml'}", moves=False)
 
     # long work
 
@@ -93,7 +102,7 @@ class RunPanel:
             viewer.say("Export: no folder. Needed: a name for a new one.")
             return
         if "simulate" in (viewer.stale or ()):
-            viewer.say("Export: the saved frames are from before the last edits: press 'Simulate in full' first.")
+            viewer.say("Export: the saved frames are older than this scene: press 'Simulate in full' first.")
             return
         request = ExportRequest(to=self._format.value)
 
@@ -149,7 +158,7 @@ class RunPanel:
         stale = self._viewer.stale
         if stale is None:
             return "comparing the saved frames with the scene ..."
-        return f"The saved frames are {'from before the last edits' if 'simulate' in stale else 'of this scene'}."
+        return f"The saved frames are {'older than' if 'simulate' in stale else 'of'} this scene."
 
 
 def _camera_of(client: Any) -> PinholeCamera:

@@ -56,7 +56,7 @@ class Panels:
         self._time = gui.add_markdown(viewer.timeline.label)
         self._play = gui.add_button("Play")
         self._steps = gui.add_button_group("step", ("first", "back", "forward", "last"))
-        self._speed = gui.add_dropdown("speed, times real", tuple(SPEEDS), initial_value="1")
+        self._speed = gui.add_dropdown("speed (1: real)", tuple(SPEEDS), initial_value="1")
         self._source = gui.add_dropdown("frames shown", ("saved frames", "live preview"), initial_value="saved frames")
         self._frame.on_update(self._scrubbed)
         self._play.on_click(self._played)
@@ -107,11 +107,20 @@ class Panels:
         self._checks = {}
         for name, label in SHOWN.items():
             check = gui.add_checkbox(label, getattr(viewer.parts, name))
-            check.on_update(lambda _, name=name, check=check: viewer.set_parts(**{name: bool(check.value)}))
+            check.on_update(lambda event, name=name, check=check: self._ticked(event, name, bool(check.value)))
             self._checks[name] = check
         self._legend = gui.add_markdown("", visible=False)
         gui.add_button("Look from the input camera", icon="video").on_click(self._input_view)
         gui.add_button("Look from the side", icon="arrows-horizontal").on_click(self._side_view)
+
+    def _ticked(self, event: Any, name: str, on: bool) -> None:
+        if event.client is not None:  # else we ticked it ourselves
+            self._viewer.set_parts(**{name: on})
+
+    def show_parts(self, changes: dict[str, bool]) -> None:
+        """These are on or off now."""
+        for name, on in changes.items():
+            _assign(self._checks[name], "value", on)
 
     def _input_view(self, event: Any) -> None:
         if event.client is None:
@@ -183,7 +192,6 @@ class Panels:
         _assign(self._source, "value", viewer.source)
         _assign(self._status, "content", self._state_told())
         self._tell_arrows()
-        self.fluid.tick()
         self.run.tick()
 
     def _tell_arrows(self) -> None:

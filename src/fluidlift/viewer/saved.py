@@ -12,8 +12,8 @@ from fluidlift.errors import FluidliftError
 from fluidlift.io.asset_folder import load_asset, read_manifest
 from fluidlift.io.asset_lock import writer_of
 from fluidlift.io.frames import FIRST_FRAME
-from fluidlift.io.stage_cache import load_stage, owner_of
-from fluidlift.pipeline.simulating import frame_file
+from fluidlift.io.stage_cache import owner_of
+from fluidlift.pipeline.simulating import frame_file, simulated_poses
 
 
 class SavedFrames:
@@ -47,11 +47,7 @@ class SavedFrames:
         self.count = int(played.get("frames", 0))
         self.interval = float(played.get("frame_interval", self.asset.interval))
         self._stamp = self._now()
-        self._poses = None
-        key = owner_of(self.folder, "simulate")
-        found = None if key is None else load_stage(self.folder, "simulate", key)
-        if found is not None:
-            self._poses = found[0].get("poses")
+        self._poses = simulated_poses(self.folder)
 
     def _now(self) -> tuple[int, str | None]:
         try:

@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from fluidlift.numerics.srgb import linear_from_srgb
 from fluidlift.physics.rotation import product
 from fluidlift.types import FluidAsset, PinholeCamera, TriangleMesh, quat_from_matrix
-from fluidlift.viewer.arrows import HEAD, THICK, arrows
+from fluidlift.viewer.arrows import HEAD, THICK, arrows, barbed
 from fluidlift.viewer.frames import SplatFrame
 from fluidlift.viewer.surfacing import Surfacer
 
@@ -182,11 +183,10 @@ class Stage:
         if found is None:
             self._take_away("/velocity")
             return
-        ends, colors = found
-        self._scene.add_arrows(
-            "/velocity", ends, colors, shaft_radius=THICK * self.size, head_radius=3 * THICK * self.size,
-            head_length=HEAD * self.size,
-        )  # fmt: skip
+        lines, colors = barbed(*found, HEAD * self.size)
+        # the browser takes colours of lines for linear ones: as sRGB they would arrive pale
+        colors = np.round(255 * linear_from_srgb(colors / np.float32(255))).astype(np.uint8)
+        self._scene.add_line_segments("/velocity", lines, colors, thickness=THICK, thickness_units="screen")
 
     def _show_surface(self, rgb: np.ndarray) -> str:
         """The surface that was made last: while frames pass, it is some frames late."""

@@ -57,6 +57,20 @@ def test_the_shapes_are_closed_and_right_side_out(mesh):
     assert len(closed_mesh(mesh).faces) == len(mesh.faces)
 
 
+def test_a_mesh_turned_inside_out_keeps_its_picture():
+    mesh = box_mesh((1, 1, 1))
+    rng = np.random.default_rng(0)
+    painted = TriangleMesh(
+        mesh.vertices, mesh.faces, uv=rng.uniform(size=(len(mesh.faces), 3, 2)).astype(np.float32),
+        texture=rng.integers(0, 255, (4, 4, 3), np.uint8),
+    )  # fmt: skip
+    turned = flipped(painted)
+    at = {tuple(v): tuple(map(tuple, uv)) for v, uv in zip(painted.faces, painted.uv)}
+    for corners, uv in zip(turned.faces, turned.uv):
+        assert at[tuple(corners[::-1])] == tuple(map(tuple, uv[::-1]))  # each corner has the place it had
+    assert turned.texture is painted.texture
+
+
 def test_a_mesh_cut_at_its_seams_is_welded():
     box = box_mesh((1, 1, 1))
     soup = TriangleMesh(box.vertices[box.faces].reshape(-1, 3), np.arange(36).reshape(12, 3))

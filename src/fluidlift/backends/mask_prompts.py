@@ -23,7 +23,7 @@ class Clicks(NamedTuple):
     frame: int
     points: Float[np.ndarray, "n 2"]
     """px, column and row of pixel centres counted from 0"""
-    fluid: Bool[np.ndarray, "n"]
+    fluid: Bool[np.ndarray, " n"]
     """True on the fluid, False beside it"""
 
 
@@ -77,6 +77,6 @@ def labels_of_frame(fluid: Bool[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
     return label[np.asarray(parts, int)]
 
 
-def ordered_from(frame: int, count: int) -> tuple[Int[np.ndarray, "a"], Int[np.ndarray, "b"]]:
+def ordered_from(frame: int, count: int) -> tuple[Int[np.ndarray, " a"], Int[np.ndarray, " b"]]:
     """Frames from `frame` on to the end, and from the one before it back to the first."""
     return np.arange(frame, count), np.arange(frame - 1, -1, -1)

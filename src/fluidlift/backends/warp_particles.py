@@ -96,7 +96,7 @@ class WarpTransfer(ParticleTransfer):
 
     def sort_by_cell(
         self, positions: Float[np.ndarray, "n 3"], grid: Grid
-    ) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "cells+1"]]:
+    ) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " cells+1"]]:
         """Particle indices cell by cell (x slowest, stable), and where each cell begins."""
         import warp as wp
 

@@ -152,7 +152,8 @@ def _tell(made: Any, as_json: bool) -> int:
     else:
         print(f"done in {made.seconds:.0f} s")
         for text, name in (("asset", ""), ("preview", "preview.mp4"), ("report", "report.html")):
-            print(f"  {text:8} {made.folder / name}")
+            if (made.folder / name).exists():
+                print(f"  {text:8} {made.folder / name}")
     return WITH_WARNINGS if made.warnings else DONE
 
 

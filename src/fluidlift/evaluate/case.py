@@ -49,7 +49,7 @@ class Case:
     static_depth: Float[np.ndarray, "h w"]
     """camera z of the solids alone, m; 0 = none"""
     grid: Grid
-    key_frames: Int[np.ndarray, "k"]
+    key_frames: Int[np.ndarray, " k"]
     velocity: Float[np.ndarray, "k nx ny nz 3"]
     """m/s at cell centres at the key frames"""
     level_set: Float[np.ndarray, "k nx ny nz"] | None

@@ -73,9 +73,9 @@ def sample_cells(
 
 
 def occupancy_iou(
-    occupied: Bool[np.ndarray, "n"],
-    truth: Bool[np.ndarray, "n"],
-    ignored: Bool[np.ndarray, "n"],
+    occupied: Bool[np.ndarray, " n"],
+    truth: Bool[np.ndarray, " n"],
+    ignored: Bool[np.ndarray, " n"],
     stray: float = 0.0,
 ) -> float | None:
     """Intersection over union of two sets of equal cells without the `ignored`; `stray` cells count as wrong."""

@@ -106,7 +106,7 @@ class Budget:
 class Evaluation:
     """Residuals of all windows at one point."""
 
-    raw: Float[np.ndarray, "p"]
+    raw: Float[np.ndarray, " p"]
     residuals: list[Float[np.ndarray, "m 6"]]
     """per window, as the rollout gives them (single precision)"""
     guesses: list[tuple[np.ndarray, ...]]
@@ -148,14 +148,14 @@ class Jacobian:
     where only the products are known"""
     normal: Float[np.ndarray, "p p"]
     """J^T J"""
-    slope: Float[np.ndarray, "p"]
+    slope: Float[np.ndarray, " p"]
     """J^T r"""
 
 
 def evaluate(
     problem: FitProblem,
     space: ParameterSpace,
-    raw: Float[np.ndarray, "p"],
+    raw: Float[np.ndarray, " p"],
     budget: Budget,
     guesses: Sequence[Sequence[np.ndarray]] | None = None,
 ) -> Evaluation:
@@ -167,7 +167,7 @@ def evaluate(
 
 
 def losses(
-    problem: FitProblem, space: ParameterSpace, points: Sequence[Float[np.ndarray, "p"]], budget: Budget
+    problem: FitProblem, space: ParameterSpace, points: Sequence[Float[np.ndarray, " p"]], budget: Budget
 ) -> list[float]:
     """The loss at several points, side by side; inf or NaN where the rollout blew up."""
 
@@ -184,7 +184,7 @@ def losses(
 def _rolled(
     problem: FitProblem,
     space: ParameterSpace,
-    raw: Float[np.ndarray, "p"],
+    raw: Float[np.ndarray, " p"],
     window: int,
     guesses: Sequence[Sequence[np.ndarray]] | None,
 ) -> tuple[np.ndarray, tuple[np.ndarray, ...], tuple[SolveReport, ...]]:

@@ -106,7 +106,7 @@ class Curvature:
         """N / L: turns the loss into twice a negative log likelihood."""
         return self.observations / noise_level(self.loss)
 
-    def covariance(self, prior_sigma: Float[np.ndarray, "p"], fitted: Bool[np.ndarray, "p"]) -> np.ndarray:
+    def covariance(self, prior_sigma: Float[np.ndarray, " p"], fitted: Bool[np.ndarray, " p"]) -> np.ndarray:
         """[f,f] covariance of the fitted raw variables, the others held."""
         part, prior = np.ix_(fitted, fitted), np.diag(1 / prior_sigma[fitted] ** 2)
         laplace = np.linalg.inv(self.precision_per_loss * self.normal[part] + prior)
@@ -117,7 +117,7 @@ class Curvature:
         return robust * np.outer(wider, wider)
 
     def covariance_beside(
-        self, prior_sigma: Float[np.ndarray, "p"], fitted: Bool[np.ndarray, "p"], held: Bool[np.ndarray, "p"]
+        self, prior_sigma: Float[np.ndarray, " p"], fitted: Bool[np.ndarray, " p"], held: Bool[np.ndarray, " p"]
     ) -> np.ndarray:
         """[f,f] covariance of the fitted raw variables where others are held at priors that may be wrong.
 
@@ -134,7 +134,7 @@ class Curvature:
 
 
 def block_scatter(
-    parts: list[tuple[Float[np.ndarray, "p n"], Float[np.ndarray, "n"], Int[np.ndarray, "n"]]], parameters: int
+    parts: list[tuple[Float[np.ndarray, "p n"], Float[np.ndarray, " n"], Int[np.ndarray, " n"]]], parameters: int
 ) -> Float[np.ndarray, "p p"]:
     """Sum of g g^T over blocks, g = J^T r of a block less the mean, for a Gaussian reading of its square root.
 
@@ -158,8 +158,8 @@ def block_scatter(
 
 
 def determined(
-    curvature: Curvature, prior_sigma: Float[np.ndarray, "p"], displacement: Float[np.ndarray, "p"] | None = None
-) -> Bool[np.ndarray, "p"]:
+    curvature: Curvature, prior_sigma: Float[np.ndarray, " p"], displacement: Float[np.ndarray, " p"] | None = None
+) -> Bool[np.ndarray, " p"]:
     """Which raw variables the data determine: clearly narrower than the prior, or clearly not at the prior.
 
     Where two variables are tied, each alone is undetermined, but fixing one determines the other. So the worst one is
@@ -183,8 +183,8 @@ def determined(
 
 
 def precise(
-    space: ParameterSpace, raw: Float[np.ndarray, "p"], sigma: Float[np.ndarray, "p"], within: float
-) -> Bool[np.ndarray, "p"]:
+    space: ParameterSpace, raw: Float[np.ndarray, " p"], sigma: Float[np.ndarray, " p"], within: float
+) -> Bool[np.ndarray, " p"]:
     """Which variables are known to `within` of their value (components: of the size); `sigma` is physical."""
     values = [float(f.range.physical(torch.tensor(x, dtype=torch.float64))) for f, x in zip(space.fitted, raw)]
     size: dict[str, float] = {}
@@ -198,8 +198,8 @@ def precise(
 
 def estimates(
     space: ParameterSpace,
-    raw: Float[np.ndarray, "p"],
-    keep: Bool[np.ndarray, "p"],
+    raw: Float[np.ndarray, " p"],
+    keep: Bool[np.ndarray, " p"],
     curvature: Curvature,
     *,
     also: dict[str, float] | None = None,

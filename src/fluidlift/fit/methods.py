@@ -23,7 +23,7 @@ RESCALED_ADAM = (10, 20, 30, 45)
 class Minimum:
     """Where a method ended."""
 
-    raw: Float[np.ndarray, "p"]
+    raw: Float[np.ndarray, " p"]
     history: list[float]
     converged: bool
     curvature: Curvature | None
@@ -123,7 +123,7 @@ def carried_on(slopes: Jacobian, step: np.ndarray, before: Evaluation, after: Ev
 def levenberg_marquardt(
     problem: FitProblem,
     space: ParameterSpace,
-    start: Float[np.ndarray, "p"],
+    start: Float[np.ndarray, " p"],
     budget: Budget,
     *,
     max_iterations: int = 20,
@@ -188,7 +188,7 @@ def precision(problem: FitProblem, here: Evaluation) -> float:
 def adam(
     problem: FitProblem,
     space: ParameterSpace,
-    start: Float[np.ndarray, "p"],
+    start: Float[np.ndarray, " p"],
     budget: Budget,
     *,
     max_iterations: int = 100,

@@ -32,8 +32,8 @@ VISCOSITIES = (0.01, 0.1, 1.0)
 class Found:
     """Where a fit ended."""
 
-    raw: Float[np.ndarray, "p"]
-    keep: Bool[np.ndarray, "p"]
+    raw: Float[np.ndarray, " p"]
+    keep: Bool[np.ndarray, " p"]
     """which variables the data determine; the others are at their prior"""
     curvature: Curvature
     loss: float
@@ -50,8 +50,8 @@ class Found:
 
 
 def first_point(
-    problem: FitProblem, space: ParameterSpace, raw: Float[np.ndarray, "p"], budget: Budget
-) -> Float[np.ndarray, "p"]:
+    problem: FitProblem, space: ParameterSpace, raw: Float[np.ndarray, " p"], budget: Budget
+) -> Float[np.ndarray, " p"]:
     """The point, with the viscosity of the lowest loss among a few."""
     index = [i for i, f in enumerate(space.fitted) if f.name == "kinematic_viscosity"]
     if not index or budget.spent:
@@ -67,7 +67,7 @@ def first_point(
 
 
 def minimise(
-    problem: FitProblem, space: ParameterSpace, start: Float[np.ndarray, "p"], budget: Budget, options: FitOptions,
+    problem: FitProblem, space: ParameterSpace, start: Float[np.ndarray, " p"], budget: Budget, options: FitOptions,
     *, errors: bool,
 ) -> Found:  # fmt: skip
     """Minimise, correct the starts, hold what is not determined at its prior, and minimise the rest again.

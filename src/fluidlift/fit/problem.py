@@ -33,11 +33,11 @@ hidden region and not one per face: trusted like measured faces it would outvote
 class Window:
     """One rollout to be compared with targets along it."""
 
-    start: Float[Tensor, "f"]
+    start: Float[Tensor, " f"]
     """open-face velocity; the rollout begins with its divergence-free part"""
-    measured: Float[Tensor, "f"]
+    measured: Float[Tensor, " f"]
     """the start as it was measured"""
-    trust: Float[Tensor, "f"]
+    trust: Float[Tensor, " f"]
     """weight of the measured start per face, in units of the loss over (m/s)^2; 0 where it was not seen"""
     domains: tuple[RolloutDomain, ...]
     """one per step"""
@@ -47,9 +47,9 @@ class Window:
     """numbers of steps after which it is compared, ascending"""
     targets: tuple[Float[Tensor, "m 3"], ...]
     """one per mark, at its cells"""
-    masks: tuple[Float[Tensor, "m"], ...]
+    masks: tuple[Float[Tensor, " m"], ...]
     """weights, summing to 1"""
-    cells: tuple[Int[Tensor, "m"], ...]
+    cells: tuple[Int[Tensor, " m"], ...]
     """flat indices of the cells with a weight"""
 
 
@@ -90,7 +90,7 @@ class FitProblem:
         index: int,
         parameters: RolloutParameters,
         guesses: Sequence[np.ndarray] | None = None,
-        start: Float[Tensor, "f"] | None = None,
+        start: Float[Tensor, " f"] | None = None,
     ) -> Run:
         """DiffSim^n of one window, cut at its marks; differentiable in the parameters and in `start`."""
         w = self.windows[index]
@@ -143,12 +143,12 @@ class FitProblem:
         ]
         return torch.stack(parts).mean() / len(self.windows)
 
-    def start_weight(self, index: int) -> Float[Tensor, "f"]:
+    def start_weight(self, index: int) -> Float[Tensor, " f"]:
         """What a square of 1 (m/s)^2 between a face's start and its measured value adds to the loss."""
         w = self.windows[index]
         return w.trust / (len(self.windows) * len(w.marks))
 
-    def departure(self, index: int, start: Float[Tensor, "f"]) -> Tensor:
+    def departure(self, index: int, start: Float[Tensor, " f"]) -> Tensor:
         """What leaving the measured start costs, in units of the loss; differentiable."""
         return (self.start_weight(index) * (start - self.windows[index].measured) ** 2).sum()
 
@@ -161,7 +161,7 @@ class FitProblem:
         ]
         return float(torch.stack(parts).mean())
 
-    def with_starts(self, starts: Sequence[Float[Tensor, "f"]]) -> FitProblem:
+    def with_starts(self, starts: Sequence[Float[Tensor, " f"]]) -> FitProblem:
         """The same windows from other states."""
         return replace(self, windows=tuple(replace(w, start=s) for w, s in zip(self.windows, starts)))
 
@@ -237,7 +237,7 @@ def _window(
     )
 
 
-def _trust(scene: FitScene, frame: int, weights: LossWeights) -> Float[np.ndarray, "f"]:
+def _trust(scene: FitScene, frame: int, weights: LossWeights) -> Float[np.ndarray, " f"]:
     """Weight of the measured start: that of the loss for the cells beside the face.
 
     So a smooth error costs the same in the start as in a target, whether or not faces err independently. A direction

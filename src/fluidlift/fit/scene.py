@@ -53,9 +53,9 @@ class FitScene:
     """95th percentile of the speed, m/s"""
     observed: tuple[np.ndarray | None, ...]
     """bool [nx,ny,nz] per target; None: all cells are seen"""
-    flat: tuple[Float[np.ndarray, "f"], ...]
+    flat: tuple[Float[np.ndarray, " f"], ...]
     """targets as flat vectors, m/s; 0 on faces that were not seen"""
-    seen: tuple[Bool[np.ndarray, "f"], ...]
+    seen: tuple[Bool[np.ndarray, " f"], ...]
     noise: float
     """standard deviation of the error of one face in one target, m/s"""
 

@@ -29,7 +29,7 @@ PROBE = 0.02
 
 
 def corrected_starts(
-    problem: FitProblem, space: ParameterSpace, raw: Float[np.ndarray, "p"], budget: Budget, *, iterations: int = 8
+    problem: FitProblem, space: ParameterSpace, raw: Float[np.ndarray, " p"], budget: Budget, *, iterations: int = 8
 ) -> FitProblem:
     """The problem from starts that fit their windows better, at fixed parameters."""
     parameters = space.physical(torch.as_tensor(raw, dtype=torch.float32))
@@ -72,7 +72,7 @@ class Profile:
     """d start / d raw, per window"""
 
 
-def start_residuals(problem: FitProblem) -> list[Float[np.ndarray, "f"]]:
+def start_residuals(problem: FitProblem) -> list[Float[np.ndarray, " f"]]:
     """Squares add up to the departures from the measured starts, per window."""
     return [
         (torch.sqrt(problem.start_weight(i)) * (w.start - w.measured)).double().numpy()

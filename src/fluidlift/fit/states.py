@@ -25,7 +25,7 @@ COARSEST = 3
 """faces: the fill's coarsest level is not smaller"""
 
 
-def seen_faces(domain: RolloutDomain, cell_types: np.ndarray, observed: np.ndarray | None) -> Bool[np.ndarray, "f"]:
+def seen_faces(domain: RolloutDomain, cell_types: np.ndarray, observed: np.ndarray | None) -> Bool[np.ndarray, " f"]:
     """Open faces whose velocity was seen: those of observed cells with fluid in them."""
     is_open = domain.dynamic | (domain.inflow > 0)
     if observed is None:
@@ -40,7 +40,7 @@ def seen_faces(domain: RolloutDomain, cell_types: np.ndarray, observed: np.ndarr
     return is_open & np.concatenate(parts)
 
 
-def noise_of(frames: Sequence[Float[np.ndarray, "f"]], seen: Sequence[Bool[np.ndarray, "f"]]) -> float:
+def noise_of(frames: Sequence[Float[np.ndarray, " f"]], seen: Sequence[Bool[np.ndarray, " f"]]) -> float:
     """Standard deviation of the error of a face that is independent from frame to frame, m/s.
 
     The smallest of the root mean square differences of first to third order in time, each scaled to what independent
@@ -63,8 +63,8 @@ def noise_of(frames: Sequence[Float[np.ndarray, "f"]], seen: Sequence[Bool[np.nd
 
 
 def smooth_in_time(
-    frames: Sequence[Float[np.ndarray, "f"]], seen: Sequence[Bool[np.ndarray, "f"]], at: int, *, reach: int = 2
-) -> tuple[Float[np.ndarray, "f"], Bool[np.ndarray, "f"]]:
+    frames: Sequence[Float[np.ndarray, " f"]], seen: Sequence[Bool[np.ndarray, " f"]], at: int, *, reach: int = 2
+) -> tuple[Float[np.ndarray, " f"], Bool[np.ndarray, " f"]]:
     """Value at frame `at` of the straight line through `reach` frames on either side, face by face.
 
     Faces seen less than three times take their mean. The second result marks faces seen at all.
@@ -115,8 +115,8 @@ def _fill(values: np.ndarray, known: np.ndarray, inside: np.ndarray) -> np.ndarr
 
 
 def fill_hidden(
-    flat: Float[np.ndarray, "f"], seen: Bool[np.ndarray, "f"], domain: RolloutDomain
-) -> Float[np.ndarray, "f"]:
+    flat: Float[np.ndarray, " f"], seen: Bool[np.ndarray, " f"], domain: RolloutDomain
+) -> Float[np.ndarray, " f"]:
     """Open faces that were not seen take a smooth continuation of their component; values there do not matter."""
     is_open = domain.dynamic | (domain.inflow > 0)
     o, out = domain.offsets, []

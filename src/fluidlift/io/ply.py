@@ -54,7 +54,7 @@ def write_gaussians(
     path: Path | str,
     gaussians: Gaussians,
     *,
-    ids: Int[np.ndarray, "n"] | None = None,
+    ids: Int[np.ndarray, " n"] | None = None,
     velocities: Float[np.ndarray, "n 3"] | None = None,
     extras: Mapping[str, np.ndarray] | None = None,
     axes: str = "z_up",

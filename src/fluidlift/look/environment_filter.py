@@ -38,7 +38,7 @@ def ggx_lobe(roughness: float) -> Lobe:
     return lobe
 
 
-def solid_angles(rows: int) -> Float[np.ndarray, "h"]:
+def solid_angles(rows: int) -> Float[np.ndarray, " h"]:
     """sr of a pixel of each row of an equirectangular picture, exactly."""
     edges = np.cos(np.arange(rows + 1) * math.pi / rows)
     return (edges[:-1] - edges[1:]) * math.pi / rows

@@ -45,7 +45,7 @@ _CHUNK = 2048
 
 def fluid_normals(
     gaussians: Gaussians, spacing: float, terrain: Terrain | None = None
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]:
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
     """Outward normals of the fluid's surface and how much each splat belongs to it.
 
     Args:
@@ -71,7 +71,7 @@ def fluid_normals(
     return normals, share
 
 
-def fluid_depths(gaussians: Gaussians, normals: Float[np.ndarray, "n 3"], spacing: float) -> Float[np.ndarray, "n"]:
+def fluid_depths(gaussians: Gaussians, normals: Float[np.ndarray, "n 3"], spacing: float) -> Float[np.ndarray, " n"]:
     """Metres of fluid on the line through each splat along its normal, float32: how deep the body is there.
 
     The bed is no fluid here. Splats with a number that is not finite have 0.
@@ -274,7 +274,7 @@ def depths_kernel(points, normals, low, h, density, out):
 
 def depths_plain(
     points: np.ndarray, normals: np.ndarray, low: np.ndarray, h: float, density: np.ndarray
-) -> Float[np.ndarray, "n"]:
+) -> Float[np.ndarray, " n"]:
     """The twin of `depths_kernel`, for finite points."""
     total = np.zeros(len(points))
     for side in (-0.5, 0.5):
@@ -316,7 +316,7 @@ def gather_plain(points: np.ndarray, low: np.ndarray, h: float, density: np.ndar
 
 def normals_plain(
     points: np.ndarray, low: np.ndarray, h: float, density: np.ndarray
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]:
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
     """The twin of `normals_kernel`, for points within the grid."""
     base, w, d = _splines(points, low, h)
     slope = np.zeros((len(points), 3))

@@ -52,7 +52,7 @@ class InflowLook:
         speed: float,
         spacing: float,
         *,
-        usable: Bool[np.ndarray, "n"] | None = None,
+        usable: Bool[np.ndarray, " n"] | None = None,
         run: Callable[[float], float] | None = None,
         lying: bool = False,
     ) -> None:

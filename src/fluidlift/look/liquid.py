@@ -278,21 +278,21 @@ def _pictures(environment: Environment) -> tuple[tuple[np.ndarray, ...], np.ndar
 class Followed:
     """Where the light of n pixels comes from."""
 
-    share: Float[np.ndarray, "n"]
+    share: Float[np.ndarray, " n"]
     """mirrored, 0 to 1"""
     mirror: Float[np.ndarray, "n 3"]
     """world direction of the mirrored ray"""
     through: Float[np.ndarray, "n 3"]
     """world direction of the ray behind the liquid"""
-    path: Float[np.ndarray, "n"]
+    path: Float[np.ndarray, " n"]
     """m in the liquid"""
     surroundings: np.ndarray
     """bool [n]: what comes through is the environment's"""
-    turned: Float[np.ndarray, "n"]
+    turned: Float[np.ndarray, " n"]
     """share of what comes through, 0 to 1, that was mirrored at the far side"""
     inward: Float[np.ndarray, "n 3"]
     """world direction from which that comes, outside the liquid"""
-    farther: Float[np.ndarray, "n"]
+    farther: Float[np.ndarray, " n"]
     """m that it goes on in the liquid"""
     beyond: np.ndarray
     """bool [n]: it is the environment's"""
@@ -300,7 +300,7 @@ class Followed:
     """linear, that where it is the picture's"""
     color: Float[np.ndarray, "n 3"]
     """linear, what comes through where it is the picture's"""
-    spread: Float[np.ndarray, "n"]
+    spread: Float[np.ndarray, " n"]
     """of the normals in the pixel, GGX's alpha"""
 
 

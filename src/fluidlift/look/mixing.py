@@ -25,7 +25,7 @@ APART = (3.0, 4.0)
 of splats at its pixels has 2.6"""
 
 
-def mixed_share(deformation: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n"]:
+def mixed_share(deformation: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, " n"]:
     """How far the colour of a particle is that of its surroundings, 0 to 1, from its deformation F (no unit).
 
     The measure is the root mean square stretch |F| / sqrt(3): 1 at rest, and what a pure shear with the limits of

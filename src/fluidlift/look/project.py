@@ -18,7 +18,7 @@ def view_colors(gaussians: Gaussians, camera: PinholeCamera) -> Float[np.ndarray
     return colors(gaussians.means, gaussians.sh, camera.position)
 
 
-def sound(gaussians: Gaussians) -> Bool[np.ndarray, "n"]:
+def sound(gaussians: Gaussians) -> Bool[np.ndarray, " n"]:
     """Every number finite, scales not negative, a quaternion that is not zero."""
     g = gaussians
     ok = np.isfinite(g.means).all(1) & np.isfinite(g.quats).all(1) & np.isfinite(g.scales).all(1)
@@ -26,14 +26,14 @@ def sound(gaussians: Gaussians) -> Bool[np.ndarray, "n"]:
     return ok & (g.scales >= 0).all(1) & (np.abs(g.quats).max(1, initial=0.0) > 1e-12)
 
 
-def camera_depths(means: Float[np.ndarray, "n 3"], camera: PinholeCamera) -> Float[np.ndarray, "n"]:
+def camera_depths(means: Float[np.ndarray, "n 3"], camera: PinholeCamera) -> Float[np.ndarray, " n"]:
     """Camera z (float32, m) of world points, without double precision copies of them."""
     pose = camera.camera_from_world
     return means @ np.float32(pose.rotation[2]) + np.float32(pose.translation[2])
 
 
 def bounded_scales(
-    scales: Float[np.ndarray, "n 3"], depths: Float[np.ndarray, "n"], camera: PinholeCamera, largest: float = LARGEST
+    scales: Float[np.ndarray, "n 3"], depths: Float[np.ndarray, " n"], camera: PinholeCamera, largest: float = LARGEST
 ) -> Float[np.ndarray, "n 3"]:
     """Scales (m) held so that none is wider than `largest` of the picture at its depth (m).
 

@@ -52,12 +52,12 @@ WIEN = np.array([16.5, 18.3, 21.6], np.float32)
 def relit(
     gaussians: Gaussians,
     normals: Float[np.ndarray, "n 3"],
-    share: Float[np.ndarray, "n"],
+    share: Float[np.ndarray, " n"],
     camera: PinholeCamera,
     material: Material,
     environment: Environment,
     among: Float[np.ndarray, "m 3"] | None = None,
-    depths: Float[np.ndarray, "n"] | None = None,
+    depths: Float[np.ndarray, " n"] | None = None,
 ) -> Float[np.ndarray, "n 3"]:
     """Linear radiance of every splat towards the camera, to be drawn as its feature.
 
@@ -92,7 +92,7 @@ def relit(
 def relit_plain(
     means: Float[np.ndarray, "n 3"],
     normals: Float[np.ndarray, "n 3"],
-    share: Float[np.ndarray, "n"],
+    share: Float[np.ndarray, " n"],
     body: Float[np.ndarray, "n 3"],
     eye: Float[np.ndarray, "3"],
     material: Material,
@@ -168,7 +168,7 @@ def lit_diffuse(
 
 
 def own_albedo(
-    colors_linear: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], share: Float[np.ndarray, "n"]
+    colors_linear: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], share: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n 3"]:
     """Albedo of splats from their colours in the clip: a guess of the clip's light is divided out.
 
@@ -188,7 +188,7 @@ def body_color(
     gaussians: Gaussians,
     own: Float[np.ndarray, "n 3"],
     material: Material,
-    depths: Float[np.ndarray, "n"] | None = None,
+    depths: Float[np.ndarray, " n"] | None = None,
 ) -> Float[np.ndarray, "n 3"]:
     """Linear albedo of the body: the material's where it scatters, the clip's own through it where it is clear.
 
@@ -269,7 +269,7 @@ def _brdf_table(roughness: float) -> Float[np.ndarray, "k 2"]:
 
 def heat(
     colors_linear: Float[np.ndarray, "n 3"], among: Float[np.ndarray, "m 3"] | None = None
-) -> Float[np.ndarray, "n"]:
+) -> Float[np.ndarray, " n"]:
     """0 to 1: how hot each splat is where a material glows: the brighter in the clip, the hotter, `among` these."""
     bright = colors_linear @ LUMINANCE
     if len(bright) == 0:

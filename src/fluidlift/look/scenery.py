@@ -189,7 +189,7 @@ def visible_beside_rocks(
     where: Bool[np.ndarray, "h w"],
     *,
     margin: float,
-) -> Bool[np.ndarray, "n"]:
+) -> Bool[np.ndarray, " n"]:
     """False for points that lie more than `margin` (m) behind the solid seen at a pixel of `where`."""
     row, col, z = camera.nearest_pixels(means)
     return ~(where[row, col] & (z > depth[row, col] + margin))

@@ -166,7 +166,7 @@ def bed_velocity(
     *,
     kind: str,
     spacing: float,
-    depth: Float[np.ndarray, "n"] | float | None = None,
+    depth: Float[np.ndarray, " n"] | float | None = None,
     wall: str = "cubic",
 ) -> Float[np.ndarray, "n 3"]:
     """Velocity in the cells beside the bed, m/s.

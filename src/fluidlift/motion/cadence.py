@@ -51,7 +51,7 @@ class CadenceReport:
     warnings: tuple[str, ...] = ()
 
 
-def examine_cadence(frames: UInt8[np.ndarray, "t h w 3"], times: Float[np.ndarray, "t"]) -> CadenceReport:
+def examine_cadence(frames: UInt8[np.ndarray, "t h w 3"], times: Float[np.ndarray, " t"]) -> CadenceReport:
     """Repeated frames and frozen stretches of a clip.
 
     Args:
@@ -104,7 +104,7 @@ def without_duplicates(clip: VideoClip, report: CadenceReport) -> VideoClip:
     return replace(clip, frames=clip.frames[kept], times=times, alpha=alpha)
 
 
-def differences(frames: UInt8[np.ndarray, "t h w 3"]) -> Float[np.ndarray, "t-1"]:
+def differences(frames: UInt8[np.ndarray, "t h w 3"]) -> Float[np.ndarray, " t-1"]:
     """How much the liveliest blocks of neighbouring frames differ, grey levels."""
     found = np.zeros(max(len(frames) - 1, 0))
     before = None
@@ -121,7 +121,7 @@ def differences(frames: UInt8[np.ndarray, "t h w 3"]) -> Float[np.ndarray, "t-1"
     return found
 
 
-def repeats(difference: Float[np.ndarray, "n"]) -> np.ndarray:
+def repeats(difference: Float[np.ndarray, " n"]) -> np.ndarray:
     """bool [n]: pairs of one and the same picture, from what `differences` says of all pairs.
 
     The differences fall into two classes with a gap between them, or there are no repeats.
@@ -149,7 +149,7 @@ def frozen_stretches(same: np.ndarray, interval: float) -> tuple[tuple[int, int]
     return tuple((int(a), int(b)) for a, b in zip(starts[long], stops[long]))
 
 
-def source_rate(kept: Float[np.ndarray, "k"], times: Float[np.ndarray, "t"]) -> float | None:
+def source_rate(kept: Float[np.ndarray, " k"], times: Float[np.ndarray, " t"]) -> float | None:
     """Frames per second before conversion, or None where the kept frames do not keep a beat.
 
     A converter shows frame k of the source at the display instant next to k / rate: the display times of the kept

@@ -27,7 +27,7 @@ def nearest_cells(carrying: Bool[np.ndarray, "nx ny nz"]) -> NearestCells:
 def splat_samples(
     points: Float[np.ndarray, "n 3"],
     fields: Float[np.ndarray, "n c"],
-    weight: Float[np.ndarray, "n"],
+    weight: Float[np.ndarray, " n"],
     carrying: Bool[np.ndarray, "nx ny nz"],
     grid: Grid,
     *,
@@ -73,7 +73,7 @@ def splat_surface(
     return splat_samples(surface.points, surface.velocities, sample_weight(surface), carrying, grid)
 
 
-def sample_weight(surface: SurfaceMotion) -> Float[np.ndarray, "n"]:
+def sample_weight(surface: SurfaceMotion) -> Float[np.ndarray, " n"]:
     """1 for observed samples, `FILLED_WEIGHT` for those that were filled in."""
     return np.where(surface.observed, 1.0, FILLED_WEIGHT)
 

@@ -49,7 +49,7 @@ def downhill_of(
 def falling_share(
     points: Float[np.ndarray, "n 3"], downhill: Float[np.ndarray, "n 3"], measured: Float[np.ndarray, "n 3"], *,
     kind: str, top: float, gravity: float,
-) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, "n"]]:  # fmt: skip
+) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:  # fmt: skip
     """Expected velocity and where it should replace the measured one.
 
     Args:

@@ -76,7 +76,7 @@ def raised_flow(
     return out, float(np.clip(-out[mask, 1].mean() / total, 1.0, LARGEST_FACTOR)) if total > 0 else LARGEST_FACTOR
 
 
-def row_rise(displacement: Float[np.ndarray, "h w 2"], mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h"]:
+def row_rise(displacement: Float[np.ndarray, "h w 2"], mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, " h"]:
     """Mean upward motion of the mask around each row, px per frame; 0 where there is no fluid."""
     rows = np.flatnonzero(mask.any(axis=1))
     side = 2 * int(0.5 * ROWS * (rows[-1] - rows[0] + 1)) + 1

@@ -138,7 +138,7 @@ def balance_surface(
     return FaceVelocity(*faces)
 
 
-EndFaces = tuple[tuple[Int[np.ndarray, "k"], Int[np.ndarray, "k"]], ...]
+EndFaces = tuple[tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]], ...]
 """per axis: faces of in- and outlet cells, and for each the nearest face of the fluid (flat indices)"""
 
 

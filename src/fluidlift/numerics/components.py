@@ -20,9 +20,9 @@ class ClosedComponents:
 
     runs: Int[np.ndarray, "r 4"]
     """i, j, first k, last k + 1 of each run of cells"""
-    labels: Int[np.ndarray, "r"]
+    labels: Int[np.ndarray, " r"]
     """component of each run, 0 to c-1"""
-    sizes: Int[np.ndarray, "c"]
+    sizes: Int[np.ndarray, " c"]
     """cells of each component"""
 
 
@@ -34,14 +34,14 @@ class FreeConstants:
     constant gives way to it: then the constant, or one combination of several, is determined.
     """
 
-    sizes: Int[np.ndarray, "c"]
+    sizes: Int[np.ndarray, " c"]
     """cells of each component"""
-    touched: Int[np.ndarray, "t"]
+    touched: Int[np.ndarray, " t"]
     """components whose constant some body feels"""
     projector: Float[np.ndarray, "t t"]
     """onto what stays free among them, in units of sqrt(cells)"""
 
-    def means(self, sums: Float[np.ndarray, "c"]) -> Float[np.ndarray, "c"]:
+    def means(self, sums: Float[np.ndarray, " c"]) -> Float[np.ndarray, " c"]:
         """What each component loses per cell, given the sum over its cells, so that nothing free is left."""
         roots = np.sqrt(np.maximum(self.sizes, 1))
         scaled = sums / roots
@@ -51,7 +51,7 @@ class FreeConstants:
 
 
 def free_constants(
-    sizes: Int[np.ndarray, "c"],
+    sizes: Int[np.ndarray, " c"],
     forces: Float[np.ndarray, "b c 6"],
     magnitudes: Float[np.ndarray, "b c 6"],
     inverse_mass: Float[np.ndarray, "b 6 6"],
@@ -206,7 +206,7 @@ def _paint(runs, labels, out):
 
 def component_of_cells(
     components: ClosedComponents, cells: Int[np.ndarray, "n 3"], shape: tuple[int, int, int]
-) -> Int[np.ndarray, "n"]:
+) -> Int[np.ndarray, " n"]:
     """The closed component of each cell, -1 where there is none."""
     label = np.full(shape, -1, np.int64)
     _paint(components.runs, components.labels, label)

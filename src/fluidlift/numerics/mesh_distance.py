@@ -230,7 +230,7 @@ def _count_crossings(triangles, low, h, crossings):
                     crossings[i, j, k] += side
 
 
-def mesh_distance_plain(mesh: TriangleMesh, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+def mesh_distance_plain(mesh: TriangleMesh, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
     """Signed distance (m) by comparing every point with every triangle; the sign from solid angles.
 
     The winding number is the sum of the signed solid angles over 4 pi (van Oosterom, Strackee 1983).

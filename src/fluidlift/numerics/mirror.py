@@ -19,8 +19,8 @@ NARROW = 4.0
 
 
 def folded(
-    values: Float[np.ndarray, "n"], low: Float[np.ndarray, "n"] | float, high: Float[np.ndarray, "n"] | float
-) -> tuple[Float[np.ndarray, "n"], Bool[np.ndarray, "n"]]:
+    values: Float[np.ndarray, " n"], low: Float[np.ndarray, " n"] | float, high: Float[np.ndarray, " n"] | float
+) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
     """Values thrown back at both ends until they lie between them, and whether an odd number of times."""
     length = np.maximum(np.asarray(high, np.float64) - low, 1e-12)
     turns = np.floor((values - low) / length)
@@ -33,11 +33,11 @@ def folded(
 class Found:
     """Which points stand for which places."""
 
-    place: Int[np.ndarray, "m"]
+    place: Int[np.ndarray, " m"]
     """index of the place"""
     offset: Float[np.ndarray, "m 3"]
     """from there, m"""
-    point: Int[np.ndarray, "m"]
+    point: Int[np.ndarray, " m"]
     """index of the point"""
 
 
@@ -93,7 +93,7 @@ class MirroredPoints:
         length = self._high - self._low
         self._low, self._high = self._low + ends[0] * length, self._low + ends[1] * length
 
-    def nearest(self, places: Float[np.ndarray, "n 3"], run: float = 0.0) -> Int[np.ndarray, "n"]:
+    def nearest(self, places: Float[np.ndarray, "n 3"], run: float = 0.0) -> Int[np.ndarray, " n"]:
         """The point nearest to the image of each place (m) once the pattern has moved on by `run` (m)."""
         return self._tree.query(self._images(np.asarray(places, np.float64), run, 0)[0])[1].reshape(-1)
 

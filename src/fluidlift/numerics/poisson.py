@@ -129,7 +129,7 @@ def _norm(values: np.ndarray) -> float:
     return float(np.sqrt(np.square(values).sum()))
 
 
-def label_components(system: PoissonSystem) -> tuple[Int[np.ndarray, "nx ny nz"], Bool[np.ndarray, "c"]]:
+def label_components(system: PoissonSystem) -> tuple[Int[np.ndarray, "nx ny nz"], Bool[np.ndarray, " c"]]:
     """Groups of unknown cells that are joined through open faces.
 
     Returns:
@@ -163,7 +163,7 @@ def label_components(system: PoissonSystem) -> tuple[Int[np.ndarray, "nx ny nz"]
 
 
 def constants_left_free(
-    labels: Int[np.ndarray, "nx ny nz"], closed: Bool[np.ndarray, "c"], low_rank: Sequence[LowRankTerm] = ()
+    labels: Int[np.ndarray, "nx ny nz"], closed: Bool[np.ndarray, " c"], low_rank: Sequence[LowRankTerm] = ()
 ) -> FreeConstants:
     """The constants of the closed components that bodies leave free; the other components count as if of no cell."""
     sizes = np.where(closed, np.bincount(labels[labels >= 0], minlength=len(closed)), 0)

@@ -47,8 +47,8 @@ class FittedStencil:
     air_gain: float
     wall_gain: float
     """logarithms: how much more a cell surrounded by air, or by wall, answers"""
-    relaxation: Float[np.ndarray, "m"]
-    momentum: Float[np.ndarray, "m"]
+    relaxation: Float[np.ndarray, " m"]
+    momentum: Float[np.ndarray, " m"]
     """one per sub-step of the cycle"""
     sub_steps: int
     """of one solve, for which it was fitted"""
@@ -88,8 +88,8 @@ class FittedStencil:
         return self.relaxation[turn], self.momentum[turn]
 
     def amplification(
-        self, eigenvalues: Float[np.ndarray, "n"], sub_steps: int | None = None
-    ) -> Float[np.ndarray, "n"]:
+        self, eigenvalues: Float[np.ndarray, " n"], sub_steps: int | None = None
+    ) -> Float[np.ndarray, " n"]:
         """What is left of the error's component of each eigenvalue of S K S A; below 1 on (0, bound]: converges."""
         error, change = np.ones_like(eigenvalues), np.zeros_like(eigenvalues)
         for w, m in zip(*self.schedule(sub_steps or self.sub_steps)):
@@ -290,8 +290,8 @@ class LayerWeights:
     kernel: Float[Tensor, "3 3 3"]
     air_gain: Tensor
     wall_gain: Tensor
-    relaxation: Float[Tensor, "m"]
-    momentum: Float[Tensor, "m"]
+    relaxation: Float[Tensor, " m"]
+    momentum: Float[Tensor, " m"]
 
     @classmethod
     def of(cls, stencil: FittedStencil, dtype: torch.dtype, device: torch.device | str = "cpu") -> LayerWeights:

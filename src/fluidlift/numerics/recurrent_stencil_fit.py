@@ -56,7 +56,7 @@ class StencilFit:
     """A stencil and the way to it."""
 
     stencil: FittedStencil
-    errors: Float[np.ndarray, "iterations+1"]
+    errors: Float[np.ndarray, " iterations+1"]
     """relative error of q, root mean square over the samples, before each iteration and after the last"""
 
 
@@ -64,15 +64,15 @@ class StencilFit:
 class StencilValidation:
     """How a stencil does on samples, beside Jacobi's sweeps of the same number. Errors are relative 2-norms of q."""
 
-    errors: Float[np.ndarray, "samples"]
-    residuals: Float[np.ndarray, "samples"]
-    jacobi_errors: Float[np.ndarray, "samples"]
-    jacobi_residuals: Float[np.ndarray, "samples"]
+    errors: Float[np.ndarray, " samples"]
+    residuals: Float[np.ndarray, " samples"]
+    jacobi_errors: Float[np.ndarray, " samples"]
+    jacobi_residuals: Float[np.ndarray, " samples"]
     sub_steps: np.ndarray
     """int [n]: where the curves are sampled"""
-    curve: Float[np.ndarray, "n"]
+    curve: Float[np.ndarray, " n"]
     """mean error after so many sub-steps"""
-    jacobi_curve: Float[np.ndarray, "n"]
+    jacobi_curve: Float[np.ndarray, " n"]
     converges_anywhere: bool
     """no component of the error can grow over a solve, on any domain"""
 
@@ -196,7 +196,7 @@ class _Batch:
         part = LayerInput(c.scale[pick], c.air[pick], c.wall[pick], c.weights[:, pick])
         return _Batch(part, self.rhs[pick], self.potential[pick])
 
-    def squared_errors(self, weights: LayerWeights, sub_steps: int) -> Float[Tensor, "n"]:
+    def squared_errors(self, weights: LayerWeights, sub_steps: int) -> Float[Tensor, " n"]:
         """Of q after the last sub-step, relative."""
         q = recurrent_layers(weights, self.conditions, self.rhs, sub_steps)
         return ((q - self.potential) ** 2).sum((1, 2, 3))

@@ -83,7 +83,7 @@ def _push(points, field, low, inverse_spacing, margin, inside):
 
 def push_outside(
     points: Float[np.ndarray, "n 3"], signed_distance: np.ndarray, grid: Grid, margin: float = 0.0
-) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, "n"]]:
+) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
     """Points (m, float32) moved along the gradient until `margin` m outside, and which of them are still inside."""
     moved = np.array(points, np.float32, order="C")
     inside = np.zeros(len(moved), bool)

@@ -61,7 +61,9 @@ def moments(mesh: TriangleMesh) -> Moments:
 
 def flipped(mesh: TriangleMesh) -> TriangleMesh:
     """The same surface with inside and outside exchanged."""
-    return TriangleMesh(mesh.vertices, np.ascontiguousarray(np.asarray(mesh.faces)[:, ::-1]), mesh.colors)
+    uv = None if mesh.uv is None else np.ascontiguousarray(np.asarray(mesh.uv)[:, ::-1])
+    faces = np.ascontiguousarray(np.asarray(mesh.faces)[:, ::-1])
+    return TriangleMesh(mesh.vertices, faces, mesh.colors, uv, mesh.texture)
 
 
 def welded(mesh: TriangleMesh) -> TriangleMesh:

@@ -79,7 +79,7 @@ class Projected:
     """centres u, v in px"""
     conics: Float[np.ndarray, "n 3"]
     """a, b, c of the inverse covariance [[a, b], [b, c]], 1/px^2"""
-    depths: Float[np.ndarray, "n"]
+    depths: Float[np.ndarray, " n"]
     """camera z, m"""
     extents: Float[np.ndarray, "n 2"]
     """half width and height of the box outside which alpha < 1/255, px"""
@@ -92,11 +92,11 @@ class Pairs:
     first: int
     last: int
     """tiles first <= t < last"""
-    gaussians: Int[np.ndarray, "pairs"]
+    gaussians: Int[np.ndarray, " pairs"]
     """place in `Bins.order` of the Gaussian of every pair, tile by tile, nearest first"""
-    slots: Int[np.ndarray, "pairs"]
+    slots: Int[np.ndarray, " pairs"]
     """where in `gaussians` the pairs of the k-th drawn Gaussian are: slots[offsets[k]:offsets[k + 1]]"""
-    offsets: Int[np.ndarray, "m+1"]
+    offsets: Int[np.ndarray, " m+1"]
 
 
 @dataclass(frozen=True)
@@ -107,9 +107,9 @@ class Bins:
     """px"""
     tiles: tuple[int, int]
     """across, down"""
-    starts: Int[np.ndarray, "tiles+1"]
+    starts: Int[np.ndarray, " tiles+1"]
     """where each tile's list begins, tiles row by row"""
-    order: Int[np.ndarray, "m"]
+    order: Int[np.ndarray, " m"]
     """drawn Gaussians, nearest first"""
     sketch: Float[np.ndarray, "m 8"]
     """their ellipses, as `sketch_kernel` writes them"""
@@ -129,7 +129,7 @@ def project(
     means: Float[np.ndarray, "n 3"],
     quats: Float[np.ndarray, "n 4"],
     scales: Float[np.ndarray, "n 3"],
-    opacities: Float[np.ndarray, "n"],
+    opacities: Float[np.ndarray, " n"],
 ) -> Projected:
     """Gaussians (m) to ellipses in the picture (px), by the local affine approximation of the pinhole map (EWA).
 
@@ -182,7 +182,7 @@ def tiles_met(projected: Projected, size: tuple[int, int], tile: int = TILE) -> 
     return float((across[:, 0] * across[:, 1]).sum(dtype=np.float64))
 
 
-def _order(projected: Projected) -> Int[np.ndarray, "m"]:
+def _order(projected: Projected) -> Int[np.ndarray, " m"]:
     drawn = np.flatnonzero(projected.extents[:, 0] > 0)
     depths = projected.depths[drawn]
     if depths.dtype != np.float32:
@@ -203,7 +203,7 @@ def _count(
     return counts, pairs
 
 
-def _bands(starts: Int[np.ndarray, "tiles+1"]) -> tuple[tuple[int, int], ...]:
+def _bands(starts: Int[np.ndarray, " tiles+1"]) -> tuple[tuple[int, int], ...]:
     """Runs of tiles of at most `PAIRS_MAX` pairs (a single tile may have more)."""
     bands, first = [], 0
     while first < len(starts) - 1:
@@ -251,7 +251,7 @@ def _stride(tiles: int) -> int:
 
 def rasterize(
     projected: Projected,
-    opacities: Float[np.ndarray, "n"],
+    opacities: Float[np.ndarray, " n"],
     features: Float[np.ndarray, "n c"],
     bins: Bins,
     size: tuple[int, int],
@@ -269,7 +269,7 @@ def rasterize(
 
 def rasterize_backward(
     projected: Projected,
-    opacities: Float[np.ndarray, "n"],
+    opacities: Float[np.ndarray, " n"],
     features: Float[np.ndarray, "n c"],
     bins: Bins,
     image: Float[np.ndarray, "h w c"],

@@ -69,7 +69,7 @@ def project(
     means: Float[Tensor, "n 3"],
     quats: Float[Tensor, "n 4"],
     scales: Float[Tensor, "n 3"],
-    opacities: Float[Tensor, "n"],
+    opacities: Float[Tensor, " n"],
     view: View,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Centres [n,2] px, conics [n,3], depths [n] m and box sizes [n,2] px; the first two carry gradients.
@@ -82,9 +82,9 @@ def project(
 def rasterize(
     uv: Float[Tensor, "n 2"],
     conics: Float[Tensor, "n 3"],
-    opacities: Float[Tensor, "n"],
+    opacities: Float[Tensor, " n"],
     features: Float[Tensor, "n c"],
-    depths: Float[Tensor, "n"],
+    depths: Float[Tensor, " n"],
     extents: Float[Tensor, "n 2"],
     size: tuple[int, int],
 ) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
@@ -96,7 +96,7 @@ def splat(
     means: Float[Tensor, "n 3"],
     quats: Float[Tensor, "n 4"],
     scales: Float[Tensor, "n 3"],
-    opacities: Float[Tensor, "n"],
+    opacities: Float[Tensor, " n"],
     features: Float[Tensor, "n c"],
     view: View,
 ) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
@@ -125,7 +125,7 @@ def splat_dense(
     means: Float[Tensor, "n 3"],
     quats: Float[Tensor, "n 4"],
     scales: Float[Tensor, "n 3"],
-    opacities: Float[Tensor, "n"],
+    opacities: Float[Tensor, " n"],
     features: Float[Tensor, "n c"],
     view: View,
 ) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:

@@ -76,7 +76,7 @@ def _restrict(fine: Level, coarse: Level, residual: Tensor) -> Tensor:
     return out.view(-1).mul_(coarse.scale)
 
 
-def v_cycle(system: DeviceSystem, b: Float[Tensor, "n"], depth: int = 0) -> Float[Tensor, "n"]:
+def v_cycle(system: DeviceSystem, b: Float[Tensor, " n"], depth: int = 0) -> Float[Tensor, " n"]:
     """An approximate solution of the scaled equation on a level (float32, flat): linear, symmetric, positive."""
     level = system.levels[depth]
     if depth == len(system.levels) - 1:

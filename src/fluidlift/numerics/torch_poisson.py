@@ -69,10 +69,10 @@ class DeviceSystem:
     levels: tuple[Level, ...]
     inverse: Tensor
     """float32 [n,n]: pseudo-inverse of the scaled operator on the coarsest level"""
-    closed_cells: Int[Tensor, "m"]
+    closed_cells: Int[Tensor, " m"]
     """cells of closed components, flat with the ring"""
-    closed_labels: Int[Tensor, "m"]
-    closed_sizes: Float[Tensor, "c"]
+    closed_labels: Int[Tensor, " m"]
+    closed_sizes: Float[Tensor, " c"]
 
     @classmethod
     def of(cls, system: PoissonSystem, device: torch.device | str) -> DeviceSystem:
@@ -115,7 +115,7 @@ class DeviceSystem:
             closed_sizes=torch.from_numpy(size.astype(np.float64)).to(device),
         )
 
-    def load(self, values: Float[Tensor, "nx ny nz"]) -> Float[Tensor, "n"]:
+    def load(self, values: Float[Tensor, "nx ny nz"]) -> Float[Tensor, " n"]:
         """Values of the unknown cells as a flat float64 vector with the ring."""
         shape = self.levels[0].shape
         out = torch.zeros(shape, dtype=torch.float64, device=self.diagonal.device)
@@ -126,7 +126,7 @@ class DeviceSystem:
         # not a product: what lies outside the unknown cells need not be finite
         return torch.where(self.active, out.view(-1), 0.0)
 
-    def store(self, flat: Float[Tensor, "n"], dtype: torch.dtype) -> Float[Tensor, "nx ny nz"]:
+    def store(self, flat: Float[Tensor, " n"], dtype: torch.dtype) -> Float[Tensor, "nx ny nz"]:
         """The reverse; 0 outside the unknown cells."""
         out = torch.zeros(self.shape, dtype=dtype, device=flat.device)
         box = out
@@ -135,13 +135,13 @@ class DeviceSystem:
         box.copy_(interior(flat.view(self.levels[0].shape), self.cells))
         return out
 
-    def apply(self, p: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
+    def apply(self, p: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
         """h^2 A p of flat vectors."""
         out = torch.mul(self.diagonal, p)
         add_neighbours(p, self.couplings, self.levels[0], out, -1.0)
         return out
 
-    def remove_means(self, values: Float[Tensor, "n"]) -> Tensor:
+    def remove_means(self, values: Float[Tensor, " n"]) -> Tensor:
         """Take the mean of every closed component, in place; returns the squared norm of what was taken (0-d)."""
         if not self.closed_cells.numel():
             return torch.zeros((), dtype=values.dtype, device=values.device)

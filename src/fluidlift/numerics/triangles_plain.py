@@ -11,7 +11,7 @@ from fluidlift.types.camera import PinholeCamera
 
 def crossings(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], camera: PinholeCamera
-) -> tuple[Float[np.ndarray, "h w f"], Float[np.ndarray, "h w f 3"], Int[np.ndarray, "f"]]:
+) -> tuple[Float[np.ndarray, "h w f"], Float[np.ndarray, "h w f 3"], Int[np.ndarray, " f"]]:
     """Camera z (m; 0: none) and barycentrics where each pixel's ray meets each face, and 1 for faces seen from outside,
     -1 for the others. Rays that meet an edge exactly are left out."""
     seen = camera.camera_from_world.points(np.asarray(vertices, np.float64))

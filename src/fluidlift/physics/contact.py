@@ -40,7 +40,7 @@ class Motion:
     """m/s"""
     spin: Float[np.ndarray, "b 3"]
     """rad/s"""
-    inverse_mass: Float[np.ndarray, "b"]
+    inverse_mass: Float[np.ndarray, " b"]
     """1/kg; 0 for bodies whose motion is prescribed"""
     inverse_inertia: Float[np.ndarray, "b 3 3"]
     """1/(kg m^2), in the world's axes"""
@@ -173,7 +173,7 @@ class ContactSolver:
         self.impulses = np.zeros((len(contacts), 3))
         """N s along normal and tangents"""
 
-    def expect(self, keys: Int[np.ndarray, "m"], impulses: Float[np.ndarray, "m 3"]) -> None:
+    def expect(self, keys: Int[np.ndarray, " m"], impulses: Float[np.ndarray, "m 3"]) -> None:
         """Apply what the same contacts (by key) needed before: impulses in the world's axes, N s, pushing ones only.
 
         The liquid then feels a body at rest on the bed as one at rest, not as one that falls for a step.
@@ -195,13 +195,13 @@ class ContactSolver:
 
     def solve(
         self,
-        friction: Float[np.ndarray, "n"],
-        restitution: Float[np.ndarray, "n"],
+        friction: Float[np.ndarray, " n"],
+        restitution: Float[np.ndarray, " n"],
         *,
         dt: float,
         spacing: float,
         gain: float,
-    ) -> Bool[np.ndarray, "n"]:
+    ) -> Bool[np.ndarray, " n"]:
         """Change the velocities so that nothing gets closer than the gap at rest; which contacts were impacts.
 
         Args:

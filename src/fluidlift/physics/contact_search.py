@@ -24,17 +24,17 @@ FIXED = 7
 class Contacts:
     """n places where the surface point of a body is near something else."""
 
-    keys: Int[np.ndarray, "n"]
+    keys: Int[np.ndarray, " n"]
     """which surface point meets which partner, the same from step to step; ascending"""
-    first: Int[np.ndarray, "n"]
+    first: Int[np.ndarray, " n"]
     """the body of the surface point"""
-    second: Int[np.ndarray, "n"]
+    second: Int[np.ndarray, " n"]
     """the other body, or -1"""
     points: Float[np.ndarray, "n 3"]
     """m"""
     normals: Float[np.ndarray, "n 3"]
     """unit vectors towards the first body"""
-    gaps: Float[np.ndarray, "n"]
+    gaps: Float[np.ndarray, " n"]
     """m"""
 
     def __len__(self) -> int:
@@ -51,12 +51,12 @@ class SurfacePoints:
 
     points: Float[np.ndarray, "m 3"]
     """m"""
-    start: Int[np.ndarray, "b+1"]
+    start: Int[np.ndarray, " b+1"]
     normals: Float[np.ndarray, "m 3"]
     """unit vectors out of the body"""
-    radii: Float[np.ndarray, "m"]
+    radii: Float[np.ndarray, " m"]
     """m, 0 at edges and corners"""
-    cosines: Float[np.ndarray, "m"]
+    cosines: Float[np.ndarray, " m"]
     """of `turn`, the angle to the next points"""
 
 
@@ -86,7 +86,7 @@ def _touching_balls(shapes, points, start, spacing, normals, radii, cosines):
                 radii[p], cosines[p] = radius, np.cos(min(1.2 * spacing[b] / radius, 1.0))
 
 
-def spread_points(shapes: Shapes, points: list[np.ndarray], spacing: Float[np.ndarray, "b"]) -> SurfacePoints:
+def spread_points(shapes: Shapes, points: list[np.ndarray], spacing: Float[np.ndarray, " b"]) -> SurfacePoints:
     """Surface points of all bodies with the balls that touch there.
 
     Args:
@@ -227,7 +227,7 @@ def _region(regions, low, inverse, x, y, z):
 
 
 def find_contacts(
-    shapes: Shapes, surface: SurfacePoints, free: np.ndarray, walls: Walls, reach: Float[np.ndarray, "b"]
+    shapes: Shapes, surface: SurfacePoints, free: np.ndarray, walls: Walls, reach: Float[np.ndarray, " b"]
 ) -> Contacts:
     """Surface points closer than `reach` (m, per body; two bodies: the sum) to anything they may not enter.
 

@@ -202,7 +202,7 @@ class Emission:
             self._faces.append(index[open_here])
             self._values.append(np.array(list(faces.values()), np.float32)[open_here])
 
-    def distance(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+    def distance(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """m to the emitter's surface, negative inside; not less than a cell beyond the box around it."""
         grid, field = self._distance.grid, self._distance.distance
         out = sample_nodes(field, grid, points)

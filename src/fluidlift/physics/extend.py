@@ -44,7 +44,7 @@ class Outlet:
         """m along the axis: the side of the box that the water leaves through."""
         return float((self.grid.high if self.sign > 0 else self.grid.low)[self.axis])
 
-    def beyond(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+    def beyond(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """m that points lie downstream of the end; negative before it."""
         return self.sign * (np.asarray(points, np.float64)[:, self.axis] - self.end)
 

@@ -106,7 +106,7 @@ def solid_shares(signed_distance: Float[np.ndarray, "nx+1 ny+1 nz+1"], grid: Gri
 
 def liquid_surface(
     positions: Float[np.ndarray, "n 3"],
-    volumes: Float[np.ndarray, "n"],
+    volumes: Float[np.ndarray, " n"],
     grid: Grid,
     order: CellOrder,
     solids: SolidShares,

@@ -26,11 +26,11 @@ class Fluctuation:
 
     wave_vectors: Float[np.ndarray, "m 3"]
     """1/m"""
-    frequencies: Float[np.ndarray, "m"]
+    frequencies: Float[np.ndarray, " m"]
     """1/s"""
     directions: Float[np.ndarray, "m 3"]
     """unit vectors normal to the wave vectors"""
-    phases: Float[np.ndarray, "m"]
+    phases: Float[np.ndarray, " m"]
 
     def __call__(self, points: Float[np.ndarray, "n 3"], time: float) -> Float[np.ndarray, "n 3"]:
         """No unit."""
@@ -73,8 +73,8 @@ def inlet_to_surface(
 
 
 def clear_of_shore(
-    points: Float[np.ndarray, "n 3"], level: Float[np.ndarray, "n"], terrain: Terrain
-) -> Bool[np.ndarray, "n"]:
+    points: Float[np.ndarray, "n 3"], level: Float[np.ndarray, " n"], terrain: Terrain
+) -> Bool[np.ndarray, " n"]:
     """Whether points (m) of a fluid whose surface stands at a level (z, m) are away from rocks and banks.
 
     Those that rise by less than `SHORE` above the surface, and its bed, do not count.
@@ -212,7 +212,7 @@ class Inlet:
             e.mark(masks, first)
         return masks
 
-    def inside(self, positions: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
+    def inside(self, positions: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
         """Particles in INFLOW cells."""
         grid = self._walls.grid
         low, high = (grid.low + c * grid.spacing for c in (self._low, self._high))
@@ -224,7 +224,7 @@ class Inlet:
         out[near] = self._cells[tuple(cells.T)]
         return out
 
-    def holds(self, positions: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
+    def holds(self, positions: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
         """Whether a particle may be put there: in INFLOW cells, clear of walls."""
         if not self._steady:
             return np.zeros(len(positions), bool)

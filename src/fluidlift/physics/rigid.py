@@ -152,7 +152,7 @@ class RigidBodies:
         return np.where(self.free[:, None], free, self._prescribed_spin)
 
     @property
-    def energy(self) -> Float[np.ndarray, "b"]:
+    def energy(self) -> Float[np.ndarray, " b"]:
         """J, of motion; free bodies."""
         turning = 0.5 * (self.spin * self.angular_momentum).sum(axis=1)
         return np.where(self.free, 0.5 * self.mass * np.square(self.velocity).sum(axis=1) + turning, 0.0)
@@ -342,13 +342,13 @@ class RigidBodies:
 
     # --- particles --------------------------------------------------------------------------------------------------
 
-    def inside(self, positions: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
+    def inside(self, positions: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
         """Which points lie in a body."""
         return distances(self._shapes, positions, self._static.grid.spacing)[0] <= 0.0
 
     def push_out(
         self, positions: Float[np.ndarray, "n 3"], velocities: Float[np.ndarray, "n 3"], *, tangential_share: float = 1
-    ) -> Bool[np.ndarray, "n"]:
+    ) -> Bool[np.ndarray, " n"]:
         """Move particles out of the bodies' present poses, in place; True: no place was found (see `rigid_push`)."""
         motion = (self.center, self.velocity, self.spin)
         lost = push_out(positions, velocities, self._shapes, motion, self._static, tangential_share=tangential_share)

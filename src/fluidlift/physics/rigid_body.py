@@ -38,7 +38,7 @@ def _unit(quats: np.ndarray, what: str) -> np.ndarray:
 class Trajectory:
     """Poses over time: straight lines and great arcs between them; the first and last one hold before and after."""
 
-    times: Float[np.ndarray, "k"]
+    times: Float[np.ndarray, " k"]
     """s, ascending"""
     positions: Float[np.ndarray, "k 3"]
     """m, of the body frame's origin"""
@@ -167,8 +167,8 @@ class RigidBody:
 
 
 def within_reach(
-    shapes: Shapes, walls: Walls, gravity: Float[np.ndarray, "3"], falls: Bool[np.ndarray, "b"]
-) -> Bool[np.ndarray, "b"]:
+    shapes: Shapes, walls: Walls, gravity: Float[np.ndarray, "3"], falls: Bool[np.ndarray, " b"]
+) -> Bool[np.ndarray, " b"]:
     """Which bodies touch the walls' box, or, of those that fall, hang where gravity brings them in by an open side."""
     grid, low, high = walls.grid, shapes.box_low, shapes.box_high
     beside = (high > grid.low) & (low < grid.high)

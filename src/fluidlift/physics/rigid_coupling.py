@@ -181,7 +181,7 @@ def _add_moving_faces(axis, first, low, h, share, offset, opening, distance, cen
 
 def moving_faces(
     cover: Cover, walls: Walls, center: Float[np.ndarray, "3"], spin: Float[np.ndarray, "3"]
-) -> tuple[Int[np.ndarray, "n 4"], Float[np.ndarray, "n 6"], Float[np.ndarray, "n"]]:
+) -> tuple[Int[np.ndarray, "n 4"], Float[np.ndarray, "n 6"], Float[np.ndarray, " n"]]:
     """Faces that count as solid and are covered by a body, and how their centres move with it: see `DraggedBody`.
 
     `center` of mass (m), `spin` in rad/s.

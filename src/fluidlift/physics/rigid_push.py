@@ -184,7 +184,7 @@ def push_out(
     walls: Walls,
     *,
     tangential_share: float = 1.0,
-) -> Bool[np.ndarray, "n"]:
+) -> Bool[np.ndarray, " n"]:
     """Move particles out of bodies, in place; those for which there is no place left are marked.
 
     Args:

@@ -276,7 +276,7 @@ class UnionWalls:
         """number of the body that closes a face which the terrain leaves open; else -1"""
         self._covered = tuple(np.zeros(grid.face_shape(a), np.float32) for a in range(3))
 
-    def update(self, shapes: Shapes, volumes: Float[np.ndarray, "b"], centers: Float[np.ndarray, "b 3"]) -> None:
+    def update(self, shapes: Shapes, volumes: Float[np.ndarray, " b"], centers: Float[np.ndarray, "b 3"]) -> None:
         """Walls for the poses of `shapes`; the bodies' true volumes (m^3) and centres of mass (m) correct `Cover`."""
         for cover in self.covers:
             self._put_back(cover)

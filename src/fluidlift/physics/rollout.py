@@ -75,7 +75,7 @@ class RolloutParameters:
 class Rollout:
     """What a rollout gives."""
 
-    velocity: Float[Tensor, "f"]
+    velocity: Float[Tensor, " f"]
     """flat face velocity after the last step, m/s, extrapolated beyond the fluid"""
     domain: RolloutDomain
     """layout of the last step"""
@@ -93,13 +93,13 @@ class Rollout:
         return self.potentials[-1] * float(parameters.density) / float(parameters.time_step)
 
 
-def flatten(velocity: FaceVelocity | Faces, dtype: torch.dtype = torch.float32) -> Float[Tensor, "f"]:
+def flatten(velocity: FaceVelocity | Faces, dtype: torch.dtype = torch.float32) -> Float[Tensor, " f"]:
     """Face arrays to the flat vector."""
     parts = velocity.components if isinstance(velocity, FaceVelocity) else velocity
     return torch.cat([torch.as_tensor(p, dtype=dtype).reshape(-1) for p in parts])
 
 
-def unflatten(flat: Float[Tensor, "f"], domain: RolloutDomain) -> Faces:
+def unflatten(flat: Float[Tensor, " f"], domain: RolloutDomain) -> Faces:
     """The flat vector to u, v, w."""
     o = domain.offsets
     u, v, w = (flat[o[a] : o[a + 1]].reshape(s) for a, s in enumerate(domain.face_shapes))
@@ -107,8 +107,8 @@ def unflatten(flat: Float[Tensor, "f"], domain: RolloutDomain) -> Faces:
 
 
 def apply_walls(
-    velocity: Float[Tensor, "f"], domain: RolloutDomain, parameters: RolloutParameters
-) -> Float[Tensor, "f"]:
+    velocity: Float[Tensor, " f"], domain: RolloutDomain, parameters: RolloutParameters
+) -> Float[Tensor, " f"]:
     """Friction of walls along the motion, and the bounce of walls across it."""
     share = torch.from_numpy(domain.wall_share)
     below, above = torch.from_numpy(domain.wall_below), torch.from_numpy(domain.wall_above)
@@ -119,11 +119,11 @@ def apply_walls(
 
 
 def set_inflow(
-    velocity: Float[Tensor, "f"],
+    velocity: Float[Tensor, " f"],
     domain: RolloutDomain,
     parameters: RolloutParameters,
-    pattern: Float[Tensor, "f"] | None,
-) -> Float[Tensor, "f"]:
+    pattern: Float[Tensor, " f"] | None,
+) -> Float[Tensor, " f"]:
     """Inflow faces take the bulk velocity plus fluctuation times pattern; closed faces become 0."""
     o = domain.offsets
     given = torch.cat([parameters.inflow_velocity[a].expand(o[a + 1] - o[a]) for a in range(3)])
@@ -133,12 +133,12 @@ def set_inflow(
 
 
 def explicit_terms_plain(
-    velocity: Float[Tensor, "f"],
+    velocity: Float[Tensor, " f"],
     domain: RolloutDomain,
     parameters: RolloutParameters,
-    pattern: Float[Tensor, "f"] | None = None,
+    pattern: Float[Tensor, " f"] | None = None,
     advection_gradient: str = "exact",
-) -> Float[Tensor, "f"]:
+) -> Float[Tensor, " f"]:
     """Advection, walls, body force, inflow of an extrapolated velocity, term by term."""
     o, h, dt = domain.offsets, float(domain.system.spacing), parameters.time_step
     moved = advect(unflatten(velocity, domain), dt, spacing=h, gradient=advection_gradient, active=domain.active())
@@ -149,11 +149,11 @@ def explicit_terms_plain(
 
 
 def explicit_terms(
-    velocity: Float[Tensor, "f"],
+    velocity: Float[Tensor, " f"],
     domain: RolloutDomain,
     parameters: RolloutParameters,
-    pattern: Float[Tensor, "f"] | None = None,
-) -> Float[Tensor, "f"]:
+    pattern: Float[Tensor, " f"] | None = None,
+) -> Float[Tensor, " f"]:
     """`explicit_terms_plain` with the exact gradient, in one go."""
     p = parameters
     moving = (p.time_step, p.wall_damping, p.restitution, p.gravity, p.inflow_velocity, p.inflow_fluctuation)
@@ -161,15 +161,15 @@ def explicit_terms(
 
 
 def step(
-    velocity: Float[Tensor, "f"],
+    velocity: Float[Tensor, " f"],
     domain: RolloutDomain,
     parameters: RolloutParameters,
     *,
-    pattern: Float[Tensor, "f"] | None = None,
+    pattern: Float[Tensor, " f"] | None = None,
     options: RolloutOptions | None = None,
     guess: np.ndarray | None = None,
     kept: list[tuple[np.ndarray, SolveReport]] | None = None,
-) -> Float[Tensor, "f"]:
+) -> Float[Tensor, " f"]:
     """One time step of the flat face velocity; see the module for the order of terms.
 
     Faces beyond the fluid and its walls keep what the extrapolation gave them.
@@ -192,12 +192,12 @@ def step(
 
 
 def rollout(
-    start: FaceVelocity | Faces | Float[Tensor, "f"],
+    start: FaceVelocity | Faces | Float[Tensor, " f"],
     domains: RolloutDomain | Sequence[RolloutDomain],
     parameters: RolloutParameters,
     *,
     steps: int,
-    patterns: Float[Tensor, "f"] | Sequence[Float[Tensor, "f"] | None] | None = None,
+    patterns: Float[Tensor, " f"] | Sequence[Float[Tensor, " f"] | None] | None = None,
     options: RolloutOptions | None = None,
     guesses: Sequence[np.ndarray] | None = None,
     checkpoint_every: int | None = None,

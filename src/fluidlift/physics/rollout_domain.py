@@ -51,26 +51,26 @@ class LinearMap:
 class RolloutLists:
     """Faces by what happens to them, as indices into the flat vector; see `rollout_kernels` for runs and components."""
 
-    known: Bool[np.ndarray, "f"]
+    known: Bool[np.ndarray, " f"]
     """faces that extrapolation starts from"""
     components: tuple[tuple[int, tuple[int, int, int]], ...]
     runs: tuple[tuple[np.ndarray, np.ndarray], ...]
     """dynamic faces of each component: runs, and where those of each plane begin"""
     extrapolation: tuple[np.ndarray, np.ndarray, np.ndarray]
     """faces in the order of filling, where the neighbours of each begin, neighbours"""
-    walls: Int[np.ndarray, "w"]
+    walls: Int[np.ndarray, " w"]
     """faces on which a wall acts"""
     wall_layout: tuple[np.ndarray, np.ndarray, np.ndarray]
     """their `wall_share`, `wall_below`, `wall_above`"""
-    inflow: Int[np.ndarray, "i"]
+    inflow: Int[np.ndarray, " i"]
     inflow_ends: tuple[int, int, int, int]
     """the inflow faces across axis a are inflow[ends[a]:ends[a + 1]]"""
-    closed: Int[np.ndarray, "c"]
+    closed: Int[np.ndarray, " c"]
     """walls: faces whose velocity is 0"""
-    outflow: Int[np.ndarray, "o"]
-    outlet: Int[np.ndarray, "o"]
+    outflow: Int[np.ndarray, " o"]
+    outlet: Int[np.ndarray, " o"]
     """faces that a head pushes"""
-    couplings: Float[np.ndarray, "f"]
+    couplings: Float[np.ndarray, " f"]
     """neighbours that a dynamic face is coupled with by viscosity, walls ahead and behind included"""
     boundary: tuple[np.ndarray, np.ndarray]
     """pairs of a dynamic face and a prescribed neighbour"""
@@ -85,33 +85,33 @@ class RolloutDomain:
     """faces to air weigh more the nearer the surface is, see `surface_distances`"""
     sweeps: int
     """of the extrapolation"""
-    dynamic: Bool[np.ndarray, "f"]
+    dynamic: Bool[np.ndarray, " f"]
     """faces whose velocity the momentum equation and the pressure change"""
-    wall: Bool[np.ndarray, "f"]
+    wall: Bool[np.ndarray, " f"]
     """closed faces beside cells whose pressure is solved"""
-    inflow: Float[np.ndarray, "f"]
+    inflow: Float[np.ndarray, " f"]
     """1 on faces with the prescribed inflow velocity"""
-    outflow: Float[np.ndarray, "f"]
+    outflow: Float[np.ndarray, " f"]
     """component of the mainstream along the face's axis on faces between fluid and OUTFLOW cells, else 0"""
-    outflow_faces: Float[np.ndarray, "f"]
+    outflow_faces: Float[np.ndarray, " f"]
     """1 on those faces"""
     outlet_head: Float[np.ndarray, "3 f"]
     """times gravity: acceleration by the weight of the liquid behind the outlet (`rollout_surface.outlet_head`)"""
-    interior: Float[np.ndarray, "f"]
+    interior: Float[np.ndarray, " f"]
     """1 on faces that keep a free value before the projection (neither wall nor inflow)"""
-    force: Float[np.ndarray, "f"]
+    force: Float[np.ndarray, " f"]
     """share of gravity each face feels: 1 on dynamic faces (liquid), minus the share of smoke beside them (gas:
     buoyancy acts against gravity, whose size is then that of the buoyancy)"""
-    wall_share: Float[np.ndarray, "f"]
+    wall_share: Float[np.ndarray, " f"]
     """0 to 1: how much solid runs along a dynamic face's cells"""
-    wall_count: Float[np.ndarray, "f"]
+    wall_count: Float[np.ndarray, " f"]
     """0 to 4: closed faces beside a dynamic face, mean of its two cells"""
-    wall_below: Float[np.ndarray, "f"]
-    wall_above: Float[np.ndarray, "f"]
+    wall_below: Float[np.ndarray, " f"]
+    wall_above: Float[np.ndarray, " f"]
     """0 to 1: closed share of the next face towards lower / higher index, where a wall stands across the motion"""
-    opening: Float[np.ndarray, "f"]
+    opening: Float[np.ndarray, " f"]
     """open share"""
-    reach: Float[np.ndarray, "f"]
+    reach: Float[np.ndarray, " f"]
     """1 / distance of the pressures on both sides of a dynamic face in cells, 0 on other faces"""
 
     @property

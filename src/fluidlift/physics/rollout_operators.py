@@ -59,7 +59,9 @@ class _SubtractGradient(torch.autograd.Function):
         return gradients[0], to_q, None
 
 
-def subtract_gradient(velocity: Float[Tensor, "f"], q: Float[Tensor, "c"], domain: RolloutDomain) -> Float[Tensor, "f"]:
+def subtract_gradient(
+    velocity: Float[Tensor, " f"], q: Float[Tensor, " c"], domain: RolloutDomain
+) -> Float[Tensor, " f"]:
     """velocity - gradient q in one go."""
     return _SubtractGradient.apply(velocity, q, domain)
 
@@ -216,13 +218,13 @@ def _tolerance(values: np.ndarray) -> float:
 
 
 def implicit_diffusion(
-    velocity: Float[Tensor, "f"],
+    velocity: Float[Tensor, " f"],
     domain: RolloutDomain,
     viscosity: Tensor,
     wall_damping: Tensor,
     time_step: Tensor,
     failed: list[SolveReport] | None = None,
-) -> Float[Tensor, "f"]:
+) -> Float[Tensor, " f"]:
     """One backward Euler step of viscosity; prescribed faces act as boundary values, walls by their damping.
 
     A component whose solve misses its tolerance appends a report to `failed`.
@@ -248,14 +250,14 @@ class _Outflow(torch.autograd.Function):
         return torch.from_numpy(g), torch.tensor(to_speed, dtype=gradients[0].dtype), None
 
 
-def set_outflow(velocity: Float[Tensor, "f"], domain: RolloutDomain, speed: Tensor) -> Float[Tensor, "f"]:
+def set_outflow(velocity: Float[Tensor, " f"], domain: RolloutDomain, speed: Tensor) -> Float[Tensor, " f"]:
     """Faces to OUTFLOW cells take `speed` along the mainstream."""
     return _Outflow.apply(velocity, speed, domain) if len(domain.lists.outflow) else velocity
 
 
 def push_outlet(
-    velocity: Float[Tensor, "f"], domain: RolloutDomain, gravity: Float[Tensor, "3"], time_step: Tensor
-) -> Float[Tensor, "f"]:
+    velocity: Float[Tensor, " f"], domain: RolloutDomain, gravity: Float[Tensor, "3"], time_step: Tensor
+) -> Float[Tensor, " f"]:
     """Faces to OUTFLOW cells feel the weight of the liquid behind them for one step."""
     faces = domain.lists.outlet
     if not len(faces):

@@ -54,8 +54,8 @@ class PressureRoute(ABC):
 
     @abstractmethod
     def solve(
-        self, rhs: Float[Tensor, "c"], system: PoissonSystem, guess: Float[np.ndarray, "nx ny nz"] | None
-    ) -> tuple[Float[Tensor, "c"], SolveReport]:
+        self, rhs: Float[Tensor, " c"], system: PoissonSystem, guess: Float[np.ndarray, "nx ny nz"] | None
+    ) -> tuple[Float[Tensor, " c"], SolveReport]:
         """q with A q = rhs, 0 outside the unknown cells; differentiable in `rhs`.
 
         Args:
@@ -75,8 +75,8 @@ class SymmetricRoute(PressureRoute):
         """The map on arrays, without a record."""
 
     def solve(
-        self, rhs: Float[Tensor, "c"], system: PoissonSystem, guess: Float[np.ndarray, "nx ny nz"] | None
-    ) -> tuple[Float[Tensor, "c"], SolveReport]:
+        self, rhs: Float[Tensor, " c"], system: PoissonSystem, guess: Float[np.ndarray, "nx ny nz"] | None
+    ) -> tuple[Float[Tensor, " c"], SolveReport]:
         """See `PressureRoute`."""
         reports: list[SolveReport] = []
         q = _SymmetricMap.apply(rhs, self, system, guess, reports)
@@ -149,8 +149,8 @@ class UnrolledPressure(PressureRoute):
     method: str = "unrolled"
 
     def solve(
-        self, rhs: Float[Tensor, "c"], system: PoissonSystem, guess: Float[np.ndarray, "nx ny nz"] | None
-    ) -> tuple[Float[Tensor, "c"], SolveReport]:
+        self, rhs: Float[Tensor, " c"], system: PoissonSystem, guess: Float[np.ndarray, "nx ny nz"] | None
+    ) -> tuple[Float[Tensor, " c"], SolveReport]:
         """See `PressureRoute`."""
         domain = stencil_domain(system)
         inside = torch.from_numpy(domain.inside)
@@ -226,13 +226,13 @@ class RolloutOptions:
 
 
 def project(
-    velocity: Float[Tensor, "f"],
+    velocity: Float[Tensor, " f"],
     domain: RolloutDomain,
     *,
     options: RolloutOptions | None = None,
     guess: np.ndarray | None = None,
     kept: list[tuple[np.ndarray, SolveReport]] | None = None,
-) -> Float[Tensor, "f"]:
+) -> Float[Tensor, " f"]:
     """The velocity without its divergence; appends the potential and the report of the solve to `kept`."""
     options = options or RolloutOptions()
     rhs = -apply_linear(velocity, domain.divergence)

@@ -271,12 +271,12 @@ def step(
 
 
 def rollout_on_device(
-    start: FaceVelocity | Faces | Float[Tensor, "f"],
+    start: FaceVelocity | Faces | Float[Tensor, " f"],
     domains: RolloutDomain | TorchDomain | Sequence[RolloutDomain | TorchDomain],
     parameters: RolloutParameters,
     *,
     steps: int,
-    patterns: Float[Tensor, "f"] | Sequence[Float[Tensor, "f"] | None] | None = None,
+    patterns: Float[Tensor, " f"] | Sequence[Float[Tensor, " f"] | None] | None = None,
     options: RolloutOptions | None = None,
     guesses: Sequence[np.ndarray] | None = None,
     device: torch.device | str = "cpu",

@@ -19,7 +19,7 @@ from fluidlift.numerics.torch_poisson import DeviceSystem
 from fluidlift.physics.rollout_domain import RolloutDomain
 
 
-def flat_to_box(flat: Float[Tensor, "f"], layout: RolloutDomain) -> Float[Tensor, "3 X Y Z"]:
+def flat_to_box(flat: Float[Tensor, " f"], layout: RolloutDomain) -> Float[Tensor, "3 X Y Z"]:
     """The flat face vector as three padded arrays."""
     o = layout.offsets
     parts = []
@@ -30,7 +30,7 @@ def flat_to_box(flat: Float[Tensor, "f"], layout: RolloutDomain) -> Float[Tensor
     return torch.stack(parts)
 
 
-def box_to_flat(box: Float[Tensor, "3 X Y Z"], layout: RolloutDomain) -> Float[Tensor, "f"]:
+def box_to_flat(box: Float[Tensor, "3 X Y Z"], layout: RolloutDomain) -> Float[Tensor, " f"]:
     """The reverse."""
     parts = [box[a, : s[0], : s[1], : s[2]].reshape(-1) for a, s in enumerate(layout.face_shapes)]
     return torch.cat(parts)
@@ -40,7 +40,7 @@ def box_to_flat(box: Float[Tensor, "3 X Y Z"], layout: RolloutDomain) -> Float[T
 class BackTrace:
     """Where the faces that advection moves lie. Axes are those of a face: across it first, the next two in turn."""
 
-    faces: Int[Tensor, "m"]
+    faces: Int[Tensor, " m"]
     """place in the flattened box"""
     around: Int[Tensor, "2 4 m"]
     """places of the four nearest faces of each of the other two components"""
@@ -50,7 +50,7 @@ class BackTrace:
     """largest index along each axis"""
     stride: Int[Tensor, "3 m"]
     """distance of neighbours in the flattened box"""
-    first: Int[Tensor, "m"]
+    first: Int[Tensor, " m"]
     """where the face's component begins in the flattened box"""
 
 

@@ -34,15 +34,15 @@ TIDY_EVERY = 4
 class Emitted:
     """Particles that fill the places where one is due. A place may take none, one or several, which share its mass."""
 
-    place: Int[np.ndarray, "m"]
+    place: Int[np.ndarray, " m"]
     """index of the place that each belongs to"""
     offset: Float[np.ndarray, "m 3"]
     """m, from there"""
-    source: Int[np.ndarray, "m"]
+    source: Int[np.ndarray, " m"]
     """index of the rest Gaussian that lends it its look"""
 
     @classmethod
-    def one_each(cls, source: Int[np.ndarray, "n"]) -> Emitted:
+    def one_each(cls, source: Int[np.ndarray, " n"]) -> Emitted:
         """One particle in each place."""
         return cls(np.arange(len(source)), np.zeros((len(source), 3), np.float32), source)
 

@@ -39,7 +39,7 @@ AROUND = [np.array(step) for step in product((-1, 0, 1), repeat=3)]
 
 def liquid_surface_plain(
     positions: Float[np.ndarray, "n 3"],
-    volumes: Float[np.ndarray, "n"],
+    volumes: Float[np.ndarray, " n"],
     grid: Grid,
     solids: SolidShares,
     *,

@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 class CellOrder:
     """Particles grouped by cell."""
 
-    order: Int[np.ndarray, "n"]
+    order: Int[np.ndarray, " n"]
     """particle indices, cell by cell (x slowest), stable"""
-    start: Int[np.ndarray, "cells+1"]
+    start: Int[np.ndarray, " cells+1"]
     """where each cell begins in `order`"""
 
 
@@ -110,7 +110,7 @@ def grid_to_particles(
 
 
 def deposit_to_cells(
-    positions: Float[np.ndarray, "n 3"], amounts: Float[np.ndarray, "n"], grid: Grid, order: CellOrder
+    positions: Float[np.ndarray, "n 3"], amounts: Float[np.ndarray, " n"], grid: Grid, order: CellOrder
 ) -> Float[np.ndarray, "nx ny nz"]:
     """Amounts shared among the eight nearest cell centres by trilinear weights; the total is kept."""
     out = np.zeros(grid.shape, np.float32)
@@ -120,7 +120,7 @@ def deposit_to_cells(
     return out
 
 
-def select_particles(particles: Particles, index: Int[np.ndarray, "m"]) -> Particles:
+def select_particles(particles: Particles, index: Int[np.ndarray, " m"]) -> Particles:
     """`Particles.select` for whole numbers, by all threads."""
     p, m = particles, len(index)
     state = [_float32(a) for a in (p.positions, p.velocities, p.affine, p.deformation, p.masses)]

@@ -87,7 +87,7 @@ def leaving(
     after: Float[np.ndarray, "n 3"],
     walls: Walls,
     mainstream: Float[np.ndarray, "3"],
-) -> Bool[np.ndarray, "n"]:
+) -> Bool[np.ndarray, " n"]:
     """Particles that are now out of the box, or have left the OUTFLOW cells along the mainstream."""
     grid = walls.grid
     out = np.empty(len(after), bool)
@@ -100,7 +100,7 @@ def leaving_plain(
     after: Float[np.ndarray, "n 3"],
     walls: Walls,
     mainstream: Float[np.ndarray, "3"],
-) -> Bool[np.ndarray, "n"]:
+) -> Bool[np.ndarray, " n"]:
     """`leaving` as it reads."""
     out = ~walls.grid.contains(after)
     last = np.asarray(walls.grid.shape) - 1

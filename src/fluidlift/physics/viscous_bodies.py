@@ -33,7 +33,7 @@ class DraggedBody:
     """component and index of the faces that move with it; only those with the role FIXED or WALL count"""
     values: Float[np.ndarray, "n 6"]
     """J: velocity of the face's centre per velocity (m/s) and angular velocity (rad/s) of the body"""
-    shift: Float[np.ndarray, "n"]
+    shift: Float[np.ndarray, " n"]
     """m/s: velocity of the centre less that given. The pressure wants the mean over the covered part, but only faces
     that move as their centres do are without strain when body and liquid turn together"""
 

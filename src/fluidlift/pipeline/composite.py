@@ -101,7 +101,7 @@ def with_fall(
     scale: place.MetricScale,
     points: Float[np.ndarray, "n 3"],
     velocities: Float[np.ndarray, "n 3"],
-    falls: Bool[np.ndarray, "n"],
+    falls: Bool[np.ndarray, " n"],
     seen: place.Sighting,
 ) -> place.MetricScale:
     """The scale from the jets' free fall, where nothing else gives one."""

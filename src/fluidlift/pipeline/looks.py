@@ -193,7 +193,7 @@ class Painter:
         """One frame, with the pixels of the camera."""
         mesh = None
         if self._mesher is not None:
-            mesh, _ = surface_of(frame.fluid, frame.velocities, self.terrain, self._mesher)
+            mesh, _ = surface_of(frame.fluid, frame.velocities, self.terrain, self._mesher, clamped=False)
         behind = self._behind(frame, mesh or self._caster(frame, backdrop), camera, backdrop)
         if self.look.style == "relit":
             return self._relit(frame.fluid, camera, behind, cut_out=backdrop.cut_out)
@@ -237,6 +237,9 @@ class Painter:
         far = self.seen_behind(camera) if backdrop.picture is None else backdrop.picture
         depth = np.zeros(far.shape[:2], np.float32) if backdrop.depth is None else backdrop.depth
         ground = self._ground if backdrop.picture is None else self._no_ground
+        if backdrop.picture is not None and self.look.style == "surface":
+            # the plate shows the ground: a liquid that touches it must not look through air
+            depth = np.where(depth > 0, depth, self._ground.depth(camera))
         # what is drawn as splats hides what is behind it, and lets no light through to the ground either
         clear = None if self.look.style == "relit" else self.material
         found = ground.picture(camera, Behind(far, depth), mesh, material=clear, bodies=frame.bodies)
@@ -301,7 +304,7 @@ class Painter:
         self, fluid: Gaussians, mesh: TriangleMesh | None, camera: PinholeCamera, behind: Behind
     ) -> LiquidSurface:
         if mesh is not None:
-            return mesh_surface(mesh, camera)
+            return mesh_surface(mesh, camera, radius=RADIUS * self.terrain.grid.spacing)
         if self.look.style == "transparent":
             apart = 0.5 * self.terrain.grid.spacing
             normals, share = fluid_normals(fluid, apart, self._bed)
@@ -311,7 +314,8 @@ class Painter:
             free = self._bed is None
             return splat_surface(fluid.select(seen), normals[seen], camera, volume=apart**3, far_side=free)
         radius = RADIUS * self.terrain.grid.spacing
-        return particle_surface(fluid.means, radius, camera, linear_from_srgb(np.clip(fluid.rgb, 0.0, 1.0)))
+        colors = linear_from_srgb(np.clip(fluid.rgb, 0.0, 1.0))
+        return particle_surface(fluid.means, radius, camera, colors, ground=behind.depth)
 
     def _traced(self, frame: Frame, camera: PinholeCamera, backdrop: Backdrop) -> Lit:
         """By light paths through the mesh, which reaches into the ground here: a gap would be a film of air."""

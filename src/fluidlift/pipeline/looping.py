@@ -45,7 +45,7 @@ class SplatFrame(NamedTuple):
     velocities: np.ndarray
 
 
-def faded(opacities: Float[np.ndarray, "n"], weight: float) -> Float[np.ndarray, "n"]:
+def faded(opacities: Float[np.ndarray, " n"], weight: float) -> Float[np.ndarray, " n"]:
     """Opacities with `weight` times the optical depth over the whole splat."""
     from scipy.special import spence
 

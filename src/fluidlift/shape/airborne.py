@@ -92,7 +92,7 @@ def airborne_setting(
 
 def inside_body(
     points: Float[np.ndarray, "n 3"], front: np.ndarray, back: np.ndarray, mask: np.ndarray, camera: PinholeCamera
-) -> Bool[np.ndarray, "n"]:
+) -> Bool[np.ndarray, " n"]:
     """Which world points lie between the near and the far side of the body seen by the camera."""
     uv, z = camera.project(points)
     height, width = mask.shape

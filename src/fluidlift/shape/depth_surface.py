@@ -63,9 +63,9 @@ class AlongHeight:
 
     direction: tuple[float, float]
     """unit vector on the ground, downstream"""
-    along: Float[np.ndarray, "k"]
+    along: Float[np.ndarray, " k"]
     """increasing"""
-    z: Float[np.ndarray, "k"]
+    z: Float[np.ndarray, " k"]
     relief: Relief | None = None
     """what stands out of that"""
 

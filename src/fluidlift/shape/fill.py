@@ -195,7 +195,7 @@ def inside(
     rays: int = 12,
     rng: np.random.Generator,
     closed_below: Terrain | None = None,
-) -> Bool[np.ndarray, "n"]:
+) -> Bool[np.ndarray, " n"]:
     """Whether points lie inside: in the hull, or most of the rays from them cross the hull an odd number of times.
 
     Args:
@@ -290,7 +290,7 @@ def fill(
     return Gaussians(means, quats, np.full((len(means), 3), width), opacities, gaussians.sh[nearest])
 
 
-def _boxed(shell: np.ndarray, cells: np.ndarray, open_below: bool) -> Bool[np.ndarray, "n"]:
+def _boxed(shell: np.ndarray, cells: np.ndarray, open_below: bool) -> Bool[np.ndarray, " n"]:
     """Cells with hull on both sides along some axis, or above them over a bed: the only ones worth any rays."""
     sides = np.zeros(len(cells), np.int64)
     above = np.zeros(len(cells), bool)

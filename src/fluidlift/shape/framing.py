@@ -13,7 +13,7 @@ BORDER = 0.5
 crosses a corner less"""
 
 
-def framing_warnings(mask: Bool[np.ndarray, "h w"], areas: Float[np.ndarray, "t"]) -> list[str]:
+def framing_warnings(mask: Bool[np.ndarray, "h w"], areas: Float[np.ndarray, " t"]) -> list[str]:
     """What the user should know of a fluid that the picture cuts off on all sides, or that is gone at times.
 
     Args:

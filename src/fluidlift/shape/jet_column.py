@@ -20,9 +20,9 @@ class Jet:
 
     axis: tuple[float, float]
     """x, y"""
-    z: Float[np.ndarray, "k"]
+    z: Float[np.ndarray, " k"]
     """increasing, from below the foot to the top"""
-    radius: Float[np.ndarray, "k"]
+    radius: Float[np.ndarray, " k"]
     """at these heights"""
 
     def __post_init__(self) -> None:

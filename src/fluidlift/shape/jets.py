@@ -57,7 +57,7 @@ class Outline:
     pixels: Bool[np.ndarray, "h w"]
     centers: Float[np.ndarray, "k 2"]
     """(u, v) of its axis from the top to the foot, px; the last is where its near side meets the lying part"""
-    half_widths: Float[np.ndarray, "k"]
+    half_widths: Float[np.ndarray, " k"]
     """px"""
     cut: bool
     """whether its top lies at the picture's edge"""

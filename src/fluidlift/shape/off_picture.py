@@ -57,7 +57,7 @@ def continued(
     return copies, hull.select(~covered[_half_cells(hull.means, setting)] | (below > HIDDEN * grid.spacing))
 
 
-def in_picture(points: Float[np.ndarray, "n 3"], camera: PinholeCamera) -> Bool[np.ndarray, "n"]:
+def in_picture(points: Float[np.ndarray, "n 3"], camera: PinholeCamera) -> Bool[np.ndarray, " n"]:
     """Whether points (world, m) lie in front of the camera and within the edges of its picture."""
     uv, z = camera.project(points)
     return (z > 0) & (uv >= 0).all(axis=1) & (uv < camera.size).all(axis=1)
@@ -93,7 +93,7 @@ class _Level:
             height = height[tuple(nearest)]
         self._height, self._low, self._spacing = height, grid.low[:2], grid.spacing
 
-    def __call__(self, xy: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
+    def __call__(self, xy: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
         from scipy.ndimage import map_coordinates
 
         at = ((np.asarray(xy, np.float64) - self._low) / self._spacing - 0.5).T

@@ -52,7 +52,7 @@ class FreeFall:
 class Sighting:
     """How velocities were seen."""
 
-    trust: Float[np.ndarray, "n"] | None = None
+    trust: Float[np.ndarray, " n"] | None = None
     """0 to 1, of each; None: all alike"""
     interval: float = 0.0
     """s between the two pictures that a velocity comes from. It is the mean over that time, so it belongs to the middle

@@ -68,7 +68,7 @@ def prune(
     return g.select(left), PruneReport(*counts)
 
 
-def _sound(g: Gaussians) -> Bool[np.ndarray, "n"]:
+def _sound(g: Gaussians) -> Bool[np.ndarray, " n"]:
     ok = np.isfinite(g.means).all(1) & np.isfinite(g.scales).all(1) & (g.scales > 0).all(1)
     ok &= np.isfinite(g.quats).all(1) & (np.abs(g.quats).max(1, initial=0.0) > 1e-12)
     return ok & np.isfinite(g.opacities) & np.isfinite(g.sh).all((1, 2))
@@ -81,7 +81,7 @@ def body_size(points: Float[np.ndarray, "n 3"]) -> float:
     return float(np.linalg.norm(np.ptp(np.quantile(points, [0.02, 0.98], axis=0), axis=0)))
 
 
-def lonely(points: Float[np.ndarray, "n 3"], neighbours: int = 4) -> Bool[np.ndarray, "n"]:
+def lonely(points: Float[np.ndarray, "n 3"], neighbours: int = 4) -> Bool[np.ndarray, " n"]:
     """Points with fewer than `neighbours` others within three times the distance at which the points nearby hold eight.
 
     The comparison is with the nearest eight points, so that a body may thin out with its distance from the camera.

@@ -60,7 +60,7 @@ class RefineResult:
     """Gaussians after the refinement, and whether it was worth it."""
 
     gaussians: Gaussians
-    loss_history: Float[np.ndarray, "iterations"]
+    loss_history: Float[np.ndarray, " iterations"]
     psnr_before: float
     """dB inside the mask"""
     psnr_after: float
@@ -335,7 +335,7 @@ def _densify(raw: _Raw, pushes: torch.Tensor, room: int, view: View, depth: np.n
 
 def _surface_step(
     view: View, depth: np.ndarray, middle: np.ndarray, move: np.ndarray, scale: np.ndarray
-) -> Float[np.ndarray, "n"]:
+) -> Float[np.ndarray, " n"]:
     """How far (m) along the line of sight the visible surface runs under a move across it; 0 away from the surface."""
     (u0, v0), z0 = _pixels(view, middle)
     (u1, v1), _ = _pixels(view, middle + move)
@@ -373,7 +373,7 @@ def _prune_background(raw: _Raw, frame: Frame) -> int:
     return int(gone.sum())
 
 
-def _at_border(means: np.ndarray, frame: Frame) -> Bool[np.ndarray, "n"]:
+def _at_border(means: np.ndarray, frame: Frame) -> Bool[np.ndarray, " n"]:
     """Centres within the cut-out that lie outside the mask or within `BORDER` px of its edge."""
     (column, row), _ = _pixels(frame.view, means)
     height, width = frame.mask.shape

@@ -73,7 +73,7 @@ class FlowPatches:
     """px, the middle of the way that was seen"""
     motion: Float[np.ndarray, "n 2"]
     """px per frame, medians"""
-    weight: Float[np.ndarray, "n"]
+    weight: Float[np.ndarray, " n"]
     """0 to 1"""
 
 
@@ -212,7 +212,7 @@ def estimate_tilt(
 
 def speed_along(
     camera: PinholeCamera, patches: FlowPatches, axes: Float[np.ndarray, "3 3"], drop: float
-) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Distance along the stream and downstream speed (per frame) of each patch, in the unit of `drop`.
 
     Args:
@@ -227,8 +227,8 @@ def speed_along(
 
 
 def energy_profile(
-    along: Float[np.ndarray, "n"], speed: Float[np.ndarray, "n"], weight: Float[np.ndarray, "n"], channel: Channel
-) -> tuple[Float[np.ndarray, "k"], Float[np.ndarray, "k"]]:
+    along: Float[np.ndarray, " n"], speed: Float[np.ndarray, " n"], weight: Float[np.ndarray, " n"], channel: Channel
+) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
     """How far (m) the surface has fallen at distances along it (m), the first of them 0.
 
     Args:
@@ -313,7 +313,7 @@ def headings(camera: PinholeCamera, patches: FlowPatches, slope: float) -> list[
 
 def plane_evidence(
     camera: PinholeCamera, patches: FlowPatches, axes: Float[np.ndarray, "3 3"]
-) -> tuple[float, Float[np.ndarray, "k"]]:
+) -> tuple[float, Float[np.ndarray, " k"]]:
     """Logarithm of the evidence for a plane with these axes, and the coefficients of the field over its mean speed.
 
     Minus infinity where the camera does not see such a plane in all patches.

@@ -49,9 +49,9 @@ class PlaneHeight:
 class ProfileHeight:
     """A surface of translation: z depends on the distance from the viewer alone (a fall seen from the front)."""
 
-    away: Float[np.ndarray, "k"]
+    away: Float[np.ndarray, " k"]
     """increasing y"""
-    z: Float[np.ndarray, "k"]
+    z: Float[np.ndarray, " k"]
 
     def height(self, xy: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
         """z above the ground positions; level beyond the upper end, gently sloping (5 degrees) beyond the foot."""
@@ -66,9 +66,9 @@ class ProfileAlongHeight:
 
     ahead: tuple[float, float]
     """unit vector that points downstream over the ground"""
-    along: Float[np.ndarray, "k"]
+    along: Float[np.ndarray, " k"]
     """increasing distances (x, y) . ahead"""
-    z: Float[np.ndarray, "k"]
+    z: Float[np.ndarray, " k"]
 
     def height(self, xy: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
         """z above the ground positions; straight on beyond both ends."""

@@ -93,7 +93,7 @@ def unite(bodies: Sequence[Gaussians], *, spacing: float, per_voxel: int = 1, wh
     return everything.select(np.sort(order[kept]))
 
 
-def _beside(cells: Int[np.ndarray, "n 3"], own: Bool[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
+def _beside(cells: Int[np.ndarray, "n 3"], own: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
     """Whether a cell of the others is, or touches, one of `own` (with its faces, edges or corners)."""
     out = np.zeros(len(cells), bool)
     others = np.flatnonzero(~own)

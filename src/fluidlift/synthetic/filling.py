@@ -88,7 +88,7 @@ def inside(grid: Grid, distance: Distance, *, seed: int = 0) -> Float[np.ndarray
     return points + np.random.default_rng(seed).uniform(-JITTER, JITTER, points.shape) * step
 
 
-def within(body: RigidBody, points: Float[np.ndarray, "n 3"], spacing: float) -> Bool[np.ndarray, "n"]:
+def within(body: RigidBody, points: Float[np.ndarray, "n 3"], spacing: float) -> Bool[np.ndarray, " n"]:
     """Which points (m) lie in a body at its start; `spacing` (m) of the grid on which its distance is taken."""
     position, quat = body.start(0.0)
     # sums, not matrix products: the points of a large scene would start threaded BLAS

@@ -32,7 +32,7 @@ class Backdrop:
     """The ground without the liquid on one raster of rays."""
 
     camera: PinholeCamera
-    depth: Float[np.ndarray, "n"]
+    depth: Float[np.ndarray, " n"]
     """camera z, m; inf where the ray meets nothing"""
     color: Float[np.ndarray, "n 3"]
     """linear, lit and with the shadows of the ground on itself"""

@@ -29,7 +29,7 @@ class Noise:
         rank[np.argsort(raw, axis=None)] = (np.arange(raw.size) + 0.5) / raw.size
         return cls(rank.reshape(raw.shape).astype(np.float32), period)
 
-    def at(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+    def at(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """Values at points (m)."""
         at = np.asarray(points) / self.period * len(self.table)
         return ndimage.map_coordinates(self.table, at.T, order=1, mode="grid-wrap")

@@ -22,7 +22,7 @@ BLUR = 1.6
 SPREAD = 0.4
 """standard deviation of what sharing particles out to cells adds, in fine cells"""
 
-ScalarField = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n"]]
+ScalarField = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, " n"]]
 """values at positions in m"""
 
 
@@ -34,7 +34,7 @@ class Body:
     level: Float[np.ndarray, "nx ny nz"]
     """0.5 minus the smoothed share of the rest density: negative inside"""
 
-    def values(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+    def values(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """The level at points (m)."""
         return sample_centers(self.level, self.grid, points)
 
@@ -66,7 +66,7 @@ def finer(grid: Grid) -> Grid:
     return Grid(tuple(2 * n for n in grid.shape), grid.spacing / 2, grid.origin)
 
 
-def deposit(points: Float[np.ndarray, "n 3"], weights: Float[np.ndarray, "n"], grid: Grid) -> np.ndarray:
+def deposit(points: Float[np.ndarray, "n 3"], weights: Float[np.ndarray, " n"], grid: Grid) -> np.ndarray:
     """Sum of the weights of points (m) at cell centres, shared out trilinearly."""
     at = (np.asarray(points, np.float64) - grid.low) / grid.spacing - 0.5
     base = np.floor(at).astype(np.int64)
@@ -121,10 +121,10 @@ def first_hit(
     field: ScalarField,
     eye: Float[np.ndarray, "3"],
     rays: Float[np.ndarray, "n 3"],
-    start: Float[np.ndarray, "n"],
-    stop: Float[np.ndarray, "n"],
+    start: Float[np.ndarray, " n"],
+    stop: Float[np.ndarray, " n"],
     step: float,
-) -> Float[np.ndarray, "n"]:
+) -> Float[np.ndarray, " n"]:
     """Depth of the first point of each ray where the field turns negative; inf where it does not.
 
     Args:
@@ -158,12 +158,12 @@ def sphere_trace(
     distance: ScalarField,
     eye: Float[np.ndarray, "3"],
     rays: Float[np.ndarray, "n 3"],
-    start: Float[np.ndarray, "n"],
-    stop: Float[np.ndarray, "n"],
+    start: Float[np.ndarray, " n"],
+    stop: Float[np.ndarray, " n"],
     *,
     tolerance: float,
     safety: float = 0.6,
-) -> Float[np.ndarray, "n"]:
+) -> Float[np.ndarray, " n"]:
     """Depth where each ray meets a body; inf where it does not (Hart 1996).
 
     Args:
@@ -193,9 +193,9 @@ def see(
     body: Body,
     camera: PinholeCamera,
     uv: Float[np.ndarray, "n 2"],
-    wall: Float[np.ndarray, "n"],
+    wall: Float[np.ndarray, " n"],
     region: Grid | None = None,
-) -> Float[np.ndarray, "n"]:
+) -> Float[np.ndarray, " n"]:
     """Camera depth of the liquid at picture positions, inf where a solid (at depth `wall`) comes first or none is."""
     eye, rays = camera.position, camera.rays(uv)
     start, stop = box_range(region or body.grid, eye, rays)

@@ -57,7 +57,7 @@ class Twin:
     kind: str
     """of the fit"""
     steps_per_frame: int
-    pattern: Float[np.ndarray, "f"] | None
+    pattern: Float[np.ndarray, " f"] | None
     """flat fluctuation of the inlet of unit root mean square, steady; None: uniform inflow"""
     exact: tuple[FaceVelocity, ...]
     """the frames as they were rolled out"""
@@ -210,7 +210,7 @@ def _frames(
     return tuple(out)
 
 
-def inflow_pattern(domain: RolloutDomain, rng: np.random.Generator) -> Float[np.ndarray, "f"]:
+def inflow_pattern(domain: RolloutDomain, rng: np.random.Generator) -> Float[np.ndarray, " f"]:
     """Smooth noise over the inlet, float32: mean 0 per component, mean squares of the components add up to 1."""
     o, out, power = domain.offsets, np.zeros(domain.offsets[3]), 0.0
     for a, shape in enumerate(domain.face_shapes):

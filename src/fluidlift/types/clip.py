@@ -17,7 +17,7 @@ class VideoClip:
 
     frames: UInt8[np.ndarray, "t h w 3"]
     """sRGB"""
-    times: Float[np.ndarray, "t"]
+    times: Float[np.ndarray, " t"]
     """presentation times in s; variable frame rates are real"""
     source: str = ""
     """name of the file, without its folder"""

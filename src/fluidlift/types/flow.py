@@ -36,7 +36,7 @@ class SurfaceMotion:
     """m"""
     velocities: Float[np.ndarray, "n 3"]
     """m/s"""
-    observed: Bool[np.ndarray, "n"]
+    observed: Bool[np.ndarray, " n"]
     """False where the mainstream filled in"""
 
     def __post_init__(self) -> None:

@@ -26,7 +26,7 @@ class Gaussians:
     """orientation w x y z, unit"""
     scales: Float[np.ndarray, "n 3"]
     """standard deviations along the principal axes, m"""
-    opacities: Float[np.ndarray, "n"]
+    opacities: Float[np.ndarray, " n"]
     """0 to 1"""
     sh: Float[np.ndarray, "n k 3"]
     """k = (d+1)^2 coefficients per colour channel; rgb = 0.5 + 0.28209 sh[:, 0] when d = 0"""
@@ -60,9 +60,9 @@ class Gaussians:
     def isotropic(
         cls,
         means: Float[np.ndarray, "n 3"],
-        scale: float | Float[np.ndarray, "n"],
+        scale: float | Float[np.ndarray, " n"],
         rgb: Float[np.ndarray, "n 3"],
-        opacity: float | Float[np.ndarray, "n"] = 0.9,
+        opacity: float | Float[np.ndarray, " n"] = 0.9,
     ) -> Gaussians:
         """Round Gaussians of one standard deviation (m) with colours in [0, 1]."""
         n = len(means)

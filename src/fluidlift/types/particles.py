@@ -22,11 +22,11 @@ class Particles:
     """1/s: row a is the gradient of velocity component a (paper: C)"""
     deformation: Float[np.ndarray, "n 3 3"]
     """no unit (paper: F)"""
-    masses: Float[np.ndarray, "n"]
+    masses: Float[np.ndarray, " n"]
     """kg"""
-    source: Int[np.ndarray, "n"]
+    source: Int[np.ndarray, " n"]
     """index of the rest Gaussian that lends its look"""
-    ids: Int[np.ndarray, "n"]
+    ids: Int[np.ndarray, " n"]
     """stable over time"""
 
     def __post_init__(self) -> None:
@@ -46,8 +46,8 @@ class Particles:
     def at_rest(
         cls,
         positions: Float[np.ndarray, "n 3"],
-        masses: float | Float[np.ndarray, "n"],
-        source: Int[np.ndarray, "n"] | None = None,
+        masses: float | Float[np.ndarray, " n"],
+        source: Int[np.ndarray, " n"] | None = None,
         velocities: Float[np.ndarray, "n 3"] | None = None,
         first_id: int = 0,
     ) -> Particles:

@@ -81,7 +81,8 @@ def inflow_look(scene: Scene, own: Gaussians, speed: float) -> InflowLook:
     from fluidlift.look.inflow import InflowLook, surface_level
     from fluidlift.physics.inlet import clear_of_shore
 
-    terrain, lying, usable = scene.terrain, scene.kind in LYING, None
+    # a sheet that falls has no level to keep to
+    terrain, lying, usable = scene.terrain, scene.kind == "stream", None
     spacing = 0.5 * terrain.grid.spacing
     if lying and len(own):
         uv, z = scene.camera.project(own.means)
@@ -98,7 +99,8 @@ def within_outlet(scene: Scene) -> tuple[np.ndarray, Particles]:
     if scene.kind not in LYING:
         return scene.cell_types, scene.body
     cells, grid = thin_outlet(scene.cell_types), scene.terrain.grid
-    cells = inlet_to_surface(cells, scene.body.positions, grid)
+    if scene.kind == "stream":
+        cells = inlet_to_surface(cells, scene.body.positions, grid)
     behind = (scene.cell_types == CellType.OUTFLOW) & (cells != CellType.OUTFLOW)
     at = np.clip(grid.cell_of(scene.body.positions), 0, np.asarray(grid.shape) - 1)
     return cells, scene.body.select(~behind[tuple(at.T)])

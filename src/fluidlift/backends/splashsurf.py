@@ -20,6 +20,8 @@ INSIDE = 0.6
 """share of the density of the full fluid at which the surface lies"""
 SMOOTHING = 15
 """passes over the mesh; the weights keep flat parts from shrinking and take the lattice out of sprays"""
+BLOCK = 32
+"""cells along a side of the blocks that are worked on at a time: small bodies fill more cores than with the package's 64"""
 FEWEST = 4
 """particles with neighbours: fewer bound nothing"""
 
@@ -46,15 +48,19 @@ class SplashsurfMesher(Mesher):
         require(np.isfinite(radius) and radius > 0, f"a radius of {radius}", "positive metres")
         points = np.ascontiguousarray(positions, np.float64)
         sound = np.isfinite(points).all(axis=1)
-        values = {k: np.ascontiguousarray(np.asarray(v, np.float64)[sound]) for k, v in attributes.items()}
+        values = {k: np.ascontiguousarray(np.asarray(v, np.float32)[sound]) for k, v in attributes.items()}
         if sound.sum() < FEWEST:
             return _nothing(values)
+        # single precision takes two thirds of the time; about its middle a body loses nothing by it
+        middle = points[sound].mean(axis=0)
         found, _ = self._package.reconstruction_pipeline(
-            np.ascontiguousarray(points[sound]), attributes_to_interpolate=values, particle_radius=radius,
+            np.float32(points[sound] - middle), attributes_to_interpolate=values, particle_radius=radius,
             smoothing_length=KERNEL, cube_size=CUBE, iso_surface_threshold=INSIDE, mesh_cleanup=True,
             decimate_barnacles=True, mesh_smoothing_iters=SMOOTHING, mesh_smoothing_weights=True,
+            subdomain_num_cubes_per_dim=BLOCK,
         )  # fmt: skip
-        vertices, faces = np.asarray(found.mesh.vertices, np.float32), np.asarray(found.mesh.triangles, np.int64)
+        vertices = np.float32(np.asarray(found.mesh.vertices, np.float64) + middle)
+        faces = np.asarray(found.mesh.triangles, np.int64)
         if len(faces) == 0:
             return _nothing(values)
         carried = {k: np.asarray(found.point_attributes[k], np.float32) for k in values}

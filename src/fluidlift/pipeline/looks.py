@@ -237,8 +237,8 @@ class Painter:
         far = self.seen_behind(camera) if backdrop.picture is None else backdrop.picture
         depth = np.zeros(far.shape[:2], np.float32) if backdrop.depth is None else backdrop.depth
         ground = self._ground if backdrop.picture is None else self._no_ground
-        if backdrop.picture is not None and self.look.style == "surface":
-            # the plate shows the ground: a liquid that touches it must not look through air
+        if backdrop.picture is not None and self.look.style == "surface" and self._bed is not None:
+            # the plate shows the ground: a liquid that touches it must not look through air. A vessel may be of glass
             depth = np.where(depth > 0, depth, self._ground.depth(camera))
         # what is drawn as splats hides what is behind it, and lets no light through to the ground either
         clear = None if self.look.style == "relit" else self.material

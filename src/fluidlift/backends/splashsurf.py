@@ -21,7 +21,7 @@ INSIDE = 0.6
 SMOOTHING = 15
 """passes over the mesh; the weights keep flat parts from shrinking and take the lattice out of sprays"""
 BLOCK = 32
-"""cells along a side of the blocks that are worked on at a time: with the 64 of the package small bodies leave cores idle"""
+"""cells along a side of the blocks worked on at a time: with the 64 of the package small bodies leave cores idle"""
 FEWEST = 4
 """particles with neighbours: fewer bound nothing"""
 

@@ -9,7 +9,7 @@ from fluidlift.numerics.mesh_distance import (
     squared_distance_to_triangle,
     thin_warning,
 )
-from fluidlift.numerics.solid_mesh import box_mesh, ellipsoid_mesh, flipped
+from fluidlift.numerics.solid_mesh import box_mesh, cylinder_mesh, ellipsoid_mesh, flipped
 from fluidlift.types import TriangleMesh
 
 
@@ -102,3 +102,14 @@ def test_a_body_thinner_than_a_cell_is_reported():
 def test_a_spacing_far_too_fine_is_refused():
     with pytest.raises(ValueError, match="coarser"):
         mesh_distance(box_mesh((1, 1, 1)), 0.001)
+
+
+def test_nodes_that_lie_in_a_plane_of_vertices_are_on_their_side():
+    """The axis of a cylinder lies among the nodes, to rounding: dividing by the spacing must not leave lines out."""
+    mesh = cylinder_mesh(0.064, 0.477)
+    for share in np.linspace(0.2, 0.5, 16):
+        found = mesh_distance(mesh, share * 0.0393517810518048, margin=1.5 * 0.0393517810518048)
+        nodes = found.grid.nodes()
+        away = np.hypot(nodes[..., 0], nodes[..., 1])
+        assert (found.distance[(away < 0.06) & (np.abs(nodes[..., 2]) < 0.23)] < 0).all(), share
+        assert (found.distance[(away > 0.068) | (np.abs(nodes[..., 2]) > 0.24)] > 0).all(), share

@@ -206,10 +206,11 @@ def test_an_obstacle_is_added_dragged_sized_let_float_and_removed(visit, viewer)
     entry = viewer.draft.obstacles[0]
     gizmo = viewer.panels.obstacles._gizmo
     along = np.array([0.0, 0.0, 1.0])
-    x, y = visit.on_screen(np.array(entry["position"]) + 0.6 * gizmo.scale * along)
-    far_x, far_y = visit.on_screen(np.array(entry["position"]) + 0.6 * gizmo.scale * along - [0, 0, 0.1])
 
     def drag():
+        grasped = np.array(entry["position"]) + 0.6 * gizmo.scale * along
+        x, y = visit.on_screen(grasped)  # anew: the page may still tell where its camera is
+        far_x, far_y = visit.on_screen(grasped - [0, 0, 0.1])
         visit.page.mouse.move(x, y)
         visit.page.mouse.down()
         visit.page.mouse.move(far_x, far_y, steps=4)

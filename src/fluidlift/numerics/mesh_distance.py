@@ -209,10 +209,11 @@ def _count_crossings(triangles, low, h, crossings):
     nx, ny, nz = crossings.shape
     for f in range(len(triangles)):
         t = triangles[f]
-        j0 = max(np.int64(np.ceil((min(t[0, 1], t[1, 1], t[2, 1]) - low[1]) / h)), 0)
-        j1 = min(np.int64(np.floor((max(t[0, 1], t[1, 1], t[2, 1]) - low[1]) / h)), ny - 1)
-        k0 = max(np.int64(np.ceil((min(t[0, 2], t[1, 2], t[2, 2]) - low[2]) / h)), 0)
-        k1 = min(np.int64(np.floor((max(t[0, 2], t[1, 2], t[2, 2]) - low[2]) / h)), nz - 1)
+        # a node more than the division says on either side: rounded, it may leave out one that lies on a vertex
+        j0 = max(np.int64(np.floor((min(t[0, 1], t[1, 1], t[2, 1]) - low[1]) / h)), 0)
+        j1 = min(np.int64(np.ceil((max(t[0, 1], t[1, 1], t[2, 1]) - low[1]) / h)), ny - 1)
+        k0 = max(np.int64(np.floor((min(t[0, 2], t[1, 2], t[2, 2]) - low[2]) / h)), 0)
+        k1 = min(np.int64(np.ceil((max(t[0, 2], t[1, 2], t[2, 2]) - low[2]) / h)), nz - 1)
         for j in range(j0, j1 + 1):
             for k in range(k0, k1 + 1):
                 y, z = low[1] + j * h, low[2] + k * h

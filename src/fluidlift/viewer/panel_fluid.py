@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import asyncio
-import logging
 import time
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from fluidlift.viewer.controls import Control, number, path_of
-
-LOG = logging.getLogger(__name__)
+from fluidlift.viewer.hearing import heard
 
 if TYPE_CHECKING:
     from fluidlift.viewer.app import Viewer
@@ -44,7 +40,7 @@ class FluidPanel:
             _label(control, value), low, high, step, control.slider_of(value), marks=_marks(control),
             hint=f"{control.range_told()}. {control.hint}.{power}",
         )  # fmt: skip
-        _heard(slider, lambda event, at: self._slid(event, control, at))
+        heard(slider, lambda event, at: self._slid(event, control, at))
         self._sliders[control.key] = slider
         self._by_label[control.label] = control
 
@@ -106,11 +102,11 @@ class FluidPanel:
         gui.add_markdown(
             "Colours are shown here; reflections, refraction and light in rendered pictures ('Save and run')."
         )
-        _heard(self._style, lambda e, value: self._looked(e, "style", value))
-        _heard(self._material, self._materialised)
-        _heard(self._light, lambda e, value: self._looked(e, "environment", value))
-        _heard(self._exposure, lambda e, value: self._looked(e, "exposure", float(value)))
-        _heard(self._tint, lambda e, value: self._looked(e, "tint", [round((c / 255) ** 2.2, 4) for c in value]))
+        heard(self._style, lambda e, value: self._looked(e, "style", value))
+        heard(self._material, self._materialised)
+        heard(self._light, lambda e, value: self._looked(e, "environment", value))
+        heard(self._exposure, lambda e, value: self._looked(e, "exposure", float(value)))
+        heard(self._tint, lambda e, value: self._looked(e, "tint", [round((c / 255) ** 2.2, 4) for c in value]))
 
     def _looked(self, event: Any, name: str, value: Any) -> None:
         if event.client is None:
@@ -147,26 +143,6 @@ class FluidPanel:
             self._exposure.value = _stops(look)
         if tuple(self._tint.value) != _bytes(look.get("tint")):
             self._tint.value = _bytes(look.get("tint"))
-
-
-def _heard(handle: Any, act: Callable[[Any, Any], None]) -> None:
-    """Have `act(event, value)` called with what a person chose.
-
-    The value is taken where the message arrives: by the time a thread is free for `act`, an edit that ended meanwhile
-    may have set the control back to what the scene holds.
-    """
-
-    async def heard(event: Any) -> None:
-        # not awaited: an edit that waits for another one would keep all other messages waiting
-        asyncio.get_running_loop().run_in_executor(None, act, event, handle.value).add_done_callback(_surprised)
-
-    handle.on_update(heard)
-
-
-def _surprised(done: asyncio.Future[None]) -> None:
-    error = done.exception()
-    if error is not None:
-        LOG.error("a control of the page", exc_info=error)
 
 
 def _label(control: Control, value: float) -> str:

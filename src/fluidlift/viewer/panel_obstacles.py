@@ -10,6 +10,7 @@ import numpy as np
 
 from fluidlift.errors import FluidliftError
 from fluidlift.pipeline.editing import Add, Remove
+from fluidlift.viewer.hearing import heard
 from fluidlift.viewer.mesh_files import MOST_BYTES, UNITS, kept_mesh, mesh_entry
 
 if TYPE_CHECKING:
@@ -40,7 +41,7 @@ class ObstaclePanel:
         with gui.add_folder("From a mesh file", expand_by_default=False):
             self._mesh_controls()
         self._chosen = gui.add_dropdown("chosen", (NONE,), initial_value=NONE, hint="the one that is edited below")
-        self._chosen.on_update(self._choose)
+        heard(self._chosen, self._choose)
         self._where = gui.add_markdown("No obstacle is chosen.")
         low, high = self._size_now / RANGE, self._size_now * RANGE
         self._size = gui.add_slider("width, m", _short(low), _short(high), _short(low / 10), _short(self._size_now))
@@ -49,9 +50,9 @@ class ObstaclePanel:
             "density, kg/m³", 20.0, 3000.0, 10.0, 500.0, hint="water 1000; less floats in it"
         )
         self._remove = gui.add_button("Remove", icon="trash", color="red")
-        self._size.on_update(self._sized)
-        self._motion.on_update(self._moves)
-        self._density.on_update(lambda e: self._set(e, "density", float(self._density.value)))
+        heard(self._size, self._sized)
+        heard(self._motion, self._moves)
+        heard(self._density, lambda e, value: self._set(e, "density", float(value)))
         self._remove.on_click(self._take_away)
         if viewer.asset.kind == "plume":
             gui.add_markdown("Smoke flows through obstacles: they are simulated in liquids only.")
@@ -125,10 +126,10 @@ class ObstaclePanel:
         entry = {"name": "", "shape": shape, "position": [_short(float(c)) for c in place]}
         self._put(shape, entry | _extent(shape, self._size_now))
 
-    def _choose(self, event: Any) -> None:
+    def _choose(self, event: Any, name: str) -> None:
         if event.client is None:
             return
-        self._viewer.chosen = "" if self._chosen.value == NONE else self._chosen.value
+        self._viewer.chosen = "" if name == NONE else name
         self.refresh()
         self._viewer.redraw()
 
@@ -147,8 +148,8 @@ class ObstaclePanel:
         viewer.draft.move(f"obstacles.{name}.{key}", value, told or f"{name}: {key} {value}", time.monotonic())
         viewer.changed()
 
-    def _sized(self, event: Any) -> None:
-        entry, width = self._entry(), float(self._size.value)
+    def _sized(self, event: Any, value: float) -> None:
+        entry, width = self._entry(), float(value)
         if entry is None or event.client is None:
             return
         if "mesh" in entry:
@@ -166,8 +167,8 @@ class ObstaclePanel:
         body = next((o for o in self._viewer.bodies() if o.name == entry["name"]), None)
         return None if body is None else float(np.ptp(body.mesh.vertices, axis=0).max())
 
-    def _moves(self, event: Any) -> None:
-        self._set(event, "motion", "free" if self._motion.value == FLOATS else "static")
+    def _moves(self, event: Any, motion: str) -> None:
+        self._set(event, "motion", "free" if motion == FLOATS else "static")
 
     # the gizmo
 

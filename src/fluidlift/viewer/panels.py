@@ -9,6 +9,7 @@ import numpy as np
 
 from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.viewer.footage import GONE, WIDTH
+from fluidlift.viewer.hearing import heard
 from fluidlift.viewer.panel_fluid import FluidPanel
 from fluidlift.viewer.panel_obstacles import ObstaclePanel
 from fluidlift.viewer.panel_run import RunPanel
@@ -58,18 +59,18 @@ class Panels:
         self._steps = gui.add_button_group("step", ("first", "back", "forward", "last"))
         self._speed = gui.add_dropdown("speed (1: real)", tuple(SPEEDS), initial_value="1")
         self._source = gui.add_dropdown("frames shown", ("saved frames", "live preview"), initial_value="saved frames")
-        self._frame.on_update(self._scrubbed)
+        heard(self._frame, self._scrubbed)
         self._play.on_click(self._played)
         self._steps.on_click(self._stepped)
-        self._speed.on_update(self._sped)
-        self._source.on_update(self._sourced)
+        heard(self._speed, self._sped)
+        heard(self._source, self._sourced)
 
-    def _scrubbed(self, event: Any) -> None:
+    def _scrubbed(self, event: Any, frame: float) -> None:
         if event.client is None:  # we moved it ourselves
             return
         with self._viewer.lock:
             self._viewer.timeline.pause()
-            self._viewer.timeline.seek(int(self._frame.value) - FIRST_FRAME)
+            self._viewer.timeline.seek(int(frame) - FIRST_FRAME)
         self._viewer.redraw()
 
     def _played(self, _: Any) -> None:
@@ -92,13 +93,13 @@ class Panels:
                 timeline.step(1 if way == "forward" else -1)
         self._viewer.redraw()
 
-    def _sped(self, _: Any) -> None:
+    def _sped(self, _: Any, speed: str) -> None:
         with self._viewer.lock:
-            self._viewer.timeline.speed = SPEEDS[self._speed.value]
+            self._viewer.timeline.speed = SPEEDS[speed]
 
-    def _sourced(self, event: Any) -> None:
+    def _sourced(self, event: Any, source: str) -> None:
         if event.client is not None:
-            self._viewer.set_source(self._source.value)
+            self._viewer.set_source(source)
 
     # view
 
@@ -107,7 +108,7 @@ class Panels:
         self._checks = {}
         for name, label in SHOWN.items():
             check = gui.add_checkbox(label, getattr(viewer.parts, name))
-            check.on_update(lambda event, name=name, check=check: self._ticked(event, name, bool(check.value)))
+            heard(check, lambda event, on, name=name: self._ticked(event, name, bool(on)))
             self._checks[name] = check
         self._legend = gui.add_markdown("", visible=False)
         gui.add_button("Look from the input camera", icon="video").on_click(self._input_view)

@@ -144,9 +144,10 @@ class Visit:
         return self.page.evaluate(script)
 
     def settled(self) -> None:
-        """Waits until what was asked for is drawn."""
+        """Waits until what was asked for is drawn, and the first picture, which lies above it, has faded."""
         end = time.monotonic() + 30
-        while self.run("fluidlift.state.dirty") and time.monotonic() < end:
+        faded = "getComputedStyle(document.getElementById('poster')).opacity === '0'"
+        while (self.run("fluidlift.state.dirty") or not self.run(faded)) and time.monotonic() < end:
             time.sleep(0.02)
         self.run("new Promise(f => requestAnimationFrame(() => requestAnimationFrame(f)))")
 

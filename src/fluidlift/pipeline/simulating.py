@@ -80,14 +80,14 @@ def inflow_look(scene: Scene, own: Gaussians, speed: float) -> InflowLook:
     rocks and banks."""
     from fluidlift.look.inflow import InflowLook, surface_level
     from fluidlift.physics.inlet import clear_of_shore
+    from fluidlift.shape.off_picture import in_picture
 
     # a sheet that falls has no level to keep to
     terrain, lying, usable = scene.terrain, scene.kind == "stream", None
     spacing = 0.5 * terrain.grid.spacing
     if lying and len(own):
-        uv, z = scene.camera.project(own.means)
-        usable = (z > 0) & (uv >= 0).all(axis=1) & (uv < scene.camera.size).all(axis=1)
-        usable &= clear_of_shore(own.means, surface_level(own.means, spacing)(own.means[:, :2]), terrain)
+        level = surface_level(own.means, spacing)(own.means[:, :2])
+        usable = in_picture(own.means, scene.camera) & clear_of_shore(own.means, level, terrain)
     return InflowLook(own, terrain.mainstream, speed, spacing, usable=usable, run=scene.inflow.run, lying=lying)
 
 

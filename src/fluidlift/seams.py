@@ -161,7 +161,8 @@ class Mesher(ABC):
     def surface(
         self, positions: np.ndarray, radius: float, attributes: Mapping[str, np.ndarray]
     ) -> tuple[TriangleMesh, dict[str, np.ndarray]]:
-        """The surface of particles, and what they carry interpolated to its vertices.
+        """The surface of particles, and what they carry interpolated to its vertices. The order of vertices and faces
+        may differ from call to call.
 
         Args:
             positions: float [n,3], m.

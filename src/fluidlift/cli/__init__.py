@@ -16,6 +16,7 @@ from typing import Any
 import tyro
 
 from fluidlift import __version__
+from fluidlift.cli.batch import Batch
 from fluidlift.cli.edit import Edit
 from fluidlift.cli.optional import REGISTRY
 from fluidlift.cli.options import (
@@ -39,6 +40,7 @@ from fluidlift.progress import shown_progress
 
 Command = (
     Make
+    | Batch
     | Edit
     | Sim
     | View
@@ -183,6 +185,12 @@ def _sim(c: Sim) -> int:
     with shown_progress() as progress:
         made = resimulate(c.asset, request=request, overrides=c.set, flat=flat, progress=progress)
     return _tell(made, c.json)
+
+
+def _batch(c: Batch) -> int:
+    from fluidlift.cli.batch import run
+
+    return run(c)
 
 
 def _edit(c: Edit) -> int:
@@ -352,7 +360,7 @@ def _doctor(c: Doctor) -> int:
 
 
 _COMMANDS = {
-    Make: _make, Fit: _fit, Sim: _sim, Edit: _edit, View: _view, Render: _render, Export: _export, Inspect: _inspect,
-    Mask: _mask, Motion: _motion, Evaluate: _evaluate, Validate: _validate, Demo: _demo, Generators: _generators,
-    Doctor: _doctor,
+    Make: _make, Batch: _batch, Fit: _fit, Sim: _sim, Edit: _edit, View: _view, Render: _render, Export: _export,
+    Inspect: _inspect, Mask: _mask, Motion: _motion, Evaluate: _evaluate, Validate: _validate, Demo: _demo,
+    Generators: _generators, Doctor: _doctor,
 }  # fmt: skip

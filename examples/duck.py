@@ -1,7 +1,11 @@
-"""A bath duck as a closed mesh: a few ellipsoids that melt into each other."""
+"""A bath duck as a closed mesh: a few ellipsoids that melt into each other.
+
+python examples/duck.py demo.fluid/duck.obj 0.23     # m, its length
+"""
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -61,3 +65,9 @@ def write_duck(path: Path, length: float) -> TriangleMesh:
     mesh = duck_mesh(length)
     write_obj(path, mesh)
     return mesh
+
+
+if __name__ == "__main__":
+    if len(sys.argv) < 2:
+        sys.exit(__doc__)
+    write_duck(Path(sys.argv[1]), float(sys.argv[2]) if len(sys.argv) > 2 else 0.23)

@@ -42,8 +42,12 @@ def objects() -> list[bpy.types.Object]:
     return [] if found is None else list(found.objects)
 
 
+COLOR = "Color"
+"""attribute of the vertices' colours; Cycles takes `color` for that of a volume, and finds none: black"""
+
+
 def fill_surface(mesh: bpy.types.Mesh, file: Path) -> None:
-    """The mesh of one frame, with `velocity` (m/s, as Cycles takes it for motion blur) and `color`."""
+    """The mesh of one frame, with `velocity` (m/s, as Cycles takes it for motion blur) and its colour."""
     vertices, faces = read_ply(file)
     material = mesh.materials[0] if mesh.materials else None
     mesh.clear_geometry()
@@ -79,7 +83,7 @@ def attributes(mesh: bpy.types.Mesh, table: np.ndarray) -> None:
     if color is not None:
         linear = np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
         full = np.concatenate([linear, np.ones((len(linear), 1))], axis=1).astype(np.float32)
-        _attribute(mesh, "color", "FLOAT_COLOR").data.foreach_set("color", full.ravel())
+        _attribute(mesh, COLOR, "FLOAT_COLOR").data.foreach_set("color", full.ravel())
     scale, opacity = columns(table, "scale_0", "scale_1", "scale_2"), columns(table, "opacity")
     number = whole_numbers(table, "id")
     if scale is not None:

@@ -11,6 +11,8 @@ from typing import NamedTuple
 
 import bpy
 
+from .build import COLOR
+
 OPAQUE = 300.0
 """1/m of scattering, from which on nothing is seen through a few millimetres"""
 DYED, LEAST = 0.1, 1e-3
@@ -97,7 +99,7 @@ def _colors_of_vertices(material: bpy.types.Material, shader: bpy.types.ShaderNo
     nodes, links = material.node_tree.nodes, material.node_tree.links
     attribute, dye = nodes.new("ShaderNodeAttribute"), nodes.new("ShaderNodeVectorMath")
     attribute.location, dye.location = (-420, 0), (-220, 0)
-    attribute.attribute_name = "color"
+    attribute.attribute_name = COLOR
     dye.operation = "MULTIPLY"
     dye.inputs[1].default_value = tuple(tint)
     links.new(attribute.outputs["Color"], dye.inputs[0])

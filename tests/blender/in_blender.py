@@ -77,6 +77,19 @@ def blurred_by_velocity() -> list[float]:
     return [float(np.abs(p - still).mean()) for p in (moving, again)]
 
 
+def shows_its_colors() -> bool:
+    """Whether a picture of the surface in the clip's colours turns red with the vertices, where it did not before."""
+    settings.material, mesh = "source", bpy.data.objects["fluid surface"].data
+    red = np.tile(np.float32([1, 0, 0, 1]), len(mesh.vertices))
+    before = picture()
+    mesh.attributes["Color"].data.foreach_set("color", red)
+    after = picture()
+    del bpy.data.objects["fluid surface"]["fluidlift_shown"]
+    changed = np.abs(after - before).max(axis=1) > 0.1
+    redder = (after[:, 0] - after[:, 1])[changed] - (before[:, 0] - before[:, 1])[changed]
+    return bool(changed.mean() > 0.02 and redder.mean() > 0.1)
+
+
 def surface_material() -> str:
     return bpy.data.objects["fluid surface"].data.materials[0].name
 
@@ -147,6 +160,7 @@ out["light"] = [scene.world.name, sum(o.type == "LIGHT" for o in scene.objects)]
 out["panel"] = panel()
 out["contact"] = contact()
 out["blur"] = blurred_by_velocity()
+out["colors"] = shows_its_colors()
 
 bpy.data.objects["fluid surface"].modifiers.new("mine", "SMOOTH")
 low, high = out["first"]["surface"]["low"], out["first"]["surface"]["high"]

@@ -116,6 +116,10 @@ def test_cycles_blurs_the_surface_by_its_velocities(seen):
     assert moving > 1e-4
 
 
+def test_cycles_shows_the_colours_of_the_vertices(seen):
+    assert seen[0]["colors"]
+
+
 def test_honey_is_the_medium_that_our_own_path_tracer_is_given(seen):
     extinction, share = medium(HONEY, np.zeros(3))
     found = seen[0]["honey"]

@@ -13,8 +13,10 @@ import pytest
 from PIL import Image
 
 from fluidlift.io.export_page import PageScene, write_page
+from fluidlift.io.frames import MovingMesh
 from fluidlift.io.page_frames import FrameEncoder, Range, decoded
 from fluidlift.look.rasterize import render
+from fluidlift.numerics.solid_mesh import box_mesh
 from fluidlift.types import Gaussians, PinholeCamera, TriangleMesh
 
 CAMERA = PinholeCamera.looking(np.array([0.3, -2.2, 1.0]), np.zeros(3), 45, (320, 200))
@@ -214,6 +216,56 @@ def test_a_vessel_does_not_hide_what_it_holds(browser, tmp_path):
     expected = alone + (1 - alpha) * 0.5 * (red - GROUND)
     expected = 0.25 * red + 0.75 * expected
     assert psnr(visit.picture(), expected) > 34  # three roundings to 8 bits, and the packed shapes
+
+
+def block(frames: int) -> MovingMesh:
+    """A blue box of 0.4 m that goes half a metre along x over the frames and ends on its side."""
+    box = box_mesh((0.4, 0.4, 0.1))
+    box = TriangleMesh(box.vertices, box.faces, np.tile(np.float32([[0.1, 0.2, 0.9]]), (len(box.vertices), 1)))
+    along = np.linspace(0, 0.5, frames)
+    turn = np.linspace(0, np.pi / 4, frames)
+    poses = np.stack([along, 0 * along, 0 * along], 1), np.stack([np.cos(turn), 0 * turn, np.sin(turn), 0 * turn], 1)
+    return MovingMesh("block", box, *poses)
+
+
+def test_solid_bodies_stand_where_they_are_in_each_frame(browser, tmp_path):
+    inside = [Gaussians.isotropic(p[None], 0.005, np.ones((1, 3)), np.ones(1)) for p in block(6).positions]
+    frames = [(g, np.zeros(1, int)) for g in inside]  # a spark within the body, which hides it
+    visit = Visit(browser, page_of(tmp_path / "page.html", frames, square(-0.6), bodies=(block(6),)))
+    visit.bare()
+    visit.run("fluidlift.camera(" + json.dumps(ABOVE.to_dict()) + ")")
+    for k, width in ((0, 0.4), (5, 0.1)):
+        visit.run(f"fluidlift.show({k})")
+        seen = np.argwhere(np.abs(visit.picture() - GROUND).max(axis=2) > 0.2)[:, ::-1] + 0.5
+        size = np.array([width, 0.4, 0.5 - width])  # on its side, its height lies along x
+        corners = block(6).positions[k] + 0.5 * size * [[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
+        pixels = ABOVE.project(corners)[0]
+        np.testing.assert_allclose(seen.min(axis=0), pixels.min(axis=0), atol=1.5)  # whole pixels
+        np.testing.assert_allclose(seen.max(axis=0), pixels.max(axis=0), atol=1.5)
+    visit.run("fluidlift.bodies(false)")
+    assert (np.abs(visit.picture() - GROUND).max(axis=2) > 0.2).sum() < 10  # the spark alone
+    assert [s for s in visit.said if not s.startswith("data:")] == []
+
+
+def test_splats_before_a_body_cover_it_and_those_behind_do_not(browser, tmp_path):
+    frames = moving(2)
+    pictures = {}
+    for z in (-0.9, 0.9):
+        still = MovingMesh("plate", square(z), np.zeros((2, 3)), np.tile([1.0, 0, 0, 0], (2, 1)))
+        visit = Visit(browser, page_of(tmp_path / f"{z}.html", frames, bodies=(still,)))
+        visit.bare()
+        visit.run("fluidlift.show(1); fluidlift.camera(" + json.dumps(ABOVE.to_dict()) + ")")
+        pictures[z] = visit.picture()
+    middle = np.s_[90:110, 150:170]
+    assert pictures[0.9][middle].std(axis=(0, 1)).max() < 0.01  # the plate alone, in one colour
+    alpha = render(frames[1][0], ABOVE).alpha[..., None]
+    assert np.abs(pictures[-0.9] - pictures[0.9])[alpha[..., 0] > 0.5].mean() > 0.1
+
+
+def test_bodies_with_other_frames_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="one for each frame"):
+        page_of(tmp_path / "page.html", moving(), bodies=(block(5),))
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_the_controls_do_what_they_say(browser, tmp_path):

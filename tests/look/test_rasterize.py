@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from fluidlift.look.project import view_colors
-from fluidlift.look.rasterize import render
+from fluidlift.look.project import sound, sound_plain, view_colors
+from fluidlift.look.rasterize import over_kernel, over_plain, render
 from fluidlift.types.camera import PinholeCamera
 from fluidlift.types.gaussians import Gaussians, concatenate
 from fluidlift.types.transforms import RigidTransform
@@ -121,7 +121,7 @@ def test_only_what_is_seen_gets_colours(monkeypatch):
     away = g.select(np.arange(1000))
     away = Gaussians(away.means + np.float32([0, -100, 0]), away.quats, away.scales, away.opacities, away.sh)
     counts = []
-    monkeypatch.setattr(module, "view_colors", lambda g, c: counts.append(len(g)) or view_colors(g, c))
+    monkeypatch.setattr(module, "view_colors", lambda g, c, i: counts.append(len(i)) or view_colors(g, c, i))
     drawn = render(concatenate([away, g]), CAMERA)
     np.testing.assert_array_equal(drawn.image, render(g, CAMERA).image)
     assert counts == [len(g)] * 2, "those behind the camera cost no colours"
@@ -134,3 +134,31 @@ def test_bands_of_tiles_change_no_bit_of_a_picture(monkeypatch):
     monkeypatch.setattr(splatting, "PAIRS_MAX", 500)
     parts = render(ball(), CAMERA)
     assert np.array_equal(parts.image, whole.image) and np.array_equal(parts.depth, whole.depth)
+
+
+@pytest.mark.parametrize("behind", [(1, 1), (13, 17)])
+def test_the_pass_that_puts_a_background_behind_is_its_plain_twin(behind):
+    rng = np.random.default_rng(0)
+    image, depth, light = (rng.random(shape).astype(np.float32) for shape in ((13, 17, 3), (13, 17), (13, 17)))
+    light[:5] = 1 - np.float32(1e-4)  # too thin for a depth
+    background = rng.random((*behind, 3)).astype(np.float32)
+    wanted = over_plain(image, depth, light, background)
+    over_kernel(image, depth, light, background)
+    for one, other in zip((image, depth, light), wanted):
+        np.testing.assert_allclose(one, other, rtol=1e-6)  # product and sum may be one instruction
+
+
+def test_one_broken_number_anywhere_makes_a_gaussian_unsound():
+    g = ball(64)
+    g = Gaussians(g.means, g.quats, g.scales, g.opacities, np.concatenate([g.sh, np.zeros((64, 3, 3), np.float32)], 1))
+    arrays = [a.copy() for a in (g.means, g.quats, g.scales, g.opacities, g.sh)]
+    row = 0
+    for array in arrays:
+        for bad in (np.nan, np.inf, -np.inf):
+            array.reshape(64, -1)[row, -1] = bad
+            row += 1
+    arrays[1][row] = 0
+    arrays[2][row + 1] *= -1
+    broken = Gaussians(*arrays)
+    assert np.array_equal(sound(broken), sound_plain(broken))
+    assert np.flatnonzero(~sound(broken)).tolist() == list(range(row + 2))

@@ -126,6 +126,11 @@ def test_smoothing_keeps_planes_and_steps_and_evens_bumps_out():
     step = np.where(u < 40, plane, plane + 0.5).astype(np.float32)  # another surface, much nearer
     after = passes(step)
     np.testing.assert_allclose(after[:, 60:], step[:, 60:], rtol=1e-6)
+    np.testing.assert_allclose(after[:, :40], step[:, :40], rtol=1e-6)  # the farther one is a plane up to its edge
+    # there it is smoothed like elsewhere, from one side: a line through half of the window has four times the variance
+    # at its end, twice the deviation
+    bumpy = passes(np.where(u < 40, rough, rough + 0.5).astype(np.float32)) - step
+    assert bumpy[10:-10, 36:40].std() < 2.0 * 0.2 * 0.01
     # nothing lies between the two: the nearer one falls off at its rim by half of `fall` at most, 0.05 m at 1 / 1.2 m
     assert (np.abs(after - step) < 0.5 * fall * 1.2**2).all()
     gone = np.where(u < 40, plane, 0).astype(np.float32)
@@ -193,21 +198,25 @@ def narrow_range_plain(q, down, across, focal, width, limit, fall, lanes=32):
             for col in np.flatnonzero(some) + first:
                 own = float(q[row, col])
                 low, high = own - limit * own**2, own + limit * own**2
-                total, weights = own, 1.0
+                found, going = [(0.0, 1.0, own)], {-1, 1}  # where, weight, inverse depth
                 for k in range(1, steps + 1):
-                    r, c = k * stride * down, k * stride * across
-                    if row < r or col < c or row + r >= h or col + c >= w:
-                        break
-                    pair = abs(np.array([q[row - r, col - c], q[row + r, col + c]], np.float64))
-                    if pair.max() > high:
-                        break
-                    near = pair > low
-                    pair = np.where(near, pair, own - fall * own**2)
-                    if near.all():
-                        low, high = min(low, pair.min() - limit * own**2), max(high, pair.max() + limit * own**2)
+                    met = {}
+                    for side in sorted(going):
+                        r, c = row + side * k * stride * down, col + side * k * stride * across
+                        value = abs(float(q[r, c])) if 0 <= r < h and 0 <= c < w else np.inf
+                        if value > high:
+                            going.remove(side)
+                        else:
+                            met[side] = value
                     weight = np.exp(-0.5 * (k * stride / wide[row, col]) ** 2)
-                    total, weights = total + weight * pair.sum(), weights + 2 * weight
-                out[row, col] = total / weights
+                    far = any(value <= low for value in met.values())
+                    found += [(s * k, weight, v if v > low else own - fall * own**2) for s, v in met.items()]
+                    if met and not far:
+                        low = min(low, min(met.values()) - limit * own**2)
+                        high = max(high, max(met.values()) + limit * own**2)
+                place, weight, value = np.array(found).T
+                if len(found) > 1:  # the line of least squares, at the pixel
+                    out[row, col] = np.polyfit(place, value, 1, w=np.sqrt(weight))[1]
     return out
 
 
@@ -225,6 +234,30 @@ def test_the_compiled_smoothing_is_that_of_the_formula(down, across):
     narrow_range(q, out, *settings)
     # float32, and a bell that is a power of 64 of a short series: 1e-5
     np.testing.assert_allclose(out, narrow_range_plain(q, *settings), rtol=3e-5)
+
+
+def test_through_a_gap_between_spheres_nothing_far_behind_is_seen():
+    # a sheet one particle thick, a diameter and a half before another: between four spheres of the first one a gap
+    camera = PinholeCamera.looking((0.0, 0.0, 3.0), (0.0, 0.0, 0.0), 30.0, (200, 200), up=(0.0, 1.0, 0.0))
+    x, y = (v.ravel() for v in np.meshgrid(*2 * (np.arange(-8, 9) * 1.6 * RADIUS,)))
+    sheets = [np.stack([x, y, np.full(x.shape, z)], -1) for z in (0.0, -6.0 * RADIUS)]
+    surface = particle_surface(np.concatenate(sheets), RADIUS, camera)
+    middle = slice(80, 120), slice(80, 120)
+    assert np.ptp(surface.depth[middle]) < 0.5 * RADIUS
+    assert surface.normal[middle][..., 2].min() > 0.97  # 14 degrees: the bumps of spheres so far apart
+
+
+def test_beside_a_rock_before_it_water_faces_up_like_elsewhere():
+    # a box hides half of a level pond: there the pond goes on behind it
+    ground = np.full((120, 160), 10.0, np.float32)
+    ground[:, 60:100] = 1.5
+    pond = box((2.4, 2.4, 0.2), jitter=0.2) - [0.0, 0.0, 0.2]
+    camera = PinholeCamera.looking((0.0, -2.0, 1.5), (0.0, 0.0, -0.1), 30.0, (160, 120))
+    surface = particle_surface(pond, RADIUS, camera, ground=ground)
+    assert not surface.depth[:, 60:100].any() and not surface.covered[:, 60:100].any()
+    beside, open_water = (surface.normal[30:90, c, 2] for c in ([58, 59, 100, 101], slice(20, 50)))
+    # without the pond behind the box the pixels at its rim keep the bumps of their spheres
+    assert np.percentile(beside, 2) > np.percentile(open_water, 2) - 0.05
 
 
 SLOPE = np.radians(15.0)

@@ -54,3 +54,10 @@ def test_a_gaussian_at_the_camera_has_a_finite_colour():
 def test_other_numbers_of_coefficients_are_refused():
     with pytest.raises(ValueError, match="5 coefficients"):
         colors(np.zeros((2, 3), np.float32), np.zeros((2, 5, 3), np.float32), EYE)
+
+
+def test_colours_of_some_are_those_of_all_in_the_order_asked_for():
+    rng = np.random.default_rng(0)
+    means, sh = rng.normal(size=(50, 3)).astype(np.float32), rng.normal(size=(50, 16, 3)).astype(np.float32)
+    some = rng.permutation(50)[:20]
+    assert np.array_equal(colors(means, sh, EYE, some), colors(means, sh, EYE)[some])

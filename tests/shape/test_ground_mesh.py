@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from fluidlift.shape.ground_mesh import ground_colours, ground_mesh
+from fluidlift.numerics.srgb import linear_from_srgb
+from fluidlift.shape.ground_mesh import LOAM, cut_colour, ground_colours, ground_mesh
 from fluidlift.types import Grid, PinholeCamera
 
 GRID = Grid((12, 8, 6), 0.25, (-1.5, -1.0, -1.0))
@@ -56,3 +57,12 @@ def test_seen_ground_has_the_colours_of_the_picture_and_cut_sides_those_of_earth
         beyond = top & side & (np.abs(x) > 1.2)  # out of the picture: as the ground beside it
         np.testing.assert_allclose(colours[beyond], np.tile(np.array(colour) / 255, (beyond.sum(), 1)), atol=1e-6)
     assert np.ptp(colours[~top], axis=0).max() == 0
+
+
+def test_a_cut_is_of_neutral_earth_under_ground_of_any_colour():
+    for top in ([0.1, 0.5, 0.1], [0.02, 0.02, 0.02], [0.95, 0.95, 0.95]):
+        cut, own = linear_from_srgb(cut_colour(np.tile(top, (5, 1)))), linear_from_srgb(np.array(top))
+        # between the ground's colour and earth, and never so dark that a side in half of the sky's light is black
+        assert (np.minimum(own, LOAM) - 1e-6 <= cut).all() and (cut <= np.maximum(own, LOAM) + 1e-6).all()
+        assert cut.min() > 0.4 * LOAM.min()
+        assert np.ptp(cut) < max(0.6 * np.ptp(own), np.ptp(LOAM))  # a cut through turf is not green

@@ -88,6 +88,32 @@ def tank_folder(finished_tank, tmp_path) -> Path:
     return shutil.copytree(finished_tank, tmp_path / "tank.fluid")
 
 
+@pytest.fixture(scope="session")
+def opened_viewer():
+    """Opens the viewer of a folder on the first free port from one on; its preview is as coarse on any machine."""
+    from fluidlift.pipeline.preview import PreviewSize
+    from fluidlift.viewer.app import Viewer, ViewRequest
+    from fluidlift.viewer.ports import free_port
+
+    def begin(folder, port):
+        return Viewer(folder, ViewRequest(port=free_port("127.0.0.1", port)), size=PreviewSize(seconds=None))
+
+    return begin
+
+
+@pytest.fixture(scope="session")
+def until():
+    """Waits for what other threads do."""
+
+    def wait(condition, seconds=PATIENCE):
+        end = time.monotonic() + seconds
+        while not condition():
+            assert time.monotonic() < end, "it did not happen"
+            time.sleep(0.01)
+
+    return wait
+
+
 @pytest.fixture(scope="module")
 def visitor():
     """Opens pages of viewers, in one browser."""

@@ -19,15 +19,11 @@ pytestmark = pytest.mark.skipif(not CHROMIUM.exists(), reason=f"there is no {CHR
 
 
 @pytest.fixture(scope="module")
-def viewer(finished_tank, tmp_path_factory):
+def viewer(finished_tank, opened_viewer, tmp_path_factory):
     import shutil
 
-    from fluidlift.pipeline.preview import PreviewSize
-    from fluidlift.viewer.app import Viewer, ViewRequest
-    from fluidlift.viewer.ports import free_port
-
     folder = shutil.copytree(finished_tank, tmp_path_factory.mktemp("viewed") / "tank.fluid")
-    made = Viewer(folder, ViewRequest(port=free_port("127.0.0.1", 18080)), size=PreviewSize(seconds=None))
+    made = opened_viewer(folder, 18080)
     yield made
     made.close()
 
@@ -202,7 +198,7 @@ def test_an_obstacle_is_added_dragged_sized_let_float_and_removed(visit, viewer)
     visit.choose("shape", "box")
     visit.press("Add to the scene")
     visit.until(lambda: viewer.chosen == "box1", "a box")
-    visit.says("Drag it with the arrows")
+    visit.says("box1 hangs just above the fluid")
     entry = viewer.draft.obstacles[0]
     gizmo = viewer.panels.obstacles._gizmo
     along = np.array([0.0, 0.0, 1.0])
@@ -236,6 +232,63 @@ def test_an_obstacle_is_added_dragged_sized_let_float_and_removed(visit, viewer)
     assert viewer.draft.obstacles == []
 
 
+def test_of_several_obstacles_the_chosen_one_has_the_gizmo_and_the_controls(visit, viewer):
+    visit.tab("Obstacles")
+    visit.choose("shape", "sphere")
+    for name in ("sphere1", "sphere2"):
+        visit.press("Add to the scene")
+        visit.until(lambda name=name: viewer.chosen == name, name)
+    first, second = viewer.draft.obstacles
+    apart = np.linalg.norm(np.subtract(first["position"], second["position"]))
+    assert apart > 2 * first["radius"]  # not one inside the other
+    panel = viewer.panels.obstacles
+    for entry in (first, second):
+        visit.choose("chosen", entry["name"])
+        visit.until(lambda entry=entry: viewer.chosen == panel._gizmo_of == entry["name"], "the choice")
+        visit.until(lambda entry=entry: np.allclose(panel._gizmo.position, entry["position"]), "the gizmo's place")
+        visit.says(f"{entry['name']} at (")
+    visit.field("width, m").fill("0.1")
+    visit.until(lambda: viewer.draft.obstacles[1]["radius"] == 0.05, "the width of the second")
+    assert viewer.draft.obstacles[0] == first
+    assert panel._density.disabled  # what stands still needs none
+    visit.choose("chosen", "(none)")
+    visit.says("No obstacle is chosen.")
+    visit.until(lambda: panel._gizmo is None and visit.field("motion").is_disabled(), "nothing to change")
+
+    visit.tab("View")
+    nodes = [viewer.server.scene.get_handle_by_name(f"/obstacles/{name}") for name in ("sphere1", "sphere2")]
+    for on in (False, True):
+        visit.field("obstacles").click()
+        visit.until(lambda on=on: [n.visible for n in nodes] == [on, on], f"obstacles {on}")
+
+
+def test_the_surface_is_meshed_shown_in_the_fluids_colour_and_taken_out(visit, viewer):
+    pytest.importorskip("pysplashsurf", reason="pysplashsurf is not installed: no surface mesh")
+    visit.tab("View")
+
+    def blue():
+        return (visit.picture()[..., 0] > visit.picture()[..., 2] + 40.0).mean()  # blue, green, red
+
+    for on in (True, False):
+        visit.field("surface mesh").click()
+        visit.until(lambda on=on: (viewer.server.scene.get_handle_by_name("/surface") is not None) == on, f"mesh {on}")
+        visit.until(lambda on=on: (blue() > 0.01) == on, f"a blue body {on}")
+
+
+def test_a_tint_colours_the_splats_and_what_is_no_colour_changes_nothing(visit, viewer):
+    viewer.set_parts(splats=True)
+    visit.tab("Fluid")
+    visit.field("tint").fill("#ff0000")
+    visit.page.keyboard.press("Tab")  # taken when the field is left
+    visit.until(lambda: viewer.draft.look.get("tint") == [1.0, 0.0, 0.0], "the tint")
+    visit.until(lambda: not viewer.draft.pending, "taking over the edit")
+    visit.until(lambda: (visit.picture()[..., :2].max(axis=2) < 40).mean() > 0.01, "splats without blue and green")
+    visit.field("tint").fill("hello")
+    visit.page.keyboard.press("Tab")
+    visit.until(lambda: visit.field("tint").input_value() != "hello", "the colour as it was")
+    assert viewer.draft.look["tint"] == [1.0, 0.0, 0.0]
+
+
 def obj(faces=slice(None), scale=0.1, turned=False):
     from fluidlift.numerics.solid_mesh import box_mesh
 
@@ -256,6 +309,15 @@ def test_a_mesh_file_is_uploaded_and_what_bounds_no_solid_is_refused(visit, view
         upload.set_input_files({"name": name, "mimeType": "text/plain", "buffer": content})
         visit.until(lambda said=said: said in viewer.messages, f"a refusal of {name}")
     assert viewer.draft.obstacles == [] and not (viewer.folder / "meshes").exists()
+    visit.field("turn over").click()
+    visit.until(lambda: viewer.panels.obstacles._over.value, "the tick")
+    upload.set_input_files({"name": "inward.obj", "mimeType": "text/plain", "buffer": obj(turned=True)})
+    visit.until(lambda: viewer.chosen == "inward1", "the mesh turned over")
+    assert viewer.draft.obstacles[0]["flip"] is True
+    visit.press("Remove")
+    visit.until(lambda: viewer.draft.obstacles == [], "the removal")
+    visit.field("turn over").click()
+    visit.until(lambda: not viewer.panels.obstacles._over.value, "no tick")
     visit.choose("file is in", "millimetres")
     upload.set_input_files({"name": "my box.obj", "mimeType": "text/plain", "buffer": obj(scale=100.0)})
     visit.until(lambda: viewer.chosen == "my_box1", "the box")

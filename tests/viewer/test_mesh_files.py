@@ -66,8 +66,11 @@ def test_a_folder_that_is_a_link_out_of_the_asset_is_refused(tmp_path):
 
 def test_a_mesh_is_put_with_the_middle_of_its_lower_side_at_the_place_in_metres(tmp_path):
     inside, _ = kept_mesh(tmp_path, "wedge.obj", BOX)
-    entry = mesh_entry(tmp_path, inside, 0.1, turned_over=True, over=np.array([1.0, 2.0, 3.0]))
+    entry = mesh_entry(tmp_path, inside, 0.1, turned_over=True, over=lambda width: np.array([1.0, 2.0, 3.0]))
     assert entry == {"mesh": "meshes/wedge.obj", "position": [0.9, 1.8, 3.0], "scale": 0.1, "flip": True}
-    assert mesh_entry(tmp_path, inside, 1.0, turned_over=False, over=np.zeros(3)).keys() == {"mesh", "position"}
+    assert mesh_entry(tmp_path, inside, 1.0, turned_over=False, over=lambda width: np.zeros(3)).keys() == {
+        "mesh",
+        "position",
+    }
     with pytest.raises(InputRejected, match="gone"):
-        mesh_entry(tmp_path, "gone.obj", 1.0, turned_over=False, over=np.zeros(3))
+        mesh_entry(tmp_path, "gone.obj", 1.0, turned_over=False, over=lambda width: np.zeros(3))

@@ -7,25 +7,12 @@ import pytest
 pytest.importorskip("viser", reason="viser is not installed: pip install 'fluidlift[view]'")
 
 
-def until(condition, seconds=60.0):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "it did not happen"
-        time.sleep(0.01)
-
-
 @pytest.fixture
-def opened(tank_folder):
-    from fluidlift.pipeline.preview import PreviewSize
-    from fluidlift.viewer.app import Viewer, ViewRequest
-    from fluidlift.viewer.ports import free_port
-
+def opened(tank_folder, opened_viewer):
     made = []
 
     def begin():
-        made.append(
-            Viewer(tank_folder, ViewRequest(port=free_port("127.0.0.1", 18200)), size=PreviewSize(seconds=None))
-        )
+        made.append(opened_viewer(tank_folder, 18200))
         return made[0]
 
     yield begin
@@ -37,7 +24,7 @@ def broken(*_):
     raise ZeroDivisionError("oh")
 
 
-def test_a_search_for_the_input_video_that_breaks_is_told_and_over(opened, monkeypatch, caplog):
+def test_a_search_for_the_input_video_that_breaks_is_told_and_over(opened, monkeypatch, caplog, until):
     from fluidlift.viewer import app
 
     monkeypatch.setattr(app, "input_pictures", broken)
@@ -47,7 +34,7 @@ def test_a_search_for_the_input_video_that_breaks_is_told_and_over(opened, monke
     assert "ZeroDivisionError" in caplog.text
 
 
-def test_a_comparison_that_breaks_is_told_and_the_next_one_is_made(opened, monkeypatch, caplog):
+def test_a_comparison_that_breaks_is_told_and_the_next_one_is_made(opened, monkeypatch, caplog, until):
     viewer = opened()
     until(lambda: viewer.stale is not None)
     with monkeypatch.context() as while_broken:
@@ -60,7 +47,7 @@ def test_a_comparison_that_breaks_is_told_and_the_next_one_is_made(opened, monke
     until(lambda: viewer.stale == {"look"})
 
 
-def test_an_asset_that_another_process_writes_is_told_and_left_alone_until_it_is_done(opened, monkeypatch):
+def test_an_asset_that_another_process_writes_is_told_and_left_alone_until_it_is_done(opened, monkeypatch, until):
     import os
 
     from fluidlift.io.asset_lock import Holder
@@ -78,7 +65,7 @@ def test_an_asset_that_another_process_writes_is_told_and_left_alone_until_it_is
     until(lambda: viewer.messages.startswith("The other process is done"))
 
 
-def test_an_edit_while_somebody_else_edits_is_refused_and_told_and_the_scene_is_as_before(opened):
+def test_an_edit_while_somebody_else_edits_is_refused_and_told_and_the_scene_is_as_before(opened, until):
     from fluidlift.io.asset_lock import editing
 
     viewer = opened()

@@ -1,7 +1,5 @@
 """The worker behind the live preview, with the real simulator."""
 
-import time
-
 import pytest
 
 from fluidlift.io.asset_folder import load_asset
@@ -9,15 +7,8 @@ from fluidlift.pipeline import preview
 from fluidlift.pipeline.preview import LivePreview, PreviewSize, Wish
 
 
-def until(condition, seconds=60.0):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "it did not happen"
-        time.sleep(0.01)
-
-
 @pytest.fixture
-def begun(tank_folder):
+def begun(tank_folder, until):
     workers = []
 
     def begin(**options):
@@ -32,7 +23,7 @@ def begun(tank_folder):
         worker.close()
 
 
-def test_a_surprise_is_told_and_logged_and_the_next_wish_is_served(begun, caplog):
+def test_a_surprise_is_told_and_logged_and_the_next_wish_is_served(begun, caplog, until):
     broken = [True]
 
     def keep(frame):

@@ -9,6 +9,7 @@ from typing import Any, final
 import numpy as np
 
 from fluidlift.errors import MissingPackage, require
+from fluidlift.numerics.particle_mean import kernel_mean
 from fluidlift.seams import Mesher
 from fluidlift.types import TriangleMesh
 
@@ -18,6 +19,8 @@ CUBE = 0.8
 """cell of the marching cubes, radii"""
 INSIDE = 0.6
 """share of the density of the full fluid at which the surface lies"""
+CARRIED = 1.5 * KERNEL
+"""reach of the means of what particles carry, radii: they are as wide as the kernel of the density"""
 SMOOTHING = 15
 """passes over the mesh; the weights keep flat parts from shrinking and take the lattice out of sprays"""
 BLOCK = 32
@@ -53,18 +56,31 @@ class SplashsurfMesher(Mesher):
             return _nothing(values)
         # single precision takes two thirds of the time; about its middle a body loses nothing by it
         middle = points[sound].mean(axis=0)
+        particles = np.float32(points[sound] - middle)
         found, _ = self._package.reconstruction_pipeline(
-            np.float32(points[sound] - middle), attributes_to_interpolate=values, particle_radius=radius,
-            smoothing_length=KERNEL, cube_size=CUBE, iso_surface_threshold=INSIDE, mesh_cleanup=True,
-            decimate_barnacles=True, mesh_smoothing_iters=SMOOTHING, mesh_smoothing_weights=True,
-            subdomain_num_cubes_per_dim=BLOCK,
+            particles, particle_radius=radius, smoothing_length=KERNEL, cube_size=CUBE,
+            iso_surface_threshold=INSIDE, mesh_cleanup=True, decimate_barnacles=True,
+            mesh_smoothing_iters=SMOOTHING, mesh_smoothing_weights=True, subdomain_num_cubes_per_dim=BLOCK,
         )  # fmt: skip
-        vertices = np.float32(np.asarray(found.mesh.vertices, np.float64) + middle)
-        faces = np.asarray(found.mesh.triangles, np.int64)
+        vertices, faces = np.asarray(found.mesh.vertices), np.asarray(found.mesh.triangles, np.int64)
         if len(faces) == 0:
             return _nothing(values)
-        carried = {k: np.asarray(found.point_attributes[k], np.float32) for k in values}
-        return TriangleMesh(vertices, faces), carried
+        mesh = TriangleMesh(np.float32(np.asarray(vertices, np.float64) + middle), faces)
+        return mesh, _carried(np.ascontiguousarray(vertices, np.float32), particles, values, CARRIED * radius)
+
+
+def _carried(
+    vertices: np.ndarray, particles: np.ndarray, values: Mapping[str, np.ndarray], reach: float
+) -> dict[str, np.ndarray]:
+    """Values at the vertices, all in one pass: for 100 000 particles the package takes a third of a second of processor
+    time for each of them, next to 1.1 for the surface."""
+    if not values:
+        return {}
+    every = [v.reshape(len(v), -1) for v in values.values()]
+    found = kernel_mean(vertices, particles, np.concatenate(every, axis=1), reach)
+    ends = np.cumsum([v.shape[1] for v in every])[:-1]
+    parts = zip(values.items(), np.split(found, ends, axis=1), strict=True)
+    return {name: part.reshape(len(part), *value.shape[1:]) for (name, value), part in parts}
 
 
 def _nothing(values: Mapping[str, np.ndarray]) -> tuple[TriangleMesh, dict[str, np.ndarray]]:

@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from fluidlift.look.environment_filter import solid_angles
 from fluidlift.look.environment_lookup import grid_directions
+from fluidlift.look.smoothstep import smoothstep
 
 ROWS = 256
 """of a built-in picture: 0.7 degrees each"""
@@ -40,11 +41,6 @@ def _unit(elevation: float, azimuth: float) -> np.ndarray:
     return np.array([math.cos(e) * math.sin(a), math.cos(e) * math.cos(a), math.sin(e)])
 
 
-def _step(values: np.ndarray, low: float, high: float) -> np.ndarray:
-    t = np.clip((values - low) / (high - low), 0.0, 1.0)
-    return t * t * (3 - 2 * t)
-
-
 def _level_irradiance(radiance: np.ndarray) -> float:
     """Luminance of a white level body under this light."""
     weights = solid_angles(len(radiance)) * np.maximum(np.cos((np.arange(len(radiance)) + 0.5) * math.pi / ROWS), 0.0)
@@ -70,7 +66,7 @@ def sky_radiance() -> Float[np.ndarray, "h 2h 3"]:
     above = d[..., 2] > 0
     air = np.where(above[..., None], air, 0.0)
     air *= (1 - SUN_SHARE) / _level_irradiance(air)
-    disc = 1.0 - _step(np.degrees(apart), 0.6 * SUN_RADIUS, 1.4 * SUN_RADIUS)
+    disc = 1.0 - smoothstep(np.degrees(apart), 0.6 * SUN_RADIUS, 1.4 * SUN_RADIUS)
     disc = disc[..., None] * np.array(SUN_COLOR)
     light = air + disc * (SUN_SHARE / _level_irradiance(disc))
     # the ground returns its share of what falls on it; the horizon lies in haze
@@ -83,7 +79,7 @@ def sky_radiance() -> Float[np.ndarray, "h 2h 3"]:
 def studio_radiance() -> Float[np.ndarray, "h 2h 3"]:
     """A dark room with soft boxes, linear float32, scaled so that a level white body has luminance 1."""
     d = grid_directions(ROWS).astype(np.float64)
-    wall = ROOM * (0.55 + 0.45 * _step(d[..., 2], -0.4, 0.8))
+    wall = ROOM * (0.55 + 0.45 * smoothstep(d[..., 2], -0.4, 0.8))
     light = np.repeat(wall[..., None], 3, axis=2)
     for elevation, azimuth, half_height, half_width, radiance, color in BOXES:
         forward = _unit(elevation, azimuth)
@@ -92,8 +88,8 @@ def studio_radiance() -> Float[np.ndarray, "h 2h 3"]:
         ahead = d @ forward
         across = np.degrees(np.arctan2(np.abs(d @ right), ahead))
         along = np.degrees(np.arctan2(np.abs(d @ np.cross(right, forward)), ahead))
-        inside = (1 - _step(across, half_width - 2, half_width + 2)) * (
-            1 - _step(along, half_height - 2, half_height + 2)
+        inside = (1 - smoothstep(across, half_width - 2, half_width + 2)) * (
+            1 - smoothstep(along, half_height - 2, half_height + 2)
         )
         light += np.where(ahead > 0, inside, 0.0)[..., None] * radiance * np.array(color)
     return (light / _level_irradiance(light)).astype(np.float32)

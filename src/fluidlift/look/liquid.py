@@ -34,6 +34,7 @@ from fluidlift.look.liquid_kernels import (
 from fluidlift.look.liquid_lookup import SLANTED
 from fluidlift.look.materials import Material
 from fluidlift.look.optics import fresnel, transmittance
+from fluidlift.look.smoothstep import smoothstep
 from fluidlift.types.camera import PinholeCamera
 
 SHARP = 0.004
@@ -233,9 +234,9 @@ def film_shown(surface: LiquidSurface, behind: Behind, camera: PinholeCamera) ->
         place = (camera.pixel_grid() - camera.center) / camera.focal
         along = inverse - place[..., 0] * slopes[0] - place[..., 1] * slopes[1]
         height = (1.0 - surface.depth * inverse) / np.sqrt(slopes[0] ** 2 + slopes[1] ** 2 + along**2)
-        share = np.clip(height / surface.grain, 0.0, 1.0) if surface.grain > 0 else np.ones(inverse.shape)
+        share = smoothstep(height, 0.0, surface.grain) if surface.grain > 0 else np.ones(inverse.shape)
     thick = np.isnan(inverse) | (behind.depth - surface.depth > SLANTED * surface.grain) | (surface.grain <= 0)
-    return np.where(thick, 1.0, share * share * (3.0 - 2.0 * share))
+    return np.where(thick, 1.0, share)
 
 
 def _check(surface: LiquidSurface, behind: Behind, camera: PinholeCamera) -> None:

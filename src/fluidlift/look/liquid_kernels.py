@@ -2,7 +2,8 @@
 metres, float32 out. `shade` in NumPy is `liquid.shaded_plain`.
 
 What works on one pixel makes no arrays and is compiled without counting who holds them (`_nrt`): that counting, of a
-dozen arrays in every call, takes longer than the light.
+dozen arrays in every call, takes longer than the light. So does handing them over, a hundred numbers on the stack: the
+compiler puts what runs in every pixel where it is called (`forceinline`, which costs less compiling than Numba's own).
 """
 
 from __future__ import annotations
@@ -13,7 +14,8 @@ import numba as nb
 import numpy as np
 
 from fluidlift.look.environment_lookup import picture_place, picture_value
-from fluidlift.look.liquid_lookup import eased, fetch_beyond, shown_of_film
+from fluidlift.look.liquid_lookup import fetch_beyond, shown_of_film
+from fluidlift.look.smoothstep import eased
 from fluidlift.look.transparent_rays import far_side, onward, seen_from
 
 STEPS = 3
@@ -81,7 +83,7 @@ def _behind(q, o, start, depth, front, lens, up, goes_on):
     return u, v, not (outside and (z == 0.0 or upward))
 
 
-@nb.njit(cache=True, error_model="numpy", _nrt=False)
+@nb.njit(cache=True, error_model="numpy", forceinline=True, _nrt=False)
 def _turned(rotation, x, y, z, out, at):
     """A direction of camera axes in the world."""
     for k in range(3):
@@ -152,9 +154,7 @@ def _inner(q, m, share, thick, surface, behind, eye, index, ray):
     o, more = m, 0.0
     if share > TRACED:
         for _ in range(LEGS):
-            found, s, bx, by, bz = onward(
-                q, m, thick, surface_depth, normals, back_normals, thickness, depth, lens, rotation
-            )
+            found, s, bx, by, bz = onward(q, m, thick, (surface_depth, thickness, depth), normals, back_normals, eye)
             if not found:  # it was last seen on its way there
                 o = m
                 break
@@ -199,13 +199,12 @@ def _to_far_side(i, j, p, v, t, n, surface, depth, eye):
     if end > 0.0:
         free = min(max((end - p[2] - thick * v[2]) / max(RESTS * thick, ROOM * p[2] / lens[0], 1e-9), 0.0), 1.0)
     if known and free > 0.0:
-        way, bx, by, bz = far_side(
-            p, t, way, (bx, by, bz), surface_depth, thickness, back_normals, depth, lens, rotation
-        )
+        sides = (surface_depth, thickness, depth)
+        way, bx, by, bz = far_side(p, t, way, (bx, by, bz), sides, back_normals, eye)
     return way, bx, by, bz, thick, free
 
 
-@nb.njit(cache=True, error_model="numpy", _nrt=False)
+@nb.njit(cache=True, error_model="numpy", forceinline=True, _nrt=False)
 def _follow(i, j, surface, behind, eye, index, ray):
     """One pixel of `follow`."""
     _, surface_depth, normals, back_normals, _, _, _ = surface
@@ -269,7 +268,7 @@ def _looked_up(picture, ray, at):
     return picture_value(picture, across, down)
 
 
-@nb.njit(cache=True, error_model="numpy", _nrt=False)
+@nb.njit(cache=True, error_model="numpy", forceinline=True, _nrt=False)
 def _mirrored(pictures, steps, roughness, ray):
     """`Environment.blurred` for the mirrored ray."""
     last = len(pictures) - 1
@@ -286,7 +285,7 @@ def _mirrored(pictures, steps, roughness, ray):
     return r0 + s * (r1 - r0), g0 + s * (g1 - g0), b0 + s * (b1 - b0)
 
 
-@nb.njit(cache=True, error_model="numpy", _nrt=False)
+@nb.njit(cache=True, error_model="numpy", forceinline=True, _nrt=False)
 def _come_through(ray, pictures, dim, numbers, light):
     """What comes through, of the picture behind or the environment, and of what is mirrored at the far side, after its
     way inside; and the share of light, of each colour, that scattering and absorption take from both together."""
@@ -310,7 +309,7 @@ def _come_through(ray, pictures, dim, numbers, light):
         light[3 + k] = 1.0 - along * left
 
 
-@nb.njit(cache=True, error_model="numpy", _nrt=False)
+@nb.njit(cache=True, error_model="numpy", forceinline=True, _nrt=False)
 def _body(carried, given, numbers, waves, light):
     """Adds what the body scatters and gives off itself, in place of the light that is lost on the way."""
     keeps, usual, cool, hot, warm, contrast = numbers[5], numbers[7], numbers[8], numbers[9], numbers[10], numbers[11]

@@ -8,17 +8,12 @@ import math
 
 import numba as nb
 
+from fluidlift.look.smoothstep import eased
+
 SLANTED = 12.0
 """grains along the line of sight from which on liquid is thicker than one, seen ever so slanting (5 degrees)"""
 RIM = 0.5
 """pictures beyond its rim at which a picture that goes on is no more than its mean"""
-
-
-@nb.njit(cache=True, inline="always")
-def eased(share):
-    """From 0 to 1 with level ends (smoothstep)."""
-    t = min(max(share, 0.0), 1.0)
-    return t * t * (3.0 - 2.0 * t)
 
 
 @nb.njit(cache=True, error_model="numpy", _nrt=False)
@@ -66,7 +61,7 @@ def _inverse(depth, i, j):
     return 1.0 / depth[i, j]
 
 
-@nb.njit(cache=True, error_model="numpy", _nrt=False)
+@nb.njit(cache=True, error_model="numpy", forceinline=True, _nrt=False)
 def shown_of_film(i, j, z, depth, lens, grain):
     """Share, 0 to 1, that is seen of liquid at depth z: it goes to 0 with the liquid's height over what it lies on.
 

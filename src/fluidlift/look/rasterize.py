@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
+import numba as nb
 import numpy as np
 from jaxtyping import Float
 
 from fluidlift.errors import require
 from fluidlift.look.project import LARGEST, bounded_scales, camera_depths, sound, view_colors
-from fluidlift.numerics.splatting import Bins, Projected, View, bin_tiles, project, rasterize, tiles_met
+from fluidlift.numerics.splatting import Bins, Projected, View, bin_tiles, project, rasterize_drawn, tiles_met
 from fluidlift.types.camera import PinholeCamera
 from fluidlift.types.gaussians import Gaussians
 
@@ -17,6 +18,8 @@ PAIRS_DRAWN_MAX = 400_000_000
 """largest number of pairs of tile and Gaussian that a picture may take (some ten seconds; memory is bounded anyway)"""
 COUNT_MAX = 2**31 - 1
 """Gaussians in one picture: their indices are 32 bits"""
+COVERED_MIN = np.float32(1e-3)
+"""coverage below which a pixel has no depth"""
 
 
 @dataclass(frozen=True)
@@ -65,31 +68,51 @@ def render(
         ok &= np.isfinite(features).all(1)
     projected, opacities, bins = _project_bounded(gaussians, np.where(ok, gaussians.opacities, np.float32(0)), camera)
     # of millions of Gaussians far from all are drawn: only those get colours and depth
-    index = np.sort(bins.order)
+    index = bins.order
     drawn = np.empty((len(index), channels + 1), np.float32)
-    drawn[:, :-1] = view_colors(gaussians.select(index), camera) if features is None else features[index]
+    drawn[:, :-1] = view_colors(gaussians, camera, index) if features is None else features[index]
     drawn[:, -1] = projected.depths[index]
-    image, light = rasterize(*_only(index, projected, opacities), drawn, _renumbered(bins, index), camera.size)
+    image, depth, light = rasterize_drawn(projected, opacities, drawn, bins, camera.size)
+    over_kernel(image, depth, light, behind)
+    return Rendered(image, depth, light)
+
+
+@nb.njit(cache=True, nogil=True, parallel=True, error_model="numpy")
+def over_kernel(image, depth, light, behind):
+    """Features and depth (premultiplied) and the light that is left, before a background [h or 1,w or 1,c]. In place,
+    and the light becomes the coverage: one pass over the picture, where array operations make eight with as many
+    arrays."""
+    height, width, channels = image.shape
+    one, zero = np.float32(1), np.float32(0)
+    for i0 in nb.prange(height):
+        i = np.int64(i0)
+        bi = min(i, behind.shape[0] - 1)
+        for j in range(width):
+            bj = min(j, behind.shape[1] - 1)
+            left = light[i, j]
+            covered = one - left
+            light[i, j] = covered
+            depth[i, j] = depth[i, j] / covered if covered > COVERED_MIN else zero
+            for c in range(channels):
+                image[i, j, c] += left * behind[bi, bj, c]
+
+
+def over_plain(
+    image: np.ndarray, depth: np.ndarray, light: np.ndarray, behind: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What `over_kernel` leaves in its operands, for reading."""
     alpha = 1.0 - light
-    depth = np.where(alpha > 1e-3, image[..., -1] / np.maximum(alpha, 1e-3), 0.0)
-    return Rendered(image[..., :-1] + light[..., None] * behind, depth.astype(np.float32), alpha)
-
-
-def _only(index: np.ndarray, projected: Projected, opacities: np.ndarray) -> tuple[Projected, np.ndarray]:
-    p = projected
-    return Projected(p.means[index], p.conics[index], p.depths[index], p.extents[index]), opacities[index]
-
-
-def _renumbered(bins: Bins, index: np.ndarray) -> Bins:
-    """The same lists for Gaussians of which only those of `index` (sorted) are kept."""
-    return replace(bins, order=np.searchsorted(index, bins.order).astype(np.int32))
+    mean = np.where(alpha > COVERED_MIN, depth / np.maximum(alpha, COVERED_MIN), np.float32(0))
+    return image + light[..., None] * behind, mean, alpha
 
 
 def _background(background: tuple[float, ...] | np.ndarray | None, shape: tuple[int, int, int]) -> np.ndarray:
+    """[h,w,c] or [1,1,c], for `over_kernel`."""
     behind = np.asarray(0.0 if background is None else background, np.float32)
     fits = behind.ndim == 0 or behind.shape in ((shape[2],), shape)
     require(fits, f"background of shape {behind.shape}", f"one value per channel ({shape[2]}) or {shape}")
-    return behind
+    whole = behind if behind.ndim == 3 else np.broadcast_to(behind, (1, 1, shape[2]))
+    return np.ascontiguousarray(whole)
 
 
 def _project_bounded(g: Gaussians, opacities: np.ndarray, camera: PinholeCamera) -> tuple[Projected, np.ndarray, Bins]:
@@ -102,5 +125,5 @@ def _project_bounded(g: Gaussians, opacities: np.ndarray, camera: PinholeCamera)
         scales = bounded_scales(g.scales, depths, camera, largest)
         projected = project(view, g.means, g.quats, scales, opacities)
         if tiles_met(projected, camera.size) <= PAIRS_DRAWN_MAX or largest < 1e-3:
-            return projected, opacities, bin_tiles(projected, camera.size)
+            return projected, opacities, bin_tiles(projected, camera.size, slots=False)
         largest /= 2

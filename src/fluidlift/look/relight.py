@@ -22,6 +22,7 @@ from fluidlift.look.environment import LUMINANCE, Environment
 from fluidlift.look.environment_lookup import picture_place, picture_value
 from fluidlift.look.fluid_normals import fluid_normals
 from fluidlift.look.materials import Material
+from fluidlift.look.smoothstep import smoothstep
 from fluidlift.numerics.srgb import linear_from_srgb
 from fluidlift.types.camera import PinholeCamera
 from fluidlift.types.gaussians import Gaussians
@@ -103,7 +104,7 @@ def relit_plain(
     toward = toward / np.linalg.norm(toward, axis=1, keepdims=True)
     cosine = (toward * normals).sum(axis=1)
     roughness = splat_roughness(material.roughness)
-    fresnel = share * _step(cosine, *FACING) * reflectance(cosine, roughness, material.refractive_index)
+    fresnel = share * smoothstep(cosine, *FACING) * reflectance(cosine, roughness, material.refractive_index)
     mirrored = environment.blurred(2 * cosine[:, None] * normals - toward, roughness)
     # inside, light comes from everywhere
     light = share[:, None] * environment.irradiance(normals) + (1 - share)[:, None] * environment.mean
@@ -289,11 +290,6 @@ def glow(
     """
     cooler = 1.0 / (COLD + (1.0 - COLD) * heat(colors_linear, among)) - 1.0
     return np.exp(-WIEN * cooler[:, None]) * np.asarray(material.emission, np.float32)
-
-
-def _step(values: np.ndarray, low: float, high: float) -> np.ndarray:
-    t = np.clip((values - low) / (high - low), 0.0, 1.0)
-    return t * t * (3 - 2 * t)
 
 
 def _thickness(gaussians: Gaussians) -> float:

@@ -32,7 +32,7 @@ from fluidlift.types.terrain import TriangleMesh
 
 SPACING = 1.25
 """radii between neighbours: the radius of surfaces is 0.4 cells, and particles lie half a cell apart"""
-SMOOTHING = (1.6, 1.0)
+SMOOTHING = (1.6, 1.0, 0.5)
 """radii: standard deviations of the passes over the depth; the second takes out the first one's rows and columns"""
 LIMIT = 3.0
 """radii: depths farther apart belong to different surfaces"""
@@ -47,6 +47,10 @@ RIM = (0.42, 0.67)
 an outline, which is then smoother than that of the spheres; a sphere alone has 0.54"""
 GRAIN = 0.5
 """radii: thinner liquid on the ground is no more than the place of its particles can tell, and fades out"""
+NOTCH = 1.0
+"""radii of the ball"""
+MOST = 12
+"""px of it"""
 COARSE = 5.0
 """px: from this median radius on, thickness and colour are summed at half the resolution"""
 GRAY = 0.5
@@ -93,12 +97,13 @@ def particle_surface(
     # spheres overlap: each stands for the volume of a cube of the spacing
     thickness *= np.float32(spacing**3 / (4.0 / 3.0 * math.pi * radius**3))
     inverse, normal = np.empty_like(depth), np.zeros((height, width, 3), np.float32)
-    inverse_depths(depth, bed, np.float32(NEAR), inverse)
+    inverse_depths(depth, bed, np.float32(NEAR), np.float32(LIMIT * radius), inverse)
+    _close_notches(inverse, radius, camera, typical)
     inverse = _smoothed(inverse, radius, camera)
     rotation = np.asarray(camera.camera_from_world.rotation, np.float64)
     plane_normals(inverse, _lens(camera), rotation, np.float32(LIMIT * radius), normal)
     covered = np.empty_like(depth)
-    depths_and_cover(inverse, thickness, near, np.array([THIN * radius, *RIM], np.float32), depth, covered)
+    depths_and_cover(inverse, bed, thickness, near, np.array([THIN * radius, *RIM], np.float32), depth, covered)
     return LiquidSurface(depth, normal, thickness, albedo, covered, grain=GRAIN * radius)
 
 
@@ -157,6 +162,22 @@ def _through_spheres(
         return sums[0], carried, sums[5]
     whole = (sums[0], carried, sums[5])
     return tuple(cv2.resize(p, (width, height), interpolation=cv2.INTER_LINEAR) for p in whole)
+
+
+def _close_notches(inverse: np.ndarray, radius: float, camera: PinholeCamera, typical: float) -> None:
+    """Fills what a ball of a radius does not get into, in the picture: gaps between spheres in which others are seen
+    far behind, and notches between those of an outline. What lies no deeper than a sphere is left to the smoothing."""
+    import cv2
+
+    reach = NOTCH * camera.focal[0] * radius / max(typical, NEAR)
+    if typical <= 0 or reach < 0.7:
+        return
+    wide = 2 * min(round(reach), MOST) + 1
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (wide, wide))
+    closed = cv2.morphologyEx(np.maximum(inverse, 0.0), cv2.MORPH_CLOSE, disc, borderType=cv2.BORDER_REPLICATE)
+    own = np.abs(inverse)
+    deep = closed - own > np.float32(radius) * closed * own
+    inverse[deep] = closed[deep]
 
 
 def _smoothed(inverse: np.ndarray, radius: float, camera: PinholeCamera) -> np.ndarray:

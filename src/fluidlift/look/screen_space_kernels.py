@@ -20,9 +20,12 @@ APART = np.float32(2.6)
 """pairs per standard deviation of the smoothing: of wide bells every second, third ... pixel is enough"""
 LEAST = np.float32(0.3)
 """px: a narrower bell averages nothing"""
+NEARER = np.float32(1e18)
+"""1/m, nearer than anything: what lies beyond the picture's rim. Not infinite: no weight times it must be nothing"""
 LANES = 32
 """pixels side by side that are smoothed at a time, with pairs equally far apart"""
-HIGH, TOTAL, WEIGHTS, WEIGHT, FADE, FADING = (np.uint64(k * LANES) for k in range(1, 7))
+HIGH, WEIGHT, FADE, FADING, BEFORE, AFTER = (np.uint64(k * LANES) for k in range(1, 7))
+SUMS, SUMS_K, SUMS_KK, SUMS_D, SUMS_KD = (np.uint64(k * LANES) for k in range(7, 12))
 """places in the state of `_take_pair`, after the lowest at 0"""
 
 
@@ -117,14 +120,15 @@ def sphere_chords(centres, box, starts, listed, radius, across, down, depth, col
 
 
 @nb.njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def inverse_depths(depth, ground, near, q):
-    """Inverse depth (1/m) of the nearest spheres (m; infinite: none) where they are not hidden by the ground, else the
-    negative one of the ground (m; 0: none), or 0: what the smoothing takes."""
+def inverse_depths(depth, ground, near, behind, q):
+    """Inverse depth (1/m) of the nearest spheres (m; infinite: none), also of those that lie more than `behind` (m)
+    behind the ground that hides them, as a pond does behind a rock; else the negative one of the ground (m; 0: none),
+    or 0: what the smoothing takes."""
     one = np.float32(1.0)
     for row in nb.prange(q.shape[0]):
         for col in range(q.shape[1]):
             z, bed = depth[row, col], ground[row, col]
-            if z < np.inf and (bed <= 0 or z < bed):
+            if z < np.inf and (bed <= 0 or z < bed or z > bed + behind):
                 q[row, col] = one / max(z, near)
             elif bed > 0:
                 q[row, col] = -one / max(bed, near)
@@ -135,7 +139,7 @@ def inverse_depths(depth, ground, near, q):
 @nb.njit(cache=True, fastmath=_FUSED, error_model="numpy")
 def _begin(own, stride, factor, limit, state):
     """What `_take_pair` goes on from, for some pixels side by side: see the offsets there."""
-    one, three = np.float32(1.0), np.float32(1.0 / 3.0)
+    zero, one, three = np.float32(0.0), np.float32(1.0), np.float32(1.0 / 3.0)
     for k in range(np.uint64(own.shape[0])):
         bell = max(factor * own[k], LEAST) / stride
         # exp(-1 / (2 bell^2)) as a power of 64, without a call: lanes side by side
@@ -144,39 +148,51 @@ def _begin(own, stride, factor, limit, state):
         for _ in range(6):
             fade = fade * fade
         narrow = limit * own[k] * own[k]
+        goes = one if factor * own[k] > LEAST else zero
         state[k] = own[k] - narrow
-        state[k + HIGH] = own[k] + narrow if factor * own[k] > LEAST else -one
-        state[k + TOTAL] = own[k]
-        state[k + WEIGHTS] = one
+        state[k + HIGH] = own[k] + narrow
         state[k + WEIGHT] = one
         state[k + FADE] = fade
         state[k + FADING] = fade * fade
+        state[k + BEFORE] = goes
+        state[k + AFTER] = goes
+        state[k + SUMS] = one
+        for n in range(np.uint64(1), np.uint64(5)):
+            state[k + SUMS + n * np.uint64(LANES)] = zero
 
 
 @nb.njit(cache=True, fastmath=_FUSED, error_model="numpy")
-def _take_pair(before, after, own, limit, fall, state):
-    """One pair of neighbours of each of some pixels side by side. state: lowest and highest inverse depth met, sum and
-    weights so far, the last weight and its factor, and that one's: exp(-k^2 / (2 bell^2)) from the one before. A
-    highest of -1 lets nothing more in. One buffer with fixed offsets: the compiler sees that lanes do not touch.
+def _take_pair(before, after, own, distance, limit, fall, state):
+    """One pair of neighbours of each of some pixels side by side. state: lowest and highest inverse depth met, the last
+    weight and its factor, and that one's: exp(-k^2 / (2 bell^2)) from the one before; whether the window is open (1) on
+    either side; and the sums of the weights w, of w k, w k^2, w d and w k d over what was met, at k pairs (`distance`),
+    d above the pixel's own. One buffer with fixed offsets: the compiler sees that lanes do not touch.
     """
     zero = np.float32(0.0)
     for k in range(np.uint64(own.shape[0])):
-        narrow, dropped = limit * own[k] * own[k], own[k] - fall * own[k] * own[k]
+        narrow, dropped = limit * own[k] * own[k], -fall * own[k] * own[k]
         one, two = abs(before[k]), abs(after[k])
         low, high = state[k], state[k + HIGH]
         weight = state[k + WEIGHT] * state[k + FADE]
         state[k + WEIGHT] = weight
         state[k + FADE] = state[k + FADE] * state[k + FADING]
-        top, bottom = max(one, two), min(one, two)
-        goes, both = top <= high, bottom > low
-        weight = weight if goes else zero
-        higher = max(high, top + narrow) if both else high
-        state[k + HIGH] = higher if goes else np.float32(-1.0)
-        state[k] = min(low, bottom - narrow) if (both and goes) else low
-        one = one if (both or one > low) else dropped
-        two = two if (both or two > low) else dropped
-        state[k + TOTAL] = state[k + TOTAL] + weight * (one + two)
-        state[k + WEIGHTS] = state[k + WEIGHTS] + (weight + weight)
+        first, second = state[k + BEFORE] if one <= high else zero, state[k + AFTER] if two <= high else zero
+        state[k + BEFORE], state[k + AFTER] = first, second
+        is_one, is_two = one > low, two > low
+        # what falls off on one side says nothing of how far the surface itself goes on
+        both = (is_one or first == zero) and (is_two or second == zero)
+        top = max(one if first > zero else low, two if second > zero else low)
+        bottom = min(one if first > zero else high, two if second > zero else high)
+        state[k + HIGH] = max(high, top + narrow) if both else high
+        state[k] = min(low, bottom - narrow) if both else low
+        one, two = one - own[k] if is_one else dropped, two - own[k] if is_two else dropped
+        first, second = weight * first, weight * second
+        state[k + SUMS] += first + second
+        state[k + SUMS_K] += distance * (second - first)
+        state[k + SUMS_KK] += distance * distance * (first + second)
+        first, second = first * one, second * two
+        state[k + SUMS_D] += first + second
+        state[k + SUMS_KD] += distance * (second - first)
 
 
 @nb.njit(cache=True, inline="always")
@@ -199,16 +215,21 @@ def narrow_range(q, out, down, across, focal, width, limit, fall):
     beside the liquid, 0: nothing there).
 
     After the narrow-range filter of Truong and Yuksel 2018: depths within `limit` (m) of what was met so far are
-    averaged; what lies nearer ends the window; what lies farther counts as if it fell off by `fall` (m), which rounds
-    outlines. Three changes: inverse depth is averaged, which is linear across the picture of a plane; pixels come in
-    pairs from both sides, so that planes stay as they are; and ground close behind an outline is averaged like liquid,
-    so that the surface runs out on it instead of ending in a rim. `width` (m) is the standard deviation of the weights.
+    averaged; what lies nearer ends the window on its side; what lies farther counts as if it fell off by `fall` (m),
+    which rounds outlines. Three changes: inverse depth is averaged, which is linear across the picture of a plane; a
+    straight line is fitted to it (local linear regression), so that planes stay as they are, also where the window is
+    open on one side alone; and ground close behind an outline is averaged like liquid, so that the surface runs out on
+    it instead of ending in a rim. `width` (m) is the standard deviation of the weights.
     """
     h, w = q.shape
     factor = np.float32(focal * width)
     for r in nb.prange(h):
         row = np.int64(r)
-        state = np.empty(7 * LANES, np.float32)
+        state = np.empty(12 * LANES, np.float32)
+        outside = np.full(LANES, NEARER, np.float32)
+        line = np.full(3 * w if across else 1, NEARER, np.float32)
+        if across:
+            line[w : 2 * w] = q[row]
         for first in range(0, w, LANES):
             last = min(first + LANES, w)
             own = q[row, first:last]
@@ -219,25 +240,20 @@ def narrow_range(q, out, down, across, focal, width, limit, fall):
             _begin(own, np.float32(stride), factor, limit, state)
             for k in range(1, steps + 1):
                 d = k * stride
-                if across:
-                    begin, end = max(d, first), min(w - d, last)  # lanes whose pairs lie in the picture
-                    for n in range(first, min(begin, last)):
-                        state[n - first + HIGH] = -1.0
-                    for n in range(max(end, first), last):
-                        state[n - first + HIGH] = -1.0
-                    if begin >= end:
-                        break
-                    lanes = state[begin - first :]
-                    _take_pair(
-                        q[row, begin - d : end - d], q[row, begin + d : end + d], q[row, begin:end], limit, fall, lanes
-                    )
-                elif row - d < 0 or row + d >= h:
+                if d >= (w if across else h):
                     break
+                if across:
+                    before, after = line[w + first - d : w + last - d], line[w + first + d : w + last + d]
                 else:
-                    _take_pair(q[row - d, first:last], q[row + d, first:last], own, limit, fall, state)
-            for k in range(last - first):
-                if own[k] > 0:
-                    out[row, first + k] = state[np.uint64(k) + TOTAL] / state[np.uint64(k) + WEIGHTS]
+                    before = q[row - d, first:last] if row >= d else outside[: last - first]
+                    after = q[row + d, first:last] if row + d < h else outside[: last - first]
+                _take_pair(before, after, own, np.float32(k), limit, fall, state)
+            for n in range(last - first):
+                k = np.uint64(n)
+                s, sk, skk = state[k + SUMS], state[k + SUMS_K], state[k + SUMS_KK]
+                most = s * skk - sk * sk
+                if own[n] > 0 and most > 0:
+                    out[row, first + n] = own[n] + (skk * state[k + SUMS_D] - sk * state[k + SUMS_KD]) / most
 
 
 @nb.njit(cache=True, inline="always")
@@ -284,8 +300,9 @@ def plane_normals(q, lens, rotation, limit, normal):
 
 
 @nb.njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def depths_and_cover(q, thickness, near, limits, depth, covered):
-    """Depth (m; 0: no liquid) of inverse depths q, and the share of each pixel that liquid of this thickness covers.
+def depths_and_cover(q, ground, thickness, near, limits, depth, covered):
+    """Depth (m; 0: no liquid) of inverse depths q that the ground (m; 0: none) does not hide, and the share of each
+    pixel that liquid of this thickness covers.
 
     near: share of what is around that spheres cover. limits: thickness (m) of full cover, and shares `near` of none and
     of full cover.
@@ -294,7 +311,8 @@ def depths_and_cover(q, thickness, near, limits, depth, covered):
     thin, none, whole = limits[0], limits[1], limits[2]
     for row in nb.prange(q.shape[0]):
         for col in range(q.shape[1]):
-            there = q[row, col] > zero
+            bed = ground[row, col]
+            there = q[row, col] > zero and (bed <= zero or q[row, col] * bed > one)
             depth[row, col] = one / q[row, col] if there else zero
             share = min(thickness[row, col] / thin, (near[row, col] - none) / (whole - none))
             covered[row, col] = min(max(share, zero), one) if there else zero

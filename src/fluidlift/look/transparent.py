@@ -20,6 +20,7 @@ from scipy.spatial import cKDTree
 from fluidlift.errors import require
 from fluidlift.look.liquid import LiquidSurface
 from fluidlift.look.project import sound
+from fluidlift.look.smoothstep import smoothstep
 from fluidlift.numerics.splatting import Bins, Projected, View, bin_tiles, project
 from fluidlift.numerics.splatting_kernels import TILE, exp_negative
 from fluidlift.numerics.splatting_projection import REACH_MAX
@@ -260,10 +261,8 @@ def _surface(total: np.ndarray, skin: np.ndarray, camera: PinholeCamera, spacing
     """Sums along the rays to the surface that they make."""
     rays = camera.rays(camera.pixel_grid())
     away = np.linalg.norm(rays, axis=-1)
-    low, high = COVERED
-    share = np.clip((total / spacing - low) / (high - low), 0.0, 1.0)
-    rim = np.clip((_cosine(skin[..., 2:5], -rays / away[..., None]) - AWAY[0]) / (AWAY[1] - AWAY[0]), 0.0, 1.0)
-    covered = share * share * (3 - 2 * share) * rim * rim * (3 - 2 * rim)
+    rim = smoothstep(_cosine(skin[..., 2:5], -rays / away[..., None]), *AWAY)
+    covered = smoothstep(total / spacing, *COVERED) * rim
     found = np.maximum(skin[..., 0], 1e-12)
     there = covered > 0
     # half of the skin lies before its middle; metres along the ray are more than those of camera z

@@ -37,8 +37,10 @@ def seen_from(normals, i, j, rotation):
 
 
 @nb.njit(cache=True, inline="always")
-def between(x, y, z, depth, thickness, behind, lens):
-    """Row, column, and z of the near and the far side (0, 0: no liquid) in the pixel of a point."""
+def between(x, y, z, sides, lens):
+    """Row, column, and z of the near and the far side (0, 0: no liquid) in the pixel of a point. sides: pictures
+    of the near side's depth, of the thickness and of the depth of what lies behind."""
+    depth, thickness, behind = sides
     if z < 1e-6:
         return -1, -1, 0.0, 0.0
     u, v = lens[0] * x / z + lens[2], lens[1] * y / z + lens[3]
@@ -64,17 +66,17 @@ def _plane(p, t, i, j, z, nx, ny, nz, lens):
 
 
 @nb.njit(cache=True, error_model="numpy")
-def far_side(p, t, way, first, depth, thickness, back_normals, behind, lens, rotation):
+def far_side(p, t, way, first, sides, back_normals, eye):
     """Metres from p, on the near side, along the unit direction t to the far side, and the outward normal there.
 
-    way: a guess; first: the normal where it ends. Where the far side is not known, the last guess stays.
+    way: a guess; first: the normal where it ends. Where the far side is not known, the last guess stays. sides: as of
+    `between`; eye: lens (fx, fy, cx, cy) and rotation.
     """
+    lens, rotation = eye
     bx, by, bz = first
     most = LONGEST * max(way, 1e-9)
     for _ in range(NEWTON):
-        i, j, near, far = between(
-            p[0] + way * t[0], p[1] + way * t[1], p[2] + way * t[2], depth, thickness, behind, lens
-        )
+        i, j, near, far = between(p[0] + way * t[0], p[1] + way * t[1], p[2] + way * t[2], sides, lens)
         if near <= 0.0:
             break
         nx, ny, nz = seen_from(back_normals, i, j, rotation)
@@ -91,16 +93,17 @@ def far_side(p, t, way, first, depth, thickness, back_normals, behind, lens, rot
 
 
 @nb.njit(cache=True, error_model="numpy")
-def onward(q, m, thick, depth, normals, back_normals, thickness, behind, lens, rotation):
+def onward(q, m, thick, sides, normals, back_normals, eye):
     """Whether a ray that is mirrored at q, inside, into the unit direction m is seen to get out, metres to there and
-    the outward normal."""
+    the outward normal. sides, eye: as of `far_side`."""
+    lens, rotation = eye
     stride = max(STRIDE * thick, STRIDE_PX * q[2] / lens[0])
     low, high, row, col, near, far = 0.0, 0.0, -1, -1, 0.0, 0.0
     inside = True
     for _ in range(MARCH):
         high = low + stride
         z = q[2] + high * m[2]
-        i, j, zn, zf = between(q[0] + high * m[0], q[1] + high * m[1], z, depth, thickness, behind, lens)
+        i, j, zn, zf = between(q[0] + high * m[0], q[1] + high * m[1], z, sides, lens)
         inside = zn > 0.0 and zn <= z <= zf
         if not inside:
             break
@@ -111,13 +114,13 @@ def onward(q, m, thick, depth, normals, back_normals, thickness, behind, lens, r
     for _ in range(HALVED):
         s = 0.5 * (low + high)
         z = q[2] + s * m[2]
-        i, j, zn, zf = between(q[0] + s * m[0], q[1] + s * m[1], z, depth, thickness, behind, lens)
+        i, j, zn, zf = between(q[0] + s * m[0], q[1] + s * m[1], z, sides, lens)
         if zn > 0.0 and zn <= z <= zf:
             low, row, col, near, far = s, i, j, zn, zf
         else:
             high = s
     if row < 0:  # no step was inside: it leaves where it is
-        row, col, near, far = between(q[0], q[1], q[2], depth, thickness, behind, lens)
+        row, col, near, far = between(q[0], q[1], q[2], sides, lens)
         if near <= 0.0:
             return False, 0.0, 0.0, 0.0, 0.0
     z = q[2] + high * m[2]

@@ -25,6 +25,7 @@ from fluidlift.numerics.splatting_binning import (
     LEAD,
     count_kernel,
     fill_kernel,
+    met_kernel,
     pack_kernel,
     places_kernel,
     sketch_kernel,
@@ -95,7 +96,8 @@ class Pairs:
     gaussians: Int[np.ndarray, " pairs"]
     """place in `Bins.order` of the Gaussian of every pair, tile by tile, nearest first"""
     slots: Int[np.ndarray, " pairs"]
-    """where in `gaussians` the pairs of the k-th drawn Gaussian are: slots[offsets[k]:offsets[k + 1]]"""
+    """where in `gaussians` the pairs of the k-th drawn Gaussian are: slots[offsets[k]:offsets[k + 1]]; empty if nobody
+    asked for them"""
     offsets: Int[np.ndarray, " m+1"]
 
 
@@ -158,8 +160,10 @@ def project_backward(
     return gradients
 
 
-def bin_tiles(projected: Projected, size: tuple[int, int], tile: int = TILE) -> Bins:
+def bin_tiles(projected: Projected, size: tuple[int, int], tile: int = TILE, *, slots: bool = True) -> Bins:
     """Deal the drawn Gaussians to the tiles of a picture of `size` (width, height), nearest first; ties by index.
+
+    Without `slots`, which only gradients need, the lists are good for `rasterize` alone.
 
     Raises:
         ValueError: a tile of less than a pixel.
@@ -170,16 +174,14 @@ def bin_tiles(projected: Projected, size: tuple[int, int], tile: int = TILE) -> 
     sketch_kernel(projected.means, projected.conics, projected.extents, order, sketch)
     tiles_x, tiles_y = (-(-s // tile) for s in size)
     counts, pairs = _count(sketch, tile, (tiles_x, tiles_y), (0, tiles_x * tiles_y))
-    starts = np.concatenate([[0], np.cumsum(counts.sum(0, dtype=np.int64))])
+    starts = np.concatenate([[0], np.cumsum(counts[:, :-1].sum(0, dtype=np.int64))])
     bins = Bins(tile, (tiles_x, tiles_y), starts, order, sketch, _bands(starts))
-    return replace(bins, whole=_dealt(bins, bins.bands[0], counts, pairs)) if len(bins.bands) == 1 else bins
+    return replace(bins, whole=_dealt(bins, bins.bands[0], counts, pairs, slots)) if len(bins.bands) == 1 else bins
 
 
 def tiles_met(projected: Projected, size: tuple[int, int], tile: int = TILE) -> float:
     """About how many pairs of tile and Gaussian a picture has (an upper bound, nearly)."""
-    e = projected.extents[projected.extents[:, 0] > 0]
-    across = np.minimum(e * np.float32(2 / tile) + np.float32(1), np.asarray(size, np.float32) / tile + 1)
-    return float((across[:, 0] * across[:, 1]).sum(dtype=np.float64))
+    return float(met_kernel(projected.extents, tile, *size))
 
 
 def _order(projected: Projected) -> Int[np.ndarray, " m"]:
@@ -198,7 +200,7 @@ def _count(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Gaussians per chunk and tile, and tiles per Gaussian, of a band of tiles."""
     chunks = min(64, len(sketch) // 2048 + 1)  # by the number of Gaussians alone: the same for any number of threads
-    counts, pairs = np.zeros((chunks, tiles[0] * tiles[1]), np.int32), np.empty(len(sketch), np.int32)
+    counts, pairs = np.zeros((chunks, tiles[0] * tiles[1] + 1), np.int32), np.empty(len(sketch), np.int32)
     count_kernel(sketch, tile, *tiles, *band, counts, pairs)
     return counts, pairs
 
@@ -214,30 +216,32 @@ def _bands(starts: Int[np.ndarray, " tiles+1"]) -> tuple[tuple[int, int], ...]:
     return tuple(bands)
 
 
-def _dealt(bins: Bins, band: tuple[int, int], counts: np.ndarray, pairs: np.ndarray) -> Pairs:
+def _dealt(bins: Bins, band: tuple[int, int], counts: np.ndarray, pairs: np.ndarray, slots: bool) -> Pairs:
     """The lists of one band, of which `counts` and `pairs` were counted."""
     first, last = band
     low, high = bins.starts[first], bins.starts[last]
     places_kernel(counts, np.clip(bins.starts[:-1], low, high) - low)
     offsets = np.concatenate([[0], np.cumsum(pairs, dtype=np.int64)])
-    gaussians, slots = np.empty(high - low, np.int32), np.empty(high - low, np.int32)
-    fill_kernel(bins.sketch, bins.tile, *bins.tiles, first, last, counts, offsets, gaussians, slots)
-    return Pairs(first, last, gaussians, slots, offsets)
+    gaussians, places = np.empty(high - low, np.int32), np.empty(high - low if slots else 0, np.int32)
+    fill_kernel(bins.sketch, bins.tile, *bins.tiles, first, last, counts, offsets, gaussians, places)
+    return Pairs(first, last, gaussians, places, offsets)
 
 
-def _each_band(bins: Bins) -> Iterator[Pairs]:
+def _each_band(bins: Bins, *, slots: bool) -> Iterator[Pairs]:
     if bins.whole is not None:
         yield bins.whole
         return
     for band in bins.bands:
-        yield _dealt(bins, band, *_count(bins.sketch, bins.tile, bins.tiles, band))
+        yield _dealt(bins, band, *_count(bins.sketch, bins.tile, bins.tiles, band), slots)
 
 
-def _packed(projected: Projected, opacities: np.ndarray, features: np.ndarray, bins: Bins) -> np.ndarray:
+def _packed(
+    projected: Projected, opacities: np.ndarray, features: np.ndarray, bins: Bins, drawn_only: bool = False
+) -> np.ndarray:
     """What the loops over pixels read, in order of depth; never fewer than four channels (those added are 0)."""
     p = projected
     packed = np.empty((len(bins.order), LEAD + max(features.shape[1], 4)), p.means.dtype)
-    pack_kernel(p.means, p.conics, opacities, p.extents, features, bins.order, packed)
+    pack_kernel(p.means, p.conics, opacities, p.extents, features, bins.order, drawn_only, packed)
     return packed
 
 
@@ -257,14 +261,35 @@ def rasterize(
     size: tuple[int, int],
 ) -> tuple[Float[np.ndarray, "h w c"], Float[np.ndarray, "h w"]]:
     """Composite front to back: sum of weight x feature (black behind), and the transmittance that is left."""
-    width, height = size
     packed = _packed(projected, opacities, features, bins)
-    image = np.empty((height, width, features.shape[1]), packed.dtype)
-    light = np.empty((height, width), packed.dtype)
-    for band in _each_band(bins):
-        span = band.first, band.last, bins.tile, _stride(band.last - band.first)
-        raster_kernel(packed, bins.starts, band.gaussians, *span, width, height, image, light)
+    image, _, light = _composited(packed, bins, size, features.shape[1], 0)
     return image, light
+
+
+def rasterize_drawn(
+    projected: Projected,
+    opacities: Float[np.ndarray, " n"],
+    features: Float[np.ndarray, "m c"],
+    bins: Bins,
+    size: tuple[int, int],
+) -> tuple[Float[np.ndarray, "h w c-1"], Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
+    """As `rasterize`, for features of the drawn Gaussians alone, in the order of `bins.order`, and with the last
+    channel in an array of its own, before the transmittance."""
+    packed = _packed(projected, opacities, features, bins, drawn_only=True)
+    return _composited(packed, bins, size, features.shape[1] - 1, 1)
+
+
+def _composited(
+    packed: np.ndarray, bins: Bins, size: tuple[int, int], channels: int, apart: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The first channels, the one after them (`apart` 1; 0: empty), and the transmittance."""
+    width, height = size
+    image, last = np.zeros((height, width, channels), packed.dtype), np.zeros((apart * height, width), packed.dtype)
+    light = np.ones((height, width), packed.dtype)
+    for band in _each_band(bins, slots=False):
+        span = band.first, band.last, bins.tile, _stride(band.last - band.first)
+        raster_kernel(packed, bins.starts, band.gaussians, *span, image, last, light)
+    return image, last, light
 
 
 def rasterize_backward(
@@ -282,7 +307,7 @@ def rasterize_backward(
     n, channels = features.shape
     gradients = (np.zeros((n, 2), packed.dtype), np.zeros((n, 3), packed.dtype), np.zeros(n, packed.dtype),
                  np.zeros((n, channels), packed.dtype))  # fmt: skip
-    for band in _each_band(bins):
+    for band in _each_band(bins, slots=True):
         records = np.zeros((len(band.gaussians), SUMS + channels), packed.dtype)
         span = band.first, band.last, bins.tile, _stride(band.last - band.first)
         raster_backward_kernel(packed, bins.starts, band.gaussians, *span, image, light, g_image, g_light, records)

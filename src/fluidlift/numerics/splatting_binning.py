@@ -19,16 +19,18 @@ box; [[a, b], [b, c]] is the inverse covariance"""
 
 
 @nb.njit(cache=True, nogil=True, parallel=True)
-def pack_kernel(uv, conics, opacities, extents, features, order, packed):
-    """The drawn Gaussians in order of depth, one row each: the loops over pixels read no more than these."""
+def pack_kernel(uv, conics, opacities, extents, features, order, drawn_only, packed):
+    """The drawn Gaussians in order of depth, one row each: the loops over pixels read no more than these. With
+    `drawn_only` the rows of `features` come in that order already."""
     for k0 in nb.prange(order.shape[0]):
         k = np.int64(k0)
         i = order[k]
         packed[k, 0], packed[k, 1] = uv[i, 0], uv[i, 1]
         packed[k, 2], packed[k, 3], packed[k, 4] = 0.5 * conics[i, 0], conics[i, 1], 0.5 * conics[i, 2]
         packed[k, 5], packed[k, 6], packed[k, 7] = opacities[i], extents[i, 1], extents[i, 0]
+        row = k if drawn_only else i
         for c in range(features.shape[1]):
-            packed[k, LEAD + c] = features[i, c]
+            packed[k, LEAD + c] = features[row, c]
         for c in range(LEAD + features.shape[1], packed.shape[1]):
             packed[k, c] = 0
 
@@ -45,6 +47,17 @@ def sketch_kernel(uv, conics, extents, order, sketch):
         # hx^2 = w^2 + (lean hy)^2
         sketch[k, 4], sketch[k, 5] = lean, math.sqrt(max(hx * hx - lean * lean * hy * hy, 0.0))
         sketch[k, 6], sketch[k, 7] = lean * hy * hy / hx, 1.0 / hy
+
+
+@nb.njit(cache=True, nogil=True)
+def met_kernel(extents, tile, width, height):
+    """Pairs of tile and box, were the boxes nowhere near the picture's edges, but never larger than the picture."""
+    total = 0.0
+    for i in range(extents.shape[0]):
+        if extents[i, 0] > 0:
+            across = min(2.0 * extents[i, 0] / tile + 1.0, width / tile + 1.0)
+            total += across * min(2.0 * extents[i, 1] / tile + 1.0, height / tile + 1.0)
+    return total
 
 
 @nb.njit(cache=True)
@@ -85,7 +98,10 @@ def _columns(sketch, k, row, tile, tiles_x):
 @nb.njit(cache=True, nogil=True, parallel=True)
 def count_kernel(sketch, tile, tiles_x, tiles_y, first, last, counts, pairs):
     """Of the tiles first <= t < last: counts[chunk, t], Gaussians of a chunk that meet t; pairs[k], tiles that the k-th
-    meets."""
+    meets. `counts` is 0 before, and has one column more than there are tiles.
+
+    A run of tiles is noted by its two ends, and the runs are summed up when all are in: no loop over pairs.
+    """
     chunks, n = counts.shape[0], sketch.shape[0]
     size = -(-n // chunks)
     row0, row1 = first // tiles_x, (last - 1) // tiles_x
@@ -97,16 +113,22 @@ def count_kernel(sketch, tile, tiles_x, tiles_y, first, last, counts, pairs):
             total = 0
             for ty in range(max(y0, row0), min(y1, row1) + 1):
                 left, right = (x0, x1) if plain else _columns(sketch, k, ty, tile, tiles_x)
-                for t in range(max(ty * tiles_x + left, first), min(ty * tiles_x + right + 1, last)):
-                    counts[chunk, t] += 1
-                    total += 1
+                begin, end = max(ty * tiles_x + left, first), min(ty * tiles_x + right + 1, last)
+                if begin < end:
+                    counts[chunk, begin] += 1
+                    counts[chunk, end] -= 1
+                    total += end - begin
             pairs[k] = total
+        running = 0
+        for t in range(first, last):
+            running += counts[chunk, t]
+            counts[chunk, t] = running
 
 
 @nb.njit(cache=True, nogil=True, parallel=True)
 def places_kernel(counts, starts):
     """Counts of chunks to where each chunk's part of each tile's list begins; `starts` are those of the lists."""
-    for t0 in nb.prange(counts.shape[1]):
+    for t0 in nb.prange(starts.shape[0]):
         t = np.int64(t0)
         place = starts[t]
         for chunk in range(counts.shape[0]):
@@ -117,7 +139,8 @@ def places_kernel(counts, starts):
 
 @nb.njit(cache=True, nogil=True, parallel=True)
 def fill_kernel(sketch, tile, tiles_x, tiles_y, first, last, places, offsets, gaussians, slots):
-    """Deal out the pairs of tiles first <= t < last: gaussians[place] = k, and the places of each k in `slots`."""
+    """Deal out the pairs of tiles first <= t < last: gaussians[place] = k, and the places of each k in `slots`, unless
+    that is empty."""
     chunks, n = places.shape[0], sketch.shape[0]
     size = -(-n // chunks)
     row0, row1 = first // tiles_x, (last - 1) // tiles_x
@@ -133,5 +156,6 @@ def fill_kernel(sketch, tile, tiles_x, tiles_y, first, last, places, offsets, ga
                     place = places[chunk, t]
                     places[chunk, t] = place + 1
                     gaussians[place] = k
-                    slots[slot] = place
-                    slot += 1
+                    if slots.size > 0:
+                        slots[slot] = place
+                        slot += 1

@@ -13,7 +13,7 @@ from typing import Any
 import numba as nb
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from fluidlift.errors import require
@@ -71,11 +71,12 @@ def _direction(means, position, i):
 
 
 @nb.njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def colors_kernel(means, sh, position, out):
-    n, count = sh.shape[0], sh.shape[1]
+def colors_kernel(means, sh, position, rows, out):
+    n, count = rows.shape[0], sh.shape[1]
     for chunk in nb.prange(-(-n // _CHUNK)):
         basis = np.empty(16)
-        for i in range(np.int64(chunk) * _CHUNK, min((np.int64(chunk) + 1) * _CHUNK, n)):
+        for p in range(np.int64(chunk) * _CHUNK, min((np.int64(chunk) + 1) * _CHUNK, n)):
+            i = rows[p]
             if count > 1:
                 x, y, z, _ = _direction(means, position, i)
                 _basis(x, y, z, count, basis)
@@ -85,7 +86,7 @@ def colors_kernel(means, sh, position, out):
                 total = 0.5
                 for k in range(count):
                     total += basis[k] * sh[i, k, c]
-                out[i, c] = max(total, 0.0)
+                out[p, c] = max(total, 0.0)
 
 
 @nb.njit(cache=True, nogil=True, parallel=True, error_model="numpy")
@@ -110,16 +111,21 @@ def colors_backward_kernel(means, sh, position, out, g_out, g_means, g_sh):
 
 
 def colors(
-    means: Float[np.ndarray, "n 3"], sh: Float[np.ndarray, "n k 3"], position: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "n 3"]:
-    """Colours (0 and up) of Gaussians at `means` (m) seen from `position` (m), in the precision of `sh`.
+    means: Float[np.ndarray, "n 3"],
+    sh: Float[np.ndarray, "n k 3"],
+    position: Float[np.ndarray, "3"],
+    rows: Int[np.ndarray, " m"] | None = None,
+) -> Float[np.ndarray, "m 3"]:
+    """Colours (0 and up) of Gaussians at `means` (m) seen from `position` (m), in the precision of `sh`: of all, or of
+    those of `rows`, in that order.
 
     Raises:
         ValueError: other than 1, 4, 9 or 16 coefficients.
     """
     require(sh.shape[1] in (1, 4, 9, 16), f"{sh.shape[1]} coefficients of harmonics", "1, 4, 9 or 16 (degree 0 to 3)")
-    out = np.empty((len(sh), 3), sh.dtype)
-    colors_kernel(means, sh, np.asarray(position, np.float64), out)
+    rows = np.arange(len(sh), dtype=np.int32) if rows is None else np.ascontiguousarray(rows, np.int32)
+    out = np.empty((len(rows), 3), sh.dtype)
+    colors_kernel(means, sh, np.asarray(position, np.float64), rows, out)
     return out
 
 

@@ -30,8 +30,8 @@ TRANSMITTANCE_MIN = np.float32(1e-4)
 TILE = 16
 """px, width and height of a tile unless asked otherwise"""
 LANES = 16
-BATCH = 32
-"""Gaussians of a tile that are fetched together; between two batches it is checked whether the tile is finished"""
+BATCH = 16
+"""Gaussians of a tile that are fetched together; between two batches it is checked which of its rows are finished"""
 SUMS = 6
 """numbers of a record before those of the features"""
 _FALLOFF_MAX = np.float32(6.0)  # exp(-6) is under the cut
@@ -66,14 +66,20 @@ def _exp_negative_compiled(p):
 
 
 @nb.njit(cache=True, inline="always")
-def _any_alive(buf, blocks, size):
-    """Whether any pixel of the tile still takes light."""
-    count = 0
-    for block in range(blocks):
-        base = np.uint64(block * size)
-        for lane in range(np.uint64(LANES)):
-            count += buf[base + lane] > 0
-    return count > 0
+def _alive(buf, tile, groups, size, rows):
+    """First and last row of a tile with a pixel that still takes light (the last is smaller if none has), and whether
+    each of its `rows` has one."""
+    first, last = tile, -1
+    for r in range(tile):
+        count = 0
+        for g in range(groups):
+            base = np.uint64((r * groups + g) * size)
+            for lane in range(np.uint64(LANES)):
+                count += buf[base + lane] > 0
+        rows[r] = count > 0
+        if count > 0:
+            first, last = min(first, r), r
+    return first, last
 
 
 @nb.njit(cache=True)
@@ -87,11 +93,25 @@ def _fetch(packed, gaussians, begin, end, near):
 
 @nb.njit(cache=True, inline="always")
 def _span(packed, k, x0, y0, tile):
-    """Rows first..last and groups of lanes first..last of a tile that the box of Gaussian k holds."""
-    u, v, hy, hx = packed[k, 0], packed[k, 1], packed[k, 6], packed[k, 7]
-    half = np.float32(0.5)
-    r0 = max(0, int(math.ceil(v - hy - half)) - y0)
-    r1 = min(tile - 1, int(math.floor(v + hy - half)) - y0)
+    """Rows first..last of a tile that the ellipse of Gaussian k meets, and groups of lanes first..last that its box
+    holds.
+
+    As for the columns of a row of tiles (`splatting_binning`), with the axes exchanged: the ellipse's upper edge is a
+    concave function of dx, whose highest point within the tile is that of the whole ellipse or at one of its sides.
+    """
+    u, v, a, b, c = packed[k, 0], packed[k, 1], packed[k, 2], packed[k, 3], packed[k, 4]
+    hy, hx = packed[k, 6], packed[k, 7]
+    half, one, zero = packed.dtype.type(0.5), packed.dtype.type(1.0), packed.dtype.type(0.0)
+    lean, peak = -half * b / c, -half * b / a * hy
+    width, inverse = math.sqrt(max(hy * hy - lean * lean * hx * hx, zero)), one / hx
+    left = np.float32(x0) + half - u
+    low, high = max(left, -hx), min(left + np.float32(tile - 1), hx)
+    xt, xb = min(max(peak, low), high), min(max(-peak, low), high)
+    slack = packed.dtype.type(0.01) + packed.dtype.type(1e-3) * hy  # more than the rounding of `width`, a difference
+    top = lean * xt + width * math.sqrt(max(one - (xt * inverse) * (xt * inverse), zero))
+    bottom = lean * xb - width * math.sqrt(max(one - (xb * inverse) * (xb * inverse), zero))
+    r0 = max(0, int(math.ceil(v + max(bottom - slack, -hy) - half)) - y0)
+    r1 = min(tile - 1, int(math.floor(v + min(top + slack, hy) - half)) - y0)
     g1 = (tile - 1) // LANES
     if g1 == 0:
         return r0, r1, 0, 0
@@ -104,8 +124,10 @@ def _span(packed, k, x0, y0, tile):
 
 
 @nb.njit(cache=True, nogil=True, parallel=True, fastmath=_FUSED, error_model="numpy")
-def raster_kernel(packed, starts, gaussians, first, last, tile, stride, width, height, image, light):
-    """Tiles first <= t < last of the picture. Block of 16 pixels: light, weights, then 16 per channel."""
+def raster_kernel(packed, starts, gaussians, first, last, tile, stride, image, apart, light):
+    """Tiles first <= t < last of the picture; where nothing is, the pictures stay as they were. `apart` takes the
+    channel after those of `image`, unless it is empty. Block of 16 pixels: light, weights, then 16 per channel."""
+    height, width = light.shape
     tiles_x = (width + tile - 1) // tile
     groups = (tile + LANES - 1) // LANES
     channels = packed.shape[1] - LEAD
@@ -115,22 +137,29 @@ def raster_kernel(packed, starts, gaussians, first, last, tile, stride, width, h
     for t0 in nb.prange(last - first):
         t = first + (np.int64(t0) * stride) % (last - first)  # scattered: every thread gets dense and empty tiles
         x0, y0 = (t % tiles_x) * tile, (t // tiles_x) * tile
-        buf = np.zeros(tile * groups * size, packed.dtype)
-        for r in range(min(tile, height - y0)):
-            for j in range(min(tile, width - x0)):
-                buf[(r * groups + j // LANES) * size + j % LANES] = one
-        near = np.empty((BATCH, packed.shape[1]), packed.dtype)
         begin, end = starts[t] - starts[first], starts[t + 1] - starts[first]
+        rows, columns = min(tile, height - y0), min(tile, width - x0)
+        if begin == end:
+            continue
+        buf = np.zeros(tile * groups * size, packed.dtype)
+        for r in range(rows):
+            for j in range(columns):
+                buf[(r * groups + j // LANES) * size + j % LANES] = one
+        near, alive, top, bottom = np.empty((BATCH, packed.shape[1]), packed.dtype), np.ones(tile, np.bool_), 0, tile
         for n in range(begin, end):
             k = (n - begin) % BATCH
             if k == 0:
-                if n > begin and not _any_alive(buf, tile * groups, size):
-                    break
+                if n > begin:
+                    top, bottom = _alive(buf, tile, groups, size, alive)
+                    if top > bottom:
+                        break
                 _fetch(packed, gaussians, n, min(n + BATCH, end), near)
             r0, r1, g0, g1 = _span(near, k, x0, y0, tile)
             u, v, a, b, c, o = near[k, 0], near[k, 1], near[k, 2], near[k, 3], near[k, 4], near[k, 5]
             f0, f1, f2, f3 = near[k, LEAD], near[k, LEAD + 1], near[k, LEAD + 2], near[k, LEAD + 3]
-            for r in range(r0, r1 + 1):
+            for r in range(max(r0, top), min(r1, bottom) + 1):
+                if not alive[r]:
+                    continue
                 dy = np.float32(y0 + r) + np.float32(0.5) - v
                 bend, rise = b * dy, c * dy * dy
                 for g in range(g0, g1 + 1):
@@ -158,12 +187,14 @@ def raster_kernel(packed, starts, gaussians, first, last, tile, stride, width, h
                         at = base + (np.uint64(2) + ch) * np.uint64(LANES)
                         for lane in range(np.uint64(LANES)):
                             buf[at + lane] += buf[base + np.uint64(16) + lane] * f
-        for r in range(min(tile, height - y0)):
-            for j in range(min(tile, width - x0)):
+        for r in range(rows):
+            for j in range(columns):
                 at = (r * groups + j // LANES) * size + j % LANES
                 light[y0 + r, x0 + j] = abs(buf[at])
                 for ch in range(image.shape[2]):
                     image[y0 + r, x0 + j, ch] = buf[at + (2 + ch) * LANES]
+                if apart.size > 0:
+                    apart[y0 + r, x0 + j] = buf[at + (2 + image.shape[2]) * LANES]
 
 
 @nb.njit(cache=True, fastmath={"reassoc", "contract"})
@@ -269,19 +300,24 @@ def raster_backward_kernel(
         buf = np.zeros(tile * groups * size, packed.dtype)
         sums = np.zeros((3 + channels) * LANES, packed.dtype)
         _load_tile(buf, size, groups, tile, x0, y0, image, light, g_image, g_light)
-        near = np.empty((BATCH, packed.shape[1]), packed.dtype)
+        near, alive = np.empty((BATCH, packed.shape[1]), packed.dtype), np.ones(tile, np.bool_)
         begin, end = starts[t] - starts[first], starts[t + 1] - starts[first]
+        top, bottom = 0, tile
         for pair in range(begin, end):
             k = (pair - begin) % BATCH
             if k == 0:
-                if pair > begin and not _any_alive(buf, tile * groups, size):
-                    break
+                if pair > begin:
+                    top, bottom = _alive(buf, tile, groups, size, alive)
+                    if top > bottom:
+                        break
                 _fetch(packed, gaussians, pair, min(pair + BATCH, end), near)
             r0, r1, g0, g1 = _span(near, k, x0, y0, tile)
             for g in range(g0, g1 + 1):
                 px = np.float32(x0 + g * LANES) + np.float32(0.5)
                 sums[:] = 0
-                for r in range(r0, r1 + 1):
+                for r in range(max(r0, top), min(r1, bottom) + 1):
+                    if not alive[r]:
+                        continue
                     dy = np.float32(y0 + r) + np.float32(0.5) - near[k, 1]
                     _backward_block(buf, np.uint64((r * groups + g) * size), sums, near, k, dy, px)
                 shift = px - near[k, 0]

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
+from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from fluidlift.numerics.sampling import sample_faces, sample_nodes
@@ -15,6 +16,16 @@ from fluidlift.types import CellType, FaceVelocity, FluidParameters, Grid, Terra
 
 MODES = 12
 """plane waves that make up the inflow fluctuation"""
+
+LOOK_BACK = 5
+"""cells of the way back without liquid after which what falls is not fed from above: as tall is one column of the plan
+of a curtain at 80 degrees, and its rim has steps of that"""
+
+STEP = 2
+"""cells that a sheet of cells may step back or forth from one layer to the next"""
+
+STEEP = 0.7
+"""cosine to gravity of a velocity that falls"""
 
 SHORE = 1.5
 """cells from what stands out of a fluid within which its splats have the colours of rocks and banks"""
@@ -70,6 +81,71 @@ def inlet_to_surface(
         above = (cells[:, :, k - 1] == CellType.INFLOW) & (cells[:, :, k] == CellType.EMPTY) & held[:, :, k]
         cells[:, :, k][above] = CellType.INFLOW
     return cells
+
+
+def inlet_along_rim(
+    cell_types: UInt8[np.ndarray, "nx ny nz"],
+    positions: Float[np.ndarray, "n 3"],
+    velocity: FaceVelocity,
+    grid: Grid,
+    gravity: Float[np.ndarray, "3"],
+) -> UInt8[np.ndarray, "nx ny nz"]:
+    """The cells with an inlet that follows the rim of a falling body without gaps, from its highest to its lowest cell.
+
+    An inlet drawn on the plan of a steep curtain misses cells of its rim, and below each gap the curtain runs dry as
+    soon as it has fallen: a sheet comes down in strings. So between the ends of the inlet a cell of the body that moves
+    down becomes INFLOW where the way back along its velocity meets nothing wet. The way is looked for to either side as
+    well, across the curtain, which may lean: it is a staircase of cells.
+
+    Args:
+        cell_types: `CellType`; those of an inlet without anything of the body are returned as they are.
+        positions: of the body's particles, m.
+        velocity: of the liquid, m/s.
+        grid: of all of it.
+        gravity: m/s^2.
+    """
+    held = np.zeros(grid.shape, bool)
+    held[tuple(np.clip(grid.cell_of(positions), 0, np.asarray(grid.shape) - 1).T)] = True
+    near = ndimage.binary_dilation(held)
+    # inlet cells away from all that was seen say nothing about where the body ends
+    down, given = np.asarray(gravity, np.float64), np.argwhere((cell_types == CellType.INFLOW) & near)
+    index = np.argwhere(held & ((cell_types == CellType.FLUID) | (cell_types == CellType.EMPTY)))
+    if not len(given) or not down.any() or not len(index):
+        return cell_types
+    down = down / np.linalg.norm(down)
+    v = velocity.at_centers()[tuple(index.T)].astype(np.float64)
+    speed = np.linalg.norm(v, axis=1)
+    falls = (speed > 0) & (v @ down > STEEP * speed) & (index @ down <= (given @ down).max())
+    index, along = index[falls], v[falls] / speed[falls, None]
+    across = _across_sheet(np.argwhere(held), down, (given @ down).max())
+    reach = LOOK_BACK + STEP + 1
+    liquid = np.isin(cell_types, (CellType.FLUID, CellType.INFLOW)) | ((cell_types != CellType.SOLID) & held)
+    wet = np.pad(liquid, reach)
+    fed = np.zeros(len(index), bool)
+    for steps in range(1, LOOK_BACK + 1):
+        for side in range(-STEP, STEP + 1):
+            at = np.rint(index - steps * along + side * across).astype(np.int64) + reach
+            fed |= wet[tuple(at.T)]
+    cells = cell_types.copy()
+    cells[tuple(index[~fed].T)] = CellType.INFLOW
+    return cells
+
+
+def _across_sheet(
+    cells: Float[np.ndarray, "n 3"], down: Float[np.ndarray, "3"], lowest: float
+) -> Float[np.ndarray, "3"]:
+    """Unit vector across what falls, level: the axis along which its layers of cells are thinnest, those that lie no
+    further along `down` than `lowest`."""
+    depth = np.rint(cells @ down).astype(int)
+    above = depth <= lowest
+    points, layer = cells[above].astype(np.float64), depth[above] - depth.min()
+    count = np.maximum(np.bincount(layer), 1)
+    middle = np.stack([np.bincount(layer, points[:, a]) / count for a in range(3)], axis=1)
+    spread = points - middle[layer]
+    spread -= (spread @ down)[:, None] * down
+    # what is along gravity itself never counts as thin
+    values, vectors = np.linalg.eigh(spread.T @ spread + 1e9 * np.outer(down, down))
+    return vectors[:, int(values.argmin())]
 
 
 def clear_of_shore(

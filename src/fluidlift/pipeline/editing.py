@@ -22,6 +22,7 @@ from fluidlift.io.scene_path import PLAIN, names_of
 from fluidlift.io.scene_text import with_value, without
 from fluidlift.pipeline import edit_history
 from fluidlift.pipeline.edit_history import BY_HAND, Edit, History, text_hash, unified
+from fluidlift.pipeline.edit_outlook import outlook
 from fluidlift.pipeline.reshaping import HIGHEST
 from fluidlift.pipeline.scene import LYING
 from fluidlift.pipeline.scene_changes import Add, Change, Remove, Set
@@ -190,11 +191,13 @@ class EditSession:
         return stale_parts(self.folder, self.edits, meshes=self.meshes)
 
     def warnings(self) -> list[str]:
-        """What is odd about the scene as it is: things mostly outside the domain, a look that is not drawn."""
-        edits = self.edits
+        """What is odd about the scene as it is: things mostly outside the domain or in the ground, edits that take very
+        long to simulate, a look that is not drawn."""
+        edits, manifest = self.edits, read_manifest(self.folder)
         idle = edits.look.warning()
         self._require_kind(edits)
-        return self._inside(edits) + ([] if idle is None else [idle])
+        found = self._inside(edits) + outlook(self.folder, manifest, edits, _grid_of(manifest))
+        return found + ([] if idle is None else [idle])
 
     # --- inside -----------------------------------------------------------------------------------------------------
 
@@ -297,12 +300,16 @@ class EditSession:
         if edits.terrain:
             return []
         manifest = read_manifest(self.folder)
-        data, clip = manifest["grid"], manifest["frame_count"] * manifest["frame_interval"]
-        grid = Grid(tuple(data["shape"]), data["spacing"], tuple(data["origin"]))
+        grid, clip = _grid_of(manifest), manifest["frame_count"] * manifest["frame_interval"]
         above = HIGHEST * float((grid.high - grid.low).max())
         return require_inside(
             edits, grid, reach=edits.extend_downstream, above=above, seconds=edits.duration or clip
         )  # fmt: skip
+
+
+def _grid_of(manifest: dict[str, Any]) -> Grid:
+    data = manifest["grid"]
+    return Grid(tuple(data["shape"]), data["spacing"], tuple(data["origin"]))
 
 
 def _as_lifted(text: str) -> str:

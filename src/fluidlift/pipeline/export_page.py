@@ -11,9 +11,10 @@ import numpy as np
 
 from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.pipeline.export_job import ExportJob, Outcome, frames_of
-from fluidlift.types import Gaussians, PinholeCamera, concatenate, sh_from_rgb
+from fluidlift.types import Gaussians, PinholeCamera, Similarity3, concatenate, matrix_from_quat, sh_from_rgb
 
 if TYPE_CHECKING:
+    from fluidlift.io.frames import MovingMesh
     from fluidlift.io.page_frames import Range
 
 MOST_SPLATS = 100_000
@@ -49,11 +50,14 @@ class Plan:
 def write_page_of(job: ExportJob) -> Outcome:
     """page.html in the folder, or the .html file that was named."""
     from fluidlift.io.export_page import PageScene, write_page
+    from fluidlift.look.scenery import LIGHT
+    from fluidlift.pipeline.usd_exporting import bodies_of
 
     first, ids, _ = next(frames_of(job.folder, job.picked[:1]))
     plan = _plan(job, len(first))
     picked = job.picked[:: plan.every]
-    warnings = _told(plan, len(first), job, len(picked))
+    bodies, missing = bodies_of(job.folder, picked)
+    warnings = [*_told(plan, len(first), job, len(picked)), *missing]
 
     def frames(told: bool) -> Iterator[tuple[Gaussians, np.ndarray]]:
         for done, (g, number, _) in enumerate(frames_of(job.folder, picked)):
@@ -66,7 +70,8 @@ def write_page_of(job: ExportJob) -> Outcome:
     scene = PageScene(
         title=job.folder.stem, camera=job.asset.camera, target=middle_of_view(job.asset.camera, first),
         interval=job.interval * plan.every, numbers=tuple(FIRST_FRAME + k for k in picked),
-        poster=_poster(job, first), terrain=job.asset.terrain.mesh, warnings=tuple(warnings),
+        poster=_poster(job, first, bodies), terrain=job.asset.terrain.mesh, warnings=tuple(warnings),
+        bodies=tuple(bodies), sun=tuple((LIGHT / np.linalg.norm(LIGHT)).tolist()),
         terrain_opacity=GLASS if job.asset.kind == "pour" else 1.0,
         facts=(f"{len(shown):,} splats".replace(",", " "), f"{len(picked)} frames"),
     )  # fmt: skip
@@ -139,17 +144,22 @@ def _told(plan: Plan, splats: int, job: ExportJob, frames: int) -> list[str]:
     return told
 
 
-def _poster(job: ExportJob, first: Gaussians) -> np.ndarray:
+def _poster(job: ExportJob, first: Gaussians, bodies: list[MovingMesh]) -> np.ndarray:
     """u8 [h,w,3]: the first frame over its ground, from the clip's camera."""
     from fluidlift.look.rasterize import render
-    from fluidlift.look.scenery import terrain_surfels
+    from fluidlift.look.scenery import mesh_surfels, terrain_surfels
 
     camera = job.asset.camera
     factor = min(1.0, POSTER / max(camera.size))
     camera = camera.resized((max(1, round(camera.size[0] * factor)), max(1, round(camera.size[1] * factor))))
-    scene = concatenate(
-        [terrain_surfels(job.asset.terrain, opacity=GLASS if job.asset.kind == "pour" else 0.98), first]
-    )
+    solids = [
+        mesh_surfels(b.mesh, job.asset.grid.spacing).transformed(
+            Similarity3(1.0, matrix_from_quat(b.orientations[0]), b.positions[0])
+        )
+        for b in bodies
+    ]
+    ground = terrain_surfels(job.asset.terrain, opacity=GLASS if job.asset.kind == "pour" else 0.98)
+    scene = concatenate([ground, *solids, first])
     picture = render(scene, camera, background=(0.08, 0.09, 0.11)).image
     return (255 * np.clip(picture, 0, 1) + 0.5).astype(np.uint8)
 

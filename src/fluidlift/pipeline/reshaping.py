@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -13,7 +13,9 @@ from fluidlift.errors import InputRejected
 from fluidlift.types import FluidParameters, Gaussians, Grid, concatenate, sh_from_rgb
 
 if TYPE_CHECKING:
+    from fluidlift.io.obstacles import Obstacle
     from fluidlift.physics.emitter import Emitter
+    from fluidlift.physics.inflow_schedule import InflowSchedule
     from fluidlift.physics.stepping import ParticleSimulator
     from fluidlift.physics.terrain_edit import TerrainEdit
     from fluidlift.pipeline.scene import Scene
@@ -185,39 +187,63 @@ def _shown(value: Any) -> str:
     return numbers[0] if len(numbers) == 1 else f"[{', '.join(numbers)}]"
 
 
-def demands(scene: Scene) -> list[tuple[float, str]]:
+class Asked(NamedTuple):
+    """What decides how many steps a scene needs from one frame to the next."""
+
+    parameters: FluidParameters
+    interval: float
+    """s, between frames"""
+    grid: Grid
+    emitters: Sequence[Emitter]
+    obstacles: Sequence[Obstacle]
+    inflow: InflowSchedule
+    longest_step: float | None
+    """s, where scene.yaml gives one"""
+    changes: tuple[str, ...]
+    """parameters that scene.yaml changes, in words that begin with their names"""
+
+
+def demands(asked: Asked) -> list[tuple[float, str]]:
     """What scene.yaml asks of the clock: (steps from one frame to the next, in words), the most demanding first."""
     from fluidlift.physics.surface_tension import capillary_time_step
 
-    p, interval, h = scene.parameters, scene.interval, scene.terrain.grid.spacing
-    changed = {text.partition(" ")[0] for text in scene.changes}
-    speeds = [(_size(e.velocity), f"emitter '{e.name}'") for e in scene.emitters]
-    for o in scene.obstacles:
+    p, interval, h = asked.parameters, asked.interval, asked.grid.spacing
+    changed = {text.partition(" ")[0] for text in asked.changes}
+    speeds = [(_size(e.velocity), f"emitter '{e.name}'") for e in asked.emitters]
+    for o in asked.obstacles:
         size = _size(np.ptp(np.asarray(o.mesh.vertices), axis=0))
         speeds.append((_size(o.velocity) + 0.5 * size * _size(o.angular_velocity), f"obstacle '{o.name}'"))
-    if "inflow_velocity" in changed or scene.inflow != type(scene.inflow)():
-        surge = max(f for _, f in scene.inflow.keyframes) * (1.0 + 2.0 * scene.inflow.fluctuation)
+    if "inflow_velocity" in changed or asked.inflow != type(asked.inflow)():
+        surge = max(f for _, f in asked.inflow.keyframes) * (1.0 + 2.0 * asked.inflow.fluctuation)
         speeds.append((_size(p.inflow_velocity) * surge, "the inflow"))
     found = [(v * interval / h, f"{what} at {v:.3g} m/s") for v, what in speeds]
     if "gravity" in changed:
-        pull, high = _size(p.gravity), scene.terrain.grid.shape[2] * h
+        pull, high = _size(p.gravity), asked.grid.shape[2] * h
         found.append((math.sqrt(2.0 * pull * high) * interval / h, f"gravity of {pull:.3g} m/s^2"))
-    if scene.longest_step is not None:
-        found.append((interval / scene.longest_step, f"time_step {scene.longest_step:.3g} s"))
+    if asked.longest_step is not None:
+        found.append((interval / asked.longest_step, f"time_step {asked.longest_step:.3g} s"))
     if p.surface_tension > 0 and changed & {"surface_tension", "density"}:
         step = capillary_time_step(p.density, p.surface_tension, h)
         found.append((interval / step, f"surface_tension {p.surface_tension:.3g} N/m on cells of {h:.3g} m"))
     return sorted(found, key=lambda d: -d[0])
 
 
-def slow_edits(scene: Scene) -> list[str]:
+def slow_edits(scene: Scene | Asked) -> list[str]:
     """A word about edits that make a simulation take far longer than usual, before it begins.
+
+    Args:
+        scene: that is to be simulated, or what of it decides.
 
     Raises:
         InputRejected: one that needs more steps from one frame to the next than the simulator takes.
     """
     from fluidlift.physics.stepping import SimulationSettings
 
+    if not isinstance(scene, Asked):
+        scene = Asked(
+            scene.parameters, scene.interval, scene.terrain.grid, scene.emitters, scene.obstacles, scene.inflow,
+            scene.longest_step, scene.changes,
+        )  # fmt: skip
     most = SimulationSettings().max_substeps
     steps, what = next(iter(demands(scene)), (0.0, ""))
     if steps > most:

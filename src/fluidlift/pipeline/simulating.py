@@ -92,8 +92,9 @@ def inflow_look(scene: Scene, own: Gaussians, speed: float) -> InflowLook:
 
 
 def within_outlet(scene: Scene) -> tuple[np.ndarray, Particles]:
-    """Cells and body of what lies on something, without what is behind its outlet; all of those of other fluids."""
-    from fluidlift.physics.inlet import inlet_to_surface
+    """Cells and body of what lies on something, without what is behind its outlet and with an inlet that takes in all
+    that flows in; all of those of other fluids."""
+    from fluidlift.physics.inlet import inlet_along_rim, inlet_to_surface
     from fluidlift.physics.outlet import thin_outlet
 
     if scene.kind not in LYING:
@@ -101,6 +102,9 @@ def within_outlet(scene: Scene) -> tuple[np.ndarray, Particles]:
     cells, grid = thin_outlet(scene.cell_types), scene.terrain.grid
     if scene.kind == "stream":
         cells = inlet_to_surface(cells, scene.body.positions, grid)
+    elif scene.kind == "fall":
+        gravity = np.asarray(scene.parameters.gravity)
+        cells = inlet_along_rim(cells, scene.body.positions, scene.velocity, grid, gravity)
     behind = (scene.cell_types == CellType.OUTFLOW) & (cells != CellType.OUTFLOW)
     at = np.clip(grid.cell_of(scene.body.positions), 0, np.asarray(grid.shape) - 1)
     return cells, scene.body.select(~behind[tuple(at.T)])

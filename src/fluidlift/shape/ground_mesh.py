@@ -7,9 +7,22 @@ from jaxtyping import Float, UInt8
 from scipy.spatial import cKDTree
 
 from fluidlift.numerics.ground_block import PARTS, ground_mesh
+from fluidlift.numerics.srgb import linear_from_srgb, srgb_from_linear
 from fluidlift.types import PinholeCamera, TriangleMesh
 
-__all__ = ["PARTS", "ground_colours", "ground_mesh"]
+__all__ = ["PARTS", "cut_colour", "ground_colours", "ground_mesh"]
+
+LOAM = np.array([0.28, 0.24, 0.20])
+"""linear reflectance of dry loam, about a quarter"""
+OWN = 0.5
+"""share of the ground's own colour in a cut through it: below turf or snow there is earth"""
+
+
+def cut_colour(ground: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:
+    """sRGB in [0, 1] of a cut through ground whose top has these colours (sRGB): half their median, half dry loam, in
+    linear light. The shade of a side comes from the light on it: a colour darkened beforehand is shaded twice.
+    """
+    return srgb_from_linear(OWN * linear_from_srgb(np.median(ground, axis=0)) + (1.0 - OWN) * LOAM)
 
 
 def ground_colours(
@@ -34,7 +47,7 @@ def ground_colours(
     known = seen & ~cut
     if not known.any():
         return colours
-    colours[cut] = 0.75 * np.median(colours[known], axis=0)
+    colours[cut] = cut_colour(colours[known])
     hidden = ~seen & ~cut
     if hidden.any():
         nearest = cKDTree(vertices[known, :2]).query(vertices[hidden, :2], k=min(32, int(known.sum())))[1]

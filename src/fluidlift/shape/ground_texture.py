@@ -15,7 +15,7 @@ from scipy import ndimage
 
 from fluidlift.numerics.textures import sample_texture
 from fluidlift.shape.background import filled_in
-from fluidlift.shape.ground_mesh import PARTS
+from fluidlift.shape.ground_mesh import PARTS, cut_colour
 from fluidlift.types import Grid, Label, PinholeCamera, TriangleMesh
 
 LONGEST = 2048
@@ -91,7 +91,7 @@ def textured(
     top = mesh.vertices[: nodes[0] * nodes[1]].reshape(*nodes, 3).astype(np.float64)
     found = _map(top, level, view, _texel(top, view.camera, longest))
     image = _continued(found)
-    earth = 0.75 * np.median(image[found.known if found.known.any() else ~found.known], axis=0)
+    earth = 255.0 * cut_colour(image[found.known if found.known.any() else ~found.known] / 255.0)
     strip = np.broadcast_to(earth, (STRIP, image.shape[1], 3))
     texture = np.clip(np.round(np.concatenate([image, strip])), 0, 255).astype(np.uint8)
     uv = _coordinates(mesh, top, image.shape[0])

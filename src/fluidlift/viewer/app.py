@@ -167,9 +167,9 @@ class Viewer:
 
     def set_parts(self, **changes: bool) -> None:
         """Show more or less."""
-        with self.lock:
+        with self.lock:  # both at once: of two quick clicks the later one stays
             self.parts = replace(self.parts, **changes)
-        self.panels.show_parts(changes)
+            self.panels.show_parts(changes)
         self._dirty = True
 
     def set_source(self, source: str) -> None:

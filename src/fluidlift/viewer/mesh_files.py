@@ -70,7 +70,9 @@ def _taken_away(path: Path) -> None:
         path.parent.rmdir()
 
 
-def mesh_entry(folder: Path, inside: str, unit: float, *, turned_over: bool, over: np.ndarray) -> dict[str, Any]:
+def mesh_entry(
+    folder: Path, inside: str, unit: float, *, turned_over: bool, over: Callable[[float], np.ndarray]
+) -> dict[str, Any]:
     """The entry of scene.yaml that puts a mesh file of the asset with the middle of its lower side at a place.
 
     Args:
@@ -78,7 +80,7 @@ def mesh_entry(folder: Path, inside: str, unit: float, *, turned_over: bool, ove
         inside: name of the file inside it.
         unit: m, of the file's lengths.
         turned_over: its faces look inwards.
-        over: [3] m, the place.
+        over: gives the place, [3] m, of a mesh so wide in plan, m.
 
     Raises:
         InputRejected: no such file, or one that cannot be read.
@@ -86,5 +88,6 @@ def mesh_entry(folder: Path, inside: str, unit: float, *, turned_over: bool, ove
     points = unit * np.asarray(read_any_mesh(asset_file(folder, inside)).vertices, float)
     low, high = points.min(axis=0), points.max(axis=0)
     foot = np.array([0.5 * (low[0] + high[0]), 0.5 * (low[1] + high[1]), low[2]])
-    entry: dict[str, Any] = {"mesh": inside, "position": [float(f"{c:.4g}") for c in over - foot]}
+    place = over(float((high - low)[:2].max()))
+    entry: dict[str, Any] = {"mesh": inside, "position": [float(f"{c:.4g}") for c in place - foot]}
     return entry | ({} if unit == 1.0 else {"scale": unit}) | ({"flip": True} if turned_over else {})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, Any
@@ -10,6 +11,7 @@ import numpy as np
 
 from fluidlift.errors import FluidliftError
 from fluidlift.pipeline.editing import Add, Remove
+from fluidlift.pipeline.open_water import open_water
 from fluidlift.viewer.hearing import heard
 from fluidlift.viewer.mesh_files import MOST_BYTES, UNITS, kept_mesh, mesh_entry
 
@@ -34,6 +36,9 @@ class ObstaclePanel:
         self._viewer, self._gui = viewer, viewer.server.gui
         self._gizmo: Any = None
         self._gizmo_of = ""
+        self._refreshing = threading.RLock()
+        self._level = np.zeros(3)
+        """m, on the fluid: where the last one was put"""
         gui = self._gui
         self._size_now = max(SIZE * viewer.stage.size, CELLS * viewer.asset.grid.spacing)
         self._shape = gui.add_dropdown("shape", SHAPES, initial_value="sphere")
@@ -47,7 +52,12 @@ class ObstaclePanel:
         self._size = gui.add_slider("width, m", _short(low), _short(high), _short(low / 10), _short(self._size_now))
         self._motion = gui.add_dropdown("motion", (STILL, FLOATS), initial_value=STILL)
         self._density = gui.add_slider(
-            "density, kg/m³", 20.0, 3000.0, 10.0, 500.0, hint="water 1000; less floats in it"
+            "density, kg/m³",
+            20.0,
+            3000.0,
+            10.0,
+            500.0,
+            hint="of one that floats freely; water 1000: less floats in it, more sinks",
         )
         self._remove = gui.add_button("Remove", icon="trash", color="red")
         heard(self._size, self._sized)
@@ -92,15 +102,23 @@ class ObstaclePanel:
 
     def _add_mesh(self, inside: str) -> bool:
         viewer = self._viewer
-        stage, unit, over = viewer.stage, UNITS[self._unit.value], bool(self._over.value)
+        unit, over = UNITS[self._unit.value], bool(self._over.value)
         try:
-            place = np.array([*stage.middle[:2], stage.top])
-            entry = mesh_entry(viewer.folder, inside, unit, turned_over=over, over=place)
+            entry = mesh_entry(viewer.folder, inside, unit, turned_over=over, over=self._room)
         except (FluidliftError, OSError) as error:
             viewer.say(str(error))
             return False
         stem = PurePosixPath(inside).stem.replace(".", "_")
         return self._put(stem, {"name": "", **entry})
+
+    def _room(self, width: float) -> np.ndarray:
+        """[3] m on the fluid, where a body so wide (m) touches neither ground nor the other obstacles."""
+        taken = []
+        for body in self._viewer.bodies():
+            points = np.asarray(body.mesh.vertices, float)[:, :2]
+            taken.append((np.asarray(body.position, float)[:2], float(np.ptp(points, axis=0).max())))
+        self._level = open_water(self._viewer.asset, width, taken)
+        return self._level
 
     def _put(self, stem: str, entry: dict[str, Any]) -> bool:
         """Add an entry under the first free name, and choose it; whether it went well."""
@@ -110,7 +128,8 @@ class ObstaclePanel:
         before, viewer.chosen = viewer.chosen, name
         added = viewer.edited(
             lambda: viewer.draft.apply([Add("obstacles", entry | {"name": name})], f"{name} added"),
-            "Drag it with the arrows and rings.",
+            f"{name} hangs just above the fluid, whose surface is at z = {self._level[2]:.3g} m there. Drag it down by "
+            "the blue arrow, or let it float: it then falls in.",
         )
         if not added:
             viewer.chosen = before
@@ -121,15 +140,17 @@ class ObstaclePanel:
         return next((o for o in self._viewer.draft.obstacles if o["name"] == self._viewer.chosen), None)
 
     def _add(self, _: Any) -> None:
-        viewer, shape = self._viewer, self._shape.value
-        place = (*viewer.stage.middle[:2], viewer.stage.top + 0.5 * self._size_now)
-        entry = {"name": "", "shape": shape, "position": [_short(float(c)) for c in place]}
-        self._put(shape, entry | _extent(shape, self._size_now))
+        shape = self._shape.value
+        extent = _extent(shape, self._size_now)
+        high = extent["size"][2] if shape == "ellipsoid" else self._size_now
+        place = self._room(self._size_now) + [0.0, 0.0, 0.5 * high]
+        self._put(shape, {"name": "", "shape": shape, "position": [_short(float(c)) for c in place]} | extent)
 
     def _choose(self, event: Any, name: str) -> None:
         if event.client is None:
             return
         self._viewer.chosen = "" if name == NONE else name
+        self._viewer.messages = ""
         self.refresh()
         self._viewer.redraw()
 
@@ -168,12 +189,18 @@ class ObstaclePanel:
         return None if body is None else float(np.ptp(body.mesh.vertices, axis=0).max())
 
     def _moves(self, event: Any, motion: str) -> None:
+        if event.client is not None and self._viewer.chosen:
+            self._density.disabled = motion != FLOATS
         self._set(event, "motion", "free" if motion == FLOATS else "static")
 
     # the gizmo
 
     def refresh(self) -> None:
         """Show the obstacles of the scene, and the chosen one's values."""
+        with self._refreshing:  # of two threads the later one shows what is chosen by then
+            self._refresh()
+
+    def _refresh(self) -> None:
         viewer = self._viewer
         names = tuple(o["name"] for o in viewer.draft.obstacles)
         if viewer.chosen not in names:
@@ -183,8 +210,9 @@ class ObstaclePanel:
         if self._chosen.value != (viewer.chosen or NONE):
             self._chosen.value = viewer.chosen or NONE
         entry = self._entry()
-        for handle in (self._size, self._motion, self._density, self._remove):
+        for handle in (self._size, self._motion, self._remove):
             handle.disabled = entry is None
+        self._density.disabled = entry is None or entry.get("motion") != "free"
         self._place_gizmo(entry)
         if entry is None:
             self._where.content = "No obstacle is chosen." if names else "There are no obstacles yet."

@@ -62,8 +62,6 @@ class Stage:
         self._ground_mesh: TriangleMesh | None = None
         low, high = np.percentile(asset.rest.means, [2, 98], axis=0) if len(asset.rest) else np.zeros((2, 3))
         self.middle = 0.5 * (low + high)
-        self.top = float(high[2])
-        """m, height that most of the fluid is below"""
         self.size = max(float(np.linalg.norm(high - low)), 1e-3)
         """m, of the fluid"""
         self._place_ground(folder)

@@ -1,6 +1,4 @@
-"use strict";
 // Plays the frames of splats that this page carries. No library, no network: a file on a disk is enough.
-(() => {
 const el = (id) => document.getElementById(id);
 const page = JSON.parse(el("page").textContent);
 const root = document.documentElement, canvas = el("stage");
@@ -86,83 +84,7 @@ function fitted() { // the whole of the camera's picture is seen, more beside it
 }
 
 // ---------------------------------------------------------------- drawing
-const CAMERA = `
-uniform vec3 eye; uniform mat3 turn; uniform vec4 lens; uniform vec2 size; uniform vec2 reach;
-vec4 placed(vec2 uv, float z) {
-  float d = (reach.y + reach.x) / (reach.y - reach.x) - 2.0 * reach.x * reach.y / ((reach.y - reach.x) * z);
-  return vec4((2.0 * uv.x / size.x - 1.0) * z, (1.0 - 2.0 * uv.y / size.y) * z, d * z, z);
-}`;
-const SPLAT_VERTEX = `#version 300 es
-precision highp float; precision highp int; precision highp usampler2D;
-uniform usampler2D records; uniform vec3 low; uniform float grain; uniform vec2 scaled;
-layout(location = 0) in uint index;
-out vec2 at; flat out vec4 look;` + CAMERA + `
-mat3 rotation(uvec3 q) {
-  uint largest = (q.x >> 7) | ((q.y >> 7) << 1);
-  vec3 kept = (vec3(q & 127u) / 63.5 - 1.0) * 0.70710678;
-  float rest = sqrt(max(0.0, 1.0 - dot(kept, kept)));
-  vec4 r = largest == 0u ? vec4(rest, kept) : largest == 1u ? vec4(kept.x, rest, kept.yz)
-    : largest == 2u ? vec4(kept.xy, rest, kept.z) : vec4(kept, rest);
-  r = normalize(r);
-  float w = r.x, x = r.y, y = r.z, z = r.w;
-  return mat3(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y),
-    2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x),
-    2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y));
-}
-void main() {
-  gl_Position = vec4(0.0, 0.0, 2.0, 1.0); at = vec2(0.0); look = vec4(0.0);
-  int width = textureSize(records, 0).x;
-  uvec4 r = texelFetch(records, ivec2(int(index) % width, int(index) / width), 0);
-  float opacity = float(r.w >> 24) / 255.0;
-  vec3 p = low + grain * vec3(r.x & 65535u, r.x >> 16, r.y & 65535u);
-  vec3 c = turn * (p - eye);
-  if (c.z < reach.x || opacity < 1.0 / 255.0) return;
-  vec3 s = exp(scaled.x + scaled.y * vec3((r.y >> 16) & 255u, r.y >> 24, r.z & 255u));
-  s = min(s, vec3(0.25 * max(size.x, size.y) / max(lens.x, lens.y) * c.z));
-  mat3 m = turn * rotation(uvec3((r.z >> 8) & 255u, (r.z >> 16) & 255u, r.z >> 24));
-  m = mat3(m[0] * s.x, m[1] * s.y, m[2] * s.z);
-  vec2 f = lens.xy / c.z, margin = 0.15 * size / lens.xy;
-  vec2 t = clamp(c.xy / c.z, -lens.zw / lens.xy - margin, (size - lens.zw) / lens.xy + margin);
-  vec3 j0 = f.x * (vec3(m[0].x, m[1].x, m[2].x) - t.x * vec3(m[0].z, m[1].z, m[2].z));
-  vec3 j1 = f.y * (vec3(m[0].y, m[1].y, m[2].y) - t.y * vec3(m[0].z, m[1].z, m[2].z));
-  float a = dot(j0, j0) + 0.3, b = dot(j0, j1), d = dot(j1, j1) + 0.3;
-  float middle = 0.5 * (a + d), spread = sqrt(max(0.25 * (a - d) * (a - d) + b * b, 0.0));
-  float most = middle + spread, least = max(middle - spread, 1e-4);
-  vec2 axis = abs(b) > 1e-6 ? normalize(vec2(most - d, b)) : (a >= d ? vec2(1.0, 0.0) : vec2(0.0, 1.0));
-  float far = min(sqrt(2.0 * log(opacity * 255.0)), 3.33);
-  vec2 corner = vec2(float(gl_VertexID & 1), float(gl_VertexID >> 1)) * 2.0 - 1.0;
-  at = far * corner;
-  vec2 uv = lens.xy * c.xy / c.z + lens.zw + at.x * sqrt(most) * axis + at.y * sqrt(least) * vec2(-axis.y, axis.x);
-  // a splat that lies on the ground is not cut by it
-  float nearer = max(c.z - max(s.x, max(s.y, s.z)), reach.x * 1.01);
-  gl_Position = placed(uv, nearer);
-  look = vec4(vec3(r.w & 255u, (r.w >> 8) & 255u, (r.w >> 16) & 255u) / 255.0, opacity);
-}`;
-const SPLAT_FRAGMENT = `#version 300 es
-precision highp float;
-in vec2 at; flat in vec4 look; out vec4 color;
-void main() {
-  float alpha = min(look.a * exp(-0.5 * dot(at, at)), 0.999);
-  if (alpha < 1.0 / 255.0) discard;
-  color = vec4(look.rgb * alpha, alpha);
-}`;
-const GROUND_VERTEX = `#version 300 es
-precision highp float;
-layout(location = 0) in vec3 point; layout(location = 1) in vec2 uv; layout(location = 2) in vec3 paint;
-out vec2 where; out vec3 tint;` + CAMERA + `
-void main() {
-  vec3 c = turn * (point - eye);
-  float d = (reach.y + reach.x) / (reach.y - reach.x) * c.z - 2.0 * reach.x * reach.y / (reach.y - reach.x);
-  vec2 g = 2.0 * (lens.xy * c.xy + lens.zw * c.z) / size;
-  gl_Position = vec4(g.x - c.z, c.z - g.y, d, c.z);
-  where = uv; tint = paint;
-}`;
-const GROUND_FRAGMENT = `#version 300 es
-precision highp float;
-in vec2 where; in vec3 tint; uniform sampler2D picture; uniform bool textured; uniform float share; out vec4 color;
-void main() { color = vec4(textured ? texture(picture, where).rgb : tint, 1.0) * share; }`;
-
-let gl = null, splats = null, ground = null, records = null, texture = null, order = null, corners = null, dirty = true;
+let gl = null, splats = null, ground = null, bodies = null, records = null, texture = null, order = null, corners = null, dirty = true;
 function program(vertex, fragment) {
   const made = gl.createProgram();
   for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
@@ -219,6 +141,26 @@ async function startGround(parts) {
   ground = { ...made, array, picture };
 }
 
+function startBodies(parts) { // each with points, normals and colours per vertex, then its faces
+  bodies = { ...program(BODY_VERTEX, BODY_FRAGMENT), all: [] };
+  let at = 0;
+  for (const body of page.bodies) {
+    const array = gl.createVertexArray();
+    gl.bindVertexArray(array);
+    for (let k = 0; k < 3; k++) {
+      gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
+      gl.bufferData(gl.ARRAY_BUFFER, new Float32Array(parts.buffer, at, 3 * body.vertices), gl.STATIC_DRAW);
+      gl.enableVertexAttribArray(k); gl.vertexAttribPointer(k, 3, gl.FLOAT, false, 0, 0);
+      at += 12 * body.vertices;
+    }
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, new Uint32Array(parts.buffer, at, 3 * body.faces), gl.STATIC_DRAW);
+    at += 12 * body.faces;
+    gl.bindVertexArray(null);
+    bodies.all.push({ array, ...body });
+  }
+}
+
 // farthest first: a counting sort of the depths in 16 bits
 let keys = null, sorted = null, counts = null;
 function sort(frame) {
@@ -246,7 +188,7 @@ function uniforms(where, lens) {
   gl.uniform2f(where.size, canvas.width, canvas.height);
   gl.uniform2f(where.reach, Math.max(1e-3, 0.01 * view.distance), far);
 }
-let paint = null, showGround = true;
+let paint = null, showGround = true, showBodies = true;
 function drawGround(lens, share) {
   gl.useProgram(ground.made); uniforms(ground.where, lens);
   gl.activeTexture(gl.TEXTURE0); gl.bindTexture(gl.TEXTURE_2D, ground.picture);
@@ -260,6 +202,15 @@ function drawGround(lens, share) {
   }
   gl.depthFunc(gl.LEQUAL); all(); gl.depthFunc(gl.LESS);
 }
+function drawBodies(lens) {
+  gl.useProgram(bodies.made); uniforms(bodies.where, lens); gl.uniform3fv(bodies.where.sun, page.sun);
+  for (const body of bodies.all) {
+    const p = body.poses[clock.frame];
+    gl.uniform3f(bodies.where.origin, p[0], p[1], p[2]); gl.uniform4f(bodies.where.pose, p[3], p[4], p[5], p[6]);
+    gl.bindVertexArray(body.array);
+    gl.drawElements(gl.TRIANGLES, 3 * body.faces, gl.UNSIGNED_INT, 0);
+  }
+}
 function draw() {
   const ratio = Math.min(window.devicePixelRatio || 1, 2);
   const w = Math.max(1, Math.round(canvas.clientWidth * ratio)), h = Math.max(1, Math.round(canvas.clientHeight * ratio));
@@ -272,7 +223,9 @@ function draw() {
   const grounded = ground && showGround, glass = grounded && page.terrain.opacity < 1;
   if (glass) { // a vessel stands behind and before what it holds, and hides nothing of it
     drawGround(lens, Math.min(2 * page.terrain.opacity, 1)); gl.clear(gl.DEPTH_BUFFER_BIT);
+    gl.disable(gl.BLEND);
   } else if (grounded) drawGround(lens, 1);
+  if (bodies && showBodies) drawBodies(lens);
   const frame = frames.all[clock.frame];
   if (frame) {
     gl.activeTexture(gl.TEXTURE0); gl.bindTexture(gl.TEXTURE_2D, texture);
@@ -326,6 +279,8 @@ function controls() {
   el("theme").onclick = () => theme(!root.classList.contains("light"));
   el("ground").onclick = () => { showGround = !showGround; pressed("ground", showGround); dirty = true; };
   el("ground").hidden = !page.terrain;
+  el("bodies").onclick = () => { showBodies = !showBodies; pressed("bodies", showBodies); dirty = true; };
+  el("bodies").hidden = !page.bodies.length;
   el("full").onclick = full; el("full").hidden = !document.documentElement.requestFullscreen;
   el("view").onclick = () => setCamera(page.camera, page.target);
   new ResizeObserver(() => { dirty = true; }).observe(canvas);
@@ -374,6 +329,7 @@ async function run() {
     el("told").textContent = `loading ${Math.round(100 * (k + 1) / nodes.length)} %`;
     if (k === 0) {
       if (page.terrain) await startGround(await inflated(bytesOf(el("terrain"))));
+      if (page.bodies.length) startBodies(await inflated(bytesOf(el("solids"))));
       dirty = true; root.classList.add("ready");
     }
     if (k % 4 === 3) await new Promise((go) => setTimeout(go, 0));
@@ -385,9 +341,9 @@ async function run() {
 window.fluidlift = {
   show: (k) => { play(false); show(k); }, play, camera: (c) => setCamera(c, null), orbit, zoom,
   terrain: (on) => { showGround = on; pressed("ground", on); dirty = true; },
+  bodies: (on) => { showBodies = on; pressed("bodies", on); dirty = true; },
   background: (rgb) => { paint = rgb; dirty = true; },
   get state() { return { frame: clock.frame, loaded: frames.all.length, drawn: clock.drawn, playing: clock.playing, dirty }; },
 };
 window.fluidlift.ready = typeof DecompressionStream === "undefined" ? Promise.reject(new Error("this browser is too old: DecompressionStream is missing")) : run();
 window.fluidlift.ready.catch((error) => { fail(String(error.message || error)); });
-})();

@@ -1,0 +1,116 @@
+"""What particles carry, at other points: means weighted by a kernel (Numba).
+
+The weight is (1 - d^2 / reach^2)^3 (Mueller, Charypar and Gross 2003), which needs no root and is as wide as a cubic
+spline that reaches 4/3 as far. The mean is that of Shepard: the weights are divided by their sum, so that an even field
+stays even at the rim of a body, where half a kernel is empty.
+
+Particles are sorted into cells as wide as the kernel reaches; a point looks into 27 of them. The cells repeat in space,
+so that a stray particle far away costs no memory: what lies in a cell by that alone is too far to weigh.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba as nb
+import numpy as np
+from jaxtyping import Float, Int
+
+from fluidlift.errors import require
+
+_CHUNK = 256
+CELLS_PER_PARTICLE = 4
+"""at most, of the cells that are kept"""
+
+
+@nb.njit(cache=True, nogil=True)
+def cells_kernel(points, low, reach, shape, cells):
+    for p in range(points.shape[0]):
+        number = 0
+        for axis in range(3):
+            number = number * shape[axis] + np.int64(math.floor((points[p, axis] - low[axis]) / reach)) % shape[axis]
+        cells[p] = number
+
+
+@nb.njit(cache=True, nogil=True, parallel=True, error_model="numpy", fastmath={"contract"})
+def mean_kernel(points, particles, values, starts, low, reach, shape, out, total):
+    """Sums over the particles (sorted by cell) of weight times value, divided by the sum of weights, which is kept."""
+    n, width, one = points.shape[0], values.shape[1], np.float32(1)
+    steep = np.float32(1.0 / (reach * reach))
+    for chunk in nb.prange(-(-n // _CHUNK)):
+        sums, at = np.empty(width, np.float32), np.empty(3, np.int64)
+        for p in range(np.int64(chunk) * _CHUNK, min((np.int64(chunk) + 1) * _CHUNK, n)):
+            x, y, z = points[p, 0], points[p, 1], points[p, 2]
+            for axis in range(3):
+                at[axis] = np.int64(math.floor((points[p, axis] - low[axis]) / reach))
+            sums[:] = 0
+            weights = np.float32(0)
+            for around in range(27):
+                i, j = (at[0] + around // 9 - 1) % shape[0], (at[1] + around // 3 % 3 - 1) % shape[1]
+                cell = (i * shape[1] + j) * shape[2] + (at[2] + around % 3 - 1) % shape[2]
+                for k in range(starts[cell], starts[cell + 1]):
+                    dx, dy, dz = particles[k, 0] - x, particles[k, 1] - y, particles[k, 2] - z
+                    left = one - (dx * dx + dy * dy + dz * dz) * steep
+                    if left > 0:
+                        w = left * left * left
+                        weights += w
+                        for c in range(width):
+                            sums[c] += w * values[k, c]
+            total[p] = weights
+            for c in range(width):
+                out[p, c] = sums[c] / weights if weights > 0 else np.float32(0)
+
+
+def kernel_mean(
+    points: Float[np.ndarray, "m 3"],
+    particles: Float[np.ndarray, "n 3"],
+    values: Float[np.ndarray, "n k"],
+    reach: float,
+) -> Float[np.ndarray, "m k"]:
+    """Means of the values of the particles around each point, float32; that of the nearest where none is in reach.
+
+    Args:
+        points, particles: m, finite; at least one particle.
+        reach: m, from which on particles do not weigh.
+
+    Raises:
+        ValueError: no particle, or a reach that is not positive.
+    """
+    require(len(particles) > 0, "no particles", "one or more")
+    require(np.isfinite(reach) and reach > 0, f"a reach of {reach}", "positive metres")
+    low = particles.min(axis=0).astype(np.float64)
+    shape = _cells(particles.max(axis=0) - low, reach, CELLS_PER_PARTICLE * len(particles) + 1000)
+    cells = np.empty(len(particles), np.int64)
+    cells_kernel(particles, low, reach, shape, cells)
+    order = np.argsort(cells, kind="stable")
+    starts = np.concatenate([[0], np.cumsum(np.bincount(cells, minlength=int(shape.prod())))])
+    out, total = np.empty((len(points), values.shape[1]), np.float32), np.empty(len(points), np.float32)
+    sorted_values = np.ascontiguousarray(values[order], np.float32)
+    mean_kernel(points, particles[order], sorted_values, starts, low, float(reach), shape, out, total)
+    lost = np.flatnonzero(total <= 0)
+    if len(lost):
+        from scipy.spatial import KDTree
+
+        out[lost] = values[KDTree(particles).query(points[lost])[1]]
+    return out
+
+
+def kernel_mean_plain(
+    points: Float[np.ndarray, "m 3"],
+    particles: Float[np.ndarray, "n 3"],
+    values: Float[np.ndarray, "n k"],
+    reach: float,
+) -> Float[np.ndarray, "m k"]:
+    """The plain twin of `kernel_mean`, for points with particles in reach: m x n numbers."""
+    squared = ((points[:, None].astype(np.float64) - particles) ** 2).sum(axis=2)
+    weights = np.maximum(1.0 - squared / reach**2, 0.0) ** 3
+    return (weights @ values / weights.sum(axis=1, keepdims=True)).astype(np.float32)
+
+
+def _cells(extent: Float[np.ndarray, "3"], reach: float, most: int) -> Int[np.ndarray, "3"]:
+    """Cells along each axis before they repeat: 3 or more, so that the 27 around a point differ."""
+    shape = np.clip(np.floor(extent / reach) + 1, 3, most)
+    while shape.prod() > most and shape.max() > 3:
+        longest = int(shape.argmax())
+        shape[longest] = max(3, shape[longest] // 2)
+    return shape.astype(np.int64)

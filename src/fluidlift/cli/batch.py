@@ -97,10 +97,12 @@ def run(command: Batch) -> int:
     Raises:
         InputRejected: a list that cannot be used, two shots of one name, no clips; nothing was made.
     """
+    from fluidlift.io.atomic import require_writable
+
     shots = _shots(command)
     folder = command.out.absolute()
-    with _refusals(command.out):
-        folder.mkdir(parents=True, exist_ok=True)
+    require_writable(command.out)
+    folder.mkdir(parents=True, exist_ok=True)
     ended: dict[str, Outcome] = {}
     tell = print if not command.json else lambda text: print(text, file=sys.stderr)
     for outcome in _all_made(shots, folder, command.jobs, tell):
@@ -164,12 +166,12 @@ def _listed(path: Path) -> list[dict[str, Any]]:
     import yaml
 
     needed = "a list: - clip: river.mp4, and below it options of make such as size: 4"
-    with _refusals(path):
+    try:
         if path.stat().st_size > MOST_LISTED:
             raise InputRejected(f"{path.name} has more than {MOST_LISTED >> 20} MB", needed)
-        text = path.read_text(encoding="utf-8")
-    try:
-        rows = yaml.safe_load(text)
+        rows = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputRejected(f"{path}: {getattr(error, 'strerror', None) or 'it is no text'}", needed) from None
     except (yaml.YAMLError, RecursionError) as error:
         raise InputRejected(f"{path.name} is not YAML: {' '.join(str(error).split())[:200]}", needed) from None
     if not isinstance(rows, list) or not rows:
@@ -249,13 +251,3 @@ def _summarise(outcomes: list[Outcome], folder: Path) -> None:
 
     with atomic_write(folder / SUMMARY) as file:
         file.write((json.dumps([dataclasses.asdict(o) for o in outcomes], indent=1) + "\n").encode())
-
-
-@contextlib.contextmanager
-def _refusals(path: Path) -> Iterator[None]:
-    """Files that cannot be read or written, in words."""
-    try:
-        yield
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "it is no text"
-        raise InputRejected(f"{path}: {reason}", "a file or folder that can be used") from None

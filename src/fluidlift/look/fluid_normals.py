@@ -17,6 +17,7 @@ from jaxtyping import Float
 from scipy import ndimage
 
 from fluidlift.errors import require
+from fluidlift.look.smoothstep import eased, smoothstep
 from fluidlift.numerics.isosurface import surface_nets
 from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.types.gaussians import Gaussians
@@ -233,8 +234,7 @@ def normals_kernel(points, low, h, density, normals, share):
             slope = math.sqrt(gx * gx + gy * gy + gz * gz)
             if slope * h > 1e-9:
                 normals[p, 0], normals[p, 1], normals[p, 2] = -gx / slope, -gy / slope, -gz / slope
-            s = min(max((slope * flat - AT_SURFACE[0]) / (AT_SURFACE[1] - AT_SURFACE[0]), 0.0), 1.0)
-            share[p] = s * s * (3.0 - 2.0 * s)
+            share[p] = eased((slope * flat - AT_SURFACE[0]) / (AT_SURFACE[1] - AT_SURFACE[0]))
 
 
 @nb.njit(cache=True, inline="always")
@@ -327,6 +327,6 @@ def normals_plain(
         slope[:, 2] += w[u, :, 0] * w[v, :, 1] * d[t, :, 2] * value
     steep = np.linalg.norm(slope, axis=1)
     # the slope of a step that is blurred by a Gaussian is 1 / (sigma sqrt(2 pi)) at its middle
-    s = np.clip((steep * BLUR * h * math.sqrt(2 * math.pi) - AT_SURFACE[0]) / (AT_SURFACE[1] - AT_SURFACE[0]), 0.0, 1.0)
+    share = smoothstep(steep * BLUR * h * math.sqrt(2 * math.pi), *AT_SURFACE)
     normals = np.where(steep[:, None] * h > 1e-9, -slope / np.maximum(steep, 1e-300)[:, None], (0.0, 0.0, 1.0))
-    return normals.astype(np.float32), (s * s * (3 - 2 * s)).astype(np.float32)
+    return normals.astype(np.float32), share.astype(np.float32)

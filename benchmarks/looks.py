@@ -28,13 +28,16 @@ from fluidlift.evaluate.images import psnr, ssim
 from fluidlift.io.asset_folder import load_asset, read_manifest
 from fluidlift.io.scene_look import Look
 from fluidlift.look.materials import PRESETS
+from fluidlift.look.open_end import OpenEnd
 from fluidlift.look.pictures import caption
 from fluidlift.look.rasterize import render
 from fluidlift.look.scenery import orbit_camera, side_camera, terrain_surfels
+from fluidlift.look.vessel import GLASS
 from fluidlift.numerics.srgb import linear_from_srgb, srgb_from_linear
 from fluidlift.pipeline.looks import Backdrop, Frame, Painter
 from fluidlift.pipeline.reading import clip_of
 from fluidlift.pipeline.resimulate import FIRST_HALF, recall_first_half
+from fluidlift.pipeline.scene import LYING
 from fluidlift.pipeline.seeing import labels_of
 from fluidlift.pipeline.showing import splat_frames
 from fluidlift.pipeline.story import Silence, Story
@@ -132,11 +135,13 @@ def sheet(folder: Path, out: Path) -> None:
 
 def tile(asset: FluidAsset, folder: Path, look: Look, fluid: Gaussians, velocities: np.ndarray, view: str):
     """One picture of a sheet."""
-    painter = Painter(look, asset.terrain, folder, kind=asset.kind)
+    lying = asset.kind in LYING
+    end = OpenEnd.of(asset.cell_types, asset.grid, asset.terrain.mainstream) if lying else None
+    painter = Painter(look, asset.terrain, folder, kind=asset.kind, end=end)
     width = 480
     size = (width, max(2, 2 * round(width * asset.camera.size[1] / asset.camera.size[0] / 2)))
     around = np.concatenate([asset.rest.means, asset.terrain.mesh.vertices])
-    ground = terrain_surfels(asset.terrain)
+    ground = terrain_surfels(asset.terrain, glass=GLASS if asset.kind == "pour" else None)
     camera = asset.camera.resized(size) if view == "input" else side_camera(
         asset.camera, asset.rest, ground, around, size=size
     )  # fmt: skip

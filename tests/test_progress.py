@@ -6,21 +6,52 @@ import itertools
 import pytest
 
 from fluidlift import progress
-from fluidlift.progress import PlainProgress, time_left
+from fluidlift.progress import Pace, PlainProgress
+
+
+def left(times, total, start=0):
+    pace = Pace()
+    for k, now in enumerate(times):
+        pace.at(start + k, now)
+    return pace.left(total)
 
 
 @pytest.mark.parametrize(
-    ("done", "total", "first", "seconds", "words"),
+    ("times", "total", "start", "words"),
     [
-        (10, 20, 0, 30.0, "about 30 s left"), (1, 101, 0, 6.0, "about 10 min left"),
-        (1, 1001, 0, 36.0, "about 10.0 h left"),
+        ([0, 3, 6, 9, 12], 20, 0, "about 48 s left"), ([0, 6, 12, 18], 103, 0, "about 10 min left"),
+        ([0, 36, 72, 108], 1003, 0, "about 10.0 h left"),
         # frames that a checkpoint had already do not count as fast ones
-        (110, 120, 100, 30.0, "about 30 s left"),
-        (0, 20, 0, 0.0, ""), (20, 20, 0, 30.0, ""), (100, 120, 100, 3.0, ""),
+        ([0, 3, 6, 9], 113, 100, "about 30 s left"),
+        ([0], 20, 0, ""), ([0, 1], 20, 0, ""), ([0, 1, 2], 20, 0, ""), ([0, 3, 6, 9], 3, 0, ""), ([], 3, 0, ""),
     ],
 )  # fmt: skip
-def test_the_rest_takes_as_long_as_the_parts_before(done, total, first, seconds, words):
-    assert time_left(done, total, first, seconds) == words
+def test_the_rest_takes_as_long_as_the_parts_before(times, total, start, words):
+    assert left(times, total, start) == words
+
+
+def test_what_is_compiled_for_the_first_frame_and_a_body_at_rest_are_no_measure_of_the_rest():
+    # the body at rest is written at once, the first frame takes a minute to compile, each later one 2 s
+    times = [0.0, 0.1, 60.1, 62.1, 64.1]
+    assert [left(times[:k], 33) for k in (1, 2, 3)] == ["", "", ""]
+    assert left(times, 33) == "about 58 s left"
+
+
+def test_a_stage_that_slows_down_is_told_by_its_later_half():
+    times = [float(t) for t in [*range(12), *range(13, 60, 4)]]  # s: at first one a part, then four
+    assert left(times, len(times) + 9) == "about 40 s left"
+
+
+def test_the_first_simulation_of_an_installation_says_that_it_compiles(monkeypatch, tmp_path):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    for name, said in (("simulate", True), ("flow", False)):
+        stream = io.StringIO()
+        PlainProgress(stream).stage(name, 1, 2)
+        assert ("compiling first" in stream.getvalue()) == said
+    (tmp_path / "transfer_kernels.scatter-93.py311.nbi").touch()
+    stream = io.StringIO()
+    PlainProgress(stream).stage("simulate", 1, 2)
+    assert "compiling" not in stream.getvalue()
 
 
 def test_plain_lines_tell_the_frame_every_few_seconds(monkeypatch):
@@ -28,12 +59,13 @@ def test_plain_lines_tell_the_frame_every_few_seconds(monkeypatch):
     monkeypatch.setattr(progress.time, "monotonic", lambda: next(clock))
     stream = io.StringIO()
     plain = PlainProgress(stream, every=10.0)
-    plain.stage("simulate", 1, 2)
-    for k in range(6):
-        plain.update(k, 6)
-    plain.finished("simulate", 24.0, False)
+    plain.stage("motion", 1, 2)
+    for k in range(8):
+        plain.update(k, 8)
+    plain.finished("motion", 32.0, False)
     assert stream.getvalue().splitlines() == [
-        "[1/2] re-simulating ...",
-        "[1/2] re-simulating: 3 of 6, about 12 s left",
-        "[1/2] re-simulating: 24.0 s",
+        "[1/2] velocities ...",
+        "[1/2] velocities: 2 of 8",
+        "[1/2] velocities: 5 of 8, about 12 s left",
+        "[1/2] velocities: 32.0 s",
     ]

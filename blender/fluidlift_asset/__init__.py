@@ -13,7 +13,7 @@ from bpy.app.handlers import persistent
 
 from . import build
 from .command import Call, find_command, run
-from .edits import changes, panel_values, read_settings
+from .edits import changes, panel_values, read_scene, read_settings
 from .facts import EXPORTED, read_facts, require_asset, up_to_date
 from .ground import rest_on
 from .light import SUN, light_up
@@ -310,8 +310,10 @@ class Undo(Guarded, bpy.types.Operator):
     bl_idname, bl_label = "fluidlift.undo", "Undo change of asset"
 
     def work(self, context: bpy.types.Context) -> set[str]:
-        run([command_of(context), "edit", str(asset_of(context)), "--undo"])
-        context.scene.fluidlift.told = "undone in scene.yaml: simulate again"
+        folder, s = asset_of(context), context.scene.fluidlift
+        said = run([command_of(context), "edit", str(folder), "--undo", "--json"])
+        read_scene(s, read_facts(folder), said)
+        s.told = "undone in scene.yaml: simulate again"
         return {"FINISHED"}
 
 

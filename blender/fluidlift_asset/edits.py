@@ -5,10 +5,9 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING
 
-from .facts import Facts
-
 if TYPE_CHECKING:
     from . import Settings
+    from .facts import Facts
 
 
 def read_settings(settings: Settings, facts: Facts) -> None:
@@ -17,6 +16,27 @@ def read_settings(settings: Settings, facts: Facts) -> None:
     settings.viscosity, settings.density = values["kinematic_viscosity"], values["density"]
     settings.gravity, settings.inflow = values["gravity"], values["inflow_velocity"]
     settings.loaded = json.dumps(panel_values(settings))
+
+
+def read_scene(settings: Settings, facts: Facts, told: str) -> None:
+    """What scene.yaml says by now, into the panel: the frames may still show another scene.
+
+    Args:
+        told: by `fluidlift edit --json`; lines around it are passed over.
+
+    Raises:
+        RuntimeError: it is not what that command says.
+    """
+    try:
+        scene = json.loads(told[told.index("{") : told.rindex("}") + 1])["scene"]
+        values, look = facts.fitted | (scene.get("parameters") or {}), scene.get("look") or {}
+        styled = look.get("style", "splats") != "splats"
+        settings.duration = float(scene.get("duration") or 0.0)
+        settings.tint = look.get("tint") or (1.0, 1.0, 1.0)
+        settings.material = look.get("material", "source") if styled else "source"
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise RuntimeError(f"fluidlift edit did not say what scene.yaml holds now ({error}): press Refresh.") from None
+    read_settings(settings, facts._replace(parameters=values))
 
 
 def panel_values(s: Settings) -> dict[str, object]:

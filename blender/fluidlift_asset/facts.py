@@ -25,6 +25,8 @@ class Facts(NamedTuple):
     tint: tuple[float, ...]
     cell: float
     """m, of the simulation's grid"""
+    fitted: dict[str, Any]
+    """parameters as they were lifted, without any edit"""
 
 
 def require_asset(folder: Path | None) -> Path:
@@ -59,6 +61,7 @@ def read_facts(folder: Path) -> Facts:
             str(look.get("material", "source")) if styled else "source",
             tuple(float(t) for t in look.get("tint", (1.0, 1.0, 1.0))) if styled else (1.0, 1.0, 1.0),
             float((played.get("grid") or manifest["grid"])["spacing"]),
+            dict(fitted["values"]),
         )
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise RuntimeError(f"{folder.name} does not say what an asset says ({error}): is it damaged?") from None

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import sys
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TextIO
 
 LABELS = {
@@ -24,14 +26,41 @@ LABELS = {
 }
 
 
-def time_left(done: int, total: int, first: int, seconds: float) -> str:
-    """How long the rest takes if it goes on as since part `first`, in words; empty where nothing is known yet."""
-    if done <= first or done >= total:
-        return ""
-    left = seconds / (done - first) * (total - done)
-    if left < 90:
-        return f"about {left:.0f} s left"
-    return f"about {left / 60:.0f} min left" if left < 5400 else f"about {left / 3600:.1f} h left"
+COMPILING = " compiling first, once: a minute or so"
+WARM_UP = 2
+"""parts at the beginning of a stage that say nothing about the rest: of a simulation the body at rest, which takes no
+time, and the frame for which a fresh installation compiles"""
+
+
+class Pace:
+    """How fast a stage goes on, from the later half of its parts: it may slow down as a fluid grows."""
+
+    def __init__(self) -> None:
+        self._times: list[tuple[int, float]] = []
+
+    def at(self, done: int, now: float) -> None:
+        """Parts that are done at a time (s, of a steady clock)."""
+        if not self._times or done > self._times[-1][0]:
+            self._times.append((done, now))
+
+    def left(self, total: int) -> str:
+        """How long the rest takes if it goes on like that, in words; empty where nothing is known yet."""
+        usable = self._times[min(WARM_UP, len(self._times)) :] if self._times else []
+        if len(usable) < 2 or usable[-1][0] >= total:
+            return ""
+        (since, began), (done, now) = usable[(len(usable) - 1) // 2], usable[-1]
+        left = (now - began) / (done - since) * (total - done)
+        if left < 90:
+            return f"about {left:.0f} s left"
+        return f"about {left / 60:.0f} min left" if left < 5400 else f"about {left / 3600:.1f} h left"
+
+
+def first_compilation() -> bool:
+    """Whether the simulator was never compiled for this installation: its first frame then takes a minute or so."""
+    given = os.environ.get("NUMBA_CACHE_DIR")
+    place = Path(given) if given else Path(__file__).parent / "physics"
+    # where the package cannot be written Numba keeps its files elsewhere, and nothing is known
+    return (bool(given) or os.access(place, os.W_OK)) and not any(place.rglob("transfer*.nbi"))
 
 
 class PlainProgress:
@@ -44,22 +73,21 @@ class PlainProgress:
 
     def __init__(self, stream: TextIO | None = None, every: float = 10.0) -> None:
         self.stream, self.every = stream or sys.stderr, every
-        self._head, self._first, self._began, self._last = "", None, 0.0, 0.0
+        self._head, self._pace, self._last = "", Pace(), time.monotonic()
 
     def stage(self, name: str, number: int, count: int) -> None:
         """A stage begins."""
         self._head = f"[{number}/{count}] {LABELS.get(name, name)}"
-        self._first = None
-        print(f"{self._head} ...", file=self.stream, flush=True)
+        self._pace, self._last = Pace(), time.monotonic()
+        told = COMPILING * (name == "simulate" and first_compilation())
+        print(f"{self._head} ...{told}", file=self.stream, flush=True)
 
     def update(self, done: int, total: int) -> None:
         """Part of the current stage is done."""
         now = time.monotonic()
-        if self._first is None:
-            self._first, self._began, self._last = done, now, now
+        self._pace.at(done, now)
         if now - self._last >= self.every and done < total:
-            self._last = now
-            left = time_left(done, total, self._first, now - self._began)
+            self._last, left = now, self._pace.left(total)
             print(f"{self._head}: {done} of {total}{', ' + left if left else ''}", file=self.stream, flush=True)
 
     def finished(self, name: str, seconds: float, cached: bool) -> None:
@@ -85,8 +113,7 @@ class BarProgress:
             TextColumn("{task.fields[parts]}"), TimeElapsedColumn(), TextColumn("{task.fields[left]}"),
             console=self.console, transient=True,
         )  # fmt: skip
-        self._task, self._head, self._last, self._began = None, "", 0.0, 0.0
-        self._first: int | None = None
+        self._task, self._head, self._last, self._pace = None, "", 0.0, Pace()
 
     def __enter__(self) -> BarProgress:
         self.bar.start()
@@ -100,18 +127,18 @@ class BarProgress:
         self._head = f"[{number}/{count}] {LABELS.get(name, name)}"
         if self._task is not None:
             self.bar.remove_task(self._task)
-        self._task = self.bar.add_task(self._head.replace("[", r"\["), total=None, parts="", left="")
-        self._first = None
+        told = COMPILING * (name == "simulate" and first_compilation())
+        self._task = self.bar.add_task(self._head.replace("[", r"\["), total=None, parts="", left=told)
+        self._pace = Pace()
 
     def update(self, done: int, total: int) -> None:
         """Part of the current stage is done."""
         now = time.monotonic()
-        if self._first is None:
-            self._first, self._began = done, now
+        self._pace.at(done, now)
         if self._task is not None and (now - self._last > 0.1 or done >= total):
-            self._last = now
-            left = time_left(done, total, self._first, now - self._began)
-            self.bar.update(self._task, completed=done, total=max(total, 1), parts=f"{done}/{total}", left=left)
+            self._last, left = now, self._pace.left(total)
+            told = {"left": left} if left else {}  # until something is known, what was said before stays
+            self.bar.update(self._task, completed=done, total=max(total, 1), parts=f"{done}/{total}", **told)
 
     def finished(self, name: str, seconds: float, cached: bool) -> None:
         """A stage ended."""

@@ -2,6 +2,7 @@
 extension, asset, command. Prints one JSON line."""
 
 import json
+import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -35,6 +36,11 @@ def look() -> dict:
             "velocity": [sum(v[a] for v in speed) / len(speed) for a in range(3)],
         }  # fmt: skip
     return found
+
+
+def values() -> list:
+    """Of the panel, what the test changes."""
+    return [settings.viscosity, settings.material, settings.duration]
 
 
 def refused(call) -> str:
@@ -196,6 +202,11 @@ out["modifiers"] = [m.name for m in bpy.data.objects["fluid surface"].modifiers]
 bpy.context.view_layer.objects.active = body
 bpy.ops.fluidlift.remove_obstacle()
 bpy.ops.fluidlift.undo()
+out["undone"] = [values()]
+bpy.ops.fluidlift.undo()  # of what the panel changed: it goes back with it
+out["undone"].append(values())
+out["material"].append(surface_material())
+subprocess.run([command, "edit", asset, "--redo"], capture_output=True)
 settings.command = "/no/such/command"
 out["refused"]["simulate"] = refused(lambda: bpy.ops.fluidlift.simulate(wait=True))
 fluidlift_asset.unregister()

@@ -9,6 +9,7 @@ import sys
 import tomllib
 import zipfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -53,6 +54,22 @@ def test_a_file_that_is_being_written_is_refused(tmp_path, cut, words):
     (tmp_path / "a.ply").write_bytes(data[:cut])
     with pytest.raises(ValueError, match=words):
         part("ply").read_ply(tmp_path / "a.ply")
+
+
+def test_the_panel_takes_over_what_scene_yaml_holds_after_an_undo():
+    edits, facts = part("edits"), part("facts")
+    fitted = {"kinematic_viscosity": 1e-5, "density": 998.0, "gravity": [0, 0, -9.81], "inflow_velocity": [1, 0, 0]}
+    known = facts.Facts(0.04, fitted | {"density": 1420.0}, "honey", (1.0, 1.0, 1.0), 0.05, fitted)
+    panel = SimpleNamespace(duration=3.0, material="honey", tint=(1.0, 1.0, 1.0))
+    scene = {"parameters": {"kinematic_viscosity": 1e-3}, "look": {"style": "relit", "material": "oil"}, "duration": 2}
+    edits.read_scene(panel, known, "a line before\n" + json.dumps({"scene": scene}, indent=1) + "\n")
+    assert (panel.viscosity, panel.density, panel.duration, panel.material) == (1e-3, 998.0, 2.0, "oil")
+    assert edits.changes(panel) == []  # nothing is left to write
+    edits.read_scene(panel, known, json.dumps({"scene": {"look": None, "parameters": None}}))
+    assert (panel.viscosity, panel.duration, panel.material) == (1e-5, 0.0, "source")
+    for told in ("", "error", '{"asset": 1}'):
+        with pytest.raises(RuntimeError, match="press Refresh"):
+            edits.read_scene(panel, known, told)
 
 
 def test_frames_end_where_one_is_missing_and_an_older_export_is_made_anew(tmp_path):

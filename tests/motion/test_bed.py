@@ -165,3 +165,23 @@ def test_a_stream_that_gains_speed_as_it_falls_has_no_friction_to_explain() -> N
     fast = np.sqrt(0.05**2 + 2 * 9.81 * 0.3 * points[:, :1])  # z + v^2 / 2g is the same everywhere
     assert film_share(points, fast * velocities, 0.3) == 0.0
     assert film_share(points, 0.2 * velocities, 0.3) == 1.0
+
+
+def test_a_chute_above_a_pool_is_no_film_although_the_pool_is_slow() -> None:
+    # a fifth of the way is 45 degrees steep and at 1.5 m/s, the rest a level pool at 0.3 m/s, 0.2 m deep
+    x, y = (a.ravel() for a in np.meshgrid(np.linspace(0, 2, 41), np.linspace(0, 0.6, 13), indexing="ij"))
+    chute = x < 0.4
+    points = np.stack([x, y, np.where(chute, 0.4 - x, 0.0)], axis=-1)
+    velocities = np.where(chute[:, None], 1.5 * np.sqrt(0.5) * np.array([1.0, 0.0, -1.0]), [0.3, 0.0, 0.0])
+    assert film_share(points, velocities, 0.2) == 0.0
+    # all of it as one plane: a slope of 0.15, whose turbulent stream would be at 1.4 m/s
+    fitted = np.polyfit(x, points[:, 2], 1)[0]
+    plane, slow = sloping_surface(-fitted, 0.3)
+    assert film_share(plane, slow, 0.2) == 1.0
+
+
+def test_a_film_of_honey_that_ends_on_a_level_plate_is_a_film() -> None:
+    x, y = (a.ravel() for a in np.meshgrid(np.linspace(0, 2, 41), np.linspace(0, 0.6, 13), indexing="ij"))
+    points = np.stack([x, y, 0.4 * np.maximum(1.4 - x, 0.0)], axis=-1)
+    velocities = np.where((x < 1.4)[:, None], [0.3, 0.0, -0.12], [0.1, 0.0, 0.0])
+    assert film_share(points, velocities, 0.04) > 0.85

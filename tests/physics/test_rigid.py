@@ -13,6 +13,7 @@ from fluidlift.physics.crowding import cell_capacity
 from fluidlift.physics.forces import add_gravity
 from fluidlift.physics.pressure import build_system, divergence, face_fractions, project
 from fluidlift.physics.rigid import RigidBodies, RigidBody, Trajectory
+from fluidlift.physics.rigid_body import slowed
 from fluidlift.physics.window import open_window
 from fluidlift.types import CellType, FaceVelocity, Grid, Particles, Terrain, TriangleMesh, matrix_from_quat
 
@@ -460,6 +461,56 @@ def test_a_light_body_on_the_floor_of_a_pool_is_lifted():
     assert bodies.pressure_forces(q)[0, 2] == pytest.approx(DENSITY * G * 0.018, rel=0.01)
 
 
+@pytest.mark.parametrize("floor", [0.5, 0.52])
+def test_what_of_a_body_lies_in_the_ground_displaces_no_liquid_and_is_not_lifted(floor):
+    # water on top of it and none below: it is pressed down by the column above, whatever of it is in the ground
+    shape = (20, 20, 22)
+    body = RigidBody.box("b", (0.4, 0.3, 0.3), motion="static", position=(0.5, 0.5, 0.5))
+    bodies, window = rigid([body], shape, distance=lambda x: x[..., 2] - floor)
+    wet = pool(shape, 20)
+    wet[:, :, : int(floor / H)] = False
+    _, q, _ = solved(bodies, window, wet)
+    force = bodies.pressure_forces(q)[0]
+    # the pressure is known at cells' centres: within that of half a cell
+    assert force[2] == pytest.approx(-DENSITY * G * 0.12 * 0.35, abs=DENSITY * G * 0.12 * 0.5 * H)
+
+
+def test_a_light_body_that_begins_deep_in_rock_creeps_out_of_it_and_is_not_thrown():
+    body = RigidBody.sphere("ball", 0.12, density=100.0, position=(0.31, 0.3, 0.15))
+    tank = Tank([body], (12, 12, 18), 0.3, distance=lambda x: x[..., 2] - 0.35)
+    assert "creeps out" in tank.bodies.warnings[0]
+    heights = [0.15]
+    for _ in range(80):
+        tank.step(0.005)
+        heights.append(tank.bodies.center[0, 2])
+    # as fast as a fall through one cell at most, though a share of the overlap per step would be twice that
+    assert np.diff(heights).max() / 0.005 <= 1.001 * np.sqrt(2 * G * H)
+    assert heights[-1] == pytest.approx(0.35 + 0.12, abs=0.1 * H)  # and there it lies, on the rock
+    assert np.abs(np.diff(heights[-5:])).max() < 0.01 * H
+
+
+def test_the_water_beside_a_bank_does_not_throw_a_light_body_out_of_it():
+    def bank(x):
+        return np.maximum(0.35 - x[..., 0], x[..., 2] - 0.4)
+
+    body = RigidBody.sphere("ball", 0.12, density=100.0, position=(0.45, 0.3, 0.15))
+    tank = Tank([body], (14, 12, 18), 0.38, distance=bank)
+    heights = [0.15]
+    for _ in range(60):
+        tank.step(0.005)
+        heights.append(tank.bodies.center[0, 2])
+    # it comes up through the water as a light ball does; lifted by rock that it is taken to displace, with 3 m/s
+    assert np.diff(heights).max() / 0.005 < 2.0
+
+
+def test_ways_out_of_an_overlap_are_slowed_down_as_a_whole():
+    push, turn = np.array([[0.0, 0.0, 3.0], [0.1, 0.0, 0.0]]), np.array([[0.0, 10.0, 0.0], [0.0, 0.0, 0.0]])
+    slow, slower = slowed(push, turn, np.array([0.1, 1.0]), 1.0)
+    np.testing.assert_allclose(slow, [[0, 0, 0.75], [0.1, 0, 0]])
+    np.testing.assert_allclose(slower, [[0, 2.5, 0], [0, 0, 0]])
+    np.testing.assert_array_equal(slowed(push, turn, np.ones(2), 0.0)[0], push)  # no gravity, no measure
+
+
 def test_a_piston_drives_the_liquid_with_its_own_velocity():
     # a plate across a channel, with a free surface in front
     shape = (24, 8, 12)
@@ -481,14 +532,15 @@ def test_a_piston_drives_the_liquid_with_its_own_velocity():
 class Tank:
     """Liquid and bodies, one substep as the simulator does it."""
 
-    def __init__(self, bodies, shape, level):
-        self.bodies, self.window = rigid(bodies, shape)
+    def __init__(self, bodies, shape, level, distance=None):
+        self.bodies, self.window = rigid(bodies, shape, distance)
         grid = self.window.grid
         axes = [grid.low[a] + (np.arange(2 * grid.shape[a]) + 0.5) * 0.5 * H for a in range(3)]
         points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
         points = points[points[:, 2] < level]
         points += np.random.default_rng(0).uniform(-0.1, 0.1, points.shape) * H
         points = points[~self.bodies.inside(points)]
+        points = points if distance is None else points[distance(points) > 0.0]
         self.particles = Particles.at_rest(points, DENSITY * (0.5 * H) ** 3)
         self.rate = None
 

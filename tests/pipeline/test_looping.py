@@ -1,6 +1,7 @@
 """A loop's last frame leads into its first one, and the fluid stays as opaque as it is while it fades."""
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,11 +11,20 @@ from fluidlift.errors import InputRejected
 from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.look.rasterize import render
 from fluidlift.pipeline.editing import EditSession
-from fluidlift.pipeline.looping import SplatFrame, blended, blended_poses, faded, read_frame, seam
+from fluidlift.pipeline.looping import (
+    SplatFrame,
+    blended,
+    blended_poses,
+    changed_over,
+    faded,
+    patch_size,
+    read_frame,
+    seam,
+)
 from fluidlift.pipeline.resimulate import resimulate
-from fluidlift.pipeline.scene import loop_overlap
+from fluidlift.pipeline.scene import LOOP_FADE, loop_overlap
 from fluidlift.pipeline.simulating import checkpoint_file, frame_file, simulate
-from fluidlift.types import CellType, Gaussians
+from fluidlift.types import CellType, FluidParameters, Gaussians
 
 
 def pictures(folder, count, camera):
@@ -72,6 +82,35 @@ def test_ids_are_unique_while_two_frames_are_shown_and_those_of_one_frame_at_its
     assert sorted(blended(head, tail, 0.0).ids) == [0, 1, 2, 7]
 
 
+def test_patches_change_over_evenly_in_time_and_most_places_show_one_instant():
+    points = np.random.default_rng(1).uniform(0, [2.0, 0.6, 0.2], (20000, 3))
+    patch = patch_size(points)
+    assert patch == pytest.approx(0.25 * 0.96 * 2.0, rel=0.02)
+    shares = np.linspace(0.0, 1.0, 21)
+    found = np.array([changed_over(points, s, patch) for s in shares])
+    assert (found[0] == 0).all() and (found[-1] == 1).all() and (np.diff(found, axis=0) >= 0).all()
+    # four patches along the body: a few times as much in one frame as on the mean at most
+    assert np.diff(found.mean(axis=1)).max() < 3 / 20
+    between = ((found > 0.02) & (found < 0.98)).mean(axis=1)
+    assert between.max() < 0.5 and between.mean() < 0.3
+
+
+def test_what_is_shown_while_it_fades_stays_about_as_much_as_one_body_without_opacities():
+    # looks that draw a surface of particles do not know opacities: two bodies over each other were twice as many
+    rng = np.random.default_rng(0)
+
+    def body():
+        means = rng.uniform(0, [2.0, 0.6, 0.2], (5000, 3))
+        gaussians = Gaussians.isotropic(means, 0.02, np.full((5000, 3), 0.5), 0.9)
+        return SplatFrame(gaussians, np.arange(5000), np.zeros((5000, 3), np.float32))
+
+    head, tail = body(), body()
+    patch = patch_size(head.gaussians.means)
+    counts = [len(blended(head, tail, s, patch).ids) / 5000 for s in np.linspace(0, 1, 11)]
+    assert counts[0] == counts[-1] == 1.0
+    assert max(counts) < 1.0 + 0.5 and np.abs(np.diff(counts)).max() < 0.35
+
+
 def test_a_body_glides_back_on_the_shorter_way():
     a = np.array([[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]])
     b = np.array([[1.0, 0.0, 0.0, -np.cos(0.5), 0.0, 0.0, -np.sin(0.5)]])
@@ -80,7 +119,10 @@ def test_a_body_glides_back_on_the_shorter_way():
 
 
 def test_the_fade_lasts_a_quarter_of_the_passage_within_bounds(channel):
-    assert loop_overlap(channel(100)) == round(0.25 * 0.9 * 1.15 / 0.6 / 0.04)  # 1.035 m at 0.6 m/s
+    slow = channel(100, parameters=FluidParameters(inflow_velocity=(0.25, 0.0, 0.0), time_step=0.04))
+    slow = replace(slow, body=replace(slow.body, velocities=slow.body.velocities * np.float32(0.25 / 0.6)))
+    assert loop_overlap(slow) == round(0.25 * 0.9 * 1.15 / 0.25 / 0.04)  # 1.035 m at 0.25 m/s
+    assert loop_overlap(channel(100)) == round(LOOP_FADE[0] / 0.04)  # at 0.6 m/s it would be 0.43 s
     assert loop_overlap(channel(10)) == 5
     with pytest.raises(InputRejected, match="4 frames or more"):
         loop_overlap(channel(3))

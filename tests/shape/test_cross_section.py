@@ -7,10 +7,12 @@ from fluidlift.shape.cross_section import (
     CONTINUITY,
     REPOSE,
     ROCK_FLANK,
+    STEEPEST,
     STRAIGHT,
     Reach,
     depth_along,
     rock_height,
+    swiftness,
     thickness,
 )
 
@@ -66,6 +68,35 @@ def test_banks_fall_at_their_slope_to_a_flat_bed():
     assert np.abs(below[near] - REPOSE * (bank[near] + H / 2)).max() < 0.01
     assert below[np.abs(y) < 0.1] == pytest.approx(0.2, rel=0.03)
     assert (below[~water.wet] == 0).all()
+
+
+def test_beside_water_that_keeps_its_speed_the_bank_is_steep():
+    water, _, y = reach(speed=lambda x: 0 * x + 0.7)
+    below = thickness(water, np.full(water.wet.shape, 0.2), WIDTH)
+    bank = WIDTH / 2 - np.abs(y)
+    first = (bank > 0) & (bank < H)
+    assert below[first] == pytest.approx(STEEPEST * H / 2, rel=0.05)  # half a column from the bank
+    assert below[bank > 3 * H].min() > 0.88 * 0.2  # its foot is rounded: 2^(-1/6) of the depth at the corner
+
+
+def test_water_that_slackens_to_the_bank_leaves_it_at_its_slope():
+    water, _, y = reach(speed=lambda x: 0 * x + 0.7)
+    slack = Reach(water.wet, water.rock, water.level, water.along, water.speed * (1.0 - (2 * y / WIDTH) ** 2), H)
+    section = np.full(water.wet.shape, 0.2)
+    plain = Reach(water.wet, water.rock, water.level, water.along, np.full(water.wet.shape, np.nan), H)
+    near = (WIDTH / 2 - np.abs(y) < 2 * H) & water.wet
+    here, usual = (thickness(w, section, WIDTH)[near] for w in (slack, plain))
+    assert here.max() < 1.3 * usual.max()
+    assert (here >= usual - 1e-9).all()
+
+
+def test_speed_says_nothing_where_it_is_not_known_and_no_scale_counts():
+    water, x, _ = reach(speed=lambda x: np.where(x < 2.0, np.nan, 0.3))
+    share = swiftness(water, WIDTH)
+    assert (share[x < 2.0] == 0).all()
+    assert share[(x > 2.0) & water.wet] == pytest.approx(1.0, abs=1e-6)
+    faster = Reach(water.wet, water.rock, water.level, water.along, 100 * water.speed, H)
+    np.testing.assert_allclose(swiftness(faster, WIDTH), share, atol=1e-9)
 
 
 def test_a_deep_narrow_section_has_steeper_banks():

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
+from fluidlift.shape.energy_line import Channel, energy_profile
 from fluidlift.shape.kind import UpEvidence, level_camera
 from fluidlift.shape.slope import (
-    Channel,
-    energy_profile,
     estimate_slope,
     estimate_tilt,
     flow_patches,

@@ -14,6 +14,8 @@ import pytest
 pytest.importorskip("viser", reason="viser is not installed: pip install 'fluidlift[view]'")
 pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 
+from fluidlift.pipeline.editing import Add
+
 CHROMIUM = Path("/usr/bin/chromium")
 pytestmark = pytest.mark.skipif(not CHROMIUM.exists(), reason=f"there is no {CHROMIUM}")
 
@@ -254,6 +256,14 @@ def test_of_several_obstacles_the_chosen_one_has_the_gizmo_and_the_controls(visi
     visit.choose("chosen", "(none)")
     visit.says("No obstacle is chosen.")
     visit.until(lambda: panel._gizmo is None and visit.field("motion").is_disabled(), "nothing to change")
+    for label, said in (("width, m", "no obstacle is chosen"), ("density", "no obstacle is chosen")):
+        # a slider that is greyed out leaves its box open: what is typed there is told and goes back
+        typed = "0.123" if label == "width, m" else "77"
+        visit.field(label).fill(typed)
+        visit.until(lambda said=said: said in viewer.messages, f"a word on {label}")
+        visit.until(lambda label=label, typed=typed: visit.field(label).input_value() != typed, "another value again")
+        viewer.say("")
+    assert all("density" not in o for o in viewer.draft.obstacles)
 
     visit.tab("View")
     nodes = [viewer.server.scene.get_handle_by_name(f"/obstacles/{name}") for name in ("sphere1", "sphere2")]
@@ -366,6 +376,18 @@ def test_edits_are_saved_simulated_in_full_stopped_exported_and_drawn(visit, vie
     visit.unfold("Draw a picture", "Draw")
     visit.press("Draw")
     visit.says("frame 1001 drawn")
+
+
+def test_what_an_edit_leads_to_is_warned_about_until_it_is_undone(visit, viewer):
+    # as fluidlift edit does
+    fast = {"name": "ball", "shape": "sphere", "radius": 0.05, "position": [0.3, 0.2, 0.2], "motion": "animated",
+            "velocity": [100.0, 0.0, 0.0]}  # fmt: skip
+    viewer.edited(lambda: viewer.draft.apply([Add("obstacles", fast)], "ball added"), moves=False)
+    visit.says("obstacle 'ball' at 100 m/s needs about 80 steps")
+    visit.tab("Save and run")
+    visit.press("undo")
+    visit.until(lambda: not viewer.comparison.warnings, "no warning any more")
+    visit.until(lambda: "needs about 80 steps" not in visit.page.inner_text("body"), "a page without it")
 
 
 def test_what_runs_away_is_told_with_the_edit_and_the_frames_before_it_stay(visit, viewer, monkeypatch):

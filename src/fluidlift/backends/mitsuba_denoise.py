@@ -33,7 +33,7 @@ def without_sparks(parts: Float[np.ndarray, "k h w 3"]) -> Float[np.ndarray, "k 
     return parts * np.minimum(1.0, limit / np.maximum(lightness, 1e-12))[..., None]
 
 
-def denoised(parts: Float[np.ndarray, "k h w 3"]) -> Float[np.ndarray, "h w 3"]:
+def denoised(parts: Float[np.ndarray, "k h w c"]) -> Float[np.ndarray, "h w c"]:
     """The mean of parts of a picture with less grain.
 
     Non-local means with the variance of the pixels (Rousselle, Knaus and Zwicker 2012, Adaptive rendering with

@@ -102,7 +102,8 @@ class MitsubaRenderer:
             parts.append(_finite(part))
             if len(parts) > PARTS:  # of a long row of them, as many as tell the grain are kept
                 parts[k % PARTS] = parts[k % PARTS] + parts.pop()
-        mean = _together(np.stack(parts), counts, denoise=scene.denoise)
+        # glass mirrors a path or lets it pass, by chance: what it covers has grain as well
+        mean = _together(np.stack(parts), counts, denoise=scene.denoise, covered=bool(scene.panes))
         apart = cut_out(self._mi, scene, camera)
         if apart is not None:
             count, seed = min(max(scene.samples, EDGE_SAMPLES), most), (scene.seed * 7919) % 2**31
@@ -144,8 +145,11 @@ def _parts(samples: int, most: int) -> list[int]:
     return [samples // count + (k < samples % count) for k in range(count)]
 
 
-def _together(parts: Float[np.ndarray, "k h w 4"], counts: list[int], *, denoise: bool) -> Float[np.ndarray, "h w 4"]:
-    """One picture of its parts (sums of those `counts` of paths that fell to them)."""
+def _together(
+    parts: Float[np.ndarray, "k h w 4"], counts: list[int], *, denoise: bool, covered: bool = False
+) -> Float[np.ndarray, "h w 4"]:
+    """One picture of its parts (sums of those `counts` of paths that fell to them); `covered`: grain is taken out of
+    the alpha too."""
     shares = np.zeros((len(parts), 2))
     for k, count in enumerate(counts):
         shares[k % len(parts)] += (count, 1)
@@ -153,6 +157,8 @@ def _together(parts: Float[np.ndarray, "k h w 4"], counts: list[int], *, denoise
     mean = np.average(parts, axis=0, weights=shares[:, 0])
     if denoise and len(counts) >= PARTS:
         mean[..., :3] = denoised(without_sparks(parts[..., :3]))
+        if covered:
+            mean[..., 3:] = denoised(parts[..., 3:])
     return mean
 
 

@@ -15,6 +15,7 @@ from fluidlift.look.environment_lookup import grid_directions
 from fluidlift.look.liquid import LUMINANCE, glow
 from fluidlift.look.materials import Material
 from fluidlift.look.optics import scattering_share
+from fluidlift.look.vessel import INDEX, TINT
 from fluidlift.numerics.mesh_normals import vertex_normals
 from fluidlift.numerics.srgb import linear_from_srgb
 from fluidlift.types import PinholeCamera, Terrain, TriangleMesh
@@ -50,6 +51,8 @@ class FinalScene:
     """linear radiance, equirectangular: first row up (+z), middle of the picture towards +y, +x to the right of it"""
     solids: tuple[TriangleMesh, ...] = ()
     """terrain and obstacles where they stand, with texture or vertex colours"""
+    panes: tuple[TriangleMesh, ...] = ()
+    """thin glass: sheets without thickness, each as a pane with two surfaces"""
     samples: int = 64
     """light paths per pixel"""
     depth: int = 12
@@ -79,7 +82,7 @@ class FinalScene:
         require(self.depth >= 2, f"light paths of {self.depth} turns", "at least two")
         require(0.0 <= self.softness <= 1.0, f"softness {self.softness}", "0 to 1")
         require(self.seed >= 0, f"seed {self.seed}", "0 or more")
-        for mesh in (self.surface, *self.solids):
+        for mesh in (self.surface, *self.solids, *self.panes):
             require(bool(np.isfinite(mesh.vertices).all()), "a mesh with vertices that are not finite")
 
     @property
@@ -178,6 +181,9 @@ def described(mi: Any, scene: FinalScene, camera: PinholeCamera) -> dict[str, An
     for k, mesh in enumerate(scene.solids):
         if len(mesh.faces):
             out[f"solid{k}"] = _solid(mi, mesh)
+    for k, mesh in enumerate(scene.panes):
+        if len(mesh.faces):
+            out[f"pane{k}"] = _sheet(mi, mesh)
     return out
 
 
@@ -300,6 +306,16 @@ def _solid(mi: Any, mesh: TriangleMesh) -> Any:
     properties["bsdf"] = mi.load_dict({"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": paint}})
     faces = np.arange(len(corner)).reshape(-1, 3)
     return _mesh(mi, properties, (points.reshape(-1, 3), faces, normals, uv), attributes)
+
+
+def _sheet(mi: Any, mesh: TriangleMesh) -> Any:
+    """Glass that light goes straight through."""
+    properties = mi.Properties()
+    tint = {"type": "rgb", "value": list(TINT)}
+    properties["bsdf"] = mi.load_dict(
+        {"type": "thindielectric", "int_ior": INDEX, "ext_ior": 1.0, "specular_transmittance": tint}
+    )
+    return _mesh(mi, properties, (mesh.vertices, np.asarray(mesh.faces), vertex_normals(mesh), None), {})
 
 
 def _mesh(mi: Any, properties: Any, shape: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None], attributes):

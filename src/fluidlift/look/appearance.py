@@ -21,6 +21,18 @@ LARGEST_TINT = 1.25
 """and no channel against the others by more than this: a bank beside the mask must not colour the water"""
 
 
+FIXED = 0.35
+"""natural logarithm by which the brightness of a place may differ, all the time, from that of its surroundings: a
+shadow, a stone or a mirror image stands there, and is no pattern that flows"""
+
+
+def relit_ratio(here: Float[np.ndarray, "n 3"], there: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """By what a colour changes that comes from the shade `there` into the shade `here` (sRGB, above 0)."""
+    bright = here.mean(axis=1, keepdims=True) / there.mean(axis=1, keepdims=True)
+    tint = np.clip(here / there / bright, 1.0 / LARGEST_TINT, LARGEST_TINT)
+    return np.clip(bright, 1.0 / LARGEST_RATIO, LARGEST_RATIO) * tint
+
+
 @dataclass(frozen=True)
 class SteadyShading:
     """The slowly varying part of the mean picture of the fluid."""
@@ -28,6 +40,8 @@ class SteadyShading:
     image: Float[np.ndarray, "h w 3"]
     """sRGB in (0, 1]; outside the fluid, that of the nearest fluid"""
     camera: PinholeCamera
+    fixed: Bool[np.ndarray, "h w"] | None = None
+    """pixels of things that stand still in the picture and are smaller than the shading's blur; None: not known"""
 
     @classmethod
     def of(
@@ -55,7 +69,7 @@ class SteadyShading:
         if mask.any():
             index = ndimage.distance_transform_edt(~mask, return_distances=False, return_indices=True)
             smooth = smooth[tuple(index)]
-        return cls(np.clip(smooth, 0.02, 1.0).astype(np.float32), camera)
+        return cls(np.clip(smooth, 0.02, 1.0).astype(np.float32), camera, _fixed(mean, smooth, mask, sigma))
 
     def at(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """The shading where each point is seen; that of the nearest pixel outside the picture."""
@@ -65,9 +79,13 @@ class SteadyShading:
     def moved(self, shown: Gaussians, origin: Float[np.ndarray, "n 3"]) -> Gaussians:
         """Gaussians whose colours were taken at `origin`, shaded for where they are now."""
         here, there = self.at(shown.means), self.at(origin)
-        bright = here.mean(axis=1, keepdims=True) / there.mean(axis=1, keepdims=True)
-        tint = np.clip(here / there / bright, 1.0 / LARGEST_TINT, LARGEST_TINT)
-        ratio = np.clip(bright, 1.0 / LARGEST_RATIO, LARGEST_RATIO) * tint
         sh = shown.sh.copy()
-        sh[:, :1] = sh_from_rgb(np.clip((0.5 + SH_C0 * sh[:, 0]) * ratio, 0.0, 1.0))
+        sh[:, :1] = sh_from_rgb(np.clip((0.5 + SH_C0 * sh[:, 0]) * relit_ratio(here, there), 0.0, 1.0))
         return Gaussians(shown.means, shown.quats, shown.scales, shown.opacities, sh)
+
+
+def _fixed(mean: np.ndarray, smooth: np.ndarray, mask: np.ndarray, sigma: float) -> np.ndarray:
+    """Pixels whose mean over time is much brighter or darker than its surroundings."""
+    fine = np.maximum(ndimage.gaussian_filter(mean.mean(axis=-1), 0.1 * sigma), 0.02)
+    odd = np.abs(np.log(fine / np.maximum(smooth.mean(axis=-1), 0.02))) > FIXED
+    return ndimage.binary_dilation(odd & mask, iterations=max(round(0.1 * sigma), 1))

@@ -121,6 +121,10 @@ class Ground:
         """Camera z (m; 0: none) of these meshes: of the ground that a photograph in place of its picture shows."""
         return self._seen(camera).depth
 
+    def albedo(self, camera: PinholeCamera) -> Float[np.ndarray, "h w 3"]:
+        """Linear; 0 where there is none of these meshes."""
+        return self._seen(camera).albedo
+
     def _seen(self, camera: PinholeCamera) -> _Surfaces:
         key = place_of(camera)
         if self._last is None or self._last[0] != key:

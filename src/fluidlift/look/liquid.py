@@ -8,12 +8,14 @@ van der Laan, Green and Sainz 2009). Everything is linear light.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float
 
 from fluidlift.errors import require
 from fluidlift.look.environment import LEVELS, LUMINANCE, Environment
+from fluidlift.look.environment_stack import stacked
 from fluidlift.look.liquid_kernels import (
     BEYOND,
     COLOR,
@@ -35,6 +37,7 @@ from fluidlift.look.liquid_lookup import SLANTED
 from fluidlift.look.materials import Material
 from fluidlift.look.optics import fresnel, transmittance
 from fluidlift.look.smoothstep import smoothstep
+from fluidlift.numerics.sharing import in_pieces
 from fluidlift.types.camera import PinholeCamera
 
 SHARP = 0.004
@@ -160,14 +163,14 @@ def shaded(
     picture = behind.image.copy()
     if usual is None:
         usual = _usual(surface, behind) if max(material.emission) > 0 else 1.0
-    pictures, steps = _pictures(environment)
     numbers = np.array([
         material.refractive_index, material.roughness, material.scattering, _straight(material), DULL, material.carried,
         SHARP, max(usual, 1e-6), COOL, HOT, WARM, CONTRAST, *material.absorption, *material.albedo, *material.emission,
         *LUMINANCE,
     ])  # fmt: skip
-    world = (pictures, steps, _DIM, environment.diffuse, SECOND_RADIATION / WAVELENGTHS)
-    shade(_arrays(surface), _scene(behind), _eye(camera), world, numbers, picture)
+    world = (*_pictures(environment), _STEPS, _DIM, SECOND_RADIATION / WAVELENGTHS)
+    with in_pieces(len(picture)):
+        shade(_arrays(surface), _scene(behind), _eye(camera), world, numbers, picture)
     return picture
 
 
@@ -269,10 +272,11 @@ _STEPS = np.array([0.0, *(roughness for roughness, _ in LEVELS)])
 _DIM = int(np.argmin(np.abs(_STEPS - DIM)))
 
 
-def _pictures(environment: Environment) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
-    """The environment and its prefiltered pictures, and their roughnesses."""
+@lru_cache(maxsize=2)
+def _pictures(environment: Environment) -> tuple[np.ndarray, np.ndarray]:
+    """The environment, its prefiltered pictures and that of the irradiance, for `shade`."""
     pictures = [environment.between(float(roughness))[0] for roughness in _STEPS[:-1]]
-    return (*pictures, environment.between(1.0)[1]), _STEPS
+    return stacked([*pictures, environment.between(1.0)[1], environment.diffuse])
 
 
 @dataclass(frozen=True)

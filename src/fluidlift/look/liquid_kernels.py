@@ -13,7 +13,7 @@ import math
 import numba as nb
 import numpy as np
 
-from fluidlift.look.environment_lookup import picture_place, picture_value
+from fluidlift.look.environment_stack import fading, place_of, value_at
 from fluidlift.look.liquid_lookup import fetch_beyond, shown_of_film
 from fluidlift.look.smoothstep import eased
 from fluidlift.look.transparent_rays import far_side, onward, seen_from
@@ -53,7 +53,8 @@ def reflectance(cos, index):
 @nb.njit(cache=True, inline="always")
 def _onto(x, y, z, lens):
     """Picture coordinates (px) of a point or direction in front of the camera."""
-    return lens[0] * x / z + lens[2], lens[1] * y / z + lens[3]
+    near = 1.0 / z  # here as elsewhere: a division takes as long as ten products
+    return lens[0] * x * near + lens[2], lens[1] * y * near + lens[3]
 
 
 @nb.njit(cache=True, error_model="numpy", _nrt=False)
@@ -65,9 +66,13 @@ def _behind(q, o, start, depth, front, lens, up, goes_on):
     u, v = start
     if o[2] < 0.05:  # back to the viewer
         return FAR_AWAY, FAR_AWAY, goes_on
+    before = -1.0
     for _ in range(STEPS):
         row, col = min(max(int(v), 0), h - 1), min(max(int(u), 0), w - 1)
         z = depth[row, col]
+        if z == before:  # as far away as it was: it is met where it was
+            break
+        before = z
         if z > 0.0:
             s = max(z - q[2], 0.0) / o[2]
             u, v = _onto(q[0] + s * o[0], q[1] + s * o[1], max(q[2] + s * o[2], 1e-6), lens)
@@ -140,9 +145,9 @@ def _leaving(tx, ty, tz, bx, by, bz, vx, vy, vz, index, free):
     ox = vx + free * (index * tx + bend * bx - vx)
     oy = vy + free * (index * ty + bend * by - vy)
     oz = vz + free * (index * tz + bend * bz - vz)
-    norm = max(math.sqrt(ox * ox + oy * oy + oz * oz), 1e-6)
+    unit = 1.0 / max(math.sqrt(ox * ox + oy * oy + oz * oz), 1e-6)
     back = free * reflectance(min(out, 1.0), index)  # the same seen from either side
-    return ox / norm, oy / norm, oz / norm, back, mx, my, mz
+    return ox * unit, oy * unit, oz * unit, back, mx, my, mz
 
 
 @nb.njit(cache=True, error_model="numpy", _nrt=False)
@@ -211,16 +216,16 @@ def _follow(i, j, surface, behind, eye, index, ray):
     picture, depth, rest = behind
     lens, rotation = eye
     x, y = (j + 0.5 - lens[2]) / lens[0], (i + 0.5 - lens[3]) / lens[1]
-    length = math.sqrt(x * x + y * y + 1.0)
-    vx, vy, vz = x / length, y / length, 1.0 / length
+    vz = 1.0 / math.sqrt(x * x + y * y + 1.0)
+    vx, vy = x * vz, y * vz
     nx, ny, nz = seen_from(normals, i, j, rotation)
     nx, ny, nz, cos = _towards_viewer(nx, ny, nz, vx, vy, vz)
     ray[SHARE] = reflectance(cos, index)
     _turned(rotation, vx + 2.0 * cos * nx, vy + 2.0 * cos * ny, vz + 2.0 * cos * nz, ray, MIRROR)
     # into the liquid
-    far = math.sqrt(max(1.0 - (1.0 - cos * cos) / (index * index), 0.0))
-    bend = cos / index - far
-    tx, ty, tz = vx / index + bend * nx, vy / index + bend * ny, vz / index + bend * nz
+    slower = 1.0 / index
+    bend = cos * slower - math.sqrt(max(1.0 - (1.0 - cos * cos) * slower * slower, 0.0))
+    tx, ty, tz = vx * slower + bend * nx, vy * slower + bend * ny, vz * slower + bend * nz
     z0 = np.float64(surface_depth[i, j])
     p = (x * z0, y * z0, z0)
     way, bx, by, bz, thick, free = _to_far_side(
@@ -263,48 +268,48 @@ def follow(pixels, surface, behind, eye, index, rays):
 
 
 @nb.njit(cache=True, inline="always")
-def _looked_up(picture, ray, at):
-    across, down = picture_place(np.float32(ray[at]), np.float32(ray[at + 1]), np.float32(ray[at + 2]))
-    return picture_value(picture, across, down)
+def _looked_up(values, places, k, ray, at):
+    across, down = place_of(np.float32(ray[at]), np.float32(ray[at + 1]), np.float32(ray[at + 2]))
+    return value_at(values, places[k, 0], places[k, 1], across, down)
 
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True, _nrt=False)
-def _mirrored(pictures, steps, roughness, ray):
+def _mirrored(values, places, steps, roughness, ray):
     """`Environment.blurred` for the mirrored ray."""
-    last = len(pictures) - 1
+    last = steps.shape[0] - 1
     k = 0
     while k < last - 1 and roughness >= steps[k + 1]:
         k += 1
     share = min(max((roughness - steps[k]) / (steps[k + 1] - steps[k]), 0.0), 1.0)
-    across, down = picture_place(np.float32(ray[MIRROR]), np.float32(ray[MIRROR + 1]), np.float32(ray[MIRROR + 2]))
-    r0, g0, b0 = picture_value(pictures[k], across, down)
+    across, down = place_of(np.float32(ray[MIRROR]), np.float32(ray[MIRROR + 1]), np.float32(ray[MIRROR + 2]))
+    r0, g0, b0 = value_at(values, places[k, 0], places[k, 1], across, down)
     if share <= 0.0:
         return r0, g0, b0
-    r1, g1, b1 = picture_value(pictures[k + 1], across, down)
+    r1, g1, b1 = value_at(values, places[k + 1, 0], places[k + 1, 1], across, down)
     s = np.float32(share)
     return r0 + s * (r1 - r0), g0 + s * (g1 - g0), b0 + s * (b1 - b0)
 
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True, _nrt=False)
-def _come_through(ray, pictures, dim, numbers, light):
+def _come_through(ray, values, places, dim, numbers, light):
     """What comes through, of the picture behind or the environment, and of what is mirrored at the far side, after its
     way inside; and the share of light, of each colour, that scattering and absorption take from both together."""
     back = ray[TURNED]
     light[0], light[1], light[2] = ray[COLOR], ray[COLOR + 1], ray[COLOR + 2]
     if ray[OUTSIDE] > 0.0 and back < 1.0:
-        light[0], light[1], light[2] = _looked_up(pictures[0], ray, THROUGH)
+        light[0], light[1], light[2] = _looked_up(values, places, 0, ray, THROUGH)
     r, g, b = ray[SECOND], ray[SECOND + 1], ray[SECOND + 2]
     if back > 0.0 and ray[BEYOND] > 0.0:
-        r, g, b = _looked_up(pictures[dim], ray, INWARD)
+        r, g, b = _looked_up(values, places, dim, ray, INWARD)
     for k in range(3):
         lost = numbers[12 + k] + numbers[2]
         inner, left = (r if k == 0 else (g if k == 1 else b)), 1.0
         if back > 0.0:
-            left = math.exp(-lost * ray[FARTHER])
+            left = fading(lost * ray[FARTHER])
             # all of it: what would come through was not looked up
             light[k] = inner * left if back >= 1.0 else light[k] + back * (inner * left - light[k])
             left = back * left + 1.0 - back
-        along = math.exp(-lost * ray[PATH])
+        along = fading(lost * ray[PATH])
         light[k] *= along
         light[3 + k] = 1.0 - along * left
 
@@ -324,21 +329,22 @@ def _body(carried, given, numbers, waves, light):
             light[k] += light[3 + k] * numbers[18 + k] * math.exp((1.0 / hot - 1.0 / kelvin) * waves[k])
 
 
-@nb.njit(cache=True, inline="always")
+@nb.njit(cache=True, error_model="numpy", forceinline=True, _nrt=False)
 def _pixel(i, j, surface, behind, eye, world, numbers, ray, light):
     """One pixel of `shade`: the light of its liquid."""
-    pictures, steps, dim, diffuse, waves = world
-    index, roughness, scattering, straight, dull, _, sharp = numbers[:7]
+    values, places, steps, dim, waves = world
+    index, roughness, scattering = numbers[0], numbers[1], numbers[2]
+    straight, dull, sharp = numbers[3], numbers[4], numbers[6]
     _follow(i, j, surface, behind, eye, index, ray)
-    _come_through(ray, pictures, dim, numbers, light)
+    _come_through(ray, values, places, dim, numbers, light)
     if scattering > 0.0:
         normals, carried = surface[2], surface[5]
-        across, down = picture_place(normals[i, j, 0], normals[i, j, 1], normals[i, j, 2])
-        own = (carried[i, j, 0], carried[i, j, 1], carried[i, j, 2])
-        _body(own, picture_value(diffuse, across, down), numbers, waves, light)
+        across, down = place_of(normals[i, j, 0], normals[i, j, 1], normals[i, j, 2])
+        given = value_at(values, places[-1, 0], places[-1, 1], across, down)
+        _body((carried[i, j, 0], carried[i, j, 1], carried[i, j, 2]), given, numbers, waves, light)
     spread = max(ray[SPREAD] - sharp, 0.0)
     wide = roughness if spread == 0.0 else math.sqrt(math.sqrt(roughness**4 + spread * spread))
-    mirror = _mirrored(pictures, steps, wide, ray)
+    mirror = _mirrored(values, places, steps, wide, ray)
     share = straight + (ray[SHARE] - straight) * (1.0 - dull * roughness)
     for k in range(3):
         light[k] = share * mirror[k] + (1.0 - share) * light[k]
@@ -350,20 +356,21 @@ def shade(surface, behind, eye, world, numbers, out):
 
     surface: covered, depth, normals, normals of the far side (of no rows: none), thickness, carried colour, grain.
     behind: picture, depth, and what it is beyond its rim. eye: lens (fx, fy, cx, cy) and rotation. world: pictures of
-    the environment, ever duller, and their roughnesses; which of them is seen by what was mirrored at the far side;
-    irradiance; second radiation constant over wavelengths. numbers: index, roughness, scattering, straight, dull,
-    carried share, sharp, usual, cool, hot, warm, contrast, then absorption, albedo, emission and weights of luminance.
+    the environment, ever duller, and that of the irradiance, as `stacked` gives them; roughnesses of the former; which
+    of them is seen by what was mirrored at the far side; second radiation constant over wavelengths. numbers: index,
+    roughness, scattering, straight, dull, carried share, sharp, usual, cool, hot, warm, contrast, then absorption,
+    albedo, emission and weights of luminance.
     """
     covered, surface_depth, normals, back_normals, thickness, carried, grain = surface
     image, depth, rest = behind
     lens, rotation = eye
-    pictures, steps, dim, diffuse, waves = world
+    values, places, steps, dim, waves = world
     for row in nb.prange(covered.shape[0]):
         i = np.int64(row)
         ray, light = np.empty(NUMBERS), np.empty(6)
         # made once: to bundle arrays costs as much as a pixel
         liquid = (covered, surface_depth, normals, back_normals, thickness, carried, grain)
-        scene, lens_and_pose, lights = (image, depth, rest), (lens, rotation), (pictures, steps, dim, diffuse, waves)
+        scene, lens_and_pose, lights = (image, depth, rest), (lens, rotation), (values, places, steps, dim, waves)
         for j in range(covered.shape[1]):
             part, z = covered[i, j], surface_depth[i, j]
             if not (part > 0.0 and z > 0.0 and (depth[i, j] <= 0.0 or z < depth[i, j])):

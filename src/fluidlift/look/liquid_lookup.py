@@ -68,9 +68,9 @@ def shown_of_film(i, j, z, depth, lens, grain):
     The height is measured across the plane that the picture behind shows there: n . p = 1 with the slopes of its
     inverse depth for n, from which the point p lies (1 - n . p) / |n| away.
     """
-    own = _inverse(depth, i, j)
-    if grain <= 0.0 or own <= 0.0 or 1.0 / own - z > SLANTED * grain:
+    if grain <= 0.0 or depth[i, j] <= 0.0 or depth[i, j] - z > SLANTED * grain:
         return 1.0
+    own = _inverse(depth, i, j)
     x = lens[0] * _flatter(_inverse(depth, i, j - 1), own, _inverse(depth, i, j + 1))
     y = lens[1] * _flatter(_inverse(depth, i - 1, j), own, _inverse(depth, i + 1, j))
     along = own - (j + 0.5 - lens[2]) / lens[0] * x - (i + 0.5 - lens[3]) / lens[1] * y

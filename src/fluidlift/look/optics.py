@@ -10,6 +10,9 @@ from jaxtyping import Bool, Float
 
 from fluidlift.errors import require
 
+WET_DEEP = 6.0
+"""optical depth from which ground below a liquid is too dark to matter"""
+
 
 def fresnel(cos_incident: Float[np.ndarray, "*n"], refractive_index: float) -> Float[np.ndarray, "*n"]:
     """Share of unpolarised light that a smooth dielectric surface reflects: the mean of both polarisations, exact.
@@ -102,6 +105,41 @@ def scattering_share(color: Float[np.ndarray, "3"], refractive_index: float = 1.
     b, left = 1.139 + 1.17 * r, 1.0 - r
     s = (b - np.sqrt(b * b - 4 * 0.139 * left)) / (2 * 0.139)
     return 1.0 - np.clip(s, 0.0, 1.0) ** 2
+
+
+def wet_light(
+    depth: Float[np.ndarray, "*n"], refractive_index: float
+) -> tuple[Float[np.ndarray, "*n"], Float[np.ndarray, "*n"], Float[np.ndarray, "*n"]]:
+    """Even light in a level layer of liquid on matt ground: why wet ground is dark (Lekner and Dorf 1988).
+
+    Ground of albedo r below it gets its light through the surface, on bent ways, and again what the surface throws back
+    of its own: 1 + r back + (r back)^2 + ... times. What it sends up is n^2 times as bright inside as outside.
+
+    Args:
+        depth: optical (1/m times m), straight down, 0 or more.
+        refractive_index: of the liquid, next to air's.
+
+    Returns:
+        Over what the ground gets without a surface, by straight ways (2 E3 of the depth, less what the surface mirrors
+        straight on): the light that arrives, over n^2; the share `back`; and what
+        the ground gets by straight ways, of the even light.
+    """
+    thick, *columns = wet_table(float(refractive_index))
+    at = np.clip(np.asarray(depth, np.float64), 0.0, thick[-1])
+    arrives, back, straight = (np.interp(at, thick, c) for c in columns)
+    return arrives, back, straight
+
+
+@lru_cache(maxsize=16)
+def wet_table(index: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Optical depths up to `WET_DEEP`, evenly spaced in their roots, and the results of `wet_light` there."""
+    thick = WET_DEEP * np.linspace(0.0, 1.0, 65) ** 2
+    cos = (np.arange(1000) + 0.5) / 1000
+    held = fresnel(-cos, index)
+    left = np.exp(-thick[:, None] / cos)
+    arrives = (2 * cos * (1.0 - held) * left).mean(axis=1)
+    straight = (1.0 - fresnel(np.ones(1), index)) * (2 * cos * left).mean(axis=1)
+    return thick, arrives / straight, (2 * cos * held * left * left).mean(axis=1), straight
 
 
 @lru_cache(maxsize=64)

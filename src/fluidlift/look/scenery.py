@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
+from fluidlift.look.vessel import vessel_apart
 from fluidlift.numerics.mesh_normals import vertex_normals
 from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.numerics.textures import sample_texture
@@ -35,12 +36,28 @@ TEXTURED = 60_000
 """surfels of a textured ground, at most: what a preview's panel shows; large stills take more"""
 
 
-def terrain_surfels(terrain: Terrain, *, opacity: float = 0.98, most: int = TEXTURED) -> Gaussians:
+def terrain_surfels(
+    terrain: Terrain, *, opacity: float = 0.98, most: int = TEXTURED, glass: float | None = None
+) -> Gaussians:
     """Flat, shaded Gaussians on the terrain's surface, so that one rasteriser draws everything.
 
     One per vertex, as large as the surface that it stands for, a cell at most. Where there is a texture, they lie on
     the faces, and these are cut up as far as `most` surfels allow.
+
+    Args:
+        terrain: the ground.
+        opacity: of each.
+        most: surfels of a textured ground.
+        glass: opacity of what stands on the ground, a pour's vessel (`vessel.vessel_apart`); 0: it is left out; None:
+            it is ground as the rest.
     """
+    if glass is not None:
+        table, vessel = vessel_apart(terrain.mesh, terrain.grid.spacing)
+        found = terrain_surfels(replace(terrain, mesh=table), opacity=opacity, most=most)
+        if vessel is None or glass <= 0:
+            return found
+        walls = terrain_surfels(replace(terrain, mesh=vessel.sheet), opacity=glass, most=most)
+        return concatenate([found, walls])
     mesh = terrain.mesh
     if len(mesh.vertices) == 0:
         return Gaussians.empty()

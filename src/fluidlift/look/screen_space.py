@@ -17,14 +17,13 @@ from fluidlift.look.screen_space_kernels import (
     depths_and_cover,
     inverse_depths,
     narrow_range,
-    place_spheres,
     plane_normals,
     smooth_normals,
-    sphere_chords,
-    sphere_depths,
     spread_edges,
     unit_rows,
 )
+from fluidlift.look.screen_space_spheres import SIDE, place_spheres, sphere_chords, sphere_depths
+from fluidlift.numerics.sharing import in_pieces
 from fluidlift.numerics.srgb import linear_from_srgb
 from fluidlift.numerics.triangles import NEAR, banded, interpolated, rasterize_closed
 from fluidlift.types.camera import PinholeCamera
@@ -118,7 +117,7 @@ def _placed(points: np.ndarray, radius: float, camera: PinholeCamera) -> tuple[n
     rotation, translation = np.asarray(pose.rotation, np.float64), np.asarray(pose.translation, np.float64)
     place_spheres(points, rotation, translation, radius, lens, np.array(camera.size, np.int64), NEAR, centres, box)
     starts, listed = banded(box, camera.size[1])
-    across = ((np.arange(camera.size[0]) + 0.5 - lens[2]) / lens[0]).astype(np.float32)
+    across = ((np.arange(camera.size[0] + SIDE) + 0.5 - lens[2]) / lens[0]).astype(np.float32)
     down = ((np.arange(camera.size[1]) + 0.5 - lens[3]) / lens[1]).astype(np.float32)
     return centres, box, starts, listed, across, down
 
@@ -126,8 +125,9 @@ def _placed(points: np.ndarray, radius: float, camera: PinholeCamera) -> tuple[n
 def _sphere_depth(points: np.ndarray, radius: float, camera: PinholeCamera) -> tuple[np.ndarray, float]:
     """Depth of the nearest sphere (m; infinite: none), and the median depth of what is drawn (m; 0: nothing is)."""
     centres, box, starts, listed, across, down = _placed(points, radius, camera)
-    depth = np.full((camera.size[1], camera.size[0]), np.inf, np.float32)
-    sphere_depths(centres, box, starts, listed, radius, across, down, depth)
+    depth = np.empty((camera.size[1], camera.size[0]), np.float32)
+    with in_pieces(len(starts)):
+        sphere_depths(centres, box, starts, listed, radius, across, down, depth)
     drawn = centres[box[:, 4] > 0, 2]
     return depth, float(np.median(drawn)) if len(drawn) else 0.0
 
@@ -147,7 +147,8 @@ def _through_spheres(
     small = camera.resized((width // 2, height // 2)) if coarse else camera
     centres, box, starts, listed, across, down = _placed(points, radius, small)
     sums = np.zeros((6, small.size[1], small.size[0]), np.float32)
-    sphere_chords(centres, box, starts, listed, radius, across, down, depth, colors, sums)
+    with in_pieces(len(starts)):
+        sphere_chords(centres, box, starts, listed, radius, across, down, depth, colors, sums)
     step = 2 if coarse else 1
     sums[5] = np.isfinite(depth[: step * small.size[1] : step, : step * small.size[0] : step])
     near = depth[::4, ::4]
@@ -183,9 +184,10 @@ def _close_notches(inverse: np.ndarray, radius: float, camera: PinholeCamera, ty
 def _smoothed(inverse: np.ndarray, radius: float, camera: PinholeCamera) -> np.ndarray:
     """Inverse depth as of `inverse_depths` without the bumps of the spheres."""
     limit, fall, other = np.float32(LIMIT * radius), np.float32(FALL * radius), np.empty_like(inverse)
-    for share in SMOOTHING:
-        narrow_range(inverse, other, 0, 1, camera.focal[0], share * radius, limit, fall)
-        narrow_range(other, inverse, 1, 0, camera.focal[1], share * radius, limit, fall)
+    with in_pieces(len(inverse)):
+        for share in SMOOTHING:
+            narrow_range(inverse, other, 0, 1, camera.focal[0], share * radius, limit, fall)
+            narrow_range(other, inverse, 1, 0, camera.focal[1], share * radius, limit, fall)
     return inverse
 
 

@@ -1,7 +1,7 @@
-"""The compiled loops of `screen_space` (Numba). Camera axes, metres, float32.
+"""The compiled loops of `screen_space` that smooth a surface, and those of meshes (Numba). Camera axes, metres,
+float32.
 
-Pictures are drawn in bands of rows, each by one thread and in the order of the particles: they are the same bits with
-any number of threads.
+What one thread writes no other one reads: pictures are the same bits with any number of threads.
 """
 
 from __future__ import annotations
@@ -10,8 +10,6 @@ import math
 
 import numba as nb
 import numpy as np
-
-from fluidlift.numerics.triangles import BAND, scattered
 
 _FUSED = {"contract"}
 LARGEST_WINDOW = 40
@@ -27,96 +25,6 @@ LANES = 32
 HIGH, WEIGHT, FADE, FADING, BEFORE, AFTER = (np.uint64(k * LANES) for k in range(1, 7))
 SUMS, SUMS_K, SUMS_KK, SUMS_D, SUMS_KD = (np.uint64(k * LANES) for k in range(7, 12))
 """places in the state of `_take_pair`, after the lowest at 0"""
-
-
-@nb.njit(cache=True, parallel=True, error_model="numpy")
-def place_spheres(points, rotation, translation, radius, lens, size, near, centres, box):
-    """Centres in camera axes, and the columns and rows that each sphere may reach: exact bounds of its outline."""
-    for i in nb.prange(points.shape[0]):
-        x = rotation[0, 0] * points[i, 0] + rotation[0, 1] * points[i, 1] + rotation[0, 2] * points[i, 2]
-        y = rotation[1, 0] * points[i, 0] + rotation[1, 1] * points[i, 1] + rotation[1, 2] * points[i, 2]
-        z = rotation[2, 0] * points[i, 0] + rotation[2, 1] * points[i, 1] + rotation[2, 2] * points[i, 2]
-        x, y, z = x + translation[0], y + translation[1], z + translation[2]
-        centres[i, 0], centres[i, 1], centres[i, 2] = x, y, z
-        box[i, 4] = 0
-        if not (z > radius + near and z < math.inf):
-            continue
-        wide = z * z - radius * radius
-        dx, dy = radius * math.sqrt(x * x + wide), radius * math.sqrt(y * y + wide)
-        u0 = math.ceil(max(lens[0] * (x * z - dx) / wide + lens[2] - 0.5, 0.0))
-        u1 = math.floor(min(lens[0] * (x * z + dx) / wide + lens[2] - 0.5, size[0] - 1.0))
-        v0 = math.ceil(max(lens[1] * (y * z - dy) / wide + lens[3] - 0.5, 0.0))
-        v1 = math.floor(min(lens[1] * (y * z + dy) / wide + lens[3] - 0.5, size[1] - 1.0))
-        if u0 <= u1 and v0 <= v1:
-            box[i, 0], box[i, 1], box[i, 2], box[i, 3], box[i, 4] = u0, u1, v0, v1, 1
-
-
-@nb.njit(cache=True, parallel=True, nogil=True, error_model="numpy", fastmath=_FUSED)
-def sphere_depths(centres, box, starts, listed, radius, across, down, depth):
-    """Camera z of the nearest sphere; infinite where there is none. across, down: x / z and y / z of pixel centres.
-
-    The ray r meets the sphere c where |r x c|^2 <= |r|^2 R^2: differences of nearby numbers stay exact in float32.
-    """
-    count = starts.shape[0] - 1
-    square = np.float32(radius * radius)
-    zero, far = np.float32(0.0), np.float32(np.inf)
-    for t in nb.prange(count):
-        band = scattered(np.int64(t), count)
-        low, high = band * BAND, min(band * BAND + BAND, depth.shape[0]) - 1
-        for n in range(starts[band], starts[band + 1]):
-            i = listed[n]
-            x, y, z = centres[i, 0], centres[i, 1], centres[i, 2]
-            first = np.uint64(box[i, 0])
-            lanes = np.uint64(box[i, 1] - box[i, 0] + 1)
-            for row in range(max(low, box[i, 2]), min(high, box[i, 3]) + 1):
-                b = down[row]
-                p = b * z - y
-                line = depth[row]
-                for k in range(lanes):
-                    a = across[first + k]
-                    q, s = x - a * z, a * y - b * x
-                    rr = a * a + b * b + np.float32(1.0)
-                    left = rr * square - (p * p + q * q + s * s)
-                    along = a * x + b * y + z
-                    d = (along - math.sqrt(max(left, zero))) / rr
-                    d = d if left > zero else far
-                    line[first + k] = min(line[first + k], d)
-
-
-@nb.njit(cache=True, parallel=True, nogil=True, error_model="numpy", fastmath=_FUSED)
-def sphere_chords(centres, box, starts, listed, radius, across, down, depth, colors, sums):
-    """Five pictures: the sum of the lengths (m, along the ray) in all spheres, then colours of those less than a
-    diameter behind the nearest surface, weighted with their lengths, and these weights.
-
-    depth: as `sphere_depths` gives it, at `step` times the resolution of `sums`.
-    """
-    count = starts.shape[0] - 1
-    square, reach = np.float32(radius * radius), np.float32(2.0 * radius)
-    zero, one = np.float32(0.0), np.float32(1.0)
-    step = depth.shape[0] // sums.shape[1]
-    for t in nb.prange(count):
-        band = scattered(np.int64(t), count)
-        low, high = band * BAND, min(band * BAND + BAND, sums.shape[1]) - 1
-        for n in range(starts[band], starts[band + 1]):
-            i = listed[n]
-            x, y, z = centres[i, 0], centres[i, 1], centres[i, 2]
-            first, last = box[i, 0], box[i, 1]
-            middle = depth[step * ((box[i, 2] + box[i, 3]) // 2), step * ((first + last) // 2)]
-            seen = z - middle < reach or middle == np.inf
-            for row in range(max(low, box[i, 2]), min(high, box[i, 3]) + 1):
-                b = down[row]
-                p = b * z - y
-                line = sums[0, row]
-                for k in range(np.uint64(first), np.uint64(last + 1)):
-                    a = across[k]
-                    q, s = x - a * z, a * y - b * x
-                    rr = a * a + b * b + one
-                    chord = math.sqrt(max(rr * square - (p * p + q * q + s * s), zero) / rr)
-                    line[k] += chord + chord
-                    if seen:
-                        for c in range(3):
-                            sums[1 + c, row, k] += chord * colors[i, c]
-                        sums[4, row, k] += chord
 
 
 @nb.njit(cache=True, parallel=True, nogil=True, error_model="numpy")

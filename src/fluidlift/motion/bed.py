@@ -10,6 +10,10 @@ from fluidlift.errors import require
 WALLS = ("cubic", "log", "film")
 """wall functions, see `speed_share`"""
 
+SECTIONS = 2
+"""pieces along a stream that are asked whether it is a viscous film: more, and the steps of a grid are pieces"""
+FEWEST = 12
+"""points of a piece: a plane through fewer follows their errors"""
 SURFACE_COEFFICIENT = 0.85
 """mean speed over depth by speed at the surface of a stream on a natural bed, where its roughness is not known: what
 gauging with floats uses (Rantz 1982, USGS Water-Supply Paper 2175: 0.85 to 0.86)"""
@@ -127,6 +131,9 @@ def film_share(points: Float[np.ndarray, "n 3"], velocities: Float[np.ndarray, "
     h and gravity give the shear velocity sqrt(g h S) of a steady stream, and the surface speed over that is compared
     with `VISCOUS_RATIO` and `TURBULENT_RATIO`. It goes with the root of the scale, so an assumed size does little.
 
+    A fluid is the same all along: where one of `SECTIONS` pieces is hardly a film, the whole is none, if another is
+    surely steep. Taken at once, a chute and the pool below it are as steep as both together and as slow as the pool.
+
     Args:
         points: of the surface, m, z up.
         velocities: m/s.
@@ -135,14 +142,28 @@ def film_share(points: Float[np.ndarray, "n 3"], velocities: Float[np.ndarray, "
     speed = np.linalg.norm(velocities, axis=-1).astype(np.float64)
     along = np.asarray(velocities, np.float64)[:, :2].sum(axis=0)
     along = along / max(float(np.linalg.norm(along)), 1e-12)
+    s = np.asarray(points, np.float64)[:, :2] @ along
+    order = np.argsort(s, kind="stable")
+    whole, _ = _film_share_of(np.asarray(points), speed, along, depth)
+    if whole == 0.0 or len(order) < SECTIONS * FEWEST:
+        return whole
+    pieces = np.array_split(order, SECTIONS)
+    shares, falls = zip(*(_film_share_of(np.asarray(points)[p], speed[p], along, depth) for p in pieces))
+    # a slope over a part of the length has that much more error: a jet on a puddle makes one piece seem steep
+    known = max(falls) + SLOPE_ERROR > SECTIONS**1.5 * SLOPE_ERROR
+    return whole * min(2.0 * min(shares), 1.0) if known else whole  # pieces scatter more than the whole
+
+
+def _film_share_of(points: np.ndarray, speed: np.ndarray, along: np.ndarray, depth: float) -> tuple[float, float]:
+    """`film_share` of a piece whose surface is a plane, and by how much its slope exceeds `SLOPE_ERROR`."""
     head = points[:, 2] + speed**2 / (2.0 * GRAVITY)
     flat = np.asarray(points, np.float64)[:, :2]
     fall, *_ = np.linalg.lstsq(flat - flat.mean(axis=0), head - head.mean(), rcond=None)
     slope = -float(fall @ along) - SLOPE_ERROR
     if slope <= 0:
-        return 0.0
+        return 0.0, slope
     ratio = float(np.median(speed)) / np.sqrt(GRAVITY * depth * slope)
-    return float(np.clip((TURBULENT_RATIO - ratio) / (TURBULENT_RATIO - VISCOUS_RATIO), 0.0, 1.0))
+    return float(np.clip((TURBULENT_RATIO - ratio) / (TURBULENT_RATIO - VISCOUS_RATIO), 0.0, 1.0)), slope
 
 
 def layer_thickness(kind: str, spacing: float) -> float:

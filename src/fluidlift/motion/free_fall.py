@@ -15,6 +15,18 @@ from fluidlift.types import Grid, SurfaceMotion
 BELIEVABLE = 0.3
 """share of the expected speed below which a measured motion counts as failed: friction takes at most half (below)"""
 
+FEWEST = 60
+"""points that a lean is read from"""
+LAYERS = 16
+"""of height, over which the way of a fall is followed"""
+QUARTILES = (0.25, 0.75)
+"""of the water in a layer, whose ways are followed: its edges would be those of spray and of threads beside it"""
+MOSTLY = 0.5
+"""share of the steep part that flow could not follow, from which its drift is not believed in the rest either: one
+sheet drifts at one speed, or it would not stay whole"""
+SIDEWAYS = 1.0
+"""drift over the speed of the fall at its foot, at most"""
+
 ENERGY_SHARE = {"pour": 0.95, "fall": 0.35}
 """share of the drop's energy that is left: almost all in the air, a third over rock (a choice)"""
 
@@ -69,6 +81,57 @@ def falling_share(
     return expected, replaced
 
 
+def drift_of(
+    points: Float[np.ndarray, "n 3"], downhill: Float[np.ndarray, "n 3"], speed: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, "n 3"]:
+    """Level velocity across the fall that makes it stand where it is seen, m/s; 0 where too little falls.
+
+    A steady fall keeps its outline, so no water passes it: a quarter of the water stays on either side of the way that
+    the quartiles of its points take from layer to layer of height. In the air nothing pushes sideways; a way that was
+    fallen for a time t has drifted by w t (a parabola), and w is the slope of the line through drift and time.
+
+    Args:
+        points: on the surface, m.
+        downhill: unit direction of the fall without drift.
+        speed: m/s along it, as expected.
+    """
+    out = np.zeros_like(points, dtype=np.float64)
+    steep = (-downhill[:, 2] > 0.5) & (speed > 0)
+    if steep.sum() < FEWEST:
+        return out
+    flat = downhill[steep, :2].mean(axis=0)
+    if np.linalg.norm(flat) < 0.05:  # in the air: across is where it is wide
+        flat = np.linalg.svd(points[steep, :2] - points[steep, :2].mean(axis=0), full_matrices=False)[2][1]
+    across = np.array([-flat[1], flat[0]]) / np.linalg.norm(flat)
+    c, z = points[:, :2] @ across, points[:, 2]
+    edges = np.linspace(*np.percentile(z[steep], [2, 98])[::-1], LAYERS + 1)
+    layer = np.where(steep, np.searchsorted(-edges, -z, side="right") - 1, -1)
+    filled = [k for k in range(LAYERS) if (layer == k).sum() >= max(5, FEWEST // LAYERS)]
+    if len(filled) < LAYERS // 2:
+        return out
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    fall = np.array([np.median((speed * -downhill[:, 2])[layer == k]) for k in filled])
+    step = -np.diff(middle[filled]) / (0.5 * (fall[1:] + fall[:-1]))
+    time = np.concatenate([[0.0], np.cumsum(step)])
+    ways = np.array([np.quantile(c[layer == k], QUARTILES) for k in filled])
+    drifts = [_middle_slope(time, way) for way in ways.T]
+    # between the quartiles, and a little beyond, the drift changes evenly
+    clock = np.interp(-z, -middle[filled], time)
+    starts = [np.median(way - w * time) for way, w in zip(ways.T, drifts)]
+    low, high = (start + w * clock for start, w in zip(starts, drifts))
+    share = np.clip((c - low) / np.maximum(high - low, 1e-9), -0.5, 1.5)
+    limit = SIDEWAYS * float(fall.max())
+    drift = np.clip(drifts[0] + share * (drifts[1] - drifts[0]), -limit, limit)
+    out[:, :2] = np.where(steep, drift, 0.0)[:, None] * across
+    return out
+
+
+def _middle_slope(time: np.ndarray, way: np.ndarray) -> float:
+    """Median of the slopes between all pairs (Theil 1950, Sen 1968)."""
+    i, j = np.triu_indices(len(time), 1)
+    return float(np.median((way[j] - way[i]) / np.maximum(time[j] - time[i], 1e-12)))
+
+
 def with_free_fall(
     surface: SurfaceMotion,
     downhill: Float[np.ndarray, "n 3"],
@@ -77,7 +140,7 @@ def with_free_fall(
     gravity: float = 9.81,
     entry: float = 0.15,
 ) -> tuple[SurfaceMotion, float]:
-    """The surface motion with free fall where steep parts seem to stand nearly still.
+    """The surface motion with free fall where steep parts seem to stand nearly still. It leans as the fluid is seen to.
 
     Args:
         surface: as measured.
@@ -100,7 +163,13 @@ def with_free_fall(
     expected, replaced = falling_share(
         surface.points, downhill, surface.velocities, kind=kind, top=high + entry * (high - low), gravity=gravity
     )
+    drift = drift_of(surface.points, downhill, np.linalg.norm(expected, axis=1))
     steep = -downhill[:, 2] > 0.5
     share = float(replaced[steep].mean()) if steep.any() else 0.0
-    velocities = np.where(replaced[:, None], expected, surface.velocities)
+    velocities = np.where(replaced[:, None], expected + drift, surface.velocities)
+    if share > MOSTLY:
+        size = np.linalg.norm(drift, axis=1, keepdims=True)
+        across = drift / np.maximum(size, 1e-12)
+        sideways = (velocities * across).sum(axis=1, keepdims=True)
+        velocities = np.where((size > 0) & ~replaced[:, None], velocities + drift - sideways * across, velocities)
     return SurfaceMotion(surface.points, velocities, surface.observed & ~replaced), share

@@ -68,16 +68,22 @@ def _exp_negative_compiled(p):
 @nb.njit(cache=True, inline="always")
 def _alive(buf, tile, groups, size, rows):
     """First and last row of a tile with a pixel that still takes light (the last is smaller if none has), and whether
-    each of its `rows` has one."""
+    each of its `rows` has one. Rows that had none are not looked at again."""
     first, last = tile, -1
     for r in range(tile):
-        count = 0
+        if not rows[r]:
+            continue
+        takes = False
         for g in range(groups):
             base = np.uint64((r * groups + g) * size)
             for lane in range(np.uint64(LANES)):
-                count += buf[base + lane] > 0
-        rows[r] = count > 0
-        if count > 0:
+                if buf[base + lane] > 0:
+                    takes = True
+                    break
+            if takes:
+                break
+        rows[r] = takes
+        if takes:
             first, last = min(first, r), r
     return first, last
 
@@ -86,9 +92,11 @@ def _alive(buf, tile, groups, size, rows):
 def _fetch(packed, gaussians, begin, end, near):
     """Copy the next Gaussians of a tile's list together: one by one, each would wait for memory."""
     for n in range(begin, end):
-        k = gaussians[n]
-        for c in range(packed.shape[1]):
-            near[n - begin, c] = packed[k, c]
+        k, m = gaussians[n], n - begin
+        for c in range(LEAD + 4):  # as many at least, without a loop
+            near[m, c] = packed[k, c]
+        for c in range(LEAD + 4, packed.shape[1]):
+            near[m, c] = packed[k, c]
 
 
 @nb.njit(cache=True, inline="always")

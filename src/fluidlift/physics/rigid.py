@@ -21,7 +21,7 @@ from fluidlift.physics import rigid_coupling
 from fluidlift.physics.boundaries import Walls, slide_along_walls
 from fluidlift.physics.contact import ContactSolver, Motion
 from fluidlift.physics.contact_search import Contacts, find_contacts, spread_points
-from fluidlift.physics.rigid_body import RigidBody, Trajectory, material_pairs, within_reach
+from fluidlift.physics.rigid_body import RigidBody, Trajectory, material_pairs, slowed, within_reach
 from fluidlift.physics.rigid_coupling import BodyRows, SolidVelocity
 from fluidlift.physics.rigid_push import push_out
 from fluidlift.physics.rigid_shapes import distances, pack, posed
@@ -129,7 +129,8 @@ class RigidBodies:
             if mine.any():
                 out.append(
                     f"body '{body.name}' starts {-contacts.gaps[mine].min():.3g} m inside the terrain, the box's side "
-                    "or another body: it will be pushed out slowly. Move it."
+                    "or another body: it first creeps out the nearest way, and lies where that ends. Put it on open "
+                    "fluid instead: fluidlift edit names such a place"
                 )
         return tuple(w for w in out if w)
 
@@ -318,7 +319,7 @@ class RigidBodies:
             gain = dt * float(np.sqrt(np.square(self._gravity).sum()))
             impact = solver.solve(friction, restitution, dt=dt, spacing=h, gain=gain)
             self._adopt(contacts, motion)
-            push, turn = solver.recovery(dt=dt, spacing=h)
+            push, turn = slowed(*solver.recovery(dt=dt, spacing=h), self._radius, np.sqrt(2.0 * gain / dt * h))
             resting = ~impact & (solver.impulses[:, 0] > 0)
             self._known_keys, self._known_impulses = contacts.keys[resting], solver.world_impulses()[resting]
         else:

@@ -187,3 +187,20 @@ def material_pairs(bodies: Sequence[RigidBody]) -> tuple[np.ndarray, np.ndarray]
         np.column_stack([np.sqrt(np.outer(friction, friction)), friction]),
         np.column_stack([np.maximum.outer(bounce, bounce), bounce]),
     )
+
+
+def slowed(
+    push: Float[np.ndarray, "b 3"], turn: Float[np.ndarray, "b 3"], radius: Float[np.ndarray, " b"], fastest: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """How bodies leave an overlap (m/s, rad/s), slowed down where a point of one would move faster than `fastest`.
+
+    The way out is a share of the overlap per step, which in short steps is a leap.
+
+    Args:
+        push, turn: of `contact.ContactSolver.recovery`.
+        radius: m, of each body about its centre of mass.
+        fastest: m/s, such as that of a fall through one cell; 0, without gravity: as it is.
+    """
+    speed = np.sqrt(np.square(push).sum(axis=1)) + radius * np.sqrt(np.square(turn).sum(axis=1))
+    share = np.minimum(fastest / np.maximum(speed, 1e-12), 1.0)[:, None] if fastest > 0 else 1.0
+    return push * share, turn * share

@@ -24,6 +24,8 @@ RAISED = 1e-3
 """cells by which a body's surface is raised, as the terrain's is (see `pressure.face_fractions`)"""
 PARTS = 2
 """pieces of a face's side between which a body's distance is linear"""
+CUT = 1e-3
+"""share of a body's cover of a cell's faces from which on its being cut off by terrain counts"""
 PADDING = 3
 """cells around a body's box in which the union differs from the terrain"""
 
@@ -348,14 +350,27 @@ class UnionWalls:
         return Cover(body, *ends, distance, tuple(shares), tuple(offsets), volume, middle)
 
     def _fitted(self, cover: Cover) -> Cover:
-        """Shares scaled so that bodies and liquid together fill what the terrain leaves open."""
+        """Shares scaled so that bodies and liquid together fill what the terrain leaves open.
+
+        Of a body that overlaps the terrain the part inside it displaces no liquid: each cell's volume counts as far as
+        its faces do. Otherwise it would lift the body as if it were under water, with up to its whole buoyancy.
+        """
         shares = []
+        before, after = np.zeros_like(cover.volume), np.zeros_like(cover.volume)
         for axis, share in enumerate(cover.share):
             at = cover.faces(axis)
             taken = self.static.walls.openings[axis][at] - self.walls.openings[axis][at]
             covered = self._covered[axis][at]
-            shares.append(share * np.divide(taken, covered, out=np.zeros_like(share), where=covered > 0))
-        return replace(cover, share=tuple(shares))
+            fitted = share * np.divide(taken, covered, out=np.zeros_like(share), where=covered > 0)
+            for side in range(2):
+                cells = tuple(slice(side, n + side) if d == axis else slice(n) for d, n in enumerate(before.shape))
+                before += share[cells]
+                after += fitted[cells]
+            shares.append(fitted)
+        # a body that only touches the terrain, or closes a narrow gap beside it, keeps its volume to the last digit
+        lost = after < (1.0 - CUT) * before
+        volume = np.where(lost, cover.volume * after / np.maximum(before, 1e-6), cover.volume)
+        return replace(cover, share=tuple(shares), volume=volume.astype(np.float32, copy=False))
 
     def _derive(self, cover: Cover, shapes: Shapes) -> None:
         walls, grid = self.walls, self.static.grid

@@ -25,10 +25,10 @@ SLOWEST = 12.0
 """frames per second down to which frames are left out before splats are"""
 FEWEST = 10_000
 """splats down to which they are left out"""
+FAINTEST = 1 / 255
+"""opacity below which a splat is not drawn, and not in the page"""
 SAMPLED = 4
 """frames that are encoded to know the size of all"""
-GLASS = 0.25
-"""opacity of what a pour falls into, over the fluid; behind it it stands twice as dense"""
 POSTER = 960
 """px, longer side"""
 _SPREAD = np.uint64(2654435761)
@@ -51,6 +51,7 @@ def write_page_of(job: ExportJob) -> Outcome:
     """page.html in the folder, or the .html file that was named."""
     from fluidlift.io.export_page import PageScene, write_page
     from fluidlift.look.scenery import LIGHT
+    from fluidlift.look.vessel import GLASS
     from fluidlift.pipeline.usd_exporting import bodies_of
 
     first, ids, _ = next(frames_of(job.folder, job.picked[:1]))
@@ -63,7 +64,8 @@ def write_page_of(job: ExportJob) -> Outcome:
         for done, (g, number, _) in enumerate(frames_of(job.folder, picked)):
             if told:
                 job.progress.update(done, len(picked))
-            yield thinned(_seen(g, job.asset.camera), number, plan.share)
+            drawn = g.opacities >= FAINTEST
+            yield thinned(_seen(g.select(drawn), job.asset.camera), number[drawn], plan.share)
 
     held = _range_of(g for g, _ in frames(False))
     shown = thinned(first, ids, plan.share)[0]
@@ -148,6 +150,7 @@ def _poster(job: ExportJob, first: Gaussians, bodies: list[MovingMesh]) -> np.nd
     """u8 [h,w,3]: the first frame over its ground, from the clip's camera."""
     from fluidlift.look.rasterize import render
     from fluidlift.look.scenery import mesh_surfels, terrain_surfels
+    from fluidlift.look.vessel import GLASS
 
     camera = job.asset.camera
     factor = min(1.0, POSTER / max(camera.size))
@@ -158,7 +161,7 @@ def _poster(job: ExportJob, first: Gaussians, bodies: list[MovingMesh]) -> np.nd
         )
         for b in bodies
     ]
-    ground = terrain_surfels(job.asset.terrain, opacity=GLASS if job.asset.kind == "pour" else 0.98)
+    ground = terrain_surfels(job.asset.terrain, glass=GLASS if job.asset.kind == "pour" else None)
     scene = concatenate([ground, *solids, first])
     picture = render(scene, camera, background=(0.08, 0.09, 0.11)).image
     return (255 * np.clip(picture, 0, 1) + 0.5).astype(np.uint8)

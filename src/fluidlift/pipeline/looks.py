@@ -19,11 +19,15 @@ from fluidlift.look.fluid_normals import fluid_depths, fluid_normals, fluid_surf
 from fluidlift.look.ground_picture import Ground, place_of
 from fluidlift.look.liquid import Behind, LiquidSurface, shaded
 from fluidlift.look.materials import Material, material_named
+from fluidlift.look.open_end import OpenEnd
 from fluidlift.look.rasterize import render
 from fluidlift.look.relight import relit
 from fluidlift.look.screen_space import mesh_surface, particle_surface
 from fluidlift.look.transparent import splat_surface
+from fluidlift.look.vessel import Pane, before_glass, panes, vessel_apart
+from fluidlift.look.wet_ground import wetted
 from fluidlift.numerics.srgb import linear_from_srgb, srgb_from_linear
+from fluidlift.pipeline.finer import Lit, averaged, enlarged
 from fluidlift.pipeline.scene import LYING
 from fluidlift.pipeline.surfacing import RADIUS, surface_of
 from fluidlift.types import Gaussians, PinholeCamera, Similarity3, Terrain, TriangleMesh, matrix_from_quat
@@ -47,18 +51,6 @@ FLOOR = 0.45
 """linear grey seen straight below"""
 HORIZON = 0.08
 """sine of the angle over which floor and sky flow into each other"""
-
-
-@dataclass(frozen=True)
-class Lit:
-    """One picture in linear light."""
-
-    image: np.ndarray
-    """[h,w,3]; premultiplied by `alpha` where the fluid is cut out"""
-    alpha: np.ndarray
-    """[h,w], share that is covered"""
-    depth: np.ndarray
-    """[h,w] camera z, m; 0 where nothing is"""
 
 
 @dataclass(frozen=True)
@@ -120,6 +112,8 @@ class Painter:
         kind: of the fluid; what lies on a bed has no surface towards it.
         engine: of the look surface, one of `ENGINES`.
         samples: per pixel, of Mitsuba.
+        end: of a stream; before the terrain it ends there in a clean section. Not on a plate, which goes on behind it,
+            nor cut out; None: it is drawn as far as its particles go.
         supersample: pictures are drawn this many times as wide and as high, and averaged in linear light: edges become
             smooth, at the price of so many pixels. Mitsuba's are smooth as they are.
 
@@ -139,6 +133,7 @@ class Painter:
         engine: str = "mesh",
         samples: int = 64,
         supersample: int = 1,
+        end: OpenEnd | None = None,
     ) -> None:
         require(1 <= supersample <= 8, f"a supersample of {supersample}", "1 to 8")
         if engine not in ENGINES:
@@ -152,8 +147,13 @@ class Painter:
         self.material: Material = material_named(look.material).tinted(look.tint)
         self.environment = environment_of(folder, look.environment)
         self._samples, self._bed = samples, terrain if kind in LYING else None
+        self._end = end
         self._finer, self._folder = 1 if engine == "mitsuba" else int(supersample), folder
         self._far: tuple[tuple, np.ndarray] | None = None
+        self._panes: tuple[tuple, tuple[Pane, Pane]] | None = None
+        # the ground that hides, and the glass of a pour that does not
+        ground, cell = terrain.mesh, terrain.grid.spacing
+        self._solid, self._vessel = vessel_apart(ground, cell) if kind == "pour" else (ground, None)
         _ = self._final if engine == "mitsuba" else self._mesher  # what is missing is said before anything is drawn
 
     @cached_property
@@ -186,18 +186,38 @@ class Painter:
             return self._drawn(frame, camera, backdrop)
         k = self._finer
         wide = camera.resized((k * camera.size[0], k * camera.size[1]))
-        finer = replace(backdrop, picture=_enlarged(backdrop.picture, k), depth=_enlarged(backdrop.depth, k))
-        return _averaged(self._drawn(frame, wide, finer), k)
+        finer = replace(backdrop, picture=enlarged(backdrop.picture, k), depth=enlarged(backdrop.depth, k))
+        return averaged(self._drawn(frame, wide, finer), k)
 
     def _drawn(self, frame: Frame, camera: PinholeCamera, backdrop: Backdrop) -> Lit:
         """One frame, with the pixels of the camera."""
-        mesh = None
-        if self._mesher is not None:
-            mesh, _ = surface_of(frame.fluid, frame.velocities, self.terrain, self._mesher, clamped=False)
+        end = None if backdrop.picture is not None or backdrop.cut_out else self._end
+        mesh = (
+            None
+            if self._mesher is None
+            else surface_of(frame.fluid, frame.velocities, self.terrain, self._mesher, clamped=False, end=end)[0]
+        )
+        if end is not None:
+            kept = end.before(frame.fluid.means)
+            frame = replace(frame, fluid=frame.fluid.select(kept), velocities=frame.velocities[kept])
         behind = self._behind(frame, mesh or self._caster(frame, backdrop), camera, backdrop)
         if self.look.style == "relit":
-            return self._relit(frame.fluid, camera, behind, cut_out=backdrop.cut_out)
-        surface = self._liquid(frame.fluid, mesh, camera, behind)
+            lit = self._relit(frame.fluid, camera, self._through_far_wall(behind, camera, backdrop), backdrop.cut_out)
+        else:
+            lit = self._refracting(frame.fluid, mesh, camera, behind, backdrop)
+        walls = self._glass(camera, backdrop)
+        return lit if walls is None else replace(lit, image=walls[0].over(lit.image, lit.depth))
+
+    def _refracting(
+        self, fluid: Gaussians, mesh: TriangleMesh | None, camera: PinholeCamera, behind: Behind, backdrop: Backdrop
+    ) -> Lit:
+        """A liquid that shows what lies behind it."""
+        surface = self._liquid(fluid, mesh, camera, behind)
+        if backdrop.picture is None:  # a plate shows its ground as it was
+            ground = self._ground.albedo(camera), self._ground.depth(camera)
+            shaded_there = self.look.style == "transparent" or mesh is not None
+            behind = wetted(behind, surface, camera, self.material, ground, shaded=shaded_there)
+        behind = self._through_far_wall(behind, camera, backdrop)
         image = shaded(surface, behind, camera, self.material, self.environment, usual=self._usual)
         if backdrop.cut_out:
             light = np.maximum(image - (1.0 - surface.covered[..., None]) * behind.image, 0.0)
@@ -256,11 +276,25 @@ class Painter:
 
     @cached_property
     def _ground(self) -> Ground:
-        return Ground([self.terrain.mesh], self.environment)
+        return Ground([self._solid], self.environment)
 
     @cached_property
     def _no_ground(self) -> Ground:
         return Ground([], self.environment)
+
+    def _glass(self, camera: PinholeCamera, backdrop: Backdrop) -> tuple[Pane, Pane] | None:
+        """The vessel's walls before and behind the fluid, kept for a camera that stands still. None on a plate, which
+        shows the vessel, and for what is cut out, which stands without its ground."""
+        if self._vessel is None or backdrop.picture is not None or backdrop.cut_out:
+            return None
+        key = place_of(camera)
+        if self._panes is None or self._panes[0] != key:
+            self._panes = key, panes(self._vessel, camera, self.environment)
+        return self._panes[1]
+
+    def _through_far_wall(self, behind: Behind, camera: PinholeCamera, backdrop: Backdrop) -> Behind:
+        walls = self._glass(camera, backdrop)
+        return behind if walls is None else before_glass(behind, walls[1])
 
     @cached_property
     def _clip_colors(self) -> np.ndarray | None:
@@ -286,7 +320,7 @@ class Painter:
         wall = behind.depth[row, col]
         return 1.0 - np.clip((z - wall) / (MARGIN * self.terrain.grid.spacing), 0.0, 1.0) * (wall > 0)
 
-    def _relit(self, fluid: Gaussians, camera: PinholeCamera, behind: Behind, *, cut_out: bool) -> Lit:
+    def _relit(self, fluid: Gaussians, camera: PinholeCamera, behind: Behind, cut_out: bool) -> Lit:
         """Splats under other light."""
         apart = 0.5 * self.terrain.grid.spacing
         normals, share = fluid_normals(fluid, apart, self._bed)
@@ -322,12 +356,14 @@ class Painter:
         from fluidlift.backends.mitsuba_scene import FinalScene, resting
 
         assert self._final is not None
-        mesh, _ = surface_of(frame.fluid, frame.velocities, self.terrain, self._need_mesher(), clamped=False)
+        end = None if backdrop.picture is not None else self._end
+        mesh, _ = surface_of(frame.fluid, frame.velocities, self.terrain, self._need_mesher(), clamped=False, end=end)
         mesh = resting(mesh, self.terrain)
-        ground = [self.terrain.mesh] if len(self.terrain.mesh.faces) else []
+        ground = [self._solid] if len(self._solid.faces) else []
         image, alpha = self._final.picture_and_alpha(
             FinalScene(
                 mesh, self.material, camera, self.environment.radiance, (*ground, *frame.bodies),
+                panes=() if self._vessel is None else (self._vessel.sheet,),
                 samples=self._samples, show_environment=False, usual=self._usual,
             )
         )  # fmt: skip
@@ -341,18 +377,3 @@ class Painter:
     def _need_mesher(self) -> Mesher:
         assert self._mesher is not None
         return self._mesher
-
-
-def _enlarged(picture: np.ndarray | None, k: int) -> np.ndarray | None:
-    """Every pixel k x k times."""
-    return None if picture is None else picture.repeat(k, axis=0).repeat(k, axis=1)
-
-
-def _averaged(lit: Lit, k: int) -> Lit:
-    """A picture of k x k as many pixels, averaged; its depth is the nearest of each."""
-    h, w = lit.alpha.shape[0] // k, lit.alpha.shape[1] // k
-    depth = np.where(lit.depth > 0, lit.depth, np.inf).reshape(h, k, w, k).min(axis=(1, 3))
-    return Lit(
-        lit.image.reshape(h, k, w, k, 3).mean(axis=(1, 3)), lit.alpha.reshape(h, k, w, k).mean(axis=(1, 3)),
-        np.where(np.isfinite(depth), depth, 0.0).astype(np.float32),
-    )  # fmt: skip

@@ -4,12 +4,16 @@ A clip of N frames is simulated M frames longer. Frame k < M then shows both fra
 ends, and frame k; the first fades out while the second fades in. So frame 0 is the one that follows frame N - 1, and
 frame M the one that follows the last faded one: nothing jumps anywhere.
 
-What fades is optical depth. A splat of opacity a takes -ln(1 - a exp(-r^2 / 2)) from the light at r standard deviations
-from its centre; over its whole footprint that is the dilogarithm of a (times its area). At weight w it gets the opacity
-with w times as much: two bodies at w and 1 - w then take as much light as one, and the fluid does not turn transparent
-on the way.
+It fades patch by patch, in soft-edged patches that stand still. Two whole bodies over each other would show at once
+whatever of the fainter one is outside of the other: many thin splats are opaque together, and surfaces that are drawn
+of particles do not know opacities at all. So most places show one of both, and change over at a time of their own.
 
-Limits. While it fades, fine patterns of two instants lie over each other, with up to 30 % less contrast. A fluid
+What fades at an edge is optical depth. A splat of opacity a takes -ln(1 - a exp(-r^2 / 2)) from the light at r standard
+deviations from its centre; over its whole footprint that is the dilogarithm of a (times its area). At weight w it gets
+the opacity with w times as much: two bodies at w and 1 - w then take as much light as one, and the fluid does not turn
+transparent on the way.
+
+Limits. At the edges of patches fine patterns of two instants lie over each other, with up to 30 % less contrast. A body
 whose level has changed between beginning and end (a vessel that fills, a flood, smoke that still spreads) is not
 faded: a warning says so. Bodies that float glide back to where they were. Particles of the end get new ids there,
 since those of the beginning live on.
@@ -33,6 +37,14 @@ if TYPE_CHECKING:
 
 FAINTEST = 1 / 255
 """opacity below which a splat is not drawn"""
+EDGE = 0.3
+"""share of a fade over which a single place changes over: the rest it shows one instant alone"""
+PATCH = 0.25
+"""length of a patch over that of the fluid"""
+WAVES = 12
+"""whose sum makes the patches: enough for it to be normally distributed"""
+LEAST = 0.02
+"""share of a place from which on what is shown there counts"""
 DRIFT = 0.15
 """share of the fluid's volume that the end may have more or less than the beginning"""
 
@@ -45,7 +57,7 @@ class SplatFrame(NamedTuple):
     velocities: np.ndarray
 
 
-def faded(opacities: Float[np.ndarray, " n"], weight: float) -> Float[np.ndarray, " n"]:
+def faded(opacities: Float[np.ndarray, " n"], weight: float | Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     """Opacities with `weight` times the optical depth over the whole splat."""
     from scipy.special import spence
 
@@ -56,18 +68,43 @@ def faded(opacities: Float[np.ndarray, " n"], weight: float) -> Float[np.ndarray
     return np.interp(wanted, depth, table).astype(np.float32)
 
 
-def blended(head: SplatFrame, tail: SplatFrame, share: float) -> SplatFrame:
+def changed_over(points: Float[np.ndarray, "n 3"], share: float, patch: float) -> float | Float[np.ndarray, " n"]:
+    """Share of the tail at places (m), 0 to 1, where it is `share` on the mean; in patches of that size (m).
+
+    The order in which places change over is a sum of waves in all directions, made uniform over 0 to 1.
+    """
+    from scipy.special import ndtr
+
+    if not np.isfinite(patch):
+        return share
+    rng = np.random.default_rng(0)
+    ways = rng.normal(size=(WAVES, 3))
+    ways *= (2.0 * np.pi / patch * rng.uniform(0.7, 1.4, WAVES) / np.linalg.norm(ways, axis=1))[:, None]
+    height = np.sin(np.asarray(points, np.float64) @ ways.T + rng.uniform(0.0, 2.0 * np.pi, WAVES)).sum(axis=1)
+    turn = ndtr(height / np.sqrt(0.5 * WAVES))
+    return np.clip((share * (1.0 + EDGE) - turn) / EDGE, 0.0, 1.0)
+
+
+def patch_size(points: Float[np.ndarray, "n 3"]) -> float:
+    """m, of the patches of a fluid; without a fluid there are none."""
+    return PATCH * float(np.ptp(np.percentile(points, [2, 98], axis=0), axis=0).max()) if len(points) else np.inf
+
+
+def blended(head: SplatFrame, tail: SplatFrame, share: float, patch: float = np.inf) -> SplatFrame:
     """Two frames over each other.
 
     Args:
         head: of the beginning.
         tail: that goes on after the end.
         share: of the tail, 0 to 1.
+        patch: m, size of the patches in which it takes over; infinite: everywhere at once.
     """
     parts = []
-    for frame, weight in ((head, 1.0 - share), (tail, share)):
+    for frame, of_tail in ((head, False), (tail, True)):
+        later = np.broadcast_to(changed_over(frame.gaussians.means, share, patch), len(frame.ids))
+        weight = later if of_tail else 1.0 - later
         opacities = faded(frame.gaussians.opacities, weight)
-        seen = opacities >= FAINTEST
+        seen = (opacities >= FAINTEST) & (weight >= LEAST)
         shown = replace(frame.gaussians, opacities=opacities).select(seen)
         parts.append(SplatFrame(shown, frame.ids[seen], frame.velocities[seen]))
     first, second = parts
@@ -129,15 +166,16 @@ def _fade(history: History, count: int, fade: int, file: Callable[[int], Path]) 
     from fluidlift.io.ply import write_gaussians
 
     volume, poses = np.array(history.volume), list(history.poses)
+    patch = patch_size(read_frame(file(0)).gaussians.means)
     for k in range(fade):
-        # a double exposure changes less from frame to frame than either of its two: most of the fade goes there
-        share = 0.5 * (1.0 + np.cos(np.pi * k / fade))
-        shown = blended(read_frame(file(k)), read_frame(file(count + k)), share)
+        # as much of the fluid changes over in each frame; bodies set out and arrive gently
+        share, glide = 1.0 - k / fade, 0.5 * (1.0 + np.cos(np.pi * k / fade))
+        shown = blended(read_frame(file(k)), read_frame(file(count + k)), share, patch)
         write_gaussians(file(k), shown.gaussians, ids=shown.ids, velocities=shown.velocities)
         history.volume[k] = float((1 - share) * volume[k] + share * volume[count + k])
         history.count[k] = len(shown.ids)
         history.leak[k] = max(history.leak[k], history.leak[count + k])
-        history.poses[k] = blended_poses(poses[k], poses[count + k], share)
+        history.poses[k] = blended_poses(poses[k], poses[count + k], glide)
 
 
 def read_frame(path: Path) -> SplatFrame:

@@ -22,8 +22,9 @@ import yaml
 from fluidlift.config import JobConfig
 from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.pipeline.coarse_copy import PreviewSize, bears_coarser, coarse_asset, coarser, thinned
+from fluidlift.pipeline.dressing import Dressing
 from fluidlift.pipeline.scene import Scene, SimulationRequest, scene_of
-from fluidlift.pipeline.simulating import MAX_STRETCH, MIXED, preflight, simulator_of
+from fluidlift.pipeline.simulating import preflight, simulator_of
 from fluidlift.types import FluidAsset, Gaussians, TriangleMesh
 
 if TYPE_CHECKING:
@@ -108,16 +109,16 @@ def preview_frames(scene: Scene, cancelled: Callable[[], bool] = lambda: False) 
     Raises:
         FluidliftError: the simulation broke down; the frames before it were good.
     """
-    simulator = simulator_of(scene)
+    simulator, dressing = simulator_of(scene), Dressing(scene)
     simulator.settings = replace(simulator.settings, max_substeps=MOST_SUBSTEPS)
-    yield _shown(scene, simulator, 0)
+    yield _shown(scene, simulator, dressing, 0)
     for number in range(1, scene.frames):
         parts = _parts(scene, simulator)
         for _ in range(parts):
             if cancelled():
                 return
             simulator.advance(scene.interval / parts)
-        frame = _shown(scene, simulator, number)
+        frame = _shown(scene, simulator, dressing, number)
         if not np.isfinite(frame.gaussians.means).all():
             raise FluidliftError(f"frame {number}: positions that are not finite")
         yield frame
@@ -138,18 +139,13 @@ def _parts(scene: Scene, simulator: Any) -> int:
     return max(1, int(np.ceil(steps / SUBSTEPS_AT_ONCE)))
 
 
-def _shown(scene: Scene, simulator: Any, number: int) -> PreviewFrame:
-    from fluidlift.look.mixing import mixed
-    from fluidlift.physics.deform import deform_gaussians
-
-    spacing, p = scene.terrain.grid.spacing, simulator.particles
-    shown = deform_gaussians(scene.rest, p, max_stretch=MAX_STRETCH, max_size=1.2 * spacing)
-    if number:
-        shown = mixed(shown, p.deformation, widest=MIXED * spacing)
+def _shown(scene: Scene, simulator: Any, dressing: Dressing, number: int) -> PreviewFrame:
+    dressing.advance(simulator.particles, number)
+    shown = dressing.dressed(simulator.particles, number)
     poses = np.zeros((0, 7))
     if scene.obstacles:
         poses = np.concatenate([simulator.bodies.position, simulator.bodies.orientation], axis=1)
-    return PreviewFrame(number, shown, p.velocities, poses)
+    return PreviewFrame(number, shown.gaussians, shown.velocities, poses)
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from fluidlift.pipeline.drawing import Stage, drawn
 from fluidlift.pipeline.looks import Painter
 from fluidlift.pipeline.resimulate import FIRST_HALF, recall_first_half, settings_of
 from fluidlift.pipeline.scene import Scene, SimulationRequest, footage_of, scene_of
+from fluidlift.pipeline.showing import open_end
 from fluidlift.pipeline.simulating import frame_file, simulated_poses
 from fluidlift.pipeline.story import Progress, Silence, Story
 from fluidlift.pipeline.written import Written, cleared, numbered
@@ -141,6 +142,7 @@ def _painter(scene: Scene, folder: Path, request: RenderRequest) -> Painter | No
         engine=request.engine,
         samples=request.samples,
         supersample=request.supersample,
+        end=open_end(scene),
     )
 
 
@@ -236,6 +238,7 @@ def _cameras(scene: Scene, request: RenderRequest, count: int) -> list[PinholeCa
     from fluidlift.io.views import read_view
     from fluidlift.look.camera_path import keyed_path, orbit_path
     from fluidlift.look.scenery import orbit_camera, side_camera, terrain_surfels
+    from fluidlift.look.vessel import GLASS
 
     camera = scene.camera
     size = request.size or camera.size
@@ -243,7 +246,8 @@ def _cameras(scene: Scene, request: RenderRequest, count: int) -> list[PinholeCa
     if request.view == "input":
         return [_fitted(camera, size)] * count
     if request.view == "side":
-        return [side_camera(camera, scene.rest, terrain_surfels(scene.terrain), around, size=size)] * count
+        ground = terrain_surfels(scene.terrain, glass=GLASS if scene.kind == "pour" else None)
+        return [side_camera(camera, scene.rest, ground, around, size=size)] * count
     if request.view == "top":
         return [orbit_camera(camera, around, azimuth=0.0, elevation=89.0, size=size)] * count
     if request.view == "turn":

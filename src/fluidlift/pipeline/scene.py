@@ -41,8 +41,8 @@ LYING = ("stream", "fall")
 """kinds that lie on something and can be made longer; the others are free in the air"""
 
 
-LOOP_FADE = (0.4, 1.5)
-"""s: a shorter fade shows as a jump, a longer one as a double exposure"""
+LOOP_FADE = (0.8, 1.5)
+"""s: a shorter fade changes too much of the fluid in each frame, a longer one makes the clip one long fade"""
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,6 +15,9 @@ from fluidlift.pipeline.looks import Backdrop, Frame, Painter, placed_bodies
 from fluidlift.pipeline.scene import LYING, Footage, Scene
 from fluidlift.pipeline.story import Result
 from fluidlift.types import Gaussians, PinholeCamera, Similarity3, concatenate, matrix_from_quat
+
+if TYPE_CHECKING:
+    from fluidlift.look.open_end import OpenEnd
 
 
 def splat_frames(folder: Path, count: int) -> Iterator[tuple[Gaussians, np.ndarray, np.ndarray]]:
@@ -83,7 +87,16 @@ def _painter(scene: Scene, folder: Path, look: Look | None) -> Painter | None:
     """Of another look than the splats' own."""
     if look is None or look.style == "splats":
         return None
-    return Painter(look, scene.terrain, folder, kind=scene.kind)
+    return Painter(look, scene.terrain, folder, kind=scene.kind, end=open_end(scene))
+
+
+def open_end(scene: Scene) -> OpenEnd | None:
+    """Where a stream is cut in pictures; None of other kinds."""
+    from fluidlift.look.open_end import OpenEnd
+
+    if scene.kind not in LYING:
+        return None
+    return OpenEnd.of(scene.cell_types, scene.terrain.grid, scene.terrain.mainstream)
 
 
 def _panels(
@@ -93,6 +106,7 @@ def _panels(
     from fluidlift.look.pictures import caption
     from fluidlift.look.rasterize import render
     from fluidlift.look.scenery import mesh_surfels, side_camera, terrain_depth, terrain_surfels, visible_beside_rocks
+    from fluidlift.look.vessel import GLASS
     from fluidlift.numerics.srgb import linear_from_srgb
 
     camera, terrain, grid = scene.camera, scene.terrain, scene.terrain.grid
@@ -107,7 +121,7 @@ def _panels(
             compared = max(len(footage.clip) - footage.start, 1)
     solid_depth = terrain_depth(terrain, camera) if rocks.any() else None
     airborne = scene.kind not in LYING
-    ground = terrain_surfels(terrain, opacity=0.25 if scene.kind == "pour" else 0.98)
+    ground = terrain_surfels(terrain, glass=GLASS if scene.kind == "pour" else None)
     size = _panel_size(camera.size, config.show.width)
     # a body in the air may fill its box later; what lies on a bed stays in it
     whole = terrain.mesh.vertices

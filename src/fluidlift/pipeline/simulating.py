@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +12,7 @@ import numpy as np
 from fluidlift.config import JobConfig
 from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.io.frames import FIRST_FRAME
+from fluidlift.pipeline.dressing import Dressing, lends_look
 from fluidlift.pipeline.looping import close_loop
 from fluidlift.pipeline.reshaping import closed_inlet, in_words, sides_open_to_air
 from fluidlift.pipeline.scene import LYING, Scene, SimulationRequest, simulation_step
@@ -22,12 +23,6 @@ if TYPE_CHECKING:
     from fluidlift.look.inflow import InflowLook
     from fluidlift.physics.numba_particles import ParticleWork
     from fluidlift.physics.stepping import ParticleSimulator
-
-MAX_STRETCH = 3.0
-"""longest axis over the mean one before a Gaussian starts again round: longer ones show as hair"""
-
-MIXED = 0.42
-"""standard deviation up to which splats close up with their neighbours, cells: that of a splat of the inside"""
 
 BYTES_PER_SPLAT = 80
 """of disk, in a frame's file"""
@@ -78,16 +73,13 @@ def simulator_of(scene: Scene, device: str = "cpu") -> ParticleSimulator:
 def inflow_look(scene: Scene, own: Gaussians, speed: float) -> InflowLook:
     """What flows in at a speed (m/s) looks like the body's own Gaussians; of what lies, as the clip shows it away from
     rocks and banks."""
-    from fluidlift.look.inflow import InflowLook, surface_level
-    from fluidlift.physics.inlet import clear_of_shore
-    from fluidlift.shape.off_picture import in_picture
+    from fluidlift.look.inflow import InflowLook
 
     # a sheet that falls has no level to keep to
     terrain, lying, usable = scene.terrain, scene.kind == "stream", None
     spacing = 0.5 * terrain.grid.spacing
     if lying and len(own):
-        level = surface_level(own.means, spacing)(own.means[:, :2])
-        usable = in_picture(own.means, scene.camera) & clear_of_shore(own.means, level, terrain)
+        usable = lends_look(scene, own)
     return InflowLook(own, terrain.mainstream, speed, spacing, usable=usable, run=scene.inflow.run, lying=lying)
 
 
@@ -215,8 +207,15 @@ class History:
         return cls(*figures, list(arrays["poses"][:frames]))
 
 
-def continued(simulator: ParticleSimulator, scene: Scene, folder: Path, request: SimulationRequest, config: JobConfig):
-    """Bring the simulator to the last checkpoint of this scene.
+def continued(
+    simulator: ParticleSimulator,
+    dressing: Dressing,
+    scene: Scene,
+    folder: Path,
+    request: SimulationRequest,
+    config: JobConfig,
+) -> History:
+    """Bring the simulator, and what floats on its surface, to the last checkpoint of this scene.
 
     Returns:
         The history up to it; empty where the simulation starts at the first frame.
@@ -251,6 +250,7 @@ def continued(simulator: ParticleSimulator, scene: Scene, folder: Path, request:
             raise InputRejected(f"the checkpoint of '{folder.name}' holds other obstacles", "a whole checkpoint")
         history = History.of(found.history, scene.simulated)
         if found.frames <= scene.simulated:
+            dressing.restore(found.state)
             simulator.restore(found.state)
         return history
     except (InputRejected, KeyError) as error:
@@ -288,7 +288,8 @@ def simulate(
     preflight(scene)
     simulator = simulator_of(scene, config.simulate.device)
     closed = closed_inlet(scene, simulator)
-    history = continued(simulator, scene, folder, request or SimulationRequest(), config)
+    dressing = Dressing(scene)
+    history = continued(simulator, dressing, scene, folder, request or SimulationRequest(), config)
     first = len(history)
     require_room(folder, scene.simulated - first, len(scene.body))
     for old in (folder / "frames" / "splats").glob("*.ply"):
@@ -296,7 +297,7 @@ def simulate(
             old.unlink()
     if first == 0:
         checkpoint_file(folder).unlink(missing_ok=True)
-    failed = _advance(simulator, scene, folder, config, history, step)
+    failed = _advance(simulator, dressing, scene, folder, config, history, step)
     warnings = [*scene.notes, *closed] + (list(simulator.bodies.warnings) if scene.obstacles else [])
     if failed is None and len(history) < scene.simulated:
         warnings.append(
@@ -319,6 +320,7 @@ def simulate(
 
 def _advance(
     simulator: ParticleSimulator,
+    dressing: Dressing,
     scene: Scene,
     folder: Path,
     config: JobConfig,
@@ -327,10 +329,7 @@ def _advance(
 ) -> str | None:
     """Simulate and write the frames that are missing; why it broke down, if it did."""
     from fluidlift.io.ply import write_gaussians
-    from fluidlift.look.mixing import mixed
-    from fluidlift.physics.deform import deform_gaussians
 
-    size = 1.2 * scene.terrain.grid.spacing
     for k in range(len(history), scene.simulated):
         step(k, scene.simulated)
         substeps = 0
@@ -344,33 +343,23 @@ def _advance(
         p = simulator.particles
         if k and len(p) > config.simulate.max_particles * 2:
             return None
-        shown = deform_gaussians(scene.rest, p, max_stretch=MAX_STRETCH, max_size=size)
-        if k:  # at rest nothing is drawn out
-            shown = mixed(shown, p.deformation, widest=MIXED * scene.terrain.grid.spacing)
-        shown = shaded(scene, shown, p.source)
-        write_gaussians(frame_file(folder, FIRST_FRAME + k), shown, ids=p.ids, velocities=p.velocities)
+        dressing.advance(p, k)
+        shown = dressing.dressed(p, k)
+        write_gaussians(
+            frame_file(folder, FIRST_FRAME + k), shown.gaussians, ids=shown.ids, velocities=shown.velocities
+        )
         history.add(scene, simulator, p, substeps)
         # the first one says whose frames these are
         if len(history) % config.simulate.checkpoint_every == 0 or len(history) in (1, scene.simulated):
-            _save(simulator, scene, folder, history)
+            _save(simulator, dressing, scene, folder, history)
     step(scene.simulated, scene.simulated)
     return None
 
 
-def shaded(scene: Scene, shown: Gaussians, source: np.ndarray) -> Gaussians:
-    """The splats with the shade of the places where they are now; those with a colour of their own keep it."""
-    if scene.shading is None:
-        return shown
-    painted = (scene.rest.means if scene.painted is None else scene.painted)[source]
-    own = ~np.isfinite(painted).all(axis=1)
-    moved = scene.shading.moved(shown, np.where(own[:, None], shown.means, painted))
-    return moved if not own.any() else replace(moved, sh=np.where(own[:, None, None], shown.sh, moved.sh))
-
-
-def _save(simulator: ParticleSimulator, scene: Scene, folder: Path, history: History) -> None:
+def _save(simulator: ParticleSimulator, dressing: Dressing, scene: Scene, folder: Path, history: History) -> None:
     from fluidlift.io.checkpoint import Checkpoint, write_checkpoint
 
-    kept = Checkpoint(len(history), scene.parts, simulator.state(), history.arrays())
+    kept = Checkpoint(len(history), scene.parts, simulator.state() | dressing.state(), history.arrays())
     write_checkpoint(checkpoint_file(folder), kept)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from fluidlift.look.open_end import BEYOND, OpenEnd
 from fluidlift.seams import Mesher
 from fluidlift.types import Gaussians, Terrain, TriangleMesh
 
@@ -13,7 +14,13 @@ more keeps drops whole and flat water flat"""
 
 
 def surface_of(
-    fluid: Gaussians, velocities: np.ndarray, terrain: Terrain, mesher: Mesher, *, clamped: bool = True
+    fluid: Gaussians,
+    velocities: np.ndarray,
+    terrain: Terrain,
+    mesher: Mesher,
+    *,
+    clamped: bool = True,
+    end: OpenEnd | None = None,
 ) -> tuple[TriangleMesh, np.ndarray]:
     """The surface with the splats' colours (sRGB) at its vertices, and its velocity [v,3] there, m/s.
 
@@ -23,11 +30,16 @@ def surface_of(
         terrain: that the surface stays out of.
         mesher: of particles.
         clamped: whether it does; the surface of particles itself stands a little outside them, and dips into the bed.
+        end: of a stream, where the surface ends in a flat section; None: it goes as far as the particles.
     """
+    if end is not None:
+        kept = end.before(fluid.means, BEYOND)
+        fluid, velocities = fluid.select(kept), velocities[kept]
     carried = {"velocity": velocities, "rgb": fluid.rgb}
     mesh, found = mesher.surface(fluid.means, RADIUS * terrain.grid.spacing, carried)
     vertices = outside_solid(mesh.vertices, terrain) if clamped else np.asarray(mesh.vertices)
-    return TriangleMesh(vertices, mesh.faces, np.clip(found["rgb"], 0.0, 1.0)), found["velocity"]
+    surface = TriangleMesh(vertices, mesh.faces, np.clip(found["rgb"], 0.0, 1.0))
+    return surface if end is None else end.section(surface), found["velocity"]
 
 
 def outside_solid(points: np.ndarray, terrain: Terrain) -> np.ndarray:

@@ -19,6 +19,8 @@ from fluidlift.types import CellType, Grid, Label, Terrain
 
 INLET = 2.5
 """cells along the flow that an inlet is long"""
+EDGE = 2.0
+"""1 / cosine of 60 degrees: what is steeper in a stream is the side of a chute, not a sheet"""
 FLAT = 0.3
 """slope at which a surface says as much as the bulk flow about where its water runs"""
 
@@ -73,7 +75,8 @@ def channel_setting(seen: Footage, config: ChannelConfig) -> Setting:
             break
         spacing *= 1.05
     plan = with_seen(plan_of(seen, grid, extent), extent.visible, grid)
-    ground = _bed_and_banks(plan, grid, depth, extent, config.kind)
+    thin = seen.surface.sheet(grid.centers()[:, :, 0, :2]) if _steps(seen) else np.full(plan.level.shape, np.inf)
+    ground = _bed_and_banks(plan, grid, (depth, thin), extent, config.kind)
     ground = _as_seen(ground, plan, grid, seen, extent)
     return _fill_channel(grid, plan, ground, extent.reach, seen, config.kind)
 
@@ -97,15 +100,23 @@ def _ground_samples(low, high, n: int = 24) -> np.ndarray:
     return np.stack([x, y], -1)
 
 
-def _bed_and_banks(plan: Plan, grid: Grid, depth: float, extent: Extent, kind: Kind) -> _Ground:
-    """Ground height and where there is water, per column."""
-    h = grid.spacing
+def _steps(seen: Footage) -> bool:
+    """Whether water comes down onto the rest of it (`chute.ChuteHeight`)."""
+    return bool(getattr(seen.surface, "steps", False))
+
+
+def _bed_and_banks(
+    plan: Plan, grid: Grid, depths: tuple[float, Float[np.ndarray, "nx ny"]], extent: Extent, kind: Kind
+) -> _Ground:
+    """Ground height and where there is water, per column; `depths`: the greatest, and the most that each column has."""
+    h, (depth, thin) = grid.spacing, depths
     wet, rock = plan.wet, plan.label == Label.SOLID  # rocks stand in the water: its banks are further out
     reach = cross_section.Reach(wet, rock, plan.level, plan.along, plan.speed, h)
     gx, gy = np.gradient(plan.level, h)
     steep = np.sqrt(1 + gx**2 + gy**2)  # thickness is meant across the sheet, columns are vertical
+    steep = steep if kind == "fall" else np.minimum(steep, EDGE)
     section = cross_section.depth_along(reach, depth, extent.width, kind)
-    below = np.maximum(cross_section.thickness(reach, section, extent.width), 0.7 * h)
+    below = np.maximum(np.minimum(cross_section.thickness(reach, section, extent.width), thin), 0.7 * h)
     outside = distance_inside(~wet, h)
     bank = plan.level + steep * np.minimum(0.4 * h + 0.9 * outside, 0.5 * depth + 2.5 * h)
     shown = np.where(wet, plan.level - below * steep, bank)
@@ -160,7 +171,8 @@ def _fill_channel(grid, plan, ground: _Ground, reach, seen: Footage, kind) -> Se
         return Setting(terrain, cells, plan.level, bed)
     start, stop = wide_ends(water, plan.along, reach, h, share=0.4)
     # on a curtain that much of its plan may be most of its height, full of faster and faster water
-    entry = upper_rim(water, plan.level, seen.along, h)[..., None] if kind == "fall" else s < start + INLET * h
+    rim = kind == "fall" or _steps(seen)
+    entry = upper_rim(water, plan.level, seen.along, h)[..., None] if rim else s < start + INLET * h
     cells[fluid & entry] = CellType.INFLOW
     cells[~solid & (s > stop - 2.5 * h)] = CellType.OUTFLOW
     return Setting(terrain, cells, plan.level, bed)

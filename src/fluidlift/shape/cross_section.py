@@ -21,6 +21,9 @@ REPOSE = 0.7
 ROCK_FLANK = 2.0
 """slope of a rock under water; a sphere that is half out of the water has steeper ones, a slab flatter ones"""
 
+STEEPEST = 2.0
+"""slope of a bank under water beside which the water is as fast as elsewhere: it is rooted, cohesive, rock or built"""
+
 CONTINUITY = 0.6
 """exponent on 1 / (speed x width): the share of what the discharge says about the depth that is believed. Depth varies
 by about 35 % along a reach, and a surface speed misjudges the mean one by about 30 %: 0.35^2 / (0.35^2 + 0.3^2)"""
@@ -104,19 +107,48 @@ def thickness(
 ) -> Float[np.ndarray, "nx ny"]:
     """Depth (m) of the water in each column: banks at their slope, down to a flat bed; 0 where it is dry.
 
+    Where the water beside a bank keeps up with the rest, it is deep there: the bank is then as steep as that asks for,
+    to `STEEPEST` (`swiftness`). Slow water says nothing, it may be in the shelter of something.
+
     Args:
         reach: the water from above.
         section: greatest depth of the section that each column lies in, m.
         width: typical, m: a section that is deep for its width has steeper banks, or its bed would never be reached.
-        slope: of the banks under water.
+        slope: of the banks under water where nothing is known.
     """
     bank = distance_inside(reach.wet, reach.spacing)
     share = bank * np.maximum(slope, section / (0.4 * width)) / np.maximum(section, 1e-12)
+    # the bank is at the edge of the first dry column, not in its middle
+    steep = STEEPEST * np.maximum(bank - 0.5 * reach.spacing, 0.0) / np.maximum(section, 1e-12)
+    share = np.maximum(share, np.minimum(steep, swiftness(reach, width)))
     below = section * share / (1.0 + share**6) ** (1 / 6)  # the smaller of both, with a rounded foot
     if reach.rock.any():
         beside = ndimage.distance_transform_edt(~reach.rock) * reach.spacing
         below = np.minimum(below, ROCK_FLANK * beside)
     return np.where(reach.wet, below, 0.0)
+
+
+def swiftness(reach: Reach, width: float) -> Float[np.ndarray, "nx ny"]:
+    """Depth that the speed of the surface speaks for, as part of the section's; 0 where no speed is known.
+
+    Driven by one slope, the deeper of two neighbouring columns is the faster one: in a turbulent stream the speed goes
+    with h^(2/3) (Manning), in a laminar film with h^2 (Nusselt). Between them stands h itself. Drag from the side slows
+    water beside a steep bank as well, so this is the least depth that the speed allows.
+
+    Args:
+        reach: the water from above.
+        width: typical, m; the section's speed is the mean over the discharge that passes within half of it.
+    """
+    known = np.isfinite(reach.speed) & reach.wet & ~reach.rock
+    speed = np.where(known, reach.speed, 0.0)
+
+    def mean(values: np.ndarray, sigma: float) -> np.ndarray:
+        return ndimage.gaussian_filter(values, sigma, mode="nearest")
+
+    across = max(0.5 * width / reach.spacing, 1.0)
+    usual = mean(speed**2, across) / np.maximum(mean(speed, across), 1e-12)
+    here = mean(speed, 1.0) / np.maximum(mean(known.astype(float), 1.0), 1e-12)
+    return np.where(known, np.clip(here / np.maximum(usual, 1e-12), 0.0, 1.0), 0.0)
 
 
 def rock_height(reach: Reach) -> Float[np.ndarray, "nx ny"]:

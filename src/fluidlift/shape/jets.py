@@ -93,7 +93,7 @@ def find_jets(
     upright = float(np.linalg.norm(camera.camera_from_world.rotation[:2, 2]))
     speed = np.linalg.norm(motion, axis=-1)
     falls = (motion * down).sum(-1)
-    usual, spread = _lying_motion(mask, motion, trust, falls > ALONG * speed)
+    usual, spread = lying_motion(mask, motion, trust, falls > ALONG * speed)
     excess = falls - (usual * down).sum(-1)
     clear = (excess > CONTRAST * spread) & (excess > FASTER * speed)
     candidate = mask & (trust > TRUSTED) & (falls > ALONG * speed) & clear & (speed > 0.5)
@@ -114,7 +114,7 @@ def find_jets(
     return found
 
 
-def _lying_motion(mask, motion, trust, falling) -> tuple[np.ndarray, float]:
+def lying_motion(mask, motion, trust, falling) -> tuple[np.ndarray, float]:
     """Motion [h,w,2] of the lying fluid, a quadratic of the place (a plane in uniform motion is one), and its robust
     scatter, px/frame. Of two starts, all of it and what does not follow the vertical, the one that explains more is
     kept: a long jet may be a third of the mask."""

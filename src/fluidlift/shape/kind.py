@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 
 from fluidlift.errors import require
-from fluidlift.shape import slope
+from fluidlift.shape import chute, slope
 from fluidlift.types import PinholeCamera, RigidTransform
 
 Kind = Literal["stream", "fall", "pour", "plume"]
@@ -180,7 +180,10 @@ def estimate_up(
     mean, sigma = PITCH_PRIOR[kind]
     found_pitch, found_roll, source, trust = mean, 0.0, f"usual view of a {kind}", 0.0
     if kind == "stream":
-        patches = slope.flow_patches(mask, displacement, confidence)
+        # a chute is another plane than what it comes down onto
+        steep = chute.chute_pixels(level_camera(camera, UpEvidence(mean, 0.0, "", 0.0)), mask, displacement, confidence)
+        lying = confidence * ~np.any(steep, axis=0) if steep else confidence
+        patches = slope.flow_patches(mask, displacement, lying)
         if patches is not None:
             tilt = slope.estimate_tilt(
                 camera, patches, lambda p, r: level_camera(camera, UpEvidence(p, r, "", 0.0)), (mean, sigma)

@@ -346,8 +346,22 @@ class PlacedHeight:
     model: object
     world_from_canonical: Similarity3
 
+    @property
+    def steps(self) -> bool:
+        """Whether fluid runs in at a part of the surface that stands higher than the rest."""
+        return bool(getattr(self.model, "steps", False))
+
     def height(self, xy: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
         """World z above world ground positions, m. The placement only turns about z, so heights stay heights."""
         t = self.world_from_canonical
-        local = (np.asarray(xy) - t.translation[:2]) @ t.rotation[:2, :2] / t.scale
-        return t.scale * self.model.height(local) + t.translation[2]  # type: ignore[attr-defined]
+        return t.scale * self.model.height(self._local(xy)) + t.translation[2]  # type: ignore[attr-defined]
+
+    def sheet(self, xy: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
+        """Greatest thickness of the fluid there, m; infinite where the surface does not say."""
+        if not self.steps:
+            return np.full(np.shape(xy)[:-1], np.inf)
+        return self.world_from_canonical.scale * self.model.sheet(self._local(xy))  # type: ignore[attr-defined]
+
+    def _local(self, xy: np.ndarray) -> np.ndarray:
+        t = self.world_from_canonical
+        return (np.asarray(xy) - t.translation[:2]) @ t.rotation[:2, :2] / t.scale

@@ -22,6 +22,7 @@ from fluidlift.shape.colour_growth import grown_from_streams, with_quiet_water
 from fluidlift.shape.evidence import Evidence, PairReader, fluid_score, gather_evidence
 from fluidlift.shape.frame_pictures import typical_picture
 from fluidlift.shape.hints import Point, clicks_at, heed, holes_asked_for
+from fluidlift.shape.islands import without_ground
 from fluidlift.shape.presence import Presence, always, grows, stay, watch
 from fluidlift.shape.region import clean_region, cut_along_edges, solids_in, still_pixels
 from fluidlift.types.clip import Label, PixelLabels, VideoClip
@@ -122,15 +123,17 @@ def segment(
         found = advancing_labels(evidence, score, presence, told)
     else:
         region = lasting_region(evidence, score, small_inside) if grown is None else clean_region(grown)
-        asked = np.zeros_like(region)
+        rocks = asked = np.zeros_like(region)
+        if grown is None:
+            region, rocks = without_ground(evidence, region)
         if clicks:
             region = heed(clicks, evidence, score, region)[0]
-            asked = holes_asked_for(region, clicks)
-            region = clean_region(region) & ~asked
+            asked, rocks = holes_asked_for(region, clicks), rocks & ~region
+            region = clean_region(region) & ~asked & ~rocks
         still = still_pixels(evidence)
         if grown is not None:  # change says nothing in such a clip: neither when the fluid came nor what is a rock
             presence, still = always(presence), np.zeros_like(still)
-        found = lasting_labels(score, region, still | asked, presence)
+        found = lasting_labels(score, region, still | asked | rocks, presence)
     tell(0.5, "labels")
     writer = LabelWriter((frames, height, width), out)
     share = write_labels(found, writer, small_inside, tell)

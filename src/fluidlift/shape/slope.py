@@ -49,13 +49,6 @@ FREEDOM = np.array([0.08, 0.25, 0.6, 1.2])
 """how far the field may be from uniform, as multiples of `USUAL`; each as likely"""
 NOISE = np.array([0.015, 0.03, 0.06, 0.12, 0.24])
 """px over the mean displacement; each as likely"""
-MANNING = 0.035
-"""s/m^(1/3), roughness of natural streams (Chow 1959, table 5-6: 0.03 clean and straight, 0.04 winding, 0.05 stony)"""
-HYDRAULIC = 0.6
-"""hydraulic radius over greatest depth of a parabolic bed five times as wide as deep (area 2/3, wetted width 1.1)"""
-MEAN_OF_SURFACE = 0.85
-"""mean speed over a column of water over that of its surface (the usual figure of image velocimetry)"""
-GRAVITY = 9.81
 LEAST_NOISE = 0.05
 """px, of optical flow at its best"""
 USUAL = np.array([1.0, 0.25, 0.5, 0.2, 0.3, 0.18, 0.15, 0.2, 0.05, 0.08, 0.2, 0.1, 0.1])
@@ -93,6 +86,8 @@ class SlopeEvidence:
     """degrees, mean over the slopes that are not level"""
     source: str
     """what the slope was taken from"""
+    chute: float = 0.0
+    """degrees of the steepest chute that comes down onto it; 0: there is none"""
 
 
 @dataclass(frozen=True)
@@ -106,18 +101,6 @@ class TiltEvidence:
     """degrees, standard deviation of the posterior"""
     gained: float
     """0 to 1: share of the prior's variance of the pitch that the motion took away"""
-
-
-@dataclass(frozen=True)
-class Channel:
-    """A stream in its bed."""
-
-    width: float
-    """m"""
-    slope: float
-    """degrees, as its perspective shows it; 0 where it does not"""
-    depth_share: float = 0.2
-    """depth over width"""
 
 
 def flow_patches(
@@ -158,12 +141,12 @@ def estimate_slope(camera: PinholeCamera, patches: FlowPatches | None, *, tilt_k
     if patches is None:
         return SlopeEvidence(0.0, STEEP, 0.0, 1.0, 0.0, "prior: too little motion to tell")
     slopes = np.arange(0.0, STEEPEST + 1.0, 2.0)
-    best = [_best_heading(camera, patches, np.radians(s)) for s in slopes]
+    best = [best_heading(camera, patches, np.radians(s)) for s in slopes]
     log = np.array([b[0] for b in best])
     if not np.isfinite(log).any():
         return SlopeEvidence(0.0, STEEP, 0.0, 1.0, 0.0, "prior: no plane is seen by the camera in all of it")
     likelihood = np.exp(log - log.max())
-    share = likelihood * _falling_prior(slopes)
+    share = likelihood * falling_prior(slopes)
     falling = float(share.sum())
     level = LEVEL * likelihood[0] / (LEVEL * likelihood[0] + (1.0 - LEVEL) * falling)
     mean = float((share * slopes).sum() / max(falling, 1e-300))
@@ -193,9 +176,9 @@ def estimate_tilt(
     """
     pitches, rolls = np.arange(8.0, 81.0, 4.0), np.array([-4.0, 0.0, 4.0])
     slopes = np.array([0.0, 5.0, 10.0, 16.0, 22.0, 30.0, 38.0])
-    prior = (1.0 - LEVEL) * _falling_prior(slopes)
+    prior = (1.0 - LEVEL) * falling_prior(slopes)
     prior[0] = LEVEL
-    log = np.array([[[_best_heading(tilted(p, r), patches, np.radians(s))[0] for s in slopes] for r in rolls]
+    log = np.array([[[best_heading(tilted(p, r), patches, np.radians(s))[0] for s in slopes] for r in rolls]
                     for p in pitches])  # fmt: skip
     log = BELIEF * log + np.log(prior)
     log -= 0.5 * (((pitches - pitch_prior[0]) / pitch_prior[1]) ** 2)[:, None, None]
@@ -221,46 +204,12 @@ def speed_along(
         axes: of the plane, as from `plane_axes`.
         drop: distance of the plane from the camera, along its normal.
     """
-    _, ray, along, across = _basis(camera, patches.at, axes)
+    _, ray, along, across = basis(camera, patches.at, axes)
     depth = drop / np.maximum(-ray @ axes[2], 1e-9)
     return (ray @ axes[0]) * depth, _downstream(patches.motion, along, across) * depth
 
 
-def energy_profile(
-    along: Float[np.ndarray, " n"], speed: Float[np.ndarray, " n"], weight: Float[np.ndarray, " n"], channel: Channel
-) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-    """How far (m) the surface has fallen at distances along it (m), the first of them 0.
-
-    Args:
-        along: m down the stream, of each patch.
-        speed: m/s there.
-        weight: 0 to 1.
-        channel: what is known of it.
-    """
-    low, high = np.percentile(along, [2.0, 98.0])
-    run = np.linspace(low, high, 25)
-    # the head of the middle of the stream: medians over slices, and a cubic through them (rocks, eddies)
-    slices = np.clip(((along - low) / max(high - low, 1e-9) * 10).astype(int), 0, 9)
-    filled = [k for k in range(10) if (slices == k).sum() >= 3]
-    centre = np.array([np.average(along[slices == k], weights=weight[slices == k] + 1e-9) for k in filled])
-    typical = np.array([np.median(speed[slices == k]) for k in filled])
-    degree = min(3, len(filled) - 1)
-    fitted = np.polyval(np.polyfit(centre, typical, max(degree, 0)), np.clip(run, centre[0], centre[-1]))
-    head = np.square(np.clip(fitted, 0.0, typical.max())) / (2.0 * GRAVITY)
-    gained = np.concatenate([[0.0], np.cumsum(np.maximum(np.diff(head), 0.0))])
-    # as deep as continuity lets it be: half the radius where it is twice as fast
-    usual = max(float(np.median(typical)), 1e-9)
-    pace = np.clip(fitted / usual, 0.3, 3.0)
-    radius = np.maximum(HYDRAULIC * channel.depth_share * channel.width / pace, 1e-3)
-    friction = np.square(MANNING * MEAN_OF_SURFACE * usual * pace) / radius ** (4.0 / 3.0)
-    friction = np.minimum(friction, np.tan(np.radians(STEEPEST)))
-    step = np.diff(run)
-    fall = gained + np.concatenate([[0.0], np.cumsum(0.5 * (friction[1:] + friction[:-1]) * step)])
-    missing = np.sin(np.radians(channel.slope)) * (run[-1] - run[0]) - fall[-1]
-    return run, fall + max(missing, 0.0) * (run - run[0]) / max(run[-1] - run[0], 1e-9)
-
-
-def _basis(camera: PinholeCamera, at: np.ndarray, axes: np.ndarray):
+def basis(camera: PinholeCamera, at: np.ndarray, axes: np.ndarray):
     """Points (x, y) of the picture, their rays, and the image motion of unit velocities along and across at depth 1."""
     rotation, focal = camera.camera_from_world.rotation, np.asarray(camera.focal)
     x = (at - np.asarray(camera.center)) / focal
@@ -275,13 +224,13 @@ def _downstream(motion: np.ndarray, along: np.ndarray, across: np.ndarray) -> np
     return (motion[:, 0] * across[:, 1] - motion[:, 1] * across[:, 0]) / determinant
 
 
-def _falling_prior(slopes: np.ndarray) -> np.ndarray:
+def falling_prior(slopes: np.ndarray) -> np.ndarray:
     """Half-normal over slopes > 0 (degrees), per step of the grid; sums to 1."""
     prior = np.exp(-0.5 * (slopes / STEEP) ** 2) * np.gradient(slopes) * (slopes > 0)
     return prior / prior.sum()
 
 
-def _best_heading(camera: PinholeCamera, patches: FlowPatches, slope: float) -> tuple[float, float]:
+def best_heading(camera: PinholeCamera, patches: FlowPatches, slope: float) -> tuple[float, float]:
     """(log evidence, heading in rad) of the better of the headings that fit the mean motion."""
     found = [(plane_evidence(camera, patches, plane_axes(slope, h))[0], h) for h in headings(camera, patches, slope)]
     return max(found, default=(-np.inf, 0.0))
@@ -319,12 +268,23 @@ def plane_evidence(
     Minus infinity where the camera does not see such a plane in all patches.
     """
     columns = _columns(camera, patches, axes)
-    if columns is None:
-        return -np.inf, np.zeros(len(USUAL))
+    return (-np.inf, np.zeros(len(USUAL))) if columns is None else field_evidence(patches, columns, USUAL)
+
+
+def field_evidence(
+    patches: FlowPatches, columns: Float[np.ndarray, "n 2 k"], usual: Float[np.ndarray, " k"]
+) -> tuple[float, Float[np.ndarray, " k"]]:
+    """Logarithm of the evidence for a field that is linear in its coefficients, and these over its mean speed.
+
+    Args:
+        patches: of the motion.
+        columns: px per frame that each coefficient moves each patch by; the first is a uniform stream of unit speed.
+        usual: standard deviations of the coefficients over the mean speed, as `USUAL`.
+    """
     first, motion, weight = columns[..., 0], patches.motion, LOOKS * patches.weight
     speed = float((weight[:, None] * first * motion).sum() / (weight[:, None] * first * first).sum())
     if speed <= 0:
-        return -np.inf, np.zeros(len(USUAL))
+        return -np.inf, np.zeros(len(usual))
     columns = columns * speed
     rest = motion - columns[..., 0]  # the prior mean is a uniform field
     normal = np.einsum("nik,n,nij->kj", columns, weight, columns)
@@ -333,10 +293,10 @@ def plane_evidence(
     looks = 2.0 * weight.sum()
     size = max(float(np.average(np.linalg.norm(motion, axis=1), weights=patches.weight)), 1e-9)
     noise = np.maximum(NOISE * size, LEAST_NOISE)
-    spread = USUAL * np.concatenate([np.ones((len(FREEDOM), 1)), np.repeat(FREEDOM[:, None], len(USUAL) - 1, 1)], 1)
+    spread = usual * np.concatenate([np.ones((len(FREEDOM), 1)), np.repeat(FREEDOM[:, None], len(usual) - 1, 1)], 1)
     variance = noise[:, None, None, None] ** 2
     # in units of the prior: I + S (A'WA / noise^2) S
-    scaled = spread[None, :, :, None] * normal * spread[None, :, None, :] / variance + np.eye(len(USUAL))
+    scaled = spread[None, :, :, None] * normal * spread[None, :, None, :] / variance + np.eye(len(usual))
     right = spread[None] * moment / variance[..., 0]
     found = np.linalg.solve(scaled, right[..., None])[..., 0]
     misfit = energy / noise[:, None] ** 2 - (right * found).sum(-1)
@@ -372,14 +332,30 @@ def _middle(camera: PinholeCamera, patches: FlowPatches) -> tuple[np.ndarray, np
 
 def _columns(camera: PinholeCamera, patches: FlowPatches, axes: np.ndarray) -> np.ndarray | None:
     """[n, 2, k] px: image motion of the fields of `USUAL` at unit speed, median depth 1."""
-    _, ray, along, across = _basis(camera, patches.at, axes)
+    _, ray, along, across = basis(camera, patches.at, axes)
     facing = -ray @ axes[2]
     if facing.min() <= facing.max() / FARTHEST:
         return None
     inverse = facing / np.median(facing)
     points = ray / inverse[:, None]
-    l, c = _to_unit(points @ axes[0]), _to_unit(points @ axes[1])
+    l, c = to_unit(points @ axes[0]), to_unit(points @ axes[1])
     along, across = along * inverse[:, None], across * inverse[:, None]
+    return field_columns(patches, along, across, l, c)
+
+
+def field_columns(
+    patches: FlowPatches, along: Float[np.ndarray, "n 2"], across: Float[np.ndarray, "n 2"],
+    l: Float[np.ndarray, " n"], c: Float[np.ndarray, " n"],
+) -> Float[np.ndarray, "n 2 k"]:  # fmt: skip
+    """px that the fields of `USUAL` move each patch by at unit speed.
+
+    Args:
+        patches: of the motion.
+        along: px that unit speed downstream is seen as.
+        across: px that unit speed across is seen as.
+        l: distance along the stream, -1 to 1.
+        c: distance across it, -1 to 1.
+    """
     one = np.ones_like(l)
     # centred powers, so that their priors mean little to each other
     fields = [one, c, c**2 - 1 / 3, c**3 - 0.6 * c, c**4 - 0.2, l, l * c, l**2 - 1 / 3]
@@ -390,6 +366,6 @@ def _columns(camera: PinholeCamera, patches: FlowPatches, axes: np.ndarray) -> n
     return np.stack([along * f[:, None] for f in fields] + [across * f[:, None] for f in turned], axis=-1)
 
 
-def _to_unit(values: np.ndarray) -> np.ndarray:
+def to_unit(values: np.ndarray) -> np.ndarray:
     low, high = np.percentile(values, [2.0, 98.0])
     return (values - 0.5 * (low + high)) / max(0.5 * (high - low), 1e-9)

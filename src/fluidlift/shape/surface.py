@@ -7,15 +7,15 @@ which the fluid is about 1 away. `place` (shape/place.py) turns that into metres
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
-from scipy.spatial import cKDTree
 
 from fluidlift.errors import InputRejected, require
-from fluidlift.shape import slope
+from fluidlift.shape import chute, sections, slope
+from fluidlift.shape.energy_line import Channel, energy_profile
+from fluidlift.shape.heights import HeightModel, PlaneHeight, ProfileAlongHeight, ProfileHeight, SampledHeight
 from fluidlift.shape.kind import Kind
 from fluidlift.shape.plume import SIGHT, section_half_thickness
 from fluidlift.shape.slope import SlopeEvidence
@@ -23,75 +23,6 @@ from fluidlift.types import PinholeCamera
 
 FAR = 12.0
 """no part of a surface is taken to be further away than this many times the nearest part"""
-
-
-class HeightModel(Protocol):
-    """A surface that is a function of the ground position."""
-
-    def height(self, xy: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
-        """z above the ground positions."""
-        ...
-
-
-@dataclass(frozen=True)
-class PlaneHeight:
-    """z = slope . (x, y) + offset."""
-
-    slope: tuple[float, float]
-    offset: float
-
-    def height(self, xy: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
-        """z above the ground positions."""
-        return xy[..., 0] * self.slope[0] + xy[..., 1] * self.slope[1] + self.offset
-
-
-@dataclass(frozen=True)
-class ProfileHeight:
-    """A surface of translation: z depends on the distance from the viewer alone (a fall seen from the front)."""
-
-    away: Float[np.ndarray, " k"]
-    """increasing y"""
-    z: Float[np.ndarray, " k"]
-
-    def height(self, xy: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
-        """z above the ground positions; level beyond the upper end, gently sloping (5 degrees) beyond the foot."""
-        y = xy[..., 1]
-        inside = np.interp(y, self.away, self.z)
-        return np.where(y < self.away[0], self.z[0] - (self.away[0] - y) * np.tan(np.radians(5.0)), inside)
-
-
-@dataclass(frozen=True)
-class ProfileAlongHeight:
-    """A surface that is level across a stream: z depends on the distance along it alone."""
-
-    ahead: tuple[float, float]
-    """unit vector that points downstream over the ground"""
-    along: Float[np.ndarray, " k"]
-    """increasing distances (x, y) . ahead"""
-    z: Float[np.ndarray, " k"]
-
-    def height(self, xy: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
-        """z above the ground positions; straight on beyond both ends."""
-        s = xy[..., 0] * self.ahead[0] + xy[..., 1] * self.ahead[1]
-        first, last = np.diff(self.z)[[0, -1]] / np.diff(self.along)[[0, -1]]
-        before, after = np.minimum(s - self.along[0], 0.0), np.maximum(s - self.along[-1], 0.0)
-        return np.interp(s, self.along, self.z) + first * before + last * after
-
-
-@dataclass(frozen=True)
-class SampledHeight:
-    """A surface through given points: inverse-distance mean of the nearest four."""
-
-    points: Float[np.ndarray, "n 3"]
-
-    def height(self, xy: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
-        """z above the ground positions."""
-        flat = np.asarray(xy).reshape(-1, 2)
-        distance, index = cKDTree(self.points[:, :2]).query(flat, k=min(4, len(self.points)))
-        distance, index = distance.reshape(len(flat), -1), index.reshape(len(flat), -1)
-        weight = 1.0 / (distance + 1e-6)
-        z = (weight * self.points[index, 2]).sum(1) / weight.sum(1)
-        return z.reshape(np.shape(xy)[:-1])
 
 
 @dataclass(frozen=True)
@@ -148,6 +79,10 @@ def stream_surface(
     (Bernoulli): the water that speeds up stands lower, and it slopes at least as Manning's formula says. A stream that
     slows down is taken to lose that energy in eddies instead of rising.
 
+    Where a chute comes down onto it (`chute.find_chutes`), it is level: water that loses most of its speed at once is
+    slower than its waves from there on, and hardly falls. So it is below a chute as wide as the stream
+    (`sections.estimate_sections`).
+
     Args:
         camera: canonical, z up.
         mask: fluid pixels.
@@ -160,13 +95,65 @@ def stream_surface(
     Raises:
         InputRejected: the camera does not look down at the surface.
     """
+    below_chutes = _chutes_on_level(camera, mask, motion, trust)
+    if below_chutes is not None:
+        return below_chutes
     patches = slope.flow_patches(mask, motion, trust)
+    broken = _chute_above_pool(camera, mask, sections.estimate_sections(camera, patches))
+    if broken is not None:
+        return broken
     evidence = slope.estimate_slope(camera, patches, tilt_known=tilt_known)
     front = level_surface(camera, mask) if evidence.slope == 0 else _sloping_plane(camera, mask, evidence)
     front = replace(front, slope=evidence)
     if patches is None or camera_height is None or camera_height <= 0:
         return front
     return _with_energy(camera, mask, front, patches, evidence, camera_height, interval)
+
+
+def _chutes_on_level(camera, mask, motion, trust) -> FrontSurface | None:
+    """A level surface with the chutes that come down onto it; None where there are none, or they are not seen."""
+    parts = chute.chute_pixels(camera, mask, motion, trust)
+    lying = mask & ~np.any(parts, axis=0) if parts else mask
+    if not parts or not lying.any():
+        return None
+    level = level_surface(camera, lying)
+    assert level.height is not None
+    found = chute.find_chutes(camera, mask, motion, trust, level.height)
+    if not found:
+        return None
+    model = chute.ChuteHeight(level.height, tuple(found))
+    near = 0.5 * float(level.depth[lying & (level.depth > 0)].min())
+    front = _from_height(camera, model, intersect_height(camera, model, near, FAR * 2.0 * near))
+    if not (front.depth[mask] > 0).mean() > 0.9:
+        return None
+    steepest, heading = max(c.slope for c in found), float(np.degrees(found[0].heading))
+    source = "a chute that comes down onto level water"
+    return replace(front, slope=SlopeEvidence(0.0, chute.AMISS, heading, 1.0, 0.0, source, steepest))
+
+
+def _chute_above_pool(camera, mask, found: sections.SectionEvidence) -> FrontSurface | None:
+    """A chute as wide as the stream, and the level below it; None where that is not sure."""
+    if found.best is None or found.share < sections.SURE:
+        return None
+    down = -camera.rays(camera.pixel_grid())[..., 2]
+    usual = 1.0 / float(np.median(down[mask & (down > 1e-3)]))  # depth of the pool's level, one below the camera
+    best = replace(found.best, chute=found.mean)
+    along, z = best.height((best.foot - 3.0 * usual, best.foot + 3.0 * usual))
+    ahead = (float(np.cos(best.heading)), float(np.sin(best.heading)))
+    model = ProfileAlongHeight(ahead, along, z)
+    depth = intersect_height(camera, model, 0.1 * usual, FAR * usual)
+    if not (depth[mask] > 0).mean() > 0.98:
+        return None
+    scale = 1.0 / float(np.median(depth[mask & (depth > 0)]))
+    points = camera.unproject(camera.pixel_grid()[mask], scale * depth[mask])
+    s = np.percentile(points[:, :2] @ ahead, [2.0, 98.0])
+    scaled = ProfileAlongHeight(ahead, scale * along, scale * z)
+    fall = scaled.height(np.array([s[0] * np.array(ahead), s[1] * np.array(ahead)]))
+    mean = float(np.degrees(np.arctan2(fall[0] - fall[1], s[1] - s[0])))
+    source = "perspective of the motion: a chute above level water"
+    heading = float(np.degrees(best.heading))
+    evidence = SlopeEvidence(mean, found.standard_error, heading, 1.0 - found.share, mean, source, found.mean)
+    return replace(_from_height(camera, scaled, scale * depth), slope=evidence)
 
 
 def _sloping_plane(camera: PinholeCamera, mask: np.ndarray, evidence: SlopeEvidence) -> FrontSurface:
@@ -191,8 +178,8 @@ def _with_energy(camera, mask, front, patches, evidence, camera_height, interval
     along, speed = slope.speed_along(camera, patches, axes, drop)
     across = points @ axes[1]
     width = metres * float(np.ptp(np.percentile(across, [5.0, 95.0])))
-    run, fall = slope.energy_profile(
-        metres * along, metres * speed / interval, patches.weight, slope.Channel(width, evidence.slope)
+    run, fall = energy_profile(
+        metres * along, metres * speed / interval, patches.weight, Channel(width, evidence.slope)
     )
     # distances along the slope, seen over the ground
     ground = run / metres * np.cos(angle)

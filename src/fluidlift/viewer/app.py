@@ -15,6 +15,7 @@ from typing import Any
 from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.pipeline.preview import LivePreview, PreviewFrame, PreviewSize, Take, Wish, obstacles_of
 from fluidlift.viewer.coloring import colored
+from fluidlift.viewer.comparing import Comparison
 from fluidlift.viewer.controls import controls_of
 from fluidlift.viewer.draft import Draft, Session
 from fluidlift.viewer.footage import InputPictures, input_pictures
@@ -115,9 +116,7 @@ class Viewer:
         self._drawn: tuple[Any, ...] = ()
         self._dirty = self.alive = True
         self._failures = 0
-        self.stale: set[str] | None = None
-        """what the saved frames no longer show of the scene; None: not known yet"""
-        self._compare = threading.Event()
+        self.comparison = Comparison(self)
         self.preview = LivePreview(self.asset, folder, size=size, keep=_kept, told=self._preview_told)
         self.jobs = Jobs(self._job_ended)
         port = free_port(request.host, request.port)
@@ -128,7 +127,7 @@ class Viewer:
         self._thread = threading.Thread(target=self._run, name="viewer", daemon=True)
         self._thread.start()
         self.preview.start()
-        threading.Thread(target=self._comparing, name="compare", daemon=True).start()
+        self.comparison.start()
         threading.Thread(target=self._find_pictures, name="input video", daemon=True).start()
 
     # what is told
@@ -158,6 +157,11 @@ class Viewer:
         """Tell a person something, in the page; empty: nothing any more."""
         self.messages = text
         self._dirty = True
+
+    @property
+    def stale(self) -> set[str] | None:
+        """What the saved frames no longer show of the scene; None: not known yet."""
+        return self.comparison.stale
 
     # what panels ask for
 
@@ -228,7 +232,7 @@ class Viewer:
                 self._tick(began)
             except Exception as error:
                 self._failures += 1
-                self._surprised("drawing the page", error, trace=self._failures == 1)
+                self.surprised("drawing the page", error, trace=self._failures == 1)
                 time.sleep(min(0.1 * self._failures, 2.0))
             time.sleep(max(1.0 / TICKS - (time.monotonic() - began), 0.002))
 
@@ -339,7 +343,7 @@ class Viewer:
         self.panels.job_ended()
         self._dirty = True
 
-    def _surprised(self, doing: str, error: Exception, *, trace: bool = True) -> None:
+    def surprised(self, doing: str, error: Exception, *, trace: bool = True) -> None:
         """Tell an error that a thread meets: in words where it is one of ours, else also with its trace in the log."""
         if isinstance(error, (FluidliftError, OSError)):
             self.say(f"{doing}: {error}")
@@ -350,22 +354,7 @@ class Viewer:
 
     def compare(self) -> None:
         """The scene or the frames have changed: find out whether they still belong together."""
-        self.stale = None
-        self._compare.set()
-
-    def _comparing(self) -> None:
-        while self.alive:
-            if not self._compare.wait(0.5) or self.preview.busy or self.jobs.running:
-                time.sleep(0.2)  # what somebody waits for goes first
-                continue
-            self._compare.clear()
-            try:
-                found = self.draft.stale()
-            except Exception as error:  # what cannot be compared counts as older than the scene
-                self._surprised("comparing the frames with the scene", error)
-                found = {"simulate", "look"}
-            if not self._compare.is_set():
-                self.stale = found
+        self.comparison.again()
 
     def _find_pictures(self) -> None:
         try:
@@ -373,7 +362,7 @@ class Viewer:
         except (FluidliftError, OSError, ValueError):
             pass  # the panel says that there are none
         except Exception as error:
-            self._surprised("looking for the input video", error)
+            self.surprised("looking for the input video", error)
         finally:
             self.looking_for_pictures, self._dirty = False, True
 

@@ -49,6 +49,10 @@ class Session(Protocol):
         """Which of simulate and look the frames on disk no longer match; this takes a second or so."""
         ...
 
+    def warnings(self) -> list[str]:
+        """What is odd about the scene as it is, and what its simulation will meet."""
+        ...
+
 
 class Draft:
     """A session and what is not in it yet. Safe to use from several threads.
@@ -205,6 +209,10 @@ class Draft:
     def stale(self) -> set[str]:
         """Which of simulate and look the frames on disk no longer match."""
         return set(self._session.stale())
+
+    def warnings(self) -> list[str]:
+        """What is odd about the scene as it is in the history; raises `InputRejected` for a broken scene.yaml."""
+        return list(self._session.warnings())
 
 
 def _put(scene: dict[str, Any], path: str, value: Any) -> None:

@@ -62,7 +62,7 @@ class ObstaclePanel:
         self._remove = gui.add_button("Remove", icon="trash", color="red")
         heard(self._size, self._sized)
         heard(self._motion, self._moves)
-        heard(self._density, lambda e, value: self._set(e, "density", float(value)))
+        heard(self._density, self._weighed)
         self._remove.on_click(self._take_away)
         if viewer.asset.kind == "plume":
             gui.add_markdown("Smoke flows through obstacles: they are simulated in liquids only.")
@@ -171,7 +171,11 @@ class ObstaclePanel:
 
     def _sized(self, event: Any, value: float) -> None:
         entry, width = self._entry(), float(value)
-        if entry is None or event.client is None:
+        if event.client is None:
+            return
+        if entry is None:  # typed into the box of a slider that is greyed out
+            self._viewer.say(f"width {width:g} m: no obstacle is chosen. Choose one, or add one first.")
+            self._size.value = _short(self._size_now)
             return
         if "mesh" in entry:
             now = self._mesh_width(entry)
@@ -187,6 +191,17 @@ class ObstaclePanel:
         """m, longest side of a mesh as it is now; None where it cannot be read."""
         body = next((o for o in self._viewer.bodies() if o.name == entry["name"]), None)
         return None if body is None else float(np.ptp(body.mesh.vertices, axis=0).max())
+
+    def _weighed(self, event: Any, density: float) -> None:
+        """A slider that is greyed out cannot be moved, but its box can be typed into: what is typed there is told to
+        have no effect, and goes back."""
+        entry = self._entry()
+        if event.client is not None and (entry is None or entry.get("motion") != "free"):
+            thing = "no obstacle is chosen" if entry is None else f"{entry['name']} stands still"
+            self._viewer.say(f"density {density:g}: {thing}, and only what floats freely has one that counts.")
+            self._density.value = min(max(float((entry or {}).get("density", 500.0)), 20.0), 3000.0)
+            return
+        self._set(event, "density", float(density))
 
     def _moves(self, event: Any, motion: str) -> None:
         if event.client is not None and self._viewer.chosen:

@@ -222,9 +222,11 @@ class Panels:
             lines.append("the live preview waits until the full simulation is done")
         if viewer.jobs.running:
             lines.append(viewer.jobs.state.told)
-        for text in (viewer.preview.problem, viewer.messages):
-            if text and text not in lines:
-                lines.append("⚠ " + text if text == viewer.preview.problem else text)
+        for text in (viewer.preview.problem, *viewer.comparison.warnings):
+            if text and "⚠ " + text not in lines:
+                lines.append("⚠ " + text)
+        if viewer.messages and "⚠ " + viewer.messages not in lines:
+            lines.append(viewer.messages)
         return "\n\n".join(lines)
 
     def refresh(self) -> None:

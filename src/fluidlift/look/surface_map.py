@@ -1,0 +1,111 @@
+"""The free surface of a liquid that lies, as a map over the plan: where it is, how high it stands, how it moves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import ndimage
+
+from fluidlift.errors import require
+
+COLUMN = 0.5
+"""width of a column of the map, cells: each holds particles where there is liquid (eight per cell)"""
+
+SPRAY = 1.0
+"""cells above its surroundings from which a particle is spray, or a jet, and not the surface"""
+
+SKIN = 1.5
+"""cells below the surface whose motion is that of the surface"""
+
+MARGIN = 4
+"""empty columns around the liquid"""
+
+
+@dataclass(frozen=True)
+class SurfaceMap:
+    """Columns of `pitch` metres from `low` on (x, y)."""
+
+    low: Float[np.ndarray, "2"]
+    pitch: float
+    wet: Bool[np.ndarray, "nx ny"]
+    """where the surface is; the space between two splashes is not"""
+    height: Float[np.ndarray, "nx ny"]
+    """z, m; beside the liquid that of the nearest"""
+    velocity: Float[np.ndarray, "nx ny 3"]
+    """m/s"""
+
+    @classmethod
+    def of(cls, positions: Float[np.ndarray, "n 3"], velocities: Float[np.ndarray, "n 3"], cell: float) -> SurfaceMap:
+        """The surface of the particles at some positions (m) with velocities (m/s).
+
+        Args:
+            positions: one or more.
+            velocities: of each of them.
+            cell: width of the simulator's cells, m.
+
+        Raises:
+            ValueError: no particles, or another number of velocities.
+        """
+        require(len(positions) > 0, "no particles", "one or more")
+        require(len(positions) == len(velocities), f"{len(velocities)} velocities", f"{len(positions)}")
+        pitch, z = COLUMN * cell, np.asarray(positions[:, 2], np.float64)
+        low = positions[:, :2].min(axis=0).astype(np.float64) - (MARGIN + 0.5) * pitch
+        size = np.ceil((positions[:, :2].max(axis=0) - low) / pitch).astype(int) + MARGIN + 1
+        index = np.floor((positions[:, :2] - low) / pitch).astype(int)
+        column = index[:, 0] * size[1] + index[:, 1]
+        top = np.full(size.prod(), -np.inf)
+        np.maximum.at(top, column, z)
+        top = top.reshape(size)
+        wet, height = _level(top, SPRAY * cell)
+        near = np.abs(z - height.ravel()[column]) < SKIN * cell
+        count = np.bincount(column[near], minlength=size.prod()).reshape(size).astype(np.float64)
+        moved = [np.bincount(column[near], velocities[near, a], minlength=size.prod()).reshape(size) for a in range(3)]
+        velocity = np.stack([_mean(m, count, 1.5) for m in moved], axis=-1)
+        return cls(low, pitch, wet, height, velocity)
+
+    def at(self, field: Float[np.ndarray, "nx ny ..."], places: Float[np.ndarray, "n 2"]) -> np.ndarray:
+        """A field of the map at some places (x, y in m), between its columns by their distance."""
+        return sampled(field, (np.asarray(places, np.float64) - self.low) / self.pitch - 0.5)
+
+    def presence(self, places: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
+        """How much of the surroundings of places (m) is liquid: 1/2 on a straight shore."""
+        return self.at(ndimage.gaussian_filter(self.wet.astype(np.float64), 0.7), places)
+
+    def columns(self) -> Float[np.ndarray, "m 2"]:
+        """Middles (x, y in m) of the wet columns."""
+        return (np.argwhere(self.wet) + 0.5) * self.pitch + self.low
+
+    def middles(self) -> Float[np.ndarray, "nx ny 2"]:
+        """Middles (x, y in m) of all columns."""
+        return (np.moveaxis(np.indices(self.wet.shape), 0, -1) + 0.5) * self.pitch + self.low
+
+
+def sampled(field: Float[np.ndarray, "nx ny ..."], index: Float[np.ndarray, "n 2"]) -> np.ndarray:
+    """Bilinear, at fractional indices; the nearest value outside."""
+    if field.ndim == 2:
+        return ndimage.map_coordinates(field, index.T, order=1, mode="nearest")
+    return np.stack([sampled(field[..., k], index) for k in range(field.shape[-1])], axis=-1)
+
+
+def _mean(total: np.ndarray, count: np.ndarray, width: float) -> np.ndarray:
+    """Weighted mean over a neighbourhood (standard deviation in columns) of sums and counts per column."""
+    return ndimage.gaussian_filter(total, width) / np.maximum(ndimage.gaussian_filter(count, width), 1e-6)
+
+
+def _level(top: np.ndarray, spray: float) -> tuple[np.ndarray, np.ndarray]:
+    """Wet columns and the height of the surface from the highest particle of each column (-inf: none)."""
+    have = np.isfinite(top)
+    z, around = np.where(have, top, 0.0), ndimage.uniform_filter(have.astype(np.float64), 3)
+    wet = (have & (around > 0.3)) | (around > 0.6)
+    counted = have.astype(np.float64)
+    for _ in range(2):
+        rough = _mean(z * counted, counted, 2.0)
+        counted = (have & (np.abs(z - rough) < spray)).astype(np.float64)
+    fine = _mean(z * counted, counted, 1.0)
+    height = np.where(ndimage.gaussian_filter(counted, 1.0) > 0.05, fine, rough)
+    if wet.any():
+        nearest = ndimage.distance_transform_edt(~wet, return_distances=False, return_indices=True)
+        height = height[tuple(nearest)]
+    return wet, height

@@ -1,0 +1,105 @@
+"""A skin of small splats over the free surface of a liquid.
+
+Particles that a simulation moves are drawn apart in one place and crowded in another, sink and come up. The splats that
+they carry show the fluid at rest well and a moving surface poorly. The skin's splats are tracers: they float with the
+surface, new ones come where they have been drawn apart, and some go where they are crowded.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from fluidlift.errors import require
+from fluidlift.look.surface_map import SurfaceMap
+from fluidlift.types import Gaussians, sh_from_rgb
+
+PITCH = 0.25
+"""cells between tracers"""
+
+WIDTH = 0.55
+"""standard deviation of a splat along the surface, spacings of the tracers: no gaps, no blur"""
+
+THICKNESS = 0.12
+"""across the surface, cells"""
+
+OPACITY = 0.9
+"""of each: neighbours cover what is below"""
+
+CROWDED, BARE = 0.55, 0.75
+"""spacings to the next tracer below which one of two goes, and above which a new one comes"""
+
+
+class SurfaceSkin:
+    """Tracers on a surface.
+
+    Args:
+        cell: width of the simulator's cells, m.
+
+    Raises:
+        ValueError: a width that is not positive.
+    """
+
+    def __init__(self, cell: float) -> None:
+        require(cell > 0, f"cell {cell}", "positive metres")
+        self.places: Float[np.ndarray, "n 2"] = np.zeros((0, 2))
+        self.ids: Int[np.ndarray, " n"] = np.zeros(0, np.int64)
+        self.next_id = 0
+        self._cell, self._spacing = cell, PITCH * cell
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def advance(self, surface: SurfaceMap, interval: float, rng: np.random.Generator) -> None:
+        """Float with the surface for an interval (s), and fill what has come apart."""
+        self.places = self.places + interval * surface.at(surface.velocity[..., :2], self.places)
+        self._keep(surface.presence(self.places) > 0.5)
+        if len(self) > 1:
+            self._keep(_sparse(self.places, self.ids, CROWDED * self._spacing))
+        low = np.floor(surface.low / self._spacing)
+        count = np.ceil(np.array(surface.wet.shape) * surface.pitch / self._spacing).astype(int) + 1
+        lattice = ((low + np.moveaxis(np.indices(count), 0, -1) + 0.5) * self._spacing).reshape(-1, 2)
+        lattice = lattice[surface.presence(lattice) > 0.5]
+        if len(self) and len(lattice):
+            lattice = lattice[cKDTree(self.places).query(lattice)[0] > BARE * self._spacing]
+        fresh = lattice + rng.uniform(-0.25, 0.25, lattice.shape) * self._spacing
+        self.places = np.concatenate([self.places, fresh])
+        self.ids = np.concatenate([self.ids, self.next_id + np.arange(len(fresh))])
+        self.next_id += len(fresh)
+
+    def _keep(self, index: np.ndarray) -> None:
+        self.places, self.ids = self.places[index], self.ids[index]
+
+    def points(self, surface: SurfaceMap) -> Float[np.ndarray, "n 3"]:
+        """Where the tracers are, m."""
+        return np.concatenate([self.places, surface.at(surface.height, self.places)[:, None]], axis=1)
+
+    def splats(self, surface: SurfaceMap, colors: Float[np.ndarray, "n 3"]) -> Gaussians:
+        """Flat splats that lie on the surface now, in sRGB colours (of each tracer) from any side."""
+        n = len(self)
+        smooth = ndimage.gaussian_filter(surface.height, 1.5)
+        slope = np.stack(np.gradient(smooth, surface.pitch), axis=-1)
+        normal = np.concatenate([-surface.at(slope, self.places), np.ones((n, 1))], axis=1)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        # the shortest turn from z to the normal
+        quats = np.stack([1 + normal[:, 2], -normal[:, 1], normal[:, 0], np.zeros(n)], axis=-1)
+        quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+        wide = WIDTH * self._spacing
+        scales = np.broadcast_to(np.array([wide, wide, THICKNESS * self._cell], np.float32), (n, 3)).copy()
+        return Gaussians(
+            self.points(surface).astype(np.float32), quats.astype(np.float32), scales,
+            np.full(n, OPACITY, np.float32), sh_from_rgb(np.clip(colors, 0.0, 1.0)),
+        )  # fmt: skip
+
+
+def _sparse(places: np.ndarray, ids: np.ndarray, apart: float) -> np.ndarray:
+    """Which places stay so that the younger of each close pair goes."""
+    pairs = cKDTree(places).query_pairs(apart, output_type="ndarray")
+    keep = np.ones(len(places), bool)
+    if len(pairs):
+        first, second = pairs.T
+        younger = np.where(ids[first] > ids[second], first, second)
+        keep[younger] = False
+    return keep

@@ -1,0 +1,198 @@
+"""The fine look of a liquid's surface, carried by patches that move without being drawn out.
+
+Foam, glitter and ripples are carried by the flow, and are made anew all the time. Carried alone they would be stirred
+into streaks after a second. So the look is that of overlapping patches (Lagrangian texture advection: Yu, Neyret,
+Bruneton, Holzschuch 2011): each moves and turns with the flow as a rigid piece of the look at rest, and gives way to a
+new one when the flow has sheared it too far. Speed and pattern both stay those that were seen, for any time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from fluidlift.errors import require
+from fluidlift.look.appearance import relit_ratio
+from fluidlift.look.seen_texture import SeenTexture
+from fluidlift.look.surface_map import SurfaceMap
+
+APART = 0.6
+"""radii between patches: each place is covered by several"""
+
+LIMIT = 1.0
+"""shear (no unit: strain added up) after which a patch gives way"""
+
+FADE = (2.0, 12.0)
+"""frames in which patches come and go, at least and at most; in between, a third of the time that the limit takes"""
+
+SHARPNESS = 8
+"""power of the weights: blends of two patterns have less contrast than either, and stay narrow"""
+
+OVERLAP = 8
+"""patches that share a place at most"""
+
+SMOOTH = 0.35
+"""radii over which a patch feels the flow"""
+
+TRIES = 12
+"""places that are looked at for the source of a new patch"""
+
+GOOD = 0.8
+"""share of a source that was seen, from which it is taken at once"""
+
+
+@dataclass
+class Patches:
+    """State of m patches."""
+
+    centers: Float[np.ndarray, "m 2"]
+    """x, y, m"""
+    sources: Float[np.ndarray, "m 2"]
+    """where the centre's look is taken from at rest, m"""
+    turns: Float[np.ndarray, " m"]
+    """about the vertical, radians"""
+    strains: Float[np.ndarray, " m"]
+    """shear so far, no unit"""
+    presences: Float[np.ndarray, " m"]
+    """0 to 1"""
+
+    @classmethod
+    def none(cls) -> Patches:
+        """No patches."""
+        return cls(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0))
+
+    def __len__(self) -> int:
+        return len(self.turns)
+
+    def select(self, index: np.ndarray) -> Patches:
+        """Some of them."""
+        return Patches(*(getattr(self, f.name)[index] for f in fields(self)))
+
+    def joined(self, other: Patches) -> Patches:
+        """These and others."""
+        return Patches(*(np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)))
+
+    @property
+    def going(self) -> Bool[np.ndarray, " m"]:
+        """Those that give way."""
+        return self.strains > LIMIT
+
+
+class TexturePatches:
+    """Patches over a moving surface.
+
+    Args:
+        texture: the look at rest.
+        radius: of a patch, m.
+
+    Raises:
+        ValueError: a radius that is not positive, or a texture without any usable place.
+    """
+
+    def __init__(self, texture: SeenTexture, radius: float) -> None:
+        require(radius > 0, f"radius {radius}", "positive metres")
+        require(texture.usable, "a texture of which nothing was seen")
+        self.state = Patches.none()
+        self._texture, self._radius = texture, radius
+        self._good = texture.trust_within(radius)
+
+    def advance(self, surface: SurfaceMap, interval: float, rng: np.random.Generator) -> None:
+        """Carry the patches along for an interval (s; 0: the first instant), and cover what they have left bare."""
+        if interval > 0 and len(self.state):
+            self._carry(surface, interval)
+        bare = surface.columns()
+        if not len(bare):
+            return
+        lasting = self.state.centers[~self.state.going]
+        uncovered = np.ones(len(bare), bool)
+        if len(lasting):
+            uncovered = cKDTree(lasting).query(bare)[0] > APART * self._radius
+        centers = _spread(bare, uncovered, APART * self._radius, rng)
+        if len(centers):
+            self.state = self.state.joined(self._fresh(centers, interval == 0, rng))
+
+    def _carry(self, surface: SurfaceMap, interval: float) -> None:
+        s, (flow, spin, shear) = self.state, _gradients(surface, SMOOTH * self._radius)
+        rate = surface.at(shear, s.centers)
+        fade = np.clip(LIMIT / 3 / np.maximum(rate * interval, 1e-9), *FADE)
+        turns, strains = s.turns + interval * surface.at(spin, s.centers), s.strains + interval * rate
+        presences = np.clip(s.presences + np.where(strains > LIMIT, -1, 1) / fade, 0.0, 1.0)
+        centers = s.centers + interval * surface.at(flow, s.centers)
+        moved = Patches(centers, s.sources, turns, strains, presences)
+        away = cKDTree(surface.columns()).query(centers)[0] if surface.wet.any() else np.full(len(s), np.inf)
+        self.state = moved.select(~(moved.going & (presences <= 0)) & (away < self._radius))
+
+    def _fresh(self, centers: np.ndarray, first: bool, rng: np.random.Generator) -> Patches:
+        """New patches. Those of the first instant show the body as it is: whole ones, of different age; where that was
+        not seen well they soon give way."""
+        none, few = np.zeros(len(centers)), np.full(len(centers), 1 / FADE[1])
+        if first:
+            seen = self._texture.surface.at(self._good, centers) > 0.5 * GOOD
+            strains = np.where(seen, rng.uniform(0, 0.5 * LIMIT, len(centers)), 2 * LIMIT)
+            return Patches(centers, centers.copy(), none, strains, np.ones(len(centers)))
+        return Patches(centers, np.array([self._source(c, rng) for c in centers]), none.copy(), none, few)
+
+    def _source(self, center: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Where a new patch takes its look from: near its place (foam is where rocks are), not the same again."""
+        reach = self._radius * (1 + 0.3 * np.arange(TRIES))[:, None]
+        tried = center + reach * rng.normal(size=(TRIES, 2))
+        good = self._texture.surface.at(self._good, tried)
+        fine = np.flatnonzero(good > GOOD)
+        best = int(fine[0]) if len(fine) else int(np.argmax(good))
+        if good[best] > 0.5 * GOOD:
+            return tried[best]
+        places = self._texture.surface.middles()[self._good > 0.6 * self._good.max()]
+        nearest = np.argsort(((places - center) ** 2).sum(axis=1))[: max(len(places) // 10, 1)]
+        return places[rng.choice(nearest)]
+
+    def colors(self, points: Float[np.ndarray, "n 3"]) -> tuple[np.ndarray, np.ndarray]:
+        """sRGB [n,3] at points (m) of the surface, in the shade of their place, and whether a patch is there [n]."""
+        s, n = self.state, len(points)
+        if n == 0 or len(s) == 0:
+            return np.zeros((n, 3)), np.zeros(n, bool)
+        places, most = np.asarray(points[:, :2], np.float64), min(OVERLAP, len(s))
+        found = cKDTree(s.centers).query(places, k=np.arange(1, most + 1), distance_upper_bound=self._radius)
+        point, rank = np.nonzero(np.isfinite(found[0]))
+        patch, distance = found[1][point, rank], found[0][point, rank]
+        weight = ((1 - (distance / self._radius) ** 2) ** 2 * s.presences[patch]) ** SHARPNESS
+        heaviest = np.zeros(n)
+        np.maximum.at(heaviest, point, weight)
+        counts = weight > 1e-3 * heaviest[point]
+        point, patch, weight = point[counts], patch[counts], weight[counts]
+        away, angle = places[point] - s.centers[patch], -s.turns[patch]
+        cos, sin = np.cos(angle), np.sin(angle)
+        turned = np.stack([cos * away[:, 0] - sin * away[:, 1], sin * away[:, 0] + cos * away[:, 1]], axis=-1)
+        sources = s.sources[patch] + turned
+        # what was not seen (a rock, a bank) shows only where no other patch is
+        weight = weight * np.clip(2 * self._texture.trust(sources) - 0.8, 1e-4, 1.0)
+        color, there = self._texture.colors(sources)
+        color = color * relit_ratio(self._texture.shade(points)[point], there)
+        total = np.bincount(point, weight, minlength=n)
+        mean = [np.bincount(point, weight * color[:, k], minlength=n) / np.maximum(total, 1e-30) for k in range(3)]
+        return np.clip(np.stack(mean, axis=-1), 0.0, 1.0), total > 0
+
+
+def _gradients(surface: SurfaceMap, width: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Horizontal velocity [nx,ny,2] (m/s), its spin and its shear [nx,ny] (1/s), over a width (m)."""
+    sigma, wet = max(width / surface.pitch, 1.0), surface.wet.astype(np.float64)
+    share = np.maximum(ndimage.gaussian_filter(wet, sigma), 1e-6)
+    flow = [ndimage.gaussian_filter(surface.velocity[..., a] * wet, sigma) / share for a in (0, 1)]
+    (xx, xy), (yx, yy) = (np.gradient(f, surface.pitch) for f in flow)
+    # at a shore the filter sees only half of its surroundings, and would turn that into shear
+    inside = ndimage.binary_erosion(surface.wet, iterations=2)
+    shear = np.sqrt(0.5 * (xx - yy) ** 2 + 0.5 * (xy + yx) ** 2 + 0.25 * (xx + yy) ** 2)
+    return np.stack(flow, axis=-1), 0.5 * (yx - xy) * inside, shear * inside
+
+
+def _spread(places: np.ndarray, bare: np.ndarray, apart: float, rng: np.random.Generator) -> np.ndarray:
+    """Some of the bare places, none within a distance of another, so that all are near one."""
+    bare, chosen = bare.copy(), []
+    for i in rng.permutation(np.flatnonzero(bare)):
+        if bare[i]:
+            chosen.append(places[i])
+            bare &= ((places - places[i]) ** 2).sum(axis=1) > apart**2
+    return np.array(chosen).reshape(-1, 2)

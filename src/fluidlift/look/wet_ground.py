@@ -1,0 +1,138 @@
+"""Ground that liquid stands on, in the picture behind that liquid: wet ground is darker than dry ground.
+
+`ground_picture` knows how much light the liquid lets through to the ground. Here is what its surface does to that
+light: it bends the ways down, and throws most of what matt ground sends up back onto it (`optics.wet_light`).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba as nb
+import numpy as np
+from jaxtyping import Float
+
+from fluidlift.look.liquid import Behind, LiquidSurface
+from fluidlift.look.liquid_kernels import RESTS, ROOM
+from fluidlift.look.materials import Material
+from fluidlift.look.optics import wet_light, wet_table
+from fluidlift.look.smoothstep import eased, smoothstep
+from fluidlift.types.camera import PinholeCamera
+
+ALBEDO = 0.4
+"""of obstacles, whose own is not at hand"""
+
+
+def wetted(
+    behind: Behind,
+    surface: LiquidSurface,
+    camera: PinholeCamera,
+    material: Material,
+    ground: tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]],
+    *,
+    shaded: bool = True,
+) -> Behind:
+    """The picture behind a liquid with the ground wet wherever liquid stands on it.
+
+    Args:
+        behind: the ground; what is not there (depth 0) is far away and stays dry.
+        surface: of the liquid.
+        camera: who looks.
+        material: of the liquid.
+        ground: linear albedo and depth (camera z, m) of the ground alone.
+        shaded: the light that shows the ground there has come through the liquid; False: it is that of bare ground, and
+            is weakened here, as even light would be.
+    """
+    image = behind.image.copy()
+    pose = np.ascontiguousarray(camera.camera_from_world.rotation, np.float64)
+    extinction = np.asarray(material.absorption, np.float64) + material.scattering
+    dampen(
+        (surface.covered, surface.depth, surface.normal, surface.thickness, float(surface.grain)),
+        (behind.depth, *(np.ascontiguousarray(g, np.float32) for g in ground)),
+        np.array([*camera.focal, *camera.center], np.float64), pose, extinction,
+        np.stack(wet_table(float(material.refractive_index))), shaded, image,
+    )  # fmt: skip
+    return Behind(image, behind.depth, behind.goes_on)
+
+
+@nb.njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+def dampen(liquid, ground, lens, pose, extinction, table, shaded, image):
+    """`wetted_plain`, pixel by pixel. liquid: covered, depth, normal, thickness, grain; ground: depth of what is
+    behind, albedo and depth of the ground alone; table: of `optics.wet_table`."""
+    covered, near, normals, thickness, grain = liquid
+    behind, albedo, own = ground
+    deep, last = table[0, -1], table.shape[1] - 1
+    for row in nb.prange(near.shape[0]):
+        i = np.int64(row)
+        y = (i + 0.5 - lens[3]) / lens[1]
+        for j in range(near.shape[1]):
+            z, end = np.float64(near[i, j]), np.float64(behind[i, j])
+            if not (covered[i, j] > 0.0 and z > 0.0 and end > z):
+                continue
+            x = (j + 0.5 - lens[2]) / lens[0]
+            away = math.sqrt(x * x + y * y + 1.0)
+            thick = min(np.float64(thickness[i, j]), (end - z) * away)
+            free = (end - z - thick / away) / max(RESTS * thick, ROOM * z / lens[0], 1e-9)
+            if free >= 1.0:
+                continue
+            cos = 0.0
+            for k in range(3):
+                cos -= normals[i, j, k] * (pose[0, k] * x + pose[1, k] * y + pose[2, k])
+            height = thick * min(max(cos / away, 0.0), 1.0)
+            share = covered[i, j] * (1.0 - max(free, 0.0))
+            if grain > 0.0:
+                share *= eased(height / grain)
+            same = abs(end - own[i, j]) <= 1e-4 * own[i, j]
+            for k in range(3):
+                at = last * math.sqrt(min(height * extinction[k], deep) / deep)
+                low = min(int(at), last - 1)
+                part = at - low
+                arrives = table[1, low] + part * (table[1, low + 1] - table[1, low])
+                back = table[2, low] + part * (table[2, low + 1] - table[2, low])
+                if not shaded:
+                    arrives *= table[3, low] + part * (table[3, low + 1] - table[3, low])
+                color = np.float64(albedo[i, j, k]) if same else ALBEDO
+                image[i, j, k] *= 1.0 + share * (arrives / (1.0 - color * back) - 1.0)
+
+
+def wetted_plain(
+    behind: Behind,
+    surface: LiquidSurface,
+    camera: PinholeCamera,
+    material: Material,
+    ground: tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]],
+    *,
+    shaded: bool = True,
+) -> Behind:
+    """What `wetted` does, in NumPy, for reading."""
+    share, height = standing(surface, behind, camera)
+    wet = share > 0
+    albedo, depth = ground
+    own = np.abs(behind.depth[wet] - depth[wet]) <= 1e-4 * depth[wet]
+    color = np.where(own[:, None], albedo[wet], ALBEDO)
+    thick = height[wet, None] * (np.asarray(material.absorption) + material.scattering)
+    arrives, back, straight = wet_light(thick, material.refractive_index)
+    factor = (arrives if shaded else arrives * straight) / (1.0 - color * back)
+    image = behind.image.copy()
+    image[wet] *= 1.0 + share[wet, None] * (factor - 1.0)
+    return Behind(image, behind.depth, behind.goes_on)
+
+
+def standing(
+    surface: LiquidSurface, behind: Behind, camera: PinholeCamera
+) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
+    """How much of what a pixel shows behind the liquid has that liquid standing on it, 0 to 1, and metres of it across
+    its surface. The same gaps count as none as for the light that leaves it (`liquid_kernels`)."""
+    rays = camera.rays(camera.pixel_grid()).astype(np.float32)
+    away = np.linalg.norm(rays, axis=-1)
+    z, end = surface.depth, behind.depth
+    there = (surface.covered > 0) & (z > 0) & (end > z)
+    thick = np.minimum(surface.thickness, (end - z) * away)
+    gap = end - z - thick / away
+    free = np.clip(gap / np.maximum(np.maximum(RESTS * thick, ROOM * z / camera.focal[0]), 1e-9), 0.0, 1.0)
+    cos = np.clip(-np.einsum("hwk,hwk->hw", surface.normal, rays) / away, 0.0, 1.0)
+    height = thick * cos
+    # a film thinner than its particles can tell fades out, and what it wets with it
+    film = smoothstep(height, 0.0, surface.grain) if surface.grain > 0 else 1.0
+    share = np.where(there, surface.covered * (1.0 - free) * film, 0.0)
+    return share.astype(np.float32), np.where(there, height, 0.0)

@@ -1,0 +1,34 @@
+"""A picture in light, and pictures drawn finer than they are shown."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Lit:
+    """One picture in linear light."""
+
+    image: np.ndarray
+    """[h,w,3]; premultiplied by `alpha` where the fluid is cut out"""
+    alpha: np.ndarray
+    """[h,w], share that is covered"""
+    depth: np.ndarray
+    """[h,w] camera z, m; 0 where nothing is"""
+
+
+def enlarged(picture: np.ndarray | None, k: int) -> np.ndarray | None:
+    """Every pixel k x k times."""
+    return None if picture is None else picture.repeat(k, axis=0).repeat(k, axis=1)
+
+
+def averaged(lit: Lit, k: int) -> Lit:
+    """A picture of k x k as many pixels, averaged; its depth is the nearest of each."""
+    h, w = lit.alpha.shape[0] // k, lit.alpha.shape[1] // k
+    depth = np.where(lit.depth > 0, lit.depth, np.inf).reshape(h, k, w, k).min(axis=(1, 3))
+    return Lit(
+        lit.image.reshape(h, k, w, k, 3).mean(axis=(1, 3)), lit.alpha.reshape(h, k, w, k).mean(axis=(1, 3)),
+        np.where(np.isfinite(depth), depth, 0.0).astype(np.float32),
+    )  # fmt: skip

@@ -1,0 +1,79 @@
+"""Surfaces that are functions of the ground position: planes, profiles, samples."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+
+
+class HeightModel(Protocol):
+    """A surface that is a function of the ground position."""
+
+    def height(self, xy: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
+        """z above the ground positions."""
+        ...
+
+
+@dataclass(frozen=True)
+class PlaneHeight:
+    """z = slope . (x, y) + offset."""
+
+    slope: tuple[float, float]
+    offset: float
+
+    def height(self, xy: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
+        """z above the ground positions."""
+        return xy[..., 0] * self.slope[0] + xy[..., 1] * self.slope[1] + self.offset
+
+
+@dataclass(frozen=True)
+class ProfileHeight:
+    """A surface of translation: z depends on the distance from the viewer alone (a fall seen from the front)."""
+
+    away: Float[np.ndarray, " k"]
+    """increasing y"""
+    z: Float[np.ndarray, " k"]
+
+    def height(self, xy: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
+        """z above the ground positions; level beyond the upper end, gently sloping (5 degrees) beyond the foot."""
+        y = xy[..., 1]
+        inside = np.interp(y, self.away, self.z)
+        return np.where(y < self.away[0], self.z[0] - (self.away[0] - y) * np.tan(np.radians(5.0)), inside)
+
+
+@dataclass(frozen=True)
+class ProfileAlongHeight:
+    """A surface that is level across a stream: z depends on the distance along it alone."""
+
+    ahead: tuple[float, float]
+    """unit vector that points downstream over the ground"""
+    along: Float[np.ndarray, " k"]
+    """increasing distances (x, y) . ahead"""
+    z: Float[np.ndarray, " k"]
+
+    def height(self, xy: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
+        """z above the ground positions; straight on beyond both ends."""
+        s = xy[..., 0] * self.ahead[0] + xy[..., 1] * self.ahead[1]
+        first, last = np.diff(self.z)[[0, -1]] / np.diff(self.along)[[0, -1]]
+        before, after = np.minimum(s - self.along[0], 0.0), np.maximum(s - self.along[-1], 0.0)
+        return np.interp(s, self.along, self.z) + first * before + last * after
+
+
+@dataclass(frozen=True)
+class SampledHeight:
+    """A surface through given points: inverse-distance mean of the nearest four."""
+
+    points: Float[np.ndarray, "n 3"]
+
+    def height(self, xy: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
+        """z above the ground positions."""
+        flat = np.asarray(xy).reshape(-1, 2)
+        distance, index = cKDTree(self.points[:, :2]).query(flat, k=min(4, len(self.points)))
+        distance, index = distance.reshape(len(flat), -1), index.reshape(len(flat), -1)
+        weight = 1.0 / (distance + 1e-6)
+        z = (weight * self.points[index, 2]).sum(1) / weight.sum(1)
+        return z.reshape(np.shape(xy)[:-1])

@@ -1,0 +1,70 @@
+"""The free surface over the plan: height, motion, and what is not part of it."""
+
+import numpy as np
+import pytest
+
+from fluidlift.look.surface_map import SurfaceMap
+
+CELL = 0.1
+STEP = 0.5 * CELL
+"""between particles: eight per cell"""
+
+
+def pool(height=lambda x, y: 0.6 + 0 * x, seed: int = 0) -> np.ndarray:
+    """Particles of a pool of 3 m x 2 m whose surface stands at a height (m)."""
+    x, y, z = np.meshgrid(*(np.arange(0.5 * STEP, size, STEP) for size in (3.0, 2.0, 1.2)), indexing="ij")
+    points = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+    points = points[points[:, 2] < height(points[:, 0], points[:, 1])]
+    return points + np.random.default_rng(seed).uniform(-0.1, 0.1, points.shape) * STEP
+
+
+def middle(surface: SurfaceMap) -> np.ndarray:
+    """Wet columns half a metre from the rim."""
+    places = surface.columns()
+    return places[(np.abs(places - [1.5, 1.0]) < [1.0, 0.5]).all(axis=1)]
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.2])
+def test_the_surface_is_where_the_highest_particles_are(slope):
+    points = pool(lambda x, y: 0.5 + slope * x)
+    surface = SurfaceMap.of(points, np.zeros_like(points), CELL)
+    at = middle(surface)
+    # the last layer of particles lies up to one spacing below the water's surface
+    off = 0.5 + slope * at[:, 0] - surface.at(surface.height, at)
+    assert off.min() > -0.1 * STEP and off.max() < 1.1 * STEP
+
+
+def test_a_drop_in_the_air_and_a_jet_do_not_lift_the_surface():
+    points = pool()
+    still = SurfaceMap.of(points, np.zeros_like(points), CELL)
+    jet = np.stack([np.full(8, 1.52), np.full(8, 1.02), np.linspace(0.75, 1.1, 8)], axis=-1)
+    drop = np.array([[1.0, 1.0, 1.0]])
+    splashed = np.concatenate([points, jet, drop])
+    surface = SurfaceMap.of(splashed, np.zeros_like(splashed), CELL)
+    at = middle(still)
+    lifted = surface.at(surface.height, at) - still.at(still.height, at)
+    assert np.abs(lifted).max() < 0.5 * STEP
+
+
+def test_it_moves_as_what_is_near_it_and_not_as_the_depth():
+    points = pool()
+    velocities = np.where(points[:, 2:] > 0.4, [1.0, 2.0, 0.0], [-5.0, 0.0, 0.0])
+    surface = SurfaceMap.of(points, velocities, CELL)
+    np.testing.assert_allclose(
+        surface.at(surface.velocity, middle(surface)), [[1.0, 2.0, 0.0]] * len(middle(surface)), atol=1e-9
+    )
+
+
+def test_half_of_the_surroundings_of_a_shore_is_liquid_and_a_wide_gap_is_dry():
+    points = pool()
+    points = points[np.abs(points[:, 0] - 1.5) > 0.3]
+    surface = SurfaceMap.of(points, np.zeros_like(points), CELL)
+    assert surface.presence(np.array([[1.5, 1.0]]))[0] < 0.01 and surface.presence(np.array([[0.6, 1.0]]))[0] > 0.99
+    assert abs(surface.presence(np.array([[1.2, 1.0]]))[0] - 0.5) < 0.3  # columns are half a cell wide
+
+
+def test_no_particles_and_velocities_of_others_are_refused():
+    with pytest.raises(ValueError, match="no particles"):
+        SurfaceMap.of(np.zeros((0, 3)), np.zeros((0, 3)), CELL)
+    with pytest.raises(ValueError, match="2 velocities"):
+        SurfaceMap.of(np.zeros((3, 3)), np.zeros((2, 3)), CELL)

@@ -1,0 +1,77 @@
+"""Tracers float with the surface and cover it evenly."""
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from fluidlift.look.surface_map import SurfaceMap
+from fluidlift.look.surface_skin import BARE, CROWDED, PITCH, SurfaceSkin
+
+CELL = 0.1
+SPACING = PITCH * CELL
+
+
+def surface(flow=lambda x, y: (0 * x, 0 * y), tilt: float = 0.0, reach: float = 2.0) -> SurfaceMap:
+    x, y = (a.ravel() for a in np.meshgrid(*[np.arange(0.025, reach, 0.05)] * 2, indexing="ij"))
+    points = np.stack([x, y, 0.5 + tilt * x], axis=-1)
+    return SurfaceMap.of(points, np.stack([*flow(x, y), 0 * x], axis=-1), CELL)
+
+
+def spread(skin: SurfaceSkin) -> tuple[float, float]:
+    """Smallest distance between tracers, and largest from any wet place to one, in spacings."""
+    closest = cKDTree(skin.places).query(skin.places, k=2)[0][:, 1].min()
+    x, y = (a.ravel() for a in np.meshgrid(*[np.arange(0.2, 1.8, 0.005)] * 2))
+    return closest / SPACING, cKDTree(skin.places).query(np.stack([x, y], axis=-1))[0].max() / SPACING
+
+
+def advanced(where: SurfaceMap, frames: int, interval: float = 0.04) -> SurfaceSkin:
+    skin = SurfaceSkin(CELL)
+    for k in range(frames + 1):
+        skin.advance(where, interval if k else 0.0, np.random.default_rng(k))
+    return skin
+
+
+@pytest.mark.parametrize("gain", [0.0, 1.0, -1.0])
+def test_they_cover_a_surface_evenly_whether_it_spreads_or_gathers(gain):
+    skin = advanced(surface(lambda x, y: (gain * (x - 1), gain * (y - 1))), 30)
+    closest, gap = spread(skin)
+    # new ones come where none is within 0.75, a quarter off either way along both axes
+    assert closest >= min(CROWDED, BARE - 0.25 * np.sqrt(2)) and gap < 1.6
+
+
+def test_each_moves_with_the_flow_under_its_id_and_ids_are_never_used_twice():
+    where = surface(lambda x, y: (0.3 + 0 * x, -0.2 + 0 * y))
+    skin = advanced(where, 3)
+    before = dict(zip(skin.ids.tolist(), skin.places.copy()))
+    known = skin.next_id
+    skin.advance(where, 0.04, np.random.default_rng(9))
+    same = [i for i in skin.ids.tolist() if i in before]
+    assert len(same) > 0.9 * len(before) and len(set(skin.ids.tolist())) == len(skin)
+    moved = dict(zip(skin.ids.tolist(), skin.places))
+    steps = np.array([moved[i] - before[i] for i in same])
+    np.testing.assert_allclose(steps, [[0.012, -0.008]] * len(same), atol=1e-9)
+    assert min(set(skin.ids.tolist()) - set(before)) >= known
+
+
+def test_splats_lie_flat_on_a_slope_in_the_colours_given():
+    where = surface(tilt=0.5)
+    skin = advanced(where, 0)
+    colors = np.random.default_rng(0).uniform(0, 1, (len(skin), 3))
+    g = skin.splats(where, colors)
+    np.testing.assert_allclose(g.rgb, colors, atol=1e-6)
+    inner = (np.abs(skin.places - 1) < 0.7).all(axis=1)
+    thin = np.linalg.eigh(g.covariances()[inner].astype(np.float64))[1][:, :, 0]
+    normal = np.array([-0.5, 0, 1]) / np.sqrt(1.25)
+    assert np.abs(thin @ normal).min() > np.cos(np.radians(3))
+    np.testing.assert_allclose(g.means[inner, 2], 0.5 + 0.5 * g.means[inner, 0], atol=0.1 * CELL)
+
+
+def test_what_has_run_dry_has_no_skin():
+    skin = advanced(surface(), 2)
+    skin.advance(surface(reach=1.0), 0.04, np.random.default_rng(0))
+    assert len(skin) and skin.places.max() < 1.0 + 0.5 * CELL
+
+
+def test_cells_without_width_are_refused():
+    with pytest.raises(ValueError, match="cell"):
+        SurfaceSkin(0.0)

@@ -1,0 +1,211 @@
+"""Chutes that come down onto level water, from exact motion on two planes."""
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from fluidlift.shape.channel import ChannelConfig, channel_setting
+from fluidlift.shape.chute import ChuteHeight, chute_pixels, find_chutes
+from fluidlift.shape.kind import UpEvidence, level_camera
+from fluidlift.shape.place import PlacedHeight
+from fluidlift.shape.plan import Footage
+from fluidlift.shape.sections import SURE, estimate_sections
+from fluidlift.shape.slope import flow_patches, plane_axes
+from fluidlift.shape.surface import level_surface, stream_surface
+from fluidlift.types import CellType, Label, PinholeCamera, Similarity3
+
+SIZE = (192, 144)
+
+
+def scene(slope, heading, pitch, *, speed=0.05, pool=0.012, half_width=0.13, length=0.3):
+    """A chute that runs down onto a pool that goes on the same way: camera, mask, px per frame, which pixels show the
+    chute, true depth."""
+    camera = level_camera(PinholeCamera.from_fov(50.0, SIZE), UpEvidence(pitch, 0.0, "", 1.0))
+    steep, level = (plane_axes(np.radians(a), np.radians(heading)) for a in (slope, 0.0))
+    grid = camera.pixel_grid()
+    rays = camera.rays(grid)
+    foot = camera.rays(np.array([[0.5 * SIZE[0], 0.45 * SIZE[1]]]))[0]
+    facing = -(rays @ steep[2])
+    onto = np.where(facing > 1e-3, -(foot @ steep[2]) / np.maximum(facing, 1e-3), np.inf)
+    below = np.where(rays[..., 2] < -1e-3, foot[2] / np.minimum(rays[..., 2], -1e-3), np.inf)
+    p = rays * np.where(np.isfinite(onto), onto, 0.0)[..., None] - foot
+    run, across = p @ level[0], p @ level[1]
+    chute = np.isfinite(onto) & (onto > 0) & (run < 0) & (run > -length) & (np.abs(across) < half_width)
+    q = rays * np.where(np.isfinite(below), below, 0.0)[..., None] - foot
+    wet = np.isfinite(below) & (np.abs(q @ level[1]) < 0.5) & (q @ level[0] > -0.15) & (q @ level[0] < 0.6)
+    mask = chute | wet
+    depth = np.where(chute, onto, np.where(wet, below, 0.0))
+    velocity = np.where(chute[..., None], speed * steep[0], pool * level[0])
+    points = rays * np.where(mask, depth, 1.0)[..., None]
+    later, _ = camera.project(points + np.where(mask[..., None], velocity, 0.0))
+    return camera, mask, np.where(mask[..., None], later - grid, 0.0), chute, depth
+
+
+OFF = 8.0
+"""degrees, of the slope: half of its prior's standard deviation"""
+SCENES = [(35.0, -150.0, 30.0), (45.0, -30.0, 40.0), (30.0, -90.0, 25.0), (55.0, 180.0, 20.0)]
+
+
+@pytest.mark.parametrize(("slope", "heading", "pitch"), SCENES)
+def test_a_chute_above_a_pool_is_found_with_its_slope_and_the_pool_is_level(slope, heading, pitch):
+    camera, mask, motion, chute, _ = scene(slope, heading, pitch)
+    trust = np.ones(mask.shape)
+    level = level_surface(camera, mask & ~chute).height
+    found = find_chutes(camera, mask, motion, trust, level)
+    assert len(found) == 1
+    # the motion turns a little over the chute, by perspective, and the prior (35 +- 15) draws
+    assert found[0].slope == pytest.approx(slope, abs=OFF)
+    turn = (np.degrees(found[0].heading) - heading + 180.0) % 360.0 - 180.0
+    assert abs(turn) < 6.0
+    overlap = (found[0].pixels & chute).sum() / (found[0].pixels | chute).sum()
+    assert overlap > 0.85  # flow is exact here, opening takes corners
+
+
+@pytest.mark.parametrize(("slope", "heading", "pitch"), SCENES)
+def test_the_surface_of_a_chute_above_a_pool_lies_where_both_planes_are(slope, heading, pitch):
+    camera, mask, motion, chute, depth = scene(slope, heading, pitch)
+    front = stream_surface(camera, mask, motion, np.ones(mask.shape), 0.04)
+    assert front.slope is not None and front.slope.chute == pytest.approx(slope, abs=OFF)
+    seen = mask & (front.depth > 0)
+    ratio = front.depth[seen] / depth[seen]
+    error = np.abs(ratio / np.median(ratio) - 1.0)
+    on = chute[seen]
+    assert np.median(error[~on]) < 1e-3  # a level plane, as it was given
+    level = level_surface(camera, mask & ~chute).depth[seen]
+    flat = np.abs((level / depth[seen]) / np.median((level / depth[seen])[~on]) - 1.0)
+    # its slope is found to some degrees: at least three quarters of what a level surface is wrong by goes
+    assert np.median(error[on]) < max(0.25 * float(np.median(flat[on])), 0.01)
+
+
+def test_noise_of_the_flow_does_not_hide_a_chute():
+    camera, mask, motion, _, _ = scene(40.0, -140.0, 35.0)
+    noise = np.random.default_rng(0).normal(0.0, 0.25, motion.shape)
+    front = stream_surface(camera, mask, motion + noise * mask[..., None], np.ones(mask.shape), 0.04)
+    assert front.slope is not None and front.slope.chute == pytest.approx(40.0, abs=10.0)
+
+
+@pytest.mark.parametrize("pitch", [25.0, 45.0])
+def test_a_swift_thread_that_keeps_its_speed_on_level_water_is_no_chute(pitch):
+    camera = level_camera(PinholeCamera.from_fov(50.0, SIZE), UpEvidence(pitch, 0.0, "", 1.0))
+    front = level_surface(camera, np.indices((SIZE[1], SIZE[0]))[0] > 50)
+    grid = camera.pixel_grid()
+    mask = (np.indices((SIZE[1], SIZE[0]))[0] > 50) & (front.depth > 0)
+    points = camera.unproject(grid, np.where(mask, front.depth, 1.0).astype(float))
+    across = points[..., 0] - np.median(points[mask][:, 0])
+    speed = 0.01 + 0.04 * np.exp(-((across / 0.08) ** 2))
+    later, _ = camera.project(points + speed[..., None] * np.array([0.0, -1.0, 0.0]))
+    motion = np.where(mask[..., None], later - grid, 0.0)
+    assert stream_surface(camera, mask, motion, np.ones(mask.shape), 0.04).slope.chute == 0.0
+
+
+def test_a_plane_film_is_no_chute():
+    camera, mask, motion, chute, _ = scene(35.0, -120.0, 30.0)
+    assert chute_pixels(camera, chute, motion, np.ones(mask.shape)) == []
+
+
+def test_beside_and_below_a_chute_the_surface_is_what_it_was():
+    camera, mask, motion, chute, _ = scene(45.0, -90.0, 40.0)
+    level = level_surface(camera, mask & ~chute).height
+    (found,) = find_chutes(camera, mask, motion, np.ones(mask.shape), level)
+    model = ChuteHeight(level, (found,))
+    foot = np.asarray(found.foot[:2])
+    ahead = np.array([np.cos(found.heading), np.sin(found.heading)])
+    side = np.array([-ahead[1], ahead[0]])
+    still = foot + np.array([0.2 * ahead, -0.1 * ahead + 2.0 * found.half_width * side])
+    np.testing.assert_allclose(model.height(still), found.foot[2], atol=1e-9)
+    up = foot - 0.1 * ahead
+    rise = 0.1 * np.tan(np.radians(found.slope))
+    assert model.height(up[None])[0] == pytest.approx(found.foot[2] + rise, abs=1e-9)
+    # it ends, level, above its top
+    far = foot - np.array([[2.0, 4.0]]).T * found.length * ahead
+    assert np.ptp(model.height(far)) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_water_comes_in_at_the_top_of_a_chute_and_rests_in_its_bed():
+    camera, mask, motion, chute, _ = scene(45.0, 0.0, 35.0, length=0.35)
+    front = stream_surface(camera, mask, motion, np.ones(mask.shape), 0.04)
+    points = camera.unproject(camera.pixel_grid()[mask], front.depth[mask].astype(float))
+    labels = np.where(mask, Label.FLUID, Label.BACKGROUND).astype(np.uint8)
+    still = Similarity3(1.0, np.eye(3), np.zeros(3))
+    surface = PlacedHeight(front.height, still)
+    assert surface.steps
+    speed = np.where(mask, np.where(chute, 0.05, 0.012) / 0.04, np.nan)
+    seen = Footage(surface, labels, points, camera, np.array([1.0, 0.0, 0.0]), speed)
+    setting = channel_setting(seen, ChannelConfig("stream", 64, 400_000))
+    cells, grid = setting.cell_types, setting.terrain.grid
+    inlet = cells == CellType.INFLOW
+    assert inlet.any()
+    z = grid.centers()[..., 2]
+    pool = float(np.median(points[:, 2]))
+    top = float(points[:, 2].max())
+    # all of it in the upper half of the chute: none in the pool, whose far end is further upstream
+    assert setting.surface_height[inlet.any(axis=2)].min() > pool + 0.3 * (top - pool)
+    # water that stands higher than the pool has ground below it
+    high = (cells == CellType.FLUID) & (z > pool + 0.5 * (top - pool))
+    assert (setting.bed_height[high.any(axis=2)] > pool).mean() > 0.9
+
+
+# a chute as wide as its stream ----------------------------------------------------------------------------------
+
+
+def stepped(slope, heading, pitch, *, noise=0.0, width=0.25):
+    """A straight stream that falls down to a line across it and is level below: camera, mask, px per frame, depth.
+    It gets faster on the chute, and half as fast below it."""
+    camera = level_camera(PinholeCamera.from_fov(50.0, SIZE), UpEvidence(pitch, 0.0, "", 1.0))
+    steep, level = (plane_axes(np.radians(a), np.radians(heading)) for a in (slope, 0.0))
+    grid = camera.pixel_grid()
+    rays = camera.rays(grid)
+    foot = camera.rays(np.array([[0.5 * SIZE[0], 0.55 * SIZE[1]]]))[0]
+    below = np.where(rays[..., 2] < -1e-3, foot[2] / np.minimum(rays[..., 2], -1e-3), 1e9)
+    facing = rays @ steep[2]
+    onto = np.where(facing < -1e-3, (foot @ steep[2]) / np.minimum(facing, -1e-3), 1e9)
+    depth = np.minimum(below, onto)
+    p = rays * np.minimum(depth, 50.0)[..., None] - foot
+    run, across = p @ level[0], p @ level[1]
+    chute = onto < below
+    run = np.where(chute, run / np.cos(np.radians(slope)), run)
+    mask = (np.abs(across) < width) & (run > -0.35) & (run < 0.5) & (depth < 50.0)
+    speed = np.where(run < 0, 1.3 + run, 0.65 + 0.65 * np.exp(-np.maximum(run, 0.0) / 0.1)) * (1 - 8 * across**2)
+    velocity = 0.02 * speed[..., None] * np.where(chute[..., None], steep[0], level[0])
+    later, _ = camera.project(np.where(mask[..., None], p + foot + velocity, foot))
+    motion = np.where(mask[..., None], later - grid, 0.0)
+    if noise:
+        eddies = ndimage.gaussian_filter(np.random.default_rng(1).normal(size=motion.shape), (6, 6, 0))
+        motion = motion + mask[..., None] * eddies * noise * np.median(np.abs(motion[mask])) / eddies.std()
+    return camera, mask, motion, np.where(mask, depth, 0.0), chute & mask
+
+
+STEPS = [(30.0, -160.0, 15.0), (50.0, -30.0, 20.0), (25.0, 150.0, 40.0)]
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.1], ids=["exact", "eddies"])
+@pytest.mark.parametrize(("slope", "heading", "pitch"), STEPS)
+def test_a_stream_in_two_sections_is_told_from_one_slope_and_both_are_found(slope, heading, pitch, noise):
+    camera, mask, motion, depth, chute = stepped(slope, heading, pitch, noise=noise)
+    patches = flow_patches(mask, motion, np.ones(mask.shape))
+    found = estimate_sections(camera, patches)
+    assert found.share > SURE
+    # chutes are tried in steps of 6 to 10 degrees; eddies of 10 % of the speed turn the motion by as many degrees
+    assert found.mean == pytest.approx(slope, abs=12.0)
+    front = stream_surface(camera, mask, motion, np.ones(mask.shape), 0.04)
+    assert front.slope is not None and front.slope.chute == pytest.approx(found.mean)
+    seen = mask & (front.depth > 0)
+    ratio = front.depth[seen] / depth[seen]
+    error = np.abs(ratio / np.median(ratio[~chute[seen]]) - 1.0)
+    flat = level_surface(camera, mask & ~chute).depth[seen] / depth[seen]
+    level = np.abs(flat / np.median(flat[~chute[seen]]) - 1.0)
+    assert np.median(error[chute[seen]]) < 0.5 * np.median(level[chute[seen]])
+    # below it the stream is level: but for a strip beside the line, whose place is tried in steps of a tenth
+    points = camera.unproject(camera.pixel_grid()[seen & ~chute], front.depth[seen & ~chute].astype(float))
+    assert np.ptp(np.percentile(points[:, 2], [5, 75])) < 1e-3
+
+
+@pytest.mark.parametrize(("heading", "pitch"), [(200.0, 20.0), (-30.0, 40.0), (-90.0, 30.0)])
+def test_a_level_stream_that_slows_down_is_one_section(heading, pitch):
+    camera, mask, motion, _, _ = stepped(0.0, heading, pitch, noise=0.15)
+    assert estimate_sections(camera, flow_patches(mask, motion, np.ones(mask.shape))).share < SURE
+
+
+def test_without_motion_there_is_one_section():
+    camera = level_camera(PinholeCamera.from_fov(50.0, SIZE), UpEvidence(30.0, 0.0, "", 1.0))
+    assert estimate_sections(camera, None).share == 0.0

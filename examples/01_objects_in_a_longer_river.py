@@ -9,7 +9,7 @@ The same from the shell:
 """  # noqa: E501
 
 import numpy as np
-from workbench import bench, end, places
+from workbench import FIRST, bench, end, places
 
 from fluidlift.pipeline import EditSession
 from fluidlift.pipeline.editing import Add, Set
@@ -56,8 +56,9 @@ b.check(
     f"{(beyond @ along).mean():.2f} m/s downstream, the inflow {inflow:.2f} m/s",
 )
 h = b.simulated_grid().spacing
-away = np.hypot((fluid.means - pillar) @ along, (fluid.means - pillar) @ across)
-inside = (away < radius - 0.1 * h) & (np.abs(fluid.means[:, 2] - pillar[2]) < 1.4 * size)
+drawn = b.all_splats(FIRST + b.count - 1).means
+away = np.hypot((drawn - pillar) @ along, (drawn - pillar) @ across)
+inside = (away < radius - 0.1 * h) & (np.abs(drawn[:, 2] - pillar[2]) < 1.4 * size)
 b.check("no water inside the pillar", not inside.any(), f"{inside.sum()} of {len(inside)} splats")
 # the obstacles push water aside and a bow wave stands before them: some per cent of the whole
 b.volume_kept(0.1)

@@ -47,7 +47,7 @@ edits.set("duration", LOOP)
 edits.set("loop", True)
 b.simulate(LOOP)
 plate, mask = footage.plate.astype(np.float32) / 255.0, footage.labels.fluid.mean(axis=0) > 0.5
-shown = [render(b.splats(FIRST + k)[0], asset.camera, background=plate).image[mask] for k in range(b.count)]
+shown = [render(b.all_splats(FIRST + k), asset.camera, background=plate).image[mask] for k in range(b.count)]
 across, between, _ = seam(np.clip(np.stack(shown), 0.0, 1.0)[:, None])
 clip = np.stack([f[mask] for f in footage.clip.frames])[:, None] / 255.0
 own = seam(clip)[1]

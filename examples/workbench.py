@@ -105,9 +105,15 @@ class Bench:
         return footage_of(story)
 
     def splats(self, number: int):
-        """Gaussians and velocities [n,3] (m/s) of a frame."""
+        """Gaussians and velocities [n,3] (m/s) of the particles of a frame, without the skin over them (odd ids)."""
         found = read_splats(self.folder / "frames" / "splats" / f"{number}.ply")
-        return found.gaussians, np.stack([found.extras[v] for v in ("vx", "vy", "vz")], axis=-1)
+        particles = found.extras["id"] % 2 == 0
+        velocities = np.stack([found.extras[v] for v in ("vx", "vy", "vz")], axis=-1)
+        return found.gaussians.select(particles), velocities[particles]
+
+    def all_splats(self, number: int):
+        """Gaussians of a frame as they are drawn, the skin among them."""
+        return read_splats(self.folder / "frames" / "splats" / f"{number}.ply").gaussians
 
     def last(self):
         """Those of the last frame."""

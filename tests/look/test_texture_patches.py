@@ -114,10 +114,10 @@ def test_new_patches_show_what_was_seen_of_the_fluid_and_not_what_was_not():
 
 
 def test_the_shade_of_a_place_stays_there():
-    """Left half in the shade: half as bright, whatever comes by."""
+    """Left half in the shade: three tenths darker, whatever comes by."""
     shade = np.ones((128, 128, 3), np.float32)
-    shade[:, :64] = 0.5
-    body = sheet(colors=lambda x, y: np.where(x[:, None] < 2, 0.4, 0.8) * np.ones(3))
+    shade[:, :64] = 0.7
+    body = sheet(colors=lambda x, y: np.where(x[:, None] < 2, 0.56, 0.8) * np.ones(3))
     where = surface(lambda x, y: (1.0 + 0 * x, 0 * y))
     patches = TexturePatches(SeenTexture(body, CAMERA, where, shading=SteadyShading(shade, CAMERA)), 0.6)
     for k in range(21):
@@ -125,7 +125,7 @@ def test_the_shade_of_a_place_stays_there():
     points = places(40)
     color = patches.colors(points)[0][:, 0]
     left, right = color[points[:, 0] < 1.8], color[points[:, 0] > 2.2]
-    np.testing.assert_allclose([left.mean(), right.mean()], [0.4, 0.8], rtol=0.05)
+    np.testing.assert_allclose([left.mean(), right.mean()], [0.56, 0.8], rtol=0.05)
 
 
 def test_their_number_does_not_grow_with_time():

@@ -133,3 +133,11 @@ def test_a_state_that_does_not_fit_changes_nothing(channel, fault):
     assert before.keys() == after.keys()
     for name, array in before.items():
         np.testing.assert_array_equal(after[name], array, err_msg=name)
+
+
+def test_there_is_no_skin_in_an_obstacle(channel):
+    dressing, p = played(channel(FRAMES))
+    shown = dressing.dressed(p, FRAMES - 1, lambda points: np.hypot(points[:, 0] - 0.6, points[:, 1] - 0.4) < 0.15)
+    away = np.hypot(*(shown.gaussians.means[:, :2] - [0.6, 0.4]).T)
+    skin = shown.ids % 2 == 1
+    assert (away[skin] >= 0.15).all() and (away[skin] < 0.2).any()

@@ -52,6 +52,14 @@ def test_a_material_changes_the_fluid_and_little_else(made, cut_out, tmp_path):
     assert milk[cut_out].mean() > lava[cut_out].mean()
 
 
+def test_a_material_may_be_written_with_a_space(made, tmp_path):
+    options = ("--view", "side", "--look", "surface", "--material")
+    apart, joined = (
+        drawn(made.folder, tmp_path / str(k), *options, m) for k, m in enumerate(("muddy water", "muddy_water"))
+    )
+    assert np.abs(apart - joined).max() <= 2  # threads add in another order
+
+
 def test_the_engines_agree_on_where_the_liquid_is(made, tmp_path):
     options = ("--view", "side", "--background", "terrain", "--look", "surface", "--material", "milk", "--engine")
     mesh, screen = (drawn(made.folder, tmp_path / e, *options, e)[..., :3] for e in ("mesh", "screen"))

@@ -169,7 +169,8 @@ def test_nothing_flows_out_of_an_obstacle_that_covers_the_inlet_and_that_is_said
     result = simulate(dammed, tmp_path, CONFIG)
     assert "line 7: obstacle 'block' over the whole inlet: nothing flows in" in result.meta["warnings"][0]
     frames = [read_frame(frame_file(tmp_path, FIRST_FRAME + k)) for k in (0, 5)]
-    assert set(frames[1].ids) <= set(frames[0].ids)  # no new particle
+    particles = [set(f.ids[f.ids % 2 == 0]) for f in frames]  # odd ids are the skin's
+    assert particles[1] and particles[1] <= particles[0]  # no new particle
     half = obstacle(position=(0.1, 0.0, 0.3))
     assert simulate(channel(6, obstacles=(half,)), tmp_path / "half", CONFIG).meta["warnings"] == []
 

@@ -26,13 +26,6 @@ FIXED = 0.35
 shadow, a stone or a mirror image stands there, and is no pattern that flows"""
 
 
-def relit_ratio(here: Float[np.ndarray, "n 3"], there: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """By what a colour changes that comes from the shade `there` into the shade `here` (sRGB, above 0)."""
-    bright = here.mean(axis=1, keepdims=True) / there.mean(axis=1, keepdims=True)
-    tint = np.clip(here / there / bright, 1.0 / LARGEST_TINT, LARGEST_TINT)
-    return np.clip(bright, 1.0 / LARGEST_RATIO, LARGEST_RATIO) * tint
-
-
 @dataclass(frozen=True)
 class SteadyShading:
     """The slowly varying part of the mean picture of the fluid."""
@@ -79,8 +72,11 @@ class SteadyShading:
     def moved(self, shown: Gaussians, origin: Float[np.ndarray, "n 3"]) -> Gaussians:
         """Gaussians whose colours were taken at `origin`, shaded for where they are now."""
         here, there = self.at(shown.means), self.at(origin)
+        bright = here.mean(axis=1, keepdims=True) / there.mean(axis=1, keepdims=True)
+        tint = np.clip(here / there / bright, 1.0 / LARGEST_TINT, LARGEST_TINT)
+        ratio = np.clip(bright, 1.0 / LARGEST_RATIO, LARGEST_RATIO) * tint
         sh = shown.sh.copy()
-        sh[:, :1] = sh_from_rgb(np.clip((0.5 + SH_C0 * sh[:, 0]) * relit_ratio(here, there), 0.0, 1.0))
+        sh[:, :1] = sh_from_rgb(np.clip((0.5 + SH_C0 * sh[:, 0]) * ratio, 0.0, 1.0))
         return Gaussians(shown.means, shown.quats, shown.scales, shown.opacities, sh)
 
 

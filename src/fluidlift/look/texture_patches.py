@@ -16,7 +16,6 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from fluidlift.errors import require
-from fluidlift.look.appearance import relit_ratio
 from fluidlift.look.seen_texture import SeenTexture
 from fluidlift.look.surface_map import SurfaceMap
 
@@ -40,6 +39,9 @@ SMOOTH = 0.35
 
 TRIES = 12
 """places that are looked at for the source of a new patch"""
+
+LARGEST_RATIO = 1.5
+"""by which a colour is brightened or darkened at most where it comes from another shade"""
 
 GOOD = 0.8
 """share of a source that was seen, from which it is taken at once"""
@@ -170,7 +172,9 @@ class TexturePatches:
         # what was not seen (a rock, a bank) shows only where no other patch is
         weight = weight * np.clip(2 * self._texture.trust(sources) - 0.8, 1e-4, 1.0)
         color, there = self._texture.colors(sources)
-        color = color * relit_ratio(self._texture.shade(points)[point], there)
+        # brightness alone: tinted by the water of another place, white foam would turn pink
+        bright = self._texture.shade(points).mean(axis=1)[point] / there.mean(axis=1)
+        color = color * np.clip(bright, 1 / LARGEST_RATIO, LARGEST_RATIO)[:, None]
         total = np.bincount(point, weight, minlength=n)
         mean = [np.bincount(point, weight * color[:, k], minlength=n) / np.maximum(total, 1e-30) for k in range(3)]
         return np.clip(np.stack(mean, axis=-1), 0.0, 1.0), total > 0

@@ -6,6 +6,7 @@ under a skin whose pattern moves with the flow without being stirred into streak
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -53,6 +54,9 @@ CLEAR = 0.1
 REACH = 0.5
 """standard deviation of a splat under the skin at most, shares of its distance from the ground and `CLEAR`: wider ones
 would lie over the rocks beside them"""
+
+
+Inside = Callable[[np.ndarray], np.ndarray]
 
 
 class Dressed(NamedTuple):
@@ -126,9 +130,14 @@ class Dressing:
         self._patches.advance(self._surface, interval, rng)
         self._skin.advance(self._surface, interval, rng)
 
-    def dressed(self, particles: Particles, number: int) -> Dressed:
-        """The splats of a frame to which `advance` has come. Ids of particles and of the skin's splats are told apart
-        by being even and odd."""
+    def dressed(self, particles: Particles, number: int, inside: Inside | None = None) -> Dressed:
+        """The splats of a frame to which `advance` has come. Ids of particles are even, those of the skin odd.
+
+        Args:
+            particles: of the frame.
+            number: of the frame, from 0.
+            inside: (points [n,3]) -> whether they are in an obstacle, where there is no skin; None: no obstacles.
+        """
         from fluidlift.look.mixing import mixed
         from fluidlift.physics.deform import deform_gaussians
 
@@ -137,11 +146,9 @@ class Dressing:
         if number:  # at rest nothing is drawn out
             shown = mixed(shown, particles.deformation, widest=MIXED * self._cell)
         shown = self._shaded(shown, particles.source)
-        if self._patches is None:
-            return Dressed(shown, particles.ids, particles.velocities)
-        if not number or self._surface is None or not len(particles):
+        if not number or self._patches is None or self._surface is None or not len(particles):
             return Dressed(shown, 2 * particles.ids, particles.velocities)
-        return self._with_skin(shown, particles, self._surface, self._patches)
+        return self._with_skin(shown, particles, self._surface, self._patches, inside)
 
     def _shaded(self, shown: Gaussians, source: np.ndarray) -> Gaussians:
         """The splats with the shade of the places where they are now; those with a colour of their own keep it."""
@@ -154,7 +161,12 @@ class Dressing:
         return moved if not own.any() else replace(moved, sh=np.where(own[:, None, None], shown.sh, moved.sh))
 
     def _with_skin(
-        self, shown: Gaussians, particles: Particles, surface: SurfaceMap, patches: TexturePatches
+        self,
+        shown: Gaussians,
+        particles: Particles,
+        surface: SurfaceMap,
+        patches: TexturePatches,
+        inside: Inside | None,
     ) -> Dressed:
         from fluidlift.look.smoothstep import smoothstep
 
@@ -173,6 +185,8 @@ class Dressing:
         color, there = patches.colors(points)
         color = self._dyed(color, points, shown, own & (np.abs(above) < TINTED), np.abs(above) < TINTED)
         there &= self._clearance(points) > CLEAR * self._cell
+        if inside is not None:
+            there &= ~inside(points)
         tracers = skin.splats(surface, color).select(there)
         speeds = surface.at(surface.velocity, skin.places[there]).astype(np.float32)
         return Dressed(

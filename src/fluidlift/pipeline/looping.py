@@ -108,7 +108,8 @@ def blended(head: SplatFrame, tail: SplatFrame, share: float, patch: float = np.
         shown = replace(frame.gaussians, opacities=opacities).select(seen)
         parts.append(SplatFrame(shown, frame.ids[seen], frame.velocities[seen]))
     first, second = parts
-    apart = int(max(head.ids.max(initial=-1), tail.ids.max(initial=-1))) + 1
+    # an even number: what is even stays a particle, what is odd of the skin
+    apart = 2 * (int(max(head.ids.max(initial=-1), tail.ids.max(initial=-1))) // 2 + 1)
     both = 0.0 < share < 1.0
     return SplatFrame(
         concatenate([first.gaussians, second.gaussians]),

@@ -141,7 +141,8 @@ def _parts(scene: Scene, simulator: Any) -> int:
 
 def _shown(scene: Scene, simulator: Any, dressing: Dressing, number: int) -> PreviewFrame:
     dressing.advance(simulator.particles, number)
-    shown = dressing.dressed(simulator.particles, number)
+    inside = simulator.bodies.inside if scene.obstacles else None
+    shown = dressing.dressed(simulator.particles, number, inside)
     poses = np.zeros((0, 7))
     if scene.obstacles:
         poses = np.concatenate([simulator.bodies.position, simulator.bodies.orientation], axis=1)

@@ -116,9 +116,8 @@ def _painter(scene: Scene, folder: Path, request: RenderRequest) -> Painter | No
     """Of the look that is asked for or that scene.yaml names; None: the splats as they were lifted."""
     from fluidlift.io.scene import read_edits
 
-    asked = {"style": request.look, "material": request.material, "environment": request.environment,
+    asked = {"style": request.look, "material": _checked_material(request), "environment": request.environment,
              "exposure": request.exposure}  # fmt: skip
-    _check_look(request)
     look = read_edits(folder).look
     if request.engine != "mesh" and request.look is None:
         asked["style"] = "surface"
@@ -146,7 +145,12 @@ def _painter(scene: Scene, folder: Path, request: RenderRequest) -> Painter | No
     )
 
 
-def _check_look(request: RenderRequest) -> None:
+def _checked_material(request: RenderRequest) -> str | None:
+    """The material by its own name ("muddy water" is muddy_water).
+
+    Raises:
+        InputRejected: an unknown material, look or environment; the nearest is told.
+    """
     from fluidlift.io.scene_look import EXPOSURE, STYLES
     from fluidlift.look.environment import BUILT_IN
     from fluidlift.look.materials import material_named
@@ -154,8 +158,7 @@ def _check_look(request: RenderRequest) -> None:
     if request.look is not None and request.look not in STYLES:
         near = difflib.get_close_matches(request.look, STYLES, 1)
         raise InputRejected(f"no look '{request.look}'", ", ".join(STYLES), f"did you mean {near[0]}?" if near else "")
-    if request.material is not None:
-        material_named(request.material)
+    material = None if request.material is None else material_named(request.material).name
     name = request.environment
     if name is not None and name not in BUILT_IN and not Path(name).is_file():
         near = difflib.get_close_matches(name, BUILT_IN, 1)
@@ -163,6 +166,7 @@ def _check_look(request: RenderRequest) -> None:
             f"no environment '{name}'", f"{', '.join(BUILT_IN)}, or an existing .hdr or .exr file",
             f"did you mean {near[0]}?" if near else "",
         )  # fmt: skip
+    return material
     if request.exposure is not None and not abs(request.exposure) <= EXPOSURE:
         raise InputRejected(f"an exposure of {request.exposure:g} stops", f"-{EXPOSURE:g} to {EXPOSURE:g}")
     if not 1 <= request.samples <= 100_000:

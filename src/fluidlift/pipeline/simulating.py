@@ -344,7 +344,7 @@ def _advance(
         if k and len(p) > config.simulate.max_particles * 2:
             return None
         dressing.advance(p, k)
-        shown = dressing.dressed(p, k)
+        shown = dressing.dressed(p, k, simulator.bodies.inside if scene.obstacles else None)
         write_gaussians(
             frame_file(folder, FIRST_FRAME + k), shown.gaussians, ids=shown.ids, velocities=shown.velocities
         )

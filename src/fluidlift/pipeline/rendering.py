@@ -166,11 +166,11 @@ def _checked_material(request: RenderRequest) -> str | None:
             f"no environment '{name}'", f"{', '.join(BUILT_IN)}, or an existing .hdr or .exr file",
             f"did you mean {near[0]}?" if near else "",
         )  # fmt: skip
-    return material
     if request.exposure is not None and not abs(request.exposure) <= EXPOSURE:
         raise InputRejected(f"an exposure of {request.exposure:g} stops", f"-{EXPOSURE:g} to {EXPOSURE:g}")
     if not 1 <= request.samples <= 100_000:
         raise InputRejected(f"{request.samples} samples per pixel", "1 to 100000")
+    return material
 
 
 def _check(request: RenderRequest, out: Path) -> None:

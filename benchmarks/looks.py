@@ -32,7 +32,7 @@ from fluidlift.look.open_end import OpenEnd
 from fluidlift.look.pictures import caption
 from fluidlift.look.rasterize import render
 from fluidlift.look.scenery import orbit_camera, side_camera, terrain_surfels
-from fluidlift.look.vessel import GLASS
+from fluidlift.look.vessel import glass_of
 from fluidlift.numerics.srgb import linear_from_srgb, srgb_from_linear
 from fluidlift.pipeline.looks import Backdrop, Frame, Painter
 from fluidlift.pipeline.reading import clip_of
@@ -141,7 +141,7 @@ def tile(asset: FluidAsset, folder: Path, look: Look, fluid: Gaussians, velociti
     width = 480
     size = (width, max(2, 2 * round(width * asset.camera.size[1] / asset.camera.size[0] / 2)))
     around = np.concatenate([asset.rest.means, asset.terrain.mesh.vertices])
-    ground = terrain_surfels(asset.terrain, glass=GLASS if asset.kind == "pour" else None)
+    ground = terrain_surfels(asset.terrain, glass=glass_of(asset.kind))
     camera = asset.camera.resized(size) if view == "input" else side_camera(
         asset.camera, asset.rest, ground, around, size=size
     )  # fmt: skip

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from fluidlift.shape import airborne, jets
+from fluidlift.shape.heights import PlaneHeight
 from fluidlift.shape.jet_column import Jet, with_columns
 from fluidlift.shape.kind import UpEvidence, level_camera
-from fluidlift.shape.surface import FrontSurface, PlaneHeight
+from fluidlift.shape.surface import FrontSurface
 from fluidlift.shape.terrain import Setting
 from fluidlift.types import CellType, Grid, PinholeCamera, Similarity3, Terrain, TriangleMesh
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fluidlift.shape.heights import PlaneHeight
 from fluidlift.shape.kind import UpEvidence, level_camera
 from fluidlift.shape.place import (
     STANDARD_GRAVITY,
@@ -15,7 +16,6 @@ from fluidlift.shape.place import (
     place,
     pose_up,
 )
-from fluidlift.shape.surface import PlaneHeight
 from fluidlift.types import PinholeCamera, RigidTransform
 
 RNG = np.random.default_rng(0)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from fluidlift.shape.energy_line import Channel, energy_profile
+from fluidlift.shape.heights import ProfileAlongHeight
 from fluidlift.shape.kind import UpEvidence, level_camera
 from fluidlift.shape.slope import (
     estimate_slope,
@@ -11,7 +12,7 @@ from fluidlift.shape.slope import (
     flow_patches,
     plane_axes,
 )
-from fluidlift.shape.surface import ProfileAlongHeight, stream_surface
+from fluidlift.shape.surface import stream_surface
 from fluidlift.types import PinholeCamera
 
 SIZE = (128, 96)

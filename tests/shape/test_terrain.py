@@ -10,8 +10,8 @@ from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.physics.apic import LiquidSimulator
 from fluidlift.shape.airborne import airborne_setting, inside_body
 from fluidlift.shape.channel import ChannelConfig, channel_setting, upper_rim
+from fluidlift.shape.heights import PlaneHeight
 from fluidlift.shape.plan import Footage
-from fluidlift.shape.surface import PlaneHeight
 from fluidlift.shape.terrain import signed_distance_from
 from fluidlift.types import CellType, FluidParameters, Label, Particles, PinholeCamera
 

@@ -158,6 +158,11 @@ class Visit:
             assert time.monotonic() < end, f"{what} did not happen; the page says: {self.page.inner_text('body')[:600]}"
             self.page.wait_for_timeout(30)
 
+    def drawn(self, after=0.0):
+        """Wait, s, and then until the page has drawn what it knows, however slowly it draws."""
+        self.page.wait_for_timeout(1000 * after)
+        self.page.evaluate("() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
+
     def says(self, text):
         self.page.get_by_text(text).locator("visible=true").first.wait_for()
 

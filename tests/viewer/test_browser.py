@@ -4,6 +4,7 @@ A software renderer draws it, so the asset is a tank of a few hundred splats, th
 and one browser with one page serves all tests. Waits are for what is to happen, never for a time.
 """
 
+import itertools
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -205,15 +206,22 @@ def test_an_obstacle_is_added_dragged_sized_let_float_and_removed(visit, viewer)
     gizmo = viewer.panels.obstacles._gizmo
     along = np.array([0.0, 0.0, 1.0])
 
+    pauses = itertools.chain((0.3, 0.6, 1.2), itertools.repeat(3.0))
+
     def drag():
+        viewer.stage.look_from_input(visit.client().camera)  # each drag beside the arrow turned the view
+        visit.drawn(next(pauses))
         grasped = np.array(entry["position"]) + 0.6 * gizmo.scale * along
-        x, y = visit.on_screen(grasped)  # anew: the page may still tell where its camera is
+        x, y = visit.on_screen(grasped)
         far_x, far_y = visit.on_screen(grasped - [0, 0, 0.1])
         visit.page.mouse.move(x, y)
+        visit.drawn()
         visit.page.mouse.down()
+        visit.drawn()
         visit.page.mouse.move(far_x, far_y, steps=4)
+        visit.drawn()
         visit.page.mouse.up()
-        visit.page.wait_for_timeout(300)
+        visit.drawn(0.3)
         return viewer.draft.obstacles[0]["position"] != entry["position"]
 
     visit.until(drag, "a drag of the arrow upwards")  # until the renderer has put the arrow where it is grasped

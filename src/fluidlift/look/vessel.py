@@ -37,6 +37,11 @@ MOST = 12.0
 """wall thicknesses on a ray, at most: light does not run round the whole of a wall"""
 
 
+def glass_of(kind: str) -> float | None:
+    """Opacity, as surfels, of the walls of what a fluid of a kind stands in; None: they are ground as the rest."""
+    return GLASS if kind == "pour" else None
+
+
 @dataclass(frozen=True)
 class Vessel:
     """The walls of a vessel that stands on a table."""

@@ -60,11 +60,12 @@ def _own_look(stage: Stage, folder: Path, step: Callable[[int], None]) -> Iterat
     """Splats before surfels: one rasteriser for all, in the colours that the clip has."""
     from fluidlift.look.rasterize import render
     from fluidlift.look.scenery import mesh_surfels, terrain_surfels
-    from fluidlift.look.vessel import GLASS
+    from fluidlift.look.vessel import glass_of
 
     scene, way, wanted = stage.scene, _background(stage), stage.numbers
     # a vessel hides nothing of what it holds, and is ground: cut out, none of it is there
-    glass = None if scene.kind != "pour" else 0.0 if way == "none" else GLASS
+    glass = glass_of(scene.kind)
+    glass = 0.0 if glass is not None and way == "none" else glass
     ground = Gaussians.empty() if way == "plate" else terrain_surfels(scene.terrain, most=SURFELS, glass=glass)
     shapes = [mesh_surfels(o.mesh, scene.terrain.grid.spacing) for o in scene.obstacles]
     before_rocks = _rocks(stage) if way == "plate" else None

@@ -11,6 +11,7 @@ import numpy as np
 
 from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.pipeline.export_job import ExportJob, Outcome, frames_of
+from fluidlift.pipeline.looping import FAINTEST
 from fluidlift.types import Gaussians, PinholeCamera, Similarity3, concatenate, matrix_from_quat, sh_from_rgb
 
 if TYPE_CHECKING:
@@ -25,8 +26,6 @@ SLOWEST = 12.0
 """frames per second down to which frames are left out before splats are"""
 FEWEST = 10_000
 """splats down to which they are left out"""
-FAINTEST = 1 / 255
-"""opacity below which a splat is not drawn, and not in the page"""
 SAMPLED = 4
 """frames that are encoded to know the size of all"""
 POSTER = 960
@@ -51,7 +50,7 @@ def write_page_of(job: ExportJob) -> Outcome:
     """page.html in the folder, or the .html file that was named."""
     from fluidlift.io.export_page import PageScene, write_page
     from fluidlift.look.scenery import LIGHT
-    from fluidlift.look.vessel import GLASS
+    from fluidlift.look.vessel import glass_of
     from fluidlift.pipeline.usd_exporting import bodies_of
 
     first, ids, _ = next(frames_of(job.folder, job.picked[:1]))
@@ -74,7 +73,7 @@ def write_page_of(job: ExportJob) -> Outcome:
         interval=job.interval * plan.every, numbers=tuple(FIRST_FRAME + k for k in picked),
         poster=_poster(job, first, bodies), terrain=job.asset.terrain.mesh, warnings=tuple(warnings),
         bodies=tuple(bodies), sun=tuple((LIGHT / np.linalg.norm(LIGHT)).tolist()),
-        terrain_opacity=GLASS if job.asset.kind == "pour" else 1.0,
+        terrain_opacity=glass_of(job.asset.kind) or 1.0,
         facts=(f"{len(shown):,} splats".replace(",", " "), f"{len(picked)} frames"),
     )  # fmt: skip
     path, size = write_page(page_path(job.out), frames(True), held, scene)
@@ -150,7 +149,7 @@ def _poster(job: ExportJob, first: Gaussians, bodies: list[MovingMesh]) -> np.nd
     """u8 [h,w,3]: the first frame over its ground, from the clip's camera."""
     from fluidlift.look.rasterize import render
     from fluidlift.look.scenery import mesh_surfels, terrain_surfels
-    from fluidlift.look.vessel import GLASS
+    from fluidlift.look.vessel import glass_of
 
     camera = job.asset.camera
     factor = min(1.0, POSTER / max(camera.size))
@@ -161,7 +160,7 @@ def _poster(job: ExportJob, first: Gaussians, bodies: list[MovingMesh]) -> np.nd
         )
         for b in bodies
     ]
-    ground = terrain_surfels(job.asset.terrain, glass=GLASS if job.asset.kind == "pour" else None)
+    ground = terrain_surfels(job.asset.terrain, glass=glass_of(job.asset.kind))
     scene = concatenate([ground, *solids, first])
     picture = render(scene, camera, background=(0.08, 0.09, 0.11)).image
     return (255 * np.clip(picture, 0, 1) + 0.5).astype(np.uint8)

@@ -242,7 +242,7 @@ def _cameras(scene: Scene, request: RenderRequest, count: int) -> list[PinholeCa
     from fluidlift.io.views import read_view
     from fluidlift.look.camera_path import keyed_path, orbit_path
     from fluidlift.look.scenery import orbit_camera, side_camera, terrain_surfels
-    from fluidlift.look.vessel import GLASS
+    from fluidlift.look.vessel import glass_of
 
     camera = scene.camera
     size = request.size or camera.size
@@ -250,7 +250,7 @@ def _cameras(scene: Scene, request: RenderRequest, count: int) -> list[PinholeCa
     if request.view == "input":
         return [_fitted(camera, size)] * count
     if request.view == "side":
-        ground = terrain_surfels(scene.terrain, glass=GLASS if scene.kind == "pour" else None)
+        ground = terrain_surfels(scene.terrain, glass=glass_of(scene.kind))
         return [side_camera(camera, scene.rest, ground, around, size=size)] * count
     if request.view == "top":
         return [orbit_camera(camera, around, azimuth=0.0, elevation=89.0, size=size)] * count

@@ -106,7 +106,7 @@ def _panels(
     from fluidlift.look.pictures import caption
     from fluidlift.look.rasterize import render
     from fluidlift.look.scenery import mesh_surfels, side_camera, terrain_depth, terrain_surfels, visible_beside_rocks
-    from fluidlift.look.vessel import GLASS
+    from fluidlift.look.vessel import glass_of
     from fluidlift.numerics.srgb import linear_from_srgb
 
     camera, terrain, grid = scene.camera, scene.terrain, scene.terrain.grid
@@ -121,7 +121,7 @@ def _panels(
             compared = max(len(footage.clip) - footage.start, 1)
     solid_depth = terrain_depth(terrain, camera) if rocks.any() else None
     airborne = scene.kind not in LYING
-    ground = terrain_surfels(terrain, glass=GLASS if scene.kind == "pour" else None)
+    ground = terrain_surfels(terrain, glass=glass_of(scene.kind))
     size = _panel_size(camera.size, config.show.width)
     # a body in the air may fill its box later; what lies on a bed stays in it
     whole = terrain.mesh.vertices

@@ -75,7 +75,7 @@ def channel_setting(seen: Footage, config: ChannelConfig) -> Setting:
             break
         spacing *= 1.05
     plan = with_seen(plan_of(seen, grid, extent), extent.visible, grid)
-    thin = seen.surface.sheet(grid.centers()[:, :, 0, :2]) if _steps(seen) else np.full(plan.level.shape, np.inf)
+    thin = seen.surface.sheet(grid.centers()[:, :, 0, :2])
     ground = _bed_and_banks(plan, grid, (depth, thin), extent, config.kind)
     ground = _as_seen(ground, plan, grid, seen, extent)
     return _fill_channel(grid, plan, ground, extent.reach, seen, config.kind)
@@ -98,11 +98,6 @@ def _channel_grid(surface, low, high, depth, spacing) -> Grid:
 def _ground_samples(low, high, n: int = 24) -> np.ndarray:
     x, y = np.meshgrid(np.linspace(low[0], high[0], n), np.linspace(low[1], high[1], n), indexing="ij")
     return np.stack([x, y], -1)
-
-
-def _steps(seen: Footage) -> bool:
-    """Whether water comes down onto the rest of it (`chute.ChuteHeight`)."""
-    return bool(getattr(seen.surface, "steps", False))
 
 
 def _bed_and_banks(
@@ -171,7 +166,7 @@ def _fill_channel(grid, plan, ground: _Ground, reach, seen: Footage, kind) -> Se
         return Setting(terrain, cells, plan.level, bed)
     start, stop = wide_ends(water, plan.along, reach, h, share=0.4)
     # on a curtain that much of its plan may be most of its height, full of faster and faster water
-    rim = kind == "fall" or _steps(seen)
+    rim = kind == "fall" or seen.surface.steps
     entry = upper_rim(water, plan.level, seen.along, h)[..., None] if rim else s < start + INLET * h
     cells[fluid & entry] = CellType.INFLOW
     cells[~solid & (s > stop - 2.5 * h)] = CellType.OUTFLOW

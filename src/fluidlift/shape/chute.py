@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from fluidlift.shape import jets, slope
+from fluidlift.shape.heights import HeightModel
 from fluidlift.types import PinholeCamera
 
 DOWN = np.cos(np.radians(75.0))
@@ -68,18 +69,20 @@ class Chute:
 
 
 @dataclass(frozen=True)
-class ChuteHeight:
+class ChuteHeight(HeightModel):
     """A surface with chutes that come down onto it."""
 
-    below: object
-    """a height model"""
+    below: HeightModel
     chutes: tuple[Chute, ...]
-    steps: bool = True
-    """it has an upper end that is higher than the rest (`channel`)"""
+
+    @property
+    def steps(self) -> bool:
+        """True: each chute has an upper end."""
+        return True
 
     def height(self, xy: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
         """z above the ground positions."""
-        z = self.below.height(xy)  # type: ignore[attr-defined]
+        z = self.below.height(xy)
         for chute in self.chutes:
             plane, share = chute.rise(xy)
             z = z + share * np.maximum(plane - z, 0.0)
@@ -89,7 +92,7 @@ class ChuteHeight:
         """Greatest thickness of the fluid above the ground positions: a chute is a sheet as a fall is (`SHEET` of its
         own width), for it is as fast; infinite elsewhere."""
         thick = np.full(np.shape(xy)[:-1], np.inf)
-        z = self.below.height(xy)  # type: ignore[attr-defined]
+        z = self.below.height(xy)
         for chute in self.chutes:
             plane, share = chute.rise(xy)
             thick = np.where((share > 0) & (plane > z), np.minimum(thick, SHEET * 2.0 * chute.half_width), thick)
@@ -256,7 +259,7 @@ def _placed(camera, part, seen: np.ndarray, angles: tuple[float, float], level: 
 
 def find_chutes(
     camera: PinholeCamera, mask: Bool[np.ndarray, "h w"], motion: Float[np.ndarray, "h w 2"],
-    trust: Float[np.ndarray, "h w"], height: object,
+    trust: Float[np.ndarray, "h w"], height: HeightModel,
 ) -> list[Chute]:  # fmt: skip
     """Chutes that come down onto a surface.
 
@@ -276,7 +279,7 @@ def find_chutes(
             continue
         level = -1.0
         for _ in range(8):  # where its foot's ray meets the surface
-            level = float(height.height((ray[:2] * level / ray[2])[None])[0])  # type: ignore[attr-defined]
+            level = float(height.height((ray[:2] * level / ray[2])[None])[0])
         chute = stand(camera, part, mask, motion, trust, level) if level < 0 else None
         if chute is not None:
             found.append(chute)

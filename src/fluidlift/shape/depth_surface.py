@@ -16,10 +16,11 @@ from scipy.linalg import solve
 
 from fluidlift.errors import InputRejected
 from fluidlift.shape.given_depth import SceneDepth, robust_plane, without_rim
+from fluidlift.shape.heights import HeightModel, ProfileHeight
 from fluidlift.shape.kind import PITCH_PRIOR, Kind, UpEvidence
 from fluidlift.shape.plume import SIGHT
 from fluidlift.shape.slope import SlopeEvidence
-from fluidlift.shape.surface import FrontSurface, HeightModel, ProfileHeight, inflated_surface, intersect_height
+from fluidlift.shape.surface import FrontSurface, inflated_surface, intersect_height
 from fluidlift.types import Grid, Label, PinholeCamera
 
 SLOPES: tuple[tuple[float, float, float], ...] = ((0.7, 0.5, 2.0), (0.3, 0.0, 20.0))
@@ -58,7 +59,7 @@ class DepthSlope:
 
 
 @dataclass(frozen=True)
-class AlongHeight:
+class AlongHeight(HeightModel):
     """A stream: level across, z a function of the way along it; beyond its ends it goes on at its mean slope."""
 
     direction: tuple[float, float]

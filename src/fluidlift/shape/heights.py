@@ -2,24 +2,33 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 
-class HeightModel(Protocol):
+class HeightModel(ABC):
     """A surface that is a function of the ground position."""
 
+    @property
+    def steps(self) -> bool:
+        """Whether fluid comes down onto the rest of it, from an upper end that stands higher."""
+        return False
+
+    @abstractmethod
     def height(self, xy: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
         """z above the ground positions."""
-        ...
+
+    def sheet(self, xy: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
+        """Greatest thickness of the fluid above the ground positions; infinite where the surface does not say."""
+        return np.full(np.shape(xy)[:-1], np.inf)
 
 
 @dataclass(frozen=True)
-class PlaneHeight:
+class PlaneHeight(HeightModel):
     """z = slope . (x, y) + offset."""
 
     slope: tuple[float, float]
@@ -31,7 +40,7 @@ class PlaneHeight:
 
 
 @dataclass(frozen=True)
-class ProfileHeight:
+class ProfileHeight(HeightModel):
     """A surface of translation: z depends on the distance from the viewer alone (a fall seen from the front)."""
 
     away: Float[np.ndarray, " k"]
@@ -46,7 +55,7 @@ class ProfileHeight:
 
 
 @dataclass(frozen=True)
-class ProfileAlongHeight:
+class ProfileAlongHeight(HeightModel):
     """A surface that is level across a stream: z depends on the distance along it alone."""
 
     ahead: tuple[float, float]
@@ -64,7 +73,7 @@ class ProfileAlongHeight:
 
 
 @dataclass(frozen=True)
-class SampledHeight:
+class SampledHeight(HeightModel):
     """A surface through given points: inverse-distance mean of the nearest four."""
 
     points: Float[np.ndarray, "n 3"]

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from fluidlift.shape.heights import HeightModel
 from fluidlift.shape.kind import PITCH_PRIOR, Kind, UpEvidence
 from fluidlift.types import PinholeCamera, RigidTransform, Similarity3
 
@@ -340,27 +341,25 @@ def place(
 
 
 @dataclass(frozen=True)
-class PlacedHeight:
+class PlacedHeight(HeightModel):
     """A canonical height model seen in the world."""
 
-    model: object
+    model: HeightModel
     world_from_canonical: Similarity3
 
     @property
     def steps(self) -> bool:
-        """Whether fluid runs in at a part of the surface that stands higher than the rest."""
-        return bool(getattr(self.model, "steps", False))
+        """As the model has it."""
+        return self.model.steps
 
     def height(self, xy: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
         """World z above world ground positions, m. The placement only turns about z, so heights stay heights."""
         t = self.world_from_canonical
-        return t.scale * self.model.height(self._local(xy)) + t.translation[2]  # type: ignore[attr-defined]
+        return t.scale * self.model.height(self._local(xy)) + t.translation[2]
 
     def sheet(self, xy: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
         """Greatest thickness of the fluid there, m; infinite where the surface does not say."""
-        if not self.steps:
-            return np.full(np.shape(xy)[:-1], np.inf)
-        return self.world_from_canonical.scale * self.model.sheet(self._local(xy))  # type: ignore[attr-defined]
+        return self.world_from_canonical.scale * self.model.sheet(self._local(xy))
 
     def _local(self, xy: np.ndarray) -> np.ndarray:
         t = self.world_from_canonical

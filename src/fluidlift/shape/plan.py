@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from fluidlift.errors import require
 from fluidlift.shape.cross_section import distance_inside
-from fluidlift.shape.surface import HeightModel
+from fluidlift.shape.heights import HeightModel
 from fluidlift.types import Grid, Label, PinholeCamera
 
 COARSE = 96

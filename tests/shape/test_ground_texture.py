@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from scipy.ndimage import binary_erosion
 
 from fluidlift.numerics.textures import sample_texture
 from fluidlift.shape.ground_mesh import ground_mesh
-from fluidlift.shape.ground_texture import STRIP, View, hidden_ground, textured
+from fluidlift.shape.ground_texture import STRIP, View, hidden_ground, over_bed, textured
 from fluidlift.types import Grid, Label, PinholeCamera
 
 GRID = Grid((24, 16, 6), 0.125, (-1.5, -1.0, -1.0))
@@ -130,6 +131,42 @@ def test_the_bed_under_water_is_of_the_stuff_of_its_rim_and_not_of_specks_that_t
     mesh = seen_on(heights, plate=plate, level=np.zeros((24, 16)), seen=~wet)
     colour, _ = colour_at(mesh, np.linspace(-1, 1, 9), np.zeros(9))
     np.testing.assert_allclose(colour, np.tile([110.0, 90.0, 60.0], (9, 1)), atol=8.0)
+
+
+def rock_in_a_channel():
+    """Ground with a bank of 45 degrees and a rock whose sides fall at 60 degrees, water at z = 0, and its picture."""
+    nodes = GRID.nodes()[:, :, 0]
+    away = np.hypot(nodes[..., 0], nodes[..., 1])
+    heights = np.maximum(0.1 - np.tan(np.radians(60)) * np.maximum(away - 0.15, 0.0), -0.4)
+    heights = np.maximum(heights, np.minimum(nodes[..., 1] - 0.5, 0.1))
+    rays = CAMERA.rays(CAMERA.pixel_grid())
+    water = CAMERA.position - rays * (CAMERA.position[2] / rays[..., 2])[..., None]
+    labels = np.where(water[..., 1] < 0.5, Label.FLUID, Label.BACKGROUND)
+    labels[np.hypot(water[..., 0], water[..., 1]) < 0.2] = Label.SOLID
+    plate = np.where((labels == Label.BACKGROUND)[..., None], (110.0, 90.0, 60.0), (20.0, 140.0, 160.0))
+    plate[labels == Label.SOLID] = (120, 120, 125)
+    seen = labels != Label.FLUID
+    return seen_on(heights, plate=plate, labels=labels, level=np.zeros((24, 16)), seen=seen), plate, seen
+
+
+def test_a_rock_goes_on_down_to_its_foot_and_a_bank_as_steep_is_no_rock():
+    mesh, *_ = rock_in_a_channel()
+    foot, place = colour_at(mesh, [0.28, -0.28, 0.0, 0.2], [0.0, 0.0, -0.28, 0.2])
+    assert (place[:, 2] < -0.05).all()  # under water
+    np.testing.assert_allclose(foot, np.tile([120.0, 120.0, 125.0], (4, 1)), atol=8.0)
+    bed, _ = colour_at(mesh, [0.8, -0.8, 0.0], [0.0, 0.0, 0.35])  # the last on the bank's side under water
+    np.testing.assert_allclose(bed, np.tile([110.0, 90.0, 60.0], (3, 1)), atol=8.0)
+
+
+def test_behind_a_fluid_the_picture_shows_the_ground_and_elsewhere_what_was_filmed():
+    mesh, plate, seen = rock_in_a_channel()
+    picture = over_bed(plate.astype(np.uint8), seen, mesh, CAMERA).astype(float)
+    uv, _ = CAMERA.project(np.array([[0.28, -0.1, -0.12], [0.8, 0.0, -0.4]]))
+    (x, y), (u, v) = np.round(uv - 0.5).astype(int)
+    np.testing.assert_allclose(picture[y, x], (120, 120, 125), atol=12.0)  # the rock's foot
+    np.testing.assert_allclose(picture[v, u], (110, 90, 60), atol=12.0)  # the bed
+    far = binary_erosion(seen, iterations=8)  # beyond the blend of 1.5 px
+    assert far.any() and (picture[far] == plate[far]).all()
 
 
 def test_vertex_colours_are_those_of_the_texture(level_ground):

@@ -124,14 +124,16 @@ def geometry(story: Story, inputs: Inputs, config: JobConfig) -> Result:
         )  # fmt: skip
     # the plate looks at a few frames only
     plate = generate.background_plate(clip.frames, cast(Any, fluid), ground.solid_share(fluid.labels) > 0.5)
+    picture = plate.image
     if setting.surface_height is not None:
         labels = ground.seen_labels(fluid, seen.start, seen.united, falling.pixels)
-        view = ground_texture.View(plate.image, camera, labels, np.asarray(plate.seen))
+        view = ground_texture.View(picture, camera, labels, np.asarray(plate.seen))
         setting = ground.textured(setting, view)
+        picture = ground_texture.over_bed(picture, view.seen, setting.terrain.mesh, camera)
     arrays, meta = ground.packed(setting)
     arrays |= {
         "mask": mask, "depth": depth, "half_thickness": half, "mean_flow": seen.motion, "mean_confidence": seen.trust,
-        "sighted_depth": (front.sighted * scale.value).astype(np.float32), "plate": plate.image,
+        "sighted_depth": (front.sighted * scale.value).astype(np.float32), "plate": picture,
     }  # fmt: skip
     meta |= {
         "warnings": warnings, "kind": kind, "kind_evidence": asdict(seen.evidence),

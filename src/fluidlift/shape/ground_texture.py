@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 
 from fluidlift.numerics.textures import sample_texture
+from fluidlift.numerics.triangles import rasterize_triangles
 from fluidlift.shape.background import filled_in
 from fluidlift.shape.ground_mesh import PARTS, cut_colour
 from fluidlift.types import Grid, Label, PinholeCamera, TriangleMesh
@@ -45,6 +46,12 @@ GRAIN = 0.005
 
 EVEN = 0.02
 """of the map's longer side: over this, ground that is not seen is evened out"""
+
+REPOSE = np.tan(np.radians(35.0))
+"""slope that gravel lies at, at most: the foot of a rock under water is of rock where it is steeper"""
+
+JOINT = 3
+"""texels that may lie between what was found as a rock on the water and its foot"""
 
 
 @dataclass(frozen=True)
@@ -98,6 +105,32 @@ def textured(
     return replace(mesh, uv=uv, texture=texture, colors=_vertex_colours(mesh, uv, texture))
 
 
+def over_bed(
+    plate: UInt8[np.ndarray, "h w 3"],
+    seen: Bool[np.ndarray, "h w"],
+    mesh: TriangleMesh,
+    camera: PinholeCamera,
+) -> UInt8[np.ndarray, "h w 3"]:
+    """The scene without its fluid, with the textured ground where no frame shows what is behind the fluid.
+
+    Args:
+        plate: sRGB.
+        seen: pixels of it that some frame shows.
+        mesh: of the ground, as `textured` gives it.
+        camera: of the plate, in the world.
+    """
+    found = rasterize_triangles(mesh.vertices, mesh.faces, camera)
+    drawn = found.face >= 0
+    if mesh.uv is None or mesh.texture is None or not drawn.any():
+        return plate
+    uv = (mesh.uv[found.face] * found.barycentric[..., None]).sum(axis=-2)
+    ground = 255.0 * sample_texture(mesh.texture, uv)
+    weight = np.clip(2.0 * ndimage.gaussian_filter((~seen).astype(np.float32), 1.5), 0.0, 1.0)
+    weight[~seen] = 1.0
+    weight = (weight * drawn)[..., None]
+    return np.clip(np.round(plate * (1.0 - weight) + ground * weight), 0, 255).astype(np.uint8)
+
+
 def _texel(top: np.ndarray, camera: PinholeCamera, longest: int) -> float:
     """Width of a texel, m."""
     points = top.reshape(-1, 3)
@@ -135,10 +168,23 @@ def _map(top: np.ndarray, level: np.ndarray, view: View, texel: float) -> _Map:
     painted = (view.labels[row, col] == Label.SOLID).reshape(height, width)
     # the rim of a rock's picture is mixed with what is behind it
     painted_well = cv2.erode(painted.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    drowned = (ground[:, 2] < surface[:, 2]).reshape(height, width) & ~rock
+    z_ground, z_water = (points[:, 2].reshape(height, width) for points in (ground, surface))
+    rock = _feet(rock, z_ground, z_water, texel)
+    drowned = (z_ground < z_water) & ~rock
     known = inside.reshape(height, width) & ~hidden & np.where(rock, painted_well, ~painted)
     known &= ~drowned | view.seen[row, col].reshape(height, width)
     return _Map(image.astype(np.float32), known, rock, drowned)
+
+
+def _feet(rock: np.ndarray, height: np.ndarray, level: np.ndarray, texel: float) -> np.ndarray:
+    """bool [h,w]: rocks on the water, and what goes down from them below its level (m) more steeply than gravel."""
+    if not rock.any():
+        return rock
+    away = texel * ndimage.distance_transform_edt(~rock)
+    falls = -sum(a * b for a, b in zip(np.gradient(away), np.gradient(height), strict=True)) / texel**2
+    near = away <= JOINT * texel
+    foot = (level - height > REPOSE * (away - JOINT * texel)) & ((falls > REPOSE) | near)
+    return ndimage.binary_fill_holes(ndimage.binary_propagation(rock, mask=rock | foot))
 
 
 def hidden_ground(top: Float[np.ndarray, "nx ny 3"], eye: Float[np.ndarray, "3"]) -> Bool[np.ndarray, "nx ny"]:

@@ -173,3 +173,17 @@ def test_what_moves_is_lit_as_if_it_stayed():
     # maps of their own for what moves: edges of shadows lie a texel beside, and the rest is the same
     off = np.abs(apart.image - whole.image).max(axis=-1)
     assert np.median(off) < 0.005 and (off > 0.1).mean() < 0.02
+
+
+def test_ground_that_a_caster_stands_out_over_is_lit_and_what_lies_deeper_is_not():
+    sky, off = lamp((0.0, 0.0, 1.0), around=0.0), 0.1
+    box = body(trimesh.creation.box((1.0, 1.0, 0.8)))
+    ground = Ground([floor()], sky, NO_AMBIENT)
+    whole, thin = (ground.picture(CAMERA, caster=box, inset=i).image.mean(axis=-1) for i in (0.0, off))
+    middle = np.array(CAMERA.size[::-1]) // 2
+    assert whole[tuple(middle)] < 0.01 and thin[tuple(middle)] < 0.01  # 0.4 m below its top
+    low = TriangleMesh(box.vertices - [0.0, 0.0, 0.4 - 0.5 * off], box.faces)
+    whole, thin = (ground.picture(CAMERA, caster=low, inset=i).image.mean(axis=-1) for i in (0.0, off))
+    open_ = ground.picture(CAMERA).image.mean(axis=-1)
+    assert whole[tuple(middle)] < 0.01  # 0.05 m below its top, which stands out by 0.1 m
+    assert thin[tuple(middle)] == pytest.approx(open_[tuple(middle)], rel=1e-3)

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from fluidlift.look.fluid_normals import fluid_depths, fluid_normals, fluid_surface
 from fluidlift.look.surface_map import SurfaceMap
-from fluidlift.look.surface_skin import BARE, CROWDED, PITCH, SurfaceSkin
+from fluidlift.look.surface_skin import BARE, CROWDED, PITCH, SurfaceSkin, of_skin, without_skin
+from fluidlift.types import Gaussians, concatenate
 
 CELL = 0.1
 SPACING = PITCH * CELL
@@ -75,3 +77,39 @@ def test_what_has_run_dry_has_no_skin():
 def test_cells_without_width_are_refused():
     with pytest.raises(ValueError, match="cell"):
         SurfaceSkin(0.0)
+
+
+def painted() -> tuple[Gaussians, Gaussians]:
+    """A body of particles half a cell apart, and the skin that floats on it."""
+    x, y, z = (
+        a.ravel() for a in np.meshgrid(*(np.arange(0.025, s, 0.5 * CELL) for s in (1.6, 1.6, 0.5)), indexing="ij")
+    )
+    rng = np.random.default_rng(1)
+    sizes = rng.uniform(0.1, 0.4, (len(x), 3)) * CELL
+    body = Gaussians.isotropic(np.stack([x, y, z], -1), 1.0, np.full((len(x), 3), 0.5), 0.9)
+    body = Gaussians(body.means, body.quats, sizes.astype(np.float32), body.opacities, body.sh)
+    where = surface(tilt=0.1, reach=1.6)
+    skin = advanced(where, 2)
+    return body, skin.splats(where, np.full((len(skin), 3), 0.5))
+
+
+def test_splats_of_a_skin_are_known_by_their_size_in_a_file_as_well():
+    body, skin = painted()
+    logarithms = np.log(skin.scales).astype(np.float32)  # as files hold them
+    skin = Gaussians(skin.means, skin.quats, np.exp(logarithms), skin.opacities, skin.sh)
+    assert of_skin(skin, CELL).all() and not of_skin(body, CELL).any()
+    assert not of_skin(skin, 1.05 * CELL).any()
+    kept = without_skin(concatenate([body, skin]), CELL)
+    np.testing.assert_array_equal(kept.means, body.means)
+    assert without_skin(body, CELL) is body and len(of_skin(Gaussians.empty(), CELL)) == 0
+
+
+def test_a_skin_adds_nothing_to_the_body_that_it_floats_on():
+    body, skin = painted()
+    both, n = concatenate([body, skin]), len(body)
+    normals, share = fluid_normals(body, 0.5 * CELL)
+    found, belongs = fluid_normals(both, 0.5 * CELL)
+    np.testing.assert_array_equal(found[:n], normals)
+    np.testing.assert_array_equal(belongs[:n], share)
+    np.testing.assert_array_equal(fluid_depths(both, found, 0.5 * CELL)[:n], fluid_depths(body, normals, 0.5 * CELL))
+    np.testing.assert_array_equal(fluid_surface(both, 0.5 * CELL).vertices, fluid_surface(body, 0.5 * CELL).vertices)

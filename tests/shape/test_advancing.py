@@ -1,9 +1,11 @@
 """A fluid that moves through the picture stands out from the still scene behind it."""
 
+from types import SimpleNamespace
+
 import numpy as np
 
 from fluidlift.shape.advancing import median_over_time
-from fluidlift.shape.background import colour_histogram, filled_in, quiet_fluid, without_background
+from fluidlift.shape.background import colour_histogram, filled_in, quiet_fluid, smooth_ground, without_background
 
 
 def test_the_median_over_time_drops_a_single_frame():
@@ -57,3 +59,22 @@ def test_a_calm_part_of_the_plume_joins_by_its_colour_only_where_it_stirs_or_not
     found = quiet_fluid(picture, domain, moving, around, stirred)
     assert found[15:25, 10:25].all() and not found[:, 25:][~domain[:, 25:]].any()
     assert not found[:, :10].any()
+
+
+def test_ground_that_flickers_in_the_light_of_a_plume_is_no_plume_and_its_quiet_column_is():
+    picture = np.full((40, 40, 3), 150.0, np.float32)
+    picture[:30, 15:25, 0] = 200.0  # the column: its outline is an edge, the flickering ground below has none
+    known = np.ones((40, 40), bool)
+    known[:40, 15:25] = False
+    activity = np.full((40, 40), 0.5, np.float32)
+    activity[:, 15:25] = 1.6  # doubtful, by a third of the spread of still things
+    activity[:10, 15:25] = 3.0
+    evidence = SimpleNamespace(
+        pictures=picture[None].repeat(3, axis=0), activity=activity, level=1.5, noise=np.ones((40, 40), np.float32)
+    )
+    ground = smooth_ground(evidence, picture, known, lambda colours: np.zeros(colours.shape[:-1]))
+    expected = np.zeros((40, 40), bool)
+    expected[30:, 15:25] = True
+    assert np.array_equal(ground, expected)
+    activity[10:, 15:25] = 3.0  # as lively as the fluid: nothing is taken away
+    assert not smooth_ground(evidence, picture, known, lambda colours: np.zeros(colours.shape[:-1])).any()

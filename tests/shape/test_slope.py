@@ -61,6 +61,21 @@ def test_a_level_stream_stays_level(pitch):
     assert found.level_share > 0.5
 
 
+@pytest.mark.parametrize("slope", [13.0, 21.0])
+def test_the_heading_belongs_to_the_slope_that_is_taken(slope):
+    camera, mask, motion = film(slope, -20.0, 31.0, 0.75)
+    found = evidence_of(camera, mask, motion)
+    axes = plane_axes(np.radians(found.slope), np.radians(found.heading))
+    middle = np.argwhere(mask).mean(axis=0)[::-1] + 0.5
+    ray = camera.rays(middle)
+    start = ray / -(ray @ axes[2])
+    ends, _ = camera.project(np.stack([start - 1e-3 * axes[0], start + 1e-3 * axes[0]]))
+    shown, seen = ends[1] - ends[0], motion[mask].mean(axis=0)
+    turned = np.degrees(np.arctan2(shown[0] * seen[1] - shown[1] * seen[0], shown @ seen))
+    # the middle of the pixels is not quite where the mean motion is seen; the neighbouring slope's heading is off by 1
+    assert abs(turned) < 0.4
+
+
 def test_without_motion_a_stream_is_level_and_says_why():
     found = estimate_slope(tilted(30.0), None)
     assert (found.slope, found.level_share) == (0.0, 1.0)
@@ -128,6 +143,16 @@ def test_a_stream_surface_lies_on_the_plane_that_was_filmed():
     # a level plane is off by more than this in the middle of the pixels
     assert np.median(error) < 0.03
     assert front.slope is not None and front.slope.slope > 0
+
+
+def test_bent_by_its_energy_a_film_is_as_steep_over_the_ground_as_its_plane():
+    camera, mask, motion = film(22.0, -20.0, 31.0, 0.75)
+    trust = np.ones(mask.shape)
+    plane = stream_surface(camera, mask, motion, trust, 0.04)
+    # slow: its velocity heads are nothing
+    bent = stream_surface(camera, mask, motion, trust, 0.04, camera_height=0.02)
+    assert plane.slope is not None and bent.slope is not None
+    assert bent.slope.slope == pytest.approx(plane.slope.slope, abs=0.3)  # 1.4 less, if taken over the way along it
 
 
 def test_a_profile_along_a_stream_goes_straight_on_and_is_level_across():

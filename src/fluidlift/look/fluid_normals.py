@@ -18,6 +18,7 @@ from scipy import ndimage
 
 from fluidlift.errors import require
 from fluidlift.look.smoothstep import eased, smoothstep
+from fluidlift.look.surface_skin import without_skin
 from fluidlift.numerics.isosurface import surface_nets
 from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.types.gaussians import Gaussians
@@ -37,6 +38,10 @@ AT_SURFACE = (0.08, 0.35)
 from which it does in full"""
 SHADOWED = 0.35
 """share of a full body's density where the surface for shadows lies: a layer of one splat has half of it"""
+OUTSIDE = 0.85
+"""spacings that the surface for shadows stands outside of a thick body"""
+SPACINGS = 2.0
+"""of the splats in a cell of the simulation"""
 STEPS = 48
 """nodes' distances that the depth of a body is followed to each side of a splat"""
 EMPTY = 0.2
@@ -64,7 +69,7 @@ def fluid_normals(
     """
     points = gaussians.means
     normals, share = np.empty((len(points), 3), np.float32), np.empty(len(points), np.float32)
-    low, h, density = _body(points, spacing)
+    low, h, density = _body(gaussians, spacing)
     if terrain is not None:
         add_solid_kernel(terrain.signed_distance, terrain.grid.low, terrain.grid.spacing, low, h, density)
     density = _blurred(_blurred(density))
@@ -81,7 +86,7 @@ def fluid_depths(gaussians: Gaussians, normals: Float[np.ndarray, "n 3"], spacin
         gaussians, spacing: as of `fluid_normals`.
         normals: unit.
     """
-    low, h, density = _body(gaussians.means, spacing)
+    low, h, density = _body(gaussians, spacing)
     out = np.zeros(len(gaussians), np.float32)
     depths_kernel(gaussians.means, np.ascontiguousarray(normals, np.float32), low, h, density, out)
     return out
@@ -90,16 +95,17 @@ def fluid_depths(gaussians: Gaussians, normals: Float[np.ndarray, "n 3"], spacin
 def fluid_surface(gaussians: Gaussians, spacing: float) -> TriangleMesh:
     """A closed, coarse surface of the fluid, for shadows: films of one layer of splats are in it, single drops are not.
 
-    Its edges are a few spacings long, and it stands off the fluid by about one.
+    Its edges are a few spacings long, and it stands `OUTSIDE` spacings off a thick body.
     """
-    low, h, density = _body(gaussians.means, spacing)
+    low, h, density = _body(gaussians, spacing)
     vertices, faces = surface_nets(SHADOWED - density, spacing=h, origin=(float(low[0]), float(low[1]), float(low[2])))
     return TriangleMesh(vertices.astype(np.float32), faces)
 
 
-def _body(points: np.ndarray, spacing: float) -> tuple[np.ndarray, float, np.ndarray]:
-    """Low corner, distance and densities (1: full) of the nodes around the splats."""
+def _body(gaussians: Gaussians, spacing: float) -> tuple[np.ndarray, float, np.ndarray]:
+    """Low corner, distance and densities (1: full) of the nodes around the splats; a skin is not counted."""
     require(np.isfinite(spacing) and spacing > 0, f"spacing {spacing}", "positive metres")
+    points = without_skin(gaussians, SPACINGS * spacing).means
     sound = points if np.isfinite(points).all() else points[np.isfinite(points).all(axis=1)]
     low, h, shape = _nodes(sound, spacing) if len(sound) else (np.zeros(3), spacing, (4, 4, 4))
     density = np.zeros(shape, np.float32)

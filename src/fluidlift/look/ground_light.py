@@ -72,6 +72,8 @@ class Casters:
     radius: float
     share: float = 1.0
     """of the width of a map: things that move get texels as large as those of what stays"""
+    inset: float = 0.0
+    """m that the caster stands outside of the liquid that it is made of: shadows begin so far behind its surface"""
     _maps: dict = field(default_factory=dict, repr=False, compare=False)
 
     @classmethod
@@ -81,12 +83,15 @@ class Casters:
         caster: TriangleMesh | None = None,
         material: Material | None = None,
         beside: Casters | None = None,
+        *,
+        inset: float = 0.0,
     ) -> Casters | None:
         """Of opaque meshes and of a liquid, which lets light through if its material is known.
 
         Args:
             meshes, caster, material: as of `ground_picture`.
             beside: what stays, where these are what moves.
+            inset: m, as of the field.
 
         Returns:
             None where nothing has a face.
@@ -104,11 +109,11 @@ class Casters:
         low, high = all_points.min(axis=0), all_points.max(axis=0)
         middle, radius = 0.5 * (low + high), max(0.5 * float(np.linalg.norm(high - low)), 1e-9)
         if beside is None:
-            return cls(vertices, faces, caster, material, middle, radius)
+            return cls(vertices, faces, caster, material, middle, radius, inset=inset)
         step = beside.radius / PLACES
         middle = step * np.round(middle / step)
         radius = step * math.ceil(radius / step + 1.0)
-        return cls(vertices, faces, caster, material, middle, radius, min(radius / beside.radius, 4.0))
+        return cls(vertices, faces, caster, material, middle, radius, min(radius / beside.radius, 4.0), inset)
 
     def light_left(
         self, points: np.ndarray, normals: np.ndarray, toward: np.ndarray, size: int, soft: float
@@ -152,13 +157,16 @@ class Casters:
         assert self.caster is not None
         if self.material is None:
             found = rasterize_triangles(self.caster.vertices, self.caster.faces, sun)
-            return found.depth, np.where(found.hit, 0.0, 1.0)[..., None].repeat(3, axis=-1).astype(np.float32)
+            first = found.depth + np.float32(self.inset) * found.hit
+            return first, np.where(found.hit, 0.0, 1.0)[..., None].repeat(3, axis=-1).astype(np.float32)
         closed = rasterize_closed(self.caster.vertices, self.caster.faces, sun)
         m = self.material
-        through = transmittance(np.asarray(m.absorption) + m.scattering, closed.inside)
+        inside = np.maximum(closed.inside - 2.0 * self.inset, 0.0)
+        through = transmittance(np.asarray(m.absorption) + m.scattering, inside)
         through *= float(1.0 - fresnel(np.ones(1), m.refractive_index)[0])
         hit = closed.front.hit
-        return closed.front.depth, np.where(hit[..., None], through, 1.0).astype(np.float32)
+        first = closed.front.depth + np.float32(self.inset) * hit
+        return first, np.where(hit[..., None], through, 1.0).astype(np.float32)
 
 
 @dataclass(frozen=True)

@@ -94,9 +94,12 @@ class Ground:
         *,
         material: Material | None = None,
         bodies: Sequence[TriangleMesh] = (),
+        inset: float = 0.0,
     ) -> Behind:
         """`ground_picture` of these meshes and of `bodies`, which move. What is found of the meshes alone is kept for
         the last camera: the picture is the same, and the next one costs what moves.
+
+        inset: m that the caster stands outside of the liquid that it is made of.
         """
         width, height = camera.size
         behind = behind or surroundings(camera, self.environment)
@@ -104,7 +107,7 @@ class Ground:
         bodies = [m for m in bodies if len(m.faces)]
         if not self.meshes and not bodies:
             return behind
-        moving = Casters.of(bodies, caster, material, beside=self.casters)
+        moving = Casters.of(bodies, caster, material, self.casters, inset=inset)
         seen = self._seen(camera)
         layers = [seen]
         if bodies:
@@ -112,10 +115,16 @@ class Ground:
             _draw(bodies, camera, depth, albedo, normal)
             moved = depth != seen.depth
             layers.append(_Surfaces(self, camera, np.where(moved, depth, 0.0).astype(np.float32), albedo, normal))
-        image, before = behind.image.copy(), behind.depth.copy()
+        image, before, direct = behind.image.copy(), behind.depth.copy(), None
         for layer in layers:
-            lay_over(layer.image(moving), layer.depth, image, before)
-        return Behind(image, before)
+            light, strongest = layer.image(moving)
+            lay_over(light, layer.depth, image, before)
+            if strongest is not None:
+                seen_there = ((layer.depth > 0) & (before == layer.depth))[..., None]
+                direct = strongest if direct is None else np.where(seen_there, strongest, direct)
+        if direct is not None and behind.depth.any():
+            direct = np.where((before == behind.depth)[..., None], np.float32(0.0), direct)
+        return Behind(image, before, direct=direct)
 
     def depth(self, camera: PinholeCamera) -> Float[np.ndarray, "h w"]:
         """Camera z (m; 0: none) of these meshes: of the ground that a photograph in place of its picture shows."""
@@ -182,25 +191,28 @@ class _Surfaces:
         filled_in(coarse, STEP, self.depth, self.normal, ALIKE, out)
         return out
 
-    def image(self, moving: Casters | None) -> np.ndarray:
-        """Linear light [h,w,3]; 0 where there are no surfaces."""
+    def image(self, moving: Casters | None) -> tuple[np.ndarray, np.ndarray | None]:
+        """Linear light [h,w,3], and what of it is the strongest light's, with its cosine (as `Behind.direct`); 0 where
+        there are no surfaces."""
         return self._standing if moving is None else self._lit(moving)
 
     @cached_property
-    def _standing(self) -> np.ndarray:
+    def _standing(self) -> tuple[np.ndarray, np.ndarray | None]:
         return self._lit(None)
 
-    def _lit(self, moving: Casters | None) -> np.ndarray:
+    def _lit(self, moving: Casters | None) -> tuple[np.ndarray, np.ndarray | None]:
         there, points, normals, whole, direct, share = self._pixels
         ambient = self._ambient(moving)[there]
-        light = whole * ambient
+        light, strongest = whole * ambient, None
         if direct is not None:
             toward = self.ground.environment.light()[0]
             left = share if moving is None else share * self._sun(moving, points, normals, toward)
             light = (whole - direct) * ambient + direct * left
+            strongest = np.zeros((*self.depth.shape, 4), np.float32)
+            strongest[there] = np.concatenate([self.albedo[there] * direct * left, (normals @ toward)[:, None]], axis=1)
         image = np.zeros_like(self.albedo)
         image[there] = self.albedo[there] * light
-        return image
+        return image, strongest
 
 
 def place_of(camera: PinholeCamera) -> tuple:

@@ -104,6 +104,8 @@ class Behind:
     goes_on: bool = False
     """it stands for what lies beyond its rim, too: first the rim, then the mean. For the plate of a clip, around which
     nobody knows the world; else that is the environment's"""
+    direct: Float[np.ndarray, "h w 4"] | None = None
+    """what of it is the strongest light's (linear), and the cosine under which that falls in; None: nothing"""
 
     def __post_init__(self) -> None:
         shape = np.shape(self.depth)

@@ -38,7 +38,9 @@ LIMIT = 3.0
 FALL = 1.0
 """radii by which a surface falls off beyond its outline, for the smoothing"""
 EVEN = 0.8
-"""radii: standard deviation of the smoothing of thickness and colour"""
+"""radii: standard deviation of the smoothing of colour and cover"""
+EVEN_THICKNESS = 1.5
+"""radii: that of thickness, wider than the particles lie apart: a sum over them shows how they crowd"""
 THIN = 0.35
 """radii of thickness from which a pixel counts as covered"""
 RIM = (0.42, 0.67)
@@ -153,9 +155,10 @@ def _through_spheres(
     sums[5] = np.isfinite(depth[: step * small.size[1] : step, : step * small.size[0] : step])
     near = depth[::4, ::4]
     near = near[np.isfinite(near)]
-    sigma = min(EVEN * radius * small.focal[0] / (float(np.median(near)) if len(near) else typical), 20.0)
-    reach = 2 * int(2.5 * sigma + 0.5) + 1
-    for picture in sums:
+    pixels = radius * small.focal[0] / (float(np.median(near)) if len(near) else typical)
+    for k, picture in enumerate(sums):
+        sigma = min((EVEN if k else EVEN_THICKNESS) * pixels, 20.0)
+        reach = 2 * int(2.5 * sigma + 0.5) + 1
         cv2.GaussianBlur(picture, (reach, reach), sigma, dst=picture, borderType=cv2.BORDER_CONSTANT)
     carried = np.empty((*sums.shape[1:], 3), np.float32)
     np.divide(np.moveaxis(sums[1:4], 0, -1), np.maximum(sums[4], 1e-12)[..., None], out=carried)

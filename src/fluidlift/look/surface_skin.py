@@ -8,7 +8,7 @@ surface, new ones come where they have been drawn apart, and some go where they 
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
@@ -28,8 +28,31 @@ THICKNESS = 0.12
 OPACITY = 0.9
 """of each: neighbours cover what is below"""
 
+ALIKE = 1e-3
+"""by how much a splat's size may differ from the skin's: files hold logarithms in single precision"""
 CROWDED, BARE = 0.55, 0.75
 """spacings to the next tracer below which one of two goes, and above which a new one comes"""
+
+
+def of_skin(gaussians: Gaussians, cell: float) -> Bool[np.ndarray, " n"]:
+    """Which splats are a skin's, by their size, which no other splat has. They are no liquid, but paint on it, and
+    count for nothing in its volume, its surface and its shadow.
+
+    Args:
+        gaussians: of a frame.
+        cell: width of the simulator's cells, m.
+    """
+    wanted = cell * np.array([THICKNESS, WIDTH * PITCH, WIDTH * PITCH])
+    s = gaussians.scales
+    found = np.abs(np.minimum(np.minimum(s[:, 0], s[:, 1]), s[:, 2]) - wanted[0]) < ALIKE * wanted[0]
+    found[found] = (np.abs(np.sort(gaussians.scales[found], axis=1) / wanted - 1.0) < ALIKE).all(axis=1)
+    return found
+
+
+def without_skin(gaussians: Gaussians, cell: float) -> Gaussians:
+    """The splats that stand for liquid."""
+    skin = of_skin(gaussians, cell)
+    return gaussians.select(~skin) if skin.any() else gaussians
 
 
 class SurfaceSkin:

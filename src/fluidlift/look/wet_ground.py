@@ -1,26 +1,34 @@
 """Ground that liquid stands on, in the picture behind that liquid: wet ground is darker than dry ground.
 
 `ground_picture` knows how much light the liquid lets through to the ground. Here is what its surface does to that
-light: it bends the ways down, and throws most of what matt ground sends up back onto it (`optics.wet_light`).
+light: it bends the ways down, and throws most of what matt ground sends up back onto it (`optics.wet_light`, for even
+light; the strongest light has one way down).
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from functools import lru_cache
 
 import numba as nb
 import numpy as np
 from jaxtyping import Float
 
+from fluidlift.look.environment_stack import fading
 from fluidlift.look.liquid import Behind, LiquidSurface
 from fluidlift.look.liquid_kernels import RESTS, ROOM
 from fluidlift.look.materials import Material
-from fluidlift.look.optics import wet_light, wet_table
+from fluidlift.look.optics import fresnel, wet_light, wet_table
 from fluidlift.look.smoothstep import eased, smoothstep
 from fluidlift.types.camera import PinholeCamera
 
 ALBEDO = 0.4
 """of obstacles, whose own is not at hand"""
+LOWEST = 0.1
+"""cosine under which the strongest light falls in, at least"""
+MOST = 1.5
+"""optical depth that bent ways are shorter than straight ones, at most: the shadow's own way may be another"""
 
 
 def wetted(
@@ -50,18 +58,30 @@ def wetted(
         (surface.covered, surface.depth, surface.normal, surface.thickness, float(surface.grain)),
         (behind.depth, *(np.ascontiguousarray(g, np.float32) for g in ground)),
         np.array([*camera.focal, *camera.center], np.float64), pose, extinction,
-        np.stack(wet_table(float(material.refractive_index))), shaded, image,
+        np.stack(wet_table(float(material.refractive_index))), _slants(float(material.refractive_index)), shaded,
+        np.zeros((0, 0, 4), np.float32) if behind.direct is None else np.asarray(behind.direct, np.float32), image,
     )  # fmt: skip
-    return Behind(image, behind.depth, behind.goes_on)
+    return replace(behind, image=image)
+
+
+@lru_cache(maxsize=16)
+def _slants(index: float) -> np.ndarray:
+    """For light that falls in under cosines from 0 to 1, evenly spaced: the share that enters, over n^2; the way
+    inside, over the depth; the share that enters."""
+    cos = np.linspace(0.0, 1.0, 513)
+    enters = 1.0 - fresnel(np.maximum(cos, 1e-6), index)
+    return np.stack([enters / index**2, 1.0 / np.sqrt(np.maximum(1.0 - (1.0 - cos**2) / index**2, 1e-6)), enters])
 
 
 @nb.njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def dampen(liquid, ground, lens, pose, extinction, table, shaded, image):
+def dampen(liquid, ground, lens, pose, extinction, table, slants, shaded, direct, image):
     """`wetted_plain`, pixel by pixel. liquid: covered, depth, normal, thickness, grain; ground: depth of what is
-    behind, albedo and depth of the ground alone; table: of `optics.wet_table`."""
+    behind, albedo and depth of the ground alone; table: of `optics.wet_table`; slants: of `_slants`;
+    direct: of `Behind`, or empty."""
     covered, near, normals, thickness, grain = liquid
     behind, albedo, own = ground
     deep, last = table[0, -1], table.shape[1] - 1
+    steps, straight_in = slants.shape[1] - 1, slants[2, -1]
     for row in nb.prange(near.shape[0]):
         i = np.int64(row)
         y = (i + 0.5 - lens[3]) / lens[1]
@@ -82,6 +102,14 @@ def dampen(liquid, ground, lens, pose, extinction, table, shaded, image):
             share = covered[i, j] * (1.0 - max(free, 0.0))
             if grain > 0.0:
                 share *= eased(height / grain)
+            longer, straight, enters = 1.0, 1.0, 0.0
+            if direct.shape[0] > 0:
+                at = min(max(np.float64(direct[i, j, 3]), LOWEST), 1.0) * steps
+                low = min(int(at), steps - 1)
+                part = at - low
+                longer = slants[1, low] + part * (slants[1, low + 1] - slants[1, low])
+                enters = slants[0, low] + part * (slants[0, low + 1] - slants[0, low])
+                straight = steps / at
             same = abs(end - own[i, j]) <= 1e-4 * own[i, j]
             for k in range(3):
                 at = last * math.sqrt(min(height * extinction[k], deep) / deep)
@@ -92,7 +120,16 @@ def dampen(liquid, ground, lens, pose, extinction, table, shaded, image):
                 if not shaded:
                     arrives *= table[3, low] + part * (table[3, low + 1] - table[3, low])
                 color = np.float64(albedo[i, j, k]) if same else ALBEDO
-                image[i, j, k] *= 1.0 + share * (arrives / (1.0 - color * back) - 1.0)
+                first, light = 0.0, np.float64(image[i, j, k])
+                if direct.shape[0] > 0:
+                    first, depth = min(np.float64(direct[i, j, k]), light), height * extinction[k]
+                    if shaded:  # by a straight way, and less what is mirrored straight on
+                        way = math.exp(min(depth * (straight - longer), MOST)) / straight_in
+                    else:
+                        way = fading(depth * longer)
+                    first, light = first * enters * way, light - first
+                wet = (light * arrives + first) / (1.0 - color * back)
+                image[i, j, k] += share * (wet - image[i, j, k])
 
 
 def wetted_plain(
@@ -112,10 +149,22 @@ def wetted_plain(
     color = np.where(own[:, None], albedo[wet], ALBEDO)
     thick = height[wet, None] * (np.asarray(material.absorption) + material.scattering)
     arrives, back, straight = wet_light(thick, material.refractive_index)
-    factor = (arrives if shaded else arrives * straight) / (1.0 - color * back)
     image = behind.image.copy()
-    image[wet] *= 1.0 + share[wet, None] * (factor - 1.0)
-    return Behind(image, behind.depth, behind.goes_on)
+    dry, first = image[wet], np.zeros((int(wet.sum()), 3))
+    even = dry
+    if behind.direct is not None:
+        slant = np.clip(behind.direct[wet][:, 3:], LOWEST, 1.0).astype(np.float64)
+        first = np.minimum(behind.direct[wet][:, :3], dry)
+        even = dry - first
+        index = material.refractive_index
+        bent = np.sqrt(1.0 - (1.0 - slant**2) / index**2)
+        way = np.exp(-thick / bent)
+        if shaded:
+            way = np.exp(np.minimum(thick / slant - thick / bent, MOST)) / (1.0 - fresnel(np.ones(1), index))
+        first = first * way * (1.0 - fresnel(slant, index)) / index**2
+    light = even * (arrives if shaded else arrives * straight) + first
+    image[wet] += share[wet, None] * (light / (1.0 - color * back) - dry)
+    return replace(behind, image=image)
 
 
 def standing(

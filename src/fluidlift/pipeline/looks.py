@@ -15,7 +15,7 @@ from fluidlift.errors import InputRejected, require
 from fluidlift.io.scene_look import Look
 from fluidlift.look.display import displayed
 from fluidlift.look.environment import BUILT_IN, LUMINANCE, Environment, built_in
-from fluidlift.look.fluid_normals import fluid_depths, fluid_normals, fluid_surface
+from fluidlift.look.fluid_normals import OUTSIDE, fluid_depths, fluid_normals, fluid_surface
 from fluidlift.look.ground_picture import Ground, place_of
 from fluidlift.look.liquid import Behind, LiquidSurface, shaded
 from fluidlift.look.materials import Material, material_named
@@ -23,6 +23,7 @@ from fluidlift.look.open_end import OpenEnd
 from fluidlift.look.rasterize import render
 from fluidlift.look.relight import relit
 from fluidlift.look.screen_space import mesh_surface, particle_surface
+from fluidlift.look.surface_skin import without_skin
 from fluidlift.look.transparent import splat_surface
 from fluidlift.look.vessel import Pane, before_glass, panes, vessel_apart
 from fluidlift.look.wet_ground import wetted
@@ -262,7 +263,9 @@ class Painter:
             depth = np.where(depth > 0, depth, self._ground.depth(camera))
         # what is drawn as splats hides what is behind it, and lets no light through to the ground either
         clear = None if self.look.style == "relit" else self.material
-        found = ground.picture(camera, Behind(far, depth), mesh, material=clear, bodies=frame.bodies)
+        # the caster made of splats stands outside of them: ground in between is beside the fluid, not under it
+        inset = 0.0 if self._mesher is not None else OUTSIDE * 0.5 * self.terrain.grid.spacing
+        found = ground.picture(camera, Behind(far, depth), mesh, material=clear, bodies=frame.bodies, inset=inset)
         # nobody knows what is around a clip: its own rim and mean fit it better than another world's sky
         return replace(found, goes_on=backdrop.picture is not None)
 
@@ -339,6 +342,7 @@ class Painter:
     ) -> LiquidSurface:
         if mesh is not None:
             return mesh_surface(mesh, camera, radius=RADIUS * self.terrain.grid.spacing)
+        fluid = without_skin(fluid, self.terrain.grid.spacing)
         if self.look.style == "transparent":
             apart = 0.5 * self.terrain.grid.spacing
             normals, share = fluid_normals(fluid, apart, self._bed)

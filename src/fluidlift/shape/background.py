@@ -9,6 +9,8 @@ import numpy as np
 from scipy.ndimage import convolve1d
 
 from fluidlift.shape.evidence import Evidence
+from fluidlift.shape.frame_pictures import typical_picture
+from fluidlift.shape.min_cut import geodesic_distance
 from fluidlift.shape.presence import Presence
 
 DECISIVE = 3.5
@@ -17,6 +19,12 @@ FAINT = 0.25
 """of the activity that separates still from moving: what is less is noise; 0.5 loses 3 % of a noisy or a small plume"""
 RARE = 20.0
 """times rarer around the fluid than in it is a colour that tells fluid without any activity"""
+ROUNDS = 3
+"""in which the colours of the scene are read anew from all of it that is known"""
+OWN = 0.5
+"""trust in the fluid's colours above which it has colours of its own: through clear water edges are those behind it"""
+SURE = 2.0
+"""log odds from which a place where no background was seen is held to be fluid"""
 
 
 def still_background(
@@ -26,8 +34,10 @@ def still_background(
 
     A pixel is taken before the fluid first reached it, or after it was last seen there. What looks more like the
     moving fluid than like the surroundings is not believed: a steady column of smoke is quiet too. The domain is
-    extended, in place, over such quiet fluid where it touches the moving one. Colour is trusted as far as the moving
-    places have colours of their own: clear water shows those of the background.
+    extended, in place, over such quiet fluid where it touches the moving one, and freed of `smooth_ground` where the
+    fluid has colours of its own. Colour is trusted as far as the moving places have: clear water shows those of the
+    background. The scene's colours are those of all that is known, so that ground of one colour with the smoke is
+    believed where the rest of that ground is.
     """
     total, count = np.zeros((*domain.shape, 3), np.float32), np.zeros(domain.shape, np.float32)
     for t in range(presence.frames):
@@ -39,7 +49,24 @@ def still_background(
     moving = colour_histogram(pictures[presence.active])
     faint = evidence.activity > FAINT * evidence.level
     domain |= quiet_fluid(background, domain, moving, colour_histogram(pictures[:, ~domain]), faint)
-    around = colour_histogram(pictures[:, ~domain])
+    seen = count >= 3
+    known = seen & ~domain
+    for _ in range(ROUNDS):
+        around = len(pictures) * colour_histogram(background[known])
+        like_fluid, trust = colour_test(moving, around)
+        known = seen & (like_fluid(background) <= np.log(2.0))
+    if trust > OWN:
+        domain &= ~smooth_ground(evidence, background, known, like_fluid)
+    return background, known, like_fluid
+
+
+def colour_test(moving: np.ndarray, around: np.ndarray) -> tuple[Callable[[np.ndarray], np.ndarray], float]:
+    """Log odds of fluid of opponent colours [...,3], and how far they are trusted, 0 to 1.
+
+    Args:
+        moving: histogram of the moving places.
+        around: histogram of the scene around.
+    """
     fluid = without_background(moving, around)
     rare = 1e-5 * (around.sum() + fluid.sum())
     trust = float(np.clip((fluid.sum() / max(moving.sum(), 1.0) - 0.3) / 0.4, 0.0, 1.0))
@@ -48,8 +75,31 @@ def still_background(
         bins = colour_bins(picture)
         return trust * np.clip(np.log((fluid[bins] + rare) / (around[bins] + rare)), -DECISIVE, DECISIVE)
 
-    suspect = like_fluid(background) > np.log(2.0)
-    return background, (count >= 3) & ~suspect, like_fluid
+    return like_fluid, trust
+
+
+def smooth_ground(
+    evidence: Evidence, background: np.ndarray, known: np.ndarray, like_fluid: Callable[[np.ndarray], np.ndarray]
+) -> np.ndarray:
+    """bool [h,w]: what always moves a little, but no edge parts it from the still ground.
+
+    Light that a plume sheds on the ground flickers, and has the plume's colours. What is doubtful, and nearer to known
+    background than to sure fluid along the picture (geodesic distance), is ground.
+
+    Args:
+        evidence: of the clip.
+        background: float32 [h,w,3].
+        known: bool [h,w], where it is known.
+        like_fluid: log odds of colours.
+    """
+    typical = typical_picture(evidence.pictures)
+    moved = (evidence.activity - evidence.level) / 0.3
+    fluid = ~known & (np.maximum(moved, moved + like_fluid(typical)) > SURE)
+    if not known.any() or not fluid.any():
+        return np.zeros_like(known)
+    picture, step = np.where(known[..., None], background, typical), float(np.median(evidence.noise))
+    near, far = (geodesic_distance(picture, seeds, step=step) for seeds in (known, fluid))
+    return ~known & ~fluid & (near < far)
 
 
 def filled_in(picture: np.ndarray, known: np.ndarray) -> np.ndarray:

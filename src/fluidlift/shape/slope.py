@@ -154,7 +154,8 @@ def estimate_slope(camera: PinholeCamera, patches: FlowPatches | None, *, tilt_k
     slope = mean if level < 0.5 else 0.0
     if not tilt_known:
         slope = (1.0 - level) * mean
-    heading = best[int(np.argmin(np.abs(slopes - slope)))][1]
+    # the heading that fits the mean motion on that very slope: on a neighbouring one it is off by up to two degrees
+    heading = best_heading(camera, patches, np.radians(slope))[1]
     source = "perspective of the motion" if slope > 0 else "prior: the motion does not speak against a level stream"
     return SlopeEvidence(slope, UNMODELLED * max(error, 1.0), float(np.degrees(heading)), float(level), mean, source)
 

@@ -191,7 +191,7 @@ def _with_energy(camera, mask, front, patches, evidence, camera_height, interval
     bent = _from_height(camera, profile, intersect_height(camera, profile, 0.2, FAR))
     if not (bent.depth[seen] > 0).mean() > 0.98:
         return front
-    mean = float(np.degrees(np.arctan2(fall[-1] - fall[0], run[-1] - run[0])))
+    mean = float(np.degrees(np.arctan2(fall[-1] - fall[0], metres * (ground[-1] - ground[0]))))
     source = evidence.source if evidence.slope > 0 else "energy of the motion, and friction"
     return replace(bent, slope=replace(evidence, slope=mean, source=source))
 

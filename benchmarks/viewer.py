@@ -1,12 +1,14 @@
 """How quick the viewer is: from an edit to the first changed frame, live frames per second, opening, memory over play.
 
     python benchmarks/viewer.py ASSET [--browser] [--frames 100] [--splats 100000] [--changes 600] [--hour 90000]
+    python benchmarks/viewer.py ASSET --minutes 60 --splats 2000        # only this: played as a person would
 
 Measured up to the message that leaves for the browser; with --browser a headless Chromium looks on, and what its page
 says is timed as well (its pictures are drawn by software, which takes its share of the cores: on an artist's machine
 the graphics card does that). Warm kernels; wall-clock seconds, and seconds of processor time, which others on the
 machine disturb less. An hour of play is 90 000 frames at 25 a second, played as fast as they go, with splats, points
-and arrows of few splats: what could grow is kept per frame.
+and arrows of few splats: what could grow is kept per frame. With --minutes it plays by the clock, while a page looks
+on: memory of this process, of the page's scripts after they were tidied up, and of all of the browser's processes.
 
 It prints a table for docs/results.md. The asset of --frames x --splats is made in a temporary folder (840 MB for
 100 x 100 000), and deleted.
@@ -18,6 +20,7 @@ import argparse
 import contextlib
 import gc
 import os
+import re
 import shutil
 import statistics
 import tempfile
@@ -180,6 +183,58 @@ def hour(folder: Path, rows: Rows, changes: int) -> None:
     viewer.close()
 
 
+def played(folder: Path, rows: Rows, minutes: float) -> None:
+    """Memory of both sides while the page plays by the clock, with splats, points and arrows."""
+    viewer = Viewer(folder, ViewRequest(port=18100))
+    viewer.set_parts(points=True, arrows=True)
+    while viewer.preview.phase == "warming up":
+        time.sleep(0.1)
+    sent, show = [0], viewer.stage.show
+
+    def counted(*parts, **more):
+        sent[0] += 1
+        return show(*parts, **more)
+
+    viewer.stage.show = counted
+    found = []
+    with watched(viewer, True) as page:
+        tools = page.context.new_cdp_session(page)
+        time.sleep(30.0)  # the page comes up
+        began = time.perf_counter()
+        viewer.timeline.play(time.monotonic())
+        for k in range(11):
+            while time.perf_counter() - began < 60.0 * minutes * k / 10:
+                time.sleep(0.5)
+                page.evaluate("1")  # keeps its messages flowing
+            gc.collect()
+            tools.send("HeapProfiler.collectGarbage")
+            heap = tools.send("Runtime.getHeapUsage")["usedSize"] / 2**20
+            found.append((resident(), heap, browser_memory(os.getpid())))
+            told = "MB: viewer {:.0f}, scripts of the page {:.1f}, browser {:.0f}".format(*found[-1])
+            print(f"{(time.perf_counter() - began) / 60:.1f} min, {sent[0]:,} frames; {told}", flush=True)
+    hours = minutes / 60
+    for what, sizes in zip(("viewer", "scripts of its page", "browser, all processes"), zip(*found)):
+        slope = float(np.polyfit(np.linspace(0.1, 1, 10) * hours, sizes[1:], 1)[0])
+        rows.append(
+            f"| memory of the {what} over {minutes:g} minutes played ({sent[0]:,} frames shown) | "
+            f"{sizes[1]:.0f} MB at a tenth, {sizes[5]:.0f} half-way, {sizes[-1]:.0f} at the end; {slope:+.1f} MB/h |"
+        )
+    viewer.close()
+
+
+def browser_memory(process: int) -> float:
+    """MB that the browser's processes took, of those that this one started: without files that are mapped, whose share
+    depends on what other browsers run, and without the driver, which keeps each line of the page's console."""
+    total = 0.0
+    with contextlib.suppress(OSError):  # ended meanwhile
+        if Path(f"/proc/{process}/comm").read_text().startswith("chrom"):
+            told = Path(f"/proc/{process}/smaps_rollup").read_text()
+            total += sum(int(kb) / 1024 for kb in re.findall(r"^Pss_(?:Anon|Shmem): *([0-9]+)", told, re.MULTILINE))
+        for task in Path(f"/proc/{process}/task").iterdir():
+            total += sum(browser_memory(int(child)) for child in (task / "children").read_text().split())
+    return total
+
+
 def main() -> None:
     """Run all on an asset."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -189,9 +244,16 @@ def main() -> None:
     parser.add_argument("--splats", type=int, default=100_000)
     parser.add_argument("--changes", type=int, default=300)
     parser.add_argument("--hour", type=int, default=90_000)
+    parser.add_argument("--minutes", type=float, default=0.0)
     options = parser.parse_args()
     rows = Rows()
     print("load average", os.getloadavg(), "cores", os.cpu_count(), flush=True)
+    if options.minutes:
+        with tempfile.TemporaryDirectory() as place:
+            asset = synthetic(options.asset, Path(place) / "small.fluid", options.frames, options.splats)
+            played(asset, rows, options.minutes)
+        print("\n".join(["", "| viewer | measured |", "|---|---|", *rows]))
+        return
     live(options.asset, rows, browser=False)
     if options.browser:
         live(options.asset, rows, browser=True)

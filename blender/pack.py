@@ -5,7 +5,7 @@ The same files give the same bytes, on any day and machine. Needs nothing but Py
 
 from __future__ import annotations
 
-import sys
+import argparse
 import tomllib
 import zipfile
 from pathlib import Path
@@ -32,4 +32,6 @@ def pack(into: Path) -> Path:
 
 
 if __name__ == "__main__":
-    print(pack(Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).resolve().parents[1] / "dist"))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, nargs="?", default=Path(__file__).resolve().parents[1] / "dist")
+    print(pack(parser.parse_args().folder))

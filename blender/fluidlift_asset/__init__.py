@@ -120,6 +120,12 @@ class Guarded:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
 
+    def warn(self, context: bpy.types.Context, warnings: list[str]) -> None:
+        """What is missing, such as obstacles whose motion is not at hand: said, and kept in the panel."""
+        if warnings:
+            context.scene.fluidlift.told = " ".join(warnings)
+            self.report({"WARNING"}, " ".join(warnings))
+
 
 class ImportAsset(Guarded, bpy.types.Operator):
     """Bring an asset in: surface with velocities, splats as points, terrain, camera, volumes, obstacles"""
@@ -143,7 +149,7 @@ class ImportAsset(Guarded, bpy.types.Operator):
             context.scene.fluidlift.asset = self.directory
         folder, settings = asset_of(context), context.scene.fluidlift
         facts = read_facts(folder)
-        export(context, folder, self.volumes)
+        warnings = export(context, folder, self.volumes)
         into = build.collection()
         assemble(context, folder, into, self.splats)
         build.camera_of(into, folder / "rest" / "camera.json")
@@ -153,16 +159,19 @@ class ImportAsset(Guarded, bpy.types.Operator):
         read_settings(settings, facts)
         settings.told = f"{folder.name}: {', '.join(o.name for o in into.objects)}"
         self.report({"INFO"}, settings.told)
+        self.warn(context, warnings)
         return {"FINISHED"}
 
 
-def export(context: bpy.types.Context, folder: Path, volumes: bool) -> None:
-    """Have the command write what Blender reads, where that is older than the frames."""
+def export(context: bpy.types.Context, folder: Path, volumes: bool) -> list[str]:
+    """Have the command write what Blender reads, where that is older than the frames; what it warns about."""
     into, source = folder / EXPORTED, folder / "frames" / "splats"
+    said = ""
     wanted = [("surface", "mesh", ".ply")] + ([("volume", "vdb", ".vdb")] if volumes else [])
     for name, form, suffix in wanted:
         if not up_to_date(into / name, source, suffix):
-            run([command_of(context), "export", str(folder), "-o", str(into / name), "--to", form])
+            said += run([command_of(context), "export", str(folder), "-o", str(into / name), "--to", form])
+    return [line.strip() for line in said.splitlines() if line.strip().startswith("warning:")]
 
 
 def assemble(context: bpy.types.Context, folder: Path, into: bpy.types.Collection, splats: bool) -> None:
@@ -233,20 +242,22 @@ class Simulate(Guarded, bpy.types.Operator):
 
     def finish(self, context: bpy.types.Context) -> set[str]:
         self.call.check()
-        refresh(context)
+        warnings = refresh(context)
         context.scene.fluidlift.told = "done"
+        self.warn(context, warnings)
         return {"FINISHED"}
 
 
-def refresh(context: bpy.types.Context) -> None:
-    """Export the frames again and show them, with the camera and the materials as they are by now."""
+def refresh(context: bpy.types.Context) -> list[str]:
+    """Export the frames again and show them, with the camera and the materials as they are by now; warnings."""
     folder, had = asset_of(context), {o.name for o in build.objects()}
     facts = read_facts(folder)
-    export(context, folder, "fluid volume" in had)
+    warnings = export(context, folder, "fluid volume" in had)
     assemble(context, folder, build.collection(KEPT), "fluid splats" in had or not had)
     if not had:
         show_material(context.scene.fluidlift, context)
     read_settings(context.scene.fluidlift, facts)
+    return warnings
 
 
 class Refresh(Guarded, bpy.types.Operator):
@@ -255,7 +266,7 @@ class Refresh(Guarded, bpy.types.Operator):
     bl_idname, bl_label = "fluidlift.refresh", "Refresh"
 
     def work(self, context: bpy.types.Context) -> set[str]:
-        refresh(context)
+        self.warn(context, refresh(context))
         return {"FINISHED"}
 
 

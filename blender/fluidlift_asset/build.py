@@ -231,12 +231,17 @@ def bodies_of(into: bpy.types.Collection, folder: Path) -> list[bpy.types.Object
         RuntimeError: bodies.json is damaged, or names files elsewhere.
         OSError, ValueError: a mesh that is not there, or is none.
     """
+    from .materials import body_material  # takes names from here
+
     made = []
     for body in read_bodies(folder):
         vertices, faces = read_ply(body.mesh)
         mesh = bpy.data.meshes.new(body.name)
         points = columns(vertices, "x", "y", "z")
         mesh.from_pydata([] if points is None else points.tolist(), [], faces.tolist())
+        attributes(mesh, vertices)
+        if COLOR in mesh.attributes:
+            mesh.materials.append(body_material())
         thing = bpy.data.objects.new(body.name, mesh)
         thing[BODY] = body.name
         thing.rotation_mode = "QUATERNION"

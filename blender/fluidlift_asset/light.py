@@ -35,6 +35,9 @@ def light_up(scene: bpy.types.Scene, into: bpy.types.Collection) -> None:
     to_sun = Vector((math.cos(e) * math.sin(a), math.cos(e) * math.cos(a), math.sin(e)))
     thing.rotation_euler = to_sun.to_track_quat("Z", "Y").to_euler()  # lamps shine along -z
     thing.location = 10.0 * to_sun
+    # it shines straight through clear liquids (`materials`): light that is refracted on its way out of the bed and
+    # happens to meet the sun would count twice, as a white speck
+    thing.visible_transmission = False
     into.objects.link(thing)
 
 

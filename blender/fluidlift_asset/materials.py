@@ -87,6 +87,24 @@ def liquid_material(name: str, tint: Color = (1.0, 1.0, 1.0)) -> bpy.types.Mater
     return material
 
 
+def body_material() -> bpy.types.Material:
+    """Of obstacles that have colours: those of their vertices, dull."""
+    title = "fluidlift obstacle"
+    material = bpy.data.materials.get(title)
+    if material is not None:
+        return material
+    material = bpy.data.materials.new(title)
+    if material.node_tree is None:
+        material.use_nodes = True
+    nodes, links = material.node_tree.nodes, material.node_tree.links
+    nodes.clear()
+    output, shader = nodes.new("ShaderNodeOutputMaterial"), nodes.new("ShaderNodeBsdfPrincipled")
+    output.location = (320, 0)
+    links.new(shader.outputs[0], output.inputs["Surface"])
+    _colors_of_vertices(material, shader, (1.0, 1.0, 1.0))
+    return material
+
+
 def _set(shader: bpy.types.ShaderNode, names: tuple, value) -> None:
     """The first input of these names that this version of Blender has."""
     for name in names:

@@ -2,6 +2,8 @@
 extension, asset, command. Prints one JSON line."""
 
 import json
+import shutil
+import struct
 import subprocess
 import sys
 from pathlib import Path
@@ -146,6 +148,24 @@ def contact() -> dict:
     return {"points": len(ways), "moved": len(moved), "farthest": max(ways), "inside": sum(inside)}
 
 
+def painted_body() -> list:
+    """Material and first colour of an obstacle whose file has colours, sRGB (255, 204, 26)."""
+    folder = Path(asset).with_name("painted")
+    (folder / "bodies").mkdir(parents=True)
+    fields = [f"property float {a}" for a in "xyz"] + [f"property uchar {c}" for c in ("red", "green", "blue")]
+    header = ["ply", "format binary_little_endian 1.0", "element vertex 3", *fields, "element face 1",
+              "property list uchar int vertex_indices", "end_header\n"]  # fmt: skip
+    corners = b"".join(struct.pack("<fffBBB", x, y, 0, 255, 204, 26) for x, y in ((0, 0), (1, 0), (0, 1)))
+    file = folder / "bodies" / "01_duck.ply"
+    file.write_bytes("\n".join(header).encode() + corners + struct.pack("<Biii", 3, 0, 1, 2))
+    told = {"name": "painted", "mesh": "bodies/01_duck.ply", "first": 1001, "poses": [[0, 0, 0, 1, 0, 0, 0]]}
+    (folder / "bodies.json").write_text(json.dumps({"bodies": [told]}))
+    (thing,) = fluidlift_asset.build.bodies_of(scene.collection, folder)
+    found = [thing.data.materials[0].name, list(thing.data.attributes["Color"].data[0].color)[:3]]
+    bpy.data.objects.remove(thing)
+    return found
+
+
 out: dict = {"version": bpy.app.version_string, "refused": {}}
 settings.command = "/no/such/command"
 out["refused"]["command"] = refused(lambda: bpy.ops.fluidlift.import_asset(directory=asset))
@@ -163,8 +183,10 @@ out["last"] = look()
 camera = scene.camera
 out["camera"] = {"matrix": [list(row) for row in camera.matrix_world], "lens": camera.data.lens}
 out["light"] = [scene.world.name, sum(o.type == "LIGHT" for o in scene.objects)]
+out["sun refracted"] = [o.visible_transmission for o in scene.objects if o.type == "LIGHT"]
 out["panel"] = panel()
 out["contact"] = contact()
+out["painted"] = painted_body()
 out["blur"] = blurred_by_velocity()
 out["colors"] = shows_its_colors()
 
@@ -199,6 +221,13 @@ for number in out["after"]:
 out["changed"] = look()
 out["material"].append(surface_material())
 out["modifiers"] = [m.name for m in bpy.data.objects["fluid surface"].modifiers]
+finished, aside = Path(asset, "work"), Path(asset).with_name("work aside")
+for move in ((finished, aside), (aside, finished)):  # an asset as it is handed on, without its work/; then whole again
+    move[0].rename(move[1])
+    shutil.rmtree(Path(asset, "blender"))
+    bpy.ops.fluidlift.refresh()
+    out.setdefault("warned", settings.told)
+body = next(o for o in scene.objects if o.get("fluidlift_body") == "ball")
 bpy.context.view_layer.objects.active = body
 bpy.ops.fluidlift.remove_obstacle()
 bpy.ops.fluidlift.undo()

@@ -136,6 +136,11 @@ def test_an_unlit_scene_gets_sun_and_sky(seen):
     assert seen[0]["light"] == ["fluidlift sky", 1]
 
 
+def test_the_sun_is_not_counted_twice_through_clear_liquids(seen):
+    # it shines straight through the surface; rays that were refracted must not meet it once more, as white specks
+    assert seen[0]["sun refracted"] == [False]
+
+
 def test_the_panel_and_the_menu_draw_what_they_offer(seen):
     drawn = seen[0]["panel"]
     assert {"Viscosity", "Density", "Gravity", "Inflow", "Duration", "Look", "Tint", "Simulate again"} <= set(drawn)
@@ -184,6 +189,17 @@ def test_a_floating_obstacle_moves_as_it_was_simulated(seen):
     (body,) = json.loads((folder / "blender" / "surface" / "bodies.json").read_text())["bodies"]
     np.testing.assert_allclose(found["ball"], [body["poses"][k][:3] for k in (0, 2)], atol=1e-6)
     assert found["ball"][1][2] < found["ball"][0][2] - 0.001  # it falls onto the water
+
+
+def test_an_obstacle_has_the_colours_of_its_file(seen):
+    material, color = seen[0]["painted"]
+    assert material == "fluidlift obstacle"
+    # sRGB (255, 204, 26) / 255 in linear light, as Blender keeps colours; single precision
+    np.testing.assert_allclose(color, [1.0, 0.60383, 0.01033], atol=1e-5)
+
+
+def test_an_obstacle_whose_motion_is_not_at_hand_is_told_to_be_missing(seen):
+    assert "they are left out" in seen[0]["warned"]
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
 STOPS = 4.0
 """of exposure, up or down"""
+NO_BREAK_SPACE = "\N{NO-BREAK SPACE}"
 ROOM = 0.25
 """share of a slider that two of its marks must lie apart to be read"""
 
@@ -146,9 +147,11 @@ class FluidPanel:
 
 
 def _label(control: Control, value: float) -> str:
-    """With three digits: more would wrap. The box beside the slider, and typing, have them all."""
+    """With three digits: more would wrap. The box beside the slider, and typing, have them all. Lines break before
+    the number, not between it and its unit."""
     name = f"{control.label} (10^x)" if control.log else control.label
-    return f"{name} {number(value, 3)} {control.unit}".strip().replace(" °", "°")
+    amount = f"{number(value, 3)} {control.unit}".strip().replace(" °", "°")
+    return f"{name} {amount.replace(' ', NO_BREAK_SPACE)}"
 
 
 def _marks(control: Control) -> tuple[tuple[float, str], ...]:

@@ -48,8 +48,8 @@ class ObstaclePanel:
         self._chosen = gui.add_dropdown("chosen", (NONE,), initial_value=NONE, hint="the one that is edited below")
         heard(self._chosen, self._choose)
         self._where = gui.add_markdown("No obstacle is chosen.")
-        low, high = self._size_now / RANGE, self._size_now * RANGE
-        self._size = gui.add_slider("width, m", _short(low), _short(high), _short(low / 10), _short(self._size_now))
+        low, high = (_short(size, 2) for size in (self._size_now / RANGE, self._size_now * RANGE))
+        self._size = gui.add_slider("width, m", low, high, _short(low / 10, 1), _short(self._size_now))
         self._motion = gui.add_dropdown("motion", (STILL, FLOATS), initial_value=STILL)
         self._density = gui.add_slider(
             "density, kg/m³",
@@ -204,8 +204,12 @@ class ObstaclePanel:
         self._set(event, "density", float(density))
 
     def _moves(self, event: Any, motion: str) -> None:
-        if event.client is not None and self._viewer.chosen:
+        name = self._viewer.chosen
+        if event.client is not None and name:
             self._density.disabled = motion != FLOATS
+            self._viewer.say(
+                f"{name} begins where the arrows are, falls in and drifts as time goes on." if motion == FLOATS else ""
+            )
         self._set(event, "motion", "free" if motion == FLOATS else "static")
 
     # the gizmo
@@ -300,9 +304,9 @@ def _width(entry: dict[str, Any]) -> float | None:
     return float(size[0]) if isinstance(size, list | tuple) else (float(size) if size else None)
 
 
-def _short(value: float) -> float:
+def _short(value: float, digits: int = 4) -> float:
     """Without the digits that nobody can see."""
-    return float(f"{value:.4g}")
+    return float(f"{value:.{digits}g}")
 
 
 def _pose(entry: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:

@@ -6,7 +6,7 @@ from scipy.spatial import cKDTree
 
 from fluidlift.look.fluid_normals import fluid_depths, fluid_normals, fluid_surface
 from fluidlift.look.surface_map import SurfaceMap
-from fluidlift.look.surface_skin import BARE, CROWDED, PITCH, SurfaceSkin, of_skin, without_skin
+from fluidlift.look.surface_skin import BARE, CROWDED, PITCH, SurfaceSkin, of_skin, painted_liquid, without_skin
 from fluidlift.types import Gaussians, concatenate
 
 CELL = 0.1
@@ -102,6 +102,19 @@ def test_splats_of_a_skin_are_known_by_their_size_in_a_file_as_well():
     kept = without_skin(concatenate([body, skin]), CELL)
     np.testing.assert_array_equal(kept.means, body.means)
     assert without_skin(body, CELL) is body and len(of_skin(Gaussians.empty(), CELL)) == 0
+
+
+def test_liquid_under_a_skin_has_its_colours_and_what_is_deep_its_own():
+    body, skin = painted()
+    skin = Gaussians(skin.means, skin.quats, skin.scales, skin.opacities, np.full_like(skin.sh, 1.0))
+    liquid = painted_liquid(concatenate([body, skin]), CELL)
+    np.testing.assert_array_equal(liquid.means, body.means)
+    away = np.linalg.norm(liquid.means[:, None] - skin.means[None], axis=-1).min(axis=1)
+    near, deep = away < 1.4 * CELL, away > 1.6 * CELL
+    assert near.sum() > 100 and deep.sum() > 100
+    np.testing.assert_array_equal(liquid.sh[near], 1.0)
+    np.testing.assert_array_equal(liquid.sh[deep], body.sh[deep])
+    assert painted_liquid(body, CELL) is body
 
 
 def test_a_skin_adds_nothing_to_the_body_that_it_floats_on():

@@ -7,6 +7,8 @@ surface, new ones come where they have been drawn apart, and some go where they 
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
@@ -30,6 +32,8 @@ OPACITY = 0.9
 
 ALIKE = 1e-3
 """by how much a splat's size may differ from the skin's: files hold logarithms in single precision"""
+UNDER = 1.5
+"""cells below the skin that have its colours where no skin is drawn: as deep as a surface of particles mixes them"""
 CROWDED, BARE = 0.55, 0.75
 """spacings to the next tracer below which one of two goes, and above which a new one comes"""
 
@@ -53,6 +57,24 @@ def without_skin(gaussians: Gaussians, cell: float) -> Gaussians:
     """The splats that stand for liquid."""
     skin = of_skin(gaussians, cell)
     return gaussians.select(~skin) if skin.any() else gaussians
+
+
+def painted_liquid(gaussians: Gaussians, cell: float) -> Gaussians:
+    """The splats that stand for liquid, in the colours of the skin where they lie under it.
+
+    Args:
+        gaussians: of a frame.
+        cell: width of the simulator's cells, m.
+    """
+    found = of_skin(gaussians, cell)
+    if not found.any():
+        return gaussians
+    liquid, skin = gaussians.select(~found), gaussians.select(found)
+    away, nearest = cKDTree(skin.means).query(liquid.means, distance_upper_bound=UNDER * cell)
+    under = np.isfinite(away)
+    sh = liquid.sh.copy()
+    sh[under] = skin.sh[nearest[under]]
+    return replace(liquid, sh=sh)
 
 
 class SurfaceSkin:

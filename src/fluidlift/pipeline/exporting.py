@@ -272,18 +272,20 @@ def gridded(frame: FluidFrame, cells: Grid) -> tuple[FaceVelocity, np.ndarray, G
     """Velocity and density of a frame on cells that lie on those of the simulation, as far as its particles reach.
 
     Density is the opacity of the splats in a cell next to that of a full one, at most 1: the share of a cell that a
-    liquid fills, and how thick smoke is.
+    liquid fills, and how thick smoke is. A skin is no liquid.
     """
+    from fluidlift.look.surface_skin import of_skin
     from fluidlift.physics.transfer import particles_to_grid
     from fluidlift.types import Particles
 
-    points, h = frame.gaussians.means.astype(np.float64), cells.spacing
+    h, liquid = cells.spacing, ~of_skin(frame.gaussians, cells.spacing)
+    points = frame.gaussians.means[liquid].astype(np.float64)
     first = np.floor((points.min(axis=0) - cells.low) / h).astype(int) - 1
     last = np.floor((points.max(axis=0) - cells.low) / h).astype(int) + 2
     (nx, ny, nz), (x, y, z) = (last - first).tolist(), (cells.low + first * h).tolist()
     grid = Grid((nx, ny, nz), h, (x, y, z))
-    velocity, _ = particles_to_grid(Particles.at_rest(points, 1.0, velocities=frame.velocities), grid)
+    velocity, _ = particles_to_grid(Particles.at_rest(points, 1.0, velocities=frame.velocities[liquid]), grid)
     flat = np.ravel_multi_index(tuple(grid.cell_of(points).T), grid.shape)
-    amount = np.bincount(flat, weights=frame.gaussians.opacities, minlength=grid.cells).reshape(grid.shape)
+    amount = np.bincount(flat, weights=frame.gaussians.opacities[liquid], minlength=grid.cells).reshape(grid.shape)
     full = np.percentile(amount[amount > 0], FULL)
     return velocity, np.clip(amount / max(float(full), 1e-12), 0.0, 1.0).astype(np.float32), grid

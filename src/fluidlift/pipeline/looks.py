@@ -23,7 +23,7 @@ from fluidlift.look.open_end import OpenEnd
 from fluidlift.look.rasterize import render
 from fluidlift.look.relight import relit
 from fluidlift.look.screen_space import mesh_surface, particle_surface
-from fluidlift.look.surface_skin import without_skin
+from fluidlift.look.surface_skin import painted_liquid
 from fluidlift.look.transparent import splat_surface
 from fluidlift.look.vessel import Pane, before_glass, panes, vessel_apart
 from fluidlift.look.wet_ground import wetted
@@ -342,7 +342,7 @@ class Painter:
     ) -> LiquidSurface:
         if mesh is not None:
             return mesh_surface(mesh, camera, radius=RADIUS * self.terrain.grid.spacing)
-        fluid = without_skin(fluid, self.terrain.grid.spacing)
+        fluid = painted_liquid(fluid, self.terrain.grid.spacing)
         if self.look.style == "transparent":
             apart = 0.5 * self.terrain.grid.spacing
             normals, share = fluid_normals(fluid, apart, self._bed)

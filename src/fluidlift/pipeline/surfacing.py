@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from fluidlift.look.open_end import BEYOND, OpenEnd
-from fluidlift.look.surface_skin import of_skin
+from fluidlift.look.surface_skin import of_skin, painted_liquid
 from fluidlift.seams import Mesher
 from fluidlift.types import Gaussians, Terrain, TriangleMesh
 
@@ -26,7 +26,7 @@ def surface_of(
     """The surface with the splats' colours (sRGB) at its vertices, and its velocity [v,3] there, m/s.
 
     Args:
-        fluid: n splats, m; those of a skin are left out.
+        fluid: n splats, m; those of a skin only give their colours.
         velocities: [n,3], m/s.
         terrain: that the surface stays out of.
         mesher: of particles.
@@ -36,9 +36,8 @@ def surface_of(
     if end is not None:
         kept = end.before(fluid.means, BEYOND)
         fluid, velocities = fluid.select(kept), velocities[kept]
-    liquid = ~of_skin(fluid, terrain.grid.spacing)
-    if not liquid.all():
-        fluid, velocities = fluid.select(liquid), velocities[liquid]
+    velocities = velocities[~of_skin(fluid, terrain.grid.spacing)]
+    fluid = painted_liquid(fluid, terrain.grid.spacing)
     carried = {"velocity": velocities, "rgb": fluid.rgb}
     mesh, found = mesher.surface(fluid.means, RADIUS * terrain.grid.spacing, carried)
     vertices = outside_solid(mesh.vertices, terrain) if clamped else np.asarray(mesh.vertices)

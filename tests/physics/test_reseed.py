@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from fluidlift.physics import boundaries, transfer
-from fluidlift.physics.reseed import FEWEST, MOST, WHOLE, inner_cells, reseed, thickened
-from fluidlift.types import CellType, Grid, Particles, Terrain, TriangleMesh
+from fluidlift.physics.reseed import FEWEST, MOST, inner_cells, reseed
+from fluidlift.types import Grid, Particles, Terrain, TriangleMesh
 
 GRID = Grid((6, 6, 6), 0.1)
 
@@ -121,42 +121,3 @@ def test_no_half_is_placed_in_the_solid():
     result = run(body, walls(distance))
     assert result.split > 0
     assert (result.particles.positions[:, 2] > 0.115).all()
-
-
-def filled(counts, *, most=10_000, distance=None):
-    body = swarm(counts)
-    cells = np.where(np.arange(6) < 4, CellType.FLUID, CellType.EMPTY) * np.ones(GRID.shape, np.uint8)
-    nodes = np.full((7, 7, 7), 1.0) if distance is None else distance
-    after = thickened(body, cells.astype(np.uint8), np.float32(nodes), GRID, most=most, rng=np.random.default_rng(2))
-    per_cell = np.zeros(GRID.shape, int)
-    np.add.at(per_cell, tuple(GRID.cell_of(after.positions).T), 1)
-    return body, after, per_cell
-
-
-def test_a_body_is_as_thick_inside_as_its_cells_and_its_surface_stays_as_it_is():
-    counts = np.random.default_rng(3).integers(0, 10, GRID.shape)
-    counts[:, :, 4:] = 0
-    body, after, per_cell = filled(counts)
-    assert (per_cell[:, :, :3] >= np.minimum(WHOLE, counts[:, :, :3])).all()
-    # an octant with two particles leaves the cell one place less; of random places half share one at most
-    assert (per_cell[:, :, :3] >= WHOLE).mean() > 0.95 and (per_cell[:, :, :3] > 0).all()
-    np.testing.assert_array_equal(per_cell[:, :, 3:], counts[:, :, 3:])
-    np.testing.assert_array_equal(after.positions[: len(body)], body.positions)
-    new = after.select(np.arange(len(body), len(after)))
-    assert len(np.unique(after.ids)) == len(after) and new.ids.min() == body.ids.max() + 1
-    away = np.linalg.norm(new.positions[:, None] - body.positions[None], axis=-1)
-    nearest = away.argmin(axis=1)
-    np.testing.assert_array_equal(new.source, body.source[nearest])
-    np.testing.assert_array_equal(new.velocities, body.velocities[nearest])
-
-
-def test_of_a_few_the_emptiest_cells_get_theirs_first_and_the_solid_none():
-    counts = np.full(GRID.shape, 4)
-    counts[:, :, 4:] = 0
-    counts[1:3, 1:3, 1] = 0
-    _, after, per_cell = filled(counts, most=8)
-    assert (per_cell[1:3, 1:3, 1] == 2).all() and len(after) == counts.sum() + 8
-    distance = GRID.nodes()[..., 0] - 0.3
-    body, after, _ = filled(counts, distance=distance)
-    new = after.positions[len(body) :]
-    assert len(new) and (new[:, 0] > 0.3).all()

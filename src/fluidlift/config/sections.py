@@ -52,7 +52,7 @@ class ShapeConfig:
     refine_iterations: int = 30
     """steps of the single-view optimisation"""
     max_gaussians: int = 120_000
-    """most rest Gaussians"""
+    """most rest Gaussians; a body whose cells hold fewer than six inside gets more"""
     rays: int = 9
     """random rays of the inside test"""
     longest_union: int = 6

@@ -12,14 +12,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool
 from numba import njit
-from scipy.spatial import cKDTree
 
 from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.physics.boundaries import CLEARANCE, Walls
 from fluidlift.physics.transfer import CellOrder, select_particles
-from fluidlift.types import CellType, Grid, Particles
+from fluidlift.types import Particles
 
 FEWEST = 2
 """particles in an inner cell below which its heaviest one splits"""
@@ -30,9 +29,6 @@ LIGHTEST_PARENT = 0.25
 """of the mass of an eighth of a cell: lighter particles do not split"""
 SPLIT_DISTANCE = 0.25
 """cells from the parent's place to each half"""
-WHOLE = 6
-"""particles in an inner cell of a body at its beginning, at least: with less than three quarters of the usual eight
-it holds less than its own mass, and the body sags as soon as it moves"""
 
 
 @dataclass(frozen=True)
@@ -54,59 +50,6 @@ def inner_cells(wet: Bool[np.ndarray, "nx ny nz"], solid: Bool[np.ndarray, "nx n
             index[axis] = shift
             inner &= closed[tuple(index)]
     return inner
-
-
-def thickened(
-    body: Particles,
-    cells: UInt8[np.ndarray, "nx ny nz"],
-    signed_distance: Float[np.ndarray, "nx+1 ny+1 nz+1"],
-    grid: Grid,
-    *,
-    most: int,
-    rng: np.random.Generator,
-) -> Particles:
-    """A body before it moves, with particles added where cells inside it hold fewer than `WHOLE`.
-
-    A body is sampled for its picture: dense at what is seen, and inside as densely as there is room for. What is added
-    lies in octants of cells that hold no particle, moves as its nearest neighbour and looks like it; ids go on after
-    the largest one.
-
-    Args:
-        body: m.
-        cells: `CellType` of each; it fills those of FLUID.
-        signed_distance: of the solid, m, positive outside.
-        grid: of the cells, m.
-        most: particles that may be added; the emptiest cells get theirs first.
-        rng: of the places.
-    """
-    if not len(body) or most <= 0:
-        return body
-    octants = Grid(tuple(2 * n for n in grid.shape), 0.5 * grid.spacing, grid.origin)
-    at = octants.cell_of(body.positions)
-    at = at[((at >= 0) & (at < octants.shape)).all(axis=1)]
-    free, count = np.ones(octants.shape, bool), np.zeros(grid.shape, np.int64)
-    free[tuple(at.T)] = False
-    np.add.at(count, tuple((at // 2).T), 1)
-    liquid = cells == CellType.FLUID
-    thin = liquid & inner_cells(liquid | (count > 0), cells == CellType.SOLID) & (count < WHOLE)
-    places = np.argwhere(free & thin.repeat(2, 0).repeat(2, 1).repeat(2, 2))
-    centers = octants.low + (places + 0.5 + rng.uniform(-0.25, 0.25, places.shape)) * octants.spacing
-    open_ = sample_nodes(signed_distance, grid, centers) > CLEARANCE * grid.spacing
-    places, centers = places[open_], centers[open_]
-    cell = np.ravel_multi_index(tuple((places // 2).T), grid.shape)
-    shuffled = rng.permutation(len(cell))
-    order = shuffled[np.argsort(cell[shuffled], kind="stable")]
-    first = np.searchsorted(cell[order], cell[order])
-    reached = count.ravel()[cell[order]] + np.arange(len(order)) - first + 1
-    chosen = order[reached <= WHOLE][np.argsort(reached[reached <= WHOLE], kind="stable")[:most]]
-    nearest = cKDTree(body.positions).query(centers[chosen])[1]
-    return body.joined(
-        replace(
-            body.select(nearest),
-            positions=centers[chosen].astype(np.float32),
-            ids=int(body.ids.max()) + 1 + np.arange(len(chosen), dtype=np.int64),
-        )
-    )
 
 
 @njit(cache=True)

@@ -16,11 +16,15 @@ from fluidlift.pipeline.seeing import labels_of
 from fluidlift.pipeline.story import Result, Story
 from fluidlift.seams import Rasterizer
 from fluidlift.shape import generate, terrain
-from fluidlift.types import Gaussians, Label, PinholeCamera, concatenate
+from fluidlift.types import CellType, Gaussians, Label, PinholeCamera, concatenate
 
 KEPT = 0.6
 """part of its size that a splat of the inside keeps at least: at 0.3 the first frame is a little cleaner, but once the
 surface is drawn apart, dark dots of what lies below show between its splats"""
+
+WHOLE = 6
+"""splats that a cell of the body may take inside, whatever the limit for all of it: with less than three quarters of
+the usual eight it holds less than its own mass, and a large shallow body sags as soon as it moves"""
 
 LATER = 5
 """how much fewer steps the frames after the first take, as they start from the last"""
@@ -54,9 +58,10 @@ def refine(story: Story, inputs: Inputs, config: JobConfig) -> Result:
     beyond, hull = continued(shown, _outside_solid(hull, setting), setting, camera)
     beyond = _bounded(_outside_solid(beyond, setting), c.max_gaussians - len(shown) - len(hull), config.seed)
     shell = concatenate([shown, beyond, hull])
+    least = WHOLE * int((setting.cell_types == CellType.FLUID).sum())
     added = fill(
         shell, spacing=h / 2, rays=c.rays, rng=np.random.default_rng(config.seed),
-        max_added=max(c.max_gaussians - len(shell), 0), closed_below=setting.terrain,
+        max_added=max(c.max_gaussians - len(shell), least), closed_below=setting.terrain,
     )  # fmt: skip
     mask, hull = g.arrays["mask"], shell.select(slice(len(shown), None))
     # what the picture contradicts goes: cells reach a little before the visible surface and beyond the silhouette

@@ -61,12 +61,8 @@ def simulator_of(scene: Scene, device: str = "cpu") -> ParticleSimulator:
             buoyancy=float(np.linalg.norm(parameters.gravity)), supply=supply,
         )  # fmt: skip
     from fluidlift.physics.apic import LiquidSimulator
-    from fluidlift.physics.reseed import thickened
 
     cells, body = within_outlet(scene)
-    body = thickened(
-        body, cells, scene.terrain.signed_distance, grid, most=len(body) // 2, rng=np.random.default_rng(scene.seed)
-    )
     return LiquidSimulator(
         grid, scene.terrain, parameters, body, cell_types=cells, inflow_profile=scene.velocity,
         seed=scene.seed, emit_source=look, bodies=scene.bodies, work=particle_work(device), supply=supply,

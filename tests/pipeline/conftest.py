@@ -1,15 +1,19 @@
-"""Striped water that flows along a flat channel: a scene of a second of work."""
+"""Striped water that flows along a flat channel: a scene of a second of work; and the stages of a made clip."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from fluidlift.io.stage_cache import load_stage
+from fluidlift.pipeline import STAGES, Silence
 from fluidlift.pipeline.scene import Scene
+from fluidlift.pipeline.story import Result, Story
 from fluidlift.types import (
     CellType,
     FaceVelocity,
@@ -63,3 +67,18 @@ def camera() -> PinholeCamera:
 def channel() -> Callable[..., Scene]:
     """`striped_channel`."""
     return striped_channel
+
+
+def story_of(folder: Path) -> Story:
+    """All stages of a finished asset, as its cache tells them."""
+    story = Story(folder, STAGES, progress=Silence())
+    for name in STAGES:
+        (facts,) = (folder / "work" / name).glob("*.json")
+        story.results[name] = Result(*load_stage(folder, name, facts.stem))
+    return story
+
+
+@pytest.fixture(scope="module")
+def story(made) -> Story:
+    """`story_of` the small clip's asset."""
+    return story_of(made.folder)

@@ -1,26 +1,13 @@
 """The velocities that the fit gets, and what was seen of them."""
 
 import numpy as np
-import pytest
 
 from fluidlift.config import build_config
-from fluidlift.io.stage_cache import load_stage
 from fluidlift.motion.sequence import MotionOptions
-from fluidlift.pipeline import STAGES, Silence
 from fluidlift.pipeline.lifting import motion_options, motion_scene, motion_warnings, seen_cells, seen_of, targets_of
-from fluidlift.pipeline.story import Result, Story
 from fluidlift.types import Grid, SurfaceMotion
 
 GRID = Grid((4, 3, 2), 0.5, (0.0, 0.0, 0.0))
-
-
-@pytest.fixture(scope="module")
-def story(made):
-    story = Story(made.folder, STAGES, progress=Silence())
-    for name in ("read", "segment", "geometry", "motion"):
-        (facts,) = (made.folder / "work" / name).glob("*.json")
-        story.results[name] = Result(*load_stage(made.folder, name, facts.stem))
-    return story
 
 
 def test_the_settings_say_what_the_motion_does_by_itself():

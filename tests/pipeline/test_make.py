@@ -11,30 +11,14 @@ from fluidlift.cli import DONE, FAILED, REJECTED, WITH_WARNINGS, main
 from fluidlift.config import build_config
 from fluidlift.io.asset_folder import load_asset, read_manifest
 from fluidlift.io.ply import read_splats
-from fluidlift.io.stage_cache import load_stage
 from fluidlift.io.video import read_clip
 from fluidlift.numerics.sampling import sample_nodes
-from fluidlift.pipeline import STAGES, Inputs, Silence, SimulationRequest, make, moving, simulating
+from fluidlift.pipeline import STAGES, Inputs, SimulationRequest, make, moving, simulating
 from fluidlift.pipeline.scene import footage_of, scene_of
-from fluidlift.pipeline.story import Result, Story
 from fluidlift.types import CellType, Label
 from fluidlift.validate import validate_asset
 
 FRAMES = 10
-
-
-def story_of(folder):
-    """The story as its cache tells it."""
-    story = Story(folder, STAGES, progress=Silence())
-    for name in STAGES:
-        (facts,) = (folder / "work" / name).glob("*.json")
-        story.results[name] = Result(*load_stage(folder, name, facts.stem))
-    return story
-
-
-@pytest.fixture(scope="module")
-def story(made):
-    return story_of(made.folder)
 
 
 @pytest.fixture(scope="module")

@@ -1,22 +1,9 @@
 """The body that is lifted: as many splats as are asked for, and inside as many as the simulation needs."""
 
-import pytest
-
 from fluidlift.config import build_config
-from fluidlift.io.stage_cache import load_stage
-from fluidlift.pipeline import STAGES, Inputs, Silence
+from fluidlift.pipeline import Inputs
 from fluidlift.pipeline.refining import WHOLE, refine
-from fluidlift.pipeline.story import Result, Story
 from fluidlift.types import CellType
-
-
-@pytest.fixture(scope="module")
-def story(made):
-    story = Story(made.folder, STAGES, progress=Silence())
-    for name in ("read", "flow", "segment", "geometry"):
-        (facts,) = (made.folder / "work" / name).glob("*.json")
-        story.results[name] = Result(*load_stage(made.folder, name, facts.stem))
-    return story
 
 
 def body(story, most: int):

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import cv2
 import numpy as np
-from scipy.ndimage import convolve1d
+from scipy.ndimage import convolve1d, gaussian_filter
 
 from fluidlift.shape.evidence import Evidence
 from fluidlift.shape.frame_pictures import typical_picture
@@ -118,6 +118,13 @@ def filled_in(picture: np.ndarray, known: np.ndarray) -> np.ndarray:
     coarse = filled_in(mean / np.maximum(share, 1e-6)[..., None], share > 0.0)
     smooth = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR)
     return np.where(known[..., None], picture, smooth).astype(np.float32)
+
+
+def weight_of_unseen(seen: np.ndarray) -> np.ndarray:
+    """How much of a guess is blended in, float32 [h,w]: 1 where nothing was `seen`, bool [h,w], 0 a few pixels off."""
+    weight = np.clip(2.0 * gaussian_filter((~seen).astype(np.float32), 1.5), 0.0, 1.0)
+    weight[~seen] = 1.0
+    return weight
 
 
 def quiet_fluid(

@@ -387,8 +387,6 @@ def solid_heights(
     """
     solid = (labels != Label.FLUID) & np.isfinite(depth) & (depth > 0)
     heights = np.full(grid.shape[:2], np.nan)
-    if not solid.any():
-        return heights
     points = camera.unproject(camera.pixel_grid()[solid], depth[solid].astype(np.float64))
     cell = np.floor((points[:, :2] - np.asarray(grid.origin)[:2]) / grid.spacing).astype(int)
     ok = ((cell >= 0) & (cell < grid.shape[:2])).all(axis=1)

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 
 from fluidlift.errors import require
+from fluidlift.shape.background import weight_of_unseen
 from fluidlift.shape.terrain import Setting
 from fluidlift.types import SH_C0, CellType, Gaussians, PinholeCamera, decompose_covariances, sh_from_rgb
 
@@ -50,9 +51,8 @@ def background_plate(
     ground = seen if solid is None else seen & ~ndimage.binary_dilation(solid, iterations=3)
     if ground.any() and not seen.all():
         painted = _inpainted(image, ~ground)
-        blend = np.clip(ndimage.gaussian_filter((~seen).astype(np.float32), 1.5) * 2.0, 0, 1)
-        blend[~seen] = 1.0
-        image = (image * (1 - blend[..., None]) + painted * blend[..., None]).astype(np.uint8)
+        blend = weight_of_unseen(seen)[..., None]
+        image = (image * (1 - blend) + painted * blend).astype(np.uint8)
     return BackgroundPlate(image, seen)
 
 

@@ -15,7 +15,7 @@ from scipy import ndimage
 
 from fluidlift.numerics.textures import sample_texture
 from fluidlift.numerics.triangles import rasterize_triangles
-from fluidlift.shape.background import filled_in
+from fluidlift.shape.background import filled_in, weight_of_unseen
 from fluidlift.shape.ground_mesh import PARTS, cut_colour
 from fluidlift.types import Grid, Label, PinholeCamera, TriangleMesh
 
@@ -125,9 +125,7 @@ def over_bed(
         return plate
     uv = (mesh.uv[found.face] * found.barycentric[..., None]).sum(axis=-2)
     ground = 255.0 * sample_texture(mesh.texture, uv)
-    weight = np.clip(2.0 * ndimage.gaussian_filter((~seen).astype(np.float32), 1.5), 0.0, 1.0)
-    weight[~seen] = 1.0
-    weight = (weight * drawn)[..., None]
+    weight = (weight_of_unseen(seen) * drawn)[..., None]
     return np.clip(np.round(plate * (1.0 - weight) + ground * weight), 0, 255).astype(np.uint8)
 
 

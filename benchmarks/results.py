@@ -4,9 +4,9 @@
     python benchmarks/results.py --work runs --only river --preset standard
 
 Cases (folders with truth.npz) are scored with `fluidlift evaluate`; clips (folders with video.mp4 alone) have no truth.
-They are looked for below FLUIDLIFT_SHARED, or a folder `shared` beside the repository; the demo case of the package is
-always there. Each run is a process of its own and leaves one JSON file in the work folder; what is there already is not
-run again (`--again` does). The tables show everything that the work folder holds.
+They are looked for below FLUIDLIFT_SHARED, or a folder `shared` beside the repository; the demo case of the package and
+a made dam break are always there. Each run is a process of its own and leaves one JSON file in the work folder; what
+is there already is not run again (`--again` does). The tables show everything that the work folder holds.
 """
 
 from __future__ import annotations
@@ -44,12 +44,22 @@ class Subject:
     hand_mask: Path | None = None
 
 
+def _made(name: str, folder: Path, **how: Any) -> Path:
+    """A made scene, from an earlier run where it is there: it takes a minute or two."""
+    from fluidlift.synthetic.record import make_scene
+
+    return folder if (folder / "truth.npz").is_file() else make_scene(name, folder, **how)
+
+
 def subjects(shared: Path | None, work: Path) -> Iterator[Subject]:
-    """The demo, then cases, then clips."""
+    """The demo and a made dam break, then cases, then clips."""
     from fluidlift.synthetic.demo import data_file, unpack_demo_case
 
     demo = unpack_demo_case(work / "demo_case")
     yield Subject("demo", demo / "video.mp4", demo, ("--camera", str(data_file("demo_camera.json"))))
+    dam = _made("dam", work / "dam_case", size=(320, 240), frames=50, seed=5, cells=64)
+    yield Subject("dam", dam / "video.mp4", dam, ("--camera", str(dam / "camera.json")))
+    yield Subject("dam_no_camera", dam / "video.mp4", dam)
     if shared is None:
         return
     for folder in sorted(p.parent for p in shared.glob("cases/*/truth.npz")):

@@ -44,13 +44,31 @@ def smoke():
     return scene(np.stack(masks), (0.2, -2.5), GREY)
 
 
+def dam(top=25, edge=0):
+    """A block that becomes a layer of twice its width, `edge` px below the picture's upper border at most."""
+    masks = []
+    for t in range(T):
+        height, right = round(50 * 60 / (60 + 15 * t)), 10 + 60 + 15 * t
+        masks.append((ROW < top + 50) & (ROW >= max(top + 50 - height, edge)) & (COL > 10) & (COL < right))
+    return scene(np.stack(masks), (2.0, 0.8), BLUE)
+
+
 @pytest.mark.parametrize(
     ("clip", "kind"),
-    [(river, "stream"), (jet, "pour"), (curtain, "fall"), (smoke, "plume")],
+    [(river, "stream"), (jet, "pour"), (curtain, "fall"), (smoke, "plume"), (dam, "dam")],
 )
 def test_the_kind_is_what_the_fluid_does(clip, kind):
     found = estimate_kind(*clip())
     assert found.kind == kind, (found.scores, found.features)
+
+
+def test_what_is_fed_from_the_upper_border_is_no_dam():
+    block = dam(top=-2)
+    assert block[1][:, 0].any()
+    assert estimate_kind(*block).features["collapsing"] == 0.0
+    assert estimate_kind(*dam()).features["collapsing"] > 0.8
+    backwards = [x[::-1] if x.ndim == 4 or x.shape[0] == T else x for x in dam()]
+    assert estimate_kind(*backwards).features["collapsing"] == 0.0  # a body that rises out of a layer
 
 
 def test_beliefs_are_shares_and_the_kind_has_the_largest():

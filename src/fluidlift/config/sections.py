@@ -31,7 +31,7 @@ class ReadConfig:
 class ShapeConfig:
     """Geometry."""
 
-    kind: Literal["auto", "stream", "fall", "pour", "plume"] = "auto"
+    kind: Literal["auto", "stream", "fall", "pour", "plume", "dam"] = "auto"
     """what the fluid does; auto decides from evidence"""
     fov: float | None = None
     """field of view across the longer side, degrees; None: camera file, lens metadata, else 50"""

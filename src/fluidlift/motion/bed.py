@@ -28,7 +28,7 @@ it is taken to be turbulent. Water is faster than the first for its slope and de
 as it is deep: 1.2 there, 2.3 where they are as tall (Ferguson 2007, Water Resources Research 43, W05427). At the
 second, 1 / 0.4, the log law ends: its mean over the depth is 0. In a film the ratio is sqrt(Re / 2)."""
 
-LAYER_CELLS = {"stream": 1.0, "fall": 0.75, "pour": 2.0, "plume": 0.4}
+LAYER_CELLS = {"stream": 1.0, "fall": 0.75, "pour": 2.0, "plume": 0.4, "dam": 1.0}
 """Thickness of the layer in cells. Water is turbulent: beside the bed of a river some 10 cells deep its speed at half
 a cell is about 0.7 of the surface speed (1/7 power law), which a layer of one cell gives; films from a fall are
 shorter. What is poured is often viscous and drags through its depth. In smoke the layer stays below half a cell and so
@@ -173,7 +173,7 @@ def layer_thickness(kind: str, spacing: float) -> float:
     grid cannot show, and the fluid's own viscosity acts beyond it.
 
     Args:
-        kind: "stream", "fall", "pour" or "plume".
+        kind: "stream", "fall", "pour", "plume" or "dam".
         spacing: cell width, m.
     """
     require(kind in LAYER_CELLS, f"kind '{kind}'", "one of " + ", ".join(LAYER_CELLS))

@@ -297,7 +297,8 @@ def _filled(
     mean, trust = smoothed_flow(near, at, mask, half_window=options.half_window, along_paths=options.along_paths)
     direction = mainstream_direction(mean, trust, mask, downhill=downhill)
     with_depth = depth is not None and bool((depth[mask] > 0).all())
-    prior = None if scene.kind == "plume" else scene.prior  # a plume that grows has no mean motion
+    # what grows or collapses has no mean motion
+    prior = None if scene.kind in ("plume", "dam") else scene.prior
     full, seen = complete_flow(mean, trust, mask, direction, depth if with_depth else None, prior=prior)
     return full, seen, trust
 

@@ -9,7 +9,8 @@ import numpy as np
 
 from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected
-from fluidlift.pipeline import composite, depths, given_body, ground
+from fluidlift.pipeline import composite, dam, depths, given_body, ground
+from fluidlift.pipeline.known_camera import known_camera, level_of
 from fluidlift.pipeline.reading import Inputs, clip_of
 from fluidlift.pipeline.seeing import masks_of, mean_motion
 from fluidlift.pipeline.story import Result, Story
@@ -19,8 +20,10 @@ from fluidlift.shape import (
     ground_texture,
     place,
     puddle,
+    standing,
     surface,
     terrain,
+    texture_gradient,
 )
 from fluidlift.shape import kind as kinds
 from fluidlift.shape.framing import framing_warnings
@@ -37,10 +40,6 @@ from fluidlift.types import (
 
 FEWEST_PIXELS = 16
 """of fluid at the first instant: fewer have no shape"""
-
-
-USUAL_FIELD_OF_VIEW = 50.0
-"""degrees across the longer side, where nothing says better: between a phone's main lens (65) and a short telephoto"""
 
 
 def rest_frame(area: np.ndarray) -> int:
@@ -73,6 +72,8 @@ class _Sight:
     """of the camera above the water, in the units of its file, where that is known"""
     unsure: str
     """what to say of that height; empty: nothing"""
+    stood: standing.StandingBody | None = None
+    """of a dam"""
 
     @property
     def lying_trust(self) -> np.ndarray:
@@ -97,26 +98,32 @@ def geometry(story: Story, inputs: Inputs, config: JobConfig) -> Result:
     points, velocities = _surface_motion(canonical, visible, front.sighted, seen.motion, clip.interval)
     falls, trust = falling.pixels[visible], seen.trust[visible]
     sighting = place.Sighting(trust, clip.interval, up.pitch)
-    scale = place.metric_scale(
-        kind, points, velocities, size=c.size, camera_height=seen.height, known_scale=known_scale, seen=sighting
-    )
+    if seen.stood is not None:
+        scale = standing.standing_scale(seen.stood, size=c.size, height=seen.height, interval=clip.interval)
+    else:
+        scale = place.metric_scale(
+            kind, points, velocities, size=c.size, camera_height=seen.height, known_scale=known_scale, seen=sighting
+        )
     if seen_depth is not None:
         scale = depths.with_learned_scale(scale, seen_depth, points)
         warnings += depths.size_warnings(scale.across, seen_depth, seen.height, points)
-    scale, sentence = _told(composite.with_fall(scale, points, velocities, falls, sighting), seen.unsure)
+    scale, sentence = _told(composite.with_fall(scale, points, velocities, falls, sighting), seen)
     warnings += [scale.warning] * bool(scale.warning)
-    mainstream = _mainstream(kind, velocities[~falls], trust[~falls])
+    mainstream = _mainstream(kind, velocities[~falls], trust[~falls]) if seen.stood is None else seen.stood.direction
     eye = seen.known.position if seen.pose_given else None
     to_world, camera = place.place(canonical, points, scale.value, heading=seen.heading, eye=eye, mainstream=mainstream)
     depth = (front.depth * scale.value).astype(np.float32)
     half = (front.half_thickness * scale.value).astype(np.float32)
     bulk = to_world.vectors(mainstream) / to_world.scale
     scene = None if seen_depth is None else np.where(mask, np.nan, seen_depth.scene.depth * scale.value)
-    setting = ground.setting_around(
-        kind, front, fluid, seen.start, seen.united, camera, to_world, depth, half, bulk, c, falling.pixels,
-        speed=_seen_speed(visible, velocities * scale.value, seen.trust), scene_depth=scene, closed=parts.puddle,
-    )  # fmt: skip
-    setting = composite.composed(setting, falling, to_world, points[~falls], velocities[~falls], camera)
+    if seen.stood is not None:
+        setting = standing.standing_setting(seen.stood, to_world, bulk, longest=c.cells, limit=c.cell_limit)
+    else:
+        setting = ground.setting_around(
+            kind, front, fluid, seen.start, seen.united, camera, to_world, depth, half, bulk, c, falling.pixels,
+            speed=_seen_speed(visible, velocities * scale.value, seen.trust), scene_depth=scene, closed=parts.puddle,
+        )  # fmt: skip
+        setting = composite.composed(setting, falling, to_world, points[~falls], velocities[~falls], camera)
     if not (setting.cell_types == CellType.FLUID).any():
         raise InputRejected(
             f"as a {kind}, the fluid fills no cell of the grid beside those of its inlet", "a larger or thicker body",
@@ -131,6 +138,8 @@ def geometry(story: Story, inputs: Inputs, config: JobConfig) -> Result:
         setting = ground.textured(setting, view)
         picture = ground_texture.over_bed(picture, view.seen, setting.terrain.mesh, camera)
     arrays, meta = ground.packed(setting)
+    if seen.stood is not None:
+        arrays["rocks"] = seen.stood.solid
     arrays |= {
         "mask": mask, "depth": depth, "half_thickness": half, "mean_flow": seen.motion, "mean_confidence": seen.trust,
         "sighted_depth": (front.sighted * scale.value).astype(np.float32), "plate": picture,
@@ -158,17 +167,24 @@ def _seen(story: Story, inputs: Inputs, config: JobConfig) -> tuple[_Sight, Dept
     if not mask.any():
         mask = fluid[start]
     motion, trust = mean_motion(story, fluid.any_frame())
-    known, pose_given = _known_camera(inputs, config, clip.size)
+    known, pose_given = known_camera(inputs, config, clip.size)
     pictures, known = _depth_pictures(story, inputs, config, known, start)
-    evidence, kind, parts, up, heading = _kind_and_up(story, inputs, config, known, pose_given, mask, motion, trust)
-    height, unsure = None, ""
-    if pose_given and kind == "stream":
-        level, unsure = _water_level(inputs)
+    evidence, kind, parts, up, heading = _kind_and_up(
+        story, inputs, config, known, pose_given, mask, motion, trust, shaped=pictures is not None
+    )
+    height, unsure, stood = None, "", None
+    if pose_given and kind in ("stream", "dam"):
+        level, unsure = level_of(kind, inputs)
         height = float(known.position[2] - level)
+    if kind == "dam":
+        start, united = dam.let_go(fluid), 1
+        mask = fluid[start]
+        parts = composite.Parts((), mask)
+        stood = dam.stood(fluid, start, kinds.level_camera(known, up))
     tilt_known = pose_given or c.pitch is not None
     seen = _Sight(
         start, united, mask, motion, trust, known, pose_given, evidence, kind, parts, up, heading, tilt_known, height,
-        unsure,
+        unsure, stood,
     )  # fmt: skip
     return seen, pictures
 
@@ -189,14 +205,15 @@ def _surface(seen: _Sight, pictures: DepthPictures | None, fluid, inputs: Inputs
     return found.up, kinds.level_camera(seen.known, found.up), found.front, found.known_scale, found
 
 
-def _told(scale: place.MetricScale, unsure: str) -> tuple[place.MetricScale, str]:
-    """The scale with its warning, and its sentence, where the water's level was assumed."""
-    if unsure and scale.source == "camera":
-        return replace(scale, warning=unsure), f"{scale.sentence}, with the water at z = 0, assumed"
+def _told(scale: place.MetricScale, seen: _Sight) -> tuple[place.MetricScale, str]:
+    """The scale with its warning, and its sentence, where the level of the water or the ground was assumed."""
+    if seen.unsure and scale.source == "camera":
+        what = "water" if seen.stood is None else "ground"
+        return replace(scale, warning=seen.unsure), f"{scale.sentence}, with the {what} at z = 0, assumed"
     return scale, scale.sentence
 
 
-def _kind_and_up(story, inputs, config, known, pose_given, mask, motion, trust):
+def _kind_and_up(story, inputs, config, known, pose_given, mask, motion, trust, *, shaped):
     """Evidence for the kind, the kind, the tilt of the camera, and its heading where it was surveyed."""
     clip, fluid, c = clip_of(story), masks_of(story), config.shape
     surveyed, heading = place.pose_up(known)
@@ -204,6 +221,12 @@ def _kind_and_up(story, inputs, config, known, pose_given, mask, motion, trust):
     pick = np.unique(np.linspace(0, len(clip) - 1, 8).astype(int))
     evidence = kinds.estimate_kind(clip.frames[pick], fluid[pick], motion, trust, pitch=pitch)
     kind = evidence.kind if c.kind == "auto" else c.kind
+    if kind == "dam" and (shaped or inputs.geometry is not None):
+        if c.kind == "dam":
+            raise InputRejected(
+                "--kind dam together with a given depth or body", "one source of the fluid's shape", "leave one out"
+            )
+        kind = max((k for k in evidence.scores if k != "dam"), key=lambda k: evidence.scores[k])
     if inputs.geometry is None:
         kind, parts = composite.split(
             kind, known, surveyed if pose_given else None, mask, motion, trust, free=c.kind == "auto"
@@ -221,7 +244,12 @@ def _kind_and_up(story, inputs, config, known, pose_given, mask, motion, trust):
         upright = given_body.up_of(inputs.geometry, surveyed, kind, rest_frame(fluid.areas()), clip.size)
         if upright is not None:
             return evidence, kind, parts, upright, None
-    up = kinds.estimate_up(kind, parts.lying, motion, trust * ~parts.falling, known, pitch=c.pitch, roll=c.roll)
+    texture = None
+    if kind == "stream" and c.pitch is None and not parts.puddle:
+        texture = texture_gradient.texture_patches(clip.frames, parts.lying & ~parts.falling)
+    up = kinds.estimate_up(
+        kind, parts.lying, motion, trust * ~parts.falling, known, pitch=c.pitch, roll=c.roll, texture=texture
+    )
     if parts.puddle and c.pitch is None:
         up = puddle.puddle_tilt(parts.lying, up)
     if c.roll is None:
@@ -239,32 +267,6 @@ def united_range(story: Story, config: JobConfig) -> tuple[int, int]:
     return start, int(min(window_length(frames[start:stop], fluid[start], longest=longest), len(frames) - start))
 
 
-def known_field_of_view(inputs: Inputs, config: JobConfig, size: tuple[int, int]) -> tuple[float, bool]:
-    """Degrees across the longer side, and whether that was told: by the user, a camera file or the lens."""
-    from fluidlift.io.lens import lens_field_of_view
-
-    focal = max(_known_camera(inputs, config, size)[0].focal)
-    told = inputs.camera is not None or config.shape.fov or lens_field_of_view(inputs.clip)
-    return float(2 * np.degrees(np.arctan(0.5 * max(size) / focal))), bool(told)
-
-
-def _known_camera(inputs: Inputs, config: JobConfig, size: tuple[int, int]) -> tuple[PinholeCamera, bool]:
-    """The camera file's camera, or one from the field of view; and whether its pose is known."""
-    from fluidlift.io.images import read_camera, read_json
-
-    if inputs.geometry is not None and given_body.note_of(inputs.geometry) is None:
-        # its camera is the one that saw the body; its world is not the user's
-        return read_camera(inputs.geometry / "camera.json", size), False
-    if inputs.camera is None:
-        from fluidlift.io.lens import lens_field_of_view
-
-        fov = config.shape.fov or lens_field_of_view(inputs.clip) or USUAL_FIELD_OF_VIEW
-        return PinholeCamera.from_fov(fov, size), False
-    camera = read_camera(inputs.camera, size)
-    data = read_json(inputs.camera, "camera file")
-    return camera, "R" in data or "frames" in data
-
-
 def _depth_pictures(story, inputs, config, known, start) -> tuple[DepthPictures | None, PinholeCamera]:
     """Depth from a file or a model, and the camera with the model's field of view where nothing else says it."""
     from fluidlift.io.lens import lens_field_of_view
@@ -276,23 +278,11 @@ def _depth_pictures(story, inputs, config, known, start) -> tuple[DepthPictures 
     return pictures, known
 
 
-def _water_level(inputs: Inputs) -> tuple[float, str]:
-    """z of the water, m, where a camera file says it; else the ground of its world, 0, and a warning."""
-    from fluidlift.io.images import read_json
-
-    data = read_json(inputs.camera, "camera file") if inputs.camera is not None else {}
-    value = data.get("water_level_z")
-    if isinstance(value, int | float):
-        return float(value), ""
-    return 0.0, (
-        "the camera file does not say how high the water stands: z = 0 is assumed, which sets the scale; "
-        "add water_level_z (m) to it, or give --size"
-    )
-
-
 def _front(seen: _Sight, inputs: Inputs, canonical: PinholeCamera, interval: float):
     """The front surface in canonical units; metres per unit where the depth came in metres, else None."""
     lying, motion, trust = seen.parts.lying, seen.motion, seen.lying_trust
+    if seen.stood is not None:
+        return standing.standing_front(canonical, seen.stood), None
     if inputs.geometry is not None:
         return given_body.given_front(inputs.geometry, canonical, lying, seen.kind, seen.start)
     if seen.kind == "stream":

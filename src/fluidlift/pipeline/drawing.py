@@ -119,7 +119,7 @@ def _rock_depth(stage: Stage) -> np.ndarray | None:
     from fluidlift.look.scenery import terrain_depth
 
     footage, camera = stage.footage, stage.cameras[0]
-    rocks = None if footage is None else footage.labels.solid.mean(axis=0) > 0.5
+    rocks = None if footage is None else footage.rocks
     if rocks is None or not rocks.any():
         return None
     there = _placed(rocks[..., None].repeat(3, 2).astype(np.uint8) * 255, stage.scene.camera, camera)[..., 0] > 0.5
@@ -145,7 +145,7 @@ def _rocks(stage: Stage) -> Callable[[Gaussians], Gaussians] | None:
     from fluidlift.look.scenery import terrain_depth, visible_beside_rocks
 
     scene, footage = stage.scene, stage.footage
-    rocks = None if footage is None else footage.labels.solid.mean(axis=0) > 0.5
+    rocks = None if footage is None else footage.rocks
     if rocks is None or not rocks.any():
         return None
     depth, margin = terrain_depth(scene.terrain, scene.camera), 1.5 * scene.terrain.grid.spacing

@@ -40,15 +40,15 @@ TIES = (
 class Verdict:
     """How a fit ended."""
 
-    status: Literal["fitted", "unfinished", "failed"]
-    """unfinished: better than the first guess, but not at the minimum"""
+    status: Literal["fitted", "unfinished", "failed", "left"]
+    """unfinished: better than the first guess, but not at the minimum; left: not tried, for the reason given"""
     reason: str = ""
     """what went wrong; empty where nothing did"""
 
     @property
     def usable(self) -> bool:
         """The values found are better than the first guess."""
-        return self.status != "failed"
+        return self.status in ("fitted", "unfinished")
 
     def warnings(self) -> list[str]:
         """For the user."""

@@ -97,7 +97,7 @@ def _require_installed(card: GeneratorCard, choice: generators.GeneratorChoice) 
 
 def run(story: Story, inputs: Inputs, config: JobConfig, hashes: Hashes) -> tuple[Inputs, Hashes]:
     """Ask the generator where the job has one; the inputs with its bodies as their geometry, and its key."""
-    from fluidlift.pipeline.body import known_field_of_view
+    from fluidlift.pipeline.known_camera import known_field_of_view
 
     if config.generate.name is None:
         return inputs, hashes

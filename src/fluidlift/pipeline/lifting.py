@@ -32,8 +32,9 @@ def motion(story: Story, config: JobConfig) -> Result:
     g, (width, height) = story["geometry"], clip_of(story).size
     pairs, grid = len(clip_of(story)) - 1, setting_of(story).terrain.grid
     start = min(g.meta["rest_frame"], pairs - 1)
-    targets = range(start, min(start + config.motion.targets, pairs))
-    wanted = sorted(set(targets) | set(range(0, pairs, config.motion.complete_every)))
+    stands = g.meta["kind"] == "dam"  # its body is known as it stands, not as it collapses
+    targets = range(start, start if stands else min(start + config.motion.targets, pairs))
+    wanted = sorted({start, *targets} | set(range(0, pairs, config.motion.complete_every)))
     spans = spans_of(clip_of(story))
     completed = story.scratch.array("completed", (pairs, height, width, 2), np.float16)
     observed = story.scratch.array("observed", (pairs, height, -(-width // 8)), np.uint8)
@@ -58,6 +59,9 @@ def motion(story: Story, config: JobConfig) -> Result:
         share = float(found.observed[wet].mean()) if wet.any() else None
         reports.append({"frame": found.frame, "observed_share": share, **plain_report(found)})
         seen.append(found)
+    if stands:
+        _add_rest(arrays, grid)
+        reports.append({"frame": start})
     shares = [s.free_fall_share for s in seen if s.free_fall_share is not None]
     factors = [s.front_factor for s in seen if s.front_factor is not None]
     return Result(
@@ -70,6 +74,13 @@ def motion(story: Story, config: JobConfig) -> Result:
             "free_fall_share": float(max(shares, default=0.0)),
         },
     )
+
+
+def _add_rest(arrays: dict[str, np.ndarray], grid: Grid) -> None:
+    """The target velocity of a fluid at rest."""
+    for name, component in zip("uvw", FaceVelocity.zeros(grid).components):
+        arrays[f"target_000_{name}"] = component.astype(np.float32)
+    arrays["target_000_seen"] = np.packbits(np.zeros(grid.shape, bool), axis=-1)
 
 
 def motion_scene(story: Story) -> MotionScene:

@@ -35,10 +35,10 @@ from fluidlift.types import (
     FluidParameters,
 )
 
-VISCOSITY_PRIOR = {"stream": 1e-5, "fall": 1e-5, "pour": 1e-4, "plume": 1e-5}
+VISCOSITY_PRIOR = {"stream": 1e-5, "fall": 1e-5, "pour": 1e-4, "plume": 1e-5, "dam": 1e-5}
 """m^2/s, where the fit starts"""
 
-WALL_DAMPING_PRIOR = {"stream": 0.05, "fall": 0.05, "pour": 0.2, "plume": 0.02}
+WALL_DAMPING_PRIOR = {"stream": 0.05, "fall": 0.05, "pour": 0.2, "plume": 0.02, "dam": 0.05}
 """share of the tangential velocity that a wall takes per step of the fit, where the fit starts: water runs nearly free
 over a bed that the grid cannot resolve. A viscous film does not: it sticks (`sticking`)"""
 
@@ -59,6 +59,11 @@ def fit(story: Story, config: JobConfig) -> Result:
         raise InputRejected(
             "a known gravity for a plume, whose gravity stands for its buoyancy", "another parameter",
             "give gravity in scene.yaml, for the simulation",
+        )  # fmt: skip
+    if kind == "dam" and request.free:
+        raise InputRejected(
+            f"a fit of {', '.join(request.free)} to a dam, whose velocities are known as it stands, before it moves",
+            "values that you know", "leave out fit.free and give them with --hold or in scene.yaml",
         )  # fmt: skip
     targets = targets_of(story)
     initial = request.applied(first_guess(story, targets), along=along)
@@ -116,6 +121,9 @@ def _attempt(
     from fluidlift.fit.optimize import fit_parameters
 
     setting = setting_of(story)
+    if story["geometry"].meta["kind"] == "dam":
+        reason = "a body at rest tells nothing of its parameters: they are those of such a fluid, or as given"
+        return FitResult(initial, {}, np.zeros(0), False, 0), Verdict("left", reason)
     try:
         with one_torch_thread():
             found = fit_parameters(
@@ -172,6 +180,11 @@ def first_guess(story: Story, targets: list[FaceVelocity]) -> FluidParameters:
     cells, direction = setting.cell_types, setting.terrain.mainstream
     mean = np.mean([t.at_centers() for t in targets], axis=0)
     inlet = cells == CellType.INFLOW
+    if kind == "dam":  # nothing flows in or out
+        return FluidParameters(
+            kinematic_viscosity=VISCOSITY_PRIOR[kind], inflow_velocity=(0.0, 0.0, 0.0), restitution=0.05,
+            wall_damping=WALL_DAMPING_PRIOR[kind], time_step=clip_of(story).interval,
+        )  # fmt: skip
     wet = inlet | (cells == CellType.FLUID)
     bulk = mean[inlet].mean(axis=0) if inlet.any() else mean[wet].mean(axis=0)
     spread = np.std([t.at_centers()[inlet] for t in targets], axis=0).mean() if inlet.any() else 0.0

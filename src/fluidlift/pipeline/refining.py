@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from fluidlift.pipeline.seeing import labels_of
 from fluidlift.pipeline.story import Result, Story
 from fluidlift.seams import Rasterizer
 from fluidlift.shape import generate, terrain
-from fluidlift.types import CellType, Gaussians, Label, PinholeCamera, concatenate
+from fluidlift.types import CellType, Gaussians, Label, PinholeCamera, VideoClip, concatenate, sh_from_rgb
 
 KEPT = 0.6
 """part of its size that a splat of the inside keeps at least: at 0.3 the first frame is a little cleaner, but once the
@@ -69,6 +70,9 @@ def refine(story: Story, inputs: Inputs, config: JobConfig) -> Result:
     inside = [hull, _outside_solid(added, setting)]
     inside = [generate.beneath_front(part, depth, mask, camera, smallest=KEPT, drop_above=True) for part in inside]
     hull, added = (generate.within_silhouette(part, allowed, camera, smallest=KEPT) for part in inside)
+    if g.meta["kind"] == "dam":  # its sides tell nothing of the inside that is seen once it spreads
+        colour = _later_colour(clip, fluid, start)
+        hull, added = (replace(part, sh=sh_from_rgb(np.tile(colour, (len(part), 1)))) for part in (hull, added))
     body = concatenate([shown, hull, added])
     if len(body) < 50:
         raise InputRejected(
@@ -85,6 +89,13 @@ def refine(story: Story, inputs: Inputs, config: JobConfig) -> Result:
         "prune_report": str(pruned),
     } | fitted
     return Result(gaussians_to_arrays(body), meta)
+
+
+def _later_colour(clip: VideoClip, fluid, start: int) -> np.ndarray:
+    """sRGB in [0, 1] that the fluid usually has after its first frame, float32 [3]."""
+    later = np.unique(np.linspace(start + 1, len(clip) - 1, 8).round().astype(int))
+    seen = np.concatenate([clip.frames[t][fluid[t]][::7] for t in later])
+    return (np.median(seen, axis=0) / 255.0).astype(np.float32)
 
 
 def _bodies(story, inputs, config, fluid, start, united) -> tuple[list[Gaussians], dict[str, Any]]:

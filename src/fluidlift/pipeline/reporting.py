@@ -237,7 +237,8 @@ def _section_parameters(story: Story) -> Section:
                 "falls and levels out; it may rise again once the noise is known and priors count",
             )
         )
-    how = {"fitted": "The fit converged.", "unfinished": "The fit did not converge: best values so far."}
+    how = {"fitted": "The fit converged.", "unfinished": "The fit did not converge: best values so far.",
+           "left": f"Not fitted: {meta.get('reason', '')}."}  # fmt: skip
     status = meta.get("status", "fitted" if meta["converged"] else "unfinished")
     said = how.get(status, f"The fit failed: {meta.get('reason', '')}. The first guess is kept.")
     scale = g["scale"].get("sentence", f"scale: {g['scale']['source']}")

@@ -73,6 +73,8 @@ class Footage:
     """u8 [H,W,3], the picture without the fluid"""
     start: int
     """frame of the clip that the first simulated one shows"""
+    rocks: np.ndarray
+    """bool [H,W], pixels in which something solid stands in or before the fluid"""
 
 
 @dataclass(frozen=True)
@@ -80,7 +82,7 @@ class Scene:
     """A simulation at its first instant."""
 
     kind: str
-    """stream, fall, pour or plume"""
+    """stream, fall, pour, plume or dam"""
     rest: Gaussians
     """world, m"""
     body: Particles
@@ -178,7 +180,9 @@ def footage_of(story: Story) -> Footage | None:
     if not {"read", "segment", "geometry"} <= story.results.keys():
         return None
     g = story["geometry"]
-    return Footage(clip_of(story), labels_of(story), g.arrays["plate"], int(g.meta["rest_frame"]))
+    labels = labels_of(story)
+    rocks = g.arrays["rocks"] if "rocks" in g.arrays else labels.solid.mean(axis=0) > 0.5
+    return Footage(clip_of(story), labels, g.arrays["plate"], int(g.meta["rest_frame"]), rocks)
 
 
 def scene_of(

@@ -114,7 +114,7 @@ def _panels(
     rocks, compared = np.zeros(plate.shape[:2], bool), 0
     if footage is not None and not scene.reshaped:  # the clip shows the ground as it was
         plate = footage.plate.astype(np.float32) / 255.0
-        rocks = footage.labels.solid.mean(axis=0) > 0.5
+        rocks = footage.rocks
         # frames after the clip or between its own, and those of an edited scene, have no counterpart in it
         edited = scene.obstacles or scene.emitters or scene.overlap or scene.changes
         if scene.interval == scene.clip_interval and not edited:

@@ -11,9 +11,10 @@ from scipy import ndimage
 
 from fluidlift.errors import require
 from fluidlift.shape import chute, slope
+from fluidlift.shape.texture_gradient import TexturePatches
 from fluidlift.types import PinholeCamera, RigidTransform
 
-Kind = Literal["stream", "fall", "pour", "plume"]
+Kind = Literal["stream", "fall", "pour", "plume", "dam"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 
 PITCH_PRIOR: dict[str, tuple[float, float]] = {
@@ -21,6 +22,7 @@ PITCH_PRIOR: dict[str, tuple[float, float]] = {
     "fall": (8.0, 8.0),
     "pour": (8.0, 8.0),
     "plume": (2.0, 6.0),
+    "dam": (25.0, 12.0),
 }
 """mean and standard deviation of how far people tilt a camera down at such a fluid, degrees (a choice, not a law)"""
 
@@ -97,6 +99,8 @@ def estimate_kind(
         + 2.0 * f["foreground"] * (1 - f["slender"])
         - 1.8 * f["falling"] * (1 - f["foreground"])
         - 1.5 * f["rising"] * (1 - still * f["ground"]),
+        # a body that stands comes down from where it was and spreads over ground that was dry
+        "dam": 7.0 * f["collapsing"] - 2.0,
     }
     if pitch is not None:  # steep views of bodies in the air are rare
         belief["stream"] += 1.5 * np.clip((pitch - 20.0) / 20.0, -1.0, 1.0)
@@ -147,9 +151,29 @@ def _features(frames, fluid, displacement, confidence) -> dict[str, float]:
         "hanging": float(fluid[:, : max(2, height // 60)].any(axis=(1, 2)).mean() * (1 - ground)),
         "changing": float(np.clip(change / 0.3, 0.0, 1.0)),
         "grey": float(np.clip(1.0 - chroma / 0.15, 0.0, 1.0)),
+        "collapsing": _collapsing(fluid),
         "speed_px": float(total / max(float((confidence * union).sum()), 1e-9)),
         "area_share": float(union.sum() / (height * width)),
     }
+
+
+def _collapsing(fluid: np.ndarray) -> float:
+    """0 to 1: how much of the first outline is left for good, from above, for ground that was dry.
+
+    What reaches the picture's upper edge is fed from there, and what is as high in the end as it was has not come down.
+    """
+    count = len(fluid)
+    first, later = fluid[0], fluid[-max(count // 3, 1) :].mean(axis=0)
+    area = float(first.sum())
+    left, gained = first & (later < 0.3), ~fluid[: max(count // 8, 1)].any(axis=0) & (later > 0.7)
+    if count < 4 or area == 0 or not left.any() or not gained.any() or first[0].any():
+        return 0.0
+    tops, (highest, lowest) = np.nonzero(later > 0.5)[0], np.percentile(np.nonzero(first)[0], [2, 98])
+    tall = max(lowest - highest, 1.0)
+    sunk = (np.percentile(tops, 2) - highest) / tall
+    fell = (np.nonzero(gained)[0].mean() - np.nonzero(left)[0].mean()) / tall
+    share = min(left.sum() / (0.25 * area), 1.0) * min(gained.sum() / (0.5 * area), 1.0)
+    return float(share * np.clip(fell / 0.3, 0.0, 1.0) * np.clip(sunk / 0.15, 0.0, 1.0))
 
 
 def estimate_up(
@@ -161,11 +185,13 @@ def estimate_up(
     *,
     pitch: float | None = None,
     roll: float | None = None,
+    texture: TexturePatches | None = None,
 ) -> UpEvidence:
     """The camera's tilt from the fluid.
 
-    Over a stream, the perspective of its motion shows the tilt (`slope.estimate_tilt`), weighed against how people
-    hold cameras: how much it had to say is the confidence, and where it runs across the picture that is little. What
+    Over a stream, the perspective of its motion and of its pattern shows the tilt (`slope.estimate_tilt`), weighed
+    against how people hold cameras: how much they had to say is the confidence, and of motion across the picture, or a
+    pattern that is not the same all over, that is little. What
     falls does so along the vertical, which gives the roll; its pitch keeps the prior, as all of a plume's tilt does.
 
     Args:
@@ -176,6 +202,7 @@ def estimate_up(
         camera: for the focal length; its pose is not used.
         pitch: degrees below the horizon, when the user gave it.
         roll: degrees clockwise, when the user gave it.
+        texture: of the fluid's pictures; of a stream without chutes it shows the tilt as well.
     """
     mean, sigma = PITCH_PRIOR[kind]
     found_pitch, found_roll, source, trust = mean, 0.0, f"usual view of a {kind}", 0.0
@@ -186,11 +213,12 @@ def estimate_up(
         patches = slope.flow_patches(mask, displacement, lying)
         if patches is not None:
             tilt = slope.estimate_tilt(
-                camera, patches, lambda p, r: level_camera(camera, UpEvidence(p, r, "", 0.0)), (mean, sigma)
-            )
+                camera, patches, lambda p, r: level_camera(camera, UpEvidence(p, r, "", 0.0)), (mean, sigma),
+                None if steep else texture,
+            )  # fmt: skip
             found_pitch, found_roll, trust = tilt.pitch, tilt.roll, tilt.gained
-            source = "perspective of the flow"
-    elif kind != "plume":  # wind leans smoke more often than hands turn cameras
+            source = "perspective of the flow" + (" and of its pattern" if texture is not None and not steep else "")
+    elif kind in ("fall", "pour"):  # wind leans smoke more often than hands turn cameras
         weight = np.where(mask, confidence * np.linalg.norm(displacement, axis=-1), 0.0)
         down = (weight[..., None] * displacement).sum((0, 1))
         if down[1] > 0 and weight.sum() > 0:

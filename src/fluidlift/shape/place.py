@@ -68,7 +68,7 @@ class MetricScale:
 
     value: float
     source: str
-    """size, depth, camera, free fall, or assumed"""
+    """size, depth, camera, free fall, front, or assumed"""
     warning: str = ""
     relative_error: float | None = None
     """standard error over value; None: not known (nothing was measured, or what was given is taken as it is)"""
@@ -81,7 +81,8 @@ class MetricScale:
     def sentence(self) -> str:
         """For people: `scale: 0.42 m across the fluid, from free fall, ± 12 %`."""
         words = {"size": "as given", "depth": "from the given depth", "camera": "from the surveyed camera",
-                 "free fall": "from free fall", "assumed": "assumed"}  # fmt: skip
+                 "free fall": "from free fall", "front": "from the speed of its front",
+                 "assumed": "assumed"}  # fmt: skip
         error = "" if self.relative_error is None else f", ± {100 * 1.96 * self.relative_error:.0f} % (95 %)"
         return f"scale: {self.across:.3g} m across the fluid, {words[self.source]}{error}"
 

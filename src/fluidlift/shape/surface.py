@@ -286,7 +286,7 @@ def inflated_surface(
     middle = 1.0 / np.maximum(ray[..., 1], 0.2)  # plane y = 1: depth z with z * ray_y = 1
     middle /= np.median(middle[mask])
     thickness = section_half_thickness(mask, roll) if kind == "plume" else _half_thickness(mask)
-    flatness = {"pour": 1.0, "plume": 1.0, "fall": 0.3, "stream": 0.3}[kind]
+    flatness = {"pour": 1.0, "plume": 1.0, "fall": 0.3, "stream": 0.3, "dam": 1.0}[kind]
     half = flatness * thickness * middle / camera.focal[0]
     front = np.where(mask, middle - half, 0.0)
     return FrontSurface(front.astype(np.float32), half.astype(np.float32), None, kind=kind)

@@ -234,7 +234,7 @@ def make_scene(
     """Simulate a scene, film it, and write its case folder, which `fluidlift.evaluate.read_case` reads.
 
     Args:
-        name: stream, pour or honey.
+        name: stream, pour, honey or dam.
         folder: the case; made if absent.
         size: width and height of the picture, px.
         frames: number of frames, 2 or more.

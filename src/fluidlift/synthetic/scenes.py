@@ -1,4 +1,4 @@
-"""Small scenes whose truth is known because this project simulates them itself: a stream, a pour, honey on a slope."""
+"""Small scenes whose truth is known because this project simulates them itself: a stream, a pour, honey, a dam."""
 
 from __future__ import annotations
 
@@ -243,14 +243,44 @@ def honey(*, size: tuple[int, int] = (288, 224), seed: int = 0, cells: int = 64)
     )  # fmt: skip
 
 
-SCENES: dict[str, Callable[..., Scene]] = {"stream": stream, "pour": pour, "honey": honey}
+def dam(*, size: tuple[int, int] = (320, 240), seed: int = 0, cells: int = 64) -> Scene:
+    """A column of water 0.6 m high that collapses onto a dry floor, past a pillar, and runs back from unseen walls."""
+    length, width, height = 2.0, 0.9, 0.8
+    h = length / cells
+    grid = Grid((cells, round(width / h), round(height / h)), h, (-length / 2, -width / 2, 0.0))
+    floor, across, level = 0.05, 0.5, 0.65
+
+    def pillar(points: np.ndarray) -> np.ndarray:
+        return np.maximum(np.abs(points[..., 0] - 0.25), np.abs(points[..., 1] + 0.05)) - 0.09
+
+    def ground(points: np.ndarray) -> np.ndarray:
+        return np.minimum(points[..., 2] - floor, np.maximum(pillar(points), points[..., 2] - 0.55))
+
+    solid = signed(ground, 0.25 * h)
+
+    def shares(points: np.ndarray) -> np.ndarray:
+        stone = smoothstep(-pillar(points), -0.012, 0.0)
+        return np.stack([stone, 0 * stone, 0 * stone], -1)
+
+    positions, volume = _seeded(
+        grid, solid, lambda p: (p[:, 0] < grid.low[0] + across) & (p[:, 2] < level), rng=np.random.default_rng(seed)
+    )
+    parameters = FluidParameters(time_step=0.01)
+    camera = PinholeCamera.looking((0.6, -2.9, 1.7), (0.0, 0.0, 0.2), 45.0, size)
+    return Scene(
+        "dam", "dam", grid, ground, shares, _terrain(solid, grid, (1.0, 0.0, 0.0)), _solid_cells(grid, solid),
+        parameters, _moving(positions, volume, parameters, (0.0, 0.0, 0.0)), volume, camera, settle=0.0,
+    )  # fmt: skip
+
+
+SCENES: dict[str, Callable[..., Scene]] = {"stream": stream, "pour": pour, "honey": honey, "dam": dam}
 
 
 def scene_of(name: str, *, size: tuple[int, int], seed: int, cells: int) -> Scene:
     """A scene by name.
 
     Args:
-        name: stream, pour or honey.
+        name: stream, pour, honey or dam.
         size: width and height of the picture, px.
         seed: of the random numbers.
         cells: of the grid along x.

@@ -1,0 +1,74 @@
+"""A dam that breaks, from the clip to frames that can be played: it stands, falls, and stays in its basin."""
+
+import json
+
+import numpy as np
+import pytest
+
+from fluidlift.cli import DONE, REJECTED, WITH_WARNINGS, main
+from fluidlift.io.asset_folder import load_asset, read_manifest
+from fluidlift.io.ply import read_splats
+from fluidlift.synthetic.record import make_scene
+from fluidlift.types import CellType
+from fluidlift.validate import validate_asset
+
+FRAMES = 20
+SPEED = ["--preset", "draft", "--set", "shape.cells=32", "--set", "shape.max_gaussians=6000",
+         "--set", "shape.refine_iterations=0", "--set", "simulate.frames=8"]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def case(tmp_path_factory):
+    return make_scene("dam", tmp_path_factory.mktemp("dam") / "case", size=(240, 180), frames=FRAMES, cells=28)
+
+
+@pytest.fixture(scope="module")
+def folder(case, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("dam") / "dam.fluid"
+    camera = json.loads((case / "camera.json").read_text()) | {"ground_level_z": 0.05}
+    (case / "surveyed.json").write_text(json.dumps(camera))
+    code = main(["make", str(case / "video.mp4"), "-o", str(folder), "--camera", str(case / "surveyed.json"), *SPEED])
+    assert code in (DONE, WITH_WARNINGS)
+    return folder
+
+
+def test_it_is_taken_for_what_it_is(folder):
+    asset, manifest = load_asset(folder), read_manifest(folder)
+    assert asset.kind == manifest["kind"] == "dam"
+    assert not any("level" in text or "size" in text for text in manifest["warnings"])  # the camera file says both
+
+
+def test_the_column_stands_where_it_stood(folder):
+    # 0.5 m long, 0.9 wide and 0.6 high on ground at 0.05; a pixel is 1.5 cm there. Its far side is seen over its top:
+    # three pixels of height move it by 20 cm
+    points = load_asset(folder).rest.means
+    np.testing.assert_allclose(np.percentile(points, 2, axis=0), [-1.0, -0.45, 0.05], atol=0.1)
+    missed = np.abs(np.percentile(points, 98, axis=0) - [-0.5, 0.45, 0.65])
+    assert (missed < [0.1, 0.22, 0.1]).all(), missed
+
+
+def test_nothing_flows_in_or_out_and_it_starts_at_rest(folder):
+    asset = load_asset(folder)
+    assert set(np.unique(asset.cell_types)) <= {CellType.EMPTY, CellType.FLUID, CellType.SOLID}
+    assert not any(part.any() for part in asset.velocity.components)
+    assert asset.parameters.inflow_velocity == (0.0, 0.0, 0.0)
+    assert asset.parameters.gravity == pytest.approx((0.0, 0.0, -9.81))
+    assert not any(e.fitted for e in asset.estimates.values())
+
+
+def test_it_falls_and_spreads_and_keeps_its_body(folder):
+    frames = sorted((folder / "frames" / "splats").glob("*.ply"))
+    first, last = (read_splats(path).gaussians.means for path in (frames[0], frames[-1]))
+    assert len(frames) == 8 and len(last) == pytest.approx(len(first), rel=0.01)
+    assert np.percentile(last[:, 2], 95) < np.percentile(first[:, 2], 95) - 0.1
+    assert np.percentile(last[:, 0], 98) > np.percentile(first[:, 0], 98) + 0.3
+    # g t^2 / 2 after 7 / 25 s: nothing falls further, nothing is thrown out of the box
+    assert 0.0 < first[:, 2].mean() - last[:, 2].mean() < 0.5 * 9.81 * (7 / 25) ** 2
+    asset = load_asset(folder)
+    assert asset.grid.contains(last).mean() > 0.999
+    assert all(finding.passed for finding in validate_asset(folder))
+
+
+def test_a_fit_of_its_parameters_is_refused_and_says_why(folder, case, capsys):
+    assert main(["fit", str(folder), "--free", "kinematic_viscosity"]) == REJECTED
+    assert "before it moves" in capsys.readouterr().err

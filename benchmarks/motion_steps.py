@@ -62,7 +62,9 @@ def planar_steps(subject: Subject, truth: Truth, flow: PixelFlow, t: int) -> tup
     found["projection"], _ = project_screen_divergence(
         full, mask, observed, np.where(mask, depth, 1.0), rate, truth.camera
     )
-    scene = MotionScene(truth.camera, depth, None, None, subject.kind, truth.case.interval)
+    scene = MotionScene(
+        truth.camera, depth, None, None, subject.kind, truth.case.interval, prior=clip_mean(truth, flow)
+    )
     made = next(
         iter(
             motion_sequence(
@@ -73,6 +75,11 @@ def planar_steps(subject: Subject, truth: Truth, flow: PixelFlow, t: int) -> tup
     )  # fmt: skip
     found["as made"] = made.displacement
     return found, made.observed
+
+
+def clip_mean(truth: Truth, flow: PixelFlow) -> tuple[np.ndarray, np.ndarray]:
+    """Mean motion of the clip and its confidence, as the pipeline's geometry hands it on to the motion."""
+    return mean_flow(flow, truth.mask[: len(flow)])
 
 
 def add_frame(pixels: Pixels, truth: Truth, t: int, found: dict[str, np.ndarray], observed: np.ndarray) -> None:

@@ -38,6 +38,8 @@ from fluidlift.viewer.app import Viewer, ViewRequest
 
 GRAVITIES = (6.0, 12.0, 4.0, 15.0, 9.0)
 """m/s^2, one edit each"""
+SMALL = (400, 320)
+"""px of the page that looks on for as long as an hour: what is drawn by software leaves the machine to others"""
 
 
 def resident() -> float:
@@ -73,8 +75,8 @@ class Rows(list):
 
 
 @contextlib.contextmanager
-def watched(viewer: Viewer, wanted: bool) -> Iterator[object]:
-    """A page that looks on, or None."""
+def watched(viewer: Viewer, wanted: bool, size: tuple[int, int] = (800, 600)) -> Iterator[object]:
+    """A page of so many px that looks on, or None."""
     if not wanted:
         yield None
         return
@@ -83,7 +85,7 @@ def watched(viewer: Viewer, wanted: bool) -> Iterator[object]:
     flags = ["--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
     with sync_playwright() as p:
         browser = p.chromium.launch(executable_path="/usr/bin/chromium", args=flags)
-        page = browser.new_page(viewport={"width": 800, "height": 600})
+        page = browser.new_page(viewport={"width": size[0], "height": size[1]})
         page.set_default_timeout(600_000)
         page.goto(f"{viewer.address}/?fixedDpr=0.5")
         page.locator("strong", has_text="frames").first.wait_for()
@@ -197,7 +199,7 @@ def played(folder: Path, rows: Rows, minutes: float) -> None:
 
     viewer.stage.show = counted
     found = []
-    with watched(viewer, True) as page:
+    with watched(viewer, True, SMALL) as page:
         tools = page.context.new_cdp_session(page)
         time.sleep(30.0)  # the page comes up
         began = time.perf_counter()

@@ -3,7 +3,7 @@
 The same from the shell, without the stripes:
 
     fluidlift edit demo.fluid --add terrain='{twist: 12}' \\
-        --add emitters='{name: dye, shape: cylinder, radius: 0.045, height: 0.054, position: [-0.3, -0.1, 0.4], velocity: [0, 0, -0.8], color: [0.1, 0.2, 0.9]}'
+        --add emitters='{name: dye, shape: cylinder, radius: 0.045, height: 0.054, position: [-0.2, -0.1, 0.4], velocity: [0, 0, -0.8], color: [0.1, 0.2, 0.9]}'
     fluidlift sim demo.fluid
 
 The stripes show how Python changes what the command line has no word for: the rest body's colours.

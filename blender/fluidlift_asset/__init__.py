@@ -18,6 +18,7 @@ from .facts import EXPORTED, read_facts, require_asset, up_to_date
 from .ground import rest_on
 from .light import SUN, light_up
 from .materials import LIQUIDS, liquid_material, turns_in_volumes
+from .waiting import waiting
 
 bl_info = {
     "name": "fluidlift assets",
@@ -170,7 +171,8 @@ def export(context: bpy.types.Context, folder: Path, volumes: bool) -> list[str]
     wanted = [("surface", "mesh", ".ply")] + ([("volume", "vdb", ".vdb")] if volumes else [])
     for name, form, suffix in wanted:
         if not up_to_date(into / name, source, suffix):
-            said += run([command_of(context), "export", str(folder), "-o", str(into / name), "--to", form])
+            with waiting(context, f"writing the {name} of each frame") as told:
+                said += run([command_of(context), "export", str(folder), "-o", str(into / name), "--to", form], told)
     return [line.strip() for line in said.splitlines() if line.strip().startswith("warning:")]
 
 
@@ -212,7 +214,8 @@ class Simulate(Guarded, bpy.types.Operator):
             s.loaded = json.dumps(panel_values(s))
         self.call = Call([program, "sim", str(folder), "--set", "show.usd=false"])
         if self.wait or bpy.app.background:
-            self.call.wait()
+            with waiting(context, "simulating") as told:
+                self.call.wait(told)
             return self.finish(context)
         self.timer = context.window_manager.event_timer_add(0.5, window=context.window)
         context.window_manager.modal_handler_add(self)

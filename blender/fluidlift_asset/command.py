@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
 
 DONE = (0, 4)
 """exit codes of success; 4: with warnings"""
+EVERY = 0.5
+"""s between two looks at what a command has printed"""
+HOW_FAR = re.compile(r": (\d+) of (\d+)\b")
+Told = Callable[[str], None]
+"""takes the last line of a command that is at work"""
 
 
 def find_command(given: str) -> str:
@@ -42,8 +49,14 @@ class Call:
     def running(self) -> bool:
         return self.process.poll() is None
 
-    def wait(self) -> None:
-        self.process.wait()
+    def wait(self, told: Told = lambda line: None) -> None:
+        """Until it has ended; meanwhile what it printed last is told."""
+        while True:
+            try:
+                self.process.wait(EVERY)
+                return
+            except subprocess.TimeoutExpired:
+                told(self.last_line())
 
     def stop(self) -> None:
         """End it; frames that are finished stay."""
@@ -52,6 +65,9 @@ class Call:
 
     def said(self) -> str:
         """All that it printed so far."""
+        if hasattr(os, "pread"):  # the command writes where the file is read: after a seek, over its own beginning
+            file = self.output.fileno()
+            return os.pread(file, os.fstat(file).st_size, 0).decode("utf-8", "replace")
         self.output.seek(0)
         return self.output.read().decode("utf-8", "replace")
 
@@ -66,13 +82,19 @@ class Call:
             raise RuntimeError(f"{' '.join(self.words[1:3])} ended with code {self.process.returncode}: {tail}")
 
 
-def run(words: list[str]) -> str:
-    """Run a command to its end; what it printed.
+def share_done(line: str) -> float | None:
+    """0 to 1, of a line such as `[1/1] export: 12 of 40, about 3 min left`; None where it does not say."""
+    found = HOW_FAR.search(line)
+    return min(int(found[1]) / int(found[2]), 1.0) if found and int(found[2]) else None
+
+
+def run(words: list[str], told: Told = lambda line: None) -> str:
+    """Run a command to its end; what it printed. Meanwhile the last line of that is told.
 
     Raises:
         RuntimeError: it failed.
     """
     call = Call(words)
-    call.wait()
+    call.wait(told)
     call.check()
     return call.said()

@@ -166,6 +166,22 @@ def painted_body() -> list:
     return found
 
 
+def waited() -> dict:
+    """What stands in the status bar and beside the pointer while a command is at work."""
+    bar, pointer = [], []
+    manager = SimpleNamespace(
+        progress_begin=lambda low, high: pointer.append([low, high]), progress_update=pointer.append,
+        progress_end=lambda: pointer.append("end"),
+    )  # fmt: skip
+    context = SimpleNamespace(
+        window=None, window_manager=manager, workspace=SimpleNamespace(status_text_set=bar.append)
+    )
+    with fluidlift_asset.waiting(context, "simulating") as told:
+        told("[1/2] re-simulating: 10 of 40, about 3 min left")
+        told("[2/2] rendering and writing ...")
+    return {"bar": bar, "pointer": pointer}
+
+
 out: dict = {"version": bpy.app.version_string, "refused": {}}
 settings.command = "/no/such/command"
 out["refused"]["command"] = refused(lambda: bpy.ops.fluidlift.import_asset(directory=asset))
@@ -185,6 +201,7 @@ out["camera"] = {"matrix": [list(row) for row in camera.matrix_world], "lens": c
 out["light"] = [scene.world.name, sum(o.type == "LIGHT" for o in scene.objects)]
 out["sun refracted"] = [o.visible_transmission for o in scene.objects if o.type == "LIGHT"]
 out["panel"] = panel()
+out["waited"] = waited()
 out["contact"] = contact()
 out["painted"] = painted_body()
 out["blur"] = blurred_by_velocity()

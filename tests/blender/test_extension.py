@@ -148,6 +148,13 @@ def test_the_panel_and_the_menu_draw_what_they_offer(seen):
     assert "Fluid asset (.fluid folder)" in drawn
 
 
+def test_while_a_command_is_at_work_the_share_that_is_done_and_its_last_line_are_shown(seen):
+    found = seen[0]["waited"]
+    assert found["pointer"] == [[0, 100], 25.0, "end"]
+    assert any("10 of 40, about 3 min left" in line for line in found["bar"][:-1])
+    assert found["bar"][-1] is None  # the status bar is Blender's own again
+
+
 def test_the_underside_of_the_liquid_lies_in_the_ground(seen, made):
     """Else a film of air is left between them, which throws the light back."""
     found, cell = seen[0]["contact"], load_asset(made.folder).grid.spacing

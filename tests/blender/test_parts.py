@@ -213,3 +213,18 @@ def test_all_say_the_same_version():
     told = ast.literal_eval(info)
     assert manifest["version"] == project["version"] == ".".join(str(v) for v in told["version"])
     assert manifest["blender_version_min"] == ".".join(str(v) for v in told["blender"])
+
+
+def test_of_a_command_at_work_the_last_line_is_told_and_nothing_of_its_output_is_lost(monkeypatch):
+    command = part("command")
+    monkeypatch.setattr(command, "EVERY", 0.01)
+    lines = [f"[1/1] export: {k} of 9" for k in range(1, 10)]
+    script = "import sys, time\nfor k in range(1, 10):\n"
+    script += " print(f'[1/1] export: {k} of 9', flush=True)\n time.sleep(0.03)"
+    told = []
+    said = command.run([sys.executable, "-c", script], told.append)
+    assert said.splitlines() == lines  # though it was read while it was written
+    shown = [line for line in told if line]
+    assert shown and set(shown) <= set(lines) and shown == sorted(shown)
+    shares = [command.share_done(line) for line in (lines[2], "[1/9] reading the clip ...", "flow: 0 of 0")]
+    assert shares == [pytest.approx(1 / 3), None, None]

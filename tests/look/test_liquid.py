@@ -19,9 +19,11 @@ from fluidlift.look.liquid import (
     shaded,
     shaded_plain,
 )
+from fluidlift.look.liquid_lookup import fetch_beyond, pyramid
 from fluidlift.look.materials import PRESETS, Material
 from fluidlift.look.optics import fresnel, refract
 from fluidlift.look.screen_space import mesh_surface
+from fluidlift.look.transparent_rays import fanned
 from fluidlift.types import PinholeCamera, TriangleMesh
 
 SIZE = (80, 60)
@@ -186,6 +188,43 @@ def test_total_reflection_at_the_far_side_sets_in_without_a_step():
     assert 0.1 < np.diff(turned).max() < 0.5
     # and where the ray would run along in the far side, it goes on through without a step too
     assert np.abs(np.diff(turned)).max() < 0.5
+
+
+def test_light_is_taken_to_fan_out_as_far_as_the_normals_of_a_pixel_turn_it():
+    rng, index, turn = np.random.default_rng(0), 1.333, 1e-4
+    near = np.array([0.0, 0.0, 1.0])  # light goes down, in at a level surface and out at a tilted one
+    for _ in range(200):
+        v, b = (w / np.linalg.norm(w) for w in (rng.normal(size=(2, 3)) * 0.35 + [0.0, 0.0, -1.0]))
+
+        def out(n1, n2, v=v):
+            t, _ = refract(v, n1, 1 / index)
+            return t, refract(t, -n2, index)[0]
+
+        t, straight = out(near, b)
+        cos, leaving = -v[2], t @ b
+        if 1 - index**2 * (1 - leaving**2) < 0.04:  # close to total reflection: bounded on purpose
+            continue
+        bend = cos / index + t[2]
+        for one, two in ((turn, 0.0), (0.0, turn), (turn, turn)):
+            most = 0.0
+            for angle in np.arange(8) * np.pi / 4:  # whichever way they turn
+                side = np.array([np.cos(angle), np.sin(angle), 0.0])
+                n1 = near + 2 * one * side
+                n2 = b + 2 * two * (side - (side @ b) * b)
+                moved = out(n1 / np.linalg.norm(n1), n2 / np.linalg.norm(n2))[1]
+                most = max(most, np.linalg.norm(moved - straight) / 4)  # a mirror turns its light twice as far
+            # the bend's own change with the normal is left out; parts at right angles are added up
+            assert 0.75 * most < fanned(bend, leaving, one, two, index) < 2.5 * most
+
+
+def test_fanned_out_light_is_the_mean_of_the_picture_behind():
+    board = (np.indices((64, 96)).sum(axis=0) % 2 * np.ones((3, 1, 1))).transpose(1, 2, 0)
+    values, levels = pyramid(board, deep=True)
+    out = np.zeros(3)
+    for wide, contrast in ((0.5, 1.0), (1.5, 1.0 - np.log2(1.5)), (2.0, 0.0), (1e4, 0.0)):
+        fetch_beyond(values, levels, 40.5, 30.5, wide, np.zeros(4), out, 0)
+        np.testing.assert_allclose(out, 0.5 - 0.5 * contrast, atol=1e-6)  # a dark field of 0 before a mean of 0.5
+    assert len(pyramid(board, deep=False)[1]) == 1
 
 
 @pytest.mark.parametrize("name", ["water", "honey", "lava", "source"])

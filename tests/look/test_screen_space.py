@@ -136,12 +136,12 @@ def test_the_outline_of_a_mesh_is_soft_and_what_it_covers_in_part_looks_like_it(
 def test_smoothing_keeps_planes_and_steps_and_evens_bumps_out():
     u, v = np.meshgrid(np.arange(80.0), np.arange(60.0))
     plane = (0.5 + 0.001 * u + 0.002 * v).astype(np.float32)  # inverse depths of a plane
-    focal, width, limit, fall = 100.0, np.float32(0.08), np.float32(0.3), np.float32(0.1)
+    focal, width, apart, limit, fall = 100.0, np.float32(0.08), np.float32(1.7), np.float32(0.3), np.float32(0.1)
 
     def passes(q):
         a, b = np.empty_like(q), np.empty_like(q)
-        narrow_range(q, a, 0, 1, focal, width, limit, fall)
-        narrow_range(a, b, 1, 0, focal, width, limit, fall)
+        narrow_range(q, a, True, focal, width, apart, limit, fall)
+        narrow_range(a, b, False, focal, width, apart, limit, fall)
         return b
 
     np.testing.assert_allclose(passes(plane), plane, rtol=1e-6)  # up to the picture's rim
@@ -207,7 +207,7 @@ def test_pictures_are_the_same_bits_with_any_number_of_threads():
         np.testing.assert_array_equal(getattr(one, name), getattr(many, name))
 
 
-def narrow_range_plain(q, down, across, focal, width, limit, fall, lanes=32):
+def narrow_range_plain(q, across, focal, width, apart, limit, fall, lanes=32):
     """What `narrow_range` does, pixel by pixel; the distance of the pairs is that of the smallest bell of its lanes."""
     out, (h, w) = q.astype(np.float64), q.shape
     wide = np.where(q > 0, focal * width * q, 0.0)
@@ -217,7 +217,7 @@ def narrow_range_plain(q, down, across, focal, width, limit, fall, lanes=32):
             some = wide[row, first : first + lanes]
             if not some.any():
                 continue
-            stride = max(int(some[some > 0].min() / 2.6), 1)
+            stride = max(int(some[some > 0].min() / apart), 1)
             steps = min(max(int(2.0 * some.max() / stride), 1), 40)
             for col in np.flatnonzero(some) + first:
                 own = float(q[row, col])
@@ -226,7 +226,7 @@ def narrow_range_plain(q, down, across, focal, width, limit, fall, lanes=32):
                 for k in range(1, steps + 1):
                     met = {}
                     for side in sorted(going):
-                        r, c = row + side * k * stride * down, col + side * k * stride * across
+                        r, c = row + side * k * stride * (not across), col + side * k * stride * across
                         value = abs(float(q[r, c])) if 0 <= r < h and 0 <= c < w else np.inf
                         if value > high:
                             going.remove(side)
@@ -244,8 +244,8 @@ def narrow_range_plain(q, down, across, focal, width, limit, fall, lanes=32):
     return out
 
 
-@pytest.mark.parametrize(("down", "across"), [(0, 1), (1, 0)])
-def test_the_compiled_smoothing_is_that_of_the_formula(down, across):
+@pytest.mark.parametrize(("across", "apart"), [(True, 1.7), (False, 2.6)])
+def test_the_compiled_smoothing_is_that_of_the_formula(across, apart):
     rng = np.random.default_rng(0)
     u, v = np.meshgrid(np.arange(75.0), np.arange(50.0))
     q = 0.5 + 0.002 * u + 0.001 * v + 0.01 * rng.standard_normal(u.shape)
@@ -253,7 +253,7 @@ def test_the_compiled_smoothing_is_that_of_the_formula(down, across):
     q[30:, 20:40] = 0.0  # nothing
     q[40:, 50:] *= -1.0  # ground
     q = q.astype(np.float32)
-    settings = down, across, 100.0, np.float32(0.08), np.float32(0.3), np.float32(0.1)
+    settings = across, 100.0, np.float32(0.08), np.float32(apart), np.float32(0.3), np.float32(0.1)
     out = np.empty_like(q)
     narrow_range(q, out, *settings)
     # float32, and a bell that is a power of 64 of a short series: 1e-5

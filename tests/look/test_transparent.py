@@ -94,10 +94,25 @@ def test_compiled_and_plain_thickness_agree():
     packed = transparent._packed(found, order[found.extents[order, 0] > 0], features, camera, 0.08**3)
     assert packed.shape[1] == LEAD + 6
     stretch = np.linalg.norm(camera.rays(camera.pixel_grid()), axis=-1).astype(np.float32)
-    plain = np.zeros_like(total), np.zeros_like(first)
-    thickness_plain(packed, np.float32(0.12), stretch, *plain)
-    # float32 sums of some hundred terms
-    assert np.abs(total - plain[0]).max() < 1e-5 and np.abs(first - plain[1]).max() < 1e-5
+    wall = np.where(np.arange(40) < 20, np.median(found.depths), np.inf) * np.ones((30, 1))
+    for ends in (np.full_like(total, np.inf), wall.astype(np.float32)):
+        total, first = splatted_thickness(g, features, camera, 0.08**3, 0.12, wall=ends)
+        plain = np.zeros_like(total), np.zeros_like(first)
+        thickness_plain(packed, np.float32(0.12), (stretch, ends), *plain)
+        # float32 sums of some hundred terms
+        assert np.abs(total - plain[0]).max() < 1e-5 and np.abs(first - plain[1]).max() < 1e-5
+
+
+def test_what_stands_before_a_liquid_changes_nothing_beside_itself():
+    g, camera = filled(slab, 0.02), ahead()
+    normals = np.tile([0.0, -1.0, 0.0], (len(g), 1))
+    post = np.zeros(camera.size[::-1], np.float32)
+    post[:, : camera.size[0] // 2] = 0.5 * camera.project(g.means)[1].min()
+    alone, behind = (splat_surface(g, normals, camera, volume=0.02**3, ground=wall) for wall in (None, post))
+    for name in ("depth", "normal", "albedo", "covered"):
+        whole, part = getattr(alone, name), getattr(behind, name)
+        np.testing.assert_array_equal(part[post == 0], whole[post == 0])
+    assert behind.covered[post > 0].max() == 0 and behind.covered[post == 0].max() == 1
 
 
 def test_a_picture_drawn_in_parts_is_the_same(monkeypatch):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fluidlift.motion.interpolation import STEPS, conductances, diffusion_interpolation
+from fluidlift.motion.interpolation import STEPS, conductances, depth_jump, diffusion_interpolation
 
 
 def plain_operator(edges: np.ndarray, f: np.ndarray) -> np.ndarray:
@@ -120,3 +120,12 @@ def test_what_no_value_reaches_is_said_so() -> None:
         diffusion_interpolation(np.ones((10, 20, 2)), weight, mask, anisotropy=0.5)
     with pytest.raises(ValueError, match="negative"):
         diffusion_interpolation(np.ones((10, 20, 2)), -weight, mask)
+
+
+def test_a_jump_of_depth_is_seen_from_both_sides_and_not_across_the_rim_of_the_mask() -> None:
+    depth = np.where(np.arange(8) < 4, 2.0, 3.0) * np.ones((5, 1))
+    mask = np.ones((5, 8), bool)
+    jump = depth_jump(depth, mask)
+    assert (jump[:, 3:5] == 0.5).all() and not jump[:, [0, 1, 2, 5, 6, 7]].any()  # a metre over the nearer two
+    mask[:, 4:] = False
+    assert not depth_jump(depth, mask).any()

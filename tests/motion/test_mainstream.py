@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
@@ -127,6 +128,57 @@ def test_motion_does_not_spread_from_a_jet_to_the_pool_behind_it() -> None:
         np.linalg.norm(complete_flow(seen, c, every, n, z)[0] - d, axis=-1)[c == 0].mean() for z in (depth, None)
     )
     assert apart < 0.3 < 0.5 * mixed  # a half of depth is 25 jumps: 1/600 of the influence is left
+
+
+def test_flow_beside_a_jump_of_depth_is_a_mixture_and_gives_way_to_what_is_seen_on_its_own_side() -> None:
+    # a jet before its pool: within half a patch of its edge flow finds the mean of the two, and is sure of it
+    _, cols = np.mgrid[:H, :W]
+    jet = np.abs(cols - W / 2) < 12
+    depth = np.where(jet, 1.0, 1.5)
+    d = np.where(jet[..., None], [0.0, 12.0], [0.0, 2.0])
+    edge = np.abs(np.abs(cols - W / 2) - 12) < 3
+    found = np.where(edge[..., None], [0.0, 7.0], d).astype(np.float32)
+    n, every = np.tile(np.array([0.0, 1.0], np.float32), (H, W, 1)), np.ones((H, W), bool)
+    sure = np.full((H, W), 0.9, np.float32)
+    with_depth, observed = complete_flow(found, sure, every, n, depth)
+    error = np.linalg.norm(with_depth - d, axis=-1)
+    assert not observed[edge].any() and observed[~jet & (np.abs(cols - W / 2) > 18)].all()
+    # a jump of a half leaves the mixture odds of 0.04; with a conductance of 1/4 across n that is a length of 2.5 px in
+    # a strip of 3: about half of the 5 px that it errs by is left, on either side
+    assert max(error[edge & jet].mean(), error[edge & ~jet].mean()) < 3.0
+    assert complete_flow(found, sure, every, n)[1][edge].all()  # without depth nothing tells
+
+
+def film(rise: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """A stream between banks 52 px apart: mask, true motion, what flow finds with patches of 8 px, and n.
+
+    Its speed is 6 px in the middle and rises from rest at the bank over `rise` px.
+    """
+    rows, _ = np.mgrid[:H, :W]
+    bank = 26.0 - np.abs(rows - (H - 1) / 2)
+    mask = bank > 0
+    speed = 6.0 * (1.0 - np.exp(-np.maximum(bank, 0.0) / rise))
+    d = np.stack([speed, 0 * speed], axis=-1).astype(np.float32)
+    # the nearest whole patch stands for what is nearer to the bank
+    seen = np.stack([6.0 * (1.0 - np.exp(-np.maximum(bank, 4.0) / rise)), 0 * speed], axis=-1).astype(np.float32)
+    return mask, d, seen, np.tile(np.array([1.0, 0.0], np.float32), (H, W, 1))
+
+
+def test_a_film_that_is_slow_towards_its_banks_is_at_rest_there() -> None:
+    mask, d, seen, n = film(8.0)
+    completed, observed = complete_flow(seen, np.full((H, W), 0.9, np.float32), mask, n)
+    rim = mask & ~observed
+    assert rim.any() and (rim[: H // 2] == np.flipud(rim[H - H // 2 :])).all()
+    before, after = (np.linalg.norm(f - d, axis=-1)[rim].mean() for f in (seen, completed))
+    assert after < 0.6 * before  # a straight line from the last measured speed to rest, where the truth is curved
+    middle = mask & ~cv2.dilate(((~mask) | rim).astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
+    assert (completed[middle] == seen[middle]).all()
+
+
+def test_a_stream_that_is_as_fast_beside_its_banks_as_within_is_left_alone() -> None:
+    mask, _, seen, n = film(0.5)
+    completed, observed = complete_flow(seen, np.full((H, W), 0.9, np.float32), mask, n)
+    assert observed[mask].all() and (completed[mask] == seen[mask]).all()
 
 
 def test_neighbours_along_the_stream_tell_more_than_those_across() -> None:

@@ -114,6 +114,23 @@ def test_a_fall_does_not_bend_back_under_itself():
     assert (np.diff(profile.away) > 0).all() and (np.diff(profile.z) >= 0).all()
 
 
+@pytest.mark.parametrize("lean", [-20.0, 12.0])
+def test_a_fall_that_leans_lies_on_a_face_whose_fall_line_is_seen_to_lean_so(lean):
+    camera = view(8.0)
+    mask, _ = fall_into_a_pool()
+    mask &= ROW < 40
+    motion = np.zeros((H, W, 2)) + 5.0 * np.array([np.sin(np.radians(lean)), np.cos(np.radians(lean))])
+    front = falling_surface(camera, mask, motion * mask[..., None], np.ones((H, W)))
+    middle = points_of(camera, front, (np.abs(COL - 54) < 2) & (np.abs(ROW - 24) < 2) & mask).mean(axis=0)
+    step = 1e-3 * np.eye(2)
+    slope = np.array([front.height.height(middle[:2] + d) - front.height.height(middle[:2] - d) for d in step]) / 2e-3
+    down = np.array([*-slope, -(slope @ slope)])
+    ends, _ = camera.project(np.stack([middle, middle + 1e-3 * down / np.linalg.norm(down)]))
+    seen = np.degrees(np.arctan2(*(ends[1] - ends[0])))
+    # the camera looks down by 8 degrees and the sheet is beside its axis; straight down would be off by all of the lean
+    assert seen == pytest.approx(lean, abs=4.0)
+
+
 def test_a_profile_goes_on_level_above_and_gently_down_below():
     profile = ProfileHeight(np.array([1.0, 1.2]), np.array([0.0, 0.8]))
     xy = np.array([[0, 1.1], [5, 1.1], [0, 3.0], [0, 0.0]])

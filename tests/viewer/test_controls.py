@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fluidlift.types import FluidParameters
-from fluidlift.viewer.controls import INFLOW, controls_of, direction, number, path_of, turned
+from fluidlift.viewer.controls import INFLOW, WHOLE, controls_of, direction, number, path_of, turned
 
 FITTED = FluidParameters(
     kinematic_viscosity=3e-5, gravity=(0.2, 0.1, -9.7), inflow_velocity=(0.4, 0.0, -0.1), wall_damping=0.3
@@ -107,3 +107,15 @@ def test_values_stand_under_their_section_of_the_scene():
 ])  # fmt: skip
 def test_numbers_are_told_as_a_person_writes_them(value, text):
     assert number(value, 3) == text
+
+
+@pytest.mark.parametrize("c", controls_of(FITTED, "stream"), ids=lambda c: c.key)
+def test_a_number_and_its_unit_stay_in_one_line(c):
+    from fluidlift.viewer.panel_fluid import _label
+
+    amount = _label(c, c.fitted).removeprefix(f"{c.label} ").removeprefix("(10^x) ")
+    assert amount and not set(amount) & set(" /-._")  # viser lets a line end behind each of these
+    read = amount
+    for old, new in WHOLE.items():
+        read = read.replace(new, chr(old))
+    assert read == f"{number(c.fitted, 3)} {c.unit}".strip().replace(" °", "°")

@@ -1,14 +1,18 @@
 """Frames on demand: what is kept, what is read again, what is missing."""
 
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
 from fluidlift.io.ply import write_gaussians
-from fluidlift.types import Gaussians
+from fluidlift.look.surface_skin import PITCH, THICKNESS, WIDTH
+from fluidlift.types import Gaussians, concatenate
 from fluidlift.viewer.frames import FrameCache, FrameMissing, read_frame, splat_frame
+
+SKIN_SCALES = np.array([WIDTH * PITCH, WIDTH * PITCH, THICKNESS])
+"""of a skin's splats, cells"""
 
 
 @dataclass
@@ -131,3 +135,22 @@ def test_a_missing_frame_and_half_of_one_are_told_by_their_number(tmp_path):
     (folder / "1004.ply").write_bytes(data[: len(data) - 40])
     with pytest.raises(FrameMissing, match="1004"):
         read_frame(tmp_path, 3)
+
+
+def with_skin(cell=0.05):
+    """Six round splats of a liquid, and two flat ones of a skin over it."""
+    body = Gaussians.isotropic(np.random.default_rng(1).uniform(size=(6, 3)), 0.4 * cell, np.full((6, 3), 0.5))
+    paint = Gaussians.isotropic(np.array([[0.2, 0.3, 1.0], [0.4, 0.3, 1.0]]), 1.0, np.full((2, 3), 0.5))
+    return concatenate([body, replace(paint, scales=np.tile(SKIN_SCALES * cell, (2, 1)))]), body.means
+
+
+def test_a_skin_is_shown_but_counts_as_no_liquid(tmp_path):
+    splats, body = with_skin()
+    (tmp_path / "frames" / "splats").mkdir(parents=True)
+    path = tmp_path / "frames" / "splats" / "1001.ply"
+    write_gaussians(path, splats, ids=np.arange(8), velocities=np.zeros((8, 3)))
+    frame = read_frame(tmp_path, 0, cell=0.05)
+    assert len(frame.centers) == 8
+    np.testing.assert_allclose(frame.liquid, body, rtol=1e-6)  # files hold single precision
+    assert len(read_frame(tmp_path, 0).liquid) == 8  # of unknown cells, or of others, all are liquid
+    assert len(read_frame(tmp_path, 0, cell=0.06).liquid) == 8

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from fluidlift.io.asset_folder import load_asset, save_asset
+from fluidlift.pipeline.edit_outlook import place_told, placed
 from fluidlift.pipeline.editing import EditSession
 from fluidlift.pipeline.open_water import open_water
 from fluidlift.types import CellType
@@ -79,3 +80,13 @@ def test_an_edit_that_takes_long_or_for_ever_is_told_when_it_is_made(tank_folder
     session.undo()
     session.undo()
     assert session.warnings() == []
+
+
+@pytest.mark.parametrize("origin", [0.0, 136.0, -5_600_000.0])
+@pytest.mark.parametrize("cell", [2e-4, 0.025, 0.3, 12.0])
+def test_a_place_is_told_and_written_as_finely_wherever_the_origin_lies(origin, cell):
+    place = origin + cell * np.array([0.123456, -4.56789, 31.41592])
+    told = [float(c) for c in place_told(place, cell).split(", ")]
+    assert np.abs(told - place).max() <= 0.05 * cell + 1e-9  # half of a tenth; doubles have 1e-9 m here
+    assert np.abs(placed(place, 0.01 * cell) - place).max() <= 0.005 * cell + 1e-9
+    assert max(len(f"{c:.12g}".partition(".")[2]) for c in placed(place, 0.01 * cell)) <= 6  # 2e-6 m: no noise behind

@@ -1,5 +1,6 @@
 """What is put into the 3D view, with a scene that only notes it."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,8 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from fluidlift.io.asset_folder import load_asset
 from fluidlift.io.obstacles import Obstacle
+from fluidlift.look.surface_skin import PITCH, THICKNESS, WIDTH
 from fluidlift.numerics.solid_mesh import box_mesh
-from fluidlift.types import Gaussians, TriangleMesh
+from fluidlift.types import Gaussians, TriangleMesh, concatenate
 from fluidlift.viewer.arrows import LONGEST, SHORTEST, arrows, barbed
 from fluidlift.viewer.frames import splat_frame
 from fluidlift.viewer.stage import Parts, Stage
@@ -73,6 +75,18 @@ def test_nothing_without_points_is_put_into_the_view(stage):
     stage._scene.get_handle_by_name = lambda name: None
     stage.show(empty, Parts(points=True, arrows=True), 0.1)
     assert set(stage._scene.nodes) == before
+
+
+def test_the_surface_is_meshed_around_the_liquid_without_the_skin_that_is_painted_on_it(stage):
+    cell, body = 0.05, np.random.default_rng(0).uniform(size=(5, 3))
+    paint = Gaussians.isotropic(np.ones((3, 3)), 1.0, np.full((3, 3), 0.5))
+    skin = replace(paint, scales=np.tile(cell * np.array([WIDTH * PITCH, WIDTH * PITCH, THICKNESS]), (3, 1)))
+    splats = concatenate([Gaussians.isotropic(body, 0.02, np.full((5, 3), 0.5)), skin])
+    asked = []
+    stage._surfacer = SimpleNamespace(ask=lambda *wish: asked.append(wish), made=None)
+    stage.show(splat_frame(splats, np.zeros((8, 3)), cell=cell), Parts(splats=False, surface=True), cell)
+    ((_, positions, _),) = asked
+    np.testing.assert_allclose(positions, body)
 
 
 def block(velocity):

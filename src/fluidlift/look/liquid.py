@@ -30,10 +30,11 @@ from fluidlift.look.liquid_kernels import (
     SPREAD,
     THROUGH,
     TURNED,
+    WIDE,
     follow,
     shade,
 )
-from fluidlift.look.liquid_lookup import SLANTED
+from fluidlift.look.liquid_lookup import SLANTED, pyramid
 from fluidlift.look.materials import Material
 from fluidlift.look.optics import fresnel, transmittance
 from fluidlift.look.smoothstep import smoothstep
@@ -139,7 +140,8 @@ def shaded(
     curved within a pixel. What enters is bent after Snell, runs to the far side (of `thickness` and `back_normal` where
     the bent ray gets there), leaves it bent again and meets what lies behind, which is looked up in the picture. The
     share that is mirrored on the far side (Fresnel's, up to all of it) is followed on inside to where it gets out, and
-    looked up there. Light that comes from outside the picture is the environment's. On the way
+    looked up there. Light that comes from outside the picture is the environment's. Picture and
+    environment are as blurred as the light of a pixel is fanned out by both sides. On the way
     exp(-(absorption + scattering) d) is left, and if it scatters, the rest is the body's own colour, lit by the
     environment's irradiance (`Material.albedo` is the limit of a deep body). A clear liquid in a uniformly white world
     is white, whatever its shape.
@@ -172,7 +174,7 @@ def shaded(
     ])  # fmt: skip
     world = (*_pictures(environment), _STEPS, _DIM, SECOND_RADIATION / WAVELENGTHS)
     with in_pieces(len(picture)):
-        shade(_arrays(surface), _scene(behind), _eye(camera), world, numbers, picture)
+        shade(_arrays(surface), _scene(behind, surface), _eye(camera), world, numbers, picture)
     return picture
 
 
@@ -183,8 +185,9 @@ def _arrays(surface: LiquidSurface) -> tuple:
     )  # fmt: skip
 
 
-def _scene(behind: Behind) -> tuple:
-    return behind.image, behind.depth, behind.rest
+def _scene(behind: Behind, surface: LiquidSurface) -> tuple:
+    # only where a far side is known is it known how wide its light is fanned out
+    return *pyramid(behind.image, deep=surface.back_normal is not None), behind.depth, behind.rest
 
 
 def shaded_plain(
@@ -198,7 +201,9 @@ def shaded_plain(
     # slopes within a pixel widen the lobe like roughness: else they sparkle (Kaplanyan et al. 2016)
     spread = np.maximum(rays.spread - SHARP, 0.0)
     mirrored = environment.blurred(rays.mirror, (material.roughness**4 + spread**2) ** 0.25)
-    through = np.where(rays.surroundings[:, None], environment.toward(rays.through), rays.color)
+    # so do both sides for what comes through, or it sparkles where the sun is
+    far = environment.blurred(rays.through, np.sqrt(np.maximum(rays.wide - SHARP, 0.0)))
+    through = np.where(rays.surroundings[:, None], far, rays.color)
     extinction = np.asarray(material.absorption) + material.scattering
     second = np.where(rays.beyond[:, None], environment.blurred(rays.inward, DIM), rays.second)
     second = second * transmittance(extinction, rays.farther)
@@ -266,7 +271,7 @@ def _straight(material: Material) -> float:
 
 
 def _eye(camera: PinholeCamera) -> tuple[np.ndarray, np.ndarray]:
-    lens = np.array([*camera.focal, *camera.center], np.float64)
+    lens = np.array([*camera.focal, *camera.center, *(1.0 / f for f in camera.focal)], np.float64)
     return lens, np.ascontiguousarray(camera.camera_from_world.rotation, np.float64)
 
 
@@ -309,6 +314,8 @@ class Followed:
     """linear, what comes through where it is the picture's"""
     spread: Float[np.ndarray, " n"]
     """of the normals in the pixel, GGX's alpha"""
+    wide: Float[np.ndarray, " n"]
+    """how wide what comes through is fanned out, in the same units"""
 
 
 def followed(
@@ -317,7 +324,7 @@ def followed(
     """Follow the light of `pixels` (int [n,2]: row, column) back through the liquid."""
     rays = np.zeros((len(pixels), NUMBERS))
     there = np.ascontiguousarray(pixels, np.int64)
-    follow(there, _arrays(surface), _scene(behind), _eye(camera), float(refractive_index), rays)
+    follow(there, _arrays(surface), _scene(behind, surface), _eye(camera), float(refractive_index), rays)
     r = rays.astype(np.float32)
 
     def three(at: int) -> np.ndarray:
@@ -326,6 +333,7 @@ def followed(
     return Followed(
         r[:, SHARE], three(MIRROR), three(THROUGH), r[:, PATH], r[:, OUTSIDE] > 0, r[:, TURNED], three(INWARD),
         r[:, FARTHER], r[:, BEYOND] > 0, three(SECOND), three(COLOR), r[:, SPREAD],
+        r[:, WIDE],
     )  # fmt: skip
 
 

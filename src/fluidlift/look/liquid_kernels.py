@@ -16,7 +16,7 @@ import numpy as np
 from fluidlift.look.environment_stack import fading, place_of, value_at
 from fluidlift.look.liquid_lookup import fetch_beyond, shown_of_film
 from fluidlift.look.smoothstep import eased
-from fluidlift.look.transparent_rays import far_side, onward, seen_from
+from fluidlift.look.transparent_rays import fanned, far_side, onward, seen_from, turned_normals
 
 STEPS = 3
 """times that the ray behind the liquid looks up how far away what it meets is"""
@@ -28,6 +28,9 @@ ROOM = 16.0
 """px: a liquid that is less than this from what lies behind it rests on it, in part"""
 RESTS = 0.25
 """of its thickness: likewise"""
+CLOSED = 4.0
+"""grains, two radii of particles: a gap to the ground that is narrower than this is none, since they do not know the
+ground any better. Seen as a film of air it would mirror, in sparks"""
 LEGS = 3
 """times that light which is mirrored inside is followed on"""
 TRACED = 0.02
@@ -35,19 +38,21 @@ TRACED = 0.02
 FAR_AWAY = 1e6
 """px, beyond any rim"""
 SHARE, MIRROR, THROUGH, PATH, OUTSIDE, TURNED, INWARD, COLOR, SPREAD = 0, 1, 4, 7, 8, 9, 10, 13, 16
-FARTHER, BEYOND, SECOND = 17, 18, 19
+FARTHER, BEYOND, SECOND, WIDE = 17, 18, 19, 22
 """places in the numbers of a ray: see `follow`"""
-NUMBERS = 22
+NUMBERS = 23
 """of a ray"""
 
 
 @nb.njit(cache=True, inline="always")
 def reflectance(cos, index):
     """Share reflected from outside (see `optics.fresnel`), for 0 < cos <= 1."""
-    far = math.sqrt(max(1.0 - (1.0 - cos * cos) / (index * index), 0.0))
-    across = (cos - index * far) / (cos + index * far)
-    along = (index * cos - far) / (index * cos + far)
-    return 0.5 * (across * across + along * along)
+    slower = 1.0 / index  # the same for all pixels: taken out of the loop
+    far = math.sqrt(max(1.0 - (1.0 - cos * cos) * slower * slower, 0.0))
+    one, two = cos + index * far, index * cos + far
+    across, along = (cos - index * far) * two, (index * cos - far) * one
+    both = one * two
+    return 0.5 * (across * across + along * along) / (both * both)
 
 
 @nb.njit(cache=True, inline="always")
@@ -59,14 +64,15 @@ def _onto(x, y, z, lens):
 
 @nb.njit(cache=True, error_model="numpy", _nrt=False)
 def _behind(q, o, start, depth, front, lens, up, goes_on):
-    """Where a ray that leaves the liquid at q towards o meets what lies behind: u, v (px) and whether the picture holds
-    it. `start`: u, v of the straight line; `front`: z of the liquid; `up`: world z in camera axes; `goes_on`: whether
-    the picture stands for what lies beyond its rim."""
+    """Where a ray that leaves the liquid at q towards o meets what lies behind: u, v (px), whether the picture holds
+    it, and how far it went, over the depth at which it ends (1: to infinity). `start`: u, v of the straight line;
+    `front`: z of the liquid; `up`: world z in camera axes; `goes_on`: whether the picture stands for what lies beyond
+    its rim."""
     h, w = depth.shape
     u, v = start
     if o[2] < 0.05:  # back to the viewer
-        return FAR_AWAY, FAR_AWAY, goes_on
-    before = -1.0
+        return FAR_AWAY, FAR_AWAY, goes_on, 1.0
+    before, onward_z, gone = -1.0, 1.0 / o[2], 1.0
     for _ in range(STEPS):
         row, col = min(max(int(v), 0), h - 1), min(max(int(u), 0), w - 1)
         z = depth[row, col]
@@ -74,18 +80,20 @@ def _behind(q, o, start, depth, front, lens, up, goes_on):
             break
         before = z
         if z > 0.0:
-            s = max(z - q[2], 0.0) / o[2]
+            s = max(z - q[2], 0.0) * onward_z
             u, v = _onto(q[0] + s * o[0], q[1] + s * o[1], max(q[2] + s * o[2], 1e-6), lens)
+            gone = s / z
         else:
             u, v = _onto(o[0], o[1], o[2], lens)
+            gone = 1.0
     row, col = min(max(int(v), 0), h - 1), min(max(int(u), 0), w - 1)
     z = depth[row, col]
     if z > 0.0 and z < front:  # something before the liquid: the straight line's
-        return start[0], start[1], True
+        return start[0], start[1], True, 0.0
     # beyond the rim ground goes on, and the sky is known all around
     outside = (u < 0.0 or v < 0.0 or u > w or v > h) and not goes_on
     upward = o[0] * up[0] + o[1] * up[1] + o[2] * up[2] > 0.0
-    return u, v, not (outside and (z == 0.0 or upward))
+    return u, v, not (outside and (z == 0.0 or upward)), gone
 
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True, _nrt=False)
@@ -109,23 +117,6 @@ def _towards_viewer(nx, ny, nz, vx, vy, vz):
 
 
 @nb.njit(cache=True, inline="always")
-def _spread(surface_depth, normals, i, j):
-    """How much the normal turns from this pixel to the next ones of the same surface, as GGX's alpha."""
-    h, w = surface_depth.shape
-    turn, known = 0.0, 0
-    for k in range(4):
-        r, c = i + (k == 0) - (k == 1), j + (k == 2) - (k == 3)
-        if r < 0 or c < 0 or r >= h or c >= w or surface_depth[r, c] <= 0.0:
-            continue
-        dot = 0.0
-        for n in range(3):
-            dot += normals[i, j, n] * normals[r, c, n]
-        turn += max(2.0 - 2.0 * dot, 0.0)
-        known += 1
-    return min(0.5 * math.sqrt(turn / max(known, 1)), 0.5)
-
-
-@nb.njit(cache=True, inline="always")
 def _leaving(tx, ty, tz, bx, by, bz, vx, vy, vz, index, free):
     """What a ray t does where it leaves the liquid with outward normal b: the direction in which it goes on, the share
     that is mirrored back (Fresnel's from inside: it rises to all of it without a step), and where to.
@@ -133,7 +124,7 @@ def _leaving(tx, ty, tz, bx, by, bz, vx, vy, vz, index, free):
     free: 0 to 1; where the liquid rests on something there is no far side: the line of sight v goes straight on.
     """
     leaving = tx * bx + ty * by + tz * bz
-    free *= eased(leaving / LEAST)
+    free *= eased(leaving * (1.0 / LEAST))
     if free <= 0.0:
         return vx, vy, vz, 0.0, tx, ty, tz
     mx, my, mz = tx - 2.0 * leaving * bx, ty - 2.0 * leaving * by, tz - 2.0 * leaving * bz
@@ -151,12 +142,14 @@ def _leaving(tx, ty, tz, bx, by, bz, vx, vy, vz, index, free):
 
 
 @nb.njit(cache=True, error_model="numpy", _nrt=False)
-def _inner(q, m, share, thick, surface, behind, eye, index, ray):
-    """What is seen by light that is mirrored at q, on the far side, into m: fills FARTHER, BEYOND, INWARD, SECOND."""
+def _inner(q, m, share, thick, turns, surface, behind, eye, index, ray):
+    """What is seen by light that is mirrored at q, on the far side, into m: fills FARTHER, BEYOND, INWARD, SECOND.
+    turns: of that light within the pixel, before it is mirrored, and of the normals that mirror it (as those of
+    `turned_normals`)."""
     _, surface_depth, normals, back_normals, thickness, _, _ = surface
-    picture, depth, rest = behind
+    picture, levels, depth, rest = behind
     lens, rotation = eye
-    o, more = m, 0.0
+    o, more, turn = m, 0.0, turns[0] + 2.0 * turns[1]
     if share > TRACED:
         for _ in range(LEGS):
             found, s, bx, by, bz = onward(q, m, thick, (surface_depth, thickness, depth), normals, back_normals, eye)
@@ -164,6 +157,7 @@ def _inner(q, m, share, thick, surface, behind, eye, index, ray):
                 o = m
                 break
             more += s
+            turn += 2.0 * turns[1]
             q = (q[0] + s * m[0], q[1] + s * m[1], q[2] + s * m[2])
             ox, oy, oz, back, mx, my, mz = _leaving(m[0], m[1], m[2], bx, by, bz, m[0], m[1], m[2], index, 1.0)
             o, m = (ox, oy, oz), (mx, my, mz)
@@ -172,11 +166,12 @@ def _inner(q, m, share, thick, surface, behind, eye, index, ray):
             o = m
     ray[FARTHER] = more
     start = _onto(q[0], q[1], max(q[2], 1e-6), lens)
-    u, v, held = _behind(q, o, start, depth, 0.0, lens, (rotation[0, 2], rotation[1, 2], rotation[2, 2]), rest[3] > 0.0)
+    up = (rotation[0, 2], rotation[1, 2], rotation[2, 2])
+    u, v, held, gone = _behind(q, o, start, depth, 0.0, lens, up, rest[3] > 0.0)
     ray[BEYOND] = 0.0 if held else 1.0
     _turned(rotation, o[0], o[1], o[2], ray, INWARD)
     if held:
-        fetch_beyond(picture, u, v, rest, ray, SECOND)
+        fetch_beyond(picture, levels, u, v, 2.0 * index * turn * gone * lens[0], rest, ray, SECOND)
 
 
 @nb.njit(cache=True, inline="always")
@@ -184,7 +179,7 @@ def _to_far_side(i, j, p, v, t, n, surface, depth, eye):
     """Metres from p, on the near side with normal n, along the bent ray t to the far side; the outward normal there;
     metres of liquid along the line of sight v; and how free its end is, from 0, where it rests on something, to 1.
     """
-    _, surface_depth, _, back_normals, thickness, _, _ = surface
+    _, surface_depth, _, back_normals, thickness, _, grain = surface
     lens, rotation = eye
     bx, by, bz = -n[0], -n[1], -n[2]
     known = False
@@ -202,7 +197,8 @@ def _to_far_side(i, j, p, v, t, n, surface, depth, eye):
         way = min(thick * straight / leaving, 2.0 * thick)
     free = 1.0
     if end > 0.0:
-        free = min(max((end - p[2] - thick * v[2]) / max(RESTS * thick, ROOM * p[2] / lens[0], 1e-9), 0.0), 1.0)
+        gap = end - p[2] - thick * v[2] - CLOSED * grain
+        free = min(gap / max(RESTS * thick, ROOM * p[2] * lens[4], 1e-9), 1.0) if gap > 0.0 else 0.0
     if known and free > 0.0:
         sides = (surface_depth, thickness, depth)
         way, bx, by, bz = far_side(p, t, way, (bx, by, bz), sides, back_normals, eye)
@@ -212,10 +208,10 @@ def _to_far_side(i, j, p, v, t, n, surface, depth, eye):
 @nb.njit(cache=True, error_model="numpy", forceinline=True, _nrt=False)
 def _follow(i, j, surface, behind, eye, index, ray):
     """One pixel of `follow`."""
-    _, surface_depth, normals, back_normals, _, _, _ = surface
-    picture, depth, rest = behind
+    _, surface_depth, normals, back_normals, _, _, grain = surface
+    picture, levels, depth, rest = behind
     lens, rotation = eye
-    x, y = (j + 0.5 - lens[2]) / lens[0], (i + 0.5 - lens[3]) / lens[1]
+    x, y = (j + 0.5 - lens[2]) * lens[4], (i + 0.5 - lens[3]) * lens[5]
     vz = 1.0 / math.sqrt(x * x + y * y + 1.0)
     vx, vy = x * vz, y * vz
     nx, ny, nz = seen_from(normals, i, j, rotation)
@@ -238,18 +234,23 @@ def _follow(i, j, surface, behind, eye, index, ray):
         u, v = _onto(q[0], q[1], q[2], lens)
         end = depth[min(max(int(v), 0), depth.shape[0] - 1), min(max(int(u), 0), depth.shape[1] - 1)]
         if end > 0.0:
-            free = min(free, max((end - q[2]) / max(RESTS * thick, ROOM * z0 / lens[0], 1e-9), 0.0))
+            free = min(free, max((end - q[2] - CLOSED * grain) / max(RESTS * thick, ROOM * z0 * lens[4], 1e-9), 0.0))
     ox, oy, oz, back, mx, my, mz = _leaving(tx, ty, tz, bx, by, bz, vx, vy, vz, index, free)
-    ray[TURNED] = back if back_normals.shape[0] > 0 else 0.0
-    if ray[TURNED] > 0.0:
-        _inner(q, (mx, my, mz), back, thick, surface, behind, eye, index, ray)
+    ray[SPREAD] = turned_normals(surface_depth, normals, i, j)
+    ray[TURNED], ray[WIDE] = 0.0, 0.0
+    if back_normals.shape[0] > 0 and free > 0.0:
+        far = turned_normals(surface_depth, back_normals, i, j)
+        ray[TURNED] = back
+        ray[WIDE] = free * fanned(bend, tx * bx + ty * by + tz * bz, ray[SPREAD], far, index)
+        if back > 0.0:
+            turns = abs(bend) * ray[SPREAD], far
+            _inner(q, (mx, my, mz), back, thick, turns, surface, behind, eye, index, ray)
     up = (rotation[0, 2], rotation[1, 2], rotation[2, 2])
-    u, v, held = _behind(q, (ox, oy, oz), (j + 0.5, i + 0.5), depth, z0, lens, up, rest[3] > 0.0)
+    u, v, held, gone = _behind(q, (ox, oy, oz), (j + 0.5, i + 0.5), depth, z0, lens, up, rest[3] > 0.0)
     ray[OUTSIDE] = 0.0 if held else 1.0
     _turned(rotation, ox, oy, oz, ray, THROUGH)
-    if held:
-        fetch_beyond(picture, u, v, rest, ray, COLOR)
-    ray[SPREAD] = _spread(surface_depth, normals, i, j)
+    if held:  # the next pixel's light goes 4 WIDE beside this one's
+        fetch_beyond(picture, levels, u, v, 4.0 * ray[WIDE] * gone * lens[0], rest, ray, COLOR)
 
 
 @nb.njit(cache=True, parallel=True, nogil=True, error_model="numpy")
@@ -259,7 +260,7 @@ def follow(pixels, surface, behind, eye, index, rays):
     the environment's (1) or the picture's (0); the share of it that is mirrored at the far side instead, and the
     direction in which that is seen; the picture's colour; the spread of normals, in the units of GGX's alpha; and of
     what is mirrored at the far side the metres that it goes on inside, whether it is the environment's (1), and the
-    picture's colour.
+    picture's colour; and how wide what comes through is fanned out, in the units of that spread.
 
     surface, behind, eye: as of `shade`.
     """
@@ -274,14 +275,14 @@ def _looked_up(values, places, k, ray, at):
 
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True, _nrt=False)
-def _mirrored(values, places, steps, roughness, ray):
-    """`Environment.blurred` for the mirrored ray."""
+def _blurred(values, places, steps, roughness, ray, at):
+    """`Environment.blurred` for the direction in `ray` from `at` on."""
     last = steps.shape[0] - 1
     k = 0
     while k < last - 1 and roughness >= steps[k + 1]:
         k += 1
     share = min(max((roughness - steps[k]) / (steps[k + 1] - steps[k]), 0.0), 1.0)
-    across, down = place_of(np.float32(ray[MIRROR]), np.float32(ray[MIRROR + 1]), np.float32(ray[MIRROR + 2]))
+    across, down = place_of(np.float32(ray[at]), np.float32(ray[at + 1]), np.float32(ray[at + 2]))
     r0, g0, b0 = value_at(values, places[k, 0], places[k, 1], across, down)
     if share <= 0.0:
         return r0, g0, b0
@@ -291,13 +292,14 @@ def _mirrored(values, places, steps, roughness, ray):
 
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True, _nrt=False)
-def _come_through(ray, values, places, dim, numbers, light):
+def _come_through(ray, values, places, steps, dim, numbers, light):
     """What comes through, of the picture behind or the environment, and of what is mirrored at the far side, after its
     way inside; and the share of light, of each colour, that scattering and absorption take from both together."""
     back = ray[TURNED]
     light[0], light[1], light[2] = ray[COLOR], ray[COLOR + 1], ray[COLOR + 2]
     if ray[OUTSIDE] > 0.0 and back < 1.0:
-        light[0], light[1], light[2] = _looked_up(values, places, 0, ray, THROUGH)
+        wide = math.sqrt(max(ray[WIDE] - numbers[6], 0.0))
+        light[0], light[1], light[2] = _blurred(values, places, steps, wide, ray, THROUGH)
     r, g, b = ray[SECOND], ray[SECOND + 1], ray[SECOND + 2]
     if back > 0.0 and ray[BEYOND] > 0.0:
         r, g, b = _looked_up(values, places, dim, ray, INWARD)
@@ -336,7 +338,7 @@ def _pixel(i, j, surface, behind, eye, world, numbers, ray, light):
     index, roughness, scattering = numbers[0], numbers[1], numbers[2]
     straight, dull, sharp = numbers[3], numbers[4], numbers[6]
     _follow(i, j, surface, behind, eye, index, ray)
-    _come_through(ray, values, places, dim, numbers, light)
+    _come_through(ray, values, places, steps, dim, numbers, light)
     if scattering > 0.0:
         normals, carried = surface[2], surface[5]
         across, down = place_of(normals[i, j, 0], normals[i, j, 1], normals[i, j, 2])
@@ -344,7 +346,7 @@ def _pixel(i, j, surface, behind, eye, world, numbers, ray, light):
         _body((carried[i, j, 0], carried[i, j, 1], carried[i, j, 2]), given, numbers, waves, light)
     spread = max(ray[SPREAD] - sharp, 0.0)
     wide = roughness if spread == 0.0 else math.sqrt(math.sqrt(roughness**4 + spread * spread))
-    mirror = _mirrored(values, places, steps, wide, ray)
+    mirror = _blurred(values, places, steps, wide, ray, MIRROR)
     share = straight + (ray[SHARE] - straight) * (1.0 - dull * roughness)
     for k in range(3):
         light[k] = share * mirror[k] + (1.0 - share) * light[k]
@@ -355,14 +357,14 @@ def shade(surface, behind, eye, world, numbers, out):
     """Adds the liquid to `out`, a copy of the picture; what the numbers are says `liquid.shaded_plain`.
 
     surface: covered, depth, normals, normals of the far side (of no rows: none), thickness, carried colour, grain.
-    behind: picture, depth, and what it is beyond its rim. eye: lens (fx, fy, cx, cy) and rotation. world: pictures of
-    the environment, ever duller, and that of the irradiance, as `stacked` gives them; roughnesses of the former; which
-    of them is seen by what was mirrored at the far side; second radiation constant over wavelengths. numbers: index,
-    roughness, scattering, straight, dull, carried share, sharp, usual, cool, hot, warm, contrast, then absorption,
-    albedo, emission and weights of luminance.
+    behind: picture (`liquid_lookup.pyramid`), depth, and what it is beyond its rim. eye: lens (fx, fy, cx, cy, 1/fx,
+    1/fy) and rotation. world: pictures of the environment, ever duller, and that of the irradiance, as `stacked` gives
+    them; roughnesses of the former; which of them is seen by what was mirrored at the far side; second radiation
+    constant over wavelengths. numbers: index, roughness, scattering, straight, dull, carried share, sharp, usual, cool,
+    hot, warm, contrast, then absorption, albedo, emission and weights of luminance.
     """
     covered, surface_depth, normals, back_normals, thickness, carried, grain = surface
-    image, depth, rest = behind
+    image, levels, depth, rest = behind
     lens, rotation = eye
     values, places, steps, dim, waves = world
     for row in nb.prange(covered.shape[0]):
@@ -370,7 +372,8 @@ def shade(surface, behind, eye, world, numbers, out):
         ray, light = np.empty(NUMBERS), np.empty(6)
         # made once: to bundle arrays costs as much as a pixel
         liquid = (covered, surface_depth, normals, back_normals, thickness, carried, grain)
-        scene, lens_and_pose, lights = (image, depth, rest), (lens, rotation), (values, places, steps, dim, waves)
+        scene, lens_and_pose = (image, levels, depth, rest), (lens, rotation)
+        lights = (values, places, steps, dim, waves)
         for j in range(covered.shape[1]):
             part, z = covered[i, j], surface_depth[i, j]
             if not (part > 0.0 and z > 0.0 and (depth[i, j] <= 0.0 or z < depth[i, j])):

@@ -7,36 +7,70 @@ from __future__ import annotations
 import math
 
 import numba as nb
+import numpy as np
+from jaxtyping import Float, Int
 
 from fluidlift.look.smoothstep import eased
 
 SLANTED = 12.0
 """grains along the line of sight from which on liquid is thicker than one, seen ever so slanting (5 degrees)"""
+SMALLEST = 8
+"""px, rows and columns of the smallest picture"""
 RIM = 0.5
 """pictures beyond its rim at which a picture that goes on is no more than its mean"""
 
 
+def pyramid(
+    image: Float[np.ndarray, "h w 3"], *, deep: bool
+) -> tuple[Float[np.ndarray, " values"], Int[np.ndarray, "k 3"]]:
+    """A picture, and with `deep` ever smaller ones of it, each half as wide and high, one after the other in one array;
+    of each where it begins, its rows and its columns (Williams 1983)."""
+    import cv2
+
+    levels = [np.ascontiguousarray(image, np.float32)]
+    while deep and min(levels[-1].shape[:2]) >= 2 * SMALLEST:
+        rows, columns = levels[-1].shape[:2]
+        levels.append(cv2.resize(levels[-1], (columns // 2, rows // 2), interpolation=cv2.INTER_AREA))
+    sizes = np.array([level.shape[:2] for level in levels], np.int64)
+    starts = np.concatenate([[0], np.cumsum(3 * sizes.prod(axis=1))[:-1]])
+    values = levels[0].reshape(-1) if len(levels) == 1 else np.concatenate([level.reshape(-1) for level in levels])
+    return values, np.column_stack([starts, sizes]).astype(np.int64)
+
+
 @nb.njit(cache=True, error_model="numpy", _nrt=False)
-def _fetch(image, u, v, out, at):
-    """Bilinear, held at the rim."""
-    h, w = image.shape[0], image.shape[1]
+def _fetch(values, levels, k, u, v):
+    """Colour at u, v (px of the first picture) of the k-th one: bilinear, held at the rim."""
+    start, h, w = levels[k, 0], levels[k, 1], levels[k, 2]
+    if k > 0:
+        u, v = u * (w / levels[0, 2]), v * (h / levels[0, 1])
     x, y = min(max(u - 0.5, 0.0), w - 1.0), min(max(v - 0.5, 0.0), h - 1.0)
     j, i = min(int(x), max(w - 2, 0)), min(int(y), max(h - 2, 0))
     a, b = x - j, y - i
-    j1, i1 = min(j + 1, w - 1), min(i + 1, h - 1)
-    for k in range(3):
-        upper = (1.0 - a) * image[i, j, k] + a * image[i, j1, k]
-        lower = (1.0 - a) * image[i1, j, k] + a * image[i1, j1, k]
-        out[at + k] = (1.0 - b) * upper + b * lower
+    n0, across, down = start + 3 * (i * w + j), 3 * (min(j + 1, w - 1) - j), 3 * w * (min(i + 1, h - 1) - i)
+    p, q, r, s = (1.0 - a) * (1.0 - b), a * (1.0 - b), (1.0 - a) * b, a * b
+    n1, n2, n3 = n0 + across, n0 + down, n0 + across + down
+    return (
+        p * values[n0] + q * values[n1] + r * values[n2] + s * values[n3],
+        p * values[n0 + 1] + q * values[n1 + 1] + r * values[n2 + 1] + s * values[n3 + 1],
+        p * values[n0 + 2] + q * values[n1 + 2] + r * values[n2 + 2] + s * values[n3 + 2],
+    )
 
 
 @nb.njit(cache=True, error_model="numpy", _nrt=False)
-def fetch_beyond(image, u, v, rest, out, at):
-    """`_fetch`, and beyond the rim ever more of the mean of a picture that goes on there (rest: its colour and 1; 0: it
-    does not go on)."""
-    _fetch(image, u, v, out, at)
+def fetch_beyond(values, levels, u, v, wide, rest, out, at):
+    """The colour of `pyramid`'s picture over some `wide` px around u, v, and beyond the rim ever more of the mean of a
+    picture that goes on there (rest: its colour and 1; 0: it does not go on)."""
+    level = min(math.log2(wide), levels.shape[0] - 1.0) if wide > 1.0 else 0.0
+    k = int(level)
+    out[at], out[at + 1], out[at + 2] = _fetch(values, levels, k, u, v)
+    if level > k:
+        r, g, b = _fetch(values, levels, k + 1, u, v)
+        share = level - k
+        out[at] += share * (r - out[at])
+        out[at + 1] += share * (g - out[at + 1])
+        out[at + 2] += share * (b - out[at + 2])
     if rest[3] > 0.0:
-        h, w = image.shape[0], image.shape[1]
+        h, w = levels[0, 1], levels[0, 2]
         off = math.sqrt((max(-u, u - w, 0.0) / w) ** 2 + (max(-v, v - h, 0.0) / h) ** 2)
         share = min(off / RIM, 1.0)
         for k in range(3):

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from fluidlift.errors import require
 from fluidlift.look.project import LARGEST, bounded_scales, camera_depths, sound, view_colors
 from fluidlift.numerics.splatting import Bins, Projected, View, bin_tiles, project, rasterize_drawn, tiles_met
+from fluidlift.numerics.splatting_kernels import WIDE_TILE
 from fluidlift.types.camera import PinholeCamera
 from fluidlift.types.gaussians import Gaussians
 
@@ -125,5 +126,5 @@ def _project_bounded(g: Gaussians, opacities: np.ndarray, camera: PinholeCamera)
         scales = bounded_scales(g.scales, depths, camera, largest)
         projected = project(view, g.means, g.quats, scales, opacities)
         if tiles_met(projected, camera.size) <= PAIRS_DRAWN_MAX or largest < 1e-3:
-            return projected, opacities, bin_tiles(projected, camera.size, slots=False)
+            return projected, opacities, bin_tiles(projected, camera.size, WIDE_TILE, slots=False)
         largest /= 2

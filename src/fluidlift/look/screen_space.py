@@ -15,6 +15,7 @@ from fluidlift.errors import require
 from fluidlift.look.liquid import LiquidSurface
 from fluidlift.look.screen_space_kernels import (
     depths_and_cover,
+    filled_notches,
     inverse_depths,
     narrow_range,
     plane_normals,
@@ -33,6 +34,9 @@ SPACING = 1.25
 """radii between neighbours: the radius of surfaces is 0.4 cells, and particles lie half a cell apart"""
 SMOOTHING = (1.6, 1.0, 0.5)
 """radii: standard deviations of the passes over the depth; the second takes out the first one's rows and columns"""
+PER_BELL, BUMP = 1.7, 0.6
+"""samples per standard deviation of these passes, at least: sums over a bell are exact from there on; and radii between
+samples, at most: half the distance of the spheres, whose bumps would else be taken for a slope"""
 LIMIT = 3.0
 """radii: depths farther apart belong to different surfaces"""
 FALL = 1.0
@@ -86,8 +90,9 @@ def particle_surface(
     points = np.ascontiguousarray(positions, np.float32)
     require(points.ndim == 2 and points.shape[1] == 3, f"positions of shape {points.shape}", "[n, 3]")
     require(np.isfinite(radius) and radius > 0, f"a radius of {radius}", "positive metres")
-    colors = np.full(points.shape, GRAY, np.float32) if colors_linear is None else np.asarray(colors_linear, np.float32)
-    require(colors.shape == points.shape, f"colours of shape {colors.shape}", str(points.shape))
+    colors = np.zeros((0, 3), np.float32) if colors_linear is None else np.asarray(colors_linear, np.float32)
+    fits = colors_linear is None or colors.shape == points.shape
+    require(fits, f"colours of shape {colors.shape}", str(points.shape))
     spacing = SPACING * radius if spacing is None else spacing
     require(spacing > 0, f"a spacing of {spacing}", "positive metres")
     height, width = camera.size[1], camera.size[0]
@@ -144,15 +149,15 @@ def _through_spheres(
 
     width, height = camera.size
     if typical <= 0:
-        return np.zeros(depth.shape, np.float32), np.zeros((*depth.shape, 3), np.float32), np.zeros_like(depth)
+        return np.zeros_like(depth), np.full((*depth.shape, 3), GRAY, np.float32), np.zeros_like(depth)
     coarse = camera.focal[0] * radius / typical >= COARSE and min(camera.size) >= 16
     small = camera.resized((width // 2, height // 2)) if coarse else camera
     centres, box, starts, listed, across, down = _placed(points, radius, small)
-    sums = np.zeros((6, small.size[1], small.size[0]), np.float32)
+    sums = np.zeros((6 if len(colors) else 2, small.size[1], small.size[0]), np.float32)
     with in_pieces(len(starts)):
         sphere_chords(centres, box, starts, listed, radius, across, down, depth, colors, sums)
     step = 2 if coarse else 1
-    sums[5] = np.isfinite(depth[: step * small.size[1] : step, : step * small.size[0] : step])
+    sums[-1] = np.isfinite(depth[: step * small.size[1] : step, : step * small.size[0] : step])
     near = depth[::4, ::4]
     near = near[np.isfinite(near)]
     pixels = radius * small.focal[0] / (float(np.median(near)) if len(near) else typical)
@@ -160,12 +165,14 @@ def _through_spheres(
         sigma = min((EVEN if k else EVEN_THICKNESS) * pixels, 20.0)
         reach = 2 * int(2.5 * sigma + 0.5) + 1
         cv2.GaussianBlur(picture, (reach, reach), sigma, dst=picture, borderType=cv2.BORDER_CONSTANT)
-    carried = np.empty((*sums.shape[1:], 3), np.float32)
-    np.divide(np.moveaxis(sums[1:4], 0, -1), np.maximum(sums[4], 1e-12)[..., None], out=carried)
-    if not coarse:
-        return sums[0], carried, sums[5]
-    whole = (sums[0], carried, sums[5])
-    return tuple(cv2.resize(p, (width, height), interpolation=cv2.INTER_LINEAR) for p in whole)
+    found = [sums[0], sums[-1]]
+    if len(colors):
+        found.append(np.empty((*sums.shape[1:], 3), np.float32))
+        np.divide(np.moveaxis(sums[1:4], 0, -1), np.maximum(sums[4], 1e-12)[..., None], out=found[-1])
+    if coarse:
+        found = [cv2.resize(p, (width, height), interpolation=cv2.INTER_LINEAR) for p in found]
+    thickness, near, carried = found if len(colors) else (*found, np.full((height, width, 3), GRAY, np.float32))
+    return thickness, carried, near
 
 
 def _close_notches(inverse: np.ndarray, radius: float, camera: PinholeCamera, typical: float) -> None:
@@ -179,9 +186,7 @@ def _close_notches(inverse: np.ndarray, radius: float, camera: PinholeCamera, ty
     wide = 2 * min(round(reach), MOST) + 1
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (wide, wide))
     closed = cv2.morphologyEx(np.maximum(inverse, 0.0), cv2.MORPH_CLOSE, disc, borderType=cv2.BORDER_REPLICATE)
-    own = np.abs(inverse)
-    deep = closed - own > np.float32(radius) * closed * own
-    inverse[deep] = closed[deep]
+    filled_notches(inverse, closed, np.float32(radius))
 
 
 def _smoothed(inverse: np.ndarray, radius: float, camera: PinholeCamera) -> np.ndarray:
@@ -189,8 +194,9 @@ def _smoothed(inverse: np.ndarray, radius: float, camera: PinholeCamera) -> np.n
     limit, fall, other = np.float32(LIMIT * radius), np.float32(FALL * radius), np.empty_like(inverse)
     with in_pieces(len(inverse)):
         for share in SMOOTHING:
-            narrow_range(inverse, other, 0, 1, camera.focal[0], share * radius, limit, fall)
-            narrow_range(other, inverse, 1, 0, camera.focal[1], share * radius, limit, fall)
+            apart = np.float32(max(PER_BELL, share / BUMP))
+            narrow_range(inverse, other, True, camera.focal[0], share * radius, apart, limit, fall)
+            narrow_range(other, inverse, False, camera.focal[1], share * radius, apart, limit, fall)
     return inverse
 
 

@@ -14,8 +14,6 @@ import numpy as np
 _FUSED = {"contract"}
 LARGEST_WINDOW = 40
 """pairs of pixels that one pass of the smoothing averages, however near the liquid is"""
-APART = np.float32(2.6)
-"""pairs per standard deviation of the smoothing: of wide bells every second, third ... pixel is enough"""
 LEAST = np.float32(0.3)
 """px: a narrower bell averages nothing"""
 NEARER = np.float32(1e18)
@@ -104,8 +102,9 @@ def _take_pair(before, after, own, distance, limit, fall, state):
 
 
 @nb.njit(cache=True, inline="always")
-def _stride_and_steps(own, factor):
-    """Pixels between pairs, and how many pairs, for some pixels side by side; none where nothing is to be smoothed."""
+def _stride_and_steps(own, factor, apart):
+    """Pixels between pairs, at least `apart` of which there are per standard deviation, and how many pairs, for some
+    pixels side by side; none where nothing is to be smoothed."""
     least, most = np.float32(np.inf), np.float32(0.0)
     for k in range(own.shape[0]):
         wide = factor * own[k]
@@ -113,21 +112,22 @@ def _stride_and_steps(own, factor):
             least, most = min(least, wide), max(most, wide)
     if most <= 0:
         return 1, 0
-    stride = max(int(least / APART), 1)
+    stride = max(int(least / apart), 1)
     return stride, min(max(int(np.float32(2.0) * most / np.float32(stride)), 1), LARGEST_WINDOW)
 
 
 @nb.njit(cache=True, parallel=True, nogil=True, error_model="numpy", fastmath=_FUSED)
-def narrow_range(q, out, down, across, focal, width, limit, fall):
-    """One pass of smoothing along rows (across = 1) or columns (down = 1) of inverse depth q (1/m; negative: of ground
-    beside the liquid, 0: nothing there).
+def narrow_range(q, out, across, focal, width, apart, limit, fall):
+    """One pass of smoothing along rows (`across`) or columns of inverse depth q (1/m; negative: of ground beside the
+    liquid, 0: nothing there).
 
     After the narrow-range filter of Truong and Yuksel 2018: depths within `limit` (m) of what was met so far are
     averaged; what lies nearer ends the window on its side; what lies farther counts as if it fell off by `fall` (m),
     which rounds outlines. Three changes: inverse depth is averaged, which is linear across the picture of a plane; a
     straight line is fitted to it (local linear regression), so that planes stay as they are, also where the window is
     open on one side alone; and ground close behind an outline is averaged like liquid, so that the surface runs out on
-    it instead of ending in a rim. `width` (m) is the standard deviation of the weights.
+    it instead of ending in a rim. `width` (m) is the standard deviation of the weights, of which `apart` samples are
+    taken at least: of wide bells every second, third ... pixel is enough.
     """
     h, w = q.shape
     factor = np.float32(focal * width)
@@ -142,7 +142,7 @@ def narrow_range(q, out, down, across, focal, width, limit, fall):
             last = min(first + LANES, w)
             own = q[row, first:last]
             out[row, first:last] = own
-            stride, steps = _stride_and_steps(own, factor)
+            stride, steps = _stride_and_steps(own, factor, apart)
             if steps == 0:
                 continue
             _begin(own, np.float32(stride), factor, limit, state)
@@ -162,6 +162,17 @@ def narrow_range(q, out, down, across, focal, width, limit, fall):
                 most = s * skk - sk * sk
                 if own[n] > 0 and most > 0:
                     out[row, first + n] = own[n] + (skk * state[k + SUMS_D] - sk * state[k + SUMS_KD]) / most
+
+
+@nb.njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+def filled_notches(inverse, closed, least):
+    """Inverse depths (1/m; 0 or less: no liquid) raised to those of `closed` where that is more than `least` (m)
+    nearer, in place."""
+    for row in nb.prange(inverse.shape[0]):
+        for col in range(inverse.shape[1]):
+            own, other = abs(inverse[row, col]), closed[row, col]
+            if other - own > least * other * own:
+                inverse[row, col] = other
 
 
 @nb.njit(cache=True, inline="always")

@@ -144,7 +144,8 @@ def sphere_depths(centres, box, starts, listed, radius, across, down, depth):
 @nb.njit(cache=True, parallel=True, nogil=True, error_model="numpy", fastmath=_FUSED)
 def sphere_chords(centres, box, starts, listed, radius, across, down, depth, colors, sums):
     """Five pictures: the sum of the lengths (m, along the ray) in all spheres, then colours of those less than a
-    diameter behind the nearest surface, weighted with their lengths, and these weights.
+    diameter behind the nearest surface, weighted with their lengths, and these weights. Without colours (none of them)
+    the sum alone.
 
     depth: as `sphere_depths` gives it, at `step` times the resolution of `sums`.
     """
@@ -160,7 +161,7 @@ def sphere_chords(centres, box, starts, listed, radius, across, down, depth, col
             x, y, z = centres[i, 0], centres[i, 1], centres[i, 2]
             first, last = box[i, 0], box[i, 1]
             middle = depth[step * ((box[i, 2] + box[i, 3]) // 2), step * ((first + last) // 2)]
-            seen = z - middle < reach or middle == np.inf
+            seen = colors.shape[0] > 0 and (z - middle < reach or middle == np.inf)
             for row in range(max(low, box[i, 2]), min(high, box[i, 3]) + 1):
                 b = down[row]
                 p = b * z - y

@@ -45,6 +45,9 @@ AWAY = (-0.3, 0.1)
 through a gap), and from which all is"""
 LEANING = 0.2
 """cosine that normals keep: leaning more they would mirror everything, in a seam around the body"""
+BURIED = 1.5
+"""spacings behind what hides liquid over which the middle of a Gaussian may lie: on ground that is seen at a slant, and
+a little inside it"""
 NEIGHBOURS = (7, 18)
 """those whose distances are taken together: from one alone, a lattice's shells would show"""
 SAMPLES = 4_000
@@ -65,6 +68,7 @@ def splat_surface(
     volume: float | None = None,
     colors: Float[np.ndarray, "n 3"] | None = None,
     far_side: bool = True,
+    ground: Float[np.ndarray, "h w"] | None = None,
 ) -> LiquidSurface:
     """The nearest surface of the liquid that Gaussians fill, and how much of it lies behind.
 
@@ -78,9 +82,11 @@ def splat_surface(
         volume: m^3 that each Gaussian stands for; None: measured (`mean_volume`).
         colors: linear, carried by the liquid; None: the Gaussians' own (sRGB) made linear.
         far_side: look for the normals there too: light leaves a drop bent once more. Takes about as long again.
+        ground: camera z (m; 0: none) of what hides liquid. A Gaussian that lies behind it counts in those pixels
+            alone that look past it: a rock before a pond cuts no hole with a blurred rim.
 
     Raises:
-        ValueError: normals or colours of another number, or a volume that is not positive.
+        ValueError: normals or colours of another number, ground of another size, or a volume that is not positive.
     """
     n, (width, height) = len(gaussians), camera.size
     require(np.shape(normals) == (n, 3), f"normals {np.shape(normals)}", f"({n}, 3)")
@@ -94,11 +100,15 @@ def splat_surface(
     spacing = volume ** (1.0 / 3.0)
     carried = linear_from_srgb(g.rgb) if colors is None else np.asarray(colors, np.float32)[ok]
     features = np.concatenate([np.asarray(normals, np.float32)[ok], carried], axis=1)
-    total, skin = splatted_thickness(g, features, camera, volume, SKIN * spacing)
+    wall = None
+    if ground is not None:
+        require(np.shape(ground) == (height, width), f"ground of {np.shape(ground)}", f"({height}, {width})")
+        wall = np.where(ground > 0, ground + BURIED * spacing, np.inf).astype(np.float32)
+    total, skin = splatted_thickness(g, features, camera, volume, SKIN * spacing, wall=wall)
     seen = _surface(total, skin, camera, spacing)
     if not far_side:
         return seen
-    _, skin = splatted_thickness(g, features[:, :3], camera, volume, SKIN * spacing, far=True)
+    _, skin = splatted_thickness(g, features[:, :3], camera, volume, SKIN * spacing, far=True, wall=wall)
     away = camera.rays(camera.pixel_grid())
     return replace(seen, back_normal=_facing(skin[..., 2:5], away / np.linalg.norm(away, axis=-1, keepdims=True)))
 
@@ -140,9 +150,11 @@ def splatted_thickness(
     skin: float,
     *,
     far: bool = False,
+    wall: Float[np.ndarray, "h w"] | None = None,
 ) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w 2+c"]]:
     """Metres of liquid on each ray, and the first `skin` metres of them (with `far`: the last): how much was found, and
-    the sums over it of depth (camera z, m) and features, each times metres.
+    the sums over it of depth (camera z, m) and features, each times metres. wall: depth up to which Gaussians count in
+    a pixel (float32; None: all do).
 
     The integral of a Gaussian of volume V along camera z is V N(u, v) du dv / dx dy: the normal distribution in the
     picture, of the projected covariance, times the pixels that a square metre has at its depth.
@@ -150,11 +162,12 @@ def splatted_thickness(
     width, height = camera.size
     stretch = np.linalg.norm(camera.rays(camera.pixel_grid()), axis=-1).astype(np.float32)
     total = np.zeros((height, width), np.float32)
+    wall = np.full((height, width), np.inf, np.float32) if wall is None else wall
     first = np.zeros((height, width, 2 + features.shape[1]), np.float32)
     found = _projected(gaussians, camera, volume)
     for part, bins, pairs in _in_order(found, np.flatnonzero(found.extents[:, 0] > 0), camera.size, far):
         packed = _packed(found, part, features, camera, volume)
-        thickness_kernel(packed, bins.starts, pairs, far, np.float32(skin), stretch, total, first)
+        thickness_kernel(packed, bins.starts, pairs, far, np.float32(skin), (stretch, wall), total, first)
     return total, first
 
 
@@ -193,10 +206,11 @@ def _packed(
 
 
 @nb.njit(cache=True, nogil=True, parallel=True, fastmath={"contract", "reassoc"}, error_model="numpy")
-def thickness_kernel(packed, starts, gaussians, backwards, skin, stretch, total, first):
+def thickness_kernel(packed, starts, gaussians, backwards, skin, rays, total, first):
     """`thickness_plain`, tile by tile, in rows of 16 pixels without branches (see `numerics.splatting_kernels`).
-    `backwards`: the farthest first."""
+    `backwards`: the farthest first; rays: metres per metre of camera z, and the depth up to which Gaussians count."""
     height, width = total.shape
+    stretch, wall = rays
     tiles_x = -(-width // TILE)
     half, none, channels = np.float32(0.5), np.float32(0.0), first.shape[2]
     for t0 in nb.prange(len(starts) - 1):
@@ -206,16 +220,18 @@ def thickness_kernel(packed, starts, gaussians, backwards, skin, stretch, total,
         x0, y0 = (t % tiles_x) * TILE, (t // tiles_x) * TILE
         rows, columns = min(TILE, height - y0), min(TILE, width - x0)
         away, found = np.zeros((TILE, TILE), np.float32), np.zeros((TILE, TILE), np.float32)
+        ends = np.zeros((TILE, TILE), np.float32)
         sums, share = np.zeros((TILE, channels, TILE), np.float32), np.zeros(TILE, np.float32)
         for i in range(rows):
             for j in range(columns):
                 away[i, j], found[i, j] = stretch[y0 + i, x0 + j], total[y0 + i, x0 + j]
+                ends[i, j] = wall[y0 + i, x0 + j]
                 for c in range(channels):
                     sums[i, c, j] = first[y0 + i, x0 + j, c]
         for n in range(starts[t], starts[t + 1]):
             k = gaussians[starts[t] + starts[t + 1] - 1 - n] if backwards else gaussians[n]
             u, v, a, b, c = packed[k, 0], packed[k, 1], packed[k, 2], packed[k, 3], packed[k, 4]
-            hy, most = packed[k, 6], packed[k, 8]
+            hy, z, most = packed[k, 6], packed[k, 7], packed[k, 8]
             above = max(0, np.int64(math.ceil(v - hy - half)) - y0)
             below = min(rows - 1, np.int64(math.floor(v + hy - half)) - y0)
             for i in range(above, below + 1):
@@ -226,7 +242,7 @@ def thickness_kernel(packed, starts, gaussians, backwards, skin, stretch, total,
                     dx = np.float32(np.int32(j)) + px
                     power = (half * a * dx + bend) * dx + rise
                     metres = most * exp_negative(min(max(power, none), FARTHEST)) * away[i, j]
-                    metres = metres if power <= FARTHEST else none
+                    metres = metres if power <= FARTHEST and z <= ends[i, j] else none
                     found[i, j] += metres
                     share[j] = max(min(metres, skin - sums[i, 0, j]), none)
                     taken += share[j]
@@ -244,14 +260,14 @@ def thickness_kernel(packed, starts, gaussians, backwards, skin, stretch, total,
                     first[y0 + i, x0 + j, c] = sums[i, c, j]
 
 
-def thickness_plain(packed, skin, stretch, total, first) -> None:
+def thickness_plain(packed, skin, rays, total, first) -> None:
     """Add up thickness, and fill the skin front to back: the twin of `thickness_kernel`, for reading."""
-    height, width = total.shape
+    (height, width), (stretch, wall) = total.shape, rays
     u, v = np.arange(width, dtype=np.float32) + 0.5, np.arange(height, dtype=np.float32)[:, None] + 0.5
     for one in packed:
         dx, dy = u - one[0], v - one[1]
         power = 0.5 * (one[2] * dx * dx + one[4] * dy * dy) + one[3] * dx * dy
-        metres = np.where(power <= FARTHEST, one[8] * np.exp(-power) * stretch, 0.0)
+        metres = np.where((power <= FARTHEST) & (one[7] <= wall), one[8] * np.exp(-power) * stretch, 0.0)
         total += metres
         share = np.maximum(np.minimum(metres, skin - first[..., 0]), 0.0)
         first += share[..., None] * np.concatenate([[1.0, one[7]], one[LEAD:]]).astype(np.float32)

@@ -24,6 +24,9 @@ STRIDE = 0.12
 STRIDE_PX = 1.5
 """and of a pixel, at least"""
 
+GLANCING = 0.1
+"""least cosine under which light that fans out is taken to leave: under less hardly any does"""
+
 
 @nb.njit(cache=True, inline="always")
 def seen_from(normals, i, j, rotation):
@@ -133,3 +136,35 @@ def onward(q, m, thick, sides, normals, back_normals, eye):
         return False, 0.0, 0.0, 0.0, 0.0
     s = _plane(q, m, row, col, near if front else far, nx, ny, nz, lens)
     return True, min(max(s, low), high), nx, ny, nz
+
+
+@nb.njit(cache=True, inline="always")
+def turned_normals(surface_depth, normals, i, j):
+    """How much the normal turns from this pixel to the next ones of the same surface, as GGX's alpha."""
+    h, w = surface_depth.shape
+    turn, known = 0.0, 0
+    for k in range(4):
+        r, c = i + (k == 0) - (k == 1), j + (k == 2) - (k == 3)
+        if r < 0 or c < 0 or r >= h or c >= w or surface_depth[r, c] <= 0.0:
+            continue
+        dot = 0.0
+        for n in range(3):
+            dot += normals[i, j, n] * normals[r, c, n]
+        turn += max(2.0 - 2.0 * dot, 0.0)
+        known += 1
+    return min(0.5 * math.sqrt(turn / max(known, 1)), 0.5)
+
+
+@nb.njit(cache=True, inline="always")
+def fanned(bend, leaving, near, far, index):
+    """How wide the light of one pixel leaves the far side, as alpha of the mirror that would fan it out as wide.
+
+    Differentials of both refractions (Igehy 1999): the normals turn by `near` at the front and by `far` at the back
+    within the pixel; t = v / n + bend n on the way in, where it meets the outward normal under the cosine `leaving`.
+    Light that leaves at a slant is fanned out ever more. A mirror turns its light by twice what its normals turn.
+    """
+    out = math.sqrt(max(1.0 - index * index * (1.0 - leaving * leaving), GLANCING * GLANCING))
+    inside = abs(bend) * near
+    aslant = inside + math.sqrt(max(1.0 - leaving * leaving, 0.0)) * far
+    turn = index * inside + abs(out - index * leaving) * far + (index * index * leaving / out - index) * aslant
+    return 0.5 * min(max(turn, 0.0), 1.0)

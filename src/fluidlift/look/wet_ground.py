@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from fluidlift.look.environment_stack import fading
 from fluidlift.look.liquid import Behind, LiquidSurface
-from fluidlift.look.liquid_kernels import RESTS, ROOM
+from fluidlift.look.liquid_kernels import CLOSED, RESTS, ROOM
 from fluidlift.look.materials import Material
 from fluidlift.look.optics import fresnel, wet_light, wet_table
 from fluidlift.look.smoothstep import eased, smoothstep
@@ -57,7 +57,7 @@ def wetted(
     dampen(
         (surface.covered, surface.depth, surface.normal, surface.thickness, float(surface.grain)),
         (behind.depth, *(np.ascontiguousarray(g, np.float32) for g in ground)),
-        np.array([*camera.focal, *camera.center], np.float64), pose, extinction,
+        np.array([*camera.focal, *camera.center, *(1.0 / f for f in camera.focal)], np.float64), pose, extinction,
         np.stack(wet_table(float(material.refractive_index))), _slants(float(material.refractive_index)), shaded,
         np.zeros((0, 0, 4), np.float32) if behind.direct is None else np.asarray(behind.direct, np.float32), image,
     )  # fmt: skip
@@ -80,26 +80,29 @@ def dampen(liquid, ground, lens, pose, extinction, table, slants, shaded, direct
     direct: of `Behind`, or empty."""
     covered, near, normals, thickness, grain = liquid
     behind, albedo, own = ground
-    deep, last = table[0, -1], table.shape[1] - 1
+    last = table.shape[1] - 1
+    # the table is even in the roots of depths, and the root of a product is that of its factors
+    roots = last * np.sqrt(extinction / table[0, -1])
     steps, straight_in = slants.shape[1] - 1, slants[2, -1]
     for row in nb.prange(near.shape[0]):
         i = np.int64(row)
-        y = (i + 0.5 - lens[3]) / lens[1]
+        y = (i + 0.5 - lens[3]) * lens[5]
         for j in range(near.shape[1]):
             z, end = np.float64(near[i, j]), np.float64(behind[i, j])
             if not (covered[i, j] > 0.0 and z > 0.0 and end > z):
                 continue
-            x = (j + 0.5 - lens[2]) / lens[0]
+            x = (j + 0.5 - lens[2]) * lens[4]
             away = math.sqrt(x * x + y * y + 1.0)
+            nearer = 1.0 / away
             thick = min(np.float64(thickness[i, j]), (end - z) * away)
-            free = (end - z - thick / away) / max(RESTS * thick, ROOM * z / lens[0], 1e-9)
-            if free >= 1.0:
+            gap, room = end - z - thick * nearer - CLOSED * grain, max(RESTS * thick, ROOM * z * lens[4], 1e-9)
+            if gap >= room:
                 continue
             cos = 0.0
             for k in range(3):
                 cos -= normals[i, j, k] * (pose[0, k] * x + pose[1, k] * y + pose[2, k])
-            height = thick * min(max(cos / away, 0.0), 1.0)
-            share = covered[i, j] * (1.0 - max(free, 0.0))
+            height = thick * min(max(cos * nearer, 0.0), 1.0)
+            share = covered[i, j] * (1.0 - gap / room if gap > 0.0 else 1.0)
             if grain > 0.0:
                 share *= eased(height / grain)
             longer, straight, enters = 1.0, 1.0, 0.0
@@ -110,9 +113,9 @@ def dampen(liquid, ground, lens, pose, extinction, table, slants, shaded, direct
                 longer = slants[1, low] + part * (slants[1, low + 1] - slants[1, low])
                 enters = slants[0, low] + part * (slants[0, low + 1] - slants[0, low])
                 straight = steps / at
-            same = abs(end - own[i, j]) <= 1e-4 * own[i, j]
+            same, root = abs(end - own[i, j]) <= 1e-4 * own[i, j], math.sqrt(height)
             for k in range(3):
-                at = last * math.sqrt(min(height * extinction[k], deep) / deep)
+                at = min(root * roots[k], np.float64(last))
                 low = min(int(at), last - 1)
                 part = at - low
                 arrives = table[1, low] + part * (table[1, low + 1] - table[1, low])
@@ -177,7 +180,7 @@ def standing(
     z, end = surface.depth, behind.depth
     there = (surface.covered > 0) & (z > 0) & (end > z)
     thick = np.minimum(surface.thickness, (end - z) * away)
-    gap = end - z - thick / away
+    gap = end - z - thick / away - CLOSED * surface.grain
     free = np.clip(gap / np.maximum(np.maximum(RESTS * thick, ROOM * z / camera.focal[0]), 1e-9), 0.0, 1.0)
     cos = np.clip(-np.einsum("hwk,hwk->hw", surface.normal, rays) / away, 0.0, 1.0)
     height = thick * cos

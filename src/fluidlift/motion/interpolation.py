@@ -161,6 +161,20 @@ def conductances(
     return out
 
 
+def depth_jump(depth: Float[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    """Largest change of depth from a pixel of the mask to its neighbours in it, as a share of the nearer; float32."""
+    jump = np.zeros(mask.shape, np.float32)
+    for axis in (0, 1):
+        low, high = [slice(None)] * 2, [slice(None)] * 2
+        low[axis], high[axis] = slice(None, -1), slice(1, None)
+        a, b = depth[tuple(low)], depth[tuple(high)]
+        both = mask[tuple(low)] & mask[tuple(high)]
+        change = np.where(both, np.abs(a - b) / np.minimum(a, b), 0.0).astype(np.float32)
+        for side in (tuple(low), tuple(high)):
+            jump[side] = np.maximum(jump[side], change)
+    return jump
+
+
 def _hierarchy(edges: np.ndarray, weight: np.ndarray) -> list[_Level]:
     weight = weight.astype(np.float32)
     levels = [_Level(edges, weight, _inverse_diagonal(edges, weight))]

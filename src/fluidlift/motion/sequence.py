@@ -291,7 +291,9 @@ def _filled(
     window: FlowWindow, t: int, now: _Instant, scene: MotionScene, options: MotionOptions, downhill: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Smoothed in time and filled in along the mainstream: displacement, observed, and confidence before filling."""
-    reach = max(options.reach, options.half_window) if options.along_paths else options.half_window
+    # what collapses is faster in every frame
+    longer = options.along_paths and scene.kind != "dam"
+    reach = max(options.reach, options.half_window) if longer else options.half_window
     near, at = window.around(t, reach)
     mask, depth = now.mask, now.depth
     mean, trust = smoothed_flow(near, at, mask, half_window=options.half_window, along_paths=options.along_paths)

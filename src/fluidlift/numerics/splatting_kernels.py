@@ -23,12 +23,15 @@ from numba.extending import overload
 from fluidlift.numerics.splatting_binning import LEAD
 from fluidlift.numerics.splatting_projection import ALPHA_MIN, BLUR
 
-__all__ = ["ALPHA_MAX", "ALPHA_MIN", "BLUR", "TILE", "TRANSMITTANCE_MIN"]
+__all__ = ["ALPHA_MAX", "ALPHA_MIN", "BLUR", "TILE", "TRANSMITTANCE_MIN", "WIDE_TILE"]
 
 ALPHA_MAX = np.float32(0.999)
 TRANSMITTANCE_MIN = np.float32(1e-4)
 TILE = 16
 """px, width and height of a tile unless asked otherwise"""
+WIDE_TILE = 32
+"""px, of pictures that are only looked at: lists are half as long, and Gaussians are fetched less often. Gradients are
+written per tile and Gaussian, and are faster with the smaller ones"""
 LANES = 16
 BATCH = 16
 """Gaussians of a tile that are fetched together; between two batches it is checked which of its rows are finished"""
@@ -165,14 +168,14 @@ def raster_kernel(packed, starts, gaussians, first, last, tile, stride, image, a
             r0, r1, g0, g1 = _span(near, k, x0, y0, tile)
             u, v, a, b, c, o = near[k, 0], near[k, 1], near[k, 2], near[k, 3], near[k, 4], near[k, 5]
             f0, f1, f2, f3 = near[k, LEAD], near[k, LEAD + 1], near[k, LEAD + 2], near[k, LEAD + 3]
-            for r in range(max(r0, top), min(r1, bottom) + 1):
-                if not alive[r]:
-                    continue
-                dy = np.float32(y0 + r) + np.float32(0.5) - v
-                bend, rise = b * dy, c * dy * dy
-                for g in range(g0, g1 + 1):
+            for g in range(g0, g1 + 1):
+                px = np.float32(x0 + g * LANES) + np.float32(0.5)
+                for r in range(max(r0, top), min(r1, bottom) + 1):
+                    if not alive[r]:
+                        continue
+                    dy = np.float32(y0 + r) + np.float32(0.5) - v
+                    bend, rise = b * dy, c * dy * dy
                     base = np.uint64((r * groups + g) * size)
-                    px = np.float32(x0 + g * LANES) + np.float32(0.5)
                     for lane in range(np.uint64(LANES)):
                         dx = np.float32(np.int32(lane)) + px - u
                         p = (a * dx + bend) * dx + rise

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -72,9 +74,22 @@ def _depth_told(obstacle: Obstacle, asset: FluidAsset) -> str:
     height = np.ptp(points[:, 2]) + grid.high[2] - grid.low[2]
     rises = np.arange(grid.spacing, height + grid.spacing, grid.spacing)
     free = next((r for r in rises if gap(float(r)) >= 0.0), None)
-    place = ", ".join(f"{c:.3g}" for c in obstacle.position)
+    h = grid.spacing
+    place = place_told(obstacle.position, h)
     told = f"{obstacle.line}: obstacle '{obstacle.name}' at ({place}) m begins {deep:.2g} m inside the ground"
     if free is not None:
-        told += f": it is free there from a height of {obstacle.position[2] + free:.2g} m"
+        told += f": it is free there from a height of {place_told([obstacle.position[2] + free], h)} m"
     x, y, z = open_water(asset, float(np.ptp(points[:, :2], axis=0).max()))
-    return told + f"; around ({x:.2g}, {y:.2g}) is open fluid up to {z:.2g} m"
+    return told + f"; around ({place_told([x, y], h)}) is open fluid up to {place_told([z], h)} m"
+
+
+def placed(place: Iterable[float], step: float) -> list[float]:
+    """A place, m, to the decimal that is no coarser than a step, m: the same wherever the origin lies, which of a
+    surveyed camera may be far away."""
+    decimals = math.ceil(-math.log10(step) - 1e-9)
+    return [round(float(c), decimals) + 0.0 for c in place]
+
+
+def place_told(place: Iterable[float], cell: float) -> str:
+    """A place, m, in words: to a tenth of a cell (m) or a little finer."""
+    return ", ".join(f"{c:.12g}" for c in placed(place, 0.1 * cell))

@@ -347,12 +347,12 @@ class Painter:
             apart = 0.5 * self.terrain.grid.spacing
             normals, share = fluid_normals(fluid, apart, self._bed)
             normals = normals * np.maximum(share, INNER)[:, None]
-            seen = self._visible(fluid, camera, behind) > 0.5
             # what lies on a bed has its far side there: no second surface to bend light at
             free = self._bed is None
-            return splat_surface(fluid.select(seen), normals[seen], camera, volume=apart**3, far_side=free)
+            return splat_surface(fluid, normals, camera, volume=apart**3, far_side=free, ground=behind.depth)
         radius = RADIUS * self.terrain.grid.spacing
-        colors = linear_from_srgb(np.clip(fluid.rgb, 0.0, 1.0))
+        shows = self.material.carried > 0 or max(self.material.emission) > 0  # else its colours change nothing
+        colors = linear_from_srgb(np.clip(fluid.rgb, 0.0, 1.0)) if shows else None
         return particle_surface(fluid.means, radius, camera, colors, ground=behind.depth)
 
     def _traced(self, frame: Frame, camera: PinholeCamera, backdrop: Backdrop) -> Lit:

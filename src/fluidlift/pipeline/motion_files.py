@@ -86,7 +86,7 @@ def _velocities(story: Story, folder: Path, config: JobConfig, files: MotionFile
     wanted = [t for t in range(pairs) if t not in writer.rows]
     found = motion_sequence(
         pairs_of(story), masks_of(story).__getitem__, pairs, motion_scene(story), options,
-        frames=wanted, volume_frames=wanted,
+        frames=wanted, volume_frames=() if g["kind"] == "dam" else wanted,
     )  # fmt: skip
     following = next(found, None)
     for t in wanted:
@@ -98,6 +98,10 @@ def _velocities(story: Story, folder: Path, config: JobConfig, files: MotionFile
     rows = writer.finish(pairs)
     shares = [r["free_fall_share"] for r in rows if r.get("free_fall_share") is not None]
     warnings = motion_warnings(rows, g["kind"], float(max(shares, default=0.0)))
+    if g["kind"] == "dam":
+        warnings.append(
+            "the shape of a dam is known as it stands, not as it collapses: flow is written, and no velocity in m/s"
+        )
     return Result({}, {"warnings": warnings + _unbalanced(rows), "rows": rows})
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import tempfile
 import threading
 import time
@@ -55,6 +56,8 @@ class PreviewFrame(NamedTuple):
     """[n,3], m/s"""
     poses: np.ndarray
     """[b,7] of the obstacles: position (m) and orientation (w, x, y, z)"""
+    cell: float = math.nan
+    """m, of the copy's cells; not a number: not known"""
 
 
 @contextlib.contextmanager
@@ -146,7 +149,7 @@ def _shown(scene: Scene, simulator: Any, dressing: Dressing, number: int) -> Pre
     poses = np.zeros((0, 7))
     if scene.obstacles:
         poses = np.concatenate([simulator.bodies.position, simulator.bodies.orientation], axis=1)
-    return PreviewFrame(number, shown.gaussians, shown.velocities, poses)
+    return PreviewFrame(number, shown.gaussians, shown.velocities, poses, scene.terrain.grid.spacing)
 
 
 @dataclass(frozen=True)

@@ -41,15 +41,17 @@ class PlaneHeight(HeightModel):
 
 @dataclass(frozen=True)
 class ProfileHeight(HeightModel):
-    """A surface of translation: z depends on the distance from the viewer alone (a fall seen from the front)."""
+    """A surface of translation: z depends on the distance uphill alone (a fall)."""
 
     away: Float[np.ndarray, " k"]
-    """increasing y"""
+    """increasing distances (x, y) . uphill"""
     z: Float[np.ndarray, " k"]
+    uphill: tuple[float, float] = (0.0, 1.0)
+    """unit vector over the ground; away from the viewer for a fall seen from the front"""
 
     def height(self, xy: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
         """z above the ground positions; level beyond the upper end, gently sloping (5 degrees) beyond the foot."""
-        y = xy[..., 1]
+        y = xy[..., 0] * self.uphill[0] + xy[..., 1] * self.uphill[1]
         inside = np.interp(y, self.away, self.z)
         return np.where(y < self.away[0], self.z[0] - (self.away[0] - y) * np.tan(np.radians(5.0)), inside)
 

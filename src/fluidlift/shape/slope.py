@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 from scipy.special import logsumexp
 
+from fluidlift.shape.texture_gradient import TexturePatches, texture_evidence, weighed
 from fluidlift.types import PinholeCamera
 
 PATCHES = 160
@@ -162,28 +163,31 @@ def estimate_slope(camera: PinholeCamera, patches: FlowPatches | None, *, tilt_k
 
 def estimate_tilt(
     camera: PinholeCamera, patches: FlowPatches, tilted: Callable[[float, float], PinholeCamera],
-    pitch_prior: tuple[float, float],
+    pitch_prior: tuple[float, float], texture: TexturePatches | None = None,
 ) -> TiltEvidence:  # fmt: skip
     """Pitch and roll of the camera over a stream of unknown slope: means of their posterior.
 
-    The motion shows the plane's tilt against the camera, not against gravity: what is the camera's and what is the
-    stream's is shared out by the priors. Level streams are the likelier ones.
+    The motion and the pattern that moves show the plane's tilt against the camera, not against gravity: what is the
+    camera's and what is the stream's is shared out by the priors. Level streams are the likelier ones.
 
     Args:
         camera: for its focal length.
         patches: of the motion.
         tilted: camera for a pitch and a roll, degrees.
         pitch_prior: mean and standard deviation, degrees.
+        texture: of the fluid's picture, where it has windows enough.
     """
     pitches, rolls = np.arange(8.0, 81.0, 4.0), np.array([-4.0, 0.0, 4.0])
     slopes = np.array([0.0, 5.0, 10.0, 16.0, 22.0, 30.0, 38.0])
     prior = (1.0 - LEVEL) * falling_prior(slopes)
     prior[0] = LEVEL
-    log = np.array([[[best_heading(tilted(p, r), patches, np.radians(s))[0] for s in slopes] for r in rolls]
-                    for p in pitches])  # fmt: skip
-    log = BELIEF * log + np.log(prior)
-    log -= 0.5 * (((pitches - pitch_prior[0]) / pitch_prior[1]) ** 2)[:, None, None]
-    log -= 0.5 * ((rolls / ROLL) ** 2)[None, :, None]
+    best = np.array([[[best_heading(tilted(p, r), patches, np.radians(s)) for s in slopes] for r in rolls]
+                     for p in pitches])  # fmt: skip
+    habit = np.log(prior) - 0.5 * (((pitches - pitch_prior[0]) / pitch_prior[1]) ** 2)[:, None]
+    log = BELIEF * best[..., 0] + habit[:, None] - 0.5 * ((rolls / ROLL) ** 2)[None, :, None]
+    if texture is not None:
+        seen = _texture_evidence([tilted(p, 0.0) for p in pitches], texture, slopes, best[:, 1, :, 1])
+        log += weighed(seen, habit)[:, None]
     if not np.isfinite(log).any():
         return TiltEvidence(pitch_prior[0], 0.0, pitch_prior[1], 0.0)
     share = np.exp(log - log.max())
@@ -192,6 +196,20 @@ def estimate_tilt(
     error = float(np.sqrt((share.sum((1, 2)) * (pitches - pitch) ** 2).sum()))
     gained = 1.0 - min(error / pitch_prior[1], 1.0) ** 2
     return TiltEvidence(pitch, float((share.sum((0, 2)) * rolls).sum()), error, gained)
+
+
+def _texture_evidence(
+    cameras: list[PinholeCamera], texture: TexturePatches, slopes: np.ndarray, headings: np.ndarray
+) -> np.ndarray:
+    """[n, k] for each camera and slope (degrees) with its heading (rad): every second camera's, and between them."""
+    known = np.arange(0, len(cameras), 2)
+    found = np.array([
+        [texture_evidence(cameras[i], texture, plane_axes(np.radians(s), h)[2])
+         for s, h in zip(slopes, headings[i], strict=True)] for i in known
+    ])  # fmt: skip
+    # planes that are not seen in all of it: less likely than any other, by far
+    found = np.where(np.isfinite(found), found, -1e4)
+    return np.stack([np.interp(np.arange(len(cameras)), known, column) for column in found.T], axis=-1)
 
 
 def speed_along(

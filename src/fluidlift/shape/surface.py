@@ -203,7 +203,9 @@ def falling_surface(
     """A sheet that is steep where the picture shows the fluid falling and flat where it runs.
 
     The inclination per picture row follows from how much of the motion points down; the profile is then integrated
-    along the rays from the row of strongest fall, both ways.
+    along the rays from the row of strongest fall, both ways. Where the motion leans from the projected vertical, the
+    sheet is taken to lie on a rock face whose fall line is seen to lean so (`_fall_line`): what is thrown sideways
+    through the air would straighten on its way down.
     """
     rows = np.where(mask.any(axis=1))[0]
     require(len(rows) > 1, "a mask of fewer than two rows")
@@ -215,15 +217,18 @@ def falling_surface(
     share = (weight * np.maximum(down, 0.0)).sum(1)[rows] / ((weight * speed).sum(1)[rows] + 1e-6)
     strength = ndimage.gaussian_filter1d(fall / max(np.percentile(fall, 90), 1e-6) * share, max(2.0, len(rows) / 40))
     blend = np.clip((strength - 0.2) / 0.35, 0.0, 1.0)
-    incline = np.radians(5.0 + 73.0 * blend * blend * (3 - 2 * blend))
-    # rays of the middle column; the picture of a level camera does not change along a row
-    u = np.full(len(rows), camera.center[0])
-    ray = camera.rays(np.stack([u, rows + 0.5], -1))
-    ry, rz = ray[:, 1], ray[:, 2]
+    blend = blend * blend * (3 - 2 * blend)
+    falls = np.zeros(mask.shape[0])
+    falls[rows] = blend > 0.5
+    aside, steepest = _fall_line(camera, weight * falls[:, None], displacement)
+    incline = np.radians(5.0) + (steepest - np.radians(5.0)) * blend
+    ray = camera.rays(np.stack([_axis(mask, rows, blend > 0.5), rows + 0.5], -1))
+    uphill = (-float(np.sin(aside)), float(np.cos(aside)))
+    ry, rz = ray[:, 0] * uphill[0] + ray[:, 1] * uphill[1], ray[:, 2]
     depth = np.ones(len(rows))
     start = int(np.argmax(strength))
     # above the strongest fall a flatter surface could hardly be seen from below; nowhere is it seen edge-on
-    incline[:start] = np.maximum(incline[:start], np.radians(70.0))
+    incline[:start] = np.maximum(incline[:start], min(np.radians(70.0), steepest))
     incline = np.maximum(incline, np.arctan2(rz, ry) + np.radians(10.0))
     for step in (1, -1):
         for i in range(start, len(rows) - 1 if step > 0 else 0, step):
@@ -234,11 +239,46 @@ def falling_surface(
             next_depth = depth[i] * (rz[i] - t * ry[i]) / below if abs(below) > 1e-3 else depth[i]
             depth[j] = np.clip(next_depth, depth[i] * 0.9, depth[i] * 1.1)  # a grazing ray does not run away
     points = ray * depth[:, None]
-    order = np.argsort(points[:, 1])
-    away, z = points[order, 1], np.maximum.accumulate(points[order, 2])
+    up = points[:, 0] * uphill[0] + points[:, 1] * uphill[1]
+    order = np.argsort(up)
+    away, z = up[order], np.maximum.accumulate(points[order, 2])
     keep = np.concatenate([[True], np.diff(away) > 1e-6])
-    profile = ProfileHeight(away[keep], z[keep])
+    profile = ProfileHeight(away[keep], z[keep], uphill)
     return _from_height(camera, profile, intersect_height(camera, profile, 0.2 * depth.min(), 3.0 * depth.max()))
+
+
+FACE = (78.0, 12.0, 30.0)
+"""degrees: how steep falls usually are, by how much they differ, and by how much their faces turn from the viewer (a
+choice). A lean of 17 degrees becomes a face 64 degrees steep that falls 40 degrees to the side"""
+
+
+def _fall_line(camera: PinholeCamera, weight: np.ndarray, displacement: np.ndarray) -> tuple[float, float]:
+    """Heading of the fall line, rad to the right of towards the viewer, and the face's greatest steepness, rad.
+
+    Of all faces whose fall line is seen to lean as the motion does, the one that differs least from the usual one.
+    """
+    moved = (weight * np.linalg.norm(displacement, axis=-1))[..., None] * displacement
+    x, y = moved.sum((0, 1))
+    right, down = -camera.camera_from_world.rotation[:2, 2]
+    lean = float(np.clip(np.arctan2(x, y) - np.arctan2(right, down), -0.8, 0.8)) if y > 0 else 0.0
+    if abs(lean) < 1e-3:
+        return 0.0, float(np.radians(FACE[0]))
+    aside = np.radians(np.arange(0.5, 85.0, 0.5))
+    steep = np.minimum(np.arctan2(np.sin(aside), np.tan(abs(lean))), np.radians(FACE[0]))
+    leans = np.sin(aside) >= np.tan(abs(lean)) * np.tan(steep) - 1e-6
+    odd = ((FACE[0] - np.degrees(steep)) / FACE[1]) ** 2 + (np.degrees(aside) / FACE[2]) ** 2
+    best = int(np.argmin(np.where(leans, odd, np.inf)))
+    return float(np.copysign(aside[best], lean)), float(steep[best])
+
+
+def _axis(mask: np.ndarray, rows: np.ndarray, falls: np.ndarray) -> np.ndarray:
+    """px, a straight line along the middle of the falling rows, held between its ends beyond them."""
+    if falls.sum() < 3:
+        return np.full(len(rows), 0.5 * mask.shape[1])
+    columns = np.arange(mask.shape[1]) + 0.5
+    middle = (mask[rows] * columns).sum(1) / mask[rows].sum(1).clip(1)
+    line = np.polyval(np.polyfit(rows[falls], middle[falls], 1), rows)
+    return np.clip(line, line[falls].min(), line[falls].max())
 
 
 def intersect_height(

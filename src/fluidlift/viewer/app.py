@@ -288,7 +288,7 @@ class Viewer:
                 frame = self.cache.get(index)
             except FrameMissing as error:
                 problem = f"{error} The frame before it stays in view."
-        spacing = take.spacing if live and take is not None else self.asset.grid.spacing
+        spacing = take.spacing if live and take is not None else self.saved.spacing
         if frame is not None:
             self.stage.ground(take.ground if live and take is not None else None)
             said = self.stage.show(frame, self.parts, spacing, colored(frame.rgb, self.draft.look))
@@ -312,7 +312,7 @@ class Viewer:
         return self._bodies
 
     def _read(self, index: int) -> SplatFrame:
-        return replace(read_frame(self.folder, index), poses=self.saved.poses(index))
+        return replace(read_frame(self.folder, index, cell=self.saved.spacing), poses=self.saved.poses(index))
 
     # around it
 
@@ -381,7 +381,7 @@ class Viewer:
 
 
 def _kept(frame: PreviewFrame) -> SplatFrame:
-    return splat_frame(frame.gaussians, frame.velocities, frame.poses)
+    return splat_frame(frame.gaussians, frame.velocities, frame.poses, cell=frame.cell)
 
 
 __all__ = ["InputRejected", "ViewRequest", "Viewer", "view_asset"]

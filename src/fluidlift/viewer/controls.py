@@ -13,6 +13,11 @@ from fluidlift.types import FluidParameters
 STEPS = 200
 """of a slider, about"""
 INFLOW = "inflow.factor"
+WHOLE = str.maketrans({
+    " ": "\N{NO-BREAK SPACE}", "/": "\N{DIVISION SLASH}", "-": "\N{MINUS SIGN}",
+    ".": "\N{ONE DOT LEADER}\N{WORD JOINER}",
+})  # fmt: skip
+"""signs at which lines are broken, and those that stand for them"""
 
 Values = dict[str, Any]
 """of `FluidParameters`, by name, and `inflow.factor`"""
@@ -104,6 +109,12 @@ def number(value: float, digits: int = 4) -> str:
         short = mantissa.rstrip("0").rstrip(".") if "." in mantissa else mantissa
         return f"{short}e{int(power)}"
     return f"{float(f'{value:.{digits}g}'):.10g}"
+
+
+def unbroken(text: str) -> str:
+    """A number and its unit as one word. In labels viser allows a line to end behind / - . and _ by a mark that no
+    joiner takes back: these signs give way to those that look the same."""
+    return text.translate(WHOLE)
 
 
 def _digits(value: float, digits: int) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
@@ -13,6 +14,7 @@ import numpy as np
 
 from fluidlift.errors import FluidliftError, InputRejected, require
 from fluidlift.io.frames import FIRST_FRAME
+from fluidlift.look.surface_skin import of_skin
 from fluidlift.types import Gaussians
 
 CACHE_BYTES = 192 * 2**20
@@ -48,12 +50,19 @@ class SplatFrame:
     """f32 [n,3], m/s"""
     poses: np.ndarray | None = None
     """[b,7] of the obstacles: position (m), orientation (w, x, y, z); None: not known"""
+    skin: np.ndarray | None = None
+    """bool [n]: those that are paint on the surface and no liquid; None: none of them"""
+
+    @property
+    def liquid(self) -> np.ndarray:
+        """f32 [m,3]: centres of the splats that stand for liquid, m."""
+        return self.centers if self.skin is None else self.centers[~self.skin]
 
     @property
     def nbytes(self) -> int:
         """Of memory."""
-        parts = (self.centers, self.covariances, self.rgb, self.opacities, self.velocities)
-        return sum(a.nbytes for a in parts)
+        parts = (self.centers, self.covariances, self.rgb, self.opacities, self.velocities, self.skin)
+        return sum(a.nbytes for a in parts if a is not None)
 
     @property
     def fastest(self) -> float:
@@ -63,11 +72,21 @@ class SplatFrame:
         return float(np.percentile(np.sqrt(np.square(self.velocities).sum(axis=1)), 99))
 
 
-def splat_frame(gaussians: Gaussians, velocities: np.ndarray, poses: np.ndarray | None = None) -> SplatFrame:
-    """What is shown of splats; those that are not finite are left out."""
+def splat_frame(
+    gaussians: Gaussians, velocities: np.ndarray, poses: np.ndarray | None = None, *, cell: float = math.nan
+) -> SplatFrame:
+    """What is shown of splats; those that are not finite are left out.
+
+    Args:
+        gaussians: n splats.
+        velocities: [n,3], m/s.
+        poses: [b,7] of the obstacles.
+        cell: m, of the simulator's cells, by which a skin is told; not a number: there is none.
+    """
     sound = np.isfinite(gaussians.means).all(axis=1) & np.isfinite(gaussians.scales).all(axis=1)
     if not sound.all():
         gaussians, velocities = gaussians.select(sound), velocities[sound]
+    skin = of_skin(gaussians, cell)
     return SplatFrame(
         gaussians.means,
         gaussians.covariances().astype(np.float32),
@@ -75,11 +94,12 @@ def splat_frame(gaussians: Gaussians, velocities: np.ndarray, poses: np.ndarray 
         np.round(255 * np.clip(gaussians.opacities, 0, 1)).astype(np.uint8)[:, None],
         np.asarray(velocities, np.float32),
         poses,
+        skin if skin.any() else None,
     )
 
 
-def read_frame(folder: Path, index: int) -> SplatFrame:
-    """Frame `index` (from 0) of an asset.
+def read_frame(folder: Path, index: int, *, cell: float = math.nan) -> SplatFrame:
+    """Frame `index` (from 0) of an asset, whose simulation had cells so wide (m).
 
     Raises:
         FrameMissing: it is not there, or not (yet) whole.
@@ -94,7 +114,8 @@ def read_frame(folder: Path, index: int) -> SplatFrame:
     names = ("vx", "vy", "vz")
     known = all(v in splats.extras for v in names)
     still = np.zeros((len(splats.gaussians), 3), np.float32)
-    return splat_frame(splats.gaussians, np.stack([splats.extras[v] for v in names], axis=-1) if known else still)
+    velocities = np.stack([splats.extras[v] for v in names], axis=-1) if known else still
+    return splat_frame(splats.gaussians, velocities, cell=cell)
 
 
 T = TypeVar("T", bound=Sized)

@@ -14,6 +14,7 @@ from fluidlift.errors import InputRejected
 from fluidlift.io.asset_folder import asset_file
 from fluidlift.io.atomic import write_bytes
 from fluidlift.io.read_mesh import SUFFIXES, read_any_mesh
+from fluidlift.pipeline.edit_outlook import placed
 
 FOLDER = "meshes"
 """of the asset, where uploaded files are kept"""
@@ -89,5 +90,6 @@ def mesh_entry(
     low, high = points.min(axis=0), points.max(axis=0)
     foot = np.array([0.5 * (low[0] + high[0]), 0.5 * (low[1] + high[1]), low[2]])
     place = over(float((high - low)[:2].max()))
-    entry: dict[str, Any] = {"mesh": inside, "position": [float(f"{c:.4g}") for c in place - foot]}
+    fine = 1e-3 * max(float((high - low).max()), 1e-9)  # of its longest side
+    entry: dict[str, Any] = {"mesh": inside, "position": placed(place - foot, fine)}
     return entry | ({} if unit == 1.0 else {"scale": unit}) | ({"flip": True} if turned_over else {})

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Any
 
-from fluidlift.viewer.controls import Control, number, path_of
+from fluidlift.viewer.controls import Control, number, path_of, unbroken
 from fluidlift.viewer.hearing import heard
 
 if TYPE_CHECKING:
@@ -13,7 +13,6 @@ if TYPE_CHECKING:
 
 STOPS = 4.0
 """of exposure, up or down"""
-NO_BREAK_SPACE = "\N{NO-BREAK SPACE}"
 ROOM = 0.25
 """share of a slider that two of its marks must lie apart to be read"""
 
@@ -151,7 +150,7 @@ def _label(control: Control, value: float) -> str:
     the number, not between it and its unit."""
     name = f"{control.label} (10^x)" if control.log else control.label
     amount = f"{number(value, 3)} {control.unit}".strip().replace(" °", "°")
-    return f"{name} {amount.replace(' ', NO_BREAK_SPACE)}"
+    return f"{name} {unbroken(amount)}"
 
 
 def _marks(control: Control) -> tuple[tuple[float, str], ...]:

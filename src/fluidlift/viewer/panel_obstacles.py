@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fluidlift.errors import FluidliftError
+from fluidlift.pipeline.edit_outlook import place_told, placed
 from fluidlift.pipeline.editing import Add, Remove
 from fluidlift.pipeline.open_water import open_water
+from fluidlift.viewer.controls import unbroken
 from fluidlift.viewer.hearing import heard
 from fluidlift.viewer.mesh_files import MOST_BYTES, UNITS, kept_mesh, mesh_entry
 
@@ -52,7 +54,7 @@ class ObstaclePanel:
         self._size = gui.add_slider("width, m", low, high, _short(low / 10, 1), _short(self._size_now))
         self._motion = gui.add_dropdown("motion", (STILL, FLOATS), initial_value=STILL)
         self._density = gui.add_slider(
-            "density, kg/m³",
+            f"density, {unbroken('kg/m³')}",
             20.0,
             3000.0,
             10.0,
@@ -128,8 +130,8 @@ class ObstaclePanel:
         before, viewer.chosen = viewer.chosen, name
         added = viewer.edited(
             lambda: viewer.draft.apply([Add("obstacles", entry | {"name": name})], f"{name} added"),
-            f"{name} hangs just above the fluid, whose surface is at z = {self._level[2]:.3g} m there. Drag it down by "
-            "the blue arrow, or let it float: it then falls in.",
+            f"{name} hangs just above the fluid, whose surface is at z = {self._told(self._level[2:])} m there. "
+            "Drag it down by the blue arrow, or let it float: it then falls in.",
         )
         if not added:
             viewer.chosen = before
@@ -144,7 +146,7 @@ class ObstaclePanel:
         extent = _extent(shape, self._size_now)
         high = extent["size"][2] if shape == "ellipsoid" else self._size_now
         place = self._room(self._size_now) + [0.0, 0.0, 0.5 * high]
-        self._put(shape, {"name": "", "shape": shape, "position": [_short(float(c)) for c in place]} | extent)
+        self._put(shape, {"name": "", "shape": shape, "position": self._at(place)} | extent)
 
     def _choose(self, event: Any, name: str) -> None:
         if event.client is None:
@@ -245,8 +247,15 @@ class ObstaclePanel:
         if width is not None:
             self._size.value = min(max(width, self._size.min), self._size.max)
 
+    def _at(self, place: Any) -> list[float]:
+        """A place as it is written: to a hundredth of a cell."""
+        return placed(place, 0.01 * self._viewer.asset.grid.spacing)
+
+    def _told(self, place: Any) -> str:
+        return place_told(place, self._viewer.asset.grid.spacing)
+
     def _tell(self, entry: dict[str, Any]) -> None:
-        at = ", ".join(f"{float(c):.3g}" for c in entry.get("position", (0, 0, 0)))
+        at = self._told(entry.get("position", (0, 0, 0)))
         turn = entry.get("rotation", (0, 0, 0))
         turned = "" if not any(turn) else f", turned by ({', '.join(f'{float(a):.0f}' for a in turn)})°"
         self._where.content = f"**{entry['name']}** at ({at}) m{turned}"
@@ -274,8 +283,8 @@ class ObstaclePanel:
         if event.client is None or not name or gizmo is None:
             return
         now = time.monotonic()
-        position = [_short(float(c)) for c in gizmo.position]
-        told = f"{name} moved to ({', '.join(f'{c:.3g}' for c in position)}) m"
+        position = self._at(gizmo.position)
+        told = f"{name} moved to ({self._told(position)}) m"
         viewer.draft.move(f"obstacles.{name}.position", position, told, now)
         turn = _degrees(np.asarray(gizmo.wxyz, float))
         entry = self._entry() or {}

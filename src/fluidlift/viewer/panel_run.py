@@ -45,6 +45,8 @@ class RunPanel:
             self._format = gui.add_dropdown("format", tuple(FORMATS))
             self._out = gui.add_text("folder", str(viewer.folder.absolute().parent / "export"))
             gui.add_button("Export", icon="package-export").on_click(self._export)
+            self._exported = gui.add_markdown("")  # the panel's top may be scrolled away
+            self._exporting = False
         with gui.add_folder("Draw a picture", expand_by_default=False):
             gui.add_markdown("This frame from here, in the chosen look.")
             gui.add_button("Draw", icon="photo").on_click(self._draw)
@@ -99,10 +101,10 @@ class RunPanel:
         if viewer.refused():
             return
         if not self._out.value.strip():
-            viewer.say("Export: no folder. Needed: a name for a new one.")
+            self._tell_export("Export: no folder. Needed: a name for a new one.")
             return
         if "simulate" in (viewer.stale or ()):
-            viewer.say("Export: the saved frames are older than this scene: press 'Simulate in full' first.")
+            self._tell_export("Export: the saved frames are older than this scene: press 'Simulate in full' first.")
             return
         request = ExportRequest(to=self._format.value)
 
@@ -111,6 +113,10 @@ class RunPanel:
 
         if not viewer.jobs.start("export", work):
             viewer.say("Something else is being done already.")
+
+    def _tell_export(self, text: str) -> None:
+        self._exported.content = text
+        self._viewer.say(text)
 
     def _draw(self, event: Any) -> None:
         viewer = self._viewer
@@ -141,6 +147,10 @@ class RunPanel:
             self._begin.disabled = state.running
         if state.running and abs(self._bar.value - state.share) >= 1:
             self._bar.value = round(state.share)
+        if state.name == "export" and (state.running or self._exporting):
+            self._exporting = state.running
+            if self._exported.content != state.told:
+                self._exported.content = state.told
         text = state.told if state.running else self._frames_told()
         if self._state.content != text:
             self._state.content = text

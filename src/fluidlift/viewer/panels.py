@@ -216,10 +216,10 @@ class Panels:
         phase = viewer.preview.phase
         if phase == "warming up":
             lines.append("warming up the live preview ...")
-        elif phase in ("preparing", "running"):
-            lines.append("simulating ..." if phase == "running" else "preparing the simulation ...")
         elif phase == "held":
             lines.append("the live preview waits until the full simulation is done")
+        elif phase in ("preparing", "running") or viewer.preview.busy:  # also before the worker has taken it up
+            lines.append("simulating ..." if phase == "running" else "preparing the simulation ...")
         if viewer.jobs.running:
             lines.append(viewer.jobs.state.told)
         for text in (viewer.preview.problem, *viewer.comparison.warnings):

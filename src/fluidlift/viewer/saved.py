@@ -27,7 +27,8 @@ class SavedFrames:
         self.folder = folder
         self.asset = load_asset(folder)
         self.manifest: dict[str, Any] = {}
-        self.count, self.interval = 0, self.asset.interval
+        self.count, self.interval, self.spacing = 0, self.asset.interval, self.asset.grid.spacing
+        """frames, s between them, m of the cells that they were simulated on"""
         self.foreign = False
         """another process is writing"""
         self._poses: np.ndarray | None = None
@@ -46,6 +47,7 @@ class SavedFrames:
         played = self.manifest.get("simulation", {})
         self.count = int(played.get("frames", 0))
         self.interval = float(played.get("frame_interval", self.asset.interval))
+        self.spacing = float(played.get("grid", {}).get("spacing", self.asset.grid.spacing))
         self._stamp = self._now()
         self._poses = simulated_poses(self.folder)
 

@@ -143,7 +143,7 @@ class Stage:
             self._surfacer.forget()
             self._shown_surface = None
             return ""
-        self._surfacer.ask(frame, frame.centers, RADIUS * spacing)
+        self._surfacer.ask(frame, frame.liquid, RADIUS * spacing)
         return self._show_surface(rgb)
 
     def _take_away(self, name: str) -> None:

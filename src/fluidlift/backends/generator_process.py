@@ -34,6 +34,8 @@ POLL = 0.05
 """s between looks at what the process has made"""
 GRACE = 5.0
 """s between asking a group to end and ending it"""
+PASSING = 1.0
+"""s in which the children of a process that has ended are waited for"""
 LAST_LINES, LAST_BYTES = 12, 2**15
 """of the log of a process that broke down, which are shown"""
 LARGEST_PLY, LARGEST_JSON, LARGEST_LOG = 4 * 2**30, 2**20, 2**28
@@ -238,6 +240,9 @@ def end_group(process: subprocess.Popen) -> None:
         if process.poll() is None:
             with suppress(subprocess.TimeoutExpired):
                 process.wait(wait)
+        until = time.monotonic() + PASSING
+        while _group_alive(process.pid) and time.monotonic() < until:  # its children end a little after the sign
+            time.sleep(0.02)
         if not _group_alive(process.pid):
             return
 

@@ -265,7 +265,7 @@ class ObstaclePanel:
         if name != self._gizmo_of:
             if self._gizmo is not None:
                 self._gizmo.remove()
-            self._gizmo, self._gizmo_of = None, name
+            self._gizmo, self._gizmo_of = None, ""
         if entry is None:
             return
         place, turn = _pose(entry)
@@ -273,6 +273,7 @@ class ObstaclePanel:
             self._gizmo = self._viewer.server.scene.add_transform_controls(
                 "/gizmo", scale=1.2 * SIZE * self._viewer.stage.size, depth_test=False, position=place, wxyz=turn
             )
+            self._gizmo_of = name
             self._gizmo.on_update(self._dragged)
         else:
             self._gizmo.position, self._gizmo.wxyz = place, turn

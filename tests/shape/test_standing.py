@@ -1,7 +1,5 @@
 """A column of liquid before it collapses: height, basin, metres, from outlines that are known exactly."""
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 import pytest
@@ -48,7 +46,7 @@ def collapse(height=0.4, across=0.45, frames=12, *, pillar=True):
 
 def found_in(masks, view=None):
     often = masks[-len(masks) // 3 :].mean(axis=0)
-    return standing.find_standing(view or camera(), masks[0], often, ~masks.any(axis=0), iter(masks[1:]))
+    return standing.find_standing(view or camera(), masks[0], often, ~masks.any(axis=0))
 
 
 @pytest.mark.parametrize("height", [0.25, 0.4, 0.55])
@@ -93,17 +91,19 @@ def test_the_front_of_the_prism_is_where_the_column_is():
 
 
 def test_metres_come_from_the_user_the_camera_or_the_front():
-    found = found_in(collapse())
-    across = max(0.45, 0.6, found.height)
-    assert standing.standing_scale(found, size=3.0, height=2.0, interval=0.04).value == pytest.approx(
-        3.0 / across, rel=0.1
-    )
-    assert standing.standing_scale(found, size=None, height=2.0, interval=0.04).value == 2.0
-    seen = standing.standing_scale(found, size=None, height=None, interval=0.04)
+    masks = collapse()
+    found = found_in(masks)
+
+    def scale(size=None, height=None, speed=lambda: pytest.fail("nobody needs it")):
+        return standing.standing_scale(found, size=size, height=height, speed=speed)
+
+    assert scale(3.0, 2.0).value == pytest.approx(3.0 / max(0.45, 0.6, found.height), rel=0.1)
+    assert scale(None, 2.0).value == 2.0
+    seen = scale(speed=lambda: standing.front_speed(camera(), found, iter(masks[1:])) / 0.04)
     # 0.15 per frame of 0.04 s in units in which the column is 0.4 high: s v = 1.55 sqrt(g s h)
     assert seen.source == "front"
     assert seen.value == pytest.approx(9.81 * 0.4 * (1.55 * 0.04 / 0.15) ** 2, rel=0.35)
-    still = standing.standing_scale(replace(found, front_speed=0.0), size=None, height=None, interval=0.04)
+    still = scale(speed=lambda: standing.front_speed(camera(), found, iter(masks[:1])))
     assert still.source == "assumed" and "--size" in still.warning
 
 

@@ -99,7 +99,10 @@ def geometry(story: Story, inputs: Inputs, config: JobConfig) -> Result:
     falls, trust = falling.pixels[visible], seen.trust[visible]
     sighting = place.Sighting(trust, clip.interval, up.pitch)
     if seen.stood is not None:
-        scale = standing.standing_scale(seen.stood, size=c.size, height=seen.height, interval=clip.interval)
+        scale = standing.standing_scale(
+            seen.stood, size=c.size, height=seen.height,
+            speed=lambda: dam.front_speed(fluid, seen.start, canonical, seen.stood) / clip.interval,
+        )  # fmt: skip
     else:
         scale = place.metric_scale(
             kind, points, velocities, size=c.size, camera_height=seen.height, known_scale=known_scale, seen=sighting

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 
 from fluidlift.errors import InputRejected
@@ -53,11 +51,13 @@ def stood(fluid: FluidMasks, start: int, camera: PinholeCamera) -> standing.Stan
         often += mask if t >= late else 0
     never = wet <= standing.DRY * (len(fluid) - start)
 
-    def outlines() -> Iterator[np.ndarray]:
-        for t in range(start + 1, min(len(fluid), start + 1 + FOLLOWED)):
-            yield fluid[t]
+    return standing.find_standing(camera, fluid[start], often / (len(fluid) - late), never)
 
-    return standing.find_standing(camera, fluid[start], often / (len(fluid) - late), never, outlines())
+
+def front_speed(fluid: FluidMasks, start: int, camera: PinholeCamera, found: standing.StandingBody) -> float:
+    """Speed of its front in units of the body per frame, from the masks of the frames after the first."""
+    last = min(len(fluid), start + 1 + FOLLOWED)
+    return standing.front_speed(camera, found, (fluid[t] for t in range(start + 1, last)))
 
 
 def _covers(fluid: FluidMasks, t: int) -> float:

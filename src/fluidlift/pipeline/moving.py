@@ -180,11 +180,6 @@ def first_guess(story: Story, targets: list[FaceVelocity]) -> FluidParameters:
     cells, direction = setting.cell_types, setting.terrain.mainstream
     mean = np.mean([t.at_centers() for t in targets], axis=0)
     inlet = cells == CellType.INFLOW
-    if kind == "dam":  # nothing flows in or out
-        return FluidParameters(
-            kinematic_viscosity=VISCOSITY_PRIOR[kind], inflow_velocity=(0.0, 0.0, 0.0), restitution=0.05,
-            wall_damping=WALL_DAMPING_PRIOR[kind], time_step=clip_of(story).interval,
-        )  # fmt: skip
     wet = inlet | (cells == CellType.FLUID)
     bulk = mean[inlet].mean(axis=0) if inlet.any() else mean[wet].mean(axis=0)
     spread = np.std([t.at_centers()[inlet] for t in targets], axis=0).mean() if inlet.any() else 0.0

@@ -13,7 +13,6 @@ from jaxtyping import Float
 from scipy import ndimage
 
 from fluidlift.errors import InputRejected
-from fluidlift.shape.heights import HeightModel
 from fluidlift.types import PinholeCamera
 
 GROUND = -1.0
@@ -56,20 +55,6 @@ class Raster:
         inside = ((index >= 0) & (index < np.array(self.shape))).all(axis=-1)
         i, j = np.moveaxis(np.where(inside[..., None], index, 0).astype(int), -1, 0)
         return np.where(inside, values[i, j], np.zeros((), values.dtype))
-
-
-@dataclass(frozen=True)
-class PrismHeight(HeightModel):
-    """Level ground with level prisms on it."""
-
-    raster: Raster
-    above: Float[np.ndarray, "n m"]
-    """height of each column over the ground"""
-    ground: float
-
-    def height(self, xy: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
-        """z above the ground positions."""
-        return self.ground + self.raster.at(self.above, xy)
 
 
 def meet(rays: np.ndarray, z: float) -> tuple[np.ndarray, np.ndarray]:

@@ -8,7 +8,7 @@ taken to be convex; what hides level water there is an upright solid. All in a f
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -22,7 +22,6 @@ from fluidlift.shape.prism import (
     FARTHEST,
     GROUND,
     LEVELS,
-    PrismHeight,
     Raster,
     columns_within,
     convex,
@@ -45,10 +44,10 @@ DRY = 0.05
 SMALLEST = 0.004
 """share of the water's pixels from which what hides it is a solid"""
 FRONT = 1.55
-"""speed of the front over sqrt(g height), once it runs: between 1.3 and 1.8 in experiments (Martin and Moyce 1952;
-Lauber and Hager 1998), 2 without friction (Ritter 1892)"""
+"""speed of the front over sqrt(g height), once it runs: between the 1.33 of an experiment (Martin and Moyce 1952, table
+2) and the 2 of a long column without friction (Ritter 1892)"""
 FRONT_ERROR = 0.25
-"""relative standard error of a scale from it: twice the spread of those numbers"""
+"""relative standard error of a scale from it, which goes with its square"""
 HOLLOW = 1.2
 """area of a body's convex hull over its own from which its outline is not convex"""
 NEARLY = 0.9
@@ -83,8 +82,6 @@ class StandingBody:
     pillars: tuple[Pillar, ...]
     solid: Bool[np.ndarray, "h w"]
     """pixels that show the pillars"""
-    front_speed: float = 0.0
-    """of the edge of the wet ground, units per frame; 0: not seen to run"""
 
     @property
     def direction(self) -> Float[np.ndarray, "3"]:
@@ -112,7 +109,6 @@ def find_standing(
     first: Bool[np.ndarray, "h w"],
     often: Float[np.ndarray, "h w"],
     never: Bool[np.ndarray, "h w"],
-    outlines: Iterable[Bool[np.ndarray, "h w"]],
 ) -> StandingBody:
     """The prism, its basin and what stands in it.
 
@@ -121,7 +117,6 @@ def find_standing(
         first: the body before it is let go.
         often: share of the clip's last part in which a pixel is wet.
         never: pixels that are (nearly) never wet.
-        outlines: of the frames after the first, in order, for the speed of the front.
 
     Raises:
         InputRejected: the camera does not look down on the ground.
@@ -135,13 +130,11 @@ def find_standing(
                             "give --pitch, or another --kind")  # fmt: skip
     basin, level = _basin(camera, raster, often > CALM, footprint, height)
     pillars, solid = _pillars(camera, raster, often > 0.5, never, (basin, level, height))
-    found = StandingBody(raster, footprint, height, basin, level, pillars, solid)
-    return replace(found, front_speed=_front_speed(camera, found, outlines))
+    return StandingBody(raster, footprint, height, basin, level, pillars, solid)
 
 
 def standing_front(camera: PinholeCamera, found: StandingBody) -> FrontSurface:
     """The visible side of the prism and of the ground around it."""
-    model = PrismHeight(found.raster, found.height * found.footprint, GROUND)
     rays = camera.rays(camera.pixel_grid())
     down = -rays[..., 2]
     depth = np.where(down > 1.0 / (4.0 * FARTHEST), 1.0 / np.maximum(down, 1e-6), 0.0)
@@ -151,17 +144,19 @@ def standing_front(camera: PinholeCamera, found: StandingBody) -> FrontSurface:
         t, xy = meet(rays, GROUND + z)
         nearest = np.where(found.raster.at(found.footprint, xy) & (t < nearest), t, nearest)
     depth = np.where(np.isfinite(nearest), nearest, depth)
-    return FrontSurface(depth.astype(np.float32), np.zeros(depth.shape, np.float32), model)
+    return FrontSurface(depth.astype(np.float32), np.zeros(depth.shape, np.float32), None)
 
 
-def standing_scale(found: StandingBody, *, size: float | None, height: float | None, interval: float) -> MetricScale:
+def standing_scale(
+    found: StandingBody, *, size: float | None, height: float | None, speed: Callable[[], float]
+) -> MetricScale:
     """Metres per unit: as given, from the camera's height above the ground, or from the speed of the front.
 
     Args:
         found: the body.
         size: metres across it, where the user says.
         height: metres of the camera above the ground, where surveyed.
-        interval: s between frames.
+        speed: gives that of the front (`front_speed`) per second; asked where nothing else is known.
     """
     at = found.raster.centers()[found.footprint]
     across = max(float(np.ptp(at, axis=0).max()), found.height)
@@ -169,9 +164,10 @@ def standing_scale(found: StandingBody, *, size: float | None, height: float | N
         return MetricScale(size / across, "size", across=size)
     if height is not None and height > 0:
         return MetricScale(height, "camera", across=height * across)
-    if found.front_speed > 0:
+    front = speed()
+    if front > 0:
         # s v_c = FRONT sqrt(g s h_c), for the scale s
-        value = (found.front_speed / interval / FRONT) ** -2 * STANDARD_GRAVITY * found.height
+        value = (front / FRONT) ** -2 * STANDARD_GRAVITY * found.height
         return MetricScale(value, "front", relative_error=FRONT_ERROR, across=value * across)
     return MetricScale(
         1.0 / across, "assumed", "the size of the fluid is unknown (its front was not seen to run): 1 m across is "
@@ -332,8 +328,14 @@ def _foot(wet: np.ndarray, row: int) -> int:
     return row + (int(below[0]) if len(below) else 0)
 
 
-def _front_speed(camera: PinholeCamera, found: StandingBody, outlines: Iterable[np.ndarray]) -> float:
-    """Greatest steady speed, units per frame, of the furthest wet ground on its way to the end of the basin."""
+def front_speed(camera: PinholeCamera, found: StandingBody, outlines: Iterable[Bool[np.ndarray, "h w"]]) -> float:
+    """Speed, units per frame, of the furthest wet ground on its way to the end of the basin; 0: not seen to run.
+
+    Args:
+        camera: canonical.
+        found: the body.
+        outlines: of the frames after the first, in order.
+    """
     at, way = found.raster.centers(), found.direction[:2]
     end = float(np.percentile(at[found.basin] @ way, 99.0))
     start = float(np.percentile(at[found.footprint] @ way, 99.0))

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -104,6 +106,18 @@ def made(stream_clip: Path, tmp_path_factory: pytest.TempPathFactory) -> Job:
     folder = tmp_path_factory.mktemp("made") / "stream.fluid"
     code = main(["make", str(stream_clip), "-o", str(folder), "--size", "2", *QUICK])
     return Job(stream_clip, folder, code)
+
+
+@pytest.fixture
+def patience_ends(monkeypatch):
+    """Lets the time that a generator may take pass once a file is there, however long it takes until then."""
+    from fluidlift.backends import generator_process
+
+    def end(when: Path) -> None:
+        clock = SimpleNamespace(sleep=time.sleep, monotonic=lambda: time.monotonic() + 1e6 * when.exists())
+        monkeypatch.setattr(generator_process, "time", clock)
+
+    return end
 
 
 @pytest.fixture(scope="module")

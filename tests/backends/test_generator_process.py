@@ -135,9 +135,10 @@ def alive(pid):
         return False
 
 
-def test_a_process_that_takes_too_long_is_ended_with_its_children(process, asked):
-    with pytest.raises(GeneratorFailed, match="longer than 3 s for frame 3") as failure:
-        list(process("hang", frame_seconds=3.0).bodies(pictures()))
+def test_a_process_that_takes_too_long_is_ended_with_its_children(process, asked, patience_ends):
+    patience_ends(asked.with_suffix(".child"))
+    with pytest.raises(GeneratorFailed, match="longer than 600 s for frame 3") as failure:
+        list(process("hang", frame_seconds=600.0).bodies(pictures()))
     assert "generate.frame_seconds" in str(failure.value)
     child = int(asked.with_suffix(".child").read_text())
     for _ in range(100):

@@ -128,7 +128,7 @@ def visitor():
 class Visit:
     """One browser that looks at a viewer."""
 
-    def __init__(self, browser, viewer, size=(760, 640)):
+    def __init__(self, browser, viewer, size=(1144, 640)):
         self.browser, self.viewer, self.complaints, self.strangers = browser, viewer, [], []
         self.page = browser.new_page(viewport={"width": size[0], "height": size[1]})
         self.page.set_default_timeout(1000 * PATIENCE)
@@ -206,13 +206,13 @@ class Visit:
         return Visit(self.browser, self.viewer, size)
 
     def on_screen(self, point):
-        """px of a place in the world."""
+        """px of a place in the world; the scene begins at the left edge of the window and ends at the controls."""
         from scipy.spatial.transform import Rotation
 
-        view, size = self.client().camera, self.page.viewport_size
+        view, height = self.client().camera, self.page.viewport_size["height"]
         eye = Rotation.from_quat(view.wxyz, scalar_first=True).inv().apply(np.subtract(point, view.position))
-        focal = 0.5 * size["height"] / math.tan(0.5 * view.fov)
-        return 0.5 * size["width"] + focal * eye[0] / eye[2], 0.5 * size["height"] + focal * eye[1] / eye[2]
+        focal = 0.5 * height / math.tan(0.5 * view.fov)
+        return 0.5 * view.aspect * height + focal * eye[0] / eye[2], 0.5 * height + focal * eye[1] / eye[2]
 
     def client(self):
         return next(iter(self.viewer.server.get_clients().values()))

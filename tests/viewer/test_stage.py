@@ -14,7 +14,7 @@ from fluidlift.numerics.solid_mesh import box_mesh
 from fluidlift.types import Gaussians, TriangleMesh, concatenate
 from fluidlift.viewer.arrows import LONGEST, SHORTEST, arrows, barbed
 from fluidlift.viewer.frames import splat_frame
-from fluidlift.viewer.stage import Parts, Stage
+from fluidlift.viewer.stage import Parts, Stage, vertical_fov, whole_fov
 
 TURN = np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])
 """a quarter about z"""
@@ -49,6 +49,20 @@ def obstacle(colors=None):
 def shown(stage, *found, **more):
     stage.obstacles(found, None, Parts(), **more)
     return stage._scene.nodes["/obstacles/box"]
+
+
+def test_a_page_that_looks_from_the_clips_camera_shows_its_whole_picture_until_it_is_turned_away(stage):
+    camera, heard = stage._asset.camera, []
+    view = SimpleNamespace(aspect=0.8, position=np.asarray(camera.position, float), fov=0.0, on_update=heard.append)
+    half = 0.5 * np.asarray(camera.size) / camera.focal  # tangents, right and down
+    stage.keep_whole(SimpleNamespace(camera=view))
+    assert np.tan(0.5 * view.fov) * view.aspect == pytest.approx(half[0])  # narrower than the clip: its width fits
+    view.aspect = 3.0  # the window is drawn wider
+    heard[0](view)
+    assert view.fov == pytest.approx(vertical_fov(camera)) and np.tan(0.5 * view.fov) == pytest.approx(half[1])
+    view.aspect, view.position = 0.5, view.position + 1.0  # looked at from elsewhere, the view is left alone
+    heard[0](view)
+    assert view.fov == pytest.approx(vertical_fov(camera)) and whole_fov(camera, 0.5) > view.fov
 
 
 def test_an_obstacle_of_one_colour_has_it_and_one_without_is_marked_while_it_is_edited(stage):

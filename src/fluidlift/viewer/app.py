@@ -124,6 +124,7 @@ class Viewer:
         self.stage = Stage(self.server, folder, self.asset, self.redraw)
         self.panels = Panels(self)
         self.stage.look_from_input(self.server.initial_camera)
+        self.server.on_client_connect(self.stage.keep_whole)
         self._thread = threading.Thread(target=self._run, name="viewer", daemon=True)
         self._thread.start()
         self.preview.start()

@@ -13,7 +13,7 @@ from fluidlift.viewer.hearing import heard
 from fluidlift.viewer.panel_fluid import FluidPanel
 from fluidlift.viewer.panel_obstacles import ObstaclePanel
 from fluidlift.viewer.panel_run import RunPanel
-from fluidlift.viewer.stage import vertical_fov, world_from_camera
+from fluidlift.viewer.stage import whole_fov, world_from_camera
 from fluidlift.viewer.timeline import SPEEDS
 
 if TYPE_CHECKING:
@@ -132,8 +132,9 @@ class Panels:
         if abs(axes[2, 0]) < LEVEL and abs(axes[2, 2]) < 0.99:  # level: orbiting then keeps the horizon level too
             up = np.array([0.0, 0.0, 1.0])
         self._look(
-            event.client, np.asarray(camera.position), viewer.stage.distance() * axes[:, 2], up, vertical_fov(camera)
-        )
+            event.client, np.asarray(camera.position), viewer.stage.distance() * axes[:, 2], up,
+            whole_fov(camera, event.client.camera.aspect),
+        )  # fmt: skip
 
     def _side_view(self, event: Any) -> None:
         if event.client is None:

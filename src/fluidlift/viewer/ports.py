@@ -79,6 +79,7 @@ def open_server(host: str, port: int, label: str) -> Any:
         server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
     server.request_share_url = lambda *_, **__: None  # would open a tunnel through somebody else's machine
     server.gui.configure_theme(control_width="large", dark_mode=False, show_logo=False, show_share_button=False)
+    server.gui.main_panel.dock_right()  # what floats over the scene hides new obstacles
     return server
 
 

@@ -120,6 +120,18 @@ class Stage:
         view.fov = vertical_fov(camera)
         view.near, view.far = 2e-3 * self.size, 200.0 * self.size
 
+    def keep_whole(self, client: Any) -> None:
+        """While a page looks from where the video's camera stood, it shows the whole picture, however wide it is."""
+        camera, fitted = self._asset.camera, [0.0]
+
+        def fit(view: Any) -> None:
+            if view.aspect != fitted[0] and np.allclose(view.position, camera.position, atol=1e-4 * self.size):
+                fitted[0] = view.aspect
+                view.fov = whole_fov(camera, view.aspect)
+
+        client.camera.on_update(fit)
+        fit(client.camera)
+
     # the fluid
 
     def show(self, frame: SplatFrame, parts: Parts, spacing: float, color: np.ndarray | None = None) -> str:
@@ -271,6 +283,12 @@ def glb_of(mesh: TriangleMesh) -> bytes:
 def vertical_fov(camera: PinholeCamera) -> float:
     """rad, from the upper to the lower edge of the picture."""
     return 2 * math.atan(0.5 * camera.size[1] / camera.focal[1])
+
+
+def whole_fov(camera: PinholeCamera, aspect: float) -> float:
+    """rad, from the upper to the lower edge of a window of that width over height which the whole picture fits into."""
+    across = 0.5 * camera.size[0] / camera.focal[0]
+    return max(vertical_fov(camera), 2 * math.atan(across / aspect))
 
 
 def world_from_camera(camera: PinholeCamera) -> np.ndarray:

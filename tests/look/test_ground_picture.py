@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from fluidlift.look.environment import Environment
-from fluidlift.look.ground_picture import Ground, GroundLight, ground_picture, received, spread_directions
+from fluidlift.look.ground_picture import Ground, GroundLight, bounced, ground_picture, received, spread_directions
 from fluidlift.look.liquid import Behind
 from fluidlift.look.materials import Material
 from fluidlift.numerics.srgb import linear_from_srgb
@@ -39,6 +39,30 @@ def test_open_ground_in_a_white_world_has_its_own_colour():
     # of light along the ground a pixel of the shadow map more or less is lost: 0.3 %
     np.testing.assert_allclose(picture.image[picture.depth > 0], np.broadcast_to(expected, (120 * 90, 3)), rtol=3e-3)
     assert (picture.depth > 0).all()
+
+
+def test_a_white_world_is_white_in_every_cleft_and_beside_every_body():
+    white, ball = (1.0, 1.0, 1.0), trimesh.creation.icosphere(subdivisions=3, radius=0.5)
+    ball.apply_translation([0.0, 0.0, 0.4])  # a little in the ground: a narrow cleft around its foot
+    walls = trimesh.creation.box((2.0, 0.2, 1.0))
+    walls.apply_translation([0.0, 0.6, 0.5])
+    stays = [floor(color=white), *(TriangleMesh(*m, np.ones_like(m[0])) for m in [(walls.vertices, walls.faces)])]
+    stone = TriangleMesh(np.array(ball.vertices), np.array(ball.faces), np.ones_like(ball.vertices))
+    for moves in (False, True):
+        ground = Ground(stays if moves else [*stays, stone], WHITE)
+        picture = ground.picture(CAMERA, bodies=[stone] if moves else [])
+        assert (picture.depth > 0).all()
+        np.testing.assert_allclose(picture.image, 1.0, atol=1e-3)  # eight bits of the environment's own picture
+
+
+def test_light_between_surfaces_takes_their_colour_and_never_adds_to_the_sky():
+    left, albedo = np.array([[1.0, 0.5, 0.0]]).T, np.array([[0.0, 0.3, 0.9]])
+    light = left * bounced(np.repeat(left, 3, axis=1), albedo)
+    assert (light <= 1.0).all() and (light >= left).all()  # nobody gets more than the open sky, nor less than alone
+    np.testing.assert_allclose(light[0], 1.0)  # nothing beside it: nothing is added
+    np.testing.assert_allclose(light[1, 0], 0.5)  # black walls send nothing
+    # half the sky, walls of 0.3: 0.5 (1 + 0.15 + 0.15^2 ...), less what a cleft is held open
+    assert light[1, 1] == pytest.approx(0.5 / 0.85, rel=5e-3)
 
 
 def test_a_texture_lies_where_its_coordinates_say():

@@ -19,7 +19,7 @@ from fluidlift.look.liquid import (
     shaded,
     shaded_plain,
 )
-from fluidlift.look.liquid_lookup import fetch_beyond, pyramid
+from fluidlift.look.liquid_lookup import borders, fetch_beyond, hides, pyramid, seen_beside
 from fluidlift.look.materials import PRESETS, Material
 from fluidlift.look.optics import fresnel, refract
 from fluidlift.look.screen_space import mesh_surface
@@ -134,6 +134,39 @@ def test_what_lies_before_the_liquid_hides_it_and_is_never_seen_through_it():
     z = np.where(post, level(0.0), level(-0.6))
     through = shaded(slab(), Behind(image, z), CAMERA, CLEAR, WHITE)
     assert through[30, 40, 0] > 8.0
+
+
+def test_what_a_rock_hides_is_taken_from_beside_its_outline():
+    depth = np.full((20, 40), 3.0, np.float32)
+    depth[:, 10:14], depth[:, 20:] = 1.0, 1.0  # two rocks before water at 2
+    water = np.where(depth > 2.0, 2.0, 0.0).astype(np.float32)
+
+    def looked(start, end, rests=False):
+        return seen_beside((start, 5.5), (end, 5.5), depth, 2.0, 2.5, water, rests)
+
+    assert looked(17.5, 30.0) == (19.5, 5.5)  # the last pixel that is seen on the way there
+    assert looked(3.5, 30.0) == (9.5, 5.5)  # before the first rock, not between the two
+    assert hides(depth, water, False, 5, 30, 2.0) and not hides(depth, water, False, 5, 17, 2.0)
+    assert borders(depth, 5, 9, 9.8, 5.5, 2.0) and not borders(depth, 5, 9, 9.2, 5.5, 2.0)
+    depth[:, 20:] = 2.5  # a shore that lies deeper than this water's surface, and is dry
+    assert not hides(depth, water, False, 5, 30, 2.0)  # through the air below a jet it is seen
+    assert hides(depth, water, True, 5, 30, 2.0)  # under water that rests on its bed it is not
+    assert looked(17.5, 30.0, rests=True) == (19.5, 5.5)
+
+
+def test_behind_a_rock_one_sees_no_band_of_another_place():
+    width, height = SIZE
+    bright = np.broadcast_to(
+        np.linspace(1.0, 0.0, height)[:, None, None], (height, width, 3)
+    )  # the farther the brighter
+    rock = np.zeros((height, width), bool)
+    rock[height // 2 :] = True  # hides the near half of the bed
+    image, z = np.where(rock[..., None], 9.0, bright), np.where(rock, 0.5 * level(0.3), level(-0.6))
+    picture = shaded(slab(), Behind(image, z), CAMERA, CLEAR, WHITE)
+    column = picture[: height // 2, width // 2, 0]
+    # light is bent towards the viewer, and close to the outline comes from what the rock hides
+    assert column.max() <= 1.0 + 1e-5
+    assert (np.diff(column) < 1e-6).all()  # a step back to a farther place would be brighter
 
 
 def test_the_ground_cuts_the_thickness_off():

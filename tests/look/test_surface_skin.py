@@ -6,7 +6,18 @@ from scipy.spatial import cKDTree
 
 from fluidlift.look.fluid_normals import fluid_depths, fluid_normals, fluid_surface
 from fluidlift.look.surface_map import SurfaceMap
-from fluidlift.look.surface_skin import BARE, CROWDED, PITCH, SurfaceSkin, of_skin, painted_liquid, without_skin
+from fluidlift.look.surface_skin import (
+    BARE,
+    CROWDED,
+    HIDING,
+    PITCH,
+    SEEN,
+    SurfaceSkin,
+    dyed,
+    of_skin,
+    painted_liquid,
+    without_skin,
+)
 from fluidlift.types import Gaussians, concatenate
 
 CELL = 0.1
@@ -115,6 +126,28 @@ def test_liquid_under_a_skin_has_its_colours_and_what_is_deep_its_own():
     np.testing.assert_array_equal(liquid.sh[near], 1.0)
     np.testing.assert_array_equal(liquid.sh[deep], body.sh[deep])
     assert painted_liquid(body, CELL) is body
+
+
+@pytest.mark.parametrize("layer", [(0.0, 0.0), (0.0, 1.0), (2.0, 4.0), (0.0, 5.0)])
+def test_dye_is_seen_through_the_skin_and_less_the_deeper_it_is(layer):
+    at = np.arange(0.025, 1.0, 0.05)  # eight to a cell
+    points = np.stack(np.meshgrid(at, at, at[at < 0.5], indexing="ij"), -1).reshape(-1, 3)  # 0.5 m, 5 cells deep
+    skin_map = SurfaceMap.of(points, 0 * points, CELL)
+    skin = advanced(skin_map, 0)
+    depth = (0.5 - points[:, 2]) / CELL
+    own = (depth > layer[0]) & (depth < layer[1])
+    rgb = np.where(own[:, None], (0.1, 0.2, 0.9), (0.9, 0.9, 0.8))
+    liquid = Gaussians.isotropic(points, 0.01, rgb, 0.9)
+    white = np.full((len(skin), 3), 0.9)
+    found = dyed(white, skin.points(skin_map), skin_map, liquid, own, CELL)
+    seen = SEEN * (np.exp(-layer[0] / SEEN) - np.exp(-layer[1] / SEEN))  # cells of pure dye at the surface
+    share = 1.0 - np.exp(-seen / HIDING)
+    expected = (1.0 - share) * white + share * np.array([0.1, 0.2, 0.9])
+    middle = (np.abs(skin.places - 0.5) < 0.3).all(axis=1)
+    # its surface is found to a tenth of a cell, and layers begin between two rows of particles
+    np.testing.assert_allclose(found[middle], expected[middle], atol=0.03)
+    if not own.any():
+        assert found is white
 
 
 def test_a_skin_adds_nothing_to_the_body_that_it_floats_on():

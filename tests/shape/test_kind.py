@@ -71,6 +71,21 @@ def test_what_is_fed_from_the_upper_border_is_no_dam():
     assert estimate_kind(*backwards).features["collapsing"] == 0.0  # a body that rises out of a layer
 
 
+def test_a_body_comes_down_where_it_stood_whatever_is_seen_higher_elsewhere():
+    away = dam()
+    spread = ~away[1][0] & (COL > 68) & (ROW < 75)
+    for t, top in enumerate((50, 40, 30, 22, 18, 18)):  # ground further away, and a wave at the wall behind it
+        away[1][t] |= spread & (COL < 70 + 15 * t) & (ROW >= top)
+    away[0][away[1]] = BLUE
+    assert away[1][-1][:25].any() and not away[1][0][:25].any()
+    assert estimate_kind(*away).kind == "dam"
+
+
+def test_a_body_that_moves_on_has_not_collapsed():
+    masks = np.stack([(ROW > 25) & (ROW < 75) & (COL > 10 + 14 * t) & (COL < 60 + 14 * t) for t in range(T)])
+    assert estimate_kind(*scene(masks, (5.0, 0.5), BLUE)).features["collapsing"] == 0.0
+
+
 def test_beliefs_are_shares_and_the_kind_has_the_largest():
     found = estimate_kind(*river())
     assert set(found.scores) == set(KINDS)

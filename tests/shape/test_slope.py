@@ -54,6 +54,17 @@ def test_the_perspective_of_a_film_shows_how_steep_it_runs(slope, heading, pitch
     assert found.slope == pytest.approx(slope, abs=10.0)  # far from level
 
 
+@pytest.mark.parametrize("turn", [-6.0, 6.0])
+@pytest.mark.parametrize(("slope", "heading", "pitch"), [(20.0, -20.0, 30.0), (30.0, 200.0, 45.0)])
+def test_a_mean_motion_that_is_a_little_off_does_not_turn_the_film(slope, heading, pitch, turn):
+    camera, mask, motion = film(slope, heading, pitch, 0.75)
+    c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))
+    found = evidence_of(camera, mask, motion @ np.array([[c, s], [-s, c]]))
+    # the vanishing point says where it runs to: headings that fit the mean motion alone are 8 to 14 degrees off
+    assert abs(found.heading % 360.0 - heading % 360.0) < 5.0
+    assert found.slope == pytest.approx(slope, abs=5.0)  # the turn itself is 6
+
+
 @pytest.mark.parametrize("pitch", [25.0, 40.0, 55.0])
 def test_a_level_stream_stays_level(pitch):
     found = evidence_of(*film(0.0, -20.0, pitch, 0.5))

@@ -378,7 +378,7 @@ class _Fit:
 
 def _buoyancy_prior(prior: FluidParameters, scene: FitScene) -> FluidParameters:
     """Buoyancy of a plume from its speed: smoke that rose through half its height H has v^2 = g' H."""
-    height = np.ptp(np.argwhere(scene.domains[0].system.unknown)[:, 2]) + 1
+    height = np.ptp(np.argwhere(scene.cell_types[0] == CellType.FLUID)[:, 2]) + 1  # of the smoke, not of its box
     strength = scene.fast**2 / (height * scene.grid.spacing)
     down = np.asarray(prior.gravity)
     size = float(np.linalg.norm(down))

@@ -38,6 +38,8 @@ GRAY = 0.5
 """sRGB of meshes without colours"""
 CREASE = 0.7
 """cosine between a face and its smooth normal below which the face's own is taken: edges stay edges"""
+CLEFT = 0.02
+"""share of the ambient light that gets into the narrowest cleft, which none of the directions meets"""
 
 
 def ground_picture(
@@ -107,7 +109,10 @@ class Ground:
         bodies = [m for m in bodies if len(m.faces)]
         if not self.meshes and not bodies:
             return behind
-        moving = Casters.of(bodies, caster, material, self.casters, inset=inset)
+        moving = (
+            Casters.of(bodies, beside=self.casters),
+            Casters.of([], caster, material, beside=self.casters, inset=inset),
+        )
         seen = self._seen(camera)
         layers = [seen]
         if bodies:
@@ -145,6 +150,11 @@ class Ground:
         return self._last[1]
 
 
+Moving = tuple[Casters | None, Casters | None]
+"""solid bodies, and the liquid"""
+NOTHING: Moving = (None, None)
+
+
 @dataclass(frozen=True)
 class _Surfaces:
     """What a camera sees of surfaces, and how much light what stays leaves them."""
@@ -158,13 +168,13 @@ class _Surfaces:
 
     @cached_property
     def _pixels(self) -> tuple[np.ndarray, ...]:
-        """Where surfaces are; there: points, normals, all light, the strongest light and its share that what stays
-        lets through."""
+        """Where surfaces are; there: points, normals, all light but the strongest, that one, and its share that what
+        stays lets through."""
         there = self.depth > 0
         points, normals = _points(np.argwhere(there), self.depth, self.camera), self.normal[there]
         whole, direct, toward = direct_light(normals, self.ground.environment)
         share = None if direct is None else self._sun(self.ground.casters, points, normals, toward)
-        return there, points, normals, whole, direct, share
+        return there, points, normals, whole if direct is None else whole - direct, direct, share
 
     def _sun(self, casters: Casters | None, points: np.ndarray, normals: np.ndarray, toward: np.ndarray):
         if casters is None:
@@ -180,39 +190,80 @@ class _Surfaces:
         points, normals = _points(pixels, self.depth, self.camera), self.normal[pixels[:, 0], pixels[:, 1]]
         return some, points, normals, self.ground.around.shares(points, normals, self.ground.casters)
 
-    def _ambient(self, moving: Casters | None) -> np.ndarray:
-        """Share [h,w,3] of the ambient light, found in some of the pixels: it changes slowly."""
+    def _filled(self, shares: list[np.ndarray | None]) -> np.ndarray:
+        """Share [n,3] of the ambient light that these leave the surfaces, found in some of the pixels: it changes
+        slowly."""
         out, around = np.ones((*self.depth.shape, 3), np.float32), self.ground.around
-        some, points, normals, shares = self._coarse
+        some, _, normals, _ = self._coarse
+        there = self._pixels[0]
         if not len(around.ways) or not some.any():
-            return out
+            return out[there]
         coarse = np.ones((*some.shape, 3), np.float32)
-        coarse[some] = around.left(normals, shares, around.shares(points, normals, moving))
+        coarse[some] = around.left(normals, *shares)
         filled_in(coarse, STEP, self.depth, self.normal, ALIKE, out)
-        return out
+        return out[there]
 
-    def image(self, moving: Casters | None) -> tuple[np.ndarray, np.ndarray | None]:
+    @cached_property
+    def _open(self) -> tuple[np.ndarray, ...]:
+        return self._opened([self._coarse[3]])
+
+    def _opened(self, shares: list[np.ndarray | None]) -> tuple[np.ndarray, ...]:
+        """Share of the ambient light that solids leave; that light in the open, with what surfaces send each other;
+        and what of it gets into clefts."""
+        left = self._filled(shares)
+        there, sky = self._pixels[0], self._pixels[3]
+        whole = (sky * bounced(left, self.albedo[there])).astype(np.float32)
+        return left, whole, CLEFT * (1.0 - left) * whole
+
+    def _ambient(self, bodies: Casters | None, liquid: Casters | None) -> np.ndarray:
+        """Ambient light [n,3] at the surfaces."""
+        _, points, normals, stays = self._coarse
+        shares = [stays] if bodies is None else [stays, self.ground.around.shares(points, normals, bodies)]
+        left, whole, cleft = self._open if bodies is None else self._opened(shares)
+        if liquid is None:
+            return left * whole + cleft
+        found = self._filled([*shares, self.ground.around.shares(points, normals, liquid)])
+        found *= whole
+        found += cleft
+        return found
+
+    def image(self, moving: Moving) -> tuple[np.ndarray, np.ndarray | None]:
         """Linear light [h,w,3], and what of it is the strongest light's, with its cosine (as `Behind.direct`); 0 where
         there are no surfaces."""
-        return self._standing if moving is None else self._lit(moving)
+        return self._lit(moving) if any(moving) else self._standing
 
     @cached_property
     def _standing(self) -> tuple[np.ndarray, np.ndarray | None]:
-        return self._lit(None)
+        return self._lit(NOTHING)
 
-    def _lit(self, moving: Casters | None) -> tuple[np.ndarray, np.ndarray | None]:
-        there, points, normals, whole, direct, share = self._pixels
-        ambient = self._ambient(moving)[there]
-        light, strongest = whole * ambient, None
+    def _lit(self, moving: Moving) -> tuple[np.ndarray, np.ndarray | None]:
+        there, points, normals, _, direct, share = self._pixels
+        light, strongest = self._ambient(*moving), None
         if direct is not None:
-            toward = self.ground.environment.light()[0]
-            left = share if moving is None else share * self._sun(moving, points, normals, toward)
-            light = (whole - direct) * ambient + direct * left
+            toward, left = self.ground.environment.light()[0], share
+            for casters in moving:
+                left = left if casters is None else left * self._sun(casters, points, normals, toward)
+            left = direct * left
+            light += left
             strongest = np.zeros((*self.depth.shape, 4), np.float32)
-            strongest[there] = np.concatenate([self.albedo[there] * direct * left, (normals @ toward)[:, None]], axis=1)
+            strongest[there] = np.concatenate([self.albedo[there] * left, (normals @ toward)[:, None]], axis=1)
         image = np.zeros_like(self.albedo)
         image[there] = self.albedo[there] * light
         return image, strongest
+
+
+def bounced(left: Float[np.ndarray, "n 3"], albedo: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """How many times more ambient light surfaces get, with that which they send each other.
+
+    What hides a share 1 - a of the sky is taken for as bright as the surface itself: B = albedo (a E + (1 - a) B), so
+    that light is a / (1 - albedo (1 - a)) times E. A world of one white is 1 then, and none gets more than E. After
+    Stewart and Langer 1997, as multi-bounce ambient occlusion of Jimenez et al. 2016.
+
+    Args:
+        left: share a of the ambient light that others leave, 0 to 1.
+        albedo: linear, 0 to 1.
+    """
+    return 1.0 / (1.0 - albedo * (1.0 - CLEFT) * (1.0 - left))
 
 
 def place_of(camera: PinholeCamera) -> tuple:
@@ -238,7 +289,8 @@ def received(
     material: Material | None = None,
     lit: GroundLight | None = None,
 ) -> Float[np.ndarray, "n 3"]:
-    """Irradiance over pi (linear, the unit of `Environment.irradiance`) at points of surfaces, with all shadows.
+    """Irradiance over pi (linear, the unit of `Environment.irradiance`) at points of surfaces, with all shadows and
+    without the light that surfaces send each other (`bounced`).
 
     Args:
         points: m, world, on the meshes.

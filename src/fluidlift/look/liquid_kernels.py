@@ -14,7 +14,7 @@ import numba as nb
 import numpy as np
 
 from fluidlift.look.environment_stack import fading, place_of, value_at
-from fluidlift.look.liquid_lookup import fetch_beyond, shown_of_film
+from fluidlift.look.liquid_lookup import borders, fetch_beyond, hides, seen_beside, shown_of_film
 from fluidlift.look.smoothstep import eased
 from fluidlift.look.transparent_rays import fanned, far_side, onward, seen_from, turned_normals
 
@@ -39,6 +39,9 @@ FAR_AWAY = 1e6
 """px, beyond any rim"""
 SHARE, MIRROR, THROUGH, PATH, OUTSIDE, TURNED, INWARD, COLOR, SPREAD = 0, 1, 4, 7, 8, 9, 10, 13, 16
 FARTHER, BEYOND, SECOND, WIDE = 17, 18, 19, 22
+APART = 4.0 / math.sqrt(3.0)
+"""the next pixel's light goes 4 WIDE beside this one's; a bilinear look-up of means over a texel is as wide as a box of
+sqrt(3) texels"""
 """places in the numbers of a ray: see `follow`"""
 NUMBERS = 23
 """of a ray"""
@@ -63,11 +66,11 @@ def _onto(x, y, z, lens):
 
 
 @nb.njit(cache=True, error_model="numpy", _nrt=False)
-def _behind(q, o, start, depth, front, lens, up, goes_on):
+def _behind(q, o, start, depth, front, lens, up, goes_on, liquid, rests):
     """Where a ray that leaves the liquid at q towards o meets what lies behind: u, v (px), whether the picture holds
     it, and how far it went, over the depth at which it ends (1: to infinity). `start`: u, v of the straight line;
     `front`: z of the liquid; `up`: world z in camera axes; `goes_on`: whether the picture stands for what lies beyond
-    its rim."""
+    its rim; `liquid`, `rests`: as of `hides`."""
     h, w = depth.shape
     u, v = start
     if o[2] < 0.05:  # back to the viewer
@@ -88,8 +91,11 @@ def _behind(q, o, start, depth, front, lens, up, goes_on):
             gone = 1.0
     row, col = min(max(int(v), 0), h - 1), min(max(int(u), 0), w - 1)
     z = depth[row, col]
-    if z > 0.0 and z < front:  # something before the liquid: the straight line's
-        return start[0], start[1], True, 0.0
+    if front > 0.0 and hides(depth, liquid, rests, row, col, front):
+        u, v = seen_beside(start, (u, v), depth, front, q[2], liquid, rests)
+        return u, v, True, 0.0
+    if front > 0.0 and borders(depth, row, col, u, v, front):
+        u, v = col + 0.5, row + 0.5
     # beyond the rim ground goes on, and the sky is known all around
     outside = (u < 0.0 or v < 0.0 or u > w or v > h) and not goes_on
     upward = o[0] * up[0] + o[1] * up[1] + o[2] * up[2] > 0.0
@@ -167,7 +173,7 @@ def _inner(q, m, share, thick, turns, surface, behind, eye, index, ray):
     ray[FARTHER] = more
     start = _onto(q[0], q[1], max(q[2], 1e-6), lens)
     up = (rotation[0, 2], rotation[1, 2], rotation[2, 2])
-    u, v, held, gone = _behind(q, o, start, depth, 0.0, lens, up, rest[3] > 0.0)
+    u, v, held, gone = _behind(q, o, start, depth, 0.0, lens, up, rest[3] > 0.0, surface_depth, False)
     ray[BEYOND] = 0.0 if held else 1.0
     _turned(rotation, o[0], o[1], o[2], ray, INWARD)
     if held:
@@ -246,11 +252,13 @@ def _follow(i, j, surface, behind, eye, index, ray):
             turns = abs(bend) * ray[SPREAD], far
             _inner(q, (mx, my, mz), back, thick, turns, surface, behind, eye, index, ray)
     up = (rotation[0, 2], rotation[1, 2], rotation[2, 2])
-    u, v, held, gone = _behind(q, (ox, oy, oz), (j + 0.5, i + 0.5), depth, z0, lens, up, rest[3] > 0.0)
+    u, v, held, gone = _behind(
+        q, (ox, oy, oz), (j + 0.5, i + 0.5), depth, z0, lens, up, rest[3] > 0.0, surface_depth, free <= 0.0
+    )  # fmt: skip
     ray[OUTSIDE] = 0.0 if held else 1.0
     _turned(rotation, ox, oy, oz, ray, THROUGH)
-    if held:  # the next pixel's light goes 4 WIDE beside this one's
-        fetch_beyond(picture, levels, u, v, 4.0 * ray[WIDE] * gone * lens[0], rest, ray, COLOR)
+    if held:
+        fetch_beyond(picture, levels, u, v, APART * ray[WIDE] * gone * lens[0], rest, ray, COLOR)
 
 
 @nb.njit(cache=True, parallel=True, nogil=True, error_model="numpy")

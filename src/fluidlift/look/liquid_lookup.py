@@ -16,6 +16,8 @@ SLANTED = 12.0
 """grains along the line of sight from which on liquid is thicker than one, seen ever so slanting (5 degrees)"""
 SMALLEST = 8
 """px, rows and columns of the smallest picture"""
+MARCHED, HALVED = 16, 5
+"""steps on the way to what is hidden, and times that the one with its outline is halved at least: to a pixel of 512"""
 RIM = 0.5
 """pictures beyond its rim at which a picture that goes on is no more than its mean"""
 
@@ -75,6 +77,46 @@ def fetch_beyond(values, levels, u, v, wide, rest, out, at):
         share = min(off / RIM, 1.0)
         for k in range(3):
             out[at + k] += share * (rest[k] - out[at + k])
+
+
+@nb.njit(cache=True, inline="always")
+def hides(depth, liquid, rests, i, j, front):
+    """Whether what a pixel shows is nearer than `front`, or of what a liquid rests on, out of that liquid (whose
+    depths are `liquid`)."""
+    z = depth[i, j]
+    return 0.0 < z and (z < front or (rests and not 0.0 < liquid[i, j] <= z))
+
+
+@nb.njit(cache=True, inline="always")
+def borders(depth, i, j, u, v, front):
+    """Whether the colour at u, v (px), between pixel i, j and its neighbours, is in part that of something nearer."""
+    m = min(i + 1, depth.shape[0] - 1) if v - i > 0.5 else max(i - 1, 0)
+    n = min(j + 1, depth.shape[1] - 1) if u - j > 0.5 else max(j - 1, 0)
+    return 0.0 < depth[m, j] < front or 0.0 < depth[i, n] < front
+
+
+@nb.njit(cache=True, error_model="numpy", _nrt=False)
+def seen_beside(start, end, depth, front, far, liquid, rests):
+    """Where (px) to look for what something before it hides at `end`: the middle of the last pixel on the line from
+    `start` where nothing hides (`hides`) the ray, from `front` to `far`, where it leaves the liquid.
+
+    What is hidden is taken for what is seen beside its outline: taken from anywhere else, it would stand around every
+    rock as a band with an edge.
+    """
+    u, v = end
+    h, w = depth.shape
+    free, hidden = 0.0, 1.0
+    for n in range(1, MARCHED + HALVED):  # the first outline: behind one rock stands another
+        s = n / MARCHED if hidden == 1.0 and n < MARCHED else 0.5 * (free + hidden)
+        i = min(max(int(start[1] + s * (v - start[1])), 0), h - 1)
+        j = min(max(int(start[0] + s * (u - start[0])), 0), w - 1)
+        if hides(depth, liquid, rests, i, j, front + s * (far - front)):
+            hidden = s
+        else:
+            free = s
+    i = min(max(int(start[1] + free * (v - start[1])), 0), h - 1)
+    j = min(max(int(start[0] + free * (u - start[0])), 0), w - 1)
+    return j + 0.5, i + 0.5
 
 
 @nb.njit(cache=True, inline="always")

@@ -45,6 +45,8 @@ EVEN = 0.8
 """radii: standard deviation of the smoothing of colour and cover"""
 EVEN_THICKNESS = 1.5
 """radii: that of thickness, wider than the particles lie apart: a sum over them shows how they crowd"""
+FAR_EVEN = 3.0
+"""radii: that of the far side, whose slope would else show how they crowd, in sparks"""
 THIN = 0.35
 """radii of thickness from which a pixel counts as covered"""
 RIM = (0.42, 0.67)
@@ -70,6 +72,7 @@ def particle_surface(
     *,
     spacing: float | None = None,
     ground: Float[np.ndarray, "h w"] | None = None,
+    far_side: bool = False,
 ) -> LiquidSurface:
     """The surface of particles.
 
@@ -83,6 +86,8 @@ def particle_surface(
             `SPACING` radii.
         ground: camera z (m; 0: none) of what the liquid lies on. It hides particles, and the surface runs out on it;
             None: every outline is rounded, as of a drop in the air.
+        far_side: light leaves a far side bent once more, `thickness` behind the near one: a jet is not seen else. Not
+            for liquid that lies on a bed.
 
     Raises:
         ValueError: arrays of the wrong shape or a radius that is not positive.
@@ -110,7 +115,30 @@ def particle_surface(
     plane_normals(inverse, _lens(camera), rotation, np.float32(LIMIT * radius), normal)
     covered = np.empty_like(depth)
     depths_and_cover(inverse, bed, thickness, near, np.array([THIN * radius, *RIM], np.float32), depth, covered)
-    return LiquidSurface(depth, normal, thickness, albedo, covered, grain=GRAIN * radius)
+    back = _far_normals(depth, thickness, covered, camera, radius) if far_side else None
+    return LiquidSurface(depth, normal, thickness, albedo, covered, back, GRAIN * radius)
+
+
+def _far_normals(
+    depth: np.ndarray, thickness: np.ndarray, covered: np.ndarray, camera: PinholeCamera, radius: float
+) -> np.ndarray:
+    """Outward normals [h,w,3] of the far side, `thickness` behind the near one; 0 where there is none."""
+    import cv2
+
+    there = (covered > 0) & (depth > 0)
+    back = np.zeros((*depth.shape, 3), np.float32)
+    if not there.any():
+        return back
+    sigma = min(FAR_EVEN * radius * camera.focal[0] / float(np.median(depth[there])), 0.05 * max(camera.size))
+    behind = depth + thickness / np.linalg.norm(camera.rays(camera.pixel_grid()), axis=-1).astype(np.float32)
+    inverse = np.where(there, 1.0 / np.maximum(behind, NEAR), 0.0).astype(np.float32)
+    share = there.astype(np.float32)
+    for layer in (inverse, share):
+        cv2.GaussianBlur(layer, (0, 0), sigma, dst=layer, borderType=cv2.BORDER_CONSTANT)
+    inverse = np.where(there, inverse / np.maximum(share, 1e-3), 0.0).astype(np.float32)
+    rotation = np.asarray(camera.camera_from_world.rotation, np.float64)
+    plane_normals(inverse, _lens(camera), rotation, np.float32(LIMIT * radius), back)
+    return -back
 
 
 def _lens(camera: PinholeCamera) -> np.ndarray:

@@ -34,6 +34,8 @@ ALIKE = 1e-3
 """by how much a splat's size may differ from the skin's: files hold logarithms in single precision"""
 UNDER = 1.5
 """cells below the skin that have its colours where no skin is drawn: as deep as a surface of particles mixes them"""
+SEEN, HIDING = 3.0, 0.5
+"""cells: of depth over which what is seen of dye under a skin falls to 1/e; of pure dye that let 1/e through"""
 CROWDED, BARE = 0.55, 0.75
 """spacings to the next tracer below which one of two goes, and above which a new one comes"""
 
@@ -75,6 +77,48 @@ def painted_liquid(gaussians: Gaussians, cell: float) -> Gaussians:
     sh = liquid.sh.copy()
     sh[under] = skin.sh[nearest[under]]
     return replace(liquid, sh=sh)
+
+
+def dyed(
+    colors: Float[np.ndarray, "n 3"],
+    points: Float[np.ndarray, "n 3"],
+    surface: SurfaceMap,
+    liquid: Gaussians,
+    own: Bool[np.ndarray, " m"],
+    cell: float,
+) -> Float[np.ndarray, "n 3"]:
+    """Colours of the skin with the liquid that brings a colour of its own, as dye does, where it is seen through it.
+
+    Dye is a pigment: `HIDING` of it, pure, leaves 1/e of what is behind; and what lies deeper under the skin is seen
+    less, as light is lost on its way down and back (`SEEN`). By the skin alone, dye that a jet carries down would
+    never be seen.
+
+    Args:
+        colors: sRGB, of the skin's tracers.
+        points: where they are, m.
+        surface: the map that they float on.
+        liquid: splats of the particles, eight to a cell, of which only places and colours count.
+        own: which of them bring a colour of their own.
+        cell: width of the simulator's cells, m.
+    """
+    if not own.any() or not len(points):
+        return colors
+    dye, shape = liquid.select(own), surface.wet.shape
+    place = np.floor((dye.means[:, :2] - surface.low) / surface.pitch).astype(int)
+    depth = (surface.at(surface.height, dye.means[:, :2]) - dye.means[:, 2]) / cell
+    there = ((place >= 0) & (place < shape)).all(axis=1) & (depth > -1.0)  # a jet stands over the skin
+    column = place[there, 0] * shape[1] + place[there, 1]
+    weight = np.exp(-np.maximum(depth[there], 0.0) / SEEN) * (cell / surface.pitch) ** 2 / 8.0
+
+    def summed(values: np.ndarray) -> np.ndarray:
+        total = np.bincount(column, values, minlength=shape[0] * shape[1]).reshape(shape)
+        return surface.at(ndimage.gaussian_filter(total, 1.0), points[:, :2])
+
+    layer = np.maximum(summed(weight), 0.0)
+    rgb = np.clip(dye.rgb[there], 0.0, 1.0)
+    mean = np.stack([summed(weight * rgb[:, k]) for k in range(3)], axis=-1) / np.maximum(layer, 1e-9)[:, None]
+    share = 1.0 - np.exp(-layer[:, None] / HIDING)
+    return (1.0 - share) * colors + share * np.clip(mean, 0.0, 1.0)
 
 
 class SurfaceSkin:

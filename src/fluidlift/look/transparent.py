@@ -14,10 +14,10 @@ from dataclasses import replace
 import numba as nb
 import numpy as np
 from jaxtyping import Float
-from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from fluidlift.errors import require
+from fluidlift.look.carried_on import carried_on
 from fluidlift.look.liquid import LiquidSurface
 from fluidlift.look.project import sound
 from fluidlift.look.smoothstep import smoothstep
@@ -48,6 +48,8 @@ LEANING = 0.2
 BURIED = 1.5
 """spacings behind what hides liquid over which the middle of a Gaussian may lie: on ground that is seen at a slant, and
 a little inside it"""
+REACH = 2.0
+"""spacings, a cell: so far particles keep off solids, up to which a liquid that lies on them is carried on"""
 NEIGHBOURS = (7, 18)
 """those whose distances are taken together: from one alone, a lattice's shells would show"""
 SAMPLES = 4_000
@@ -82,6 +84,7 @@ def splat_surface(
         volume: m^3 that each Gaussian stands for; None: measured (`mean_volume`).
         colors: linear, carried by the liquid; None: the Gaussians' own (sRGB) made linear.
         far_side: look for the normals there too: light leaves a drop bent once more. Takes about as long again.
+            Without it the liquid lies on the ground, and its surface is carried on to where that comes out of it.
         ground: camera z (m; 0: none) of what hides liquid. A Gaussian that lies behind it counts in those pixels
             alone that look past it: a rock before a pond cuts no hole with a blurred rim.
 
@@ -105,21 +108,36 @@ def splat_surface(
         require(np.shape(ground) == (height, width), f"ground of {np.shape(ground)}", f"({height}, {width})")
         wall = np.where(ground > 0, ground + BURIED * spacing, np.inf).astype(np.float32)
     total, skin = splatted_thickness(g, features, camera, volume, SKIN * spacing, wall=wall)
-    seen = _surface(total, skin, camera, spacing)
-    if not far_side:
-        return seen
+    seen = _surface(total, skin, camera, spacing, ground)
+    if not far_side:  # it lies on the ground
+        return seen if ground is None else carried_on(seen, np.asarray(ground, np.float32), camera, REACH * spacing)
     _, skin = splatted_thickness(g, features[:, :3], camera, volume, SKIN * spacing, far=True, wall=wall)
     away = camera.rays(camera.pixel_grid())
     return replace(seen, back_normal=_facing(skin[..., 2:5], away / np.linalg.norm(away, axis=-1, keepdims=True)))
 
 
-def _even(thickness: np.ndarray, depth: np.ndarray, camera: PinholeCamera, spacing: float) -> np.ndarray:
-    """Without the grain of single splats, by as many px as suit the middle of the depths; the sum stays."""
+def _even(
+    thickness: np.ndarray, depth: np.ndarray, camera: PinholeCamera, spacing: float, ground: np.ndarray | None
+) -> np.ndarray:
+    """Without the grain of single splats, by as many px as suit the middle of the depths; the sum stays. Pixels of
+    the ground (m; 0, None: none) that show no liquid have no say: behind a rock liquid is as thick as beside it."""
+    import cv2
+
     there = depth > 0
     if not there.any():
         return thickness
     px = GRAIN * spacing * max(camera.focal) / float(np.median(depth[there]))
-    return ndimage.gaussian_filter(thickness, min(px, 0.05 * max(camera.size)), mode="constant", truncate=3.0)
+    sigma = max(min(px, 0.05 * max(camera.size)), 0.1)
+    reach = 2 * int(3.0 * sigma + 0.5) + 1
+
+    def bell(picture: np.ndarray) -> np.ndarray:
+        picture = np.ascontiguousarray(picture, np.float32)
+        return cv2.GaussianBlur(picture, (reach, reach), sigma, borderType=cv2.BORDER_CONSTANT)
+
+    if ground is None or not (ground > 0).any():
+        return bell(thickness)
+    counts = (there | (ground <= 0)).astype(np.float32)
+    return bell(thickness * counts) / np.maximum(bell(counts), 1e-3)
 
 
 def mean_volume(positions: Float[np.ndarray, "n 3"]) -> float:
@@ -273,7 +291,9 @@ def thickness_plain(packed, skin, rays, total, first) -> None:
         first += share[..., None] * np.concatenate([[1.0, one[7]], one[LEAD:]]).astype(np.float32)
 
 
-def _surface(total: np.ndarray, skin: np.ndarray, camera: PinholeCamera, spacing: float) -> LiquidSurface:
+def _surface(
+    total: np.ndarray, skin: np.ndarray, camera: PinholeCamera, spacing: float, ground: np.ndarray | None
+) -> LiquidSurface:
     """Sums along the rays to the surface that they make."""
     rays = camera.rays(camera.pixel_grid())
     away = np.linalg.norm(rays, axis=-1)
@@ -286,7 +306,7 @@ def _surface(total: np.ndarray, skin: np.ndarray, camera: PinholeCamera, spacing
     toward = -rays / away[..., None]
     normal = _facing(skin[..., 2:5], toward)
     albedo = np.clip(skin[..., 5:8] / found[..., None], 0.0, 1.0) * there[..., None]
-    even = _even(total, depth, camera, spacing)
+    even = _even(total, depth, camera, spacing, ground)
     thickness = np.where(there, even, 0.0)
     return LiquidSurface(np.maximum(depth, 0.0), normal, thickness, albedo, covered, grain=FILM * spacing)
 

@@ -140,19 +140,22 @@ def onward(q, m, thick, sides, normals, back_normals, eye):
 
 @nb.njit(cache=True, inline="always")
 def turned_normals(surface_depth, normals, i, j):
-    """How much the normal turns from this pixel to the next ones of the same surface, as GGX's alpha."""
+    """How much the normal turns from this pixel to the next ones of the same surface, as GGX's alpha: in rows and in
+    columns to the side where it turns less, for across an edge there is another face and nothing is bent in between."""
     h, w = surface_depth.shape
-    turn, known = 0.0, 0
-    for k in range(4):
-        r, c = i + (k == 0) - (k == 1), j + (k == 2) - (k == 3)
-        if r < 0 or c < 0 or r >= h or c >= w or surface_depth[r, c] <= 0.0:
-            continue
-        dot = 0.0
-        for n in range(3):
-            dot += normals[i, j, n] * normals[r, c, n]
-        turn += max(2.0 - 2.0 * dot, 0.0)
-        known += 1
-    return min(0.5 * math.sqrt(turn / max(known, 1)), 0.5)
+    turn = 0.0
+    for axis in range(2):
+        least = math.inf
+        for side in (-1, 1):
+            r, c = i + side * (axis == 0), j + side * (axis == 1)
+            if r < 0 or c < 0 or r >= h or c >= w or surface_depth[r, c] <= 0.0:
+                continue
+            dot = 0.0
+            for n in range(3):
+                dot += normals[i, j, n] * normals[r, c, n]
+            least = min(least, max(2.0 - 2.0 * dot, 0.0))
+        turn += least if least < math.inf else 0.0
+    return min(0.5 * math.sqrt(turn / 2.0), 0.5)
 
 
 @nb.njit(cache=True, inline="always")

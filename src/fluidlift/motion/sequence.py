@@ -33,8 +33,8 @@ MaskReader = Callable[[int], Bool[np.ndarray, "h w"]]
 DepthReader = Callable[[int], Float[np.ndarray, "h w"]]
 """frame -> camera z of the visible surface, m; 0 where there is none"""
 
-FRONT_HALF_WINDOW = 6
-"""frames on either side over which a silhouette's growth is followed"""
+FRONT_HALF_WINDOW = 30
+"""frames on either side over which a silhouette's growth is followed at most"""
 
 LEVEL = 0.05
 """sine of the slope below which a surface counts as level: 3 degrees, the error of a pitch that was estimated from one

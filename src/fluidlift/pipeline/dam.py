@@ -44,14 +44,10 @@ def stood(fluid: FluidMasks, start: int, camera: PinholeCamera) -> standing.Stan
     if _covers(fluid, len(fluid) - 1) > (1.0 + SPREADS) * _covers(fluid, late):
         late = max(len(fluid) - RECENT, start + 1)
     shape = fluid.shape[1:]
-    wet, often = np.zeros(shape), np.zeros(shape)
-    for t in range(start, len(fluid)):
-        mask = fluid[t]
-        wet += mask
-        often += mask if t >= late else 0
-    never = wet <= standing.DRY * (len(fluid) - start)
-
-    return standing.find_standing(camera, fluid[start], often / (len(fluid) - late), never)
+    often = np.zeros(shape)
+    for t in range(late, len(fluid)):
+        often += fluid[t]
+    return standing.find_standing(camera, fluid[start], often / (len(fluid) - late))
 
 
 def front_speed(fluid: FluidMasks, start: int, camera: PinholeCamera, found: standing.StandingBody) -> float:

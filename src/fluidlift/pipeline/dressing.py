@@ -11,10 +11,9 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from fluidlift.errors import InputRejected
-from fluidlift.types import SH_C0, Gaussians, Particles, concatenate, sh_from_rgb
+from fluidlift.types import Gaussians, Particles, concatenate, sh_from_rgb
 
 if TYPE_CHECKING:
     from fluidlift.look.surface_map import SurfaceMap
@@ -169,6 +168,7 @@ class Dressing:
         inside: Inside | None,
     ) -> Dressed:
         from fluidlift.look.smoothstep import smoothstep
+        from fluidlift.look.surface_skin import dyed
 
         skin, xy = self._skin, particles.positions[:, :2]
         above = (particles.positions[:, 2] - surface.at(surface.height, xy)) / self._cell
@@ -183,7 +183,7 @@ class Dressing:
         sh[near[there], :1] = sh_from_rgb(color[there])
         points = skin.points(surface)
         color, there = patches.colors(points)
-        color = self._dyed(color, points, shown, own & (np.abs(above) < TINTED), np.abs(above) < TINTED)
+        color = dyed(color, points, surface, shown, own, self._cell)
         there &= self._clearance(points) > CLEAR * self._cell
         if inside is not None:
             there &= ~inside(points)
@@ -199,22 +199,6 @@ class Dressing:
         """Which particles bring a colour of their own, as dye does."""
         painted = self._scene.painted
         return np.zeros(len(source), bool) if painted is None else ~np.isfinite(painted[source]).all(axis=1)
-
-    def _dyed(
-        self, color: np.ndarray, points: np.ndarray, shown: Gaussians, dye: np.ndarray, near: np.ndarray
-    ) -> np.ndarray:
-        """Colours of the skin with the dye of the particles about it."""
-        if not dye.any() or not len(points):
-            return color
-        around = np.flatnonzero(near)
-        distance, index = cKDTree(shown.means[around]).query(points, k=np.arange(1, min(6, len(around)) + 1))
-        index = around[index]
-        full = 1.0 / (1.0 + (distance / (0.5 * self._cell)) ** 2)
-        weight = full * dye[index]
-        own = np.clip(0.5 + SH_C0 * shown.sh[index, 0], 0.0, 1.0)
-        mean = (weight[..., None] * own).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-9)[:, None]
-        share = (weight.sum(axis=1) / full.sum(axis=1))[:, None]
-        return (1 - share) * color + share * mean
 
     def _clearance(self, points: np.ndarray) -> np.ndarray:
         """How far points are from the ground, m; negative inside it."""

@@ -343,17 +343,16 @@ class Painter:
         if mesh is not None:
             return mesh_surface(mesh, camera, radius=RADIUS * self.terrain.grid.spacing)
         fluid = painted_liquid(fluid, self.terrain.grid.spacing)
+        free = self._bed is None  # what lies on a bed has its far side there: no second surface to bend light at
         if self.look.style == "transparent":
             apart = 0.5 * self.terrain.grid.spacing
             normals, share = fluid_normals(fluid, apart, self._bed)
             normals = normals * np.maximum(share, INNER)[:, None]
-            # what lies on a bed has its far side there: no second surface to bend light at
-            free = self._bed is None
             return splat_surface(fluid, normals, camera, volume=apart**3, far_side=free, ground=behind.depth)
         radius = RADIUS * self.terrain.grid.spacing
         shows = self.material.carried > 0 or max(self.material.emission) > 0  # else its colours change nothing
         colors = linear_from_srgb(np.clip(fluid.rgb, 0.0, 1.0)) if shows else None
-        return particle_surface(fluid.means, radius, camera, colors, ground=behind.depth)
+        return particle_surface(fluid.means, radius, camera, colors, ground=behind.depth, far_side=free)
 
     def _traced(self, frame: Frame, camera: PinholeCamera, backdrop: Backdrop) -> Lit:
         """By light paths through the mesh, which reaches into the ground here: a gap would be a film of air."""

@@ -22,9 +22,10 @@ from fluidlift.pipeline.fit_outcome import (
     table,
     verdict,
 )
-from fluidlift.pipeline.fit_request import request_of, startable
+from fluidlift.pipeline.fit_request import FitRequest, request_of, startable
 from fluidlift.pipeline.lifting import targets_of
 from fluidlift.pipeline.reading import clip_of
+from fluidlift.pipeline.rising import outline_rises, with_buoyancy
 from fluidlift.pipeline.seeing import masks_of
 from fluidlift.pipeline.story import Result, Story, one_torch_thread
 from fluidlift.types import (
@@ -55,16 +56,7 @@ def fit(story: Story, config: JobConfig) -> Result:
 
     setting, kind = setting_of(story), story["geometry"].meta["kind"]
     request, along = request_of(config.fit), setting.terrain.mainstream
-    if kind == "plume" and "gravity" in request.held:
-        raise InputRejected(
-            "a known gravity for a plume, whose gravity stands for its buoyancy", "another parameter",
-            "give gravity in scene.yaml, for the simulation",
-        )  # fmt: skip
-    if kind == "dam" and request.free:
-        raise InputRejected(
-            f"a fit of {', '.join(request.free)} to a dam, whose velocities are known as it stands, before it moves",
-            "values that you know", "leave out fit.free and give them with --hold or in scene.yaml",
-        )  # fmt: skip
+    _check_request(request, kind)
     targets = targets_of(story)
     initial = request.applied(first_guess(story, targets), along=along)
     # speeds that come from free fall were not measured: they say nothing about friction inside or at the walls
@@ -73,7 +65,8 @@ def fit(story: Story, config: JobConfig) -> Result:
     if filling_rate(story) is not None:  # the level in the vessel says how much enters
         usual = tuple(name for name in usual if name != "inflow_velocity")
     free = request.free_of(usual)
-    found, judged = _attempt(story, config, targets, startable(initial, request.held), free)
+    moved = _told_by_velocities(story, free)
+    found, judged = _attempt(story, config, targets, startable(initial, request.held), moved)
     parameters, estimates = found.parameters, dict(found.estimates)
     if not judged.usable:
         # the buoyancy of smoke was guessed from its speed by the fit
@@ -87,6 +80,9 @@ def fit(story: Story, config: JobConfig) -> Result:
         if "wall_damping" in estimates:
             estimates["wall_damping"] = replace(estimates["wall_damping"], value=d, prior=d)
     estimates = {n: as_given(n, e, initial) if family(n) in known else e for n, e in estimates.items()}
+    parameters, estimates, lift = (
+        (parameters, estimates, {}) if moved == free else with_buoyancy(story, parameters, estimates, targets[0])
+    )
     rows = table(estimates, held=set(known), free=set(free), measured=set(AT_THE_ENDS))
     size = size_row(story["geometry"].meta["scale"])
     if size is not None:
@@ -109,9 +105,30 @@ def fit(story: Story, config: JobConfig) -> Result:
             "reason": judged.reason,
             "rollouts": found.rollouts,
             "notes": notes,
-            "extra": {k: float(v) for k, v in found.extra.items()},
+            "extra": {k: float(v) for k, v in (found.extra | lift).items()},
         },
     )
+
+
+def _check_request(request: FitRequest, kind: str) -> None:
+    """Raises InputRejected where a kind of fluid has no such parameter, or its clip cannot tell it."""
+    if kind == "plume" and "gravity" in request.held:
+        raise InputRejected(
+            "a known gravity for a plume, whose gravity stands for its buoyancy", "another parameter",
+            "give gravity in scene.yaml, for the simulation",
+        )  # fmt: skip
+    if kind == "dam" and request.free:
+        raise InputRejected(
+            f"a fit of {', '.join(request.free)} to a dam, whose velocities are known as it stands, before it moves",
+            "values that you know", "leave out fit.free and give them with --hold or in scene.yaml",
+        )  # fmt: skip
+
+
+def _told_by_velocities(story: Story, free: tuple[str, ...]) -> tuple[str, ...]:
+    """What is fitted to velocities: all but the lift of smoke whose outline rises, which says more of it than they."""
+    if story["geometry"].meta["kind"] != "plume" or set(free) <= {"gravity"} or not outline_rises(story):
+        return free
+    return tuple(name for name in free if name != "gravity")
 
 
 def _attempt(

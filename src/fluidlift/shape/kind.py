@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 
 from fluidlift.errors import require
-from fluidlift.shape import chute, slope
+from fluidlift.shape import chute, prism, slope
 from fluidlift.shape.texture_gradient import TexturePatches
 from fluidlift.types import PinholeCamera, RigidTransform
 
@@ -158,22 +158,24 @@ def _features(frames, fluid, displacement, confidence) -> dict[str, float]:
 
 
 def _collapsing(fluid: np.ndarray) -> float:
-    """0 to 1: how much of the first outline is left for good, from above, for ground that was dry.
+    """0 to 1: how far a body has come down for good, where it stood, for ground that was dry.
 
-    What reaches the picture's upper edge is fed from there, and what is as high in the end as it was has not come down.
+    Column by column of the picture: its top is lower in the end, and its foot still wet. Elsewhere the liquid may be
+    seen higher than the body ever was: ground further away, and waves at its walls. What reaches the picture's upper
+    edge is fed from there.
     """
     count = len(fluid)
     first, later = fluid[0], fluid[-max(count // 3, 1) :].mean(axis=0)
-    area = float(first.sum())
-    left, gained = first & (later < 0.3), ~fluid[: max(count // 8, 1)].any(axis=0) & (later > 0.7)
-    if count < 4 or area == 0 or not left.any() or not gained.any() or first[0].any():
+    area, rows = float(first.sum()), np.arange(fluid.shape[1])[:, None]
+    if count < 4 or area == 0 or first[0].any():
         return 0.0
-    tops, (highest, lowest) = np.nonzero(later > 0.5)[0], np.percentile(np.nonzero(first)[0], [2, 98])
-    tall = max(lowest - highest, 1.0)
-    sunk = (np.percentile(tops, 2) - highest) / tall
-    fell = (np.nonzero(gained)[0].mean() - np.nonzero(left)[0].mean()) / tall
-    share = min(left.sum() / (0.25 * area), 1.0) * min(gained.sum() / (0.5 * area), 1.0)
-    return float(share * np.clip(fell / 0.3, 0.0, 1.0) * np.clip(sunk / 0.15, 0.0, 1.0))
+    gained = ~fluid[: max(count // 8, 1)].any(axis=0) & (later > 0.7)
+    top, bottom = first.argmax(axis=0), len(first) - 1 - first[::-1].argmax(axis=0)
+    foot = first & (rows >= bottom - (bottom - top) // 8)
+    stayed = (later * foot).sum(axis=0) > 0.5 * np.maximum(foot.sum(axis=0), 1)
+    left = first & stayed & (rows < (later > 0.3).argmax(axis=0))
+    # seen from above, liquid behind it soon hides how far it came down: a few times what noise of the masks would leave
+    return float(min(left.sum() / (0.1 * area), 1.0) * min(gained.sum() / (0.5 * area), 1.0))
 
 
 def estimate_up(
@@ -191,8 +193,9 @@ def estimate_up(
 
     Over a stream, the perspective of its motion and of its pattern shows the tilt (`slope.estimate_tilt`), weighed
     against how people hold cameras: how much they had to say is the confidence, and of motion across the picture, or a
-    pattern that is not the same all over, that is little. What
-    falls does so along the vertical, which gives the roll; its pitch keeps the prior, as all of a plume's tilt does.
+    pattern that is not the same all over, that is little. The edges of a body that stands point to what lies below the
+    camera (`prism.upright_tilt`). What falls does so along the vertical, which gives the roll; its pitch keeps the
+    prior, as all of a plume's tilt does.
 
     Args:
         kind: of the fluid.
@@ -207,17 +210,14 @@ def estimate_up(
     mean, sigma = PITCH_PRIOR[kind]
     found_pitch, found_roll, source, trust = mean, 0.0, f"usual view of a {kind}", 0.0
     if kind == "stream":
-        # a chute is another plane than what it comes down onto
-        steep = chute.chute_pixels(level_camera(camera, UpEvidence(mean, 0.0, "", 0.0)), mask, displacement, confidence)
-        lying = confidence * ~np.any(steep, axis=0) if steep else confidence
-        patches = slope.flow_patches(mask, displacement, lying)
-        if patches is not None:
-            tilt = slope.estimate_tilt(
-                camera, patches, lambda p, r: level_camera(camera, UpEvidence(p, r, "", 0.0)), (mean, sigma),
-                None if steep else texture,
-            )  # fmt: skip
-            found_pitch, found_roll, trust = tilt.pitch, tilt.roll, tilt.gained
-            source = "perspective of the flow" + (" and of its pattern" if texture is not None and not steep else "")
+        tilt, source_seen = _tilt_of_stream(mask, displacement, confidence, camera, texture)
+        if tilt is not None:
+            found_pitch, found_roll, trust, source = tilt.pitch, tilt.roll, tilt.gained, source_seen
+    elif kind == "dam" and mask.any():
+        found_pitch, left = prism.upright_tilt(
+            mask, lambda p: level_camera(camera, UpEvidence(p, roll or 0.0, "", 0.0)), (mean, sigma)
+        )
+        source, trust = "upright edges of the body", float(np.clip(1.0 - left / sigma, 0.0, 1.0))
     elif kind in ("fall", "pour"):  # wind leans smoke more often than hands turn cameras
         weight = np.where(mask, confidence * np.linalg.norm(displacement, axis=-1), 0.0)
         down = (weight[..., None] * displacement).sum((0, 1))
@@ -232,6 +232,22 @@ def estimate_up(
     return UpEvidence(
         float(found_pitch if pitch is None else pitch), float(found_roll if roll is None else roll), source, trust
     )
+
+
+def _tilt_of_stream(mask, displacement, confidence, camera, texture) -> tuple[slope.TiltEvidence | None, str]:
+    """What its motion and its pattern say, None where they say nothing; and which of them spoke."""
+    mean, sigma = PITCH_PRIOR["stream"]
+    # a chute is another plane than what it comes down onto
+    steep = chute.chute_pixels(level_camera(camera, UpEvidence(mean, 0.0, "", 0.0)), mask, displacement, confidence)
+    lying = confidence * ~np.any(steep, axis=0) if steep else confidence
+    patches = slope.flow_patches(mask, displacement, lying)
+    if patches is None:
+        return None, ""
+    tilt = slope.estimate_tilt(
+        camera, patches, lambda p, r: level_camera(camera, UpEvidence(p, r, "", 0.0)), (mean, sigma),
+        None if steep else texture,
+    )  # fmt: skip
+    return tilt, "perspective of the flow" + (" and of its pattern" if texture is not None and not steep else "")
 
 
 def level_camera(camera: PinholeCamera, up: UpEvidence) -> PinholeCamera:

@@ -5,6 +5,7 @@ In a frame with its origin at the camera, z up, and lengths in which the camera 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -33,6 +34,14 @@ LOST, MORE = 0.05, 0.15
 the height"""
 HEIGHTS = (0.02, 2.0)
 """between which a body's height is looked for"""
+STRAIGHT = 1.5
+"""px by which an outline may stray from the straight edges that it is made of"""
+EDGE_NOISE = 2.0
+"""px by which one end of an edge may lie beside the other: masks round off corners, and liquid has round edges"""
+OBLIQUE = 3.0
+"""standard errors from which an edge is taken to lie along the ground, or the top, and says nothing of the upright"""
+TILTS = np.arange(0.0, 80.5, 0.5)
+"""that are tried, degrees below the horizon"""
 
 
 @dataclass(frozen=True)
@@ -66,6 +75,40 @@ def meet(rays: np.ndarray, z: float) -> tuple[np.ndarray, np.ndarray]:
         return t, rays[..., :2] * t[..., None]
 
 
+def upright_tilt(
+    body: np.ndarray, pose: Callable[[float], PinholeCamera], usual: tuple[float, float]
+) -> tuple[float, float]:
+    """The camera's tilt from the upright edges of a body: they point to what lies straight below the camera.
+
+    Args:
+        body: bool [h,w], its pixels.
+        pose: the camera at the origin of a frame with z up, at a tilt in degrees below the horizon.
+        usual: mean and standard deviation of the tilt, before the picture is looked at, degrees.
+
+    Returns:
+        Mean and standard deviation of the tilt, degrees.
+    """
+    outlines, _ = cv2.findContours(body.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    hull = cv2.convexHull(max(outlines, key=cv2.contourArea))
+    corners = cv2.approxPolyDP(hull, STRAIGHT, True)[:, 0].astype(float) + 0.5
+    edges = np.roll(corners, -1, axis=0) - corners
+    middles, error = corners + 0.5 * edges, EDGE_NOISE / np.maximum(np.linalg.norm(edges, axis=1), 1.0)
+
+    def unlikely(tilt: float) -> float:
+        camera = pose(tilt)
+        x, y = ((middles - camera.center) / camera.focal).T
+        down = -camera.camera_from_world.rotation[:, 2]
+        along = np.stack([down[0] - x * down[2], down[1] - y * down[2]], axis=1) * camera.focal
+        sine = along[:, 0] * edges[:, 1] - along[:, 1] * edges[:, 0]
+        away = np.arctan(sine / np.where(np.abs(d := (along * edges).sum(axis=1)) > 1e-9, d, 1e-9))
+        return float(np.minimum((away / error) ** 2, OBLIQUE**2).sum() + ((tilt - usual[0]) / usual[1]) ** 2)
+
+    odds = np.array([unlikely(float(t)) for t in TILTS])
+    weight = np.exp(-0.5 * (odds - odds.min()))
+    mean = float((weight * TILTS).sum() / weight.sum())
+    return mean, float(np.sqrt((weight * (TILTS - mean) ** 2).sum() / weight.sum()))
+
+
 def raster_over(camera: PinholeCamera, wet: np.ndarray) -> Raster:
     """Columns over the ground that some pixels show.
 
@@ -87,25 +130,42 @@ def raster_over(camera: PinholeCamera, wet: np.ndarray) -> Raster:
 def columns_within(camera: PinholeCamera, raster: Raster, mask: np.ndarray, height: float) -> np.ndarray:
     """bool [n,m]: columns from the ground up to a height of which the picture shows nothing beside the mask."""
     h, w = mask.shape
-    shown = mask.astype(np.float32)
-    at, ok = raster.centers(), np.ones(raster.shape, bool)
-    beyond = OUTSIDE * max(h, w)
+    shown, beyond = mask.astype(np.float32), OUTSIDE * max(h, w)
+    i, j = np.meshgrid(*(np.arange(n) for n in raster.shape), indexing="ij")
+    index, ok = np.stack([j, i, np.ones_like(i)], axis=-1).astype(float), np.ones(raster.shape, bool)
     for z in np.linspace(0.0, height, LEVELS):
-        uv, depth = camera.project(np.concatenate([at, np.full((*at.shape[:2], 1), GROUND + z)], axis=-1))
-        uv = np.nan_to_num(uv, nan=-1e9, posinf=1e9, neginf=-1e9)
-        near = (uv > -beyond).all(-1) & (uv < np.array([w, h]) + beyond).all(-1) & (depth > 0)
-        share = ndimage.map_coordinates(shown, [uv[..., 1] - 0.5, uv[..., 0] - 0.5], order=1, mode="nearest")
-        ok &= near & (share > EDGE)
+        seen = index @ _pixel_from_column(camera, raster, z).T
+        depth = np.where(seen[..., 2] > 1e-9, seen[..., 2], np.nan)
+        u, v = (np.nan_to_num(seen[..., k] / depth, nan=-2.0 * beyond).clip(-1e4, 1e4) for k in (0, 1))
+        ok &= (u > -beyond) & (u < w + beyond) & (v > -beyond) & (v < h + beyond)
+        at = (u.astype(np.float32), v.astype(np.float32))
+        ok &= cv2.remap(shown, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) > EDGE
     return ok
 
 
 def silhouette(camera: PinholeCamera, raster: Raster, footprint: np.ndarray, height: float) -> np.ndarray:
     """bool [h,w]: pixels that see a prism."""
-    rays = camera.rays(camera.pixel_grid())
-    seen = np.zeros(rays.shape[:2], bool)
+    upwards = camera.rays(camera.pixel_grid())[..., 2]
+    columns, seen = footprint.astype(np.uint8), np.zeros(upwards.shape, bool)
+    nearest = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
     for z in np.linspace(0.0, height, LEVELS):
-        seen |= raster.at(footprint, meet(rays, GROUND + z)[1])
+        if abs(z + GROUND) < 1e-6:  # the camera is in that plane, and sees it as a line
+            continue
+        back = np.linalg.inv(_pixel_from_column(camera, raster, z))
+        seen |= (cv2.warpPerspective(columns, back, upwards.shape[::-1], flags=nearest) > 0) & (
+            upwards * (z + GROUND) > 0
+        )
     return seen
+
+
+def _pixel_from_column(camera: PinholeCamera, raster: Raster, z: float) -> np.ndarray:
+    """[3,3]: from (j, i, 1), a column at a height over the ground, to (u, v, 1) times its depth; both count the centre
+    of the first as 0."""
+    rotation, first = camera.camera_from_world.rotation, raster.low + 0.5 * raster.step
+    origin = rotation @ [*first, z + GROUND] + camera.camera_from_world.translation
+    lens = np.array([[camera.focal[0], 0.0, camera.center[0] - 0.5], [0.0, camera.focal[1], camera.center[1] - 0.5],
+                     [0.0, 0.0, 1.0]])  # fmt: skip
+    return lens @ np.stack([raster.step * rotation[:, 1], raster.step * rotation[:, 0], origin], axis=1)
 
 
 def tallest(camera: PinholeCamera, raster: Raster, mask: np.ndarray) -> float:

@@ -50,6 +50,9 @@ FREEDOM = np.array([0.08, 0.25, 0.6, 1.2])
 """how far the field may be from uniform, as multiples of `USUAL`; each as likely"""
 NOISE = np.array([0.015, 0.03, 0.06, 0.12, 0.24])
 """px over the mean displacement; each as likely"""
+TURNS = np.radians(np.arange(-12.0, 13.0, 3.0))
+"""about the headings that fit the mean motion: the steeper a plane, the more headings look alike, and the best alone
+draws slopes down"""
 LEAST_NOISE = 0.05
 """px, of optical flow at its best"""
 USUAL = np.array([1.0, 0.25, 0.5, 0.2, 0.3, 0.18, 0.15, 0.2, 0.05, 0.08, 0.2, 0.1, 0.1])
@@ -123,8 +126,7 @@ def flow_patches(
     if kept.sum() < FEWEST:
         return None
     at, flow = medians[kept, :2], medians[kept, 2:]
-    weight = _robust_weights(at, flow, np.clip(share[kept], 0.0, 1.0))
-    return FlowPatches(at + 0.5 * flow, flow, weight)
+    return FlowPatches(at + 0.5 * flow, flow, _robust_weights(at, flow, np.clip(share[kept], 0.0, 1.0)))
 
 
 def estimate_slope(camera: PinholeCamera, patches: FlowPatches | None, *, tilt_known: bool = True) -> SlopeEvidence:
@@ -142,8 +144,7 @@ def estimate_slope(camera: PinholeCamera, patches: FlowPatches | None, *, tilt_k
     if patches is None:
         return SlopeEvidence(0.0, STEEP, 0.0, 1.0, 0.0, "prior: too little motion to tell")
     slopes = np.arange(0.0, STEEPEST + 1.0, 2.0)
-    best = [best_heading(camera, patches, np.radians(s)) for s in slopes]
-    log = np.array([b[0] for b in best])
+    log = np.array([heading_evidence(camera, patches, np.radians(s))[0] for s in slopes])
     if not np.isfinite(log).any():
         return SlopeEvidence(0.0, STEEP, 0.0, 1.0, 0.0, "prior: no plane is seen by the camera in all of it")
     likelihood = np.exp(log - log.max())
@@ -152,11 +153,8 @@ def estimate_slope(camera: PinholeCamera, patches: FlowPatches | None, *, tilt_k
     level = LEVEL * likelihood[0] / (LEVEL * likelihood[0] + (1.0 - LEVEL) * falling)
     mean = float((share * slopes).sum() / max(falling, 1e-300))
     error = float(np.sqrt((share * (slopes - mean) ** 2).sum() / max(falling, 1e-300)))
-    slope = mean if level < 0.5 else 0.0
-    if not tilt_known:
-        slope = (1.0 - level) * mean
-    # the heading that fits the mean motion on that very slope: on a neighbouring one it is off by up to two degrees
-    heading = best_heading(camera, patches, np.radians(slope))[1]
+    slope = (mean if level < 0.5 else 0.0) if tilt_known else (1.0 - level) * mean
+    heading = heading_evidence(camera, patches, np.radians(slope))[1]
     source = "perspective of the motion" if slope > 0 else "prior: the motion does not speak against a level stream"
     return SlopeEvidence(slope, UNMODELLED * max(error, 1.0), float(np.degrees(heading)), float(level), mean, source)
 
@@ -194,8 +192,8 @@ def estimate_tilt(
     share /= share.sum()
     pitch = float((share.sum((1, 2)) * pitches).sum())
     error = float(np.sqrt((share.sum((1, 2)) * (pitches - pitch) ** 2).sum()))
-    gained = 1.0 - min(error / pitch_prior[1], 1.0) ** 2
-    return TiltEvidence(pitch, float((share.sum((0, 2)) * rolls).sum()), error, gained)
+    roll = float((share.sum((0, 2)) * rolls).sum())
+    return TiltEvidence(pitch, roll, error, 1.0 - min(error / pitch_prior[1], 1.0) ** 2)
 
 
 def _texture_evidence(
@@ -253,6 +251,17 @@ def best_heading(camera: PinholeCamera, patches: FlowPatches, slope: float) -> t
     """(log evidence, heading in rad) of the better of the headings that fit the mean motion."""
     found = [(plane_evidence(camera, patches, plane_axes(slope, h))[0], h) for h in headings(camera, patches, slope)]
     return max(found, default=(-np.inf, 0.0))
+
+
+def heading_evidence(camera: PinholeCamera, patches: FlowPatches, slope: float) -> tuple[float, float]:
+    """(log evidence, mean heading in rad) with the heading integrated out about those that fit the mean motion."""
+    tried = np.add.outer(headings(camera, patches, slope), TURNS)
+    log = np.array([[plane_evidence(camera, patches, plane_axes(slope, h))[0] for h in row] for row in tried])
+    if not np.isfinite(log).any():
+        return -np.inf, 0.0
+    share = np.exp(log - log.max())
+    side = int(np.argmax(share.sum(axis=1)))
+    return float(logsumexp(log)), float(np.average(tried[side], weights=share[side]))
 
 
 def plane_axes(slope: float, heading: float) -> Float[np.ndarray, "3 3"]:

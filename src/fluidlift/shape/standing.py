@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy import ndimage
+from scipy import ndimage, stats
 
 from fluidlift.errors import InputRejected
 from fluidlift.shape.ground_mesh import ground_mesh
@@ -39,8 +39,6 @@ STILL = 0.02
 """share of the outline's area that changes while the body is still held: noise of the mask"""
 CALM = 0.85
 """share of the clip's last part in which ground of the basin is under water: less often only waves are seen there"""
-DRY = 0.05
-"""share of the frames in which a solid that stands in the water may be taken for wet"""
 SMALLEST = 0.004
 """share of the water's pixels from which what hides it is a solid"""
 FRONT = 1.55
@@ -108,7 +106,6 @@ def find_standing(
     camera: PinholeCamera,
     first: Bool[np.ndarray, "h w"],
     often: Float[np.ndarray, "h w"],
-    never: Bool[np.ndarray, "h w"],
 ) -> StandingBody:
     """The prism, its basin and what stands in it.
 
@@ -116,7 +113,6 @@ def find_standing(
         camera: canonical, z up, at the origin.
         first: the body before it is let go.
         often: share of the clip's last part in which a pixel is wet.
-        never: pixels that are (nearly) never wet.
 
     Raises:
         InputRejected: the camera does not look down on the ground.
@@ -129,7 +125,7 @@ def find_standing(
         raise InputRejected("no upright body fits the outline of the fluid", "a body that stands on level ground",
                             "give --pitch, or another --kind")  # fmt: skip
     basin, level = _basin(camera, raster, often > CALM, footprint, height)
-    pillars, solid = _pillars(camera, raster, often > 0.5, never, (basin, level, height))
+    pillars, solid = _pillars(camera, raster, often > 0.5, ~first & (often <= 0.5), (basin, level, height))
     return StandingBody(raster, footprint, height, basin, level, pillars, solid)
 
 
@@ -275,7 +271,8 @@ def _basin(camera, raster: Raster, settled: np.ndarray, footprint: np.ndarray, h
 def _walled(raster: Raster, basin: np.ndarray, footprint: np.ndarray) -> np.ndarray:
     """The basin no wider than a body that stands at one of its sides: that one is a dam, from wall to wall.
 
-    The far side of the basin is the least sure: waves hide it.
+    The far side of the basin is the least sure: waves hide it. So is the end of such a channel, where the front climbs
+    the wall: the ground behind that water seems wet, but for the near side, where the eye passes by it.
     """
     at = raster.centers()
     way = at[basin].mean(axis=0) - at[footprint].mean(axis=0)
@@ -288,22 +285,32 @@ def _walled(raster: Raster, basin: np.ndarray, footprint: np.ndarray) -> np.ndar
     width = high - low
     if min(low - left, right - high) > AT_THE_WALL * width:
         return basin
-    return basin & (place > low - AT_THE_WALL * width) & (place < high + AT_THE_WALL * width)
+    basin = basin & (place > low - AT_THE_WALL * width) & (place < high + AT_THE_WALL * width)
+    # from the side that is nearer to the eye
+    depth = place if abs(low) < abs(high) else -place
+    station = np.round((at @ [-across[1], across[0]]) / raster.step).astype(int)
+    station -= station.min()
+    begins = np.full(station.max() + 1, np.inf)
+    np.minimum.at(begins, station[basin], depth[basin])
+    seen = np.flatnonzero(np.isfinite(begins))
+    slope, level = stats.theilslopes(begins[seen], seen)[:2]  # it seems askew where the tilt is not known well
+    reach, _ = ndimage.label(begins < slope * np.arange(len(begins)) + level + AT_THE_WALL * width)
+    return basin & (reach == reach[int(np.median(station[footprint]))])[station] | footprint
 
 
-def _pillars(camera, raster: Raster, settled, never, body) -> tuple[tuple[Pillar, ...], np.ndarray]:
-    """What hides level water, by pixels of its surface that are never wet; and all pixels that show it."""
+def _pillars(camera, raster: Raster, settled, dry, body) -> tuple[tuple[Pillar, ...], np.ndarray]:
+    """What hides level water, by pixels of its surface that are mostly dry; and all pixels that show it."""
     basin, level, height = body
-    hidden = never & ~settled & silhouette(camera, raster, ndimage.binary_erosion(basin, iterations=2), level)
+    hidden = dry & silhouette(camera, raster, ndimage.binary_erosion(basin, iterations=2), level)
     hidden = ndimage.binary_opening(hidden, iterations=2)
     parts, count = ndimage.label(hidden)
-    rays, out, shown = camera.rays(camera.pixel_grid()), [], np.zeros(never.shape, bool)
+    rays, out, shown = camera.rays(camera.pixel_grid()), [], np.zeros(dry.shape, bool)
     for k in range(1, count + 1):
         part = parts == k
-        if part.sum() < SMALLEST * settled.sum():
-            continue
         widths = part.sum(axis=1)
         rows, columns = np.nonzero(part)
+        if part.sum() < SMALLEST * settled.sum() or not _in_water(part, settled):
+            continue
         lowest = int(np.median([_foot(settled[:, c], rows[columns == c].max()) for c in np.unique(columns)]))
         t, xy = meet(rays[lowest, round(columns.mean())], GROUND + level)
         if not np.isfinite(t):
@@ -318,8 +325,22 @@ def _pillars(camera, raster: Raster, settled, never, body) -> tuple[tuple[Pillar
         out.append(Pillar((float(center[0]), float(center[1])), radius, max(top, GROUND + height)))
         disc = np.hypot(*np.moveaxis(raster.centers() - out[-1].center, -1, 0)) < radius
         shown |= silhouette(camera, raster, disc, top - GROUND)
-        shown |= never & silhouette(camera, raster, disc, out[-1].top - GROUND)
+        shown |= dry & silhouette(camera, raster, disc, out[-1].top - GROUND)
     return tuple(out), shown
+
+
+def _in_water(part: np.ndarray, wet: np.ndarray) -> bool:
+    """Whether there is water close by on both sides of most rows of a part: else it is the edge of the basin.
+
+    Close is less than the part's own width: drops that run down a solid leave dry pixels beside it.
+    """
+    rows, columns = np.nonzero(part)
+    wide = int(np.ptp(columns)) + 1
+    beside = []
+    for row in np.unique(rows):
+        first, last = columns[rows == row][[0, -1]]
+        beside.append(wet[row, max(first - wide, 0) : first].any() and wet[row, last + 1 : last + 1 + wide].any())
+    return float(np.mean(beside)) > 0.5
 
 
 def _foot(wet: np.ndarray, row: int) -> int:

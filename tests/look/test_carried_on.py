@@ -1,0 +1,57 @@
+"""A liquid's surface next to solids: no dry ring around rocks, no film where no ground is near."""
+
+import numpy as np
+import pytest
+
+from fluidlift.look.carried_on import carried_on
+from fluidlift.look.liquid import LiquidSurface
+from fluidlift.types import PinholeCamera
+
+CAMERA = PinholeCamera.looking(np.array([0.0, -2.0, 2.0]), np.array([0.0, 0.2, 0.0]), 45.0, (160, 120))
+REACH, DEEP, BANK, STEEP = 0.1, 0.3, 0.5, np.tan(np.radians(60))
+"""m; m; y of the foot of a bank, m; its slope"""
+SHORE = BANK + DEEP / STEEP
+
+
+def scene(gap: float) -> tuple[LiquidSurface, np.ndarray, np.ndarray]:
+    """Water at z = 0 that ends `gap` (m) before its bank and at x = 0.4; the ground; where its plane is met."""
+    rays, eye = CAMERA.rays(CAMERA.pixel_grid()), CAMERA.position
+    z = -eye[2] / rays[..., 2]
+    place = eye + z[..., None] * rays
+    bed = (-DEEP - eye[2]) / rays[..., 2]
+    bank = (STEEP * (eye[1] - BANK) - DEEP - eye[2]) / (rays[..., 2] - STEEP * rays[..., 1])
+    ground = np.where(bank > 0, np.minimum(bed, bank), bed)
+    wet = (place[..., 1] < SHORE - gap) & (place[..., 0] < 0.4)
+    flat, up = wet.astype(np.float32), np.zeros((*wet.shape, 3), np.float32)
+    up[wet] = 0, 0, 1
+    thick = flat * (ground - z) * np.linalg.norm(rays, axis=-1)
+    return LiquidSurface(flat * z, up, thick, 0.2 * np.ones_like(up), flat), ground, place
+
+
+@pytest.mark.parametrize("gap", [0.3, 0.8])
+def test_a_level_surface_goes_on_to_the_bank_that_comes_out_of_it(gap):
+    surface, ground, place = scene(gap * REACH)
+    found = carried_on(surface, ground, CAMERA, REACH)
+    x, y = place[..., 0], place[..., 1]
+    ring = (y > SHORE - gap * REACH) & (y < SHORE - 0.01) & (np.abs(x) < 0.25)
+    assert ring.any() and not surface.covered[ring].any()
+    assert (found.covered[ring] > 0.9).all()
+    exact = -CAMERA.position[2] / CAMERA.rays(CAMERA.pixel_grid())[..., 2]
+    np.testing.assert_allclose(found.depth[ring], exact[ring], rtol=1e-4)  # the mean of planes is a plane; float32
+    room = (ground - exact) * np.linalg.norm(CAMERA.rays(CAMERA.pixel_grid()), axis=-1)
+    np.testing.assert_allclose(found.thickness[ring], room[ring], atol=1e-3)
+    np.testing.assert_allclose(found.normal[ring], np.broadcast_to((0, 0, 1), (ring.sum(), 3)), atol=1e-5)
+    ashore = y > SHORE + 0.01
+    assert not found.covered[ashore].any()
+
+
+def test_what_there_was_stays_and_nothing_comes_where_no_ground_is_near():
+    surface, ground, place = scene(0.5 * REACH)
+    found = carried_on(surface, ground, CAMERA, REACH)
+    wet = surface.covered > 0
+    for name in ("depth", "normal", "thickness", "albedo", "covered"):
+        np.testing.assert_array_equal(getattr(found, name)[wet], getattr(surface, name)[wet])
+    open_end = (place[..., 0] > 0.4) & (place[..., 1] < SHORE - 2 * REACH)
+    assert open_end.any() and not found.covered[open_end].any()
+    air = carried_on(surface, np.zeros_like(ground), CAMERA, REACH)
+    np.testing.assert_array_equal(air.covered, surface.covered)

@@ -199,6 +199,30 @@ def test_the_trembling_shadow_of_smoke_is_no_smoke():
     assert overlap(fluid[20], truth[20]) > 0.85  # as without a shadow
 
 
+def spilled(rng: np.random.Generator, *, frames: int = 24) -> tuple[np.ndarray, np.ndarray, tuple[slice, slice]]:
+    """Blue water before a brown wall, that runs where its shadow lay; pictures, true masks, the first shadow."""
+    pictures, truth = still_room(rng, frames=frames), np.zeros((frames, HEIGHT, WIDTH), bool)
+    shadow, grain = (slice(70, 110), slice(76, 100)), texture(rng, (HEIGHT, WIDTH), sigma=2.5)
+    for t in range(frames):
+        front = max(100 - 4 * t, 10)
+        truth[t, 30 + 2 * t :, 100:130], truth[t, 70:, front:100] = True, True
+        truth[t, 110:] = False
+        water = np.array([40.0, 75.0, 120.0]) + 15.0 * np.roll(grain, -4 * t, axis=1)[..., None]  # as dark as a shadow
+        shade = np.zeros((HEIGHT, WIDTH), bool)
+        shade[70:110, max(front - 24, 0) : front] = True
+        pictures[t][shade] *= 0.6
+        pictures[t][truth[t]] = water[truth[t]]
+    return pictures, truth, shadow
+
+
+def test_the_shadow_of_coloured_water_is_ground_though_no_light_ever_falls_there():
+    pictures, truth, shadow = spilled(np.random.default_rng(3))
+    fluid = segment(clip_of(pictures), no_flow(24)).fluid
+    assert fluid[0][shadow].mean() < 0.05  # 0.25 by brightness alone
+    for t in (0, 4, 8, 12, 20):  # 0.82 to 0.93
+        assert overlap(fluid[t], truth[t]) > 0.95, t
+
+
 def test_the_mask_of_the_user_wins_with_confidence_one(river):
     clip, flow = river
     mask = np.zeros((HEIGHT, WIDTH), bool)

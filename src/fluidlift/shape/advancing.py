@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import cv2
 import numpy as np
 
-from fluidlift.shape.background import DECISIVE, filled_in, still_background, typical_contrast
+from fluidlift.shape.background import DECISIVE, filled_in, own_tint, still_background, typical_contrast
 from fluidlift.shape.evidence import POOLING, Evidence, change_over_time, pool
 from fluidlift.shape.min_cut import disc
 from fluidlift.shape.presence import Presence
@@ -16,6 +16,9 @@ from fluidlift.types.clip import Label
 
 SHADOW = 0.2
 """factor on changes of brightness against the sign of the fluid's own contrast"""
+TINGED, TINT_BLUR = 0.4, 1.5
+"""of the fluid's own colour, in the mean over px: what is darker than the ground and has less is ground in shade, which
+may be tinged by the sky"""
 FAINTEST = 0.5
 """of the fluid's typical contrast with the background: an outline lies where fluid and background mix half and half"""
 GAP = 0.012
@@ -57,6 +60,7 @@ def odds_over_time(
     contrast, brightens = typical_contrast(evidence, presence, background, known)
     threshold = np.maximum(4.0 * evidence.noise, FAINTEST * contrast)
     background = filled_in(background, known)
+    tint = own_tint(evidence, presence, background, known)
     sigma = POOLING * max(evidence.noise.shape)
     for t, change in enumerate(change_over_time(evidence)):
         picture = evidence.source[t].astype(np.float32)
@@ -65,6 +69,9 @@ def odds_over_time(
         size = np.abs(change_of_colour).sum(axis=-1)
         differs = size / threshold
         shaded = change_of_colour[..., 0] * brightens < -0.5 * size
+        if tint is not None:
+            darker = change_of_colour[..., 0] < -0.5 * size
+            shaded |= darker & (cv2.GaussianBlur(tint(picture), (0, 0), TINT_BLUR) < TINGED)
         differs[shaded] *= SHADOW
         stands_out = np.log(np.maximum(differs, 1e-3)) / 0.3
         seen = stands_out + 0.25 * np.clip(moved, -4.0, 4.0)

@@ -23,6 +23,9 @@ ROUNDS = 3
 """in which the colours of the scene are read anew from all of it that is known"""
 OWN = 0.5
 """trust in the fluid's colours above which it has colours of its own: through clear water edges are those behind it"""
+TINTED = 0.6
+"""of the places that move must have at least half of their typical colour difference, or the fluid has none of its own;
+they reach a little over its outline"""
 SURE = 2.0
 """log odds from which a place where no background was seen is held to be fluid"""
 
@@ -159,6 +162,32 @@ def typical_contrast(
     brightness = together[:, 0]
     bias = float(brightness.sum() / max(float(np.abs(brightness).sum()), 1e-6))
     return float(np.median(np.abs(together).sum(axis=-1))), float(np.sign(bias)) if abs(bias) > 0.7 else 0.0
+
+
+def own_tint(
+    evidence: Evidence, presence: Presence, background: np.ndarray, known: np.ndarray
+) -> Callable[[np.ndarray], np.ndarray] | None:
+    """How much of the fluid's colour a picture of opponent colours [h,w,3] has, 1 in the fluid and 0 in any shade of
+    the background; None where the fluid has no colour of its own.
+
+    A shadow scales all colours of the ground alike. What is left of a change after that is along the fluid's own
+    colour difference, nearly everywhere where it moves, or that difference is none.
+    """
+    moving = [(evidence.source[t], active & known) for t, active in zip(presence.picked, presence.active, strict=True)]
+    tints = np.concatenate([(_tint(picture, background))[where] for picture, where in moving])
+    if len(tints) == 0:
+        return None
+    own = np.median(tints, axis=0)
+    size = float(own @ own)
+    if size == 0.0 or float((tints @ own > 0.5 * size).mean()) < TINTED:
+        return None
+    return lambda picture: _tint(picture, background) @ own / size
+
+
+def _tint(picture: np.ndarray, background: np.ndarray) -> np.ndarray:
+    """[h,w,2], colour differences less those of the background in as much light."""
+    light = np.clip(picture[..., :1] / np.maximum(background[..., :1], 1.0), 0.0, 1.0)
+    return picture[..., 1:] - light * background[..., 1:]
 
 
 def colour_bins(colours: np.ndarray, *, bins: int = 16) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -1,10 +1,11 @@
-"""Where the liquid leaves: how thick the outlet is."""
+"""Where the liquid leaves: how thick the outlet is, and that it does not fill up."""
 
 import numpy as np
 import pytest
 
-from fluidlift.physics.outlet import OUTLET_CELLS, thin_outlet
-from fluidlift.types import CellType
+from fluidlift.physics.outlet import OUTLET_CELLS, OVERFULL, surplus, thin_outlet
+from fluidlift.physics.transfer import sort_by_cell
+from fluidlift.types import CellType, Grid
 
 THICK = int(OUTLET_CELLS)
 
@@ -35,3 +36,23 @@ def test_an_outlet_that_is_thin_already_stays_as_it_is(outlet):
 def test_a_closed_basin_has_no_outlet_to_change():
     closed = np.where(channel() == CellType.OUTFLOW, CellType.FLUID, channel())
     np.testing.assert_array_equal(thin_outlet(closed), closed)
+
+
+def test_what_crowds_in_the_outlet_has_left_the_heaviest_first_and_nothing_else():
+    grid, rng = Grid((4, 3, 3), 0.1), np.random.default_rng(0)
+    positions = (grid.low + rng.uniform(0, 1, (900, 3)) * 0.1 * np.array(grid.shape)).astype(np.float32)
+    masses = rng.uniform(0.1, 0.5, 900).astype(np.float32)  # some 25 particles a cell: 7 kg where 1 kg is full
+    outflow = np.zeros(grid.shape, bool)
+    outflow[-1] = True
+    gone = surplus(masses, sort_by_cell(positions, grid), outflow, 1.0)
+    cell = grid.cell_of(positions)
+    assert not gone[cell[:, 0] < 3].any()
+    for place in np.argwhere(outflow):
+        here = (cell == place).all(axis=1)
+        kept = here & ~gone
+        assert masses[kept].sum() <= OVERFULL
+        # no more than it takes: the lightest that went would not have had room
+        assert masses[kept].sum() + masses[here & gone].min() > OVERFULL
+        assert masses[kept].max() <= masses[here & gone].min()
+    held = surplus(masses, sort_by_cell(positions, grid), outflow, 100.0)
+    assert not held.any()

@@ -18,6 +18,7 @@ from fluidlift.physics.crowding import fill_ratio, spreading
 from fluidlift.physics.emitter import Supply
 from fluidlift.physics.liquid_grid import Layout, LiquidGrid
 from fluidlift.physics.numba_particles import ParticleWork
+from fluidlift.physics.outlet import surplus
 from fluidlift.physics.pressure import build_system
 from fluidlift.physics.reseed import inner_cells, reseed
 from fluidlift.physics.rigid import RigidBodies, RigidBody
@@ -52,9 +53,9 @@ class LiquidSimulator(LiquidGrid):
     particles that leave there are removed. The terrain's signed distance decides what is solid.
 
     Outlet: particles flow freely and are removed when they leave the box there, or when they leave the OUTFLOW cells
-    along the mainstream. Columns of liquid that stand on the ground inside OUTFLOW cells have the hydrostatic pressure
-    of the water level they start with (see `physics.outlet`). `parameters.outflow_velocity` is used only with
-    `settings.prescribe_outflow`.
+    along the mainstream, or crowd there (`outlet.surplus`). Columns of liquid that stand on the ground inside OUTFLOW
+    cells have the hydrostatic pressure of the water level they start with (see `physics.outlet`).
+    `parameters.outflow_velocity` is used only with `settings.prescribe_outflow`.
 
     Masses: the initial particles get the mass of the space around them (their mean spacing where they are sparser
     than usual), since Gaussians sample a body unevenly; the masses given are replaced.
@@ -190,6 +191,8 @@ class LiquidSimulator(LiquidGrid):
         rules = MoveRules(dt, self.parameters.restitution, keep, self.settings.max_stretch)
         state = self._work.mover.moved(particles, moves, velocities, affine, walls, rules)
         gone = leaving(particles.positions, state.positions, walls, self._mainstream)
+        full = self.parameters.density * grid.spacing**3
+        gone |= surplus(particles.masses, order, window.walls.regions == CellType.OUTFLOW, full)
         if bodies is not None:
             bodies.advance()
             gone |= bodies.push_out(state.positions, state.velocities, tangential_share=keep)

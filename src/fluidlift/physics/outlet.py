@@ -10,13 +10,20 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
+from numba import njit
 from scipy import ndimage
 
 from fluidlift.physics.boundaries import Walls
+from fluidlift.physics.transfer import CellOrder
 from fluidlift.types import CellType, FaceVelocity
 
 OUTLET_CELLS = 3.0
 """cells of OUTFLOW that liquid passes before it is taken away: one for its level, one each side of it for gradients"""
+
+OVERFULL = 3.0
+"""of what an OUTFLOW cell holds, from which the surplus has left. The pressure is given there, so nothing keeps the
+flow from converging, and particles that run together would gather for ever; one cell may take in what its neighbours in
+the outlet lack"""
 
 
 def thin_outlet(cell_types: UInt8[np.ndarray, "nx ny nz"]) -> UInt8[np.ndarray, "nx ny nz"]:
@@ -105,3 +112,35 @@ def hold_columns(
         inner -= np.where(here[1:] & here[:-1] & (opening[1:-1] > 0), change / walls.grid.spacing, 0.0)
         out.append(new)
     return FaceVelocity(*out)
+
+
+def surplus(
+    masses: Float[np.ndarray, " n"], order: CellOrder, outflow: Bool[np.ndarray, "nx ny nz"], full: float
+) -> Bool[np.ndarray, " n"]:
+    """Particles that OUTFLOW cells hold beyond `OVERFULL`, the heaviest first: clumps merge.
+
+    Args:
+        masses: kg.
+        order: from `transfer.sort_by_cell`, on the grid of `outflow`.
+        outflow: the cells of the outlet.
+        full: kg that a cell holds.
+    """
+    gone = np.zeros(len(masses), bool)
+    _mark_surplus(masses, order.order, order.start, np.flatnonzero(outflow), OVERFULL * full, gone)
+    return gone
+
+
+@njit(cache=True)
+def _mark_surplus(masses, order, start, cells, most, gone):
+    for c in cells:
+        here = order[start[c] : start[c + 1]]
+        held = 0.0
+        for p in here:
+            held += masses[p]
+        if held <= most:
+            continue
+        for p in here[np.argsort(-masses[here], kind="mergesort")]:
+            if held <= most:
+                break
+            gone[p] = True
+            held -= masses[p]

@@ -285,7 +285,7 @@ def _walled(raster: Raster, basin: np.ndarray, footprint: np.ndarray) -> np.ndar
     width = high - low
     if min(low - left, right - high) > AT_THE_WALL * width:
         return basin
-    basin = basin & (place > low - AT_THE_WALL * width) & (place < high + AT_THE_WALL * width)
+    basin = basin & (place >= place[footprint].min()) & (place <= place[footprint].max())
     # from the side that is nearer to the eye
     depth = place if abs(low) < abs(high) else -place
     station = np.round((at @ [-across[1], across[0]]) / raster.step).astype(int)

@@ -37,11 +37,11 @@ TRACED = 0.02
 """share of the light from which that is worth it"""
 FAR_AWAY = 1e6
 """px, beyond any rim"""
-SHARE, MIRROR, THROUGH, PATH, OUTSIDE, TURNED, INWARD, COLOR, SPREAD = 0, 1, 4, 7, 8, 9, 10, 13, 16
-FARTHER, BEYOND, SECOND, WIDE = 17, 18, 19, 22
 APART = 4.0 / math.sqrt(3.0)
 """the next pixel's light goes 4 WIDE beside this one's; a bilinear look-up of means over a texel is as wide as a box of
 sqrt(3) texels"""
+SHARE, MIRROR, THROUGH, PATH, OUTSIDE, TURNED, INWARD, COLOR, SPREAD = 0, 1, 4, 7, 8, 9, 10, 13, 16
+FARTHER, BEYOND, SECOND, WIDE = 17, 18, 19, 22
 """places in the numbers of a ray: see `follow`"""
 NUMBERS = 23
 """of a ray"""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fluidlift.fit import buoyancy
-from fluidlift.fit.buoyancy import RisingSmoke, buoyancy_from_rise, course, upper_end
+from fluidlift.fit.buoyancy import RisingSmoke, buoyancy_from_rise, course
 from fluidlift.types import CellType, FaceVelocity, FluidParameters, Grid, PinholeCamera, Terrain, TriangleMesh
 
 GRID = Grid((14, 14, 30), 0.1, (-0.7, -0.7, 0.0))
@@ -98,12 +98,3 @@ def test_the_course_ends_where_the_smoke_leaves_the_picture():
     assert np.diff(rows) == pytest.approx(np.full(11, -2.0), abs=0.1)  # 3 % of a body that grows: a little deeper
     assert course(lambda k: masks[k], 5) is None
     assert course(lambda k: masks[k + 14], 6) is None
-
-
-def test_the_upper_end_moves_with_an_outline_by_parts_of_rows():
-    rows = np.zeros(50)
-    rows[20:40] = 10.0
-    lower = 0.5 * (rows + np.roll(rows, 1))  # by half a row
-    # 3 % are 0.6 rows, of which half a row has half the width
-    assert upper_end(rows) == pytest.approx(20.6)
-    assert upper_end(lower) == pytest.approx(21.1)

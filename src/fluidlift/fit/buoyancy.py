@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from fluidlift.errors import FluidliftError
 from fluidlift.fit.coarsen import coarsen_cells, coarsen_terrain, coarsen_velocity
+from fluidlift.numerics.outline import upper_end
 from fluidlift.physics.gas import GasSimulator
 from fluidlift.types import CellType, FaceVelocity, FluidParameters, Particles, PinholeCamera, Terrain
 
@@ -29,8 +30,6 @@ FEWEST_FRAMES = 6
 """in which the upper end is in the picture; fewer are no course"""
 LEAST_RISE = 0.1
 """of the body's height, that the outline must rise by: a plume that stands as high as it gets says nothing"""
-UPPER = 0.03
-"""share of the outline's area above its upper end, as for the front (`motion.front`)"""
 WIDEST = 32.0
 """factor on either side of the first guess that is looked at"""
 STRIDE = math.log(3.0)
@@ -154,12 +153,6 @@ def _distance(smoke: RisingSmoke) -> float:
     """Camera z of the middle of the smoke, m."""
     centers = smoke.terrain.grid.centers()[smoke.cell_types == CellType.FLUID]
     return float(np.median(smoke.camera.project(centers)[1]))
-
-
-def upper_end(rows: Float[np.ndarray, " h"]) -> float:
-    """Row above which `UPPER` of an outline lies, whose area per row is given; between rows where it falls there."""
-    total = np.concatenate([[0.0], np.cumsum(rows)])
-    return float(np.interp(UPPER * total[-1], total, np.arange(len(total))))
 
 
 def course(outline: Callable[[int], Bool[np.ndarray, "h w"]], frames: int) -> list[float] | None:

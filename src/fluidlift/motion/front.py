@@ -9,6 +9,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float
 
+from fluidlift.numerics.outline import upper_end
+
 LARGEST_FACTOR = 3.0
 """nothing is raised beyond so many times the best seen rise: from there the silhouette says more about the mask than
 about the fluid"""
@@ -38,10 +40,10 @@ ROWS = 0.03
 def cap_speed(masks: Bool[np.ndarray, "t h w"], t: int, *, half_window: int = 6) -> float:
     """Speed (px per frame, positive upwards) of the upper end of the silhouette around frame t.
 
-    The upper end is the row above which 3 % of the silhouette lie; its slope over a window is a median of pairwise
-    slopes (Theil-Sen), so that single bad masks do not count. The window grows from `half_window` on either side until
-    the end has risen by `COURSE` of the body's height: a thing that stands before the cap, or is taken for smoke, holds
-    up the mask, and not the smoke. 0 where the silhouette touches the upper border.
+    The slope of the upper end (`numerics.outline`) over a window is a median of pairwise slopes (Theil-Sen), so that
+    single bad masks do not count. The window grows from `half_window` on either side until the end has risen by
+    `COURSE` of the body's height: a thing that stands before the cap, or is taken for smoke, holds up the mask, and not
+    the smoke. 0 where the silhouette touches the upper border.
     """
     ends = np.array([_upper_end(mask) for mask in masks])
     rows = np.flatnonzero(masks[t].any(axis=1))
@@ -57,11 +59,11 @@ def cap_speed(masks: Bool[np.ndarray, "t h w"], t: int, *, half_window: int = 6)
 
 
 def _upper_end(mask: np.ndarray) -> float:
-    """Row above which 3 % of the silhouette lie; not a number where there is none, or it is cut off."""
+    """Row of the upper end of a silhouette; not a number where there is none, or it is cut off."""
     count = mask.sum(axis=1)
     if count.sum() == 0 or mask[:2].any():
         return np.nan
-    return float(np.searchsorted(np.cumsum(count), 0.03 * count.sum()))
+    return upper_end(count)
 
 
 def _slope(frames: np.ndarray, rows: np.ndarray) -> float:

@@ -20,6 +20,7 @@ from fluidlift.pipeline.preview import (
     preview_scene,
     thinned,
 )
+from fluidlift.pipeline.simulating import simulator_of
 from fluidlift.types import (
     CellType,
     FaceVelocity,
@@ -140,11 +141,12 @@ class Studio:
     """Stands in for the simulator: frames come when they are allowed to, and some edits break."""
 
     def __init__(self, monkeypatch, total=4):
-        self.total, self.allowed, self.served = total, threading.Semaphore(0), []
+        self.total, self.allowed, self.served, self.asked = total, threading.Semaphore(0), [], []
         monkeypatch.setattr(preview, "preview_scene", self.scene)
         monkeypatch.setattr(preview, "preview_frames", self.frames)
 
     def scene(self, asset, folder, edits, frames):
+        self.asked.append(edits)
         if edits.get("refused"):
             raise InputRejected("a gravity of nothing", "numbers")
         scene = type("Scene", (), {})()
@@ -193,6 +195,26 @@ def until(condition, seconds=10.0):
 
 def wish(name, **edits):
     return Wish({"name": name} | edits, f"{name} moved")
+
+
+def test_what_an_edit_may_bring_is_rehearsed_on_a_scene_that_bears_it(tmp_path):
+    thick, floating = (preview_scene(tank(), tmp_path, edits, 2) for edits in preview.rehearsals(tank()))
+    simulator = simulator_of(thick)
+    assert simulator.advance(thick.interval).viscosity  # solved for, which water at this resolution is not
+    assert not simulator_of(preview_scene(tank(), tmp_path, {}, 2)).advance(thick.interval).viscosity
+    frames = list(preview_frames(floating))
+    assert len(frames) == 2 and frames[1].poses.shape == (1, 7)
+    assert frames[1].poses[0, 2] != frames[0].poses[0, 2]  # it moves
+
+
+def test_nothing_is_rehearsed_once_somebody_wants_something(studio, tmp_path):
+    worker = LivePreview(tank(), tmp_path)
+    worker.ask(wish("a"))
+    studio.let(4)
+    worker.start()
+    until(lambda: worker.shown is not None and worker.shown.complete)
+    assert [edits for edits in studio.asked if edits] == [{"name": "a"}]
+    worker.close()
 
 
 def test_a_wish_is_shown_frame_by_frame_until_it_is_complete(live, studio):

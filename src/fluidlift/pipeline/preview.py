@@ -152,6 +152,16 @@ def _shown(scene: Scene, simulator: Any, dressing: Dressing, number: int) -> Pre
     return PreviewFrame(number, shown.gaussians, shown.velocities, poses, scene.terrain.grid.spacing)
 
 
+def rehearsals(asset: FluidAsset) -> tuple[dict[str, Any], ...]:
+    """Edits that between them take a live preview through what no scene needs unless it is edited: viscosity that
+    counts on any grid, and a body that floats."""
+    grid = asset.terrain.grid
+    thick = 0.01 * grid.spacing**2 / asset.interval
+    place = np.median(asset.rest.means, axis=0).tolist()
+    ball = {"shape": "sphere", "radius": 2.5 * grid.spacing, "position": place, "motion": "free", "density": 500.0}
+    return {"parameters": {"kinematic_viscosity": thick}}, {"obstacles": [ball]}
+
+
 @dataclass(frozen=True)
 class Wish:
     """What somebody wants to see."""
@@ -270,6 +280,7 @@ class LivePreview:
         while bears_coarser(coarse) and self._slow(coarse):
             coarse = coarser(coarse)
         self.particles = len(coarse.rest)
+        self._rehearse(coarse)
         while True:
             self._tell("held" if self._held else "ready")
             with self._news:
@@ -291,6 +302,21 @@ class LivePreview:
             if not isinstance(error, FluidliftError):
                 LOG.exception("live preview")
             self.problem = f"this asset cannot be simulated live: {error}"
+
+    def _rehearse(self, coarse: FluidAsset) -> None:
+        """Two frames each of what the scene may lack now and an edit may bring, until somebody wants something: where
+        its kernels are not compiled yet, the first such edit would wait for a compiler."""
+        self._tell("held" if self._held else "ready")
+        for edits in rehearsals(coarse):
+            if self._unwanted():
+                return
+            with contextlib.suppress(Exception):  # an edit that this asset does not bear is refused when it is made
+                for _ in preview_frames(preview_scene(coarse, self._folder, edits, 2), self._unwanted):
+                    pass
+
+    def _unwanted(self) -> bool:
+        """Whether there is more to do than to get ready."""
+        return self._closed or self._held or self._wish is not None
 
     def _slow(self, coarse: FluidAsset) -> bool:
         """Whether this machine, as busy as it is now, takes longer for a frame than a live preview may."""

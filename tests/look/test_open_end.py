@@ -24,6 +24,7 @@ def cells() -> np.ndarray:
 
 
 GRID = Grid(CELLS, H)
+EMPTY = TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), int))
 STREAM = np.array([0.98, 0.0, -0.2])
 
 
@@ -34,7 +35,20 @@ def test_the_section_stands_upright_where_the_outlet_begins():
     assert end.at == pytest.approx(2.05)  # the middle of the first of the outlet's cells
     points = np.array([[2.0, 0, 0], [2.1, 0, 0], [2.3, 0, 0]])
     np.testing.assert_array_equal(end.before(points), [True, False, False])
-    np.testing.assert_array_equal(end.before(points, 2.0), [True, True, False])
+
+
+def test_behind_the_section_the_liquid_goes_on_as_a_prism():
+    # a stream two rows high, and behind the section a drop that lies higher and one that lies beside it
+    stream = np.stack(np.meshgrid(np.arange(1.625, 2.05, 0.05), [0.4], [0.2, 0.25], indexing="ij"), -1).reshape(-1, 3)
+    points = np.concatenate([stream, [[2.1, 0.4, 0.4], [2.15, 0.7, 0.2]]])
+    end = OpenEnd.of(cells(), GRID, STREAM)
+    assert end is not None
+    which, places = end.carried_on(points)
+    assert which.max() < len(stream)
+    np.testing.assert_array_equal(places[:, 1:], points[which, 1:])  # carried straight on
+    rows = np.arange(1.625, 2.25, 0.05)  # two cells on, with the distances of the stream
+    np.testing.assert_allclose(np.unique(np.round(places[:, 0], 6)), rows, atol=1e-6)
+    assert len(which) == 2 * len(rows)
 
 
 def test_what_falls_or_has_no_outlet_has_no_section():
@@ -93,3 +107,20 @@ def test_a_ragged_end_is_cut_before_the_terrain_and_kept_on_a_plate(style, engin
     assert np.ptp(edge) <= 2, edge
     plate = Backdrop(np.zeros((48, 80, 3), np.float32))
     np.testing.assert_array_equal(cut.picture(frame, camera, plate).image, whole.picture(frame, camera, plate).image)
+
+
+def test_what_lies_behind_the_section_leaves_no_film_beside_it():
+    from fluidlift.backends.splashsurf import SplashsurfMesher
+    from fluidlift.pipeline.surfacing import surface_of
+
+    # half a cell behind the section liquid stands twice as high as before it
+    before = np.meshgrid(np.arange(1.3, 2.05, 0.05), np.arange(0.2, 0.6, 0.05), np.arange(0.125, 0.3, 0.05))
+    behind = np.meshgrid(np.arange(2.1, 2.35, 0.05), np.arange(0.2, 0.6, 0.05), np.arange(0.125, 0.5, 0.05))
+    p = np.concatenate([np.stack(part, -1).reshape(-1, 3) for part in (before, behind)])
+    fluid = Gaussians(p, np.tile([1.0, 0, 0, 0], (len(p), 1)), np.full((len(p), 3), 0.42 * H), np.full(len(p), 0.9),
+                      sh_from_rgb(np.full((len(p), 3), 0.5)))  # fmt: skip
+    terrain = Terrain(GRID, np.ones(tuple(n + 1 for n in CELLS), np.float32), np.float32([1, 0, 0]), EMPTY)
+    end = OpenEnd.of(cells(), GRID, STREAM)
+    mesh, _ = surface_of(fluid, np.zeros_like(p), terrain, SplashsurfMesher(), clamped=False, end=end)
+    # the highest particles lie at 0.275 m, and a surface stands a radius of 0.04 m outside them
+    assert mesh.vertices[:, 2].max() < 0.33

@@ -9,13 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from fluidlift.types import CellType, Grid, TriangleMesh
 
-BEYOND = 2.0
-"""cells beyond the section whose particles still count for a surface: as far as its kernel reaches, so that it is whole
-up to there"""
+BEYOND = 2
+"""cells by which the liquid before the section is carried on for a surface: as far as its kernel reaches, so that it is
+whole up to there"""
 LEVEL = 0.3
 """horizontal part of the direction of flow from which a section stands upright across it"""
 
@@ -48,9 +48,25 @@ class OpenEnd:
         flat /= level
         return cls(flat, float(np.median(grid.centers()[first] @ flat)), grid.spacing)
 
-    def before(self, points: Float[np.ndarray, "n 3"], beyond: float = 0.0) -> Bool[np.ndarray, " n"]:
-        """Whether points lie before the section, or at most `beyond` cells behind it."""
-        return np.asarray(points) @ self.along < self.at + beyond * self.spacing
+    def before(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+        """Whether points lie before the section."""
+        return np.asarray(points) @ self.along < self.at
+
+    def carried_on(self, points: Float[np.ndarray, "n 3"]) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, "m 3"]]:
+        """The points before the section and, `BEYOND` times behind it, those of the last cell before it: which of them,
+        and where.
+
+        The liquid goes on as a prism, as wide and as high as at the section. What is there in truth thins out and
+        spreads, and pushed onto the plane it would stand beside the section as a film.
+        """
+        points = np.asarray(points)
+        over = points @ self.along - self.at
+        last = np.flatnonzero((over < 0) & (over >= -self.spacing))
+        which, steps = [np.flatnonzero(over < 0)], [0]
+        which += [last] * BEYOND
+        steps += range(1, BEYOND + 1)
+        places = [points[i] + k * self.spacing * self.along for i, k in zip(which, steps, strict=True)]
+        return np.concatenate(which), np.concatenate(places).astype(points.dtype)
 
     def section(self, mesh: TriangleMesh) -> TriangleMesh:
         """A closed mesh with all that is behind the section pushed onto it: closed still, and flat there."""

@@ -37,6 +37,9 @@ SMOOTHING = (1.6, 1.0, 0.5)
 PER_BELL, BUMP = 1.7, 0.6
 """samples per standard deviation of these passes, at least: sums over a bell are exact from there on; and radii between
 samples, at most: half the distance of the spheres, whose bumps would else be taken for a slope"""
+FINISH = 0.12
+"""radii: standard deviation of a last pass over pixels side by side. Those before it leave some out: pixels between
+which none of them mixes come apart beside an edge, as a weave"""
 LIMIT = 3.0
 """radii: depths farther apart belong to different surfaces"""
 FALL = 1.0
@@ -221,8 +224,8 @@ def _smoothed(inverse: np.ndarray, radius: float, camera: PinholeCamera) -> np.n
     """Inverse depth as of `inverse_depths` without the bumps of the spheres."""
     limit, fall, other = np.float32(LIMIT * radius), np.float32(FALL * radius), np.empty_like(inverse)
     with in_pieces(len(inverse)):
-        for share in SMOOTHING:
-            apart = np.float32(max(PER_BELL, share / BUMP))
+        for share, samples in (*((share, max(PER_BELL, share / BUMP)) for share in SMOOTHING), (FINISH, math.inf)):
+            apart = np.float32(samples)
             narrow_range(inverse, other, True, camera.focal[0], share * radius, apart, limit, fall)
             narrow_range(other, inverse, False, camera.focal[1], share * radius, apart, limit, fall)
     return inverse

@@ -11,7 +11,7 @@ import numpy as np
 from fluidlift.errors import InputRejected
 from fluidlift.pipeline.looks import Backdrop, Frame, Painter, placed_bodies
 from fluidlift.pipeline.scene import Footage, Scene
-from fluidlift.pipeline.showing import splat_frames
+from fluidlift.pipeline.showing import open_end, splat_frames
 from fluidlift.types import Gaussians, PinholeCamera, Similarity3, concatenate, matrix_from_quat
 
 SURFELS = 200_000
@@ -69,11 +69,13 @@ def _own_look(stage: Stage, folder: Path, step: Callable[[int], None]) -> Iterat
     ground = Gaussians.empty() if way == "plate" else terrain_surfels(scene.terrain, most=SURFELS, glass=glass)
     shapes = [mesh_surfels(o.mesh, scene.terrain.grid.spacing) for o in scene.obstacles]
     before_rocks = _rocks(stage) if way == "plate" else None
+    end = None if way in ("plate", "none") else open_end(scene)
     for k, (fluid, _, _) in enumerate(splat_frames(folder, wanted.stop)):
         if k < wanted.start:
             continue
         step(k - wanted.start)
         camera = stage.cameras[k - wanted.start]
+        fluid = fluid if end is None else fluid.select(end.before(fluid.means))
         bodies = [] if stage.poses is None else [
             s.transformed(Similarity3(1.0, matrix_from_quat(p[3:]), p[:3])) for s, p in zip(shapes, stage.poses[k])
         ]  # fmt: skip

@@ -124,11 +124,12 @@ def _panels(
     ground = terrain_surfels(terrain, glass=glass_of(scene.kind))
     size = _panel_size(camera.size, config.show.width)
     # a body in the air may fill its box later; what lies on a bed stays in it
-    whole = terrain.mesh.vertices
+    around = terrain.mesh.vertices
     if airborne:
         inset = 0.18 * (grid.high - grid.low) * np.array([1.0, 1.0, 0.0])
-        whole = np.stack([grid.low + inset, grid.high - inset])
-    side = side_camera(camera, scene.rest, ground, np.concatenate([scene.rest.means, whole]), size=size)
+        around = np.stack([grid.low + inset, grid.high - inset])
+    side = side_camera(camera, scene.rest, ground, np.concatenate([scene.rest.means, around]), size=size)
+    end = open_end(scene)
     sky = np.linspace(0.93, 0.78, size[1], dtype=np.float32)[:, None, None] * np.ones((1, size[0], 3), np.float32)
     shapes = [mesh_surfels(o.mesh, grid.spacing) for o in scene.obstacles]
     lit_plate = linear_from_srgb(plate).astype(np.float32)
@@ -149,7 +150,9 @@ def _panels(
             measured["mask"].append(rendered.alpha > 0.5)
             measured["flow"].append(_screen_velocity(front, velocity, camera, scene.interval, rendered.alpha))
         if painter is None:
-            view = _bytes(render(concatenate([ground, *solids, gaussians]), side, background=sky).image)
+            # as in the other looks, what thins out behind the section of a stream is not drawn before the terrain
+            whole = gaussians if end is None else gaussians.select(end.before(gaussians.means))
+            view = _bytes(render(concatenate([ground, *solids, whole]), side, background=sky).image)
         else:
             frame = Frame(gaussians, speeds, placed_bodies(scene.obstacles, poses[k]))
             picture = painter.shown(frame, camera, Backdrop(lit_plate, rock_depth))

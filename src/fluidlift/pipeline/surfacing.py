@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from fluidlift.look.open_end import BEYOND, OpenEnd
+from fluidlift.look.open_end import OpenEnd
 from fluidlift.look.surface_skin import of_skin, painted_liquid
 from fluidlift.seams import Mesher
 from fluidlift.types import Gaussians, Terrain, TriangleMesh
@@ -34,8 +36,8 @@ def surface_of(
         end: of a stream, where the surface ends in a flat section; None: it goes as far as the particles.
     """
     if end is not None:
-        kept = end.before(fluid.means, BEYOND)
-        fluid, velocities = fluid.select(kept), velocities[kept]
+        kept, places = end.carried_on(fluid.means)
+        fluid, velocities = replace(fluid.select(kept), means=places), velocities[kept]
     velocities = velocities[~of_skin(fluid, terrain.grid.spacing)]
     fluid = painted_liquid(fluid, terrain.grid.spacing)
     carried = {"velocity": velocities, "rgb": fluid.rgb}

@@ -21,10 +21,11 @@ from fluidlift.shape.advancing import advancing_labels
 from fluidlift.shape.colour_growth import grown_from_streams, with_quiet_water
 from fluidlift.shape.evidence import Evidence, PairReader, fluid_score, gather_evidence
 from fluidlift.shape.frame_pictures import typical_picture
-from fluidlift.shape.hints import Point, clicks_at, heed, holes_asked_for
+from fluidlift.shape.hints import VOICE, Point, clicks_at, heed, holes_asked_for
 from fluidlift.shape.islands import without_ground
 from fluidlift.shape.presence import Presence, always, grows, stay, watch
 from fluidlift.shape.region import clean_region, cut_along_edges, solids_in, still_pixels
+from fluidlift.shape.waterline import dry_over_time
 from fluidlift.types.clip import Label, PixelLabels, VideoClip
 from fluidlift.types.flow import PixelFlow
 
@@ -123,17 +124,24 @@ def segment(
         found = advancing_labels(evidence, score, presence, told)
     else:
         region = lasting_region(evidence, score, small_inside) if grown is None else clean_region(grown)
-        rocks = asked = np.zeros_like(region)
+        rocks = asked = held = np.zeros_like(region)
         if grown is None:
             region, rocks = without_ground(evidence, region)
         if clicks:
-            region = heed(clicks, evidence, score, region)[0]
+            before = region
+            region, told = heed(clicks, evidence, score, region)
+            held = (region & ~before) | (told > VOICE)
             asked, rocks = holes_asked_for(region, clicks), rocks & ~region
             region = clean_region(region) & ~asked & ~rocks
         still = still_pixels(evidence)
         if grown is not None:  # change says nothing in such a clip: neither when the fluid came nor what is a rock
             presence, still = always(presence), np.zeros_like(still)
-        found = lasting_labels(score, region, still | asked | rocks, presence)
+        still = still | asked | rocks
+        found = lasting_labels(score, region, still, presence)
+        if grown is None:
+            outline, solid = solids_in(region, still)
+            dry = dry_over_time(evidence, outline, solid, presence.picked)
+            found = down_to_waterline(found, (ashore & ~held for ashore in dry))
     tell(0.5, "labels")
     writer = LabelWriter((frames, height, width), out)
     share = write_labels(found, writer, small_inside, tell)
@@ -244,6 +252,15 @@ def lasting_labels(
             labels[solids_in(now, np.zeros_like(now))[0] & region] = Label.FLUID
             labels[solid] = Label.SOLID
         yield labels, sure
+
+
+def down_to_waterline(
+    found: Iterator[tuple[np.ndarray, np.ndarray]], dry: Iterator[np.ndarray]
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """The labels and confidence of every frame with what lies dry in it, bool [h,w], given back to the background."""
+    for (labels, sure), ashore in zip(found, dry, strict=True):
+        bare = ashore & (labels == Label.FLUID)
+        yield (np.where(bare, np.uint8(Label.BACKGROUND), labels) if bare.any() else labels), sure
 
 
 def doubtful_part(score: np.ndarray) -> float:

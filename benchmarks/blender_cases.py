@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from blender_beds import STREAMS, Carried, bed_mesh, rock_mesh
 
 FPS, SOLVER_TIME = 25, 0.1
 """pictures per second; Mantaflow's time in one of them"""
@@ -53,6 +54,7 @@ CASES: dict[str, Spec] = {
         "high": [0.8, 0.8, 3.2], "source": [[0.0, 0.0, 0.12], 0.18, 0.08], "jet": [0.0, 0.0, 0.8], "heat": 0.5,
         "eye": [-0.9, -6.4, 1.5], "target": [0.0, 0.0, 1.5], "fov": 24.0,
     },
+    **STREAMS,
 }  # fmt: skip
 
 
@@ -87,6 +89,10 @@ def solids_of(spec: Spec) -> dict[str, tuple[np.ndarray, np.ndarray, list[float]
     """Meshes and colours of all that stands still."""
     low, high, wall = spec["low"], spec["high"], spec.get("walls", 0.0)
     reach = 2.0 * max(high[0] - low[0], high[1] - low[1])
+    if "bed" in spec:
+        out = {"bed": (*bed_mesh(spec), [0.36, 0.28, 0.2])}
+        out |= {f"pillar{k}": (*box_mesh(a, b), [0.4, 0.4, 0.4]) for k, (a, b) in enumerate(spec.get("pillars", []))}
+        return out | {f"rock{k}": (*rock_mesh(spec, r), [0.4, 0.38, 0.36]) for k, r in enumerate(spec.get("rocks", []))}
     out = {"floor": (*box_mesh([low[0] - reach, low[1] - reach, -0.1], [high[0] + reach, high[1] + reach, 0.0]),
                      [0.42, 0.36, 0.30])}  # fmt: skip
     for k, (a, b) in enumerate(spec.get("pillars", [])):
@@ -143,8 +149,8 @@ def moved(points: np.ndarray, before: np.ndarray, after: np.ndarray, spec: Spec)
     return points + speed(points + 0.5 / FPS * speed(points)) / FPS
 
 
-def color(spec: Spec, folder: Path) -> None:
-    """Colours of the surface's vertices: of the nearest of many points that go along with the liquid."""
+def poured(spec: Spec) -> tuple[np.ndarray, np.ndarray]:
+    """Many points in the body of liquid that is there at first, and a shade each, 0 to 1."""
     from scipy.spatial import cKDTree
 
     generator, h = np.random.default_rng(3), spec["spacing"]
@@ -153,15 +159,31 @@ def color(spec: Spec, folder: Path) -> None:
     points = generator.uniform(low, high, (count, 3))
     # fine grain on patches: the patches are still told apart where the grain is smaller than a pixel
     patches = cKDTree(generator.uniform(low, high, (max(count // 150, 8), 3)))
-    shade = 0.55 * generator.uniform(size=count) + 0.45 * generator.uniform(size=patches.n)[patches.query(points)[1]]
-    colors = (1 - shade[:, None]) * [0.02, 0.10, 0.22] + shade[:, None] * [0.45, 0.75, 0.85]
-    before = None
+    shades = 0.55 * generator.uniform(size=count) + 0.45 * generator.uniform(size=patches.n)[patches.query(points)[1]]
+    return points, shades
+
+
+def color(spec: Spec, folder: Path) -> None:
+    """Colours of the surface's vertices: of the nearest of many points that go along with the liquid."""
+    from scipy.spatial import cKDTree
+
+    h, before, carried = spec["spacing"], None, None
+    points, shades = poured(spec) if "body" in spec else (np.empty((0, 3)), np.empty(0))
     for path in states_of(folder):
         with np.load(path) as state:
-            vertices, velocity = state["v"], filled(state["velocity"])
+            vertices, inside = state["v"], state["velocity"]
+        velocity = filled(inside)
         if before is not None:
             points = moved(points, before, velocity, spec)
         before = velocity
+        if "inflow" in spec:
+            if carried is None:
+                carried = Carried(spec, grid_of(spec)[0], inside)
+            else:
+                carried.step(points, inside)
+            points, shades = carried.points, carried.shades
+        dark, light = np.array(spec.get("colors", [[0.02, 0.10, 0.22], [0.45, 0.75, 0.85]]))
+        colors = dark + shades[:, None] * (light - dark)
         away, near = cKDTree(points).query(vertices, k=4, workers=1)
         weight = 1.0 / (away + 0.1 * h) ** 2
         found = (weight[..., None] * colors[near]).sum(axis=1) / weight.sum(axis=1)[:, None]

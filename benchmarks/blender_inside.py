@@ -52,7 +52,22 @@ def fluid_scene(bpy: Any, spec: Spec, cache: str) -> Any:
     s.cache_frame_end = bpy.context.scene.frame_end = spec["frames"] + spec.get("first", 1) + 1
     bpy.context.scene.render.fps = FPS
     s.use_collision_border_top = False
-    if liquid:
+    if "bed" in spec:
+        s.use_mesh, s.mesh_scale, s.cache_mesh_format = True, 2, "BOBJECT"
+        s.use_collision_border_right = False
+        if "viscosity" in spec:
+            s.use_viscosity, s.viscosity_value, s.simulation_method = True, spec["viscosity"], "APIC"
+        else:
+            s.use_fractions, s.fractions_distance = True, 0.2
+        source = add_mesh(bpy, "inflow", *box_mesh(*spec["inflow"]))
+        for name, (v, f, _) in solids_of(spec).items():
+            add_mesh(bpy, name + "_inside", v, f).modifiers.new("fluid", "FLUID").fluid_type = "EFFECTOR"
+        (x, y, _), top = spec["high"], low + h * cells
+        end = add_mesh(bpy, "drain", *box_mesh([x - 4 * h, -y - h, 0.0], top.tolist()))
+        drain = end.modifiers.new("fluid", "FLUID")
+        drain.fluid_type = "FLOW"
+        drain.flow_settings.flow_type, drain.flow_settings.flow_behavior = "LIQUID", "OUTFLOW"
+    elif liquid:
         s.use_mesh, s.mesh_scale, s.cache_mesh_format = True, 2, "BOBJECT"
         a, b = (np.array(x) for x in spec["body"])
         # beyond the walls where it touches them
@@ -70,10 +85,10 @@ def fluid_scene(bpy: Any, spec: Spec, cache: str) -> Any:
     modifier = source.modifiers.new("fluid", "FLUID")
     modifier.fluid_type = "FLOW"
     flow = modifier.flow_settings
-    flow.flow_type, flow.flow_behavior = ("LIQUID", "GEOMETRY") if liquid else ("SMOKE", "INFLOW")
-    if not liquid:
+    flow.flow_type, flow.flow_behavior = "LIQUID" if liquid else "SMOKE", "GEOMETRY" if "body" in spec else "INFLOW"
+    if "jet" in spec:
         flow.use_initial_velocity, flow.velocity_coord = True, spec["jet"]
-    for k, (a, b) in enumerate(spec.get("pillars", [])):
+    for k, (a, b) in enumerate([] if "bed" in spec else spec.get("pillars", [])):
         modifier = add_mesh(bpy, f"obstacle{k}", *box_mesh(a, b)).modifiers.new("fluid", "FLUID")
         modifier.fluid_type = "EFFECTOR"
     return domain

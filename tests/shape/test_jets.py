@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -342,3 +342,23 @@ def test_the_seen_depth_of_a_column_is_where_the_rays_meet_it():
     assert (away[~side] <= 0.06 + 1e-9).all() and (~side).any()
     back = WIDE.unproject(WIDE.pixel_grid()[hit], (near + 2 * half)[hit])
     np.testing.assert_allclose(np.hypot(back[:, 0] + 0.2, back[:, 1]), 0.06, atol=1e-9)
+
+
+def test_a_jet_that_feeds_all_of_a_film_is_told_from_one_above_a_stream_and_one_that_spreads():
+    s = scene()
+    found = jets.find_jets(s.camera, s.mask, s.motion, s.trust)
+    lying = jets.lying_pixels(s.mask, jets.airborne_pixels(found, s.mask.shape))
+    rows, cols = np.nonzero(lying)
+    assert jets.feed_all(found, lying, s.motion, s.trust)
+    assert not jets.feed_all([], lying, s.motion, s.trust)  # nothing is seen to bring it
+    # the same cut off where it comes from: a stream over the border, under the same jet
+    flow = s.motion[lying].mean(axis=0)
+    upstream = int(np.argmax(np.abs(flow)))
+    line = int(np.percentile((cols, rows)[upstream], 30))
+    kept = slice(line, None) if flow[upstream] > 0 else slice(None, line)
+    window = (slice(None), kept) if upstream == 0 else (kept, slice(None))
+    cut = [replace(found[0], pixels=found[0].pixels[window])]
+    assert not jets.feed_all(cut, lying[window], s.motion[window], s.trust[window])
+    # off to all sides from the foot
+    away = s.camera.pixel_grid() - found[0].centers[-1]
+    assert not jets.feed_all(found, lying, away / np.linalg.norm(away, axis=-1, keepdims=True), s.trust)

@@ -87,6 +87,23 @@ def test_the_heading_belongs_to_the_slope_that_is_taken(slope):
     assert abs(turned) < 0.4
 
 
+@pytest.mark.parametrize("slope", [0.0, 10.0])
+def test_where_level_streams_are_rare_less_evidence_makes_a_slope(slope):
+    scene = film(slope, -20.0, 31.0, 0.75)
+    usual, rare = evidence_of(*scene), evidence_of(*scene, level_prior=0.1)
+    odds = [(1 - e.level_share) / e.level_share for e in (usual, rare)]
+    assert odds[1] / odds[0] == pytest.approx((0.9 / 0.1) / (0.4 / 0.6))
+    assert rare.likeliest == pytest.approx(usual.likeliest)
+
+
+def test_where_level_streams_are_rare_less_of_the_tilt_is_the_cameras():
+    camera, mask, motion = film(15.0, -60.0, 31.0, 0.75)
+    patches = flow_patches(mask, motion, np.ones(mask.shape))
+    assert patches is not None
+    usual, rare = (estimate_tilt(camera, patches, tilted, (40.0, 13.0), level_prior=p) for p in (0.6, 0.1))
+    assert abs(rare.pitch - 31.0) < abs(usual.pitch - 31.0)
+
+
 def test_without_motion_a_stream_is_level_and_says_why():
     found = estimate_slope(tilted(30.0), None)
     assert (found.slope, found.level_share) == (0.0, 1.0)

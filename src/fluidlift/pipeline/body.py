@@ -251,8 +251,9 @@ def _kind_and_up(story, inputs, config, known, pose_given, mask, motion, trust, 
     if kind == "stream" and c.pitch is None and not parts.puddle:
         texture = texture_gradient.texture_patches(clip.frames, parts.lying & ~parts.falling)
     up = kinds.estimate_up(
-        kind, parts.lying, motion, trust * ~parts.falling, known, pitch=c.pitch, roll=c.roll, texture=texture
-    )
+        kind, parts.lying, motion, trust * ~parts.falling, known, pitch=c.pitch, roll=c.roll, texture=texture,
+        level_prior=composite.level_prior(parts, motion, trust),
+    )  # fmt: skip
     if parts.puddle and c.pitch is None:
         up = puddle.puddle_tilt(parts.lying, up)
     if c.roll is None:
@@ -290,8 +291,9 @@ def _front(seen: _Sight, inputs: Inputs, canonical: PinholeCamera, interval: flo
         return given_body.given_front(inputs.geometry, canonical, lying, seen.kind, seen.start)
     if seen.kind == "stream":
         front = surface.stream_surface(
-            canonical, lying, motion, trust, interval, camera_height=seen.height, tilt_known=seen.tilt_known
-        )
+            canonical, lying, motion, trust, interval, camera_height=seen.height, tilt_known=seen.tilt_known,
+            level_prior=composite.level_prior(seen.parts, motion, seen.trust),
+        )  # fmt: skip
         return front, None
     if seen.kind == "fall":
         return surface.falling_surface(canonical, lying, motion, trust), None

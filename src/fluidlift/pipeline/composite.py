@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from fluidlift.shape import airborne, jets, place
 from fluidlift.shape.jet_column import Jet, with_columns
 from fluidlift.shape.kind import PITCH_PRIOR, Kind, UpEvidence, level_camera
+from fluidlift.shape.slope import LEVEL
 from fluidlift.shape.surface import FrontSurface
 from fluidlift.shape.terrain import Setting
 from fluidlift.types import PinholeCamera, Similarity3
@@ -73,6 +74,12 @@ def with_roll(up: UpEvidence, parts: Parts, camera: PinholeCamera) -> UpEvidence
         return up
     roll = jets.roll_of(list(parts.outlines), level_camera(camera, replace(up, roll=0.0)))
     return replace(up, roll=roll, source=f"{up.source}; roll from the direction of a jet")
+
+
+def level_prior(parts: Parts, motion: Float[np.ndarray, "h w 2"], trust: Float[np.ndarray, "h w"]) -> float:
+    """Share of such streams that are level: few are where jets bring all there is."""
+    fed = not parts.puddle and jets.feed_all(list(parts.outlines), parts.lying, motion, trust)
+    return jets.LEVEL_FED if fed else LEVEL
 
 
 @dataclass(frozen=True)

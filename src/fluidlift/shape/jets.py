@@ -37,6 +37,13 @@ in a pool decays over many widths"""
 SLOWING = 0.5
 """radii above the surface at which a jet that lands has half its speed: in the flow towards a wall the speed falls
 linearly over about a radius. Its motion is followed down to there"""
+LEVEL_FED = 0.1
+"""prior share of level ones among films that get all they have from jets: on level ground, what a jet brings spreads
+to all sides, unless walls lead it"""
+ONE_WAY = 0.7
+"""length of the mean motion over the mean of its lengths, from which a film runs off to one side (evenly to all: 0)"""
+ENTERS = 0.2
+"""length of the picture's border over which a film may seem to come in, over the root of its area: errors of flow"""
 FEWEST = 40
 """pixels of a jet: fewer have no shape"""
 BLUR = 4.0
@@ -232,6 +239,37 @@ def _lands(outline: Outline, mask: np.ndarray, falls: np.ndarray, trust: np.ndar
             break
         least = min(least, float(np.median(falls[row[wet], col[wet]])))
     return least < STOPS * own
+
+
+def feed_all(
+    outlines: list[Outline],
+    lying: Bool[np.ndarray, "h w"],
+    motion: Float[np.ndarray, "h w 2"],
+    trust: Float[np.ndarray, "h w"],
+) -> bool:
+    """Whether jets bring all of what lies below them, and it runs off to one side: nothing comes in over the border of
+    the picture. Such a film is rarely level (`LEVEL_FED`).
+
+    Args:
+        outlines: of the jets.
+        lying: pixels of what lies.
+        motion: mean over the clip, px per frame.
+        trust: of the motion, 0 to 1.
+    """
+    known = lying & ~airborne_pixels(outlines, lying.shape) & (trust > TRUSTED)
+    if not outlines or known.sum() < FEWEST:
+        return False
+    flow, weight = motion[known], trust[known]
+    if np.linalg.norm(weight @ flow) < ONE_WAY * float(weight @ np.linalg.norm(flow, axis=1)):
+        return False
+    m = round(BLUR)
+    inwards = [
+        (known[:, :m], motion[:, :m, 0]), (known[:, -m:], -motion[:, -m:, 0]),
+        (known[:m], motion[:m, :, 1]), (known[-m:], -motion[-m:, :, 1]),
+    ]  # fmt: skip
+    over = np.concatenate([speed[seen] for seen, speed in inwards])
+    slow = 0.1 * float(np.median(np.linalg.norm(flow, axis=1)))
+    return float((over > slow).sum()) < ENTERS * m * float(np.sqrt(known.sum()))
 
 
 def find_neck(mask: Bool[np.ndarray, "h w"], *, pitch: float = 35.0) -> Outline | None:

@@ -188,6 +188,7 @@ def estimate_up(
     pitch: float | None = None,
     roll: float | None = None,
     texture: TexturePatches | None = None,
+    level_prior: float = slope.LEVEL,
 ) -> UpEvidence:
     """The camera's tilt from the fluid.
 
@@ -206,11 +207,12 @@ def estimate_up(
         pitch: degrees below the horizon, when the user gave it.
         roll: degrees clockwise, when the user gave it.
         texture: of the fluid's pictures; of a stream without chutes it shows the tilt as well.
+        level_prior: share of such streams that are level.
     """
     mean, sigma = PITCH_PRIOR[kind]
     found_pitch, found_roll, source, trust = mean, 0.0, f"usual view of a {kind}", 0.0
     if kind == "stream":
-        tilt, source_seen = _tilt_of_stream(mask, displacement, confidence, camera, texture)
+        tilt, source_seen = _tilt_of_stream(mask, displacement, confidence, camera, texture, level_prior)
         if tilt is not None:
             found_pitch, found_roll, trust, source = tilt.pitch, tilt.roll, tilt.gained, source_seen
     elif kind == "dam" and mask.any():
@@ -234,7 +236,9 @@ def estimate_up(
     )
 
 
-def _tilt_of_stream(mask, displacement, confidence, camera, texture) -> tuple[slope.TiltEvidence | None, str]:
+def _tilt_of_stream(
+    mask, displacement, confidence, camera, texture, level_prior
+) -> tuple[slope.TiltEvidence | None, str]:
     """What its motion and its pattern say, None where they say nothing; and which of them spoke."""
     mean, sigma = PITCH_PRIOR["stream"]
     # a chute is another plane than what it comes down onto
@@ -245,7 +249,7 @@ def _tilt_of_stream(mask, displacement, confidence, camera, texture) -> tuple[sl
         return None, ""
     tilt = slope.estimate_tilt(
         camera, patches, lambda p, r: level_camera(camera, UpEvidence(p, r, "", 0.0)), (mean, sigma),
-        None if steep else texture,
+        None if steep else texture, level_prior,
     )  # fmt: skip
     return tilt, "perspective of the flow" + (" and of its pattern" if texture is not None and not steep else "")
 

@@ -129,17 +129,18 @@ def flow_patches(
     return FlowPatches(at + 0.5 * flow, flow, _robust_weights(at, flow, np.clip(share[kept], 0.0, 1.0)))
 
 
-def estimate_slope(camera: PinholeCamera, patches: FlowPatches | None, *, tilt_known: bool = True) -> SlopeEvidence:
+def estimate_slope(
+    camera: PinholeCamera, patches: FlowPatches | None, *, tilt_known: bool = True, level_prior: float = LEVEL
+) -> SlopeEvidence:
     """Slope of a stream under a camera whose tilt is known, or was estimated by `estimate_tilt`.
 
-    A choice between two models by their posterior odds: level, with the prior share `LEVEL`; or falling by an angle
-    whose prior is half-normal. Where falling wins, its slope is the posterior's mean. Under an estimated tilt, which is
-    a mean over both models, so is the slope: what the motion shows is their sum.
+    A choice between two models by their posterior odds: level; or falling by an angle whose prior is half-normal. Where
+    falling wins, its slope is the posterior's mean. Under an estimated tilt, a mean over both models, so is the slope.
 
     Args:
         camera: canonical, z up.
         patches: of the motion; None: nothing is known, and level is taken.
-        tilt_known: the camera's tilt was given.
+        tilt_known: the camera's tilt was given; level_prior: share of such streams that are level.
     """
     if patches is None:
         return SlopeEvidence(0.0, STEEP, 0.0, 1.0, 0.0, "prior: too little motion to tell")
@@ -150,7 +151,7 @@ def estimate_slope(camera: PinholeCamera, patches: FlowPatches | None, *, tilt_k
     likelihood = np.exp(log - log.max())
     share = likelihood * falling_prior(slopes)
     falling = float(share.sum())
-    level = LEVEL * likelihood[0] / (LEVEL * likelihood[0] + (1.0 - LEVEL) * falling)
+    level = level_prior * likelihood[0] / (level_prior * likelihood[0] + (1.0 - level_prior) * falling)
     mean = float((share * slopes).sum() / max(falling, 1e-300))
     error = float(np.sqrt((share * (slopes - mean) ** 2).sum() / max(falling, 1e-300)))
     slope = (mean if level < 0.5 else 0.0) if tilt_known else (1.0 - level) * mean
@@ -161,12 +162,11 @@ def estimate_slope(camera: PinholeCamera, patches: FlowPatches | None, *, tilt_k
 
 def estimate_tilt(
     camera: PinholeCamera, patches: FlowPatches, tilted: Callable[[float, float], PinholeCamera],
-    pitch_prior: tuple[float, float], texture: TexturePatches | None = None,
+    pitch_prior: tuple[float, float], texture: TexturePatches | None = None, level_prior: float = LEVEL,
 ) -> TiltEvidence:  # fmt: skip
     """Pitch and roll of the camera over a stream of unknown slope: means of their posterior.
 
-    The motion and the pattern that moves show the plane's tilt against the camera, not against gravity: what is the
-    camera's and what is the stream's is shared out by the priors. Level streams are the likelier ones.
+    The motion and the pattern show the plane's tilt against the camera, not gravity: priors share it out between both.
 
     Args:
         camera: for its focal length.
@@ -174,11 +174,11 @@ def estimate_tilt(
         tilted: camera for a pitch and a roll, degrees.
         pitch_prior: mean and standard deviation, degrees.
         texture: of the fluid's picture, where it has windows enough.
+        level_prior: share of such streams that are level.
     """
     pitches, rolls = np.arange(8.0, 81.0, 4.0), np.array([-4.0, 0.0, 4.0])
     slopes = np.array([0.0, 5.0, 10.0, 16.0, 22.0, 30.0, 38.0])
-    prior = (1.0 - LEVEL) * falling_prior(slopes)
-    prior[0] = LEVEL
+    prior = np.where(slopes > 0, (1.0 - level_prior) * falling_prior(slopes), level_prior)
     best = np.array([[[best_heading(tilted(p, r), patches, np.radians(s)) for s in slopes] for r in rolls]
                      for p in pitches])  # fmt: skip
     habit = np.log(prior) - 0.5 * (((pitches - pitch_prior[0]) / pitch_prior[1]) ** 2)[:, None]

@@ -77,6 +77,12 @@ def grid_of(spec: Spec) -> tuple[np.ndarray, np.ndarray]:
     return low - h, np.round((high - low) / h).astype(int) + 2
 
 
+def viscosity_of(spec: Spec) -> float:
+    """Kinematic, m^2/s: Mantaflow's is in squares of the domain's longest side and in its own unit of time."""
+    longest = spec["spacing"] * int(grid_of(spec)[1].max())
+    return spec.get("viscosity", 0.0) * longest**2 * SOLVER_TIME * FPS
+
+
 def box_mesh(low: list[float], high: list[float]) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and triangles, seen from outside."""
     v = np.array([[(low, high)[i][0], (low, high)[j][1], (low, high)[k][2]]
@@ -283,8 +289,8 @@ def write_case(name: str, spec: Spec, folder: Path, truth: Spec) -> None:
         "case": name, "simulator": "Mantaflow in Blender", "renderer": "Cycles", "fps": FPS, "dt": 1.0 / FPS,
         "gravity": [0.0, 0.0, -9.81], "units": "metres, seconds; world right-handed, +z up",
         "domain_min": low.tolist(), "domain_max": (low + cells * spec["spacing"]).tolist(), "dx": spec["spacing"],
-        "grid": cells.tolist(), "viscosity_m2_s": 0.0, "inflow": {"velocity_m_s": spec.get("jet", [0.0, 0.0, 0.0])},
-        "video_frames": spec["frames"], "made_from": spec,
+        "grid": cells.tolist(), "viscosity_m2_s": viscosity_of(spec), "video_frames": spec["frames"],
+        "inflow": {"velocity_m_s": spec.get("jet", [0.0, 0.0, 0.0])}, "made_from": spec,
     }  # fmt: skip
     (folder / "scene.json").write_text(json.dumps(scene, indent=1))
     arrays = {}

@@ -4,9 +4,8 @@ Model: a plane that is level across the stream. Motion in it, at the distances l
 the fluid), is a smooth field V(l, c) = V_l d + V_c e: a profile across, a gain along, banks that open or close, a
 bend. A point at depth Z = h / (n.r) on the ray r = (x, y, 1) moves in the picture by f / Z (V_xy - x V_z). Every such
 field is linear in its coefficients, so their prior and the noise are integrated out exactly (Bayesian linear
-regression), and what is left is the evidence for the plane alone. Streamlines that are parallel in space meet in a
-vanishing point, and the speed along them grows as they come nearer: both are in it, weighed by how free the field is
-to do the same.
+regression), and what is left is the evidence for the plane alone: parallel streamlines that meet in a vanishing point,
+speeds that grow as they come nearer, weighed by how free the field is to do the same.
 """
 
 from __future__ import annotations
@@ -140,7 +139,8 @@ def estimate_slope(
     Args:
         camera: canonical, z up.
         patches: of the motion; None: nothing is known, and level is taken.
-        tilt_known: the camera's tilt was given; level_prior: share of such streams that are level.
+        tilt_known: the camera's tilt was given.
+        level_prior: share of such streams that are level.
     """
     if patches is None:
         return SlopeEvidence(0.0, STEEP, 0.0, 1.0, 0.0, "prior: too little motion to tell")

@@ -154,7 +154,7 @@ class Studio:
         return scene
 
     def frames(self, scene, cancelled=lambda: False):
-        if not scene.edits:  # warming up
+        if "name" not in scene.edits:  # warming up, or rehearsed
             return
         self.served.append(scene.edits["name"])
         for k in range(self.total):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from fluidlift.shape.frame_pictures import opponent
 from fluidlift.shape.segment import segment
 from fluidlift.shape.waterline import MISTAKEN, ShoreColours
 from fluidlift.types.clip import VideoClip
@@ -11,7 +12,6 @@ from fluidlift.types.flow import PixelFlow
 
 FRAMES, HEIGHT, WIDTH = 24, 120, 160
 ROWS, COLUMNS = np.mgrid[0:HEIGHT, 0:WIDTH]
-OPPONENT = np.array([[0.299, 0.5, -0.25], [0.587, 0.0, 0.5], [0.114, -0.5, -0.25]], np.float32)
 GROUND, WATER = np.array([125.0, 112.0, 98.0]), np.array([70.0, 105.0, 120.0])
 
 
@@ -64,7 +64,7 @@ def test_a_place_that_the_user_calls_fluid_stays_fluid_while_it_looks_dry():
 @pytest.mark.parametrize(("ground", "tells"), [(GROUND, True), (WATER, False)])
 def test_colours_tell_only_where_the_ground_does_not_look_like_the_water(ground, tells):
     video, _, wet = swash(ground)
-    pictures = video.frames[::4].astype(np.float32) @ OPPONENT
+    pictures = np.stack([opponent(frame) for frame in video.frames[::4]])
     region = np.asarray(wet.any(axis=0))
     colours = ShoreColours(pictures, region, np.zeros_like(region))
     strip = region & (ROWS < 43)

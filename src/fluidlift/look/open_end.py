@@ -62,10 +62,8 @@ class OpenEnd:
         points = np.asarray(points)
         over = points @ self.along - self.at
         last = np.flatnonzero((over < 0) & (over >= -self.spacing))
-        which, steps = [np.flatnonzero(over < 0)], [0]
-        which += [last] * BEYOND
-        steps += range(1, BEYOND + 1)
-        places = [points[i] + k * self.spacing * self.along for i, k in zip(which, steps, strict=True)]
+        which = [np.flatnonzero(over < 0), *[last] * BEYOND]
+        places = [points[i] + k * self.spacing * self.along for k, i in enumerate(which)]
         return np.concatenate(which), np.concatenate(places).astype(points.dtype)
 
     def section(self, mesh: TriangleMesh) -> TriangleMesh:

@@ -224,7 +224,7 @@ def _smoothed(inverse: np.ndarray, radius: float, camera: PinholeCamera) -> np.n
     """Inverse depth as of `inverse_depths` without the bumps of the spheres."""
     limit, fall, other = np.float32(LIMIT * radius), np.float32(FALL * radius), np.empty_like(inverse)
     with in_pieces(len(inverse)):
-        for share, samples in (*((share, max(PER_BELL, share / BUMP)) for share in SMOOTHING), (FINISH, math.inf)):
+        for share, samples in [*((share, max(PER_BELL, share / BUMP)) for share in SMOOTHING), (FINISH, math.inf)]:
             apart = np.float32(samples)
             narrow_range(inverse, other, True, camera.focal[0], share * radius, apart, limit, fall)
             narrow_range(other, inverse, False, camera.focal[1], share * radius, apart, limit, fall)

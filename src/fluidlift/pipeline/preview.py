@@ -310,9 +310,13 @@ class LivePreview:
         for edits in rehearsals(coarse):
             if self._unwanted():
                 return
-            with contextlib.suppress(Exception):  # an edit that this asset does not bear is refused when it is made
+            try:
                 for _ in preview_frames(preview_scene(coarse, self._folder, edits, 2), self._unwanted):
                     pass
+            except FluidliftError:  # what this asset does not bear is refused when it is asked for
+                continue
+            except Exception:  # a wish meets it as well, and tells it
+                LOG.exception("getting ready for edits")
 
     def _unwanted(self) -> bool:
         """Whether there is more to do than to get ready."""

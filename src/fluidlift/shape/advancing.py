@@ -9,7 +9,7 @@ import numpy as np
 
 from fluidlift.shape.background import DECISIVE, filled_in, own_tint, still_background, typical_contrast
 from fluidlift.shape.evidence import POOLING, Evidence, change_over_time, pool
-from fluidlift.shape.min_cut import disc
+from fluidlift.shape.min_cut import spread
 from fluidlift.shape.presence import Presence
 from fluidlift.shape.region import clean_region, solids_in, still_pixels
 from fluidlift.types.clip import Label
@@ -38,7 +38,7 @@ def advancing_labels(
     """
     hint = np.zeros_like(score) if told is None else told
     sure_of = score + hint
-    domain = cv2.dilate(clean_region(sure_of > -1.0).astype(np.uint8), disc(0.01 * max(score.shape))) > 0
+    domain = spread(clean_region(sure_of > -1.0), 0.01 * max(score.shape))
     domain &= hint > -2.0
     still = still_pixels(evidence)
     for odds in median_over_time(odds_over_time(evidence, presence, domain, hint)):

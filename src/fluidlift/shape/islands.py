@@ -15,7 +15,7 @@ from scipy import ndimage
 from fluidlift.shape.colour_growth import STIFFNESS, colour_odds
 from fluidlift.shape.evidence import Evidence
 from fluidlift.shape.frame_pictures import typical_picture
-from fluidlift.shape.min_cut import disc, edge_weights, min_cut
+from fluidlift.shape.min_cut import disc, edge_weights, min_cut, spread
 from fluidlift.shape.region import SMALLEST_SOLID
 
 FLOWS = 0.3
@@ -64,7 +64,7 @@ def without_ground(evidence: Evidence, region: np.ndarray) -> tuple[np.ndarray, 
         if (piece & ashore).any():
             kept &= ~piece
             continue
-        ring = (cv2.dilate(piece.astype(np.uint8), disc(0.01 * longest)) > 0) & ~piece
+        ring = spread(piece, 0.01 * longest) & ~piece
         if (ring & region & (pace > 1.0)).sum() > 0.5 * ring.sum():
             rocks |= piece
     threads = cv2.morphologyEx(kept.astype(np.uint8), cv2.MORPH_OPEN, disc(0.004 * longest)) > 0

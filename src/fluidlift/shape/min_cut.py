@@ -99,3 +99,8 @@ def disc(radius: float) -> np.ndarray:
     """Round structuring element, u8."""
     size = 2 * max(1, round(radius)) + 1
     return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+
+
+def spread(where: np.ndarray, radius: float) -> np.ndarray:
+    """bool [h,w]: what lies within so many px (at least 1) of it."""
+    return cv2.dilate(where.astype(np.uint8), disc(radius)) > 0

@@ -15,7 +15,7 @@ from scipy.ndimage import convolve1d
 from fluidlift.shape.advancing import median_over_time
 from fluidlift.shape.background import colour_bins
 from fluidlift.shape.evidence import POOLING, Evidence
-from fluidlift.shape.min_cut import disc
+from fluidlift.shape.min_cut import disc, spread
 
 REACH = 0.04
 """part of the longer side: how far a waterline may go back, and the width of the strip of ground that is looked at"""
@@ -91,11 +91,6 @@ class ShoreColours:
                 weight = np.abs(1 - down - (self._rows - top)) * np.abs(1 - right - (self._columns - left))
                 odds += weight * self._odds[(top + down, left + right, *bins)]
         return cv2.GaussianBlur(odds, (0, 0), BLUR)
-
-
-def spread(where: np.ndarray, radius: float) -> np.ndarray:
-    """bool [h,w]: what lies within so many px (at least 1) of it."""
-    return cv2.dilate(where.astype(np.uint8), disc(radius)) > 0
 
 
 def dry_over_time(

@@ -222,8 +222,7 @@ def scene_of(
     body = Particles.at_rest(rest.means, 1.0, np.arange(len(rest)), sample_faces(velocity, grid, rest.means))
     shading = None
     if footage is not None and asset.kind in LYING:  # bodies in the air change their outline: nothing is steady
-        mask = footage.labels.fluid.mean(axis=0) > 0.5
-        shading = SteadyShading.of(footage.clip.frames, mask, asset.camera) if mask.any() else None
+        shading = SteadyShading.of(footage.clip.frames, footage.labels.fluid, asset.camera)
     changes = dict(edits.parameters)
     longest_step = changes.pop("time_step", None)
     scene = Scene(

@@ -29,6 +29,15 @@ def test_a_jet_into_a_round_pool_seen_from_above_is_a_puddle_with_a_jet():
     assert found.lying[130, 80] and not found.lying[20, 80]
 
 
+def test_wet_traces_around_a_pool_are_no_part_of_its_outline():
+    mask, motion, trust = scene(pool(32.0))
+    ring = ((COL - 80) / 66) ** 2 + ((ROW - 100) / 46) ** 2
+    mask |= (np.abs(ring - 1.0) < 0.03) & (ROW < 90) & ~JET
+    found = jets_into_puddle(CAMERA, UpEvidence(40.0, 0.0, "", 1.0), mask, motion, trust)
+    assert found is not None
+    assert not found.lying[ring > 0.9].any()
+
+
 def test_a_glass_seen_from_the_side_is_no_puddle():
     glass = (np.abs(COL - 80) < 32) & (ROW > 60) & (ROW < 150)
     assert jets_into_puddle(CAMERA, None, *scene(glass)) is None

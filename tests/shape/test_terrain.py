@@ -274,6 +274,8 @@ def test_a_closed_puddle_has_a_bank_on_all_sides():
     box = np.ones(rim.shape, bool)
     box[1:-1, 1:-1] = False
     assert (setting.bed_height[box] > 0).all()
+    # a fifth of the pool's true width
+    assert -setting.bed_height.min() == pytest.approx(0.2 * 1.4, rel=0.1)
 
 
 def test_a_dry_corner_beyond_the_end_of_the_stream_is_no_bank():

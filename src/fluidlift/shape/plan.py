@@ -114,8 +114,8 @@ def extent_of(seen: Footage) -> Extent:
     require(bool(wet.any()), "no fluid on the ground")
     whole = ndimage.binary_fill_holes(ndimage.binary_closing(np.pad(wet, 2), iterations=2))[2:-2, 2:-2]
     whole &= plan.known
-    stream = _without_tails(whole, TAIL * _width(whole, h) / h)
-    width = _width(stream if seen.closed else _continued(stream, plan.known, grid, seen.along), h)
+    stream = _without_tails(whole, TAIL * _width(whole, h, seen.closed) / h)
+    width = _width(stream if seen.closed else _continued(stream, plan.known, grid, seen.along), h, seen.closed)
     cell = grid.cell_of(seen.visible)[:, :2]
     inside = ((cell >= 0) & (cell < grid.shape[:2])).all(axis=1)
     cell = np.clip(cell, 0, np.array(grid.shape[:2]) - 1)
@@ -164,10 +164,12 @@ def _without_tails(wet: np.ndarray, radius: float) -> np.ndarray:
     return (sizes >= 0.1 * sizes.max())[label] & opened
 
 
-def _width(wet: np.ndarray, spacing: float) -> float:
-    """Typical width across the stream, m. In a channel of half width a the distances to the bank are spread evenly over
-    0 to a, whose 90th percentile is 0.9 a; that holds on when a bank is ragged or an island stands in the stream."""
-    return 2.0 / 0.9 * float(np.percentile(distance_inside(wet, spacing)[wet], 90))
+def _width(wet: np.ndarray, spacing: float, closed: bool) -> float:
+    """Typical width across the stream or the pool, m. In a channel of half width a the distances to the bank are spread
+    evenly over 0 to a, whose 90th percentile is 0.9 a; that holds on when a bank is ragged or an island stands in the
+    stream. In a round pool of radius a more of them are short, (1 - d / a)^2 lie beyond d: 0.9 a is their 99th."""
+    share = 99.0 if closed else 90.0
+    return 2.0 / 0.9 * float(np.percentile(distance_inside(wet, spacing)[wet], share))
 
 
 def plan_of(seen: Footage, grid: Grid, extent: Extent | None = None) -> Plan:

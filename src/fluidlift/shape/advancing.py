@@ -4,10 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-import cv2
 import numpy as np
 
-from fluidlift.shape.background import DECISIVE, filled_in, own_tint, still_background, typical_contrast
+from fluidlift.shape.background import (
+    DECISIVE,
+    TINGED,
+    darker,
+    filled_in,
+    is_tinted,
+    own_tint,
+    still_background,
+    typical_contrast,
+)
 from fluidlift.shape.evidence import POOLING, Evidence, change_over_time, pool
 from fluidlift.shape.min_cut import spread
 from fluidlift.shape.presence import Presence
@@ -16,9 +24,6 @@ from fluidlift.types.clip import Label
 
 SHADOW = 0.2
 """factor on changes of brightness against the sign of the fluid's own contrast"""
-TINGED, TINT_BLUR = 0.4, 1.5
-"""of the fluid's own colour, in the mean over px: what is darker than the ground and has less is ground in shade, which
-may be tinged by the sky"""
 FAINTEST = 0.5
 """of the fluid's typical contrast with the background: an outline lies where fluid and background mix half and half"""
 GAP = 0.012
@@ -54,13 +59,12 @@ def odds_over_time(
     """float32 [h,w], log odds of fluid in every frame: it differs from what is behind it, moves, has its colour.
 
     Where the background was never seen, what is filled in from around it only tells a shadow: a clear change against
-    the sign of the fluid's contrast, though it moves as the fluid does.
+    the sign of the fluid's contrast, though it moves as the fluid does. That steady fluid stands still says nothing.
     """
-    background, known, like_fluid = still_background(evidence, presence, domain)
-    contrast, brightens = typical_contrast(evidence, presence, background, known)
+    scene = still_background(evidence, presence, domain)
+    contrast, brightens = typical_contrast(evidence, presence, scene.background, scene.known)
     threshold = np.maximum(4.0 * evidence.noise, FAINTEST * contrast)
-    background = filled_in(background, known)
-    tint = own_tint(evidence, presence, background, known)
+    background, tinted = filled_in(scene.background, scene.known), is_tinted(evidence, presence, scene)
     sigma = POOLING * max(evidence.noise.shape)
     for t, change in enumerate(change_over_time(evidence)):
         picture = evidence.source[t].astype(np.float32)
@@ -69,15 +73,17 @@ def odds_over_time(
         size = np.abs(change_of_colour).sum(axis=-1)
         differs = size / threshold
         shaded = change_of_colour[..., 0] * brightens < -0.5 * size
-        if tint is not None:
-            darker = change_of_colour[..., 0] < -0.5 * size
-            shaded |= darker & (cv2.GaussianBlur(tint(picture), (0, 0), TINT_BLUR) < TINGED)
         differs[shaded] *= SHADOW
+        if tinted:
+            tint, dark = own_tint(picture, background, scene.fluid) / TINGED, darker(change_of_colour)
+            differs[dark] = np.minimum(differs, np.maximum(tint, 0.0))[dark]
+            shaded |= dark & (tint < 1.0)
         stands_out = np.log(np.maximum(differs, 1e-3)) / 0.3
         seen = stands_out + 0.25 * np.clip(moved, -4.0, 4.0)
-        guessed = np.clip(moved, -3.0, 3.0) + like_fluid(picture)
+        told = np.where(scene.steady, np.maximum(moved, 0.0), moved)
+        guessed = np.clip(told, -3.0, 3.0) + scene.like_fluid(picture)
         guessed[shaded & (2.0 * size > threshold)] = -DECISIVE
-        best = np.where(known, seen, guessed) + hint
+        best = np.where(scene.known, seen, guessed) + hint
         yield np.clip(np.where(domain, best, -12.0), -12.0, 12.0).astype(np.float32)
 
 

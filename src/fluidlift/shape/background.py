@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -10,7 +11,7 @@ from scipy.ndimage import convolve1d, gaussian_filter
 
 from fluidlift.shape.evidence import Evidence
 from fluidlift.shape.frame_pictures import typical_picture
-from fluidlift.shape.min_cut import geodesic_distance
+from fluidlift.shape.min_cut import geodesic_distance, spread
 from fluidlift.shape.presence import Presence
 
 DECISIVE = 3.5
@@ -28,19 +29,44 @@ TINTED = 0.6
 they reach a little over its outline"""
 SURE = 2.0
 """log odds from which a place where no background was seen is held to be fluid"""
+COMMONER = 5.0
+"""times rarer around the fluid than in it is a colour that may be steady fluid rather than its surroundings"""
+TINGED, TINT_BLUR = 0.4, 1.5
+"""of the fluid's own colour, in the mean over px: what is darker than the ground and has less is ground in shade, which
+may be tinged by the sky"""
+LEAST_TINT = 8.0
+"""grey levels: before a ground to which the fluid would give less tint of its own, the tint tells nothing"""
+MIXED = 0.5
+"""of the way from the ground's colour to the fluid's from which what stands still can be fluid"""
+RIM = 0.012
+"""part of the longer side: so far a steady column is thinner, and nearer to its ground's colours, than its core"""
 
 
-def still_background(
-    evidence: Evidence, presence: Presence, domain: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, Callable[[np.ndarray], np.ndarray]]:
-    """The picture behind the fluid, float32 [h,w,3], where it is known, bool [h,w], and a colour test of fluid.
+@dataclass(frozen=True)
+class StillScene:
+    """What is behind the fluid, and what of the fluid stands still before it."""
+
+    background: np.ndarray
+    """float32 [h,w,3], opponent colours"""
+    known: np.ndarray
+    """bool [h,w], where it is"""
+    steady: np.ndarray
+    """bool [h,w], `steady_fluid`: its picture is not the background"""
+    like_fluid: Callable[[np.ndarray], np.ndarray]
+    """log odds of fluid of opponent colours [...,3]"""
+    fluid: np.ndarray
+    """float [3], the fluid's own colour"""
+
+
+def still_background(evidence: Evidence, presence: Presence, domain: np.ndarray) -> StillScene:
+    """The picture behind the fluid and a colour test of fluid.
 
     A pixel is taken before the fluid first reached it, or after it was last seen there. What looks more like the
-    moving fluid than like the surroundings is not believed: a steady column of smoke is quiet too. The domain is
-    extended, in place, over such quiet fluid where it touches the moving one, and freed of `smooth_ground` where the
-    fluid has colours of its own. Colour is trusted as far as the moving places have: clear water shows those of the
-    background. The scene's colours are those of all that is known, so that ground of one colour with the smoke is
-    believed where the rest of that ground is.
+    moving fluid than like the surroundings is not believed: a steady column of smoke is quiet too. The domain,
+    bool [h,w], is extended, in place, over such quiet fluid where it touches the moving one, and freed of
+    `smooth_ground` where the fluid has colours of its own. Colour is trusted as far as the moving places have: clear
+    water shows those of the background. The scene's colours are those of all that is known, so that ground of one
+    colour with the smoke is believed where the rest of that ground is.
     """
     total, count = np.zeros((*domain.shape, 3), np.float32), np.zeros(domain.shape, np.float32)
     for t in range(presence.frames):
@@ -49,18 +75,74 @@ def still_background(
         count += free
     background = total / np.maximum(count, 1.0)[..., None]
     pictures = np.stack([evidence.source[t] for t in presence.picked])
-    moving = colour_histogram(pictures[presence.active])
+    moving, around = colour_histogram(pictures[presence.active]), colour_histogram(pictures[:, ~domain])
     faint = evidence.activity > FAINT * evidence.level
-    domain |= quiet_fluid(background, domain, moving, colour_histogram(pictures[:, ~domain]), faint)
+    quiet = quiet_fluid(background, domain, moving, around, faint)
     seen = count >= 3
+    own = without_background(moving, around)
+    alien = rarer_around(background, own, around, COMMONER)
+    ground = filled_in(background, seen & ~domain & ~quiet & ~spread(alien, RIM * max(domain.shape)))
+    fluid = fluid_colour(pictures, presence.active, ground)
+    rare = rarer_around(background, own, colour_histogram(pictures[:, ~domain & ~alien]), RARE)
+    steady = steady_fluid(background, seen & rare, domain, ground=ground, fluid=fluid)
+    domain |= quiet | steady
     known = seen & ~domain
     for _ in range(ROUNDS):
-        around = len(pictures) * colour_histogram(background[known])
-        like_fluid, trust = colour_test(moving, around)
-        known = seen & (like_fluid(background) <= np.log(2.0))
+        scene = len(pictures) * colour_histogram(background[known])
+        like_fluid, trust = colour_test(moving, scene)
+        known = seen & ~steady & (like_fluid(background) <= np.log(2.0))
     if trust > OWN:
-        domain &= ~smooth_ground(evidence, background, known, like_fluid)
-    return background, known, like_fluid
+        domain &= steady | ~smooth_ground(evidence, background, known, like_fluid)
+    return StillScene(background, known, steady, like_fluid, fluid)
+
+
+def fluid_colour(pictures: np.ndarray, active: np.ndarray, ground: np.ndarray) -> np.ndarray:
+    """float [3]: median of the quarter of the moving places that differs most from the ground: the rest shows it too.
+
+    Args:
+        pictures: float [n,h,w,3], opponent colours.
+        active: bool [n,h,w], where there was motion in them.
+        ground: float32 [h,w,3], what is behind.
+    """
+    colours = pictures[active].astype(np.float32)
+    if len(colours) == 0:
+        return np.zeros(3)
+    size = np.abs(pictures - ground).sum(axis=-1)[active]
+    return np.median(colours[size >= np.quantile(size, 0.75)], axis=0)
+
+
+def steady_fluid(
+    picture: np.ndarray, rare: np.ndarray, domain: np.ndarray, *, ground: np.ndarray, fluid: np.ndarray
+) -> np.ndarray:
+    """bool [h,w]: fluid that looks the same all the time, touches the domain, and a rim of `RIM` around it.
+
+    Its colour is rare around the fluid, and lies on the way from the ground's to the fluid's: where smoke brightens,
+    its shadow darkens; where both darken, the shadow has no tint of the smoke.
+
+    Args:
+        picture: float32 [h,w,3], opponent colours that were seen without motion.
+        rare: bool [h,w], where they are the fluid's own and rare in its surroundings.
+        domain: bool [h,w], where the fluid moves.
+        ground: float32 [h,w,3], what the surroundings let expect there.
+        fluid: float [3], the fluid's own colour.
+    """
+    step, way = picture - ground, fluid - ground
+    mixed = (step * way).sum(axis=-1) > MIXED * (way**2).sum(axis=-1)
+    shade = darker(step) & (own_tint(picture, ground, fluid) < TINGED)
+    found = touching(rare & mixed & ~shade, domain)
+    return spread(found, RIM * max(domain.shape)) if found.any() else found
+
+
+def rarer_around(picture: np.ndarray, fluid: np.ndarray, around: np.ndarray, times: float | np.ndarray) -> np.ndarray:
+    """bool [h,w]: colours so many times rarer in one histogram than in the fluid's."""
+    bins = colour_bins(picture)
+    return fluid[bins] / max(fluid.sum(), 1.0) + 1e-5 > times * (around[bins] / max(around.sum(), 1.0) + 1e-5)
+
+
+def touching(found: np.ndarray, domain: np.ndarray) -> np.ndarray:
+    """The parts of what was found that hang together with the domain, bool [h,w]."""
+    parts = cv2.connectedComponents((domain | found).astype(np.uint8), connectivity=4)[1]
+    return found & np.isin(parts, np.unique(parts[domain]))
 
 
 def colour_test(moving: np.ndarray, around: np.ndarray) -> tuple[Callable[[np.ndarray], np.ndarray], float]:
@@ -137,11 +219,7 @@ def quiet_fluid(
 
     Where there is `faint` activity, bool [h,w], the colour need only be more common in the fluid than around.
     """
-    bins = colour_bins(picture)
-    share_moving, share_around = moving[bins] / max(moving.sum(), 1.0), around[bins] / max(around.sum(), 1.0)
-    alien = share_moving + 1e-5 > np.where(faint, 1.0, RARE) * (share_around + 1e-5)
-    parts = cv2.connectedComponents((domain | alien).astype(np.uint8), connectivity=4)[1]
-    return alien & np.isin(parts, np.unique(parts[domain]))
+    return touching(rarer_around(picture, moving, around, np.where(faint, 1.0, RARE)), domain)
 
 
 def typical_contrast(
@@ -164,30 +242,45 @@ def typical_contrast(
     return float(np.median(np.abs(together).sum(axis=-1))), float(np.sign(bias)) if abs(bias) > 0.7 else 0.0
 
 
-def own_tint(
-    evidence: Evidence, presence: Presence, background: np.ndarray, known: np.ndarray
-) -> Callable[[np.ndarray], np.ndarray] | None:
-    """How much of the fluid's colour a picture of opponent colours [h,w,3] has, 1 in the fluid and 0 in any shade of
-    the background; None where the fluid has no colour of its own.
+def darker(step: np.ndarray) -> np.ndarray:
+    """bool [h,w]: changes [h,w,3] that are mostly a loss of brightness."""
+    return step[..., 0] < -0.5 * np.abs(step).sum(axis=-1)
 
-    A shadow scales all colours of the ground alike. What is left of a change after that is along the fluid's own
-    colour difference, nearly everywhere where it moves, or that difference is none.
-    """
-    moving = [(evidence.source[t], active & known) for t, active in zip(presence.picked, presence.active, strict=True)]
-    tints = np.concatenate([(_tint(picture, background))[where] for picture, where in moving])
+
+def is_tinted(evidence: Evidence, presence: Presence, scene: StillScene) -> bool:
+    """Whether the fluid has a colour of its own: nearly all that moves changes in colour alike, not so clear water."""
+    moving = zip(presence.picked, presence.active, strict=True)
+    parts = [_tint(evidence.source[t], scene.background)[active & scene.known] for t, active in moving]
+    tints = np.concatenate(parts)
     if len(tints) == 0:
-        return None
+        return False
     own = np.median(tints, axis=0)
     size = float(own @ own)
-    if size == 0.0 or float((tints @ own > 0.5 * size).mean()) < TINTED:
-        return None
-    return lambda picture: _tint(picture, background) @ own / size
+    return size > 0.0 and float((tints @ own > 0.5 * size).mean()) >= TINTED
 
 
-def _tint(picture: np.ndarray, background: np.ndarray) -> np.ndarray:
-    """[h,w,2], colour differences less those of the background in as much light."""
-    light = np.clip(picture[..., :1] / np.maximum(background[..., :1], 1.0), 0.0, 1.0)
-    return picture[..., 1:] - light * background[..., 1:]
+def own_tint(picture: np.ndarray, ground: np.ndarray, fluid: np.ndarray) -> np.ndarray:
+    """float [h,w]: how much of the fluid's colour a picture has, 1 in the fluid and 0 in any shade of the ground.
+
+    A shadow scales all colours of the ground alike. What is left of a change after that is compared with what the
+    fluid would leave before the same ground; 1 where that is below `LEAST_TINT`.
+
+    Args:
+        picture: float32 [h,w,3], opponent colours.
+        ground: float32 [h,w,3], what is behind.
+        fluid: float [3], the fluid's own colour.
+    """
+    expected = _tint(np.broadcast_to(fluid, ground.shape), ground)
+    size = (expected**2).sum(axis=-1)
+    part = (_tint(picture, ground) * expected).sum(axis=-1) / np.maximum(size, LEAST_TINT**2)
+    part[size < LEAST_TINT**2] = 1.0
+    return cv2.GaussianBlur(part, (0, 0), TINT_BLUR)
+
+
+def _tint(picture: np.ndarray, ground: np.ndarray) -> np.ndarray:
+    """[h,w,2], colour differences less those of the ground in as much light."""
+    light = np.clip(picture[..., :1] / np.maximum(ground[..., :1], 1.0), 0.0, 1.0)
+    return picture[..., 1:] - light * ground[..., 1:]
 
 
 def colour_bins(colours: np.ndarray, *, bins: int = 16) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -99,6 +99,25 @@ def test_shear_does_not_draw_the_pattern_out():
     assert (patches.state.strains < LIMIT + 13 * 0.05 * shear).all(), "those beyond the limit go within twelve frames"
 
 
+def test_streaks_stay_along_a_flow_that_shears():
+    """Turned with half of the vorticity, they would lie across it by half a radian before they give way."""
+    state = patches_over(lambda x, y: (2.0 + 0.8 * (y - 2), 0 * y), 60).state
+    assert state.strains.max() > 0.5 and np.abs(state.turns).max() < 0.05
+
+
+def test_a_piece_taken_from_a_stretch_that_heads_elsewhere_lies_along_the_flow():
+    """Seen, everything went along x; now it goes along y: old pieces come round as fast as the flow can turn a line."""
+    seen = surface(lambda x, y: (1.0 + 0 * x, 0 * y))
+    patches = TexturePatches(SeenTexture(sheet(), CAMERA, seen), 0.6)
+    patches.advance(seen, 0.0, np.random.default_rng(0))
+    now = surface(lambda x, y: (0 * x, 1.0 + 0 * y))
+    for k in range(60):
+        patches.advance(now, 0.05, np.random.default_rng(k))
+    young = patches.state.presences < 1
+    assert young.any()
+    np.testing.assert_allclose(patches.state.turns[young], np.pi / 2, atol=0.05)
+
+
 def test_new_patches_show_what_was_seen_of_the_fluid_and_not_what_was_not():
     """Red is what may not lend its look: a bank, say. After three seconds all that was there at first has left."""
     inside = lambda x, y: (np.abs(x - 2) < 1.4) & (np.abs(y - 2) < 1.4)  # noqa: E731

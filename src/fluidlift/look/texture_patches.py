@@ -2,8 +2,9 @@
 
 Foam, glitter and ripples are carried by the flow, and are made anew all the time. Carried alone they would be stirred
 into streaks after a second. So the look is that of overlapping patches (Lagrangian texture advection: Yu, Neyret,
-Bruneton, Holzschuch 2011): each moves and turns with the flow as a rigid piece of the look at rest, and gives way to a
-new one when the flow has sheared it too far. Speed and pattern both stay those that were seen, for any time.
+Bruneton, Holzschuch 2011): each moves with the flow as a rigid piece of the look at rest, turns as its path does, and
+gives way to a new one when the flow has sheared it too far. Speed and pattern both stay those that were seen, for any
+time.
 """
 
 from __future__ import annotations
@@ -101,6 +102,7 @@ class TexturePatches:
         self.state = Patches.none()
         self._texture, self._radius = texture, radius
         self._good = texture.trust_within(radius)
+        self._seen_flow = _gradients(texture.surface, SMOOTH * radius)[0]
 
     def advance(self, surface: SurfaceMap, interval: float, rng: np.random.Generator) -> None:
         """Carry the patches along for an interval (s; 0: the first instant), and cover what they have left bare."""
@@ -115,20 +117,31 @@ class TexturePatches:
             uncovered = cKDTree(lasting).query(bare)[0] > APART * self._radius
         centers = _spread(bare, uncovered, APART * self._radius, rng)
         if len(centers):
-            self.state = self.state.joined(self._fresh(centers, interval == 0, rng))
+            self.state = self.state.joined(self._fresh(centers, interval == 0, surface, rng))
 
     def _carry(self, surface: SurfaceMap, interval: float) -> None:
         s, (flow, spin, shear) = self.state, _gradients(surface, SMOOTH * self._radius)
         rate = surface.at(shear, s.centers)
         fade = np.clip(LIMIT / 3 / np.maximum(rate * interval, 1e-9), *FADE)
-        turns, strains = s.turns + interval * surface.at(spin, s.centers), s.strains + interval * rate
+        strains = s.strains + interval * rate
         presences = np.clip(s.presences + np.where(strains > LIMIT, -1, 1) / fade, 0.0, 1.0)
         centers = s.centers + interval * surface.at(flow, s.centers)
+        # a line that is carried along turns at most so fast
+        most = interval * (np.abs(surface.at(spin, s.centers)) + rate)
+        turns = s.turns + np.clip(_wrapped(self._heading(surface, flow, centers, s.sources) - s.turns), -most, most)
         moved = Patches(centers, s.sources, turns, strains, presences)
         away = cKDTree(surface.columns()).query(centers)[0] if surface.wet.any() else np.full(len(s), np.inf)
         self.state = moved.select(~(moved.going & (presences <= 0)) & (away < self._radius))
 
-    def _fresh(self, centers: np.ndarray, first: bool, rng: np.random.Generator) -> Patches:
+    def _heading(self, surface: SurfaceMap, flow: np.ndarray, centers: np.ndarray, sources: np.ndarray) -> np.ndarray:
+        """Turn (radians) that lies along the flow at `centers` as the look at rest lies along the flow at `sources`.
+
+        Streaks of foam lie along the flow, however it shears them: turned with half of its vorticity they would not.
+        """
+        here, there = surface.at(flow, centers), self._texture.surface.at(self._seen_flow, sources)
+        return np.arctan2(here[:, 1], here[:, 0]) - np.arctan2(there[:, 1], there[:, 0])
+
+    def _fresh(self, centers: np.ndarray, first: bool, surface: SurfaceMap, rng: np.random.Generator) -> Patches:
         """New patches. Those of the first instant show the body as it is: whole ones, of different age; where that was
         not seen well they soon give way."""
         none, few = np.zeros(len(centers)), np.full(len(centers), 1 / FADE[1])
@@ -136,7 +149,9 @@ class TexturePatches:
             seen = self._texture.surface.at(self._good, centers) > 0.5 * GOOD
             strains = np.where(seen, rng.uniform(0, 0.5 * LIMIT, len(centers)), 2 * LIMIT)
             return Patches(centers, centers.copy(), none, strains, np.ones(len(centers)))
-        return Patches(centers, np.array([self._source(c, rng) for c in centers]), none.copy(), none, few)
+        sources = np.array([self._source(c, rng) for c in centers])
+        turns = _wrapped(self._heading(surface, _gradients(surface, SMOOTH * self._radius)[0], centers, sources))
+        return Patches(centers, sources, turns, none, few)
 
     def _source(self, center: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Where a new patch takes its look from: near its place (foam is where rocks are), not the same again."""
@@ -178,6 +193,11 @@ class TexturePatches:
         total = np.bincount(point, weight, minlength=n)
         mean = [np.bincount(point, weight * color[:, k], minlength=n) / np.maximum(total, 1e-30) for k in range(3)]
         return np.clip(np.stack(mean, axis=-1), 0.0, 1.0), total > 0
+
+
+def _wrapped(angles: np.ndarray) -> np.ndarray:
+    """The same angles within half a turn to either side."""
+    return (angles + np.pi) % (2 * np.pi) - np.pi
 
 
 def _gradients(surface: SurfaceMap, width: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

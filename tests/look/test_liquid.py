@@ -141,10 +141,12 @@ def test_what_a_rock_hides_is_taken_from_beside_its_outline():
     depth[:, 10:14], depth[:, 20:] = 1.0, 1.0  # two rocks before water at 2
     water = np.where(depth > 2.0, 2.0, 0.0).astype(np.float32)
 
-    def looked(start, end, rests=False):
-        return seen_beside((start, 5.5), (end, 5.5), depth, 2.0, 2.5, water, rests)
+    def looked(start, end, rests=False, coarse=1.0):
+        return seen_beside((start, 5.5), (end, 5.5), depth, 2.0, 2.5, water, rests, coarse)
 
     assert looked(17.5, 30.0) == (19.5, 5.5)  # the last pixel that is seen on the way there
+    assert looked(15.5, 30.0, coarse=2.0) == (17.5, 5.5)  # two of the former pixels off, and not beyond the start
+    assert looked(17.5, 30.0, coarse=9.0) == (17.5, 5.5)
     assert looked(3.5, 30.0) == (9.5, 5.5)  # before the first rock, not between the two
     assert hides(depth, water, False, 5, 30, 2.0) and not hides(depth, water, False, 5, 17, 2.0)
     assert borders(depth, 5, 9, 9.8, 5.5, 2.0) and not borders(depth, 5, 9, 9.2, 5.5, 2.0)
@@ -167,6 +169,22 @@ def test_behind_a_rock_one_sees_no_band_of_another_place():
     # light is bent towards the viewer, and close to the outline comes from what the rock hides
     assert column.max() <= 1.0 + 1e-5
     assert (np.diff(column) < 1e-6).all()  # a step back to a farther place would be brighter
+
+
+def test_the_blurred_rim_of_a_rock_in_an_enlarged_picture_is_not_drawn_out():
+    width, height = SIZE
+    rock = np.arange(height)[:, None] * np.ones(width) >= height // 2
+    image, z = (
+        np.where(rock[..., None], 1.0, np.zeros((height, width, 3))),
+        np.where(rock, 0.5 * level(0.3), level(-0.6)),
+    )
+    image[height // 2 - 2 : height // 2] = np.array([0.3, 0.6])[:, None, None]  # two of the former pixels
+
+    def seen(image, coarse):
+        return shaded(slab(), Behind(image, z, coarse=coarse), CAMERA, CLEAR, WHITE)[: height // 2 - 2, width // 2, 0]
+
+    assert (seen(image, 1.0) - seen(0.0 * image, 1.0)).max() > 0.2
+    assert (seen(image, 2.0) - seen(0.0 * image, 2.0)).max() < 0.1  # half a pixel over, as every look-up
 
 
 def test_the_ground_cuts_the_thickness_off():

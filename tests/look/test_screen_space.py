@@ -181,6 +181,20 @@ def test_particles_carry_the_colours_of_those_that_are_seen():
     np.testing.assert_allclose(albedo, np.broadcast_to([1.0, 0.0, 0.0], albedo.shape), atol=1e-5)
 
 
+def test_colours_lie_on_the_surface_also_where_it_is_seen_at_a_slant():
+    points, e = box((1.2, 1.6, 0.2)), np.radians(25.0)
+    camera = PinholeCamera.looking((0.0, -3.0 * np.cos(e), 3.0 * np.sin(e)), (0.0, 0.0, 0.1), 26.0, (160, 120))
+    colors = np.where(np.abs(points[:, 1:2]) < 0.1, [1.0, 0.0, 0.0], [0.0, 0.0, 1.0])  # all the way down
+    surface, middle = particle_surface(points, RADIUS, camera, colors), (slice(None), slice(76, 84))
+    there = (surface.covered > 0.9)[middle]
+    y = camera.unproject(camera.pixel_grid()[middle], surface.depth[middle])[..., 1]
+    red = surface.albedo[middle][..., 0] * there
+    # the next layer, 1.25 radii down, is seen 2.7 radii nearer to the viewer: spheres that weigh as much as they are
+    # long in the line of sight draw the stripe there
+    off = (red * y).sum() / red.sum() - y[there & (np.abs(y) < 0.1)].mean()
+    assert abs(off) < 1.5 * RADIUS
+
+
 def test_nothing_far_and_broken_particles_draw_nothing():
     points = np.array([[np.nan, 0, 0], [0.0, -4.0, 1.5], [0.3, -3.0, 1.02]])  # no number, behind, around the camera
     for some in (points, np.zeros((0, 3))):

@@ -12,7 +12,9 @@ from fluidlift.errors import InputRejected
 from fluidlift.io.asset_folder import read_manifest
 from fluidlift.io.exr import read_channels
 from fluidlift.io.video import read_clip
+from fluidlift.pipeline.drawing import _placed
 from fluidlift.pipeline.rendering import RenderRequest, render_asset
+from fluidlift.types import PinholeCamera
 
 WELL = (DONE, WITH_WARNINGS)
 
@@ -83,6 +85,18 @@ def test_a_wider_picture_shows_more_and_stretches_nothing(made, tmp_path):
         assert render(made, tmp_path / name, "--size", size, "--frames", "1001-1001") in WELL
     narrow, wide = (picture(tmp_path / n / "1001.png")[..., :3].astype(int) for n in "ab")
     np.testing.assert_allclose(wide[:, 16:112], narrow, atol=1)
+
+
+def test_beyond_its_edges_a_plate_goes_on_as_in_a_mirror_and_its_rocks_do_not():
+    source = PinholeCamera.from_fov(50, (60, 40))
+    camera = PinholeCamera(source.focal, (50.0, 20.0), (100, 40), source.camera_from_world)  # 20 px more on each side
+    plate = np.random.default_rng(0).integers(0, 255, (40, 60, 3), np.uint8)
+    wide = _placed(plate, source, camera)
+    np.testing.assert_allclose(wide, np.pad(plate, ((0, 0), (20, 20), (0, 0)), mode="symmetric") / 255.0, atol=1e-6)
+    assert np.abs(np.diff(wide[:, :20], axis=1)).mean() > 0.2  # no streaks of one pixel's colour
+    rocks = _placed(plate, source, camera, goes_on=False)
+    assert (rocks[:, :20] == 0).all() and (rocks[:, 80:] == 0).all()
+    np.testing.assert_array_equal(rocks[:, 20:80], wide[:, 20:80])
 
 
 @pytest.mark.parametrize(

@@ -315,6 +315,18 @@ def test_behind_a_fluid_that_never_goes_the_ground_around_it_is_painted():
     np.testing.assert_allclose(plate.image.astype(int), np.broadcast_to(BROWN, (H, W, 3)), atol=3)
 
 
+def test_behind_a_fluid_that_stands_the_layers_of_the_scene_go_on_and_no_seam_is_in_them():
+    scene = np.where(ROW[..., None] < 20, (230, 235, 240), (40, 60, 30)).astype(np.uint8)  # sky over trees
+    fluid = np.zeros((3, H, W), bool)
+    fluid[:, 8:, 28:68] = True
+    frames = np.where(fluid[..., None], np.uint8(128), scene)
+    plate = background_plate(frames, fluid).image.astype(float)
+    # in a hole 40 px wide the sky fades by exp(-3 pi / 40) per row: to 4 % of it, 8 grey levels, in row 34
+    np.testing.assert_allclose(plate[34:, 48], np.broadcast_to((40, 60, 30), (H - 34, 3)), atol=12)
+    assert (plate[8:14, 48] > 150).all()
+    assert np.abs(np.diff(plate[34:, 32:64], axis=1)).max() < 4  # no seam where sides meet
+
+
 def test_rocks_stay_in_the_plate_but_do_not_colour_the_bed_beside_them():
     frames, fluid, stone = passing_blob(rock=True)
     plate = background_plate(frames, fluid, stone)

@@ -1,12 +1,14 @@
 """The picture on the ground: where it shows it, behind what hides it, under water, and on the cut sides."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from scipy.ndimage import binary_erosion
+from scipy.ndimage import binary_dilation, binary_erosion
 
 from fluidlift.numerics.textures import sample_texture
 from fluidlift.shape.ground_mesh import ground_mesh
-from fluidlift.shape.ground_texture import STRIP, View, hidden_ground, over_bed, textured
+from fluidlift.shape.ground_texture import STRIP, View, hidden_ground, over_bed, sky_pixels, textured
 from fluidlift.types import Grid, Label, PinholeCamera
 
 GRID = Grid((24, 16, 6), 0.125, (-1.5, -1.0, -1.0))
@@ -167,6 +169,73 @@ def test_behind_a_fluid_the_picture_shows_the_ground_and_elsewhere_what_was_film
     np.testing.assert_allclose(picture[v, u], (110, 90, 60), atol=12.0)  # the bed
     far = binary_erosion(seen, iterations=8)  # beyond the blend of 1.5 px
     assert far.any() and (picture[far] == plate[far]).all()
+
+
+FACING = PinholeCamera.looking((0.0, -4.0, 0.5), (0.0, 0.0, 0.4), 50.0, (200, 150))
+"""level: the horizon is in the middle of its picture"""
+
+
+def landscape():
+    """Trees and rocks, white sky in the upper corner at the right, as far down as the horizon."""
+    plate = np.random.default_rng(0).normal(80, 15, (150, 200, 1)) * np.array([0.7, 0.8, 0.6])
+    plate[:60, 120:] = (240, 245, 243)
+    return np.clip(plate, 0, 255).astype(np.uint8)
+
+
+def water_before_a_wall():
+    """A sheet of water that stands, the ground that was made up behind it, and a picture of what is really there."""
+    x, y = np.moveaxis(GRID.nodes()[:, :, 0, :2], -1, 0)
+    wall = np.clip(3.0 * (y + 0.3), 0.0, 1.2)
+    level = np.clip(3.0 * (GRID.centers()[:, :, 0, 1] + 0.4), 0.0, 1.3) + 0.05
+    labels = np.full((150, 200), Label.BACKGROUND)
+    labels[20:, 60:120] = Label.FLUID
+    plate = landscape()
+    plate[20:, 60:120] = (150, 40, 40)  # whatever was painted there
+    mesh = ground_mesh(GRID, wall + 0.0 * x)
+    seen = labels != Label.FLUID
+    return textured(mesh, GRID, level, View(plate, FACING, labels.astype(np.uint8), seen)), plate, seen
+
+
+def test_no_ground_is_painted_over_the_scene_behind_water_that_stands():
+    mesh, plate, seen = water_before_a_wall()
+    picture = over_bed(plate, seen, mesh, FACING)
+    np.testing.assert_array_equal(picture[35:70, 75:105], plate[35:70, 75:105])
+
+
+def test_a_wall_behind_water_has_the_colours_of_the_scene_behind_it():
+    mesh, *_ = water_before_a_wall()
+    on_wall, place = colour_at(mesh, [-0.1, -0.1], [-0.2, -0.1])
+    assert (place[:, 2] > 0.2).all()
+    np.testing.assert_allclose(on_wall, np.tile([150.0, 40.0, 40.0], (2, 1)), atol=6.0)
+
+
+def test_the_sky_is_above_the_horizon_even_and_bright_or_blue_and_reaches_the_upper_edge():
+    truth = np.zeros((150, 200), bool)
+    truth[:60, 120:] = True
+    white = landscape()
+    blue = white.copy()
+    blue[truth] = (70, 95, 130)
+    grown = binary_dilation(truth, iterations=6)  # its rim is mixed with what stands before it: 1 % twice
+    for plate in (white, blue):
+        found = sky_pixels(plate, FACING)
+        assert found[binary_erosion(truth, iterations=4, border_value=1)].all() and not found[~grown].any()
+    cliff = white.copy()
+    cliff[truth] = np.clip(np.random.default_rng(1).normal(200, 30, (truth.sum(), 1)), 0, 255)  # bright, but not even
+    assert not sky_pixels(cliff, FACING).any()
+    roof = white.copy()
+    roof[:8] = white[80:88]  # trees above it: no sky
+    assert not sky_pixels(roof, FACING).any()
+    assert not sky_pixels(white, CAMERA).any()  # looks down
+
+
+def test_no_sky_is_laid_on_the_ground():
+    y = GRID.nodes()[:, :, 0, 1]
+    rises = np.clip(3.0 * (y + 0.3), 0.0, 1.2)
+    labels = np.full((150, 200), Label.BACKGROUND, np.uint8)
+    view = View(landscape(), FACING, labels, np.ones((150, 200), bool))
+    assert textured(ground_mesh(GRID, rises), GRID, DRY, view).texture.max() < 160
+    sky_seen = textured(ground_mesh(GRID, 0 * rises), GRID, DRY, replace(view, camera=CAMERA)).texture
+    assert sky_seen.max() > 230  # a white thing on level ground stays
 
 
 def test_vertex_colours_are_those_of_the_texture(level_ground):

@@ -105,6 +105,8 @@ class Behind:
     goes_on: bool = False
     """it stands for what lies beyond its rim, too: first the rim, then the mean. For the plate of a clip, around which
     nobody knows the world; else that is the environment's"""
+    coarse: float = 1.0
+    """px of it that were one px of what it was enlarged from: so far over its outline what it shows may reach"""
     direct: Float[np.ndarray, "h w 4"] | None = None
     """what of it is the strongest light's (linear), and the cosine under which that falls in; None: nothing"""
 
@@ -116,13 +118,13 @@ class Behind:
             object.__setattr__(self, name, array)
 
     @property
-    def rest(self) -> Float[np.ndarray, "4"]:
-        """Linear mean of what is far away and 1, if it goes on beyond the rim; else 0."""
+    def rest(self) -> Float[np.ndarray, "5"]:
+        """Linear mean of what is far away and 1, if it goes on beyond the rim, else 0; and how coarse it is."""
         if not self.goes_on:
-            return np.zeros(4)
+            return np.array([0.0, 0.0, 0.0, 0.0, self.coarse])
         far = self.depth <= 0
         mean = (self.image[far] if far.any() else self.image.reshape(-1, 3)).mean(axis=0, dtype=np.float64)
-        return np.append(mean, 1.0)
+        return np.array([*mean, 1.0, self.coarse])
 
 
 def shaded(

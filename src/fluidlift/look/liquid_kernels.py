@@ -14,7 +14,7 @@ import numba as nb
 import numpy as np
 
 from fluidlift.look.environment_stack import fading, place_of, value_at
-from fluidlift.look.liquid_lookup import borders, fetch_beyond, hides, seen_beside, shown_of_film
+from fluidlift.look.liquid_lookup import blurred_end, borders, fetch_beyond, hides, seen_beside, shown_of_film
 from fluidlift.look.smoothstep import eased
 from fluidlift.look.transparent_rays import fanned, far_side, onward, seen_from, turned_normals
 
@@ -66,12 +66,13 @@ def _onto(x, y, z, lens):
 
 
 @nb.njit(cache=True, error_model="numpy", _nrt=False)
-def _behind(q, o, start, depth, front, lens, up, goes_on, liquid, rests):
+def _behind(q, o, start, depth, front, lens, up, rest, liquid, rests):
     """Where a ray that leaves the liquid at q towards o meets what lies behind: u, v (px), whether the picture holds
     it, and how far it went, over the depth at which it ends (1: to infinity). `start`: u, v of the straight line;
-    `front`: z of the liquid; `up`: world z in camera axes; `goes_on`: whether the picture stands for what lies beyond
-    its rim; `liquid`, `rests`: as of `hides`."""
+    `front`: z of the liquid; `up`: world z in camera axes; `rest`: as of `Behind`; `liquid`, `rests`: as of
+    `hides`."""
     h, w = depth.shape
+    goes_on = rest[3] > 0.0
     u, v = start
     if o[2] < 0.05:  # back to the viewer
         return FAR_AWAY, FAR_AWAY, goes_on, 1.0
@@ -89,11 +90,13 @@ def _behind(q, o, start, depth, front, lens, up, goes_on, liquid, rests):
         else:
             u, v = _onto(o[0], o[1], o[2], lens)
             gone = 1.0
+    if front > 0.0:
+        a, b = blurred_end(start, u, v, rest[4])
+        if hides(depth, liquid, rests, min(max(int(b), 0), h - 1), min(max(int(a), 0), w - 1), front):
+            u, v = seen_beside(start, (a, b), depth, front, q[2], liquid, rests, rest[4])
+            return u, v, True, 0.0
     row, col = min(max(int(v), 0), h - 1), min(max(int(u), 0), w - 1)
     z = depth[row, col]
-    if front > 0.0 and hides(depth, liquid, rests, row, col, front):
-        u, v = seen_beside(start, (u, v), depth, front, q[2], liquid, rests)
-        return u, v, True, 0.0
     if front > 0.0 and borders(depth, row, col, u, v, front):
         u, v = col + 0.5, row + 0.5
     # beyond the rim ground goes on, and the sky is known all around
@@ -173,7 +176,7 @@ def _inner(q, m, share, thick, turns, surface, behind, eye, index, ray):
     ray[FARTHER] = more
     start = _onto(q[0], q[1], max(q[2], 1e-6), lens)
     up = (rotation[0, 2], rotation[1, 2], rotation[2, 2])
-    u, v, held, gone = _behind(q, o, start, depth, 0.0, lens, up, rest[3] > 0.0, surface_depth, False)
+    u, v, held, gone = _behind(q, o, start, depth, 0.0, lens, up, rest, surface_depth, False)
     ray[BEYOND] = 0.0 if held else 1.0
     _turned(rotation, o[0], o[1], o[2], ray, INWARD)
     if held:
@@ -253,7 +256,7 @@ def _follow(i, j, surface, behind, eye, index, ray):
             _inner(q, (mx, my, mz), back, thick, turns, surface, behind, eye, index, ray)
     up = (rotation[0, 2], rotation[1, 2], rotation[2, 2])
     u, v, held, gone = _behind(
-        q, (ox, oy, oz), (j + 0.5, i + 0.5), depth, z0, lens, up, rest[3] > 0.0, surface_depth, free <= 0.0
+        q, (ox, oy, oz), (j + 0.5, i + 0.5), depth, z0, lens, up, rest, surface_depth, free <= 0.0
     )  # fmt: skip
     ray[OUTSIDE] = 0.0 if held else 1.0
     _turned(rotation, ox, oy, oz, ray, THROUGH)

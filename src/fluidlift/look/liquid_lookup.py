@@ -18,6 +18,8 @@ SMALLEST = 8
 """px, rows and columns of the smallest picture"""
 MARCHED, HALVED = 16, 5
 """steps on the way to what is hidden, and times that the one with its outline is halved at least: to a pixel of 512"""
+BLURRED = 2.0
+"""px over which a picture that is enlarged mixes what it shows"""
 RIM = 0.5
 """pictures beyond its rim at which a picture that goes on is no more than its mean"""
 
@@ -95,13 +97,26 @@ def borders(depth, i, j, u, v, front):
     return 0.0 < depth[m, j] < front or 0.0 < depth[i, n] < front
 
 
+@nb.njit(cache=True, inline="always")
+def blurred_end(start, u, v, coarse):
+    """As far on from `start` through u, v (px) as a picture that was enlarged `coarse` times is mixed with what is
+    there."""
+    x, y = u - start[0], v - start[1]
+    away = math.sqrt(x * x + y * y)
+    if coarse <= 1.0 or away < 1e-6:
+        return u, v
+    on = 1.0 + BLURRED * (coarse - 1.0) / away
+    return start[0] + on * x, start[1] + on * y
+
+
 @nb.njit(cache=True, error_model="numpy", _nrt=False)
-def seen_beside(start, end, depth, front, far, liquid, rests):
+def seen_beside(start, end, depth, front, far, liquid, rests, coarse):
     """Where (px) to look for what something before it hides at `end`: the middle of the last pixel on the line from
     `start` where nothing hides (`hides`) the ray, from `front` to `far`, where it leaves the liquid.
 
     What is hidden is taken for what is seen beside its outline: taken from anywhere else, it would stand around every
-    rock as a band with an edge.
+    rock as a band with an edge. In a picture that was enlarged, so many times (`coarse`), what hides reaches over its
+    outline by up to `BLURRED` of the former pixels.
     """
     u, v = end
     h, w = depth.shape
@@ -114,6 +129,7 @@ def seen_beside(start, end, depth, front, far, liquid, rests):
             hidden = s
         else:
             free = s
+    free -= min(BLURRED * (coarse - 1.0) / max(math.hypot(u - start[0], v - start[1]), 1e-9), free)
     i = min(max(int(start[1] + free * (v - start[1])), 0), h - 1)
     j = min(max(int(start[0] + free * (u - start[0])), 0), w - 1)
     return j + 0.5, i + 0.5

@@ -144,14 +144,15 @@ def sphere_depths(centres, box, starts, listed, radius, across, down, depth):
 @nb.njit(cache=True, parallel=True, nogil=True, error_model="numpy", fastmath=_FUSED)
 def sphere_chords(centres, box, starts, listed, radius, across, down, depth, colors, sums):
     """Five pictures: the sum of the lengths (m, along the ray) in all spheres, then colours of those less than a
-    diameter behind the nearest surface, weighted with their lengths, and these weights. Without colours (none of them)
-    the sum alone.
+    diameter from the nearest surface, weighted with their lengths and (1 - (distance / diameter)^2)^3, and these
+    weights: on a surface seen at a slant a colour is as flat as the surface is, and what is deeper than it, and thus
+    seen elsewhere, fades. Without colours (none of them) the sum alone.
 
     depth: as `sphere_depths` gives it, at `step` times the resolution of `sums`.
     """
     count = starts.shape[0] - 1
     square, reach = np.float32(radius * radius), np.float32(2.0 * radius)
-    zero, one = np.float32(0.0), np.float32(1.0)
+    zero, one, support = np.float32(0.0), np.float32(1.0), np.float32(4.0) * square
     step = depth.shape[0] // sums.shape[1]
     for t in nb.prange(count):
         band = scattered(np.int64(t), count)
@@ -172,7 +173,10 @@ def sphere_chords(centres, box, starts, listed, radius, across, down, depth, col
                     rr = a * a + b * b + one
                     chord = math.sqrt(max(rr * square - (p * p + q * q + s * s), zero) / rr)
                     line[k] += chord + chord
-                    if seen:
+                    d = depth[step * row, step * k]
+                    if seen and d < np.inf:
+                        away = (a * d - x) ** 2 + (b * d - y) ** 2 + (d - z) ** 2
+                        weight = chord * max(one - away / support, zero) ** 3
                         for c in range(3):
-                            sums[1 + c, row, k] += chord * colors[i, c]
-                        sums[4, row, k] += chord
+                            sums[1 + c, row, k] += weight * colors[i, c]
+                        sums[4, row, k] += weight

@@ -103,6 +103,7 @@ def _other_look(stage: Stage, folder: Path, step: Callable[[int], None]) -> Iter
     assert stage.painter is not None
     scene, wanted, way = stage.scene, stage.numbers, _background(stage)
     rocks = _rock_depth(stage) if way == "plate" else None
+    coarse = max(stage.cameras[0].focal[0] / scene.camera.focal[0], 1.0) if way == "plate" else 1.0
     for k, (fluid, _, velocities) in enumerate(splat_frames(folder, wanted.stop)):
         if k < wanted.start:
             continue
@@ -110,7 +111,7 @@ def _other_look(stage: Stage, folder: Path, step: Callable[[int], None]) -> Iter
         camera = stage.cameras[k - wanted.start]
         frame = Frame(fluid, velocities, [] if stage.poses is None else placed_bodies(scene.obstacles, stage.poses[k]))
         plate = linear_from_srgb(_behind(way, stage, camera)).astype(np.float32) if way == "plate" else None
-        found = stage.painter.picture(frame, camera, Backdrop(plate, rocks, cut_out=way == "none"))
+        found = stage.painter.picture(frame, camera, Backdrop(plate, rocks, coarse, way == "none"))
         alpha = found.alpha[..., None]
         light = stage.painter.display(found.image / np.maximum(alpha, 1e-4))
         yield Drawn(found.image, found.alpha, found.depth, (srgb_from_linear(light) * alpha).astype(np.float32))
@@ -124,7 +125,8 @@ def _rock_depth(stage: Stage) -> np.ndarray | None:
     rocks = None if footage is None else footage.rocks
     if rocks is None or not rocks.any():
         return None
-    there = _placed(rocks[..., None].repeat(3, 2).astype(np.uint8) * 255, stage.scene.camera, camera)[..., 0] > 0.5
+    picture = rocks[..., None].repeat(3, 2).astype(np.uint8) * 255
+    there = _placed(picture, stage.scene.camera, camera, goes_on=False)[..., 0] > 0.5
     depth = terrain_depth(stage.scene.terrain, camera)
     return np.where(there & np.isfinite(depth), depth, 0.0).astype(np.float32)
 
@@ -175,8 +177,15 @@ def _behind(way: str, stage: Stage, camera: PinholeCamera) -> np.ndarray:
     return _placed(stage.footage.plate, stage.scene.camera, camera)
 
 
-def _placed(plate: np.ndarray, source: PinholeCamera, camera: PinholeCamera) -> np.ndarray:
-    """The plate as a camera of the same place with another picture size sees it; its edge goes on beyond it."""
+def _placed(plate: np.ndarray, source: PinholeCamera, camera: PinholeCamera, *, goes_on: bool = True) -> np.ndarray:
+    """The plate as a camera of the same place with another picture size sees it.
+
+    Args:
+        plate: u8 [h,w,3].
+        source: its camera.
+        camera: of the picture.
+        goes_on: beyond its edges as in a mirror: grass stays grass, where a repeated last pixel is a streak. Else zero.
+    """
     import cv2
 
     scale = np.array(camera.focal) / np.array(source.focal)
@@ -186,5 +195,6 @@ def _placed(plate: np.ndarray, source: PinholeCamera, camera: PinholeCamera) -> 
     way = cv2.INTER_AREA if scale[0] < 1 else cv2.INTER_CUBIC
     if (scale == 1).all() and camera.size == source.size:
         return plate.astype(np.float32) / 255.0
-    moved = cv2.warpAffine(plate, move, camera.size, flags=way, borderMode=cv2.BORDER_REPLICATE)
+    border = cv2.BORDER_REFLECT if goes_on else cv2.BORDER_CONSTANT
+    moved = cv2.warpAffine(plate, move, camera.size, flags=way, borderMode=border)
     return moved.astype(np.float32) / 255.0

@@ -73,6 +73,8 @@ class Backdrop:
     """[h,w,3] linear, which shows the ground as well; None: the terrain before the environment"""
     depth: np.ndarray | None = None
     """[h,w] camera z (m) at which the picture hides the fluid, 0 where it does not; None: nowhere"""
+    coarse: float = 1.0
+    """px of the picture that were one px of the clip"""
     cut_out: bool = False
     """the terrain hides the fluid and the obstacles, and is not drawn itself"""
 
@@ -187,7 +189,12 @@ class Painter:
             return self._drawn(frame, camera, backdrop)
         k = self._finer
         wide = camera.resized((k * camera.size[0], k * camera.size[1]))
-        finer = replace(backdrop, picture=enlarged(backdrop.picture, k), depth=enlarged(backdrop.depth, k))
+        finer = replace(
+            backdrop,
+            picture=enlarged(backdrop.picture, k),
+            depth=enlarged(backdrop.depth, k),
+            coarse=k * backdrop.coarse,
+        )
         return averaged(self._drawn(frame, wide, finer), k)
 
     def _drawn(self, frame: Frame, camera: PinholeCamera, backdrop: Backdrop) -> Lit:
@@ -267,7 +274,8 @@ class Painter:
         inset = 0.0 if self._mesher is not None else OUTSIDE * 0.5 * self.terrain.grid.spacing
         found = ground.picture(camera, Behind(far, depth), mesh, material=clear, bodies=frame.bodies, inset=inset)
         # nobody knows what is around a clip: its own rim and mean fit it better than another world's sky
-        return replace(found, goes_on=backdrop.picture is not None)
+        on_plate = backdrop.picture is not None
+        return replace(found, goes_on=on_plate, coarse=backdrop.coarse if on_plate else 1.0)
 
     def _caster(self, frame: Frame, backdrop: Backdrop) -> TriangleMesh | None:
         """The splats as a body that throws a shadow. Not on the plate of a clip: the clip's fluid has thrown its own

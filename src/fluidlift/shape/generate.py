@@ -7,12 +7,19 @@ from typing import cast
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
-from scipy import ndimage
+from scipy import ndimage, sparse
+from scipy.sparse.linalg import splu
 
 from fluidlift.errors import require
 from fluidlift.shape.background import weight_of_unseen
 from fluidlift.shape.terrain import Setting
 from fluidlift.types import SH_C0, CellType, Gaussians, PinholeCamera, decompose_covariances, sh_from_rgb
+
+COARSE = 256
+"""px on the longer side of the picture in which a hole is filled, at most"""
+
+ALONG_ROWS = 9.0
+"""times better conducts the filling of a hole along rows than along columns"""
 
 _WET = (CellType.FLUID, CellType.INFLOW)
 
@@ -57,16 +64,37 @@ def background_plate(
 
 
 def _inpainted(image: np.ndarray, hole: np.ndarray) -> np.ndarray:
-    """Telea inpainting at a quarter of the size: wide holes get smooth ground instead of streaks."""
+    """The hole filled by diffusion from its rim, three times as far along rows as along columns.
+
+    What is behind a fluid that stands is layered by height, sky over trees over a shore: it goes on sideways. Diffusion
+    has no seams, where fronts that march in from the rim meet in some. It is solved at a quarter of the size or less.
+    """
     import cv2
 
     h, w = hole.shape
-    small = (max(w // 4, 8), max(h // 4, 8))
-    coarse = (cv2.resize(hole.astype(np.float32), small, interpolation=cv2.INTER_AREA) > 0.01).astype(np.uint8)
+    factor = max(4.0, max(h, w) / COARSE)
+    small = (max(int(w / factor), 8), max(int(h / factor), 8))
+    coarse = cv2.resize(hole.astype(np.float32), small, interpolation=cv2.INTER_AREA) > 0.01
     if coarse.all():
         return image
-    filled = cv2.inpaint(cv2.resize(image, small, interpolation=cv2.INTER_AREA), coarse, 5, cv2.INPAINT_TELEA)
-    return cv2.resize(filled, (w, h), interpolation=cv2.INTER_CUBIC)
+    filled = cv2.resize(image, small, interpolation=cv2.INTER_AREA).astype(np.float64)
+    filled[coarse] = _diffused(filled, coarse)
+    wide = cv2.resize(filled, (w, h), interpolation=cv2.INTER_CUBIC)
+    return np.clip(np.round(wide), 0, 255).astype(np.uint8)
+
+
+def _diffused(values: np.ndarray, hole: np.ndarray) -> np.ndarray:
+    """[n,c] in a hole, bool [h,w], of values [h,w,c]: the weights of neighbours in a row are `ALONG_ROWS`, else 1."""
+    number = np.arange(hole.size).reshape(hole.shape)
+    pairs = [(number[:, :-1], number[:, 1:], ALONG_ROWS), (number[:-1], number[1:], 1.0)]
+    i, j = (np.concatenate([p[k].ravel() for p in pairs]) for k in (0, 1))
+    weight = np.concatenate([np.full(p[0].size, p[2]) for p in pairs])
+    edges = sparse.coo_array((np.tile(weight, 2), (np.append(i, j), np.append(j, i))), (hole.size,) * 2).tocsr()
+    inside, rim = np.flatnonzero(hole), np.flatnonzero(~hole)
+    rows = edges[inside]
+    system = sparse.diags_array(rows.sum(axis=1)) - rows[:, inside]
+    given = rows[:, rim] @ values.reshape(hole.size, -1)[rim]
+    return splu(system.tocsc()).solve(np.asarray(given, np.float64))
 
 
 def front_gaussians(

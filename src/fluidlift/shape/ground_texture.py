@@ -50,6 +50,24 @@ EVEN = 0.02
 REPOSE = np.tan(np.radians(35.0))
 """slope that gravel lies at, at most: the foot of a rock under water is of rock where it is steeper"""
 
+LYING, WALL = np.cos(np.radians([50.0, 65.0]))
+"""cosine of slopes: what is less steep than the first lies, what is steeper than the second stands"""
+
+BROAD = 0.08
+"""of the picture's longer side: over this, what the ground slopes by is evened out"""
+
+BRIGHT = 98.0
+"""percentile of what lies below the horizon that a white sky is brighter than"""
+
+BLUER = 1.3
+"""times more of blue to red has a blue sky than what lies below the horizon"""
+
+SMOOTH = 0.08
+"""of its brightness a sky changes by at most within `SKY_RIM` of a place"""
+
+SKY_RIM = 0.01
+"""of the picture's longer side: so far beside the sky things are mixed with it"""
+
 JOINT = 3
 """texels that may lie between what was found as a rock on the water and its foot"""
 
@@ -79,7 +97,9 @@ class _Map:
     rock: np.ndarray
     """bool [h,w]"""
     drowned: np.ndarray
-    """bool [h,w]: bed under the water"""
+    """bool [h,w]: bed under the water, where it lies"""
+    wall: np.ndarray
+    """bool [h,w]: ground that stands behind water"""
 
 
 def textured(
@@ -113,6 +133,9 @@ def over_bed(
 ) -> UInt8[np.ndarray, "h w 3"]:
     """The scene without its fluid, with the textured ground where no frame shows what is behind the fluid.
 
+    Only ground that lies: a map from above has few texels on a wall, and the wall behind water that stands before the
+    open sky is none. What the rim of the hole shows goes on there.
+
     Args:
         plate: sRGB.
         seen: pixels of it that some frame shows.
@@ -125,8 +148,29 @@ def over_bed(
         return plate
     uv = (mesh.uv[found.face] * found.barycentric[..., None]).sum(axis=-2)
     ground = 255.0 * sample_texture(mesh.texture, uv)
-    weight = (weight_of_unseen(seen) * drawn)[..., None]
+    weight = (weight_of_unseen(seen) * drawn * (1.0 - _standing(mesh, found.face)))[..., None]
     return np.clip(np.round(plate * (1.0 - weight) + ground * weight), 0, 255).astype(np.uint8)
+
+
+def _standing(mesh: TriangleMesh, face: np.ndarray) -> np.ndarray:
+    """How far the ground stands that each pixel shows, float32 [h,w]: 0 where it lies, 1 where it is a wall.
+
+    Of a mean normal: the foot of a rock and a low bank are parts of ground that lies.
+
+    Args:
+        mesh: of the ground.
+        face: int [h,w], -1 where none is drawn.
+    """
+    a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(np.float32) for k in range(3))
+    normal = np.cross(b - a, c - a)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    mean = cv2.GaussianBlur(normal[face] * (face >= 0)[..., None], (0, 0), BROAD * max(face.shape))
+    return 1.0 - _lying(mean[..., 2] / np.maximum(np.linalg.norm(mean, axis=-1), 1e-12))
+
+
+def _lying(upward: np.ndarray) -> np.ndarray:
+    """1 where something lies, 0 where it stands, by the upward part of its normal."""
+    return np.clip((upward - WALL) / (LYING - WALL), 0.0, 1.0).astype(np.float32)
 
 
 def _texel(top: np.ndarray, camera: PinholeCamera, longest: int) -> float:
@@ -164,14 +208,46 @@ def _map(top: np.ndarray, level: np.ndarray, view: View, texel: float) -> _Map:
     rock = ((z > 0) & (view.labels[row, col] == Label.SOLID)).reshape(height, width)
     row, col, _ = camera.nearest_pixels(ground)
     painted = (view.labels[row, col] == Label.SOLID).reshape(height, width)
+    sky = sky_pixels(view.plate, camera)[row, col].reshape(height, width)
     # the rim of a rock's picture is mixed with what is behind it
     painted_well = cv2.erode(painted.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     z_ground, z_water = (points[:, 2].reshape(height, width) for points in (ground, surface))
     rock = _feet(rock, z_ground, z_water, texel)
-    drowned = (z_ground < z_water) & ~rock
-    known = inside.reshape(height, width) & ~hidden & np.where(rock, painted_well, ~painted)
+    wet = (z_ground < z_water) & ~rock
+    steps = np.gradient(level, *(np.ptp(top[..., k]) / n for k, n in enumerate(level.shape)))
+    lies = looked_up(_lying(1.0 / np.sqrt(1.0 + steps[0] ** 2 + steps[1] ** 2)), True) > 0.5
+    drowned, wall = wet & lies, wet & ~lies
+    known = inside.reshape(height, width) & ~hidden & ~sky & np.where(rock, painted_well, ~painted)
     known &= ~drowned | view.seen[row, col].reshape(height, width)
-    return _Map(image.astype(np.float32), known, rock, drowned)
+    return _Map(image.astype(np.float32), known, rock, drowned, wall)
+
+
+def sky_pixels(plate: UInt8[np.ndarray, "h w 3"], camera: PinholeCamera) -> Bool[np.ndarray, "h w"]:
+    """What of a picture shows the sky, with the twigs and the blur at its rim.
+
+    Above the horizon, from the picture's upper edge on, as smooth as only a sky is; and as bright as what lies below
+    hardly ever is, since that has its light from the sky, or bluer and no darker than is usual there. Where the
+    horizon is above the picture there is none.
+
+    Args:
+        plate: sRGB.
+        camera: in the world.
+    """
+    above = camera.rays(camera.pixel_grid())[..., 2] > 0.0
+    below = plate[~above].astype(np.float32)
+    if not above.any() or len(below) == 0:
+        return np.zeros(above.shape, bool)
+    picture = cv2.GaussianBlur(plate, (0, 0), 1.0).astype(np.float32)
+    grey, blue = picture.mean(axis=-1), picture[..., 2] / (picture[..., 0] + 1.0)
+    bright = grey > np.percentile(below.mean(axis=-1), BRIGHT)
+    bluer = (blue > BLUER * np.median(below[:, 2] / (below[:, 0] + 1.0))) & (grey > np.median(below.mean(axis=-1)))
+    reach = max(round(SKY_RIM * max(above.shape)), 1)
+    square = np.ones((2 * reach + 1,) * 2, np.uint8)
+    even = cv2.dilate(grey, square) - cv2.erode(grey, square) < SMOOTH * grey
+    core = cv2.morphologyEx((above & (bright | bluer) & even).astype(np.uint8), cv2.MORPH_OPEN, square)  # no specks
+    core = cv2.dilate(core, square)
+    parts = cv2.connectedComponents(core, connectivity=4)[1]
+    return cv2.dilate(((core > 0) & np.isin(parts, parts[0][core[0] > 0])).astype(np.uint8), square) > 0
 
 
 def _feet(rock: np.ndarray, height: np.ndarray, level: np.ndarray, texel: float) -> np.ndarray:
@@ -214,9 +290,10 @@ def hidden_ground(top: Float[np.ndarray, "nx ny 3"], eye: Float[np.ndarray, "3"]
 
 def _continued(found: _Map) -> np.ndarray:
     """Unknown texels from the known ones: rock from rock, the bed from itself and its rim, dry ground from dry."""
-    dry = ~found.rock & ~found.drowned
+    dry = ~found.rock & ~found.drowned & ~found.wall
     out = found.image
-    for part, beside in ((found.rock, found.rock), (found.drowned, _of_the_bed(found, dry)), (dry, dry)):
+    bed = _of_the_bed(found, dry)
+    for part, beside in ((found.rock, found.rock), (found.drowned, bed), (found.wall, found.wall), (dry, dry)):
         source = found.known & beside
         hole = part & ~source
         if not source.any():

@@ -26,6 +26,7 @@ from fluidlift.shape.islands import without_ground
 from fluidlift.shape.presence import Presence, always, grows, stay, watch
 from fluidlift.shape.region import clean_region, cut_along_edges, solids_in, still_pixels
 from fluidlift.shape.waterline import dry_over_time
+from fluidlift.shape.waving import without_plants
 from fluidlift.types.clip import Label, PixelLabels, VideoClip
 from fluidlift.types.flow import PixelFlow
 
@@ -126,6 +127,7 @@ def segment(
         region = lasting_region(evidence, score, small_inside) if grown is None else clean_region(grown)
         rocks = asked = held = np.zeros_like(region)
         if grown is None:
+            region = without_plants(evidence, score, region, clip.interval)
             region, rocks = without_ground(evidence, region)
         if clicks:
             before = region

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from scipy import ndimage
 
 from fluidlift.errors import InputRejected
+from fluidlift.shape.region import largest_piece
 from fluidlift.types import PinholeCamera
 
 GROUND = -1.0
@@ -189,13 +190,9 @@ def tallest(camera: PinholeCamera, raster: Raster, mask: np.ndarray) -> float:
     return HEIGHTS[1]
 
 
-def largest_piece(columns: np.ndarray) -> np.ndarray:
+def whole_piece(columns: np.ndarray) -> np.ndarray:
     """The largest piece, without holes."""
-    parts, count = ndimage.label(columns)
-    if count == 0:
-        return columns
-    sizes = ndimage.sum_labels(columns, parts, np.arange(1, count + 1))
-    return ndimage.binary_fill_holes(parts == 1 + int(np.argmax(sizes)))
+    return ndimage.binary_fill_holes(largest_piece(columns))
 
 
 def convex(columns: np.ndarray) -> np.ndarray:

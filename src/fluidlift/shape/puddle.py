@@ -7,14 +7,13 @@ is seen by its motion (shape/jets.py), and a pool that is round lies where its o
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import cast
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy import ndimage
 
 from fluidlift.shape.jets import Outline, airborne_pixels, find_jets, lying_pixels
 from fluidlift.shape.kind import PITCH_PRIOR, UpEvidence, level_camera
+from fluidlift.shape.region import largest_piece
 from fluidlift.types import PinholeCamera
 
 ROUND = 0.85
@@ -88,19 +87,13 @@ def jets_into_puddle(
     found = find_jets(level_camera(camera, tilt), mask, motion, trust)
     found = [down_to_landing(outline, mask, motion, trust) for outline in found]
     airborne = airborne_pixels(found, mask.shape)
-    lying = lying_pixels(airborne | _largest_piece(mask & ~airborne), airborne)
+    # wet traces on a bowl's rim, and what is left of a jet at the picture's edge, have no part in the outline
+    lying = lying_pixels(airborne | largest_piece(mask & ~airborne), airborne)
     pool = fit_ellipse(lying)
     if not found or pool is None or pool.likeness < ROUND or lying.sum() < LEAST_SHARE * mask.sum():
         return None
     tallest = 1.0 if up is None else min(UPRIGHT * np.sin(np.radians(max(up.pitch, 0.0))), 1.0)
     return Poured(tuple(found), lying) if pool.flatness <= tallest else None
-
-
-def _largest_piece(region: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """The largest of the connected pieces of a region: wet traces on a bowl's rim, and what is left of a jet at the
-    picture's edge, have no part in the pool's outline."""
-    label, count = cast(tuple[np.ndarray, int], ndimage.label(region))
-    return region if count < 2 else label == 1 + np.argmax(np.bincount(label[region])[1:])
 
 
 def down_to_landing(

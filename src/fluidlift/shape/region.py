@@ -79,3 +79,9 @@ def solids_in(region: np.ndarray, still: np.ndarray) -> tuple[np.ndarray, np.nda
         else:
             filled |= hole
     return filled, solid
+
+
+def largest_piece(region: np.ndarray) -> np.ndarray:
+    """bool [h,w]: the largest of the connected pieces of a region."""
+    count, label, stats, _ = cv2.connectedComponentsWithStats(region.astype(np.uint8), connectivity=4)
+    return region if count < 2 else label == 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))

@@ -25,11 +25,11 @@ from fluidlift.shape.prism import (
     Raster,
     columns_within,
     convex,
-    largest_piece,
     meet,
     raster_over,
     silhouette,
     tallest,
+    whole_piece,
 )
 from fluidlift.shape.surface import FrontSurface
 from fluidlift.shape.terrain import Setting, at_cells, to_corners, unit
@@ -120,7 +120,7 @@ def find_standing(
     first = _outline(first)
     raster = raster_over(camera, first | (often > CALM))
     height = tallest(camera, raster, first)
-    footprint = _squared(largest_piece(columns_within(camera, raster, first, height)))
+    footprint = _squared(whole_piece(columns_within(camera, raster, first, height)))
     if footprint.sum() < 4:
         raise InputRejected("no upright body fits the outline of the fluid", "a body that stands on level ground",
                             "give --pitch, or another --kind")  # fmt: skip
@@ -222,7 +222,7 @@ def standing_setting(found: StandingBody, to_world: Similarity3, mainstream, *, 
 
 def _outline(mask: np.ndarray) -> np.ndarray:
     """A body's outline without the roughness of its mask: convex, as those of convex prisms are, or as it is."""
-    body = largest_piece(ndimage.binary_opening(mask) if ndimage.binary_opening(mask).any() else mask)
+    body = whole_piece(ndimage.binary_opening(mask) if ndimage.binary_opening(mask).any() else mask)
     hull = convex(body)
     return hull if hull.sum() < HOLLOW * body.sum() else body
 
@@ -260,7 +260,7 @@ def _basin(camera, raster: Raster, settled: np.ndarray, footprint: np.ndarray, h
     volume, basin = float(footprint.sum()) * height, footprint
     wide = ndimage.binary_dilation(settled)  # a rough edge would cost a column at each of its sections
     for level in np.geomspace(0.02 * height, 0.8 * height, 32):  # the lowest that holds it: no column of its own
-        columns = largest_piece(columns_within(camera, raster, wide, level))
+        columns = whole_piece(columns_within(camera, raster, wide, level))
         basin = convex(_narrowed(columns) | footprint)
         if float(basin.sum()) * level >= volume:
             break

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 from fractions import Fraction
 from pathlib import Path
@@ -285,6 +286,22 @@ def test_written_video_has_its_rate_and_colours(tmp_path):
     middle = clip.frames[3, 16, 7::15].astype(int)
     assert np.abs(middle - colors).max() <= 6  # 8-bit limited-range YUV rounds by about 2, x264 adds a little
     assert [p.name for p in tmp_path.iterdir()] == ["out.mp4"]
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="processors cannot be taken away here")
+def test_a_repeatable_video_is_the_same_on_one_processor(tmp_path):
+    noise = np.random.default_rng(0).integers(0, 255, (60, 80, 3), np.uint8).repeat(4, axis=0).repeat(4, axis=1)
+    frames = [np.roll(noise, 3 * t, axis=1) for t in range(12)]
+    processors = os.sched_getaffinity(0)
+    if len(processors) < 2:
+        pytest.skip("one processor")
+    several = write_video(tmp_path / "several.mp4", frames, 25, repeatable=True)
+    try:
+        os.sched_setaffinity(0, {min(processors)})
+        one = write_video(tmp_path / "one.mp4", frames, 25, repeatable=True)
+    finally:
+        os.sched_setaffinity(0, processors)
+    assert one.read_bytes() == several.read_bytes()
 
 
 def test_a_failed_video_leaves_nothing_behind(tmp_path):

@@ -18,7 +18,12 @@ _ITU709, _MPEG_RANGE = 1, 1
 
 
 def write_video(
-    path: Path | str, frames: Iterable[UInt8[np.ndarray, "h w 3"]], fps: float, *, quality: float = 18.0
+    path: Path | str,
+    frames: Iterable[UInt8[np.ndarray, "h w 3"]],
+    fps: float,
+    *,
+    quality: float = 18.0,
+    repeatable: bool = False,
 ) -> Path:
     """Write sRGB frames as H.264 (yuv420p, BT.709), which everything plays; the file appears when it is whole.
 
@@ -28,6 +33,7 @@ def write_video(
             because 4:2:0 needs even sizes.
         fps: frames per second.
         quality: constant rate factor, 0 (lossless) to 51.
+        repeatable: the same file whatever the number of processors, for clips that are measured on; slower.
 
     Raises:
         InputRejected: the disk is full or may not be written.
@@ -44,7 +50,7 @@ def write_video(
             picture = _even(frame)
             if stream is None:
                 shape = picture.shape
-                stream = _new_stream(container, shape, fps, quality)
+                stream = _new_stream(container, shape, fps, quality, repeatable)
             require(picture.shape == shape, f"a frame {picture.shape} after frames {shape}", "one size")
             video_frame = av.VideoFrame.from_ndarray(picture, "rgb24")
             video_frame = video_frame.reformat(format="yuv420p", dst_colorspace=_ITU709)
@@ -67,10 +73,12 @@ def _even(frame: np.ndarray) -> np.ndarray:
 
 
 def _new_stream(
-    container: av.container.OutputContainer, shape: tuple[int, ...], fps: float, quality: float
+    container: av.container.OutputContainer, shape: tuple[int, ...], fps: float, quality: float, repeatable: bool
 ) -> av.VideoStream:
     rate = Fraction(fps).limit_denominator(1001)
-    for name, options in (("libx264", {"crf": str(quality), "preset": "medium"}), ("mpeg4", {"qscale": "3"})):
+    # x264 takes as many threads as there are processors, and what it looks ahead with changes what it writes
+    alone = {"x264-params": "threads=1:lookahead-threads=1"} if repeatable else {}
+    for name, options in (("libx264", {"crf": str(quality), "preset": "medium"} | alone), ("mpeg4", {"qscale": "3"})):
         try:
             stream = container.add_stream(name, rate=rate, options=options)
             break

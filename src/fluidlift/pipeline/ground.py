@@ -39,10 +39,10 @@ def setting_around(
 
 
 def seen_labels(fluid, start: int, united: int, falls: np.ndarray) -> np.ndarray:
-    """`Label` of each pixel over the united frames."""
+    """`Label` of each pixel over the united frames; a rock is one though waves wash over it in some."""
     window = slice(start, start + united)
     solid, lying = solid_share(fluid.labels[window]) > 0.5, lying_pixels(generate.united_mask(fluid[window]), falls)
-    return np.where(lying, Label.FLUID, np.where(solid, Label.SOLID, Label.BACKGROUND)).astype(np.uint8)
+    return np.where(solid, Label.SOLID, np.where(lying, Label.FLUID, Label.BACKGROUND)).astype(np.uint8)
 
 
 def textured(setting: terrain.Setting, view: ground_texture.View) -> terrain.Setting:

@@ -25,6 +25,7 @@ from fluidlift.shape.hints import VOICE, Point, clicks_at, heed, holes_asked_for
 from fluidlift.shape.islands import without_ground
 from fluidlift.shape.presence import Presence, always, grows, stay, watch
 from fluidlift.shape.region import clean_region, cut_along_edges, solids_in, still_pixels
+from fluidlift.shape.washed import bare_over_time, washed_ground
 from fluidlift.shape.waterline import dry_over_time
 from fluidlift.shape.waving import without_plants
 from fluidlift.types.clip import Label, PixelLabels, VideoClip
@@ -126,8 +127,10 @@ def segment(
     else:
         region = lasting_region(evidence, score, small_inside) if grown is None else clean_region(grown)
         rocks = asked = held = np.zeros_like(region)
+        washed = None
         if grown is None:
             region = without_plants(evidence, score, region, clip.interval)
+            washed = washed_ground(evidence, region)
             region, rocks = without_ground(evidence, region)
         if clicks:
             before = region
@@ -143,7 +146,9 @@ def segment(
         if grown is None:
             outline, solid = solids_in(region, still)
             dry = dry_over_time(evidence, outline, solid, presence.picked)
-            found = down_to_waterline(found, (ashore & ~held for ashore in dry))
+            found = given_back(found, (ashore & ~held for ashore in dry))
+        if washed is not None:
+            found = given_back(found, (bare & ~held for bare in bare_over_time(evidence, washed)))
     tell(0.5, "labels")
     writer = LabelWriter((frames, height, width), out)
     share = write_labels(found, writer, small_inside, tell)
@@ -256,13 +261,22 @@ def lasting_labels(
         yield labels, sure
 
 
-def down_to_waterline(
-    found: Iterator[tuple[np.ndarray, np.ndarray]], dry: Iterator[np.ndarray]
+def given_back(
+    found: Iterator[tuple[np.ndarray, np.ndarray]], bare: Iterator[np.ndarray]
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """The labels and confidence of every frame with what lies dry in it, bool [h,w], given back to the background."""
-    for (labels, sure), ashore in zip(found, dry, strict=True):
-        bare = ashore & (labels == Label.FLUID)
-        yield (np.where(bare, np.uint8(Label.BACKGROUND), labels) if bare.any() else labels), sure
+    """The labels and confidence of every frame with what lies bare in it, bool [h,w], given back to the background.
+
+    What does not hang together with it is a rock.
+    """
+    for (labels, sure), dry in zip(found, bare, strict=True):
+        dry = dry & (labels == Label.FLUID)
+        if not dry.any():
+            yield labels, sure
+            continue
+        ground = labels == Label.BACKGROUND
+        parts = cv2.connectedComponents((dry | ground).astype(np.uint8), connectivity=4)[1]
+        rock = dry & ~np.isin(parts, np.unique(parts[ground]))
+        yield np.where(rock, np.uint8(Label.SOLID), np.where(dry, np.uint8(Label.BACKGROUND), labels)), sure
 
 
 def doubtful_part(score: np.ndarray) -> float:

@@ -223,7 +223,7 @@ def falling_surface(
     falls = np.zeros(mask.shape[0])
     falls[rows] = blend > 0.5
     aside, steepest = _fall_line(camera, weight * falls[:, None], displacement)
-    incline = np.radians(5.0) + (steepest - np.radians(5.0)) * blend
+    incline = np.radians(FOOT) + (steepest - np.radians(FOOT)) * blend
     ray = camera.rays(np.stack([_axis(mask, rows, blend > 0.5), rows + 0.5], -1))
     uphill = (-float(np.sin(aside)), float(np.cos(aside)))
     ry, rz = ray[:, 0] * uphill[0] + ray[:, 1] * uphill[1], ray[:, 2]
@@ -249,6 +249,8 @@ def falling_surface(
     return _from_height(camera, profile, intersect_height(camera, profile, 0.2 * depth.min(), 3.0 * depth.max()))
 
 
+FOOT = 1.0
+"""degrees: slope of what runs below a fall. A basin is level and a stream hardly steeper; more would empty either"""
 FACE = (78.0, 12.0, 30.0)
 """degrees: how steep falls usually are, by how much they differ, and by how much their faces turn from the viewer (a
 choice). A lean of 17 degrees becomes a face 64 degrees steep that falls 40 degrees to the side"""

@@ -71,7 +71,7 @@ def make_demo(
     for name, target in FILES.items():
         if name != "video.mp4":
             (folder / name).replace(folder / target)
-    write_video(folder / "demo.mp4", list(recording.frames), scene.fps, quality=21.0)
+    write_video(folder / "demo.mp4", list(recording.frames), scene.fps, quality=21.0, repeatable=True)
     seen = recording.mask[0] & (recording.depth[0] > 0)
     water = scene.camera.unproject(scene.camera.pixel_grid()[seen], recording.depth[0][seen])
     surveyed = scene.camera.to_dict() | {"water_level_z": round(float(np.median(water[:, 2])), 3)}

@@ -195,7 +195,7 @@ def write_case(scene: Scene, recording: Recording, folder: Path, *, quality: flo
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    write_video(folder / "video.mp4", list(recording.frames), scene.fps, quality=quality)
+    write_video(folder / "video.mp4", list(recording.frames), scene.fps, quality=quality, repeatable=True)
     (folder / "camera.json").write_text(json.dumps(scene.camera.to_dict(), indent=1))
     (folder / "scene.json").write_text(json.dumps(scene_record(scene, len(recording.frames)), indent=1))
     np.savez_compressed(

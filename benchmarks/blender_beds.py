@@ -1,6 +1,7 @@
 """What flows along in `blender_cases.py`: beds, rocks, and the colours that a flow carries in and out.
 
 A bed is a height field: base - slope x, risen by a bank beyond half_width from its line y = bend sin(2 pi x / wave).
+With a ledge [x, drop] it falls there into a basin 2 pool wide, whose far end rises by rim [x, rise].
 Rocks are [x, y, radius], sunk into it by a third. Liquid comes from the box `inflow` and leaves at the low end.
 """
 
@@ -24,6 +25,15 @@ STREAMS: dict[str, dict[str, Any]] = {
         "inflow": [[-1.5, -0.75, 0.12], [-1.35, 0.75, 0.54]], "jet": [0.4, 0.0, 0.0],
         "pillars": [[[-1.34, -0.75, 0.4], [-1.25, 0.75, 0.66]]],
     },
+    "fall_ledge": {
+        "kind": "liquid", "size": [320, 240], "frames": 36, "first": 55, "spacing": 0.025, "low": [-0.7, -0.55, 0.0],
+        "high": [1.0, 0.55, 1.0], "eye": [2.3, 0.75, 1.15], "target": [0.05, 0.02, 0.38], "fov": 40.0,
+        "bed": {"base": 0.68, "slope": 0.03, "half_width": 0.22, "bend": 0.0, "wave": 3.4, "bank": 0.14,
+                "ledge": [-0.1, 0.6], "pool": 0.42, "rim": [0.8, 0.1]},
+        "colors": [[0.05, 0.13, 0.15], [0.8, 0.85, 0.85]],
+        "inflow": [[-0.7, -0.24, 0.72], [-0.6, 0.24, 0.86]], "jet": [0.7, 0.0, 0.0],
+        "pillars": [],
+    },
     "film_slope": {
         "kind": "liquid", "size": [320, 240], "frames": 36, "first": 55, "spacing": 0.006, "low": [-0.18, -0.12, 0.0],
         "high": [0.18, 0.12, 0.2], "eye": [0.1, -0.5, 0.34], "target": [0.0, 0.0, 0.07], "fov": 42.0,
@@ -40,7 +50,16 @@ def bed_height(bed: dict[str, Any], x: np.ndarray, y: np.ndarray) -> np.ndarray:
     if "half_width" not in bed:
         return ground
     away = np.abs(y - bed["bend"] * np.sin(2 * math.pi * x / bed["wave"]))
-    rise = np.clip((away - bed["half_width"]) / bed["bank"], 0.0, 1.0)
+    half = bed["half_width"]
+    low = np.zeros_like(ground + away)
+    if "ledge" in bed:
+        edge, drop = bed["ledge"]
+        low = np.clip((x - edge) / 0.06, 0, 1)
+        half = half + (bed["pool"] - half) * low
+        rim, up = bed["rim"]
+        over = np.clip((x - rim + 0.2) / 0.2, 0, 1)
+        ground = ground - drop * low + up * over * over * (3 - 2 * over)
+    rise = np.clip((away - half) / bed["bank"], 0.0, 1.0)
     return ground + bed["bank"] * rise * rise * (3 - 2 * rise)
 
 

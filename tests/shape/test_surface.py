@@ -93,7 +93,7 @@ def test_water_is_steep_where_it_falls_and_flat_where_it_runs():
     steps = np.diff(p, axis=0)
     slope = np.degrees(np.arctan2(-steps[:, 2], -steps[:, 1]))
     assert np.median(slope[(rows[:-1] > 14) & (rows[:-1] < 34)]) > 65
-    assert np.median(slope[(rows[:-1] > 46) & (rows[:-1] < 62)]) < 20
+    assert np.median(slope[(rows[:-1] > 46) & (rows[:-1] < 62)]) < 3  # a basin that leans runs empty
 
 
 def test_the_depth_of_a_fall_is_where_its_rays_meet_its_height():
@@ -134,7 +134,7 @@ def test_a_fall_that_leans_lies_on_a_face_whose_fall_line_is_seen_to_lean_so(lea
 def test_a_profile_goes_on_level_above_and_gently_down_below():
     profile = ProfileHeight(np.array([1.0, 1.2]), np.array([0.0, 0.8]))
     xy = np.array([[0, 1.1], [5, 1.1], [0, 3.0], [0, 0.0]])
-    np.testing.assert_allclose(profile.height(xy), [0.4, 0.4, 0.8, -np.tan(np.radians(5))])
+    np.testing.assert_allclose(profile.height(xy), [0.4, 0.4, 0.8, -np.tan(np.radians(1))])
 
 
 def test_rays_meet_a_sloping_plane_where_algebra_says():

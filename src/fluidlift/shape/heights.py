@@ -9,6 +9,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
+FOOT = 1.0
+"""degrees: slope of what runs below a fall. A basin is level and a stream hardly steeper; more would empty either"""
+
 
 class HeightModel(ABC):
     """A surface that is a function of the ground position."""
@@ -50,10 +53,10 @@ class ProfileHeight(HeightModel):
     """unit vector over the ground; away from the viewer for a fall seen from the front"""
 
     def height(self, xy: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
-        """z above the ground positions; level beyond the upper end, gently sloping (5 degrees) beyond the foot."""
+        """z above the ground positions; level beyond the upper end, sloping by `FOOT` beyond the foot."""
         y = xy[..., 0] * self.uphill[0] + xy[..., 1] * self.uphill[1]
         inside = np.interp(y, self.away, self.z)
-        return np.where(y < self.away[0], self.z[0] - (self.away[0] - y) * np.tan(np.radians(5.0)), inside)
+        return np.where(y < self.away[0], self.z[0] - (self.away[0] - y) * np.tan(np.radians(FOOT)), inside)
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from scipy import ndimage
 from fluidlift.errors import InputRejected, require
 from fluidlift.shape import chute, sections, slope
 from fluidlift.shape.energy_line import Channel, energy_profile
-from fluidlift.shape.heights import HeightModel, PlaneHeight, ProfileAlongHeight, ProfileHeight, SampledHeight
+from fluidlift.shape.heights import FOOT, HeightModel, PlaneHeight, ProfileAlongHeight, ProfileHeight, SampledHeight
 from fluidlift.shape.kind import Kind
 from fluidlift.shape.plume import SIGHT, section_half_thickness
 from fluidlift.shape.slope import SlopeEvidence
@@ -249,8 +249,6 @@ def falling_surface(
     return _from_height(camera, profile, intersect_height(camera, profile, 0.2 * depth.min(), 3.0 * depth.max()))
 
 
-FOOT = 1.0
-"""degrees: slope of what runs below a fall. A basin is level and a stream hardly steeper; more would empty either"""
 FACE = (78.0, 12.0, 30.0)
 """degrees: how steep falls usually are, by how much they differ, and by how much their faces turn from the viewer (a
 choice). A lean of 17 degrees becomes a face 64 degrees steep that falls 40 degrees to the side"""

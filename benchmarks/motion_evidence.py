@@ -16,12 +16,12 @@ import cv2
 import numpy as np
 from motion_page import replace_section
 from motion_steps import measured_frames
-from motion_subjects import Subject, default_shared, prepare, read_truth, subjects
+from motion_subjects import Subject, Truth, default_shared, prepare, read_truth, subjects
 from results import table
 
 from fluidlift.motion.multiframe import moving_detail
 from fluidlift.motion.optical_flow import estimate_flow
-from fluidlift.motion.temporal import pixel_indices
+from fluidlift.motion.temporal import forward, pixel_indices, sampled
 
 BEGIN, END = "<!-- evidence:begin -->", "<!-- evidence:end -->"
 RIM = 9
@@ -32,40 +32,55 @@ CLEAR = 1.1
 """ratio of two local differences that counts as one being better"""
 PATCH = 3.0
 """px: standard deviation over which differences are gathered, that of a patch of flow"""
+LONG = 4
+"""pairs of the longer paths: errors of a flow that stays wrong add up along them"""
 HEAD = ["clip", "error, px", "not moved", "true flow", "found flow", "wrong", "true fits better", "found fits better"]
+HEAD += [f"true, {LONG} pairs", f"found, {LONG} pairs"]
 
 
 def differences(subject: Subject) -> list[str]:
     """A row of the table: rms differences (log brightness), and how both flows fit where the found one is wrong."""
     truth = read_truth(subject)
     flow = estimate_flow(truth.frames)
-    errors, still, true, found, fits = [], [], [], [], []
+    still = np.zeros_like(truth.flow)
+    errors, left, fits = [], ([], [], []), {1: [], LONG: []}
     for t in measured_frames(len(flow)):
-        detail = moving_detail(truth.frames, t)
-        assert detail is not None, "the clips are long enough"
-        first, second = detail
-        inside = cv2.erode((truth.mask[t] & truth.rows[:, None]).astype(np.uint8), np.ones((RIM, RIM))) > 0
-        left = []
-        for moved in (np.zeros_like(truth.flow[t]), truth.flow[t], flow.displacement[t]):
-            place = pixel_indices(first.shape) + moved.astype(np.float32)
-            back = cv2.remap(second, *cv2.split(place), cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-            left.append((back - first) ** 2)
-        error = np.linalg.norm(flow.displacement[t] - truth.flow[t], axis=-1)
-        errors.append(error[inside])
-        for kept, squared in zip((still, true, found), left):
-            kept.append(squared[inside])
-        local = [cv2.GaussianBlur(squared, (0, 0), PATCH)[inside & (error > FAR)] for squared in left[1:]]
-        fits.append(np.stack(local))
-    of_true, of_found = np.sqrt(np.concatenate(fits, axis=1))
+        for pairs in fits:
+            start = min(t, len(flow) - pairs)
+            inside, squared = difference(truth, start, pairs, (still, truth.flow, flow.displacement))
+            error = np.linalg.norm(flow.displacement[start] - truth.flow[start], axis=-1)
+            wrong = inside & (error > FAR)
+            fits[pairs].append(np.stack([cv2.GaussianBlur(s, (0, 0), PATCH)[wrong] for s in squared[1:]]))
+            if pairs == 1:
+                errors.append(error[inside])
+                for kept, s in zip(left, squared):
+                    kept.append(s[inside])
     error = np.concatenate(errors)
-    return [
-        subject.name,
-        f"{error.mean():.2f}",
-        *(f"{typical(np.concatenate(x)):.3f}" for x in (still, true, found)),
-        f"{np.mean(error > FAR):.0%}",
-        f"{np.mean(CLEAR * of_true < of_found):.0%}",
-        f"{np.mean(CLEAR * of_found < of_true):.0%}",
-    ]
+    better = []
+    for parts in fits.values():
+        of_true, of_found = np.sqrt(np.concatenate(parts, axis=1))
+        better += [np.mean(CLEAR * of_true < of_found), np.mean(CLEAR * of_found < of_true)]
+    figures = [f"{typical(np.concatenate(x)):.3f}" for x in left]
+    return [subject.name, f"{error.mean():.2f}", *figures, *(f"{x:.0%}" for x in (np.mean(error > FAR), *better))]
+
+
+def difference(
+    truth: Truth, start: int, pairs: int, flows: tuple[np.ndarray, ...]
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Pixels whose paths stay in the fluid, and squared differences of the picture `pairs` later along each flow."""
+    first, last = moving_detail(truth.frames, start), moving_detail(truth.frames, start + pairs - 1)
+    assert first is not None and last is not None, "the clips are long enough"
+    inside = cv2.erode((truth.mask[start] & truth.rows[:, None]).astype(np.uint8), np.ones((RIM, RIM))) > 0
+    after, out = truth.mask[start + pairs].astype(np.float32), []
+    for moved in flows:
+        place = pixel_indices(inside.shape)
+        for k in range(pairs):
+            place = forward(place, np.asarray(moved[start + k], np.float32))
+        inside &= sampled(after, place) > 0.5
+        columns, rows = cv2.split(place)
+        back = cv2.remap(last[1], columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        out.append((back - first[0]) ** 2)
+    return inside, out
 
 
 def typical(squared: np.ndarray) -> float:

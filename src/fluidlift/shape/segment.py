@@ -21,7 +21,7 @@ from fluidlift.shape.advancing import advancing_labels
 from fluidlift.shape.colour_growth import grown_from_streams, with_quiet_water
 from fluidlift.shape.evidence import Evidence, PairReader, fluid_score, gather_evidence
 from fluidlift.shape.frame_pictures import typical_picture
-from fluidlift.shape.hints import VOICE, Point, clicks_at, heed, holes_asked_for
+from fluidlift.shape.hints import VOICE, Clicks, Point, clicks_at, heed, holes_asked_for
 from fluidlift.shape.islands import without_ground
 from fluidlift.shape.presence import Presence, always, grows, stay, watch
 from fluidlift.shape.region import clean_region, cut_along_edges, solids_in, still_pixels
@@ -125,34 +125,53 @@ def segment(
         told = heed(clicks, evidence, score, score > 0.0)[1] if clicks else None
         found = advancing_labels(evidence, score, presence, told)
     else:
-        region = lasting_region(evidence, score, small_inside) if grown is None else clean_region(grown)
-        rocks = asked = held = np.zeros_like(region)
-        washed = None
-        if grown is None:
-            region = without_plants(evidence, score, region, clip.interval)
-            washed = washed_ground(evidence, region)
-            region, rocks = without_ground(evidence, region)
-        if clicks:
-            before = region
-            region, told = heed(clicks, evidence, score, region)
-            held = (region & ~before) | (told > VOICE)
-            asked, rocks = holes_asked_for(region, clicks), rocks & ~region
-            region = clean_region(region) & ~asked & ~rocks
-        still = still_pixels(evidence)
-        if grown is not None:  # change says nothing in such a clip: neither when the fluid came nor what is a rock
-            presence, still = always(presence), np.zeros_like(still)
-        still = still | asked | rocks
-        found = lasting_labels(score, region, still, presence)
-        if grown is None:
-            outline, solid = solids_in(region, still)
-            dry = dry_over_time(evidence, outline, solid, presence.picked)
-            found = given_back(found, (ashore & ~held for ashore in dry))
-        if washed is not None:
-            found = given_back(found, (bare & ~held for bare in bare_over_time(evidence, washed)))
+        found = staying_labels(evidence, score, presence, grown, small_inside, clicks, clip.interval)
     tell(0.5, "labels")
     writer = LabelWriter((frames, height, width), out)
     share = write_labels(found, writer, small_inside, tell)
     return PixelLabels(writer.labels, writer.confidence, warnings=doubts(share, score))
+
+
+def staying_labels(
+    evidence: Evidence, score: np.ndarray, presence: Presence, grown: np.ndarray | None, inside: np.ndarray,
+    clicks: Clicks, interval: float,
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:  # fmt: skip
+    """Labels and confidence of every frame of a fluid that stays in its bed.
+
+    Args:
+        evidence: of the clip.
+        score: log odds of fluid, float32 [h,w].
+        presence: when it is there.
+        grown: bool [h,w], the fluid where change says nothing and it was grown from its streams; else None.
+        inside: bool [h,w], where fluid is looked for.
+        clicks: what a person said of some pixels.
+        interval: s between two frames.
+    """
+    region = lasting_region(evidence, score, inside) if grown is None else clean_region(grown)
+    rocks = asked = held = np.zeros_like(region)
+    washed = None
+    if grown is None:
+        region = without_plants(evidence, score, region, interval)
+        washed = washed_ground(evidence, region)
+        region, rocks = without_ground(evidence, region)
+    if clicks:
+        before = region
+        region, told = heed(clicks, evidence, score, region)
+        held = (region & ~before) | (told > VOICE)
+        asked, rocks = holes_asked_for(region, clicks), rocks & ~region
+        region = clean_region(region) & ~asked & ~rocks
+    still = still_pixels(evidence)
+    if grown is not None:  # change says nothing in such a clip: neither when the fluid came nor what is a rock
+        presence, still = always(presence), np.zeros_like(still)
+    still = still | asked | rocks
+    found = lasting_labels(score, region, still, presence)
+    if grown is None:
+        outline, solid = solids_in(region, still)
+        dry = dry_over_time(evidence, outline, solid, presence.picked)
+        found = given_back(found, (ashore & ~held for ashore in dry))
+    if washed is not None:
+        found = given_back(found, (bare & ~held for bare in bare_over_time(evidence, washed)))
+    return found
 
 
 def write_labels(

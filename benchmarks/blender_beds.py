@@ -32,7 +32,6 @@ STREAMS: dict[str, dict[str, Any]] = {
                 "ledge": [-0.1, 0.6], "pool": 0.42, "rim": [0.8, 0.1]},
         "colors": [[0.05, 0.13, 0.15], [0.8, 0.85, 0.85]],
         "inflow": [[-0.7, -0.24, 0.72], [-0.6, 0.24, 0.86]], "jet": [0.7, 0.0, 0.0],
-        "pillars": [],
     },
     "film_slope": {
         "kind": "liquid", "size": [320, 240], "frames": 36, "first": 55, "spacing": 0.006, "low": [-0.18, -0.12, 0.0],
@@ -51,7 +50,6 @@ def bed_height(bed: dict[str, Any], x: np.ndarray, y: np.ndarray) -> np.ndarray:
         return ground
     away = np.abs(y - bed["bend"] * np.sin(2 * math.pi * x / bed["wave"]))
     half = bed["half_width"]
-    low = np.zeros_like(ground + away)
     if "ledge" in bed:
         edge, drop = bed["ledge"]
         low = np.clip((x - edge) / 0.06, 0, 1)

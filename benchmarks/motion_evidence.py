@@ -2,9 +2,10 @@
 
     python benchmarks/motion_evidence.py --work runs --page docs/results.md
 
-Subjects, frames and pixels are those of `motion.py` (the fluid less a rim of four pixels). The second picture of a pair
-is drawn back along a flow and compared with the first, in the moving detail that the flow is estimated from. A flow
-that errs and still leaves less of a difference than the true one cannot be told from it by comparing pictures.
+Subjects, frames and pixels are those of `motion.py`, less a rim of four pixels and what leaves the fluid. The second
+picture of a pair is drawn back along a flow and compared with the first, in the moving detail that the flow is
+estimated from. A flow that errs and still leaves less of a difference than the true one cannot be told from it by
+comparing pictures.
 """
 
 from __future__ import annotations

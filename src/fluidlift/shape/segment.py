@@ -168,9 +168,9 @@ def staying_labels(
     if grown is None:
         outline, solid = solids_in(region, still)
         dry = dry_over_time(evidence, outline, solid, presence.picked)
-        found = given_back(found, (ashore & ~held for ashore in dry))
-    if washed is not None:
-        found = given_back(found, (bare & ~held for bare in bare_over_time(evidence, washed)))
+        if washed is not None:
+            dry = (ashore | bare for ashore, bare in zip(dry, bare_over_time(evidence, washed), strict=True))
+        found = given_back(found, (bare & ~held for bare in dry))
     return found
 
 

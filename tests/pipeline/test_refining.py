@@ -17,3 +17,9 @@ def test_a_body_is_filled_inside_whatever_the_limit_of_its_splats(story):
     assert tight["front"] + tight["hull"] <= 2_000 < free["front"] + free["hull"]  # what is seen keeps to the limit
     assert tight["filled"] > 2_000  # and a body of so many would be empty inside
     assert tight["filled"] <= WHOLE * cells
+
+
+def test_the_parts_of_a_body_add_up(story):
+    counted = body(story, 1_000_000)
+    assert counted["pruned"] >= 0  # none where splats are carried on beyond the picture
+    assert counted["front"] - counted["pruned"] + counted["hull"] + counted["filled"] == counted["total"]

@@ -54,7 +54,6 @@ def refine(story: Story, inputs: Inputs, config: JobConfig) -> Result:
     # what is seen is kept before what is hidden
     front = _bounded(front, int(0.75 * c.max_gaussians), config.seed)
     hull = _bounded(hull, c.max_gaussians - len(front), config.seed)
-    generated = len(front) + len(hull)
     shown, pruned = prune(_outside_solid(front, setting), min_opacity=0.05, max_stretch=12.0)
     beyond, hull = continued(shown, _outside_solid(hull, setting), setting, camera)
     beyond = _bounded(_outside_solid(beyond, setting), c.max_gaussians - len(shown) - len(hull), config.seed)
@@ -83,7 +82,7 @@ def refine(story: Story, inputs: Inputs, config: JobConfig) -> Result:
         "warnings": list(fitted.pop("warnings")),
         "front": len(front),
         "hull": len(hull),
-        "pruned": generated - len(shell),
+        "pruned": len(front) - len(shown),
         "filled": len(added),
         "total": len(body),
         "prune_report": str(pruned),

@@ -1,6 +1,7 @@
 # Works on a fresh machine with make and Python 3.11 or newer:
 #   make demo    make an asset from the clip that comes with the package
-#   make test    every check that a change must pass
+#   make test    the checks of a newcomer: lint, types, import contracts, unit tests
+#   make check   every test: assets, packages of others and physics at full resolution as well
 # Another interpreter: make demo PYTHON=python3.12; tests in another number of processes: make test WORKERS=4
 
 PYTHON ?= python3
@@ -10,11 +11,12 @@ WORKERS ?= 2
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --disable-pip-version-check -c constraints.txt
 
-.PHONY: help demo test lint format unit clean
+.PHONY: help demo test check lint format clean
 
 help:
 	@echo "make demo    make an asset from the clip that comes with the package, in $(OUT)"
-	@echo "make test    lint, types, import contracts and all tests"
+	@echo "make test    lint, types, import contracts and unit tests"
+	@echo "make check   the first three and all tests"
 	@echo "make lint    the first three of them only"
 	@echo "make format  let ruff put the source in order"
 	@echo "make clean   remove the environment, caches and the demo asset"
@@ -24,16 +26,19 @@ demo: $(VENV)/.core
 	@$(BIN)/fluidlift demo --out $(OUT) || [ $$? -eq 4 ]
 	@echo "watch $(OUT)/preview.mp4, then open $(OUT)/report.html"
 
-test: lint unit
+PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
+
+test: lint
+	$(PYTEST) -m unit
+
+check: lint
+	$(PYTEST)
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 	$(BIN)/lint-imports
-
-unit: $(VENV)/.dev
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
 format: $(VENV)/.dev
 	$(BIN)/ruff check --fix .

@@ -28,6 +28,30 @@ HASTY = (
 )  # fmt: skip
 """for tests that only ask what is said on the way"""
 
+FOREIGN = {"backends", "blender"}
+"""folders whose tests run a large package of others; tests that ask for `visitor` run a browser"""
+
+ASSET = {"made", "story", "finished_tank", "tank_folder"}
+"""fixtures that make an asset, which takes seconds"""
+
+
+def tier_of(item: pytest.Item) -> str:
+    """One of the markers in pyproject.toml, by the test's folder, its fixtures and what its module calls."""
+    room = item.path.relative_to(Path(__file__).parent).parts[0]
+    fixtures = set(item.fixturenames)
+    if room in FOREIGN or "visitor" in fixtures:
+        return "foreign"
+    if room == "validation":
+        return "ladder"
+    calls = "fluidlift.cli import main" in item.path.read_text()
+    return "asset" if calls or ASSET & fixtures else "unit"
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Every test gets its tier."""
+    for item in items:
+        item.add_marker(tier_of(item))
+
 
 def stream_pictures(count: int = 10, size: tuple[int, int] = (96, 64), step: int = 2, seed: int = 0) -> np.ndarray:
     """u8 [T,H,W,3]: blue texture that runs `step` px per frame to the right between still brown banks, round a rock."""

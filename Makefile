@@ -1,6 +1,6 @@
 # Works on a fresh machine with make and Python 3.11 or newer:
 #   make demo    make an asset from the clip that comes with the package
-#   make test    the checks of a newcomer: lint, types, import contracts, unit tests
+#   make test    the checks of a newcomer: lint, types, import contracts, unit tests, one whole asset
 #   make check   every test: assets, packages of others and physics at full resolution as well
 # Another interpreter: make demo PYTHON=python3.12; tests in another number of processes: make test WORKERS=4
 
@@ -15,7 +15,7 @@ PIP := $(BIN)/python -m pip install --disable-pip-version-check -c constraints.t
 
 help:
 	@echo "make demo    make an asset from the clip that comes with the package, in $(OUT)"
-	@echo "make test    lint, types, import contracts and unit tests"
+	@echo "make test    lint, types, import contracts, unit tests, one whole asset"
 	@echo "make check   the first three and all tests"
 	@echo "make lint    the first three of them only"
 	@echo "make format  let ruff put the source in order"
@@ -29,7 +29,7 @@ demo: $(VENV)/.core
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
 test: lint
-	$(PYTEST) -m unit
+	$(PYTEST) -m "unit or whole"
 
 check: lint
 	$(PYTEST)

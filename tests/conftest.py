@@ -1,26 +1,18 @@
-"""A small clip of a stream whose truth is known, and the asset that is made from it once for all tests."""
+"""Tiers, and what many tests start from: the small clip of a stream and the asset that is made from it."""
 
 from __future__ import annotations
 
+import json
+import re
 import time
+from collections import defaultdict
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 
-import cv2
 import numpy as np
 import pytest
-
-INTERVAL = 0.04
-"""s between frames of the small clip"""
-
-QUICK = (
-    "--set", "shape.cells=24", "--set", "shape.refine_iterations=2", "--set", "motion.targets=2",
-    "--set", "fit.max_seconds=60",
-)  # fmt: skip
-"""coarse; the fit may take the time that it needs (a few seconds), because one that is cut off by the clock depends on
-how fast the machine is"""
+from catalogue import QUICK, Job, asset, stream_pictures, write_clip
 
 HASTY = (
     "--set", "shape.cells=12", "--set", "shape.refine_iterations=0", "--set", "motion.targets=1",
@@ -31,65 +23,82 @@ HASTY = (
 FOREIGN = {"backends", "blender"}
 """folders whose tests run a large package of others; tests that ask for `visitor` run a browser"""
 
-ASSET = {"made", "story", "finished_tank", "tank_folder"}
+ASSET = {"made", "catalogue_asset", "story", "finished_tank", "tank_folder"}
 """fixtures that make an asset, which takes seconds"""
 
+COMMAND_LINE = re.compile(r"from fluidlift\.cli import (\([^)]*|[^\n]*)\bmain\b")
 
-def tier_of(item: pytest.Item) -> str:
+DURATIONS = Path(__file__).with_name("durations.json")
+"""s of each test that took over a second, and of whole files whose shared fixtures did, on a warm machine with two
+cores; written by `pytest --record-durations`"""
+
+SLOW = 2.0
+"""s; what takes longer is no unit test: the tests of a newcomer are 2000, and end within five minutes"""
+
+
+def slow_tests() -> set[str]:
+    """Tests, and files, that took longer than a unit test may."""
+    recorded = json.loads(DURATIONS.read_text(encoding="utf-8")) if DURATIONS.is_file() else {}
+    return {name for name, seconds in recorded.items() if seconds > SLOW}
+
+
+def tier_of(item: pytest.Item, slow: set[str]) -> str:
     """One of the markers in pyproject.toml, by the test's folder, its fixtures and what its module calls."""
     room = item.path.relative_to(Path(__file__).parent).parts[0]
     fixtures = set(item.fixturenames)
+    if room == "test_whole_asset.py":
+        return "whole"
     if room in FOREIGN or "visitor" in fixtures:
         return "foreign"
-    if room == "validation":
-        return "ladder"
-    calls = "fluidlift.cli import main" in item.path.read_text()
-    return "asset" if calls or ASSET & fixtures else "unit"
+    if ASSET & fixtures or COMMAND_LINE.search(item.path.read_text(encoding="utf-8")):
+        return "asset"
+    return "ladder" if {item.nodeid, item.nodeid.split("::")[0]} & slow else "unit"
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """--record-durations."""
+    parser.addoption("--record-durations", action="store_true", help="write tests/durations.json anew")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """The controller of a run watches how long tests take."""
+    if not hasattr(config, "workerinput"):
+        config.pluginmanager.register(Stopwatch(config.getoption("--record-durations")))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Every test gets its tier."""
+    slow = slow_tests()
     for item in items:
-        item.add_marker(tier_of(item))
+        item.add_marker(tier_of(item, slow))
 
 
-def stream_pictures(count: int = 10, size: tuple[int, int] = (96, 64), step: int = 2, seed: int = 0) -> np.ndarray:
-    """u8 [T,H,W,3]: blue texture that runs `step` px per frame to the right between still brown banks, round a rock."""
-    width, height = size
-    rng = np.random.default_rng(seed)
+class Stopwatch:
+    """Adds up what each test takes, and tells of unit tests that are none."""
 
-    def texture(shape: tuple[int, int], colour: tuple[int, int, int], contrast: float) -> np.ndarray:
-        noise = cv2.GaussianBlur(rng.standard_normal(shape).astype(np.float32), (0, 0), 1.1)
-        return np.clip(np.asarray(colour) + contrast * (noise / noise.std())[..., None], 0, 255)
+    def __init__(self, record: bool) -> None:
+        self.record = record
+        self.seconds: dict[str, float] = defaultdict(float)
+        self.slow_units: set[str] = set()
 
-    ground = texture((height, width), (120, 95, 60), 22)
-    water = texture((height, width + step * count), (70, 105, 120), 25)
-    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    # a trapezoid: a channel that is a little wider on the near side
-    channel = (v > 0.28 * height) & (v < (0.78 + 0.04 * u / width) * height)
-    rock = ((u - 0.6 * width) / 7) ** 2 + ((v - 0.55 * height) / 5) ** 2 < 1
-    frames = []
-    for t in range(count):
-        moved = water[:, step * (count - t) : step * (count - t) + width]
-        picture = np.where((channel & ~rock)[..., None], moved, ground)
-        frames.append(np.where(rock[..., None], 0.7 * ground, picture))
-    return np.stack(frames).astype(np.uint8)
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """One phase of a test is done."""
+        # a fixture that a file shares is paid for by whichever test comes first
+        shared = report.when == "setup" and report.duration > SLOW
+        name = report.nodeid.split("::")[0] if shared else report.nodeid
+        self.seconds[name] += report.duration
+        if "unit" in report.keywords and self.seconds[name] > SLOW:
+            self.slow_units.add(name)
 
-
-def write_clip(path: Path, frames: np.ndarray) -> Path:
-    """Encode frames at 25 per second."""
-    from fluidlift.io.video import write_video
-
-    return write_video(path, frames, 1.0 / INTERVAL)
-
-
-@dataclass(frozen=True)
-class Job:
-    """What one run of the command line left."""
-
-    clip: Path
-    folder: Path
-    code: int
+    def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
+        """Unit tests that took too long, or the file of durations."""
+        if self.record:
+            long = {name: round(s, 1) for name, s in sorted(self.seconds.items()) if s > 1.0}
+            DURATIONS.write_text(json.dumps(long, indent=1) + "\n", encoding="utf-8")
+        elif self.slow_units:
+            terminalreporter.section(f"unit tests that took over {SLOW:g} s here")
+            for name in sorted(self.slow_units):
+                terminalreporter.line(f"{self.seconds[name]:6.1f} s  {name}")
 
 
 @pytest.fixture
@@ -123,13 +132,15 @@ def stream_clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def made(stream_clip: Path, tmp_path_factory: pytest.TempPathFactory) -> Job:
+def made() -> Job:
     """The small clip as an asset. Tests read it; those that change it work on a copy."""
-    from fluidlift.cli import main
+    return asset("stream")
 
-    folder = tmp_path_factory.mktemp("made") / "stream.fluid"
-    code = main(["make", str(stream_clip), "-o", str(folder), "--size", "2", *QUICK])
-    return Job(stream_clip, folder, code)
+
+@pytest.fixture(scope="session")
+def catalogue_asset() -> Callable[[str], Job]:
+    """Any asset of the catalogue, by its name."""
+    return asset
 
 
 @pytest.fixture

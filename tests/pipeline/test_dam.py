@@ -1,35 +1,32 @@
 """A dam that breaks, from the clip to frames that can be played: it stands, falls, and stays in its basin."""
 
-import json
-
 import numpy as np
 import pytest
 
 from fluidlift.cli import DONE, REJECTED, WITH_WARNINGS, main
 from fluidlift.io.asset_folder import load_asset, read_manifest
 from fluidlift.io.ply import read_splats
-from fluidlift.synthetic.record import make_scene
 from fluidlift.types import CellType
 from fluidlift.validate import validate_asset
 
 FRAMES = 20
-SPEED = ["--preset", "draft", "--set", "shape.cells=32", "--set", "shape.max_gaussians=6000",
-         "--set", "shape.refine_iterations=0", "--set", "simulate.frames=8"]  # fmt: skip
 
 
 @pytest.fixture(scope="module")
-def case(tmp_path_factory):
-    return make_scene("dam", tmp_path_factory.mktemp("dam") / "case", size=(240, 180), frames=FRAMES, cells=28)
+def dam(catalogue_asset):
+    job = catalogue_asset("dam")
+    assert job.code in (DONE, WITH_WARNINGS)
+    return job
 
 
 @pytest.fixture(scope="module")
-def folder(case, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("dam") / "dam.fluid"
-    camera = json.loads((case / "camera.json").read_text()) | {"ground_level_z": 0.05}
-    (case / "surveyed.json").write_text(json.dumps(camera))
-    code = main(["make", str(case / "video.mp4"), "-o", str(folder), "--camera", str(case / "surveyed.json"), *SPEED])
-    assert code in (DONE, WITH_WARNINGS)
-    return folder
+def case(dam):
+    return dam.clip.parent
+
+
+@pytest.fixture(scope="module")
+def folder(dam):
+    return dam.folder
 
 
 def test_it_is_taken_for_what_it_is(folder):

@@ -55,7 +55,7 @@ def show(
     painter = _painter(scene, folder, look)
     panels = _panels(scene, footage, folder, config, poses, measured, step, painter)
     if config.show.preview:
-        write_video(folder / "preview.mp4", panels, 1.0 / scene.interval)
+        write_video(folder / "preview.mp4", panels, 1.0 / scene.interval, repeatable=True)
     else:
         (folder / "preview.mp4").unlink(missing_ok=True)  # of frames that are no longer there
     if config.show.usd:

@@ -305,7 +305,7 @@ def test_a_repeatable_video_is_the_same_on_one_processor(tmp_path):
 
 
 def test_a_repeatable_video_is_the_same_every_time(tmp_path):
-    """With AVX-512, x264's macroblock tree left four different files of these frames in forty tries."""
+    """Previews once came out as one of four files, by the rounding of x264's macroblock tree with AVX-512."""
     rng = np.random.default_rng(0)
     texture = np.repeat(np.repeat(rng.integers(40, 220, (16, 90, 3), np.uint8), 4, axis=0), 4, axis=1)
     frames = [texture[:, 4 * t : 288 + 4 * t] for t in range(10)]

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import sys
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from typing import TextIO
 
 LABELS = {
+    "compile": "compiling",
     "read": "reading the clip",
     "flow": "optical flow",
     "segment": "finding the fluid",
@@ -26,7 +25,6 @@ LABELS = {
 }
 
 
-COMPILING = " compiling first, once: a minute or so"
 WARM_UP = 2
 """parts at the beginning of a stage that say nothing about the rest: of a simulation the body at rest, which takes no
 time, and the frame for which a fresh installation compiles"""
@@ -55,14 +53,6 @@ class Pace:
         return f"about {left / 60:.0f} min left" if left < 5400 else f"about {left / 3600:.1f} h left"
 
 
-def first_compilation() -> bool:
-    """Whether the simulator was never compiled for this installation: its first frame then takes a minute or so."""
-    given = os.environ.get("NUMBA_CACHE_DIR")
-    place = Path(given) if given else Path(__file__).parent / "physics"
-    # where the package cannot be written Numba keeps its files elsewhere, and nothing is known
-    return (bool(given) or os.access(place, os.W_OK)) and not any(place.rglob("transfer*.nbi"))
-
-
 class PlainProgress:
     """One line when a stage begins and one when it ends; of a long one also how far it is, every few seconds.
 
@@ -75,12 +65,15 @@ class PlainProgress:
         self.stream, self.every = stream or sys.stderr, every
         self._head, self._pace, self._last = "", Pace(), time.monotonic()
 
+    def say(self, text: str) -> None:
+        """Something good to know."""
+        print(text, file=self.stream, flush=True)
+
     def stage(self, name: str, number: int, count: int) -> None:
         """A stage begins."""
         self._head = f"[{number}/{count}] {LABELS.get(name, name)}"
         self._pace, self._last = Pace(), time.monotonic()
-        told = COMPILING * (name == "simulate" and first_compilation())
-        print(f"{self._head} ...{told}", file=self.stream, flush=True)
+        print(f"{self._head} ...", file=self.stream, flush=True)
 
     def update(self, done: int, total: int) -> None:
         """Part of the current stage is done."""
@@ -122,13 +115,16 @@ class BarProgress:
     def __exit__(self, *_: object) -> None:
         self.bar.stop()
 
+    def say(self, text: str) -> None:
+        """Something good to know."""
+        self.console.print(text, markup=False, highlight=False)
+
     def stage(self, name: str, number: int, count: int) -> None:
         """A stage begins."""
         self._head = f"[{number}/{count}] {LABELS.get(name, name)}"
         if self._task is not None:
             self.bar.remove_task(self._task)
-        told = COMPILING * (name == "simulate" and first_compilation())
-        self._task = self.bar.add_task(self._head.replace("[", r"\["), total=None, parts="", left=told)
+        self._task = self.bar.add_task(self._head.replace("[", r"\["), total=None, parts="", left="")
         self._pace = Pace()
 
     def update(self, done: int, total: int) -> None:

@@ -36,6 +36,7 @@ from fluidlift.cli.options import (
 )
 from fluidlift.cli.view import View
 from fluidlift.errors import FluidliftError, InputRejected
+from fluidlift.kernels import compiling_beside
 from fluidlift.progress import shown_progress
 
 Command = (
@@ -140,9 +141,9 @@ def default_folder(clip: Path) -> Path:
 
 
 def _run_job(clip: Path, out: Path, config: Any, *, force=(), as_json=False, **files: Path | None) -> int:
-    from fluidlift.pipeline import Inputs, make
+    with shown_progress() as progress, compiling_beside(progress.say):
+        from fluidlift.pipeline import Inputs, make
 
-    with shown_progress() as progress:
         made = make(Inputs(clip, **files), out, config, force=force, progress=progress)
     return _tell(made, as_json)
 
@@ -178,11 +179,13 @@ def _fit(c: Fit) -> int:
 
 
 def _sim(c: Sim) -> int:
-    from fluidlift.pipeline import SimulationRequest, resimulate
+    from fluidlift.pipeline import SimulationRequest
 
     request = SimulationRequest(c.duration, c.fps, c.extend_downstream, c.meshes, c.resume, c.restart)
     flat = {"seed": c.seed, "simulate.checkpoint_every": c.checkpoint_every}
-    with shown_progress() as progress:
+    with shown_progress() as progress, compiling_beside(progress.say):
+        from fluidlift.pipeline import resimulate
+
         made = resimulate(c.asset, request=request, overrides=c.set, flat=flat, progress=progress)
     return _tell(made, c.json)
 
@@ -349,6 +352,15 @@ def _generators(c: Generators) -> int:
 
 def _doctor(c: Doctor) -> int:
     from fluidlift.doctor import examine
+
+    if c.compile:
+        from fluidlift.kernels import compile_all, compiled
+
+        with shown_progress() as progress:
+            if not compiled():
+                progress.stage("compile", 1, 1)
+                compile_all(told=progress.update)
+        return DONE
 
     found = examine()
     if c.json:

@@ -332,3 +332,5 @@ class Doctor:
 
     json: bool = False
     """print as JSON"""
+    compile: bool = False
+    """compile everything now (a minute or so), so that the first job of an installation is as fast as the next"""

@@ -1,0 +1,78 @@
+"""Writes src/fluidlift/kernels.json: what the jobs of the package compile, stage by stage.
+
+    python benchmarks/record_kernels.py        makes the four assets of tests/catalogue.py with an empty cache (5 min)
+
+Run it when kernels were added, renamed or called with other types. Only what Python calls is listed: what a kernel
+calls is compiled with it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+class Recorder:
+    """Listens to Numba."""
+
+    def __init__(self) -> None:
+        self.stage = "read"
+        self.rows: dict[tuple[str, tuple[str, ...]], list[Any]] = {}
+        self._began: list[float] = []
+
+    def on_start(self, event: Any) -> None:
+        """A compilation begins, perhaps within another."""
+        self._began.append(time.perf_counter())
+
+    def on_end(self, event: Any) -> None:
+        """A compilation ended."""
+        seconds = time.perf_counter() - self._began.pop()
+        function = event.data["dispatcher"].py_func
+        if not self._began and function.__module__.startswith("fluidlift.") and "<" not in function.__qualname__:
+            name = f"{function.__module__}:{function.__qualname__}"
+            types = tuple(repr(t) for t in event.data["args"])
+            self.rows.setdefault((name, types), [self.stage, name, types, round(seconds, 2)])
+
+
+def main() -> int:
+    """See the module."""
+    with tempfile.TemporaryDirectory() as cache:
+        os.environ["NUMBA_CACHE_DIR"] = cache
+        sys.path.insert(0, str(ROOT / "tests"))
+        from catalogue import RECIPES
+        from numba.core import event
+
+        from fluidlift import kernels
+        from fluidlift.progress import PlainProgress
+
+        # Numba must not be imported before its cache is named, so the listener becomes one here
+        recorder = type("Listener", (Recorder, event.Listener), {})()
+        event.register("numba:compile", recorder)
+        begin = PlainProgress.stage
+
+        def stage(self: PlainProgress, name: str, number: int, count: int) -> None:
+            recorder.stage = name
+            begin(self, name, number, count)
+
+        PlainProgress.stage = stage  # type: ignore[method-assign]
+        kernels.compiled = lambda: True  # nothing beside it
+        for name in ("demo", *(n for n in RECIPES if n != "demo")):
+            place = Path(cache) / "assets" / name
+            place.mkdir(parents=True)
+            RECIPES[name](place)
+        order = list(dict.fromkeys(row[0] for row in recorder.rows.values()))
+        rows = sorted(recorder.rows.values(), key=lambda row: order.index(row[0]))
+        kernels.LIST.write_text("[\n" + ",\n".join(json.dumps(row) for row in rows) + "\n]\n", encoding="utf-8")
+        print(f"{len(rows)} kernels, {sum(row[3] for row in rows):.0f} s")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

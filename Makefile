@@ -11,7 +11,7 @@ WORKERS ?= 2
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --disable-pip-version-check -c constraints.txt
 
-.PHONY: help demo test check lint format clean
+.PHONY: help demo test check lint compiled format clean
 
 help:
 	@echo "make demo    make an asset from the clip that comes with the package, in $(OUT)"
@@ -28,11 +28,15 @@ demo: $(VENV)/.core
 
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
-test: lint
+test: lint compiled
 	$(PYTEST) -m "unit or whole"
 
-check: lint
+check: lint compiled
 	$(PYTEST)
+
+# Once, instead of in every process of the tests that calls them first.
+compiled: $(VENV)/.dev
+	@$(BIN)/fluidlift doctor --compile >/dev/null
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .

@@ -42,18 +42,6 @@ def test_a_stage_that_slows_down_is_told_by_its_later_half():
     assert left(times, len(times) + 9) == "about 40 s left"
 
 
-def test_the_first_simulation_of_an_installation_says_that_it_compiles(monkeypatch, tmp_path):
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    for name, said in (("simulate", True), ("flow", False)):
-        stream = io.StringIO()
-        PlainProgress(stream).stage(name, 1, 2)
-        assert ("compiling first" in stream.getvalue()) == said
-    (tmp_path / "transfer_kernels.scatter-93.py311.nbi").touch()
-    stream = io.StringIO()
-    PlainProgress(stream).stage("simulate", 1, 2)
-    assert "compiling" not in stream.getvalue()
-
-
 def test_plain_lines_tell_the_frame_every_few_seconds(monkeypatch):
     clock = itertools.count(0.0, 4.0)  # s: each look at the clock is four seconds after the one before
     monkeypatch.setattr(progress.time, "monotonic", lambda: next(clock))

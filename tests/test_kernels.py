@@ -12,7 +12,6 @@ import pytest
 from numba import types
 
 from fluidlift import kernels
-from fluidlift.kernels import Kernel
 
 
 @pytest.fixture

@@ -15,6 +15,12 @@ BROAD = 0.03
 """standard deviation of the blur that separates the shade of a place from its fine look, shares of the picture's longer
 side; as `look.appearance`"""
 
+SHOWN = 0.1
+"""share of the film in which a place is fluid, from which its look counts: rarer, it is spray, or ground with noise"""
+
+RIM = 2
+"""px inside its outline in which a pixel may show half of the bank: lens, coding and mask are no sharper than that"""
+
 FEWEST = 8
 """frames: a shorter film has no life of its own to show"""
 
@@ -36,8 +42,8 @@ class FluidFootage:
     """of the frames in which a pixel is fluid, 0 to 1; beside the fluid that of the nearest fluid"""
     shade: Float[np.ndarray, "h w 3"]
     """the broad part of it"""
-    share: Float[np.ndarray, "h w"]
-    """of the frames in which a pixel is fluid"""
+    outside: Float[np.ndarray, "h w"]
+    """px to the nearest pixel that shows fluid (in `SHOWN` of the frames); 0 where it does"""
 
     @classmethod
     def of(cls, frames: np.ndarray, fluid: np.ndarray, interval: float, *, blur: float = 0.0) -> FluidFootage | None:
@@ -52,23 +58,23 @@ class FluidFootage:
         require(frames.shape[:3] == fluid.shape, f"{frames.shape} pictures for masks {fluid.shape}", "one each")
         if blur > 0:
             frames = np.stack([_sharpened(f, m, blur) for f, m in zip(frames, fluid, strict=True)])
-        wet = fluid.sum(axis=0, dtype=np.int32)
-        if len(frames) < FEWEST or not wet.any():
+        weight = fluid.mean(axis=0, dtype=np.float32)
+        known = weight > SHOWN
+        if len(frames) < FEWEST or not known.any():
             return None
         total = np.zeros(frames.shape[1:], np.float32)
         for picture, mask in zip(frames, fluid, strict=True):
             total += picture * mask[..., None]
-        known = wet > 0
-        mean = total / (255.0 * np.maximum(wet, 1)[..., None])
-        nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
-        # a pixel that is fluid once shows its rim; those that often are count in the blur
-        weight = (wet / len(frames)).astype(np.float32)
+        mean = total / (255.0 * len(frames) * np.maximum(weight, 1e-6)[..., None])
+        outside, own = ndimage.distance_transform_edt(~known), _without_rim(known)
+        nearest = ndimage.distance_transform_edt(~own, return_distances=False, return_indices=True)
+        # a pixel that is rarely fluid shows its rim; those that often are count in the blur
         sigma = BROAD * max(weight.shape)
         spread = np.maximum(ndimage.gaussian_filter(weight, sigma), 1e-6)
         blurred = [ndimage.gaussian_filter(mean[..., k] * weight, sigma) / spread for k in range(3)]
         shade = np.stack(blurred, axis=-1)[tuple(nearest)]
         mean = mean[tuple(nearest)].astype(np.float32)
-        return cls(frames, fluid, interval, mean, shade.astype(np.float32), weight)
+        return cls(frames, fluid & own, interval, mean, shade.astype(np.float32), outside.astype(np.float32))
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -86,6 +92,13 @@ class FluidFootage:
         out, share = np.zeros((len(index), 3), np.float32), np.zeros(len(index), np.float32)
         _residual(self.frames, self.fluid, self.mean, index.astype(np.float64), frame, out, share)
         return out, share
+
+
+def _without_rim(fluid: np.ndarray) -> np.ndarray:
+    """Pixels that show nothing but fluid: not those at the rim, but for threads that are no wider."""
+    inner = ndimage.binary_erosion(fluid, iterations=RIM, border_value=1)
+    threads = fluid & ~ndimage.binary_dilation(inner, iterations=2 * RIM)
+    return inner | threads
 
 
 def _sharpened(picture: np.ndarray, fluid: np.ndarray, blur: float) -> np.ndarray:

@@ -10,9 +10,6 @@ from fluidlift.look.footage import FluidFootage
 from fluidlift.look.surface_axes import PictureAxes
 from fluidlift.look.surface_map import SurfaceMap, sampled
 
-SHOWN = 0.1
-"""share of the film in which a place is fluid, from which it may lend its look: rarer, it is spray"""
-
 
 class PictureTexture:
     """As `look.seen_texture.SeenTexture` for a map over the picture, where each place is seen in itself.
@@ -26,8 +23,8 @@ class PictureTexture:
     def __init__(self, axes: PictureAxes, surface: SurfaceMap, footage: FluidFootage) -> None:
         self.surface, self._axes = surface, axes
         index = self.index_of(surface.middles().reshape(-1, 2))
-        inside = ((index >= 0) & (index <= np.array(footage.share.shape) - 1)).all(axis=1)
-        seen = (inside & (sampled(footage.share, index) > SHOWN)).reshape(surface.wet.shape)
+        inside = ((index >= 0) & (index <= np.array(footage.outside.shape) - 1)).all(axis=1)
+        seen = (inside & (sampled(footage.outside, index) <= 0)).reshape(surface.wet.shape)
         self._trust = ndimage.gaussian_filter(seen.astype(np.float64), 1.0)
 
     @property

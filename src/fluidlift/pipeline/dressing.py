@@ -14,9 +14,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from fluidlift.errors import InputRejected
+from fluidlift.pipeline.scene import LYING
 from fluidlift.types import Gaussians, Particles, PinholeCamera, concatenate, sh_from_rgb
 
 if TYPE_CHECKING:
+    from fluidlift.look.filmed_outline import FilmedOutline
     from fluidlift.look.footage import FluidFootage
     from fluidlift.look.seen_texture import SeenTexture
     from fluidlift.look.surface_axes import SurfaceAxes
@@ -60,6 +62,9 @@ LOOKED_UP = 1 / 6 + 0.3
 
 WIDEST = 1.5
 """px of the splats' standard deviation that is taken out of a film at most: beyond, noise is all that is sharpened"""
+
+SMALLEST = 0.02
+"""standard deviation of a splat at least, cells: files hold its logarithm"""
 
 REACH = 0.5
 """standard deviation of a splat under the skin at most, shares of its distance from the ground and `CLEAR`: wider ones
@@ -115,11 +120,13 @@ class Dressing:
         self._patches: TexturePatches | None = None
         self._surface: SurfaceMap | None = None
         self._axes: SurfaceAxes
+        self._outline: FilmedOutline | None = None
         self._own = scene.rest.select(np.arange(len(scene.rest) - sum(map(len, scene.emitter_looks))))
         if len(self._own) and len(scene.body):
             self._lay_skin()
 
     def _lay_skin(self) -> None:
+        from fluidlift.look.filmed_outline import FilmedOutline
         from fluidlift.look.picture_texture import PictureTexture
         from fluidlift.look.surface_axes import PictureAxes, PlanAxes
         from fluidlift.look.texture_patches import TexturePatches
@@ -150,6 +157,8 @@ class Dressing:
             texture, max(PATCH * across, FEWEST_CELLS * self._cell), footage=footage, edited=scene.edited,
             start=scene.film_start,
         )  # fmt: skip
+        if footage is not None and scene.kind in LYING and not scene.edited:
+            self._outline = FilmedOutline(scene.camera, footage.outside, self._cell)
         self._begin_again()
 
     def _seen_texture(self, surface: SurfaceMap, footage: FluidFootage | None) -> SeenTexture:
@@ -176,7 +185,8 @@ class Dressing:
         if not shown.any():
             return None
         moving = self._axes.velocities(particles.positions, particles.velocities)
-        return SurfaceMap.of(points[shown], moving[shown], self._cell)
+        surface = SurfaceMap.of(points[shown], moving[shown], self._cell)
+        return surface if self._outline is None else self._outline.cut(surface, self._axes)
 
     def _begin_again(self) -> None:
         from fluidlift.look.surface_skin import SurfaceSkin
@@ -246,6 +256,10 @@ class Dressing:
         below, spray = COVERED
         covered = smoothstep(above, *below) * (1 - smoothstep(above, *spray)) * (surface.presence(xy) > 0.5)
         room = REACH * np.maximum(self._clearance(shown.means) + CLEAR * self._cell, CLEAR * self._cell)
+        if self._outline is not None:
+            filmed = self._outline.room(shown.means)
+            covered = np.where(filmed > 0, covered, 1.0)
+            room = np.minimum(room, np.maximum(filmed, SMALLEST * self._cell))
         scales = np.minimum(shown.scales, room[:, None]).astype(np.float32)
         opacities = np.minimum(shown.opacities, np.maximum(shown.opacities * (1 - covered), FAINT)).astype(np.float32)
         sh, own = shown.sh.copy(), self._own_colors(particles.source)
@@ -256,7 +270,10 @@ class Dressing:
         color, there = patches.colors(points)
         color = dyed(color, points, surface, replace(shown, means=axes.points(shown.means)), own, self._cell)
         world = axes.world_points(points)
-        there &= self._clearance(world) > CLEAR * self._cell
+        if self._outline is None:
+            there &= self._clearance(world) > CLEAR * self._cell
+        else:
+            there &= self._outline.inside(world)
         if inside is not None:
             there &= ~inside(world)
         tracers = axes.world_splats(skin.splats(surface, color).select(there))

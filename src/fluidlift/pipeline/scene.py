@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -194,6 +195,28 @@ def footage_of(story: Story) -> Footage | None:
     labels = labels_of(story)
     rocks = g.arrays["rocks"] if "rocks" in g.arrays else labels.solid.mean(axis=0) > 0.5
     return Footage(clip_of(story), labels, g.arrays["plate"], int(g.meta["rest_frame"]), rocks)
+
+
+BEHIND = (1.5, 0.5)
+"""cells behind the terrain from which fluid is hidden: at rocks, whose shape is a guess, and where it is always dry"""
+
+
+def before_ground(scene: Scene, footage: Footage | None) -> Callable[[Gaussians], np.ndarray] | None:
+    """Which splats are not hidden by the ground that the clip's picture shows; None where it hides nothing.
+
+    The picture is drawn as one plate behind the fluid: without this, fluid would be seen through a near bank.
+    """
+    from fluidlift.look.scenery import terrain_depth, visible_beside_rocks
+
+    if footage is None:
+        return None
+    rocks = footage.rocks
+    ground = rocks | ~footage.labels.fluid.any(axis=0) if scene.kind in LYING else rocks
+    if not ground.any():
+        return None
+    margin = scene.terrain.grid.spacing * np.where(rocks, *BEHIND)
+    depth = terrain_depth(scene.terrain, scene.camera)
+    return lambda g: visible_beside_rocks(g.means, scene.camera, depth, ground, margin=margin)
 
 
 def scene_of(

@@ -12,7 +12,7 @@ from fluidlift.config import JobConfig
 from fluidlift.io.scene_look import Look
 from fluidlift.pipeline.export_job import frames_of
 from fluidlift.pipeline.looks import Backdrop, Frame, Painter, placed_bodies
-from fluidlift.pipeline.scene import LYING, Footage, Scene
+from fluidlift.pipeline.scene import LYING, Footage, Scene, before_ground
 from fluidlift.pipeline.story import Result
 from fluidlift.types import Gaussians, PinholeCamera, Similarity3, concatenate, matrix_from_quat
 
@@ -105,7 +105,7 @@ def _panels(
     """Input | re-simulation | side view, frame by frame; keeps what the evaluation needs on the way."""
     from fluidlift.look.pictures import caption
     from fluidlift.look.rasterize import render
-    from fluidlift.look.scenery import mesh_surfels, side_camera, terrain_depth, terrain_surfels, visible_beside_rocks
+    from fluidlift.look.scenery import mesh_surfels, side_camera, terrain_depth, terrain_surfels
     from fluidlift.look.vessel import glass_of
     from fluidlift.numerics.srgb import linear_from_srgb
 
@@ -119,7 +119,8 @@ def _panels(
         edited = scene.obstacles or scene.emitters or scene.overlap or scene.changes
         if scene.interval == scene.clip_interval and not edited:
             compared = max(len(footage.clip) - footage.start, 1)
-    solid_depth = terrain_depth(terrain, camera) if rocks.any() else None
+    seen_of = before_ground(scene, None if scene.reshaped else footage)
+    solid_depth = terrain_depth(terrain, camera) if rocks.any() and painter is not None else None
     airborne = scene.kind not in LYING
     ground = terrain_surfels(terrain, glass=glass_of(scene.kind))
     size = _panel_size(camera.size, config.show.width)
@@ -140,8 +141,8 @@ def _panels(
             shape.transformed(Similarity3(1.0, matrix_from_quat(p[3:]), p[:3])) for shape, p in zip(shapes, poses[k])
         ]
         front, velocity = gaussians, speeds
-        if solid_depth is not None:
-            keep = visible_beside_rocks(gaussians.means, camera, solid_depth, rocks, margin=1.5 * grid.spacing)
+        if seen_of is not None:
+            keep = seen_of(gaussians)
             front, velocity = gaussians.select(keep), velocity[keep]
         rendered = render(concatenate([front, *solids]), camera, background=plate)
         picture = _bytes(rendered.image)

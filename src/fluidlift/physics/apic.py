@@ -16,6 +16,7 @@ from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.physics import transfer
 from fluidlift.physics.crowding import fill_ratio, spreading
 from fluidlift.physics.emitter import Supply
+from fluidlift.physics.guidance import BodyForce
 from fluidlift.physics.liquid_grid import Layout, LiquidGrid
 from fluidlift.physics.numba_particles import ParticleWork
 from fluidlift.physics.outlet import surplus
@@ -76,6 +77,7 @@ class LiquidSimulator(LiquidGrid):
         bodies: rigid bodies, at rest, animated or free; particles inside them at the start are removed.
         supply: how the inflow changes over time, and emitters; None: a steady inlet alone.
         open_sides: bool [3,2] (axis, low/high) of the box without a wall; None: `open_sky`.
+        forces: beside gravity.
 
     Raises:
         ValueError: arguments of wrong shape, or numbers that are not finite.
@@ -98,6 +100,7 @@ class LiquidSimulator(LiquidGrid):
         bodies: Sequence[RigidBody] = (),
         supply: Supply | None = None,
         open_sides: np.ndarray | None = None,
+        forces: Sequence[BodyForce] = (),
     ) -> None:
         super().__init__(
             grid, terrain, parameters, particles, cell_types=cell_types, inflow_profile=inflow_profile, seed=seed,
@@ -105,6 +108,7 @@ class LiquidSimulator(LiquidGrid):
             open_sides=open_sky(parameters.gravity) if open_sides is None else np.asarray(open_sides, bool),
             settings=replace(settings or SimulationSettings(), particles_per_cell=particles_per_cell),
         )  # fmt: skip
+        self._forces = tuple(forces)
         self._prepare_grid(work or ParticleWork(), bodies)
 
     def state(self) -> dict[str, np.ndarray]:

@@ -23,6 +23,7 @@ from fluidlift.physics.free_surface import (
     solid_shares,
     surface_gaps,
 )
+from fluidlift.physics.guidance import BodyForce
 from fluidlift.physics.numba_particles import ParticleWork
 from fluidlift.physics.outlet import hold_columns, outlet_heads, surface_heights, water_levels
 from fluidlift.physics.pressure import PressureSystem, build_system, project, subtract_gradient
@@ -68,6 +69,8 @@ class Layout:
 class LiquidGrid(ParticleSimulator):
     """What `apic.LiquidSimulator` does on the grid: surface, viscosity, pressure, bodies, outlet."""
 
+    _forces: tuple[BodyForce, ...]
+
     def _prepare_grid(self, work: ParticleWork, bodies: Sequence[RigidBody]) -> None:
         """Everything below needs this once, after the particles are there."""
         self._work = work
@@ -91,6 +94,10 @@ class LiquidGrid(ParticleSimulator):
     def _volumes(self) -> np.ndarray:
         """m^3 of each particle."""
         return (self._particles.masses / self.parameters.density).astype(np.float32)
+
+    def _speed_gain(self) -> float:
+        """See `ParticleSimulator`."""
+        return super()._speed_gain() + sum(force.largest for force in self._forces)
 
     def _substep_length(self, remaining: float) -> float:
         """See `ParticleSimulator`; also within the limit of surface tension."""
@@ -163,7 +170,10 @@ class LiquidGrid(ParticleSimulator):
         if bodies is not None:
             bodies.predict(dt, rate)
             solid = bodies.face_velocity()
-        velocity = self._impose(add_gravity(carried, self.parameters.gravity, dt), window, outlet)
+        forced = add_gravity(carried, self.parameters.gravity, dt)
+        for force in self._forces:
+            forced = force.applied(forced, masses, window.box, dt)
+        velocity = self._impose(forced, window, outlet)
         known, system = self._known(layout, window, dt), self._system(layout, window, outlet)
         moving = self._wet_faces(layout.wet | (layout.holding == CellType.FLUID), walls)
         pressed = self._pressed(velocity, system, rate, known, dt)

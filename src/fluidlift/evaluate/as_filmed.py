@@ -40,6 +40,8 @@ CURRENT_COSINE = (0.95, 0.85)
 """18 and 32 degrees"""
 SLOWEST = 0.3
 """px/frame: a slower mean flow lies within what optical flow is wrong by, and is not judged"""
+FOLLOWED = 0.1
+"""correlation: what is less alike downstream in the clip is chance, and no number to divide by"""
 STAYS = 0.8
 """share of the fluid that must be the same in both halves of a clip for frames after its end to be held against it"""
 FEWEST = 6
@@ -75,6 +77,7 @@ def _text(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f}" if abs(value) < 10 else f"{value:.1f}"
 
 
+NONE = float("nan")
 HEADER = ("figure", "value", "floor", "after the clip", "verdict", "")
 
 
@@ -221,7 +224,7 @@ def likeness(a: FilmStatistics, b: FilmStatistics, inside: np.ndarray, places: P
         "ring": _mean(off, places.ring),
         "liveliness": _ratio(_mean(b.deviation, inside), _mean(a.deviation, inside)),
     }
-    found |= {f"along_{lag:g}": _ratio(b.along[lag], a.along[lag]) for lag in a.along}
+    found |= {f"along_{lag:g}": _ratio(b.along[lag], own) if own > FOLLOWED else NONE for lag, own in a.along.items()}
     found |= {f"crispness_{k}": _ratio(b.bands[k], a.bands[k]) for k in range(BANDS)}
     found |= {"colours": colour_distance(a.colours, b.colours), "foam": foam_likeness(a.foam, b.foam, inside)}
     error, cosine = current(a.flow, b.flow, inside)

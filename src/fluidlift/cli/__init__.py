@@ -337,12 +337,14 @@ def _evaluate(c: Evaluate) -> int:
 
 def _evaluate_as_filmed(c: Evaluate) -> int:
     """The asset's own card, or one against other footage."""
-    from fluidlift.evaluate.as_filmed import HEADER
     from fluidlift.io.asset_folder import read_manifest
+
+    manifest = read_manifest(c.asset)  # before the heavy packages: a wrong name is told at once
+    from fluidlift.evaluate.as_filmed import HEADER
     from fluidlift.pipeline import card_against, card_of
 
     if c.clip is None:
-        card = card_of(read_manifest(c.asset))
+        card = card_of(manifest)
         if isinstance(card, str):
             raise InputRejected(f"'{c.asset.name}' was not held against its clip", "frames as they were filmed", card)
     else:

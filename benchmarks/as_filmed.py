@@ -5,9 +5,9 @@
     python benchmarks/as_filmed.py --make river.mp4 --work runs --held-out
 
 Figures are those of `fluidlift evaluate ASSET` (docs/cli.md), each with the same figure between the halves of the clip
-in brackets and, after a comma, that of the frames after the clip's end. `--make` makes drafts and simulates them to three
-times the length of the clip. With `--held-out` they are made from the first two thirds of the clip and held against the
-last third, which they have not seen. What lies in the work folder already is not made again. `--json` writes the cards.
+in brackets and, after a comma, that of the frames after the clip's end. `--make` makes drafts and simulates them to
+three times the length of the clip. With `--held-out` they are made from the first two thirds of the clip and held
+against the last third, which they have not seen. What lies in the work folder is not made again.
 """
 
 from __future__ import annotations

@@ -167,7 +167,8 @@ def test_films_that_are_too_short_or_of_another_size_are_refused(clip, masks):
     [
         ("level", 0.95, 0.99, GOOD), ("level", 0.92, 0.91, GOOD), ("level", 0.92, 0.99, USABLE),
         ("level", 0.87, 0.5, WRONG), ("mean", 9.0, 6.0, GOOD), ("mean", 14.0, 6.0, USABLE), ("mean", 14.1, 6.0, WRONG),
-        ("ring", 2.0, None, GOOD), ("ring", 5.1, 0.0, WRONG), ("crispness_0", 1.2, 1.0, USABLE),
+        ("ring", 2.0, 0.0, GOOD), ("ring", 9.0, None, None), ("ring", 5.1, 0.0, WRONG),
+        ("crispness_0", 1.2, 1.0, USABLE),
         ("crispness_0", 0.74, 1.0, WRONG), ("liveliness", 1.3, 1.0, USABLE), ("liveliness", 1.31, 1.0, WRONG),
         ("current_error", 0.5, 0.0, USABLE), ("current_cosine", 0.84, 1.0, WRONG), ("foam", 0.0, 1.0, None),
         ("level", None, 1.0, None),

@@ -325,7 +325,7 @@ def _plain(value: float | None) -> float | None:
 
 def _judged(key: str, value: float | None, floor: float | None) -> str | None:
     """The verdict on one value; None where this figure is told but not judged."""
-    if value is None:
+    if value is None or (floor is None and key in ("mean", "ring")):
         return None
     least = floor or 0.0
     match key:

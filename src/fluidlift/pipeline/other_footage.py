@@ -56,9 +56,9 @@ def card_against(folder: Path, video: Path, *, start: float = 0.0, progress: Pro
     reason = why_not(scene, footage, config)
     if reason is not None or footage is None:
         raise InputRejected(f"'{folder.name}' cannot be held against footage", "frames as they were filmed", reason)
-    other = read_clip(video, start=start, max_size=max(asset.camera.size))
-    _check(other, footage.clip, interval)
     count, own = int(played.get("frames", 0)), len(footage.clip) - footage.start
+    other = read_clip(video, start=start, duration=(count + 1) * interval, max_size=max(asset.camera.size))
+    _check(other, footage.clip, interval)
     first = own if count - own >= FEWEST else 0
     last = min(count, first + len(other))
     if min(last - first, len(other)) < FEWEST:

@@ -67,6 +67,10 @@ class Likeness:
     """of `VERDICTS`, the worse of `value` and `beyond`; None: not judged"""
     note: str = ""
 
+    def against(self) -> str:
+        """The floor in words, of figures that say nothing without it."""
+        return f" against {_text(self.floor)}" if self.key in ("mean", "ring") and self.floor is not None else ""
+
     def row(self) -> tuple[str, str, str, str, str, str]:
         """Words with the unit, value, floor, beyond, verdict, note."""
         name = f"{self.words}, {self.unit}" if self.unit else self.words
@@ -115,16 +119,15 @@ class AsFilmed:
         judged = sorted((f for f in self.figures if f.verdict), key=lambda f: -VERDICTS.index(str(f.verdict)))
         told = []
         for f in judged:
-            floor = f" against {_text(f.floor)}" if f.key in ("mean", "ring") and f.floor is not None else ""
             later = f", {_text(f.beyond)} after the clip" if f.beyond is not None else ""
-            told.append(f"{f.words} {_text(f.value)}{floor}{later}")
+            told.append(f"{f.words} {_text(f.value)}{f.against()}{later}")
         return f"as filmed: {self.verdict or 'not judged'} ({'; '.join(told) or 'nothing could be measured'})"
 
     def warning(self) -> str | None:
         """What to say where it does not hold, with advice; None where it does."""
         if self.verdict != WRONG:
             return None
-        wrong = ", ".join(f"{f.words} {_text(_worst(f))}" for f in self.figures if f.verdict == WRONG)
+        wrong = ", ".join(f"{f.words} {_text(_worst(f))}{f.against()}" for f in self.figures if f.verdict == WRONG)
         return f"the re-simulation does not hold to its clip: {wrong}. {' '.join(self.advice)}".strip()
 
     def to_dict(self) -> dict[str, Any]:

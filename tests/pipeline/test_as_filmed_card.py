@@ -100,7 +100,7 @@ def a_footage(frames: int, height: int = 48, width: int = 64) -> Footage:
     [
         ({"overlap": 3}, "a loop"), ({"changes": ("density",)}, "other parameters"), ({"reshaped": True}, "terrain"),
         ({"extended": 1.0}, "a longer channel"), ({"inflow": InflowSchedule(((0.0, 2.0),))}, "another inflow"),
-        ({"interval": 0.02}, "another rate"), ({"frames": 4}, "4 frames are too few"),
+        ({"interval": 0.02}, "another rate"), ({"frames": 4}, "4 where 6 are needed"),
     ],
 )  # fmt: skip
 def test_why_a_scene_cannot_be_held_against_its_clip(channel, change, said):
@@ -118,7 +118,7 @@ def test_a_run_that_floods_its_banks_warns_and_one_that_broke_down_says_so(chann
     assert found["as_filmed"]["verdict"] == "does not hold" and "level" in found["warnings"][0]
     assert "warnings" not in card_of_run(channel(8), footage, config, frames, footage.labels.fluid)
     short = card_of_run(channel(8), footage, config, frames[:2], everywhere[:2])
-    assert "ended after 2 frames" in short["as_filmed"]["none"]
+    assert "2 where 6 are needed" in short["as_filmed"]["none"]
 
 
 def test_a_reel_gives_back_what_it_was_given_and_leaves_no_file(tmp_path):

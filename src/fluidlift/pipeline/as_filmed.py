@@ -59,7 +59,7 @@ def why_not(scene: Scene, footage: Footage | None, config: JobConfig) -> str | N
         return "no pictures were drawn: run fluidlift sim with --set show.preview=true"
     filmed = len(footage.clip) - footage.start
     if min(filmed, scene.frames) < FEWEST:
-        return f"{min(filmed, scene.frames)} frames are too few: give {FEWEST} or more (--duration)"
+        return f"too few frames, {min(filmed, scene.frames)} where {FEWEST} are needed: give a longer --duration"
     return None
 
 
@@ -79,7 +79,7 @@ def card_of_run(
 
     reason = why_not(scene, footage, config)
     if reason is None and len(renders) < FEWEST:
-        reason = f"the simulation ended after {len(renders)} frames, and {FEWEST} are needed"
+        reason = f"the simulation ended early: too few frames, {len(renders)} where {FEWEST} are needed"
     if reason is not None or footage is None:
         return {"as_filmed": {"none": reason}}
     first = footage.start

@@ -68,6 +68,7 @@ FILES = {
     "velocity": "rest/velocity.npz",
     "velocity_volume": "rest/velocity.vdb",
     "camera": "rest/camera.json",
+    "film": "rest/film.mp4",
     "parameters": "parameters.json",
     "scene": "scene.yaml",
 }

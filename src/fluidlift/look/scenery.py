@@ -205,11 +205,11 @@ def visible_beside_rocks(
     depth: Float[np.ndarray, "h w"],
     where: Bool[np.ndarray, "h w"],
     *,
-    margin: float,
+    margin: float | Float[np.ndarray, "h w"],
 ) -> Bool[np.ndarray, " n"]:
     """False for points that lie more than `margin` (m) behind the solid seen at a pixel of `where`."""
     row, col, z = camera.nearest_pixels(means)
-    return ~(where[row, col] & (z > depth[row, col] + margin))
+    return ~(where[row, col] & (z > (depth + margin)[row, col]))
 
 
 def orbit_camera(

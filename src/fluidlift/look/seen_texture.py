@@ -85,12 +85,17 @@ class SeenTexture:
         width = 2 * int(np.ceil(radius / self.surface.pitch)) + 1
         return ndimage.uniform_filter(self._trust, width, mode="constant") * self._trust
 
+    def seen_at(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
+        """Row and column of the picture in which points (m) are seen, whatever is before them."""
+        return self._camera.project(points)[0][:, ::-1] - 0.5
+
+    def index_of(self, places: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+        """Row and column in which places (x, y in m) of the surface at rest were seen."""
+        return self.seen_at(np.concatenate([places, self.surface.at(self.surface.height, places)[:, None]], axis=1))
+
     def colors(self, places: Float[np.ndarray, "n 2"]) -> tuple[np.ndarray, np.ndarray]:
         """sRGB [n,3] seen at places (x, y in m), and the steady shade [n,3] there; ones where there is none."""
-        uv, _ = self._camera.project(
-            np.concatenate([places, self.surface.at(self.surface.height, places)[:, None]], axis=1)
-        )
-        index = uv[:, ::-1] - 0.5
+        index = self.index_of(places)
         color = sampled(self._picture, index)
         return color, np.ones_like(color) if self._shading is None else sampled(self._shading.image, index)
 

@@ -17,8 +17,10 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from fluidlift.errors import require
+from fluidlift.look.footage import FluidFootage
+from fluidlift.look.picture_texture import PictureTexture
 from fluidlift.look.seen_texture import SeenTexture
-from fluidlift.look.surface_map import SurfaceMap
+from fluidlift.look.surface_map import SurfaceMap, sampled
 
 APART = 0.6
 """radii between patches: each place is covered by several"""
@@ -44,6 +46,13 @@ TRIES = 12
 LARGEST_RATIO = 1.5
 """by which a colour is brightened or darkened at most where it comes from another shade"""
 
+FASTEST = 2.0
+"""times its own speed that footage plays at most: faster, frames are skipped that a viewer misses"""
+
+UNLIKE = 0.5
+"""difference of the flow from the filmed one, over the filmed one, from which a place looks otherwise than it was
+filmed: as when a stream is half as fast, or turned by 30 degrees"""
+
 GOOD = 0.8
 """share of a source that was seen, from which it is taken at once"""
 
@@ -62,11 +71,15 @@ class Patches:
     """shear so far, no unit"""
     presences: Float[np.ndarray, " m"]
     """0 to 1"""
+    instants: Float[np.ndarray, " m"]
+    """of the footage that they show, frames"""
+    ends: Float[np.ndarray, " m"]
+    """instants at which they give way"""
 
     @classmethod
     def none(cls) -> Patches:
         """No patches."""
-        return cls(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0))
+        return cls(np.zeros((0, 2)), np.zeros((0, 2)), *np.zeros((5, 0)))
 
     def __len__(self) -> int:
         return len(self.turns)
@@ -82,25 +95,42 @@ class Patches:
     @property
     def going(self) -> Bool[np.ndarray, " m"]:
         """Those that give way."""
-        return self.strains > LIMIT
+        return (self.strains > LIMIT) | (self.instants >= self.ends)
 
 
 class TexturePatches:
     """Patches over a moving surface.
 
+    With footage, a patch shows what its place looked like from some instant of the film on, and gives way when the
+    film ends. Foam is born at its rock, breaks up, and is carried on by the footage itself, so a patch stays where it
+    is as long as the fluid flows as it was filmed (`edited` False). Where a person changed the scene it moves by the
+    difference of the two flows, and its footage plays at the ratio of their speeds.
+
     Args:
         texture: the look at rest.
         radius: of a patch, m.
+        footage: the fluid over time; None: patches are pieces of the look at rest.
+        edited: whether the fluid flows otherwise than it was filmed.
+        start: instant of the footage, frames, that the body at rest shows.
 
     Raises:
         ValueError: a radius that is not positive, or a texture without any usable place.
     """
 
-    def __init__(self, texture: SeenTexture, radius: float) -> None:
+    def __init__(
+        self,
+        texture: SeenTexture | PictureTexture,
+        radius: float,
+        *,
+        footage: FluidFootage | None = None,
+        edited: bool = False,
+        start: float = 0.0,
+    ) -> None:
         require(radius > 0, f"radius {radius}", "positive metres")
         require(texture.usable, "a texture of which nothing was seen")
         self.state = Patches.none()
         self._texture, self._radius = texture, radius
+        self._footage, self._edited, self._start = footage, edited, start
         self._good = texture.trust_within(radius)
         self._seen_flow = _gradients(texture.surface, SMOOTH * radius)[0]
 
@@ -122,16 +152,28 @@ class TexturePatches:
     def _carry(self, surface: SurfaceMap, interval: float) -> None:
         s, (flow, spin, shear) = self.state, _gradients(surface, SMOOTH * self._radius)
         rate = surface.at(shear, s.centers)
-        fade = np.clip(LIMIT / 3 / np.maximum(rate * interval, 1e-9), *FADE)
+        moved, turns, instants = interval * surface.at(flow, s.centers), s.turns, s.instants
+        if self._footage is not None and not self._edited:
+            rate, moved = np.zeros(len(s)), np.zeros((len(s), 2))
+            instants = s.instants + interval / self._footage.interval
+        elif self._footage is not None:
+            there = self._texture.surface.at(self._seen_flow, s.sources)
+            pace = np.linalg.norm(moved, axis=1) / np.maximum(interval * np.linalg.norm(there, axis=1), 1e-9)
+            pace = np.minimum(pace, FASTEST)
+            moved = moved - interval * pace[:, None] * _turned(there, s.turns)
+            instants = s.instants + pace * interval / self._footage.interval
         strains = s.strains + interval * rate
-        presences = np.clip(s.presences + np.where(strains > LIMIT, -1, 1) / fade, 0.0, 1.0)
-        centers = s.centers + interval * surface.at(flow, s.centers)
-        # a line that is carried along turns at most so fast
-        most = interval * (np.abs(surface.at(spin, s.centers)) + rate)
-        turns = s.turns + np.clip(_wrapped(self._heading(surface, flow, centers, s.sources) - s.turns), -most, most)
-        moved = Patches(centers, s.sources, turns, strains, presences)
+        fade = np.clip(LIMIT / 3 / np.maximum(rate * interval, 1e-9), *FADE)
+        going = (strains > LIMIT) | (instants >= s.ends)
+        presences = np.clip(s.presences + np.where(going, -1, 1) / fade, 0.0, 1.0)
+        centers = s.centers + moved
+        if self._footage is None or self._edited:
+            # a line that is carried along turns at most so fast
+            most = interval * (np.abs(surface.at(spin, s.centers)) + rate)
+            turns = turns + np.clip(_wrapped(self._heading(surface, flow, centers, s.sources) - turns), -most, most)
+        new = Patches(centers, s.sources, turns, strains, presences, instants, s.ends)
         away = cKDTree(surface.columns()).query(centers)[0] if surface.wet.any() else np.full(len(s), np.inf)
-        self.state = moved.select(~(moved.going & (presences <= 0)) & (away < self._radius))
+        self.state = new.select(~(new.going & (presences <= 0)) & (away < self._radius))
 
     def _heading(self, surface: SurfaceMap, flow: np.ndarray, centers: np.ndarray, sources: np.ndarray) -> np.ndarray:
         """Turn (radians) that lies along the flow at `centers` as the look at rest lies along the flow at `sources`.
@@ -144,14 +186,38 @@ class TexturePatches:
     def _fresh(self, centers: np.ndarray, first: bool, surface: SurfaceMap, rng: np.random.Generator) -> Patches:
         """New patches. Those of the first instant show the body as it is: whole ones, of different age; where that was
         not seen well they soon give way."""
+        if self._footage is not None:
+            return self._fresh_footage(centers, first, surface, rng)
         none, few = np.zeros(len(centers)), np.full(len(centers), 1 / FADE[1])
+        lasting = np.full(len(centers), np.inf)
         if first:
             seen = self._texture.surface.at(self._good, centers) > 0.5 * GOOD
             strains = np.where(seen, rng.uniform(0, 0.5 * LIMIT, len(centers)), 2 * LIMIT)
-            return Patches(centers, centers.copy(), none, strains, np.ones(len(centers)))
+            return Patches(centers, centers.copy(), none, strains, np.ones(len(centers)), none, lasting)
         sources = np.array([self._source(c, rng) for c in centers])
         turns = _wrapped(self._heading(surface, _gradients(surface, SMOOTH * self._radius)[0], centers, sources))
-        return Patches(centers, sources, turns, none, few)
+        return Patches(centers, sources, turns, none, few, none, lasting)
+
+    def _fresh_footage(
+        self, centers: np.ndarray, first: bool, surface: SurfaceMap, rng: np.random.Generator
+    ) -> Patches:
+        """New patches that play: their own place, where it was seen and flows as it did; else one that is like it."""
+        assert self._footage is not None
+        flow, n = _gradients(surface, SMOOTH * self._radius)[0], len(centers)
+        here, own = surface.at(flow, centers), self._texture.surface.at(self._seen_flow, centers)
+        like = np.linalg.norm(here - own, axis=1) < UNLIKE * np.linalg.norm(own, axis=1)
+        at_home = (self._texture.trust(centers) > 0.5) & (like if self._edited else True)
+        sources = np.array([
+            c if home else self._source(c, rng) for c, home in zip(centers, at_home, strict=True)
+        ])  # fmt: skip
+        turns = np.where(at_home, 0.0, _wrapped(self._heading(surface, flow, centers, sources)))
+        last, fade = len(self._footage) - 1.0, min(FADE[1], len(self._footage) / 4)
+        if first:
+            begin = np.full(n, min(self._start, last))
+            ends = begin + rng.uniform(0, 1, n) * np.maximum(last - fade - begin, 0.0)
+            return Patches(centers, sources, turns, np.zeros(n), np.ones(n), begin, ends)
+        begin = rng.uniform(0, 0.5 * last, n)
+        return Patches(centers, sources, turns, np.zeros(n), np.full(n, 1 / fade), begin, np.full(n, last - fade))
 
     def _source(self, center: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Where a new patch takes its look from: near its place (foam is where rocks are), not the same again."""
@@ -180,19 +246,57 @@ class TexturePatches:
         np.maximum.at(heaviest, point, weight)
         counts = weight > 1e-3 * heaviest[point]
         point, patch, weight = point[counts], patch[counts], weight[counts]
-        away, angle = places[point] - s.centers[patch], -s.turns[patch]
-        cos, sin = np.cos(angle), np.sin(angle)
-        turned = np.stack([cos * away[:, 0] - sin * away[:, 1], sin * away[:, 0] + cos * away[:, 1]], axis=-1)
-        sources = s.sources[patch] + turned
+        sources = s.sources[patch] + _turned(places[point] - s.centers[patch], -s.turns[patch])
         # what was not seen (a rock, a bank) shows only where no other patch is
         weight = weight * np.clip(2 * self._texture.trust(sources) - 0.8, 1e-4, 1.0)
+        if self._footage is not None:
+            return self._played(np.asarray(points, np.float64), point, sources, s.instants[patch], weight)
         color, there = self._texture.colors(sources)
         # brightness alone: tinted by the water of another place, white foam would turn pink
         bright = self._texture.shade(points).mean(axis=1)[point] / there.mean(axis=1)
         color = color * np.clip(bright, 1 / LARGEST_RATIO, LARGEST_RATIO)[:, None]
         total = np.bincount(point, weight, minlength=n)
-        mean = [np.bincount(point, weight * color[:, k], minlength=n) / np.maximum(total, 1e-30) for k in range(3)]
-        return np.clip(np.stack(mean, axis=-1), 0.0, 1.0), total > 0
+        mean = _summed(point, weight[:, None] * color, n) / np.maximum(total, 1e-30)[:, None]
+        return np.clip(mean, 0.0, 1.0), total > 0
+
+    def _played(
+        self, points: np.ndarray, point: np.ndarray, sources: np.ndarray, instants: np.ndarray, weight: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Colours [n,3] and whether there are any [n], from pairs of a point and a place of the footage.
+
+        colour = shade + sum w gain fine / sum w + sum w gain residual / sqrt(sum w^2): the shade is that of the point's
+        own place; what differs from the mean keeps its variance where patches overlap (Gagnon et al. 2019). A patch
+        that is at home gives the clip's own picture.
+        """
+        footage, texture = self._footage, self._texture
+        assert footage is not None
+        n = len(points)
+        # at home, a point is looked up where it is seen now, also where the level has changed
+        seen, rest = texture.seen_at(points), texture.index_of(points[:, :2])
+        index = texture.index_of(sources) + (seen - rest)[point]
+        residual, wet = footage.looked_up(index, instants)
+        shade = sampled(footage.shade, seen)
+        there = sampled(footage.shade, index)
+        brighter = shade[point].mean(axis=1) / np.maximum(there.mean(axis=1), 1e-3)
+        gain = np.clip(brighter, 1 / LARGEST_RATIO, LARGEST_RATIO)
+        fine = sampled(footage.mean, index) - there
+        weight = weight * np.clip(wet, 1e-2, 1.0)
+        total = np.bincount(point, weight, minlength=n)
+        spread = np.sqrt(np.bincount(point, weight**2, minlength=n))
+        still = _summed(point, (weight * gain)[:, None] * fine, n) / np.maximum(total, 1e-30)[:, None]
+        lively = _summed(point, (weight * gain)[:, None] * residual, n) / np.maximum(spread, 1e-30)[:, None]
+        return np.clip(shade + still + lively, 0.0, 1.0), total > 0
+
+
+def _summed(point: np.ndarray, values: np.ndarray, n: int) -> np.ndarray:
+    """Sums [n,3] of the values of each point."""
+    return np.stack([np.bincount(point, values[:, k], minlength=n) for k in range(values.shape[1])], axis=-1)
+
+
+def _turned(vectors: np.ndarray, angles: np.ndarray) -> np.ndarray:
+    """Vectors [m,2] turned by angles [m], radians."""
+    cos, sin = np.cos(angles), np.sin(angles)
+    return np.stack([cos * vectors[:, 0] - sin * vectors[:, 1], sin * vectors[:, 0] + cos * vectors[:, 1]], axis=-1)
 
 
 def _wrapped(angles: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 
 from fluidlift.errors import InputRejected
 from fluidlift.pipeline.looks import Backdrop, Frame, Painter, placed_bodies
-from fluidlift.pipeline.scene import Footage, Scene
+from fluidlift.pipeline.scene import Footage, Scene, before_ground
 from fluidlift.pipeline.showing import open_end, splat_frames
 from fluidlift.types import Gaussians, PinholeCamera, Similarity3, concatenate, matrix_from_quat
 
@@ -68,7 +68,7 @@ def _own_look(stage: Stage, folder: Path, step: Callable[[int], None]) -> Iterat
     glass = 0.0 if glass is not None and way == "none" else glass
     ground = Gaussians.empty() if way == "plate" else terrain_surfels(scene.terrain, most=SURFELS, glass=glass)
     shapes = [mesh_surfels(o.mesh, scene.terrain.grid.spacing) for o in scene.obstacles]
-    before_rocks = _rocks(stage) if way == "plate" else None
+    seen_of = before_ground(stage.scene, stage.footage) if way == "plate" else None
     end = None if way in ("plate", "none") else open_end(scene)
     for k, (fluid, _, _) in enumerate(splat_frames(folder, wanted.stop)):
         if k < wanted.start:
@@ -79,7 +79,7 @@ def _own_look(stage: Stage, folder: Path, step: Callable[[int], None]) -> Iterat
         bodies = [] if stage.poses is None else [
             s.transformed(Similarity3(1.0, matrix_from_quat(p[3:]), p[:3])) for s, p in zip(shapes, stage.poses[k])
         ]  # fmt: skip
-        seen = concatenate([fluid if before_rocks is None else before_rocks(fluid), *bodies])
+        seen = concatenate([fluid if seen_of is None else fluid.select(seen_of(fluid)), *bodies])
         if way == "none":
             yield _encoded(*_held_out(seen, ground, camera))
             continue
@@ -142,18 +142,6 @@ def _held_out(seen: Gaussians, ground: Gaussians, camera: PinholeCamera) -> tupl
     drawn = render(both, camera, features=shown * np.concatenate([view_colors(both, camera), shown, depth], axis=1))
     rgb, alpha, z = drawn.image[..., :3], drawn.image[..., 3], drawn.image[..., 4]
     return rgb, alpha, np.where(alpha > 1e-3, z / np.maximum(alpha, 1e-3), 0.0).astype(np.float32)
-
-
-def _rocks(stage: Stage) -> Callable[[Gaussians], Gaussians] | None:
-    """Takes away what rocks of the plate hide; None where the clip shows none."""
-    from fluidlift.look.scenery import terrain_depth, visible_beside_rocks
-
-    scene, footage = stage.scene, stage.footage
-    rocks = None if footage is None else footage.rocks
-    if rocks is None or not rocks.any():
-        return None
-    depth, margin = terrain_depth(scene.terrain, scene.camera), 1.5 * scene.terrain.grid.spacing
-    return lambda g: g.select(visible_beside_rocks(g.means, scene.camera, depth, rocks, margin=margin))
 
 
 def _background(stage: Stage) -> str:

@@ -8,14 +8,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from fluidlift.errors import InputRejected
-from fluidlift.types import Gaussians, Particles, concatenate, sh_from_rgb
+from fluidlift.pipeline.scene import LYING
+from fluidlift.types import Gaussians, Particles, PinholeCamera, concatenate, sh_from_rgb
 
 if TYPE_CHECKING:
+    from fluidlift.look.filmed_outline import FilmedOutline
+    from fluidlift.look.footage import FluidFootage
+    from fluidlift.look.seen_texture import SeenTexture
+    from fluidlift.look.surface_axes import SurfaceAxes
     from fluidlift.look.surface_map import SurfaceMap
     from fluidlift.look.texture_patches import TexturePatches
     from fluidlift.pipeline.scene import Scene
@@ -50,6 +56,16 @@ TINTED = 1.5
 CLEAR = 0.1
 """cells from the ground within which the skin is left out"""
 
+LOOKED_UP = 1 / 6 + 0.3
+"""variance (px^2) of the blur between a film and its splats' picture beside that of the splats: a bilinear look-up
+(a triangle of one pixel to each side, 1/6), and what the rasteriser adds to each splat"""
+
+WIDEST = 1.5
+"""px of the splats' standard deviation that is taken out of a film at most: beyond, noise is all that is sharpened"""
+
+SMALLEST = 0.02
+"""standard deviation of a splat at least, cells: files hold its logarithm"""
+
 REACH = 0.5
 """standard deviation of a splat under the skin at most, shares of its distance from the ground and `CLEAR`: wider ones
 would lie over the rocks beside them"""
@@ -77,6 +93,25 @@ def lends_look(scene: Scene, own: Gaussians) -> np.ndarray:
     return in_picture(own.means, scene.camera) & clear_of_shore(own.means, level, scene.terrain)
 
 
+def _footage(film: Path, camera: PinholeCamera, means: np.ndarray, cell: float) -> FluidFootage | None:
+    """The film of an asset, taken apart; None where it is too short to be played.
+
+    Args:
+        film: its file.
+        camera: that took it.
+        means: of the body's Gaussians, m.
+        cell: width of the simulator's cells, m.
+    """
+    from fluidlift.io.footage_file import read_footage
+    from fluidlift.look.footage import FluidFootage
+    from fluidlift.look.surface_skin import PITCH, WIDTH
+
+    depth = float(np.median(camera.project(means)[1]))
+    splat = WIDTH * PITCH * cell * camera.focal[0] / max(depth, 1e-6)
+    blur = float(np.sqrt(min(splat, WIDEST) ** 2 + LOOKED_UP))
+    return FluidFootage.of(*read_footage(film, camera.size), blur=blur)
+
+
 class Dressing:
     """Splats for the particles of a scene, frame by frame from the first one on."""
 
@@ -84,29 +119,74 @@ class Dressing:
         self._scene, self._cell = scene, scene.terrain.grid.spacing
         self._patches: TexturePatches | None = None
         self._surface: SurfaceMap | None = None
-        gravity = np.asarray(scene.parameters.gravity, np.float64)
-        upright = -gravity[2] > UPRIGHT * max(float(np.linalg.norm(gravity)), 1e-12)
+        self._axes: SurfaceAxes
+        self._outline: FilmedOutline | None = None
         self._own = scene.rest.select(np.arange(len(scene.rest) - sum(map(len, scene.emitter_looks))))
-        if scene.kind == "stream" and upright and len(self._own) and len(scene.body):
+        if len(self._own) and len(scene.body):
             self._lay_skin()
 
     def _lay_skin(self) -> None:
-        from fluidlift.look.inflow import ENDS
-        from fluidlift.look.seen_texture import SeenTexture
-        from fluidlift.look.surface_map import SurfaceMap
+        from fluidlift.look.filmed_outline import FilmedOutline
+        from fluidlift.look.picture_texture import PictureTexture
+        from fluidlift.look.surface_axes import PictureAxes, PlanAxes
         from fluidlift.look.texture_patches import TexturePatches
 
         scene, own = self._scene, self._own
-        surface = SurfaceMap.of(scene.body.positions, scene.body.velocities, self._cell)
+        gravity = np.asarray(scene.parameters.gravity, np.float64)
+        upright = -gravity[2] > UPRIGHT * max(float(np.linalg.norm(gravity)), 1e-12)
+        footage = None if scene.film is None else _footage(scene.film, scene.camera, own.means, self._cell)
+        if scene.kind == "stream" and upright:
+            self._axes = PlanAxes()
+        elif footage is not None and scene.kind != "plume":  # smoke has no surface
+            self._axes = PictureAxes(scene.camera, float(np.median(scene.camera.project(own.means)[1])))
+        else:
+            return
+        surface = self._surface_of(scene.body)
+        if surface is None:
+            return
+        if isinstance(self._axes, PlanAxes):
+            texture = self._seen_texture(surface, footage)
+        else:
+            assert footage is not None
+            texture = PictureTexture(self._axes, surface, footage)
+        if not texture.usable:
+            return
+        places = self._axes.points(own.means)
+        across = float(np.ptp(places[self._axes.shown(places), :2], axis=0).max(initial=0.0))
+        self._patches = TexturePatches(
+            texture, max(PATCH * across, FEWEST_CELLS * self._cell), footage=footage, edited=scene.edited,
+            start=scene.film_start,
+        )  # fmt: skip
+        if footage is not None and scene.kind in LYING and not scene.edited:
+            self._outline = FilmedOutline(scene.camera, footage.outside, self._cell)
+        self._begin_again()
+
+    def _seen_texture(self, surface: SurfaceMap, footage: FluidFootage | None) -> SeenTexture:
+        from fluidlift.look.inflow import ENDS
+        from fluidlift.look.seen_texture import SeenTexture
+        from fluidlift.shape.off_picture import in_picture
+
+        scene, own = self._scene, self._own
+        if (
+            footage is not None
+        ):  # each place shows its own film: shores, and what stands in the water's picture, as well
+            return SeenTexture(own, scene.camera, surface, usable=in_picture(own.means, scene.camera))
         along = own.means @ scene.terrain.mainstream
         share = (along - along.min()) / max(float(np.ptp(along)), 1e-12)
         usable = lends_look(scene, own) & (share > ENDS[0]) & (share < ENDS[1])
-        texture = SeenTexture(own, scene.camera, surface, shading=scene.shading, usable=usable)
-        if not texture.usable:
-            return
-        across = float(np.ptp(own.means[:, :2], axis=0).max())
-        self._patches = TexturePatches(texture, max(PATCH * across, FEWEST_CELLS * self._cell))
-        self._begin_again()
+        return SeenTexture(own, scene.camera, surface, shading=scene.shading, usable=usable)
+
+    def _surface_of(self, particles: Particles) -> SurfaceMap | None:
+        """The map of the surface; None where nothing is on it."""
+        from fluidlift.look.surface_map import SurfaceMap
+
+        points = self._axes.points(particles.positions)
+        shown = self._axes.shown(points)
+        if not shown.any():
+            return None
+        moving = self._axes.velocities(particles.positions, particles.velocities)
+        surface = SurfaceMap.of(points[shown], moving[shown], self._cell)
+        return surface if self._outline is None else self._outline.cut(surface, self._axes)
 
     def _begin_again(self) -> None:
         from fluidlift.look.surface_skin import SurfaceSkin
@@ -117,15 +197,15 @@ class Dressing:
 
     def advance(self, particles: Particles, number: int) -> None:
         """Bring what floats on the surface to a frame; every frame after the last one, in order."""
-        from fluidlift.look.surface_map import SurfaceMap
-
         if self._patches is None or not len(particles):
             return
         if number == 0:
             self._begin_again()
         rng = np.random.default_rng([self._scene.seed, number])
         interval = self._scene.interval if number else 0.0
-        self._surface = SurfaceMap.of(particles.positions, particles.velocities, self._cell)
+        self._surface = self._surface_of(particles)
+        if self._surface is None:
+            return
         self._patches.advance(self._surface, interval, rng)
         self._skin.advance(self._surface, interval, rng)
 
@@ -170,29 +250,38 @@ class Dressing:
         from fluidlift.look.smoothstep import smoothstep
         from fluidlift.look.surface_skin import dyed
 
-        skin, xy = self._skin, particles.positions[:, :2]
-        above = (particles.positions[:, 2] - surface.at(surface.height, xy)) / self._cell
+        skin, axes, places = self._skin, self._axes, self._axes.points(particles.positions)
+        xy = places[:, :2]
+        above = (places[:, 2] - surface.at(surface.height, xy)) / self._cell
         below, spray = COVERED
         covered = smoothstep(above, *below) * (1 - smoothstep(above, *spray)) * (surface.presence(xy) > 0.5)
         room = REACH * np.maximum(self._clearance(shown.means) + CLEAR * self._cell, CLEAR * self._cell)
+        if self._outline is not None:
+            filmed = self._outline.room(shown.means)
+            covered = np.where(filmed > 0, covered, 1.0)
+            room = np.minimum(room, np.maximum(filmed, SMALLEST * self._cell))
         scales = np.minimum(shown.scales, room[:, None]).astype(np.float32)
         opacities = np.minimum(shown.opacities, np.maximum(shown.opacities * (1 - covered), FAINT)).astype(np.float32)
         sh, own = shown.sh.copy(), self._own_colors(particles.source)
         near = np.flatnonzero((np.abs(above) < TINTED) & (covered < 1) & ~own)
-        color, there = patches.colors(particles.positions[near])
+        color, there = patches.colors(places[near])
         sh[near[there], :1] = sh_from_rgb(color[there])
         points = skin.points(surface)
         color, there = patches.colors(points)
-        color = dyed(color, points, surface, shown, own, self._cell)
-        there &= self._clearance(points) > CLEAR * self._cell
+        color = dyed(color, points, surface, replace(shown, means=axes.points(shown.means)), own, self._cell)
+        world = axes.world_points(points)
+        if self._outline is None:
+            there &= self._clearance(world) > CLEAR * self._cell
+        else:
+            there &= self._outline.inside(world)
         if inside is not None:
-            there &= ~inside(points)
-        tracers = skin.splats(surface, color).select(there)
-        speeds = surface.at(surface.velocity, skin.places[there]).astype(np.float32)
+            there &= ~inside(world)
+        tracers = axes.world_splats(skin.splats(surface, color).select(there))
+        speeds = axes.world_velocities(points[there], surface.at(surface.velocity, skin.places[there]))
         return Dressed(
             concatenate([replace(shown, scales=scales, opacities=opacities, sh=sh), tracers]),
             np.concatenate([2 * particles.ids, 2 * skin.ids[there] + 1]),
-            np.concatenate([particles.velocities, speeds]),
+            np.concatenate([particles.velocities, speeds.astype(np.float32)]),
         )
 
     def _own_colors(self, source: np.ndarray) -> np.ndarray:
@@ -233,7 +322,8 @@ class Dressing:
             raise InputRejected(f"the state of a surface that does not fit: {error}") from None
         n = len(patches.turns)
         shapes = [(patches.centers, (n, 2)), (patches.sources, (n, 2)), (places, (len(ids), 2))]
-        shapes += [(a, (n,)) for a in (patches.turns, patches.strains, patches.presences)]
+        shapes += [(a, (n,)) for a in (patches.turns, patches.strains, patches.presences, patches.instants)]
+        shapes += [(np.nan_to_num(patches.ends, posinf=0.0), (n,))]  # without footage they do not end
         for array, shape in shapes:
             if array.shape != shape or not np.isfinite(array).all():
                 raise InputRejected("the state of a surface with arrays of another shape, or not finite", "a whole one")

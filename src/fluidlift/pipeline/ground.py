@@ -23,7 +23,7 @@ def setting_around(
     near = camera.unproject(grid[visible & ~falls], depth[visible & ~falls])
     if front.height is not None:
         labels, height = seen_labels(fluid, start, united, falls), place.PlacedHeight(front.height, to_world)
-        seen = plan.Footage(height, labels, near, camera, bulk, **known)
+        seen = plan.Footage(height, labels, near, camera, bulk, ever=fluid.any_frame(), **known)
         return channel.channel_setting(seen, channel.ChannelConfig(kind, c.cells, c.cell_limit, c.depth_ratio))
     back = depth + 2 * half
     far = camera.unproject(grid[visible], back[visible])

@@ -15,7 +15,8 @@ from fluidlift.pipeline.begin import input_hashes, provenance_of
 from fluidlift.pipeline.fit_request import request_of
 from fluidlift.pipeline.reading import Inputs, clip_of
 from fluidlift.pipeline.resimulate import Made, play
-from fluidlift.pipeline.scene import SimulationRequest
+from fluidlift.pipeline.scene import SimulationRequest, first_of_film
+from fluidlift.pipeline.seeing import masks_of
 from fluidlift.pipeline.story import Progress, Silence, Story, gone_if_refused
 from fluidlift.pipeline.written import require_stages
 from fluidlift.types import FluidAsset
@@ -86,6 +87,7 @@ def _write_asset(story: Story, folder: Path, config: JobConfig, provenance: dict
 
     clip, g = clip_of(story), story["geometry"]
     setting = body.setting_of(story)
+    _write_film(story, folder)
     origin = {"config": config.to_dict(), "versions": versions(), "seed": config.seed, "stages": dict(story.keys)}
     asset = FluidAsset(
         kind=g.meta["kind"],
@@ -109,6 +111,21 @@ def _write_asset(story: Story, folder: Path, config: JobConfig, provenance: dict
         metrics=_metrics(story),
         warnings=story.warnings,
     )
+
+
+def _write_film(story: Story, folder: Path) -> None:
+    """The film that the fluid's surface plays; smoke has none."""
+    from fluidlift.io.asset_folder import FILES
+    from fluidlift.io.footage_file import MOST_FRAMES, write_footage
+
+    film, start = folder / FILES["film"], story["geometry"].meta["rest_frame"]
+    if story["geometry"].meta["kind"] == "plume":
+        film.unlink(missing_ok=True)  # of an earlier run, as something else
+        return
+    clip = clip_of(story)
+    first = first_of_film(start, len(clip))
+    part = slice(first, first + MOST_FRAMES)
+    write_footage(film, clip.frames[part], masks_of(story)[part], clip.interval)
 
 
 def _metrics(story: Story) -> dict[str, Any]:

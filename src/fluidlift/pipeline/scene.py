@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -123,11 +124,21 @@ class Scene:
     """what was done to what scene.yaml gives, for whom it concerns"""
     overlap: int = 0
     """frames simulated beyond `frames`, that a loop is closed with"""
+    film: Path | None = None
+    """of the fluid, which its surface plays; None: the surface looks as it did at rest"""
+    film_start: int = 0
+    """frame of the film that the body at rest shows"""
 
     @property
     def simulated(self) -> int:
         """Frames to simulate."""
         return self.frames + self.overlap
+
+    @property
+    def edited(self) -> bool:
+        """Whether a person changed how the fluid flows."""
+        moved = self.inflow != InflowSchedule() or self.extended > 0
+        return bool(self.obstacles or self.emitters or self.changes or self.reshaped or moved)
 
     @cached_property
     def parts(self) -> dict[str, str]:
@@ -141,7 +152,8 @@ class Scene:
             "velocity": _hash(*v.components),
             "body": _hash(self.body.positions, self.body.velocities, self.body.source, self.rest.means),
             "look": _hash(self.rest.quats, self.rest.scales, self.rest.opacities, self.rest.sh,
-                          b"" if self.shading is None else self.shading.image),
+                          b"" if self.shading is None else self.shading.image,
+                          b"" if self.film is None else self.film.read_bytes(), self.film_start),
             "parameters": _hash(self.parameters, self.longest_step),
             "frame interval": _hash(self.interval),
             "seed": _hash(self.seed),
@@ -183,6 +195,28 @@ def footage_of(story: Story) -> Footage | None:
     labels = labels_of(story)
     rocks = g.arrays["rocks"] if "rocks" in g.arrays else labels.solid.mean(axis=0) > 0.5
     return Footage(clip_of(story), labels, g.arrays["plate"], int(g.meta["rest_frame"]), rocks)
+
+
+BEHIND = (1.5, 0.5)
+"""cells behind the terrain from which fluid is hidden: at rocks, whose shape is a guess, and where it is always dry"""
+
+
+def before_ground(scene: Scene, footage: Footage | None) -> Callable[[Gaussians], np.ndarray] | None:
+    """Which splats are not hidden by the ground that the clip's picture shows; None where it hides nothing.
+
+    The picture is drawn as one plate behind the fluid: without this, fluid would be seen through a near bank.
+    """
+    from fluidlift.look.scenery import terrain_depth, visible_beside_rocks
+
+    if footage is None:
+        return None
+    rocks = footage.rocks
+    ground = rocks | ~footage.labels.fluid.any(axis=0) if scene.kind in LYING else rocks
+    if not ground.any():
+        return None
+    margin = scene.terrain.grid.spacing * np.where(rocks, *BEHIND)
+    depth = terrain_depth(scene.terrain, scene.camera)
+    return lambda g: visible_beside_rocks(g.means, scene.camera, depth, ground, margin=margin)
 
 
 def scene_of(
@@ -230,12 +264,28 @@ def scene_of(
         asset.parameters.updated(changes), asset.camera, interval, asset.interval,
         wanted or config.simulate.frames or clip_frames, config.seed, edits.obstacles, shading,
         longest_step=longest_step, inflow=edits.inflow, changes=changed_parameters(asset.parameters, changes),
+        film=film_of(request.meshes or folder), film_start=start - first_of_film(start, asset.frame_count),
     )  # fmt: skip
     longer = edits.extend_downstream if request.extend_downstream is None else request.extend_downstream
     if longer > 0:
         scene = extended(scene, longer)
     scene = with_emitters(with_terrain(scene, edits.terrain), edits.emitters)
     return replace(scene, overlap=loop_overlap(scene)) if edits.loop else scene
+
+
+def film_of(folder: Path) -> Path | None:
+    """The film of the fluid that an asset carries; None where it has none."""
+    from fluidlift.io.asset_folder import FILES, asset_file
+
+    film = asset_file(folder, FILES["film"])
+    return film if film.is_file() else None
+
+
+def first_of_film(start: int, frames: int) -> int:
+    """Frame of the clip that the film begins with, of a clip of some frames whose body at rest is that of `start`."""
+    from fluidlift.io.footage_file import MOST_FRAMES
+
+    return min(start, max(frames - MOST_FRAMES, 0))
 
 
 def beyond_surface(asset: FluidAsset) -> FaceVelocity:

@@ -14,7 +14,7 @@ from fluidlift.io.scene_look import Look
 from fluidlift.pipeline.as_filmed import BEYOND, Reel, card_of_run
 from fluidlift.pipeline.export_job import frames_of
 from fluidlift.pipeline.looks import Backdrop, Frame, Painter, placed_bodies
-from fluidlift.pipeline.scene import LYING, Footage, Scene
+from fluidlift.pipeline.scene import LYING, Footage, Scene, before_ground
 from fluidlift.pipeline.story import Result
 from fluidlift.types import Gaussians, PinholeCamera, Similarity3, concatenate, matrix_from_quat
 
@@ -97,32 +97,26 @@ class FrontView:
     """[H,W,3] sRGB in [0, 1]"""
     rocks: np.ndarray
     """bool [H,W]"""
-    rock_depth: np.ndarray | None
-    """[H,W] camera z of the terrain, m; None where the clip shows no rocks"""
-    margin: float
-    """m, by which splats may lie behind a rock and still be seen beside it"""
+    seen_of: Callable[[Gaussians], np.ndarray] | None
+    """whether the ground of the clip hides a splat; None where it hides none"""
 
     @staticmethod
     def of(scene: Scene, footage: Footage | None) -> FrontView:
         """Of a scene; before grey where its clip is not at hand, or shows a ground that was edited."""
-        from fluidlift.look.scenery import terrain_depth
-
-        size = scene.camera.size[::-1]
+        size, shown = scene.camera.size[::-1], None if scene.reshaped else footage
         plate, rocks = np.full((*size, 3), 0.5, np.float32), np.zeros(size, bool)
-        if footage is not None and not scene.reshaped:  # the clip shows the ground as it was
-            plate, rocks = footage.plate.astype(np.float32) / 255.0, footage.rocks
-        depth = terrain_depth(scene.terrain, scene.camera) if rocks.any() else None
-        return FrontView(scene.camera, plate, rocks, depth, 1.5 * scene.terrain.grid.spacing)
+        if shown is not None:  # the clip shows the ground as it was
+            plate, rocks = shown.plate.astype(np.float32) / 255.0, shown.rocks
+        return FrontView(scene.camera, plate, rocks, before_ground(scene, shown))
 
     def drawn(
         self, gaussians: Gaussians, velocity: np.ndarray, solids: Sequence[Gaussians] = ()
     ) -> tuple[Rendered, Gaussians, np.ndarray]:
-        """The picture with its coverage, and the splats that rocks leave over, with their velocities (m/s)."""
+        """The picture with its coverage, and the splats that the ground leaves over, with their velocities (m/s)."""
         from fluidlift.look.rasterize import render
-        from fluidlift.look.scenery import visible_beside_rocks
 
-        if self.rock_depth is not None:
-            keep = visible_beside_rocks(gaussians.means, self.camera, self.rock_depth, self.rocks, margin=self.margin)
+        if self.seen_of is not None:
+            keep = self.seen_of(gaussians)
             gaussians, velocity = gaussians.select(keep), velocity[keep]
         return render(concatenate([gaussians, *solids]), self.camera, background=self.plate), gaussians, velocity
 
@@ -149,7 +143,7 @@ def _panels(
     """Input | re-simulation | side view, frame by frame; keeps what the evaluation needs on the way."""
     from fluidlift.look.pictures import caption
     from fluidlift.look.rasterize import render
-    from fluidlift.look.scenery import mesh_surfels, side_camera, terrain_surfels
+    from fluidlift.look.scenery import mesh_surfels, side_camera, terrain_depth, terrain_surfels
     from fluidlift.look.vessel import glass_of
     from fluidlift.numerics.srgb import linear_from_srgb
 
@@ -160,6 +154,8 @@ def _panels(
         edited = scene.obstacles or scene.emitters or scene.overlap or scene.changes
         if scene.interval == scene.clip_interval and not edited:
             compared = max(len(footage.clip) - footage.start, 1)
+    rocks = front_view.rocks
+    behind = terrain_depth(terrain, camera) if rocks.any() and painter is not None else None
     airborne = scene.kind not in LYING
     ground = terrain_surfels(terrain, glass=glass_of(scene.kind))
     size = _panel_size(camera.size, config.show.width)
@@ -172,8 +168,8 @@ def _panels(
     end = open_end(scene)
     sky = np.linspace(0.93, 0.78, size[1], dtype=np.float32)[:, None, None] * np.ones((1, size[0], 3), np.float32)
     shapes = [mesh_surfels(o.mesh, grid.spacing) for o in scene.obstacles]
-    lit_plate, behind = linear_from_srgb(front_view.plate).astype(np.float32), front_view.rock_depth
-    rock_depth = None if behind is None else np.where(front_view.rocks & np.isfinite(behind), behind, 0.0)
+    lit_plate = linear_from_srgb(front_view.plate).astype(np.float32)
+    rock_depth = None if behind is None else np.where(rocks & np.isfinite(behind), behind, 0.0)
     for k, (gaussians, _, speeds) in enumerate(splat_frames(folder, len(poses))):
         step(k, len(poses))
         solids = [

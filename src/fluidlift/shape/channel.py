@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -13,7 +13,7 @@ from fluidlift.shape.cross_section import distance_inside
 from fluidlift.shape.depth_surface import solid_heights
 from fluidlift.shape.ground_mesh import ground_mesh
 from fluidlift.shape.kind import Kind
-from fluidlift.shape.plan import Extent, Footage, Plan, extent_of, plan_of, wide_ends, with_seen
+from fluidlift.shape.plan import Extent, Footage, Plan, dry_columns, extent_of, plan_of, wide_ends, with_seen
 from fluidlift.shape.terrain import Setting, at_cells, signed_distance_from, to_corners, unit
 from fluidlift.types import CellType, Grid, Label, Terrain
 
@@ -23,6 +23,15 @@ EDGE = 2.0
 """1 / cosine of 60 degrees: what is steeper in a stream is the side of a chute, not a sheet"""
 FLAT = 0.3
 """slope at which a surface says as much as the bulk flow about where its water runs"""
+
+
+OUTLET = 5.0
+"""cells before the end of a stream from which on the ground beside it is no wall: the section in which it leaves is
+thinner than the stream, and needs room"""
+BEYOND = 0.25
+"""cells from the rim of the wet columns to the wall beside them: none was thinner than the stream, whole ones wider"""
+MARGIN = 2.0
+"""cells by which such a wall stands above the water: waves of a stream of some four cells' depth stay below"""
 
 
 @dataclass(frozen=True)
@@ -170,7 +179,27 @@ def _fill_channel(grid, plan, ground: _Ground, reach, seen: Footage, kind) -> Se
     entry = upper_rim(water, plan.level, seen.along, h)[..., None] if rim else s < start + INLET * h
     cells[fluid & entry] = CellType.INFLOW
     cells[~solid & (s > stop - 2.5 * h)] = CellType.OUTFLOW
+    # before the outlet the water spreads as it likes
+    wall = _kept_dry(grid, plan, dry_columns(seen, plan, grid) & (plan.along < stop - OUTLET * h))
+    terrain = replace(terrain, signed_distance=np.minimum(terrain.signed_distance, wall).astype(np.float32))
     return Setting(terrain, cells, plan.level, bed)
+
+
+def _kept_dry(grid: Grid, plan: Plan, dry: Bool[np.ndarray, "nx ny"]) -> Float[np.ndarray, "nx ny nz"]:
+    """Signed distance (m, on the nodes) to ground that stands above the water wherever the clip stays dry.
+
+    A bank of cells slopes; water that swells by half a cell runs up it by one, which is seven pixels of a clip. That
+    the clip stays dry there says that the ground stands higher: a wall, `BEYOND` cells outside of the wet columns.
+    """
+    h = grid.spacing
+    if not dry.any() or dry.all():
+        return np.full(tuple(n + 1 for n in grid.shape), np.inf)
+    # on columns, then on the corners between them; half a column from the middle of one to its edge
+    outside = ndimage.distance_transform_edt(dry) - 0.5
+    inside = ndimage.distance_transform_edt(~dry) - 0.5
+    away = to_corners(h * (np.where(dry, -outside, inside) + BEYOND))
+    top = to_corners(plan.level + MARGIN * h)
+    return np.maximum(away[..., None], grid.nodes()[..., 2] - top[..., None])
 
 
 def upper_rim(

@@ -46,6 +46,8 @@ class Footage:
     """camera depth of the whole picture, m; nan where it is not known"""
     closed: bool = False
     """a puddle: it ends where it is seen to end, on all sides"""
+    ever: Bool[np.ndarray, "h w"] | None = None
+    """pixels that show fluid at some time of the clip; None: not known"""
 
     @cached_property
     def along(self) -> Float[np.ndarray, "2"]:
@@ -206,6 +208,15 @@ def plan_of(seen: Footage, grid: Grid, extent: Extent | None = None) -> Plan:
         if not seen.closed:
             label = _without_corners(label, source)
     return Plan(label, level, s, speed, known)
+
+
+def dry_columns(seen: Footage, plan: Plan, grid: Grid) -> Bool[np.ndarray, "nx ny"]:
+    """Columns that are seen, and that no water covers in the whole clip."""
+    if seen.ever is None:
+        return np.zeros(plan.label.shape, bool)
+    points = np.concatenate([grid.centers()[:, :, 0, :2], plan.level[..., None]], axis=-1)
+    row, col, _ = seen.camera.nearest_pixels(points)
+    return plan.known & ~seen.ever[row, col] & (plan.label != Label.FLUID)
 
 
 def wide_ends(

@@ -1,0 +1,70 @@
+"""A small film of the fluid that an asset carries: what its surface looks like over time, for simulations without the
+clip. One H.264 file, each picture with its mask below it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, UInt8
+
+from fluidlift.errors import InputRejected
+from fluidlift.io.encode import write_video
+from fluidlift.io.limits import ReadLimits
+from fluidlift.io.video import read_clip
+
+MOST_FRAMES = 120
+"""frames of the clip: four seconds at 30 per second, some 1 to 3 MB. Patches of footage last half of it, longer than
+foam does"""
+LARGEST = 1024
+"""px of a picture's longer side"""
+QUALITY = 14.0
+"""constant rate factor: errors of one to two levels, below the noise of clips"""
+LIMITS = ReadLimits(max_pixels=2 * LARGEST**2 + 16 * LARGEST, max_frames=4 * MOST_FRAMES, max_bytes=2**30)
+"""on what is read back; the file may come from a stranger"""
+
+
+def write_footage(
+    path: Path, frames: UInt8[np.ndarray, "t h w 3"], fluid: Bool[np.ndarray, "t h w"], interval: float
+) -> Path:
+    """Write pictures (sRGB), and where they show fluid, `interval` seconds apart.
+
+    Raises:
+        InputRejected: the disk is full or may not be written.
+        ValueError: no frames.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pairs = (
+        np.concatenate([_even_rows(np.asarray(f)), _even_rows(np.repeat(255 * m[..., None].astype(np.uint8), 3, -1))])
+        for f, m in zip(frames, fluid, strict=True)
+    )
+    return write_video(path, pairs, 1.0 / interval, quality=QUALITY, repeatable=True)
+
+
+def read_footage(path: Path, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, float]:
+    """Pictures u8 [T,H,W,3], masks bool [T,H,W] and the seconds between frames.
+
+    Args:
+        path: as `write_footage` wrote it.
+        size: px of a picture (width, height), which the file must have.
+
+    Raises:
+        InputRejected: not such a file, or larger than an asset's film may be.
+    """
+    clip = read_clip(path, max_size=2 * LARGEST + 16, limits=LIMITS)
+    width, height = size
+    rows = height + height % 2
+    if clip.size != (width + width % 2, 2 * rows):
+        raise InputRejected(
+            f"a film of {clip.size[0]} x {clip.size[1]} px in '{path.name}'",
+            f"one of {width + width % 2} x {2 * rows} px, the camera's picture and its mask",
+            "make the asset again",
+        )
+    frames = np.asarray(clip.frames)
+    fluid = frames[:, rows : rows + height, :width].min(axis=-1) > 127
+    return np.ascontiguousarray(frames[:, :height, :width]), fluid, float(clip.interval)
+
+
+def _even_rows(picture: np.ndarray) -> np.ndarray:
+    """With its last row and column doubled where their number is odd, as 4:2:0 needs it."""
+    return np.pad(picture, [(0, picture.shape[0] % 2), (0, picture.shape[1] % 2), (0, 0)], mode="edge")

@@ -1,0 +1,67 @@
+"""The waterline of a film on the surface of its simulation, finer than the simulator's cells.
+
+A simulated rim lies somewhere in a cell, which is several pixels of the clip. Where the film shows fluid within one
+cell of it, the surface ends where the film's does. What is further off stays as it is simulated.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import ndimage
+
+from fluidlift.look.surface_axes import SurfaceAxes
+from fluidlift.look.surface_map import COLUMN, SurfaceMap, sampled
+from fluidlift.types import PinholeCamera
+
+FINER = 1.0
+"""cells within which the film decides"""
+
+RIM = 0.5
+"""px: outline of a mask of whole pixels"""
+
+WIDEST = 0.4
+"""standard deviation of a splat at most, shares of its distance from the outline: what is seen of it ends there"""
+
+
+class FilmedOutline:
+    """Where a film shows fluid.
+
+    Args:
+        camera: that took it.
+        outside: px from each pixel to the nearest one that shows fluid.
+        cell: width of the simulator's cells, m.
+    """
+
+    def __init__(self, camera: PinholeCamera, outside: Float[np.ndarray, "h w"], cell: float) -> None:
+        self._camera, self._cell = camera, cell
+        # to the nearest pixel beside the fluid, as negative px inside; the picture's border is none
+        self._away_px = np.where(outside > 0, outside, -ndimage.distance_transform_edt(outside <= 0)).astype(np.float32)
+
+    def inside(self, world: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+        """Which points (m) are seen in the fluid, or beyond `FINER` cells from it, or not at all."""
+        away, pixel, seen = self._away(world)
+        return ~seen | (away <= RIM) | (away * pixel > FINER * self._cell)
+
+    def room(self, world: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        """Standard deviation (m) of splats at points at most; 0 where they are seen beside the fluid."""
+        away, pixel, seen = self._away(world)
+        beyond = away * pixel > FINER * self._cell
+        return np.where(seen & ~beyond, WIDEST * pixel * np.maximum(RIM - away, 0.0), np.inf)
+
+    def cut(self, surface: SurfaceMap, axes: SurfaceAxes) -> SurfaceMap:
+        """The map with its wet columns as the film shows them, within `FINER` cells of the simulated rim."""
+        shape = surface.wet.shape
+        middles = np.concatenate([surface.middles(), surface.height[..., None]], axis=-1).reshape(-1, 3)
+        away, pixel, seen = (a.reshape(shape) for a in self._away(axes.world_points(middles)))
+        near = ndimage.binary_dilation(surface.wet, iterations=round(FINER / COLUMN))
+        beside = seen & (away > RIM) & (away * pixel <= FINER * self._cell)
+        return replace(surface, wet=(surface.wet & ~beside) | (near & seen & (away <= RIM)))
+
+    def _away(self, world: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """px from the fluid, m of a pixel there, and whether it is in the picture."""
+        uv, depth = self._camera.project(world)
+        inside = ((uv >= 0) & (uv <= np.array(self._camera.size))).all(axis=1) & (depth > 0)
+        return sampled(self._away_px, uv[:, ::-1] - 0.5), depth / self._camera.focal[0], inside

@@ -1,0 +1,130 @@
+"""What a fluid looks like in each place over time, from a film of it: what stays there, and what comes and goes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from numba import njit, prange
+from scipy import ndimage
+
+from fluidlift.errors import require
+
+BROAD = 0.03
+"""standard deviation of the blur that separates the shade of a place from its fine look, shares of the picture's longer
+side; as `look.appearance`"""
+
+SHOWN = 0.1
+"""share of the film in which a place is fluid, from which its look counts: rarer, it is spray, or ground with noise"""
+
+RIM = 2
+"""px inside its outline in which a pixel may show half of the bank: lens, coding and mask are no sharper than that"""
+
+FEWEST = 8
+"""frames: a shorter film has no life of its own to show"""
+
+
+@dataclass(frozen=True)
+class FluidFootage:
+    """Pictures of a fluid, taken apart.
+
+    A picture is shade + fine + residual: the mean over the time in which a pixel is fluid, in its broad and its fine
+    part, and what differs from it in one frame.
+    """
+
+    frames: UInt8[np.ndarray, "t h w 3"]
+    """sRGB"""
+    fluid: Bool[np.ndarray, "t h w"]
+    interval: float
+    """s between frames"""
+    mean: Float[np.ndarray, "h w 3"]
+    """of the frames in which a pixel is fluid, 0 to 1; beside the fluid that of the nearest fluid"""
+    shade: Float[np.ndarray, "h w 3"]
+    """the broad part of it"""
+    outside: Float[np.ndarray, "h w"]
+    """px to the nearest pixel that shows fluid (in `SHOWN` of the frames); 0 where it does"""
+
+    @classmethod
+    def of(cls, frames: np.ndarray, fluid: np.ndarray, interval: float, *, blur: float = 0.0) -> FluidFootage | None:
+        """From pictures u8 [T,H,W,3] and masks bool [T,H,W]; None where they are too few, or show no fluid.
+
+        Args:
+            frames: sRGB.
+            fluid: in each of them.
+            interval: s between them.
+            blur: standard deviation (px) of the splats that will show them, which is taken out beforehand.
+        """
+        require(frames.shape[:3] == fluid.shape, f"{frames.shape} pictures for masks {fluid.shape}", "one each")
+        if blur > 0:
+            frames = np.stack([_sharpened(f, m, blur) for f, m in zip(frames, fluid, strict=True)])
+        weight = fluid.mean(axis=0, dtype=np.float32)
+        known = weight > SHOWN
+        if len(frames) < FEWEST or not known.any():
+            return None
+        total = np.zeros(frames.shape[1:], np.float32)
+        for picture, mask in zip(frames, fluid, strict=True):
+            total += picture * mask[..., None]
+        mean = total / (255.0 * len(frames) * np.maximum(weight, 1e-6)[..., None])
+        outside, own = ndimage.distance_transform_edt(~known), _without_rim(known)
+        nearest = ndimage.distance_transform_edt(~own, return_distances=False, return_indices=True)
+        # a pixel that is rarely fluid shows its rim; those that often are count in the blur
+        sigma = BROAD * max(weight.shape)
+        spread = np.maximum(ndimage.gaussian_filter(weight, sigma), 1e-6)
+        blurred = [ndimage.gaussian_filter(mean[..., k] * weight, sigma) / spread for k in range(3)]
+        shade = np.stack(blurred, axis=-1)[tuple(nearest)]
+        mean = mean[tuple(nearest)].astype(np.float32)
+        return cls(frames, fluid & own, interval, mean, shade.astype(np.float32), outside.astype(np.float32))
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def looked_up(
+        self, index: Float[np.ndarray, "n 2"], instants: Float[np.ndarray, " n"]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """What differs from the mean at places of the picture [n,3], 0 to 1, and the share of fluid there [n].
+
+        Args:
+            index: row and column, bilinear between pixels.
+            instants: frames, counted from 0; the nearest one is taken, since a mean of two would show both.
+        """
+        frame = np.clip(np.rint(instants), 0, len(self) - 1).astype(np.int64)
+        out, share = np.zeros((len(index), 3), np.float32), np.zeros(len(index), np.float32)
+        _residual(self.frames, self.fluid, self.mean, index.astype(np.float64), frame, out, share)
+        return out, share
+
+
+def _without_rim(fluid: np.ndarray) -> np.ndarray:
+    """Pixels that show nothing but fluid: not those at the rim, but for threads that are no wider."""
+    inner = ndimage.binary_erosion(fluid, iterations=RIM, border_value=1)
+    threads = fluid & ~ndimage.binary_dilation(inner, iterations=2 * RIM)
+    return inner | threads
+
+
+def _sharpened(picture: np.ndarray, fluid: np.ndarray, blur: float) -> np.ndarray:
+    """A picture that a blur makes into the given one, to first order: I + (I - G I), inside the fluid."""
+    import cv2
+
+    def blurred(values: np.ndarray) -> np.ndarray:
+        return cv2.GaussianBlur(values, (0, 0), blur, borderType=cv2.BORDER_REPLICATE)
+
+    weight = fluid.astype(np.float32)
+    smooth = blurred(picture * weight[..., None]) / np.maximum(blurred(weight), 1e-3)[..., None]
+    sharp = np.where(fluid[..., None], 2.0 * picture - smooth, picture)
+    return np.clip(np.rint(sharp), 0, 255).astype(np.uint8)
+
+
+@njit(cache=True, parallel=True)
+def _residual(frames, fluid, mean, index, instant, out, share):
+    _, h, w, _ = frames.shape
+    for i in prange(len(index)):
+        y, x = min(max(index[i, 0], 0.0), h - 1.0), min(max(index[i, 1], 0.0), w - 1.0)
+        r, c, t = min(int(y), h - 2), min(int(x), w - 2), instant[i]
+        fy, fx = y - r, x - c
+        for a in range(2):
+            for b in range(2):
+                weight = (fy if a else 1.0 - fy) * (fx if b else 1.0 - fx)
+                if fluid[t, r + a, c + b]:
+                    share[i] += weight
+                    for k in range(3):
+                        out[i, k] += weight * (frames[t, r + a, c + b, k] / 255.0 - mean[r + a, c + b, k])

@@ -13,7 +13,7 @@ from fluidlift.io.asset_folder import load_asset, read_manifest
 from fluidlift.io.ply import read_splats
 from fluidlift.io.video import read_clip
 from fluidlift.numerics.sampling import sample_nodes
-from fluidlift.pipeline import STAGES, Inputs, SimulationRequest, make, moving, simulating
+from fluidlift.pipeline import STAGES, Inputs, SimulationRequest, card_of, make, moving, simulating
 from fluidlift.pipeline.scene import footage_of, scene_of
 from fluidlift.types import CellType, Label
 from fluidlift.validate import validate_asset
@@ -209,7 +209,11 @@ def test_a_second_run_has_nothing_to_do(made, copy, quick, capsys):
 def test_the_same_clip_settings_and_seed_give_the_same_asset(made, tmp_path, quick):
     """Simulation and pictures are left out the second time: they follow from what is compared here."""
     other = tmp_path / "again.fluid"
-    assert run(made, other, "--set", "simulate.frames=1", "--set", "show.usd=false", quick=quick) == made.code
+    code = run(made, other, "--set", "simulate.frames=1", "--set", "show.usd=false", quick=quick)
+    manifest = read_manifest(made.folder)
+    # one frame is too few to be held against the clip: what was said of the ten does not count
+    alike = [w for w in manifest["warnings"] if w != card_of(manifest).warning()]
+    assert code == (WITH_WARNINGS if alike else DONE)
     for name in ("parameters.json", "rest/gaussians.ply", "rest/camera.json", "rest/terrain.glb"):
         assert (other / name).read_bytes() == (made.folder / name).read_bytes(), name
     a, b = load_asset(made.folder), load_asset(other)

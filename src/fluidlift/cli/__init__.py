@@ -149,14 +149,21 @@ def _run_job(clip: Path, out: Path, config: Any, *, force=(), as_json=False, **f
 
 
 def _tell(made: Any, as_json: bool) -> int:
+    from fluidlift.io.asset_folder import read_manifest
+    from fluidlift.pipeline import card_of
+
+    card = card_of(read_manifest(made.folder))
     if as_json:
+        found = {"none": card} if isinstance(card, str) else card.to_dict()
         print(json.dumps({"asset": str(made.folder), "seconds": made.seconds, "frames": made.frames,
-                          "warnings": made.warnings, "stages": made.timings}, indent=1))  # fmt: skip
+                          "as_filmed": found, "warnings": made.warnings, "stages": made.timings},
+                         indent=1))  # fmt: skip
     else:
         print(f"done in {made.seconds:.0f} s")
         for text, name in (("asset", ""), ("preview", "preview.mp4"), ("report", "report.html")):
             if (made.folder / name).exists():
                 print(f"  {text:8} {made.folder / name}")
+        print(f"as filmed: not measured, {card}" if isinstance(card, str) else card.sentence())
     return WITH_WARNINGS if made.warnings else DONE
 
 
@@ -309,6 +316,12 @@ def _told(found: Any, as_json: bool) -> int:
 
 
 def _evaluate(c: Evaluate) -> int:
+    if c.truth is not None and (c.clip is not None or c.start is not None):
+        raise InputRejected("--truth with --clip or --start", "one of them: a case, or other footage")
+    if c.start is not None and c.clip is None:
+        raise InputRejected(f"--start {c.start:g} without --clip", "the footage that it is a time of")
+    if c.truth is None:
+        return _evaluate_as_filmed(c)
     from fluidlift.evaluate import evaluate_asset
 
     found = evaluate_asset(c.asset, c.truth)
@@ -320,6 +333,32 @@ def _evaluate(c: Evaluate) -> int:
     for name, value, unit, note in rows:
         print(f"{name:{width}}  {value:>10} {unit:9} {note}".rstrip())
     return DONE
+
+
+def _evaluate_as_filmed(c: Evaluate) -> int:
+    """The asset's own card, or one against other footage."""
+    from fluidlift.io.asset_folder import read_manifest
+
+    manifest = read_manifest(c.asset)  # before the heavy packages: a wrong name is told at once
+    from fluidlift.evaluate.as_filmed import HEADER
+    from fluidlift.pipeline import card_against, card_of
+
+    if c.clip is None:
+        card = card_of(manifest)
+        if isinstance(card, str):
+            raise InputRejected(f"'{c.asset.name}' was not held against its clip", "frames as they were filmed", card)
+    else:
+        with shown_progress() as progress:
+            card = card_against(c.asset, c.clip, start=c.start or 0.0, progress=progress)
+    if c.json:
+        print(json.dumps(card.to_dict(), indent=1))
+    else:
+        rows = [HEADER, *card.rows()]
+        width = [max(len(row[k]) for row in rows) for k in range(len(HEADER))]
+        for row in rows:
+            print("  ".join(cell.ljust(w) for cell, w in zip(row, width)).rstrip())
+        print("\n".join([card.sentence(), *card.notes, *card.advice]))
+    return WITH_WARNINGS if card.warning() else DONE
 
 
 def _validate(c: Validate) -> int:

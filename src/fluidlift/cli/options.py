@@ -284,12 +284,16 @@ class Motion:
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Measure an asset against a case with known truth."""
+    """Tell how near an asset stays to its own clip, to other footage, or to a case with known truth."""
 
     asset: Asset
     """asset folder"""
-    truth: Path
-    """case folder: video, camera.json, truth.npz, scene.json"""
+    truth: Path | None = None
+    """case folder: video, camera.json, truth.npz, scene.json; by default the asset is held against its own clip"""
+    clip: Path | None = None
+    """other footage of the same camera to hold it against, such as a part of the clip that was not used"""
+    start: float | None = None
+    """seconds into that footage"""
     json: bool = False
     """print as JSON"""
 

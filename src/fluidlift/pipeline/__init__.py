@@ -1,10 +1,12 @@
 """The story: the only place that knows the order of the stages."""
 
+from fluidlift.pipeline.as_filmed import card_of
 from fluidlift.pipeline.editing import EditSession
 from fluidlift.pipeline.exporting import ExportRequest, export_asset
 from fluidlift.pipeline.make import STAGES, make
 from fluidlift.pipeline.mask_files import find_masks
 from fluidlift.pipeline.motion_files import MotionFiles, measure_motion
+from fluidlift.pipeline.other_footage import card_against
 from fluidlift.pipeline.reading import Inputs
 from fluidlift.pipeline.refit import Refitted, refit
 from fluidlift.pipeline.rendering import RenderRequest, render_asset
@@ -26,6 +28,8 @@ __all__ = [
     "RenderRequest",
     "Silence",
     "SimulationRequest",
+    "card_against",
+    "card_of",
     "export_asset",
     "find_masks",
     "make",

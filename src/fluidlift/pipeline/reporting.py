@@ -9,6 +9,7 @@ import numpy as np
 
 from fluidlift.config import JobConfig
 from fluidlift.look.report import Figure, Section, report_html
+from fluidlift.pipeline.as_filmed import card_of
 from fluidlift.pipeline.body import setting_of
 from fluidlift.pipeline.fit_outcome import TIES, how_sure, in_words
 from fluidlift.pipeline.moving import targets_of
@@ -34,6 +35,7 @@ def write_report(story: Story, folder: Path, config: JobConfig, timings: dict[st
     sure = np.clip(labels.confidence[start].astype(np.float32), 0.0, 1.0)
     write_png(folder / "rest" / "mask_confidence.png", (255 * sure + 0.5).astype(np.uint8))
     sections = [
+        _section_as_filmed(story),
         _section_outcome(story),
         _section_seeing(story, overlay),
         _section_body(story),
@@ -68,6 +70,21 @@ def _film(path: Path) -> bytes:
 
 def _kind(story: Story) -> str:
     return story["geometry"].meta["kind"]
+
+
+def _section_as_filmed(story: Story) -> Section:
+    """The card, first of all: whether what follows can be used."""
+    from fluidlift.evaluate.as_filmed import HEADER
+
+    card = card_of({"simulation": story["show"].meta})
+    if isinstance(card, str):
+        return Section("As filmed", notes=[f"How near the re-simulation stays to the clip is not known: {card}."])
+    said = card.sentence()
+    how = f"{card.frames} frames were compared with the clip at the same time, {card.beyond} after its end. "
+    how += "The floor is the same figure between the two halves of the clip."
+    return Section(
+        "As filmed", (), card.rows(), HEADER, [said[:1].upper() + said[1:] + ".", how, *card.notes, *card.advice]
+    )
 
 
 def _section_outcome(story: Story) -> Section:

@@ -28,6 +28,9 @@ SECOND_HALF_SECTIONS = ("simulate", "show")
 FPS_RANGE = (0.1, 10_000.0)
 """frames per second that can be asked for"""
 
+AS_FILMED = 1
+"""raised where figures of the card change, so that frames that are there are measured again"""
+
 PARTS = {
     "preview": "preview.mp4", "report": "report.html", "usd": "asset.usda", "mask_overlay": "mask_overlay.png",
 }  # fmt: skip
@@ -84,7 +87,7 @@ def resimulate(
     recall_first_half(story, manifest)
     with disk_errors(folder), writing(folder, "a simulation"):
         frames = play(story, folder, config, request)
-    own = tuple(story["simulate"].meta.get("warnings", ()))
+    own = tuple(text for name in SECOND_HALF for text in story[name].meta.get("warnings", ()))
     return Made(folder, own, time.perf_counter() - began, story.timings, frames)
 
 
@@ -190,13 +193,14 @@ def play(story: Story, folder: Path, config: JobConfig, request: SimulationReque
         owns_files=True,
     )
     done = story["simulate"].meta
+    first_half = [story.keys[s] for s in FIRST_HALF if s in story.keys]
     wanted = [folder / "preview.mp4"] * config.show.preview + [folder / "asset.usda"] * config.show.usd
     story.run(
         "show",
         lambda: showing.show(
             scene, footage, folder, config, story["simulate"].arrays["poses"], look=edits.look, step=story.step
         ),
-        settings=[config.section("show"), done["frames"], look, [story.keys[s] for s in FIRST_HALF if s in story.keys]],
+        settings=[config.section("show"), done["frames"], look, AS_FILMED, first_half],
         after=("simulate",),
         still_there=lambda result: all(p.is_file() for p in wanted),
         owns_files=True,
@@ -232,7 +236,9 @@ def _finish(story: Story, scene: Scene, config: JobConfig, manifest: dict[str, A
     folder = story.folder
     result = story["simulate"].meta
     before = set(manifest.get("simulation", {}).get("warnings", ()))
+    shown = story["show"].meta
     own = [*edited["warnings"], *result.get("warnings", ()), *([result["failed"]] if "failed" in result else [])]
+    own += shown.get("warnings", ())
     story.warnings[:] = [w for w in manifest.get("warnings", ()) if w not in before] + own
     if story.results.keys() >= set(FIRST_HALF):
         reporting.write_report(story, folder, config, story.timings)
@@ -260,6 +266,7 @@ def _finish(story: Story, scene: Scene, config: JobConfig, manifest: dict[str, A
             "look": edited["look"],
             "loop": edited["loop"],
             "parts": scene.parts,
+            "as_filmed": shown["as_filmed"],
             "warnings": own,
         },
     )  # fmt: skip

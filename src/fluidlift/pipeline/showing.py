@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from fluidlift.config import JobConfig
 from fluidlift.io.scene_look import Look
+from fluidlift.pipeline.as_filmed import BEYOND, Reel, card_of_run
 from fluidlift.pipeline.export_job import frames_of
 from fluidlift.pipeline.looks import Backdrop, Frame, Painter, placed_bodies
 from fluidlift.pipeline.scene import LYING, Footage, Scene, before_ground
@@ -18,6 +20,7 @@ from fluidlift.types import Gaussians, PinholeCamera, Similarity3, concatenate, 
 
 if TYPE_CHECKING:
     from fluidlift.look.open_end import OpenEnd
+    from fluidlift.look.rasterize import Rendered
 
 
 def splat_frames(folder: Path, count: int) -> Iterator[tuple[Gaussians, np.ndarray, np.ndarray]]:
@@ -51,7 +54,7 @@ def show(
     from fluidlift.io.video import write_video
 
     count = len(poses)
-    measured: dict[str, list[np.ndarray]] = {"frames": [], "mask": [], "flow": []}
+    measured: dict[str, Any] = {"frames": Reel(folder), "mask": Reel(folder), "flow": []}
     painter = _painter(scene, folder, look)
     panels = _panels(scene, footage, folder, config, poses, measured, step, painter)
     if config.show.preview:
@@ -73,14 +76,49 @@ def show(
     else:
         for name in ("asset.usda", "asset.usdc"):  # of frames that are no longer there
             (folder / name).unlink(missing_ok=True)
-    if not measured["frames"]:
-        return Result({}, {"frames": count})
+    frames, mask, compared = measured["frames"].array(), measured["mask"].array(), len(measured["flow"])
+    meta = {"frames": count} | card_of_run(scene, footage, config, frames, mask)
+    if not compared:
+        return Result({}, meta)
     arrays = {
-        "resim_frames": np.stack(measured["frames"]),
-        "resim_mask": np.stack(measured["mask"]),
+        "resim_frames": frames[:compared],
+        "resim_mask": mask[:compared],
         "resim_flow": np.stack(measured["flow"]).astype(np.float16),
     }
-    return Result(arrays, {"frames": count})
+    return Result(arrays, meta)
+
+
+@dataclass(frozen=True)
+class FrontView:
+    """Splats as the clip's camera sees them: before the clip without its fluid, behind its rocks."""
+
+    camera: PinholeCamera
+    plate: np.ndarray
+    """[H,W,3] sRGB in [0, 1]"""
+    rocks: np.ndarray
+    """bool [H,W]"""
+    seen_of: Callable[[Gaussians], np.ndarray] | None
+    """whether the ground of the clip hides a splat; None where it hides none"""
+
+    @staticmethod
+    def of(scene: Scene, footage: Footage | None) -> FrontView:
+        """Of a scene; before grey where its clip is not at hand, or shows a ground that was edited."""
+        size, shown = scene.camera.size[::-1], None if scene.reshaped else footage
+        plate, rocks = np.full((*size, 3), 0.5, np.float32), np.zeros(size, bool)
+        if shown is not None:  # the clip shows the ground as it was
+            plate, rocks = shown.plate.astype(np.float32) / 255.0, shown.rocks
+        return FrontView(scene.camera, plate, rocks, before_ground(scene, shown))
+
+    def drawn(
+        self, gaussians: Gaussians, velocity: np.ndarray, solids: Sequence[Gaussians] = ()
+    ) -> tuple[Rendered, Gaussians, np.ndarray]:
+        """The picture with its coverage, and the splats that the ground leaves over, with their velocities (m/s)."""
+        from fluidlift.look.rasterize import render
+
+        if self.seen_of is not None:
+            keep = self.seen_of(gaussians)
+            gaussians, velocity = gaussians.select(keep), velocity[keep]
+        return render(concatenate([gaussians, *solids]), self.camera, background=self.plate), gaussians, velocity
 
 
 def _painter(scene: Scene, folder: Path, look: Look | None) -> Painter | None:
@@ -110,17 +148,14 @@ def _panels(
     from fluidlift.numerics.srgb import linear_from_srgb
 
     camera, terrain, grid = scene.camera, scene.terrain, scene.terrain.grid
-    plate = np.full((camera.size[1], camera.size[0], 3), 0.5, np.float32)
-    rocks, compared = np.zeros(plate.shape[:2], bool), 0
-    if footage is not None and not scene.reshaped:  # the clip shows the ground as it was
-        plate = footage.plate.astype(np.float32) / 255.0
-        rocks = footage.rocks
-        # frames after the clip or between its own, and those of an edited scene, have no counterpart in it
+    front_view, compared = FrontView.of(scene, footage), 0
+    if footage is not None and not scene.reshaped:
+        # frames between those of the clip, and those of an edited scene, have no counterpart in it
         edited = scene.obstacles or scene.emitters or scene.overlap or scene.changes
         if scene.interval == scene.clip_interval and not edited:
             compared = max(len(footage.clip) - footage.start, 1)
-    seen_of = before_ground(scene, None if scene.reshaped else footage)
-    solid_depth = terrain_depth(terrain, camera) if rocks.any() and painter is not None else None
+    rocks = front_view.rocks
+    behind = terrain_depth(terrain, camera) if rocks.any() and painter is not None else None
     airborne = scene.kind not in LYING
     ground = terrain_surfels(terrain, glass=glass_of(scene.kind))
     size = _panel_size(camera.size, config.show.width)
@@ -133,27 +168,24 @@ def _panels(
     end = open_end(scene)
     sky = np.linspace(0.93, 0.78, size[1], dtype=np.float32)[:, None, None] * np.ones((1, size[0], 3), np.float32)
     shapes = [mesh_surfels(o.mesh, grid.spacing) for o in scene.obstacles]
-    lit_plate = linear_from_srgb(plate).astype(np.float32)
-    rock_depth = None if solid_depth is None else np.where(rocks & np.isfinite(solid_depth), solid_depth, 0.0)
+    lit_plate = linear_from_srgb(front_view.plate).astype(np.float32)
+    rock_depth = None if behind is None else np.where(rocks & np.isfinite(behind), behind, 0.0)
     for k, (gaussians, _, speeds) in enumerate(splat_frames(folder, len(poses))):
         step(k, len(poses))
         solids = [
             shape.transformed(Similarity3(1.0, matrix_from_quat(p[3:]), p[:3])) for shape, p in zip(shapes, poses[k])
         ]
-        front, velocity = gaussians, speeds
-        if seen_of is not None:
-            keep = seen_of(gaussians)
-            front, velocity = gaussians.select(keep), velocity[keep]
-        rendered = render(concatenate([front, *solids]), camera, background=plate)
-        picture = _bytes(rendered.image)
-        if k < compared:  # of the splats, whatever look the preview has
+        rendered, front, velocity = front_view.drawn(gaussians, speeds, solids)
+        picture = to_bytes(rendered.image)
+        if k < BEYOND * compared:  # of the splats, whatever look the preview has
             measured["frames"].append(picture)
             measured["mask"].append(rendered.alpha > 0.5)
+        if k < compared:
             measured["flow"].append(_screen_velocity(front, velocity, camera, scene.interval, rendered.alpha))
         if painter is None:
             # as in the other looks, what thins out behind the section of a stream is not drawn before the terrain
             whole = gaussians if end is None else gaussians.select(end.before(gaussians.means))
-            view = _bytes(render(concatenate([ground, *solids, whole]), side, background=sky).image)
+            view = to_bytes(render(concatenate([ground, *solids, whole]), side, background=sky).image)
         else:
             frame = Frame(gaussians, speeds, placed_bodies(scene.obstacles, poses[k]))
             picture = painter.shown(frame, camera, Backdrop(lit_plate, rock_depth))
@@ -179,7 +211,8 @@ def _resized(picture: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     return cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
 
 
-def _bytes(image: np.ndarray) -> np.ndarray:
+def to_bytes(image: np.ndarray) -> np.ndarray:
+    """u8 sRGB of sRGB in [0, 1]."""
     return (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
 
 

@@ -1,0 +1,193 @@
+"""The card: a re-simulation that is the clip itself holds, and each way to go wrong shows in the figure made for it."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from fluidlift.evaluate.as_filmed import FEWEST, GOOD, USABLE, VERDICTS, WRONG, AsFilmed, Likeness, as_filmed
+
+T, H, W = 48, 64, 96
+INTERVAL = 0.04
+SPEED = 2
+"""px/frame, to the right"""
+LIFE = 5.0
+"""frames, after which a pattern has been replaced by another"""
+STREAM = slice(20, 52)
+"""rows that are water"""
+
+
+def pattern(frames: int, life: float, seed: int = 0) -> np.ndarray:
+    """[T,H,W] of unit variance, with grains of a few px, that changes within `life` frames and repeats after them."""
+    noise = np.random.default_rng(seed).standard_normal((frames, H, W))
+    smooth = ndimage.gaussian_filter(noise, (life, 1.3, 1.3), mode="wrap") if life else noise[:1].repeat(frames, 0)
+    smooth = smooth if life else ndimage.gaussian_filter(smooth, (0, 1.3, 1.3), mode="wrap")
+    return smooth / smooth.std()
+
+
+def film(life: float = LIFE, speed: int = SPEED, seed: int = 0) -> np.ndarray:
+    """u8 [T,H,W,3]: water between still banks; `life` 0: a wallpaper that only moves."""
+    moved = np.stack([np.roll(p, speed * t, axis=1) for t, p in enumerate(pattern(T, life, seed))])
+    shade = 110 + 25 * np.sin(np.arange(W) / 11.0) + 12 * np.cos(np.arange(H) / 5.0)[:, None]
+    bank = 90 + 20 * pattern(1, 0.0, 7)[0]
+    grey = np.repeat(bank[None], T, axis=0)
+    grey[:, STREAM] = (shade + 20 * moved)[:, STREAM]
+    return np.clip(grey[..., None] * [0.9, 1.0, 1.1], 0, 255).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def clip() -> np.ndarray:
+    return film()
+
+
+@pytest.fixture(scope="module")
+def masks() -> np.ndarray:
+    found = np.zeros((T, H, W), bool)
+    found[:, STREAM] = True
+    return found
+
+
+def held(clip, masks, renders, coverage=None) -> AsFilmed:
+    return as_filmed(clip, masks, INTERVAL, renders, masks if coverage is None else coverage)
+
+
+def test_the_clip_itself_is_good_and_equal_in_every_figure(clip, masks):
+    card = held(clip, masks, clip)
+    assert card.verdict == GOOD and card.warning() is None and card.advice == ()
+    for key in ("level", "liveliness", "crispness_0", "crispness_3", "along_0.2", "along_0.5", "current_cosine"):
+        assert card[key].value == pytest.approx(1.0, abs=1e-4)  # stored with four digits
+    for key in ("mean", "ring", "flooded", "missing", "colours", "current_error"):
+        assert card[key].value == pytest.approx(0.0, abs=1e-6)
+
+
+def test_the_same_film_half_a_clip_later_is_good(clip, masks):
+    card = held(clip, masks, np.roll(clip, T // 2, axis=0))
+    assert card.verdict == GOOD, card.rows()
+    assert card["mean"].value == pytest.approx(0.0, abs=1e-6)  # the same frames in another order
+
+
+def test_another_film_of_the_same_water_is_good(masks):
+    card = held(film(seed=0), masks, film(seed=1))
+    assert card.verdict == GOOD, card.rows()
+
+
+def test_a_frozen_still_does_not_live(clip, masks):
+    card = held(clip, masks, clip[:1].repeat(T, axis=0))
+    assert card["liveliness"].value == pytest.approx(0.0, abs=1e-6)
+    assert card["liveliness"].verdict == WRONG and card.verdict == WRONG
+    assert card["along_0.5"].value is None  # what never changes cannot be followed
+    assert "liveliness" in card.warning() and card.advice
+
+
+def test_a_wallpaper_that_only_moves_is_found_again_downstream_and_water_is_not(clip, masks):
+    card = held(clip, masks, film(life=0.0))
+    # after 0.5 s, 12 frames, a pattern that lives for 5 is gone: its correlation is exp(-(12 / 5)^2 / 4) = 0.24
+    assert card["along_0.5"].value > 2.0
+    assert card["along_1"].value is None  # after 1 s the clip's own is no number to divide by
+    assert card["current_cosine"].verdict == GOOD
+
+
+def test_water_on_its_banks_shows_in_level_and_ring(clip, masks):
+    wide = masks.copy()
+    wide[:, 12:60] = True
+    flooded = clip.copy()
+    flooded[:, 12:60] = clip[:, 20:44].repeat(2, axis=1)
+    card = held(clip, masks, flooded, wide)
+    assert card["level"].value == pytest.approx(32 / 48, abs=1e-3)  # rows of water over those that are covered
+    assert card["flooded"].value == pytest.approx(1.0) and card["missing"].value == 0.0
+    assert card["level"].verdict == WRONG and card["ring"].verdict == WRONG
+    assert any("none was filmed" in text for text in card.advice)
+
+
+def test_water_that_ran_dry_is_missing(clip, masks):
+    gone = masks.copy()
+    gone[2 * T // 3 :] = False
+    card = held(clip, masks, clip, gone)
+    assert card["level"].value == 0.0 and card["missing"].value == 1.0
+    assert any("missing where it was filmed" in text for text in card.advice)
+
+
+def test_a_blurred_film_is_not_crisp(clip, masks):
+    card = held(clip, masks, np.stack([ndimage.gaussian_filter(f, (1.5, 1.5, 0)) for f in clip]))
+    assert card["crispness_0"].value < 0.5 and card["crispness_0"].verdict == WRONG
+    assert card["crispness_0"].value < card["crispness_3"].value  # blur takes the fine first
+
+
+def test_a_current_that_runs_back_has_a_cosine_of_minus_one(clip, masks):
+    card = held(clip, masks, clip[:, :, ::-1])
+    # flow at the picture's edges, where the pattern comes in, is not measured to a tenth
+    assert card["current_cosine"].value == pytest.approx(-1.0, abs=0.05)
+    assert card["current_error"].value == pytest.approx(2.0, abs=0.2)
+    assert any("another way" in text for text in card.advice)
+
+
+def test_a_current_too_slow_for_optical_flow_is_not_judged(masks):
+    still = film(speed=0)
+    card = held(still, masks, still)
+    assert card["current_error"].value is None and card["current_error"].verdict is None
+    assert "not judged" in card["current_error"].note
+    assert card.verdict == GOOD
+
+
+def test_frames_after_the_end_are_held_against_what_the_clip_is_like(clip, masks):
+    later = np.concatenate([clip, clip[:1].repeat(T, axis=0)])
+    card = held(clip, masks, later, np.concatenate([masks, masks]))
+    assert (card.frames, card.beyond) == (T, T)
+    assert card["liveliness"].value == pytest.approx(1.0, abs=1e-4)
+    assert card["liveliness"].beyond == pytest.approx(0.0, abs=1e-6)
+    assert card["liveliness"].verdict == WRONG and card["level"].beyond == 1.0
+
+
+def test_a_front_that_moves_is_compared_at_the_same_time_and_only_there(clip, masks):
+    advancing = masks & (np.arange(W) < 2 * np.arange(T)[:, None])[:, None]
+    ahead = masks & (np.arange(W) < 2 * np.arange(T)[:, None] + 40)[:, None]
+    wet = np.where(advancing[..., None], clip, 60)
+    card = as_filmed(wet, advancing, INTERVAL, np.concatenate([wet, wet]), np.concatenate([advancing, advancing]))
+    assert card.verdict == GOOD and card.beyond == 0 and card["level"].floor is None and card.notes
+    assert held(wet, advancing, wet, ahead)["level"].verdict == WRONG
+
+
+def test_fluid_of_a_few_pixels_gives_no_number(clip):
+    few = np.zeros((T, H, W), bool)
+    few[:, 30:35, 30:35] = True
+    card = held(clip, few, clip)
+    assert card["mean"].value is None and card["mean"].verdict is None
+
+
+def test_films_that_are_too_short_or_of_another_size_are_refused(clip, masks):
+    with pytest.raises(ValueError, match=f"{FEWEST} or more"):
+        held(clip[: FEWEST - 1], masks[: FEWEST - 1], clip[: FEWEST - 1])
+    with pytest.raises(ValueError, match="pictures of the clip"):
+        as_filmed(clip, masks, INTERVAL, clip[:, ::2], masks[:, ::2])
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "floor", "verdict"),
+    [
+        ("level", 0.95, 0.99, GOOD), ("level", 0.92, 0.91, GOOD), ("level", 0.92, 0.99, USABLE),
+        ("level", 0.87, 0.5, WRONG), ("mean", 9.0, 6.0, GOOD), ("mean", 14.0, 6.0, USABLE), ("mean", 14.1, 6.0, WRONG),
+        ("ring", 2.0, 0.0, GOOD), ("ring", 9.0, None, None), ("ring", 5.1, 0.0, WRONG),
+        ("crispness_0", 1.2, 1.0, USABLE),
+        ("crispness_0", 0.74, 1.0, WRONG), ("liveliness", 1.3, 1.0, USABLE), ("liveliness", 1.31, 1.0, WRONG),
+        ("current_error", 0.5, 0.0, USABLE), ("current_cosine", 0.84, 1.0, WRONG), ("foam", 0.0, 1.0, None),
+        ("level", None, 1.0, None),
+    ],
+)  # fmt: skip
+def test_the_limits_are_those_that_the_documents_tell(key, value, floor, verdict):
+    from fluidlift.evaluate.as_filmed import _judged
+
+    assert _judged(key, value, floor) == verdict
+
+
+def test_a_card_comes_back_from_json_as_it_was(clip, masks):
+    card = held(clip, masks, np.concatenate([clip, clip]), np.concatenate([masks, masks]))
+    assert AsFilmed.from_dict(json.loads(json.dumps(card.to_dict(), allow_nan=False))) == card
+
+
+def test_the_verdict_is_the_worst_of_those_that_are_judged():
+    figures = [Likeness(k, k, 1.0, verdict=v) for k, v in (("a", GOOD), ("b", None), ("c", USABLE))]
+    assert AsFilmed(9, 0, tuple(figures)).verdict == USABLE
+    assert AsFilmed(9, 0, (figures[1],)).verdict is None
+    assert AsFilmed(9, 0, (figures[1],)).sentence().startswith("as filmed: not judged")
+    assert VERDICTS[-1] == WRONG

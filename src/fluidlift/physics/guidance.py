@@ -106,6 +106,5 @@ class Nudging(BodyForce):
         Where liquid comes by only now and then, the pull is that of splashes.
         """
         least = 0.5 * max(self._passed - self._after, 0.0)
-        return FaceVelocity(
-            *(np.where(t > least, s / np.maximum(t, 1e-9), 0.0).astype(np.float32) for s, t in zip(self._sum, self._time))
-        )
+        pairs = zip(self._sum, self._time)
+        return FaceVelocity(*(np.where(t > least, s / np.maximum(t, 1e-9), 0).astype(np.float32) for s, t in pairs))

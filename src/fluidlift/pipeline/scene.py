@@ -16,6 +16,7 @@ from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected
 from fluidlift.look.appearance import SteadyShading
 from fluidlift.physics.inflow_schedule import InflowSchedule
+from fluidlift.pipeline.following import following
 from fluidlift.pipeline.reading import clip_of
 from fluidlift.pipeline.reshaping import changed_parameters, with_emitters, with_terrain
 from fluidlift.pipeline.seeing import labels_of
@@ -128,6 +129,8 @@ class Scene:
     """of the fluid, which its surface plays; None: the surface looks as it did at rest"""
     film_start: int = 0
     """frame of the film that the body at rest shows"""
+    force: FaceVelocity | None = None
+    """m/s^2 on the faces of the terrain's grid, beside gravity"""
 
     @property
     def simulated(self) -> int:
@@ -164,6 +167,8 @@ class Scene:
             found["emitters"] = _hash(*(x for e in self.emitters for x in e.plain()))
         if self.inflow != InflowSchedule():
             found["inflow"] = _hash(self.inflow)
+        if self.force is not None:
+            found["force"] = _hash(*self.force.components)
         if self.overlap:
             found["loop"] = _hash(self.frames, self.overlap)
         return found
@@ -270,6 +275,8 @@ def scene_of(
     if longer > 0:
         scene = extended(scene, longer)
     scene = with_emitters(with_terrain(scene, edits.terrain), edits.emitters)
+    if config.simulate.follow > 0:
+        scene = following(scene, asset, request.meshes or folder, config.simulate.follow)
     return replace(scene, overlap=loop_overlap(scene)) if edits.loop else scene
 
 

@@ -13,22 +13,23 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fluidlift.pipeline.scene import LYING, Scene
+from fluidlift.pipeline.scene import LYING, Scene, wave_speed
 from fluidlift.pipeline.story import Result
 from fluidlift.types import CellType, FaceVelocity
 
 if TYPE_CHECKING:
     from fluidlift.types import FluidAsset
 
-PULL = 2.0
-"""cells that the fluid moves in the time constant of the pull: shorter, and the mean holds the noise of single cells
-(0.05 against 0.1 s at 0.85 m/s and cells of 4.4 cm: planar error 1.76 against 1.74 px, forces 1.6 times as strong)"""
+PULL = 3.0
+"""cells that a wave crosses in the time constant of the pull: it has to be faster than what it corrects, and no faster,
+for then the mean holds the noise of single cells (river of 20 cm, cells of 4.4 cm: time constants of 0.05 and 0.1 s
+leave planar errors of 1.76 and 1.74 px, with forces 1.6 times as strong for the shorter one)"""
 
 SETTLED = 0.25
 """share of the run that does not count: the body sinks into its cells, and waves of the start run off"""
 
-LONGEST = 60
-"""frames of the run: two seconds at 30 per second, in which a stream of 70 cells passes its length once or twice"""
+LONGEST = 40
+"""frames of the run: what counts of it is a second at 30 per second, the time in which most free runs leave the clip"""
 
 STRONG = 0.5
 """left of the difference to the filmed flow under the pull, over the flow's speed, from which shape, motion and mass do
@@ -72,7 +73,7 @@ def calibrate(
     speed = _typical_speed(target, scene.cell_types)
     if speed <= 0:
         return Result()
-    rate = speed / (PULL * grid.spacing)
+    rate = max(speed, wave_speed(scene)) / (PULL * grid.spacing)
     rates = tuple(np.full(c.shape, rate, np.float32) for c in target.components)
     pull = Nudging(target, rates, after=SETTLED * frames * scene.interval)
     simulator = simulator_of(replace(scene, force=None), device, forces=(pull,))

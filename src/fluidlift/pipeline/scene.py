@@ -360,6 +360,13 @@ def loop_overlap(scene: Scene) -> int:
     return int(np.clip(round(fade / scene.interval), 2, scene.frames // 2))
 
 
+def wave_speed(scene: Scene) -> float:
+    """Of a long gravity wave on the fluid where it is deep, m/s."""
+    h, wet = scene.terrain.grid.spacing, (scene.cell_types == CellType.FLUID).sum(axis=2)
+    depth = h * float(np.percentile(wet[wet > 0], 90)) if (wet > 0).any() else h
+    return float(np.sqrt(np.linalg.norm(scene.parameters.gravity) * depth))
+
+
 def simulation_step(scene: Scene) -> FluidParameters:
     """The same physics with the simulator's own longest step.
 
@@ -369,10 +376,7 @@ def simulation_step(scene: Scene) -> FluidParameters:
     """
     parameters, interval = scene.parameters, min(scene.interval, scene.clip_interval)
     h = scene.terrain.grid.spacing
-    wet = (scene.cell_types == CellType.FLUID).sum(axis=2)
-    depth = h * float(np.percentile(wet[wet > 0], 90)) if (wet > 0).any() else h
-    wave = float(np.sqrt(np.linalg.norm(parameters.gravity) * depth))
-    longest = interval if scene.kind == "plume" else h / max(wave, 1e-6)
+    longest = interval if scene.kind == "plume" else h / max(wave_speed(scene), 1e-6)
     step = float(np.clip(longest, interval / 8, interval))
     if scene.longest_step is not None:
         step = min(float(scene.longest_step), scene.interval)

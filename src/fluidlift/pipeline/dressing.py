@@ -60,6 +60,9 @@ LOOKED_UP = 1 / 6 + 0.3
 """variance (px^2) of the blur between a film and its splats' picture beside that of the splats: a bilinear look-up
 (a triangle of one pixel to each side, 1/6), and what the rasteriser adds to each splat"""
 
+AS_AT_REST = "its surface looks as it did at rest"
+"""what follows where there is no film to play"""
+
 WIDEST = 1.5
 """px of the splats' standard deviation that is taken out of a film at most: beyond, noise is all that is sharpened"""
 
@@ -93,8 +96,8 @@ def lends_look(scene: Scene, own: Gaussians) -> np.ndarray:
     return in_picture(own.means, scene.camera) & clear_of_shore(own.means, level, scene.terrain)
 
 
-def _footage(film: Path, camera: PinholeCamera, means: np.ndarray, cell: float) -> FluidFootage | None:
-    """The film of an asset, taken apart; None where it is too short to be played.
+def _footage(film: Path, camera: PinholeCamera, means: np.ndarray, cell: float) -> FluidFootage | str:
+    """The film of an asset, taken apart; or what is wrong with it, in words.
 
     Args:
         film: its file.
@@ -103,13 +106,23 @@ def _footage(film: Path, camera: PinholeCamera, means: np.ndarray, cell: float) 
         cell: width of the simulator's cells, m.
     """
     from fluidlift.io.footage_file import read_footage
-    from fluidlift.look.footage import FluidFootage
+    from fluidlift.look.footage import FEWEST, FluidFootage
     from fluidlift.look.surface_skin import PITCH, WIDTH
 
+    if not film.is_file():
+        return f"is missing: {AS_AT_REST}; make the asset again"
+    try:
+        frames, fluid, interval = read_footage(film, camera.size)
+    except InputRejected as error:
+        return f"is damaged ({error.got}): {AS_AT_REST}; make the asset again"
+    if len(frames) < FEWEST:
+        return f"has {len(frames)} frames and needs {FEWEST}: {AS_AT_REST}; make the asset from a longer clip"
+    camera = camera.resized((frames.shape[2], frames.shape[1]))
     depth = float(np.median(camera.project(means)[1]))
     splat = WIDTH * PITCH * cell * camera.focal[0] / max(depth, 1e-6)
     blur = float(np.sqrt(min(splat, WIDEST) ** 2 + LOOKED_UP))
-    return FluidFootage.of(*read_footage(film, camera.size), blur=blur)
+    found = FluidFootage.of(frames, fluid, interval, blur=blur)
+    return f"shows none: {AS_AT_REST}; make the asset again" if found is None else found
 
 
 class Dressing:
@@ -117,6 +130,9 @@ class Dressing:
 
     def __init__(self, scene: Scene) -> None:
         self._scene, self._cell = scene, scene.terrain.grid.spacing
+        self._camera = scene.camera
+        self.warnings: tuple[str, ...] = ()
+        """what is missing for the usual look, in words"""
         self._patches: TexturePatches | None = None
         self._surface: SurfaceMap | None = None
         self._axes: SurfaceAxes
@@ -134,11 +150,11 @@ class Dressing:
         scene, own = self._scene, self._own
         gravity = np.asarray(scene.parameters.gravity, np.float64)
         upright = -gravity[2] > UPRIGHT * max(float(np.linalg.norm(gravity)), 1e-12)
-        footage = None if scene.film is None else _footage(scene.film, scene.camera, own.means, self._cell)
+        footage = self._film_of(own)
         if scene.kind == "stream" and upright:
             self._axes = PlanAxes()
-        elif footage is not None and scene.kind != "plume":  # smoke has no surface
-            self._axes = PictureAxes(scene.camera, float(np.median(scene.camera.project(own.means)[1])))
+        elif footage is not None:
+            self._axes = PictureAxes(self._camera, float(np.median(self._camera.project(own.means)[1])))
         else:
             return
         surface = self._surface_of(scene.body)
@@ -158,8 +174,20 @@ class Dressing:
             start=scene.film_start,
         )  # fmt: skip
         if footage is not None and scene.kind in LYING and not scene.edited:
-            self._outline = FilmedOutline(scene.camera, footage.outside, self._cell)
+            self._outline = FilmedOutline(self._camera, footage.outside, self._cell)
         self._begin_again()
+
+    def _film_of(self, own: Gaussians) -> FluidFootage | None:
+        """The film that the surface plays, whose size the camera has from here on; one that cannot be is a warning."""
+        scene = self._scene
+        if scene.film is None or scene.kind == "plume":
+            return None
+        found = _footage(scene.film, scene.camera, own.means, self._cell)
+        if isinstance(found, str):
+            self.warnings = (f"the film of the fluid {found}",)
+            return None
+        self._camera = scene.camera.resized((found.mean.shape[1], found.mean.shape[0]))
+        return found
 
     def _seen_texture(self, surface: SurfaceMap, footage: FluidFootage | None) -> SeenTexture:
         from fluidlift.look.inflow import ENDS
@@ -167,10 +195,9 @@ class Dressing:
         from fluidlift.shape.off_picture import in_picture
 
         scene, own = self._scene, self._own
-        if (
-            footage is not None
-        ):  # each place shows its own film: shores, and what stands in the water's picture, as well
-            return SeenTexture(own, scene.camera, surface, usable=in_picture(own.means, scene.camera))
+        if footage is not None:
+            # each place shows its own film: shores, and what stands in the water's picture, as well
+            return SeenTexture(own, self._camera, surface, usable=in_picture(own.means, scene.camera))
         along = own.means @ scene.terrain.mainstream
         share = (along - along.min()) / max(float(np.ptp(along)), 1e-12)
         usable = lends_look(scene, own) & (share > ENDS[0]) & (share < ENDS[1])

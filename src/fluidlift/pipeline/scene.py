@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -125,7 +126,7 @@ class Scene:
     overlap: int = 0
     """frames simulated beyond `frames`, that a loop is closed with"""
     film: Path | None = None
-    """of the fluid, which its surface plays; None: the surface looks as it did at rest"""
+    """of the fluid, which its surface plays; None, or a file that cannot be played: it looks as it did at rest"""
     film_start: int = 0
     """frame of the film that the body at rest shows"""
 
@@ -153,7 +154,7 @@ class Scene:
             "body": _hash(self.body.positions, self.body.velocities, self.body.source, self.rest.means),
             "look": _hash(self.rest.quats, self.rest.scales, self.rest.opacities, self.rest.sh,
                           b"" if self.shading is None else self.shading.image,
-                          b"" if self.film is None else self.film.read_bytes(), self.film_start),
+                          b"" if self.film is None else self.film, self.film_start),
             "parameters": _hash(self.parameters, self.longest_step),
             "frame interval": _hash(self.interval),
             "seed": _hash(self.seed),
@@ -175,16 +176,25 @@ class Scene:
 
 
 def _hash(*values: Any) -> str:
-    """SHA-256 of arrays (with shape and type) and of the text of anything else."""
+    """SHA-256 of arrays (with shape and type), of the content of files, and of the text of anything else."""
     digest = hashlib.sha256()
     for value in values:
         if isinstance(value, np.ndarray):
             digest.update(f"{value.dtype.str}{value.shape}".encode())
             digest.update(np.ascontiguousarray(value).tobytes())
+        elif isinstance(value, Path):
+            _update(digest, value)
         else:
             digest.update(value if isinstance(value, bytes) else repr(value).encode())
         digest.update(b"\0")
     return digest.hexdigest()
+
+
+def _update(digest: hashlib._Hash, file: Path) -> None:
+    """Add a file to a hash, piece by piece; one that is gone or may not be read adds nothing."""
+    with suppress(OSError), file.open("rb") as stream:
+        while piece := stream.read(2**20):
+            digest.update(piece)
 
 
 def footage_of(story: Story) -> Footage | None:
@@ -264,7 +274,7 @@ def scene_of(
         asset.parameters.updated(changes), asset.camera, interval, asset.interval,
         wanted or config.simulate.frames or clip_frames, config.seed, edits.obstacles, shading,
         longest_step=longest_step, inflow=edits.inflow, changes=changed_parameters(asset.parameters, changes),
-        film=film_of(request.meshes or folder), film_start=start - first_of_film(start, asset.frame_count),
+        film=film_of(folder), film_start=start - first_of_film(start, asset.frame_count),
     )  # fmt: skip
     longer = edits.extend_downstream if request.extend_downstream is None else request.extend_downstream
     if longer > 0:
@@ -274,11 +284,17 @@ def scene_of(
 
 
 def film_of(folder: Path) -> Path | None:
-    """The film of the fluid that an asset carries; None where it has none."""
-    from fluidlift.io.asset_folder import FILES, asset_file
+    """The film of the fluid that the manifest of an asset lists, though it may be gone; None where it lists none.
 
-    film = asset_file(folder, FILES["film"])
-    return film if film.is_file() else None
+    Raises:
+        InputRejected: a broken manifest, or a film that is a link or lies elsewhere.
+    """
+    from fluidlift.io.asset_folder import asset_file, read_manifest
+
+    if not (folder / "manifest.json").is_file():  # edits alone, which a preview shows
+        return None
+    name = read_manifest(folder)["files"].get("film")
+    return None if name is None else asset_file(folder, name)
 
 
 def first_of_film(start: int, frames: int) -> int:

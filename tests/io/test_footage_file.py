@@ -78,7 +78,9 @@ def test_a_film_that_was_cut_off_is_refused(tmp_path):
             read_footage(path, (64, 48))
 
 
-@pytest.mark.parametrize("content", [b"", b"not a film at all\n" * 40, bytes(range(256)) * 30, b"ffconcat version 1.0\nfile /etc/passwd\n"])
+@pytest.mark.parametrize(
+    "content", [b"", b"not a film at all\n" * 40, bytes(range(256)) * 30, b"ffconcat version 1.0\nfile /etc/passwd\n"]
+)
 def test_a_file_that_is_no_video_is_refused(tmp_path, content):
     path = tmp_path / "film.mp4"
     path.write_bytes(content)

@@ -11,7 +11,9 @@ from fluidlift.look.surface_map import SurfaceMap
 from fluidlift.types import PinholeCamera
 
 CELL, LEVEL = 0.2, 0.5
-CAMERA = PinholeCamera.looking((2.0, 2.0, 8.5), (2.0, 2.0, LEVEL), fov_degrees=30.0, size=(160, 160), up=(0.0, 1.0, 0.0))
+CAMERA = PinholeCamera.looking(
+    (2.0, 2.0, 8.5), (2.0, 2.0, LEVEL), fov_degrees=30.0, size=(160, 160), up=(0.0, 1.0, 0.0)
+)
 """sees 4.3 x 4.3 m of the surface from straight above"""
 PIXEL = 8.0 / CAMERA.focal[0]
 """m on the surface: seven and a half in a cell"""
@@ -36,7 +38,9 @@ def simulated(shore: float, axes=None, low: float = 0.3) -> SurfaceMap:
 def waterline(surface: SurfaceMap) -> float:
     """x of the right rim of the wet columns in the middle rows, m."""
     middle = np.abs(surface.middles()[0, :, 1] - 2.0) < 1.0
-    return float(np.max(np.where(surface.wet[:, middle], surface.middles()[:, middle, 0], -np.inf))) + 0.5 * surface.pitch
+    return (
+        float(np.max(np.where(surface.wet[:, middle], surface.middles()[:, middle, 0], -np.inf))) + 0.5 * surface.pitch
+    )
 
 
 @pytest.mark.parametrize("film", [2.35, 2.43, 2.6])
@@ -78,7 +82,9 @@ def test_only_the_rim_is_touched():
 
 def test_nothing_beyond_the_picture_is_touched():
     """A stream goes on where the film ends; its border is no waterline."""
-    near = PinholeCamera.looking((2.0, 2.0, 8.5), (2.0, 2.0, LEVEL), fov_degrees=12.0, size=(64, 64), up=(0.0, 1.0, 0.0))
+    near = PinholeCamera.looking(
+        (2.0, 2.0, 8.5), (2.0, 2.0, LEVEL), fov_degrees=12.0, size=(64, 64), up=(0.0, 1.0, 0.0)
+    )
     before, half = simulated(3.7), 8.0 * np.tan(np.radians(6.0))
     dry = FilmedOutline(near, np.full((64, 64), 1.0), CELL)  # a film that is dry all over, right at its fluid
     after = dry.cut(before, PlanAxes())

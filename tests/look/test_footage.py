@@ -14,7 +14,9 @@ INTERVAL = 0.04
 def noise(sigma: float = 1.0, contrast: float = 12.0, seed: int = 0, count: int = FRAMES) -> np.ndarray:
     """[T,H,W,1]: grain, another one in each frame."""
     rng = np.random.default_rng(seed)
-    grain = np.stack([cv2.GaussianBlur(rng.standard_normal(SIZE).astype(np.float32), (0, 0), sigma) for _ in range(count)])
+    grain = np.stack(
+        [cv2.GaussianBlur(rng.standard_normal(SIZE).astype(np.float32), (0, 0), sigma) for _ in range(count)]
+    )
     return contrast * (grain / grain.std())[..., None]
 
 
@@ -64,7 +66,9 @@ def test_what_is_broad_is_shade_and_what_is_small_is_fine():
     film = FluidFootage.of(frames, everywhere(), INTERVAL)
     inner = slice(8, -8)  # four standard deviations of the blur from the rim
     assert BROAD * max(SIZE) < 2
-    np.testing.assert_allclose(255 * film.shade[:, inner, 0], np.broadcast_to(wide[inner], (48, 48)), atol=1.0)  # rounding
+    np.testing.assert_allclose(
+        255 * film.shade[:, inner, 0], np.broadcast_to(wide[inner], (48, 48)), atol=1.0
+    )  # rounding
     fine = 255 * (film.mean - film.shade)[:, inner, 0]
     np.testing.assert_allclose(fine, np.broadcast_to(stripes[inner], (48, 48)), atol=1.0)
 

@@ -48,7 +48,9 @@ def test_velocities_come_back_from_the_map():
 
 def test_what_is_in_the_picture_or_near_it_is_shown():
     width, height = CAMERA.size
-    uv = np.array([[80, 60], [1, 1], [-0.5 * BESIDE * width, 60], [-1.5 * BESIDE * width, 60], [80, (1 + 1.5 * BESIDE) * height]])
+    uv = np.array(
+        [[80, 60], [1, 1], [-0.5 * BESIDE * width, 60], [-1.5 * BESIDE * width, 60], [80, (1 + 1.5 * BESIDE) * height]]
+    )
     world = CAMERA.unproject(uv, np.full(5, 4.0))
     np.testing.assert_array_equal(AXES.shown(AXES.points(world)), [True, True, True, False, False])
 

@@ -20,6 +20,7 @@ LABELS = {
     "motion": "velocities",
     "velocities": "velocities of every frame",
     "fit": "fitting the physics",
+    "calibrate": "calibrating the flow",
     "simulate": "re-simulating",
     "show": "rendering and writing",
 }

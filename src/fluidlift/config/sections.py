@@ -187,6 +187,8 @@ class SimulateConfig:
     """most particles"""
     device: Literal["cpu", "cuda"] = "cpu"
     """who moves the particles of a liquid: the CPU (Numba), or a GPU (NVIDIA Warp, `pip install "fluidlift[cuda]"`)"""
+    follow: float = 1.0
+    """how far it keeps to the filmed flow where geometry does not explain it: 0 pure physics, 1 as filmed"""
     checkpoint_every: int = 10
     """frames between checkpoints, from which a stopped simulation goes on"""
 

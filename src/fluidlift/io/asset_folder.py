@@ -69,6 +69,7 @@ FILES = {
     "velocity_volume": "rest/velocity.vdb",
     "camera": "rest/camera.json",
     "film": "rest/film.mp4",
+    "force": "rest/force.npz",
     "parameters": "parameters.json",
     "scene": "scene.yaml",
 }

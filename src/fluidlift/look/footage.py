@@ -21,6 +21,9 @@ SHOWN = 0.1
 RIM = 2
 """px inside its outline in which a pixel may show half of the bank: lens, coding and mask are no sharper than that"""
 
+SHARPER = 2
+"""steps of the deconvolution. Of 1, 2 and 3, 2 is nearest to the energy of clips in three bands (0.9 to 1.1 of it)"""
+
 FEWEST = 8
 """frames: a shorter film has no life of its own to show"""
 
@@ -102,15 +105,19 @@ def _without_rim(fluid: np.ndarray) -> np.ndarray:
 
 
 def _sharpened(picture: np.ndarray, fluid: np.ndarray, blur: float) -> np.ndarray:
-    """A picture that a blur makes into the given one, to first order: I + (I - G I), inside the fluid."""
+    """A picture that a blur G makes into the given one I, inside the fluid (van Cittert's deconvolution).
+
+    X <- X + (I - G X), from X = I on, `SHARPER` times: frequencies that G leaves g of come out with 1 - (1 - g)^n of
+    their size instead of g, n = `SHARPER` + 1, so noise is never amplified beyond what the blur takes from it.
+    """
     import cv2
 
-    def blurred(values: np.ndarray) -> np.ndarray:
-        return cv2.GaussianBlur(values, (0, 0), blur, borderType=cv2.BORDER_REPLICATE)
-
     weight = fluid.astype(np.float32)
-    smooth = blurred(picture * weight[..., None]) / np.maximum(blurred(weight), 1e-3)[..., None]
-    sharp = np.where(fluid[..., None], 2.0 * picture - smooth, picture)
+    share = np.maximum(cv2.GaussianBlur(weight, (0, 0), blur, borderType=cv2.BORDER_REPLICATE), 1e-3)[..., None]
+    sharp = picture.astype(np.float32)
+    for _ in range(SHARPER):
+        smooth = cv2.GaussianBlur(sharp * weight[..., None], (0, 0), blur, borderType=cv2.BORDER_REPLICATE) / share
+        sharp = np.where(fluid[..., None], sharp + picture - smooth, sharp)
     return np.clip(np.rint(sharp), 0, 255).astype(np.uint8)
 
 

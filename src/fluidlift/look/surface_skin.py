@@ -7,7 +7,9 @@ surface, new ones come where they have been drawn apart, and some go where they 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -19,7 +21,10 @@ from fluidlift.look.surface_map import SurfaceMap
 from fluidlift.types import Gaussians, sh_from_rgb
 
 PITCH = 0.25
-"""cells between tracers"""
+"""cells between tracers, at the coarsest level"""
+
+FINEST = 4
+"""levels, each finer than the one before by the square root of 2: at the last one 16 tracers stand for one"""
 
 WIDTH = 0.55
 """standard deviation of a splat along the surface, spacings of the tracers: no gaps, no blur"""
@@ -49,10 +54,18 @@ def of_skin(gaussians: Gaussians, cell: float) -> Bool[np.ndarray, " n"]:
         cell: width of the simulator's cells, m.
     """
     wanted = cell * np.array([THICKNESS, WIDTH * PITCH, WIDTH * PITCH])
-    s = gaussians.scales
-    found = np.abs(np.minimum(np.minimum(s[:, 0], s[:, 1]), s[:, 2]) - wanted[0]) < ALIKE * wanted[0]
-    found[found] = (np.abs(np.sort(gaussians.scales[found], axis=1) / wanted - 1.0) < ALIKE).all(axis=1)
+    least = gaussians.scales.min(axis=1)
+    found = np.zeros(len(gaussians), bool)
+    for level in range(FINEST + 1):
+        size = wanted * _finer(level)
+        like = np.flatnonzero(np.abs(least - size[0]) < ALIKE * size[0])
+        found[like] |= (np.abs(np.sort(gaussians.scales[like], axis=1) / size - 1.0) < ALIKE).all(axis=1)
     return found
+
+
+def _finer(level: Int[np.ndarray, "*n"] | int) -> Any:
+    """Sizes at a level, shares of those at level 0."""
+    return 2.0 ** (-0.5 * np.asarray(level))
 
 
 def without_skin(gaussians: Gaussians, cell: float) -> Gaussians:
@@ -126,17 +139,19 @@ class SurfaceSkin:
 
     Args:
         cell: width of the simulator's cells, m.
+        level_at: (places [n,2] m) -> level of the tracers there, 0 to `FINEST`; None: 0 everywhere.
 
     Raises:
         ValueError: a width that is not positive.
     """
 
-    def __init__(self, cell: float) -> None:
+    def __init__(self, cell: float, level_at: Callable[[np.ndarray], np.ndarray] | None = None) -> None:
         require(cell > 0, f"cell {cell}", "positive metres")
         self.places: Float[np.ndarray, "n 2"] = np.zeros((0, 2))
         self.ids: Int[np.ndarray, " n"] = np.zeros(0, np.int64)
+        self.levels: Int[np.ndarray, " n"] = np.zeros(0, np.int64)
         self.next_id = 0
-        self._cell, self._spacing = cell, PITCH * cell
+        self._cell, self._level_at = cell, level_at
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -144,22 +159,38 @@ class SurfaceSkin:
     def advance(self, surface: SurfaceMap, interval: float, rng: np.random.Generator) -> None:
         """Float with the surface for an interval (s), and fill what has come apart."""
         self.places = self.places + interval * surface.at(surface.velocity[..., :2], self.places)
-        self._keep(surface.presence(self.places) > 0.5)
-        if len(self) > 1:
-            self._keep(_sparse(self.places, self.ids, CROWDED * self._spacing))
-        low = np.floor(surface.low / self._spacing)
-        count = np.ceil(np.array(surface.wet.shape) * surface.pitch / self._spacing).astype(int) + 1
-        lattice = ((low + np.moveaxis(np.indices(count), 0, -1) + 0.5) * self._spacing).reshape(-1, 2)
+        levels = self._levels(self.places)
+        self._keep((surface.presence(self.places) > 0.5) & (levels == self.levels))
+        present = np.unique(self._levels(surface.columns())) if surface.wet.any() else np.zeros(0, np.int64)
+        for level in present:
+            self._fill(surface, int(level), rng)
+
+    def _fill(self, surface: SurfaceMap, level: int, rng: np.random.Generator) -> None:
+        """Tracers of a level go where they are crowded, and come where they are drawn apart."""
+        spacing, own = PITCH * self._cell * float(_finer(level)), np.flatnonzero(self.levels == level)
+        if len(own) > 1:
+            keep = np.ones(len(self), bool)
+            keep[own] = _sparse(self.places[own], self.ids[own], CROWDED * spacing)
+            self._keep(keep)
+            own = np.flatnonzero(self.levels == level)
+        low = np.floor(surface.low / spacing)
+        count = np.ceil(np.array(surface.wet.shape) * surface.pitch / spacing).astype(int) + 1
+        lattice = ((low + np.moveaxis(np.indices(count), 0, -1) + 0.5) * spacing).reshape(-1, 2)
         lattice = lattice[surface.presence(lattice) > 0.5]
-        if len(self) and len(lattice):
-            lattice = lattice[cKDTree(self.places).query(lattice)[0] > BARE * self._spacing]
-        fresh = lattice + rng.uniform(-0.25, 0.25, lattice.shape) * self._spacing
+        lattice = lattice[self._levels(lattice) == level]
+        if len(own) and len(lattice):
+            lattice = lattice[cKDTree(self.places[own]).query(lattice)[0] > BARE * spacing]
+        fresh = lattice + rng.uniform(-0.25, 0.25, lattice.shape) * spacing
         self.places = np.concatenate([self.places, fresh])
         self.ids = np.concatenate([self.ids, self.next_id + np.arange(len(fresh))])
+        self.levels = np.concatenate([self.levels, np.full(len(fresh), level)])
         self.next_id += len(fresh)
 
+    def _levels(self, places: np.ndarray) -> np.ndarray:
+        return np.zeros(len(places), np.int64) if self._level_at is None else self._level_at(places)
+
     def _keep(self, index: np.ndarray) -> None:
-        self.places, self.ids = self.places[index], self.ids[index]
+        self.places, self.ids, self.levels = self.places[index], self.ids[index], self.levels[index]
 
     def points(self, surface: SurfaceMap) -> Float[np.ndarray, "n 3"]:
         """Where the tracers are, m."""
@@ -175,8 +206,8 @@ class SurfaceSkin:
         # the shortest turn from z to the normal
         quats = np.stack([1 + normal[:, 2], -normal[:, 1], normal[:, 0], np.zeros(n)], axis=-1)
         quats /= np.linalg.norm(quats, axis=1, keepdims=True)
-        wide = WIDTH * self._spacing
-        scales = np.broadcast_to(np.array([wide, wide, THICKNESS * self._cell], np.float32), (n, 3)).copy()
+        sizes = self._cell * np.array([WIDTH * PITCH, WIDTH * PITCH, THICKNESS])
+        scales = (_finer(self.levels)[:, None] * sizes).astype(np.float32)
         return Gaussians(
             self.points(surface).astype(np.float32), quats.astype(np.float32), scales,
             np.full(n, OPACITY, np.float32), sh_from_rgb(np.clip(colors, 0.0, 1.0)),

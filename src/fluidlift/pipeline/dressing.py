@@ -63,8 +63,9 @@ LOOKED_UP = 1 / 6 + 0.3
 AS_AT_REST = "its surface looks as it did at rest"
 """what follows where there is no film to play"""
 
-WIDEST = 1.5
-"""px of the splats' standard deviation that is taken out of a film at most: beyond, noise is all that is sharpened"""
+FINE = 1.7
+"""px of the film between tracers of a skin that plays it, at most: with splats of `WIDTH` spacings the finest band
+of a Laplacian pyramid keeps half of its energy, which sharpening the film gives back"""
 
 SMALLEST = 0.02
 """standard deviation of a splat at least, cells: files hold its logarithm"""
@@ -119,8 +120,8 @@ def _footage(film: Path, camera: PinholeCamera, means: np.ndarray, cell: float) 
         return f"has {len(frames)} frames and needs {FEWEST}: {AS_AT_REST}; make the asset from a longer clip"
     camera = camera.resized((frames.shape[2], frames.shape[1]))
     depth = float(np.median(camera.project(means)[1]))
-    splat = WIDTH * PITCH * cell * camera.focal[0] / max(depth, 1e-6)
-    blur = float(np.sqrt(min(splat, WIDEST) ** 2 + LOOKED_UP))
+    apart = min(PITCH * cell * camera.focal[0] / max(depth, 1e-6), FINE)
+    blur = float(np.sqrt((WIDTH * apart) ** 2 + LOOKED_UP))
     found = FluidFootage.of(frames, fluid, interval, blur=blur)
     return f"shows none: {AS_AT_REST}; make the asset again" if found is None else found
 
@@ -137,6 +138,7 @@ class Dressing:
         self._surface: SurfaceMap | None = None
         self._axes: SurfaceAxes
         self._outline: FilmedOutline | None = None
+        self._plays = False
         self._own = scene.rest.select(np.arange(len(scene.rest) - sum(map(len, scene.emitter_looks))))
         if len(self._own) and len(scene.body):
             self._lay_skin()
@@ -175,6 +177,7 @@ class Dressing:
         )  # fmt: skip
         if footage is not None and scene.kind in LYING and not scene.edited:
             self._outline = FilmedOutline(self._camera, footage.outside, self._cell)
+        self._plays = footage is not None
         self._begin_again()
 
     def _film_of(self, own: Gaussians) -> FluidFootage | None:
@@ -188,6 +191,20 @@ class Dressing:
             return None
         self._camera = scene.camera.resized((found.mean.shape[1], found.mean.shape[0]))
         return found
+
+    def _level_at(self, places: np.ndarray) -> np.ndarray:
+        """How fine the skin is at places of the map: as the film's pixels are there, 0 beside its picture."""
+        from fluidlift.look.surface_skin import FINEST, PITCH
+
+        assert self._surface is not None
+        heights = self._surface.at(self._surface.height, places)
+        world = self._axes.world_points(np.concatenate([places, heights[:, None]], axis=1))
+        camera = self._camera
+        uv, depth = camera.project(world)
+        inside = (depth > 0) & ((uv >= 0) & (uv <= np.array(camera.size))).all(axis=1)
+        apart = PITCH * self._cell * camera.focal[0] / np.maximum(depth, 1e-6)
+        level = np.ceil(2.0 * np.log2(np.maximum(apart / FINE, 1.0)) - 1e-6).astype(np.int64)
+        return np.where(inside, np.minimum(level, FINEST), 0)
 
     def _seen_texture(self, surface: SurfaceMap, footage: FluidFootage | None) -> SeenTexture:
         from fluidlift.look.inflow import ENDS
@@ -220,7 +237,10 @@ class Dressing:
         from fluidlift.look.texture_patches import Patches
 
         assert self._patches is not None
-        self._patches.state, self._skin = Patches.none(), SurfaceSkin(self._cell)
+        self._patches.state, self._skin = (
+            Patches.none(),
+            SurfaceSkin(self._cell, self._level_at if self._plays else None),
+        )
 
     def advance(self, particles: Particles, number: int) -> None:
         """Bring what floats on the surface to a frame; every frame after the last one, in order."""
@@ -328,7 +348,7 @@ class Dressing:
         if self._patches is None:
             return {}
         patches = {f"patches.{name}": np.array(value) for name, value in vars(self._patches.state).items()}
-        skin = {"skin.places": self._skin.places.copy(), "skin.ids": self._skin.ids.copy()}
+        skin = {f"skin.{name}": getattr(self._skin, name).copy() for name in ("places", "ids", "levels")}
         return patches | skin | {"skin.next_id": np.int64(self._skin.next_id)}
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
@@ -345,14 +365,15 @@ class Dressing:
             parts = {n.removeprefix("patches."): np.array(a) for n, a in state.items() if n.startswith("patches.")}
             patches, places = Patches(**parts), np.array(state["skin.places"], np.float64)
             ids, next_id = np.array(state["skin.ids"], np.int64), int(state["skin.next_id"])
+            levels = np.array(state["skin.levels"], np.int64)
         except (KeyError, TypeError, ValueError) as error:
             raise InputRejected(f"the state of a surface that does not fit: {error}") from None
         n = len(patches.turns)
-        shapes = [(patches.centers, (n, 2)), (patches.sources, (n, 2)), (places, (len(ids), 2))]
+        shapes = [(patches.centers, (n, 2)), (patches.sources, (n, 2)), (places, (len(ids), 2)), (levels, ids.shape)]
         shapes += [(a, (n,)) for a in (patches.turns, patches.strains, patches.presences, patches.instants)]
         shapes += [(np.nan_to_num(patches.ends, posinf=0.0), (n,))]  # without footage they do not end
         for array, shape in shapes:
             if array.shape != shape or not np.isfinite(array).all():
                 raise InputRejected("the state of a surface with arrays of another shape, or not finite", "a whole one")
         self._patches.state = patches
-        self._skin.places, self._skin.ids, self._skin.next_id = places, ids, next_id
+        self._skin.places, self._skin.ids, self._skin.levels, self._skin.next_id = places, ids, levels, next_id

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+import tempfile
 import time
 from collections.abc import Iterable
 from pathlib import Path
@@ -10,18 +11,18 @@ from typing import Any
 
 from fluidlift import __version__
 from fluidlift.config import JobConfig
-from fluidlift.pipeline import begin, body, generating, lifting, moving, refining, simulating
+from fluidlift.pipeline import begin, body, calibrating, generating, lifting, moving, refining, simulating
 from fluidlift.pipeline.begin import input_hashes, provenance_of
 from fluidlift.pipeline.fit_request import request_of
 from fluidlift.pipeline.reading import Inputs, clip_of
 from fluidlift.pipeline.resimulate import Made, play
-from fluidlift.pipeline.scene import SimulationRequest, first_of_film
+from fluidlift.pipeline.scene import SimulationRequest, first_of_film, scene_of
 from fluidlift.pipeline.seeing import masks_of
-from fluidlift.pipeline.story import Progress, Silence, Story, gone_if_refused
+from fluidlift.pipeline.story import Progress, Result, Silence, Story, gone_if_refused
 from fluidlift.pipeline.written import require_stages
 from fluidlift.types import FluidAsset
 
-STAGES = ("read", "flow", "segment", "geometry", "refine", "motion", "fit", "simulate", "show")
+STAGES = ("read", "flow", "segment", "geometry", "refine", "motion", "fit", "calibrate", "simulate", "show")
 
 
 def make(
@@ -84,6 +85,7 @@ def _run(story: Story, inputs: Inputs, config: JobConfig) -> dict[str, Any]:
 def _write_asset(story: Story, folder: Path, config: JobConfig, provenance: dict[str, Any]) -> None:
     """The body at rest and what moves it; simulation and pictures come after."""
     from fluidlift.io.asset_folder import save_asset
+    from fluidlift.io.force_file import write_force
 
     clip, g = clip_of(story), story["geometry"]
     setting = body.setting_of(story)
@@ -104,12 +106,31 @@ def _write_asset(story: Story, folder: Path, config: JobConfig, provenance: dict
         frame_count=len(clip),
         provenance=provenance | origin,
     )
+    write_force(folder, calibrating.force_of(_calibrated(story, asset, config)))
     save_asset(
         folder,
         asset,
         timings={k: float(t["seconds"]) for k, t in story.timings.items()},
         metrics=_metrics(story),
         warnings=story.warnings,
+    )
+
+
+def _calibrated(story: Story, asset: FluidAsset, config: JobConfig) -> Result:
+    """The force that keeps the filmed flow, from a run without what scene.yaml changes."""
+    with tempfile.TemporaryDirectory(prefix="fluidlift-calibrate-") as name:
+        start = story["geometry"].meta["rest_frame"]
+        scene = scene_of(asset, Path(name), SimulationRequest(), config, footage=None, start=start)
+    target = calibrating.mean_target(asset, lifting.targets_of(story))
+    return story.run(
+        "calibrate",
+        lambda: (
+            calibrating.calibrate(scene, target, device=config.simulate.device, step=story.step)
+            if config.simulate.follow > 0
+            else Result()
+        ),
+        settings=[config.simulate.follow > 0, scene.frames, config.seed],
+        after=("geometry", "refine", "motion", "fit"),
     )
 
 
@@ -142,6 +163,7 @@ def _metrics(story: Story) -> dict[str, Any]:
         "fit_rollouts": story["fit"].meta["rollouts"],
         "fit_extra": story["fit"].meta["extra"],
         "fit": fit_figures(story),
+        "calibration": {k: v for k, v in story["calibrate"].meta.items() if isinstance(v, int | float)},
     }
 
 

@@ -17,6 +17,7 @@ from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected
 from fluidlift.look.appearance import SteadyShading
 from fluidlift.physics.inflow_schedule import InflowSchedule
+from fluidlift.pipeline.following import following
 from fluidlift.pipeline.reading import clip_of
 from fluidlift.pipeline.reshaping import changed_parameters, with_emitters, with_terrain
 from fluidlift.pipeline.seeing import labels_of
@@ -129,6 +130,8 @@ class Scene:
     """of the fluid, which its surface plays; None, or a file that cannot be played: it looks as it did at rest"""
     film_start: int = 0
     """frame of the film that the body at rest shows"""
+    force: FaceVelocity | None = None
+    """m/s^2 on the faces of the terrain's grid, beside gravity"""
 
     @property
     def simulated(self) -> int:
@@ -165,6 +168,8 @@ class Scene:
             found["emitters"] = _hash(*(x for e in self.emitters for x in e.plain()))
         if self.inflow != InflowSchedule():
             found["inflow"] = _hash(self.inflow)
+        if self.force is not None:
+            found["force"] = _hash(*self.force.components)
         if self.overlap:
             found["loop"] = _hash(self.frames, self.overlap)
         return found
@@ -258,6 +263,8 @@ def scene_of(
     from fluidlift.numerics.sampling import sample_faces
 
     edits = read_edits(folder, meshes=request.meshes)
+    # edits that are tried out lie elsewhere than their asset
+    home = folder if request.meshes is None or (folder / "manifest.json").is_file() else request.meshes
     interval = asset.interval if request.fps is None else 1.0 / request.fps
     duration = edits.duration if request.duration is None else request.duration
     clip_frames = max(1, round((asset.frame_count - start) * asset.interval / interval))
@@ -274,12 +281,14 @@ def scene_of(
         asset.parameters.updated(changes), asset.camera, interval, asset.interval,
         wanted or config.simulate.frames or clip_frames, config.seed, edits.obstacles, shading,
         longest_step=longest_step, inflow=edits.inflow, changes=changed_parameters(asset.parameters, changes),
-        film=film_of(folder), film_start=start - first_of_film(start, asset.frame_count),
+        film=film_of(home), film_start=start - first_of_film(start, asset.frame_count),
     )  # fmt: skip
     longer = edits.extend_downstream if request.extend_downstream is None else request.extend_downstream
     if longer > 0:
         scene = extended(scene, longer)
     scene = with_emitters(with_terrain(scene, edits.terrain), edits.emitters)
+    if config.simulate.follow > 0:
+        scene = following(scene, asset, home, config.simulate.follow)
     return replace(scene, overlap=loop_overlap(scene)) if edits.loop else scene
 
 
@@ -291,7 +300,7 @@ def film_of(folder: Path) -> Path | None:
     """
     from fluidlift.io.asset_folder import asset_file, read_manifest
 
-    if not (folder / "manifest.json").is_file():  # edits alone, which a preview shows
+    if not (folder / "manifest.json").is_file():  # not finished yet
         return None
     name = read_manifest(folder)["files"].get("film")
     return None if name is None else asset_file(folder, name)
@@ -369,6 +378,13 @@ def loop_overlap(scene: Scene) -> int:
     return int(np.clip(round(fade / scene.interval), 2, scene.frames // 2))
 
 
+def wave_speed(scene: Scene) -> float:
+    """Of a long gravity wave on the fluid where it is deep, m/s."""
+    h, wet = scene.terrain.grid.spacing, (scene.cell_types == CellType.FLUID).sum(axis=2)
+    depth = h * float(np.percentile(wet[wet > 0], 90)) if (wet > 0).any() else h
+    return float(np.sqrt(np.linalg.norm(scene.parameters.gravity) * depth))
+
+
 def simulation_step(scene: Scene) -> FluidParameters:
     """The same physics with the simulator's own longest step.
 
@@ -378,10 +394,7 @@ def simulation_step(scene: Scene) -> FluidParameters:
     """
     parameters, interval = scene.parameters, min(scene.interval, scene.clip_interval)
     h = scene.terrain.grid.spacing
-    wet = (scene.cell_types == CellType.FLUID).sum(axis=2)
-    depth = h * float(np.percentile(wet[wet > 0], 90)) if (wet > 0).any() else h
-    wave = float(np.sqrt(np.linalg.norm(parameters.gravity) * depth))
-    longest = interval if scene.kind == "plume" else h / max(wave, 1e-6)
+    longest = interval if scene.kind == "plume" else h / max(wave_speed(scene), 1e-6)
     step = float(np.clip(longest, interval / 8, interval))
     if scene.longest_step is not None:
         step = min(float(scene.longest_step), scene.interval)

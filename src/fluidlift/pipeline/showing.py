@@ -192,9 +192,9 @@ def _panels(
             view = painter.shown(frame, side, Backdrop())
         panels = [caption(_resized(picture, size), "re-simulation"), caption(view, "side view")]
         if footage is not None:
-            time = footage.start + round(k * scene.interval / scene.clip_interval)
-            source = footage.clip.frames[min(time, len(footage.clip) - 1)]
-            panels.insert(0, caption(_resized(source, size), "input"))
+            time, clip = round(k * scene.interval / scene.clip_interval), footage.clip.frames[footage.start :]
+            again = time >= len(clip)  # beyond its end the clip begins again: a still would say nothing of the motion
+            panels.insert(0, caption(_resized(clip[time % len(clip)], size), "input, again" if again else "input"))
         yield np.concatenate(panels, axis=1)
 
 

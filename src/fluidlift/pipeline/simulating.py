@@ -21,6 +21,7 @@ from fluidlift.types import CellType, Gaussians, Particles
 
 if TYPE_CHECKING:
     from fluidlift.look.inflow import InflowLook
+    from fluidlift.physics.guidance import BodyForce
     from fluidlift.physics.numba_particles import ParticleWork
     from fluidlift.physics.stepping import ParticleSimulator
 
@@ -44,8 +45,8 @@ def particle_work(device: str) -> ParticleWork:
     return ParticleWork(WarpTransfer(device), WarpMover(device))
 
 
-def simulator_of(scene: Scene, device: str = "cpu") -> ParticleSimulator:
-    """The simulator at the first instant. Smoke is simulated on the CPU."""
+def simulator_of(scene: Scene, device: str = "cpu", forces: Sequence[BodyForce] = ()) -> ParticleSimulator:
+    """The simulator at the first instant. Smoke is simulated on the CPU, without `forces`."""
     from fluidlift.physics.emitter import Supply
 
     parameters = simulation_step(scene)
@@ -61,12 +62,15 @@ def simulator_of(scene: Scene, device: str = "cpu") -> ParticleSimulator:
             buoyancy=float(np.linalg.norm(parameters.gravity)), supply=supply,
         )  # fmt: skip
     from fluidlift.physics.apic import LiquidSimulator
+    from fluidlift.physics.guidance import SteadyForce
 
+    if scene.force is not None:
+        forces = (*forces, SteadyForce(scene.force))
     cells, body = within_outlet(scene)
     return LiquidSimulator(
         grid, scene.terrain, parameters, body, cell_types=cells, inflow_profile=scene.velocity,
         seed=scene.seed, emit_source=look, bodies=scene.bodies, work=particle_work(device), supply=supply,
-        open_sides=sides_open_to_air(parameters.gravity),
+        open_sides=sides_open_to_air(parameters.gravity), forces=forces,
     )  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Body forces that depend on the place: a steady one accelerates, a pull decays as its time says and tells what it took."""
+"""Body forces of each place: a steady one accelerates, a pull decays in its time, and tells what it took."""
 
 import numpy as np
 import pytest
@@ -34,8 +34,8 @@ def blob(
     body = Particles.at_rest(points, 1.0, velocities=np.broadcast_to(np.float32(velocity), points.shape))
     terrain = Terrain(GRID, np.full([n + 1 for n in GRID.shape], 10.0, np.float32), np.array([1.0, 0.0, 0.0]), NO_MESH)
     return LiquidSimulator(
-        GRID, terrain, FluidParameters(gravity=gravity, time_step=step), body, cell_types=np.zeros(GRID.shape, np.uint8),
-        open_sides=np.zeros((3, 2), bool), forces=forces,
+        GRID, terrain, FluidParameters(gravity=gravity, time_step=step), body,
+        cell_types=np.zeros(GRID.shape, np.uint8), open_sides=np.zeros((3, 2), bool), forces=forces,
     )  # fmt: skip
 
 

@@ -1,5 +1,4 @@
-"""An asset carries a film of its fluid, which its surface plays; one that cannot be played is said, and missed in nothing
-else."""
+"""An asset carries a film of its fluid, which its surface plays; where it cannot, that is said and all else stays."""
 
 import shutil
 from dataclasses import replace

@@ -81,7 +81,7 @@ def test_splats_that_lie_on_the_map_face_the_camera():
 
 
 def test_a_splat_that_leans_on_the_map_leans_so_before_the_camera():
-    """Turned by 30 degrees about the map's X, which is the camera's right, its normal goes up in the picture or down."""
+    """Turned by 30 degrees about the map's X, which is the camera's right, its normal leans down in the picture."""
     angle = np.radians(30.0)
     lean = Gaussians(
         np.zeros((1, 3)) + [0, 0, -5.0], [[np.cos(angle / 2), np.sin(angle / 2), 0, 0]], [[0.2, 0.2, 0.01]],

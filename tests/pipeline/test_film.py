@@ -113,6 +113,20 @@ def test_a_fall_without_its_film_is_told_as_well(channel, tmp_path):
     assert CONSEQUENCE in dressing.warnings[0] and (shown.ids % 2 == 0).all()
 
 
+def test_a_film_is_taken_apart_once_and_again_when_it_has_changed(channel, tmp_path):
+    """A live preview begins anew with every edit."""
+    from fluidlift.pipeline.dressing import _taken_apart
+
+    path = film(tmp_path / "film.mp4")
+    scene, before = channel(FRAMES, film=path), _taken_apart.cache_info()
+    for _ in range(2):
+        assert Dressing(scene).warnings == ()
+    after = _taken_apart.cache_info()
+    assert after.misses == before.misses + 1 and after.hits == before.hits + 1
+    path.write_bytes(b"something else")
+    assert CONSEQUENCE in Dressing(scene).warnings[0]
+
+
 def test_another_film_is_another_look_and_a_missing_one_is_none(channel, tmp_path):
     """Frames on disk, and the checkpoint, are those of one film."""
     one, two = film(tmp_path / "a.mp4"), film(tmp_path / "b.mp4", count=17)

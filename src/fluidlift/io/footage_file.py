@@ -15,8 +15,8 @@ from fluidlift.io.pictures import fitted_size, resample
 from fluidlift.io.video import read_clip
 
 MOST_FRAMES = 120
-"""frames of the clip: four seconds at 30 per second, 0.2 to 1.3 MB at 512 px. Patches of footage last half of it, longer than
-foam does"""
+"""frames of the clip: four seconds at 30 per second, 0.2 to 1.3 MB at 512 px. Patches of footage last half of it, longer
+than foam does"""
 LARGEST = 1024
 """px of a picture's longer side: those of a larger clip are scaled down"""
 QUALITY = 14.0
@@ -25,6 +25,11 @@ MOST_BYTES = 256 * 2**20
 """of the file: more than any film of `MOST_FRAMES` takes"""
 LIMITS = ReadLimits(max_pixels=2 * LARGEST**2 + 16 * LARGEST, max_frames=4 * MOST_FRAMES, max_bytes=2**30)
 """on what is read back; the file may come from a stranger"""
+
+
+def size_of_film(size: tuple[int, int]) -> tuple[int, int]:
+    """(width, height) of the pictures that are kept of a clip of some size, px."""
+    return fitted_size(size, LARGEST)
 
 
 def write_footage(
@@ -37,7 +42,7 @@ def write_footage(
         ValueError: no frames.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    size = fitted_size(fluid.shape[2:0:-1], LARGEST)
+    size = size_of_film(fluid.shape[2:0:-1])
 
     def stacked(picture: np.ndarray, mask: np.ndarray) -> np.ndarray:
         marks = np.repeat(255 * mask[..., None].astype(np.uint8), 3, axis=-1)
@@ -62,7 +67,7 @@ def read_footage(path: Path, size: tuple[int, int]) -> tuple[np.ndarray, np.ndar
     clip = read_clip(path, max_size=2 * LARGEST + 16, limits=LIMITS)
     if any("damaged" in note for note in clip.warnings):
         raise InputRejected(f"'{path.name}' is damaged or cut off", "a whole film", "make the asset again")
-    width, height = fitted_size(size, LARGEST)
+    width, height = size_of_film(size)
     rows = height + height % 2
     if clip.size != (width + width % 2, 2 * rows):
         raise InputRejected(

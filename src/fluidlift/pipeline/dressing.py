@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -106,22 +107,32 @@ def _footage(film: Path, camera: PinholeCamera, means: np.ndarray, cell: float) 
         means: of the body's Gaussians, m.
         cell: width of the simulator's cells, m.
     """
-    from fluidlift.io.footage_file import read_footage
-    from fluidlift.look.footage import FEWEST, FluidFootage
+    from fluidlift.io.footage_file import size_of_film
     from fluidlift.look.surface_skin import PITCH, WIDTH
 
     if not film.is_file():
         return f"is missing: {AS_AT_REST}; make the asset again"
+    small = camera.resized(size_of_film(camera.size))
+    depth = float(np.median(small.project(means)[1]))
+    apart = min(PITCH * cell * small.focal[0] / max(depth, 1e-6), FINE)
+    blur = float(np.sqrt((WIDTH * apart) ** 2 + LOOKED_UP))
+    written = film.stat()
+    return _taken_apart(film, camera.size, blur, (written.st_mtime_ns, written.st_size))
+
+
+@lru_cache(maxsize=1)
+def _taken_apart(film: Path, size: tuple[int, int], blur: float, written: tuple[int, int]) -> FluidFootage | str:
+    """As `_footage`, of a file as it was `written`. The last one is kept: it takes a second or two, and a live preview
+    begins anew with every edit."""
+    from fluidlift.io.footage_file import read_footage
+    from fluidlift.look.footage import FEWEST, FluidFootage
+
     try:
-        frames, fluid, interval = read_footage(film, camera.size)
+        frames, fluid, interval = read_footage(film, size)
     except InputRejected as error:
         return f"is damaged ({error.got}): {AS_AT_REST}; make the asset again"
     if len(frames) < FEWEST:
         return f"has {len(frames)} frames and needs {FEWEST}: {AS_AT_REST}; make the asset from a longer clip"
-    camera = camera.resized((frames.shape[2], frames.shape[1]))
-    depth = float(np.median(camera.project(means)[1]))
-    apart = min(PITCH * cell * camera.focal[0] / max(depth, 1e-6), FINE)
-    blur = float(np.sqrt((WIDTH * apart) ** 2 + LOOKED_UP))
     found = FluidFootage.of(frames, fluid, interval, blur=blur)
     return f"shows none: {AS_AT_REST}; make the asset again" if found is None else found
 

@@ -4,9 +4,12 @@ import numpy as np
 import pytest
 
 from fluidlift.look.appearance import SteadyShading
+from fluidlift.look.footage import FluidFootage
+from fluidlift.look.picture_texture import PictureTexture
 from fluidlift.look.seen_texture import SeenTexture
+from fluidlift.look.surface_axes import PictureAxes
 from fluidlift.look.surface_map import SurfaceMap
-from fluidlift.look.texture_patches import LIMIT, TexturePatches
+from fluidlift.look.texture_patches import FASTEST, LIMIT, Patches, TexturePatches
 from fluidlift.types import Gaussians, PinholeCamera
 
 CELL, SIZE = 0.1, 4.0
@@ -160,3 +163,214 @@ def test_a_radius_of_nothing_and_a_body_out_of_sight_are_refused():
     away = PinholeCamera.looking((2.0, 2.0, 10.0), (2.0, 9.0, 20.0), fov_degrees=20.0, size=(64, 64))
     with pytest.raises(ValueError, match="nothing was seen"):
         TexturePatches(SeenTexture(sheet(), away, where), 0.6)
+
+
+# with a film of the surface ------------------------------------------------------------------------------------------
+
+STEP = 0.05
+"""s between frames"""
+AXES = PictureAxes(CAMERA, 9.5)
+CONTRAST = 0.1
+
+
+def noise_film(count: int = 60, fluid: np.ndarray | None = None) -> FluidFootage:
+    """Grain around grey, another one in each pixel, frame and colour."""
+    values = 0.5 + CONTRAST * np.random.default_rng(11).normal(size=(count, 128, 128, 3))
+    frames = np.round(255 * np.clip(values, 0, 1)).astype(np.uint8)
+    film = FluidFootage.of(frames, np.ones(frames.shape[:3], bool) if fluid is None else fluid, STEP)
+    assert film is not None
+    return film
+
+
+FILM = noise_film()
+
+
+def upright(flow) -> SurfaceMap:
+    """`surface` as a map over the picture."""
+    x, y, z = np.meshgrid(np.arange(0.025, SIZE, 0.05), np.arange(0.025, SIZE, 0.05), [0.45, 0.5], indexing="ij")
+    world = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+    moving = np.stack([*flow(world[:, 0], world[:, 1]), np.zeros(len(world))], axis=-1)
+    return SurfaceMap.of(AXES.points(world), AXES.velocities(world, moving), CELL)
+
+
+def uniform(u: float, v: float = 0.0):
+    return lambda x, y: (u + 0 * x, v + 0 * y)
+
+
+def played(frames: int, film: FluidFootage = FILM, *, now=None, interval: float = STEP, **options) -> TexturePatches:
+    """Patches of a film, of a surface that was seen to flow at 0.5 m/s, after some frames of the flow `now`."""
+    seen = upright(uniform(0.5))
+    patches = TexturePatches(PictureTexture(AXES, seen, film), 0.6, footage=film, **options)
+    patches.advance(seen, 0.0, np.random.default_rng([3, 0]))
+    where = seen if now is None else upright(now)
+    for k in range(1, frames + 1):
+        patches.advance(where, interval, np.random.default_rng([3, k]))
+    return patches
+
+
+def pixels(inset: int = 40) -> tuple[np.ndarray, np.ndarray]:
+    """Points of the map (m) at the middles of pixels, and these pixels."""
+    index = np.stack(np.meshgrid(np.arange(inset, 128 - inset), np.arange(inset, 128 - inset), indexing="ij"), -1)
+    index = index.reshape(-1, 2)
+    world = CAMERA.unproject(index[:, ::-1] + 0.5, np.full(len(index), 9.5))
+    return AXES.points(world), index
+
+
+def shown_at(film: FluidFootage, index: np.ndarray, frame: int) -> np.ndarray:
+    return film.frames[frame, index[:, 0], index[:, 1]] / 255.0
+
+
+def at_home(centers: np.ndarray, instants: np.ndarray) -> Patches:
+    n = len(centers)
+    return Patches(centers, centers.copy(), np.zeros(n), np.zeros(n), np.ones(n), instants, np.full(n, np.inf))
+
+
+def test_patches_of_a_film_stay_and_play_as_fast_as_it_was_filmed():
+    before, after = (played(n, start=4.0).state for n in (0, 1))
+    n = len(before)
+    np.testing.assert_array_equal(after.centers[:n], before.centers)
+    np.testing.assert_array_equal(after.turns, 0)
+    assert (before.instants == 4).all()
+    np.testing.assert_allclose(after.instants[:n], 5.0, rtol=1e-12)
+    slow = played(1, start=4.0, interval=0.25 * STEP).state
+    np.testing.assert_allclose(slow.instants[:n], 4.25, rtol=1e-12)
+
+
+@pytest.mark.parametrize("instant", [0, 7, 59])
+def test_one_patch_at_home_shows_the_clips_own_picture(instant):
+    patches = played(0)
+    patches.state = at_home(np.zeros((1, 2)), np.array([float(instant)]))
+    points, index = pixels(inset=56)
+    color, there = patches.colors(points)
+    assert there.all()
+    np.testing.assert_allclose(color, shown_at(FILM, index, instant), atol=1e-5)  # single precision
+
+
+def test_patches_of_one_instant_show_together_what_one_of_them_shows():
+    """What they share is one picture, not several that happen to be added up: where they overlap it is no livelier."""
+    patches = played(0, start=9.0)
+    points, index = pixels()
+    assert len(patches.state) > 10
+    color, there = patches.colors(points)
+    assert there.all()
+    np.testing.assert_allclose(color, shown_at(FILM, index, 9), atol=1e-5)
+
+
+def test_a_surface_seen_in_plan_shows_the_clips_own_picture_whatever_its_level():
+    """Water that has risen is looked up where it is seen now."""
+    where = surface(uniform(0.5))
+    patches = TexturePatches(SeenTexture(sheet(), CAMERA, where), 0.6, footage=FILM, start=9.0)
+    patches.advance(where, 0.0, np.random.default_rng(0))
+    index = pixels()[1]
+    for depth in (9.5, 9.3):  # the surface as it was, and 20 cm higher
+        points = CAMERA.unproject(index[:, ::-1] + 0.5, np.full(len(index), depth))
+        color, there = patches.colors(points)
+        assert there.all()
+        np.testing.assert_allclose(color, shown_at(FILM, index, 9), atol=1e-4)  # single precision of the projection
+
+
+def test_a_blend_of_pieces_of_different_instants_is_as_lively_as_each():
+    """Two patches of the same weight along the line between them; a mean would have half of the variance."""
+    patches, rng = played(0), np.random.default_rng(8)
+    points, index = pixels(inset=50)
+    middle = np.abs(points[:, 0] - points[len(points) // 2, 0]) < 1e-6
+    points, index = points[middle], index[middle]
+    x = points[0, 0]
+    found, mean = [], FILM.mean[index[:, 0], index[:, 1]]
+    for _ in range(60):
+        first, second = rng.choice(len(FILM), 2, replace=False)
+        patches.state = at_home(np.array([[x - 0.25, 0.0], [x + 0.25, 0.0]]), np.array([first, second], float))
+        found.append(patches.colors(points)[0] - mean)
+    found = np.array(found)
+    # 60 x 28 x 3 values, of which the film's 60 frames give as many that are new: sampling error of a variance
+    # sqrt(2 / 5040) = 2 %; residuals of a mean of sixty frames are a sixtieth smaller, and anticorrelated by as much
+    assert found.size > 5000
+    assert found.var() == pytest.approx(CONTRAST**2, rel=4 * 0.02)
+
+
+def test_liveliness_is_the_same_wherever_and_whenever_one_looks():
+    """Many patches, at random instants, coming and going."""
+    patches, where = played(70), upright(uniform(0.5))
+    points, index = pixels()
+    mean = FILM.mean[index[:, 0], index[:, 1]]
+    found = []
+    for k in range(6):
+        for j in range(5):
+            patches.advance(where, STEP, np.random.default_rng([4, k, j]))
+        found.append((patches.colors(points)[0] - mean).var())
+    # 48 x 48 x 3 values each: 1.7 %; residuals are a sixtieth smaller, and those of two frames anticorrelated
+    np.testing.assert_allclose(found, CONTRAST**2, rtol=4 * 0.017 + 2 / 60)
+
+
+def test_after_the_films_end_other_patches_play():
+    """None is left of the first ones, none shows a last frame that stands still, and nothing is bare."""
+    film = noise_film(24)
+    last, points = len(film) - 1, pixels()[0]
+    seen = upright(uniform(0.5))
+    patches = TexturePatches(PictureTexture(AXES, seen, film), 0.6, footage=film)
+    latest = []
+    for k in range(60):
+        patches.advance(seen, STEP if k else 0.0, np.random.default_rng([5, k]))
+        latest.append(patches.state.instants.max())
+        assert patches.colors(points)[1].all()
+    assert max(latest) <= last
+    assert np.ptp(patches.state.instants) > 0.3 * last, "of many instants, where the first ones were of one"
+    assert (patches.state.instants < 60).all()
+
+
+@pytest.mark.parametrize("count", [8, 12])
+def test_a_short_film_does_not_stand_still_at_its_end(count):
+    film = noise_film(count)
+    for interval in (STEP, 2 * STEP):  # frames as filmed, and half as many of them
+        seen = upright(uniform(0.5))
+        patches = TexturePatches(PictureTexture(AXES, seen, film), 0.6, footage=film)
+        for k in range(30):
+            patches.advance(seen, interval if k else 0.0, np.random.default_rng([6, k]))
+            # rounded to a frame; by how much one step overshoots is not held back
+            assert patches.state.instants.max() <= count - 1 + interval / STEP
+
+
+def test_an_edited_flow_of_the_same_kind_only_plays_faster():
+    """1.6 times as fast along the same way: the film itself carries its foam along."""
+    before, after = (played(n, edited=True, now=uniform(0.8)).state for n in (0, 1))
+    n = len(before)
+    inner = np.abs(before.centers).max(axis=1) < 1.0  # at a rim the flow of the map is known less well
+    assert inner.sum() > 5
+    # a splat's flow is that of half a cell around it
+    np.testing.assert_allclose(after.instants[:n][inner], 1.6, rtol=1e-3)
+    np.testing.assert_allclose(after.centers[:n][inner], before.centers[inner], atol=1e-4)
+
+
+def test_a_film_is_not_played_faster_than_a_viewer_can_follow():
+    """Three times as fast: it plays at twice its speed, and patches make up the rest."""
+    before, after = (played(n, edited=True, now=uniform(1.5)).state for n in (0, 1))
+    inner = np.flatnonzero(np.abs(before.centers).max(axis=1) < 1.0)
+    np.testing.assert_allclose(after.instants[inner], FASTEST, rtol=1e-6)
+    rest = (1.5 - FASTEST * 0.5) * STEP
+    np.testing.assert_allclose(after.centers[inner] - before.centers[inner], [[rest, 0.0]] * len(inner), atol=1e-4)
+
+
+def test_an_edited_flow_that_turns_carries_patches_by_the_difference():
+    """It was filmed along x and goes along y: the film carries along x what must be taken back."""
+    before, after = (played(n, edited=True, now=uniform(0.0, 0.5)).state for n in (0, 1))
+    inner = np.flatnonzero(np.abs(before.centers).max(axis=1) < 1.0)
+    moved = after.centers[inner] - before.centers[inner]
+    np.testing.assert_allclose(moved, [[-0.5 * STEP, 0.5 * STEP]] * len(inner), atol=1e-4)
+    np.testing.assert_allclose(after.instants[inner], 1.0, rtol=1e-3)
+
+
+def test_water_that_an_edit_stops_shows_a_still():
+    before, after = (played(n, edited=True, now=uniform(0.0)).state for n in (0, 10))
+    inner = np.flatnonzero(np.abs(before.centers).max(axis=1) < 1.0)
+    np.testing.assert_allclose(after.instants[inner], before.instants[inner], atol=1e-6)
+    np.testing.assert_allclose(after.centers[inner], before.centers[inner], atol=1e-6)
+
+
+def test_where_an_edit_makes_the_flow_unlike_the_film_new_patches_come_from_elsewhere():
+    """A place that now flows three times as fast looks otherwise than it was filmed."""
+    patches = played(80, edited=True, now=uniform(1.5))
+    assert len(patches.state) and (np.linalg.norm(patches.state.sources - patches.state.centers, axis=1) > 0.05).all()
+    same = played(80, edited=True, now=uniform(0.5))
+    young = same.state.instants < 40
+    assert young.any()
+    np.testing.assert_allclose(same.state.centers[young], same.state.sources[young], atol=0.02)

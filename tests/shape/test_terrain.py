@@ -9,7 +9,7 @@ import trimesh
 from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.physics.apic import LiquidSimulator
 from fluidlift.shape.airborne import airborne_setting, inside_body
-from fluidlift.shape.channel import ChannelConfig, channel_setting, upper_rim
+from fluidlift.shape.channel import BEYOND, MARGIN, OUTLET, ChannelConfig, channel_setting, upper_rim
 from fluidlift.shape.heights import PlaneHeight
 from fluidlift.shape.plan import Footage
 from fluidlift.shape.terrain import signed_distance_from
@@ -36,6 +36,8 @@ def channel(mainstream=(1.0, 0.0, 0.0), *, slope=0.0, rock=True, along="x", tail
     elif rock:
         labels[np.hypot(ground[..., 0] - ROCK[0], ground[..., 1] - ROCK[1]) < ROCK_RADIUS] = Label.SOLID
     told = {k: options.pop(k) for k in ("speed", "scene_depth", "closed") if k in options}
+    if "ever" in options:  # what is wet at some time, beside what is so now
+        told["ever"] = (labels == Label.FLUID) | options.pop("ever")(ground[..., 0], ground[..., 1])
     seen = Footage(surface, labels.astype(np.uint8), visible, camera, np.array(mainstream), **told)
     setting = channel_setting(seen, ChannelConfig(**{"kind": "stream", "longest": 48, "cell_limit": 120_000} | options))
     return SimpleNamespace(
@@ -255,6 +257,93 @@ def test_a_bank_that_the_depth_puts_below_the_water_still_holds_it():
     h = scene.grid.spacing
     bank = (np.abs(y) > WIDTH / 2 + 2 * h) & (np.abs(x) < 1.0)
     assert (scene.bed[bank] > scene.level[bank] + 0.25 * h).all()
+
+
+# where the clip stays dry ---------------------------------------------------------------------------------------
+
+
+def never(x, y):
+    return np.zeros(x.shape, bool)
+
+
+def above_water(scene, cells):
+    """Signed distance (m) over each column, so many cells above its water."""
+    places = np.concatenate([scene.grid.centers()[:, :, 0, :2], scene.level[..., None]], axis=-1)
+    places[..., 2] += cells * scene.grid.spacing
+    return sample_nodes(scene.phi, scene.grid, places.reshape(-1, 3)).reshape(scene.level.shape)
+
+
+def beside(scene, low, high):
+    """Columns from `low` to `high` cells outside of the banks, away from both ends."""
+    x, y = columns(scene)
+    out = (np.abs(y) - WIDTH / 2) / scene.grid.spacing
+    return (out > low) & (out < high) & (np.abs(x) < 0.6)
+
+
+@pytest.fixture(scope="module")
+def dry_beside():
+    return channel(rock=False, ever=never)
+
+
+def test_ground_that_stays_dry_stands_above_the_water(dry_beside):
+    """A wave of a cell does not run up it; and it is a wall, no tower."""
+    # the picture tells wet from dry to a column, and the corners between columns round it off by half of one
+    rim = beside(dry_beside, 1.0, 2.0)
+    assert rim.sum() > 20
+    assert (above_water(dry_beside, MARGIN - 0.5)[rim] < 0).all()
+    plain = channel(rock=False)
+    assert (above_water(plain, MARGIN - 0.5)[beside(plain, 0.3, 1.0)] > 0).all(), "a bank slopes up to there"
+    assert (above_water(dry_beside, MARGIN + 0.5)[rim] > 0).all()
+
+
+def test_the_wall_stands_just_outside_of_the_water(dry_beside):
+    """Its face is `BEYOND` cells from the rim of the wet columns: the stream is as wide as it was filmed."""
+    h = dry_beside.grid.spacing
+    middle = np.argmin(np.abs(columns(dry_beside)[0][:, 0]))
+    y = np.linspace(0.3, 1.0, 400)
+    x = np.full_like(y, columns(dry_beside)[0][middle, 0])
+    phi = sample_nodes(dry_beside.phi, dry_beside.grid, np.stack([x, y, np.full_like(y, 0.5 * h)], axis=-1))
+    face = y[np.argmax(phi < 0)]
+    # half a column to either side for where columns lie, and half for the corners between them
+    assert face == pytest.approx(WIDTH / 2 + BEYOND * h, abs=h)
+    assert (phi[y < WIDTH / 2 - 1.5 * h] > 0).all()
+
+
+def test_water_keeps_all_of_its_cells_beside_such_a_wall(dry_beside):
+    plain = channel(rock=False)
+    assert plain.grid == dry_beside.grid
+    np.testing.assert_array_equal(plain.cells, dry_beside.cells)
+    np.testing.assert_array_equal(plain.bed, dry_beside.bed)
+    centers = dry_beside.grid.centers()[np.isin(dry_beside.cells, [CellType.FLUID, CellType.INFLOW])]
+    # the wall's face may cut a cell of the rim, whose middle is a quarter of a cell from it at least
+    assert sample_nodes(dry_beside.phi, dry_beside.grid, centers).min() > 0
+
+
+def test_before_the_outlet_ground_is_no_wall(dry_beside):
+    """The section in which a stream leaves is thinner, and needs room."""
+    plain, h = channel(rock=False), dry_beside.grid.spacing
+    x, _ = columns(dry_beside)
+    stop = x[(dry_beside.cells == CellType.OUTFLOW).any(axis=2)].min() + 2.5 * h
+    nodes = dry_beside.grid.nodes()[..., 0]
+    behind = nodes > stop - OUTLET * h + 2 * h  # the corners between columns, and where the sections begin: to a cell
+    assert behind.any()
+    # the end of the wall is nearer than the bank is, but is not there
+    np.testing.assert_array_equal(dry_beside.phi[behind] < 0, plain.phi[behind] < 0)
+    before = nodes < stop - OUTLET * h - 2 * h
+    assert ((dry_beside.phi < 0) & (plain.phi > 0))[before].any()
+
+
+def test_ground_that_is_wet_at_some_time_is_no_wall():
+    """A wave that comes once in the clip needs its way: one bank stays dry, the other is washed over."""
+    scene = channel(rock=False, ever=lambda x, y: (y > 0) & (y < 1.0))
+    _, y = columns(scene)
+    rim, height = beside(scene, 1.0, 2.0), above_water(scene, MARGIN - 0.5)
+    assert (height[rim & (y > 0)] > 0).all() and (height[rim & (y < 0)] < 0).all()
+
+
+def test_where_the_clip_is_not_known_nothing_is_a_wall():
+    plain, unknown = channel(rock=False), channel(rock=False, ever=lambda x, y: np.ones(x.shape, bool))
+    np.testing.assert_array_equal(plain.phi, unknown.phi)
 
 
 def test_a_closed_puddle_has_a_bank_on_all_sides():

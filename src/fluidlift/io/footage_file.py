@@ -10,18 +10,26 @@ from jaxtyping import Bool, UInt8
 
 from fluidlift.errors import InputRejected
 from fluidlift.io.encode import write_video
-from fluidlift.io.limits import ReadLimits
+from fluidlift.io.limits import ReadLimits, require_file, require_size
+from fluidlift.io.pictures import fitted_size, resample
 from fluidlift.io.video import read_clip
 
 MOST_FRAMES = 120
-"""frames of the clip: four seconds at 30 per second, some 1 to 3 MB. Patches of footage last half of it, longer than
-foam does"""
+"""frames of the clip: four seconds at 30 per second, 0.2 to 1.3 MB at 512 px. Patches of footage last half of it, longer
+than foam does"""
 LARGEST = 1024
-"""px of a picture's longer side"""
+"""px of a picture's longer side: those of a larger clip are scaled down"""
 QUALITY = 14.0
 """constant rate factor: errors of one to two levels, below the noise of clips"""
+MOST_BYTES = 256 * 2**20
+"""of the file: more than any film of `MOST_FRAMES` takes"""
 LIMITS = ReadLimits(max_pixels=2 * LARGEST**2 + 16 * LARGEST, max_frames=4 * MOST_FRAMES, max_bytes=2**30)
 """on what is read back; the file may come from a stranger"""
+
+
+def size_of_film(size: tuple[int, int]) -> tuple[int, int]:
+    """(width, height) of the pictures that are kept of a clip of some size, px."""
+    return fitted_size(size, LARGEST)
 
 
 def write_footage(
@@ -34,10 +42,13 @@ def write_footage(
         ValueError: no frames.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    pairs = (
-        np.concatenate([_even_rows(np.asarray(f)), _even_rows(np.repeat(255 * m[..., None].astype(np.uint8), 3, -1))])
-        for f, m in zip(frames, fluid, strict=True)
-    )
+    size = size_of_film(fluid.shape[2:0:-1])
+
+    def stacked(picture: np.ndarray, mask: np.ndarray) -> np.ndarray:
+        marks = np.repeat(255 * mask[..., None].astype(np.uint8), 3, axis=-1)
+        return np.concatenate([_even_sides(resample(np.asarray(p), size)) for p in (picture, marks)])
+
+    pairs = (stacked(f, m) for f, m in zip(frames, fluid, strict=True))
     return write_video(path, pairs, 1.0 / interval, quality=QUALITY, repeatable=True)
 
 
@@ -46,13 +57,17 @@ def read_footage(path: Path, size: tuple[int, int]) -> tuple[np.ndarray, np.ndar
 
     Args:
         path: as `write_footage` wrote it.
-        size: px of a picture (width, height), which the file must have.
+        size: px of the clip (width, height); the pictures have it, up to `LARGEST`.
 
     Raises:
-        InputRejected: not such a file, or larger than an asset's film may be.
+        InputRejected: not such a file, one that lacks frames, or larger than an asset's film may be.
     """
+    require_file(path, "film")
+    require_size(path, MOST_BYTES, "film")
     clip = read_clip(path, max_size=2 * LARGEST + 16, limits=LIMITS)
-    width, height = size
+    if any("damaged" in note for note in clip.warnings):
+        raise InputRejected(f"'{path.name}' is damaged or cut off", "a whole film", "make the asset again")
+    width, height = size_of_film(size)
     rows = height + height % 2
     if clip.size != (width + width % 2, 2 * rows):
         raise InputRejected(
@@ -65,6 +80,6 @@ def read_footage(path: Path, size: tuple[int, int]) -> tuple[np.ndarray, np.ndar
     return np.ascontiguousarray(frames[:, :height, :width]), fluid, float(clip.interval)
 
 
-def _even_rows(picture: np.ndarray) -> np.ndarray:
+def _even_sides(picture: np.ndarray) -> np.ndarray:
     """With its last row and column doubled where their number is odd, as 4:2:0 needs it."""
     return np.pad(picture, [(0, picture.shape[0] % 2), (0, picture.shape[1] % 2), (0, 0)], mode="edge")

@@ -22,6 +22,9 @@ FINER = 1.0
 RIM = 0.5
 """px: outline of a mask of whole pixels"""
 
+EVERYWHERE = 1e6
+"""px to the outline of a fluid that fills the whole picture"""
+
 WIDEST = 0.4
 """standard deviation of a splat at most, shares of its distance from the outline: what is seen of it ends there"""
 
@@ -38,7 +41,9 @@ class FilmedOutline:
     def __init__(self, camera: PinholeCamera, outside: Float[np.ndarray, "h w"], cell: float) -> None:
         self._camera, self._cell = camera, cell
         # to the nearest pixel beside the fluid, as negative px inside; the picture's border is none
-        self._away_px = np.where(outside > 0, outside, -ndimage.distance_transform_edt(outside <= 0)).astype(np.float32)
+        wet = outside <= 0
+        inside = np.full(outside.shape, EVERYWHERE) if wet.all() else ndimage.distance_transform_edt(wet)
+        self._away_px = np.where(wet, -inside, outside).astype(np.float32)
 
     def inside(self, world: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
         """Which points (m) are seen in the fluid, or beyond `FINER` cells from it, or not at all."""

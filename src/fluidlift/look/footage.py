@@ -71,8 +71,8 @@ class FluidFootage:
         mean = total / (255.0 * len(frames) * np.maximum(weight, 1e-6)[..., None])
         outside, own = ndimage.distance_transform_edt(~known), _without_rim(known)
         nearest = ndimage.distance_transform_edt(~own, return_distances=False, return_indices=True)
-        # a pixel that is rarely fluid shows its rim; those that often are count in the blur
-        sigma = BROAD * max(weight.shape)
+        # what is rarely fluid, or mixed with the bank, counts less or nothing in the blur
+        weight, sigma = np.where(own, weight, np.float32(0)), BROAD * max(weight.shape)
         spread = np.maximum(ndimage.gaussian_filter(weight, sigma), 1e-6)
         blurred = [ndimage.gaussian_filter(mean[..., k] * weight, sigma) / spread for k in range(3)]
         shade = np.stack(blurred, axis=-1)[tuple(nearest)]

@@ -53,6 +53,9 @@ UNLIKE = 0.5
 """difference of the flow from the filmed one, over the filmed one, from which a place looks otherwise than it was
 filmed: as when a stream is half as fast, or turned by 30 degrees"""
 
+SAME = 0.25
+"""px from a point's own place in the picture within which a patch is at home"""
+
 GOOD = 0.8
 """share of a source that was seen, from which it is taken at once"""
 
@@ -164,6 +167,8 @@ class TexturePatches:
             instants = s.instants + pace * interval / self._footage.interval
         strains = s.strains + interval * rate
         fade = np.clip(LIMIT / 3 / np.maximum(rate * interval, 1e-9), *FADE)
+        if self._footage is not None:  # those that go must be gone by the film's last frame
+            fade = np.clip(_fade_of(self._footage) / np.maximum(instants - s.instants, 1e-9), 1.0, fade)
         going = (strains > LIMIT) | (instants >= s.ends)
         presences = np.clip(s.presences + np.where(going, -1, 1) / fade, 0.0, 1.0)
         centers = s.centers + moved
@@ -211,7 +216,7 @@ class TexturePatches:
             c if home else self._source(c, rng) for c, home in zip(centers, at_home, strict=True)
         ])  # fmt: skip
         turns = np.where(at_home, 0.0, _wrapped(self._heading(surface, flow, centers, sources)))
-        last, fade = len(self._footage) - 1.0, min(FADE[1], len(self._footage) / 4)
+        last, fade = len(self._footage) - 1.0, _fade_of(self._footage)
         if first:
             begin = np.full(n, min(self._start, last))
             ends = begin + rng.uniform(0, 1, n) * np.maximum(last - fade - begin, 0.0)
@@ -266,7 +271,8 @@ class TexturePatches:
 
         colour = shade + sum w gain fine / sum w + sum w gain residual / sqrt(sum w^2): the shade is that of the point's
         own place; what differs from the mean keeps its variance where patches overlap (Gagnon et al. 2019). A patch
-        that is at home gives the clip's own picture.
+        that is at home gives the clip's own picture. So do several of the same instant: what they show is one thing,
+        whose weights add up before they are squared.
         """
         footage, texture = self._footage, self._texture
         assert footage is not None
@@ -282,7 +288,7 @@ class TexturePatches:
         fine = sampled(footage.mean, index) - there
         weight = weight * np.clip(wet, 1e-2, 1.0)
         total = np.bincount(point, weight, minlength=n)
-        spread = np.sqrt(np.bincount(point, weight**2, minlength=n))
+        spread = _spread_of(point, instants, np.abs(index - seen[point]).max(axis=1, initial=0.0) < SAME, weight, n)
         still = _summed(point, (weight * gain)[:, None] * fine, n) / np.maximum(total, 1e-30)[:, None]
         lively = _summed(point, (weight * gain)[:, None] * residual, n) / np.maximum(spread, 1e-30)[:, None]
         return np.clip(shade + still + lively, 0.0, 1.0), total > 0
@@ -291,6 +297,23 @@ class TexturePatches:
 def _summed(point: np.ndarray, values: np.ndarray, n: int) -> np.ndarray:
     """Sums [n,3] of the values of each point."""
     return np.stack([np.bincount(point, values[:, k], minlength=n) for k in range(values.shape[1])], axis=-1)
+
+
+def _spread_of(point: np.ndarray, instants: np.ndarray, home: np.ndarray, weight: np.ndarray, n: int) -> np.ndarray:
+    """Root [n] of the variance of a sum of weighted pieces of unit variance, of each point.
+
+    Pieces are independent, but for those at home that show the same frame: these are equal.
+    """
+    frame = np.rint(instants).astype(np.int64)
+    count = int(frame.max(initial=0)) + 1
+    key, group = np.unique((point * count + frame)[home], return_inverse=True)
+    alike = np.bincount(key // count, np.bincount(group, weight[home]) ** 2, minlength=n)
+    return np.sqrt(alike + np.bincount(point[~home], weight[~home] ** 2, minlength=n))
+
+
+def _fade_of(footage: FluidFootage) -> float:
+    """Frames of the footage over which a patch comes or goes."""
+    return min(FADE[1], len(footage) / 4)
 
 
 def _turned(vectors: np.ndarray, angles: np.ndarray) -> np.ndarray:

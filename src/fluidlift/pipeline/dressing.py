@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -60,8 +61,11 @@ LOOKED_UP = 1 / 6 + 0.3
 """variance (px^2) of the blur between a film and its splats' picture beside that of the splats: a bilinear look-up
 (a triangle of one pixel to each side, 1/6), and what the rasteriser adds to each splat"""
 
+AS_AT_REST = "its surface looks as it did at rest"
+"""what follows where there is no film to play"""
+
 FINE = 1.7
-"""px of the clip between tracers of a skin that plays a film, at most: with splats of `WIDTH` spacings the finest band
+"""px of the film between tracers of a skin that plays it, at most: with splats of `WIDTH` spacings the finest band
 of a Laplacian pyramid keeps half of its energy, which sharpening the film gives back"""
 
 SMALLEST = 0.02
@@ -94,8 +98,8 @@ def lends_look(scene: Scene, own: Gaussians) -> np.ndarray:
     return in_picture(own.means, scene.camera) & clear_of_shore(own.means, level, scene.terrain)
 
 
-def _footage(film: Path, camera: PinholeCamera, means: np.ndarray, cell: float) -> FluidFootage | None:
-    """The film of an asset, taken apart; None where it is too short to be played.
+def _footage(film: Path, camera: PinholeCamera, means: np.ndarray, cell: float) -> FluidFootage | str:
+    """The film of an asset, taken apart; or what is wrong with it, in words.
 
     Args:
         film: its file.
@@ -103,14 +107,34 @@ def _footage(film: Path, camera: PinholeCamera, means: np.ndarray, cell: float) 
         means: of the body's Gaussians, m.
         cell: width of the simulator's cells, m.
     """
-    from fluidlift.io.footage_file import read_footage
-    from fluidlift.look.footage import FluidFootage
+    from fluidlift.io.footage_file import size_of_film
     from fluidlift.look.surface_skin import PITCH, WIDTH
 
-    depth = float(np.median(camera.project(means)[1]))
-    apart = min(PITCH * cell * camera.focal[0] / max(depth, 1e-6), FINE)
+    if not film.is_file():
+        return f"is missing: {AS_AT_REST}; make the asset again"
+    small = camera.resized(size_of_film(camera.size))
+    depth = float(np.median(small.project(means)[1]))
+    apart = min(PITCH * cell * small.focal[0] / max(depth, 1e-6), FINE)
     blur = float(np.sqrt((WIDTH * apart) ** 2 + LOOKED_UP))
-    return FluidFootage.of(*read_footage(film, camera.size), blur=blur)
+    written = film.stat()
+    return _taken_apart(film, camera.size, blur, (written.st_mtime_ns, written.st_size))
+
+
+@lru_cache(maxsize=1)
+def _taken_apart(film: Path, size: tuple[int, int], blur: float, written: tuple[int, int]) -> FluidFootage | str:
+    """As `_footage`, of a file as it was `written`. The last one is kept: it takes a second or two, and a live preview
+    begins anew with every edit."""
+    from fluidlift.io.footage_file import read_footage
+    from fluidlift.look.footage import FEWEST, FluidFootage
+
+    try:
+        frames, fluid, interval = read_footage(film, size)
+    except InputRejected as error:
+        return f"is damaged ({error.got}): {AS_AT_REST}; make the asset again"
+    if len(frames) < FEWEST:
+        return f"has {len(frames)} frames and needs {FEWEST}: {AS_AT_REST}; make the asset from a longer clip"
+    found = FluidFootage.of(frames, fluid, interval, blur=blur)
+    return f"shows none: {AS_AT_REST}; make the asset again" if found is None else found
 
 
 class Dressing:
@@ -118,6 +142,9 @@ class Dressing:
 
     def __init__(self, scene: Scene) -> None:
         self._scene, self._cell = scene, scene.terrain.grid.spacing
+        self._camera = scene.camera
+        self.warnings: tuple[str, ...] = ()
+        """what is missing for the usual look, in words"""
         self._patches: TexturePatches | None = None
         self._surface: SurfaceMap | None = None
         self._axes: SurfaceAxes
@@ -136,11 +163,11 @@ class Dressing:
         scene, own = self._scene, self._own
         gravity = np.asarray(scene.parameters.gravity, np.float64)
         upright = -gravity[2] > UPRIGHT * max(float(np.linalg.norm(gravity)), 1e-12)
-        footage = None if scene.film is None else _footage(scene.film, scene.camera, own.means, self._cell)
+        footage = self._film_of(own)
         if scene.kind == "stream" and upright:
             self._axes = PlanAxes()
-        elif footage is not None and scene.kind != "plume":  # smoke has no surface
-            self._axes = PictureAxes(scene.camera, float(np.median(scene.camera.project(own.means)[1])))
+        elif footage is not None:
+            self._axes = PictureAxes(self._camera, float(np.median(self._camera.project(own.means)[1])))
         else:
             return
         surface = self._surface_of(scene.body)
@@ -160,18 +187,30 @@ class Dressing:
             start=scene.film_start,
         )  # fmt: skip
         if footage is not None and scene.kind in LYING and not scene.edited:
-            self._outline = FilmedOutline(scene.camera, footage.outside, self._cell)
+            self._outline = FilmedOutline(self._camera, footage.outside, self._cell)
         self._plays = footage is not None
         self._begin_again()
 
+    def _film_of(self, own: Gaussians) -> FluidFootage | None:
+        """The film that the surface plays, whose size the camera has from here on; one that cannot be is a warning."""
+        scene = self._scene
+        if scene.film is None or scene.kind == "plume":
+            return None
+        found = _footage(scene.film, scene.camera, own.means, self._cell)
+        if isinstance(found, str):
+            self.warnings = (f"the film of the fluid {found}",)
+            return None
+        self._camera = scene.camera.resized((found.mean.shape[1], found.mean.shape[0]))
+        return found
+
     def _level_at(self, places: np.ndarray) -> np.ndarray:
-        """How fine the skin is at places of the map: as the clip's pixels are there, 0 beside its picture."""
+        """How fine the skin is at places of the map: as the film's pixels are there, 0 beside its picture."""
         from fluidlift.look.surface_skin import FINEST, PITCH
 
         assert self._surface is not None
         heights = self._surface.at(self._surface.height, places)
         world = self._axes.world_points(np.concatenate([places, heights[:, None]], axis=1))
-        camera = self._scene.camera
+        camera = self._camera
         uv, depth = camera.project(world)
         inside = (depth > 0) & ((uv >= 0) & (uv <= np.array(camera.size))).all(axis=1)
         apart = PITCH * self._cell * camera.focal[0] / np.maximum(depth, 1e-6)
@@ -184,10 +223,9 @@ class Dressing:
         from fluidlift.shape.off_picture import in_picture
 
         scene, own = self._scene, self._own
-        if (
-            footage is not None
-        ):  # each place shows its own film: shores, and what stands in the water's picture, as well
-            return SeenTexture(own, scene.camera, surface, usable=in_picture(own.means, scene.camera))
+        if footage is not None:
+            # each place shows its own film: shores, and what stands in the water's picture, as well
+            return SeenTexture(own, self._camera, surface, usable=in_picture(own.means, scene.camera))
         along = own.means @ scene.terrain.mainstream
         share = (along - along.min()) / max(float(np.ptp(along)), 1e-12)
         usable = lends_look(scene, own) & (share > ENDS[0]) & (share < ENDS[1])

@@ -24,7 +24,7 @@ from fluidlift.config import JobConfig
 from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.pipeline.coarse_copy import PreviewSize, bears_coarser, coarse_asset, coarser, thinned
 from fluidlift.pipeline.dressing import Dressing
-from fluidlift.pipeline.scene import Scene, SimulationRequest, scene_of
+from fluidlift.pipeline.scene import Scene, SimulationRequest, first_of_film, scene_of
 from fluidlift.pipeline.simulating import preflight, simulator_of
 from fluidlift.types import FluidAsset, Gaussians, TriangleMesh
 
@@ -97,8 +97,14 @@ def preview_scene(asset: FluidAsset, folder: Path, edits: dict[str, Any], frames
     Raises:
         InputRejected: edits that do not fit.
     """
+    from fluidlift.io.asset_folder import read_manifest
+    from fluidlift.pipeline.resimulate import rest_frame_of
+
     with _written(edits) as place:
         scene = scene_of(asset, place, SimulationRequest(meshes=folder), JobConfig(), footage=None, start=0)
+    if scene.film is not None:
+        start = rest_frame_of(read_manifest(folder), None)
+        scene = replace(scene, film_start=start - first_of_film(start, asset.frame_count))
     # one step per frame where the flow allows it: waves are damped more than in frames that are kept
     step = scene.interval if scene.longest_step is None else scene.longest_step
     scene = replace(scene, frames=min(scene.frames, frames), longest_step=step)

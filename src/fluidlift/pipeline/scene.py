@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -126,7 +127,7 @@ class Scene:
     overlap: int = 0
     """frames simulated beyond `frames`, that a loop is closed with"""
     film: Path | None = None
-    """of the fluid, which its surface plays; None: the surface looks as it did at rest"""
+    """of the fluid, which its surface plays; None, or a file that cannot be played: it looks as it did at rest"""
     film_start: int = 0
     """frame of the film that the body at rest shows"""
     force: FaceVelocity | None = None
@@ -156,7 +157,7 @@ class Scene:
             "body": _hash(self.body.positions, self.body.velocities, self.body.source, self.rest.means),
             "look": _hash(self.rest.quats, self.rest.scales, self.rest.opacities, self.rest.sh,
                           b"" if self.shading is None else self.shading.image,
-                          b"" if self.film is None else self.film.read_bytes(), self.film_start),
+                          b"" if self.film is None else self.film, self.film_start),
             "parameters": _hash(self.parameters, self.longest_step),
             "frame interval": _hash(self.interval),
             "seed": _hash(self.seed),
@@ -180,16 +181,25 @@ class Scene:
 
 
 def _hash(*values: Any) -> str:
-    """SHA-256 of arrays (with shape and type) and of the text of anything else."""
+    """SHA-256 of arrays (with shape and type), of the content of files, and of the text of anything else."""
     digest = hashlib.sha256()
     for value in values:
         if isinstance(value, np.ndarray):
             digest.update(f"{value.dtype.str}{value.shape}".encode())
             digest.update(np.ascontiguousarray(value).tobytes())
+        elif isinstance(value, Path):
+            _update(digest, value)
         else:
             digest.update(value if isinstance(value, bytes) else repr(value).encode())
         digest.update(b"\0")
     return digest.hexdigest()
+
+
+def _update(digest: hashlib._Hash, file: Path) -> None:
+    """Add a file to a hash, piece by piece; one that is gone or may not be read adds nothing."""
+    with suppress(OSError), file.open("rb") as stream:
+        while piece := stream.read(2**20):
+            digest.update(piece)
 
 
 def footage_of(story: Story) -> Footage | None:
@@ -253,6 +263,8 @@ def scene_of(
     from fluidlift.numerics.sampling import sample_faces
 
     edits = read_edits(folder, meshes=request.meshes)
+    # edits that are tried out lie elsewhere than their asset
+    home = folder if request.meshes is None or (folder / "manifest.json").is_file() else request.meshes
     interval = asset.interval if request.fps is None else 1.0 / request.fps
     duration = edits.duration if request.duration is None else request.duration
     clip_frames = max(1, round((asset.frame_count - start) * asset.interval / interval))
@@ -269,23 +281,29 @@ def scene_of(
         asset.parameters.updated(changes), asset.camera, interval, asset.interval,
         wanted or config.simulate.frames or clip_frames, config.seed, edits.obstacles, shading,
         longest_step=longest_step, inflow=edits.inflow, changes=changed_parameters(asset.parameters, changes),
-        film=film_of(request.meshes or folder), film_start=start - first_of_film(start, asset.frame_count),
+        film=film_of(home), film_start=start - first_of_film(start, asset.frame_count),
     )  # fmt: skip
     longer = edits.extend_downstream if request.extend_downstream is None else request.extend_downstream
     if longer > 0:
         scene = extended(scene, longer)
     scene = with_emitters(with_terrain(scene, edits.terrain), edits.emitters)
     if config.simulate.follow > 0:
-        scene = following(scene, asset, request.meshes or folder, config.simulate.follow)
+        scene = following(scene, asset, home, config.simulate.follow)
     return replace(scene, overlap=loop_overlap(scene)) if edits.loop else scene
 
 
 def film_of(folder: Path) -> Path | None:
-    """The film of the fluid that an asset carries; None where it has none."""
-    from fluidlift.io.asset_folder import FILES, asset_file
+    """The film of the fluid that the manifest of an asset lists, though it may be gone; None where it lists none.
 
-    film = asset_file(folder, FILES["film"])
-    return film if film.is_file() else None
+    Raises:
+        InputRejected: a broken manifest, or a film that is a link or lies elsewhere.
+    """
+    from fluidlift.io.asset_folder import asset_file, read_manifest
+
+    if not (folder / "manifest.json").is_file():  # not finished yet
+        return None
+    name = read_manifest(folder)["files"].get("film")
+    return None if name is None else asset_file(folder, name)
 
 
 def first_of_film(start: int, frames: int) -> int:

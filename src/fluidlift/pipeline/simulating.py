@@ -302,7 +302,9 @@ def simulate(
     if first == 0:
         checkpoint_file(folder).unlink(missing_ok=True)
     failed = _advance(simulator, dressing, scene, folder, config, history, step)
-    warnings = [*scene.notes, *closed] + (list(simulator.bodies.warnings) if scene.obstacles else [])
+    warnings = [*scene.notes, *dressing.warnings, *closed] + (
+        list(simulator.bodies.warnings) if scene.obstacles else []
+    )
     if failed is None and len(history) < scene.simulated:
         warnings.append(
             f"the re-simulation stopped after {len(history)} of {scene.simulated} frames, at twice the number of "

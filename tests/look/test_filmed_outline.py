@@ -1,0 +1,128 @@
+"""The waterline of a film is that of its simulation wherever the two are within a cell of each other."""
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from fluidlift.look.filmed_outline import FINER, RIM, WIDEST, FilmedOutline
+from fluidlift.look.footage import FluidFootage
+from fluidlift.look.surface_axes import PictureAxes, PlanAxes
+from fluidlift.look.surface_map import SurfaceMap
+from fluidlift.types import PinholeCamera
+
+CELL, LEVEL = 0.2, 0.5
+CAMERA = PinholeCamera.looking(
+    (2.0, 2.0, 8.5), (2.0, 2.0, LEVEL), fov_degrees=30.0, size=(160, 160), up=(0.0, 1.0, 0.0)
+)
+"""sees 4.3 x 4.3 m of the surface from straight above"""
+PIXEL = 8.0 / CAMERA.focal[0]
+"""m on the surface: seven and a half in a cell"""
+
+
+def filmed(shore: float) -> np.ndarray:
+    """px to the nearest fluid: water to the left of x = `shore`, m."""
+    x = (np.arange(160) + 0.5 - 80) * PIXEL + 2.0
+    wet = np.broadcast_to(x < shore, (160, 160))
+    frames = np.zeros((8, 160, 160, 3), np.uint8)
+    return FluidFootage.of(frames, np.repeat(wet[None], 8, axis=0), 0.04).outside
+
+
+def simulated(shore: float, axes=None, low: float = 0.3) -> SurfaceMap:
+    """Water to the left of x = `shore`."""
+    x, y, z = np.meshgrid(np.arange(low, shore, 0.05), np.arange(0.3, 3.7, 0.05), [0.45, LEVEL], indexing="ij")
+    world = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+    points = world if axes is None else axes.points(world)
+    return SurfaceMap.of(points, np.zeros_like(points), CELL)
+
+
+def waterline(surface: SurfaceMap) -> float:
+    """x of the right rim of the wet columns in the middle rows, m."""
+    middle = np.abs(surface.middles()[0, :, 1] - 2.0) < 1.0
+    return (
+        float(np.max(np.where(surface.wet[:, middle], surface.middles()[:, middle, 0], -np.inf))) + 0.5 * surface.pitch
+    )
+
+
+@pytest.mark.parametrize("film", [2.35, 2.43, 2.6])
+def test_a_rim_within_a_cell_is_moved_to_the_films(film):
+    """Both ways: what is simulated beyond the film's waterline goes, what falls short of it is filled up."""
+    outline = FilmedOutline(CAMERA, filmed(film), CELL)
+    before = simulated(2.5)
+    after = outline.cut(before, PlanAxes())
+    # a column of the map is half a cell wide; pixels are 2.7 cm
+    assert waterline(after) == pytest.approx(film, abs=0.5 * before.pitch + PIXEL)
+    assert abs(waterline(after) - film) <= abs(waterline(before) - film) + 1e-9
+
+
+@pytest.mark.parametrize("film", [2.0, 3.1])
+def test_a_rim_that_is_further_off_stays_as_it_is_simulated(film):
+    """Beyond one cell the two tell of different flows: only a band of a cell about the film's own line is its own."""
+    before = simulated(2.5)
+    after = FilmedOutline(CAMERA, filmed(film), CELL).cut(before, PlanAxes())
+    x = before.middles()[..., 0]
+    if film > 2.5:  # filled by a cell at most (two columns, and half of one where it ends)
+        assert waterline(after) <= waterline(before) + FINER * CELL + 1e-9
+        assert (after.wet >= before.wet).all()
+    else:  # what lies more than a cell from the film's water is left
+        far = x > film + FINER * CELL + PIXEL
+        assert (before.wet & far).any()
+        np.testing.assert_array_equal(after.wet[far], before.wet[far])
+
+
+def test_only_the_rim_is_touched():
+    before = simulated(2.5)
+    after = FilmedOutline(CAMERA, filmed(2.4), CELL).cut(before, PlanAxes())
+    # the film is wet up to the picture's other sides as well: rims there may grow by a cell, two columns of the map
+    away = np.maximum(*(ndimage.distance_transform_cdt(m, "taxicab") for m in (before.wet, ~before.wet))) > 2
+    assert away.mean() > 0.5
+    np.testing.assert_array_equal(after.wet[away], before.wet[away])
+    np.testing.assert_array_equal(after.height, before.height)
+    np.testing.assert_array_equal(after.velocity, before.velocity)
+
+
+def test_nothing_beyond_the_picture_is_touched():
+    """A stream goes on where the film ends; its border is no waterline."""
+    near = PinholeCamera.looking(
+        (2.0, 2.0, 8.5), (2.0, 2.0, LEVEL), fov_degrees=12.0, size=(64, 64), up=(0.0, 1.0, 0.0)
+    )
+    before, half = simulated(3.7), 8.0 * np.tan(np.radians(6.0))
+    dry = FilmedOutline(near, np.full((64, 64), 1.0), CELL)  # a film that is dry all over, right at its fluid
+    after = dry.cut(before, PlanAxes())
+    inside = (np.abs(before.middles() - 2.0) < half - 1e-6).all(axis=-1)
+    np.testing.assert_array_equal(after.wet[~inside], before.wet[~inside])
+    assert not after.wet[inside].any(), "or this says nothing"
+    beyond = np.array([[0.5, 2.0, LEVEL], [2.0, 3.5, LEVEL], [2.0, 2.0, 20.0]])  # the last is behind the camera
+    assert np.isposinf(dry.room(beyond)).all() and dry.inside(beyond).all()
+
+
+def test_water_that_fills_the_whole_picture_has_no_rim():
+    outline = FilmedOutline(CAMERA, filmed(99.0), CELL)
+    before = simulated(2.5)
+    assert (outline.cut(before, PlanAxes()).wet >= before.wet).all()
+    places = np.array([[0.5, 0.5, LEVEL], [2.0, 2.0, LEVEL], [3.9, 0.2, LEVEL]])
+    assert outline.inside(places).all() and (outline.room(places) > 100.0).all()  # m: any splat
+
+
+def test_splats_have_no_room_beside_the_fluid_and_more_the_deeper_inside_they_are():
+    outline = FilmedOutline(CAMERA, filmed(2.4), CELL)
+    away = np.array([-1.0, -0.5, -0.2, -0.05, 0.05, 0.15])  # m to the right of the waterline
+    places = np.stack([2.4 + away, np.full(6, 2.0), np.full(6, LEVEL)], axis=-1)
+    room = outline.room(places)
+    # a splat ends within the outline: WIDEST of its distance, known to the half pixel of the mask and of its tolerance
+    np.testing.assert_allclose(room[:4], WIDEST * -away[:4], atol=WIDEST * (RIM + 0.6) * PIXEL)
+    assert (np.diff(room[:4]) < 0).all() and (room[4:] == 0).all()
+    np.testing.assert_array_equal(outline.inside(places), [True] * 4 + [False] * 2)
+    # a cell beside it, the simulation has its way
+    far = np.array([[2.4 + FINER * CELL + 2 * PIXEL, 2.0, LEVEL]])
+    assert np.isposinf(outline.room(far)).all() and outline.inside(far).all()
+
+
+def test_the_same_holds_on_a_map_over_the_picture():
+    """A fall's map is the picture itself."""
+    axes = PictureAxes(CAMERA, 8.0)
+    before = simulated(2.5, axes)
+    after = FilmedOutline(CAMERA, filmed(2.4), CELL).cut(before, axes)
+    # X counts from the middle of the picture, at x = 2
+    middle = np.abs(before.middles()[0, :, 1]) < 1.0
+    line = np.max(np.where(after.wet[:, middle], after.middles()[:, middle, 0], -np.inf)) + 0.5 * after.pitch
+    assert line == pytest.approx(0.4, abs=0.5 * before.pitch + PIXEL)

@@ -1,0 +1,166 @@
+"""A film of a fluid is what stays in each place, and what comes and goes, without the bank that its rim shows."""
+
+import cv2
+import numpy as np
+import pytest
+
+from fluidlift.look.footage import BROAD, FEWEST, RIM, SHOWN, FluidFootage
+
+SIZE, FRAMES = (48, 64), 12
+WATER, BANK = np.array([60, 110, 150]), np.array([150, 90, 40])
+INTERVAL = 0.04
+
+
+def noise(sigma: float = 1.0, contrast: float = 12.0, seed: int = 0, count: int = FRAMES) -> np.ndarray:
+    """[T,H,W,1]: grain, another one in each frame."""
+    rng = np.random.default_rng(seed)
+    grain = np.stack(
+        [cv2.GaussianBlur(rng.standard_normal(SIZE).astype(np.float32), (0, 0), sigma) for _ in range(count)]
+    )
+    return contrast * (grain / grain.std())[..., None]
+
+
+def everywhere(count: int = FRAMES) -> np.ndarray:
+    return np.ones((count, *SIZE), bool)
+
+
+def lively(**more) -> np.ndarray:
+    """u8 [T,H,W,3]: water with grain."""
+    return np.clip(WATER + noise(**more), 0, 255).astype(np.uint8)
+
+
+def at_pixels(mask: np.ndarray) -> np.ndarray:
+    return np.argwhere(mask).astype(np.float64)
+
+
+def test_mean_and_residual_add_up_to_each_picture():
+    frames = lively()
+    film = FluidFootage.of(frames, everywhere(), INTERVAL)
+    index = at_pixels(everywhere()[0])
+    for t in (0, 5, FRAMES - 1):
+        residual, share = film.looked_up(index, np.full(len(index), float(t)))
+        whole = film.mean.reshape(-1, 3) + residual
+        # single precision; a level of the picture is 4e-3
+        np.testing.assert_allclose(whole, frames[t].reshape(-1, 3) / 255.0, atol=1e-5)
+        assert (share == 1).all()
+
+
+def test_residuals_of_a_place_cancel_over_the_time_in_which_it_is_fluid():
+    """A thin and a wide part: water that comes and goes has the mean of its own time alone."""
+    fluid = everywhere()
+    fluid[::2, :, 32:] = False  # half of the time the right half is dry, and shows the bank
+    frames = np.where(fluid[..., None], lively(), BANK).astype(np.uint8)
+    film = FluidFootage.of(frames, fluid, INTERVAL)
+    index = at_pixels(everywhere()[0])
+    total = sum(film.looked_up(index, np.full(len(index), float(t)))[0] for t in range(FRAMES))
+    assert np.abs(total).max() < 1e-5 * FRAMES  # sums of single precision
+    assert np.abs(255 * film.mean[:, 40:] - WATER).mean() < 12, "grain of twelve levels over six frames, and no bank"
+
+
+def test_what_is_broad_is_shade_and_what_is_small_is_fine():
+    """A stripe pattern over a slope of brightness: the blur takes the slope, up to its rim, and leaves the stripes."""
+    x = np.arange(SIZE[1])
+    wide = 80 + 1.0 * x
+    stripes = 20 * np.cos(np.pi * x)  # two pixels long, far below the blur
+    frames = np.broadcast_to((wide + stripes)[None, None, :, None], (FRAMES, *SIZE, 3)).round().astype(np.uint8)
+    film = FluidFootage.of(frames, everywhere(), INTERVAL)
+    inner = slice(8, -8)  # four standard deviations of the blur from the rim
+    assert BROAD * max(SIZE) < 2
+    np.testing.assert_allclose(
+        255 * film.shade[:, inner, 0], np.broadcast_to(wide[inner], (48, 48)), atol=1.0
+    )  # rounding
+    fine = 255 * (film.mean - film.shade)[:, inner, 0]
+    np.testing.assert_allclose(fine, np.broadcast_to(stripes[inner], (48, 48)), atol=1.0)
+
+
+def test_the_rim_shows_no_bank():
+    """An edge that runs through pixels mixes two colours there; beside the fluid goes on what is well inside."""
+    y, x = np.indices(SIZE)
+    away = 0.8 * (x - 30.3) + 0.6 * (y - 24.0)  # px from an oblique waterline, water to its left
+    covered = np.clip(0.5 - cv2.GaussianBlur(away, (0, 0), 0.7), 0, 1)[..., None]  # antialiased over a pixel
+    picture = np.round(covered * WATER + (1 - covered) * BANK)
+    frames = np.repeat(picture[None].astype(np.uint8), FRAMES, axis=0)
+    fluid = np.repeat((covered[..., 0] >= 0.5)[None], FRAMES, axis=0)
+    film = FluidFootage.of(frames, fluid, INTERVAL)
+    mixed = fluid[0] & (np.abs(picture - WATER).max(axis=-1) > 5)
+    assert mixed.sum() > 20, "the mask must take in pixels that are mixed for this to say anything"
+    assert np.abs(255 * film.mean - WATER).max() < 1.5 and np.abs(255 * film.shade - WATER).max() < 1.5  # rounding
+    residual, share = film.looked_up(at_pixels(mixed), np.zeros(mixed.sum()))
+    assert (residual == 0).all() and (share == 0).all(), "nothing comes and goes in a mixed pixel"
+
+
+def test_threads_that_are_no_wider_than_a_rim_are_kept():
+    """A thread of two pixels has no pixel that is not at its rim: its own look is all that there is."""
+    fluid = np.zeros((FRAMES, *SIZE), bool)
+    fluid[:, :, 10:12] = True
+    fluid[:, 20:44, 30:60] = True
+    frames = np.where(fluid[..., None], WATER, BANK).astype(np.uint8)
+    frames[:, :, 10:12] = (250, 250, 250)
+    film = FluidFootage.of(frames, fluid, INTERVAL)
+    np.testing.assert_allclose(film.mean[:, 10:12], 250 / 255, atol=1e-6)
+    assert film.fluid[:, :, 10:12].all()
+    assert not film.fluid[:, 20, 30:60].any() and film.fluid[0, 20 + RIM + 1, 45], "a wide body loses its rim"
+
+
+def test_a_film_that_is_too_short_or_shows_no_fluid_is_none():
+    assert FluidFootage.of(lively()[: FEWEST - 1], everywhere(FEWEST - 1), INTERVAL) is None
+    assert FluidFootage.of(lively()[:FEWEST], everywhere(FEWEST), INTERVAL) is not None
+    assert FluidFootage.of(lively(), ~everywhere(), INTERVAL) is None
+    rare = ~everywhere()
+    rare[0] = True  # one frame of twelve is less than a tenth
+    assert 1 / FRAMES < SHOWN and FluidFootage.of(lively(), rare, INTERVAL) is None
+    with pytest.raises(ValueError, match="masks"):
+        FluidFootage.of(lively(), everywhere(FRAMES - 1), INTERVAL)
+
+
+def test_what_was_sharpened_comes_out_of_the_splats_blur_as_it_was():
+    """To first order: I + (I - G I), blurred, differs by the square of what the blur takes."""
+    blur, frames = 0.9, lively(sigma=1.2)
+    film = FluidFootage.of(frames, everywhere(), INTERVAL, blur=blur)
+
+    def error(pictures: np.ndarray) -> float:
+        shown = np.stack([cv2.GaussianBlur(p.astype(np.float32), (0, 0), blur) for p in pictures])
+        return float(np.sqrt(np.square((shown - frames)[:, 6:-6, 6:-6]).mean()))
+
+    plain, sharpened = error(frames), error(film.frames)
+    # grain as wide as the blur loses half of its variance or so; what is left is a blur of that loss
+    assert plain > 2.0 and sharpened < 0.5 * plain
+
+
+def test_sharpening_takes_nothing_from_beside_the_fluid():
+    """A bank that is much brighter would darken the rim of water that is even."""
+    fluid = everywhere()
+    fluid[:, :, 32:] = False
+    frames = np.where(fluid[..., None], WATER, 255).astype(np.uint8)
+    film = FluidFootage.of(frames, fluid, INTERVAL, blur=1.2)
+    np.testing.assert_array_equal(film.frames, frames)
+
+
+def test_a_place_is_looked_up_in_the_nearest_frame():
+    """A mean of two frames would show both."""
+    frames = np.empty((FRAMES, *SIZE, 3), np.uint8)
+    frames[:] = 10 * np.arange(FRAMES)[:, None, None, None]
+    film = FluidFootage.of(frames, everywhere(), INTERVAL)
+    instants = np.array([-3.0, 2.4, 2.6, FRAMES - 1.2, FRAMES + 7.0])
+    residual, _ = film.looked_up(np.full((5, 2), 20.0), instants)
+    found = 255 * (residual + film.mean[20, 20])[:, 0]
+    np.testing.assert_allclose(found, 10 * np.array([0, 2, 3, FRAMES - 1, FRAMES - 1]), atol=1e-3)  # single precision
+
+
+def test_the_share_of_fluid_is_bilinear_between_pixels():
+    fluid = everywhere()
+    fluid[3, :, 32:] = False
+    film = FluidFootage.of(lively(), fluid, INTERVAL)
+    columns = np.array([30.0, 31.0, 31.25, 31.5, 32.0, 40.0])
+    index = np.stack([np.full(6, 20.0), columns], axis=-1)
+    residual, share = film.looked_up(index, np.full(6, 3.0))
+    np.testing.assert_allclose(share, [1, 1, 0.75, 0.5, 0, 0], atol=1e-6)
+    assert (residual[-2:] == 0).all(), "what is dry adds nothing"
+    np.testing.assert_allclose(film.looked_up(index, np.full(6, 4.0))[1], 1.0, atol=1e-6)  # wet again
+
+
+def test_places_beyond_the_picture_are_its_border():
+    film = FluidFootage.of(lively(), everywhere(), INTERVAL)
+    beyond, _ = film.looked_up(np.array([[-5.0, 12.0], [200.0, 400.0]]), np.full(2, 2.0))
+    border, _ = film.looked_up(np.array([[0.0, 12.0], [SIZE[0] - 1.0, SIZE[1] - 1.0]]), np.full(2, 2.0))
+    np.testing.assert_allclose(beyond, border, atol=1e-7)

@@ -19,7 +19,7 @@ from fluidlift.pipeline.scene import SimulationRequest, scene_of
 from fluidlift.pipeline.simulating import simulator_of
 from fluidlift.types import FaceVelocity
 
-FRAMES = 24
+FRAMES = 14
 
 
 def of(scene) -> SimpleNamespace:

@@ -225,7 +225,7 @@ def test_another_seed_gives_another_body_from_the_same_motion(made, copy, quick,
     capsys.readouterr()
     run(made, copy, "--seed", "1", "--json", "--set", "simulate.frames=1", "--set", "show.usd=false", quick=quick)
     stages = outcome(capsys)["stages"]
-    assert [name for name in STAGES if not stages[name]["cached"]] == ["refine", "simulate", "show"]
+    assert [name for name in STAGES if not stages[name]["cached"]] == ["refine", "calibrate", "simulate", "show"]
     assert (copy / "rest/gaussians.ply").read_bytes() != (made.folder / "rest/gaussians.ply").read_bytes()
     assert (copy / "parameters.json").read_bytes() == (made.folder / "parameters.json").read_bytes()
 

@@ -15,8 +15,8 @@ from fluidlift.io.pictures import fitted_size, resample
 from fluidlift.io.video import read_clip
 
 MOST_FRAMES = 120
-"""frames of the clip: four seconds at 30 per second, 0.2 to 1.3 MB at 512 px. Patches of footage last half of it, which
-is longer than foam does"""
+"""frames of the clip: four seconds at 30 per second, 0.2 to 1.3 MB at 512 px. Patches of footage last half of it,
+longer than foam does"""
 LARGEST = 1024
 """px of a picture's longer side: those of a larger clip are scaled down"""
 QUALITY = 14.0

@@ -163,7 +163,7 @@ def _metrics(story: Story) -> dict[str, Any]:
         "fit_rollouts": story["fit"].meta["rollouts"],
         "fit_extra": story["fit"].meta["extra"],
         "fit": fit_figures(story),
-        "calibration": {k: v for k, v in story["calibrate"].meta.items() if isinstance(v, int | float)},
+        "calibration": {k: story["calibrate"].meta.get(k) for k in ("acceleration", "speed", "left", "frames")},
     }
 
 

@@ -75,6 +75,9 @@ FILES = {
 }
 """where the parts lie, relative to the folder"""
 
+OPTIONAL = frozenset({"film", "force"})
+"""parts that not every asset has: smoke has no film, and only streams and falls are calibrated"""
+
 _HASHED = frozenset(FILES) - {"scene"} | {"usd"}
 """parts whose SHA-256 the manifest keeps: all but what a person edits, and what is large"""
 

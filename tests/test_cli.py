@@ -450,11 +450,11 @@ def test_progress_is_plain_lines_where_there_is_no_terminal(stream_clip, tmp_pat
     folder = tmp_path / "x.fluid"
     main(["make", str(stream_clip), "-o", str(folder), "--size", "2", *hasty])
     said = capsys.readouterr()
-    assert "[1/9] reading the clip ..." in said.err and "[9/9]" in said.err
+    assert "[1/10] reading the clip ..." in said.err and "[10/10]" in said.err
     assert "\x1b" not in said.err + said.out and "\r" not in said.err
     assert str(folder) in said.out
     main(["make", str(stream_clip), "-o", str(folder), "--size", "2", *hasty])
-    assert capsys.readouterr().err.count("already done") == 9
+    assert capsys.readouterr().err.count("already done") == 10
 
 
 def test_pictures_in_a_folder_are_a_clip_too(stream_clip, tmp_path, hasty):

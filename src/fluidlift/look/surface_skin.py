@@ -57,13 +57,19 @@ def of_skin(gaussians: Gaussians, cell: float) -> Bool[np.ndarray, " n"]:
     least = gaussians.scales.min(axis=1)
     found = np.zeros(len(gaussians), bool)
     for level in range(FINEST + 1):
-        size = wanted * _finer(level)
+        size = wanted * finer(level)
         like = np.flatnonzero(np.abs(least - size[0]) < ALIKE * size[0])
         found[like] |= (np.abs(np.sort(gaussians.scales[like], axis=1) / size - 1.0) < ALIKE).all(axis=1)
     return found
 
 
-def _finer(level: Int[np.ndarray, "*n"] | int) -> Any:
+def level_for(apart: Float[np.ndarray, " n"], wanted: float) -> Int[np.ndarray, " n"]:
+    """The coarsest level at which tracers that would be `apart` at level 0 are at most `wanted` apart, to `FINEST`."""
+    level = np.ceil(2.0 * np.log2(np.maximum(apart / wanted, 1.0)) - 1e-6).astype(np.int64)
+    return np.minimum(level, FINEST)
+
+
+def finer(level: Int[np.ndarray, "*n"] | int) -> Any:
     """Sizes at a level, shares of those at level 0."""
     return 2.0 ** (-0.5 * np.asarray(level))
 
@@ -167,7 +173,7 @@ class SurfaceSkin:
 
     def _fill(self, surface: SurfaceMap, level: int, rng: np.random.Generator) -> None:
         """Tracers of a level go where they are crowded, and come where they are drawn apart."""
-        spacing, own = PITCH * self._cell * float(_finer(level)), np.flatnonzero(self.levels == level)
+        spacing, own = PITCH * self._cell * float(finer(level)), np.flatnonzero(self.levels == level)
         if len(own) > 1:
             keep = np.ones(len(self), bool)
             keep[own] = _sparse(self.places[own], self.ids[own], CROWDED * spacing)
@@ -207,7 +213,7 @@ class SurfaceSkin:
         quats = np.stack([1 + normal[:, 2], -normal[:, 1], normal[:, 0], np.zeros(n)], axis=-1)
         quats /= np.linalg.norm(quats, axis=1, keepdims=True)
         sizes = self._cell * np.array([WIDTH * PITCH, WIDTH * PITCH, THICKNESS])
-        scales = (_finer(self.levels)[:, None] * sizes).astype(np.float32)
+        scales = (finer(self.levels)[:, None] * sizes).astype(np.float32)
         return Gaussians(
             self.points(surface).astype(np.float32), quats.astype(np.float32), scales,
             np.full(n, OPACITY, np.float32), sh_from_rgb(np.clip(colors, 0.0, 1.0)),

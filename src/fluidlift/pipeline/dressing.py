@@ -108,13 +108,13 @@ def _footage(film: Path, camera: PinholeCamera, means: np.ndarray, cell: float) 
         cell: width of the simulator's cells, m.
     """
     from fluidlift.io.footage_file import size_of_film
-    from fluidlift.look.surface_skin import PITCH, WIDTH
+    from fluidlift.look.surface_skin import PITCH, WIDTH, finer, level_for
 
     if not film.is_file():
         return f"is missing: {AS_AT_REST}; make the asset again"
     small = camera.resized(size_of_film(camera.size))
-    depth = float(np.median(small.project(means)[1]))
-    apart = min(PITCH * cell * small.focal[0] / max(depth, 1e-6), FINE)
+    coarse = PITCH * cell * small.focal[0] / np.maximum(small.project(means)[1], 1e-6)
+    apart = float(np.median(coarse * finer(level_for(coarse, FINE))))
     blur = float(np.sqrt((WIDTH * apart) ** 2 + LOOKED_UP))
     written = film.stat()
     return _taken_apart(film, camera.size, blur, (written.st_mtime_ns, written.st_size))
@@ -205,7 +205,7 @@ class Dressing:
 
     def _level_at(self, places: np.ndarray) -> np.ndarray:
         """How fine the skin is at places of the map: as the film's pixels are there, 0 beside its picture."""
-        from fluidlift.look.surface_skin import FINEST, PITCH
+        from fluidlift.look.surface_skin import PITCH, level_for
 
         assert self._surface is not None
         heights = self._surface.at(self._surface.height, places)
@@ -214,8 +214,7 @@ class Dressing:
         uv, depth = camera.project(world)
         inside = (depth > 0) & ((uv >= 0) & (uv <= np.array(camera.size))).all(axis=1)
         apart = PITCH * self._cell * camera.focal[0] / np.maximum(depth, 1e-6)
-        level = np.ceil(2.0 * np.log2(np.maximum(apart / FINE, 1.0)) - 1e-6).astype(np.int64)
-        return np.where(inside, np.minimum(level, FINEST), 0)
+        return np.where(inside, level_for(apart, FINE), 0)
 
     def _seen_texture(self, surface: SurfaceMap, footage: FluidFootage | None) -> SeenTexture:
         from fluidlift.look.inflow import ENDS

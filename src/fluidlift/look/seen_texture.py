@@ -23,7 +23,33 @@ BEHIND = 4.0
 """columns of the map by which a place may be behind what its pixel shows"""
 
 
-class SeenTexture:
+class TrustedMap:
+    """A map of a surface whose places may lend their look, more or less.
+
+    Args:
+        surface: the map.
+        seen: which of its columns were seen as what they are.
+    """
+
+    def __init__(self, surface: SurfaceMap, seen: Bool[np.ndarray, "nx ny"]) -> None:
+        self.surface, self._trust = surface, ndimage.gaussian_filter(seen.astype(np.float64), 1.0)
+
+    @property
+    def usable(self) -> bool:
+        """Whether any place can lend its look."""
+        return bool(self._trust.max(initial=0.0) > 0.5)
+
+    def trust(self, places: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
+        """Share of the surroundings of places (x, y in m) that was seen and may lend its look, 0 to 1."""
+        return self.surface.at(self._trust, places)
+
+    def trust_within(self, radius: float) -> Float[np.ndarray, "nx ny"]:
+        """Share of a square of twice a radius (m) around each column, and of the column itself, that may lend it."""
+        width = 2 * int(np.ceil(radius / self.surface.pitch)) + 1
+        return ndimage.uniform_filter(self._trust, width, mode="constant") * self._trust
+
+
+class SeenTexture(TrustedMap):
     """The picture of the body, looked up through the camera.
 
     The picture is drawn from the splats, at the clip's size: what is not at hand with an asset is not needed.
@@ -49,7 +75,7 @@ class SeenTexture:
         usable: Bool[np.ndarray, " n"] | None = None,
     ) -> None:
         require(len(body) > 0, "a body without Gaussians", "one or more")
-        self.surface, self._camera, self._shading = surface, camera, shading
+        self._camera, self._shading = camera, shading
         drawn = render(body, camera, background=np.zeros((camera.size[1], camera.size[0], 3), np.float32))
         have = drawn.alpha > OPAQUE
         straight = np.clip(drawn.image / np.maximum(drawn.alpha, 1e-3)[..., None], 0.0, 1.0)
@@ -68,22 +94,7 @@ class SeenTexture:
             seen &= ~shading.fixed[row, col]
         if usable is not None:
             seen &= usable[cKDTree(body.means[:, :2]).query(places.reshape(-1, 2))[1]]
-        seen = ndimage.binary_closing(seen.reshape(surface.wet.shape)) & surface.wet
-        self._trust = ndimage.gaussian_filter(seen.astype(np.float64), 1.0)
-
-    @property
-    def usable(self) -> bool:
-        """Whether any place can lend its look."""
-        return bool(self._trust.max(initial=0.0) > 0.5)
-
-    def trust(self, places: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
-        """Share of the surroundings of places (x, y in m) that was seen and may lend its look, 0 to 1."""
-        return self.surface.at(self._trust, places)
-
-    def trust_within(self, radius: float) -> Float[np.ndarray, "nx ny"]:
-        """Share of a square of twice a radius (m) around each column, and of the column itself, that may lend it."""
-        width = 2 * int(np.ceil(radius / self.surface.pitch)) + 1
-        return ndimage.uniform_filter(self._trust, width, mode="constant") * self._trust
+        super().__init__(surface, ndimage.binary_closing(seen.reshape(surface.wet.shape)) & surface.wet)
 
     def seen_at(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
         """Row and column of the picture in which points (m) are seen, whatever is before them."""

@@ -131,13 +131,6 @@ def test_the_mean_force_keeps_the_flow_that_it_was_needed_for():
     assert free.particles.velocities[:, 0].mean() == pytest.approx(start[0] - 0.5, abs=2e-3)
 
 
-def test_a_steady_force_beside_the_pull_acts_and_counts():
-    nudging = Nudging(uniform(0, 0, 0), rates(0.0), steady=uniform(2, 0, 0))
-    out = nudging.applied(uniform(0, 0, 0), masses(), WHOLE, 0.1)
-    np.testing.assert_allclose(out.u, 0.2, rtol=1e-6)
-    np.testing.assert_allclose(nudging.mean().u, 2.0, rtol=1e-6)
-
-
 def test_faces_without_liquid_do_not_count():
     """Air moves anyhow; and where liquid comes by less than half of the time, the pull is that of splashes."""
     nudging, often, seldom = Nudging(uniform(1, 0, 0), rates(5.0)), masses(), masses()

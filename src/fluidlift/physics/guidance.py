@@ -65,7 +65,6 @@ class Nudging(BodyForce):
     Args:
         target: m/s, on the faces of the simulator's grid.
         rates: 1/s per component, of its faces; 0 where nothing is known.
-        steady: an acceleration (m/s^2) that acts beside the pull and counts in the mean; None: none.
         after: s of the simulation that do not count in the mean.
     """
 
@@ -74,12 +73,11 @@ class Nudging(BodyForce):
         target: FaceVelocity,
         rates: tuple[Float[np.ndarray, "..."], ...],
         *,
-        steady: FaceVelocity | None = None,
         after: float = 0.0,
     ) -> None:
         for rate, component in zip(rates, target.components):
             require(rate.shape == component.shape, f"rates {rate.shape}", str(component.shape))
-        self._target, self._rates, self._steady = target, rates, steady
+        self._target, self._rates = target, rates
         self._sum = [np.zeros(c.shape, np.float32) for c in target.components]
         self._time = [np.zeros(c.shape, np.float32) for c in target.components]
         self._passed, self._after = 0.0, after
@@ -91,8 +89,6 @@ class Nudging(BodyForce):
             faces = face_box(box, axis)
             share = -np.expm1(-np.float32(dt) * self._rates[axis][faces])
             change = share * (self._target.components[axis][faces] - v)
-            if self._steady is not None:
-                change = change + np.float32(dt) * self._steady.components[axis][faces]
             wet = (mass > 0) & (self._passed >= self._after)
             self._sum[axis][faces] += np.where(wet, change, np.float32(0))
             self._time[axis][faces] += np.where(wet, np.float32(dt), np.float32(0))

@@ -21,8 +21,8 @@ TOUCHED = 0.1
 """cells by which edited terrain differs from the filmed one, from which its place counts as touched"""
 
 WAKE = 3.0
-"""widths of what was put in over which the force comes back: as far as the velocity behind a bluff body is lower
-by more than a tenth or so is longer, but there the force is that of the bed, and still right"""
+"""widths of what was put in over which the force comes back: the near wake of a bluff body, in which the flow turns
+back, is one to three long"""
 
 
 def following(scene: Scene, asset: FluidAsset, folder: Path, share: float) -> Scene:

@@ -13,13 +13,13 @@ import numpy as np
 from jaxtyping import Float
 
 from fluidlift.errors import InputRejected
-from fluidlift.io.exr import read_channels
+from fluidlift.io.exr import MAX_SIDE, read_channels
 from fluidlift.io.limits import ReadLimits, require_file, require_size
 
 SUFFIXES = (".hdr", ".exr")
 MAX_HEADER = 64 * 1024
 """bytes before the pixels of an .hdr"""
-MAX_BYTES = 2**30
+MAX_BYTES = 2**29
 """of a file"""
 NEEDED = "a panorama in linear light: Radiance .hdr, or OpenEXR"
 _PLAIN = {b"\x89PNG": "a PNG", b"\xff\xd8\xff": "a JPEG", b"RIFF": "a WebP", b"BM": "a BMP", b"GIF8": "a GIF"}
@@ -96,7 +96,7 @@ def _openexr(path: Path, limits: ReadLimits) -> np.ndarray:
 def _radiance(path: Path, limits: ReadLimits) -> np.ndarray:
     data = path.read_bytes()
     at, flip_rows, flip_columns, height, width = _header(path, data)
-    if not (0 < width * height <= limits.max_pixels):
+    if not (0 < width * height <= limits.max_pixels) or max(width, height) > MAX_SIDE:
         raise InputRejected(
             f"'{path.name}' is {width} x {height} pixels", f"1 to {limits.max_pixels} pixels", "scale it down"
         )
@@ -143,12 +143,14 @@ def _run_lengths(path: Path, data: bytes, at: int, height: int, width: int) -> n
             if at + 1 >= len(data):
                 raise _cut_off(path, f"it ends in scan line {row} of {height}")
             count = data[at]
+            if count == 0:
+                raise _cut_off(path, f"a run of nothing in scan line {row}")
             if count > 128:
                 line += data[at + 1 : at + 2] * (count - 128)
                 at += 2
             else:
                 line += data[at + 1 : at + 1 + count]
-                at += 1 + max(count, 1)
+                at += 1 + count
         if len(line) != 4 * width:
             raise _cut_off(path, f"scan line {row} of {height} is too long")
         out[row] = np.frombuffer(bytes(line), np.uint8).reshape(4, width).T

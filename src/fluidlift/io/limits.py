@@ -10,8 +10,11 @@ from typing import Any
 
 from fluidlift.errors import InputRejected, require
 
-MAX_TEXT_BYTES = 64 * 2**20
-"""of a JSON or YAML file"""
+MAX_TEXT_BYTES = 16 * 2**20
+"""of a JSON file"""
+MAX_PIXEL_BYTES = 16
+"""of decoded samples for each pixel of `ReadLimits.max_pixels`: four channels in single precision, or more on smaller
+pictures"""
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from pathlib import Path
 
 import cv2
@@ -10,18 +9,22 @@ import numpy as np
 
 from fluidlift.errors import InputRejected
 from fluidlift.io.atomic import write_bytes
-from fluidlift.io.exr import read_channels
-from fluidlift.io.limits import ReadLimits, require_file
+from fluidlift.io.exr import MAX_SIDE, channels_in
+from fluidlift.io.limits import MAX_PIXEL_BYTES, ReadLimits, require_file, require_size
+from fluidlift.io.picture_headers import PictureHeader, picture_header
 from fluidlift.numerics.srgb import srgb_from_linear
 
 PICTURE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".exr"})
+MAX_BYTES = 2**30
+"""of a file"""
 
 
 def read_picture(path: Path | str, *, limits: ReadLimits | None = None) -> np.ndarray:
     """Samples as they are stored: [H,W], [H,W,3] or [H,W,4] in RGB(A) order, u8, u16 or float32 (linear light).
 
     Raises:
-        InputRejected: no such file, not a picture, damaged, or more pixels than `limits.max_pixels`.
+        InputRejected: no such file, not a picture, damaged, or more than `limits` and `MAX_PIXEL_BYTES` let in; all
+            of it before anything is decoded.
     """
     limits = limits or ReadLimits()
     path = require_file(path, "picture")
@@ -29,59 +32,67 @@ def read_picture(path: Path | str, *, limits: ReadLimits | None = None) -> np.nd
         raise InputRejected(
             f"'{path.name}' is not a picture of a known kind", "one of " + ", ".join(sorted(PICTURE_SUFFIXES))
         )
-    if path.suffix.lower() == ".exr":
-        return _from_channels(path, read_channels(path, limits=limits))
-    with path.open("rb") as file:
-        size = _size_in_header(file.read(2**16))
-    if size is not None:
-        _require_pixels(path, size, limits)
-    data = np.fromfile(path, np.uint8)  # imdecode takes any file name; imread does not on every system
+    require_size(path, MAX_BYTES, "picture")
+    return picture_in(path.read_bytes(), path.name, limits)
+
+
+def picture_in(data: bytes, name: str, limits: ReadLimits) -> np.ndarray:
+    """The picture in a file's bytes, as `read_picture` gives it; what it is is told by its content.
+
+    Args:
+        data: the whole file.
+        name: of the file, for complaints.
+        limits: on its pixels.
+
+    Raises:
+        InputRejected: as `read_picture`.
+    """
+    head = checked_header(data, name, limits)
+    if head.kind == "OpenEXR":
+        return _from_channels(name, channels_in(data, name, limits))
     try:
-        picture = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+        picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         picture = None
     if picture is None:
-        raise InputRejected(f"'{path.name}' cannot be decoded", "an undamaged picture", "export it again")
-    _require_pixels(path, picture.shape[1::-1], limits)
+        raise InputRejected(f"'{name}' cannot be decoded", "an undamaged picture", "export it again")
     if picture.ndim == 2:
         return picture
     order = {3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGBA}.get(picture.shape[2])
     return cv2.cvtColor(picture, order) if order is not None else np.ascontiguousarray(picture[..., 0])
 
 
-def _from_channels(path: Path, channels: dict[str, np.ndarray]) -> np.ndarray:
+def checked_header(data: bytes, name: str, limits: ReadLimits) -> PictureHeader:
+    """The header of a picture that may be decoded; raises as `read_picture`."""
+    try:
+        head = picture_header(data)
+    except ValueError as error:
+        raise InputRejected(
+            f"'{name}' cannot be decoded ({error})", "an undamaged picture", "export it again"
+        ) from None
+    size = head.width * head.height
+    if max(head.width, head.height) > MAX_SIDE or size > limits.max_pixels:
+        raise InputRejected(
+            f"'{name}' is {head.width} x {head.height} pixels",
+            f"at most {limits.max_pixels} pixels, and {MAX_SIDE} a side",
+            "scale it down, or raise the limit with --max-pixels",
+        )
+    if size * head.pixel_bytes > MAX_PIXEL_BYTES * limits.max_pixels:
+        raise InputRejected(
+            f"'{name}' has {head.pixel_bytes} bytes in each of its {size} pixels",
+            f"at most {MAX_PIXEL_BYTES * limits.max_pixels} bytes", "export it with fewer channels, or smaller",
+        )  # fmt: skip
+    return head
+
+
+def _from_channels(name: str, channels: dict[str, np.ndarray]) -> np.ndarray:
     """R, G, B (and A) of an OpenEXR file, or the one channel that it has."""
     if {"R", "G", "B"} <= channels.keys():
         return np.stack([channels[c] for c in "RGBA" if c in channels], axis=-1)
-    for name in ("Y", "Z", "A", *channels):
-        if name in channels:
-            return channels[name]
-    raise InputRejected(f"'{path.name}' has no channels", "R, G, B or Y")
-
-
-def _require_pixels(path: Path, size: tuple[int, int], limits: ReadLimits) -> None:
-    if size[0] * size[1] > limits.max_pixels:
-        raise InputRejected(
-            f"'{path.name}' is {size[0]} x {size[1]} pixels",
-            f"at most {limits.max_pixels} pixels",
-            "scale it down, or raise the limit with --max-pixels",
-        )
-
-
-def _size_in_header(head: bytes) -> tuple[int, int] | None:
-    """(width, height) of a PNG or JPEG before it is decoded; None for other kinds."""
-    if head[:8] == b"\x89PNG\r\n\x1a\n" and len(head) >= 24:
-        return struct.unpack(">II", head[16:24])
-    if head[:2] != b"\xff\xd8":
-        return None
-    at = 2
-    while at + 9 <= len(head) and head[at] == 0xFF:
-        marker, length = head[at + 1], int.from_bytes(head[at + 2 : at + 4], "big")
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
-            height, width = struct.unpack(">HH", head[at + 5 : at + 9])
-            return width, height
-        at += 2 + length
-    return None
+    for channel in ("Y", "Z", "A", *channels):
+        if channel in channels:
+            return channels[channel]
+    raise InputRejected(f"'{name}' has no channels", "R, G, B or Y")
 
 
 def eight_bit(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:

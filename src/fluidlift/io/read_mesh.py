@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-import json
 import struct
+from array import array
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from fluidlift.errors import InputRejected
-from fluidlift.io.limits import require_file, require_size
+from fluidlift.io.limits import parse_json, require_file, require_size
 from fluidlift.io.mesh_textures import (
-    MAX_MATERIALS,
+    MAX_PLAIN,
     Paint,
     corner_colors,
     materials_of,
     one_picture,
-    picture_bytes,
     vertex_colors,
 )
 from fluidlift.io.ply import AXES, read_mesh
+from fluidlift.io.ply_records import open_ply
 from fluidlift.numerics.srgb import srgb_from_linear
 from fluidlift.types import TriangleMesh
 
@@ -28,7 +28,13 @@ SUFFIXES = (".obj", ".ply", ".glb")
 
 _MAX_BYTES = 256 * 2**20
 _MAX_NODES = 10_000
-_MAX_VERTICES = 5_000_000
+MAX_VERTICES = 5_000_000
+MAX_TRIANGLES = 3_000_000
+"""with their colours and texture coordinates they take 1 GB while they are read"""
+_MAX_LINE = 2**20
+"""characters of a line of an OBJ"""
+_MAX_SCENE = 16 * 2**20
+"""bytes of the JSON of a GLB"""
 _KINDS = {5121: np.dtype("<u1"), 5123: np.dtype("<u2"), 5125: np.dtype("<u4"), 5126: np.dtype("<f4")}
 _JSON, _BINARY = 0x4E4F534A, 0x004E4942
 
@@ -52,9 +58,9 @@ def read_any_mesh(path: Path | str) -> TriangleMesh:
     read = {".obj": _read_obj, ".ply": _read_ply, ".glb": _read_glb}[path.suffix.lower()]
     try:
         mesh = read(path)
-    except (ValueError, KeyError, IndexError, TypeError, struct.error, RecursionError, OverflowError) as error:
+    except (ValueError, LookupError, TypeError, AttributeError, struct.error, ArithmeticError) as error:
         raise InputRejected(
-            f"'{path.name}' cannot be read as a mesh ({error})", "a whole file", "export it again"
+            f"'{path.name}' cannot be read as a mesh ({str(error)[:200]})", "a whole file", "export it again"
         ) from None
     if not len(mesh.faces):
         raise InputRejected(f"'{path.name}' holds no triangles", "a closed surface of triangles")
@@ -66,6 +72,9 @@ def read_any_mesh(path: Path | str) -> TriangleMesh:
 
 
 def _read_ply(path: Path) -> TriangleMesh:
+    elements, _ = open_ply(path)
+    for name, most in (("vertex", MAX_VERTICES), ("face", MAX_TRIANGLES)):
+        _require_count(elements[name].count if name in elements else 0, most, f"elements '{name}'")
     mesh = read_mesh(path)
     return TriangleMesh(mesh.vertices.astype(np.float64), mesh.faces, mesh.colors)
 
@@ -82,68 +91,74 @@ def _read_obj(path: Path) -> TriangleMesh:
                 obj.take(line)
             except ValueError as error:
                 raise ValueError(f"line {number}: {error}") from None
-    places, triangles = np.array(obj.vertices, np.float64).reshape(-1, 3), np.array(obj.faces, np.int64).reshape(-1, 3)
+    places, triangles = np.array(obj.vertices).reshape(-1, 3), np.array(obj.faces, np.int64).reshape(-1, 3)
     colors = np.array(obj.colors, np.float32).reshape(-1, 3)
     whole = len(colors) == len(places) > 0 and bool(((colors >= 0) & (colors <= 1)).all())
     materials = materials_of(path.parent, obj.library) if obj.library and len(triangles) else {}
-    if not materials or not set(obj.names) & materials.keys():
+    if not materials or not obj.names.keys() & materials.keys():
         return TriangleMesh(places, triangles, colors if whole else None)
     paints = [materials.get(name, Paint()) for name in obj.names]
-    uv = np.array([(0.0, 0.0), *obj.coordinates], np.float64)[np.array(obj.corners) + 1].reshape(-1, 3, 2)
+    coordinates = np.concatenate([np.zeros((1, 2)), np.array(obj.coordinates).reshape(-1, 2)])
+    uv = coordinates[np.array(obj.corners, np.int64) + 1].reshape(-1, 3, 2)
     uv[..., 1] = 1.0 - uv[..., 1]  # an OBJ counts from the lower left corner
-    return _painted(places, triangles, paints, np.array(obj.materials), uv)
+    return _painted(places, triangles, paints, np.array(obj.materials, np.int64), uv)
 
 
 class _Obj:
-    """What the lines of an OBJ add up to."""
+    """What the lines of an OBJ add up to; numbers lie in arrays, which take a tenth of the memory of lists."""
 
     def __init__(self) -> None:
-        self.vertices: list[list[float]] = []
-        self.colors: list[list[float]] = []
-        self.coordinates: list[tuple[float, float]] = []
-        self.faces: list[tuple[int, int, int]] = []
-        self.corners: list[tuple[int, int, int]] = []
-        """of faces: indices of coordinates, -1 where there are none"""
-        self.materials: list[int] = []
-        """of faces: indices of names"""
-        self.names: list[str] = [""]
+        self.vertices, self.colors, self.coordinates = array("d"), array("d"), array("d")
+        self.faces, self.corners, self.materials = array("i"), array("i"), array("i")
+        """vertices and coordinates (-1: none) of corners; indices of names"""
+        self.names: dict[str, int] = {"": 0}
         self.library = ""
         self._material = 0
 
     def take(self, line: str) -> None:
         """One line; raises ValueError."""
+        if len(line) > _MAX_LINE:
+            raise ValueError(f"a line of {len(line)} characters")
         words = line.split()
         if not words:
             return
         if words[0] == "v":
-            self.vertices.append([float(w) for w in words[1:4]])
-            if len(self.vertices[-1]) != 3:
-                raise ValueError("a vertex of fewer than three numbers")
-            if len(words) == 7:
-                self.colors.append([float(w) for w in words[4:7]])
+            self._vertex(words)
         elif words[0] == "vt":
-            self.coordinates.append((float(words[1]), float(words[2]) if len(words) > 2 else 0.0))
+            self.coordinates.extend((float(words[1]), float(words[2]) if len(words) > 2 else 0.0))
+            _require_count(len(self.coordinates) // 2, MAX_VERTICES, "texture coordinates")
         elif words[0] == "f":
             self._face(words[1:])
         elif words[0] == "usemtl":
             name = line.split(None, 1)[1].strip() if len(words) > 1 else ""
-            if name not in self.names:
-                if len(self.names) > 16 * MAX_MATERIALS:
-                    raise ValueError(f"more than {16 * MAX_MATERIALS} materials")
-                self.names.append(name)
-            self._material = self.names.index(name)
+            self._material = self.names.setdefault(name, len(self.names))
+            _require_count(len(self.names), MAX_PLAIN, "materials")
         elif words[0] == "mtllib" and len(words) > 1 and not self.library:
             self.library = line.split(None, 1)[1].strip()
 
+    def _vertex(self, words: list[str]) -> None:
+        if len(words) < 4:
+            raise ValueError("a vertex of fewer than three numbers")
+        self.vertices.extend([float(w) for w in words[1:4]])
+        _require_count(len(self.vertices) // 3, MAX_VERTICES, "vertices")
+        if len(words) == 7:
+            self.colors.extend([float(w) for w in words[4:7]])
+
     def _face(self, words: list[str]) -> None:
-        corner = [_obj_index(w, len(self.vertices)) for w in words]
-        if len(corner) < 3:
+        if len(words) < 3:
             raise ValueError("a face of fewer than three corners")
-        at = [_obj_coordinate(w, len(self.coordinates)) for w in words]
+        _require_count(len(self.materials) + len(words) - 2, MAX_TRIANGLES, "triangles")
+        corner = [_obj_index(w, len(self.vertices) // 3) for w in words]
+        at = [_obj_coordinate(w, len(self.coordinates) // 2) for w in words]
         for i in range(1, len(corner) - 1):
-            self.faces.append((corner[0], corner[i], corner[i + 1]))
-            self.corners.append((at[0], at[i], at[i + 1]))
+            self.faces.extend((corner[0], corner[i], corner[i + 1]))
+            self.corners.extend((at[0], at[i], at[i + 1]))
             self.materials.append(self._material)
+
+
+def _require_count(count: int, most: int, what: str) -> None:
+    if count > most:
+        raise ValueError(f"more than {most} {what}")
 
 
 def _painted(
@@ -180,23 +195,23 @@ def _read_glb(path: Path) -> TriangleMesh:
         raise ValueError(f"it needs the extension {str(required[0])[:40]}, which this reader does not know")
     parts: list[tuple[np.ndarray, ...]] = []
     paints = _glb_paints(scene, binary)
-    count, colored = 0, False
+    count, built, colored = 0, 0, False
     for node, world in _placed_nodes(scene):
         if "mesh" not in node:
             continue
         for primitive in scene["meshes"][_index(node["mesh"])]["primitives"]:
             if primitive.get("mode", 4) != 4:
                 continue  # points and lines bound nothing
-            part = _glb_part(scene, binary, primitive, world)
+            count, built = count + _count_of(scene, primitive, "POSITION"), built + _triangles_of(scene, primitive)
+            _require_count(count, MAX_VERTICES, "vertices")  # primitives and nodes may share what they are made of
+            _require_count(built, MAX_TRIANGLES, "triangles")
             material = _index(primitive["material"]) + 1 if "material" in primitive else 0
             if material >= len(paints):
                 raise ValueError("a material that is not there")
-            points, triangles, colors, uv = part
+            points, triangles, colors, uv = _glb_part(scene, binary, primitive, world)
             colored = colored or material > 0 or "COLOR_0" in primitive["attributes"]
-            parts.append((points, triangles + count, colors, uv, np.full(len(triangles), material)))
-            count += len(points)
-            if count > _MAX_VERTICES:
-                raise ValueError(f"more than {_MAX_VERTICES} vertices")
+            parts.append((points, triangles + (count - len(points)), colors, uv, np.full(len(triangles), material)))
+            _require_count(len(parts), _MAX_NODES, "parts")
     if not parts:
         raise ValueError("no triangles")
     points, faces, colors, uv, which = (np.concatenate(p) for p in zip(*parts, strict=True))
@@ -210,6 +225,18 @@ def _read_glb(path: Path) -> TriangleMesh:
     plain = np.array([_linear(p.color) for p in paints])
     factor = vertex_colors(len(points), faces, np.repeat(plain[which][:, None], 3, axis=1))
     return TriangleMesh(points, faces, srgb_from_linear(np.clip(colors * factor, 0, 1)).astype(np.float32))
+
+
+def _count_of(scene: dict[str, Any], primitive: dict[str, Any], name: str) -> int:
+    """Values of an attribute, as its accessor says."""
+    return _index(scene["accessors"][_index(primitive["attributes"][name])]["count"])
+
+
+def _triangles_of(scene: dict[str, Any], primitive: dict[str, Any]) -> int:
+    """Triangles of a primitive, as its accessors say."""
+    if "indices" not in primitive:
+        return _count_of(scene, primitive, "POSITION") // 3
+    return _index(scene["accessors"][_index(primitive["indices"])]["count"]) // 3
 
 
 def _linear(color: tuple[float, float, float]) -> np.ndarray:
@@ -259,35 +286,29 @@ def _glb_paints(scene: dict[str, Any], binary: bytes) -> list[Paint]:
     """The one of primitives without a material (white), then the materials."""
     paints = [Paint((1.0, 1.0, 1.0))]
     materials = scene.get("materials", [])
-    if len(materials) > 16 * MAX_MATERIALS:
-        raise ValueError(f"{len(materials)} materials")
-    decoded: dict[int, np.ndarray] = {}
+    _require_count(len(materials), MAX_PLAIN, "materials")
     for material in materials:
         told = material.get("pbrMetallicRoughness", {})
         factor = np.clip(np.array(told.get("baseColorFactor", [1, 1, 1, 1]), np.float64)[:3], 0, 1)
         r, g, b = srgb_from_linear(factor).tolist()
-        picture = None
+        source = None
         if "baseColorTexture" in told:
-            source = scene["textures"][_index(told["baseColorTexture"]["index"])].get("source")
-            if source is not None:
-                if len(decoded) >= MAX_MATERIALS and _index(source) not in decoded:
-                    raise ValueError(f"more than {MAX_MATERIALS} pictures")
-                if source not in decoded:
-                    decoded[source] = _glb_picture(scene, binary, source)
-                picture = decoded[source]
-                if (factor < 1).any():
-                    picture = np.round(picture * np.array([r, g, b])).astype(np.uint8)  # nearly: a power law's factor
-        paints.append(Paint((r, g, b), picture))
+            number = scene["textures"][_index(told["baseColorTexture"]["index"])].get("source")
+            source = None if number is None else _glb_picture(scene, binary, _index(number))
+        paints.append(Paint((r, g, b), source, (r, g, b)))
     return paints
 
 
-def _glb_picture(scene: dict[str, Any], binary: bytes, number: int) -> np.ndarray:
+def _glb_picture(scene: dict[str, Any], binary: bytes, number: int) -> memoryview:
     image = scene["images"][number]
     if "bufferView" not in image:
         raise ValueError("a texture in another file")
+    kind = image.get("mimeType", "")
+    if kind not in ("image/png", "image/jpeg"):
+        raise ValueError(f"a texture of the kind '{str(kind)[:40]}'; PNG and JPEG are known")
     view = scene["bufferViews"][_index(image["bufferView"])]
     start = _index(view.get("byteOffset", 0))
-    return picture_bytes(binary[start : start + _index(view["byteLength"])], image.get("mimeType", ""))
+    return memoryview(binary)[start : start + _index(view["byteLength"])]
 
 
 def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
@@ -303,7 +324,9 @@ def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
             raise ValueError("it breaks off")
         chunk = data[at + 8 : at + 8 + size]
         if kind == _JSON and scene is None:
-            scene = json.loads(chunk)
+            if size > _MAX_SCENE:
+                raise ValueError(f"a scene of {size} bytes; at most {_MAX_SCENE} are read")
+            scene = parse_json(chunk)
         elif kind == _BINARY and not binary:
             binary = chunk
         at += 8 + size

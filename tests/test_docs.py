@@ -173,7 +173,8 @@ def test_the_drawing_of_the_house_names_every_module(package):
 
 
 def test_sections_that_programs_fill_have_both_markers_in_order():
-    text = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
-    markers = re.findall(r"^<!-- ([\w-]+):(begin|end) -->$", text, flags=re.M)
-    assert len(markers) >= 10
-    assert all(a == (b[0], "begin") and b[1] == "end" for a, b in zip(markers[::2], markers[1::2], strict=True))
+    pages = sorted((ROOT / "docs" / "experiments").glob("*.md"))
+    found = [re.findall(r"^<!-- ([\w-]+):(begin|end) -->$", p.read_text(encoding="utf-8"), flags=re.M) for p in pages]
+    assert sum(map(len, found)) >= 10
+    for markers in found:
+        assert all(a == (b[0], "begin") and b[1] == "end" for a, b in zip(markers[::2], markers[1::2], strict=True))

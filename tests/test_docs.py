@@ -117,7 +117,8 @@ def test_the_python_example_of_the_readme_uses_what_there_is():
     names: dict[str, object] = {}
     exec(beginning, names)
     assert names["config"] == build_config("draft", overrides=["fit.max_work=2e8"])
-    assert callable(names["make"]) and callable(names["Inputs"]) and callable(names["load_asset"])
+    face = set(re.findall(r"\bfl\.(\w+)", example))
+    assert len(face) >= 4 and all(callable(getattr(names["fl"], name)) for name in face)
 
 
 SECTIONS = (

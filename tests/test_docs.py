@@ -90,7 +90,7 @@ def test_relative_links_lead_to_files(page):
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
 def test_commands_and_settings_in_the_documents_exist(page):
     code = code_of(page.read_text(encoding="utf-8"))
-    used = set(re.findall(r"(?:^|[\s/`])fluidlift ([a-z]+)\b", code))
+    used = set(re.findall(r"(?:^|[\s/`])(?<!import )fluidlift ([a-z]+)\b", code))
     assert used <= set(COMMANDS)
     for setting in set(re.findall(r"--set ([\w.]+=[\w.-]+)", code)) - {"section.name=value", "PLACE=VALUE"}:
         if not is_scene_entry(setting.partition("=")[0]):  # `edit` sets those of scene.yaml by the same option

@@ -34,7 +34,7 @@ def setting_around(
     return airborne.airborne_setting(
         depth, back, visible, camera, np.concatenate([near, far, reach]), bulk,
         # smoke needs the whole box, and is cheap per cell: no free surface, few particles
-        kind=kind, longest=c.cells, cell_limit=c.cell_limit * (2 if kind == "plume" else 1),
+        kind=kind, longest=c.cells, cell_limit=c.cell_limit * (2 if kind.is_gas else 1),
     )  # fmt: skip
 
 

@@ -15,7 +15,7 @@ from fluidlift.shape.depth_surface import solid_heights
 from fluidlift.shape.ground_mesh import ground_mesh
 from fluidlift.shape.plan import Extent, Footage, Plan, dry_columns, extent_of, plan_of, wide_ends, with_seen
 from fluidlift.shape.terrain import Setting, at_cells, signed_distance_from, to_corners, unit
-from fluidlift.types import CellType, FluidKind, Grid, Label, Terrain
+from fluidlift.types import CellType, FluidKind, Grid, Label, Terrain, kind_of
 
 INLET = 2.5
 """cells along the flow that an inlet is long"""
@@ -50,7 +50,7 @@ class _Ground:
 class ChannelConfig:
     """How a fluid that lies on something is built."""
 
-    kind: FluidKind
+    kind: str | FluidKind
     """of the fluid, a channel flow"""
     longest: int
     """cells along the longest side"""
@@ -73,9 +73,9 @@ def channel_setting(seen: Footage, config: ChannelConfig) -> Setting:
     Raises:
         ValueError: no fluid on the ground, or a kind that runs in no channel.
     """
-    extent = extent_of(seen)
-    share = config.kind.depth_ratio if config.depth_ratio is None else config.depth_ratio
-    require(share is not None, f"the kind '{config.kind}'", "a channel flow")
+    extent, kind = extent_of(seen), kind_of(config.kind)
+    share = kind.depth_ratio if config.depth_ratio is None else config.depth_ratio
+    require(share is not None, f"the kind '{kind}'", "a channel flow")
     depth = share * extent.width
     spacing = max((extent.high - extent.low).max() / config.longest, depth / 10)
     spacing = min(spacing, depth / 4)  # fewer than four cells hold no velocity profile
@@ -86,9 +86,9 @@ def channel_setting(seen: Footage, config: ChannelConfig) -> Setting:
         spacing *= 1.05
     plan = with_seen(plan_of(seen, grid, extent), extent.visible, grid)
     thin = seen.surface.sheet(grid.centers()[:, :, 0, :2])
-    ground = _bed_and_banks(plan, grid, (depth, thin), extent, config.kind)
+    ground = _bed_and_banks(plan, grid, (depth, thin), extent, kind)
     ground = _as_seen(ground, plan, grid, seen, extent)
-    return _fill_channel(grid, plan, ground, extent.reach, seen, config.kind)
+    return _fill_channel(grid, plan, ground, extent.reach, seen, kind)
 
 
 def _channel_grid(surface, low, high, depth, spacing) -> Grid:

@@ -13,12 +13,12 @@ import pytest
 from fuzz.corpus import glb_file, scene_with_picture
 
 from fluidlift.errors import InputRejected
+from fluidlift.io import read_mesh
 from fluidlift.io.exr import channels_in
 from fluidlift.io.images import read_depth
 from fluidlift.io.limits import ReadLimits, parse_json
 from fluidlift.io.picture_headers import picture_header
 from fluidlift.io.pictures import picture_in, read_picture
-from fluidlift.io import read_mesh
 from fluidlift.io.read_mesh import read_any_mesh
 
 

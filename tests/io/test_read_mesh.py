@@ -93,7 +93,9 @@ def change_accessor(**values):
 @pytest.mark.parametrize(
     ("change", "word"),
     [
-        (change_accessor(count=10**12), "more than 5000000 vertices"), (change_accessor(count=10**6), "beyond its data"), (change_accessor(byteOffset=10**12), "beyond its data"),
+        (change_accessor(count=10**12), "more than 5000000 vertices"),
+        (change_accessor(count=10**6), "beyond its data"),
+        (change_accessor(byteOffset=10**12), "beyond its data"),
         (change_accessor(count=-1), "index"), (change_accessor(sparse={"count": 1}), "sparse"),
         (lambda s: s.update(extensionsRequired=["KHR_draco_mesh_compression"]), "draco"),
         (lambda s: s["buffers"][0].update(uri="/etc/passwd"), "another file"),

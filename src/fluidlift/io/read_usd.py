@@ -6,13 +6,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from pxr import Tf, Usd, UsdGeom, UsdVol
+from pxr import Usd, UsdGeom, UsdVol
 
 from fluidlift.errors import InputRejected
 from fluidlift.io.frames import FluidFrame
-from fluidlift.io.limits import require_file
 from fluidlift.io.ply import AXES
 from fluidlift.io.usd_camera import read_camera
+from fluidlift.io.usd_open import open_stage
 from fluidlift.numerics.srgb import srgb_from_linear
 from fluidlift.types import Gaussians, PinholeCamera, Similarity3, TriangleMesh
 
@@ -24,18 +24,17 @@ class UsdFluid:
         """Open a file.
 
         Raises:
-            InputRejected: no such file, no USD, or no fluid in it.
+            InputRejected: as `open_stage`, or no fluid in it.
         """
-        path = require_file(path, "USD file")
-        try:
-            self._stage = Usd.Stage.Open(str(path))
-        except Tf.ErrorException as error:
-            why = " ".join(str(error).split())[:300]
-            raise InputRejected(f"'{path.name}' cannot be read ({why})", "an OpenUSD file") from None
+        path = Path(path)
+        self._stage = open_stage(path)
         self._splats = UsdVol.ParticleField3DGaussianSplat(self._stage.GetPrimAtPath("/Fluid/Splats"))
         if not self._splats:
             raise InputRejected(f"'{path.name}' has no splats at /Fluid/Splats", "a file made with fluidlift export")
         up, unit = UsdGeom.GetStageUpAxis(self._stage), UsdGeom.GetStageMetersPerUnit(self._stage)
+        bounds = (self._stage.GetStartTimeCode(), self._stage.GetEndTimeCode(), self._stage.GetTimeCodesPerSecond())
+        if not (1e-9 < unit < 1e9 and np.abs(bounds).max() < 1e9 and bounds[2] > 0):  # a nan fails, too
+            raise InputRejected(f"'{path.name}' has no sound units, times or rate", "a file made with fluidlift export")
         self._place = Similarity3(1.0 / unit, AXES[f"{str(up).lower()}_up"], np.zeros(3))
         """file_from_world"""
 
@@ -68,7 +67,7 @@ class UsdFluid:
                 world.vectors(_vectors(points.GetVelocitiesAttr(), code)).astype(np.float32),
                 *self._surface(code, world),
             ).checked()
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError, RuntimeError) as error:
             got = f"frame {code:g} of a USD file whose arrays do not fit ({error})"
             raise InputRejected(got, "a whole file", "export it again") from None
         return found

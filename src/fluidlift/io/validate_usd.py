@@ -7,11 +7,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from pxr import Sdf, Tf, Usd, UsdGeom, UsdUtils, UsdValidation
+from pxr import Sdf, Usd, UsdGeom, UsdUtils, UsdValidation
 
-from fluidlift.errors import MissingPackage
+from fluidlift.errors import InputRejected, MissingPackage
 from fluidlift.io.limits import require_file
 from fluidlift.io.usd_checks import prim_faults
+from fluidlift.io.usd_open import open_stage
 
 
 def validate_usd(path: Path | str) -> list[str]:
@@ -26,10 +27,10 @@ def validate_usd(path: Path | str) -> list[str]:
     """
     path = require_file(path, "USD file")
     try:
-        stage = Usd.Stage.Open(str(path))
-    except Tf.ErrorException as error:
-        return [f"cannot be opened: {' '.join(str(error).split())}"]
-    faults = _foreign_paths(path)
+        stage = open_stage(path)
+    except InputRejected as error:
+        return [f"cannot be opened: {error.got}"]
+    faults = _missing_files(path)
     with _quiet():
         context = UsdValidation.ValidationContext(UsdValidation.ValidationRegistry().GetOrLoadAllValidators())
         errors = context.Validate(stage)
@@ -85,20 +86,11 @@ def _quiet() -> Iterator[None]:
         heard.TakeUncoalescedDiagnostics()
 
 
-def _foreign_paths(path: Path) -> list[str]:
-    """Dependencies that are absolute, missing, or outside the folder."""
-    folder = path.resolve().parent
+def _missing_files(path: Path) -> list[str]:
+    """Dependencies that are not there; `open_stage` has seen that all are inside the folder."""
     with _quiet():
-        layers, assets, unresolved = UsdUtils.ComputeAllDependencies(str(path))
-    faults = [f"missing file: {name}" for name in unresolved]
-    for name in [layer.realPath for layer in layers] + list(assets):
-        if folder not in Path(name).resolve().parents:
-            faults.append(f"file outside the folder: {Path(name).name}")
-    for layer in layers:
-        for reference in layer.GetCompositionAssetDependencies():
-            if Path(reference).is_absolute() or ".." in Path(reference).parts:
-                faults.append(f"path that is not inside the folder: {reference}")
-    return faults
+        _, _, unresolved = UsdUtils.ComputeAllDependencies(str(path))
+    return [f"missing file: {name}" for name in unresolved]
 
 
 def _stage_faults(stage: Usd.Stage) -> list[str]:

@@ -1,7 +1,6 @@
-"""Readers of text and arrays take a thousand damaged files each: refused or read, in bounds, and nothing else opened.
+"""Every reader of files from strangers takes a thousand damaged ones: refused or read, in bounds, nothing else opened.
 
-Meshes, pictures, films and USD have targets as well, which are not held to this yet: `python -m tests.fuzz.trial NAME
-INPUTS SEED FOLDER` from the repository tries one and keeps what it trips over (with PYTHONPATH=tests).
+`python -m tests.fuzz` tries more.
 """
 
 from __future__ import annotations
@@ -12,17 +11,13 @@ import sys
 from pathlib import Path
 
 import pytest
+from fuzz.targets import TARGETS
 from fuzz.trial import LARGEST, SLOWEST
 
 INPUTS, SEED = 1000, 20261125
-HELD = (
-    "yaml", "scene", "scene-edited", "settings", "values", "shots", "camera", "distortion", "view", "manifest",
-    "parameters", "asset-camera", "terrain", "velocity", "frames", "force", "history", "splats", "depth", "flow-npz",
-    "flow-npy", "flow-flo", "checkpoint", "stage-facts", "stage-arrays", "stage-mapped",
-)  # fmt: skip
 
 
-@pytest.mark.parametrize("target", HELD)
+@pytest.mark.parametrize("target", TARGETS)
 def test_damaged_files_are_refused_or_read_within_bounds(target):
     # in a process of its own: its memory is its own, and the watch over files that are opened ends with it
     run = subprocess.run(
@@ -36,3 +31,16 @@ def test_damaged_files_are_refused_or_read_within_bounds(target):
     assert found["outside"] == []
     assert found["slowest"] < SLOWEST
     assert found["peak_bytes"] < LARGEST
+
+
+def test_the_command_tries_what_is_asked_for():
+    def run(*args: str) -> subprocess.CompletedProcess[str]:
+        root = Path(__file__).parents[2]
+        return subprocess.run(
+            [sys.executable, "-m", "tests.fuzz", *args], capture_output=True, text=True, timeout=100, cwd=root
+        )
+
+    done = run("--inputs", "20", "force")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[1].split()[:2] == ["force", "20"]
+    assert run("nothing").returncode == 2

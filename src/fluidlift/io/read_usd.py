@@ -35,7 +35,10 @@ class UsdFluid:
         bounds = (self._stage.GetStartTimeCode(), self._stage.GetEndTimeCode(), self._stage.GetTimeCodesPerSecond())
         if not (1e-9 < unit < 1e9 and np.abs(bounds).max() < 1e9 and bounds[2] > 0):  # a nan fails, too
             raise InputRejected(f"'{path.name}' has no sound units, times or rate", "a file made with fluidlift export")
-        self._place = Similarity3(1.0 / unit, AXES[f"{str(up).lower()}_up"], np.zeros(3))
+        axes = AXES.get(f"{str(up).lower()}_up")
+        if axes is None:
+            raise InputRejected(f"'{path.name}' has the up axis '{str(up)[:20]}'", "Y or Z", "export it again")
+        self._place = Similarity3(1.0 / unit, axes, np.zeros(3))
         """file_from_world"""
 
     @property

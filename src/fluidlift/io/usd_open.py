@@ -38,7 +38,7 @@ def open_stage(path: Path | str) -> Usd.Stage:
     foreign = foreign_files(path)
     if foreign:
         raise InputRejected(
-            f"'{path.name}' names files outside its folder ({', '.join(foreign[:3])[:200]})",
+            f"'{path.name}' names files outside the folder that it is in ({', '.join(foreign[:3])[:200]})",
             "files in the folder of the USD file, by relative names", "do not trust this file",
         )  # fmt: skip
     try:
@@ -95,11 +95,18 @@ def _below(folder: Path, layer: Path, name: str) -> Path | None:
         return None
     try:
         beside = layer.parent.relative_to(folder)
-        return asset_file(folder, (beside / name).as_posix())
+        inside = asset_file(folder, (beside / name).as_posix())
     except (InputRejected, ValueError):
         return None
+    if not name.startswith("./") and not inside.exists() and Path(name).exists():
+        return None  # a bare name that is not beside its layer is looked for in the current folder
+    return inside
 
 
 def _unreadable(path: Path, error: BaseException) -> InputRejected:
-    why = " ".join(str(error).split())[:300] if isinstance(error, Tf.ErrorException) else "its text is damaged"
+    try:
+        why = " ".join(str(error).split())[:300] if isinstance(error, Tf.ErrorException) else ""
+    except UnicodeDecodeError:  # the complaint quotes the file
+        why = ""
+    why = why or "its text is damaged"
     return InputRejected(f"'{path.name}' cannot be read ({why})", "an OpenUSD file", "export it again")

@@ -14,6 +14,9 @@ from fluidlift.io.limits import require_file
 from fluidlift.io.usd_checks import prim_faults
 from fluidlift.io.usd_open import open_stage
 
+MOST_CODES = 1e6
+"""largest time code that is looked at"""
+
 
 def validate_usd(path: Path | str) -> list[str]:
     """Faults of a USD file, one line each; an empty list means none.
@@ -37,10 +40,16 @@ def validate_usd(path: Path | str) -> list[str]:
     for error in errors:
         sites = ", ".join(str(s.GetPrim().GetPath()) for s in error.GetSites() if s.IsPrim())
         faults.append(f"{error.GetName()}: {error.GetMessage()} {sites}".strip())
+    first, last = stage.GetStartTimeCode(), stage.GetEndTimeCode()
+    if not (abs(first) < MOST_CODES and abs(last) < MOST_CODES):  # a nan fails, too
+        return [*faults, f"time codes from {first:g} to {last:g}"]
     faults += _stage_faults(stage)
-    codes = range(int(stage.GetStartTimeCode()), int(stage.GetEndTimeCode()) + 1)
+    codes = range(int(first), int(last) + 1)
     for prim in stage.Traverse():
-        faults += prim_faults(prim, codes)
+        try:
+            faults += prim_faults(prim, codes)
+        except (TypeError, ValueError, OverflowError) as error:
+            faults.append(f"{prim.GetPath()}: values of another type than its schema's ({error})")
     return faults
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from fluidlift.errors import InputRejected
+from fluidlift.io.asset_paths import asset_file, asset_files
 from fluidlift.types import FluidAsset
 
 SHOWN = 5
@@ -83,7 +84,7 @@ def _files(folder: Path, manifest: dict[str, Any]) -> Iterator[Finding]:
     from fluidlift.io.hashes import altered
 
     names = manifest["files"].values()
-    gone = [name for name in names if not (folder / name).is_file()]
+    gone = [name for name in names if not asset_file(folder, name).is_file()]
     faults = [f"'{name}' is missing" for name in gone]
     yield _found("files of the manifest are there", faults, f"restore them, or {_MAKE}")
     recorded = {name: value for name, value in manifest.get("hashes", {}).items() if name in names}
@@ -187,7 +188,7 @@ def _frames(folder: Path, manifest: dict[str, Any]) -> Iterator[Finding]:
     from fluidlift.io.frames import FIRST_FRAME
 
     simulation = manifest.get("simulation", {})
-    files = sorted((folder / "frames" / "splats").glob("*.ply"))
+    files = asset_files(folder, "frames/splats", (".ply",))
     told = simulation.get("frames")
     if not files and told is None:
         yield Finding("splat frames are complete", True, "none: nothing was simulated yet")
@@ -238,7 +239,7 @@ def _usd(folder: Path, manifest: dict[str, Any]) -> Iterator[Finding]:
     """The file for other tools, by the rules that are installed, and against the manifest."""
     from fluidlift.io.validate_usd import frame_range, has_splat_rule, splat_rule_faults, validate_usd
 
-    path = folder / manifest["files"]["usd"]
+    path = asset_file(folder, manifest["files"]["usd"])
     if not path.is_file():
         yield Finding("USD", False, f"'{path.name}' is missing", _SIM)
         return
@@ -262,7 +263,7 @@ def _preview(folder: Path, manifest: dict[str, Any]) -> Finding:
 
     check, limits, notes = "preview opens", ReadLimits(), Notes()
     try:
-        with open_video(folder / manifest["files"]["preview"], limits) as (container, stream):
+        with open_video(asset_file(folder, manifest["files"]["preview"]), limits) as (container, stream):
             count = sum(1 for _ in decode_frames(container, stream, limits, notes))
     except InputRejected as error:
         return Finding(check, False, error.got, _SIM)

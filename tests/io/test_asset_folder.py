@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import errno
+import itertools
 import json
 import os
+import subprocess
+import sys
 import time
 from dataclasses import replace
 
@@ -14,7 +17,9 @@ import trimesh
 
 from fluidlift.errors import InputRejected
 from fluidlift.io import asset_folder as af
-from fluidlift.io.atomic import atomic_path
+from fluidlift.io import atomic
+from fluidlift.io.asset_lock import writing
+from fluidlift.io.atomic import atomic_path, write_bytes
 from fluidlift.io.export_mesh import write_glb, write_obj
 from fluidlift.io.stage_cache import Scratch
 from fluidlift.types import FluidAsset, TriangleMesh
@@ -225,13 +230,68 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
     assert (tmp_path / "b.usdc").read_bytes() == b"x"
 
 
-def test_what_a_killed_run_left_is_removed_after_a_day(tmp_path):
-    for name, age in ((".a.1.part.bin", 2 * 86400), (".a.2.part.bin", 60), (".b.1.part.bin", 2 * 86400)):
+def _ended() -> int:
+    """The number of a process that is over."""
+    done = subprocess.Popen([sys.executable, "-c", ""])
+    done.wait()
+    return done.pid
+
+
+def test_what_a_killed_run_left_is_removed_by_the_next(tmp_path):
+    gone, other = _ended(), os.getppid()
+    names = (f".a.{gone}.1.part.bin", f".a.{other}.1.part.bin", f".a.{os.getpid()}.99999999.part.bin")
+    for name in (*names, f".b.{gone}.1.part.bin", f".a.b.{gone}.part.bin"):
         (tmp_path / name).write_bytes(b"x")
-        os.utime(tmp_path / name, (time.time() - age,) * 2)
+    os.utime(tmp_path / names[2], (time.time() - 1e6,) * 2)  # of an earlier process with this one's number
     with af.atomic_write(tmp_path / "a.bin") as file:
         file.write(b"new")
-    assert sorted(p.name for p in tmp_path.iterdir()) == [".a.2.part.bin", ".b.1.part.bin", "a.bin"]
+    left = {names[1], f".b.{gone}.1.part.bin", f".a.b.{gone}.part.bin", "a.bin"}
+    assert {p.name for p in tmp_path.iterdir()} == left
+
+
+def test_a_run_removes_what_killed_runs_left_anywhere_in_the_asset(folder):
+    left = [f"work/flow/.labels.{_ended()}.3.part.npy", f"frames/splats/.1001.{_ended()}.1.part.ply"]
+    mine = f"work/flow/.labels.{os.getppid()}.3.part.npy"
+    for name in (*left, mine):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(b"x")
+    with writing(folder, "a test"):
+        assert not any((folder / name).exists() for name in left)
+        assert (folder / mine).exists()
+
+
+def test_temporary_files_are_new_ones(tmp_path, monkeypatch):
+    (tmp_path / "outside").write_bytes(b"kept")
+    monkeypatch.setattr(atomic, "_COUNT", itertools.count(1))
+    (tmp_path / f".a.{os.getpid()}.1.part.bin").symlink_to(tmp_path / "outside")
+    write_bytes(tmp_path / "a.bin", b"new")
+    assert (tmp_path / "outside").read_bytes() == b"kept"
+    assert (tmp_path / "a.bin").read_bytes() == b"new" and not (tmp_path / "a.bin").is_symlink()
+
+
+def test_what_cannot_be_made_again_is_on_the_disk_before_it_has_its_name(tmp_path, monkeypatch):
+    calls: list[str] = []
+    monkeypatch.setattr(atomic.os, "fsync", lambda file: calls.append("fsync"))
+    replace = os.replace
+    monkeypatch.setattr(atomic.os, "replace", lambda *a: (calls.append("replace"), replace(*a)))
+    write_bytes(tmp_path / "a", b"x", lasting=True)
+    assert calls == ["fsync", "replace", "fsync"]
+    write_bytes(tmp_path / "b", b"x")
+    assert calls[3:] == ["replace"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="has no such limit")
+def test_a_file_over_the_limit_is_said_like_a_full_disk(tmp_path):
+    script = (
+        "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))\n"
+        "from fluidlift.errors import InputRejected\n"
+        "from fluidlift.io.atomic import write_bytes\n"
+        "try: write_bytes(sys.argv[1], bytes(2**20))\n"
+        "except InputRejected as error: print(error)\n"
+    )
+    run = subprocess.run([sys.executable, "-c", script, str(tmp_path / "a")], capture_output=True, text=True)
+    assert "larger than it may be" in run.stdout, run.stderr
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(("number", "word"), [(errno.ENOSPC, "disk full"), (errno.EACCES, "cannot be written")])

@@ -120,11 +120,12 @@ def evaluate_asset(folder: Path, truth: Path, *, rows: tuple[int, int] | None = 
         InputRejected: the asset or the case cannot be read. A missing evaluation.npz only leaves figures out.
     """
     from fluidlift.io.asset_folder import load_asset
+    from fluidlift.io.asset_paths import asset_file
 
     folder = Path(folder)
     case = read_case(Path(truth))
     asset = load_asset(folder)
-    stored = folder / "work" / "evaluation.npz"
+    stored = asset_file(folder, "work/evaluation.npz")
     arrays = read_arrays(stored) if stored.is_file() else {}
     manifest = read_json(folder / "manifest.json")
     frames, _ = picked(arrays, "resim_frames", 4, 3)

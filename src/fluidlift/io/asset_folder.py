@@ -17,7 +17,7 @@ import json
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import cache
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from pathlib import Path
 from typing import Any
 
 import jsonschema
@@ -25,6 +25,7 @@ import numpy as np
 
 from fluidlift.errors import InputRejected
 from fluidlift.io.array_archive import read_arrays
+from fluidlift.io.asset_paths import asset_file, require_no_links
 from fluidlift.io.atomic import (
     atomic_path,
     atomic_write,
@@ -89,7 +90,7 @@ def check_output_folder(path: Path | str) -> Path:
     """The path, if an asset may be written there: it does not exist, is an empty folder, or holds an asset already.
 
     Raises:
-        InputRejected: it is a file, a folder with other things in it, or one that may not be looked into.
+        InputRejected: it is a file, a folder with other things in it or with links, or one that may not be looked into.
     """
     with disk_errors(path):
         return _checked_folder(Path(path))
@@ -108,15 +109,17 @@ def _checked_folder(path: Path) -> Path:
             "a new name, an empty folder, or one of an earlier run",
             "choose another folder with -o; nothing was changed",
         )
+    require_no_links(path)
     return path
 
 
 def _is_asset(path: Path) -> bool:
     """Whether the folder was begun by fluidlift: our marker under work/, or a manifest of ours."""
-    if (path / "work" / WORK_MARKER).is_file():
+    if asset_file(path, f"work/{WORK_MARKER}").is_file():
         return True
+    file = asset_file(path, "manifest.json")
     try:
-        manifest = read_json(path / "manifest.json", "manifest", _MAX_JSON)
+        manifest = read_json(file, "manifest", _MAX_JSON)
     except InputRejected:
         return False
     return isinstance(manifest, dict) and manifest.get("format") == "fluidlift asset"
@@ -152,13 +155,13 @@ def save_asset(
     with disk_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         mark_work_folder(folder)
-        write_gaussians(folder / FILES["gaussians"], asset.rest, comments=["rest shape"])
+        write_gaussians(asset_file(folder, FILES["gaussians"]), asset.rest, comments=["rest shape"])
         _write_terrain(folder, asset)
         _write_velocity(folder, asset)
-        write_json(folder / FILES["camera"], asset.camera.to_dict())
+        write_json(asset_file(folder, FILES["camera"]), asset.camera.to_dict())
         write_parameters(folder, asset.parameters, asset.estimates)
-        if not (folder / FILES["scene"]).exists():
-            write_bytes(folder / FILES["scene"], SCENE_TEMPLATE.encode())
+        if not (scene := asset_file(folder, FILES["scene"])).exists():
+            write_bytes(scene, SCENE_TEMPLATE.encode())
         present = {name: file for name, file in FILES.items() if (folder / file).is_file()}
         manifest = _manifest(asset, start_frame) | {
             "files": present | dict(files or {}),
@@ -196,7 +199,7 @@ def _write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
     _validate(data, "manifest", ValueError)
     for name in data["files"].values():
         asset_file(folder, name)
-    write_json(folder / "manifest.json", data)
+    write_json(asset_file(folder, "manifest.json"), data, lasting=True)
 
 
 def update_manifest(folder: Path | str, **changes: Any) -> dict[str, Any]:
@@ -218,14 +221,16 @@ def read_manifest(folder: Path | str) -> dict[str, Any]:
     """The manifest of an asset, checked.
 
     Raises:
-        InputRejected: no asset, a newer format, a broken manifest, or a file entry that leads out of the folder.
+        InputRejected: no asset, a newer format, a broken manifest, or a link or a file entry that leads out of the
+            folder.
     """
     folder = Path(folder)
     if not (folder / "manifest.json").is_file():
         why = "it has no manifest.json" if folder.exists() else "there is nothing of that name"
         do = "check the name, or run 'fluidlift make' to its end"
         raise InputRejected(f"'{folder}' is not a fluidlift asset ({why})", "a folder made with 'fluidlift make'", do)
-    manifest = read_json(asset_file(folder, "manifest.json"), "manifest", _MAX_JSON)
+    require_no_links(folder)
+    manifest = read_json(folder / "manifest.json", "manifest", _MAX_JSON)
     version = manifest.get("format_version") if isinstance(manifest, dict) else None
     if isinstance(version, int) and version > FORMAT_VERSION:
         raise InputRejected(
@@ -281,33 +286,11 @@ def load_asset(folder: Path | str) -> FluidAsset:
         raise InputRejected(f"the parts of '{folder.name}' contradict each other: {error}", "a whole asset") from None
 
 
-def asset_file(folder: Path | str, name: str) -> Path:
-    """The file `name` of an asset.
-
-    Raises:
-        InputRejected: an absolute name, a drive, `..`, or a link on the way: the file could be anywhere.
-    """
-    folder = Path(folder)
-    foreign = PurePosixPath(name).is_absolute() or PureWindowsPath(name).drive or PureWindowsPath(name).root
-    parts = PurePosixPath(name.replace("\\", "/")).parts
-    endless = any(len(part.encode("utf-8", "replace")) > 255 for part in parts) or len(name) > 1000
-    if foreign or ".." in parts or not parts or "\0" in name or endless:
-        raise InputRejected(
-            f"the asset names the file '{name[:100]}'", "names inside its own folder", "do not trust this asset"
-        )
-    path = folder
-    for part in parts:
-        path = path / part
-        if path.is_symlink():
-            raise InputRejected(f"'{name}' in '{folder.name}' is a link", "plain files", "do not trust this asset")
-    return path
-
-
 def write_parameters(folder: Path | str, parameters: FluidParameters, estimates: Mapping[str, Estimate]) -> Path:
     """Write parameters.json, and its hash in the manifest if there is one. A sigma of infinity becomes null."""
     data = plain({"values": parameters.to_dict(), "estimates": {k: vars(e) for k, e in estimates.items()}})
     _validate(data, "parameters", ValueError)
-    path = write_json(Path(folder) / FILES["parameters"], data)
+    path = write_json(asset_file(folder, FILES["parameters"]), data, lasting=True)
     with suppress(InputRejected):  # no manifest yet, or one that is about to be replaced
         update_manifest(folder, hashes=digests(folder, [FILES["parameters"]]))
     return path
@@ -368,9 +351,9 @@ def _write_terrain(folder: Path, asset: FluidAsset) -> None:
         "faces": terrain.mesh.faces,
     }
     arrays |= {k: v for k in ("colors", "uv", "texture") if (v := getattr(terrain.mesh, k)) is not None}
-    with atomic_write(folder / FILES["terrain"]) as file:
+    with atomic_write(asset_file(folder, FILES["terrain"])) as file:
         np.savez(file, **arrays)
-    glb = folder / FILES["terrain_mesh"]
+    glb = asset_file(folder, FILES["terrain_mesh"])
     if len(terrain.mesh.faces):
         from fluidlift.io.export_mesh import write_glb  # trimesh is slow to import
 
@@ -391,8 +374,8 @@ def _read_terrain(path: Path) -> Terrain:
 
 def _write_velocity(folder: Path, asset: FluidAsset) -> None:
     v = asset.velocity
-    with atomic_write(folder / FILES["velocity"]) as file:
+    with atomic_write(asset_file(folder, FILES["velocity"])) as file:
         np.savez(file, u=v.u, v=v.v, w=v.w, cell_types=asset.cell_types)
     fluid = np.isin(asset.cell_types, (CellType.FLUID, CellType.INFLOW, CellType.OUTFLOW))
     density = VolumeGrid("density", fluid.astype(np.float32), asset.grid.spacing, asset.grid.origin)
-    write_vdb(folder / FILES["velocity_volume"], [density, velocity_grid(v, asset.grid, active=fluid)])
+    write_vdb(asset_file(folder, FILES["velocity_volume"]), [density, velocity_grid(v, asset.grid, active=fluid)])

@@ -17,7 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fluidlift.errors import InputRejected
-from fluidlift.io.atomic import disk_errors
+from fluidlift.io.asset_paths import asset_file
+from fluidlift.io.atomic import disk_errors, remove_leftovers
 
 WRITING, EDITING = "work/.writing", "edits/.editing"
 """lock files, inside the asset"""
@@ -41,7 +42,7 @@ class Holder:
 
 @contextmanager
 def writing(folder: Path | str, work: str) -> Iterator[None]:
-    """Hold the right to write an asset's frames while the block runs.
+    """Hold the right to write an asset's frames while the block runs; what a killed run left half written is removed.
 
     Args:
         folder: of the asset.
@@ -51,6 +52,7 @@ def writing(folder: Path | str, work: str) -> Iterator[None]:
         InputRejected: another run holds it, in this process or another one.
     """
     with _locked(Path(folder), WRITING, work, wait=0.0, do="wait until it is done, or stop it"):
+        remove_leftovers(folder)
         yield
 
 
@@ -100,10 +102,8 @@ def require_not_written(folder: Path | str) -> None:
 
 @contextmanager
 def _locked(folder: Path, name: str, work: str, *, wait: float, do: str) -> Iterator[None]:
-    path = folder / name
+    path = asset_file(folder, name)
     with disk_errors(path):
-        if path.parent.is_symlink() or path.is_symlink():
-            raise InputRejected(f"'{name}' in '{folder.name}' is a link", "plain files", "do not trust this asset")
         path.parent.mkdir(parents=True, exist_ok=True)
         file = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o644)
     try:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import errno
 import glob
+import itertools
 import json
 import math
 import os
+import re
 import shutil
 import tempfile
 import time
@@ -25,7 +27,8 @@ def disk_errors(path: Path | str) -> Iterator[None]:
     """Translate what the operating system says about a full or forbidden disk.
 
     Raises:
-        InputRejected: no space, no permission, or a read-only file system. Other errors pass unchanged.
+        InputRejected: no space, too large a file, no permission, or a read-only file system. Other errors pass
+            unchanged.
     """
     try:
         yield
@@ -34,6 +37,11 @@ def disk_errors(path: Path | str) -> Iterator[None]:
             raise InputRejected(
                 f"disk full while writing '{path}'", "free space", "free some space or choose another folder with -o"
             ) from error
+        if error.errno == errno.EFBIG:
+            raise InputRejected(
+                f"a file larger than it may be while writing '{path}'", "a limit (ulimit -f) or a disk for larger ones",
+                "raise the limit, or choose another folder with -o",
+            ) from error  # fmt: skip
         if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
             raise InputRejected(
                 f"'{path}' cannot be written ({error.strerror})", "permission to write there", "choose another folder"
@@ -82,41 +90,96 @@ def require_free_space(path: Path | str, needed: int) -> None:
 
 
 @contextmanager
-def atomic_path(path: Path | str) -> Iterator[Path]:
-    """A temporary name in the same folder, with the same suffix; renamed to `path` when the block ends well.
+def atomic_path(path: Path | str, *, lasting: bool = False) -> Iterator[Path]:
+    """An empty temporary file in the same folder, with the same suffix; renamed to `path` when the block ends well.
 
-    For libraries that want a name. The temporary file is removed when the block fails.
+    For libraries that want a name. The temporary file is removed when the block fails, and those that a killed run left
+    behind for `path` before it begins.
+
+    Args:
+        path: of the file.
+        lasting: wait until the content is on the disk before it is renamed: for what cannot be made again.
     """
     path = Path(path)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
     with disk_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        _remove_leftovers(path)
+        for old in path.parent.glob(f".{glob.escape(path.stem)}.*.part{glob.escape(path.suffix)}"):
+            if _is_leftover(old):
+                old.unlink(missing_ok=True)
+        temporary = new_temporary(path.parent, path.stem, path.suffix)
         try:
             yield temporary
+            if lasting:
+                _onto_disk(temporary)
             os.replace(temporary, path)
+            if lasting:
+                _onto_disk(path.parent)
         finally:
             temporary.unlink(missing_ok=True)
 
 
-def _remove_leftovers(path: Path) -> None:
-    """Temporary files of this name that a killed run left behind: those untouched for a day."""
-    for old in path.parent.glob(f".{glob.escape(path.stem)}.*.part{glob.escape(path.suffix)}"):
-        with suppress(OSError):
-            if time.time() - old.stat().st_mtime > 86400:
-                old.unlink()
+_COUNT = itertools.count(1)
+_BEGAN = time.time()
+_TEMPORARY = re.compile(r"\..*\.([0-9]+)\.[0-9]+\.part(\.\w+)?")
+
+
+def new_temporary(folder: Path, stem: str, suffix: str) -> Path:
+    """An empty file that was not there before, nor a link of its name, and says which process it belongs to."""
+    path = folder / f".{stem}.{os.getpid()}.{next(_COUNT)}.part{suffix}"
+    path.unlink(missing_ok=True)  # of a killed run whose process had the same number: a link itself, not its target
+    os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY | getattr(os, "O_NOFOLLOW", 0), 0o666))
+    return path
+
+
+def remove_leftovers(folder: Path | str) -> None:
+    """Remove the temporary files of killed runs anywhere below a folder, without following links."""
+    for place, _, names in os.walk(folder):
+        for name in names:
+            path = Path(place) / name
+            if _is_leftover(path):
+                with suppress(OSError):
+                    path.unlink()
+
+
+def _is_leftover(path: Path) -> bool:
+    """Whether a file is one of `new_temporary` whose process has ended."""
+    found = _TEMPORARY.fullmatch(path.name)
+    if found is None:
+        return False
+    pid = int(found[1])
+    try:
+        if pid == os.getpid():  # in a container every run has the same number
+            return path.lstat().st_mtime < _BEGAN
+        os.kill(pid, 0)
+    except (ProcessLookupError, OverflowError):
+        return True
+    except OSError:  # someone else's, or gone in the meantime
+        return False
+    return False
+
+
+def _onto_disk(path: Path) -> None:
+    """Wait until what was written to a file or a folder is on the disk; a file system that cannot wait does not."""
+    file = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(file)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.EOPNOTSUPP, errno.EBADF):
+            raise
+    finally:
+        os.close(file)
 
 
 @contextmanager
-def atomic_write(path: Path | str) -> Iterator[IO[bytes]]:
+def atomic_write(path: Path | str, *, lasting: bool = False) -> Iterator[IO[bytes]]:
     """A binary file object whose content appears under `path` all at once when the block ends well."""
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
+    with atomic_path(path, lasting=lasting) as temporary, temporary.open("r+b") as file:
         yield file
 
 
-def write_bytes(path: Path | str, data: bytes) -> Path:
+def write_bytes(path: Path | str, data: bytes, *, lasting: bool = False) -> Path:
     """Write all of a small file at once."""
-    with atomic_write(path) as file:
+    with atomic_write(path, lasting=lasting) as file:
         file.write(data)
     return Path(path)
 
@@ -136,6 +199,7 @@ def plain(value: Any) -> Any:
     return value.as_posix() if isinstance(value, Path) else value
 
 
-def write_json(path: Path | str, data: Any) -> Path:
+def write_json(path: Path | str, data: Any, *, lasting: bool = False) -> Path:
     """Write `data` as readable JSON."""
-    return write_bytes(path, (json.dumps(plain(data), indent=2, allow_nan=False) + "\n").encode())
+    text = json.dumps(plain(data), indent=2, allow_nan=False) + "\n"
+    return write_bytes(path, text.encode(), lasting=lasting)

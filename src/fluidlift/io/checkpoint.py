@@ -61,7 +61,7 @@ def write_checkpoint(path: Path | str, checkpoint: Checkpoint) -> Path:
         "frames": int(checkpoint.frames),
         "parts": dict(checkpoint.parts),
     }
-    with atomic_write(path) as file:
+    with atomic_write(path, lasting=True) as file:
         np.savez(file, **{_HEADER: np.frombuffer(json.dumps(header).encode(), np.uint8)}, **arrays)
     return Path(path)
 

@@ -8,14 +8,15 @@ import numpy as np
 
 from fluidlift.errors import InputRejected
 from fluidlift.io.array_archive import read_arrays
-from fluidlift.io.asset_folder import FILES, asset_file
+from fluidlift.io.asset_folder import FILES
+from fluidlift.io.asset_paths import asset_file
 from fluidlift.io.atomic import atomic_write
 from fluidlift.types import FaceVelocity
 
 
 def write_force(folder: Path, force: FaceVelocity | None) -> None:
     """Write an acceleration (m/s^2, on the faces of the asset's grid) into an asset; None: take away an older one."""
-    path = folder / FILES["force"]
+    path = asset_file(folder, FILES["force"])
     if force is None:
         path.unlink(missing_ok=True)
         return

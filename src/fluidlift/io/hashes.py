@@ -6,6 +6,8 @@ import hashlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+from fluidlift.io.asset_paths import asset_file
+
 
 def digest(path: Path) -> str:
     """SHA-256 of a file's content, 64 hexadecimal digits."""
@@ -14,9 +16,9 @@ def digest(path: Path) -> str:
 
 
 def digests(folder: Path | str, names: Iterable[str]) -> dict[str, str]:
-    """SHA-256 of those of the files that are there, by name relative to the folder."""
-    folder = Path(folder)
-    return {name: digest(folder / name) for name in sorted(set(names)) if (folder / name).is_file()}
+    """SHA-256 of those files of an asset that are there, by their names in it; raises as `asset_file`."""
+    paths = {name: asset_file(folder, name) for name in sorted(set(names))}
+    return {name: digest(path) for name, path in paths.items() if path.is_file()}
 
 
 def altered(folder: Path | str, recorded: Mapping[str, str]) -> tuple[list[str], list[str]]:

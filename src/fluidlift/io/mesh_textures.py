@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from fluidlift.errors import InputRejected
+from fluidlift.io.asset_paths import asset_file
 from fluidlift.io.limits import ReadLimits, require_file, require_size
 from fluidlift.io.pictures import checked_header, eight_bit, fitted_size, picture_in, resample
 from fluidlift.numerics.textures import sample_texture
@@ -206,8 +207,6 @@ def materials_of(folder: Path, name: str) -> dict[str, Paint]:
 
 def _beside(folder: Path, name: str) -> Path | None:
     """The file of that name in a folder, or of its last part; never one that lies elsewhere."""
-    from fluidlift.io.asset_folder import asset_file
-
     for asked in (name, name.replace("\\", "/").rpartition("/")[2]):
         try:
             path = asset_file(folder, asked)

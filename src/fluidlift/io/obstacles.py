@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fluidlift.errors import InputRejected
+from fluidlift.io.asset_paths import asset_file
 from fluidlift.io.entries import Entries
 from fluidlift.io.read_mesh import read_any_mesh
 from fluidlift.numerics.solid_mesh import box_mesh, closed_mesh, cylinder_mesh, ellipsoid_mesh, flipped
@@ -314,8 +315,6 @@ def mesh_file(entry: Entries, meshes: Path) -> TriangleMesh:
 
     It is turned inside out where the entry says `flip: true`.
     """
-    from fluidlift.io.asset_folder import asset_file
-
     name = entry.text("mesh")
     try:
         path = asset_file(meshes, name)

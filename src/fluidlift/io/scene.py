@@ -12,6 +12,7 @@ from typing import Any
 import yaml
 
 from fluidlift.errors import InputRejected
+from fluidlift.io.asset_paths import asset_file
 from fluidlift.io.entries import Entries, line_numbers
 from fluidlift.io.limits import require_file, require_size
 from fluidlift.io.obstacles import Obstacle, read_obstacles
@@ -178,9 +179,7 @@ def scene_text(folder: Path | str) -> str:
     Raises:
         InputRejected: a link, a file of more than a megabyte, or one that is no text.
     """
-    path = Path(folder) / "scene.yaml"
-    if path.is_symlink():
-        raise InputRejected("scene.yaml is a link", "a plain file", "do not trust this asset")
+    path = asset_file(folder, "scene.yaml")
     if not path.exists() or (path.is_file() and path.stat().st_size == 0):
         return ""
     require_size(require_file(path, "scene file"), MAX_BYTES, "scene file")

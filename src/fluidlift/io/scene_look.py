@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from fluidlift.errors import InputRejected, require
+from fluidlift.io.asset_paths import asset_file
 from fluidlift.io.entries import Entries
 from fluidlift.io.hashes import digest
 
@@ -97,8 +98,6 @@ def read_look(scene: Entries, folder: Path) -> Look:
 
 
 def _environment(look: Entries, folder: Path) -> str:
-    from fluidlift.io.asset_folder import asset_file
-
     name = look.data["environment"]
     if not isinstance(name, str) or Path(name).suffix.lower() not in PICTURES:
         try:

@@ -24,7 +24,17 @@ import numpy as np
 
 from fluidlift.errors import InputRejected, require
 from fluidlift.io.array_archive import DAMAGE, array_in, mapped_array, members_of
-from fluidlift.io.atomic import atomic_write, disk_errors, plain, require_free_space, write_bytes, write_json
+from fluidlift.io.asset_paths import asset_file
+from fluidlift.io.atomic import (
+    atomic_write,
+    disk_errors,
+    new_temporary,
+    plain,
+    remove_leftovers,
+    require_free_space,
+    write_bytes,
+    write_json,
+)
 from fluidlift.io.limits import MAX_TEXT_BYTES, parse_json, require_size
 
 WORK_MARKER = ".fluidlift"
@@ -38,7 +48,7 @@ _KEPT = 2
 
 def mark_work_folder(folder: Path | str) -> Path:
     """Make work/ and put our marker there; the folder work/."""
-    work = Path(folder) / "work"
+    work = asset_file(folder, "work")
     marker = work / WORK_MARKER
     if not marker.exists():
         write_bytes(marker, b"cached stage results of fluidlift; may be deleted\n")
@@ -53,14 +63,14 @@ class GrowingArray:
     """An array on disk whose length is known only at its end: items are appended, then it is closed.
 
     Args:
-        path: of the .npy file.
+        path: of the .npy file, which is there and empty.
         shape: of one item.
         dtype: of the numbers.
     """
 
     def __init__(self, path: Path, shape: tuple[int, ...], dtype: Any) -> None:
         self.path, self.shape, self.dtype, self.count = path, tuple(shape), np.dtype(dtype), 0
-        self._file = path.open("wb")
+        self._file = path.open("r+b")
         self._head()
 
     def __len__(self) -> int:
@@ -96,7 +106,7 @@ class Scratch:
     def __init__(self, folder: Path | str, stage: str) -> None:
         self.folder, self.place = Path(folder), _names(folder, stage, "none")[0].parent
         self._made: dict[str, Path] = {}
-        self._copies = 0
+        remove_leftovers(self.place)
 
     def array(self, name: str, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
         """A new array of zeros.
@@ -160,8 +170,7 @@ class Scratch:
         with disk_errors(self.folder):
             mark_work_folder(self.folder)
             self.place.mkdir(parents=True, exist_ok=True)
-        self._copies += 1
-        return self.place / f".{name}.{os.getpid()}.{self._copies}.part.npy"
+            return new_temporary(self.place, name, ".npy")
 
 
 def _whole_file(array: np.ndarray) -> Path | None:
@@ -181,7 +190,7 @@ def parts_of(array: np.ndarray, *, size: int = PART_BYTES) -> Iterator[slice]:
 def _names(folder: Path | str, stage: str, key: str) -> tuple[Path, Path]:
     for name in (stage, key):
         require(re.fullmatch(r"[A-Za-z0-9_-]{1,128}", name) is not None, f"stage or key '{name}'", "letters and digits")
-    place = Path(folder) / "work" / stage
+    place = asset_file(folder, f"work/{stage}")
     return place / f"{key}.npz", place / f"{key}.json"
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from pxr import Sdf, Tf, Usd, UsdUtils
 
 from fluidlift.errors import InputRejected
-from fluidlift.io.asset_folder import asset_file
+from fluidlift.io.asset_paths import asset_file
 from fluidlift.io.limits import require_file, require_size
 
 MAX_BYTES = 16 * 2**30

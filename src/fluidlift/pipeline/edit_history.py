@@ -254,7 +254,7 @@ def _line(data: dict[str, Any]) -> bytes:
 
 def announce(folder: Path, edit: Edit, text: str) -> None:
     """Say what is about to happen: the edit, and scene.yaml after it."""
-    write_json(asset_file(folder, PENDING), {"edit": edit.to_dict(), "text": text})
+    write_json(asset_file(folder, PENDING), {"edit": edit.to_dict(), "text": text}, lasting=True)
 
 
 def withdraw(folder: Path) -> None:
@@ -279,4 +279,4 @@ def write_scene(folder: Path, text: str) -> None:
     """Replace scene.yaml, all of it or nothing."""
     path = asset_file(folder, "scene.yaml")
     with disk_errors(path):
-        write_bytes(path, text.encode())
+        write_bytes(path, text.encode(), lasting=True)

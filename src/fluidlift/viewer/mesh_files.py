@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from fluidlift.errors import InputRejected
-from fluidlift.io.asset_folder import asset_file
+from fluidlift.io.asset_paths import asset_file
 from fluidlift.io.atomic import write_bytes
 from fluidlift.io.read_mesh import SUFFIXES, read_any_mesh
 from fluidlift.pipeline.edit_outlook import placed
@@ -58,7 +58,7 @@ def kept_mesh(folder: Path, name: str, content: bytes) -> tuple[str, Callable[[]
         path = asset_file(folder, inside)
         if not path.exists():
             path.parent.mkdir(exist_ok=True)
-            write_bytes(path, content)
+            write_bytes(path, content, lasting=True)
             return inside, partial(_taken_away, path)
         if path.is_file() and path.stat().st_size == len(content) and path.read_bytes() == content:
             return inside, lambda: None

@@ -64,7 +64,9 @@ class PlainProgress:
 
     def __init__(self, stream: TextIO | None = None, every: float = 10.0) -> None:
         self.stream, self.every = stream or sys.stderr, every
-        self._head, self._pace, self._last = "", Pace(), time.monotonic()
+        self.head = ""
+        """of the current stage, as its line begins"""
+        self._pace, self._last = Pace(), time.monotonic()
 
     def say(self, text: str) -> None:
         """Something good to know."""
@@ -72,9 +74,9 @@ class PlainProgress:
 
     def stage(self, name: str, number: int, count: int) -> None:
         """A stage begins."""
-        self._head = f"[{number}/{count}] {LABELS.get(name, name)}"
+        self.head = f"[{number}/{count}] {LABELS.get(name, name)}"
         self._pace, self._last = Pace(), time.monotonic()
-        print(f"{self._head} ...", file=self.stream, flush=True)
+        print(f"{self.head} ...", file=self.stream, flush=True)
 
     def update(self, done: int, total: int) -> None:
         """Part of the current stage is done."""
@@ -82,12 +84,12 @@ class PlainProgress:
         self._pace.at(done, now)
         if now - self._last >= self.every and done < total:
             self._last, left = now, self._pace.left(total)
-            print(f"{self._head}: {done} of {total}{', ' + left if left else ''}", file=self.stream, flush=True)
+            print(f"{self.head}: {done} of {total}{', ' + left if left else ''}", file=self.stream, flush=True)
 
     def finished(self, name: str, seconds: float, cached: bool) -> None:
         """A stage ended."""
         how = "already done" if cached else f"{seconds:.1f} s"
-        print(f"{self._head}: {how}", file=self.stream, flush=True)
+        print(f"{self.head}: {how}", file=self.stream, flush=True)
 
     def warn(self, text: str) -> None:
         """Something the user should know."""
@@ -107,7 +109,9 @@ class BarProgress:
             TextColumn("{task.fields[parts]}"), TimeElapsedColumn(), TextColumn("{task.fields[left]}"),
             console=self.console, transient=True,
         )  # fmt: skip
-        self._task, self._head, self._last, self._pace = None, "", 0.0, Pace()
+        self.head = ""
+        """of the current stage, as its line begins"""
+        self._task, self._last, self._pace = None, 0.0, Pace()
 
     def __enter__(self) -> BarProgress:
         self.bar.start()
@@ -122,10 +126,10 @@ class BarProgress:
 
     def stage(self, name: str, number: int, count: int) -> None:
         """A stage begins."""
-        self._head = f"[{number}/{count}] {LABELS.get(name, name)}"
+        self.head = f"[{number}/{count}] {LABELS.get(name, name)}"
         if self._task is not None:
             self.bar.remove_task(self._task)
-        self._task = self.bar.add_task(self._head.replace("[", r"\["), total=None, parts="", left="")
+        self._task = self.bar.add_task(self.head.replace("[", r"\["), total=None, parts="", left="")
         self._pace = Pace()
 
     def update(self, done: int, total: int) -> None:
@@ -140,7 +144,7 @@ class BarProgress:
     def finished(self, name: str, seconds: float, cached: bool) -> None:
         """A stage ended."""
         how = "already done" if cached else f"{seconds:.1f} s"
-        self.console.print(f"{self._head}: {how}", markup=False, highlight=False)
+        self.console.print(f"{self.head}: {how}", markup=False, highlight=False)
 
     def warn(self, text: str) -> None:
         """Something the user should know."""
@@ -149,9 +153,11 @@ class BarProgress:
 
 @contextlib.contextmanager
 def shown_progress() -> Iterator[BarProgress | PlainProgress]:
-    """A bar where standard error is a terminal, plain lines elsewhere."""
-    if sys.stderr.isatty():
-        with BarProgress() as bar:
-            yield bar
-    else:
-        yield PlainProgress()
+    """A bar where standard error is a terminal, plain lines elsewhere. What is raised gets a note of the stage."""
+    with BarProgress() if sys.stderr.isatty() else contextlib.nullcontext(PlainProgress()) as progress:
+        try:
+            yield progress
+        except Exception as error:
+            if progress.head:
+                error.add_note(f"while {progress.head}")
+            raise

@@ -9,7 +9,10 @@ import contextlib
 import dataclasses
 import json
 import os
+import signal
 import sys
+import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +21,7 @@ import tyro
 from fluidlift import __version__
 from fluidlift.cli.batch import Batch
 from fluidlift.cli.edit import Edit
+from fluidlift.cli.failure import failure_line
 from fluidlift.cli.optional import REGISTRY
 from fluidlift.cli.options import (
     Demo,
@@ -63,13 +67,28 @@ DONE, FAILED, USAGE, REJECTED, WITH_WARNINGS = 0, 1, 2, 3, 4
 def main(argv: list[str] | None = None) -> int:
     """Run one command; the exit code."""
     try:
-        code = _run(list(sys.argv[1:] if argv is None else argv))
+        with _terminated_as_interrupted():
+            code = _run(list(sys.argv[1:] if argv is None else argv))
         sys.stdout.flush()
         return code
     except BrokenPipeError:  # who reads along, such as head, has seen enough; what is buffered goes nowhere
         with contextlib.suppress(OSError, ValueError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED
+
+
+@contextlib.contextmanager
+def _terminated_as_interrupted() -> Iterator[None]:
+    """SIGTERM, which schedulers and containers send, ends a run as Ctrl-C does: what is finished is kept, and said."""
+    ours = threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+    if not ours:
+        yield
+        return
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def _run(args: list[str]) -> int:
@@ -97,6 +116,11 @@ def _run(args: list[str]) -> int:
             "\nfluidlift: stopped. Finished stages and frames are kept: the same command goes on from there.",
             file=sys.stderr,
         )
+        return FAILED
+    except BrokenPipeError:
+        raise
+    except Exception as error:
+        print(failure_line(error, args), file=sys.stderr)
         return FAILED
 
 

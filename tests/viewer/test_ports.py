@@ -1,8 +1,10 @@
 """Where the page is served, and to whom."""
 
-import re
 import socket
 import sys
+import urllib.error
+import urllib.parse
+import urllib.request
 
 import pytest
 
@@ -52,15 +54,19 @@ def test_only_loopback_addresses_count_as_this_machine(host, local):
 
 
 @pytest.mark.parametrize(
-    ("origin", "ours"),
+    ("origin", "host", "ours"),
     [
-        ("http://127.0.0.1:8080", True), ("http://localhost:9000", True), ("http://[::1]:80", True),
-        ("http://example.org", False), ("http://localhost.example.org:8080", False),
-        ("http://127.0.0.1.example.org", False), ("http://example.org/?http://localhost:8080", False),
+        ("http://127.0.0.1:8080", "127.0.0.1:8080", True), ("http://[::1]:8080", "[::1]:8080", True),
+        ("http://localhost:9000", "localhost:9000", True),  # through a tunnel
+        ("https://Fluid.example.org", "fluid.example.org", True), (None, "127.0.0.1:8080", True),
+        ("http://127.0.0.1:9000", "127.0.0.1:8080", False), ("http://localhost:8080", "127.0.0.1:8080", False),
+        ("http://example.org", "127.0.0.1:8080", False), ("http://127.0.0.1:8080.example.org", "127.0.0.1:8080", False),
+        ("http://example.org/?http://127.0.0.1:8080", "127.0.0.1:8080", False), ("null", "127.0.0.1:8080", False),
+        ("http://a@127.0.0.1:8080", "127.0.0.1:8080", False), ("file://", "", False), ("http://[", "[", False),
     ],
 )  # fmt: skip
-def test_pages_of_other_sites_are_told_from_ours(origin, ours):
-    assert bool(re.fullmatch(ports.LOCAL_PAGES, origin)) is ours
+def test_pages_of_other_origins_are_told_from_ours(origin, host, ours):
+    assert ports.same_origin(origin, host) is ours
 
 
 def test_without_viser_the_message_says_what_to_install(monkeypatch):
@@ -69,19 +75,57 @@ def test_without_viser_the_message_says_what_to_install(monkeypatch):
         ports.require_viser()
 
 
-def test_a_page_of_another_site_cannot_open_a_connection():
-    """A browser sends along whose page it is; any site could try 127.0.0.1."""
+@pytest.fixture
+def served():
+    """A server: its address without the secret, and the secret."""
     pytest.importorskip("viser", reason="viser is not installed")
+    server, secret = ports.open_server("127.0.0.1", ports.free_port("127.0.0.1"), "test")
+    yield f"127.0.0.1:{server.get_port()}", secret, server
+    server.stop()
+
+
+def asked(address: str, **headers: str) -> tuple[int, dict[str, str], bytes]:
+    """Status, headers and body of an answer."""
+    try:
+        with urllib.request.urlopen(urllib.request.Request(address, headers=headers), timeout=10) as answer:
+            return answer.status, dict(answer.headers), answer.read()
+    except urllib.error.HTTPError as error:
+        return error.code, dict(error.headers), error.read()
+
+
+def test_a_page_of_another_origin_cannot_open_a_connection(served):
+    """A browser sends along whose page it is; any site, and any other port, could try 127.0.0.1."""
     from websockets.exceptions import InvalidStatus
     from websockets.sync.client import connect
 
-    server = ports.open_server("127.0.0.1", ports.free_port("127.0.0.1"), "test")
-    try:
-        address = f"ws://127.0.0.1:{server.get_port()}"
-        with connect(address, origin=f"http://127.0.0.1:{server.get_port()}"):
+    place, secret, server = served
+    with connect(f"ws://{place}/{secret}", origin=f"http://{place}"):
+        pass
+    for origin in ("http://example.org", "http://127.0.0.1:1", "http://localhost:1"):
+        with pytest.raises(InvalidStatus), connect(f"ws://{place}/{secret}", origin=origin):
             pass
-        with pytest.raises(InvalidStatus), connect(address, origin="http://example.org"):
+    assert server.request_share_url() is None
+
+
+def test_only_who_knows_the_address_is_let_in(served):
+    from websockets.exceptions import InvalidStatus
+    from websockets.sync.client import connect
+
+    place, secret, _ = served
+    for path in ("", "/", f"/{secret}x/", f"/x/{secret}", f"/?{secret}", "/%2e%2e", f"/{secret[:-1]}", "/ä"):
+        status, _, body = asked(f"http://{place}{urllib.parse.quote(path, safe='/%?')}")
+        assert status == 403 and secret.encode() not in body, path
+        with pytest.raises(InvalidStatus), connect(f"ws://{place}{urllib.parse.quote(path, safe='/%?')}"):
             pass
-        assert server.request_share_url() is None
-    finally:
-        server.stop()
+    status, _, body = asked(f"http://{place}/{secret}/?fixedDpr=1")
+    assert status == 200 and b"<html" in body
+    assert asked(f"http://{place}/{secret}")[0] == 200
+    assert asked(f"http://{place}/{secret}/../../etc/passwd")[0] == 404
+
+
+def test_no_other_page_may_show_this_one_in_a_frame(served):
+    place, secret, _ = served
+    headers = asked(f"http://{place}/{secret}/")[1]
+    assert headers["Content-Security-Policy"] == "frame-ancestors 'none'"
+    assert headers["X-Frame-Options"] == "DENY"
+    assert headers["Referrer-Policy"] == "no-referrer"

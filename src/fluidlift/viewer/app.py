@@ -120,7 +120,7 @@ class Viewer:
         self.preview = LivePreview(self.asset, folder, size=size, keep=_kept, told=self._preview_told)
         self.jobs = Jobs(self._job_ended)
         port = free_port(request.host, request.port)
-        self.server = open_server(request.host, port, f"fluidlift · {folder.name}")
+        self.server, self._secret = open_server(request.host, port, f"fluidlift · {folder.name}")
         self.stage = Stage(self.server, folder, self.asset, self.redraw)
         self.panels = Panels(self)
         self.stage.look_from_input(self.server.initial_camera)
@@ -135,9 +135,9 @@ class Viewer:
 
     @property
     def address(self) -> str:
-        """Of the page."""
-        host = self.request.host
-        return f"http://{'127.0.0.1' if host in ('0.0.0.0', 'localhost') else host}:{self.server.get_port()}"
+        """Of the page; who knows it is let in."""
+        host = "127.0.0.1" if self.request.host in ("0.0.0.0", "localhost") else self.request.host
+        return f"http://{f'[{host}]' if ':' in host else host}:{self.server.get_port()}/{self._secret}"
 
     def lines(self) -> list[str]:
         """What a person at the terminal should know."""
@@ -147,8 +147,8 @@ class Viewer:
             found.append(f"port {self.request.port} is in use; {port} is taken instead")
         if not is_local(self.request.host):
             found.append(
-                f"warning: on {self.request.host} everybody in the network can reach this page, change the scene and "
-                "write files into the asset; 127.0.0.1 is for this machine alone"
+                f"warning: on {self.request.host} everybody in the network who has this address can change the scene "
+                "and write files into the asset, and it is sent unencrypted; 127.0.0.1 is for this machine alone"
             )
         if not self.saved.count:
             found.append(f"no simulated frames yet: press 'simulate in full', or run fluidlift sim {self.folder}")

@@ -1,14 +1,17 @@
-"""The web server: on this machine alone unless asked for more, on the next free port, for pages of its own only."""
+"""The web server: on this machine alone unless asked for more, on the next free port, for who knows its address."""
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import ipaddress
-import re
+import secrets
 import socket
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from http import HTTPStatus
 from typing import Any
+from urllib.parse import urlsplit
 
 from fluidlift.errors import InputRejected, MissingPackage
 
@@ -16,8 +19,14 @@ FIRST_PORT = 8080
 TRIED = 100
 """ports, from the one that was asked for"""
 
-LOCAL_PAGES = re.compile(r"https?://(localhost|127\.0\.0\.1|\[::1\])(:\d+)?")
-"""origins of pages on this machine"""
+PAGE_HEADERS = {
+    "Content-Security-Policy": "frame-ancestors 'none'",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "Cross-Origin-Resource-Policy": "same-origin",
+}
+"""of all that is served: in no frame, and the address, which is a secret, is told to nobody"""
 
 
 def is_local(host: str) -> bool:
@@ -68,35 +77,71 @@ def require_viser() -> Any:
     return viser
 
 
-def open_server(host: str, port: int, label: str) -> Any:
-    """A viser server that answers pages of this machine alone, and lets nobody share it with the world.
+def open_server(host: str, port: int, label: str) -> tuple[Any, str]:
+    """A viser server that answers only who knows its address, and lets nobody share it with the world.
 
-    Other web sites open in the same browser could reach a server on 127.0.0.1 as well: a connection that names a page
-    of theirs as its origin is refused, unless the host was opened to the network on purpose.
+    Other users of this machine, and web sites that are open in the same browser, can reach a server on 127.0.0.1 as
+    well. Every request must name a secret, which is drawn here, as the first part of its path; a connection that a page
+    of another origin opens is refused, other ports of this machine included; and no page may show this one in a frame.
+
+    Returns:
+        The server, and the secret.
     """
-    viser = require_viser()
-    with _checked_origins(host), contextlib.redirect_stdout(None):
+    viser, secret = require_viser(), secrets.token_urlsafe(16)
+    with _guarded(secret), contextlib.redirect_stdout(None):
         server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
     server.request_share_url = lambda *_, **__: None  # would open a tunnel through somebody else's machine
     server.gui.configure_theme(control_width="large", dark_mode=False, show_logo=False, show_share_button=False)
     server.gui.main_panel.dock_right()  # what floats over the scene hides new obstacles
-    return server
+    return server, secret
 
 
 @contextlib.contextmanager
-def _checked_origins(host: str) -> Iterator[None]:
-    """While the server is made, web sockets are opened with a check of where a page comes from."""
+def _guarded(secret: str) -> Iterator[None]:
+    """While the server is made, what it serves is put behind `_guard`."""
     import websockets.asyncio.server as sockets
 
     plain = sockets.serve
 
-    def checked(*args: Any, **options: Any) -> Any:
-        if is_local(host):
-            options.setdefault("origins", [LOCAL_PAGES, None])
-        return plain(*args, **options)
+    def guarded(*args: Any, **options: Any) -> Any:
+        return plain(*args, **options | {"process_request": _guard(secret, options["process_request"])})
 
-    sockets.serve = checked
+    sockets.serve = guarded
     try:
         yield
     finally:
         sockets.serve = plain
+
+
+def _guard(secret: str, answer: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+    """`answer` (which takes a connection and a request) for requests under `/secret` that no foreign page makes."""
+
+    def guarded(connection: Any, request: Any) -> Any:
+        given, _, rest = request.path.partition("?")[0].removeprefix("/").partition("/")
+        if not secrets.compare_digest(given.encode(), secret.encode()):
+            return connection.respond(HTTPStatus.FORBIDDEN, "Open the whole address that fluidlift view printed.\n")
+        if not same_origin(request.headers.get("Origin"), request.headers.get("Host", "")):
+            return connection.respond(HTTPStatus.FORBIDDEN, "A page of another origin is not let in.\n")
+        response = answer(connection, dataclasses.replace(request, path=f"/{rest}"))
+        if response is not None:
+            for name, value in PAGE_HEADERS.items():
+                response.headers[name] = value
+        return response
+
+    return guarded
+
+
+def same_origin(origin: str | None, host: str) -> bool:
+    """Whether a request comes from a page of the address that it goes to, however a tunnel may have renamed both.
+
+    Args:
+        origin: of the page, as browsers tell it; None: no browser, or no page.
+        host: that was asked for, with its port.
+    """
+    if origin is None:
+        return True
+    try:
+        parts = urlsplit(origin)
+    except ValueError:
+        return False
+    return parts.scheme in ("http", "https") and parts.netloc.lower() == host.lower() != ""

@@ -6,6 +6,7 @@ import json
 import struct
 import tracemalloc
 import zlib
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -13,7 +14,8 @@ import pytest
 from fuzz.corpus import glb_file, scene_with_picture
 
 from fluidlift.errors import InputRejected
-from fluidlift.io import read_mesh
+from fluidlift.io import pictures, read_mesh
+from fluidlift.io.array_archive import mapped_array, release_pages
 from fluidlift.io.exr import channels_in
 from fluidlift.io.images import read_depth
 from fluidlift.io.limits import ReadLimits, parse_json
@@ -211,3 +213,36 @@ def test_numbers_of_json_that_no_reader_can_mean_are_infinite():
     ]  # fmt: skip
     with pytest.raises(ValueError, match="nested"):
         parse_json("[" * 100_000)
+
+
+@pytest.mark.parametrize("dtype", [np.uint16, np.float32])
+@pytest.mark.parametrize("channels", [(), (3,), (4,)])
+def test_a_deep_picture_becomes_eight_bits_in_strips(memory, monkeypatch, dtype, channels):
+    rng = np.random.default_rng(0)
+    shape = (700, 900, *channels)
+    deep = rng.uniform(-0.2, 1.2, shape).astype(dtype) if dtype == np.float32 else rng.integers(0, 2**16, shape, dtype)
+    tracemalloc.reset_peak()
+    before = memory()
+    monkeypatch.setattr(pictures, "_STRIP", 10_000)
+    found = pictures.eight_bit(deep)
+    assert memory() - before < 3 * deep.size / 1e6 + 1.5
+    monkeypatch.setattr(pictures, "_STRIP", 10**9)
+    for strip, whole in zip(found, pictures.eight_bit(deep)):
+        np.testing.assert_array_equal(strip, whole)
+
+
+def test_pages_of_a_mapped_array_are_given_back_and_read_again(tmp_path):
+    np.save(tmp_path / "a.npy", np.arange(2**21, dtype=np.float32).reshape(2, -1))
+    found = mapped_array(tmp_path / "a.npy")
+
+    def held() -> int:
+        """kB of the mapping that are in memory."""
+        maps = Path("/proc/self/smaps").read_text().split("/a.npy")[1]
+        return int(maps.split("Rss:")[1].split()[0])
+
+    assert float(found[1].sum()) > 0
+    if Path("/proc/self/smaps").exists():
+        assert held() > 1000
+        release_pages(found[None])
+        assert held() < 100
+    assert found[1, -1] == 2**21 - 1

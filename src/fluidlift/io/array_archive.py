@@ -7,6 +7,7 @@ below raise besides), which the readers turn into their own words.
 from __future__ import annotations
 
 import math
+import mmap
 import struct
 import tempfile
 import tokenize
@@ -89,6 +90,15 @@ def mapped_array(path: Path, mode: str = "r", kinds: str = "fiub") -> np.memmap:
             raise ValueError("it breaks off")
     order = "F" if head.fortran else "C"
     return np.memmap(path, head.dtype, mode, offset, head.shape, order)  # type: ignore[call-overload]
+
+
+def release_pages(array: np.ndarray) -> None:
+    """Give back the memory of a mapped array that was only looked at; what is looked at again is read again."""
+    mapped = array
+    while isinstance(mapped, np.ndarray):
+        mapped = mapped.base
+    if isinstance(mapped, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED"):
+        mapped.madvise(mmap.MADV_DONTNEED)
 
 
 def members_of(archive: zipfile.ZipFile, max_bytes: int) -> dict[str, zipfile.ZipInfo]:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from fluidlift.errors import InputRejected
-from fluidlift.io.array_archive import DAMAGE, array_in, mapped_array, members_of
+from fluidlift.io.array_archive import DAMAGE, array_in, mapped_array, members_of, release_pages
 from fluidlift.io.exr import read_channels
 from fluidlift.io.limits import ReadLimits, read_json, require_file, require_size
 from fluidlift.io.pictures import PICTURE_SUFFIXES, read_picture, resample, same_shape, write_png
@@ -150,6 +150,7 @@ def read_depth(
     fitted = np.empty((len(layers), size[1], size[0]), np.float32)
     for layer, out in zip(layers, fitted):  # one by one: the array may be larger than memory
         out[:] = cv2.resize(layer.astype(np.float32) * np.float32(scale), size, interpolation=cv2.INTER_NEAREST_EXACT)
+        release_pages(layers)
     fitted[~(np.isfinite(fitted) & ((fitted > 0) | (not positive)))] = np.nan
     if not np.isfinite(fitted).any():
         raise InputRejected(f"no valid depth in '{path.name}'", "positive metres", "look at it: is it black?")

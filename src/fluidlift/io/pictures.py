@@ -17,6 +17,8 @@ from fluidlift.numerics.srgb import srgb_from_linear
 PICTURE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".exr"})
 MAX_BYTES = 2**30
 """of a file"""
+_STRIP = 2**20
+"""samples that are converted in one go"""
 
 
 def read_picture(path: Path | str, *, limits: ReadLimits | None = None) -> np.ndarray:
@@ -88,7 +90,11 @@ def checked_header(data: bytes, name: str, limits: ReadLimits) -> PictureHeader:
 def _from_channels(name: str, channels: dict[str, np.ndarray]) -> np.ndarray:
     """R, G, B (and A) of an OpenEXR file, or the one channel that it has."""
     if {"R", "G", "B"} <= channels.keys():
-        return np.stack([channels[c] for c in "RGBA" if c in channels], axis=-1)
+        names = [c for c in "RGBA" if c in channels]
+        picture = np.empty((*channels["R"].shape, len(names)), np.float32)
+        for k, c in enumerate(names):
+            picture[..., k] = channels.pop(c)  # one of them in memory twice, not all
+        return picture
     for channel in ("Y", "Z", "A", *channels):
         if channel in channels:
             return channels[channel]
@@ -97,17 +103,26 @@ def _from_channels(name: str, channels: dict[str, np.ndarray]) -> np.ndarray:
 
 def eight_bit(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
     """u8 [H,W,3] sRGB and, where there is one, u8 [H,W] alpha of what `read_picture` gives."""
-    if picture.dtype == np.uint16:
-        picture = np.round(picture / 257.0).astype(np.uint8)
-    elif picture.dtype != np.uint8:
-        light = np.clip(np.nan_to_num(picture), 0.0, 1.0)
-        encoded = srgb_from_linear(light)
-        if picture.ndim == 3 and picture.shape[2] == 4:
-            encoded[..., 3] = light[..., 3]
-        picture = np.round(255.0 * encoded).astype(np.uint8)
+    if picture.dtype != np.uint8:
+        encoded = np.empty(picture.shape, np.uint8)
+        rows = max(1, _STRIP // max(1, picture[:1].size))
+        for first in range(0, len(picture), rows):  # at once it would take ten times the memory of the picture
+            encoded[first : first + rows] = _encoded(picture[first : first + rows])
+        picture = encoded
     if picture.ndim == 2:
         picture = np.repeat(picture[..., None], 3, axis=-1)
     return np.ascontiguousarray(picture[..., :3]), picture[..., 3].copy() if picture.shape[2] == 4 else None
+
+
+def _encoded(picture: np.ndarray) -> np.ndarray:
+    """u8 of u16 samples, or of linear light."""
+    if picture.dtype == np.uint16:
+        return np.round(picture / 257.0).astype(np.uint8)
+    light = np.clip(np.nan_to_num(picture), 0.0, 1.0)
+    encoded = srgb_from_linear(light)
+    if picture.ndim == 3 and picture.shape[2] == 4:
+        encoded[..., 3] = light[..., 3]
+    return np.round(255.0 * encoded).astype(np.uint8)
 
 
 def fitted_size(size: tuple[int, int], max_size: int) -> tuple[int, int]:

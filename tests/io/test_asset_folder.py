@@ -148,6 +148,18 @@ def test_a_manifest_that_makes_no_sense_is_refused(folder, change):
         af.load_asset(folder)
 
 
+@pytest.mark.parametrize("number", ["1e999", "NaN", "-Infinity", "1" + "0" * 400])
+@pytest.mark.parametrize("file", ["manifest.json", "parameters.json"])
+def test_numbers_that_are_not_finite_are_refused(folder, file, number):
+    path = folder / file
+    found = {"manifest.json": '"spacing": 0.1', "parameters.json": '"density": 1000.0'}[file]
+    text = path.read_text()
+    assert found in text
+    path.write_text(text.replace(found, found.partition(":")[0] + f": {number}"))
+    with pytest.raises(InputRejected, match="not finite"):
+        af.load_asset(folder)
+
+
 def test_an_oversize_manifest_is_refused_before_it_is_read(folder):
     with (folder / "manifest.json").open("ab") as file:
         file.truncate(17 * 2**20)

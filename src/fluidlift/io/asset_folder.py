@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import importlib.resources
 import json
+import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import cache
@@ -254,12 +255,12 @@ def load_asset(folder: Path | str) -> FluidAsset:
     folder = Path(folder)
     manifest = read_manifest(folder)
     part = {name: asset_file(folder, file) for name, file in manifest["files"].items()}
-    grid = _grid(manifest["grid"])
     parameters, estimates = read_parameters(part["parameters"])
     camera = read_json(part["camera"], "camera JSON", _MAX_JSON)
     canonical = manifest["world_from_canonical"]
     moving = read_arrays(part["velocity"], ("u", "v", "w", "cell_types"))
     try:
+        grid = _grid(manifest["grid"])
         velocity = FaceVelocity(moving["u"], moving["v"], moving["w"])
         if velocity.shape != grid.shape or moving["cell_types"].shape != grid.shape:
             raise ValueError(f"velocity {velocity.shape} for a grid {grid.shape}")
@@ -325,7 +326,14 @@ def _validator(name: str) -> jsonschema.Draft202012Validator:
 
 
 def _validate(data: Any, name: str, error: type[Exception]) -> None:
-    """Raise the first and deepest complaint of the schema."""
+    """Raise the first and deepest complaint of the schema, or one about a number that is not finite."""
+    waiting = [data]
+    while waiting:
+        part = waiting.pop()
+        if isinstance(part, dict | list):
+            waiting += part.values() if isinstance(part, dict) else part
+        elif isinstance(part, float) and not math.isfinite(part):
+            raise error(f"{name}.json: the number {part}, which is not finite")
     complaint = jsonschema.exceptions.best_match(_validator(name).iter_errors(data))
     if complaint is not None:
         raise error(f"{name}.json: {complaint.json_path}: {complaint.message[:300]}")

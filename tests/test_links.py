@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 
 import numpy as np
@@ -125,6 +126,13 @@ def test_no_function_goes_through_a_link(linked, name, do):
     with pytest.raises(InputRejected, match="is a link"):
         do(asset)
     assert held(part) == before
+
+
+def test_a_pipe_in_an_asset_holds_up_nobody(whole, tmp_path, capsys):
+    shutil.copytree(whole / "a.fluid", tmp_path / "a.fluid")
+    os.mkfifo(tmp_path / "a.fluid" / "work" / "simulate" / "owner")
+    assert main(["sim", str(tmp_path / "a.fluid")]) == REJECTED
+    assert "'work/simulate/owner' in 'a.fluid' is a pipe or a device" in capsys.readouterr().err
 
 
 def test_an_asset_may_itself_be_reached_through_a_link(whole, tmp_path, capsys):

@@ -55,7 +55,8 @@ def require_no_links(folder: Path | str) -> None:
     """Look through an asset before anything is done with it; the folder itself may be a link.
 
     Raises:
-        InputRejected: a link anywhere below it, to a file or a folder; or one that may not be looked into.
+        InputRejected: a link anywhere below it, to a file or a folder; a pipe or a device; or a folder that may not be
+            looked into.
     """
     folder = Path(folder)
     waiting = [folder]
@@ -68,6 +69,11 @@ def require_no_links(folder: Path | str) -> None:
                         raise _is_link(folder, Path(entry.path).relative_to(folder).as_posix())
                     if entry.is_dir(follow_symlinks=False):
                         waiting.append(Path(entry.path))
+                    elif not entry.is_file(follow_symlinks=False):  # a pipe would hold up who reads it for ever
+                        raise InputRejected(
+                            f"'{Path(entry.path).relative_to(folder)}' in '{folder.name}' is a pipe or a device",
+                            "plain files and folders inside an asset", "do not trust this asset",
+                        )  # fmt: skip
         except FileNotFoundError:  # another run is at work, and this was a temporary folder of it
             continue
         except OSError as error:

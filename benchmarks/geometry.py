@@ -43,8 +43,10 @@ from fluidlift.look.rasterize import render
 from fluidlift.look.scenery import orbit_camera, terrain_surfels
 from fluidlift.pipeline import begin, body, refining
 from fluidlift.pipeline.make import STAGES
-from fluidlift.pipeline.reading import Inputs, clip_of
-from fluidlift.pipeline.story import Silence, Story
+from fluidlift.pipeline.inputs import Inputs
+from fluidlift.pipeline.reading import clip_of
+from fluidlift.pipeline.work import Silence
+from fluidlift.pipeline.story import Story
 from fluidlift.shape.airborne import inside_body
 from fluidlift.shape.kind import PITCH_PRIOR
 from fluidlift.shape.place import pose_up

@@ -39,8 +39,9 @@ from fluidlift.pipeline.reading import clip_of
 from fluidlift.pipeline.resimulate import FIRST_HALF, recall_first_half
 from fluidlift.pipeline.scene import LYING
 from fluidlift.pipeline.seeing import labels_of
-from fluidlift.pipeline.showing import splat_frames
-from fluidlift.pipeline.story import Silence, Story
+from fluidlift.pipeline.splat_files import splat_frames
+from fluidlift.pipeline.work import Silence
+from fluidlift.pipeline.story import Story
 from fluidlift.types import FluidAsset, Gaussians, Grid, PinholeCamera, Terrain, TriangleMesh
 
 BEGIN, END = "<!-- looks:begin -->", "<!-- looks:end -->"

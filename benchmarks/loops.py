@@ -27,8 +27,9 @@ from fluidlift.pipeline.coarse_copy import coarser
 from fluidlift.pipeline.looping import read_frame
 from fluidlift.pipeline.resimulate import FIRST_HALF, recall_first_half
 from fluidlift.pipeline.scene import footage_of
-from fluidlift.pipeline.simulating import frame_file
-from fluidlift.pipeline.story import Silence, Story
+from fluidlift.pipeline.splat_files import frame_file
+from fluidlift.pipeline.work import Silence
+from fluidlift.pipeline.story import Story
 
 PARTS = 8
 """along each side of the picture"""

@@ -22,7 +22,8 @@ from fluidlift.io.asset_folder import read_manifest
 from fluidlift.pipeline.reading import clip_of
 from fluidlift.pipeline.resimulate import FIRST_HALF, recall_first_half
 from fluidlift.pipeline.seeing import labels_of
-from fluidlift.pipeline.story import Silence, Story
+from fluidlift.pipeline.work import Silence
+from fluidlift.pipeline.story import Story
 
 CAPTION = 0.08
 """upper share of a panel, where its caption stands"""

@@ -21,7 +21,8 @@ from fluidlift.pipeline import EditSession, Inputs, RenderRequest, SimulationReq
 from fluidlift.pipeline.coarse_copy import coarser
 from fluidlift.pipeline.resimulate import FIRST_HALF, recall_first_half
 from fluidlift.pipeline.scene import Footage, footage_of
-from fluidlift.pipeline.story import Silence, Story
+from fluidlift.pipeline.work import Silence
+from fluidlift.pipeline.story import Story
 from fluidlift.synthetic.demo import demo_clip
 from fluidlift.types import FluidAsset, Grid, Particles
 

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 from fluidlift.shape.jets import Outline
-from fluidlift.shape.kind import PITCH_PRIOR, UpEvidence
+from fluidlift.shape.kind import PITCH_PRIOR
 from fluidlift.shape.puddle import down_to_landing, fit_ellipse, jets_into_puddle, puddle_tilt
-from fluidlift.types import PinholeCamera
+from fluidlift.types import PinholeCamera, UpEvidence
 
 H, W = 160, 160
 CAMERA = PinholeCamera.from_fov(40.0, (W, H))

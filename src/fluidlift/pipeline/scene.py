@@ -18,10 +18,8 @@ from fluidlift.errors import InputRejected
 from fluidlift.look.appearance import SteadyShading
 from fluidlift.physics.inflow_schedule import InflowSchedule
 from fluidlift.pipeline.following import following
-from fluidlift.pipeline.reading import clip_of
+from fluidlift.pipeline.machine import available_memory
 from fluidlift.pipeline.reshaping import changed_parameters, with_emitters, with_terrain
-from fluidlift.pipeline.seeing import labels_of
-from fluidlift.pipeline.story import Story, available_memory
 from fluidlift.types import (
     CellType,
     FaceVelocity,
@@ -34,9 +32,11 @@ from fluidlift.types import (
     Terrain,
     VideoClip,
 )
+from fluidlift.types.stages import Geometry, Read, Segmentation
 
 if TYPE_CHECKING:
     from fluidlift.io.obstacles import Obstacle
+    from fluidlift.io.scene import SceneEdits
     from fluidlift.physics.emitter import Emitter
     from fluidlift.physics.rigid_body import RigidBody
 
@@ -174,6 +174,11 @@ class Scene:
             found["loop"] = _hash(self.frames, self.overlap)
         return found
 
+    @property
+    def cache_key(self) -> list[Any]:
+        """What the keys of stages know of it: how it goes, and how long and from where it is seen."""
+        return [self.parts, self.frames, self.clip_interval, self.camera.to_dict()]
+
     @cached_property
     def bodies(self) -> tuple[RigidBody, ...]:
         """The obstacles as bodies; raises `InputRejected` where a mesh bounds no solid."""
@@ -202,14 +207,11 @@ def _update(digest: hashlib._Hash, file: Path) -> None:
             digest.update(piece)
 
 
-def footage_of(story: Story) -> Footage | None:
-    """The clip as the first stages saw it, or None where their results are not at hand."""
-    if not {"read", "segment", "geometry"} <= story.results.keys():
-        return None
-    g = story["geometry"]
-    labels = labels_of(story)
-    rocks = g.arrays["rocks"] if "rocks" in g.arrays else labels.solid.mean(axis=0) > 0.5
-    return Footage(clip_of(story), labels, g.arrays["plate"], int(g.meta["rest_frame"]), rocks)
+def footage_of(read: Read, segmentation: Segmentation, geometry: Geometry) -> Footage:
+    """The clip as the first stages saw it."""
+    labels = segmentation.labels
+    rocks = geometry.rocks if geometry.rocks is not None else labels.solid.mean(axis=0) > 0.5
+    return Footage(read.clip, labels, geometry.plate, geometry.rest_frame, rocks)
 
 
 BEHIND = (1.5, 0.5)
@@ -242,6 +244,7 @@ def scene_of(
     *,
     footage: Footage | None,
     start: int,
+    edits: SceneEdits | None = None,
 ) -> Scene:
     """The scene that an asset, its scene.yaml and a request describe.
 
@@ -255,6 +258,7 @@ def scene_of(
         config: seed, and frames where neither request nor scene.yaml say.
         footage: the clip, where it is at hand.
         start: frame of the clip that the first simulated one shows.
+        edits: the folder's scene.yaml, where it was read already.
 
     Raises:
         InputRejected: a scene.yaml or a request that does not fit.
@@ -262,7 +266,7 @@ def scene_of(
     from fluidlift.io.scene import read_edits
     from fluidlift.numerics.sampling import sample_faces
 
-    edits = read_edits(folder, meshes=request.meshes)
+    edits = read_edits(folder, meshes=request.meshes) if edits is None else edits
     # edits that are tried out lie elsewhere than their asset
     home = folder if request.meshes is None or (folder / "manifest.json").is_file() else request.meshes
     interval = asset.interval if request.fps is None else 1.0 / request.fps

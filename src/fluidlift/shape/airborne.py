@@ -9,8 +9,8 @@ from jaxtyping import Bool, Float
 
 from fluidlift.shape.jet_column import Jet
 from fluidlift.shape.kind import Kind
-from fluidlift.shape.terrain import Setting, at_cells, terrain_mesh, unit
-from fluidlift.types import CellType, Grid, PinholeCamera, Terrain
+from fluidlift.shape.terrain import at_cells, terrain_mesh, unit
+from fluidlift.types import CellType, Grid, PinholeCamera, Setting, Terrain
 
 PASSING = 0.25
 """speed along the stream at one of its ends over that of its swift part (90th percentile), above which fluid enters or

@@ -17,11 +17,10 @@ from scipy.linalg import solve
 from fluidlift.errors import InputRejected
 from fluidlift.shape.given_depth import SceneDepth, robust_plane, without_rim
 from fluidlift.shape.heights import HeightModel, ProfileHeight
-from fluidlift.shape.kind import PITCH_PRIOR, Kind, UpEvidence
+from fluidlift.shape.kind import PITCH_PRIOR, Kind
 from fluidlift.shape.plume import SIGHT
-from fluidlift.shape.slope import SlopeEvidence
 from fluidlift.shape.surface import FrontSurface, inflated_surface, intersect_height
-from fluidlift.types import Grid, Label, PinholeCamera
+from fluidlift.types import Grid, Label, PinholeCamera, SlopeEvidence, UpEvidence
 
 SLOPES: tuple[tuple[float, float, float], ...] = ((0.7, 0.5, 2.0), (0.3, 0.0, 20.0))
 """share, mean and standard deviation (degrees, down is positive) of how streams slope: most are nearly level, films and

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
@@ -12,7 +11,7 @@ from scipy import ndimage
 from fluidlift.errors import require
 from fluidlift.shape import chute, prism, slope
 from fluidlift.shape.texture_gradient import TexturePatches
-from fluidlift.types import PinholeCamera, RigidTransform
+from fluidlift.types import KindEvidence, PinholeCamera, RigidTransform, UpEvidence
 
 Kind = Literal["stream", "fall", "pour", "plume", "dam"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
@@ -25,31 +24,6 @@ PITCH_PRIOR: dict[str, tuple[float, float]] = {
     "dam": (25.0, 12.0),
 }
 """mean and standard deviation of how far people tilt a camera down at such a fluid, degrees (a choice, not a law)"""
-
-
-@dataclass(frozen=True)
-class KindEvidence:
-    """Why a kind was chosen."""
-
-    kind: Kind
-    scores: dict[str, float]
-    """share of belief per kind, sums to 1"""
-    features: dict[str, float]
-    """the measured figures behind the scores"""
-
-
-@dataclass(frozen=True)
-class UpEvidence:
-    """Which way is up, as seen by the camera."""
-
-    pitch: float
-    """degrees that the camera looks below the horizon"""
-    roll: float
-    """degrees that the picture is turned clockwise"""
-    source: str
-    """user, camera file, or what it was estimated from"""
-    confidence: float
-    """0 (prior alone) to 1 (given)"""
 
 
 def estimate_kind(

@@ -12,8 +12,7 @@ from jaxtyping import Bool, Float
 from fluidlift.numerics.mirror import MirroredPoints
 from fluidlift.physics.inlet import clear_of_shore
 from fluidlift.shape.generate import body_cells
-from fluidlift.shape.terrain import Setting
-from fluidlift.types import Gaussians, PinholeCamera
+from fluidlift.types import Gaussians, PinholeCamera, Setting
 
 HIDDEN = 0.5
 """cells below the surface to which splats of the hull would show through finer ones above them"""

@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from fluidlift.shape.jets import Outline, airborne_pixels, find_jets, lying_pixels
-from fluidlift.shape.kind import PITCH_PRIOR, UpEvidence, level_camera
+from fluidlift.shape.kind import PITCH_PRIOR, level_camera
 from fluidlift.shape.region import largest_piece
-from fluidlift.types import PinholeCamera
+from fluidlift.types import PinholeCamera, UpEvidence
 
 ROUND = 0.85
 """IoU of a pool's outline with the ellipse of its moments, at least: a rectangle has 0.83, a glass from the side less.

@@ -18,8 +18,7 @@ from fluidlift.shape.energy_line import Channel, energy_profile
 from fluidlift.shape.heights import FOOT, HeightModel, PlaneHeight, ProfileAlongHeight, ProfileHeight, SampledHeight
 from fluidlift.shape.kind import Kind
 from fluidlift.shape.plume import SIGHT, section_half_thickness
-from fluidlift.shape.slope import SlopeEvidence
-from fluidlift.types import PinholeCamera
+from fluidlift.types import PinholeCamera, SlopeEvidence
 
 FAR = 12.0
 """no part of a surface is taken to be further away than this many times the nearest part"""

@@ -2,66 +2,74 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from fluidlift.config import JobConfig
 from fluidlift.io.scene_look import Look
 from fluidlift.pipeline.as_filmed import BEYOND, Reel, card_of_run
-from fluidlift.pipeline.export_job import frames_of
+from fluidlift.pipeline.front_view import FrontView, open_end, to_bytes
 from fluidlift.pipeline.looks import Backdrop, Frame, Painter, placed_bodies
-from fluidlift.pipeline.scene import LYING, Footage, Scene, before_ground
-from fluidlift.pipeline.story import Result
-from fluidlift.types import Gaussians, PinholeCamera, Similarity3, concatenate, matrix_from_quat
+from fluidlift.pipeline.scene import LYING, Footage, Scene
+from fluidlift.pipeline.settings import ShowSettings
+from fluidlift.pipeline.splat_files import splat_frames
+from fluidlift.pipeline.work import Work
+from fluidlift.types import PinholeCamera, Similarity3, concatenate, matrix_from_quat
+from fluidlift.types.stages import Shown, Simulation
 
-if TYPE_CHECKING:
-    from fluidlift.look.open_end import OpenEnd
-    from fluidlift.look.rasterize import Rendered
 
+@dataclass(frozen=True)
+class SeenLook:
+    """The look of the fluid in pictures, by what they depend on."""
 
-def splat_frames(folder: Path, count: int) -> Iterator[tuple[Gaussians, np.ndarray, np.ndarray]]:
-    """(gaussians, ids, velocities) of each simulated frame."""
-    return frames_of(folder, range(count))
+    look: Look
+    mark: dict[str, Any]
+    """`Look.mark`, with the colours of obstacles"""
+
+    @property
+    def cache_key(self) -> dict[str, Any]:
+        """What the stage's key knows of it."""
+        return self.mark
 
 
 def show(
     scene: Scene,
+    simulation: Simulation,
     footage: Footage | None,
-    folder: Path,
-    config: JobConfig,
-    poses: np.ndarray,
+    seen: SeenLook,
+    config: ShowSettings,
     *,
-    look: Look | None = None,
-    step: Callable[[int, int], None] = lambda done, total: None,
-) -> Result:
+    folder: Path,
+    work: Work,
+) -> Shown:
     """Render the frames, write what people open.
 
     Args:
         scene: that was simulated.
+        simulation: of it.
         footage: the clip; without it the preview leaves out the input, and the fluid stands before grey.
+        seen: look of the fluid in the preview. What is measured are its splats as lifted in any case.
+        config: what is written.
         folder: of the asset.
-        config: its `show` section.
-        poses: [k,b,7] of the obstacles in the k frames that were simulated: position (m), orientation (w, x, y, z).
-        look: of the fluid in the preview; None: its splats as lifted. What is measured are those in any case.
-        step: told (frames done, all frames).
+        work: told how many frames are done.
     """
     from fluidlift.io.export_usd import write_usd
     from fluidlift.io.frames import MovingMesh
     from fluidlift.io.video import write_video
 
+    poses, step = simulation.poses, work.step
     count = len(poses)
     measured: dict[str, Any] = {"frames": Reel(folder), "mask": Reel(folder), "flow": []}
-    painter = _painter(scene, folder, look)
+    painter = _painter(scene, folder, seen.look)
     panels = _panels(scene, footage, folder, config, poses, measured, step, painter)
-    if config.show.preview:
+    if config.preview:
         write_video(folder / "preview.mp4", panels, 1.0 / scene.interval, repeatable=True)
     else:
         (folder / "preview.mp4").unlink(missing_ok=True)  # of frames that are no longer there
-    if config.show.usd:
+    if config.usd:
         write_usd(
             folder / "asset.usda",
             frames=splat_frames(folder, count),
@@ -77,48 +85,11 @@ def show(
         for name in ("asset.usda", "asset.usdc"):  # of frames that are no longer there
             (folder / name).unlink(missing_ok=True)
     frames, mask, compared = measured["frames"].array(), measured["mask"].array(), len(measured["flow"])
-    meta = {"frames": count} | card_of_run(scene, footage, config, frames, mask)
+    card = card_of_run(scene, footage, config.preview, frames, mask)
     if not compared:
-        return Result({}, meta)
-    arrays = {
-        "resim_frames": frames[:compared],
-        "resim_mask": mask[:compared],
-        "resim_flow": np.stack(measured["flow"]).astype(np.float16),
-    }
-    return Result(arrays, meta)
-
-
-@dataclass(frozen=True)
-class FrontView:
-    """Splats as the clip's camera sees them: before the clip without its fluid, behind its rocks."""
-
-    camera: PinholeCamera
-    plate: np.ndarray
-    """[H,W,3] sRGB in [0, 1]"""
-    rocks: np.ndarray
-    """bool [H,W]"""
-    seen_of: Callable[[Gaussians], np.ndarray] | None
-    """whether the ground of the clip hides a splat; None where it hides none"""
-
-    @staticmethod
-    def of(scene: Scene, footage: Footage | None) -> FrontView:
-        """Of a scene; before grey where its clip is not at hand, or shows a ground that was edited."""
-        size, shown = scene.camera.size[::-1], None if scene.reshaped else footage
-        plate, rocks = np.full((*size, 3), 0.5, np.float32), np.zeros(size, bool)
-        if shown is not None:  # the clip shows the ground as it was
-            plate, rocks = shown.plate.astype(np.float32) / 255.0, shown.rocks
-        return FrontView(scene.camera, plate, rocks, before_ground(scene, shown))
-
-    def drawn(
-        self, gaussians: Gaussians, velocity: np.ndarray, solids: Sequence[Gaussians] = ()
-    ) -> tuple[Rendered, Gaussians, np.ndarray]:
-        """The picture with its coverage, and the splats that the ground leaves over, with their velocities (m/s)."""
-        from fluidlift.look.rasterize import render
-
-        if self.seen_of is not None:
-            keep = self.seen_of(gaussians)
-            gaussians, velocity = gaussians.select(keep), velocity[keep]
-        return render(concatenate([gaussians, *solids]), self.camera, background=self.plate), gaussians, velocity
+        return Shown(count, card.as_filmed, warnings=card.warnings)
+    flow = np.stack(measured["flow"]).astype(np.float16)
+    return Shown(count, card.as_filmed, frames[:compared], mask[:compared], flow, card.warnings)
 
 
 def _painter(scene: Scene, folder: Path, look: Look | None) -> Painter | None:
@@ -128,17 +99,15 @@ def _painter(scene: Scene, folder: Path, look: Look | None) -> Painter | None:
     return Painter(look, scene.terrain, folder, kind=scene.kind, end=open_end(scene))
 
 
-def open_end(scene: Scene) -> OpenEnd | None:
-    """Where a stream is cut in pictures; None of other kinds."""
-    from fluidlift.look.open_end import OpenEnd
-
-    if scene.kind not in LYING:
-        return None
-    return OpenEnd.of(scene.cell_types, scene.terrain.grid, scene.terrain.mainstream)
-
-
 def _panels(
-    scene: Scene, footage: Footage | None, folder: Path, config: JobConfig, poses: np.ndarray, measured, step, painter
+    scene: Scene,
+    footage: Footage | None,
+    folder: Path,
+    config: ShowSettings,
+    poses: np.ndarray,
+    measured,
+    step,
+    painter,
 ) -> Iterator[np.ndarray]:
     """Input | re-simulation | side view, frame by frame; keeps what the evaluation needs on the way."""
     from fluidlift.look.pictures import caption
@@ -158,7 +127,7 @@ def _panels(
     behind = terrain_depth(terrain, camera) if rocks.any() and painter is not None else None
     airborne = scene.kind not in LYING
     ground = terrain_surfels(terrain, glass=glass_of(scene.kind))
-    size = _panel_size(camera.size, config.show.width)
+    size = _panel_size(camera.size, config.width)
     # a body in the air may fill its box later; what lies on a bed stays in it
     around = terrain.mesh.vertices
     if airborne:
@@ -209,11 +178,6 @@ def _resized(picture: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     if picture.shape[1::-1] == tuple(size):
         return picture
     return cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
-
-
-def to_bytes(image: np.ndarray) -> np.ndarray:
-    """u8 sRGB of sRGB in [0, 1]."""
-    return (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
 
 
 def _screen_velocity(gaussians, velocity, camera: PinholeCamera, interval: float, alpha) -> np.ndarray:

@@ -14,11 +14,14 @@ from fluidlift.backends import generators
 from fluidlift.backends.generator_licence import require_accepted, require_use
 from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected, MissingPackage
-from fluidlift.pipeline.begin import Hashes, weights_hash
+from fluidlift.pipeline.fluid_masks import FluidMasks
 from fluidlift.pipeline.given_body import NOTE
-from fluidlift.pipeline.reading import Inputs, clip_of
-from fluidlift.pipeline.seeing import masks_of
-from fluidlift.pipeline.story import Result, Story
+from fluidlift.pipeline.inputs import Inputs
+from fluidlift.pipeline.known_camera import known_field_of_view
+from fluidlift.pipeline.rest_frames import FEWEST_PIXELS, united_range
+from fluidlift.pipeline.settings import GenerateSettings, GivenView
+from fluidlift.pipeline.work import Work
+from fluidlift.types.stages import Bodies, Read, Segmentation
 
 if TYPE_CHECKING:
     from fluidlift.backends.generator_card import GeneratorCard
@@ -36,16 +39,13 @@ def stages_of(stages: tuple[str, ...], config: JobConfig) -> tuple[str, ...]:
     return (*stages[:at], STAGE, *stages[at:])
 
 
-def choice_of(config: JobConfig, field_of_view: float | None = None) -> generators.GeneratorChoice:
-    """The generator as the job has it; needs `generate.name`."""
-    c = config.generate
-
-    def path(text: str | None) -> Path | None:
-        return None if text is None else Path(text).expanduser()
-
+def choice_of(config: GenerateSettings, field_of_view: float | None = None) -> generators.GeneratorChoice:
+    """The generator as the job has it."""
+    runner = None if config.runner is None else Path(config.runner.name).expanduser()
+    weights = None if config.weights is None else config.weights.name
     return generators.GeneratorChoice(
-        generators.require_known(str(c.name)), path(c.python), path(c.code), path(c.runner), c.weights, c.device,
-        config.seed, c.download, field_of_view, c.frame_seconds,
+        config.name, config.python, config.code, runner, weights, config.device, config.seed, config.download,
+        field_of_view, config.frame_seconds,
     )  # fmt: skip
 
 
@@ -73,7 +73,7 @@ def require_usable(inputs: Inputs, config: JobConfig, folder: Path) -> list[str]
         )
     warning = require_use(card, c.use, tuple(generators.card_of(name) for name in generators.GENERATORS))
     require_accepted(card, c.accept_licence)
-    choice = choice_of(config)
+    choice = choice_of(GenerateSettings.of(config))
     generators.make_generator(replace(choice, device="cpu" if choice.device == "auto" else choice.device))
     if not folder.exists():
         _require_installed(card, choice)
@@ -95,53 +95,52 @@ def _require_installed(card: GeneratorCard, choice: generators.GeneratorChoice) 
     )
 
 
-def run(story: Story, inputs: Inputs, config: JobConfig, hashes: Hashes) -> tuple[Inputs, Hashes]:
-    """Ask the generator where the job has one; the inputs with its bodies as their geometry, and its key."""
-    from fluidlift.pipeline.known_camera import known_field_of_view
-
-    if config.generate.name is None:
-        return inputs, hashes
-    c = config.generate
-    view, told = known_field_of_view(inputs, config, clip_of(story).size)
-    settings = {
-        "name": c.name, "weights": weights_hash(c.weights), "runner": weights_hash(c.runner), "seed": config.seed,
-        "view": [round(view, 6), told], "union": config.shape.longest_union,
-    }  # fmt: skip
-    place = story.folder / "work" / STAGE
-
-    def there(result: Result) -> bool:
-        made = place / story.keys[STAGE]
-        return all((made / f"{t:04d}{s}").is_file() for t in result.meta["frames"] for s in (".ply", ".json"))
-
-    story.run(
-        STAGE, lambda: _generate(story, config, place / story.keys[STAGE], view, told),
-        settings=settings, after=("read", "segment"), still_there=there,
-    )  # fmt: skip
-    key = story.keys[STAGE]
-    return replace(inputs, geometry=place / key), hashes | {"geometry": key}
+def bodies_folder(folder: Path, key: str) -> Path:
+    """Where an asset keeps the bodies that were made with the settings of a key."""
+    return folder / "work" / STAGE / key
 
 
-def _generate(story: Story, config: JobConfig, folder: Path, view: float, told: bool) -> Result:
-    """Bodies of the united frames, those that are there already left out; their note is written last."""
+def bodies_there(folder: Path, made: Bodies) -> bool:
+    """Whether the files of all bodies are still in their folder."""
+    return all((folder / f"{t:04d}{s}").is_file() for t in made.frames for s in (".ply", ".json"))
+
+
+def generate(
+    read: Read, segmentation: Segmentation, given: GivenView, config: GenerateSettings, *, folder: Path, work: Work
+) -> Bodies:
+    """Bodies of the united frames, those that are there already left out; their note is written last.
+
+    Args:
+        read: the clip.
+        segmentation: of it.
+        given: what is known of the lens.
+        config: which generator.
+        folder: of the asset.
+        work: has the key under which the bodies are kept.
+
+    Raises:
+        GeneratorFailed: what it says; bodies before that are kept.
+    """
     from fluidlift.backends.generator_process import GeneratorFailed, Picture
     from fluidlift.io.atomic import write_json
     from fluidlift.io.ply import write_gaussians
     from fluidlift.io.stage_cache import mark_work_folder
-    from fluidlift.pipeline.body import FEWEST_PIXELS, united_range
 
-    clip, fluid = clip_of(story), masks_of(story)
-    start, united = united_range(story, config)
+    clip, fluid = read.clip, FluidMasks(segmentation.labels.labels)
+    view, told = known_field_of_view(given, config.fov, clip.size)
+    start, united = united_range(clip, fluid, config.longest_union)
     frames = [t for t in range(start, start + united) if t == start or fluid[t].sum() >= FEWEST_PIXELS]
-    if story.force & set(story.stages[: story.stages.index(STAGE) + 1]):
+    mark_work_folder(folder)
+    folder = bodies_folder(folder, work.key)
+    if work.again:
         shutil.rmtree(folder, ignore_errors=True)
-    mark_work_folder(story.folder)
     folder.mkdir(parents=True, exist_ok=True)
     todo = [t for t in frames if not (folder / f"{t:04d}.json").is_file()]
     choice = choice_of(config, view)
     card = generators.card_of(choice.name)
     pictures = [Picture(t, np.ascontiguousarray(clip.frames[t]), np.asarray(fluid[t])) for t in todo]
     done = len(frames) - len(todo)
-    story.step(done, len(frames))
+    work.step(done, len(frames))
     try:
         if todo:
             _require_installed(card, choice)
@@ -149,7 +148,7 @@ def _generate(story: Story, config: JobConfig, folder: Path, view: float, told: 
             write_gaussians(folder / f"{t:04d}.ply", body)
             write_json(folder / f"{t:04d}.json", camera.to_dict())
             done += 1
-            story.step(done, len(frames))
+            work.step(done, len(frames))
     except (InputRejected, MissingPackage) as error:  # not the clip's fault: what was found in it is kept
         raise GeneratorFailed(str(error)) from error
     knows_up = bool(getattr(generators.generator_class(choice.name), "knows_up", False))
@@ -157,7 +156,7 @@ def _generate(story: Story, config: JobConfig, folder: Path, view: float, told: 
     note: dict[str, Any] = {"name": card.name, "metric": card.metric and told, "knows_up": knows_up, "frames": frames}
     write_json(folder / NOTE, note | {"licence": card.licence})
     _forget_old(folder)
-    return Result({}, {"name": card.name, "frames": frames, "warnings": []})
+    return Bodies(card.name, tuple(frames))
 
 
 def _forget_old(folder: Path) -> None:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 
-from fluidlift.config import JobConfig
+from fluidlift.config import FitConfig
 from fluidlift.errors import InputRejected
-from fluidlift.pipeline.body import camera_of, setting_of
 from fluidlift.pipeline.fit_outcome import (
     AT_THE_ENDS,
     Verdict,
@@ -23,18 +23,12 @@ from fluidlift.pipeline.fit_outcome import (
     verdict,
 )
 from fluidlift.pipeline.fit_request import FitRequest, request_of, startable
-from fluidlift.pipeline.lifting import targets_of
-from fluidlift.pipeline.reading import clip_of
+from fluidlift.pipeline.fluid_masks import FluidMasks
+from fluidlift.pipeline.machine import one_torch_thread
 from fluidlift.pipeline.rising import outline_rises, with_buoyancy
-from fluidlift.pipeline.seeing import masks_of
-from fluidlift.pipeline.story import Result, Story, one_torch_thread
-from fluidlift.types import (
-    CellType,
-    Estimate,
-    FaceVelocity,
-    FitResult,
-    FluidParameters,
-)
+from fluidlift.pipeline.work import Work
+from fluidlift.types import CellType, FaceVelocity, FitResult, FluidParameters
+from fluidlift.types.stages import Fit, Geometry, Motion, Read, Segmentation
 
 VISCOSITY_PRIOR = {"stream": 1e-5, "fall": 1e-5, "pour": 1e-4, "plume": 1e-5, "dam": 1e-5}
 """m^2/s, where the fit starts"""
@@ -49,24 +43,39 @@ AT_WALLS = ("restitution", "wall_damping")
 (`motion.bed`), and a steady flow whose slope the geometry lacks is best explained by walls without friction"""
 
 
-def fit(story: Story, config: JobConfig) -> Result:
-    """Physical parameters that make the grid move like the targets; the first guess where the fit fails."""
+def fit(
+    read: Read, segmentation: Segmentation, geometry: Geometry, motion: Motion, config: FitConfig, *, work: Work
+) -> Fit:
+    """Physical parameters that make the grid move like the targets; the first guess where the fit fails.
+
+    Args:
+        read: the clip.
+        segmentation: of it.
+        geometry: of the body.
+        motion: velocities that the fit explains.
+        config: what is asked of the fit.
+        work: told how far it is.
+
+    Raises:
+        InputRejected: a request that this kind of fluid has no answer to.
+    """
     from fluidlift.fit.optimize import DEFAULT_FREE
     from fluidlift.fit.ranges import UNITS
 
-    setting, kind = setting_of(story), story["geometry"].meta["kind"]
-    request, along = request_of(config.fit), setting.terrain.mainstream
+    kind, masks = geometry.kind, FluidMasks(segmentation.labels.labels)
+    request, along = request_of(config), geometry.setting.terrain.mainstream
     _check_request(request, kind)
-    targets = targets_of(story)
-    initial = request.applied(first_guess(story, targets), along=along)
+    filling = filling_rate(read, masks, geometry)
+    initial = request.applied(first_guess(geometry, motion.velocities, read.clip.interval, filling), along=along)
     # speeds that come from free fall were not measured: they say nothing about friction inside or at the walls
-    assumed = story["motion"].meta["free_fall_share"] > 0.3
+    assumed = motion.free_fall_share > 0.3
     usual = AT_THE_ENDS if assumed else tuple(name for name in DEFAULT_FREE if name not in AT_WALLS)
-    if filling_rate(story) is not None:  # the level in the vessel says how much enters
+    if filling is not None:  # the level in the vessel says how much enters
         usual = tuple(name for name in usual if name != "inflow_velocity")
     free = request.free_of(usual)
-    moved = _told_by_velocities(story, free)
-    found, judged = _attempt(story, config, targets, startable(initial, request.held), moved)
+    moved = _told_by_velocities(kind, free, lambda: outline_rises(masks, geometry.rest_frame))
+    start = startable(initial, request.held)
+    found, judged = _attempt(geometry, motion, read.clip.interval, config, start, moved, work)
     parameters, estimates = found.parameters, dict(found.estimates)
     if not judged.usable:
         # the buoyancy of smoke was guessed from its speed by the fit
@@ -75,16 +84,17 @@ def fit(story: Story, config: JobConfig) -> Result:
     known = {name: getattr(initial, name) for name in request.held}
     parameters = replace(parameters, **known)
     if "wall_damping" not in (*free, *known):
-        d = sticking(kind, story["motion"].meta["reports"])
+        d = sticking(kind, motion.reports)
         parameters = replace(parameters, wall_damping=d)
         if "wall_damping" in estimates:
             estimates["wall_damping"] = replace(estimates["wall_damping"], value=d, prior=d)
     estimates = {n: as_given(n, e, initial) if family(n) in known else e for n, e in estimates.items()}
-    parameters, estimates, lift = (
-        (parameters, estimates, {}) if moved == free else with_buoyancy(story, parameters, estimates, targets[0])
-    )
+    lift: dict[str, float] = {}
+    if moved != free:
+        velocity = motion.velocities[0]
+        parameters, estimates, lift = with_buoyancy(read, masks, geometry, parameters, estimates, velocity, work.step)
     rows = table(estimates, held=set(known), free=set(free), measured=set(AT_THE_ENDS))
-    size = size_row(story["geometry"].meta["scale"])
+    size = size_row(asdict(geometry.scale))
     if size is not None:
         rows, estimates = [*rows, size], estimates | {"size": size_estimate(size)}
     notes = list(found.notes)
@@ -92,21 +102,19 @@ def fit(story: Story, config: JobConfig) -> Result:
         notes.append(
             "viscosity, restitution and wall damping keep their priors: the steep part was too fast to be measured"
         )
-    return Result(
-        {"loss_history": np.asarray(found.loss_history, np.float64)},
-        {
-            "warnings": judged.warnings(),
-            "parameters": parameters.to_dict(),
-            "estimates": {r["name"]: asdict(labelled(estimates[r["name"]], r)) for r in rows},
-            "table": rows,
-            "initial": initial.to_dict(),
-            "converged": found.converged,
-            "status": judged.status,
-            "reason": judged.reason,
-            "rollouts": found.rollouts,
-            "notes": notes,
-            "extra": {k: float(v) for k, v in (found.extra | lift).items()},
-        },
+    return Fit(
+        parameters=parameters,
+        initial=initial,
+        estimates={r["name"]: labelled(estimates[r["name"]], r) for r in rows},
+        table=tuple(rows),
+        converged=bool(found.converged),
+        status=judged.status,
+        reason=judged.reason,
+        rollouts=int(found.rollouts),
+        notes=tuple(notes),
+        extra={k: float(v) for k, v in (found.extra | lift).items()},
+        loss_history=np.asarray(found.loss_history, np.float64),
+        warnings=tuple(judged.warnings()),
     )
 
 
@@ -124,38 +132,38 @@ def _check_request(request: FitRequest, kind: str) -> None:
         )  # fmt: skip
 
 
-def _told_by_velocities(story: Story, free: tuple[str, ...]) -> tuple[str, ...]:
+def _told_by_velocities(kind: str, free: tuple[str, ...], rises: Callable[[], bool]) -> tuple[str, ...]:
     """What is fitted to velocities: all but the lift of smoke whose outline rises, which says more of it than they."""
-    if story["geometry"].meta["kind"] != "plume" or set(free) <= {"gravity"} or not outline_rises(story):
+    if kind != "plume" or set(free) <= {"gravity"} or not rises():
         return free
     return tuple(name for name in free if name != "gravity")
 
 
 def _attempt(
-    story: Story, config: JobConfig, targets: list[FaceVelocity], initial: FluidParameters, free: tuple[str, ...]
-) -> tuple[FitResult, Verdict]:
+    geometry: Geometry, motion: Motion, interval: float, config: FitConfig, initial: FluidParameters,
+    free: tuple[str, ...], work: Work,
+) -> tuple[FitResult, Verdict]:  # fmt: skip
     """One fit, judged; equations without a solution are a failure like others."""
     from fluidlift.fit.optimize import fit_parameters
 
-    setting = setting_of(story)
-    if story["geometry"].meta["kind"] == "dam":
+    setting, kind = geometry.setting, geometry.kind
+    if kind == "dam":
         reason = "a body at rest tells nothing of its parameters: they are those of such a fluid, or as given"
         return FitResult(initial, {}, np.zeros(0), False, 0), Verdict("left", reason)
     try:
         with one_torch_thread():
             found = fit_parameters(
-                targets, setting.cell_types, setting.terrain, setting.terrain.grid, clip_of(story).interval, initial,
-                kind=story["geometry"].meta["kind"], mainstream=setting.terrain.mainstream, method=config.fit.method,
-                free=free, prior_sigmas=prior_widths(story), restarts=config.fit.restarts + 1,
-                max_work=config.fit.max_work, max_seconds=config.fit.max_seconds, device=config.fit.device,
-                progress=story.step,
+                motion.velocities, setting.cell_types, setting.terrain, setting.terrain.grid, interval, initial,
+                kind=kind, mainstream=setting.terrain.mainstream, method=config.method, free=free,
+                prior_sigmas=prior_widths(kind), restarts=config.restarts + 1, max_work=config.max_work,
+                max_seconds=config.max_seconds, device=config.device, progress=work.step,
             )  # fmt: skip
     except (np.linalg.LinAlgError, FloatingPointError) as error:
         return FitResult(initial, {}, np.zeros(0), False, 0), Verdict("failed", f"no solution ({error})")
     return found, verdict(found)
 
 
-def prior_widths(story: Story) -> dict[str, float]:
+def prior_widths(kind: str) -> dict[str, float]:
     """Relative widths of what is known before the fit looks: the time step to 1 %, gravity to 2 % of 9.81 m/s^2.
 
     The time between two frames is on record; a fit that may stretch it makes up for errors of the velocities with it.
@@ -164,26 +172,25 @@ def prior_widths(story: Story) -> dict[str, float]:
     plume's buoyancy is free.
     """
     known = {"time_step": 0.01}
-    return known if story["geometry"].meta["kind"] == "plume" else known | {"gravity": 0.02}
+    return known if kind == "plume" else known | {"gravity": 0.02}
 
 
-def filling_rate(story: Story) -> float | None:
+def filling_rate(read: Read, masks: FluidMasks, geometry: Geometry) -> float | None:
     """Volume (m^3/s) that a vessel gains over the clip, from its rounded silhouette; None where nothing fills.
 
     What a jet brings is seen better in the vessel than in the jet, whose speed is a blur and whose mask is too wide.
     """
     from fluidlift.shape.surface import rounded_volume
 
-    g, clip = story["geometry"], clip_of(story)
-    if g.meta["kind"] != "pour" or g.meta["pool_level"] is None:
+    if geometry.kind != "pour" or geometry.setting.pool_level is None:
         return None
-    camera, fluid, start = camera_of(story), masks_of(story), g.meta["rest_frame"]
-    distance = float(np.median(g.arrays["depth"][g.arrays["depth"] > 0]))
+    clip, depth = read.clip, geometry.depth
+    distance = float(np.median(depth[depth > 0]))
     times, volumes = [], []
-    for t in np.unique(np.linspace(start, len(clip) - 1, 8).astype(int)):
-        if not fluid[t].any():
+    for t in np.unique(np.linspace(geometry.rest_frame, len(clip) - 1, 8).astype(int)):
+        if not masks[t].any():
             continue
-        volumes.append(rounded_volume(camera, fluid[t], distance))
+        volumes.append(rounded_volume(geometry.camera, masks[t], distance))
         times.append(float(clip.times[t]))
     if len(times) < 4:
         return None
@@ -191,9 +198,18 @@ def filling_rate(story: Story) -> float | None:
     return rate if rate > 0 else None
 
 
-def first_guess(story: Story, targets: list[FaceVelocity]) -> FluidParameters:
-    """Where the fit starts: velocities measured at the ends, the rest from what such a fluid usually has."""
-    setting, kind = setting_of(story), story["geometry"].meta["kind"]
+def first_guess(
+    geometry: Geometry, targets: list[FaceVelocity], interval: float, filling: float | None
+) -> FluidParameters:
+    """Where the fit starts: velocities measured at the ends, the rest from what such a fluid usually has.
+
+    Args:
+        geometry: of the body.
+        targets: m/s, of consecutive frames.
+        interval: s between frames.
+        filling: m^3/s that a vessel gains; None where nothing fills.
+    """
+    setting, kind = geometry.setting, geometry.kind
     cells, direction = setting.cell_types, setting.terrain.mainstream
     mean = np.mean([t.at_centers() for t in targets], axis=0)
     inlet = cells == CellType.INFLOW
@@ -207,12 +223,10 @@ def first_guess(story: Story, targets: list[FaceVelocity]) -> FluidParameters:
         outlet = ndimage.binary_dilation(cells == CellType.OUTFLOW, iterations=2) & (cells == CellType.FLUID)
     out = float((mean[outlet] @ direction).mean()) if outlet.any() else float((mean[wet] @ direction).mean())
     speed = float(np.linalg.norm(mean[wet], axis=1).max()) if wet.any() else 0.0
-    filling = filling_rate(story)
     if filling is not None and inlet.any():
         # the mouth of the inlet is its cross-section across the stream, one layer of its cells
         layer = setting.terrain.grid.spacing**2 * float(inlet.any(axis=int(np.argmax(np.abs(direction)))).sum())
         bulk = direction * min(filling / layer, float(np.linalg.norm(bulk)))
-    interval = clip_of(story).interval
     courant = setting.terrain.grid.spacing / max(speed, 1e-6)
     return FluidParameters(
         kinematic_viscosity=VISCOSITY_PRIOR[kind],
@@ -235,21 +249,7 @@ def sticking(kind: str, reports: list[dict[str, Any]]) -> float:
 
     Args:
         kind: of the fluid.
-        reports: of the motion's targets (`lifting.plain_report`).
+        reports: of the motion's targets (`types.stages.Motion.reports`).
     """
     viscous = [r.get("viscous", 0.0) for r in reports]
     return WALL_DAMPING_PRIOR[kind] ** (1.0 - (float(np.median(viscous)) if viscous else 0.0))
-
-
-def parameters_of(story: Story) -> FluidParameters:
-    """The fitted parameters."""
-    return FluidParameters().updated(story["fit"].meta["parameters"])
-
-
-def estimates_of(story: Story) -> dict[str, Estimate]:
-    """The fitted parameters with their uncertainties."""
-    # JSON has no infinity
-    return {
-        name: Estimate(**(e | {"sigma": float("inf") if e["sigma"] is None else e["sigma"]}))
-        for name, e in story["fit"].meta["estimates"].items()
-    }

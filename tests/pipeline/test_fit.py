@@ -7,7 +7,7 @@ import pytest
 
 from fluidlift.config import build_config
 from fluidlift.errors import InputRejected
-from fluidlift.pipeline import moving
+from fluidlift.pipeline.stages import fit as stage
 from fluidlift.types import CellType, FaceVelocity, Grid
 
 GRID = Grid((12, 6, 5), 0.05, (0.0, 0.0, 0.0))
@@ -31,17 +31,19 @@ def flow(u, v=0.0, w=0.0):
     return FaceVelocity(u, np.full(shapes[1], v, np.float32), np.full(shapes[2], w, np.float32))
 
 
+def body(kind, cells=None):
+    """What counts of a geometry with these cells."""
+    terrain = SimpleNamespace(grid=GRID, mainstream=X)
+    setting = SimpleNamespace(cell_types=channel() if cells is None else cells, terrain=terrain, pool_level=None)
+    return SimpleNamespace(kind=kind, setting=setting)
+
+
 @pytest.fixture
-def guess(monkeypatch):
-    """`first_guess` of a story with these cells."""
+def guess():
+    """`first_guess` of a body with these cells."""
 
     def find(targets, *, kind="stream", cells=None, filling=None):
-        terrain = SimpleNamespace(grid=GRID, mainstream=X)
-        setting = SimpleNamespace(cell_types=channel() if cells is None else cells, terrain=terrain)
-        monkeypatch.setattr(moving, "setting_of", lambda story: setting)
-        monkeypatch.setattr(moving, "clip_of", lambda story: SimpleNamespace(interval=INTERVAL))
-        monkeypatch.setattr(moving, "filling_rate", lambda story: filling)
-        return moving.first_guess({"geometry": SimpleNamespace(meta={"kind": kind})}, targets)
+        return stage.first_guess(body(kind, cells), targets, INTERVAL, filling)
 
     return find
 
@@ -93,32 +95,32 @@ def test_what_fills_the_vessel_is_what_the_inlet_brings(guess):
 @pytest.mark.parametrize("kind", ["stream", "fall", "pour", "plume"])
 def test_what_the_velocities_cannot_say_is_what_such_a_fluid_usually_has(guess, kind):
     found = guess([flow(0.3)], kind=kind)
-    assert found.kinematic_viscosity == moving.VISCOSITY_PRIOR[kind]
-    assert found.wall_damping == moving.WALL_DAMPING_PRIOR[kind]
+    assert found.kinematic_viscosity == stage.VISCOSITY_PRIOR[kind]
+    assert found.wall_damping == stage.WALL_DAMPING_PRIOR[kind]
     assert found.gravity == (0.0, 0.0, -9.81)
 
 
 @pytest.mark.parametrize(("kind", "width"), [("stream", 0.02), ("fall", 0.02), ("pour", 0.02)])
 def test_gravity_is_nearly_known_for_what_has_weight(kind, width):
-    assert moving.prior_widths({"geometry": SimpleNamespace(meta={"kind": kind})})["gravity"] == width
+    assert stage.prior_widths(kind)["gravity"] == width
 
 
 def test_the_buoyancy_of_smoke_is_free():
-    assert moving.prior_widths({"geometry": SimpleNamespace(meta={"kind": "plume"})}) == {"time_step": 0.01}
+    assert stage.prior_widths("plume") == {"time_step": 0.01}
 
 
-def test_the_gravity_of_smoke_cannot_be_known_since_it_stands_for_buoyancy(monkeypatch):
-    monkeypatch.setattr(moving, "setting_of", lambda story: SimpleNamespace(terrain=SimpleNamespace(mainstream=X)))
-    story = {"geometry": SimpleNamespace(meta={"kind": "plume"})}
+def test_the_gravity_of_smoke_cannot_be_known_since_it_stands_for_buoyancy():
+    segmentation = SimpleNamespace(labels=SimpleNamespace(labels=np.zeros((2, 3, 4), np.uint8)))
+    config = build_config(overrides=["fit.hold=gravity=3"]).fit
     with pytest.raises(InputRejected, match="buoyancy"):
-        moving.fit(story, build_config(overrides=["fit.hold=gravity=3"]))
+        stage.fit(None, segmentation, body("plume"), None, config, work=None)
 
 
 def test_water_slips_over_its_bed_and_a_viscous_film_sticks_to_it():
     def stick(*viscous):
-        return moving.sticking("stream", [{"viscous": v} for v in viscous])
+        return stage.sticking("stream", [{"viscous": v} for v in viscous])
 
-    water = moving.WALL_DAMPING_PRIOR["stream"]
+    water = stage.WALL_DAMPING_PRIOR["stream"]
     assert stick() == water
     assert stick(0.0, 0.0, 1.0) == water  # one frame of three is an outlier
     assert stick(1.0, 1.0, 0.9) == 1.0

@@ -2,50 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
 
-from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected
 from fluidlift.pipeline import composite, dam, depths, given_body, ground
-from fluidlift.pipeline.known_camera import known_camera, level_of
-from fluidlift.pipeline.reading import Inputs, clip_of
-from fluidlift.pipeline.seeing import masks_of, mean_motion
-from fluidlift.pipeline.story import Result, Story
-from fluidlift.shape import (
-    generate,
-    ground_mesh,
-    ground_texture,
-    place,
-    puddle,
-    standing,
-    surface,
-    terrain,
-    texture_gradient,
-)
+from fluidlift.pipeline.fluid_masks import FluidMasks
+from fluidlift.pipeline.inputs import GivenFile
+from fluidlift.pipeline.known_camera import known_camera, lens_is_known, level_of
+from fluidlift.pipeline.rest_frames import FEWEST_PIXELS, rest_frame, united_range
+from fluidlift.pipeline.settings import GeometrySettings, GivenView
+from fluidlift.pipeline.steady_flow import mean_motion
+from fluidlift.pipeline.work import Work
+from fluidlift.shape import generate, ground_texture, place, puddle, standing, surface, texture_gradient
 from fluidlift.shape import kind as kinds
 from fluidlift.shape.framing import framing_warnings
 from fluidlift.shape.given_depth import DepthPictures
-from fluidlift.types import (
-    CellType,
-    Gaussians,
-    Grid,
-    PinholeCamera,
-    Similarity3,
-    Terrain,
-    TriangleMesh,
-)
-
-FEWEST_PIXELS = 16
-"""of fluid at the first instant: fewer have no shape"""
-
-
-def rest_frame(area: np.ndarray) -> int:
-    """First frame in which a good part of the fluid is there (smoke and pours begin with nothing), of areas [T]."""
-    enough = area >= 0.3 * np.percentile(area, 90)
-    return int(np.argmax(enough)) if enough.any() else int(np.argmax(area))
+from fluidlift.types import CellType, KindEvidence, MetricScale, PinholeCamera, UpEvidence, VideoClip
+from fluidlift.types.stages import Flow, Geometry, Read, Segmentation
 
 
 @dataclass(frozen=True)
@@ -62,10 +38,10 @@ class _Sight:
     known: PinholeCamera
     """its pose counts where `pose_given`"""
     pose_given: bool
-    evidence: kinds.KindEvidence
+    evidence: KindEvidence
     kind: kinds.Kind
     parts: composite.Parts
-    up: kinds.UpEvidence
+    up: UpEvidence
     heading: float | None
     tilt_known: bool
     height: float | None
@@ -81,13 +57,28 @@ class _Sight:
         return self.trust * ~self.parts.falling
 
 
-def geometry(story: Story, inputs: Inputs, config: JobConfig) -> Result:
-    """Kind, camera, front surface, scale, terrain, cells."""
-    clip, fluid, c = clip_of(story), masks_of(story), config.shape
-    seen, pictures = _seen(story, inputs, config)
+def geometry(
+    read: Read, flow: Flow, segmentation: Segmentation, given: GivenView, config: GeometrySettings, *, work: Work
+) -> Geometry:
+    """Kind, camera, front surface, scale, terrain, cells.
+
+    Args:
+        read: the clip.
+        flow: of it.
+        segmentation: of it.
+        given: what a person has of camera, body and depth.
+        config: what a person says of the fluid, and the cells.
+        work: keeps a learned model's depth.
+
+    Raises:
+        InputRejected: a fluid without a shape, or something given that does not fit.
+    """
+    clip, c = read.clip, config
+    fluid = FluidMasks(segmentation.labels.labels)
+    seen, pictures = _seen(read, flow, fluid, given, config, work)
     kind, parts, mask = seen.kind, seen.parts, seen.mask
     warnings = framing_warnings(mask, fluid.areas())
-    up, canonical, front, known_scale, seen_depth = _surface(seen, pictures, fluid, inputs, clip.interval)
+    up, canonical, front, known_scale, seen_depth = _surface(seen, pictures, fluid, given, clip.interval)
     front, falling = composite.standing(front, parts, canonical, mask)
     visible = mask & (front.depth > 0)
     if 0 < visible.sum() < FEWEST_PIXELS:
@@ -140,51 +131,59 @@ def geometry(story: Story, inputs: Inputs, config: JobConfig) -> Result:
         view = ground_texture.View(picture, camera, labels, np.asarray(plate.seen))
         setting = ground.textured(setting, view)
         picture = ground_texture.over_bed(picture, view.seen, setting.terrain.mesh, camera)
-    arrays, meta = ground.packed(setting)
-    if seen.stood is not None:
-        arrays["rocks"] = seen.stood.solid
-    arrays |= {
-        "mask": mask, "depth": depth, "half_thickness": half, "mean_flow": seen.motion, "mean_confidence": seen.trust,
-        "sighted_depth": (front.sighted * scale.value).astype(np.float32), "plate": picture,
-    }  # fmt: skip
-    meta |= {
-        "warnings": warnings, "kind": kind, "kind_evidence": asdict(seen.evidence),
-        "kind_source": "evidence" if c.kind == "auto" else "user", "up": asdict(up),
-        "scale": asdict(scale) | {"sentence": sentence}, "camera": camera.to_dict(),
-        "world_from_canonical": {
-            "scale": to_world.scale, "rotation": to_world.rotation.tolist(),
-            "translation": to_world.translation.tolist(),
-        },
-        "known_scale": known_scale, "depth_source": None if seen_depth is None else seen_depth.meta,
-        "jets": falling.plain(to_world), "slope": None if front.slope is None else asdict(front.slope),
-        "rest_frame": seen.start, "united_frames": seen.united,
-    }  # fmt: skip
-    return Result(arrays, meta)
+    return Geometry(
+        kind=kind,
+        kind_source="evidence" if c.kind == "auto" else "user",
+        kind_evidence=seen.evidence,
+        up=up,
+        scale=scale,
+        scale_sentence=sentence,
+        camera=camera,
+        world_from_canonical=to_world,
+        setting=ground.finished(setting, picture, camera),
+        mask=mask,
+        depth=depth,
+        half_thickness=half,
+        sighted_depth=(front.sighted * scale.value).astype(np.float32),
+        mean_flow=seen.motion,
+        mean_confidence=seen.trust,
+        plate=picture,
+        rest_frame=seen.start,
+        united_frames=seen.united,
+        rocks=None if seen.stood is None else seen.stood.solid,
+        known_scale=known_scale,
+        depth_source=None if seen_depth is None else seen_depth.meta,
+        jets=tuple(falling.plain(to_world)),
+        slope=front.slope,
+        warnings=tuple(warnings),
+    )
 
 
-def _seen(story: Story, inputs: Inputs, config: JobConfig) -> tuple[_Sight, DepthPictures | None]:
+def _seen(
+    read: Read, flow: Flow, fluid: FluidMasks, given: GivenView, config: GeometrySettings, work: Work
+) -> tuple[_Sight, DepthPictures | None]:
     """Mask, motion, kind and camera; and depth pictures where there are some."""
-    clip, fluid, c = clip_of(story), masks_of(story), config.shape
-    start, united = united_range(story, config)
+    clip = read.clip
+    start, united = united_range(clip, fluid, config.longest_union)
     mask = generate.united_mask(fluid[start : start + united])
     if not mask.any():
         mask = fluid[start]
-    motion, trust = mean_motion(story, fluid.any_frame())
-    known, pose_given = known_camera(inputs, config, clip.size)
-    pictures, known = _depth_pictures(story, inputs, config, known, start)
+    motion, trust = mean_motion(clip, flow.flow, fluid.any_frame())
+    known, pose_given = known_camera(given, config.fov, clip.size)
+    pictures, known = _depth_pictures(read, given, config.fov, known, start, work)
     evidence, kind, parts, up, heading = _kind_and_up(
-        story, inputs, config, known, pose_given, mask, motion, trust, shaped=pictures is not None
+        _Looked(clip, fluid, mask, motion, trust), given, config, known, pose_given, shaped=pictures is not None
     )
     height, unsure, stood = None, "", None
     if pose_given and kind in ("stream", "dam"):
-        level, unsure = level_of(kind, inputs)
+        level, unsure = level_of(kind, given.camera)
         height = float(known.position[2] - level)
     if kind == "dam":
         start, united = dam.let_go(fluid), 1
         mask = fluid[start]
         parts = composite.Parts((), mask)
         stood = dam.stood(fluid, start, kinds.level_camera(known, up))
-    tilt_known = pose_given or c.pitch is not None
+    tilt_known = pose_given or config.pitch is not None
     seen = _Sight(
         start, united, mask, motion, trust, known, pose_given, evidence, kind, parts, up, heading, tilt_known, height,
         unsure, stood,
@@ -192,11 +191,11 @@ def _seen(story: Story, inputs: Inputs, config: JobConfig) -> tuple[_Sight, Dept
     return seen, pictures
 
 
-def _surface(seen: _Sight, pictures: DepthPictures | None, fluid, inputs: Inputs, interval: float):
+def _surface(seen: _Sight, pictures: DepthPictures | None, fluid: FluidMasks, given: GivenView, interval: float):
     """Up, the level camera, the surface of what lies, metres per unit where they are known, and the depth behind it."""
     lying, up = seen.parts.lying, seen.up
     canonical = kinds.level_camera(seen.known, up)
-    front, known_scale = _front(seen, inputs, canonical, interval)
+    front, known_scale = _front(seen, given.bodies, canonical, interval)
     if seen.parts.puddle:
         front = surface.level_surface(canonical, lying)
     if pictures is None:
@@ -208,7 +207,7 @@ def _surface(seen: _Sight, pictures: DepthPictures | None, fluid, inputs: Inputs
     return found.up, kinds.level_camera(seen.known, found.up), found.front, found.known_scale, found
 
 
-def _told(scale: place.MetricScale, seen: _Sight) -> tuple[place.MetricScale, str]:
+def _told(scale: MetricScale, seen: _Sight) -> tuple[MetricScale, str]:
     """The scale with its warning, and its sentence, where the level of the water or the ground was assumed."""
     if seen.unsure and scale.source == "camera":
         what = "water" if seen.stood is None else "ground"
@@ -216,21 +215,35 @@ def _told(scale: place.MetricScale, seen: _Sight) -> tuple[place.MetricScale, st
     return scale, scale.sentence
 
 
-def _kind_and_up(story, inputs, config, known, pose_given, mask, motion, trust, *, shaped):
+@dataclass(frozen=True)
+class _Looked:
+    """The pictures, and what moves in them."""
+
+    clip: VideoClip
+    fluid: FluidMasks
+    mask: np.ndarray
+    motion: np.ndarray
+    trust: np.ndarray
+
+
+def _kind_and_up(
+    looked: _Looked, given: GivenView, config: GeometrySettings, known: PinholeCamera, pose_given: bool, *, shaped: bool
+):
     """Evidence for the kind, the kind, the tilt of the camera, and its heading where it was surveyed."""
-    clip, fluid, c = clip_of(story), masks_of(story), config.shape
+    clip, fluid, mask, motion, trust = looked.clip, looked.fluid, looked.mask, looked.motion, looked.trust
+    c, bodies = config, None if given.bodies is None else given.bodies.path
     surveyed, heading = place.pose_up(known)
     pitch = float(surveyed.pitch) if pose_given else c.pitch
     pick = np.unique(np.linspace(0, len(clip) - 1, 8).astype(int))
     evidence = kinds.estimate_kind(clip.frames[pick], fluid[pick], motion, trust, pitch=pitch)
     kind = evidence.kind if c.kind == "auto" else c.kind
-    if kind == "dam" and (shaped or inputs.geometry is not None):
+    if kind == "dam" and (shaped or bodies is not None):
         if c.kind == "dam":
             raise InputRejected(
                 "--kind dam together with a given depth or body", "one source of the fluid's shape", "leave one out"
             )
         kind = max((k for k in evidence.scores if k != "dam"), key=lambda k: evidence.scores[k])
-    if inputs.geometry is None:
+    if bodies is None:
         kind, parts = composite.split(
             kind, known, surveyed if pose_given else None, mask, motion, trust, free=c.kind == "auto"
         )
@@ -242,9 +255,9 @@ def _kind_and_up(story, inputs, config, known, pose_given, mask, motion, trust, 
         parts = composite.Parts((), mask)
     if pose_given:
         return evidence, kind, parts, surveyed, heading
-    generated = given_body.note_of(inputs.geometry) is not None
-    if inputs.geometry is not None and not (generated and (c.pitch is not None or c.roll is not None)):
-        upright = given_body.up_of(inputs.geometry, surveyed, kind, rest_frame(fluid.areas()), clip.size)
+    generated = given_body.note_of(bodies) is not None
+    if bodies is not None and not (generated and (c.pitch is not None or c.roll is not None)):
+        upright = given_body.up_of(bodies, surveyed, kind, rest_frame(fluid.areas()), clip.size)
         if upright is not None:
             return evidence, kind, parts, upright, None
     texture = None
@@ -261,34 +274,24 @@ def _kind_and_up(story, inputs, config, known, pose_given, mask, motion, trust, 
     return evidence, kind, parts, up, None
 
 
-def united_range(story: Story, config: JobConfig) -> tuple[int, int]:
-    """First frame whose body is wanted, and how many in all become one."""
-    from fluidlift.shape.unite import window_length
-
-    frames, fluid, longest = clip_of(story).frames, masks_of(story), config.shape.longest_union
-    start = rest_frame(fluid.areas())
-    stop = min(len(frames), start + 2 * longest + 1)
-    return start, int(min(window_length(frames[start:stop], fluid[start], longest=longest), len(frames) - start))
-
-
-def _depth_pictures(story, inputs, config, known, start) -> tuple[DepthPictures | None, PinholeCamera]:
+def _depth_pictures(
+    read: Read, given: GivenView, fov: float | None, known: PinholeCamera, start: int, work: Work
+) -> tuple[DepthPictures | None, PinholeCamera]:
     """Depth from a file or a model, and the camera with the model's field of view where nothing else says it."""
-    from fluidlift.io.lens import lens_field_of_view
-
-    told = inputs.camera is not None or config.shape.fov or lens_field_of_view(inputs.clip)
-    pictures = depths.pictures_of(story, inputs, config, known if told else None, start)
+    told = lens_is_known(given, fov)
+    pictures = depths.pictures_of(read, given, known if told else None, start, work)
     if pictures is not None and not told and pictures.field_of_view is not None:
         known = PinholeCamera.from_fov(pictures.field_of_view, known.size)
     return pictures, known
 
 
-def _front(seen: _Sight, inputs: Inputs, canonical: PinholeCamera, interval: float):
+def _front(seen: _Sight, bodies: GivenFile | None, canonical: PinholeCamera, interval: float):
     """The front surface in canonical units; metres per unit where the depth came in metres, else None."""
     lying, motion, trust = seen.parts.lying, seen.motion, seen.lying_trust
     if seen.stood is not None:
         return standing.standing_front(canonical, seen.stood), None
-    if inputs.geometry is not None:
-        return given_body.given_front(inputs.geometry, canonical, lying, seen.kind, seen.start)
+    if bodies is not None:
+        return given_body.given_front(bodies.path, canonical, lying, seen.kind, seen.start)
     if seen.kind == "stream":
         front = surface.stream_surface(
             canonical, lying, motion, trust, interval, camera_height=seen.height, tilt_known=seen.tilt_known,
@@ -337,57 +340,3 @@ def _seen_speed(visible, velocities, trust) -> np.ndarray:
     speed = np.full(visible.shape, np.nan)
     speed[visible] = np.where(trust[visible] > 0.3, np.linalg.norm(velocities, axis=1), np.nan)
     return speed
-
-
-# what later stages see ------------------------------------------------------------------------------------------
-
-
-def camera_of(story: Story) -> PinholeCamera:
-    """The video's camera in the world."""
-    return PinholeCamera.from_dict(story["geometry"].meta["camera"])
-
-
-def grid_of(story: Story) -> Grid:
-    """The simulation grid."""
-    g = story["geometry"].meta["grid"]
-    return Grid(tuple(g["shape"]), g["spacing"], tuple(g["origin"]))
-
-
-def placement_of(story: Story) -> Similarity3:
-    """world_from_canonical."""
-    t = story["geometry"].meta["world_from_canonical"]
-    return Similarity3(t["scale"], np.array(t["rotation"]), np.array(t["translation"]))
-
-
-def terrain_of(story: Story) -> Terrain:
-    """The solid, textured from the background plate."""
-    a = story["geometry"].arrays
-    mesh = TriangleMesh(
-        a["mesh_vertices"], a["mesh_faces"], a.get("mesh_colours"), a.get("mesh_uv"), a.get("mesh_texture")
-    )
-    if len(mesh.faces) and mesh.colors is None:
-        mesh = replace(mesh, colors=ground_mesh.ground_colours(mesh, a["plate"], camera_of(story)))
-    return Terrain(grid_of(story), a["signed_distance"], a["mainstream"], mesh)
-
-
-def setting_of(story: Story) -> terrain.Setting:
-    """Terrain and cells."""
-    a, meta = story["geometry"].arrays, story["geometry"].meta
-    return terrain.Setting(
-        terrain_of(story), a["cell_types"], a.get("surface_height"), a["bed_height"], meta["pool_level"]
-    )
-
-
-def gaussians_to_arrays(g: Gaussians) -> dict[str, np.ndarray]:
-    """Fields by name."""
-    return {k: getattr(g, k) for k in ("means", "quats", "scales", "opacities", "sh")}
-
-
-def gaussians_from_arrays(arrays: dict[str, np.ndarray]) -> Gaussians:
-    """The reverse of `gaussians_to_arrays`."""
-    return Gaussians(*(arrays[k] for k in ("means", "quats", "scales", "opacities", "sh")))
-
-
-def rest_of(story: Story) -> Gaussians:
-    """The rest body."""
-    return gaussians_from_arrays(story["refine"].arrays)

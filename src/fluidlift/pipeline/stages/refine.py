@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fluidlift.backends.gsplat_rasterizer import best_rasterizer
-from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected
-from fluidlift.pipeline.body import camera_of, gaussians_to_arrays, placement_of, setting_of
 from fluidlift.pipeline.given_body import placed_bodies
-from fluidlift.pipeline.reading import Inputs, clip_of
-from fluidlift.pipeline.seeing import labels_of
-from fluidlift.pipeline.story import Result, Story
+from fluidlift.pipeline.inputs import GivenFile
+from fluidlift.pipeline.settings import RefineSettings
+from fluidlift.pipeline.work import Work
 from fluidlift.seams import Rasterizer
-from fluidlift.shape import generate, terrain
-from fluidlift.types import CellType, Gaussians, Label, PinholeCamera, VideoClip, concatenate, sh_from_rgb
+from fluidlift.shape import generate
+from fluidlift.types import (
+    CellType,
+    Gaussians,
+    Label,
+    PinholeCamera,
+    Setting,
+    VideoClip,
+    concatenate,
+    sh_from_rgb,
+)
+from fluidlift.types.stages import Flow, Geometry, Read, Refined, Segmentation
 
 KEPT = 0.6
 """part of its size that a splat of the inside keeps at least: at 0.3 the first frame is a little cleaner, but once the
@@ -31,26 +38,65 @@ LATER = 5
 """how much fewer steps the frames after the first take, as they start from the last"""
 
 
-def refine(story: Story, inputs: Inputs, config: JobConfig) -> Result:
-    """Generate per frame, refine on the first, prune, unite, fill."""
+@dataclass(frozen=True)
+class _Seen:
+    """What the bodies are made of."""
+
+    clip: VideoClip
+    fluid: np.ndarray
+    """bool [T,H,W]"""
+    flow: np.ndarray
+    """px, [T-1,H,W,2]"""
+    geometry: Geometry
+    config: RefineSettings
+    work: Work
+
+
+@dataclass(frozen=True)
+class _Refinement:
+    """How the first body came out of the refinement."""
+
+    psnr_before: float | None = None
+    psnr_after: float | None = None
+    kept: bool = True
+    loss_history: tuple[float, ...] = ()
+
+
+def refine(
+    read: Read, flow: Flow, segmentation: Segmentation, geometry: Geometry, bodies: GivenFile | None,
+    config: RefineSettings, *, work: Work,
+) -> Refined:  # fmt: skip
+    """Generate per frame, refine on the first, prune, unite, fill.
+
+    Args:
+        read: the clip.
+        flow: of it.
+        segmentation: of it.
+        geometry: of the body.
+        bodies: folder of Gaussians, the user's or a generator's; None: the embedded generator makes them.
+        config: how many, how fine.
+        work: told how far the refinement is.
+
+    Raises:
+        InputRejected: too little fluid for a body.
+    """
     from fluidlift.shape.fill import fill
     from fluidlift.shape.off_picture import continued
     from fluidlift.shape.prune import prune
     from fluidlift.shape.unite import unite
 
-    clip, labels, c = clip_of(story), labels_of(story), config.shape
-    g, camera, setting = story["geometry"], camera_of(story), setting_of(story)
-    start, united = g.meta["rest_frame"], g.meta["united_frames"]
+    clip, labels, c, camera, setting = read.clip, segmentation.labels, config, geometry.camera, geometry.setting
+    start, united, depth = geometry.rest_frame, geometry.united_frames, geometry.depth
     h = setting.terrain.grid.spacing
-    depth = g.arrays["depth"]
     fluid = labels.fluid
-    bodies, fitted = _bodies(story, inputs, config, fluid, start, united)
+    seen = _Seen(clip, fluid, flow.flow.displacement, geometry, config, work)
+    made, fitted, later = _bodies(seen, bodies)
     colours = generate.fluid_colour_frame(clip.frames[start], fluid[start])
     hull = generate.hull_gaussians(colours, setting, camera, seed=config.seed)
     step = max(0.35 * h, 0.6 * c.stride * _pixel(depth, camera))
     # what another frame has nearer to the camera would hide the picture of the first
-    others = [generate.beneath_front(b, depth, fluid[start], camera, smallest=1.0, drop_above=True) for b in bodies[1:]]
-    front = unite([b for b in (bodies[0], *others) if len(b)], spacing=step, whole_first=True)
+    others = [generate.beneath_front(b, depth, fluid[start], camera, smallest=1.0, drop_above=True) for b in made[1:]]
+    front = unite([b for b in (made[0], *others) if len(b)], spacing=step, whole_first=True)
     # what is seen is kept before what is hidden
     front = _bounded(front, int(0.75 * c.max_gaussians), config.seed)
     hull = _bounded(hull, c.max_gaussians - len(front), config.seed)
@@ -63,13 +109,13 @@ def refine(story: Story, inputs: Inputs, config: JobConfig) -> Result:
         shell, spacing=h / 2, rays=c.rays, rng=np.random.default_rng(config.seed),
         max_added=max(c.max_gaussians - len(shell), least), closed_below=setting.terrain,
     )  # fmt: skip
-    mask, hull = g.arrays["mask"], shell.select(slice(len(shown), None))
+    mask, hull = geometry.mask, shell.select(slice(len(shown), None))
     # what the picture contradicts goes: cells reach a little before the visible surface and beyond the silhouette
     allowed = (labels.labels[start : start + united] != Label.BACKGROUND).any(axis=0) | mask
     inside = [hull, _outside_solid(added, setting)]
     inside = [generate.beneath_front(part, depth, mask, camera, smallest=KEPT, drop_above=True) for part in inside]
     hull, added = (generate.within_silhouette(part, allowed, camera, smallest=KEPT) for part in inside)
-    if g.meta["kind"] == "dam":  # its sides tell nothing of the inside that is seen once it spreads
+    if geometry.kind == "dam":  # its sides tell nothing of the inside that is seen once it spreads
         colour = _later_colour(clip, fluid, start)
         hull, added = (replace(part, sh=sh_from_rgb(np.tile(colour, (len(part), 1)))) for part in (hull, added))
     body = concatenate([shown, hull, added])
@@ -78,16 +124,10 @@ def refine(story: Story, inputs: Inputs, config: JobConfig) -> Result:
             f"the body of the fluid has only {len(body)} Gaussians", "more fluid in the picture",
             "check the mask in the report, or raise --max-size",
         )  # fmt: skip
-    meta = {
-        "warnings": list(fitted.pop("warnings")),
-        "front": len(front),
-        "hull": len(hull),
-        "pruned": len(front) - len(shown),
-        "filled": len(added),
-        "total": len(body),
-        "prune_report": str(pruned),
-    } | fitted
-    return Result(gaussians_to_arrays(body), meta)
+    return Refined(
+        body, len(front), len(hull), len(added), len(front) - len(shown), str(pruned), fitted.psnr_before,
+        fitted.psnr_after, fitted.kept, fitted.loss_history, later,
+    )  # fmt: skip
 
 
 def _later_colour(clip: VideoClip, fluid, start: int) -> np.ndarray:
@@ -97,65 +137,67 @@ def _later_colour(clip: VideoClip, fluid, start: int) -> np.ndarray:
     return (np.median(seen, axis=0) / 255.0).astype(np.float32)
 
 
-def _bodies(story, inputs, config, fluid, start, united) -> tuple[list[Gaussians], dict[str, Any]]:
+def _bodies(
+    seen: _Seen, given: GivenFile | None
+) -> tuple[list[Gaussians], _Refinement, tuple[tuple[float, float], ...]]:
     """One body per united frame, each refined against its picture; those after the first start from the last."""
     from fluidlift.shape.prune import prune
 
-    clip, camera, c = clip_of(story), camera_of(story), config.shape
-    depth = story["geometry"].arrays["depth"]
-    frames = list(range(start, start + united))
-    if inputs.geometry is not None:
-        given = placed_bodies(story, inputs.geometry, frames, camera, placement_of(story))
+    g, clip, fluid = seen.geometry, seen.clip, seen.fluid
+    frames = list(range(g.rest_frame, g.rest_frame + g.united_frames))
+    if given is not None:
+        placed = placed_bodies(g, given.path, frames)
         # strays in front of the fluid would count as its shape, which the refinement must not change
-        bodies = [prune(b, min_opacity=0.05, max_stretch=12.0)[0] for b in given]
+        bodies = [prune(b, min_opacity=0.05, max_stretch=12.0)[0] for b in placed]
     else:
-        bodies = [generate.front_gaussians(clip.frames[t], fluid[t], depth, camera, stride=c.stride) for t in frames]
-    draws = best_rasterizer(c.rasterizer, story.warn)
-    first, fitted = _refined(story, config, bodies[0], fluid[start], draws)
-    later, fitted["psnr_later"] = _followed(story, config, first, bodies[1:], fluid, frames[1:], draws)
-    return [first, *later], fitted
+        stride = seen.config.stride
+        bodies = [generate.front_gaussians(clip.frames[t], fluid[t], g.depth, g.camera, stride=stride) for t in frames]
+    draws = best_rasterizer(seen.config.rasterizer, seen.work.warn)
+    first, fitted = _refined(seen, bodies[0], draws)
+    later, likeness = _followed(seen, first, bodies[1:], frames[1:], draws)
+    return [first, *later], fitted, likeness
 
 
-def _followed(story, config, last: Gaussians, bodies: list[Gaussians], fluid, frames, draws: Rasterizer):
+def _followed(
+    seen: _Seen, last: Gaussians, bodies: list[Gaussians], frames: list[int], draws: Rasterizer
+) -> tuple[list[Gaussians], tuple[tuple[float, float], ...]]:
     """Bodies of the frames after the first, each from the one before; and their likeness before and after, dB."""
     from fluidlift.shape.follow import follow
 
-    clip, camera, c = clip_of(story), camera_of(story), config.shape
+    clip, fluid, camera, c = seen.clip, seen.fluid, seen.geometry.camera, seen.config
     if c.refine_iterations == 0 or len(last) == 0:
-        return bodies, []
-    depth, flow = story["geometry"].arrays["depth"], story["flow"].arrays["displacement"]
-    out, likeness = [], []
+        return bodies, ()
+    depth, out, likeness = seen.geometry.depth, [], []
     for t, fresh in zip(frames, bodies, strict=True):
         if not fluid[t].any() or len(fresh) == 0:
             out.append(fresh)
             continue
         found = follow(
-            last, fresh, clip.frames[t], fluid[t], camera, motion=np.asarray(flow[t - 1], np.float32),
-            depths=(depth, depth), iterations=max(c.refine_iterations // LATER, 1), seed=config.seed,
+            last, fresh, clip.frames[t], fluid[t], camera, motion=np.asarray(seen.flow[t - 1], np.float32),
+            depths=(depth, depth), iterations=max(c.refine_iterations // LATER, 1), seed=c.seed,
             max_gaussians=max(int(1.5 * len(fresh)), 1000), rasterizer=draws,
         )  # fmt: skip
         last = generate.bounded_colours(found.gaussians, clip.frames[t], camera)
         out.append(last)
-        likeness.append([found.psnr_before, found.psnr_after])
-    return out, likeness
+        likeness.append((found.psnr_before, found.psnr_after))
+    return out, tuple(likeness)
 
 
-def _refined(story, config, front: Gaussians, mask, draws: Rasterizer) -> tuple[Gaussians, dict[str, Any]]:
+def _refined(seen: _Seen, front: Gaussians, draws: Rasterizer) -> tuple[Gaussians, _Refinement]:
     """A body optimised against the picture of the rest frame."""
     from fluidlift.shape.refine import refine as refine_view
 
-    clip, camera, c = clip_of(story), camera_of(story), config.shape
-    start = story["geometry"].meta["rest_frame"]
-    fitted: dict[str, Any] = {"warnings": []}
-    if c.refine_iterations > 0 and len(front):
-        found = refine_view(
-            front, clip.frames[start], mask, camera, iterations=c.refine_iterations, seed=config.seed,
-            max_gaussians=max(int(1.5 * len(front)), 1000), rasterizer=draws, progress=story.step,
-        )  # fmt: skip
-        fitted |= {"psnr_before": found.psnr_before, "psnr_after": found.psnr_after, "kept": found.kept}
-        fitted["loss_history"] = [float(x) for x in found.loss_history]
-        front = generate.bounded_colours(found.gaussians, clip.frames[start], camera)
-    return front, fitted
+    c, start, camera = seen.config, seen.geometry.rest_frame, seen.geometry.camera
+    if c.refine_iterations == 0 or not len(front):
+        return front, _Refinement()
+    picture = seen.clip.frames[start]
+    found = refine_view(
+        front, picture, seen.fluid[start], camera, iterations=c.refine_iterations, seed=c.seed,
+        max_gaussians=max(int(1.5 * len(front)), 1000), rasterizer=draws, progress=seen.work.step,
+    )  # fmt: skip
+    history = tuple(float(x) for x in found.loss_history)
+    how = _Refinement(found.psnr_before, found.psnr_after, found.kept, history)
+    return generate.bounded_colours(found.gaussians, picture, camera), how
 
 
 def _pixel(depth: np.ndarray, camera: PinholeCamera) -> float:
@@ -163,7 +205,7 @@ def _pixel(depth: np.ndarray, camera: PinholeCamera) -> float:
     return float(np.median(depth[depth > 0]) / camera.focal[0])
 
 
-def _outside_solid(g: Gaussians, setting: terrain.Setting) -> Gaussians:
+def _outside_solid(g: Gaussians, setting: Setting) -> Gaussians:
     """Those whose centre is in the box and not inside the terrain."""
     from fluidlift.numerics.sampling import sample_nodes
 

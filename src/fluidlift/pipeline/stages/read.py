@@ -7,78 +7,67 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected
-from fluidlift.io.collect import is_variable
 from fluidlift.io.stage_cache import Scratch, parts_of
-from fluidlift.pipeline.story import Result, Story
+from fluidlift.pipeline.inputs import GivenFile
+from fluidlift.pipeline.settings import ReadSettings
+from fluidlift.pipeline.work import Work
 from fluidlift.types import VideoClip
+from fluidlift.types.stages import Read
 
 
-@dataclass(frozen=True)
-class Inputs:
-    """Files of a job. All but the clip are optional."""
+def read(clip: GivenFile, camera: GivenFile | None, config: ReadSettings, *, work: Work) -> Read:
+    """Decode, steady, look for repeated frames and cuts.
 
-    clip: Path
-    mask: Path | None = None
-    camera: Path | None = None
-    depth: Path | None = None
-    geometry: Path | None = None
-    """folder of Gaussian PLY files and camera.json"""
-    flow: Path | None = None
-    """optical flow of the clip: a folder of .flo, .exr or .npz files, or one .npz"""
+    Args:
+        clip: video file or image sequence.
+        camera: a file that may know how the lens distorts.
+        config: what is decoded.
+        work: room for the frames.
 
-    def existing(self) -> dict[str, Path]:
-        """Those that were given."""
-        return {k: v for k, v in vars(self).items() if v is not None}
-
-
-def read(story: Story, inputs: Inputs, config: JobConfig) -> Result:
-    """Decode, steady, look for repeated frames and cuts."""
+    Raises:
+        InputRejected: a clip that cannot be used.
+    """
     from fluidlift.io.limits import ReadLimits
     from fluidlift.io.sequences import is_sequence
     from fluidlift.io.video import read_clip
 
-    r, scratch = config.read, story.scratch
-    clip = read_clip(
-        inputs.clip,
-        start=r.start,
-        duration=r.duration,
-        max_size=r.max_size,
-        fps=r.fps if is_sequence(inputs.clip) else None,
-        limits=ReadLimits(max_pixels=r.max_pixels, max_frames=r.max_frames),
+    scratch = work.scratch
+    found = read_clip(
+        clip.path,
+        start=config.start,
+        duration=config.duration,
+        max_size=config.max_size,
+        fps=config.fps if is_sequence(clip.path) else None,
+        limits=ReadLimits(max_pixels=config.max_pixels, max_frames=config.max_frames),
         store=scratch,
     )
-    decoded = len(clip)
-    clip = _without_distortion(clip, inputs, scratch)
-    clip, kept = _without_repeats(clip, scratch)
-    steady, meta = _steady(clip, scratch, correct=r.stabilise)
-    first, last, warnings = _longest_shot(meta["cuts"], len(steady), clip.source, kept)
+    decoded = len(found)
+    found = _without_distortion(found, None if camera is None else camera.path, scratch)
+    found, kept = _without_repeats(found, scratch)
+    steady, shake = _steady(found, scratch, correct=config.stabilise)
+    first, last, warnings = _longest_shot(shake.cuts, len(steady), found.source, kept)
     frames, alpha = steady.frames, steady.alpha
     if last - first < len(steady):
         frames, kept = frames[first:last], kept[first:last]
         alpha = None if alpha is None else alpha[first:last]
-    arrays = {"frames": scratch.keep("frames", frames), "times": steady.times[first:last], "kept": kept}
-    if alpha is not None:
-        arrays["alpha"] = scratch.keep("alpha", alpha)
-    left_out = np.setdiff1d(np.arange(decoded), kept)
-    meta["warnings"] = [*clip.warnings, *(w for w in meta["warnings"] if w not in clip.warnings), *warnings]
-    meta |= {"source": clip.source, "decoded_frames": decoded, "dropped_frames": left_out.tolist()}
-    return Result(arrays, meta)
+    alpha = None if alpha is None else scratch.keep("alpha", alpha)
+    used = VideoClip(scratch.keep("frames", frames), steady.times[first:last], found.source, alpha)
+    said = (*found.warnings, *(w for w in shake.warnings if w not in found.warnings), *warnings)
+    return Read(used, kept, decoded, shake.shake_px, shake.stabilised, shake.cuts, said)
 
 
-def _without_distortion(clip: VideoClip, inputs: Inputs, scratch: Scratch) -> VideoClip:
+def _without_distortion(clip: VideoClip, file: Path | None, scratch: Scratch) -> VideoClip:
     """Lines that are straight in the world made straight in the picture, where a camera file knows the lens."""
     from fluidlift.io.images import read_camera, read_distortion, undistort_clip
 
-    distortion = read_distortion(inputs.camera) if inputs.camera is not None else None
-    if inputs.camera is None or distortion is None:
+    distortion = read_distortion(file) if file is not None else None
+    if file is None or distortion is None:
         return clip
-    camera = read_camera(inputs.camera, clip.size)
+    camera = read_camera(file, clip.size)
     frames, alpha, before = scratch.array("straight", clip.frames.shape, np.uint8), None, clip.alpha
     if before is not None:
         alpha = scratch.array("straight_alpha", before.shape, np.uint8)
@@ -127,23 +116,31 @@ def _told(before: tuple[str, ...], more: tuple[str, ...]) -> tuple[str, ...]:
     return (*before, *(w for w in more if w not in before))
 
 
-def _steady(clip: VideoClip, scratch: Scratch, *, correct: bool) -> tuple[VideoClip, dict[str, Any]]:
+@dataclass(frozen=True)
+class _Shake:
+    """How the camera moved."""
+
+    shake_px: float
+    stabilised: bool
+    cuts: tuple[int, ...]
+    warnings: tuple[str, ...] = ()
+
+
+def _steady(clip: VideoClip, scratch: Scratch, *, correct: bool) -> tuple[VideoClip, _Shake]:
     """The clip as from a camera that stands still, and how the camera moved."""
     from fluidlift.motion.stabilize import GreyFrames, find_cuts, stabilise
 
     if not correct:
         cuts = find_cuts(GreyFrames(clip.frames))
-        return clip, {"shake_px": 0.0, "stabilised": False, "cuts": [int(c) for c in cuts], "warnings": []}
+        return clip, _Shake(0.0, False, tuple(int(c) for c in cuts))
     steady, shake = stabilise(clip, out=scratch.array("steady", clip.frames.shape, np.uint8))
     # cuts are told below, with what follows from them
-    warnings = [w for w in shake.warnings if not w.startswith("the clip is cut at")]
-    cuts = [int(c) for c in shake.cuts]
-    return steady, {
-        "shake_px": float(shake.shake_px), "stabilised": bool(shake.stabilised), "cuts": cuts, "warnings": warnings,
-    }  # fmt: skip
+    warnings = tuple(w for w in shake.warnings if not w.startswith("the clip is cut at"))
+    cuts = tuple(int(c) for c in shake.cuts)
+    return steady, _Shake(float(shake.shake_px), bool(shake.stabilised), cuts, warnings)
 
 
-def _longest_shot(cuts: list[int], frames: int, source: str, kept: np.ndarray) -> tuple[int, int, list[str]]:
+def _longest_shot(cuts: tuple[int, ...], frames: int, source: str, kept: np.ndarray) -> tuple[int, int, list[str]]:
     """First frame and end of the longest stretch without a cut; what comes after one is another scene."""
     if not cuts:
         return 0, frames, []
@@ -161,15 +158,3 @@ def _longest_shot(cuts: list[int], frames: int, source: str, kept: np.ndarray) -
         last,
         [f"the clip has {len(cuts)} cut(s), at frame {where}: only frames {kept[first]} to {kept[last - 1]} are used"],
     )
-
-
-def spans_of(clip: VideoClip) -> np.ndarray:
-    """Time that each pair of frames spans, in `clip.interval`, float32 [T-1]; rounded time stamps count as even."""
-    steps = np.diff(clip.times)
-    return (steps / clip.interval if is_variable(clip.times) else np.ones(len(steps))).astype(np.float32)
-
-
-def clip_of(story: Story) -> VideoClip:
-    """The clip that later stages see; its frames are mapped."""
-    r = story["read"]
-    return VideoClip(r.arrays["frames"], r.arrays["times"], r.meta["source"], r.arrays.get("alpha"))

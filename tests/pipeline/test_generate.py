@@ -15,11 +15,13 @@ from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.io.asset_folder import read_manifest
 from fluidlift.io.atomic import write_json
 from fluidlift.io.ply import read_gaussians, write_gaussians
-from fluidlift.io.stage_cache import load_stage
-from fluidlift.pipeline import STAGES, Inputs, body, generating
+from fluidlift.pipeline import STAGES, Inputs
 from fluidlift.pipeline.given_body import NOTE, given_bodies, tilt_of_sheet, up_of
-from fluidlift.shape.kind import UpEvidence
-from fluidlift.types import Gaussians, PinholeCamera
+from fluidlift.pipeline.runner import kept_value
+from fluidlift.pipeline.stages import generate as generating
+from fluidlift.pipeline.stages import geometry as stage
+from fluidlift.types import Gaussians, PinholeCamera, UpEvidence
+from fluidlift.types.stages import Geometry, Segmentation
 
 RUNNER = Path(__file__).parent.parent / "backends" / "stand_in_runner.py"
 NAME = "trellis"  # its terms allow commercial use
@@ -60,28 +62,30 @@ def written(folder):
     return {path.parent.name: path.stat().st_mtime_ns for path in (folder / "work").glob("*/*.json")}
 
 
-def geometry_of(folder):
-    (facts,) = (folder / "work" / "geometry").glob("*.json")
-    return load_stage(folder, "geometry", facts.stem)
+def kept(folder, name, kind):
+    """The one value that a stage has kept."""
+    (facts,) = (folder / "work" / name).glob("*.json")
+    found = kept_value(folder, name, facts.stem, kind)
+    assert found is not None
+    return found[0]
 
 
 def test_the_bodies_of_a_generator_take_the_place_of_the_embedded_one(run, tmp_path, asked, capsys):
     assert run("success", "--fov", "40", "--json") in (DONE, WITH_WARNINGS)
     folder = tmp_path / "x.fluid"
-    arrays, meta = geometry_of(folder)
-    frames = list(range(meta["rest_frame"], meta["rest_frame"] + meta["united_frames"]))
+    found = kept(folder, "geometry", Geometry)
+    frames = list(range(found.rest_frame, found.rest_frame + found.united_frames))
     assert asked() == frames and len(frames) > 1
     # the stand-in's own depth at the first frame, seen by a camera of the same field of view
     import cv2
 
-    facts = next((folder / "work" / "segment").glob("*.json"))
-    mask = load_stage(folder, "segment", facts.stem)[0]["labels"][frames[0]] == 1
+    mask = kept(folder, "segment", Segmentation).labels.labels[frames[0]] == 1
     true = 2.0 - 0.5 * cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5) / max(mask.shape)
-    both = mask & (arrays["depth"] > 0)
-    ratio = arrays["depth"][both] / true[both]
+    both = mask & (found.depth > 0)
+    ratio = found.depth[both] / true[both]
     # the near side is a minimum over some px, on which the stand-in's slope is 0.5 / 96 of 2 per px
     np.testing.assert_allclose(ratio / np.median(ratio), 1.0, atol=0.02)
-    assert meta["scale"]["source"] == "user" or meta["scale"]["across"] == pytest.approx(2.0)
+    assert found.scale.source == "user" or found.scale.across == pytest.approx(2.0)
     assert set(json.loads(capsys.readouterr().out)["stages"]) == {*STAGES, "generate"}
     assert read_manifest(folder)["provenance"]["config"]["generate"]["name"] == NAME
     assert run("crash", "--fov", "40") in (DONE, WITH_WARNINGS)  # nothing is asked for again
@@ -92,10 +96,10 @@ def test_the_bodies_of_a_generator_take_the_place_of_the_embedded_one(run, tmp_p
 def stops_at_the_geometry(monkeypatch):
     """What comes after the generator is not what is looked at."""
 
-    def stop(story, inputs, config):
+    def stop(*inputs):
         raise FluidliftError("no further")
 
-    monkeypatch.setattr(body, "geometry", stop)
+    monkeypatch.setattr(stage, "_seen", stop)
 
 
 def test_after_every_failure_the_same_command_goes_on_from_the_last_finished_frame(

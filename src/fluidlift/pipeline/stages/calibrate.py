@@ -7,15 +7,16 @@ force in each place (flux adjustment), and the asset keeps it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from fluidlift.pipeline.scene import LYING, Scene, wave_speed
-from fluidlift.pipeline.story import Result
+from fluidlift.pipeline.work import Work
 from fluidlift.types import CellType, FaceVelocity
+from fluidlift.types.stages import Calibration
 
 if TYPE_CHECKING:
     from fluidlift.types import FluidAsset
@@ -53,36 +54,39 @@ def calibrate(
     scene: Scene,
     target: FaceVelocity,
     *,
+    wanted: bool = True,
     device: str = "cpu",
-    step: Callable[[int, int], None] = lambda done, total: None,
-) -> Result:
-    """The force (arrays u, v, w in m/s^2) that keeps `target`, and how well it does.
+    work: Work | None = None,
+) -> Calibration:
+    """The force that keeps `target`, and how well it does.
 
     Args:
         scene: unedited.
         target: m/s, on the faces of its grid.
+        wanted: False leaves all as it is.
         device: of the simulation.
-        step: told (frames done, all frames).
+        work: told how many frames are done.
 
     Raises:
         FluidliftError: the simulation broke down.
     """
     from fluidlift.physics.guidance import Nudging
-    from fluidlift.pipeline.simulating import simulator_of
+    from fluidlift.pipeline.simulator import simulator_of
 
-    if scene.kind not in LYING or not len(scene.body):
-        return Result()
+    if not wanted or scene.kind not in LYING or not len(scene.body):
+        return Calibration()
     grid, frames = scene.terrain.grid, min(scene.frames, LONGEST)
     speed = _typical_speed(target, scene.cell_types)
     if speed <= 0:
-        return Result()
+        return Calibration()
     wave = wave_speed(scene)
     rate = max(speed, wave) / (PULL * grid.spacing)
     rates = tuple(np.full(c.shape, rate, np.float32) for c in target.components)
     pull = Nudging(target, rates, after=SETTLED * frames * scene.interval)
     simulator = simulator_of(replace(scene, force=None), device, forces=(pull,))
     for k in range(1, frames):
-        step(k, frames)
+        if work is not None:
+            work.step(k, frames)
         simulator.advance(scene.interval)
     force = pull.mean()
     liquid = scene.cell_types == CellType.FLUID
@@ -95,16 +99,10 @@ def calibrate(
             f"differs from it by {100 * left:.0f} % of its speed; the level will rise or fall; a --mask, --pitch or "
             "--size that is known would help"
         )
-    meta = {"acceleration": size, "speed": speed, "left": left, "frames": frames, "warnings": warnings}
-    return Result(dict(zip("uvw", force.components, strict=True)), meta)
+    return Calibration(force, size, speed, left, frames, tuple(warnings))
 
 
 def _typical_speed(target: FaceVelocity, cell_types: np.ndarray) -> float:
     """Root mean square in the liquid, m/s."""
     liquid = cell_types == CellType.FLUID
     return float(np.sqrt(np.square(target.at_centers()[liquid]).sum(axis=-1).mean())) if liquid.any() else 0.0
-
-
-def force_of(result: Result) -> FaceVelocity | None:
-    """The force of a result, m/s^2; None where there is none."""
-    return FaceVelocity(*(result.arrays[name] for name in "uvw")) if "u" in result.arrays else None

@@ -12,11 +12,11 @@ from fluidlift.io.asset_folder import FILES, load_asset, read_manifest
 from fluidlift.io.force_file import read_force, write_force
 from fluidlift.numerics.sampling import sample_faces
 from fluidlift.physics.inflow_schedule import InflowSchedule
-from fluidlift.pipeline.calibrating import STRONG, calibrate, force_of
 from fluidlift.pipeline.coarse_copy import coarser
 from fluidlift.pipeline.following import following
 from fluidlift.pipeline.scene import SimulationRequest, scene_of
-from fluidlift.pipeline.simulating import simulator_of
+from fluidlift.pipeline.simulator import simulator_of
+from fluidlift.pipeline.stages.calibrate import STRONG, calibrate
 from fluidlift.types import FaceVelocity
 
 FRAMES = 14
@@ -49,7 +49,7 @@ def test_the_force_of_a_calibration_keeps_a_flow_that_a_free_run_leaves(channel)
     # twice as fast as what flows in: bed and discharge do not explain it
     target = FaceVelocity(*(2.0 * c for c in scene.velocity.components))
     found = calibrate(scene, target)
-    free, kept = away_from(scene, target, None), away_from(scene, target, force_of(found))
+    free, kept = away_from(scene, target, None), away_from(scene, target, found.force)
     assert kept < 0.8 * free, "the force alone brings the flow at least a fifth of the way to the target"
 
 
@@ -57,13 +57,13 @@ def test_a_target_that_contradicts_shape_and_mass_is_said(channel):
     scene = channel(FRAMES)
     against = FaceVelocity(*(-c for c in scene.velocity.components))  # towards the inlet
     found = calibrate(scene, against)
-    assert found.meta["left"] > STRONG
-    assert any("do not fit together" in text for text in found.meta["warnings"])
+    assert found.left > STRONG
+    assert any("do not fit together" in text for text in found.warnings)
 
 
 def test_smoke_and_pours_are_not_calibrated(channel):
     scene = replace(channel(2), kind="pour")
-    assert force_of(calibrate(scene, scene.velocity)) is None
+    assert calibrate(scene, scene.velocity).force is None
 
 
 def test_an_asset_of_a_stream_carries_its_force_and_says_how_strong_it_is(made):

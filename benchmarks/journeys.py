@@ -1,4 +1,4 @@
-"""How many stops two journeys through the code make: of an edit until particles exist, of a picture until Gaussians do.
+"""How many stops journeys through the code make: of an edit until particles exist, of a picture until Gaussians do.
 
     python benchmarks/journeys.py            # makes a small asset first, some minutes
     PYTHONPATH=OTHER/src python benchmarks/journeys.py --asset ASSET.fluid    # of another checkout, its own asset
@@ -7,7 +7,9 @@ A stop is a function of fluidlift that is entered from another module, counted o
 somebody has to look who follows the journey by reading. It is a return where its module was visited before. The number
 of times that control passes from one module to another is told beside it; it grows with loops.
 
-Each journey is followed through all of fluidlift, and through `pipeline` alone, where the stages are wired up.
+Each journey is followed through all of fluidlift, and through `pipeline` alone, where the stages are wired up. The edit
+goes once through the files of an asset (`fluidlift sim`), and once as a value, with the asset at hand (the viewer, or
+somebody's program).
 """
 
 from __future__ import annotations
@@ -117,6 +119,9 @@ def small_clip(path: Path) -> Path:
 
 def journeys(folder: Path, asset: Path | None, show: bool) -> list[str]:
     """Rows of the table."""
+    from fluidlift import pipeline
+    from fluidlift.io.asset_folder import load_asset
+    from fluidlift.io.scene import SceneEdits
     from fluidlift.pipeline import EditSession, Inputs, make, resimulate
 
     clip, config = small_clip(folder / "clip.mp4"), build_config("draft", None, QUICK, {"shape.size": 2.0})
@@ -124,13 +129,21 @@ def journeys(folder: Path, asset: Path | None, show: bool) -> list[str]:
         asset = folder / "asset.fluid"
         make(Inputs(clip), asset, config)
     EditSession.open(asset).set("parameters.kinematic_viscosity", 0.001)
+    lifted, edits = load_asset(asset), SceneEdits(parameters={"kinematic_viscosity": 0.001})
     rows = []
     for number, (inside, where) in enumerate((("", "fluidlift"), ("pipeline.", "pipeline alone"))):
         fresh = folder / f"{number}.fluid"
         for title, until, journey in (
             ("an edit until particles exist", EDIT, lambda: resimulate(asset)),
+            (
+                "an edit as a value until particles exist",
+                EDIT,
+                lambda: pipeline.simulator_of(pipeline.edited_scene(lifted, edits)),
+            ),
             ("a picture until Gaussians exist", PICTURE, lambda fresh=fresh: make(Inputs(clip), fresh, config)),
         ):
+            if "value" in title and not hasattr(pipeline, "edited_scene"):
+                continue  # code in which values do not travel
             found = Traveller(inside, until)
             found.follow(journey)
             rows.append(

@@ -78,28 +78,27 @@ def test_an_asset_of_a_stream_carries_its_force_and_says_how_strong_it_is(made):
 def test_the_force_fades_around_what_was_put_in_and_stays_elsewhere(tmp_path, channel):
     scene = channel(2)
     grid = scene.terrain.grid
-    write_force(tmp_path, uniform(grid, (1.0, 0.0, 0.0)))
-    asset = of(scene)
-    assert following(scene, asset, tmp_path, 0.0).force is None
-    np.testing.assert_allclose(following(scene, asset, tmp_path, 0.5).force.u, 0.5)
+    force, asset = uniform(grid, (1.0, 0.0, 0.0)), of(scene)
+    assert following(scene, asset, force, 0.0).force is None
+    np.testing.assert_allclose(following(scene, asset, force, 0.5).force.u, 0.5)
     dug = scene.terrain.signed_distance.copy()
     place = (2, 4, 2)
     dug[place] += grid.spacing
-    there = following(replace(scene, terrain=replace(scene.terrain, signed_distance=dug)), asset, tmp_path, 1.0).force
+    there = following(replace(scene, terrain=replace(scene.terrain, signed_distance=dug)), asset, force, 1.0).force
     assert there.u[place] == 0.0, "no force where the ground was dug"
     assert there.u[-1, 4, 2] == 1.0, "all of it ten cells from there: two of them were touched, and it needs six"
     assert (np.diff(there.u[2:, 4, 2]) >= 0).all()
 
 
 @pytest.mark.parametrize("change", ["fluid", "inflow"])
-def test_another_fluid_or_inflow_takes_the_force_away_and_that_is_noted(tmp_path, channel, change):
+def test_another_fluid_or_inflow_takes_the_force_away_and_that_is_noted(channel, change):
     scene = channel(2)
-    write_force(tmp_path, uniform(scene.terrain.grid, (1.0, 0.0, 0.0)))
+    force = uniform(scene.terrain.grid, (1.0, 0.0, 0.0))
     if change == "fluid":
         other = replace(scene, changes=("kinematic_viscosity",))
     else:
         other = replace(scene, inflow=InflowSchedule(((0.0, 2.0),)))
-    found = following(other, of(scene), tmp_path, 1.0)
+    found = following(other, of(scene), force, 1.0)
     assert found.force is None and "left out" in found.notes[-1]
 
 

@@ -10,11 +10,14 @@ import pytest
 from fluidlift.cli import DONE, FAILED, REJECTED, WITH_WARNINGS, main
 from fluidlift.config import build_config
 from fluidlift.io.asset_folder import load_asset, read_manifest
+from fluidlift.io.force_file import read_force
 from fluidlift.io.ply import read_splats
+from fluidlift.io.scene import SceneEdits
 from fluidlift.io.video import read_clip
 from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.pipeline import STAGES, Inputs, SimulationRequest, card_of, make
-from fluidlift.pipeline.scene import footage_of, scene_of
+from fluidlift.pipeline.scene import edited_scene, footage_of, scene_of
+from fluidlift.pipeline.settings import SceneSettings
 from fluidlift.pipeline.simulator import simulator_of
 from fluidlift.pipeline.stages import fit, geometry, simulate
 from fluidlift.types import CellType, Label
@@ -145,6 +148,22 @@ def test_the_files_hold_what_was_simulated(made, finished, asset):
     np.testing.assert_allclose(shown.gaussians.means[written], p.positions[order], atol=tolerance)
     velocity = np.stack([shown.extras[k] for k in ("vx", "vy", "vz")], axis=-1)
     np.testing.assert_allclose(velocity[written], p.velocities[order], atol=1e-3 * np.abs(p.velocities).max())
+
+
+def test_an_edited_asset_becomes_a_scene_without_a_file(made, asset, tmp_path):
+    """What `fluidlift sim` reads from the folder, and what is handed over in Python, go the same way."""
+    edits = SceneEdits(parameters={"kinematic_viscosity": 1e-3}, duration=0.2)
+    (tmp_path / "scene.yaml").write_text("parameters: {kinematic_viscosity: 1.0e-3}\nduration: 0.2\n")
+    there = scene_of(asset, tmp_path, SimulationRequest(), build_config(), footage=None, start=0)
+    scene = edited_scene(asset, edits)
+    assert scene.parts == there.parts and scene.frames == there.frames == 5
+    simulator = simulator_of(scene)
+    simulator.advance(scene.interval)
+    assert len(simulator.particles) > 0
+    filmed = read_force(made.folder)
+    assert filmed is not None
+    same = edited_scene(asset, SceneEdits(), settings=SceneSettings(None, 0.5, 0), force=filmed)
+    np.testing.assert_allclose(same.force.u, 0.5 * filmed.u)
 
 
 def test_every_frame_has_a_splat_per_particle(made, finished):

@@ -12,7 +12,8 @@ from fluidlift.pipeline.other_footage import card_against
 from fluidlift.pipeline.refit import Refitted, refit
 from fluidlift.pipeline.rendering import RenderRequest, render_asset
 from fluidlift.pipeline.resimulate import Made, resimulate
-from fluidlift.pipeline.scene import SimulationRequest
+from fluidlift.pipeline.scene import SimulationRequest, edited_scene
+from fluidlift.pipeline.simulator import simulator_of
 from fluidlift.pipeline.work import Progress, Silence
 
 __all__ = [
@@ -30,6 +31,7 @@ __all__ = [
     "SimulationRequest",
     "card_against",
     "card_of",
+    "edited_scene",
     "export_asset",
     "find_masks",
     "make",
@@ -37,4 +39,5 @@ __all__ = [
     "refit",
     "render_asset",
     "resimulate",
+    "simulator_of",
 ]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import platform
-import tempfile
 import time
 from collections.abc import Iterable
 from dataclasses import asdict, replace
@@ -18,8 +17,15 @@ from fluidlift.pipeline.fluid_masks import FluidMasks
 from fluidlift.pipeline.inputs import GivenFile, GivenFiles, Inputs
 from fluidlift.pipeline.resimulate import Made, play
 from fluidlift.pipeline.runner import Runner, gone_if_refused
-from fluidlift.pipeline.scene import SimulationRequest, first_of_film, scene_of
-from fluidlift.pipeline.settings import GenerateSettings, GivenView, MotionSettings, RefineSettings, taken
+from fluidlift.pipeline.scene import SimulationRequest, edited_scene, first_of_film
+from fluidlift.pipeline.settings import (
+    GenerateSettings,
+    GivenView,
+    MotionSettings,
+    RefineSettings,
+    SceneSettings,
+    taken,
+)
 from fluidlift.pipeline.simulator import particle_work
 from fluidlift.pipeline.splat_files import require_room
 from fluidlift.pipeline.stages import generate
@@ -150,9 +156,9 @@ def _write_asset(runner: Runner, lift: Lift, config: JobConfig, provenance: dict
 
 def _calibrated(runner: Runner, lift: Lift, asset: FluidAsset, config: JobConfig) -> Calibration:
     """The force that keeps the filmed flow, from a run without what scene.yaml changes."""
-    with tempfile.TemporaryDirectory(prefix="fluidlift-calibrate-") as name:
-        start = lift.geometry.rest_frame
-        scene = scene_of(asset, Path(name), SimulationRequest(), config, footage=None, start=start)
+    from fluidlift.io.scene import SceneEdits
+
+    scene = edited_scene(asset, SceneEdits(), None, SceneSettings.of(config), start=lift.geometry.rest_frame)
     target = mean_target(asset, lift.motion.velocities)
     s = config.simulate
     return runner.run("calibrate", calibrate, scene, target, wanted=s.follow > 0, beside={"device": s.device})

@@ -20,6 +20,7 @@ from fluidlift.physics.inflow_schedule import InflowSchedule
 from fluidlift.pipeline.following import following
 from fluidlift.pipeline.machine import available_memory
 from fluidlift.pipeline.reshaping import changed_parameters, with_emitters, with_terrain
+from fluidlift.pipeline.settings import SceneSettings
 from fluidlift.types import (
     CellType,
     FaceVelocity,
@@ -246,10 +247,7 @@ def scene_of(
     start: int,
     edits: SceneEdits | None = None,
 ) -> Scene:
-    """The scene that an asset, its scene.yaml and a request describe.
-
-    The channel is made longer first, then its terrain is edited, then emitters are put into it: each in the world as
-    the one before left it.
+    """The scene that an asset, its scene.yaml and a request describe: `edited_scene` with what lies in the folder.
 
     Args:
         asset: as `load_asset` gives it.
@@ -261,14 +259,51 @@ def scene_of(
         edits: the folder's scene.yaml, where it was read already.
 
     Raises:
-        InputRejected: a scene.yaml or a request that does not fit.
+        InputRejected: a scene.yaml or a request that does not fit, or a damaged file.
     """
+    from fluidlift.io.force_file import read_force
     from fluidlift.io.scene import read_edits
-    from fluidlift.numerics.sampling import sample_faces
 
     edits = read_edits(folder, meshes=request.meshes) if edits is None else edits
     # edits that are tried out lie elsewhere than their asset
     home = folder if request.meshes is None or (folder / "manifest.json").is_file() else request.meshes
+    settings = SceneSettings.of(config)
+    force = read_force(home) if settings.follow > 0 else None
+    return edited_scene(asset, edits, request, settings, footage=footage, start=start, film=film_of(home), force=force)
+
+
+def edited_scene(
+    asset: FluidAsset,
+    edits: SceneEdits,
+    request: SimulationRequest | None = None,
+    settings: SceneSettings | None = None,
+    *,
+    footage: Footage | None = None,
+    start: int = 0,
+    film: Path | None = None,
+    force: FaceVelocity | None = None,
+) -> Scene:
+    """The scene that an asset, edits of it and a request describe. No file is looked at.
+
+    The channel is made longer first, then its terrain is edited, then emitters are put into it: each in the world as
+    the one before left it.
+
+    Args:
+        asset: at rest.
+        edits: what scene.yaml says; `SceneEdits()` says nothing.
+        request: of this run.
+        settings: seed, and frames where neither request nor edits say; None: as by default.
+        footage: the clip, where it is at hand.
+        start: frame of the clip that the first simulated one shows.
+        film: that the fluid's surface plays.
+        force: m/s^2, that keeps the filmed flow.
+
+    Raises:
+        InputRejected: edits or a request that do not fit.
+    """
+    from fluidlift.numerics.sampling import sample_faces
+
+    request, settings = request or SimulationRequest(), settings or SceneSettings.of(JobConfig())
     interval = asset.interval if request.fps is None else 1.0 / request.fps
     duration = edits.duration if request.duration is None else request.duration
     clip_frames = max(1, round((asset.frame_count - start) * asset.interval / interval))
@@ -283,16 +318,15 @@ def scene_of(
     scene = Scene(
         asset.kind, rest, body, asset.terrain, asset.cell_types, velocity,
         asset.parameters.updated(changes), asset.camera, interval, asset.interval,
-        wanted or config.simulate.frames or clip_frames, config.seed, edits.obstacles, shading,
+        wanted or settings.frames or clip_frames, settings.seed, edits.obstacles, shading,
         longest_step=longest_step, inflow=edits.inflow, changes=changed_parameters(asset.parameters, changes),
-        film=film_of(home), film_start=start - first_of_film(start, asset.frame_count),
+        film=film, film_start=start - first_of_film(start, asset.frame_count),
     )  # fmt: skip
     longer = edits.extend_downstream if request.extend_downstream is None else request.extend_downstream
     if longer > 0:
         scene = extended(scene, longer)
     scene = with_emitters(with_terrain(scene, edits.terrain), edits.emitters)
-    if config.simulate.follow > 0:
-        scene = following(scene, asset, home, config.simulate.follow)
+    scene = following(scene, asset, force, settings.follow)
     return replace(scene, overlap=loop_overlap(scene)) if edits.loop else scene
 
 

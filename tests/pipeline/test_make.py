@@ -16,7 +16,8 @@ from fluidlift.io.scene import SceneEdits
 from fluidlift.io.video import read_clip
 from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.pipeline import STAGES, Inputs, SimulationRequest, card_of, make
-from fluidlift.pipeline.scene import edited_scene, footage_of, scene_of
+from fluidlift.pipeline.footage import footage_of
+from fluidlift.pipeline.scene import edited_scene, scene_of
 from fluidlift.pipeline.settings import SceneSettings
 from fluidlift.pipeline.simulator import simulator_of
 from fluidlift.pipeline.stages import fit, geometry, simulate

@@ -51,14 +51,13 @@ class MotionFiles:
 
 @dataclass(frozen=True)
 class WritingPlace:
-    """Where files go, and beside what."""
+    """Where files go, and what lies there already."""
 
     folder: Path
-    files: MotionFiles
     inputs: Inputs
     """of the job: what was given stays as it is"""
-    journal: Path
-    """of the rows that are written"""
+    again: bool = False
+    """write all frames again, over masks that a person has changed, too"""
 
 
 class FrameWriter:
@@ -69,28 +68,30 @@ class FrameWriter:
         masks: of its fluid.
         measured: its flow, as measured.
         geometry: of the body.
-        place: where files go.
-        again: write all frames again, over masks that a person has changed, too.
+        files: which are written.
+        place: where they go.
+        key: of the run: only one with the same goes on from what it has written.
 
     Raises:
         InputRejected: a person has changed the masks of the run before, and has not given them back.
     """
 
     def __init__(
-        self, clip: VideoClip, masks: FluidMasks, measured: PixelFlow, geometry: Geometry, place: WritingPlace, *,
-        again: bool,
+        self, clip: VideoClip, masks: FluidMasks, measured: PixelFlow, geometry: Geometry, files: MotionFiles,
+        place: WritingPlace, key: str,
     ) -> None:  # fmt: skip
-        self.folder, self.files, self.inputs, self.journal = place.folder, place.files, place.inputs, place.journal
+        folder, inputs = place.folder, place.inputs
+        self.folder, self.inputs, self.files = folder, inputs, files
         self.clip, self.masks, self.measured, self.geometry = clip, masks, measured, geometry
-        folder, inputs = self.folder, self.inputs
+        self.journal = folder / "work" / "velocities" / f"{key}.rows"
         self.spans = spans_of(self.clip)
         self.grid, self.cells = geometry.grid, geometry.setting.cell_types
         self.scale = self._flow_scale()
         self.keeps_masks = _same(inputs.mask, folder / "mask")
         """the masks there are those that were given: they stay as they are"""
-        self.rows: dict[int, dict[str, Any]] = {} if again else self._written_before()
+        self.rows: dict[int, dict[str, Any]] = {} if place.again else self._written_before()
         if not self.rows:
-            if not again and not self.keeps_masks:
+            if not place.again and not self.keeps_masks:
                 require_unchanged(folder / "mask", "velocities")
             self._clear()
         self._write_once()

@@ -8,12 +8,35 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fluidlift.pipeline.scene import LYING, Footage, Scene, before_ground
+from fluidlift.pipeline.footage import Footage
+from fluidlift.pipeline.scene import LYING, Scene
 from fluidlift.types import Gaussians, PinholeCamera, concatenate
 
 if TYPE_CHECKING:
     from fluidlift.look.open_end import OpenEnd
     from fluidlift.look.rasterize import Rendered
+
+
+BEHIND = (1.5, 0.5)
+"""cells behind the terrain from which fluid is hidden: at rocks, whose shape is a guess, and where it is always dry"""
+
+
+def before_ground(scene: Scene, footage: Footage | None) -> Callable[[Gaussians], np.ndarray] | None:
+    """Which splats are not hidden by the ground that the clip's picture shows; None where it hides nothing.
+
+    The picture is drawn as one plate behind the fluid: without this, fluid would be seen through a near bank.
+    """
+    from fluidlift.look.scenery import terrain_depth, visible_beside_rocks
+
+    if footage is None:
+        return None
+    rocks = footage.rocks
+    ground = rocks | ~footage.labels.fluid.any(axis=0) if scene.kind in LYING else rocks
+    if not ground.any():
+        return None
+    margin = scene.terrain.grid.spacing * np.where(rocks, *BEHIND)
+    depth = terrain_depth(scene.terrain, scene.camera)
+    return lambda g: visible_beside_rocks(g.means, scene.camera, depth, ground, margin=margin)
 
 
 @dataclass(frozen=True)

@@ -66,7 +66,7 @@ def measure_motion(
         geometry = begin.shape(runner, seen, given, config)
         found = runner.run(
             "velocities", write_velocities, *seen, geometry, files, taken(MotionSettings, config.motion),
-            beside={"folder": folder, "inputs": inputs, "again": "velocities" in runner.force},
+            beside={"place": WritingPlace(folder, inputs, "velocities" in runner.force)},
             still_there=lambda made: _all_there(folder, files, made), owns_files=True,
         )  # fmt: skip
         facts = _facts(seen, geometry, found) | {"provenance": given.provenance(), "warnings": list(runner.warnings)}
@@ -79,15 +79,14 @@ def measure_motion(
 
 def write_velocities(
     read: Read, flow: Flow, segmentation: Segmentation, geometry: Geometry, files: MotionFiles,
-    config: MotionSettings, *, folder: Path, inputs: Inputs, again: bool, work: Work,
+    config: MotionSettings, *, place: WritingPlace, work: Work,
 ) -> VelocityFiles:  # fmt: skip
     """Write the files of every frame; what was written by a run that was stopped is kept."""
     from fluidlift.motion.sequence import motion_sequence
 
     clip, options, masks = read.clip, motion_options(config), FluidMasks(segmentation.labels.labels)
     pairs, kind = len(clip) - 1, geometry.kind
-    place = WritingPlace(folder, files, inputs, folder / "work" / "velocities" / f"{work.key}.rows")
-    writer = FrameWriter(clip, masks, flow.flow, geometry, place, again=again)
+    writer = FrameWriter(clip, masks, flow.flow, geometry, files, place, work.key)
     wanted = [t for t in range(pairs) if t not in writer.rows]
     found = motion_sequence(
         pairs_of(clip, flow.flow), masks.__getitem__, pairs, motion_scene(clip, geometry), options,

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from fluidlift.pipeline.footage import Footage, footage_of
 from fluidlift.pipeline.runner import Runner, kept_value, last_value
-from fluidlift.pipeline.scene import Footage, footage_of
 from fluidlift.types.stages import (
     Fit,
     Flow,

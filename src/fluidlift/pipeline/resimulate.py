@@ -13,11 +13,12 @@ import numpy as np
 from fluidlift.config import PRESETS, JobConfig, build_config
 from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.pipeline import reporting
+from fluidlift.pipeline.footage import footage_of
 from fluidlift.pipeline.machine import peak_memory_mb
 from fluidlift.pipeline.recall import recalled_lift, rest_frame_of
 from fluidlift.pipeline.reshaping import slow_edits
 from fluidlift.pipeline.runner import Runner
-from fluidlift.pipeline.scene import Scene, SimulationRequest, footage_of, scene_of
+from fluidlift.pipeline.scene import Scene, SimulationRequest, scene_of
 from fluidlift.pipeline.settings import ShowSettings, SimulateSettings, taken
 from fluidlift.pipeline.stages.show import SeenLook, show
 from fluidlift.pipeline.stages.simulate import frames_still_there, simulate

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -18,6 +17,7 @@ from fluidlift.errors import InputRejected
 from fluidlift.look.appearance import SteadyShading
 from fluidlift.physics.inflow_schedule import InflowSchedule
 from fluidlift.pipeline.following import following
+from fluidlift.pipeline.footage import Footage
 from fluidlift.pipeline.machine import available_memory
 from fluidlift.pipeline.reshaping import changed_parameters, with_emitters, with_terrain
 from fluidlift.pipeline.settings import SceneSettings
@@ -29,11 +29,8 @@ from fluidlift.types import (
     Gaussians,
     Particles,
     PinholeCamera,
-    PixelLabels,
     Terrain,
-    VideoClip,
 )
-from fluidlift.types.stages import Geometry, Read, Segmentation
 
 if TYPE_CHECKING:
     from fluidlift.io.obstacles import Obstacle
@@ -65,20 +62,6 @@ class SimulationRequest:
     """go on from the checkpoint, or say why not"""
     restart: bool = False
     """begin again, although a checkpoint fits"""
-
-
-@dataclass(frozen=True)
-class Footage:
-    """The clip that an asset comes from, where it is still at hand."""
-
-    clip: VideoClip
-    labels: PixelLabels
-    plate: np.ndarray
-    """u8 [H,W,3], the picture without the fluid"""
-    start: int
-    """frame of the clip that the first simulated one shows"""
-    rocks: np.ndarray
-    """bool [H,W], pixels in which something solid stands in or before the fluid"""
 
 
 @dataclass(frozen=True)
@@ -206,35 +189,6 @@ def _update(digest: hashlib._Hash, file: Path) -> None:
     with suppress(OSError), file.open("rb") as stream:
         while piece := stream.read(2**20):
             digest.update(piece)
-
-
-def footage_of(read: Read, segmentation: Segmentation, geometry: Geometry) -> Footage:
-    """The clip as the first stages saw it."""
-    labels = segmentation.labels
-    rocks = geometry.rocks if geometry.rocks is not None else labels.solid.mean(axis=0) > 0.5
-    return Footage(read.clip, labels, geometry.plate, geometry.rest_frame, rocks)
-
-
-BEHIND = (1.5, 0.5)
-"""cells behind the terrain from which fluid is hidden: at rocks, whose shape is a guess, and where it is always dry"""
-
-
-def before_ground(scene: Scene, footage: Footage | None) -> Callable[[Gaussians], np.ndarray] | None:
-    """Which splats are not hidden by the ground that the clip's picture shows; None where it hides nothing.
-
-    The picture is drawn as one plate behind the fluid: without this, fluid would be seen through a near bank.
-    """
-    from fluidlift.look.scenery import terrain_depth, visible_beside_rocks
-
-    if footage is None:
-        return None
-    rocks = footage.rocks
-    ground = rocks | ~footage.labels.fluid.any(axis=0) if scene.kind in LYING else rocks
-    if not ground.any():
-        return None
-    margin = scene.terrain.grid.spacing * np.where(rocks, *BEHIND)
-    depth = terrain_depth(scene.terrain, scene.camera)
-    return lambda g: visible_beside_rocks(g.means, scene.camera, depth, ground, margin=margin)
 
 
 def scene_of(

@@ -20,7 +20,7 @@ from fluidlift.shape import generate, ground_texture, place, puddle, standing, s
 from fluidlift.shape import kind as kinds
 from fluidlift.shape.framing import framing_warnings
 from fluidlift.shape.given_depth import DepthPictures
-from fluidlift.types import CellType, KindEvidence, MetricScale, PinholeCamera, UpEvidence, VideoClip
+from fluidlift.types import CellType, KindEvidence, MetricScale, PinholeCamera, Setting, UpEvidence, VideoClip
 from fluidlift.types.stages import Flow, Geometry, Read, Segmentation
 
 
@@ -89,20 +89,9 @@ def geometry(
     points, velocities = _surface_motion(canonical, visible, front.sighted, seen.motion, clip.interval)
     falls, trust = falling.pixels[visible], seen.trust[visible]
     sighting = place.Sighting(trust, clip.interval, up.pitch)
-    if seen.stood is not None:
-        scale = standing.standing_scale(
-            seen.stood, size=c.size, height=seen.height,
-            speed=lambda: dam.front_speed(fluid, seen.start, canonical, seen.stood) / clip.interval,
-        )  # fmt: skip
-    else:
-        scale = place.metric_scale(
-            kind, points, velocities, size=c.size, camera_height=seen.height, known_scale=known_scale, seen=sighting
-        )
-    if seen_depth is not None:
-        scale = depths.with_learned_scale(scale, seen_depth, points)
-        warnings += depths.size_warnings(scale.across, seen_depth, seen.height, points)
-    scale, sentence = _told(composite.with_fall(scale, points, velocities, falls, sighting), seen)
-    warnings += [scale.warning] * bool(scale.warning)
+    moving = _Moving(points, velocities, falls, sighting, known_scale)
+    scale, sentence, told = _scale(seen, moving, seen_depth, c.size, fluid, canonical)
+    warnings += told
     mainstream = _mainstream(kind, velocities[~falls], trust[~falls]) if seen.stood is None else seen.stood.direction
     eye = seen.known.position if seen.pose_given else None
     to_world, camera = place.place(canonical, points, scale.value, heading=seen.heading, eye=eye, mainstream=mainstream)
@@ -123,14 +112,7 @@ def geometry(
             f"as a {kind}, the fluid fills no cell of the grid beside those of its inlet", "a larger or thicker body",
             "check the mask and --kind, or raise --set shape.cells=...",
         )  # fmt: skip
-    # the plate looks at a few frames only
-    plate = generate.background_plate(clip.frames, cast(Any, fluid), ground.solid_share(fluid.labels) > 0.5)
-    picture = plate.image
-    if setting.surface_height is not None:
-        labels = ground.seen_labels(fluid, seen.start, seen.united, falling.pixels)
-        view = ground_texture.View(picture, camera, labels, np.asarray(plate.seen))
-        setting = ground.textured(setting, view)
-        picture = ground_texture.over_bed(picture, view.seen, setting.terrain.mesh, camera)
+    setting, picture = _coloured(setting, clip, fluid, seen, falling.pixels, camera)
     return Geometry(
         kind=kind,
         kind_source="evidence" if c.kind == "auto" else "user",
@@ -140,7 +122,7 @@ def geometry(
         scale_sentence=sentence,
         camera=camera,
         world_from_canonical=to_world,
-        setting=ground.finished(setting, picture, camera),
+        setting=setting,
         mask=mask,
         depth=depth,
         half_thickness=half,
@@ -157,6 +139,58 @@ def geometry(
         slope=front.slope,
         warnings=tuple(warnings),
     )
+
+
+@dataclass(frozen=True)
+class _Moving:
+    """Points on the surface, canonical, and how they move."""
+
+    points: np.ndarray
+    velocities: np.ndarray
+    """units per second"""
+    falls: np.ndarray
+    """bool: of jets"""
+    sighting: place.Sighting
+    known_scale: float | None
+    """m per unit, of depth in metres"""
+
+
+def _scale(
+    seen: _Sight, moving: _Moving, seen_depth: depths.DepthFront | None, size: float | None, fluid: FluidMasks,
+    canonical: PinholeCamera,
+) -> tuple[MetricScale, str, list[str]]:  # fmt: skip
+    """Metres per canonical unit, in words, and warnings."""
+    points, velocities, stood, warnings = moving.points, moving.velocities, seen.stood, []
+    if stood is not None:
+        scale = standing.standing_scale(
+            stood, size=size, height=seen.height,
+            speed=lambda: dam.front_speed(fluid, seen.start, canonical, stood) / moving.sighting.interval,
+        )  # fmt: skip
+    else:
+        scale = place.metric_scale(
+            seen.kind, points, velocities, size=size, camera_height=seen.height, known_scale=moving.known_scale,
+            seen=moving.sighting,
+        )  # fmt: skip
+    if seen_depth is not None:
+        scale = depths.with_learned_scale(scale, seen_depth, points)
+        warnings += depths.size_warnings(scale.across, seen_depth, seen.height, points)
+    scale, sentence = _told(composite.with_fall(scale, points, velocities, moving.falls, moving.sighting), seen)
+    return scale, sentence, warnings + [scale.warning] * bool(scale.warning)
+
+
+def _coloured(
+    setting: Setting, clip: VideoClip, fluid: FluidMasks, seen: _Sight, falls: np.ndarray, camera: PinholeCamera
+) -> tuple[Setting, np.ndarray]:
+    """The setting with its ground as the clip shows it, and the picture without the fluid, u8 [h,w,3]."""
+    # the plate looks at a few frames only
+    plate = generate.background_plate(clip.frames, cast(Any, fluid), ground.solid_share(fluid.labels) > 0.5)
+    picture = plate.image
+    if setting.surface_height is not None:
+        labels = ground.seen_labels(fluid, seen.start, seen.united, falls)
+        view = ground_texture.View(picture, camera, labels, np.asarray(plate.seen))
+        setting = ground.textured(setting, view)
+        picture = ground_texture.over_bed(picture, view.seen, setting.terrain.mesh, camera)
+    return ground.finished(setting, picture, camera), picture
 
 
 def _seen(

@@ -11,9 +11,10 @@ import numpy as np
 
 from fluidlift.io.scene_look import Look
 from fluidlift.pipeline.as_filmed import BEYOND, Reel, card_of_run
+from fluidlift.pipeline.footage import Footage
 from fluidlift.pipeline.front_view import FrontView, open_end, to_bytes
 from fluidlift.pipeline.looks import Backdrop, Frame, Painter, placed_bodies
-from fluidlift.pipeline.scene import LYING, Footage, Scene
+from fluidlift.pipeline.scene import LYING, Scene
 from fluidlift.pipeline.settings import ShowSettings
 from fluidlift.pipeline.splat_files import splat_frames
 from fluidlift.pipeline.work import Work

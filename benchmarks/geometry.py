@@ -50,7 +50,6 @@ from fluidlift.pipeline.settings import RefineSettings, taken
 from fluidlift.pipeline.stages.refine import refine
 from fluidlift.pipeline.work import Silence, Work
 from fluidlift.shape.airborne import inside_body
-from fluidlift.shape.kind import PITCH_PRIOR
 from fluidlift.shape.place import pose_up
 from fluidlift.shape.surface import inflated_surface, level_surface
 from fluidlift.types import (
@@ -62,6 +61,7 @@ from fluidlift.types import (
     Grid,
     PinholeCamera,
     concatenate,
+    kind_of,
 )
 from fluidlift.types.stages import Flow, Geometry, Read, Segmentation
 
@@ -178,7 +178,7 @@ def _tilted(camera: PinholeCamera, kind: str) -> PinholeCamera:
     """The camera in a world that is level where it is known to be, and where people usually hold it else."""
     forward = camera.camera_from_world.rotation[2]
     pitch = float(np.degrees(np.arcsin(np.clip(-forward[2], -1, 1))))
-    pitch = pitch if pitch > 5.0 else PITCH_PRIOR[kind][0]
+    pitch = pitch if pitch > 5.0 else kind_of(kind).pitch_prior[0]
     ahead = (0.0, float(np.cos(np.radians(pitch))), -float(np.sin(np.radians(pitch))))
     posed = PinholeCamera.looking((0.0, 0.0, 0.0), ahead, 50.0, camera.size)
     return PinholeCamera(camera.focal, camera.center, camera.size, posed.camera_from_world)

@@ -36,9 +36,8 @@ from fluidlift.look.vessel import glass_of
 from fluidlift.numerics.srgb import linear_from_srgb, srgb_from_linear
 from fluidlift.pipeline.looks import Backdrop, Frame, Painter
 from fluidlift.pipeline.recall import footage_of_asset
-from fluidlift.pipeline.scene import LYING
 from fluidlift.pipeline.splat_files import splat_frames
-from fluidlift.types import FluidAsset, Gaussians, Grid, PinholeCamera, Terrain, TriangleMesh
+from fluidlift.types import FluidAsset, Gaussians, Grid, PinholeCamera, Terrain, TriangleMesh, kind_of
 
 BEGIN, END = "<!-- looks:begin -->", "<!-- looks:end -->"
 SPEED_BEGIN, SPEED_END = "<!-- looks-speed:begin -->", "<!-- looks-speed:end -->"
@@ -129,7 +128,7 @@ def sheet(folder: Path, out: Path) -> None:
 
 def tile(asset: FluidAsset, folder: Path, look: Look, fluid: Gaussians, velocities: np.ndarray, view: str):
     """One picture of a sheet."""
-    lying = asset.kind in LYING
+    lying = kind_of(asset.kind).is_channel_flow
     end = OpenEnd.of(asset.cell_types, asset.grid, asset.terrain.mainstream) if lying else None
     painter = Painter(look, asset.terrain, folder, kind=asset.kind, end=end)
     width = 480

@@ -8,7 +8,7 @@ import pytest
 from fluidlift.config import build_config
 from fluidlift.errors import InputRejected
 from fluidlift.pipeline.stages import fit as stage
-from fluidlift.types import CellType, FaceVelocity, Grid
+from fluidlift.types import CellType, FaceVelocity, Grid, kind_of
 
 GRID = Grid((12, 6, 5), 0.05, (0.0, 0.0, 0.0))
 X = np.array([1.0, 0.0, 0.0])
@@ -95,18 +95,18 @@ def test_what_fills_the_vessel_is_what_the_inlet_brings(guess):
 @pytest.mark.parametrize("kind", ["stream", "fall", "pour", "plume"])
 def test_what_the_velocities_cannot_say_is_what_such_a_fluid_usually_has(guess, kind):
     found = guess([flow(0.3)], kind=kind)
-    assert found.kinematic_viscosity == stage.VISCOSITY_PRIOR[kind]
-    assert found.wall_damping == stage.WALL_DAMPING_PRIOR[kind]
+    assert found.kinematic_viscosity == kind_of(kind).kinematic_viscosity
+    assert found.wall_damping == kind_of(kind).wall_damping
     assert found.gravity == (0.0, 0.0, -9.81)
 
 
 @pytest.mark.parametrize(("kind", "width"), [("stream", 0.02), ("fall", 0.02), ("pour", 0.02)])
 def test_gravity_is_nearly_known_for_what_has_weight(kind, width):
-    assert stage.prior_widths(kind)["gravity"] == width
+    assert stage.prior_widths(kind_of(kind))["gravity"] == width
 
 
 def test_the_buoyancy_of_smoke_is_free():
-    assert stage.prior_widths("plume") == {"time_step": 0.01}
+    assert stage.prior_widths(kind_of("plume")) == {"time_step": 0.01}
 
 
 def test_the_gravity_of_smoke_cannot_be_known_since_it_stands_for_buoyancy():
@@ -118,9 +118,9 @@ def test_the_gravity_of_smoke_cannot_be_known_since_it_stands_for_buoyancy():
 
 def test_water_slips_over_its_bed_and_a_viscous_film_sticks_to_it():
     def stick(*viscous):
-        return stage.sticking("stream", [{"viscous": v} for v in viscous])
+        return stage.sticking(kind_of("stream"), [{"viscous": v} for v in viscous])
 
-    water = stage.WALL_DAMPING_PRIOR["stream"]
+    water = kind_of("stream").wall_damping
     assert stick() == water
     assert stick(0.0, 0.0, 1.0) == water  # one frame of three is an outlier
     assert stick(1.0, 1.0, 0.9) == 1.0

@@ -53,6 +53,7 @@ from fluidlift.types import (
     Similarity3,
     Terrain,
     TriangleMesh,
+    kind_of,
 )
 
 __all__ = [
@@ -175,7 +176,7 @@ def _manifest(asset: FluidAsset, start_frame: int) -> dict[str, Any]:
     return {
         "format": "fluidlift asset",
         "format_version": FORMAT_VERSION,
-        "kind": asset.kind,
+        "kind": kind_of(asset.kind).name,
         "units": {"length": "m", "time": "s", "mass": "kg", "up": "z"},
         "frame_interval": asset.interval,
         "frame_count": asset.frame_count,
@@ -233,6 +234,7 @@ def read_manifest(folder: Path | str) -> dict[str, Any]:
             "update fluidlift: pip install -U fluidlift",
         )
     _validate(manifest, "manifest", InputRejected)
+    kind_of(manifest["kind"])
     for name in manifest["files"].values():
         asset_file(folder, name)
     return manifest

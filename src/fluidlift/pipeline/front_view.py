@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fluidlift.pipeline.footage import Footage
-from fluidlift.pipeline.scene import LYING, Scene
-from fluidlift.types import Gaussians, PinholeCamera, concatenate
+from fluidlift.pipeline.scene import Scene
+from fluidlift.types import Gaussians, PinholeCamera, concatenate, kind_of
 
 if TYPE_CHECKING:
     from fluidlift.look.open_end import OpenEnd
@@ -31,7 +31,7 @@ def before_ground(scene: Scene, footage: Footage | None) -> Callable[[Gaussians]
     if footage is None:
         return None
     rocks = footage.rocks
-    ground = rocks | ~footage.labels.fluid.any(axis=0) if scene.kind in LYING else rocks
+    ground = rocks | ~footage.labels.fluid.any(axis=0) if kind_of(scene.kind).is_channel_flow else rocks
     if not ground.any():
         return None
     margin = scene.terrain.grid.spacing * np.where(rocks, *BEHIND)
@@ -76,7 +76,7 @@ def open_end(scene: Scene) -> OpenEnd | None:
     """Where a stream is cut in pictures; None of other kinds."""
     from fluidlift.look.open_end import OpenEnd
 
-    if scene.kind not in LYING:
+    if not kind_of(scene.kind).is_channel_flow:
         return None
     return OpenEnd.of(scene.cell_types, scene.terrain.grid, scene.terrain.mainstream)
 

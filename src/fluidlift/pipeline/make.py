@@ -35,7 +35,7 @@ from fluidlift.pipeline.stages.motion import motion
 from fluidlift.pipeline.stages.refine import refine
 from fluidlift.pipeline.work import Progress, Silence
 from fluidlift.pipeline.written import require_stages
-from fluidlift.types import FluidAsset
+from fluidlift.types import FluidAsset, kind_of
 from fluidlift.types.stages import Bodies, Calibration, Fit, Lift, Read, Segmentation
 
 STAGES = ("read", "flow", "segment", "geometry", "refine", "motion", "fit", "calibrate", "simulate", "show")
@@ -170,7 +170,7 @@ def _write_film(lift: Lift, folder: Path) -> None:
     from fluidlift.io.footage_file import MOST_FRAMES, write_footage
 
     film = folder / FILES["film"]
-    if lift.geometry.kind == "plume":
+    if kind_of(lift.geometry.kind).is_gas:
         film.unlink(missing_ok=True)  # of an earlier run, as something else
         return
     clip = lift.clip

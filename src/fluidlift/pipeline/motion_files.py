@@ -22,6 +22,7 @@ from fluidlift.pipeline.steady_flow import pairs_of
 from fluidlift.pipeline.volume_motion import motion_options, motion_scene, motion_warnings
 from fluidlift.pipeline.work import Progress, Silence, Work
 from fluidlift.pipeline.written import Written, numbered, require_stages
+from fluidlift.types import kind_of
 from fluidlift.types.stages import Flow, Geometry, Read, Segmentation, VelocityFiles
 
 MOTION_STAGES = ("read", "flow", "segment", "geometry", "velocities")
@@ -90,7 +91,7 @@ def write_velocities(
     wanted = [t for t in range(pairs) if t not in writer.rows]
     found = motion_sequence(
         pairs_of(clip, flow.flow), masks.__getitem__, pairs, motion_scene(clip, geometry), options,
-        frames=wanted, volume_frames=() if kind == "dam" else wanted,
+        frames=wanted, volume_frames=() if kind_of(kind).starts_at_rest else wanted,
     )  # fmt: skip
     following = next(found, None)
     for t in wanted:
@@ -102,9 +103,9 @@ def write_velocities(
     rows = writer.finish(pairs)
     shares = [r["free_fall_share"] for r in rows if r.get("free_fall_share") is not None]
     warnings = motion_warnings(rows, kind, float(max(shares, default=0.0)))
-    if kind == "dam":
+    if kind_of(kind).starts_at_rest:
         warnings.append(
-            "the shape of a dam is known as it stands, not as it collapses: flow is written, and no velocity in m/s"
+            f"the shape of a {kind} is known as it stands, not as it collapses: flow is written, and no velocity in m/s"
         )
     return VelocityFiles(tuple(rows), tuple(warnings + _unbalanced(rows)))
 

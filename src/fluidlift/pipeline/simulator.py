@@ -11,8 +11,8 @@ from fluidlift.errors import InputRejected
 from fluidlift.pipeline.dressing import lends_look
 from fluidlift.pipeline.machine import available_memory
 from fluidlift.pipeline.reshaping import sides_open_to_air
-from fluidlift.pipeline.scene import LYING, Scene, simulation_step
-from fluidlift.types import CellType, Gaussians, Particles
+from fluidlift.pipeline.scene import Scene, simulation_step
+from fluidlift.types import CellType, Gaussians, Particles, kind_of
 
 if TYPE_CHECKING:
     from fluidlift.look.inflow import InflowLook
@@ -45,7 +45,7 @@ def simulator_of(scene: Scene, device: str = "cpu", forces: Sequence[BodyForce] 
     own = scene.rest.select(np.arange(len(scene.rest) - sum(map(len, scene.emitter_looks))))
     look = inflow_look(scene, own, float(np.linalg.norm(parameters.inflow_velocity)))
     grid, supply = scene.terrain.grid, Supply(scene.inflow, scene.emitters, scene.emitter_looks)
-    if scene.kind == "plume":
+    if kind_of(scene.kind).is_gas:
         from fluidlift.physics.gas import GasSimulator
 
         return GasSimulator(
@@ -72,7 +72,7 @@ def inflow_look(scene: Scene, own: Gaussians, speed: float) -> InflowLook:
     from fluidlift.look.inflow import InflowLook
 
     # a sheet that falls has no level to keep to
-    terrain, lying, usable = scene.terrain, scene.kind == "stream", None
+    terrain, lying, usable = scene.terrain, kind_of(scene.kind).nearly_level, None
     spacing = 0.5 * terrain.grid.spacing
     if lying and len(own):
         usable = lends_look(scene, own)
@@ -85,12 +85,13 @@ def within_outlet(scene: Scene) -> tuple[np.ndarray, Particles]:
     from fluidlift.physics.inlet import inlet_along_rim, inlet_to_surface
     from fluidlift.physics.outlet import thin_outlet
 
-    if scene.kind not in LYING:
+    kind = kind_of(scene.kind)
+    if not kind.is_channel_flow:
         return scene.cell_types, scene.body
     cells, grid = thin_outlet(scene.cell_types), scene.terrain.grid
-    if scene.kind == "stream":
+    if kind.nearly_level:
         cells = inlet_to_surface(cells, scene.body.positions, grid)
-    elif scene.kind == "fall":
+    elif kind.enters_over_rim:
         gravity = np.asarray(scene.parameters.gravity)
         cells = inlet_along_rim(cells, scene.body.positions, scene.velocity, grid, gravity)
     behind = (scene.cell_types == CellType.OUTFLOW) & (cells != CellType.OUTFLOW)
@@ -108,10 +109,11 @@ def preflight(scene: Scene) -> None:
     from fluidlift.physics.stepping import SimulationSettings
     from fluidlift.physics.surface_tension import capillary_time_step
 
-    if scene.obstacles and scene.kind == "plume":
+    if scene.obstacles and kind_of(scene.kind).is_gas:
         raise InputRejected(
-            f"{scene.obstacles[0].line}: an obstacle in a plume", "obstacles in a liquid", "remove it from scene.yaml"
-        )
+            f"{scene.obstacles[0].line}: an obstacle in a {scene.kind}", "obstacles in a liquid",
+            "remove it from scene.yaml",
+        )  # fmt: skip
     p, step = scene.parameters, simulation_step(scene).time_step
     if p.surface_tension > 0:
         step = min(step, capillary_time_step(p.density, p.surface_tension, scene.terrain.grid.spacing))

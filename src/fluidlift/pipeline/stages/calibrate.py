@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fluidlift.pipeline.scene import LYING, Scene, wave_speed
+from fluidlift.pipeline.scene import Scene, wave_speed
 from fluidlift.pipeline.work import Work
-from fluidlift.types import CellType, FaceVelocity
+from fluidlift.types import CellType, FaceVelocity, kind_of
 from fluidlift.types.stages import Calibration
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ def calibrate(
     from fluidlift.physics.guidance import Nudging
     from fluidlift.pipeline.simulator import simulator_of
 
-    if not wanted or scene.kind not in LYING or not len(scene.body):
+    if not wanted or not kind_of(scene.kind).is_channel_flow or not len(scene.body):
         return Calibration()
     grid, frames = scene.terrain.grid, min(scene.frames, LONGEST)
     speed = _typical_speed(target, scene.cell_types)

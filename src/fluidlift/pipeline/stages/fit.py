@@ -27,16 +27,8 @@ from fluidlift.pipeline.fluid_masks import FluidMasks
 from fluidlift.pipeline.machine import one_torch_thread
 from fluidlift.pipeline.rising import outline_rises, with_buoyancy
 from fluidlift.pipeline.work import Work
-from fluidlift.types import CellType, FaceVelocity, FitResult, FluidParameters
+from fluidlift.types import CellType, FaceVelocity, FitResult, FluidKind, FluidParameters, kind_of
 from fluidlift.types.stages import Fit, Geometry, Motion, Read, Segmentation
-
-VISCOSITY_PRIOR = {"stream": 1e-5, "fall": 1e-5, "pour": 1e-4, "plume": 1e-5, "dam": 1e-5}
-"""m^2/s, where the fit starts"""
-
-WALL_DAMPING_PRIOR = {"stream": 0.05, "fall": 0.05, "pour": 0.2, "plume": 0.02, "dam": 0.05}
-"""share of the tangential velocity that a wall takes per step of the fit, where the fit starts: water runs nearly free
-over a bed that the grid cannot resolve. A viscous film does not: it sticks (`sticking`)"""
-
 
 AT_WALLS = ("restitution", "wall_damping")
 """not fitted unless asked for: how the velocity falls off towards a wall under water was not seen but assumed
@@ -62,7 +54,7 @@ def fit(
     from fluidlift.fit.optimize import DEFAULT_FREE
     from fluidlift.fit.ranges import UNITS
 
-    kind, masks = geometry.kind, FluidMasks(segmentation.labels.labels)
+    kind, masks = kind_of(geometry.kind), FluidMasks(segmentation.labels.labels)
     request, along = request_of(config), geometry.setting.terrain.mainstream
     _check_request(request, kind)
     filling = filling_rate(read, masks, geometry)
@@ -79,7 +71,7 @@ def fit(
     parameters, estimates = found.parameters, dict(found.estimates)
     if not judged.usable:
         # the buoyancy of smoke was guessed from its speed by the fit
-        parameters = replace(initial, gravity=parameters.gravity) if kind == "plume" else initial
+        parameters = replace(initial, gravity=parameters.gravity) if kind.is_gas else initial
         estimates = first_guess_as_result(parameters, UNITS)
     known = {name: getattr(initial, name) for name in request.held}
     parameters = replace(parameters, **known)
@@ -118,23 +110,23 @@ def fit(
     )
 
 
-def _check_request(request: FitRequest, kind: str) -> None:
+def _check_request(request: FitRequest, kind: FluidKind) -> None:
     """Raises InputRejected where a kind of fluid has no such parameter, or its clip cannot tell it."""
-    if kind == "plume" and "gravity" in request.held:
+    if kind.is_gas and "gravity" in request.held:
         raise InputRejected(
-            "a known gravity for a plume, whose gravity stands for its buoyancy", "another parameter",
+            f"a known gravity for a {kind}, whose gravity stands for its buoyancy", "another parameter",
             "give gravity in scene.yaml, for the simulation",
         )  # fmt: skip
-    if kind == "dam" and request.free:
+    if kind.starts_at_rest and request.free:
         raise InputRejected(
-            f"a fit of {', '.join(request.free)} to a dam, whose velocities are known as it stands, before it moves",
+            f"a fit of {', '.join(request.free)} to a {kind}, whose velocities are known as it stands, before it moves",
             "values that you know", "leave out fit.free and give them with --hold or in scene.yaml",
         )  # fmt: skip
 
 
-def _told_by_velocities(kind: str, free: tuple[str, ...], rises: Callable[[], bool]) -> tuple[str, ...]:
+def _told_by_velocities(kind: FluidKind, free: tuple[str, ...], rises: Callable[[], bool]) -> tuple[str, ...]:
     """What is fitted to velocities: all but the lift of smoke whose outline rises, which says more of it than they."""
-    if kind != "plume" or set(free) <= {"gravity"} or not rises():
+    if not kind.is_gas or set(free) <= {"gravity"} or not rises():
         return free
     return tuple(name for name in free if name != "gravity")
 
@@ -146,8 +138,8 @@ def _attempt(
     """One fit, judged; equations without a solution are a failure like others."""
     from fluidlift.fit.optimize import fit_parameters
 
-    setting, kind = geometry.setting, geometry.kind
-    if kind == "dam":
+    setting, kind = geometry.setting, kind_of(geometry.kind)
+    if kind.starts_at_rest:
         reason = "a body at rest tells nothing of its parameters: they are those of such a fluid, or as given"
         return FitResult(initial, {}, np.zeros(0), False, 0), Verdict("left", reason)
     try:
@@ -163,7 +155,7 @@ def _attempt(
     return found, verdict(found)
 
 
-def prior_widths(kind: str) -> dict[str, float]:
+def prior_widths(kind: FluidKind) -> dict[str, float]:
     """Relative widths of what is known before the fit looks: the time step to 1 %, gravity to 2 % of 9.81 m/s^2.
 
     The time between two frames is on record; a fit that may stretch it makes up for errors of the velocities with it.
@@ -172,7 +164,7 @@ def prior_widths(kind: str) -> dict[str, float]:
     plume's buoyancy is free.
     """
     known = {"time_step": 0.01}
-    return known if kind == "plume" else known | {"gravity": 0.02}
+    return known if kind.is_gas else known | {"gravity": 0.02}
 
 
 def filling_rate(read: Read, masks: FluidMasks, geometry: Geometry) -> float | None:
@@ -182,7 +174,7 @@ def filling_rate(read: Read, masks: FluidMasks, geometry: Geometry) -> float | N
     """
     from fluidlift.shape.surface import rounded_volume
 
-    if geometry.kind != "pour" or geometry.setting.pool_level is None:
+    if not kind_of(geometry.kind).fills_vessel or geometry.setting.pool_level is None:
         return None
     clip, depth = read.clip, geometry.depth
     distance = float(np.median(depth[depth > 0]))
@@ -209,7 +201,7 @@ def first_guess(
         interval: s between frames.
         filling: m^3/s that a vessel gains; None where nothing fills.
     """
-    setting, kind = geometry.setting, geometry.kind
+    setting, kind = geometry.setting, kind_of(geometry.kind)
     cells, direction = setting.cell_types, setting.terrain.mainstream
     mean = np.mean([t.at_centers() for t in targets], axis=0)
     inlet = cells == CellType.INFLOW
@@ -229,17 +221,17 @@ def first_guess(
         bulk = direction * min(filling / layer, float(np.linalg.norm(bulk)))
     courant = setting.terrain.grid.spacing / max(speed, 1e-6)
     return FluidParameters(
-        kinematic_viscosity=VISCOSITY_PRIOR[kind],
+        kinematic_viscosity=kind.kinematic_viscosity,
         inflow_velocity=(float(bulk[0]), float(bulk[1]), float(bulk[2])),
         inflow_fluctuation=float(spread),
         outflow_velocity=max(out, 0.0),
         restitution=0.05,
-        wall_damping=WALL_DAMPING_PRIOR[kind],
+        wall_damping=kind.wall_damping,
         time_step=float(np.clip(min(interval, 2.0 * courant), interval / 20, interval)),
     )
 
 
-def sticking(kind: str, reports: list[dict[str, Any]]) -> float:
+def sticking(kind: FluidKind, reports: list[dict[str, Any]]) -> float:
     """Share of the tangential velocity that a wall takes per step of the simulation: all of it where the motion is that
     of a viscous film (`motion.bed.film_share`), whose profile from the bed up is the flow itself. Where that is
     doubtful the two are mixed by ratio, as they differ by more than an order of magnitude.
@@ -252,4 +244,4 @@ def sticking(kind: str, reports: list[dict[str, Any]]) -> float:
         reports: of the motion's targets (`types.stages.Motion.reports`).
     """
     viscous = [r.get("viscous", 0.0) for r in reports]
-    return WALL_DAMPING_PRIOR[kind] ** (1.0 - (float(np.median(viscous)) if viscous else 0.0))
+    return kind.wall_damping ** (1.0 - (float(np.median(viscous)) if viscous else 0.0))

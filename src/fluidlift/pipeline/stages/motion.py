@@ -11,7 +11,7 @@ from fluidlift.pipeline.settings import MotionSettings
 from fluidlift.pipeline.steady_flow import pairs_of, spans_of
 from fluidlift.pipeline.volume_motion import motion_options, motion_scene, motion_warnings, plain_report, seen_cells
 from fluidlift.pipeline.work import Work
-from fluidlift.types import FaceVelocity
+from fluidlift.types import FaceVelocity, kind_of
 from fluidlift.types.stages import Flow, Geometry, Motion, Read, Segmentation, TargetVelocity
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ def motion(
     clip, (width, height) = read.clip, read.clip.size
     pairs, grid, masks = len(clip) - 1, geometry.grid, FluidMasks(segmentation.labels.labels)
     start = min(geometry.rest_frame, pairs - 1)
-    stands = geometry.kind == "dam"  # its body is known as it stands, not as it collapses
+    stands = kind_of(geometry.kind).starts_at_rest  # its body is known as it stands, not as it collapses
     targets = range(start, start if stands else min(start + config.targets, pairs))
     wanted = sorted({start, *targets} | set(range(0, pairs, config.complete_every)))
     spans = spans_of(clip)

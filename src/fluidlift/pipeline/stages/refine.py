@@ -22,6 +22,7 @@ from fluidlift.types import (
     Setting,
     VideoClip,
     concatenate,
+    kind_of,
     sh_from_rgb,
 )
 from fluidlift.types.stages import Flow, Geometry, Read, Refined, Segmentation
@@ -115,7 +116,7 @@ def refine(
     inside = [hull, _outside_solid(added, setting)]
     inside = [generate.beneath_front(part, depth, mask, camera, smallest=KEPT, drop_above=True) for part in inside]
     hull, added = (generate.within_silhouette(part, allowed, camera, smallest=KEPT) for part in inside)
-    if geometry.kind == "dam":  # its sides tell nothing of the inside that is seen once it spreads
+    if kind_of(geometry.kind).starts_at_rest:  # its sides tell nothing of the inside that is seen once it spreads
         colour = _later_colour(clip, fluid, start)
         hull, added = (replace(part, sh=sh_from_rgb(np.tile(colour, (len(part), 1)))) for part in (hull, added))
     body = concatenate([shown, hull, added])

@@ -14,11 +14,11 @@ from fluidlift.pipeline.as_filmed import BEYOND, Reel, card_of_run
 from fluidlift.pipeline.footage import Footage
 from fluidlift.pipeline.front_view import FrontView, open_end, to_bytes
 from fluidlift.pipeline.looks import Backdrop, Frame, Painter, placed_bodies
-from fluidlift.pipeline.scene import LYING, Scene
+from fluidlift.pipeline.scene import Scene
 from fluidlift.pipeline.settings import ShowSettings
 from fluidlift.pipeline.splat_files import splat_frames
 from fluidlift.pipeline.work import Work
-from fluidlift.types import PinholeCamera, Similarity3, concatenate, matrix_from_quat
+from fluidlift.types import PinholeCamera, Similarity3, concatenate, kind_of, matrix_from_quat
 from fluidlift.types.stages import Shown, Simulation
 
 
@@ -126,7 +126,7 @@ def _panels(
             compared = max(len(footage.clip) - footage.start, 1)
     rocks = front_view.rocks
     behind = terrain_depth(terrain, camera) if rocks.any() and painter is not None else None
-    airborne = scene.kind not in LYING
+    airborne = not kind_of(scene.kind).is_channel_flow
     ground = terrain_surfels(terrain, glass=glass_of(scene.kind))
     size = _panel_size(camera.size, config.width)
     # a body in the air may fill its box later; what lies on a bed stays in it

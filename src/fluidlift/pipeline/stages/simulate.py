@@ -18,6 +18,7 @@ from fluidlift.pipeline.simulator import preflight, simulator_of
 from fluidlift.pipeline.source import source_hash
 from fluidlift.pipeline.splat_files import checkpoint_file, frame_file, require_room
 from fluidlift.pipeline.work import Work
+from fluidlift.types import kind_of
 from fluidlift.types.stages import Simulation
 
 if TYPE_CHECKING:
@@ -193,7 +194,7 @@ def _save(simulator: ParticleSimulator, dressing: Dressing, scene: Scene, folder
 def _simulation_warnings(kind: str, volumes: Sequence[float], leaks: Sequence[float]) -> list[str]:
     warnings = []
     drift = volumes[-1] / max(volumes[0], 1e-12) - 1
-    if drift < -0.5 or (drift > 0.5 and kind in ("stream", "fall")):  # pours fill and smoke spreads
+    if drift < -0.5 or (drift > 0.5 and kind_of(kind).is_channel_flow):  # pours fill and smoke spreads
         word = "lost" if drift < 0 else "gained"
         warnings.append(f"the re-simulation {word} {100 * abs(drift):.0f} % of its volume by its last frame")
     if max(leaks) > 0.01:

@@ -18,6 +18,9 @@ FILES = {
     "tools/__init__.py": "from house.tools.steel import saw\n",
     "tools/steel.py": "saw = 2\n",
     "garden.py": "",
+    "kinds/__init__.py": 'def of(kind):\n    return import_module(f"{__name__}.{kind}").BUILDER\n',
+    "kinds/roof.py": "",
+    "choice.py": "from house.kinds import of\n",
 }
 
 
@@ -56,6 +59,10 @@ def test_a_change_of_anything_else_does_not(house, name):
     file = house / f"{name}.py"
     file.write_text(file.read_text() + "# changed\n")
     assert Sources(house).hash("house.stage") == before
+
+
+def test_a_package_that_finds_its_modules_by_name_uses_all_of_them(house):
+    assert Sources(house).closure("house.choice") == {"house.choice", "house.kinds", "house.kinds.roof"}
 
 
 def test_a_module_that_moves_changes_the_hash(house):

@@ -2,7 +2,8 @@
 
 The module's own text and that of all it imports inside the package, at the top and inside functions, one after the
 other. The text is searched, neither run nor parsed: all files of the package together take some 40 ms, once per
-process. Modules that are chosen by name at run time are not seen: who does so has their hashes in its settings.
+process. A package that imports its own modules by name (`import_module(f"{__name__}...")`) uses all of them; other
+modules that are chosen by name are not seen, and who does so has their hashes in its settings.
 """
 
 from __future__ import annotations
@@ -12,6 +13,9 @@ import os
 import re
 import sys
 from pathlib import Path
+
+_BY_NAME = re.compile(rb"import_module\(f[\"']\{__name__\}\.")
+"""a package that imports its own modules by name"""
 
 
 class Sources:
@@ -60,7 +64,10 @@ class Sources:
         if module not in self._read:
             path = self._file(module)
             data = b"" if path is None else path.read_bytes()
-            self._read[module] = hashlib.sha256(data).hexdigest(), frozenset(self._imported(data))
+            found = self._imported(data)
+            if _BY_NAME.search(data):
+                found |= {name for name in self._files if name.startswith(f"{module}.")}
+            self._read[module] = hashlib.sha256(data).hexdigest(), frozenset(found)
         return self._read[module]
 
     def _imported(self, text: bytes) -> set[str]:

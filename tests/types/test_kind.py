@@ -10,7 +10,6 @@ from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
-from fluidlift.pipeline.moving import sticking
 
 import fluidlift
 from fluidlift.cli.options import Make
@@ -19,12 +18,23 @@ from fluidlift.errors import InputRejected
 from fluidlift.look.vessel import glass_of
 from fluidlift.motion.bed import layer_thickness
 from fluidlift.motion.volume import volume_velocity
+from fluidlift.pipeline.stages.fit import sticking
 from fluidlift.shape.airborne import airborne_setting
 from fluidlift.shape.kind import KINDS as RECOGNISED
-from fluidlift.shape.kind import UpEvidence, estimate_up, level_camera
+from fluidlift.shape.kind import estimate_up, level_camera
 from fluidlift.shape.kinds import builder_of
 from fluidlift.shape.place import metric_scale
-from fluidlift.types import KINDS, CellType, FluidKind, FluidParameters, Grid, PinholeCamera, SurfaceMotion, kind_of
+from fluidlift.types import (
+    KINDS,
+    CellType,
+    FluidKind,
+    FluidParameters,
+    Grid,
+    PinholeCamera,
+    SurfaceMotion,
+    UpEvidence,
+    kind_of,
+)
 from fluidlift.types.kind import DAM, FALL, PLUME, POUR, STREAM
 from fluidlift.viewer.controls import controls_of
 

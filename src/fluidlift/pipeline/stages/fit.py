@@ -231,7 +231,7 @@ def first_guess(
     )
 
 
-def sticking(kind: FluidKind, reports: list[dict[str, Any]]) -> float:
+def sticking(kind: str | FluidKind, reports: list[dict[str, Any]]) -> float:
     """Share of the tangential velocity that a wall takes per step of the simulation: all of it where the motion is that
     of a viscous film (`motion.bed.film_share`), whose profile from the bed up is the flow itself. Where that is
     doubtful the two are mixed by ratio, as they differ by more than an order of magnitude.
@@ -244,4 +244,4 @@ def sticking(kind: FluidKind, reports: list[dict[str, Any]]) -> float:
         reports: of the motion's targets (`types.stages.Motion.reports`).
     """
     viscous = [r.get("viscous", 0.0) for r in reports]
-    return kind.wall_damping ** (1.0 - (float(np.median(viscous)) if viscous else 0.0))
+    return kind_of(kind).wall_damping ** (1.0 - (float(np.median(viscous)) if viscous else 0.0))

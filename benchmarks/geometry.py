@@ -2,7 +2,7 @@
 
     python benchmarks/geometry.py --work runs
     python benchmarks/geometry.py --work runs --only river --sheets sheets
-    python benchmarks/geometry.py --work runs --page docs/results.md --before before.json
+    python benchmarks/geometry.py --work runs --page docs/experiments/2026-11-geometry.md --before before.json
 
 Subjects are the demo of the package, scenes that the package simulates and films (kept in --work), and the cases below
 FLUIDLIFT_SHARED or a folder `shared` beside the repository. Masks and motion are the pipeline's own estimates; only the
@@ -26,10 +26,10 @@ from typing import Any
 
 import cv2
 import numpy as np
+from clips import subjects as runs
 from motion_page import replace_section
 from motion_subjects import Subject, default_shared, prepare, subjects
-from results import subjects as runs
-from results import table
+from report import table
 from scipy import ndimage
 
 from fluidlift.config import JobConfig, build_config
@@ -284,7 +284,7 @@ def _met(record: dict[str, Any]) -> str:
     alone = record["given"] == "nothing"
     if alone:
         met = [("up", (record["up"] or 0.0) <= GOAL_UP), ("IoU", (record["aligned"] or 0.0) >= GOAL_IOU_ALONE)]
-    elif record["kind"] == "stream":
+    elif kind_of(record["kind"]).nearly_level:
         depth = np.inf if record["depth"] is None else record["depth"]
         met = [("depth", depth < GOAL_DEPTH), ("IoU", (record["iou"] or 0.0) >= GOAL_IOU)]
     else:

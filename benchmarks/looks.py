@@ -1,8 +1,8 @@
 """Measures the looks: how near the splats come to the clip, how much each look flickers, how long a picture takes.
 
-    python benchmarks/looks.py demo.fluid river.fluid --page docs/results.md
+    python benchmarks/looks.py demo.fluid river.fluid --page docs/experiments/2026-11-looks.md
     python benchmarks/looks.py demo.fluid river.fluid --sheets sheets
-    python benchmarks/looks.py --speed --page docs/results.md
+    python benchmarks/looks.py --speed --page docs/experiments/2026-11-looks.md
 
 Assets are finished ones, with their folder work/. PSNR and SSIM compare the re-simulated splats, seen from the clip's
 camera, with the clip inside its mask. Flicker is the mean of |I(t-1) - 2 I(t) + I(t+1)| over the pixels that are
@@ -22,7 +22,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from motion_page import replace_section
-from results import table as rows_of
+from report import table as rows_of
 
 from fluidlift.evaluate.images import psnr, ssim
 from fluidlift.io.asset_folder import load_asset, read_manifest

@@ -277,7 +277,7 @@ def load_asset(folder: Path | str) -> FluidAsset:
             frame_count=manifest["frame_count"],
             provenance=manifest.get("provenance", {}),
         )
-    except ValueError as error:
+    except (ValueError, TypeError, IndexError, OverflowError) as error:
         raise InputRejected(f"the parts of '{folder.name}' contradict each other: {error}", "a whole asset") from None
 
 
@@ -290,9 +290,10 @@ def asset_file(folder: Path | str, name: str) -> Path:
     folder = Path(folder)
     foreign = PurePosixPath(name).is_absolute() or PureWindowsPath(name).drive or PureWindowsPath(name).root
     parts = PurePosixPath(name.replace("\\", "/")).parts
-    if foreign or ".." in parts or not parts or "\0" in name:
+    endless = any(len(part.encode("utf-8", "replace")) > 255 for part in parts) or len(name) > 1000
+    if foreign or ".." in parts or not parts or "\0" in name or endless:
         raise InputRejected(
-            f"the asset names the file '{name}'", "names inside its own folder", "do not trust this asset"
+            f"the asset names the file '{name[:100]}'", "names inside its own folder", "do not trust this asset"
         )
     path = folder
     for part in parts:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -95,7 +95,7 @@ def require_weights(config: DepthConfig) -> None:
             f"--depth-model {config.model} without its weights", "a file or folder with them",
             "--depth-weights PATH; docs/depth.md says where to get them",
         )  # fmt: skip
-    if not config.download and not Path(config.weights).expanduser().exists():
+    if not config.download and not os.path.exists(os.path.expanduser(config.weights)):
         raise InputRejected(
             f"weights '{config.weights}' that are not there", "an existing file or folder",
             "check --depth-weights, or --set depth.download=true for a name on the hub",

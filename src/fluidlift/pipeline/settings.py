@@ -6,6 +6,7 @@ the reading) is marked `BESIDE` and stays out of the key.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, TypeVar
@@ -190,7 +191,7 @@ class GenerateSettings:
         from fluidlift.backends.generators import require_known
 
         def path(text: str | None) -> Path | None:
-            return None if text is None else Path(text).expanduser()
+            return None if text is None else Path(os.path.expanduser(text))
 
         c, s, name = config.generate, config.shape, require_known(str(config.generate.name))
         source = source_hash("fluidlift.backends." + name.replace("-", "_"))

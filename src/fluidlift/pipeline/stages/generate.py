@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from contextlib import suppress
 from dataclasses import replace
@@ -41,7 +42,7 @@ def stages_of(stages: tuple[str, ...], config: JobConfig) -> tuple[str, ...]:
 
 def choice_of(config: GenerateSettings, field_of_view: float | None = None) -> generators.GeneratorChoice:
     """The generator as the job has it."""
-    runner = None if config.runner is None else Path(config.runner.name).expanduser()
+    runner = None if config.runner is None else Path(os.path.expanduser(config.runner.name))
     weights = None if config.weights is None else config.weights.name
     return generators.GeneratorChoice(
         config.name, config.python, config.code, runner, weights, config.device, config.seed, config.download,

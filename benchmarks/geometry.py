@@ -46,7 +46,6 @@ from fluidlift.pipeline.make import STAGES
 from fluidlift.pipeline.reading import Inputs, clip_of
 from fluidlift.pipeline.story import Silence, Story
 from fluidlift.shape.airborne import inside_body
-from fluidlift.shape.kind import PITCH_PRIOR
 from fluidlift.shape.place import pose_up
 from fluidlift.shape.surface import inflated_surface, level_surface
 from fluidlift.types import (
@@ -58,6 +57,7 @@ from fluidlift.types import (
     Grid,
     PinholeCamera,
     concatenate,
+    kind_of,
 )
 
 BEGIN, END = "<!-- geometry:begin -->", "<!-- geometry:end -->"
@@ -166,7 +166,7 @@ def _tilted(camera: PinholeCamera, kind: str) -> PinholeCamera:
     """The camera in a world that is level where it is known to be, and where people usually hold it else."""
     forward = camera.camera_from_world.rotation[2]
     pitch = float(np.degrees(np.arcsin(np.clip(-forward[2], -1, 1))))
-    pitch = pitch if pitch > 5.0 else PITCH_PRIOR[kind][0]
+    pitch = pitch if pitch > 5.0 else kind_of(kind).pitch_prior[0]
     ahead = (0.0, float(np.cos(np.radians(pitch))), -float(np.sin(np.radians(pitch))))
     posed = PinholeCamera.looking((0.0, 0.0, 0.0), ahead, 50.0, camera.size)
     return PinholeCamera(camera.focal, camera.center, camera.size, posed.camera_from_world)
@@ -273,7 +273,7 @@ def _met(record: dict[str, Any]) -> str:
     alone = record["given"] == "nothing"
     if alone:
         met = [("up", (record["up"] or 0.0) <= GOAL_UP), ("IoU", (record["aligned"] or 0.0) >= GOAL_IOU_ALONE)]
-    elif record["kind"] == "stream":
+    elif kind_of(record["kind"]).nearly_level:
         depth = np.inf if record["depth"] is None else record["depth"]
         met = [("depth", depth < GOAL_DEPTH), ("IoU", (record["iou"] or 0.0) >= GOAL_IOU)]
     else:

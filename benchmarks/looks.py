@@ -37,11 +37,10 @@ from fluidlift.numerics.srgb import linear_from_srgb, srgb_from_linear
 from fluidlift.pipeline.looks import Backdrop, Frame, Painter
 from fluidlift.pipeline.reading import clip_of
 from fluidlift.pipeline.resimulate import FIRST_HALF, recall_first_half
-from fluidlift.pipeline.scene import LYING
 from fluidlift.pipeline.seeing import labels_of
 from fluidlift.pipeline.showing import splat_frames
 from fluidlift.pipeline.story import Silence, Story
-from fluidlift.types import FluidAsset, Gaussians, Grid, PinholeCamera, Terrain, TriangleMesh
+from fluidlift.types import FluidAsset, Gaussians, Grid, PinholeCamera, Terrain, TriangleMesh, kind_of
 
 BEGIN, END = "<!-- looks:begin -->", "<!-- looks:end -->"
 SPEED_BEGIN, SPEED_END = "<!-- looks-speed:begin -->", "<!-- looks-speed:end -->"
@@ -135,7 +134,7 @@ def sheet(folder: Path, out: Path) -> None:
 
 def tile(asset: FluidAsset, folder: Path, look: Look, fluid: Gaussians, velocities: np.ndarray, view: str):
     """One picture of a sheet."""
-    lying = asset.kind in LYING
+    lying = kind_of(asset.kind).is_channel_flow
     end = OpenEnd.of(asset.cell_types, asset.grid, asset.terrain.mainstream) if lying else None
     painter = Painter(look, asset.terrain, folder, kind=asset.kind, end=end)
     width = 480

@@ -50,7 +50,7 @@ def test_a_folder_gives_its_videos(tmp_path, capsys):
         ("- clip: a.mp4\n  size: {x: 1}\n", "a word or a number"),
         ("- size: 3\n", "shot 1 names no clip"),
         ("clip: a.mp4\n", "holds no list"),
-        ("- [\n", "is not YAML"),
+        ("- [\n", "shots.yaml cannot be read: line 2"),
         ("- clip: a.mp4\n  out: elsewhere\n", "unknown option 'out'"),
     ],
 )
@@ -63,7 +63,7 @@ def test_a_list_that_cannot_be_used_is_refused_before_anything_is_made(tmp_path,
 
 def test_places_that_cannot_be_used_are_named(tmp_path, capsys):
     assert main(["batch", str(tmp_path / "gone.yaml"), "-o", str(tmp_path / "out")]) == REJECTED
-    assert "gone.yaml: No such file" in capsys.readouterr().err
+    assert "no such list of shots" in capsys.readouterr().err
     (tmp_path / "a.mp4").write_text("no film")
     assert main(["batch", str(tmp_path / "a.mp4"), "-o", "/proc/no"]) == REJECTED
     assert "/proc/no" in capsys.readouterr().err

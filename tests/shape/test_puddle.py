@@ -2,9 +2,10 @@ import numpy as np
 import pytest
 
 from fluidlift.shape.jets import Outline
-from fluidlift.shape.kind import PITCH_PRIOR, UpEvidence
+from fluidlift.shape.kind import UpEvidence
 from fluidlift.shape.puddle import down_to_landing, fit_ellipse, jets_into_puddle, puddle_tilt
 from fluidlift.types import PinholeCamera
+from fluidlift.types.kind import STREAM
 
 H, W = 160, 160
 CAMERA = PinholeCamera.from_fov(40.0, (W, H))
@@ -65,7 +66,7 @@ def test_the_ellipse_of_an_ellipse_is_itself():
 def test_a_flatter_pool_is_seen_at_a_lower_angle(pitch):
     habit = UpEvidence(10.0, 2.0, "", 0.0)
     found = puddle_tilt(pool(50.0 * np.sin(np.radians(pitch))), habit)
-    usual = PITCH_PRIOR["stream"][0]
+    usual = STREAM.pitch_prior[0]
     # between the usual view and what a round pool says, as a pool may be out of round
     assert min(pitch, usual) - 0.5 <= found.pitch <= max(pitch, usual) + 0.5
     assert found.roll == habit.roll

@@ -8,6 +8,8 @@ from typing import Annotated, Literal
 
 import tyro
 
+from fluidlift.types.kind import KindChoice
+
 Clip = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CLIP")]
 Asset = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="ASSET")]
 
@@ -16,7 +18,7 @@ Asset = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="ASSET")]
 class Scene:
     """What the clip does not say by itself."""
 
-    kind: Literal["auto", "stream", "fall", "pour", "plume", "dam"] | None = None
+    kind: KindChoice | None = None
     """what the fluid does; auto decides from evidence that the report shows"""
     size: float | None = None
     """metres across the fluid (its longest side); sets the scale"""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -12,26 +11,19 @@ from scipy import ndimage
 from fluidlift.errors import require
 from fluidlift.shape import chute, prism, slope
 from fluidlift.shape.texture_gradient import TexturePatches
-from fluidlift.types import PinholeCamera, RigidTransform
+from fluidlift.types import FluidKind, PinholeCamera, RigidTransform, kind_of
+from fluidlift.types.kind import KINDS as FLUID_KINDS
+from fluidlift.types.kind import STREAM
 
-Kind = Literal["stream", "fall", "pour", "plume", "dam"]
-KINDS: tuple[Kind, ...] = get_args(Kind)
-
-PITCH_PRIOR: dict[str, tuple[float, float]] = {
-    "stream": (40.0, 13.0),
-    "fall": (8.0, 8.0),
-    "pour": (8.0, 8.0),
-    "plume": (2.0, 6.0),
-    "dam": (25.0, 12.0),
-}
-"""mean and standard deviation of how far people tilt a camera down at such a fluid, degrees (a choice, not a law)"""
+KINDS: tuple[str, ...] = tuple(name for name, kind in FLUID_KINDS.items() if kind.recognised)
+"""names of the kinds whose evidence is weighed"""
 
 
 @dataclass(frozen=True)
 class KindEvidence:
     """Why a kind was chosen."""
 
-    kind: Kind
+    kind: str
     scores: dict[str, float]
     """share of belief per kind, sums to 1"""
     features: dict[str, float]
@@ -179,7 +171,7 @@ def _collapsing(fluid: np.ndarray) -> float:
 
 
 def estimate_up(
-    kind: Kind,
+    kind: str | FluidKind,
     mask: Bool[np.ndarray, "h w"],
     displacement: Float[np.ndarray, "h w 2"],
     confidence: Float[np.ndarray, "h w"],
@@ -209,18 +201,19 @@ def estimate_up(
         texture: of the fluid's pictures; of a stream without chutes it shows the tilt as well.
         level_prior: share of such streams that are level.
     """
-    mean, sigma = PITCH_PRIOR[kind]
+    kind = kind_of(kind)
+    mean, sigma = kind.pitch_prior
     found_pitch, found_roll, source, trust = mean, 0.0, f"usual view of a {kind}", 0.0
-    if kind == "stream":
+    if kind.nearly_level:
         tilt, source_seen = _tilt_of_stream(mask, displacement, confidence, camera, texture, level_prior)
         if tilt is not None:
             found_pitch, found_roll, trust, source = tilt.pitch, tilt.roll, tilt.gained, source_seen
-    elif kind == "dam" and mask.any():
+    elif kind.starts_at_rest and mask.any():
         found_pitch, left = prism.upright_tilt(
             mask, lambda p: level_camera(camera, UpEvidence(p, roll or 0.0, "", 0.0)), (mean, sigma)
         )
         source, trust = "upright edges of the body", float(np.clip(1.0 - left / sigma, 0.0, 1.0))
-    elif kind in ("fall", "pour"):  # wind leans smoke more often than hands turn cameras
+    elif kind.falls_freely:  # wind leans smoke more often than hands turn cameras
         weight = np.where(mask, confidence * np.linalg.norm(displacement, axis=-1), 0.0)
         down = (weight[..., None] * displacement).sum((0, 1))
         if down[1] > 0 and weight.sum() > 0:
@@ -240,7 +233,7 @@ def _tilt_of_stream(
     mask, displacement, confidence, camera, texture, level_prior
 ) -> tuple[slope.TiltEvidence | None, str]:
     """What its motion and its pattern say, None where they say nothing; and which of them spoke."""
-    mean, sigma = PITCH_PRIOR["stream"]
+    mean, sigma = STREAM.pitch_prior
     # a chute is another plane than what it comes down onto
     steep = chute.chute_pixels(level_camera(camera, UpEvidence(mean, 0.0, "", 0.0)), mask, displacement, confidence)
     lying = confidence * ~np.any(steep, axis=0) if steep else confidence

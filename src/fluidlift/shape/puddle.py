@@ -12,9 +12,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from fluidlift.shape.jets import Outline, airborne_pixels, find_jets, lying_pixels
-from fluidlift.shape.kind import PITCH_PRIOR, UpEvidence, level_camera
+from fluidlift.shape.kind import UpEvidence, level_camera
 from fluidlift.shape.region import largest_piece
 from fluidlift.types import PinholeCamera
+from fluidlift.types.kind import STREAM
 
 ROUND = 0.85
 """IoU of a pool's outline with the ellipse of its moments, at least: a rectangle has 0.83, a glass from the side less.
@@ -83,7 +84,7 @@ def jets_into_puddle(
         motion: mean over the clip, px per frame.
         trust: of it.
     """
-    tilt = up or UpEvidence(PITCH_PRIOR["stream"][0], 0.0, "", 0.0)
+    tilt = up or UpEvidence(STREAM.pitch_prior[0], 0.0, "", 0.0)
     found = find_jets(level_camera(camera, tilt), mask, motion, trust)
     found = [down_to_landing(outline, mask, motion, trust) for outline in found]
     airborne = airborne_pixels(found, mask.shape)
@@ -140,7 +141,7 @@ def puddle_tilt(lying: Bool[np.ndarray, "h w"], habit: UpEvidence) -> UpEvidence
     pool = fit_ellipse(lying)
     if pool is None or pool.likeness < ROUND or pool.flatness >= 1.0:
         return habit
-    mean, sigma = PITCH_PRIOR["stream"]
+    mean, sigma = STREAM.pitch_prior
     seen = np.arcsin(pool.flatness)
     error = np.degrees(OUT_OF_ROUND * np.tan(seen))  # d pitch = tan(pitch) d log(sin(pitch))
     weight = sigma**2 / (sigma**2 + error**2)

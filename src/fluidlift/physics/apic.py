@@ -1,7 +1,8 @@
-"""The liquid: affine particle-in-cell with pressure projection (paper: "Presumed APIC Simulation").
+"""The liquid simulator: affine particle-in-cell (APIC) and pressure projection (paper: "Presumed APIC Simulation").
 
-One substep: fill the inlet; particles to grid; gravity; viscosity; pressure; continue the velocity into air and along
-walls; grid to particles; move; correct crowding; collide; deform; remove what has left. A substep either completes
+One substep, as long as the CFL number allows: fill the inlet; P2G; gravity; viscosity; pressure projection;
+extrapolate the velocity into air and along walls; G2P; advect (RK2); correct positions; collide; deform; remove what
+has left. A substep either completes
 or leaves the state as it was.
 """
 

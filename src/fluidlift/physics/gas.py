@@ -1,4 +1,4 @@
-"""The gas: smoke carried by air that fills the whole box.
+"""The gas simulator: smoke in air on a MAC grid, with MacCormack advection; tracers move by RK2.
 
 The air is incompressible and solved on the grid: advection (MacCormack after Selle et al. 2008, limited to the values
 it interpolates), buoyancy where there is smoke, viscosity, pressure. The sides of the box are open (p = 0) except the
@@ -74,8 +74,8 @@ def _trace_back(q, u, v, w, axis, cells, out, low, high):
 
 
 def advect_maccormack(velocity: FaceVelocity, grid: Grid, dt: float) -> FaceVelocity:
-    """The velocity carried along itself for dt (s): back-trace, estimate of its error by tracing forth, correction,
-    limited to the range of the values that the back-trace interpolates."""
+    """MacCormack advection of the velocity by itself for dt (s): back-trace, estimate of its error by tracing
+    forth, correction, limited to the range of the values that the back-trace interpolates."""
     u, v, w = (np.ascontiguousarray(c, np.float32) for c in velocity.components)
     cells = dt / grid.spacing
     out = []

@@ -263,7 +263,7 @@ class ParticleSimulator(ABC):
         return float(np.linalg.norm(self.parameters.gravity))
 
     def _substep_length(self, remaining: float) -> float:
-        """Equal substeps within the Courant limit, the gain of speed by body forces included."""
+        """Equal substeps within the CFL limit (`settings.courant`), the gain of speed by body forces included."""
         longest = min(self.parameters.time_step, remaining)
         gain = self._speed_gain()
         # (speed + gain dt) dt <= courant h

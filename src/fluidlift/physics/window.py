@@ -1,4 +1,4 @@
-"""The part of the box that a substep works on: cost follows the liquid, not the box.
+"""The active region of the grid, which a substep works on: cost follows the liquid, not the box.
 
 The window is the bounding box of the particles with a margin, rounded outwards to whole blocks so that it seldom
 changes. It depends on the present particles only, not on the past. Beyond it there is air, as far as the liquid of

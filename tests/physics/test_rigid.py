@@ -9,8 +9,8 @@ from fluidlift.errors import InputRejected
 from fluidlift.numerics.poisson import PoissonSystem
 from fluidlift.numerics.solid_mesh import flipped
 from fluidlift.physics import boundaries, free_surface, transfer
-from fluidlift.physics.crowding import cell_capacity
 from fluidlift.physics.forces import add_gravity
+from fluidlift.physics.position_correction import cell_capacity
 from fluidlift.physics.pressure import build_system, divergence, face_fractions, project
 from fluidlift.physics.rigid import RigidBodies, RigidBody, Trajectory
 from fluidlift.physics.rigid_body import slowed

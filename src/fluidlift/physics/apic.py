@@ -15,12 +15,12 @@ import numpy as np
 
 from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.physics import transfer
-from fluidlift.physics.crowding import fill_ratio, spreading
 from fluidlift.physics.emitter import Supply
 from fluidlift.physics.guidance import BodyForce
 from fluidlift.physics.liquid_grid import Layout, LiquidGrid
 from fluidlift.physics.numba_particles import ParticleWork
 from fluidlift.physics.outlet import surplus
+from fluidlift.physics.position_correction import fill_ratio, spreading
 from fluidlift.physics.pressure import build_system
 from fluidlift.physics.reseed import inner_cells, reseed
 from fluidlift.physics.rigid import RigidBodies, RigidBody

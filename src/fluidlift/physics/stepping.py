@@ -18,9 +18,9 @@ from fluidlift.errors import FluidliftError, InputRejected, require
 from fluidlift.numerics.sampling import sample_centers
 from fluidlift.numerics.signed_distance import push_outside
 from fluidlift.physics import boundaries, transfer
-from fluidlift.physics.crowding import cell_capacity
 from fluidlift.physics.emitter import Supply
 from fluidlift.physics.inlet import Inlet
+from fluidlift.physics.position_correction import cell_capacity
 from fluidlift.physics.rigid import RigidBodies
 from fluidlift.physics.viscosity import NEGLIGIBLE, FaceRoles, diffuse_with_bodies
 from fluidlift.physics.window import Window, open_window

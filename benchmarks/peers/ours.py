@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 
 from fluidlift.physics import transfer
+from fluidlift.physics.advect_particles import displacements
 from fluidlift.physics.apic import LiquidSimulator, SimulationSettings
 from fluidlift.physics.forces import add_gravity
 from fluidlift.physics.stepping import TIDY_EVERY
-from fluidlift.physics.travel import displacements
 from fluidlift.physics.window import window_around
 from fluidlift.types import FluidParameters, Grid, Particles, Terrain, TriangleMesh
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.physics import transfer
+from fluidlift.physics.advect_particles import displacements, leaving
 from fluidlift.physics.emitter import Supply
 from fluidlift.physics.guidance import BodyForce
 from fluidlift.physics.liquid_grid import Layout, LiquidGrid
@@ -31,7 +32,6 @@ from fluidlift.physics.stepping import (
     SimulationSettings,
     StepReport,
 )
-from fluidlift.physics.travel import displacements, leaving
 from fluidlift.physics.window import Window
 from fluidlift.seams import MoveRules
 from fluidlift.types import CellType, FaceVelocity, FluidParameters, Grid, Particles, SolveReport, Terrain

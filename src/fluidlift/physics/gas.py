@@ -15,13 +15,13 @@ from numba import njit, prange
 from fluidlift.errors import FluidliftError, InputRejected, require
 from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.physics import boundaries, transfer
+from fluidlift.physics.advect_particles import leaving
 from fluidlift.physics.deform import updated_deformation
 from fluidlift.physics.emitter import Supply
 from fluidlift.physics.forces import add_buoyancy
 from fluidlift.physics.position_correction import fill_ratio
 from fluidlift.physics.pressure import build_system, project
 from fluidlift.physics.stepping import EmitSource, Outcome, ParticleSimulator, SimulationSettings
-from fluidlift.physics.travel import leaving
 from fluidlift.types import CellType, FaceVelocity, FluidParameters, Grid, Particles, SolveReport, Terrain
 
 

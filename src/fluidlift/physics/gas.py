@@ -201,7 +201,7 @@ class GasSimulator(ParticleSimulator):
                 *((c * (1.0 - taken * s)).astype(np.float32) for c, s in zip(velocity.components, self._wall_share))
             )
         velocity = self._inlet.impose(velocity, self.time)
-        velocity, viscosity_reports = self._viscous(velocity, self._open_faces, self._window, dt)
+        velocity, viscosity_reports = self._viscous(velocity, self._open_faces, self._region, dt)
         initial = None if self._head_rate is None else self._head_rate * dt
         velocity, q, report = project(
             velocity, self._system, tolerance=self.settings.pressure_tolerance, initial=initial

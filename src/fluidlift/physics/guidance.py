@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fluidlift.errors import require
-from fluidlift.physics.window import Box, face_box
+from fluidlift.physics.active_region import Box, face_box
 from fluidlift.types import FaceVelocity
 
 Masses = tuple[Float[np.ndarray, "..."], ...]

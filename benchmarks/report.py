@@ -13,7 +13,8 @@ One JSON file per topic:
     records            {subject, figure, value, before; goal, unit, better, command, date, machine where they differ}
 
 Topics, figures and records with `"shown": false` are in the file, in comparisons, and not on the page. `before` is the
-value that the last change replaced. A benchmark adds its records with `put`.
+value that the last change replaced. A benchmark adds its records with `put`, as `clips.py` does for clips and cases;
+the figures of the other topics were copied from what their commands print, and have to be again after a new run.
 """
 
 from __future__ import annotations

@@ -41,6 +41,13 @@ def test_a_folder_gives_its_videos(tmp_path, capsys):
     assert list(summary(tmp_path / "out")) == ["a", "b"]
 
 
+def test_a_home_of_nobody_is_a_name_like_any_other(tmp_path):
+    (tmp_path / "shots.yaml").write_text("- ~nobody-is-called-so.mp4\n")
+    assert main(["batch", str(tmp_path / "shots.yaml"), "-o", str(tmp_path / "out")]) == FAILED
+    (row,) = summary(tmp_path / "out").values()
+    assert row["outcome"] == "rejected" and "no such video" in row["reason"]
+
+
 @pytest.mark.parametrize(
     ("rows", "words"),
     [

@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import difflib
 import json
+import os
 import reprlib
 import subprocess
 import sys
@@ -189,7 +190,7 @@ def _row(row: Any, where: str, folder: Path) -> dict[str, Any]:
             needed = "a word or a number" + (", or a list of them" * several)
             raise InputRejected(f"{where}: {key}: {reprlib.repr(value)}", needed)
         if key == "clip" or "Path" in kinds.get(key, ""):
-            found[key] = folder / Path(str(value)).expanduser()
+            found[key] = folder / os.path.expanduser(str(value))  # pathlib raises where there is no such user
         else:
             found[key] = [str(v) for v in values] if several else value
     return found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -101,7 +102,7 @@ def require_weights(config: JobConfig) -> None:
             f"--depth-model {d.model} without its weights", "a file or folder with them",
             "--depth-weights PATH; docs/depth.md says where to get them",
         )  # fmt: skip
-    if not d.download and not Path(d.weights).expanduser().exists():
+    if not d.download and not os.path.exists(os.path.expanduser(d.weights)):
         raise InputRejected(
             f"weights '{d.weights}' that are not there", "an existing file or folder",
             "check --depth-weights, or --set depth.download=true for a name on the hub",

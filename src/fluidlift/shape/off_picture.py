@@ -1,4 +1,4 @@
-"""The surface of a stream beyond the edges of the picture: the seen one goes on as in a mirror.
+"""Extrapolation of a stream's surface beyond the edges of the picture: the seen one goes on as in a mirror.
 
 What the camera does not see is part of the body all the same, and some of it flows into the picture a moment later. The
 colours of the nearest pixels would come in as smears.

@@ -1,4 +1,4 @@
-"""From the canonical frame of a single view to metres: the one free scale, the heading, the origin."""
+"""Registration and scale, from the canonical frame of a single view to metres: the free scale, heading, origin."""
 
 from __future__ import annotations
 

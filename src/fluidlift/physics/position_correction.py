@@ -1,4 +1,4 @@
-"""Against clumps: small moves of particles from crowded places to others, which leave the velocity alone.
+"""Position correction against clumps: particles are spread from crowded places, their velocity left alone.
 
 After Kugelstadt, Longva, Thuerey, Bender 2019, "Implicit density projection for volume conserving liquids": where
 particles fill more than a cell holds, a displacement field with the divergence of the excess spreads them. Cells

@@ -1,4 +1,4 @@
-"""How particles move in a substep: second-order displacement, and which of them leave the box."""
+"""Particle advection in a substep: second-order Runge-Kutta (RK2, midpoint), and which particles leave the box."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def _displace(velocities, affine, dt, moves, farthest):
 def displacements(
     velocities: Float[np.ndarray, "n 3"], affine: Float[np.ndarray, "n 3 3"], dt: float
 ) -> tuple[Float[np.ndarray, "n 3"], float]:
-    """dt (v + dt/2 C v) in m: the velocity half way, by the particle's own gradient; and its largest component.
+    """RK2 displacement dt (v + dt/2 C v) in m: the velocity half way, by the affine matrix; and its largest component.
 
     The largest component is not a number where any displacement is not one.
     """

@@ -1,10 +1,10 @@
-"""The window of a substep: it holds what matters, and changes nothing."""
+"""The region of a substep: it holds what matters, and changes nothing."""
 
 import numpy as np
 
+from fluidlift.physics.active_region import BLOCK, MARGIN, crop_walls, face_box, moved_to, region_around
 from fluidlift.physics.apic import LiquidSimulator, SimulationSettings
 from fluidlift.physics.boundaries import build_walls
-from fluidlift.physics.window import BLOCK, MARGIN, crop_walls, face_box, moved_to, window_around
 from fluidlift.types import CellType, FluidParameters, Grid, Particles, Terrain, TriangleMesh
 
 GRID = Grid((40, 33, 20), 0.1, (1.0, -2.0, 0.5))
@@ -16,11 +16,11 @@ def terrain_on(grid, distance):
     )
 
 
-def test_the_window_holds_all_particles_with_a_margin_and_stays_in_the_box():
+def test_the_region_holds_all_particles_with_a_margin_and_stays_in_the_box():
     rng = np.random.default_rng(0)
     for low, high in (([2.0, -1.0, 1.0], [2.4, -0.5, 1.2]), ([1.0, -2.0, 0.5], [5.0, 1.29, 2.49])):
         points = rng.uniform(low, high, (9000, 3)).astype(np.float32)
-        box = window_around(points, GRID)
+        box = region_around(points, GRID)
         cells = GRID.cell_of(points)
         for axis, side in enumerate(box):
             assert 0 <= side.start and side.stop <= GRID.shape[axis]
@@ -31,7 +31,7 @@ def test_the_window_holds_all_particles_with_a_margin_and_stays_in_the_box():
 
 def test_cells_that_must_be_kept_are_kept():
     points = np.array([[4.5, 1.0, 2.0]], np.float32)
-    box = window_around(points, GRID, (np.array([0, 3, 1]), np.array([2, 5, 4])))
+    box = region_around(points, GRID, (np.array([0, 3, 1]), np.array([2, 5, 4])))
     assert [s.start for s in box] == [0, 0, 0]
 
 

@@ -1,6 +1,6 @@
-"""The part of the box that a substep works on: cost follows the liquid, not the box.
+"""The active region of the grid, which a substep works on: cost follows the liquid, not the box.
 
-The window is the bounding box of the particles with a margin, rounded outwards to whole blocks so that it seldom
+The region is the bounding box of the particles with a margin, rounded outwards to whole blocks so that it seldom
 changes. It depends on the present particles only, not on the past. Beyond it there is air, as far as the liquid of
 one substep can feel: the margin exceeds the longest way of a particle plus the layers of continued velocity.
 """
@@ -17,9 +17,9 @@ from fluidlift.physics.boundaries import Walls, beside_closed_faces
 from fluidlift.types import Grid
 
 MARGIN = 4
-"""cells between the outermost particle and the window's side"""
+"""cells between the outermost particle and the region's side"""
 BLOCK = 8
-"""cells: windows begin and end at multiples of it"""
+"""cells: regions begin and end at multiples of it"""
 CHUNK = 4096
 
 Box = tuple[slice, slice, slice]
@@ -37,10 +37,10 @@ def _extremes(positions, lows, highs):
                 highs[chunk, a] = max(highs[chunk, a], positions[p, a])
 
 
-def window_around(
+def region_around(
     positions: Float[np.ndarray, "n 3"], grid: Grid, kept: tuple[np.ndarray, np.ndarray] | None = None
 ) -> Box:
-    """The window of particles (at least one); `kept` is a range of cells (low, high exclusive) that it must hold."""
+    """The region of particles (at least one); `kept` is a range of cells (low, high exclusive) that it must hold."""
     chunks = (len(positions) + CHUNK - 1) // CHUNK
     lows, highs = np.full((chunks, 3), np.inf, np.float32), np.full((chunks, 3), -np.inf, np.float32)
     _extremes(positions, lows, highs)
@@ -55,12 +55,12 @@ def window_around(
 
 
 def face_box(box: Box, axis: int) -> Box:
-    """The faces across `axis` of the window's cells."""
+    """The faces across `axis` of the region's cells."""
     return tuple(slice(s.start, s.stop + (a == axis)) for a, s in enumerate(box))
 
 
 def crop_walls(walls: Walls, box: Box) -> Walls:
-    """The walls inside a window, on the window's own grid."""
+    """The walls inside a region, on the region's own grid."""
     grid = walls.grid
     inner = Grid(
         tuple(s.stop - s.start for s in box), grid.spacing,
@@ -77,12 +77,12 @@ def crop_walls(walls: Walls, box: Box) -> Walls:
 
 
 @dataclass(frozen=True)
-class Window:
-    """What a substep knows about its window."""
+class ActiveRegion:
+    """What a substep knows about its region."""
 
     box: Box
     walls: Walls
-    """cut to the window"""
+    """cut to the region"""
     capacity: Float[np.ndarray, "nx ny nz"]
     """of `crowding.cell_capacity`"""
     wall_cells: Bool[np.ndarray, "nx ny nz"]
@@ -90,25 +90,25 @@ class Window:
 
     @property
     def grid(self) -> Grid:
-        """Of the window."""
+        """Of the region."""
         return self.walls.grid
 
     @property
     def first(self) -> tuple[int, int, int]:
-        """Indices of the window's first cell in the whole box."""
+        """Indices of the region's first cell in the whole box."""
         return tuple(s.start for s in self.box)
 
 
-def open_window(box: Box, walls: Walls, capacity: Float[np.ndarray, "nx ny nz"]) -> Window:
-    """The window `box` onto walls and capacity of the whole box."""
+def open_region(box: Box, walls: Walls, capacity: Float[np.ndarray, "nx ny nz"]) -> ActiveRegion:
+    """The region `box` onto walls and capacity of the whole box."""
     inner = crop_walls(walls, box)
-    return Window(box, inner, np.ascontiguousarray(capacity[box]), beside_closed_faces(inner))
+    return ActiveRegion(box, inner, np.ascontiguousarray(capacity[box]), beside_closed_faces(inner))
 
 
 def moved_to(
     values: Float[np.ndarray, "nx ny nz"], old: tuple[int, int, int], new: tuple[int, int, int], shape: tuple[int, ...]
 ) -> Float[np.ndarray, "nx ny nz"]:
-    """Cell values of the window that begins at `old`, on the window of `shape` that begins at `new`; 0 where new."""
+    """Cell values of the region that begins at `old`, on the region of `shape` that begins at `new`; 0 where new."""
     out = np.zeros(shape, values.dtype)
     source, target = [], []
     for axis in range(3):

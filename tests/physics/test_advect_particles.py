@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from fluidlift.physics.advect_particles import displacements, displacements_plain, leaving, leaving_plain
 from fluidlift.physics.boundaries import build_walls
-from fluidlift.physics.travel import displacements, displacements_plain, leaving, leaving_plain
 from fluidlift.types import CellType, Grid, Terrain, TriangleMesh
 
 RNG = np.random.default_rng(4)

@@ -2,9 +2,8 @@ import numpy as np
 import pytest
 
 from fluidlift.shape.jets import Outline
-from fluidlift.shape.kind import UpEvidence
 from fluidlift.shape.puddle import down_to_landing, fit_ellipse, jets_into_puddle, puddle_tilt
-from fluidlift.types import PinholeCamera
+from fluidlift.types import PinholeCamera, UpEvidence
 from fluidlift.types.kind import STREAM
 
 H, W = 160, 160

@@ -71,7 +71,7 @@ def _require_bounded(file: str, width: int, height: int, channels: int, limits: 
         raise InputRejected(
             f"'{file}' is {width} x {height} pixels",
             f"1 to {limits.max_pixels} pixels, and at most {MAX_SIDE} a side",
-            "scale it down, or raise the limit with --max-pixels",
+            "scale it down, or raise the limit with --set read.max_pixels=NUMBER",
         )
     most = MAX_PIXEL_BYTES * limits.max_pixels
     if 4 * width * height * channels > most:

@@ -77,7 +77,7 @@ def checked_header(data: bytes, name: str, limits: ReadLimits) -> PictureHeader:
         raise InputRejected(
             f"'{name}' is {head.width} x {head.height} pixels",
             f"at most {limits.max_pixels} pixels, and {MAX_SIDE} a side",
-            "scale it down, or raise the limit with --max-pixels",
+            "scale it down, or raise the limit with --set read.max_pixels=NUMBER",
         )
     if size * head.pixel_bytes > MAX_PIXEL_BYTES * limits.max_pixels:
         raise InputRejected(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
@@ -11,37 +9,12 @@ from scipy import ndimage
 from fluidlift.errors import require
 from fluidlift.shape import chute, prism, slope
 from fluidlift.shape.texture_gradient import TexturePatches
-from fluidlift.types import FluidKind, PinholeCamera, RigidTransform, kind_of
+from fluidlift.types import FluidKind, KindEvidence, PinholeCamera, RigidTransform, UpEvidence, kind_of
 from fluidlift.types.kind import KINDS as FLUID_KINDS
 from fluidlift.types.kind import STREAM
 
 KINDS: tuple[str, ...] = tuple(name for name, kind in FLUID_KINDS.items() if kind.recognised)
 """names of the kinds whose evidence is weighed"""
-
-
-@dataclass(frozen=True)
-class KindEvidence:
-    """Why a kind was chosen."""
-
-    kind: str
-    scores: dict[str, float]
-    """share of belief per kind, sums to 1"""
-    features: dict[str, float]
-    """the measured figures behind the scores"""
-
-
-@dataclass(frozen=True)
-class UpEvidence:
-    """Which way is up, as seen by the camera."""
-
-    pitch: float
-    """degrees that the camera looks below the horizon"""
-    roll: float
-    """degrees that the picture is turned clockwise"""
-    source: str
-    """user, camera file, or what it was estimated from"""
-    confidence: float
-    """0 (prior alone) to 1 (given)"""
 
 
 def estimate_kind(

@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from fluidlift.shape.jets import Outline, airborne_pixels, find_jets, lying_pixels
-from fluidlift.shape.kind import UpEvidence, level_camera
+from fluidlift.shape.kind import level_camera
 from fluidlift.shape.region import largest_piece
-from fluidlift.types import PinholeCamera
+from fluidlift.types import PinholeCamera, UpEvidence
 from fluidlift.types.kind import STREAM
 
 ROUND = 0.85

@@ -19,6 +19,7 @@ from fluidlift.io.asset_paths import asset_file, asset_files
 from fluidlift.io.checkpoint import Checkpoint, write_checkpoint
 from fluidlift.io.ply import write_gaussians
 from fluidlift.io.stage_cache import Scratch, load_stage, save_stage
+from fluidlift.pipeline.splat_files import checkpoint_file, frame_file
 
 PLACES = (
     "frames", "frames/splats", "frames/splats/1002.ply", "work", "work/simulate", "work/checkpoint",
@@ -138,3 +139,10 @@ def test_a_pipe_in_an_asset_holds_up_nobody(whole, tmp_path, capsys):
 def test_an_asset_may_itself_be_reached_through_a_link(whole, tmp_path, capsys):
     (tmp_path / "b.fluid").symlink_to(whole / "a.fluid")
     assert main(["edit", str(tmp_path / "b.fluid"), "--diff"]) != REJECTED, capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["frames", "frames/splats", "frames/splats/1001.ply", "work", "work/checkpoint"])
+def test_the_simulation_has_its_paths_from_the_same_place(linked, name):
+    asset, _ = linked(name)
+    with pytest.raises(InputRejected, match="is a link"):
+        frame_file(asset, 1001) if name.startswith("frames") else checkpoint_file(asset)

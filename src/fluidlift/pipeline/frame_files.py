@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from fluidlift.io.asset_folder import mark_owner
+from fluidlift.io.asset_paths import asset_file
 from fluidlift.io.atomic import plain, write_json
 from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.pipeline.fluid_masks import FluidMasks
@@ -83,7 +84,7 @@ class FrameWriter:
         folder, inputs = place.folder, place.inputs
         self.folder, self.inputs, self.files = folder, inputs, files
         self.clip, self.masks, self.measured, self.geometry = clip, masks, measured, geometry
-        self.journal = folder / "work" / "velocities" / f"{key}.rows"
+        self.journal = asset_file(folder, f"work/velocities/{key}.rows")
         self.spans = spans_of(self.clip)
         self.grid, self.cells = geometry.grid, geometry.setting.cell_types
         self.scale = self._flow_scale()
@@ -142,7 +143,7 @@ class FrameWriter:
     def _written_before(self) -> dict[int, dict[str, Any]]:
         """Rows of frames whose files are all there; a line that was cut off ends the list."""
         rows: dict[int, dict[str, Any]] = {}
-        if not self.journal.is_file() or self.journal.is_symlink():
+        if not self.journal.is_file():
             return rows
         for line in self.journal.read_text(encoding="utf-8").splitlines():
             try:

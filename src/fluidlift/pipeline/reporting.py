@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from fluidlift.io.asset_paths import asset_file
 from fluidlift.look.report import Figure, Section, report_html
 from fluidlift.pipeline.as_filmed import card_of
 from fluidlift.pipeline.fit_outcome import TIES, how_sure, in_words
@@ -38,9 +39,9 @@ def write_report(
 
     clip, labels, start = lift.clip, lift.labels, lift.geometry.rest_frame
     write_png(folder / "mask_overlay.png", overlay(clip.frames[start], labels.labels[start]))
-    write_png(folder / "rest" / "mask.png", np.where(labels.fluid[start], 255, 0).astype(np.uint8))
+    write_png(asset_file(folder, "rest/mask.png"), np.where(labels.fluid[start], 255, 0).astype(np.uint8))
     sure = np.clip(labels.confidence[start].astype(np.float32), 0.0, 1.0)
-    write_png(folder / "rest" / "mask_confidence.png", (255 * sure + 0.5).astype(np.uint8))
+    write_png(asset_file(folder, "rest/mask_confidence.png"), (255 * sure + 0.5).astype(np.uint8))
     sections = [
         _section_as_filmed(shown),
         _section_outcome(lift, shown),

@@ -12,6 +12,7 @@ import numpy as np
 
 from fluidlift.config import PRESETS, JobConfig, build_config
 from fluidlift.errors import FluidliftError, InputRejected
+from fluidlift.io.asset_paths import asset_file
 from fluidlift.pipeline import reporting
 from fluidlift.pipeline.footage import footage_of
 from fluidlift.pipeline.machine import peak_memory_mb
@@ -216,7 +217,7 @@ def _finish(
     runner.warnings[:] = [w for w in manifest.get("warnings", ()) if w not in before] + own
     if lift is not None:
         reporting.write_report(lift, done, shown, folder, config.preset, runner.timings, runner.warnings)
-        figures = folder / "work" / "evaluation.npz"
+        figures = asset_file(folder, "work/evaluation.npz")
         if shown.pictures is not None:
             with atomic_write(figures) as stream:
                 np.savez_compressed(stream, **evaluation_arrays(lift, done, shown))

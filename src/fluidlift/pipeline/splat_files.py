@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from fluidlift.errors import InputRejected
+from fluidlift.io.asset_paths import asset_file
 from fluidlift.types import Gaussians
 
 BYTES_PER_SPLAT = 80
@@ -15,8 +16,8 @@ BYTES_PER_SPLAT = 80
 
 
 def frame_file(folder: Path, number: int) -> Path:
-    """Splats of one frame; numbers start at 1001."""
-    return folder / "frames" / "splats" / f"{number:04d}.ply"
+    """Splats of one frame; numbers start at 1001. Raises as `asset_file`."""
+    return asset_file(folder, f"frames/splats/{number:04d}.ply")
 
 
 def require_room(folder: Path, frames: int, splats: int) -> None:
@@ -27,8 +28,8 @@ def require_room(folder: Path, frames: int, splats: int) -> None:
 
 
 def checkpoint_file(folder: Path) -> Path:
-    """Where the state of the simulation is kept whose frames are in the folder."""
-    return folder / "work" / "checkpoint" / "simulation.npz"
+    """Where the state of the simulation is kept whose frames are in the folder. Raises as `asset_file`."""
+    return asset_file(folder, "work/checkpoint/simulation.npz")
 
 
 def frames_of(folder: Path, picked: range) -> Iterator[tuple[Gaussians, np.ndarray, np.ndarray]]:

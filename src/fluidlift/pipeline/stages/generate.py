@@ -15,6 +15,7 @@ from fluidlift.backends import generators
 from fluidlift.backends.generator_licence import require_accepted, require_use
 from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected, MissingPackage
+from fluidlift.io.asset_paths import asset_file
 from fluidlift.pipeline.fluid_masks import FluidMasks
 from fluidlift.pipeline.given_body import NOTE
 from fluidlift.pipeline.inputs import Inputs
@@ -98,7 +99,7 @@ def _require_installed(card: GeneratorCard, choice: generators.GeneratorChoice) 
 
 def bodies_folder(folder: Path, key: str) -> Path:
     """Where an asset keeps the bodies that were made with the settings of a key."""
-    return folder / "work" / STAGE / key
+    return asset_file(folder, f"work/{STAGE}/{key}")
 
 
 def bodies_there(folder: Path, made: Bodies) -> bool:

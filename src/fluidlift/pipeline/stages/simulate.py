@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fluidlift.errors import FluidliftError, InputRejected
+from fluidlift.io.asset_paths import asset_files
 from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.pipeline.dressing import Dressing
 from fluidlift.pipeline.looping import close_loop
@@ -115,7 +116,7 @@ def simulate(
     history = continued(simulator, dressing, scene, folder, request or SimulationRequest(), config.max_particles)
     first = len(history)
     require_room(folder, scene.simulated - first, len(scene.body))
-    for old in (folder / "frames" / "splats").glob("*.ply"):
+    for old in asset_files(folder, "frames/splats", (".ply",)):
         if not (old.stem.isdigit() and 0 <= int(old.stem) - FIRST_FRAME < first):
             old.unlink()
     if first == 0:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import tempfile
 from pathlib import Path
@@ -347,11 +348,16 @@ def test_a_full_disk_changes_nothing(folder, step, monkeypatch):
     assert session.scene["parameters"] == {}
 
 
-def test_a_damaged_history_is_told_and_the_scene_kept(folder):
+@pytest.mark.parametrize(
+    "damage", [lambda text: "{}\n" + text, lambda text: re.sub('"number": 1', '"number": 1e999', text)]
+)
+def test_a_damaged_history_is_told_and_the_scene_kept(folder, damage):
     session = EditSession.open(folder)
     session.set("parameters.density", 900)
     path, before = folder / edit_history.HISTORY, scene_bytes(folder)
-    path.write_text("{}\n" + path.read_text())
+    text = path.read_text()
+    path.write_text(damage(text))
+    assert path.read_text() != text
     with pytest.raises(InputRejected, match="remove the folder edits/"):
         session.undo()
     assert scene_bytes(folder) == before

@@ -153,7 +153,7 @@ def _grid(scene: dict[str, Any]) -> Grid:
         if len(shape) != 3 or len(origin) != 3:
             raise ValueError("three numbers each")
         return Grid(shape, float(scene["dx"]), origin)
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputRejected(
             f"scene.json whose grid cannot be read ({type(error).__name__}: {error})",
             "grid [nx,ny,nz], domain_min [3] in m and dx in m",

@@ -139,5 +139,5 @@ def _holder(file: int) -> Holder:
     try:
         note = json.loads(os.pread(file, _MAX_NOTE, 0))
         return Holder(int(note["pid"]), str(note["work"])[:100])
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, OverflowError):
         return Holder(0, "another run")

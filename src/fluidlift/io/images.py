@@ -241,7 +241,7 @@ def read_distortion(path: Path | str) -> tuple[float, ...] | None:
     values = listed if listed is not None else [data.get(k, 0.0) for k in ("k1", "k2", "p1", "p2", "k3")]
     try:
         numbers = tuple(float(v) for v in values)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise InputRejected(f"distortion {values} in '{Path(path).name}'", "4 or 5 numbers: k1 k2 p1 p2 (k3)") from None
     if not any(numbers):
         return None

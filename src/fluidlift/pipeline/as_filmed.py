@@ -109,5 +109,5 @@ def card_of(manifest: Mapping[str, Any]) -> AsFilmed | str:
         return str(stored["none"])
     try:
         return AsFilmed.from_dict(stored)
-    except (KeyError, TypeError, ValueError, AttributeError):
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError):
         return "what the manifest says of it cannot be read: run fluidlift sim --restart"

@@ -77,7 +77,7 @@ class Edit:
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Edit:
-        """As `to_dict` gave it; raises KeyError, TypeError or ValueError for other data."""
+        """As `to_dict` gave it; raises KeyError, TypeError, ValueError or OverflowError for other data."""
         lines = [tuple(str(x) for x in data[name]) for name in ("before", "after")]
         links = [None if data.get(name) is None else int(data[name]) for name in ("undoes", "redoes")]
         words = (str(data["old"]), str(data["new"]), str(data["time"]))
@@ -202,7 +202,7 @@ def read_history(folder: Path) -> History | None:
         edits = [Edit.from_dict(json.loads(line)) for line in lines[1:]]
         if not isinstance(base, str):
             raise TypeError("no text")
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise InputRejected(
             f"'{HISTORY}' cannot be read ({error})", "a whole history",
             "remove the folder edits/ of the asset: scene.yaml stays as it is, and a new history begins",
@@ -270,7 +270,7 @@ def announced(folder: Path) -> tuple[Edit, str] | None:
     try:
         data = read_json(path, "announced edit", _MAX_BYTES)
         edit, text = Edit.from_dict(data["edit"]), data["text"]
-    except (InputRejected, KeyError, TypeError, ValueError):
+    except (InputRejected, KeyError, TypeError, ValueError, OverflowError):
         return None
     return (edit, text) if isinstance(text, str) and text_hash(text) == edit.new else None
 

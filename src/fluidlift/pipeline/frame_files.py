@@ -149,7 +149,7 @@ class FrameWriter:
             try:
                 row = json.loads(line)
                 t = int(row["frame"])
-            except (ValueError, KeyError, TypeError):
+            except (ValueError, KeyError, TypeError, OverflowError):
                 break
             if all(path.is_file() for path in self.files.of_frame(self.folder, t)):
                 rows[t] = row

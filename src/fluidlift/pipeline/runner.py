@@ -210,7 +210,7 @@ def kept_value(folder: Path, name: str, key: str, kind: type[T]) -> tuple[T, flo
     arrays, meta = found
     try:
         return unpacked(kind, arrays, meta["value"]), float(meta["seconds"])
-    except (Mistyped, KeyError, TypeError, ValueError):
+    except (Mistyped, KeyError, TypeError, ValueError, OverflowError):
         return None
 
 

@@ -70,7 +70,7 @@ class FluidParameters:
         try:
             clean = {k: tuple(v) if isinstance(v, list) else v for k, v in overrides.items()}
             return replace(self, **clean)
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise InputRejected(f"parameters that do not fit: {error}") from None
 
 

@@ -146,3 +146,10 @@ def test_the_simulation_has_its_paths_from_the_same_place(linked, name):
     asset, _ = linked(name)
     with pytest.raises(InputRejected, match="is a link"):
         frame_file(asset, 1001) if name.startswith("frames") else checkpoint_file(asset)
+
+
+@pytest.mark.parametrize("name", ["../a", "/etc/passwd", "a/../../b", "C:\\a", "", "a\0b", "n" * 256, "a\ud800"])
+def test_names_that_lead_out_or_that_no_file_can_have_are_refused(tmp_path, name):
+    with pytest.raises(InputRejected, match="the asset names the file") as refused:
+        asset_file(tmp_path, name)
+    str(refused.value).encode()  # it can be printed

@@ -13,7 +13,8 @@ NUMBERS = (
 )  # fmt: skip
 TOKENS = (
     b"null", b"true", b"[]", b"{}", b'""', b'"' + b"n" * 299 + b'"', b"[[1]]", b'{"a": 1}', b"[1, 2]", b"'", b"\x00",
-    b"[" * 3000, b'{"a":' * 3000, b"&a", b"*a", b"!!python/name:os.system", b"../../../../etc/passwd", b"\xff\xfe",
+    b'"\\ud800"', b"\\udc00", b"[" * 3000, b'{"a":' * 3000, b"&a", b"*a", b"!!python/name:os.system",
+    b"../../../../etc/passwd", b"\xff\xfe",
     b"\xed\xa0\x80", b"n" * 299, b"-", b"~", b"\r\n", b"\t", b"[" * 100 + b"]" * 100, b"/etc/passwd",
 )  # fmt: skip
 INTEGERS = (0, 1, 2, 3, 127, 128, 255, 256, 0x7FFF, 0x8000, 0xFFFF, 0x10000, 1 << 24, 0x7FFFFFFF, 1 << 31, 0xFFFFFFFF)

@@ -213,6 +213,9 @@ def test_numbers_of_json_that_no_reader_can_mean_are_infinite():
     ]  # fmt: skip
     with pytest.raises(ValueError, match="nested"):
         parse_json("[" * 100_000)
+    with pytest.raises(ValueError, match="surrogates"):
+        parse_json(r'{"name": ["a\ud800"]}')
+    assert parse_json(r'"\ud83d\ude00"') == "\U0001f600"  # a whole pair
 
 
 @pytest.mark.parametrize("dtype", [np.uint16, np.float32])

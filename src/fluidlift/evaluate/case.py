@@ -7,7 +7,6 @@ Files: `video.mp4`; `camera.json` (width, height, K, R, t); `scene.json` (domain
 
 from __future__ import annotations
 
-import json
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from fluidlift.errors import InputRejected
+from fluidlift.io.limits import parse_json
 from fluidlift.types import Grid, PinholeCamera, TriangleMesh
 
 LARGEST_BYTES = 4 << 30
@@ -93,7 +93,7 @@ def read_json(path: Path) -> dict[str, Any]:
         InputRejected: not JSON, or not an object.
     """
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = parse_json(path.read_bytes())
     except (OSError, ValueError) as error:
         raise InputRejected(f"'{path.name}' cannot be read ({type(error).__name__})", "a JSON object") from None
     if not isinstance(data, dict):

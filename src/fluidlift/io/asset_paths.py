@@ -23,9 +23,12 @@ def asset_file(folder: Path | str, name: str) -> Path:
     foreign = PurePosixPath(name).is_absolute() or PureWindowsPath(name).drive or PureWindowsPath(name).root
     parts = PurePosixPath(name.replace("\\", "/")).parts
     endless = any(len(part.encode("utf-8", "replace")) > 255 for part in parts) or len(name) > 1000
-    if foreign or ".." in parts or not parts or "\0" in name or endless:
+    unwritable = "\0" in name or any(0xD800 <= ord(letter) < 0xE000 for letter in name)
+    if foreign or ".." in parts or not parts or unwritable or endless:
         raise InputRejected(
-            f"the asset names the file '{name[:100]}'", "names inside its own folder", "do not trust this asset"
+            f"the asset names the file '{name[:100].encode('utf-8', 'backslashreplace').decode()}'",
+            "names inside its own folder",
+            "do not trust this asset",
         )
     path = folder
     for part in parts:

@@ -100,11 +100,14 @@ def parse_json(data: bytes | str) -> Any:
     """Plain data of a JSON text (UTF-8). Whole numbers that no reader can mean become infinite, as `1e999` does.
 
     Raises:
-        ValueError: no JSON, no UTF-8, or lists nested more deeply than Python goes.
+        ValueError: no JSON, no UTF-8, half a character, or lists nested more deeply than Python goes.
     """
     try:
         text = data if isinstance(data, str) else data.decode("utf-8")
-        return json.loads(text, parse_int=_whole_number)
+        value = json.loads(text, parse_int=_whole_number)
+        if "\\u" in text:  # half of a pair is no character: it can be neither printed nor written
+            json.dumps(value, ensure_ascii=False).encode("utf-8")
+        return value
     except RecursionError:
         raise ValueError("lists and objects nested too deeply") from None
 

@@ -23,7 +23,7 @@ from typing import Any
 from fluidlift.errors import InputRejected
 from fluidlift.io.asset_folder import asset_file
 from fluidlift.io.atomic import disk_errors, write_bytes, write_json
-from fluidlift.io.limits import read_json, require_size
+from fluidlift.io.limits import parse_json, read_json, require_size
 
 HISTORY, PENDING = "edits/history.jsonl", "edits/pending.json"
 """inside the asset"""
@@ -198,11 +198,11 @@ def read_history(folder: Path) -> History | None:
     if not lines:
         return None
     try:
-        base = json.loads(lines[0])["text"]
-        edits = [Edit.from_dict(json.loads(line)) for line in lines[1:]]
+        base = parse_json(lines[0])["text"]
+        edits = [Edit.from_dict(parse_json(line)) for line in lines[1:]]
         if not isinstance(base, str):
             raise TypeError("no text")
-    except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError, OverflowError) as error:
         raise InputRejected(
             f"'{HISTORY}' cannot be read ({error})", "a whole history",
             "remove the folder edits/ of the asset: scene.yaml stays as it is, and a new history begins",

@@ -14,6 +14,7 @@ from fluidlift.io.asset_folder import mark_owner
 from fluidlift.io.asset_paths import asset_file
 from fluidlift.io.atomic import plain, write_json
 from fluidlift.io.frames import FIRST_FRAME
+from fluidlift.io.limits import parse_json
 from fluidlift.pipeline.fluid_masks import FluidMasks
 from fluidlift.pipeline.inputs import Inputs
 from fluidlift.pipeline.mask_facts import MASK_FACTS, cleared_masks, require_unchanged, sealed
@@ -147,7 +148,7 @@ class FrameWriter:
             return rows
         for line in self.journal.read_text(encoding="utf-8").splitlines():
             try:
-                row = json.loads(line)
+                row = parse_json(line)
                 t = int(row["frame"])
             except (ValueError, KeyError, TypeError, OverflowError):
                 break

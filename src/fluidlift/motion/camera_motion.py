@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from fluidlift.motion.align import refined_similarity
+from fluidlift.numerics.similarity2 import composed, inverse
 
 GRID = (8, 6)
 """columns and rows of cells that each give features of their own, whatever the contrast elsewhere"""
@@ -103,17 +104,6 @@ class _KeyFrame:
         found = similarity_to(self.picture, picture, self.features, self.cells, guess, limit)
         settled, fits = _settled(self.picture, picture, guess if found is None else found, guess)
         return composed(settled, self.motion), found is not None or fits
-
-
-def composed(second: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """The similarity [2,3] that does `first`, then `second`."""
-    return np.hstack([second[:, :2] @ first[:, :2], (second[:, :2] @ first[:, 2] + second[:, 2])[:, None]])
-
-
-def inverse(motion: np.ndarray) -> np.ndarray:
-    """The similarity [2,3] that takes `motion` back."""
-    back = np.linalg.inv(motion[:, :2])
-    return np.hstack([back, -(back @ motion[:, 2])[:, None]])
 
 
 def _settled(

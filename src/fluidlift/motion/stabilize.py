@@ -15,7 +15,8 @@ import cv2
 import numpy as np
 
 from fluidlift.errors import require
-from fluidlift.motion.camera_motion import camera_motion, composed, inverse
+from fluidlift.motion.camera_motion import camera_motion
+from fluidlift.numerics.similarity2 import composed, inverse
 from fluidlift.types.clip import VideoClip
 
 STEADY_PX = 0.3

@@ -87,13 +87,13 @@ def test_a_turn_of_the_camera_is_taken_out_and_what_it_does_not_see_is_filled_in
 
 
 def test_a_fluid_is_not_taken_for_the_camera_while_it_turns():
-    steady, report = stabilise(clip_of(flowing(panned(5 * np.arange(19)), speed=5)))
+    _, report = stabilise(clip_of(flowing(panned(5 * np.arange(19)), speed=5)))
     assert report.stabilised and report.drift_px == pytest.approx(45.0, abs=1.0)
 
 
 def test_of_a_camera_that_turns_away_the_longest_run_of_one_view_is_used():
     steps = np.concatenate([8 * np.arange(6), np.full(12, 44), 44 + 14 * np.arange(1, 15)])
-    steady, report = stabilise(clip_of(panned(steps)))
+    _, report = stabilise(clip_of(panned(steps)))
     ((first, last),) = report.runs
     assert report.stabilised
     # 72 px are three tenths of the picture: a frame among the first is laid on, and all that see seven tenths of it

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from fluidlift.shape.kind import KINDS, estimate_kind, estimate_up, level_camera
-from fluidlift.types import PinholeCamera, UpEvidence, kind_of
+from fluidlift.shape.kind import KINDS, doubts, estimate_kind, estimate_up, level_camera
+from fluidlift.types import KindEvidence, PinholeCamera, UpEvidence, kind_of
 
 H, W, T = 90, 160, 6
 BLUE, GREY = (60, 110, 160), (150, 150, 150)
@@ -84,6 +84,14 @@ def test_a_body_comes_down_where_it_stood_whatever_is_seen_higher_elsewhere():
 def test_a_body_that_moves_on_has_not_collapsed():
     masks = np.stack([(ROW > 25) & (ROW < 75) & (COL > 10 + 14 * t) & (COL < 60 + 14 * t) for t in range(T)])
     assert estimate_kind(*scene(masks, (5.0, 0.5), BLUE)).features["collapsing"] == 0.0
+
+
+def test_a_kind_that_is_unsure_is_told_with_the_next_one():
+    sure = KindEvidence("fall", {"fall": 0.8, "stream": 0.15, "pour": 0.05}, {})
+    torn = KindEvidence("fall", {"stream": 0.4, "fall": 0.5, "pour": 0.1}, {})
+    assert doubts(sure) == ()
+    (told,) = doubts(torn)
+    assert "fall (0.50) or stream (0.40)" in told and "--kind" in told
 
 
 def test_beliefs_are_shares_and_the_kind_has_the_largest():

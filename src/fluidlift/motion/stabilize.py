@@ -1,8 +1,8 @@
-"""Camera motion by tracked features and RANSAC: shake, cuts, and video stabilisation where the shake is mild.
+"""Video stabilisation: shake and drift taken out, cuts found.
 
-Everything downstream takes the camera to stand still. The camera's motion is read from features that are found
-again, against one reference frame, over the whole picture: what flows away is not found again, so that even a fluid
-that fills most of the picture does not pass for the camera.
+Everything downstream takes the camera to stand still. Its motion (`motion.camera_motion`) is taken out by laying all
+frames on one of them. Where the camera turns away, the longest run of frames that still share most of the picture is
+what can be used.
 """
 
 from __future__ import annotations
@@ -15,28 +15,22 @@ import cv2
 import numpy as np
 
 from fluidlift.errors import require
-from fluidlift.motion.align import refined_similarity
+from fluidlift.motion.camera_motion import camera_motion
+from fluidlift.numerics.similarity2 import composed, inverse
 from fluidlift.types.clip import VideoClip
 
-GRID = (8, 6)
-"""columns and rows of cells that each give features of their own, whatever the contrast elsewhere"""
 STEADY_PX = 0.3
 """shake below this is left alone: resampling would blur more than it mends"""
 STEADY_DRIFT_PX = 1.0
 """drift below this is left alone"""
+FAR = 0.04
+"""part of the longer side; hands that hold a camera still move it less, and parallax is then below a pixel"""
+SEARCH = 0.16
+"""part of the longer side that a feature may have moved since its key frame"""
+LEAST_OVERLAP = 0.7
+"""part of the picture that all frames used must see: what some of them did not see has no motion of its own there"""
 MENDED = 0.6
 """the shake that is left, as part of what was, below which the correction is kept"""
-HYPOTHESES = 3
-"""motions tried, each among the features that the ones before left over"""
-LEAST_CELLS = 6
-"""cells of the grid that must agree on the motion of the camera"""
-LEAST_FIT = 0.5
-"""part of the textured pixels that must agree with a motion refined on all pixels: where the fluid has more than half
-of them, those that fit by chance pull it off by some tenths of a pixel, and features do better"""
-LEAST_AGREEMENT = 0.35
-"""part of the features found again that must agree on some motion, whichever it is"""
-LEAST_ALTERNATIVE = 0.2
-"""part of the features found again that must agree on another motion, for that to be the camera's"""
 
 
 @dataclass(frozen=True)
@@ -51,6 +45,8 @@ class ShakeReport:
     """whether the picture was warped"""
     cuts: tuple[int, ...]
     """first frame of every shot but the first"""
+    runs: tuple[tuple[int, int], ...]
+    """first frame and end of what can be used of each shot: where the camera moved on, that is a part of it"""
     warnings: tuple[str, ...] = ()
 
 
@@ -71,38 +67,81 @@ class GreyFrames(Sequence[np.ndarray]):
 
 
 def stabilise(
-    clip: VideoClip, *, max_correction_px: float | None = None, out: np.ndarray | None = None
+    clip: VideoClip, *, least_overlap: float = LEAST_OVERLAP, out: np.ndarray | None = None
 ) -> tuple[VideoClip, ShakeReport]:
     """The clip as from a camera that stands still, and how the camera moved.
 
     Args:
         clip: any number of frames; they are read one after the other and may lie in a file.
-        max_correction_px: a larger motion is reported but not corrected; default 4% of the longer side.
+        least_overlap: part of the picture that each frame used must share with the one all are laid on, 0 to 1.
         out: u8 [T,H,W,3], where steady frames are written if there are any (such as a memory map); None: a new array.
 
     Returns:
         The same clip when nothing was to mend, or nothing could be.
     """
+    require(0 < least_overlap <= 1, f"least_overlap {least_overlap}", "above 0, at most 1")
     width, height = clip.size
-    limit = 0.04 * max(width, height) if max_correction_px is None else max_correction_px
-    require(limit > 0, f"max_correction_px {limit}", "above 0")
+    reach = SEARCH * max(width, height)
     cuts = find_cuts(GreyFrames(clip.frames))
-    warnings = [f"the clip is cut at frame {cut}: use one shot" for cut in cuts]
-    motions, blind = motions_of_shots(clip.frames, cuts, limit)
+    edges = (0, *cuts, len(clip))
+    shots = tuple(zip(edges, edges[1:]))
+    motions, blind = motions_of_shots(clip.frames, cuts, reach)
+    warnings: list[str] = []
     if blind:
         warnings.append(f"no features that stay, to see the camera by, in {blind} frames: assumed still")
     shake, drift = shake_and_drift(motions, width, height, cuts)
-    strong = shake > limit or drift > limit
-    restless = shake > STEADY_PX or drift > STEADY_DRIFT_PX
-    if strong:
-        warnings.append(f"the camera moves by up to {max(shake, drift):.1f} px: use a clip from a tripod")
-    if restless and not strong:
-        steady = warp_back(clip, motions, out)
-        left, _ = shake_and_drift(motions_of_shots(steady.frames, cuts, limit)[0], width, height, cuts)
-        if left < max(MENDED * shake, STEADY_PX):
-            return steady, ShakeReport(shake, drift, True, cuts, tuple(warnings))
-        warnings.append(f"a camera motion of {shake:.1f} px per frame does not read the same twice: not corrected")
-    return clip, ShakeReport(shake, drift, False, cuts, tuple(warnings))
+    if shake <= STEADY_PX and drift <= STEADY_DRIFT_PX:
+        return clip, ShakeReport(shake, drift, False, cuts, shots, tuple(warnings))
+    runs, laid = [], motions.copy()
+    for first, last in shots:
+        begin, end, reference = steady_run(motions[first:last], clip.size, least_overlap)
+        runs.append((first + begin, first + end))
+        back = inverse(motions[first + reference])
+        laid[first:last] = [composed(motion, back) for motion in motions[first:last]]
+    steady = warp_back(clip, laid, runs, out)
+    left = max(
+        shake_and_drift(motions_of_shots(steady.frames[a:b], (), reach)[0], width, height, ())[0] for a, b in runs
+    )
+    if left < max(MENDED * shake, STEADY_PX):
+        if drift > FAR * max(width, height):
+            warnings.append(
+                f"the camera moves by up to {drift:.0f} px: taken out as if it only turned; where it went somewhere, "
+                "what is near still moves"
+            )
+        return steady, ShakeReport(shake, drift, True, cuts, tuple(runs), tuple(warnings))
+    warnings.append(f"a camera motion of {shake:.1f} px per frame does not read the same twice: not corrected")
+    return clip, ShakeReport(shake, drift, False, cuts, shots, tuple(warnings))
+
+
+def steady_run(motions: np.ndarray, size: tuple[int, int], least_overlap: float) -> tuple[int, int, int]:
+    """The longest run of frames that share enough of the picture with one of them: first, end, and that one.
+
+    Args:
+        motions: [T,2,3], of each frame from a common reference.
+        size: width, height, px.
+        least_overlap: part of the picture.
+    """
+    width, height = size
+    corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
+    middle, best = len(motions) // 2, (0, 1, 0)
+    for reference in sorted(np.unique(np.linspace(0, len(motions) - 1, 65).astype(int)), key=lambda t: abs(t - middle)):
+        back = inverse(motions[reference])
+
+        def seen(t: int, back: np.ndarray = back) -> bool:
+            motion = inverse(composed(motions[t], back))
+            view = (corners @ motion[:, :2].T + motion[:, 2]).astype(np.float32)
+            return cv2.intersectConvexConvex(corners, view)[0] >= least_overlap * width * height
+
+        begin, end = int(reference), int(reference) + 1
+        while begin > 0 and seen(begin - 1):
+            begin -= 1
+        while end < len(motions) and seen(end):
+            end += 1
+        if end - begin > best[1] - best[0]:
+            best = (begin, end, int(reference))
+        if best[1] - best[0] == len(motions):
+            break
+    return best
 
 
 def motions_of_shots(frames: np.ndarray, cuts: tuple[int, ...], limit: float) -> tuple[np.ndarray, int]:
@@ -110,7 +149,7 @@ def motions_of_shots(frames: np.ndarray, cuts: tuple[int, ...], limit: float) ->
     motions = np.tile(np.eye(2, 3), (len(frames), 1, 1))
     blind = 0
     for start, stop in zip((0, *cuts), (*cuts, len(frames))):
-        found = camera_motion(GreyFrames(frames, start, stop), limit=4.0 * limit)
+        found = camera_motion(GreyFrames(frames, start, stop), limit=limit)
         if found is None:
             blind += stop - start
         else:
@@ -153,106 +192,6 @@ def unlike(first: np.ndarray, second: np.ndarray) -> float:
     return float(1.0 - (a * b).mean() / (strong_a * strong_b))
 
 
-def spread_features(picture: np.ndarray, *, per_cell: int = 8) -> np.ndarray:
-    """Corners float32 [n,1,2], px (x,y of pixel indices), the best few of every cell of the grid."""
-    height, width = picture.shape
-    found = []
-    strength = cv2.cornerMinEigenVal(picture, 5)
-    for row in range(GRID[1]):
-        for column in range(GRID[0]):
-            y0, y1 = row * height // GRID[1], (row + 1) * height // GRID[1]
-            x0, x1 = column * width // GRID[0], (column + 1) * width // GRID[0]
-            cell = np.ascontiguousarray(picture[y0:y1, x0:x1])
-            if float(strength[y0:y1, x0:x1].max(initial=0.0)) < 1e-4:
-                continue
-            corners = cv2.goodFeaturesToTrack(cell, per_cell, 0.1, max(3, min(height, width) // 60), blockSize=5)
-            if corners is not None:
-                found.append(np.asarray(corners, np.float32).reshape(-1, 1, 2) + np.array([x0, y0], np.float32))
-    return np.concatenate(found) if found else np.zeros((0, 1, 2), np.float32)
-
-
-def camera_motion(grey: Sequence[np.ndarray], *, limit: float) -> np.ndarray | None:
-    """Similarities [T,2,3], frame from reference (the middle frame), or None where there is too little to go by."""
-    middle = len(grey) // 2
-    reference = grey[middle]
-    features = spread_features(reference)
-    if len(features) < 4 * LEAST_CELLS:
-        return None
-    height, width = reference.shape
-    places = features[:, 0] * np.array(GRID, np.float32) / np.array([width, height], np.float32)
-    columns, rows = places.astype(int).T
-    cells = rows * GRID[0] + columns
-    motions = np.tile(np.eye(2, 3), (len(grey), 1, 1))
-    weak = 0
-    for order in (range(middle + 1, len(grey)), range(middle - 1, -1, -1)):
-        last = np.eye(2, 3)
-        for t in order:
-            picture = grey[t]
-            found = similarity_to(reference, picture, features, cells, last, limit)
-            weak += found is None
-            last = _settled(reference, picture, last if found is None else found, last)
-            motions[t] = last
-    return None if weak > 0.5 * (len(grey) - 1) else motions
-
-
-def _settled(reference: np.ndarray, picture: np.ndarray, found: np.ndarray, last: np.ndarray) -> np.ndarray:
-    """The similarity refined on all pixels, from the features' guess or from the frame before, whichever fits more.
-
-    Where too little of the picture agrees with either to be refined by it, the better guess stays as it is.
-    """
-    best, most = found, LEAST_FIT
-    for guess in (found, last):
-        refined, fit, cells = refined_similarity(reference, picture, guess)
-        if cells >= LEAST_CELLS and fit > most:
-            best, most = refined, fit
-    if most > LEAST_FIT:
-        return best
-    return max((found, last), key=lambda guess: refined_similarity(reference, picture, guess, iterations=1)[1])
-
-
-def similarity_to(
-    reference: np.ndarray, picture: np.ndarray, features: np.ndarray, cells: np.ndarray, guess: np.ndarray, limit: float
-) -> np.ndarray | None:
-    """Similarity [2,3] that carries the features to the picture, or None when too few of them agree on one."""
-    options = {"winSize": (17, 17), "maxLevel": 3, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
-    start = (features @ guess[:, :2].T + guess[:, 2]).astype(np.float32)
-    ahead, ok_ahead, _ = cv2.calcOpticalFlowPyrLK(reference, picture, features, start.copy(), **options)
-    back, ok_back, _ = cv2.calcOpticalFlowPyrLK(picture, reference, ahead, features.copy(), **options)
-    gone = np.linalg.norm(back - features, axis=-1)[:, 0]
-    moved = np.linalg.norm(ahead - features, axis=-1)[:, 0]
-    good = (ok_ahead[:, 0] > 0) & (ok_back[:, 0] > 0) & (gone < 0.5) & (moved < limit)
-    if good.sum() < 3 * LEAST_CELLS:
-        return None
-    return calmest_similarity(features[good, 0], ahead[good, 0], cells[good])
-
-
-def calmest_similarity(source: np.ndarray, target: np.ndarray, cells: np.ndarray) -> np.ndarray | None:
-    """RANSAC: the similarity [2,3] of least motion among those that enough of the pairs [n,2] agree on, or None.
-
-    A river that slides by as one sheet is a similarity too, and may have more features than its banks: it moves
-    farther from the reference than a camera on its place does.
-    """
-    left = np.ones(len(source), bool)
-    best, least = None, np.inf
-    cv2.setRNGSeed(0)
-    for part in [LEAST_AGREEMENT] + [LEAST_ALTERNATIVE] * (HYPOTHESES - 1):
-        if left.sum() < max(3 * LEAST_CELLS, part * len(source)):
-            break
-        similarity, inliers = cv2.estimateAffinePartial2D(
-            source[left], target[left], method=cv2.RANSAC, ransacReprojThreshold=0.7, maxIters=500, confidence=0.995
-        )
-        if similarity is None:
-            break
-        agree = np.flatnonzero(left)[inliers[:, 0] > 0]
-        if len(agree) < part * len(source):
-            break
-        moved = float(np.linalg.norm(target[agree] - source[agree], axis=-1).mean())
-        if len(np.unique(cells[agree])) >= LEAST_CELLS and moved < least:
-            best, least = similarity, moved
-        left[agree] = False
-    return best
-
-
 def shake_and_drift(motions: np.ndarray, width: int, height: int, cuts: tuple[int, ...]) -> tuple[float, float]:
     """Shake and drift in px, as mean displacement over a grid of 9 points of the picture."""
     if len(motions) < 2:
@@ -267,13 +206,29 @@ def shake_and_drift(motions: np.ndarray, width: int, height: int, cuts: tuple[in
     return shake, float(np.linalg.norm(moved, axis=-1).mean(axis=-1).max())
 
 
-def warp_back(clip: VideoClip, motions: np.ndarray, out: np.ndarray | None = None) -> VideoClip:
-    """The clip with every frame carried back to its reference; what comes in from outside repeats the rim."""
+def warp_back(
+    clip: VideoClip, motions: np.ndarray, runs: Sequence[tuple[int, int]], out: np.ndarray | None = None
+) -> VideoClip:
+    """The clip with every frame of the runs carried back to its reference.
+
+    What a frame does not see is what the frame before it, on the way from the reference, shows there: its own picture
+    or what was filled in (full-frame stabilisation by mosaics, Litvin et al. 2003, without their blending).
+    """
     options = {"flags": cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP, "borderMode": cv2.BORDER_REPLICATE}
     frames = np.empty(clip.frames.shape, np.uint8) if out is None else out
-    for t, motion in enumerate(motions):
-        frames[t] = cv2.warpAffine(clip.frames[t], motion, clip.size, **options)
-    alpha = clip.alpha
-    if alpha is not None:
-        alpha = np.stack([cv2.warpAffine(a, m, clip.size, **options) for a, m in zip(alpha, motions)])
+    alpha = None if clip.alpha is None else np.array(clip.alpha)
+    width, height = clip.size
+    inside = np.full((height, width), 255, np.uint8)
+    for first, last in runs:
+        reference = first + int(np.argmin([np.abs(m - np.eye(2, 3)).sum() for m in motions[first:last]]))
+        for order in (range(reference, last), range(reference - 1, first - 1, -1)):
+            before = reference
+            for t in order:
+                picture = cv2.warpAffine(clip.frames[t], motions[t], clip.size, **options)
+                seen = cv2.warpAffine(inside, motions[t], clip.size, flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP)
+                if t != reference:
+                    picture[seen == 0] = frames[before][seen == 0]
+                frames[t], before = picture, t
+                if alpha is not None:
+                    alpha[t] = cv2.warpAffine(alpha[t], motions[t], clip.size, **options)
     return replace(clip, frames=frames, alpha=alpha)

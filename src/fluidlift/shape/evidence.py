@@ -27,6 +27,12 @@ from fluidlift.types.flow import PixelFlow
 PairReader = Callable[[int], tuple[np.ndarray, np.ndarray]]
 """displacement [H,W,2] (px) and confidence [H,W] from frame t to t + 1"""
 
+
+def pair_reader(flow: PixelFlow | PairReader) -> PairReader:
+    """What reads the flow of a pair, of either form."""
+    return flow if callable(flow) else (lambda t: (flow.displacement[t], flow.confidence[t]))
+
+
 QUANTISATION = 0.3
 """mean absolute change between two 8-bit readings of the same brightness, grey levels: a floor for the noise"""
 QUIET_QUANTILE = 0.2
@@ -186,7 +192,7 @@ def flow_evidence(
 
 def gather_evidence(clip: VideoClip, flow: PixelFlow | PairReader) -> Evidence:
     """All maps of one clip of at least 2 frames; a long clip is looked at in bursts (`sampled_frames`)."""
-    pair = flow if callable(flow) else (lambda t: (flow.displacement[t], flow.confidence[t]))
+    pair = pair_reader(flow)
     frames, height, width = clip.frames.shape[:3]
     scale = working_scale(height, width)
     source = FramePictures(clip.frames, sampled_frames(frames, clip.interval), scale)

@@ -16,6 +16,23 @@ from fluidlift.types.kind import STREAM
 KINDS: tuple[str, ...] = tuple(name for name, kind in FLUID_KINDS.items() if kind.recognised)
 """names of the kinds whose evidence is weighed"""
 
+SHARPNESS = 0.75
+"""log odds per unit of belief. Of 36 clips with known kinds (34 of them real) the beliefs have the least log loss at
+0.75 to 1.0 (0.47, where 2.0 has 0.64); the lower of these, since most of the clips were in sight when the beliefs were
+written"""
+
+LEAST_SURE = 0.7
+"""share of the belief below which a user is told what else it could be: of the same clips 10 are, 2 of the 4 wrong ones
+among them"""
+
+
+def doubts(evidence: KindEvidence) -> tuple[str, ...]:
+    """What a user should know of how sure the kind is; empty where it is."""
+    (best, share), (second, other) = sorted(evidence.scores.items(), key=lambda item: -item[1])[:2]
+    if share >= LEAST_SURE:
+        return ()
+    return (f"what kind of fluid this is, is unsure: {best} ({share:.2f}) or {second} ({other:.2f}); --kind decides",)
+
 
 def estimate_kind(
     frames: UInt8[np.ndarray, "t h w 3"],
@@ -69,7 +86,7 @@ def estimate_kind(
     }
     if pitch is not None:  # steep views of bodies in the air are rare
         belief["stream"] += 1.5 * np.clip((pitch - 20.0) / 20.0, -1.0, 1.0)
-    values = np.array([belief[k] for k in KINDS]) * 2.0
+    values = SHARPNESS * np.array([belief[k] for k in KINDS])
     share = np.exp(values - values.max())
     share /= share.sum()
     best = KINDS[int(np.argmax(share))]

@@ -19,10 +19,11 @@ import numpy as np
 from fluidlift.errors import InputRejected, require
 from fluidlift.shape.advancing import advancing_labels
 from fluidlift.shape.colour_growth import grown_from_streams, with_quiet_water
-from fluidlift.shape.evidence import Evidence, PairReader, fluid_score, gather_evidence
+from fluidlift.shape.evidence import Evidence, PairReader, fluid_score, gather_evidence, pair_reader
 from fluidlift.shape.frame_pictures import typical_picture
 from fluidlift.shape.hints import VOICE, Clicks, Point, clicks_at, heed, holes_asked_for
 from fluidlift.shape.islands import without_ground
+from fluidlift.shape.moving_solids import moving_solids
 from fluidlift.shape.presence import Presence, always, grows, stay, watch
 from fluidlift.shape.region import clean_region, cut_along_edges, solids_in, still_pixels
 from fluidlift.shape.washed import bare_over_time, washed_ground
@@ -113,7 +114,8 @@ def segment(
     evidence = gather_evidence(clip, flow)
     small_inside = shrink_mask(inside, evidence.noise.shape)
     clicks = clicks_at(points, clip.size, evidence.noise.shape)
-    score = np.where(small_inside, fluid_score(evidence), -12.0).astype(np.float32)
+    solids = moving_solids(clip, pair_reader(flow), evidence.noise.shape)
+    score = np.where(small_inside & ~solids, fluid_score(evidence), -12.0).astype(np.float32)
     seen = score > 0.0
     if (seen.mean() < 1e-3 or float(score.max()) < 1.0) and len(clicks.fluid) == 0:
         raise InputRejected("nothing moves in this clip", "a fluid that moves before a camera that stands still",

@@ -89,7 +89,7 @@ def geometry(
     fluid = FluidMasks(segmentation.labels.labels)
     seen, pictures = _seen(read, flow, fluid, given, config, work)
     kind, parts, mask = seen.kind, seen.parts, seen.mask
-    warnings = framing_warnings(mask, fluid.areas())
+    warnings = framing_warnings(mask, fluid.areas()) + (list(kinds.doubts(seen.evidence)) if c.kind == "auto" else [])
     up, canonical, front, known_scale, seen_depth = _surface(seen, pictures, fluid, given, clip.interval)
     front, falling = composite.standing(front, parts, canonical, mask)
     visible = mask & (front.depth > 0)

@@ -6,6 +6,7 @@ Frames go to disk as they are decoded and are mapped from there on: memory does 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -49,7 +50,7 @@ def read(clip: GivenFile, camera: GivenFile | None, config: ReadSettings, *, wor
     found = _without_distortion(found, None if camera is None else camera.path, scratch)
     found, kept = _without_repeats(found, scratch)
     steady, shake = _steady(found, scratch, correct=config.stabilise)
-    first, last, warnings = _longest_shot(shake.cuts, len(steady), found.source, kept)
+    first, last, warnings = _longest_run(shake, len(steady), found.source, kept)
     frames, alpha = steady.frames, steady.alpha
     if last - first < len(steady):
         frames, kept = frames[first:last], kept[first:last]
@@ -123,6 +124,8 @@ class _Shake:
     shake_px: float
     stabilised: bool
     cuts: tuple[int, ...]
+    runs: tuple[tuple[int, int], ...]
+    """first frame and end of what can be used of each shot"""
     warnings: tuple[str, ...] = ()
 
 
@@ -131,30 +134,26 @@ def _steady(clip: VideoClip, scratch: Scratch, *, correct: bool) -> tuple[VideoC
     from fluidlift.motion.stabilize import GreyFrames, find_cuts, stabilise
 
     if not correct:
-        cuts = find_cuts(GreyFrames(clip.frames))
-        return clip, _Shake(0.0, False, tuple(int(c) for c in cuts))
+        cuts = tuple(int(c) for c in find_cuts(GreyFrames(clip.frames)))
+        return clip, _Shake(0.0, False, cuts, tuple(pairwise((0, *cuts, len(clip)))))
     steady, shake = stabilise(clip, out=scratch.array("steady", clip.frames.shape, np.uint8))
-    # cuts are told below, with what follows from them
-    warnings = tuple(w for w in shake.warnings if not w.startswith("the clip is cut at"))
     cuts = tuple(int(c) for c in shake.cuts)
-    return steady, _Shake(float(shake.shake_px), bool(shake.stabilised), cuts, warnings)
+    return steady, _Shake(float(shake.shake_px), bool(shake.stabilised), cuts, shake.runs, shake.warnings)
 
 
-def _longest_shot(cuts: tuple[int, ...], frames: int, source: str, kept: np.ndarray) -> tuple[int, int, list[str]]:
-    """First frame and end of the longest stretch without a cut; what comes after one is another scene."""
-    if not cuts:
-        return 0, frames, []
-    edges = [0, *cuts, frames]
-    longest = max(range(len(edges) - 1), key=lambda i: edges[i + 1] - edges[i])
-    first, last = edges[longest], edges[longest + 1]
+def _longest_run(shake: _Shake, frames: int, source: str, kept: np.ndarray) -> tuple[int, int, list[str]]:
+    """First frame and end of the longest stretch of one view; what comes after a cut or a turn is another scene."""
+    first, last = max(shake.runs, key=lambda run: run[1] - run[0])
+    if last - first == frames:
+        return first, last, []
     if last - first < 2:
         raise InputRejected(
-            f"'{source}' has a cut at nearly every frame", "a stretch of at least 2 frames from one camera",
+            f"'{source}' shows another view at nearly every frame", "a stretch of at least 2 frames from one camera",
             "trim it with --start and --duration",
         )  # fmt: skip
-    where = ", ".join(str(kept[c]) for c in cuts)
-    return (
-        first,
-        last,
-        [f"the clip has {len(cuts)} cut(s), at frame {where}: only frames {kept[first]} to {kept[last - 1]} are used"],
-    )
+    why = []
+    if shake.cuts:
+        why.append(f"has {len(shake.cuts)} cut(s), at frame {', '.join(str(kept[c]) for c in shake.cuts)}")
+    if last - first < max(b - a for a, b in pairwise((0, *shake.cuts, frames))):
+        why.append("turns away from its view")
+    return first, last, [f"the clip {' and '.join(why)}: only frames {kept[first]} to {kept[last - 1]} are used"]

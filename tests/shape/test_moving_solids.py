@@ -1,0 +1,81 @@
+"""Hands and jugs move in the picture and are no fluid; what deforms, or keeps flowing, is none of them."""
+
+import cv2
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+from fluidlift.motion.optical_flow import DenseInverseSearch, flow_of_pair
+from fluidlift.shape.moving_solids import moving_solids
+from fluidlift.types.clip import VideoClip
+
+FRAMES, HEIGHT, WIDTH = 40, 180, 240
+
+
+def texture(seed: int, shape: tuple[int, int], sigma: float = 1.5) -> np.ndarray:
+    noise = gaussian_filter(np.random.default_rng(seed).normal(size=shape), sigma)
+    return noise / noise.std()
+
+
+def room() -> np.ndarray:
+    """float [T,H,W], still."""
+    return np.repeat((110.0 + 15.0 * texture(0, (HEIGHT, WIDTH), 2.5))[None], FRAMES, axis=0)
+
+
+def swung(t: int) -> np.ndarray:
+    """Similarity [2,3] of a hand that swings to and fro about the middle of the left half, 20 px and 6 degrees."""
+    phase = np.sin(2.0 * np.pi * t / 30.0)
+    motion = cv2.getRotationMatrix2D((60.0, 90.0), 6.0 * phase, 1.0)
+    motion[0, 2] += 20.0 * phase
+    return motion
+
+
+def with_hand(pictures: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The pictures with a hand in front, and bool [T,H,W] where it is."""
+    hand = (150.0 + 25.0 * texture(1, (HEIGHT, WIDTH))).astype(np.float32)
+    rows, columns = np.mgrid[0:HEIGHT, 0:WIDTH]
+    outline = (((columns - 60) / 32.0) ** 2 + ((rows - 90) / 45.0) ** 2 < 1.0).astype(np.float32)
+    result, where = pictures.copy(), np.zeros(pictures.shape, bool)
+    for t in range(FRAMES):
+        where[t] = cv2.warpAffine(outline, swung(t), (WIDTH, HEIGHT)) > 0.5
+        result[t][where[t]] = cv2.warpAffine(hand, swung(t), (WIDTH, HEIGHT))[where[t]]
+    return result, where
+
+
+def found_in(pictures: np.ndarray) -> np.ndarray:
+    rng = np.random.default_rng(5)
+    noisy = pictures + rng.normal(size=pictures.shape)
+    frames = np.clip(noisy, 0, 255).round().astype(np.uint8)[..., None].repeat(3, axis=-1)
+    clip, estimator = VideoClip(frames, np.arange(FRAMES) / 25.0), DenseInverseSearch()
+    return moving_solids(clip, lambda t: flow_of_pair(frames[t], frames[t + 1], estimator), (HEIGHT, WIDTH))
+
+
+def test_a_hand_that_swings_is_a_solid_and_the_room_is_none():
+    pictures, where = with_hand(room())
+    found = found_in(pictures)
+    always, ever = where.all(axis=0), where.any(axis=0)
+    assert found[always].mean() > 0.9
+    around = cv2.dilate(ever.astype(np.uint8), np.ones((21, 21))) == 0  # optical flow spreads beyond an outline
+    assert not found[around].any()
+
+
+def test_a_sheet_of_foam_that_slides_by_is_none_though_it_does_not_deform():
+    pictures = room()
+    for t in range(FRAMES):
+        pictures[t, 100:150] = (120.0 + 30.0 * np.roll(texture(2, (HEIGHT, WIDTH)), 3 * t, axis=1))[100:150]
+    assert found_in(pictures).mean() < 0.002
+
+
+def test_water_that_deforms_as_it_sways_is_none():
+    pictures = room()
+    a, b = texture(3, (HEIGHT, WIDTH)), texture(4, (HEIGHT, WIDTH))
+    for t in range(FRAMES):
+        phase = 2.0 * np.pi * t / 10.0  # a look of its own every few frames
+        moved = np.cos(phase) * np.roll(a, round(8 * np.sin(phase / 3)), axis=1) + np.sin(phase) * b
+        pictures[t, 100:150] = (120.0 + 30.0 * moved)[100:150]
+    assert found_in(pictures).mean() < 0.002
+
+
+def test_a_clip_that_is_too_short_shows_none():
+    frames = np.zeros((6, HEIGHT, WIDTH, 3), np.uint8)
+    clip = VideoClip(frames, np.arange(6) / 25.0)
+    assert not moving_solids(clip, lambda t: (np.zeros((HEIGHT, WIDTH, 2)), np.ones((HEIGHT, WIDTH))), (90, 120)).any()

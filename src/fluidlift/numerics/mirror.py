@@ -107,7 +107,7 @@ class MirroredPoints:
         for attempt in range(TRIES):
             images, turned, beside = self._images(places[left], run, attempt)
             members = self._tree.query_ball_point(images, 0.5 * self._spacing, p=np.inf, return_sorted=True)
-            count = np.array([len(m) for m in members], np.int64)
+            count = np.array([len(m) for m in np.atleast_1d(members)], np.int64)
             if count.any():
                 own = np.repeat(np.arange(len(left)), count)
                 point = np.concatenate([m for m in members if m]).astype(np.int64)

@@ -321,3 +321,35 @@ class VelocityContinuation(ABC):
     ) -> FaceVelocity:
         """Faces without a value (`valid` bool per face) take the mean of their neighbours that have one, layer by
         layer; 0 farther away."""
+
+
+class Progress(Protocol):
+    """Where progress is told: a terminal, plain lines, or nowhere."""
+
+    def stage(self, name: str, number: int, count: int) -> None:
+        """A stage begins."""
+
+    def update(self, done: int, total: int) -> None:
+        """Part of the current stage is done."""
+
+    def finished(self, name: str, seconds: float, cached: bool) -> None:
+        """A stage ended."""
+
+    def warn(self, text: str) -> None:
+        """Something the user should know."""
+
+
+class Silence:
+    """No progress at all."""
+
+    def stage(self, name: str, number: int, count: int) -> None:
+        """Nothing."""
+
+    def update(self, done: int, total: int) -> None:
+        """Nothing."""
+
+    def finished(self, name: str, seconds: float, cached: bool) -> None:
+        """Nothing."""
+
+    def warn(self, text: str) -> None:
+        """Nothing."""

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fluidlift.io.kept_values import kept_value
 from fluidlift.pipeline.recall import OF_CLIP
-from fluidlift.pipeline.runner import kept_value
 from fluidlift.pipeline.scene import Scene
 from fluidlift.types import (
     CellType,

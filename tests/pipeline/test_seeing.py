@@ -21,8 +21,8 @@ from fluidlift.pipeline.stages.flow import estimated_flow
 from fluidlift.pipeline.stages.read import read
 from fluidlift.pipeline.stages.segment import segment
 from fluidlift.pipeline.steady_flow import mean_motion, pairs_of, spans_of
-from fluidlift.pipeline.work import Silence, Work
-from fluidlift.seams import Segmenter
+from fluidlift.pipeline.work import Work
+from fluidlift.seams import Segmenter, Silence
 from fluidlift.types import Label, PixelFlow, PixelLabels
 from fluidlift.types.stages import Flow, Read
 

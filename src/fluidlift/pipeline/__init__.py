@@ -14,7 +14,7 @@ from fluidlift.pipeline.rendering import RenderRequest, render_asset
 from fluidlift.pipeline.resimulate import Made, resimulate
 from fluidlift.pipeline.scene import SimulationRequest, edited_scene
 from fluidlift.pipeline.simulator import simulator_of
-from fluidlift.pipeline.work import Progress, Silence
+from fluidlift.seams import Progress, Silence
 
 __all__ = [
     "STAGES",

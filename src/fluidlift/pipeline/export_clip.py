@@ -10,10 +10,10 @@ import numpy as np
 
 from fluidlift.errors import InputRejected
 from fluidlift.io.frames import FIRST_FRAME
+from fluidlift.io.written import cleared, numbered
 from fluidlift.pipeline.export_job import ExportRequest, Outcome
 from fluidlift.pipeline.recall import recalled
-from fluidlift.pipeline.work import Progress
-from fluidlift.pipeline.written import cleared, numbered
+from fluidlift.seams import Progress
 from fluidlift.types import FluidAsset, Label, PinholeCamera
 from fluidlift.types.stages import Flow, Motion, Segmentation
 

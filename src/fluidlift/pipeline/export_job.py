@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from fluidlift.errors import InputRejected
-from fluidlift.pipeline.work import Progress
+from fluidlift.seams import Progress
 from fluidlift.types import FluidAsset
 
 OF_CLIP = ("camera", "flow", "flo", "masks")
@@ -130,8 +130,8 @@ def as_simulated(folder: Path, asset: FluidAsset, manifest: dict[str, Any]) -> F
     Raises:
         InputRejected: a scene.yaml that does not fit.
     """
+    from fluidlift.config.of_asset import settings_of
     from fluidlift.io.scene import read_edits
-    from fluidlift.pipeline.resimulate import settings_of
     from fluidlift.pipeline.scene import SimulationRequest, scene_of
 
     played, edits = manifest.get("simulation", {}), read_edits(folder)

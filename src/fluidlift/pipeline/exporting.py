@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fluidlift.io.frames import FIRST_FRAME, FluidFrame
+from fluidlift.io.written import Written, cleared, numbered
 from fluidlift.pipeline.export_job import (
     FORMATS,
     OF_CLIP,
@@ -27,8 +28,7 @@ from fluidlift.pipeline.export_job import (
 from fluidlift.pipeline.rendering import frame_numbers, frames_told
 from fluidlift.pipeline.splat_files import frames_of
 from fluidlift.pipeline.surfacing import surface_of
-from fluidlift.pipeline.work import Progress, Silence
-from fluidlift.pipeline.written import Written, cleared, numbered
+from fluidlift.seams import Progress, Silence
 from fluidlift.types import FaceVelocity, FluidAsset, Gaussians, Grid, Similarity3, TriangleMesh, kind_of
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from fluidlift.pipeline.fit_request import request_of
 from fluidlift.pipeline.fluid_masks import FluidMasks
 from fluidlift.pipeline.inputs import GivenFile, GivenFiles, Inputs
 from fluidlift.pipeline.resimulate import Made, play
-from fluidlift.pipeline.runner import Runner, gone_if_refused
+from fluidlift.pipeline.runner import Runner, gone_if_refused, require_stages
 from fluidlift.pipeline.scene import SimulationRequest, edited_scene, first_of_film
 from fluidlift.pipeline.settings import (
     GenerateSettings,
@@ -33,8 +33,7 @@ from fluidlift.pipeline.stages.calibrate import calibrate, mean_target
 from fluidlift.pipeline.stages.fit import fit
 from fluidlift.pipeline.stages.motion import motion
 from fluidlift.pipeline.stages.refine import refine
-from fluidlift.pipeline.work import Progress, Silence
-from fluidlift.pipeline.written import require_stages
+from fluidlift.seams import Progress, Silence
 from fluidlift.types import FluidAsset, kind_of
 from fluidlift.types.stages import Bodies, Calibration, Fit, Lift, Read, Segmentation
 

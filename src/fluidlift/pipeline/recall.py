@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from fluidlift.io.kept_values import kept_value, last_value
 from fluidlift.pipeline.footage import Footage, footage_of
-from fluidlift.pipeline.runner import Runner, kept_value, last_value
+from fluidlift.pipeline.runner import Runner
 from fluidlift.types.stages import (
     Fit,
     Flow,

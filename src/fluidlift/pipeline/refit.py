@@ -11,17 +11,18 @@ from typing import Any
 
 from fluidlift import __version__
 from fluidlift.config import JobConfig
+from fluidlift.config.of_asset import settings_of
 from fluidlift.errors import InputRejected
+from fluidlift.fit.outcome import SUBJECT, in_words
+from fluidlift.io.kept_values import last_value
+from fluidlift.machine import peak_memory_mb
 from fluidlift.pipeline import reporting
-from fluidlift.pipeline.fit_outcome import SUBJECT, in_words
 from fluidlift.pipeline.fit_request import request_of
-from fluidlift.pipeline.machine import peak_memory_mb
 from fluidlift.pipeline.make import fit_figures
 from fluidlift.pipeline.recall import OF_CLIP, recalled, stage_keys
-from fluidlift.pipeline.resimulate import settings_of
-from fluidlift.pipeline.runner import Runner, last_value
+from fluidlift.pipeline.runner import Runner
 from fluidlift.pipeline.stages.fit import fit
-from fluidlift.pipeline.work import Progress, Silence
+from fluidlift.seams import Progress, Silence
 from fluidlift.types.stages import Fit, Geometry, Lift, Motion, Read, Segmentation, Shown, Simulation
 
 NEEDED = ("read", "segment", "geometry", "motion")

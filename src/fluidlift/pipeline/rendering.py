@@ -10,17 +10,17 @@ from pathlib import Path
 
 import numpy as np
 
+from fluidlift.config.of_asset import settings_of
 from fluidlift.errors import InputRejected
 from fluidlift.io.frames import FIRST_FRAME
+from fluidlift.io.written import Written, cleared, numbered
 from fluidlift.pipeline.drawing import Stage, drawn
 from fluidlift.pipeline.front_view import open_end
 from fluidlift.pipeline.looks import Painter
 from fluidlift.pipeline.recall import footage_of_asset, simulated_poses
-from fluidlift.pipeline.resimulate import settings_of
 from fluidlift.pipeline.scene import Scene, SimulationRequest, scene_of
 from fluidlift.pipeline.splat_files import frame_file
-from fluidlift.pipeline.work import Progress, Silence
-from fluidlift.pipeline.written import Written, cleared, numbered
+from fluidlift.seams import Progress, Silence
 from fluidlift.types import PinholeCamera
 
 VIEWS = ("input", "side", "top", "turn")

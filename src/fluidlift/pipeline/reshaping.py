@@ -64,10 +64,10 @@ def with_terrain(scene: Scene, edits: Sequence[TerrainEdit]) -> Scene:
     Raises:
         InputRejected: edits that do not fit, or a box that memory cannot hold.
     """
+    from fluidlift.machine import available_memory
     from fluidlift.physics.preflight import check_memory
     from fluidlift.physics.terrain_edit import Replace
     from fluidlift.physics.terrain_reshape import reshaped, reshaped_body, reshaped_gaussians, reshaped_velocity
-    from fluidlift.pipeline.machine import available_memory
     from fluidlift.types import CellType
 
     if not edits:

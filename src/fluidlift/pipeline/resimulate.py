@@ -10,11 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from fluidlift.config import PRESETS, JobConfig, build_config
+from fluidlift.config import JobConfig
+from fluidlift.config.of_asset import SECOND_HALF_SECTIONS, settings_of
 from fluidlift.errors import FluidliftError, InputRejected
+from fluidlift.machine import peak_memory_mb
 from fluidlift.pipeline import reporting
 from fluidlift.pipeline.footage import footage_of
-from fluidlift.pipeline.machine import peak_memory_mb
 from fluidlift.pipeline.recall import recalled_lift, rest_frame_of
 from fluidlift.pipeline.reshaping import slow_edits
 from fluidlift.pipeline.runner import Runner
@@ -22,14 +23,12 @@ from fluidlift.pipeline.scene import Scene, SimulationRequest, scene_of
 from fluidlift.pipeline.settings import ShowSettings, SimulateSettings, taken
 from fluidlift.pipeline.stages.show import SeenLook, show
 from fluidlift.pipeline.stages.simulate import frames_still_there, simulate
-from fluidlift.pipeline.work import Progress, Silence
+from fluidlift.seams import Progress, Silence
 from fluidlift.types import FluidAsset
 from fluidlift.types.stages import Lift, Shown, Simulation
 
 SECOND_HALF = ("simulate", "show")
 
-SECOND_HALF_SECTIONS = ("simulate", "show")
-"""settings that the second half depends on"""
 
 FPS_RANGE = (0.1, 10_000.0)
 """frames per second that can be asked for"""
@@ -105,41 +104,6 @@ def _check(request: SimulationRequest) -> None:
         raise InputRejected(f"--meshes '{request.meshes}'", "an existing folder")
     if request.resume and request.restart:
         raise InputRejected("both --resume and --restart", "one of them")
-
-
-def settings_of(
-    manifest: dict[str, Any], overrides: Sequence[str], flat: dict[str, Any], *, sections: Sequence[str], work: str
-) -> JobConfig:
-    """The settings that the asset was made with, and what is changed now.
-
-    Of an asset made by another version, settings that this one does not know are left out.
-
-    Args:
-        manifest: of the asset.
-        overrides: `section.name=value`.
-        flat: settings by dotted name; None values are left out.
-        sections: that matter for the work.
-        work: a word for it.
-
-    Raises:
-        InputRejected: a setting of another section, an unknown one, or a wrong value.
-    """
-    for text in overrides:
-        if text.partition("=")[0].strip().partition(".")[0] not in sections:
-            raise InputRejected(
-                f"--set {text}, which has no effect on {work}", " or ".join(f"{s}.name=value" for s in sections),
-                "change it with fluidlift make",
-            )  # fmt: skip
-    provenance = manifest.get("provenance", {})
-    stored = provenance.get("config", {})
-    values: dict[str, Any] = {"seed": provenance.get("seed")}
-    for section in sections:
-        part = stored.get(section, {}) if isinstance(stored, dict) else {}
-        known = JobConfig().section(section)
-        values |= {f"{section}.{k}": v for k, v in part.items() if k in known} if isinstance(part, dict) else {}
-    preset = stored.get("preset") if isinstance(stored, dict) else None
-    preset = preset if isinstance(preset, str) and preset in PRESETS else None
-    return build_config(preset, None, overrides, values | {k: v for k, v in flat.items() if v is not None})
 
 
 def play(runner: Runner, asset: FluidAsset, config: JobConfig, request: SimulationRequest, lift: Lift | None) -> int:

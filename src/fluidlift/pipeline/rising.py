@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from fluidlift.machine import one_torch_thread
 from fluidlift.pipeline.fluid_masks import FluidMasks
-from fluidlift.pipeline.machine import one_torch_thread
 from fluidlift.types import Estimate, FaceVelocity, FluidParameters
 from fluidlift.types.stages import Geometry, Read
 

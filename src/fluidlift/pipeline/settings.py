@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 from fluidlift.config import JobConfig
 from fluidlift.pipeline.inputs import GivenFile, GivenFiles, Weights
-from fluidlift.pipeline.source import source_hash
+from fluidlift.source import source_hash
 
 T = TypeVar("T")
 

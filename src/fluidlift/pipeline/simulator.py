@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fluidlift.errors import InputRejected
+from fluidlift.machine import available_memory
 from fluidlift.pipeline.dressing import lends_look
-from fluidlift.pipeline.machine import available_memory
 from fluidlift.pipeline.reshaping import sides_open_to_air
 from fluidlift.pipeline.scene import Scene, simulation_step
 from fluidlift.types import CellType, Gaussians, Particles, kind_of

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from fluidlift.config.of_asset import SECOND_HALF_SECTIONS, settings_of
 from fluidlift.io.asset_folder import load_asset, read_manifest
 from fluidlift.io.checkpoint import differing_parts, read_parts
 from fluidlift.io.obstacles import color_mark
@@ -13,7 +14,6 @@ from fluidlift.io.scene import SceneEdits
 from fluidlift.io.scene_look import Look
 from fluidlift.io.stage_cache import owner_of
 from fluidlift.pipeline.recall import footage_of_asset, rest_frame_of
-from fluidlift.pipeline.resimulate import SECOND_HALF_SECTIONS, settings_of
 from fluidlift.pipeline.scene import Scene, SimulationRequest, scene_of
 from fluidlift.pipeline.splat_files import checkpoint_file
 from fluidlift.pipeline.stages.simulate import state_parts

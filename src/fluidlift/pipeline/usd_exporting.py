@@ -83,8 +83,8 @@ def _with_volumes(
 ) -> Iterator[FluidFrame]:
     """The frames of smoke, each with the name of its OpenVDB file."""
     from fluidlift.io.volume_grid import VolumeGrid, velocity_grid, write_vdb
+    from fluidlift.io.written import cleared
     from fluidlift.pipeline.exporting import gridded
-    from fluidlift.pipeline.written import cleared
 
     cleared(out / VOLUMES, [".vdb"])
     for k, frame in enumerate(frames):

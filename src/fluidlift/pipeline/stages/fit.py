@@ -10,7 +10,7 @@ import numpy as np
 
 from fluidlift.config import FitConfig
 from fluidlift.errors import InputRejected
-from fluidlift.pipeline.fit_outcome import (
+from fluidlift.fit.outcome import (
     AT_THE_ENDS,
     Verdict,
     as_given,
@@ -22,9 +22,9 @@ from fluidlift.pipeline.fit_outcome import (
     table,
     verdict,
 )
+from fluidlift.machine import one_torch_thread
 from fluidlift.pipeline.fit_request import FitRequest, request_of, startable
 from fluidlift.pipeline.fluid_masks import FluidMasks
-from fluidlift.pipeline.machine import one_torch_thread
 from fluidlift.pipeline.rising import outline_rises, with_buoyancy
 from fluidlift.pipeline.work import Work
 from fluidlift.types import CellType, FaceVelocity, FitResult, FluidKind, FluidParameters, kind_of

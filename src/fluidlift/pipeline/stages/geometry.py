@@ -8,7 +8,7 @@ from typing import Any, cast
 import numpy as np
 
 from fluidlift.errors import InputRejected
-from fluidlift.pipeline import composite, dam, depths, given_body, ground
+from fluidlift.pipeline import dam, depths, given_body, ground
 from fluidlift.pipeline.fluid_masks import FluidMasks
 from fluidlift.pipeline.inputs import GivenFile
 from fluidlift.pipeline.known_camera import known_camera, lens_is_known, level_of
@@ -16,7 +16,7 @@ from fluidlift.pipeline.rest_frames import FEWEST_PIXELS, rest_frame, united_ran
 from fluidlift.pipeline.settings import GeometrySettings, GivenView
 from fluidlift.pipeline.steady_flow import mean_motion
 from fluidlift.pipeline.work import Work
-from fluidlift.shape import generate, ground_texture, place, puddle, standing, surface, texture_gradient
+from fluidlift.shape import composite, generate, ground_texture, place, puddle, standing, surface, texture_gradient
 from fluidlift.shape import kind as kinds
 from fluidlift.shape.framing import framing_warnings
 from fluidlift.shape.given_depth import DepthPictures

@@ -15,9 +15,9 @@ from fluidlift.pipeline.scene import Scene, SimulationRequest
 from fluidlift.pipeline.settings import SimulateSettings
 from fluidlift.pipeline.simulated_history import History
 from fluidlift.pipeline.simulator import preflight, simulator_of
-from fluidlift.pipeline.source import source_hash
 from fluidlift.pipeline.splat_files import checkpoint_file, frame_file, require_room
 from fluidlift.pipeline.work import Work
+from fluidlift.source import source_hash
 from fluidlift.types import kind_of
 from fluidlift.types.stages import Simulation
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from fluidlift.errors import InputRejected
 from fluidlift.io.frames import FIRST_FRAME
 
 
@@ -62,10 +61,3 @@ def digest_of(files: Iterable[Path]) -> str:
         digest.update(file.read_bytes() if file.is_file() else b"")
         digest.update(b"\0")
     return digest.hexdigest()
-
-
-def require_stages(force: Iterable[str], stages: tuple[str, ...]) -> None:
-    """Raise `InputRejected` for a stage that there is not."""
-    unknown = set(force) - set(stages)
-    if unknown:
-        raise InputRejected(f"unknown stage '{sorted(unknown)[0]}'", "one of " + ", ".join(stages))

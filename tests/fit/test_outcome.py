@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
+from fluidlift.fit import outcome
+from fluidlift.fit.outcome import interval_of, table, verdict
 from fluidlift.fit.ranges import UNITS, Bounded, Positive
-from fluidlift.pipeline import fit_outcome
-from fluidlift.pipeline.fit_outcome import interval_of, table, verdict
 from fluidlift.types import Estimate, FitResult, FluidParameters
 
 KNOWN = Estimate(0.5, 0.01, True, 0.4, "m/s")
@@ -77,7 +77,7 @@ def test_the_interval_of_anything_else_is_symmetric_and_of_nothing_none():
 def test_every_number_says_where_it_comes_from():
     estimates = {
         "gravity_z": KNOWN, "density": UNKNOWN, "inflow_velocity_x": UNKNOWN, "restitution": UNKNOWN,
-        "kinematic_viscosity": fit_outcome.as_given("kinematic_viscosity", UNKNOWN, FluidParameters()),
+        "kinematic_viscosity": outcome.as_given("kinematic_viscosity", UNKNOWN, FluidParameters()),
     }  # fmt: skip
     rows = table(estimates, held={"kinematic_viscosity"}, free={"gravity", "density"}, measured={"inflow_velocity"})
     assert {r["name"]: r["source"] for r in rows} == {
@@ -86,7 +86,7 @@ def test_every_number_says_where_it_comes_from():
     }  # fmt: skip
     given = rows[-1]
     assert (given["value"], given["sigma"], given["interval"]) == (1e-6, 0.0, [1e-6, 1e-6])
-    assert fit_outcome.in_words(given) == "exact" and fit_outcome.in_words(rows[1]) == "unknown"
+    assert outcome.in_words(given) == "exact" and outcome.in_words(rows[1]) == "unknown"
 
 
 @pytest.mark.parametrize(
@@ -97,20 +97,20 @@ def test_every_number_says_where_it_comes_from():
     ],
 )  # fmt: skip
 def test_the_size_says_where_metres_come_from(source, relative, said, sigma):
-    row = fit_outcome.size_row({"source": source, "across": 0.5, "relative_error": relative})
+    row = outcome.size_row({"source": source, "across": 0.5, "relative_error": relative})
     assert (row["source"], row["unit"]) == (said, "m")
     assert row["sigma"] == (None if sigma is None else pytest.approx(sigma))
-    assert fit_outcome.size_estimate(row).identifiable == (source == "free fall")
+    assert outcome.size_estimate(row).identifiable == (source == "free fall")
 
 
 def test_an_earlier_version_did_not_note_the_size():
-    assert fit_outcome.size_row({"source": "size", "value": 2.0}) is None
+    assert outcome.size_row({"source": "size", "value": 2.0}) is None
 
 
 def test_the_bar_is_full_where_the_value_is_sure():
     def bar(sigma):
         (row,) = table({"gravity_z": Estimate(-10.0, sigma, True, -9.81)}, held=(), free=("gravity",), measured=())
-        return fit_outcome.how_sure(row).count("▰")
+        return outcome.how_sure(row).count("▰")
 
     assert (bar(0.01), bar(10.0)) == (10, 0)
     assert 0 < bar(2.0) < 10
@@ -118,7 +118,7 @@ def test_the_bar_is_full_where_the_value_is_sure():
 
 def test_a_failed_fit_has_an_estimate_of_every_number_of_which_nothing_is_known():
     initial = FluidParameters(inflow_velocity=(0.5, 0.0, 0.1))
-    found = fit_outcome.first_guess_as_result(initial, UNITS)
+    found = outcome.first_guess_as_result(initial, UNITS)
     assert found["inflow_velocity_z"].value == 0.1 and found["density"].value == 1000.0
     assert not any(e.identifiable or math.isfinite(e.sigma) for e in found.values())
     # three numbers for each vector

@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from fluidlift.pipeline.source import ROOT, Sources
+from fluidlift.source import ROOT, Sources
 
 FILES = {
     "__init__.py": '__version__ = "1"\n',

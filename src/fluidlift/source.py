@@ -97,7 +97,7 @@ def _modules(root: Path) -> dict[str, Path]:
     return found
 
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parent
 """folder of this package"""
 _OURS = Sources(ROOT)
 

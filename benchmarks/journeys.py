@@ -122,7 +122,8 @@ def journeys(folder: Path, asset: Path | None, show: bool) -> list[str]:
     from fluidlift import pipeline
     from fluidlift.io.asset_folder import load_asset
     from fluidlift.io.scene import SceneEdits
-    from fluidlift.pipeline import EditSession, Inputs, make, resimulate
+    from fluidlift.pipeline import Inputs, make, resimulate
+    from fluidlift.scene import EditSession
 
     clip, config = small_clip(folder / "clip.mp4"), build_config("draft", None, QUICK, {"shape.size": 2.0})
     if asset is None:

@@ -35,8 +35,8 @@ from fluidlift.look.scenery import orbit_camera, side_camera, terrain_surfels
 from fluidlift.look.vessel import glass_of
 from fluidlift.numerics.srgb import linear_from_srgb, srgb_from_linear
 from fluidlift.pipeline.looks import Backdrop, Frame, Painter
-from fluidlift.pipeline.recall import footage_of_asset
-from fluidlift.pipeline.splat_files import splat_frames
+from fluidlift.scene.recall import footage_of_asset
+from fluidlift.scene.splat_files import splat_frames
 from fluidlift.types import FluidAsset, Gaussians, Grid, PinholeCamera, Terrain, TriangleMesh, kind_of
 
 BEGIN, END = "<!-- looks:begin -->", "<!-- looks:end -->"

@@ -18,8 +18,9 @@ __version__ = "0.1.0"
 
 _FACE = {
     # from a clip to an asset, and on from there
-    "pipeline": ("EditSession", "ExportRequest", "Inputs", "RenderRequest", "SimulationRequest", "export_asset",
-                 "find_masks", "make", "measure_motion", "refit", "render_asset", "resimulate"),
+    "scene": ("EditSession", "SimulationRequest"),
+    "pipeline": ("ExportRequest", "Inputs", "RenderRequest", "export_asset", "find_masks",
+                 "make", "measure_motion", "refit", "render_asset", "resimulate"),
     "config": ("build_config",),
     "io.asset_folder": ("load_asset", "save_asset"),
     "validate": ("validate_asset",),

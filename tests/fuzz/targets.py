@@ -118,7 +118,7 @@ def _asset(folder: Path) -> None:
 
 
 def _history(folder: Path) -> None:
-    from fluidlift.pipeline.edit_history import announced, read_history
+    from fluidlift.scene.edit_history import announced, read_history
 
     announced(folder)
     read_history(folder)
@@ -127,7 +127,7 @@ def _history(folder: Path) -> None:
 def _history_files() -> list[Seed]:
     import json
 
-    from fluidlift.pipeline.edit_history import Edit
+    from fluidlift.scene.edit_history import Edit
 
     edit = Edit.of(1, "set", "a: 1\n", "a: 2\n")
     lines = [{"time": "", "what": "found", "text": "a: 1\n"}, edit.to_dict()]

@@ -12,7 +12,7 @@ from fluidlift.io.scene_domain import require_inside
 from fluidlift.io.scene_look import ENVIRONMENTS, MATERIALS, Look
 from fluidlift.numerics.solid_mesh import box_mesh, moments
 from fluidlift.physics.terrain_edit import Move, Replace, Rotate, Scale, Twist
-from fluidlift.pipeline.substances import SUBSTANCES
+from fluidlift.scene.substances import SUBSTANCES
 from fluidlift.types import FluidParameters, Grid, TriangleMesh
 
 GRID = Grid((10, 10, 5), 0.1, (0.0, 0.0, 0.0))

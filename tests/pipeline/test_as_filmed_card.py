@@ -11,7 +11,7 @@ from fluidlift.cli import DONE, REJECTED, WITH_WARNINGS, main
 from fluidlift.io.asset_folder import read_manifest, update_manifest
 from fluidlift.physics.inflow_schedule import InflowSchedule
 from fluidlift.pipeline.as_filmed import Reel, card_of, card_of_run, why_not
-from fluidlift.pipeline.footage import Footage
+from fluidlift.scene.footage import Footage
 from fluidlift.types import PixelLabels, VideoClip
 
 WELL = (DONE, WITH_WARNINGS)

@@ -10,7 +10,6 @@ from fluidlift.config import build_config
 from fluidlift.errors import InputRejected
 from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.look.rasterize import render
-from fluidlift.pipeline.editing import EditSession
 from fluidlift.pipeline.looping import (
     SplatFrame,
     blended,
@@ -22,11 +21,12 @@ from fluidlift.pipeline.looping import (
     seam,
 )
 from fluidlift.pipeline.resimulate import resimulate
-from fluidlift.pipeline.scene import LOOP_FADE, loop_overlap
 from fluidlift.pipeline.settings import SimulateSettings, taken
-from fluidlift.pipeline.splat_files import checkpoint_file, frame_file
 from fluidlift.pipeline.stages.simulate import simulate
 from fluidlift.pipeline.work import Work
+from fluidlift.scene.build import LOOP_FADE, loop_overlap
+from fluidlift.scene.edits import EditSession
+from fluidlift.scene.splat_files import checkpoint_file, frame_file
 from fluidlift.types import CellType, FluidParameters, Gaussians
 
 

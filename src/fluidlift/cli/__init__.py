@@ -203,7 +203,7 @@ def _fit(c: Fit) -> int:
 
 
 def _sim(c: Sim) -> int:
-    from fluidlift.pipeline import SimulationRequest
+    from fluidlift.scene import SimulationRequest
 
     request = SimulationRequest(c.duration, c.fps, c.extend_downstream, c.meshes, c.resume, c.restart)
     flat = {"seed": c.seed, "simulate.checkpoint_every": c.checkpoint_every}

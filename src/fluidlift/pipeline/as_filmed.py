@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fluidlift.physics.inflow_schedule import InflowSchedule
-from fluidlift.pipeline.footage import Footage
-from fluidlift.pipeline.scene import Scene
+from fluidlift.scene.build import Scene
+from fluidlift.scene.footage import Footage
 
 if TYPE_CHECKING:
     from fluidlift.evaluate.as_filmed import AsFilmed

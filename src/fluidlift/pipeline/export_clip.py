@@ -12,7 +12,7 @@ from fluidlift.errors import InputRejected
 from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.io.written import cleared, numbered
 from fluidlift.pipeline.export_job import ExportRequest, Outcome
-from fluidlift.pipeline.recall import recalled
+from fluidlift.scene.recall import recalled
 from fluidlift.seams import Progress
 from fluidlift.types import FluidAsset, Label, PinholeCamera
 from fluidlift.types.stages import Flow, Motion, Segmentation

@@ -132,7 +132,7 @@ def as_simulated(folder: Path, asset: FluidAsset, manifest: dict[str, Any]) -> F
     """
     from fluidlift.config.of_asset import settings_of
     from fluidlift.io.scene import read_edits
-    from fluidlift.pipeline.scene import SimulationRequest, scene_of
+    from fluidlift.scene.build import SimulationRequest, scene_of
 
     played, edits = manifest.get("simulation", {}), read_edits(folder)
     longer = float(played.get("extended_downstream", 0.0))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.io.written import cleared, numbered
 from fluidlift.pipeline.export_job import ExportJob, Outcome
-from fluidlift.pipeline.splat_files import frames_of
+from fluidlift.scene.splat_files import frames_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -26,8 +26,8 @@ from fluidlift.pipeline.export_job import (
     every,
 )
 from fluidlift.pipeline.rendering import frame_numbers, frames_told
-from fluidlift.pipeline.splat_files import frames_of
 from fluidlift.pipeline.surfacing import surface_of
+from fluidlift.scene.splat_files import frames_of
 from fluidlift.seams import Progress, Silence
 from fluidlift.types import FaceVelocity, FluidAsset, Gaussians, Grid, Similarity3, TriangleMesh, kind_of
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fluidlift.pipeline.footage import Footage
-from fluidlift.pipeline.scene import Scene
+from fluidlift.scene.build import Scene
+from fluidlift.scene.footage import Footage
 from fluidlift.types import Gaussians, PinholeCamera, concatenate, kind_of
 
 if TYPE_CHECKING:

@@ -32,8 +32,8 @@ from jaxtyping import Float
 from fluidlift.types import Gaussians, concatenate
 
 if TYPE_CHECKING:
-    from fluidlift.pipeline.scene import Scene
-    from fluidlift.pipeline.simulated_history import History
+    from fluidlift.scene.build import Scene
+    from fluidlift.scene.simulated_history import History
 
 FAINTEST = 1 / 255
 """opacity below which a splat is not drawn"""

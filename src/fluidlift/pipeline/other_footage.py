@@ -11,9 +11,9 @@ from fluidlift.config.of_asset import settings_of
 from fluidlift.errors import InputRejected
 from fluidlift.pipeline.as_filmed import Reel, why_not
 from fluidlift.pipeline.front_view import FrontView, to_bytes
-from fluidlift.pipeline.recall import footage_of_asset
-from fluidlift.pipeline.scene import SimulationRequest, scene_of
-from fluidlift.pipeline.splat_files import frames_of
+from fluidlift.scene.build import SimulationRequest, scene_of
+from fluidlift.scene.recall import footage_of_asset
+from fluidlift.scene.splat_files import frames_of
 from fluidlift.seams import Progress, Silence
 from fluidlift.types import VideoClip
 

@@ -19,9 +19,9 @@ from fluidlift.machine import peak_memory_mb
 from fluidlift.pipeline import reporting
 from fluidlift.pipeline.fit_request import request_of
 from fluidlift.pipeline.make import fit_figures
-from fluidlift.pipeline.recall import OF_CLIP, recalled, stage_keys
 from fluidlift.pipeline.runner import Runner
 from fluidlift.pipeline.stages.fit import fit
+from fluidlift.scene.recall import OF_CLIP, recalled, stage_keys
 from fluidlift.seams import Progress, Silence
 from fluidlift.types.stages import Fit, Geometry, Lift, Motion, Read, Segmentation, Shown, Simulation
 

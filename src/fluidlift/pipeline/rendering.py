@@ -17,9 +17,9 @@ from fluidlift.io.written import Written, cleared, numbered
 from fluidlift.pipeline.drawing import Stage, drawn
 from fluidlift.pipeline.front_view import open_end
 from fluidlift.pipeline.looks import Painter
-from fluidlift.pipeline.recall import footage_of_asset, simulated_poses
-from fluidlift.pipeline.scene import Scene, SimulationRequest, scene_of
-from fluidlift.pipeline.splat_files import frame_file
+from fluidlift.scene.build import Scene, SimulationRequest, scene_of
+from fluidlift.scene.recall import footage_of_asset, simulated_poses
+from fluidlift.scene.splat_files import frame_file
 from fluidlift.seams import Progress, Silence
 from fluidlift.types import PinholeCamera
 

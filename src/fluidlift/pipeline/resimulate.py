@@ -15,14 +15,14 @@ from fluidlift.config.of_asset import SECOND_HALF_SECTIONS, settings_of
 from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.machine import peak_memory_mb
 from fluidlift.pipeline import reporting
-from fluidlift.pipeline.footage import footage_of
-from fluidlift.pipeline.recall import recalled_lift, rest_frame_of
-from fluidlift.pipeline.reshaping import slow_edits
 from fluidlift.pipeline.runner import Runner
-from fluidlift.pipeline.scene import Scene, SimulationRequest, scene_of
 from fluidlift.pipeline.settings import ShowSettings, SimulateSettings, taken
 from fluidlift.pipeline.stages.show import SeenLook, show
 from fluidlift.pipeline.stages.simulate import frames_still_there, simulate
+from fluidlift.scene.build import Scene, SimulationRequest, scene_of
+from fluidlift.scene.footage import footage_of
+from fluidlift.scene.recall import OF_CLIP, rest_frame_of, stage_keys
+from fluidlift.scene.reshaping import slow_edits
 from fluidlift.seams import Progress, Silence
 from fluidlift.types import FluidAsset
 from fluidlift.types.stages import Lift, Shown, Simulation
@@ -228,3 +228,15 @@ def evaluation_arrays(lift: Lift, simulation: Simulation, shown: Shown) -> dict[
         "particle_volume": simulation.volume,
         "leak_share": simulation.leak,
     }
+
+
+def recalled_lift(runner: Runner, manifest: dict[str, Any]) -> Lift | None:
+    """What `make` found in the clip; None where any of it is gone, and the runner knows nothing of it then."""
+    keys, values = stage_keys(manifest), []
+    for name, kind in OF_CLIP.items():
+        value = runner.recall(name, keys[name], kind) if name in keys else None
+        if value is None:
+            runner.forget()
+            return None
+        values.append(value)
+    return Lift(*values)

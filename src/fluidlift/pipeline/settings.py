@@ -242,20 +242,6 @@ class MotionSettings:
 
 
 @dataclass(frozen=True)
-class SceneSettings:
-    """What a scene takes from the job, beside its asset and its edits."""
-
-    frames: int | None
-    follow: float
-    seed: int
-
-    @classmethod
-    def of(cls, config: JobConfig) -> SceneSettings:
-        """From those of a job."""
-        return taken(cls, config.simulate, seed=config.seed)
-
-
-@dataclass(frozen=True)
 class SimulateSettings:
     """The re-simulation, beside what its scene says."""
 

@@ -11,13 +11,13 @@ import numpy as np
 
 from fluidlift.io.scene_look import Look
 from fluidlift.pipeline.as_filmed import BEYOND, Reel, card_of_run
-from fluidlift.pipeline.footage import Footage
 from fluidlift.pipeline.front_view import FrontView, open_end, to_bytes
 from fluidlift.pipeline.looks import Backdrop, Frame, Painter, placed_bodies
-from fluidlift.pipeline.scene import Scene
 from fluidlift.pipeline.settings import ShowSettings
-from fluidlift.pipeline.splat_files import splat_frames
 from fluidlift.pipeline.work import Work
+from fluidlift.scene.build import Scene
+from fluidlift.scene.footage import Footage
+from fluidlift.scene.splat_files import splat_frames
 from fluidlift.types import PinholeCamera, Similarity3, concatenate, kind_of, matrix_from_quat
 from fluidlift.types.stages import Shown, Simulation
 

@@ -17,9 +17,9 @@ from fluidlift.io.asset_lock import editing, writing
 from fluidlift.io.export_mesh import write_obj
 from fluidlift.io.scene import SCENE_TEMPLATE, SceneEdits, read_edits
 from fluidlift.numerics.solid_mesh import box_mesh, moments
-from fluidlift.pipeline import edit_history
-from fluidlift.pipeline.editing import Add, EditSession, Remove, Set
-from fluidlift.pipeline.substances import SUBSTANCES
+from fluidlift.scene import edit_history
+from fluidlift.scene.edits import Add, EditSession, Remove, Set
+from fluidlift.scene.substances import SUBSTANCES
 from fluidlift.types import (
     CellType,
     FaceVelocity,
@@ -489,9 +489,9 @@ def test_any_sequence_of_edits_undone_and_redone_gives_the_same_bytes(lifted, se
 def test_by_hand_by_command_in_python_and_in_the_viewer_give_the_same_simulation(lifted, tmp_path):
     from fluidlift.cli import DONE, WITH_WARNINGS, main
     from fluidlift.config import JobConfig
-    from fluidlift.pipeline.scene import SimulationRequest, scene_of
     from fluidlift.pipeline.settings import SimulateSettings, taken
     from fluidlift.pipeline.stages.simulate import simulate
+    from fluidlift.scene.build import SimulationRequest, scene_of
     from fluidlift.viewer.draft import Draft
 
     ways = ("hand", "command", "python", "viewer")
@@ -550,9 +550,9 @@ def test_only_what_an_edit_touches_is_stale(folder):
     from fluidlift.config import JobConfig
     from fluidlift.io.asset_folder import update_manifest
     from fluidlift.io.checkpoint import Checkpoint, write_checkpoint
-    from fluidlift.pipeline.scene import SimulationRequest, scene_of
-    from fluidlift.pipeline.splat_files import checkpoint_file
-    from fluidlift.pipeline.stages.simulate import state_parts
+    from fluidlift.scene.build import SimulationRequest, scene_of
+    from fluidlift.scene.simulation import state_parts
+    from fluidlift.scene.splat_files import checkpoint_file
 
     session = EditSession.open(folder)
     assert session.stale() == {"simulate", "look"}  # nothing was simulated yet

@@ -14,7 +14,7 @@ from fluidlift.physics.inflow_schedule import InflowSchedule
 from fluidlift.types import FaceVelocity, FluidAsset, Grid, TriangleMesh, matrix_from_quat
 
 if TYPE_CHECKING:
-    from fluidlift.pipeline.scene import Scene
+    from fluidlift.scene.build import Scene
 
 TOUCHED = 0.1
 """cells by which edited terrain differs from the filmed one, from which its place counts as touched"""

@@ -14,8 +14,8 @@ from fluidlift.io.asset_folder import asset_file, load_asset, read_parameters
 from fluidlift.io.obstacles import Obstacle
 from fluidlift.io.scene import SceneEdits
 from fluidlift.numerics.sampling import sample_nodes
-from fluidlift.pipeline.open_water import open_water
-from fluidlift.pipeline.reshaping import Asked, changed_parameters, slow_edits
+from fluidlift.scene.open_water import open_water
+from fluidlift.scene.reshaping import Asked, changed_parameters, slow_edits
 from fluidlift.types import FluidAsset, Grid, matrix_from_quat
 
 

@@ -8,13 +8,11 @@ from typing import Any
 import numpy as np
 
 from fluidlift.io.kept_values import kept_value, last_value
-from fluidlift.pipeline.footage import Footage, footage_of
-from fluidlift.pipeline.runner import Runner
+from fluidlift.scene.footage import Footage, footage_of
 from fluidlift.types.stages import (
     Fit,
     Flow,
     Geometry,
-    Lift,
     Motion,
     Read,
     Refined,
@@ -27,18 +25,6 @@ OF_CLIP: dict[str, type] = {
     "fit": Fit,
 }  # fmt: skip
 """stages that need the clip, and what they leave"""
-
-
-def recalled_lift(runner: Runner, manifest: dict[str, Any]) -> Lift | None:
-    """What `make` found in the clip; None where any of it is gone, and the runner knows nothing of it then."""
-    keys, values = stage_keys(manifest), []
-    for name, kind in OF_CLIP.items():
-        value = runner.recall(name, keys[name], kind) if name in keys else None
-        if value is None:
-            runner.forget()
-            return None
-        values.append(value)
-    return Lift(*values)
 
 
 def footage_of_asset(folder: Path, manifest: dict[str, Any]) -> Footage | None:

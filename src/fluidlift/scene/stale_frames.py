@@ -13,10 +13,10 @@ from fluidlift.io.obstacles import color_mark
 from fluidlift.io.scene import SceneEdits
 from fluidlift.io.scene_look import Look
 from fluidlift.io.stage_cache import owner_of
-from fluidlift.pipeline.recall import footage_of_asset, rest_frame_of
-from fluidlift.pipeline.scene import Scene, SimulationRequest, scene_of
-from fluidlift.pipeline.splat_files import checkpoint_file
-from fluidlift.pipeline.stages.simulate import state_parts
+from fluidlift.scene.build import Scene, SimulationRequest, scene_of
+from fluidlift.scene.recall import footage_of_asset, rest_frame_of
+from fluidlift.scene.simulation import state_parts
+from fluidlift.scene.splat_files import checkpoint_file
 
 
 def stale_parts(folder: Path, edits: SceneEdits, *, meshes: Path | None = None) -> set[str]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fluidlift.pipeline.scene import Scene
+from fluidlift.scene.build import Scene
 from fluidlift.types import Particles
 
 if TYPE_CHECKING:

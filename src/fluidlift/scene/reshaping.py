@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from fluidlift.physics.inflow_schedule import InflowSchedule
     from fluidlift.physics.stepping import ParticleSimulator
     from fluidlift.physics.terrain_edit import TerrainEdit
-    from fluidlift.pipeline.scene import Scene
+    from fluidlift.scene.build import Scene
 
 INSIDE = 0.42
 """standard deviation of a splat of the inside, cells"""

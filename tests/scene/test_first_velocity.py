@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fluidlift.numerics.sampling import sample_faces
-from fluidlift.pipeline.scene import beyond_surface
+from fluidlift.scene.build import beyond_surface
 from fluidlift.types import CellType, FaceVelocity, Grid
 
 

@@ -17,10 +17,10 @@ from fluidlift.errors import InputRejected
 from fluidlift.look.appearance import SteadyShading
 from fluidlift.machine import available_memory
 from fluidlift.physics.inflow_schedule import InflowSchedule
-from fluidlift.pipeline.following import following
-from fluidlift.pipeline.footage import Footage
-from fluidlift.pipeline.reshaping import changed_parameters, with_emitters, with_terrain
-from fluidlift.pipeline.settings import SceneSettings
+from fluidlift.scene.following import following
+from fluidlift.scene.footage import Footage
+from fluidlift.scene.reshaping import changed_parameters, with_emitters, with_terrain
+from fluidlift.scene.settings import SceneSettings
 from fluidlift.types import (
     CellType,
     FaceVelocity,

@@ -12,10 +12,10 @@ from fluidlift.io.asset_folder import FILES, load_asset, read_manifest
 from fluidlift.io.footage_file import read_footage, write_footage
 from fluidlift.io.video import read_clip
 from fluidlift.look.footage import FEWEST
-from fluidlift.pipeline.dressing import Dressing
 from fluidlift.pipeline.preview import preview_scene
-from fluidlift.pipeline.scene import SimulationRequest, film_of, first_of_film, scene_of
-from fluidlift.pipeline.simulator import simulator_of
+from fluidlift.scene.build import SimulationRequest, film_of, first_of_film, scene_of
+from fluidlift.scene.simulator import simulator_of
+from fluidlift.scene.surface_appearance import Dressing
 
 FRAMES = 4
 CONSEQUENCE = "its surface looks as it did at rest"
@@ -114,7 +114,7 @@ def test_a_fall_without_its_film_is_told_as_well(channel, tmp_path):
 
 def test_a_film_is_taken_apart_once_and_again_when_it_has_changed(channel, tmp_path):
     """A live preview begins anew with every edit."""
-    from fluidlift.pipeline.dressing import _taken_apart
+    from fluidlift.scene.surface_appearance import _taken_apart
 
     path = film(tmp_path / "film.mp4")
     scene, before = channel(FRAMES, film=path), _taken_apart.cache_info()

@@ -20,12 +20,12 @@ from fluidlift.io.scene_domain import require_inside
 from fluidlift.io.scene_look import Look
 from fluidlift.io.scene_path import PLAIN, names_of
 from fluidlift.io.scene_text import with_value, without
-from fluidlift.pipeline import edit_history
-from fluidlift.pipeline.edit_history import BY_HAND, Edit, History, text_hash, unified
-from fluidlift.pipeline.edit_outlook import outlook
-from fluidlift.pipeline.reshaping import HIGHEST
-from fluidlift.pipeline.scene_changes import Add, Change, Remove, Set
-from fluidlift.pipeline.substances import SUBSTANCES
+from fluidlift.scene import edit_history
+from fluidlift.scene.changes import Add, Change, Remove, Set
+from fluidlift.scene.edit_history import BY_HAND, Edit, History, text_hash, unified
+from fluidlift.scene.forecast import outlook
+from fluidlift.scene.reshaping import HIGHEST
+from fluidlift.scene.substances import SUBSTANCES
 from fluidlift.types import Grid, kind_of
 
 __all__ = ["Add", "Change", "EditSession", "Remove", "Set"]
@@ -185,7 +185,7 @@ class EditSession:
 
     def stale(self) -> set[str]:
         """What the frames on disk no longer show of scene.yaml: of "simulate" and "look", or nothing."""
-        from fluidlift.pipeline.stale_frames import stale_parts
+        from fluidlift.scene.stale_frames import stale_parts
 
         return stale_parts(self.folder, self.edits, meshes=self.meshes)
 

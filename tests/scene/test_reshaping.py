@@ -15,7 +15,9 @@ from fluidlift.physics.inflow_schedule import InflowSchedule
 from fluidlift.physics.stepping import ParticleSimulator
 from fluidlift.physics.terrain_edit import Rotate
 from fluidlift.pipeline.looping import read_frame
-from fluidlift.pipeline.reshaping import (
+from fluidlift.pipeline.settings import SimulateSettings, taken
+from fluidlift.pipeline.stages.simulate import simulate
+from fluidlift.scene.reshaping import (
     changed_parameters,
     in_words,
     sides_open_to_air,
@@ -23,10 +25,8 @@ from fluidlift.pipeline.reshaping import (
     with_emitters,
     with_terrain,
 )
-from fluidlift.pipeline.settings import SimulateSettings, taken
-from fluidlift.pipeline.simulator import simulator_of
-from fluidlift.pipeline.splat_files import frame_file
-from fluidlift.pipeline.stages.simulate import simulate
+from fluidlift.scene.simulator import simulator_of
+from fluidlift.scene.splat_files import frame_file
 from fluidlift.types import FluidParameters, TriangleMesh
 
 CONFIG = taken(SimulateSettings, build_config().simulate)

@@ -9,9 +9,9 @@ import numpy as np
 
 from fluidlift.errors import InputRejected
 from fluidlift.machine import available_memory
-from fluidlift.pipeline.dressing import lends_look
-from fluidlift.pipeline.reshaping import sides_open_to_air
-from fluidlift.pipeline.scene import Scene, simulation_step
+from fluidlift.scene.build import Scene, simulation_step
+from fluidlift.scene.reshaping import sides_open_to_air
+from fluidlift.scene.surface_appearance import lends_look
 from fluidlift.types import CellType, Gaussians, Particles, kind_of
 
 if TYPE_CHECKING:

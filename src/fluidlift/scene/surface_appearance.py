@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from fluidlift.look.surface_axes import SurfaceAxes
     from fluidlift.look.surface_map import SurfaceMap
     from fluidlift.look.texture_patches import TexturePatches
-    from fluidlift.pipeline.scene import Scene
+    from fluidlift.scene.build import Scene
 
 MAX_STRETCH = 3.0
 """longest axis over the mean one before a Gaussian starts again round: longer ones show as hair"""

@@ -15,11 +15,9 @@ from fluidlift.physics.pressure import build_system
 from fluidlift.physics.rollout import RolloutParameters, rollout
 from fluidlift.physics.rollout_domain import prepare_domain
 from fluidlift.pipeline import (
-    EditSession,
     ExportRequest,
     Inputs,
     RenderRequest,
-    SimulationRequest,
     export_asset,
     find_masks,
     make,
@@ -28,6 +26,7 @@ from fluidlift.pipeline import (
     render_asset,
     resimulate,
 )
+from fluidlift.scene import EditSession, SimulationRequest
 from fluidlift.types import (
     CellType,
     FaceVelocity,

@@ -158,7 +158,9 @@ def is_setting(name: str) -> bool:
 @pytest.mark.parametrize("page", [p for p in PAGES if p.name != "CHANGELOG.md"], ids=lambda p: p.name)
 def test_dotted_names_in_the_documents_are_modules_functions_or_settings(page):
     """Such as `shape.slope`, `motion.optical_flow.estimate_flow` and `fit.method`."""
-    spans = set(re.findall(rf"`(?!scene\.yaml)((?:{'|'.join(SECTIONS)})\.[a-z_][\w.]*)`", page.read_text(encoding="utf-8")))
+    spans = set(
+        re.findall(rf"`(?!scene\.yaml)((?:{'|'.join(SECTIONS)})\.[a-z_][\w.]*)`", page.read_text(encoding="utf-8"))
+    )
     missing = []
     for name in sorted(n for n in spans if not n.endswith(".json") and not (is_setting(n) or is_scene_entry(n))):
         try:
@@ -168,7 +170,7 @@ def test_dotted_names_in_the_documents_are_modules_functions_or_settings(page):
     assert missing == []
 
 
-@pytest.mark.parametrize("package", ["shape", "motion", "fit", "look", "scene", "pipeline"])
+@pytest.mark.parametrize("package", ["shape", "motion", "fit", "look", "scene", "present", "pipeline"])
 def test_the_drawing_of_the_house_names_every_module(package):
     text = (ROOT / "docs" / "design.md").read_text(encoding="utf-8")
     (drawing,) = re.findall(r"^```\nsrc/fluidlift/\n.*?^```", text, flags=re.M | re.S)

@@ -19,7 +19,7 @@ from fluidlift.io.stage_codec import packed
 from fluidlift.io.validate_usd import validate_usd
 from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.pipeline.exporting import gridded, level_set
-from fluidlift.pipeline.rendering import frame_numbers
+from fluidlift.scene.splat_files import frame_numbers
 from fluidlift.types import TriangleMesh
 from fluidlift.types.stages import Simulation
 

@@ -14,9 +14,9 @@ from fluidlift.physics.emitter import Emitter
 from fluidlift.physics.inflow_schedule import InflowSchedule
 from fluidlift.physics.stepping import ParticleSimulator
 from fluidlift.physics.terrain_edit import Rotate
-from fluidlift.pipeline.looping import read_frame
 from fluidlift.pipeline.settings import SimulateSettings, taken
 from fluidlift.pipeline.stages.simulate import simulate
+from fluidlift.present.looping import read_frame
 from fluidlift.scene.reshaping import (
     changed_parameters,
     in_words,

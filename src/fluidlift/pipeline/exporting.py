@@ -25,9 +25,8 @@ from fluidlift.pipeline.export_job import (
     checked,
     every,
 )
-from fluidlift.pipeline.rendering import frame_numbers, frames_told
-from fluidlift.pipeline.surfacing import surface_of
-from fluidlift.scene.splat_files import frames_of
+from fluidlift.present.surfacing import surface_of
+from fluidlift.scene.splat_files import frame_numbers, frames_of, frames_told
 from fluidlift.seams import Progress, Silence
 from fluidlift.types import FaceVelocity, FluidAsset, Gaussians, Grid, Similarity3, TriangleMesh, kind_of
 

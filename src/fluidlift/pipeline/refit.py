@@ -16,11 +16,11 @@ from fluidlift.errors import InputRejected
 from fluidlift.fit.outcome import SUBJECT, in_words
 from fluidlift.io.kept_values import last_value
 from fluidlift.machine import peak_memory_mb
-from fluidlift.pipeline import reporting
 from fluidlift.pipeline.fit_request import request_of
 from fluidlift.pipeline.make import fit_figures
 from fluidlift.pipeline.runner import Runner
 from fluidlift.pipeline.stages.fit import fit
+from fluidlift.present import report
 from fluidlift.scene.recall import OF_CLIP, recalled, stage_keys
 from fluidlift.seams import Progress, Silence
 from fluidlift.types.stages import Fit, Geometry, Lift, Motion, Read, Segmentation, Shown, Simulation
@@ -160,7 +160,7 @@ def _write_report(
     known = {
         k: t for k, t in timings.items() if isinstance(t, dict) and {"seconds", "cached", "peak_memory_mb"} <= t.keys()
     }
-    reporting.write_report(lift, done, shown, folder, config.preset, known | fresh, runner.warnings)
+    report.write_report(lift, done, shown, folder, config.preset, known | fresh, runner.warnings)
 
 
 def _number(asset: Any, label: str) -> float | None:

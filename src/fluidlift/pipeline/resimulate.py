@@ -14,11 +14,11 @@ from fluidlift.config import JobConfig
 from fluidlift.config.of_asset import SECOND_HALF_SECTIONS, settings_of
 from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.machine import peak_memory_mb
-from fluidlift.pipeline import reporting
 from fluidlift.pipeline.runner import Runner
 from fluidlift.pipeline.settings import ShowSettings, SimulateSettings, taken
 from fluidlift.pipeline.stages.show import SeenLook, show
 from fluidlift.pipeline.stages.simulate import frames_still_there, simulate
+from fluidlift.present import report
 from fluidlift.scene.build import Scene, SimulationRequest, scene_of
 from fluidlift.scene.footage import footage_of
 from fluidlift.scene.recall import OF_CLIP, rest_frame_of, stage_keys
@@ -179,7 +179,7 @@ def _finish(
     own = [*played.warnings, *done.warnings, *([] if done.failed is None else [done.failed]), *shown.warnings]
     runner.warnings[:] = [w for w in manifest.get("warnings", ()) if w not in before] + own
     if lift is not None:
-        reporting.write_report(lift, done, shown, folder, config.preset, runner.timings, runner.warnings)
+        report.write_report(lift, done, shown, folder, config.preset, runner.timings, runner.warnings)
         figures = folder / "work" / "evaluation.npz"
         if shown.pictures is not None:
             with atomic_write(figures) as stream:

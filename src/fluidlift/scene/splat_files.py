@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from fluidlift.errors import InputRejected
+from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.types import Gaussians
 
 BYTES_PER_SPLAT = 80
@@ -54,3 +55,33 @@ def frames_of(folder: Path, picked: range) -> Iterator[tuple[Gaussians, np.ndarr
 def splat_frames(folder: Path, count: int) -> Iterator[tuple[Gaussians, np.ndarray, np.ndarray]]:
     """(gaussians, ids, velocities) of each simulated frame."""
     return frames_of(folder, range(count))
+
+
+def frames_told(count: int) -> str:
+    """A number of frames in words."""
+    return f"{count} frame" + ("s" if count != 1 else "")
+
+
+def frame_numbers(folder: Path, count: int, wanted: tuple[int, int] | None) -> range:
+    """Frames of an asset, from 0: of the `count` that were simulated those whose files are there, or those wanted
+    (first and last number, from 1001).
+
+    Raises:
+        InputRejected: none are there, or not those.
+    """
+    gaps = [k for k in range(count) if not frame_file(folder, FIRST_FRAME + k).is_file()]
+    if len(gaps) == count:
+        raise InputRejected(f"'{folder.name}' has no simulated frames", "frames/splats/1001.ply and so on",
+                            f"fluidlift sim {folder}")  # fmt: skip
+    if wanted is None and gaps[:1] != [0]:
+        return range(gaps[0] if gaps else count)
+    first, last = wanted or (FIRST_FRAME, FIRST_FRAME + count - 1)
+    if not FIRST_FRAME <= first <= last < FIRST_FRAME + count:
+        raise InputRejected(f"frames {first} to {last}", f"numbers from {FIRST_FRAME} to {FIRST_FRAME + count - 1}",
+                            "the first frame of an asset is 1001" if first < FIRST_FRAME else "")  # fmt: skip
+    numbers = range(first - FIRST_FRAME, last - FIRST_FRAME + 1)
+    gone = next((FIRST_FRAME + k for k in gaps if k in numbers), None)
+    if gone is not None:
+        raise InputRejected(f"frame {gone} is missing: frames/splats/{gone}.ply", "every frame of the range",
+                            f"fluidlift sim {folder} --restart, or --frames with a range without it")  # fmt: skip
+    return numbers

@@ -187,7 +187,7 @@ def _drawn(folder: Path, camera: PinholeCamera, number: int, progress: JobProgre
     """u8 [h,w,3] of one frame of the asset, in its look."""
     import cv2
 
-    from fluidlift.pipeline.rendering import RenderRequest, render_asset
+    from fluidlift.pipeline.render import RenderRequest, render_asset
 
     with tempfile.TemporaryDirectory(prefix="fluidlift-view-") as name:
         place = Path(name)

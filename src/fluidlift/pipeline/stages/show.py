@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from fluidlift.io.scene_look import Look
-from fluidlift.pipeline.as_filmed import BEYOND, Reel, card_of_run
-from fluidlift.pipeline.front_view import FrontView, open_end, to_bytes
-from fluidlift.pipeline.looks import Backdrop, Frame, Painter, placed_bodies
 from fluidlift.pipeline.settings import ShowSettings
 from fluidlift.pipeline.work import Work
+from fluidlift.present.as_filmed import BEYOND, Reel, card_of_run
+from fluidlift.present.front_view import FrontView, open_end, to_bytes
+from fluidlift.present.looks import Backdrop, Frame, Painter, placed_bodies
 from fluidlift.scene.build import Scene
 from fluidlift.scene.footage import Footage
 from fluidlift.scene.splat_files import splat_frames

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fluidlift.io.frames import FIRST_FRAME
-from fluidlift.pipeline.looping import close_loop
 from fluidlift.pipeline.settings import SimulateSettings
 from fluidlift.pipeline.work import Work
+from fluidlift.present.looping import close_loop
 from fluidlift.scene.build import Scene, SimulationRequest
 from fluidlift.scene.reshaping import closed_inlet
 from fluidlift.scene.simulation import advance, continued

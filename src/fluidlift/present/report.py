@@ -9,7 +9,7 @@ import numpy as np
 
 from fluidlift.fit.outcome import TIES, how_sure, in_words
 from fluidlift.look.report import Figure, Section, report_html
-from fluidlift.pipeline.as_filmed import card_of
+from fluidlift.present.as_filmed import card_of
 from fluidlift.types import CellType
 from fluidlift.types.stages import Fit, Geometry, Lift, Refined, Shown, Simulation
 

@@ -14,12 +14,12 @@ from fluidlift.config.of_asset import settings_of
 from fluidlift.errors import InputRejected
 from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.io.written import Written, cleared, numbered
-from fluidlift.pipeline.drawing import Stage, drawn
-from fluidlift.pipeline.front_view import open_end
-from fluidlift.pipeline.looks import Painter
+from fluidlift.present.drawing import Stage, drawn
+from fluidlift.present.front_view import open_end
+from fluidlift.present.looks import Painter
 from fluidlift.scene.build import Scene, SimulationRequest, scene_of
 from fluidlift.scene.recall import footage_of_asset, simulated_poses
-from fluidlift.scene.splat_files import frame_file
+from fluidlift.scene.splat_files import frame_numbers, frames_told
 from fluidlift.seams import Progress, Silence
 from fluidlift.types import PinholeCamera
 
@@ -194,36 +194,6 @@ def _check(request: RenderRequest, out: Path) -> None:
         raise InputRejected("a transparent film", "pictures: H.264 has no alpha", "give a folder to --out")
     if out.suffix.lower() not in FILMS and out.exists() and not out.is_dir():
         raise InputRejected(f"'{out.name}', which is a file", "a folder, or a film that ends in .mp4 or .mov")
-
-
-def frames_told(count: int) -> str:
-    """A number of frames in words."""
-    return f"{count} frame" + ("s" if count != 1 else "")
-
-
-def frame_numbers(folder: Path, count: int, wanted: tuple[int, int] | None) -> range:
-    """Frames of an asset, from 0: of the `count` that were simulated those whose files are there, or those wanted
-    (first and last number, from 1001).
-
-    Raises:
-        InputRejected: none are there, or not those.
-    """
-    gaps = [k for k in range(count) if not frame_file(folder, FIRST_FRAME + k).is_file()]
-    if len(gaps) == count:
-        raise InputRejected(f"'{folder.name}' has no simulated frames", "frames/splats/1001.ply and so on",
-                            f"fluidlift sim {folder}")  # fmt: skip
-    if wanted is None and gaps[:1] != [0]:
-        return range(gaps[0] if gaps else count)
-    first, last = wanted or (FIRST_FRAME, FIRST_FRAME + count - 1)
-    if not FIRST_FRAME <= first <= last < FIRST_FRAME + count:
-        raise InputRejected(f"frames {first} to {last}", f"numbers from {FIRST_FRAME} to {FIRST_FRAME + count - 1}",
-                            "the first frame of an asset is 1001" if first < FIRST_FRAME else "")  # fmt: skip
-    numbers = range(first - FIRST_FRAME, last - FIRST_FRAME + 1)
-    gone = next((FIRST_FRAME + k for k in gaps if k in numbers), None)
-    if gone is not None:
-        raise InputRejected(f"frame {gone} is missing: frames/splats/{gone}.ply", "every frame of the range",
-                            f"fluidlift sim {folder} --restart, or --frames with a range without it")  # fmt: skip
-    return numbers
 
 
 def _poses(folder: Path, scene: Scene, frames: int) -> tuple[np.ndarray | None, list[str]]:

@@ -10,7 +10,7 @@ import pytest
 from fluidlift.cli import DONE, REJECTED, WITH_WARNINGS, main
 from fluidlift.io.asset_folder import read_manifest, update_manifest
 from fluidlift.physics.inflow_schedule import InflowSchedule
-from fluidlift.pipeline.as_filmed import Reel, card_of, card_of_run, why_not
+from fluidlift.present.as_filmed import Reel, card_of, card_of_run, why_not
 from fluidlift.scene.footage import Footage
 from fluidlift.types import PixelLabels, VideoClip
 

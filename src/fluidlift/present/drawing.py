@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from fluidlift.errors import InputRejected
-from fluidlift.pipeline.front_view import before_ground, open_end
-from fluidlift.pipeline.looks import Backdrop, Frame, Painter, placed_bodies
+from fluidlift.present.front_view import before_ground, open_end
+from fluidlift.present.looks import Backdrop, Frame, Painter, placed_bodies
 from fluidlift.scene.build import Scene
 from fluidlift.scene.footage import Footage
 from fluidlift.scene.splat_files import splat_frames

@@ -10,7 +10,11 @@ from fluidlift.config import build_config
 from fluidlift.errors import InputRejected
 from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.look.rasterize import render
-from fluidlift.pipeline.looping import (
+from fluidlift.pipeline.resimulate import resimulate
+from fluidlift.pipeline.settings import SimulateSettings, taken
+from fluidlift.pipeline.stages.simulate import simulate
+from fluidlift.pipeline.work import Work
+from fluidlift.present.looping import (
     SplatFrame,
     blended,
     blended_poses,
@@ -20,10 +24,6 @@ from fluidlift.pipeline.looping import (
     read_frame,
     seam,
 )
-from fluidlift.pipeline.resimulate import resimulate
-from fluidlift.pipeline.settings import SimulateSettings, taken
-from fluidlift.pipeline.stages.simulate import simulate
-from fluidlift.pipeline.work import Work
 from fluidlift.scene.build import LOOP_FADE, loop_overlap
 from fluidlift.scene.edits import EditSession
 from fluidlift.scene.splat_files import checkpoint_file, frame_file

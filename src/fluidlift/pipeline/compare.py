@@ -9,8 +9,8 @@ import numpy as np
 
 from fluidlift.config.of_asset import settings_of
 from fluidlift.errors import InputRejected
-from fluidlift.pipeline.as_filmed import Reel, why_not
-from fluidlift.pipeline.front_view import FrontView, to_bytes
+from fluidlift.present.as_filmed import Reel, why_not
+from fluidlift.present.front_view import FrontView, to_bytes
 from fluidlift.scene.build import SimulationRequest, scene_of
 from fluidlift.scene.recall import footage_of_asset
 from fluidlift.scene.splat_files import frames_of

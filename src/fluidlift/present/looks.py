@@ -28,8 +28,8 @@ from fluidlift.look.transparent import splat_surface
 from fluidlift.look.vessel import Pane, before_glass, panes, vessel_apart
 from fluidlift.look.wet_ground import wetted
 from fluidlift.numerics.srgb import linear_from_srgb, srgb_from_linear
-from fluidlift.pipeline.finer import Lit, averaged, enlarged
-from fluidlift.pipeline.surfacing import RADIUS, surface_of
+from fluidlift.present.finer import Lit, averaged, enlarged
+from fluidlift.present.surfacing import RADIUS, surface_of
 from fluidlift.types import (
     FluidKind,
     Gaussians,

@@ -170,7 +170,7 @@ def test_dotted_names_in_the_documents_are_modules_functions_or_settings(page):
     assert missing == []
 
 
-@pytest.mark.parametrize("package", ["shape", "motion", "fit", "look", "scene", "present", "pipeline"])
+@pytest.mark.parametrize("package", ["shape", "motion", "fit", "look", "scene", "present", "export", "pipeline"])
 def test_the_drawing_of_the_house_names_every_module(package):
     text = (ROOT / "docs" / "design.md").read_text(encoding="utf-8")
     (drawing,) = re.findall(r"^```\nsrc/fluidlift/\n.*?^```", text, flags=re.M | re.S)

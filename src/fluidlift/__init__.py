@@ -19,8 +19,9 @@ __version__ = "0.1.0"
 _FACE = {
     # from a clip to an asset, and on from there
     "scene": ("EditSession", "SimulationRequest"),
-    "pipeline": ("ExportRequest", "Inputs", "RenderRequest", "export_asset", "find_masks",
-                 "make", "measure_motion", "refit", "render_asset", "resimulate"),
+    "pipeline": ("Inputs", "RenderRequest", "find_masks", "make", "measure_motion", "refit", "render_asset",
+                 "resimulate"),
+    "export": ("ExportRequest", "export_asset"),
     "config": ("build_config",),
     "io.asset_folder": ("load_asset", "save_asset"),
     "validate": ("validate_asset",),

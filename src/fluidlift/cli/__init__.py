@@ -244,7 +244,7 @@ def _render(c: Render) -> int:
 
 
 def _export(c: Export) -> int:
-    from fluidlift.pipeline import ExportRequest, export_asset
+    from fluidlift.export import ExportRequest, export_asset
 
     frames = _pair(c.frames, "-", "--frames", "1001-1024")
     request = ExportRequest(c.to, c.up_axis, c.meters_per_unit, frames, c.fps)

@@ -1,7 +1,6 @@
 """The only place that knows the order of the stages, and the commands that run them."""
 
 from fluidlift.pipeline.compare import card_against
-from fluidlift.pipeline.exporting import ExportRequest, export_asset
 from fluidlift.pipeline.hints import Hints
 from fluidlift.pipeline.inputs import Inputs
 from fluidlift.pipeline.make import STAGES, make
@@ -14,7 +13,6 @@ from fluidlift.present.as_filmed import card_of
 
 __all__ = [
     "STAGES",
-    "ExportRequest",
     "Hints",
     "Inputs",
     "Made",
@@ -23,7 +21,6 @@ __all__ = [
     "RenderRequest",
     "card_against",
     "card_of",
-    "export_asset",
     "find_masks",
     "make",
     "measure_motion",

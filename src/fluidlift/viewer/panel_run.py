@@ -26,7 +26,7 @@ class RunPanel:
     """Undo, save, export, simulate, draw."""
 
     def __init__(self, viewer: Viewer) -> None:
-        from fluidlift.pipeline.exporting import FORMATS
+        from fluidlift.export.job import FORMATS
 
         self._viewer, self._gui = viewer, viewer.server.gui
         gui = self._gui
@@ -96,7 +96,8 @@ class RunPanel:
         viewer.set_source("saved frames")
 
     def _export(self, _: Any) -> None:
-        from fluidlift.pipeline.exporting import ExportRequest, export_asset
+        from fluidlift.export.asset import export_asset
+        from fluidlift.export.job import ExportRequest
 
         viewer, out = self._viewer, Path(os.path.expanduser(self._out.value.strip()))
         if viewer.refused():

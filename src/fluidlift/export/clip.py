@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from fluidlift.errors import InputRejected
+from fluidlift.export.job import ExportRequest, Outcome
 from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.io.written import cleared, numbered
-from fluidlift.pipeline.export_job import ExportRequest, Outcome
 from fluidlift.scene.recall import recalled
 from fluidlift.seams import Progress
 from fluidlift.types import FluidAsset, Label, PinholeCamera

@@ -12,7 +12,7 @@ import numpy as np
 
 from fluidlift.errors import InputRejected
 from fluidlift.seams import Progress
-from fluidlift.types import FluidAsset
+from fluidlift.types import FluidAsset, Similarity3
 
 OF_CLIP = ("camera", "flow", "flo", "masks")
 """formats that hold what was found in the clip; no simulated frame is needed for them"""
@@ -65,6 +65,18 @@ class ExportJob:
     def numbers(self) -> range:
         """Of the written files, from 0: without gaps, from the first that was picked."""
         return range(self.picked.start, self.picked.start + len(self.picked))
+
+    @property
+    def place(self) -> Similarity3:
+        """From the world to the axes and units that are asked for."""
+        from fluidlift.io.ply import AXES as ROTATIONS
+
+        return Similarity3(1.0 / self.request.meters_per_unit, ROTATIONS[f"{self.request.up_axis}_up"], np.zeros(3))
+
+    @property
+    def unit(self) -> str:
+        """Axes and units in words, for the comments of files."""
+        return f"{self.request.up_axis} up, one unit is {self.request.meters_per_unit:g} m"
 
 
 @dataclass(frozen=True)
@@ -145,3 +157,11 @@ def as_simulated(folder: Path, asset: FluidAsset, manifest: dict[str, Any]) -> F
     return replace(
         asset, terrain=scene.terrain, grid=scene.terrain.grid, cell_types=scene.cell_types, velocity=scene.velocity
     )
+
+
+def write_terrain(job: ExportJob) -> None:
+    """terrain.glb beside the numbered files, where there is a terrain."""
+    from fluidlift.io.export_mesh import write_glb
+
+    if len(job.asset.terrain.mesh.faces):
+        write_glb(job.out / "terrain.glb", job.asset.terrain.mesh)

@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fluidlift.io.frames import FIRST_FRAME, FluidFrame, MovingMesh
+from fluidlift.export.bodies import bodies_of
+from fluidlift.export.job import ExportJob, Outcome
+from fluidlift.io.frames import FIRST_FRAME, FluidFrame
 from fluidlift.types import FluidAsset, kind_of
 
 if TYPE_CHECKING:
     from fluidlift.io.export_usd import PreviewMaterial, UsdSettings
-    from fluidlift.pipeline.export_job import ExportJob
 
 VOLUMES = "volumes"
 """folder of the OpenVDB files, beside the USD file"""
@@ -45,21 +46,6 @@ def write_usd_asset(job: ExportJob, frames: Iterable[FluidFrame], settings: UsdS
     return warnings
 
 
-def bodies_of(folder: Path, picked: range) -> tuple[list[MovingMesh], tuple[str, ...]]:
-    """The obstacles in the poses that the simulation gave them in the frames that are picked, and warnings."""
-    from fluidlift.io.scene import read_edits
-    from fluidlift.scene.recall import simulated_poses
-
-    obstacles = read_edits(folder).obstacles
-    if not obstacles:
-        return [], ()
-    poses = simulated_poses(folder, len(obstacles), picked[-1] + 1)
-    if poses is None:
-        return [], ("the obstacles' motion is not at hand and they are left out: run fluidlift sim again",)
-    shown = np.asarray(poses)[list(picked)]
-    return [MovingMesh(o.name, o.mesh, shown[:, k, :3], shown[:, k, 3:]) for k, o in enumerate(obstacles)], ()
-
-
 def preview_of(folder: Path, asset: FluidAsset) -> PreviewMaterial | None:
     """The material that scene.yaml names, as a preview can show it; None: the clip's own colours."""
     from fluidlift.io.export_usd import PreviewMaterial
@@ -82,9 +68,9 @@ def _with_volumes(
     frames: Iterable[FluidFrame], out: Path, asset: FluidAsset, start_frame: int = FIRST_FRAME
 ) -> Iterator[FluidFrame]:
     """The frames of smoke, each with the name of its OpenVDB file."""
+    from fluidlift.export.volumes import gridded
     from fluidlift.io.volume_grid import VolumeGrid, velocity_grid, write_vdb
     from fluidlift.io.written import cleared
-    from fluidlift.pipeline.exporting import gridded
 
     cleared(out / VOLUMES, [".vdb"])
     for k, frame in enumerate(frames):
@@ -94,3 +80,13 @@ def _with_volumes(
         density_grid = VolumeGrid("density", density, asset.grid.spacing, grid.origin, filled)
         write_vdb(path, [velocity_grid(velocity, grid, active=filled), density_grid])
         yield frame._replace(volume=path.relative_to(out).as_posix())
+
+
+def write_usd_files(job: ExportJob, frames: Iterator[FluidFrame]) -> Outcome:
+    """One file with all of it, or one with a clip per frame."""
+    from fluidlift.io.export_usd import UsdSettings
+
+    layout = "clips" if job.request.to == "usd-clips" else "file"
+    axes, unit = job.request.up_axis, job.request.meters_per_unit
+    settings = UsdSettings(FIRST_FRAME + job.numbers.start, axes, unit, layout)
+    return Outcome(warnings=write_usd_asset(job, frames, settings))

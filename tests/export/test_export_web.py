@@ -10,15 +10,15 @@ from PIL import Image
 
 from fluidlift.cli import DONE, REJECTED, WITH_WARNINGS, main
 from fluidlift.errors import InputRejected
+from fluidlift.export import ExportRequest, export_asset, page
+from fluidlift.export.job import every
+from fluidlift.export.page import thinned
 from fluidlift.io.asset_folder import load_asset
 from fluidlift.io.flow_files import UNKNOWN, read_flo
 from fluidlift.io.ply import read_splats
 from fluidlift.io.spz import read_spz
 from fluidlift.io.views import read_view
 from fluidlift.look.rasterize import render
-from fluidlift.pipeline import ExportRequest, export_asset, export_page
-from fluidlift.pipeline.export_job import every
-from fluidlift.pipeline.export_page import thinned
 from fluidlift.types import Gaussians, PinholeCamera
 
 WELL = (DONE, WITH_WARNINGS)
@@ -87,8 +87,8 @@ def test_the_page_is_one_file_of_the_name_that_was_given(made, tmp_path, capsys)
 def test_a_page_that_grows_too_large_leaves_out_frames_then_splats_and_says_so(made, tmp_path, monkeypatch):
     whole = export_asset(made.folder, tmp_path / "a.html", ExportRequest("html"))
     assert whole.warnings == ()
-    monkeypatch.setattr(export_page, "MOST_BYTES", whole.facts["bytes"] / 3)
-    monkeypatch.setattr(export_page, "FEWEST", 100)
+    monkeypatch.setattr(page, "MOST_BYTES", whole.facts["bytes"] / 3)
+    monkeypatch.setattr(page, "FEWEST", 100)
     small = export_asset(made.folder, tmp_path / "b.html", ExportRequest("html"))
     assert small.facts["bytes"] < 0.75 * whole.facts["bytes"]  # ground, script and poster stay
     assert any("frames are in the page, at 12.5 per second" in w for w in small.warnings)

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from fluidlift.cli import DONE, REJECTED, WITH_WARNINGS, main
 from fluidlift.errors import InputRejected
+from fluidlift.export.volumes import gridded, level_set
 from fluidlift.io.asset_folder import load_asset, read_manifest
 from fluidlift.io.frames import FluidFrame
 from fluidlift.io.ply import read_mesh, read_splats
@@ -18,7 +19,6 @@ from fluidlift.io.stage_cache import mark_owner, save_stage
 from fluidlift.io.stage_codec import packed
 from fluidlift.io.validate_usd import validate_usd
 from fluidlift.numerics.sampling import sample_nodes
-from fluidlift.pipeline.exporting import gridded, level_set
 from fluidlift.scene.splat_files import frame_numbers
 from fluidlift.types import TriangleMesh
 from fluidlift.types.stages import Simulation

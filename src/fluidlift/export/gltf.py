@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from fluidlift.export.job import ExportJob, Outcome
 from fluidlift.io.frames import FIRST_FRAME
-from fluidlift.io.written import cleared, numbered
-from fluidlift.pipeline.export_job import ExportJob, Outcome
-from fluidlift.scene.splat_files import frames_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -15,19 +13,6 @@ if TYPE_CHECKING:
     from fluidlift.io.frames import FluidFrame
 
 HERO, SURFACE = "hero.glb", "surface.glb"
-
-
-def write_spz_frames(job: ExportJob) -> Outcome:
-    """Numbered .spz files: y up, metres."""
-    from fluidlift.io.spz import write_spz
-
-    cleared(job.out, [".spz"])
-    size = 0
-    for done, (k, (gaussians, _, _)) in enumerate(zip(job.numbers, frames_of(job.folder, job.picked), strict=True)):
-        job.progress.update(done, len(job.picked))
-        size += write_spz(numbered(job.out, k, ".spz"), gaussians).stat().st_size
-    each = size / max(len(job.picked), 1) / 1e6
-    return Outcome((f"{each:.2f} MB per frame; the format has no place for ids and velocities",), (), {"bytes": size})
 
 
 def hero_of(picked: range) -> int:

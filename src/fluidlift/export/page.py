@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fluidlift.export.job import ExportJob, Outcome
 from fluidlift.io.frames import FIRST_FRAME
-from fluidlift.pipeline.export_job import ExportJob, Outcome
 from fluidlift.present.looping import FAINTEST
 from fluidlift.scene.splat_files import frames_of
 from fluidlift.types import Gaussians, PinholeCamera, Similarity3, concatenate, matrix_from_quat, sh_from_rgb
@@ -49,10 +49,10 @@ class Plan:
 
 def write_page_of(job: ExportJob) -> Outcome:
     """page.html in the folder, or the .html file that was named."""
+    from fluidlift.export.usd import bodies_of
     from fluidlift.io.export_page import PageScene, write_page
     from fluidlift.look.scenery import LIGHT
     from fluidlift.look.vessel import glass_of
-    from fluidlift.pipeline.usd_exporting import bodies_of
 
     first, ids, _ = next(frames_of(job.folder, job.picked[:1]))
     plan = _plan(job, len(first))

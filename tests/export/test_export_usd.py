@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from pxr import Gf, Usd, UsdGeom, UsdVol
 
+from fluidlift.export.usd import bodies_of, preview_of, write_usd_asset
 from fluidlift.io.frames import FluidFrame
 from fluidlift.io.stage_cache import mark_owner, save_stage
 from fluidlift.io.stage_codec import packed
 from fluidlift.io.validate_usd import splat_rule_faults, validate_usd
-from fluidlift.pipeline.usd_exporting import bodies_of, preview_of, write_usd_asset
 from fluidlift.types import FluidParameters, Gaussians, Grid, PinholeCamera, TriangleMesh
 from fluidlift.types.stages import Simulation
 

@@ -13,7 +13,7 @@ from fluidlift.io.asset_folder import read_manifest
 from fluidlift.io.exr import read_channels
 from fluidlift.io.video import read_clip
 from fluidlift.pipeline.render import RenderRequest, render_asset
-from fluidlift.present.drawing import _placed
+from fluidlift.present.frames import _placed
 from fluidlift.types import PinholeCamera
 
 WELL = (DONE, WITH_WARNINGS)

@@ -142,18 +142,14 @@ def as_simulated(folder: Path, asset: FluidAsset, manifest: dict[str, Any]) -> F
     Raises:
         InputRejected: a scene.yaml that does not fit.
     """
-    from fluidlift.config.of_asset import settings_of
     from fluidlift.io.scene import read_edits
-    from fluidlift.scene.build import SimulationRequest, scene_of
+    from fluidlift.scene.recall import simulated_scene
 
     played, edits = manifest.get("simulation", {}), read_edits(folder)
     longer = float(played.get("extended_downstream", 0.0))
     if not (edits.terrain or edits.emitters or longer > 0):
         return asset
-    interval = float(played.get("frame_interval", asset.interval))
-    config = settings_of(manifest, (), {}, sections=("simulate", "show"), work="an export")
-    request = SimulationRequest(fps=1.0 / interval, extend_downstream=longer)
-    scene = scene_of(asset, folder, request, config, footage=None, start=0)
+    scene = simulated_scene(folder, asset, manifest)
     return replace(
         asset, terrain=scene.terrain, grid=scene.terrain.grid, cell_types=scene.cell_types, velocity=scene.velocity
     )

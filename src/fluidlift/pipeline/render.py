@@ -4,29 +4,29 @@ from __future__ import annotations
 
 import difflib
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from fluidlift.config.of_asset import settings_of
 from fluidlift.errors import InputRejected
 from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.io.written import Written, cleared, numbered
-from fluidlift.present.drawing import Stage, drawn
+from fluidlift.present.frames import BACKGROUNDS, Drawn, FrameRenderer, SimulatedFrame
 from fluidlift.present.front_view import open_end
 from fluidlift.present.looks import Painter
-from fluidlift.scene.build import Scene, SimulationRequest, scene_of
-from fluidlift.scene.recall import footage_of_asset, simulated_poses
-from fluidlift.scene.splat_files import frame_numbers, frames_told
+from fluidlift.scene.build import Scene
+from fluidlift.scene.recall import footage_of_asset, simulated_poses, simulated_scene
+from fluidlift.scene.splat_files import frame_numbers, frames_of, frames_told
 from fluidlift.seams import Progress, Silence
 from fluidlift.types import PinholeCamera
 
 VIEWS = ("input", "side", "top", "turn")
-BACKGROUNDS = ("auto", "plate", "terrain", "none")
 FILMS = (".mp4", ".mov")
 PICTURES = (".png", ".exr")
+SURFELS = 200_000
+"""of the terrain: stills are looked at longer than the preview"""
 SIZES = (16, 8192)
 """px, of a side of the picture"""
 
@@ -85,26 +85,23 @@ def render_asset(
     played = manifest.get("simulation", {})
     interval = float(played.get("frame_interval", asset.interval))
     footage = footage_of_asset(folder, manifest)
-    config = settings_of(manifest, (), {}, sections=("simulate", "show"), work="a picture")
-    longer = float(played.get("extended_downstream", 0.0))
-    made_with = SimulationRequest(fps=1.0 / interval, extend_downstream=longer)
-    scene = scene_of(asset, folder, made_with, config, footage=None, start=0)
+    scene = simulated_scene(folder, asset, manifest)
     numbers = frame_numbers(folder, int(played.get("frames", 0)), request.frames)
     poses, warnings = _poses(folder, scene, len(numbers) + numbers[0])
     painter = _painter(scene, folder, request)
-    stage = Stage(
-        scene, footage, request.background, request.view == "input", _cameras(scene, request, len(numbers)), numbers,
-        poses, painter,
-    )  # fmt: skip
+    renderer = FrameRenderer(scene, footage, painter=painter, surfels=SURFELS)
+    background = renderer.background(request.background, front=request.view == "input")
+    cameras = _cameras(scene, request, len(numbers))
+    pictures = _pictures(renderer, folder, numbers, cameras, poses, background)
     require_writable(out.parent if out.suffix.lower() in FILMS else out)
     progress.stage("render", 1, 1)
     with disk_errors(out):
-        _write(stage, folder, out, request.format, 1.0 / interval, lambda done: progress.update(done, len(numbers)))
+        _write(_told(pictures, progress, len(numbers)), out, numbers, request.format, 1.0 / interval)
     seconds = time.perf_counter() - began
     progress.finished("render", seconds, False)
     for text in warnings:
         progress.warn(text)
-    size = stage.cameras[0].size
+    size = cameras[0].size
     facts = {"frames": len(numbers), "first": FIRST_FRAME + numbers[0], "size": list(size), "view": request.view,
              "look": "splats" if painter is None else painter.look.style, "out": str(out)}  # fmt: skip
     words = (f"{frames_told(len(numbers))} of {size[0]} x {size[1]} px: {out}",)
@@ -248,19 +245,39 @@ def _fitted(camera: PinholeCamera, size: tuple[int, int]) -> PinholeCamera:
     return PinholeCamera(focal, center, (int(size[0]), int(size[1])), camera.camera_from_world)
 
 
-def _write(stage: Stage, folder: Path, out: Path, form: str, fps: float, step: Callable[[int], None]) -> None:
+def _pictures(
+    renderer: FrameRenderer,
+    folder: Path,
+    numbers: range,
+    cameras: list[PinholeCamera],
+    poses: np.ndarray | None,
+    background: str,
+) -> Iterator[Drawn]:
+    """Each frame, from its camera."""
+    for k, camera, (fluid, _, velocities) in zip(numbers, cameras, frames_of(folder, numbers), strict=True):
+        frame = SimulatedFrame(fluid, velocities, None if poses is None else poses[k])
+        yield renderer.draw(frame, camera, background)
+
+
+def _told(pictures: Iterator[Drawn], progress: Progress, count: int) -> Iterator[Drawn]:
+    """The same pictures; how many are done is told before each."""
+    for done in range(count):
+        progress.update(done, count)
+        yield next(pictures)
+
+
+def _write(pictures: Iterator[Drawn], out: Path, numbers: range, form: str, fps: float) -> None:
     from fluidlift.io.exr_write import write_channels
     from fluidlift.io.images import write_png
     from fluidlift.io.video import write_video
 
-    pictures = drawn(stage, folder, step)
     if out.suffix.lower() in FILMS:
         out.parent.mkdir(parents=True, exist_ok=True)
         write_video(out, (p.shown for p in pictures), fps)
         return
     suffix = "." + form
     cleared(out, [suffix])
-    for k, p in zip(stage.numbers, pictures, strict=True):
+    for k, p in zip(numbers, pictures, strict=True):
         path = numbered(out, k, suffix)
         if suffix == ".exr":
             write_channels(path, {**{c: p.image[..., i] for i, c in enumerate("RGB")}, "A": p.alpha, "Z": p.depth})

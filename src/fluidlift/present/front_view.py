@@ -61,15 +61,31 @@ class FrontView:
         return FrontView(scene.camera, plate, rocks, before_ground(scene, shown))
 
     def drawn(
-        self, gaussians: Gaussians, velocity: np.ndarray, solids: Sequence[Gaussians] = ()
+        self,
+        gaussians: Gaussians,
+        velocity: np.ndarray,
+        solids: Sequence[Gaussians] = (),
+        *,
+        camera: PinholeCamera | None = None,
+        plate: np.ndarray | None = None,
     ) -> tuple[Rendered, Gaussians, np.ndarray]:
-        """The picture with its coverage, and the splats that the ground leaves over, with their velocities (m/s)."""
+        """The picture with its coverage, and the splats that the ground leaves over, with their velocities (m/s).
+
+        Args:
+            gaussians: of the fluid.
+            velocity: [n,3], m/s.
+            solids: of the obstacles.
+            camera: another in the same place; None: the clip's own.
+            plate: as that one sees it, sRGB in [0, 1].
+        """
         from fluidlift.look.rasterize import render
 
         if self.seen_of is not None:
             keep = self.seen_of(gaussians)
             gaussians, velocity = gaussians.select(keep), velocity[keep]
-        return render(concatenate([gaussians, *solids]), self.camera, background=self.plate), gaussians, velocity
+        behind = self.plate if plate is None else plate
+        picture = render(concatenate([gaussians, *solids]), camera or self.camera, background=behind)
+        return picture, gaussians, velocity
 
 
 def open_end(scene: Scene) -> OpenEnd | None:

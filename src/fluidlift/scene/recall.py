@@ -7,8 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from fluidlift.config.of_asset import SECOND_HALF_SECTIONS, settings_of
 from fluidlift.io.kept_values import kept_value, last_value
+from fluidlift.scene.build import Scene, SimulationRequest, scene_of
 from fluidlift.scene.footage import Footage, footage_of
+from fluidlift.types import FluidAsset
 from fluidlift.types.stages import (
     Fit,
     Flow,
@@ -66,3 +69,17 @@ def simulated_poses(folder: Path, bodies: int | None = None, frames: int = 0) ->
     if found is None or found.frames < frames:
         return None
     return found.poses if bodies is None or found.poses.shape[1:] == (bodies, 7) else None
+
+
+def simulated_scene(folder: Path, asset: FluidAsset, manifest: dict[str, Any]) -> Scene:
+    """The scene whose frames lie in an asset's folder: at their rate, in the channel as long as it was for them.
+
+    Raises:
+        InputRejected: a scene.yaml that does not fit.
+    """
+    played = manifest.get("simulation", {})
+    interval = float(played.get("frame_interval", asset.interval))
+    longer = float(played.get("extended_downstream", 0.0))
+    config = settings_of(manifest, (), {}, sections=SECOND_HALF_SECTIONS, work="frames that are there")
+    request = SimulationRequest(fps=1.0 / interval, extend_downstream=longer)
+    return scene_of(asset, folder, request, config, footage=None, start=0)

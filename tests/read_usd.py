@@ -1,4 +1,4 @@
-"""The frames of an exported USD file, read back into the world: z up, metres, m/s."""
+"""The frames of an exported USD file, read back by the tests into the world: z up, metres, m/s."""
 
 from __future__ import annotations
 
@@ -12,9 +12,11 @@ from fluidlift.errors import InputRejected
 from fluidlift.io.frames import FluidFrame
 from fluidlift.io.limits import require_file
 from fluidlift.io.ply import AXES
-from fluidlift.io.usd_camera import read_camera
 from fluidlift.numerics.srgb import srgb_from_linear
-from fluidlift.types import Gaussians, PinholeCamera, Similarity3, TriangleMesh
+from fluidlift.types import Gaussians, PinholeCamera, RigidTransform, Similarity3, TriangleMesh
+
+_FLIP = np.diag([1.0, -1.0, -1.0])
+"""USD cameras look along -z, y up; ours along z, y down"""
 
 
 class UsdFluid:
@@ -121,3 +123,32 @@ def _either(full: Usd.Attribute, half: Usd.Attribute, code: float) -> np.ndarray
     """The one that has values; the full one if both have."""
     value = full.Get(code) if full.HasAuthoredValue() else half.Get(code)
     return np.asarray(value).astype(np.float32)
+
+
+def read_camera(
+    prim: UsdGeom.Camera, size: tuple[int, int], place: Similarity3, time: Usd.TimeCode | None = None
+) -> PinholeCamera:
+    """The pinhole camera of a picture of `size` (width, height) px that sees what a USD camera sees.
+
+    Args:
+        prim: a camera.
+        size: of the picture; the film back may have another shape, pixels are then not square.
+        place: file_from_world, as in `write_camera`.
+        time: None: the default values.
+    """
+    time = time or Usd.TimeCode.Default()
+    focal, across, up, right, top = (
+        float(attribute.Get(time))
+        for attribute in (
+            prim.GetFocalLengthAttr(), prim.GetHorizontalApertureAttr(), prim.GetVerticalApertureAttr(),
+            prim.GetHorizontalApertureOffsetAttr(), prim.GetVerticalApertureOffsetAttr(),
+        )
+    )  # fmt: skip
+    width, height = size
+    fx, fy = focal * width / across, focal * height / up
+    center = (0.5 * width - right * fx / focal, 0.5 * height + top * fy / focal)
+    matrix = np.array(prim.ComputeLocalToWorldTransform(time)).T
+    turned = matrix[:3, :3] / np.linalg.norm(matrix[:3, :3], axis=0)
+    rotation = (place.rotation.T @ turned @ _FLIP).T
+    position = place.inverse().points(matrix[:3, 3])
+    return PinholeCamera((fx, fy), center, size, RigidTransform(rotation, -rotation @ position))

@@ -16,7 +16,7 @@ LEFT_OUT = "prior: not fitted"
 GIVEN = "given"
 MEASURED = "measured"
 SUBJECT = "the parameter fit"
-"""how every warning of a fit begins: the next fit takes those of the last one away"""
+"""how every warning of a fit begins"""
 AT_THE_ENDS = ("inflow_velocity", "inflow_fluctuation", "outflow_velocity")
 """what the first guess reads off the velocities of the clip"""
 POSITIVE = ("density", "kinematic_viscosity", "inflow_fluctuation", "time_step")

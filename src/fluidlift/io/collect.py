@@ -12,8 +12,11 @@ from fluidlift.errors import InputRejected
 from fluidlift.io.decode import Notes
 from fluidlift.io.limits import ReadLimits
 from fluidlift.io.pictures import fitted_size, resample_with_alpha, same_shape
+from fluidlift.messages import Warning
 from fluidlift.types import VideoClip
 
+REPEATED = "repeated frames"
+"""code of the warning about frames that are the same as the one before"""
 MIN_SIDE = 16
 """px; below it nothing can be seen to move"""
 
@@ -160,7 +163,8 @@ class Collector:
                 f"longest after frame {int(np.argmax(steps))}; the real times are used"
             )
         if self.repeated:
-            self.notes.add(f"{self.repeated} of {len(times)} frames repeat the one before (a converted frame rate?)")
+            text = f"{self.repeated} of {len(times)} frames repeat the one before (a converted frame rate?)"
+            self.notes.add(Warning(REPEATED, text))
         frames = self.frames.close()
         alpha = None if self.alphas is None else self.alphas.close()
         if self.alpha_count < len(times) or self.least_alpha == 255:

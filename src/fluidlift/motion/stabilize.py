@@ -18,6 +18,8 @@ from fluidlift.errors import require
 from fluidlift.motion.align import refined_similarity
 from fluidlift.types.clip import VideoClip
 
+CUT = "cut"
+"""code of the warning about a cut in the clip"""
 GRID = (8, 6)
 """columns and rows of cells that each give features of their own, whatever the contrast elsewhere"""
 STEADY_PX = 0.3
@@ -87,7 +89,7 @@ def stabilise(
     limit = 0.04 * max(width, height) if max_correction_px is None else max_correction_px
     require(limit > 0, f"max_correction_px {limit}", "above 0")
     cuts = find_cuts(GreyFrames(clip.frames))
-    warnings = [f"the clip is cut at frame {cut}: use one shot" for cut in cuts]
+    warnings = [Warning(CUT, f"the clip is cut at frame {cut}: use one shot") for cut in cuts]
     motions, blind = motions_of_shots(clip.frames, cuts, limit)
     if blind:
         warnings.append(f"no features that stay, to see the camera by, in {blind} frames: assumed still")

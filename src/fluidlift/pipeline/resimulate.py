@@ -14,11 +14,13 @@ from fluidlift.config import JobConfig
 from fluidlift.config.of_asset import SECOND_HALF_SECTIONS, settings_of
 from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.machine import peak_memory_mb
+from fluidlift.messages import code_of
 from fluidlift.pipeline.runner import Runner
 from fluidlift.pipeline.settings import ShowSettings, SimulateSettings, taken
 from fluidlift.pipeline.stages.show import SeenLook, show
 from fluidlift.pipeline.stages.simulate import frames_still_there, simulate
 from fluidlift.present import report
+from fluidlift.present.looping import OPEN
 from fluidlift.scene.build import Scene, SimulationRequest, scene_of
 from fluidlift.scene.footage import footage_of
 from fluidlift.scene.recall import OF_CLIP, rest_frame_of, stage_keys
@@ -145,7 +147,7 @@ def play(runner: Runner, asset: FluidAsset, config: JobConfig, request: Simulati
         "show", show, scene, done, footage, seen, taken(ShowSettings, config.show), beside={"folder": folder},
         still_there=lambda value: all(p.is_file() for p in wanted), owns_files=True,
     )  # fmt: skip
-    closed = edits.loop and not any("loop is not closed" in text for text in done.warnings)
+    closed = edits.loop and all(code_of(text) != OPEN for text in done.warnings)
     _finish(runner, scene, manifest, config, lift, Played(done, shown, seen.mark, closed, tuple(outside)))
     if done.failed is not None:
         raise FluidliftError(

@@ -35,6 +35,8 @@ if TYPE_CHECKING:
     from fluidlift.scene.build import Scene
     from fluidlift.scene.simulated_history import History
 
+OPEN = "open loop"
+"""code of the warning that says why a loop is not closed"""
 FAINTEST = 1 / 255
 """opacity below which a splat is not drawn"""
 EDGE = 0.3
@@ -142,7 +144,7 @@ def close_loop(scene: Scene, history: History, file: Callable[[int], Path], chec
     """
     count, fade = scene.frames, scene.overlap
     if len(history) < scene.simulated:
-        return ["the loop is not closed: the simulation ended early"]
+        return [Warning(OPEN, "the loop is not closed: the simulation ended early")]
     checkpoint.unlink(missing_ok=True)
     volume = np.array(history.volume)
     drift = volume[count:].mean() / max(volume[:fade].mean(), 1e-12) - 1.0
@@ -156,10 +158,11 @@ def close_loop(scene: Scene, history: History, file: Callable[[int], Path], chec
     if steady:
         return []
     change = f"{100 * abs(drift):.0f} % {'more' if drift > 0 else 'less'} fluid at its end than at its beginning"
-    return [
+    text = (
         f"the loop is not closed: there is {change}, and no more than {100 * DRIFT:.0f} % goes unseen. Choose a "
         "duration after which the level is the same again; what fills or spreads for ever has none"
-    ]
+    )
+    return [Warning(OPEN, text)]
 
 
 def _fade(history: History, count: int, fade: int, file: Callable[[int], Path]) -> None:

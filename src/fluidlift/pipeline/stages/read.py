@@ -12,6 +12,7 @@ import numpy as np
 
 from fluidlift.errors import InputRejected
 from fluidlift.io.stage_cache import Scratch, parts_of
+from fluidlift.messages import without
 from fluidlift.pipeline.inputs import GivenFile
 from fluidlift.pipeline.settings import ReadSettings
 from fluidlift.pipeline.work import Work
@@ -100,8 +101,10 @@ def _without_repeats(clip: VideoClip, scratch: Scratch) -> tuple[VideoClip, np.n
     times = without_duplicates(hollow, report).times
     frames = _chosen(clip.frames, kept, "without_repeats", scratch)
     alpha = None if clip.alpha is None else _chosen(clip.alpha, kept, "alpha_without_repeats", scratch)
+    from fluidlift.io.collect import REPEATED
+
     # the reader counts exact repeats as well: said once is enough
-    said = tuple(w for w in clip.warnings if "repeat the one before" not in w)
+    said = without(clip.warnings, REPEATED)
     return replace(clip, frames=frames, times=times, alpha=alpha, warnings=_told(said, report.warnings)), kept
 
 
@@ -128,14 +131,14 @@ class _Shake:
 
 def _steady(clip: VideoClip, scratch: Scratch, *, correct: bool) -> tuple[VideoClip, _Shake]:
     """The clip as from a camera that stands still, and how the camera moved."""
-    from fluidlift.motion.stabilize import GreyFrames, find_cuts, stabilise
+    from fluidlift.motion.stabilize import CUT, GreyFrames, find_cuts, stabilise
 
     if not correct:
         cuts = find_cuts(GreyFrames(clip.frames))
         return clip, _Shake(0.0, False, tuple(int(c) for c in cuts))
     steady, shake = stabilise(clip, out=scratch.array("steady", clip.frames.shape, np.uint8))
     # cuts are told below, with what follows from them
-    warnings = tuple(w for w in shake.warnings if not w.startswith("the clip is cut at"))
+    warnings = without(shake.warnings, CUT)
     cuts = tuple(int(c) for c in shake.cuts)
     return steady, _Shake(float(shake.shake_px), bool(shake.stabilised), cuts, warnings)
 

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from fluidlift.backends.monocular_depth import Guess, ModelWeights, make_depth_estimator
+from fluidlift.backends.monocular_depth import Guess, make_depth_estimator
+from fluidlift.backends.registry import ModelChoice
 from fluidlift.config import DepthConfig
 from fluidlift.errors import InputRejected
 from fluidlift.pipeline.fluid_masks import FluidMasks
@@ -140,7 +141,7 @@ def depth_by_model(
 ) -> DepthGuess:
     """What a learned model says of some frames, one after the other."""
     weights = None if model.weights is None else model.weights.name
-    estimator = make_depth_estimator(model.model, ModelWeights(weights, model.device, model.download))
+    estimator = make_depth_estimator(model.model, ModelChoice(weights, model.device, model.download))
     guesses: list[Guess] = []
     for t in frames:
         guesses.append(estimator.guess(np.ascontiguousarray(read.clip.frames[t]), camera))

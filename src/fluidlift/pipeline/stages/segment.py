@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fluidlift.backends.learned import MASK_METHODS, ModelChoice, make_segmenter
+from fluidlift.backends.learned import MASK_METHODS, make_segmenter
+from fluidlift.backends.registry import ModelChoice
 from fluidlift.errors import InputRejected
 from fluidlift.io.stage_cache import parts_of
 from fluidlift.pipeline.fluid_masks import FluidMasks

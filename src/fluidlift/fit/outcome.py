@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from fluidlift.types import Estimate, FitResult, FluidParameters
+from fluidlift.types.parameter_table import PARAMETERS, Scale
 
 FITTED = "fitted"
 LOOSE = "fitted, known loosely"
@@ -19,10 +20,6 @@ SUBJECT = "the parameter fit"
 """how every warning of a fit begins"""
 AT_THE_ENDS = ("inflow_velocity", "inflow_fluctuation", "outflow_velocity")
 """what the first guess reads off the velocities of the clip"""
-POSITIVE = ("density", "kinematic_viscosity", "inflow_fluctuation", "time_step")
-"""fitted as logarithms"""
-SHARES = ("restitution", "wall_damping")
-"""fitted as logits"""
 MORE = "--set fit.max_work=... and --set fit.max_seconds=... give it more"
 """what helps a fit that was cut off"""
 WIDTH = 1.96
@@ -118,10 +115,11 @@ def interval_of(label: str, e: Estimate) -> tuple[float, float] | None:
     if not math.isfinite(e.sigma):
         return None
     name, v, reach = family(label), e.value, WIDTH * e.sigma
-    if name in (*POSITIVE, "size") and v > 0:
+    scale = Scale.LOG if name == "size" else PARAMETERS[name].scale if name in PARAMETERS else Scale.LINEAR
+    if scale is Scale.LOG and v > 0:
         factor = math.exp(min(reach / v, 700.0))
         return v / factor, v * factor
-    if name in SHARES and 0 < v < 1:
+    if scale is Scale.LOGIT and 0 < v < 1:
         logit, wide = math.log(v / (1 - v)), min(reach / (v * (1 - v)), 700.0)
         return tuple(1 / (1 + math.exp(-min(max(logit + d, -700.0), 700.0))) for d in (-wide, wide))  # type: ignore[return-value]
     return v - reach, v + reach

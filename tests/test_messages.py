@@ -5,7 +5,7 @@ import pickle
 from dataclasses import dataclass
 
 from fluidlift.io.stage_codec import packed, unpacked
-from fluidlift.messages import Warning, code_of, without
+from fluidlift.messages import Notice, code_of, without
 
 
 @dataclass(frozen=True)
@@ -14,19 +14,19 @@ class Told:
 
 
 def test_a_warning_is_its_text():
-    warning = Warning("cut", "the clip is cut")
+    warning = Notice("cut", "the clip is cut")
     assert warning == "the clip is cut" and f"{warning}!" == "the clip is cut!" and code_of(warning) == "cut"
     assert json.loads(json.dumps([warning])) == ["the clip is cut"]
     assert code_of("the clip is cut") == ""
 
 
 def test_warnings_of_one_code_are_left_out_whatever_they_say():
-    said = (Warning("cut", "a"), Warning("shake", "a"), "a")
+    said = (Notice("cut", "a"), Notice("shake", "a"), "a")
     assert [code_of(w) for w in without(said, "cut")] == ["shake", ""]
 
 
 def test_codes_outlast_the_cache_and_another_process():
-    told = Told((Warning("cut", "the clip is cut"), "and more"))
+    told = Told((Notice("cut", "the clip is cut"), "and more"))
     arrays, data = packed(told)
     for back in (unpacked(Told, arrays, json.loads(json.dumps(data))), pickle.loads(pickle.dumps(told))):
         assert back == told and [code_of(w) for w in back.warnings] == ["cut", ""]

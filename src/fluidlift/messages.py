@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 
-class Warning(str):
+class Notice(str):
     """A text with a code; wherever a text will do, it is one.
 
     Codes last as long as values do (`io.stage_codec` keeps them); files for people hold the text alone.
@@ -15,7 +15,7 @@ class Warning(str):
 
     code: str
 
-    def __new__(cls, code: str, text: str) -> Warning:
+    def __new__(cls, code: str, text: str) -> Notice:
         self = super().__new__(cls, text)
         self.code = code
         return self
@@ -31,4 +31,4 @@ def without(warnings: tuple[str, ...], code: str) -> tuple[str, ...]:
 
 def code_of(warning: str) -> str:
     """The code of a warning; empty where it has none."""
-    return warning.code if isinstance(warning, Warning) else ""
+    return warning.code if isinstance(warning, Notice) else ""

@@ -12,7 +12,7 @@ from fluidlift.errors import InputRejected
 from fluidlift.io.decode import Notes
 from fluidlift.io.limits import ReadLimits
 from fluidlift.io.pictures import fitted_size, resample_with_alpha, same_shape
-from fluidlift.messages import Warning
+from fluidlift.messages import Notice
 from fluidlift.types import VideoClip
 
 REPEATED = "repeated frames"
@@ -164,7 +164,7 @@ class Collector:
             )
         if self.repeated:
             text = f"{self.repeated} of {len(times)} frames repeat the one before (a converted frame rate?)"
-            self.notes.add(Warning(REPEATED, text))
+            self.notes.add(Notice(REPEATED, text))
         frames = self.frames.close()
         alpha = None if self.alphas is None else self.alphas.close()
         if self.alpha_count < len(times) or self.least_alpha == 255:

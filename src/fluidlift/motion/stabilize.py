@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from fluidlift.errors import require
+from fluidlift.messages import Notice
 from fluidlift.motion.align import refined_similarity
 from fluidlift.types.clip import VideoClip
 
@@ -89,7 +90,7 @@ def stabilise(
     limit = 0.04 * max(width, height) if max_correction_px is None else max_correction_px
     require(limit > 0, f"max_correction_px {limit}", "above 0")
     cuts = find_cuts(GreyFrames(clip.frames))
-    warnings = [Warning(CUT, f"the clip is cut at frame {cut}: use one shot") for cut in cuts]
+    warnings = [Notice(CUT, f"the clip is cut at frame {cut}: use one shot") for cut in cuts]
     motions, blind = motions_of_shots(clip.frames, cuts, limit)
     if blind:
         warnings.append(f"no features that stay, to see the camera by, in {blind} frames: assumed still")

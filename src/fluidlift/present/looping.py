@@ -29,6 +29,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from fluidlift.messages import Notice
 from fluidlift.types import Gaussians, concatenate
 
 if TYPE_CHECKING:
@@ -144,7 +145,7 @@ def close_loop(scene: Scene, history: History, file: Callable[[int], Path], chec
     """
     count, fade = scene.frames, scene.overlap
     if len(history) < scene.simulated:
-        return [Warning(OPEN, "the loop is not closed: the simulation ended early")]
+        return [Notice(OPEN, "the loop is not closed: the simulation ended early")]
     checkpoint.unlink(missing_ok=True)
     volume = np.array(history.volume)
     drift = volume[count:].mean() / max(volume[:fade].mean(), 1e-12) - 1.0
@@ -162,7 +163,7 @@ def close_loop(scene: Scene, history: History, file: Callable[[int], Path], chec
         f"the loop is not closed: there is {change}, and no more than {100 * DRIFT:.0f} % goes unseen. Choose a "
         "duration after which the level is the same again; what fills or spreads for ever has none"
     )
-    return [Warning(OPEN, text)]
+    return [Notice(OPEN, text)]
 
 
 def _fade(history: History, count: int, fade: int, file: Callable[[int], Path]) -> None:

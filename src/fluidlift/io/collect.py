@@ -14,6 +14,7 @@ from fluidlift.io.limits import ReadLimits
 from fluidlift.io.pictures import fitted_size, resample_with_alpha, same_shape
 from fluidlift.messages import Notice
 from fluidlift.types import VideoClip
+from fluidlift.types.clip import is_variable
 
 REPEATED = "repeated frames"
 """code of the warning about frames that are the same as the one before"""
@@ -170,11 +171,3 @@ class Collector:
         if self.alpha_count < len(times) or self.least_alpha == 255:
             alpha = None  # an alpha channel that hides nothing says nothing
         return VideoClip(frames, times, self.name, alpha, tuple(self.notes.lines))
-
-
-def is_variable(times: np.ndarray) -> bool:
-    """Steps that differ by more than the rounding of time stamps to milliseconds explains."""
-    if len(times) < 3:
-        return False
-    steps = np.diff(times)
-    return bool(steps.max() - steps.min() > max(0.1 * np.median(steps), 0.0021))

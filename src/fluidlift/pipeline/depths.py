@@ -12,7 +12,6 @@ from fluidlift.backends.monocular_depth import Guess, make_depth_estimator
 from fluidlift.backends.registry import ModelChoice
 from fluidlift.config import DepthConfig
 from fluidlift.errors import InputRejected
-from fluidlift.pipeline.fluid_masks import FluidMasks
 from fluidlift.pipeline.settings import DepthModel, GivenDepth, GivenView
 from fluidlift.pipeline.work import Work
 from fluidlift.shape import depth_surface, given_depth
@@ -22,6 +21,7 @@ from fluidlift.shape.kinds import Observation, builder_of
 from fluidlift.shape.place import DISAGREEING
 from fluidlift.shape.surface import FrontSurface
 from fluidlift.types import FluidKind, MetricScale, PinholeCamera, UpEvidence
+from fluidlift.types.fluid_masks import FluidMasks
 from fluidlift.types.stages import DepthGuess, Read
 
 LEARNED_SCALE = 0.15

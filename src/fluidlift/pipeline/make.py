@@ -13,7 +13,6 @@ from fluidlift import __version__
 from fluidlift.config import JobConfig
 from fluidlift.pipeline import begin
 from fluidlift.pipeline.fit_request import request_of
-from fluidlift.pipeline.fluid_masks import FluidMasks
 from fluidlift.pipeline.inputs import GivenFile, GivenFiles, Inputs
 from fluidlift.pipeline.resimulate import Made, play
 from fluidlift.pipeline.runner import Runner, gone_if_refused, require_stages
@@ -29,6 +28,7 @@ from fluidlift.scene.simulator import particle_work
 from fluidlift.scene.splat_files import require_room
 from fluidlift.seams import Progress, Silence
 from fluidlift.types import FluidAsset, kind_of
+from fluidlift.types.fluid_masks import FluidMasks
 from fluidlift.types.stages import Bodies, Calibration, Fit, Lift, Read, Segmentation
 
 STAGES = ("read", "flow", "segment", "geometry", "refine", "motion", "fit", "calibrate", "simulate", "show")

@@ -22,12 +22,12 @@ from fluidlift.fit.outcome import (
     table,
     verdict,
 )
+from fluidlift.fit.rising import outline_rises, with_buoyancy
 from fluidlift.machine import one_torch_thread
 from fluidlift.pipeline.fit_request import FitRequest, request_of, startable
-from fluidlift.pipeline.fluid_masks import FluidMasks
-from fluidlift.pipeline.rising import outline_rises, with_buoyancy
 from fluidlift.pipeline.work import Work
 from fluidlift.types import CellType, FaceVelocity, FitResult, FluidKind, FluidParameters, kind_of
+from fluidlift.types.fluid_masks import FluidMasks
 from fluidlift.types.stages import Fit, Geometry, Motion, Read, Segmentation
 
 AT_WALLS = ("restitution", "wall_damping")

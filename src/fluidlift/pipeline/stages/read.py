@@ -11,12 +11,13 @@ from pathlib import Path
 import numpy as np
 
 from fluidlift.errors import InputRejected
-from fluidlift.io.stage_cache import Scratch, parts_of
+from fluidlift.io.stage_cache import Scratch
 from fluidlift.messages import without
 from fluidlift.pipeline.inputs import GivenFile
 from fluidlift.pipeline.settings import ReadSettings
 from fluidlift.pipeline.work import Work
 from fluidlift.types import VideoClip
+from fluidlift.types.fluid_masks import parts_of
 from fluidlift.types.stages import Read
 
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from fluidlift.pipeline.fluid_masks import FluidMasks
-from fluidlift.pipeline.ground import seen_labels
+from fluidlift.shape.ground import seen_labels
 from fluidlift.types.clip import Label
+from fluidlift.types.fluid_masks import FluidMasks
 
 
 def test_a_rock_is_one_though_waves_wash_over_it_in_some_frames():

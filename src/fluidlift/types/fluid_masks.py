@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
-from fluidlift.io.stage_cache import parts_of
 from fluidlift.types import Label
 
 
@@ -33,3 +33,14 @@ class FluidMasks:
         """float [T]: px of each frame."""
         parts = [self[part].sum(axis=(1, 2)) for part in parts_of(self.labels)]
         return np.concatenate(parts).astype(float)
+
+
+PART_BYTES = 2**25
+"""of an array on disk that are copied or looked at in one go"""
+
+
+def parts_of(array: np.ndarray, *, size: int = PART_BYTES) -> Iterator[slice]:
+    """Slices along the first axis that cover an array, each of about `size` bytes."""
+    step = max(1, size // max(1, array[:1].nbytes))
+    for first in range(0, len(array), step):
+        yield slice(first, min(first + step, len(array)))

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from fluidlift.errors import InputRejected
-from fluidlift.pipeline.fluid_masks import FluidMasks
 from fluidlift.shape import standing
 from fluidlift.types import PinholeCamera
+from fluidlift.types.fluid_masks import FluidMasks
 
 LAST = 1.0 / 3.0
 """part of the clip in which the liquid is looked at in its basin"""

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from fluidlift.machine import one_torch_thread
-from fluidlift.pipeline.fluid_masks import FluidMasks
 from fluidlift.types import Estimate, FaceVelocity, FluidParameters
+from fluidlift.types.fluid_masks import FluidMasks
 from fluidlift.types.stages import Geometry, Read
 
 PRECISE = 0.05

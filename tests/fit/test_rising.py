@@ -5,9 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from fluidlift.fit import buoyancy
+from fluidlift.fit import buoyancy, rising
 from fluidlift.fit.buoyancy import Buoyancy
-from fluidlift.pipeline import rising
 from fluidlift.types import Estimate, FaceVelocity, FluidParameters, Grid
 
 GRID = Grid((4, 4, 4), 0.1)

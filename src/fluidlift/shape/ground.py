@@ -8,10 +8,10 @@ from typing import cast
 import numpy as np
 from jaxtyping import UInt8
 
-from fluidlift.io.stage_cache import parts_of
 from fluidlift.shape import airborne, channel, generate, ground_mesh, ground_texture, place, plan
 from fluidlift.shape.jets import lying_pixels
 from fluidlift.types import Label, PinholeCamera, Setting, kind_of
+from fluidlift.types.fluid_masks import parts_of
 
 
 def setting_around(

@@ -10,8 +10,8 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from fluidlift.io.collect import is_variable
 from fluidlift.types import PixelFlow, VideoClip
+from fluidlift.types.clip import is_variable
 
 MOST_PAIRS = 600
 """of a clip from which its mean motion is taken, evenly spread where there are more"""

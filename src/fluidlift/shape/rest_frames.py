@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from fluidlift.pipeline.fluid_masks import FluidMasks
 from fluidlift.types import VideoClip
+from fluidlift.types.fluid_masks import FluidMasks
 
 FEWEST_PIXELS = 16
 """of fluid at the first instant: fewer have no shape"""

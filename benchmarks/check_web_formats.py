@@ -21,11 +21,11 @@ from pathlib import Path
 
 import numpy as np
 
+from fluidlift.export import ExportRequest, export_asset
 from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.io.ply import AXES, read_splats, write_gaussians
 from fluidlift.io.spz import fractional_bits, read_spz, write_spz
 from fluidlift.look.rasterize import render
-from fluidlift.pipeline import ExportRequest, export_asset
 from fluidlift.types import Gaussians, PinholeCamera, Similarity3
 
 TOOLS = ("gltf-validator@2.0.0-dev.3.10", "@playcanvas/splat-transform@2.7.1")

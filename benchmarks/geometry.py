@@ -48,7 +48,8 @@ from fluidlift.pipeline.make import STAGES
 from fluidlift.pipeline.runner import Runner
 from fluidlift.pipeline.settings import RefineSettings, taken
 from fluidlift.pipeline.stages.refine import refine
-from fluidlift.pipeline.work import Silence, Work
+from fluidlift.pipeline.work import Work
+from fluidlift.seams import Silence
 from fluidlift.shape.airborne import inside_body
 from fluidlift.shape.place import pose_up
 from fluidlift.shape.surface import inflated_surface, level_surface

@@ -7,7 +7,7 @@ A stop is a function of fluidlift that is entered from another module, counted o
 somebody has to look who follows the journey by reading. It is a return where its module was visited before. The number
 of times that control passes from one module to another is told beside it; it grows with loops.
 
-Each journey is followed through all of fluidlift, and through `pipeline` alone, where the stages are wired up. The edit
+Each journey is followed through all of fluidlift, and through the top floors alone (`TOP`). The edit
 goes once through the files of an asset (`fluidlift sim`), and once as a value, with the asset at hand (the viewer, or
 somebody's program).
 """
@@ -46,7 +46,7 @@ class Traveller:
         until: name of the function, and how its module's name ends in any version of the code.
     """
 
-    inside: str
+    inside: str | tuple[str, ...]
     until: tuple[str, tuple[str, ...]]
     stops: list[str] = field(default_factory=list)
     visited: set[str] = field(default_factory=set)
@@ -100,7 +100,9 @@ def _module(code: CodeType) -> str | None:
     return path[len(str(ROOT)) + 1 : -3].replace("/", ".") if path.startswith(str(ROOT)) else None
 
 
-EDIT = ("simulator_of", ("pipeline.simulating", "pipeline.simulator"))
+EDIT = ("simulator_of", ("pipeline.simulating", "pipeline.simulator", "scene.simulator"))
+TOP = ("pipeline.", "scene.", "present.", "export.")
+"""where the stages are wired up, and what an asset becomes"""
 PICTURE = ("refine", ("pipeline.refining", "pipeline.stages.refine"))
 
 
@@ -119,10 +121,11 @@ def small_clip(path: Path) -> Path:
 
 def journeys(folder: Path, asset: Path | None, show: bool) -> list[str]:
     """Rows of the table."""
-    from fluidlift import pipeline
+    from fluidlift import scene as scenes
     from fluidlift.io.asset_folder import load_asset
     from fluidlift.io.scene import SceneEdits
-    from fluidlift.pipeline import EditSession, Inputs, make, resimulate
+    from fluidlift.pipeline import Inputs, make, resimulate
+    from fluidlift.scene import EditSession
 
     clip, config = small_clip(folder / "clip.mp4"), build_config("draft", None, QUICK, {"shape.size": 2.0})
     if asset is None:
@@ -131,18 +134,18 @@ def journeys(folder: Path, asset: Path | None, show: bool) -> list[str]:
     EditSession.open(asset).set("parameters.kinematic_viscosity", 0.001)
     lifted, edits = load_asset(asset), SceneEdits(parameters={"kinematic_viscosity": 0.001})
     rows = []
-    for number, (inside, where) in enumerate((("", "fluidlift"), ("pipeline.", "pipeline alone"))):
+    for number, (inside, where) in enumerate((("", "fluidlift"), (TOP, "the top floors"))):
         fresh = folder / f"{number}.fluid"
         for title, until, journey in (
             ("an edit until particles exist", EDIT, lambda: resimulate(asset)),
             (
                 "an edit as a value until particles exist",
                 EDIT,
-                lambda: pipeline.simulator_of(pipeline.edited_scene(lifted, edits)),
+                lambda: scenes.simulator_of(scenes.edited_scene(lifted, edits)),
             ),
             ("a picture until Gaussians exist", PICTURE, lambda fresh=fresh: make(Inputs(clip), fresh, config)),
         ):
-            if "value" in title and not hasattr(pipeline, "edited_scene"):
+            if "value" in title and not hasattr(scenes, "edited_scene"):
                 continue  # code in which values do not travel
             found = Traveller(inside, until)
             found.follow(journey)

@@ -34,9 +34,9 @@ from fluidlift.look.rasterize import render
 from fluidlift.look.scenery import orbit_camera, side_camera, terrain_surfels
 from fluidlift.look.vessel import glass_of
 from fluidlift.numerics.srgb import linear_from_srgb, srgb_from_linear
-from fluidlift.pipeline.looks import Backdrop, Frame, Painter
-from fluidlift.pipeline.recall import footage_of_asset
-from fluidlift.pipeline.splat_files import splat_frames
+from fluidlift.present.looks import Backdrop, Frame, Painter
+from fluidlift.scene.recall import footage_of_asset
+from fluidlift.scene.splat_files import splat_frames
 from fluidlift.types import FluidAsset, Gaussians, Grid, PinholeCamera, Terrain, TriangleMesh, kind_of
 
 BEGIN, END = "<!-- looks:begin -->", "<!-- looks:end -->"
@@ -180,7 +180,7 @@ def median_ms(work: Callable[[], object], repeats: int = 7) -> float:
 def speeds(count: int = 100_000, size: tuple[int, int] = (1280, 720)) -> list[list[str]]:
     """Rows of the table of speeds."""
     from fluidlift.backends.splashsurf import SplashsurfMesher
-    from fluidlift.pipeline.surfacing import surface_of
+    from fluidlift.present.surfacing import surface_of
 
     g, velocities, terrain = body(count)
     start = PinholeCamera.looking(np.array([0.5, -1.0, 0.8]), np.array([0.5, 0.5, 0.0]), 45.0, size)

@@ -19,7 +19,7 @@ from report import table as rows_of
 from scipy import ndimage
 
 from fluidlift.io.asset_folder import read_manifest
-from fluidlift.pipeline.recall import footage_of_asset
+from fluidlift.scene.recall import footage_of_asset
 
 CAPTION = 0.08
 """upper share of a panel, where its caption stands"""

@@ -8,7 +8,7 @@ import pytest
 
 from fluidlift.cli import FAILED, REJECTED, USAGE, main
 from fluidlift.cli.options import Make
-from fluidlift.pipeline.rendering import frames_told
+from fluidlift.scene.splat_files import frames_told
 
 
 def shown(capsys, *arguments):

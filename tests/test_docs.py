@@ -14,6 +14,7 @@ from fluidlift.config import build_config
 from fluidlift.io.scene import SceneEdits
 from fluidlift.io.scene_look import Look
 from fluidlift.types import FluidParameters
+from fluidlift.types.parameter_table import PARAMETERS
 
 INFLOW = ("factor", "keyframes", "fluctuation", "period")
 ROOT = Path(__file__).resolve().parent.parent
@@ -130,6 +131,9 @@ SECTIONS = (
     "io",
     "numerics",
     "physics",
+    "scene",
+    "present",
+    "export",
     "pipeline",
     "backends",
     "evaluate",
@@ -155,7 +159,9 @@ def is_setting(name: str) -> bool:
 @pytest.mark.parametrize("page", [p for p in PAGES if p.name != "CHANGELOG.md"], ids=lambda p: p.name)
 def test_dotted_names_in_the_documents_are_modules_functions_or_settings(page):
     """Such as `shape.slope`, `motion.optical_flow.estimate_flow` and `fit.method`."""
-    spans = set(re.findall(rf"`((?:{'|'.join(SECTIONS)})\.[a-z_][\w.]*)`", page.read_text(encoding="utf-8")))
+    spans = set(
+        re.findall(rf"`(?!scene\.yaml)((?:{'|'.join(SECTIONS)})\.[a-z_][\w.]*)`", page.read_text(encoding="utf-8"))
+    )
     missing = []
     for name in sorted(n for n in spans if not n.endswith(".json") and not (is_setting(n) or is_scene_entry(n))):
         try:
@@ -165,7 +171,7 @@ def test_dotted_names_in_the_documents_are_modules_functions_or_settings(page):
     assert missing == []
 
 
-@pytest.mark.parametrize("package", ["shape", "motion", "fit", "look", "pipeline"])
+@pytest.mark.parametrize("package", ["shape", "motion", "fit", "look", "scene", "present", "export", "pipeline"])
 def test_the_drawing_of_the_house_names_every_module(package):
     text = (ROOT / "docs" / "design.md").read_text(encoding="utf-8")
     (drawing,) = re.findall(r"^```\nsrc/fluidlift/\n.*?^```", text, flags=re.M | re.S)
@@ -180,3 +186,16 @@ def test_sections_that_programs_fill_have_both_markers_in_order():
     assert sum(map(len, found)) >= 10
     for markers in found:
         assert all(a == (b[0], "begin") and b[1] == "end" for a, b in zip(markers[::2], markers[1::2], strict=True))
+
+
+def test_the_table_of_parameters_in_editing_md_is_the_one_that_the_software_goes_by():
+    text = (ROOT / "docs" / "editing.md").read_text(encoding="utf-8")
+    section = text.split("### parameters\n")[1].split("\n### ")[0]
+    raised, found = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹−", "-0123456789-"), {}
+    for names, unit, limits in re.findall(r"^\| (`.*?`) \| ?(.*?) \| (.*?) \|$", section, flags=re.M):
+        ends = [
+            re.sub(r"^10(?=[⁰-⁹⁻¹²³])", "1e", word).translate(raised) for word in limits.split(" each")[0].split(" to ")
+        ]
+        for name in re.findall(r"`(\w+)`", names):
+            found[name] = unit.split(",")[0], tuple(map(float, ends)), "three numbers" in unit
+    assert found == {name: (p.sign, p.limits, p.is_vector) for name, p in PARAMETERS.items()}

@@ -11,8 +11,8 @@ The same from the shell:
 import numpy as np
 from workbench import FIRST, bench, end, places
 
-from fluidlift.pipeline import EditSession
-from fluidlift.pipeline.editing import Add, Set
+from fluidlift.scene import EditSession
+from fluidlift.scene.edits import Add, Set
 
 LONGER = 0.8
 """m"""

@@ -11,8 +11,8 @@ The same from the shell:
 import numpy as np
 from workbench import FIRST, bench, end, places
 
-from fluidlift.pipeline import EditSession
-from fluidlift.pipeline.editing import Set
+from fluidlift.scene import EditSession
+from fluidlift.scene.edits import Set
 
 b = bench("turned", __doc__)
 asset = b.asset

@@ -15,8 +15,8 @@ import numpy as np
 from workbench import bench, end, places
 
 from fluidlift.io.asset_folder import save_asset
-from fluidlift.pipeline import EditSession
-from fluidlift.pipeline.editing import Add
+from fluidlift.scene import EditSession
+from fluidlift.scene.edits import Add
 from fluidlift.types import sh_from_rgb
 from fluidlift.validate import validate_asset
 

@@ -9,7 +9,7 @@ The same from the shell:
 import numpy as np
 from workbench import bench, end
 
-from fluidlift.pipeline import EditSession
+from fluidlift.scene import EditSession
 
 b = bench("honey_and_water", __doc__)
 edits = EditSession.open(b.folder)

@@ -13,8 +13,8 @@ import numpy as np
 from workbench import FIRST, bench, end
 
 from fluidlift.look.rasterize import render
-from fluidlift.pipeline import EditSession
-from fluidlift.pipeline.looping import seam
+from fluidlift.present.looping import seam
+from fluidlift.scene import EditSession
 
 LONG, LOOP = 120.0, 1.5
 """s"""

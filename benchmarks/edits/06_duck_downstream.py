@@ -15,8 +15,8 @@ from workbench import FIRST, bench, end, places
 
 from fluidlift.numerics.mesh_distance import mesh_distance
 from fluidlift.numerics.sampling import sample_faces, sample_nodes
-from fluidlift.pipeline import EditSession
-from fluidlift.pipeline.editing import Add, Set
+from fluidlift.scene import EditSession
+from fluidlift.scene.edits import Add, Set
 from fluidlift.types import matrix_from_quat
 
 DENSITY = 350.0

@@ -14,13 +14,14 @@ from scipy import ndimage
 
 from fluidlift.config import build_config
 from fluidlift.io.asset_folder import load_asset, read_manifest, save_asset
+from fluidlift.io.kept_values import last_value
 from fluidlift.io.ply import read_splats
 from fluidlift.physics.transfer import particles_to_grid, sort_by_cell
-from fluidlift.pipeline import EditSession, Inputs, RenderRequest, SimulationRequest, make, render_asset, resimulate
-from fluidlift.pipeline.coarse_copy import coarser
-from fluidlift.pipeline.footage import Footage
-from fluidlift.pipeline.recall import footage_of_asset
-from fluidlift.pipeline.runner import last_value
+from fluidlift.pipeline import Inputs, RenderRequest, make, render_asset, resimulate
+from fluidlift.scene import EditSession, SimulationRequest
+from fluidlift.scene.coarse_copy import coarser
+from fluidlift.scene.footage import Footage
+from fluidlift.scene.recall import footage_of_asset
 from fluidlift.synthetic.demo import demo_clip
 from fluidlift.types import FluidAsset, Grid, Particles
 from fluidlift.types.stages import Simulation

@@ -18,8 +18,10 @@ __version__ = "0.1.0"
 
 _FACE = {
     # from a clip to an asset, and on from there
-    "pipeline": ("EditSession", "ExportRequest", "Inputs", "RenderRequest", "SimulationRequest", "export_asset",
-                 "find_masks", "make", "measure_motion", "refit", "render_asset", "resimulate"),
+    "scene": ("EditSession", "SimulationRequest"),
+    "pipeline": ("Inputs", "RenderRequest", "find_masks", "make", "measure_motion", "refit", "render_asset",
+                 "resimulate"),
+    "export": ("ExportRequest", "export_asset"),
     "config": ("build_config",),
     "io.asset_folder": ("load_asset", "save_asset"),
     "validate": ("validate_asset",),

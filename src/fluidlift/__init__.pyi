@@ -2,6 +2,7 @@
 
 from fluidlift.config import build_config
 from fluidlift.evaluate import evaluate_asset
+from fluidlift.export import ExportRequest, export_asset
 from fluidlift.fit.optimize import FitOptions, fit_parameters
 from fluidlift.io.asset_folder import load_asset, save_asset
 from fluidlift.io.video import read_clip
@@ -14,20 +15,8 @@ from fluidlift.physics.gas import GasSimulator
 from fluidlift.physics.pressure import build_system
 from fluidlift.physics.rollout import RolloutParameters, rollout
 from fluidlift.physics.rollout_domain import prepare_domain
-from fluidlift.pipeline import (
-    EditSession,
-    ExportRequest,
-    Inputs,
-    RenderRequest,
-    SimulationRequest,
-    export_asset,
-    find_masks,
-    make,
-    measure_motion,
-    refit,
-    render_asset,
-    resimulate,
-)
+from fluidlift.pipeline import Inputs, RenderRequest, find_masks, make, measure_motion, refit, render_asset, resimulate
+from fluidlift.scene import EditSession, SimulationRequest
 from fluidlift.types import (
     CellType,
     FaceVelocity,

@@ -5,14 +5,12 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 
 from fluidlift.types import (
     FaceVelocity,
-    FluidAsset,
     Gaussians,
     Grid,
     Particles,
@@ -171,14 +169,6 @@ class Mesher(ABC):
         """
 
 
-class Exporter(ABC):
-    """An asset to files of one format."""
-
-    @abstractmethod
-    def export(self, asset: FluidAsset, folder: Path) -> list[Path]:
-        """Write below `folder`; the files written."""
-
-
 class GroupedByCell(Protocol):
     """The particles cell by cell, x slowest (`physics.transfer.CellOrder` is one)."""
 
@@ -284,40 +274,33 @@ class ParticleMover(ABC):
         """
 
 
-class PoissonSolver(ABC):
-    """-div(w grad p) = rhs on the unknown cells of a staggered grid (conventions: `numerics.poisson`)."""
+class Progress(Protocol):
+    """Where progress is told: a terminal, plain lines, or nowhere."""
 
-    @abstractmethod
-    def solve(
-        self,
-        unknown: np.ndarray,
-        weights: tuple[np.ndarray, np.ndarray, np.ndarray],
-        spacing: float,
-        rhs: np.ndarray,
-        *,
-        initial: np.ndarray,
-        tolerance: float,
-        max_iterations: int,
-    ) -> tuple[np.ndarray, int, float]:
-        """p (float64 [nx,ny,nz], 0 outside the unknown cells), iterations, and the true relative residual.
+    def stage(self, name: str, number: int, count: int) -> None:
+        """A stage begins."""
 
-        Args:
-            unknown: bool [nx,ny,nz].
-            weights: open face fractions across x, y, z.
-            spacing: cell width, m.
-            rhs: float64 [nx,ny,nz], of zero mean over components without an open face to a known cell.
-            initial: float64 first guess.
-            tolerance: of |rhs - A p| / |rhs|.
-            max_iterations: of the solver.
-        """
+    def update(self, done: int, total: int) -> None:
+        """Part of the current stage is done."""
+
+    def finished(self, name: str, seconds: float, cached: bool) -> None:
+        """A stage ended."""
+
+    def warn(self, text: str) -> None:
+        """Something the user should know."""
 
 
-class VelocityContinuation(ABC):
-    """The velocity beyond the liquid."""
+class Silence:
+    """No progress at all."""
 
-    @abstractmethod
-    def continued(
-        self, velocity: FaceVelocity, valid: tuple[np.ndarray, np.ndarray, np.ndarray], layers: int = 3
-    ) -> FaceVelocity:
-        """Faces without a value (`valid` bool per face) take the mean of their neighbours that have one, layer by
-        layer; 0 farther away."""
+    def stage(self, name: str, number: int, count: int) -> None:
+        """Nothing."""
+
+    def update(self, done: int, total: int) -> None:
+        """Nothing."""
+
+    def finished(self, name: str, seconds: float, cached: bool) -> None:
+        """Nothing."""
+
+    def warn(self, text: str) -> None:
+        """Nothing."""

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from fluidlift.backends.learned import FLOW_METHODS, MASK_METHODS, ModelChoice, make_estimator, make_segmenter
+from fluidlift.backends.learned import FLOW_METHODS, MASK_METHODS, make_estimator, make_segmenter
+from fluidlift.backends.registry import ModelChoice
 from fluidlift.backends.sea_raft import SeaRaft
 from fluidlift.backends.sea_raft_network import NetworkShape, SeaRaftNetwork
 from fluidlift.errors import InputRejected, MissingPackage

@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from fluidlift.backends.depth_pictures import longer_field_of_view, multiple_near
-from fluidlift.backends.monocular_depth import DEPTH_MODELS, ModelWeights, make_depth_estimator
+from fluidlift.backends.monocular_depth import DEPTH_MODELS, make_depth_estimator
+from fluidlift.backends.registry import ModelChoice
 from fluidlift.errors import InputRejected, MissingPackage
 from fluidlift.types import PinholeCamera
 
@@ -26,7 +27,7 @@ def picture(seed: int = 0) -> np.ndarray:
 
 
 def model_of(name, weights, **options):
-    return make_depth_estimator(name, ModelWeights(weights, announce=quiet, **options))
+    return make_depth_estimator(name, ModelChoice(weights, announce=quiet, **options))
 
 
 @pytest.fixture(scope="module")
@@ -79,12 +80,12 @@ def depth_pro(transformers, tmp_path_factory):
 @pytest.mark.parametrize("name", DEPTH_MODELS)
 def test_without_weights_every_model_says_what_it_needs(name):
     with pytest.raises(InputRejected, match="no weights"):
-        make_depth_estimator(name, ModelWeights(announce=quiet))
+        make_depth_estimator(name, ModelChoice(announce=quiet))
 
 
 def test_other_names_are_a_mistake():
     with pytest.raises(ValueError, match="moge, depth-anything"):
-        make_depth_estimator("midas", ModelWeights("w"))
+        make_depth_estimator("midas", ModelChoice("w"))
 
 
 def test_sides_of_the_picture():
@@ -201,7 +202,7 @@ def moge_file(folder, **config):
 def test_moge_gives_metres_and_the_field_of_view(moge, tmp_path):
     said = []
     weights = moge_file(tmp_path, neck={}, scale_head={})
-    model = make_depth_estimator("moge", ModelWeights(weights, announce=said.append))
+    model = make_depth_estimator("moge", ModelChoice(weights, announce=said.append))
     found = model.guess(picture(), None)
     assert "MIT" in said[0] and found.holds == "metres"
     assert np.isnan(found.values[:5]).all() and found.values[-1] == pytest.approx(2.0)

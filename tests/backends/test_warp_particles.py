@@ -140,7 +140,7 @@ def test_a_device_of_another_name_is_refused(name):
         warp_device(name)
 
 
-KERNELS = ["warp_transfer_kernels", "warp_motion_kernels", "warp_grid_kernels"]
+KERNELS = ["warp_transfer_kernels", "warp_motion_kernels"]
 
 
 @pytest.mark.parametrize("module", KERNELS)

@@ -118,7 +118,7 @@ def _asset(folder: Path) -> None:
 
 
 def _history(folder: Path) -> None:
-    from fluidlift.pipeline.edit_history import announced, read_history
+    from fluidlift.scene.edit_history import announced, read_history
 
     announced(folder)
     read_history(folder)
@@ -127,7 +127,7 @@ def _history(folder: Path) -> None:
 def _history_files() -> list[Seed]:
     import json
 
-    from fluidlift.pipeline.edit_history import Edit
+    from fluidlift.scene.edit_history import Edit
 
     edit = Edit.of(1, "set", "a: 1\n", "a: 2\n")
     lines = [{"time": "", "what": "found", "text": "a: 1\n"}, edit.to_dict()]
@@ -290,14 +290,6 @@ def _video(folder: Path) -> None:
     read_clip(folder / "a.mp4", max_size=64)
 
 
-def _usd(folder: Path) -> None:
-    from fluidlift.io.read_usd import UsdFluid
-
-    fluid = UsdFluid(folder / "a.usda")
-    for code, _ in zip(fluid.codes, range(3)):
-        fluid.frame(code)
-
-
 def _usd_checked(folder: Path) -> None:
     from fluidlift.io.validate_usd import validate_usd
 
@@ -366,6 +358,5 @@ TARGETS: dict[str, Target] = {
     "stage-arrays": Target(_stage_part("work/flow/k.npz"), _stage, "work/flow/k.npz", _stage_files),
     "stage-mapped": Target(_stage_part("work/flow/k.long.npy"), _stage, "work/flow/k.long.npy", _stage_files),
     "video": Target(corpus.videos, _video, "a.mp4", slow=True),
-    "usd": Target(_text(corpus.USDA), _usd, "a.usda", slow=True),
     "usd-checked": Target(_text(corpus.USDA), _usd_checked, "a.usda", slow=True),
 }

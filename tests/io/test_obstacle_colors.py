@@ -10,7 +10,7 @@ from fluidlift.io.read_mesh import read_any_mesh
 from fluidlift.io.scene import read_edits
 from fluidlift.look.scenery import mesh_surfels
 from fluidlift.numerics.solid_mesh import box_mesh
-from fluidlift.pipeline.looks import placed_bodies
+from fluidlift.present.looks import placed_bodies
 from fluidlift.types import TriangleMesh
 
 YELLOW, BLACK = (1.0, 0.8, 0.1), (0.0, 0.0, 0.0)

@@ -6,10 +6,7 @@ import numpy as np
 import pytest
 
 from fluidlift.errors import InputRejected
-from fluidlift.io.export_sequence import write_mesh_sequence, write_splat_sequence, write_volume_sequence
-from fluidlift.io.frames import FluidFrame
 from fluidlift.io.ply import AXES, read_gaussians, read_mesh, read_splats, write_gaussians, write_mesh, write_points
-from fluidlift.io.volume_grid import VolumeGrid
 from fluidlift.numerics import harmonics
 from fluidlift.types import Gaussians
 
@@ -245,18 +242,3 @@ def test_trimesh_reads_our_points_and_meshes(tmp_path, mesh):
     np.testing.assert_array_equal(loaded.faces, mesh.faces)
     cloud = trimesh.load(write_points(tmp_path / "p.ply", mesh.vertices, colors=mesh.colors))
     np.testing.assert_array_equal(cloud.vertices, mesh.vertices)
-
-
-def test_sequences_begin_at_1001_and_keep_ids(tmp_path, gaussians, mesh):
-    frames = [FluidFrame(gaussians(5 + t), np.arange(5 + t) + t, np.zeros((5 + t, 3)), mesh) for t in range(3)]
-    written = write_splat_sequence(tmp_path / "splats", iter(frames))
-    assert [p.name for p in written] == ["1001.ply", "1002.ply", "1003.ply"]
-    np.testing.assert_array_equal(read_splats(written[2]).extras["id"], np.arange(7) + 2)
-    assert [p.name for p in write_mesh_sequence(tmp_path / "mesh", frames)] == [p.name for p in written]
-    grids = [[VolumeGrid("density", np.ones((4, 4, 4)), 0.1)]] * 2
-    assert [p.name for p in write_volume_sequence(tmp_path / "vdb", grids)] == ["1001.vdb", "1002.vdb"]
-
-
-def test_a_sequence_of_wrong_lengths_is_a_fault_of_the_caller(tmp_path, gaussians):
-    with pytest.raises(ValueError, match="ids"):
-        write_splat_sequence(tmp_path, [(gaussians(5), np.arange(4), np.zeros((5, 3)))])

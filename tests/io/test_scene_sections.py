@@ -7,13 +7,14 @@ import pytest
 
 from fluidlift.errors import InputRejected
 from fluidlift.io.export_mesh import write_obj
-from fluidlift.io.scene import PARAMETERS, SceneEdits, edits_of
+from fluidlift.io.scene import SceneEdits, edits_of
 from fluidlift.io.scene_domain import require_inside
 from fluidlift.io.scene_look import ENVIRONMENTS, MATERIALS, Look
 from fluidlift.numerics.solid_mesh import box_mesh, moments
 from fluidlift.physics.terrain_edit import Move, Replace, Rotate, Scale, Twist
-from fluidlift.pipeline.substances import SUBSTANCES
+from fluidlift.scene.substances import SUBSTANCES
 from fluidlift.types import FluidParameters, Grid, TriangleMesh
+from fluidlift.types.parameter_table import PARAMETERS
 
 GRID = Grid((10, 10, 5), 0.1, (0.0, 0.0, 0.0))
 

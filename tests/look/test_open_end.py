@@ -8,7 +8,7 @@ import pytest
 from fluidlift.io.scene_look import Look
 from fluidlift.look.open_end import OpenEnd
 from fluidlift.numerics.triangles import rasterize_closed
-from fluidlift.pipeline.looks import Backdrop, Frame, Painter
+from fluidlift.present.looks import Backdrop, Frame, Painter
 from fluidlift.types import CellType, Gaussians, Grid, PinholeCamera, Terrain, TriangleMesh, sh_from_rgb
 
 H = 0.1
@@ -111,7 +111,7 @@ def test_a_ragged_end_is_cut_before_the_terrain_and_kept_on_a_plate(style, engin
 
 def test_what_lies_behind_the_section_leaves_no_film_beside_it():
     from fluidlift.backends.splashsurf import SplashsurfMesher
-    from fluidlift.pipeline.surfacing import surface_of
+    from fluidlift.present.surfacing import surface_of
 
     # half a cell behind the section liquid stands twice as high as before it
     before = np.meshgrid(np.arange(1.3, 2.05, 0.05), np.arange(0.2, 0.6, 0.05), np.arange(0.125, 0.3, 0.05))

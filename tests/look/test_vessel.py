@@ -15,8 +15,8 @@ from fluidlift.look.environment import Environment
 from fluidlift.look.materials import material_named
 from fluidlift.look.scenery import terrain_surfels
 from fluidlift.look.vessel import pane_share, panes, vessel_apart
-from fluidlift.pipeline import looks
-from fluidlift.pipeline.looks import Backdrop, Frame, Painter
+from fluidlift.present import looks
+from fluidlift.present.looks import Backdrop, Frame, Painter
 from fluidlift.shape.terrain import terrain_mesh
 from fluidlift.types import Gaussians, Grid, PinholeCamera, Terrain, TriangleMesh, sh_from_rgb
 

@@ -96,20 +96,12 @@ def test_particles_collide_like_the_plain_model(collide, grid, shape, seed):
     assert sample_nodes(walls.signed_distance, grid, got_x[inside]).min() >= 0 and inside.mean() > 0.5
 
 
-def warp_extrapolate(velocity, valid, layers=3):
-    pytest.importorskip("warp")
-    from fluidlift.backends.warp_grid import WarpContinuation
-
-    return WarpContinuation("cpu").continued(velocity, valid, layers)
-
-
-@pytest.mark.parametrize("extrapolate", [boundaries.extrapolate, warp_extrapolate], ids=["numba", "warp"])
 @pytest.mark.parametrize("grid", [*GRIDS, Grid((1, 2, 1), 0.1)], ids=lambda g: str(g.shape))
 @pytest.mark.parametrize("layers", [1, 3, 5])
-def test_velocity_is_continued_like_the_plain_model(extrapolate, grid, layers):
+def test_velocity_is_continued_like_the_plain_model(grid, layers):
     velocity, rng = random_velocity(grid, 5), np.random.default_rng(layers)
     valid = tuple(rng.uniform(size=grid.face_shape(a)) < 0.05 for a in range(3))
-    got, plain = extrapolate(velocity, valid, layers), extrapolate_plain(velocity, valid, layers)
+    got, plain = boundaries.extrapolate(velocity, valid, layers), extrapolate_plain(velocity, valid, layers)
     for a, b, known, original in zip(got.components, plain.components, valid, velocity.components):
         # one rounding of numbers up to 4 per layer
         np.testing.assert_allclose(a, b, atol=layers * 4 * 2.0**-23)

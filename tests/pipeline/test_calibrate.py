@@ -12,11 +12,11 @@ from fluidlift.io.asset_folder import FILES, load_asset, read_manifest
 from fluidlift.io.force_file import read_force, write_force
 from fluidlift.numerics.sampling import sample_faces
 from fluidlift.physics.inflow_schedule import InflowSchedule
-from fluidlift.pipeline.coarse_copy import coarser
-from fluidlift.pipeline.following import following
-from fluidlift.pipeline.scene import SimulationRequest, scene_of
-from fluidlift.pipeline.simulator import simulator_of
 from fluidlift.pipeline.stages.calibrate import STRONG, calibrate
+from fluidlift.scene.build import SimulationRequest, scene_of
+from fluidlift.scene.coarse_copy import coarser
+from fluidlift.scene.following import following
+from fluidlift.scene.simulator import simulator_of
 from fluidlift.types import FaceVelocity
 
 FRAMES = 14

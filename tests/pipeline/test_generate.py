@@ -14,10 +14,10 @@ from fluidlift.config import GenerateConfig, JobConfig
 from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.io.asset_folder import read_manifest
 from fluidlift.io.atomic import write_json
+from fluidlift.io.kept_values import kept_value
 from fluidlift.io.ply import read_gaussians, write_gaussians
 from fluidlift.pipeline import STAGES, Inputs
 from fluidlift.pipeline.given_body import NOTE, given_bodies, tilt_of_sheet, up_of
-from fluidlift.pipeline.runner import kept_value
 from fluidlift.pipeline.stages import generate as generating
 from fluidlift.pipeline.stages import geometry as stage
 from fluidlift.types import Gaussians, PinholeCamera, UpEvidence

@@ -15,12 +15,13 @@ from fluidlift.io.ply import read_splats
 from fluidlift.io.scene import SceneEdits
 from fluidlift.io.video import read_clip
 from fluidlift.numerics.sampling import sample_nodes
-from fluidlift.pipeline import STAGES, Inputs, SimulationRequest, card_of, make
-from fluidlift.pipeline.footage import footage_of
-from fluidlift.pipeline.scene import edited_scene, scene_of
-from fluidlift.pipeline.settings import SceneSettings
-from fluidlift.pipeline.simulator import simulator_of
+from fluidlift.pipeline import STAGES, Inputs, card_of, make
 from fluidlift.pipeline.stages import fit, geometry, simulate
+from fluidlift.scene import SimulationRequest
+from fluidlift.scene.build import edited_scene, scene_of
+from fluidlift.scene.footage import footage_of
+from fluidlift.scene.settings import SceneSettings
+from fluidlift.scene.simulator import simulator_of
 from fluidlift.types import CellType, Label
 from fluidlift.validate import validate_asset
 

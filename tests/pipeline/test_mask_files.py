@@ -8,9 +8,9 @@ import pytest
 
 from fluidlift.cli import DONE, REJECTED, WITH_WARNINGS, main
 from fluidlift.errors import MissingPackage
+from fluidlift.io.kept_values import kept_value
 from fluidlift.io.pictures import read_picture, write_png
 from fluidlift.motion import optical_flow
-from fluidlift.pipeline.runner import kept_value
 from fluidlift.pipeline.stages import flow
 from fluidlift.types import PinholeCamera
 from fluidlift.types.stages import Segmentation

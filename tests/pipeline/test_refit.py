@@ -48,8 +48,8 @@ def outcome(monkeypatch):
                 calls.append((initial, free, options))
             if error is not None:
                 raise error
+            from fluidlift.fit.outcome import first_guess_as_result
             from fluidlift.fit.ranges import UNITS
-            from fluidlift.pipeline.fit_outcome import first_guess_as_result
             from fluidlift.types import Estimate, FitResult
 
             found = replace(initial, outflow_velocity=0.123, kinematic_viscosity=2e-5)

@@ -14,7 +14,7 @@ from fluidlift.io.asset_folder import load_asset, read_manifest
 from fluidlift.io.ply import read_splats
 from fluidlift.io.video import read_clip
 from fluidlift.physics.stepping import ParticleSimulator
-from fluidlift.pipeline import simulator
+from fluidlift.scene import simulator
 
 FRAMES = 6
 WELL = (DONE, WITH_WARNINGS)

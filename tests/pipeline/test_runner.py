@@ -6,13 +6,15 @@ import numpy as np
 import pytest
 
 from fluidlift.errors import InputRejected
+from fluidlift.io.kept_values import kept_value, last_value
 from fluidlift.io.stage_cache import load_stage, save_stage
+from fluidlift.machine import peak_memory_mb
 from fluidlift.pipeline import runner as running
 from fluidlift.pipeline.inputs import GivenFile, Weights, file_hash
-from fluidlift.pipeline.machine import peak_memory_mb
-from fluidlift.pipeline.runner import Runner, digest_of, kept_value, last_value
+from fluidlift.pipeline.runner import Runner, digest_of
 from fluidlift.pipeline.settings import BESIDE
-from fluidlift.pipeline.work import Silence, Work
+from fluidlift.pipeline.work import Work
+from fluidlift.seams import Silence
 from fluidlift.types import FaceVelocity, Grid
 
 STAGES = ("one", "two", "three")

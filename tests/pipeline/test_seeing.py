@@ -9,9 +9,8 @@ import pytest
 
 from fluidlift.config import build_config
 from fluidlift.errors import InputRejected
-from fluidlift.io.stage_cache import parts_of
 from fluidlift.motion.optical_flow import estimate_flow, mean_flow
-from fluidlift.pipeline.fluid_masks import FluidMasks
+from fluidlift.motion.steady_flow import mean_motion, pairs_of, spans_of
 from fluidlift.pipeline.hints import NO_HINTS, Hints
 from fluidlift.pipeline.inputs import GivenFile, file_hash
 from fluidlift.pipeline.runner import Runner
@@ -20,10 +19,10 @@ from fluidlift.pipeline.stages import segment as segmenting
 from fluidlift.pipeline.stages.flow import estimated_flow
 from fluidlift.pipeline.stages.read import read
 from fluidlift.pipeline.stages.segment import segment
-from fluidlift.pipeline.steady_flow import mean_motion, pairs_of, spans_of
-from fluidlift.pipeline.work import Silence, Work
-from fluidlift.seams import Segmenter
+from fluidlift.pipeline.work import Work
+from fluidlift.seams import Segmenter, Silence
 from fluidlift.types import Label, PixelFlow, PixelLabels
+from fluidlift.types.fluid_masks import FluidMasks, parts_of
 from fluidlift.types.stages import Flow, Read
 
 

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from fluidlift.config.of_asset import settings_of
 from fluidlift.io.asset_folder import load_asset, read_manifest
-from fluidlift.pipeline.resimulate import settings_of
-from fluidlift.pipeline.scene import SimulationRequest, scene_of
 from fluidlift.pipeline.settings import ShowSettings, taken
 from fluidlift.pipeline.stages import show
+from fluidlift.scene.build import SimulationRequest, scene_of
 from fluidlift.types.gaussians import concatenate
 
 

@@ -118,7 +118,7 @@ def test_a_round_drop_holds_the_pressure_of_laplace_and_rests(scene):
     report = simulator.advance(swing)
     steps = swing / report.substeps
     assert steps <= capillary_time_step(density, tension, MILLIMETRE)
-    first, rate = simulator._head_rate
+    first, rate = simulator._liquid.head_rate
     center = (np.asarray(simulator.grid.shape) // 2 - np.asarray(first)).astype(int)
     pressure = density * rate[tuple(center)]
     assert pressure == pytest.approx(2 * tension / radius, rel=0.03)

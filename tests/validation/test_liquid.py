@@ -113,9 +113,9 @@ def test_the_grid_velocity_is_free_of_divergence(scene):
     terrain = scene.terrain(grid, distance)
     particles = scene.body(grid, lambda p: p[:, 2] < 0.8 - 0.3 * p[:, 0], terrain=terrain, velocity=(1.0, 0.2, 0.0))
     simulator = LiquidSimulator(grid, terrain, FluidParameters(time_step=0.01), particles, cell_types=scene.cells(grid))
-    window = simulator._look(simulator._particles.positions)
+    window = simulator._liquid.look(simulator._particles.positions)
     order = transfer.sort_by_cell(simulator._particles.positions, window.grid)
-    step = simulator._grid_velocity(window, order, 0.01)
+    step = simulator._liquid.step(simulator._particles, simulator.bodies.enter(window), order, 0.01, 0.0)
     grid, velocity, system, report = window.grid, step.velocity, step.system, step.report
     assert report.converged
     left = np.abs(divergence(velocity, grid, system)).max() * grid.spacing

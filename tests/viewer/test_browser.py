@@ -15,7 +15,7 @@ import pytest
 pytest.importorskip("viser", reason="viser is not installed: pip install 'fluidlift[view]'")
 pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 
-from fluidlift.pipeline.editing import Add
+from fluidlift.scene.edits import Add
 from fluidlift.viewer.controls import unbroken
 
 CHROMIUM = Path("/usr/bin/chromium")

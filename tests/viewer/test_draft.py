@@ -3,7 +3,7 @@
 import pytest
 
 from fluidlift.errors import InputRejected
-from fluidlift.pipeline.editing import EditSession
+from fluidlift.scene.edits import EditSession
 from fluidlift.types import FluidParameters
 from fluidlift.viewer.draft import QUIET, Draft
 
@@ -64,7 +64,7 @@ def test_a_value_as_fitted_leaves_no_trace(draft, session):
 
 
 def test_obstacles_are_moved_by_their_names(draft, session):
-    from fluidlift.pipeline.editing import Add
+    from fluidlift.scene.edits import Add
 
     draft.apply([Add("obstacles", {"shape": "sphere", "radius": 0.05, "position": [0.3, 0.2, 0.2]})], "added")
     name = draft.obstacles[0]["name"]

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from fluidlift.io.asset_folder import load_asset, save_asset
-from fluidlift.pipeline.edit_outlook import place_told, placed
-from fluidlift.pipeline.editing import EditSession
-from fluidlift.pipeline.open_water import open_water
+from fluidlift.scene.edits import EditSession
+from fluidlift.scene.forecast import place_told, placed
+from fluidlift.scene.open_water import open_water
 from fluidlift.types import CellType
 
 ROCK, WIDE = np.array([0.125, 0.2, 0.15]), 0.08

@@ -10,7 +10,7 @@ from fluidlift.io.asset_folder import update_manifest
 from fluidlift.io.asset_lock import Holder
 from fluidlift.io.stage_cache import mark_owner, save_stage
 from fluidlift.io.stage_codec import packed
-from fluidlift.pipeline.recall import simulated_poses
+from fluidlift.scene.recall import simulated_poses
 from fluidlift.types.stages import Simulation
 from fluidlift.viewer import saved
 from fluidlift.viewer.footage import InputPictures, input_pictures

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fluidlift.backends.generator_card import GeneratorCard
+from fluidlift.backends.registry import class_of, module_name, names
 from fluidlift.errors import FluidliftError, InputRejected
 
 if TYPE_CHECKING:
@@ -21,8 +22,7 @@ if TYPE_CHECKING:
     from fluidlift.seams import Generator
     from fluidlift.types import Gaussians, PinholeCamera
 
-GENERATORS = ("triplane-gaussian", "trellis", "triposplat", "lgm", "sharp")
-"""names, of which each is that of a module here, with hyphens for underscores"""
+GENERATORS = names("generator")
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ def require_known(name: str) -> str:
 
 
 def _adapter(name: str) -> Any:
-    return importlib.import_module("fluidlift.backends." + require_known(name).replace("-", "_"))
+    return importlib.import_module(module_name("generator", require_known(name)))
 
 
 def card_of(name: str) -> GeneratorCard:
@@ -134,11 +134,7 @@ def generator_class(name: str) -> Any:
     Raises:
         InputRejected: there is none of that name.
     """
-    from fluidlift.seams import Generator
-
-    module = _adapter(name)
-    found = [c for c in vars(module).values() if isinstance(c, type) and issubclass(c, Generator)]
-    return next(c for c in found if c.__module__ == module.__name__)
+    return class_of("generator", require_known(name))
 
 
 def make_generator(choice: GeneratorChoice) -> Generator:

@@ -3,33 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fluidlift.backends.model_weights import Announce, say
-from fluidlift.errors import InputRejected, require
+from fluidlift.backends.registry import ModelChoice, class_of, names
+from fluidlift.errors import InputRejected
 from fluidlift.seams import FlowEstimator, Segmenter
 
 if TYPE_CHECKING:
     from fluidlift.backends.sam2_video import Guess, Progress
 
-FLOW_METHODS = ("raft", "sea-raft")
-MASK_METHODS = ("sam2", "sam3")
-
-
-@dataclass(frozen=True)
-class ModelChoice:
-    """Which weights, where they run, and what the user has agreed to."""
-
-    weights: Path | str | None = None
-    """file (flow) or folder (masks); None: the default of the method, where there is one to download"""
-    device: str = "cpu"
-    """cpu, cuda or cuda:1"""
-    allow_download: bool = False
-    """whether weights may be fetched"""
-    announce: Announce = say
-    """is told the licence before the weights are touched"""
+FLOW, MASKS = "flow method", "mask method"
+FLOW_METHODS, MASK_METHODS = names(FLOW), names(MASKS)
 
 
 def make_estimator(name: str, choice: ModelChoice) -> FlowEstimator:
@@ -41,18 +26,11 @@ def make_estimator(name: str, choice: ModelChoice) -> FlowEstimator:
         FluidliftError: no such device.
         ValueError: another name.
     """
-    require(name in FLOW_METHODS, f"flow method '{name}'", "one of " + ", ".join(FLOW_METHODS))
+    kind, weights = class_of(FLOW, name), choice.weights
+    run = {"device": choice.device, "announce": choice.announce}
     if name == "raft":
-        from fluidlift.backends.torchvision_raft import TorchvisionRaft
-
-        return TorchvisionRaft(
-            choice.weights, device=choice.device, allow_download=choice.allow_download, announce=choice.announce
-        )
-    from fluidlift.backends.sea_raft import SeaRaft
-
-    return SeaRaft(
-        _given(choice, "sea-raft", "a checkpoint of its authors"), device=choice.device, announce=choice.announce
-    )
+        return kind(weights, allow_download=choice.allow_download, **run)
+    return kind(_given(choice, name, "a checkpoint of its authors"), **run)
 
 
 def make_segmenter(
@@ -78,29 +56,13 @@ def make_segmenter(
         FluidliftError: no such device.
         ValueError: another name.
     """
-    require(name in MASK_METHODS, f"mask method '{name}'", "one of " + ", ".join(MASK_METHODS))
+    kind = class_of(MASKS, name)
     weights = _given(choice, name, "a folder with config.json and model.safetensors")
-    if name == "sam2":
-        from fluidlift.backends.sam2_video import Sam2Video
-
-        return Sam2Video(
-            weights,
-            guess=guess,
-            device=choice.device,
-            allow_download=choice.allow_download,
-            announce=choice.announce,
-            progress=progress,
-        )
-    from fluidlift.backends.sam3_video import Sam3Video
-
-    return Sam3Video(
-        weights,
-        words=words,
-        device=choice.device,
-        allow_download=choice.allow_download,
-        announce=choice.announce,
-        progress=progress,
-    )
+    hint = {"guess": guess} if name == "sam2" else {"words": words}
+    return kind(
+        weights, device=choice.device, allow_download=choice.allow_download, announce=choice.announce,
+        progress=progress, **hint,
+    )  # fmt: skip
 
 
 def _given(choice: ModelChoice, name: str, what: str) -> Path | str:

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
-from fluidlift.backends.model_weights import Announce, say
-from fluidlift.errors import InputRejected, require
+from fluidlift.backends.registry import ModelChoice, class_of, names
+from fluidlift.errors import InputRejected
 from fluidlift.seams import DepthEstimator
 from fluidlift.types import PinholeCamera
 
-DEPTH_MODELS = ("moge", "depth-anything", "depth-anything-3", "depth-pro")
+DEPTH = "depth model"
+DEPTH_MODELS = names(DEPTH)
 """the first is what we advise: its code and weights may be used for everything, and it says the field of view"""
 
 
@@ -29,20 +29,6 @@ class Guess:
     """metres; depth up to a factor; inverse depth up to factor and offset"""
     field_of_view: float | None = None
     """degrees across the longer side, where it says that"""
-
-
-@dataclass(frozen=True)
-class ModelWeights:
-    """Which weights, where they run, and what the user has agreed to."""
-
-    weights: Path | str | None = None
-    """file or folder, or a name on the hub where downloads are allowed"""
-    device: str = "cpu"
-    """cpu, cuda or cuda:1"""
-    allow_download: bool = False
-    """whether weights may be fetched"""
-    announce: Announce = say
-    """is told the licence before the weights are touched"""
 
 
 class DepthModel(DepthEstimator):
@@ -61,7 +47,7 @@ class DepthModel(DepthEstimator):
             return np.where(found.values > 0, 1.0 / found.values, np.nan).astype(np.float32)
 
 
-def make_depth_estimator(name: str, choice: ModelWeights) -> DepthModel:
+def make_depth_estimator(name: str, choice: ModelChoice) -> DepthModel:
     """A learned model of depth: one of `DEPTH_MODELS`.
 
     Raises:
@@ -70,17 +56,9 @@ def make_depth_estimator(name: str, choice: ModelWeights) -> DepthModel:
         FluidliftError: no such device.
         ValueError: another name.
     """
-    require(name in DEPTH_MODELS, f"depth model '{name}'", "one of " + ", ".join(DEPTH_MODELS))
+    kind = class_of(DEPTH, name)
     if choice.weights is None:
         raise InputRejected(
             f"no weights for {name}", "a file or folder with them", "name it (docs/depth.md says where to get it)"
         )
-    if name == "moge":
-        from fluidlift.backends.moge_depth import MogeDepth as Model
-    elif name == "depth-anything":
-        from fluidlift.backends.depth_anything import DepthAnything as Model
-    elif name == "depth-anything-3":
-        from fluidlift.backends.depth_anything import DepthAnything3 as Model
-    else:
-        from fluidlift.backends.depth_pro import DepthPro as Model
-    return Model(choice.weights, device=choice.device, allow_download=choice.allow_download, announce=choice.announce)
+    return kind(choice.weights, device=choice.device, allow_download=choice.allow_download, announce=choice.announce)

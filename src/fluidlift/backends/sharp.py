@@ -44,8 +44,6 @@ CARD = GeneratorCard(
     metric=True,
 )
 
-INNER_SIZE = 1536
-"""px, both ways, to which the network stretches the picture"""
 USUAL_FOCAL = 30.0
 """mm on 36 x 24 mm film, where nobody knows better, as in its own tool"""
 BEHIND = 0.05

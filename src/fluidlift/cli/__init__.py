@@ -227,7 +227,7 @@ def _fit(c: Fit) -> int:
 
 
 def _sim(c: Sim) -> int:
-    from fluidlift.pipeline import SimulationRequest
+    from fluidlift.scene import SimulationRequest
 
     request = SimulationRequest(c.duration, c.fps, c.extend_downstream, c.meshes, c.resume, c.restart)
     flat = {"seed": c.seed, "simulate.checkpoint_every": c.checkpoint_every}
@@ -268,7 +268,7 @@ def _render(c: Render) -> int:
 
 
 def _export(c: Export) -> int:
-    from fluidlift.pipeline import ExportRequest, export_asset
+    from fluidlift.export import ExportRequest, export_asset
 
     frames = _pair(c.frames, "-", "--frames", "1001-1024")
     request = ExportRequest(c.to, c.up_axis, c.meters_per_unit, frames, c.fps)

@@ -12,8 +12,8 @@ import tyro
 from fluidlift.errors import FluidliftError, InputRejected
 
 if TYPE_CHECKING:
-    from fluidlift.pipeline.edit_history import Edit as Done
-    from fluidlift.pipeline.editing import Change, EditSession
+    from fluidlift.scene.edit_history import Edit as Done
+    from fluidlift.scene.edits import Change, EditSession
 
 _DONE, _WITH_WARNINGS = 0, 4
 
@@ -58,7 +58,7 @@ def run(command: Edit) -> int:
         InputRejected: an edit that does not fit; nothing was changed.
         FluidliftError: the simulation after the edit broke down; the edit stands.
     """
-    from fluidlift.pipeline.editing import EditSession
+    from fluidlift.scene.edits import EditSession
 
     session = EditSession.open(command.asset, meshes=command.meshes)
     wanted, look = _wanted(command), _look(session)
@@ -84,7 +84,7 @@ def changes_of(session: EditSession, command: Edit) -> list[Change]:
     Raises:
         InputRejected: an option that is not of the form path=value, or a value that is no YAML.
     """
-    from fluidlift.pipeline.editing import Add, Remove, Set
+    from fluidlift.scene.edits import Add, Remove, Set
 
     changes: list[Change] = [] if command.material is None else session.made_of(command.material)
     changes += [Remove(path) for path in command.remove]
@@ -132,8 +132,9 @@ def _pair(text: str, option: str, example: str) -> tuple[str, Any]:
 
 
 def _simulate(session: EditSession, command: Edit) -> None:
-    from fluidlift.pipeline import SimulationRequest, resimulate
+    from fluidlift.pipeline import resimulate
     from fluidlift.progress import shown_progress
+    from fluidlift.scene import SimulationRequest
 
     try:
         with shown_progress() as progress:

@@ -32,7 +32,7 @@ from fluidlift.fit.identifiability import estimates
 from fluidlift.fit.inlet import boundary_prior, fluctuation_error
 from fluidlift.fit.minimise import Found, first_point, minimise
 from fluidlift.fit.problem import FitProblem, build_problem
-from fluidlift.fit.ranges import UNITS, VECTORS, ParameterSpace, parameter_space
+from fluidlift.fit.ranges import UNITS, ParameterSpace, parameter_space
 from fluidlift.fit.scene import FitScene, WindowPlan, build_scene, plan_windows
 from fluidlift.fit.settings import DEFAULT_FREE, SCALES, FitOptions
 from fluidlift.numerics.poisson import PoissonSystem
@@ -48,6 +48,7 @@ from fluidlift.types import (
     kind_of,
 )
 from fluidlift.types.kind import STREAM
+from fluidlift.types.parameter_table import VECTORS
 
 __all__ = ["DEFAULT_FREE", "FitOptions", "fit_parameters"]
 

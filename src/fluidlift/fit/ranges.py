@@ -18,20 +18,10 @@ from torch import Tensor
 from fluidlift.errors import require
 from fluidlift.physics.rollout import RolloutParameters
 from fluidlift.types import FluidParameters
+from fluidlift.types.parameter_table import FITTABLE, VECTORS, Scale
 
-VECTORS = ("gravity", "inflow_velocity")
-UNITS = {
-    "density": "kg/m^3",
-    "kinematic_viscosity": "m^2/s",
-    "gravity": "m/s^2",
-    "inflow_velocity": "m/s",
-    "inflow_fluctuation": "m/s",
-    "outflow_velocity": "m/s",
-    "restitution": "",
-    "wall_damping": "",
-    "time_step": "s",
-}
-"""every parameter and its unit"""
+UNITS = {name: p.unit for name, p in FITTABLE.items()}
+"""every parameter that can be fitted, and its unit"""
 
 
 class Range(ABC):
@@ -210,19 +200,16 @@ def parameter_space(
     unknown = set(free) - set(UNITS)
     require(not unknown, f"unknown parameters {sorted(unknown)}", ", ".join(UNITS))
     strength = max(math.hypot(*prior.gravity), 1e-3)
+    units = {
+        "density": 1000.0, "kinematic_viscosity": speed * spacing, "gravity": strength, "time_step": prior.time_step,
+    }  # fmt: skip
+    maps = {Scale.LOG: Positive, Scale.LINEAR: Signed}
     ranges: dict[str, Range] = {
-        "density": Positive(1000.0),
-        "kinematic_viscosity": Positive(speed * spacing),
-        "gravity": Signed(strength),
-        "inflow_velocity": Signed(speed),
-        "inflow_fluctuation": Positive(speed),
-        "outflow_velocity": Signed(speed),
-        "restitution": Bounded(),
-        "wall_damping": Bounded(),
-        "time_step": Positive(prior.time_step),
+        name: Bounded() if p.scale is Scale.LOGIT else maps[p.scale](units.get(name, speed))
+        for name, p in FITTABLE.items()
     }
     floors = {"kinematic_viscosity": 1e-7, "inflow_fluctuation": 0.02 * speed}
-    sigmas = DEFAULT_PRIOR_SIGMAS | (prior_sigmas or {})
+    sigmas = {n: p.prior_sigma for n, p in FITTABLE.items() if p.prior_sigma is not None} | (prior_sigmas or {})
     fitted, fixed = [], []
     # what the rollout knows: surface tension is not part of it
     for name, values in ((n, v) for n, v in prior.to_dict().items() if n in UNITS):
@@ -234,19 +221,3 @@ def parameter_space(
             else:
                 fixed.append(FixedParameter(name, component, value))
     return ParameterSpace(tuple(fitted), tuple(fixed))
-
-
-DEFAULT_PRIOR_SIGMAS = {
-    "density": 0.1,
-    "kinematic_viscosity": 3.0,
-    "gravity": 0.1,
-    "inflow_velocity": 1.0,
-    "inflow_fluctuation": 1.0,
-    "outflow_velocity": 1.0,
-    "restitution": 1.5,
-    "wall_damping": 2.5,
-    "time_step": 0.1,
-}
-"""raw: a factor e^3 = 20 for viscosity; about the whole range for wall coefficients; the flow's own speed for
-velocities; 10 % and some 6 degrees for gravity, since a slow viscous flow only knows its ratio to the viscosity, and
-errors of the free surface look like less of it"""

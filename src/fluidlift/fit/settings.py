@@ -10,11 +10,9 @@ import torch
 from fluidlift.errors import require
 from fluidlift.fit.loss import LossWeights
 from fluidlift.physics.rollout_pressure import RolloutOptions
+from fluidlift.types.parameter_table import FITTABLE
 
-DEFAULT_FREE = (
-    "density", "kinematic_viscosity", "gravity", "inflow_velocity", "inflow_fluctuation", "outflow_velocity",
-    "restitution", "wall_damping", "time_step",
-)  # fmt: skip
+DEFAULT_FREE = tuple(FITTABLE)
 """All of the paper's. The time step has a narrow prior: the interval between frames is known, its division a choice."""
 
 SCALES = ((1.0, 1.0), (0.05, 0.5), (20.0, 2.0), (0.2, 1.5), (5.0, 0.7))
@@ -38,7 +36,7 @@ class FitOptions:
     free: Sequence[str] = DEFAULT_FREE
     """parameters to fit"""
     prior_sigmas: dict[str, float] | None = None
-    """raw prior widths instead of `ranges.DEFAULT_PRIOR_SIGMAS`"""
+    """raw prior widths instead of those of `types.parameter_table`"""
     weights: LossWeights | None = None
     """of the loss"""
     options: RolloutOptions | None = None

@@ -12,8 +12,12 @@ from fluidlift.errors import InputRejected
 from fluidlift.io.decode import Notes
 from fluidlift.io.limits import ReadLimits
 from fluidlift.io.pictures import fitted_size, resample_with_alpha, same_shape
+from fluidlift.messages import Notice
 from fluidlift.types import VideoClip
+from fluidlift.types.clip import is_variable
 
+REPEATED = "repeated frames"
+"""code of the warning about frames that are the same as the one before"""
 MIN_SIDE = 16
 """px; below it nothing can be seen to move"""
 
@@ -160,17 +164,10 @@ class Collector:
                 f"longest after frame {int(np.argmax(steps))}; the real times are used"
             )
         if self.repeated:
-            self.notes.add(f"{self.repeated} of {len(times)} frames repeat the one before (a converted frame rate?)")
+            text = f"{self.repeated} of {len(times)} frames repeat the one before (a converted frame rate?)"
+            self.notes.add(Notice(REPEATED, text))
         frames = self.frames.close()
         alpha = None if self.alphas is None else self.alphas.close()
         if self.alpha_count < len(times) or self.least_alpha == 255:
             alpha = None  # an alpha channel that hides nothing says nothing
         return VideoClip(frames, times, self.name, alpha, tuple(self.notes.lines))
-
-
-def is_variable(times: np.ndarray) -> bool:
-    """Steps that differ by more than the rounding of time stamps to milliseconds explains."""
-    if len(times) < 3:
-        return False
-    steps = np.diff(times)
-    return bool(steps.max() - steps.min() > max(0.1 * np.median(steps), 0.0021))

@@ -23,6 +23,7 @@ from fluidlift.io.yaml_reader import MAX_BYTES, parse_yaml
 from fluidlift.physics.emitter import Emitter
 from fluidlift.physics.inflow_schedule import InflowSchedule
 from fluidlift.physics.terrain_edit import TerrainEdit
+from fluidlift.types.parameter_table import PARAMETERS
 
 SCENE_TEMPLATE = """\
 # What to change when this fluid is simulated again. SI units, z up.
@@ -60,22 +61,6 @@ look:
 #extend_downstream: 2.0   # m by which the channel of a stream or a fall goes on
 #loop: true   # the last frame leads into the first
 """
-
-PARAMETERS = {
-    "density": (1e-3, 1e6, "kg/m^3"),
-    "kinematic_viscosity": (0.0, 1e6, "m^2/s"),
-    "surface_tension": (0.0, 10.0, "N/m"),
-    "gravity": (-1e3, 1e3, "m/s^2"),
-    "inflow_velocity": (-1e3, 1e3, "m/s"),
-    "inflow_fluctuation": (0.0, 1e3, "m/s"),
-    "outflow_velocity": (-1e3, 1e3, "m/s"),
-    "restitution": (0.0, 1.0, ""),
-    "wall_damping": (0.0, 1.0, ""),
-    "time_step": (1e-9, 1e3, "s"),
-}
-"""least, most and unit of what can stand under `parameters`; vectors: of each component"""
-VECTORS = {"gravity": "[0, 0, -9.81]", "inflow_velocity": "[1, 0, 0]"}
-"""those with three numbers, with an example"""
 
 
 @dataclass(frozen=True)
@@ -154,11 +139,11 @@ def _parameters(changes: Entries) -> dict[str, Any]:
     changes.only(PARAMETERS, {n: home_of(n) for n in changes.data})
     found: dict[str, Any] = {}
     for name in changes.data:
-        low, high, unit = PARAMETERS[name]
-        if name in VECTORS:
-            found[name] = changes.vector(name, None, limit=high, unit=unit, example=VECTORS[name])
+        known, (low, high) = PARAMETERS[name], PARAMETERS[name].limits
+        if known.is_vector:
+            found[name] = changes.vector(name, None, limit=high, unit=known.unit, example=known.example)
         else:
-            found[name] = changes.number(name, None, low=low, high=high, unit=unit)
+            found[name] = changes.number(name, None, low=low, high=high, unit=known.unit)
     return found
 
 

@@ -15,7 +15,7 @@ import json
 import os
 import re
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -36,6 +36,7 @@ from fluidlift.io.atomic import (
     write_json,
 )
 from fluidlift.io.limits import MAX_TEXT_BYTES, parse_json, require_size
+from fluidlift.types.fluid_masks import parts_of
 
 WORK_MARKER = ".fluidlift"
 """file in work/ that says whose folder this is"""
@@ -53,10 +54,6 @@ def mark_work_folder(folder: Path | str) -> Path:
     if not marker.exists():
         write_bytes(marker, b"cached stage results of fluidlift; may be deleted\n")
     return work
-
-
-PART_BYTES = 2**25
-"""of an array on disk that are copied or looked at in one go"""
 
 
 class GrowingArray:
@@ -176,13 +173,6 @@ def _whole_file(array: np.ndarray) -> Path | None:
     if not isinstance(array, np.memmap) or isinstance(array.base, np.ndarray) or array.filename is None:
         return None
     return Path(array.filename)
-
-
-def parts_of(array: np.ndarray, *, size: int = PART_BYTES) -> Iterator[slice]:
-    """Slices along the first axis that cover an array, each of about `size` bytes."""
-    step = max(1, size // max(1, array[:1].nbytes))
-    for first in range(0, len(array), step):
-        yield slice(first, min(first + step, len(array)))
 
 
 def _names(folder: Path | str, stage: str, key: str) -> tuple[Path, Path]:

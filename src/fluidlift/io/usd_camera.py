@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from pxr import Gf, Usd, UsdGeom
+from pxr import Gf, UsdGeom
 
-from fluidlift.types import PinholeCamera, RigidTransform, Similarity3
+from fluidlift.types import PinholeCamera, Similarity3
 
 FILM = 0.036
 """m: the width of the film back that is written, that of a 35 mm camera. Only its ratio to the focal length is known"""
@@ -42,32 +42,3 @@ def write_camera(prim: UsdGeom.Camera, camera: PinholeCamera, place: Similarity3
     file_from_camera[:3, :3] = place.rotation @ camera.camera_from_world.rotation.T @ _FLIP
     file_from_camera[:3, 3] = place.points(camera.position)
     prim.MakeMatrixXform().Set(Gf.Matrix4d(file_from_camera.T.tolist()))  # row vectors
-
-
-def read_camera(
-    prim: UsdGeom.Camera, size: tuple[int, int], place: Similarity3, time: Usd.TimeCode | None = None
-) -> PinholeCamera:
-    """The pinhole camera of a picture of `size` (width, height) px that sees what a USD camera sees.
-
-    Args:
-        prim: a camera.
-        size: of the picture; the film back may have another shape, pixels are then not square.
-        place: file_from_world, as in `write_camera`.
-        time: None: the default values.
-    """
-    time = time or Usd.TimeCode.Default()
-    focal, across, up, right, top = (
-        float(attribute.Get(time))
-        for attribute in (
-            prim.GetFocalLengthAttr(), prim.GetHorizontalApertureAttr(), prim.GetVerticalApertureAttr(),
-            prim.GetHorizontalApertureOffsetAttr(), prim.GetVerticalApertureOffsetAttr(),
-        )
-    )  # fmt: skip
-    width, height = size
-    fx, fy = focal * width / across, focal * height / up
-    center = (0.5 * width - right * fx / focal, 0.5 * height + top * fy / focal)
-    matrix = np.array(prim.ComputeLocalToWorldTransform(time)).T
-    turned = matrix[:3, :3] / np.linalg.norm(matrix[:3, :3], axis=0)
-    rotation = (place.rotation.T @ turned @ _FLIP).T
-    position = place.inverse().points(matrix[:3, 3])
-    return PinholeCamera((fx, fy), center, size, RigidTransform(rotation, -rotation @ position))

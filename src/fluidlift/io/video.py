@@ -19,7 +19,7 @@ import av
 import numpy as np
 
 from fluidlift.errors import InputRejected, require
-from fluidlift.io.collect import MIN_SIDE, Collector, FrameStore, Wanted, is_variable
+from fluidlift.io.collect import MIN_SIDE, Collector, FrameStore, Wanted
 from fluidlift.io.decode import (
     Notes,
     decode_frames,
@@ -35,6 +35,7 @@ from fluidlift.io.limits import ReadLimits
 from fluidlift.io.pictures import eight_bit, read_picture
 from fluidlift.io.sequences import is_sequence, list_sequence
 from fluidlift.types import VideoClip
+from fluidlift.types.clip import is_variable
 
 __all__ = ["ClipInfo", "ReadLimits", "frames_before", "probe", "read_clip", "write_video"]
 

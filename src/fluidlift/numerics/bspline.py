@@ -10,9 +10,6 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-SECOND_MOMENT = 0.25
-"""cell^2"""
-
 
 def quadratic(coordinates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """First of the three samples each point touches, int64 [...], and their weights [...,3].

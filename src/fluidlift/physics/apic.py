@@ -19,7 +19,7 @@ from fluidlift.physics.active_region import ActiveRegion
 from fluidlift.physics.advect_particles import displacements, leaving
 from fluidlift.physics.emitter import Supply
 from fluidlift.physics.guidance import BodyForce
-from fluidlift.physics.liquid_grid import Layout, LiquidGrid
+from fluidlift.physics.liquid_grid import LiquidGrid
 from fluidlift.physics.numba_particles import ParticleWork
 from fluidlift.physics.outlet import surplus
 from fluidlift.physics.position_correction import fill_ratio, spreading
@@ -30,9 +30,11 @@ from fluidlift.physics.stepping import (
     TIDY_EVERY,
     EmitSource,
     Outcome,
+    ParticleSimulator,
     SimulationSettings,
     StepReport,
 )
+from fluidlift.physics.surface_tension import capillary_time_step
 from fluidlift.seams import MoveRules
 from fluidlift.types import CellType, FaceVelocity, FluidParameters, Grid, Particles, SolveReport, Terrain
 
@@ -48,7 +50,7 @@ def open_sky(gravity: tuple[float, float, float]) -> np.ndarray:
     return out
 
 
-class LiquidSimulator(LiquidGrid):
+class LiquidSimulator(ParticleSimulator):
     """A body of liquid on a terrain, with an inlet and an outlet.
 
     The sides of the box are frictionless walls, except in INFLOW and OUTFLOW cells and where `open_sides` says so:
@@ -109,74 +111,66 @@ class LiquidSimulator(LiquidGrid):
             open_sides=open_sky(parameters.gravity) if open_sides is None else np.asarray(open_sides, bool),
             settings=replace(settings or SimulationSettings(), particles_per_cell=particles_per_cell),
         )  # fmt: skip
-        self._forces = tuple(forces)
-        self._prepare_grid(work or ParticleWork(), bodies)
+        self._forces, self._work = tuple(forces), work or ParticleWork()
+        if bodies:
+            gravity = np.asarray(parameters.gravity)
+            self.bodies = RigidBodies(bodies, self._walls, density=parameters.density, gravity=gravity)
+            self._particles = self._particles.select(~self.bodies.inside(self._particles.positions))
+        self._liquid = LiquidGrid(
+            self._surroundings, self._particles, transfer=self._work.transfer, bodies=self.bodies, forces=self._forces
+        )
 
     def state(self) -> dict[str, np.ndarray]:
-        """See `ParticleSimulator.state`; also the water levels at the outlet and the pressure as a first guess."""
-        own = {} if self._start_levels is None else {"start_levels": self._start_levels.copy()}
-        if self._head_rate is not None:
-            own |= {"head_rate": self._head_rate[1].copy(), "head_first": np.array(self._head_rate[0], np.int64)}
-        if self._bodies is not None:
-            own |= {f"bodies.{name}": value for name, value in self._bodies.state().items()}
-        return super().state() | own
+        """See `ParticleSimulator.state`; also that of the grid and of the bodies."""
+        bodies = {f"bodies.{name}": value for name, value in self.bodies.state().items()}
+        return super().state() | self._liquid.state() | bodies
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """See `ParticleSimulator.restore`."""
-        rate, first, levels = (state.get(name) for name in ("head_rate", "head_first", "start_levels"))
-        if (levels is None) != (self._start_levels is None) or (
-            levels is not None and levels.shape != self.grid.shape[:2]
-        ):
-            raise InputRejected("a simulation state with another outlet")
-        if rate is not None:
-            fits = rate.ndim == 3 and first is not None and first.shape == (3,) and (first >= 0).all()
-            if not fits or (first + rate.shape > self.grid.shape).any() or not np.isfinite(rate).all():
-                raise InputRejected("a simulation state of another grid", f"{self.grid.shape} cells")
+        self._liquid.require_fit(state)
         before = super().state()
         super().restore(state)
-        if self._bodies is not None:
-            try:
-                prefix = "bodies."
-                self._bodies.restore({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
-            except InputRejected:
-                super().restore(before)
-                raise
-        self._head_rate = None if rate is None else (tuple(int(i) for i in first), np.array(rate))
-        self._start_levels = None if levels is None else np.array(levels)
+        try:
+            prefix = "bodies."
+            self.bodies.restore({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
+        except InputRejected:
+            super().restore(before)
+            raise
+        self._liquid.restore(state)
 
-    @property
-    def bodies(self) -> RigidBodies | None:
-        """The rigid bodies, where there are any."""
-        return self._bodies
+    def _speed_gain(self) -> float:
+        return super()._speed_gain() + sum(force.largest for force in self._forces)
+
+    def _substep_length(self, remaining: float) -> float:
+        """See `ParticleSimulator`; also within the limit of surface tension."""
+        longest = capillary_time_step(self.parameters.density, self.parameters.surface_tension, self.grid.spacing)
+        step = super()._substep_length(remaining)
+        return step if step <= longest else remaining / np.ceil(remaining / longest - 1e-9)
 
     def _max_speed(self) -> float:
-        own = super()._max_speed()
-        return own if self._bodies is None else max(own, self._bodies.max_speed(self.parameters.time_step))
+        return max(super()._max_speed(), self.bodies.max_speed(self.parameters.time_step))
 
     def _substep(self, dt: float, number: int, *, last_attempt: bool) -> Outcome | None:
-        walls, bodies = self._walls, self._bodies
-        before = None if bodies is None else bodies.state()
+        walls, bodies = self._walls, self.bodies
+        before = bodies.state()
         if not len(self._particles):
-            if bodies is not None:
-                bodies.predict(dt)
-                bodies.advance()
+            bodies.predict(dt)
+            bodies.advance()
             return Outcome(self._particles, 0, SolveReport(True, 0, 0.0, "empty"), (), lambda: None)
-        region = self._look(self._particles.positions)
-        if bodies is not None:
-            region = bodies.enter(region)
+        region = bodies.enter(self._liquid.look(self._particles.positions))
         grid = region.grid
         order = transfer.sort_by_cell(self._particles.positions, grid)
         if number % TIDY_EVERY == 0:
             order = self._tidied(order, region)
         particles = self._particles
-        step = self._grid_velocity(region, order, dt)
+        step = self._liquid.step(particles, region, order, dt, self.time)
         velocities, affine = self._work.transfer.grid_to_particles(step.velocity, grid, particles.positions, order)
-        self._carry_inlet(velocities, affine)
+        # particles in the inlet move as prescribed: walls beside it would hold back its rim
+        self._inlet.carry(particles.positions, velocities, affine, self.time)
         moves, farthest = displacements(velocities, affine, dt)
         farthest /= grid.spacing
         if not farthest <= 3.0 * self.settings.courant:
-            if bodies is not None:
-                bodies.restore(before)
+            bodies.restore(before)
             if not last_attempt:
                 return None
             raise FluidliftError(
@@ -198,42 +192,15 @@ class LiquidSimulator(LiquidGrid):
         gone = leaving(particles.positions, state.positions, walls, self._mainstream)
         full = self.parameters.density * grid.spacing**3
         gone |= surplus(particles.masses, order, region.walls.regions == CellType.OUTFLOW, full)
-        if bodies is not None:
-            bodies.advance()
-            gone |= bodies.push_out(state.positions, state.velocities, tangential_share=keep)
+        bodies.advance()
+        gone |= bodies.push_out(state.positions, state.velocities, tangential_share=keep)
         if gone.any():
             state = transfer.select_particles(state, np.flatnonzero(~gone))
 
         def adopt() -> None:
-            self._head_rate = step.head_rate
+            self._liquid.head_rate = step.head_rate
 
         return Outcome(state, int(gone.sum()), step.report, step.viscosity, adopt)
-
-    def _add(
-        self, places: np.ndarray, volume: float, look: np.ndarray | None = None, velocity: np.ndarray | None = None
-    ) -> None:
-        """See `ParticleSimulator`; nothing comes out of inlets and emitters where a body is."""
-        if self._bodies is not None and len(places):
-            places = places[~self._bodies.inside(places)]
-        super()._add(places, volume, look, velocity)
-
-    def _carry_inlet(self, velocities: np.ndarray, affine: np.ndarray) -> None:
-        """Particles in the inlet move as prescribed, in place: walls beside it would hold back its rim."""
-        self._inlet.carry(self._particles.positions, velocities, affine, self.time)
-
-    def _layout(self, region: ActiveRegion, order: transfer.CellOrder) -> Layout:
-        """With the cells of emitters as inflow."""
-        layout = super()._layout(region, order)
-        if not self._inlet.running:
-            return layout
-        cells = self._inlet.emitter_cells(region.grid.shape, region.first)
-        inflow = np.uint8(CellType.INFLOW)
-        return replace(
-            layout,
-            holding=np.where(cells, inflow, layout.holding),
-            types=np.where(cells, inflow, layout.types),
-            wet=layout.wet | cells,
-        )
 
     def _tidied(self, order: transfer.CellOrder, region: ActiveRegion) -> transfer.CellOrder:
         """Reseed, and put the particles in the order of their cells, so that neighbours are close in memory."""

@@ -15,6 +15,7 @@ from numba import njit, prange
 from fluidlift.errors import FluidliftError, InputRejected, require
 from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.physics import boundaries, transfer
+from fluidlift.physics.active_region import open_region
 from fluidlift.physics.advect_particles import leaving
 from fluidlift.physics.deform import updated_deformation
 from fluidlift.physics.emitter import Supply
@@ -130,6 +131,7 @@ class GasSimulator(ParticleSimulator):
             settings=replace(settings or SimulationSettings(), particles_per_cell=particles_per_cell),
         )  # fmt: skip
         self.buoyancy = float(buoyancy)
+        self._region = open_region(tuple(slice(0, n) for n in grid.shape), self._walls, self._capacity)
         self._emitters_switched()
         self._open_faces = tuple(o > 0 for o in self._walls.openings)
         # how much of a face's surroundings a wall takes, for the damping
@@ -201,7 +203,7 @@ class GasSimulator(ParticleSimulator):
                 *((c * (1.0 - taken * s)).astype(np.float32) for c, s in zip(velocity.components, self._wall_share))
             )
         velocity = self._inlet.impose(velocity, self.time)
-        velocity, viscosity_reports = self._viscous(velocity, self._open_faces, self._region, dt)
+        velocity, viscosity_reports = self._surroundings.viscous(velocity, self._open_faces, self._region, dt)
         initial = None if self._head_rate is None else self._head_rate * dt
         velocity, q, report = project(
             velocity, self._system, tolerance=self.settings.pressure_tolerance, initial=initial

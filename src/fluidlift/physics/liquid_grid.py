@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from fluidlift.errors import InputRejected
 from fluidlift.physics import boundaries, transfer
 from fluidlift.physics.active_region import ActiveRegion, moved_to, open_region, region_around
 from fluidlift.physics.boundaries import Walls
@@ -25,13 +25,14 @@ from fluidlift.physics.free_surface import (
     surface_gaps,
 )
 from fluidlift.physics.guidance import BodyForce
-from fluidlift.physics.numba_particles import ParticleWork
+from fluidlift.physics.no_bodies import NoBodies
 from fluidlift.physics.outlet import hold_columns, outlet_heads, surface_heights, water_levels
 from fluidlift.physics.pressure import PressureSystem, build_system, project, subtract_gradient
-from fluidlift.physics.rigid import RigidBodies, RigidBody
-from fluidlift.physics.stepping import ParticleSimulator
-from fluidlift.physics.surface_tension import capillary_time_step, surface_tension_jumps
-from fluidlift.types import CellType, FaceVelocity, SolveReport
+from fluidlift.physics.rigid import RigidBodies
+from fluidlift.physics.surface_tension import surface_tension_jumps
+from fluidlift.physics.surroundings import Surroundings
+from fluidlift.seams import ParticleTransfer
+from fluidlift.types import CellType, FaceVelocity, Particles, SolveReport
 
 STRONG = 0.05
 """dt nu / h^2 above which the pressure of the step before acts before viscosity does"""
@@ -66,50 +67,77 @@ class Layout:
     wet: Bool[np.ndarray, "nx ny nz"]
 
 
-class LiquidGrid(ParticleSimulator):
-    """What `apic.LiquidSimulator` does on the grid: surface, viscosity, pressure, bodies, outlet."""
+class LiquidGrid:
+    """What a liquid does on the grid within a substep: surface, viscosity, pressure, bodies, outlet.
 
-    _forces: tuple[BodyForce, ...]
+    Args:
+        surroundings: box, walls, inlet, parameters and settings.
+        particles: at the start, outside of the bodies.
+        transfer: between particles and grid.
+        bodies: rigid ones, or none.
+        forces: beside gravity.
+    """
 
-    def _prepare_grid(self, work: ParticleWork, bodies: Sequence[RigidBody]) -> None:
-        """Everything below needs this once, after the particles are there."""
-        self._work = work
-        self._bodies: RigidBodies | None = None
-        if bodies:
-            gravity = np.asarray(self.parameters.gravity)
-            self._bodies = RigidBodies(bodies, self._walls, density=self.parameters.density, gravity=gravity)
-            self._particles = self._particles.select(~self._bodies.inside(self._particles.positions))
-        self._solids = solid_shares(self._walls.signed_distance, self.grid)
+    def __init__(
+        self,
+        surroundings: Surroundings,
+        particles: Particles,
+        *,
+        transfer: ParticleTransfer,
+        bodies: RigidBodies | NoBodies,
+        forces: tuple[BodyForce, ...],
+    ) -> None:
+        s = self._surroundings = surroundings
+        self.grid, self.parameters, self.settings = s.grid, s.parameters, s.settings
+        self._walls, self._inlet = s.walls, s.inlet
+        self._transfer, self._bodies, self._forces = transfer, bodies, forces
+        self._region = open_region(tuple(slice(0, n) for n in s.grid.shape), s.walls, s.capacity)
+        self._solids = solid_shares(s.walls.signed_distance, s.grid)
         self._region_solids = self._solids.inside(self._region.box)
-        self._head_rate: tuple[tuple[int, int, int], np.ndarray] | None = None
+        self.head_rate: tuple[tuple[int, int, int], np.ndarray] | None = None
         """first cell of the region of the last substep, and there q / dt: the first guess of the pressure"""
-        self._start_levels = self._levels_now() if (self._walls.regions == CellType.OUTFLOW).any() else None
+        self._start_levels = self._levels(particles) if (s.walls.regions == CellType.OUTFLOW).any() else None
 
-    def _levels_now(self) -> np.ndarray:
-        order = transfer.sort_by_cell(self._particles.positions, self.grid)
+    def state(self) -> dict[str, np.ndarray]:
+        """The water levels at the outlet, and the pressure as a first guess."""
+        own = {} if self._start_levels is None else {"start_levels": self._start_levels.copy()}
+        if self.head_rate is not None:
+            own |= {"head_rate": self.head_rate[1].copy(), "head_first": np.array(self.head_rate[0], np.int64)}
+        return own
+
+    def require_fit(self, state: dict[str, np.ndarray]) -> None:
+        """Raise `InputRejected` for a state that is not one of this grid."""
+        rate, first, levels = (state.get(name) for name in ("head_rate", "head_first", "start_levels"))
+        if (levels is None) != (self._start_levels is None) or (
+            levels is not None and levels.shape != self.grid.shape[:2]
+        ):
+            raise InputRejected("a simulation state with another outlet")
+        if rate is not None:
+            fits = rate.ndim == 3 and first is not None and first.shape == (3,) and (first >= 0).all()
+            if not fits or (first + rate.shape > self.grid.shape).any() or not np.isfinite(rate).all():
+                raise InputRejected("a simulation state of another grid", f"{self.grid.shape} cells")
+
+    def restore(self, state: dict[str, np.ndarray]) -> None:
+        """Go to a state that fits."""
+        rate, levels = state.get("head_rate"), state.get("start_levels")
+        self.head_rate = None if rate is None else (tuple(int(i) for i in state["head_first"]), np.array(rate))
+        self._start_levels = None if levels is None else np.array(levels)
+
+    def _levels(self, particles: Particles) -> np.ndarray:
+        order = transfer.sort_by_cell(particles.positions, self.grid)
         levels = water_levels((np.diff(order.start) > 0).reshape(self.grid.shape), self._walls)
-        surface = liquid_surface(self._particles.positions, self._volumes(), self.grid, order, self._solids)
+        surface = liquid_surface(particles.positions, self._volumes(particles), self.grid, order, self._solids)
         return surface_heights(levels, surface.distance, self.grid.spacing)
 
-    def _volumes(self) -> np.ndarray:
+    def _volumes(self, particles: Particles) -> np.ndarray:
         """m^3 of each particle."""
-        return (self._particles.masses / self.parameters.density).astype(np.float32)
+        return (particles.masses / self.parameters.density).astype(np.float32)
 
-    def _speed_gain(self) -> float:
-        """See `ParticleSimulator`."""
-        return super()._speed_gain() + sum(force.largest for force in self._forces)
-
-    def _substep_length(self, remaining: float) -> float:
-        """See `ParticleSimulator`; also within the limit of surface tension."""
-        longest = capillary_time_step(self.parameters.density, self.parameters.surface_tension, self.grid.spacing)
-        step = super()._substep_length(remaining)
-        return step if step <= longest else remaining / np.ceil(remaining / longest - 1e-9)
-
-    def _look(self, positions: np.ndarray) -> ActiveRegion:
+    def look(self, positions: np.ndarray) -> ActiveRegion:
         """The region around the particles and the inlet."""
         box = region_around(positions, self.grid, self._inlet.cell_range if self._inlet.active else None)
         if box != self._region.box:
-            self._region = open_region(box, self._walls, self._capacity)
+            self._region = open_region(box, self._walls, self._surroundings.capacity)
             self._region_solids = self._solids.inside(box)
         return self._region
 
@@ -121,13 +149,13 @@ class LiquidGrid(ParticleSimulator):
         return tuple(t & (o > 0) for t, o in zip(boundaries.touching_faces(outflow), walls.openings))
 
     def _impose(
-        self, velocity: FaceVelocity, region: ActiveRegion, outlet: tuple[np.ndarray, ...] | None
+        self, velocity: FaceVelocity, region: ActiveRegion, outlet: tuple[np.ndarray, ...] | None, time: float
     ) -> FaceVelocity:
         """Inflow, and outflow where it is prescribed."""
-        velocity = self._inlet.impose(velocity, self.time, region.first)
+        velocity = self._inlet.impose(velocity, time, region.first)
         if outlet is None:
             return velocity
-        speed = self.parameters.outflow_velocity * self._mainstream
+        speed = self.parameters.outflow_velocity * self._surroundings.mainstream
         return FaceVelocity(*(np.where(f, np.float32(s), c) for f, s, c in zip(outlet, speed, velocity.components)))
 
     def _known(self, layout: Layout, region: ActiveRegion, dt: float) -> np.ndarray | None:
@@ -142,53 +170,58 @@ class LiquidGrid(ParticleSimulator):
         heads = outlet_heads(levels, start, region.walls)
         return None if heads is None else heads * max(-self.parameters.gravity[2], 0.0) * dt
 
-    def _layout(self, region: ActiveRegion, order: transfer.CellOrder) -> Layout:
+    def _layout(self, particles: Particles, region: ActiveRegion, order: transfer.CellOrder) -> Layout:
         """Which cells hold liquid, and where its surface lies."""
         grid, walls = region.grid, region.walls
         occupied = (np.diff(order.start) > 0).reshape(grid.shape)
-        solids = self._region_solids if self._bodies is None else solid_shares(walls.signed_distance, grid)
+        solids = solid_shares(walls.signed_distance, grid) if len(self._bodies) else self._region_solids
         surface = liquid_surface(
-            self._particles.positions, self._volumes(), grid, order, solids,
+            particles.positions, self._volumes(particles), grid, order, solids,
             curved=self.parameters.surface_tension > 0,
         )  # fmt: skip
         holding = boundaries.liquid_cells(occupied, walls)
         own, distance = pressure_cells(holding, surface.distance, walls.openings, grid.spacing)
         # p = 0 in a sliver of open space above the bed would suck the liquid into it
         types = np.where((holding == CellType.FLUID) & walls.buried, holding, own)
-        if self._bodies is not None:
-            types = self._bodies.fill_films(types)
+        types = self._bodies.fill_films(types)
         films = (types == CellType.FLUID) & (own != CellType.FLUID)
         distance = np.where(films, np.minimum(distance, np.float32(-SPRAY_DEPTH * grid.spacing)), distance)
         wet = (types == CellType.FLUID) | (types == CellType.INFLOW) | ((types == CellType.OUTFLOW) & occupied)
+        if self._inlet.running:  # the cells of emitters are inflow
+            cells, inflow = self._inlet.emitter_cells(grid.shape, region.first), np.uint8(CellType.INFLOW)
+            holding, types = np.where(cells, inflow, holding), np.where(cells, inflow, types)
+            wet = wet | cells
         return Layout(surface, holding, types, distance, wet)
 
-    def _grid_velocity(self, region: ActiveRegion, order: transfer.CellOrder, dt: float) -> GridStep:
-        """From particles to the new velocity on all faces near the liquid."""
+    def step(
+        self, particles: Particles, region: ActiveRegion, order: transfer.CellOrder, dt: float, time: float
+    ) -> GridStep:
+        """From particles, which are in `order` in a region, to the new velocity on all faces near the liquid."""
         grid, walls, bodies = region.grid, region.walls, self._bodies
-        carried, masses = self._work.transfer.particles_to_grid(self._particles, grid, order)
-        layout = self._layout(region, order)
-        wet_faces, outlet = self._wet_faces(layout.wet, walls), self._outlet_faces(walls)
-        rate, solid = self._last_rate(region), None
-        if bodies is not None:
-            bodies.predict(dt, rate)
-            solid = bodies.face_velocity()
+        carried, masses = self._transfer.particles_to_grid(particles, grid, order)
+        layout = self._layout(particles, region, order)
+        wet_faces, outlet = _wet_faces(layout.wet, walls), self._outlet_faces(walls)
+        rate = self._last_rate(region)
+        bodies.predict(dt, rate)
+        solid = bodies.face_velocity()
         forced = add_gravity(carried, self.parameters.gravity, dt)
         for force in self._forces:
             forced = force.applied(forced, masses, region.box, dt)
-        velocity = self._impose(forced, region, outlet)
+        velocity = self._impose(forced, region, outlet, time)
         known, system = self._known(layout, region, dt), self._system(layout, region, outlet)
-        moving = self._wet_faces(layout.wet | (layout.holding == CellType.FLUID), walls)
+        moving = _wet_faces(layout.wet | (layout.holding == CellType.FLUID), walls)
         pressed = self._pressed(velocity, system, rate, known, dt)
-        eager = bodies is not None and rate is not None and pressed is not velocity
-        if eager:  # the pressure of the step before acts on bodies too
+        eager = rate is not None and pressed is not velocity
+        if eager and rate is not None:  # the pressure of the step before acts on bodies too
             bodies.coupling(system.unknown)
             bodies.apply_pressure(rate * dt)
             solid = bodies.face_velocity()
-        new, viscosity_reports = self._viscous(pressed, moving, region, dt, outlet, layout.distance, solid, bodies)
-        if bodies is not None:
-            if eager:
-                bodies.apply_pressure(-rate * dt)
-            solid = bodies.face_velocity()
+        new, viscosity_reports = self._surroundings.viscous(
+            pressed, moving, region, dt, outlet, layout.distance, solid, bodies
+        )
+        if eager and rate is not None:
+            bodies.apply_pressure(-rate * dt)
+        solid = bodies.face_velocity()
         if viscosity_reports:
             velocity = self._dragged(velocity, pressed, new, walls, dt)
         velocity, q, report, system = self._projected(
@@ -198,14 +231,11 @@ class LiquidGrid(ParticleSimulator):
         if known is not None:
             weight = max(-self.parameters.gravity[2], 0.0) * grid.spacing * dt
             velocity = hold_columns(velocity, known, walls, weight=weight)
-        velocity = self._impose(velocity, region, outlet)
+        velocity = self._impose(velocity, region, outlet, time)
         skin = (layout.holding == CellType.FLUID) & (layout.types == CellType.EMPTY)
         velocity = continue_velocity(velocity, carried, masses, wet_faces, skin, walls.openings)
-        if bodies is None:
-            velocity = boundaries.slide_along_walls(velocity, walls)
-        else:
-            bodies.apply_pressure(q)
-            velocity = bodies.slide(velocity)
+        bodies.apply_pressure(q)
+        velocity = bodies.slide(velocity)
         velocity = self._held_by_walls(velocity, walls, solid, dt)
         return GridStep(velocity, system, layout.holding, (region.first, q / dt), report, viscosity_reports)
 
@@ -259,9 +289,9 @@ class LiquidGrid(ParticleSimulator):
 
     def _last_rate(self, region: ActiveRegion) -> np.ndarray | None:
         """q / dt (m^2/s^2) of the substep before, on this region."""
-        if self._head_rate is None:
+        if self.head_rate is None:
             return None
-        first, rate = self._head_rate
+        first, rate = self.head_rate
         return moved_to(rate, first, region.first, region.grid.shape)
 
     def _system(self, layout: Layout, region: ActiveRegion, outlet: tuple[np.ndarray, ...] | None) -> PressureSystem:
@@ -293,7 +323,7 @@ class LiquidGrid(ParticleSimulator):
 
         def solved(system: PressureSystem, initial: np.ndarray | None) -> tuple[FaceVelocity, np.ndarray, SolveReport]:
             # coupling also tells the bodies which cells press on them: it has to follow the system
-            coupling = () if self._bodies is None else self._bodies.coupling(system.unknown)
+            coupling = self._bodies.coupling(system.unknown)
             tolerance = self.settings.pressure_tolerance
             return project(velocity, system, tolerance=tolerance, initial=initial, low_rank=coupling, **given)
 
@@ -306,3 +336,9 @@ class LiquidGrid(ParticleSimulator):
             return new, q, report, system
         system = replace(system, unknown=system.unknown & ~sucked)
         return *solved(system, q), system
+
+
+def _wet_faces(wet: np.ndarray, walls: Walls) -> Faces:
+    """bool per component: open faces of wet cells."""
+    x, y, z = (t & (o > 0) for t, o in zip(boundaries.touching_faces(wet), walls.openings))
+    return x, y, z

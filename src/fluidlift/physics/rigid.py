@@ -90,6 +90,9 @@ class RigidBodies:
         self.warnings = self._check()
         """what a user should know: bodies thinner than a cell, or starting inside the terrain"""
 
+    def __len__(self) -> int:
+        return len(self.bodies)
+
     def _set_start(self) -> None:
         n = len(self.bodies)
         starts = [b.start(self.time) for b in self.bodies]

@@ -18,12 +18,12 @@ from fluidlift.errors import FluidliftError, InputRejected, require
 from fluidlift.numerics.sampling import sample_centers
 from fluidlift.numerics.signed_distance import push_outside
 from fluidlift.physics import boundaries, transfer
-from fluidlift.physics.active_region import ActiveRegion, open_region
 from fluidlift.physics.emitter import Supply
 from fluidlift.physics.inlet import Inlet
+from fluidlift.physics.no_bodies import NoBodies
 from fluidlift.physics.position_correction import cell_capacity
 from fluidlift.physics.rigid import RigidBodies
-from fluidlift.physics.viscosity import NEGLIGIBLE, FaceRoles, diffuse_with_bodies
+from fluidlift.physics.surroundings import SimulationSettings, Surroundings
 from fluidlift.types import FaceVelocity, FluidParameters, Grid, Particles, SolveReport, Terrain
 
 TIDY_EVERY = 4
@@ -49,30 +49,6 @@ class Emitted:
 
 EmitSource = Callable[[np.ndarray, float], Emitted]
 """(places [n,3] m, time s) -> the particles that enter there"""
-
-
-@dataclass(frozen=True)
-class SimulationSettings:
-    """Numerical choices, independent of the fluid."""
-
-    particles_per_cell: int = 8
-    """of the inflow; its cube root is rounded"""
-    courant: float = 1.0
-    """cells that the fastest particle may cross in a substep"""
-    pressure_tolerance: float = 1e-5
-    viscosity_tolerance: float = 1e-5
-    max_substeps: int = 1000
-    """per call of `advance`"""
-    max_stretch: float = 4.0
-    """of the deformation of a particle"""
-    spread_crowds: bool = True
-    """correct clumps of particles"""
-    separate_from_walls: bool = True
-    """let liquid leave a wall that would have to hold it by suction"""
-    reseed: bool = True
-    """split and merge particles inside the liquid where cells run empty or crowded"""
-    prescribe_outflow: bool = False
-    """True: the outlet's faces move with `outflow_velocity` along the mainstream; False: free outflow"""
 
 
 @dataclass(frozen=True)
@@ -141,10 +117,14 @@ class ParticleSimulator(ABC):
         self._rng = np.random.default_rng(seed)
         self._walls = boundaries.build_walls(terrain, cell_types, open_sides)
         self._capacity = cell_capacity(terrain.signed_distance, grid)
-        self._region = open_region(tuple(slice(0, n) for n in grid.shape), self._walls, self._capacity)
         self._mainstream = np.asarray(terrain.mainstream, np.float64)
         self._inlet = Inlet(self._walls, parameters, inflow_profile, seed, settings.particles_per_cell, supply)
         self._inlet.switch(0.0)
+        self._surroundings = Surroundings(
+            grid, parameters, settings, self._walls, self._capacity, self._mainstream, self._inlet
+        )
+        self.bodies: RigidBodies | NoBodies = NoBodies()
+        """rigid bodies; nothing comes out of inlets and emitters where one is"""
         self._particles = self._prepared(particles)
         self._next_id = int(particles.ids.max()) + 1 if len(particles) else 0
         self._emit_source = emit_source or self._nearest_source(particles)
@@ -322,6 +302,7 @@ class ParticleSimulator(ABC):
         self, places: np.ndarray, volume: float, look: np.ndarray | None = None, velocity: np.ndarray | None = None
     ) -> None:
         """New particles of one volume (m^3), with the rest Gaussians of `look` in turn, or as at the inlet."""
+        places = places[~self.bodies.inside(places)] if len(places) else places
         if not len(places):
             return
         if look is None or not len(look):
@@ -344,49 +325,3 @@ class ParticleSimulator(ABC):
 
     def _emitters_switched(self) -> None:  # noqa: B027
         """An emitter has come on or gone off; for simulators that keep what depends on it."""
-
-    def _wet_faces(self, wet: np.ndarray, walls: boundaries.Walls) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return tuple(t & (o > 0) for t, o in zip(boundaries.touching_faces(wet), walls.openings))
-
-    def _viscous(
-        self,
-        velocity: FaceVelocity,
-        wet: tuple,
-        region: ActiveRegion,
-        dt: float,
-        prescribed: tuple | None = None,
-        distance: np.ndarray | None = None,
-        solid: FaceVelocity | None = None,
-        bodies: RigidBodies | None = None,
-    ) -> tuple[FaceVelocity, tuple[SolveReport, ...]]:
-        """Viscosity on the wet faces; inflow and other `prescribed` faces (bool per component) keep their velocity.
-
-        `distance` to the liquid's surface as for `viscosity.diffuse`; closed faces move with `solid`, or rest.
-        The liquid drags free `bodies`.
-        """
-        walls = region.walls
-        fixed = self._inlet.face_masks(tuple(w.shape for w in wet), region.first)
-        if prescribed is not None:
-            fixed = [f | o for f, o in zip(fixed, prescribed)]
-        solved = tuple(w & ~f for w, f in zip(wet, fixed))
-        head_on, beside = [], []
-        for axis, opening in enumerate(walls.openings):
-            closed = opening == 0
-            # a wall across the component stops it; a wall along it drags by its share
-            across = closed & (np.abs(walls.normals[axis][..., axis]) > 0.7)
-            head_on.append(fixed[axis] | across)
-            beside.append(closed & ~across)
-        resting = FaceVelocity.zeros(walls.grid) if solid is None else solid
-        stopped = FaceVelocity(
-            *(np.where(o == 0, r, c) for o, r, c in zip(walls.openings, resting.components, velocity.components))
-        )
-        number = self.parameters.kinematic_viscosity * dt / self.grid.spacing**2
-        dragged = bodies.dragged() if bodies is not None and number >= NEGLIGIBLE else ()
-        roles = FaceRoles(solved, tuple(head_on), tuple(beside), distance, walls.signed_distance, solid, dragged)
-        new, change, reports = diffuse_with_bodies(
-            stopped, roles, viscosity=self.parameters.kinematic_viscosity, dt=dt, spacing=self.grid.spacing,
-            wall_share=self.parameters.wall_damping, tolerance=self.settings.viscosity_tolerance,
-        )  # fmt: skip
-        if bodies is not None and dragged:
-            bodies.apply_viscosity(dragged, change)
-        return (new if reports else velocity), reports

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from fluidlift.backends.monocular_depth import Guess, ModelWeights, make_depth_estimator
+from fluidlift.backends.monocular_depth import Guess, make_depth_estimator
+from fluidlift.backends.registry import ModelChoice
 from fluidlift.config import DepthConfig
 from fluidlift.errors import InputRejected
-from fluidlift.pipeline.fluid_masks import FluidMasks
 from fluidlift.pipeline.settings import DepthModel, GivenDepth, GivenView
 from fluidlift.pipeline.work import Work
 from fluidlift.shape import depth_surface, given_depth
@@ -21,6 +21,7 @@ from fluidlift.shape.kinds import Observation, builder_of
 from fluidlift.shape.place import DISAGREEING
 from fluidlift.shape.surface import FrontSurface
 from fluidlift.types import FluidKind, MetricScale, PinholeCamera, UpEvidence
+from fluidlift.types.fluid_masks import FluidMasks
 from fluidlift.types.stages import DepthGuess, Read
 
 LEARNED_SCALE = 0.15
@@ -140,7 +141,7 @@ def depth_by_model(
 ) -> DepthGuess:
     """What a learned model says of some frames, one after the other."""
     weights = None if model.weights is None else model.weights.name
-    estimator = make_depth_estimator(model.model, ModelWeights(weights, model.device, model.download))
+    estimator = make_depth_estimator(model.model, ModelChoice(weights, model.device, model.download))
     guesses: list[Guess] = []
     for t in frames:
         guesses.append(estimator.guess(np.ascontiguousarray(read.clip.frames[t]), camera))

@@ -13,12 +13,9 @@ from fluidlift.config import FitConfig
 from fluidlift.errors import InputRejected
 from fluidlift.io.yaml_reader import parse_yaml
 from fluidlift.types import FluidParameters
+from fluidlift.types.parameter_table import FITTABLE, VECTORS
 
-VECTORS = ("gravity", "inflow_velocity")
-NAMES = (
-    "density", "kinematic_viscosity", "gravity", "inflow_velocity", "inflow_fluctuation", "outflow_velocity",
-    "restitution", "wall_damping", "time_step",
-)  # fmt: skip
+NAMES = tuple(FITTABLE)
 """what can be fitted: the paper's parameters"""
 Value = float | tuple[float, float, float]
 

@@ -15,13 +15,13 @@ from fluidlift.io.asset_paths import asset_file
 from fluidlift.io.atomic import plain, write_json
 from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.io.limits import parse_json
-from fluidlift.pipeline.fluid_masks import FluidMasks
+from fluidlift.io.written import cleared, numbered
+from fluidlift.motion.steady_flow import TRUSTED, spans_of
 from fluidlift.pipeline.inputs import Inputs
 from fluidlift.pipeline.mask_facts import MASK_FACTS, cleared_masks, require_unchanged, sealed
-from fluidlift.pipeline.steady_flow import TRUSTED, spans_of
 from fluidlift.pipeline.volume_motion import FAST_FALL, plain_report
-from fluidlift.pipeline.written import cleared, numbered
 from fluidlift.types import CellType, FaceVelocity, PixelFlow, SurfaceMotion, VideoClip
+from fluidlift.types.fluid_masks import FluidMasks
 from fluidlift.types.stages import Geometry
 
 if TYPE_CHECKING:

@@ -13,29 +13,22 @@ from fluidlift import __version__
 from fluidlift.config import JobConfig
 from fluidlift.pipeline import begin
 from fluidlift.pipeline.fit_request import request_of
-from fluidlift.pipeline.fluid_masks import FluidMasks
 from fluidlift.pipeline.inputs import GivenFile, GivenFiles, Inputs
 from fluidlift.pipeline.resimulate import Made, play
-from fluidlift.pipeline.runner import Runner, gone_if_refused
-from fluidlift.pipeline.scene import SimulationRequest, edited_scene, first_of_film
-from fluidlift.pipeline.settings import (
-    GenerateSettings,
-    GivenView,
-    MotionSettings,
-    RefineSettings,
-    SceneSettings,
-    taken,
-)
-from fluidlift.pipeline.simulator import particle_work
-from fluidlift.pipeline.splat_files import require_room
+from fluidlift.pipeline.runner import Runner, gone_if_refused, require_stages
+from fluidlift.pipeline.settings import GenerateSettings, GivenView, MotionSettings, RefineSettings, taken
 from fluidlift.pipeline.stages import generate
 from fluidlift.pipeline.stages.calibrate import calibrate, mean_target
 from fluidlift.pipeline.stages.fit import fit
 from fluidlift.pipeline.stages.motion import motion
 from fluidlift.pipeline.stages.refine import refine
-from fluidlift.pipeline.work import Progress, Silence
-from fluidlift.pipeline.written import require_stages
+from fluidlift.scene.build import SimulationRequest, edited_scene, first_of_film
+from fluidlift.scene.settings import SceneSettings
+from fluidlift.scene.simulator import particle_work
+from fluidlift.scene.splat_files import require_room
+from fluidlift.seams import Progress, Silence
 from fluidlift.types import FluidAsset, kind_of
+from fluidlift.types.fluid_masks import FluidMasks
 from fluidlift.types.stages import Bodies, Calibration, Fit, Lift, Read, Segmentation
 
 STAGES = ("read", "flow", "segment", "geometry", "refine", "motion", "fit", "calibrate", "simulate", "show")

@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 
 from fluidlift.config import JobConfig
+from fluidlift.io.written import Written, cleared, numbered
 from fluidlift.pipeline import begin
 from fluidlift.pipeline.hints import NO_HINTS, Hints
 from fluidlift.pipeline.inputs import GivenFiles, Inputs
 from fluidlift.pipeline.mask_facts import cleared_masks, require_unchanged, sealed
-from fluidlift.pipeline.runner import Runner, gone_if_refused
-from fluidlift.pipeline.work import Progress, Silence, Work
-from fluidlift.pipeline.written import Written, cleared, numbered, require_stages
+from fluidlift.pipeline.runner import Runner, gone_if_refused, require_stages
+from fluidlift.pipeline.work import Work
+from fluidlift.seams import Progress, Silence
 from fluidlift.types import Label
 from fluidlift.types.stages import MaskFiles, Read, Segmentation
 

@@ -12,17 +12,18 @@ import numpy as np
 
 from fluidlift.config import JobConfig
 from fluidlift.io.frames import FIRST_FRAME
+from fluidlift.io.written import Written, numbered
+from fluidlift.motion.steady_flow import pairs_of
 from fluidlift.pipeline import begin
-from fluidlift.pipeline.fluid_masks import FluidMasks
 from fluidlift.pipeline.frame_files import FrameWriter, MotionFiles, WritingPlace
 from fluidlift.pipeline.inputs import GivenFiles, Inputs
-from fluidlift.pipeline.runner import Runner, gone_if_refused
+from fluidlift.pipeline.runner import Runner, gone_if_refused, require_stages
 from fluidlift.pipeline.settings import MotionSettings, taken
-from fluidlift.pipeline.steady_flow import pairs_of
 from fluidlift.pipeline.volume_motion import motion_options, motion_scene, motion_warnings
-from fluidlift.pipeline.work import Progress, Silence, Work
-from fluidlift.pipeline.written import Written, numbered, require_stages
+from fluidlift.pipeline.work import Work
+from fluidlift.seams import Progress, Silence
 from fluidlift.types import kind_of
+from fluidlift.types.fluid_masks import FluidMasks
 from fluidlift.types.stages import Flow, Geometry, Read, Segmentation, VelocityFiles
 
 MOTION_STAGES = ("read", "flow", "segment", "geometry", "velocities")

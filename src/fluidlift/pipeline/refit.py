@@ -11,17 +11,18 @@ from typing import Any
 
 from fluidlift import __version__
 from fluidlift.config import JobConfig
+from fluidlift.config.of_asset import settings_of
 from fluidlift.errors import InputRejected
-from fluidlift.pipeline import reporting
-from fluidlift.pipeline.fit_outcome import SUBJECT, in_words
+from fluidlift.fit.outcome import in_words
+from fluidlift.io.kept_values import last_value
+from fluidlift.machine import peak_memory_mb
 from fluidlift.pipeline.fit_request import request_of
-from fluidlift.pipeline.machine import peak_memory_mb
 from fluidlift.pipeline.make import fit_figures
-from fluidlift.pipeline.recall import OF_CLIP, recalled, stage_keys
-from fluidlift.pipeline.resimulate import settings_of
-from fluidlift.pipeline.runner import Runner, last_value
+from fluidlift.pipeline.runner import Runner
 from fluidlift.pipeline.stages.fit import fit
-from fluidlift.pipeline.work import Progress, Silence
+from fluidlift.present import report
+from fluidlift.scene.recall import OF_CLIP, recalled, stage_keys
+from fluidlift.seams import Progress, Silence
 from fluidlift.types.stages import Fit, Geometry, Lift, Motion, Read, Segmentation, Shown, Simulation
 
 NEEDED = ("read", "segment", "geometry", "motion")
@@ -90,7 +91,7 @@ def refit(
     before = load_asset(folder)
     with disk_errors(folder), writing(folder, "a fit"):
         found = runner.run("fit", fit, read, segmentation, geometry, moved, config.fit)
-        runner.warnings[:] = [w for w in manifest.get("warnings", ()) if not str(w).startswith(SUBJECT)]
+        runner.warnings[:] = [w for w in manifest.get("warnings", ()) if w not in _last_warnings(manifest)]
         runner.warnings += found.warnings
         write_parameters(folder, found.parameters, found.estimates)
         _write_report(runner, found, (read, segmentation, geometry, moved), config, manifest)
@@ -159,7 +160,7 @@ def _write_report(
     known = {
         k: t for k, t in timings.items() if isinstance(t, dict) and {"seconds", "cached", "peak_memory_mb"} <= t.keys()
     }
-    reporting.write_report(lift, done, shown, folder, config.preset, known | fresh, runner.warnings)
+    report.write_report(lift, done, shown, folder, config.preset, known | fresh, runner.warnings)
 
 
 def _number(asset: Any, label: str) -> float | None:
@@ -181,3 +182,10 @@ def _notes(geometry: Geometry, folder: Path) -> list[str]:
             names = ", ".join(f"{k} = {v}" for k, v in edited.items())
             notes.append(f"scene.yaml sets {names}: a simulation takes that, whatever was fitted")
     return [n for n in notes if n]
+
+
+def _last_warnings(manifest: dict[str, Any]) -> list[Any]:
+    """What the fit before this one warned of."""
+    figures = manifest.get("metrics", {}).get("fit", {})
+    found = figures.get("warnings", []) if isinstance(figures, dict) else []
+    return found if isinstance(found, list) else []

@@ -10,27 +10,28 @@ from typing import Any
 
 import numpy as np
 
-from fluidlift.config import PRESETS, JobConfig, build_config
+from fluidlift.config import JobConfig
+from fluidlift.config.of_asset import SECOND_HALF_SECTIONS, settings_of
 from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.io.asset_paths import asset_file
-from fluidlift.pipeline import reporting
-from fluidlift.pipeline.footage import footage_of
-from fluidlift.pipeline.machine import peak_memory_mb
-from fluidlift.pipeline.recall import recalled_lift, rest_frame_of
-from fluidlift.pipeline.reshaping import slow_edits
+from fluidlift.machine import peak_memory_mb
+from fluidlift.messages import code_of
 from fluidlift.pipeline.runner import Runner
-from fluidlift.pipeline.scene import Scene, SimulationRequest, scene_of
 from fluidlift.pipeline.settings import ShowSettings, SimulateSettings, taken
 from fluidlift.pipeline.stages.show import SeenLook, show
 from fluidlift.pipeline.stages.simulate import frames_still_there, simulate
-from fluidlift.pipeline.work import Progress, Silence
+from fluidlift.present import report
+from fluidlift.present.looping import OPEN
+from fluidlift.scene.build import Scene, SimulationRequest, scene_of
+from fluidlift.scene.footage import footage_of
+from fluidlift.scene.recall import OF_CLIP, rest_frame_of, stage_keys
+from fluidlift.scene.reshaping import slow_edits
+from fluidlift.seams import Progress, Silence
 from fluidlift.types import FluidAsset
 from fluidlift.types.stages import Lift, Shown, Simulation
 
 SECOND_HALF = ("simulate", "show")
 
-SECOND_HALF_SECTIONS = ("simulate", "show")
-"""settings that the second half depends on"""
 
 FPS_RANGE = (0.1, 10_000.0)
 """frames per second that can be asked for"""
@@ -108,41 +109,6 @@ def _check(request: SimulationRequest) -> None:
         raise InputRejected("both --resume and --restart", "one of them")
 
 
-def settings_of(
-    manifest: dict[str, Any], overrides: Sequence[str], flat: dict[str, Any], *, sections: Sequence[str], work: str
-) -> JobConfig:
-    """The settings that the asset was made with, and what is changed now.
-
-    Of an asset made by another version, settings that this one does not know are left out.
-
-    Args:
-        manifest: of the asset.
-        overrides: `section.name=value`.
-        flat: settings by dotted name; None values are left out.
-        sections: that matter for the work.
-        work: a word for it.
-
-    Raises:
-        InputRejected: a setting of another section, an unknown one, or a wrong value.
-    """
-    for text in overrides:
-        if text.partition("=")[0].strip().partition(".")[0] not in sections:
-            raise InputRejected(
-                f"--set {text}, which has no effect on {work}", " or ".join(f"{s}.name=value" for s in sections),
-                "change it with fluidlift make",
-            )  # fmt: skip
-    provenance = manifest.get("provenance", {})
-    stored = provenance.get("config", {})
-    values: dict[str, Any] = {"seed": provenance.get("seed")}
-    for section in sections:
-        part = stored.get(section, {}) if isinstance(stored, dict) else {}
-        known = JobConfig().section(section)
-        values |= {f"{section}.{k}": v for k, v in part.items() if k in known} if isinstance(part, dict) else {}
-    preset = stored.get("preset") if isinstance(stored, dict) else None
-    preset = preset if isinstance(preset, str) and preset in PRESETS else None
-    return build_config(preset, None, overrides, values | {k: v for k, v in flat.items() if v is not None})
-
-
 def play(runner: Runner, asset: FluidAsset, config: JobConfig, request: SimulationRequest, lift: Lift | None) -> int:
     """Simulate and show an asset, and bring its manifest up to date; the number of frames.
 
@@ -182,7 +148,7 @@ def play(runner: Runner, asset: FluidAsset, config: JobConfig, request: Simulati
         "show", show, scene, done, footage, seen, taken(ShowSettings, config.show), beside={"folder": folder},
         still_there=lambda value: all(p.is_file() for p in wanted), owns_files=True,
     )  # fmt: skip
-    closed = edits.loop and not any("loop is not closed" in text for text in done.warnings)
+    closed = edits.loop and all(code_of(text) != OPEN for text in done.warnings)
     _finish(runner, scene, manifest, config, lift, Played(done, shown, seen.mark, closed, tuple(outside)))
     if done.failed is not None:
         raise FluidliftError(
@@ -216,7 +182,7 @@ def _finish(
     own = [*played.warnings, *done.warnings, *([] if done.failed is None else [done.failed]), *shown.warnings]
     runner.warnings[:] = [w for w in manifest.get("warnings", ()) if w not in before] + own
     if lift is not None:
-        reporting.write_report(lift, done, shown, folder, config.preset, runner.timings, runner.warnings)
+        report.write_report(lift, done, shown, folder, config.preset, runner.timings, runner.warnings)
         figures = asset_file(folder, "work/evaluation.npz")
         if shown.pictures is not None:
             with atomic_write(figures) as stream:
@@ -265,3 +231,15 @@ def evaluation_arrays(lift: Lift, simulation: Simulation, shown: Shown) -> dict[
         "particle_volume": simulation.volume,
         "leak_share": simulation.leak,
     }
+
+
+def recalled_lift(runner: Runner, manifest: dict[str, Any]) -> Lift | None:
+    """What `make` found in the clip; None where any of it is gone, and the runner knows nothing of it then."""
+    keys, values = stage_keys(manifest), []
+    for name, kind in OF_CLIP.items():
+        value = runner.recall(name, keys[name], kind) if name in keys else None
+        if value is None:
+            runner.forget()
+            return None
+        values.append(value)
+    return Lift(*values)

@@ -13,7 +13,7 @@ import json
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from enum import Enum
@@ -24,11 +24,13 @@ import numpy as np
 
 from fluidlift.errors import InputRejected, MissingPackage
 from fluidlift.io.atomic import disk_errors, require_writable
-from fluidlift.io.stage_cache import Scratch, is_owner, load_stage, mark_owner, owner_of, save_stage
-from fluidlift.io.stage_codec import Mistyped, packed, unpacked
-from fluidlift.pipeline.machine import peak_memory_mb
-from fluidlift.pipeline.source import source_hash
-from fluidlift.pipeline.work import Progress, Work
+from fluidlift.io.kept_values import kept_value
+from fluidlift.io.stage_cache import Scratch, is_owner, mark_owner, save_stage
+from fluidlift.io.stage_codec import packed
+from fluidlift.machine import peak_memory_mb
+from fluidlift.pipeline.work import Work
+from fluidlift.seams import Progress
+from fluidlift.source import source_hash
 
 T = TypeVar("T")
 
@@ -202,25 +204,6 @@ def result_type(stage: Callable[..., T]) -> type[T]:
     return getattr(sys.modules[stage.__module__], said) if isinstance(said, str) else said
 
 
-def kept_value(folder: Path, name: str, key: str, kind: type[T]) -> tuple[T, float] | None:
-    """A stage's value in the cache with the seconds that it took; None where it is gone, damaged or of another type."""
-    found = load_stage(folder, name, key)
-    if found is None:
-        return None
-    arrays, meta = found
-    try:
-        return unpacked(kind, arrays, meta["value"]), float(meta["seconds"])
-    except (Mistyped, KeyError, TypeError, ValueError, OverflowError):
-        return None
-
-
-def last_value(folder: Path, name: str, kind: type[T]) -> T | None:
-    """The value whose files lie beside the cache now (the frames of a simulation); None where that is not known."""
-    key = owner_of(folder, name)
-    found = None if key is None else kept_value(folder, name, key, kind)
-    return None if found is None else found[0]
-
-
 @contextmanager
 def gone_if_refused(runner: Runner, until: str) -> Iterator[None]:
     """Where an input is refused before the stage `until` is done, a folder that was not there before goes again.
@@ -240,3 +223,10 @@ def gone_if_refused(runner: Runner, until: str) -> Iterator[None]:
         if fresh and until not in runner.timings:
             shutil.rmtree(runner.folder, ignore_errors=True)
         raise
+
+
+def require_stages(force: Iterable[str], stages: tuple[str, ...]) -> None:
+    """Raise `InputRejected` for a stage that there is not."""
+    unknown = set(force) - set(stages)
+    if unknown:
+        raise InputRejected(f"unknown stage '{sorted(unknown)[0]}'", "one of " + ", ".join(stages))

@@ -11,9 +11,10 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, TypeVar
 
+from fluidlift.backends.registry import module_name, names
 from fluidlift.config import JobConfig
 from fluidlift.pipeline.inputs import GivenFile, GivenFiles, Weights
-from fluidlift.pipeline.source import source_hash
+from fluidlift.source import source_hash
 
 T = TypeVar("T")
 
@@ -26,6 +27,11 @@ def taken(kind: type[T], section: Any, **more: Any) -> T:
     """The settings of a stage from those of a section with the same names; `more` are given or replace them."""
     names = [f.name for f in fields(kind) if f.name not in more]  # type: ignore[arg-type]
     return kind(**{n: getattr(section, n) for n in names}, **more)
+
+
+def _source_of(purpose: str, name: str) -> str:
+    """Hash of the source of a back end; empty where the name is none."""
+    return source_hash(module_name(purpose, name)) if name in names(purpose) else ""
 
 
 @dataclass(frozen=True)
@@ -47,13 +53,16 @@ class FlowSettings:
 
     method: str
     weights: Weights | None
+    source: str
+    """hash of the source of a learned one, which is chosen by name; empty of our own"""
     device: str = field(metadata=BESIDE)
     download: bool = field(metadata=BESIDE)
 
     @classmethod
     def of(cls, config: JobConfig) -> FlowSettings:
         """From those of a job."""
-        return taken(cls, config.motion, weights=Weights.of(config.motion.weights))
+        m = config.motion
+        return taken(cls, m, weights=Weights.of(m.weights), source=_source_of("flow method", m.method))
 
 
 @dataclass(frozen=True)
@@ -104,13 +113,16 @@ class SegmentSettings:
     method: str
     weights: Weights | None
     words: tuple[str, ...]
+    source: str
+    """hash of the source of a learned one, which is chosen by name; empty of our own"""
     device: str = field(metadata=BESIDE)
     download: bool = field(metadata=BESIDE)
 
     @classmethod
     def of(cls, config: JobConfig) -> SegmentSettings:
         """From those of a job."""
-        return taken(cls, config.segment, weights=Weights.of(config.segment.weights))
+        s = config.segment
+        return taken(cls, s, weights=Weights.of(s.weights), source=_source_of("mask method", s.method))
 
 
 @dataclass(frozen=True)
@@ -136,6 +148,8 @@ class DepthModel:
 
     model: str
     weights: Weights | None
+    source: str
+    """hash of the source of the model, which is chosen by name"""
     frames: int
     device: str = field(metadata=BESIDE)
     download: bool = field(metadata=BESIDE)
@@ -145,7 +159,8 @@ class DepthModel:
         """Where one is to look at the pictures: nothing better was given."""
         if config.depth.model == "none" or given.depth is not None or given.geometry is not None:
             return None
-        return taken(cls, config.depth, weights=Weights.of(config.depth.weights))
+        d = config.depth
+        return taken(cls, d, weights=Weights.of(d.weights), source=_source_of("depth model", d.model))
 
 
 @dataclass(frozen=True)
@@ -194,7 +209,7 @@ class GenerateSettings:
             return None if text is None else Path(os.path.expanduser(text))
 
         c, s, name = config.generate, config.shape, require_known(str(config.generate.name))
-        source = source_hash("fluidlift.backends." + name.replace("-", "_"))
+        source = source_hash(module_name("generator", name))
         return taken(
             cls, c, name=name, source=source, weights=Weights.of(c.weights), runner=Weights.of(c.runner),
             seed=config.seed, longest_union=s.longest_union, fov=s.fov, python=path(c.python), code=path(c.code),
@@ -239,20 +254,6 @@ class MotionSettings:
     divergence: str
     targets: int
     complete_every: int
-
-
-@dataclass(frozen=True)
-class SceneSettings:
-    """What a scene takes from the job, beside its asset and its edits."""
-
-    frames: int | None
-    follow: float
-    seed: int
-
-    @classmethod
-    def of(cls, config: JobConfig) -> SceneSettings:
-        """From those of a job."""
-        return taken(cls, config.simulate, seed=config.seed)
 
 
 @dataclass(frozen=True)

@@ -5,43 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 from fluidlift.io.stage_cache import Scratch
 
 T = TypeVar("T")
-
-
-class Progress(Protocol):
-    """Where progress is told: a terminal, plain lines, or nowhere."""
-
-    def stage(self, name: str, number: int, count: int) -> None:
-        """A stage begins."""
-
-    def update(self, done: int, total: int) -> None:
-        """Part of the current stage is done."""
-
-    def finished(self, name: str, seconds: float, cached: bool) -> None:
-        """A stage ended."""
-
-    def warn(self, text: str) -> None:
-        """Something the user should know."""
-
-
-class Silence:
-    """No progress at all."""
-
-    def stage(self, name: str, number: int, count: int) -> None:
-        """Nothing."""
-
-    def update(self, done: int, total: int) -> None:
-        """Nothing."""
-
-    def finished(self, name: str, seconds: float, cached: bool) -> None:
-        """Nothing."""
-
-    def warn(self, text: str) -> None:
-        """Nothing."""
 
 
 def _alone(name: str, function: Callable[..., T], *inputs: Any, **named: Any) -> T:

@@ -78,3 +78,11 @@ class PixelLabels:
     def solid(self) -> np.ndarray:
         """bool [T,H,W]."""
         return self.labels == Label.SOLID
+
+
+def is_variable(times: np.ndarray) -> bool:
+    """Steps that differ by more than the rounding of time stamps to milliseconds explains."""
+    if len(times) < 3:
+        return False
+    steps = np.diff(times)
+    return bool(steps.max() - steps.min() > max(0.1 * np.median(steps), 0.0021))

@@ -261,7 +261,7 @@ class Fit:
     estimates: dict[str, Estimate]
     """by label (`gravity_z`, `size`, ...)"""
     table: tuple[dict[str, Any], ...]
-    """one row per number, as `pipeline.fit_outcome.table` makes it"""
+    """one row per number, as `fit.outcome.table` makes it"""
     converged: bool
     status: str
     """fitted, unfinished, failed or left"""

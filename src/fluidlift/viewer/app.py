@@ -49,7 +49,7 @@ class ViewRequest:
 
 def open_session(folder: Path) -> Session:
     """The edits of an asset."""
-    from fluidlift.pipeline.editing import EditSession
+    from fluidlift.scene.edits import EditSession
 
     return EditSession.open(folder)
 

@@ -9,6 +9,7 @@ from typing import Any
 
 from fluidlift.errors import require
 from fluidlift.types import FluidKind, FluidParameters, kind_of
+from fluidlift.types.parameter_table import PARAMETERS, Scale
 
 STEPS = 200
 """of a slider, about"""
@@ -134,23 +135,13 @@ def controls_of(fitted: FluidParameters, kind: str | FluidKind) -> tuple[Control
     liquid = not kind_of(kind).is_gas
     found = []
     if liquid:
-        found.append(_plain("kinematic_viscosity", "viscosity", "m²/s", fitted, (1e-7, 1.0), log=True,
-                            hint="kinematic: water 1e-6, oil 1e-4, honey 7e-3, lava 0.1 m²/s and more"))  # fmt: skip
+        found.append(_plain("kinematic_viscosity", fitted, log=True))
     found += _gravity(fitted, liquid)
     if speed > 0:
         found.append(_inflow(speed))
-        found.append(_plain("inflow_fluctuation", "inflow fluctuation", "m/s", fitted, (0.0, max(speed, 0.1)),
-                            hint="root mean square of how the speed at the inlet varies"))  # fmt: skip
+        found.append(_plain("inflow_fluctuation", fitted, span=(0.0, max(speed, 0.1))))
     if liquid:
-        found += [
-            _plain("density", "density", "kg/m³", fitted, (200.0, 5000.0),
-                   hint="matters to what floats in it, and to surface tension"),
-            _plain("surface_tension", "surface tension", "N/m", fitted, (0.0, 0.5),
-                   hint="water 0.072 N/m; drops and thin jets only; small cells then need short steps"),
-            _plain("wall_damping", "wall friction", "", fitted, (0.0, 1.0),
-                   hint="0: slips along walls freely; 1: sticks to them"),
-            _plain("restitution", "bounce", "", fitted, (0.0, 1.0), hint="share of the speed that a wall gives back"),
-        ]  # fmt: skip
+        found += [_plain(name, fitted) for name in ("density", "surface_tension", "wall_damping", "restitution")]
     return tuple(found)
 
 
@@ -159,16 +150,17 @@ def _length(vector: Any) -> float:
 
 
 def _plain(
-    name: str, label: str, unit: str, fitted: FluidParameters, span: tuple[float, float], *, log: bool = False,
-    hint: str = "",
-) -> Control:  # fmt: skip
-    value = float(getattr(fitted, name))
+    name: str, fitted: FluidParameters, *, span: tuple[float, float] | None = None, log: bool = False
+) -> Control:
+    """The slider of one number of the table; `span` replaces the table's."""
+    known, value = PARAMETERS[name], float(getattr(fitted, name))
+    span = span or known.span
     low, high = min(span[0], value) if value > 0 or not log else span[0], max(span[1], 2 * value)
-    if name in ("wall_damping", "restitution"):
+    if known.scale is Scale.LOGIT:
         high = span[1]
     return Control(
-        name, label, unit, low, high, min(max(value, low), high), lambda p: float(p[name]), lambda p, v: {name: v},
-        log=log, hint=hint,
+        name, known.label, known.sign, low, high, min(max(value, low), high), lambda p: float(p[name]),
+        lambda p, v: {name: v}, log=log, hint=known.hint,
     )  # fmt: skip
 
 

@@ -14,7 +14,7 @@ QUIET = 0.7
 
 
 class Session(Protocol):
-    """What the viewer needs of `pipeline.editing.EditSession`; all that change something raise `InputRejected`."""
+    """What the viewer needs of `scene.edits.EditSession`; all that change something raise `InputRejected`."""
 
     @property
     def scene(self) -> dict[str, Any]:
@@ -145,7 +145,7 @@ class Draft:
         Raises:
             InputRejected: edits that do not fit; they are dropped.
         """
-        from fluidlift.pipeline.editing import Set
+        from fluidlift.scene.edits import Set
 
         with self._lock:
             pending, self._pending = self._pending, {}
@@ -160,7 +160,7 @@ class Draft:
             self._base = None
 
     def apply(self, changes: Sequence[Any], told: str) -> None:
-        """Changes of `pipeline.editing` as one edit.
+        """Changes of `scene.edits` as one edit.
 
         Raises:
             InputRejected: they do not fit; nothing was changed.

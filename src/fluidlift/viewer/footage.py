@@ -80,7 +80,7 @@ def input_pictures(
 
 
 def _of_stages(folder: Path, manifest: dict[str, Any]) -> InputPictures | None:
-    from fluidlift.pipeline.recall import footage_of_asset
+    from fluidlift.scene.recall import footage_of_asset
 
     try:
         footage = footage_of_asset(folder, manifest)

@@ -14,7 +14,7 @@ from fluidlift.errors import InputRejected
 from fluidlift.io.asset_paths import asset_file
 from fluidlift.io.atomic import write_bytes
 from fluidlift.io.read_mesh import SUFFIXES, read_any_mesh
-from fluidlift.pipeline.edit_outlook import placed
+from fluidlift.scene.forecast import placed
 
 FOLDER = "meshes"
 """of the asset, where uploaded files are kept"""

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fluidlift.errors import FluidliftError
-from fluidlift.pipeline.edit_outlook import place_told, placed
-from fluidlift.pipeline.editing import Add, Remove
-from fluidlift.pipeline.open_water import open_water
+from fluidlift.scene.edits import Add, Remove
+from fluidlift.scene.forecast import place_told, placed
+from fluidlift.scene.open_water import open_water
 from fluidlift.types import kind_of
 from fluidlift.viewer.controls import unbroken
 from fluidlift.viewer.hearing import heard

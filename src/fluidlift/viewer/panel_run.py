@@ -26,7 +26,7 @@ class RunPanel:
     """Undo, save, export, simulate, draw."""
 
     def __init__(self, viewer: Viewer) -> None:
-        from fluidlift.pipeline.exporting import FORMATS
+        from fluidlift.export.job import FORMATS
 
         self._viewer, self._gui = viewer, viewer.server.gui
         gui = self._gui
@@ -96,7 +96,8 @@ class RunPanel:
         viewer.set_source("saved frames")
 
     def _export(self, _: Any) -> None:
-        from fluidlift.pipeline.exporting import ExportRequest, export_asset
+        from fluidlift.export.asset import export_asset
+        from fluidlift.export.job import ExportRequest
 
         viewer, out = self._viewer, Path(os.path.expanduser(self._out.value.strip()))
         if viewer.refused():
@@ -187,7 +188,7 @@ def _drawn(folder: Path, camera: PinholeCamera, number: int, progress: JobProgre
     """u8 [h,w,3] of one frame of the asset, in its look."""
     import cv2
 
-    from fluidlift.pipeline.rendering import RenderRequest, render_asset
+    from fluidlift.pipeline.render import RenderRequest, render_asset
 
     with tempfile.TemporaryDirectory(prefix="fluidlift-view-") as name:
         place = Path(name)

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fluidlift.pipeline.scene import Scene, wave_speed
 from fluidlift.pipeline.work import Work
+from fluidlift.scene.build import Scene, wave_speed
 from fluidlift.types import CellType, FaceVelocity, kind_of
 from fluidlift.types.stages import Calibration
 
@@ -71,7 +71,7 @@ def calibrate(
         FluidliftError: the simulation broke down.
     """
     from fluidlift.physics.guidance import Nudging
-    from fluidlift.pipeline.simulator import simulator_of
+    from fluidlift.scene.simulator import simulator_of
 
     if not wanted or not kind_of(scene.kind).is_channel_flow or not len(scene.body):
         return Calibration()

@@ -10,7 +10,7 @@ import numpy as np
 
 from fluidlift.config import FitConfig
 from fluidlift.errors import InputRejected
-from fluidlift.pipeline.fit_outcome import (
+from fluidlift.fit.outcome import (
     AT_THE_ENDS,
     Verdict,
     as_given,
@@ -22,12 +22,12 @@ from fluidlift.pipeline.fit_outcome import (
     table,
     verdict,
 )
+from fluidlift.fit.rising import outline_rises, with_buoyancy
+from fluidlift.machine import one_torch_thread
 from fluidlift.pipeline.fit_request import FitRequest, request_of, startable
-from fluidlift.pipeline.fluid_masks import FluidMasks
-from fluidlift.pipeline.machine import one_torch_thread
-from fluidlift.pipeline.rising import outline_rises, with_buoyancy
 from fluidlift.pipeline.work import Work
 from fluidlift.types import CellType, FaceVelocity, FitResult, FluidKind, FluidParameters, kind_of
+from fluidlift.types.fluid_masks import FluidMasks
 from fluidlift.types.stages import Fit, Geometry, Motion, Read, Segmentation
 
 AT_WALLS = ("restitution", "wall_damping")

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from fluidlift.backends.learned import FLOW_METHODS, ModelChoice, make_estimator
+from fluidlift.backends.learned import FLOW_METHODS, make_estimator
+from fluidlift.backends.registry import ModelChoice
 from fluidlift.pipeline.settings import FlowSettings, GivenFlow
 from fluidlift.pipeline.work import Work
 from fluidlift.seams import FlowEstimator

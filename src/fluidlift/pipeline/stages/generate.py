@@ -16,13 +16,13 @@ from fluidlift.backends.generator_licence import require_accepted, require_use
 from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected, MissingPackage
 from fluidlift.io.asset_paths import asset_file
-from fluidlift.pipeline.fluid_masks import FluidMasks
 from fluidlift.pipeline.given_body import NOTE
 from fluidlift.pipeline.inputs import Inputs
 from fluidlift.pipeline.known_camera import known_field_of_view
-from fluidlift.pipeline.rest_frames import FEWEST_PIXELS, united_range
 from fluidlift.pipeline.settings import GenerateSettings, GivenView
 from fluidlift.pipeline.work import Work
+from fluidlift.shape.rest_frames import FEWEST_PIXELS, united_range
+from fluidlift.types.fluid_masks import FluidMasks
 from fluidlift.types.stages import Bodies, Read, Segmentation
 
 if TYPE_CHECKING:

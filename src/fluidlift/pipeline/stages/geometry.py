@@ -8,19 +8,29 @@ from typing import Any, cast
 import numpy as np
 
 from fluidlift.errors import InputRejected
-from fluidlift.pipeline import composite, dam, depths, given_body, ground
-from fluidlift.pipeline.fluid_masks import FluidMasks
+from fluidlift.motion.steady_flow import mean_motion
+from fluidlift.pipeline import depths, given_body
 from fluidlift.pipeline.inputs import GivenFile
 from fluidlift.pipeline.known_camera import known_camera, lens_is_known, level_of
-from fluidlift.pipeline.rest_frames import FEWEST_PIXELS, rest_frame, united_range
 from fluidlift.pipeline.settings import GeometrySettings, GivenView
-from fluidlift.pipeline.steady_flow import mean_motion
 from fluidlift.pipeline.work import Work
-from fluidlift.shape import generate, ground_texture, place, puddle, standing, surface, texture_gradient
+from fluidlift.shape import (
+    composite,
+    dam,
+    generate,
+    ground,
+    ground_texture,
+    place,
+    puddle,
+    standing,
+    surface,
+    texture_gradient,
+)
 from fluidlift.shape import kind as kinds
 from fluidlift.shape.framing import framing_warnings
 from fluidlift.shape.given_depth import DepthPictures
 from fluidlift.shape.kinds import Observation, builder_of
+from fluidlift.shape.rest_frames import FEWEST_PIXELS, rest_frame, united_range
 from fluidlift.types import (
     CellType,
     FluidKind,
@@ -32,6 +42,7 @@ from fluidlift.types import (
     VideoClip,
     kind_of,
 )
+from fluidlift.types.fluid_masks import FluidMasks
 from fluidlift.types.kind import STREAM
 from fluidlift.types.stages import Flow, Geometry, Read, Segmentation
 

@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fluidlift.pipeline.fluid_masks import FluidMasks
+from fluidlift.motion.steady_flow import pairs_of, spans_of
 from fluidlift.pipeline.settings import MotionSettings
-from fluidlift.pipeline.steady_flow import pairs_of, spans_of
 from fluidlift.pipeline.volume_motion import motion_options, motion_scene, motion_warnings, plain_report, seen_cells
 from fluidlift.pipeline.work import Work
 from fluidlift.types import FaceVelocity, kind_of
+from fluidlift.types.fluid_masks import FluidMasks
 from fluidlift.types.stages import Flow, Geometry, Motion, Read, Segmentation, TargetVelocity
 
 if TYPE_CHECKING:

@@ -12,11 +12,13 @@ from pathlib import Path
 import numpy as np
 
 from fluidlift.errors import InputRejected
-from fluidlift.io.stage_cache import Scratch, parts_of
+from fluidlift.io.stage_cache import Scratch
+from fluidlift.messages import without
 from fluidlift.pipeline.inputs import GivenFile
 from fluidlift.pipeline.settings import ReadSettings
 from fluidlift.pipeline.work import Work
 from fluidlift.types import VideoClip
+from fluidlift.types.fluid_masks import parts_of
 from fluidlift.types.stages import Read
 
 
@@ -101,8 +103,10 @@ def _without_repeats(clip: VideoClip, scratch: Scratch) -> tuple[VideoClip, np.n
     times = without_duplicates(hollow, report).times
     frames = _chosen(clip.frames, kept, "without_repeats", scratch)
     alpha = None if clip.alpha is None else _chosen(clip.alpha, kept, "alpha_without_repeats", scratch)
+    from fluidlift.io.collect import REPEATED
+
     # the reader counts exact repeats as well: said once is enough
-    said = tuple(w for w in clip.warnings if "repeat the one before" not in w)
+    said = without(clip.warnings, REPEATED)
     return replace(clip, frames=frames, times=times, alpha=alpha, warnings=_told(said, report.warnings)), kept
 
 

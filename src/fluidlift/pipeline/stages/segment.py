@@ -6,16 +6,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fluidlift.backends.learned import MASK_METHODS, ModelChoice, make_segmenter
+from fluidlift.backends.learned import MASK_METHODS, make_segmenter
+from fluidlift.backends.registry import ModelChoice
 from fluidlift.errors import InputRejected
-from fluidlift.io.stage_cache import parts_of
-from fluidlift.pipeline.fluid_masks import FluidMasks
+from fluidlift.motion.steady_flow import TRUSTED
 from fluidlift.pipeline.hints import NO_HINTS, Hints
 from fluidlift.pipeline.settings import GivenMask, SegmentSettings
-from fluidlift.pipeline.steady_flow import TRUSTED
 from fluidlift.pipeline.work import Work
 from fluidlift.seams import Segmenter
 from fluidlift.types import Label, PixelFlow, PixelLabels, VideoClip
+from fluidlift.types.fluid_masks import FluidMasks, parts_of
 from fluidlift.types.stages import Flow, Read, Segmentation
 
 if TYPE_CHECKING:

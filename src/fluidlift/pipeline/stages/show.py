@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,15 +10,16 @@ from typing import Any
 import numpy as np
 
 from fluidlift.io.scene_look import Look
-from fluidlift.pipeline.as_filmed import BEYOND, Reel, card_of_run
-from fluidlift.pipeline.footage import Footage
-from fluidlift.pipeline.front_view import FrontView, open_end, to_bytes
-from fluidlift.pipeline.looks import Backdrop, Frame, Painter, placed_bodies
-from fluidlift.pipeline.scene import Scene
 from fluidlift.pipeline.settings import ShowSettings
-from fluidlift.pipeline.splat_files import splat_frames
 from fluidlift.pipeline.work import Work
-from fluidlift.types import PinholeCamera, Similarity3, concatenate, kind_of, matrix_from_quat
+from fluidlift.present.as_filmed import BEYOND, Reel, card_of_run
+from fluidlift.present.frames import FrameRenderer, SimulatedFrame
+from fluidlift.present.front_view import open_end, to_bytes
+from fluidlift.present.looks import Painter
+from fluidlift.scene.build import Scene
+from fluidlift.scene.footage import Footage
+from fluidlift.scene.splat_files import splat_frames
+from fluidlift.types import PinholeCamera, kind_of
 from fluidlift.types.stages import Shown, Simulation
 
 
@@ -34,6 +35,18 @@ class SeenLook:
     def cache_key(self) -> dict[str, Any]:
         """What the stage's key knows of it."""
         return self.mark
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What is compared with the clip, frame by frame, as it is drawn."""
+
+    frames: Reel
+    """u8 [H,W,3]"""
+    mask: Reel
+    """bool [H,W]"""
+    flow: list[np.ndarray]
+    """[H,W,2], px per frame"""
 
 
 def show(
@@ -63,7 +76,7 @@ def show(
 
     poses, step = simulation.poses, work.step
     count = len(poses)
-    measured: dict[str, Any] = {"frames": Reel(folder), "mask": Reel(folder), "flow": []}
+    measured = Measured(Reel(folder), Reel(folder), [])
     painter = _painter(scene, folder, seen.look)
     panels = _panels(scene, footage, folder, config, poses, measured, step, painter)
     if config.preview:
@@ -85,11 +98,11 @@ def show(
     else:
         for name in ("asset.usda", "asset.usdc"):  # of frames that are no longer there
             (folder / name).unlink(missing_ok=True)
-    frames, mask, compared = measured["frames"].array(), measured["mask"].array(), len(measured["flow"])
+    frames, mask, compared = measured.frames.array(), measured.mask.array(), len(measured.flow)
     card = card_of_run(scene, footage, config.preview, frames, mask)
     if not compared:
         return Shown(count, card.as_filmed, warnings=card.warnings)
-    flow = np.stack(measured["flow"]).astype(np.float16)
+    flow = np.stack(measured.flow).astype(np.float16)
     return Shown(count, card.as_filmed, frames[:compared], mask[:compared], flow, card.warnings)
 
 
@@ -106,66 +119,52 @@ def _panels(
     folder: Path,
     config: ShowSettings,
     poses: np.ndarray,
-    measured,
-    step,
-    painter,
+    measured: Measured,
+    step: Callable[[int, int], None],
+    painter: Painter | None,
 ) -> Iterator[np.ndarray]:
     """Input | re-simulation | side view, frame by frame; keeps what the evaluation needs on the way."""
     from fluidlift.look.pictures import caption
-    from fluidlift.look.rasterize import render
-    from fluidlift.look.scenery import mesh_surfels, side_camera, terrain_depth, terrain_surfels
-    from fluidlift.look.vessel import glass_of
-    from fluidlift.numerics.srgb import linear_from_srgb
 
-    camera, terrain, grid = scene.camera, scene.terrain, scene.terrain.grid
-    front_view, compared = FrontView.of(scene, footage), 0
-    if footage is not None and not scene.reshaped:
+    renderer, compared = FrameRenderer(scene, footage, painter=painter), 0
+    if renderer.footage is not None:
         # frames between those of the clip, and those of an edited scene, have no counterpart in it
         edited = scene.obstacles or scene.emitters or scene.overlap or scene.changes
         if scene.interval == scene.clip_interval and not edited:
-            compared = max(len(footage.clip) - footage.start, 1)
-    rocks = front_view.rocks
-    behind = terrain_depth(terrain, camera) if rocks.any() and painter is not None else None
-    airborne = not kind_of(scene.kind).is_channel_flow
-    ground = terrain_surfels(terrain, glass=glass_of(scene.kind))
-    size = _panel_size(camera.size, config.width)
-    # a body in the air may fill its box later; what lies on a bed stays in it
-    around = terrain.mesh.vertices
-    if airborne:
-        inset = 0.18 * (grid.high - grid.low) * np.array([1.0, 1.0, 0.0])
-        around = np.stack([grid.low + inset, grid.high - inset])
-    side = side_camera(camera, scene.rest, ground, np.concatenate([scene.rest.means, around]), size=size)
-    end = open_end(scene)
-    sky = np.linspace(0.93, 0.78, size[1], dtype=np.float32)[:, None, None] * np.ones((1, size[0], 3), np.float32)
-    shapes = [mesh_surfels(o.mesh, grid.spacing) for o in scene.obstacles]
-    lit_plate = linear_from_srgb(front_view.plate).astype(np.float32)
-    rock_depth = None if behind is None else np.where(rocks & np.isfinite(behind), behind, 0.0)
+            compared = max(len(renderer.footage.clip) - renderer.footage.start, 1)
+    size = _panel_size(scene.camera.size, config.width)
+    side = _side_camera(scene, renderer, size)
     for k, (gaussians, _, speeds) in enumerate(splat_frames(folder, len(poses))):
         step(k, len(poses))
-        solids = [
-            shape.transformed(Similarity3(1.0, matrix_from_quat(p[3:]), p[:3])) for shape, p in zip(shapes, poses[k])
-        ]
-        rendered, front, velocity = front_view.drawn(gaussians, speeds, solids)
+        frame = SimulatedFrame(gaussians, speeds, poses[k])
+        rendered, front, velocity = renderer.measured(frame)
         picture = to_bytes(rendered.image)
         if k < BEYOND * compared:  # of the splats, whatever look the preview has
-            measured["frames"].append(picture)
-            measured["mask"].append(rendered.alpha > 0.5)
+            measured.frames.append(picture)
+            measured.mask.append(rendered.alpha > 0.5)
         if k < compared:
-            measured["flow"].append(_screen_velocity(front, velocity, camera, scene.interval, rendered.alpha))
-        if painter is None:
-            # as in the other looks, what thins out behind the section of a stream is not drawn before the terrain
-            whole = gaussians if end is None else gaussians.select(end.before(gaussians.means))
-            view = to_bytes(render(concatenate([ground, *solids, whole]), side, background=sky).image)
-        else:
-            frame = Frame(gaussians, speeds, placed_bodies(scene.obstacles, poses[k]))
-            picture = painter.shown(frame, camera, Backdrop(lit_plate, rock_depth))
-            view = painter.shown(frame, side, Backdrop())
+            measured.flow.append(_screen_velocity(front, velocity, scene.camera, scene.interval, rendered.alpha))
+        if painter is not None:
+            picture = renderer.shown(frame, scene.camera, "plate")
+        view = renderer.shown(frame, side, "terrain")
         panels = [caption(_resized(picture, size), "re-simulation"), caption(view, "side view")]
         if footage is not None:
             time, clip = round(k * scene.interval / scene.clip_interval), footage.clip.frames[footage.start :]
             again = time >= len(clip)  # beyond its end the clip begins again: a still would say nothing of the motion
             panels.insert(0, caption(_resized(clip[time % len(clip)], size), "input, again" if again else "input"))
         yield np.concatenate(panels, axis=1)
+
+
+def _side_camera(scene: Scene, renderer: FrameRenderer, size: tuple[int, int]) -> PinholeCamera:
+    """The camera of the side view."""
+    from fluidlift.look.scenery import side_camera
+
+    # a body in the air may fill its box later; what lies on a bed stays in it
+    grid, around = scene.terrain.grid, scene.terrain.mesh.vertices
+    if not kind_of(scene.kind).is_channel_flow:
+        inset = 0.18 * (grid.high - grid.low) * np.array([1.0, 1.0, 0.0])
+        around = np.stack([grid.low + inset, grid.high - inset])
+    return side_camera(scene.camera, scene.rest, renderer.ground, np.concatenate([scene.rest.means, around]), size=size)
 
 
 def _panel_size(size: tuple[int, int], width: int) -> tuple[int, int]:

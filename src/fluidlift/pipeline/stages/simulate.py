@@ -6,83 +6,22 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.io.asset_paths import asset_files
 from fluidlift.io.frames import FIRST_FRAME
-from fluidlift.pipeline.dressing import Dressing
-from fluidlift.pipeline.looping import close_loop
-from fluidlift.pipeline.reshaping import closed_inlet, in_words
-from fluidlift.pipeline.scene import Scene, SimulationRequest
 from fluidlift.pipeline.settings import SimulateSettings
-from fluidlift.pipeline.simulated_history import History
-from fluidlift.pipeline.simulator import preflight, simulator_of
-from fluidlift.pipeline.source import source_hash
-from fluidlift.pipeline.splat_files import checkpoint_file, frame_file, require_room
 from fluidlift.pipeline.work import Work
+from fluidlift.present.looping import close_loop
+from fluidlift.scene.build import Scene, SimulationRequest
+from fluidlift.scene.reshaping import closed_inlet
+from fluidlift.scene.simulation import advance, continued
+from fluidlift.scene.simulator import preflight, simulator_of
+from fluidlift.scene.splat_files import checkpoint_file, frame_file, require_room
+from fluidlift.scene.surface_appearance import Dressing
 from fluidlift.types import kind_of
 from fluidlift.types.stages import Simulation
 
 if TYPE_CHECKING:
-    from fluidlift.physics.stepping import ParticleSimulator
-
-
-def state_parts(scene: Scene) -> dict[str, str]:
-    """A hash of each part that the state of a simulation depends on: those of its scene, and the source."""
-    return scene.parts | {"version": source_hash(__name__)}
-
-
-def continued(
-    simulator: ParticleSimulator,
-    dressing: Dressing,
-    scene: Scene,
-    folder: Path,
-    request: SimulationRequest,
-    max_particles: int,
-) -> History:
-    """Bring the simulator, and what floats on its surface, to the last checkpoint of this scene.
-
-    Returns:
-        The history up to it; empty where the simulation starts at the first frame.
-
-    Raises:
-        InputRejected: `request.resume`, and there is no checkpoint that fits; the message says what differs.
-    """
-    from fluidlift.io.checkpoint import differing_parts, read_checkpoint, read_parts
-    from fluidlift.physics.preflight import simulation_bytes
-
-    if request.restart:
-        return History()
-    path = checkpoint_file(folder)
-    try:
-        frames, parts = read_parts(path)
-        other = differing_parts(parts, state_parts(scene))
-        if other:
-            raise InputRejected(
-                f"the checkpoint of '{folder.name}' is of a simulation with another {', another '.join(other)}",
-                "the scene, settings and version that it was made with",
-                "undo the change, or leave out --resume to start at the first frame",
-            )
-        missing = [k for k in range(frames) if not frame_file(folder, FIRST_FRAME + k).is_file()]
-        if missing:
-            raise InputRejected(
-                f"frame {FIRST_FRAME + missing[0]}, after which the checkpoint goes on, is not there any more",
-                f"all {frames} frames before the checkpoint", "leave out --resume to start at the first frame",
-            )  # fmt: skip
-        most = len(scene.body) + 2 * max_particles
-        found = read_checkpoint(path, max_bytes=4 * simulation_bytes(scene.terrain.grid, most))
-        if found.history["poses"].shape != (found.frames, len(scene.obstacles), 7):
-            raise InputRejected(f"the checkpoint of '{folder.name}' holds other obstacles", "a whole checkpoint")
-        history = History.of(found.history, scene.simulated)
-        if found.frames <= scene.simulated:
-            dressing.restore(found.state)
-            simulator.restore(found.state)
-        return history
-    except (InputRejected, KeyError) as error:
-        if not request.resume:
-            return History()
-        if isinstance(error, KeyError):
-            raise InputRejected(f"the checkpoint of '{folder.name}' lacks {error}", "a whole checkpoint") from None
-        raise
+    pass
 
 
 def simulate(
@@ -122,7 +61,10 @@ def simulate(
     if first == 0:
         checkpoint_file(folder).unlink(missing_ok=True)
     step = (lambda done, total: None) if work is None else work.step
-    failed = _advance(simulator, dressing, scene, folder, config, history, step)
+    failed = advance(
+        simulator, dressing, scene, folder, history, step, max_particles=config.max_particles,
+        checkpoint_every=config.checkpoint_every,
+    )  # fmt: skip
     warnings = [*scene.notes, *dressing.warnings, *closed] + (
         list(simulator.bodies.warnings) if scene.obstacles else []
     )
@@ -145,51 +87,6 @@ def simulate(
         failed=failed,
         warnings=tuple(warnings),
     )
-
-
-def _advance(
-    simulator: ParticleSimulator,
-    dressing: Dressing,
-    scene: Scene,
-    folder: Path,
-    config: SimulateSettings,
-    history: History,
-    step: Callable[[int, int], None],
-) -> str | None:
-    """Simulate and write the frames that are missing; why it broke down, if it did."""
-    from fluidlift.io.ply import write_gaussians
-
-    for k in range(len(history), scene.simulated):
-        step(k, scene.simulated)
-        substeps = 0
-        if k:
-            try:
-                substeps = int(simulator.advance(scene.interval).substeps)
-            except InputRejected:
-                raise
-            except FluidliftError as error:
-                return f"frame {FIRST_FRAME + k} ({k} of {scene.simulated}): {error} {in_words(scene)}".rstrip()
-        p = simulator.particles
-        if k and len(p) > config.max_particles * 2:
-            return None
-        dressing.advance(p, k)
-        shown = dressing.dressed(p, k, simulator.bodies.inside if scene.obstacles else None)
-        write_gaussians(
-            frame_file(folder, FIRST_FRAME + k), shown.gaussians, ids=shown.ids, velocities=shown.velocities
-        )
-        history.add(scene, simulator, p, substeps)
-        # the first one says whose frames these are
-        if len(history) % config.checkpoint_every == 0 or len(history) in (1, scene.simulated):
-            _save(simulator, dressing, scene, folder, history)
-    step(scene.simulated, scene.simulated)
-    return None
-
-
-def _save(simulator: ParticleSimulator, dressing: Dressing, scene: Scene, folder: Path, history: History) -> None:
-    from fluidlift.io.checkpoint import Checkpoint, write_checkpoint
-
-    kept = Checkpoint(len(history), state_parts(scene), simulator.state() | dressing.state(), history.arrays())
-    write_checkpoint(checkpoint_file(folder), kept)
 
 
 def _simulation_warnings(kind: str, volumes: Sequence[float], leaks: Sequence[float]) -> list[str]:

@@ -1,0 +1,113 @@
+"""The card of an asset: how near its re-simulation stays to its own clip, or why that cannot be told."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from fluidlift.physics.inflow_schedule import InflowSchedule
+from fluidlift.scene.build import Scene
+from fluidlift.scene.footage import Footage
+
+if TYPE_CHECKING:
+    from fluidlift.evaluate.as_filmed import AsFilmed
+
+BEYOND = 3
+"""times the clip's length, up to which frames are held against it: they lie on disk meanwhile"""
+
+
+class Reel:
+    """Pictures of one size, which go to a file without a name as they come and are mapped from there."""
+
+    def __init__(self, folder: Path) -> None:
+        self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115  it lives as long as the reel
+        self._count, self._shape, self._type = 0, (0, 0), np.dtype(np.uint8)
+
+    def append(self, picture: np.ndarray) -> None:
+        """One more; all have the shape and type of the first."""
+        self._count, self._shape, self._type = self._count + 1, picture.shape, picture.dtype
+        self._file.write(np.ascontiguousarray(picture).tobytes())
+
+    def array(self) -> np.ndarray:
+        """All of them, [k, ...]; the file is gone once neither this nor the reel is held any more."""
+        self._file.flush()
+        shape = (self._count, *self._shape)
+        return np.memmap(self._file, self._type, "r", shape=shape) if self._count else np.zeros(shape, self._type)
+
+
+def why_not(scene: Scene, footage: Footage | None, *, preview: bool) -> str | None:
+    """Why a re-simulation, drawn or not, cannot be held against its clip, and what to do; None where it can."""
+    from fluidlift.evaluate.as_filmed import FEWEST
+
+    edits = {
+        "obstacles": scene.obstacles, "emitters": scene.emitters, "a loop": scene.overlap,
+        "other parameters": scene.changes, "another inflow": scene.inflow != InflowSchedule(),
+        "another terrain": scene.reshaped, "a longer channel": scene.extended,
+    }  # fmt: skip
+    found = [name for name, there in edits.items() if there]
+    if found:
+        return f"the scene is edited ({', '.join(found)}): run fluidlift edit --reset, then fluidlift sim"
+    if footage is None:
+        return "the clip is not at hand (work/ is missing or of another version): run fluidlift make again"
+    if scene.interval != scene.clip_interval:
+        return "the frames are at another rate than the clip's: run fluidlift sim without --fps"
+    if not preview:
+        return "no pictures were drawn: run fluidlift sim with --set show.preview=true"
+    filmed = len(footage.clip) - footage.start
+    if min(filmed, scene.frames) < FEWEST:
+        return f"too few frames, {min(filmed, scene.frames)} where {FEWEST} are needed: give a longer --duration"
+    return None
+
+
+@dataclass(frozen=True)
+class Noted:
+    """The card as the manifest has it."""
+
+    as_filmed: dict[str, Any]
+    """the card, or why there is `none`"""
+    warnings: tuple[str, ...] = ()
+
+
+def card_of_run(
+    scene: Scene, footage: Footage | None, preview: bool, renders: np.ndarray, coverage: np.ndarray
+) -> Noted:
+    """What the stage that shows notes; a warning where the card does not hold.
+
+    Args:
+        scene: that was simulated.
+        footage: its clip, where it is at hand.
+        preview: whether pictures are drawn.
+        renders: u8 [K,H,W,3] in the clip's camera, from the first simulated frame on.
+        coverage: bool [K,H,W], pixels that the fluid covers.
+    """
+    from fluidlift.evaluate.as_filmed import FEWEST, as_filmed
+
+    reason = why_not(scene, footage, preview=preview)
+    if reason is None and len(renders) < FEWEST:
+        reason = f"the simulation ended early: too few frames, {len(renders)} where {FEWEST} are needed"
+    if reason is not None or footage is None:
+        return Noted({"none": reason})
+    first = footage.start
+    card = as_filmed(footage.clip.frames[first:], footage.labels.fluid[first:], scene.interval, renders, coverage)
+    warning = card.warning()
+    return Noted(card.to_dict(), (warning,) if warning else ())
+
+
+def card_of(manifest: Mapping[str, Any]) -> AsFilmed | str:
+    """The card that a manifest holds, or why there is none and what to do."""
+    from fluidlift.evaluate.as_filmed import AsFilmed
+
+    stored = manifest.get("simulation", {}).get("as_filmed")
+    if not isinstance(stored, dict):
+        return "its frames are of a version that did not measure this: run fluidlift sim"
+    if "none" in stored:
+        return str(stored["none"])
+    try:
+        return AsFilmed.from_dict(stored)
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError):
+        return "what the manifest says of it cannot be read: run fluidlift sim --restart"

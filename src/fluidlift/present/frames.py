@@ -1,0 +1,228 @@
+"""The one renderer of frames, for the preview, `fluidlift render` and the viewer's pictures.
+
+A frame is drawn as its splats or in another look, before the clip's plate, the terrain or nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from fluidlift.errors import InputRejected
+from fluidlift.look.rasterize import Rendered, render
+from fluidlift.look.scenery import mesh_surfels, terrain_depth, terrain_surfels
+from fluidlift.look.vessel import glass_of
+from fluidlift.numerics.srgb import linear_from_srgb, srgb_from_linear
+from fluidlift.present.front_view import FrontView, open_end, to_bytes
+from fluidlift.present.looks import Backdrop, Frame, Painter, placed_bodies
+from fluidlift.scene.build import Scene
+from fluidlift.scene.footage import Footage
+from fluidlift.types import Gaussians, PinholeCamera, Similarity3, concatenate, matrix_from_quat
+
+BACKGROUNDS = ("auto", "plate", "terrain", "none")
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """One picture."""
+
+    image: np.ndarray
+    """[h,w,3], linear light, premultiplied by `alpha`"""
+    alpha: np.ndarray
+    """[h,w]"""
+    depth: np.ndarray
+    """[h,w] camera z, m; 0 where nothing is"""
+    shown: np.ndarray
+    """[h,w,3] sRGB in [0, 1] for a display, premultiplied by `alpha`"""
+
+
+@dataclass(frozen=True)
+class SimulatedFrame:
+    """What the simulation left of one frame."""
+
+    fluid: Gaussians
+    velocities: np.ndarray
+    """[n,3], m/s"""
+    poses: np.ndarray | None = None
+    """[b,7] of the obstacles: position (m) and orientation (w, x, y, z); None: they are not drawn"""
+
+
+class FrameRenderer:
+    """Draws the frames of one scene. What stays from frame to frame is kept.
+
+    Args:
+        scene: that was simulated.
+        footage: the clip, where it is at hand; of a scene whose terrain was edited it is not shown.
+        painter: of another look than the splats' own.
+        surfels: of the terrain at most; None: as many as a film needs.
+    """
+
+    def __init__(
+        self, scene: Scene, footage: Footage | None, *, painter: Painter | None = None, surfels: int | None = None
+    ) -> None:
+        self.scene, self.footage, self.painter = scene, None if scene.reshaped else footage, painter
+        self.front_view = FrontView.of(scene, footage)
+        self._most = {} if surfels is None else {"most": surfels}
+        self._rock_depth: tuple[PinholeCamera, np.ndarray | None] | None = None
+        self._end = open_end(scene)
+
+    def background(self, asked: str, *, front: bool) -> str:
+        """plate, terrain or none: what is asked for; of auto the first of these that there is.
+
+        Args:
+            asked: one of `BACKGROUNDS`.
+            front: whether the camera stands where the clip's stood.
+
+        Raises:
+            InputRejected: the clip's background, which is not at hand.
+        """
+        if asked == "plate" and self.footage is None:
+            raise InputRejected(
+                "the clip's background, which is no longer at hand", "the asset's folder work/, as make left it",
+                "use --background terrain or none, or run fluidlift make again",
+            )  # fmt: skip
+        if asked != "auto":
+            return asked
+        return "plate" if front and self.footage is not None else "terrain"
+
+    def draw(self, frame: SimulatedFrame, camera: PinholeCamera, background: str) -> Drawn:
+        """One frame.
+
+        Args:
+            frame: what is in it.
+            camera: who looks.
+            background: plate (of a camera where the clip's stood; grey where the clip is not at hand), terrain or none.
+        """
+        if self.painter is not None:
+            found = self.painter.picture(self._painted(frame), camera, self._backdrop(camera, background))
+            alpha = found.alpha[..., None]
+            light = self.painter.display(found.image / np.maximum(alpha, 1e-4))
+            return Drawn(found.image, found.alpha, found.depth, (srgb_from_linear(light) * alpha).astype(np.float32))
+        if background == "none":
+            return _encoded(*_held_out(self._seen(frame), self._ground_without_glass, camera))
+        found = self._splatted(frame, camera, background)
+        return _encoded(found.image, np.ones(found.alpha.shape, np.float32), found.depth)
+
+    def shown(self, frame: SimulatedFrame, camera: PinholeCamera, background: str) -> np.ndarray:
+        """One frame before plate or terrain, as `draw` has it: u8 [h,w,3], sRGB."""
+        if self.painter is not None:
+            return self.painter.shown(self._painted(frame), camera, self._backdrop(camera, background))
+        return to_bytes(self._splatted(frame, camera, background).image)
+
+    def measured(self, frame: SimulatedFrame) -> tuple[Rendered, Gaussians, np.ndarray]:
+        """The splats as the clip's camera sees them, whatever the look: `FrontView.drawn`."""
+        return self.front_view.drawn(frame.fluid, frame.velocities, self._solids(frame))
+
+    # --- inside -----------------------------------------------------------------------------------------------------
+
+    def _splatted(self, frame: SimulatedFrame, camera: PinholeCamera, background: str) -> Rendered:
+        """Splats before surfels: one rasteriser for all, in the colours that the clip has."""
+        if background == "plate":
+            return self.front_view.drawn(
+                frame.fluid, frame.velocities, self._solids(frame), camera=camera, plate=self._plate(camera)
+            )[0]
+        # as in the other looks, what thins out behind the section of a stream is not drawn before the terrain
+        fluid = frame.fluid if self._end is None else frame.fluid.select(self._end.before(frame.fluid.means))
+        return render(concatenate([self.ground, *self._solids(frame), fluid]), camera, background=_sky(camera))
+
+    def _seen(self, frame: SimulatedFrame) -> Gaussians:
+        return concatenate([frame.fluid, *self._solids(frame)])
+
+    def _painted(self, frame: SimulatedFrame) -> Frame:
+        bodies = [] if frame.poses is None else placed_bodies(self.scene.obstacles, frame.poses)
+        return Frame(frame.fluid, frame.velocities, bodies)
+
+    def _backdrop(self, camera: PinholeCamera, background: str) -> Backdrop:
+        if background != "plate":
+            return Backdrop(cut_out=background == "none")
+        plate = linear_from_srgb(self._plate(camera)).astype(np.float32)
+        coarse = max(camera.focal[0] / self.scene.camera.focal[0], 1.0)
+        return Backdrop(plate, self._depth_of_rocks(camera), coarse)
+
+    @cached_property
+    def ground(self) -> Gaussians:
+        """Surfels of the terrain."""
+        return terrain_surfels(self.scene.terrain, glass=glass_of(self.scene.kind), **self._most)
+
+    @cached_property
+    def _ground_without_glass(self) -> Gaussians:
+        """A vessel hides nothing of what it holds, and is ground: cut out, none of it is there."""
+        if glass_of(self.scene.kind) is None:
+            return self.ground
+        return terrain_surfels(self.scene.terrain, glass=0.0, **self._most)
+
+    @cached_property
+    def _shapes(self) -> list[Gaussians]:
+        return [mesh_surfels(o.mesh, self.scene.terrain.grid.spacing) for o in self.scene.obstacles]
+
+    def _solids(self, frame: SimulatedFrame) -> list[Gaussians]:
+        """The obstacles where they are."""
+        poses = () if frame.poses is None else frame.poses
+        return [s.transformed(Similarity3(1.0, matrix_from_quat(p[3:]), p[:3])) for s, p in zip(self._shapes, poses)]
+
+    def _plate(self, camera: PinholeCamera) -> np.ndarray:
+        """sRGB [h,w,3] in [0, 1] of the clip without its fluid; grey where it is not at hand."""
+        if self.footage is None:
+            return np.full((*camera.size[::-1], 3), 0.5, np.float32)
+        return _placed(self.footage.plate, self.scene.camera, camera)
+
+    def _depth_of_rocks(self, camera: PinholeCamera) -> np.ndarray | None:
+        """Camera depth (m) of the rocks that the plate shows, 0 beside them; None where it shows none."""
+        if self.footage is None or not self.footage.rocks.any():
+            return None
+        if self._rock_depth is None or self._rock_depth[0] is not camera:
+            picture = self.footage.rocks[..., None].repeat(3, 2).astype(np.uint8) * 255
+            there = _placed(picture, self.scene.camera, camera, goes_on=False)[..., 0] > 0.5
+            depth = terrain_depth(self.scene.terrain, camera)
+            self._rock_depth = camera, np.where(there & np.isfinite(depth), depth, 0.0).astype(np.float32)
+        return self._rock_depth[1]
+
+
+def _sky(camera: PinholeCamera) -> np.ndarray:
+    """sRGB [h,w,3] behind the terrain: pale, darker towards the bottom."""
+    width, height = camera.size
+    return np.linspace(0.93, 0.78, height, dtype=np.float32)[:, None, None] * np.ones((1, width, 3), np.float32)
+
+
+def _encoded(rgb: np.ndarray, alpha: np.ndarray, depth: np.ndarray) -> Drawn:
+    """Of sRGB colours, premultiplied; linear light beside them, because compositing programs multiply linear values."""
+    rgb = np.clip(rgb, 0.0, 1.0)
+    straight = np.clip(rgb / np.maximum(alpha, 1e-4)[..., None], 0.0, 1.0)
+    return Drawn((linear_from_srgb(straight) * alpha[..., None]).astype(np.float32), alpha, depth, rgb)
+
+
+def _held_out(seen: Gaussians, ground: Gaussians, camera: PinholeCamera) -> tuple[np.ndarray, ...]:
+    """What is seen of the fluid beside the ground: the ground hides, and is not drawn itself."""
+    from fluidlift.look.project import view_colors
+
+    both = concatenate([seen, ground])
+    shown = (np.arange(len(both)) < len(seen)).astype(np.float32)[:, None]
+    depth = camera.camera_from_world.points(both.means)[:, 2:]
+    drawn = render(both, camera, features=shown * np.concatenate([view_colors(both, camera), shown, depth], axis=1))
+    rgb, alpha, z = drawn.image[..., :3], drawn.image[..., 3], drawn.image[..., 4]
+    return rgb, alpha, np.where(alpha > 1e-3, z / np.maximum(alpha, 1e-3), 0.0).astype(np.float32)
+
+
+def _placed(plate: np.ndarray, source: PinholeCamera, camera: PinholeCamera, *, goes_on: bool = True) -> np.ndarray:
+    """The plate as a camera of the same place with another picture size sees it.
+
+    Args:
+        plate: u8 [h,w,3].
+        source: its camera.
+        camera: of the picture.
+        goes_on: beyond its edges as in a mirror: grass stays grass, where a repeated last pixel is a streak. Else zero.
+    """
+    import cv2
+
+    scale = np.array(camera.focal) / np.array(source.focal)
+    # OpenCV counts from the middle of the first pixel
+    shift = np.array(camera.center) - 0.5 - scale * (np.array(source.center) - 0.5)
+    move = np.array([[scale[0], 0.0, shift[0]], [0.0, scale[1], shift[1]]])
+    way = cv2.INTER_AREA if scale[0] < 1 else cv2.INTER_CUBIC
+    if (scale == 1).all() and camera.size == source.size:
+        return plate.astype(np.float32) / 255.0
+    border = cv2.BORDER_REFLECT if goes_on else cv2.BORDER_CONSTANT
+    moved = cv2.warpAffine(plate, move, camera.size, flags=way, borderMode=border)
+    return moved.astype(np.float32) / 255.0

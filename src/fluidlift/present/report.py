@@ -1,0 +1,280 @@
+"""report.html: what was found, how sure it is, and what to look for in every picture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fluidlift.fit.outcome import TIES, how_sure, in_words
+from fluidlift.io.asset_paths import asset_file
+from fluidlift.look.report import Figure, Section, report_html
+from fluidlift.present.as_filmed import card_of
+from fluidlift.types import CellType
+from fluidlift.types.stages import Fit, Geometry, Lift, Refined, Shown, Simulation
+
+FILM_MAX = 12_000_000
+"""bytes of a preview that goes into the page: it should still open at once and fit into a mail"""
+
+
+def write_report(
+    lift: Lift, simulation: Simulation, shown: Shown, folder: Path, preset: str, timings: dict[str, Any],
+    warnings: list[str],
+) -> Path:  # fmt: skip
+    """report.html and the overlay picture.
+
+    Args:
+        lift: what was found in the clip.
+        simulation: of it.
+        shown: what was measured on its frames.
+        folder: of the asset.
+        preset: of the job.
+        timings: of the stages.
+        warnings: for its head.
+    """
+    from fluidlift.io.atomic import write_bytes
+    from fluidlift.io.images import write_png
+    from fluidlift.shape.segment import overlay
+
+    clip, labels, start = lift.clip, lift.labels, lift.geometry.rest_frame
+    write_png(folder / "mask_overlay.png", overlay(clip.frames[start], labels.labels[start]))
+    write_png(asset_file(folder, "rest/mask.png"), np.where(labels.fluid[start], 255, 0).astype(np.uint8))
+    sure = np.clip(labels.confidence[start].astype(np.float32), 0.0, 1.0)
+    write_png(asset_file(folder, "rest/mask_confidence.png"), (255 * sure + 0.5).astype(np.uint8))
+    sections = [
+        _section_as_filmed(shown),
+        _section_outcome(lift, shown),
+        _section_seeing(lift, overlay),
+        _section_body(lift.geometry, lift.refined),
+        _section_motion(lift),
+        _section_parameters(lift.fit, lift.geometry.scale_sentence),
+        _section_simulation(simulation),
+        Section(
+            "Time and memory",
+            rows=[
+                [name, f"{t['seconds']:.1f} s", "from cache" if t["cached"] else "", f"{t['peak_memory_mb']:.0f} MB"]
+                for name, t in timings.items()
+            ],
+            header=["stage", "time", "", "peak memory so far"],
+        ),
+    ]
+    page = report_html(
+        f"{clip.source} as a fluid asset",
+        f"kind: {lift.geometry.kind} · {len(clip)} frames at {1 / clip.interval:.4g} per second · {clip.size[0]} x "
+        f"{clip.size[1]} px · preset {preset}",
+        sections,
+        warnings=warnings,
+        film=_film(folder / "preview.mp4"),
+        links={"preview": "preview.mp4", "USD": "asset.usda", "parameters": "parameters.json", "scene": "scene.yaml"},
+    )
+    return write_bytes(folder / "report.html", page.encode())
+
+
+def _film(path: Path) -> bytes:
+    """The preview, where it is small enough to go into the page."""
+    return path.read_bytes() if path.is_file() and path.stat().st_size <= FILM_MAX else b""
+
+
+def _section_as_filmed(shown: Shown) -> Section:
+    """The card, first of all: whether what follows can be used."""
+    from fluidlift.evaluate.as_filmed import HEADER
+
+    card = card_of({"simulation": {"as_filmed": shown.as_filmed}})
+    if isinstance(card, str):
+        return Section("As filmed", notes=[f"How near the re-simulation stays to the clip is not known: {card}."])
+    said = card.sentence()
+    how = f"{card.frames} frames were compared with the clip at the same time, {card.beyond} after its end. "
+    how += "The floor is the same figure between the two halves of the clip."
+    return Section(
+        "As filmed", (), card.rows(), HEADER, [said[:1].upper() + said[1:] + ".", how, *card.notes, *card.advice]
+    )
+
+
+def _section_outcome(lift: Lift, seen: Shown) -> Section:
+    clip, start = lift.clip, lift.geometry.rest_frame
+    shown = () if seen.pictures is None else seen.pictures
+    figures = []
+    for k in sorted({0, len(shown) // 2, len(shown) - 1} if len(shown) else ()):
+        pair = np.concatenate([clip.frames[min(start + k, len(clip) - 1)], shown[k]], axis=1)
+        figures.append(
+            Figure(
+                pair,
+                f"Frame {start + k}: the clip (left) and the re-simulation from the same camera (right)",
+                "same outline and colours; the pattern need not be the same, how it moves should be",
+            )
+        )
+    return Section("Input and re-simulation", figures)
+
+
+def _section_seeing(lift: Lift, overlay) -> Section:
+    from fluidlift.look.pictures import colour_map
+
+    clip, labels = lift.clip, lift.labels
+    pick = sorted({0, len(clip) // 2, len(clip) - 1})
+    figures = [
+        Figure(
+            overlay(clip.frames[t], labels.labels[t]),
+            f"Frame {t}: what is taken for fluid is tinted, solids in it are marked",
+            "the tint covers the fluid up to its edge and nothing else; correct it with fluidlift mask",
+        )
+        for t in pick
+    ]
+    sure = labels.confidence[pick[1] if len(pick) > 1 else 0].astype(np.float32)
+    figures.append(
+        Figure(
+            colour_map(sure, low=0.0, high=1.0),
+            "How sure the mask is: dark is a guess, bright is sure",
+            "bright everywhere but along a thin line at the edge",
+        )
+    )
+    found, read = lift.segmentation, lift.read
+    rows = [
+        ["mask", "given by the user" if found.user_mask else "found from motion and colour"],
+        ["mean confidence on the fluid", found.confidence_mean],
+        ["share of the picture", found.fluid_share],
+        ["camera shake", f"{read.shake_px:.2f} px per frame" + (", taken out" if read.stabilised else "")],
+        ["optical flow trusted on", f"{100 * found.flow_trusted:.0f} % of the fluid"],
+    ]
+    return Section("What is fluid", figures, rows)
+
+
+def _section_body(g: Geometry, fitted: Refined) -> Section:
+    from fluidlift.look.pictures import colour_map
+
+    evidence, grid = g.kind_evidence, g.grid
+    rows: list[list[Any]] = [
+        ["kind", f"{g.kind} ({g.kind_source})"],
+        ["belief per kind", ", ".join(f"{k} {v:.2f}" for k, v in evidence.scores.items())],
+        ["evidence", ", ".join(f"{k} {v:.2f}" for k, v in evidence.features.items())],
+        *_surface_rows(g),
+        ["scale", g.scale_sentence.removeprefix("scale: ")],
+        ["grid", f"{' x '.join(map(str, grid.shape))} cells of {1000 * grid.spacing:.2f} mm"],
+        ["frames united", g.united_frames],
+        ["Gaussians", f"{len(fitted.body)} ({fitted.front} seen, {fitted.hull} hull, {fitted.filled} inside, "
+                      f"{fitted.pruned} pruned)"],
+    ]  # fmt: skip
+    if fitted.psnr_before is not None and fitted.psnr_after is not None:
+        kept = "" if fitted.kept else " (rejected by the depth guard)"
+        rows.append(["single-view refinement", f"PSNR {fitted.psnr_before:.1f} to {fitted.psnr_after:.1f} dB{kept}"])
+    depth, mask = g.depth, g.mask
+    figures = [
+        Figure(
+            colour_map(depth, mask & (depth > 0)),
+            "Distance of the visible surface: dark is near",
+            "a smooth slope that fits the scene; steps and holes mean a wrong surface: give --depth or --pitch",
+        ),
+        Figure(
+            g.plate,
+            "The clip without its fluid, which becomes the texture of the ground",
+            "bed and banks alone; what is left of the fluid will stick to the ground",
+        ),
+    ]
+    return Section("Body", figures, rows)
+
+
+def _surface_rows(geometry: Geometry) -> list[list[str]]:
+    """How the camera stands and what the surface was taken from, and how sure both are."""
+    up, slope, depth = geometry.up, geometry.slope, geometry.depth_source
+    tilt = f"{up.pitch:.1f} degrees, rolled {up.roll:.1f} ({up.source}, confidence {up.confidence:.2f})"
+    rows = [["camera looks down by", tilt]]
+    if depth is not None:
+        rows.append(["surface", f"by the {depth['source']}"])
+    elif slope is not None:
+        level = f"level with a probability of {slope.level_share:.2f}"
+        steep = f"{slope.slope:.1f} ± {slope.standard_error:.1f} degrees, {level} ({slope.source})"
+        rows.append(["slope of the surface", steep])
+    if geometry.jets:
+        rows.append(["jets above it", str(len(geometry.jets))])
+    return rows
+
+
+def _section_motion(lift: Lift) -> Section:
+    from fluidlift.look.pictures import velocity_slices
+    from fluidlift.motion.optical_flow import flow_picture
+
+    motion = lift.motion
+    figures = []
+    if motion.targets:
+        t = motion.targets[0].frame
+        raw, full = (np.asarray(x[t], np.float32) for x in (lift.flow.flow.displacement, motion.completed))
+        mask = lift.labels.fluid[t]
+        scale = float(np.percentile(np.linalg.norm(full[mask], axis=-1), 95)) if mask.any() else 1.0
+        figures = [
+            Figure(
+                flow_picture(raw, mask, scale),
+                f"Motion between frames {t} and {t + 1} as measured: hue is direction, brightness is speed",
+                "one family of hues along the stream; speckle is where the picture shows no motion",
+            ),
+            Figure(
+                flow_picture(full, mask, scale),
+                "The same after averaging over neighbouring frames and filling along the main stream",
+                "smooth, no holes, faster in the middle than at the banks",
+            ),
+        ]
+        cells = lift.geometry.setting.cell_types
+        wet = (cells == CellType.FLUID) | (cells == CellType.INFLOW)
+        figures.append(
+            Figure(
+                velocity_slices(motion.targets[0].velocity.at_centers(), wet),
+                "Speed in the volume: from above, along the stream, across it",
+                "slower towards the bed, nowhere cut off inside the fluid",
+            )
+        )
+    rows = [
+        [
+            r["frame"],
+            r.get("divergence_max", ""),
+            r.get("divergence_mean", ""),
+            r.get("flux_in", ""),
+            r.get("flux_out", ""),
+        ]
+        for r in motion.reports[:12]
+    ]
+    return Section(
+        "Motion", figures, rows, ["frame", "max |div| dx / speed", "mean", "flux in, m3/s", "flux out, m3/s"]
+    )
+
+
+def _section_parameters(fit: Fit, scale: str) -> Section:
+    from fluidlift.look.pictures import curve
+
+    rows = [[r["name"], r["value"], r["unit"], in_words(r), how_sure(r), r["prior"], r["source"]] for r in fit.table]
+    loss = fit.loss_history
+    figures = []
+    if len(loss):
+        picture = curve(loss, title="data term of the fit", x="iteration", y="loss")
+        figures.append(
+            Figure(
+                picture,
+                "Misfit of the velocities over the steps of the fit",
+                "falls and levels out; it may rise again once the noise is known and priors count",
+            )
+        )
+    how = {"fitted": "The fit converged.", "unfinished": "The fit did not converge: best values so far.",
+           "left": f"Not fitted: {fit.reason}."}  # fmt: skip
+    said = how.get(fit.status, f"The fit failed: {fit.reason}. The first guess is kept.")
+    return Section(
+        "Physical parameters", figures, rows,
+        ["parameter", "value", "unit", "between (95 %)", "how sure", "first guess", "where it comes from"],
+        [said, scale[:1].upper() + scale[1:] + ".", *TIES, *fit.notes],
+    )  # fmt: skip
+
+
+def _section_simulation(done: Simulation) -> Section:
+    from fluidlift.look.pictures import curve
+
+    figures = [
+        Figure(
+            curve(done.volume / max(done.volume[0], 1e-12), title="volume over its start", x="frame", y="ratio"),
+            "Volume of the simulated fluid, as a multiple of the first frame's",
+            "close to 1 all the way; a slope means more flows in than out, or the reverse",
+        ),
+        Figure(
+            curve(done.count, title="particles", x="frame", y="count"),
+            "Particles of the simulation",
+            "level, or slowly rising while an inlet fills; a fall means fluid that left",
+        ),
+    ]
+    rows = [["largest share of particles inside the terrain", f"{100 * float(done.leak.max()):.2f} %"]]
+    return Section("Re-simulation", figures, rows)

@@ -1,0 +1,388 @@
+"""What the splats of a simulated fluid look like in each frame.
+
+Every particle carries a splat of the body at rest, deformed with it (paper: A = F A0 F^T). Over what lies, they are
+under a skin whose pattern moves with the flow without being stirred into streaks (`look.texture_patches`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from fluidlift.errors import InputRejected
+from fluidlift.types import Gaussians, Particles, PinholeCamera, concatenate, kind_of, sh_from_rgb
+
+if TYPE_CHECKING:
+    from fluidlift.look.filmed_outline import FilmedOutline
+    from fluidlift.look.footage import FluidFootage
+    from fluidlift.look.seen_texture import SeenTexture
+    from fluidlift.look.surface_axes import SurfaceAxes
+    from fluidlift.look.surface_map import SurfaceMap
+    from fluidlift.look.texture_patches import TexturePatches
+    from fluidlift.scene.build import Scene
+
+MAX_STRETCH = 3.0
+"""longest axis over the mean one before a Gaussian starts again round: longer ones show as hair"""
+
+MIXED = 0.42
+"""standard deviation up to which splats close up with their neighbours, cells: that of a splat of the inside"""
+
+LARGEST = 1.2
+"""standard deviation of a splat at most, cells"""
+
+PATCH = 0.12
+"""radius of a patch of the skin, shares of the body's longer side in plan"""
+
+FEWEST_CELLS = 4.0
+"""radius of a patch at least, cells"""
+
+UPRIGHT = 0.9
+"""cosine between gravity and straight down from which the surface has one height at each place"""
+
+COVERED = ((-0.6, -0.3), (0.6, 1.0))
+"""cells from the surface between which the skin takes over from what is below, and spray from the skin"""
+
+FAINT = 0.002
+"""least opacity of a splat under the skin: not drawn, but there for other tools"""
+
+TINTED = 1.5
+"""cells about the surface within which particles wear the skin's colours"""
+
+CLEAR = 0.1
+"""cells from the ground within which the skin is left out"""
+
+LOOKED_UP = 1 / 6 + 0.3
+"""variance (px^2) of the blur between a film and its splats' picture beside that of the splats: a bilinear look-up
+(a triangle of one pixel to each side, 1/6), and what the rasteriser adds to each splat"""
+
+AS_AT_REST = "its surface looks as it did at rest"
+"""what follows where there is no film to play"""
+
+FINE = 1.7
+"""px of the film between tracers of a skin that plays it, at most: with splats of `WIDTH` spacings the finest band
+of a Laplacian pyramid keeps half of its energy, which sharpening the film gives back"""
+
+SMALLEST = 0.02
+"""standard deviation of a splat at least, cells: files hold its logarithm"""
+
+REACH = 0.5
+"""standard deviation of a splat under the skin at most, shares of its distance from the ground and `CLEAR`: wider ones
+would lie over the rocks beside them"""
+
+
+Inside = Callable[[np.ndarray], np.ndarray]
+
+
+class Dressed(NamedTuple):
+    """One frame."""
+
+    gaussians: Gaussians
+    ids: np.ndarray
+    velocities: np.ndarray
+    """m/s"""
+
+
+def lends_look(scene: Scene, own: Gaussians) -> np.ndarray:
+    """Which of the body's own Gaussians show the fluid as such: in the picture, away from rocks and banks."""
+    from fluidlift.look.inflow import surface_level
+    from fluidlift.physics.inlet import clear_of_shore
+    from fluidlift.shape.off_picture import in_picture
+
+    level = surface_level(own.means, 0.5 * scene.terrain.grid.spacing)(own.means[:, :2])
+    return in_picture(own.means, scene.camera) & clear_of_shore(own.means, level, scene.terrain)
+
+
+def _footage(film: Path, camera: PinholeCamera, means: np.ndarray, cell: float) -> FluidFootage | str:
+    """The film of an asset, taken apart; or what is wrong with it, in words.
+
+    Args:
+        film: its file.
+        camera: that took it.
+        means: of the body's Gaussians, m.
+        cell: width of the simulator's cells, m.
+    """
+    from fluidlift.io.footage_file import size_of_film
+    from fluidlift.look.surface_skin import PITCH, WIDTH, finer, level_for
+
+    if not film.is_file():
+        return f"is missing: {AS_AT_REST}; make the asset again"
+    small = camera.resized(size_of_film(camera.size))
+    coarse = PITCH * cell * small.focal[0] / np.maximum(small.project(means)[1], 1e-6)
+    apart = float(np.median(coarse * finer(level_for(coarse, FINE))))
+    blur = float(np.sqrt((WIDTH * apart) ** 2 + LOOKED_UP))
+    written = film.stat()
+    return _taken_apart(film, camera.size, blur, (written.st_mtime_ns, written.st_size))
+
+
+@lru_cache(maxsize=1)
+def _taken_apart(film: Path, size: tuple[int, int], blur: float, written: tuple[int, int]) -> FluidFootage | str:
+    """As `_footage`, of a file as it was `written`. The last one is kept: it takes a second or two, and a live preview
+    begins anew with every edit."""
+    from fluidlift.io.footage_file import read_footage
+    from fluidlift.look.footage import FEWEST, FluidFootage
+
+    try:
+        frames, fluid, interval = read_footage(film, size)
+    except InputRejected as error:
+        return f"is damaged ({error.got}): {AS_AT_REST}; make the asset again"
+    if len(frames) < FEWEST:
+        return f"has {len(frames)} frames and needs {FEWEST}: {AS_AT_REST}; make the asset from a longer clip"
+    found = FluidFootage.of(frames, fluid, interval, blur=blur)
+    return f"shows none: {AS_AT_REST}; make the asset again" if found is None else found
+
+
+class Dressing:
+    """Splats for the particles of a scene, frame by frame from the first one on."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene, self._cell = scene, scene.terrain.grid.spacing
+        self._camera = scene.camera
+        self.warnings: tuple[str, ...] = ()
+        """what is missing for the usual look, in words"""
+        self._patches: TexturePatches | None = None
+        self._surface: SurfaceMap | None = None
+        self._axes: SurfaceAxes
+        self._outline: FilmedOutline | None = None
+        self._plays = False
+        self._own = scene.rest.select(np.arange(len(scene.rest) - sum(map(len, scene.emitter_looks))))
+        if len(self._own) and len(scene.body):
+            self._lay_skin()
+
+    def _lay_skin(self) -> None:
+        from fluidlift.look.filmed_outline import FilmedOutline
+        from fluidlift.look.picture_texture import PictureTexture
+        from fluidlift.look.surface_axes import PictureAxes, PlanAxes
+        from fluidlift.look.texture_patches import TexturePatches
+
+        scene, own = self._scene, self._own
+        gravity = np.asarray(scene.parameters.gravity, np.float64)
+        upright = -gravity[2] > UPRIGHT * max(float(np.linalg.norm(gravity)), 1e-12)
+        footage = self._film_of(own)
+        if kind_of(scene.kind).nearly_level and upright:
+            self._axes = PlanAxes()
+        elif footage is not None:
+            self._axes = PictureAxes(self._camera, float(np.median(self._camera.project(own.means)[1])))
+        else:
+            return
+        surface = self._surface_of(scene.body)
+        if surface is None:
+            return
+        if isinstance(self._axes, PlanAxes):
+            texture = self._seen_texture(surface, footage)
+        else:
+            assert footage is not None
+            texture = PictureTexture(self._axes, surface, footage)
+        if not texture.usable:
+            return
+        places = self._axes.points(own.means)
+        across = float(np.ptp(places[self._axes.shown(places), :2], axis=0).max(initial=0.0))
+        self._patches = TexturePatches(
+            texture, max(PATCH * across, FEWEST_CELLS * self._cell), footage=footage, edited=scene.edited,
+            start=scene.film_start,
+        )  # fmt: skip
+        if footage is not None and kind_of(scene.kind).is_channel_flow and not scene.edited:
+            self._outline = FilmedOutline(self._camera, footage.outside, self._cell)
+        self._plays = footage is not None
+        self._begin_again()
+
+    def _film_of(self, own: Gaussians) -> FluidFootage | None:
+        """The film that the surface plays, whose size the camera has from here on; one that cannot be is a warning."""
+        scene = self._scene
+        if scene.film is None or kind_of(scene.kind).is_gas:
+            return None
+        found = _footage(scene.film, scene.camera, own.means, self._cell)
+        if isinstance(found, str):
+            self.warnings = (f"the film of the fluid {found}",)
+            return None
+        self._camera = scene.camera.resized((found.mean.shape[1], found.mean.shape[0]))
+        return found
+
+    def _level_at(self, places: np.ndarray) -> np.ndarray:
+        """How fine the skin is at places of the map: as the film's pixels are there, 0 beside its picture."""
+        from fluidlift.look.surface_skin import PITCH, level_for
+
+        assert self._surface is not None
+        heights = self._surface.at(self._surface.height, places)
+        world = self._axes.world_points(np.concatenate([places, heights[:, None]], axis=1))
+        camera = self._camera
+        uv, depth = camera.project(world)
+        inside = (depth > 0) & ((uv >= 0) & (uv <= np.array(camera.size))).all(axis=1)
+        apart = PITCH * self._cell * camera.focal[0] / np.maximum(depth, 1e-6)
+        return np.where(inside, level_for(apart, FINE), 0)
+
+    def _seen_texture(self, surface: SurfaceMap, footage: FluidFootage | None) -> SeenTexture:
+        from fluidlift.look.inflow import ENDS
+        from fluidlift.look.seen_texture import SeenTexture
+        from fluidlift.shape.off_picture import in_picture
+
+        scene, own = self._scene, self._own
+        if footage is not None:
+            # each place shows its own film: shores, and what stands in the water's picture, as well
+            return SeenTexture(own, self._camera, surface, usable=in_picture(own.means, scene.camera))
+        along = own.means @ scene.terrain.mainstream
+        share = (along - along.min()) / max(float(np.ptp(along)), 1e-12)
+        usable = lends_look(scene, own) & (share > ENDS[0]) & (share < ENDS[1])
+        return SeenTexture(own, scene.camera, surface, shading=scene.shading, usable=usable)
+
+    def _surface_of(self, particles: Particles) -> SurfaceMap | None:
+        """The map of the surface; None where nothing is on it."""
+        from fluidlift.look.surface_map import SurfaceMap
+
+        points = self._axes.points(particles.positions)
+        shown = self._axes.shown(points)
+        if not shown.any():
+            return None
+        moving = self._axes.velocities(particles.positions, particles.velocities)
+        surface = SurfaceMap.of(points[shown], moving[shown], self._cell)
+        return surface if self._outline is None else self._outline.cut(surface, self._axes)
+
+    def _begin_again(self) -> None:
+        from fluidlift.look.surface_skin import SurfaceSkin
+        from fluidlift.look.texture_patches import Patches
+
+        assert self._patches is not None
+        self._patches.state, self._skin = (
+            Patches.none(),
+            SurfaceSkin(self._cell, self._level_at if self._plays else None),
+        )
+
+    def advance(self, particles: Particles, number: int) -> None:
+        """Bring what floats on the surface to a frame; every frame after the last one, in order."""
+        if self._patches is None or not len(particles):
+            return
+        if number == 0:
+            self._begin_again()
+        rng = np.random.default_rng([self._scene.seed, number])
+        interval = self._scene.interval if number else 0.0
+        self._surface = self._surface_of(particles)
+        if self._surface is None:
+            return
+        self._patches.advance(self._surface, interval, rng)
+        self._skin.advance(self._surface, interval, rng)
+
+    def dressed(self, particles: Particles, number: int, inside: Inside | None = None) -> Dressed:
+        """The splats of a frame to which `advance` has come. Ids of particles are even, those of the skin odd.
+
+        Args:
+            particles: of the frame.
+            number: of the frame, from 0.
+            inside: (points [n,3]) -> whether they are in an obstacle, where there is no skin; None: no obstacles.
+        """
+        from fluidlift.look.mixing import mixed
+        from fluidlift.physics.deform import deform_gaussians
+
+        scene = self._scene
+        shown = deform_gaussians(scene.rest, particles, max_stretch=MAX_STRETCH, max_size=LARGEST * self._cell)
+        if number:  # at rest nothing is drawn out
+            shown = mixed(shown, particles.deformation, widest=MIXED * self._cell)
+        shown = self._shaded(shown, particles.source)
+        if not number or self._patches is None or self._surface is None or not len(particles):
+            return Dressed(shown, 2 * particles.ids, particles.velocities)
+        return self._with_skin(shown, particles, self._surface, self._patches, inside)
+
+    def _shaded(self, shown: Gaussians, source: np.ndarray) -> Gaussians:
+        """The splats with the shade of the places where they are now; those with a colour of their own keep it."""
+        scene = self._scene
+        if scene.shading is None:
+            return shown
+        painted = (scene.rest.means if scene.painted is None else scene.painted)[source]
+        own = ~np.isfinite(painted).all(axis=1)
+        moved = scene.shading.moved(shown, np.where(own[:, None], shown.means, painted))
+        return moved if not own.any() else replace(moved, sh=np.where(own[:, None, None], shown.sh, moved.sh))
+
+    def _with_skin(
+        self,
+        shown: Gaussians,
+        particles: Particles,
+        surface: SurfaceMap,
+        patches: TexturePatches,
+        inside: Inside | None,
+    ) -> Dressed:
+        from fluidlift.look.smoothstep import smoothstep
+        from fluidlift.look.surface_skin import dyed
+
+        skin, axes, places = self._skin, self._axes, self._axes.points(particles.positions)
+        xy = places[:, :2]
+        above = (places[:, 2] - surface.at(surface.height, xy)) / self._cell
+        below, spray = COVERED
+        covered = smoothstep(above, *below) * (1 - smoothstep(above, *spray)) * (surface.presence(xy) > 0.5)
+        room = REACH * np.maximum(self._clearance(shown.means) + CLEAR * self._cell, CLEAR * self._cell)
+        if self._outline is not None:
+            filmed = self._outline.room(shown.means)
+            covered = np.where(filmed > 0, covered, 1.0)
+            room = np.minimum(room, np.maximum(filmed, SMALLEST * self._cell))
+        scales = np.minimum(shown.scales, room[:, None]).astype(np.float32)
+        opacities = np.minimum(shown.opacities, np.maximum(shown.opacities * (1 - covered), FAINT)).astype(np.float32)
+        sh, own = shown.sh.copy(), self._own_colors(particles.source)
+        near = np.flatnonzero((np.abs(above) < TINTED) & (covered < 1) & ~own)
+        color, there = patches.colors(places[near])
+        sh[near[there], :1] = sh_from_rgb(color[there])
+        points = skin.points(surface)
+        color, there = patches.colors(points)
+        color = dyed(color, points, surface, replace(shown, means=axes.points(shown.means)), own, self._cell)
+        world = axes.world_points(points)
+        if self._outline is None:
+            there &= self._clearance(world) > CLEAR * self._cell
+        else:
+            there &= self._outline.inside(world)
+        if inside is not None:
+            there &= ~inside(world)
+        tracers = axes.world_splats(skin.splats(surface, color).select(there))
+        speeds = axes.world_velocities(points[there], surface.at(surface.velocity, skin.places[there]))
+        return Dressed(
+            concatenate([replace(shown, scales=scales, opacities=opacities, sh=sh), tracers]),
+            np.concatenate([2 * particles.ids, 2 * skin.ids[there] + 1]),
+            np.concatenate([particles.velocities, speeds.astype(np.float32)]),
+        )
+
+    def _own_colors(self, source: np.ndarray) -> np.ndarray:
+        """Which particles bring a colour of their own, as dye does."""
+        painted = self._scene.painted
+        return np.zeros(len(source), bool) if painted is None else ~np.isfinite(painted[source]).all(axis=1)
+
+    def _clearance(self, points: np.ndarray) -> np.ndarray:
+        """How far points are from the ground, m; negative inside it."""
+        from fluidlift.numerics.sampling import sample_nodes
+
+        terrain = self._scene.terrain
+        return sample_nodes(terrain.signed_distance, terrain.grid, points)
+
+    def state(self) -> dict[str, np.ndarray]:
+        """What changes from frame to frame, as plain arrays."""
+        if self._patches is None:
+            return {}
+        patches = {f"patches.{name}": np.array(value) for name, value in vars(self._patches.state).items()}
+        skin = {f"skin.{name}": getattr(self._skin, name).copy() for name in ("places", "ids", "levels")}
+        return patches | skin | {"skin.next_id": np.int64(self._skin.next_id)}
+
+    def restore(self, state: dict[str, np.ndarray]) -> None:
+        """Go to a state of `state`.
+
+        Raises:
+            InputRejected: something is missing, of the wrong shape or not finite; nothing has changed then.
+        """
+        from fluidlift.look.texture_patches import Patches
+
+        if self._patches is None:
+            return
+        try:
+            parts = {n.removeprefix("patches."): np.array(a) for n, a in state.items() if n.startswith("patches.")}
+            patches, places = Patches(**parts), np.array(state["skin.places"], np.float64)
+            ids, next_id = np.array(state["skin.ids"], np.int64), int(state["skin.next_id"])
+            levels = np.array(state["skin.levels"], np.int64)
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputRejected(f"the state of a surface that does not fit: {error}") from None
+        n = len(patches.turns)
+        shapes = [(patches.centers, (n, 2)), (patches.sources, (n, 2)), (places, (len(ids), 2)), (levels, ids.shape)]
+        shapes += [(a, (n,)) for a in (patches.turns, patches.strains, patches.presences, patches.instants)]
+        shapes += [(np.nan_to_num(patches.ends, posinf=0.0), (n,))]  # without footage they do not end
+        for array, shape in shapes:
+            if array.shape != shape or not np.isfinite(array).all():
+                raise InputRejected("the state of a surface with arrays of another shape, or not finite", "a whole one")
+        self._patches.state = patches
+        self._skin.places, self._skin.ids, self._skin.levels, self._skin.next_id = places, ids, levels, next_id

@@ -1,0 +1,71 @@
+"""What a fluid rests in: cells and terrain from its surface, and the ground's texture or colours."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import cast
+
+import numpy as np
+from jaxtyping import UInt8
+
+from fluidlift.shape import airborne, channel, generate, ground_mesh, ground_texture, place, plan
+from fluidlift.shape.jets import lying_pixels
+from fluidlift.types import Label, PinholeCamera, Setting, kind_of
+from fluidlift.types.fluid_masks import parts_of
+
+
+def setting_around(
+    kind, front, fluid, start, united, camera, to_world, depth, half, bulk, c, falls, **known
+) -> Setting:
+    """Terrain and cells around a surface; what is known beside it goes to `plan.Footage`."""
+    mask = generate.united_mask(fluid[start : start + united])
+    visible = mask & (depth > 0)
+    grid = camera.pixel_grid()
+    near = camera.unproject(grid[visible & ~falls], depth[visible & ~falls])
+    if front.height is not None:
+        labels, height = seen_labels(fluid, start, united, falls), place.PlacedHeight(front.height, to_world)
+        seen = plan.Footage(height, labels, near, camera, bulk, ever=fluid.any_frame(), **known)
+        return channel.channel_setting(seen, channel.ChannelConfig(kind, c.cells, c.cell_limit, c.depth_ratio))
+    back = depth + 2 * half
+    far = camera.unproject(grid[visible], back[visible])
+    # the box holds what the clip shows later, in the same vertical plane
+    later = fluid.any_frame()
+    middle = np.median((depth + half)[visible])
+    reach = camera.unproject(grid[later], np.full(int(later.sum()), middle))
+    return airborne.airborne_setting(
+        depth, back, visible, camera, np.concatenate([near, far, reach]), bulk,
+        # smoke needs the whole box, and is cheap per cell: no free surface, few particles
+        kind=kind, longest=c.cells, cell_limit=c.cell_limit * (2 if kind_of(kind).is_gas else 1),
+    )  # fmt: skip
+
+
+def seen_labels(fluid, start: int, united: int, falls: np.ndarray) -> np.ndarray:
+    """`Label` of each pixel over the united frames; a rock is one though waves wash over it in some."""
+    window = slice(start, start + united)
+    solid, lying = solid_share(fluid.labels[window]) > 0.5, lying_pixels(generate.united_mask(fluid[window]), falls)
+    return np.where(solid, Label.SOLID, np.where(lying, Label.FLUID, Label.BACKGROUND)).astype(np.uint8)
+
+
+def textured(setting: Setting, view: ground_texture.View) -> Setting:
+    """The setting, its terrain with the picture on it."""
+    solid = setting.terrain
+    mesh = ground_texture.textured(solid.mesh, solid.grid, cast(np.ndarray, setting.surface_height), view)
+    return replace(setting, terrain=replace(solid, mesh=mesh))
+
+
+def solid_share(labels: np.ndarray) -> np.ndarray:
+    """float [H,W]: share of the frames, u8 [T,H,W], in which a pixel shows something solid."""
+    parts = (labels[part] == Label.SOLID for part in parts_of(labels))
+    return np.sum([part.sum(axis=0) for part in parts], axis=0) / len(labels)
+
+
+def finished(setting: Setting, plate: UInt8[np.ndarray, "h w 3"], camera: PinholeCamera) -> Setting:
+    """The setting in float32, its ground in the colours of the plate where it has no texture."""
+    mesh = setting.terrain.mesh
+    if len(mesh.faces) and mesh.texture is None:
+        mesh = replace(mesh, colors=ground_mesh.ground_colours(mesh, plate, camera))
+    height = None if setting.surface_height is None else setting.surface_height.astype(np.float32)
+    return replace(
+        setting, terrain=replace(setting.terrain, mesh=mesh), surface_height=height,
+        bed_height=setting.bed_height.astype(np.float32),
+    )  # fmt: skip

@@ -1,0 +1,3 @@
+"""The fixtures of `small_scene`."""
+
+from small_scene import camera, channel, finished  # noqa: F401

@@ -1,0 +1,214 @@
+"""An asset carries a film of its fluid, which its surface plays; where it cannot, that is said and all else stays."""
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fluidlift.cli import REJECTED, WITH_WARNINGS, main
+from fluidlift.config import JobConfig
+from fluidlift.io.asset_folder import FILES, load_asset, read_manifest
+from fluidlift.io.footage_file import read_footage, write_footage
+from fluidlift.io.video import read_clip
+from fluidlift.look.footage import FEWEST
+from fluidlift.pipeline.preview import preview_scene
+from fluidlift.scene.build import SimulationRequest, film_of, first_of_film, scene_of
+from fluidlift.scene.simulator import simulator_of
+from fluidlift.scene.surface_appearance import Dressing
+
+FRAMES = 4
+CONSEQUENCE = "its surface looks as it did at rest"
+
+
+def film(path, count=16, size=(64, 48), fluid=True):
+    """Grain that is another one in each frame, bright red: the body at rest is grey."""
+    rng = np.random.default_rng(0)
+    frames = np.clip([200, 60, 40] + 20 * rng.normal(size=(count, size[1], size[0], 3)), 0, 255).astype(np.uint8)
+    return write_footage(path, frames, np.full((count, size[1], size[0]), fluid), 0.04)
+
+
+def dressed(scene):
+    """The dressing, and the splats of the last of a few frames."""
+    simulator, dressing = simulator_of(scene), Dressing(scene)
+    for k in range(FRAMES):
+        if k:
+            simulator.advance(scene.interval)
+        dressing.advance(simulator.particles, k)
+    return dressing, dressing.dressed(simulator.particles, FRAMES - 1)
+
+
+def is_red(shown) -> bool:
+    skin = shown.ids % 2 == 1
+    mean = shown.gaussians.rgb[skin].mean(axis=0)
+    return bool(mean[0] > mean[2] + 0.3)
+
+
+# what the surface plays -----------------------------------------------------------------------------------------
+
+
+def test_the_surface_plays_the_film(channel, tmp_path):
+    dressing, shown = dressed(channel(FRAMES, film=film(tmp_path / "film.mp4")))
+    assert dressing.warnings == () and is_red(shown)
+
+
+def test_a_fall_plays_its_film_on_a_map_over_the_picture(channel, tmp_path):
+    """Without one it has no skin, as nothing else is known of how it looks over time."""
+    path = film(tmp_path / "film.mp4")
+    dressing, shown = dressed(channel(FRAMES, kind="fall", film=path))
+    assert dressing.warnings == () and (shown.ids % 2 == 1).any() and is_red(shown)
+    _, plain = dressed(channel(FRAMES, kind="fall"))
+    assert (plain.ids % 2 == 0).all()
+
+
+def test_a_film_smaller_than_the_clip_is_played_all_the_same(channel, tmp_path, monkeypatch):
+    """Clips may be larger than their film: the camera is the same, with larger pixels."""
+    from fluidlift.io import footage_file
+
+    monkeypatch.setattr(footage_file, "LARGEST", 32)
+    path = film(tmp_path / "film.mp4")
+    for kind in ("stream", "fall"):
+        dressing, shown = dressed(channel(FRAMES, kind=kind, film=path))
+        assert dressing.warnings == () and is_red(shown)
+
+
+def broken(path, fault):
+    """A film that cannot be played, and the word by which its warning names that."""
+    if fault == "missing":
+        return "missing"
+    if fault == "short":
+        film(path, FEWEST - 1)
+        return f"{FEWEST - 1} frames"
+    if fault == "dry":
+        film(path, fluid=False)
+        return "none"
+    film(path, size=(96, 64) if fault == "size" else (64, 48))
+    data = path.read_bytes()
+    path.write_bytes({"size": data, "cut": data[: len(data) // 2], "text": b"no film " * 99, "empty": b""}[fault])
+    return "damaged"
+
+
+@pytest.mark.parametrize("fault", ["missing", "short", "dry", "size", "cut", "text", "empty"])
+def test_a_film_that_cannot_be_played_is_a_warning_and_the_look_is_that_without_one(channel, tmp_path, fault):
+    path = tmp_path / "film.mp4"
+    word = broken(path, fault)
+    dressing = Dressing(channel(FRAMES, film=path))
+    (text,) = dressing.warnings
+    assert word in text and CONSEQUENCE in text and "make the asset" in text
+    plain = Dressing(channel(FRAMES))
+    assert plain.warnings == ()
+    p = simulator_of(channel(FRAMES)).particles
+    for k in range(2):  # the same particles at both instants: what differs is the look alone
+        dressing.advance(p, k)
+        plain.advance(p, k)
+    one, two = dressing.dressed(p, 1), plain.dressed(p, 1)
+    np.testing.assert_array_equal(one.ids, two.ids)
+    np.testing.assert_array_equal(one.gaussians.sh, two.gaussians.sh)
+    np.testing.assert_array_equal(one.gaussians.means, two.gaussians.means)
+
+
+def test_a_fall_without_its_film_is_told_as_well(channel, tmp_path):
+    dressing, shown = dressed(channel(FRAMES, kind="fall", film=tmp_path / "gone.mp4"))
+    assert CONSEQUENCE in dressing.warnings[0] and (shown.ids % 2 == 0).all()
+
+
+def test_a_film_is_taken_apart_once_and_again_when_it_has_changed(channel, tmp_path):
+    """A live preview begins anew with every edit."""
+    from fluidlift.scene.surface_appearance import _taken_apart
+
+    path = film(tmp_path / "film.mp4")
+    scene, before = channel(FRAMES, film=path), _taken_apart.cache_info()
+    for _ in range(2):
+        assert Dressing(scene).warnings == ()
+    after = _taken_apart.cache_info()
+    assert after.misses == before.misses + 1 and after.hits == before.hits + 1
+    path.write_bytes(b"something else")
+    assert CONSEQUENCE in Dressing(scene).warnings[0]
+
+
+def test_another_film_is_another_look_and_a_missing_one_is_none(channel, tmp_path):
+    """Frames on disk, and the checkpoint, are those of one film."""
+    one, two = film(tmp_path / "a.mp4"), film(tmp_path / "b.mp4", count=17)
+    looks = {name: channel(FRAMES, film=p).parts["look"] for name, p in (("none", None), ("one", one), ("two", two))}
+    assert len(set(looks.values())) == 3
+    assert channel(FRAMES, film=tmp_path / "gone.mp4").parts["look"] == looks["none"]
+    assert channel(FRAMES, film=one, film_start=3).parts["look"] != looks["one"]
+
+
+def test_a_film_begins_so_that_it_holds_the_body_at_rest():
+    assert first_of_film(0, 300) == 0 and first_of_film(40, 60) == 0
+    assert first_of_film(100, 300) == 100, "from the body at rest on"
+    assert first_of_film(250, 300) == 180, "as long as a film may be, to the clip's end"
+
+
+# what an asset holds ------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def copy(made, tmp_path):
+    return shutil.copytree(made.folder, tmp_path / "stream.fluid")
+
+
+def simulate(folder):
+    return main(["sim", str(folder), "--set", "show.usd=false", "--set", "show.preview=false", "--duration", "0.12"])
+
+
+def said_of(folder):
+    return read_manifest(folder)["simulation"]["warnings"]
+
+
+def test_a_stream_carries_the_clip_with_its_masks(made, finished):
+    manifest, clip = read_manifest(made.folder), read_clip(made.clip)
+    assert manifest["files"]["film"] == FILES["film"] and FILES["film"] in manifest["hashes"]
+    frames, fluid, interval = read_footage(made.folder / FILES["film"], clip.size)
+    first = first_of_film(manifest["metrics"]["rest_frame"], len(clip))
+    assert len(frames) == len(clip) - first and interval == pytest.approx(clip.interval, rel=1e-3)
+    # the clip is grain of a pixel in two colours, and 4:2:0 keeps half of its colour
+    assert np.abs(frames.astype(int) - clip.frames[first:]).mean() < 6
+    labels = finished.lift.labels.labels
+    assert (fluid != (labels[first:] == 1)).mean() < 0.01  # FLUID; the coder rounds the mask's corners
+    assert not [w for w in said_of(made.folder) if "film" in w]
+
+
+def test_smoke_carries_none(catalogue_asset):
+    folder = catalogue_asset("plume").folder
+    assert not (folder / FILES["film"]).exists() and "film" not in read_manifest(folder)["files"]
+    assert film_of(folder) is None
+
+
+@pytest.mark.parametrize("fault", ["missing", "damaged"])
+def test_an_asset_whose_film_is_gone_or_damaged_simulates_with_a_warning(copy, fault):
+    path = copy / FILES["film"]
+    if fault == "missing":
+        path.unlink()
+    else:
+        path.write_bytes(path.read_bytes()[:4000])
+    assert simulate(copy) == WITH_WARNINGS
+    (text,) = [w for w in said_of(copy) if "film of the fluid" in w]
+    assert fault in text and CONSEQUENCE in text
+
+
+def test_a_film_that_is_a_link_is_not_followed(copy, tmp_path):
+    path, other = copy / FILES["film"], tmp_path / "other.mp4"
+    shutil.move(path, other)
+    path.symlink_to(other)
+    before = sorted(p.name for p in (copy / "frames" / "splats").iterdir())
+    assert simulate(copy) == REJECTED
+    assert sorted(p.name for p in (copy / "frames" / "splats").iterdir()) == before
+
+
+def test_a_film_that_the_manifest_does_not_list_is_not_played(channel, tmp_path):
+    """A folder that is no asset has none, whatever lies in it."""
+    film(tmp_path / FILES["film"])
+    assert film_of(tmp_path) is None
+
+
+def test_meshes_in_another_folder_and_a_preview_do_not_lose_the_film(made, tmp_path):
+    asset = load_asset(made.folder)
+    request = SimulationRequest(meshes=tmp_path)
+    scene = scene_of(asset, made.folder, request, JobConfig(), footage=None, start=0)
+    assert scene.film == made.folder / FILES["film"]
+    shown = preview_scene(asset, made.folder, {}, 2)
+    start = read_manifest(made.folder)["metrics"]["rest_frame"]
+    assert shown.film == scene.film and shown.film_start == start - first_of_film(start, asset.frame_count)
+    assert replace(scene, film=None).parts["look"] != scene.parts["look"]

@@ -26,8 +26,10 @@ from fluidlift.shape import (
     texture_gradient,
 )
 from fluidlift.shape import kind as kinds
+from fluidlift.shape.frame_pictures import typical_picture
 from fluidlift.shape.framing import framing_warnings
 from fluidlift.shape.given_depth import DepthPictures
+from fluidlift.shape.view import look_at
 from fluidlift.types import (
     CellType,
     Gaussians,
@@ -250,8 +252,10 @@ def _kind_and_up(story, inputs, config, known, pose_given, mask, motion, trust, 
     texture = None
     if kind == "stream" and c.pitch is None and not parts.puddle:
         texture = texture_gradient.texture_patches(clip.frames, parts.lying & ~parts.falling)
+    typical = typical_picture(clip.frames[pick]).astype(np.uint8)
+    picture = look_at(typical, fluid.any_frame(), parts.lying if kind == "stream" else None, texture)
     up = kinds.estimate_up(
-        kind, parts.lying, motion, trust * ~parts.falling, known, pitch=c.pitch, roll=c.roll, texture=texture,
+        kind, parts.lying, motion, trust * ~parts.falling, known, picture, given=(c.pitch, c.roll),
         level_prior=composite.level_prior(parts, motion, trust),
     )  # fmt: skip
     if parts.puddle and c.pitch is None:

@@ -18,7 +18,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from results import table
+from report import table
 
 from fluidlift.evaluate.as_filmed import AsFilmed, Likeness
 from fluidlift.io.asset_folder import read_manifest

@@ -2,7 +2,7 @@
 
     python benchmarks/geometry.py --work runs
     python benchmarks/geometry.py --work runs --only river --sheets sheets
-    python benchmarks/geometry.py --work runs --page docs/results.md --before before.json
+    python benchmarks/geometry.py --work runs --page docs/experiments/2026-11-geometry.md --before before.json
 
 Subjects are the demo of the package, scenes that the package simulates and films (kept in --work), and the cases below
 FLUIDLIFT_SHARED or a folder `shared` beside the repository. Masks and motion are the pipeline's own estimates; only the
@@ -25,10 +25,10 @@ from typing import Any
 
 import cv2
 import numpy as np
+from clips import subjects as runs
 from motion_page import replace_section
 from motion_subjects import Subject, default_shared, prepare, subjects
-from results import subjects as runs
-from results import table
+from report import table
 from scipy import ndimage
 
 from fluidlift.config import build_config
@@ -46,7 +46,6 @@ from fluidlift.pipeline.make import STAGES
 from fluidlift.pipeline.reading import Inputs, clip_of
 from fluidlift.pipeline.story import Silence, Story
 from fluidlift.shape.airborne import inside_body
-from fluidlift.shape.kind import PITCH_PRIOR
 from fluidlift.shape.place import pose_up
 from fluidlift.shape.surface import inflated_surface, level_surface
 from fluidlift.types import (
@@ -58,6 +57,7 @@ from fluidlift.types import (
     Grid,
     PinholeCamera,
     concatenate,
+    kind_of,
 )
 
 BEGIN, END = "<!-- geometry:begin -->", "<!-- geometry:end -->"
@@ -166,7 +166,7 @@ def _tilted(camera: PinholeCamera, kind: str) -> PinholeCamera:
     """The camera in a world that is level where it is known to be, and where people usually hold it else."""
     forward = camera.camera_from_world.rotation[2]
     pitch = float(np.degrees(np.arcsin(np.clip(-forward[2], -1, 1))))
-    pitch = pitch if pitch > 5.0 else PITCH_PRIOR[kind][0]
+    pitch = pitch if pitch > 5.0 else kind_of(kind).usual_pitch[0]
     ahead = (0.0, float(np.cos(np.radians(pitch))), -float(np.sin(np.radians(pitch))))
     posed = PinholeCamera.looking((0.0, 0.0, 0.0), ahead, 50.0, camera.size)
     return PinholeCamera(camera.focal, camera.center, camera.size, posed.camera_from_world)
@@ -273,7 +273,7 @@ def _met(record: dict[str, Any]) -> str:
     alone = record["given"] == "nothing"
     if alone:
         met = [("up", (record["up"] or 0.0) <= GOAL_UP), ("IoU", (record["aligned"] or 0.0) >= GOAL_IOU_ALONE)]
-    elif record["kind"] == "stream":
+    elif kind_of(record["kind"]).nearly_level:
         depth = np.inf if record["depth"] is None else record["depth"]
         met = [("depth", depth < GOAL_DEPTH), ("IoU", (record["iou"] or 0.0) >= GOAL_IOU)]
     else:

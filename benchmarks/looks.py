@@ -1,8 +1,8 @@
 """Measures the looks: how near the splats come to the clip, how much each look flickers, how long a picture takes.
 
-    python benchmarks/looks.py demo.fluid river.fluid --page docs/results.md
+    python benchmarks/looks.py demo.fluid river.fluid --page docs/experiments/2026-11-looks.md
     python benchmarks/looks.py demo.fluid river.fluid --sheets sheets
-    python benchmarks/looks.py --speed --page docs/results.md
+    python benchmarks/looks.py --speed --page docs/experiments/2026-11-looks.md
 
 Assets are finished ones, with their folder work/. PSNR and SSIM compare the re-simulated splats, seen from the clip's
 camera, with the clip inside its mask. Flicker is the mean of |I(t-1) - 2 I(t) + I(t+1)| over the pixels that are
@@ -22,7 +22,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from motion_page import replace_section
-from results import table as rows_of
+from report import table as rows_of
 
 from fluidlift.evaluate.images import psnr, ssim
 from fluidlift.io.asset_folder import load_asset, read_manifest
@@ -37,11 +37,10 @@ from fluidlift.numerics.srgb import linear_from_srgb, srgb_from_linear
 from fluidlift.pipeline.looks import Backdrop, Frame, Painter
 from fluidlift.pipeline.reading import clip_of
 from fluidlift.pipeline.resimulate import FIRST_HALF, recall_first_half
-from fluidlift.pipeline.scene import LYING
 from fluidlift.pipeline.seeing import labels_of
 from fluidlift.pipeline.showing import splat_frames
 from fluidlift.pipeline.story import Silence, Story
-from fluidlift.types import FluidAsset, Gaussians, Grid, PinholeCamera, Terrain, TriangleMesh
+from fluidlift.types import FluidAsset, Gaussians, Grid, PinholeCamera, Terrain, TriangleMesh, kind_of
 
 BEGIN, END = "<!-- looks:begin -->", "<!-- looks:end -->"
 SPEED_BEGIN, SPEED_END = "<!-- looks-speed:begin -->", "<!-- looks-speed:end -->"
@@ -135,7 +134,7 @@ def sheet(folder: Path, out: Path) -> None:
 
 def tile(asset: FluidAsset, folder: Path, look: Look, fluid: Gaussians, velocities: np.ndarray, view: str):
     """One picture of a sheet."""
-    lying = asset.kind in LYING
+    lying = kind_of(asset.kind).is_channel_flow
     end = OpenEnd.of(asset.cell_types, asset.grid, asset.terrain.mainstream) if lying else None
     painter = Painter(look, asset.terrain, folder, kind=asset.kind, end=end)
     width = 480

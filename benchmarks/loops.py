@@ -7,7 +7,7 @@ camera in the clip's mask over the clip's still background. Mean absolute differ
 to the next: over the whole mask, and in that part of it (of 8 x 8 parts of the picture) where it changes most. The
 seam is the step from the last picture to the first; the fade is the largest step of those that show two instants.
 
-It prints a table for docs/results.md. Assets need their folder work/ (the clip as it was read).
+It prints a table for docs/experiments/2026-11-looks.md. Assets need their folder work/ (the clip as it was read).
 """
 
 from __future__ import annotations

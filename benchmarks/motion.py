@@ -2,7 +2,7 @@
 
     python benchmarks/motion.py --work runs
     python benchmarks/motion.py --work runs --only river --only scene_pour
-    python benchmarks/motion.py --work runs --assets runs --before before.json --page docs/results.md
+    python benchmarks/motion.py --work runs --assets runs --before before.json --page docs/experiments/2026-11-motion.md
 
 Subjects are the demo of the package, three scenes that the package simulates and films (kept in --work), the cases and
 the real clips with a drawn mask below FLUIDLIFT_SHARED or a folder `shared` beside the repository (mask only). Masks,

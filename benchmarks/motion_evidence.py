@@ -1,6 +1,6 @@
 """What the pictures themselves say about flow: does the true motion explain them better than the one that was found?
 
-    python benchmarks/motion_evidence.py --work runs --page docs/results.md
+    python benchmarks/motion_evidence.py --work runs --page docs/experiments/2026-11-motion.md
 
 Subjects, frames and pixels are those of `motion.py`, less a rim of four pixels and what leaves the fluid. The second
 picture of a pair is drawn back along a flow and compared with the first, in the moving detail that the flow is
@@ -18,7 +18,7 @@ import numpy as np
 from motion_page import replace_section
 from motion_steps import measured_frames
 from motion_subjects import Subject, Truth, default_shared, prepare, read_truth, subjects
-from results import table
+from report import table
 
 from fluidlift.motion.multiframe import moving_detail
 from fluidlift.motion.optical_flow import estimate_flow

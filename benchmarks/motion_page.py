@@ -1,4 +1,4 @@
-"""Turns the figures of `motion.py` into the motion section of docs/results.md."""
+"""Turns the figures of `motion.py` into the motion section of docs/experiments/2026-11-motion.md."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ CASE_IOU, CLIP_IOU = 0.85, 0.8
 def goals(records: Records) -> str:
     """Which goals each subject meets; a step that is worse than the one before is named with its loss."""
     lines = [
-        "### Goals",
+        "## Goals",
         "",
         f"| clip | no step worse | filled at most {FILLED_FACTOR:g} x observed | "
         f"final at most {_percent(FINAL_SHARE)} of Farneback | volume cosine, from true / own motion | mask |",
@@ -78,8 +78,8 @@ def pictures(records: Records) -> str:
     """Links to the pictures of the project's own scenes, as far as they lie there."""
     folder = Path(__file__).resolve().parent.parent / "docs" / "pictures"
     names = [name for name, r in records.items() if r["own"] and (folder / f"motion_{name}.png").is_file()]
-    links = [f"![{name}: flow after each step](pictures/motion_{name}.png)" for name in names]
-    return "\n\n".join(["### Pictures", *links]) if links else ""
+    links = [f"![{name}: flow after each step](../pictures/motion_{name}.png)" for name in names]
+    return "\n\n".join(["## Pictures", *links]) if links else ""
 
 
 def replace_section(page: Path, text: str, begin: str = BEGIN, end: str = END) -> None:
@@ -97,7 +97,7 @@ def replace_section(page: Path, text: str, begin: str = BEGIN, end: str = END) -
 
 def planar(records: Records, before: Records) -> str:
     """One table of steps for each clip with a truth."""
-    lines = ["### Planar velocity, step by step"]
+    lines = ["## Planar velocity, step by step"]
     for name, r in records.items():
         if "steps" not in r:
             continue
@@ -125,7 +125,7 @@ def planar(records: Records, before: Records) -> str:
 def surface(records: Records, before: Records) -> str:
     """Velocity of the visible surface in m/s."""
     lines = [
-        "### Surface velocity",
+        "## Surface velocity",
         "",
         "| clip | truth, m/s | error, m/s | relative | speed found | from Farneback alone |" + _old(before, "relative"),
         "|---|---|---|---|---|---|" + _old(before, "---"),
@@ -145,7 +145,7 @@ def surface(records: Records, before: Records) -> str:
 def volume(records: Records, before: Records) -> str:
     """Velocity of the whole volume against the grid of the truth."""
     lines = [
-        "### Volume velocity",
+        "## Volume velocity",
         "",
         "| clip | surface motion | relative L2 | cosine | speed found | divergence max | mean | in, out, up (l/s) |"
         + _old(before, "L2, cosine"),
@@ -178,7 +178,7 @@ def volume(records: Records, before: Records) -> str:
 def masks(records: Records, before: Records) -> str:
     """Automatic masks."""
     lines = [
-        "### Masks",
+        "## Masks",
         "",
         "| clip | IoU | worst frame |" + _old(before, "IoU"),
         "|---|---|---|" + _old(before, "---"),

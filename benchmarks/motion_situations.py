@@ -68,7 +68,7 @@ def table(found: dict[str, dict[str, float]], before: dict[str, dict[str, Any]])
     """As Markdown; with the last step of an earlier run beside, where given."""
     steps = list(next(iter(found.values())))
     lines = [
-        "### Hard situations", "",
+        "## Hard situations", "",
         "| situation | " + " | ".join(steps) + (" | before: as made |" if before else " |"),
         "|---|" + "---|" * (len(steps) + bool(before)),
     ]  # fmt: skip

@@ -1,6 +1,6 @@
 """Seconds per frame of the motion estimate, and whether its memory grows with the clip.
 
-    python benchmarks/motion_speed.py --page docs/results.md
+    python benchmarks/motion_speed.py --page docs/experiments/2026-11-motion.md
     python benchmarks/motion_speed.py --only memory --seconds 30 300
 
 Speed: a moving texture (`synthetic.moving_texture`) 512 px wide on a level pool, on a grid of 64^3 cells of which the

@@ -206,7 +206,7 @@ def compared(body: Body, width: int, samples: int) -> tuple[dict[str, dict[str, 
 
 def page_section(found: dict[str, dict[str, dict[str, float]]], width: int, samples: int) -> str:
     """The table."""
-    from results import table
+    from report import table
 
     rows = []
     for body, ways in found.items():

@@ -3,7 +3,7 @@
     python benchmarks/refinement.py --work runs
     python benchmarks/refinement.py --work runs --only demo --publish
     python benchmarks/refinement.py --work runs --only speed
-    python benchmarks/refinement.py --work runs --only none --page docs/results.md
+    python benchmarks/refinement.py --work runs --only none --page docs/experiments/2026-11-splats.md
 
 Subjects are those of `motion.py` that have a truth: the demo of the package, its own scenes, and the cases below
 FLUIDLIFT_SHARED or a folder `shared` beside the repository. The body that comes in is what a generator would give: a

@@ -19,13 +19,13 @@ def page(records: list[dict[str, Any]]) -> str:
         for r in subjects if r["held_out"] == "filmed"
     ] + [""]  # fmt: skip
     out += ["The pipeline's own body, with the case's camera:", "", *_steps(subjects, "estimated")]
-    out += ["", "#### Frames after the first", ""]
+    out += ["", "### Frames after the first", ""]
     out += _table(
         ["clip", "started from the last, dB", "after a fifth of the steps", "a new start after as many"],
         [[r["name"], *(_n(sum(x[i] for x in r["later"]) / len(r["later"]), 2) for i in range(3))]
          for r in subjects if r["later"]],
     )  # fmt: skip
-    out += ["", "#### Terms of the loss", ""]
+    out += ["", "### Terms of the loss", ""]
     out += _table(
         ["clip", "loss", "Gaussians", "PSNR dB", "beside dB", "depth error %", "needles", "largest / median",
          "out of [0, 1]"],
@@ -36,7 +36,7 @@ def page(records: list[dict[str, Any]]) -> str:
         ],
     )  # fmt: skip
     change = "Mean change from frame to frame over the thickness of the body."
-    out += ["", "#### Flicker of the far side", "", change, ""]
+    out += ["", "### Flicker of the far side", "", change, ""]
     out += _table(
         ["clip", "frames", "N", "single bodies", "united", "thickness, united over single"],
         [[r["name"], f["frames"], f["window"], _n(f["single"]), _n(f["united"]),

@@ -15,7 +15,7 @@ from pathlib import Path
 import av
 import cv2
 import numpy as np
-from results import table as rows_of
+from report import table as rows_of
 from scipy import ndimage
 
 from fluidlift.io.asset_folder import read_manifest

@@ -1,7 +1,7 @@
 """Surface speeds in m/s next to OpenPIV, the usual tool of river velocimetry, on the same frames.
 
     pip install openpiv     # GPL: in an environment of its own, never a dependency
-    python benchmarks/velocimetry.py --openpiv PATH/TO/python --page docs/results.md
+    python benchmarks/velocimetry.py --openpiv PATH/TO/python --page docs/experiments/2026-11-motion.md
 
 Frames are laid onto the level plane of the water with the known camera, at the median footprint of a pixel of the
 water. What stands still (the mean over time) is taken out of them, as pyorc, which runs such velocimetry on rivers,

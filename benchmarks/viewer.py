@@ -10,8 +10,8 @@ machine disturb less. An hour of play is 90 000 frames at 25 a second, played as
 and arrows of few splats: what could grow is kept per frame. With --minutes it plays by the clock, while a page looks
 on: memory of this process, of the page's scripts after they were tidied up, and of all of the browser's processes.
 
-It prints a table for docs/results.md. The asset of --frames x --splats is made in a temporary folder (840 MB for
-100 x 100 000), and deleted.
+It prints a table for docs/experiments/2026-11-looks.md. The asset of --frames x --splats is made in a temporary folder
+(840 MB for 100 x 100 000), and deleted.
 """
 
 from __future__ import annotations

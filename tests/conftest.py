@@ -50,6 +50,8 @@ def tier_of(item: pytest.Item, slow: set[str]) -> str:
         return "whole"
     if room in FOREIGN or "visitor" in fixtures:
         return "foreign"
+    if room == "fuzz":
+        return "ladder"
     if ASSET & fixtures or COMMAND_LINE.search(item.path.read_text(encoding="utf-8")):
         return "asset"
     return "ladder" if {item.nodeid, item.nodeid.split("::")[0]} & slow else "unit"

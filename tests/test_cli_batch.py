@@ -41,6 +41,13 @@ def test_a_folder_gives_its_videos(tmp_path, capsys):
     assert list(summary(tmp_path / "out")) == ["a", "b"]
 
 
+def test_a_home_of_nobody_is_a_name_like_any_other(tmp_path):
+    (tmp_path / "shots.yaml").write_text("- ~nobody-is-called-so.mp4\n")
+    assert main(["batch", str(tmp_path / "shots.yaml"), "-o", str(tmp_path / "out")]) == FAILED
+    (row,) = summary(tmp_path / "out").values()
+    assert row["outcome"] == "rejected" and "no such video" in row["reason"]
+
+
 @pytest.mark.parametrize(
     ("rows", "words"),
     [
@@ -50,7 +57,7 @@ def test_a_folder_gives_its_videos(tmp_path, capsys):
         ("- clip: a.mp4\n  size: {x: 1}\n", "a word or a number"),
         ("- size: 3\n", "shot 1 names no clip"),
         ("clip: a.mp4\n", "holds no list"),
-        ("- [\n", "is not YAML"),
+        ("- [\n", "shots.yaml cannot be read: line 2"),
         ("- clip: a.mp4\n  out: elsewhere\n", "unknown option 'out'"),
     ],
 )
@@ -63,7 +70,7 @@ def test_a_list_that_cannot_be_used_is_refused_before_anything_is_made(tmp_path,
 
 def test_places_that_cannot_be_used_are_named(tmp_path, capsys):
     assert main(["batch", str(tmp_path / "gone.yaml"), "-o", str(tmp_path / "out")]) == REJECTED
-    assert "gone.yaml: No such file" in capsys.readouterr().err
+    assert "no such list of shots" in capsys.readouterr().err
     (tmp_path / "a.mp4").write_text("no film")
     assert main(["batch", str(tmp_path / "a.mp4"), "-o", "/proc/no"]) == REJECTED
     assert "/proc/no" in capsys.readouterr().err

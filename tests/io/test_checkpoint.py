@@ -62,11 +62,11 @@ def test_a_write_that_fails_leaves_the_checkpoint_before(file, checkpoint, monke
     assert file.read_bytes() == before and list(file.parent.iterdir()) == [file]
 
 
-def rewritten(file, change):
+def rewritten(file, change, packing=zipfile.ZIP_STORED):
     """The same archive with its members changed by `change(name, data) -> data`."""
     with zipfile.ZipFile(file) as archive:
         members = {m.filename: archive.read(m) for m in archive.infolist()}
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+    with zipfile.ZipFile(file, "w", packing) as archive:
         for name, data in members.items():
             archive.writestr(name, change(name, data))
 
@@ -114,9 +114,13 @@ def test_an_array_that_promises_more_than_it_has_takes_no_memory(file):
 
 
 def test_more_than_a_scene_can_need_is_refused_before_it_is_unpacked(file):
-    rewritten(file, lambda name, data: array_bytes(np.zeros(10**6)) if name == "state.field.npy" else data)
+    rewritten(
+        file,
+        lambda name, data: array_bytes(np.zeros(10**6)) if name == "state.field.npy" else data,
+        zipfile.ZIP_DEFLATED,
+    )
     assert file.stat().st_size < 10**5  # zeros, packed
-    with pytest.raises(InputRejected, match="unpacks to 8"):
+    with pytest.raises(InputRejected, match="unpacks to too much"):
         read_checkpoint(file, max_bytes=10**6)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from fluidlift.errors import InputRejected
 from fluidlift.motion.bed import (
     SURFACE_COEFFICIENT,
     bed_velocity,
@@ -44,7 +45,7 @@ def test_layers_scale_with_the_cell_and_stay_within_the_fluid() -> None:
         assert layer_thickness(kind, 0.02) == pytest.approx(2 * layer_thickness(kind, 0.01))
         assert speed_share(0.03, kind=kind, spacing=0.1, depth=0.03) == pytest.approx(1.0)
     assert layer_thickness("pour", 0.01) > layer_thickness("stream", 0.01) > layer_thickness("plume", 0.01)
-    with pytest.raises(ValueError, match="lava"):
+    with pytest.raises(InputRejected, match="lava"):
         layer_thickness("lava", 0.01)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from fluidlift.errors import InputRejected
 from fluidlift.motion.volume import DOUBT, VolumeOptions, VolumeSolver, _change, volume_velocity
 from fluidlift.types import CellType, FaceVelocity, Grid, SurfaceMotion
 
@@ -309,7 +310,7 @@ def test_wrong_input_is_named() -> None:
         volume_velocity(surface, None, types[1:], grid, kind="stream")
     with pytest.raises(ValueError, match="without fluid"):
         volume_velocity(surface, None, np.zeros_like(types), grid, kind="stream")
-    with pytest.raises(ValueError, match="lava"):
+    with pytest.raises(InputRejected, match="lava"):
         volume_velocity(surface, None, types, grid, kind="lava")
     far = SurfaceMotion(np.array([[0.55, 0.35, 8.0]]), np.zeros((1, 3)), np.ones(1, bool))
     with pytest.raises(ValueError, match="no surface sample"):

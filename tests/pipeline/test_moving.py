@@ -8,7 +8,7 @@ import pytest
 from fluidlift.config import build_config
 from fluidlift.errors import InputRejected
 from fluidlift.pipeline import moving
-from fluidlift.types import CellType, FaceVelocity, Grid
+from fluidlift.types import CellType, FaceVelocity, Grid, kind_of
 
 GRID = Grid((12, 6, 5), 0.05, (0.0, 0.0, 0.0))
 X = np.array([1.0, 0.0, 0.0])
@@ -93,8 +93,8 @@ def test_what_fills_the_vessel_is_what_the_inlet_brings(guess):
 @pytest.mark.parametrize("kind", ["stream", "fall", "pour", "plume"])
 def test_what_the_velocities_cannot_say_is_what_such_a_fluid_usually_has(guess, kind):
     found = guess([flow(0.3)], kind=kind)
-    assert found.kinematic_viscosity == moving.VISCOSITY_PRIOR[kind]
-    assert found.wall_damping == moving.WALL_DAMPING_PRIOR[kind]
+    assert found.kinematic_viscosity == kind_of(kind).kinematic_viscosity
+    assert found.wall_damping == kind_of(kind).wall_damping
     assert found.gravity == (0.0, 0.0, -9.81)
 
 
@@ -118,7 +118,7 @@ def test_water_slips_over_its_bed_and_a_viscous_film_sticks_to_it():
     def stick(*viscous):
         return moving.sticking("stream", [{"viscous": v} for v in viscous])
 
-    water = moving.WALL_DAMPING_PRIOR["stream"]
+    water = kind_of("stream").wall_damping
     assert stick() == water
     assert stick(0.0, 0.0, 1.0) == water  # one frame of three is an outlier
     assert stick(1.0, 1.0, 0.9) == 1.0

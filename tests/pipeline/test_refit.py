@@ -12,7 +12,7 @@ import pytest
 from fluidlift.cli import DONE, FAILED, REJECTED, WITH_WARNINGS, main
 from fluidlift.fit import optimize
 from fluidlift.io.asset_folder import load_asset, read_manifest
-from fluidlift.pipeline import moving
+from fluidlift.types import kind_of
 from fluidlift.validate import validate_asset
 
 WELL = (DONE, WITH_WARNINGS)
@@ -88,7 +88,7 @@ def test_a_fit_without_time_is_a_warning_and_keeps_the_first_guess(made):
     assert any("fit failed" in w and "max_seconds" in w for w in manifest["warnings"])
     assert manifest["metrics"]["fit"]["status"] == "failed"
     assert "The fit failed" in (made.folder / "report.html").read_text(encoding="utf-8")
-    assert parameters(made.folder).kinematic_viscosity == moving.VISCOSITY_PRIOR["stream"]
+    assert parameters(made.folder).kinematic_viscosity == kind_of("stream").kinematic_viscosity
 
 
 def test_a_real_fit_of_a_finished_asset_finds_the_outflow(asset, capsys):
@@ -189,7 +189,7 @@ def test_known_values_stay_known_in_the_next_fit_until_they_are_let_go(asset, ou
     fit(asset)
     assert calls[1][0].kinematic_viscosity == 1e-6
     fit(asset, "--set", "fit.hold=null")
-    assert calls[2][0].kinematic_viscosity == moving.VISCOSITY_PRIOR["stream"]
+    assert calls[2][0].kinematic_viscosity == kind_of("stream").kinematic_viscosity
 
 
 def test_only_what_is_asked_for_is_fitted(asset, outcome):
@@ -262,7 +262,7 @@ def test_a_failed_fit_keeps_the_first_guess_and_says_why(asset, outcome, capsys,
     assert found["status"] == "failed" and reason in found["reason"]
     kept = parameters(asset)
     assert kept.outflow_velocity not in (0.0, 0.123)
-    assert kept.kinematic_viscosity == moving.VISCOSITY_PRIOR["stream"]
+    assert kept.kinematic_viscosity == kind_of("stream").kinematic_viscosity
     assert kept.density == 998.0  # what a person knows is known, fit or no fit
     sources = {r["source"] for r in found["parameters"]}
     assert "fitted" not in sources and {"given", "measured"} < sources

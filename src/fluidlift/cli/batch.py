@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import difflib
 import json
+import os
 import reprlib
 import subprocess
 import sys
@@ -24,8 +25,6 @@ from fluidlift.errors import InputRejected
 VIDEOS = frozenset({".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".mxf", ".gif"})
 LISTS = (".yaml", ".yml")
 SUMMARY = "batch.json"
-MOST_LISTED = 1 << 20
-"""bytes of a list of shots"""
 _OUTCOMES = {0: "done", 2: "rejected", 3: "rejected", 4: "done, warnings"}
 _WELL = ("done", "done, warnings")
 _OURS = ("clip", "out", "json", "print_config")
@@ -163,17 +162,10 @@ def _require_names(shots: list[Shot]) -> None:
 
 def _listed(path: Path) -> list[dict[str, Any]]:
     """The rows of a list, checked, with paths from where the list lies."""
-    import yaml
+    from fluidlift.io.yaml_reader import read_yaml
 
     needed = "a list: - clip: river.mp4, and below it options of make such as size: 4"
-    try:
-        if path.stat().st_size > MOST_LISTED:
-            raise InputRejected(f"{path.name} has more than {MOST_LISTED >> 20} MB", needed)
-        rows = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputRejected(f"{path}: {getattr(error, 'strerror', None) or 'it is no text'}", needed) from None
-    except (yaml.YAMLError, RecursionError) as error:
-        raise InputRejected(f"{path.name} is not YAML: {' '.join(str(error).split())[:200]}", needed) from None
+    rows = read_yaml(path, "list of shots")
     if not isinstance(rows, list) or not rows:
         raise InputRejected(f"{path.name} holds no list", needed)
     return [_row(row, f"{path.name}, shot {k}", path.absolute().parent) for k, row in enumerate(rows, 1)]
@@ -198,7 +190,7 @@ def _row(row: Any, where: str, folder: Path) -> dict[str, Any]:
             needed = "a word or a number" + (", or a list of them" * several)
             raise InputRejected(f"{where}: {key}: {reprlib.repr(value)}", needed)
         if key == "clip" or "Path" in kinds.get(key, ""):
-            found[key] = folder / Path(str(value)).expanduser()
+            found[key] = folder / os.path.expanduser(str(value))  # pathlib raises where there is no such user
         else:
             found[key] = [str(v) for v in values] if several else value
     return found

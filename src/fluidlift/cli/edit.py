@@ -116,14 +116,14 @@ def _pair(text: str, option: str, example: str) -> tuple[str, Any]:
     """The place and the YAML value of `place=value`."""
     import yaml
 
-    from fluidlift.io.scene import parse_yaml
+    from fluidlift.io.yaml_reader import parse_yaml
 
     place, mark, value = text.partition("=")
     if not mark or not place.strip():
         raise InputRejected(f"{option} {text}", f"place=value, such as {option} {example}")
     try:
         return place.strip(), parse_yaml(value)
-    except (yaml.YAMLError, ValueError, TypeError, LookupError, RecursionError, AttributeError) as error:
+    except yaml.YAMLError as error:
         why = getattr(error, "problem", None) or error
         raise InputRejected(
             f"{option} {text}: '{value}' is no value ({why})", "a number, a text, [a list] or {name: value}",

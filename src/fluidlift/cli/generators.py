@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import sys
 import textwrap
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fluidlift.backends import generators as registry
@@ -36,7 +38,7 @@ def show(c: Generators) -> int:
 
 
 def _plain(path: Any) -> Any:
-    return None if path is None else path.expanduser()
+    return None if path is None else Path(os.path.expanduser(path))
 
 
 def _row(card: GeneratorCard, found: registry.Readiness) -> dict[str, Any]:

@@ -8,6 +8,8 @@ from typing import Annotated, Literal
 
 import tyro
 
+from fluidlift.types.kind import KindChoice
+
 Clip = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CLIP")]
 Asset = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="ASSET")]
 
@@ -22,7 +24,7 @@ class Make:
     """asset folder to write; by default the clip's name with .fluid, in the current folder"""
     preset: Literal["draft", "standard", "hero"] | None = None
     """draft (the default): minutes on a laptop; standard: finer; hero: as fine as the machine allows"""
-    kind: Literal["auto", "stream", "fall", "pour", "plume", "dam"] | None = None
+    kind: KindChoice | None = None
     """what the fluid does; auto decides from evidence that the report shows"""
     mask: Path | None = None
     """where the fluid is: one picture, a folder of pictures or a video; white is fluid"""
@@ -254,7 +256,7 @@ class Motion:
     """of the flow files; .flo has no place for confidence"""
     raw: bool = False
     """write the flow of single pairs as well, before averaging and completion"""
-    kind: Literal["auto", "stream", "fall", "pour", "plume", "dam"] | None = None
+    kind: KindChoice | None = None
     """what the fluid does; auto decides from evidence"""
     size: float | None = None
     """metres across the fluid (its longest side); sets the scale"""

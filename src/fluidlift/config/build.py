@@ -56,13 +56,9 @@ def build_config(
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:
-    import yaml
+    from fluidlift.io.yaml_reader import read_yaml
 
-    try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        reason = " ".join(str(error).split())  # YAML draws its complaint over several lines
-        raise InputRejected(f"config file {path.name} cannot be read: {reason}", "a YAML file") from None
+    data = read_yaml(path, "config file")
     if not isinstance(data, dict):
         raise InputRejected(f"config file {path.name} holds no sections", "read:, shape:, motion:, fit:, ...")
     return data
@@ -81,8 +77,10 @@ def _flatten(data: dict[str, Any]) -> dict[str, Any]:
 def _parse(text: str) -> Any:
     import yaml
 
+    from fluidlift.io.yaml_reader import parse_yaml
+
     try:
-        return yaml.safe_load(text)
+        return parse_yaml(text)
     except yaml.YAMLError:
         raise InputRejected(f"the value '{text}'", "a number, a word, true, false or null") from None
 

@@ -6,6 +6,8 @@ import dataclasses
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from fluidlift.types.kind import KindChoice
+
 
 @dataclass(frozen=True)
 class ReadConfig:
@@ -31,7 +33,7 @@ class ReadConfig:
 class ShapeConfig:
     """Geometry."""
 
-    kind: Literal["auto", "stream", "fall", "pour", "plume", "dam"] = "auto"
+    kind: KindChoice = "auto"
     """what the fluid does; auto decides from evidence"""
     fov: float | None = None
     """field of view across the longer side, degrees; None: camera file, lens metadata, else 50"""

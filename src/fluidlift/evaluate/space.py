@@ -30,7 +30,7 @@ from fluidlift.evaluate.volumes import (
 )
 from fluidlift.motion.lift import lift_flow
 from fluidlift.physics.pressure import build_system, divergence
-from fluidlift.types import CellType, Estimate, FluidAsset, Similarity3
+from fluidlift.types import CellType, Estimate, FluidAsset, Similarity3, kind_of
 
 FEWEST_CELLS = 8
 """inlet cells that must meet the truth's fluid before its inflow is called known"""
@@ -243,7 +243,7 @@ def score_parameters(asset: FluidAsset, case: Case, alignment: Alignment) -> lis
     gravity = case.scene.get("gravity")
     true = np.asarray(gravity, float) @ rotation if np.shape(gravity) == (3,) else None
     mine, why = s * np.asarray(p.gravity), "the case does not say"
-    if asset.kind == "plume":
+    if kind_of(asset.kind).is_gas:
         true, why = None, "the gravity of a plume is its buoyancy, which the case does not say in m/s2"
     out += _recovery("gravity", mine, true, vector("gravity"), "m/s2", why)
     if true is not None:

@@ -36,7 +36,18 @@ from fluidlift.fit.ranges import UNITS, VECTORS, ParameterSpace, parameter_space
 from fluidlift.fit.scene import FitScene, WindowPlan, build_scene, plan_windows
 from fluidlift.fit.settings import DEFAULT_FREE, SCALES, FitOptions
 from fluidlift.numerics.poisson import PoissonSystem
-from fluidlift.types import CellType, Estimate, FaceVelocity, FitResult, FluidParameters, Grid, Terrain
+from fluidlift.types import (
+    CellType,
+    Estimate,
+    FaceVelocity,
+    FitResult,
+    FluidKind,
+    FluidParameters,
+    Grid,
+    Terrain,
+    kind_of,
+)
+from fluidlift.types.kind import STREAM
 
 __all__ = ["DEFAULT_FREE", "FitOptions", "fit_parameters"]
 
@@ -58,7 +69,7 @@ class _Data:
     layouts: Sequence[np.ndarray]
     solid: PoissonSystem | Terrain | None
     grid: Grid
-    kind: str
+    kind: FluidKind
     mainstream: np.ndarray | None
     observed: Sequence[np.ndarray] | None
     distances: Sequence[np.ndarray] | None
@@ -95,7 +106,7 @@ def fit_parameters(
     interval: float,
     initial: FluidParameters,
     *,
-    kind: str = "stream",
+    kind: str | FluidKind = STREAM,
     mainstream: np.ndarray | None = None,
     observed: Sequence[np.ndarray] | np.ndarray | None = None,
     liquid_distance: Sequence[np.ndarray] | np.ndarray | None = None,
@@ -113,7 +124,7 @@ def fit_parameters(
         grid: of the targets, which are `interval` (s) apart.
         initial: start and centre of the priors; its time step becomes interval / steps per frame. Values at the inlet
             and the outlet that are zero are first read off the targets.
-        kind: "plume" is a gas: EMPTY cells are solved too, the box is open, and `gravity` acts on FLUID (smoke) cells
+        kind: of a gas, EMPTY cells are solved too, the box is open, and `gravity` acts on FLUID (smoke) cells
             alone: its size is the buoyancy, m/s^2, also in `extra["buoyancy"]`. All others are liquids.
         mainstream: unit direction of the outflow; default: the terrain's, or the mean velocity.
         observed: bool [nx,ny,nz], one or one per target: cells whose velocity was seen; what the targets hold elsewhere
@@ -138,13 +149,13 @@ def fit_parameters(
     assert layouts is not None
     require(all(t.shape == grid.shape for t in targets), "targets of another shape than the grid", str(grid.shape))
     views, levels = _each(observed, n, grid, "observed cells"), _each(liquid_distance, n, grid, "distances")
-    data = _Data(targets, layouts, system_or_terrain, grid, kind, mainstream, views, levels)
+    data = _Data(targets, layouts, system_or_terrain, grid, kind_of(kind), mainstream, views, levels)
     nothing = _no_flow(data)
     if nothing:
         return _failure(initial, nothing)
     with single_thread():
         result = _Fit(data, interval, initial, options, _budget(options, progress)).run()
-    if kind == "plume":
+    if data.kind.is_gas:
         return replace(result, extra=result.extra | {"buoyancy": math.hypot(*result.parameters.gravity)})
     return result
 
@@ -229,7 +240,7 @@ class _Fit:
     def plan(self, scene: FitScene) -> tuple[WindowPlan, ParameterSpace]:
         """Windows and variables."""
         prior, sigmas = boundary_prior(scene, self.initial), dict(self.options.prior_sigmas or {})
-        if self.data.kind == "plume":
+        if self.data.kind.is_gas:
             prior, sigmas = _buoyancy_prior(prior, scene), {"gravity": BUOYANCY_SIGMA} | sigmas
         plan = plan_windows(
             scene, self.interval, windows=self.options.windows, steps_per_frame=self.options.steps_per_frame,

@@ -17,7 +17,7 @@ from fluidlift.physics.pressure import build_system
 from fluidlift.physics.rollout import flatten
 from fluidlift.physics.rollout_domain import RolloutDomain, prepare_domain
 from fluidlift.physics.rollout_surface import surface_cells
-from fluidlift.types import CellType, FaceVelocity, Grid, Terrain
+from fluidlift.types import CellType, FaceVelocity, FluidKind, Grid, Terrain, kind_of
 
 LONGEST_WINDOW = 25
 """steps; the paper's longest"""
@@ -102,7 +102,7 @@ def build_scene(
     system_or_terrain: PoissonSystem | Terrain | None,
     grid: Grid,
     *,
-    kind: str,
+    kind: str | FluidKind,
     mainstream: np.ndarray | None = None,
     observed: Sequence[np.ndarray | None] | None = None,
     distances: Sequence[np.ndarray | None] | None = None,
@@ -113,8 +113,8 @@ def build_scene(
     Raises:
         ValueError: shapes that do not match, or targets at rest.
     """
-    views = [None] * len(targets) if observed is None else list(observed)
-    if distances is not None and kind != "plume" and not isinstance(system_or_terrain, PoissonSystem):
+    kind, views = kind_of(kind), [None] * len(targets) if observed is None else list(observed)
+    if distances is not None and not kind.is_gas and not isinstance(system_or_terrain, PoissonSystem):
         cell_types, distances = with_surface(cell_types, distances, system_or_terrain, grid)
     centers = [np.asarray(t.at_centers(), float) for t in targets]
     fluid = [np.asarray(c) == CellType.FLUID for c in cell_types]
@@ -154,12 +154,12 @@ def _layout(
     types: np.ndarray,
     system_or_terrain: PoissonSystem | Terrain | None,
     grid: Grid,
-    kind: str,
+    kind: FluidKind,
     mainstream: np.ndarray,
     sweeps: int,
     distance: np.ndarray | None,
 ) -> RolloutDomain:
-    gas = kind == "plume"
+    gas = kind.is_gas
     if isinstance(system_or_terrain, PoissonSystem):
         system = system_or_terrain
     else:

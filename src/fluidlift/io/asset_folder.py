@@ -53,6 +53,7 @@ from fluidlift.types import (
     Similarity3,
     Terrain,
     TriangleMesh,
+    kind_of,
 )
 
 __all__ = [
@@ -175,7 +176,7 @@ def _manifest(asset: FluidAsset, start_frame: int) -> dict[str, Any]:
     return {
         "format": "fluidlift asset",
         "format_version": FORMAT_VERSION,
-        "kind": asset.kind,
+        "kind": kind_of(asset.kind).name,
         "units": {"length": "m", "time": "s", "mass": "kg", "up": "z"},
         "frame_interval": asset.interval,
         "frame_count": asset.frame_count,
@@ -233,6 +234,7 @@ def read_manifest(folder: Path | str) -> dict[str, Any]:
             "update fluidlift: pip install -U fluidlift",
         )
     _validate(manifest, "manifest", InputRejected)
+    kind_of(manifest["kind"])
     for name in manifest["files"].values():
         asset_file(folder, name)
     return manifest
@@ -275,7 +277,7 @@ def load_asset(folder: Path | str) -> FluidAsset:
             frame_count=manifest["frame_count"],
             provenance=manifest.get("provenance", {}),
         )
-    except ValueError as error:
+    except (ValueError, TypeError, IndexError, OverflowError) as error:
         raise InputRejected(f"the parts of '{folder.name}' contradict each other: {error}", "a whole asset") from None
 
 
@@ -288,9 +290,10 @@ def asset_file(folder: Path | str, name: str) -> Path:
     folder = Path(folder)
     foreign = PurePosixPath(name).is_absolute() or PureWindowsPath(name).drive or PureWindowsPath(name).root
     parts = PurePosixPath(name.replace("\\", "/")).parts
-    if foreign or ".." in parts or not parts or "\0" in name:
+    endless = any(len(part.encode("utf-8", "replace")) > 255 for part in parts) or len(name) > 1000
+    if foreign or ".." in parts or not parts or "\0" in name or endless:
         raise InputRejected(
-            f"the asset names the file '{name}'", "names inside its own folder", "do not trust this asset"
+            f"the asset names the file '{name[:100]}'", "names inside its own folder", "do not trust this asset"
         )
     path = folder
     for part in parts:

@@ -8,7 +8,6 @@ file of a stranger: no pickles, no links, and no array is unpacked before its si
 from __future__ import annotations
 
 import json
-import math
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,7 +17,9 @@ from typing import Any
 import numpy as np
 
 from fluidlift.errors import InputRejected, require
+from fluidlift.io.array_archive import DAMAGE, array_in, members_of
 from fluidlift.io.atomic import atomic_write
+from fluidlift.io.limits import parse_json
 
 CHECKPOINT_VERSION = 1
 """of the file; a reader refuses others"""
@@ -78,13 +79,11 @@ def read_checkpoint(path: Path | str, *, max_bytes: int = _MAX_BYTES) -> Checkpo
     path = _plain_file(path)
     try:
         with zipfile.ZipFile(path) as archive:
-            members = archive.infolist()
-            total = sum(m.file_size for m in members)
-            if total > max_bytes:
-                raise InputRejected(f"the checkpoint '{path.name}' unpacks to {total} bytes", f"at most {max_bytes}")
+            # written as they are: they are not larger in memory than on disk
+            members = members_of(archive, min(max_bytes, path.stat().st_size))
             head = _header(archive, path)
-            arrays = {m.filename.removesuffix(".npy"): _array(archive, m, path) for m in members}
-    except _DAMAGE as error:
+            arrays = {name: array_in(archive, m) for name, m in members.items()}
+    except DAMAGE as error:
         raise _damaged(path, error) from None
     state = {k.removeprefix("state."): a for k, a in arrays.items() if k.startswith("state.")}
     history = {k.removeprefix("history."): a for k, a in arrays.items() if k.startswith("history.")}
@@ -102,7 +101,7 @@ def read_parts(path: Path | str) -> tuple[int, dict[str, str]]:
     try:
         with zipfile.ZipFile(path) as archive:
             head = _header(archive, path)
-    except _DAMAGE as error:
+    except DAMAGE as error:
         raise _damaged(path, error) from None
     return head["frames"], head["parts"]
 
@@ -110,10 +109,6 @@ def read_parts(path: Path | str) -> tuple[int, dict[str, str]]:
 def differing_parts(found: Mapping[str, str], wanted: Mapping[str, str]) -> list[str]:
     """Names of the parts whose hashes differ or that only one side has, sorted."""
     return sorted(name for name in {*found, *wanted} if found.get(name) != wanted.get(name))
-
-
-_DAMAGE = (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, NotImplementedError, MemoryError,
-           RecursionError, SyntaxError)  # fmt: skip
 
 
 def _damaged(path: Path, error: BaseException) -> InputRejected:
@@ -137,7 +132,7 @@ def _header(archive: zipfile.ZipFile, path: Path) -> dict[str, Any]:
     member = archive.getinfo(f"{_HEADER}.npy")
     if member.file_size > _MAX_HEADER:
         raise ValueError(f"a header of {member.file_size} bytes")
-    head = json.loads(bytes(_array(archive, member, path)))
+    head = parse_json(bytes(array_in(archive, member)))
     if head["format"] != _FORMAT:
         raise ValueError("another format")
     if head["version"] != CHECKPOINT_VERSION:
@@ -150,20 +145,3 @@ def _header(archive: zipfile.ZipFile, path: Path) -> dict[str, Any]:
     if not plain or type(head["frames"]) is not int or head["frames"] < 1:
         raise ValueError("a header without frames and parts")
     return head
-
-
-def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo, path: Path) -> np.ndarray:
-    """One array, after its own header has been compared with the size of its member."""
-    with archive.open(member) as stream:
-        version = np.lib.format.read_magic(stream)
-        read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-        if version not in read:
-            raise ValueError(f"'{member.filename}' of NumPy format {version}")
-        shape, fortran, dtype = read[version](stream)
-        size = math.prod(shape) * dtype.itemsize
-        if dtype.kind not in "fiub" or size > member.file_size:
-            raise ValueError(f"'{member.filename}' promises {size} bytes of {dtype} and has {member.file_size}")
-        data = stream.read(size)
-    if len(data) != size:
-        raise ValueError(f"'{member.filename}' breaks off")
-    return np.frombuffer(data, dtype).reshape(shape, order="F" if fortran else "C").copy()

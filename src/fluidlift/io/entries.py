@@ -4,25 +4,15 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Mapping
-from functools import lru_cache
 from typing import Any
 
 import yaml
 
 from fluidlift.errors import InputRejected
+from fluidlift.io.yaml_reader import composed
 
 Path = tuple[Any, ...]
 """keys and indices from the top of the file"""
-
-
-@lru_cache(maxsize=4)
-def composed(text: str) -> yaml.Node | None:
-    """The nodes of a YAML text, with the places where they stand; not to be changed.
-
-    Raises:
-        yaml.YAMLError: broken YAML.
-    """
-    return yaml.compose(text, Loader=yaml.SafeLoader)
 
 
 def line_numbers(text: str) -> dict[Path, int]:
@@ -46,7 +36,7 @@ def line_numbers(text: str) -> dict[Path, int]:
 
     try:
         walk(composed(text), ())
-    except (yaml.YAMLError, RecursionError):
+    except yaml.YAMLError:
         return {}
     return lines
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from fluidlift.errors import InputRejected
+from fluidlift.io.array_archive import DAMAGE, array_in, mapped_array, members_of
 from fluidlift.io.limits import ReadLimits, require_file, require_size
 
 _FLOW_KEYS = ("displacement", "flow", "flows", "forward")
@@ -46,10 +46,11 @@ def open_array(path: Path | str, pairs: int, start: int, limits: ReadLimits) -> 
     """
     path = require_file(path, "flow file")
     try:
-        flow, trust = _from_npz(path, limits) if path.suffix.lower() == ".npz" else (_from_npy(path), None)
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile, zlib.error, KeyError, NotImplementedError) as error:
+        flow, trust = _from_npz(path, limits) if path.suffix.lower() == ".npz" else (mapped_array(path), None)
+    except DAMAGE as error:
         raise InputRejected(
-            f"'{path.name}' cannot be read as an array ({error})", "numbers saved with numpy.save or numpy.savez"
+            f"'{path.name}' cannot be read as an array ({str(error)[:200]})",
+            "numbers saved with numpy.save or numpy.savez",
         ) from None
     flow = _channels_last(path, flow)
     if flow.shape[1] * flow.shape[2] > limits.max_pixels or not flow.size:
@@ -68,26 +69,19 @@ def open_array(path: Path | str, pairs: int, start: int, limits: ReadLimits) -> 
     return FlowArray(path.name, flow[wanted], None if trust is None else trust[wanted])
 
 
-def _from_npy(path: Path) -> np.ndarray:
-    return np.load(path, mmap_mode="r", allow_pickle=False)
-
-
 def _from_npz(path: Path, limits: ReadLimits) -> tuple[np.ndarray, np.ndarray | None]:
     require_size(path, limits.max_bytes, "flow array")
-    arrays = np.load(path, allow_pickle=False)
-    if isinstance(arrays, np.ndarray):  # a .npy file under another name
-        return arrays, None
-    with arrays:
-        if sum(member.file_size for member in arrays.zip.infolist()) > limits.max_bytes:
-            raise InputRejected(f"'{path.name}' unpacks to too much", f"at most {limits.max_bytes} bytes")
-        names = [n for n in arrays.files if n not in _TRUST_KEYS]
+    if not zipfile.is_zipfile(path):  # a .npy file under another name
+        return mapped_array(path), None
+    with zipfile.ZipFile(path) as archive:
+        members = members_of(archive, limits.max_bytes)
+        names = [n for n in members if n not in _TRUST_KEYS]
         key = next((k for k in _FLOW_KEYS if k in names), names[0] if len(names) == 1 else None)
         if key is None:
-            raise InputRejected(
-                f"'{path.name}' holds {', '.join(arrays.files) or 'nothing'}", "an array 'displacement'"
-            )
-        trust = next((k for k in _TRUST_KEYS if k in arrays.files), None)
-        return arrays[key], None if trust is None else arrays[trust]
+            listed = ", ".join(members)[:200] or "nothing"
+            raise InputRejected(f"'{path.name}' holds {listed}", "an array 'displacement'")
+        trust = next((members[k] for k in _TRUST_KEYS if k in members), None)
+        return array_in(archive, members[key]), None if trust is None else array_in(archive, trust)
 
 
 def _channels_last(path: Path, flow: np.ndarray) -> np.ndarray:

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from fluidlift.errors import InputRejected
+from fluidlift.io.array_archive import DAMAGE, array_in, mapped_array, members_of
 from fluidlift.io.exr import read_channels
 from fluidlift.io.limits import ReadLimits, read_json, require_file, require_size
 from fluidlift.io.pictures import PICTURE_SUFFIXES, read_picture, resample, same_shape, write_png
@@ -140,8 +141,15 @@ def read_depth(
     if depth.ndim not in (2, 3):
         raise InputRejected(f"'{path.name}' holds an array {depth.shape}", "[H,W] or [T,H,W]")
     _require_shape(depth.shape[:-3:-1], size, f"the depth '{path.name}'")
-    layers = depth.reshape(-1, *depth.shape[-2:]).astype(np.float32) * np.float32(scale)
-    fitted = np.stack([cv2.resize(layer, size, interpolation=cv2.INTER_NEAREST_EXACT) for layer in layers])
+    layers = depth[None] if depth.ndim == 2 else depth
+    if len(layers) > limits.max_frames or layers[0].size > limits.max_pixels:
+        raise InputRejected(
+            f"'{path.name}' holds an array {depth.shape}",
+            f"at most {limits.max_frames} frames of {limits.max_pixels} pixels",
+        )
+    fitted = np.empty((len(layers), size[1], size[0]), np.float32)
+    for layer, out in zip(layers, fitted):  # one by one: the array may be larger than memory
+        out[:] = cv2.resize(layer.astype(np.float32) * np.float32(scale), size, interpolation=cv2.INTER_NEAREST_EXACT)
     fitted[~(np.isfinite(fitted) & ((fitted > 0) | (not positive)))] = np.nan
     if not np.isfinite(fitted).any():
         raise InputRejected(f"no valid depth in '{path.name}'", "positive metres", "look at it: is it black?")
@@ -161,26 +169,22 @@ def _depth_channel(path: Path, limits: ReadLimits) -> np.ndarray:
 
 
 def _depth_array(path: Path, limits: ReadLimits) -> np.ndarray:
+    """The array, mapped where it is large."""
     require_size(path, limits.max_bytes, "depth array")
     try:
-        arrays = np.load(path, allow_pickle=False)
-        if isinstance(arrays, np.ndarray):
-            depth = arrays
-        else:
-            with arrays:
-                if sum(i.file_size for i in arrays.zip.infolist()) > limits.max_bytes:
-                    raise InputRejected(f"'{path.name}' unpacks to too much", f"at most {limits.max_bytes} bytes")
-                names = arrays.files
-                if "depth" not in names and len(names) != 1:
-                    raise InputRejected(f"'{path.name}' holds {', '.join(names) or 'nothing'}", "an array 'depth'")
-                depth = arrays["depth" if "depth" in names else names[0]]
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile, KeyError) as error:
+        if not zipfile.is_zipfile(path):
+            return mapped_array(path, kinds="fui")
+        with zipfile.ZipFile(path) as archive:
+            members = members_of(archive, limits.max_bytes)
+            if "depth" not in members and len(members) != 1:
+                listed = ", ".join(members)[:200] or "nothing"
+                raise InputRejected(f"'{path.name}' holds {listed}", "an array 'depth'")
+            return array_in(archive, members.get("depth") or next(iter(members.values())), kinds="fui")
+    except DAMAGE as error:
         raise InputRejected(
-            f"'{path.name}' cannot be read as an array ({error})", "numbers saved with numpy.save or numpy.savez"
+            f"'{path.name}' cannot be read as an array ({str(error)[:200]})",
+            "numbers saved with numpy.save or numpy.savez",
         ) from None
-    if depth.dtype.kind not in "fui":
-        raise InputRejected(f"'{path.name}' holds {depth.dtype}", "numbers")
-    return depth
 
 
 def read_camera(path: Path | str, size: tuple[int, int]) -> PinholeCamera:
@@ -220,7 +224,7 @@ def _from_transforms(data: dict[str, Any], name: str) -> PinholeCamera:
         rotation = poses[0, :3, :3] @ np.diag([1.0, -1.0, -1.0])  # world from camera, OpenGL axes to OpenCV axes
         pose = RigidTransform(rotation, poses[0, :3, 3]).inverse()
         return PinholeCamera(focal, center, size, pose)
-    except (KeyError, TypeError, ValueError, IndexError) as error:
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
         raise InputRejected(
             f"'{name}' is a transforms.json that cannot be read ({type(error).__name__}: {error})",
             "w, h, fl_x or camera_angle_x, and frames with a rigid transform_matrix (4x4)",

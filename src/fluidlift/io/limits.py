@@ -36,7 +36,12 @@ def require_file(path: Path | str, what: str = "file") -> Path:
         InputRejected: nothing there, a folder, a device, an empty file, or no permission.
     """
     path = Path(path)
-    if not path.exists():
+    try:
+        there = path.exists()
+    except (OSError, ValueError) as error:  # longer than names can be, or with a zero byte
+        why = getattr(error, "strerror", None) or error
+        raise InputRejected(f"the {what} '{str(path)[:60]}' cannot be looked for ({why})", f"a {what}") from None
+    if not there:
         raise InputRejected(f"no such {what}: '{path}'", f"an existing {what}", _suggestion(path))
     if path.is_dir():
         raise InputRejected(f"'{path}' is a folder", f"a {what}")
@@ -83,6 +88,25 @@ def read_json(path: Path | str, what: str = "JSON file", max_bytes: int = MAX_TE
     path = require_file(path, what)
     require_size(path, max_bytes, what)
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+        return parse_json(path.read_bytes())
+    except ValueError as error:
         raise InputRejected(f"'{path.name}' is not valid JSON ({error})", f"a {what}", "check the file") from None
+
+
+def parse_json(data: bytes | str) -> Any:
+    """Plain data of a JSON text (UTF-8). Whole numbers that no reader can mean become infinite, as `1e999` does.
+
+    Raises:
+        ValueError: no JSON, no UTF-8, or lists nested more deeply than Python goes.
+    """
+    try:
+        text = data if isinstance(data, str) else data.decode("utf-8")
+        return json.loads(text, parse_int=_whole_number)
+    except RecursionError:
+        raise ValueError("lists and objects nested too deeply") from None
+
+
+def _whole_number(text: str) -> int | float:
+    """Python refuses to read more than 4300 digits, and NumPy those that do not fit into 64 bits."""
+    value = int(text) if len(text) <= 20 else float(text)
+    return value if abs(value) < 2**63 else float(value)

@@ -18,6 +18,7 @@ from fluidlift.io.obstacles import Obstacle, read_obstacles
 from fluidlift.io.scene_emitters import read_emitters, read_inflow
 from fluidlift.io.scene_look import Look, read_look
 from fluidlift.io.scene_terrain import read_terrain
+from fluidlift.io.yaml_reader import MAX_BYTES, parse_yaml
 from fluidlift.physics.emitter import Emitter
 from fluidlift.physics.inflow_schedule import InflowSchedule
 from fluidlift.physics.terrain_edit import TerrainEdit
@@ -74,54 +75,6 @@ PARAMETERS = {
 """least, most and unit of what can stand under `parameters`; vectors: of each component"""
 VECTORS = {"gravity": "[0, 0, -9.81]", "inflow_velocity": "[1, 0, 0]"}
 """those with three numbers, with an example"""
-
-_MAX_BYTES = 2**20
-_BROKEN = (yaml.YAMLError, RecursionError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError)
-"""what PyYAML raises for text that is no YAML; the last five for odd scalars, such as a date in month 13"""
-
-
-class _PlainLoader(yaml.SafeLoader):
-    """YAML without aliases: a few lines of nested ones can describe more data than any machine holds.
-
-    A name that is there twice is an error: of two values, one would be ignored in silence.
-    """
-
-    def construct_mapping(self, node: Any, deep: bool = False) -> Any:
-        seen: set[str] = set()
-        for key, _ in getattr(node, "value", ()):
-            if isinstance(key, yaml.ScalarNode):
-                if key.value in seen:
-                    raise yaml.constructor.ConstructorError(None, None, f"'{key.value}' twice", key.start_mark)
-                seen.add(key.value)
-        return super().construct_mapping(node, deep=deep)
-
-    def compose_node(self, parent: Any, index: Any) -> Any:
-        if self.check_event(yaml.AliasEvent):
-            raise yaml.YAMLError("aliases (*name) are not used here")
-        return super().compose_node(parent, index)
-
-
-def parse_yaml(text: str) -> Any:
-    """Plain data of a YAML text: no objects, no aliases. `1e-6` is a number, as everyone expects.
-
-    Raises:
-        yaml.YAMLError: broken YAML or an alias.
-    """
-    return as_numbers(yaml.load(text, Loader=_PlainLoader))
-
-
-def as_numbers(data: Any) -> Any:
-    """The same data with `1e-6` as a number: YAML 1.1 takes it for a word, because it has no point."""
-    if isinstance(data, dict):
-        return {k: as_numbers(v) for k, v in data.items()}
-    if isinstance(data, list):
-        return [as_numbers(v) for v in data]
-    if isinstance(data, str) and data[:1] in "+-.0123456789" and "e" in data.lower():
-        try:
-            return float(data)
-        except ValueError:
-            return data
-    return data
 
 
 @dataclass(frozen=True)
@@ -230,7 +183,7 @@ def scene_text(folder: Path | str) -> str:
         raise InputRejected("scene.yaml is a link", "a plain file", "do not trust this asset")
     if not path.exists() or (path.is_file() and path.stat().st_size == 0):
         return ""
-    require_size(require_file(path, "scene file"), _MAX_BYTES, "scene file")
+    require_size(require_file(path, "scene file"), MAX_BYTES, "scene file")
     try:
         return path.read_bytes().decode("utf-8")
     except UnicodeDecodeError as error:
@@ -271,7 +224,7 @@ def plain_scene(text: str) -> dict[str, Any]:
     """
     try:
         data = copy.deepcopy(_parsed(text))
-    except _BROKEN as error:
+    except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         place = "scene.yaml" if mark is None else f"scene.yaml, line {mark.line + 1}"
         why = getattr(error, "problem", None) or error

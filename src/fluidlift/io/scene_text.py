@@ -12,8 +12,8 @@ from typing import Any
 import yaml
 
 from fluidlift.errors import InputRejected
-from fluidlift.io.entries import composed
-from fluidlift.io.scene import as_numbers, plain_scene
+from fluidlift.io.scene import plain_scene
+from fluidlift.io.yaml_reader import as_numbers, composed
 
 Path = tuple[str | int, ...]
 """names and list indices from the top of the file"""

@@ -10,6 +10,7 @@ Their size and header are checked, their content is not (that would mean to read
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
@@ -21,12 +22,16 @@ from typing import Any
 
 import numpy as np
 
-from fluidlift.errors import require
+from fluidlift.errors import InputRejected, require
+from fluidlift.io.array_archive import DAMAGE, array_in, mapped_array, members_of
 from fluidlift.io.atomic import atomic_write, disk_errors, plain, require_free_space, write_bytes, write_json
+from fluidlift.io.limits import MAX_TEXT_BYTES, parse_json, require_size
 
 WORK_MARKER = ".fluidlift"
 """file in work/ that says whose folder this is"""
 
+_KINDS = "fiubcU"
+"""of arrays, as NumPy's `dtype.kind`"""
 _KEPT = 2
 """results kept per stage: going back to the settings before is free"""
 
@@ -203,7 +208,7 @@ def save_stage(
     """
     data, facts = _names(folder, stage, key)
     for name, array in arrays.items():
-        require(np.asarray(array).dtype.kind in "fiubcU", f"array '{name}' of {np.asarray(array).dtype}", "numbers")
+        require(np.asarray(array).dtype.kind in _KINDS, f"array '{name}' of {np.asarray(array).dtype}", "numbers")
     mark_work_folder(folder)
     facts.unlink(missing_ok=True)
     mapped = {} if scratch is None else {n: p for n in arrays if (p := scratch.path_of(n)) is not None}
@@ -218,7 +223,8 @@ def save_stage(
     if scratch is not None:
         scratch.discard()
     shapes = {name: [list(np.shape(a)), np.asarray(a).dtype.str] for name, a in arrays.items()}
-    write_json(facts, {"stage": stage, "key": key, "arrays": shapes, "mapped": sorted(mapped), "meta": plain(meta)})
+    known = {"stage": stage, "key": key, "arrays": shapes, "mapped": sorted(mapped), "meta": plain(meta)}
+    write_json(facts, known | {"sum": _sum(known)})
     _forget_old(data.parent, key)
 
 
@@ -236,20 +242,29 @@ def load_stage(folder: Path | str, stage: str, key: str) -> tuple[dict[str, np.n
     if not (data.is_file() and facts.is_file()) or data.is_symlink() or facts.is_symlink():
         return None
     try:
-        known = json.loads(facts.read_text(encoding="utf-8"))
-        with np.load(data, allow_pickle=False) as archive:
-            arrays = {name.removesuffix("."): archive[name] for name in archive.files}
-        for name in known.get("mapped", ()):
+        require_size(facts, MAX_TEXT_BYTES, "cache")
+        known = parse_json(facts.read_bytes())
+        if known.pop("sum") != _sum(known):
+            return None
+        with zipfile.ZipFile(data) as archive:  # not packed: no larger in memory than on disk
+            members = members_of(archive, data.stat().st_size)
+            arrays = {name.removesuffix("."): array_in(archive, m, _KINDS) for name, m in members.items()}
+        for name in known["mapped"]:
             path = _mapped(data, name)
             if path.is_symlink() or not re.fullmatch(r"[A-Za-z0-9_-]{1,64}", name):
                 return None
-            arrays[name] = np.load(path, mmap_mode="c", allow_pickle=False)
+            arrays[name] = mapped_array(path, "c", _KINDS)
         shapes = {name: [list(a.shape), a.dtype.str] for name, a in arrays.items()}
         if known["key"] != key or known["stage"] != stage or known["arrays"] != shapes:
             return None
         return arrays, dict(known["meta"])
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, MemoryError, RecursionError):
+    except (*DAMAGE, AttributeError, InputRejected):
         return None
+
+
+def _sum(facts: Mapping[str, Any]) -> str:
+    """Checksum of the facts: what was changed in them is no cache any more."""
+    return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
 
 
 def mark_owner(folder: Path | str, stage: str, key: str | None) -> None:

@@ -18,6 +18,7 @@ from fluidlift.look.optics import fresnel
 from fluidlift.numerics.mesh_normals import vertex_normals
 from fluidlift.numerics.triangles import interpolated, rasterize_closed, rasterize_triangles
 from fluidlift.types.camera import PinholeCamera
+from fluidlift.types.kind import FluidKind, kind_of
 from fluidlift.types.terrain import TriangleMesh
 
 if TYPE_CHECKING:
@@ -37,9 +38,9 @@ MOST = 12.0
 """wall thicknesses on a ray, at most: light does not run round the whole of a wall"""
 
 
-def glass_of(kind: str) -> float | None:
+def glass_of(kind: str | FluidKind) -> float | None:
     """Opacity, as surfels, of the walls of what a fluid of a kind stands in; None: they are ground as the rest."""
-    return GLASS if kind == "pour" else None
+    return GLASS if kind_of(kind).fills_vessel else None
 
 
 @dataclass(frozen=True)

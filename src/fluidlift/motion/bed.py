@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fluidlift.errors import require
+from fluidlift.types import FluidKind, kind_of
 
 WALLS = ("cubic", "log", "film")
 """wall functions, see `speed_share`"""
@@ -27,12 +28,6 @@ VISCOUS_RATIO, TURBULENT_RATIO = 1.0, 2.5
 it is taken to be turbulent. Water is faster than the first for its slope and depth even among boulders twice as tall
 as it is deep: 1.2 there, 2.3 where they are as tall (Ferguson 2007, Water Resources Research 43, W05427). At the
 second, 1 / 0.4, the log law ends: its mean over the depth is 0. In a film the ratio is sqrt(Re / 2)."""
-
-LAYER_CELLS = {"stream": 1.0, "fall": 0.75, "pour": 2.0, "plume": 0.4, "dam": 1.0}
-"""Thickness of the layer in cells. Water is turbulent: beside the bed of a river some 10 cells deep its speed at half
-a cell is about 0.7 of the surface speed (1/7 power law), which a layer of one cell gives; films from a fall are
-shorter. What is poured is often viscous and drags through its depth. In smoke the layer stays below half a cell and so
-damps nothing (paper: "sub-cell scale")."""
 
 
 def wall_profile(distance: Float[np.ndarray, "*n"], thickness: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
@@ -91,7 +86,7 @@ def film_profile(distance: Float[np.ndarray, "*n"], depth: Float[np.ndarray, "*n
 def speed_share(
     distance: Float[np.ndarray, "*n"],
     *,
-    kind: str,
+    kind: str | FluidKind,
     spacing: float,
     depth: Float[np.ndarray, "*n"] | float | None = None,
     wall: str = "cubic",
@@ -111,7 +106,8 @@ def speed_share(
         wall: one of `WALLS`.
 
     Raises:
-        ValueError: an unknown wall function or kind, or a depth that is missing or not positive.
+        ValueError: an unknown wall function, or a depth that is missing or not positive.
+        InputRejected: an unknown kind.
     """
     require(wall in WALLS, f"wall function '{wall}'", "one of " + ", ".join(WALLS))
     if wall == "cubic":
@@ -166,18 +162,20 @@ def _film_share_of(points: np.ndarray, speed: np.ndarray, along: np.ndarray, dep
     return float(np.clip((TURBULENT_RATIO - ratio) / (TURBULENT_RATIO - VISCOUS_RATIO), 0.0, 1.0)), slope
 
 
-def layer_thickness(kind: str, spacing: float) -> float:
+def layer_thickness(kind: str | FluidKind, spacing: float) -> float:
     """Thickness d of the layer, m, by fluid type and grid (paper: "dynamically decided by the fluid type").
 
     It is set in cells and not from a Reynolds number: the wall function stands for the part of the slowing that the
     grid cannot show, and the fluid's own viscosity acts beyond it.
 
     Args:
-        kind: "stream", "fall", "pour", "plume" or "dam".
+        kind: of the fluid.
         spacing: cell width, m.
+
+    Raises:
+        InputRejected: an unknown kind.
     """
-    require(kind in LAYER_CELLS, f"kind '{kind}'", "one of " + ", ".join(LAYER_CELLS))
-    return LAYER_CELLS[kind] * spacing
+    return kind_of(kind).wall_layer * spacing
 
 
 def bed_velocity(
@@ -185,7 +183,7 @@ def bed_velocity(
     mainstream: Float[np.ndarray, "*n 3"],
     normal: Float[np.ndarray, "n 3"] | None = None,
     *,
-    kind: str,
+    kind: str | FluidKind,
     spacing: float,
     depth: Float[np.ndarray, " n"] | float | None = None,
     wall: str = "cubic",

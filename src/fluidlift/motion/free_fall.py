@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from fluidlift.errors import require
-from fluidlift.types import Grid, SurfaceMotion
+from fluidlift.types import FluidKind, Grid, SurfaceMotion, kind_of
 
 BELIEVABLE = 0.3
 """share of the expected speed below which a measured motion counts as failed: friction takes at most half (below)"""
@@ -26,9 +26,6 @@ MOSTLY = 0.5
 sheet drifts at one speed, or it would not stay whole"""
 SIDEWAYS = 1.0
 """drift over the speed of the fall at its foot, at most"""
-
-ENERGY_SHARE = {"pour": 0.95, "fall": 0.35}
-"""share of the drop's energy that is left: almost all in the air, a third over rock (a choice)"""
 
 
 def downhill_of(
@@ -60,7 +57,7 @@ def downhill_of(
 
 def falling_share(
     points: Float[np.ndarray, "n 3"], downhill: Float[np.ndarray, "n 3"], measured: Float[np.ndarray, "n 3"], *,
-    kind: str, top: float, gravity: float,
+    kind: str | FluidKind, top: float, gravity: float,
 ) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:  # fmt: skip
     """Expected velocity and where it should replace the measured one.
 
@@ -68,13 +65,15 @@ def falling_share(
         points: on the surface, m.
         downhill: unit direction of steepest descent along the surface there (straight down in the air).
         measured: m/s.
-        kind: pour or fall.
+        kind: of the fluid, which falls freely.
         top: height from which the fluid falls, m.
         gravity: m/s^2, positive.
     """
+    kept = kind_of(kind).energy_share
+    require(kept is not None, f"the kind '{kind}'", "a fluid that falls freely")
     steep = np.clip(-downhill[:, 2], 0.0, 1.0)
     drop = np.maximum(top - points[:, 2], 0.0)
-    speed = np.sqrt(2.0 * gravity * ENERGY_SHARE[kind] * drop) * steep
+    speed = np.sqrt(2.0 * gravity * kept * drop) * steep
     expected = speed[:, None] * downhill
     along = (measured * downhill).sum(axis=1)
     replaced = (steep > 0.5) & (speed > 0) & (along < BELIEVABLE * speed)
@@ -136,7 +135,7 @@ def with_free_fall(
     surface: SurfaceMotion,
     downhill: Float[np.ndarray, "n 3"],
     *,
-    kind: str,
+    kind: str | FluidKind,
     gravity: float = 9.81,
     entry: float = 0.15,
 ) -> tuple[SurfaceMotion, float]:
@@ -145,7 +144,7 @@ def with_free_fall(
     Args:
         surface: as measured.
         downhill: see `falling_share`; [n,3].
-        kind: pour or fall.
+        kind: of the fluid, which falls freely.
         gravity: m/s^2.
         entry: share of the whole drop that the fluid has already fallen where it enters the picture.
 
@@ -153,9 +152,9 @@ def with_free_fall(
         The motion, and the share of the steep points that was replaced. Replaced points are not `observed`.
 
     Raises:
-        ValueError: another kind, or arrays of different lengths.
+        ValueError: a kind that does not fall freely, or arrays of different lengths.
     """
-    require(kind in ENERGY_SHARE, f"kind '{kind}'", "pour or fall")
+    require(kind_of(kind).falls_freely, f"the kind '{kind}'", "a fluid that falls freely")
     require(downhill.shape == surface.points.shape, f"downhill {downhill.shape}", str(surface.points.shape))
     if len(surface.points) == 0:
         return surface, 0.0

@@ -23,7 +23,7 @@ from fluidlift.motion.mainstream import complete_flow
 from fluidlift.motion.screen_divergence import project_screen_divergence, validated_reach
 from fluidlift.motion.temporal import smoothed_flow
 from fluidlift.motion.volume import VolumeReport, VolumeSolver
-from fluidlift.types import FaceVelocity, PinholeCamera, PixelFlow, SurfaceMotion, Terrain
+from fluidlift.types import FaceVelocity, FluidKind, PinholeCamera, PixelFlow, SurfaceMotion, Terrain, kind_of
 
 FlowReader = Callable[[int, int], PixelFlow]
 """(first, last) -> the flow of the pairs first to last - 1"""
@@ -54,8 +54,8 @@ class MotionScene:
     """its grid is the grid of the volume. None: no volume"""
     cell_types: UInt8[np.ndarray, "nx ny nz"] | None
     """`CellType`"""
-    kind: str
-    """stream, fall, pour or plume"""
+    kind: str | FluidKind
+    """of the fluid"""
     interval: float
     """s per frame"""
     surface_height: Float[np.ndarray, "nx ny"] | None = None
@@ -277,7 +277,7 @@ def _frame_motion(
     if clip.reach > 0:
         full = _constrained(full, seen, now, scene, options, clip.reach)
     factor = None
-    if scene.kind == "plume":
+    if kind_of(scene.kind).is_gas:
         full, factor = _with_front(full, mask, t, window)
     surface = velocity = report = share = None
     if solver is not None:
@@ -292,15 +292,14 @@ def _filled(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Smoothed in time and filled in along the mainstream: displacement, observed, and confidence before filling."""
     # what collapses is faster in every frame
-    longer = options.along_paths and scene.kind != "dam"
+    longer = options.along_paths and not kind_of(scene.kind).starts_at_rest
     reach = max(options.reach, options.half_window) if longer else options.half_window
     near, at = window.around(t, reach)
     mask, depth = now.mask, now.depth
     mean, trust = smoothed_flow(near, at, mask, half_window=options.half_window, along_paths=options.along_paths)
     direction = mainstream_direction(mean, trust, mask, downhill=downhill)
     with_depth = depth is not None and bool((depth[mask] > 0).all())
-    # what grows or collapses has no mean motion
-    prior = None if scene.kind in ("plume", "dam") else scene.prior
+    prior = scene.prior if kind_of(scene.kind).has_mean_motion else None
     full, seen = complete_flow(mean, trust, mask, direction, depth if with_depth else None, prior=prior)
     return full, seen, trust
 
@@ -341,11 +340,11 @@ def _lifted(
         full, seen, body, now.depth, now.depth_after, scene.camera, scene.interval, mask_t1=body_after
     )
     share = None
-    if scene.kind in ("fall", "pour"):
+    if kind_of(scene.kind).falls_freely:
         down = downhill_of(surface.points, terrain.grid, scene.surface_height, scene.pool_level)
         surface, share = with_free_fall(surface, down, kind=scene.kind)
     velocity, report = solver.velocity(surface, tolerance=options.tolerance)
-    if scene.kind == "plume":
+    if kind_of(scene.kind).is_gas:
         velocity, _ = with_air(velocity, cells, terrain, terrain.grid)
     return measured, surface, velocity, report, share
 

@@ -55,11 +55,8 @@ from fluidlift.motion.volume_projection import (
 )
 from fluidlift.numerics.sampling import gradient_nodes
 from fluidlift.physics.pressure import PressureSystem, build_system
-from fluidlift.types import CellType, FaceVelocity, Grid, SolveReport, SurfaceMotion, Terrain
+from fluidlift.types import CellType, FaceVelocity, FluidKind, Grid, SolveReport, SurfaceMotion, Terrain, kind_of
 
-LAYERED = ("stream", "fall")
-"""kinds of turbulent flow: nearly the same speed at all depths but for a layer at the walls. What is poured may be
-viscous, which drags through its depth: there the extension is harmonic between the surface and the bed"""
 CLOSED_SURFACE = 0.25
 """Mobility of faces between fluid and air over that of the fluid below, times length^2 / depth of the fluid in cells,
 where the flow is steady: about 3e-4 on a stream of 5 by 64 cells. A leak acts on a stream over sqrt(depth / mobility)
@@ -126,41 +123,40 @@ class VolumeSolver:
         cell_types: UInt8[np.ndarray, "nx ny nz"],
         grid: Grid,
         *,
-        kind: str,
+        kind: str | FluidKind,
         mainstream: Float[np.ndarray, "3"] | None = None,
         wall: str = "cubic",
         options: VolumeOptions | None = None,
     ) -> None:
         """Prepare; see `volume_velocity`."""
-        options = VolumeOptions() if options is None else options
+        options, kind = VolumeOptions() if options is None else options, kind_of(kind)
         types = np.asarray(cell_types)
         require(types.shape == grid.shape, f"cell types {types.shape}", str(grid.shape))
         require(wall in WALLS, f"wall function '{wall}'", "one of " + ", ".join(WALLS))
         carrying = (types == CellType.FLUID) | (types == CellType.INFLOW) | (types == CellType.OUTFLOW)
         require(bool(carrying.any()), "cell types without fluid")
         self._types, self._carrying, self._options = types, carrying, options
-        wall = "cubic" if kind == "plume" else wall  # a gas meets few walls, and never by its whole depth
+        wall = "cubic" if kind.is_gas else wall  # a gas meets few walls, and never by its whole depth
         # the other wall functions span the whole depth: there is nothing left to interpolate
-        layered = kind in LAYERED or wall != "cubic"
+        # what is poured may be viscous, which drags through its depth: harmonic between the surface and the bed
+        layered = kind.is_channel_flow or wall != "cubic"
         self._bed = _Bed(types, terrain, grid, kind, mainstream, wall, _typical_depth(types, grid.spacing))
         self._extension = options.extension or ("layered" if layered else "harmonic")
         self._share = self._bed.share() if self._extension == "layered" else None
         # the paper's layer is for fluid that is not viscous; whether a stream is shows only in its motion
-        asked = kind == "stream" and wall == "cubic" and self._share is not None
+        asked = kind.nearly_level and wall == "cubic" and self._share is not None
         self._film = replace(self._bed, wall="film").share() if asked else None
         # fluid passes freely through both ends
         self._system = build_system(np.where(types == CellType.INFLOW, CellType.OUTFLOW, types), terrain, grid)
         self._nearest, self._ends = nearest_cells(carrying), end_faces(types)
         self._mouths = mouths_of(types, self._system, REACH * self._bed.depth)
-        self._steady = kind == "stream" and len(self._mouths) == 2
-        self._rim = [end for end in self._mouths if end.inlet] if kind == "fall" else []
-        self._balanced = options.balanced if options.balanced is not None else kind != "plume"
+        self._steady = kind.nearly_level and len(self._mouths) == 2
+        self._rim = [end for end in self._mouths if end.inlet] if kind.enters_over_rim else []
+        self._balanced = options.balanced if options.balanced is not None else not kind.is_gas
         if options.surface_mobility is not None:
             self._leak = np.full(grid.shape, options.surface_mobility, np.float32)
         else:
-            steady = (
-                0.0 if kind == "plume" else passed_through(types, self._system.openings, however_narrow=self._steady)
-            )
+            steady = 0.0 if kind.is_gas else passed_through(types, self._system.openings, however_narrow=self._steady)
             # between the two by ratio: they differ by orders of magnitude
             leak = self._closed() ** steady * YIELDING_SURFACE ** (1.0 - steady)
             self._leak = np.broadcast_to(leak, grid.shape).astype(np.float32)
@@ -276,7 +272,7 @@ def volume_velocity(
     cell_types: UInt8[np.ndarray, "nx ny nz"],
     grid: Grid,
     *,
-    kind: str,
+    kind: str | FluidKind,
     mainstream: Float[np.ndarray, "3"] | None = None,
     wall: str = "cubic",
     tolerance: float = 1e-4,
@@ -300,7 +296,8 @@ def volume_velocity(
         velocity on the faces, float32 m/s, 0 where neither neighbour holds fluid, and the report.
 
     Raises:
-        ValueError: cell types of the wrong shape, an unknown kind or wall, or no fluid cell near any sample.
+        ValueError: cell types of the wrong shape, an unknown wall, or no fluid cell near any sample.
+        InputRejected: an unknown kind.
     """
     solver = VolumeSolver(terrain, cell_types, grid, kind=kind, mainstream=mainstream, wall=wall, options=options)
     return solver.velocity(surface, tolerance=tolerance)
@@ -313,7 +310,7 @@ class _Bed:
     types: np.ndarray
     terrain: Terrain | None
     grid: Grid
-    kind: str
+    kind: FluidKind
     mainstream: np.ndarray | None
     wall: str
     depth: float

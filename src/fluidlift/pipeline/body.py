@@ -29,16 +29,20 @@ from fluidlift.shape import kind as kinds
 from fluidlift.shape.frame_pictures import typical_picture
 from fluidlift.shape.framing import framing_warnings
 from fluidlift.shape.given_depth import DepthPictures
+from fluidlift.shape.kinds import Observation, builder_of
 from fluidlift.shape.view import look_at
 from fluidlift.types import (
     CellType,
+    FluidKind,
     Gaussians,
     Grid,
     PinholeCamera,
     Similarity3,
     Terrain,
     TriangleMesh,
+    kind_of,
 )
+from fluidlift.types.kind import STREAM
 
 FEWEST_PIXELS = 16
 """of fluid at the first instant: fewer have no shape"""
@@ -65,7 +69,7 @@ class _Sight:
     """its pose counts where `pose_given`"""
     pose_given: bool
     evidence: kinds.KindEvidence
-    kind: kinds.Kind
+    kind: FluidKind
     parts: composite.Parts
     up: kinds.UpEvidence
     heading: float | None
@@ -150,7 +154,7 @@ def geometry(story: Story, inputs: Inputs, config: JobConfig) -> Result:
         "sighted_depth": (front.sighted * scale.value).astype(np.float32), "plate": picture,
     }  # fmt: skip
     meta |= {
-        "warnings": warnings, "kind": kind, "kind_evidence": asdict(seen.evidence),
+        "warnings": warnings, "kind": kind.name, "kind_evidence": asdict(seen.evidence),
         "kind_source": "evidence" if c.kind == "auto" else "user", "up": asdict(up),
         "scale": asdict(scale) | {"sentence": sentence}, "camera": camera.to_dict(),
         "world_from_canonical": {
@@ -178,10 +182,10 @@ def _seen(story: Story, inputs: Inputs, config: JobConfig) -> tuple[_Sight, Dept
         story, inputs, config, known, pose_given, mask, motion, trust, shaped=pictures is not None
     )
     height, unsure, stood = None, "", None
-    if pose_given and kind in ("stream", "dam"):
-        level, unsure = level_of(kind, inputs)
+    if pose_given and kind.surveyed_level is not None:
+        level, unsure = level_of(kind.surveyed_level, inputs)
         height = float(known.position[2] - level)
-    if kind == "dam":
+    if kind.starts_at_rest:
         start, united = dam.let_go(fluid), 1
         mask = fluid[start]
         parts = composite.Parts((), mask)
@@ -198,15 +202,13 @@ def _surface(seen: _Sight, pictures: DepthPictures | None, fluid, inputs: Inputs
     """Up, the level camera, the surface of what lies, metres per unit where they are known, and the depth behind it."""
     lying, up = seen.parts.lying, seen.up
     canonical = kinds.level_camera(seen.known, up)
-    front, known_scale = _front(seen, inputs, canonical, interval)
+    observed = _observation(seen, canonical, interval)
+    front, known_scale = _front(seen, inputs, observed)
     if seen.parts.puddle:
         front = surface.level_surface(canonical, lying)
     if pictures is None:
         return up, canonical, front, known_scale, None
-    found = depths.depth_front(
-        pictures, fluid, seen.known, up, seen.kind, lying, seen.motion, seen.lying_trust, expected=front,
-        tilt_known=seen.tilt_known,
-    )  # fmt: skip
+    found = depths.depth_front(pictures, fluid, seen.known, up, seen.kind, observed, expected=front)
     return found.up, kinds.level_camera(seen.known, found.up), found.front, found.known_scale, found
 
 
@@ -225,21 +227,22 @@ def _kind_and_up(story, inputs, config, known, pose_given, mask, motion, trust, 
     pitch = float(surveyed.pitch) if pose_given else c.pitch
     pick = np.unique(np.linspace(0, len(clip) - 1, 8).astype(int))
     evidence = kinds.estimate_kind(clip.frames[pick], fluid[pick], motion, trust, pitch=pitch)
-    kind = evidence.kind if c.kind == "auto" else c.kind
-    if kind == "dam" and (shaped or inputs.geometry is not None):
-        if c.kind == "dam":
+    kind = kind_of(evidence.kind if c.kind == "auto" else c.kind)
+    if kind.starts_at_rest and (shaped or inputs.geometry is not None):
+        if c.kind != "auto":
             raise InputRejected(
-                "--kind dam together with a given depth or body", "one source of the fluid's shape", "leave one out"
+                f"--kind {kind} together with a given depth or body", "one source of the fluid's shape", "leave one out"
             )
-        kind = max((k for k in evidence.scores if k != "dam"), key=lambda k: evidence.scores[k])
+        others = [k for k in evidence.scores if not kind_of(k).starts_at_rest]
+        kind = kind_of(max(others, key=lambda k: evidence.scores[k]))
     if inputs.geometry is None:
         kind, parts = composite.split(
             kind, known, surveyed if pose_given else None, mask, motion, trust, free=c.kind == "auto"
         )
-        if kind == "pour" and c.kind == "auto":
+        if kind.fills_vessel and c.kind == "auto":
             poured = puddle.jets_into_puddle(known, surveyed if pose_given else None, mask, motion, trust)
             if poured is not None:
-                kind, parts = "stream", composite.Parts(poured.jets, poured.lying, puddle=True)
+                kind, parts = STREAM, composite.Parts(poured.jets, poured.lying, puddle=True)
     else:
         parts = composite.Parts((), mask)
     if pose_given:
@@ -250,16 +253,14 @@ def _kind_and_up(story, inputs, config, known, pose_given, mask, motion, trust, 
         if upright is not None:
             return evidence, kind, parts, upright, None
     texture = None
-    if kind == "stream" and c.pitch is None and not parts.puddle:
+    if kind.nearly_level and c.pitch is None and not parts.puddle:
         texture = texture_gradient.texture_patches(clip.frames, parts.lying & ~parts.falling)
     typical = typical_picture(clip.frames[pick]).astype(np.uint8)
-    picture = look_at(typical, fluid.any_frame(), parts.lying if kind == "stream" else None, texture)
+    picture = look_at(typical, fluid.any_frame(), parts.lying if kind.nearly_level else None, texture)
     up = kinds.estimate_up(
         kind, parts.lying, motion, trust * ~parts.falling, known, picture, given=(c.pitch, c.roll),
         level_prior=composite.level_prior(parts, motion, trust),
     )  # fmt: skip
-    if parts.puddle and c.pitch is None:
-        up = puddle.puddle_tilt(parts.lying, up)
     if c.roll is None:
         up = composite.with_roll(up, parts, known)
     return evidence, kind, parts, up, None
@@ -286,22 +287,20 @@ def _depth_pictures(story, inputs, config, known, start) -> tuple[DepthPictures 
     return pictures, known
 
 
-def _front(seen: _Sight, inputs: Inputs, canonical: PinholeCamera, interval: float):
+def _observation(seen: _Sight, canonical: PinholeCamera, interval: float) -> Observation:
+    """What lies, as the builder of its kind wants it."""
+    return Observation(
+        canonical, seen.parts.lying, seen.motion, seen.lying_trust, interval, camera_height=seen.height,
+        tilt_known=seen.tilt_known, level_prior=composite.level_prior(seen.parts, seen.motion, seen.trust),
+        roll=seen.up.roll, standing=seen.stood,
+    )  # fmt: skip
+
+
+def _front(seen: _Sight, inputs: Inputs, observed: Observation):
     """The front surface in canonical units; metres per unit where the depth came in metres, else None."""
-    lying, motion, trust = seen.parts.lying, seen.motion, seen.lying_trust
-    if seen.stood is not None:
-        return standing.standing_front(canonical, seen.stood), None
     if inputs.geometry is not None:
-        return given_body.given_front(inputs.geometry, canonical, lying, seen.kind, seen.start)
-    if seen.kind == "stream":
-        front = surface.stream_surface(
-            canonical, lying, motion, trust, interval, camera_height=seen.height, tilt_known=seen.tilt_known,
-            level_prior=composite.level_prior(seen.parts, motion, seen.trust),
-        )  # fmt: skip
-        return front, None
-    if seen.kind == "fall":
-        return surface.falling_surface(canonical, lying, motion, trust), None
-    return surface.inflated_surface(canonical, lying, seen.kind, seen.up.roll), None
+        return given_body.given_front(inputs.geometry, observed.camera, observed.mask, seen.kind, seen.start)
+    return builder_of(seen.kind).front_surface(observed), None
 
 
 def _surface_motion(camera, visible, depth, motion, interval) -> tuple[np.ndarray, np.ndarray]:
@@ -324,14 +323,12 @@ def _surface_motion(camera, visible, depth, motion, interval) -> tuple[np.ndarra
     return points, (camera.unproject(end, later) - points) / interval
 
 
-def _mainstream(kind: str, velocities: np.ndarray, trust: np.ndarray) -> np.ndarray:
+def _mainstream(kind: FluidKind, velocities: np.ndarray, trust: np.ndarray) -> np.ndarray:
     """Bulk direction: confident and fast motion counts most; bodies in the air move along the vertical."""
     speed = np.linalg.norm(velocities, axis=1)
     capped = velocities * np.minimum(1.0, np.percentile(speed, 95) / np.maximum(speed, 1e-12))[:, None]
     bulk = (capped * (trust * np.linalg.norm(capped, axis=1))[:, None]).sum(axis=0)
-    if kind in ("pour", "plume"):
-        bulk = bulk / max(np.linalg.norm(bulk), 1e-12)
-        bulk = np.array([bulk[0], bulk[1], -max(-bulk[2], 1.0) if kind == "pour" else max(bulk[2], 1.0)])
+    bulk = builder_of(kind).mainstream(bulk)
     norm = np.linalg.norm(bulk)
     return bulk / norm if norm > 1e-12 else np.array([1.0, 0.0, 0.0])
 

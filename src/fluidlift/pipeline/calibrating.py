@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fluidlift.pipeline.scene import LYING, Scene, wave_speed
+from fluidlift.pipeline.scene import Scene, wave_speed
 from fluidlift.pipeline.story import Result
-from fluidlift.types import CellType, FaceVelocity
+from fluidlift.types import CellType, FaceVelocity, kind_of
 
 if TYPE_CHECKING:
     from fluidlift.types import FluidAsset
@@ -70,7 +70,7 @@ def calibrate(
     from fluidlift.physics.guidance import Nudging
     from fluidlift.pipeline.simulating import simulator_of
 
-    if scene.kind not in LYING or not len(scene.body):
+    if not kind_of(scene.kind).is_channel_flow or not len(scene.body):
         return Result()
     grid, frames = scene.terrain.grid, min(scene.frames, LONGEST)
     speed = _typical_speed(target, scene.cell_types)

@@ -10,11 +10,12 @@ from jaxtyping import Bool, Float
 
 from fluidlift.shape import airborne, jets, place
 from fluidlift.shape.jet_column import Jet, with_columns
-from fluidlift.shape.kind import PITCH_PRIOR, Kind, UpEvidence, level_camera
+from fluidlift.shape.kind import UpEvidence, level_camera
 from fluidlift.shape.slope import LEVEL
 from fluidlift.shape.surface import FrontSurface
 from fluidlift.shape.terrain import Setting
-from fluidlift.types import PinholeCamera, Similarity3
+from fluidlift.types import FluidKind, PinholeCamera, Similarity3
+from fluidlift.types.kind import LOOKING_DOWN, POUR, STREAM
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,7 @@ class Parts:
 
 
 def split(
-    kind: Kind,
+    kind: FluidKind,
     camera: PinholeCamera,
     up: UpEvidence | None,
     mask: Bool[np.ndarray, "h w"],
@@ -42,7 +43,7 @@ def split(
     trust: Float[np.ndarray, "h w"],
     *,
     free: bool,
-) -> tuple[Kind, Parts]:
+) -> tuple[FluidKind, Parts]:
     """The kind of the lying part, and the parts.
 
     A pour whose mask is a wide puddle below narrow threads is a stream with jets: a puddle does not stand on edge.
@@ -56,14 +57,14 @@ def split(
         trust: of it.
         free: whether the kind may change (the user did not give it).
     """
-    tilt = up or UpEvidence(PITCH_PRIOR["stream"][0], 0.0, "", 0.0)
+    tilt = up or UpEvidence(LOOKING_DOWN[0], 0.0, "", 0.0)
     found: list[jets.Outline] = []
     neck = None
-    if kind == "stream":
+    if kind.nearly_level:
         found = jets.find_jets(level_camera(camera, tilt), mask, motion, trust)
-    elif kind == "pour" and free:
+    elif kind.fills_vessel and free:
         neck = jets.find_neck(mask, pitch=tilt.pitch)
-        kind, found = ("stream", [neck]) if neck is not None else (kind, [])
+        kind, found = (STREAM, [neck]) if neck is not None else (kind, [])
     lying = jets.lying_pixels(mask, jets.airborne_pixels(found, mask.shape))
     return kind, Parts(tuple(found), lying, puddle=neck is not None)
 
@@ -115,7 +116,7 @@ def with_fall(
     if scale.source != "assumed" or not falls.any():
         return scale
     part = place.Sighting(None if seen.trust is None else seen.trust[falls], seen.interval, seen.pitch)
-    found = place.metric_scale("pour", points[falls], velocities[falls], seen=part)
+    found = place.metric_scale(POUR, points[falls], velocities[falls], seen=part)
     if found.source != "free fall":
         return scale
     return replace(found, across=scale.across * found.value / scale.value)

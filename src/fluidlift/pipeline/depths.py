@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -18,9 +19,10 @@ from fluidlift.pipeline.story import Story, content_hash, file_hash
 from fluidlift.shape import depth_surface, given_depth
 from fluidlift.shape import kind as kinds
 from fluidlift.shape.given_depth import DepthPictures, SceneDepth
+from fluidlift.shape.kinds import Observation, builder_of
 from fluidlift.shape.place import DISAGREEING, MetricScale
 from fluidlift.shape.surface import FrontSurface
-from fluidlift.types import PinholeCamera
+from fluidlift.types import FluidKind, PinholeCamera
 
 LEARNED_SCALE = 0.15
 """relative standard error of a model's metres: assumed, as no trained model was measured here"""
@@ -100,7 +102,7 @@ def require_weights(config: JobConfig) -> None:
             f"--depth-model {d.model} without its weights", "a file or folder with them",
             "--depth-weights PATH; docs/depth.md says where to get them",
         )  # fmt: skip
-    if not d.download and not Path(d.weights).expanduser().exists():
+    if not d.download and not os.path.exists(os.path.expanduser(d.weights)):
         raise InputRejected(
             f"weights '{d.weights}' that are not there", "an existing file or folder",
             "check --depth-weights, or --set depth.download=true for a name on the hub",
@@ -171,8 +173,8 @@ def _from_model(story: Story, config: JobConfig, camera: PinholeCamera | None, s
 
 
 def depth_front(
-    pictures: DepthPictures, fluid: FluidMasks, camera: PinholeCamera, up: kinds.UpEvidence, kind: kinds.Kind,
-    mask: np.ndarray, motion: np.ndarray, trust: np.ndarray, *, expected: FrontSurface, tilt_known: bool,
+    pictures: DepthPictures, fluid: FluidMasks, camera: PinholeCamera, up: kinds.UpEvidence, kind: FluidKind,
+    seen: Observation, *, expected: FrontSurface,
 ) -> DepthFront:  # fmt: skip
     """Surface, tilt and scale by the depth.
 
@@ -182,34 +184,28 @@ def depth_front(
         camera: pose not used.
         up: as it is known, or taken to be without the depth.
         kind: of the fluid.
-        mask: the fluid whose surface is wanted.
-        motion: mean optical flow, px per frame.
-        trust: of the flow.
+        seen: the fluid whose surface is wanted; its camera is not used.
         expected: surface that the fluid would be taken to have otherwise, for what the pictures cannot say.
-        tilt_known: whether `up` is surveyed or the user's.
 
     Raises:
         InputRejected: a depth that says nothing about the fluid, or cannot be of this view.
     """
+    mask = seen.mask
     fused = given_depth.fuse(pictures, np.stack([fluid[t] for t in pictures.frames]), mask)
     scene = given_depth.scene_depth(fused, expected.depth, mask)
     meta: dict[str, Any] = {
         "source": scene.source, "frames": scene.frames, "flicker": scene.flicker, "holds": fused.holds,
     }  # fmt: skip
     slopes, usual = depth_surface.slopes_by_motion(expected.slope), expected.height
-    if kind == "stream" and not tilt_known and fused.holds != "disparity":
-        up, slope = depth_surface.up_from_depth(scene, camera, mask, motion, trust)
+    if kind.nearly_level and not seen.tilt_known and fused.holds != "disparity":
+        up, slope = depth_surface.up_from_depth(scene, camera, mask, seen.motion, seen.trust)
         slopes, usual = ((1.0, slope, 0.5),), None
     level = kinds.level_camera(camera, up)
-    if kind == "stream":
-        front, evidence = depth_surface.stream_surface(scene, level, mask, motion, trust, slopes=slopes, usual=usual)
+    front, evidence = builder_of(kind).depth_surface(scene, replace(seen, camera=level), slopes=slopes, usual=usual)
+    if evidence is not None:
         meta["slope"] = asdict(evidence)
-    elif kind == "fall":
-        front = depth_surface.fall_surface(scene, level, mask)
-    else:
-        front = depth_surface.airborne_surface(scene, level, mask, kind)
     learned = pictures.source != "depth file"
-    if not learned and kind in ("stream", "fall") and fused.holds != "disparity":
+    if not learned and kind.is_channel_flow and fused.holds != "disparity":
         # a file is believed to its last wave, where it says something; what lies below follows the smooth surface
         known = mask & np.isfinite(scene.depth) & (scene.depth > 0)
         front = replace(front, depth=np.where(known, scene.depth, front.depth).astype(np.float32))

@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from fluidlift.errors import InputRejected
-from fluidlift.pipeline.scene import LYING
-from fluidlift.types import Gaussians, Particles, PinholeCamera, concatenate, sh_from_rgb
+from fluidlift.types import Gaussians, Particles, PinholeCamera, concatenate, kind_of, sh_from_rgb
 
 if TYPE_CHECKING:
     from fluidlift.look.filmed_outline import FilmedOutline
@@ -164,7 +163,7 @@ class Dressing:
         gravity = np.asarray(scene.parameters.gravity, np.float64)
         upright = -gravity[2] > UPRIGHT * max(float(np.linalg.norm(gravity)), 1e-12)
         footage = self._film_of(own)
-        if scene.kind == "stream" and upright:
+        if kind_of(scene.kind).nearly_level and upright:
             self._axes = PlanAxes()
         elif footage is not None:
             self._axes = PictureAxes(self._camera, float(np.median(self._camera.project(own.means)[1])))
@@ -186,7 +185,7 @@ class Dressing:
             texture, max(PATCH * across, FEWEST_CELLS * self._cell), footage=footage, edited=scene.edited,
             start=scene.film_start,
         )  # fmt: skip
-        if footage is not None and scene.kind in LYING and not scene.edited:
+        if footage is not None and kind_of(scene.kind).is_channel_flow and not scene.edited:
             self._outline = FilmedOutline(self._camera, footage.outside, self._cell)
         self._plays = footage is not None
         self._begin_again()
@@ -194,7 +193,7 @@ class Dressing:
     def _film_of(self, own: Gaussians) -> FluidFootage | None:
         """The film that the surface plays, whose size the camera has from here on; one that cannot be is a warning."""
         scene = self._scene
-        if scene.film is None or scene.kind == "plume":
+        if scene.film is None or kind_of(scene.kind).is_gas:
             return None
         found = _footage(scene.film, scene.camera, own.means, self._cell)
         if isinstance(found, str):

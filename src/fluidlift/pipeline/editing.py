@@ -24,10 +24,9 @@ from fluidlift.pipeline import edit_history
 from fluidlift.pipeline.edit_history import BY_HAND, Edit, History, text_hash, unified
 from fluidlift.pipeline.edit_outlook import outlook
 from fluidlift.pipeline.reshaping import HIGHEST
-from fluidlift.pipeline.scene import LYING
 from fluidlift.pipeline.scene_changes import Add, Change, Remove, Set
 from fluidlift.pipeline.substances import SUBSTANCES
-from fluidlift.types import Grid
+from fluidlift.types import Grid, kind_of
 
 __all__ = ["Add", "Change", "EditSession", "Remove", "Set"]
 
@@ -117,7 +116,7 @@ class EditSession:
             return [Set("look.material", None), *(Set(f"parameters.{n}", None) for n in names)]
         if material not in SUBSTANCES:
             raise InputRejected(f"no material '{material}'", "one of source, " + ", ".join(SUBSTANCES))
-        if read_manifest(self.folder)["kind"] == "plume":
+        if kind_of(read_manifest(self.folder)["kind"]).is_gas:
             raise InputRejected(
                 f"{material} for smoke", "a liquid", "look.tint and look.environment change smoke's look"
             )
@@ -289,11 +288,11 @@ class EditSession:
 
     def _require_kind(self, edits: SceneEdits) -> None:
         """Raise `InputRejected` for what this kind of fluid cannot do."""
-        kind = read_manifest(self.folder)["kind"]
-        if edits.extend_downstream > 0 and kind not in LYING:
+        kind = kind_of(read_manifest(self.folder)["kind"])
+        if edits.extend_downstream > 0 and not kind.is_channel_flow:
             raise InputRejected(f"a {kind} cannot be extended downstream", "a stream or a fall")
-        if kind == "plume" and edits.obstacles:
-            raise InputRejected(f"{edits.obstacles[0].line}: an obstacle in a plume", "obstacles in a liquid")
+        if kind.is_gas and edits.obstacles:
+            raise InputRejected(f"{edits.obstacles[0].line}: an obstacle in a {kind}", "obstacles in a liquid")
 
     def _inside(self, edits: SceneEdits) -> list[str]:
         """Warnings about what lies mostly outside the domain, which the terrain's edits may move elsewhere."""

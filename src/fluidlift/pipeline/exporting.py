@@ -29,7 +29,7 @@ from fluidlift.pipeline.rendering import frame_numbers, frames_told
 from fluidlift.pipeline.story import Progress, Silence
 from fluidlift.pipeline.surfacing import surface_of
 from fluidlift.pipeline.written import Written, cleared, numbered
-from fluidlift.types import FaceVelocity, FluidAsset, Gaussians, Grid, Similarity3, TriangleMesh
+from fluidlift.types import FaceVelocity, FluidAsset, Gaussians, Grid, Similarity3, TriangleMesh, kind_of
 
 if TYPE_CHECKING:
     from fluidlift.io.volume_grid import VolumeGrid
@@ -152,7 +152,7 @@ def _written(job: ExportJob) -> Outcome:
 def _frames(job: ExportJob) -> Iterator[FluidFrame]:
     """Frame by frame, with the surface where the format has one."""
     mesher, asset = None, job.asset
-    smoke = asset.kind == "plume"  # its volumes say it all; as a surface it would be a lump
+    smoke = kind_of(asset.kind).is_gas  # its volumes say it all; as a surface it would be a lump
     if (job.request.to in MESHED and not (smoke and job.request.to in ("usd", "usd-clips"))) or (
         job.request.to == "vdb" and not smoke
     ):

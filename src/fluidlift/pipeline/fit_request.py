@@ -11,6 +11,7 @@ import yaml
 
 from fluidlift.config import FitConfig
 from fluidlift.errors import InputRejected
+from fluidlift.io.yaml_reader import parse_yaml
 from fluidlift.types import FluidParameters
 
 VECTORS = ("gravity", "inflow_velocity")
@@ -107,10 +108,9 @@ def parameter_named(word: str) -> str:
 def _value(name: str, text: str) -> Value:
     numbers: Any = None
     try:
-        numbers = yaml.safe_load(text)
-        # YAML takes 1e-6 for a word
+        numbers = parse_yaml(text)
         found = [float(x) for x in numbers] if isinstance(numbers, list) else float(numbers)
-    except (yaml.YAMLError, TypeError, ValueError):
+    except (yaml.YAMLError, TypeError, ValueError, OverflowError):
         raise InputRejected(f"the value '{text}' of {name}", "a number") from None
     if isinstance(found, list):
         if name not in VECTORS or len(found) != 3:

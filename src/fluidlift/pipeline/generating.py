@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from contextlib import suppress
 from dataclasses import replace
@@ -41,7 +42,7 @@ def choice_of(config: JobConfig, field_of_view: float | None = None) -> generato
     c = config.generate
 
     def path(text: str | None) -> Path | None:
-        return None if text is None else Path(text).expanduser()
+        return None if text is None else Path(os.path.expanduser(text))
 
     return generators.GeneratorChoice(
         generators.require_known(str(c.name)), path(c.python), path(c.code), path(c.runner), c.weights, c.device,

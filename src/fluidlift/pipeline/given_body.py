@@ -19,7 +19,7 @@ from fluidlift.io.ply import read_gaussians
 from fluidlift.pipeline.story import Story
 from fluidlift.shape import given, place, surface
 from fluidlift.shape.kind import UpEvidence
-from fluidlift.types import Gaussians, PinholeCamera, Similarity3
+from fluidlift.types import FluidKind, Gaussians, PinholeCamera, Similarity3, kind_of
 
 NOTE = "generator.json"
 """file of a folder of generated bodies: `name`, `metric` (in metres), `knows_up` (z is the vertical), `frames`"""
@@ -69,7 +69,9 @@ GENERATOR_TRUST = 0.5
 """of 1: generators put things upright that usually stand; a fluid need not"""
 
 
-def up_of(folder: Path, camera: UpEvidence, kind: str, start: int, size: tuple[int, int]) -> UpEvidence | None:
+def up_of(
+    folder: Path, camera: UpEvidence, kind: str | FluidKind, start: int, size: tuple[int, int]
+) -> UpEvidence | None:
     """The vertical where the body's own axes say it; None where it has to be estimated.
 
     Args:
@@ -85,7 +87,7 @@ def up_of(folder: Path, camera: UpEvidence, kind: str, start: int, size: tuple[i
     if not note["knows_up"]:
         return None
     seen = given_bodies(folder, size, [start])
-    if kind == "stream" and tilt_of_sheet(seen.bodies[0]) > STEEPEST:
+    if kind_of(kind).nearly_level and tilt_of_sheet(seen.bodies[0]) > STEEPEST:
         return None
     return replace(place.pose_up(seen.cameras[0])[0], source="generator", confidence=GENERATOR_TRUST)
 
@@ -99,7 +101,7 @@ def tilt_of_sheet(body: Gaussians) -> float:
 
 
 def given_front(
-    folder: Path, canonical: PinholeCamera, mask: np.ndarray, kind: Any, start: int
+    folder: Path, canonical: PinholeCamera, mask: np.ndarray, kind: FluidKind, start: int
 ) -> tuple[surface.FrontSurface, float | None]:
     """The front surface in canonical units, and metres per unit where the body is in metres."""
     seen, note = given_bodies(folder, canonical.size, [start]), note_of(folder)
@@ -112,7 +114,7 @@ def given_front(
     front = surface.given_surface(canonical, mask, near, kind)
     unit = float(np.median(near[mask]))
     half = np.where(mask, 0.5 * np.maximum(far - near, 0.0), 0.0) / unit
-    thick = half if kind in ("pour", "plume") else np.zeros_like(half)
+    thick = half if kind.airborne else np.zeros_like(half)
     metres = unit / to_canonical.scale if note is None or note["metric"] else None
     return surface.FrontSurface(front.depth, thick.astype(np.float32), front.height), metres
 

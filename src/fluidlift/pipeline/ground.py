@@ -10,7 +10,7 @@ import numpy as np
 from fluidlift.io.stage_cache import parts_of
 from fluidlift.shape import airborne, channel, generate, ground_texture, place, plan, terrain
 from fluidlift.shape.jets import lying_pixels
-from fluidlift.types import Label
+from fluidlift.types import Label, kind_of
 
 
 def setting_around(
@@ -34,7 +34,7 @@ def setting_around(
     return airborne.airborne_setting(
         depth, back, visible, camera, np.concatenate([near, far, reach]), bulk,
         # smoke needs the whole box, and is cheap per cell: no free surface, few particles
-        kind=kind, longest=c.cells, cell_limit=c.cell_limit * (2 if kind == "plume" else 1),
+        kind=kind, longest=c.cells, cell_limit=c.cell_limit * (2 if kind_of(kind).is_gas else 1),
     )  # fmt: skip
 
 

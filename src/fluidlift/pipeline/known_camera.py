@@ -39,13 +39,13 @@ def known_camera(inputs: Inputs, config: JobConfig, size: tuple[int, int]) -> tu
     return camera, "R" in data or "frames" in data
 
 
-def level_of(kind: str, inputs: Inputs) -> tuple[float, str]:
-    """z of a stream's water, or of the ground that a dam stands on, m, where a camera file says it; else 0, the ground
-    of its world, and a warning.
+def level_of(level: tuple[str, str], inputs: Inputs) -> tuple[float, str]:
+    """z of the plane that a surveyed camera stands over (`FluidKind.surveyed_level`), m, where a camera file says it;
+    else 0, the ground of its world, and a warning.
     """
     from fluidlift.io.images import read_json
 
-    name, what = ("ground_level_z", "the ground lies") if kind == "dam" else ("water_level_z", "the water stands")
+    name, what = level
     data = read_json(inputs.camera, "camera file") if inputs.camera is not None else {}
     value = data.get(name)
     if isinstance(value, int | float):

@@ -12,7 +12,7 @@ from fluidlift.pipeline.body import camera_of, setting_of
 from fluidlift.pipeline.reading import clip_of, spans_of
 from fluidlift.pipeline.seeing import masks_of, pairs_of
 from fluidlift.pipeline.story import Result, Story
-from fluidlift.types import FaceVelocity, Grid, SurfaceMotion
+from fluidlift.types import FaceVelocity, Grid, SurfaceMotion, kind_of
 
 if TYPE_CHECKING:
     from fluidlift.motion.sequence import FrameMotion, MotionOptions, MotionScene
@@ -32,7 +32,7 @@ def motion(story: Story, config: JobConfig) -> Result:
     g, (width, height) = story["geometry"], clip_of(story).size
     pairs, grid = len(clip_of(story)) - 1, setting_of(story).terrain.grid
     start = min(g.meta["rest_frame"], pairs - 1)
-    stands = g.meta["kind"] == "dam"  # its body is known as it stands, not as it collapses
+    stands = kind_of(g.meta["kind"]).starts_at_rest  # its body is known as it stands, not as it collapses
     targets = range(start, start if stands else min(start + config.motion.targets, pairs))
     wanted = sorted({start, *targets} | set(range(0, pairs, config.motion.complete_every)))
     spans = spans_of(clip_of(story))

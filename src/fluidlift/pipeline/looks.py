@@ -29,9 +29,18 @@ from fluidlift.look.vessel import Pane, before_glass, panes, vessel_apart
 from fluidlift.look.wet_ground import wetted
 from fluidlift.numerics.srgb import linear_from_srgb, srgb_from_linear
 from fluidlift.pipeline.finer import Lit, averaged, enlarged
-from fluidlift.pipeline.scene import LYING
 from fluidlift.pipeline.surfacing import RADIUS, surface_of
-from fluidlift.types import Gaussians, PinholeCamera, Similarity3, Terrain, TriangleMesh, matrix_from_quat
+from fluidlift.types import (
+    FluidKind,
+    Gaussians,
+    PinholeCamera,
+    Similarity3,
+    Terrain,
+    TriangleMesh,
+    kind_of,
+    matrix_from_quat,
+)
+from fluidlift.types.kind import STREAM
 
 if TYPE_CHECKING:
     from fluidlift.backends.mitsuba_renderer import MitsubaRenderer
@@ -132,7 +141,7 @@ class Painter:
         terrain: Terrain,
         folder: Path,
         *,
-        kind: str = "stream",
+        kind: str | FluidKind = STREAM,
         engine: str = "mesh",
         samples: int = 64,
         supersample: int = 1,
@@ -149,14 +158,14 @@ class Painter:
         self.look, self.terrain, self.engine = look, terrain, engine
         self.material: Material = material_named(look.material).tinted(look.tint)
         self.environment = environment_of(folder, look.environment)
-        self._samples, self._bed = samples, terrain if kind in LYING else None
+        self._samples, self._bed = samples, terrain if kind_of(kind).is_channel_flow else None
         self._end = end
         self._finer, self._folder = 1 if engine == "mitsuba" else int(supersample), folder
         self._far: tuple[tuple, np.ndarray] | None = None
         self._panes: tuple[tuple, tuple[Pane, Pane]] | None = None
         # the ground that hides, and the glass of a pour that does not
         ground, cell = terrain.mesh, terrain.grid.spacing
-        self._solid, self._vessel = vessel_apart(ground, cell) if kind == "pour" else (ground, None)
+        self._solid, self._vessel = vessel_apart(ground, cell) if kind_of(kind).fills_vessel else (ground, None)
         _ = self._final if engine == "mitsuba" else self._mesher  # what is missing is said before anything is drawn
 
     @cached_property

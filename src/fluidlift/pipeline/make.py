@@ -20,7 +20,7 @@ from fluidlift.pipeline.scene import SimulationRequest, first_of_film, scene_of
 from fluidlift.pipeline.seeing import masks_of
 from fluidlift.pipeline.story import Progress, Result, Silence, Story, gone_if_refused
 from fluidlift.pipeline.written import require_stages
-from fluidlift.types import FluidAsset
+from fluidlift.types import FluidAsset, kind_of
 
 STAGES = ("read", "flow", "segment", "geometry", "refine", "motion", "fit", "calibrate", "simulate", "show")
 
@@ -140,7 +140,7 @@ def _write_film(story: Story, folder: Path) -> None:
     from fluidlift.io.footage_file import MOST_FRAMES, write_footage
 
     film, start = folder / FILES["film"], story["geometry"].meta["rest_frame"]
-    if story["geometry"].meta["kind"] == "plume":
+    if kind_of(story["geometry"].meta["kind"]).is_gas:
         film.unlink(missing_ok=True)  # of an earlier run, as something else
         return
     clip = clip_of(story)

@@ -20,6 +20,7 @@ from fluidlift.pipeline.reading import Inputs, clip_of
 from fluidlift.pipeline.seeing import masks_of, pairs_of
 from fluidlift.pipeline.story import Progress, Result, Silence, Story, gone_if_refused
 from fluidlift.pipeline.written import Written, numbered, require_stages
+from fluidlift.types import kind_of
 
 MOTION_STAGES = ("read", "flow", "segment", "geometry", "velocities")
 
@@ -86,7 +87,7 @@ def _velocities(story: Story, folder: Path, config: JobConfig, files: MotionFile
     wanted = [t for t in range(pairs) if t not in writer.rows]
     found = motion_sequence(
         pairs_of(story), masks_of(story).__getitem__, pairs, motion_scene(story), options,
-        frames=wanted, volume_frames=() if g["kind"] == "dam" else wanted,
+        frames=wanted, volume_frames=() if kind_of(g["kind"]).starts_at_rest else wanted,
     )  # fmt: skip
     following = next(found, None)
     for t in wanted:
@@ -98,9 +99,10 @@ def _velocities(story: Story, folder: Path, config: JobConfig, files: MotionFile
     rows = writer.finish(pairs)
     shares = [r["free_fall_share"] for r in rows if r.get("free_fall_share") is not None]
     warnings = motion_warnings(rows, g["kind"], float(max(shares, default=0.0)))
-    if g["kind"] == "dam":
+    if kind_of(g["kind"]).starts_at_rest:
         warnings.append(
-            "the shape of a dam is known as it stands, not as it collapses: flow is written, and no velocity in m/s"
+            f"the shape of a {g['kind']} is known as it stands, not as it collapses: flow is written, and no velocity "
+            "in m/s"
         )
     return Result({}, {"warnings": warnings + _unbalanced(rows), "rows": rows})
 

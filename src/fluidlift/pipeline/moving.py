@@ -33,16 +33,10 @@ from fluidlift.types import (
     Estimate,
     FaceVelocity,
     FitResult,
+    FluidKind,
     FluidParameters,
+    kind_of,
 )
-
-VISCOSITY_PRIOR = {"stream": 1e-5, "fall": 1e-5, "pour": 1e-4, "plume": 1e-5, "dam": 1e-5}
-"""m^2/s, where the fit starts"""
-
-WALL_DAMPING_PRIOR = {"stream": 0.05, "fall": 0.05, "pour": 0.2, "plume": 0.02, "dam": 0.05}
-"""share of the tangential velocity that a wall takes per step of the fit, where the fit starts: water runs nearly free
-over a bed that the grid cannot resolve. A viscous film does not: it sticks (`sticking`)"""
-
 
 AT_WALLS = ("restitution", "wall_damping")
 """not fitted unless asked for: how the velocity falls off towards a wall under water was not seen but assumed
@@ -54,7 +48,7 @@ def fit(story: Story, config: JobConfig) -> Result:
     from fluidlift.fit.optimize import DEFAULT_FREE
     from fluidlift.fit.ranges import UNITS
 
-    setting, kind = setting_of(story), story["geometry"].meta["kind"]
+    setting, kind = setting_of(story), kind_of(story["geometry"].meta["kind"])
     request, along = request_of(config.fit), setting.terrain.mainstream
     _check_request(request, kind)
     targets = targets_of(story)
@@ -70,7 +64,7 @@ def fit(story: Story, config: JobConfig) -> Result:
     parameters, estimates = found.parameters, dict(found.estimates)
     if not judged.usable:
         # the buoyancy of smoke was guessed from its speed by the fit
-        parameters = replace(initial, gravity=parameters.gravity) if kind == "plume" else initial
+        parameters = replace(initial, gravity=parameters.gravity) if kind.is_gas else initial
         estimates = first_guess_as_result(parameters, UNITS)
     known = {name: getattr(initial, name) for name in request.held}
     parameters = replace(parameters, **known)
@@ -110,23 +104,23 @@ def fit(story: Story, config: JobConfig) -> Result:
     )
 
 
-def _check_request(request: FitRequest, kind: str) -> None:
+def _check_request(request: FitRequest, kind: FluidKind) -> None:
     """Raises InputRejected where a kind of fluid has no such parameter, or its clip cannot tell it."""
-    if kind == "plume" and "gravity" in request.held:
+    if kind.is_gas and "gravity" in request.held:
         raise InputRejected(
-            "a known gravity for a plume, whose gravity stands for its buoyancy", "another parameter",
+            f"a known gravity for a {kind}, whose gravity stands for its buoyancy", "another parameter",
             "give gravity in scene.yaml, for the simulation",
         )  # fmt: skip
-    if kind == "dam" and request.free:
+    if kind.starts_at_rest and request.free:
         raise InputRejected(
-            f"a fit of {', '.join(request.free)} to a dam, whose velocities are known as it stands, before it moves",
+            f"a fit of {', '.join(request.free)} to a {kind}, whose velocities are known as it stands, before it moves",
             "values that you know", "leave out fit.free and give them with --hold or in scene.yaml",
         )  # fmt: skip
 
 
 def _told_by_velocities(story: Story, free: tuple[str, ...]) -> tuple[str, ...]:
     """What is fitted to velocities: all but the lift of smoke whose outline rises, which says more of it than they."""
-    if story["geometry"].meta["kind"] != "plume" or set(free) <= {"gravity"} or not outline_rises(story):
+    if not kind_of(story["geometry"].meta["kind"]).is_gas or set(free) <= {"gravity"} or not outline_rises(story):
         return free
     return tuple(name for name in free if name != "gravity")
 
@@ -138,7 +132,7 @@ def _attempt(
     from fluidlift.fit.optimize import fit_parameters
 
     setting = setting_of(story)
-    if story["geometry"].meta["kind"] == "dam":
+    if kind_of(story["geometry"].meta["kind"]).starts_at_rest:
         reason = "a body at rest tells nothing of its parameters: they are those of such a fluid, or as given"
         return FitResult(initial, {}, np.zeros(0), False, 0), Verdict("left", reason)
     try:
@@ -164,7 +158,7 @@ def prior_widths(story: Story) -> dict[str, float]:
     plume's buoyancy is free.
     """
     known = {"time_step": 0.01}
-    return known if story["geometry"].meta["kind"] == "plume" else known | {"gravity": 0.02}
+    return known if kind_of(story["geometry"].meta["kind"]).is_gas else known | {"gravity": 0.02}
 
 
 def filling_rate(story: Story) -> float | None:
@@ -175,7 +169,7 @@ def filling_rate(story: Story) -> float | None:
     from fluidlift.shape.surface import rounded_volume
 
     g, clip = story["geometry"], clip_of(story)
-    if g.meta["kind"] != "pour" or g.meta["pool_level"] is None:
+    if not kind_of(g.meta["kind"]).fills_vessel or g.meta["pool_level"] is None:
         return None
     camera, fluid, start = camera_of(story), masks_of(story), g.meta["rest_frame"]
     distance = float(np.median(g.arrays["depth"][g.arrays["depth"] > 0]))
@@ -193,7 +187,7 @@ def filling_rate(story: Story) -> float | None:
 
 def first_guess(story: Story, targets: list[FaceVelocity]) -> FluidParameters:
     """Where the fit starts: velocities measured at the ends, the rest from what such a fluid usually has."""
-    setting, kind = setting_of(story), story["geometry"].meta["kind"]
+    setting, kind = setting_of(story), kind_of(story["geometry"].meta["kind"])
     cells, direction = setting.cell_types, setting.terrain.mainstream
     mean = np.mean([t.at_centers() for t in targets], axis=0)
     inlet = cells == CellType.INFLOW
@@ -215,17 +209,17 @@ def first_guess(story: Story, targets: list[FaceVelocity]) -> FluidParameters:
     interval = clip_of(story).interval
     courant = setting.terrain.grid.spacing / max(speed, 1e-6)
     return FluidParameters(
-        kinematic_viscosity=VISCOSITY_PRIOR[kind],
+        kinematic_viscosity=kind.kinematic_viscosity,
         inflow_velocity=(float(bulk[0]), float(bulk[1]), float(bulk[2])),
         inflow_fluctuation=float(spread),
         outflow_velocity=max(out, 0.0),
         restitution=0.05,
-        wall_damping=WALL_DAMPING_PRIOR[kind],
+        wall_damping=kind.wall_damping,
         time_step=float(np.clip(min(interval, 2.0 * courant), interval / 20, interval)),
     )
 
 
-def sticking(kind: str, reports: list[dict[str, Any]]) -> float:
+def sticking(kind: str | FluidKind, reports: list[dict[str, Any]]) -> float:
     """Share of the tangential velocity that a wall takes per step of the simulation: all of it where the motion is that
     of a viscous film (`motion.bed.film_share`), whose profile from the bed up is the flow itself. Where that is
     doubtful the two are mixed by ratio, as they differ by more than an order of magnitude.
@@ -238,7 +232,7 @@ def sticking(kind: str, reports: list[dict[str, Any]]) -> float:
         reports: of the motion's targets (`lifting.plain_report`).
     """
     viscous = [r.get("viscous", 0.0) for r in reports]
-    return WALL_DAMPING_PRIOR[kind] ** (1.0 - (float(np.median(viscous)) if viscous else 0.0))
+    return kind_of(kind).wall_damping ** (1.0 - (float(np.median(viscous)) if viscous else 0.0))
 
 
 def parameters_of(story: Story) -> FluidParameters:

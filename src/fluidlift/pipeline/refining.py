@@ -17,7 +17,7 @@ from fluidlift.pipeline.seeing import labels_of
 from fluidlift.pipeline.story import Result, Story
 from fluidlift.seams import Rasterizer
 from fluidlift.shape import generate, terrain
-from fluidlift.types import CellType, Gaussians, Label, PinholeCamera, VideoClip, concatenate, sh_from_rgb
+from fluidlift.types import CellType, Gaussians, Label, PinholeCamera, VideoClip, concatenate, kind_of, sh_from_rgb
 
 KEPT = 0.6
 """part of its size that a splat of the inside keeps at least: at 0.3 the first frame is a little cleaner, but once the
@@ -69,7 +69,7 @@ def refine(story: Story, inputs: Inputs, config: JobConfig) -> Result:
     inside = [hull, _outside_solid(added, setting)]
     inside = [generate.beneath_front(part, depth, mask, camera, smallest=KEPT, drop_above=True) for part in inside]
     hull, added = (generate.within_silhouette(part, allowed, camera, smallest=KEPT) for part in inside)
-    if g.meta["kind"] == "dam":  # its sides tell nothing of the inside that is seen once it spreads
+    if kind_of(g.meta["kind"]).starts_at_rest:  # its sides tell nothing of the inside that is seen once it spreads
         colour = _later_colour(clip, fluid, start)
         hull, added = (replace(part, sh=sh_from_rgb(np.tile(colour, (len(part), 1)))) for part in (hull, added))
     body = concatenate([shown, hull, added])

@@ -33,16 +33,13 @@ from fluidlift.types import (
     PixelLabels,
     Terrain,
     VideoClip,
+    kind_of,
 )
 
 if TYPE_CHECKING:
     from fluidlift.io.obstacles import Obstacle
     from fluidlift.physics.emitter import Emitter
     from fluidlift.physics.rigid_body import RigidBody
-
-LYING = ("stream", "fall")
-"""kinds that lie on something and can be made longer; the others are free in the air"""
-
 
 LOOP_FADE = (0.8, 1.5)
 """s: a shorter fade changes too much of the fluid in each frame, a longer one makes the clip one long fade"""
@@ -85,7 +82,7 @@ class Scene:
     """A simulation at its first instant."""
 
     kind: str
-    """stream, fall, pour, plume or dam"""
+    """name of a `FluidKind` (`kind_of`)"""
     rest: Gaussians
     """world, m"""
     body: Particles
@@ -226,7 +223,7 @@ def before_ground(scene: Scene, footage: Footage | None) -> Callable[[Gaussians]
     if footage is None:
         return None
     rocks = footage.rocks
-    ground = rocks | ~footage.labels.fluid.any(axis=0) if scene.kind in LYING else rocks
+    ground = rocks | ~footage.labels.fluid.any(axis=0) if kind_of(scene.kind).is_channel_flow else rocks
     if not ground.any():
         return None
     margin = scene.terrain.grid.spacing * np.where(rocks, *BEHIND)
@@ -272,7 +269,8 @@ def scene_of(
     rest, grid, velocity = asset.rest, asset.grid, beyond_surface(asset)
     body = Particles.at_rest(rest.means, 1.0, np.arange(len(rest)), sample_faces(velocity, grid, rest.means))
     shading = None
-    if footage is not None and asset.kind in LYING:  # bodies in the air change their outline: nothing is steady
+    # bodies in the air change their outline: nothing is steady
+    if footage is not None and kind_of(asset.kind).is_channel_flow:
         shading = SteadyShading.of(footage.clip.frames, footage.labels.fluid, asset.camera)
     changes = dict(edits.parameters)
     longest_step = changes.pop("time_step", None)
@@ -321,7 +319,7 @@ def beyond_surface(asset: FluidAsset) -> FaceVelocity:
     """
     from fluidlift.physics.boundaries import extrapolate, touching_faces
 
-    if asset.kind == "plume":
+    if kind_of(asset.kind).is_gas:
         return asset.velocity
     liquid = np.isin(asset.cell_types, (CellType.FLUID, CellType.INFLOW, CellType.OUTFLOW))
     return extrapolate(asset.velocity, touching_faces(liquid))
@@ -342,7 +340,7 @@ def extended(scene: Scene, length: float) -> Scene:
     )
     from fluidlift.physics.preflight import check_memory
 
-    if scene.kind not in LYING:
+    if not kind_of(scene.kind).is_channel_flow:
         raise InputRejected(
             f"a {scene.kind} cannot be extended downstream", "a stream or a fall", "leave out --extend-downstream"
         )
@@ -394,7 +392,7 @@ def simulation_step(scene: Scene) -> FluidParameters:
     """
     parameters, interval = scene.parameters, min(scene.interval, scene.clip_interval)
     h = scene.terrain.grid.spacing
-    longest = interval if scene.kind == "plume" else h / max(wave_speed(scene), 1e-6)
+    longest = interval if kind_of(scene.kind).is_gas else h / max(wave_speed(scene), 1e-6)
     step = float(np.clip(longest, interval / 8, interval))
     if scene.longest_step is not None:
         step = min(float(scene.longest_step), scene.interval)

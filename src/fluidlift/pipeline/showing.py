@@ -14,9 +14,9 @@ from fluidlift.io.scene_look import Look
 from fluidlift.pipeline.as_filmed import BEYOND, Reel, card_of_run
 from fluidlift.pipeline.export_job import frames_of
 from fluidlift.pipeline.looks import Backdrop, Frame, Painter, placed_bodies
-from fluidlift.pipeline.scene import LYING, Footage, Scene, before_ground
+from fluidlift.pipeline.scene import Footage, Scene, before_ground
 from fluidlift.pipeline.story import Result
-from fluidlift.types import Gaussians, PinholeCamera, Similarity3, concatenate, matrix_from_quat
+from fluidlift.types import Gaussians, PinholeCamera, Similarity3, concatenate, kind_of, matrix_from_quat
 
 if TYPE_CHECKING:
     from fluidlift.look.open_end import OpenEnd
@@ -132,7 +132,7 @@ def open_end(scene: Scene) -> OpenEnd | None:
     """Where a stream is cut in pictures; None of other kinds."""
     from fluidlift.look.open_end import OpenEnd
 
-    if scene.kind not in LYING:
+    if not kind_of(scene.kind).is_channel_flow:
         return None
     return OpenEnd.of(scene.cell_types, scene.terrain.grid, scene.terrain.mainstream)
 
@@ -156,7 +156,7 @@ def _panels(
             compared = max(len(footage.clip) - footage.start, 1)
     rocks = front_view.rocks
     behind = terrain_depth(terrain, camera) if rocks.any() and painter is not None else None
-    airborne = scene.kind not in LYING
+    airborne = not kind_of(scene.kind).is_channel_flow
     ground = terrain_surfels(terrain, glass=glass_of(scene.kind))
     size = _panel_size(camera.size, config.show.width)
     # a body in the air may fill its box later; what lies on a bed stays in it

@@ -15,9 +15,9 @@ from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.pipeline.dressing import Dressing, lends_look
 from fluidlift.pipeline.looping import close_loop
 from fluidlift.pipeline.reshaping import closed_inlet, in_words, sides_open_to_air
-from fluidlift.pipeline.scene import LYING, Scene, SimulationRequest, simulation_step
+from fluidlift.pipeline.scene import Scene, SimulationRequest, simulation_step
 from fluidlift.pipeline.story import Result, available_memory
-from fluidlift.types import CellType, Gaussians, Particles
+from fluidlift.types import CellType, Gaussians, Particles, kind_of
 
 if TYPE_CHECKING:
     from fluidlift.look.inflow import InflowLook
@@ -53,7 +53,7 @@ def simulator_of(scene: Scene, device: str = "cpu", forces: Sequence[BodyForce] 
     own = scene.rest.select(np.arange(len(scene.rest) - sum(map(len, scene.emitter_looks))))
     look = inflow_look(scene, own, float(np.linalg.norm(parameters.inflow_velocity)))
     grid, supply = scene.terrain.grid, Supply(scene.inflow, scene.emitters, scene.emitter_looks)
-    if scene.kind == "plume":
+    if kind_of(scene.kind).is_gas:
         from fluidlift.physics.gas import GasSimulator
 
         return GasSimulator(
@@ -80,7 +80,7 @@ def inflow_look(scene: Scene, own: Gaussians, speed: float) -> InflowLook:
     from fluidlift.look.inflow import InflowLook
 
     # a sheet that falls has no level to keep to
-    terrain, lying, usable = scene.terrain, scene.kind == "stream", None
+    terrain, lying, usable = scene.terrain, kind_of(scene.kind).nearly_level, None
     spacing = 0.5 * terrain.grid.spacing
     if lying and len(own):
         usable = lends_look(scene, own)
@@ -93,12 +93,13 @@ def within_outlet(scene: Scene) -> tuple[np.ndarray, Particles]:
     from fluidlift.physics.inlet import inlet_along_rim, inlet_to_surface
     from fluidlift.physics.outlet import thin_outlet
 
-    if scene.kind not in LYING:
+    kind = kind_of(scene.kind)
+    if not kind.is_channel_flow:
         return scene.cell_types, scene.body
     cells, grid = thin_outlet(scene.cell_types), scene.terrain.grid
-    if scene.kind == "stream":
+    if kind.nearly_level:
         cells = inlet_to_surface(cells, scene.body.positions, grid)
-    elif scene.kind == "fall":
+    elif kind.enters_over_rim:
         gravity = np.asarray(scene.parameters.gravity)
         cells = inlet_along_rim(cells, scene.body.positions, scene.velocity, grid, gravity)
     behind = (scene.cell_types == CellType.OUTFLOW) & (cells != CellType.OUTFLOW)
@@ -116,10 +117,11 @@ def preflight(scene: Scene) -> None:
     from fluidlift.physics.stepping import SimulationSettings
     from fluidlift.physics.surface_tension import capillary_time_step
 
-    if scene.obstacles and scene.kind == "plume":
+    if scene.obstacles and kind_of(scene.kind).is_gas:
         raise InputRejected(
-            f"{scene.obstacles[0].line}: an obstacle in a plume", "obstacles in a liquid", "remove it from scene.yaml"
-        )
+            f"{scene.obstacles[0].line}: an obstacle in a {scene.kind}", "obstacles in a liquid",
+            "remove it from scene.yaml",
+        )  # fmt: skip
     p, step = scene.parameters, simulation_step(scene).time_step
     if p.surface_tension > 0:
         step = min(step, capillary_time_step(p.density, p.surface_tension, scene.terrain.grid.spacing))
@@ -372,7 +374,7 @@ def _save(simulator: ParticleSimulator, dressing: Dressing, scene: Scene, folder
 def _simulation_warnings(kind: str, volumes: Sequence[float], leaks: Sequence[float]) -> list[str]:
     warnings = []
     drift = volumes[-1] / max(volumes[0], 1e-12) - 1
-    if drift < -0.5 or (drift > 0.5 and kind in ("stream", "fall")):  # pours fill and smoke spreads
+    if drift < -0.5 or (drift > 0.5 and kind_of(kind).is_channel_flow):  # pours fill and smoke spreads
         word = "lost" if drift < 0 else "gained"
         warnings.append(f"the re-simulation {word} {100 * abs(drift):.0f} % of its volume by its last frame")
     if max(leaks) > 0.01:

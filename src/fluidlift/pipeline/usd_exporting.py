@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fluidlift.io.frames import FIRST_FRAME, FluidFrame, MovingMesh
-from fluidlift.types import FluidAsset
+from fluidlift.types import FluidAsset, kind_of
 
 if TYPE_CHECKING:
     from fluidlift.io.export_usd import PreviewMaterial, UsdSettings
@@ -36,7 +36,7 @@ def write_usd_asset(job: ExportJob, frames: Iterable[FluidFrame], settings: UsdS
     asset = job.asset
     settings = replace(settings, material=settings.material or preview_of(job.folder, asset))
     bodies, warnings = bodies_of(job.folder, job.picked)
-    if asset.kind == "plume":
+    if kind_of(asset.kind).is_gas:
         frames = _with_volumes(frames, job.out, asset, settings.start_frame)
     write_usd(
         job.out / "fluid.usda", frames=frames, interval=job.interval, terrain=asset.terrain.mesh, camera=asset.camera,

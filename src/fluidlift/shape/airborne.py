@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from fluidlift.errors import require
 from fluidlift.shape.jet_column import Jet
-from fluidlift.shape.kind import Kind
+from fluidlift.shape.kinds import AirborneBuilder, builder_of
 from fluidlift.shape.terrain import Setting, at_cells, terrain_mesh, unit
-from fluidlift.types import CellType, Grid, PinholeCamera, Terrain
+from fluidlift.types import CellType, FluidKind, Grid, PinholeCamera, Terrain, kind_of
 
 PASSING = 0.25
 """speed along the stream at one of its ends over that of its swift part (90th percentile), above which fluid enters or
@@ -28,7 +30,7 @@ def airborne_setting(
     body: Float[np.ndarray, "n 3"],
     mainstream: Float[np.ndarray, "3"],
     *,
-    kind: Kind,
+    kind: str | FluidKind,
     longest: int,
     cell_limit: int,
 ) -> Setting:
@@ -41,16 +43,21 @@ def airborne_setting(
         camera: in the world.
         body: points of the fluid over the whole clip, world (the box must hold all of it).
         mainstream: direction of the bulk flow, world.
-        kind: pour or plume.
+        kind: of the fluid, which is in the air.
         longest: cells along the longest side.
         cell_limit: most cells of the grid.
+
+    Raises:
+        ValueError: a kind that is not in the air.
     """
+    require(kind_of(kind).airborne, f"the kind '{kind}'", "a fluid in the air")
+    builder = cast(AirborneBuilder, builder_of(kind))
     low, high = np.percentile(body, 0.2, axis=0), np.percentile(body, 99.8, axis=0)
     extent = high - low
     spacing = extent.max() / longest
     for _ in range(80):
-        side = (0.35 if kind == "pour" else 0.2) * max(extent[0], extent[1]) + 4 * spacing
-        above = (0.1 if kind == "pour" else 0.2) * extent[2] + 3 * spacing
+        side = builder.side * max(extent[0], extent[1]) + 4 * spacing
+        above = builder.above * extent[2] + 3 * spacing
         origin = (low[0] - side, low[1] - side, low[2] - 3 * spacing)
         size = (extent[0] + 2 * side, extent[1] + 2 * side, extent[2] + above + 3 * spacing)
         nx, ny, nz = (int(np.ceil(v / spacing)) for v in size)
@@ -61,7 +68,7 @@ def airborne_setting(
     h = grid.spacing
     nodes, centers = grid.nodes(), grid.centers()
     phi = nodes[..., 2] - low[2] + 0.5 * h
-    vessel = _vessel(body) if kind == "pour" else None
+    vessel = builder.vessel(body)
     if vessel is not None:
         (cx, cy), radius, level = vessel
         rim = level + 0.5 * (level - low[2])
@@ -74,17 +81,8 @@ def airborne_setting(
     cells[solid] = CellType.SOLID
     cells[fluid] = CellType.FLUID
     if fluid.any():
-        z = centers[..., 2]
-        if kind == "pour":
-            cells[fluid & (z > z[fluid].max() - 2.0 * h)] = CellType.INFLOW
-        else:
-            cells[fluid & (z < z[fluid].min() + 3.0 * h)] = CellType.INFLOW
-    border = np.ones(grid.shape, bool)
-    border[2:-2, 2:-2, :-2] = False
-    if kind == "pour":
-        border[:, :, -2:] = False  # what pours leaves sideways over the floor
-        border[2:-2, 2:-2] = False
-    cells[border & ~solid] = CellType.OUTFLOW
+        cells[builder.inlet(fluid, centers[..., 2], h)] = CellType.INFLOW
+    cells[builder.outlet(grid.shape) & ~solid] = CellType.OUTFLOW
     terrain = Terrain(grid, phi.astype(np.float32), unit(mainstream), terrain_mesh(grid, phi))
     bed = np.full(grid.shape[:2], low[2] - 0.5 * h)
     return Setting(terrain, cells, None, bed, None if vessel is None else vessel[2])
@@ -100,26 +98,6 @@ def inside_body(
     ok = (col >= 0) & (col < width) & (row >= 0) & (row < height) & (z > 0)
     col, row = np.clip(col, 0, width - 1), np.clip(row, 0, height - 1)
     return ok & mask[row, col] & (z >= front[row, col]) & (z <= back[row, col])
-
-
-def _vessel(body: np.ndarray) -> tuple[tuple[float, float], float, float] | None:
-    """Axis, radius and filling height of a container around the lower part of a body, if that is much wider than the
-    upper part and holds its width (a pool that a jet falls into)."""
-    z = body[:, 2]
-    edges = np.linspace(z.min(), z.max(), 13)
-    widths = np.zeros(12)
-    for i in range(12):
-        layer = (z >= edges[i]) & (z <= edges[i + 1])
-        if layer.sum() > 5:
-            widths[i] = np.ptp(np.percentile(body[layer, 0], [2, 98]))
-    widest = np.percentile(widths, 90)
-    wide = widths > 0.6 * widest
-    first_narrow = int(np.argmin(wide)) if not wide.all() else 12
-    if first_narrow < 2 or first_narrow > 10 or np.median(widths[first_narrow:]) > 0.55 * widest:
-        return None
-    pool = body[z <= edges[first_narrow]]
-    centre = 0.5 * (np.percentile(pool[:, :2], 2, axis=0) + np.percentile(pool[:, :2], 98, axis=0))
-    return (float(centre[0]), float(centre[1])), 0.5 * float(widest), float(edges[first_narrow])
 
 
 def with_jets(

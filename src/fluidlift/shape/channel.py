@@ -8,14 +8,14 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
+from fluidlift.errors import require
 from fluidlift.shape import cross_section
 from fluidlift.shape.cross_section import distance_inside
 from fluidlift.shape.depth_surface import solid_heights
 from fluidlift.shape.ground_mesh import ground_mesh
-from fluidlift.shape.kind import Kind
 from fluidlift.shape.plan import Extent, Footage, Plan, dry_columns, extent_of, plan_of, wide_ends, with_seen
 from fluidlift.shape.terrain import Setting, at_cells, signed_distance_from, to_corners, unit
-from fluidlift.types import CellType, Grid, Label, Terrain
+from fluidlift.types import CellType, FluidKind, Grid, Label, Terrain, kind_of
 
 INLET = 2.5
 """cells along the flow that an inlet is long"""
@@ -50,8 +50,8 @@ class _Ground:
 class ChannelConfig:
     """How a fluid that lies on something is built."""
 
-    kind: Kind
-    """stream or fall"""
+    kind: str | FluidKind
+    """of the fluid, a channel flow"""
     longest: int
     """cells along the longest side"""
     cell_limit: int
@@ -71,10 +71,11 @@ def channel_setting(seen: Footage, config: ChannelConfig) -> Setting:
         config: how it is built.
 
     Raises:
-        ValueError: no fluid on the ground.
+        ValueError: no fluid on the ground, or a kind that runs in no channel.
     """
-    extent = extent_of(seen)
-    share = cross_section.DEPTH_SHARE[config.kind] if config.depth_ratio is None else config.depth_ratio
+    extent, kind = extent_of(seen), kind_of(config.kind)
+    share = kind.depth_ratio if config.depth_ratio is None else config.depth_ratio
+    require(share is not None, f"the kind '{kind}'", "a channel flow")
     depth = share * extent.width
     spacing = max((extent.high - extent.low).max() / config.longest, depth / 10)
     spacing = min(spacing, depth / 4)  # fewer than four cells hold no velocity profile
@@ -85,9 +86,9 @@ def channel_setting(seen: Footage, config: ChannelConfig) -> Setting:
         spacing *= 1.05
     plan = with_seen(plan_of(seen, grid, extent), extent.visible, grid)
     thin = seen.surface.sheet(grid.centers()[:, :, 0, :2])
-    ground = _bed_and_banks(plan, grid, (depth, thin), extent, config.kind)
+    ground = _bed_and_banks(plan, grid, (depth, thin), extent, kind)
     ground = _as_seen(ground, plan, grid, seen, extent)
-    return _fill_channel(grid, plan, ground, extent.reach, seen, config.kind)
+    return _fill_channel(grid, plan, ground, extent.reach, seen, kind)
 
 
 def _channel_grid(surface, low, high, depth, spacing) -> Grid:
@@ -110,7 +111,7 @@ def _ground_samples(low, high, n: int = 24) -> np.ndarray:
 
 
 def _bed_and_banks(
-    plan: Plan, grid: Grid, depths: tuple[float, Float[np.ndarray, "nx ny"]], extent: Extent, kind: Kind
+    plan: Plan, grid: Grid, depths: tuple[float, Float[np.ndarray, "nx ny"]], extent: Extent, kind: FluidKind
 ) -> _Ground:
     """Ground height and where there is water, per column; `depths`: the greatest, and the most that each column has."""
     h, (depth, thin) = grid.spacing, depths
@@ -118,7 +119,7 @@ def _bed_and_banks(
     reach = cross_section.Reach(wet, rock, plan.level, plan.along, plan.speed, h)
     gx, gy = np.gradient(plan.level, h)
     steep = np.sqrt(1 + gx**2 + gy**2)  # thickness is meant across the sheet, columns are vertical
-    steep = steep if kind == "fall" else np.minimum(steep, EDGE)
+    steep = steep if kind.enters_over_rim else np.minimum(steep, EDGE)
     section = cross_section.depth_along(reach, depth, extent.width, kind)
     below = np.maximum(np.minimum(cross_section.thickness(reach, section, extent.width), thin), 0.7 * h)
     outside = distance_inside(~wet, h)
@@ -175,7 +176,7 @@ def _fill_channel(grid, plan, ground: _Ground, reach, seen: Footage, kind) -> Se
         return Setting(terrain, cells, plan.level, bed)
     start, stop = wide_ends(water, plan.along, reach, h, share=0.4)
     # on a curtain that much of its plan may be most of its height, full of faster and faster water
-    rim = kind == "fall" or seen.surface.steps
+    rim = kind.enters_over_rim or seen.surface.steps
     entry = upper_rim(water, plan.level, seen.along, h)[..., None] if rim else s < start + INLET * h
     cells[fluid & entry] = CellType.INFLOW
     cells[~solid & (s > stop - 2.5 * h)] = CellType.OUTFLOW

@@ -37,7 +37,7 @@ AMISS = 12.0
 FEWEST = 60
 """pixels"""
 SHEET = 0.1
-"""greatest thickness of a chute over its width: that of a fall (`cross_section.DEPTH_SHARE`)"""
+"""greatest thickness of a chute over its width: that of a fall (`types.kind.FALL.depth_ratio`)"""
 FLANK = 0.25
 """of its half width, over which a chute's surface comes down to the fluid beside it"""
 

@@ -10,10 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
-from fluidlift.shape.kind import Kind
-
-DEPTH_SHARE: dict[str, float] = {"stream": 0.2, "fall": 0.1}
-"""greatest water depth over the full width: a single view does not show the bed (a choice; --depth-ratio overrides)"""
+from fluidlift.types import FluidKind, kind_of
 
 REPOSE = 0.7
 """slope of a bank under water: the tangent of 35 degrees, the angle of repose of gravel and soil (30 to 40 degrees)"""
@@ -57,7 +54,7 @@ def distance_inside(inside: Bool[np.ndarray, "nx ny"], spacing: float) -> Float[
     return ndimage.distance_transform_edt(np.pad(inside, pad, mode="edge"))[pad:-pad, pad:-pad] * spacing
 
 
-def depth_along(reach: Reach, depth: float, width: float, kind: Kind) -> Float[np.ndarray, "nx ny"]:
+def depth_along(reach: Reach, depth: float, width: float, kind: str | FluidKind) -> Float[np.ndarray, "nx ny"]:
     """Greatest depth (m) of the section that each column lies in.
 
     The same discharge passes every section, so that depth x width x speed is the same in all of them: a narrow or fast
@@ -67,7 +64,7 @@ def depth_along(reach: Reach, depth: float, width: float, kind: Kind) -> Float[n
         reach: the water from above.
         depth: of a typical section, m.
         width: typical, m; what changes over less than half of it along the stream does not count.
-        kind: of a fall, the bed is not straight.
+        kind: of the fluid; only what is nearly level has a straight bed.
     """
     h = reach.spacing
     free = reach.wet & ~reach.rock
@@ -95,7 +92,7 @@ def depth_along(reach: Reach, depth: float, width: float, kind: Kind) -> Float[n
             flux = np.interp(np.arange(count), np.flatnonzero(good), flux[good])
             factor = np.clip((np.median(flux) / flux) ** CONTINUITY, 0.5, 2.0)
     section = depth * factor
-    if kind == "stream" and count > 2:
+    if kind_of(kind).nearly_level and count > 2:
         bed = level - section
         line = np.polyval(np.polyfit(np.arange(count), bed, 1, w=np.sqrt(columns)), np.arange(count))
         section = np.clip(level - (STRAIGHT * line + (1 - STRAIGHT) * bed), 0.4 * depth, 2.5 * depth)

@@ -17,11 +17,13 @@ from scipy.linalg import solve
 from fluidlift.errors import InputRejected
 from fluidlift.shape.given_depth import SceneDepth, robust_plane, without_rim
 from fluidlift.shape.heights import HeightModel, ProfileHeight
-from fluidlift.shape.kind import PITCH_PRIOR, Kind, UpEvidence
+from fluidlift.shape.kind import UpEvidence
 from fluidlift.shape.plume import SIGHT
 from fluidlift.shape.slope import SlopeEvidence
 from fluidlift.shape.surface import FrontSurface, inflated_surface, intersect_height
-from fluidlift.types import Grid, Label, PinholeCamera
+from fluidlift.shape.view import Scene, habit_prior
+from fluidlift.types import FluidKind, Grid, Label, PinholeCamera, kind_of
+from fluidlift.types.kind import STREAM
 
 SLOPES: tuple[tuple[float, float, float], ...] = ((0.7, 0.5, 2.0), (0.3, 0.0, 20.0))
 """share, mean and standard deviation (degrees, down is positive) of how streams slope: most are nearly level, films and
@@ -126,14 +128,13 @@ def up_from_depth(
     angles = np.arange(0.0, 45.5, 0.5)
     share = _share_of(angles, slopes)
     pitches, rolls, belief = [], [], []
-    mean, sigma = PITCH_PRIOR["stream"]
     for angle in np.radians(angles):
         # gravity turned so that the plane falls along the flow by this angle
         up = normal if flow is None else np.cos(angle) * normal - np.sin(angle) * flow
         pitch, roll = float(np.degrees(-np.arcsin(np.clip(up[2], -1, 1)))), float(np.degrees(np.arctan2(up[0], -up[1])))
         pitches.append(pitch)
         rolls.append(roll)
-        belief.append(np.exp(-0.5 * (((pitch - mean) / sigma) ** 2 + (roll / USUAL_ROLL) ** 2)))
+        belief.append(np.exp(habit_prior(STREAM, np.array([pitch]), Scene())[0] - 0.5 * (roll / USUAL_ROLL) ** 2))
     weight = share * np.asarray(belief) + 1e-30
     best = float((angles * weight).sum() / weight.sum()) if flow is not None else 0.0
     k = int(np.argmin(np.abs(angles - best)))
@@ -352,7 +353,7 @@ def fall_surface(scene: SceneDepth, camera: PinholeCamera, mask: Bool[np.ndarray
 
 
 def airborne_surface(
-    scene: SceneDepth, camera: PinholeCamera, mask: Bool[np.ndarray, "h w"], kind: Kind
+    scene: SceneDepth, camera: PinholeCamera, mask: Bool[np.ndarray, "h w"], kind: str | FluidKind
 ) -> FrontSurface:
     """A body in the air: thickness from its silhouette, its middle in the plane of its depth.
 
@@ -366,12 +367,12 @@ def airborne_surface(
     inverse = a + b * x + c * y
     near, far = np.nanpercentile(1.0 / scene.depth[use], [99, 1])
     plane = 1.0 / np.clip(inverse, far, near)
-    round_body = inflated_surface(camera, mask, kind)
+    gas, round_body = kind_of(kind).is_gas, inflated_surface(camera, mask, kind)
     # smoke is seen where enough of it lies in front; of a jet the front is seen
-    share = 2.0 * SIGHT if kind == "plume" else np.pi / 4
+    share = 2.0 * SIGHT if gas else np.pi / 4
     half = round_body.half_thickness * plane
     front = np.where(mask, plane - share * half, 0.0)
-    return FrontSurface(front.astype(np.float32), half.astype(np.float32), None, kind=kind)
+    return FrontSurface(front.astype(np.float32), half.astype(np.float32), None, is_gas=gas)
 
 
 def solid_heights(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -11,20 +10,13 @@ from scipy import ndimage
 
 from fluidlift.errors import require
 from fluidlift.shape import chute, prism, slope
-from fluidlift.shape.view import USUAL_PITCH, PictureEvidence
-from fluidlift.types import PinholeCamera, RigidTransform
+from fluidlift.shape.view import PictureEvidence, habit_prior
+from fluidlift.types import FluidKind, PinholeCamera, RigidTransform, kind_of
+from fluidlift.types.kind import KINDS as FLUID_KINDS
+from fluidlift.types.kind import STREAM
 
-Kind = Literal["stream", "fall", "pour", "plume", "dam"]
-KINDS: tuple[Kind, ...] = get_args(Kind)
-
-PITCH_PRIOR: dict[str, tuple[float, float]] = {
-    "stream": USUAL_PITCH,
-    "fall": (8.0, 8.0),
-    "pour": (8.0, 8.0),
-    "plume": (2.0, 6.0),
-    "dam": (25.0, 12.0),
-}
-"""mean and standard deviation of how far people tilt a camera down at such a fluid, degrees (a choice, not a law)"""
+KINDS: tuple[str, ...] = tuple(name for name, kind in FLUID_KINDS.items() if kind.recognised)
+"""names of the kinds whose evidence is weighed"""
 
 
 STRAIGHT = 10.0
@@ -35,7 +27,7 @@ STRAIGHT = 10.0
 class KindEvidence:
     """Why a kind was chosen."""
 
-    kind: Kind
+    kind: str
     scores: dict[str, float]
     """share of belief per kind, sums to 1"""
     features: dict[str, float]
@@ -54,6 +46,8 @@ class UpEvidence:
     """user, camera file, or what it was estimated from"""
     confidence: float
     """0 (prior alone) to 1 (given)"""
+    error: float = 0.0
+    """degrees, standard deviation of what the pitch may be; 0: given, or not known"""
 
 
 def estimate_kind(
@@ -183,7 +177,7 @@ def _collapsing(fluid: np.ndarray) -> float:
 
 
 def estimate_up(
-    kind: Kind,
+    kind: str | FluidKind,
     mask: Bool[np.ndarray, "h w"],
     displacement: Float[np.ndarray, "h w 2"],
     confidence: Float[np.ndarray, "h w"],
@@ -211,16 +205,17 @@ def estimate_up(
         given: pitch (degrees below the horizon) and roll (degrees clockwise), each where the user gave it.
         level_prior: share of such streams that are level.
     """
+    kind = kind_of(kind)
     picture = picture or PictureEvidence()
     pitch, roll = given
-    if kind == "dam" and mask.any():
-        mean, sigma = PITCH_PRIOR[kind]
+    if kind.starts_at_rest and mask.any():
+        mean, sigma = kind.usual_pitch
         found, left = prism.upright_tilt(
             mask, lambda p: level_camera(camera, UpEvidence(p, roll or 0.0, "", 0.0)), (mean, sigma)
         )
         tilt = slope.TiltEvidence(found, 0.0, left, float(np.clip(1.0 - left / sigma, 0.0, 1.0)))
         words = ["upright edges of the body"]
-    elif kind == "stream":
+    elif kind.nearly_level:
         tilt, words = _tilt_of_stream(mask, displacement, confidence, camera, picture, level_prior)
     else:
         tilt, words = _tilt_in_air(kind, mask, displacement, confidence, camera, picture)
@@ -230,8 +225,9 @@ def estimate_up(
         source = "user" if pitch is not None and roll is not None else f"user and {source}"
         trust = 1.0 if pitch is not None else trust
     return UpEvidence(
-        float(tilt.pitch if pitch is None else pitch), float(tilt.roll if roll is None else roll), source, trust
-    )
+        float(tilt.pitch if pitch is None else pitch), float(tilt.roll if roll is None else roll), source, trust,
+        tilt.pitch_error if pitch is None else 0.0,
+    )  # fmt: skip
 
 
 def _tilt_of_stream(
@@ -240,11 +236,11 @@ def _tilt_of_stream(
     """What its motion, its pattern and its surroundings say; and which of them spoke."""
     tilted = _tilted(camera)
     # a chute is another plane than what it comes down onto
-    steep = chute.chute_pixels(tilted(USUAL_PITCH[0], 0.0), mask, displacement, confidence)
+    steep = chute.chute_pixels(tilted(STREAM.usual_pitch[0], 0.0), mask, displacement, confidence)
     lying = confidence * ~np.any(steep, axis=0) if steep else confidence
     if steep:
         picture = replace(picture, texture=None)
-    patches = slope.flow_patches(mask, displacement, lying)
+    patches = None if picture.contained else slope.flow_patches(mask, displacement, lying)
     tilt = slope.estimate_tilt(camera, patches, tilted, picture, level_prior)
     motion = [] if patches is None else ["perspective of the flow"]
     pattern = ["perspective of its pattern"] if picture.texture is not None and patches is not None else []
@@ -255,27 +251,25 @@ def _tilt_in_air(kind, mask, displacement, confidence, camera, picture) -> tuple
     """Of a body in the air: its surroundings, and the direction in which it falls."""
     picture = replace(picture, waterline=None)
     lean = None
-    if kind in ("fall", "pour"):  # wind leans smoke more often than hands turn cameras
+    if kind.falls_freely:  # wind leans smoke more often than hands turn cameras
         weight = np.where(mask, confidence * np.linalg.norm(displacement, axis=-1), 0.0)
         down = (weight[..., None] * displacement).sum((0, 1))
         if down[1] > 0 and weight.sum() > 0:
             lean = float(np.degrees(np.arctan2(-down[0], down[1])))
     if lean is not None and abs(lean) >= STRAIGHT:
         lean = None
-    tilt = _without_motion(PITCH_PRIOR[kind], _tilted(camera), picture, lean)
+    tilt = _without_motion(kind, _tilted(camera), picture, lean)
     return tilt, picture.words + (["direction of the fall"] if lean is not None else [])
 
 
-def _without_motion(prior, tilted, picture, lean) -> slope.TiltEvidence:
+def _without_motion(kind, tilted, picture, lean) -> slope.TiltEvidence:
     """The posterior of pitch and roll from habit, the pictures, and the lean of what falls (degrees)."""
-    pitches = prior[0] + prior[1] * np.arange(-4.0, 4.01, 0.125)
-    rolls = np.arange(-5.0, 5.01, 0.5) * slope.ROLL
-    log = -0.5 * ((pitches - prior[0]) / prior[1])[:, None] ** 2 - 0.5 * (rolls / slope.ROLL) ** 2
+    pitches, rolls = np.arange(-24.0, 89.0, 1.0), np.arange(-5.0, 5.01, 0.5) * slope.ROLL
+    log = habit_prior(kind, pitches, picture.scene)[:, None] - 0.5 * (rolls / slope.ROLL) ** 2
     if lean is not None:
         log = log - 0.5 * ((rolls - lean) / slope.ROLL) ** 2
-    for i, j in np.ndindex(log.shape):
-        log[i, j] += picture.tilt(tilted(float(pitches[i]), float(rolls[j])))
-    return slope.tilt_posterior(pitches, rolls, log, prior)
+    log += np.array([[picture.tilt(tilted(float(p), float(r))) for r in rolls] for p in pitches])
+    return slope.tilt_posterior(pitches, rolls, log, kind.usual_pitch)
 
 
 def _tilted(camera: PinholeCamera):

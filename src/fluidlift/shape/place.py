@@ -8,8 +8,9 @@ import numpy as np
 from jaxtyping import Float
 
 from fluidlift.shape.heights import HeightModel
-from fluidlift.shape.kind import PITCH_PRIOR, Kind, UpEvidence
-from fluidlift.types import PinholeCamera, RigidTransform, Similarity3
+from fluidlift.shape.kind import UpEvidence
+from fluidlift.types import FluidKind, PinholeCamera, RigidTransform, Similarity3, kind_of
+from fluidlift.types.kind import POUR
 
 STANDARD_GRAVITY = 9.81
 FEWEST_FALLING = 120
@@ -27,7 +28,7 @@ UNSURE = 0.3
 """relative standard error of the acceleration from which it is no measurement"""
 LEFT_OUT = 0.03
 """relative error of a scale from free fall for what the law leaves out: drag, a jet that widens, pictures in time"""
-LEAN = np.radians(PITCH_PRIOR["pour"][1])
+LEAN = np.radians(POUR.pitch_prior[1])
 """rad, how far camera and jet are off the tilt that they are taken for; seen from above, that changes the drop"""
 BENT = 2.0
 """ratio of the accelerations of the lower and the upper half from which the law is not that of free fall"""
@@ -250,7 +251,7 @@ def _not_free(line, acceleration: float, error: float, explained: float, centre,
 
 
 def metric_scale(
-    kind: Kind,
+    kind: str | FluidKind,
     points: Float[np.ndarray, "n 3"],
     velocities: Float[np.ndarray, "n 3"],
     *,
@@ -262,7 +263,7 @@ def metric_scale(
     """Metres per canonical unit (design: a single view has no scale of its own).
 
     In this order: a given size (what a person asks for wins; where a camera says clearly otherwise, there is a
-    warning), metric depth, a surveyed camera, free fall at 9.81 m/s^2 for falls and pours, one metre.
+    warning), metric depth, a surveyed camera, free fall at 9.81 m/s^2 for what falls freely, one metre.
 
     Args:
         kind: of the fluid.
@@ -289,7 +290,7 @@ def metric_scale(
     if surveyed is not None:
         return MetricScale(surveyed, "camera", across=surveyed * extent)
     refusal = ""
-    if kind in ("fall", "pour"):
+    if kind_of(kind).falls_freely:
         fall = fit_free_fall(points, velocities, seen=seen)
         refusal = fall.refusal
         if not refusal:

@@ -19,8 +19,9 @@ from scipy import ndimage
 from scipy.special import logsumexp
 
 from fluidlift.shape.texture_gradient import TexturePatches, texture_evidence, weighed
-from fluidlift.shape.view import USUAL_PITCH, PictureEvidence
+from fluidlift.shape.view import PictureEvidence
 from fluidlift.types import PinholeCamera
+from fluidlift.types.kind import STREAM
 
 PATCHES = 160
 """pieces that the fluid's picture is cut into"""
@@ -103,7 +104,7 @@ class TiltEvidence:
 
     pitch: float
     roll: float
-    """degrees, posterior means"""
+    """degrees, median and mean of the posterior"""
     pitch_error: float
     """degrees, standard deviation of the posterior"""
     gained: float
@@ -191,26 +192,31 @@ def estimate_tilt(
         best = np.array([[[best_heading(c, patches, np.radians(s)) for s in slopes] for c in row] for row in cameras])
     # the vanishing line of a plane that comes down towards the camera lies above the horizon
     rise = np.degrees(np.arctan(-np.tan(np.radians(slopes)) * np.sin(best[..., 1])))
-    habit = picture.lying(pitches, cameras, rise) + np.log(prior)
+    habit = picture.lying(STREAM, pitches, cameras, rise) + np.log(prior)
     log = BELIEF * best[..., 0] + habit - 0.5 * ((rolls / ROLL) ** 2)[None, :, None]
     log += np.array([[picture.tilt(c) for c in row] for row in cameras])[..., None]
     if picture.texture is not None and patches is not None:
         seen = _texture_evidence([row[1] for row in cameras], picture.texture, slopes, best[:, 1, :, 1])
         log += weighed(seen, habit[:, 1])[:, None]
-    return tilt_posterior(pitches, rolls, logsumexp(log, axis=2), USUAL_PITCH)
+    return tilt_posterior(pitches, rolls, logsumexp(log, axis=2), STREAM.usual_pitch)
 
 
 def tilt_posterior(
     pitches: Float[np.ndarray, " p"], rolls: Float[np.ndarray, " r"], log: Float[np.ndarray, "p r"],
     pitch_prior: tuple[float, float],
 ) -> TiltEvidence:  # fmt: skip
-    """Means of a posterior that is known on a grid of pitches and rolls (degrees), but for a constant."""
+    """Median pitch and mean roll of a posterior that is known on an even grid (degrees), but for a constant.
+
+    The median is the pitch with the least error to be expected; between two habits of filming, a mean is neither.
+    """
     if not np.isfinite(log).any():
         return TiltEvidence(pitch_prior[0], 0.0, pitch_prior[1], 0.0)
     share = np.exp(log - log.max())
     share /= share.sum()
-    pitch = float((share.sum(axis=1) * pitches).sum())
-    error = float(np.sqrt((share.sum(axis=1) * (pitches - pitch) ** 2).sum()))
+    of_pitch = share.sum(axis=1)
+    ends = np.append(pitches, 2.0 * pitches[-1] - pitches[-2]) - 0.5 * (pitches[1] - pitches[0])
+    pitch = float(np.interp(0.5, np.concatenate([[0.0], np.cumsum(of_pitch)]), ends))
+    error = float(np.sqrt((of_pitch * (pitches - pitch) ** 2).sum()))
     roll = float((share.sum(axis=0) * rolls).sum())
     return TiltEvidence(pitch, roll, error, 1.0 - min(error / pitch_prior[1], 1.0) ** 2)
 

@@ -16,10 +16,10 @@ from fluidlift.errors import InputRejected, require
 from fluidlift.shape import chute, sections, slope
 from fluidlift.shape.energy_line import Channel, energy_profile
 from fluidlift.shape.heights import FOOT, HeightModel, PlaneHeight, ProfileAlongHeight, ProfileHeight, SampledHeight
-from fluidlift.shape.kind import Kind
 from fluidlift.shape.plume import SIGHT, section_half_thickness
 from fluidlift.shape.slope import SlopeEvidence
-from fluidlift.types import PinholeCamera
+from fluidlift.types import FluidKind, PinholeCamera, kind_of
+from fluidlift.types.kind import POUR
 
 FAR = 12.0
 """no part of a surface is taken to be further away than this many times the nearest part"""
@@ -37,13 +37,13 @@ class FrontSurface:
     """for a fluid that lies on something"""
     slope: SlopeEvidence | None = None
     """where its motion was asked how steep it runs"""
-    kind: Kind | None = None
-    """of a body in the air"""
+    is_gas: bool = False
+    """whether it is seen within instead of at its surface"""
 
     @property
     def sighted(self) -> Float[np.ndarray, "h w"]:
         """Camera z at which the fluid is seen in the mean: of smoke within it, of all else on its near side."""
-        return self.depth + (2.0 * SIGHT * self.half_thickness if self.kind == "plume" else 0.0)
+        return self.depth + (2.0 * SIGHT * self.half_thickness if self.is_gas else 0.0)
 
 
 def level_surface(camera: PinholeCamera, mask: Bool[np.ndarray, "h w"]) -> FrontSurface:
@@ -310,12 +310,12 @@ def intersect_height(
 
 
 def inflated_surface(
-    camera: PinholeCamera, mask: Bool[np.ndarray, "h w"], kind: Kind, roll: float = 0.0
+    camera: PinholeCamera, mask: Bool[np.ndarray, "h w"], kind: str | FluidKind, roll: float = 0.0
 ) -> FrontSurface:
     """A rounded body in the air: its middle in a vertical plane facing the viewer, its thickness from the silhouette.
 
-    Where the silhouette is 2R wide the body is taken to be a circle across: about its middle line (pour), or in level
-    sections (plume).
+    Where the silhouette is 2R wide the body is taken to be a circle across: about its middle line, or of a gas in level
+    sections.
 
     Args:
         camera: level, its tilt as known.
@@ -324,14 +324,13 @@ def inflated_surface(
         roll: degrees that the picture is turned clockwise.
     """
     require(bool(mask.any()), "an empty mask")
-    ray = camera.rays(camera.pixel_grid())
+    gas, ray = kind_of(kind).is_gas, camera.rays(camera.pixel_grid())
     middle = 1.0 / np.maximum(ray[..., 1], 0.2)  # plane y = 1: depth z with z * ray_y = 1
     middle /= np.median(middle[mask])
-    thickness = section_half_thickness(mask, roll) if kind == "plume" else _half_thickness(mask)
-    flatness = {"pour": 1.0, "plume": 1.0, "fall": 0.3, "stream": 0.3, "dam": 1.0}[kind]
-    half = flatness * thickness * middle / camera.focal[0]
+    thickness = section_half_thickness(mask, roll) if gas else _half_thickness(mask)
+    half = thickness * middle / camera.focal[0]
     front = np.where(mask, middle - half, 0.0)
-    return FrontSurface(front.astype(np.float32), half.astype(np.float32), None, kind=kind)
+    return FrontSurface(front.astype(np.float32), half.astype(np.float32), None, is_gas=gas)
 
 
 def _half_thickness(mask: np.ndarray) -> np.ndarray:
@@ -345,7 +344,9 @@ def _half_thickness(mask: np.ndarray) -> np.ndarray:
     return ndimage.gaussian_filter(thickness, 1.5) * mask
 
 
-def rounded_volume(camera: PinholeCamera, mask: Bool[np.ndarray, "h w"], distance: float, kind: Kind = "pour") -> float:
+def rounded_volume(
+    camera: PinholeCamera, mask: Bool[np.ndarray, "h w"], distance: float, kind: str | FluidKind = POUR
+) -> float:
     """Volume (cube of the unit of `distance`) of the body inflated from a silhouette whose middle is that far away."""
     front = inflated_surface(camera, mask, kind)
     pixel = (front.depth + front.half_thickness) / camera.focal[0]
@@ -353,7 +354,7 @@ def rounded_volume(camera: PinholeCamera, mask: Bool[np.ndarray, "h w"], distanc
 
 
 def given_surface(
-    camera: PinholeCamera, mask: Bool[np.ndarray, "h w"], depth: Float[np.ndarray, "h w"], kind: Kind
+    camera: PinholeCamera, mask: Bool[np.ndarray, "h w"], depth: Float[np.ndarray, "h w"], kind: str | FluidKind
 ) -> FrontSurface:
     """The user's depth, scaled to a median of 1 on the fluid.
 
@@ -368,10 +369,11 @@ def given_surface(
         )
     index = ndimage.distance_transform_edt(~valid, return_distances=False, return_indices=True)
     filled = depth[tuple(index)] / np.median(depth[valid])
-    if kind in ("pour", "plume"):
+    kind = kind_of(kind)
+    if kind.airborne:
         half = inflated_surface(camera, mask, kind).half_thickness
-        front = filled - (2.0 * SIGHT * half if kind == "plume" else 0.0)
-        return FrontSurface(np.where(mask, front, 0.0).astype(np.float32), half, None, kind=kind)
+        front = filled - (2.0 * SIGHT * half if kind.is_gas else 0.0)
+        return FrontSurface(np.where(mask, front, 0.0).astype(np.float32), half, None, is_gas=kind.is_gas)
     rows, cols = np.where(valid)
     pick = np.linspace(0, len(rows) - 1, min(len(rows), 20000)).astype(int)
     points = camera.unproject(np.stack([cols[pick] + 0.5, rows[pick] + 0.5], -1), filled[rows[pick], cols[pick]])

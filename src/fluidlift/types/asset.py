@@ -23,7 +23,7 @@ class FluidAsset:
     """One fluid, at rest in its terrain, with the physics that moves it."""
 
     kind: str
-    """stream, fall, pour or plume"""
+    """name of a `FluidKind` (`kind_of`)"""
     rest: Gaussians
     """world, m"""
     terrain: Terrain

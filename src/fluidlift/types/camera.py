@@ -139,7 +139,7 @@ class PinholeCamera:
                 np.asarray(data.get("t", np.zeros(3)), float).reshape(3),
             )
             return cls((float(k[0, 0]), float(k[1, 1])), (float(k[0, 2]), float(k[1, 2])), size, pose)
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise InputRejected(
                 f"a camera JSON that cannot be read ({type(error).__name__}: {error})",
                 "width, height, K (3x3, px) and, for a known pose, R (3x3) and t (3) with x_cam = R x_world + t",

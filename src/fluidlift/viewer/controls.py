@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from fluidlift.errors import require
-from fluidlift.types import FluidParameters
+from fluidlift.types import FluidKind, FluidParameters, kind_of
 
 STEPS = 200
 """of a slider, about"""
@@ -122,16 +122,16 @@ def _digits(value: float, digits: int) -> float:
     return float(f"{value:.{digits}g}")
 
 
-def controls_of(fitted: FluidParameters, kind: str) -> tuple[Control, ...]:
+def controls_of(fitted: FluidParameters, kind: str | FluidKind) -> tuple[Control, ...]:
     """The controls of an asset, in the order in which they are shown. Ranges hold what its kind is like and reach past
     the fitted value.
 
     Args:
         fitted: of the asset, before any edit.
-        kind: stream, fall, pour or plume.
+        kind: of the fluid.
     """
     speed = _length(fitted.inflow_velocity)
-    liquid = kind != "plume"
+    liquid = not kind_of(kind).is_gas
     found = []
     if liquid:
         found.append(_plain("kinematic_viscosity", "viscosity", "m²/s", fitted, (1e-7, 1.0), log=True,

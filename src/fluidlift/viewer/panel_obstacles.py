@@ -13,6 +13,7 @@ from fluidlift.errors import FluidliftError
 from fluidlift.pipeline.edit_outlook import place_told, placed
 from fluidlift.pipeline.editing import Add, Remove
 from fluidlift.pipeline.open_water import open_water
+from fluidlift.types import kind_of
 from fluidlift.viewer.controls import unbroken
 from fluidlift.viewer.hearing import heard
 from fluidlift.viewer.mesh_files import MOST_BYTES, UNITS, kept_mesh, mesh_entry
@@ -66,7 +67,7 @@ class ObstaclePanel:
         heard(self._motion, self._moves)
         heard(self._density, self._weighed)
         self._remove.on_click(self._take_away)
-        if viewer.asset.kind == "plume":
+        if kind_of(viewer.asset.kind).is_gas:
             gui.add_markdown("Smoke flows through obstacles: they are simulated in liquids only.")
         self.refresh()
 

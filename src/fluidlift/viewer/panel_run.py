@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -97,7 +98,7 @@ class RunPanel:
     def _export(self, _: Any) -> None:
         from fluidlift.pipeline.exporting import ExportRequest, export_asset
 
-        viewer, out = self._viewer, Path(self._out.value.strip()).expanduser()
+        viewer, out = self._viewer, Path(os.path.expanduser(self._out.value.strip()))
         if viewer.refused():
             return
         if not self._out.value.strip():

@@ -3,58 +3,70 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from fluidlift.shape.texture_gradient import TexturePatches
-from fluidlift.shape.view.habit import habit, runs_out
+from fluidlift.shape.view.habit import Scene, habit_prior, runs_out
 from fluidlift.shape.view.horizon import Skyline, farthest_elevation, skyline, skyline_evidence, upper_outline
 from fluidlift.shape.view.plumb import PlumbLines, plumb_evidence, plumb_lines
-from fluidlift.types import PinholeCamera
+from fluidlift.shape.view.rims import find_rims
+from fluidlift.shape.view.roundness import IN_VESSEL, Ellipse, round_pool, roundness_evidence
+from fluidlift.types import FluidKind, PinholeCamera
 
 
 @dataclass(frozen=True)
 class PictureEvidence:
-    """What was found in the pictures; None where there is no such thing."""
+    """What was found in the pictures; None or nothing where there is no such thing."""
 
     sky: Skyline | None = None
     lines: PlumbLines | None = None
+    pool: Ellipse | None = None
+    """a fluid that lies, where its outline is an ellipse"""
+    rims: tuple[Ellipse, ...] = ()
+    """of vessels"""
     waterline: Float[np.ndarray, "n 2"] | None = None
     """px, upper outline of a fluid that lies"""
     texture: TexturePatches | None = None
     """the fluid's own pattern, where it lies in one plane"""
-    open_ended: bool = True
-    """the fluid runs out of the picture at its sides or below"""
+    scene: Scene = field(default_factory=Scene)
+    contained: bool = False
+    """the fluid is a round pool, or in a vessel: it stirs in one place, and its motion and far edge are no stream's"""
 
     def tilt(self, camera: PinholeCamera) -> float:
-        """Log likelihood of a camera (level frame, z up) given sky and plumb lines."""
+        """Log likelihood of a camera (level frame, z up) given sky, plumb lines and what is round."""
         log = 0.0 if self.sky is None else skyline_evidence(camera, self.sky)
-        return log if self.lines is None else log + plumb_evidence(camera, self.lines)
+        if self.lines is not None:
+            log += plumb_evidence(camera, self.lines)
+        rounds = self.rims if self.pool is None else (*self.rims, self.pool)
+        return log + roundness_evidence(camera, rounds)
 
     def lying(
-        self, pitches: Float[np.ndarray, " p"], cameras: Sequence[Sequence[PinholeCamera]],
+        self, kind: FluidKind, pitches: Float[np.ndarray, " p"], cameras: Sequence[Sequence[PinholeCamera]],
         rise: Float[np.ndarray, "p r s"],
     ) -> Float[np.ndarray, "p r s"]:  # fmt: skip
         """Log prior of the pitch over what lies, with what its upper outline says, for pitches, rolls and planes.
 
         Args:
+            kind: of the fluid.
             pitches: degrees.
             cameras: level frame, z up, by pitch and roll.
             rise: degrees that the planes' vanishing lines lie above the horizon (0: level).
         """
-        below = None
-        if self.waterline is not None:
-            top = np.array([[farthest_elevation(c, self.waterline) for c in row] for row in cameras])
-            below = rise - top[..., None]
-        log = habit(pitches, below, open_ended=self.open_ended, sky=self.sky is not None)
-        return log if below is not None else np.broadcast_to(log[:, None, None], rise.shape)
+        if self.waterline is None:
+            return np.broadcast_to(habit_prior(kind, pitches, self.scene)[:, None, None], rise.shape)
+        top = np.array([[farthest_elevation(c, self.waterline) for c in row] for row in cameras])
+        return habit_prior(kind, pitches, self.scene, rise - top[..., None])
 
     @property
     def words(self) -> list[str]:
         """Names of what speaks for the tilt, for the report."""
-        named = {"sky": self.sky, "plumb lines": self.lines, "upper end of the water": self.waterline}
+        named = {
+            "sky": self.sky, "plumb lines": self.lines, "roundness of the pool": self.pool,
+            "rims of vessels": self.rims or None, "upper end of the water": self.waterline,
+        }  # fmt: skip
         return [name for name, found in named.items() if found is not None]
 
 
@@ -62,7 +74,7 @@ def look_at(
     picture: UInt8[np.ndarray, "h w 3"], ever: Bool[np.ndarray, "h w"], lying: Bool[np.ndarray, "h w"] | None,
     texture: TexturePatches | None = None,
 ) -> PictureEvidence:  # fmt: skip
-    """Sky, plumb lines and waterline of a clip.
+    """Sky, plumb lines, rims, the shape of a pool and its waterline.
 
     Args:
         picture: sRGB, typical for the clip.
@@ -70,8 +82,10 @@ def look_at(
         lying: pixels of fluid that lies on a plane; None: none does.
         texture: of that fluid.
     """
-    return PictureEvidence(
-        skyline(picture, ever), plumb_lines(picture, ~ever),
-        None if lying is None or not lying.any() else upper_outline(lying), texture,
-        True if lying is None else runs_out(lying),
-    )  # fmt: skip
+    sky, rims = skyline(picture, ever), find_rims(picture)
+    lies = lying is not None and bool(lying.any())
+    pool = round_pool(lying) if lies else None
+    contained = pool is not None or any(rim.share_inside(lying) > IN_VESSEL for rim in rims if lies)
+    scene = Scene(runs_out(lying) if lies else None, sky is not None, pool is not None or bool(rims))
+    waterline = upper_outline(lying) if lies and not contained else None
+    return PictureEvidence(sky, plumb_lines(picture, ~ever), pool, rims, waterline, texture, scene, contained)

@@ -1,12 +1,13 @@
-"""Runs `fluidlift make` on every case and clip, measures it, and writes the tables of docs/results.md.
+"""Runs `fluidlift make` on every case and clip, measures it, and puts the figures into benchmarks/results.
 
-    python benchmarks/results.py --work runs
-    python benchmarks/results.py --work runs --only river --preset standard
+    python benchmarks/clips.py --work runs && python -m benchmarks.report
+    python benchmarks/clips.py --work runs --only river --preset standard --page docs/experiments/2026-11-clips.md
 
 Cases (folders with truth.npz) are scored with `fluidlift evaluate`; clips (folders with video.mp4 alone) have no truth.
 They are looked for below FLUIDLIFT_SHARED, or a folder `shared` beside the repository; the demo case of the package and
 a made dam break are always there. Each run is a process of its own and leaves one JSON file in the work folder; what
-is there already is not run again (`--again` does). The tables show everything that the work folder holds.
+is there already is not run again (`--again` does). Figures of the preset draft that were run go into `clips.json` and
+`cases.json`; `--page` writes tables of everything that the work folder holds between the markers of a page.
 """
 
 from __future__ import annotations
@@ -23,8 +24,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from report import put, table
+
 ROOT = Path(__file__).resolve().parent.parent
-PAGE = ROOT / "docs" / "results.md"
 BEGIN, END = "<!-- results:begin -->", "<!-- results:end -->"
 GROUPS = {
     "segmentation": "Mask", "flow": "Planar velocity", "geometry": "Geometry", "volume": "Volume velocity",
@@ -152,10 +154,28 @@ def number(value: Any, digits: int = 3) -> str:
     return f"{value:.{digits}g}" if isinstance(value, int | float) else "-"
 
 
-def table(head: list[str], rows: list[list[str]]) -> list[str]:
-    """Markdown."""
-    clean = [[cell.replace("|", "/") for cell in row] for row in rows]
-    return ["| " + " | ".join(r) + " |" for r in [head, ["---"] * len(head), *clean]] + [""]
+GROUP_NAMES = {"segmentation": "mask", "resimulation": "resimulated"}
+"""of groups of figures in cases.json, where they differ"""
+
+
+def keep(record: dict[str, Any]) -> None:
+    """Put the figures of a run into benchmarks/results."""
+    if record["exit_code"] not in (0, 4):
+        return
+    about = {"date": record["date"], "machine": record["machine"]}
+    name = record["name"].removeprefix("clip ")
+    figures = {"frames": record["frame_count"], "Gaussians": record["metrics"].get("gaussians"),
+               "time": record["wall_s"], "memory": record["peak_memory_mb"],
+               "IoU with hand mask": record.get("hand_mask_iou"), **record["timings"]}  # fmt: skip
+    put("clips", [{"subject": name, "figure": k, "value": v} for k, v in figures.items() if v is not None], **about)
+    found = record.get("evaluation", {"figures": {}})["figures"]
+    records = []
+    for key, f in found.items():
+        group, _, figure = key.partition(".")
+        if group in GROUPS and isinstance(f.get("value"), int | float):
+            title = f"{GROUP_NAMES.get(group, group)} {figure}"
+            records.append({"subject": name, "figure": title, "value": f["value"], "unit": f["unit"] or ""})
+    put("cases", records, **about)
 
 
 def run_table(records: list[dict[str, Any]]) -> list[str]:
@@ -226,7 +246,7 @@ def write_page(work: Path, page: Path) -> None:
 
 
 def main() -> int:
-    """Run what is missing, then write the page."""
+    """Run what is missing, keep its figures, then write the page."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--work", type=Path, required=True, help="folder for assets, logs and one JSON per run")
     parser.add_argument("--shared", type=Path, default=default_shared(), help="folder with cases/ and clips/")
@@ -234,7 +254,7 @@ def main() -> int:
     parser.add_argument("--only", action="append", metavar="NAME", help="names that contain this; may be repeated")
     parser.add_argument("--again", action="store_true", help="run again what has been run")
     parser.add_argument("--tables-only", action="store_true", help="run nothing, write the page")
-    parser.add_argument("--page", type=Path, default=PAGE, help="default: docs/results.md")
+    parser.add_argument("--page", type=Path, help=f"page with the markers {BEGIN} and {END}")
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.NAME=VALUE", help="passed on to make")
     args = parser.parse_args()
     args.work.mkdir(parents=True, exist_ok=True)
@@ -253,9 +273,12 @@ def main() -> int:
             half = file.with_suffix(".part")
             half.write_text(json.dumps(record, indent=1), encoding="utf-8")
             half.replace(file)
+            if preset == "draft":
+                keep(record)
             outcome = f"exit code {record['exit_code']}, {record['wall_s']:.0f} s, {record['peak_memory_mb']} MB"
             print(f"{subject.name} {preset}: {outcome}", flush=True)
-    write_page(args.work, args.page)
+    if args.page is not None:
+        write_page(args.work, args.page)
     return 0
 
 

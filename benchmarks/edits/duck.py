@@ -1,6 +1,6 @@
 """A bath duck as a closed mesh: a few ellipsoids that melt into each other.
 
-python examples/duck.py demo.fluid/duck.obj 0.23     # m, its length
+python benchmarks/edits/duck.py demo.fluid/duck.obj 0.23     # m, its length
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What the examples share: an asset to work on, pictures, and checks that are counted."""
+"""What these edits share: an asset to work on, pictures, and checks that are counted."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 The same from the shell; any closed mesh will do for the duck (duck.py wrote this one):
 
-    python examples/duck.py demo.fluid/duck.obj
+    python benchmarks/edits/duck.py demo.fluid/duck.obj
     fluidlift edit demo.fluid --set extend_downstream=0.8 \\
         --add obstacles='{name: duck, mesh: duck.obj, position: [-0.4, 0, 0.2], motion: free, density: 350}'
     fluidlift sim demo.fluid --duration 2

@@ -1,0 +1,167 @@
+"""Kinds of fluid: what each one is, and what is usual for it. All other code asks these values, never a name.
+
+To add a kind: one entry in `KINDS`, and `shape/kinds/NAME.py` with the construction of its body.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+from fluidlift.errors import InputRejected, require
+
+LOOKING_DOWN = (42.0, 14.0)
+"""degrees, mean and standard deviation of the pitch of a camera that looks down on a fluid: 22 to 55 in eight clips"""
+STRAIGHT_DOWN = (88.0, 5.0)
+"""the same of drones and cameras on a stand over a table: 85 and 88 in two clips"""
+STRAIGHT = 0.25
+"""share of the latter (two of ten, one added to each)"""
+
+
+@dataclass(frozen=True)
+class FluidKind:
+    """One kind of fluid: questions of physics, and the priors that a single view needs.
+
+    Raises:
+        ValueError: a prior without a width, or a fluid that is in the air and runs over ground at once.
+    """
+
+    name: str
+    """what users type and files hold"""
+    pitch_prior: tuple[float, float]
+    """degrees, mean and standard deviation of how far people tilt a camera down at it from beside (a choice, not a law,
+    where nothing else is said)"""
+    kinematic_viscosity: float
+    """m^2/s, where the fit starts"""
+    wall_damping: float
+    """share of the tangential velocity that a wall takes per step of the fit, where the fit starts: water runs nearly
+    free over a bed that the grid cannot resolve. A viscous film does not: it sticks (`pipeline.moving.sticking`)"""
+    wall_layer: float
+    """Thickness of the boundary layer at a wall, cells (`motion.bed.layer_thickness`). Water is turbulent: beside the
+    bed of a river some 10 cells deep its speed at half a cell is about 0.7 of the surface speed (1/7 power law), which
+    a layer of one cell gives; films from a fall are shorter. What is poured is often viscous and drags through its
+    depth. In smoke the layer stays below half a cell and so damps nothing (paper: "sub-cell scale")."""
+    looked_down_on: float = 0.0
+    """share of clips that look down on it instead (`LOOKING_DOWN`): into a vessel, from a bridge, from a drone"""
+    is_gas: bool = False
+    """smoke: buoyant, without a free surface, seen within instead of at its surface; it passes through obstacles"""
+    airborne: bool = False
+    """free in the air: its body has a far side, and no ground bears it"""
+    is_channel_flow: bool = False
+    """open-channel flow: runs over ground, in at one open end and out at the other. It is steady, and turbulent: its
+    speed is nearly the same at all depths but for a layer at the walls; it can be made longer"""
+    starts_at_rest: bool = False
+    """a body that stands until it is let go: its shape is known as it stands, not as it collapses"""
+    fills_vessel: bool = False
+    """what it falls into may be a vessel that holds it: glass, whose level rises"""
+    energy_share: float | None = None
+    """share of the drop's energy that is left to what falls freely: almost all in the air, a third over rock (a
+    choice); None: it does not fall freely"""
+    depth_ratio: float | None = None
+    """greatest depth of a channel over its full width: a single view does not show the bed (a choice; --depth-ratio
+    overrides). None: it runs in no channel"""
+    surveyed_level: tuple[str, str] | None = None
+    """entry of a camera file with the height (m) of the plane under a surveyed camera, and that plane in a message;
+    None: there is no such plane"""
+    recognised: bool = False
+    """whether the evidence of a clip is weighed for it (`shape.kind.estimate_kind`); else only a user chooses it"""
+
+    def __post_init__(self) -> None:
+        require(self.pitch_prior[1] > 0, f"a pitch prior {self.pitch_prior} of the kind '{self.name}'", "a width > 0")
+        share = self.looked_down_on
+        require(0.0 <= share < 1.0, f"a share {share} of the kind '{self.name}' that is looked down on", "0 to below 1")
+        both = self.airborne and self.is_channel_flow
+        require(not both, f"the kind '{self.name}' in the air and in a channel", "one of them")
+        require(
+            self.is_channel_flow == (self.depth_ratio is not None), f"the kind '{self.name}'",
+            "a depth_ratio where it runs in a channel, and only there",
+        )  # fmt: skip
+
+    def __str__(self) -> str:
+        """The name, as messages say it."""
+        return self.name
+
+    @property
+    def pitch_habits(self) -> tuple[tuple[float, float, float], ...]:
+        """Share, mean and standard deviation (degrees) of how people film it: from beside, looking down, from above."""
+        down = self.looked_down_on
+        beside = (1.0 - down, *self.pitch_prior)
+        if not down:
+            return (beside,)
+        return beside, (down * (1.0 - STRAIGHT), *LOOKING_DOWN), (down * STRAIGHT, *STRAIGHT_DOWN)
+
+    @property
+    def usual_pitch(self) -> tuple[float, float]:
+        """Mean and standard deviation of all its habits together, degrees."""
+        mean = sum(w * m for w, m, _ in self.pitch_habits)
+        return mean, sum(w * (s**2 + (m - mean) ** 2) for w, m, s in self.pitch_habits) ** 0.5
+
+    @property
+    def falls_freely(self) -> bool:
+        """Whether gravity alone sets its speed, so that 9.81 m/s^2 gives its size."""
+        return self.energy_share is not None
+
+    @property
+    def enters_over_rim(self) -> bool:
+        """A free overfall: a channel flow that comes in over a rim and falls along its bed."""
+        return self.is_channel_flow and self.falls_freely
+
+    @property
+    def nearly_level(self) -> bool:
+        """A channel flow whose surface is a plane close to level: the perspective of its motion shows the tilt."""
+        return self.is_channel_flow and not self.falls_freely
+
+    @property
+    def has_mean_motion(self) -> bool:
+        """Whether the mean over a clip says what moves in each frame: what grows or collapses has no mean motion."""
+        return not (self.is_gas or self.starts_at_rest)
+
+
+STREAM = FluidKind(
+    "stream", pitch_prior=(10.0, 9.0), looked_down_on=0.35, kinematic_viscosity=1e-5, wall_damping=0.05, wall_layer=1.0,
+    is_channel_flow=True, depth_ratio=0.2, surveyed_level=("water_level_z", "the water stands"), recognised=True,
+)  # fmt: skip
+"""rivers, brooks, puddles. Pitch over a landscape, by horizon or far shore of 14 real clips (read by hand, one of
+them surveyed): 2 to 29, mean 10, deviation 9; 8 of 22 clips look down"""
+FALL = FluidKind(
+    "fall", pitch_prior=(8.0, 8.0), kinematic_viscosity=1e-5, wall_damping=0.05, wall_layer=0.75,
+    is_channel_flow=True, depth_ratio=0.1, energy_share=0.35, recognised=True,
+)  # fmt: skip
+"""waterfalls, curtains over rock"""
+POUR = FluidKind(
+    "pour", pitch_prior=(8.0, 8.0), looked_down_on=0.35, kinematic_viscosity=1e-4, wall_damping=0.2, wall_layer=2.0,
+    airborne=True, fills_vessel=True, energy_share=0.95, recognised=True,
+)  # fmt: skip
+"""jets in the air, and the pool that they fall into"""
+PLUME = FluidKind(
+    "plume", pitch_prior=(2.0, 6.0), kinematic_viscosity=1e-5, wall_damping=0.02, wall_layer=0.4,
+    is_gas=True, airborne=True, recognised=True,
+)  # fmt: skip
+"""smoke, steam"""
+DAM = FluidKind(
+    "dam", pitch_prior=(25.0, 12.0), kinematic_viscosity=1e-5, wall_damping=0.05, wall_layer=1.0,
+    starts_at_rest=True, surveyed_level=("ground_level_z", "the ground lies"), recognised=True,
+)  # fmt: skip
+"""a column of liquid that is let go (dam break)"""
+
+KINDS: dict[str, FluidKind] = {kind.name: kind for kind in (STREAM, FALL, POUR, PLUME, DAM)}
+"""by name; the classifier, the command line and the reader of assets go through it"""
+
+if TYPE_CHECKING:
+    KindChoice = str
+else:
+    KindChoice = Literal[("auto", *KINDS)]
+"""what a user may say: one of the names, or auto, which decides from evidence"""
+
+
+def kind_of(kind: str | FluidKind) -> FluidKind:
+    """The kind of a name; a kind is returned as it is.
+
+    Raises:
+        InputRejected: an unknown name.
+    """
+    if isinstance(kind, FluidKind):
+        return kind
+    if kind not in KINDS:
+        raise InputRejected(f"the kind of fluid '{kind}'", "one of " + ", ".join(KINDS))
+    return KINDS[kind]

@@ -45,11 +45,15 @@ def cup(pitch, roll=0.0, hidden=0.0, seed=2):
     rng = np.random.default_rng(seed)
     picture = cv2.GaussianBlur(rng.uniform(60, 120, (*SIZE[::-1], 3)).astype(np.float32), (0, 0), 2.0)
     for radius, value in ((0.3, 225), (0.27, 45)):
-        cv2.fillPoly(picture, [np.round(ring(pitch, roll, radius) * 16 - 8).astype(np.int32)], (value,) * 3, cv2.LINE_AA, 4)
+        cv2.fillPoly(
+            picture, [np.round(ring(pitch, roll, radius) * 16 - 8).astype(np.int32)], (value,) * 3, cv2.LINE_AA, 4
+        )
     if hidden:
         u, v = ring(pitch, roll, 0.35, count=100)[: round(100 * hidden)].T
         cv2.fillPoly(
-            picture, [np.stack([np.append(u, SIZE[0] / 2), np.append(v, SIZE[1] / 2)], -1).astype(np.int32)], (90, 80, 70)
+            picture,
+            [np.stack([np.append(u, SIZE[0] / 2), np.append(v, SIZE[1] / 2)], -1).astype(np.int32)],
+            (90, 80, 70),
         )
     return np.clip(picture, 0, 255).astype(np.uint8)
 
@@ -155,7 +159,14 @@ def test_a_pour_into_a_cup_that_is_seen_from_above_is_not_filmed_from_beside():
 
 def test_a_flat_pool_says_more_than_one_that_is_seen_from_high_above():
     low, high = (
-        estimate_up("stream", d, np.zeros((*SIZE[::-1], 2)), 0.0 * ROW, CAMERA, look_at(np.zeros((*SIZE[::-1], 3), np.uint8), d, d))
+        estimate_up(
+            "stream",
+            d,
+            np.zeros((*SIZE[::-1], 2)),
+            0.0 * ROW,
+            CAMERA,
+            look_at(np.zeros((*SIZE[::-1], 3), np.uint8), d, d),
+        )
         for d in (disc(25.0), disc(65.0))
     )
     assert low.error < 0.7 * high.error

@@ -92,8 +92,8 @@ def geometry(story: Story, inputs: Inputs, config: JobConfig) -> Result:
     clip, fluid, c = clip_of(story), masks_of(story), config.shape
     seen, pictures = _seen(story, inputs, config)
     kind, parts, mask = seen.kind, seen.parts, seen.mask
-    warnings = framing_warnings(mask, fluid.areas())
     up, canonical, front, known_scale, seen_depth = _surface(seen, pictures, fluid, inputs, clip.interval)
+    warnings = framing_warnings(mask, fluid.areas()) + up.warnings
     front, falling = composite.standing(front, parts, canonical, mask)
     visible = mask & (front.depth > 0)
     if 0 < visible.sum() < FEWEST_PIXELS:
@@ -256,7 +256,8 @@ def _kind_and_up(story, inputs, config, known, pose_given, mask, motion, trust, 
     if kind.nearly_level and c.pitch is None and not parts.puddle:
         texture = texture_gradient.texture_patches(clip.frames, parts.lying & ~parts.falling)
     typical = typical_picture(clip.frames[pick]).astype(np.uint8)
-    picture = look_at(typical, fluid.any_frame(), parts.lying if kind.nearly_level else None, texture)
+    lying = parts.lying if kind.nearly_level else None
+    picture = look_at(typical, fluid.any_frame(), lying, texture, stays=parts.puddle)
     up = kinds.estimate_up(
         kind, parts.lying, motion, trust * ~parts.falling, known, picture, given=(c.pitch, c.roll),
         level_prior=composite.level_prior(parts, motion, trust),

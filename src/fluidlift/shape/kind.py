@@ -19,6 +19,9 @@ KINDS: tuple[str, ...] = tuple(name for name, kind in FLUID_KINDS.items() if kin
 """names of the kinds whose evidence is weighed"""
 
 
+UNSURE = 12.0
+"""degrees, error of the pitch from which the user is asked: a quarter of what lies between level and straight down, by
+which lengths along the view come out wrong by half and more"""
 STRAIGHT = 10.0
 """degrees: a larger lean of what falls is a thrown jet or wind, not a turned camera"""
 
@@ -48,6 +51,16 @@ class UpEvidence:
     """0 (prior alone) to 1 (given)"""
     error: float = 0.0
     """degrees, standard deviation of what the pitch may be; 0: given, or not known"""
+
+    @property
+    def warnings(self) -> list[str]:
+        """What the user should know of a tilt that little is known of."""
+        if self.error <= UNSURE:
+            return []
+        return [
+            f"how far the camera looks down is known to {self.error:.0f} degrees only: {self.pitch:.0f} is the middle of "
+            f"what it may be ({self.source}); give --pitch, or a camera file, for a better shape"
+        ]
 
 
 def estimate_kind(

@@ -72,7 +72,7 @@ class PictureEvidence:
 
 def look_at(
     picture: UInt8[np.ndarray, "h w 3"], ever: Bool[np.ndarray, "h w"], lying: Bool[np.ndarray, "h w"] | None,
-    texture: TexturePatches | None = None,
+    texture: TexturePatches | None = None, *, stays: bool = False,
 ) -> PictureEvidence:  # fmt: skip
     """Sky, plumb lines, rims, the shape of a pool and its waterline.
 
@@ -81,11 +81,12 @@ def look_at(
         ever: pixels that show fluid at some time.
         lying: pixels of fluid that lies on a plane; None: none does.
         texture: of that fluid.
+        stays: it has no downstream: a puddle.
     """
     sky, rims = skyline(picture, ever), find_rims(picture)
     lies = lying is not None and bool(lying.any())
     pool = round_pool(lying) if lies else None
-    contained = pool is not None or any(rim.share_inside(lying) > IN_VESSEL for rim in rims if lies)
+    contained = stays or pool is not None or any(rim.share_inside(lying) > IN_VESSEL for rim in rims if lies)
     scene = Scene(runs_out(lying) if lies else None, sky is not None, pool is not None or bool(rims))
     waterline = upper_outline(lying) if lies and not contained else None
     return PictureEvidence(sky, plumb_lines(picture, ~ever), pool, rims, waterline, texture, scene, contained)

@@ -256,8 +256,7 @@ def _kind_and_up(story, inputs, config, known, pose_given, mask, motion, trust, 
     if kind.nearly_level and c.pitch is None and not parts.puddle:
         texture = texture_gradient.texture_patches(clip.frames, parts.lying & ~parts.falling)
     typical = typical_picture(clip.frames[pick]).astype(np.uint8)
-    lying = parts.lying if kind.nearly_level else None
-    picture = look_at(typical, fluid.any_frame(), lying, texture, stays=parts.puddle)
+    picture = look_at(kind, typical, fluid.any_frame(), parts.lying, texture, stays=parts.puddle)
     up = kinds.estimate_up(
         kind, parts.lying, motion, trust * ~parts.falling, known, picture, given=(c.pitch, c.roll),
         level_prior=composite.level_prior(parts, motion, trust),

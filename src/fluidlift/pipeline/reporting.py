@@ -177,7 +177,9 @@ def _surface_rows(geometry: dict[str, Any]) -> list[list[str]]:
     """How the camera stands and what the surface was taken from, and how sure both are."""
     up, slope, jets, depth = (geometry.get(k) for k in ("up", "slope", "jets", "depth_source"))
     error = f" ± {up['error']:.0f}" if up.get("error") else ""
-    tilt = f"{up['pitch']:.1f}{error} degrees, rolled {up['roll']:.1f} ({up['source']}, confidence {up['confidence']:.2f})"
+    tilt = (
+        f"{up['pitch']:.1f}{error} degrees, rolled {up['roll']:.1f} ({up['source']}, confidence {up['confidence']:.2f})"
+    )
     rows = [["camera looks down by", tilt]]
     if depth is not None:
         rows.append(["surface", f"by the {depth['source']}"])

@@ -58,8 +58,8 @@ class UpEvidence:
         if self.error <= UNSURE:
             return []
         return [
-            f"how far the camera looks down is known to {self.error:.0f} degrees only: {self.pitch:.0f} is the middle of "
-            f"what it may be ({self.source}); give --pitch, or a camera file, for a better shape"
+            f"how far the camera looks down is known to {self.error:.0f} degrees only: {self.pitch:.0f} is the middle "
+            f"of what it may be ({self.source}); give --pitch, or a camera file, for a better shape"
         ]
 
 
@@ -281,7 +281,10 @@ def _without_motion(kind, tilted, picture, lean) -> slope.TiltEvidence:
     log = habit_prior(kind, pitches, picture.scene)[:, None] - 0.5 * (rolls / slope.ROLL) ** 2
     if lean is not None:
         log = log - 0.5 * ((rolls - lean) / slope.ROLL) ** 2
-    log += np.array([[picture.tilt(tilted(float(p), float(r))) for r in rolls] for p in pitches])
+    if picture.speaks:
+        known = rolls[::2]  # and between them
+        seen = np.array([[picture.tilt(tilted(float(p), float(r))) for r in known] for p in pitches])
+        log += np.array([np.interp(rolls, known, row) for row in seen])
     return slope.tilt_posterior(pitches, rolls, log, kind.usual_pitch)
 
 

@@ -7,12 +7,14 @@ import pytest
 from fluidlift.shape.kind import UpEvidence, estimate_up, level_camera
 from fluidlift.shape.view import look_at
 from fluidlift.shape.view.rims import find_rims
-from fluidlift.shape.view.roundness import Ellipse, fit_ellipse, out_of_round, round_pool, roundness_evidence
+from fluidlift.shape.view.roundness import Ellipse, fit_ellipse, out_of_round, round_pool, roundness_evidence, wide_part
 from fluidlift.types import PinholeCamera
+from fluidlift.types.kind import POUR, STREAM
 
 SIZE = (320, 240)
 CAMERA = PinholeCamera.from_fov(50.0, SIZE)
 PITCHES = np.arange(2.0, 89.0, 1.0)
+BLACK = np.zeros((*SIZE[::-1], 3), np.uint8)
 ROW, COL = np.mgrid[: SIZE[1], : SIZE[0]] + 0.5
 
 
@@ -114,6 +116,20 @@ def test_a_pool_that_the_picture_cuts_or_that_leans_is_not_taken_for_a_circle():
     assert round_pool((np.abs(COL - 160) < 90) & (np.abs(ROW - 120) < 40)) is None  # a rectangle
 
 
+@pytest.mark.parametrize("pitch", [25.0, 40.0])
+def test_the_pool_below_a_jet_is_what_is_wide(pitch):
+    pool, jet = disc(pitch), (np.abs(COL - 150) < 8) & (ROW < 120)
+    kept = wide_part(pool | jet)
+    assert (kept & pool).sum() > 0.97 * pool.sum()
+    assert not kept[:20].any()
+    down = np.zeros((*SIZE[::-1], 2))
+    seen = look_at(POUR, BLACK, pool | jet, pool | jet)
+    up = estimate_up("pour", pool | jet, down, 0.0 * ROW, CAMERA, seen)
+    assert up.pitch == pytest.approx(pitch, abs=8.0)
+    glass = (np.abs(COL - 150) < 60) & (ROW > 70) & (ROW < 200)  # from beside
+    assert look_at(POUR, BLACK, glass | jet, glass | jet).pool is None
+
+
 @pytest.mark.parametrize("pitch", [20.0, 40.0, 65.0])
 def test_the_rim_of_a_cup_is_found_and_shows_the_tilt(pitch):
     rims = find_rims(cup(pitch))
@@ -140,7 +156,7 @@ def test_texture_and_a_box_have_no_rims(seed):
 def test_liquid_in_a_cup_is_looked_down_on_whatever_it_stirs(pitch):
     picture, coffee = cup(pitch), disc(pitch, radius=0.26)
     swirl = 3.0 * np.stack([-(ROW - 120) / 60, (COL - 160) / 60], -1)
-    seen = look_at(picture, coffee, coffee)
+    seen = look_at(STREAM, picture, coffee, coffee)
     assert seen.contained and seen.waterline is None
     up = estimate_up("stream", coffee, swirl, coffee.astype(float), CAMERA, seen)
     assert up.pitch == pytest.approx(pitch, abs=6.0)
@@ -152,7 +168,7 @@ def test_a_pour_into_a_cup_that_is_seen_from_above_is_not_filmed_from_beside():
     jet = (np.abs(COL - 160) < 6) & (ROW < 120)
     down = np.zeros((*SIZE[::-1], 2))
     down[..., 1] = 5.0
-    up = estimate_up("pour", jet, down, jet.astype(float), CAMERA, look_at(cup(40.0), jet, None))
+    up = estimate_up("pour", jet, down, jet.astype(float), CAMERA, look_at(POUR, cup(40.0), jet, jet))
     assert up.pitch == pytest.approx(40.0, abs=5.0)
     assert "rims of vessels" in up.source
 
@@ -165,7 +181,7 @@ def test_a_flat_pool_says_more_than_one_that_is_seen_from_high_above():
             np.zeros((*SIZE[::-1], 2)),
             0.0 * ROW,
             CAMERA,
-            look_at(np.zeros((*SIZE[::-1], 3), np.uint8), d, d),
+            look_at(STREAM, BLACK, d, d),
         )
         for d in (disc(25.0), disc(65.0))
     )

@@ -9,6 +9,7 @@ from fluidlift.shape.view import PictureEvidence, look_at
 from fluidlift.shape.view.horizon import elevation, farthest_elevation, skyline, skyline_evidence, upper_outline
 from fluidlift.shape.view.plumb import plumb_evidence, plumb_lines
 from fluidlift.types import PinholeCamera, kind_of
+from fluidlift.types.kind import STREAM
 
 SIZE = (320, 200)
 CAMERA = PinholeCamera.from_fov(50.0, SIZE)
@@ -121,7 +122,7 @@ def test_a_fall_beside_posts_is_seen_from_where_the_posts_say():
     fluid[60:160, 150:170] = True
     flow = np.zeros((*SIZE[::-1], 2))
     flow[..., 1] = 3.0
-    seen = look_at(picture, fluid, None)
+    seen = look_at(kind_of("fall"), picture, fluid, fluid)
     up = estimate_up("fall", fluid, flow, np.ones(SIZE[::-1]), CAMERA, seen)
     without = estimate_up("fall", fluid, flow, np.ones(SIZE[::-1]), CAMERA)
     assert without.pitch == pytest.approx(kind_of("fall").pitch_prior[0], abs=0.01)
@@ -133,7 +134,7 @@ def test_a_fall_beside_posts_is_seen_from_where_the_posts_say():
 def test_a_quiet_river_under_the_sky_is_seen_from_near_the_horizon(pitch):
     """Sky and far shore alone; main habit is a camera that looks over a landscape at 10 degrees."""
     picture, water = landscape(pitch, hills=5.0, shore=3.0)
-    up = still_water(water, look_at(picture, water, water))
+    up = still_water(water, look_at(STREAM, picture, water, water))
     assert up.pitch == pytest.approx(pitch, abs=5.0)
     assert up.error < 8.0
     assert {"sky", "upper end of the water"} <= set(up.source.split(", "))

@@ -13,7 +13,14 @@ from fluidlift.shape.view.habit import Scene, habit_prior, runs_out
 from fluidlift.shape.view.horizon import Skyline, farthest_elevation, skyline, skyline_evidence, upper_outline
 from fluidlift.shape.view.plumb import PlumbLines, plumb_evidence, plumb_lines
 from fluidlift.shape.view.rims import find_rims
-from fluidlift.shape.view.roundness import IN_VESSEL, Ellipse, round_pool, roundness_evidence
+from fluidlift.shape.view.roundness import (
+    IN_VESSEL,
+    JET_LIKENESS,
+    Ellipse,
+    round_pool,
+    roundness_evidence,
+    wide_part,
+)
 from fluidlift.types import FluidKind, PinholeCamera
 
 
@@ -61,6 +68,11 @@ class PictureEvidence:
         return habit_prior(kind, pitches, self.scene, rise - top[..., None])
 
     @property
+    def speaks(self) -> bool:
+        """Whether `tilt` says anything."""
+        return self.sky is not None or self.lines is not None or self.pool is not None or bool(self.rims)
+
+    @property
     def words(self) -> list[str]:
         """Names of what speaks for the tilt, for the report."""
         named = {
@@ -71,22 +83,25 @@ class PictureEvidence:
 
 
 def look_at(
-    picture: UInt8[np.ndarray, "h w 3"], ever: Bool[np.ndarray, "h w"], lying: Bool[np.ndarray, "h w"] | None,
-    texture: TexturePatches | None = None, *, stays: bool = False,
+    kind: FluidKind, picture: UInt8[np.ndarray, "h w 3"], ever: Bool[np.ndarray, "h w"],
+    fluid: Bool[np.ndarray, "h w"], texture: TexturePatches | None = None, *, stays: bool = False,
 ) -> PictureEvidence:  # fmt: skip
     """Sky, plumb lines, rims, the shape of a pool and its waterline.
 
     Args:
+        kind: of the fluid.
         picture: sRGB, typical for the clip.
         ever: pixels that show fluid at some time.
-        lying: pixels of fluid that lies on a plane; None: none does.
+        fluid: its pixels, without the jets that fall onto it.
         texture: of that fluid.
         stays: it has no downstream: a puddle.
     """
     sky, rims = skyline(picture, ever), find_rims(picture)
-    lies = lying is not None and bool(lying.any())
-    pool = round_pool(lying) if lies else None
-    contained = stays or pool is not None or any(rim.share_inside(lying) > IN_VESSEL for rim in rims if lies)
-    scene = Scene(runs_out(lying) if lies else None, sky is not None, pool is not None or bool(rims))
-    waterline = upper_outline(lying) if lies and not contained else None
+    lies = kind.nearly_level and bool(fluid.any())
+    pool = round_pool(fluid) if lies else None
+    if kind.fills_vessel:
+        pool = round_pool(wide_part(fluid), JET_LIKENESS)
+    contained = stays or pool is not None or any(rim.share_inside(fluid) > IN_VESSEL for rim in rims)
+    scene = Scene(runs_out(fluid) if lies else None, sky is not None, pool is not None or bool(rims))
+    waterline = upper_outline(fluid) if lies and not contained else None
     return PictureEvidence(sky, plumb_lines(picture, ~ever), pool, rims, waterline, texture, scene, contained)

@@ -10,9 +10,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
+from fluidlift.shape.region import largest_piece
 from fluidlift.types import PinholeCamera
 
 POOL_SPREAD = 0.25
@@ -20,6 +22,10 @@ POOL_SPREAD = 0.25
 POOL_LIKENESS = 0.85
 """IoU of a pool's outline with the ellipse of its moments, at least: a rectangle has 0.83, a glass from the side less.
 What waves and a jet in front take away from a true ellipse is under a tenth"""
+NARROW = 0.35
+"""width of jets over that of the pool that they end in, at most, to be told from it"""
+JET_LIKENESS = 0.9
+"""`POOL_LIKENESS` where jets were taken away so: a square whose corners that rounds has 0.86"""
 CUT = 0.12
 """share of the picture's border that a pool may meet and count as whole: more moves the ellipse of its moments"""
 LEVEL = 20.0
@@ -97,13 +103,30 @@ def fit_ellipse(region: Bool[np.ndarray, "h w"]) -> Ellipse | None:
     return Ellipse((float(center[0]), float(center[1])), covariance, likeness)
 
 
-def round_pool(lying: Bool[np.ndarray, "h w"]) -> Ellipse | None:
-    """The ellipse of a pool whose outline is one, and closed inside the picture; None where there is no such pool."""
+def round_pool(lying: Bool[np.ndarray, "h w"], likeness: float = POOL_LIKENESS) -> Ellipse | None:
+    """The ellipse of a pool whose outline is one, and closed inside the picture; None where there is no such pool.
+
+    Args:
+        lying: its pixels.
+        likeness: IoU with its ellipse, at least.
+    """
     edges = np.concatenate([lying[0], lying[-1], lying[:, 0], lying[:, -1]])
     pool = fit_ellipse(lying)
-    if pool is None or pool.likeness < POOL_LIKENESS or edges.mean() > CUT or not pool.lies:
+    if pool is None or pool.likeness < likeness or edges.mean() > CUT or not pool.lies:
         return None
     return pool
+
+
+def wide_part(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """The largest piece of a fluid without what is much narrower than its widest place: a pool without its jets."""
+    inside = np.pad(mask, 1)
+    away = cv2.distanceTransform(inside.astype(np.uint8), cv2.DIST_L2, 5)
+    radius = NARROW * float(away.max())
+    core = away > radius
+    if not core.any():
+        return np.zeros_like(mask)
+    near = cv2.distanceTransform((~core).astype(np.uint8), cv2.DIST_L2, 5) <= radius
+    return largest_piece((near & inside)[1:-1, 1:-1])
 
 
 def out_of_round(camera: PinholeCamera, ellipse: Ellipse) -> float:

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import tempfile
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -31,7 +32,7 @@ from motion_subjects import Subject, default_shared, prepare, subjects
 from report import table
 from scipy import ndimage
 
-from fluidlift.config import build_config
+from fluidlift.config import JobConfig, build_config
 from fluidlift.evaluate.alignment import score_aligned
 from fluidlift.evaluate.case import Case, read_case
 from fluidlift.evaluate.images import depth_error, depth_scale, resample_nearest
@@ -41,10 +42,13 @@ from fluidlift.evaluate.volumes import align_cameras, behind, in_picture, occupa
 from fluidlift.look.pictures import caption
 from fluidlift.look.rasterize import render
 from fluidlift.look.scenery import orbit_camera, terrain_surfels
-from fluidlift.pipeline import begin, body, refining
+from fluidlift.pipeline import begin
+from fluidlift.pipeline.inputs import GivenFiles, Inputs
 from fluidlift.pipeline.make import STAGES
-from fluidlift.pipeline.reading import Inputs, clip_of
-from fluidlift.pipeline.story import Silence, Story
+from fluidlift.pipeline.runner import Runner
+from fluidlift.pipeline.settings import RefineSettings, taken
+from fluidlift.pipeline.stages.refine import refine
+from fluidlift.pipeline.work import Silence, Work
 from fluidlift.shape.airborne import inside_body
 from fluidlift.shape.place import pose_up
 from fluidlift.shape.surface import inflated_surface, level_surface
@@ -59,6 +63,7 @@ from fluidlift.types import (
     concatenate,
     kind_of,
 )
+from fluidlift.types.stages import Flow, Geometry, Read, Segmentation
 
 BEGIN, END = "<!-- geometry:begin -->", "<!-- geometry:end -->"
 FIGURES = {
@@ -82,8 +87,9 @@ CELLS = 96
 class Shaped:
     """A clip up to its geometry."""
 
-    story: Story
-    inputs: Inputs
+    lift: tuple[Read, Flow, Segmentation]
+    """the clip, and what was seen in it"""
+    geometry: Geometry
     seconds: float
     """of processor time, of the geometry alone"""
 
@@ -94,29 +100,35 @@ def shaped(clip: Path, camera: Path | None, folder: Path, again: bool, **told: f
     config = replace(config, shape=replace(config.shape, **told))
     folder.mkdir(parents=True, exist_ok=True)
     force = frozenset({"read", "geometry"} if again else {"geometry"})
-    story, hashes = Story(folder, STAGES, force=force, progress=Silence()), begin.input_hashes(inputs)
-    begin.look(story, inputs, config, hashes)
+    runner, given = Runner(folder, STAGES, force=force, progress=Silence()), GivenFiles.of(inputs)
+    seen = begin.look(runner, given, config)
     began = time.process_time()
-    begin.shape(story, inputs, config, hashes)
-    return Shaped(story, inputs, time.process_time() - began)
+    geometry = begin.shape(runner, seen, given, config)
+    return Shaped(seen, geometry, time.process_time() - began)
 
 
-def still_asset(story: Story) -> FluidAsset:
+def body_of(found: Shaped, config: JobConfig) -> Gaussians:
+    """The Gaussians of the body."""
+    settings = taken(RefineSettings, config.shape, seed=config.seed)
+    with tempfile.TemporaryDirectory() as folder:
+        return refine(*found.lift, found.geometry, None, settings, work=Work.alone(Path(folder))).body
+
+
+def still_asset(found: Shaped) -> FluidAsset:
     """The geometry as an asset at rest: what the figures of space need."""
-    setting, clip = body.setting_of(story), clip_of(story)
-    grid = setting.terrain.grid
-    velocity = FaceVelocity(*(np.zeros(grid.face_shape(axis), np.float32) for axis in range(3)))
+    g, clip = found.geometry, found.lift[0].clip
+    velocity = FaceVelocity(*(np.zeros(g.grid.face_shape(axis), np.float32) for axis in range(3)))
     return FluidAsset(
-        story["geometry"].meta["kind"], Gaussians.empty(), setting.terrain, grid, setting.cell_types, velocity,
-        FluidParameters(), {}, body.camera_of(story), body.placement_of(story), clip.interval, len(clip),
+        g.kind, Gaussians.empty(), g.setting.terrain, g.grid, g.setting.cell_types, velocity, FluidParameters(), {},
+        g.camera, g.world_from_canonical, clip.interval, len(clip),
     )  # fmt: skip
 
 
 def measured(found: Shaped, case: Case) -> dict[str, Any]:
     """Figures of the geometry, and of the bodies without thought."""
-    g = found.story["geometry"]
-    front = np.where(g.arrays["mask"], g.arrays["sighted_depth"], 0.0)
-    arrays, asset = {"front_depth": front, "rest_frame": g.meta["rest_frame"]}, still_asset(found.story)
+    g = found.geometry
+    front = np.where(g.mask, g.sighted_depth, 0.0)
+    arrays, asset = {"front_depth": front, "rest_frame": g.rest_frame}, still_asset(found)
     figures, scale, frame = score_depth(arrays, case)
     if scale is not None:
         alignment = align(asset, case, scale, frame)
@@ -124,8 +136,8 @@ def measured(found: Shaped, case: Case) -> dict[str, Any]:
         figures += score_volume(asset, case, alignment) + score_aligned(asset, case, alignment)
     values = {f.key: f.value for f in figures}
     record: dict[str, Any] = {name: values.get(key) for name, key in FIGURES.items()}
-    record |= {"kind": g.meta["kind"], "seconds": round(found.seconds, 2), "warnings": g.meta["warnings"]}
-    record["plain"] = plain_bodies(g.arrays["mask"], asset, case, frame, g.meta["kind"])
+    record |= {"kind": g.kind, "seconds": round(found.seconds, 2), "warnings": list(g.warnings)}
+    record["plain"] = plain_bodies(g.mask, asset, case, frame, g.kind)
     return record
 
 
@@ -201,14 +213,13 @@ def plain_moved(shape: tuple[np.ndarray, ...], asset: FluidAsset, case: Case, fr
 
 def sheet(found: Shaped, out: Path) -> None:
     """Input, Gaussians in the input view and from two sides, the bed alone: one row."""
-    story, config = found.story, build_config(preset="draft")
-    story.results["refine"] = refining.refine(story, found.inputs, config)
-    rest, camera, g = body.rest_of(story), body.camera_of(story), story["geometry"]
-    ground = terrain_surfels(body.terrain_of(story))
+    g = found.geometry
+    rest, camera = body_of(found, build_config(preset="draft")), g.camera
+    ground = terrain_surfels(g.setting.terrain)
     left, right = (orbit_camera(camera, rest.means, azimuth=a) for a in (-60.0, 60.0))
     sky = (0.82, 0.86, 0.9)
-    clip = clip_of(story).frames[g.meta["rest_frame"]]
-    views = [clip, _drawn(rest, camera, g.arrays["plate"] / 255.0)]
+    clip = found.lift[0].clip.frames[g.rest_frame]
+    views = [clip, _drawn(rest, camera, g.plate / 255.0)]
     views += [_drawn(concatenate([ground, rest]), c, sky) for c in (left, right)]
     views.append(_drawn(ground, left, sky))
     titles = ("input", "input view", "side view", "other side", "bed")

@@ -35,11 +35,8 @@ from fluidlift.look.scenery import orbit_camera, side_camera, terrain_surfels
 from fluidlift.look.vessel import glass_of
 from fluidlift.numerics.srgb import linear_from_srgb, srgb_from_linear
 from fluidlift.pipeline.looks import Backdrop, Frame, Painter
-from fluidlift.pipeline.reading import clip_of
-from fluidlift.pipeline.resimulate import FIRST_HALF, recall_first_half
-from fluidlift.pipeline.seeing import labels_of
-from fluidlift.pipeline.showing import splat_frames
-from fluidlift.pipeline.story import Silence, Story
+from fluidlift.pipeline.recall import footage_of_asset
+from fluidlift.pipeline.splat_files import splat_frames
 from fluidlift.types import FluidAsset, Gaussians, Grid, PinholeCamera, Terrain, TriangleMesh, kind_of
 
 BEGIN, END = "<!-- looks:begin -->", "<!-- looks:end -->"
@@ -57,11 +54,8 @@ def table(head: list[str], rows: list[list[str]]) -> str:
 
 def footage(folder: Path):
     """Clip, mask [t,h,w] and first frame of an asset whose stages are still there; None where they are not."""
-    story = Story(folder, FIRST_HALF, progress=Silence())
-    recall_first_half(story, read_manifest(folder))
-    if not {"read", "segment", "geometry"} <= story.results.keys():
-        return None
-    return clip_of(story), labels_of(story).fluid, int(story["geometry"].meta["rest_frame"])
+    found = footage_of_asset(folder, read_manifest(folder))
+    return None if found is None else (found.clip, found.labels.fluid, found.start)
 
 
 def picked(count: int) -> list[int]:

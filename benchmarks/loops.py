@@ -25,10 +25,8 @@ from fluidlift.look.rasterize import render
 from fluidlift.pipeline import EditSession, resimulate
 from fluidlift.pipeline.coarse_copy import coarser
 from fluidlift.pipeline.looping import read_frame
-from fluidlift.pipeline.resimulate import FIRST_HALF, recall_first_half
-from fluidlift.pipeline.scene import footage_of
-from fluidlift.pipeline.simulating import frame_file
-from fluidlift.pipeline.story import Silence, Story
+from fluidlift.pipeline.recall import footage_of_asset
+from fluidlift.pipeline.splat_files import frame_file
 
 PARTS = 8
 """along each side of the picture"""
@@ -66,9 +64,7 @@ def measured(source: Path, folder: Path, seconds: float | None, *, coarse: bool)
     """A row of the table."""
     began = time.perf_counter()
     warnings = looped(source, folder, seconds, coarse=coarse)
-    story = Story(folder, FIRST_HALF, progress=Silence())
-    recall_first_half(story, read_manifest(folder))
-    footage = footage_of(story)
+    footage = footage_of_asset(folder, read_manifest(folder))
     if footage is None:
         return f"| {source.stem} | has no work/ | | | |"
     asset, count = load_asset(folder), read_manifest(folder)["simulation"]["frames"]

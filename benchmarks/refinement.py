@@ -25,7 +25,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from geometry import shaped, still_asset
+from geometry import body_of, shaped, still_asset
 from motion_page import replace_section
 from motion_subjects import ROOT, SCENES, Subject, Truth, default_shared, prepare, read_truth, subjects
 from refinement_page import page
@@ -36,7 +36,6 @@ from fluidlift.config import build_config
 from fluidlift.evaluate.score import score_depth
 from fluidlift.evaluate.space import align
 from fluidlift.look.rasterize import render
-from fluidlift.pipeline import body, refining
 from fluidlift.shape.fill import fill
 from fluidlift.shape.follow import follow
 from fluidlift.shape.generate import beneath_front, bounded_colours, front_gaussians, picture_colours
@@ -136,29 +135,23 @@ def estimated(subject: Subject, truth: Truth, work: Path) -> list[dict[str, Any]
     """
     assert subject.case is not None
     found = shaped(subject.video, subject.case / "camera.json", work / f"{subject.name}.camera.fluid", False)
-    story, config = found.story, build_config(preset="draft")
-    g = story["geometry"]
-    arrays = {
-        "front_depth": np.where(g.arrays["mask"], g.arrays["sighted_depth"], 0.0),
-        "rest_frame": g.meta["rest_frame"],
-    }
+    config, g = build_config(preset="draft"), found.geometry
+    arrays = {"front_depth": np.where(g.mask, g.sighted_depth, 0.0), "rest_frame": g.rest_frame}
     _, scale, frame = score_depth(arrays, truth.case)
     if scale is None:
         return []
-    alignment = align(still_asset(story), truth.case, scale, frame)
+    alignment = align(still_asset(found), truth.case, scale, frame)
     scored = Scored.of(truth, alignment.key, frame, None)
-    rows, frames = [], g.meta["united_frames"]
+    rows, frames = [], g.united_frames
     for name, united, iterations in (
         ("generated", 1, 0), ("refine", 1, config.shape.refine_iterations),
         (f"unite ({frames})", frames, config.shape.refine_iterations),
     ):  # fmt: skip
-        g.meta["united_frames"] = united
+        wanted = replace(config, shape=replace(config.shape, refine_iterations=iterations))
         began = time.process_time()
-        made = refining.refine(
-            story, found.inputs, replace(config, shape=replace(config.shape, refine_iterations=iterations))
-        )
+        made = body_of(replace(found, geometry=replace(g, united_frames=united)), wanted)
         seconds = time.process_time() - began
-        laid = body.gaussians_from_arrays(made.arrays).transformed(alignment.truth_from_asset)
+        laid = made.transformed(alignment.truth_from_asset)
         # without its terrain, what lies behind a rock is seen through it
         rows.append(score(name, laid, scored, seconds, shell=Gaussians.empty()) | {"rocks": None})
     return rows

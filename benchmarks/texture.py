@@ -19,10 +19,7 @@ from report import table as rows_of
 from scipy import ndimage
 
 from fluidlift.io.asset_folder import read_manifest
-from fluidlift.pipeline.reading import clip_of
-from fluidlift.pipeline.resimulate import FIRST_HALF, recall_first_half
-from fluidlift.pipeline.seeing import labels_of
-from fluidlift.pipeline.story import Silence, Story
+from fluidlift.pipeline.recall import footage_of_asset
 
 CAPTION = 0.08
 """upper share of a panel, where its caption stands"""
@@ -47,15 +44,14 @@ def texture(picture: np.ndarray, inside: np.ndarray) -> tuple[float, float]:
 def measured(folder: Path) -> list[str]:
     """One row."""
     manifest = read_manifest(folder)
-    story = Story(folder, FIRST_HALF, force=frozenset(), progress=Silence())
-    recall_first_half(story, manifest)
-    if "segment" not in story.results:
+    footage = footage_of_asset(folder, manifest)
+    if footage is None:
         raise SystemExit(f"{folder}: without the stages of its clip in work/")
-    fluid, start = labels_of(story).fluid, int(story["geometry"].meta["rest_frame"])
+    fluid, start = footage.labels.fluid, footage.start
     with av.open(str(folder / "preview.mp4")) as film:
         frames = [f.to_ndarray(format="rgb24") for f in film.decode(video=0)]
     found = []
-    count = min(len(frames), len(clip_of(story).frames) - start)
+    count = min(len(frames), len(footage.clip) - start)
     for k in range(count // 3, count):
         panel = frames[k].shape[1] // 3
         mask = cv2.resize(np.asarray(fluid[start + k], np.uint8), (panel, frames[k].shape[0])) > 0

@@ -19,8 +19,8 @@ import numba
 import numpy as np
 
 from fluidlift.physics import boundaries, transfer
+from fluidlift.physics.advect_particles import displacements
 from fluidlift.physics.numba_particles import NumbaMover, NumbaTransfer
-from fluidlift.physics.travel import displacements
 from fluidlift.seams import MoveRules, ParticleMover, ParticleTransfer
 from fluidlift.types import Grid, Particles, Terrain, TriangleMesh
 

@@ -23,7 +23,7 @@ HASTY = (
 FOREIGN = {"backends", "blender"}
 """folders whose tests run a large package of others; tests that ask for `visitor` run a browser"""
 
-ASSET = {"made", "catalogue_asset", "story", "finished_tank", "tank_folder"}
+ASSET = {"made", "catalogue_asset", "finished", "finished_tank", "tank_folder"}
 """fixtures that make an asset, which takes seconds"""
 
 COMMAND_LINE = re.compile(r"from fluidlift\.cli import (\([^)]*|[^\n]*)\bmain\b")

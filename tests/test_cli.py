@@ -165,10 +165,14 @@ def test_a_body_that_is_lost_in_its_grid_is_rejected(stream_clip, out, capsys, h
 
 
 @pytest.mark.parametrize(
-    ("option", "value"), [("--max-frames", "5"), ("--max-pixels", "1000")], ids=["frames", "pixels"]
+    ("options", "setting"),
+    [(["--max-frames", "5"], "read.max_frames"), (["--max-pixels=1000"], "read.max_pixels")],
+    ids=["frames", "pixels"],
 )
-def test_a_limit_is_named_by_its_option(stream_clip, out, capsys, hasty, option, value):
-    assert option in rejected(capsys, "make", stream_clip, "-o", out, option, value, *hasty)
+def test_a_limit_is_named_by_its_setting_and_may_be_given_as_the_option_that_it_was(
+    stream_clip, out, capsys, hasty, options, setting
+):
+    assert f"--set {setting}=" in rejected(capsys, "make", stream_clip, "-o", out, *options, *hasty)
 
 
 @pytest.mark.parametrize(

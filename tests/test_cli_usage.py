@@ -32,6 +32,20 @@ def test_help_does_not_offer_none(command, capsys):
     assert "None" not in said and "(default: )" not in said
 
 
+def test_help_of_make_has_its_options_in_groups(capsys):
+    code, said = shown(capsys, "make", "--help")
+    groups = ["input options", "scene options", "part options", "quality options", "body options", "settings options"]
+    places = [said.index(group) for group in groups]
+    assert code == 0 and places == sorted(places)
+    assert places[0] < said.index("--mask PATH") < places[1] < said.index("--size FLOAT") < places[2]
+    assert "--max-pixels" not in said
+
+
+def test_an_old_option_without_a_value_is_a_wrong_option(capsys):
+    code, said = shown(capsys, "make", "x.mp4", "--max-pixels")
+    assert code == USAGE and "--max-pixels" in said
+
+
 def test_a_word_in_place_of_a_number_names_its_option(capsys):
     code, said = shown(capsys, "make", "x.mp4", "--size", "big")
     assert code == USAGE
@@ -45,8 +59,8 @@ def test_options_that_are_left_out_are_none():
 
     with REGISTRY:
         command = tyro.cli(Make, args=["x.mp4", "--fov", "40"])
-    assert command.fov == 40.0
-    assert command.kind is command.size is command.mask is None
+    assert command.scene.fov == 40.0
+    assert command.scene.kind is command.scene.size is command.input.mask is None
 
 
 def test_a_reader_who_has_seen_enough_gets_no_traceback(monkeypatch):

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from fluidlift import cli
+from fluidlift.cli.options import options_of
 from fluidlift.config import build_config
 from fluidlift.io.scene import SceneEdits
 from fluidlift.io.scene_look import Look
@@ -99,7 +100,7 @@ def test_commands_and_settings_in_the_documents_exist(page):
 
 @pytest.mark.parametrize("page", ["README.md", "docs/cli.md", "docs/troubleshooting.md", "SECURITY.md"])
 def test_options_in_the_documents_exist(page):
-    known = {f.name.replace("_", "-") for c in COMMANDS.values() for f in dataclasses.fields(c)} | {"help", "version"}
+    known = {name.replace("_", "-") for c in COMMANDS.values() for name in options_of(c)} | {"help", "version"}
     code = code_of((ROOT / page).read_text(encoding="utf-8"))
     assert set(re.findall(r"(?<![\w-])--([a-z][a-z-]*)", code)) <= known
 

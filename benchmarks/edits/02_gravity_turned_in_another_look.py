@@ -42,7 +42,7 @@ b.check(
 )
 fluid, velocities = b.last()
 b.check("all positions are finite", bool(np.isfinite(fluid.means).all()), f"{len(fluid)} splats")
-count = b.history()["count"]
+count = b.history().count
 b.check("what falls over the bank is gone", count[-1] < count[0], f"{count[-1]} particles of {count[0]} are left")
 b.divergence_free()
 b.solids_stay_dry()

@@ -27,7 +27,7 @@ edits.set("duration", LONG)
 b.edited(edits)
 b.simulate(LONG, preview=False)
 
-volume = b.history()["volume"]
+volume = b.history().volume
 late = volume[len(volume) // 2 :]
 drift = float(np.abs(late / late.mean() - 1).max())
 # the inflow is steady but for the fitted fluctuation, so what is left are waves: a few per cent of the depth

@@ -50,7 +50,7 @@ b.simulate(SECONDS)
 b.film("06_duck")
 b.picture("06_duck")
 
-poses = b.history()["poses"][:, 0]
+poses = b.history().poses[:, 0]
 half = len(poses) // 2
 moved, seconds = float((poses[-1, :3] - poses[half, :3]) @ along), (len(poses) - 1 - half) * asset.interval
 speed = float(np.linalg.norm(asset.parameters.inflow_velocity))

@@ -15,15 +15,15 @@ from scipy import ndimage
 from fluidlift.config import build_config
 from fluidlift.io.asset_folder import load_asset, read_manifest, save_asset
 from fluidlift.io.ply import read_splats
-from fluidlift.io.stage_cache import load_stage, owner_of
 from fluidlift.physics.transfer import particles_to_grid, sort_by_cell
 from fluidlift.pipeline import EditSession, Inputs, RenderRequest, SimulationRequest, make, render_asset, resimulate
 from fluidlift.pipeline.coarse_copy import coarser
-from fluidlift.pipeline.resimulate import FIRST_HALF, recall_first_half
-from fluidlift.pipeline.scene import Footage, footage_of
-from fluidlift.pipeline.story import Silence, Story
+from fluidlift.pipeline.footage import Footage
+from fluidlift.pipeline.recall import footage_of_asset
+from fluidlift.pipeline.runner import last_value
 from fluidlift.synthetic.demo import demo_clip
 from fluidlift.types import FluidAsset, Grid, Particles
+from fluidlift.types.stages import Simulation
 
 FIRST = 1001
 WIDTH = 640
@@ -91,18 +91,15 @@ class Bench:
         print(f"film: {path}")
         return path
 
-    def history(self) -> dict[str, np.ndarray]:
+    def history(self) -> Simulation:
         """Figures of every simulated frame: volume (m^3), leak (share of particles inside solids), count, poses."""
-        key = owner_of(self.folder, "simulate")
-        found = None if key is None else load_stage(self.folder, "simulate", key)
+        found = last_value(self.folder, "simulate", Simulation)
         assert found is not None, "the simulation's figures are gone"
-        return found[0]
+        return found
 
     def footage(self) -> Footage | None:
         """The clip as `make` read it, with its mask; None where work/ is gone."""
-        story = Story(self.folder, FIRST_HALF, progress=Silence())
-        recall_first_half(story, read_manifest(self.folder))
-        return footage_of(story)
+        return footage_of_asset(self.folder, read_manifest(self.folder))
 
     def splats(self, number: int):
         """Gaussians and velocities [n,3] (m/s) of the particles of a frame, without the skin over them (odd ids)."""
@@ -131,12 +128,12 @@ class Bench:
         Each step ends with pushing particles out of the ground. A particle counts as inside from a tenth of a cell on;
         one in a thousand is left for clefts narrower than a cell, which the grid cannot tell from solid.
         """
-        leak = float(self.history()["leak"].max())
+        leak = float(self.history().leak.max())
         self.check("nothing inside solids", leak <= most, f"{100 * leak:.3f} % of the particles at worst")
 
     def volume_kept(self, most: float) -> None:
         """The volume stays near that of the first frame: what flows in flows out. The bound is each example's own."""
-        volume = self.history()["volume"]
+        volume = self.history().volume
         drift = float(np.abs(volume / volume[0] - 1).max())
         self.check("volume kept", drift <= most, f"{100 * drift:.1f} % from the first frame at worst")
 

@@ -19,11 +19,11 @@ from typing import Any
 import numpy as np
 
 from fluidlift.physics import transfer
+from fluidlift.physics.active_region import region_around
+from fluidlift.physics.advect_particles import displacements
 from fluidlift.physics.apic import LiquidSimulator, SimulationSettings
 from fluidlift.physics.forces import add_gravity
 from fluidlift.physics.stepping import TIDY_EVERY
-from fluidlift.physics.travel import displacements
-from fluidlift.physics.window import window_around
 from fluidlift.types import FluidParameters, Grid, Particles, Terrain, TriangleMesh
 
 GRAVITY = (0.0, 0.0, -9.81)
@@ -43,7 +43,7 @@ def block_of_particles(block: list[int], spacing: float, seed: int = 0) -> Parti
 
 
 def measure_transfer(scene: dict[str, Any]) -> dict[str, Any]:
-    """Window, sort by cell, particles to grid, gravity, grid to particles, move; reorder every few steps.
+    """ActiveRegion, sort by cell, particles to grid, gravity, grid to particles, move; reorder every few steps.
 
     As in a substep of the simulator, without pressure, viscosity, walls and crowds.
     """
@@ -54,16 +54,16 @@ def measure_transfer(scene: dict[str, Any]) -> dict[str, Any]:
         if number == scene["warm"]:
             busy = time.process_time()
         began = time.perf_counter()
-        box = window_around(particles.positions, grid)
+        box = region_around(particles.positions, grid)
         low = tuple(o + s.start * grid.spacing for o, s in zip(grid.origin, box))
-        window = Grid(tuple(s.stop - s.start for s in box), grid.spacing, low)
-        order = transfer.sort_by_cell(particles.positions, window)
+        region = Grid(tuple(s.stop - s.start for s in box), grid.spacing, low)
+        order = transfer.sort_by_cell(particles.positions, region)
         if number % TIDY_EVERY == 0:
             particles = transfer.select_particles(particles, order.order)
             order = transfer.CellOrder(np.arange(len(particles)), order.start)
-        velocity, _ = transfer.particles_to_grid(particles, window, order)
+        velocity, _ = transfer.particles_to_grid(particles, region, order)
         velocity = add_gravity(velocity, GRAVITY, dt)
-        velocities, affine = transfer.grid_to_particles(velocity, window, particles.positions, order)
+        velocities, affine = transfer.grid_to_particles(velocity, region, particles.positions, order)
         moves, _ = displacements(velocities, affine, dt)
         positions = particles.positions + moves
         particles = replace(particles, positions=positions, velocities=velocities, affine=affine)

@@ -9,10 +9,10 @@ import pytest
 from fluidlift.backends.warp_device import warp_device
 from fluidlift.errors import FluidliftError, MissingPackage
 from fluidlift.physics import boundaries, transfer
+from fluidlift.physics.advect_particles import displacements
 from fluidlift.physics.deform import updated_deformation
 from fluidlift.physics.forces import add_gravity
 from fluidlift.physics.numba_particles import NumbaMover, NumbaTransfer
-from fluidlift.physics.travel import displacements
 from fluidlift.seams import MoveRules
 from fluidlift.types import Grid, Particles, Terrain, TriangleMesh
 

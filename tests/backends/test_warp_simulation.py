@@ -6,7 +6,7 @@ import pytest
 pytest.importorskip("warp", reason="the GPU back end, NVIDIA Warp, is not installed")
 
 from fluidlift.errors import FluidliftError
-from fluidlift.pipeline.simulating import particle_work
+from fluidlift.pipeline.simulator import particle_work
 from fluidlift.synthetic import tanks
 
 

@@ -101,7 +101,7 @@ def test_what_cannot_be_read_is_refused(tmp_path):
         "PIZ": good[:name] + b"\x04" + good[name + 1 :],
         "tiled": good[:4] + struct.pack("<I", 2 | 0x200) + good[8:],
         "damaged": good[:-10],
-        "max-pixels": good.replace(struct.pack("<4i", 0, 0, 29, 19), struct.pack("<4i", 0, 0, 99999, 99999)),
+        "max_pixels": good.replace(struct.pack("<4i", 0, 0, 29, 19), struct.pack("<4i", 0, 0, 99999, 99999)),
     }
     for reason, data in cases.items():
         (tmp_path / "a.exr").write_bytes(data)

@@ -260,8 +260,8 @@ def test_times_that_make_no_sense_are_refused(make_video, options):
 
 
 def test_limits_name_the_option_that_raises_them(make_video):
-    rejected(make_video(), "--max-pixels", limits=ReadLimits(max_pixels=1000))
-    rejected(make_video(), "--max-frames", limits=ReadLimits(max_frames=5))
+    rejected(make_video(), "read.max_pixels", limits=ReadLimits(max_pixels=1000))
+    rejected(make_video(), "read.max_frames", limits=ReadLimits(max_frames=5))
     rejected(make_video(), "--max-bytes", limits=ReadLimits(max_bytes=20000))
 
 

@@ -9,12 +9,12 @@ from fluidlift.errors import InputRejected
 from fluidlift.numerics.poisson import PoissonSystem
 from fluidlift.numerics.solid_mesh import flipped
 from fluidlift.physics import boundaries, free_surface, transfer
-from fluidlift.physics.crowding import cell_capacity
+from fluidlift.physics.active_region import open_region
 from fluidlift.physics.forces import add_gravity
+from fluidlift.physics.position_correction import cell_capacity
 from fluidlift.physics.pressure import build_system, divergence, face_fractions, project
 from fluidlift.physics.rigid import RigidBodies, RigidBody, Trajectory
 from fluidlift.physics.rigid_body import slowed
-from fluidlift.physics.window import open_window
 from fluidlift.types import CellType, FaceVelocity, Grid, Particles, Terrain, TriangleMesh, matrix_from_quat
 
 G = 9.81
@@ -34,9 +34,9 @@ def walls_of(shape, distance=None, open_top=True):
 
 
 def whole(walls):
-    """The window onto the whole box."""
+    """The region onto the whole box."""
     box = tuple(slice(0, n) for n in walls.grid.shape)
-    return open_window(box, walls, cell_capacity(walls.signed_distance, walls.grid))
+    return open_region(box, walls, cell_capacity(walls.signed_distance, walls.grid))
 
 
 def rigid(bodies, shape=(20, 20, 20), distance=None, gravity=(0.0, 0.0, -G), open_top=True):
@@ -44,15 +44,15 @@ def rigid(bodies, shape=(20, 20, 20), distance=None, gravity=(0.0, 0.0, -G), ope
     return RigidBodies(bodies, walls, density=DENSITY, gravity=gravity), whole(walls)
 
 
-def solved(bodies, window, wet, velocity=None, *, dt=0.005, rounds=1, gravity=(0.0, 0.0, -G)):
+def solved(bodies, region, wet, velocity=None, *, dt=0.005, rounds=1, gravity=(0.0, 0.0, -G)):
     """One substep on the grid with liquid in the cells `wet`; with more rounds from the pressure of the last one.
 
     Returns the velocity, q, and the system.
     """
-    grid, rate, start = window.grid, None, bodies.state()
+    grid, rate, start = region.grid, None, bodies.state()
     for _ in range(rounds):
         bodies.restore(start)
-        walls = bodies.enter(window).walls
+        walls = bodies.enter(region).walls
         types = bodies.fill_films(boundaries.liquid_cells(wet, walls))
         system = build_system(types, walls.openings, grid, open_border=True)
         bodies.predict(dt, rate)
@@ -178,7 +178,7 @@ def test_thin_bodies_and_bodies_in_the_terrain_are_reported():
 
 
 def test_a_state_continues_bit_for_bit():
-    bodies, window = rigid(
+    bodies, region = rigid(
         [
             RigidBody.box(
                 "crate", (0.2, 0.2, 0.2), density=2500.0, position=(0.5, 0.5, 0.104), orientation=(1, 0.02, 0, 0)
@@ -188,7 +188,7 @@ def test_a_state_continues_bit_for_bit():
     )
 
     def step():
-        solved(bodies, window, pool((20, 20, 20), 8))
+        solved(bodies, region, pool((20, 20, 20), 8))
         bodies.advance()
         return bodies.state()
 
@@ -202,9 +202,9 @@ def test_a_state_continues_bit_for_bit():
     for one, two in zip(first, again):
         for name, value in one.items():
             np.testing.assert_array_equal(value, two[name])
-    fresh, window = rigid(bodies.bodies)
+    fresh, region = rigid(bodies.bodies)
     fresh.restore(kept)
-    solved(fresh, window, pool((20, 20, 20), 8))
+    solved(fresh, region, pool((20, 20, 20), 8))
     fresh.advance()
     np.testing.assert_array_equal(fresh.center, first[0]["center"])
     with pytest.raises(InputRejected, match="'center'"):
@@ -220,8 +220,8 @@ def bed(x):
 
 def test_the_open_shares_beside_a_body_are_those_of_its_distance():
     body = RigidBody.sphere("s", 0.32, position=(0.52, 0.49, 0.62))
-    bodies, window = rigid([body], distance=bed)
-    walls = bodies.enter(window).walls
+    bodies, region = rigid([body], distance=bed)
+    walls = bodies.enter(region).walls
     plain = face_fractions(walls.signed_distance)
     for axis in range(3):
         inner = [slice(None)] * 3
@@ -239,8 +239,8 @@ def test_the_open_shares_beside_a_body_are_those_of_its_distance():
 
 def test_what_the_simulator_knows_of_cells_follows_the_union():
     body = RigidBody.box("b", (0.4, 0.3, 0.3), position=(0.52, 0.49, 0.6), orientation=TURN)
-    bodies, window = rigid([body], distance=bed)
-    union = bodies.enter(window)
+    bodies, region = rigid([body], distance=bed)
+    union = bodies.enter(region)
     walls = union.walls
     np.testing.assert_array_equal(union.wall_cells, boundaries.beside_closed_faces(walls))
     mean = boundaries.mean_of_corners(walls.signed_distance.astype(np.float64))
@@ -255,32 +255,32 @@ def test_what_the_simulator_knows_of_cells_follows_the_union():
 
 
 def test_where_a_body_has_left_the_terrain_is_as_before():
-    bodies, window = rigid([RigidBody.sphere("s", 0.2, position=(0.5, 0.5, 0.4))], distance=bed)
-    before = replace(window.walls, signed_distance=window.walls.signed_distance.copy())
-    bodies.enter(window)
-    assert (bodies.enter(window).walls.signed_distance != before.signed_distance).any()
+    bodies, region = rigid([RigidBody.sphere("s", 0.2, position=(0.5, 0.5, 0.4))], distance=bed)
+    before = replace(region.walls, signed_distance=region.walls.signed_distance.copy())
+    bodies.enter(region)
+    assert (bodies.enter(region).walls.signed_distance != before.signed_distance).any()
     bodies.center[:] = (0.5, 0.5, 5.0)
     bodies.predict(1e-9)
     bodies.advance()
-    union = bodies.enter(window)
+    union = bodies.enter(region)
     for name in ("signed_distance", "solid", "buried", "regions"):
         np.testing.assert_array_equal(getattr(union.walls, name), getattr(before, name))
     for axis in range(3):
         np.testing.assert_array_equal(union.walls.openings[axis], before.openings[axis])
         np.testing.assert_array_equal(union.walls.normals[axis], before.normals[axis])
         assert (bodies.face_velocity().components[axis] == 0).all()
-    np.testing.assert_array_equal(union.capacity, window.capacity)
-    np.testing.assert_array_equal(union.wall_cells, window.wall_cells)
+    np.testing.assert_array_equal(union.capacity, region.capacity)
+    np.testing.assert_array_equal(union.wall_cells, region.wall_cells)
 
 
 def test_a_gap_of_a_twentieth_of_a_cell_stays_open_and_holds_liquid():
     # terrain up to 0.3 of cell layer 2, and a flat bottom 0.05 cells above it
     body = RigidBody.box("b", (0.4, 0.4, 0.2), position=(0.5, 0.5, 0.115 + 0.05 * H + 0.1))
-    bodies, window = rigid([body], distance=lambda x: x[..., 2] - 0.115)
-    walls = bodies.enter(window).walls
+    bodies, region = rigid([body], distance=lambda x: x[..., 2] - 0.115)
+    walls = bodies.enter(region).walls
     assert walls.openings[0][10, 10, 2] == pytest.approx(0.05, abs=0.003)
     types = boundaries.liquid_cells(pool((20, 20, 20), 4) & ~bodies.inside(
-        window.grid.centers().reshape(-1, 3)).reshape(20, 20, 20), walls)  # fmt: skip
+        region.grid.centers().reshape(-1, 3)).reshape(20, 20, 20), walls)  # fmt: skip
     types[7:13, 7:13, 2] = CellType.EMPTY
     filled = bodies.fill_films(types)
     assert (filled[7:13, 7:13, 2] == CellType.FLUID).all()
@@ -291,17 +291,17 @@ def test_a_gap_of_a_twentieth_of_a_cell_stays_open_and_holds_liquid():
 
 
 def test_a_spinning_ball_and_a_moving_box_drive_no_flux_through_their_inside():
-    bodies, window = rigid(
+    bodies, region = rigid(
         [
             RigidBody.sphere("ball", 0.2, position=(0.31, 0.52, 0.5), angular_velocity=(3.0, 4.0, 5.0)),
             RigidBody.box("box", (0.25, 0.2, 0.2), position=(0.73, 0.52, 0.5), orientation=TURN, velocity=(1, 2, 3)),
         ],
         gravity=(0, 0, 0),
     )
-    walls = bodies.enter(window).walls
+    walls = bodies.enter(region).walls
     solid = bodies.face_velocity()
     flux = FaceVelocity(*((1 - w) * s for w, s in zip(walls.openings, solid.components)))
-    spread = divergence(flux, window.grid) * H
+    spread = divergence(flux, region.grid) * H
     inside = boundaries.mean_of_corners(walls.signed_distance) < -H
     assert inside[:10].any() and inside[10:].any()
     # cells deep inside: a rigid motion has no divergence
@@ -317,14 +317,14 @@ def test_a_spinning_ball_and_a_moving_box_drive_no_flux_through_their_inside():
 def test_rows_times_velocity_are_the_divergence_of_the_solid():
     motion = {"velocity": (1.0, 2.0, 3.0), "angular_velocity": (5.0, 4.0, -3.0)}
     body = RigidBody.box("b", (0.4, 0.3, 0.3), position=(0.52, 0.49, 0.22), orientation=TURN, **motion)
-    bodies, window = rigid([body], gravity=(0, 0, 0), distance=bed)
-    walls = bodies.enter(window).walls
+    bodies, region = rigid([body], gravity=(0, 0, 0), distance=bed)
+    walls = bodies.enter(region).walls
     unknown = ~walls.solid
     unknown[:, :, 12:] = False
     (term,) = bodies.coupling(unknown)
     solid = bodies.face_velocity()
     flux = FaceVelocity(*((1 - w.astype(float)) * s for w, s in zip(walls.openings, solid.components)))
-    wanted = np.where(unknown, divergence(flux, window.grid), 0.0)
+    wanted = np.where(unknown, divergence(flux, region.grid), 0.0)
     found = np.zeros(unknown.shape)
     found[tuple(term.cells.T)] = term.values @ np.concatenate([bodies.velocity[0], bodies.spin[0]])
     # single precision of the face velocity
@@ -335,17 +335,17 @@ def test_velocity_slides_along_a_moving_wall():
     normal = matrix_from_quat(TURN)[:, 2]
     motion = {"velocity": (1.0, -2.0, 0.5), "angular_velocity": (0.0, 0.0, 0.0)}
     body = RigidBody.box("b", (2, 2, 0.3), position=(0.5, 0.5, 0.5), orientation=TURN, **motion)
-    bodies, window = rigid([body], gravity=(0, 0, 0))
-    walls = bodies.enter(window).walls
+    bodies, region = rigid([body], gravity=(0, 0, 0))
+    walls = bodies.enter(region).walls
     bodies.face_velocity()
     wind = np.array([0.3, 0.7, -1.1])
-    velocity = FaceVelocity(*(np.full(window.grid.face_shape(a), wind[a], np.float32) for a in range(3)))
+    velocity = FaceVelocity(*(np.full(region.grid.face_shape(a), wind[a], np.float32) for a in range(3)))
     new = bodies.slide(velocity)
     wanted = wind - (wind - np.array([1.0, -2.0, 0.5])) @ normal * normal
     for axis in range(3):
-        above = (window.grid.faces(axis) - 0.5) @ normal
+        above = (region.grid.faces(axis) - 0.5) @ normal
         closed = (
-            (walls.openings[axis] == 0) & (np.abs(above) > 0.02) & (np.abs(window.grid.faces(axis) - 0.5).max(-1) < 0.4)
+            (walls.openings[axis] == 0) & (np.abs(above) > 0.02) & (np.abs(region.grid.faces(axis) - 0.5).max(-1) < 0.4)
         )
         assert closed.any()
         np.testing.assert_allclose(new.components[axis][closed], wanted[axis], atol=1e-3)
@@ -371,14 +371,14 @@ def dense(system: PoissonSystem, terms):
 
 def test_the_coupled_solve_agrees_with_the_dense_one():
     body = RigidBody.box("b", (0.2, 0.15, 0.15), density=300.0, position=(0.21, 0.2, 0.16), orientation=TURN)
-    bodies, window = rigid([body], (8, 8, 8))
-    velocity = add_gravity(FaceVelocity.zeros(window.grid), (0, 0, -G), 0.005)
-    _, q, system = solved(bodies, window, pool((8, 8, 8), 6))
-    fresh, window = rigid([body], (8, 8, 8))
-    fresh.enter(window)
+    bodies, region = rigid([body], (8, 8, 8))
+    velocity = add_gravity(FaceVelocity.zeros(region.grid), (0, 0, -G), 0.005)
+    _, q, system = solved(bodies, region, pool((8, 8, 8), 6))
+    fresh, region = rigid([body], (8, 8, 8))
+    fresh.enter(region)
     fresh.predict(0.005)
     matrix, cells = dense(system, fresh.coupling(system.unknown))
-    rhs = -divergence(velocity, window.grid, system, solid_velocity=fresh.face_velocity())
+    rhs = -divergence(velocity, region.grid, system, solid_velocity=fresh.face_velocity())
     wanted = np.linalg.solve(matrix, rhs[tuple(cells.T)])
     # q is kept in single precision
     np.testing.assert_allclose(q[tuple(cells.T)], wanted, atol=1e-6 * np.abs(wanted).max())
@@ -392,14 +392,14 @@ def test_liquid_and_body_keep_their_momentum_together(density):
     shape = (20, 20, 20)
     body = RigidBody.ellipsoid("b", (0.2, 0.12, 0.12), density=density, position=(0.52, 0.49, 0.5), orientation=TURN,
                                velocity=(0.5, 0.2, -0.3), angular_velocity=(1, 2, 3))  # fmt: skip
-    bodies, window = rigid([body], shape, gravity=(0, 0, 0))
+    bodies, region = rigid([body], shape, gravity=(0, 0, 0))
     wet = np.zeros(shape, bool)
     wet[3:17, 3:17, 3:17] = True
     rng = np.random.default_rng(0)
-    start = FaceVelocity(*(rng.normal(size=window.grid.face_shape(a)).astype(np.float32) for a in range(3)))
+    start = FaceVelocity(*(rng.normal(size=region.grid.face_shape(a)).astype(np.float32) for a in range(3)))
     before = bodies.mass[0] * bodies.velocity[0]
-    new, _, _ = solved(bodies, window, wet, start, gravity=(0, 0, 0))
-    openings = bodies.enter(window).walls.openings
+    new, _, _ = solved(bodies, region, wet, start, gravity=(0, 0, 0))
+    openings = bodies.enter(region).walls.openings
     gained = np.array(
         [
             DENSITY * H**3 * (w.astype(float) * (n.astype(float) - s)).sum()
@@ -419,8 +419,8 @@ def test_a_pool_at_rest_lifts_with_the_weight_of_the_displaced_liquid(height, tu
     shape = (22, 20, 22)
     body = RigidBody.box("b", (0.4, 0.3, 0.3), motion="static", position=(0.53, 0.49, height),
                          orientation=TURN if turned else (1, 0, 0, 0))  # fmt: skip
-    bodies, window = rigid([body], shape)
-    _, q, _ = solved(bodies, window, pool(shape, 20))
+    bodies, region = rigid([body], shape)
+    _, q, _ = solved(bodies, region, pool(shape, 20))
     force = bodies.pressure_forces(q)[0]
     weight = DENSITY * G * 0.036
     # wherever the flat bottom lies in its cells: the rest is single precision
@@ -432,8 +432,8 @@ def test_a_pool_at_rest_lifts_with_the_weight_of_the_displaced_liquid(height, tu
 
 def test_a_neutral_body_stays_where_it_is():
     shape = (20, 20, 22)
-    bodies, window = rigid([RigidBody.sphere("b", 0.2, density=DENSITY, position=(0.51, 0.52, 0.5))], shape)
-    solved(bodies, window, pool(shape, 20), rounds=3)
+    bodies, region = rigid([RigidBody.sphere("b", 0.2, density=DENSITY, position=(0.51, 0.52, 0.5))], shape)
+    solved(bodies, region, pool(shape, 20), rounds=3)
     # of free fall
     assert np.abs(bodies.velocity[0]).max() < 1e-4 * G * 0.005
 
@@ -442,8 +442,8 @@ def test_a_neutral_body_stays_where_it_is():
 def test_a_ball_in_liquid_accelerates_with_its_added_mass(density):
     # (m + m' / 2) a = (m' - m) g with the mass m' of the displaced liquid
     shape = (32, 32, 34)
-    bodies, window = rigid([RigidBody.sphere("b", 0.2, density=density, position=(0.81, 0.82, 0.8))], shape)
-    solved(bodies, window, pool(shape, 32), rounds=3)
+    bodies, region = rigid([RigidBody.sphere("b", 0.2, density=density, position=(0.81, 0.82, 0.8))], shape)
+    solved(bodies, region, pool(shape, 32), rounds=3)
     wanted = (DENSITY - density) / (density + 0.5 * DENSITY) * G
     # sides at four radii raise the added mass by some percent, the open surface lowers it
     assert bodies.velocity[0, 2] / 0.005 == pytest.approx(wanted, rel=0.03)
@@ -452,11 +452,11 @@ def test_a_ball_in_liquid_accelerates_with_its_added_mass(density):
 
 def test_a_light_body_on_the_floor_of_a_pool_is_lifted():
     shape = (16, 16, 16)
-    bodies, window = rigid([RigidBody.box("b", (0.3, 0.3, 0.2), density=500.0, position=(0.4, 0.4, 0.1025))], shape)
-    solved(bodies, window, pool(shape, 14), rounds=3)
+    bodies, region = rigid([RigidBody.box("b", (0.3, 0.3, 0.2), density=500.0, position=(0.4, 0.4, 0.1025))], shape)
+    solved(bodies, region, pool(shape, 14), rounds=3)
     assert bodies.velocity[0, 2] > 0.0
-    bodies, window = rigid([RigidBody.box("b", (0.3, 0.3, 0.2), motion="static", position=(0.4, 0.4, 0.1025))], shape)
-    _, q, _ = solved(bodies, window, pool(shape, 14))
+    bodies, region = rigid([RigidBody.box("b", (0.3, 0.3, 0.2), motion="static", position=(0.4, 0.4, 0.1025))], shape)
+    _, q, _ = solved(bodies, region, pool(shape, 14))
     # the film below carries the pressure of the depth
     assert bodies.pressure_forces(q)[0, 2] == pytest.approx(DENSITY * G * 0.018, rel=0.01)
 
@@ -466,10 +466,10 @@ def test_what_of_a_body_lies_in_the_ground_displaces_no_liquid_and_is_not_lifted
     # water on top of it and none below: it is pressed down by the column above, whatever of it is in the ground
     shape = (20, 20, 22)
     body = RigidBody.box("b", (0.4, 0.3, 0.3), motion="static", position=(0.5, 0.5, 0.5))
-    bodies, window = rigid([body], shape, distance=lambda x: x[..., 2] - floor)
+    bodies, region = rigid([body], shape, distance=lambda x: x[..., 2] - floor)
     wet = pool(shape, 20)
     wet[:, :, : int(floor / H)] = False
-    _, q, _ = solved(bodies, window, wet)
+    _, q, _ = solved(bodies, region, wet)
     force = bodies.pressure_forces(q)[0]
     # the pressure is known at cells' centres: within that of half a cell
     assert force[2] == pytest.approx(-DENSITY * G * 0.12 * 0.35, abs=DENSITY * G * 0.12 * 0.5 * H)
@@ -518,10 +518,10 @@ def test_a_piston_drives_the_liquid_with_its_own_velocity():
         np.array([0.0, 1.0]), np.array([[0.2, 0.2, 0.3], [0.7, 0.2, 0.3]]), np.tile([1.0, 0, 0, 0], (2, 1))
     )
     plate = RigidBody.box("plate", (0.2, 0.6, 0.8), motion="animated", trajectory=path)
-    bodies, window = rigid([plate], shape, gravity=(0, 0, 0), open_top=False)
+    bodies, region = rigid([plate], shape, gravity=(0, 0, 0), open_top=False)
     wet = np.zeros(shape, bool)
     wet[6:18] = True
-    new, _, _ = solved(bodies, window, wet, gravity=(0, 0, 0))
+    new, _, _ = solved(bodies, region, wet, gravity=(0, 0, 0))
     np.testing.assert_allclose(new.u[7:18], 0.5, atol=1e-4)
     assert np.abs(new.v[7:18]).max() < 1e-4
 
@@ -533,8 +533,8 @@ class Tank:
     """Liquid and bodies, one substep as the simulator does it."""
 
     def __init__(self, bodies, shape, level, distance=None):
-        self.bodies, self.window = rigid(bodies, shape, distance)
-        grid = self.window.grid
+        self.bodies, self.region = rigid(bodies, shape, distance)
+        grid = self.region.grid
         axes = [grid.low[a] + (np.arange(2 * grid.shape[a]) + 0.5) * 0.5 * H for a in range(3)]
         points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
         points = points[points[:, 2] < level]
@@ -545,9 +545,9 @@ class Tank:
         self.rate = None
 
     def step(self, dt):
-        bodies, p, grid = self.bodies, self.particles, self.window.grid
-        window = bodies.enter(self.window)
-        walls = window.walls
+        bodies, p, grid = self.bodies, self.particles, self.region.grid
+        region = bodies.enter(self.region)
+        walls = region.walls
         order = transfer.sort_by_cell(p.positions, grid)
         carried, masses = transfer.particles_to_grid(p, grid, order)
         full = boundaries.liquid_cells((np.diff(order.start) > 0).reshape(grid.shape), walls)
@@ -572,7 +572,7 @@ class Tank:
         velocities, affine = transfer.grid_to_particles(bodies.slide(new), grid, p.positions, order)
         positions = (p.positions + dt * velocities).astype(np.float32)
         boundaries.collide(
-            positions, p.positions, velocities, p.velocities, self.window.walls, dt=dt, restitution=0.0,
+            positions, p.positions, velocities, p.velocities, self.region.walls, dt=dt, restitution=0.0,
             tangential_share=1.0,
         )  # fmt: skip
         bodies.advance()

@@ -7,12 +7,12 @@ import pytest
 
 from fluidlift.physics import boundaries
 from fluidlift.physics import stress_kernels as kernels
-from fluidlift.physics.crowding import cell_capacity
+from fluidlift.physics.active_region import open_region
 from fluidlift.physics.face_clearance import face_clearance
+from fluidlift.physics.position_correction import cell_capacity
 from fluidlift.physics.rigid import RigidBodies, RigidBody
 from fluidlift.physics.viscosity import FaceRoles, build_system, diffuse, diffuse_with_bodies
 from fluidlift.physics.viscous_bodies import DraggedBody
-from fluidlift.physics.window import open_window
 from fluidlift.types import FaceVelocity, Grid, Terrain, TriangleMesh
 
 H, FLUID = 0.05, 1400.0
@@ -28,9 +28,9 @@ class Scene:
         terrain = Terrain(grid, far, np.eye(3)[0], TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), int)))
         walls = boundaries.build_walls(terrain, np.zeros(shape, np.uint8), np.zeros((3, 2), bool))
         box = tuple(slice(0, n) for n in shape)
-        window = open_window(box, walls, cell_capacity(walls.signed_distance, grid))
+        region = open_region(box, walls, cell_capacity(walls.signed_distance, grid))
         self.grid, self.bodies = grid, RigidBodies(bodies, walls, density=FLUID, gravity=(0.0, 0.0, 0.0))
-        self.walls = self.bodies.enter(window).walls
+        self.walls = self.bodies.enter(region).walls
         self.bodies.predict(0.01)
         middle = np.array(shape) * 0.5 * H
         self.distance = np.sqrt(np.square(grid.centers() - middle).sum(-1)).astype(np.float32) - drop

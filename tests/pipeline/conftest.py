@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from fluidlift.io.stage_cache import load_stage
-from fluidlift.pipeline import STAGES, Silence
+from fluidlift.pipeline.recall import OF_CLIP
+from fluidlift.pipeline.runner import kept_value
 from fluidlift.pipeline.scene import Scene
-from fluidlift.pipeline.story import Result, Story
 from fluidlift.types import (
     CellType,
     FaceVelocity,
@@ -26,6 +25,7 @@ from fluidlift.types import (
     Terrain,
     TriangleMesh,
 )
+from fluidlift.types.stages import Lift, Shown, Simulation
 
 H = 0.1
 """m, of its cells"""
@@ -69,16 +69,29 @@ def channel() -> Callable[..., Scene]:
     return striped_channel
 
 
-def story_of(folder: Path) -> Story:
-    """All stages of a finished asset, as its cache tells them."""
-    story = Story(folder, STAGES, progress=Silence())
-    for name in STAGES:
-        (facts,) = (folder / "work" / name).glob("*.json")
-        story.results[name] = Result(*load_stage(folder, name, facts.stem))
-    return story
+@dataclass(frozen=True)
+class Finished:
+    """The values of all stages of a finished asset, as its cache has them."""
+
+    lift: Lift
+    simulation: Simulation
+    shown: Shown
+
+    @classmethod
+    def of(cls, folder: Path) -> Finished:
+        """Of the one result that each stage has kept."""
+
+        def kept(name: str, kind: type) -> Any:
+            (facts,) = (folder / "work" / name).glob("*.json")
+            found = kept_value(folder, name, facts.stem, kind)
+            assert found is not None, f"the cache of {name} is damaged"
+            return found[0]
+
+        lift = Lift(*(kept(name, kind) for name, kind in OF_CLIP.items()))
+        return cls(lift, kept("simulate", Simulation), kept("show", Shown))
 
 
 @pytest.fixture(scope="module")
-def story(made) -> Story:
-    """`story_of` the small clip's asset."""
-    return story_of(made.folder)
+def finished(made) -> Finished:
+    """The small clip's asset."""
+    return Finished.of(made.folder)

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from fluidlift.cli import DONE, REJECTED, WITH_WARNINGS, main
-from fluidlift.config import build_config
 from fluidlift.io.asset_folder import read_manifest, update_manifest
 from fluidlift.physics.inflow_schedule import InflowSchedule
 from fluidlift.pipeline.as_filmed import Reel, card_of, card_of_run, why_not
-from fluidlift.pipeline.scene import Footage
+from fluidlift.pipeline.footage import Footage
 from fluidlift.types import PixelLabels, VideoClip
 
 WELL = (DONE, WITH_WARNINGS)
@@ -104,21 +103,21 @@ def a_footage(frames: int, height: int = 48, width: int = 64) -> Footage:
     ],
 )  # fmt: skip
 def test_why_a_scene_cannot_be_held_against_its_clip(channel, change, said):
-    footage, config = a_footage(8), build_config()
-    assert why_not(channel(8), footage, config) is None
-    assert said in why_not(replace(channel(8), **change), footage, config)
-    assert "clip is not at hand" in why_not(channel(8), None, config)
-    assert "preview" in why_not(channel(8), footage, build_config(None, None, ("show.preview=false",)))
+    footage = a_footage(8)
+    assert why_not(channel(8), footage, preview=True) is None
+    assert said in why_not(replace(channel(8), **change), footage, preview=True)
+    assert "clip is not at hand" in why_not(channel(8), None, preview=True)
+    assert "preview" in why_not(channel(8), footage, preview=False)
 
 
 def test_a_run_that_floods_its_banks_warns_and_one_that_broke_down_says_so(channel):
-    footage, config = a_footage(8), build_config()
+    footage = a_footage(8)
     frames, everywhere = footage.clip.frames, np.ones_like(footage.labels.fluid)
-    found = card_of_run(channel(8), footage, config, frames, everywhere)
-    assert found["as_filmed"]["verdict"] == "does not hold" and "level" in found["warnings"][0]
-    assert "warnings" not in card_of_run(channel(8), footage, config, frames, footage.labels.fluid)
-    short = card_of_run(channel(8), footage, config, frames[:2], everywhere[:2])
-    assert "2 where 6 are needed" in short["as_filmed"]["none"]
+    found = card_of_run(channel(8), footage, True, frames, everywhere)
+    assert found.as_filmed["verdict"] == "does not hold" and "level" in found.warnings[0]
+    assert card_of_run(channel(8), footage, True, frames, footage.labels.fluid).warnings == ()
+    short = card_of_run(channel(8), footage, True, frames[:2], everywhere[:2])
+    assert "2 where 6 are needed" in short.as_filmed["none"]
 
 
 def test_a_reel_gives_back_what_it_was_given_and_leaves_no_file(tmp_path):

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from fluidlift.errors import InputRejected
 from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.pipeline.dressing import CLEAR, FAINT, Dressing
-from fluidlift.pipeline.simulating import simulator_of
+from fluidlift.pipeline.simulator import simulator_of
 from fluidlift.types import FluidParameters, sh_from_rgb
 
 FRAMES = 6

@@ -490,7 +490,8 @@ def test_by_hand_by_command_in_python_and_in_the_viewer_give_the_same_simulation
     from fluidlift.cli import DONE, WITH_WARNINGS, main
     from fluidlift.config import JobConfig
     from fluidlift.pipeline.scene import SimulationRequest, scene_of
-    from fluidlift.pipeline.simulating import simulate
+    from fluidlift.pipeline.settings import SimulateSettings, taken
+    from fluidlift.pipeline.stages.simulate import simulate
     from fluidlift.viewer.draft import Draft
 
     ways = ("hand", "command", "python", "viewer")
@@ -539,7 +540,7 @@ def test_by_hand_by_command_in_python_and_in_the_viewer_give_the_same_simulation
         scene = scene_of(load_asset(folder), folder, SimulationRequest(), JobConfig(), footage=None, start=0)
         rest = edits.parameters, edits.duration, edits.inflow, edits.look, edits.loop
         plain.append((rest, [repr(x) for o in edits.obstacles for x in o.plain()], scene.parts, scene.frames))
-        simulate(scene, folder, JobConfig())
+        simulate(scene, taken(SimulateSettings, JobConfig().simulate), folder=folder)
         shown.append([p.read_bytes() for p in sorted((folder / "frames" / "splats").glob("*.ply"))])
     assert plain[0] == plain[1] == plain[2] == plain[3]
     assert len(shown[0]) == 3 and shown[0] == shown[1] == shown[2] == shown[3]
@@ -550,13 +551,14 @@ def test_only_what_an_edit_touches_is_stale(folder):
     from fluidlift.io.asset_folder import update_manifest
     from fluidlift.io.checkpoint import Checkpoint, write_checkpoint
     from fluidlift.pipeline.scene import SimulationRequest, scene_of
-    from fluidlift.pipeline.simulating import checkpoint_file
+    from fluidlift.pipeline.splat_files import checkpoint_file
+    from fluidlift.pipeline.stages.simulate import state_parts
 
     session = EditSession.open(folder)
     assert session.stale() == {"simulate", "look"}  # nothing was simulated yet
     scene = scene_of(load_asset(folder), folder, SimulationRequest(), JobConfig(), footage=None, start=0)
     history = {"poses": np.zeros((scene.frames, 0, 7))}
-    write_checkpoint(checkpoint_file(folder), Checkpoint(scene.frames, scene.parts, {}, history))
+    write_checkpoint(checkpoint_file(folder), Checkpoint(scene.frames, state_parts(scene), {}, history))
     update_manifest(
         folder, simulation={"frames": scene.frames, "frame_interval": scene.interval, "seed": scene.seed}
     )  # fmt: skip

@@ -15,11 +15,13 @@ from fluidlift.io.asset_folder import load_asset, read_manifest
 from fluidlift.io.frames import FluidFrame
 from fluidlift.io.ply import read_mesh, read_splats
 from fluidlift.io.stage_cache import mark_owner, save_stage
+from fluidlift.io.stage_codec import packed
 from fluidlift.io.validate_usd import validate_usd
 from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.pipeline.exporting import gridded, level_set
 from fluidlift.pipeline.rendering import frame_numbers
 from fluidlift.types import TriangleMesh
+from fluidlift.types.stages import Simulation
 
 WELL = (DONE, WITH_WARNINGS)
 
@@ -193,7 +195,8 @@ def floating(made, tmp_path):
     poses = np.zeros((2, 1, 7))
     poses[:, 0, 0], poses[:, 0, 2] = (0.0, 1.0), 1.0
     poses[:, 0, 3], poses[:, 0, 6] = np.sqrt(0.5), np.sqrt(0.5)  # a quarter turn about z
-    save_stage(folder, "simulate", "k", {"poses": poses}, {})
+    arrays, data = packed(Simulation(np.ones(len(poses)), np.zeros(len(poses)), np.ones(len(poses), int), poses))
+    save_stage(folder, "simulate", "k", arrays, {"seconds": 1.0, "value": data})
     mark_owner(folder, "simulate", "k")
     return folder
 

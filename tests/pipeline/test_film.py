@@ -10,13 +10,12 @@ from fluidlift.cli import REJECTED, WITH_WARNINGS, main
 from fluidlift.config import JobConfig
 from fluidlift.io.asset_folder import FILES, load_asset, read_manifest
 from fluidlift.io.footage_file import read_footage, write_footage
-from fluidlift.io.stage_cache import load_stage
 from fluidlift.io.video import read_clip
 from fluidlift.look.footage import FEWEST
 from fluidlift.pipeline.dressing import Dressing
 from fluidlift.pipeline.preview import preview_scene
 from fluidlift.pipeline.scene import SimulationRequest, film_of, first_of_film, scene_of
-from fluidlift.pipeline.simulating import simulator_of
+from fluidlift.pipeline.simulator import simulator_of
 
 FRAMES = 4
 CONSEQUENCE = "its surface looks as it did at rest"
@@ -158,7 +157,7 @@ def said_of(folder):
     return read_manifest(folder)["simulation"]["warnings"]
 
 
-def test_a_stream_carries_the_clip_with_its_masks(made):
+def test_a_stream_carries_the_clip_with_its_masks(made, finished):
     manifest, clip = read_manifest(made.folder), read_clip(made.clip)
     assert manifest["files"]["film"] == FILES["film"] and FILES["film"] in manifest["hashes"]
     frames, fluid, interval = read_footage(made.folder / FILES["film"], clip.size)
@@ -166,8 +165,7 @@ def test_a_stream_carries_the_clip_with_its_masks(made):
     assert len(frames) == len(clip) - first and interval == pytest.approx(clip.interval, rel=1e-3)
     # the clip is grain of a pixel in two colours, and 4:2:0 keeps half of its colour
     assert np.abs(frames.astype(int) - clip.frames[first:]).mean() < 6
-    (facts,) = (made.folder / "work" / "segment").glob("*.json")
-    labels = load_stage(made.folder, "segment", facts.stem)[0]["labels"]
+    labels = finished.lift.labels.labels
     assert (fluid != (labels[first:] == 1)).mean() < 0.01  # FLUID; the coder rounds the mask's corners
     assert not [w for w in said_of(made.folder) if "film" in w]
 

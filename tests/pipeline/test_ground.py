@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from fluidlift.pipeline.fluid_masks import FluidMasks
 from fluidlift.pipeline.ground import seen_labels
-from fluidlift.pipeline.seeing import FluidMasks
 from fluidlift.types.clip import Label
 
 

@@ -13,7 +13,7 @@ from fluidlift.io.exr import read_channels
 from fluidlift.io.exr_write import write_channels
 from fluidlift.io.scene_look import Look
 from fluidlift.pipeline.looks import Backdrop, Frame, Painter
-from fluidlift.pipeline.showing import splat_frames
+from fluidlift.pipeline.splat_files import splat_frames
 from fluidlift.types import Gaussians, Grid, PinholeCamera, Terrain, TriangleMesh
 
 WELL = (DONE, WITH_WARNINGS)

@@ -23,7 +23,10 @@ from fluidlift.pipeline.looping import (
 )
 from fluidlift.pipeline.resimulate import resimulate
 from fluidlift.pipeline.scene import LOOP_FADE, loop_overlap
-from fluidlift.pipeline.simulating import checkpoint_file, frame_file, simulate
+from fluidlift.pipeline.settings import SimulateSettings, taken
+from fluidlift.pipeline.splat_files import checkpoint_file, frame_file
+from fluidlift.pipeline.stages.simulate import simulate
+from fluidlift.pipeline.work import Work
 from fluidlift.types import CellType, FluidParameters, Gaussians
 
 
@@ -129,13 +132,13 @@ def test_the_fade_lasts_a_quarter_of_the_passage_within_bounds(channel):
 
 
 def test_the_seam_of_a_loop_is_no_larger_than_the_clips_own_steps(tmp_path, channel, camera):
-    config = build_config(None, None, (), {})
+    config = taken(SimulateSettings, build_config().simulate)
     plain, loop = channel(20), channel(20, overlap=6)
-    simulate(plain, tmp_path / "plain", config)
-    result = simulate(loop, tmp_path / "loop", config)
-    assert result.meta["frames"] == 20
-    assert result.meta["warnings"] == []
-    assert {len(v) for v in result.arrays.values()} == {20}
+    simulate(plain, config, folder=tmp_path / "plain")
+    result = simulate(loop, config, folder=tmp_path / "loop")
+    assert result.frames == 20
+    assert result.warnings == ()
+    assert {len(v) for v in (result.volume, result.leak, result.count, result.poses)} == {20}
     assert len(list((tmp_path / "loop" / "frames" / "splats").glob("*.ply"))) == 20
     across, mean, largest = seam(pictures(tmp_path / "loop", 20, camera))
     before, usual, _ = seam(pictures(tmp_path / "plain", 20, camera))
@@ -149,17 +152,17 @@ def test_the_seam_of_a_loop_is_no_larger_than_the_clips_own_steps(tmp_path, chan
 
 
 def test_a_closed_loop_has_no_checkpoint_to_go_on_from(tmp_path, channel):
-    config = build_config(None, None, (), {})
-    simulate(channel(8, overlap=2), tmp_path, config)
+    config = taken(SimulateSettings, build_config().simulate)
+    simulate(channel(8, overlap=2), config, folder=tmp_path)
     assert not checkpoint_file(tmp_path).exists()
     first = frame_file(tmp_path, FIRST_FRAME).read_bytes()
-    again = simulate(channel(8, overlap=2), tmp_path, config)
-    assert again.meta["resumed_at"] == 0
+    again = simulate(channel(8, overlap=2), config, folder=tmp_path)
+    assert again.resumed_at == 0
     assert frame_file(tmp_path, FIRST_FRAME).read_bytes() == first
 
 
 def test_a_loop_that_was_interrupted_before_it_was_closed_is_closed_by_the_next_run(tmp_path, channel):
-    config = build_config(None, None, ("simulate.checkpoint_every=1",), {})
+    config = taken(SimulateSettings, build_config().simulate, checkpoint_every=1)
     scene, calls = channel(8, overlap=2), []
 
     def stop(done, total):
@@ -168,22 +171,22 @@ def test_a_loop_that_was_interrupted_before_it_was_closed_is_closed_by_the_next_
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        simulate(scene, tmp_path / "stopped", config, step=stop)
-    resumed = simulate(scene, tmp_path / "stopped", config)
-    assert resumed.meta["resumed_at"] > 0
-    simulate(scene, tmp_path / "whole", config)
+        simulate(scene, config, folder=tmp_path / "stopped", work=replace(Work.alone(tmp_path), step=stop))
+    resumed = simulate(scene, config, folder=tmp_path / "stopped")
+    assert resumed.resumed_at > 0
+    simulate(scene, config, folder=tmp_path / "whole")
     for k in range(8):
         files = [frame_file(tmp_path / n, FIRST_FRAME + k).read_bytes() for n in ("stopped", "whole")]
         assert files[0] == files[1]
 
 
 def test_a_vessel_that_fills_has_no_loop_and_keeps_its_frames(tmp_path, channel):
-    config = build_config(None, None, (), {})
+    config = taken(SimulateSettings, build_config().simulate)
     cells = channel(12).cell_types
     cells = np.where(cells == CellType.OUTFLOW, np.uint8(CellType.FLUID), cells)
-    result = simulate(channel(12, overlap=4, cell_types=cells), tmp_path / "loop", config)
-    assert any("not closed" in w and "more fluid at its end" in w for w in result.meta["warnings"])
-    simulate(channel(12, cell_types=cells), tmp_path / "plain", config)
+    result = simulate(channel(12, overlap=4, cell_types=cells), config, folder=tmp_path / "loop")
+    assert any("not closed" in w and "more fluid at its end" in w for w in result.warnings)
+    simulate(channel(12, cell_types=cells), config, folder=tmp_path / "plain")
     files = [sorted((tmp_path / n / "frames" / "splats").glob("*.ply")) for n in ("loop", "plain")]
     assert len(files[0]) == 12
     assert [p.read_bytes() for p in files[0]] == [p.read_bytes() for p in files[1]]

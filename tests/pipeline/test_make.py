@@ -10,11 +10,17 @@ import pytest
 from fluidlift.cli import DONE, FAILED, REJECTED, WITH_WARNINGS, main
 from fluidlift.config import build_config
 from fluidlift.io.asset_folder import load_asset, read_manifest
+from fluidlift.io.force_file import read_force
 from fluidlift.io.ply import read_splats
+from fluidlift.io.scene import SceneEdits
 from fluidlift.io.video import read_clip
 from fluidlift.numerics.sampling import sample_nodes
-from fluidlift.pipeline import STAGES, Inputs, SimulationRequest, card_of, make, moving, simulating
-from fluidlift.pipeline.scene import footage_of, scene_of
+from fluidlift.pipeline import STAGES, Inputs, SimulationRequest, card_of, make
+from fluidlift.pipeline.footage import footage_of
+from fluidlift.pipeline.scene import edited_scene, scene_of
+from fluidlift.pipeline.settings import SceneSettings
+from fluidlift.pipeline.simulator import simulator_of
+from fluidlift.pipeline.stages import fit, geometry, simulate
 from fluidlift.types import CellType, Label
 from fluidlift.validate import validate_asset
 
@@ -59,15 +65,15 @@ def test_a_channel_that_runs_to_the_right_is_a_stream_to_the_right(asset):
     assert (asset.velocity.at_centers()[wet][:, 0] > 0).mean() > 0.95
 
 
-def test_the_fluid_was_found_between_its_banks(story):
-    labels = story["segment"].arrays["labels"]
+def test_the_fluid_was_found_between_its_banks(finished):
+    labels = finished.lift.labels.labels
     inside, outside = labels[:, 26:44, 8:40], labels[:, :10]
     assert (inside == Label.FLUID).mean() > 0.95
     assert (outside == Label.FLUID).mean() < 0.02
 
 
-def test_the_flow_is_two_pixels_per_frame(story):
-    flow = story["flow"].arrays["displacement"].astype(float)[:, 26:44, 8:40]
+def test_the_flow_is_two_pixels_per_frame(finished):
+    flow = finished.lift.flow.flow.displacement.astype(float)[:, 26:44, 8:40]
     # compressed video of 96 px: a tenth of a pixel
     np.testing.assert_allclose(np.median(flow, axis=(0, 1, 2)), [2.0, 0.0], atol=0.1)
 
@@ -78,9 +84,9 @@ def test_the_size_is_what_was_asked_for(asset):
     assert extent == pytest.approx(2.0, rel=0.15)
 
 
-def test_the_surface_moves_at_the_speed_of_the_picture(story, asset):
+def test_the_surface_moves_at_the_speed_of_the_picture(finished, asset):
     """2 px per frame at the distance and focal length of the camera, in metres per second."""
-    depth = float(np.median(story["geometry"].arrays["depth"][26:44, 8:40]))
+    depth = float(np.median(finished.lift.geometry.depth[26:44, 8:40]))
     expected = 2.0 * depth / asset.camera.focal[0] / asset.interval
     wet = asset.cell_types == CellType.FLUID
     top = wet & ~np.roll(wet, -1, axis=2)
@@ -94,10 +100,10 @@ def test_the_rest_body_lies_in_its_grid_and_outside_the_terrain(asset):
     assert distance.min() > -0.3 * asset.grid.spacing  # centres may sink by a quarter of a cell
 
 
-def test_the_camera_of_the_asset_sees_the_body_where_the_video_shows_it(asset, story):
+def test_the_camera_of_the_asset_sees_the_body_where_the_video_shows_it(asset, finished):
     uv, z = asset.camera.project(asset.rest.means)
     assert (z > 0).all()
-    mask = story["geometry"].arrays["mask"]
+    mask = finished.lift.geometry.mask
     ok = ((uv >= 0) & (uv < asset.camera.size)).all(axis=1)
     col, row = uv[ok].astype(int).T
     # the deep parts of the body project below the water line of the near bank, and rocks hide some of it
@@ -127,9 +133,11 @@ def test_the_first_frame_is_the_rest_body_without_what_lies_behind_the_outlet(ma
     np.testing.assert_allclose(first.gaussians.rgb[moved == 0], rest.rgb[moved == 0], atol=1e-5)
 
 
-def test_the_files_hold_what_was_simulated(made, story, asset):
-    scene = scene_of(asset, made.folder, SimulationRequest(), build_config(), footage=footage_of(story), start=0)
-    simulator = simulating.simulator_of(scene)
+def test_the_files_hold_what_was_simulated(made, finished, asset):
+    lift = finished.lift
+    footage = footage_of(lift.read, lift.segmentation, lift.geometry)
+    scene = scene_of(asset, made.folder, SimulationRequest(), build_config(), footage=footage, start=0)
+    simulator = simulator_of(scene)
     for _ in range(2):
         simulator.advance(asset.interval)
     p, shown = simulator.particles, splats(made, 2)
@@ -143,9 +151,25 @@ def test_the_files_hold_what_was_simulated(made, story, asset):
     np.testing.assert_allclose(velocity[written], p.velocities[order], atol=1e-3 * np.abs(p.velocities).max())
 
 
-def test_every_frame_has_a_splat_per_particle(made, story):
+def test_an_edited_asset_becomes_a_scene_without_a_file(made, asset, tmp_path):
+    """What `fluidlift sim` reads from the folder, and what is handed over in Python, go the same way."""
+    edits = SceneEdits(parameters={"kinematic_viscosity": 1e-3}, duration=0.2)
+    (tmp_path / "scene.yaml").write_text("parameters: {kinematic_viscosity: 1.0e-3}\nduration: 0.2\n")
+    there = scene_of(asset, tmp_path, SimulationRequest(), build_config(), footage=None, start=0)
+    scene = edited_scene(asset, edits)
+    assert scene.parts == there.parts and scene.frames == there.frames == 5
+    simulator = simulator_of(scene)
+    simulator.advance(scene.interval)
+    assert len(simulator.particles) > 0
+    filmed = read_force(made.folder)
+    assert filmed is not None
+    same = edited_scene(asset, SceneEdits(), settings=SceneSettings(None, 0.5, 0), force=filmed)
+    np.testing.assert_allclose(same.force.u, 0.5 * filmed.u)
+
+
+def test_every_frame_has_a_splat_per_particle(made, finished):
     counts = [int((splats(made, k).extras["id"] % 2 == 0).sum()) for k in range(FRAMES)]
-    assert counts == story["simulate"].arrays["count"].tolist()
+    assert counts == finished.simulation.count.tolist()
 
 
 def test_particles_keep_their_ids_and_move_with_the_stream(made, asset):
@@ -173,11 +197,11 @@ def test_the_preview_shows_three_views_of_every_frame(made):
     assert preview.size == (3 * 96, 64)
 
 
-def test_the_report_says_what_the_surface_was_taken_from_and_how_sure_that_is(made, story):
+def test_the_report_says_what_the_surface_was_taken_from_and_how_sure_that_is(made, finished):
     text = (made.folder / "report.html").read_text(encoding="utf-8")
-    slope, up = story["geometry"].meta["slope"], story["geometry"].meta["up"]
-    assert f"level with a probability of {slope['level_share']:.2f}" in text
-    assert f"± {slope['standard_error']:.1f} degrees" in text and f"confidence {up['confidence']:.2f}" in text
+    slope, up = finished.lift.geometry.slope, finished.lift.geometry.up
+    assert f"level with a probability of {slope.level_share:.2f}" in text
+    assert f"± {slope.standard_error:.1f} degrees" in text and f"confidence {up.confidence:.2f}" in text
 
 
 def test_the_report_tells_the_kind_and_every_stage(made):
@@ -271,11 +295,11 @@ def test_a_given_body_replaces_the_embedded_generator(made, tmp_path, hasty, ass
 
 
 def test_an_interrupted_job_goes_on_where_it_stopped(made, copy, quick, capsys, monkeypatch):
-    def stop(story, config):
+    def stop(*inputs):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(moving, "fit", stop)
+        patch.setattr(fit, "first_guess", stop)
         assert run(made, copy, "--force", "fit", quick=quick) == FAILED
     assert "goes on from there" in capsys.readouterr().err
     assert run(made, copy, "--json", quick=quick) == made.code
@@ -284,14 +308,12 @@ def test_an_interrupted_job_goes_on_where_it_stopped(made, copy, quick, capsys, 
 
 
 def test_an_interrupt_in_a_fresh_folder_keeps_what_was_done(stream_clip, tmp_path, hasty, monkeypatch, capsys):
-    from fluidlift.pipeline import body
-
-    def stop(story, inputs, config):
+    def stop(*inputs):
         raise KeyboardInterrupt
 
     folder = tmp_path / "x.fluid"
     with monkeypatch.context() as patch:
-        patch.setattr(body, "geometry", stop)
+        patch.setattr(geometry, "_seen", stop)
         assert main(["make", str(stream_clip), "-o", str(folder), *hasty]) == FAILED
     assert [name for name in STAGES if any((folder / "work" / name).glob("*.json"))] == ["read", "flow", "segment"]
     assert main(["validate", str(folder)]) == REJECTED  # half an asset is none
@@ -301,10 +323,10 @@ def test_an_interrupt_in_a_fresh_folder_keeps_what_was_done(stream_clip, tmp_pat
 def test_a_full_disk_in_a_later_stage_is_said_as_such(made, copy, quick, monkeypatch, capsys):
     import errno
 
-    def full(scene, folder, config, **_):
+    def full(scene):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(simulating, "simulate", full)
+    monkeypatch.setattr(simulate, "preflight", full)
     assert run(made, copy, "--force", "simulate", quick=quick) == REJECTED
     assert "disk full" in capsys.readouterr().err
     assert (copy / "rest" / "gaussians.ply").is_file()  # the asset that was there before stays

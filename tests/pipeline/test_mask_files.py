@@ -9,10 +9,11 @@ import pytest
 from fluidlift.cli import DONE, REJECTED, WITH_WARNINGS, main
 from fluidlift.errors import MissingPackage
 from fluidlift.io.pictures import read_picture, write_png
-from fluidlift.io.stage_cache import load_stage
 from fluidlift.motion import optical_flow
-from fluidlift.pipeline import seeing
+from fluidlift.pipeline.runner import kept_value
+from fluidlift.pipeline.stages import flow
 from fluidlift.types import PinholeCamera
+from fluidlift.types.stages import Segmentation
 
 FRAMES = 10
 
@@ -67,7 +68,7 @@ def test_a_corrected_mask_fits_make_and_is_taken_as_it_is(found, copy, stream_cl
     options = ["--size", "2", "--mask", str(copy / "mask"), *hasty]
     assert main(["make", str(stream_clip), "-o", str(folder), *options]) in (DONE, WITH_WARNINGS)
     (facts,) = (folder / "work" / "segment").glob("*.json")
-    labels = load_stage(folder, "segment", facts.stem)[0]["labels"]
+    labels = kept_value(folder, "segment", facts.stem, Segmentation)[0].labels.labels
     np.testing.assert_array_equal(labels == 1, pictures_in(copy / "mask") == 255)
 
 
@@ -120,7 +121,7 @@ def test_a_mask_of_straightened_pictures_is_not_straightened_again(stream_clip, 
     options = ["--camera", str(file), "--mask", str(look / "mask"), *hasty]
     assert main(["make", str(stream_clip), "-o", str(folder), *options]) in (DONE, WITH_WARNINGS)
     (facts,) = (folder / "work" / "segment").glob("*.json")
-    labels = load_stage(folder, "segment", facts.stem)[0]["labels"]
+    labels = kept_value(folder, "segment", facts.stem, Segmentation)[0].labels.labels
     np.testing.assert_array_equal(labels == 1, pictures_in(look / "mask") == 255)
 
 
@@ -159,7 +160,7 @@ def test_a_missing_package_leaves_no_folder_behind(stream_clip, tmp_path, monkey
     def missing(*_, **__):
         raise MissingPackage("torchvision is not installed")
 
-    monkeypatch.setattr(seeing, "make_estimator", missing)
+    monkeypatch.setattr(flow, "make_estimator", missing)
     code = main(["mask", str(stream_clip), "-o", str(tmp_path / "out"), "--set", "motion.method=raft"])
     assert code == 1 and "torchvision" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

@@ -17,7 +17,7 @@ from fluidlift.io.flow_files import write_flow
 from fluidlift.io.pictures import read_picture, write_png
 from fluidlift.pipeline import frame_files, motion_files
 from fluidlift.pipeline.frame_files import FrameWriter
-from fluidlift.pipeline.mask_files import is_straight
+from fluidlift.pipeline.mask_facts import is_straight
 
 FRAMES = 5
 PAIRS = FRAMES - 1

@@ -20,7 +20,7 @@ from fluidlift.pipeline.preview import (
     preview_scene,
     thinned,
 )
-from fluidlift.pipeline.simulating import simulator_of
+from fluidlift.pipeline.simulator import simulator_of
 from fluidlift.types import (
     CellType,
     FaceVelocity,

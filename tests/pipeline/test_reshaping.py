@@ -23,10 +23,13 @@ from fluidlift.pipeline.reshaping import (
     with_emitters,
     with_terrain,
 )
-from fluidlift.pipeline.simulating import frame_file, simulate, simulator_of
+from fluidlift.pipeline.settings import SimulateSettings, taken
+from fluidlift.pipeline.simulator import simulator_of
+from fluidlift.pipeline.splat_files import frame_file
+from fluidlift.pipeline.stages.simulate import simulate
 from fluidlift.types import FluidParameters, TriangleMesh
 
-CONFIG = build_config(None, None, (), {})
+CONFIG = taken(SimulateSettings, build_config().simulate)
 
 
 def tap(at=(0.6, 0.4, 0.9), **more):
@@ -37,7 +40,7 @@ def tap(at=(0.6, 0.4, 0.9), **more):
 def test_a_red_tap_above_the_box_pours_red_water_into_the_frames(tmp_path, channel):
     scene = with_emitters(channel(6), [tap(color=(0.9, 0.1, 0.1))])
     assert scene.terrain.grid.high[2] > 1.0  # the box was 0.6 m high
-    assert simulate(scene, tmp_path, CONFIG).meta["frames"] == 6
+    assert simulate(scene, CONFIG, folder=tmp_path).frames == 6
     shown = read_frame(frame_file(tmp_path, FIRST_FRAME + 5)).gaussians
     new = shown.means[:, 2] > 0.5
     assert new.sum() > 50
@@ -102,17 +105,17 @@ def test_a_simulation_that_breaks_down_names_the_edits_and_keeps_its_frames(tmp_
         return advance(self, duration)
 
     monkeypatch.setattr(ParticleSimulator, "advance", breaking)
-    result = simulate(scene, tmp_path, CONFIG)
-    assert result.meta["frames"] == 4
-    assert "blew up. Edited in scene.yaml: kinematic_viscosity 1e+03" in result.meta["failed"]
+    result = simulate(scene, CONFIG, folder=tmp_path)
+    assert result.frames == 4
+    assert "blew up. Edited in scene.yaml: kinematic_viscosity 1e+03" in result.failed
     assert in_words(channel(6)) == ""
 
 
 def test_too_many_particles_end_a_simulation_with_its_frames_and_a_word(tmp_path, channel):
-    few = build_config(None, None, ("simulate.max_particles=780",), {})
-    result = simulate(with_emitters(channel(8), [tap(color=(1.0, 0.0, 0.0))]), tmp_path, few)
-    assert 0 < result.meta["frames"] < 8
-    assert "max_particles=780" in result.meta["warnings"][0]
+    few = replace(CONFIG, max_particles=780)
+    result = simulate(with_emitters(channel(8), [tap(color=(1.0, 0.0, 0.0))]), few, folder=tmp_path)
+    assert 0 < result.frames < 8
+    assert "max_particles=780" in result.warnings[0]
 
 
 @pytest.mark.parametrize(
@@ -166,17 +169,17 @@ def test_what_no_machine_would_finish_is_refused_by_name(channel):
 
 def test_nothing_flows_out_of_an_obstacle_that_covers_the_inlet_and_that_is_said(channel, tmp_path):
     dammed = channel(6, obstacles=(obstacle(position=(0.1, 0.4, 0.3)),))
-    result = simulate(dammed, tmp_path, CONFIG)
-    assert "line 7: obstacle 'block' over the whole inlet: nothing flows in" in result.meta["warnings"][0]
+    result = simulate(dammed, CONFIG, folder=tmp_path)
+    assert "line 7: obstacle 'block' over the whole inlet: nothing flows in" in result.warnings[0]
     frames = [read_frame(frame_file(tmp_path, FIRST_FRAME + k)) for k in (0, 5)]
     particles = [set(f.ids[f.ids % 2 == 0]) for f in frames]  # odd ids are the skin's
     assert particles[1] and particles[1] <= particles[0]  # no new particle
     half = obstacle(position=(0.1, 0.0, 0.3))
-    assert simulate(channel(6, obstacles=(half,)), tmp_path / "half", CONFIG).meta["warnings"] == []
+    assert simulate(channel(6, obstacles=(half,)), CONFIG, folder=tmp_path / "half").warnings == ()
 
 
 def test_an_obstacle_in_the_place_of_all_of_the_fluid_is_refused(channel, tmp_path):
     whole = Obstacle("block", box_mesh(np.full(3, 4.0)), line="scene.yaml, line 7")
     with pytest.raises(InputRejected, match="line 7: obstacle 'block' in the place of all of the fluid"):
-        simulate(channel(6, obstacles=(whole,)), tmp_path, CONFIG)
+        simulate(channel(6, obstacles=(whole,)), CONFIG, folder=tmp_path)
     assert not list(tmp_path.rglob("*.ply"))

@@ -14,7 +14,7 @@ from fluidlift.io.asset_folder import load_asset, read_manifest
 from fluidlift.io.ply import read_splats
 from fluidlift.io.video import read_clip
 from fluidlift.physics.stepping import ParticleSimulator
-from fluidlift.pipeline import simulating
+from fluidlift.pipeline import simulator
 
 FRAMES = 6
 WELL = (DONE, WITH_WARNINGS)
@@ -276,7 +276,7 @@ def test_a_scene_file_that_does_not_fit_is_rejected_with_its_line(asset, made, c
 
 
 def test_the_memory_that_is_there_is_compared_with_what_is_needed(asset, monkeypatch, capsys):
-    monkeypatch.setattr(simulating, "available_memory", lambda: 10**6)
+    monkeypatch.setattr(simulator, "available_memory", lambda: 10**6)
     assert sim(asset, "--restart") == REJECTED
     said = capsys.readouterr().err
     assert "cells" in said and "0.0 GB are free" in said

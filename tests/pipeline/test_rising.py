@@ -14,26 +14,23 @@ GRID = Grid((4, 4, 4), 0.1)
 
 
 @pytest.fixture
-def story(monkeypatch):
-    masks = np.zeros((20, 40, 10), bool)
+def masks():
+    """Smoke that rises by a pixel per frame."""
+    found = np.zeros((20, 40, 10), bool)
     for k in range(20):
-        masks[k, 24 - k : 36, 3:7] = True
-    monkeypatch.setattr(rising, "masks_of", lambda story: masks[: story["frames"]])
-    monkeypatch.setattr(rising, "setting_of", lambda story: SimpleNamespace(terrain=None, cell_types=None))
-    monkeypatch.setattr(rising, "camera_of", lambda story: None)
-    monkeypatch.setattr(rising, "clip_of", lambda story: SimpleNamespace(interval=0.04))
+        found[k, 24 - k : 36, 3:7] = True
+    return found
 
-    class Told(dict):
-        step = staticmethod(lambda done, total: None)
 
-    return Told(geometry=SimpleNamespace(meta={"rest_frame": 2}), frames=20)
+GEOMETRY = SimpleNamespace(setting=SimpleNamespace(terrain=None, cell_types=None), camera=None, rest_frame=2)
+READ = SimpleNamespace(clip=SimpleNamespace(interval=0.04))
 
 
 def estimates():
     return {f"gravity_{a}": Estimate(v, np.inf, False, v, "m/s^2") for a, v in zip("xyz", (0.06, 0.0, -0.08))}
 
 
-def found(monkeypatch, story, lift):
+def found(monkeypatch, masks, lift):
     seen = []
 
     def told(smoke, guess, step):
@@ -41,12 +38,12 @@ def found(monkeypatch, story, lift):
         return lift
 
     monkeypatch.setattr(buoyancy, "buoyancy_from_rise", told)
-    parameters = FluidParameters(gravity=(0.06, 0.0, -0.08))
-    return rising.with_buoyancy(story, parameters, estimates(), FaceVelocity.zeros(GRID)), seen
+    parameters, quiet = FluidParameters(gravity=(0.06, 0.0, -0.08)), lambda done, total: None
+    return rising.with_buoyancy(READ, masks, GEOMETRY, parameters, estimates(), FaceVelocity.zeros(GRID), quiet), seen
 
 
-def test_the_lift_changes_and_its_direction_stays(monkeypatch, story):
-    (parameters, known, figures), seen = found(monkeypatch, story, Buoyancy(2.0, 0.5, 18, 4))
+def test_the_lift_changes_and_its_direction_stays(monkeypatch, masks):
+    (parameters, known, figures), seen = found(monkeypatch, masks, Buoyancy(2.0, 0.5, 18, 4))
     assert parameters.gravity == pytest.approx((1.2, 0.0, -1.6))
     assert known["gravity_z"].value == pytest.approx(-1.6) and known["gravity_z"].sigma == pytest.approx(0.4)
     assert known["gravity_z"].fitted and not known["gravity_z"].identifiable  # a quarter is more than 5 %
@@ -57,12 +54,11 @@ def test_the_lift_changes_and_its_direction_stays(monkeypatch, story):
     assert smoke.frames == 18 and smoke.outline(0).sum() == 4 * (36 - 22)  # from the first instant of the body on
 
 
-def test_outlines_that_say_nothing_leave_the_guess(monkeypatch, story):
-    (parameters, known, figures), _ = found(monkeypatch, story, None)
+def test_outlines_that_say_nothing_leave_the_guess(monkeypatch, masks):
+    (parameters, known, figures), _ = found(monkeypatch, masks, None)
     assert parameters.gravity == (0.06, 0.0, -0.08) and known == estimates() and figures == {}
 
 
-def test_smoke_must_rise_in_a_few_frames_at_least(story):
-    assert rising.outline_rises(story)
-    story["frames"] = 6
-    assert not rising.outline_rises(story)
+def test_smoke_must_rise_in_a_few_frames_at_least(masks):
+    assert rising.outline_rises(masks, 2)
+    assert not rising.outline_rises(masks[:6], 2)

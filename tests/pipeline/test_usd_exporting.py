@@ -10,9 +10,11 @@ from pxr import Gf, Usd, UsdGeom, UsdVol
 
 from fluidlift.io.frames import FluidFrame
 from fluidlift.io.stage_cache import mark_owner, save_stage
+from fluidlift.io.stage_codec import packed
 from fluidlift.io.validate_usd import splat_rule_faults, validate_usd
 from fluidlift.pipeline.usd_exporting import bodies_of, preview_of, write_usd_asset
 from fluidlift.types import FluidParameters, Gaussians, Grid, PinholeCamera, TriangleMesh
+from fluidlift.types.stages import Simulation
 
 COUNT = 4
 
@@ -28,7 +30,8 @@ def folder(tmp_path):
     )
     poses = np.zeros((COUNT, 1, 7))
     poses[:, 0, 0], poses[:, 0, 2], poses[:, 0, 3] = np.arange(COUNT), 1.0, 1.0
-    save_stage(path, "simulate", "k", {"poses": poses}, {})
+    arrays, data = packed(Simulation(np.ones(len(poses)), np.zeros(len(poses)), np.ones(len(poses), int), poses))
+    save_stage(path, "simulate", "k", arrays, {"seconds": 1.0, "value": data})
     mark_owner(path, "simulate", "k")
     return path
 

@@ -15,8 +15,8 @@ from fluidlift.shape.depth_surface import (
     up_from_depth,
 )
 from fluidlift.shape.given_depth import SceneDepth
-from fluidlift.shape.kind import UpEvidence, level_camera
-from fluidlift.types import Grid, Label, PinholeCamera, RigidTransform
+from fluidlift.shape.kind import level_camera
+from fluidlift.types import Grid, Label, PinholeCamera, RigidTransform, UpEvidence
 
 H, W = 72, 108
 ROW, COL = np.mgrid[:H, :W]

@@ -17,8 +17,7 @@ from fluidlift.shape.generate import (
     united_mask,
     within_silhouette,
 )
-from fluidlift.shape.terrain import Setting
-from fluidlift.types import CellType, Gaussians, Grid, PinholeCamera, Terrain, TriangleMesh, concatenate
+from fluidlift.types import CellType, Gaussians, Grid, PinholeCamera, Setting, Terrain, TriangleMesh, concatenate
 
 H, W = 64, 96
 ROW, COL = np.mgrid[:H, :W]

@@ -7,8 +7,8 @@ import pytest
 
 from fluidlift.errors import InputRejected
 from fluidlift.shape.given_depth import DepthPictures, fuse, robust_line, robust_plane, scene_depth, without_rim
-from fluidlift.shape.kind import UpEvidence, level_camera
-from fluidlift.types import PinholeCamera
+from fluidlift.shape.kind import level_camera
+from fluidlift.types import PinholeCamera, UpEvidence
 
 H, W = 60, 90
 ROW, COL = np.mgrid[:H, :W]

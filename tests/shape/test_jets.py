@@ -10,10 +10,9 @@ import pytest
 from fluidlift.shape import airborne, jets
 from fluidlift.shape.heights import PlaneHeight
 from fluidlift.shape.jet_column import Jet, with_columns
-from fluidlift.shape.kind import UpEvidence, level_camera
+from fluidlift.shape.kind import level_camera
 from fluidlift.shape.surface import FrontSurface
-from fluidlift.shape.terrain import Setting
-from fluidlift.types import CellType, Grid, PinholeCamera, Similarity3, Terrain, TriangleMesh
+from fluidlift.types import CellType, Grid, PinholeCamera, Setting, Similarity3, Terrain, TriangleMesh, UpEvidence
 
 INTERVAL = 0.04
 RADIUS = 0.03

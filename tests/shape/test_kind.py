@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from fluidlift.shape.kind import KINDS, UpEvidence, estimate_kind, estimate_up, level_camera
-from fluidlift.types import PinholeCamera, kind_of
+from fluidlift.shape.kind import KINDS, estimate_kind, estimate_up, level_camera
+from fluidlift.types import PinholeCamera, UpEvidence, kind_of
 
 H, W, T = 90, 160, 6
 BLUE, GREY = (60, 110, 160), (150, 150, 150)

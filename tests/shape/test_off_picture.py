@@ -5,8 +5,7 @@ import pytest
 
 from fluidlift.physics.inlet import clear_of_shore
 from fluidlift.shape.off_picture import continued, in_picture
-from fluidlift.shape.terrain import Setting
-from fluidlift.types import CellType, Gaussians, Grid, PinholeCamera, Terrain, TriangleMesh
+from fluidlift.types import CellType, Gaussians, Grid, PinholeCamera, Setting, Terrain, TriangleMesh
 
 GRID = Grid((24, 12, 6), 0.1)
 LEVEL = 0.35

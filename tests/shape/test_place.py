@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fluidlift.shape.heights import PlaneHeight
-from fluidlift.shape.kind import UpEvidence, level_camera
+from fluidlift.shape.kind import level_camera
 from fluidlift.shape.place import (
     STANDARD_GRAVITY,
     PlacedHeight,
@@ -16,7 +16,7 @@ from fluidlift.shape.place import (
     place,
     pose_up,
 )
-from fluidlift.types import PinholeCamera, RigidTransform
+from fluidlift.types import PinholeCamera, RigidTransform, UpEvidence
 
 RNG = np.random.default_rng(0)
 CANONICAL = level_camera(PinholeCamera.from_fov(50.0, (160, 100)), UpEvidence(30.0, 0.0, "", 1.0))

@@ -2,9 +2,8 @@ import numpy as np
 import pytest
 
 from fluidlift.shape.jets import Outline
-from fluidlift.shape.kind import UpEvidence
 from fluidlift.shape.puddle import down_to_landing, jets_into_puddle
-from fluidlift.types import PinholeCamera
+from fluidlift.types import PinholeCamera, UpEvidence
 
 H, W = 160, 160
 CAMERA = PinholeCamera.from_fov(40.0, (W, H))

@@ -5,7 +5,7 @@ import pytest
 
 from fluidlift.shape.energy_line import Channel, energy_profile
 from fluidlift.shape.heights import ProfileAlongHeight
-from fluidlift.shape.kind import UpEvidence, level_camera
+from fluidlift.shape.kind import level_camera
 from fluidlift.shape.slope import (
     estimate_slope,
     estimate_tilt,
@@ -14,7 +14,7 @@ from fluidlift.shape.slope import (
 )
 from fluidlift.shape.surface import stream_surface
 from fluidlift.shape.view import PictureEvidence
-from fluidlift.types import PinholeCamera
+from fluidlift.types import PinholeCamera, UpEvidence
 
 SIZE = (128, 96)
 

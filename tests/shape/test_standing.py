@@ -6,8 +6,8 @@ import pytest
 
 from fluidlift.errors import InputRejected
 from fluidlift.shape import prism, standing
-from fluidlift.shape.kind import UpEvidence, estimate_up, level_camera
-from fluidlift.types import CellType, PinholeCamera, Similarity3
+from fluidlift.shape.kind import estimate_up, level_camera
+from fluidlift.types import CellType, PinholeCamera, Similarity3, UpEvidence
 
 SIZE = (256, 192)
 WORLD = Similarity3(2.0, np.eye(3), np.array([0.3, -0.4, 2.1]))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fluidlift.errors import InputRejected
-from fluidlift.shape.kind import UpEvidence, level_camera
+from fluidlift.shape.kind import level_camera
 from fluidlift.shape.plume import SIGHT
 from fluidlift.shape.surface import (
     PlaneHeight,
@@ -16,7 +16,7 @@ from fluidlift.shape.surface import (
     intersect_height,
     level_surface,
 )
-from fluidlift.types import PinholeCamera
+from fluidlift.types import PinholeCamera, UpEvidence
 
 H, W = 72, 108
 ROW, COL = np.mgrid[:H, :W]
@@ -241,6 +241,6 @@ def test_the_volume_of_a_round_silhouette_is_that_of_a_ball():
 
 
 def kinds_level(camera):
-    from fluidlift.shape.kind import UpEvidence, level_camera
+    from fluidlift.shape.kind import level_camera
 
     return level_camera(camera, UpEvidence(0.0, 0.0, "given", 1.0))

@@ -4,11 +4,11 @@ import cv2
 import numpy as np
 import pytest
 
-from fluidlift.shape.kind import UpEvidence, estimate_up, level_camera
+from fluidlift.shape.kind import estimate_up, level_camera
 from fluidlift.shape.slope import plane_axes
 from fluidlift.shape.texture_gradient import PATTERNLESS, texture_evidence, texture_patches, weighed
 from fluidlift.shape.view import PictureEvidence
-from fluidlift.types import PinholeCamera
+from fluidlift.types import PinholeCamera, UpEvidence
 
 SIZE = (256, 192)
 PITCHES = np.arange(10.0, 81.0, 5.0)

@@ -12,19 +12,29 @@ import numpy as np
 import pytest
 
 import fluidlift
-from fluidlift.cli.options import Make
+from fluidlift.cli.options import Scene
 from fluidlift.config.sections import ShapeConfig
 from fluidlift.errors import InputRejected
 from fluidlift.look.vessel import glass_of
 from fluidlift.motion.bed import layer_thickness
 from fluidlift.motion.volume import volume_velocity
-from fluidlift.pipeline.moving import sticking
+from fluidlift.pipeline.stages.fit import sticking
 from fluidlift.shape.airborne import airborne_setting
 from fluidlift.shape.kind import KINDS as RECOGNISED
-from fluidlift.shape.kind import UpEvidence, estimate_up, level_camera
+from fluidlift.shape.kind import estimate_up, level_camera
 from fluidlift.shape.kinds import builder_of
 from fluidlift.shape.place import metric_scale
-from fluidlift.types import KINDS, CellType, FluidKind, FluidParameters, Grid, PinholeCamera, SurfaceMotion, kind_of
+from fluidlift.types import (
+    KINDS,
+    CellType,
+    FluidKind,
+    FluidParameters,
+    Grid,
+    PinholeCamera,
+    SurfaceMotion,
+    UpEvidence,
+    kind_of,
+)
 from fluidlift.types.kind import DAM, FALL, PLUME, POUR, STREAM
 from fluidlift.viewer.controls import controls_of
 
@@ -99,7 +109,7 @@ def test_a_name_gives_its_kind_and_an_unknown_one_the_names_that_there_are():
 def test_what_a_user_may_say_is_what_there_is():
     asked = get_type_hints(ShapeConfig)["kind"]
     assert get_args(asked) == ("auto", *KINDS)
-    assert get_args(get_args(get_type_hints(Make)["kind"])[0]) == ("auto", *KINDS)
+    assert get_args(get_args(get_type_hints(Scene)["kind"])[0]) == ("auto", *KINDS)
 
 
 def test_kinds_differ_in_physics():

@@ -9,7 +9,9 @@ from fluidlift.errors import InputRejected
 from fluidlift.io.asset_folder import update_manifest
 from fluidlift.io.asset_lock import Holder
 from fluidlift.io.stage_cache import mark_owner, save_stage
-from fluidlift.pipeline.simulating import simulated_poses
+from fluidlift.io.stage_codec import packed
+from fluidlift.pipeline.recall import simulated_poses
+from fluidlift.types.stages import Simulation
 from fluidlift.viewer import saved
 from fluidlift.viewer.footage import InputPictures, input_pictures
 from fluidlift.viewer.saved import SavedFrames
@@ -69,7 +71,8 @@ def test_the_picture_is_that_of_the_simulated_time():
 def test_poses_of_obstacles_are_those_of_the_last_simulation_and_of_so_many_bodies_and_frames(tank_folder):
     poses = np.arange(3 * 2 * 7, dtype=float).reshape(3, 2, 7)
     assert simulated_poses(tank_folder) is None
-    save_stage(tank_folder, "simulate", "0" * 16, {"poses": poses}, {})
+    arrays, data = packed(Simulation(np.ones(len(poses)), np.zeros(len(poses)), np.ones(len(poses), int), poses))
+    save_stage(tank_folder, "simulate", "0" * 16, arrays, {"seconds": 1.0, "value": data})
     mark_owner(tank_folder, "simulate", "0" * 16)
     np.testing.assert_array_equal(simulated_poses(tank_folder, 2, 3), poses)
     assert simulated_poses(tank_folder, 1) is None  # of another scene

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from fluidlift.errors import InputRejected, require
-from fluidlift.types import Gaussians, PinholeCamera, Similarity3
+from fluidlift.types import Gaussians, PinholeCamera, Similarity3, UpEvidence
 
 Z_UP_FROM_Y_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 """x right, y up, z towards the viewer (OpenGL) to x right, y away from the viewer, z up"""
@@ -130,7 +130,7 @@ def tilted(
     For generators whose z is only the picture's up (`knows_up` is False): they take every camera for a level one. The
     picture stays as it is; the camera comes to the origin, with y away from the viewer.
     """
-    from fluidlift.shape.kind import UpEvidence, level_camera  # which the environment of a generator may not hold
+    from fluidlift.shape.kind import level_camera  # which the environment of a generator may not hold
 
     target = level_camera(camera, UpEvidence(pitch, roll, "generator", 1.0))
     turn = target.camera_from_world.rotation.T @ camera.camera_from_world.rotation

@@ -20,6 +20,7 @@ from fluidlift.cli.batch import Batch
 from fluidlift.cli.edit import Edit
 from fluidlift.cli.optional import REGISTRY
 from fluidlift.cli.options import (
+    MOVED,
     Demo,
     Doctor,
     Evaluate,
@@ -76,6 +77,8 @@ def _run(args: list[str]) -> int:
     if args in (["--version"], ["-V"]):
         print(f"fluidlift {__version__}")
         return DONE
+    if args[:1] == ["make"]:
+        args = _as_settings(args)
     with REGISTRY:
         command = tyro.cli(
             Command,  # type: ignore[arg-type]
@@ -103,17 +106,17 @@ def _run(args: list[str]) -> int:
 def _make(c: Make) -> int:
     from fluidlift.config import build_config
 
+    s, p, q, b = c.scene, c.part, c.quality, c.body
     flat = {
-        "seed": c.seed, "shape.kind": c.kind, "shape.size": c.size, "shape.fov": c.fov, "shape.pitch": c.pitch,
-        "shape.roll": c.roll, "read.start": c.start, "read.duration": c.duration, "read.fps": c.fps,
-        "read.max_size": c.max_size, "read.max_pixels": c.max_pixels, "read.max_frames": c.max_frames,
-        "depth.model": c.depth_model, "depth.weights": text_of(c.depth_weights),
-        "generate.name": c.generator, "generate.use": c.use,
-        "generate.python": text_of(c.generator_python), "generate.code": text_of(c.generator_code),
-        "generate.accept_licence": c.accept_licence or None,
+        "seed": q.seed, "shape.kind": s.kind, "shape.size": s.size, "shape.fov": s.fov, "shape.pitch": s.pitch,
+        "shape.roll": s.roll, "read.start": p.start, "read.duration": p.duration, "read.fps": p.fps,
+        "read.max_size": q.max_size, "depth.model": b.depth_model, "depth.weights": text_of(b.depth_weights),
+        "generate.name": b.generator, "generate.python": text_of(b.generator_python),
+        "generate.code": text_of(b.generator_code), "generate.accept_licence": b.accept_licence or None,
+        "generate.use": b.use,
     }  # fmt: skip
-    config = build_config(c.preset, c.config, c.set, flat)
-    if c.print_config:
+    config = build_config(q.preset, c.settings.config, c.settings.set, flat)
+    if c.settings.print_config:
         import yaml
 
         print(yaml.safe_dump(config.to_dict(), sort_keys=False), end="")
@@ -123,9 +126,23 @@ def _make(c: Make) -> int:
 
         config = accepted_by_asking(config)
     return _run_job(
-        c.clip, c.out or default_folder(c.clip), config, mask=c.mask, camera=c.camera, depth=c.depth,
-        geometry=c.geometry_from, flow=c.flow, force=c.force, as_json=c.json,
+        c.clip, c.out or default_folder(c.clip), config, mask=c.input.mask, camera=c.input.camera, depth=c.input.depth,
+        geometry=b.geometry_from, flow=c.input.flow, force=c.settings.force, as_json=c.json,
     )  # fmt: skip
+
+
+def _as_settings(args: list[str]) -> list[str]:
+    """The arguments of `make`, with options that became settings (`MOVED`) as `--set`."""
+    found, rest = [], iter(args)
+    for arg in rest:
+        name, sign, value = arg.partition("=")
+        setting = MOVED.get(name.removeprefix("--").replace("-", "_")) if name.startswith("--") else None
+        if setting is None:
+            found.append(arg)
+            continue
+        value = value if sign else next(rest, None)
+        found += ["--set", f"{setting}={value}"] if value is not None else [arg]
+    return found
 
 
 def text_of(path: Path | None) -> str | None:
@@ -280,7 +297,8 @@ def _mask(c: Mask) -> int:
     from fluidlift.config import build_config
     from fluidlift.pipeline import Hints, Inputs, find_masks
 
-    flat = {"read.start": c.start, "read.duration": c.duration, "read.fps": c.fps, "read.max_size": c.max_size}
+    p = c.part
+    flat = {"read.start": p.start, "read.duration": p.duration, "read.fps": p.fps, "read.max_size": c.max_size}
     _require_sections(c.set, ("read", "segment", "motion"))
     config = build_config(None, None, c.set, flat, base=LONGEST)
     hints = Hints.of(c.roi, c.click, c.not_here)
@@ -295,13 +313,14 @@ def _motion(c: Motion) -> int:
     from fluidlift.config import build_config
     from fluidlift.pipeline import Inputs, MotionFiles, measure_motion
 
+    s, p = c.scene, c.part
     flat = {
-        "shape.kind": c.kind, "shape.size": c.size, "shape.fov": c.fov, "shape.pitch": c.pitch, "shape.roll": c.roll,
-        "read.start": c.start, "read.duration": c.duration, "read.fps": c.fps, "read.max_size": c.max_size,
+        "shape.kind": s.kind, "shape.size": s.size, "shape.fov": s.fov, "shape.pitch": s.pitch, "shape.roll": s.roll,
+        "read.start": p.start, "read.duration": p.duration, "read.fps": p.fps, "read.max_size": c.max_size,
     }  # fmt: skip
     _require_sections(c.set, ("read", "segment", "shape", "depth", "motion"))
     config = build_config(None, c.config, c.set, flat, base=LONGEST)
-    inputs = Inputs(c.clip, mask=c.mask, camera=c.camera, depth=c.depth, flow=c.flow)
+    inputs = Inputs(c.clip, mask=c.input.mask, camera=c.input.camera, depth=c.input.depth, flow=c.input.flow)
     with shown_progress() as progress:
         found = measure_motion(
             inputs, c.out, config, files=MotionFiles(c.format, c.raw), force=c.force, progress=progress

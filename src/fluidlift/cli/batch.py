@@ -19,7 +19,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from fluidlift.cli.options import Make
+from fluidlift.cli.options import MOVED, Make, options_of
 from fluidlift.errors import InputRejected
 
 VIDEOS = frozenset({".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".mxf", ".gif"})
@@ -175,7 +175,7 @@ def _row(row: Any, where: str, folder: Path) -> dict[str, Any]:
     row = {"clip": row} if isinstance(row, str) else row
     if not isinstance(row, dict) or not isinstance(row.get("clip"), str):
         raise InputRejected(f"{where} names no clip", "clip: and the name of a file")
-    kinds = {f.name: str(f.type) for f in dataclasses.fields(Make)}
+    kinds = options_of(Make) | dict.fromkeys(MOVED, "")
     known = ["clip", "name", *(k for k in kinds if k not in _OURS)]
     found: dict[str, Any] = {}
     for key, value in row.items():

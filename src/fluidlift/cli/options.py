@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -15,29 +15,55 @@ Asset = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="ASSET")]
 
 
 @dataclass(frozen=True)
-class Make:
-    """Turn a clip into a fluid asset."""
+class Scene:
+    """What the clip does not say by itself."""
 
-    clip: Clip
-    """a video, a folder of pictures or a pattern such as frames/%04d.png"""
-    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
-    """asset folder to write; by default the clip's name with .fluid, in the current folder"""
-    preset: Literal["draft", "standard", "hero"] | None = None
-    """draft (the default): minutes on a laptop; standard: finer; hero: as fine as the machine allows"""
     kind: KindChoice | None = None
     """what the fluid does; auto decides from evidence that the report shows"""
+    size: float | None = None
+    """metres across the fluid (its longest side); sets the scale"""
+    fov: float | None = None
+    """field of view across the longer side, degrees; else the file's lens metadata, else 50"""
+    pitch: float | None = None
+    """degrees that the camera looks below the horizon"""
+    roll: float | None = None
+    """degrees that the picture is turned clockwise"""
+
+
+@dataclass(frozen=True)
+class Part:
+    """Which part of the clip."""
+
+    start: float | None = None
+    """seconds into the clip"""
+    duration: float | None = None
+    """seconds to use"""
+    fps: float | None = None
+    """frames per second of an image sequence"""
+
+
+@dataclass(frozen=True)
+class Input:
+    """Files beside the clip."""
+
     mask: Path | None = None
     """where the fluid is: one picture, a folder of pictures or a video; white is fluid"""
     camera: Path | None = None
     """camera JSON: width, height, K, and R, t where the pose is known"""
     depth: Path | None = None
     """depth map of the first used frame, or of all (EXR, 16-bit PNG, npz): replaces the estimated front depth"""
+    flow: Path | None = None
+    """optical flow of the clip, made elsewhere: a folder or pattern of .flo, .exr, .npz or KITTI .png, or one .npz"""
+
+
+@dataclass(frozen=True)
+class Body:
+    """Learned depth, or a body that something else made."""
+
     depth_model: Literal["none", "moge", "depth-anything", "depth-anything-3", "depth-pro"] | None = None
     """learned depth, moge advised; it needs --depth-weights (docs/depth.md)"""
     depth_weights: Path | None = None
     """file or folder of the weights of --depth-model"""
-    flow: Path | None = None
-    """optical flow of the clip, made elsewhere: a folder or pattern of .flo, .exr, .npz or KITTI .png, or one .npz"""
     geometry_from: Path | None = None
     """folder of Gaussian PLY files and camera.json: replaces the embedded generator"""
     generator: str | None = None
@@ -50,28 +76,24 @@ class Make:
     """name of a generator whose licence you have read and accept; remembered; may be repeated"""
     use: Literal["research", "commercial"] | None = None
     """what the asset is for; a generator whose terms forbid that is refused"""
-    size: float | None = None
-    """metres across the fluid (its longest side); sets the scale"""
-    fov: float | None = None
-    """field of view across the longer side, degrees; else the file's lens metadata, else 50"""
-    pitch: float | None = None
-    """degrees that the camera looks below the horizon"""
-    roll: float | None = None
-    """degrees that the picture is turned clockwise"""
-    start: float | None = None
-    """seconds into the clip"""
-    duration: float | None = None
-    """seconds to use"""
-    fps: float | None = None
-    """frames per second of an image sequence"""
+
+
+@dataclass(frozen=True)
+class Quality:
+    """How fine, and how repeatable."""
+
+    preset: Literal["draft", "standard", "hero"] | None = None
+    """draft (the default): minutes on a laptop; standard: finer; hero: as fine as the machine allows"""
     max_size: int | None = None
     """longer side of the working pictures, px"""
-    max_pixels: int | None = None
-    """largest source picture accepted, px"""
-    max_frames: int | None = None
-    """most frames accepted"""
     seed: int | None = None
     """same clip, settings and seed: same asset"""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Everything that has no option of its own."""
+
     config: Path | None = None
     """YAML file with settings"""
     set: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default_factory=tuple)
@@ -80,8 +102,34 @@ class Make:
     """run this stage and all after it again; may be repeated"""
     print_config: bool = False
     """show the settings and stop"""
+
+
+MOVED = {"max_pixels": "read.max_pixels", "max_frames": "read.max_frames"}
+"""options of `make` that are settings now; they are understood as before and stand no longer in its help"""
+
+
+@dataclass(frozen=True)
+class Make:
+    """Turn a clip into a fluid asset."""
+
+    clip: Clip
+    """a video, a folder of pictures or a pattern such as frames/%04d.png"""
+    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """asset folder to write; by default the clip's name with .fluid, in the current folder"""
     json: bool = False
     """print the outcome as JSON"""
+    input: tyro.conf.OmitArgPrefixes[Input] = field(default_factory=Input)
+    """files beside the clip; what is not given is estimated"""
+    scene: tyro.conf.OmitArgPrefixes[Scene] = field(default_factory=Scene)
+    """what you know of the fluid and of the camera"""
+    part: tyro.conf.OmitArgPrefixes[Part] = field(default_factory=Part)
+    """which part of the clip"""
+    quality: tyro.conf.OmitArgPrefixes[Quality] = field(default_factory=Quality)
+    """how fine"""
+    body: tyro.conf.OmitArgPrefixes[Body] = field(default_factory=Body)
+    """learned depth, or a body that something else made"""
+    settings: tyro.conf.OmitArgPrefixes[Settings] = field(default_factory=Settings)
+    """all else: --print-config lists every setting, such as read.max_pixels (docs/cli.md)"""
 
 
 @dataclass(frozen=True)
@@ -220,12 +268,6 @@ class Mask:
     """x,y in px of the overlay: there is fluid here; may be repeated"""
     not_here: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default_factory=tuple)
     """x,y in px of the overlay: there is none here; may be repeated"""
-    start: float | None = None
-    """seconds into the clip"""
-    duration: float | None = None
-    """seconds to use"""
-    fps: float | None = None
-    """frames per second of an image sequence"""
     max_size: int | None = None
     """longer side of the working pictures, px (512)"""
     set: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default_factory=tuple)
@@ -234,6 +276,8 @@ class Mask:
     """run this stage (read, flow, segment, masks) and all after it again; may be repeated"""
     json: bool = False
     """print the outcome as JSON"""
+    part: tyro.conf.OmitArgPrefixes[Part] = field(default_factory=Part)
+    """which part of the clip"""
 
 
 @dataclass(frozen=True)
@@ -244,34 +288,10 @@ class Motion:
     """a video, a folder of pictures or a pattern"""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """folder for mask/, flow/, velocity/ and more (numbers from 1001), camera.json and motion.json"""
-    mask: Path | None = None
-    """where the fluid is: one picture, a folder of pictures or a video; white is fluid"""
-    camera: Path | None = None
-    """camera JSON: width, height, K, and R, t where the pose is known"""
-    depth: Path | None = None
-    """depth map of the first used frame (EXR, 16-bit PNG, npz): replaces the estimated front depth"""
-    flow: Path | None = None
-    """optical flow of the clip, made elsewhere: a folder or pattern of .flo, .exr, .npz or KITTI .png, or one .npz"""
     format: Literal["flo", "exr", "npz"] = "exr"
     """of the flow files; .flo has no place for confidence"""
     raw: bool = False
     """write the flow of single pairs as well, before averaging and completion"""
-    kind: KindChoice | None = None
-    """what the fluid does; auto decides from evidence"""
-    size: float | None = None
-    """metres across the fluid (its longest side); sets the scale"""
-    fov: float | None = None
-    """field of view across the longer side, degrees; else the file's lens metadata, else 50"""
-    pitch: float | None = None
-    """degrees that the camera looks below the horizon"""
-    roll: float | None = None
-    """degrees that the picture is turned clockwise"""
-    start: float | None = None
-    """seconds into the clip"""
-    duration: float | None = None
-    """seconds to use"""
-    fps: float | None = None
-    """frames per second of an image sequence"""
     max_size: int | None = None
     """longer side of the working pictures, px (512)"""
     config: Path | None = None
@@ -282,6 +302,12 @@ class Motion:
     """run this stage (read, flow, segment, geometry, velocities) and all after it again; may be repeated"""
     json: bool = False
     """print the outcome as JSON"""
+    input: tyro.conf.OmitArgPrefixes[Input] = field(default_factory=Input)
+    """files beside the clip; what is not given is estimated"""
+    scene: tyro.conf.OmitArgPrefixes[Scene] = field(default_factory=Scene)
+    """what you know of the fluid and of the camera"""
+    part: tyro.conf.OmitArgPrefixes[Part] = field(default_factory=Part)
+    """which part of the clip"""
 
 
 @dataclass(frozen=True)
@@ -340,3 +366,12 @@ class Doctor:
     """print as JSON"""
     compile: bool = False
     """compile everything now (a minute or so), so that the first job of an installation is as fast as the next"""
+
+
+def options_of(command: type) -> dict[str, str]:
+    """The options of a command by name, those of its groups among them, with their types as they are written."""
+    found: dict[str, str] = {}
+    for f in fields(command):
+        group = f.default_factory if is_dataclass(f.default_factory) else None
+        found |= {f.name: str(f.type)} if group is None else options_of(group)
+    return found

@@ -126,7 +126,7 @@ class Collector:
             raise InputRejected(
                 f"'{self.name}' has more than {self.limits.max_frames} frames",
                 f"at most {self.limits.max_frames} frames",
-                f"{advice}, or raise the limit with --max-frames",
+                f"{advice}, or raise the limit with --set read.max_frames=NUMBER",
             )
         if self.in_memory and n * size[0] * size[1] * 4 > self.limits.max_bytes:
             raise InputRejected(

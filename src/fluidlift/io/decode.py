@@ -67,7 +67,7 @@ def open_video(path: Path | str, limits: ReadLimits) -> Iterator[tuple[av.contai
             raise InputRejected(
                 f"the frames of '{path.name}' are {width} x {height} = {width * height} pixels",
                 f"at most {limits.max_pixels} pixels",
-                "scale the video down, or raise the limit with --max-pixels",
+                "scale the video down, or raise the limit with --set read.max_pixels=NUMBER",
             )
         yield container, stream
 

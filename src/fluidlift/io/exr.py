@@ -38,7 +38,7 @@ def read_channels(path: Path | str, *, limits: ReadLimits | None = None) -> dict
             raise InputRejected(
                 f"'{path.name}' is {width} x {height} pixels",
                 f"1 to {limits.max_pixels} pixels",
-                "scale it down, or raise the limit with --max-pixels",
+                "scale it down, or raise the limit with --set read.max_pixels=NUMBER",
             )
         out = {name: np.zeros((height, width), np.float32) for name, _ in channels}
         blocks = -(-height // _LINES[compression])

@@ -64,7 +64,7 @@ def _require_pixels(path: Path, size: tuple[int, int], limits: ReadLimits) -> No
         raise InputRejected(
             f"'{path.name}' is {size[0]} x {size[1]} pixels",
             f"at most {limits.max_pixels} pixels",
-            "scale it down, or raise the limit with --max-pixels",
+            "scale it down, or raise the limit with --set read.max_pixels=NUMBER",
         )
 
 

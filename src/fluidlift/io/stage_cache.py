@@ -86,7 +86,7 @@ class GrowingArray:
 
 
 class Scratch:
-    """Arrays on disk of a stage that is at work, under temporary names; `save_stage` keeps those that are its result.
+    """Arrays on disk of a stage that is at work, under temporary names; `save_stage` keeps those in its result.
 
     Args:
         folder: of the asset.
@@ -123,22 +123,20 @@ class Scratch:
         return growing
 
     def keep(self, name: str, array: np.ndarray) -> np.ndarray:
-        """The array as one of this scratch under `name`: renamed where it lies here already, else copied."""
-        mapped = _whole_file(array)
-        for made, path in self._made.items():
-            if mapped is not None and mapped.samefile(path):
-                if made != name:
-                    del self._made[made]
-                    self._register(name, path)
-                return array
+        """The array where it lies here already, else a copy that does, under `name`."""
+        if self.file_of(array) is not None:
+            return array
         out = self.array(name, array.shape, array.dtype)
         for part in parts_of(array):
             out[part] = array[part]
         return out
 
-    def path_of(self, name: str) -> Path | None:
-        """Where an array lies; None for one that is not here."""
-        return self._made.get(name)
+    def file_of(self, array: np.ndarray) -> Path | None:
+        """The file here that an array is all of; None for one that lies elsewhere."""
+        mapped = _whole_file(array)
+        if mapped is None or not mapped.exists():  # one of an earlier stage has its last name now
+            return None
+        return next((path for path in self._made.values() if mapped.samefile(path)), None)
 
     def discard(self) -> None:
         """Remove what was not kept."""
@@ -211,7 +209,8 @@ def save_stage(
         require(np.asarray(array).dtype.kind in _KINDS, f"array '{name}' of {np.asarray(array).dtype}", "numbers")
     mark_work_folder(folder)
     facts.unlink(missing_ok=True)
-    mapped = {} if scratch is None else {n: p for n in arrays if (p := scratch.path_of(n)) is not None}
+    mapped = {} if scratch is None else {n: p for n, a in arrays.items() if (p := scratch.file_of(a)) is not None}
+    require(len(set(mapped.values())) == len(mapped), "one array under two names", "a copy")
     with atomic_write(data) as file:
         np.savez(file, **{f"{name}.": array for name, array in arrays.items() if name not in mapped})
     with disk_errors(folder):

@@ -1,4 +1,4 @@
-"""From linear light to what a display shows."""
+"""Tone mapping: from linear light to what a display shows."""
 
 from __future__ import annotations
 

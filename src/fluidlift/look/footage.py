@@ -1,4 +1,4 @@
-"""What a fluid looks like in each place over time, from a film of it: what stays there, and what comes and goes."""
+"""Video texture: what a fluid looks like in each place over time, from its film; what stays, what comes and goes."""
 
 from __future__ import annotations
 

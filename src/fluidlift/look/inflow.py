@@ -1,4 +1,4 @@
-"""What fluid that flows in looks like: the body downstream, mirrored, with all of its splats.
+"""Appearance of fluid that flows in: the body downstream, mirrored, with all of its splats.
 
 The clip does not show what comes in after it. The body is continued upstream by its own mirror image, which travels in
 with the inflow: without a seam at the inlet, and never of one colour for long. A place where a particle is due takes

@@ -1,4 +1,4 @@
-"""Gaussians to a picture, expected depth and coverage, on the CPU."""
+"""Gaussian splatting: Gaussians to a picture, expected depth and coverage (alpha compositing), on the CPU."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Splats under another light, after the formula of GaussianShader (Jiang et al. 2024, arXiv:2311.17977).
+"""Relighting of splats: image-based light, split sum; after GaussianShader (Jiang et al. 2024, arXiv:2311.17977).
 
     c = (1 - F) body irradiance(n) + F reflected(r, roughness) + glow
 

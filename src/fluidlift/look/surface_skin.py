@@ -1,4 +1,4 @@
-"""A skin of small splats over the free surface of a liquid.
+"""Surface appearance: a skin of small splats over the free surface of a liquid.
 
 Particles that a simulation moves are drawn apart in one place and crowded in another, sink and come up. The splats that
 they carry show the fluid at rest well and a moving surface poorly. The skin's splats are tracers: they float with the

@@ -1,4 +1,4 @@
-"""The fine look of a liquid's surface, carried by patches that move without being drawn out.
+"""Advected textures (Lagrangian patches): the fine look of a liquid's surface, on patches that are not drawn out.
 
 Foam, glitter and ripples are carried by the flow, and are made anew all the time. Carried alone they would be stirred
 into streaks after a second. So the look is that of overlapping patches (Lagrangian texture advection: Yu, Neyret,

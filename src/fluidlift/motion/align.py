@@ -1,4 +1,4 @@
-"""A picture laid on a reference, to a fraction of a pixel, by all pixels of the part that stands still.
+"""Subpixel image registration (robust Gauss-Newton) on a reference, by all pixels of the part that stands still.
 
 Features that are found again say roughly how a camera moved; in foam, foliage and compression each reading is off by
 up to a pixel, more than a hand's tremble. The robust alignment of whole pictures (Odobez, Bouthemy 1995) takes it from

@@ -1,4 +1,4 @@
-"""From samples of the surface to every cell of the fluid."""
+"""Extrapolation (harmonic or layered) from samples of the surface to every cell of the fluid."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the silhouette says: where a body of smoke grows, its edge moves with the fluid.
+"""Moving front of a silhouette: where a body of smoke grows, its edge moves with the fluid.
 
 Smoke has little texture and its stem looks the same from frame to frame, so optical flow reports a fraction of the
 rise. The kinematic condition at the edge does not depend on texture: the cap goes up as fast as the fluid below it.

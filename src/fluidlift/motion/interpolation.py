@@ -1,4 +1,4 @@
-"""Interpolation by diffusion inside a mask: the values of some pixels spread to the others, faster along a direction.
+"""Inpainting by anisotropic diffusion inside a mask: values of some pixels spread to others, faster along a direction.
 
 The equation is (W - div D grad) x = W values, with the weights W of the given values on the diagonal and a tensor D
 that conducts more along a unit vector n than across it. Its solution at a pixel is a mean of the given values: with the

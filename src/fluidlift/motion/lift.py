@@ -1,4 +1,4 @@
-"""From the screen to the world (paper: V_surf): the one place where px/frame becomes m/s."""
+"""Scene flow: optical flow unprojected by depth (paper: V_surf), the one place where px/frame becomes m/s."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Motion of the camera: how much it shakes, where the clip is cut, and a steady picture where the shake is mild.
+"""Camera motion by tracked features and RANSAC: shake, cuts, and video stabilisation where the shake is mild.
 
 Everything downstream takes the camera to stand still. The camera's motion is read from features that are found
 again, against one reference frame, over the whole picture: what flows away is not found again, so that even a fluid
@@ -227,7 +227,7 @@ def similarity_to(
 
 
 def calmest_similarity(source: np.ndarray, target: np.ndarray, cells: np.ndarray) -> np.ndarray | None:
-    """The similarity [2,3] of least motion among those that enough of the pairs [n,2] agree on, or None.
+    """RANSAC: the similarity [2,3] of least motion among those that enough of the pairs [n,2] agree on, or None.
 
     A river that slides by as one sheet is a similarity too, and may have more features than its banks: it moves
     farther from the reference than a camera on its place does.

@@ -1,4 +1,4 @@
-"""Divergence-free velocity: the projection that keeps what was seen, and the paper's own iteration.
+"""Weighted Helmholtz projection to a divergence-free velocity that keeps what was seen; the paper's own iteration.
 
 The weighted projection takes of all divergence-free fields the one with least
 

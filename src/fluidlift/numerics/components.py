@@ -1,4 +1,4 @@
-"""Closed components: groups of unknown cells that no open face joins with anything known, where p has a free constant.
+"""Null space of the pressure: connected components without a Dirichlet cell, where p has a free constant.
 
 Cells are gathered into runs: unknown cells above each other, joined by open faces. A run beside air is not closed, and
 nearly all are; only the others are joined with their neighbours (union-find), so that the search costs little more

@@ -1,4 +1,4 @@
-"""The Poisson equation on irregular cell domains: system, plain solvers, and the door to the fast one.
+"""The Poisson equation on irregular cell domains (Dirichlet and Neumann): system, plain solvers, the fast one.
 
 Discretisation: cell-centred p, -div(w grad p) = b with open face fractions w (Batty, Bertails, Bridson 2007);
 a closed face (w = 0) is a Neumann wall, a known neighbour behind an open face holds p = 0 (air). Where air begins

@@ -1,4 +1,4 @@
-"""Trilinear interpolation of grid fields at points. Outside the samples the nearest one is continued."""
+"""Trilinear interpolation of grid fields at points. Outside, the nearest sample is extrapolated."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Signed distances at grid nodes: making them, and keeping points outside the solid."""
+"""Signed distance fields (SDF) at grid nodes: making them, and keeping points outside the solid."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Triangles to pictures: which face each pixel sees, where on it and how far away; and how deep closed bodies are.
+"""Triangle rasterisation (z-buffer): the face that each pixel sees, where and how far; and how deep closed bodies are.
 
 Homogeneous rasterisation (Olano and Greer 1997): a pixel's ray r lies in the triangle a, b, c (camera axes) where
 (b x c) r, (c x a) r and (a x b) r have the sign of the determinant of a, b, c. Their shares are the perspective-correct

@@ -1,7 +1,8 @@
-"""The liquid: affine particle-in-cell with pressure projection (paper: "Presumed APIC Simulation").
+"""The liquid simulator: affine particle-in-cell (APIC) and pressure projection (paper: "Presumed APIC Simulation").
 
-One substep: fill the inlet; particles to grid; gravity; viscosity; pressure; continue the velocity into air and along
-walls; grid to particles; move; correct crowding; collide; deform; remove what has left. A substep either completes
+One substep, as long as the CFL number allows: fill the inlet; P2G; gravity; viscosity; pressure projection;
+extrapolate the velocity into air and along walls; G2P; advect (RK2); correct positions; collide; deform; remove what
+has left. A substep either completes
 or leaves the state as it was.
 """
 
@@ -14,12 +15,14 @@ import numpy as np
 
 from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.physics import transfer
-from fluidlift.physics.crowding import fill_ratio, spreading
+from fluidlift.physics.active_region import ActiveRegion
+from fluidlift.physics.advect_particles import displacements, leaving
 from fluidlift.physics.emitter import Supply
 from fluidlift.physics.guidance import BodyForce
 from fluidlift.physics.liquid_grid import Layout, LiquidGrid
 from fluidlift.physics.numba_particles import ParticleWork
 from fluidlift.physics.outlet import surplus
+from fluidlift.physics.position_correction import fill_ratio, spreading
 from fluidlift.physics.pressure import build_system
 from fluidlift.physics.reseed import inner_cells, reseed
 from fluidlift.physics.rigid import RigidBodies, RigidBody
@@ -30,8 +33,6 @@ from fluidlift.physics.stepping import (
     SimulationSettings,
     StepReport,
 )
-from fluidlift.physics.travel import displacements, leaving
-from fluidlift.physics.window import Window
 from fluidlift.seams import MoveRules
 from fluidlift.types import CellType, FaceVelocity, FluidParameters, Grid, Particles, SolveReport, Terrain
 
@@ -160,15 +161,15 @@ class LiquidSimulator(LiquidGrid):
                 bodies.predict(dt)
                 bodies.advance()
             return Outcome(self._particles, 0, SolveReport(True, 0, 0.0, "empty"), (), lambda: None)
-        window = self._look(self._particles.positions)
+        region = self._look(self._particles.positions)
         if bodies is not None:
-            window = bodies.enter(window)
-        grid = window.grid
+            region = bodies.enter(region)
+        grid = region.grid
         order = transfer.sort_by_cell(self._particles.positions, grid)
         if number % TIDY_EVERY == 0:
-            order = self._tidied(order, window)
+            order = self._tidied(order, region)
         particles = self._particles
-        step = self._grid_velocity(window, order, dt)
+        step = self._grid_velocity(region, order, dt)
         velocities, affine = self._work.transfer.grid_to_particles(step.velocity, grid, particles.positions, order)
         self._carry_inlet(velocities, affine)
         moves, farthest = displacements(velocities, affine, dt)
@@ -186,17 +187,17 @@ class LiquidSimulator(LiquidGrid):
             )
         if self.settings.spread_crowds:
             volumes = (particles.masses / self.parameters.density).astype(np.float32)
-            ratio = fill_ratio(particles.positions, volumes, grid, order, window.capacity)
+            ratio = fill_ratio(particles.positions, volumes, grid, order, region.capacity)
             # the skin of the liquid counts here, and p = 0 lies outside all cells that hold particles
-            held = build_system(step.holding, window.walls.openings, grid, open_border=True)
-            spread = spreading(particles.positions, ratio, window.capacity, held, grid, order)
+            held = build_system(step.holding, region.walls.openings, grid, open_border=True)
+            spread = spreading(particles.positions, ratio, region.capacity, held, grid, order)
             moves = moves if spread is None else moves + spread
         keep = (1.0 - self.parameters.wall_damping) ** (dt / self.parameters.time_step)
         rules = MoveRules(dt, self.parameters.restitution, keep, self.settings.max_stretch)
         state = self._work.mover.moved(particles, moves, velocities, affine, walls, rules)
         gone = leaving(particles.positions, state.positions, walls, self._mainstream)
         full = self.parameters.density * grid.spacing**3
-        gone |= surplus(particles.masses, order, window.walls.regions == CellType.OUTFLOW, full)
+        gone |= surplus(particles.masses, order, region.walls.regions == CellType.OUTFLOW, full)
         if bodies is not None:
             bodies.advance()
             gone |= bodies.push_out(state.positions, state.velocities, tangential_share=keep)
@@ -220,12 +221,12 @@ class LiquidSimulator(LiquidGrid):
         """Particles in the inlet move as prescribed, in place: walls beside it would hold back its rim."""
         self._inlet.carry(self._particles.positions, velocities, affine, self.time)
 
-    def _layout(self, window: Window, order: transfer.CellOrder) -> Layout:
+    def _layout(self, region: ActiveRegion, order: transfer.CellOrder) -> Layout:
         """With the cells of emitters as inflow."""
-        layout = super()._layout(window, order)
+        layout = super()._layout(region, order)
         if not self._inlet.running:
             return layout
-        cells = self._inlet.emitter_cells(window.grid.shape, window.first)
+        cells = self._inlet.emitter_cells(region.grid.shape, region.first)
         inflow = np.uint8(CellType.INFLOW)
         return replace(
             layout,
@@ -234,11 +235,11 @@ class LiquidSimulator(LiquidGrid):
             wet=layout.wet | cells,
         )
 
-    def _tidied(self, order: transfer.CellOrder, window: Window) -> transfer.CellOrder:
+    def _tidied(self, order: transfer.CellOrder, region: ActiveRegion) -> transfer.CellOrder:
         """Reseed, and put the particles in the order of their cells, so that neighbours are close in memory."""
         particles = self._particles
         if self.settings.reseed:
-            inner = inner_cells((np.diff(order.start) > 0).reshape(window.grid.shape), window.walls.solid)
+            inner = inner_cells((np.diff(order.start) > 0).reshape(region.grid.shape), region.walls.solid)
             done = reseed(
                 particles, order, inner, self._walls, density=self.parameters.density, first_id=self._next_id,
                 rng=self._rng,
@@ -246,6 +247,6 @@ class LiquidSimulator(LiquidGrid):
             particles = done.particles
             self._next_id += done.split
             if done.split or done.merged:
-                order = transfer.sort_by_cell(particles.positions, window.grid)
+                order = transfer.sort_by_cell(particles.positions, region.grid)
         self._particles = transfer.select_particles(particles, order.order)
         return transfer.CellOrder(np.arange(len(particles)), order.start)

@@ -1,4 +1,4 @@
-"""Walls and free surfaces: open faces, liquid cells, velocity beyond the liquid, collisions of particles.
+"""Boundary conditions: walls (cut cells; free slip to no-slip), liquid cells, extrapolation, particle collisions.
 
 Wall model (paper: b, d). The grid lets no fluid through a wall. `wall_damping` takes its share of the tangential
 velocity of particles within one cell of the wall once per nominal time step; the share fades linearly with distance.
@@ -210,7 +210,7 @@ def _grow(field, layer, number, first, last, new_first, new_last):
 def extrapolate(
     velocity: FaceVelocity, valid: tuple[np.ndarray, np.ndarray, np.ndarray], layers: int = 3
 ) -> FaceVelocity:
-    """Continue the velocity beyond the faces where it is known (bool per face), layer by layer; 0 farther away."""
+    """Extrapolate the velocity beyond the faces where it is known (bool per face), layer by layer; 0 farther away."""
     out = []
     for component, known in zip(velocity.components, valid):
         field = np.where(known, component, np.float32(0)).astype(np.float32, copy=False)
@@ -262,7 +262,7 @@ def _slide(u, v, w, opening, normals, axis, out):
 
 
 def slide_along_walls(velocity: FaceVelocity, walls: Walls) -> FaceVelocity:
-    """The velocity continued into the solid, made tangential to its surface (free slip)."""
+    """Free-slip wall: the velocity extrapolated into the solid, made tangential to its surface."""
     out = []
     for axis, component in enumerate(velocity.components):
         new = component.copy()

@@ -1,4 +1,4 @@
-"""Where surfaces of rigid bodies are near something they may not enter.
+"""Collision detection: where surfaces of rigid bodies are near something they may not enter.
 
 Points on the surface of a body meet the signed distance of terrain, box sides and other bodies. Where the surface is
 smooth the point moves along the largest ball that touches it from inside.

@@ -1,4 +1,4 @@
-"""A longer channel: the terrain goes on downstream of the outlet as it is there.
+"""Extrapolation of the channel: the terrain goes on downstream of the outlet as it is there.
 
 The box grows along the horizontal axis of the grid that is nearest to the mainstream. The last cross-section of the
 bed is continued, lowered by the slope of the bed before the outlet, as a prismatic channel in uniform flow (bed, water

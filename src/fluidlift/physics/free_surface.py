@@ -1,4 +1,4 @@
-"""Where the surface of a liquid lies, from its particles, to a few hundredths of a cell.
+"""Reconstruction of the free surface (a level set) from particles, to a few hundredths of a cell.
 
 The volumes of the particles, shared among cells by quadratic splines and smoothed by a binomial filter, are the fill F
 around each cell centre: the liquid's shape blurred with variance s^2 = 3/4 h^2. At the distance d from a flat surface

@@ -1,4 +1,4 @@
-"""The gas: smoke carried by air that fills the whole box.
+"""The gas simulator: smoke in air on a MAC grid, with MacCormack advection; tracers move by RK2.
 
 The air is incompressible and solved on the grid: advection (MacCormack after Selle et al. 2008, limited to the values
 it interpolates), buoyancy where there is smoke, viscosity, pressure. The sides of the box are open (p = 0) except the
@@ -15,13 +15,13 @@ from numba import njit, prange
 from fluidlift.errors import FluidliftError, InputRejected, require
 from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.physics import boundaries, transfer
-from fluidlift.physics.crowding import fill_ratio
+from fluidlift.physics.advect_particles import leaving
 from fluidlift.physics.deform import updated_deformation
 from fluidlift.physics.emitter import Supply
 from fluidlift.physics.forces import add_buoyancy
+from fluidlift.physics.position_correction import fill_ratio
 from fluidlift.physics.pressure import build_system, project
 from fluidlift.physics.stepping import EmitSource, Outcome, ParticleSimulator, SimulationSettings
-from fluidlift.physics.travel import leaving
 from fluidlift.types import CellType, FaceVelocity, FluidParameters, Grid, Particles, SolveReport, Terrain
 
 
@@ -74,8 +74,8 @@ def _trace_back(q, u, v, w, axis, cells, out, low, high):
 
 
 def advect_maccormack(velocity: FaceVelocity, grid: Grid, dt: float) -> FaceVelocity:
-    """The velocity carried along itself for dt (s): back-trace, estimate of its error by tracing forth, correction,
-    limited to the range of the values that the back-trace interpolates."""
+    """MacCormack advection of the velocity by itself for dt (s): back-trace, estimate of its error by tracing
+    forth, correction, limited to the range of the values that the back-trace interpolates."""
     u, v, w = (np.ascontiguousarray(c, np.float32) for c in velocity.components)
     cells = dt / grid.spacing
     out = []
@@ -201,7 +201,7 @@ class GasSimulator(ParticleSimulator):
                 *((c * (1.0 - taken * s)).astype(np.float32) for c, s in zip(velocity.components, self._wall_share))
             )
         velocity = self._inlet.impose(velocity, self.time)
-        velocity, viscosity_reports = self._viscous(velocity, self._open_faces, self._window, dt)
+        velocity, viscosity_reports = self._viscous(velocity, self._open_faces, self._region, dt)
         initial = None if self._head_rate is None else self._head_rate * dt
         velocity, q, report = project(
             velocity, self._system, tolerance=self.settings.pressure_tolerance, initial=initial

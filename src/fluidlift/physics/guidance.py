@@ -1,4 +1,4 @@
-"""Body forces that depend on the place: a pull towards a known flow, and the steady one that keeps it.
+"""Nudging and other body forces that depend on place: a pull towards a known flow, and a steady one that keeps it.
 
 Nudging (Newtonian relaxation, Hoke and Anthes 1976) adds dv/dt = (v_target - v) / tau. Its time mean is what the
 model lacks to keep the target by itself (flux adjustment): applied alone, it is a force like gravity, and waves, wakes
@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fluidlift.errors import require
-from fluidlift.physics.window import Box, face_box
+from fluidlift.physics.active_region import Box, face_box
 from fluidlift.types import FaceVelocity
 
 Masses = tuple[Float[np.ndarray, "..."], ...]

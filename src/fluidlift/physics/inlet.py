@@ -1,4 +1,4 @@
-"""The inlet: prescribed velocity in INFLOW cells (paper: v_in, v~_in) and gap-free emission of particles."""
+"""The inlet: Dirichlet velocity in INFLOW cells (paper: v_in, v~_in) and gap-free emission of particles."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How much liquid the control volumes of the MAC grid hold, from the liquid's signed distance at cell centres.
+"""Volume fractions of liquid in the control volumes of the MAC grid, from its signed distance at cell centres.
 
 Every cell is cut into eight octants. The share of liquid in an octant follows from the trilinear distance, taken as
 linear inside the octant (the exact cut of a cube by a plane, Scardovelli and Zaleski 2000). The volumes around cell

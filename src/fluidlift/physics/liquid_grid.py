@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from fluidlift.physics import boundaries, transfer
+from fluidlift.physics.active_region import ActiveRegion, moved_to, open_region, region_around
 from fluidlift.physics.boundaries import Walls
 from fluidlift.physics.face_clearance import face_clearance
 from fluidlift.physics.forces import add_gravity
@@ -30,7 +31,6 @@ from fluidlift.physics.pressure import PressureSystem, build_system, project, su
 from fluidlift.physics.rigid import RigidBodies, RigidBody
 from fluidlift.physics.stepping import ParticleSimulator
 from fluidlift.physics.surface_tension import capillary_time_step, surface_tension_jumps
-from fluidlift.physics.window import Window, moved_to, open_window, window_around
 from fluidlift.types import CellType, FaceVelocity, SolveReport
 
 STRONG = 0.05
@@ -47,7 +47,7 @@ class GridStep:
     holding: np.ndarray
     """see `Layout`"""
     head_rate: tuple[tuple[int, int, int], np.ndarray]
-    """first cell of the window, and q / dt (m^2/s^2)"""
+    """first cell of the region, and q / dt (m^2/s^2)"""
     report: SolveReport
     viscosity: tuple[SolveReport, ...]
 
@@ -80,9 +80,9 @@ class LiquidGrid(ParticleSimulator):
             self._bodies = RigidBodies(bodies, self._walls, density=self.parameters.density, gravity=gravity)
             self._particles = self._particles.select(~self._bodies.inside(self._particles.positions))
         self._solids = solid_shares(self._walls.signed_distance, self.grid)
-        self._window_solids = self._solids.inside(self._window.box)
+        self._region_solids = self._solids.inside(self._region.box)
         self._head_rate: tuple[tuple[int, int, int], np.ndarray] | None = None
-        """first cell of the window of the last substep, and there q / dt: the first guess of the pressure"""
+        """first cell of the region of the last substep, and there q / dt: the first guess of the pressure"""
         self._start_levels = self._levels_now() if (self._walls.regions == CellType.OUTFLOW).any() else None
 
     def _levels_now(self) -> np.ndarray:
@@ -105,13 +105,13 @@ class LiquidGrid(ParticleSimulator):
         step = super()._substep_length(remaining)
         return step if step <= longest else remaining / np.ceil(remaining / longest - 1e-9)
 
-    def _look(self, positions: np.ndarray) -> Window:
-        """The window around the particles and the inlet."""
-        box = window_around(positions, self.grid, self._inlet.cell_range if self._inlet.active else None)
-        if box != self._window.box:
-            self._window = open_window(box, self._walls, self._capacity)
-            self._window_solids = self._solids.inside(box)
-        return self._window
+    def _look(self, positions: np.ndarray) -> ActiveRegion:
+        """The region around the particles and the inlet."""
+        box = region_around(positions, self.grid, self._inlet.cell_range if self._inlet.active else None)
+        if box != self._region.box:
+            self._region = open_region(box, self._walls, self._capacity)
+            self._region_solids = self._solids.inside(box)
+        return self._region
 
     def _outlet_faces(self, walls: Walls) -> tuple[np.ndarray, ...] | None:
         """bool per component: faces of OUTFLOW cells, where their velocity is prescribed."""
@@ -120,31 +120,33 @@ class LiquidGrid(ParticleSimulator):
         outflow = walls.regions == CellType.OUTFLOW
         return tuple(t & (o > 0) for t, o in zip(boundaries.touching_faces(outflow), walls.openings))
 
-    def _impose(self, velocity: FaceVelocity, window: Window, outlet: tuple[np.ndarray, ...] | None) -> FaceVelocity:
+    def _impose(
+        self, velocity: FaceVelocity, region: ActiveRegion, outlet: tuple[np.ndarray, ...] | None
+    ) -> FaceVelocity:
         """Inflow, and outflow where it is prescribed."""
-        velocity = self._inlet.impose(velocity, self.time, window.first)
+        velocity = self._inlet.impose(velocity, self.time, region.first)
         if outlet is None:
             return velocity
         speed = self.parameters.outflow_velocity * self._mainstream
         return FaceVelocity(*(np.where(f, np.float32(s), c) for f, s, c in zip(outlet, speed, velocity.components)))
 
-    def _known(self, layout: Layout, window: Window, dt: float) -> np.ndarray | None:
-        """q (m^2/s) of the columns of liquid that stand in the outlet, in cells of the window."""
+    def _known(self, layout: Layout, region: ActiveRegion, dt: float) -> np.ndarray | None:
+        """q (m^2/s) of the columns of liquid that stand in the outlet, in cells of the region."""
         if self._start_levels is None or self.settings.prescribe_outflow:
             return None
-        lowest = window.first[2]
-        start = self._start_levels[window.box[:2]]
+        lowest = region.first[2]
+        start = self._start_levels[region.box[:2]]
         start = np.where(start >= 0, np.maximum(start - lowest, 0.0), -1.0)
-        levels = water_levels(layout.wet, window.walls)
+        levels = water_levels(layout.wet, region.walls)
         levels = surface_heights(levels, layout.surface.distance, self.grid.spacing)
-        heads = outlet_heads(levels, start, window.walls)
+        heads = outlet_heads(levels, start, region.walls)
         return None if heads is None else heads * max(-self.parameters.gravity[2], 0.0) * dt
 
-    def _layout(self, window: Window, order: transfer.CellOrder) -> Layout:
+    def _layout(self, region: ActiveRegion, order: transfer.CellOrder) -> Layout:
         """Which cells hold liquid, and where its surface lies."""
-        grid, walls = window.grid, window.walls
+        grid, walls = region.grid, region.walls
         occupied = (np.diff(order.start) > 0).reshape(grid.shape)
-        solids = self._window_solids if self._bodies is None else solid_shares(walls.signed_distance, grid)
+        solids = self._region_solids if self._bodies is None else solid_shares(walls.signed_distance, grid)
         surface = liquid_surface(
             self._particles.positions, self._volumes(), grid, order, solids,
             curved=self.parameters.surface_tension > 0,
@@ -160,21 +162,21 @@ class LiquidGrid(ParticleSimulator):
         wet = (types == CellType.FLUID) | (types == CellType.INFLOW) | ((types == CellType.OUTFLOW) & occupied)
         return Layout(surface, holding, types, distance, wet)
 
-    def _grid_velocity(self, window: Window, order: transfer.CellOrder, dt: float) -> GridStep:
+    def _grid_velocity(self, region: ActiveRegion, order: transfer.CellOrder, dt: float) -> GridStep:
         """From particles to the new velocity on all faces near the liquid."""
-        grid, walls, bodies = window.grid, window.walls, self._bodies
+        grid, walls, bodies = region.grid, region.walls, self._bodies
         carried, masses = self._work.transfer.particles_to_grid(self._particles, grid, order)
-        layout = self._layout(window, order)
+        layout = self._layout(region, order)
         wet_faces, outlet = self._wet_faces(layout.wet, walls), self._outlet_faces(walls)
-        rate, solid = self._last_rate(window), None
+        rate, solid = self._last_rate(region), None
         if bodies is not None:
             bodies.predict(dt, rate)
             solid = bodies.face_velocity()
         forced = add_gravity(carried, self.parameters.gravity, dt)
         for force in self._forces:
-            forced = force.applied(forced, masses, window.box, dt)
-        velocity = self._impose(forced, window, outlet)
-        known, system = self._known(layout, window, dt), self._system(layout, window, outlet)
+            forced = force.applied(forced, masses, region.box, dt)
+        velocity = self._impose(forced, region, outlet)
+        known, system = self._known(layout, region, dt), self._system(layout, region, outlet)
         moving = self._wet_faces(layout.wet | (layout.holding == CellType.FLUID), walls)
         pressed = self._pressed(velocity, system, rate, known, dt)
         eager = bodies is not None and rate is not None and pressed is not velocity
@@ -182,7 +184,7 @@ class LiquidGrid(ParticleSimulator):
             bodies.coupling(system.unknown)
             bodies.apply_pressure(rate * dt)
             solid = bodies.face_velocity()
-        new, viscosity_reports = self._viscous(pressed, moving, window, dt, outlet, layout.distance, solid, bodies)
+        new, viscosity_reports = self._viscous(pressed, moving, region, dt, outlet, layout.distance, solid, bodies)
         if bodies is not None:
             if eager:
                 bodies.apply_pressure(-rate * dt)
@@ -190,13 +192,13 @@ class LiquidGrid(ParticleSimulator):
         if viscosity_reports:
             velocity = self._dragged(velocity, pressed, new, walls, dt)
         velocity, q, report, system = self._projected(
-            velocity, system, window, dt, None if rate is None else rate * dt,
+            velocity, system, region, dt, None if rate is None else rate * dt,
             known=known, jumps=self._jumps(layout, dt), solid_velocity=solid,
         )  # fmt: skip
         if known is not None:
             weight = max(-self.parameters.gravity[2], 0.0) * grid.spacing * dt
             velocity = hold_columns(velocity, known, walls, weight=weight)
-        velocity = self._impose(velocity, window, outlet)
+        velocity = self._impose(velocity, region, outlet)
         skin = (layout.holding == CellType.FLUID) & (layout.types == CellType.EMPTY)
         velocity = continue_velocity(velocity, carried, masses, wet_faces, skin, walls.openings)
         if bodies is None:
@@ -205,7 +207,7 @@ class LiquidGrid(ParticleSimulator):
             bodies.apply_pressure(q)
             velocity = bodies.slide(velocity)
         velocity = self._held_by_walls(velocity, walls, solid, dt)
-        return GridStep(velocity, system, layout.holding, (window.first, q / dt), report, viscosity_reports)
+        return GridStep(velocity, system, layout.holding, (region.first, q / dt), report, viscosity_reports)
 
     def _pressed(
         self, velocity: FaceVelocity, system: PressureSystem, rate: np.ndarray | None, known: np.ndarray | None,
@@ -255,17 +257,17 @@ class LiquidGrid(ParticleSimulator):
             *(np.where(o == 0, c + taken * (w - c), c) for c, w, o in zip(velocity.components, wall, walls.openings))
         )
 
-    def _last_rate(self, window: Window) -> np.ndarray | None:
-        """q / dt (m^2/s^2) of the substep before, on this window."""
+    def _last_rate(self, region: ActiveRegion) -> np.ndarray | None:
+        """q / dt (m^2/s^2) of the substep before, on this region."""
         if self._head_rate is None:
             return None
         first, rate = self._head_rate
-        return moved_to(rate, first, window.first, window.grid.shape)
+        return moved_to(rate, first, region.first, region.grid.shape)
 
-    def _system(self, layout: Layout, window: Window, outlet: tuple[np.ndarray, ...] | None) -> PressureSystem:
+    def _system(self, layout: Layout, region: ActiveRegion, outlet: tuple[np.ndarray, ...] | None) -> PressureSystem:
         gaps = surface_gaps(layout.distance, layout.types)
         # the walls have closed the sides of the box already
-        system = build_system(layout.types, window.walls.openings, window.grid, open_border=True, gaps=gaps)
+        system = build_system(layout.types, region.walls.openings, region.grid, open_border=True, gaps=gaps)
         if outlet is None:
             return system
         closed = [np.where(f, np.float32(0), w) for f, w in zip(outlet, system.weights)]
@@ -279,8 +281,8 @@ class LiquidGrid(ParticleSimulator):
         return surface_tension_jumps(layout.surface, layout.types, strength)
 
     def _projected(
-        self, velocity: FaceVelocity, system: PressureSystem, window: Window, dt: float, initial: np.ndarray | None,
-        **given: Any,
+        self, velocity: FaceVelocity, system: PressureSystem, region: ActiveRegion, dt: float,
+        initial: np.ndarray | None, **given: Any,
     ) -> tuple[FaceVelocity, np.ndarray, SolveReport, PressureSystem]:  # fmt: skip
         """Projection in which no wall sucks: wall cells whose pressure comes out negative are solved again as air.
 
@@ -299,7 +301,7 @@ class LiquidGrid(ParticleSimulator):
         weight = float(np.linalg.norm(self.parameters.gravity)) * self.grid.spacing * dt
         if not self.settings.separate_from_walls or weight == 0.0:
             return new, q, report, system
-        sucked = system.unknown & window.wall_cells & (q < -0.1 * weight)
+        sucked = system.unknown & region.wall_cells & (q < -0.1 * weight)
         if not sucked.any():
             return new, q, report, system
         system = replace(system, unknown=system.unknown & ~sucked)

@@ -1,4 +1,4 @@
-"""The free outlet: p = 0 at its rim, hydrostatic pressure inside columns of liquid that stand on the ground.
+"""The free outlet (Dirichlet pressure): p = 0 at its rim, hydrostatic in columns of liquid that stand on the ground.
 
 With p = 0 throughout, a river would pour over the outlet as over an edge and drain its own bed upstream. Columns of
 OUTFLOW cells whose liquid rests on the bed therefore hold the pressure of a water level: that of the start (the stage

@@ -1,4 +1,4 @@
-"""Pressure: the projection that makes a face velocity divergence-free (paper: `eq::v`, first term; `divProj`).
+"""Pressure projection to a divergence-free face velocity, with cut cells (paper: `eq::v`, first term; `divProj`).
 
 With q = p dt / density (m^2/s) the projection solves -div(w grad q) = -div(w v) and subtracts grad q from the open
 faces. w is the open fraction of each face, after Batty, Bertails and Bridson 2007, "A fast variational framework
@@ -67,7 +67,7 @@ def _open_share_of_triangle(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.n
 
 
 def face_fractions(signed_distance: Float[np.ndarray, "nx+1 ny+1 nz+1"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Open share of every face across x, y and z, float32, from the signed distance at the nodes.
+    """Cut cells: open share of every face across x, y and z, float32, from the signed distance at the nodes.
 
     Each square is cut into triangles along both diagonals, and the two results are averaged (no preferred diagonal).
     The surface is raised by a thousandth of the largest step between nodes (one cell's width), so that a face which
@@ -106,9 +106,9 @@ def build_system(
 ) -> PressureSystem:
     """The pressure system of a cell layout.
 
-    FLUID cells are unknown (save those without any open face: buried); EMPTY and OUTFLOW cells hold p = 0; SOLID
-    cells are closed on all faces; faces of INFLOW cells have a prescribed velocity. Without a terrain, faces are open
-    or closed by cell type alone.
+    FLUID cells are unknown (save those without any open face: buried); EMPTY and OUTFLOW cells hold p = 0
+    (Dirichlet); SOLID cells are closed on all faces and faces of INFLOW cells have a prescribed velocity
+    (Neumann). Without a terrain, faces are open or closed by cell type alone.
 
     Args:
         cell_types: u8 [nx,ny,nz], `CellType`.
@@ -248,7 +248,7 @@ def project(
     solid_velocity: FaceVelocity | None = None,
     low_rank: Sequence[LowRankTerm] = (),
 ) -> tuple[FaceVelocity, Float[np.ndarray, "nx ny nz"], SolveReport]:
-    """The velocity without its divergence (paper: `divProj`, all constraints at once).
+    """Pressure projection: the velocity without its divergence (paper: `divProj`, all constraints at once).
 
     Args:
         velocity: m/s.

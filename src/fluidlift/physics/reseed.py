@@ -1,4 +1,4 @@
-"""Reseeding: cells inside the liquid get neither empty of particles nor stuffed with them.
+"""Particle reseeding by splitting and merging: inner cells get neither empty of particles nor stuffed with them.
 
 A particle splits into two halves, placed symmetrically about it with the velocity of its own affine field there; two
 particles of one cell merge into their centre of mass. Both keep mass and linear momentum (the halves have m/2 each and

@@ -18,6 +18,7 @@ from fluidlift.numerics.mesh_distance import thin_warning
 from fluidlift.numerics.poisson import LowRankTerm
 from fluidlift.numerics.solid_mesh import hull_points, moments, surface_points
 from fluidlift.physics import rigid_coupling
+from fluidlift.physics.active_region import ActiveRegion
 from fluidlift.physics.boundaries import Walls, slide_along_walls
 from fluidlift.physics.contact import ContactSolver, Motion
 from fluidlift.physics.contact_search import Contacts, find_contacts, spread_points
@@ -28,7 +29,6 @@ from fluidlift.physics.rigid_shapes import distances, pack, posed
 from fluidlift.physics.rigid_walls import UnionWalls
 from fluidlift.physics.rotation import product, rotation_by, turned
 from fluidlift.physics.viscous_bodies import DraggedBody
-from fluidlift.physics.window import Window
 from fluidlift.types import FaceVelocity, matrix_from_quat
 
 __all__ = ["RigidBodies", "RigidBody", "Trajectory"]
@@ -177,16 +177,16 @@ class RigidBodies:
 
     # --- a substep, in the order of the calls -----------------------------------------------------------------------
 
-    def enter(self, window: Window) -> Window:
-        """The window onto terrain and bodies in their present poses, from one without bodies.
+    def enter(self, region: ActiveRegion) -> ActiveRegion:
+        """The region onto terrain and bodies in their present poses, from one without bodies.
 
-        The arrays change at the next call. All fields on cells or faces in the calls that follow are of this window.
+        The arrays change at the next call. All fields on cells or faces in the calls that follow are of this region.
         """
-        if self._union is None or self._union.static is not window:
-            self._union = UnionWalls(window)
+        if self._union is None or self._union.static is not region:
+            self._union = UnionWalls(region)
             self._solid = SolidVelocity(self._union)
         self._union.update(self._shapes, self._volume, self.center)
-        return self._union.window
+        return self._union.region
 
     def predict(self, dt: float, pressure_rate: Float[np.ndarray, "nx ny nz"] | None = None) -> None:
         """Velocities that the bodies would have after `dt` s without the liquid's new pressure.

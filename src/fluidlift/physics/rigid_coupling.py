@@ -1,4 +1,4 @@
-"""What rigid bodies and the liquid do to each other on the grid.
+"""Two-way coupling of rigid bodies and liquid by cut cells in the pressure projection.
 
 After Batty, Bertails, Bridson 2007, "A fast variational framework for accurate solid-fluid coupling", section 4. The
 share a of a face that a body covers moves with the body, so that cell c loses (sum over faces +-a u_body) / h of its

@@ -1,4 +1,4 @@
-"""Terrain and rigid bodies as one solid on the grid of a window: `Walls` for the present poses.
+"""Terrain and rigid bodies as one solid on the grid of a region: `Walls` for the present poses.
 
 Bodies and terrain do not overlap (contact sees to it), so the share of a face that a body covers comes from the body's
 distance field alone and is taken off what the terrain leaves open. That is exact for gaps much thinner than a cell,
@@ -15,9 +15,9 @@ from jaxtyping import Float
 from numba import njit, prange
 
 from fluidlift.numerics.signed_distance import distance_and_gradient
+from fluidlift.physics.active_region import ActiveRegion
 from fluidlift.physics.pressure import SMALLEST_OPENING
 from fluidlift.physics.rigid_shapes import Shapes, body_distance
-from fluidlift.physics.window import Window
 from fluidlift.types import CellType
 
 RAISED = 1e-3
@@ -260,9 +260,9 @@ def _cell_facts(distance, ox, oy, oz, first, last, low, h, solid_code, solid, bu
 
 
 class UnionWalls:
-    """Keeps a `Window` onto terrain and bodies up to date. All arrays it gives out change at the next `update`."""
+    """Keeps an `ActiveRegion` of terrain and bodies up to date. All arrays it gives out change at the next `update`."""
 
-    def __init__(self, static: Window) -> None:
+    def __init__(self, static: ActiveRegion) -> None:
         walls, grid = static.walls, static.grid
         self.static = static
         self.covers: tuple[Cover, ...] = ()
@@ -271,7 +271,7 @@ class UnionWalls:
             normals=tuple(n.copy() for n in walls.normals), solid=walls.solid.copy(), buried=walls.buried.copy(),
             regions=walls.regions.copy(),
         )  # fmt: skip
-        self.window = replace(
+        self.region = replace(
             static, walls=self.walls, capacity=static.capacity.copy(), wall_cells=static.wall_cells.copy()
         )
         self.closed_by = tuple(np.full(grid.face_shape(a), -1, np.int16) for a in range(3))
@@ -312,8 +312,8 @@ class UnionWalls:
         at = cover.cells
         for name in ("solid", "buried", "regions"):
             getattr(walls, name)[at] = getattr(static, name)[at]
-        self.window.wall_cells[at] = self.static.wall_cells[at]
-        self.window.capacity[at] = self.static.capacity[at]
+        self.region.wall_cells[at] = self.static.wall_cells[at]
+        self.region.capacity[at] = self.static.capacity[at]
 
     def _measured(self, shapes: Shapes, body: int, true_volume: float, center: np.ndarray) -> Cover | None:
         """Distance and covered shares on the faces around a body; None where it is out of the box."""
@@ -383,5 +383,5 @@ class UnionWalls:
             )  # fmt: skip
         _cell_facts(
             walls.signed_distance, *walls.openings, first, last, grid.low, grid.spacing, np.uint8(CellType.SOLID),
-            walls.solid, walls.buried, walls.regions, self.window.wall_cells, self.window.capacity,
+            walls.solid, walls.buried, walls.regions, self.region.wall_cells, self.region.capacity,
         )  # fmt: skip

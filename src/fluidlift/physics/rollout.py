@@ -109,7 +109,7 @@ def unflatten(flat: Float[Tensor, " f"], domain: RolloutDomain) -> Faces:
 def apply_walls(
     velocity: Float[Tensor, " f"], domain: RolloutDomain, parameters: RolloutParameters
 ) -> Float[Tensor, " f"]:
-    """Friction of walls along the motion, and the bounce of walls across it."""
+    """Wall friction between free slip and no-slip, and restitution across the wall."""
     share = torch.from_numpy(domain.wall_share)
     below, above = torch.from_numpy(domain.wall_below), torch.from_numpy(domain.wall_above)
     velocity = velocity * (1 - 0.5 * parameters.wall_damping * share)
@@ -124,7 +124,7 @@ def set_inflow(
     parameters: RolloutParameters,
     pattern: Float[Tensor, " f"] | None,
 ) -> Float[Tensor, " f"]:
-    """Inflow faces take the bulk velocity plus fluctuation times pattern; closed faces become 0."""
+    """Dirichlet inflow: its faces take the bulk velocity plus fluctuation times pattern; closed faces become 0."""
     o = domain.offsets
     given = torch.cat([parameters.inflow_velocity[a].expand(o[a + 1] - o[a]) for a in range(3)])
     if pattern is not None:

@@ -1,4 +1,4 @@
-"""Where the free surface of a liquid lies between the cells of a rollout's layout.
+"""The free surface (a level set) of a rollout's liquid, between the cells of its layout, for ghost-fluid pressure.
 
 p = 0 holds on the surface, a share of a cell away from the centre of the liquid's last cell: ghost fluid, second order
 (Enright et al. 2003; Gibou et al. 2002), as in `pressure`. With a distance that is linear near the surface the weight

@@ -18,12 +18,12 @@ from fluidlift.errors import FluidliftError, InputRejected, require
 from fluidlift.numerics.sampling import sample_centers
 from fluidlift.numerics.signed_distance import push_outside
 from fluidlift.physics import boundaries, transfer
-from fluidlift.physics.crowding import cell_capacity
+from fluidlift.physics.active_region import ActiveRegion, open_region
 from fluidlift.physics.emitter import Supply
 from fluidlift.physics.inlet import Inlet
+from fluidlift.physics.position_correction import cell_capacity
 from fluidlift.physics.rigid import RigidBodies
 from fluidlift.physics.viscosity import NEGLIGIBLE, FaceRoles, diffuse_with_bodies
-from fluidlift.physics.window import Window, open_window
 from fluidlift.types import FaceVelocity, FluidParameters, Grid, Particles, SolveReport, Terrain
 
 TIDY_EVERY = 4
@@ -141,7 +141,7 @@ class ParticleSimulator(ABC):
         self._rng = np.random.default_rng(seed)
         self._walls = boundaries.build_walls(terrain, cell_types, open_sides)
         self._capacity = cell_capacity(terrain.signed_distance, grid)
-        self._window = open_window(tuple(slice(0, n) for n in grid.shape), self._walls, self._capacity)
+        self._region = open_region(tuple(slice(0, n) for n in grid.shape), self._walls, self._capacity)
         self._mainstream = np.asarray(terrain.mainstream, np.float64)
         self._inlet = Inlet(self._walls, parameters, inflow_profile, seed, settings.particles_per_cell, supply)
         self._inlet.switch(0.0)
@@ -263,7 +263,7 @@ class ParticleSimulator(ABC):
         return float(np.linalg.norm(self.parameters.gravity))
 
     def _substep_length(self, remaining: float) -> float:
-        """Equal substeps within the Courant limit, the gain of speed by body forces included."""
+        """Equal substeps within the CFL limit (`settings.courant`), the gain of speed by body forces included."""
         longest = min(self.parameters.time_step, remaining)
         gain = self._speed_gain()
         # (speed + gain dt) dt <= courant h
@@ -352,7 +352,7 @@ class ParticleSimulator(ABC):
         self,
         velocity: FaceVelocity,
         wet: tuple,
-        window: Window,
+        region: ActiveRegion,
         dt: float,
         prescribed: tuple | None = None,
         distance: np.ndarray | None = None,
@@ -364,8 +364,8 @@ class ParticleSimulator(ABC):
         `distance` to the liquid's surface as for `viscosity.diffuse`; closed faces move with `solid`, or rest.
         The liquid drags free `bodies`.
         """
-        walls = window.walls
-        fixed = self._inlet.face_masks(tuple(w.shape for w in wet), window.first)
+        walls = region.walls
+        fixed = self._inlet.face_masks(tuple(w.shape for w in wet), region.first)
         if prescribed is not None:
             fixed = [f | o for f, o in zip(fixed, prescribed)]
         solved = tuple(w & ~f for w, f in zip(wet, fixed))

@@ -1,4 +1,4 @@
-"""Surface tension: a jump of pressure at the surface of a liquid, sigma times the sum of the principal curvatures.
+"""Surface tension (Young-Laplace, ghost fluid): the pressure jumps by sigma times the sum of the principal curvatures.
 
 The jump enters the pressure solve at the place of the surface (Kang, Fedkiw, Liu 2000, "A boundary condition capturing
 method for multiphase incompressible flow"), so that a round drop at rest has no forces left to move it. It is explicit

@@ -1,4 +1,4 @@
-"""Affine particle-in-cell transfers on the staggered grid (paper: `particle_map`; Jiang et al. 2015).
+"""P2G and G2P: affine particle-in-cell (APIC) transfers on the MAC grid (paper: `particle_map`; Jiang et al. 2015).
 
 Each velocity component lives on its own faces, so row a of a particle's affine matrix belongs to component a:
 
@@ -72,7 +72,7 @@ def _float32(array: np.ndarray) -> np.ndarray:
 def particles_to_grid(
     particles: Particles, grid: Grid, order: CellOrder | None = None
 ) -> tuple[FaceVelocity, tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Face velocity (m/s, 0 where no particle reaches) and face masses (kg), float32.
+    """P2G: face velocity (m/s, 0 where no particle reaches) and face masses (kg), float32.
 
     Args:
         particles: inside the box of the grid.
@@ -95,7 +95,8 @@ def particles_to_grid(
 def grid_to_particles(
     velocity: FaceVelocity, grid: Grid, positions: Float[np.ndarray, "n 3"], order: CellOrder | None = None
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"]]:
-    """Velocities (m/s) and affine matrices (1/s) at positions, float32. Beyond the outer faces the outer value goes on.
+    """G2P: velocities (m/s) and affine matrices (1/s) at positions, float32. Beyond the outer faces the outer value
+    goes on.
 
     `order` only makes it faster where the positions are in no order.
     """

@@ -1,4 +1,4 @@
-"""Numba kernels of the particle-grid transfers (see `physics.transfer`, whose plain twins say what they compute).
+"""Numba kernels of P2G and G2P (see `physics.transfer`, whose plain twins say what they compute).
 
 The grid arrays here have GHOST more faces on every side, and one more in z: the footprint of a particle never leaves
 them, and a row of three samples along z may be read and written as four, the last with weight 0. The sums of a

@@ -1,4 +1,4 @@
-"""Viscosity: implicit, with all components coupled by the full stress (paper: `eq::v`, second term).
+"""Implicit viscosity (backward Euler), components coupled by the full stress (paper: `eq::v`, second term).
 
 After Batty and Bridson 2008, "Accurate viscous free surfaces for buckling, coiling, and rotating liquids". The new
 velocity v minimises

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fluidlift.config import JobConfig
 from fluidlift.physics.inflow_schedule import InflowSchedule
-from fluidlift.pipeline.scene import Footage, Scene
+from fluidlift.pipeline.footage import Footage
+from fluidlift.pipeline.scene import Scene
 
 if TYPE_CHECKING:
     from fluidlift.evaluate.as_filmed import AsFilmed
@@ -39,8 +40,8 @@ class Reel:
         return np.memmap(self._file, self._type, "r", shape=shape) if self._count else np.zeros(shape, self._type)
 
 
-def why_not(scene: Scene, footage: Footage | None, config: JobConfig) -> str | None:
-    """Why a re-simulation cannot be held against its clip, and what to do; None where it can."""
+def why_not(scene: Scene, footage: Footage | None, *, preview: bool) -> str | None:
+    """Why a re-simulation, drawn or not, cannot be held against its clip, and what to do; None where it can."""
     from fluidlift.evaluate.as_filmed import FEWEST
 
     edits = {
@@ -55,7 +56,7 @@ def why_not(scene: Scene, footage: Footage | None, config: JobConfig) -> str | N
         return "the clip is not at hand (work/ is missing or of another version): run fluidlift make again"
     if scene.interval != scene.clip_interval:
         return "the frames are at another rate than the clip's: run fluidlift sim without --fps"
-    if not config.show.preview:
+    if not preview:
         return "no pictures were drawn: run fluidlift sim with --set show.preview=true"
     filmed = len(footage.clip) - footage.start
     if min(filmed, scene.frames) < FEWEST:
@@ -63,29 +64,38 @@ def why_not(scene: Scene, footage: Footage | None, config: JobConfig) -> str | N
     return None
 
 
+@dataclass(frozen=True)
+class Noted:
+    """The card as the manifest has it."""
+
+    as_filmed: dict[str, Any]
+    """the card, or why there is `none`"""
+    warnings: tuple[str, ...] = ()
+
+
 def card_of_run(
-    scene: Scene, footage: Footage | None, config: JobConfig, renders: np.ndarray, coverage: np.ndarray
-) -> dict[str, Any]:
-    """What the stage that shows notes: `as_filmed`, the card or why there is `none`; a warning where it does not hold.
+    scene: Scene, footage: Footage | None, preview: bool, renders: np.ndarray, coverage: np.ndarray
+) -> Noted:
+    """What the stage that shows notes; a warning where the card does not hold.
 
     Args:
         scene: that was simulated.
         footage: its clip, where it is at hand.
-        config: of the run.
+        preview: whether pictures are drawn.
         renders: u8 [K,H,W,3] in the clip's camera, from the first simulated frame on.
         coverage: bool [K,H,W], pixels that the fluid covers.
     """
     from fluidlift.evaluate.as_filmed import FEWEST, as_filmed
 
-    reason = why_not(scene, footage, config)
+    reason = why_not(scene, footage, preview=preview)
     if reason is None and len(renders) < FEWEST:
         reason = f"the simulation ended early: too few frames, {len(renders)} where {FEWEST} are needed"
     if reason is not None or footage is None:
-        return {"as_filmed": {"none": reason}}
+        return Noted({"none": reason})
     first = footage.start
     card = as_filmed(footage.clip.frames[first:], footage.labels.fluid[first:], scene.interval, renders, coverage)
     warning = card.warning()
-    return {"as_filmed": card.to_dict()} | ({"warnings": [warning]} if warning else {})
+    return Noted(card.to_dict(), (warning,) if warning else ())
 
 
 def card_of(manifest: Mapping[str, Any]) -> AsFilmed | str:

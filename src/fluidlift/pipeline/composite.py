@@ -10,11 +10,10 @@ from jaxtyping import Bool, Float
 
 from fluidlift.shape import airborne, jets, place
 from fluidlift.shape.jet_column import Jet, with_columns
-from fluidlift.shape.kind import UpEvidence, level_camera
+from fluidlift.shape.kind import level_camera
 from fluidlift.shape.slope import LEVEL
 from fluidlift.shape.surface import FrontSurface
-from fluidlift.shape.terrain import Setting
-from fluidlift.types import FluidKind, PinholeCamera, Similarity3
+from fluidlift.types import FluidKind, MetricScale, PinholeCamera, Setting, Similarity3, UpEvidence
 from fluidlift.types.kind import LOOKING_DOWN, POUR, STREAM
 
 
@@ -106,12 +105,12 @@ def standing(
 
 
 def with_fall(
-    scale: place.MetricScale,
+    scale: MetricScale,
     points: Float[np.ndarray, "n 3"],
     velocities: Float[np.ndarray, "n 3"],
     falls: Bool[np.ndarray, " n"],
     seen: place.Sighting,
-) -> place.MetricScale:
+) -> MetricScale:
     """The scale from the jets' free fall, where nothing else gives one."""
     if scale.source != "assumed" or not falls.any():
         return scale

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from fluidlift.errors import InputRejected
-from fluidlift.pipeline.seeing import FluidMasks
+from fluidlift.pipeline.fluid_masks import FluidMasks
 from fluidlift.shape import standing
 from fluidlift.types import PinholeCamera
 

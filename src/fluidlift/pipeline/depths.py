@@ -4,25 +4,24 @@ from __future__ import annotations
 
 import os
 from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from fluidlift.backends.monocular_depth import Guess, ModelWeights, make_depth_estimator
-from fluidlift.config import JobConfig
+from fluidlift.config import DepthConfig
 from fluidlift.errors import InputRejected
-from fluidlift.io.stage_cache import load_stage, save_stage
-from fluidlift.pipeline.reading import Inputs, clip_of
-from fluidlift.pipeline.seeing import FluidMasks
-from fluidlift.pipeline.story import Story, content_hash, file_hash
+from fluidlift.pipeline.fluid_masks import FluidMasks
+from fluidlift.pipeline.settings import DepthModel, GivenDepth, GivenView
+from fluidlift.pipeline.work import Work
 from fluidlift.shape import depth_surface, given_depth
 from fluidlift.shape import kind as kinds
 from fluidlift.shape.given_depth import DepthPictures, SceneDepth
 from fluidlift.shape.kinds import Observation, builder_of
-from fluidlift.shape.place import DISAGREEING, MetricScale
+from fluidlift.shape.place import DISAGREEING
 from fluidlift.shape.surface import FrontSurface
-from fluidlift.types import FluidKind, PinholeCamera
+from fluidlift.types import FluidKind, MetricScale, PinholeCamera, UpEvidence
+from fluidlift.types.stages import DepthGuess, Read
 
 LEARNED_SCALE = 0.15
 """relative standard error of a model's metres: assumed, as no trained model was measured here"""
@@ -38,7 +37,7 @@ class DepthFront:
     """What the pictures' depth says about a fluid."""
 
     scene: SceneDepth
-    up: kinds.UpEvidence
+    up: UpEvidence
     front: FrontSurface
     unit: float | None
     """m per canonical unit, where the depth is in metres"""
@@ -51,87 +50,80 @@ class DepthFront:
         return None if self.learned else self.unit
 
 
-def wanted(inputs: Inputs, config: JobConfig) -> bool:
-    """Whether there is a depth to go by."""
-    return inputs.geometry is None and (inputs.depth is not None or config.depth.model != "none")
-
-
-def key_parts(config: JobConfig) -> dict[str, Any]:
-    """Plain values that the geometry depends on: the section, with the weights by their content."""
-    section = config.section("depth")
-    weights = section["weights"]
-    if weights is not None and Path(weights).exists():
-        section["weights"] = file_hash(Path(weights))
-    return section
-
-
 def pictures_of(
-    story: Story, inputs: Inputs, config: JobConfig, camera: PinholeCamera | None, start: int
+    read: Read, given: GivenView, camera: PinholeCamera | None, start: int, work: Work
 ) -> DepthPictures | None:
     """Depth of some frames from `start` on: of the file that was given, or of a model; None where there is neither.
 
     Args:
-        story: with the clip.
-        inputs: the depth file.
-        config: the model.
+        read: the clip.
+        given: the depth file, or the model.
         camera: where it is known; some models take it, and all others say how wide they see.
         start: first frame in which there is enough fluid.
+        work: keeps what a model says: it is the slowest part of the geometry.
 
     Raises:
         InputRejected: a file that does not fit, or weights that do not.
         MissingPackage: of a model.
     """
-    if not wanted(inputs, config):
+    if given.depth is not None:
+        return _from_file(read, given.depth, start)
+    if given.model is None:
         return None
-    if inputs.depth is not None:
-        return _from_file(story, inputs.depth, config, start)
-    return _from_model(story, config, camera, start)
+    pick = _frames(len(read.clip), start, given.model.frames)
+    found = work.part("depth", depth_by_model, read, given.model, pick, camera)
+    return DepthPictures(
+        np.asarray(found.values),
+        tuple(pick),
+        found.holds,
+        f"depth of {given.model.model}",
+        MODEL_FLOOR,
+        found.field_of_view,
+    )
 
 
-def require_weights(config: JobConfig) -> None:
+def require_weights(config: DepthConfig) -> None:
     """Say before the clip is read that a model lacks its weights.
 
     Raises:
         InputRejected: a model without weights, or weights that are not there and may not be fetched.
     """
-    d = config.depth
-    if d.model == "none":
+    if config.model == "none":
         return
-    if d.weights is None:
+    if config.weights is None:
         raise InputRejected(
-            f"--depth-model {d.model} without its weights", "a file or folder with them",
+            f"--depth-model {config.model} without its weights", "a file or folder with them",
             "--depth-weights PATH; docs/depth.md says where to get them",
         )  # fmt: skip
-    if not d.download and not os.path.exists(os.path.expanduser(d.weights)):
+    if not config.download and not os.path.exists(os.path.expanduser(config.weights)):
         raise InputRejected(
-            f"weights '{d.weights}' that are not there", "an existing file or folder",
+            f"weights '{config.weights}' that are not there", "an existing file or folder",
             "check --depth-weights, or --set depth.download=true for a name on the hub",
         )  # fmt: skip
 
 
-def require_file(story: Story, inputs: Inputs, config: JobConfig) -> None:
-    """Say before the flow is computed that a depth file cannot be of this clip; needs the stage read.
+def require_file(read: Read, given: GivenDepth) -> None:
+    """Say before the flow is computed that a depth file cannot be of this clip.
 
     Raises:
         InputRejected: a file that cannot be read, or does not fit.
     """
-    if inputs.depth is not None and wanted(inputs, config):
-        _from_file(story, inputs.depth, config, 0)
+    _from_file(read, given, 0)
 
 
 def _frames(count: int, start: int, most: int) -> list[int]:
     return [int(t) for t in np.unique(np.linspace(start, count - 1, min(most, count - start)).round())]
 
 
-def _from_file(story: Story, path: Path, config: JobConfig, start: int) -> DepthPictures:
+def _from_file(read: Read, given: GivenDepth, start: int) -> DepthPictures:
     from fluidlift.io.images import read_depth
 
-    clip, d = clip_of(story), config.depth
-    holds = "metres" if d.holds == "auto" else d.holds
-    values = read_depth(path, clip.size, scale=d.scale, positive=holds != "disparity")
+    clip, path = read.clip, given.file.path
+    holds = "metres" if given.holds == "auto" else given.holds
+    values = read_depth(path, clip.size, scale=given.scale, positive=holds != "disparity")
     if values.ndim == 2:
         return DepthPictures(values[None], (start,), holds, "depth file", FILE_FLOOR)
-    kept = np.asarray(story["read"].arrays["kept"])
+    kept = np.asarray(read.kept)
     if len(values) != len(clip):
         if len(values) <= kept.max(initial=0):
             raise InputRejected(
@@ -139,41 +131,27 @@ def _from_file(story: Story, path: Path, config: JobConfig, start: int) -> Depth
                 "cut it as the clip is cut",
             )  # fmt: skip
         values = values[kept]
-    pick = _frames(len(clip), start, d.frames)
+    pick = _frames(len(clip), start, given.frames)
     return DepthPictures(values[pick], tuple(pick), holds, "depth file", FILE_FLOOR)
 
 
-def _from_model(story: Story, config: JobConfig, camera: PinholeCamera | None, start: int) -> DepthPictures:
-    """The model's pictures, from the cache where it has seen them before: it is the slowest part of the geometry."""
-    clip, d = clip_of(story), config.depth
-    pick = _frames(len(clip), start, d.frames)
-    known = None if camera is None else camera.to_dict()
-    key = content_hash("depth", key_parts(config), story.keys.get("read"), pick, known)
-    found = load_stage(story.folder, "depth", key)
-    if found is None:
-        model = make_depth_estimator(d.model, ModelWeights(d.weights, d.device, d.download))
-        guesses: list[Guess] = []
-        for t in pick:
-            guesses.append(model.guess(np.ascontiguousarray(clip.frames[t]), camera))
-            story.step(len(guesses), len(pick))
-        views = [g.field_of_view for g in guesses if g.field_of_view is not None]
-        arrays = {"values": np.stack([g.values for g in guesses])}
-        meta = {"holds": guesses[0].holds, "field_of_view": float(np.median(views)) if views else None}
-        save_stage(story.folder, "depth", key, arrays, meta)
-        found = arrays, meta
-    arrays, meta = found
-    return DepthPictures(
-        np.asarray(arrays["values"]),
-        tuple(pick),
-        meta["holds"],
-        f"depth of {d.model}",
-        MODEL_FLOOR,
-        meta["field_of_view"],
-    )
+def depth_by_model(
+    read: Read, model: DepthModel, frames: list[int], camera: PinholeCamera | None, *, work: Work
+) -> DepthGuess:
+    """What a learned model says of some frames, one after the other."""
+    weights = None if model.weights is None else model.weights.name
+    estimator = make_depth_estimator(model.model, ModelWeights(weights, model.device, model.download))
+    guesses: list[Guess] = []
+    for t in frames:
+        guesses.append(estimator.guess(np.ascontiguousarray(read.clip.frames[t]), camera))
+        work.step(len(guesses), len(frames))
+    views = [g.field_of_view for g in guesses if g.field_of_view is not None]
+    values = np.stack([g.values for g in guesses])
+    return DepthGuess(values, guesses[0].holds, float(np.median(views)) if views else None)
 
 
 def depth_front(
-    pictures: DepthPictures, fluid: FluidMasks, camera: PinholeCamera, up: kinds.UpEvidence, kind: FluidKind,
+    pictures: DepthPictures, fluid: FluidMasks, camera: PinholeCamera, up: UpEvidence, kind: FluidKind,
     seen: Observation, *, expected: FrontSurface,
 ) -> DepthFront:  # fmt: skip
     """Surface, tilt and scale by the depth.

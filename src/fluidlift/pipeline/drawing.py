@@ -9,9 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from fluidlift.errors import InputRejected
+from fluidlift.pipeline.footage import Footage
+from fluidlift.pipeline.front_view import before_ground, open_end
 from fluidlift.pipeline.looks import Backdrop, Frame, Painter, placed_bodies
-from fluidlift.pipeline.scene import Footage, Scene, before_ground
-from fluidlift.pipeline.showing import open_end, splat_frames
+from fluidlift.pipeline.scene import Scene
+from fluidlift.pipeline.splat_files import splat_frames
 from fluidlift.types import Gaussians, PinholeCamera, Similarity3, concatenate, matrix_from_quat
 
 SURFELS = 200_000

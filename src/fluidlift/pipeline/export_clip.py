@@ -11,9 +11,11 @@ import numpy as np
 from fluidlift.errors import InputRejected
 from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.pipeline.export_job import ExportRequest, Outcome
-from fluidlift.pipeline.story import Progress, Silence, Story
+from fluidlift.pipeline.recall import recalled
+from fluidlift.pipeline.work import Progress
 from fluidlift.pipeline.written import cleared, numbered
 from fluidlift.types import FluidAsset, Label, PinholeCamera
+from fluidlift.types.stages import Flow, Motion, Segmentation
 
 SENSOR = 36.0
 """mm, longer side of the film back that focal lengths in mm are told for, as 3D programs have it by default"""
@@ -29,10 +31,11 @@ def write_clip_files(
     """
     if request.to == "camera":
         return write_camera(out, asset)
-    story = Story(folder, ("read", "flow", "segment", "motion"), progress=Silence())
     if request.to == "masks":
-        return _masks(story, out, request, manifest, progress)
-    return _flow(story, out, request, manifest, progress)
+        (segmentation,) = _recalled(folder, manifest, ("segment",), "the masks")
+        return _masks(segmentation.labels.labels, out, request, progress)
+    found = _recalled(folder, manifest, ("flow", "segment", "motion"), "the flow")
+    return _flow(*found, out, request, progress)
 
 
 def camera_facts(camera: PinholeCamera) -> dict[str, Any]:
@@ -64,17 +67,17 @@ def write_camera(out: Path, asset: FluidAsset) -> Outcome:
     return Outcome(words, (), {"frames": asset.frame_count, "first": FIRST_FRAME})
 
 
-def _recalled(story: Story, manifest: dict[str, Any], names: tuple[str, ...], what: str) -> None:
-    from fluidlift.pipeline.resimulate import stage_keys
-
-    keys = stage_keys(manifest)
-    gone = [name for name in names if not (name in keys and story.recall(name, keys[name]))]
+def _recalled(folder: Path, manifest: dict[str, Any], names: tuple[str, ...], what: str) -> list[Any]:
+    """Values of the stages that an asset was made from."""
+    found = [recalled(folder, manifest, name) for name in names]
+    gone = [name for name, value in zip(names, found) if value is None]
     if gone:
         raise InputRejected(
             f"{what} of the clip, which {'are' if what.endswith('s') else 'is'} no longer at hand "
             f"(no work/{gone[0]} of this asset)",
             "the asset's folder work/, as make left it", "run fluidlift make again, or fluidlift motion on the clip",
         )  # fmt: skip
+    return found
 
 
 def _wanted(request: ExportRequest, count: int, what: str) -> range:
@@ -86,12 +89,10 @@ def _wanted(request: ExportRequest, count: int, what: str) -> range:
     return range(first - FIRST_FRAME, last - FIRST_FRAME + 1)
 
 
-def _masks(story: Story, out: Path, request: ExportRequest, manifest: dict[str, Any], progress: Progress) -> Outcome:
+def _masks(labels: np.ndarray, out: Path, request: ExportRequest, progress: Progress) -> Outcome:
     """####.png of every frame of the clip: white is fluid."""
     from fluidlift.io.images import write_png
 
-    _recalled(story, manifest, ("segment",), "the masks")
-    labels = story["segment"].arrays["labels"]
     wanted = _wanted(request, len(labels), "masks")
     out.mkdir(parents=True, exist_ok=True)
     cleared(out, [".png"])
@@ -101,14 +102,15 @@ def _masks(story: Story, out: Path, request: ExportRequest, manifest: dict[str, 
     return Outcome(("white is fluid; of the working pictures of the clip",), (), _counted(wanted))
 
 
-def _flow(story: Story, out: Path, request: ExportRequest, manifest: dict[str, Any], progress: Progress) -> Outcome:
+def _flow(
+    flow: Flow, segmentation: Segmentation, motion: Motion, out: Path, request: ExportRequest, progress: Progress
+) -> Outcome:
     """flow.####.exr or .flo from every frame of the clip to the next: completed along the mainstream where make has
     done so, else as measured; unknown outside the fluid."""
     from fluidlift.io.flow_files import write_flow
 
-    _recalled(story, manifest, ("flow", "segment", "motion"), "the flow")
-    measured, found, labels = story["flow"].arrays, story["motion"].arrays, story["segment"].arrays["labels"]
-    wanted = _wanted(request, len(measured["displacement"]), "flow")
+    measured, labels = flow.flow, segmentation.labels.labels
+    wanted = _wanted(request, len(measured), "flow")
     form = "flo" if request.to == "flo" else "exr"
     out.mkdir(parents=True, exist_ok=True)
     cleared(out, [".flo", ".exr"])
@@ -116,15 +118,14 @@ def _flow(story: Story, out: Path, request: ExportRequest, manifest: dict[str, A
     for done, t in enumerate(wanted):
         progress.update(done, len(wanted))
         wet = np.asarray(labels[t]) == Label.FLUID
-        flow, trust = np.asarray(found["completed"][t], np.float32), np.asarray(measured["confidence"][t], np.float32)
-        if np.isfinite(flow[wet]).any():
+        shown, trust = np.asarray(motion.completed[t], np.float32), np.asarray(measured.confidence[t], np.float32)
+        if np.isfinite(shown[wet]).any():
             completed += 1
-            seen = np.unpackbits(found["observed"][t], axis=-1)[:, : wet.shape[1]].astype(bool)
-            flow, trust = np.where(np.isfinite(flow), flow, 0.0), np.where(seen, trust, 0.0)
+            shown, trust = np.where(np.isfinite(shown), shown, 0.0), np.where(motion.observed(t), trust, 0.0)
         else:
-            flow = np.asarray(measured["displacement"][t], np.float32)
+            shown = np.asarray(measured.displacement[t], np.float32)
         # EXR readers do not expect NaN: there the confidence says what is known
-        shown = np.where(wet[..., None], flow, np.nan if form == "flo" else 0.0)
+        shown = np.where(wet[..., None], shown, np.nan if form == "flo" else 0.0)
         write_flow(out, t, shown, np.where(wet, trust, 0.0), form)
     told = f"{completed} completed along the mainstream, {len(wanted) - completed} as measured between two frames"
     words = (f"{told}; px per frame of the working pictures", "fluidlift motion completes every frame")

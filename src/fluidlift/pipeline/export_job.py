@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,9 +11,8 @@ from typing import Any
 import numpy as np
 
 from fluidlift.errors import InputRejected
-from fluidlift.pipeline.simulating import frame_file
-from fluidlift.pipeline.story import Progress
-from fluidlift.types import FluidAsset, Gaussians
+from fluidlift.pipeline.work import Progress
+from fluidlift.types import FluidAsset
 
 OF_CLIP = ("camera", "flow", "flo", "masks")
 """formats that hold what was found in the clip; no simulated frame is needed for them"""
@@ -147,23 +145,3 @@ def as_simulated(folder: Path, asset: FluidAsset, manifest: dict[str, Any]) -> F
     return replace(
         asset, terrain=scene.terrain, grid=scene.terrain.grid, cell_types=scene.cell_types, velocity=scene.velocity
     )
-
-
-def frames_of(folder: Path, picked: range) -> Iterator[tuple[Gaussians, np.ndarray, np.ndarray]]:
-    """(gaussians, ids, velocities m/s) of some simulated frames, read one by one.
-
-    Raises:
-        InputRejected: a frame is missing or damaged.
-    """
-    from fluidlift.io.frames import FIRST_FRAME
-    from fluidlift.io.ply import read_splats
-
-    for k in picked:
-        splats = read_splats(frame_file(folder, FIRST_FRAME + k))
-        missing = {"id", "vx", "vy", "vz"} - splats.extras.keys()
-        if missing:
-            raise InputRejected(
-                f"frame {FIRST_FRAME + k} of '{folder.name}' has no {', '.join(sorted(missing))}",
-                "frames as the simulation writes them", f"fluidlift sim {folder} --restart",
-            )  # fmt: skip
-        yield splats.gaussians, splats.extras["id"], np.stack([splats.extras[v] for v in ("vx", "vy", "vz")], axis=-1)

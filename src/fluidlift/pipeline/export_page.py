@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fluidlift.io.frames import FIRST_FRAME
-from fluidlift.pipeline.export_job import ExportJob, Outcome, frames_of
+from fluidlift.pipeline.export_job import ExportJob, Outcome
 from fluidlift.pipeline.looping import FAINTEST
+from fluidlift.pipeline.splat_files import frames_of
 from fluidlift.types import Gaussians, PinholeCamera, Similarity3, concatenate, matrix_from_quat, sh_from_rgb
 
 if TYPE_CHECKING:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from fluidlift.io.frames import FIRST_FRAME
-from fluidlift.pipeline.export_job import ExportJob, Outcome, frames_of
+from fluidlift.pipeline.export_job import ExportJob, Outcome
+from fluidlift.pipeline.splat_files import frames_of
 from fluidlift.pipeline.written import cleared, numbered
 
 if TYPE_CHECKING:

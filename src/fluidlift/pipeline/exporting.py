@@ -23,11 +23,11 @@ from fluidlift.pipeline.export_job import (
     as_simulated,
     checked,
     every,
-    frames_of,
 )
 from fluidlift.pipeline.rendering import frame_numbers, frames_told
-from fluidlift.pipeline.story import Progress, Silence
+from fluidlift.pipeline.splat_files import frames_of
 from fluidlift.pipeline.surfacing import surface_of
+from fluidlift.pipeline.work import Progress, Silence
 from fluidlift.pipeline.written import Written, cleared, numbered
 from fluidlift.types import FaceVelocity, FluidAsset, Gaussians, Grid, Similarity3, TriangleMesh, kind_of
 

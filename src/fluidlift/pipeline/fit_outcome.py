@@ -168,7 +168,7 @@ def size_row(scale: Mapping[str, Any]) -> dict[str, Any] | None:
     """The row of the size, which decides on the unit of all others; None where an earlier version did not note it.
 
     Args:
-        scale: plain values of `place.MetricScale`.
+        scale: plain values of `MetricScale`.
     """
     across, relative = scale.get("across"), scale.get("relative_error")
     if not across:

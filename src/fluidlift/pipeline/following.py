@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,7 +24,7 @@ WAKE = 3.0
 back, is one to three long"""
 
 
-def following(scene: Scene, asset: FluidAsset, folder: Path, share: float) -> Scene:
+def following(scene: Scene, asset: FluidAsset, force: FaceVelocity | None, share: float) -> Scene:
     """The scene with a share of the asset's force.
 
     The force fades out around what was put in or dug out. It is left out, with a note, where the fluid itself, its
@@ -34,16 +33,14 @@ def following(scene: Scene, asset: FluidAsset, folder: Path, share: float) -> Sc
     Args:
         scene: with all edits.
         asset: that it comes from, as it was or on a coarser grid.
-        folder: of the asset.
+        force: m/s^2, of the asset on its own grid; None where it has none.
         share: 0 to 1.
 
     Raises:
-        InputRejected: a damaged file of the force.
+        InputRejected: a force on another grid.
     """
     from fluidlift.fit.coarsen import coarsen_velocity
-    from fluidlift.io.force_file import read_force
 
-    force = read_force(folder)
     if force is None or share <= 0:
         return scene
     while max(force.shape) > max(asset.grid.shape) and min(force.shape) > 1:

@@ -13,14 +13,14 @@ import numpy as np
 from fluidlift.io.asset_folder import mark_owner
 from fluidlift.io.atomic import plain, write_json
 from fluidlift.io.frames import FIRST_FRAME
-from fluidlift.pipeline.body import camera_of, grid_of, setting_of
-from fluidlift.pipeline.lifting import FAST_FALL, plain_report
-from fluidlift.pipeline.mask_files import MASK_FACTS, cleared_masks, require_unchanged, sealed
-from fluidlift.pipeline.reading import Inputs, clip_of, spans_of
-from fluidlift.pipeline.seeing import TRUSTED, flow_of, masks_of
-from fluidlift.pipeline.story import Story
+from fluidlift.pipeline.fluid_masks import FluidMasks
+from fluidlift.pipeline.inputs import Inputs
+from fluidlift.pipeline.mask_facts import MASK_FACTS, cleared_masks, require_unchanged, sealed
+from fluidlift.pipeline.steady_flow import TRUSTED, spans_of
+from fluidlift.pipeline.volume_motion import FAST_FALL, plain_report
 from fluidlift.pipeline.written import cleared, numbered
-from fluidlift.types import CellType, FaceVelocity, SurfaceMotion
+from fluidlift.types import CellType, FaceVelocity, PixelFlow, SurfaceMotion, VideoClip
+from fluidlift.types.stages import Geometry
 
 if TYPE_CHECKING:
     from fluidlift.motion.sequence import FrameMotion
@@ -49,32 +49,49 @@ class MotionFiles:
         return [*found, folder / "raw_flow" / flow] if self.raw else found
 
 
+@dataclass(frozen=True)
+class WritingPlace:
+    """Where files go, and what lies there already."""
+
+    folder: Path
+    inputs: Inputs
+    """of the job: what was given stays as it is"""
+    again: bool = False
+    """write all frames again, over masks that a person has changed, too"""
+
+
 class FrameWriter:
     """Writes frames one after the other and remembers what it has written.
 
     Args:
-        story: with the geometry done.
-        folder: to write.
-        files: which.
-        inputs: of the job.
-        again: write all frames again, over masks that a person has changed, too.
+        clip: that moves.
+        masks: of its fluid.
+        measured: its flow, as measured.
+        geometry: of the body.
+        files: which are written.
+        place: where they go.
+        key: of the run: only one with the same goes on from what it has written.
 
     Raises:
         InputRejected: a person has changed the masks of the run before, and has not given them back.
     """
 
-    def __init__(self, story: Story, folder: Path, files: MotionFiles, inputs: Inputs, *, again: bool) -> None:
-        self.story, self.folder, self.files, self.inputs = story, folder, files, inputs
-        self.clip, self.masks, self.measured = clip_of(story), masks_of(story), flow_of(story)
+    def __init__(
+        self, clip: VideoClip, masks: FluidMasks, measured: PixelFlow, geometry: Geometry, files: MotionFiles,
+        place: WritingPlace, key: str,
+    ) -> None:  # fmt: skip
+        folder, inputs = place.folder, place.inputs
+        self.folder, self.inputs, self.files = folder, inputs, files
+        self.clip, self.masks, self.measured, self.geometry = clip, masks, measured, geometry
+        self.journal = folder / "work" / "velocities" / f"{key}.rows"
         self.spans = spans_of(self.clip)
-        self.grid, self.cells = grid_of(story), setting_of(story).cell_types
+        self.grid, self.cells = geometry.grid, geometry.setting.cell_types
         self.scale = self._flow_scale()
         self.keeps_masks = _same(inputs.mask, folder / "mask")
         """the masks there are those that were given: they stay as they are"""
-        self.journal = folder / "work" / "velocities" / f"{story.keys['velocities']}.rows"
-        self.rows: dict[int, dict[str, Any]] = {} if again else self._written_before()
+        self.rows: dict[int, dict[str, Any]] = {} if place.again else self._written_before()
         if not self.rows:
-            if not again and not self.keeps_masks:
+            if not place.again and not self.keeps_masks:
                 require_unchanged(folder / "mask", "velocities")
             self._clear()
         self._write_once()
@@ -168,7 +185,7 @@ class FrameWriter:
         from fluidlift.io.images import write_png
         from fluidlift.motion.optical_flow import flow_picture
 
-        write_json(self.folder / "camera.json", camera_of(self.story).to_dict())
+        write_json(self.folder / "camera.json", self.geometry.camera.to_dict())
         if not self.keeps_masks:
             write_json(self.folder / "mask" / MASK_FACTS, self._mask_facts())
         across = np.linspace(-self.scale, self.scale, LEGEND_SIDE, dtype=np.float32)
@@ -178,8 +195,8 @@ class FrameWriter:
 
     def _flow_scale(self) -> float:
         """px per frame of full colour, the same for the whole clip: a little above its mean motion."""
-        g = self.story["geometry"].arrays
-        speed = np.linalg.norm(g["mean_flow"], axis=-1)[(g["mean_confidence"] > TRUSTED) & g["mask"]]
+        g = self.geometry
+        speed = np.linalg.norm(g.mean_flow, axis=-1)[(g.mean_confidence > TRUSTED) & g.mask]
         return max(1.3 * float(np.percentile(speed, 99)), 0.5) if speed.size else 1.0
 
     def _overlay(self, t: int, displacement: np.ndarray, mask: np.ndarray) -> np.ndarray:

@@ -16,10 +16,9 @@ import numpy as np
 from fluidlift.errors import InputRejected
 from fluidlift.io.images import read_camera, read_json
 from fluidlift.io.ply import read_gaussians
-from fluidlift.pipeline.story import Story
 from fluidlift.shape import given, place, surface
-from fluidlift.shape.kind import UpEvidence
-from fluidlift.types import FluidKind, Gaussians, PinholeCamera, Similarity3, kind_of
+from fluidlift.types import FluidKind, Gaussians, PinholeCamera, Similarity3, UpEvidence, kind_of
+from fluidlift.types.stages import Geometry
 
 NOTE = "generator.json"
 """file of a folder of generated bodies: `name`, `metric` (in metres), `knows_up` (z is the vertical), `frames`"""
@@ -119,26 +118,24 @@ def given_front(
     return surface.FrontSurface(front.depth, thick.astype(np.float32), front.height), metres
 
 
-def placed_bodies(
-    story: Story, folder: Path, frames: list[int], camera: PinholeCamera, placement: Similarity3
-) -> list[Gaussians]:
+def placed_bodies(geometry: Geometry, folder: Path, frames: list[int]) -> list[Gaussians]:
     """The bodies in the world: a user's where its files have them, a generator's as the clip's camera saw them.
 
     Args:
-        story: whose geometry is done.
+        geometry: of the clip.
         folder: of the bodies.
         frames: that are wanted.
-        camera: of the clip, in the world.
-        placement: world_from_canonical.
     """
-    seen, g = given_bodies(folder, camera.size, frames), story["geometry"]
+    camera = geometry.camera
+    seen = given_bodies(folder, camera.size, frames)
     if note_of(folder) is None:
+        assert geometry.known_scale is not None  # a user's body is in metres
         to_canonical = given.canonical_from_given(seen.cameras[0], seen.bodies[0])
-        scale = 1.0 / g.meta["known_scale"]
+        scale = 1.0 / geometry.known_scale
         moved = to_canonical.translation * (scale / to_canonical.scale)
-        to_world = placement @ Similarity3(scale, to_canonical.rotation, moved)
+        to_world = geometry.world_from_canonical @ Similarity3(scale, to_canonical.rotation, moved)
         return [b.transformed(to_world) for b in seen.bodies]
-    depth, mask = g.arrays["depth"], g.arrays["mask"]
+    depth, mask = geometry.depth, geometry.mask
     first = given.into_view(seen.bodies[0].means, seen.cameras[0], camera)
     near, _ = given.near_and_far(seen.bodies[0].transformed(first), camera, mask)
     visible = mask & (depth > 0)

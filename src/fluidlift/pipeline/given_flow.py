@@ -12,17 +12,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected
 from fluidlift.io.video import frames_before
-from fluidlift.pipeline.reading import Inputs, clip_of
-from fluidlift.pipeline.story import Story
+from fluidlift.pipeline.settings import GivenFlow
+from fluidlift.types.stages import Read
 
 if TYPE_CHECKING:
     from fluidlift.io.flow_files import FlowFiles, FlowLayout, Pair
 
 
-def given_flow(story: Story, inputs: Inputs, config: JobConfig) -> tuple[Iterable[Pair], bool, list[str]]:
+def flow_of_files(read: Read, given: GivenFlow) -> tuple[Iterable[Pair], bool, list[str]]:
     """The user's displacement and confidence of each pair of the used frames, whether the files have one, warnings.
 
     Raises:
@@ -30,28 +29,23 @@ def given_flow(story: Story, inputs: Inputs, config: JobConfig) -> tuple[Iterabl
     """
     from fluidlift.io.images import read_distortion
 
-    read = story["read"]
-    kept = np.asarray(read.arrays["kept"])
-    files, places, warnings = _opened(story, inputs, config, kept)
+    files, places, warnings = _opened(read, given)
     warnings += files.warnings
-    if read.meta["stabilised"]:
+    if read.stabilised:
         warnings.append("the clip was steadied, the given flow was not: it should be that of steady pictures")
-    if inputs.camera is not None and read_distortion(inputs.camera) is not None:
+    if given.camera is not None and read_distortion(given.camera.path) is not None:
         warnings.append("lens distortion was taken out of the clip: the given flow should be that of such pictures")
 
     return (_between(files, first, last) for first, last in pairwise(places.tolist())), files.has_confidence, warnings
 
 
-def _opened(
-    story: Story, inputs: Inputs, config: JobConfig, kept: np.ndarray
-) -> tuple[FlowFiles, np.ndarray, list[str]]:
+def _opened(read: Read, given: GivenFlow) -> tuple[FlowFiles, np.ndarray, list[str]]:
     """The files, and the pair of theirs that begins at each used frame."""
     from fluidlift.io.flow_files import open_flow
 
-    assert inputs.flow is not None
-    size, decoded = clip_of(story).size, int(story["read"].meta["decoded_frames"])
-    before = frames_before(inputs.clip, config.read.start, config.read.fps) if config.read.start > 0 else 0
-    used, layout = np.arange(len(kept)), flow_layout(config)
+    size, decoded, kept = read.clip.size, read.decoded, np.asarray(read.kept)
+    before = frames_before(given.clip.path, given.start, given.fps) if given.start > 0 else 0
+    used, layout = np.arange(len(kept)), flow_layout(given)
     ways = [(before, decoded - 1, kept, "")]
     if before:
         ways.append((0, decoded - 1, kept, f"it is taken to begin where --start does, with frame {before} of the file"))
@@ -60,7 +54,7 @@ def _opened(
     refusal: InputRejected | None = None
     for start, pairs, places, words in ways:
         try:
-            files = open_flow(inputs.flow, size, pairs, start=start, layout=layout)
+            files = open_flow(given.files.path, size, pairs, start=start, layout=layout)
         except InputRejected as error:
             refusal = refusal or error
             continue
@@ -69,7 +63,7 @@ def _opened(
     raise refusal
 
 
-def flow_layout(config: JobConfig) -> FlowLayout:
+def flow_layout(given: GivenFlow) -> FlowLayout:
     """What the numbers of the user's flow mean, from the settings.
 
     Raises:
@@ -77,13 +71,12 @@ def flow_layout(config: JobConfig) -> FlowLayout:
     """
     from fluidlift.io.flow_files import FlowLayout
 
-    m = config.motion
-    if len(m.flow_channels) not in (0, 2):
-        raise InputRejected(f"motion.flow_channels = {','.join(m.flow_channels)}", "two names, such as R,G")
-    if m.flow_scale == 0:
+    channels = given.flow_channels
+    if len(channels) not in (0, 2):
+        raise InputRejected(f"motion.flow_channels = {','.join(channels)}", "two names, such as R,G")
+    if given.flow_scale == 0:
         raise InputRejected("motion.flow_scale = 0", "px per stored unit, not 0")
-    u_v = (m.flow_channels[0], m.flow_channels[1]) if m.flow_channels else None
-    return FlowLayout(u_v, m.flow_v_up, m.flow_scale)
+    return FlowLayout((channels[0], channels[1]) if channels else None, given.flow_v_up, given.flow_scale)
 
 
 def _between(files: FlowFiles, first: int, last: int) -> Pair:

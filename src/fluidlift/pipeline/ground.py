@@ -1,21 +1,22 @@
-"""What a fluid rests in: cells and terrain from its surface, the texture of the ground, and how both are stored."""
+"""What a fluid rests in: cells and terrain from its surface, and the ground's texture or colours."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
+from jaxtyping import UInt8
 
 from fluidlift.io.stage_cache import parts_of
-from fluidlift.shape import airborne, channel, generate, ground_texture, place, plan, terrain
+from fluidlift.shape import airborne, channel, generate, ground_mesh, ground_texture, place, plan
 from fluidlift.shape.jets import lying_pixels
-from fluidlift.types import Label, kind_of
+from fluidlift.types import Label, PinholeCamera, Setting, kind_of
 
 
 def setting_around(
     kind, front, fluid, start, united, camera, to_world, depth, half, bulk, c, falls, **known
-) -> terrain.Setting:
+) -> Setting:
     """Terrain and cells around a surface; what is known beside it goes to `plan.Footage`."""
     mask = generate.united_mask(fluid[start : start + united])
     visible = mask & (depth > 0)
@@ -45,7 +46,7 @@ def seen_labels(fluid, start: int, united: int, falls: np.ndarray) -> np.ndarray
     return np.where(solid, Label.SOLID, np.where(lying, Label.FLUID, Label.BACKGROUND)).astype(np.uint8)
 
 
-def textured(setting: terrain.Setting, view: ground_texture.View) -> terrain.Setting:
+def textured(setting: Setting, view: ground_texture.View) -> Setting:
     """The setting, its terrain with the picture on it."""
     solid = setting.terrain
     mesh = ground_texture.textured(solid.mesh, solid.grid, cast(np.ndarray, setting.surface_height), view)
@@ -58,24 +59,13 @@ def solid_share(labels: np.ndarray) -> np.ndarray:
     return np.sum([part.sum(axis=0) for part in parts], axis=0) / len(labels)
 
 
-def packed(setting: terrain.Setting) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """A setting as arrays and plain values; `setting_of` reads them back."""
-    solid = setting.terrain
-    arrays = {
-        "signed_distance": solid.signed_distance,
-        "mainstream": solid.mainstream,
-        "mesh_vertices": solid.mesh.vertices,
-        "mesh_faces": solid.mesh.faces,
-        "cell_types": setting.cell_types,
-        "bed_height": setting.bed_height.astype(np.float32),
-    }
-    if setting.surface_height is not None:
-        arrays["surface_height"] = setting.surface_height.astype(np.float32)
-    if solid.mesh.uv is not None and solid.mesh.texture is not None:
-        arrays |= {"mesh_uv": solid.mesh.uv, "mesh_texture": solid.mesh.texture, "mesh_colours": solid.mesh.colors}
-    grid = {"shape": solid.grid.shape, "spacing": solid.grid.spacing, "origin": solid.grid.origin}
-    return arrays, {
-        "grid": grid,
-        "height_field": setting.surface_height is not None,
-        "pool_level": setting.pool_level,
-    }
+def finished(setting: Setting, plate: UInt8[np.ndarray, "h w 3"], camera: PinholeCamera) -> Setting:
+    """The setting in float32, its ground in the colours of the plate where it has no texture."""
+    mesh = setting.terrain.mesh
+    if len(mesh.faces) and mesh.texture is None:
+        mesh = replace(mesh, colors=ground_mesh.ground_colours(mesh, plate, camera))
+    height = None if setting.surface_height is None else setting.surface_height.astype(np.float32)
+    return replace(
+        setting, terrain=replace(setting.terrain, mesh=mesh), surface_height=height,
+        bed_height=setting.bed_height.astype(np.float32),
+    )  # fmt: skip

@@ -4,49 +4,53 @@ from __future__ import annotations
 
 import numpy as np
 
-from fluidlift.config import JobConfig
 from fluidlift.pipeline import given_body
-from fluidlift.pipeline.reading import Inputs
+from fluidlift.pipeline.inputs import GivenFile
+from fluidlift.pipeline.settings import GivenView
 from fluidlift.types import PinholeCamera
 
 USUAL_FIELD_OF_VIEW = 50.0
 """degrees across the longer side, where nothing says better: between a phone's main lens (65) and a short telephoto"""
 
 
-def known_field_of_view(inputs: Inputs, config: JobConfig, size: tuple[int, int]) -> tuple[float, bool]:
+def known_field_of_view(given: GivenView, fov: float | None, size: tuple[int, int]) -> tuple[float, bool]:
     """Degrees across the longer side, and whether that was told: by the user, a camera file or the lens."""
+    focal = max(known_camera(given, fov, size)[0].focal)
+    return float(2 * np.degrees(np.arctan(0.5 * max(size) / focal))), lens_is_known(given, fov)
+
+
+def lens_is_known(given: GivenView, fov: float | None) -> bool:
+    """Whether the user (`fov`, degrees), a camera file or the clip's file says how wide the picture is."""
     from fluidlift.io.lens import lens_field_of_view
 
-    focal = max(known_camera(inputs, config, size)[0].focal)
-    told = inputs.camera is not None or config.shape.fov or lens_field_of_view(inputs.clip)
-    return float(2 * np.degrees(np.arctan(0.5 * max(size) / focal))), bool(told)
+    return bool(given.camera is not None or fov or lens_field_of_view(given.clip.path))
 
 
-def known_camera(inputs: Inputs, config: JobConfig, size: tuple[int, int]) -> tuple[PinholeCamera, bool]:
+def known_camera(given: GivenView, fov: float | None, size: tuple[int, int]) -> tuple[PinholeCamera, bool]:
     """The camera file's camera, or one from the field of view; and whether its pose is known."""
     from fluidlift.io.images import read_camera, read_json
 
-    if inputs.geometry is not None and given_body.note_of(inputs.geometry) is None:
+    bodies = None if given.bodies is None else given.bodies.path
+    if bodies is not None and given_body.note_of(bodies) is None:
         # its camera is the one that saw the body; its world is not the user's
-        return read_camera(inputs.geometry / "camera.json", size), False
-    if inputs.camera is None:
+        return read_camera(bodies / "camera.json", size), False
+    if given.camera is None:
         from fluidlift.io.lens import lens_field_of_view
 
-        fov = config.shape.fov or lens_field_of_view(inputs.clip) or USUAL_FIELD_OF_VIEW
-        return PinholeCamera.from_fov(fov, size), False
-    camera = read_camera(inputs.camera, size)
-    data = read_json(inputs.camera, "camera file")
+        return PinholeCamera.from_fov(fov or lens_field_of_view(given.clip.path) or USUAL_FIELD_OF_VIEW, size), False
+    camera = read_camera(given.camera.path, size)
+    data = read_json(given.camera.path, "camera file")
     return camera, "R" in data or "frames" in data
 
 
-def level_of(level: tuple[str, str], inputs: Inputs) -> tuple[float, str]:
+def level_of(level: tuple[str, str], camera: GivenFile | None) -> tuple[float, str]:
     """z of the plane that a surveyed camera stands over (`FluidKind.surveyed_level`), m, where a camera file says it;
     else 0, the ground of its world, and a warning.
     """
     from fluidlift.io.images import read_json
 
     name, what = level
-    data = read_json(inputs.camera, "camera file") if inputs.camera is not None else {}
+    data = read_json(camera.path, "camera file") if camera is not None else {}
     value = data.get(name)
     if isinstance(value, int | float):
         return float(value), ""

@@ -33,7 +33,7 @@ from fluidlift.types import Gaussians, concatenate
 
 if TYPE_CHECKING:
     from fluidlift.pipeline.scene import Scene
-    from fluidlift.pipeline.simulating import History
+    from fluidlift.pipeline.simulated_history import History
 
 FAINTEST = 1 / 255
 """opacity below which a splat is not drawn"""

@@ -3,24 +3,40 @@
 from __future__ import annotations
 
 import platform
-import tempfile
 import time
 from collections.abc import Iterable
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from fluidlift import __version__
 from fluidlift.config import JobConfig
-from fluidlift.pipeline import begin, body, calibrating, generating, lifting, moving, refining, simulating
-from fluidlift.pipeline.begin import input_hashes, provenance_of
+from fluidlift.pipeline import begin
 from fluidlift.pipeline.fit_request import request_of
-from fluidlift.pipeline.reading import Inputs, clip_of
+from fluidlift.pipeline.fluid_masks import FluidMasks
+from fluidlift.pipeline.inputs import GivenFile, GivenFiles, Inputs
 from fluidlift.pipeline.resimulate import Made, play
-from fluidlift.pipeline.scene import SimulationRequest, first_of_film, scene_of
-from fluidlift.pipeline.seeing import masks_of
-from fluidlift.pipeline.story import Progress, Result, Silence, Story, gone_if_refused
+from fluidlift.pipeline.runner import Runner, gone_if_refused
+from fluidlift.pipeline.scene import SimulationRequest, edited_scene, first_of_film
+from fluidlift.pipeline.settings import (
+    GenerateSettings,
+    GivenView,
+    MotionSettings,
+    RefineSettings,
+    SceneSettings,
+    taken,
+)
+from fluidlift.pipeline.simulator import particle_work
+from fluidlift.pipeline.splat_files import require_room
+from fluidlift.pipeline.stages import generate
+from fluidlift.pipeline.stages.calibrate import calibrate, mean_target
+from fluidlift.pipeline.stages.fit import fit
+from fluidlift.pipeline.stages.motion import motion
+from fluidlift.pipeline.stages.refine import refine
+from fluidlift.pipeline.work import Progress, Silence
 from fluidlift.pipeline.written import require_stages
 from fluidlift.types import FluidAsset, kind_of
+from fluidlift.types.stages import Bodies, Calibration, Fit, Lift, Read, Segmentation
 
 STAGES = ("read", "flow", "segment", "geometry", "refine", "motion", "fit", "calibrate", "simulate", "show")
 
@@ -51,126 +67,139 @@ def make(
     from fluidlift.io.asset_folder import check_output_folder
     from fluidlift.io.asset_lock import writing
 
-    stages = generating.stages_of(STAGES, config)
+    stages = generate.stages_of(STAGES, config)
     require_stages(force, stages)
     check_output_folder(folder)
-    simulating.particle_work(config.simulate.device)  # a device that is not there is said now, not after the fit
+    particle_work(config.simulate.device)  # a device that is not there is said now, not after the fit
     request_of(config.fit)  # so is a parameter that is not known
-    warnings = generating.require_usable(inputs, config, folder)
+    warnings = generate.require_usable(inputs, config, folder)
     began = time.perf_counter()
-    story = Story(folder, stages, force=frozenset(force), progress=progress or Silence())
+    runner = Runner(folder, stages, force=frozenset(force), progress=progress or Silence())
     for text in warnings:
-        story.warn(text)
-    with gone_if_refused(story, "motion"), writing(folder, "fluidlift make"):
-        provenance = _run(story, inputs, config)
-        frames = config.simulate.frames or len(clip_of(story)) - story["geometry"].meta["rest_frame"]
-        simulating.require_room(folder, frames, len(body.rest_of(story)))
-        _write_asset(story, folder, config, provenance)
-        frames = play(story, folder, config, SimulationRequest(restart="simulate" in story.force))
-    return Made(folder, tuple(story.warnings), time.perf_counter() - began, story.timings, frames)
+        runner.warn(text)
+    with gone_if_refused(runner, "motion"), writing(folder, "fluidlift make"):
+        given = GivenFiles.of(inputs)
+        lift = _lifted(runner, given, config)
+        frames = config.simulate.frames or len(lift.clip) - lift.geometry.rest_frame
+        require_room(folder, frames, len(lift.refined.body))
+        asset = _write_asset(runner, lift, config, given.provenance())
+        request = SimulationRequest(restart="simulate" in runner.force)
+        frames = play(runner, asset, config, request, lift)
+    return Made(folder, tuple(runner.warnings), time.perf_counter() - began, runner.timings, frames)
 
 
-def _run(story: Story, inputs: Inputs, config: JobConfig) -> dict[str, Any]:
-    hashes = input_hashes(inputs)
-    seed, run, shape = config.seed, story.run, config.section("shape")
-    begin.look(story, inputs, config, hashes)
-    given, known = generating.run(story, inputs, config, hashes)
-    begin.shape(story, given, config, known)
-    run("refine", lambda: refining.refine(story, given, config), settings=[shape, seed], after=("geometry",))
-    run("motion", lambda: lifting.motion(story, config), settings=config.section("motion"), after=("geometry",))
-    run("fit", lambda: moving.fit(story, config), settings=config.section("fit"), after=("motion",))
-    return provenance_of(inputs, hashes)
+def _lifted(runner: Runner, given: GivenFiles, config: JobConfig) -> Lift:
+    """From the clip to the parameters."""
+    read, flow, segmentation = seen = begin.look(runner, given, config)
+    given = _with_bodies(runner, read, segmentation, given, config)
+    geometry = begin.shape(runner, seen, given, config)
+    settings = taken(RefineSettings, config.shape, seed=config.seed)
+    refined = runner.run("refine", refine, *seen, geometry, given.geometry, settings)
+    moving = runner.run("motion", motion, *seen, geometry, taken(MotionSettings, config.motion))
+    fitted = runner.run("fit", fit, read, segmentation, geometry, moving, config.fit)
+    return Lift(read, flow, segmentation, geometry, refined, moving, fitted)
 
 
-def _write_asset(story: Story, folder: Path, config: JobConfig, provenance: dict[str, Any]) -> None:
+def _with_bodies(
+    runner: Runner, read: Read, segmentation: Segmentation, given: GivenFiles, config: JobConfig
+) -> GivenFiles:
+    """Ask the generator where the job has one: its bodies count as given."""
+    if config.generate.name is None:
+        return given
+    view, name = GivenView(given.clip, given.camera), generate.STAGE
+
+    def there(made: Bodies) -> bool:
+        return generate.bodies_there(generate.bodies_folder(runner.folder, runner.keys[name]), made)
+
+    runner.run(
+        name, generate.generate, read, segmentation, view, GenerateSettings.of(config),
+        beside={"folder": runner.folder}, still_there=there,
+    )  # fmt: skip
+    key = runner.keys[name]
+    return replace(given, geometry=GivenFile(generate.bodies_folder(runner.folder, key), key))
+
+
+def _write_asset(runner: Runner, lift: Lift, config: JobConfig, provenance: dict[str, Any]) -> FluidAsset:
     """The body at rest and what moves it; simulation and pictures come after."""
-    from fluidlift.io.asset_folder import save_asset
+    from fluidlift.io.asset_folder import load_asset, save_asset
     from fluidlift.io.force_file import write_force
 
-    clip, g = clip_of(story), story["geometry"]
-    setting = body.setting_of(story)
-    _write_film(story, folder)
-    origin = {"config": config.to_dict(), "versions": versions(), "seed": config.seed, "stages": dict(story.keys)}
+    clip, g, folder = lift.clip, lift.geometry, runner.folder
+    _write_film(lift, folder)
+    origin = {"config": config.to_dict(), "versions": versions(), "seed": config.seed, "stages": dict(runner.keys)}
     asset = FluidAsset(
-        kind=g.meta["kind"],
-        rest=body.rest_of(story),
-        terrain=setting.terrain,
-        grid=setting.terrain.grid,
-        cell_types=setting.cell_types,
-        velocity=lifting.targets_of(story)[0],
-        parameters=moving.parameters_of(story),
-        estimates=moving.estimates_of(story),
-        camera=body.camera_of(story),
-        world_from_canonical=body.placement_of(story),
+        kind=g.kind,
+        rest=lift.refined.body,
+        terrain=g.setting.terrain,
+        grid=g.grid,
+        cell_types=g.setting.cell_types,
+        velocity=lift.motion.velocities[0],
+        parameters=lift.fit.parameters,
+        estimates=lift.fit.estimates,
+        camera=g.camera,
+        world_from_canonical=g.world_from_canonical,
         interval=clip.interval,
         frame_count=len(clip),
         provenance=provenance | origin,
     )
-    write_force(folder, calibrating.force_of(_calibrated(story, asset, config)))
+    calibration = _calibrated(runner, lift, asset, config)
+    write_force(folder, calibration.force)
     save_asset(
         folder,
         asset,
-        timings={k: float(t["seconds"]) for k, t in story.timings.items()},
-        metrics=_metrics(story),
-        warnings=story.warnings,
+        timings={k: float(t["seconds"]) for k, t in runner.timings.items()},
+        metrics=_metrics(lift, calibration),
+        warnings=runner.warnings,
     )
+    return load_asset(folder)  # as everybody else finds it: files hold less digits
 
 
-def _calibrated(story: Story, asset: FluidAsset, config: JobConfig) -> Result:
+def _calibrated(runner: Runner, lift: Lift, asset: FluidAsset, config: JobConfig) -> Calibration:
     """The force that keeps the filmed flow, from a run without what scene.yaml changes."""
-    with tempfile.TemporaryDirectory(prefix="fluidlift-calibrate-") as name:
-        start = story["geometry"].meta["rest_frame"]
-        scene = scene_of(asset, Path(name), SimulationRequest(), config, footage=None, start=start)
-    target = calibrating.mean_target(asset, lifting.targets_of(story))
-    return story.run(
-        "calibrate",
-        lambda: (
-            calibrating.calibrate(scene, target, device=config.simulate.device, step=story.step)
-            if config.simulate.follow > 0
-            else Result()
-        ),
-        settings=[config.simulate.follow > 0, scene.frames, config.seed],
-        after=("geometry", "refine", "motion", "fit"),
-    )
+    from fluidlift.io.scene import SceneEdits
+
+    scene = edited_scene(asset, SceneEdits(), None, SceneSettings.of(config), start=lift.geometry.rest_frame)
+    target = mean_target(asset, lift.motion.velocities)
+    s = config.simulate
+    return runner.run("calibrate", calibrate, scene, target, wanted=s.follow > 0, beside={"device": s.device})
 
 
-def _write_film(story: Story, folder: Path) -> None:
+def _write_film(lift: Lift, folder: Path) -> None:
     """The film that the fluid's surface plays; smoke has none."""
     from fluidlift.io.asset_folder import FILES
     from fluidlift.io.footage_file import MOST_FRAMES, write_footage
 
-    film, start = folder / FILES["film"], story["geometry"].meta["rest_frame"]
-    if kind_of(story["geometry"].meta["kind"]).is_gas:
+    film = folder / FILES["film"]
+    if kind_of(lift.geometry.kind).is_gas:
         film.unlink(missing_ok=True)  # of an earlier run, as something else
         return
-    clip = clip_of(story)
-    first = first_of_film(start, len(clip))
+    clip = lift.clip
+    first = first_of_film(lift.geometry.rest_frame, len(clip))
     part = slice(first, first + MOST_FRAMES)
-    write_footage(film, clip.frames[part], masks_of(story)[part], clip.interval)
+    write_footage(film, clip.frames[part], FluidMasks(lift.labels.labels)[part], clip.interval)
 
 
-def _metrics(story: Story) -> dict[str, Any]:
-    g, refined, reports = story["geometry"].meta, story["refine"].meta, story["motion"].meta["reports"]
+def _metrics(lift: Lift, calibration: Calibration) -> dict[str, Any]:
+    g, reports = lift.geometry, lift.motion.reports
     return {
-        "kind_scores": g["kind_evidence"]["scores"],
-        "up": g["up"],
-        "scale": g["scale"],
-        "rest_frame": g["rest_frame"],
-        "gaussians": refined["total"],
-        "refine_psnr_after": refined.get("psnr_after"),
+        "kind_scores": g.kind_evidence.scores,
+        "up": asdict(g.up),
+        "scale": asdict(g.scale) | {"sentence": g.scale_sentence},
+        "rest_frame": g.rest_frame,
+        "gaussians": len(lift.refined.body),
+        "refine_psnr_after": lift.refined.psnr_after,
         "divergence_max": max((r.get("divergence_max", 0.0) for r in reports), default=None),
-        "fit_converged": story["fit"].meta["converged"],
-        "fit_rollouts": story["fit"].meta["rollouts"],
-        "fit_extra": story["fit"].meta["extra"],
-        "fit": fit_figures(story),
-        "calibration": {k: story["calibrate"].meta.get(k) for k in ("acceleration", "speed", "left", "frames")},
+        "fit_converged": lift.fit.converged,
+        "fit_rollouts": lift.fit.rollouts,
+        "fit_extra": lift.fit.extra,
+        "fit": fit_figures(lift.fit),
+        "calibration": {k: getattr(calibration, k) for k in ("acceleration", "speed", "left", "frames")},
     }
 
 
-def fit_figures(story: Story) -> dict[str, Any]:
+def fit_figures(fit: Fit) -> dict[str, Any]:
     """How the fit ended, and its table, for the manifest."""
-    meta = story["fit"].meta
-    return {k: meta[k] for k in ("status", "reason", "warnings", "notes", "table")}
+    return {k: getattr(fit, k) for k in ("status", "reason", "warnings", "notes", "table")}
 
 
 def versions() -> dict[str, str]:

@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 
 from fluidlift.config import JobConfig
-from fluidlift.errors import InputRejected
 from fluidlift.pipeline import begin
-from fluidlift.pipeline.reading import Inputs, clip_of
-from fluidlift.pipeline.seeing import NO_HINTS, Hints, labels_of
-from fluidlift.pipeline.story import Progress, Result, Silence, Story, gone_if_refused
-from fluidlift.pipeline.written import Written, cleared, digest_of, numbered, require_stages
+from fluidlift.pipeline.hints import NO_HINTS, Hints
+from fluidlift.pipeline.inputs import GivenFiles, Inputs
+from fluidlift.pipeline.mask_facts import cleared_masks, require_unchanged, sealed
+from fluidlift.pipeline.runner import Runner, gone_if_refused
+from fluidlift.pipeline.work import Progress, Silence, Work
+from fluidlift.pipeline.written import Written, cleared, numbered, require_stages
 from fluidlift.types import Label
+from fluidlift.types.stages import MaskFiles, Read, Segmentation
 
 MASK_STAGES = ("read", "flow", "segment", "masks")
-MASK_FACTS = "mask.json"
-"""beside the pictures: what they belong to"""
 
 
 def find_masks(
@@ -51,121 +51,71 @@ def find_masks(
     require_stages(force, MASK_STAGES)
     check_output_folder(folder)
     began = time.perf_counter()
-    story = Story(folder, MASK_STAGES, force=frozenset(force), progress=progress or Silence())
-    with gone_if_refused(story, "segment"):
-        begin.look(story, inputs, config, begin.input_hashes(inputs), hints)
-        found = story.run(
-            "masks",
-            lambda: _write(story, folder, "masks" in story.force, inputs.camera is not None),
-            settings=inputs.camera is not None,
-            after=("read", "segment"),
-            still_there=lambda result: all(
-                numbered(folder / name, t, ".png").is_file()
-                for name in ("mask", "overlay") for t in range(result.meta["frames"])
+    runner = Runner(folder, MASK_STAGES, force=frozenset(force), progress=progress or Silence())
+    with gone_if_refused(runner, "segment"):
+        read, _, segmentation = begin.look(runner, GivenFiles.of(inputs), config, hints)
+        found = runner.run(
+            "masks", write_masks, read, segmentation, undistorted=inputs.camera is not None,
+            beside={"folder": folder, "overwrite": "masks" in runner.force},
+            still_there=lambda made: all(
+                numbered(folder / name, t, ".png").is_file() for name in ("mask", "overlay") for t in range(made.frames)
             ),
             owns_files=True,
         )  # fmt: skip
     return Written(
-        folder, time.perf_counter() - began, tuple(story.warnings), story.timings,
-        _facts(story, folder, found), _words(story, folder, found),
+        folder, time.perf_counter() - began, tuple(runner.warnings), runner.timings,
+        _facts(segmentation, folder, found), _words(segmentation, folder, found),
     )  # fmt: skip
 
 
-def _write(story: Story, folder: Path, overwrite: bool, undistorted: bool) -> Result:
+def write_masks(
+    read: Read, segmentation: Segmentation, *, undistorted: bool, folder: Path, overwrite: bool, work: Work
+) -> MaskFiles:
     """The pictures, and beside them what they belong to."""
     from fluidlift.io.asset_folder import mark_owner
     from fluidlift.io.images import write_png
     from fluidlift.shape.segment import overlay
 
-    clip, labels = clip_of(story), labels_of(story)
+    clip, labels = read.clip, segmentation.labels
     if not overwrite:
         require_unchanged(folder / "mask", MASK_STAGES[-1])
     mark_owner(folder, "velocities", None)  # motion has masks and overlays of the same names
     masks, overlays = cleared_masks(folder / "mask"), cleared(folder / "overlay", (".png",))
     for t in range(len(clip)):
-        story.step(t, len(clip))
+        work.step(t, len(clip))
         seen = np.asarray(labels.labels[t])
         write_png(numbered(masks, t, ".png"), np.where(seen == Label.FLUID, 255, 0).astype(np.uint8))
         write_png(numbered(overlays, t, ".png"), overlay(np.asarray(clip.frames[t]), seen))
-    kept = story["read"].arrays["kept"]
     facts = {
         "of": clip.source,
         "size": clip.size,
         "frames": len(clip),
-        "first_frame_of_clip": int(kept[0]),
+        "first_frame_of_clip": int(read.kept[0]),
         "undistorted": undistorted,
     }
-    return Result({}, sealed(masks, facts))
+    sealed(masks, facts)
+    return MaskFiles(len(clip), clip.size)
 
 
-def cleared_masks(masks: Path) -> Path:
-    """The folder without the masks of an earlier run; their facts go first, so that a run cut off here is not taken
-    for a person's change."""
-    (masks / MASK_FACTS).unlink(missing_ok=True)
-    return cleared(masks, (".png",))
-
-
-def sealed(masks: Path, facts: dict[str, Any]) -> dict[str, Any]:
-    """Write what finished masks belong to, with the digest by which a person's change is seen later."""
-    from fluidlift.io.atomic import write_json
-
-    digest = digest_of(numbered(masks, t, ".png") for t in range(facts["frames"]))
-    facts = facts | {"sha256": digest}
-    write_json(masks / MASK_FACTS, facts)
-    return facts
-
-
-def require_unchanged(masks: Path, stage: str) -> None:
-    """Raise `InputRejected` where a person has changed the masks of an earlier run; `stage` writes them anew.
-
-    Masks without a digest are those of a run that was stopped: nothing is known of them.
-    """
-    from fluidlift.io.limits import read_json
-
-    if not (masks / MASK_FACTS).is_file():
-        return
-    facts = read_json(masks / MASK_FACTS, "mask facts")
-    facts = facts if isinstance(facts, dict) else {}
-    if "sha256" not in facts:
-        return
-    if digest_of(numbered(masks, t, ".png") for t in range(facts.get("frames", 0))) != facts["sha256"]:
-        raise InputRejected(
-            f"the masks in '{masks}' were changed since they were written", "another folder",
-            f"choose another one with -o, or write over them with --force {stage}",
-        )  # fmt: skip
-
-
-def is_straight(mask: Path) -> bool:
-    """Whether a mask was drawn on pictures without lens distortion, as those that fluidlift writes."""
-    from fluidlift.io.limits import read_json
-
-    facts = mask / MASK_FACTS if mask.is_dir() else mask.parent / MASK_FACTS
-    if not facts.is_file():
-        return False
-    data = read_json(facts, "mask facts")
-    return isinstance(data, dict) and data.get("undistorted") is True
-
-
-def _facts(story: Story, folder: Path, found: Result) -> dict[str, Any]:
-    meta = story["segment"].meta
+def _facts(segmentation: Segmentation, folder: Path, found: MaskFiles) -> dict[str, Any]:
     return {
         "mask": str(folder / "mask"),
         "overlay": str(folder / "overlay"),
-        "frames": found.meta["frames"],
-        "size": list(found.meta["size"]),
+        "frames": found.frames,
+        "size": list(found.size),
         "first_number": 1001,
-        "fluid_share": meta["fluid_share"],
-        "confidence_mean": meta["confidence_mean"],
-        "flow_trusted": meta["flow_trusted"],
+        "fluid_share": segmentation.fluid_share,
+        "confidence_mean": segmentation.confidence_mean,
+        "flow_trusted": segmentation.flow_trusted,
     }
 
 
-def _words(story: Story, folder: Path, found: Result) -> tuple[str, ...]:
-    meta, (width, height) = story["segment"].meta, found.meta["size"]
+def _words(segmentation: Segmentation, folder: Path, found: MaskFiles) -> tuple[str, ...]:
+    (width, height), sure = found.size, segmentation.confidence_mean
     return (
-        f"{found.meta['frames']} masks of {width} x {height} px in {folder / 'mask'}, to be compared with the overlays "
+        f"{found.frames} masks of {width} x {height} px in {folder / 'mask'}, to be compared with the overlays "
         f"in {folder / 'overlay'}",
-        f"fluid covers {100 * meta['fluid_share']:.0f} % of the picture, mean confidence {meta['confidence_mean']:.2f}",
+        f"fluid covers {100 * segmentation.fluid_share:.0f} % of the picture, mean confidence {sure:.2f}",
         f"correct them (white is fluid) and go on with: fluidlift make ... --mask {folder / 'mask'}",
         "or say more with --roi x,y,width,height, --click x,y and --not-here x,y",
     )

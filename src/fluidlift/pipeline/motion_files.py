@@ -13,14 +13,17 @@ import numpy as np
 from fluidlift.config import JobConfig
 from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.pipeline import begin
-from fluidlift.pipeline.body import grid_of
-from fluidlift.pipeline.frame_files import FrameWriter, MotionFiles
-from fluidlift.pipeline.lifting import motion_options, motion_scene, motion_warnings
-from fluidlift.pipeline.reading import Inputs, clip_of
-from fluidlift.pipeline.seeing import masks_of, pairs_of
-from fluidlift.pipeline.story import Progress, Result, Silence, Story, gone_if_refused
+from fluidlift.pipeline.fluid_masks import FluidMasks
+from fluidlift.pipeline.frame_files import FrameWriter, MotionFiles, WritingPlace
+from fluidlift.pipeline.inputs import GivenFiles, Inputs
+from fluidlift.pipeline.runner import Runner, gone_if_refused
+from fluidlift.pipeline.settings import MotionSettings, taken
+from fluidlift.pipeline.steady_flow import pairs_of
+from fluidlift.pipeline.volume_motion import motion_options, motion_scene, motion_warnings
+from fluidlift.pipeline.work import Progress, Silence, Work
 from fluidlift.pipeline.written import Written, numbered, require_stages
 from fluidlift.types import kind_of
+from fluidlift.types.stages import Flow, Geometry, Read, Segmentation, VelocityFiles
 
 MOTION_STAGES = ("read", "flow", "segment", "geometry", "velocities")
 
@@ -57,54 +60,54 @@ def measure_motion(
     require_stages(force, MOTION_STAGES)
     check_output_folder(folder)
     began = time.perf_counter()
-    story = Story(folder, MOTION_STAGES, force=frozenset(force), progress=progress or Silence())
-    with gone_if_refused(story, "geometry"):
-        hashes = begin.input_hashes(inputs)
-        begin.look(story, inputs, config, hashes)
-        begin.shape(story, inputs, config, hashes)
-        found = story.run(
-            "velocities",
-            lambda: _velocities(story, folder, config, files, inputs),
-            settings=[asdict(motion_options(config)), asdict(files)],
-            after=("read", "flow", "segment", "geometry"),
-            still_there=lambda result: _all_there(folder, files, result),
-            owns_files=True,
-        )
-        facts = _facts(story, found, begin.provenance_of(inputs, hashes))
+    runner = Runner(folder, MOTION_STAGES, force=frozenset(force), progress=progress or Silence())
+    with gone_if_refused(runner, "geometry"):
+        given = GivenFiles.of(inputs)
+        seen = begin.look(runner, given, config)
+        geometry = begin.shape(runner, seen, given, config)
+        found = runner.run(
+            "velocities", write_velocities, *seen, geometry, files, taken(MotionSettings, config.motion),
+            beside={"place": WritingPlace(folder, inputs, "velocities" in runner.force)},
+            still_there=lambda made: _all_there(folder, files, made), owns_files=True,
+        )  # fmt: skip
+        facts = _facts(seen, geometry, found) | {"provenance": given.provenance(), "warnings": list(runner.warnings)}
+        facts |= {"per_frame": list(found.rows)}
         write_json(folder / "motion.json", facts)
     return Written(
-        folder, time.perf_counter() - began, tuple(story.warnings), story.timings, facts, _words(folder, facts)
+        folder, time.perf_counter() - began, tuple(runner.warnings), runner.timings, facts, _words(folder, facts)
     )
 
 
-def _velocities(story: Story, folder: Path, config: JobConfig, files: MotionFiles, inputs: Inputs) -> Result:
+def write_velocities(
+    read: Read, flow: Flow, segmentation: Segmentation, geometry: Geometry, files: MotionFiles,
+    config: MotionSettings, *, place: WritingPlace, work: Work,
+) -> VelocityFiles:  # fmt: skip
     """Write the files of every frame; what was written by a run that was stopped is kept."""
     from fluidlift.motion.sequence import motion_sequence
 
-    clip, options = clip_of(story), motion_options(config)
-    pairs, g = len(clip) - 1, story["geometry"].meta
-    writer = FrameWriter(story, folder, files, inputs, again="velocities" in story.force)
+    clip, options, masks = read.clip, motion_options(config), FluidMasks(segmentation.labels.labels)
+    pairs, kind = len(clip) - 1, geometry.kind
+    writer = FrameWriter(clip, masks, flow.flow, geometry, files, place, work.key)
     wanted = [t for t in range(pairs) if t not in writer.rows]
     found = motion_sequence(
-        pairs_of(story), masks_of(story).__getitem__, pairs, motion_scene(story), options,
-        frames=wanted, volume_frames=() if kind_of(g["kind"]).starts_at_rest else wanted,
+        pairs_of(clip, flow.flow), masks.__getitem__, pairs, motion_scene(clip, geometry), options,
+        frames=wanted, volume_frames=() if kind_of(kind).starts_at_rest else wanted,
     )  # fmt: skip
     following = next(found, None)
     for t in wanted:
-        story.step(t, pairs)
+        work.step(t, pairs)
         here = following if following is not None and following.frame == t else None
         if here is not None:
             following = next(found, None)
         writer.write(t, here)
     rows = writer.finish(pairs)
     shares = [r["free_fall_share"] for r in rows if r.get("free_fall_share") is not None]
-    warnings = motion_warnings(rows, g["kind"], float(max(shares, default=0.0)))
-    if kind_of(g["kind"]).starts_at_rest:
+    warnings = motion_warnings(rows, kind, float(max(shares, default=0.0)))
+    if kind_of(kind).starts_at_rest:
         warnings.append(
-            f"the shape of a {g['kind']} is known as it stands, not as it collapses: flow is written, and no velocity "
-            "in m/s"
+            f"the shape of a {kind} is known as it stands, not as it collapses: flow is written, and no velocity in m/s"
         )
-    return Result({}, {"warnings": warnings + _unbalanced(rows), "rows": rows})
+    return VelocityFiles(tuple(rows), tuple(warnings + _unbalanced(rows)))
 
 
 def _unbalanced(rows: list[dict[str, Any]]) -> list[str]:
@@ -136,14 +139,13 @@ def _unbalanced(rows: list[dict[str, Any]]) -> list[str]:
     ]
 
 
-def _all_there(folder: Path, files: MotionFiles, result: Result) -> bool:
-    return all(path.is_file() for t in range(len(result.meta["rows"])) for path in files.of_frame(folder, t))
+def _all_there(folder: Path, files: MotionFiles, made: VelocityFiles) -> bool:
+    return all(path.is_file() for t in range(len(made.rows)) for path in files.of_frame(folder, t))
 
 
-def _facts(story: Story, found: Result, provenance: dict[str, Any]) -> dict[str, Any]:
-    clip, g, rows = clip_of(story), story["geometry"].meta, found.meta["rows"]
-    wet = [r for r in rows if r["fluid_share"] > 0]
-    grid = grid_of(story)
+def _facts(seen: tuple[Read, Flow, Segmentation], geometry: Geometry, found: VelocityFiles) -> dict[str, Any]:
+    (read, flow, segmentation), g, clip, grid = seen, geometry, seen[0].clip, geometry.grid
+    wet = [r for r in found.rows if r["fluid_share"] > 0]
     return {
         "format": "fluidlift motion",
         "format_version": 1,
@@ -152,23 +154,20 @@ def _facts(story: Story, found: Result, provenance: dict[str, Any]) -> dict[str,
         "frames": len(clip),
         "frame_interval": clip.interval,
         "times": [round(float(t), 6) for t in clip.times],
-        "frames_of_clip": [int(k) for k in story["read"].arrays["kept"]],
+        "frames_of_clip": [int(k) for k in read.kept],
         "size": list(clip.size),
-        "kind": g["kind"],
-        "kind_source": g["kind_source"],
-        "scale": g["scale"],
-        "scale_sentence": g["scale"].get("sentence", ""),
+        "kind": g.kind,
+        "kind_source": g.kind_source,
+        "scale": asdict(g.scale) | {"sentence": g.scale_sentence},
+        "scale_sentence": g.scale_sentence,
         "grid": {"shape": list(grid.shape), "spacing": grid.spacing, "origin": list(grid.origin)},
-        "fluid_share": story["segment"].meta["fluid_share"],
-        "flow_trusted_as_given": bool(story["flow"].meta.get("trusted_as_given")),
-        "flow_trusted": story["segment"].meta["flow_trusted"],
+        "fluid_share": segmentation.fluid_share,
+        "flow_trusted_as_given": flow.trusted_as_given,
+        "flow_trusted": segmentation.flow_trusted,
         "observed_share": _median(wet, "observed_share"),
         "surface_speed": _median(wet, "surface_speed_median"),
         "surface_speed_fast": _median(wet, "surface_speed_p90"),
         "divergence_max": max((r.get("divergence_max", 0.0) for r in wet), default=None),
-        "provenance": provenance,
-        "warnings": list(story.warnings),
-        "per_frame": rows,
     }
 
 

@@ -9,11 +9,12 @@ import numpy as np
 
 from fluidlift.errors import InputRejected
 from fluidlift.pipeline.as_filmed import Reel, why_not
-from fluidlift.pipeline.export_job import frames_of
-from fluidlift.pipeline.resimulate import FIRST_HALF, recall_first_half, settings_of
-from fluidlift.pipeline.scene import SimulationRequest, footage_of, scene_of
-from fluidlift.pipeline.showing import FrontView, to_bytes
-from fluidlift.pipeline.story import Progress, Silence, Story
+from fluidlift.pipeline.front_view import FrontView, to_bytes
+from fluidlift.pipeline.recall import footage_of_asset
+from fluidlift.pipeline.resimulate import settings_of
+from fluidlift.pipeline.scene import SimulationRequest, scene_of
+from fluidlift.pipeline.splat_files import frames_of
+from fluidlift.pipeline.work import Progress, Silence
 from fluidlift.types import VideoClip
 
 if TYPE_CHECKING:
@@ -45,15 +46,13 @@ def card_against(folder: Path, video: Path, *, start: float = 0.0, progress: Pro
 
     progress, manifest, asset = progress or Silence(), read_manifest(folder), load_asset(folder)
     played = manifest.get("simulation", {})
-    story = Story(folder, FIRST_HALF, progress=Silence())
-    recall_first_half(story, manifest)
-    footage = footage_of(story)
+    footage = footage_of_asset(folder, manifest)
     config = settings_of(manifest, (), {"show.preview": True}, sections=("simulate", "show"), work="a comparison")
     interval, longer = played.get("frame_interval", asset.interval), played.get("extended_downstream")
     fps = None if interval == asset.interval else 1.0 / interval
     request = SimulationRequest(played.get("frames", 0) * interval, fps, longer)
     scene = scene_of(asset, folder, request, config, footage=None, start=0)
-    reason = why_not(scene, footage, config)
+    reason = why_not(scene, footage, preview=config.show.preview)
     if reason is not None or footage is None:
         raise InputRejected(f"'{folder.name}' cannot be held against footage", "frames as they were filmed", reason)
     count, own = int(played.get("frames", 0)), len(footage.clip) - footage.start

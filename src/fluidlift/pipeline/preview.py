@@ -25,7 +25,7 @@ from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.pipeline.coarse_copy import PreviewSize, bears_coarser, coarse_asset, coarser, thinned
 from fluidlift.pipeline.dressing import Dressing
 from fluidlift.pipeline.scene import Scene, SimulationRequest, first_of_film, scene_of
-from fluidlift.pipeline.simulating import preflight, simulator_of
+from fluidlift.pipeline.simulator import preflight, simulator_of
 from fluidlift.types import FluidAsset, Gaussians, TriangleMesh
 
 if TYPE_CHECKING:
@@ -98,7 +98,7 @@ def preview_scene(asset: FluidAsset, folder: Path, edits: dict[str, Any], frames
         InputRejected: edits that do not fit.
     """
     from fluidlift.io.asset_folder import read_manifest
-    from fluidlift.pipeline.resimulate import rest_frame_of
+    from fluidlift.pipeline.recall import rest_frame_of
 
     with _written(edits) as place:
         scene = scene_of(asset, place, SimulationRequest(meshes=folder), JobConfig(), footage=None, start=0)

@@ -5,26 +5,27 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from fluidlift import __version__
 from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected
-from fluidlift.pipeline import moving, reporting
+from fluidlift.pipeline import reporting
 from fluidlift.pipeline.fit_outcome import SUBJECT, in_words
 from fluidlift.pipeline.fit_request import request_of
+from fluidlift.pipeline.machine import peak_memory_mb
 from fluidlift.pipeline.make import fit_figures
-from fluidlift.pipeline.resimulate import is_key, settings_of, stage_keys
-from fluidlift.pipeline.story import Progress, Silence, Story, peak_memory_mb
+from fluidlift.pipeline.recall import OF_CLIP, recalled, stage_keys
+from fluidlift.pipeline.resimulate import settings_of
+from fluidlift.pipeline.runner import Runner, last_value
+from fluidlift.pipeline.stages.fit import fit
+from fluidlift.pipeline.work import Progress, Silence
+from fluidlift.types.stages import Fit, Geometry, Lift, Motion, Read, Segmentation, Shown, Simulation
 
 NEEDED = ("read", "segment", "geometry", "motion")
 """stages whose cached results the fit starts from"""
-SHOWN = ("flow", "refine")
-"""stages that only the report needs"""
-LAST = ("simulate", "show")
-"""stages whose frames stay as they are"""
 
 
 @dataclass(frozen=True)
@@ -84,16 +85,15 @@ def refit(
     manifest = read_manifest(folder)
     config = settings_of(manifest, overrides, flat or {}, sections=("fit",), work="the fit")
     request_of(config.fit)
-    story = Story(folder, ("fit",), force=frozenset({"fit"}), progress=progress or Silence())
-    _recall(story, manifest)
+    runner = Runner(folder, ("fit",), force=frozenset({"fit"}), progress=progress or Silence())
+    read, segmentation, geometry, moved = _recalled(runner, manifest)
     before = load_asset(folder)
     with disk_errors(folder), writing(folder, "a fit"):
-        story.run("fit", lambda: moving.fit(story, config), settings=config.section("fit"), after=("motion",))
-        own = story["fit"].meta["warnings"]
-        story.warnings[:] = [w for w in manifest.get("warnings", ()) if not str(w).startswith(SUBJECT)] + own
-        parameters = moving.parameters_of(story)
-        write_parameters(folder, parameters, moving.estimates_of(story))
-        _write_report(story, folder, config, manifest)
+        found = runner.run("fit", fit, read, segmentation, geometry, moved, config.fit)
+        runner.warnings[:] = [w for w in manifest.get("warnings", ()) if not str(w).startswith(SUBJECT)]
+        runner.warnings += found.warnings
+        write_parameters(folder, found.parameters, found.estimates)
+        _write_report(runner, found, (read, segmentation, geometry, moved), config, manifest)
         origin = manifest.get("provenance", {})
         stored = origin.get("config")
         stored = stored if isinstance(stored, dict) else {}
@@ -101,68 +101,65 @@ def refit(
             folder,
             provenance=origin
             | {
-                "stages": stage_keys(manifest) | {"fit": story.keys["fit"]},
+                "stages": stage_keys(manifest) | {"fit": runner.keys["fit"]},
                 "config": stored | {"fit": config.section("fit")},
             },
-            timings={"fit": float(story.timings["fit"]["seconds"])},
+            timings={"fit": float(runner.timings["fit"]["seconds"])},
             metrics={
-                "fit_converged": story["fit"].meta["converged"],
-                "fit_rollouts": story["fit"].meta["rollouts"],
-                "fit_extra": story["fit"].meta["extra"],
-                "fit": fit_figures(story),
+                "fit_converged": found.converged,
+                "fit_rollouts": found.rollouts,
+                "fit_extra": found.extra,
+                "fit": fit_figures(found),
             },
-            warnings=story.warnings,
+            warnings=runner.warnings,
         )
-    meta = story["fit"].meta
-    rows = tuple({"name": r["name"], "before": _number(before, r["name"])} | r for r in meta["table"])
+    rows = tuple({"name": r["name"], "before": _number(before, r["name"])} | r for r in found.table)
     return Refitted(
-        folder, meta["status"], meta["reason"], tuple(own), tuple(_notes(story, folder)),
+        folder, found.status, found.reason, found.warnings, tuple(_notes(geometry, folder)),
         time.perf_counter() - began, rows,
     )  # fmt: skip
 
 
-def _recall(story: Story, manifest: dict[str, Any]) -> None:
-    """The cached results that the fit starts from, and those that the report shows, where they are still there."""
-    keys = stage_keys(manifest)
-    for name in (*NEEDED, *SHOWN):
-        if name in keys:
-            story.recall(name, keys[name])
-    missing = [name for name in NEEDED if name not in story.results]
+def _recalled(runner: Runner, manifest: dict[str, Any]) -> tuple[Read, Segmentation, Geometry, Motion]:
+    """What the fit starts from."""
+    keys, values = stage_keys(manifest), {}
+    for name in NEEDED:
+        values[name] = runner.recall(name, keys[name], OF_CLIP[name]) if name in keys else None
+    missing = [name for name in NEEDED if values[name] is None]
     if missing:
         made = manifest.get("provenance", {}).get("versions", {})
         version = made.get("fluidlift") if isinstance(made, dict) else None
-        got = f"'{story.folder.name}' no longer holds the velocities that a fit starts from (work/{missing[0]})"
+        name = runner.folder.name
+        got = f"'{name}' no longer holds the velocities that a fit starts from (work/{missing[0]})"
         if version not in (None, __version__):
-            got = f"'{story.folder.name}' was made by fluidlift {version}, and its work/{missing[0]} cannot be used"
+            got = f"'{name}' was made by fluidlift {version}, and its work/{missing[0]} cannot be used"
         raise InputRejected(
             got, "an asset with the work/ folder that 'fluidlift make' left",
-            f"run 'fluidlift make CLIP -o {story.folder.name}' again with its clip, and then the fit",
+            f"run 'fluidlift make CLIP -o {name}' again with its clip, and then the fit",
         )  # fmt: skip
-    for name in LAST:
-        # frames have no key in the manifest: the cache notes whose they are
-        owner = story.folder / "work" / name / "owner"
-        with suppress(OSError, UnicodeDecodeError):
-            key = "" if owner.is_symlink() else owner.read_text("ascii")[:128]
-            if is_key(key):
-                story.recall(name, key)
+    return values["read"], values["segment"], values["geometry"], values["motion"]
 
 
-def _write_report(story: Story, folder: Path, config: JobConfig, manifest: dict[str, Any]) -> None:
+def _write_report(
+    runner: Runner, found: Fit, start: tuple[Read, Segmentation, Geometry, Motion], config: JobConfig,
+    manifest: dict[str, Any],
+) -> None:  # fmt: skip
     """The report anew, where everything that it shows is still cached; it says whose values the frames show."""
-    if not {"flow", "refine", *LAST} <= story.results.keys():
+    folder = runner.folder
+    flow, refined = (recalled(folder, manifest, name) for name in ("flow", "refine"))
+    done, shown = last_value(folder, "simulate", Simulation), last_value(folder, "show", Shown)
+    if flow is None or refined is None or done is None or shown is None:
         return
-    facts = story["fit"].meta
-    facts["notes"] = [
-        *facts["notes"],
-        "Fitted again: the frames show the values before until fluidlift sim plays these.",
-    ]
+    told = "Fitted again: the frames show the values before until fluidlift sim plays these."
+    read, segmentation, geometry, moved = start
+    lift = Lift(read, flow, segmentation, geometry, refined, moved, replace(found, notes=(*found.notes, told)))
     stages = manifest.get("metrics", {}).get("stages", {})
     timings = stages if isinstance(stages, dict) else {}
-    fresh = {"fit": story.timings["fit"] | {"peak_memory_mb": round(peak_memory_mb(), 1)}}
+    fresh = {"fit": runner.timings["fit"] | {"peak_memory_mb": round(peak_memory_mb(), 1)}}
     known = {
         k: t for k, t in timings.items() if isinstance(t, dict) and {"seconds", "cached", "peak_memory_mb"} <= t.keys()
     }
-    reporting.write_report(story, folder, config, known | fresh)
+    reporting.write_report(lift, done, shown, folder, config.preset, known | fresh, runner.warnings)
 
 
 def _number(asset: Any, label: str) -> float | None:
@@ -173,11 +170,11 @@ def _number(asset: Any, label: str) -> float | None:
     return float(value["xyz".index(label[-1])] if isinstance(value, tuple) else value) if value is not None else None
 
 
-def _notes(story: Story, folder: Path) -> list[str]:
+def _notes(geometry: Geometry, folder: Path) -> list[str]:
     """What scene.yaml overrides, and where metres come from."""
     from fluidlift.io.scene import read_scene
 
-    notes = [story["geometry"].meta["scale"].get("sentence", "")]
+    notes = [geometry.scale_sentence]
     with suppress(InputRejected):
         edited = read_scene(folder).get("parameters")
         if isinstance(edited, dict) and edited:

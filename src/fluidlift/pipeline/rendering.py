@@ -13,12 +13,13 @@ import numpy as np
 from fluidlift.errors import InputRejected
 from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.pipeline.drawing import Stage, drawn
+from fluidlift.pipeline.front_view import open_end
 from fluidlift.pipeline.looks import Painter
-from fluidlift.pipeline.resimulate import FIRST_HALF, recall_first_half, settings_of
-from fluidlift.pipeline.scene import Scene, SimulationRequest, footage_of, scene_of
-from fluidlift.pipeline.showing import open_end
-from fluidlift.pipeline.simulating import frame_file, simulated_poses
-from fluidlift.pipeline.story import Progress, Silence, Story
+from fluidlift.pipeline.recall import footage_of_asset, simulated_poses
+from fluidlift.pipeline.resimulate import settings_of
+from fluidlift.pipeline.scene import Scene, SimulationRequest, scene_of
+from fluidlift.pipeline.splat_files import frame_file
+from fluidlift.pipeline.work import Progress, Silence
 from fluidlift.pipeline.written import Written, cleared, numbered
 from fluidlift.types import PinholeCamera
 
@@ -83,9 +84,7 @@ def render_asset(
     manifest, asset = read_manifest(folder), load_asset(folder)
     played = manifest.get("simulation", {})
     interval = float(played.get("frame_interval", asset.interval))
-    story = Story(folder, FIRST_HALF, progress=Silence())
-    recall_first_half(story, manifest)
-    footage = footage_of(story)
+    footage = footage_of_asset(folder, manifest)
     config = settings_of(manifest, (), {}, sections=("simulate", "show"), work="a picture")
     longer = float(played.get("extended_downstream", 0.0))
     made_with = SimulationRequest(fps=1.0 / interval, extend_downstream=longer)

@@ -7,41 +7,48 @@ from typing import Any
 
 import numpy as np
 
-from fluidlift.config import JobConfig
 from fluidlift.look.report import Figure, Section, report_html
 from fluidlift.pipeline.as_filmed import card_of
-from fluidlift.pipeline.body import setting_of
 from fluidlift.pipeline.fit_outcome import TIES, how_sure, in_words
-from fluidlift.pipeline.moving import targets_of
-from fluidlift.pipeline.reading import clip_of
-from fluidlift.pipeline.seeing import flow_of, labels_of
-from fluidlift.pipeline.story import Story
 from fluidlift.types import CellType
+from fluidlift.types.stages import Fit, Geometry, Lift, Refined, Shown, Simulation
 
 FILM_MAX = 12_000_000
 """bytes of a preview that goes into the page: it should still open at once and fit into a mail"""
 
 
-def write_report(story: Story, folder: Path, config: JobConfig, timings: dict[str, Any]) -> Path:
-    """report.html and the overlay picture."""
+def write_report(
+    lift: Lift, simulation: Simulation, shown: Shown, folder: Path, preset: str, timings: dict[str, Any],
+    warnings: list[str],
+) -> Path:  # fmt: skip
+    """report.html and the overlay picture.
+
+    Args:
+        lift: what was found in the clip.
+        simulation: of it.
+        shown: what was measured on its frames.
+        folder: of the asset.
+        preset: of the job.
+        timings: of the stages.
+        warnings: for its head.
+    """
     from fluidlift.io.atomic import write_bytes
     from fluidlift.io.images import write_png
     from fluidlift.shape.segment import overlay
 
-    clip, labels = clip_of(story), labels_of(story)
-    start = story["geometry"].meta["rest_frame"]
+    clip, labels, start = lift.clip, lift.labels, lift.geometry.rest_frame
     write_png(folder / "mask_overlay.png", overlay(clip.frames[start], labels.labels[start]))
     write_png(folder / "rest" / "mask.png", np.where(labels.fluid[start], 255, 0).astype(np.uint8))
     sure = np.clip(labels.confidence[start].astype(np.float32), 0.0, 1.0)
     write_png(folder / "rest" / "mask_confidence.png", (255 * sure + 0.5).astype(np.uint8))
     sections = [
-        _section_as_filmed(story),
-        _section_outcome(story),
-        _section_seeing(story, overlay),
-        _section_body(story),
-        _section_motion(story),
-        _section_parameters(story),
-        _section_simulation(story),
+        _section_as_filmed(shown),
+        _section_outcome(lift, shown),
+        _section_seeing(lift, overlay),
+        _section_body(lift.geometry, lift.refined),
+        _section_motion(lift),
+        _section_parameters(lift.fit, lift.geometry.scale_sentence),
+        _section_simulation(simulation),
         Section(
             "Time and memory",
             rows=[
@@ -53,10 +60,10 @@ def write_report(story: Story, folder: Path, config: JobConfig, timings: dict[st
     ]
     page = report_html(
         f"{clip.source} as a fluid asset",
-        f"kind: {_kind(story)} · {len(clip)} frames at {1 / clip.interval:.4g} per second · {clip.size[0]} x "
-        f"{clip.size[1]} px · preset {config.preset}",
+        f"kind: {lift.geometry.kind} · {len(clip)} frames at {1 / clip.interval:.4g} per second · {clip.size[0]} x "
+        f"{clip.size[1]} px · preset {preset}",
         sections,
-        warnings=story.warnings,
+        warnings=warnings,
         film=_film(folder / "preview.mp4"),
         links={"preview": "preview.mp4", "USD": "asset.usda", "parameters": "parameters.json", "scene": "scene.yaml"},
     )
@@ -68,15 +75,11 @@ def _film(path: Path) -> bytes:
     return path.read_bytes() if path.is_file() and path.stat().st_size <= FILM_MAX else b""
 
 
-def _kind(story: Story) -> str:
-    return story["geometry"].meta["kind"]
-
-
-def _section_as_filmed(story: Story) -> Section:
+def _section_as_filmed(shown: Shown) -> Section:
     """The card, first of all: whether what follows can be used."""
     from fluidlift.evaluate.as_filmed import HEADER
 
-    card = card_of({"simulation": story["show"].meta})
+    card = card_of({"simulation": {"as_filmed": shown.as_filmed}})
     if isinstance(card, str):
         return Section("As filmed", notes=[f"How near the re-simulation stays to the clip is not known: {card}."])
     said = card.sentence()
@@ -87,9 +90,9 @@ def _section_as_filmed(story: Story) -> Section:
     )
 
 
-def _section_outcome(story: Story) -> Section:
-    clip, shown = clip_of(story), story["show"].arrays.get("resim_frames", ())
-    start = story["geometry"].meta["rest_frame"]
+def _section_outcome(lift: Lift, seen: Shown) -> Section:
+    clip, start = lift.clip, lift.geometry.rest_frame
+    shown = () if seen.pictures is None else seen.pictures
     figures = []
     for k in sorted({0, len(shown) // 2, len(shown) - 1} if len(shown) else ()):
         pair = np.concatenate([clip.frames[min(start + k, len(clip) - 1)], shown[k]], axis=1)
@@ -103,10 +106,10 @@ def _section_outcome(story: Story) -> Section:
     return Section("Input and re-simulation", figures)
 
 
-def _section_seeing(story: Story, overlay) -> Section:
+def _section_seeing(lift: Lift, overlay) -> Section:
     from fluidlift.look.pictures import colour_map
 
-    clip, labels = clip_of(story), labels_of(story)
+    clip, labels = lift.clip, lift.labels
     pick = sorted({0, len(clip) // 2, len(clip) - 1})
     figures = [
         Figure(
@@ -124,40 +127,36 @@ def _section_seeing(story: Story, overlay) -> Section:
             "bright everywhere but along a thin line at the edge",
         )
     )
-    meta, read = story["segment"].meta, story["read"].meta
+    found, read = lift.segmentation, lift.read
     rows = [
-        ["mask", "given by the user" if meta["user_mask"] else "found from motion and colour"],
-        ["mean confidence on the fluid", meta["confidence_mean"]],
-        ["share of the picture", meta["fluid_share"]],
-        ["camera shake", f"{read['shake_px']:.2f} px per frame" + (", taken out" if read["stabilised"] else "")],
-        ["optical flow trusted on", f"{100 * meta['flow_trusted']:.0f} % of the fluid"],
+        ["mask", "given by the user" if found.user_mask else "found from motion and colour"],
+        ["mean confidence on the fluid", found.confidence_mean],
+        ["share of the picture", found.fluid_share],
+        ["camera shake", f"{read.shake_px:.2f} px per frame" + (", taken out" if read.stabilised else "")],
+        ["optical flow trusted on", f"{100 * found.flow_trusted:.0f} % of the fluid"],
     ]
     return Section("What is fluid", figures, rows)
 
 
-def _section_body(story: Story) -> Section:
+def _section_body(g: Geometry, fitted: Refined) -> Section:
     from fluidlift.look.pictures import colour_map
 
-    g, fitted = story["geometry"], story["refine"].meta
-    m = g.meta
-    evidence = m["kind_evidence"]
+    evidence, grid = g.kind_evidence, g.grid
     rows: list[list[Any]] = [
-        ["kind", f"{m['kind']} ({m['kind_source']})"],
-        ["belief per kind", ", ".join(f"{k} {v:.2f}" for k, v in evidence["scores"].items())],
-        ["evidence", ", ".join(f"{k} {v:.2f}" for k, v in evidence["features"].items())],
-        *_surface_rows(m),
-        ["scale", m["scale"].get("sentence", "").removeprefix("scale: ")],
-        ["grid", f"{' x '.join(map(str, m['grid']['shape']))} cells of {1000 * m['grid']['spacing']:.2f} mm"],
-        ["frames united", m["united_frames"]],
-        ["Gaussians", f"{fitted['total']} ({fitted['front']} seen, {fitted['hull']} hull, {fitted['filled']} inside, "
-                      f"{fitted['pruned']} pruned)"],
+        ["kind", f"{g.kind} ({g.kind_source})"],
+        ["belief per kind", ", ".join(f"{k} {v:.2f}" for k, v in evidence.scores.items())],
+        ["evidence", ", ".join(f"{k} {v:.2f}" for k, v in evidence.features.items())],
+        *_surface_rows(g),
+        ["scale", g.scale_sentence.removeprefix("scale: ")],
+        ["grid", f"{' x '.join(map(str, grid.shape))} cells of {1000 * grid.spacing:.2f} mm"],
+        ["frames united", g.united_frames],
+        ["Gaussians", f"{len(fitted.body)} ({fitted.front} seen, {fitted.hull} hull, {fitted.filled} inside, "
+                      f"{fitted.pruned} pruned)"],
     ]  # fmt: skip
-    if "psnr_before" in fitted:
-        kept = "" if fitted["kept"] else " (rejected by the depth guard)"
-        rows.append(
-            ["single-view refinement", f"PSNR {fitted['psnr_before']:.1f} to {fitted['psnr_after']:.1f} dB{kept}"]
-        )
-    depth, mask = g.arrays["depth"], g.arrays["mask"]
+    if fitted.psnr_before is not None and fitted.psnr_after is not None:
+        kept = "" if fitted.kept else " (rejected by the depth guard)"
+        rows.append(["single-view refinement", f"PSNR {fitted.psnr_before:.1f} to {fitted.psnr_after:.1f} dB{kept}"])
+    depth, mask = g.depth, g.mask
     figures = [
         Figure(
             colour_map(depth, mask & (depth > 0)),
@@ -165,7 +164,7 @@ def _section_body(story: Story) -> Section:
             "a smooth slope that fits the scene; steps and holes mean a wrong surface: give --depth or --pitch",
         ),
         Figure(
-            g.arrays["plate"],
+            g.plate,
             "The clip without its fluid, which becomes the texture of the ground",
             "bed and banks alone; what is left of the fluid will stick to the ground",
         ),
@@ -173,35 +172,33 @@ def _section_body(story: Story) -> Section:
     return Section("Body", figures, rows)
 
 
-def _surface_rows(geometry: dict[str, Any]) -> list[list[str]]:
+def _surface_rows(geometry: Geometry) -> list[list[str]]:
     """How the camera stands and what the surface was taken from, and how sure both are."""
-    up, slope, jets, depth = (geometry.get(k) for k in ("up", "slope", "jets", "depth_source"))
-    error = f" ± {up['error']:.0f}" if up.get("error") else ""
-    tilt = (
-        f"{up['pitch']:.1f}{error} degrees, rolled {up['roll']:.1f} ({up['source']}, confidence {up['confidence']:.2f})"
-    )
+    up, slope, depth = geometry.up, geometry.slope, geometry.depth_source
+    error = f" ± {up.error:.0f}" if up.error else ""
+    tilt = f"{up.pitch:.1f}{error} degrees, rolled {up.roll:.1f} ({up.source}, confidence {up.confidence:.2f})"
     rows = [["camera looks down by", tilt]]
     if depth is not None:
         rows.append(["surface", f"by the {depth['source']}"])
     elif slope is not None:
-        level = f"level with a probability of {slope['level_share']:.2f}"
-        steep = f"{slope['slope']:.1f} ± {slope['standard_error']:.1f} degrees, {level} ({slope['source']})"
+        level = f"level with a probability of {slope.level_share:.2f}"
+        steep = f"{slope.slope:.1f} ± {slope.standard_error:.1f} degrees, {level} ({slope.source})"
         rows.append(["slope of the surface", steep])
-    if jets:
-        rows.append(["jets above it", str(len(jets))])
+    if geometry.jets:
+        rows.append(["jets above it", str(len(geometry.jets))])
     return rows
 
 
-def _section_motion(story: Story) -> Section:
+def _section_motion(lift: Lift) -> Section:
     from fluidlift.look.pictures import velocity_slices
     from fluidlift.motion.optical_flow import flow_picture
 
-    meta, a = story["motion"].meta, story["motion"].arrays
+    motion = lift.motion
     figures = []
-    if meta["targets"]:
-        t = meta["targets"][0]
-        raw, full = (np.asarray(x[t], np.float32) for x in (flow_of(story).displacement, a["completed"]))
-        mask = labels_of(story).fluid[t]
+    if motion.targets:
+        t = motion.targets[0].frame
+        raw, full = (np.asarray(x[t], np.float32) for x in (lift.flow.flow.displacement, motion.completed))
+        mask = lift.labels.fluid[t]
         scale = float(np.percentile(np.linalg.norm(full[mask], axis=-1), 95)) if mask.any() else 1.0
         figures = [
             Figure(
@@ -215,11 +212,11 @@ def _section_motion(story: Story) -> Section:
                 "smooth, no holes, faster in the middle than at the banks",
             ),
         ]
-        cells = setting_of(story).cell_types
+        cells = lift.geometry.setting.cell_types
         wet = (cells == CellType.FLUID) | (cells == CellType.INFLOW)
         figures.append(
             Figure(
-                velocity_slices(targets_of(story)[0].at_centers(), wet),
+                velocity_slices(motion.targets[0].velocity.at_centers(), wet),
                 "Speed in the volume: from above, along the stream, across it",
                 "slower towards the bed, nowhere cut off inside the fluid",
             )
@@ -232,21 +229,18 @@ def _section_motion(story: Story) -> Section:
             r.get("flux_in", ""),
             r.get("flux_out", ""),
         ]
-        for r in meta["reports"][:12]
+        for r in motion.reports[:12]
     ]
     return Section(
         "Motion", figures, rows, ["frame", "max |div| dx / speed", "mean", "flux in, m3/s", "flux out, m3/s"]
     )
 
 
-def _section_parameters(story: Story) -> Section:
+def _section_parameters(fit: Fit, scale: str) -> Section:
     from fluidlift.look.pictures import curve
 
-    meta, g = story["fit"].meta, story["geometry"].meta
-    # an asset of an earlier version has no such table
-    table = meta.get("table", ())
-    rows = [[r["name"], r["value"], r["unit"], in_words(r), how_sure(r), r["prior"], r["source"]] for r in table]
-    loss = story["fit"].arrays["loss_history"]
+    rows = [[r["name"], r["value"], r["unit"], in_words(r), how_sure(r), r["prior"], r["source"]] for r in fit.table]
+    loss = fit.loss_history
     figures = []
     if len(loss):
         picture = curve(loss, title="data term of the fit", x="iteration", y="loss")
@@ -258,32 +252,29 @@ def _section_parameters(story: Story) -> Section:
             )
         )
     how = {"fitted": "The fit converged.", "unfinished": "The fit did not converge: best values so far.",
-           "left": f"Not fitted: {meta.get('reason', '')}."}  # fmt: skip
-    status = meta.get("status", "fitted" if meta["converged"] else "unfinished")
-    said = how.get(status, f"The fit failed: {meta.get('reason', '')}. The first guess is kept.")
-    scale = g["scale"].get("sentence", f"scale: {g['scale']['source']}")
+           "left": f"Not fitted: {fit.reason}."}  # fmt: skip
+    said = how.get(fit.status, f"The fit failed: {fit.reason}. The first guess is kept.")
     return Section(
         "Physical parameters", figures, rows,
         ["parameter", "value", "unit", "between (95 %)", "how sure", "first guess", "where it comes from"],
-        [said, scale[:1].upper() + scale[1:] + ".", *TIES, *meta["notes"]],
+        [said, scale[:1].upper() + scale[1:] + ".", *TIES, *fit.notes],
     )  # fmt: skip
 
 
-def _section_simulation(story: Story) -> Section:
+def _section_simulation(done: Simulation) -> Section:
     from fluidlift.look.pictures import curve
 
-    a = story["simulate"].arrays
     figures = [
         Figure(
-            curve(a["volume"] / max(a["volume"][0], 1e-12), title="volume over its start", x="frame", y="ratio"),
+            curve(done.volume / max(done.volume[0], 1e-12), title="volume over its start", x="frame", y="ratio"),
             "Volume of the simulated fluid, as a multiple of the first frame's",
             "close to 1 all the way; a slope means more flows in than out, or the reverse",
         ),
         Figure(
-            curve(a["count"], title="particles", x="frame", y="count"),
+            curve(done.count, title="particles", x="frame", y="count"),
             "Particles of the simulation",
             "level, or slowly rising while an inlet fills; a fall means fluid that left",
         ),
     ]
-    rows = [["largest share of particles inside the terrain", f"{100 * float(a['leak'].max()):.2f} %"]]
+    rows = [["largest share of particles inside the terrain", f"{100 * float(done.leak.max()):.2f} %"]]
     return Section("Re-simulation", figures, rows)

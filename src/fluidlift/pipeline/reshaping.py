@@ -67,7 +67,7 @@ def with_terrain(scene: Scene, edits: Sequence[TerrainEdit]) -> Scene:
     from fluidlift.physics.preflight import check_memory
     from fluidlift.physics.terrain_edit import Replace
     from fluidlift.physics.terrain_reshape import reshaped, reshaped_body, reshaped_gaussians, reshaped_velocity
-    from fluidlift.pipeline.story import available_memory
+    from fluidlift.pipeline.machine import available_memory
     from fluidlift.types import CellType
 
     if not edits:

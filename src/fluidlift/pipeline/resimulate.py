@@ -1,4 +1,4 @@
-"""The second half of the story, which `make` and `sim` share: an asset at rest becomes frames, pictures and USD."""
+"""The second half, which `make` and `sim` share: an asset at rest becomes frames, pictures and USD."""
 
 from __future__ import annotations
 
@@ -12,13 +12,19 @@ import numpy as np
 
 from fluidlift.config import PRESETS, JobConfig, build_config
 from fluidlift.errors import FluidliftError, InputRejected
-from fluidlift.pipeline import reporting, showing, simulating
+from fluidlift.pipeline import reporting
+from fluidlift.pipeline.footage import footage_of
+from fluidlift.pipeline.machine import peak_memory_mb
+from fluidlift.pipeline.recall import recalled_lift, rest_frame_of
 from fluidlift.pipeline.reshaping import slow_edits
-from fluidlift.pipeline.scene import Footage, Scene, SimulationRequest, footage_of, scene_of
-from fluidlift.pipeline.story import Progress, Silence, Story, peak_memory_mb
-
-FIRST_HALF = ("read", "flow", "segment", "geometry", "refine", "motion", "fit")
-"""stages that need the clip; `sim` takes their results from where `make` left them"""
+from fluidlift.pipeline.runner import Runner
+from fluidlift.pipeline.scene import Scene, SimulationRequest, scene_of
+from fluidlift.pipeline.settings import ShowSettings, SimulateSettings, taken
+from fluidlift.pipeline.stages.show import SeenLook, show
+from fluidlift.pipeline.stages.simulate import frames_still_there, simulate
+from fluidlift.pipeline.work import Progress, Silence
+from fluidlift.types import FluidAsset
+from fluidlift.types.stages import Lift, Shown, Simulation
 
 SECOND_HALF = ("simulate", "show")
 
@@ -27,9 +33,6 @@ SECOND_HALF_SECTIONS = ("simulate", "show")
 
 FPS_RANGE = (0.1, 10_000.0)
 """frames per second that can be asked for"""
-
-AS_FILMED = 1
-"""raised where figures of the card change, so that frames that are there are measured again"""
 
 PARTS = {
     "preview": "preview.mp4", "report": "report.html", "usd": "asset.usda", "mask_overlay": "mask_overlay.png",
@@ -72,7 +75,7 @@ def resimulate(
         InputRejected: no asset, or a request, a scene.yaml or settings that do not fit; nothing was changed.
         FluidliftError: the simulation broke down; the frames before are kept and shown.
     """
-    from fluidlift.io.asset_folder import read_manifest
+    from fluidlift.io.asset_folder import load_asset, read_manifest
     from fluidlift.io.asset_lock import writing
     from fluidlift.io.atomic import disk_errors
 
@@ -81,14 +84,13 @@ def resimulate(
     manifest = read_manifest(folder)
     config = settings_of(manifest, overrides, flat or {}, sections=SECOND_HALF_SECTIONS, work="a simulation")
     _check(request)
-    story = Story(
+    runner = Runner(
         folder, SECOND_HALF, force=frozenset(SECOND_HALF if request.restart else ()), progress=progress or Silence()
     )
-    recall_first_half(story, manifest)
+    lift = recalled_lift(runner, manifest)
     with disk_errors(folder), writing(folder, "a simulation"):
-        frames = play(story, folder, config, request)
-    own = tuple(text for name in SECOND_HALF for text in story[name].meta.get("warnings", ()))
-    return Made(folder, own, time.perf_counter() - began, story.timings, frames)
+        frames = play(runner, load_asset(folder), config, request, lift)
+    return Made(folder, tuple(runner.told), time.perf_counter() - began, runner.timings, frames)
 
 
 def _check(request: SimulationRequest) -> None:
@@ -140,122 +142,94 @@ def settings_of(
     return build_config(preset, None, overrides, values | {k: v for k, v in flat.items() if v is not None})
 
 
-def recall_first_half(story: Story, manifest: dict[str, Any]) -> None:
-    """Results of the first half, as far as they are still cached; all of them or none."""
-    keys = stage_keys(manifest)
-    if not all(name in keys and story.recall(name, keys[name]) for name in FIRST_HALF):
-        for part in (story.results, story.keys, story.timings):
-            part.clear()
-
-
-def stage_keys(manifest: dict[str, Any]) -> dict[str, str]:
-    """Keys of the cached results that an asset was made from; those that are none are left out."""
-    keys = manifest.get("provenance", {}).get("stages", {})
-    return {n: k for n, k in keys.items() if is_key(k)} if isinstance(keys, dict) else {}
-
-
-def is_key(text: Any) -> bool:
-    """Whether this can be the key of a result."""
-    return isinstance(text, str) and len(text) == 64 and text.isalnum() and text.isascii()
-
-
-def play(story: Story, folder: Path, config: JobConfig, request: SimulationRequest) -> int:
-    """Simulate and show the asset in a folder, and bring its manifest up to date; the number of frames.
+def play(runner: Runner, asset: FluidAsset, config: JobConfig, request: SimulationRequest, lift: Lift | None) -> int:
+    """Simulate and show an asset, and bring its manifest up to date; the number of frames.
 
     Args:
-        story: with the results of the first half, or without any of them.
-        folder: of the asset.
+        runner: of the asset's folder.
+        asset: as `load_asset` gives it.
         config: its `simulate` and `show` sections, and the seed.
         request: what this run is asked for.
+        lift: what was found in the clip, where that is still at hand.
 
     Raises:
         InputRejected: a scene that does not fit.
         FluidliftError: the simulation broke down; the frames before it are written.
     """
-    from fluidlift.io.asset_folder import load_asset, read_manifest
+    from fluidlift.io.asset_folder import read_manifest
     from fluidlift.io.obstacles import color_mark
     from fluidlift.io.scene import read_edits
     from fluidlift.io.scene_domain import require_inside
 
-    manifest, asset = read_manifest(folder), load_asset(folder)
-    footage, edits = footage_of(story), read_edits(folder, meshes=request.meshes)
-    scene = scene_of(asset, folder, request, config, footage=footage, start=rest_frame_of(manifest, footage))
+    folder, manifest, footage = runner.folder, read_manifest(runner.folder), None
+    if lift is not None:
+        source = lift.read, lift.segmentation, lift.geometry
+        footage = runner.follows(footage_of(*source), *source)
+    edits = read_edits(folder, meshes=request.meshes)
+    start = rest_frame_of(manifest, footage)
+    scene = scene_of(asset, folder, request, config, footage=footage, start=start, edits=edits)
     outside = require_inside(edits, scene.terrain.grid, seconds=scene.frames * scene.interval) + slow_edits(scene)
-    look = edits.look.mark(folder) | color_mark(edits.obstacles)
+    seen = SeenLook(edits.look, edits.look.mark(folder) | color_mark(edits.obstacles))
     for text in outside:
-        story.progress.warn(text)
-    story.run(
-        "simulate",
-        lambda: simulating.simulate(scene, folder, config, request=request, step=story.step),
-        settings=[scene.parts, scene.frames, config.simulate.max_particles],
-        after=(),
-        still_there=simulating.frames_still_there(folder),
-        owns_files=True,
-    )
-    done = story["simulate"].meta
-    first_half = [story.keys[s] for s in FIRST_HALF if s in story.keys]
+        runner.progress.warn(text)
+    done = runner.run(
+        "simulate", simulate, scene, taken(SimulateSettings, config.simulate),
+        beside={"folder": folder, "request": request}, still_there=frames_still_there(folder), owns_files=True,
+    )  # fmt: skip
     wanted = [folder / "preview.mp4"] * config.show.preview + [folder / "asset.usda"] * config.show.usd
-    story.run(
-        "show",
-        lambda: showing.show(
-            scene, footage, folder, config, story["simulate"].arrays["poses"], look=edits.look, step=story.step
-        ),
-        settings=[config.section("show"), done["frames"], look, AS_FILMED, first_half],
-        after=("simulate",),
-        still_there=lambda result: all(p.is_file() for p in wanted),
-        owns_files=True,
-    )
-    closed = edits.loop and not any("loop is not closed" in text for text in done.get("warnings", ()))
-    _finish(story, scene, config, manifest, {"look": look, "loop": closed, "warnings": outside})
-    if "failed" in done:
+    shown = runner.run(
+        "show", show, scene, done, footage, seen, taken(ShowSettings, config.show), beside={"folder": folder},
+        still_there=lambda value: all(p.is_file() for p in wanted), owns_files=True,
+    )  # fmt: skip
+    closed = edits.loop and not any("loop is not closed" in text for text in done.warnings)
+    _finish(runner, scene, manifest, config, lift, Played(done, shown, seen.mark, closed, tuple(outside)))
+    if done.failed is not None:
         raise FluidliftError(
-            f"{done['failed']} The {done['frames']} frames before it are kept, with their preview: '{folder}'."
+            f"{done.failed} The {done.frames} frames before it are kept, with their preview: '{folder}'."
         )
-    return int(done["frames"])
+    return done.frames
 
 
-def rest_frame_of(manifest: dict[str, Any], footage: Footage | None) -> int:
-    """Frame of the clip that the body at rest shows."""
-    start = manifest.get("metrics", {}).get("rest_frame", 0) if footage is None else footage.start
-    return start if type(start) is int and 0 <= start < manifest["frame_count"] else 0
+@dataclass(frozen=True)
+class Played:
+    """A simulation and its pictures, and what of scene.yaml is noted beside them."""
+
+    simulation: Simulation
+    shown: Shown
+    look: dict[str, Any]
+    loop: bool
+    """whether its end runs into its beginning"""
+    warnings: tuple[str, ...]
+    """about scene.yaml"""
 
 
-def _finish(story: Story, scene: Scene, config: JobConfig, manifest: dict[str, Any], edited: dict[str, Any]) -> None:
-    """Report, figures for `evaluate`, manifest.
-
-    Args:
-        story: of the run.
-        scene: that was simulated.
-        config: its `simulate` and `show` sections.
-        manifest: as it was before.
-        edited: what of scene.yaml is noted beside the scene, and warnings about it.
-    """
+def _finish(
+    runner: Runner, scene: Scene, manifest: dict[str, Any], config: JobConfig, lift: Lift | None, played: Played
+) -> None:
+    """Report, figures for `evaluate`, manifest, which is given as it was before."""
     from fluidlift.io.asset_folder import update_manifest
     from fluidlift.io.atomic import atomic_write
 
-    folder = story.folder
-    result = story["simulate"].meta
+    folder, done, shown = runner.folder, played.simulation, played.shown
     before = set(manifest.get("simulation", {}).get("warnings", ()))
-    shown = story["show"].meta
-    own = [*edited["warnings"], *result.get("warnings", ()), *([result["failed"]] if "failed" in result else [])]
-    own += shown.get("warnings", ())
-    story.warnings[:] = [w for w in manifest.get("warnings", ()) if w not in before] + own
-    if story.results.keys() >= set(FIRST_HALF):
-        reporting.write_report(story, folder, config, story.timings)
+    own = [*played.warnings, *done.warnings, *([] if done.failed is None else [done.failed]), *shown.warnings]
+    runner.warnings[:] = [w for w in manifest.get("warnings", ()) if w not in before] + own
+    if lift is not None:
+        reporting.write_report(lift, done, shown, folder, config.preset, runner.timings, runner.warnings)
         figures = folder / "work" / "evaluation.npz"
-        if "resim_frames" in story["show"].arrays:
+        if shown.pictures is not None:
             with atomic_write(figures) as stream:
-                np.savez_compressed(stream, **evaluation_arrays(story))
+                np.savez_compressed(stream, **evaluation_arrays(lift, done, shown))
         else:
             figures.unlink(missing_ok=True)  # of frames that are no longer there
     update_manifest(
         folder,
         files={name: file for name, file in PARTS.items() if (folder / file).is_file()},
-        timings={k: float(t["seconds"]) for k, t in story.timings.items()},
-        metrics={"peak_memory_mb": round(peak_memory_mb(), 1), "stages": story.timings},
-        warnings=story.warnings,
+        timings={k: float(t["seconds"]) for k, t in runner.timings.items()},
+        metrics={"peak_memory_mb": round(peak_memory_mb(), 1), "stages": runner.timings},
+        warnings=runner.warnings,
         simulation={
-            "frames": result["frames"],
+            "frames": done.frames,
             "frame_interval": scene.interval,
             "grid": {"shape": scene.terrain.grid.shape, "spacing": scene.terrain.grid.spacing,
                      "origin": scene.terrain.grid.origin},
@@ -263,31 +237,30 @@ def _finish(story: Story, scene: Scene, config: JobConfig, manifest: dict[str, A
             "seed": scene.seed,
             "extended_downstream": scene.extended,
             "obstacles": [o.name for o in scene.obstacles],
-            "look": edited["look"],
-            "loop": edited["loop"],
+            "look": played.look,
+            "loop": played.loop,
             "parts": scene.parts,
-            "as_filmed": shown["as_filmed"],
+            "as_filmed": shown.as_filmed,
             "warnings": own,
         },
     )  # fmt: skip
 
 
-def evaluation_arrays(story: Story) -> dict[str, np.ndarray]:
-    """What `fluidlift evaluate` compares with a truth."""
-    g, m, s, shown = story["geometry"], story["motion"], story["simulate"], story["show"].arrays
-    targets = m.meta["targets"]
-    start = g.meta["rest_frame"]
+def evaluation_arrays(lift: Lift, simulation: Simulation, shown: Shown) -> dict[str, np.ndarray]:
+    """What `fluidlift evaluate` compares with a truth; needs the pictures of frames that the clip has, too."""
+    g, m = lift.geometry, lift.motion
+    assert shown.pictures is not None and shown.coverage is not None and shown.flow is not None
     return {
-        "labels": story["segment"].arrays["labels"],
-        "front_depth": g.arrays["sighted_depth"] * g.arrays["mask"],
-        "flow_raw": story["flow"].arrays["displacement"],
-        "flow_completed": m.arrays["completed"],
-        "flow_observed": np.unpackbits(m.arrays["observed"], axis=-1)[..., : m.arrays["completed"].shape[2]],
-        "resim_flow": shown["resim_flow"][:-1],
-        "resim_mask": shown["resim_mask"],
-        "resim_frames": shown["resim_frames"],
-        "first_frame": np.int64(start),
-        "fit_frames": np.array([targets[0], targets[-1] + 1] if targets else [0, 0]),
-        "particle_volume": s.arrays["volume"],
-        "leak_share": s.arrays["leak"],
+        "labels": lift.labels.labels,
+        "front_depth": g.sighted_depth * g.mask,
+        "flow_raw": lift.flow.flow.displacement,
+        "flow_completed": m.completed,
+        "flow_observed": m.observed().view(np.uint8),
+        "resim_flow": shown.flow[:-1],
+        "resim_mask": shown.coverage,
+        "resim_frames": shown.pictures,
+        "first_frame": np.int64(g.rest_frame),
+        "fit_frames": np.array([m.frames[0], m.frames[-1] + 1] if m.frames else [0, 0]),
+        "particle_volume": simulation.volume,
+        "leak_share": simulation.leak,
     }

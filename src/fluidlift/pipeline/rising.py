@@ -2,49 +2,52 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
-from fluidlift.pipeline.body import camera_of, setting_of
-from fluidlift.pipeline.reading import clip_of
-from fluidlift.pipeline.seeing import masks_of
-from fluidlift.pipeline.story import Story, one_torch_thread
+from fluidlift.pipeline.fluid_masks import FluidMasks
+from fluidlift.pipeline.machine import one_torch_thread
 from fluidlift.types import Estimate, FaceVelocity, FluidParameters
+from fluidlift.types.stages import Geometry, Read
 
 PRECISE = 0.05
 """share of the value up to which it counts as determined, as in the fit of velocities"""
 
 
-def outline_rises(story: Story) -> bool:
-    """Whether the outlines of a plume tell its buoyancy."""
+def outline_rises(masks: FluidMasks, start: int) -> bool:
+    """Whether the outlines of a plume, from frame `start` of its masks on, tell its buoyancy."""
     from fluidlift.fit.buoyancy import course
 
-    masks, start = masks_of(story), int(story["geometry"].meta["rest_frame"])
     return course(lambda k: masks[start + k], len(masks) - start) is not None
 
 
 def with_buoyancy(
-    story: Story, parameters: FluidParameters, estimates: dict[str, Estimate], velocity: FaceVelocity
-) -> tuple[FluidParameters, dict[str, Estimate], dict[str, float]]:
+    read: Read, masks: FluidMasks, geometry: Geometry, parameters: FluidParameters, estimates: dict[str, Estimate],
+    velocity: FaceVelocity, step: Callable[[int, int], None],
+) -> tuple[FluidParameters, dict[str, Estimate], dict[str, float]]:  # fmt: skip
     """Parameters and estimates of a plume with the buoyancy that its outlines tell, and figures for the report.
 
     Args:
-        story: up to its motion.
+        read: the clip.
+        masks: of it.
+        geometry: of the body.
         parameters: of it; the size of gravity is a first guess of the buoyancy.
         estimates: by label.
         velocity: of the whole box at the first instant, m/s.
+        step: told (done, all).
     """
     from fluidlift.fit.buoyancy import RisingSmoke, buoyancy_from_rise
 
-    setting, masks, start = setting_of(story), masks_of(story), int(story["geometry"].meta["rest_frame"])
+    setting, start = geometry.setting, geometry.rest_frame
     guess = float(np.linalg.norm(parameters.gravity))
     smoke = RisingSmoke(
-        setting.terrain, setting.cell_types, velocity, parameters, camera_of(story), clip_of(story).interval,
+        setting.terrain, setting.cell_types, velocity, parameters, geometry.camera, read.clip.interval,
         lambda k: masks[start + k], len(masks) - start,
     )  # fmt: skip
     with one_torch_thread():
-        lift = buoyancy_from_rise(smoke, guess, step=story.step)
+        lift = buoyancy_from_rise(smoke, guess, step=step)
     if lift is None:
         return parameters, estimates, {}
     gravity = tuple(float(g) * lift.value / guess for g in parameters.gravity)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -18,10 +17,10 @@ from fluidlift.errors import InputRejected
 from fluidlift.look.appearance import SteadyShading
 from fluidlift.physics.inflow_schedule import InflowSchedule
 from fluidlift.pipeline.following import following
-from fluidlift.pipeline.reading import clip_of
+from fluidlift.pipeline.footage import Footage
+from fluidlift.pipeline.machine import available_memory
 from fluidlift.pipeline.reshaping import changed_parameters, with_emitters, with_terrain
-from fluidlift.pipeline.seeing import labels_of
-from fluidlift.pipeline.story import Story, available_memory
+from fluidlift.pipeline.settings import SceneSettings
 from fluidlift.types import (
     CellType,
     FaceVelocity,
@@ -30,14 +29,13 @@ from fluidlift.types import (
     Gaussians,
     Particles,
     PinholeCamera,
-    PixelLabels,
     Terrain,
-    VideoClip,
     kind_of,
 )
 
 if TYPE_CHECKING:
     from fluidlift.io.obstacles import Obstacle
+    from fluidlift.io.scene import SceneEdits
     from fluidlift.physics.emitter import Emitter
     from fluidlift.physics.rigid_body import RigidBody
 
@@ -61,20 +59,6 @@ class SimulationRequest:
     """go on from the checkpoint, or say why not"""
     restart: bool = False
     """begin again, although a checkpoint fits"""
-
-
-@dataclass(frozen=True)
-class Footage:
-    """The clip that an asset comes from, where it is still at hand."""
-
-    clip: VideoClip
-    labels: PixelLabels
-    plate: np.ndarray
-    """u8 [H,W,3], the picture without the fluid"""
-    start: int
-    """frame of the clip that the first simulated one shows"""
-    rocks: np.ndarray
-    """bool [H,W], pixels in which something solid stands in or before the fluid"""
 
 
 @dataclass(frozen=True)
@@ -171,6 +155,11 @@ class Scene:
             found["loop"] = _hash(self.frames, self.overlap)
         return found
 
+    @property
+    def cache_key(self) -> list[Any]:
+        """What the keys of stages know of it: how it goes, and how long and from where it is seen."""
+        return [self.parts, self.frames, self.clip_interval, self.camera.to_dict()]
+
     @cached_property
     def bodies(self) -> tuple[RigidBody, ...]:
         """The obstacles as bodies; raises `InputRejected` where a mesh bounds no solid."""
@@ -199,38 +188,6 @@ def _update(digest: hashlib._Hash, file: Path) -> None:
             digest.update(piece)
 
 
-def footage_of(story: Story) -> Footage | None:
-    """The clip as the first stages saw it, or None where their results are not at hand."""
-    if not {"read", "segment", "geometry"} <= story.results.keys():
-        return None
-    g = story["geometry"]
-    labels = labels_of(story)
-    rocks = g.arrays["rocks"] if "rocks" in g.arrays else labels.solid.mean(axis=0) > 0.5
-    return Footage(clip_of(story), labels, g.arrays["plate"], int(g.meta["rest_frame"]), rocks)
-
-
-BEHIND = (1.5, 0.5)
-"""cells behind the terrain from which fluid is hidden: at rocks, whose shape is a guess, and where it is always dry"""
-
-
-def before_ground(scene: Scene, footage: Footage | None) -> Callable[[Gaussians], np.ndarray] | None:
-    """Which splats are not hidden by the ground that the clip's picture shows; None where it hides nothing.
-
-    The picture is drawn as one plate behind the fluid: without this, fluid would be seen through a near bank.
-    """
-    from fluidlift.look.scenery import terrain_depth, visible_beside_rocks
-
-    if footage is None:
-        return None
-    rocks = footage.rocks
-    ground = rocks | ~footage.labels.fluid.any(axis=0) if kind_of(scene.kind).is_channel_flow else rocks
-    if not ground.any():
-        return None
-    margin = scene.terrain.grid.spacing * np.where(rocks, *BEHIND)
-    depth = terrain_depth(scene.terrain, scene.camera)
-    return lambda g: visible_beside_rocks(g.means, scene.camera, depth, ground, margin=margin)
-
-
 def scene_of(
     asset: FluidAsset,
     folder: Path,
@@ -239,11 +196,9 @@ def scene_of(
     *,
     footage: Footage | None,
     start: int,
+    edits: SceneEdits | None = None,
 ) -> Scene:
-    """The scene that an asset, its scene.yaml and a request describe.
-
-    The channel is made longer first, then its terrain is edited, then emitters are put into it: each in the world as
-    the one before left it.
+    """The scene that an asset, its scene.yaml and a request describe: `edited_scene` with what lies in the folder.
 
     Args:
         asset: as `load_asset` gives it.
@@ -252,16 +207,54 @@ def scene_of(
         config: seed, and frames where neither request nor scene.yaml say.
         footage: the clip, where it is at hand.
         start: frame of the clip that the first simulated one shows.
+        edits: the folder's scene.yaml, where it was read already.
 
     Raises:
-        InputRejected: a scene.yaml or a request that does not fit.
+        InputRejected: a scene.yaml or a request that does not fit, or a damaged file.
     """
+    from fluidlift.io.force_file import read_force
     from fluidlift.io.scene import read_edits
-    from fluidlift.numerics.sampling import sample_faces
 
-    edits = read_edits(folder, meshes=request.meshes)
+    edits = read_edits(folder, meshes=request.meshes) if edits is None else edits
     # edits that are tried out lie elsewhere than their asset
     home = folder if request.meshes is None or (folder / "manifest.json").is_file() else request.meshes
+    settings = SceneSettings.of(config)
+    force = read_force(home) if settings.follow > 0 else None
+    return edited_scene(asset, edits, request, settings, footage=footage, start=start, film=film_of(home), force=force)
+
+
+def edited_scene(
+    asset: FluidAsset,
+    edits: SceneEdits,
+    request: SimulationRequest | None = None,
+    settings: SceneSettings | None = None,
+    *,
+    footage: Footage | None = None,
+    start: int = 0,
+    film: Path | None = None,
+    force: FaceVelocity | None = None,
+) -> Scene:
+    """The scene that an asset, edits of it and a request describe. No file is looked at.
+
+    The channel is made longer first, then its terrain is edited, then emitters are put into it: each in the world as
+    the one before left it.
+
+    Args:
+        asset: at rest.
+        edits: what scene.yaml says; `SceneEdits()` says nothing.
+        request: of this run.
+        settings: seed, and frames where neither request nor edits say; None: as by default.
+        footage: the clip, where it is at hand.
+        start: frame of the clip that the first simulated one shows.
+        film: that the fluid's surface plays.
+        force: m/s^2, that keeps the filmed flow.
+
+    Raises:
+        InputRejected: edits or a request that do not fit.
+    """
+    from fluidlift.numerics.sampling import sample_faces
+
+    request, settings = request or SimulationRequest(), settings or SceneSettings.of(JobConfig())
     interval = asset.interval if request.fps is None else 1.0 / request.fps
     duration = edits.duration if request.duration is None else request.duration
     clip_frames = max(1, round((asset.frame_count - start) * asset.interval / interval))
@@ -277,16 +270,15 @@ def scene_of(
     scene = Scene(
         asset.kind, rest, body, asset.terrain, asset.cell_types, velocity,
         asset.parameters.updated(changes), asset.camera, interval, asset.interval,
-        wanted or config.simulate.frames or clip_frames, config.seed, edits.obstacles, shading,
+        wanted or settings.frames or clip_frames, settings.seed, edits.obstacles, shading,
         longest_step=longest_step, inflow=edits.inflow, changes=changed_parameters(asset.parameters, changes),
-        film=film_of(home), film_start=start - first_of_film(start, asset.frame_count),
+        film=film, film_start=start - first_of_film(start, asset.frame_count),
     )  # fmt: skip
     longer = edits.extend_downstream if request.extend_downstream is None else request.extend_downstream
     if longer > 0:
         scene = extended(scene, longer)
     scene = with_emitters(with_terrain(scene, edits.terrain), edits.emitters)
-    if config.simulate.follow > 0:
-        scene = following(scene, asset, home, config.simulate.follow)
+    scene = following(scene, asset, force, settings.follow)
     return replace(scene, overlap=loop_overlap(scene)) if edits.loop else scene
 
 

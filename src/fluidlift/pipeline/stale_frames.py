@@ -12,16 +12,11 @@ from fluidlift.io.obstacles import color_mark
 from fluidlift.io.scene import SceneEdits
 from fluidlift.io.scene_look import Look
 from fluidlift.io.stage_cache import owner_of
-from fluidlift.pipeline.resimulate import (
-    SECOND_HALF,
-    SECOND_HALF_SECTIONS,
-    recall_first_half,
-    rest_frame_of,
-    settings_of,
-)
-from fluidlift.pipeline.scene import Scene, SimulationRequest, footage_of, scene_of
-from fluidlift.pipeline.simulating import checkpoint_file
-from fluidlift.pipeline.story import Silence, Story
+from fluidlift.pipeline.recall import footage_of_asset, rest_frame_of
+from fluidlift.pipeline.resimulate import SECOND_HALF_SECTIONS, settings_of
+from fluidlift.pipeline.scene import Scene, SimulationRequest, scene_of
+from fluidlift.pipeline.splat_files import checkpoint_file
+from fluidlift.pipeline.stages.simulate import state_parts
 
 
 def stale_parts(folder: Path, edits: SceneEdits, *, meshes: Path | None = None) -> set[str]:
@@ -53,15 +48,15 @@ def stale_parts(folder: Path, edits: SceneEdits, *, meshes: Path | None = None) 
 
 def _moved(folder: Path, edits: SceneEdits, manifest: dict[str, Any], meshes: Path | None) -> bool:
     """Whether a simulation of scene.yaml would give other frames, or more."""
-    done, parts = manifest["simulation"], None
-    if checkpoint_file(folder).is_file():
+    done, parts, of_state = manifest["simulation"], None, checkpoint_file(folder).is_file()
+    if of_state:
         _, parts = read_parts(checkpoint_file(folder))
     elif owner_of(folder, "simulate") is not None:  # a closed loop has no checkpoint; frames half written, no owner
         parts = done.get("parts")
     if not isinstance(parts, dict):
         return True
     scene = scene_now(folder, manifest, meshes)
-    if differing_parts(parts, scene.parts):
+    if differing_parts(parts, state_parts(scene) if of_state else scene.parts):
         return True
     more = done["frames"] > scene.frames
     return done["frames"] < scene.frames or (more and edits.duration is not None)
@@ -75,9 +70,7 @@ def scene_now(folder: Path, manifest: dict[str, Any], meshes: Path | None) -> Sc
     """
     done = manifest["simulation"]
     config = settings_of(manifest, (), {"seed": done.get("seed")}, sections=SECOND_HALF_SECTIONS, work="a simulation")
-    story = Story(folder, SECOND_HALF, progress=Silence())
-    recall_first_half(story, manifest)
-    footage, interval = footage_of(story), done["frame_interval"]
+    footage, interval = footage_of_asset(folder, manifest), done["frame_interval"]
     fps = None if interval == manifest["frame_interval"] else 1.0 / interval
     request = SimulationRequest(fps=fps, meshes=meshes)
     start = rest_frame_of(manifest, footage)

@@ -48,7 +48,7 @@ def write_usd_asset(job: ExportJob, frames: Iterable[FluidFrame], settings: UsdS
 def bodies_of(folder: Path, picked: range) -> tuple[list[MovingMesh], tuple[str, ...]]:
     """The obstacles in the poses that the simulation gave them in the frames that are picked, and warnings."""
     from fluidlift.io.scene import read_edits
-    from fluidlift.pipeline.simulating import simulated_poses
+    from fluidlift.pipeline.recall import simulated_poses
 
     obstacles = read_edits(folder).obstacles
     if not obstacles:

@@ -1,4 +1,4 @@
-"""The outline, frame by frame, of a fluid that moves through the picture: smoke that rises, a jet that arrives."""
+"""Moving fronts: the outline, frame by frame, of a fluid that crosses the picture: rising smoke, an arriving jet."""
 
 from __future__ import annotations
 

@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float
 from fluidlift.errors import require
 from fluidlift.shape.jet_column import Jet
 from fluidlift.shape.kinds import AirborneBuilder, builder_of
-from fluidlift.shape.terrain import Setting, at_cells, terrain_mesh, unit
-from fluidlift.types import CellType, FluidKind, Grid, PinholeCamera, Terrain, kind_of
+from fluidlift.shape.terrain import at_cells, terrain_mesh, unit
+from fluidlift.types import CellType, FluidKind, Grid, PinholeCamera, Setting, Terrain, kind_of
 
 PASSING = 0.25
 """speed along the stream at one of its ends over that of its swift part (90th percentile), above which fluid enters or

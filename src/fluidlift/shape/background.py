@@ -1,4 +1,4 @@
-"""The still scene behind a fluid that moves through the picture, and how the fluid stands out from it."""
+"""Background subtraction: the still scene behind a fluid that moves through the picture; what stands out from it."""
 
 from __future__ import annotations
 

@@ -14,8 +14,8 @@ from fluidlift.shape.cross_section import distance_inside
 from fluidlift.shape.depth_surface import solid_heights
 from fluidlift.shape.ground_mesh import ground_mesh
 from fluidlift.shape.plan import Extent, Footage, Plan, dry_columns, extent_of, plan_of, wide_ends, with_seen
-from fluidlift.shape.terrain import Setting, at_cells, signed_distance_from, to_corners, unit
-from fluidlift.types import CellType, FluidKind, Grid, Label, Terrain, kind_of
+from fluidlift.shape.terrain import at_cells, signed_distance_from, to_corners, unit
+from fluidlift.types import CellType, FluidKind, Grid, Label, Setting, Terrain, kind_of
 
 INLET = 2.5
 """cells along the flow that an inlet is long"""

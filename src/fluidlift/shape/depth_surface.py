@@ -17,12 +17,10 @@ from scipy.linalg import solve
 from fluidlift.errors import InputRejected
 from fluidlift.shape.given_depth import SceneDepth, robust_plane, without_rim
 from fluidlift.shape.heights import HeightModel, ProfileHeight
-from fluidlift.shape.kind import UpEvidence
 from fluidlift.shape.plume import SIGHT
-from fluidlift.shape.slope import SlopeEvidence
 from fluidlift.shape.surface import FrontSurface, inflated_surface, intersect_height
 from fluidlift.shape.view import Scene, habit_prior
-from fluidlift.types import FluidKind, Grid, Label, PinholeCamera, kind_of
+from fluidlift.types import FluidKind, Grid, Label, PinholeCamera, SlopeEvidence, UpEvidence, kind_of
 from fluidlift.types.kind import STREAM
 
 SLOPES: tuple[tuple[float, float, float], ...] = ((0.7, 0.5, 2.0), (0.3, 0.0, 20.0))

@@ -1,4 +1,4 @@
-"""What in a clip speaks for fluid: change against the clip's own noise, and motion that goes somewhere.
+"""Motion segmentation cues for fluid: change against the clip's own noise, and motion that goes somewhere.
 
 Nothing here was learned from data. All thresholds are relative to the noise of the clip, which is read from
 the quietest part of the picture, separately for flat and for sharply drawn places: where an edge is sharp, the

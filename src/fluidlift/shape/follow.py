@@ -1,4 +1,4 @@
-"""Refines the frames after the first: each starts from the refined Gaussians of the frame before it.
+"""Warm start of the frames after the first: each is refined from the Gaussians of the frame before it.
 
 They are moved as the picture moves and keep to the surface, so that a few steps are enough for what is new in the
 frame. Where the fluid has come to a place that the last frame did not show, the freshly generated body helps out.

@@ -12,8 +12,7 @@ from scipy.sparse.linalg import splu
 
 from fluidlift.errors import require
 from fluidlift.shape.background import weight_of_unseen
-from fluidlift.shape.terrain import Setting
-from fluidlift.types import SH_C0, CellType, Gaussians, PinholeCamera, decompose_covariances, sh_from_rgb
+from fluidlift.types import SH_C0, CellType, Gaussians, PinholeCamera, Setting, decompose_covariances, sh_from_rgb
 
 COARSE = 256
 """px on the longer side of the picture in which a hole is filled, at most"""

@@ -1,4 +1,4 @@
-"""The frame that Gaussians are refined on, and the figures that must not get worse meanwhile."""
+"""Regression guard of the refinement: the frame it is refined on, and the figures that must not get worse meanwhile."""
 
 from __future__ import annotations
 

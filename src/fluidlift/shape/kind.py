@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -11,7 +11,7 @@ from scipy import ndimage
 from fluidlift.errors import require
 from fluidlift.shape import chute, prism, slope
 from fluidlift.shape.view import PictureEvidence, habit_prior
-from fluidlift.types import FluidKind, PinholeCamera, RigidTransform, kind_of
+from fluidlift.types import FluidKind, KindEvidence, PinholeCamera, RigidTransform, UpEvidence, kind_of
 from fluidlift.types.kind import KINDS as FLUID_KINDS
 from fluidlift.types.kind import STREAM
 
@@ -19,48 +19,8 @@ KINDS: tuple[str, ...] = tuple(name for name, kind in FLUID_KINDS.items() if kin
 """names of the kinds whose evidence is weighed"""
 
 
-UNSURE = 12.0
-"""degrees, error of the pitch from which the user is asked: a quarter of what lies between level and straight down, by
-which lengths along the view come out wrong by half and more"""
 STRAIGHT = 10.0
 """degrees: a larger lean of what falls is a thrown jet or wind, not a turned camera"""
-
-
-@dataclass(frozen=True)
-class KindEvidence:
-    """Why a kind was chosen."""
-
-    kind: str
-    scores: dict[str, float]
-    """share of belief per kind, sums to 1"""
-    features: dict[str, float]
-    """the measured figures behind the scores"""
-
-
-@dataclass(frozen=True)
-class UpEvidence:
-    """Which way is up, as seen by the camera."""
-
-    pitch: float
-    """degrees that the camera looks below the horizon"""
-    roll: float
-    """degrees that the picture is turned clockwise"""
-    source: str
-    """user, camera file, or what it was estimated from"""
-    confidence: float
-    """0 (prior alone) to 1 (given)"""
-    error: float = 0.0
-    """degrees, standard deviation of what the pitch may be; 0: given, or not known"""
-
-    @property
-    def warnings(self) -> list[str]:
-        """What the user should know of a tilt that little is known of."""
-        if self.error <= UNSURE:
-            return []
-        return [
-            f"how far the camera looks down is known to {self.error:.0f} degrees only: {self.pitch:.0f} is the middle "
-            f"of what it may be ({self.source}); give --pitch, or a camera file, for a better shape"
-        ]
 
 
 def estimate_kind(

@@ -1,4 +1,4 @@
-"""The cheapest cut of a picture in two: log odds per pixel against the length of an outline that shuns smooth places.
+"""Graph cut (min-cut) of a picture: log odds per pixel against the length of an outline that shuns smooth places.
 
 Boykov, Jolly 2001 ("Interactive graph cuts"); the maximum flow is scipy's, exact, so the result does not depend on
 threads or on order.

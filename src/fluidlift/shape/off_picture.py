@@ -1,4 +1,4 @@
-"""The surface of a stream beyond the edges of the picture: the seen one goes on as in a mirror.
+"""Extrapolation of a stream's surface beyond the edges of the picture: the seen one goes on as in a mirror.
 
 What the camera does not see is part of the body all the same, and some of it flows into the picture a moment later. The
 colours of the nearest pixels would come in as smears.
@@ -12,8 +12,7 @@ from jaxtyping import Bool, Float
 from fluidlift.numerics.mirror import MirroredPoints
 from fluidlift.physics.inlet import clear_of_shore
 from fluidlift.shape.generate import body_cells
-from fluidlift.shape.terrain import Setting
-from fluidlift.types import Gaussians, PinholeCamera
+from fluidlift.types import Gaussians, PinholeCamera, Setting
 
 HIDDEN = 0.5
 """cells below the surface to which splats of the hull would show through finer ones above them"""

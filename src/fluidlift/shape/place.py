@@ -1,4 +1,4 @@
-"""From the canonical frame of a single view to metres: the one free scale, the heading, the origin."""
+"""Registration and scale, from the canonical frame of a single view to metres: the free scale, heading, origin."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fluidlift.shape.heights import HeightModel
-from fluidlift.shape.kind import UpEvidence
-from fluidlift.types import FluidKind, PinholeCamera, RigidTransform, Similarity3, kind_of
+from fluidlift.types import FluidKind, MetricScale, PinholeCamera, RigidTransform, Similarity3, UpEvidence, kind_of
 from fluidlift.types.kind import POUR
 
 STANDARD_GRAVITY = 9.81
@@ -61,31 +60,6 @@ class Sighting:
     of the way."""
     pitch: float = 0.0
     """degrees that the camera looks below the horizon"""
-
-
-@dataclass(frozen=True)
-class MetricScale:
-    """Metres per canonical unit and where that came from."""
-
-    value: float
-    source: str
-    """size, depth, camera, free fall, front, or assumed"""
-    warning: str = ""
-    relative_error: float | None = None
-    """standard error over value; None: not known (nothing was measured, or what was given is taken as it is)"""
-    across: float = 0.0
-    """m across the fluid, along the longest side of its box"""
-    refusal: str = ""
-    """why free fall was not used, where it was looked for"""
-
-    @property
-    def sentence(self) -> str:
-        """For people: `scale: 0.42 m across the fluid, from free fall, ± 12 %`."""
-        words = {"size": "as given", "depth": "from the given depth", "camera": "from the surveyed camera",
-                 "free fall": "from free fall", "front": "from the speed of its front",
-                 "assumed": "assumed"}  # fmt: skip
-        error = "" if self.relative_error is None else f", ± {100 * 1.96 * self.relative_error:.0f} % (95 %)"
-        return f"scale: {self.across:.3g} m across the fluid, {words[self.source]}{error}"
 
 
 def pose_up(camera: PinholeCamera) -> tuple[UpEvidence, float]:

@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from fluidlift.shape.jets import Outline, airborne_pixels, find_jets, lying_pixels
-from fluidlift.shape.kind import UpEvidence, level_camera
+from fluidlift.shape.kind import level_camera
 from fluidlift.shape.region import largest_piece
 from fluidlift.shape.view.roundness import POOL_LIKENESS, fit_ellipse
-from fluidlift.types import PinholeCamera
+from fluidlift.types import PinholeCamera, UpEvidence
 from fluidlift.types.kind import LOOKING_DOWN
 
 LEAST_SHARE = 0.4

@@ -20,7 +20,7 @@ from scipy.special import logsumexp
 
 from fluidlift.shape.texture_gradient import TexturePatches, texture_evidence, weighed
 from fluidlift.shape.view import PictureEvidence
-from fluidlift.types import PinholeCamera
+from fluidlift.types import PinholeCamera, SlopeEvidence
 from fluidlift.types.kind import STREAM
 
 PATCHES = 160
@@ -76,26 +76,6 @@ class FlowPatches:
     """px per frame, medians"""
     weight: Float[np.ndarray, " n"]
     """0 to 1"""
-
-
-@dataclass(frozen=True)
-class SlopeEvidence:
-    """What the motion says about the slope of a stream."""
-
-    slope: float
-    """degrees that the surface falls along the stream; 0 where the evidence is weak"""
-    standard_error: float
-    """degrees, of a slope that is not level (of the likeliest one, where level is taken)"""
-    heading: float
-    """degrees from the canonical x axis towards y, where the stream runs to"""
-    level_share: float
-    """probability that the stream is level"""
-    likeliest: float
-    """degrees, mean over the slopes that are not level"""
-    source: str
-    """what the slope was taken from"""
-    chute: float = 0.0
-    """degrees of the steepest chute that comes down onto it; 0: there is none"""
 
 
 @dataclass(frozen=True)

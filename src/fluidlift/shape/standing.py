@@ -17,7 +17,7 @@ from scipy import ndimage, stats
 
 from fluidlift.errors import InputRejected
 from fluidlift.shape.ground_mesh import ground_mesh
-from fluidlift.shape.place import STANDARD_GRAVITY, MetricScale
+from fluidlift.shape.place import STANDARD_GRAVITY
 from fluidlift.shape.prism import (
     FARTHEST,
     GROUND,
@@ -32,8 +32,8 @@ from fluidlift.shape.prism import (
     whole_piece,
 )
 from fluidlift.shape.surface import FrontSurface
-from fluidlift.shape.terrain import Setting, at_cells, to_corners, unit
-from fluidlift.types import CellType, Grid, PinholeCamera, Similarity3, Terrain
+from fluidlift.shape.terrain import at_cells, to_corners, unit
+from fluidlift.types import CellType, Grid, MetricScale, PinholeCamera, Setting, Similarity3, Terrain
 
 STILL = 0.02
 """share of the outline's area that changes while the body is still held: noise of the mask"""

@@ -17,8 +17,7 @@ from fluidlift.shape import chute, sections, slope
 from fluidlift.shape.energy_line import Channel, energy_profile
 from fluidlift.shape.heights import FOOT, HeightModel, PlaneHeight, ProfileAlongHeight, ProfileHeight, SampledHeight
 from fluidlift.shape.plume import SIGHT, section_half_thickness
-from fluidlift.shape.slope import SlopeEvidence
-from fluidlift.types import FluidKind, PinholeCamera, kind_of
+from fluidlift.types import FluidKind, PinholeCamera, SlopeEvidence, kind_of
 from fluidlift.types.kind import POUR
 
 FAR = 12.0

@@ -4,29 +4,12 @@ hold fluid and where it enters and leaves.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from scipy import ndimage
 
 from fluidlift.numerics.isosurface import surface_nets
-from fluidlift.types import Grid, Terrain, TriangleMesh
-
-
-@dataclass(frozen=True)
-class Setting:
-    """A fluid in its place at the first instant."""
-
-    terrain: Terrain
-    cell_types: UInt8[np.ndarray, "nx ny nz"]
-    """values of `CellType`"""
-    surface_height: Float[np.ndarray, "nx ny"] | None
-    """z of the free surface over each column, m (fluids that lie on something)"""
-    bed_height: Float[np.ndarray, "nx ny"]
-    """z of the ground under each column, m"""
-    pool_level: float | None = None
-    """z below which a pour stands in its vessel, m"""
+from fluidlift.types import Grid, TriangleMesh
 
 
 def signed_distance_from(

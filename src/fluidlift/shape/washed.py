@@ -1,4 +1,4 @@
-"""Rocks and banks that waves wash over: places that come back to one picture again and again, which water never does.
+"""Intermittently wetted rocks and banks: places that come back to one picture again and again; water never does.
 
 A splash changes a rock more than the stream changes itself, so its mean change is the water's, and flow follows the
 splash across it. What shows between two splashes is always the same: the colour that a place has most often (its

@@ -1,4 +1,4 @@
-"""Plants that wave in front of a fluid or beside it: they change as much as it does, but hang on to their place.
+"""Vegetation that waves in front of a fluid or beside it: they change as much as it does, but hang on to their place.
 
 A stem or a leaf has few ways to move, and they are slow: half a second later a patch of it looks much as before, or as
 it did some swings ago. Water in the same patch has many eddies and ripples, none of which waits so long. So a picture

@@ -35,7 +35,7 @@ class FluidKind:
     """m^2/s, where the fit starts"""
     wall_damping: float
     """share of the tangential velocity that a wall takes per step of the fit, where the fit starts: water runs nearly
-    free over a bed that the grid cannot resolve. A viscous film does not: it sticks (`pipeline.moving.sticking`)"""
+    free over a bed that the grid cannot resolve. A viscous film does not: it sticks (`pipeline.stages.fit.sticking`)"""
     wall_layer: float
     """Thickness of the boundary layer at a wall, cells (`motion.bed.layer_thickness`). Water is turbulent: beside the
     bed of a river some 10 cells deep its speed at half a cell is about 0.7 of the surface speed (1/7 power law), which

@@ -52,3 +52,18 @@ class Terrain:
     def __post_init__(self) -> None:
         shape = tuple(n + 1 for n in self.grid.shape)
         require(self.signed_distance.shape == shape, f"signed distance {self.signed_distance.shape}", str(shape))
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A fluid in its place at the first instant."""
+
+    terrain: Terrain
+    cell_types: UInt8[np.ndarray, "nx ny nz"]
+    """values of `CellType`"""
+    surface_height: Float[np.ndarray, "nx ny"] | None
+    """z of the free surface over each column, m (fluids that lie on something)"""
+    bed_height: Float[np.ndarray, "nx ny"]
+    """z of the ground under each column, m"""
+    pool_level: float | None = None
+    """z below which a pour stands in its vessel, m"""

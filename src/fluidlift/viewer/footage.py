@@ -80,16 +80,10 @@ def input_pictures(
 
 
 def _of_stages(folder: Path, manifest: dict[str, Any]) -> InputPictures | None:
-    from fluidlift.pipeline.resimulate import stage_keys
-    from fluidlift.pipeline.scene import footage_of
-    from fluidlift.pipeline.story import Silence, Story
+    from fluidlift.pipeline.recall import footage_of_asset
 
-    keys = stage_keys(manifest)
-    story = Story(folder, ("read", "segment", "geometry"), progress=Silence())
     try:
-        if not all(n in keys and story.recall(n, keys[n]) for n in story.stages):
-            return None
-        footage = footage_of(story)
+        footage = footage_of_asset(folder, manifest)
     except (FluidliftError, OSError, ValueError, KeyError):  # a cache that is damaged is as good as none
         return None
     if footage is None or not len(footage.clip):

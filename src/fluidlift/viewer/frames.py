@@ -105,7 +105,7 @@ def read_frame(folder: Path, index: int, *, cell: float = math.nan) -> SplatFram
         FrameMissing: it is not there, or not (yet) whole.
     """
     from fluidlift.io.ply import read_splats
-    from fluidlift.pipeline.simulating import frame_file
+    from fluidlift.pipeline.splat_files import frame_file
 
     try:
         splats = read_splats(frame_file(folder, FIRST_FRAME + index))

@@ -13,7 +13,8 @@ from fluidlift.io.asset_folder import load_asset, read_manifest
 from fluidlift.io.asset_lock import writer_of
 from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.io.stage_cache import owner_of
-from fluidlift.pipeline.simulating import frame_file, simulated_poses
+from fluidlift.pipeline.recall import simulated_poses
+from fluidlift.pipeline.splat_files import frame_file
 
 
 class SavedFrames:

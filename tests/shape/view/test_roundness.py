@@ -4,11 +4,11 @@ import cv2
 import numpy as np
 import pytest
 
-from fluidlift.shape.kind import UpEvidence, estimate_up, level_camera
+from fluidlift.shape.kind import estimate_up, level_camera
 from fluidlift.shape.view import look_at
 from fluidlift.shape.view.rims import find_rims
 from fluidlift.shape.view.roundness import Ellipse, fit_ellipse, out_of_round, round_pool, roundness_evidence, wide_part
-from fluidlift.types import PinholeCamera
+from fluidlift.types import PinholeCamera, UpEvidence
 from fluidlift.types.kind import POUR, STREAM
 
 SIZE = (320, 240)

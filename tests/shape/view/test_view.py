@@ -4,11 +4,11 @@ import cv2
 import numpy as np
 import pytest
 
-from fluidlift.shape.kind import UpEvidence, estimate_up, level_camera
+from fluidlift.shape.kind import estimate_up, level_camera
 from fluidlift.shape.view import PictureEvidence, look_at
 from fluidlift.shape.view.horizon import elevation, farthest_elevation, skyline, skyline_evidence, upper_outline
 from fluidlift.shape.view.plumb import plumb_evidence, plumb_lines
-from fluidlift.types import PinholeCamera, kind_of
+from fluidlift.types import PinholeCamera, UpEvidence, kind_of
 from fluidlift.types.kind import STREAM
 
 SIZE = (320, 200)

@@ -1,0 +1,86 @@
+"""The fluid as the clip's camera sees it: before the clip without its fluid, behind its rocks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fluidlift.pipeline.footage import Footage
+from fluidlift.pipeline.scene import Scene
+from fluidlift.types import Gaussians, PinholeCamera, concatenate, kind_of
+
+if TYPE_CHECKING:
+    from fluidlift.look.open_end import OpenEnd
+    from fluidlift.look.rasterize import Rendered
+
+
+BEHIND = (1.5, 0.5)
+"""cells behind the terrain from which fluid is hidden: at rocks, whose shape is a guess, and where it is always dry"""
+
+
+def before_ground(scene: Scene, footage: Footage | None) -> Callable[[Gaussians], np.ndarray] | None:
+    """Which splats are not hidden by the ground that the clip's picture shows; None where it hides nothing.
+
+    The picture is drawn as one plate behind the fluid: without this, fluid would be seen through a near bank.
+    """
+    from fluidlift.look.scenery import terrain_depth, visible_beside_rocks
+
+    if footage is None:
+        return None
+    rocks = footage.rocks
+    ground = rocks | ~footage.labels.fluid.any(axis=0) if kind_of(scene.kind).is_channel_flow else rocks
+    if not ground.any():
+        return None
+    margin = scene.terrain.grid.spacing * np.where(rocks, *BEHIND)
+    depth = terrain_depth(scene.terrain, scene.camera)
+    return lambda g: visible_beside_rocks(g.means, scene.camera, depth, ground, margin=margin)
+
+
+@dataclass(frozen=True)
+class FrontView:
+    """Splats as the clip's camera sees them: before the clip without its fluid, behind its rocks."""
+
+    camera: PinholeCamera
+    plate: np.ndarray
+    """[H,W,3] sRGB in [0, 1]"""
+    rocks: np.ndarray
+    """bool [H,W]"""
+    seen_of: Callable[[Gaussians], np.ndarray] | None
+    """whether the ground of the clip hides a splat; None where it hides none"""
+
+    @staticmethod
+    def of(scene: Scene, footage: Footage | None) -> FrontView:
+        """Of a scene; before grey where its clip is not at hand, or shows a ground that was edited."""
+        size, shown = scene.camera.size[::-1], None if scene.reshaped else footage
+        plate, rocks = np.full((*size, 3), 0.5, np.float32), np.zeros(size, bool)
+        if shown is not None:  # the clip shows the ground as it was
+            plate, rocks = shown.plate.astype(np.float32) / 255.0, shown.rocks
+        return FrontView(scene.camera, plate, rocks, before_ground(scene, shown))
+
+    def drawn(
+        self, gaussians: Gaussians, velocity: np.ndarray, solids: Sequence[Gaussians] = ()
+    ) -> tuple[Rendered, Gaussians, np.ndarray]:
+        """The picture with its coverage, and the splats that the ground leaves over, with their velocities (m/s)."""
+        from fluidlift.look.rasterize import render
+
+        if self.seen_of is not None:
+            keep = self.seen_of(gaussians)
+            gaussians, velocity = gaussians.select(keep), velocity[keep]
+        return render(concatenate([gaussians, *solids]), self.camera, background=self.plate), gaussians, velocity
+
+
+def open_end(scene: Scene) -> OpenEnd | None:
+    """Where a stream is cut in pictures; None of other kinds."""
+    from fluidlift.look.open_end import OpenEnd
+
+    if not kind_of(scene.kind).is_channel_flow:
+        return None
+    return OpenEnd.of(scene.cell_types, scene.terrain.grid, scene.terrain.mainstream)
+
+
+def to_bytes(image: np.ndarray) -> np.ndarray:
+    """u8 sRGB of sRGB in [0, 1]."""
+    return (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)

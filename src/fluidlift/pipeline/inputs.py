@@ -1,0 +1,120 @@
+"""The files of a job: where they are, and what is in them."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from fluidlift.errors import InputRejected
+
+_OPTIONS = {"geometry": ("--geometry-from", "folder")}
+"""option and what it takes, where they are not --name and a file"""
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Files of a job. All but the clip are optional."""
+
+    clip: Path
+    mask: Path | None = None
+    camera: Path | None = None
+    depth: Path | None = None
+    geometry: Path | None = None
+    """folder of Gaussian PLY files and camera.json"""
+    flow: Path | None = None
+    """optical flow of the clip: a folder of .flo, .exr or .npz files, or one .npz"""
+
+    def existing(self) -> dict[str, Path]:
+        """Those that were given."""
+        return {k: v for k, v in vars(self).items() if v is not None}
+
+
+@dataclass(frozen=True)
+class GivenFile:
+    """A file or folder, and a hash of its content, which is what results depend on."""
+
+    path: Path
+    content: str | list[str]
+    """SHA-256; of numbered pictures one each"""
+
+    @property
+    def cache_key(self) -> Any:
+        """What a stage's key knows of it."""
+        return self.content
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Weights of a learned model, by their content where they are files here, else by their name."""
+
+    name: str
+    content: str
+
+    @property
+    def cache_key(self) -> str:
+        """What a stage's key knows of them."""
+        return self.content
+
+    @classmethod
+    def of(cls, name: str | None) -> Weights | None:
+        """Of a file, a folder, or a name on the hub."""
+        if name is None:
+            return None
+        path = Path(name)
+        return cls(name, file_hash(path) if path.exists() else name)
+
+
+@dataclass(frozen=True)
+class GivenFiles:
+    """The files of a job with their hashes."""
+
+    clip: GivenFile
+    mask: GivenFile | None = None
+    camera: GivenFile | None = None
+    depth: GivenFile | None = None
+    geometry: GivenFile | None = None
+    flow: GivenFile | None = None
+
+    @classmethod
+    def of(cls, inputs: Inputs) -> GivenFiles:
+        """Look at every file that was given.
+
+        Raises:
+            InputRejected: a file that is not there.
+        """
+        from fluidlift.io.limits import require_file
+        from fluidlift.io.sequences import is_sequence, list_sequence
+
+        if not is_sequence(inputs.clip):
+            require_file(inputs.clip, "video")
+        found: dict[str, GivenFile] = {}
+        for name, path in inputs.existing().items():
+            if path.exists():
+                found[name] = GivenFile(path, file_hash(path))
+            elif name == "clip":
+                found[name] = GivenFile(path, [file_hash(p) for _, p in list_sequence(path)])
+            elif name in ("flow", "mask") and is_sequence(path):  # a pattern
+                found[name] = GivenFile(path, file_hash(path.parent))
+            else:
+                option, what = _OPTIONS.get(name, (f"--{name}", "file"))
+                raise InputRejected(f"no such {name} {what}: '{path}'", f"an existing {what}", f"check {option}")
+        return cls(**found)
+
+    def provenance(self) -> dict[str, Any]:
+        """Names and hashes, for a manifest."""
+        given = {k: v for k, v in vars(self).items() if v is not None}
+        return {"inputs": {k: {"name": v.path.name, "sha256": v.content} for k, v in given.items()}}
+
+
+def file_hash(path: Path) -> str:
+    """SHA-256 of a file, or of all files of a folder with their names."""
+    digest = hashlib.sha256()
+    files = [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file())
+    for file in files:
+        digest.update(file.name.encode())
+        with file.open("rb") as stream:
+            while block := stream.read(1 << 20):
+                digest.update(block)
+    return digest.hexdigest()

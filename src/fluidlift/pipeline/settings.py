@@ -1,0 +1,273 @@
+"""What each stage is told: the settings that it reads, and no others, so that none can be forgotten in its key.
+
+A stage gets one of these in place of the job's settings. What does not change its result (a device, a limit that guards
+the reading) is marked `BESIDE` and stays out of the key.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any, TypeVar
+
+from fluidlift.config import JobConfig
+from fluidlift.pipeline.inputs import GivenFile, GivenFiles, Weights
+from fluidlift.pipeline.source import source_hash
+
+T = TypeVar("T")
+
+
+BESIDE = {"keyed": False}
+"""metadata of a field that does not change the result"""
+
+
+def taken(kind: type[T], section: Any, **more: Any) -> T:
+    """The settings of a stage from those of a section with the same names; `more` are given or replace them."""
+    names = [f.name for f in fields(kind) if f.name not in more]  # type: ignore[arg-type]
+    return kind(**{n: getattr(section, n) for n in names}, **more)
+
+
+@dataclass(frozen=True)
+class ReadSettings:
+    """Decoding."""
+
+    start: float
+    duration: float | None
+    max_size: int
+    fps: float
+    stabilise: bool
+    max_pixels: int = field(metadata=BESIDE)
+    max_frames: int = field(metadata=BESIDE)
+
+
+@dataclass(frozen=True)
+class FlowSettings:
+    """Who estimates the flow."""
+
+    method: str
+    weights: Weights | None
+    device: str = field(metadata=BESIDE)
+    download: bool = field(metadata=BESIDE)
+
+    @classmethod
+    def of(cls, config: JobConfig) -> FlowSettings:
+        """From those of a job."""
+        return taken(cls, config.motion, weights=Weights.of(config.motion.weights))
+
+
+@dataclass(frozen=True)
+class GivenFlow:
+    """The user's own flow, and what its numbers mean."""
+
+    files: GivenFile
+    clip: GivenFile
+    camera: GivenFile | None
+    start: float
+    """s into the clip"""
+    fps: float
+    """of image sequences"""
+    flow_channels: tuple[str, ...]
+    flow_v_up: bool | None
+    flow_scale: float
+
+    @classmethod
+    def of(cls, given: GivenFiles, config: JobConfig) -> GivenFlow | None:
+        """Where there is one."""
+        if given.flow is None:
+            return None
+        m, r = config.motion, config.read
+        return cls(given.flow, given.clip, given.camera, r.start, r.fps, m.flow_channels, m.flow_v_up, m.flow_scale)
+
+
+@dataclass(frozen=True)
+class GivenMask:
+    """The user's own mask, and which stretch of the clip it belongs to."""
+
+    file: GivenFile
+    camera: GivenFile | None
+    start: float
+    duration: float | None
+
+    @classmethod
+    def of(cls, given: GivenFiles, config: JobConfig) -> GivenMask | None:
+        """Where there is one."""
+        if given.mask is None:
+            return None
+        return cls(given.mask, given.camera, config.read.start, config.read.duration)
+
+
+@dataclass(frozen=True)
+class SegmentSettings:
+    """Who finds the fluid."""
+
+    method: str
+    weights: Weights | None
+    words: tuple[str, ...]
+    device: str = field(metadata=BESIDE)
+    download: bool = field(metadata=BESIDE)
+
+    @classmethod
+    def of(cls, config: JobConfig) -> SegmentSettings:
+        """From those of a job."""
+        return taken(cls, config.segment, weights=Weights.of(config.segment.weights))
+
+
+@dataclass(frozen=True)
+class GivenDepth:
+    """The user's depth file, and what its numbers mean."""
+
+    file: GivenFile
+    holds: str
+    scale: float | None
+    frames: int
+
+    @classmethod
+    def of(cls, given: GivenFiles, config: JobConfig) -> GivenDepth | None:
+        """Where there is one that counts: a body that is given has its own depth."""
+        if given.depth is None or given.geometry is not None:
+            return None
+        return taken(cls, config.depth, file=given.depth)
+
+
+@dataclass(frozen=True)
+class DepthModel:
+    """A learned model of depth."""
+
+    model: str
+    weights: Weights | None
+    frames: int
+    device: str = field(metadata=BESIDE)
+    download: bool = field(metadata=BESIDE)
+
+    @classmethod
+    def of(cls, given: GivenFiles, config: JobConfig) -> DepthModel | None:
+        """Where one is to look at the pictures: nothing better was given."""
+        if config.depth.model == "none" or given.depth is not None or given.geometry is not None:
+            return None
+        return taken(cls, config.depth, weights=Weights.of(config.depth.weights))
+
+
+@dataclass(frozen=True)
+class GivenView:
+    """What a person has of the camera, the body and the depth."""
+
+    clip: GivenFile
+    """its file may tell of the lens"""
+    camera: GivenFile | None = None
+    bodies: GivenFile | None = None
+    """folder of Gaussian PLY files, the user's or a generator's"""
+    depth: GivenDepth | None = None
+    model: DepthModel | None = None
+
+    @classmethod
+    def of(cls, given: GivenFiles, config: JobConfig) -> GivenView:
+        """Of a job."""
+        return cls(given.clip, given.camera, given.geometry, GivenDepth.of(given, config), DepthModel.of(given, config))
+
+
+@dataclass(frozen=True)
+class GenerateSettings:
+    """Which third-party generator makes bodies. Where it is installed does not change them."""
+
+    name: str
+    weights: Weights | None
+    runner: Weights | None
+    """a script of the user's own, by its content"""
+    source: str
+    """hash of the source that talks to it, which is chosen by name"""
+    seed: int
+    longest_union: int
+    fov: float | None
+    python: Path | None = field(metadata=BESIDE)
+    code: Path | None = field(metadata=BESIDE)
+    device: str = field(metadata=BESIDE)
+    download: bool = field(metadata=BESIDE)
+    frame_seconds: float = field(metadata=BESIDE)
+
+    @classmethod
+    def of(cls, config: JobConfig) -> GenerateSettings:
+        """From those of a job; needs `generate.name`."""
+        from fluidlift.backends.generators import require_known
+
+        def path(text: str | None) -> Path | None:
+            return None if text is None else Path(os.path.expanduser(text))
+
+        c, s, name = config.generate, config.shape, require_known(str(config.generate.name))
+        source = source_hash("fluidlift.backends." + name.replace("-", "_"))
+        return taken(
+            cls, c, name=name, source=source, weights=Weights.of(c.weights), runner=Weights.of(c.runner),
+            seed=config.seed, longest_union=s.longest_union, fov=s.fov, python=path(c.python), code=path(c.code),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class GeometrySettings:
+    """Kind, camera, size and cells."""
+
+    kind: str
+    fov: float | None
+    pitch: float | None
+    roll: float | None
+    size: float | None
+    depth_ratio: float | None
+    cells: int
+    cell_limit: int
+    longest_union: int
+
+
+@dataclass(frozen=True)
+class RefineSettings:
+    """The Gaussians of the body."""
+
+    stride: int
+    refine_iterations: int
+    max_gaussians: int
+    rays: int
+    rasterizer: str
+    seed: int
+
+
+@dataclass(frozen=True)
+class MotionSettings:
+    """From flow to velocities."""
+
+    half_window: int
+    reach: int
+    along_paths: bool
+    wall: str
+    divergence: str
+    targets: int
+    complete_every: int
+
+
+@dataclass(frozen=True)
+class SceneSettings:
+    """What a scene takes from the job, beside its asset and its edits."""
+
+    frames: int | None
+    follow: float
+    seed: int
+
+    @classmethod
+    def of(cls, config: JobConfig) -> SceneSettings:
+        """From those of a job."""
+        return taken(cls, config.simulate, seed=config.seed)
+
+
+@dataclass(frozen=True)
+class SimulateSettings:
+    """The re-simulation, beside what its scene says."""
+
+    max_particles: int
+    device: str = field(metadata=BESIDE)
+    checkpoint_every: int = field(metadata=BESIDE)
+
+
+@dataclass(frozen=True)
+class ShowSettings:
+    """Pictures and files."""
+
+    width: int
+    usd: bool
+    preview: bool

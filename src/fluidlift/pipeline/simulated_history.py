@@ -1,0 +1,65 @@
+"""Figures of each simulated frame, as they come."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fluidlift.pipeline.scene import Scene
+from fluidlift.types import Particles
+
+if TYPE_CHECKING:
+    from fluidlift.physics.stepping import ParticleSimulator
+
+
+@dataclass
+class History:
+    """Figures of each frame so far."""
+
+    volume: list[float] = field(default_factory=list)
+    """m^3 of the cells that hold particles"""
+    leak: list[float] = field(default_factory=list)
+    """share of the particles inside the terrain"""
+    count: list[int] = field(default_factory=list)
+    """particles"""
+    substeps: list[int] = field(default_factory=list)
+    """of the step that led to the frame; 0 for the first"""
+    poses: list[np.ndarray] = field(default_factory=list)
+    """[b,7] of the obstacles: position (m) and orientation (w, x, y, z)"""
+
+    def __len__(self) -> int:
+        return len(self.count)
+
+    def add(self, scene: Scene, simulator: ParticleSimulator, particles: Particles, substeps: int) -> None:
+        """One more frame."""
+        from fluidlift.numerics.sampling import sample_nodes
+
+        bodies = simulator.bodies if scene.obstacles else None
+        pose = np.zeros((0, 7)) if bodies is None else np.concatenate([bodies.position, bodies.orientation], axis=1)
+        self.poses.append(pose)
+        grid = scene.terrain.grid
+        occupied = np.unique(np.floor((particles.positions - grid.low) / grid.spacing).astype(np.int64), axis=0)
+        inside = grid.contains(particles.positions)
+        distance = sample_nodes(scene.terrain.signed_distance, grid, particles.positions[inside])
+        self.volume.append(len(occupied) * grid.spacing**3)
+        self.leak.append(float((distance < -0.1 * grid.spacing).mean()) if inside.any() else 0.0)
+        self.count.append(len(particles))
+        self.substeps.append(substeps)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """One entry per frame."""
+        return {
+            "volume": np.array(self.volume, np.float32),
+            "leak": np.array(self.leak, np.float32),
+            "count": np.array(self.count, np.int64),
+            "substeps": np.array(self.substeps, np.int64),
+            "poses": np.array(self.poses, np.float64),
+        }
+
+    @classmethod
+    def of(cls, arrays: dict[str, np.ndarray], frames: int) -> History:
+        """The first frames of `arrays`."""
+        figures = (arrays[name][:frames].tolist() for name in ("volume", "leak", "count", "substeps"))
+        return cls(*figures, list(arrays["poses"][:frames]))

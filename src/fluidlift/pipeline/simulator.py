@@ -1,0 +1,122 @@
+"""The simulator of a scene, at its first instant."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fluidlift.errors import InputRejected
+from fluidlift.pipeline.dressing import lends_look
+from fluidlift.pipeline.machine import available_memory
+from fluidlift.pipeline.reshaping import sides_open_to_air
+from fluidlift.pipeline.scene import Scene, simulation_step
+from fluidlift.types import CellType, Gaussians, Particles, kind_of
+
+if TYPE_CHECKING:
+    from fluidlift.look.inflow import InflowLook
+    from fluidlift.physics.guidance import BodyForce
+    from fluidlift.physics.numba_particles import ParticleWork
+    from fluidlift.physics.stepping import ParticleSimulator
+
+
+def particle_work(device: str) -> ParticleWork:
+    """The back end that moves particles on a device, "cpu" or "cuda".
+
+    Raises:
+        MissingPackage: NVIDIA Warp is not installed.
+        FluidliftError: there is no such GPU.
+    """
+    from fluidlift.physics.numba_particles import ParticleWork
+
+    if device == "cpu":
+        return ParticleWork()
+    from fluidlift.backends.warp_particles import WarpMover, WarpTransfer
+
+    return ParticleWork(WarpTransfer(device), WarpMover(device))
+
+
+def simulator_of(scene: Scene, device: str = "cpu", forces: Sequence[BodyForce] = ()) -> ParticleSimulator:
+    """The simulator at the first instant. Smoke is simulated on the CPU, without `forces`."""
+    from fluidlift.physics.emitter import Supply
+
+    parameters = simulation_step(scene)
+    own = scene.rest.select(np.arange(len(scene.rest) - sum(map(len, scene.emitter_looks))))
+    look = inflow_look(scene, own, float(np.linalg.norm(parameters.inflow_velocity)))
+    grid, supply = scene.terrain.grid, Supply(scene.inflow, scene.emitters, scene.emitter_looks)
+    if kind_of(scene.kind).is_gas:
+        from fluidlift.physics.gas import GasSimulator
+
+        return GasSimulator(
+            grid, scene.terrain, parameters, scene.body, cell_types=scene.cell_types, inflow_profile=scene.velocity,
+            velocity=scene.velocity, seed=scene.seed, emit_source=look,
+            buoyancy=float(np.linalg.norm(parameters.gravity)), supply=supply,
+        )  # fmt: skip
+    from fluidlift.physics.apic import LiquidSimulator
+    from fluidlift.physics.guidance import SteadyForce
+
+    if scene.force is not None:
+        forces = (*forces, SteadyForce(scene.force))
+    cells, body = within_outlet(scene)
+    return LiquidSimulator(
+        grid, scene.terrain, parameters, body, cell_types=cells, inflow_profile=scene.velocity,
+        seed=scene.seed, emit_source=look, bodies=scene.bodies, work=particle_work(device), supply=supply,
+        open_sides=sides_open_to_air(parameters.gravity), forces=forces,
+    )  # fmt: skip
+
+
+def inflow_look(scene: Scene, own: Gaussians, speed: float) -> InflowLook:
+    """What flows in at a speed (m/s) looks like the body's own Gaussians; of what lies, as the clip shows it away from
+    rocks and banks."""
+    from fluidlift.look.inflow import InflowLook
+
+    # a sheet that falls has no level to keep to
+    terrain, lying, usable = scene.terrain, kind_of(scene.kind).nearly_level, None
+    spacing = 0.5 * terrain.grid.spacing
+    if lying and len(own):
+        usable = lends_look(scene, own)
+    return InflowLook(own, terrain.mainstream, speed, spacing, usable=usable, run=scene.inflow.run, lying=lying)
+
+
+def within_outlet(scene: Scene) -> tuple[np.ndarray, Particles]:
+    """Cells and body of what lies on something, without what is behind its outlet and with an inlet that takes in all
+    that flows in; all of those of other fluids."""
+    from fluidlift.physics.inlet import inlet_along_rim, inlet_to_surface
+    from fluidlift.physics.outlet import thin_outlet
+
+    kind = kind_of(scene.kind)
+    if not kind.is_channel_flow:
+        return scene.cell_types, scene.body
+    cells, grid = thin_outlet(scene.cell_types), scene.terrain.grid
+    if kind.nearly_level:
+        cells = inlet_to_surface(cells, scene.body.positions, grid)
+    elif kind.enters_over_rim:
+        gravity = np.asarray(scene.parameters.gravity)
+        cells = inlet_along_rim(cells, scene.body.positions, scene.velocity, grid, gravity)
+    behind = (scene.cell_types == CellType.OUTFLOW) & (cells != CellType.OUTFLOW)
+    at = np.clip(grid.cell_of(scene.body.positions), 0, np.asarray(grid.shape) - 1)
+    return cells, scene.body.select(~behind[tuple(at.T)])
+
+
+def preflight(scene: Scene) -> None:
+    """What would fail on the way, said before anything is written.
+
+    Raises:
+        InputRejected: too little memory, too many frames, an inlet that lets nothing in, or obstacles in smoke.
+    """
+    from fluidlift.physics.preflight import check_frames, check_inlet, check_memory
+    from fluidlift.physics.stepping import SimulationSettings
+    from fluidlift.physics.surface_tension import capillary_time_step
+
+    if scene.obstacles and kind_of(scene.kind).is_gas:
+        raise InputRejected(
+            f"{scene.obstacles[0].line}: an obstacle in a {scene.kind}", "obstacles in a liquid",
+            "remove it from scene.yaml",
+        )  # fmt: skip
+    p, step = scene.parameters, simulation_step(scene).time_step
+    if p.surface_tension > 0:
+        step = min(step, capillary_time_step(p.density, p.surface_tension, scene.terrain.grid.spacing))
+    check_frames(scene.simulated, scene.interval, step, SimulationSettings().max_substeps)
+    check_memory(scene.terrain.grid, len(scene.body), available_memory())
+    check_inlet(scene.terrain, scene.cell_types, np.array(p.inflow_velocity))

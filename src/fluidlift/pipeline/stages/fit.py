@@ -1,0 +1,247 @@
+"""The stage that fits the physics: what the parameters are, and what was known of them before."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from typing import Any
+
+import numpy as np
+
+from fluidlift.config import FitConfig
+from fluidlift.errors import InputRejected
+from fluidlift.pipeline.fit_outcome import (
+    AT_THE_ENDS,
+    Verdict,
+    as_given,
+    family,
+    first_guess_as_result,
+    labelled,
+    size_estimate,
+    size_row,
+    table,
+    verdict,
+)
+from fluidlift.pipeline.fit_request import FitRequest, request_of, startable
+from fluidlift.pipeline.fluid_masks import FluidMasks
+from fluidlift.pipeline.machine import one_torch_thread
+from fluidlift.pipeline.rising import outline_rises, with_buoyancy
+from fluidlift.pipeline.work import Work
+from fluidlift.types import CellType, FaceVelocity, FitResult, FluidKind, FluidParameters, kind_of
+from fluidlift.types.stages import Fit, Geometry, Motion, Read, Segmentation
+
+AT_WALLS = ("restitution", "wall_damping")
+"""not fitted unless asked for: how the velocity falls off towards a wall under water was not seen but assumed
+(`motion.bed`), and a steady flow whose slope the geometry lacks is best explained by walls without friction"""
+
+
+def fit(
+    read: Read, segmentation: Segmentation, geometry: Geometry, motion: Motion, config: FitConfig, *, work: Work
+) -> Fit:
+    """Physical parameters that make the grid move like the targets; the first guess where the fit fails.
+
+    Args:
+        read: the clip.
+        segmentation: of it.
+        geometry: of the body.
+        motion: velocities that the fit explains.
+        config: what is asked of the fit.
+        work: told how far it is.
+
+    Raises:
+        InputRejected: a request that this kind of fluid has no answer to.
+    """
+    from fluidlift.fit.optimize import DEFAULT_FREE
+    from fluidlift.fit.ranges import UNITS
+
+    kind, masks = kind_of(geometry.kind), FluidMasks(segmentation.labels.labels)
+    request, along = request_of(config), geometry.setting.terrain.mainstream
+    _check_request(request, kind)
+    filling = filling_rate(read, masks, geometry)
+    initial = request.applied(first_guess(geometry, motion.velocities, read.clip.interval, filling), along=along)
+    # speeds that come from free fall were not measured: they say nothing about friction inside or at the walls
+    assumed = motion.free_fall_share > 0.3
+    usual = AT_THE_ENDS if assumed else tuple(name for name in DEFAULT_FREE if name not in AT_WALLS)
+    if filling is not None:  # the level in the vessel says how much enters
+        usual = tuple(name for name in usual if name != "inflow_velocity")
+    free = request.free_of(usual)
+    moved = _told_by_velocities(kind, free, lambda: outline_rises(masks, geometry.rest_frame))
+    start = startable(initial, request.held)
+    found, judged = _attempt(geometry, motion, read.clip.interval, config, start, moved, work)
+    parameters, estimates = found.parameters, dict(found.estimates)
+    if not judged.usable:
+        # the buoyancy of smoke was guessed from its speed by the fit
+        parameters = replace(initial, gravity=parameters.gravity) if kind.is_gas else initial
+        estimates = first_guess_as_result(parameters, UNITS)
+    known = {name: getattr(initial, name) for name in request.held}
+    parameters = replace(parameters, **known)
+    if "wall_damping" not in (*free, *known):
+        d = sticking(kind, motion.reports)
+        parameters = replace(parameters, wall_damping=d)
+        if "wall_damping" in estimates:
+            estimates["wall_damping"] = replace(estimates["wall_damping"], value=d, prior=d)
+    estimates = {n: as_given(n, e, initial) if family(n) in known else e for n, e in estimates.items()}
+    lift: dict[str, float] = {}
+    if moved != free:
+        velocity = motion.velocities[0]
+        parameters, estimates, lift = with_buoyancy(read, masks, geometry, parameters, estimates, velocity, work.step)
+    rows = table(estimates, held=set(known), free=set(free), measured=set(AT_THE_ENDS))
+    size = size_row(asdict(geometry.scale))
+    if size is not None:
+        rows, estimates = [*rows, size], estimates | {"size": size_estimate(size)}
+    notes = list(found.notes)
+    if assumed and not request.free:
+        notes.append(
+            "viscosity, restitution and wall damping keep their priors: the steep part was too fast to be measured"
+        )
+    return Fit(
+        parameters=parameters,
+        initial=initial,
+        estimates={r["name"]: labelled(estimates[r["name"]], r) for r in rows},
+        table=tuple(rows),
+        converged=bool(found.converged),
+        status=judged.status,
+        reason=judged.reason,
+        rollouts=int(found.rollouts),
+        notes=tuple(notes),
+        extra={k: float(v) for k, v in (found.extra | lift).items()},
+        loss_history=np.asarray(found.loss_history, np.float64),
+        warnings=tuple(judged.warnings()),
+    )
+
+
+def _check_request(request: FitRequest, kind: FluidKind) -> None:
+    """Raises InputRejected where a kind of fluid has no such parameter, or its clip cannot tell it."""
+    if kind.is_gas and "gravity" in request.held:
+        raise InputRejected(
+            f"a known gravity for a {kind}, whose gravity stands for its buoyancy", "another parameter",
+            "give gravity in scene.yaml, for the simulation",
+        )  # fmt: skip
+    if kind.starts_at_rest and request.free:
+        raise InputRejected(
+            f"a fit of {', '.join(request.free)} to a {kind}, whose velocities are known as it stands, before it moves",
+            "values that you know", "leave out fit.free and give them with --hold or in scene.yaml",
+        )  # fmt: skip
+
+
+def _told_by_velocities(kind: FluidKind, free: tuple[str, ...], rises: Callable[[], bool]) -> tuple[str, ...]:
+    """What is fitted to velocities: all but the lift of smoke whose outline rises, which says more of it than they."""
+    if not kind.is_gas or set(free) <= {"gravity"} or not rises():
+        return free
+    return tuple(name for name in free if name != "gravity")
+
+
+def _attempt(
+    geometry: Geometry, motion: Motion, interval: float, config: FitConfig, initial: FluidParameters,
+    free: tuple[str, ...], work: Work,
+) -> tuple[FitResult, Verdict]:  # fmt: skip
+    """One fit, judged; equations without a solution are a failure like others."""
+    from fluidlift.fit.optimize import fit_parameters
+
+    setting, kind = geometry.setting, kind_of(geometry.kind)
+    if kind.starts_at_rest:
+        reason = "a body at rest tells nothing of its parameters: they are those of such a fluid, or as given"
+        return FitResult(initial, {}, np.zeros(0), False, 0), Verdict("left", reason)
+    try:
+        with one_torch_thread():
+            found = fit_parameters(
+                motion.velocities, setting.cell_types, setting.terrain, setting.terrain.grid, interval, initial,
+                kind=kind, mainstream=setting.terrain.mainstream, method=config.method, free=free,
+                prior_sigmas=prior_widths(kind), restarts=config.restarts + 1, max_work=config.max_work,
+                max_seconds=config.max_seconds, device=config.device, progress=work.step,
+            )  # fmt: skip
+    except (np.linalg.LinAlgError, FloatingPointError) as error:
+        return FitResult(initial, {}, np.zeros(0), False, 0), Verdict("failed", f"no solution ({error})")
+    return found, verdict(found)
+
+
+def prior_widths(kind: FluidKind) -> dict[str, float]:
+    """Relative widths of what is known before the fit looks: the time step to 1 %, gravity to 2 % of 9.81 m/s^2.
+
+    The time between two frames is on record; a fit that may stretch it makes up for errors of the velocities with it.
+    Gravity is what it is everywhere. Under an assumed size it could stand for the unknown scale as well: freed, it goes
+    to nearly nothing wherever the motion is slow for the assumed size, and water without weight leaves its bed. A
+    plume's buoyancy is free.
+    """
+    known = {"time_step": 0.01}
+    return known if kind.is_gas else known | {"gravity": 0.02}
+
+
+def filling_rate(read: Read, masks: FluidMasks, geometry: Geometry) -> float | None:
+    """Volume (m^3/s) that a vessel gains over the clip, from its rounded silhouette; None where nothing fills.
+
+    What a jet brings is seen better in the vessel than in the jet, whose speed is a blur and whose mask is too wide.
+    """
+    from fluidlift.shape.surface import rounded_volume
+
+    if not kind_of(geometry.kind).fills_vessel or geometry.setting.pool_level is None:
+        return None
+    clip, depth = read.clip, geometry.depth
+    distance = float(np.median(depth[depth > 0]))
+    times, volumes = [], []
+    for t in np.unique(np.linspace(geometry.rest_frame, len(clip) - 1, 8).astype(int)):
+        if not masks[t].any():
+            continue
+        volumes.append(rounded_volume(geometry.camera, masks[t], distance))
+        times.append(float(clip.times[t]))
+    if len(times) < 4:
+        return None
+    rate = float(np.polyfit(times, volumes, 1)[0])
+    return rate if rate > 0 else None
+
+
+def first_guess(
+    geometry: Geometry, targets: list[FaceVelocity], interval: float, filling: float | None
+) -> FluidParameters:
+    """Where the fit starts: velocities measured at the ends, the rest from what such a fluid usually has.
+
+    Args:
+        geometry: of the body.
+        targets: m/s, of consecutive frames.
+        interval: s between frames.
+        filling: m^3/s that a vessel gains; None where nothing fills.
+    """
+    setting, kind = geometry.setting, kind_of(geometry.kind)
+    cells, direction = setting.cell_types, setting.terrain.mainstream
+    mean = np.mean([t.at_centers() for t in targets], axis=0)
+    inlet = cells == CellType.INFLOW
+    wet = inlet | (cells == CellType.FLUID)
+    bulk = mean[inlet].mean(axis=0) if inlet.any() else mean[wet].mean(axis=0)
+    spread = np.std([t.at_centers()[inlet] for t in targets], axis=0).mean() if inlet.any() else 0.0
+    outlet = np.zeros(cells.shape, bool)
+    if (cells == CellType.OUTFLOW).any():
+        from scipy import ndimage
+
+        outlet = ndimage.binary_dilation(cells == CellType.OUTFLOW, iterations=2) & (cells == CellType.FLUID)
+    out = float((mean[outlet] @ direction).mean()) if outlet.any() else float((mean[wet] @ direction).mean())
+    speed = float(np.linalg.norm(mean[wet], axis=1).max()) if wet.any() else 0.0
+    if filling is not None and inlet.any():
+        # the mouth of the inlet is its cross-section across the stream, one layer of its cells
+        layer = setting.terrain.grid.spacing**2 * float(inlet.any(axis=int(np.argmax(np.abs(direction)))).sum())
+        bulk = direction * min(filling / layer, float(np.linalg.norm(bulk)))
+    courant = setting.terrain.grid.spacing / max(speed, 1e-6)
+    return FluidParameters(
+        kinematic_viscosity=kind.kinematic_viscosity,
+        inflow_velocity=(float(bulk[0]), float(bulk[1]), float(bulk[2])),
+        inflow_fluctuation=float(spread),
+        outflow_velocity=max(out, 0.0),
+        restitution=0.05,
+        wall_damping=kind.wall_damping,
+        time_step=float(np.clip(min(interval, 2.0 * courant), interval / 20, interval)),
+    )
+
+
+def sticking(kind: str | FluidKind, reports: list[dict[str, Any]]) -> float:
+    """Share of the tangential velocity that a wall takes per step of the simulation: all of it where the motion is that
+    of a viscous film (`motion.bed.film_share`), whose profile from the bed up is the flow itself. Where that is
+    doubtful the two are mixed by ratio, as they differ by more than an order of magnitude.
+
+    The fit keeps its own start: its steps take a share at walls beside what viscosity does there, and with all of it
+    the viscosity of a film of four cells with an exact parabola comes out at 0.53 of the true one (1.37 with 0.05).
+
+    Args:
+        kind: of the fluid.
+        reports: of the motion's targets (`types.stages.Motion.reports`).
+    """
+    viscous = [r.get("viscous", 0.0) for r in reports]
+    return kind_of(kind).wall_damping ** (1.0 - (float(np.median(viscous)) if viscous else 0.0))

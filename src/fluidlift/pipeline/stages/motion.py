@@ -1,0 +1,68 @@
+"""The stage that turns flow into velocities: completed flow, surface and volume velocity of the target frames."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fluidlift.pipeline.fluid_masks import FluidMasks
+from fluidlift.pipeline.settings import MotionSettings
+from fluidlift.pipeline.steady_flow import pairs_of, spans_of
+from fluidlift.pipeline.volume_motion import motion_options, motion_scene, motion_warnings, plain_report, seen_cells
+from fluidlift.pipeline.work import Work
+from fluidlift.types import FaceVelocity, kind_of
+from fluidlift.types.stages import Flow, Geometry, Motion, Read, Segmentation, TargetVelocity
+
+if TYPE_CHECKING:
+    from fluidlift.motion.sequence import FrameMotion
+
+
+def motion(
+    read: Read, flow: Flow, segmentation: Segmentation, geometry: Geometry, config: MotionSettings, *, work: Work
+) -> Motion:
+    """Completed flow of many frames, volume velocity of the target frames."""
+    from fluidlift.motion.sequence import motion_sequence
+
+    clip, (width, height) = read.clip, read.clip.size
+    pairs, grid, masks = len(clip) - 1, geometry.grid, FluidMasks(segmentation.labels.labels)
+    start = min(geometry.rest_frame, pairs - 1)
+    stands = kind_of(geometry.kind).starts_at_rest  # its body is known as it stands, not as it collapses
+    targets = range(start, start if stands else min(start + config.targets, pairs))
+    wanted = sorted({start, *targets} | set(range(0, pairs, config.complete_every)))
+    spans = spans_of(clip)
+    completed = work.scratch.array("completed", (pairs, height, width, 2), np.float16)
+    observed = work.scratch.array("observed", (pairs, height, -(-width // 8)), np.uint8)
+    for t in range(pairs):
+        completed[t] = np.nan
+    found: list[TargetVelocity] = []
+    seen: list[FrameMotion] = []
+    for frame in motion_sequence(
+        pairs_of(clip, flow.flow), masks.__getitem__, pairs, motion_scene(clip, geometry), motion_options(config),
+        frames=wanted, volume_frames=targets,
+    ):  # fmt: skip
+        work.step(wanted.index(frame.frame), len(wanted))
+        completed[frame.frame] = spans[frame.frame] * frame.displacement
+        observed[frame.frame] = np.packbits(frame.observed, axis=-1)
+        if frame.velocity is None or frame.surface is None:
+            continue
+        wet = masks[frame.frame]
+        share = float(frame.observed[wet].mean()) if wet.any() else None
+        velocity = FaceVelocity(*(component.astype(np.float32) for component in frame.velocity.components))
+        cells = seen_cells(frame.surface, grid)
+        found.append(TargetVelocity(frame.frame, velocity, cells, share, plain_report(frame)))
+        seen.append(frame)
+    if stands:
+        still = FaceVelocity(*(c.astype(np.float32) for c in FaceVelocity.zeros(grid).components))
+        found.append(TargetVelocity(start, still, np.zeros(grid.shape, bool)))
+    shares = [s.free_fall_share for s in seen if s.free_fall_share is not None]
+    factors = [s.front_factor for s in seen if s.front_factor is not None]
+    fast = float(max(shares, default=0.0))
+    return Motion(
+        targets=tuple(found),
+        completed=completed,
+        observed_bits=observed,
+        front_factor=float(np.median(factors)) if factors else 1.0,
+        free_fall_share=fast,
+        warnings=tuple(motion_warnings([t.plain() for t in found], geometry.kind, fast)),
+    )

@@ -1,0 +1,160 @@
+"""The stage that reads the clip: decoded, without lens distortion, repeated frames, shake and cuts.
+
+Frames go to disk as they are decoded and are mapped from there on: memory does not grow with the clip.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from fluidlift.errors import InputRejected
+from fluidlift.io.stage_cache import Scratch, parts_of
+from fluidlift.pipeline.inputs import GivenFile
+from fluidlift.pipeline.settings import ReadSettings
+from fluidlift.pipeline.work import Work
+from fluidlift.types import VideoClip
+from fluidlift.types.stages import Read
+
+
+def read(clip: GivenFile, camera: GivenFile | None, config: ReadSettings, *, work: Work) -> Read:
+    """Decode, steady, look for repeated frames and cuts.
+
+    Args:
+        clip: video file or image sequence.
+        camera: a file that may know how the lens distorts.
+        config: what is decoded.
+        work: room for the frames.
+
+    Raises:
+        InputRejected: a clip that cannot be used.
+    """
+    from fluidlift.io.limits import ReadLimits
+    from fluidlift.io.sequences import is_sequence
+    from fluidlift.io.video import read_clip
+
+    scratch = work.scratch
+    found = read_clip(
+        clip.path,
+        start=config.start,
+        duration=config.duration,
+        max_size=config.max_size,
+        fps=config.fps if is_sequence(clip.path) else None,
+        limits=ReadLimits(max_pixels=config.max_pixels, max_frames=config.max_frames),
+        store=scratch,
+    )
+    decoded = len(found)
+    found = _without_distortion(found, None if camera is None else camera.path, scratch)
+    found, kept = _without_repeats(found, scratch)
+    steady, shake = _steady(found, scratch, correct=config.stabilise)
+    first, last, warnings = _longest_shot(shake.cuts, len(steady), found.source, kept)
+    frames, alpha = steady.frames, steady.alpha
+    if last - first < len(steady):
+        frames, kept = frames[first:last], kept[first:last]
+        alpha = None if alpha is None else alpha[first:last]
+    alpha = None if alpha is None else scratch.keep("alpha", alpha)
+    used = VideoClip(scratch.keep("frames", frames), steady.times[first:last], found.source, alpha)
+    said = (*found.warnings, *(w for w in shake.warnings if w not in found.warnings), *warnings)
+    return Read(used, kept, decoded, shake.shake_px, shake.stabilised, shake.cuts, said)
+
+
+def _without_distortion(clip: VideoClip, file: Path | None, scratch: Scratch) -> VideoClip:
+    """Lines that are straight in the world made straight in the picture, where a camera file knows the lens."""
+    from fluidlift.io.images import read_camera, read_distortion, undistort_clip
+
+    distortion = read_distortion(file) if file is not None else None
+    if file is None or distortion is None:
+        return clip
+    camera = read_camera(file, clip.size)
+    frames, alpha, before = scratch.array("straight", clip.frames.shape, np.uint8), None, clip.alpha
+    if before is not None:
+        alpha = scratch.array("straight_alpha", before.shape, np.uint8)
+    straight = clip
+    for part in parts_of(clip.frames):
+        piece = replace(
+            clip, frames=clip.frames[part], times=clip.times[part], alpha=None if before is None else before[part]
+        )
+        straight = undistort_clip(piece, camera, distortion)
+        frames[part] = straight.frames
+        if alpha is not None:
+            alpha[part] = straight.alpha
+    return replace(clip, frames=frames, alpha=alpha, warnings=straight.warnings)
+
+
+def _without_repeats(clip: VideoClip, scratch: Scratch) -> tuple[VideoClip, np.ndarray]:
+    """The clip without frames that bring nothing new, and which frames (int [T]) it has kept."""
+    from fluidlift.motion.cadence import examine_cadence, without_duplicates
+
+    report = examine_cadence(clip.frames, clip.times)
+    kept = np.asarray(report.kept)
+    if len(kept) == len(clip):
+        return replace(clip, warnings=_told(clip.warnings, report.warnings)), kept
+    if len(kept) < 2:
+        raise InputRejected(
+            f"'{clip.source}' shows one picture all the time", "at least two different frames", "choose another stretch"
+        )
+    # what lies on disk is chosen part by part; the times do not depend on the pictures
+    hollow = replace(clip, frames=np.zeros((len(clip), 1, 1, 3), np.uint8), alpha=None)
+    times = without_duplicates(hollow, report).times
+    frames = _chosen(clip.frames, kept, "without_repeats", scratch)
+    alpha = None if clip.alpha is None else _chosen(clip.alpha, kept, "alpha_without_repeats", scratch)
+    # the reader counts exact repeats as well: said once is enough
+    said = tuple(w for w in clip.warnings if "repeat the one before" not in w)
+    return replace(clip, frames=frames, times=times, alpha=alpha, warnings=_told(said, report.warnings)), kept
+
+
+def _chosen(array: np.ndarray, kept: np.ndarray, name: str, scratch: Scratch) -> np.ndarray:
+    out = scratch.array(name, (len(kept), *array.shape[1:]), array.dtype)
+    for part in parts_of(out):
+        out[part] = array[kept[part]]
+    return out
+
+
+def _told(before: tuple[str, ...], more: tuple[str, ...]) -> tuple[str, ...]:
+    return (*before, *(w for w in more if w not in before))
+
+
+@dataclass(frozen=True)
+class _Shake:
+    """How the camera moved."""
+
+    shake_px: float
+    stabilised: bool
+    cuts: tuple[int, ...]
+    warnings: tuple[str, ...] = ()
+
+
+def _steady(clip: VideoClip, scratch: Scratch, *, correct: bool) -> tuple[VideoClip, _Shake]:
+    """The clip as from a camera that stands still, and how the camera moved."""
+    from fluidlift.motion.stabilize import GreyFrames, find_cuts, stabilise
+
+    if not correct:
+        cuts = find_cuts(GreyFrames(clip.frames))
+        return clip, _Shake(0.0, False, tuple(int(c) for c in cuts))
+    steady, shake = stabilise(clip, out=scratch.array("steady", clip.frames.shape, np.uint8))
+    # cuts are told below, with what follows from them
+    warnings = tuple(w for w in shake.warnings if not w.startswith("the clip is cut at"))
+    cuts = tuple(int(c) for c in shake.cuts)
+    return steady, _Shake(float(shake.shake_px), bool(shake.stabilised), cuts, warnings)
+
+
+def _longest_shot(cuts: tuple[int, ...], frames: int, source: str, kept: np.ndarray) -> tuple[int, int, list[str]]:
+    """First frame and end of the longest stretch without a cut; what comes after one is another scene."""
+    if not cuts:
+        return 0, frames, []
+    edges = [0, *cuts, frames]
+    longest = max(range(len(edges) - 1), key=lambda i: edges[i + 1] - edges[i])
+    first, last = edges[longest], edges[longest + 1]
+    if last - first < 2:
+        raise InputRejected(
+            f"'{source}' has a cut at nearly every frame", "a stretch of at least 2 frames from one camera",
+            "trim it with --start and --duration",
+        )  # fmt: skip
+    where = ", ".join(str(kept[c]) for c in cuts)
+    return (
+        first,
+        last,
+        [f"the clip has {len(cuts)} cut(s), at frame {where}: only frames {kept[first]} to {kept[last - 1]} are used"],
+    )

@@ -1,0 +1,225 @@
+"""The stage that makes the rest Gaussians: generate per frame, refine, prune, unite, fill."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fluidlift.backends.gsplat_rasterizer import best_rasterizer
+from fluidlift.errors import InputRejected
+from fluidlift.pipeline.given_body import placed_bodies
+from fluidlift.pipeline.inputs import GivenFile
+from fluidlift.pipeline.settings import RefineSettings
+from fluidlift.pipeline.work import Work
+from fluidlift.seams import Rasterizer
+from fluidlift.shape import generate
+from fluidlift.types import (
+    CellType,
+    Gaussians,
+    Label,
+    PinholeCamera,
+    Setting,
+    VideoClip,
+    concatenate,
+    kind_of,
+    sh_from_rgb,
+)
+from fluidlift.types.stages import Flow, Geometry, Read, Refined, Segmentation
+
+KEPT = 0.6
+"""part of its size that a splat of the inside keeps at least: at 0.3 the first frame is a little cleaner, but once the
+surface is drawn apart, dark dots of what lies below show between its splats"""
+
+WHOLE = 6
+"""splats that a cell of the body may take inside, whatever the limit for all of it: with less than three quarters of
+the usual eight it holds less than its own mass, and a large shallow body sags as soon as it moves"""
+
+LATER = 5
+"""how much fewer steps the frames after the first take, as they start from the last"""
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """What the bodies are made of."""
+
+    clip: VideoClip
+    fluid: np.ndarray
+    """bool [T,H,W]"""
+    flow: np.ndarray
+    """px, [T-1,H,W,2]"""
+    geometry: Geometry
+    config: RefineSettings
+    work: Work
+
+
+@dataclass(frozen=True)
+class _Refinement:
+    """How the first body came out of the refinement."""
+
+    psnr_before: float | None = None
+    psnr_after: float | None = None
+    kept: bool = True
+    loss_history: tuple[float, ...] = ()
+
+
+def refine(
+    read: Read, flow: Flow, segmentation: Segmentation, geometry: Geometry, bodies: GivenFile | None,
+    config: RefineSettings, *, work: Work,
+) -> Refined:  # fmt: skip
+    """Generate per frame, refine on the first, prune, unite, fill.
+
+    Args:
+        read: the clip.
+        flow: of it.
+        segmentation: of it.
+        geometry: of the body.
+        bodies: folder of Gaussians, the user's or a generator's; None: the embedded generator makes them.
+        config: how many, how fine.
+        work: told how far the refinement is.
+
+    Raises:
+        InputRejected: too little fluid for a body.
+    """
+    from fluidlift.shape.fill import fill
+    from fluidlift.shape.off_picture import continued
+    from fluidlift.shape.prune import prune
+    from fluidlift.shape.unite import unite
+
+    clip, labels, c, camera, setting = read.clip, segmentation.labels, config, geometry.camera, geometry.setting
+    start, united, depth = geometry.rest_frame, geometry.united_frames, geometry.depth
+    h = setting.terrain.grid.spacing
+    fluid = labels.fluid
+    seen = _Seen(clip, fluid, flow.flow.displacement, geometry, config, work)
+    made, fitted, later = _bodies(seen, bodies)
+    colours = generate.fluid_colour_frame(clip.frames[start], fluid[start])
+    hull = generate.hull_gaussians(colours, setting, camera, seed=config.seed)
+    step = max(0.35 * h, 0.6 * c.stride * _pixel(depth, camera))
+    # what another frame has nearer to the camera would hide the picture of the first
+    others = [generate.beneath_front(b, depth, fluid[start], camera, smallest=1.0, drop_above=True) for b in made[1:]]
+    front = unite([b for b in (made[0], *others) if len(b)], spacing=step, whole_first=True)
+    # what is seen is kept before what is hidden
+    front = _bounded(front, int(0.75 * c.max_gaussians), config.seed)
+    hull = _bounded(hull, c.max_gaussians - len(front), config.seed)
+    shown, pruned = prune(_outside_solid(front, setting), min_opacity=0.05, max_stretch=12.0)
+    beyond, hull = continued(shown, _outside_solid(hull, setting), setting, camera)
+    beyond = _bounded(_outside_solid(beyond, setting), c.max_gaussians - len(shown) - len(hull), config.seed)
+    shell = concatenate([shown, beyond, hull])
+    least = WHOLE * int((setting.cell_types == CellType.FLUID).sum())
+    added = fill(
+        shell, spacing=h / 2, rays=c.rays, rng=np.random.default_rng(config.seed),
+        max_added=max(c.max_gaussians - len(shell), least), closed_below=setting.terrain,
+    )  # fmt: skip
+    mask, hull = geometry.mask, shell.select(slice(len(shown), None))
+    # what the picture contradicts goes: cells reach a little before the visible surface and beyond the silhouette
+    allowed = (labels.labels[start : start + united] != Label.BACKGROUND).any(axis=0) | mask
+    inside = [hull, _outside_solid(added, setting)]
+    inside = [generate.beneath_front(part, depth, mask, camera, smallest=KEPT, drop_above=True) for part in inside]
+    hull, added = (generate.within_silhouette(part, allowed, camera, smallest=KEPT) for part in inside)
+    if kind_of(geometry.kind).starts_at_rest:  # its sides tell nothing of the inside that is seen once it spreads
+        colour = _later_colour(clip, fluid, start)
+        hull, added = (replace(part, sh=sh_from_rgb(np.tile(colour, (len(part), 1)))) for part in (hull, added))
+    body = concatenate([shown, hull, added])
+    if len(body) < 50:
+        raise InputRejected(
+            f"the body of the fluid has only {len(body)} Gaussians", "more fluid in the picture",
+            "check the mask in the report, or raise --max-size",
+        )  # fmt: skip
+    return Refined(
+        body, len(front), len(hull), len(added), len(front) - len(shown), str(pruned), fitted.psnr_before,
+        fitted.psnr_after, fitted.kept, fitted.loss_history, later,
+    )  # fmt: skip
+
+
+def _later_colour(clip: VideoClip, fluid, start: int) -> np.ndarray:
+    """sRGB in [0, 1] that the fluid usually has after its first frame, float32 [3]."""
+    later = np.unique(np.linspace(start + 1, len(clip) - 1, 8).round().astype(int))
+    seen = np.concatenate([clip.frames[t][fluid[t]][::7] for t in later])
+    return (np.median(seen, axis=0) / 255.0).astype(np.float32)
+
+
+def _bodies(
+    seen: _Seen, given: GivenFile | None
+) -> tuple[list[Gaussians], _Refinement, tuple[tuple[float, float], ...]]:
+    """One body per united frame, each refined against its picture; those after the first start from the last."""
+    from fluidlift.shape.prune import prune
+
+    g, clip, fluid = seen.geometry, seen.clip, seen.fluid
+    frames = list(range(g.rest_frame, g.rest_frame + g.united_frames))
+    if given is not None:
+        placed = placed_bodies(g, given.path, frames)
+        # strays in front of the fluid would count as its shape, which the refinement must not change
+        bodies = [prune(b, min_opacity=0.05, max_stretch=12.0)[0] for b in placed]
+    else:
+        stride = seen.config.stride
+        bodies = [generate.front_gaussians(clip.frames[t], fluid[t], g.depth, g.camera, stride=stride) for t in frames]
+    draws = best_rasterizer(seen.config.rasterizer, seen.work.warn)
+    first, fitted = _refined(seen, bodies[0], draws)
+    later, likeness = _followed(seen, first, bodies[1:], frames[1:], draws)
+    return [first, *later], fitted, likeness
+
+
+def _followed(
+    seen: _Seen, last: Gaussians, bodies: list[Gaussians], frames: list[int], draws: Rasterizer
+) -> tuple[list[Gaussians], tuple[tuple[float, float], ...]]:
+    """Bodies of the frames after the first, each from the one before; and their likeness before and after, dB."""
+    from fluidlift.shape.follow import follow
+
+    clip, fluid, camera, c = seen.clip, seen.fluid, seen.geometry.camera, seen.config
+    if c.refine_iterations == 0 or len(last) == 0:
+        return bodies, ()
+    depth, out, likeness = seen.geometry.depth, [], []
+    for t, fresh in zip(frames, bodies, strict=True):
+        if not fluid[t].any() or len(fresh) == 0:
+            out.append(fresh)
+            continue
+        found = follow(
+            last, fresh, clip.frames[t], fluid[t], camera, motion=np.asarray(seen.flow[t - 1], np.float32),
+            depths=(depth, depth), iterations=max(c.refine_iterations // LATER, 1), seed=c.seed,
+            max_gaussians=max(int(1.5 * len(fresh)), 1000), rasterizer=draws,
+        )  # fmt: skip
+        last = generate.bounded_colours(found.gaussians, clip.frames[t], camera)
+        out.append(last)
+        likeness.append((found.psnr_before, found.psnr_after))
+    return out, tuple(likeness)
+
+
+def _refined(seen: _Seen, front: Gaussians, draws: Rasterizer) -> tuple[Gaussians, _Refinement]:
+    """A body optimised against the picture of the rest frame."""
+    from fluidlift.shape.refine import refine as refine_view
+
+    c, start, camera = seen.config, seen.geometry.rest_frame, seen.geometry.camera
+    if c.refine_iterations == 0 or not len(front):
+        return front, _Refinement()
+    picture = seen.clip.frames[start]
+    found = refine_view(
+        front, picture, seen.fluid[start], camera, iterations=c.refine_iterations, seed=c.seed,
+        max_gaussians=max(int(1.5 * len(front)), 1000), rasterizer=draws, progress=seen.work.step,
+    )  # fmt: skip
+    history = tuple(float(x) for x in found.loss_history)
+    how = _Refinement(found.psnr_before, found.psnr_after, found.kept, history)
+    return generate.bounded_colours(found.gaussians, picture, camera), how
+
+
+def _pixel(depth: np.ndarray, camera: PinholeCamera) -> float:
+    """Median size of a pixel on the fluid, m."""
+    return float(np.median(depth[depth > 0]) / camera.focal[0])
+
+
+def _outside_solid(g: Gaussians, setting: Setting) -> Gaussians:
+    """Those whose centre is in the box and not inside the terrain."""
+    from fluidlift.numerics.sampling import sample_nodes
+
+    grid = setting.terrain.grid
+    inside = grid.contains(g.means, margin=1e-6)
+    g = g.select(inside)
+    distance = sample_nodes(setting.terrain.signed_distance, grid, g.means)
+    return g.select(distance > -0.25 * grid.spacing)
+
+
+def _bounded(g: Gaussians, most: int, seed: int) -> Gaussians:
+    """A random subset where there are too many; each stands for more fluid then."""
+    if len(g) <= most:
+        return g
+    keep = np.sort(np.random.default_rng(seed).permutation(len(g))[:most])
+    return g.select(keep)

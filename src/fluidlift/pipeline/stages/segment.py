@@ -1,0 +1,167 @@
+"""The stage that finds the fluid. Labels are written to disk frame by frame."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fluidlift.backends.learned import MASK_METHODS, ModelChoice, make_segmenter
+from fluidlift.errors import InputRejected
+from fluidlift.io.stage_cache import parts_of
+from fluidlift.pipeline.fluid_masks import FluidMasks
+from fluidlift.pipeline.hints import NO_HINTS, Hints
+from fluidlift.pipeline.settings import GivenMask, SegmentSettings
+from fluidlift.pipeline.steady_flow import TRUSTED
+from fluidlift.pipeline.work import Work
+from fluidlift.seams import Segmenter
+from fluidlift.types import Label, PixelFlow, PixelLabels, VideoClip
+from fluidlift.types.stages import Flow, Read, Segmentation
+
+if TYPE_CHECKING:
+    from fluidlift.shape.evidence import PairReader
+
+
+def segment(
+    read: Read, flow: Flow, mask: GivenMask | None, config: SegmentSettings | None, hints: Hints, *, work: Work
+) -> Segmentation:
+    """What each pixel shows.
+
+    Args:
+        read: the clip.
+        flow: of it.
+        mask: the user's, which is taken as it is.
+        config: who finds the fluid; None where the mask is the user's.
+        hints: of a person.
+        work: room for the labels.
+
+    Raises:
+        InputRejected: no fluid, or a mask that does not fit.
+    """
+    from fluidlift.shape.segment import segment as segment_clip
+
+    clip, shape = read.clip, read.clip.frames.shape[:3]
+    out = work.scratch.array("labels", shape, np.uint8), work.scratch.array("confidence", shape, np.float16)
+    if config is not None and config.method in MASK_METHODS:
+        labels = _learned(clip, config, hints, work).segment(clip, flow.flow, out=out)
+    else:
+        drawn = None if mask is None else drawn_mask(clip, mask)
+        labels = segment_clip(
+            clip, _flow_for_masks(clip, flow), user_mask=drawn, roi=hints.roi, points=hints.clicks(),
+            progress=lambda part, _: work.step(round(100 * part), 100), out=out,
+        )  # fmt: skip
+    fluid = FluidMasks(labels.labels)
+    areas = fluid.areas()
+    if not areas.any():
+        raise InputRejected(
+            f"no fluid was found in '{clip.source}'", "a region that moves", "draw it and pass it with --mask"
+        )
+    warnings = list(labels.warnings)
+    trusted, sure = _trusted(flow.flow, fluid.any_frame()), _sureness(labels, areas.sum())
+    if trusted < 0.1:
+        warnings.append(
+            f"optical flow failed on {100 * (1 - trusted):.0f} % of the fluid: velocities there are filled in from the "
+            "mainstream; a clip with more texture or a higher frame rate would help"
+        )
+    kept = work.scratch.keep("labels", labels.labels), work.scratch.keep("confidence", _halved(work, labels.confidence))
+    share = float(areas.mean() / (clip.size[0] * clip.size[1]))
+    return Segmentation(PixelLabels(*kept), share, sure, trusted, mask is not None, tuple(warnings))
+
+
+def require_usable(clip: VideoClip, mask: GivenMask | None, config: SegmentSettings, hints: Hints) -> None:
+    """Look at what is given, before the flow is computed for nothing.
+
+    Raises:
+        InputRejected: a hint outside the picture, a mask that cannot be used, a learned segmentation without weights or
+            with hints that it does not take.
+    """
+    from fluidlift.shape.hints import clicks_at
+    from fluidlift.shape.segment import region_of_interest
+
+    width, height = clip.size
+    region_of_interest(hints.roi, height, width)
+    clicks_at(hints.clicks(), clip.size, (height, width))
+    if mask is not None:
+        drawn_mask(clip, mask)
+    elif config.method in MASK_METHODS:
+        _require_hints(config, hints)
+        if config.weights is None:
+            make_segmenter(config.method, ModelChoice())  # says which are needed
+
+
+def _require_hints(config: SegmentSettings, hints: Hints) -> None:
+    if hints != NO_HINTS and config.method == "sam3":
+        raise InputRejected(
+            "--roi, --click or --not-here with sam3, which goes by words", "hints for segment.method=auto or sam2",
+            "leave them out, or choose another method",
+        )  # fmt: skip
+
+
+def _flow_for_masks(clip: VideoClip, flow: Flow) -> PixelFlow | PairReader:
+    """Flow of single pairs as they are, where ours is blind to what stands still: to a mask, rest is a finding."""
+    from fluidlift.motion.optical_flow import DenseInverseSearch, flow_of_pair
+
+    if flow.method != "multiframe":
+        return flow.flow
+    frames, estimator = clip.frames, DenseInverseSearch()
+    return lambda t: flow_of_pair(frames[t], frames[t + 1], estimator)
+
+
+def _learned(clip: VideoClip, config: SegmentSettings, hints: Hints, work: Work) -> Segmenter:
+    """A learned segmentation with its weights; one that starts from our own is given the hints through it."""
+    from fluidlift.shape.segment import segment as segment_clip
+
+    shape = clip.frames.shape[:3]
+    _require_hints(config, hints)
+
+    def guess(clip: VideoClip, flow: PixelFlow) -> PixelLabels:
+        room = work.scratch.array("guess", shape, np.uint8), work.scratch.array("guess_trust", shape, np.float16)
+        return segment_clip(clip, flow, roi=hints.roi, points=hints.clicks(), out=room)
+
+    weights = None if config.weights is None else config.weights.name
+    choice = ModelChoice(weights, config.device, config.download)
+    return make_segmenter(config.method, choice, words=config.words, guess=guess, progress=work.step)
+
+
+def _halved(work: Work, confidence: np.ndarray) -> np.ndarray:
+    """Confidence as float16; as it is where it is already."""
+    if confidence.dtype == np.float16:
+        return confidence
+    out = work.scratch.array("halved", confidence.shape, np.float16)
+    for part in parts_of(confidence):
+        out[part] = confidence[part]
+    return out
+
+
+def drawn_mask(clip: VideoClip, given: GivenMask) -> np.ndarray:
+    """bool [T,H,W]: the user's mask of the frames that are used.
+
+    Raises:
+        InputRejected: a mask that cannot be read, or of other frames.
+    """
+    from fluidlift.io.images import read_camera, read_distortion, read_mask, undistort_mask
+    from fluidlift.pipeline.mask_facts import is_straight
+
+    file, camera = given.file.path, None if given.camera is None else given.camera.path
+    mask = read_mask(file, clip.size, len(clip), start=given.start, duration=given.duration)
+    distortion = read_distortion(camera) if camera is not None else None
+    if camera is not None and distortion is not None and not is_straight(file):
+        mask = undistort_mask(mask, read_camera(camera, clip.size), distortion)
+    return mask
+
+
+def _trusted(flow: PixelFlow, wet: np.ndarray) -> float:
+    """Share of the fluid's pixels and pairs whose flow is trusted."""
+    confidence, count = flow.confidence, 0
+    for part in parts_of(confidence):
+        count += int((confidence[part][:, wet] > TRUSTED).sum())
+    return count / (len(confidence) * int(wet.sum()))
+
+
+def _sureness(labels: PixelLabels, area: float) -> float:
+    """Mean confidence of what was taken for fluid."""
+    total = 0.0
+    for part in parts_of(labels.labels):
+        fluid = labels.labels[part] == Label.FLUID
+        total += float(labels.confidence[part][fluid].sum(dtype=np.float64))
+    return total / area

@@ -1,0 +1,89 @@
+"""How the motion in the volume is asked for, and what is told of it: what `make` and `fluidlift motion` share."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from fluidlift.pipeline.settings import MotionSettings
+from fluidlift.types import Grid, SurfaceMotion, VideoClip
+from fluidlift.types.stages import Geometry
+
+if TYPE_CHECKING:
+    from fluidlift.motion.sequence import FrameMotion, MotionOptions, MotionScene
+
+FAST_FALL = 0.3
+"""share of the steep part whose speed is that of free fall, from which the user is told"""
+LITTLE_SEEN = 0.25
+"""share of the fluid below which the result is more the completion's than the clip's, and the user is told"""
+DISAGREEMENT = 0.5
+"""share by which the projection changes what was seen on the surface, from which the user is told"""
+
+
+def motion_scene(clip: VideoClip, geometry: Geometry) -> MotionScene:
+    """Where the fluid is."""
+    from fluidlift.motion.sequence import MotionScene
+
+    g, setting = geometry, geometry.setting
+    return MotionScene(
+        g.camera, g.sighted_depth, setting.terrain, setting.cell_types, g.kind, clip.interval, setting.surface_height,
+        setting.pool_level, prior=(g.mean_flow, g.mean_confidence),
+    )  # fmt: skip
+
+
+def motion_options(config: MotionSettings) -> MotionOptions:
+    """How the motion is estimated, from the settings."""
+    from fluidlift.motion.sequence import MotionOptions
+
+    return MotionOptions(
+        half_window=config.half_window, reach=max(config.reach, config.half_window), along_paths=config.along_paths,
+        divergence=config.divergence, wall=config.wall,
+    )  # fmt: skip
+
+
+def motion_warnings(reports: list[dict[str, Any]], kind: str, free_fall_share: float) -> list[str]:
+    """What the user should know of the velocities."""
+    warnings = []
+    stuck = [r["frame"] for r in reports if not r.get("solve", {}).get("converged", True)]
+    if stuck:
+        warnings.append(
+            "the divergence-free solve of the target velocity did not converge on every frame: "
+            f"{len(stuck)} of {len(reports)}, the first is {stuck[0]}"
+        )
+    shares = [r["observed_share"] for r in reports if r.get("observed_share") is not None]
+    if shares and np.median(shares) < LITTLE_SEEN:
+        warnings.append(
+            f"the motion was measured on {100 * np.median(shares):.0f} % of the fluid only; the rest is filled in: "
+            "speeds there are a guess; look at observed/ of fluidlift motion, and at a larger --max-size, more texture "
+            "or a higher frame rate"
+        )
+    changes = [r["change_observed"] for r in reports if "change_observed" in r]
+    if changes and np.median(changes) > DISAGREEMENT:
+        warnings.append(
+            "the shape and the measured motion do not agree on one discharge: velocities of the seen surface were "
+            "changed by more than half"
+        )
+    if free_fall_share > FAST_FALL:
+        warnings.append(
+            f"the {kind} moves faster than optical flow can follow: on {100 * free_fall_share:.0f} % of its steep part "
+            "the speed comes from free fall at the given size"
+        )
+    return warnings
+
+
+def plain_report(found: FrameMotion) -> dict[str, Any]:
+    """The report of a frame's volume as plain values for JSON."""
+    if found.report is None:
+        return {}
+    return {k: v for k, v in asdict(found.report).items() if isinstance(v, int | float | str | bool | dict)}
+
+
+def seen_cells(surface: SurfaceMotion, grid: Grid) -> np.ndarray:
+    """bool [nx,ny,nz]: cells in which a point of the surface was observed."""
+    cells = np.zeros(grid.shape, bool)
+    points = surface.points[surface.observed]
+    points = points[grid.contains(points)]
+    cells[tuple(grid.cell_of(points).T)] = True
+    return cells

@@ -1,0 +1,70 @@
+"""What a stage may use of its run beside its inputs: room on disk, and who is told how far it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+from fluidlift.io.stage_cache import Scratch
+
+T = TypeVar("T")
+
+
+class Progress(Protocol):
+    """Where progress is told: a terminal, plain lines, or nowhere."""
+
+    def stage(self, name: str, number: int, count: int) -> None:
+        """A stage begins."""
+
+    def update(self, done: int, total: int) -> None:
+        """Part of the current stage is done."""
+
+    def finished(self, name: str, seconds: float, cached: bool) -> None:
+        """A stage ended."""
+
+    def warn(self, text: str) -> None:
+        """Something the user should know."""
+
+
+class Silence:
+    """No progress at all."""
+
+    def stage(self, name: str, number: int, count: int) -> None:
+        """Nothing."""
+
+    def update(self, done: int, total: int) -> None:
+        """Nothing."""
+
+    def finished(self, name: str, seconds: float, cached: bool) -> None:
+        """Nothing."""
+
+    def warn(self, text: str) -> None:
+        """Nothing."""
+
+
+def _alone(name: str, function: Callable[..., T], *inputs: Any, **named: Any) -> T:
+    return function(*inputs, **named)
+
+
+@dataclass(frozen=True)
+class Work:
+    """Nothing of it changes what a stage finds."""
+
+    scratch: Scratch
+    """for large arrays"""
+    step: Callable[[int, int], None] = lambda done, total: None
+    """told (done, all)"""
+    warn: Callable[[str], None] = lambda text: None
+    key: str = ""
+    """of the stage's result, for files that are kept under it"""
+    again: bool = False
+    """this stage, or one before it, was asked for again: what was kept of an earlier run does not count"""
+    part: Callable[..., Any] = _alone
+    """`part(name, function, *inputs, **named)` is `function(*inputs, **named)`; what is slow is kept between runs"""
+
+    @classmethod
+    def alone(cls, folder: Path) -> Work:
+        """Of a stage that is called by itself."""
+        return cls(Scratch(folder, "alone"))

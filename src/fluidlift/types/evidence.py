@@ -1,0 +1,91 @@
+"""What the clip says about a fluid and its camera, and how sure that is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+UNSURE = 12.0
+"""degrees, error of the pitch from which the user is asked: a quarter of what lies between level and straight down, by
+which lengths along the view come out wrong by half and more"""
+
+
+@dataclass(frozen=True)
+class KindEvidence:
+    """Why a kind was chosen."""
+
+    kind: str
+    scores: dict[str, float]
+    """share of belief per kind, sums to 1"""
+    features: dict[str, float]
+    """the measured figures behind the scores"""
+
+
+@dataclass(frozen=True)
+class UpEvidence:
+    """Which way is up, as seen by the camera."""
+
+    pitch: float
+    """degrees that the camera looks below the horizon"""
+    roll: float
+    """degrees that the picture is turned clockwise"""
+    source: str
+    """user, camera file, or what it was estimated from"""
+    confidence: float
+    """0 (prior alone) to 1 (given)"""
+    error: float = 0.0
+    """degrees, standard deviation of what the pitch may be; 0: given, or not known"""
+
+    @property
+    def warnings(self) -> list[str]:
+        """What the user should know of a tilt that little is known of."""
+        if self.error <= UNSURE:
+            return []
+        return [
+            f"how far the camera looks down is known to {self.error:.0f} degrees only: {self.pitch:.0f} is the middle "
+            f"of what it may be ({self.source}); give --pitch, or a camera file, for a better shape"
+        ]
+
+
+@dataclass(frozen=True)
+class SlopeEvidence:
+    """What the motion says about the slope of a stream."""
+
+    slope: float
+    """degrees that the surface falls along the stream; 0 where the evidence is weak"""
+    standard_error: float
+    """degrees, of a slope that is not level (of the likeliest one, where level is taken)"""
+    heading: float
+    """degrees from the canonical x axis towards y, where the stream runs to"""
+    level_share: float
+    """probability that the stream is level"""
+    likeliest: float
+    """degrees, mean over the slopes that are not level"""
+    source: str
+    """what the slope was taken from"""
+    chute: float = 0.0
+    """degrees of the steepest chute that comes down onto it; 0: there is none"""
+
+
+@dataclass(frozen=True)
+class MetricScale:
+    """Metres per canonical unit and where that came from."""
+
+    value: float
+    source: str
+    """size, depth, camera, free fall, front, or assumed"""
+    warning: str = ""
+    relative_error: float | None = None
+    """standard error over value; None: not known (nothing was measured, or what was given is taken as it is)"""
+    across: float = 0.0
+    """m across the fluid, along the longest side of its box"""
+    refusal: str = ""
+    """why free fall was not used, where it was looked for"""
+
+    @property
+    def sentence(self) -> str:
+        """For people: `scale: 0.42 m across the fluid, from free fall, ± 12 %`."""
+        words = {"size": "as given", "depth": "from the given depth", "camera": "from the surveyed camera",
+                 "free fall": "from free fall", "front": "from the speed of its front",
+                 "assumed": "assumed"}  # fmt: skip
+        error = "" if self.relative_error is None else f", ± {100 * 1.96 * self.relative_error:.0f} % (95 %)"
+        return f"scale: {self.across:.3g} m across the fluid, {words[self.source]}{error}"

@@ -1,0 +1,127 @@
+"""Where the fit starts: what is measured at the ends of the flow, and what is taken for known."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from fluidlift.config import build_config
+from fluidlift.errors import InputRejected
+from fluidlift.pipeline.stages import fit as stage
+from fluidlift.types import CellType, FaceVelocity, Grid, kind_of
+
+GRID = Grid((12, 6, 5), 0.05, (0.0, 0.0, 0.0))
+X = np.array([1.0, 0.0, 0.0])
+INTERVAL = 0.04
+
+
+def channel():
+    """Inlet at the low end of x, outlet at the high one, the topmost layer empty."""
+    cells = np.full(GRID.shape, CellType.FLUID, np.uint8)
+    cells[:, :, -1] = CellType.EMPTY
+    cells[0, :, :-1], cells[-1, :, :-1] = CellType.INFLOW, CellType.OUTFLOW
+    return cells
+
+
+def flow(u, v=0.0, w=0.0):
+    """Speed along x given per face, the others even."""
+    nx, ny, nz = GRID.shape
+    shapes = ((nx + 1, ny, nz), (nx, ny + 1, nz), (nx, ny, nz + 1))
+    u = np.broadcast_to(np.reshape(u, (-1, 1, 1)), shapes[0]).astype(np.float32)
+    return FaceVelocity(u, np.full(shapes[1], v, np.float32), np.full(shapes[2], w, np.float32))
+
+
+def body(kind, cells=None):
+    """What counts of a geometry with these cells."""
+    terrain = SimpleNamespace(grid=GRID, mainstream=X)
+    setting = SimpleNamespace(cell_types=channel() if cells is None else cells, terrain=terrain, pool_level=None)
+    return SimpleNamespace(kind=kind, setting=setting)
+
+
+@pytest.fixture
+def guess():
+    """`first_guess` of a body with these cells."""
+
+    def find(targets, *, kind="stream", cells=None, filling=None):
+        return stage.first_guess(body(kind, cells), targets, INTERVAL, filling)
+
+    return find
+
+
+def test_the_fit_starts_with_the_speed_at_the_inlet_and_at_the_outlet(guess):
+    ramp = np.linspace(1.0, 0.4, GRID.shape[0] + 1)
+    found = guess([flow(ramp, 0.1, -0.2)] * 2)
+    first = 0.5 * (ramp[0] + ramp[1])
+    assert found.inflow_velocity == pytest.approx((first, 0.1, -0.2), rel=1e-6)
+    assert found.inflow_fluctuation == pytest.approx(0.0, abs=1e-7)
+    # the two layers of fluid before the outlet
+    assert found.outflow_velocity == pytest.approx(ramp[9:12].mean(), rel=1e-5)
+
+
+def test_the_fluctuation_is_that_of_the_inlet_over_the_frames(guess):
+    found = guess([flow(0.9), flow(1.1)])
+    assert found.inflow_velocity[0] == pytest.approx(1.0)
+    # 0.1 along x and nothing along the others, in the mean over the components
+    assert found.inflow_fluctuation == pytest.approx(0.1 / 3, rel=1e-4)
+
+
+def test_water_that_flows_backwards_leaves_no_outlet_that_sucks(guess):
+    assert guess([flow(-0.5)]).outflow_velocity == 0.0
+
+
+def test_without_inlet_and_outlet_the_whole_body_says_how_fast_it_is(guess):
+    cells = channel()
+    cells[0], cells[-1] = cells[1], cells[1]
+    found = guess([flow(0.3)], cells=cells)
+    assert found.inflow_velocity == pytest.approx((0.3, 0.0, 0.0), rel=1e-5)  # float32 faces, averaged
+    assert (found.inflow_fluctuation, found.outflow_velocity) == (0.0, pytest.approx(0.3, rel=1e-5))
+
+
+def test_a_step_crosses_two_cells_at_most_and_never_outlasts_a_frame(guess):
+    # 5 m/s through cells of 0.05 m: 0.01 s each
+    assert guess([flow(5.0)]).time_step == pytest.approx(0.02)
+    assert guess([flow(0.01)]).time_step == INTERVAL
+    assert guess([flow(1000.0)]).time_step == pytest.approx(INTERVAL / 20)
+
+
+def test_what_fills_the_vessel_is_what_the_inlet_brings(guess):
+    mouth = 6 * 4 * GRID.spacing**2
+    found = guess([flow(2.0)], kind="pour", filling=0.5 * mouth)
+    assert found.inflow_velocity == pytest.approx((0.5, 0.0, 0.0))
+    # a vessel that fills faster than the jet moves was measured wrongly: the jet's speed is the limit
+    assert guess([flow(2.0)], kind="pour", filling=9.0 * mouth).inflow_velocity == pytest.approx((2.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("kind", ["stream", "fall", "pour", "plume"])
+def test_what_the_velocities_cannot_say_is_what_such_a_fluid_usually_has(guess, kind):
+    found = guess([flow(0.3)], kind=kind)
+    assert found.kinematic_viscosity == kind_of(kind).kinematic_viscosity
+    assert found.wall_damping == kind_of(kind).wall_damping
+    assert found.gravity == (0.0, 0.0, -9.81)
+
+
+@pytest.mark.parametrize(("kind", "width"), [("stream", 0.02), ("fall", 0.02), ("pour", 0.02)])
+def test_gravity_is_nearly_known_for_what_has_weight(kind, width):
+    assert stage.prior_widths(kind_of(kind))["gravity"] == width
+
+
+def test_the_buoyancy_of_smoke_is_free():
+    assert stage.prior_widths(kind_of("plume")) == {"time_step": 0.01}
+
+
+def test_the_gravity_of_smoke_cannot_be_known_since_it_stands_for_buoyancy():
+    segmentation = SimpleNamespace(labels=SimpleNamespace(labels=np.zeros((2, 3, 4), np.uint8)))
+    config = build_config(overrides=["fit.hold=gravity=3"]).fit
+    with pytest.raises(InputRejected, match="buoyancy"):
+        stage.fit(None, segmentation, body("plume"), None, config, work=None)
+
+
+def test_water_slips_over_its_bed_and_a_viscous_film_sticks_to_it():
+    def stick(*viscous):
+        return stage.sticking(kind_of("stream"), [{"viscous": v} for v in viscous])
+
+    water = kind_of("stream").wall_damping
+    assert stick() == water
+    assert stick(0.0, 0.0, 1.0) == water  # one frame of three is an outlier
+    assert stick(1.0, 1.0, 0.9) == 1.0
+    assert water < stick(0.5) < 0.5

@@ -136,7 +136,7 @@ def test_a_quiet_river_under_the_sky_is_seen_from_near_the_horizon(pitch):
     picture, water = landscape(pitch, hills=5.0, shore=3.0)
     up = still_water(water, look_at(STREAM, picture, water, water))
     assert up.pitch == pytest.approx(pitch, abs=5.0)
-    assert up.error < 8.0
+    assert up.error < 8.0 and up.warnings == []
     assert {"sky", "upper end of the water"} <= set(up.source.split(", "))
 
 
@@ -144,6 +144,7 @@ def test_what_nothing_is_known_of_is_seen_as_usual_and_unsure():
     up = still_water(np.ones(SIZE[::-1], bool), PictureEvidence())
     assert up.error > 15.0 and up.confidence < 0.2
     assert up.source == "usual view of a stream"
+    assert len(up.warnings) == 1 and "--pitch" in up.warnings[0]
     assert PictureEvidence().words == []
 
 

@@ -21,6 +21,8 @@ SHORTEST = 0.05
 """of that side, length of an arc that is looked at"""
 SMALLEST, LARGEST = 0.08, 0.6
 """of that side, half the length of a rim"""
+FEWEST = 30.0
+"""px, the same: in less, any texture has arcs that fit (of 224 px pictures, one of three had such a rim, by mistake)"""
 TURN = 25.0
 """degrees that an arc turns between its ends, at least: straighter ones say nothing of an ellipse"""
 CORNER = 50.0
@@ -149,7 +151,7 @@ def _candidate(parts: tuple[np.ndarray, ...], shape: tuple[int, int]) -> Ellipse
         return None
     (u, v), (first, second), turn = cv2.fitEllipseDirect(points.astype(np.float32))
     long, short = 0.5 * max(first, second), 0.5 * min(first, second)
-    if not SMALLEST * max(shape) < long < LARGEST * max(shape) or short < FLATTEST * long:
+    if not max(SMALLEST * max(shape), FEWEST) < long < LARGEST * max(shape) or short < FLATTEST * long:
         return None
     if not (0 <= u < shape[1] and -0.2 * shape[0] <= v < 1.2 * shape[0]):
         return None

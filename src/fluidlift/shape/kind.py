@@ -237,6 +237,8 @@ def _tilt_in_air(kind, mask, displacement, confidence, camera, picture) -> tuple
 
 def _without_motion(kind, tilted, picture, lean) -> slope.TiltEvidence:
     """The posterior of pitch and roll from habit, the pictures, and the lean of what falls (degrees)."""
+    if len(kind.pitch_habits) == 1 and lean is None and not picture.speaks:
+        return slope.TiltEvidence(kind.pitch_prior[0], 0.0, kind.pitch_prior[1], 0.0)  # free of the grid's rounding
     pitches, rolls = np.arange(-24.0, 89.0, 1.0), np.arange(-5.0, 5.01, 0.5) * slope.ROLL
     log = habit_prior(kind, pitches, picture.scene)[:, None] - 0.5 * (rolls / slope.ROLL) ** 2
     if lean is not None:

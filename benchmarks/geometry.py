@@ -179,7 +179,7 @@ def _tilted(camera: PinholeCamera, kind: str) -> PinholeCamera:
     """The camera in a world that is level where it is known to be, and where people usually hold it else."""
     forward = camera.camera_from_world.rotation[2]
     pitch = float(np.degrees(np.arcsin(np.clip(-forward[2], -1, 1))))
-    pitch = pitch if pitch > 5.0 else kind_of(kind).pitch_prior[0]
+    pitch = pitch if pitch > 5.0 else kind_of(kind).usual_pitch[0]
     ahead = (0.0, float(np.cos(np.radians(pitch))), -float(np.sin(np.radians(pitch))))
     posed = PinholeCamera.looking((0.0, 0.0, 0.0), ahead, 50.0, camera.size)
     return PinholeCamera(camera.focal, camera.center, camera.size, posed.camera_from_world)

@@ -2,9 +2,8 @@ import numpy as np
 import pytest
 
 from fluidlift.shape.jets import Outline
-from fluidlift.shape.puddle import down_to_landing, fit_ellipse, jets_into_puddle, puddle_tilt
+from fluidlift.shape.puddle import down_to_landing, jets_into_puddle
 from fluidlift.types import PinholeCamera, UpEvidence
-from fluidlift.types.kind import STREAM
 
 H, W = 160, 160
 CAMERA = PinholeCamera.from_fov(40.0, (W, H))
@@ -52,35 +51,6 @@ def test_a_round_vessel_seen_level_is_no_puddle():
 def test_without_a_jet_there_is_no_puddle():
     mask, motion, trust = scene(pool(32.0))
     assert jets_into_puddle(CAMERA, None, mask, 0 * motion, trust) is None
-
-
-def test_the_ellipse_of_an_ellipse_is_itself():
-    found = fit_ellipse(pool(30.0))
-    assert found is not None
-    assert found.flatness == pytest.approx(0.6, abs=0.01)  # pixels at the rim
-    assert found.likeness > 0.98
-
-
-@pytest.mark.parametrize("pitch", [25.0, 40.0, 60.0])
-def test_a_flatter_pool_is_seen_at_a_lower_angle(pitch):
-    habit = UpEvidence(10.0, 2.0, "", 0.0)
-    found = puddle_tilt(pool(50.0 * np.sin(np.radians(pitch))), habit)
-    usual = STREAM.pitch_prior[0]
-    # between the usual view and what a round pool says, as a pool may be out of round
-    assert min(pitch, usual) - 0.5 <= found.pitch <= max(pitch, usual) + 0.5
-    assert found.roll == habit.roll
-
-
-def test_a_flat_pool_says_more_than_one_that_is_seen_from_high_above():
-    habit = UpEvidence(10.0, 2.0, "", 0.0)
-    low, high = (puddle_tilt(pool(50.0 * np.sin(np.radians(p))), habit).confidence for p in (25.0, 60.0))
-    assert low > 2.0 * high
-
-
-def test_a_puddle_of_another_shape_says_nothing_of_the_tilt():
-    habit = UpEvidence(10.0, 2.0, "", 0.0)
-    cross = (np.abs(COL - 80) < 8) | (np.abs(ROW - 80) < 8)
-    assert puddle_tilt(cross, habit) is habit
 
 
 @pytest.mark.parametrize(("below", "reach"), [(0.0, 12.0), (0.8, 0.0), (0.4, 6.0)])

@@ -7,6 +7,7 @@ import pytest
 from fluidlift.shape.kind import estimate_up, level_camera
 from fluidlift.shape.slope import plane_axes
 from fluidlift.shape.texture_gradient import PATTERNLESS, texture_evidence, texture_patches, weighed
+from fluidlift.shape.view import PictureEvidence
 from fluidlift.types import PinholeCamera, UpEvidence
 
 SIZE = (256, 192)
@@ -114,7 +115,7 @@ def test_a_stream_across_the_view_shows_the_tilt_by_its_pattern():
     motion = np.where(mask[..., None], camera.project(points + velocity)[0] - camera.pixel_grid(), 0.0)
     texture = texture_patches(pictures, mask)
     assert texture is not None
-    found = estimate_up("stream", mask, motion, np.ones(mask.shape), camera, texture=texture)
+    found = estimate_up("stream", mask, motion, np.ones(mask.shape), camera, PictureEvidence(texture=texture))
     without = estimate_up("stream", mask, motion, np.ones(mask.shape), camera)
     # habit is 15 off; so little of a pattern is believed that it is a step on the way, as measured 3 degrees of 17
     assert 55.0 - found.pitch < 0.9 * (55.0 - without.pitch)

@@ -128,7 +128,13 @@ def test_kinds_differ_in_physics():
 
 @pytest.mark.parametrize(
     "changed",
-    [{"pitch_prior": (8.0, 0.0)}, {"airborne": True}, {"depth_ratio": None}, {"is_channel_flow": False}],
+    [
+        {"pitch_prior": (8.0, 0.0)},
+        {"airborne": True},
+        {"looked_down_on": 1.0},
+        {"depth_ratio": None},
+        {"is_channel_flow": False},
+    ],
     ids=str,
 )
 def test_a_kind_that_contradicts_itself_is_refused(changed):
@@ -193,3 +199,12 @@ def test_a_new_kind_gets_a_velocity_and_a_place(mist):
         near, far, mask, camera, body, np.array([0.0, 0.0, 1.0]), kind=mist, longest=16, cell_limit=20_000
     )
     assert (setting.cell_types == CellType.FLUID).any() and setting.pool_level is None
+
+
+@pytest.mark.parametrize("kind", KINDS.values(), ids=str)
+def test_the_habits_of_filming_are_shares(kind):
+    shares, means, spreads = zip(*kind.pitch_habits, strict=True)
+    assert sum(shares) == pytest.approx(1.0)
+    mean, spread = kind.usual_pitch
+    assert min(means) <= mean <= max(means)
+    assert spread >= min(spreads)

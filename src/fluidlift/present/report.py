@@ -176,7 +176,8 @@ def _section_body(g: Geometry, fitted: Refined) -> Section:
 def _surface_rows(geometry: Geometry) -> list[list[str]]:
     """How the camera stands and what the surface was taken from, and how sure both are."""
     up, slope, depth = geometry.up, geometry.slope, geometry.depth_source
-    tilt = f"{up.pitch:.1f} degrees, rolled {up.roll:.1f} ({up.source}, confidence {up.confidence:.2f})"
+    error = f" ± {up.error:.0f}" if up.error else ""
+    tilt = f"{up.pitch:.1f}{error} degrees, rolled {up.roll:.1f} ({up.source}, confidence {up.confidence:.2f})"
     rows = [["camera looks down by", tilt]]
     if depth is not None:
         rows.append(["surface", f"by the {depth['source']}"])

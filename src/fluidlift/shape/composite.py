@@ -14,7 +14,7 @@ from fluidlift.shape.kind import level_camera
 from fluidlift.shape.slope import LEVEL
 from fluidlift.shape.surface import FrontSurface
 from fluidlift.types import FluidKind, MetricScale, PinholeCamera, Setting, Similarity3, UpEvidence
-from fluidlift.types.kind import POUR, STREAM
+from fluidlift.types.kind import LOOKING_DOWN, POUR, STREAM
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ def split(
         trust: of it.
         free: whether the kind may change (the user did not give it).
     """
-    tilt = up or UpEvidence(STREAM.pitch_prior[0], 0.0, "", 0.0)
+    tilt = up or UpEvidence(LOOKING_DOWN[0], 0.0, "", 0.0)
     found: list[jets.Outline] = []
     neck = None
     if kind.nearly_level:

@@ -19,6 +19,7 @@ from fluidlift.shape.given_depth import SceneDepth, robust_plane, without_rim
 from fluidlift.shape.heights import HeightModel, ProfileHeight
 from fluidlift.shape.plume import SIGHT
 from fluidlift.shape.surface import FrontSurface, inflated_surface, intersect_height
+from fluidlift.shape.view import Scene, habit_prior
 from fluidlift.types import FluidKind, Grid, Label, PinholeCamera, SlopeEvidence, UpEvidence, kind_of
 from fluidlift.types.kind import STREAM
 
@@ -125,14 +126,13 @@ def up_from_depth(
     angles = np.arange(0.0, 45.5, 0.5)
     share = _share_of(angles, slopes)
     pitches, rolls, belief = [], [], []
-    mean, sigma = STREAM.pitch_prior
     for angle in np.radians(angles):
         # gravity turned so that the plane falls along the flow by this angle
         up = normal if flow is None else np.cos(angle) * normal - np.sin(angle) * flow
         pitch, roll = float(np.degrees(-np.arcsin(np.clip(up[2], -1, 1)))), float(np.degrees(np.arctan2(up[0], -up[1])))
         pitches.append(pitch)
         rolls.append(roll)
-        belief.append(np.exp(-0.5 * (((pitch - mean) / sigma) ** 2 + (roll / USUAL_ROLL) ** 2)))
+        belief.append(np.exp(habit_prior(STREAM, np.array([pitch]), Scene())[0] - 0.5 * (roll / USUAL_ROLL) ** 2))
     weight = share * np.asarray(belief) + 1e-30
     best = float((angles * weight).sum() / weight.sum()) if flow is not None else 0.0
     k = int(np.argmin(np.abs(angles - best)))

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 
 from fluidlift.errors import require
 from fluidlift.shape import chute, prism, slope
-from fluidlift.shape.texture_gradient import TexturePatches
+from fluidlift.shape.view import PictureEvidence, habit_prior
 from fluidlift.types import FluidKind, KindEvidence, PinholeCamera, RigidTransform, UpEvidence, kind_of
 from fluidlift.types.kind import KINDS as FLUID_KINDS
 from fluidlift.types.kind import STREAM
@@ -32,6 +34,10 @@ def doubts(evidence: KindEvidence) -> tuple[str, ...]:
     if share >= LEAST_SURE:
         return ()
     return (f"what kind of fluid this is, is unsure: {best} ({share:.2f}) or {second} ({other:.2f}); --kind decides",)
+
+
+STRAIGHT = 10.0
+"""degrees: a larger lean of what falls is a thrown jet or wind, not a turned camera"""
 
 
 def estimate_kind(
@@ -166,19 +172,18 @@ def estimate_up(
     displacement: Float[np.ndarray, "h w 2"],
     confidence: Float[np.ndarray, "h w"],
     camera: PinholeCamera,
+    picture: PictureEvidence | None = None,
     *,
-    pitch: float | None = None,
-    roll: float | None = None,
-    texture: TexturePatches | None = None,
+    given: tuple[float | None, float | None] = (None, None),
     level_prior: float = slope.LEVEL,
 ) -> UpEvidence:
-    """The camera's tilt from the fluid.
+    """The camera's tilt: the mean of its posterior, and how much of the habit's spread was taken away.
 
-    Over a stream, the perspective of its motion and of its pattern shows the tilt (`slope.estimate_tilt`), weighed
-    against how people hold cameras: how much they had to say is the confidence, and of motion across the picture, or a
-    pattern that is not the same all over, that is little. The edges of a body that stands point to what lies below the
-    camera (`prism.upright_tilt`). What falls does so along the vertical, which gives the roll; its pitch keeps the
-    prior, as all of a plume's tilt does.
+    How people hold cameras at such a fluid is the prior. Sky and plumb lines (`fluidlift.shape.view`) speak beside all
+    kinds, the upper end of the water for a stream. Over a stream, the perspective of its motion and of its pattern
+    shows the tilt as well (`slope.estimate_tilt`); of motion across the picture, or a pattern that is not the same all
+    over, that is little. The edges of a body that stands point to what lies below the camera (`prism.upright_tilt`).
+    What falls does so along the vertical, which gives the roll.
 
     Args:
         kind: of the fluid.
@@ -186,55 +191,84 @@ def estimate_up(
         displacement: mean optical flow, px per frame.
         confidence: of the flow.
         camera: for the focal length; its pose is not used.
-        pitch: degrees below the horizon, when the user gave it.
-        roll: degrees clockwise, when the user gave it.
-        texture: of the fluid's pictures; of a stream without chutes it shows the tilt as well.
+        picture: what the pictures say beside the motion; None: nothing.
+        given: pitch (degrees below the horizon) and roll (degrees clockwise), each where the user gave it.
         level_prior: share of such streams that are level.
     """
     kind = kind_of(kind)
-    mean, sigma = kind.pitch_prior
-    found_pitch, found_roll, source, trust = mean, 0.0, f"usual view of a {kind}", 0.0
-    if kind.nearly_level:
-        tilt, source_seen = _tilt_of_stream(mask, displacement, confidence, camera, texture, level_prior)
-        if tilt is not None:
-            found_pitch, found_roll, trust, source = tilt.pitch, tilt.roll, tilt.gained, source_seen
-    elif kind.starts_at_rest and mask.any():
-        found_pitch, left = prism.upright_tilt(
+    picture = picture or PictureEvidence()
+    pitch, roll = given
+    if kind.starts_at_rest and mask.any():
+        mean, sigma = kind.usual_pitch
+        found, left = prism.upright_tilt(
             mask, lambda p: level_camera(camera, UpEvidence(p, roll or 0.0, "", 0.0)), (mean, sigma)
         )
-        source, trust = "upright edges of the body", float(np.clip(1.0 - left / sigma, 0.0, 1.0))
-    elif kind.falls_freely:  # wind leans smoke more often than hands turn cameras
-        weight = np.where(mask, confidence * np.linalg.norm(displacement, axis=-1), 0.0)
-        down = (weight[..., None] * displacement).sum((0, 1))
-        if down[1] > 0 and weight.sum() > 0:
-            lean = float(np.degrees(np.arctan2(-down[0], down[1])))
-            if abs(lean) < 10.0:  # a larger lean is a thrown jet or wind, not a turned camera
-                found_roll, trust = 0.5 * lean, 0.3
-                source = "direction of the fall"
+        tilt = slope.TiltEvidence(found, 0.0, left, float(np.clip(1.0 - left / sigma, 0.0, 1.0)))
+        words = ["upright edges of the body"]
+    elif kind.nearly_level:
+        tilt, words = _tilt_of_stream(mask, displacement, confidence, camera, picture, level_prior)
+    else:
+        tilt, words = _tilt_in_air(kind, mask, displacement, confidence, camera, picture)
+    source = ", ".join(words) if words else f"usual view of a {kind}"
+    trust = tilt.gained
     if pitch is not None or roll is not None:
         source = "user" if pitch is not None and roll is not None else f"user and {source}"
         trust = 1.0 if pitch is not None else trust
     return UpEvidence(
-        float(found_pitch if pitch is None else pitch), float(found_roll if roll is None else roll), source, trust
-    )
+        float(tilt.pitch if pitch is None else pitch), float(tilt.roll if roll is None else roll), source, trust,
+        tilt.pitch_error if pitch is None else 0.0,
+    )  # fmt: skip
 
 
 def _tilt_of_stream(
-    mask, displacement, confidence, camera, texture, level_prior
-) -> tuple[slope.TiltEvidence | None, str]:
-    """What its motion and its pattern say, None where they say nothing; and which of them spoke."""
-    mean, sigma = STREAM.pitch_prior
+    mask, displacement, confidence, camera, picture, level_prior
+) -> tuple[slope.TiltEvidence, list[str]]:
+    """What its motion, its pattern and its surroundings say; and which of them spoke."""
+    tilted = _tilted(camera)
     # a chute is another plane than what it comes down onto
-    steep = chute.chute_pixels(level_camera(camera, UpEvidence(mean, 0.0, "", 0.0)), mask, displacement, confidence)
+    steep = chute.chute_pixels(tilted(STREAM.usual_pitch[0], 0.0), mask, displacement, confidence)
     lying = confidence * ~np.any(steep, axis=0) if steep else confidence
-    patches = slope.flow_patches(mask, displacement, lying)
-    if patches is None:
-        return None, ""
-    tilt = slope.estimate_tilt(
-        camera, patches, lambda p, r: level_camera(camera, UpEvidence(p, r, "", 0.0)), (mean, sigma),
-        None if steep else texture, level_prior,
-    )  # fmt: skip
-    return tilt, "perspective of the flow" + (" and of its pattern" if texture is not None and not steep else "")
+    if steep:
+        picture = replace(picture, texture=None)
+    patches = None if picture.contained else slope.flow_patches(mask, displacement, lying)
+    tilt = slope.estimate_tilt(camera, patches, tilted, picture, level_prior)
+    motion = [] if patches is None else ["perspective of the flow"]
+    pattern = ["perspective of its pattern"] if picture.texture is not None and patches is not None else []
+    return tilt, motion + pattern + picture.words
+
+
+def _tilt_in_air(kind, mask, displacement, confidence, camera, picture) -> tuple[slope.TiltEvidence, list[str]]:
+    """Of a body in the air: its surroundings, and the direction in which it falls."""
+    picture = replace(picture, waterline=None)
+    lean = None
+    if kind.falls_freely:  # wind leans smoke more often than hands turn cameras
+        weight = np.where(mask, confidence * np.linalg.norm(displacement, axis=-1), 0.0)
+        down = (weight[..., None] * displacement).sum((0, 1))
+        if down[1] > 0 and weight.sum() > 0:
+            lean = float(np.degrees(np.arctan2(-down[0], down[1])))
+    if lean is not None and abs(lean) >= STRAIGHT:
+        lean = None
+    tilt = _without_motion(kind, _tilted(camera), picture, lean)
+    return tilt, picture.words + (["direction of the fall"] if lean is not None else [])
+
+
+def _without_motion(kind, tilted, picture, lean) -> slope.TiltEvidence:
+    """The posterior of pitch and roll from habit, the pictures, and the lean of what falls (degrees)."""
+    if len(kind.pitch_habits) == 1 and lean is None and not picture.speaks:
+        return slope.TiltEvidence(kind.pitch_prior[0], 0.0, kind.pitch_prior[1], 0.0)  # free of the grid's rounding
+    pitches, rolls = np.arange(-24.0, 89.0, 1.0), np.arange(-5.0, 5.01, 0.5) * slope.ROLL
+    log = habit_prior(kind, pitches, picture.scene)[:, None] - 0.5 * (rolls / slope.ROLL) ** 2
+    if lean is not None:
+        log = log - 0.5 * ((rolls - lean) / slope.ROLL) ** 2
+    if picture.speaks:
+        known = rolls[::2]  # and between them
+        seen = np.array([[picture.tilt(tilted(float(p), float(r))) for r in known] for p in pitches])
+        log += np.array([np.interp(rolls, known, row) for row in seen])
+    return slope.tilt_posterior(pitches, rolls, log, kind.usual_pitch)
+
+
+def _tilted(camera: PinholeCamera):
+    return lambda pitch, roll: level_camera(camera, UpEvidence(pitch, roll, "", 0.0))
 
 
 def level_camera(camera: PinholeCamera, up: UpEvidence) -> PinholeCamera:

@@ -19,7 +19,9 @@ from scipy import ndimage
 from scipy.special import logsumexp
 
 from fluidlift.shape.texture_gradient import TexturePatches, texture_evidence, weighed
+from fluidlift.shape.view import PictureEvidence
 from fluidlift.types import PinholeCamera, SlopeEvidence
+from fluidlift.types.kind import STREAM
 
 PATCHES = 160
 """pieces that the fluid's picture is cut into"""
@@ -30,7 +32,10 @@ changes (6.0 to 6.4 degrees there). On 150 others it is 6.2 (+- 0.8); 16 if all 
 FEWEST = 12
 """patches that a plane is read from"""
 FARTHEST = 12.0
-"""ratio of the largest and the smallest depth that a surface is believed to have"""
+"""ratio of the largest and the smallest depth that a surface is believed to have: what would be farther counts as that
+far, and hardly moves"""
+BEYOND = 0.1
+"""share of the patches that may lie above a plane's vanishing line (spray, errors of the mask) where it is possible"""
 STEEPEST = 50.0
 """degrees; what is steeper is a fall"""
 LEVEL = 0.6
@@ -79,7 +84,7 @@ class TiltEvidence:
 
     pitch: float
     roll: float
-    """degrees, posterior means"""
+    """degrees, median and mean of the posterior"""
     pitch_error: float
     """degrees, standard deviation of the posterior"""
     gained: float
@@ -141,38 +146,58 @@ def estimate_slope(
 
 
 def estimate_tilt(
-    camera: PinholeCamera, patches: FlowPatches, tilted: Callable[[float, float], PinholeCamera],
-    pitch_prior: tuple[float, float], texture: TexturePatches | None = None, level_prior: float = LEVEL,
+    camera: PinholeCamera, patches: FlowPatches | None, tilted: Callable[[float, float], PinholeCamera],
+    picture: PictureEvidence, level_prior: float = LEVEL,
 ) -> TiltEvidence:  # fmt: skip
     """Pitch and roll of the camera over a stream of unknown slope: means of their posterior.
 
-    The motion and the pattern show the plane's tilt against the camera, not gravity: priors share it out between both.
+    The motion and the pattern show the plane's tilt against the camera, not gravity: priors share it out between both,
+    and what is seen beside the fluid.
 
     Args:
         camera: for its focal length.
-        patches: of the motion.
+        patches: of the motion; None: too little is known of it.
         tilted: camera for a pitch and a roll, degrees.
-        pitch_prior: mean and standard deviation, degrees.
-        texture: of the fluid's picture, where it has windows enough.
+        picture: what else shows the tilt.
         level_prior: share of such streams that are level.
     """
-    pitches, rolls = np.arange(8.0, 81.0, 4.0), np.array([-4.0, 0.0, 4.0])
+    pitches, rolls = np.arange(-4.0, 89.0, 4.0), np.array([-4.0, 0.0, 4.0])
     slopes = np.array([0.0, 5.0, 10.0, 16.0, 22.0, 30.0, 38.0])
     prior = np.where(slopes > 0, (1.0 - level_prior) * falling_prior(slopes), level_prior)
-    best = np.array([[[best_heading(tilted(p, r), patches, np.radians(s)) for s in slopes] for r in rolls]
-                     for p in pitches])  # fmt: skip
-    habit = np.log(prior) - 0.5 * (((pitches - pitch_prior[0]) / pitch_prior[1]) ** 2)[:, None]
-    log = BELIEF * best[..., 0] + habit[:, None] - 0.5 * ((rolls / ROLL) ** 2)[None, :, None]
-    if texture is not None:
-        seen = _texture_evidence([tilted(p, 0.0) for p in pitches], texture, slopes, best[:, 1, :, 1])
-        log += weighed(seen, habit)[:, None]
+    cameras = [[tilted(float(p), float(r)) for r in rolls] for p in pitches]
+    if patches is None:
+        slopes, prior = slopes[:1], np.ones(1)
+        best = np.zeros((len(pitches), len(rolls), 1, 2))
+    else:
+        best = np.array([[[best_heading(c, patches, np.radians(s)) for s in slopes] for c in row] for row in cameras])
+    # the vanishing line of a plane that comes down towards the camera lies above the horizon
+    rise = np.degrees(np.arctan(-np.tan(np.radians(slopes)) * np.sin(best[..., 1])))
+    habit = picture.lying(STREAM, pitches, cameras, rise) + np.log(prior)
+    log = BELIEF * best[..., 0] + habit - 0.5 * ((rolls / ROLL) ** 2)[None, :, None]
+    log += np.array([[picture.tilt(c) for c in row] for row in cameras])[..., None]
+    if picture.texture is not None and patches is not None:
+        seen = _texture_evidence([row[1] for row in cameras], picture.texture, slopes, best[:, 1, :, 1])
+        log += weighed(seen, habit[:, 1])[:, None]
+    return tilt_posterior(pitches, rolls, logsumexp(log, axis=2), STREAM.usual_pitch)
+
+
+def tilt_posterior(
+    pitches: Float[np.ndarray, " p"], rolls: Float[np.ndarray, " r"], log: Float[np.ndarray, "p r"],
+    pitch_prior: tuple[float, float],
+) -> TiltEvidence:  # fmt: skip
+    """Median pitch and mean roll of a posterior that is known on an even grid (degrees), but for a constant.
+
+    The median is the pitch with the least error to be expected; between two habits of filming, a mean is neither.
+    """
     if not np.isfinite(log).any():
         return TiltEvidence(pitch_prior[0], 0.0, pitch_prior[1], 0.0)
     share = np.exp(log - log.max())
     share /= share.sum()
-    pitch = float((share.sum((1, 2)) * pitches).sum())
-    error = float(np.sqrt((share.sum((1, 2)) * (pitches - pitch) ** 2).sum()))
-    roll = float((share.sum((0, 2)) * rolls).sum())
+    of_pitch = share.sum(axis=1)
+    ends = np.append(pitches, 2.0 * pitches[-1] - pitches[-2]) - 0.5 * (pitches[1] - pitches[0])
+    pitch = float(np.interp(0.5, np.concatenate([[0.0], np.cumsum(of_pitch)]), ends))
+    error = float(np.sqrt((of_pitch * (pitches - pitch) ** 2).sum()))
+    roll = float((share.sum(axis=0) * rolls).sum())
     return TiltEvidence(pitch, roll, error, 1.0 - min(error / pitch_prior[1], 1.0) ** 2)
 
 
@@ -342,8 +367,9 @@ def _columns(camera: PinholeCamera, patches: FlowPatches, axes: np.ndarray) -> n
     """[n, 2, k] px: image motion of the fields of `USUAL` at unit speed, median depth 1."""
     _, ray, along, across = basis(camera, patches.at, axes)
     facing = -ray @ axes[2]
-    if facing.min() <= facing.max() / FARTHEST:
+    if (facing <= 0).mean() > BEYOND:
         return None
+    facing = np.maximum(facing, facing.max() / FARTHEST)
     inverse = facing / np.median(facing)
     points = ray / inverse[:, None]
     l, c = to_unit(points @ axes[0]), to_unit(points @ axes[1])

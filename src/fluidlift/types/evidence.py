@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+UNSURE = 12.0
+"""degrees, error of the pitch from which the user is asked: a quarter of what lies between level and straight down, by
+which lengths along the view come out wrong by half and more"""
+
 
 @dataclass(frozen=True)
 class KindEvidence:
@@ -28,6 +32,18 @@ class UpEvidence:
     """user, camera file, or what it was estimated from"""
     confidence: float
     """0 (prior alone) to 1 (given)"""
+    error: float = 0.0
+    """degrees, standard deviation of what the pitch may be; 0: given, or not known"""
+
+    @property
+    def warnings(self) -> list[str]:
+        """What the user should know of a tilt that little is known of."""
+        if self.error <= UNSURE:
+            return []
+        return [
+            f"how far the camera looks down is known to {self.error:.0f} degrees only: {self.pitch:.0f} is the middle "
+            f"of what it may be ({self.source}); give --pitch, or a camera file, for a better shape"
+        ]
 
 
 @dataclass(frozen=True)

@@ -27,10 +27,12 @@ from fluidlift.shape import (
     texture_gradient,
 )
 from fluidlift.shape import kind as kinds
+from fluidlift.shape.frame_pictures import typical_picture
 from fluidlift.shape.framing import framing_warnings
 from fluidlift.shape.given_depth import DepthPictures
 from fluidlift.shape.kinds import Observation, builder_of
 from fluidlift.shape.rest_frames import FEWEST_PIXELS, rest_frame, united_range
+from fluidlift.shape.view import look_at
 from fluidlift.types import (
     CellType,
     FluidKind,
@@ -100,8 +102,10 @@ def geometry(
     fluid = FluidMasks(segmentation.labels.labels)
     seen, pictures = _seen(read, flow, fluid, given, config, work)
     kind, parts, mask = seen.kind, seen.parts, seen.mask
-    warnings = framing_warnings(mask, fluid.areas()) + (list(kinds.doubts(seen.evidence)) if c.kind == "auto" else [])
     up, canonical, front, known_scale, seen_depth = _surface(seen, pictures, fluid, given, clip.interval)
+    warnings = framing_warnings(mask, fluid.areas()) + up.warnings
+    if c.kind == "auto":
+        warnings += kinds.doubts(seen.evidence)
     front, falling = composite.standing(front, parts, canonical, mask)
     visible = mask & (front.depth > 0)
     if 0 < visible.sum() < FEWEST_PIXELS:
@@ -319,12 +323,12 @@ def _kind_and_up(
     texture = None
     if kind.nearly_level and c.pitch is None and not parts.puddle:
         texture = texture_gradient.texture_patches(clip.frames, parts.lying & ~parts.falling)
+    typical = typical_picture(clip.frames[pick]).astype(np.uint8)
+    picture = look_at(kind, typical, fluid.any_frame(), parts.lying, texture, stays=parts.puddle)
     up = kinds.estimate_up(
-        kind, parts.lying, motion, trust * ~parts.falling, known, pitch=c.pitch, roll=c.roll, texture=texture,
+        kind, parts.lying, motion, trust * ~parts.falling, known, picture, given=(c.pitch, c.roll),
         level_prior=composite.level_prior(parts, motion, trust),
     )  # fmt: skip
-    if parts.puddle and c.pitch is None:
-        up = puddle.puddle_tilt(parts.lying, up)
     if c.roll is None:
         up = composite.with_roll(up, parts, known)
     return evidence, kind, parts, up, None

@@ -1,0 +1,107 @@
+"""All that a clip's pictures say of the camera's tilt beside the motion of the fluid."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from fluidlift.shape.texture_gradient import TexturePatches
+from fluidlift.shape.view.habit import Scene, habit_prior, runs_out
+from fluidlift.shape.view.horizon import Skyline, farthest_elevation, skyline, skyline_evidence, upper_outline
+from fluidlift.shape.view.plumb import PlumbLines, plumb_evidence, plumb_lines
+from fluidlift.shape.view.rims import find_rims
+from fluidlift.shape.view.roundness import (
+    IN_VESSEL,
+    JET_LIKENESS,
+    Ellipse,
+    round_pool,
+    roundness_evidence,
+    wide_part,
+)
+from fluidlift.types import FluidKind, PinholeCamera
+
+
+@dataclass(frozen=True)
+class PictureEvidence:
+    """What was found in the pictures; None or nothing where there is no such thing."""
+
+    sky: Skyline | None = None
+    lines: PlumbLines | None = None
+    pool: Ellipse | None = None
+    """a fluid that lies, where its outline is an ellipse"""
+    rims: tuple[Ellipse, ...] = ()
+    """of vessels"""
+    waterline: Float[np.ndarray, "n 2"] | None = None
+    """px, upper outline of a fluid that lies"""
+    texture: TexturePatches | None = None
+    """the fluid's own pattern, where it lies in one plane"""
+    scene: Scene = field(default_factory=Scene)
+    contained: bool = False
+    """the fluid is a round pool, or in a vessel: it stirs in one place, and its motion and far edge are no stream's"""
+
+    def tilt(self, camera: PinholeCamera) -> float:
+        """Log likelihood of a camera (level frame, z up) given sky, plumb lines and what is round."""
+        log = 0.0 if self.sky is None else skyline_evidence(camera, self.sky)
+        if self.lines is not None:
+            log += plumb_evidence(camera, self.lines)
+        rounds = self.rims if self.pool is None else (*self.rims, self.pool)
+        return log + roundness_evidence(camera, rounds)
+
+    def lying(
+        self, kind: FluidKind, pitches: Float[np.ndarray, " p"], cameras: Sequence[Sequence[PinholeCamera]],
+        rise: Float[np.ndarray, "p r s"],
+    ) -> Float[np.ndarray, "p r s"]:  # fmt: skip
+        """Log prior of the pitch over what lies, with what its upper outline says, for pitches, rolls and planes.
+
+        Args:
+            kind: of the fluid.
+            pitches: degrees.
+            cameras: level frame, z up, by pitch and roll.
+            rise: degrees that the planes' vanishing lines lie above the horizon (0: level).
+        """
+        if self.waterline is None:
+            return np.broadcast_to(habit_prior(kind, pitches, self.scene)[:, None, None], rise.shape)
+        top = np.array([[farthest_elevation(c, self.waterline) for c in row] for row in cameras])
+        return habit_prior(kind, pitches, self.scene, rise - top[..., None])
+
+    @property
+    def speaks(self) -> bool:
+        """Whether `tilt` says anything."""
+        return self.sky is not None or self.lines is not None or self.pool is not None or bool(self.rims)
+
+    @property
+    def words(self) -> list[str]:
+        """Names of what speaks for the tilt, for the report."""
+        named = {
+            "sky": self.sky, "plumb lines": self.lines, "roundness of the pool": self.pool,
+            "rims of vessels": self.rims or None, "upper end of the water": self.waterline,
+        }  # fmt: skip
+        return [name for name, found in named.items() if found is not None]
+
+
+def look_at(
+    kind: FluidKind, picture: UInt8[np.ndarray, "h w 3"], ever: Bool[np.ndarray, "h w"],
+    fluid: Bool[np.ndarray, "h w"], texture: TexturePatches | None = None, *, stays: bool = False,
+) -> PictureEvidence:  # fmt: skip
+    """Sky, plumb lines, rims, the shape of a pool and its waterline.
+
+    Args:
+        kind: of the fluid.
+        picture: sRGB, typical for the clip.
+        ever: pixels that show fluid at some time.
+        fluid: its pixels, without the jets that fall onto it.
+        texture: of that fluid.
+        stays: it has no downstream: a puddle.
+    """
+    sky, rims = skyline(picture, ever), find_rims(picture)
+    lies = kind.nearly_level and bool(fluid.any())
+    pool = round_pool(fluid) if lies else None
+    if kind.fills_vessel:
+        pool = round_pool(wide_part(fluid), JET_LIKENESS)
+    contained = stays or pool is not None or any(rim.share_inside(fluid) > IN_VESSEL for rim in rims)
+    scene = Scene(runs_out(fluid) if lies else None, sky is not None, pool is not None or bool(rims))
+    waterline = upper_outline(fluid) if lies and not contained else None
+    return PictureEvidence(sky, plumb_lines(picture, ~ever), pool, rims, waterline, texture, scene, contained)

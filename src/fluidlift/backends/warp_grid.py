@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from fluidlift.backends.warp_device import on_device, warp_device
+from fluidlift.errors import required
 from fluidlift.seams import PoissonSolver, VelocityContinuation
 from fluidlift.types import FaceVelocity
 
@@ -98,8 +99,12 @@ class WarpPoissonSolver(PoissonSolver):
         from fluidlift.backends import warp_grid_kernels as kernels
 
         device, fine = self._device, levels[0]
-        size, dot = fine.x.size, wp.utils.array_inner
+        size = fine.x.size
         p, r, q, z, direction, b = (wp.zeros(size, dtype=wp.float64, device=device) for _ in range(6))
+
+        def dot(one: Any, other: Any) -> float:
+            inner: Any = wp.utils.array_inner(one, other)
+            return float(inner)
 
         def run(kernel: Any, *inputs: Any, dim: int = size) -> None:
             wp.launch(kernel, dim, list(inputs), device=device)
@@ -118,14 +123,14 @@ class WarpPoissonSolver(PoissonSolver):
         iterations, rz, goal = 0, 1.0, (tolerance * norm) ** 2
         while iterations < max_iterations and dot(r, r) > goal:
             run(kernels.to_cycle, fine, scale, r)
-            wp.capture_launch(capture.graph)
+            wp.capture_launch(required(capture.graph, "no graph of a cycle"))
             run(kernels.from_cycle, fine, z)
-            rz, previous = float(dot(r, z)), rz
+            rz, previous = dot(r, z), rz
             if not rz > 0:
                 break
             run(kernels.turn, z, rz / previous if iterations else 0.0, direction)
             run(kernels.apply_operator, fine, direction, q)
-            curvature = float(dot(direction, q))
+            curvature = dot(direction, q)
             if not curvature > 0:
                 break
             run(kernels.step_from, rz / curvature, direction, p)

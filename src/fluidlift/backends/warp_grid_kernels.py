@@ -5,6 +5,10 @@ Launches are flat. Levels of the multigrid carry a ring of ghost cells, so a nei
 Teran 2010; coarse operators scaled by one half, Braess 1995). Imported only by adapters that have found Warp.
 """
 
+# pyright: reportArgumentType=false, reportGeneralTypeIssues=false, reportIndexIssue=false
+# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false
+# what is written here is Warp's own language: Python's types of it are no types of the kernels
+
 # Warp reads the annotations of kernels: they must not become strings
 import warp as wp
 

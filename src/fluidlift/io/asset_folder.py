@@ -17,14 +17,16 @@ import json
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import cache
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from pathlib import Path
 from typing import Any
 
 import jsonschema
 import numpy as np
+from jsonschema.exceptions import best_match
 
 from fluidlift.errors import InputRejected
 from fluidlift.io.array_archive import read_arrays
+from fluidlift.io.asset_paths import asset_file
 from fluidlift.io.atomic import (
     atomic_path,
     atomic_write,
@@ -281,28 +283,6 @@ def load_asset(folder: Path | str) -> FluidAsset:
         raise InputRejected(f"the parts of '{folder.name}' contradict each other: {error}", "a whole asset") from None
 
 
-def asset_file(folder: Path | str, name: str) -> Path:
-    """The file `name` of an asset.
-
-    Raises:
-        InputRejected: an absolute name, a drive, `..`, or a link on the way: the file could be anywhere.
-    """
-    folder = Path(folder)
-    foreign = PurePosixPath(name).is_absolute() or PureWindowsPath(name).drive or PureWindowsPath(name).root
-    parts = PurePosixPath(name.replace("\\", "/")).parts
-    endless = any(len(part.encode("utf-8", "replace")) > 255 for part in parts) or len(name) > 1000
-    if foreign or ".." in parts or not parts or "\0" in name or endless:
-        raise InputRejected(
-            f"the asset names the file '{name[:100]}'", "names inside its own folder", "do not trust this asset"
-        )
-    path = folder
-    for part in parts:
-        path = path / part
-        if path.is_symlink():
-            raise InputRejected(f"'{name}' in '{folder.name}' is a link", "plain files", "do not trust this asset")
-    return path
-
-
 def write_parameters(folder: Path | str, parameters: FluidParameters, estimates: Mapping[str, Estimate]) -> Path:
     """Write parameters.json, and its hash in the manifest if there is one. A sigma of infinity becomes null."""
     data = plain({"values": parameters.to_dict(), "estimates": {k: vars(e) for k, e in estimates.items()}})
@@ -343,7 +323,7 @@ def _validator(name: str) -> jsonschema.Draft202012Validator:
 
 def _validate(data: Any, name: str, error: type[Exception]) -> None:
     """Raise the first and deepest complaint of the schema."""
-    complaint = jsonschema.exceptions.best_match(_validator(name).iter_errors(data))
+    complaint = best_match(_validator(name).iter_errors(data))
     if complaint is not None:
         raise error(f"{name}.json: {complaint.json_path}: {complaint.message[:300]}")
 
@@ -358,7 +338,7 @@ def _grid(data: Mapping[str, Any]) -> Grid:
 
 def _write_terrain(folder: Path, asset: FluidAsset) -> None:
     terrain = asset.terrain
-    arrays = {
+    arrays: dict[str, Any] = {
         "shape": np.array(terrain.grid.shape),
         "spacing": np.array(terrain.grid.spacing),
         "origin": np.array(terrain.grid.origin),

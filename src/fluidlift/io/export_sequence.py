@@ -31,7 +31,7 @@ def write_splat_sequence(
     """
     written = []
     for number, item in enumerate(frames, start=start_frame):
-        frame = FluidFrame(*item).checked()
+        frame = FluidFrame.of(item)
         path = Path(folder) / frame_name(number, ".ply")
         comments = [f"frame {number}"]
         write_gaussians(path, frame.gaussians, ids=frame.ids, velocities=frame.velocities, axes=axes, comments=comments)
@@ -46,7 +46,7 @@ def write_mesh_sequence(
     """Write the free surface of the frames that have one, with velocities of the vertices for motion blur."""
     written = []
     for number, item in enumerate(frames, start=start_frame):
-        frame = FluidFrame(*item).checked()
+        frame = FluidFrame.of(item)
         if frame.surface is not None:
             path = Path(folder) / frame_name(number, ".ply")
             written.append(write_mesh(path, frame.surface, velocities=frame.surface_velocities))

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from fluidlift.errors import InputRejected
 from fluidlift.io.array_archive import read_arrays
-from fluidlift.io.asset_folder import FILES, asset_file
+from fluidlift.io.asset_folder import FILES
+from fluidlift.io.asset_paths import asset_file
 from fluidlift.io.atomic import atomic_write
 from fluidlift.types import FaceVelocity
 
@@ -20,8 +22,9 @@ def write_force(folder: Path, force: FaceVelocity | None) -> None:
         path.unlink(missing_ok=True)
         return
     path.parent.mkdir(parents=True, exist_ok=True)
+    components: dict[str, Any] = {n: c.astype(np.float32) for n, c in zip("uvw", force.components)}
     with atomic_write(path) as stream:
-        np.savez_compressed(stream, **{n: c.astype(np.float32) for n, c in zip("uvw", force.components)})
+        np.savez_compressed(stream, **components)
 
 
 def read_force(folder: Path) -> FaceVelocity | None:

@@ -178,7 +178,7 @@ def materials_of(folder: Path, name: str) -> dict[str, Paint]:
 
 def _beside(folder: Path, name: str) -> Path | None:
     """The file of that name in a folder, or of its last part; never one that lies elsewhere."""
-    from fluidlift.io.asset_folder import asset_file
+    from fluidlift.io.asset_paths import asset_file
 
     for asked in (name, name.replace("\\", "/").rpartition("/")[2]):
         try:

@@ -314,7 +314,7 @@ def mesh_file(entry: Entries, meshes: Path) -> TriangleMesh:
 
     It is turned inside out where the entry says `flip: true`.
     """
-    from fluidlift.io.asset_folder import asset_file
+    from fluidlift.io.asset_paths import asset_file
 
     name = entry.text("mesh")
     try:

@@ -97,7 +97,7 @@ def read_look(scene: Entries, folder: Path) -> Look:
 
 
 def _environment(look: Entries, folder: Path) -> str:
-    from fluidlift.io.asset_folder import asset_file
+    from fluidlift.io.asset_paths import asset_file
 
     name = look.data["environment"]
     if not isinstance(name, str) or Path(name).suffix.lower() not in PICTURES:

@@ -269,11 +269,15 @@ def shake_and_drift(motions: np.ndarray, width: int, height: int, cuts: tuple[in
 
 def warp_back(clip: VideoClip, motions: np.ndarray, out: np.ndarray | None = None) -> VideoClip:
     """The clip with every frame carried back to its reference; what comes in from outside repeats the rim."""
-    options = {"flags": cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP, "borderMode": cv2.BORDER_REPLICATE}
+
+    def moved(picture: np.ndarray, motion: np.ndarray) -> np.ndarray:
+        way = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+        return cv2.warpAffine(picture, motion, clip.size, flags=way, borderMode=cv2.BORDER_REPLICATE)
+
     frames = np.empty(clip.frames.shape, np.uint8) if out is None else out
     for t, motion in enumerate(motions):
-        frames[t] = cv2.warpAffine(clip.frames[t], motion, clip.size, **options)
+        frames[t] = moved(clip.frames[t], motion)
     alpha = clip.alpha
     if alpha is not None:
-        alpha = np.stack([cv2.warpAffine(a, m, clip.size, **options) for a, m in zip(alpha, motions)])
+        alpha = np.stack([moved(a, m) for a, m in zip(alpha, motions)])
     return replace(clip, frames=frames, alpha=alpha)

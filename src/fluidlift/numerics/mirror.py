@@ -106,7 +106,9 @@ class MirroredPoints:
         left, parts = np.arange(len(places)), []
         for attempt in range(TRIES):
             images, turned, beside = self._images(places[left], run, attempt)
-            members = self._tree.query_ball_point(images, 0.5 * self._spacing, p=np.inf, return_sorted=True)
+            members = np.asarray(
+                self._tree.query_ball_point(images, 0.5 * self._spacing, p=np.inf, return_sorted=True), object
+            )
             count = np.array([len(m) for m in members], np.int64)
             if count.any():
                 own = np.repeat(np.arange(len(left)), count)

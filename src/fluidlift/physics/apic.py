@@ -34,7 +34,7 @@ from fluidlift.physics.stepping import (
     StepReport,
 )
 from fluidlift.seams import MoveRules
-from fluidlift.types import CellType, FaceVelocity, FluidParameters, Grid, Particles, SolveReport, Terrain
+from fluidlift.types import CellType, FaceVelocity, FluidParameters, Grid, Particles, SolveReport, Terrain, triple
 
 __all__ = ["EmitSource", "LiquidSimulator", "SimulationSettings", "StepReport"]
 
@@ -129,8 +129,9 @@ class LiquidSimulator(LiquidGrid):
         ):
             raise InputRejected("a simulation state with another outlet")
         if rate is not None:
-            fits = rate.ndim == 3 and first is not None and first.shape == (3,) and (first >= 0).all()
-            if not fits or (first + rate.shape > self.grid.shape).any() or not np.isfinite(rate).all():
+            if first is None or rate.ndim != 3 or first.shape != (3,) or not (first >= 0).all():
+                raise InputRejected("a simulation state of another grid", f"{self.grid.shape} cells")
+            if (first + rate.shape > self.grid.shape).any() or not np.isfinite(rate).all():
                 raise InputRejected("a simulation state of another grid", f"{self.grid.shape} cells")
         before = super().state()
         super().restore(state)
@@ -141,7 +142,7 @@ class LiquidSimulator(LiquidGrid):
             except InputRejected:
                 super().restore(before)
                 raise
-        self._head_rate = None if rate is None else (tuple(int(i) for i in first), np.array(rate))
+        self._head_rate = None if rate is None or first is None else (triple(int(i) for i in first), np.array(rate))
         self._start_levels = None if levels is None else np.array(levels)
 
     @property
@@ -175,7 +176,7 @@ class LiquidSimulator(LiquidGrid):
         moves, farthest = displacements(velocities, affine, dt)
         farthest /= grid.spacing
         if not farthest <= 3.0 * self.settings.courant:
-            if bodies is not None:
+            if bodies is not None and before is not None:
                 bodies.restore(before)
             if not last_attempt:
                 return None

@@ -179,15 +179,15 @@ class LiquidGrid(ParticleSimulator):
         known, system = self._known(layout, region, dt), self._system(layout, region, outlet)
         moving = self._wet_faces(layout.wet | (layout.holding == CellType.FLUID), walls)
         pressed = self._pressed(velocity, system, rate, known, dt)
-        eager = bodies is not None and rate is not None and pressed is not velocity
-        if eager:  # the pressure of the step before acts on bodies too
+        before = None if rate is None or pressed is velocity else rate * dt
+        if bodies is not None and before is not None:  # the pressure of the step before acts on bodies too
             bodies.coupling(system.unknown)
-            bodies.apply_pressure(rate * dt)
+            bodies.apply_pressure(before)
             solid = bodies.face_velocity()
         new, viscosity_reports = self._viscous(pressed, moving, region, dt, outlet, layout.distance, solid, bodies)
         if bodies is not None:
-            if eager:
-                bodies.apply_pressure(-rate * dt)
+            if before is not None:
+                bodies.apply_pressure(-before)
             solid = bodies.face_velocity()
         if viscosity_reports:
             velocity = self._dragged(velocity, pressed, new, walls, dt)

@@ -24,7 +24,7 @@ from fluidlift.physics.inlet import Inlet
 from fluidlift.physics.position_correction import cell_capacity
 from fluidlift.physics.rigid import RigidBodies
 from fluidlift.physics.viscosity import NEGLIGIBLE, FaceRoles, diffuse_with_bodies
-from fluidlift.types import FaceVelocity, FluidParameters, Grid, Particles, SolveReport, Terrain
+from fluidlift.types import FaceVelocity, FluidParameters, Grid, Particles, SolveReport, Terrain, triple
 
 TIDY_EVERY = 4
 """substeps between two tidyings: particles put in the order of their cells, thin and crowded cells reseeded"""
@@ -141,7 +141,7 @@ class ParticleSimulator(ABC):
         self._rng = np.random.default_rng(seed)
         self._walls = boundaries.build_walls(terrain, cell_types, open_sides)
         self._capacity = cell_capacity(terrain.signed_distance, grid)
-        self._region = open_region(tuple(slice(0, n) for n in grid.shape), self._walls, self._capacity)
+        self._region = open_region(triple(slice(0, n) for n in grid.shape), self._walls, self._capacity)
         self._mainstream = np.asarray(terrain.mainstream, np.float64)
         self._inlet = Inlet(self._walls, parameters, inflow_profile, seed, settings.particles_per_cell, supply)
         self._inlet.switch(0.0)
@@ -153,6 +153,11 @@ class ParticleSimulator(ABC):
     @abstractmethod
     def _substep(self, dt: float, number: int, *, last_attempt: bool) -> Outcome | None:
         """The state after dt; None where dt should be halved, unless it is the last attempt."""
+
+    @property
+    def bodies(self) -> RigidBodies | None:
+        """The rigid bodies, where there are any: a gas has none."""
+        return None
 
     @property
     def particles(self) -> Particles:
@@ -221,12 +226,11 @@ class ParticleSimulator(ABC):
                 )
             emitted += self._fill_inlet()
             dt = self._substep_length(end - self.time)
-            for attempt in range(7):
-                outcome = self._substep(dt, substeps, last_attempt=attempt == 6)
-                if outcome is not None:
-                    break
+            attempt = 0
+            while (outcome := self._substep(dt, substeps, last_attempt=attempt >= 6)) is None:
                 dt *= 0.5
-                retries += 1
+                attempt += 1
+            retries += attempt
             self._particles = outcome.particles
             outcome.adopt()
             self._inlet.travel(dt, self.time)
@@ -346,7 +350,7 @@ class ParticleSimulator(ABC):
         """An emitter has come on or gone off; for simulators that keep what depends on it."""
 
     def _wet_faces(self, wet: np.ndarray, walls: boundaries.Walls) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return tuple(t & (o > 0) for t, o in zip(boundaries.touching_faces(wet), walls.openings))
+        return triple(t & (o > 0) for t, o in zip(boundaries.touching_faces(wet), walls.openings))
 
     def _viscous(
         self,

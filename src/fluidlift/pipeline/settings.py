@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 from fluidlift.config import JobConfig
 from fluidlift.pipeline.inputs import GivenFile, GivenFiles, Weights
@@ -118,7 +118,7 @@ class GivenDepth:
     """The user's depth file, and what its numbers mean."""
 
     file: GivenFile
-    holds: str
+    holds: Literal["auto", "metres", "relative", "disparity"]
     scale: float | None
     frames: int
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from fluidlift.errors import InputRejected
-from fluidlift.io.asset_folder import asset_file
+from fluidlift.io.asset_paths import asset_file
 from fluidlift.io.atomic import write_bytes
 from fluidlift.io.read_mesh import SUFFIXES, read_any_mesh
 from fluidlift.pipeline.edit_outlook import placed

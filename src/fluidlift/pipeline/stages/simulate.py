@@ -122,9 +122,8 @@ def simulate(
         checkpoint_file(folder).unlink(missing_ok=True)
     step = (lambda done, total: None) if work is None else work.step
     failed = _advance(simulator, dressing, scene, folder, config, history, step)
-    warnings = [*scene.notes, *dressing.warnings, *closed] + (
-        list(simulator.bodies.warnings) if scene.obstacles else []
-    )
+    warnings = [*scene.notes, *dressing.warnings, *closed]
+    warnings += [] if simulator.bodies is None else simulator.bodies.warnings
     if failed is None and len(history) < scene.simulated:
         warnings.append(
             f"the re-simulation stopped after {len(history)} of {scene.simulated} frames, at twice the number of "
@@ -172,7 +171,7 @@ def _advance(
         if k and len(p) > config.max_particles * 2:
             return None
         dressing.advance(p, k)
-        shown = dressing.dressed(p, k, simulator.bodies.inside if scene.obstacles else None)
+        shown = dressing.dressed(p, k, None if simulator.bodies is None else simulator.bodies.inside)
         write_gaussians(
             frame_file(folder, FIRST_FRAME + k), shown.gaussians, ids=shown.ids, velocities=shown.velocities
         )

@@ -1,5 +1,9 @@
 """What can go wrong, by whose fault it is: every message says what was got, what is needed and what to do."""
 
+from typing import TypeVar
+
+T = TypeVar("T")
+
 
 class FluidliftError(Exception):
     """The work failed (exit code 1)."""
@@ -26,6 +30,13 @@ class InputRejected(FluidliftError):
 
 class MissingPackage(FluidliftError):
     """An optional package is not installed; the message says which and how to install it."""
+
+
+def required(value: T | None, got: str, needed: str = "", do: str = "") -> T:
+    """The value; `ValueError` as `require` raises it where it is None."""
+    if value is None:
+        raise ValueError(str(InputRejected(got, needed, do)))
+    return value
 
 
 def require(condition: bool, got: str, needed: str = "", do: str = "") -> None:

@@ -6,7 +6,7 @@ import contextlib
 import sys
 import time
 from collections.abc import Iterator
-from typing import TextIO
+from typing import Any, TextIO
 
 LABELS = {
     "compile": "compiling",
@@ -138,7 +138,8 @@ class BarProgress:
         self._pace.at(done, now)
         if self._task is not None and (now - self._last > 0.1 or done >= total):
             self._last, left = now, self._pace.left(total)
-            told = {"left": left} if left else {}  # until something is known, what was said before stays
+            # until something is known, what was said before stays
+            told: dict[str, Any] = {"left": left} if left else {}
             self.bar.update(self._task, completed=done, total=max(total, 1), parts=f"{done}/{total}", **told)
 
     def finished(self, name: str, seconds: float, cached: bool) -> None:

@@ -14,12 +14,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
-from scipy.spatial import KDTree
 
 from fluidlift.backends.generator_view import Crop, box_of, require_picture
 from fluidlift.errors import FluidliftError
 from fluidlift.look.project import view_colors
 from fluidlift.look.rasterize import render
+from fluidlift.numerics.nearest import nearest
 from fluidlift.types import Gaussians, PinholeCamera, RigidTransform
 
 _ANGLE_STEP = 15.0
@@ -296,7 +296,7 @@ def _thinned(body: Gaussians, count: int, seed: int) -> Gaussians:
     if len(seen) <= count:
         return seen
     pick = seen.select(np.sort(np.random.default_rng(seed).choice(len(seen), count, replace=False)))
-    spacing = np.median(KDTree(pick.means).query(pick.means, k=2)[0][:, 1])
+    spacing = np.median(nearest(pick.means, pick.means, 2)[0][:, 1])
     width = max(float(np.median(pick.scales.max(axis=1))), 1e-12)
     wider = float(np.clip(spacing / width, 1.0, math.sqrt(len(seen) / count)))
     return replace(pick, scales=pick.scales * wider)

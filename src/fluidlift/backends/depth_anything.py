@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fluidlift.backends.depth_model import DepthModel, Guess
 from fluidlift.backends.depth_pictures import (
     TransformersDepth,
     longer_field_of_view,
@@ -16,7 +17,6 @@ from fluidlift.backends.depth_pictures import (
     to_tensor,
 )
 from fluidlift.backends.model_weights import Announce, say
-from fluidlift.backends.monocular_depth import DepthModel, Guess
 from fluidlift.backends.pair_network import memory_errors, torch_device
 from fluidlift.backends.sam2_video import MEAN, SPREAD
 from fluidlift.errors import InputRejected, MissingPackage

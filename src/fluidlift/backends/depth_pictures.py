@@ -7,8 +7,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from fluidlift.backends.depth_model import DepthModel
 from fluidlift.backends.model_weights import Announce, say
-from fluidlift.backends.monocular_depth import DepthModel
 from fluidlift.backends.pair_network import torch_device
 from fluidlift.backends.sam2_video import loaded_model
 from fluidlift.errors import InputRejected, require

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from fluidlift.backends.depth_model import Guess
 from fluidlift.backends.depth_pictures import (
     TransformersDepth,
     longer_field_of_view,
@@ -12,7 +13,6 @@ from fluidlift.backends.depth_pictures import (
     to_picture,
     to_tensor,
 )
-from fluidlift.backends.monocular_depth import Guess
 from fluidlift.backends.pair_network import memory_errors
 from fluidlift.types import PinholeCamera
 

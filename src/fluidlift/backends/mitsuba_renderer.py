@@ -164,7 +164,7 @@ def _together(
 
 def _finite(part: np.ndarray) -> np.ndarray:
     """A path or two in a million may come out as no number; more of them mean a scene that Mitsuba cannot draw."""
-    broken = ~np.isfinite(part).all(axis=-1)
+    broken = ~np.all(np.isfinite(part), axis=-1)
     if broken.mean() > 1e-3:
         raise FluidliftError(
             f"Mitsuba drew {100 * broken.mean():.1f} % of the pixels as no number. Needed: a closed mesh of the liquid "

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from fluidlift.backends.depth_model import DepthModel, Guess
 from fluidlift.backends.depth_pictures import longer_field_of_view, require_answer, require_picture, to_picture
 from fluidlift.backends.model_weights import Announce, say
-from fluidlift.backends.monocular_depth import DepthModel, Guess
 from fluidlift.backends.pair_network import memory_errors, torch_device
 from fluidlift.errors import InputRejected, MissingPackage
 from fluidlift.types import PinholeCamera

@@ -56,7 +56,7 @@ class SplashsurfMesher(Mesher):
             return _nothing(values)
         # single precision takes two thirds of the time; about its middle a body loses nothing by it
         middle = points[sound].mean(axis=0)
-        particles = np.float32(points[sound] - middle)
+        particles = (points[sound] - middle).astype(np.float32)
         found, _ = self._package.reconstruction_pipeline(
             particles, particle_radius=radius, smoothing_length=KERNEL, cube_size=CUBE,
             iso_surface_threshold=INSIDE, mesh_cleanup=True, decimate_barnacles=True,
@@ -65,7 +65,7 @@ class SplashsurfMesher(Mesher):
         vertices, faces = np.asarray(found.mesh.vertices), np.asarray(found.mesh.triangles, np.int64)
         if len(faces) == 0:
             return _nothing(values)
-        mesh = TriangleMesh(np.float32(np.asarray(vertices, np.float64) + middle), faces)
+        mesh = TriangleMesh((vertices.astype(np.float64) + middle).astype(np.float32), faces)
         return mesh, _carried(np.ascontiguousarray(vertices, np.float32), particles, values, CARRIED * radius)
 
 

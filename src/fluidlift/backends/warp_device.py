@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -41,6 +41,13 @@ def warp_device(name: str = "cuda") -> warp.Device:
             "and its driver (nvidia-smi must list it). Do: install the driver, or choose the CPU."
         )
     return warp.get_device(f"cuda:{number}")
+
+
+def empty(size: int, dtype: Any, device: warp.Device) -> warp.array:
+    """A Warp array [size] of `dtype` (a number, vector or matrix type) that nothing has been written to."""
+    import warp
+
+    return warp.empty(size, dtype=dtype, device=device)
 
 
 def on_device(values: np.ndarray, dtype: type, device: warp.Device) -> warp.array:

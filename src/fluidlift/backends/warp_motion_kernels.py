@@ -4,6 +4,11 @@ What decides whether a particle is inside the solid is computed in double precis
 Imported only by adapters that have found Warp.
 """
 
+# pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false
+# pyright: reportGeneralTypeIssues=false, reportIndexIssue=false, reportInvalidTypeForm=false
+# pyright: reportOperatorIssue=false
+# what is written here is Warp's own language: Python's types of it are no types of the kernels
+
 # Warp reads the annotations of kernels: they must not become strings
 import warp as wp
 

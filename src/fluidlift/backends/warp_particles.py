@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from fluidlift.backends.warp_device import on_device, warp_device
+from fluidlift.backends.warp_device import empty, on_device, warp_device
 from fluidlift.seams import CLEARANCE, CONTACT, GroupedByCell, MoveRules, ParticleMover, ParticleTransfer, WallShape
-from fluidlift.types import FaceVelocity, Grid, Particles
+from fluidlift.types import FaceVelocity, Grid, Particles, triple
 
 if TYPE_CHECKING:
     import warp
@@ -34,7 +34,7 @@ class WarpTransfer(ParticleTransfer):
     ) -> tuple[FaceVelocity, tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """See `ParticleTransfer`; `order` is not used: the device sorts faster than a copy takes."""
         velocities, masses = self.scattered(self.upload(particles), grid)
-        return FaceVelocity(*(v.numpy() for v in velocities)), tuple(m.numpy() for m in masses)
+        return FaceVelocity(*(v.numpy() for v in velocities)), triple(m.numpy() for m in masses)
 
     def grid_to_particles(
         self,
@@ -89,7 +89,7 @@ class WarpTransfer(ParticleTransfer):
         from fluidlift.backends import warp_transfer_kernels as kernels
 
         n, device = len(positions), self._device
-        velocities, affine = (wp.empty(n, dtype=t, device=device) for t in (wp.vec3, wp.mat33))
+        velocities, affine = (empty(n, t, device) for t in (wp.vec3, wp.mat33))
         inputs = [positions, wp.vec3(*grid.low), float(grid.spacing), *components]
         wp.launch(kernels.gather_particles, n, inputs, [velocities, affine], device=device)
         return velocities, affine
@@ -110,7 +110,7 @@ class WarpTransfer(ParticleTransfer):
 
         n, device = len(positions), self._device
         # the sort needs the same room again
-        cells, order = (wp.empty(2 * n, dtype=wp.int32, device=device) for _ in range(2))
+        cells, order = (empty(2 * n, wp.int32, device) for _ in range(2))
         counts, ends = (wp.zeros(grid.cells, dtype=wp.int32, device=device) for _ in range(2))
         inputs = [positions, wp.vec3(*grid.low), float(grid.spacing), wp.vec3i(*grid.shape)]
         wp.launch(kernels.number_cells, n, inputs, [cells, order, counts], device=device)
@@ -148,7 +148,7 @@ class WarpMover(ParticleMover):
             on_device(a, wp.vec3, device) for a in (particles.positions, particles.velocities, moves)
         )
         new_velocities = on_device(np.array(velocities, np.float32), wp.vec3, device)
-        positions, deformation = (wp.empty(n, dtype=t, device=device) for t in (wp.vec3, wp.mat33))
+        positions, deformation = (empty(n, t, device) for t in (wp.vec3, wp.mat33))
         inputs = [self._box(walls, rules), old, incoming, displacements, new_velocities]
         wp.launch(kernels.move_particles, n, inputs, [positions], device=device)
         inputs = [on_device(affine, wp.mat33, device), float(rules.dt), float(rules.max_stretch)]

@@ -4,6 +4,10 @@ Launches are flat: one thread per particle or per face. Coordinates are in cells
 lies at coordinate i. Imported only by adapters that have found Warp.
 """
 
+# pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false, reportInvalidTypeForm=false
+# pyright: reportOperatorIssue=false
+# what is written here is Warp's own language: Python's types of it are no types of the kernels
+
 # Warp reads the annotations of kernels: they must not become strings
 import warp as wp
 

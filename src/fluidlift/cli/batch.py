@@ -125,6 +125,7 @@ def _shots(command: Batch) -> list[Shot]:
     base = {k: v for k, v in base.items() if v is not None}
     shots: list[Shot] = []
     for path in command.clips:
+        rows: list[dict[str, Any]]
         if path.suffix.lower() in LISTS:
             rows = _listed(path)
         elif path.is_dir() and (videos := _videos(path)):

@@ -16,6 +16,7 @@ from jaxtyping import Bool, UInt8
 from fluidlift.errors import require
 from fluidlift.evaluate.film import BANDS, CELL, LEAST, FilmStatistics, Foam, Places, film_statistics
 from fluidlift.evaluate.images import mask_iou
+from fluidlift.types import triple
 
 GOOD, USABLE, WRONG = "good", "usable", "does not hold"
 VERDICTS = (GOOD, USABLE, WRONG)
@@ -74,7 +75,7 @@ class Likeness:
     def row(self) -> tuple[str, str, str, str, str, str]:
         """Words with the unit, value, floor, beyond, verdict, note."""
         name = f"{self.words}, {self.unit}" if self.unit else self.words
-        return name, *(_text(v) for v in (self.value, self.floor, self.beyond)), self.verdict or "", self.note
+        return name, _text(self.value), _text(self.floor), _text(self.beyond), self.verdict or "", self.note
 
 
 def _text(value: float | None) -> str:
@@ -313,7 +314,7 @@ _WORDS = {
 def _figures(value: dict[str, float], floor: dict[str, float], beyond: dict[str, float], speed: float):
     """Each figure with its verdict."""
     for key, (words, unit) in _WORDS.items():
-        numbers = [_plain(x.get(key)) for x in (value, floor, beyond)]
+        numbers = triple(_plain(x.get(key)) for x in (value, floor, beyond))
         verdicts = [v for v in (_judged(key, x, numbers[1]) for x in (numbers[0], numbers[2])) if v]
         slow = key.startswith("current") and speed < SLOWEST
         note = f"not judged: {speed:.2f} px/frame is less than what optical flow is wrong by" if slow else ""

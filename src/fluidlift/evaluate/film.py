@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -29,6 +30,9 @@ further than where a wrong level shows"""
 CELL = 1.0 / 32.0
 """side of the places in which foam is counted, over the longer side of the picture"""
 
+NO_MAP: Any = None
+"""OpenCV takes the rows from a second map unless there is none, which its stub does not know"""
+
 
 @dataclass(frozen=True)
 class Places:
@@ -50,10 +54,10 @@ class Places:
         """From where fluid was filmed in each frame."""
         half = max(len(masks) // 2, 1)
         first, second = masks[:half].mean(axis=0) > 0.5, masks[-half:].mean(axis=0) > 0.5
-        fluid, ever = masks.mean(axis=0) > 0.5, masks.any(axis=0)
+        fluid, ever, always = masks.mean(axis=0) > 0.5, np.any(masks, axis=0), np.all(masks, axis=0)
         longer = max(fluid.shape)
         near, far = (_grown(ever, max(round(r * longer), least)) for r, least in zip(RING, (1, 3)))
-        return Places(fluid, first & second, masks.all(axis=0), ~ever, far & ~near, _zones(fluid))
+        return Places(fluid, first & second, always, ~ever, far & ~near, _zones(fluid))
 
     @property
     def stays(self) -> float:
@@ -244,8 +248,8 @@ def along_the_flow(
             found[name] = float("nan")
             continue
         for _ in range(lag - done):
-            halfway = place + 0.5 * cv2.remap(move, place, None, cv2.INTER_LINEAR)
-            place = place + cv2.remap(move, halfway, None, cv2.INTER_LINEAR)
+            halfway = place + 0.5 * cv2.remap(move, place, NO_MAP, cv2.INTER_LINEAR)
+            place = place + cv2.remap(move, halfway, NO_MAP, cv2.INTER_LINEAR)
         done = lag
         found[name] = _correlation_at(frames, masks, np.where(known, mean, np.nan).astype(np.float32), place, lag)
     return found
@@ -257,8 +261,8 @@ def _correlation_at(frames, masks, mean: np.ndarray, place: np.ndarray, lag: int
     count = 0
     for t in spread(0, len(frames) - lag, STARTS):
         here, there = (cv2.cvtColor(np.ascontiguousarray(frames[k]), cv2.COLOR_RGB2GRAY) - mean for k in (t, t + lag))
-        moved = cv2.remap(there, place, None, cv2.INTER_LINEAR)
-        inside = cv2.remap(masks[t + lag].astype(np.uint8), place, None, cv2.INTER_NEAREST) > 0
+        moved = cv2.remap(there, place, NO_MAP, cv2.INTER_LINEAR)
+        inside = cv2.remap(masks[t + lag].astype(np.uint8), place, NO_MAP, cv2.INTER_NEAREST) > 0
         on = masks[t] & inside & np.isfinite(here) & np.isfinite(moved)
         a, b = here[on].astype(np.float64), moved[on].astype(np.float64)
         own, later, both = own + (a * a).sum(), later + (b * b).sum(), both + (a * b).sum()

@@ -50,7 +50,7 @@ def truth_mask(case: Case, frames: slice, size: tuple[int, int]) -> np.ndarray:
 def truth_flow(case: Case, frames: slice, size: tuple[int, int]) -> np.ndarray:
     """float32 [n,h,w,2] in px/frame of the raster of the run."""
     flow = resample_nearest(case.flow[frames], size, axes=(-3, -2)).astype(np.float32)
-    return flow * np.float32([size[0] / case.size[0], size[1] / case.size[1]])
+    return flow * np.array([size[0] / case.size[0], size[1] / case.size[1]], np.float32)
 
 
 def score_segmentation(arrays: Arrays, case: Case) -> tuple[list[Figure], Series]:

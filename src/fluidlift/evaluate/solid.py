@@ -39,6 +39,8 @@ def score_up(case: Case, alignment: Alignment) -> list[Figure]:
     """Angle between the asset's vertical and the case's, both as their cameras see them."""
     up = alignment.truth_from_asset.rotation @ np.array([0.0, 0.0, 1.0])
     gravity = case.scene.get("gravity")
-    true = -np.asarray(gravity, float) if np.shape(gravity) == (3,) and np.any(gravity) else np.array([0.0, 0.0, 1.0])
+    true = np.array([0.0, 0.0, 1.0])
+    if gravity is not None and np.shape(gravity) == (3,) and np.any(gravity):
+        true = -np.asarray(gravity, float)
     cosine = float(np.clip(up @ true / np.linalg.norm(true), -1.0, 1.0))
     return [figure("geometry.up_angle", float(np.degrees(np.arccos(cosine))), "degrees", "from the true vertical")]

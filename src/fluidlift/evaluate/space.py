@@ -241,7 +241,7 @@ def score_parameters(asset: FluidAsset, case: Case, alignment: Alignment) -> lis
 
     out = []
     gravity = case.scene.get("gravity")
-    true = np.asarray(gravity, float) @ rotation if np.shape(gravity) == (3,) else None
+    true = np.asarray(gravity, float) @ rotation if gravity is not None and np.shape(gravity) == (3,) else None
     mine, why = s * np.asarray(p.gravity), "the case does not say"
     if kind_of(asset.kind).is_gas:
         true, why = None, "the gravity of a plume is its buoyancy, which the case does not say in m/s2"

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
-from scipy.spatial import cKDTree
 
 from fluidlift.errors import require
-from fluidlift.types import FaceVelocity, Grid, PinholeCamera, Similarity3
+from fluidlift.numerics.nearest import nearest
+from fluidlift.types import FaceVelocity, Grid, PinholeCamera, Similarity3, triple
 
 
 def align_cameras(truth: PinholeCamera, other: PinholeCamera, scale: float) -> Similarity3:
@@ -47,7 +47,7 @@ def lookup(
     """The value of the cell that each point lies in; `outside` beyond the grid."""
     require(values.shape == grid.shape, f"cell values {values.shape}", str(grid.shape))
     index = grid.cell_of(points)
-    inside = ((index >= 0) & (index < np.asarray(grid.shape))).all(axis=-1)
+    inside = np.all((index >= 0) & (index < np.asarray(grid.shape)), axis=-1)
     i = np.where(inside[..., None], index, 0)
     return np.where(inside, values[i[..., 0], i[..., 1], i[..., 2]], outside)
 
@@ -93,8 +93,8 @@ def level_set_points(phi: Float[np.ndarray, "nx ny nz"], grid: Grid) -> Float[np
     for axis in range(3):
         line = np.moveaxis(phi, axis, 0)
         line[0], line[-1] = np.where(line[1] < 0, -line[1], line[0]), np.where(line[-2] < 0, -line[-2], line[-1])
-    wide = tuple(n + 2 for n in grid.shape)
-    centers = Grid(wide, grid.spacing, tuple(grid.low - grid.spacing)).centers()
+    wide = triple(n + 2 for n in grid.shape)
+    centers = Grid(wide, grid.spacing, triple(grid.low - grid.spacing)).centers()
     found = []
     for axis in range(3):
         low, high = [slice(None)] * 3, [slice(None)] * 3
@@ -125,7 +125,7 @@ def mean_nearest(points: Float[np.ndarray, "n 3"], others: Float[np.ndarray, "m 
     """Mean distance (m) from each point to the nearest of the others: half of the Chamfer distance."""
     if len(points) == 0 or len(others) == 0:
         return None
-    return float(cKDTree(others).query(points)[0].mean())
+    return float(nearest(others, points)[0].mean())
 
 
 def relative_l2(values: Float[np.ndarray, "n 3"], truth: Float[np.ndarray, "n 3"]) -> float | None:

@@ -34,8 +34,8 @@ def write_clip_files(
     if request.to == "masks":
         (segmentation,) = _recalled(folder, manifest, ("segment",), "the masks")
         return _masks(segmentation.labels.labels, out, request, progress)
-    found = _recalled(folder, manifest, ("flow", "segment", "motion"), "the flow")
-    return _flow(*found, out, request, progress)
+    flow, segmentation, motion = _recalled(folder, manifest, ("flow", "segment", "motion"), "the flow")
+    return _flow(flow, segmentation, motion, out, request, progress)
 
 
 def camera_facts(camera: PinholeCamera) -> dict[str, Any]:

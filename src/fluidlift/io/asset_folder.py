@@ -23,6 +23,7 @@ from typing import Any
 
 import jsonschema
 import numpy as np
+from jsonschema.exceptions import best_match
 
 from fluidlift.errors import InputRejected
 from fluidlift.io.array_archive import read_arrays
@@ -334,7 +335,7 @@ def _validate(data: Any, name: str, error: type[Exception]) -> None:
             waiting += part.values() if isinstance(part, dict) else part
         elif isinstance(part, float) and not math.isfinite(part):
             raise error(f"{name}.json: the number {part}, which is not finite")
-    complaint = jsonschema.exceptions.best_match(_validator(name).iter_errors(data))
+    complaint = best_match(_validator(name).iter_errors(data))
     if complaint is not None:
         raise error(f"{name}.json: {complaint.json_path}: {complaint.message[:300]}")
 
@@ -349,7 +350,7 @@ def _grid(data: Mapping[str, Any]) -> Grid:
 
 def _write_terrain(folder: Path, asset: FluidAsset) -> None:
     terrain = asset.terrain
-    arrays = {
+    arrays: dict[str, Any] = {
         "shape": np.array(terrain.grid.shape),
         "spacing": np.array(terrain.grid.spacing),
         "origin": np.array(terrain.grid.origin),

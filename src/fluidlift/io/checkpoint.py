@@ -61,8 +61,9 @@ def write_checkpoint(path: Path | str, checkpoint: Checkpoint) -> Path:
         "frames": int(checkpoint.frames),
         "parts": dict(checkpoint.parts),
     }
+    held: dict[str, Any] = {_HEADER: np.frombuffer(json.dumps(header).encode(), np.uint8)} | arrays
     with atomic_write(path, lasting=True) as file:
-        np.savez(file, **{_HEADER: np.frombuffer(json.dumps(header).encode(), np.uint8)}, **arrays)
+        np.savez(file, **held)
     return Path(path)
 
 

@@ -7,9 +7,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
+from typing import cast
 
 import av
+import av.container
+import av.error
 import numpy as np
+from av.video.codeccontext import VideoCodecContext
 
 from fluidlift.errors import InputRejected
 from fluidlift.io.color import HLG, PQ, tone_map
@@ -97,7 +101,7 @@ def _damaged(path: Path) -> InputRejected:
     )
 
 
-def _decoder(stream: av.VideoStream, limits: ReadLimits) -> av.CodecContext:
+def _decoder(stream: av.VideoStream, limits: ReadLimits) -> VideoCodecContext:
     """The stream's decoder; libvpx where WebM carries alpha, which FFmpeg's own VP8 and VP9 decoders drop."""
     own = stream.codec_context
     name = {"vp8": "libvpx", "vp9": "libvpx-vp9"}.get(own.name)
@@ -105,7 +109,7 @@ def _decoder(stream: av.VideoStream, limits: ReadLimits) -> av.CodecContext:
         try:
             other = av.CodecContext.create(name, "r")
             other.extradata = own.extradata
-            own = other
+            own = cast(VideoCodecContext, other)
         except (av.error.FFmpegError, ValueError):
             pass  # this build of FFmpeg has no libvpx: the pictures come without alpha
     own.options = {"max_pixels": str(limits.max_pixels)}
@@ -141,7 +145,8 @@ def decode_frames(
             if frame.is_corrupt:
                 bad += 1
                 continue
-            time = None if frame.pts is None else frame.pts * (frame.time_base or stream.time_base)
+            tick = frame.time_base or stream.time_base
+            time = None if frame.pts is None or tick is None else frame.pts * tick
             yield time, frame
     if bad:
         notes.add(f"{bad} damaged frames or packets were left out")

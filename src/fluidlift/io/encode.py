@@ -6,12 +6,15 @@ import math
 from collections.abc import Iterable
 from fractions import Fraction
 from pathlib import Path
+from typing import cast
 
 import av
+import av.container
+import av.error
 import numpy as np
 from jaxtyping import UInt8
 
-from fluidlift.errors import InputRejected, require
+from fluidlift.errors import InputRejected, require, required
 from fluidlift.io.atomic import atomic_path
 
 _ITU709, _MPEG_RANGE = 1, 1
@@ -57,8 +60,7 @@ def write_video(
             video_frame.pts = None
             for packet in stream.encode(video_frame):
                 container.mux(packet)
-        require(stream is not None, "no frames to write")
-        for packet in stream.encode():
+        for packet in required(stream, "no frames to write").encode():
             container.mux(packet)
     return path
 
@@ -81,7 +83,7 @@ def _new_stream(
     alone = {"x264-params": "threads=1:lookahead-threads=1:cpu-independent=1"} if repeatable else {}
     for name, options in (("libx264", {"crf": str(quality), "preset": "medium"} | alone), ("mpeg4", {"qscale": "3"})):
         try:
-            stream = container.add_stream(name, rate=rate, options=options)
+            stream = cast(av.VideoStream, container.add_stream(name, rate=rate, options=options))
             break
         except (av.error.FFmpegError, ValueError):  # FFmpeg without x264 (an LGPL build)
             continue

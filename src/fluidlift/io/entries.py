@@ -107,11 +107,11 @@ class Entries:
         value, least = self.data.get(name), -limit if low is None else low
         if value is None and default is not None:
             return default
-        good = isinstance(value, list) and len(value) == 3
-        good = good and all(
-            isinstance(v, int | float) and not isinstance(v, bool) and least <= v <= limit for v in value
-        )
-        if not good:  # a nan fails the comparison
+
+        def good(v: object) -> bool:  # a nan fails the comparison
+            return isinstance(v, int | float) and not isinstance(v, bool) and least <= v <= limit
+
+        if not isinstance(value, list) or len(value) != 3 or not all(map(good, value)):
             unit = f" {unit}" if unit else ""
             needed = f"3 numbers from {least:g} to {limit:g}{unit}, such as {example}"
             raise self.wrong(name, f"{name} of {self.what} is {value!r}", needed)

@@ -225,7 +225,7 @@ def _write_frames(stage: Usd.Stage, frames: Iterable[FluidFrame | tuple], into: 
     """The moving prims; the number of frames."""
     count, volumes = 0, {}
     for count, given in enumerate(frames, start=1):  # the count is the result
-        frame = ordered(FluidFrame(*given).checked())
+        frame = ordered(FluidFrame.of(given))
         code = settings.start_frame + count - 1
         into.add(placed(frame, settings.place), code)
         if frame.volume is not None:

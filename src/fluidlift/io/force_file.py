@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -21,8 +22,9 @@ def write_force(folder: Path, force: FaceVelocity | None) -> None:
         path.unlink(missing_ok=True)
         return
     path.parent.mkdir(parents=True, exist_ok=True)
+    components: dict[str, Any] = {n: c.astype(np.float32) for n, c in zip("uvw", force.components)}
     with atomic_write(path) as stream:
-        np.savez_compressed(stream, **{n: c.astype(np.float32) for n, c in zip("uvw", force.components)})
+        np.savez_compressed(stream, **components)
 
 
 def read_force(folder: Path) -> FaceVelocity | None:

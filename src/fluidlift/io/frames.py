@@ -41,6 +41,11 @@ class FluidFrame(NamedTuple):
     volume: str | None = None
     """name of this frame's OpenVDB file, relative to the USD file"""
 
+    @staticmethod
+    def of(given: FluidFrame | tuple) -> FluidFrame:
+        """A frame, or one from the values of its fields in their order; after a check of the array lengths."""
+        return (given if isinstance(given, FluidFrame) else FluidFrame(*given)).checked()
+
     def checked(self) -> FluidFrame:
         """Itself, after a check of the array lengths."""
         n = len(self.gaussians)

@@ -147,7 +147,9 @@ def resample(picture: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     return cv2.resize(picture, size, interpolation=method)
 
 
-def resample_with_alpha(rgb: np.ndarray, alpha: np.ndarray | None, size: tuple[int, int]) -> tuple[np.ndarray, ...]:
+def resample_with_alpha(
+    rgb: np.ndarray, alpha: np.ndarray | None, size: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray | None]:
     """The same for straight alpha: colours are weighted with it, so that nothing bleeds out of transparent pixels."""
     if alpha is None or rgb.shape[1::-1] == size:
         return resample(rgb, size), alpha

@@ -139,33 +139,43 @@ def write_elements(path: Path | str, elements: Sequence[tuple[str, np.ndarray]],
             file.write(records.tobytes())
 
 
+def _layout(lines: Sequence[str]) -> tuple[list[tuple[str, int, list]], list[str]]:
+    """(name, count, fields) of each element of a header, and comments.
+
+    Raises:
+        KeyError, IndexError, ValueError: a header that is none of PLY.
+    """
+    order, layout, comments = "", [], []
+    for line in lines[1:]:
+        words = line.split()
+        if not words or words[0] == "obj_info":
+            continue
+        if words[0] == "comment":
+            comments.append(line[len("comment") :].strip())
+        elif words[0] == "format":
+            order = {"binary_little_endian": "<", "binary_big_endian": ">"}[words[1]]
+        elif words[0] == "element":
+            count = int(words[2])
+            if count < 0:
+                raise ValueError(f"{count} elements")
+            layout.append((words[1], count, []))
+        elif words[:2] == ["property", "list"]:
+            name = "vertex_indices" if words[4] == "vertex_index" else words[4]
+            count_kind, item_kind = order + _TYPES[words[2]], order + _TYPES[words[3]]
+            layout[-1][2].extend([(f"count of {name}", count_kind), (name, item_kind, (3,))])
+        elif words[0] == "property":
+            layout[-1][2].append((words[2], order + _TYPES[words[1]]))
+        else:
+            raise ValueError(f"the line '{line[:60]}'")
+    if not order:
+        raise ValueError("no format line")
+    return layout, comments
+
+
 def _parse(path: Path, lines: Sequence[str]) -> tuple[list[tuple[str, int, np.dtype]], list[str]]:
     """(name, count, record) of each element, and comments."""
-    order, layout, comments = "", [], []
     try:
-        for line in lines[1:]:
-            words = line.split()
-            if not words or words[0] == "obj_info":
-                continue
-            if words[0] == "comment":
-                comments.append(line[len("comment") :].strip())
-            elif words[0] == "format":
-                order = {"binary_little_endian": "<", "binary_big_endian": ">"}[words[1]]
-            elif words[0] == "element":
-                count = int(words[2])
-                if count < 0:
-                    raise ValueError(f"{count} elements")
-                layout.append((words[1], count, []))
-            elif words[:2] == ["property", "list"]:
-                name = "vertex_indices" if words[4] == "vertex_index" else words[4]
-                count_kind, item_kind = order + _TYPES[words[2]], order + _TYPES[words[3]]
-                layout[-1][2].extend([(f"count of {name}", count_kind), (name, item_kind, (3,))])
-            elif words[0] == "property":
-                layout[-1][2].append((words[2], order + _TYPES[words[1]]))
-            else:
-                raise ValueError(f"the line '{line[:60]}'")
-        if not order:
-            raise ValueError("no format line")
+        layout, comments = _layout(lines)
         if any(count and not fields for _, count, fields in layout):
             raise ValueError("an element without properties")
         if len({name for name, _, _ in layout}) < len(layout):

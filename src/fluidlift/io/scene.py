@@ -188,8 +188,9 @@ def _mending(error: BaseException, text: str) -> str:
     if "'\\t'" in why or "\t" in line[: len(line) - len(line.lstrip())]:
         return "indent with spaces: YAML takes no tabs"
     opened = getattr(error, "context_mark", None)
-    if opened is not None and "flow" in str(getattr(error, "context", "")):
-        pair = "[]" if "sequence" in error.context else "{}"
+    context = str(getattr(error, "context", ""))
+    if opened is not None and "flow" in context:
+        pair = "[]" if "sequence" in context else "{}"
         return f"close the '{pair[0]}' of line {opened.line + 1} with a '{pair[1]}'"
     above = [x for x in lines[: mark.line if mark is not None else 0] if x.strip() and not x.lstrip().startswith("#")]
     empty = re.match(r"(\w+): *(\{\}|\[\])", above[-1]) if above else None

@@ -11,7 +11,7 @@ from fluidlift.errors import InputRejected
 from fluidlift.io.entries import Entries, nearest
 from fluidlift.io.obstacles import FAR, mesh_file, rotation_of, scale_of
 from fluidlift.physics.terrain_edit import Move, Replace, Rotate, Scale, TerrainEdit, Twist, solid_ground
-from fluidlift.types import TriangleMesh, matrix_from_quat
+from fluidlift.types import TriangleMesh, matrix_from_quat, triple
 
 TERRAIN_EDITS = ("move", "rotate", "scale", "twist", "mesh")
 _OF_A_MESH = ("mesh", "position", "rotation", "scale", "flip")
@@ -55,7 +55,7 @@ def _read(entry: Entries, meshes: Path) -> TerrainEdit:
         return Rotate(entry.number("rotate", None, low=-360.0, high=360.0, unit="degrees about z"), entry.place)
     if name == "twist":
         return Twist(entry.number("twist", None, low=-3600.0, high=3600.0, unit="degrees per metre"), entry.place)
-    return Scale(tuple(float(f) for f in scale_of(entry, low=0.01, high=100.0)), entry.place)
+    return Scale(triple(float(f) for f in scale_of(entry, low=0.01, high=100.0)), entry.place)
 
 
 def _bed(entry: Entries, meshes: Path) -> tuple[TriangleMesh, str]:

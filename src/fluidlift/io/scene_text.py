@@ -151,7 +151,7 @@ def _append(text: str, root: yaml.Node | None, path: Path, item: Any) -> str:
 
 def _remove(text: str, root: yaml.Node | None, path: Path) -> str:
     parent, node = _at(root, path[:-1]), _at(root, path)
-    if parent is None or node is None:
+    if not isinstance(parent, yaml.CollectionNode) or node is None:
         raise _NotHere
     if len(parent.value) == 1 and len(path) > 1:
         empty = None if len(path) == 2 else {} if isinstance(parent, yaml.MappingNode) else []

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from fluidlift.errors import InputRejected
+from fluidlift.errors import InputRejected, required
 from fluidlift.io.pictures import PICTURE_SUFFIXES
 
 _PLACEHOLDER = re.compile(r"%0?(\d*)d|#+")
@@ -62,7 +62,7 @@ def _matching(pattern: Path) -> list[tuple[int, Path]]:
         raise InputRejected(
             f"'{pattern.name}' does not name pictures of a known kind", "one of " + ", ".join(sorted(PICTURE_SUFFIXES))
         )
-    place = _PLACEHOLDER.search(pattern.name)
+    place = required(_PLACEHOLDER.search(pattern.name), f"'{pattern.name}' without a place for numbers")
     head, tail = re.escape(pattern.name[: place.start()]), re.escape(pattern.name[place.end() :])
     name = re.compile(head + r"(\d+)" + tail)
     hits = [(int(m[1]), p) for p in pattern.parent.iterdir() if (m := name.fullmatch(p.name))]

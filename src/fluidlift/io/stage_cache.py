@@ -210,8 +210,9 @@ def save_stage(
     facts.unlink(missing_ok=True)
     mapped = {} if scratch is None else {n: p for n, a in arrays.items() if (p := scratch.file_of(a)) is not None}
     require(len(set(mapped.values())) == len(mapped), "one array under two names", "a copy")
+    held: dict[str, Any] = {f"{name}.": array for name, array in arrays.items() if name not in mapped}
     with atomic_write(data) as file:
-        np.savez(file, **{f"{name}.": array for name, array in arrays.items() if name not in mapped})
+        np.savez(file, **held)
     with disk_errors(folder):
         for name, path in mapped.items():
             made = arrays[name]

@@ -8,6 +8,7 @@ import numpy as np
 from pxr import Usd, UsdGeom, UsdVol
 
 from fluidlift.io.frame_checks import Particles, identity_faults, repeated
+from fluidlift.types import triple
 
 NORM = 1e-3
 """of a unit quaternion, as NVIDIA's rule has it; rounding to half precision moves it by up to 5e-4"""
@@ -94,15 +95,21 @@ def _splat_faults(prim: Usd.Prim, time: Usd.TimeCode) -> list[str]:
         return faults
     if not np.isfinite(positions).all():
         faults.append("positions that are not finite")
-    if not arrays["scales"][0].min() > 0:
+    faults += _range_faults({name: values for name, (values, _) in arrays.items() if values is not None})
+    return faults + _extent_faults(prim, time, positions)
+
+
+def _range_faults(arrays: dict[str, np.ndarray]) -> list[str]:
+    """Of scales, opacities and orientations [n,...] that are finite."""
+    faults, opacities = [], arrays["opacities"]
+    if not arrays["scales"].min() > 0:
         faults.append("scales of 0 or less")
-    opacities = arrays["opacities"][0]
     if opacities.min() < 0 or opacities.max() > 1:
         faults.append("opacities outside 0 to 1")
-    norms = np.linalg.norm(arrays["orientations"][0].astype(np.float32), axis=-1)
+    norms = np.linalg.norm(arrays["orientations"].astype(np.float32), axis=-1)
     if np.abs(norms - 1).max() > NORM:
         faults.append("orientations that are not unit quaternions")
-    return faults + _extent_faults(prim, time, positions)
+    return faults
 
 
 def _harmonics_faults(prim: Usd.Prim, per_splat: int) -> list[str]:
@@ -132,7 +139,8 @@ def _points_faults(prim: Usd.Prim, time: Usd.TimeCode) -> list[str]:
     if points is None:
         return ["no points"]
     n = len(points)
-    expected = dict.fromkeys(("points", "widths", "ids", "velocities", "primvars:displayColor"), (n,))
+    names = ("points", "widths", "ids", "velocities", "primvars:displayColor")
+    expected: dict[str, tuple[int, ...]] = dict.fromkeys(names, (n,))
     faults = _lengths(prim, time, expected, f"{n} points")
     ids, widths = _array(prim, time, "ids"), _array(prim, time, "widths")
     if ids is not None and repeated(ids):
@@ -146,13 +154,12 @@ def _identities(prim: Usd.Prim, codes: list[float]) -> Iterator[str]:
     """Whether an id is the same particle from one frame to the next."""
     rate, before = prim.GetStage().GetTimeCodesPerSecond(), None
     for k, code in enumerate(codes):
-        arrays = [_array(prim, Usd.TimeCode(code), name) for name in ("ids", "points", "velocities")]
-        ids = arrays[0]
-        whole = ids is not None and all(a is not None and len(a) == len(ids) and np.isfinite(a).all() for a in arrays)
-        if not whole or repeated(ids):
+        found = (_array(prim, Usd.TimeCode(code), name) for name in ("ids", "points", "velocities"))
+        arrays = [a for a in found if a is not None and np.isfinite(a).all()]
+        if len(arrays) < 3 or len({len(a) for a in arrays}) > 1 or repeated(arrays[0]):
             before = None
             continue
-        now = Particles(*arrays)
+        now = Particles(*triple(arrays))
         if before is not None:
             seconds = (code - codes[k - 1]) / rate
             yield from (f"{prim.GetPath()} at {code:g}: {fault}" for fault in identity_faults(before, now, seconds))

@@ -47,11 +47,11 @@ class FluidPrims:
 
     def set_surface(self, surface: TriangleMesh, velocities: np.ndarray | None, time: Usd.TimeCode) -> None:
         """Write the surface; velocities [v,3] are what motion blur is made of: another frame has other vertices."""
-        if self.surface is None:
-            self.surface = UsdGeom.Mesh.Define(self.stage, "/Fluid/Surface")
-        write_mesh(self.surface, surface, velocities, time)
-        self.surface.CreateNormalsAttr().Set(vec3(vertex_normals(surface)), time)
-        self.surface.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+        mesh = UsdGeom.Mesh.Define(self.stage, "/Fluid/Surface") if self.surface is None else self.surface
+        self.surface = mesh
+        write_mesh(mesh, surface, velocities, time)
+        mesh.CreateNormalsAttr().Set(vec3(vertex_normals(surface)), time)
+        mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
 
     def _define_splats(self) -> None:
         self.splats = s = UsdVol.ParticleField3DGaussianSplat.Define(self.stage, "/Fluid/Splats")

@@ -6,10 +6,11 @@ import importlib.util
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from pxr import Sdf, Usd, UsdGeom, UsdUtils, UsdValidation
 
-from fluidlift.errors import InputRejected, MissingPackage
+from fluidlift.errors import InputRejected, MissingPackage, required
 from fluidlift.io.limits import require_file
 from fluidlift.io.usd_checks import prim_faults
 from fluidlift.io.usd_open import open_stage
@@ -67,9 +68,12 @@ def splat_rule_faults(path: Path | str) -> list[str]:
     from usd_validation_nvidia.rules import GaussianSplatSchemaChecker
 
     engine = ValidationEngine(init_rules=False)
-    engine.enable_rule(GaussianSplatSchemaChecker)  # it is registered as one to skip, so only code can ask for it
+    engine.enable_rule(
+        required(GaussianSplatSchemaChecker, "no rule for splats")
+    )  # it is registered as one to skip, so only code can ask for it
     with _quiet():
-        issues = list(engine.validate(str(path)).issues())
+        found: Any = engine.validate(str(path))  # whose types take the method `issues` for a list
+        issues = list(found.issues())
     return list(dict.fromkeys(str(issue.message) for issue in issues))  # each is told once per variant of the file
 
 

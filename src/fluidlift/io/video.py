@@ -16,6 +16,8 @@ from pathlib import Path
 from typing import Any
 
 import av
+import av.container
+import av.error
 import numpy as np
 
 from fluidlift.errors import InputRejected, require
@@ -116,11 +118,11 @@ def _read_video(path: Path, limits: ReadLimits, collector: Collector, notes: Not
     if combed:
         notes.add(COMBED_NOTE)
     with open_video(path, limits) as (container, stream):
-        rate = stream.average_rate or stream.guessed_rate
-        origin = None if stream.start_time is None else stream.start_time * stream.time_base
-        if collector.start > 10.0 and origin is not None:
+        rate, tick = stream.average_rate or stream.guessed_rate, stream.time_base
+        origin = None if stream.start_time is None or tick is None else stream.start_time * tick
+        if collector.start > 10.0 and origin is not None and tick is not None:
             with contextlib.suppress(av.error.FFmpegError):  # a file without an index is decoded from its beginning
-                container.seek(int((collector.start + float(origin)) / stream.time_base), stream=stream)
+                container.seek(int((collector.start + float(origin)) / tick), stream=stream)
         for time, frame in decode_frames(container, stream, limits, notes):
             if time is None:
                 step = float(1 / rate) if rate else 1.0 / 25.0

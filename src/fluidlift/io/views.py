@@ -38,7 +38,7 @@ def read_view(path: Path | str) -> PinholeCamera | list[ViewKey]:
             fov, frame = float(key.get("fov", 40.0)), float(key["frame"]) - FIRST_FRAME
             sound = bool(np.isfinite([*eye, *target, fov, frame]).all()) and 1 < fov < 170
         except (KeyError, TypeError, ValueError, OverflowError):
-            sound, eye, target, fov, frame = False, (0.0,) * 3, (0.0,) * 3, 0.0, 0.0
+            sound, eye, target, fov, frame = False, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0, 0.0
         if unknown or not sound or eye == target:
             raise InputRejected(f"key {number} of '{name}'", f"numbers as in {VIEW}, with an eye beside its target")
         found.append(ViewKey(frame, eye, target, fov))

@@ -168,7 +168,7 @@ class _Leaves:
         m = self.masks.reshape(-1, 8, 8, 8)
         low, high = [], []
         for axis in range(3):
-            line = m.any(axis=tuple(a + 1 for a in range(3) if a != axis))
+            line = np.any(m, axis=tuple(a + 1 for a in range(3) if a != axis))
             low.append((self.corners[:, axis] + line.argmax(axis=1)).min())
             high.append((self.corners[:, axis] + 7 - line[:, ::-1].argmax(axis=1)).max())
         return np.array(low), np.array(high)

@@ -154,7 +154,7 @@ class _Composer:
         """Where it is in the text itself."""
         if not self.shift:
             return mark
-        return yaml.Mark(mark.name, mark.index + self.shift, mark.line, mark.column, None, None)
+        return yaml.Mark(mark.name, mark.index + self.shift, mark.line, mark.column, None, 0)
 
 
 def _refused(why: str, event: Any) -> yaml.MarkedYAMLError:

@@ -57,22 +57,24 @@ def carried_on(
     sigma = BELL * reach * max(camera.focal) / float(np.median(surface.depth[there]))
     sigma = min(sigma, 0.05 * max(camera.size))
     step = max(1, round(sigma / SAMPLES))
-    some = (slice(step // 2, None, step),) * 2
+    each = slice(step // 2, None, step)
+    some = (each, each)
     grid = camera.pixel_grid()
     rays = camera.rays(grid[some])
     planes, weight = _planes(surface, there, rays, some)
     known = [surface.normal[some], surface.albedo[some], surface.thickness[some][..., None]]
     layers = np.concatenate([weight[..., None], planes, *(weight[..., None] * k for k in known)], axis=-1)
-    layers = [cv2.GaussianBlur(np.float32(k), (0, 0), sigma / step) for k in np.moveaxis(layers, -1, 0)]
+    layers = [cv2.GaussianBlur(k.astype(np.float32), (0, 0), sigma / step) for k in np.moveaxis(layers, -1, 0)]
     wet = layers[0]
     inverse = np.einsum("khw,hwk->hw", np.stack(layers[1:4]), rays) / np.maximum(wet, 1e-6)
     out = (ground[some] > 0) & (inverse * ground[some] <= 1.0) & (inverse > 0) & (wet > 0.1 * FEW[0])
-    shore = cv2.GaussianBlur(np.float32(out), (0, 0), sigma / step)
+    shore = cv2.GaussianBlur(out.astype(np.float32), (0, 0), sigma / step)
     ways = np.array([np.gradient(wet), np.gradient(shore)])
     length = np.maximum(np.linalg.norm(ways, axis=1), 1e-9)
     between = smoothstep(-(ways[0] * ways[1]).sum(axis=0) / (length[0] * length[1]), *BETWEEN)
     share = smoothstep(wet, *FEW) * smoothstep(shore, *FEW) * between
-    near = cv2.resize(np.float32(ndimage.maximum_filter(share, 3) > 0), camera.size, interpolation=cv2.INTER_NEAREST)
+    around = (ndimage.maximum_filter(share, 3) > 0).astype(np.float32)
+    near = cv2.resize(around, camera.size, interpolation=cv2.INTER_NEAREST)
     pixels = np.argwhere(open_ & (near > 0))
     if not len(pixels):
         return surface

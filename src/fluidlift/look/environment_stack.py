@@ -4,6 +4,9 @@ A tuple of arrays would be copied for that, and who holds them counted, which ta
 values are those of `environment_lookup`: `picture_place` up to 1e-6 of the picture's size, without calls.
 """
 
+# pyright: reportCallIssue=false
+# numba's stub of `njit` does not know `_nrt`, without which a kernel does not count references to arrays
+
 from __future__ import annotations
 
 from collections.abc import Sequence

@@ -147,7 +147,7 @@ def _nodes(points: np.ndarray, spacing: float) -> tuple[np.ndarray, float, tuple
             low, high = np.percentile(points, (0.5, 99.5), axis=0) + np.array([[-4 * h], [4 * h]])
         else:
             h *= 1.26
-    return first * h, h, (int(shape[0]), int(shape[1]), int(shape[2]))
+    return np.asarray(first * h), h, (int(shape[0]), int(shape[1]), int(shape[2]))
 
 
 @nb.njit(cache=True, inline="always")
@@ -304,7 +304,7 @@ def _splines(points: np.ndarray, low: np.ndarray, h: float) -> tuple[np.ndarray,
 
 def add_solid_plain(terrain: Terrain, low: np.ndarray, h: float, density: np.ndarray) -> None:
     """The twin of `add_solid_kernel`."""
-    nodes = low + h * np.stack(np.indices(density.shape), axis=-1).reshape(-1, 3)
+    nodes = low + h * np.stack([*np.indices(density.shape)], axis=-1).reshape(-1, 3)
     grid = terrain.grid
     beyond = np.abs(nodes - np.clip(nodes, grid.low, grid.high)).max(axis=1) > 3 * h
     solid = np.clip(0.5 - sample_nodes(terrain.signed_distance, grid, nodes) / h, 0.0, 1.0)

@@ -167,23 +167,28 @@ class _Surfaces:
     normal: np.ndarray
 
     @cached_property
-    def _pixels(self) -> tuple[np.ndarray, ...]:
+    def _pixels(
+        self,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray | None, np.ndarray | np.float32 | None]:
         """Where surfaces are; there: points, normals, all light but the strongest, that one, and its share that what
         stays lets through."""
         there = self.depth > 0
         points, normals = _points(np.argwhere(there), self.depth, self.camera), self.normal[there]
         whole, direct, toward = direct_light(normals, self.ground.environment)
         share = None if direct is None else self._sun(self.ground.casters, points, normals, toward)
-        return there, points, normals, whole if direct is None else whole - direct, direct, share
+        sky = whole if direct is None else np.asarray(whole - direct)
+        return there, points, normals, sky, direct, share
 
-    def _sun(self, casters: Casters | None, points: np.ndarray, normals: np.ndarray, toward: np.ndarray):
+    def _sun(
+        self, casters: Casters | None, points: np.ndarray, normals: np.ndarray, toward: np.ndarray
+    ) -> np.ndarray | np.float32:
         if casters is None:
             return np.float32(1.0)
         lit, stays = self.ground.lit, self.ground.casters or casters
         return casters.light_left(points, normals, toward, lit.shadow, lit.soft * stays.radius)
 
     @cached_property
-    def _coarse(self) -> tuple[np.ndarray, ...]:
+    def _coarse(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
         """Every `STEP`-th pixel where surfaces are; there: points, normals, and the shares of what stays."""
         some = self.depth[::STEP, ::STEP] > 0
         pixels = STEP * np.argwhere(some)
@@ -218,6 +223,7 @@ class _Surfaces:
     def _ambient(self, bodies: Casters | None, liquid: Casters | None) -> np.ndarray:
         """Ambient light [n,3] at the surfaces."""
         _, points, normals, stays = self._coarse
+        shares: list[np.ndarray | None]
         shares = [stays] if bodies is None else [stays, self.ground.around.shares(points, normals, bodies)]
         left, whole, cleft = self._open if bodies is None else self._opened(shares)
         if liquid is None:
@@ -239,7 +245,7 @@ class _Surfaces:
     def _lit(self, moving: Moving) -> tuple[np.ndarray, np.ndarray | None]:
         there, points, normals, _, direct, share = self._pixels
         light, strongest = self._ambient(*moving), None
-        if direct is not None:
+        if direct is not None and share is not None:
             toward, left = self.ground.environment.light()[0], share
             for casters in moving:
                 left = left if casters is None else left * self._sun(casters, points, normals, toward)

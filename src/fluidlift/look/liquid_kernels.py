@@ -6,6 +6,9 @@ dozen arrays in every call, takes longer than the light. So does handing them ov
 compiler puts what runs in every pixel where it is called (`forceinline`, which costs less compiling than Numba's own).
 """
 
+# pyright: reportCallIssue=false
+# numba's stub of `njit` does not know `_nrt`, without which a kernel does not count references to arrays
+
 from __future__ import annotations
 
 import math

@@ -2,6 +2,9 @@
 (Numba). In NumPy: `liquid.film_shown`.
 """
 
+# pyright: reportCallIssue=false
+# numba's stub of `njit` does not know `_nrt`, without which a kernel does not count references to arrays
+
 from __future__ import annotations
 
 import math
@@ -31,7 +34,7 @@ def pyramid(
     of each where it begins, its rows and its columns (Williams 1983)."""
     import cv2
 
-    levels = [np.ascontiguousarray(image, np.float32)]
+    levels: list[np.ndarray] = [np.ascontiguousarray(image, np.float32)]
     while deep and min(levels[-1].shape[:2]) >= 2 * SMALLEST:
         rows, columns = levels[-1].shape[:2]
         levels.append(cv2.resize(levels[-1], (columns // 2, rows // 2), interpolation=cv2.INTER_AREA))

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import cKDTree
 
 from fluidlift.errors import require
+from fluidlift.numerics.nearest import nearest
 from fluidlift.types.gaussians import Gaussians
 
 RESOLVED = (2.0, 3.0)
@@ -59,7 +59,7 @@ def mixed(shown: Gaussians, deformation: Float[np.ndarray, "n 3 3"], *, widest: 
     if len(at) == 0 or sound.sum() <= NEIGHBOURS:
         return shown
     around = np.flatnonzero(sound)
-    distance, near = cKDTree(shown.means[around]).query(shown.means[at], k=NEIGHBOURS + 1, workers=-1)
+    distance, near = nearest(shown.means[around], shown.means[at], NEIGHBOURS + 1, workers=-1)
     weight = (1 - (distance / np.maximum(distance[:, -1:], 1e-12)) ** 2) ** 2 + 1e-9
     weight /= weight.sum(axis=1, keepdims=True)
     share, colours = share[at], shown.sh[:, 0]

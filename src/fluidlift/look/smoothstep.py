@@ -7,7 +7,11 @@ import numpy as np
 from jaxtyping import Float
 
 
-def smoothstep(values: Float[np.ndarray, "*n"], low: float = 0.0, high: float = 1.0) -> Float[np.ndarray, "*n"]:
+def smoothstep(
+    values: Float[np.ndarray, "*n"],
+    low: float | Float[np.ndarray, "*n"] = 0.0,
+    high: float | Float[np.ndarray, "*n"] = 1.0,
+) -> Float[np.ndarray, "*n"]:
     """0 up to `low`, 1 from `high` on, t^2 (3 - 2 t) between them."""
     t = np.clip((values - low) / (high - low), 0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)

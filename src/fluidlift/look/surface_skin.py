@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 
 from fluidlift.errors import require
 from fluidlift.look.surface_map import SurfaceMap
+from fluidlift.numerics.nearest import nearest
 from fluidlift.types import Gaussians, sh_from_rgb
 
 PITCH = 0.25
@@ -91,10 +92,10 @@ def painted_liquid(gaussians: Gaussians, cell: float) -> Gaussians:
     if not found.any():
         return gaussians
     liquid, skin = gaussians.select(~found), gaussians.select(found)
-    away, nearest = cKDTree(skin.means).query(liquid.means, distance_upper_bound=UNDER * cell)
+    away, above = nearest(skin.means, liquid.means, within=UNDER * cell)
     under = np.isfinite(away)
     sh = liquid.sh.copy()
-    sh[under] = skin.sh[nearest[under]]
+    sh[under] = skin.sh[above[under]]
     return replace(liquid, sh=sh)
 
 
@@ -181,7 +182,7 @@ class SurfaceSkin:
             own = np.flatnonzero(self.levels == level)
         low = np.floor(surface.low / spacing)
         count = np.ceil(np.array(surface.wet.shape) * surface.pitch / spacing).astype(int) + 1
-        lattice = ((low + np.moveaxis(np.indices(count), 0, -1) + 0.5) * spacing).reshape(-1, 2)
+        lattice = ((low + np.moveaxis(np.indices(tuple(count)), 0, -1) + 0.5) * spacing).reshape(-1, 2)
         lattice = lattice[surface.presence(lattice) > 0.5]
         lattice = lattice[self._levels(lattice) == level]
         if len(own) and len(lattice):
@@ -206,7 +207,7 @@ class SurfaceSkin:
         """Flat splats that lie on the surface now, in sRGB colours (of each tracer) from any side."""
         n = len(self)
         smooth = ndimage.gaussian_filter(surface.height, 1.5)
-        slope = np.stack(np.gradient(smooth, surface.pitch), axis=-1)
+        slope = np.stack([*np.gradient(smooth, surface.pitch)], axis=-1)
         normal = np.concatenate([-surface.at(slope, self.places), np.ones((n, 1))], axis=1)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         # the shortest turn from z to the normal

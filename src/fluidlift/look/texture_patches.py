@@ -21,6 +21,7 @@ from fluidlift.look.footage import FluidFootage
 from fluidlift.look.picture_texture import PictureTexture
 from fluidlift.look.seen_texture import SeenTexture
 from fluidlift.look.surface_map import SurfaceMap, sampled
+from fluidlift.numerics.nearest import nearest
 
 APART = 0.6
 """radii between patches: each place is covered by several"""
@@ -147,7 +148,7 @@ class TexturePatches:
         lasting = self.state.centers[~self.state.going]
         uncovered = np.ones(len(bare), bool)
         if len(lasting):
-            uncovered = cKDTree(lasting).query(bare)[0] > APART * self._radius
+            uncovered = nearest(lasting, bare)[0] > APART * self._radius
         centers = _spread(bare, uncovered, APART * self._radius, rng)
         if len(centers):
             self.state = self.state.joined(self._fresh(centers, interval == 0, surface, rng))
@@ -243,9 +244,9 @@ class TexturePatches:
         if n == 0 or len(s) == 0:
             return np.zeros((n, 3)), np.zeros(n, bool)
         places, most = np.asarray(points[:, :2], np.float64), min(OVERLAP, len(s))
-        found = cKDTree(s.centers).query(places, k=np.arange(1, most + 1), distance_upper_bound=self._radius)
-        point, rank = np.nonzero(np.isfinite(found[0]))
-        patch, distance = found[1][point, rank], found[0][point, rank]
+        away, patches = nearest(s.centers, places, np.arange(1, most + 1), within=self._radius)
+        point, rank = np.nonzero(np.isfinite(away))
+        patch, distance = patches[point, rank], away[point, rank]
         weight = ((1 - (distance / self._radius) ** 2) ** 2 * s.presences[patch]) ** SHARPNESS
         heaviest = np.zeros(n)
         np.maximum.at(heaviest, point, weight)
@@ -254,11 +255,12 @@ class TexturePatches:
         sources = s.sources[patch] + _turned(places[point] - s.centers[patch], -s.turns[patch])
         # what was not seen (a rock, a bank) shows only where no other patch is
         weight = weight * np.clip(2 * self._texture.trust(sources) - 0.8, 1e-4, 1.0)
-        if self._footage is not None:
+        texture = self._texture
+        if self._footage is not None or not isinstance(texture, SeenTexture):
             return self._played(np.asarray(points, np.float64), point, sources, s.instants[patch], weight)
-        color, there = self._texture.colors(sources)
+        color, there = texture.colors(sources)
         # brightness alone: tinted by the water of another place, white foam would turn pink
-        bright = self._texture.shade(points).mean(axis=1)[point] / there.mean(axis=1)
+        bright = texture.shade(points).mean(axis=1)[point] / there.mean(axis=1)
         color = color * np.clip(bright, 1 / LARGEST_RATIO, LARGEST_RATIO)[:, None]
         total = np.bincount(point, weight, minlength=n)
         mean = _summed(point, weight[:, None] * color, n) / np.maximum(total, 1e-30)[:, None]

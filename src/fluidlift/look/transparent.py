@@ -14,13 +14,13 @@ from dataclasses import replace
 import numba as nb
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import cKDTree
 
 from fluidlift.errors import require
 from fluidlift.look.carried_on import carried_on
 from fluidlift.look.liquid import LiquidSurface
 from fluidlift.look.project import sound
 from fluidlift.look.smoothstep import smoothstep
+from fluidlift.numerics.nearest import nearest
 from fluidlift.numerics.splatting import Bins, Projected, View, bin_tiles, project
 from fluidlift.numerics.splatting_kernels import TILE, exp_negative
 from fluidlift.numerics.splatting_projection import REACH_MAX
@@ -93,7 +93,8 @@ def splat_surface(
     """
     n, (width, height) = len(gaussians), camera.size
     require(np.shape(normals) == (n, 3), f"normals {np.shape(normals)}", f"({n}, 3)")
-    require(colors is None or np.shape(colors) == (n, 3), f"colours {np.shape(colors)}", f"({n}, 3)")
+    if colors is not None:
+        require(np.shape(colors) == (n, 3), f"colours {np.shape(colors)}", f"({n}, 3)")
     require(volume is None or (np.isfinite(volume) and volume > 0), f"volume {volume}", "positive m^3")
     ok = sound(gaussians) & np.isfinite(normals).all(1)
     g = gaussians if ok.all() else gaussians.select(ok)
@@ -149,9 +150,8 @@ def mean_volume(positions: Float[np.ndarray, "n 3"]) -> float:
     low, high = NEIGHBOURS
     if len(positions) <= high:
         return 0.0
-    tree = cKDTree(positions)
     some = positions[:: max(1, len(positions) // SAMPLES)]
-    distance, near = tree.query(some, k=high + 1, workers=-1)
+    distance, near = nearest(positions, some, high + 1, workers=-1)
     aside = np.linalg.norm(positions[near[:, 1:]].mean(axis=1) - some, axis=1)
     inside = aside < 0.15 * distance[:, -1]
     reach = distance[inside] if inside.sum() >= 10 else distance

@@ -82,7 +82,7 @@ def vessel_apart(ground: TriangleMesh, cell: float) -> tuple[TriangleMesh, Vesse
     if level is None:
         return ground, None
     high = points[:, 2] > level + ABOVE * cell
-    stands = high[faces].any(axis=1)
+    stands = np.any(high[faces], axis=1)
     if not stands.any():
         return ground, None
     foot = np.zeros(len(points), bool)

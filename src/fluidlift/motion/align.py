@@ -89,8 +89,8 @@ def _linearised(
     still: np.ndarray, moved: np.ndarray, motion: np.ndarray, size: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Gradient of the picture carried back, and its difference from the reference without a common offset."""
-    options = {"flags": cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, "borderMode": cv2.BORDER_REPLICATE}
-    back = cv2.warpAffine(moved, motion.astype(np.float32), size, **options)
+    way = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    back = cv2.warpAffine(moved, motion.astype(np.float32), size, flags=way, borderMode=cv2.BORDER_REPLICATE)
     gx, gy = (cv2.Sobel(back, cv2.CV_32F, dx, dy, scale=1 / 8) for dx, dy in ((1, 0), (0, 1)))
     error = back - still
     return gx, gy, error - np.median(error)

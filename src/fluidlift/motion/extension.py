@@ -8,7 +8,7 @@ from scipy import ndimage
 
 from fluidlift.motion.volume_projection import cells_of_faces, sides_of_faces
 from fluidlift.numerics.poisson import PoissonSystem, solve
-from fluidlift.types import CellType, Grid, SurfaceMotion, Terrain
+from fluidlift.types import CellType, Grid, SurfaceMotion, Terrain, triple
 
 FILLED_WEIGHT = 0.25
 """weight of a surface sample that the mainstream filled in, beside 1 for an observed one"""
@@ -108,7 +108,7 @@ def harmonic_extension(
     for axis in range(3):
         low, high = sides_of_faces(domain, axis)
         weights.append((low & high).astype(np.float32))
-    system = PoissonSystem(unknown, *weights, spacing).prepared()  # one hierarchy for all components
+    system = PoissonSystem(unknown, *triple(weights), spacing).prepared()  # one hierarchy for all components
     nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
     first_guess = out[tuple(nearest)]
     for c in range(values.shape[-1]):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float
 
-from fluidlift.errors import require
+from fluidlift.errors import require, required
 from fluidlift.types import FluidKind, Grid, SurfaceMotion, kind_of
 
 BELIEVABLE = 0.3
@@ -69,8 +69,7 @@ def falling_share(
         top: height from which the fluid falls, m.
         gravity: m/s^2, positive.
     """
-    kept = kind_of(kind).energy_share
-    require(kept is not None, f"the kind '{kind}'", "a fluid that falls freely")
+    kept = required(kind_of(kind).energy_share, f"the kind '{kind}'", "a fluid that falls freely")
     steep = np.clip(-downhill[:, 2], 0.0, 1.0)
     drop = np.maximum(top - points[:, 2], 0.0)
     speed = np.sqrt(2.0 * gravity * kept * drop) * steep
@@ -103,7 +102,8 @@ def drift_of(
         flat = np.linalg.svd(points[steep, :2] - points[steep, :2].mean(axis=0), full_matrices=False)[2][1]
     across = np.array([-flat[1], flat[0]]) / np.linalg.norm(flat)
     c, z = points[:, :2] @ across, points[:, 2]
-    edges = np.linspace(*np.percentile(z[steep], [2, 98])[::-1], LAYERS + 1)
+    low, high = np.percentile(z[steep], [2, 98])
+    edges = np.linspace(high, low, LAYERS + 1)
     layer = np.where(steep, np.searchsorted(-edges, -z, side="right") - 1, -1)
     filled = [k for k in range(LAYERS) if (layer == k).sum() >= max(5, FEWEST // LAYERS)]
     if len(filled) < LAYERS // 2:

@@ -214,7 +214,7 @@ def warp_back(
     What a frame does not see is what the frame before it, on the way from the reference, shows there: its own picture
     or what was filled in (full-frame stabilisation by mosaics, Litvin et al. 2003, without their blending).
     """
-    options = {"flags": cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP, "borderMode": cv2.BORDER_REPLICATE}
+    cubic = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
     frames = np.empty(clip.frames.shape, np.uint8) if out is None else out
     alpha = None if clip.alpha is None else np.array(clip.alpha)
     width, height = clip.size
@@ -224,11 +224,15 @@ def warp_back(
         for order in (range(reference, last), range(reference - 1, first - 1, -1)):
             before = reference
             for t in order:
-                picture = cv2.warpAffine(clip.frames[t], motions[t], clip.size, **options)
+                picture = cv2.warpAffine(
+                    clip.frames[t], motions[t], clip.size, flags=cubic, borderMode=cv2.BORDER_REPLICATE
+                )
                 seen = cv2.warpAffine(inside, motions[t], clip.size, flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP)
                 if t != reference:
                     picture[seen == 0] = frames[before][seen == 0]
                 frames[t], before = picture, t
                 if alpha is not None:
-                    alpha[t] = cv2.warpAffine(alpha[t], motions[t], clip.size, **options)
+                    alpha[t] = cv2.warpAffine(
+                        alpha[t], motions[t], clip.size, flags=cubic, borderMode=cv2.BORDER_REPLICATE
+                    )
     return replace(clip, frames=frames, alpha=alpha)

@@ -262,7 +262,7 @@ class VolumeSolver:
         centers, confidence = out[..., :3], out[..., 3]
         if share is not None:
             centers = layered_extension(centers, seen, share, bed.mainstream)
-        away = ndimage.distance_transform_edt(~seen.any(axis=2)) * bed.grid.spacing / (REACH * bed.depth)
+        away = ndimage.distance_transform_edt(~np.any(seen, axis=2)) * bed.grid.spacing / (REACH * bed.depth)
         return centers, confidence * np.exp(-away)[..., None].astype(np.float32)
 
 

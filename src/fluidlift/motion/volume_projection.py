@@ -19,7 +19,7 @@ from scipy import ndimage
 
 from fluidlift.numerics.poisson import PoissonSystem, solve
 from fluidlift.physics.pressure import PressureSystem
-from fluidlift.types import CellType, FaceVelocity, SolveReport
+from fluidlift.types import CellType, FaceVelocity, SolveReport, triple
 
 Faces = tuple[np.ndarray, np.ndarray, np.ndarray]
 """one array per axis: [nx+1,ny,nz], [nx,ny+1,nz], [nx,ny,nz+1]"""
@@ -202,7 +202,7 @@ def weighted_projection(
         mobility: per face across x, y, z, 0 to 1.
         tolerance: share of the divergence that may stay.
     """
-    weights = [(w * m).astype(np.float32) for w, m in zip(system.weights, mobility)]
+    weights = triple((w * m).astype(np.float32) for w, m in zip(system.weights, mobility))
     weighted = PoissonSystem(system.unknown, *weights, system.spacing)
     rhs = -net_outflow(velocity, system)
     q, report = solve(weighted, rhs.astype(np.float32), tolerance=tolerance)

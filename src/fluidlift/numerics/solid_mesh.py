@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -159,8 +160,8 @@ def _require_closed(solid: TriangleMesh, name: str) -> None:
         )  # fmt: skip
 
 
-def box_mesh(size: Float[np.ndarray, "3"]) -> TriangleMesh:
-    """A box of edge lengths `size` (m) around the origin."""
+def box_mesh(size: Float[np.ndarray, "3"] | Sequence[float] | float) -> TriangleMesh:
+    """A box of edge lengths `size` (m; one for a cube) around the origin."""
     half = 0.5 * np.broadcast_to(np.asarray(size, np.float64), (3,))
     require(bool((half > 0).all()), f"box size {tuple(2 * half)}", "positive metres")
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * half
@@ -169,7 +170,7 @@ def box_mesh(size: Float[np.ndarray, "3"]) -> TriangleMesh:
     return TriangleMesh(corners, np.array(faces))
 
 
-def ellipsoid_mesh(semi_axes: Float[np.ndarray, "3"], subdivisions: int = 4) -> TriangleMesh:
+def ellipsoid_mesh(semi_axes: Float[np.ndarray, "3"] | Sequence[float] | float, subdivisions: int = 4) -> TriangleMesh:
     """An ellipsoid around the origin: an icosahedron subdivided (20 * 4^n faces), with the volume of the ellipsoid."""
     axes = np.broadcast_to(np.asarray(semi_axes, np.float64), (3,))
     require(bool((axes > 0).all()), f"semi-axes {tuple(axes)}", "positive metres")

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from numba import njit, prange
 
 from fluidlift.physics.boundaries import Walls, beside_closed_faces
-from fluidlift.types import Grid
+from fluidlift.types import Grid, triple
 
 MARGIN = 4
 """cells between the outermost particle and the region's side"""
@@ -51,12 +51,12 @@ def region_around(
     last = np.asarray(grid.shape)
     low = np.clip(np.floor(low / BLOCK) * BLOCK, 0, last - 1).astype(int)
     high = np.clip(np.ceil(high / BLOCK) * BLOCK, low + 1, last).astype(int)
-    return tuple(slice(int(a), int(b)) for a, b in zip(low, high))
+    return triple(slice(int(a), int(b)) for a, b in zip(low, high))
 
 
 def face_box(box: Box, axis: int) -> Box:
     """The faces across `axis` of the region's cells."""
-    return tuple(slice(s.start, s.stop + (a == axis)) for a, s in enumerate(box))
+    return triple(slice(s.start, s.stop + (a == axis)) for a, s in enumerate(box))
 
 
 def crop_walls(walls: Walls, box: Box) -> Walls:
@@ -67,12 +67,12 @@ def crop_walls(walls: Walls, box: Box) -> Walls:
         tuple(o + s.start * grid.spacing for o, s in zip(grid.origin, box)),
     )  # fmt: skip
     nodes = tuple(slice(s.start, s.stop + 1) for s in box)
+    solid, buried, regions = (np.ascontiguousarray(c[box]) for c in (walls.solid, walls.buried, walls.regions))
     return Walls(
         inner, np.ascontiguousarray(walls.signed_distance[nodes]),
-        tuple(np.ascontiguousarray(o[face_box(box, a)]) for a, o in enumerate(walls.openings)),
-        tuple(np.ascontiguousarray(n[face_box(box, a)]) for a, n in enumerate(walls.normals)),
-        *(np.ascontiguousarray(c[box]) for c in (walls.solid, walls.buried, walls.regions)),
-        walls.open_sides,
+        triple(np.ascontiguousarray(o[face_box(box, a)]) for a, o in enumerate(walls.openings)),
+        triple(np.ascontiguousarray(n[face_box(box, a)]) for a, n in enumerate(walls.normals)),
+        solid, buried, regions, walls.open_sides,
     )  # fmt: skip
 
 

@@ -236,12 +236,12 @@ def deformed_covariances(
     """
     f = np.asarray(deformation, np.float64)
     a = f @ np.asarray(covariances, np.float64) @ np.swapaxes(f, 1, 2)
-    bad = ~np.isfinite(a).all(axis=(1, 2))
+    bad = ~np.all(np.isfinite(a), axis=(1, 2))
     a[bad] = covariances[bad]
     values, vectors = np.linalg.eigh(0.5 * (a + np.swapaxes(a, 1, 2)))
     scales = np.sqrt(np.maximum(values, 1e-18))
     size = np.cbrt(scales.prod(axis=1, keepdims=True))
-    needle = bad[:, None] | (scales > max_ratio * size).any(axis=1, keepdims=True)
+    needle = bad[:, None] | np.any(scales > max_ratio * size, axis=1)[:, None]
     scales = np.where(needle, size, np.maximum(scales, 1e-3 * size))
     return (vectors * (scales**2)[:, None, :]) @ np.swapaxes(vectors, 1, 2)
 

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from fluidlift.errors import InputRejected, require
 from fluidlift.numerics.ground_block import ground_mesh
 from fluidlift.numerics.sampling import sample_faces, sample_nodes
-from fluidlift.types import CellType, FaceVelocity, Grid, Particles, Terrain, TriangleMesh
+from fluidlift.types import CellType, FaceVelocity, Grid, Particles, Terrain, TriangleMesh, triple
 
 STEEPEST = 0.5
 """m of drop per metre that is continued; steeper ends are falls, whose next metres nobody knows"""
@@ -117,7 +117,7 @@ def extended_grid(outlet: Outlet, length: float) -> Grid:
     shape[2] += deeper
     origin[outlet.axis] -= h * more * (outlet.sign < 0)
     origin[2] -= h * deeper
-    return Grid(tuple(shape), h, tuple(origin))
+    return Grid(triple(shape), h, triple(origin))
 
 
 def extended_downstream(terrain: Terrain, cell_types: np.ndarray, length: float) -> tuple[Terrain, np.ndarray]:

@@ -95,7 +95,7 @@ def solid_shares(signed_distance: Float[np.ndarray, "nx+1 ny+1 nz+1"], grid: Gri
     reached = share > 0.5
     layer = np.where(reached, np.where(share > 0.999, 0, 1), LAYERS + 1).astype(np.uint8)
     for number in range(2, LAYERS + 1):
-        wider = ndimage.binary_dilation(reached, np.ones((3, 3, 3)))
+        wider = ndimage.binary_dilation(reached, np.ones((3, 3, 3), bool))
         layer[wider & ~reached] = number
         reached = wider
     wide = share

@@ -23,7 +23,7 @@ from fluidlift.physics.forces import add_buoyancy
 from fluidlift.physics.position_correction import fill_ratio
 from fluidlift.physics.pressure import build_system, project
 from fluidlift.physics.stepping import EmitSource, Outcome, ParticleSimulator, SimulationSettings
-from fluidlift.types import CellType, FaceVelocity, FluidParameters, Grid, Particles, SolveReport, Terrain
+from fluidlift.types import CellType, FaceVelocity, FluidParameters, Grid, Particles, SolveReport, Terrain, triple
 
 
 @njit(cache=True)
@@ -131,9 +131,9 @@ class GasSimulator(ParticleSimulator):
             settings=replace(settings or SimulationSettings(), particles_per_cell=particles_per_cell),
         )  # fmt: skip
         self.buoyancy = float(buoyancy)
-        self._region = open_region(tuple(slice(0, n) for n in grid.shape), self._walls, self._capacity)
+        self._region = open_region(triple(slice(0, n) for n in grid.shape), self._walls, self._capacity)
         self._emitters_switched()
-        self._open_faces = tuple(o > 0 for o in self._walls.openings)
+        self._open_faces = triple(o > 0 for o in self._walls.openings)
         # how much of a face's surroundings a wall takes, for the damping
         self._wall_share = tuple(
             np.clip(1.0 - sample_nodes(self._walls.signed_distance, grid, grid.faces(a).reshape(-1, 3)) / grid.spacing,

@@ -32,7 +32,7 @@ from fluidlift.physics.rigid import RigidBodies
 from fluidlift.physics.surface_tension import surface_tension_jumps
 from fluidlift.physics.surroundings import Surroundings
 from fluidlift.seams import ParticleTransfer
-from fluidlift.types import CellType, FaceVelocity, Particles, SolveReport
+from fluidlift.types import CellType, FaceVelocity, Particles, SolveReport, triple
 
 STRONG = 0.05
 """dt nu / h^2 above which the pressure of the step before acts before viscosity does"""
@@ -91,7 +91,7 @@ class LiquidGrid:
         self.grid, self.parameters, self.settings = s.grid, s.parameters, s.settings
         self._walls, self._inlet = s.walls, s.inlet
         self._transfer, self._bodies, self._forces = transfer, bodies, forces
-        self._region = open_region(tuple(slice(0, n) for n in s.grid.shape), s.walls, s.capacity)
+        self._region = open_region(triple(slice(0, n) for n in s.grid.shape), s.walls, s.capacity)
         self._solids = solid_shares(s.walls.signed_distance, s.grid)
         self._region_solids = self._solids.inside(self._region.box)
         self.head_rate: tuple[tuple[int, int, int], np.ndarray] | None = None
@@ -113,14 +113,15 @@ class LiquidGrid:
         ):
             raise InputRejected("a simulation state with another outlet")
         if rate is not None:
-            fits = rate.ndim == 3 and first is not None and first.shape == (3,) and (first >= 0).all()
-            if not fits or (first + rate.shape > self.grid.shape).any() or not np.isfinite(rate).all():
+            if first is None or rate.ndim != 3 or first.shape != (3,) or not (first >= 0).all():
+                raise InputRejected("a simulation state of another grid", f"{self.grid.shape} cells")
+            if (first + rate.shape > self.grid.shape).any() or not np.isfinite(rate).all():
                 raise InputRejected("a simulation state of another grid", f"{self.grid.shape} cells")
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """Go to a state that fits."""
         rate, levels = state.get("head_rate"), state.get("start_levels")
-        self.head_rate = None if rate is None else (tuple(int(i) for i in state["head_first"]), np.array(rate))
+        self.head_rate = None if rate is None else (triple(int(i) for i in state["head_first"]), np.array(rate))
         self._start_levels = None if levels is None else np.array(levels)
 
     def _levels(self, particles: Particles) -> np.ndarray:

@@ -20,7 +20,7 @@ from jaxtyping import Float
 
 from fluidlift.errors import require
 from fluidlift.numerics.poisson import LowRankTerm, PoissonSystem, solve
-from fluidlift.types import CellType, FaceVelocity, Grid, SolveReport, Terrain
+from fluidlift.types import CellType, FaceVelocity, Grid, SolveReport, Terrain, triple
 
 Faces = tuple[np.ndarray, np.ndarray, np.ndarray]
 """one array per axis: [nx+1,ny,nz], [nx,ny+1,nz], [nx,ny,nz+1]"""
@@ -151,7 +151,7 @@ def build_system(
         low, high = [slice(None)] * 3, [slice(None)] * 3
         low[axis], high[axis] = slice(None, -1), slice(1, None)
         reached |= (w[tuple(low)] > 0) | (w[tuple(high)] > 0)
-    return PressureSystem(unknown & reached, *weights, grid.spacing, *openings, *(gaps or ()))
+    return PressureSystem(unknown & reached, *triple(weights), grid.spacing, *triple(openings), *(gaps or ()))
 
 
 def divergence(
@@ -176,7 +176,7 @@ def divergence(
             flux = [f + (1.0 - w.astype(np.float64)) * s for f, w, s in solids]
     elif system is not None:
         flux = [f * np.where(w > 0, w, 1.0) for f, w in zip(flux, system.weights)]
-    total = sum(np.diff(f, axis=axis) for axis, f in enumerate(flux)) / h
+    total = np.asarray(sum(np.diff(f, axis=axis) for axis, f in enumerate(flux))) / h
     if system is None:
         return total
     return np.where(system.unknown, total, 0.0)

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
-from fluidlift.errors import InputRejected, require
+from fluidlift.errors import InputRejected, required
 from fluidlift.numerics.mesh_distance import thin_warning
 from fluidlift.numerics.poisson import LowRankTerm
 from fluidlift.numerics.solid_mesh import hull_points, moments, surface_points
@@ -180,6 +180,10 @@ class RigidBodies:
 
     # --- a substep, in the order of the calls -----------------------------------------------------------------------
 
+    @property
+    def _entered(self) -> UnionWalls:
+        return required(self._union, "a step of bodies without enter")
+
     def enter(self, region: ActiveRegion) -> ActiveRegion:
         """The region onto terrain and bodies in their present poses, from one without bodies.
 
@@ -251,10 +255,11 @@ class RigidBodies:
         """The free bodies for `viscosity.diffuse_with_bodies`; on their faces it wants `face_velocity`."""
         out = []
         inertia, spin = np.einsum("nij,njk,nlk->nil", self.rotation, self._inertia, self.rotation), self.spin
-        for c in self._union.covers:
+        union = self._entered
+        for c in union.covers:
             if self.free[c.body] and self.active[c.body]:
                 mass = rigid_coupling.mass_matrix(self.mass[c.body], inertia[c.body]) / self._cell_mass
-                rows = rigid_coupling.moving_faces(c, self._union.walls, self.center[c.body], spin[c.body])
+                rows = rigid_coupling.moving_faces(c, union.walls, self.center[c.body], spin[c.body])
                 out.append(DraggedBody(c.body, mass, *rows))
         return tuple(out)
 
@@ -270,9 +275,8 @@ class RigidBodies:
         Divergence (1/s) of the liquid = values . (velocity, angular velocity) of the body; the body gains
         inverse_mass . values^T q. Units: inverse_mass = density h^3 times the inverse of mass and inertia.
         """
-        self._rows = tuple(
-            rigid_coupling.body_rows(c, unknown, self._union.walls, self.center[c.body]) for c in self._union.covers
-        )
+        union = self._entered
+        self._rows = tuple(rigid_coupling.body_rows(c, unknown, union.walls, self.center[c.body]) for c in union.covers)
         inertia, terms = self._inverse_world_inertia(), []
         for rows in self._rows:
             if self.free[rows.body] and self.active[rows.body] and len(rows.cells):
@@ -283,10 +287,10 @@ class RigidBodies:
     def pressure_forces(self, q: Float[np.ndarray, "nx ny nz"]) -> Float[np.ndarray, "b 6"]:
         """Force (N) and torque (N m) of the liquid on every body, from the q (m^2/s) of a solve with `coupling`."""
         out = np.zeros((len(self.bodies), 6))
-        h = self._static.grid.spacing
-        for cover, rows in zip(self._union.covers, self._rows):
-            pressed = (rows.values * q[tuple(rows.cells.T)].astype(np.float64)[:, None]).sum(axis=0) * h**3
-            rest = rigid_coupling.surface_force(cover, q, self._union.walls, self.center[rows.body])
+        union, volume = self._entered, self._static.grid.spacing**3
+        for cover, rows in zip(union.covers, self._rows):
+            pressed = (rows.values * q[tuple(rows.cells.T)].astype(np.float64)[:, None]).sum(axis=0) * volume
+            rest = rigid_coupling.surface_force(cover, q, union.walls, self.center[rows.body])
             out[rows.body] = self._density / self._step * (pressed + rest)
         return out
 
@@ -302,18 +306,18 @@ class RigidBodies:
 
     def fill_films(self, types: np.ndarray) -> np.ndarray:
         """See `rigid_coupling.fill_films`."""
-        return rigid_coupling.fill_films(types, self._union, self._gravity)
+        return rigid_coupling.fill_films(types, self._entered, self._gravity)
 
     def slide(self, velocity: FaceVelocity) -> FaceVelocity:
         """Velocity on closed faces without its part into the solid: terrain at rest, bodies in their motion."""
-        slid = slide_along_walls(velocity, self._union.walls)
+        slid = slide_along_walls(velocity, self._entered.walls)
         speeds = (self.velocity, self.spin)
-        return rigid_coupling.slide_along_bodies(velocity, slid, self._union, self.center, speeds)
+        return rigid_coupling.slide_along_bodies(velocity, slid, self._entered, self.center, speeds)
 
     def advance(self) -> None:
         """Contacts, then the poses at the end of the step that `predict` began."""
-        require(self._solver is not None, "advance without predict")
-        dt, h, solver = self._step, self._static.grid.spacing, self._solver
+        solver = required(self._solver, "advance without predict")
+        dt, h = self._step, self._static.grid.spacing
         contacts, motion = solver.contacts, solver.motion
         push, turn = np.zeros_like(self.velocity), np.zeros_like(self.velocity)
         if len(contacts):

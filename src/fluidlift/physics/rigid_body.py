@@ -172,7 +172,7 @@ def within_reach(
     """Which bodies touch the walls' box, or, of those that fall, hang where gravity brings them in by an open side."""
     grid, low, high = walls.grid, shapes.box_low, shapes.box_high
     beside = (high > grid.low) & (low < grid.high)
-    out = beside.all(axis=1)
+    out = np.all(beside, axis=1)
     for axis, side in np.argwhere(walls.open_sides):
         if gravity[axis] * (-1 if side else 1) > 0:
             above = low[:, axis] >= grid.high[axis] if side else high[:, axis] <= grid.low[axis]

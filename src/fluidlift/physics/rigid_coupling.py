@@ -21,7 +21,7 @@ from numba import njit, prange
 
 from fluidlift.physics.boundaries import Walls
 from fluidlift.physics.rigid_walls import Cover, UnionWalls
-from fluidlift.types import CellType, FaceVelocity
+from fluidlift.types import CellType, FaceVelocity, triple
 
 
 @dataclass(frozen=True)
@@ -195,7 +195,7 @@ def moving_faces(
             walls.openings[axis], walls.signed_distance, center, spin, faces, rows, shift,
         )  # fmt: skip
         found.append((faces[:count], rows[:count], shift[:count]))
-    return tuple(np.concatenate(parts) for parts in zip(*found))
+    return triple(np.concatenate(parts) for parts in zip(*found))
 
 
 def mass_matrix(mass: float, inertia: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "6 6"]:
@@ -342,7 +342,7 @@ def slide_along_bodies(
         speeds: velocity [b,3] m/s and angular velocity [b,3] rad/s.
     """
     grid = union.static.grid
-    fields = [np.ascontiguousarray(c, np.float32) for c in velocity.components]
+    fields = triple(np.ascontiguousarray(c, np.float32) for c in velocity.components)
     out = [c.copy() for c in slid.components]
     for c in union.covers:
         for axis in range(3):

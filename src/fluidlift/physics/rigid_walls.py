@@ -18,7 +18,7 @@ from fluidlift.numerics.signed_distance import distance_and_gradient
 from fluidlift.physics.active_region import ActiveRegion
 from fluidlift.physics.pressure import SMALLEST_OPENING
 from fluidlift.physics.rigid_shapes import Shapes, body_distance
-from fluidlift.types import CellType
+from fluidlift.types import CellType, triple
 
 RAISED = 1e-3
 """cells by which a body's surface is raised, as the terrain's is (see `pressure.face_fractions`)"""
@@ -52,17 +52,17 @@ class Cover:
 
     def faces(self, axis: int) -> tuple[slice, slice, slice]:
         """Where the box's faces across `axis` lie in an array of the grid."""
-        return tuple(slice(a, b + (d == axis)) for d, (a, b) in enumerate(zip(self.low, self.high)))
+        return triple(slice(a, b + (d == axis)) for d, (a, b) in enumerate(zip(self.low, self.high)))
 
     @property
     def cells(self) -> tuple[slice, slice, slice]:
         """Where the box's cells lie in an array of the grid."""
-        return tuple(slice(a, b) for a, b in zip(self.low, self.high))
+        return triple(slice(a, b) for a, b in zip(self.low, self.high))
 
     @property
     def nodes(self) -> tuple[slice, slice, slice]:
         """Where the box's nodes lie in an array of the grid."""
-        return tuple(slice(a, b + 1) for a, b in zip(self.low, self.high))
+        return triple(slice(a, b + 1) for a, b in zip(self.low, self.high))
 
 
 @njit(parallel=True, cache=True)
@@ -346,7 +346,7 @@ class UnionWalls:
                 shift = (volume[..., None] * arms).sum(axis=(0, 1, 2)) / seen
                 middle -= shift.astype(np.float32)
                 volume *= np.float32(true_volume / (h**3 * seen))
-        ends = tuple(int(x) for x in first), tuple(int(x) for x in last)
+        ends = triple(int(x) for x in first), triple(int(x) for x in last)
         return Cover(body, *ends, distance, tuple(shares), tuple(offsets), volume, middle)
 
     def _fitted(self, cover: Cover) -> Cover:

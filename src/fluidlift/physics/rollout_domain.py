@@ -22,7 +22,7 @@ from fluidlift.physics.pressure import PressureSystem
 from fluidlift.physics.rollout_diffusion import add_boundary
 from fluidlift.physics.rollout_matrices import extrapolation_matrix, pressure_matrices, viscous_matrices
 from fluidlift.physics.rollout_surface import depth_at_outlet, liquid_distance, outlet_head, sides, surface_distances
-from fluidlift.types import CellType
+from fluidlift.types import CellType, triple
 
 WEIGHTS = ("weight_x", "weight_y", "weight_z")
 """fields of `PoissonSystem`"""
@@ -215,7 +215,7 @@ class RolloutDomain:
     def _viscous_matrix(self, which: int) -> sparse.csr_matrix:
         masks = (self.dynamic, self.inflow > 0, self.wall)
         h = float(self.system.spacing)
-        pairs = [viscous_matrices(*(self.component(m, a) for m in masks), a, h) for a in range(3)]
+        pairs = [viscous_matrices(*triple(self.component(m, a) for m in masks), a, h) for a in range(3)]
         return self._matrix(sparse.block_diag([pair[which] for pair in pairs]))
 
     def _pressure_matrix(self, which: int) -> sparse.csr_matrix:

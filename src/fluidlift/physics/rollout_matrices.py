@@ -82,8 +82,8 @@ def pressure_matrices(
     cells, low, high = cells[use], low[use], high[use]
     area = opening.ravel()
     values = np.concatenate([area[high], -area[low]]) / h
-    shape = (unknown.size, reach.size)
-    divergence = sparse.csr_matrix((values, (np.tile(cells, 2), np.concatenate([high, low]))), shape=shape)
+    columns, rows = np.tile(cells, 2), np.concatenate([high, low])
+    divergence = sparse.csr_matrix((values, (columns, rows)), shape=(unknown.size, reach.size))
     signs = np.concatenate([-np.ones(cells.size), np.ones(cells.size)]) / h
-    gradient = sparse.csr_matrix((signs, (np.concatenate([high, low]), np.tile(cells, 2))), shape=shape[::-1])
-    return divergence, sparse.diags(reach.ravel()) @ gradient
+    gradient = sparse.csr_matrix((signs, (rows, columns)), shape=(reach.size, unknown.size))
+    return divergence, sparse.csr_matrix(sparse.diags(reach.ravel()) @ gradient)

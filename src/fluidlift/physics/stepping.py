@@ -201,12 +201,11 @@ class ParticleSimulator(ABC):
                 )
             emitted += self._fill_inlet()
             dt = self._substep_length(end - self.time)
-            for attempt in range(7):
-                outcome = self._substep(dt, substeps, last_attempt=attempt == 6)
-                if outcome is not None:
-                    break
+            attempt = 0
+            while (outcome := self._substep(dt, substeps, last_attempt=attempt >= 6)) is None:
                 dt *= 0.5
-                retries += 1
+                attempt += 1
+            retries += attempt
             self._particles = outcome.particles
             outcome.adopt()
             self._inlet.travel(dt, self.time)

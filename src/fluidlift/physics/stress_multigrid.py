@@ -115,8 +115,8 @@ def assemble(
     cells = cell_shares(octants, excluded)
     kernels.weigh_stresses(roles, clearance, octants, cells, resistance, number, wall_share, normal, shear)
     kernels.weigh_faces(roles, octants, cells, resistance, normal, shear, LEAST_SHARE, mass, inverse)
-    some = (mass > 0).any(axis=0)
-    columns = some.any(axis=2)
+    some = np.any(mass > 0, axis=0)
+    columns = np.any(some, axis=2)
     first = np.where(columns, some.argmax(axis=2), 1).astype(np.int32)
     last = np.where(columns, some.shape[2] - some[:, :, ::-1].argmax(axis=2), 1).astype(np.int32)
     return StressSystem(

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import UInt8
 
-from fluidlift.errors import require
+from fluidlift.errors import require, required
 from fluidlift.physics.free_surface import Faces, LiquidSurface
 from fluidlift.types import CellType
 
@@ -46,13 +46,14 @@ def surface_tension_jumps(surface: LiquidSurface, types: UInt8[np.ndarray, "nx n
         types: from `free_surface.pressure_cells`.
         strength: surface tension * dt / density, m^3/s.
     """
+    curvature = required(surface.curvature, "a surface without curvature", "`liquid_surface` with curvature")
     liquid = (types == CellType.FLUID) & (surface.distance < 0)
     air = (types == CellType.EMPTY) & (surface.distance > 0)
     out = []
     for axis in range(3):
         jump = np.zeros(tuple(n + (a == axis) for a, n in enumerate(types.shape)), np.float32)
         inner = np.moveaxis(jump, axis, 0)[1:-1]
-        arrays = (surface.distance, surface.curvature, liquid, air)
+        arrays = (surface.distance, curvature, liquid, air)
         d, bend, wet, dry = (np.moveaxis(f, axis, 0) for f in arrays)
         for one, other in ((slice(None, -1), slice(1, None)), (slice(1, None), slice(None, -1))):
             here = wet[one] & dry[other]

@@ -22,6 +22,7 @@ from fluidlift.types import (
     Terrain,
     TriangleMesh,
     decompose_covariances,
+    triple,
 )
 
 NEAR = 1.0
@@ -97,15 +98,15 @@ def _new_solid(
     terrain: Terrain, cell_types: np.ndarray, edits: Sequence[TerrainEdit]
 ) -> tuple[TriangleMesh | None, str]:
     """The mesh of the last `Replace`, moved by the edits after it, and the line that it stands on."""
-    at = [i for i, e in enumerate(edits) if isinstance(e, Replace)]
-    if not at:
+    found = [(i, e) for i, e in enumerate(edits) if isinstance(e, Replace)]
+    if not found:
         return None, ""
-    edit = edits[at[-1]]
+    at, edit = found[-1]
     try:
         mesh, _ = solid_ground(edit.mesh)
     except InputRejected as error:
         raise InputRejected(f"{edit.line}: {error.got}", error.needed, error.do) from None
-    before = place_of(terrain, cell_types, edits[: at[-1]])
+    before = place_of(terrain, cell_types, edits[:at])
     whole = place_of(terrain, cell_types, edits)
     after = Place(whole.forth[len(before.forth) :], whole.back[len(before.back) :])
     return replace(mesh, vertices=after.points(mesh.vertices)), edit.line
@@ -128,7 +129,7 @@ def box_around(grid: Grid, low: Float[np.ndarray, "3"], high: Float[np.ndarray, 
     h = grid.spacing
     first = np.floor((low - grid.low) / h + 1e-6).astype(int)
     last = np.maximum(np.ceil((high - grid.low) / h - 1e-6).astype(int), first + 1)
-    return Grid(tuple(int(n) for n in last - first), h, tuple(float(x) for x in grid.low + first * h))
+    return Grid(triple(int(n) for n in last - first), h, triple(float(x) for x in grid.low + first * h))
 
 
 def _resampled(terrain: Terrain, cell_types: np.ndarray, grid: Grid, place: Place) -> np.ndarray:

@@ -20,7 +20,8 @@ from jaxtyping import Float, Int
 
 from fluidlift.physics import transfer_kernels as kernels
 from fluidlift.physics.transfer_kernels import BLOCK, GHOST
-from fluidlift.types import FaceVelocity, Grid, Particles
+from fluidlift.seams import GroupedByCell
+from fluidlift.types import FaceVelocity, Grid, Particles, triple
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -70,7 +71,7 @@ def _float32(array: np.ndarray) -> np.ndarray:
 
 
 def particles_to_grid(
-    particles: Particles, grid: Grid, order: CellOrder | None = None
+    particles: Particles, grid: Grid, order: GroupedByCell | None = None
 ) -> tuple[FaceVelocity, tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """P2G: face velocity (m/s, 0 where no particle reaches) and face masses (kg), float32.
 
@@ -81,19 +82,22 @@ def particles_to_grid(
             threads meet on a face.
     """
     order = order or sort_by_cell(particles.positions, grid)
-    sums = [np.zeros((*_padded_shape(grid, axis), 2), np.float32) for axis in range(3)]
-    p = particles
-    state = [_float32(a) for a in (p.positions, p.velocities, p.affine, p.masses)]
+    sums = triple(np.zeros((*_padded_shape(grid, axis), 2), np.float32) for axis in range(3))
+    positions, affine = _float32(particles.positions), _float32(particles.affine)
+    carried, weights = _float32(particles.velocities), _float32(particles.masses)
     for blocks in _blocks_by_color(order.start, grid):
-        kernels.scatter(*state, order.order, order.start, blocks, grid.low, grid.spacing, grid.shape, *sums)
-    velocities, masses = ([np.empty(grid.face_shape(a), np.float32) for a in range(3)] for _ in range(2))
+        kernels.scatter(
+            positions, carried, affine, weights, order.order, order.start, blocks, grid.low, grid.spacing, grid.shape,
+            *sums,
+        )  # fmt: skip
+    velocities, masses = (triple(np.empty(grid.face_shape(a), np.float32) for a in range(3)) for _ in range(2))
     for padded, velocity, mass in zip(sums, velocities, masses):
         kernels.divide(padded, velocity, mass)
-    return FaceVelocity(*velocities), tuple(masses)
+    return FaceVelocity(*velocities), masses
 
 
 def grid_to_particles(
-    velocity: FaceVelocity, grid: Grid, positions: Float[np.ndarray, "n 3"], order: CellOrder | None = None
+    velocity: FaceVelocity, grid: Grid, positions: Float[np.ndarray, "n 3"], order: GroupedByCell | None = None
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"]]:
     """G2P: velocities (m/s) and affine matrices (1/s) at positions, float32. Beyond the outer faces the outer value
     goes on.
@@ -103,7 +107,7 @@ def grid_to_particles(
     velocities = np.empty((len(positions), 3), np.float32)
     affine = np.empty((len(positions), 3, 3), np.float32)
     index = order.order if order is not None else np.arange(len(positions))
-    padded = [np.empty(_padded_shape(grid, axis), np.float32) for axis in range(3)]
+    padded = triple(np.empty(_padded_shape(grid, axis), np.float32) for axis in range(3))
     for component, out in zip(velocity.components, padded):
         kernels.pad(_float32(component), out)
     kernels.gather(_float32(positions), index, grid.low, grid.spacing, *padded, velocities, affine)

@@ -118,7 +118,8 @@ class BodyUnknowns:
 
     def _gathered(self, x: np.ndarray) -> np.ndarray:
         """[b,6]: J^T of what the stresses take from the momentum of the bodies' faces."""
-        kernels.pull_faces(x, self._normal, self._shear, *self._at, self._pulls)
+        axis, i, j, k = self._at
+        kernels.pull_faces(x, self._normal, self._shear, axis, i, j, k, self._pulls)
         return np.array([(v * self._pulls[r][:, None]).sum(axis=0) for r, v in self._rows]).reshape(-1, 6)
 
     def _image_of(self, x: np.ndarray, motion: np.ndarray) -> np.ndarray:

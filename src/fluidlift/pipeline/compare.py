@@ -54,7 +54,9 @@ def card_against(folder: Path, video: Path, *, start: float = 0.0, progress: Pro
     scene = scene_of(asset, folder, request, config, footage=None, start=0)
     reason = why_not(scene, footage, preview=config.show.preview)
     if reason is not None or footage is None:
-        raise InputRejected(f"'{folder.name}' cannot be held against footage", "frames as they were filmed", reason)
+        raise InputRejected(
+            f"'{folder.name}' cannot be held against footage", "frames as they were filmed", reason or ""
+        )
     count, own = int(played.get("frames", 0)), len(footage.clip) - footage.start
     other = read_clip(video, start=start, duration=(count + 1) * interval, max_size=max(asset.camera.size))
     _check(other, footage.clip, interval)

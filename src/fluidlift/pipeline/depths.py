@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from fluidlift.backends.monocular_depth import Guess, make_depth_estimator
+from fluidlift.backends.depth_model import Guess
+from fluidlift.backends.monocular_depth import make_depth_estimator
 from fluidlift.backends.registry import ModelChoice
 from fluidlift.config import DepthConfig
 from fluidlift.errors import InputRejected
@@ -16,7 +17,7 @@ from fluidlift.pipeline.settings import DepthModel, GivenDepth, GivenView
 from fluidlift.pipeline.work import Work
 from fluidlift.shape import depth_surface, given_depth
 from fluidlift.shape import kind as kinds
-from fluidlift.shape.given_depth import DepthPictures, SceneDepth
+from fluidlift.shape.given_depth import DepthPictures, Holds, SceneDepth
 from fluidlift.shape.kinds import Observation, builder_of
 from fluidlift.shape.place import DISAGREEING
 from fluidlift.shape.surface import FrontSurface
@@ -120,7 +121,7 @@ def _from_file(read: Read, given: GivenDepth, start: int) -> DepthPictures:
     from fluidlift.io.images import read_depth
 
     clip, path = read.clip, given.file.path
-    holds = "metres" if given.holds == "auto" else given.holds
+    holds: Holds = "metres" if given.holds == "auto" else given.holds
     values = read_depth(path, clip.size, scale=given.scale, positive=holds != "disparity")
     if values.ndim == 2:
         return DepthPictures(values[None], (start,), holds, "depth file", FILE_FLOOR)

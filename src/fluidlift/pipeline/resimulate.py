@@ -185,8 +185,9 @@ def _finish(
         report.write_report(lift, done, shown, folder, config.preset, runner.timings, runner.warnings)
         figures = asset_file(folder, "work/evaluation.npz")
         if shown.pictures is not None:
+            held: dict[str, Any] = evaluation_arrays(lift, done, shown)
             with atomic_write(figures) as stream:
-                np.savez_compressed(stream, **evaluation_arrays(lift, done, shown))
+                np.savez_compressed(stream, **held)
         else:
             figures.unlink(missing_ok=True)  # of frames that are no longer there
     update_manifest(
@@ -226,7 +227,7 @@ def evaluation_arrays(lift: Lift, simulation: Simulation, shown: Shown) -> dict[
         "resim_flow": shown.flow[:-1],
         "resim_mask": shown.coverage,
         "resim_frames": shown.pictures,
-        "first_frame": np.int64(g.rest_frame),
+        "first_frame": np.array(g.rest_frame, np.int64),
         "fit_frames": np.array([m.frames[0], m.frames[-1] + 1] if m.frames else [0, 0]),
         "particle_volume": simulation.volume,
         "leak_share": simulation.leak,

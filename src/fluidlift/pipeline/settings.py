@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 from fluidlift.backends.registry import module_name, names
 from fluidlift.config import JobConfig
@@ -130,7 +130,7 @@ class GivenDepth:
     """The user's depth file, and what its numbers mean."""
 
     file: GivenFile
-    holds: str
+    holds: Literal["auto", "metres", "relative", "disparity"]
     scale: float | None
     frames: int
 

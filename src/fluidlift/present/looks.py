@@ -104,7 +104,7 @@ def environment_of(folder: Path, name: str) -> Environment:
     Raises:
         InputRejected: an unknown name, or a file that is no environment.
     """
-    from fluidlift.io.asset_folder import asset_file
+    from fluidlift.io.asset_paths import asset_file
     from fluidlift.io.environments import read_environment_image
 
     if Path(name).suffix.lower() not in (".hdr", ".exr"):

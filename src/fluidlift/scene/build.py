@@ -288,7 +288,8 @@ def film_of(folder: Path) -> Path | None:
     Raises:
         InputRejected: a broken manifest, or a film that is a link or lies elsewhere.
     """
-    from fluidlift.io.asset_folder import asset_file, read_manifest
+    from fluidlift.io.asset_folder import read_manifest
+    from fluidlift.io.asset_paths import asset_file
 
     if not (folder / "manifest.json").is_file():  # not finished yet
         return None

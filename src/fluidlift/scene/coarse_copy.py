@@ -69,7 +69,7 @@ def thinned(rest: Gaussians, grid: Any, per_cell: int) -> Gaussians:
     if not len(rest):
         return rest
     cells = np.clip(grid.cell_of(rest.means), 0, np.asarray(grid.shape) - 1)
-    key = np.ravel_multi_index(tuple(cells.T), grid.shape)
+    key = np.asarray(np.ravel_multi_index(tuple(cells.T), grid.shape))
     order = np.random.default_rng(0).permutation(len(key))
     order = order[np.argsort(key[order], kind="stable")]
     _, first, count = np.unique(key[order], return_index=True, return_counts=True)

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from fluidlift.errors import InputRejected
-from fluidlift.io.asset_folder import asset_file
+from fluidlift.io.asset_paths import asset_file
 from fluidlift.io.atomic import disk_errors, write_bytes, write_json
 from fluidlift.io.limits import parse_json, read_json, require_size
 
@@ -79,9 +79,9 @@ class Edit:
     def from_dict(cls, data: dict[str, Any]) -> Edit:
         """As `to_dict` gave it; raises KeyError, TypeError, ValueError or OverflowError for other data."""
         lines = [tuple(str(x) for x in data[name]) for name in ("before", "after")]
-        links = [None if data.get(name) is None else int(data[name]) for name in ("undoes", "redoes")]
-        words = (str(data["old"]), str(data["new"]), str(data["time"]))
-        return cls(int(data["number"]), str(data["what"]), int(data["line"]), lines[0], lines[1], *words, *links)
+        undoes, redoes = (None if data.get(name) is None else int(data[name]) for name in ("undoes", "redoes"))
+        own = (int(data["number"]), str(data["what"]), int(data["line"]))
+        return cls(*own, lines[0], lines[1], str(data["old"]), str(data["new"]), str(data["time"]), undoes, redoes)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, without those that say nothing."""

@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from fluidlift.errors import FluidliftError, InputRejected
-from fluidlift.io.asset_folder import asset_file, read_manifest, read_scene
+from fluidlift.io.asset_folder import read_manifest, read_scene
 from fluidlift.io.asset_lock import editing
+from fluidlift.io.asset_paths import asset_file
 from fluidlift.io.scene import SCENE_TEMPLATE, SECTIONS, SceneEdits, edits_of, plain_scene, read_edits, scene_text
 from fluidlift.io.scene_domain import require_inside
 from fluidlift.io.scene_look import Look

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from fluidlift.errors import FluidliftError, InputRejected
-from fluidlift.io.asset_folder import asset_file, load_asset, read_parameters
+from fluidlift.io.asset_folder import load_asset, read_parameters
+from fluidlift.io.asset_paths import asset_file
 from fluidlift.io.obstacles import Obstacle
 from fluidlift.io.scene import SceneEdits
 from fluidlift.numerics.sampling import sample_nodes

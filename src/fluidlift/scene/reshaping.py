@@ -276,7 +276,8 @@ def closed_inlet(scene: Scene, simulator: ParticleSimulator) -> list[str]:
     grid = scene.terrain.grid
     inlet = grid.low + (np.argwhere(scene.cell_types == CellType.INFLOW) + 0.5) * grid.spacing
     inlet = inlet[sample_nodes(scene.terrain.signed_distance, grid, inlet) > 0]
-    if not len(inlet) or not simulator.bodies.inside(inlet).all():
+    bodies = simulator.bodies
+    if not len(inlet) or bodies is None or not bodies.inside(inlet).all():
         return []
     return [f"{named} over the whole inlet: nothing flows in while it is there"]
 

@@ -36,7 +36,7 @@ class History:
         """One more frame."""
         from fluidlift.numerics.sampling import sample_nodes
 
-        bodies = simulator.bodies if scene.obstacles else None
+        bodies = simulator.bodies
         pose = np.zeros((0, 7)) if bodies is None else np.concatenate([bodies.position, bodies.orientation], axis=1)
         self.poses.append(pose)
         grid = scene.terrain.grid
@@ -61,5 +61,5 @@ class History:
     @classmethod
     def of(cls, arrays: dict[str, np.ndarray], frames: int) -> History:
         """The first frames of `arrays`."""
-        figures = (arrays[name][:frames].tolist() for name in ("volume", "leak", "count", "substeps"))
-        return cls(*figures, list(arrays["poses"][:frames]))
+        figures = {name: arrays[name][:frames].tolist() for name in ("volume", "leak", "count", "substeps")}
+        return cls(**figures, poses=list(arrays["poses"][:frames]))

@@ -291,7 +291,7 @@ class Dressing:
         if scene.shading is None:
             return shown
         painted = (scene.rest.means if scene.painted is None else scene.painted)[source]
-        own = ~np.isfinite(painted).all(axis=1)
+        own = ~np.all(np.isfinite(painted), axis=1)
         moved = scene.shading.moved(shown, np.where(own[:, None], shown.means, painted))
         return moved if not own.any() else replace(moved, sh=np.where(own[:, None, None], shown.sh, moved.sh))
 
@@ -343,7 +343,7 @@ class Dressing:
     def _own_colors(self, source: np.ndarray) -> np.ndarray:
         """Which particles bring a colour of their own, as dye does."""
         painted = self._scene.painted
-        return np.zeros(len(source), bool) if painted is None else ~np.isfinite(painted[source]).all(axis=1)
+        return np.zeros(len(source), bool) if painted is None else ~np.all(np.isfinite(painted[source]), axis=1)
 
     def _clearance(self, points: np.ndarray) -> np.ndarray:
         """How far points are from the ground, m; negative inside it."""
@@ -358,7 +358,7 @@ class Dressing:
             return {}
         patches = {f"patches.{name}": np.array(value) for name, value in vars(self._patches.state).items()}
         skin = {f"skin.{name}": getattr(self._skin, name).copy() for name in ("places", "ids", "levels")}
-        return patches | skin | {"skin.next_id": np.int64(self._skin.next_id)}
+        return patches | skin | {"skin.next_id": np.array(self._skin.next_id, np.int64)}
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """Go to a state of `state`.

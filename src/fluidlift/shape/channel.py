@@ -8,14 +8,14 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
-from fluidlift.errors import require
+from fluidlift.errors import required
 from fluidlift.shape import cross_section
 from fluidlift.shape.cross_section import distance_inside
 from fluidlift.shape.depth_surface import solid_heights
 from fluidlift.shape.ground_mesh import ground_mesh
 from fluidlift.shape.plan import Extent, Footage, Plan, dry_columns, extent_of, plan_of, wide_ends, with_seen
 from fluidlift.shape.terrain import at_cells, signed_distance_from, to_corners, unit
-from fluidlift.types import CellType, FluidKind, Grid, Label, Setting, Terrain, kind_of
+from fluidlift.types import CellType, FluidKind, Grid, Label, Setting, Terrain, kind_of, triple
 
 INLET = 2.5
 """cells along the flow that an inlet is long"""
@@ -74,8 +74,8 @@ def channel_setting(seen: Footage, config: ChannelConfig) -> Setting:
         ValueError: no fluid on the ground, or a kind that runs in no channel.
     """
     extent, kind = extent_of(seen), kind_of(config.kind)
-    share = kind.depth_ratio if config.depth_ratio is None else config.depth_ratio
-    require(share is not None, f"the kind '{kind}'", "a channel flow")
+    ratio = kind.depth_ratio if config.depth_ratio is None else config.depth_ratio
+    share = required(ratio, f"the kind '{kind}'", "a channel flow")
     depth = share * extent.width
     spacing = max((extent.high - extent.low).max() / config.longest, depth / 10)
     spacing = min(spacing, depth / 4)  # fewer than four cells hold no velocity profile
@@ -102,7 +102,7 @@ def _channel_grid(surface, low, high, depth, spacing) -> Grid:
     top = max(z.max(), high[2]) + max(5 * spacing, 0.6 * depth)
     origin = (low[0] - margin, low[1] - margin, bottom)
     size = (high[0] - low[0] + 2 * margin, high[1] - low[1] + 2 * margin, top - bottom)
-    return Grid(tuple(int(np.ceil(s / spacing)) for s in size), spacing, origin)
+    return Grid(triple(int(np.ceil(s / spacing)) for s in size), spacing, origin)
 
 
 def _ground_samples(low, high, n: int = 24) -> np.ndarray:

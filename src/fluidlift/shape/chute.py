@@ -199,7 +199,7 @@ def _heading_below(camera, part, mask, motion, trust) -> float | None:
     reach = 2.0 * float(np.sqrt(part.sum() / np.pi))
     rows, cols = np.nonzero(part)
     foot = rows >= np.percentile(rows, 80)
-    grid = np.stack(np.mgrid[: mask.shape[0], : mask.shape[1]], axis=-1)
+    grid = np.stack([*np.mgrid[: mask.shape[0], : mask.shape[1]]], axis=-1)
     middle = np.array([rows[foot].mean(), cols[foot].mean()])
     around = np.linalg.norm(grid - middle, axis=-1) < reach
     lying = mask & ~ndimage.binary_dilation(part, iterations=int(jets.BLUR)) & (trust > jets.TRUSTED)

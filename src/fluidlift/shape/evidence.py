@@ -167,8 +167,7 @@ def flow_evidence(
     before, after = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32)
     pairs = source.pairs(1)
     for one, other in pairs:
-        t = source.sampled[one]
-        displacement, confidence = flow(t)
+        displacement, confidence = flow(int(source.sampled[one]))
         sure = shrink(np.asarray(confidence, np.float32), scale)[..., None]
         step = shrink(np.nan_to_num(np.asarray(displacement, np.float32)), scale) * scale
         first, second = source.kept[one].astype(np.float32), source.kept[other].astype(np.float32)

@@ -18,9 +18,10 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 
-from fluidlift.errors import require
+from fluidlift.errors import require, required
 from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.shape.prune import body_size
+from fluidlift.types import triple
 from fluidlift.types.gaussians import Gaussians
 from fluidlift.types.grid import Grid
 from fluidlift.types.terrain import Terrain
@@ -184,7 +185,7 @@ def _hull_grid(means: np.ndarray, spacing: float, terrain: Terrain | None) -> Gr
     while shape.prod() > CELLS_MAX:
         spacing *= max(1.02, (shape.prod() / CELLS_MAX) ** (1 / 3))
         shape = np.maximum(np.ceil((high - low) / spacing), 1)
-    return Grid(tuple(int(n) for n in shape), spacing, tuple(low))
+    return Grid(triple(int(n) for n in shape), spacing, triple(low))
 
 
 def inside(
@@ -208,8 +209,8 @@ def inside(
     """
     require(rays >= 1, f"{rays} rays", "1 or more")
     if isinstance(gaussians, Gaussians):
-        require(spacing is not None, "no spacing", "the voxel of the hull in m")
-        gaussians = hull(gaussians, spacing=spacing, closed_below=closed_below)
+        voxel = required(spacing, "no spacing", "the voxel of the hull in m")
+        gaussians = hull(gaussians, spacing=voxel, closed_below=closed_below)
     grid, voxels = gaussians.grid, gaussians.voxels
     points = np.asarray(points, np.float64)
     out = np.zeros(len(points), bool)
@@ -285,7 +286,7 @@ def fill(
     # by the distances of voxels: a search tree visits all of a shell for each point near its centre
     index = ndimage.distance_transform_edt(~held, return_distances=False, return_indices=True)
     nearest = holder[tuple(index[(slice(None), *chosen.T)])]
-    quats = np.tile(np.float32([1, 0, 0, 0]), (len(means), 1))
+    quats = np.tile(np.array([1, 0, 0, 0], np.float32), (len(means), 1))
     opacities = np.nan_to_num(gaussians.opacities[nearest])
     return Gaussians(means, quats, np.full((len(means), 3), width), opacities, gaussians.sh[nearest])
 

@@ -85,7 +85,8 @@ def follow(
         InputRejected: as `refine`.
         ValueError: image, mask, motion or depths of different size.
     """
-    require(motion is None or motion.shape == (*mask.shape, 2), f"motion {np.shape(motion)}", f"({mask.shape}, 2)")
+    if motion is not None:
+        require(motion.shape == (*mask.shape, 2), f"motion {motion.shape}", f"({mask.shape}, 2)")
     require(depths is None or all(d.shape == mask.shape for d in depths), "depths of another size than the mask")
     start = carried(last, fresh, mask, camera, motion=motion, depths=depths)
     return refine(

@@ -49,7 +49,7 @@ def background_plate(
     wet = np.stack([ndimage.binary_dilation(fluid[t], iterations=2) for t in pick])
     if solid is not None:
         wet &= ~solid
-    seen = ~wet.all(axis=0)
+    seen = ~np.all(wet, axis=0)
     if not seen.any():
         return BackgroundPlate(np.median(frames[pick], axis=0).astype(np.uint8), seen)
     values = np.ma.masked_array(frames[pick], mask=np.repeat(wet[..., None], 3, axis=-1))
@@ -86,9 +86,9 @@ def _diffused(values: np.ndarray, hole: np.ndarray) -> np.ndarray:
     """[n,c] in a hole, bool [h,w], of values [h,w,c]: the weights of neighbours in a row are `ALONG_ROWS`, else 1."""
     number = np.arange(hole.size).reshape(hole.shape)
     pairs = [(number[:, :-1], number[:, 1:], ALONG_ROWS), (number[:-1], number[1:], 1.0)]
-    i, j = (np.concatenate([p[k].ravel() for p in pairs]) for k in (0, 1))
-    weight = np.concatenate([np.full(p[0].size, p[2]) for p in pairs])
-    edges = sparse.coo_array((np.tile(weight, 2), (np.append(i, j), np.append(j, i))), (hole.size,) * 2).tocsr()
+    i, j = np.concatenate([a.ravel() for a, _, _ in pairs]), np.concatenate([b.ravel() for _, b, _ in pairs])
+    weight = np.concatenate([np.full(a.size, w) for a, _, w in pairs])
+    edges = sparse.coo_array((np.tile(weight, 2), (np.append(i, j), np.append(j, i))), (hole.size, hole.size)).tocsr()
     inside, rim = np.flatnonzero(hole), np.flatnonzero(~hole)
     rows = edges[inside]
     system = sparse.diags_array(rows.sum(axis=1)) - rows[:, inside]

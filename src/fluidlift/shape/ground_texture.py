@@ -314,7 +314,7 @@ def _of_the_bed(found: _Map, dry: np.ndarray) -> np.ndarray:
     colour = _mean(found.image, found.known, GRAIN * max(dry.shape))
     middle = np.median(colour[rim], axis=0)
     spread = np.maximum(1.4826 * np.median(np.abs(colour[rim] - middle), axis=0), 2.0)
-    usual = (np.abs(colour - middle) < ODD * spread).all(axis=-1)
+    usual = np.all(np.abs(colour - middle) < ODD * spread, axis=-1)
     # between odd and usual colours lie mixed ones
     usual = ndimage.binary_erosion(usual, iterations=max(round(2.0 * GRAIN * max(dry.shape)), 1), border_value=1)
     return usual & (found.drowned | (dry & near))

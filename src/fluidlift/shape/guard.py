@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from fluidlift.errors import require
 from fluidlift.numerics.splatting import View, bin_tiles, project, rasterize
+from fluidlift.types import triple
 from fluidlift.types.camera import PinholeCamera
 from fluidlift.types.gaussians import SH_C0, Gaussians
 
@@ -38,35 +39,38 @@ class Frame:
     """[h,w]: camera z of the body before the refinement, m; NaN where it is not to be held"""
 
     @classmethod
-    def of(cls, image: np.ndarray, mask: np.ndarray, camera: PinholeCamera, plain: tuple[float, ...]) -> Frame:
+    def of(cls, image: np.ndarray, mask: np.ndarray, camera: PinholeCamera, plain: tuple[float, float, float]) -> Frame:
         rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
         y0, y1 = max(0, rows[0] - MARGIN), min(mask.shape[0], rows[-1] + 1 + MARGIN)
         x0, x1 = max(0, columns[0] - MARGIN), min(mask.shape[1], columns[-1] + 1 + MARGIN)
         inside = np.ascontiguousarray(mask[y0:y1, x0:x1])
-        picture = np.where(inside[..., None], image[y0:y1, x0:x1].astype(np.float32) / 255, np.float32(plain))
+        picture = np.where(inside[..., None], image[y0:y1, x0:x1].astype(np.float32) / 255, np.array(plain, np.float32))
         near = cv2.dilate(inside.astype(np.uint8), np.ones((2 * MARGIN + 1,) * 2, np.uint8))
         pose, (cx, cy) = camera.camera_from_world, camera.center
         view = View(pose.rotation, pose.translation, camera.focal, (cx - x0, cy - y0), (int(x1 - x0), int(y1 - y0)))
         unknown = np.full(inside.shape, np.nan, np.float32)
-        return cls(view, picture.astype(np.float32), near.astype(np.float32), inside, tuple(map(float, plain)), unknown)
+        near, own = near.astype(np.float32), triple(map(float, plain))
+        return cls(view, picture.astype(np.float32), near, inside, own, unknown)
 
     def before_another_color(self) -> Frame:
         """The same on the complementary plain background."""
-        plain = tuple(1 - p for p in self.plain)
-        return replace(self, plain=plain, target=np.where(self.mask[..., None], self.target, np.float32(plain)))
+        plain = triple(1 - p for p in self.plain)
+        target = np.where(self.mask[..., None], self.target, np.array(plain, np.float32))
+        return replace(self, plain=plain, target=target)
 
 
-def plain_color(image: np.ndarray, mask: np.ndarray, background: object) -> tuple[float, ...]:
+def plain_color(image: np.ndarray, mask: np.ndarray, background: object) -> tuple[float, float, float]:
     if background == "black":
         return (0.0, 0.0, 0.0)
     if background is not None:
         color = np.asarray(background, float)
-        require(color.shape == (3,) and (color >= 0).all() and (color <= 1).all(), f"background {background!r}",
+        require(color.shape == (3,) and bool(((color >= 0) & (color <= 1)).all()), f"background {background!r}",
                 "'black' or three numbers in [0, 1]")  # fmt: skip
-        return tuple(color)
+        return triple(color)
     fluid = image[mask].astype(np.float32) / 255
     # even the 2 % of the fluid that come nearest: before its own colour a fluid may turn transparent unnoticed
-    distances = [float(np.quantile(np.linalg.norm(fluid - np.float32(c), axis=1), 0.02)) for c in PLAIN_COLORS]
+    away = (np.linalg.norm(fluid - np.array(c, np.float32), axis=1) for c in PLAIN_COLORS)
+    distances = [float(np.quantile(a, 0.02)) for a in away]
     return PLAIN_COLORS[int(np.argmax(distances))]
 
 
@@ -135,7 +139,7 @@ def picture_and_figures(gaussians: Gaussians, frame: Frame) -> tuple[Float[np.nd
     middle = float(np.nanmedian(depth)) if np.isfinite(depth).any() else 0.0
     side = float(np.sqrt(frame.mask.sum())) * middle / max(view.focal)
     figures = ShapeFigures(depth, extents, float(alpha[frame.mask].mean()), side)
-    return image[..., :3] + light[..., None] * np.float32(frame.plain), figures
+    return image[..., :3] + light[..., None] * np.array(frame.plain, np.float32), figures
 
 
 def _extents(g: Gaussians, view: View) -> Float[np.ndarray, "3"]:

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import cKDTree
+
+from fluidlift.numerics.nearest import nearest
 
 FOOT = 1.0
 """degrees: slope of what runs below a fall. A basin is level and a stream hardly steeper; more would empty either"""
@@ -86,7 +87,7 @@ class SampledHeight(HeightModel):
     def height(self, xy: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n"]:
         """z above the ground positions."""
         flat = np.asarray(xy).reshape(-1, 2)
-        distance, index = cKDTree(self.points[:, :2]).query(flat, k=min(4, len(self.points)))
+        distance, index = nearest(self.points[:, :2], flat, min(4, len(self.points)))
         distance, index = distance.reshape(len(flat), -1), index.reshape(len(flat), -1)
         weight = 1.0 / (distance + 1e-6)
         z = (weight * self.points[index, 2]).sum(1) / weight.sum(1)

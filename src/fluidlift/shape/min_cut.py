@@ -6,6 +6,8 @@ threads or on order.
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -66,7 +68,8 @@ def min_cut(odds: np.ndarray, across: np.ndarray, down: np.ndarray) -> np.ndarra
     rows = np.concatenate([begin, end, np.full(len(fluid), source), other])
     columns = np.concatenate([end, begin, fluid, np.full(len(other), sink)])
     capacity = np.concatenate([link, link, terminal[fluid], -terminal[other]])
-    graph = csr_matrix((capacity, (rows, columns)), shape=(pixels + 2, pixels + 2), dtype=np.int32)
+    # SciPy's stubs know `maximum_flow` of the newer csr_array alone
+    graph: Any = csr_matrix((capacity, (rows, columns)), shape=(pixels + 2, pixels + 2), dtype=np.int32)
     rest = graph - maximum_flow(graph, source, sink, method="dinic").flow
     rest.data = np.maximum(rest.data, 0)
     rest.eliminate_zeros()

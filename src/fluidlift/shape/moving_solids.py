@@ -138,11 +138,10 @@ def _tracks(grey: list[np.ndarray]) -> _Tracks | None:
     corners = cv2.goodFeaturesToTrack(grey[0], 600, 0.01, 5, blockSize=5)
     if corners is None:
         return None
-    options = {"winSize": (PATCH, PATCH), "maxLevel": 3}
     places, kept = [corners], np.ones(len(corners), bool)
     for first, second in zip(grey, grey[1:]):
-        ahead, found, _ = cv2.calcOpticalFlowPyrLK(first, second, places[-1], None, **options)
-        back, again, _ = cv2.calcOpticalFlowPyrLK(second, first, ahead, None, **options)
+        ahead, found, _ = cv2.calcOpticalFlowPyrLK(first, second, places[-1], places[-1].copy(), winSize=(PATCH, PATCH))
+        back, again, _ = cv2.calcOpticalFlowPyrLK(second, first, ahead, ahead.copy(), winSize=(PATCH, PATCH))
         kept &= (found[:, 0] > 0) & (again[:, 0] > 0) & (np.linalg.norm(back - places[-1], axis=-1)[:, 0] < 0.5)
         places.append(ahead)
     followed = np.stack(places)[:, :, 0]

@@ -109,8 +109,8 @@ def extent_of(seen: Footage) -> Extent:
     """
     low, high = np.percentile(seen.visible, 0.5, axis=0), np.percentile(seen.visible, 99.5, axis=0)
     h = max(float((high - low)[:2].max()), 1e-9) / COARSE
-    shape = tuple(int(np.ceil((high[a] - low[a]) / h)) + 8 for a in (0, 1))
-    grid = Grid((*shape, 1), h, (low[0] - 4 * h, low[1] - 4 * h, low[2]))
+    columns, rows = (int(np.ceil((high[a] - low[a]) / h)) + 8 for a in (0, 1))
+    grid = Grid((columns, rows, 1), h, (low[0] - 4 * h, low[1] - 4 * h, low[2]))
     plan = plan_of(seen, grid)
     wet = plan.wet & plan.known & _not_grazing(seen, plan, grid)
     require(bool(wet.any()), "no fluid on the ground")
@@ -119,7 +119,7 @@ def extent_of(seen: Footage) -> Extent:
     stream = _without_tails(whole, TAIL * _width(whole, h, seen.closed) / h)
     width = _width(stream if seen.closed else _continued(stream, plan.known, grid, seen.along), h, seen.closed)
     cell = grid.cell_of(seen.visible)[:, :2]
-    inside = ((cell >= 0) & (cell < grid.shape[:2])).all(axis=1)
+    inside = np.all((cell >= 0) & (cell < grid.shape[:2]), axis=1)
     cell = np.clip(cell, 0, np.array(grid.shape[:2]) - 1)
     near = ndimage.binary_dilation(stream, iterations=1)
     kept = inside & near[tuple(cell.T)]

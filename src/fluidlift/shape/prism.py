@@ -62,7 +62,7 @@ class Raster:
         """The value of the column at each position; 0 outside."""
         with np.errstate(invalid="ignore"):
             index = np.floor((np.clip(np.nan_to_num(xy, nan=-1e9), -1e9, 1e9) - self.low) / self.step)
-        inside = ((index >= 0) & (index < np.array(self.shape))).all(axis=-1)
+        inside = np.all((index >= 0) & (index < np.array(self.shape)), axis=-1)
         i, j = np.moveaxis(np.where(inside[..., None], index, 0).astype(int), -1, 0)
         return np.where(inside, values[i, j], np.zeros((), values.dtype))
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.spatial import cKDTree
 
 from fluidlift.errors import require
+from fluidlift.numerics.nearest import nearest
 from fluidlift.types.gaussians import Gaussians
 
 
@@ -88,6 +88,6 @@ def lonely(points: Float[np.ndarray, "n 3"], neighbours: int = 4) -> Bool[np.nda
     """
     if len(points) < 10:
         return np.zeros(len(points), bool)
-    distances, others = cKDTree(points).query(points, k=max(neighbours, 8) + 1)
+    distances, others = nearest(points, points, max(neighbours, 8) + 1)
     usual = np.median(distances[others[:, 1:9], 8], axis=1)
     return distances[:, neighbours] > 3 * usual

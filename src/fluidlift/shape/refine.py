@@ -123,7 +123,7 @@ def refine(
     torch.set_num_threads(1)  # torch's spinning threads would slow the kernels, which use all cores themselves
     try:
         step = partial(_step, weights=weights, rasterizer=rasterizer or NumbaRasterizer())
-        return _run(gaussians, frame, first, before, iterations, step, seed, max_gaussians, progress)
+        return _run(gaussians, frame, (first, before), iterations, step, seed, max_gaussians, progress)
     finally:
         torch.set_num_threads(threads)
 
@@ -204,11 +204,12 @@ class _Raw:
 
 
 def _run(
-    gaussians: Gaussians, frame: Frame, first: ShapeFigures, before: float, iterations: int,
+    gaussians: Gaussians, frame: Frame, start: tuple[ShapeFigures, float], iterations: int,
     step: Callable[..., tuple[float, torch.Tensor]], seed: int, max_gaussians: int,
     progress: Callable[[int, int], None] | None,
 ) -> RefineResult:  # fmt: skip
-    rng = torch.Generator().manual_seed(seed)
+    """From the figures of the body and its PSNR in dB at the start."""
+    rng, (first, before) = torch.Generator().manual_seed(seed), start
     seen = _in_front(gaussians, frame.view)
     sides = neighbours(frame, gaussians.select(seen), first)
     frame = replace(frame, depth=first.depth.astype(np.float32))
@@ -353,7 +354,8 @@ def _surface_step(
 def _pixels(view: View, points: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
     """Column and row (int64) of points, and their camera z (m)."""
     x = points @ np.float32(view.rotation.T) + np.float32(view.translation)
-    uv = x[:, :2] / np.maximum(x[:, 2:], view.near) * np.float32(view.focal) + np.float32(view.center)
+    focal, center = np.array(view.focal, np.float32), np.array(view.center, np.float32)
+    uv = x[:, :2] / np.maximum(x[:, 2:], view.near) * focal + center
     column, row = np.floor(np.clip(uv, -1e6, 1e6)).astype(np.int64).T
     return (column, row), x[:, 2]
 

@@ -33,7 +33,7 @@ from fluidlift.shape.prism import (
 )
 from fluidlift.shape.surface import FrontSurface
 from fluidlift.shape.terrain import at_cells, to_corners, unit
-from fluidlift.types import CellType, Grid, MetricScale, PinholeCamera, Setting, Similarity3, Terrain
+from fluidlift.types import CellType, Grid, MetricScale, PinholeCamera, Setting, Similarity3, Terrain, triple
 
 STILL = 0.02
 """share of the outline's area that changes while the body is still held: noise of the mask"""
@@ -194,7 +194,7 @@ def standing_setting(found: StandingBody, to_world: Similarity3, mainstream, *, 
         if both is not None:  # a whole number of cells between both walls
             spacing = float((high - low)[both]) / max(int((high - low)[both] / spacing), 4)
         size = (*(high - low), HEADROOM * tall + 3 * spacing)
-        shape = tuple(max(int(np.ceil(v / spacing - 1e-6)), 4) for v in size)
+        shape = triple(max(int(np.ceil(v / spacing - 1e-6)), 4) for v in size)
         if np.prod(shape) <= limit:
             break
         spacing *= 1.05

@@ -46,10 +46,10 @@ def window_length(
     count = len(frames)
     if count < 2:
         return count
-    masks = [None] * count if mask is None else list(np.broadcast_to(mask, frames.shape[:3]))
+    masks = None if mask is None else np.broadcast_to(mask, frames.shape[:3])
     squares = []
     for f in range(count - 1):
-        both = None if masks[f] is None else masks[f] & masks[f + 1]
+        both = None if masks is None else masks[f] & masks[f + 1]
         squares.append(psnr(frames[f], frames[f + 1], both if both is not None and both.any() else None) ** 2)
     n = round(longest * float(np.mean(squares)) / CALM**2)
     return min(max(n, shortest), longest, count)
@@ -73,7 +73,7 @@ def unite(bodies: Sequence[Gaussians], *, spacing: float, per_voxel: int = 1, wh
     require(len(bodies) > 0, "no body to unite", "one at least")
     require(np.isfinite(spacing) and spacing > 0, f"spacing {spacing}", "positive metres")
     require(per_voxel >= 1, f"per_voxel {per_voxel}", "1 or more")
-    bodies = [b.select(np.isfinite(b.means).all(1) & (np.abs(b.means) < 1e6).all(1)) for b in bodies]
+    bodies = [b.select(np.all(np.isfinite(b.means) & (np.abs(b.means) < 1e6), axis=1)) for b in bodies]
     everything = concatenate(bodies)
     if len(everything) == 0:
         return everything

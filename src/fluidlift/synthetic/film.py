@@ -18,7 +18,7 @@ from fluidlift.synthetic.surface import (
     see,
     sphere_trace,
 )
-from fluidlift.types import Grid, PinholeCamera
+from fluidlift.types import Grid, PinholeCamera, triple
 
 SUPERSAMPLING = 2
 """rays per pixel and axis of the pictures (the truth has one ray through each pixel centre)"""
@@ -49,7 +49,7 @@ def backdrop(scene: Scene, camera: PinholeCamera, rng: np.random.Generator, *, c
     low = scene.grid.low - VIEW_MARGIN
     span = scene.grid.high - scene.grid.low + wide
     cell = float(span.max())
-    box = Grid(tuple(max(1, int(np.ceil(s / cell))) for s in span), cell, tuple(low))
+    box = Grid(triple(max(1, int(np.ceil(s / cell))) for s in span), cell, tuple(low))
     eye, rays = camera.position, camera.rays(camera.pixel_grid().reshape(-1, 2))
     start, stop = box_range(box, eye, rays)
     depth = sphere_trace(scene.ground, eye, rays, start, stop, tolerance=0.02 * scene.grid.spacing)

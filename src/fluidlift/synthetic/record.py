@@ -216,7 +216,7 @@ def write_case(scene: Scene, recording: Recording, folder: Path, *, quality: flo
         folder / "solids.npz",
         terrain_v=mesh.vertices.astype(np.float32),
         terrain_f=mesh.faces.astype(np.int32),
-        terrain_rgb=np.float32([0.35, 0.28, 0.20]),
+        terrain_rgb=np.array([0.35, 0.28, 0.20], np.float32),
     )
     return folder
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 from scipy import ndimage, special
-from scipy.spatial import cKDTree
 
+from fluidlift.numerics.nearest import nearest
 from fluidlift.numerics.sampling import sample_centers
-from fluidlift.types import Grid, PinholeCamera
+from fluidlift.types import Grid, PinholeCamera, triple
 
 HALF = 0.5
 """the surface is where the density has fallen to this share of its value inside"""
@@ -63,7 +63,7 @@ class Body:
 
 def finer(grid: Grid) -> Grid:
     """Twice the cells along each axis."""
-    return Grid(tuple(2 * n for n in grid.shape), grid.spacing / 2, grid.origin)
+    return Grid(triple(2 * n for n in grid.shape), grid.spacing / 2, grid.origin)
 
 
 def deposit(points: Float[np.ndarray, "n 3"], weights: Float[np.ndarray, " n"], grid: Grid) -> np.ndarray:
@@ -88,7 +88,7 @@ def open_share(solid_distance: Float[np.ndarray, "nx ny nz"], spacing: float) ->
 
 def body_of(
     positions: Float[np.ndarray, "n 3"],
-    volume: float,
+    volume: float | Float[np.ndarray, " n"],
     grid: Grid,
     opening: Float[np.ndarray, "fx fy fz"],
 ) -> Body:
@@ -96,7 +96,7 @@ def body_of(
 
     Args:
         positions: m.
-        volume: of one particle, m^3.
+        volume: of one particle or of each, m^3.
         grid: of the simulation; the body lives on `finer(grid)`.
         opening: open share of the cells of `finer(grid)`. The density is taken over the open space alone, so that
             the liquid reaches its walls.
@@ -215,10 +215,9 @@ class Neighbours:
         cls, points: Float[np.ndarray, "n 3"], particles: Float[np.ndarray, "m 3"], radius: float, count: int = 8
     ) -> Neighbours:
         """Gaussian weights of width `radius` (m) over the `count` nearest particles, which sum to 1."""
-        distance, index = cKDTree(particles).query(points, k=min(count, len(particles)))
+        distance, index = nearest(particles, points, min(count, len(particles)))
         distance, index = distance.reshape(len(points), -1), index.reshape(len(points), -1)
-        nearest = distance[:, :1]
-        weight = np.exp(-0.5 * (distance**2 - nearest**2) / radius**2)
+        weight = np.exp(-0.5 * (distance**2 - distance[:, :1] ** 2) / radius**2)
         return cls(index, weight / weight.sum(axis=1, keepdims=True))
 
     def mean(self, values: np.ndarray) -> np.ndarray:

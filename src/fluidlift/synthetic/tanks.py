@@ -80,7 +80,7 @@ def tank_of(
     pull = max(float(np.linalg.norm(gravity)), 1e-12)
     parameters.setdefault("time_step", 0.5 * float(np.sqrt(grid.spacing / pull)))
     fluid = FluidParameters(gravity=gravity, **parameters)
-    velocities = np.tile(np.float32(fluid.inflow_velocity), (len(positions), 1))
+    velocities = np.tile(np.array(fluid.inflow_velocity, np.float32), (len(positions), 1))
     particles = Particles.at_rest(positions, fluid.density * fill / max(len(positions), 1), velocities=velocities)
     types = np.zeros(grid.shape, np.uint8) if cell_types is None else cell_types
     return Tank(name, grid, terrain or terrain_of(grid), fluid, particles, types, size, fill)
@@ -147,7 +147,7 @@ def standing_wave(
     grid = Grid((nx, width_cells, nz), h)
 
     def surface(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        return length * (depth + (amplitude * np.cos(mode * np.pi * x / length) if mode else 0.0))
+        return length * (depth + (amplitude * np.cos(mode * np.pi * x / length) if mode else np.zeros_like(x)))
 
     positions, fill = between(grid, 0.0, surface, seed=seed)
     return tank_of(

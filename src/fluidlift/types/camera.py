@@ -77,8 +77,10 @@ class PinholeCamera:
         y = (uv[..., 1] - self.center[1]) / self.focal[1]
         return np.stack([x, y, np.ones_like(x)], axis=-1) @ self.camera_from_world.rotation
 
-    def unproject(self, uv: Float[np.ndarray, "*n 2"], depth: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n 3"]:
-        """World points of pixels (u, v) at camera depth z (not ray length), metres."""
+    def unproject(
+        self, uv: Float[np.ndarray, "*n 2"], depth: Float[np.ndarray, "*n"] | float
+    ) -> Float[np.ndarray, "*n 3"]:
+        """World points of pixels (u, v) at camera depth z (not ray length; of each or of all), metres."""
         return self.position + self.rays(uv) * np.asarray(depth)[..., None]
 
     def resized(self, size: tuple[int, int]) -> PinholeCamera:
@@ -94,8 +96,8 @@ class PinholeCamera:
     @classmethod
     def looking(
         cls,
-        eye: Float[np.ndarray, "3"],
-        target: Float[np.ndarray, "3"],
+        eye: Float[np.ndarray, "3"] | tuple[float, float, float],
+        target: Float[np.ndarray, "3"] | tuple[float, float, float],
         fov_degrees: float,
         size: tuple[int, int],
         up: tuple[float, float, float] = (0.0, 0.0, 1.0),

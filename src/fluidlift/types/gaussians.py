@@ -81,8 +81,8 @@ class Gaussians:
         r = matrix_from_quat(self.quats) * self.scales[:, None, :]
         return r @ np.swapaxes(r, 1, 2)
 
-    def select(self, index: np.ndarray) -> Gaussians:
-        """Those of a boolean or integer index."""
+    def select(self, index: np.ndarray | slice) -> Gaussians:
+        """Those of a boolean or integer index, or of a slice."""
         return Gaussians(
             self.means[index], self.quats[index], self.scales[index], self.opacities[index], self.sh[index]
         )

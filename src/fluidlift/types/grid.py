@@ -2,13 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float
 
 from fluidlift.errors import require
+
+T = TypeVar("T")
+
+
+def triple(values: Iterable[T]) -> tuple[T, T, T]:
+    """Three values, one per axis, as a tuple whose length a type checker knows.
+
+    Raises:
+        ValueError: more or fewer values.
+    """
+    x, y, z = values
+    return x, y, z
 
 
 class CellType(IntEnum):
@@ -77,12 +91,12 @@ class Grid:
         nx, ny, nz = self.shape
         return (nx + (axis == 0), ny + (axis == 1), nz + (axis == 2))
 
-    def cell_of(self, points: Float[np.ndarray, "n 3"]) -> np.ndarray:
-        """int64 [n,3] cell indices (not clipped: may lie outside)."""
+    def cell_of(self, points: Float[np.ndarray, "*n 3"]) -> np.ndarray:
+        """int64 [*n,3] cell indices (not clipped: may lie outside)."""
         return np.floor((np.asarray(points) - self.low) / self.spacing).astype(np.int64)
 
-    def contains(self, points: Float[np.ndarray, "n 3"], margin: float = 0.0) -> np.ndarray:
-        """bool [n]: inside the box, at least `margin` metres from its sides."""
+    def contains(self, points: Float[np.ndarray, "*n 3"], margin: float = 0.0) -> np.ndarray:
+        """bool [*n]: inside the box, at least `margin` metres from its sides."""
         p = np.asarray(points)
         return np.all((p >= self.low + margin) & (p < self.high - margin), axis=-1)
 

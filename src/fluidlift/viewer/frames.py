@@ -83,7 +83,7 @@ def splat_frame(
         poses: [b,7] of the obstacles.
         cell: m, of the simulator's cells, by which a skin is told; not a number: there is none.
     """
-    sound = np.isfinite(gaussians.means).all(axis=1) & np.isfinite(gaussians.scales).all(axis=1)
+    sound = np.all(np.isfinite(gaussians.means) & np.isfinite(gaussians.scales), axis=1)
     if not sound.all():
         gaussians, velocities = gaussians.select(sound), velocities[sound]
     skin = of_skin(gaussians, cell)

@@ -229,7 +229,7 @@ class Stage:
         for name in [n for n in self._bodies if n not in names]:
             self._bodies.pop(name).remove()
             self._shown_bodies.pop(name)
-        known = poses is not None and len(poses) == len(names)
+        known = poses if poses is not None and len(poses) == len(names) else None
         for b, o in enumerate(found):
             look = (o.mesh, o.name == chosen)
             before = self._shown_bodies.get(o.name)
@@ -239,8 +239,8 @@ class Stage:
                 self._bodies[o.name] = self._add_body(o.name, *look)
                 self._shown_bodies[o.name] = look
             body = self._bodies[o.name]
-            body.position = np.asarray(poses[b, :3] if known else o.position, float)
-            turn = np.asarray(poses[b, 3:] if known else o.rotation, float)
+            body.position = np.asarray(o.position if known is None else known[b, :3], float)
+            turn = np.asarray(o.rotation if known is None else known[b, 3:], float)
             body.wxyz = product(turn, np.array(Y_UP)) if is_painted(o.mesh) else turn
             body.visible = parts.obstacles
 

@@ -45,7 +45,7 @@ def mean_target(asset: FluidAsset, targets: Sequence[FaceVelocity]) -> FaceVeloc
     from fluidlift.physics.boundaries import extrapolate, touching_faces
 
     components = zip(*(t.components for t in targets), strict=True)
-    mean = FaceVelocity(*(np.mean(c, axis=0, dtype=np.float32) for c in components))
+    mean = FaceVelocity(*(np.asarray(np.mean(c, axis=0, dtype=np.float32)) for c in components))
     liquid = np.isin(asset.cell_types, (CellType.FLUID, CellType.INFLOW, CellType.OUTFLOW))
     return extrapolate(mean, touching_faces(liquid))
 

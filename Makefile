@@ -11,13 +11,13 @@ WORKERS ?= 2
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --disable-pip-version-check -c constraints.txt
 
-.PHONY: help demo test check lint compiled format clean
+.PHONY: help demo test check lint style compiled format clean
 
 help:
 	@echo "make demo    make an asset from the clip that comes with the package, in $(OUT)"
 	@echo "make test    lint, types, import contracts, unit tests, one whole asset"
 	@echo "make check   the first three and all tests"
-	@echo "make lint    the first three of them only"
+	@echo "make lint    lint, types and import contracts only"
 	@echo "make format  let ruff put the source in order"
 	@echo "make clean   remove the environment, caches and the demo asset"
 
@@ -28,8 +28,11 @@ demo: $(VENV)/.core
 
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
-test: lint compiled
-	$(PYTEST) -m "unit or whole"
+# Types are checked beside the tests: the checker takes a minute of one core, which lies idle while others end.
+test: style compiled
+	@$(BIN)/pyright >$(VENV)/pyright.log 2>&1 & types=$$!; code=0; \
+	$(PYTEST) -m "unit or whole" || code=$$?; \
+	wait $$types || code=$$?; tail -n 20 $(VENV)/pyright.log; exit $$code
 
 check: lint compiled
 	$(PYTEST)
@@ -38,10 +41,12 @@ check: lint compiled
 compiled: $(VENV)/.dev
 	@$(BIN)/fluidlift doctor --compile >/dev/null
 
-lint: $(VENV)/.dev
+lint: style
+	$(BIN)/pyright
+
+style: $(VENV)/.dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/pyright
 	$(BIN)/lint-imports
 
 format: $(VENV)/.dev

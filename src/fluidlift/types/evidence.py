@@ -34,15 +34,26 @@ class UpEvidence:
     """0 (prior alone) to 1 (given)"""
     error: float = 0.0
     """degrees, standard deviation of what the pitch may be; 0: given, or not known"""
+    raised: float = 0.0
+    """degrees that the pitch is above what was seen, so that the far water does not take the cells of the near"""
 
     @property
     def warnings(self) -> list[str]:
-        """What the user should know of a tilt that little is known of."""
+        """What the user should know of a tilt that little is known of, or that is not what was seen."""
+        found = []
+        if self.raised >= 1.0:
+            seen = self.pitch - self.raised
+            found.append(
+                f"the camera looks {seen:.0f} degrees down, and the scene is built as from {self.pitch:.0f}: a relief, "
+                "whose far shore is nearer than it is, since its near water would have too few cells; "
+                f"--pitch {seen:.0f} builds it true"
+            )
         if self.error <= UNSURE:
-            return []
+            return found
         return [
+            *found,
             f"how far the camera looks down is known to {self.error:.0f} degrees only: {self.pitch:.0f} is the middle "
-            f"of what it may be ({self.source}); give --pitch, or a camera file, for a better shape"
+            f"of what it may be ({self.source}); give --pitch, or a camera file, for a better shape",
         ]
 
 

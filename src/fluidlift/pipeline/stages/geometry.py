@@ -32,7 +32,7 @@ from fluidlift.shape.framing import framing_warnings
 from fluidlift.shape.given_depth import DepthPictures
 from fluidlift.shape.kinds import Observation, builder_of
 from fluidlift.shape.rest_frames import FEWEST_PIXELS, rest_frame, united_range
-from fluidlift.shape.view import look_at
+from fluidlift.shape.view import as_relief, look_at
 from fluidlift.types import (
     CellType,
     FluidKind,
@@ -331,6 +331,8 @@ def _kind_and_up(
     )  # fmt: skip
     if c.roll is None:
         up = composite.with_roll(up, parts, known)
+    if c.pitch is None and kind.nearly_level and not shaped:
+        up = as_relief(up, parts.lying & ~parts.falling, lambda tilted: kinds.level_camera(known, tilted))
     return evidence, kind, parts, up, None
 
 

@@ -2,5 +2,6 @@
 
 from fluidlift.shape.view.habit import Scene, habit_prior
 from fluidlift.shape.view.picture import PictureEvidence, look_at
+from fluidlift.shape.view.relief import as_relief
 
-__all__ = ["PictureEvidence", "Scene", "habit_prior", "look_at"]
+__all__ = ["PictureEvidence", "Scene", "as_relief", "habit_prior", "look_at"]

@@ -8,7 +8,6 @@ import shutil
 import numpy as np
 import pytest
 from catalogue import write_clip
-from fluidlift.pipeline.splat_files import checkpoint_file, frame_file
 from fuzz.trial import Watched
 from small_asset import random_gaussians, small_asset
 
@@ -20,6 +19,7 @@ from fluidlift.io.asset_paths import asset_file, asset_files
 from fluidlift.io.checkpoint import Checkpoint, write_checkpoint
 from fluidlift.io.ply import write_gaussians
 from fluidlift.io.stage_cache import Scratch, load_stage, save_stage
+from fluidlift.scene.splat_files import checkpoint_file, frame_file
 
 PLACES = (
     "frames", "frames/splats", "frames/splats/1002.ply", "work", "work/simulate", "work/checkpoint",

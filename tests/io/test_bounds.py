@@ -78,11 +78,15 @@ def test_the_size_is_told_by_the_content_before_anything_is_decoded(tmp_path, me
     assert memory() < 5
 
 
-@pytest.mark.parametrize("suffix", [".png", ".jpg", ".tif", ".bmp", ".webp"])
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize(
+    ("suffix", "dtype"),
+    [
+        *((suffix, np.uint8) for suffix in (".png", ".jpg", ".tif", ".bmp", ".webp")),
+        (".png", np.uint16),
+        (".tif", np.uint16),
+    ],
+)
 def test_headers_say_what_the_decoder_makes(suffix, dtype):
-    if dtype == np.uint16 and suffix in (".jpg", ".bmp", ".webp"):
-        pytest.skip("has 8 bits")
     _, data = cv2.imencode(suffix, np.full((7, 13, 3), 90, dtype))
     head = picture_header(data.tobytes())
     assert (head.width, head.height) == (13, 7)

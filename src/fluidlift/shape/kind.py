@@ -22,10 +22,11 @@ SHARPNESS = 0.75
 """log odds per unit of belief. Of 36 clips with known kinds (34 of them real) the beliefs have the least log loss at
 0.75 to 1.0 (0.47, where 2.0 has 0.64); the lower of these, since most of the clips were in sight when the beliefs were
 written"""
-
 LEAST_SURE = 0.7
 """share of the belief below which a user is told what else it could be: of the same clips 10 are, 2 of the 4 wrong ones
 among them"""
+STRAIGHT = 10.0
+"""degrees: a larger lean of what falls is a thrown jet or wind, not a turned camera"""
 
 
 def doubts(evidence: KindEvidence) -> tuple[str, ...]:
@@ -34,10 +35,6 @@ def doubts(evidence: KindEvidence) -> tuple[str, ...]:
     if share >= LEAST_SURE:
         return ()
     return (f"what kind of fluid this is, is unsure: {best} ({share:.2f}) or {second} ({other:.2f}); --kind decides",)
-
-
-STRAIGHT = 10.0
-"""degrees: a larger lean of what falls is a thrown jet or wind, not a turned camera"""
 
 
 def estimate_kind(
@@ -177,7 +174,7 @@ def estimate_up(
     given: tuple[float | None, float | None] = (None, None),
     level_prior: float = slope.LEVEL,
 ) -> UpEvidence:
-    """The camera's tilt: the mean of its posterior, and how much of the habit's spread was taken away.
+    """The camera's tilt: median pitch and mean roll of the posterior, and how much of the habit's spread it took away.
 
     How people hold cameras at such a fluid is the prior. Sky and plumb lines (`fluidlift.shape.view`) speak beside all
     kinds, the upper end of the water for a stream. Over a stream, the perspective of its motion and of its pattern

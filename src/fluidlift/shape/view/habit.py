@@ -3,8 +3,7 @@
 Over a landscape the camera looks near the horizon, the water runs out of the picture at its sides or below, and its far
 shore is seen not far below the horizon. What is looked down on (a vessel, a table, a river from a bridge or a drone) is
 seen at any steeper angle, it is often round and whole in the picture, and nothing is known of its far edge but that it
-lies below the horizon. The shares are counts over real clips and
-made ones, one added to each side.
+lies below the horizon. The shares are counts over real clips and made ones, one added to each side.
 """
 
 from __future__ import annotations

@@ -84,10 +84,19 @@ def test_a_value_after_a_material_stands_over_it(asset):
     assert "kinematic_viscosity: 0.00704" in text
 
 
+def test_a_viscosity_with_its_unit_is_kinematic_in_scene_yaml(asset):
+    wanted = ("--set", "parameters.density=1400", "--set", "parameters.kinematic_viscosity=7 Pa s")
+    assert edit(asset, *wanted) in WELL
+    assert "kinematic_viscosity: 0.005" in (asset / "scene.yaml").read_text()
+    assert edit(asset, "--set", "parameters.kinematic_viscosity=20 cSt") in WELL
+    assert "kinematic_viscosity: 2.0e-05" in (asset / "scene.yaml").read_text()
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
         (("--set", "parameters.density"), ["place=value"]),
+        (("--set", "parameters.surface_tension=3 kg"), ["'3 kg'", "N/m, mN/m"]),
         (("--set", "parameters.density=-3"), ["-3", "kg/m^3"]),
         (("--set", "parameters.gravity=[0, 0"), ["no value", "quotes"]),
         (("--set", "parameters.densty=3"), ["write 'parameters.density'"]),

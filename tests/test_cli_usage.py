@@ -29,7 +29,7 @@ def test_a_wrong_kind_is_answered_with_the_kinds_there_are_in_their_order(capsys
 def test_help_does_not_offer_none(command, capsys):
     code, said = shown(capsys, command, "--help")
     assert code == 0
-    assert "None" not in said and "(default: )" not in said
+    assert "None" not in said and "(default: )" not in said and "default: not given" not in said
 
 
 def test_help_of_make_has_its_options_in_groups(capsys):
@@ -37,7 +37,7 @@ def test_help_of_make_has_its_options_in_groups(capsys):
     groups = ["input options", "scene options", "part options", "quality options", "body options", "settings options"]
     places = [said.index(group) for group in groups]
     assert code == 0 and places == sorted(places)
-    assert places[0] < said.index("--mask PATH") < places[1] < said.index("--size FLOAT") < places[2]
+    assert places[0] < said.index("--mask PATH") < places[1] < said.index("--size METRES") < places[2]
     assert "--max-pixels" not in said
 
 
@@ -49,7 +49,25 @@ def test_an_old_option_without_a_value_is_a_wrong_option(capsys):
 def test_a_word_in_place_of_a_number_names_its_option(capsys):
     code, said = shown(capsys, "make", "x.mp4", "--size", "big")
     assert code == USAGE
-    assert "--size FLOAT" in said and "big" in said
+    assert "--size METRES" in said and "big" in said
+
+
+@pytest.mark.parametrize(
+    ("word", "meant"),
+    [("mak", "fluidlift make or fluidlift mask"), ("rendr", "fluidlift render"), ("SIM", "fluidlift sim")],
+)
+def test_a_command_with_a_letter_missing_is_answered_with_those_it_looks_like(word, meant, capsys):
+    assert main([word, "x.mp4"]) == USAGE
+    assert capsys.readouterr().err == f"fluidlift: there is no command '{word}'. Do: {meant}\n"
+
+
+def test_a_length_in_another_unit_is_one_in_metres(stream_clip, tmp_path, capsys):
+    assert (
+        main(["make", str(stream_clip), "--size", "30 cm", "--duration=500ms", "--roll", "0.1rad", "--print-config"])
+        == 0
+    )
+    said = capsys.readouterr().out
+    assert "size: 0.3\n" in said and "duration: 0.5\n" in said and "roll: 5.7295" in said
 
 
 def test_options_that_are_left_out_are_none():

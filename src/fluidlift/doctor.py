@@ -4,11 +4,26 @@ from __future__ import annotations
 
 import os
 import platform
+import shutil
+import tempfile
 from importlib import metadata
+from importlib.util import find_spec
 
 from fluidlift import __version__
+from fluidlift.machine import available_memory
 
 CORE = ("numpy", "scipy", "numba", "torch", "av", "opencv-python-headless", "usd-core", "trimesh")
+EXTRAS = {
+    "viewer": ("viser", "pip install 'fluidlift[view]'"),
+    "Mitsuba": ("mitsuba", "pip install 'fluidlift[mitsuba]'"),
+    "gsplat": ("gsplat", "pip install 'fluidlift[gsplat]', with a GPU"),
+    "Warp": ("warp", "pip install 'fluidlift[cuda]'"),
+    "learned models": ("transformers", "pip install 'fluidlift[learned]'"),
+    "splashsurf": ("pysplashsurf", "pip install pysplashsurf"),
+}
+"""what is not needed, by the module that it brings, and how to get it"""
+PROGRAMS = {"FFmpeg": ("ffmpeg", "not needed: PyAV brings its own libraries"), "Blender": ("blender", "blender.org")}
+"""programs of others, by the command that starts them"""
 
 
 def examine() -> dict[str, str]:
@@ -17,13 +32,20 @@ def examine() -> dict[str, str]:
         "fluidlift": __version__,
         "python": platform.python_version(),
         "system": f"{platform.system()} {platform.machine()}",
-        "cores": str(os.cpu_count()),
+        "cores": str(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()),
+        "memory": f"{available_memory() / 1e9:.1f} GB free",
+        "disk": f"{shutil.disk_usage(os.curdir).free / 1e9:.1f} GB free in this folder, "
+        f"{shutil.disk_usage(tempfile.gettempdir()).free / 1e9:.1f} GB for temporary files",
     }
     for name in CORE:
         try:
             found[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
             found[name] = "MISSING: pip install fluidlift again"
+    for name, (module, remedy) in EXTRAS.items():
+        found[name] = "installed" if find_spec(module) else f"not installed, an extra: {remedy}"
+    for name, (program, remedy) in PROGRAMS.items():
+        found[name] = "installed" if shutil.which(program) else f"not found ({remedy})"
     found["GPU"] = _gpu()
     return found
 

@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import difflib
 import json
 import os
+import shlex
 import signal
 import sys
 import threading
@@ -96,6 +98,9 @@ def _run(args: list[str]) -> int:
     if args in (["--version"], ["-V"]):
         print(f"fluidlift {__version__}")
         return DONE
+    if args and (meant := _meant(args[0])):
+        print(f"fluidlift: there is no command '{args[0][:40]}'. Do: {' or '.join(meant)}", file=sys.stderr)
+        return USAGE
     if args[:1] == ["make"]:
         args = _as_settings(args)
     with REGISTRY:
@@ -125,6 +130,15 @@ def _run(args: list[str]) -> int:
     except Exception as error:
         print(failure_line(error, args), file=sys.stderr)
         return FAILED
+
+
+def _meant(word: str) -> list[str]:
+    """The commands that a word which is none looks like; none for a command or an option."""
+    names = [command.__name__.lower() for command in _COMMANDS]
+    if word in names or word.startswith("-"):
+        return []
+    alike = difflib.get_close_matches(word.lower(), names, n=2)
+    return [f"fluidlift {name}" for name in sorted(alike, key=lambda name: not name.startswith(word))]
 
 
 def _make(c: Make) -> int:
@@ -204,6 +218,7 @@ def _tell(made: Any, as_json: bool) -> int:
         for text, name in (("asset", ""), ("preview", "preview.mp4"), ("report", "report.html")):
             if (made.folder / name).exists():
                 print(f"  {text:8} {made.folder / name}")
+        print(f"  look at  fluidlift view {shlex.quote(str(made.folder))}")
         print(f"as filmed: not measured, {card}" if isinstance(card, str) else card.sentence())
     return WITH_WARNINGS if made.warnings else DONE
 

@@ -20,6 +20,7 @@ from typing import Annotated, Any
 import tyro
 
 from fluidlift.cli.options import MOVED, Make, options_of
+from fluidlift.cli.quantities import command
 from fluidlift.errors import InputRejected
 
 VIDEOS = frozenset({".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".mxf", ".gif"})
@@ -31,7 +32,7 @@ _OURS = ("clip", "out", "json", "print_config")
 """options of make that the batch itself gives"""
 
 
-@dataclass(frozen=True)
+@command
 class Batch:
     """Turn many clips into assets; a clip that fails does not stop the others, and the same command goes on."""
 

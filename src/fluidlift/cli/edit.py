@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json as json_module
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from fluidlift.cli import quantities
 from fluidlift.errors import FluidliftError, InputRejected
 
 if TYPE_CHECKING:
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 _DONE, _WITH_WARNINGS = 0, 4
 
 
-@dataclass(frozen=True)
+@quantities.command
 class Edit:
     """Change a finished asset: parameters, inflow, terrain, obstacles, emitters, look. Every edit can be undone."""
 
@@ -91,7 +92,29 @@ def changes_of(session: EditSession, command: Edit) -> list[Change]:
     for text in command.add:
         section, value = _pair(text, "--add", "obstacles='{shape: sphere, radius: 0.1}'")
         changes.append(Add(section, value))
-    return changes + [Set(*_pair(text, "--set", "parameters.gravity='[0, 0, -9.81]'")) for text in command.set]
+    for text in command.set:
+        place, value = _pair(text, "--set", "parameters.gravity='[0, 0, -9.81]'")
+        changes.append(Set(place, _with_unit(session, changes, place, value) if isinstance(value, str) else value))
+    return changes
+
+
+def _with_unit(session: EditSession, before: list[Change], place: str, value: str) -> Any:
+    """A parameter that is written with its unit, such as "2 cSt" or "5 Pa s", in the unit of scene.yaml."""
+    from fluidlift.scene.edits import Set
+    from fluidlift.types.parameter_table import PARAMETERS
+    from fluidlift.types.quantity import DYNAMIC, parameter
+
+    row = PARAMETERS.get(place.removeprefix("parameters."))
+    if row is None or not place.startswith("parameters.") or row.is_vector:
+        return value
+    density = None
+    if value.lstrip("+-.0123456789eE ").strip() in DYNAMIC:
+        told = [c.value for c in before if isinstance(c, Set) and c.path == "parameters.density"]
+        density = told[-1] if told and told[-1] else session.density
+    try:
+        return parameter(value, row.unit, density=density)
+    except ValueError as error:
+        raise InputRejected(f"--set {place}: {error}", f"a number of {row.sign or 'no unit'}") from None
 
 
 def _wanted(command: Edit) -> str:

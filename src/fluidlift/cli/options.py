@@ -2,47 +2,48 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import field, fields, is_dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
+from fluidlift.cli.quantities import Degrees, Metres, Seconds, command
 from fluidlift.types.kind import KindChoice
 
 Clip = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CLIP")]
 Asset = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="ASSET")]
 
 
-@dataclass(frozen=True)
+@command
 class Scene:
     """What the clip does not say by itself."""
 
     kind: KindChoice | None = None
     """what the fluid does; auto decides from evidence that the report shows"""
-    size: float | None = None
-    """metres across the fluid (its longest side); sets the scale"""
-    fov: float | None = None
-    """field of view across the longer side, degrees; else the file's lens metadata, else 50"""
-    pitch: float | None = None
-    """degrees that the camera looks below the horizon"""
-    roll: float | None = None
-    """degrees that the picture is turned clockwise"""
+    size: Metres | None = None
+    """across the fluid (its longest side), such as 0.3 or 30cm; sets the scale"""
+    fov: Degrees | None = None
+    """field of view across the longer side; else the file's lens metadata, else 50"""
+    pitch: Degrees | None = None
+    """by which the camera looks below the horizon"""
+    roll: Degrees | None = None
+    """by which the picture is turned clockwise"""
 
 
-@dataclass(frozen=True)
+@command
 class Part:
     """Which part of the clip."""
 
-    start: float | None = None
-    """seconds into the clip"""
-    duration: float | None = None
-    """seconds to use"""
+    start: Seconds | None = None
+    """where in the clip it begins, such as 12 or 12s; by default at its first frame"""
+    duration: Seconds | None = None
+    """how much of it is used; by default all, up to read.max_frames frames"""
     fps: float | None = None
     """frames per second of an image sequence"""
 
 
-@dataclass(frozen=True)
+@command
 class Input:
     """Files beside the clip."""
 
@@ -56,7 +57,7 @@ class Input:
     """optical flow of the clip, made elsewhere: a folder or pattern of .flo, .exr, .npz or KITTI .png, or one .npz"""
 
 
-@dataclass(frozen=True)
+@command
 class Body:
     """Learned depth, or a body that something else made."""
 
@@ -78,7 +79,7 @@ class Body:
     """what the asset is for; a generator whose terms forbid that is refused"""
 
 
-@dataclass(frozen=True)
+@command
 class Quality:
     """How fine, and how repeatable."""
 
@@ -90,7 +91,7 @@ class Quality:
     """same clip, settings and seed: same asset"""
 
 
-@dataclass(frozen=True)
+@command
 class Settings:
     """Everything that has no option of its own."""
 
@@ -108,7 +109,7 @@ MOVED = {"max_pixels": "read.max_pixels", "max_frames": "read.max_frames"}
 """options of `make` that are settings now; they are understood as before and stand no longer in its help"""
 
 
-@dataclass(frozen=True)
+@command
 class Make:
     """Turn a clip into a fluid asset."""
 
@@ -132,18 +133,18 @@ class Make:
     """all else: --print-config lists every setting, such as read.max_pixels (docs/cli.md)"""
 
 
-@dataclass(frozen=True)
+@command
 class Sim:
     """Simulate a finished asset again, with its scene.yaml: longer, other frames, another liquid, obstacles."""
 
     asset: Asset
     """asset folder"""
-    duration: float | None = None
-    """seconds; by default what scene.yaml says, else as long as the clip; a longer one continues what is there"""
+    duration: Seconds | None = None
+    """by default what scene.yaml says, else as long as the clip; a longer one continues what is there"""
     fps: float | None = None
     """frames per second; by default those of the clip"""
-    extend_downstream: float | None = None
-    """metres by which the channel of a stream or a fall goes on behind its outlet"""
+    extend_downstream: Metres | None = None
+    """by which the channel of a stream or a fall goes on behind its outlet"""
     meshes: Path | None = None
     """folder of the mesh files that scene.yaml names; by default the asset"""
     resume: bool = False
@@ -160,7 +161,7 @@ class Sim:
     """print the outcome as JSON"""
 
 
-@dataclass(frozen=True)
+@command
 class Fit:
     """Fit the physical parameters of a finished asset again; fluidlift sim then plays the new values."""
 
@@ -174,15 +175,15 @@ class Fit:
     """a value that is known, such as --hold viscosity=1e-6; it is not fitted; may be repeated"""
     restarts: int | None = None
     """further fits from other initial values, 4 at most, whose spread is reported"""
-    max_seconds: float | None = None
-    """s that the fit may take; by default as in make"""
+    max_seconds: Seconds | None = None
+    """that the fit may take; by default as in make"""
     set: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default_factory=tuple)
     """one setting of fit, such as --set fit.method=adam; may be repeated"""
     json: bool = False
     """print the outcome as JSON"""
 
 
-@dataclass(frozen=True)
+@command
 class Render:
     """Draw a finished asset from any camera: a film, or pictures with transparency or depth."""
 
@@ -216,7 +217,7 @@ class Render:
     """print the outcome as JSON"""
 
 
-@dataclass(frozen=True)
+@command
 class Export:
     """Write files of a finished asset for other tools: meshes, splats, volumes, USD, glTF, a page to share."""
 
@@ -240,7 +241,7 @@ class Export:
     """print the outcome as JSON"""
 
 
-@dataclass(frozen=True)
+@command
 class Inspect:
     """Tell what a clip is, and what would be warned about."""
 
@@ -252,7 +253,7 @@ class Inspect:
     """print as JSON"""
 
 
-@dataclass(frozen=True)
+@command
 class Mask:
     """Find the fluid only: write masks and overlays, to be corrected and given to make or motion with --mask."""
 
@@ -280,7 +281,7 @@ class Mask:
     """which part of the clip"""
 
 
-@dataclass(frozen=True)
+@command
 class Motion:
     """Measure how the fluid moves, for every frame: flow, surface and volume velocity as files for other tools."""
 
@@ -310,7 +311,7 @@ class Motion:
     """which part of the clip"""
 
 
-@dataclass(frozen=True)
+@command
 class Evaluate:
     """Tell how near an asset stays to its own clip, to other footage, or to a case with known truth."""
 
@@ -320,13 +321,13 @@ class Evaluate:
     """case folder: video, camera.json, truth.npz, scene.json; by default the asset is held against its own clip"""
     clip: Path | None = None
     """other footage of the same camera to hold it against, such as a part of the clip that was not used"""
-    start: float | None = None
-    """seconds into that footage"""
+    start: Seconds | None = None
+    """where in that footage it begins"""
     json: bool = False
     """print as JSON"""
 
 
-@dataclass(frozen=True)
+@command
 class Validate:
     """Check an asset: schema, hashes, every frame, scene.yaml, USD, preview; say what to do."""
 
@@ -336,7 +337,7 @@ class Validate:
     """print as JSON"""
 
 
-@dataclass(frozen=True)
+@command
 class Demo:
     """Make an asset from the clip that comes with the package."""
 
@@ -344,7 +345,7 @@ class Demo:
     """asset folder to write"""
 
 
-@dataclass(frozen=True)
+@command
 class Generators:
     """List third-party generators and what is there of them, or explain one: licence, hardware, installation."""
 
@@ -358,7 +359,7 @@ class Generators:
     """print as JSON"""
 
 
-@dataclass(frozen=True)
+@command
 class Doctor:
     """Tell what is installed and what this machine can do."""
 

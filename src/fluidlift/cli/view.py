@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from fluidlift.cli.options import Asset
+from fluidlift.cli.quantities import command
 
 
-@dataclass(frozen=True)
+@command
 class View:
     """Look at an asset in the browser, change it and see the change."""
 
@@ -21,10 +20,10 @@ class View:
     """open the page in the default browser"""
 
 
-def run(command: View) -> int:
+def run(wanted: View) -> int:
     """Show the asset until Ctrl-C; the exit code."""
     from fluidlift.viewer.app import ViewRequest, view_asset
 
-    request = ViewRequest(command.host, command.port, command.browser)
-    view_asset(command.asset, request, told=lambda line: print(line, flush=True))
+    request = ViewRequest(wanted.host, wanted.port, wanted.browser)
+    view_asset(wanted.asset, request, told=lambda line: print(line, flush=True))
     return 0

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from fluidlift.errors import FluidliftError, InputRejected
-from fluidlift.io.asset_folder import read_manifest, read_scene
+from fluidlift.io.asset_folder import read_manifest, read_parameters, read_scene
 from fluidlift.io.asset_lock import editing
 from fluidlift.io.asset_paths import asset_file
 from fluidlift.io.scene import SCENE_TEMPLATE, SECTIONS, SceneEdits, edits_of, plain_scene, read_edits, scene_text
@@ -58,6 +58,12 @@ class EditSession:
     def scene(self) -> dict[str, Any]:
         """scene.yaml as it is now."""
         return read_scene(self.folder)
+
+    @property
+    def density(self) -> float:
+        """kg/m^3, as edited, else as fitted."""
+        edited = (self.scene.get("parameters") or {}).get("density")
+        return read_parameters(asset_file(self.folder, "parameters.json"))[0].density if edited is None else edited
 
     @property
     def edits(self) -> SceneEdits:

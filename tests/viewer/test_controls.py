@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from fluidlift.types import FluidParameters
+from fluidlift.types.parameters import Estimate
 from fluidlift.viewer.controls import INFLOW, WHOLE, controls_of, direction, number, path_of, turned
 
 FITTED = FluidParameters(
@@ -119,3 +120,20 @@ def test_a_number_and_its_unit_stay_in_one_line(c):
     for old, new in WHOLE.items():
         read = read.replace(new, chr(old))
     assert read == f"{number(c.fitted, 3)} {c.unit}".strip().replace(" °", "°")
+
+
+def test_what_was_not_fitted_is_not_called_so():
+    """A number that the data say nothing about is a prior, one that a person gave is given: as in the report."""
+    estimates = {
+        "kinematic_viscosity": Estimate(1e-6, 4e-7, False, 2e-6, "m^2/s", (4e-7, 3e-6), "fitted to the motion"),
+        "density": Estimate(1000.0, np.inf, False, 1000.0, "kg/m^3", None, "prior, not determined by the clip"),
+        "gravity_z": Estimate(-9.81, 0.0, True, -9.81, "m/s^2", None, "given"),
+        "inflow_velocity_x": Estimate(1.0, 0.1, True, 0.5, "m/s", (0.8, 1.2), "fitted"),
+        "inflow_velocity_y": Estimate(0.0, np.inf, False, 0.0, "m/s", None, "prior, not determined by the clip"),
+    }
+    found = {c.key: c for c in controls_of(FITTED, "stream", estimates)}
+    assert found["kinematic_viscosity"].origin == "fitted"
+    assert found["kinematic_viscosity"].hint.endswith("fitted to the motion; 95 %: 4e-7 to 3e-6 m^2/s")
+    assert (found["density"].origin, found["gravity"].origin, found[INFLOW].origin) == ("prior", "given", "fitted")
+    assert found["density"].hint.endswith("prior, not determined by the clip")
+    assert found["surface_tension"].origin == "lifted"

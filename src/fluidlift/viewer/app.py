@@ -100,7 +100,7 @@ class Viewer:
         self.saved = SavedFrames(folder)
         self.asset = self.saved.asset
         self.draft = Draft(session or open_session(folder), self.asset.parameters)
-        self.controls = controls_of(self.asset.parameters, self.asset.kind)
+        self.controls = controls_of(self.asset.parameters, self.asset.kind, self.asset.estimates)
         self.cache: FrameCache[SplatFrame] = FrameCache(self._read)
         self.pictures: InputPictures | None = None
         self.looking_for_pictures = True

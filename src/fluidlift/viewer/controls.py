@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 from fluidlift.errors import require
 from fluidlift.types import FluidKind, FluidParameters, kind_of
 from fluidlift.types.parameter_table import PARAMETERS, Scale
+from fluidlift.types.parameters import Estimate
 
 STEPS = 200
 """of a slider, about"""
 INFLOW = "inflow.factor"
+ESTIMATES = {INFLOW: "inflow_velocity", "gravity": "gravity_z", "gravity_tilt": "gravity", "gravity_heading": "gravity"}
+"""what a control moves, by its name among the estimates, where that is another"""
 WHOLE = str.maketrans({
     " ": "\N{NO-BREAK SPACE}", "/": "\N{DIVISION SLASH}", "-": "\N{MINUS SIGN}",
     ".": "\N{ONE DOT LEADER}\N{WORD JOINER}",
@@ -48,6 +51,8 @@ class Control:
     log: bool = False
     """the slider moves the power of ten"""
     hint: str = ""
+    origin: str = "lifted"
+    """a word on where `fitted` comes from, its mark on the slider: fitted, given, prior"""
 
     def __post_init__(self) -> None:
         require(self.low < self.high, f"{self.key} from {self.low} to {self.high}", "an ascending range")
@@ -123,13 +128,16 @@ def _digits(value: float, digits: int) -> float:
     return float(f"{value:.{digits}g}")
 
 
-def controls_of(fitted: FluidParameters, kind: str | FluidKind) -> tuple[Control, ...]:
+def controls_of(
+    fitted: FluidParameters, kind: str | FluidKind, estimates: Mapping[str, Estimate] | None = None
+) -> tuple[Control, ...]:
     """The controls of an asset, in the order in which they are shown. Ranges hold what its kind is like and reach past
     the fitted value.
 
     Args:
         fitted: of the asset, before any edit.
         kind: of the fluid.
+        estimates: of its parameters (`FluidAsset.estimates`): how sure each is, and where it comes from.
     """
     speed = _length(fitted.inflow_velocity)
     liquid = not kind_of(kind).is_gas
@@ -142,7 +150,22 @@ def controls_of(fitted: FluidParameters, kind: str | FluidKind) -> tuple[Control
         found.append(_plain("inflow_fluctuation", fitted, span=(0.0, max(speed, 0.1))))
     if liquid:
         found += [_plain(name, fitted) for name in ("density", "surface_tension", "wall_damping", "restitution")]
-    return tuple(found)
+    return tuple(_with_origin(control, estimates or {}) for control in found)
+
+
+def _with_origin(control: Control, estimates: Mapping[str, Estimate]) -> Control:
+    """With the mark and the words of the report on where its number comes from; of a vector, of the least sure of
+    its parts that the clip says something about."""
+    names = ESTIMATES.get(control.key, control.key)
+    parts = [e for name, e in estimates.items() if name == names or name.startswith(f"{names}_")]
+    if not parts:
+        return control
+    known = max([e for e in parts if e.fitted] or parts, key=lambda e: e.sigma)
+    origin = "given" if known.sigma == 0 else "fitted" if known.fitted else "prior"
+    told = known.source or origin
+    if known.interval is not None and known.fitted:
+        told += f"; 95 %: {number(known.interval[0], 3)} to {number(known.interval[1], 3)} {known.unit}".rstrip()
+    return replace(control, origin=origin, hint=f"{control.hint}. {told}".lstrip(". "))
 
 
 def _length(vector: Any) -> float:

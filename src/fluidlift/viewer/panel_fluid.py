@@ -154,11 +154,11 @@ def _label(control: Control, value: float) -> str:
 
 
 def _marks(control: Control) -> tuple[tuple[float, str], ...]:
-    """The fitted value, and those ends of the range whose numbers have room beside it."""
+    """The value before any edit, and those ends of the range whose numbers have room beside it."""
     low, high, _ = control.slider
     fitted = control.slider_of(control.fitted)
     ends = ((low, number(control.low, 3)), (high, number(control.high, 3)))
-    return ((fitted, "fitted"), *((at, told) for at, told in ends if abs(at - fitted) > ROOM * (high - low)))
+    return ((fitted, control.origin), *((at, told) for at, told in ends if abs(at - fitted) > ROOM * (high - low)))
 
 
 def _known(name: Any, options: tuple[str, ...]) -> str:

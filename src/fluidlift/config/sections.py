@@ -202,7 +202,9 @@ class ShowConfig:
     width: int = 512
     """longer side of one preview panel, px"""
     usd: bool = True
-    """write asset.usda"""
+    """write asset.usda: terrain, camera, parameters and the first frame"""
+    usd_frames: bool = False
+    """all frames in it, which takes as much disk again as they do; fluidlift export --to usd writes them when needed"""
     preview: bool = True
     """write preview.mp4; of minutes of simulation it takes as long as they do"""
 

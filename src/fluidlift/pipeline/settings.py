@@ -271,4 +271,5 @@ class ShowSettings:
 
     width: int
     usd: bool
+    usd_frames: bool
     preview: bool

@@ -84,14 +84,15 @@ def show(
     else:
         (folder / "preview.mp4").unlink(missing_ok=True)  # of frames that are no longer there
     if config.usd:
+        told = count if config.usd_frames else 1
         write_usd(
             folder / "asset.usda",
-            frames=splat_frames(folder, count),
+            frames=splat_frames(folder, told),
             interval=scene.interval,
             terrain=scene.terrain.mesh,
             camera=scene.camera,
             bodies=[
-                MovingMesh(o.name, o.mesh, poses[:, b, :3], poses[:, b, 3:]) for b, o in enumerate(scene.obstacles)
+                MovingMesh(o.name, o.mesh, poses[:told, b, :3], poses[:told, b, 3:]) for b, o in enumerate(scene.obstacles)
             ],
             attributes=scene.parameters.to_dict() | {"kind": scene.kind},
         )

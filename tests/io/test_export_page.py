@@ -133,9 +133,11 @@ def browser():
 class Visit:
     """An open page, with all that it said and asked for."""
 
-    def __init__(self, browser, path: Path) -> None:
+    def __init__(self, browser, path: Path, script: str = "") -> None:
         self.said: list[str] = []
         self.page = browser.new_page(viewport={"width": CAMERA.size[0], "height": CAMERA.size[1]})
+        if script:
+            self.page.add_init_script(script)
         self.page.on("console", lambda m: self.said.append(m.text))
         self.page.on("pageerror", lambda e: self.said.append(str(e)))
         self.page.on("request", lambda r: self.said.append(r.url) if r.url != path.as_uri() else None)
@@ -285,6 +287,33 @@ def test_the_controls_do_what_they_say(browser, tmp_path):
     page.keyboard.press("ArrowLeft")
     assert not visit.run("fluidlift.state.playing")
     assert [s for s in visit.said if not s.startswith("data:")] == []
+
+
+def test_it_swings_until_somebody_touches_it(browser, tmp_path):
+    visit = Visit(browser, page_of(tmp_path / "page.html", moving(), square(-0.6)))
+    visit.run("fluidlift.play(true)")
+    end = time.monotonic() + 20
+    while not abs(visit.run("fluidlift.state.yaw")) > 0.02 and time.monotonic() < end:
+        time.sleep(0.05)
+    assert visit.run("fluidlift.state.swinging") and 0.02 < abs(visit.run("fluidlift.state.yaw")) <= 0.2
+    visit.page.mouse.click(150, 100)
+    at = visit.run("fluidlift.state.yaw")
+    assert not visit.run("fluidlift.state.swinging")
+    time.sleep(0.3)
+    assert visit.run("fluidlift.state.yaw") == at
+
+
+def test_a_slow_machine_leaves_frames_out_and_goes_on(browser, tmp_path):
+    """Each picture takes longer than the whole film: what is shown are other frames each time, not the first."""
+    path = page_of(tmp_path / "page.html", moving())
+    slow = "window.requestAnimationFrame = (f) => { window.late = (window.late || 0) + 710; return setTimeout(() => f(window.late), 5); };"
+    visit = Visit(browser, path, slow)
+    visit.run("fluidlift.play(true)")
+    seen, end = set(), time.monotonic() + 20
+    while len(seen) < 3 and time.monotonic() < end:
+        seen.add(visit.run("fluidlift.state.frame"))
+        time.sleep(0.02)
+    assert len(seen) >= 3
 
 
 def test_two_fingers_come_nearer(browser, tmp_path):

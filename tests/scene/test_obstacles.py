@@ -82,7 +82,10 @@ def test_a_raft_floats_and_the_usd_file_shows_where(asset):
     from pxr import Gf, Usd, UsdGeom
 
     raft(asset)
-    assert main(["sim", str(asset), "--set", "show.usd=true", "--set", "show.usd_frames=true", "--duration", "0.4"]) in WELL
+    assert (
+        main(["sim", str(asset), "--set", "show.usd=true", "--set", "show.usd_frames=true", "--duration", "0.4"])
+        in WELL
+    )
     assert main(["validate", str(asset)]) == DONE
     assert read_manifest(asset)["simulation"]["obstacles"] == ["raft"]
     stage = Usd.Stage.Open(str(asset / "asset.usda"))

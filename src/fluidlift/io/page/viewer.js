@@ -248,6 +248,10 @@ function draw() {
 
 // ---------------------------------------------------------------- time and controls
 const frames = new Frames(page.range), clock = { frame: 0, at: 0, playing: false, last: 0, drawn: 0 };
+// until somebody touches it, the view swings to both sides, which shows that there is depth; the back is a guess
+const SWING = 0.2, ROUND = 14, swing = { on: true, time: 0, yaw: 0, last: 0 }; // radians, s
+function touched() { swing.on = false; }
+function still() { if (swing.on) orbit(-swing.yaw, 0); touched(); }
 function show(frame) {
   const last = Math.max(frames.all.length - 1, 0);
   clock.frame = Math.min(Math.max(Math.round(frame), 0), last); clock.at = clock.frame; dirty = true; tell();
@@ -263,8 +267,15 @@ function tick(now) {
   if (clock.playing && frames.all.length > 1) {
     if (clock.last) clock.at += (now - clock.last) / 1000 / page.interval * Number(el("speed").value);
     clock.last = now;
-    if (clock.at >= frames.all.length) clock.at = frames.all.length < page.frames ? frames.all.length - 1 : 0;
+    // a slow machine leaves frames out: the time that passed counts, over the end and on from the beginning
+    if (clock.at >= frames.all.length) clock.at = frames.all.length < page.frames ? frames.all.length - 1 : clock.at % frames.all.length;
     if (Math.floor(clock.at) !== clock.frame) { clock.frame = Math.floor(clock.at); dirty = true; tell(); }
+  }
+  if (swing.on && clock.playing) {
+    if (swing.last) swing.time += Math.min(now - swing.last, 250) / 1000;
+    const yaw = SWING * Math.sin(2 * Math.PI * swing.time / ROUND);
+    orbit(yaw - swing.yaw, 0);
+    Object.assign(swing, { yaw, last: now });
   }
   if (dirty && gl && !gl.isContextLost() && frames.all.length) { dirty = false; draw(); clock.drawn++; }
   requestAnimationFrame(tick);
@@ -283,6 +294,7 @@ function controls() {
   el("bodies").hidden = !page.bodies.length;
   el("full").onclick = full; el("full").hidden = !document.documentElement.requestFullscreen;
   el("view").onclick = () => setCamera(page.camera, page.target);
+  for (const kind of ["pointerdown", "wheel", "keydown"]) window.addEventListener(kind, touched, { capture: true, passive: true });
   new ResizeObserver(() => { dirty = true; }).observe(canvas);
   const held = new Map();
   canvas.addEventListener("pointerdown", (e) => { canvas.setPointerCapture(e.pointerId); held.set(e.pointerId, [e.clientX, e.clientY]); });
@@ -339,11 +351,12 @@ async function run() {
 }
 // for who puts the page into one of their own, and for tests
 window.fluidlift = {
-  show: (k) => { play(false); show(k); }, play, camera: (c) => setCamera(c, null), orbit, zoom,
+  show: (k) => { still(); play(false); show(k); }, play,
+  camera: (c) => { still(); setCamera(c, null); }, orbit: (yaw, pitch) => { still(); orbit(yaw, pitch); }, zoom: (by) => { still(); zoom(by); },
   terrain: (on) => { showGround = on; pressed("ground", on); dirty = true; },
   bodies: (on) => { showBodies = on; pressed("bodies", on); dirty = true; },
   background: (rgb) => { paint = rgb; dirty = true; },
-  get state() { return { frame: clock.frame, loaded: frames.all.length, drawn: clock.drawn, playing: clock.playing, dirty }; },
+  get state() { return { frame: clock.frame, loaded: frames.all.length, drawn: clock.drawn, playing: clock.playing, swinging: swing.on, yaw: swing.yaw, dirty }; },
 };
 window.fluidlift.ready = typeof DecompressionStream === "undefined" ? Promise.reject(new Error("this browser is too old: DecompressionStream is missing")) : run();
 window.fluidlift.ready.catch((error) => { fail(String(error.message || error)); });

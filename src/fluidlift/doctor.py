@@ -10,7 +10,7 @@ from importlib import metadata
 from importlib.util import find_spec
 
 from fluidlift import __version__
-from fluidlift.machine import available_memory
+from fluidlift.machine import available_memory, cores
 
 CORE = ("numpy", "scipy", "numba", "torch", "av", "opencv-python-headless", "usd-core", "trimesh")
 EXTRAS = {
@@ -32,7 +32,7 @@ def examine() -> dict[str, str]:
         "fluidlift": __version__,
         "python": platform.python_version(),
         "system": f"{platform.system()} {platform.machine()}",
-        "cores": str(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()),
+        "cores": str(cores()),
         "memory": f"{available_memory() / 1e9:.1f} GB free",
         "disk": f"{shutil.disk_usage(os.curdir).free / 1e9:.1f} GB free in this folder, "
         f"{shutil.disk_usage(tempfile.gettempdir()).free / 1e9:.1f} GB for temporary files",

@@ -25,6 +25,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from fluidlift.machine import cores
+
 PACKAGE = Path(__file__).parent
 LIST = PACKAGE / "kernels.json"
 
@@ -125,7 +127,7 @@ def compile_all(processes: int | None = None, told: Callable[[int, int], None] =
     """
     kernels = listed()
     reader, writer = os.pipe()  # all processes print into one, a line for each kernel
-    workers = [_worker(share, output=writer) for share in _shares(kernels, processes or os.cpu_count() or 1)]
+    workers = [_worker(share, output=writer) for share in _shares(kernels, processes or cores())]
     os.close(writer)
     with open(reader, encoding="utf-8") as lines:
         for done, _ in enumerate(lines, 1):
@@ -168,7 +170,7 @@ def compiling_beside(told: Callable[[str], None]) -> Iterator[None]:
     Args:
         told: called with a line for the user if there is something to compile.
     """
-    if compiled() or (os.cpu_count() or 1) < 2:
+    if compiled() or cores() < 2:
         yield
         return
     told("first run of this installation: compiling beside it, once")

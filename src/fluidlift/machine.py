@@ -42,3 +42,27 @@ def one_torch_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+THREADS = (
+    "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENCV_FOR_THREADS_NUM",
+)  # fmt: skip
+"""environment variables by which torch, NumPy, Numba and OpenCV are told how many threads they may start"""
+
+
+def cores() -> int:
+    """Processors that this process may use: those of its CPU set, or fewer where `OMP_NUM_THREADS` says so."""
+    found = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    with suppress(ValueError):
+        found = min(found, int(os.environ.get("OMP_NUM_THREADS", "")))
+    return max(found, 1)
+
+
+def group_memory(group: int) -> int:
+    """Resident bytes of all processes of a process group; 0 where the system does not tell (no /proc)."""
+    pages = 0
+    for process in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError, ValueError, IndexError):  # gone meanwhile
+            if int((process / "stat").read_text().rpartition(")")[2].split()[2]) == group:
+                pages += int((process / "statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE")

@@ -306,7 +306,8 @@ def test_it_swings_until_somebody_touches_it(browser, tmp_path):
 def test_a_slow_machine_leaves_frames_out_and_goes_on(browser, tmp_path):
     """Each picture takes longer than the whole film: what is shown are other frames each time, not the first."""
     path = page_of(tmp_path / "page.html", moving())
-    slow = "window.requestAnimationFrame = (f) => { window.late = (window.late || 0) + 710; return setTimeout(() => f(window.late), 5); };"
+    slow = """window.requestAnimationFrame = (f) => {
+      window.late = (window.late || 0) + 710; return setTimeout(() => f(window.late), 5); };"""
     visit = Visit(browser, path, slow)
     visit.run("fluidlift.play(true)")
     seen, end = set(), time.monotonic() + 20

@@ -1,6 +1,6 @@
 """The command line: parse, call, show.
 
-Exit codes: 0 done, 1 failed, 2 usage, 3 input rejected, 4 done with warnings.
+Exit codes: 0 done, 1 failed, 2 usage, 3 input rejected, 4 done with warnings, 143 told to end by SIGTERM.
 """
 
 from __future__ import annotations
@@ -65,13 +65,16 @@ Command = (
     | Doctor
 )
 DONE, FAILED, USAGE, REJECTED, WITH_WARNINGS = 0, 1, 2, 3, 4
+TERMINATED = 128 + signal.SIGTERM
+"""what a process that SIGTERM ended is expected to exit with"""
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run one command; the exit code."""
     try:
-        with _terminated_as_interrupted():
+        with _terminated_as_interrupted() as terminated:
             code = _run(list(sys.argv[1:] if argv is None else argv))
+            code = TERMINATED if terminated.is_set() else code
         sys.stdout.flush()
         return code
     except BrokenPipeError:  # who reads along, such as head, has seen enough; what is buffered goes nowhere
@@ -81,15 +84,22 @@ def main(argv: list[str] | None = None) -> int:
 
 
 @contextlib.contextmanager
-def _terminated_as_interrupted() -> Iterator[None]:
-    """SIGTERM, which schedulers and containers send, ends a run as Ctrl-C does: what is finished is kept, and said."""
+def _terminated_as_interrupted() -> Iterator[threading.Event]:
+    """SIGTERM, which schedulers and containers send, ends a run as Ctrl-C does: what is finished is kept, and said.
+    Gives what is set once it came."""
+    terminated = threading.Event()
     ours = threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
     if not ours:
-        yield
+        yield terminated
         return
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+
+    def interrupt(number: int, frame: Any) -> None:
+        terminated.set()
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGTERM, interrupt)
     try:
-        yield
+        yield terminated
     finally:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
@@ -163,10 +173,11 @@ def _make(c: Make) -> int:
         from fluidlift.cli.generators import accepted_by_asking
 
         config = accepted_by_asking(config)
-    return _run_job(
+    code = _run_job(
         c.clip, c.out or default_folder(c.clip), config, mask=c.input.mask, camera=c.input.camera, depth=c.input.depth,
         geometry=b.geometry_from, flow=c.input.flow, force=c.settings.force, as_json=c.json,
     )  # fmt: skip
+    return DONE if c.warnings_ok and code == WITH_WARNINGS else code
 
 
 def _as_settings(args: list[str]) -> list[str]:

@@ -2,33 +2,20 @@
 
 from __future__ import annotations
 
-import contextlib
-import dataclasses
-import difflib
 import json
-import os
-import reprlib
-import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 
 from fluidlift.cli.options import MOVED, Make, options_of
-from fluidlift.cli.quantities import command
+from fluidlift.cli.quantities import Bytes, Seconds, command
 from fluidlift.errors import InputRejected
 
-VIDEOS = frozenset({".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".mxf", ".gif"})
-LISTS = (".yaml", ".yml")
-SUMMARY = "batch.json"
-_OUTCOMES = {0: "done", 2: "rejected", 3: "rejected", 4: "done, warnings"}
-_WELL = ("done", "done, warnings")
-_OURS = ("clip", "out", "json", "print_config")
+_OURS = ("clip", "out", "json", "print_config", "warnings_ok")
 """options of make that the batch itself gives"""
 
 
@@ -37,211 +24,151 @@ class Batch:
     """Turn many clips into assets; a clip that fails does not stop the others, and the same command goes on."""
 
     clips: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="CLIPS")]
-    """clips, folders of videos, or a list (.yaml) of shots, each with options of make"""
-    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """folder for the assets (NAME.fluid), their logs (NAME.log) and the summary (batch.json)"""
+    """clips, folders of videos, or a list (.yaml) of shots, each with options of make; with --status the folder"""
+    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """folder for the assets (NAME.fluid), their logs (NAME.log), what became of each (NAME.state.json) and the summary
+    (batch.json); needed but for --status"""
     jobs: int = 1
-    """clips at a time; each takes the memory of a make of its own"""
+    """clips at a time; each takes the memory of a make of its own, and its share of the cores"""
     preset: str | None = None
     """of all shots that name none: draft, standard, hero"""
     config: Path | None = None
     """YAML file with settings, of all shots that name none"""
     set: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default_factory=tuple)
     """one setting for all shots; may be repeated"""
+    time_limit: Seconds | None = None
+    """that a shot may take, such as 30min; it counts as failed then"""
+    memory_limit: Bytes | None = None
+    """that a shot may take, such as 8GB; it counts as failed then"""
+    retry: Literal["input", "memory", "time", "crash", "stopped"] | None = None
+    """make only those shots again that failed like this"""
+    shard: str | None = None
+    """i/n: every n-th shot from the i-th on, for tasks of a farm; their states lie in one folder"""
+    plan: Literal["openjd", "slurm", "commands"] | None = None
+    """write a job for a scheduler into the folder instead, one task per shot: an Open Job Description, a Slurm array
+    script, or a command per line"""
+    status: bool = False
+    """tell how far a folder is, and make nothing"""
+    csv: bool = False
+    """with --status: a row per shot"""
+    html: bool = False
+    """with --status: write status.html, a page with pictures of all shots, the most doubtful first"""
+    progress: Literal["lines", "openjd"] = "lines"
+    """how progress is told; openjd: as tasks of Open Job Description do"""
+    warnings_ok: bool = False
+    """end with 0 instead of 4 where assets have warnings: farms take any other code for a failure"""
     json: bool = False
     """print the summary as JSON"""
 
 
-@dataclass(frozen=True)
-class Shot:
-    """One clip, the name of its asset, and the options of make that it has of its own."""
-
-    clip: Path
-    name: str
-    options: dict[str, Any]
-
-    def arguments(self, folder: Path) -> list[str]:
-        """Of the command line that makes it, below `folder`."""
-        told = ["make", str(self.clip), "--out", str(folder / f"{self.name}.fluid"), "--json"]
-        for key, value in self.options.items():
-            values = value if isinstance(value, list | tuple) else [value]
-            told += [f"--{key.replace('_', '-')}={v}" for v in values]
-        return told
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """How the make of one shot ended."""
-
-    name: str
-    outcome: str
-    """done, "done, warnings", rejected or failed"""
-    seconds: float
-    asset: str
-    log: str
-    warnings: list[str]
-    reason: str
-    """what a make that failed said last"""
-
-    def line(self) -> str:
-        """For people."""
-        warned = f" ({len(self.warnings)} warnings)" if self.warnings else ""
-        return f"{self.name}: {self.outcome.partition(',')[0]} in {self.seconds:.0f} s{warned}" + (
-            f": {self.reason}" if self.reason else ""
-        )
-
-
-def run(command: Batch) -> int:
+def run(wanted: Batch) -> int:
     """Make every shot; the exit code: 0 all done, 4 some with warnings, 1 some failed.
 
     Raises:
         InputRejected: a list that cannot be used, two shots of one name, no clips; nothing was made.
     """
+    from fluidlift.farm.shots import ShotOptions, read_shots, shard_of
+
+    if wanted.status:
+        return _status(wanted)
+    if wanted.out is None:
+        raise InputRejected("no -o", "the folder for the assets, such as -o assets/")
+    if wanted.csv or wanted.html:
+        raise InputRejected("--csv or --html without --status", "fluidlift batch FOLDER --status --html")
+    if wanted.jobs < 1:
+        raise InputRejected(f"--jobs {wanted.jobs}", "a whole number of 1 or more")
+    base: dict[str, Any] = {"preset": wanted.preset, "config": wanted.config and wanted.config.absolute()}
+    kinds = options_of(Make) | dict.fromkeys(MOVED, "")
+    shots = read_shots(
+        wanted.clips, ShotOptions({k: v for k, v in kinds.items() if k not in _OURS}),
+        base={k: v for k, v in base.items() if v is not None}, settings=wanted.set,
+    )  # fmt: skip
+    return _plan(wanted, len(shots)) if wanted.plan else _make(wanted, wanted.out, shard_of(shots, wanted.shard))
+
+
+def _make(wanted: Batch, out: Path, shots: list) -> int:
+    from fluidlift.farm.engine import Limits, make_shots
+    from fluidlift.farm.summary import SUMMARY, summarise
     from fluidlift.io.atomic import require_writable
 
-    shots = _shots(command)
-    folder = command.out.absolute()
-    require_writable(command.out)
+    require_writable(out)
+    folder = out.absolute()
     folder.mkdir(parents=True, exist_ok=True)
-    ended: dict[str, Outcome] = {}
-    tell = print if not command.json else lambda text: print(text, file=sys.stderr)
-    for outcome in _all_made(shots, folder, command.jobs, tell):
-        ended[outcome.name] = outcome
-        tell(f"[{len(ended)}/{len(shots)}] {outcome.line()}")
-        _summarise([ended[s.name] for s in shots if s.name in ended], folder)
-    outcomes = list(ended.values())
-    bad = [o for o in outcomes if o.outcome not in _WELL]
-    if command.json:
+    limits = Limits(wanted.jobs, wanted.time_limit, wanted.memory_limit, wanted.retry)
+    tell, part = _told(wanted)
+    outcomes = []
+    for outcome in make_shots(shots, folder, limits, tell, part):
+        outcomes.append(outcome)
+        tell(f"[{len(outcomes)}/{len(shots)}] {outcome.line()}")
+        summarise(folder)
+    summarise(folder)
+    bad = [o for o in outcomes if not o.well]
+    if wanted.json:
         print((folder / SUMMARY).read_text(encoding="utf-8"), end="")
     else:
-        print(f"{len(outcomes) - len(bad)} of {len(outcomes)} made; summary: {command.out / SUMMARY}")
-    return 1 if bad else 4 if any(o.warnings for o in outcomes) else 0
+        print(f"{len(outcomes) - len(bad)} of {len(outcomes)} made; summary: {out / SUMMARY}")
+    return 1 if bad else 4 if any(o.warnings for o in outcomes) and not wanted.warnings_ok else 0
 
 
-def _shots(command: Batch) -> list[Shot]:
-    """All that the command names, in its order."""
-    if command.jobs < 1:
-        raise InputRejected(f"--jobs {command.jobs}", "a whole number of 1 or more")
-    base: dict[str, Any] = {"preset": command.preset, "config": command.config and command.config.absolute()}
-    base = {k: v for k, v in base.items() if v is not None}
-    shots: list[Shot] = []
-    for path in command.clips:
-        rows: list[dict[str, Any]]
-        if path.suffix.lower() in LISTS:
-            rows = _listed(path)
-        elif path.is_dir() and (videos := _videos(path)):
-            rows = [{"clip": v} for v in videos]
-        else:
-            rows = [{"clip": path.absolute()}]
-        for row in rows:
-            clip = row.pop("clip")
-            name = str(row.pop("name", clip.stem or "clip"))
-            row["set"] = [*command.set, *row.get("set", ())]
-            shots.append(Shot(clip, name, base | row))
-    _require_names(shots)
-    return shots
+def _told(wanted: Batch) -> tuple[Callable[[str], None], Callable[[str], None]]:
+    """Who prints lines for people, and how far the stages of a shot are, as "done of all"."""
+
+    def line(text: str) -> None:
+        print(f"openjd_status: {text}" if wanted.progress == "openjd" else text,
+              file=sys.stderr if wanted.json else sys.stdout, flush=True)  # fmt: skip
+
+    def part(text: str) -> None:
+        done, _, count = text.partition("/")
+        print(f"openjd_progress: {100 * (int(done) - 1) / int(count):.1f}", flush=True)
+
+    single = wanted.progress == "openjd" and wanted.jobs == 1
+    return line, part if single else (lambda text: None)
 
 
-def _videos(folder: Path) -> list[Path]:
-    """Those in a folder, by name; none in a folder of numbered pictures, which is itself a clip."""
-    return sorted(p.absolute() for p in folder.iterdir() if p.suffix.lower() in VIDEOS and p.is_file())
+def _plan(wanted: Batch, shots: int) -> int:
+    """Write a job instead of doing it; paths in it are absolute, as other machines of the farm see them."""
+    from fluidlift.farm.plans import Plan, written
+    from fluidlift.io.atomic import require_writable
+    from fluidlift.machine import cores
+
+    assert wanted.out is not None and wanted.plan is not None
+    require_writable(wanted.out)
+    folder = wanted.out.absolute()
+    folder.mkdir(parents=True, exist_ok=True)
+    arguments = [str(p.absolute()) for p in wanted.clips] + ["-o", str(folder)]
+    given = {"preset": wanted.preset, "config": wanted.config and wanted.config.absolute(),
+             "time-limit": wanted.time_limit, "memory-limit": wanted.memory_limit}  # fmt: skip
+    arguments += [f"--{name}={value}" for name, value in given.items() if value is not None]
+    arguments += [f"--set={text}" for text in wanted.set]
+    plan = Plan(arguments, shots, min(cores(), TASK_CORES), wanted.memory_limit or TASK_MEMORY, wanted.time_limit)
+    path = written(wanted.plan, plan, folder)
+    print(f"{shots} tasks; plan: {path}\nIts paths are those of this machine: they must be the same on the farm's.")
+    return 0
 
 
-def _require_names(shots: list[Shot]) -> None:
-    if not shots:
-        raise InputRejected("no clip", "clips, folders of videos, or a list of shots (.yaml)")
-    seen: dict[str, Path] = {}
-    for shot in shots:
-        if not shot.name or shot.name.startswith((".", "-")) or any(c in shot.name for c in '/\\:*?"<>|\0'):
-            raise InputRejected(f"the name '{shot.name}' of {shot.clip.name}", "a name that a folder can have")
-        if shot.name in seen:
-            raise InputRejected(
-                f"two shots are called {shot.name}: {seen[shot.name]} and {shot.clip}",
-                "a name for each", "give one of them a name: in a list of shots",
-            )  # fmt: skip
-        seen[shot.name] = shot.clip
+TASK_CORES = 2
+"""of a task of a farm: a make is 1.5 times as fast on two as on one, and little faster on more"""
+TASK_MEMORY = 4e9
+"""bytes; of 15 clips of 512 px the largest took 1.8 GB"""
 
 
-def _listed(path: Path) -> list[dict[str, Any]]:
-    """The rows of a list, checked, with paths from where the list lies."""
-    from fluidlift.io.yaml_reader import read_yaml
+def _status(wanted: Batch) -> int:
+    from fluidlift.farm.summary import as_csv, status_of
+    from fluidlift.io.atomic import write_bytes
 
-    needed = "a list: - clip: river.mp4, and below it options of make such as size: 4"
-    rows = read_yaml(path, "list of shots")
-    if not isinstance(rows, list) or not rows:
-        raise InputRejected(f"{path.name} holds no list", needed)
-    return [_row(row, f"{path.name}, shot {k}", path.absolute().parent) for k, row in enumerate(rows, 1)]
+    folder = wanted.out or wanted.clips[0]
+    if not folder.is_dir():
+        raise InputRejected(f"'{folder}'", "the folder of a batch")
+    found = status_of(folder)
+    if wanted.json:
+        print(json.dumps(found.to_dict(), indent=1))
+    elif wanted.csv:
+        print(as_csv(found.outcomes), end="")
+    else:
+        print("\n".join(found.lines()))
+    if wanted.html:
+        from fluidlift.farm.page import page
 
-
-def _row(row: Any, where: str, folder: Path) -> dict[str, Any]:
-    row = {"clip": row} if isinstance(row, str) else row
-    if not isinstance(row, dict) or not isinstance(row.get("clip"), str):
-        raise InputRejected(f"{where} names no clip", "clip: and the name of a file")
-    kinds = options_of(Make) | dict.fromkeys(MOVED, "")
-    known = ["clip", "name", *(k for k in kinds if k not in _OURS)]
-    found: dict[str, Any] = {}
-    for key, value in row.items():
-        key = str(key).replace("-", "_")
-        if key not in known:
-            near = difflib.get_close_matches(key, known, 1)
-            hint = f"did you mean {near[0]}?" if near else "one of " + ", ".join(known)
-            raise InputRejected(f"{where}: unknown option '{key}'", hint)
-        several = "UseAppendAction" in kinds.get(key, "")
-        values = value if isinstance(value, list) and several else [value]
-        if not all(isinstance(v, str | int | float) and not isinstance(v, bool) for v in values):
-            needed = "a word or a number" + (", or a list of them" * several)
-            raise InputRejected(f"{where}: {key}: {reprlib.repr(value)}", needed)
-        if key == "clip" or "Path" in kinds.get(key, ""):
-            found[key] = folder / os.path.expanduser(str(value))  # pathlib raises where there is no such user
-        else:
-            found[key] = [str(v) for v in values] if several else value
-    return found
-
-
-def _all_made(shots: list[Shot], folder: Path, jobs: int, tell: Callable[[str], None]) -> Iterator[Outcome]:
-    """Each shot as it ends. Stopped with Ctrl-C, the makes that run are stopped too; what they finished is kept."""
-    running: list[subprocess.Popen] = []
-    with ThreadPoolExecutor(jobs) as pool:
-        waiting = [pool.submit(_made, shot, folder, running, tell) for shot in shots]
-        try:
-            for one in as_completed(waiting):
-                yield one.result()
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            for process in running:
-                process.terminate()
-            raise
-
-
-def _made(shot: Shot, folder: Path, running: list[subprocess.Popen], tell: Callable[[str], None]) -> Outcome:
-    log, began = folder / f"{shot.name}.log", time.monotonic()
-    tell(f"{shot.name}: begun, {log.name} tells how far it is")
-    with log.open("w", encoding="utf-8") as said:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "fluidlift.cli", *shot.arguments(folder)],
-            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=said, text=True, encoding="utf-8",
-        )  # fmt: skip
-        running.append(process)
-        told, _ = process.communicate()
-    outcome = _OUTCOMES.get(process.returncode, "failed")
-    warnings: list[str] = []
-    with contextlib.suppress(ValueError, KeyError, TypeError):
-        warnings = [str(w) for w in json.loads(told)["warnings"]]
-    reason = "" if outcome in _WELL else _last_words(log, process.returncode)
-    asset = folder / f"{shot.name}.fluid"
-    return Outcome(shot.name, outcome, round(time.monotonic() - began, 1), str(asset), str(log), warnings, reason)
-
-
-def _last_words(log: Path, code: int) -> str:
-    """What a make said last, on one line; of a wrong option what is wrong with it, without the frame around it."""
-    lines = [" ".join(t.replace("│", " ").split()) for t in log.read_text("utf-8", "replace").splitlines()]
-    lines = [t for t in lines if any(c.isalnum() for c in t)]
-    own = [t for t in lines if t.startswith(("fluidlift: ", "Error parsing"))]
-    return (own or lines or [f"ended with {code}"])[-1].removeprefix("fluidlift: ")
-
-
-def _summarise(outcomes: list[Outcome], folder: Path) -> None:
-    from fluidlift.io.atomic import atomic_write
-
-    with atomic_write(folder / SUMMARY) as file:
-        file.write((json.dumps([dataclasses.asdict(o) for o in outcomes], indent=1) + "\n").encode())
+        write_bytes(folder / "status.html", page(folder, found).encode())
+        print(f"page: {folder / 'status.html'}", file=sys.stderr)
+    return 0

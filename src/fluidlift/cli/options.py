@@ -119,6 +119,8 @@ class Make:
     """asset folder to write; by default the clip's name with .fluid, in the current folder"""
     json: bool = False
     """print the outcome as JSON"""
+    warnings_ok: bool = False
+    """end with 0 instead of 4 where the asset has warnings"""
     input: tyro.conf.OmitArgPrefixes[Input] = field(default_factory=Input)
     """files beside the clip; what is not given is estimated"""
     scene: tyro.conf.OmitArgPrefixes[Scene] = field(default_factory=Scene)

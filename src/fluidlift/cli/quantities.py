@@ -9,7 +9,7 @@ from typing import Annotated, Any, TypeVar, dataclass_transform, get_type_hints
 import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
-from fluidlift.types.quantity import DEGREES, METRES, SECONDS, quantity
+from fluidlift.types.quantity import BYTES, DEGREES, METRES, SECONDS, quantity
 
 Class = TypeVar("Class", bound=type)
 
@@ -30,6 +30,8 @@ Metres = Annotated[float, _spec("METRES", METRES)]
 """such as 0.1, 10cm or "4 in" """
 Degrees = Annotated[float, _spec("DEGREES", DEGREES)]
 """such as 12, 12deg or 0.2rad"""
+Bytes = Annotated[float, _spec("BYTES", BYTES)]
+"""such as 8GB or 512MiB"""
 
 _NO_DEFAULTS = ("not given", "False", "")
 HINT = tyro.conf.arg(help_behavior_hint=lambda label: "" if label in _NO_DEFAULTS else f"(default: {label})")

@@ -10,7 +10,6 @@ what that is.
 from __future__ import annotations
 
 import math
-import os
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -35,6 +34,7 @@ from fluidlift.fit.problem import FitProblem, build_problem
 from fluidlift.fit.ranges import UNITS, ParameterSpace, parameter_space
 from fluidlift.fit.scene import FitScene, WindowPlan, build_scene, plan_windows
 from fluidlift.fit.settings import DEFAULT_FREE, SCALES, FitOptions
+from fluidlift.machine import cores
 from fluidlift.numerics.poisson import PoissonSystem
 from fluidlift.types import (
     CellType,
@@ -163,7 +163,7 @@ def fit_parameters(
 
 def _budget(options: FitOptions, progress: Progress | None) -> Budget:
     # a device is busy with one window
-    workers = 1 if options.device != "cpu" else options.workers or os.cpu_count() or 1
+    workers = 1 if options.device != "cpu" else options.workers or cores()
     return Budget(time.monotonic() + options.max_seconds, options.max_rollouts, options.max_work, workers, progress)
 
 

@@ -101,24 +101,44 @@ def require_not_written(folder: Path | str) -> None:
 
 
 @contextmanager
-def _locked(folder: Path, name: str, work: str, *, wait: float, do: str) -> Iterator[None]:
-    path = asset_file(folder, name)
+def held(path: Path, work: str, *, wait: float = 0.0) -> Iterator[bool]:
+    """Try to hold a lock while the block runs; whether it is ours.
+
+    Args:
+        path: of the lock file, which is made; no link is followed.
+        work: what is done, in words, for others to read; empty: only to see whether it is free.
+        wait: s to wait for it.
+    """
     with disk_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         file = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o644)
     try:
         until = time.monotonic() + wait
-        while not _taken(file, fcntl.LOCK_EX):
-            if time.monotonic() >= until:
-                raise InputRejected(
-                    f"'{folder.name}' is being changed by {_holder(file)}", "one at a time", do
-                )  # fmt: skip
+        while not (ours := _taken(file, fcntl.LOCK_EX)) and time.monotonic() < until:
             time.sleep(_POLL)
-        note = json.dumps({"pid": os.getpid(), "work": work}).encode()
-        with suppress(OSError):  # a full disk: the lock holds all the same
-            os.ftruncate(file, 0)
-            os.pwrite(file, note, 0)
+        if ours and work:
+            note = json.dumps({"pid": os.getpid(), "work": work}).encode()
+            with suppress(OSError):  # a full disk: the lock holds all the same
+                os.ftruncate(file, 0)
+                os.pwrite(file, note, 0)
+        yield ours
+    finally:
+        os.close(file)
+
+
+@contextmanager
+def _locked(folder: Path, name: str, work: str, *, wait: float, do: str) -> Iterator[None]:
+    path = asset_file(folder, name)
+    with held(path, work, wait=wait) as ours:
+        if not ours:
+            raise InputRejected(f"'{folder.name}' is being changed by {_holder_of(path)}", "one at a time", do)
         yield
+
+
+def _holder_of(path: Path) -> Holder:
+    file = os.open(path, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0))
+    try:
+        return _holder(file)
     finally:
         os.close(file)
 

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 SECONDS: Mapping[str, float] = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0}
 METRES: Mapping[str, float] = {"m": 1.0, "cm": 0.01, "mm": 1e-3, "km": 1e3, "in": 0.0254, "ft": 0.3048}
 DEGREES: Mapping[str, float] = {"deg": 1.0, "°": 1.0, "degrees": 1.0, "rad": 180.0 / math.pi}
+BYTES: Mapping[str, float] = {"B": 1.0, "KB": 1e3, "MB": 1e6, "GB": 1e9, "MiB": 2.0**20, "GiB": 2.0**30}
 OF_UNIT: Mapping[str, Mapping[str, float]] = {
     "kg/m^3": {"kg/m^3": 1.0, "g/cm^3": 1e3, "g/ml": 1e3, "kg/l": 1e3},
     "m^2/s": {"m^2/s": 1.0, "mm^2/s": 1e-6, "cm^2/s": 1e-4, "St": 1e-4, "cSt": 1e-6},

@@ -92,7 +92,8 @@ def show(
             terrain=scene.terrain.mesh,
             camera=scene.camera,
             bodies=[
-                MovingMesh(o.name, o.mesh, poses[:told, b, :3], poses[:told, b, 3:]) for b, o in enumerate(scene.obstacles)
+                MovingMesh(o.name, o.mesh, poses[:told, b, :3], poses[:told, b, 3:])
+                for b, o in enumerate(scene.obstacles)
             ],
             attributes=scene.parameters.to_dict() | {"kind": scene.kind},
         )

@@ -1,0 +1,134 @@
+"""What became of each shot: one small file beside its asset, and one lock while somebody makes it.
+
+A shot is finished when the file says so, its fingerprint is that of the shot that is asked for, and the asset's
+manifest is the one that was written then. Several batches, machines and schedulers may share one folder: who holds a
+shot's lock makes it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from fluidlift.farm.shots import is_name
+from fluidlift.io.asset_lock import held
+from fluidlift.io.atomic import atomic_write
+from fluidlift.io.hashes import digest
+
+STATE, LOCK, LOG = ".state.json", ".lock", ".log"
+"""suffixes of a shot's files, beside NAME.fluid"""
+LISTED = "shots.json"
+"""names of all shots of a folder, in the order in which batches named them"""
+WELL = ("done", "done, warnings")
+FAILURES = ("input", "memory", "time", "crash", "stopped")
+"""classes of failure: what `make` refuses; memory or time ran out; it broke down; it was told to end"""
+_LARGEST = 1 << 20
+"""bytes of a state file that are read: warnings are some hundred characters each"""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How the make of one shot ended."""
+
+    name: str
+    outcome: str
+    """done, "done, warnings", rejected or failed"""
+    seconds: float
+    asset: str
+    log: str
+    warnings: list[str] = field(default_factory=list)
+    reason: str = ""
+    """what a make that failed said last"""
+    failure: str = ""
+    """one of `FAILURES`, or empty"""
+    verdict: str = ""
+    """of the asset, as filmed: good, usable, does not hold; empty: not measured"""
+    peak_memory_mb: float = 0.0
+    host: str = ""
+    version: str = ""
+    """of fluidlift"""
+    ended: str = ""
+    """UTC, for people: clocks of machines differ"""
+    fingerprint: str = ""
+    manifest: str = ""
+    """SHA-256 of the asset's manifest.json"""
+
+    @property
+    def well(self) -> bool:
+        """It became an asset."""
+        return self.outcome in WELL
+
+    def line(self) -> str:
+        """For people."""
+        warned = f" ({len(self.warnings)} warnings)" if self.warnings else ""
+        return f"{self.name}: {self.outcome.partition(',')[0]} in {self.seconds:.0f} s{warned}" + (
+            f": {self.reason}" if self.reason else ""
+        )
+
+
+def read_outcome(folder: Path, name: str) -> Outcome | None:
+    """What became of a shot; None where nothing has, or what is there is damaged."""
+    with suppress(OSError, ValueError, TypeError):
+        with os.fdopen(os.open(folder / f"{name}{STATE}", os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0)), "rb") as file:
+            found = json.loads(file.read(_LARGEST))
+        known = {f.name: type(f.default) for f in fields(Outcome)}
+        if found["name"] == name and all(isinstance(found[k], str) for k in ("outcome", "failure", "fingerprint")):
+            return Outcome(**{k: v for k, v in found.items() if k in known})
+    return None
+
+
+def write_outcome(folder: Path, outcome: Outcome) -> None:
+    """Beside the asset, whole or not at all."""
+    with atomic_write(folder / f"{outcome.name}{STATE}") as file:
+        file.write((json.dumps(asdict(outcome), indent=1) + "\n").encode())
+
+
+def is_finished(folder: Path, found: Outcome | None, fingerprint: str) -> bool:
+    """Whether nothing is left to do for a shot of this fingerprint."""
+    if found is None or not found.well or found.fingerprint != fingerprint:
+        return False
+    return manifest_digest(folder, found.name) == found.manifest != ""
+
+
+def manifest_digest(folder: Path, name: str) -> str:
+    """SHA-256 of the manifest of a shot's asset; empty where there is none."""
+    path = folder / f"{name}.fluid" / "manifest.json"
+    return digest(path) if path.is_file() and not path.is_symlink() and not path.parent.is_symlink() else ""
+
+
+@contextmanager
+def claimed(folder: Path, name: str) -> Iterator[bool]:
+    """Whether this process may make a shot; it alone does while the block runs."""
+    with held(folder / f"{name}{LOCK}", f"making {name}") as ours:
+        yield ours
+
+
+def is_running(folder: Path, name: str) -> bool:
+    """Whether somebody on this machine, or on a file system whose locks reach further, makes a shot."""
+    if not (folder / f"{name}{LOCK}").is_file():
+        return False
+    with held(folder / f"{name}{LOCK}", "") as ours:
+        return not ours
+
+
+def names_of(folder: Path) -> list[str]:
+    """Shots of a folder: those that batches put on its list, then others that something is known of."""
+    listed: Any = []
+    with suppress(OSError, ValueError):
+        listed = json.loads((folder / LISTED).read_bytes())
+    names = [n for n in listed if isinstance(n, str) and is_name(n)] if isinstance(listed, list) else []
+    others = sorted(p.name.removesuffix(STATE) for p in folder.glob(f"*{STATE}"))
+    return list(dict.fromkeys([*names, *others]))
+
+
+def list_names(folder: Path, names: list[str]) -> None:
+    """Put shots on the folder's list, after those that other batches put there."""
+    with held(folder / ".shots.lock", "a list of shots", wait=10.0):
+        text = json.dumps(list(dict.fromkeys([*names_of(folder), *names])), indent=1)
+        with atomic_write(folder / LISTED) as file:
+            file.write((text + "\n").encode())

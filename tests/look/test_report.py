@@ -122,3 +122,13 @@ def test_pictures_need_not_be_contiguous(picture):
 def test_lists_and_odd_values_in_tables_are_text():
     text = " ".join(Collector(page(sections=[Section("x", rows=[[[1.0, 2.5], None, True, float("nan")]])])).text)
     assert "1, 2.5" in text and "None" in text and "nan" in text
+
+
+def test_commands_are_shown_as_they_are_typed_and_wide_pictures_over_the_whole_width():
+    section = Section(
+        "Next", [Figure(np.zeros((4, 16, 3), np.uint8), "two"), Figure(np.zeros((8, 8, 3), np.uint8), "one")],
+        commands=[("fluidlift view 'a b.fluid'", "look <around>"), ("fluidlift sim", "longer")],
+    )  # fmt: skip
+    page = report_html("t", "s", [section], warnings=[], links={})
+    assert "<pre>fluidlift view &#x27;a b.fluid&#x27;   # look &lt;around&gt;\nfluidlift sim                " in page
+    assert page.count("<figure class=wide>") == 1 and page.count("<figure>") == 1

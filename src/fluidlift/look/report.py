@@ -22,7 +22,9 @@ h1{font-size:27px;margin:0 0 4px}h2{font-size:19px;margin:36px 0 10px;border-bot
 padding-bottom:4px}
 .figures{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(100%,320px),1fr));gap:16px;margin:12px 0}
 figure{margin:0;background:var(--card);border:1px solid var(--line);border-radius:8px;overflow:hidden}
-figure img{display:block;width:100%;height:auto;image-rendering:auto}
+figure img{display:block;width:100%;height:auto;image-rendering:auto;cursor:zoom-in}
+figure.wide,figure:focus-within{grid-column:1/-1}
+pre{background:var(--card);border:1px solid var(--line);border-radius:8px;padding:10px 12px;overflow-x:auto}
 figcaption{padding:8px 12px 10px;font-size:13.5px}figcaption .good{color:var(--soft);display:block;margin-top:2px}
 video{width:100%;border-radius:8px;background:#000}
 .table{overflow-x:auto}table{border-collapse:collapse;margin:8px 0}
@@ -31,6 +33,9 @@ td,th{padding:4px 14px 4px 0;text-align:left;border-bottom:1px solid var(--line)
 .ok{background:var(--ok);border-left:4px solid var(--ok-edge);padding:8px 12px;margin:6px 0}
 .sub{color:var(--soft);margin:0 0 12px}
 """
+WIDE = 1.7
+"""width over height from which a picture, two side by side for instance, takes the whole width at once; others do while
+they are clicked"""
 
 
 @dataclass(frozen=True)
@@ -52,6 +57,8 @@ class Section:
     rows: Sequence[Sequence[Any]] = ()
     header: Sequence[str] = ()
     notes: Sequence[str] = field(default_factory=tuple)
+    commands: Sequence[tuple[str, str]] = ()
+    """to be typed, each with what it does"""
 
 
 def report_html(
@@ -90,6 +97,10 @@ def report_html(
     for section in sections:
         parts.append(f"<h2>{html.escape(section.title)}</h2>")
         parts += [f"<p>{html.escape(note)}</p>" for note in section.notes]
+        if section.commands:
+            width = max(len(command) for command, _ in section.commands)
+            lines = [f"{command:{width}}   # {what}" for command, what in section.commands]
+            parts.append(f"<pre>{html.escape(chr(10).join(lines))}</pre>")
         if section.rows:
             parts.append(_table(section.header, section.rows))
         if section.figures:
@@ -115,8 +126,9 @@ def _figure(figure: Figure) -> str:
     data = base64.b64encode(png_bytes(figure.picture)).decode()
     alt = html.escape(figure.text)
     good = f"<span class=good>Good: {html.escape(figure.good)}.</span>" if figure.good else ""
-    picture = f"<img alt='{alt}' src='data:image/png;base64,{data}'>"
-    return f"<figure>{picture}<figcaption>{alt}.{good}</figcaption></figure>"
+    picture = f"<img tabindex=0 alt='{alt}' src='data:image/png;base64,{data}'>"
+    wide = " class=wide" if figure.picture.shape[1] > WIDE * figure.picture.shape[0] else ""
+    return f"<figure{wide}>{picture}<figcaption>{alt}.{good}</figcaption></figure>"
 
 
 def png_bytes(picture: UInt8[np.ndarray, "h w 3"]) -> bytes:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from fluidlift.fit.outcome import TIES, how_sure, in_words
 from fluidlift.io.asset_paths import asset_file
+from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.look.report import Figure, Section, report_html
 from fluidlift.present.as_filmed import card_of
 from fluidlift.types import CellType
@@ -50,6 +52,7 @@ def write_report(
         _section_motion(lift),
         _section_parameters(lift.fit, lift.geometry.scale_sentence),
         _section_simulation(simulation),
+        _section_next(folder),
         Section(
             "Time and memory",
             rows=[
@@ -69,6 +72,22 @@ def write_report(
         links={"preview": "preview.mp4", "USD": "asset.usda", "parameters": "parameters.json", "scene": "scene.yaml"},
     )
     return write_bytes(folder / "report.html", page.encode())
+
+
+def _section_next(folder: Path) -> Section:
+    """What an asset is made for, as commands."""
+    name = shlex.quote(folder.name)
+    return Section(
+        "What next",
+        notes=["In the folder that holds the asset:"],
+        commands=[
+            (f"fluidlift view {name}", "look around it, change it, see the change"),
+            (f"fluidlift edit {name} --material honey", "or --set, --add, --remove; --undo takes it back"),
+            (f"fluidlift sim {name} --duration 20", "longer, or with the edits"),
+            (f"fluidlift render {name} -o turn.mp4 --view turn", "from any camera, also with --look surface"),
+            (f"fluidlift export {name} -o page.html --to html", "or mesh, usd, vdb, splats, gltf for other tools"),
+        ],
+    )
 
 
 def _film(path: Path) -> bytes:
@@ -100,7 +119,8 @@ def _section_outcome(lift: Lift, seen: Shown) -> Section:
         figures.append(
             Figure(
                 pair,
-                f"Frame {start + k}: the clip (left) and the re-simulation from the same camera (right)",
+                f"Frame {FIRST_FRAME + k}, {k * clip.interval:.2f} s: the clip (left) and the re-simulation from "
+                "the same camera (right)",
                 "same outline and colours; the pattern need not be the same, how it moves should be",
             )
         )
@@ -115,7 +135,7 @@ def _section_seeing(lift: Lift, overlay) -> Section:
     figures = [
         Figure(
             overlay(clip.frames[t], labels.labels[t]),
-            f"Frame {t}: what is taken for fluid is tinted, solids in it are marked",
+            f"The clip at {t * clip.interval:.2f} s: what is taken for fluid is tinted, solids in it are marked",
             "the tint covers the fluid up to its edge and nothing else; correct it with fluidlift mask",
         )
         for t in pick
@@ -252,7 +272,8 @@ def _section_parameters(fit: Fit, scale: str) -> Section:
                 "falls and levels out; it may rise again once the noise is known and priors count",
             )
         )
-    how = {"fitted": "The fit converged.", "unfinished": "The fit did not converge: best values so far.",
+    how = {"fitted": "The fit converged: misfit over its noise and priors together fall no more.",
+           "unfinished": "The fit did not converge: best values so far.",
            "left": f"Not fitted: {fit.reason}."}  # fmt: skip
     said = how.get(fit.status, f"The fit failed: {fit.reason}. The first guess is kept.")
     return Section(

@@ -135,9 +135,9 @@ def _history_files() -> list[Seed]:
 
 
 def _force(folder: Path) -> None:
-    from fluidlift.io.force_file import read_force
+    from fluidlift.io.force_file import read_filmed
 
-    read_force(folder)
+    read_filmed(folder)
 
 
 def _force_files() -> list[Seed]:

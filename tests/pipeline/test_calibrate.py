@@ -9,7 +9,7 @@ import pytest
 from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected
 from fluidlift.io.asset_folder import FILES, load_asset, read_manifest
-from fluidlift.io.force_file import read_force, write_force
+from fluidlift.io.force_file import read_filmed, write_filmed
 from fluidlift.numerics.sampling import sample_faces
 from fluidlift.physics.inflow_schedule import InflowSchedule
 from fluidlift.pipeline.stages.calibrate import STRONG, calibrate
@@ -17,7 +17,7 @@ from fluidlift.scene.build import SimulationRequest, scene_of
 from fluidlift.scene.coarse_copy import coarser
 from fluidlift.scene.following import following
 from fluidlift.scene.simulator import simulator_of
-from fluidlift.types import FaceVelocity
+from fluidlift.types import FaceVelocity, Filmed
 
 FRAMES = 14
 
@@ -67,7 +67,7 @@ def test_smoke_and_pours_are_not_calibrated(channel):
 
 
 def test_an_asset_of_a_stream_carries_its_force_and_says_how_strong_it_is(made):
-    asset, force = load_asset(made.folder), read_force(made.folder)
+    asset, force = load_asset(made.folder), read_filmed(made.folder).force
     assert force is not None and force.shape == asset.grid.shape
     assert all(np.isfinite(c).all() for c in force.components)
     figures = read_manifest(made.folder)["metrics"]["calibration"]
@@ -79,12 +79,14 @@ def test_the_force_fades_around_what_was_put_in_and_stays_elsewhere(tmp_path, ch
     scene = channel(2)
     grid = scene.terrain.grid
     force, asset = uniform(grid, (1.0, 0.0, 0.0)), of(scene)
-    assert following(scene, asset, force, 0.0).force is None
-    np.testing.assert_allclose(following(scene, asset, force, 0.5).force.u, 0.5)
+    assert following(scene, asset, Filmed(force), 0.0).force is None
+    np.testing.assert_allclose(following(scene, asset, Filmed(force), 0.5).force.u, 0.5)
     dug = scene.terrain.signed_distance.copy()
     place = (2, 4, 2)
     dug[place] += grid.spacing
-    there = following(replace(scene, terrain=replace(scene.terrain, signed_distance=dug)), asset, force, 1.0).force
+    there = following(
+        replace(scene, terrain=replace(scene.terrain, signed_distance=dug)), asset, Filmed(force), 1.0
+    ).force
     assert there.u[place] == 0.0, "no force where the ground was dug"
     assert there.u[-1, 4, 2] == 1.0, "all of it ten cells from there: two of them were touched, and it needs six"
     assert (np.diff(there.u[2:, 4, 2]) >= 0).all()
@@ -98,24 +100,29 @@ def test_another_fluid_or_inflow_takes_the_force_away_and_that_is_noted(channel,
         other = replace(scene, changes=("kinematic_viscosity",))
     else:
         other = replace(scene, inflow=InflowSchedule(((0.0, 2.0),)))
-    found = following(other, of(scene), force, 1.0)
-    assert found.force is None and "left out" in found.notes[-1]
+    found = following(other, of(scene), Filmed(force), 1.0)
+    assert found.force is None and found.dry is None and "left out" in found.notes[-1]
 
 
 def test_a_coarser_copy_gets_a_coarser_force(tmp_path, made):
     asset = coarser(load_asset(made.folder))
-    write_force(tmp_path, uniform(load_asset(made.folder).grid, (1.0, 2.0, 3.0)))
+    grid = load_asset(made.folder).grid
+    dry = np.zeros(grid.shape, bool)
+    dry[:4, :3] = True
+    write_filmed(tmp_path, Filmed(uniform(grid, (1.0, 2.0, 3.0)), dry))
     (tmp_path / "empty").mkdir()
     scene = scene_of(asset, tmp_path / "empty", SimulationRequest(meshes=tmp_path), JobConfig(), footage=None, start=0)
     assert scene.force.shape == asset.grid.shape
     np.testing.assert_allclose(scene.force.w[1:-1, 1:-1, 1:-1], 3.0)
+    assert scene.dry.shape == asset.grid.shape and scene.dry[:2, 0].all() and not scene.dry[2:].any()
+    assert not scene.dry[:, 1:].any(), "a wide cell is dry where all of it is"
 
 
 def test_a_damaged_force_is_refused_with_what_to_do(tmp_path):
     (tmp_path / "rest").mkdir()
     (tmp_path / FILES["force"]).write_bytes(b"no arrays")
     with pytest.raises(InputRejected):
-        read_force(tmp_path)
+        read_filmed(tmp_path)
     np.savez(tmp_path / FILES["force"], u=np.zeros((3, 2, 2)), v=np.zeros((2, 2, 2)), w=np.zeros((2, 2, 3)))
     with pytest.raises(InputRejected, match="make the asset again"):
-        read_force(tmp_path)
+        read_filmed(tmp_path)

@@ -10,7 +10,7 @@ import pytest
 from fluidlift.cli import DONE, FAILED, REJECTED, WITH_WARNINGS, main
 from fluidlift.config import build_config
 from fluidlift.io.asset_folder import load_asset, read_manifest
-from fluidlift.io.force_file import read_force
+from fluidlift.io.force_file import read_filmed
 from fluidlift.io.ply import read_splats
 from fluidlift.io.scene import SceneEdits
 from fluidlift.io.video import read_clip
@@ -162,10 +162,10 @@ def test_an_edited_asset_becomes_a_scene_without_a_file(made, asset, tmp_path):
     simulator = simulator_of(scene)
     simulator.advance(scene.interval)
     assert len(simulator.particles) > 0
-    filmed = read_force(made.folder)
-    assert filmed is not None
-    same = edited_scene(asset, SceneEdits(), settings=SceneSettings(None, 0.5, 0), force=filmed)
-    np.testing.assert_allclose(same.force.u, 0.5 * filmed.u)
+    filmed = read_filmed(made.folder)
+    assert filmed.force is not None
+    same = edited_scene(asset, SceneEdits(), settings=SceneSettings(None, 0.5, 0), filmed=filmed)
+    np.testing.assert_allclose(same.force.u, 0.5 * filmed.force.u)
 
 
 def test_every_frame_has_a_splat_per_particle(made, finished):

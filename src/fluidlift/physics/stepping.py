@@ -125,6 +125,10 @@ class ParticleSimulator(ABC):
         )
         self.bodies: RigidBodies | NoBodies = NoBodies()
         """rigid bodies; nothing comes out of inlets and emitters where one is"""
+        self.drains: np.ndarray | None = None
+        """bool [nx,ny,nz]: cells whose particles are taken out at the end of every `advance`; None: none are"""
+        self.drained = 0.0
+        """m^3 that were taken out there"""
         self._particles = self._prepared(particles)
         self._next_id = int(particles.ids.max()) + 1 if len(particles) else 0
         self._emit_source = emit_source or self._nearest_source(particles)
@@ -146,6 +150,7 @@ class ParticleSimulator(ABC):
         particles = {f"particles.{f.name}": getattr(self._particles, f.name).copy() for f in fields(Particles)}
         return particles | {
             "time": np.float64(self.time),
+            "drained": np.float64(self.drained),
             "counts": np.array([self._advances, self._next_id], np.int64),
             "generator": np.frombuffer(generator, np.uint8),
             "inlet_shift": self._inlet.shift.copy(),
@@ -162,6 +167,7 @@ class ParticleSimulator(ABC):
             particles = Particles(**{f.name: np.array(state[f"particles.{f.name}"]) for f in fields(Particles)})
             generator = json.loads(bytes(state["generator"]))
             counts, shift, time = state["counts"], np.array(state["inlet_shift"], np.float64), float(state["time"])
+            drained = float(state.get("drained", 0.0))
             emitted = np.array(state.get("emitted_until", np.zeros(0)), np.float64)
             require(counts.shape == (2,) and shift.shape == (3,), "counters of another shape")
             require(emitted.shape == (len(self._inlet.emissions),), "a simulation state with other emitters")
@@ -172,6 +178,7 @@ class ParticleSimulator(ABC):
         except (KeyError, TypeError, ValueError) as error:
             raise InputRejected(f"a simulation state that does not fit: {error}") from None
         self._particles, self._rng, self.time = particles, fresh, time
+        self.drained = drained
         self._advances, self._next_id = int(counts[0]), int(counts[1])
         self._inlet.shift = shift
         for emission, last in zip(self._inlet.emissions, emitted):
@@ -215,11 +222,23 @@ class ParticleSimulator(ABC):
             pressure.append(outcome.pressure)
             viscosity.extend(outcome.viscosity)
         self.time = end
+        removed += self._drain()
         emitted += self._fill_inlet()  # what the last substep carried away leaves no gap in the frame
         return StepReport(
             duration, substeps, self._max_speed(), self.volume, self._wet_volume(), tuple(pressure), tuple(viscosity),
             len(self._particles), emitted, removed, retries,
         )  # fmt: skip
+
+    def _drain(self) -> int:
+        """Take out what lies in cells that are drained; how many particles."""
+        if self.drains is None or not len(self._particles):
+            return 0
+        cells = np.clip(self.grid.cell_of(self._particles.positions), 0, np.asarray(self.grid.shape) - 1)
+        gone = self.drains[tuple(cells.T)]
+        if gone.any():
+            self.drained += float(self._particles.masses[gone].sum(dtype=np.float64)) / self.parameters.density
+            self._particles = self._particles.select(~gone)
+        return int(gone.sum())
 
     @property
     def volume(self) -> float:

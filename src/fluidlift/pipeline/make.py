@@ -27,7 +27,7 @@ from fluidlift.scene.settings import SceneSettings
 from fluidlift.scene.simulator import particle_work
 from fluidlift.scene.splat_files import require_room
 from fluidlift.seams import Progress, Silence
-from fluidlift.types import FluidAsset, kind_of
+from fluidlift.types import Filmed, FluidAsset, kind_of
 from fluidlift.types.fluid_masks import FluidMasks
 from fluidlift.types.stages import Bodies, Calibration, Fit, Lift, Read, Segmentation
 
@@ -115,7 +115,7 @@ def _with_bodies(
 def _write_asset(runner: Runner, lift: Lift, config: JobConfig, provenance: dict[str, Any]) -> FluidAsset:
     """The body at rest and what moves it; simulation and pictures come after."""
     from fluidlift.io.asset_folder import load_asset, save_asset
-    from fluidlift.io.force_file import write_force
+    from fluidlift.io.force_file import write_filmed
 
     clip, g, folder = lift.clip, lift.geometry, runner.folder
     _write_film(lift, folder)
@@ -136,7 +136,7 @@ def _write_asset(runner: Runner, lift: Lift, config: JobConfig, provenance: dict
         provenance=provenance | origin,
     )
     calibration = _calibrated(runner, lift, asset, config)
-    write_force(folder, calibration.force)
+    write_filmed(folder, Filmed(calibration.force, calibration.dry))
     save_asset(
         folder,
         asset,
@@ -153,8 +153,8 @@ def _calibrated(runner: Runner, lift: Lift, asset: FluidAsset, config: JobConfig
 
     scene = edited_scene(asset, SceneEdits(), None, SceneSettings.of(config), start=lift.geometry.rest_frame)
     target = mean_target(asset, lift.motion.velocities)
-    s = config.simulate
-    return runner.run("calibrate", calibrate, scene, target, wanted=s.follow > 0, beside={"device": s.device})
+    wet, s = FluidMasks(lift.labels.labels).any_frame(), config.simulate
+    return runner.run("calibrate", calibrate, scene, target, wet, wanted=s.follow > 0, beside={"device": s.device})
 
 
 def _write_film(lift: Lift, folder: Path) -> None:

@@ -24,6 +24,7 @@ from fluidlift.scene.settings import SceneSettings
 from fluidlift.types import (
     CellType,
     FaceVelocity,
+    Filmed,
     FluidAsset,
     FluidParameters,
     Gaussians,
@@ -113,6 +114,8 @@ class Scene:
     """frame of the film that the body at rest shows"""
     force: FaceVelocity | None = None
     """m/s^2 on the faces of the terrain's grid, beside gravity"""
+    dry: np.ndarray | None = None
+    """bool [nx,ny,nz]: cells that the clip shows dry throughout, from which fluid is taken out"""
 
     @property
     def simulated(self) -> int:
@@ -151,6 +154,8 @@ class Scene:
             found["inflow"] = _hash(self.inflow)
         if self.force is not None:
             found["force"] = _hash(*self.force.components)
+        if self.dry is not None:
+            found["dry cells"] = _hash(self.dry)
         if self.overlap:
             found["loop"] = _hash(self.frames, self.overlap)
         return found
@@ -212,15 +217,17 @@ def scene_of(
     Raises:
         InputRejected: a scene.yaml or a request that does not fit, or a damaged file.
     """
-    from fluidlift.io.force_file import read_force
+    from fluidlift.io.force_file import read_filmed
     from fluidlift.io.scene import read_edits
 
     edits = read_edits(folder, meshes=request.meshes) if edits is None else edits
     # edits that are tried out lie elsewhere than their asset
     home = folder if request.meshes is None or (folder / "manifest.json").is_file() else request.meshes
     settings = SceneSettings.of(config)
-    force = read_force(home) if settings.follow > 0 else None
-    return edited_scene(asset, edits, request, settings, footage=footage, start=start, film=film_of(home), force=force)
+    filmed = read_filmed(home) if settings.follow > 0 else None
+    return edited_scene(
+        asset, edits, request, settings, footage=footage, start=start, film=film_of(home), filmed=filmed
+    )
 
 
 def edited_scene(
@@ -232,7 +239,7 @@ def edited_scene(
     footage: Footage | None = None,
     start: int = 0,
     film: Path | None = None,
-    force: FaceVelocity | None = None,
+    filmed: Filmed | None = None,
 ) -> Scene:
     """The scene that an asset, edits of it and a request describe. No file is looked at.
 
@@ -247,7 +254,7 @@ def edited_scene(
         footage: the clip, where it is at hand.
         start: frame of the clip that the first simulated one shows.
         film: that the fluid's surface plays.
-        force: m/s^2, that keeps the filmed flow.
+        filmed: what keeps the filmed flow; None: nothing does.
 
     Raises:
         InputRejected: edits or a request that do not fit.
@@ -278,7 +285,7 @@ def edited_scene(
     if longer > 0:
         scene = extended(scene, longer)
     scene = with_emitters(with_terrain(scene, edits.terrain), edits.emitters)
-    scene = following(scene, asset, force, settings.follow)
+    scene = following(scene, asset, filmed or Filmed(), settings.follow)
     return replace(scene, overlap=loop_overlap(scene)) if edits.loop else scene
 
 

@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from fluidlift.errors import InputRejected
 from fluidlift.physics.inflow_schedule import InflowSchedule
-from fluidlift.types import FaceVelocity, FluidAsset, Grid, TriangleMesh, matrix_from_quat
+from fluidlift.types import FaceVelocity, Filmed, FluidAsset, Grid, TriangleMesh, matrix_from_quat
 
 if TYPE_CHECKING:
     from fluidlift.scene.build import Scene
@@ -24,35 +24,45 @@ WAKE = 3.0
 back, is one to three long"""
 
 
-def following(scene: Scene, asset: FluidAsset, force: FaceVelocity | None, share: float) -> Scene:
-    """The scene with a share of the asset's force.
+def following(scene: Scene, asset: FluidAsset, filmed: Filmed, share: float) -> Scene:
+    """The scene with a share of the asset's force, and its dry cells.
 
-    The force fades out around what was put in or dug out. It is left out, with a note, where the fluid itself, its
-    inflow or the box is another one.
+    The force fades out around what was put in or dug out, and cells there may get wet. Both are left out, with a note,
+    where the fluid itself, its inflow or the box is another one.
 
     Args:
         scene: with all edits.
         asset: that it comes from, as it was or on a coarser grid.
-        force: m/s^2, of the asset on its own grid; None where it has none.
+        filmed: of the asset on its own grid.
         share: 0 to 1.
 
     Raises:
-        InputRejected: a force on another grid.
+        InputRejected: of another grid.
     """
     from fluidlift.fit.coarsen import coarsen_velocity
 
+    force, dry = filmed.force, filmed.dry
     if force is None or share <= 0:
         return scene
+    if dry is not None and dry.shape != force.shape:
+        raise InputRejected(f"dry cells {dry.shape}", f"{force.shape}, as the force", "make the asset again")
     while max(force.shape) > max(asset.grid.shape) and min(force.shape) > 1:
-        force = coarsen_velocity(force)
+        force, dry = coarsen_velocity(force), None if dry is None else _coarser(dry)
     if force.shape != asset.grid.shape:
         raise InputRejected(f"a force on {force.shape} cells", f"{asset.grid.shape} cells", "make the asset again")
     if scene.changes or scene.inflow != InflowSchedule() or scene.terrain.grid != asset.grid:
         note = "the force that keeps the filmed flow is left out, since this scene has another fluid, inflow or box"
         return replace(scene, notes=(*scene.notes, note))
-    weight = share * _untouched(scene, asset)
+    untouched = _untouched(scene, asset)
+    weight = share * untouched
     kept = FaceVelocity(*(_on_faces(weight, axis) * c for axis, c in enumerate(force.components)))
-    return replace(scene, force=kept)
+    return replace(scene, force=kept, dry=None if dry is None else dry & (untouched >= 1.0))
+
+
+def _coarser(dry: Bool[np.ndarray, "nx ny nz"]) -> Bool[np.ndarray, "mx my mz"]:
+    """Cells twice as wide that are dry throughout; an odd last layer goes as `coarsen_velocity` has it."""
+    even = np.pad(dry, [(0, n % 2) for n in dry.shape], mode="edge")
+    return np.logical_and.reduce([even[i::2, j::2, k::2] for i, j, k in np.ndindex(2, 2, 2)])
 
 
 def _untouched(scene: Scene, asset: FluidAsset) -> Float[np.ndarray, "nx ny nz"]:

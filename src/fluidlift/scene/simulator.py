@@ -59,11 +59,13 @@ def simulator_of(scene: Scene, device: str = "cpu", forces: Sequence[BodyForce] 
     if scene.force is not None:
         forces = (*forces, SteadyForce(scene.force))
     cells, body = within_outlet(scene)
-    return LiquidSimulator(
+    simulator = LiquidSimulator(
         grid, scene.terrain, parameters, body, cell_types=cells, inflow_profile=scene.velocity,
         seed=scene.seed, emit_source=look, bodies=scene.bodies, work=particle_work(device), supply=supply,
         open_sides=sides_open_to_air(parameters.gravity), forces=forces,
     )  # fmt: skip
+    simulator.drains = scene.dry
+    return simulator
 
 
 def inflow_look(scene: Scene, own: Gaussians, speed: float) -> InflowLook:
@@ -80,21 +82,25 @@ def inflow_look(scene: Scene, own: Gaussians, speed: float) -> InflowLook:
 
 
 def within_outlet(scene: Scene) -> tuple[np.ndarray, Particles]:
-    """Cells and body of what lies on something, without what is behind its outlet and with an inlet that takes in all
-    that flows in; all of those of other fluids."""
+    """Cells and body of what lies on something, without what is behind its outlet or in dry cells, and with an inlet
+    that takes in all that flows in; all of those of other fluids."""
     from fluidlift.physics.inlet import inlet_along_rim, inlet_to_surface
     from fluidlift.physics.outlet import thin_outlet
 
     kind = kind_of(scene.kind)
     if not kind.is_channel_flow:
         return scene.cell_types, scene.body
+    dry = np.zeros(scene.cell_types.shape, bool) if scene.dry is None else scene.dry
     cells, grid = thin_outlet(scene.cell_types), scene.terrain.grid
     if kind.nearly_level:
         cells = inlet_to_surface(cells, scene.body.positions, grid)
     elif kind.enters_over_rim:
         gravity = np.asarray(scene.parameters.gravity)
         cells = inlet_along_rim(cells, scene.body.positions, scene.velocity, grid, gravity)
-    behind = (scene.cell_types == CellType.OUTFLOW) & (cells != CellType.OUTFLOW)
+    inlet = cells == CellType.INFLOW
+    if (inlet & ~dry).any():
+        cells = np.where(inlet & dry, np.uint8(CellType.EMPTY), cells)
+    behind = dry | ((scene.cell_types == CellType.OUTFLOW) & (cells != CellType.OUTFLOW))
     at = np.clip(grid.cell_of(scene.body.positions), 0, np.asarray(grid.shape) - 1)
     return cells, scene.body.select(~behind[tuple(at.T)])
 

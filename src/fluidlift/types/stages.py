@@ -299,7 +299,7 @@ class Lift:
 
 @dataclass(frozen=True)
 class Calibration:
-    """The steady force that keeps the filmed flow."""
+    """The steady force that keeps the filmed flow, and where that flow never is."""
 
     force: FaceVelocity | None = None
     """m/s^2; None where there is none"""
@@ -312,6 +312,8 @@ class Calibration:
     frames: int | None = None
     """of the run"""
     warnings: tuple[str, ...] = ()
+    dry: Bool[np.ndarray, "nx ny nz"] | None = None
+    """cells that the clip shows dry throughout; None where that is not known"""
 
 
 @dataclass(frozen=True)

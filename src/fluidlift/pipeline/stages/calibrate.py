@@ -12,6 +12,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Bool
 
 from fluidlift.pipeline.work import Work
 from fluidlift.scene.build import Scene, wave_speed
@@ -53,6 +54,7 @@ def mean_target(asset: FluidAsset, targets: Sequence[FaceVelocity]) -> FaceVeloc
 def calibrate(
     scene: Scene,
     target: FaceVelocity,
+    wet: Bool[np.ndarray, "h w"] | None = None,
     *,
     wanted: bool = True,
     device: str = "cpu",
@@ -63,6 +65,7 @@ def calibrate(
     Args:
         scene: unedited.
         target: m/s, on the faces of its grid.
+        wet: pixels of the clip that are fluid in at least one frame; None: nothing is known to stay dry.
         wanted: False leaves all as it is.
         device: of the simulation.
         work: told how many frames are done.
@@ -71,6 +74,7 @@ def calibrate(
         FluidliftError: the simulation broke down.
     """
     from fluidlift.physics.guidance import Nudging
+    from fluidlift.scene.dry_cells import dry_cells
     from fluidlift.scene.simulator import simulator_of
 
     if not wanted or not kind_of(scene.kind).is_channel_flow or not len(scene.body):
@@ -83,7 +87,8 @@ def calibrate(
     rate = max(speed, wave) / (PULL * grid.spacing)
     rates = tuple(np.full(c.shape, rate, np.float32) for c in target.components)
     pull = Nudging(target, rates, after=SETTLED * frames * scene.interval)
-    simulator = simulator_of(replace(scene, force=None), device, forces=(pull,))
+    dry = None if wet is None else dry_cells(scene.terrain, scene.camera, wet, scene.cell_types)
+    simulator = simulator_of(replace(scene, force=None, dry=dry), device, forces=(pull,))
     for k in range(1, frames):
         if work is not None:
             work.step(k, frames)
@@ -99,7 +104,7 @@ def calibrate(
             f"differs from it by {100 * left:.0f} % of its speed; the level will rise or fall; a --mask, --pitch or "
             "--size that is known would help"
         )
-    return Calibration(force, size, speed, left, frames, tuple(warnings))
+    return Calibration(force, size, speed, left, frames, tuple(warnings), dry)
 
 
 def _typical_speed(target: FaceVelocity, cell_types: np.ndarray) -> float:

@@ -1,0 +1,68 @@
+"""Cells in which the clip shows no fluid at any time.
+
+A mask says more than where the fluid is: whatever stands seen above dry ground, or before it, would have been filmed.
+Water that gets there in a simulation has left what was filmed (over a bank that is lower than the true one, or past
+what stands before it), and is taken out as at an outlet. What is hidden, beside the picture or within a cell of the
+filmed fluid is left alone.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool
+from scipy import ndimage
+
+from fluidlift.errors import require
+from fluidlift.numerics.sampling import sample_nodes
+from fluidlift.types import CellType, PinholeCamera, Terrain
+
+MARGIN = 1.0
+"""cells from the filmed fluid, as the camera sees them: a simulated rim lies somewhere in a cell"""
+STEP = 0.5
+"""cells between two looks for ground on the way to the camera"""
+
+
+def dry_cells(
+    terrain: Terrain, camera: PinholeCamera, wet: Bool[np.ndarray, "h w"], cell_types: np.ndarray
+) -> Bool[np.ndarray, "nx ny nz"]:
+    """Cells that the clip shows dry throughout; those of inlets and of the fluid at rest may be among them, where the
+    surface that was laid through the picture goes beyond what is seen in it.
+
+    Args:
+        terrain: solid ground.
+        camera: of the clip.
+        wet: pixels that are fluid in at least one frame.
+        cell_types: u8 [nx,ny,nz]; solid cells are not looked at.
+    """
+    grid = terrain.grid
+    require(wet.shape == camera.size[::-1], f"a mask {wet.shape}", f"{camera.size[::-1]}")
+    dry = np.zeros(grid.shape, bool)
+    if not wet.any() or wet.all():
+        return dry
+    cells = np.argwhere(cell_types != CellType.SOLID)
+    centres = grid.low + (cells + 0.5) * grid.spacing
+    uv, depth = camera.project(centres)
+    seen = (depth > 0) & ((uv >= 0) & (uv < np.array(camera.size))).all(axis=1)
+    column, row = np.where(seen, uv.T, 0.0).astype(int)
+    away = np.asarray(ndimage.distance_transform_edt(~wet))[row, column] * depth / camera.focal[0]
+    beside = np.flatnonzero(seen & (away > MARGIN * grid.spacing))
+    open_view = ~_hidden(terrain, centres[beside], camera.position)
+    dry[tuple(cells[beside[open_view]].T)] = True
+    return dry
+
+
+def _hidden(terrain: Terrain, points: np.ndarray, eye: np.ndarray) -> Bool[np.ndarray, " n"]:
+    """Whether ground lies between points (m) and the camera; points within the ground are."""
+    grid = terrain.grid
+    to_eye = eye - points
+    reach = np.linalg.norm(to_eye, axis=1, keepdims=True)
+    step = STEP * grid.spacing * to_eye / np.maximum(reach, 1e-12)
+    hidden, at = np.zeros(len(points), bool), points.copy()
+    left = np.flatnonzero(reach[:, 0] > 0)
+    while len(left):
+        left = left[grid.contains(at[left])]
+        ground = sample_nodes(terrain.signed_distance, grid, at[left]) < 0
+        hidden[left[ground]] = True
+        left = left[~ground]
+        at[left] += step[left]
+    return hidden

@@ -1,0 +1,98 @@
+"""Cells that the clip shows dry: by what the camera sees of them, and what a simulation does there."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fluidlift.numerics.signed_distance import distance_of_heights
+from fluidlift.scene.dry_cells import MARGIN, dry_cells
+from fluidlift.scene.simulator import simulator_of
+from fluidlift.types import CellType, Grid, PinholeCamera, Terrain, TriangleMesh
+
+GRID = Grid((20, 16, 12), 0.1, (-1.0, -0.8, 0.0))
+EYE = np.array([0.0, 0.0, 5.0])
+
+
+def camera_above() -> PinholeCamera:
+    """Looks straight down at the grid; a cell at the floor is about 8 px wide."""
+    return PinholeCamera.looking(EYE, np.array([0.0, 1e-3, 0.0]), 40.0, (300, 240))
+
+
+def flat(grid: Grid = GRID, wall: np.ndarray | None = None) -> Terrain:
+    """A floor at z = 0.1, with heights of its own where `wall` says so."""
+    heights = np.full((grid.shape[0] + 1, grid.shape[1] + 1), 0.1) if wall is None else wall
+    mesh = TriangleMesh(np.zeros((3, 3), np.float32), np.array([[0, 1, 2]]), np.zeros((3, 3), np.float32))
+    return Terrain(grid, distance_of_heights(heights, grid), np.array([1.0, 0.0, 0.0]), mesh)
+
+
+def types_of(terrain: Terrain) -> np.ndarray:
+    solid = terrain.grid.centers()[..., 2] < 0.1
+    return np.where(solid, np.uint8(CellType.SOLID), np.uint8(CellType.EMPTY))
+
+
+def wet_half(camera: PinholeCamera) -> np.ndarray:
+    """The fluid fills the half of the picture in which x is negative."""
+    rays = camera.rays(camera.pixel_grid())
+    return rays[..., 0] < 0
+
+
+def test_what_is_seen_more_than_a_margin_beside_the_fluid_is_dry_and_nothing_else():
+    terrain, camera = flat(), camera_above()
+    dry = dry_cells(terrain, camera, wet_half(camera), types_of(terrain))
+    centres = GRID.centers()
+    seen_at = centres[..., 0] / (EYE[2] - centres[..., 2])  # tangent of the angle from the picture's middle
+    beyond = seen_at * (EYE[2] - centres[..., 2])
+    assert not dry[beyond < (MARGIN - 0.1) * GRID.spacing].any()
+    clear = (beyond > (MARGIN + 0.2) * GRID.spacing) & (centres[..., 2] > 0.1)
+    assert dry[clear].all() and clear.sum() > 500
+    assert not dry[centres[..., 2] < 0.1].any(), "ground is neither"
+
+
+def test_what_ground_hides_from_the_camera_may_be_wet():
+    camera = PinholeCamera.looking(np.array([-4.0, 0.0, 0.6]), np.array([0.0, 0.0, 0.5]), 40.0, (300, 240))
+    heights = np.full((21, 17), 0.1)
+    heights[10, :] = 0.9  # a wall across the view
+    terrain = flat(wall=heights)
+    wet = np.zeros((240, 300), bool)
+    wet[:4, :4] = True
+    dry = dry_cells(terrain, camera, wet, types_of(terrain))
+    assert dry[4, 8, 4] and not dry[14, 8, 4], "before the wall and behind it"
+    assert dry[14, 8, 11], "above it"
+
+
+def test_a_picture_full_of_fluid_or_without_any_says_nothing():
+    terrain, camera = flat(), camera_above()
+    for wet in (np.ones((240, 300), bool), np.zeros((240, 300), bool)):
+        assert not dry_cells(terrain, camera, wet, types_of(terrain)).any()
+    with pytest.raises(ValueError, match="a mask"):
+        dry_cells(terrain, camera, np.ones((3, 3), bool), types_of(terrain))
+
+
+def test_fluid_that_gets_into_dry_cells_is_taken_out_and_counted(channel):
+    scene = channel(6)
+    grid = scene.terrain.grid
+    free = simulator_of(scene)
+    dry = np.zeros(grid.shape, bool)
+    dry[grid.shape[0] // 2 :] = True  # the lower half of the channel
+    kept = simulator_of(replace(scene, dry=dry))
+    assert not dry[tuple(grid.cell_of(kept.particles.positions).T)].any(), "nor is any there at first"
+    for _ in range(4):
+        free.advance(scene.interval)
+        report = kept.advance(scene.interval)
+    assert not dry[tuple(np.clip(grid.cell_of(kept.particles.positions), 0, np.array(grid.shape) - 1).T)].any()
+    assert dry[tuple(np.clip(grid.cell_of(free.particles.positions), 0, np.array(grid.shape) - 1).T)].any()
+    assert kept.drained > 0 and report.removed > 0 and free.drained == 0
+    again = simulator_of(replace(scene, dry=dry))
+    again.restore(kept.state())
+    assert again.drained == kept.drained
+
+
+def test_an_inlet_beside_the_filmed_fluid_is_closed_unless_all_of_it_is(channel):
+    scene = channel(2)
+    inlet = scene.cell_types == CellType.INFLOW
+    half = inlet & (np.arange(inlet.shape[1]) < inlet.shape[1] // 2)[None, :, None]
+    assert half.any() and (inlet & ~half).any()
+    fed = simulator_of(replace(scene, dry=half))._walls.regions == CellType.INFLOW
+    assert fed.any() and not (fed & half).any()
+    assert (simulator_of(replace(scene, dry=inlet))._walls.regions == CellType.INFLOW).any()

@@ -27,12 +27,13 @@ from fluidlift.shape import (
     texture_gradient,
 )
 from fluidlift.shape import kind as kinds
+from fluidlift.shape.drawn import sky_pixels
 from fluidlift.shape.frame_pictures import typical_picture
 from fluidlift.shape.framing import framing_warnings
 from fluidlift.shape.given_depth import DepthPictures
 from fluidlift.shape.kinds import Observation, builder_of
 from fluidlift.shape.rest_frames import FEWEST_PIXELS, rest_frame, united_range
-from fluidlift.shape.view import as_relief, look_at
+from fluidlift.shape.view import Ellipse, Skyline, as_relief, drawn_rim, look_at, sky_of, tilt_of_horizon
 from fluidlift.types import (
     CellType,
     FluidKind,
@@ -117,7 +118,7 @@ def geometry(
     falls, trust = falling.pixels[visible], seen.trust[visible]
     sighting = place.Sighting(trust, clip.interval, up.pitch)
     moving = _Moving(points, velocities, falls, sighting, known_scale)
-    scale, sentence, told = _scale(seen, moving, seen_depth, c.size, fluid, canonical)
+    scale, sentence, told = _scale(seen, moving, seen_depth, c, fluid, canonical)
     warnings += told
     mainstream = _mainstream(kind, velocities[~falls], trust[~falls]) if seen.stood is None else seen.stood.direction
     eye = seen.known.position if seen.pose_given else None
@@ -183,11 +184,14 @@ class _Moving:
 
 
 def _scale(
-    seen: _Sight, moving: _Moving, seen_depth: depths.DepthFront | None, size: float | None, fluid: FluidMasks,
+    seen: _Sight, moving: _Moving, seen_depth: depths.DepthFront | None, c: GeometrySettings, fluid: FluidMasks,
     canonical: PinholeCamera,
 ) -> tuple[MetricScale, str, list[str]]:  # fmt: skip
     """Metres per canonical unit, in words, and warnings."""
-    points, velocities, stood, warnings = moving.points, moving.velocities, seen.stood, []
+    points, velocities, stood, warnings, size = moving.points, moving.velocities, seen.stood, [], c.size
+    if c.drawn is not None and c.drawn.ruler is not None:
+        scale = place.ruler_scale(canonical, points, c.drawn.ruler)
+        return scale, scale.sentence, []
     if stood is not None:
         scale = standing.standing_scale(
             stood, size=size, height=seen.height,
@@ -244,7 +248,8 @@ def _seen(
         mask = fluid[start]
         parts = composite.Parts((), mask)
         stood = dam.stood(fluid, start, kinds.level_camera(known, up))
-    tilt_known = pose_given or config.pitch is not None
+    horizon = config.drawn is not None and config.drawn.horizon is not None and up.raised == 0.0
+    tilt_known = pose_given or config.pitch is not None or horizon
     seen = _Sight(
         start, united, mask, motion, trust, known, pose_given, evidence, kind, parts, up, heading, tilt_known, height,
         unsure, stood,
@@ -292,7 +297,7 @@ def _kind_and_up(
     clip, fluid, mask, motion, trust = looked.clip, looked.fluid, looked.mask, looked.motion, looked.trust
     c, bodies = config, None if given.bodies is None else given.bodies.path
     surveyed, heading = place.pose_up(known)
-    pitch = float(surveyed.pitch) if pose_given else c.pitch
+    pitch = float(surveyed.pitch) if pose_given else _said_of_view(c, known, mask.shape).pitch
     pick = np.unique(np.linspace(0, len(clip) - 1, 8).astype(int))
     evidence = kinds.estimate_kind(clip.frames[pick], fluid[pick], motion, trust, pitch=pitch)
     kind = kind_of(evidence.kind if c.kind == "auto" else c.kind)
@@ -324,16 +329,40 @@ def _kind_and_up(
     if kind.nearly_level and c.pitch is None and not parts.puddle:
         texture = texture_gradient.texture_patches(clip.frames, parts.lying & ~parts.falling)
     typical = typical_picture(clip.frames[pick]).astype(np.uint8)
-    picture = look_at(kind, typical, fluid.any_frame(), parts.lying, texture, stays=parts.puddle)
+    said = _said_of_view(c, known, mask.shape)
+    picture = look_at(
+        kind, typical, fluid.any_frame(), parts.lying, texture, stays=parts.puddle,
+        drawn_sky=said.sky, drawn_rims=said.rims,
+    )  # fmt: skip
     up = kinds.estimate_up(
-        kind, parts.lying, motion, trust * ~parts.falling, known, picture, given=(c.pitch, c.roll),
+        kind, parts.lying, motion, trust * ~parts.falling, known, picture, given=(said.pitch, said.roll),
         level_prior=composite.level_prior(parts, motion, trust),
     )  # fmt: skip
-    if c.roll is None:
+    if said.roll is None:
         up = composite.with_roll(up, parts, known)
     if c.pitch is None and kind.nearly_level and not shaped:
         up = as_relief(up, parts.lying & ~parts.falling, lambda tilted: kinds.level_camera(known, tilted))
     return evidence, kind, parts, up, None
+
+
+@dataclass(frozen=True)
+class _SaidOfView:
+    """What a person says of the camera's tilt."""
+
+    pitch: float | None
+    roll: float | None
+    sky: Skyline | None = None
+    rims: tuple[Ellipse, ...] = ()
+
+
+def _said_of_view(c: GeometrySettings, known: PinholeCamera, shape: tuple[int, ...]) -> _SaidOfView:
+    """By number or by the horizon's line, and what speaks for it."""
+    drawn = c.drawn
+    if drawn is None:
+        return _SaidOfView(c.pitch, c.roll)
+    pitch, roll = (c.pitch, c.roll) if drawn.horizon is None else tilt_of_horizon(known, drawn.horizon)
+    sky = sky_of(sky_pixels(drawn.sky, (shape[0], shape[1])))
+    return _SaidOfView(pitch, roll, sky, tuple(drawn_rim(r.center, r.axes, r.turned) for r in drawn.rims))
 
 
 def _depth_pictures(

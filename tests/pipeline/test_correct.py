@@ -6,9 +6,10 @@ import pytest
 from fluidlift.config import build_config
 from fluidlift.errors import InputRejected
 from fluidlift.pipeline import Inputs, begin
-from fluidlift.pipeline.find import FIND_STAGES, find_hints, identity_of
+from fluidlift.pipeline.find import FIND_STAGES, find_hints, identity_of, view
 from fluidlift.pipeline.inputs import GivenFiles
 from fluidlift.pipeline.runner import Runner
+from fluidlift.pipeline.settings import GivenView
 from fluidlift.pipeline.stages.correct import correct
 from fluidlift.pipeline.work import Work
 from fluidlift.seams import Silence
@@ -81,18 +82,19 @@ def again(looked, hints):
     runner = Runner(folder, begin.stages_of(FIND_STAGES, hints), progress=Silence())
     given = GivenFiles.of(Inputs(clip))
     found = begin.look(runner, given, config, said=hints)
-    geometry = begin.shape(runner, found, given, config, hints)
-    return [name for name, t in runner.timings.items() if not t["cached"]], found, geometry
+    settings = begin.geometry_settings(found[0], config, hints)
+    seen = runner.run("view", view, *found, GivenView.of(given, config), settings)
+    return [name for name, t in runner.timings.items() if not t["cached"]], found, seen
 
 
 def test_only_what_depends_on_a_hint_is_done_again(looked):
     identity = looked[3]
     w, h = identity.size
     level = ClipHints(identity, horizon=((0.0, 0.1 * h), (float(w), 0.1 * h)))
-    assert again(looked, level)[0] == ["geometry"]
+    assert again(looked, level)[0] == ["view"]
     assert again(looked, ClipHints(identity))[0] == []
     area = Region("rock", ((0.4 * w, 0.5 * h), (0.5 * w, 0.5 * h), (0.5 * w, 0.6 * h)))
-    assert again(looked, ClipHints(identity, regions=(area,)))[0] == ["correct", "geometry"]
+    assert again(looked, ClipHints(identity, regions=(area,)))[0] == ["correct", "view"]
 
 
 def test_a_drawn_horizon_and_a_ruler_are_taken(looked):
@@ -102,10 +104,10 @@ def test_a_drawn_horizon_and_a_ruler_are_taken(looked):
         identity, horizon=((0.0, -0.3 * h), (float(w), -0.3 * h)),
         ruler=Ruler((0.3 * w, 0.6 * h), (0.7 * w, 0.6 * h), 2.0),
     )  # fmt: skip
-    geometry = again(looked, hints)[2]
+    seen = again(looked, hints)[2]
     half = 0.8 * h * 2 * np.tan(np.radians(25.0)) / max(w, h)
-    assert geometry.up.pitch == pytest.approx(np.degrees(np.arctan(half)), abs=0.1) and geometry.up.source == "user"
-    assert geometry.scale.source == "ruler" and not geometry.scale.warning
+    assert seen.up.pitch == pytest.approx(np.degrees(np.arctan(half)), abs=0.1) and seen.up.source == "user"
+    assert seen.scale.source == "ruler" and not seen.scale.warning
 
 
 def test_what_was_found_is_told_in_px_of_the_clip(looked):

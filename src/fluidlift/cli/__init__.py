@@ -40,6 +40,7 @@ from fluidlift.cli.options import (
     Sim,
     Validate,
 )
+from fluidlift.cli.studio import Studio
 from fluidlift.cli.view import View
 from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.kernels import compiling_beside
@@ -50,6 +51,7 @@ Command = (
     | Batch
     | Edit
     | Sim
+    | Studio
     | View
     | Render
     | Export
@@ -277,6 +279,12 @@ def _edit(c: Edit) -> int:
     return run(c)
 
 
+def _studio(c: Studio) -> int:
+    from fluidlift.cli.studio import run
+
+    return run(c)
+
+
 def _view(c: View) -> int:
     from fluidlift.cli.view import run
 
@@ -481,7 +489,7 @@ def _doctor(c: Doctor) -> int:
 
 
 _COMMANDS = {
-    Make: _make, Batch: _batch, Fit: _fit, Sim: _sim, Edit: _edit, View: _view, Render: _render, Export: _export,
-    Inspect: _inspect, Hints: _hints, Mask: _mask, Motion: _motion, Evaluate: _evaluate, Validate: _validate,
-    Demo: _demo, Generators: _generators, Doctor: _doctor,
+    Make: _make, Batch: _batch, Fit: _fit, Sim: _sim, Edit: _edit, Studio: _studio, View: _view, Render: _render,
+    Export: _export, Inspect: _inspect, Hints: _hints, Mask: _mask, Motion: _motion, Evaluate: _evaluate,
+    Validate: _validate, Demo: _demo, Generators: _generators, Doctor: _doctor,
 }  # fmt: skip

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected
 from fluidlift.pipeline import depths, given_body
@@ -43,9 +40,8 @@ def stages_of(stages: tuple[str, ...], hints: ClipHints) -> tuple[str, ...]:
 
 
 def look(
-    runner: Runner, given: GivenFiles, config: JobConfig, hints: Hints = NO_HINTS, said: ClipHints = NOTHING_SAID,
-    told: Callable[[Any], None] = lambda value: None,
-) -> tuple[Read, Flow, Segmentation]:  # fmt: skip
+    runner: Runner, given: GivenFiles, config: JobConfig, hints: Hints = NO_HINTS, said: ClipHints = NOTHING_SAID
+) -> tuple[Read, Flow, Segmentation]:
     """Run read, flow, segment and, where regions were drawn, correct; what later stages are given is looked at first.
 
     Args:
@@ -54,7 +50,6 @@ def look(
         config: of it.
         hints: of the command line, in px of the working picture.
         said: those of a hints file, which take the place of `hints` where there are some.
-        told: gets the value of each stage as it comes.
 
     Raises:
         InputRejected: an input that cannot be used.
@@ -64,7 +59,6 @@ def look(
     mask, finder = GivenMask.of(given, config), SegmentSettings.of(config)
     clip = runner.run("read", read, given.clip, given.camera, taken(ReadSettings, config.read))
 
-    told(clip)
     drawn = said.at(clip.clip.size)
     if drawn.roi is not None or drawn.clicks:
         hints = Hints.drawn(drawn)
@@ -81,7 +75,6 @@ def look(
         flow = runner.run("flow", estimated_flow, clip, FlowSettings.of(config), before=first)
     else:
         flow = runner.run("flow", given_flow, clip, own, before=first)
-    told(flow)
     try:
         found = runner.run("segment", segment, clip, flow, mask, None if mask is not None else finder, hints)
     except InputRejected:
@@ -90,7 +83,6 @@ def look(
         found = runner.run("segment", nothing_found, clip)
     if drawn.regions:
         found = runner.run(CORRECT, correct, clip, flow, found, drawn.regions)
-    told(found)
     return clip, flow, found
 
 
@@ -99,5 +91,10 @@ def shape(
     said: ClipHints = NOTHING_SAID,
 ) -> Geometry:  # fmt: skip
     """Run geometry, with what a hints file says of the view."""
-    settings = taken(GeometrySettings, config.shape, drawn=said.at(seen[0].clip.size).view)
+    settings = geometry_settings(seen[0], config, said)
     return runner.run("geometry", geometry, *seen, GivenView.of(given, config), settings)
+
+
+def geometry_settings(read: Read, config: JobConfig, said: ClipHints) -> GeometrySettings:
+    """What geometry is told."""
+    return taken(GeometrySettings, config.shape, drawn=said.at(read.clip.size).view)

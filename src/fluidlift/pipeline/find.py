@@ -9,6 +9,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from jaxtyping import Bool, Float
 
 from fluidlift.config import JobConfig
 from fluidlift.io.hints_file import content_hash
@@ -16,16 +17,19 @@ from fluidlift.io.video import probe
 from fluidlift.pipeline import begin
 from fluidlift.pipeline.inputs import GivenFiles, Inputs
 from fluidlift.pipeline.runner import Runner
+from fluidlift.pipeline.settings import GeometrySettings, GivenView
+from fluidlift.pipeline.sight import sighted
+from fluidlift.pipeline.work import Work
 from fluidlift.seams import Progress, Silence
 from fluidlift.shape.frame_pictures import typical_picture
 from fluidlift.shape.kind import level_camera
 from fluidlift.shape.view import horizon_line
 from fluidlift.shape.view.rims import find_rims
-from fluidlift.types import Label
+from fluidlift.types import KindEvidence, Label, MetricScale, PinholeCamera, UpEvidence
 from fluidlift.types.hints import NOTHING_SAID, ClipHints, ClipIdentity
-from fluidlift.types.stages import Geometry, Read, Segmentation
+from fluidlift.types.stages import Flow, Read, Segmentation
 
-FIND_STAGES = ("read", "flow", "segment", "geometry")
+FIND_STAGES = ("read", "flow", "segment", "view")
 ARROWS = 9
 """along the longer side of the picture, of which those on the fluid are told"""
 LEAST_TRUST = 0.3
@@ -37,18 +41,53 @@ SMALLEST = 0.002
 
 
 @dataclass(frozen=True)
+class View:
+    """How the fluid stands before the camera: what geometry begins with, without ground and cells."""
+
+    kind: str
+    kind_evidence: KindEvidence
+    up: UpEvidence
+    scale: MetricScale
+    scale_sentence: str
+    camera: PinholeCamera
+    """level, in units of its own"""
+    mask: Bool[np.ndarray, "h w"]
+    mean_flow: Float[np.ndarray, "h w 2"]
+    """px per frame"""
+    mean_confidence: Float[np.ndarray, "h w"]
+    rest_frame: int
+    warnings: tuple[str, ...] = ()
+
+
+def view(
+    read: Read, flow: Flow, segmentation: Segmentation, given: GivenView, config: GeometrySettings, *, work: Work
+) -> View:
+    """Kind, tilt, flow and scale.
+
+    Raises:
+        InputRejected: as `pipeline.sight.sighted`.
+    """
+    s = sighted(read, flow, segmentation, given, config, work=work)
+    seen = s.seen
+    return View(
+        seen.kind.name, seen.evidence, s.up, s.scale, s.sentence, s.canonical, seen.mask, np.asarray(seen.motion),
+        np.asarray(seen.trust), seen.start, tuple(s.warnings),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
 class Found:
     """What was found."""
 
     identity: ClipIdentity
     read: Read
     segmentation: Segmentation
-    geometry: Geometry
+    view: View
     warnings: tuple[str, ...] = ()
 
     def facts(self) -> dict[str, Any]:
         """Plain data for the section `found` of a hints file, in px of the clip's own picture."""
-        g, (width, height) = self.geometry, self.read.clip.size
+        g, (width, height) = self.view, self.read.clip.size
         k = self.identity.size[0] / width
         up = replace(g.up, pitch=g.up.pitch - g.up.raised)  # as it was seen, not as a relief is built
         scores = sorted(g.kind_evidence.scores.items(), key=lambda item: -item[1])
@@ -85,7 +124,7 @@ class Found:
 
     def lines(self) -> list[str]:
         """For people."""
-        g = self.geometry
+        g = self.view
         scores = sorted(g.kind_evidence.scores.items(), key=lambda item: -item[1])
         return [
             f"kind: {g.kind} ({', '.join(f'{name} {share:.2f}' for name, share in scores[:3])})",
@@ -107,9 +146,9 @@ def identity_of(clip: Path, fps: float | None = None) -> ClipIdentity:
 
 def find_hints(
     inputs: Inputs, folder: Path, config: JobConfig, hints: ClipHints = NOTHING_SAID, *,
-    progress: Progress | None = None, told: Callable[[Any], None] = lambda value: None,
+    progress: Progress | None = None, told: Callable[[str, Any], None] = lambda name, value: None,
 ) -> Found:  # fmt: skip
-    """Read, flow, segment and geometry, with the hints that there are.
+    """Read, flow, segment and view, with the hints that there are.
 
     Args:
         inputs: the clip.
@@ -117,21 +156,23 @@ def find_hints(
         config: of the job.
         hints: of a person, with the clip's identity.
         progress: where progress is told.
-        told: gets the value of each stage as it comes.
+        told: gets the name and the value of each stage as it ends.
 
     Raises:
         InputRejected: an input that cannot be used.
     """
-    runner = Runner(folder, begin.stages_of(FIND_STAGES, hints), progress=progress or Silence())
+    stages = begin.stages_of(FIND_STAGES, hints)
+    runner = Runner(folder, stages, progress=progress or Silence(), value_told=told)
     given = GivenFiles.of(inputs)
-    seen = begin.look(runner, given, config, said=hints, told=told)
-    geometry = begin.shape(runner, seen, given, config, hints)
-    told(geometry)
+    seen = begin.look(runner, given, config, said=hints)
+    found = runner.run(
+        "view", view, *seen, GivenView.of(given, config), begin.geometry_settings(seen[0], config, hints)
+    )
     identity = hints.clip or identity_of(inputs.clip, config.read.fps)
-    return Found(identity, seen[0], seen[2], geometry, tuple(runner.warnings))
+    return Found(identity, seen[0], seen[2], found, tuple(runner.warnings))
 
 
-def arrows(g: Geometry) -> list[tuple[tuple[float, float], tuple[float, float]]]:
+def arrows(g: View) -> list[tuple[tuple[float, float], tuple[float, float]]]:
     """Where the fluid moves and where to, px of the working picture: begin and end, the fastest a step long."""
     height, width = g.mask.shape
     step = max(height, width) / ARROWS

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import platform
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -44,6 +44,7 @@ def make(
     hints: ClipHints = NOTHING_SAID,
     force: Iterable[str] = (),
     progress: Progress | None = None,
+    value_told: Callable[[str, Any], None] = lambda name, value: None,
 ) -> Made:
     """Run every stage that is not already done and write the asset folder.
 
@@ -54,6 +55,7 @@ def make(
         hints: what a person drew on the clip; those that are settings (`ClipHints.settings`) stand in `config`.
         force: stages to run again, with all that come after.
         progress: where progress is told.
+        value_told: gets the name and the value of each stage as it ends.
 
     Raises:
         InputRejected: an input that cannot be used, or a folder that is not an asset. Nothing is left behind then
@@ -71,7 +73,7 @@ def make(
     request_of(config.fit)  # so is a parameter that is not known
     warnings = generate.require_usable(inputs, config, folder)
     began = time.perf_counter()
-    runner = Runner(folder, stages, force=frozenset(force), progress=progress or Silence())
+    runner = Runner(folder, stages, force=frozenset(force), progress=progress or Silence(), value_told=value_told)
     for text in warnings:
         runner.warn(text)
     with gone_if_refused(runner, "motion"), writing(folder, "fluidlift make"):

@@ -1,0 +1,29 @@
+"""`fluidlift studio`: clips in the browser, put right and made."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+
+@dataclass(frozen=True)
+class Studio:
+    """See in the browser what is found of a clip, put it right with a few strokes, and make it."""
+
+    place: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CLIP|FOLDER")] = Path(".")
+    """a video, or a folder of videos and assets; by default the current folder"""
+    port: int = 8180
+    """of the page; the next free one where it is in use"""
+    browser: bool = True
+    """open the page in the default browser"""
+
+
+def run(command: Studio) -> int:
+    """Serve the page until Ctrl-C; the exit code."""
+    from fluidlift.studio.app import StudioRequest, studio
+
+    studio(command.place, StudioRequest(command.port, command.browser), told=lambda line: print(line, flush=True))
+    return 0

@@ -202,9 +202,7 @@ def test_make_can_be_stopped_goes_on_and_lies_on_the_shelf(visit):
     visit.says("what was done is kept")
     visit.page.locator("#make").click()
     visit.until(lambda: desk.making.state.running or desk.making.state.outcome.startswith("made"), "the second make")
-    visit.until(
-        lambda: not desk.making.state.running, "the end", 900.0
-    )  # a whole make
+    visit.until(lambda: not desk.making.state.running, "the end", 900.0)  # a whole make
     assert desk.making.state.finished[0]["kept"], desk.making.state
     visit.says("made in")
     visit.tab("Shelf")

@@ -4,6 +4,7 @@ import asyncio
 import json
 import shutil
 
+import numpy as np
 import pytest
 
 pytest.importorskip("starlette", reason="starlette is not installed: pip install 'fluidlift[studio]'")
@@ -13,8 +14,10 @@ from fluidlift.io.hints_file import read_hints
 from fluidlift.studio.app import app_of, open_desk
 from fluidlift.studio.clips import name_for
 from fluidlift.studio.history import HintsHistory
+from fluidlift.studio.looking import LOOK_SECONDS, LOOK_SIZE, Wish, look_config
 from fluidlift.studio.shelf import Shelf
-from fluidlift.types.hints import ClipIdentity
+from fluidlift.studio.stage_pictures import StagePictures, flow_picture
+from fluidlift.types.hints import ClipHints, ClipIdentity
 
 SIZE = (320, 200)
 AREA = {"is": "rock", "area": [[10, 10], [30, 10], [30, 30]]}
@@ -169,6 +172,62 @@ def test_a_place_that_is_neither_clip_nor_folder_is_refused(tmp_path):
     for name in ("a.txt", "nothing.mp4"):
         with pytest.raises(InputRejected):
             open_desk(tmp_path / name)
+
+
+def test_a_hints_file_that_cannot_be_used_is_told_and_moved_aside(desk, monkeypatch):
+    monkeypatch.setattr(desk.looking, "ask", lambda wish: None)
+    file = desk.folder / "stream.hints.yaml"
+    file.write_text("hints: 1\nclip: {size: [96, 64], sha256: abc, name: other.mp4}\n")
+    desk.open("stream.mp4")
+    state = desk.state()
+    assert "belongs to another clip" in state["error"] and state["broken"] == file.name and state["hints"] is None
+    desk.fresh_hints()
+    assert desk.state()["error"] == "" and desk.state()["hints"] is not None
+    assert len(list(desk.folder.glob("stream.hints.yaml.*.old"))) == 1
+
+
+def test_a_clip_that_cannot_be_read_is_told(desk):
+    (desk.folder / "broken.mp4").write_bytes(b"no film" * 50)
+    desk.open("broken.mp4")
+    assert "broken.mp4" in desk.state()["error"]
+
+
+@pytest.mark.parametrize("duration", [None, 1.5])
+def test_a_look_is_short_where_nothing_is_trimmed(duration):
+    config = look_config(ClipHints(duration=duration))
+    assert config.read.duration == (duration or LOOK_SECONDS) and config.read.max_size == LOOK_SIZE
+
+
+def test_a_newer_wish_overtakes_slow_work_only_where_that_depends_on_it(desk, tmp_path):
+    def wish(**hints):
+        return Wish(tmp_path / "a.mp4", ClipHints(**hints), tmp_path)
+
+    looking, old = desk.looking, wish()
+    for newer, at_once in ((wish(kind="pour"), False), (wish(start=1.0), True)):
+        looking._wish = newer  # without waking the thread
+        assert looking.overtaken(old, between=True)
+        assert looking.overtaken(old, between=False) == at_once
+    looking._wish = None
+
+
+def test_colours_of_the_flow_tell_directions_apart():
+    way = np.zeros((4, 8, 2), np.float32)
+    way[:, :4, 0], way[:, 4:, 0] = 2.0, -2.0
+    picture = flow_picture(way)
+    assert np.abs(picture[0, 0].astype(int) - picture[0, 7].astype(int)).max() > 100
+
+
+def test_stages_without_a_picture_leave_none(tmp_path):
+    pictures = StagePictures(tmp_path / "making")
+    pictures.told("fit", object())
+    assert list((tmp_path / "making").iterdir()) == []
+
+
+def test_a_wrong_place_is_rejected_on_the_command_line(tmp_path, capsys):
+    from fluidlift.cli import _run
+
+    assert _run(["studio", str(tmp_path / "nothing.mp4"), "--no-browser"]) == 3
+    assert "no such clip or folder" in capsys.readouterr().err
 
 
 def test_the_shelf_copies_discards_and_restores(finished_tank_copy):

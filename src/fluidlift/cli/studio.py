@@ -18,7 +18,7 @@ class Studio:
     port: int = 8180
     """of the page; the next free one where it is in use"""
     browser: bool = True
-    """open the page in the default browser"""
+    """the page opens in the default browser; --no-browser leaves that to you"""
 
 
 def run(command: Studio) -> int:

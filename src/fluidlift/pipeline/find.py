@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from fluidlift.config import JobConfig
+from fluidlift.io.atomic import disk_errors
 from fluidlift.io.hints_file import content_hash
 from fluidlift.io.video import probe
 from fluidlift.pipeline import begin
@@ -164,10 +165,11 @@ def find_hints(
     stages = begin.stages_of(FIND_STAGES, hints)
     runner = Runner(folder, stages, progress=progress or Silence(), value_told=told)
     given = GivenFiles.of(inputs)
-    seen = begin.look(runner, given, config, said=hints)
-    found = runner.run(
-        "view", view, *seen, GivenView.of(given, config), begin.geometry_settings(seen[0], config, hints)
-    )
+    with disk_errors(folder):
+        seen = begin.look(runner, given, config, said=hints)
+        found = runner.run(
+            "view", view, *seen, GivenView.of(given, config), begin.geometry_settings(seen[0], config, hints)
+        )
     identity = hints.clip or identity_of(inputs.clip, config.read.fps)
     return Found(identity, seen[0], seen[2], found, tuple(runner.warnings))
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from fluidlift.errors import InputRejected
-from fluidlift.io.atomic import write_json
+from fluidlift.io.atomic import disk_errors, write_json
 from fluidlift.io.hints_file import hints_data, parse_hints, read_found, read_hints, require_same_clip, write_hints
 from fluidlift.io.limits import read_json
 from fluidlift.types.hints import ClipHints, ClipIdentity
@@ -118,12 +118,14 @@ class HintsHistory:
 
     def _save(self, hints: ClipHints) -> None:
         hints = replace(hints, clip=self._identity)
-        write_hints(self.file, hints, self.found)
+        with disk_errors(self.file):
+            write_hints(self.file, hints, self.found)
         self.hints, self._written = hints, self.file.read_bytes()
 
     def _save_steps(self) -> None:
-        self._steps.parent.mkdir(parents=True, exist_ok=True)
-        write_json(self._steps, {"done": self._done, "undone": self._undone})
+        with disk_errors(self._steps):
+            self._steps.parent.mkdir(parents=True, exist_ok=True)
+            write_json(self._steps, {"done": self._done, "undone": self._undone})
 
 
 def _changed(data: dict[str, Any], what: dict[str, Any]) -> dict[str, Any]:

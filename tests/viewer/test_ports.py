@@ -8,6 +8,7 @@ import urllib.request
 
 import pytest
 
+from fluidlift import served as serving
 from fluidlift.errors import InputRejected, MissingPackage
 from fluidlift.viewer import ports
 
@@ -23,13 +24,13 @@ def taken():
 
 def test_a_port_in_use_gives_the_next_free_one(taken):
     found = ports.free_port("127.0.0.1", taken)
-    assert taken < found < taken + ports.TRIED
+    assert taken < found < taken + serving.TRIED
     with socket.socket() as mine:
         mine.bind(("127.0.0.1", found))
 
 
 def test_where_no_port_is_free_the_message_says_which_were_tried(taken, monkeypatch):
-    monkeypatch.setattr(ports, "TRIED", 1)
+    monkeypatch.setattr(serving, "TRIED", 1)
     with pytest.raises(InputRejected, match=rf"no free port from {taken} to {taken}.*--port"):
         ports.free_port("127.0.0.1", taken)
 

@@ -33,6 +33,7 @@ from fluidlift.cli.options import (
     Export,
     Fit,
     Generators,
+    Hints,
     Inspect,
     Make,
     Mask,
@@ -41,6 +42,7 @@ from fluidlift.cli.options import (
     Sim,
     Validate,
 )
+from fluidlift.cli.studio import Studio
 from fluidlift.cli.view import View
 from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.kernels import compiling_beside
@@ -51,11 +53,13 @@ Command = (
     | Batch
     | Edit
     | Sim
+    | Studio
     | View
     | Render
     | Export
     | Fit
     | Inspect
+    | Hints
     | Mask
     | Motion
     | Evaluate
@@ -163,7 +167,8 @@ def _make(c: Make) -> int:
         "generate.code": text_of(b.generator_code), "generate.accept_licence": b.accept_licence or None,
         "generate.use": b.use,
     }  # fmt: skip
-    config = build_config(q.preset, c.settings.config, c.settings.set, flat)
+    hints = _read_hints(c.input.hints, c.clip)
+    config = build_config(q.preset, c.settings.config, c.settings.set, flat, base=dict(hints.settings))
     if c.settings.print_config:
         import yaml
 
@@ -175,9 +180,29 @@ def _make(c: Make) -> int:
         config = accepted_by_asking(config)
     code = _run_job(
         c.clip, c.out or default_folder(c.clip), config, mask=c.input.mask, camera=c.input.camera, depth=c.input.depth,
-        geometry=b.geometry_from, flow=c.input.flow, force=c.settings.force, as_json=c.json,
+        geometry=b.geometry_from, flow=c.input.flow, hints=hints, force=c.settings.force, as_json=c.json,
     )  # fmt: skip
     return DONE if c.warnings_ok and code == WITH_WARNINGS else code
+
+
+def _read_hints(file: Path | None, clip: Path) -> Any:
+    """The hints of a file, which must be of this clip; none where there is no file."""
+    from fluidlift.types.hints import NOTHING_SAID
+
+    if file is None:
+        return NOTHING_SAID
+    from fluidlift.io.hints_file import read_hints, require_same_clip
+
+    hints = read_hints(file)
+    if clip.exists():  # that it is not there is said where the clip is read
+        require_same_clip(hints, clip, file.name)
+    return hints
+
+
+def _hints(c: Hints) -> int:
+    from fluidlift.cli.hints import run
+
+    return run(c)
 
 
 def _as_settings(args: list[str]) -> list[str]:
@@ -206,11 +231,15 @@ def default_folder(clip: Path) -> Path:
     return Path((name or "clip") + ".fluid")
 
 
-def _run_job(clip: Path, out: Path, config: Any, *, force=(), as_json=False, **files: Path | None) -> int:
+def _run_job(
+    clip: Path, out: Path, config: Any, *, hints: Any = None, force=(), as_json=False, **files: Path | None
+) -> int:
     with shown_progress() as progress, compiling_beside(progress.say):
         from fluidlift.pipeline import Inputs, make
+        from fluidlift.types.hints import NOTHING_SAID
 
-        made = make(Inputs(clip, **files), out, config, force=force, progress=progress)
+        said = hints or NOTHING_SAID
+        made = make(Inputs(clip, **files), out, config, hints=said, force=force, progress=progress)
     return _tell(made, as_json)
 
 
@@ -272,6 +301,12 @@ def _batch(c: Batch) -> int:
 
 def _edit(c: Edit) -> int:
     from fluidlift.cli.edit import run
+
+    return run(c)
+
+
+def _studio(c: Studio) -> int:
+    from fluidlift.cli.studio import run
 
     return run(c)
 
@@ -480,7 +515,7 @@ def _doctor(c: Doctor) -> int:
 
 
 _COMMANDS = {
-    Make: _make, Batch: _batch, Fit: _fit, Sim: _sim, Edit: _edit, View: _view, Render: _render, Export: _export,
-    Inspect: _inspect, Mask: _mask, Motion: _motion, Evaluate: _evaluate, Validate: _validate, Demo: _demo,
-    Generators: _generators, Doctor: _doctor,
+    Make: _make, Batch: _batch, Fit: _fit, Sim: _sim, Edit: _edit, Studio: _studio, View: _view, Render: _render,
+    Export: _export, Inspect: _inspect, Hints: _hints, Mask: _mask, Motion: _motion, Evaluate: _evaluate,
+    Validate: _validate, Demo: _demo, Generators: _generators, Doctor: _doctor,
 }  # fmt: skip

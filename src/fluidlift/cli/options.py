@@ -58,6 +58,14 @@ class Input:
 
 
 @command
+class MakeInput(Input):
+    """Files beside the clip."""
+
+    hints: Path | None = None
+    """hints.yaml: mask, horizon, ruler, kind and more as you know them (docs/hints.md; fluidlift hints begins one)"""
+
+
+@command
 class Body:
     """Learned depth, or a body that something else made."""
 
@@ -121,7 +129,7 @@ class Make:
     """print the outcome as JSON"""
     warnings_ok: bool = False
     """end with 0 instead of 4 where the asset has warnings"""
-    input: tyro.conf.OmitArgPrefixes[Input] = field(default_factory=Input)
+    input: tyro.conf.OmitArgPrefixes[MakeInput] = field(default_factory=MakeInput)
     """files beside the clip; what is not given is estimated"""
     scene: tyro.conf.OmitArgPrefixes[Scene] = field(default_factory=Scene)
     """what you know of the fluid and of the camera"""
@@ -253,6 +261,22 @@ class Inspect:
     """frames per second of an image sequence"""
     json: bool = False
     """print as JSON"""
+
+
+@command
+class Hints:
+    """Find mask, kind, tilt and scale of a clip only, and write them beside it as a hints file to be corrected."""
+
+    clip: Clip
+    """a video, a folder of pictures or a pattern"""
+    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """hints file; by default the clip's name with .hints.yaml, beside it. Hints that stand in it are kept and used"""
+    max_size: int | None = None
+    """longer side of the working pictures, px (512)"""
+    json: bool = False
+    """print what was found as JSON"""
+    part: tyro.conf.OmitArgPrefixes[Part] = field(default_factory=Part)
+    """which part of the clip; it is written as a hint"""
 
 
 @command

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from fluidlift.config import JobConfig
+from fluidlift.errors import InputRejected
 from fluidlift.pipeline import depths, given_body
-from fluidlift.pipeline.hints import NO_HINTS, Hints
+from fluidlift.pipeline.hints import NO_HINTS, Hints, require_no_contradiction
 from fluidlift.pipeline.inputs import GivenFiles
 from fluidlift.pipeline.runner import Runner
 from fluidlift.pipeline.settings import (
@@ -18,24 +19,49 @@ from fluidlift.pipeline.settings import (
     SegmentSettings,
     taken,
 )
+from fluidlift.pipeline.stages.correct import correct, nothing_found
 from fluidlift.pipeline.stages.flow import estimated_flow, given_flow
 from fluidlift.pipeline.stages.geometry import geometry
 from fluidlift.pipeline.stages.read import read
 from fluidlift.pipeline.stages.segment import require_usable, segment
+from fluidlift.types.hints import NOTHING_SAID, ClipHints
 from fluidlift.types.stages import Flow, Geometry, Read, Segmentation
+
+CORRECT = "correct"
+"""the stage that a job with regions in its hints has after segment"""
+
+
+def stages_of(stages: tuple[str, ...], hints: ClipHints) -> tuple[str, ...]:
+    """The stages of a job: with `correct` after segment where a person drew regions."""
+    if not hints.regions:
+        return stages
+    at = stages.index("segment") + 1
+    return (*stages[:at], CORRECT, *stages[at:])
 
 
 def look(
-    runner: Runner, given: GivenFiles, config: JobConfig, hints: Hints = NO_HINTS
+    runner: Runner, given: GivenFiles, config: JobConfig, hints: Hints = NO_HINTS, said: ClipHints = NOTHING_SAID
 ) -> tuple[Read, Flow, Segmentation]:
-    """Run read, flow and segment; what later stages are given is looked at before the slow ones.
+    """Run read, flow, segment and, where regions were drawn, correct; what later stages are given is looked at first.
+
+    Args:
+        runner: of the job.
+        given: its files.
+        config: of it.
+        hints: of the command line, in px of the working picture.
+        said: those of a hints file, which take the place of `hints` where there are some.
 
     Raises:
         InputRejected: an input that cannot be used.
     """
     depths.require_weights(config.depth)
+    require_no_contradiction(said, config, given)
     mask, finder = GivenMask.of(given, config), SegmentSettings.of(config)
     clip = runner.run("read", read, given.clip, given.camera, taken(ReadSettings, config.read))
+
+    drawn = said.at(clip.clip.size)
+    if drawn.roi is not None or drawn.clicks:
+        hints = Hints.drawn(drawn)
 
     def first() -> None:
         require_usable(clip.clip, mask, finder, hints)
@@ -49,11 +75,26 @@ def look(
         flow = runner.run("flow", estimated_flow, clip, FlowSettings.of(config), before=first)
     else:
         flow = runner.run("flow", given_flow, clip, own, before=first)
-    found = runner.run("segment", segment, clip, flow, mask, None if mask is not None else finder, hints)
+    try:
+        found = runner.run("segment", segment, clip, flow, mask, None if mask is not None else finder, hints)
+    except InputRejected:
+        if not any(r.what == "fluid" for r in drawn.regions):
+            raise
+        found = runner.run("segment", nothing_found, clip)
+    if drawn.regions:
+        found = runner.run(CORRECT, correct, clip, flow, found, drawn.regions)
     return clip, flow, found
 
 
-def shape(runner: Runner, seen: tuple[Read, Flow, Segmentation], given: GivenFiles, config: JobConfig) -> Geometry:
-    """Run geometry."""
-    settings = taken(GeometrySettings, config.shape)
+def shape(
+    runner: Runner, seen: tuple[Read, Flow, Segmentation], given: GivenFiles, config: JobConfig,
+    said: ClipHints = NOTHING_SAID,
+) -> Geometry:  # fmt: skip
+    """Run geometry, with what a hints file says of the view."""
+    settings = geometry_settings(seen[0], config, said)
     return runner.run("geometry", geometry, *seen, GivenView.of(given, config), settings)
+
+
+def geometry_settings(read: Read, config: JobConfig, said: ClipHints) -> GeometrySettings:
+    """What geometry is told."""
+    return taken(GeometrySettings, config.shape, drawn=said.at(read.clip.size).view)

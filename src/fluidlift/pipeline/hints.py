@@ -1,4 +1,4 @@
-"""What a person says about where the fluid is."""
+"""What a person says about where the fluid is, on the command line or in a hints file."""
 
 from __future__ import annotations
 
@@ -7,7 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected
+from fluidlift.pipeline.inputs import GivenFiles
+from fluidlift.types.hints import ClipHints
 
 
 @dataclass(frozen=True)
@@ -31,12 +34,37 @@ class Hints:
         points += [(*_numbers(text, 2, "--not-here", "x,y"), False) for text in not_here]
         return cls(None if box is None else tuple(round(v) for v in box), tuple(points))  # type: ignore[arg-type]
 
+    @classmethod
+    def drawn(cls, hints: ClipHints) -> Hints:
+        """Those of a hints file, in px of the working picture (`ClipHints.at`)."""
+        box = None if hints.roi is None else tuple(round(v) for v in hints.roi)
+        return cls(box, tuple((*c.at, c.fluid) for c in hints.clicks))  # type: ignore[arg-type]
+
     def clicks(self) -> list[tuple[float, float, int]]:
         """The points as `shape.segment` takes them."""
         return [(x, y, int(there)) for x, y, there in self.points]
 
 
 NO_HINTS = Hints()
+
+
+def require_no_contradiction(hints: ClipHints, config: JobConfig, given: GivenFiles) -> None:
+    """Raise `InputRejected` where a hints file and what stands beside it say the same thing twice."""
+    s = config.shape
+    if hints.horizon is not None and (s.pitch is not None or s.roll is not None):
+        raise InputRejected(
+            "two horizons: one drawn in the hints, and --pitch or --roll", "one of them", "leave one out"
+        )
+    if hints.ruler is not None and s.size is not None:
+        raise InputRejected("two sizes: a ruler in the hints, and --size", "one of them", "leave one out")
+    if given.camera is not None and (hints.horizon is not None or hints.fov is not None):
+        from fluidlift.io.images import read_json
+
+        posed = {"R", "frames"} & set(read_json(given.camera.path, "camera file"))
+        if hints.fov is not None or posed:
+            raise InputRejected(
+                "a camera file, and a horizon or a field of view in the hints", "one of them", "leave one out"
+            )
 
 
 def _numbers(text: str, count: int, option: str, form: str) -> list[float]:

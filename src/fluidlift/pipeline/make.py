@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import platform
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from fluidlift import __version__
 from fluidlift.config import JobConfig
+from fluidlift.io.hints_file import hints_data
 from fluidlift.pipeline import begin
 from fluidlift.pipeline.fit_request import request_of
 from fluidlift.pipeline.inputs import GivenFile, GivenFiles, Inputs
@@ -29,6 +30,7 @@ from fluidlift.scene.splat_files import require_room
 from fluidlift.seams import Progress, Silence
 from fluidlift.types import Filmed, FluidAsset, kind_of
 from fluidlift.types.fluid_masks import FluidMasks
+from fluidlift.types.hints import NOTHING_SAID, ClipHints
 from fluidlift.types.stages import Bodies, Calibration, Fit, Lift, Read, Segmentation
 
 STAGES = ("read", "flow", "segment", "geometry", "refine", "motion", "fit", "calibrate", "simulate", "show")
@@ -39,8 +41,10 @@ def make(
     folder: Path,
     config: JobConfig,
     *,
+    hints: ClipHints = NOTHING_SAID,
     force: Iterable[str] = (),
     progress: Progress | None = None,
+    value_told: Callable[[str, Any], None] = lambda name, value: None,
 ) -> Made:
     """Run every stage that is not already done and write the asset folder.
 
@@ -48,8 +52,10 @@ def make(
         inputs: the clip and what the user adds to it.
         folder: of the asset; an existing asset is continued or rewritten.
         config: of the job.
+        hints: what a person drew on the clip; those that are settings (`ClipHints.settings`) stand in `config`.
         force: stages to run again, with all that come after.
         progress: where progress is told.
+        value_told: gets the name and the value of each stage as it ends.
 
     Raises:
         InputRejected: an input that cannot be used, or a folder that is not an asset. Nothing is left behind then
@@ -60,32 +66,37 @@ def make(
     from fluidlift.io.asset_folder import check_output_folder
     from fluidlift.io.asset_lock import writing
 
-    stages = generate.stages_of(STAGES, config)
+    stages = begin.stages_of(generate.stages_of(STAGES, config), hints)
     require_stages(force, stages)
     check_output_folder(folder)
     particle_work(config.simulate.device)  # a device that is not there is said now, not after the fit
     request_of(config.fit)  # so is a parameter that is not known
     warnings = generate.require_usable(inputs, config, folder)
     began = time.perf_counter()
-    runner = Runner(folder, stages, force=frozenset(force), progress=progress or Silence())
+    runner = Runner(folder, stages, force=frozenset(force), progress=progress or Silence(), value_told=value_told)
     for text in warnings:
         runner.warn(text)
     with gone_if_refused(runner, "motion"), writing(folder, "fluidlift make"):
         given = GivenFiles.of(inputs)
-        lift = _lifted(runner, given, config)
+        lift = _lifted(runner, given, config, hints)
         frames = config.simulate.frames or len(lift.clip) - lift.geometry.rest_frame
         require_room(folder, frames, len(lift.refined.body))
-        asset = _write_asset(runner, lift, config, given.provenance())
+        asset = _write_asset(runner, lift, config, given.provenance() | _provenance(hints))
         request = SimulationRequest(restart="simulate" in runner.force)
         frames = play(runner, asset, config, request, lift)
     return Made(folder, tuple(runner.warnings), time.perf_counter() - began, runner.timings, frames)
 
 
-def _lifted(runner: Runner, given: GivenFiles, config: JobConfig) -> Lift:
+def _provenance(hints: ClipHints) -> dict[str, Any]:
+    """What a person said, for a manifest."""
+    return {} if hints == NOTHING_SAID else {"hints": hints_data(hints)}
+
+
+def _lifted(runner: Runner, given: GivenFiles, config: JobConfig, hints: ClipHints) -> Lift:
     """From the clip to the parameters."""
-    read, flow, segmentation = seen = begin.look(runner, given, config)
+    read, flow, segmentation = seen = begin.look(runner, given, config, said=hints)
     given = _with_bodies(runner, read, segmentation, given, config)
-    geometry = begin.shape(runner, seen, given, config)
+    geometry = begin.shape(runner, seen, given, config, hints)
     settings = taken(RefineSettings, config.shape, seed=config.seed)
     refined = runner.run("refine", refine, *seen, geometry, given.geometry, settings)
     moving = runner.run("motion", motion, *seen, geometry, taken(MotionSettings, config.motion))

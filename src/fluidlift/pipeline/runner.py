@@ -43,12 +43,15 @@ class Runner:
         stages: names of those that will be run, for progress.
         force: names of stages to run again, with all that come after.
         progress: where progress is told.
+        value_told: gets the name and the value of each stage as it ends.
     """
 
     def __init__(
-        self, folder: Path, stages: tuple[str, ...], *, force: frozenset[str] = frozenset(), progress: Progress
-    ) -> None:
+        self, folder: Path, stages: tuple[str, ...], *, force: frozenset[str] = frozenset(), progress: Progress,
+        value_told: Callable[[str, Any], None] = lambda name, value: None,
+    ) -> None:  # fmt: skip
         self.folder, self.stages, self.force, self.progress = folder, stages, force, progress
+        self._value_told = value_told
         self.keys: dict[str, str] = {}
         self.timings: dict[str, dict[str, Any]] = {}
         """of the stages that are done"""
@@ -103,6 +106,7 @@ class Runner:
         for text in getattr(found[0], "warnings", ()):
             self.told.append(text)
             self.warn(text)
+        self._value_told(name, found[0])
         self.progress.finished(name, seconds, cached)
         return found[0]
 

@@ -15,6 +15,7 @@ from fluidlift.backends.registry import module_name, names
 from fluidlift.config import JobConfig
 from fluidlift.pipeline.inputs import GivenFile, GivenFiles, Weights
 from fluidlift.source import source_hash
+from fluidlift.types.hints import DrawnView
 
 T = TypeVar("T")
 
@@ -229,6 +230,8 @@ class GeometrySettings:
     cells: int
     cell_limit: int
     longest_union: int
+    drawn: DrawnView | None = None
+    """horizon, ruler, rims and sky of a hints file, in px of the working picture"""
 
 
 @dataclass(frozen=True)

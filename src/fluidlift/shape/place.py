@@ -7,8 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from fluidlift.errors import InputRejected
 from fluidlift.shape.heights import HeightModel
 from fluidlift.types import FluidKind, MetricScale, PinholeCamera, RigidTransform, Similarity3, UpEvidence, kind_of
+from fluidlift.types.hints import Ruler
 from fluidlift.types.kind import POUR
 
 STANDARD_GRAVITY = 9.81
@@ -248,7 +250,7 @@ def metric_scale(
         known_scale: metres per canonical unit, where the depth came in metres.
         seen: how the velocities were seen.
     """
-    extent = float(np.ptp(np.percentile(points, [0.5, 99.5], axis=0), axis=0).max())
+    extent = extent_of(points)
     drop = float(-np.median(points[:, 2])) if camera_height is not None else 0.0
     surveyed = camera_height / drop if camera_height is not None and camera_height > 0 and drop > 0 else None
     if size is not None:
@@ -284,6 +286,41 @@ def metric_scale(
         across=1.0,
         refusal=refusal,
     )
+
+
+def ruler_scale(camera: PinholeCamera, points: Float[np.ndarray, "n 3"], ruler: Ruler) -> MetricScale:
+    """Metres per canonical unit by something of known length that lies on the fluid's surface.
+
+    The surface is taken for the plane that fits its points best; the ends of the ruler may lie beside the fluid.
+
+    Args:
+        camera: at the origin of the canonical frame.
+        points: canonical, on the fluid.
+        ruler: px of the camera's picture.
+
+    Raises:
+        InputRejected: an end at which the plane is not seen, such as one above the horizon.
+    """
+    middle = np.median(points, axis=0)
+    normal = np.linalg.svd(points - middle, full_matrices=False)[2][2]
+    rays = camera.rays(np.array([ruler.begin, ruler.end], float))
+    toward = rays @ normal
+    away = (middle - camera.position) @ normal
+    along = away / np.where(np.abs(toward) < 1e-9, 1e-9, toward)
+    farthest = 20.0 * float(np.linalg.norm(points - camera.position, axis=1).max())
+    if (along <= 0).any() or (along * np.linalg.norm(rays, axis=1) > farthest).any():
+        raise InputRejected(
+            "an end of the ruler lies where the fluid's surface is not seen (at its horizon, or above)",
+            "two points on the fluid's surface, or beside it", "move the ruler, or correct the horizon",
+        )  # fmt: skip
+    ends = camera.position + rays * along[:, None]
+    value = ruler.metres / float(np.linalg.norm(ends[1] - ends[0]))
+    return MetricScale(value, "ruler", across=value * extent_of(points))
+
+
+def extent_of(points: Float[np.ndarray, "n 3"]) -> float:
+    """The longest side of the box around points, without outliers."""
+    return float(np.ptp(np.percentile(points, [0.5, 99.5], axis=0), axis=0).max())
 
 
 def place(

@@ -83,7 +83,7 @@ class MetricScale:
 
     value: float
     source: str
-    """size, depth, camera, free fall, front, or assumed"""
+    """size, ruler, depth, camera, free fall, front, or assumed"""
     warning: str = ""
     relative_error: float | None = None
     """standard error over value; None: not known (nothing was measured, or what was given is taken as it is)"""
@@ -95,7 +95,8 @@ class MetricScale:
     @property
     def sentence(self) -> str:
         """For people: `scale: 0.42 m across the fluid, from free fall, ± 12 %`."""
-        words = {"size": "as given", "depth": "from the given depth", "camera": "from the surveyed camera",
+        words = {"size": "as given", "ruler": "by the ruler laid along it",
+                 "depth": "from the given depth", "camera": "from the surveyed camera",
                  "free fall": "from free fall", "front": "from the speed of its front",
                  "assumed": "assumed"}  # fmt: skip
         error = "" if self.relative_error is None else f", ± {100 * 1.96 * self.relative_error:.0f} % (95 %)"

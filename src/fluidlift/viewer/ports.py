@@ -4,64 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import ipaddress
 import secrets
-import socket
-import sys
 from collections.abc import Callable, Iterator
 from http import HTTPStatus
 from typing import Any
-from urllib.parse import urlsplit
 
-from fluidlift.errors import InputRejected, MissingPackage
+from fluidlift.errors import MissingPackage
+from fluidlift.served import FIRST_PORT, PAGE_HEADERS, free_port, is_local, knows, same_origin
 
-FIRST_PORT = 8080
-TRIED = 100
-"""ports, from the one that was asked for"""
-
-PAGE_HEADERS = {
-    "Content-Security-Policy": "frame-ancestors 'none'",
-    "X-Frame-Options": "DENY",
-    "Referrer-Policy": "no-referrer",
-    "X-Content-Type-Options": "nosniff",
-    "Cross-Origin-Resource-Policy": "same-origin",
-}
-"""of all that is served: in no frame, and the address, which is a secret, is told to nobody"""
-
-
-def is_local(host: str) -> bool:
-    """Whether only this machine can reach a host's address."""
-    if host == "localhost":
-        return True
-    with contextlib.suppress(ValueError):
-        return ipaddress.ip_address(host).is_loopback
-    return False
-
-
-def free_port(host: str, first: int = FIRST_PORT) -> int:
-    """The first port from `first` on that nobody listens on.
-
-    Raises:
-        InputRejected: a port that does not exist, a host that is not this machine's, or none of `TRIED` ports is free.
-    """
-    if not 1 <= first <= 65535:
-        raise InputRejected(f"port {first}", "1 to 65535, such as 8080")
-    try:
-        family, _, _, _, address = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0]
-    except (OSError, UnicodeError):
-        raise InputRejected(f"no host '{host}'", "an address of this machine, such as 127.0.0.1") from None
-    for port in range(first, min(first + TRIED, 65536)):
-        with socket.socket(family, socket.SOCK_STREAM) as probe:
-            if sys.platform != "win32":  # as servers do: a port whose last connection has just ended is free
-                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            try:
-                probe.bind((address[0], port))
-                return port
-            except OSError as error:
-                last = error
-    raise InputRejected(
-        f"no free port from {first} to {port} on {host} ({last.strerror})", "a free one", "give another --port"
-    )
+__all__ = ["FIRST_PORT", "PAGE_HEADERS", "free_port", "is_local", "open_server", "require_viser", "same_origin"]
 
 
 def require_viser() -> Any:
@@ -117,31 +68,15 @@ def _guard(secret: str, answer: Callable[[Any, Any], Any]) -> Callable[[Any, Any
     """`answer` (which takes a connection and a request) for requests under `/secret` that no foreign page makes."""
 
     def guarded(connection: Any, request: Any) -> Any:
-        given, _, rest = request.path.partition("?")[0].removeprefix("/").partition("/")
-        if not secrets.compare_digest(given.encode(), secret.encode()):
+        known, path = knows(request.path, secret)
+        if not known:
             return connection.respond(HTTPStatus.FORBIDDEN, "Open the whole address that fluidlift view printed.\n")
         if not same_origin(request.headers.get("Origin"), request.headers.get("Host", "")):
             return connection.respond(HTTPStatus.FORBIDDEN, "A page of another origin is not let in.\n")
-        response = answer(connection, dataclasses.replace(request, path=f"/{rest}"))
+        response = answer(connection, dataclasses.replace(request, path=path))
         if response is not None:
             for name, value in PAGE_HEADERS.items():
                 response.headers[name] = value
         return response
 
     return guarded
-
-
-def same_origin(origin: str | None, host: str) -> bool:
-    """Whether a request comes from a page of the address that it goes to, however a tunnel may have renamed both.
-
-    Args:
-        origin: of the page, as browsers tell it; None: no browser, or no page.
-        host: that was asked for, with its port.
-    """
-    if origin is None:
-        return True
-    try:
-        parts = urlsplit(origin)
-    except ValueError:
-        return False
-    return parts.scheme in ("http", "https") and parts.netloc.lower() == host.lower() != ""

@@ -2,84 +2,30 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
 
 from fluidlift.errors import InputRejected
-from fluidlift.motion.steady_flow import mean_motion
-from fluidlift.pipeline import depths, given_body
-from fluidlift.pipeline.inputs import GivenFile
-from fluidlift.pipeline.known_camera import known_camera, lens_is_known, level_of
 from fluidlift.pipeline.settings import GeometrySettings, GivenView
+from fluidlift.pipeline.sight import Sight, mainstream_of, sighted
 from fluidlift.pipeline.work import Work
 from fluidlift.shape import (
     composite,
-    dam,
     generate,
     ground,
     ground_texture,
     place,
-    puddle,
     standing,
-    surface,
-    texture_gradient,
 )
-from fluidlift.shape import kind as kinds
-from fluidlift.shape.frame_pictures import typical_picture
-from fluidlift.shape.framing import framing_warnings
-from fluidlift.shape.given_depth import DepthPictures
-from fluidlift.shape.kinds import Observation, builder_of
-from fluidlift.shape.rest_frames import FEWEST_PIXELS, rest_frame, united_range
-from fluidlift.shape.view import as_relief, look_at
 from fluidlift.types import (
     CellType,
-    FluidKind,
-    KindEvidence,
-    MetricScale,
     PinholeCamera,
     Setting,
-    UpEvidence,
     VideoClip,
-    kind_of,
 )
 from fluidlift.types.fluid_masks import FluidMasks
-from fluidlift.types.kind import STREAM
 from fluidlift.types.stages import Flow, Geometry, Read, Segmentation
-
-
-@dataclass(frozen=True)
-class _Sight:
-    """What the stages before have seen, and how the camera is taken to stand."""
-
-    start: int
-    """frame of the body at rest"""
-    united: int
-    """frames in all that become one body"""
-    mask: np.ndarray
-    motion: np.ndarray
-    trust: np.ndarray
-    known: PinholeCamera
-    """its pose counts where `pose_given`"""
-    pose_given: bool
-    evidence: KindEvidence
-    kind: FluidKind
-    parts: composite.Parts
-    up: UpEvidence
-    heading: float | None
-    tilt_known: bool
-    height: float | None
-    """of the camera above the water, in the units of its file, where that is known"""
-    unsure: str
-    """what to say of that height; empty: nothing"""
-    stood: standing.StandingBody | None = None
-    """of a dam"""
-
-    @property
-    def lying_trust(self) -> np.ndarray:
-        """Trust in the motion of what lies."""
-        return self.trust * ~self.parts.falling
 
 
 def geometry(
@@ -98,28 +44,12 @@ def geometry(
     Raises:
         InputRejected: a fluid without a shape, or something given that does not fit.
     """
-    clip, c = read.clip, config
+    s, clip, c = sighted(read, flow, segmentation, given, config, work=work), read.clip, config
     fluid = FluidMasks(segmentation.labels.labels)
-    seen, pictures = _seen(read, flow, fluid, given, config, work)
-    kind, parts, mask = seen.kind, seen.parts, seen.mask
-    up, canonical, front, known_scale, seen_depth = _surface(seen, pictures, fluid, given, clip.interval)
-    warnings = framing_warnings(mask, fluid.areas()) + up.warnings
-    if c.kind == "auto":
-        warnings += kinds.doubts(seen.evidence)
-    front, falling = composite.standing(front, parts, canonical, mask)
-    visible = mask & (front.depth > 0)
-    if 0 < visible.sum() < FEWEST_PIXELS:
-        raise InputRejected(
-            f"only {int(visible.sum())} fluid pixels at frame {seen.start}", f"at least {FEWEST_PIXELS}",
-            "check the mask, or raise --max-size",
-        )  # fmt: skip
-    points, velocities = _surface_motion(canonical, visible, front.sighted, seen.motion, clip.interval)
-    falls, trust = falling.pixels[visible], seen.trust[visible]
-    sighting = place.Sighting(trust, clip.interval, up.pitch)
-    moving = _Moving(points, velocities, falls, sighting, known_scale)
-    scale, sentence, told = _scale(seen, moving, seen_depth, c.size, fluid, canonical)
-    warnings += told
-    mainstream = _mainstream(kind, velocities[~falls], trust[~falls]) if seen.stood is None else seen.stood.direction
+    seen, canonical, front, falling, visible = s.seen, s.canonical, s.front, s.falling, s.visible
+    kind, parts, mask, points, velocities, scale = seen.kind, seen.parts, seen.mask, s.points, s.velocities, s.scale
+    falls, trust, seen_depth = falling.pixels[visible], seen.trust[visible], s.seen_depth
+    mainstream = mainstream_of(kind, velocities[~falls], trust[~falls]) if seen.stood is None else seen.stood.direction
     eye = seen.known.position if seen.pose_given else None
     to_world, camera = place.place(canonical, points, scale.value, heading=seen.heading, eye=eye, mainstream=mainstream)
     depth = (front.depth * scale.value).astype(np.float32)
@@ -142,11 +72,11 @@ def geometry(
     setting, picture = _coloured(setting, clip, fluid, seen, falling.pixels, camera)
     return Geometry(
         kind=kind.name,
-        kind_source="evidence" if c.kind == "auto" else "user",
+        kind_source=s.kind_source,
         kind_evidence=seen.evidence,
-        up=up,
+        up=s.up,
         scale=scale,
-        scale_sentence=sentence,
+        scale_sentence=s.sentence,
         camera=camera,
         world_from_canonical=to_world,
         setting=setting,
@@ -160,53 +90,16 @@ def geometry(
         rest_frame=seen.start,
         united_frames=seen.united,
         rocks=None if seen.stood is None else seen.stood.solid,
-        known_scale=known_scale,
+        known_scale=s.known_scale,
         depth_source=None if seen_depth is None else seen_depth.meta,
         jets=tuple(falling.plain(to_world)),
         slope=front.slope,
-        warnings=tuple(warnings),
+        warnings=tuple(s.warnings),
     )
 
 
-@dataclass(frozen=True)
-class _Moving:
-    """Points on the surface, canonical, and how they move."""
-
-    points: np.ndarray
-    velocities: np.ndarray
-    """units per second"""
-    falls: np.ndarray
-    """bool: of jets"""
-    sighting: place.Sighting
-    known_scale: float | None
-    """m per unit, of depth in metres"""
-
-
-def _scale(
-    seen: _Sight, moving: _Moving, seen_depth: depths.DepthFront | None, size: float | None, fluid: FluidMasks,
-    canonical: PinholeCamera,
-) -> tuple[MetricScale, str, list[str]]:  # fmt: skip
-    """Metres per canonical unit, in words, and warnings."""
-    points, velocities, stood, warnings = moving.points, moving.velocities, seen.stood, []
-    if stood is not None:
-        scale = standing.standing_scale(
-            stood, size=size, height=seen.height,
-            speed=lambda: dam.front_speed(fluid, seen.start, canonical, stood) / moving.sighting.interval,
-        )  # fmt: skip
-    else:
-        scale = place.metric_scale(
-            seen.kind, points, velocities, size=size, camera_height=seen.height, known_scale=moving.known_scale,
-            seen=moving.sighting,
-        )  # fmt: skip
-    if seen_depth is not None:
-        scale = depths.with_learned_scale(scale, seen_depth, points)
-        warnings += depths.size_warnings(scale.across, seen_depth, seen.height, points)
-    scale, sentence = _told(composite.with_fall(scale, points, velocities, moving.falls, moving.sighting), seen)
-    return scale, sentence, warnings + [scale.warning] * bool(scale.warning)
-
-
 def _coloured(
-    setting: Setting, clip: VideoClip, fluid: FluidMasks, seen: _Sight, falls: np.ndarray, camera: PinholeCamera
+    setting: Setting, clip: VideoClip, fluid: FluidMasks, seen: Sight, falls: np.ndarray, camera: PinholeCamera
 ) -> tuple[Setting, np.ndarray]:
     """The setting with its ground as the clip shows it, and the picture without the fluid, u8 [h,w,3]."""
     # the plate looks at a few frames only
@@ -218,179 +111,6 @@ def _coloured(
         setting = ground.textured(setting, view)
         picture = ground_texture.over_bed(picture, view.seen, setting.terrain.mesh, camera)
     return ground.finished(setting, picture, camera), picture
-
-
-def _seen(
-    read: Read, flow: Flow, fluid: FluidMasks, given: GivenView, config: GeometrySettings, work: Work
-) -> tuple[_Sight, DepthPictures | None]:
-    """Mask, motion, kind and camera; and depth pictures where there are some."""
-    clip = read.clip
-    start, united = united_range(clip, fluid, config.longest_union)
-    mask = generate.united_mask(fluid[start : start + united])
-    if not mask.any():
-        mask = fluid[start]
-    motion, trust = mean_motion(clip, flow.flow, fluid.any_frame())
-    known, pose_given = known_camera(given, config.fov, clip.size)
-    pictures, known = _depth_pictures(read, given, config.fov, known, start, work)
-    evidence, kind, parts, up, heading = _kind_and_up(
-        _Looked(clip, fluid, mask, motion, trust), given, config, known, pose_given, shaped=pictures is not None
-    )
-    height, unsure, stood = None, "", None
-    if pose_given and kind.surveyed_level is not None:
-        level, unsure = level_of(kind.surveyed_level, given.camera)
-        height = float(known.position[2] - level)
-    if kind.starts_at_rest:
-        start, united = dam.let_go(fluid), 1
-        mask = fluid[start]
-        parts = composite.Parts((), mask)
-        stood = dam.stood(fluid, start, kinds.level_camera(known, up))
-    tilt_known = pose_given or config.pitch is not None
-    seen = _Sight(
-        start, united, mask, motion, trust, known, pose_given, evidence, kind, parts, up, heading, tilt_known, height,
-        unsure, stood,
-    )  # fmt: skip
-    return seen, pictures
-
-
-def _surface(seen: _Sight, pictures: DepthPictures | None, fluid: FluidMasks, given: GivenView, interval: float):
-    """Up, the level camera, the surface of what lies, metres per unit where they are known, and the depth behind it."""
-    lying, up = seen.parts.lying, seen.up
-    canonical = kinds.level_camera(seen.known, up)
-    observed = _observation(seen, canonical, interval)
-    front, known_scale = _front(seen, given.bodies, observed)
-    if seen.parts.puddle:
-        front = surface.level_surface(canonical, lying)
-    if pictures is None:
-        return up, canonical, front, known_scale, None
-    found = depths.depth_front(pictures, fluid, seen.known, up, seen.kind, observed, expected=front)
-    return found.up, kinds.level_camera(seen.known, found.up), found.front, found.known_scale, found
-
-
-def _told(scale: MetricScale, seen: _Sight) -> tuple[MetricScale, str]:
-    """The scale with its warning, and its sentence, where the level of the water or the ground was assumed."""
-    if seen.unsure and scale.source == "camera":
-        what = "water" if seen.stood is None else "ground"
-        return replace(scale, warning=seen.unsure), f"{scale.sentence}, with the {what} at z = 0, assumed"
-    return scale, scale.sentence
-
-
-@dataclass(frozen=True)
-class _Looked:
-    """The pictures, and what moves in them."""
-
-    clip: VideoClip
-    fluid: FluidMasks
-    mask: np.ndarray
-    motion: np.ndarray
-    trust: np.ndarray
-
-
-def _kind_and_up(
-    looked: _Looked, given: GivenView, config: GeometrySettings, known: PinholeCamera, pose_given: bool, *, shaped: bool
-):
-    """Evidence for the kind, the kind, the tilt of the camera, and its heading where it was surveyed."""
-    clip, fluid, mask, motion, trust = looked.clip, looked.fluid, looked.mask, looked.motion, looked.trust
-    c, bodies = config, None if given.bodies is None else given.bodies.path
-    surveyed, heading = place.pose_up(known)
-    pitch = float(surveyed.pitch) if pose_given else c.pitch
-    pick = np.unique(np.linspace(0, len(clip) - 1, 8).astype(int))
-    evidence = kinds.estimate_kind(clip.frames[pick], fluid[pick], motion, trust, pitch=pitch)
-    kind = kind_of(evidence.kind if c.kind == "auto" else c.kind)
-    if kind.starts_at_rest and (shaped or bodies is not None):
-        if c.kind != "auto":
-            raise InputRejected(
-                f"--kind {kind} together with a given depth or body", "one source of the fluid's shape", "leave one out"
-            )
-        others = [k for k in evidence.scores if not kind_of(k).starts_at_rest]
-        kind = kind_of(max(others, key=lambda k: evidence.scores[k]))
-    if bodies is None:
-        kind, parts = composite.split(
-            kind, known, surveyed if pose_given else None, mask, motion, trust, free=c.kind == "auto"
-        )
-        if kind.fills_vessel and c.kind == "auto":
-            poured = puddle.jets_into_puddle(known, surveyed if pose_given else None, mask, motion, trust)
-            if poured is not None:
-                kind, parts = STREAM, composite.Parts(poured.jets, poured.lying, puddle=True)
-    else:
-        parts = composite.Parts((), mask)
-    if pose_given:
-        return evidence, kind, parts, surveyed, heading
-    generated = given_body.note_of(bodies) is not None
-    if bodies is not None and not (generated and (c.pitch is not None or c.roll is not None)):
-        upright = given_body.up_of(bodies, surveyed, kind, rest_frame(fluid.areas()), clip.size)
-        if upright is not None:
-            return evidence, kind, parts, upright, None
-    texture = None
-    if kind.nearly_level and c.pitch is None and not parts.puddle:
-        texture = texture_gradient.texture_patches(clip.frames, parts.lying & ~parts.falling)
-    typical = typical_picture(clip.frames[pick]).astype(np.uint8)
-    picture = look_at(kind, typical, fluid.any_frame(), parts.lying, texture, stays=parts.puddle)
-    up = kinds.estimate_up(
-        kind, parts.lying, motion, trust * ~parts.falling, known, picture, given=(c.pitch, c.roll),
-        level_prior=composite.level_prior(parts, motion, trust),
-    )  # fmt: skip
-    if c.roll is None:
-        up = composite.with_roll(up, parts, known)
-    if c.pitch is None and kind.nearly_level and not shaped:
-        up = as_relief(up, parts.lying & ~parts.falling, lambda tilted: kinds.level_camera(known, tilted))
-    return evidence, kind, parts, up, None
-
-
-def _depth_pictures(
-    read: Read, given: GivenView, fov: float | None, known: PinholeCamera, start: int, work: Work
-) -> tuple[DepthPictures | None, PinholeCamera]:
-    """Depth from a file or a model, and the camera with the model's field of view where nothing else says it."""
-    told = lens_is_known(given, fov)
-    pictures = depths.pictures_of(read, given, known if told else None, start, work)
-    if pictures is not None and not told and pictures.field_of_view is not None:
-        known = PinholeCamera.from_fov(pictures.field_of_view, known.size)
-    return pictures, known
-
-
-def _observation(seen: _Sight, canonical: PinholeCamera, interval: float) -> Observation:
-    """What lies, as the builder of its kind wants it."""
-    return Observation(
-        canonical, seen.parts.lying, seen.motion, seen.lying_trust, interval, camera_height=seen.height,
-        tilt_known=seen.tilt_known, level_prior=composite.level_prior(seen.parts, seen.motion, seen.trust),
-        roll=seen.up.roll, standing=seen.stood,
-    )  # fmt: skip
-
-
-def _front(seen: _Sight, bodies: GivenFile | None, observed: Observation):
-    """The front surface in canonical units; metres per unit where the depth came in metres, else None."""
-    if bodies is not None:
-        return given_body.given_front(bodies.path, observed.camera, observed.mask, seen.kind, seen.start)
-    return builder_of(seen.kind).front_surface(observed), None
-
-
-def _surface_motion(camera, visible, depth, motion, interval) -> tuple[np.ndarray, np.ndarray]:
-    """Canonical points on the fluid and their velocities (units/s), moving along the surface."""
-    from scipy import ndimage
-
-    grid = camera.pixel_grid()
-    uv = grid[visible]
-    if len(uv) == 0:
-        raise InputRejected(
-            "no fluid pixel has a depth", "a surface that the camera sees", "give --pitch or another --kind"
-        )
-    points = camera.unproject(uv, depth[visible])
-    index = ndimage.distance_transform_edt(~visible, return_distances=False, return_indices=True)
-    whole = depth[tuple(index)]
-    end = uv + motion[visible]
-    row = np.clip(end[:, 1] - 0.5, 0, depth.shape[0] - 1)
-    col = np.clip(end[:, 0] - 0.5, 0, depth.shape[1] - 1)
-    later = ndimage.map_coordinates(whole, np.stack([row, col]), order=1)
-    return points, (camera.unproject(end, later) - points) / interval
-
-
-def _mainstream(kind: FluidKind, velocities: np.ndarray, trust: np.ndarray) -> np.ndarray:
-    """Bulk direction: confident and fast motion counts most; bodies in the air move along the vertical."""
-    speed = np.linalg.norm(velocities, axis=1)
-    capped = velocities * np.minimum(1.0, np.percentile(speed, 95) / np.maximum(speed, 1e-12))[:, None]
-    bulk = (capped * (trust * np.linalg.norm(capped, axis=1))[:, None]).sum(axis=0)
-    bulk = builder_of(kind).mainstream(bulk)
-    norm = np.linalg.norm(bulk)
-    return bulk / norm if norm > 1e-12 else np.array([1.0, 0.0, 0.0])
 
 
 def _seen_speed(visible, velocities, trust) -> np.ndarray:

@@ -9,12 +9,12 @@ import numpy as np
 from fluidlift.backends.learned import MASK_METHODS, make_segmenter
 from fluidlift.backends.registry import ModelChoice
 from fluidlift.errors import InputRejected
-from fluidlift.motion.steady_flow import TRUSTED
+from fluidlift.pipeline.fluid_found import sureness, trusted_share
 from fluidlift.pipeline.hints import NO_HINTS, Hints
 from fluidlift.pipeline.settings import GivenMask, SegmentSettings
 from fluidlift.pipeline.work import Work
 from fluidlift.seams import Segmenter
-from fluidlift.types import Label, PixelFlow, PixelLabels, VideoClip
+from fluidlift.types import PixelFlow, PixelLabels, VideoClip
 from fluidlift.types.fluid_masks import FluidMasks, parts_of
 from fluidlift.types.stages import Flow, Read, Segmentation
 
@@ -57,7 +57,7 @@ def segment(
             f"no fluid was found in '{clip.source}'", "a region that moves", "draw it and pass it with --mask"
         )
     warnings = list(labels.warnings)
-    trusted, sure = _trusted(flow.flow, fluid.any_frame()), _sureness(labels, areas.sum())
+    trusted, sure = trusted_share(flow.flow, fluid.any_frame()), sureness(labels, areas.sum())
     if trusted < 0.1:
         warnings.append(
             f"optical flow failed on {100 * (1 - trusted):.0f} % of the fluid: velocities there are filled in from the "
@@ -148,20 +148,3 @@ def drawn_mask(clip: VideoClip, given: GivenMask) -> np.ndarray:
     if camera is not None and distortion is not None and not is_straight(file):
         mask = undistort_mask(mask, read_camera(camera, clip.size), distortion)
     return mask
-
-
-def _trusted(flow: PixelFlow, wet: np.ndarray) -> float:
-    """Share of the fluid's pixels and pairs whose flow is trusted."""
-    confidence, count = flow.confidence, 0
-    for part in parts_of(confidence):
-        count += int((confidence[part][:, wet] > TRUSTED).sum())
-    return count / (len(confidence) * int(wet.sum()))
-
-
-def _sureness(labels: PixelLabels, area: float) -> float:
-    """Mean confidence of what was taken for fluid."""
-    total = 0.0
-    for part in parts_of(labels.labels):
-        fluid = labels.labels[part] == Label.FLUID
-        total += float(labels.confidence[part][fluid].sum(dtype=np.float64))
-    return total / area

@@ -1,7 +1,13 @@
 """Which way is up: what a picture says of it beside the fluid's motion, as log likelihoods of the camera's tilt."""
 
 from fluidlift.shape.view.habit import Scene, habit_prior
+from fluidlift.shape.view.horizon import Skyline, horizon_line, sky_of, tilt_of_horizon
 from fluidlift.shape.view.picture import PictureEvidence, look_at
 from fluidlift.shape.view.relief import as_relief
+from fluidlift.shape.view.rims import drawn_rim
+from fluidlift.shape.view.roundness import Ellipse
 
-__all__ = ["PictureEvidence", "Scene", "as_relief", "habit_prior", "look_at"]
+__all__ = [
+    "Ellipse", "PictureEvidence", "Scene", "Skyline", "as_relief", "drawn_rim", "habit_prior", "horizon_line",
+    "look_at", "sky_of", "tilt_of_horizon",
+]  # fmt: skip

@@ -81,6 +81,41 @@ def skyline(picture: UInt8[np.ndarray, "h w 3"], fluid: Bool[np.ndarray, "h w"])
     return Skyline(np.stack([u, lowest[columns] / scale], -1), float(sky.mean()))
 
 
+def sky_of(pixels: Bool[np.ndarray, "h w"]) -> Skyline | None:
+    """The sky that a person marked: the lowest marked row of each column; None where nothing is."""
+    columns = np.flatnonzero(pixels.any(axis=0))
+    if not len(columns):
+        return None
+    lowest = len(pixels) - pixels[::-1].argmax(axis=0)[columns]
+    return Skyline(np.stack([columns + 0.5, lowest.astype(float)], -1), float(pixels.mean()))
+
+
+def tilt_of_horizon(
+    camera: PinholeCamera, ends: tuple[tuple[float, float], tuple[float, float]]
+) -> tuple[float, float]:
+    """Pitch (degrees below the horizon) and roll (degrees clockwise) of a camera that sees the horizon on a line.
+
+    Args:
+        camera: for its lens; its pose is not used.
+        ends: px, two points of the line, the left one first.
+    """
+    at = (np.asarray(ends, float) - np.asarray(camera.center)) / np.asarray(camera.focal)
+    rays = np.concatenate([at, np.ones((2, 1))], axis=1)
+    up = np.cross(rays[1], rays[0])  # y is down: from right to left the normal points up
+    up = up / np.linalg.norm(up)
+    return float(np.degrees(np.arcsin(np.clip(-up[2], -1.0, 1.0)))), float(np.degrees(np.arctan2(up[0], -up[1])))
+
+
+def horizon_line(camera: PinholeCamera) -> tuple[tuple[float, float], tuple[float, float]]:
+    """px, where a camera (z up) sees the horizon at the left and at the right edge of its picture, or beyond."""
+    up = camera.camera_from_world.rotation[:, 2]
+    x = (np.array([0.0, camera.size[0]]) - camera.center[0]) / camera.focal[0]
+    # up . (x, y, 1) = 0; a camera that looks straight down sees it infinitely far above
+    steep = up[1] if abs(up[1]) > 1e-3 else np.copysign(1e-3, up[1])
+    v = camera.center[1] - camera.focal[1] * (up[0] * x + up[2]) / steep
+    return (0.0, float(v[0])), (float(camera.size[0]), float(v[1]))
+
+
 def _best_border(lab: np.ndarray) -> np.ndarray | None:
     """Per column the first row with a strong gradient, for the threshold that tells both sides best apart."""
     gradient = np.zeros(lab.shape[:2], np.float32)

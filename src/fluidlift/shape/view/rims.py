@@ -76,6 +76,20 @@ def find_rims(picture: UInt8[np.ndarray, "h w 3"]) -> tuple[Ellipse, ...]:
     )
 
 
+def drawn_rim(center: tuple[float, float], axes: tuple[float, float], turned: float) -> Ellipse:
+    """A rim that a person drew.
+
+    Args:
+        center: px.
+        axes: px, half its length and half its width.
+        turned: degrees clockwise from the picture's horizontal to the longer axis.
+    """
+    angle = np.radians(turned)
+    axis, across = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
+    covariance = 0.25 * (axes[0] ** 2 * np.outer(axis, axis) + axes[1] ** 2 * np.outer(across, across))
+    return Ellipse(center, covariance, 1.0, float(np.hypot(SPREAD, EDGE / axes[1])))
+
+
 def _arcs(edges: Bool[np.ndarray, "h w"], slope: Float[np.ndarray, "h w 2"]) -> list[Float[np.ndarray, "n 2"]]:
     """Smooth pieces of edges that turn one way, the longest first, (u, v) px."""
     shortest = max(SHORTEST * max(edges.shape), 2 * REACH + 2)

@@ -1,0 +1,154 @@
+"""How quick the studio is: from dropping a clip to what is found of it, and from a correction to the changed picture.
+
+    python benchmarks/studio.py [--record]
+
+The clip is the demo at 512 px, played to and fro for 3 s. A headless Chromium drops it on the page, draws a rock with
+the brush and drags the horizon; times end where the page has drawn it. Seconds of the clock, and of processor time of
+the studio itself, which others on the machine disturb less. --record writes benchmarks/results/studio.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from datetime import date
+from importlib import resources
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from fluidlift.io.video import read_clip, write_video
+from fluidlift.studio.app import app_of
+from fluidlift.studio.desk import Desk
+
+ROOT = Path(__file__).resolve().parent.parent
+CHROMIUM = Path("/usr/bin/chromium")
+FRAMES, WIDTH = 75, 512
+PATIENCE = 600.0
+
+
+def long_demo(file: Path) -> Path:
+    """The demo clip to and fro, 3 s at 512 px."""
+    demo = resources.files("fluidlift.synthetic") / "data" / "demo.mp4"
+    with resources.as_file(demo) as path:
+        frames = read_clip(path).frames
+    there = np.concatenate([frames, frames[-2:0:-1]])
+    height = round(WIDTH * frames.shape[1] / frames.shape[2] / 2) * 2
+    chosen = [there[t % len(there)] for t in range(FRAMES)]
+    write_video(file, np.stack([cv2.resize(f, (WIDTH, height), interpolation=cv2.INTER_CUBIC) for f in chosen]), 25.0)
+    return file
+
+
+class Clock:
+    """Seconds since the last start, of the clock and of this process's processors."""
+
+    def __init__(self, page) -> None:
+        self.page, self.begun = page, (0.0, 0.0)
+
+    def start(self) -> None:
+        """Count from now."""
+        self.begun = time.perf_counter(), time.process_time()
+
+    def until(self, condition: Callable[[], bool]) -> tuple[float, float]:
+        """Wait for something; the seconds until then."""
+        while not condition():
+            if time.perf_counter() - self.begun[0] > PATIENCE:
+                raise SystemExit(f"nothing for {PATIENCE:.0f} s; the page says: {self.page.inner_text('body')[:400]}")
+            self.page.wait_for_timeout(20)
+        return time.perf_counter() - self.begun[0], time.process_time() - self.begun[1]
+
+
+def measured(folder: Path) -> dict[str, tuple[float, float]]:
+    """Seconds of the clock and of the processors, by what was waited for."""
+    import uvicorn
+    from playwright.sync_api import sync_playwright
+
+    desk, found = Desk(folder), {}
+    config = uvicorn.Config(app_of(desk, "here"), host="127.0.0.1", port=18390, log_level="error")
+    server = uvicorn.Server(config)
+    threading.Thread(target=server.run, daemon=True).start()
+    clip = long_demo(Path(tempfile.mkdtemp()) / "river.mp4")
+    with sync_playwright() as p:
+        browser = p.chromium.launch(executable_path=str(CHROMIUM), args=["--headless=new", "--no-sandbox"])
+        page = browser.new_page(viewport={"width": 1280, "height": 720})
+        page.goto("http://127.0.0.1:18390/here/")
+        page.wait_for_selector("html[data-version]")
+        page.wait_for_timeout(8000)  # a person takes longer to find the file, and packages are loaded meanwhile
+        look, clock = desk.looking, Clock(page)
+
+        def drawn() -> dict[str, int]:
+            return page.evaluate("window.studio.drawn()")
+
+        clock.start()
+        page.set_input_files("#file", str(clip))
+        found["drop to the first picture"] = clock.until(lambda: drawn()["first"] > 0)
+        found["drop to the frames"] = clock.until(lambda: drawn()["frames"] > 0)
+        found["drop to the mask"] = clock.until(lambda: drawn()["masks"] > 0)
+        found["drop to all findings"] = clock.until(lambda: look.look.facts is not None and look.idle)
+        page.keyboard.press("b")
+        page.get_by_label("what is there").select_option("rock")
+        box, before = page.locator("#picture").bounding_box(), look.look.masks
+        page.mouse.move(box["x"] + 0.4 * box["width"], box["y"] + 0.5 * box["height"])
+        page.mouse.down()
+        page.mouse.move(box["x"] + 0.5 * box["width"], box["y"] + 0.52 * box["height"], steps=5)
+        clock.start()
+        page.mouse.up()
+        found["stroke to the changed mask"] = clock.until(lambda: drawn()["masks"] > before)
+        found["stroke to all findings"] = clock.until(lambda: look.idle)
+        page.get_by_label("kind", exact=True).select_option("fall")
+        clock.start()
+        found["kind to the changed findings"] = clock.until(lambda: look.idle and look.look.facts["kind"] == "fall")
+        browser.close()
+    server.should_exit = True
+    desk.close()
+    return found
+
+
+def main() -> int:
+    """Measure and tell."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--record", action="store_true", help="write benchmarks/results/studio.json")
+    wanted = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        found = measured(Path(folder))
+    for name, (clock, processors) in found.items():
+        print(f"{name:32} {clock:6.1f} s, {processors:6.1f} s of processors")
+    if wanted.record:
+        write(found)
+    return 0
+
+
+GOALS = {"drop to all findings": 20.0, "stroke to the changed mask": 2.0}
+
+
+def write(found: dict[str, tuple[float, float]]) -> None:
+    """The figures as a topic of docs/results.md."""
+    from benchmarks.report import text_of
+
+    records = []
+    for name, (clock, processors) in found.items():
+        goal = {"goal": GOALS[name]} if name in GOALS else {}
+        records.append({"subject": name, "figure": "time", "value": round(clock, 2), **goal})
+        records.append({"subject": name, "figure": "processor time", "value": round(processors, 2)})
+    content = {
+        "title": "Studio",
+        "text": "A clip of 3 s at 512 px, looked at on 320 px, in a headless Chromium on the same machine; two cores.",
+        "rows": "subject",
+        "command": "python benchmarks/studio.py --record",
+        "date": date.today().isoformat(),
+        "machine": f"2 cores, {platform.system()}, Python {platform.python_version()}",
+        "figures": {"time": {"unit": "s", "better": "less"}, "processor time": {"unit": "s", "better": "less"}},
+        "records": records,
+    }
+    json.dumps(content)  # plain
+    (ROOT / "benchmarks" / "results" / "studio.json").write_text(text_of(content), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

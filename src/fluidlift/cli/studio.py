@@ -1,0 +1,30 @@
+"""`fluidlift studio`: clips in the browser, put right and made."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from fluidlift.cli.quantities import command
+
+
+@command
+class Studio:
+    """See in the browser what is found of a clip, put it right with a few strokes, and make it."""
+
+    place: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CLIP|FOLDER")] = Path(".")
+    """a video, or a folder of videos and assets; by default the current folder"""
+    port: int = 8180
+    """of the page; the next free one where it is in use"""
+    browser: bool = True
+    """the page opens in the default browser; --no-browser leaves that to you"""
+
+
+def run(wanted: Studio) -> int:
+    """Serve the page until Ctrl-C; the exit code."""
+    from fluidlift.studio.app import StudioRequest, studio
+
+    studio(wanted.place, StudioRequest(wanted.port, wanted.browser), told=lambda line: print(line, flush=True))
+    return 0

@@ -1,0 +1,213 @@
+"""What is found of a clip before anything is made of it: mask, kind, tilt, flow, scale, for a person to correct."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+
+from fluidlift.config import JobConfig
+from fluidlift.io.atomic import disk_errors
+from fluidlift.io.hints_file import content_hash
+from fluidlift.io.video import probe
+from fluidlift.pipeline import begin
+from fluidlift.pipeline.inputs import GivenFiles, Inputs
+from fluidlift.pipeline.runner import Runner
+from fluidlift.pipeline.settings import GeometrySettings, GivenView
+from fluidlift.pipeline.sight import sighted
+from fluidlift.pipeline.work import Work
+from fluidlift.seams import Progress, Silence
+from fluidlift.shape.frame_pictures import typical_picture
+from fluidlift.shape.kind import level_camera
+from fluidlift.shape.view import horizon_line
+from fluidlift.shape.view.rims import find_rims
+from fluidlift.types import KindEvidence, Label, MetricScale, PinholeCamera, UpEvidence
+from fluidlift.types.hints import NOTHING_SAID, ClipHints, ClipIdentity
+from fluidlift.types.stages import Flow, Read, Segmentation
+
+FIND_STAGES = ("read", "flow", "segment", "view")
+ARROWS = 9
+"""along the longer side of the picture, of which those on the fluid are told"""
+LEAST_TRUST = 0.3
+"""of the mean flow at an arrow"""
+CORNERS = 0.004
+"""of the longer side: how far an outline may be from the mask's"""
+SMALLEST = 0.002
+"""of the picture: pieces of the mask whose outline is told"""
+
+
+@dataclass(frozen=True)
+class View:
+    """How the fluid stands before the camera: what geometry begins with, without ground and cells."""
+
+    kind: str
+    kind_evidence: KindEvidence
+    up: UpEvidence
+    scale: MetricScale
+    scale_sentence: str
+    camera: PinholeCamera
+    """level, in units of its own"""
+    mask: Bool[np.ndarray, "h w"]
+    mean_flow: Float[np.ndarray, "h w 2"]
+    """px per frame"""
+    mean_confidence: Float[np.ndarray, "h w"]
+    rest_frame: int
+    warnings: tuple[str, ...] = ()
+
+
+def view(
+    read: Read, flow: Flow, segmentation: Segmentation, given: GivenView, config: GeometrySettings, *, work: Work
+) -> View:
+    """Kind, tilt, flow and scale.
+
+    Raises:
+        InputRejected: as `pipeline.sight.sighted`.
+    """
+    s = sighted(read, flow, segmentation, given, config, work=work)
+    seen = s.seen
+    return View(
+        seen.kind.name, seen.evidence, s.up, s.scale, s.sentence, s.canonical, seen.mask, np.asarray(seen.motion),
+        np.asarray(seen.trust), seen.start, tuple(s.warnings),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Found:
+    """What was found."""
+
+    identity: ClipIdentity
+    read: Read
+    segmentation: Segmentation
+    view: View
+    warnings: tuple[str, ...] = ()
+
+    def facts(self) -> dict[str, Any]:
+        """Plain data for the section `found` of a hints file, in px of the clip's own picture."""
+        g, (width, height) = self.view, self.read.clip.size
+        k = self.identity.size[0] / width
+        up = replace(g.up, pitch=g.up.pitch - g.up.raised)  # as it was seen, not as a relief is built
+        scores = sorted(g.kind_evidence.scores.items(), key=lambda item: -item[1])
+        level = level_camera(g.camera, up)
+        frame = g.rest_frame
+        return {
+            "kind": g.kind,
+            "probability": {name: round(share, 3) for name, share in scores},
+            "horizon": [_px(p, k) for p in horizon_line(level)],
+            "pitch": round(up.pitch, 1),
+            "pitch_error": round(up.error, 1),
+            "roll": round(up.roll, 1),
+            "tilt_from": up.source,
+            "field_of_view": round(float(2 * np.degrees(np.arctan(0.5 * max(width, height) / max(g.camera.focal)))), 1),
+            "scale": g.scale_sentence,
+            "metres_across": float(f"{g.scale.across:.3g}"),
+            "flow": [{"at": _px(a, k), "to": _px(b, k)} for a, b in arrows(g)],
+            "rims": [
+                {"center": _px(r.center, k), "axes": _px(r.axes, k), "turned": round(_turned(r.covariance), 1)}
+                for r in find_rims(self._typical())
+            ],
+            "fluid_share": round(self.segmentation.fluid_share, 4),
+            "fluid_sure": round(self.segmentation.confidence_mean, 2),
+            "mask": [
+                {"is": "fluid", "area": [_px(p, k) for p in line], "time": round(float(self.read.clip.times[frame]), 4)}
+                for line in outlines(np.asarray(self.segmentation.labels.labels[frame]) == Label.FLUID)
+            ],
+            "warnings": list(self.warnings),
+        }
+
+    def _typical(self) -> np.ndarray:
+        frames = self.read.clip.frames
+        return typical_picture(frames[:: max(1, len(frames) // 8)]).astype(np.uint8)
+
+    def lines(self) -> list[str]:
+        """For people."""
+        g = self.view
+        scores = sorted(g.kind_evidence.scores.items(), key=lambda item: -item[1])
+        return [
+            f"kind: {g.kind} ({', '.join(f'{name} {share:.2f}' for name, share in scores[:3])})",
+            f"the camera looks {g.up.pitch:.0f} ± {g.up.error:.0f} degrees below the horizon (from {g.up.source})",
+            g.scale_sentence,
+            f"fluid covers {100 * self.segmentation.fluid_share:.0f} % of the picture",
+        ]
+
+
+def identity_of(clip: Path, fps: float | None = None) -> ClipIdentity:
+    """Which clip it is.
+
+    Raises:
+        InputRejected: as `io.video.probe`.
+    """
+    info = probe(clip, fps=fps)
+    return ClipIdentity(clip.name, info.size, info.frame_count, content_hash(clip))
+
+
+def find_hints(
+    inputs: Inputs, folder: Path, config: JobConfig, hints: ClipHints = NOTHING_SAID, *,
+    progress: Progress | None = None, told: Callable[[str, Any], None] = lambda name, value: None,
+) -> Found:  # fmt: skip
+    """Read, flow, segment and view, with the hints that there are.
+
+    Args:
+        inputs: the clip.
+        folder: where stages are kept; what has not changed since an earlier call is not done again.
+        config: of the job.
+        hints: of a person, with the clip's identity.
+        progress: where progress is told.
+        told: gets the name and the value of each stage as it ends.
+
+    Raises:
+        InputRejected: an input that cannot be used.
+    """
+    stages = begin.stages_of(FIND_STAGES, hints)
+    runner = Runner(folder, stages, progress=progress or Silence(), value_told=told)
+    given = GivenFiles.of(inputs)
+    with disk_errors(folder):
+        seen = begin.look(runner, given, config, said=hints)
+        found = runner.run(
+            "view", view, *seen, GivenView.of(given, config), begin.geometry_settings(seen[0], config, hints)
+        )
+    identity = hints.clip or identity_of(inputs.clip, config.read.fps)
+    return Found(identity, seen[0], seen[2], found, tuple(runner.warnings))
+
+
+def arrows(g: View) -> list[tuple[tuple[float, float], tuple[float, float]]]:
+    """Where the fluid moves and where to, px of the working picture: begin and end, the fastest a step long."""
+    height, width = g.mask.shape
+    step = max(height, width) / ARROWS
+    found = []
+    for v in np.arange(0.5 * step, height, step):
+        for u in np.arange(0.5 * step, width, step):
+            part = np.s_[int(max(v - step / 2, 0)) : int(v + step / 2), int(max(u - step / 2, 0)) : int(u + step / 2)]
+            seen = g.mask[part] & (g.mean_confidence[part] > LEAST_TRUST)
+            if seen.sum() < 0.1 * step * step:
+                continue
+            rows, columns = np.nonzero(seen)
+            at = (part[1].start + columns.mean() + 0.5, part[0].start + rows.mean() + 0.5)
+            found.append((at, np.median(g.mean_flow[part][seen], axis=0)))
+    fastest = max((float(np.linalg.norm(way)) for _, way in found), default=0.0)
+    if fastest < 1e-6:
+        return []
+    length = step / fastest
+    return [((float(a[0]), float(a[1])), (float(a[0] + length * w[0]), float(a[1] + length * w[1]))) for a, w in found]
+
+
+def outlines(mask: np.ndarray) -> list[list[tuple[float, float]]]:
+    """Outlines of the pieces of a mask, bool [h,w], the largest first, px, with few corners; holes are left out."""
+    found, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    large = sorted((c for c in found if cv2.contourArea(c) > SMALLEST * mask.size), key=cv2.contourArea, reverse=True)
+    lines = (cv2.approxPolyDP(c, CORNERS * max(mask.shape), True)[:, 0] + 0.5 for c in large)
+    return [[(float(u), float(v)) for u, v in line] for line in lines if len(line) >= 3]
+
+
+def _px(point: Any, k: float) -> list[float]:
+    return [round(float(v) * k, 1) for v in point]
+
+
+def _turned(covariance: np.ndarray) -> float:
+    """Degrees clockwise from the picture's horizontal to the longer axis."""
+    axis = np.linalg.eigh(covariance)[1][:, 1]
+    return float((np.degrees(np.arctan2(axis[1], axis[0])) + 90.0) % 180.0 - 90.0)

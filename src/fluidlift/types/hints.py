@@ -1,0 +1,167 @@
+"""What a person says of a clip, in px and seconds of that clip: so it holds at any working size and for any trim."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from fluidlift.errors import InputRejected, require
+
+Point = tuple[float, float]
+"""(x, y), px of the clip's picture, from its upper left corner"""
+
+What = Literal["fluid", "not fluid", "rock", "sky"]
+SHAPE = 0.02
+"""relative difference between the width over height of pictures that are of one shape: whole pixels at 64 px"""
+
+
+@dataclass(frozen=True)
+class ClipIdentity:
+    """Which clip hints were given for."""
+
+    name: str
+    """of the file, without its folder"""
+    size: tuple[int, int]
+    """width and height of its picture, px: what points are counted in"""
+    frames: int | None = None
+    sha256: str | None = None
+    """of its content"""
+
+
+@dataclass(frozen=True)
+class Region:
+    """Part of the picture, and what is there."""
+
+    what: What
+    line: tuple[Point, ...]
+    """corners of an area, or the way of a brush"""
+    width: float | None = None
+    """px, of the brush; None: an area"""
+    time: float = 0.0
+    """s into the clip: the frame that it was drawn on"""
+    moves: bool = False
+    """it goes with the fluid, by the optical flow, to the other frames; else it is there in all of them"""
+
+    def __post_init__(self) -> None:
+        least = 3 if self.width is None else 1
+        require(len(self.line) >= least, f"a region of {len(self.line)} points", f"{least} or more")
+        require(self.width is None or self.width > 0, f"a brush {self.width} px wide", "more than 0")
+
+
+@dataclass(frozen=True)
+class Ruler:
+    """Something on the fluid's surface whose length is known."""
+
+    begin: Point
+    end: Point
+    metres: float
+
+
+@dataclass(frozen=True)
+class Rim:
+    """The rim of a vessel, which is round and lies level."""
+
+    center: Point
+    axes: tuple[float, float]
+    """px, half its length and half its width"""
+    turned: float = 0.0
+    """degrees clockwise from the picture's horizontal to the longer axis"""
+
+
+@dataclass(frozen=True)
+class Click:
+    """A pixel of fluid, or of something else; it speaks for what looks and moves like it around."""
+
+    at: Point
+    fluid: bool
+
+
+@dataclass(frozen=True)
+class ClipHints:
+    """All that a person says of one clip."""
+
+    clip: ClipIdentity | None = None
+    """which clip it was; None: whichever they are used with, in px of its picture"""
+    start: float | None = None
+    """s into the clip"""
+    duration: float | None = None
+    """s to use"""
+    kind: str | None = None
+    fov: float | None = None
+    """degrees across the longer side"""
+    horizon: tuple[Point, Point] | None = None
+    """two points of it, left and right; outside the picture where it is not in it"""
+    ruler: Ruler | None = None
+    rims: tuple[Rim, ...] = ()
+    regions: tuple[Region, ...] = ()
+    """later ones lie over earlier ones"""
+    clicks: tuple[Click, ...] = ()
+    roi: tuple[float, float, float, float] | None = None
+    """x, y, width, height: fluid is looked for inside only"""
+
+    @property
+    def settings(self) -> dict[str, float | str]:
+        """Those that are settings of a job, by dotted name."""
+        found = {
+            "read.start": self.start, "read.duration": self.duration, "shape.kind": self.kind, "shape.fov": self.fov,
+        }  # fmt: skip
+        return {name: value for name, value in found.items() if value is not None}
+
+    def at(self, size: tuple[int, int]) -> ClipHints:
+        """The same in px of a picture of another size.
+
+        Raises:
+            InputRejected: a picture of another shape.
+        """
+        if self.clip is None or self.clip.size == tuple(size):
+            return self
+        (w, h), (width, height) = self.clip.size, size
+        if abs((w * height) / (h * width) - 1.0) > SHAPE:
+            raise InputRejected(
+                f"hints drawn on a {w} x {h} picture for a clip of {width} x {height} px",
+                "hints and a clip of one shape", "draw them again on this clip (fluidlift studio)",
+            )  # fmt: skip
+        kx, ky = width / w, height / h
+        mean = (kx * ky) ** 0.5
+
+        def moved(p: Point) -> Point:
+            return p[0] * kx, p[1] * ky
+
+        return replace(
+            self,
+            clip=replace(self.clip, size=(width, height)),
+            horizon=None if self.horizon is None else (moved(self.horizon[0]), moved(self.horizon[1])),
+            ruler=None if self.ruler is None else replace(
+                self.ruler, begin=moved(self.ruler.begin), end=moved(self.ruler.end)
+            ),
+            rims=tuple(
+                replace(r, center=moved(r.center), axes=(r.axes[0] * mean, r.axes[1] * mean)) for r in self.rims
+            ),
+            regions=tuple(
+                replace(r, line=tuple(moved(p) for p in r.line), width=None if r.width is None else r.width * mean)
+                for r in self.regions
+            ),
+            clicks=tuple(replace(c, at=moved(c.at)) for c in self.clicks),
+            roi=None if self.roi is None else (self.roi[0] * kx, self.roi[1] * ky, self.roi[2] * kx, self.roi[3] * ky),
+        )  # fmt: skip
+
+    @property
+    def view(self) -> DrawnView | None:
+        """What of it says how the camera stands and how large things are; None: nothing of it does."""
+        sky = tuple(r for r in self.regions if r.what == "sky")
+        if self.horizon is None and self.ruler is None and not self.rims and not sky:
+            return None
+        return DrawnView(self.horizon, self.ruler, self.rims, sky)
+
+
+@dataclass(frozen=True)
+class DrawnView:
+    """What a person drew of the camera's tilt and of size, in px of the working picture."""
+
+    horizon: tuple[Point, Point] | None = None
+    ruler: Ruler | None = None
+    rims: tuple[Rim, ...] = ()
+    sky: tuple[Region, ...] = ()
+
+
+NOTHING_SAID = ClipHints()

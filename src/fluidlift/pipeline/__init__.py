@@ -1,4 +1,11 @@
-"""The only place that knows the order of the stages, and the commands that run them."""
+"""The only place that knows the order of the stages, and the commands that run them.
+
+Modules of the face:
+
+    preview  Simulation while somebody edits: a coarse copy of the scene, frame by frame, the newest wish first
+    render   Pictures of a finished asset from any camera: a film, numbered PNG with transparency, or numbered EXR
+             with depth
+"""
 
 from fluidlift.pipeline.compare import card_against
 from fluidlift.pipeline.hints import Hints
@@ -12,19 +19,6 @@ from fluidlift.pipeline.resimulate import Made, resimulate
 from fluidlift.present.as_filmed import card_of
 
 __all__ = [
-    "STAGES",
-    "Hints",
-    "Inputs",
-    "Made",
-    "MotionFiles",
-    "Refitted",
-    "RenderRequest",
-    "card_against",
-    "card_of",
-    "find_masks",
-    "make",
-    "measure_motion",
-    "refit",
-    "render_asset",
-    "resimulate",
-]
+    "STAGES", "Hints", "Inputs", "Made", "MotionFiles", "Refitted", "RenderRequest", "card_against", "card_of",
+    "find_masks", "make", "measure_motion", "preview", "refit", "render", "render_asset", "resimulate",
+]  # fmt: skip

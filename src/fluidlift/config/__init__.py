@@ -1,4 +1,9 @@
-"""What a job can be told: typed sections, presets, YAML files and single overrides."""
+"""What a job can be told: typed sections, presets, YAML files and single overrides.
+
+Modules of the face:
+
+    of_asset  The settings that an asset was made with
+"""
 
 from fluidlift.config.build import build_config
 from fluidlift.config.presets import PRESETS, RANGES
@@ -16,17 +21,6 @@ from fluidlift.config.sections import (
 )
 
 __all__ = [
-    "PRESETS",
-    "RANGES",
-    "DepthConfig",
-    "FitConfig",
-    "GenerateConfig",
-    "JobConfig",
-    "MotionConfig",
-    "ReadConfig",
-    "SegmentConfig",
-    "ShapeConfig",
-    "ShowConfig",
-    "SimulateConfig",
-    "build_config",
-]
+    "PRESETS", "RANGES", "DepthConfig", "FitConfig", "GenerateConfig", "JobConfig", "MotionConfig",
+    "ReadConfig", "SegmentConfig", "ShapeConfig", "ShowConfig", "SimulateConfig", "build_config", "of_asset",
+]  # fmt: skip

@@ -1,1 +1,59 @@
+"""The terms of the equations of motion, and the simulators and the differentiable rollout made of them.
 
+Modules of the face:
+
+    advection             Semi-Lagrangian advection of face velocities, differentiable (Stam 1999; paper, "Grid-
+                          Based Velocity Evolution")
+    apic                  The liquid simulator: affine particle-in-cell (APIC) and pressure projection (paper:
+                          "Presumed APIC Simulation")
+    boundaries            Boundary conditions: walls (cut cells; free slip to no-slip), liquid cells, extrapolation,
+                          particle collisions
+    deform                Deformation of particles and of the Gaussians they carry (paper: F <- (I + dt C) F, A = F
+                          A0 F^T)
+    emitter               Emitters: closed meshes in the world whose volume is kept full of fluid while they are on
+    extend                Extrapolation of the channel: the terrain goes on downstream of the outlet as it is there
+    gas                   The gas simulator: smoke in air on a MAC grid, with MacCormack advection; tracers move by
+                          RK2
+    guidance              Nudging and other body forces that depend on place: a pull towards a known flow, and a
+                          steady one that keeps it
+    inflow_schedule       The inflow over time: a factor on the inflow's velocity, between keyframes, with a surge
+                          of its own
+    inlet                 The inlet: Dirichlet velocity in INFLOW cells (paper: v_in, v~_in) and gap-free emission
+                          of particles
+    numba_particles       The particle half of a step on the CPU: what `seams.ParticleTransfer` and
+                          `seams.ParticleMover` ask for, in Numba
+    outlet                The free outlet (Dirichlet pressure): p = 0 at its rim, hydrostatic in columns of liquid
+                          that stand on the ground
+    preflight             What would fail during a simulation, said before it begins, with the numbers
+    pressure              Pressure projection to a divergence-free face velocity, with cut cells (paper: `eq::v`,
+                          first term; `divProj`)
+    rigid                 Rigid bodies in the liquid: their state, and what a substep of the simulator asks of them
+    rigid_body            Rigid bodies as they are given: shape, material, motion
+    rollout               DiffSim^n: n differentiable steps of incompressible flow on a MAC grid (paper, "Presumed
+                          APIC Simulation")
+    rollout_domain        The cell layout of a differentiable rollout: which face does what, assembled once
+    rollout_pressure      The pressure of a rollout: the ways through the Poisson equation and their gradients,
+                          behind one door (`project`)
+    rollout_surface       The free surface (a level set) of a rollout's liquid, between the cells of its layout, for
+                          ghost-fluid pressure
+    rollout_torch         DiffSim^n in plain torch operations on any device: the readable twin of `rollout`, and its
+                          way onto a GPU
+    rollout_torch_domain  The layout of a rollout as tensors on any device, and its linear operators as whole-array
+                          slices
+    rotation              Rotations of rigid bodies: quaternions (w, x, y, z) and their motion
+    stepping              What the liquid and the gas simulator share: time stepping, particles, inlet and outlet
+    surface_tension       Surface tension (Young-Laplace, ghost fluid): the pressure jumps by sigma times the sum of
+                          the principal curvatures
+    terrain_edit          Edits of the terrain before a simulation: moved, turned, scaled, twisted or replaced
+    terrain_reshape       What edits of the terrain make of it: solid, cells, water and its Gaussians in their new
+                          places
+    transfer              P2G and G2P: affine particle-in-cell (APIC) transfers on the MAC grid (paper:
+                          `particle_map`; Jiang et al. 2015)
+"""
+
+__all__ = [
+    "advection", "apic", "boundaries", "deform", "emitter", "extend", "gas", "guidance", "inflow_schedule",
+    "inlet", "numba_particles", "outlet", "preflight", "pressure", "rigid", "rigid_body", "rollout",
+    "rollout_domain", "rollout_pressure", "rollout_surface", "rollout_torch", "rollout_torch_domain",
+    "rotation", "stepping", "surface_tension", "terrain_edit", "terrain_reshape", "transfer",
+]  # fmt: skip

@@ -1,18 +1,37 @@
-"""What is parsed, edited and simulated: an asset with its scene.yaml becomes a scene and its simulator."""
+"""What is parsed, edited and simulated: an asset with its scene.yaml becomes a scene and its simulator.
+
+Modules of the face:
+
+    build               What is simulated: an asset's body in its terrain, with what a person changed
+    coarse_copy         An asset on wider cells and with fewer Gaussians, for a simulation that follows a hand
+    dry_cells           Cells in which the clip shows no fluid at any time
+    edit_history        The history of an asset's scene.yaml: every edit as the lines it took away and put in,
+                        undone or not
+    edits               Edits of an asset: one model behind scene.yaml, the command line, Python and the viewer
+    footage             The clip that an asset comes from, where it is still at hand
+    forecast            What the next simulation will meet, said when an edit is made: from the files alone, without
+                        building the scene
+    open_water          Where on a fluid there is room for something new: not in the ground, the inlet, or what was
+                        put there before
+    recall              Values of an asset's earlier runs, where they are still in its folder work/
+    reshaping           Edits of the world around a fluid, before it is simulated: terrain, emitters, and what was
+                        changed in words
+    settings            What a scene takes from a job, beside its asset and its edits
+    simulated_history   Figures of each simulated frame, as they come
+    simulation          A scene played frame by frame, with a checkpoint every few frames that another run goes on
+                        from
+    simulator           The simulator of a scene, at its first instant
+    splat_files         Where an asset keeps the frames of its simulation, and what goes on from them
+    surface_appearance  What the splats of a simulated fluid look like in each frame
+"""
 
 from fluidlift.scene.build import Scene, SimulationRequest, edited_scene, scene_of
 from fluidlift.scene.edits import Add, Change, EditSession, Remove, Set
 from fluidlift.scene.simulator import simulator_of
 
 __all__ = [
-    "Add",
-    "Change",
-    "EditSession",
-    "Remove",
-    "Scene",
-    "Set",
-    "SimulationRequest",
-    "edited_scene",
-    "scene_of",
-    "simulator_of",
-]
+    "Add", "Change", "EditSession", "Remove", "Scene", "Set", "SimulationRequest", "build", "coarse_copy",
+    "dry_cells", "edit_history", "edited_scene", "edits", "footage", "forecast", "open_water", "recall",
+    "reshaping", "scene_of", "settings", "simulated_history", "simulation", "simulator", "simulator_of",
+    "splat_files", "surface_appearance",
+]  # fmt: skip

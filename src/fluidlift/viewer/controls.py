@@ -8,9 +8,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from fluidlift.errors import require
-from fluidlift.types import FluidKind, FluidParameters, kind_of
+from fluidlift.types import Estimate, FluidKind, FluidParameters, kind_of
 from fluidlift.types.parameter_table import PARAMETERS, Scale
-from fluidlift.types.parameters import Estimate
 
 STEPS = 200
 """of a slider, about"""

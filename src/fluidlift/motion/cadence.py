@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from fluidlift.errors import require
 from fluidlift.types.clip import VideoClip
@@ -149,7 +149,7 @@ def frozen_stretches(same: np.ndarray, interval: float) -> tuple[tuple[int, int]
     return tuple((int(a), int(b)) for a, b in zip(starts[long], stops[long]))
 
 
-def source_rate(kept: Float[np.ndarray, " k"], times: Float[np.ndarray, " t"]) -> float | None:
+def source_rate(kept: Int[np.ndarray, " k"], times: Float[np.ndarray, " t"]) -> float | None:
     """Frames per second before conversion, or None where the kept frames do not keep a beat.
 
     A converter shows frame k of the source at the display instant next to k / rate: the display times of the kept

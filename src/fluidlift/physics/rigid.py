@@ -57,7 +57,7 @@ class RigidBodies:
         walls: Walls,
         *,
         density: float,
-        gravity: Float[np.ndarray, "3"],
+        gravity: Float[np.ndarray, "3"] | Sequence[float],
         time: float = 0.0,
     ) -> None:
         self.bodies, self._static = tuple(bodies), walls

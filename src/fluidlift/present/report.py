@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ FILM_MAX = 12_000_000
 
 def write_report(
     lift: Lift, simulation: Simulation, shown: Shown, folder: Path, preset: str, timings: dict[str, Any],
-    warnings: list[str],
+    warnings: Sequence[str],
 ) -> Path:  # fmt: skip
     """report.html and the overlay picture.
 

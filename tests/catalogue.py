@@ -193,8 +193,8 @@ def asset(name: str, shelf: Path | None = None) -> Job:
 def digests(folder: Path) -> dict[str, str]:
     """SHA-256 of what an asset holds, by file, and by folder for its frames.
 
-    Left out: `work/`, which is the cache; times, keys of the cache and figures of the machine in the manifest; and the
-    report, which shows them.
+    Left out: `work/`, which is the cache; times, keys of the cache, figures of the machine and codes of warnings in the
+    manifest, whose texts stay; and the report, which shows them.
     """
     found: dict[str, "hashlib._Hash"] = {}
     for file in sorted(p for p in folder.rglob("*") if p.is_file()):
@@ -208,6 +208,8 @@ def digests(folder: Path) -> dict[str, str]:
             del manifest["metrics"]["stages"], manifest["metrics"]["peak_memory_mb"]
             manifest["metrics"].get("fit_extra", {}).pop("seconds", None)
             manifest["hashes"].pop("report.html", None)
+            for part in (manifest, manifest["simulation"]):
+                part.pop("warning_codes", None)
             data = json.dumps(manifest, sort_keys=True).encode()
         name = str(path.parent if path.parts[0] == "frames" else path)
         found.setdefault(name, hashlib.sha256()).update(path.name.encode() + b"\0" + data)

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
+import array_shapes
 import numpy as np
 import pytest
 from catalogue import QUICK, Job, asset, stream_pictures, write_clip
@@ -25,6 +26,9 @@ FOREIGN = {"backends", "blender"}
 
 ASSET = {"made", "catalogue_asset", "finished", "finished_tank", "tank_folder"}
 """fixtures that make an asset, which takes seconds"""
+
+FAST = re.compile(r"(unit|whole)( or (unit|whole))*")
+"""what `-m` says where the fast tier is asked for, or a part of it"""
 
 COMMAND_LINE = re.compile(r"from fluidlift\.cli import (\([^)]*|[^\n]*)\bmain\b")
 
@@ -63,7 +67,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """The controller of a run watches how long tests take."""
+    """The fast tier checks the shapes of arrays; the controller of a run watches how long tests take."""
+    if FAST.fullmatch(config.getoption("markexpr")):
+        array_shapes.install()
     if not hasattr(config, "workerinput"):
         config.pluginmanager.register(Stopwatch(config.getoption("--record-durations")))
 

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
+from typing import Any
+
 
 class Notice(str):
     """A text with a code; wherever a text will do, it is one.
 
-    Codes last as long as values do (`io.stage_codec` keeps them); files for people hold the text alone.
+    Codes last as long as values do (`io.stage_codec` keeps them); files and JSON for programs hold them beside the
+    texts (`as_plain`), and files for people hold the text alone.
 
     Args:
-        code: a word of the module that warns.
+        code: lower-case words with hyphens, which stay what they are: docs/warnings.md lists them.
         text: for people.
     """
 
@@ -24,11 +28,29 @@ class Notice(str):
         return self.code, str(self)
 
 
-def without(warnings: tuple[str, ...], code: str) -> tuple[str, ...]:
+NONE = Notice("", "")
+"""nothing to say"""
+
+
+def without(warnings: tuple[Notice, ...], code: str) -> tuple[Notice, ...]:
     """All warnings but those of a code."""
     return tuple(w for w in warnings if code_of(w) != code)
 
 
 def code_of(warning: str) -> str:
-    """The code of a warning; empty where it has none."""
+    """The code of a warning; empty where it has none, as in files of earlier versions."""
     return warning.code if isinstance(warning, Notice) else ""
+
+
+def as_plain(warnings: Iterable[str]) -> dict[str, list[str]]:
+    """Texts, and as many codes beside them, as JSON holds both."""
+    told = list(warnings)
+    return {"warnings": told, "warning_codes": [code_of(w) for w in told]}
+
+
+def from_plain(data: Mapping[str, Any]) -> list[Notice]:
+    """The reverse of `as_plain`, of data that anybody may have written: without codes where there are none."""
+    texts, codes = data.get("warnings"), data.get("warning_codes")
+    texts = [t for t in texts if isinstance(t, str)] if isinstance(texts, list) else []
+    known = isinstance(codes, list) and len(codes) == len(texts) and all(isinstance(c, str) for c in codes)
+    return [Notice(c, t) for c, t in zip(codes if known and isinstance(codes, list) else [""] * len(texts), texts)]

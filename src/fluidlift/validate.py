@@ -269,7 +269,7 @@ def _preview(folder: Path, manifest: dict[str, Any]) -> Finding:
     except InputRejected as error:
         return Finding(check, False, error.got, _SIM)
     told = manifest.get("simulation", {}).get("frames")
-    faults = list(notes.lines)
+    faults: list[str] = [*notes.lines]
     if told is not None and count != told:
         faults.append(f"{count} pictures for {told} frames")
     return _found(check, faults, _SIM, f"{count} pictures")

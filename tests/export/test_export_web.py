@@ -19,6 +19,7 @@ from fluidlift.io.ply import read_splats
 from fluidlift.io.spz import read_spz
 from fluidlift.io.views import read_view
 from fluidlift.look.rasterize import render
+from fluidlift.messages import code_of
 from fluidlift.types import Gaussians, PinholeCamera
 
 WELL = (DONE, WITH_WARNINGS)
@@ -92,7 +93,7 @@ def test_a_page_that_grows_too_large_leaves_out_frames_then_splats_and_says_so(m
     small = export_asset(made.folder, tmp_path / "b.html", ExportRequest("html"))
     assert small.facts["bytes"] < 0.75 * whole.facts["bytes"]  # ground, script and poster stay
     assert any("frames are in the page, at 12.5 per second" in w for w in small.warnings)
-    assert any("splats are in the page" in w for w in small.warnings)
+    assert "page-splats-thinned" in map(code_of, small.warnings)
     text = (tmp_path / "b.html").read_text(encoding="utf-8")
     assert small.warnings[0] in text  # who opens it is told as well
 

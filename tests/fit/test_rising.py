@@ -21,7 +21,9 @@ def masks():
     return found
 
 
-GEOMETRY = SimpleNamespace(setting=SimpleNamespace(terrain=None, cell_types=None), camera=None, rest_frame=2)
+GEOMETRY = SimpleNamespace(
+    setting=SimpleNamespace(terrain=None, cell_types=np.zeros((1, 1, 1), np.uint8)), camera=None, rest_frame=2
+)
 READ = SimpleNamespace(clip=SimpleNamespace(interval=0.04))
 
 

@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 
 from fluidlift.io.atomic import plain
 from fluidlift.io.stage_codec import Mistyped, field_types, packed, unpacked
+from fluidlift.messages import Notice
 from fluidlift.types import (
     Estimate,
     FaceVelocity,
@@ -72,7 +73,9 @@ def velocity() -> FaceVelocity:
 
 
 def clip() -> VideoClip:
-    return VideoClip(RNG.integers(0, 255, (T, H, W, 3), np.uint8), 0.04 * np.arange(T), "a.mp4", warnings=("odd",))
+    return VideoClip(
+        RNG.integers(0, 255, (T, H, W, 3), np.uint8), 0.04 * np.arange(T), "a.mp4", warnings=(Notice("odd", "odd"),)
+    )
 
 
 def setting(textured: bool) -> Setting:
@@ -96,7 +99,8 @@ def geometry(textured: bool) -> stages.Geometry:
         united_frames=2, **picture, rocks=floats(H, W) > 0 if textured else None, known_scale=None,
         depth_source={"source": "depth file", "frames": [1, 2]} if textured else None,
         jets=({"width": 0.1, "path": [[0.0, 1.0]]},),
-        slope=SlopeEvidence(1.0, 0.5, 3.0, 0.2, 1.1, "motion") if textured else None, warnings=("a", "b"),
+        slope=SlopeEvidence(1.0, 0.5, 3.0, 0.2, 1.1, "motion") if textured else None,
+        warnings=(Notice("a", "a"), Notice("b", "b")),
     )  # fmt: skip
 
 
@@ -119,12 +123,12 @@ def fit() -> stages.Fit:
 
 
 def read() -> stages.Read:
-    return stages.Read(clip(), np.array([0, 1, 3, 4]), 6, 0.25, True, (2,), ("w",))
+    return stages.Read(clip(), np.array([0, 1, 3, 4]), 6, 0.25, True, (2,), (Notice("w", "w"),))
 
 
 def flow() -> stages.Flow:
     found = PixelFlow(floats(T - 1, H, W, 2, dtype=np.float16), floats(T - 1, H, W, dtype=np.float16))
-    return stages.Flow(found, "multiframe", warnings=("w",))
+    return stages.Flow(found, "multiframe", warnings=(Notice("w", "w"),))
 
 
 def segmentation() -> stages.Segmentation:
@@ -139,7 +143,9 @@ def refined() -> stages.Refined:
 
 def simulation() -> stages.Simulation:
     poses = floats(3, 2, 7, dtype=float)
-    return stages.Simulation(floats(3), floats(3), np.array([5, 6, 7]), poses, (4, 5), 1, "blew up", ("w",))
+    return stages.Simulation(
+        floats(3), floats(3), np.array([5, 6, 7]), poses, (4, 5), 1, "blew up", (Notice("w", "w"),)
+    )
 
 
 VALUES = {
@@ -155,7 +161,7 @@ VALUES = {
     "Motion": motion,
     "Fit": fit,
     "Lift": lambda: stages.Lift(read(), flow(), segmentation(), geometry(True), refined(), motion(), fit()),
-    "Calibration": lambda: stages.Calibration(velocity(), 0.1, 0.2, 0.3, 14, ("w",)),
+    "Calibration": lambda: stages.Calibration(velocity(), 0.1, 0.2, 0.3, 14, (Notice("w", "w"),)),
     "Calibration of nothing": stages.Calibration,
     "Simulation": simulation,
     "Shown": lambda: stages.Shown(
@@ -163,7 +169,7 @@ VALUES = {
     ),
     "Shown without a clip": lambda: stages.Shown(3, {"none": "no clip"}),
     "MaskFiles": lambda: stages.MaskFiles(4, (W, H)),
-    "VelocityFiles": lambda: stages.VelocityFiles(({"frame": 0, "warnings": []},), ("w",)),
+    "VelocityFiles": lambda: stages.VelocityFiles(({"frame": 0, "warnings": []},), (Notice("w", "w"),)),
 }
 
 

@@ -33,7 +33,7 @@ def test_the_picture_lies_around_the_scene_as_documented():
     picture[:, rows - 8 : rows + 8] = (0, 1, 0)  # middle: +y
     picture[:, rows + rows // 2 - 8 : rows + rows // 2 + 8] = (0, 0, 1)  # right quarter: +x
     picture[:2], picture[-2:] = 5, 7
-    seen = Environment(picture).toward(np.array([AXES["-x"], AXES["+y"], AXES["+x"], AXES["+z"], AXES["-z"]]))
+    seen = Environment(picture).toward(np.array([AXES[name] for name in ("-x", "+y", "+x", "+z", "-z")], float))
     np.testing.assert_array_equal(seen, [(1, 0, 0), (0, 1, 0), (0, 0, 1), (5, 5, 5), (7, 7, 7)])
 
 

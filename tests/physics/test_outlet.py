@@ -34,7 +34,7 @@ def test_an_outlet_that_is_thin_already_stays_as_it_is(outlet):
 
 
 def test_a_closed_basin_has_no_outlet_to_change():
-    closed = np.where(channel() == CellType.OUTFLOW, CellType.FLUID, channel())
+    closed = np.where(channel() == CellType.OUTFLOW, CellType.FLUID, channel()).astype(np.uint8)
     np.testing.assert_array_equal(thin_outlet(closed), closed)
 
 

@@ -36,7 +36,7 @@ def test_make_leaves_a_card_in_the_manifest_and_in_the_report(made):
 def test_what_does_not_hold_is_a_warning_of_the_asset(made):
     manifest = read_manifest(made.folder)
     card = card_of(manifest)
-    assert (card.warning() is not None) == any("does not hold to its clip" in w for w in manifest["warnings"])
+    assert (card.warning() is not None) == ("not-as-filmed" in manifest["warning_codes"])
     assert (card.warning() in manifest["simulation"]["warnings"]) == (card.warning() is not None)
 
 

@@ -32,6 +32,6 @@ def test_a_fluid_on_all_sides_is_told(hole, said):
 def test_frames_without_fluid_count_only_between_others():
     mask = np.zeros((40, 60), bool)
     mask[10:20] = True
-    assert framing_warnings(mask, np.array([0, 0, 5, 7, 0])) == []  # it comes late and goes early
-    (warning,) = framing_warnings(mask, np.array([0, 5, 0, 0, 7, 0]))
+    assert framing_warnings(mask, np.array([0.0, 0, 5, 7, 0])) == []  # it comes late and goes early
+    (warning,) = framing_warnings(mask, np.array([0.0, 5, 0, 0, 7, 0]))
     assert "2 frame(s)" in warning and "(2, 3)" in warning

@@ -8,6 +8,7 @@ import pytest
 from scipy.ndimage import gaussian_filter, shift
 
 from fluidlift.errors import InputRejected
+from fluidlift.messages import code_of
 from fluidlift.shape.colour_growth import colour_odds, grown_from_streams, with_quiet_water
 from fluidlift.shape.evidence import fluid_score, gather_evidence
 from fluidlift.shape.segment import Label, LabelWriter, doubts, overlay, segment
@@ -432,7 +433,7 @@ def test_doubt_is_told_where_the_picture_shakes():
     flow = no_flow()
     flow.displacement[:, 50:70, 60:110, 0] = 2.0
     labels = segment(clip_of(pictures), flow)
-    assert any("--mask" in warning for warning in labels.warnings)
+    assert "mask-doubtful" in map(code_of, labels.warnings)
 
 
 def test_the_more_of_the_picture_could_be_either_the_stronger_the_warning():
@@ -445,4 +446,4 @@ def test_the_more_of_the_picture_could_be_either_the_stronger_the_warning():
     score[40:90] = -0.5
     (strong,) = doubts(0.4, score)
     assert "more of the picture is doubtful than is fluid" in strong
-    assert any("nearly the whole" in warning for warning in doubts(0.95, score))
+    assert "mask-nearly-everything" in map(code_of, doubts(0.95, score))

@@ -11,6 +11,7 @@ from typing import Literal
 
 from fluidlift.backends.generator_card import GeneratorCard
 from fluidlift.errors import InputRejected
+from fluidlift.messages import NONE, Notice
 
 Use = Literal["research", "commercial"]
 
@@ -60,7 +61,7 @@ def require_accepted(card: GeneratorCard, accepted: tuple[str, ...]) -> None:
         )
 
 
-def require_use(card: GeneratorCard, use: Use | None, others: tuple[GeneratorCard, ...] = ()) -> str:
+def require_use(card: GeneratorCard, use: Use | None, others: tuple[GeneratorCard, ...] = ()) -> Notice:
     """A warning where the terms forbid commercial use and nothing was said about the use; else an empty text.
 
     Args:
@@ -72,11 +73,12 @@ def require_use(card: GeneratorCard, use: Use | None, others: tuple[GeneratorCar
         InputRejected: the use that was stated is forbidden.
     """
     if card.licence_commercial or use == "research":
-        return ""
+        return NONE
     if use is None:
-        return (
+        return Notice(
+            "generator-not-commercial",
             f"{card.title} may not be used commercially: nor may this asset, as far as it is made of its body. Say "
-            "what it is for with --use research or --use commercial"
+            "what it is for with --use research or --use commercial",
         )
     free = ", ".join(c.name for c in others if c.licence_commercial)
     raise InputRejected(

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fluidlift.errors import FluidliftError, MissingPackage, require
+from fluidlift.messages import Notice
 from fluidlift.numerics.splatting import View
 from fluidlift.numerics.splatting_projection import BLUR
 from fluidlift.numerics.splatting_torch import NumbaRasterizer
@@ -88,7 +89,7 @@ class GsplatRasterizer(Rasterizer):
             ) from error
 
 
-def best_rasterizer(name: str = "auto", say: Callable[[str], None] | None = None) -> Rasterizer:
+def best_rasterizer(name: str = "auto", say: Callable[[Notice], None] | None = None) -> Rasterizer:
     """The rasteriser of this name: "cpu", "gsplat", or "auto" (gsplat where it runs, else the CPU).
 
     Args:
@@ -107,7 +108,7 @@ def best_rasterizer(name: str = "auto", say: Callable[[str], None] | None = None
             return GsplatRasterizer()
         except FluidliftError as error:
             if say is not None:
-                say(f"Drawing on the CPU: {error}")
+                say(Notice("gpu-not-used", f"Drawing on the CPU: {error}"))
     return NumbaRasterizer()
 
 

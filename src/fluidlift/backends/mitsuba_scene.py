@@ -47,7 +47,7 @@ class FinalScene:
     mirrors); colours (sRGB per vertex) where the material carries them"""
     material: Material
     camera: PinholeCamera
-    environment: Float[np.ndarray, "h 2h 3"]
+    environment: Float[np.ndarray, "h 2*h 3"]
     """linear radiance, equirectangular: first row up (+z), middle of the picture towards +y, +x to the right of it"""
     solids: tuple[TriangleMesh, ...] = ()
     """terrain and obstacles where they stand, with texture or vertex colours"""

@@ -16,6 +16,7 @@ from fluidlift.backends.mask_prompts import Clicks, clicks_from, labels_of_frame
 from fluidlift.backends.model_weights import Announce, missing, say
 from fluidlift.backends.pair_network import memory_errors, torch_device
 from fluidlift.errors import InputRejected, MissingPackage
+from fluidlift.messages import Notice
 from fluidlift.seams import Segmenter
 from fluidlift.types import Label, PixelFlow, PixelLabels, VideoClip
 
@@ -171,7 +172,11 @@ def checked_labels(labels: np.ndarray, confidence: np.ndarray, model: str) -> Pi
         raise InputRejected(
             f"{model} found no fluid in any frame", "a fluid that it knows", "draw a mask, or leave it out"
         )
-    warnings = () if not lost else (f"{model} lost the fluid in {len(lost)} frame(s), first in frame {lost[0]}",)
+    warnings = (
+        ()
+        if not lost
+        else (Notice("model-lost-fluid", f"{model} lost the fluid in {len(lost)} frame(s), first in frame {lost[0]}"),)
+    )
     return PixelLabels(labels, confidence, warnings)
 
 

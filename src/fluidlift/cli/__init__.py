@@ -46,6 +46,7 @@ from fluidlift.cli.studio import Studio
 from fluidlift.cli.view import View
 from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.kernels import compiling_beside
+from fluidlift.messages import as_plain
 from fluidlift.progress import shown_progress
 
 Command = (
@@ -251,7 +252,7 @@ def _tell(made: Any, as_json: bool) -> int:
     if as_json:
         found = {"none": card} if isinstance(card, str) else card.to_dict()
         print(json.dumps({"asset": str(made.folder), "seconds": made.seconds, "frames": made.frames,
-                          "as_filmed": found, "warnings": made.warnings, "stages": made.timings},
+                          "as_filmed": found, "stages": made.timings} | as_plain(made.warnings),
                          indent=1))  # fmt: skip
     else:
         print(f"done in {made.seconds:.0f} s")
@@ -274,8 +275,8 @@ def _fit(c: Fit) -> int:
         found = refit(c.asset, overrides=c.set, flat=flat, progress=progress)
     if c.json:
         print(json.dumps({"asset": str(found.folder), "seconds": found.seconds, "status": found.status,
-                          "reason": found.reason, "parameters": found.rows, "notes": found.notes,
-                          "warnings": found.warnings}, indent=1))  # fmt: skip
+                          "reason": found.reason, "parameters": found.rows, "notes": found.notes}
+                         | as_plain(found.warnings), indent=1))  # fmt: skip
     else:
         print("\n".join(found.lines()))
     return WITH_WARNINGS if found.warnings else DONE
@@ -355,7 +356,7 @@ def _inspect(c: Inspect) -> int:
         print(json.dumps(info, indent=1, default=str))
         return DONE
     for name, value in info.items():
-        if name != "warnings":
+        if name not in ("warnings", "warning_codes"):
             print(f"{name.replace('_', ' '):16} {value}")
     for text in info.get("warnings", ()):
         print(f"warning: {text}")

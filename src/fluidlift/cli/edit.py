@@ -11,6 +11,7 @@ import tyro
 
 from fluidlift.cli import quantities
 from fluidlift.errors import FluidliftError, InputRejected
+from fluidlift.messages import Notice, as_plain
 
 if TYPE_CHECKING:
     from fluidlift.scene.edit_history import Edit as Done
@@ -71,7 +72,7 @@ def run(command: Edit) -> int:
     told = _outcome(session, command, edit)
     idle = session.edits.look.warning()
     if edit is None or _look(session) == look:  # said once, of the edit that does it
-        told["warnings"] = [text for text in told["warnings"] if text != idle]
+        told |= as_plain(w for w in told["warnings"] if w != idle)
     if command.json:
         print(json_module.dumps(told, indent=1))
     else:
@@ -176,12 +177,15 @@ def _outcome(session: EditSession, command: Edit, edit: Done | None) -> dict[str
     try:
         stale = sorted(session.stale())
     except InputRejected as error:  # the edit is done, and can be undone
-        stale, warnings = ["simulate"], [*warnings, f"this scene cannot be simulated as it is: {error}"]
+        stale, warnings = (
+            ["simulate"],
+            [*warnings, Notice("scene-refused", f"this scene cannot be simulated as it is: {error}")],
+        )
     told = {
         "asset": str(session.folder),
         "edit": None if edit is None else edit.to_dict(),
         "stale": stale,
-        "warnings": warnings,
+        **as_plain(warnings),
         "can_undo": session.can_undo,
         "can_redo": session.can_redo,
         "scene": session.scene,

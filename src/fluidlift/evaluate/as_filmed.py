@@ -16,6 +16,7 @@ from jaxtyping import Bool, UInt8
 from fluidlift.errors import require
 from fluidlift.evaluate.film import BANDS, CELL, LEAST, FilmStatistics, Foam, Places, film_statistics
 from fluidlift.evaluate.images import mask_iou
+from fluidlift.messages import Notice
 from fluidlift.types import triple
 
 GOOD, USABLE, WRONG = "good", "usable", "does not hold"
@@ -124,12 +125,13 @@ class AsFilmed:
             told.append(f"{f.words} {_text(f.value)}{f.against()}{later}")
         return f"as filmed: {self.verdict or 'not judged'} ({'; '.join(told) or 'nothing could be measured'})"
 
-    def warning(self) -> str | None:
+    def warning(self) -> Notice | None:
         """What to say where it does not hold, with advice; None where it does."""
         if self.verdict != WRONG:
             return None
         wrong = ", ".join(f"{f.words} {_text(_worst(f))}{f.against()}" for f in self.figures if f.verdict == WRONG)
-        return f"the re-simulation does not hold to its clip: {wrong}. {' '.join(self.advice)}".strip()
+        text = f"the re-simulation does not hold to its clip: {wrong}. {' '.join(self.advice)}".strip()
+        return Notice("not-as-filmed", text)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values."""

@@ -26,6 +26,7 @@ from fluidlift.export.usd import write_usd_files
 from fluidlift.export.volumes import write_volumes
 from fluidlift.io.frames import FIRST_FRAME, FluidFrame
 from fluidlift.io.written import Written
+from fluidlift.messages import Notice
 from fluidlift.present.surfacing import surface_of
 from fluidlift.scene.splat_files import frame_numbers, frames_of, frames_told
 from fluidlift.seams import Progress, Silence
@@ -92,14 +93,15 @@ def _job(
     return ExportJob(folder, out, asset, request, numbers[::step], step * interval, progress)
 
 
-def _missing(job: ExportJob, manifest: dict[str, Any]) -> tuple[str, ...]:
+def _missing(job: ExportJob, manifest: dict[str, Any]) -> tuple[Notice, ...]:
     """A warning where frames of the simulation have gone."""
     simulated = int(manifest.get("simulation", {}).get("frames", 0))
     last = job.picked[-1] + 1
     if job.request.frames is not None or last >= simulated - (job.picked.step - 1):
         return ()
-    return (f"frame {FIRST_FRAME + last} is missing: {last} of {simulated} frames are exported; "
-            f"fluidlift sim {job.folder} makes the others",)  # fmt: skip
+    return (Notice("frames-missing", f"frame {FIRST_FRAME + last} is missing: {last} of {simulated} frames are "
+                                     f"exported; "
+            f"fluidlift sim {job.folder} makes the others"),)  # fmt: skip
 
 
 def _told(out: Path, request: ExportRequest, outcome: Outcome, interval: float, seconds: float) -> Written:

@@ -13,13 +13,14 @@ from fluidlift.export.job import (
 )
 from fluidlift.io.frames import FIRST_FRAME, MovingMesh
 from fluidlift.io.written import cleared
+from fluidlift.messages import Notice
 from fluidlift.types import TriangleMesh
 
 if TYPE_CHECKING:
     pass
 
 
-def write_bodies(job: ExportJob) -> tuple[str, ...]:
+def write_bodies(job: ExportJob) -> tuple[Notice, ...]:
     """Obstacles beside the meshes of the fluid, in the same axes and units; warnings.
 
     bodies/NUMBER_NAME.ply has one around its own origin, bodies.json where it is in every frame: "poses" [frames][7],
@@ -52,7 +53,7 @@ def write_bodies(job: ExportJob) -> tuple[str, ...]:
     return warnings
 
 
-def bodies_of(folder: Path, picked: range) -> tuple[list[MovingMesh], tuple[str, ...]]:
+def bodies_of(folder: Path, picked: range) -> tuple[list[MovingMesh], tuple[Notice, ...]]:
     """The obstacles in the poses that the simulation gave them in the frames that are picked, and warnings."""
     from fluidlift.io.scene import read_edits
     from fluidlift.scene.recall import simulated_poses
@@ -62,6 +63,11 @@ def bodies_of(folder: Path, picked: range) -> tuple[list[MovingMesh], tuple[str,
         return [], ()
     poses = simulated_poses(folder, len(obstacles), picked[-1] + 1)
     if poses is None:
-        return [], ("the obstacles' motion is not at hand and they are left out: run fluidlift sim again",)
+        return [], (
+            Notice(
+                "obstacles-left-out",
+                "the obstacles' motion is not at hand and they are left out: run fluidlift sim again",
+            ),
+        )
     shown = np.asarray(poses)[list(picked)]
     return [MovingMesh(o.name, o.mesh, shown[:, k, :3], shown[:, k, 3:]) for k, o in enumerate(obstacles)], ()

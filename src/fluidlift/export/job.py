@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from fluidlift.errors import InputRejected
+from fluidlift.messages import Notice
 from fluidlift.seams import Progress
 from fluidlift.types import FluidAsset, Similarity3
 
@@ -84,7 +85,7 @@ class Outcome:
     """What a writer has to tell."""
 
     words: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
     facts: dict[str, Any] | None = None
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from fluidlift.export.job import ExportJob, Outcome
 from fluidlift.io.frames import FIRST_FRAME
+from fluidlift.messages import Notice
 from fluidlift.present.looping import FAINTEST
 from fluidlift.scene.splat_files import frames_of
 from fluidlift.types import Gaussians, PinholeCamera, Similarity3, concatenate, matrix_from_quat, sh_from_rgb
@@ -134,15 +135,25 @@ def _range_of(frames: Iterator[Gaussians]) -> Range:
     return Range.of(frames)
 
 
-def _told(plan: Plan, splats: int, job: ExportJob, frames: int) -> list[str]:
+def _told(plan: Plan, splats: int, job: ExportJob, frames: int) -> list[Notice]:
     """What was left out, in words."""
     told = []
     if plan.share < 1.0:
-        told.append(f"{100 * plan.share:.0f} % of {splats} splats are in the page, grown to fill the same room")
+        told.append(
+            Notice(
+                "page-splats-thinned",
+                f"{100 * plan.share:.0f} % of {splats} splats are in the page, grown to fill the same room",
+            )
+        )
     if plan.every > 1:
         rate = 1.0 / (job.interval * plan.every)
-        told.append(f"{frames} of {len(job.picked)} frames are in the page, at {rate:.3g} per second; a shorter piece "
-                    "at full rate with --frames")  # fmt: skip
+        told.append(
+            Notice(
+                "page-frames-thinned",
+                f"{frames} of {len(job.picked)} frames are in the page, at {rate:.3g} per second; a shorter piece at "
+                "full rate with --frames",
+            )
+        )
     return told
 
 

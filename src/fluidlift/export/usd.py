@@ -11,6 +11,7 @@ import numpy as np
 from fluidlift.export.bodies import bodies_of
 from fluidlift.export.job import ExportJob, Outcome
 from fluidlift.io.frames import FIRST_FRAME, FluidFrame
+from fluidlift.messages import Notice
 from fluidlift.types import FluidAsset, kind_of
 
 if TYPE_CHECKING:
@@ -22,7 +23,7 @@ DEPTH = 0.5
 """of the body: as deep as half its height, a preview material shows the liquid"""
 
 
-def write_usd_asset(job: ExportJob, frames: Iterable[FluidFrame], settings: UsdSettings) -> tuple[str, ...]:
+def write_usd_asset(job: ExportJob, frames: Iterable[FluidFrame], settings: UsdSettings) -> tuple[Notice, ...]:
     """fluid.usda with all that belongs to it; warnings.
 
     Args:

@@ -7,6 +7,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+from fluidlift.messages import Notice
 from fluidlift.types import Estimate, FitResult, FluidParameters
 from fluidlift.types.parameter_table import PARAMETERS, Scale
 
@@ -47,17 +48,23 @@ class Verdict:
         """The values found are better than the first guess."""
         return self.status in ("fitted", "unfinished")
 
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Notice]:
         """For the user."""
         if self.status == "failed":
             return [
-                f"{SUBJECT} failed: {self.reason}; the first guess is kept (velocities as measured, the rest "
-                "as such fluids usually are). Known values help: fluidlift fit ASSET --hold viscosity=..."
+                Notice(
+                    "fit-failed",
+                    f"{SUBJECT} failed: {self.reason}; the first guess is kept (velocities as measured, the rest "
+                    "as such fluids usually are). Known values help: fluidlift fit ASSET --hold viscosity=...",
+                )
             ]
         if self.status == "unfinished":
             return [
-                f"{SUBJECT} stopped before it converged ({self.reason}): its values are the best found so far, "
-                f"better than the first guess ({MORE})"
+                Notice(
+                    "fit-unfinished",
+                    f"{SUBJECT} stopped before it converged ({self.reason}): its values are the best found so far, "
+                    f"better than the first guess ({MORE})",
+                )
             ]
         return []
 

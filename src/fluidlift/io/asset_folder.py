@@ -44,6 +44,7 @@ from fluidlift.io.ply import read_gaussians, write_gaussians
 from fluidlift.io.scene import SCENE_TEMPLATE, read_scene
 from fluidlift.io.stage_cache import WORK_MARKER, is_owner, load_stage, mark_owner, mark_work_folder, save_stage
 from fluidlift.io.volume_grid import VolumeGrid, velocity_grid, write_vdb
+from fluidlift.messages import as_plain
 from fluidlift.types import (
     FORMAT_VERSION,
     CellType,
@@ -165,13 +166,16 @@ def save_asset(
         if not (scene := asset_file(folder, FILES["scene"])).exists():
             write_bytes(scene, SCENE_TEMPLATE.encode())
         present = {name: file for name, file in FILES.items() if (folder / file).is_file()}
-        manifest = _manifest(asset, start_frame) | {
-            "files": present | dict(files or {}),
-            "hashes": _hashes(folder, present | dict(files or {})),
-            "timings": dict(timings or {}),
-            "metrics": dict(metrics or {}),
-            "warnings": list(warnings),
-        }
+        manifest = (
+            _manifest(asset, start_frame)
+            | {
+                "files": present | dict(files or {}),
+                "hashes": _hashes(folder, present | dict(files or {})),
+                "timings": dict(timings or {}),
+                "metrics": dict(metrics or {}),
+            }
+            | as_plain(warnings)
+        )
         _write_manifest(folder, manifest)  # last: an asset without a manifest is not finished
     return folder
 

@@ -16,7 +16,7 @@ from fluidlift.messages import Notice
 from fluidlift.types import VideoClip
 from fluidlift.types.clip import is_variable
 
-REPEATED = "repeated frames"
+REPEATED = "repeated-frames"
 """code of the warning about frames that are the same as the one before"""
 MIN_SIDE = 16
 """px; below it nothing can be seen to move"""
@@ -96,7 +96,7 @@ class Collector:
     def wants(self, time: float) -> bool:
         """Whether the frame at `time` (s) is to be kept. Half a microsecond absorbs the rounding of time stamps."""
         if time <= self.last_seen:
-            self.notes.add("frames with times that do not increase were left out")
+            self.notes.add(Notice("times-not-increasing", "frames with times that do not increase were left out"))
             return False
         self.last_seen = time
         return self.start - 5e-7 <= time < self.end - 5e-7
@@ -108,7 +108,12 @@ class Collector:
             if min(self.size) < MIN_SIDE:
                 raise InputRejected(f"the frames of '{self.name}' are {shape[0]} x {shape[1]} px", f"{MIN_SIDE} px")
         elif not same_shape(shape, self.size):
-            self.notes.add("the frame size changes inside the clip; later frames were stretched to the first size")
+            self.notes.add(
+                Notice(
+                    "frame-size-changes",
+                    "the frame size changes inside the clip; later frames were stretched to the first size",
+                )
+            )
         self._require_room(self.size)
         rgb, alpha = resample_with_alpha(rgb, alpha, self.size)
         self.repeated += self.last_frame is not None and np.array_equal(rgb, self.last_frame)
@@ -160,8 +165,11 @@ class Collector:
         if is_variable(times):
             steps = np.diff(times)
             self.notes.add(
-                f"variable frame rate: {1000 * steps.min():.1f} to {1000 * steps.max():.1f} ms between frames, the "
-                f"longest after frame {int(np.argmax(steps))}; the real times are used"
+                Notice(
+                    "variable-frame-rate",
+                    f"variable frame rate: {1000 * steps.min():.1f} to {1000 * steps.max():.1f} ms between frames, the "
+                    f"longest after frame {int(np.argmax(steps))}; the real times are used",
+                )
             )
         if self.repeated:
             text = f"{self.repeated} of {len(times)} frames repeat the one before (a converted frame rate?)"

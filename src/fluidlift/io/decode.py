@@ -19,6 +19,7 @@ from fluidlift.errors import InputRejected
 from fluidlift.io.color import HLG, PQ, tone_map
 from fluidlift.io.limits import ReadLimits, require_file
 from fluidlift.io.pictures import PICTURE_SUFFIXES
+from fluidlift.messages import Notice
 
 CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,gif,mxf"
 """A text file that begins with 'ffconcat' or '#EXTM3U' is a playlist to FFmpeg, whatever its name, and opens other
@@ -28,13 +29,17 @@ _WHITELIST = {"format_whitelist": CONTAINERS, "protocol_whitelist": "file"}
 _ITU709, _UNSPECIFIED = 1, 2
 
 
+CUT_OFF = Notice("file-cut-off", "the file ends early: it is damaged or cut off; what was there is used")
+"""of a file whose end does not decode"""
+
+
 @dataclass
 class Notes:
     """What a reader noticed; the same remark is kept once."""
 
-    lines: list[str] = field(default_factory=list)
+    lines: list[Notice] = field(default_factory=list)
 
-    def add(self, line: str) -> None:
+    def add(self, line: Notice) -> None:
         """Keep a remark."""
         if line not in self.lines:
             self.lines.append(line)
@@ -130,10 +135,10 @@ def decode_frames(
         except StopIteration:
             break
         except (av.error.FFmpegError, OSError):
-            notes.add("the file ends early: it is damaged or cut off; what was there is used")
+            notes.add(CUT_OFF)
             break
         if packet.is_corrupt:  # FFmpeg marks the packet that the end of the file cuts through
-            notes.add("the file ends early: it is damaged or cut off; what was there is used")
+            notes.add(CUT_OFF)
         try:
             frames = decoder.decode(packet if packet.size else None)
         except av.error.EOFError:
@@ -149,7 +154,7 @@ def decode_frames(
             time = None if frame.pts is None or tick is None else frame.pts * tick
             yield time, frame
     if bad:
-        notes.add(f"{bad} damaged frames or packets were left out")
+        notes.add(Notice("frames-damaged", f"{bad} damaged frames or packets were left out"))
 
 
 def has_alpha(frame: av.VideoFrame) -> bool:
@@ -170,7 +175,9 @@ def picture_of(frame: av.VideoFrame, notes: Notes) -> tuple[np.ndarray, np.ndarr
     options = {} if frame.format.is_rgb or space == _UNSPECIFIED else {"src_colorspace": space}
     alpha = None
     if is_hdr(frame):
-        notes.add("high dynamic range (PQ or HLG) was tone-mapped to sRGB; colours are approximate")
+        notes.add(
+            Notice("tone-mapped", "high dynamic range (PQ or HLG) was tone-mapped to sRGB; colours are approximate")
+        )
         rgb = tone_map(frame.reformat(format="rgb48le", **options).to_ndarray(), int(frame.color_trc))
     elif has_alpha(frame):
         rgba = frame.reformat(format="rgba", **options).to_ndarray()
@@ -186,5 +193,7 @@ def quarter_turns(frame: av.VideoFrame, notes: Notes) -> int:
     """Counter-clockwise quarter turns that set the picture upright."""
     turns = round(frame.rotation / 90)
     if abs(frame.rotation - 90 * turns) > 1:
-        notes.add(f"rotation metadata of {frame.rotation} degrees was rounded to {90 * turns}")
+        notes.add(
+            Notice("rotation-rounded", f"rotation metadata of {frame.rotation} degrees was rounded to {90 * turns}")
+        )
     return turns % 4

@@ -26,7 +26,7 @@ _PLAIN = {b"\x89PNG": "a PNG", b"\xff\xd8\xff": "a JPEG", b"RIFF": "a WebP", b"B
 _SIZE = re.compile(rb"([-+])Y +(\d{1,9}) +([-+])X +(\d{1,9})$")
 
 
-def read_environment_image(path: Path | str, *, limits: ReadLimits | None = None) -> Float[np.ndarray, "h 2h 3"]:
+def read_environment_image(path: Path | str, *, limits: ReadLimits | None = None) -> Float[np.ndarray, "h 2*h 3"]:
     """The light of a panorama: float32, linear, as stored (an EXPOSURE in the header is not undone).
 
     Rows go from straight up to straight down, and the middle of the picture is straight ahead, as all tools of the

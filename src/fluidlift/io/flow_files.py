@@ -31,6 +31,7 @@ from fluidlift.io.flow_sequence import FLOW_SUFFIXES, is_array, numbered_flow
 from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.io.limits import ReadLimits, require_file
 from fluidlift.io.pictures import read_picture, same_shape
+from fluidlift.messages import Notice
 from fluidlift.types import PixelFlow
 
 UNKNOWN = 1e9
@@ -71,13 +72,17 @@ class FlowFiles:
         start: int = 0,
     ) -> None:
         self._source, self._size, self._layout, self._limits, self._start = source, size, layout, limits, start
-        self.warnings: tuple[str, ...] = ()
+        self.warnings: tuple[Notice, ...] = ()
         """what the user should know"""
         first, own = self._stored(0)
         _require_shape(first, own, size)
         if own != size:
             self.warnings += (
-                f"the flow is {own[0]} x {own[1]} px: resampled to {size[0]} x {size[1]}, its vectors scaled with it",
+                Notice(
+                    "flow-resampled",
+                    f"the flow is {own[0]} x {own[1]} px: resampled to {size[0]} x {size[1]}, its vectors scaled "
+                    f"with it",
+                ),
             )
         if not (self.pair(0)[1] > 0).any():
             raise InputRejected(

@@ -13,6 +13,7 @@ from fluidlift.io.encode import write_video
 from fluidlift.io.limits import ReadLimits, require_file, require_size
 from fluidlift.io.pictures import fitted_size, resample
 from fluidlift.io.video import read_clip
+from fluidlift.messages import code_of
 
 MOST_FRAMES = 120
 """frames of the clip: four seconds at 30 per second, 0.2 to 1.3 MB at 512 px. Patches of footage last half of it,
@@ -65,7 +66,7 @@ def read_footage(path: Path, size: tuple[int, int]) -> tuple[np.ndarray, np.ndar
     require_file(path, "film")
     require_size(path, MOST_BYTES, "film")
     clip = read_clip(path, max_size=2 * LARGEST + 16, limits=LIMITS)
-    if any("damaged" in note for note in clip.warnings):
+    if {"file-cut-off", "frames-damaged"} & {code_of(note) for note in clip.warnings}:
         raise InputRejected(f"'{path.name}' is damaged or cut off", "a whole film", "make the asset again")
     width, height = size_of_film(size)
     rows = height + height % 2

@@ -18,6 +18,7 @@ from fluidlift.io.limits import ReadLimits, read_json, require_file, require_siz
 from fluidlift.io.pictures import PICTURE_SUFFIXES, read_picture, resample, same_shape, write_png
 from fluidlift.io.sequences import is_sequence, list_sequence
 from fluidlift.io.video import read_clip
+from fluidlift.messages import Notice
 from fluidlift.types import PinholeCamera, RigidTransform, VideoClip
 
 __all__ = [
@@ -264,7 +265,7 @@ def undistort_clip(clip: VideoClip, camera: PinholeCamera, distortion: tuple[flo
     alpha = None
     if clip.alpha is not None:
         alpha = np.stack([cv2.remap(layer, *maps, cv2.INTER_LINEAR) for layer in clip.alpha])
-    note = "lens distortion was removed with the coefficients of the camera file"
+    note = Notice("lens-straightened", "lens distortion was removed with the coefficients of the camera file")
     return replace(clip, frames=frames, alpha=alpha, warnings=(*clip.warnings, note))
 
 

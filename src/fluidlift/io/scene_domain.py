@@ -7,6 +7,7 @@ import numpy as np
 from fluidlift.errors import InputRejected
 from fluidlift.io.obstacles import Obstacle
 from fluidlift.io.scene import SceneEdits
+from fluidlift.messages import Notice
 from fluidlift.physics.terrain_edit import Replace
 from fluidlift.types import Grid, TriangleMesh, matrix_from_quat
 
@@ -22,7 +23,7 @@ PULL = (0.0, 0.0, -9.81)
 
 def require_inside(
     edits: SceneEdits, grid: Grid, *, reach: float = 0.0, above: float = 0.0, seconds: float | None = None
-) -> list[str]:
+) -> list[Notice]:
     """See that obstacles, emitters and a new terrain touch the simulation's box.
 
     Args:
@@ -46,7 +47,12 @@ def require_inside(
         fall = _fall(obstacle, (low, high), edits.parameters.get("gravity", PULL)[2])
         if fall is not None:
             late = seconds is not None and fall > seconds
-            warnings += [f"{what} falls for {fall:.2g} s before it is in the domain, after the last frame"] * late
+            warnings += [
+                Notice(
+                    "obstacle-falls-late",
+                    f"{what} falls for {fall:.2g} s before it is in the domain, after the last frame",
+                )
+            ] * late
             continue
         warnings += _judged(what, _all_places(obstacle), (low, high), still=obstacle.motion == "static")
     for emitter in edits.emitters:
@@ -86,7 +92,7 @@ def _all_places(obstacle: Obstacle) -> list[np.ndarray]:
 def _judged(
     what: str, places: list[np.ndarray], box: tuple[np.ndarray, np.ndarray], *, still: bool = True,
     room: np.ndarray | None = None,
-) -> list[str]:  # fmt: skip
+) -> list[Notice]:  # fmt: skip
     low, high = box
     size = float(max(np.ptp(p, axis=0).max() for p in places))
     side = float((high - low).max())
@@ -108,7 +114,12 @@ def _judged(
         )
     outside = min(1.0 - _share_inside(p, low, high) for p in touching)
     if still and outside > MOSTLY:
-        return [f"{what} lies outside the domain with {100 * outside:.0f} % of its extent: only the rest acts"]
+        return [
+            Notice(
+                "mostly-outside",
+                f"{what} lies outside the domain with {100 * outside:.0f} % of its extent: only the rest acts",
+            )
+        ]
     return []
 
 

@@ -11,6 +11,7 @@ from fluidlift.errors import InputRejected, require
 from fluidlift.io.asset_paths import asset_file
 from fluidlift.io.entries import Entries
 from fluidlift.io.hashes import digest
+from fluidlift.messages import Notice
 
 STYLES = ("splats", "relit", "transparent", "surface")
 MATERIALS = ("source", "water", "muddy_water", "honey", "lava", "milk", "oil", "chocolate")
@@ -65,14 +66,14 @@ class Look:
             found["environment_sha256"] = digest(path)
         return found
 
-    def warning(self) -> str | None:
+    def warning(self) -> Notice | None:
         """What is said but not drawn."""
         plain = Look()
         idle = [k for k in ("material", "environment", "tint", "exposure") if getattr(self, k) != getattr(plain, k)]
         if self.style != "splats" or not idle:
             return None
         what = f"look.{' and look.'.join(idle)} change{'s' * (len(idle) == 1)} nothing while look.style is splats"
-        return f"{what}: set it to relit, transparent or surface"
+        return Notice("look-not-drawn", f"{what}: set it to relit, transparent or surface")
 
 
 def read_look(scene: Entries, folder: Path) -> Look:

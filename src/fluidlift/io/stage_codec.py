@@ -20,7 +20,7 @@ import numpy as np
 
 from fluidlift.errors import FluidliftError
 from fluidlift.io.atomic import plain
-from fluidlift.messages import Notice
+from fluidlift.messages import Notice, code_of
 
 T = TypeVar("T")
 Arrays = Mapping[str, np.ndarray]
@@ -115,7 +115,7 @@ def _unpacked(hint: Any, data: Any, path: str, arrays: Arrays) -> Any:
         return data
     if isinstance(hint, type) and issubclass(hint, Enum):
         return hint(data)
-    if hint is str and isinstance(data, dict) and data.keys() == {"code", "text"}:
+    if hint is Notice and isinstance(data, dict) and data.keys() == {"code", "text"}:
         return Notice(_scalar(str, data["code"], path), _scalar(str, data["text"], path))
     return _scalar(hint, NO_NUMBERS.get(data, data) if hint is float and isinstance(data, str) else data, path)
 
@@ -158,8 +158,9 @@ def _checked(hint: Any, array: Any, path: str) -> np.ndarray:
 
 def _scalar(hint: Any, value: Any, path: str, *, as_text: bool = False) -> Any:
     """A number, text or truth value; `as_text`: inf and nan as JSON can hold them."""
-    if hint is str and isinstance(value, Notice):
-        return {"code": value.code, "text": str(value)} if as_text else value
+    if hint is Notice:
+        _require(isinstance(value, str), path, value, str)
+        return {"code": code_of(value), "text": str(value)} if as_text else Notice("", value)
     if hint is bool or hint is str or hint is type(None):
         _require(isinstance(value, hint), path, value, hint)
         return value

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from fractions import Fraction
 from itertools import chain, islice
 from pathlib import Path
@@ -36,6 +36,7 @@ from fluidlift.io.interlace import first_field, is_combed
 from fluidlift.io.limits import ReadLimits
 from fluidlift.io.pictures import eight_bit, read_picture
 from fluidlift.io.sequences import is_sequence, list_sequence
+from fluidlift.messages import Notice, as_plain
 from fluidlift.types import VideoClip
 from fluidlift.types.clip import is_variable
 
@@ -83,7 +84,7 @@ def read_clip(
         _read_sequence(path, fps, limits, collector, notes)
     else:
         if fps is not None:
-            notes.add("--fps is for pictures and was not used: a video has its own times")
+            notes.add(Notice("fps-not-used", "--fps is for pictures and was not used: a video has its own times"))
         _read_video(path, limits, collector, notes)
     return collector.clip()
 
@@ -92,9 +93,10 @@ INTERLACED_HEIGHT = 1088
 """px: interlaced formats have at most so many rows (1080, in whole blocks); taller videos are not looked at"""
 LOOKED_AT = 12
 """frames at the beginning of which combing is looked for"""
-COMBED_NOTE = (
+COMBED_NOTE = Notice(
+    "interlaced",
     "the video is interlaced (two instants in each frame): the rows of the first one are used; a deinterlaced copy "
-    "(ffmpeg -vf bwdif) has finer pictures"
+    "(ffmpeg -vf bwdif) has finer pictures",
 )
 
 
@@ -127,7 +129,7 @@ def _read_video(path: Path, limits: ReadLimits, collector: Collector, notes: Not
             if time is None:
                 step = float(1 / rate) if rate else 1.0 / 25.0
                 seconds = 0.0 if collector.last_seen == -math.inf else collector.last_seen + step
-                notes.add("frames without time stamps: the nominal frame rate is used")
+                notes.add(Notice("no-time-stamps", "frames without time stamps: the nominal frame rate is used"))
             else:
                 origin = time if origin is None else origin
                 seconds = float(time - origin)
@@ -161,7 +163,11 @@ def _read_sequence(path: Path, fps: float | None, limits: ReadLimits, collector:
         raise InputRejected(f"--fps {fps}", "a positive number of frames per second")
     first = files[0][0]
     if files[-1][0] - first + 1 > len(files):
-        notes.add("numbers are missing in the sequence; the time between their neighbours is longer")
+        notes.add(
+            Notice(
+                "numbers-missing", "numbers are missing in the sequence; the time between their neighbours is longer"
+            )
+        )
     for number, file in files:
         seconds = (number - first) / fps
         if seconds >= collector.end:
@@ -191,11 +197,11 @@ class ClipInfo:
     pixel_format: str
     hdr: bool
     alpha: bool
-    warnings: tuple[str, ...]
+    warnings: tuple[Notice, ...]
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data for --json."""
-        return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items()}
+        return {k: list(v) if isinstance(v, tuple) else v for k, v in vars(self).items()} | as_plain(self.warnings)
 
 
 def probe(path: Path | str, *, fps: float | None = None, limits: ReadLimits | None = None) -> ClipInfo:
@@ -229,9 +235,14 @@ def probe(path: Path | str, *, fps: float | None = None, limits: ReadLimits | No
     step = float(np.median(steps)) if len(steps) else (float(1 / rate) if rate else 0.0)
     variable = is_variable(np.asarray(times))
     if variable:
-        notes.add(f"variable frame rate: {1000 * steps.min():.1f} to {1000 * steps.max():.1f} ms between frames")
+        notes.add(
+            Notice(
+                "variable-frame-rate",
+                f"variable frame rate: {1000 * steps.min():.1f} to {1000 * steps.max():.1f} ms between frames",
+            )
+        )
     if len(times) < 2:
-        notes.add("fewer than two frames: motion cannot be measured")
+        notes.add(Notice("one-frame", "fewer than two frames: motion cannot be measured"))
     return ClipInfo(
         source=path.name,
         size=size,
@@ -269,7 +280,7 @@ def _packets(container: av.container.InputContainer, stream: av.VideoStream, not
     try:
         yield from container.demux(stream)
     except (av.error.FFmpegError, OSError):
-        notes.add("the file ends early: it is damaged or cut off")
+        notes.add(Notice("file-cut-off", "the file ends early: it is damaged or cut off"))
 
 
 def _probe_sequence(path: Path, fps: float | None, limits: ReadLimits) -> ClipInfo:
@@ -277,10 +288,10 @@ def _probe_sequence(path: Path, fps: float | None, limits: ReadLimits) -> ClipIn
     picture = read_picture(files[0][1], limits=limits)
     notes = Notes()
     if fps is None:
-        notes.add("pictures have no frame rate of their own: give --fps")
+        notes.add(Notice("no-frame-rate", "pictures have no frame rate of their own: give --fps"))
     span = files[-1][0] - files[0][0] + 1
     if span > len(files):
-        notes.add(f"{span - len(files)} numbers are missing in the sequence")
+        notes.add(Notice("numbers-missing", f"{span - len(files)} numbers are missing in the sequence"))
     return ClipInfo(
         source=path.name,
         size=picture.shape[1::-1],

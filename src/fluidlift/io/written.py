@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from fluidlift.io.frames import FIRST_FRAME
+from fluidlift.messages import Notice, as_plain
 
 
 @dataclass(frozen=True)
@@ -17,7 +18,7 @@ class Written:
 
     folder: Path
     seconds: float
-    warnings: tuple[str, ...]
+    warnings: tuple[Notice, ...]
     stages: dict[str, Any]
     """seconds and peak memory of each stage"""
     facts: dict[str, Any]
@@ -27,12 +28,15 @@ class Written:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data for --json."""
-        return self.facts | {
-            "folder": str(self.folder),
-            "seconds": round(self.seconds, 3),
-            "warnings": list(self.warnings),
-            "stages": self.stages,
-        }
+        return (
+            self.facts
+            | {
+                "folder": str(self.folder),
+                "seconds": round(self.seconds, 3),
+                "stages": self.stages,
+            }
+            | as_plain(self.warnings)
+        )
 
     def lines(self) -> list[str]:
         """For people."""

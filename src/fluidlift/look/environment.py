@@ -41,7 +41,7 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 class Environment:
     """Light from infinitely far away. Filtered pictures are made when they are first asked for, and kept."""
 
-    radiance: Float[np.ndarray, "h 2h 3"]
+    radiance: Float[np.ndarray, "h 2*h 3"]
     """float32, linear, equirectangular, z up; the module says which direction is where"""
 
     def __post_init__(self) -> None:
@@ -146,7 +146,7 @@ class Environment:
         return tuple(convolved(resized(self._small, rows), ggx_lobe(roughness)) for roughness, rows in LEVELS)
 
     @cached_property
-    def diffuse(self) -> Float[np.ndarray, "h 2h 3"]:
+    def diffuse(self) -> Float[np.ndarray, "h 2*h 3"]:
         """The picture of the irradiance over pi, by normal."""
         return convolved(resized(self._small, DIFFUSE_ROWS), clamped_cosine)
 

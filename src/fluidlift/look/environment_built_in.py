@@ -48,7 +48,7 @@ def _level_irradiance(radiance: np.ndarray) -> float:
     return float(luminance @ weights / weights.sum())
 
 
-def sky_radiance() -> Float[np.ndarray, "h 2h 3"]:
+def sky_radiance() -> Float[np.ndarray, "h 2*h 3"]:
     """A clear day, linear float32, scaled so that a level white body has luminance 1.
 
     The brightness of the sky is the CIE's standard clear one of low turbidity (ISO 15469, type 12); its colour goes
@@ -76,7 +76,7 @@ def sky_radiance() -> Float[np.ndarray, "h 2h 3"]:
     return light.astype(np.float32)
 
 
-def studio_radiance() -> Float[np.ndarray, "h 2h 3"]:
+def studio_radiance() -> Float[np.ndarray, "h 2*h 3"]:
     """A dark room with soft boxes, linear float32, scaled so that a level white body has luminance 1."""
     d = grid_directions(ROWS).astype(np.float64)
     wall = ROOM * (0.55 + 0.45 * smoothstep(d[..., 2], -0.4, 0.8))

@@ -44,7 +44,7 @@ def solid_angles(rows: int) -> Float[np.ndarray, " h"]:
     return (edges[:-1] - edges[1:]) * math.pi / rows
 
 
-def resized(picture: Float[np.ndarray, "h 2h 3"], rows: int) -> Float[np.ndarray, "rows 2rows 3"]:
+def resized(picture: Float[np.ndarray, "h 2*h 3"], rows: int) -> Float[np.ndarray, "rows 2*rows 3"]:
     """The picture with another number of rows, float32: a smaller one keeps the light of every region."""
     h = len(picture)
     if h == rows:
@@ -76,7 +76,7 @@ def _averaged(values: np.ndarray, count: int, weights: np.ndarray) -> np.ndarray
     return np.maximum(weighted, 0.0) / np.diff(up_to(weights)).reshape(-1, *[1] * (values.ndim - 1))
 
 
-def convolved(picture: Float[np.ndarray, "h 2h 3"], lobe: Lobe) -> Float[np.ndarray, "h 2h 3"]:
+def convolved(picture: Float[np.ndarray, "h 2*h 3"], lobe: Lobe) -> Float[np.ndarray, "h 2*h 3"]:
     """Weighted mean of the picture around every direction, float32; a constant picture stays exactly as it is."""
     h, w = picture.shape[:2]
     light = np.fft.rfft(picture, axis=1)

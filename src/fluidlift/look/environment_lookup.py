@@ -15,7 +15,7 @@ from jaxtyping import Float
 _CHUNK = 2048
 
 
-def grid_directions(rows: int) -> Float[np.ndarray, "h 2h 3"]:
+def grid_directions(rows: int) -> Float[np.ndarray, "h 2*h 3"]:
     """Unit directions (float32) of the pixel centres of an equirectangular picture."""
     polar = (np.arange(rows) + 0.5) * math.pi / rows
     azimuth = ((np.arange(2 * rows) + 0.5) / rows - 1.0) * math.pi
@@ -26,7 +26,7 @@ def grid_directions(rows: int) -> Float[np.ndarray, "h 2h 3"]:
     return out
 
 
-def lookup(picture: Float[np.ndarray, "h 2h 3"], directions: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+def lookup(picture: Float[np.ndarray, "h 2*h 3"], directions: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
     """The picture towards directions of any length, float32, bilinear and continuous across the poles and the seam."""
     flat = np.ascontiguousarray(np.reshape(directions, (-1, 3)), np.float32)
     out = np.empty_like(flat)
@@ -35,7 +35,7 @@ def lookup(picture: Float[np.ndarray, "h 2h 3"], directions: Float[np.ndarray, "
 
 
 def lookup_plain(
-    picture: Float[np.ndarray, "h 2h 3"], directions: Float[np.ndarray, "n 3"]
+    picture: Float[np.ndarray, "h 2*h 3"], directions: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n 3"]:
     """The twin of `lookup_kernel`."""
     h, w = picture.shape[:2]

@@ -22,7 +22,7 @@ _LOG2_E = np.float32(1.4426950408889634)
 
 
 def stacked(
-    pictures: Sequence[Float[np.ndarray, "h 2h 3"]],
+    pictures: Sequence[Float[np.ndarray, "h 2*h 3"]],
 ) -> tuple[Float[np.ndarray, " values"], Int[np.ndarray, "k 2"]]:
     """All values, and of each picture where it begins and its rows."""
     rows = np.array([len(p) for p in pictures], np.int64)

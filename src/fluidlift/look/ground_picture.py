@@ -258,7 +258,7 @@ class _Surfaces:
         return image, strongest
 
 
-def bounced(left: Float[np.ndarray, "n 3"], albedo: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+def bounced(left: Float[np.ndarray, "n 3"], albedo: Float[np.ndarray, "#n 3"]) -> Float[np.ndarray, "n 3"]:
     """How many times more ambient light surfaces get, with that which they send each other.
 
     What hides a share 1 - a of the sky is taken for as bright as the surface itself: B = albedo (a E + (1 - a) B), so

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from fluidlift.errors import require
@@ -82,7 +82,9 @@ class SurfaceMap:
         return (np.moveaxis(np.indices(self.wet.shape), 0, -1) + 0.5) * self.pitch + self.low
 
 
-def sampled(field: Float[np.ndarray, "nx ny ..."], index: Float[np.ndarray, "n 2"]) -> np.ndarray:
+def sampled(
+    field: Float[np.ndarray, "nx ny ..."] | Int[np.ndarray, "nx ny ..."], index: Float[np.ndarray, "n 2"]
+) -> np.ndarray:
     """Bilinear, at fractional indices; the nearest value outside."""
     if field.ndim == 2:
         return ndimage.map_coordinates(field, index.T, order=1, mode="nearest")

@@ -30,7 +30,7 @@ as it is deep: 1.2 there, 2.3 where they are as tall (Ferguson 2007, Water Resou
 second, 1 / 0.4, the log law ends: its mean over the depth is 0. In a film the ratio is sqrt(Re / 2)."""
 
 
-def wall_profile(distance: Float[np.ndarray, "*n"], thickness: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+def wall_profile(distance: Float[np.ndarray, "*#n"] | float, thickness: Float[np.ndarray, "*#n"] | float) -> np.ndarray:
     """Share of the free speed at a distance from the wall: 3/2 (y/d) - 1/2 (y/d)^3, and 1 beyond the layer.
 
     This is the cubic of the integral (Karman-Pohlhausen) solution of laminar flow along a plate: no slip at the wall,
@@ -46,8 +46,8 @@ def wall_profile(distance: Float[np.ndarray, "*n"], thickness: Float[np.ndarray,
 
 
 def log_profile(
-    distance: Float[np.ndarray, "*n"], depth: Float[np.ndarray, "*n"], roughness: float | None = None
-) -> Float[np.ndarray, "*n"]:
+    distance: Float[np.ndarray, "*#n"] | float, depth: Float[np.ndarray, "*#n"] | float, roughness: float | None = None
+) -> np.ndarray:
     """Share of the surface speed in a turbulent stream: ln(y / y0) / ln(h / y0), and 0 below y0 (Prandtl, Karman).
 
     The mean of this over the depth is 1 - 1 / ln(h / y0) for small y0 / h. Without a roughness, y0 is the one for which
@@ -68,7 +68,7 @@ def log_profile(
     return np.clip(1.0 + np.log(np.maximum(np.asarray(distance) / h, 1e-12)) / decades, 0.0, 1.0)
 
 
-def film_profile(distance: Float[np.ndarray, "*n"], depth: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+def film_profile(distance: Float[np.ndarray, "*#n"] | float, depth: Float[np.ndarray, "*#n"] | float) -> np.ndarray:
     """Share of the surface speed in a laminar film: 2 y/h - (y/h)^2 (Nusselt 1916), half of plane Poiseuille flow.
 
     `wall_profile` with a thickness of the whole depth differs from it by eta (1 - eta)^2 / 2 at most, 0.074 at a third
@@ -84,13 +84,13 @@ def film_profile(distance: Float[np.ndarray, "*n"], depth: Float[np.ndarray, "*n
 
 
 def speed_share(
-    distance: Float[np.ndarray, "*n"],
+    distance: Float[np.ndarray, "*#n"] | float,
     *,
     kind: str | FluidKind,
     spacing: float,
-    depth: Float[np.ndarray, "*n"] | float | None = None,
+    depth: Float[np.ndarray, "*#n"] | float | None = None,
     wall: str = "cubic",
-) -> Float[np.ndarray, "*n"]:
+) -> np.ndarray:
     """Share of the surface speed at a distance from the bed, by wall function.
 
     "cubic" is the paper's: a layer as thick as fluid type and grid say (`layer_thickness`). "log" is a turbulent

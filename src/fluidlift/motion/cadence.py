@@ -11,9 +11,10 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from fluidlift.errors import require
+from fluidlift.messages import Notice
 from fluidlift.types.clip import VideoClip
 
 WORKING_SIZE = 256
@@ -48,7 +49,7 @@ class CadenceReport:
     """frames per second before conversion, where the repeats come at its beat"""
     kept: tuple[int, ...]
     """frames worth keeping: without repeats, of the longest stretch between frozen ones"""
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
 
 
 def examine_cadence(frames: UInt8[np.ndarray, "t h w 3"], times: Float[np.ndarray, " t"]) -> CadenceReport:
@@ -75,12 +76,20 @@ def examine_cadence(frames: UInt8[np.ndarray, "t h w 3"], times: Float[np.ndarra
         if frozen or len(duplicates) < LEAST_BEATS
         else source_rate(np.asarray(kept), np.asarray(times, np.float64))
     )
-    warnings = [f"frames {a} to {b} show one picture: only frames {kept[0]} to {kept[-1]} are used" for a, b in frozen]
+    warnings = [
+        Notice("frozen-stretch", f"frames {a} to {b} show one picture: only frames {kept[0]} to {kept[-1]} are used")
+        for a, b in frozen
+    ]
     single = [int(d) for d in duplicates if not any(a < d <= b for a, b in frozen)]
     if single:
         named = ", ".join(map(str, single[:6])) + (", ..." if len(single) > 6 else "")
         why = f", as {rate:.4g} frames per second do when played at {1 / interval:.4g}" if rate else ""
-        warnings.append(f"{len(single)} of {len(frames)} frames repeat the one before{why}; left out: frame {named}")
+        warnings.append(
+            Notice(
+                "repeated-frames",
+                f"{len(single)} of {len(frames)} frames repeat the one before{why}; left out: frame {named}",
+            )
+        )
     return CadenceReport(len(frames), tuple(duplicates.tolist()), frozen, rate, kept, tuple(warnings))
 
 
@@ -149,7 +158,7 @@ def frozen_stretches(same: np.ndarray, interval: float) -> tuple[tuple[int, int]
     return tuple((int(a), int(b)) for a, b in zip(starts[long], stops[long]))
 
 
-def source_rate(kept: Float[np.ndarray, " k"], times: Float[np.ndarray, " t"]) -> float | None:
+def source_rate(kept: Int[np.ndarray, " k"], times: Float[np.ndarray, " t"]) -> float | None:
     """Frames per second before conversion, or None where the kept frames do not keep a beat.
 
     A converter shows frame k of the source at the display instant next to k / rate: the display times of the kept

@@ -44,7 +44,7 @@ class _Level(NamedTuple):
 
 
 def diffusion_interpolation(
-    values: Float[np.ndarray, "h w c"],
+    values: Float[np.ndarray, "h w c"] | Bool[np.ndarray, "h w c"],
     weight: Float[np.ndarray, "h w"],
     mask: Bool[np.ndarray, "h w"],
     direction: Float[np.ndarray, "h w 2"] | None = None,

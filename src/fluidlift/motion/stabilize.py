@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from fluidlift.errors import require
+from fluidlift.messages import Notice
 from fluidlift.motion.camera_motion import camera_motion
 from fluidlift.numerics.similarity2 import composed, inverse
 from fluidlift.types.clip import VideoClip
@@ -48,7 +49,7 @@ class ShakeReport:
     """first frame of every shot but the first"""
     runs: tuple[tuple[int, int], ...]
     """first frame and end of what can be used of each shot: where the camera moved on, that is a part of it"""
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
 
 
 class GreyFrames(Sequence[np.ndarray]):
@@ -87,9 +88,11 @@ def stabilise(
     edges = (0, *cuts, len(clip))
     shots = tuple(zip(edges, edges[1:]))
     motions, blind = motions_of_shots(clip.frames, cuts, reach)
-    warnings: list[str] = []
+    warnings: list[Notice] = []
     if blind:
-        warnings.append(f"no features that stay, to see the camera by, in {blind} frames: assumed still")
+        warnings.append(
+            Notice("camera-not-seen", f"no features that stay, to see the camera by, in {blind} frames: assumed still")
+        )
     shake, drift = shake_and_drift(motions, width, height, cuts)
     if shake <= STEADY_PX and drift <= STEADY_DRIFT_PX:
         return clip, ShakeReport(shake, drift, False, cuts, shots, tuple(warnings))
@@ -106,11 +109,20 @@ def stabilise(
     if left < max(MENDED * shake, STEADY_PX):
         if drift > FAR * max(width, height):
             warnings.append(
-                f"the camera moves by up to {drift:.0f} px: taken out as if it only turned; where it went somewhere, "
-                "what is near still moves"
+                Notice(
+                    "camera-moves-far",
+                    f"the camera moves by up to {drift:.0f} px: taken out as if it only turned; where it went "
+                    f"somewhere, "
+                    "what is near still moves",
+                )
             )
         return steady, ShakeReport(shake, drift, True, cuts, tuple(runs), tuple(warnings))
-    warnings.append(f"a camera motion of {shake:.1f} px per frame does not read the same twice: not corrected")
+    warnings.append(
+        Notice(
+            "camera-motion-unclear",
+            f"a camera motion of {shake:.1f} px per frame does not read the same twice: not corrected",
+        )
+    )
     return clip, ShakeReport(shake, drift, False, cuts, shots, tuple(warnings))
 
 

@@ -17,6 +17,7 @@ from numba import njit, prange
 from scipy import ndimage
 
 from fluidlift.errors import require
+from fluidlift.messages import NONE, Notice
 from fluidlift.types import Grid, TriangleMesh
 
 BAND = 2.0
@@ -41,13 +42,14 @@ class MeshDistance:
         return max(0.0, -2.0 * float(self.distance.min()))
 
 
-def thin_warning(name: str, distance: MeshDistance, spacing: float) -> str:
+def thin_warning(name: str, distance: MeshDistance, spacing: float) -> Notice:
     """What to tell about a solid thinner than a cell of the simulation (`spacing`, m); empty where it is thick."""
     if distance.thickness >= spacing:
-        return ""
-    return (
+        return NONE
+    return Notice(
+        "body-thin",
         f"{name}: its thickest part measures {distance.thickness:.3g} m, less than a cell ({spacing:.3g} m): the "
-        "liquid hardly sees it. Use a finer grid or a thicker body."
+        "liquid hardly sees it. Use a finer grid or a thicker body.",
     )
 
 

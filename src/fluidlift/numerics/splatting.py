@@ -96,7 +96,7 @@ class Pairs:
     """tiles first <= t < last"""
     gaussians: Int[np.ndarray, " pairs"]
     """place in `Bins.order` of the Gaussian of every pair, tile by tile, nearest first"""
-    slots: Int[np.ndarray, " pairs"]
+    slots: Int[np.ndarray, " slots"]
     """where in `gaussians` the pairs of the k-th drawn Gaussian are: slots[offsets[k]:offsets[k + 1]]; empty if nobody
     asked for them"""
     offsets: Int[np.ndarray, " m+1"]

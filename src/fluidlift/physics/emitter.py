@@ -226,7 +226,7 @@ class Emission:
         k = np.arange(len(column)) - np.repeat(np.cumsum(counts) - counts, counts) + first[column]
         return self._feet[column] + ((k + self._phases[column]) * self._step + run)[:, None] * self._along
 
-    def due(self, time: float, positions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    def due(self, time: float, positions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
         """Places (m) of the particles that have come out since the last call, which had an earlier time (s).
 
         Args:

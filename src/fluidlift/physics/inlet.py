@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
@@ -131,9 +131,7 @@ def inlet_along_rim(
     return cells
 
 
-def _across_sheet(
-    cells: Float[np.ndarray, "n 3"], down: Float[np.ndarray, "3"], lowest: float
-) -> Float[np.ndarray, "3"]:
+def _across_sheet(cells: Int[np.ndarray, "n 3"], down: Float[np.ndarray, "3"], lowest: float) -> Float[np.ndarray, "3"]:
     """Unit vector across what falls, level: the axis along which its layers of cells are thinnest, those that lie no
     further along `down` than `lowest`."""
     depth = np.rint(cells @ down).astype(int)
@@ -333,7 +331,7 @@ class Inlet:
         points[:, along] += s * np.mod((lattice - turns)[:, beside] @ PHASES, 1.0)
         return points
 
-    def missing(self, positions: Float[np.ndarray, "n 3"], rng: np.random.Generator) -> Float[np.ndarray, "n 3"]:
+    def missing(self, positions: Float[np.ndarray, "n 3"], rng: np.random.Generator) -> Float[np.ndarray, "m 3"]:
         """Places in INFLOW cells that lack a particle: points of the travelling lattice farther than 0.8 of its
         spacing from every particle, slightly jittered."""
         if not self._steady:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from fluidlift.messages import Notice
 from fluidlift.numerics.poisson import LowRankTerm
 from fluidlift.physics import boundaries
 from fluidlift.physics.active_region import ActiveRegion
@@ -18,7 +19,7 @@ from fluidlift.types import FaceVelocity
 class NoBodies:
     """Nothing is inside, nothing is pushed, and walls are those of the region."""
 
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
 
     def __init__(self) -> None:
         self.position, self.orientation = np.zeros((0, 3)), np.zeros((0, 4))

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from fluidlift.errors import InputRejected, required
+from fluidlift.messages import Notice
 from fluidlift.numerics.mesh_distance import thin_warning
 from fluidlift.numerics.poisson import LowRankTerm
 from fluidlift.numerics.solid_mesh import hull_points, moments, surface_points
@@ -57,7 +58,7 @@ class RigidBodies:
         walls: Walls,
         *,
         density: float,
-        gravity: Float[np.ndarray, "3"],
+        gravity: Float[np.ndarray, "3"] | Sequence[float],
         time: float = 0.0,
     ) -> None:
         self.bodies, self._static = tuple(bodies), walls
@@ -111,7 +112,7 @@ class RigidBodies:
         self._rows: tuple[BodyRows, ...] = ()
         self._step = 0.0
 
-    def _check(self) -> tuple[str, ...]:
+    def _check(self) -> tuple[Notice, ...]:
         grid, out = self._static.grid, []
         names = [b.name for b in self.bodies]
         for name in names:
@@ -131,9 +132,14 @@ class RigidBodies:
             mine = (contacts.first == n) & (contacts.gaps < -grid.spacing)
             if mine.any():
                 out.append(
-                    f"body '{body.name}' starts {-contacts.gaps[mine].min():.3g} m inside the terrain, the box's side "
-                    "or another body: it first creeps out the nearest way, and lies where that ends. Put it on open "
-                    "fluid instead: fluidlift edit names such a place"
+                    Notice(
+                        "body-starts-inside",
+                        f"body '{body.name}' starts {-contacts.gaps[mine].min():.3g} m inside the terrain, the "
+                        f"box's side "
+                        "or another body: it first creeps out the nearest way, and lies where that ends. Put it "
+                        "on open "
+                        "fluid instead: fluidlift edit names such a place",
+                    )
                 )
         return tuple(w for w in out if w)
 

@@ -138,12 +138,12 @@ class RigidBody:
         return cls(name, ellipsoid_mesh(np.full(3, radius)), **options)
 
     @classmethod
-    def ellipsoid(cls, name: str, semi_axes: Float[np.ndarray, "3"], **options: Any) -> RigidBody:
+    def ellipsoid(cls, name: str, semi_axes: Float[np.ndarray, "3"] | Sequence[float], **options: Any) -> RigidBody:
         """An ellipsoid around the body frame's origin."""
         return cls(name, ellipsoid_mesh(semi_axes), **options)
 
     @classmethod
-    def box(cls, name: str, size: Float[np.ndarray, "3"], **options: Any) -> RigidBody:
+    def box(cls, name: str, size: Float[np.ndarray, "3"] | Sequence[float], **options: Any) -> RigidBody:
         """A box of edge lengths `size` (m) around the body frame's origin."""
         return cls(name, box_mesh(size), **options)
 

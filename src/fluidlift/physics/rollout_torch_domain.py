@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
@@ -19,7 +19,9 @@ from fluidlift.numerics.torch_poisson import DeviceSystem
 from fluidlift.physics.rollout_domain import RolloutDomain
 
 
-def flat_to_box(flat: Float[Tensor, " f"], layout: RolloutDomain) -> Float[Tensor, "3 X Y Z"]:
+def flat_to_box(
+    flat: Float[Tensor, " f"] | Bool[Tensor, " f"], layout: RolloutDomain
+) -> Float[Tensor, "3 X Y Z"] | Bool[Tensor, "3 X Y Z"]:
     """The flat face vector as three padded arrays."""
     o = layout.offsets
     parts = []

@@ -13,6 +13,7 @@ from fluidlift.backends.monocular_depth import make_depth_estimator
 from fluidlift.backends.registry import ModelChoice
 from fluidlift.config import DepthConfig
 from fluidlift.errors import InputRejected
+from fluidlift.messages import Notice
 from fluidlift.pipeline.settings import DepthModel, GivenDepth, GivenView
 from fluidlift.pipeline.work import Work
 from fluidlift.shape import depth_surface, given_depth
@@ -200,20 +201,25 @@ def with_learned_scale(scale: MetricScale, found: DepthFront, points: np.ndarray
     return MetricScale(found.unit, "depth", relative_error=LEARNED_SCALE, across=found.unit * extent)
 
 
-def size_warnings(across: float, found: DepthFront, camera_height: float | None, points: np.ndarray) -> list[str]:
+def size_warnings(across: float, found: DepthFront, camera_height: float | None, points: np.ndarray) -> list[Notice]:
     """What to say about a depth file whose metres are hardly meant, or not those of the surveyed camera."""
     if found.learned or found.unit is None:
         return []
-    told = []
+    told: list[Notice] = []
     if not TINY < across < HUGE:
         likely = "millimetres: --set depth.scale=0.001" if across >= HUGE else "kilometres: --set depth.scale=1000"
-        told.append(f"the depth file makes the fluid {across:.3g} m across; is it in {likely}?")
+        told.append(
+            Notice("depth-unit-unlikely", f"the depth file makes the fluid {across:.3g} m across; is it in {likely}?")
+        )
     drop = float(-np.median(points[:, 2]))
     if camera_height is not None and camera_height > 0 and drop > 0:
         ratio = found.unit * drop / camera_height
         if not 1 / DISAGREEING < ratio < DISAGREEING:
             told.append(
-                f"the depth file puts the camera {found.unit * drop:.3g} m above the water, the camera file "
-                f"{camera_height:.3g} m: one of them has another unit; the depth is taken"
+                Notice(
+                    "depth-camera-disagree",
+                    f"the depth file puts the camera {found.unit * drop:.3g} m above the water, the camera file "
+                    f"{camera_height:.3g} m: one of them has another unit; the depth is taken",
+                )
             )
     return told

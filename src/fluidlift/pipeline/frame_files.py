@@ -16,6 +16,7 @@ from fluidlift.io.atomic import plain, write_json
 from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.io.limits import parse_json
 from fluidlift.io.written import cleared, numbered
+from fluidlift.messages import Notice, as_plain
 from fluidlift.motion.steady_flow import TRUSTED, spans_of
 from fluidlift.pipeline.inputs import Inputs
 from fluidlift.pipeline.mask_facts import MASK_FACTS, cleared_masks, require_unchanged, sealed
@@ -255,8 +256,8 @@ def _row(
         "flow_p99": float(np.percentile(speed, 99)),
         "free_fall_share": found.free_fall_share,
         "front_factor": found.front_factor,
-        "warnings": _doubts(found),
     }
+    row |= as_plain(_doubts(found))
     if found.surface is not None and len(found.surface.velocities):
         fast = np.linalg.norm(found.surface.velocities, axis=1)
         row |= {
@@ -267,15 +268,20 @@ def _row(
     return row | plain_report(found)
 
 
-def _doubts(found: FrameMotion) -> list[str]:
+def _doubts(found: FrameMotion) -> list[Notice]:
     """What is wrong with one frame."""
     doubts = []
     if not found.observed.any():
-        doubts.append("nothing of the flow was trusted: all of it is filled in")
+        doubts.append(Notice("frame-not-trusted", "nothing of the flow was trusted: all of it is filled in"))
     if found.surface is None:
-        doubts.append("none of its fluid lies on the body: no velocities in space")
+        doubts.append(Notice("frame-off-body", "none of its fluid lies on the body: no velocities in space"))
     if found.report is not None and not found.report.solve.converged:
-        doubts.append("the divergence-free solve did not converge")
+        doubts.append(Notice("solve-not-converged", "the divergence-free solve did not converge"))
     if (found.free_fall_share or 0.0) > FAST_FALL:
-        doubts.append("much of the steep part moves at the speed of free fall, which was not measured")
+        doubts.append(
+            Notice(
+                "speed-from-free-fall",
+                "much of the steep part moves at the speed of free fall, which was not measured",
+            )
+        )
     return doubts

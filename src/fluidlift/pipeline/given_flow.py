@@ -14,6 +14,7 @@ import numpy as np
 
 from fluidlift.errors import InputRejected
 from fluidlift.io.video import frames_before
+from fluidlift.messages import Notice
 from fluidlift.pipeline.settings import GivenFlow
 from fluidlift.types.stages import Read
 
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from fluidlift.io.flow_files import FlowFiles, FlowLayout, Pair
 
 
-def flow_of_files(read: Read, given: GivenFlow) -> tuple[Iterable[Pair], bool, list[str]]:
+def flow_of_files(read: Read, given: GivenFlow) -> tuple[Iterable[Pair], bool, list[Notice]]:
     """The user's displacement and confidence of each pair of the used frames, whether the files have one, warnings.
 
     Raises:
@@ -32,14 +33,24 @@ def flow_of_files(read: Read, given: GivenFlow) -> tuple[Iterable[Pair], bool, l
     files, places, warnings = _opened(read, given)
     warnings += files.warnings
     if read.stabilised:
-        warnings.append("the clip was steadied, the given flow was not: it should be that of steady pictures")
+        warnings.append(
+            Notice(
+                "flow-not-steadied",
+                "the clip was steadied, the given flow was not: it should be that of steady pictures",
+            )
+        )
     if given.camera is not None and read_distortion(given.camera.path) is not None:
-        warnings.append("lens distortion was taken out of the clip: the given flow should be that of such pictures")
+        warnings.append(
+            Notice(
+                "flow-lens-distorted",
+                "lens distortion was taken out of the clip: the given flow should be that of such pictures",
+            )
+        )
 
     return (_between(files, first, last) for first, last in pairwise(places.tolist())), files.has_confidence, warnings
 
 
-def _opened(read: Read, given: GivenFlow) -> tuple[FlowFiles, np.ndarray, list[str]]:
+def _opened(read: Read, given: GivenFlow) -> tuple[FlowFiles, np.ndarray, list[Notice]]:
     """The files, and the pair of theirs that begins at each used frame."""
     from fluidlift.io.flow_files import open_flow
 
@@ -58,7 +69,13 @@ def _opened(read: Read, given: GivenFlow) -> tuple[FlowFiles, np.ndarray, list[s
         except InputRejected as error:
             refusal = refusal or error
             continue
-        return files, places, [f"the given flow is shorter than the clip's file: {words}"] if words else []
+        return (
+            files,
+            places,
+            [Notice("flow-shorter-than-clip", f"the given flow is shorter than the clip's file: {words}")]
+            if words
+            else [],
+        )
     assert refusal is not None
     raise refusal
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from fluidlift.messages import NONE, Notice
 from fluidlift.pipeline import given_body
 from fluidlift.pipeline.inputs import GivenFile
 from fluidlift.pipeline.settings import GivenView
@@ -43,7 +44,7 @@ def known_camera(given: GivenView, fov: float | None, size: tuple[int, int]) -> 
     return camera, "R" in data or "frames" in data
 
 
-def level_of(level: tuple[str, str], camera: GivenFile | None) -> tuple[float, str]:
+def level_of(level: tuple[str, str], camera: GivenFile | None) -> tuple[float, Notice]:
     """z of the plane that a surveyed camera stands over (`FluidKind.surveyed_level`), m, where a camera file says it;
     else 0, the ground of its world, and a warning.
     """
@@ -53,8 +54,11 @@ def level_of(level: tuple[str, str], camera: GivenFile | None) -> tuple[float, s
     data = read_json(camera.path, "camera file") if camera is not None else {}
     value = data.get(name)
     if isinstance(value, int | float):
-        return float(value), ""
+        return float(value), NONE
     return 0.0, (
-        f"the camera file does not say how high {what}: z = 0 is assumed, which sets the scale; "
-        f"add {name} (m) to it, or give --size"
+        Notice(
+            "camera-height-missing",
+            f"the camera file does not say how high {what}: z = 0 is assumed, which sets the scale; "
+            f"add {name} (m) to it, or give --size",
+        )
     )

@@ -13,6 +13,7 @@ import numpy as np
 from fluidlift.config import JobConfig
 from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.io.written import Written, numbered
+from fluidlift.messages import Notice, as_plain
 from fluidlift.motion.steady_flow import pairs_of
 from fluidlift.pipeline import begin
 from fluidlift.pipeline.frame_files import FrameWriter, MotionFiles, WritingPlace
@@ -71,7 +72,7 @@ def measure_motion(
             beside={"place": WritingPlace(folder, inputs, "velocities" in runner.force)},
             still_there=lambda made: _all_there(folder, files, made), owns_files=True,
         )  # fmt: skip
-        facts = _facts(seen, geometry, found) | {"provenance": given.provenance(), "warnings": list(runner.warnings)}
+        facts = _facts(seen, geometry, found) | {"provenance": given.provenance()} | as_plain(runner.warnings)
         facts |= {"per_frame": list(found.rows)}
         write_json(folder / "motion.json", facts)
     return Written(
@@ -106,12 +107,16 @@ def write_velocities(
     warnings = motion_warnings(rows, kind, float(max(shares, default=0.0)))
     if kind_of(kind).starts_at_rest:
         warnings.append(
-            f"the shape of a {kind} is known as it stands, not as it collapses: flow is written, and no velocity in m/s"
+            Notice(
+                "no-velocity-in-metres",
+                f"the shape of a {kind} is known as it stands, not as it collapses: flow is written, and no "
+                f"velocity in m/s",
+            )
         )
     return VelocityFiles(tuple(rows), tuple(warnings + _unbalanced(rows)))
 
 
-def _unbalanced(rows: list[dict[str, Any]]) -> list[str]:
+def _unbalanced(rows: list[dict[str, Any]]) -> list[Notice]:
     """A warning where what flows in at the inlet and out at the outlet do not agree, or run the wrong way."""
     both = [(r["flux_in"], r["flux_out"]) for r in rows if r.get("flux_in") and r.get("flux_out")]
     if not both:
@@ -119,24 +124,37 @@ def _unbalanced(rows: list[dict[str, Any]]) -> list[str]:
     entering, leaving = (float(v) for v in np.median(both, axis=0))
     if entering > 0 > leaving:
         return [
-            f"fluid flows in at both ends ({entering:.3g} and {-leaving:.3g} m3/s, medians), and "
-            f"{entering - leaving:.3g} m3/s leave through the surface: the outlet is badly seen, look at the mask"
+            Notice(
+                "inflow-at-both-ends",
+                f"fluid flows in at both ends ({entering:.3g} and {-leaving:.3g} m3/s, medians), and "
+                f"{entering - leaving:.3g} m3/s leave through the surface: the outlet is badly seen, look at the mask",
+            )
         ]
     if leaving > 0 > entering:
         return [
-            f"fluid flows out at both ends ({-entering:.3g} and {leaving:.3g} m3/s, medians), and "
-            f"{leaving - entering:.3g} m3/s come through the surface: the inlet is badly seen, look at the mask"
+            Notice(
+                "outflow-at-both-ends",
+                f"fluid flows out at both ends ({-entering:.3g} and {leaving:.3g} m3/s, medians), and "
+                f"{leaving - entering:.3g} m3/s come through the surface: the inlet is badly seen, look at the mask",
+            )
         ]
     if entering < 0 and leaving < 0:
         return [
-            f"fluid flows in at the outlet ({-leaving:.3g} m3/s) and out at the inlet ({-entering:.3g} m3/s, medians): "
-            "inlet and outlet are taken for each other, look at the overlay"
+            Notice(
+                "ends-exchanged",
+                f"fluid flows in at the outlet ({-leaving:.3g} m3/s) and out at the inlet ({-entering:.3g} m3/s, "
+                f"medians): "
+                "inlet and outlet are taken for each other, look at the overlay",
+            )
         ]
     if abs(entering - leaving) <= SPREAD_OF_FLUX * min(entering, leaving):
         return []
     return [
-        f"{entering:.3g} m3/s flow in and {leaving:.3g} m3/s flow out (medians): the difference passes through the "
-        "surface or changes its level"
+        Notice(
+            "fluxes-differ",
+            f"{entering:.3g} m3/s flow in and {leaving:.3g} m3/s flow out (medians): the difference passes through the "
+            "surface or changes its level",
+        )
     ]
 
 

@@ -16,6 +16,7 @@ from fluidlift.errors import InputRejected
 from fluidlift.fit.outcome import in_words
 from fluidlift.io.kept_values import last_value
 from fluidlift.machine import peak_memory_mb
+from fluidlift.messages import Notice, as_plain, from_plain
 from fluidlift.pipeline.fit_request import request_of
 from fluidlift.pipeline.make import fit_figures
 from fluidlift.pipeline.runner import Runner
@@ -37,7 +38,7 @@ class Refitted:
     status: str
     """fitted, unfinished or failed"""
     reason: str
-    warnings: tuple[str, ...]
+    warnings: tuple[Notice, ...]
     notes: tuple[str, ...]
     """what else should be known: what scene.yaml overrides, the scale"""
     seconds: float
@@ -91,7 +92,7 @@ def refit(
     before = load_asset(folder)
     with disk_errors(folder), writing(folder, "a fit"):
         found = runner.run("fit", fit, read, segmentation, geometry, moved, config.fit)
-        runner.warnings[:] = [w for w in manifest.get("warnings", ()) if w not in _last_warnings(manifest)]
+        runner.warnings[:] = [w for w in from_plain(manifest) if w not in _last_warnings(manifest)]
         runner.warnings += found.warnings
         write_parameters(folder, found.parameters, found.estimates)
         _write_report(runner, found, (read, segmentation, geometry, moved), config, manifest)
@@ -112,7 +113,7 @@ def refit(
                 "fit_extra": found.extra,
                 "fit": fit_figures(found),
             },
-            warnings=runner.warnings,
+            **as_plain(runner.warnings),
         )
     rows = tuple({"name": r["name"], "before": _number(before, r["name"])} | r for r in found.table)
     return Refitted(

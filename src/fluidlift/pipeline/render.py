@@ -13,6 +13,7 @@ import numpy as np
 from fluidlift.errors import InputRejected
 from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.io.written import Written, cleared, numbered
+from fluidlift.messages import Notice
 from fluidlift.present.frames import BACKGROUNDS, Drawn, FrameRenderer, SimulatedFrame
 from fluidlift.present.front_view import open_end
 from fluidlift.present.looks import Painter
@@ -193,13 +194,18 @@ def _check(request: RenderRequest, out: Path) -> None:
         raise InputRejected(f"'{out.name}', which is a file", "a folder, or a film that ends in .mp4 or .mov")
 
 
-def _poses(folder: Path, scene: Scene, frames: int) -> tuple[np.ndarray | None, list[str]]:
+def _poses(folder: Path, scene: Scene, frames: int) -> tuple[np.ndarray | None, list[Notice]]:
     """Where the obstacles are in every frame, from the simulation's own result."""
     if not scene.obstacles:
         return None, []
     poses = simulated_poses(folder, len(scene.obstacles), frames)
     if poses is None:
-        return None, ["the obstacles' motion is not at hand and they are not drawn: run fluidlift sim again"]
+        return None, [
+            Notice(
+                "obstacles-left-out",
+                "the obstacles' motion is not at hand and they are not drawn: run fluidlift sim again",
+            )
+        ]
     return poses, []
 
 

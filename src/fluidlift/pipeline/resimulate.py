@@ -15,7 +15,7 @@ from fluidlift.config.of_asset import SECOND_HALF_SECTIONS, settings_of
 from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.io.asset_paths import asset_file
 from fluidlift.machine import peak_memory_mb
-from fluidlift.messages import code_of
+from fluidlift.messages import Notice, as_plain, code_of, from_plain
 from fluidlift.pipeline.runner import Runner
 from fluidlift.pipeline.settings import ShowSettings, SimulateSettings, taken
 from fluidlift.pipeline.stages.show import SeenLook, show
@@ -47,7 +47,7 @@ class Made:
     """What a run left."""
 
     folder: Path
-    warnings: tuple[str, ...]
+    warnings: tuple[Notice, ...]
     seconds: float
     timings: dict[str, dict[str, Any]]
     frames: int
@@ -166,7 +166,7 @@ class Played:
     look: dict[str, Any]
     loop: bool
     """whether its end runs into its beginning"""
-    warnings: tuple[str, ...]
+    warnings: tuple[Notice, ...]
     """about scene.yaml"""
 
 
@@ -178,9 +178,14 @@ def _finish(
     from fluidlift.io.atomic import atomic_write
 
     folder, done, shown = runner.folder, played.simulation, played.shown
-    before = set(manifest.get("simulation", {}).get("warnings", ()))
-    own = [*played.warnings, *done.warnings, *([] if done.failed is None else [done.failed]), *shown.warnings]
-    runner.warnings[:] = [w for w in manifest.get("warnings", ()) if w not in before] + own
+    before = set(from_plain(manifest.get("simulation", {})))
+    own = [
+        *played.warnings,
+        *done.warnings,
+        *([] if done.failed is None else [Notice("simulation-broke-down", done.failed)]),
+        *shown.warnings,
+    ]
+    runner.warnings[:] = [w for w in from_plain(manifest) if w not in before] + own
     if lift is not None:
         report.write_report(lift, done, shown, folder, config.preset, runner.timings, runner.warnings)
         figures = asset_file(folder, "work/evaluation.npz")
@@ -195,7 +200,7 @@ def _finish(
         files={name: file for name, file in PARTS.items() if (folder / file).is_file()},
         timings={k: float(t["seconds"]) for k, t in runner.timings.items()},
         metrics={"peak_memory_mb": round(peak_memory_mb(), 1), "stages": runner.timings},
-        warnings=runner.warnings,
+        **as_plain(runner.warnings),
         simulation={
             "frames": done.frames,
             "frame_interval": scene.interval,
@@ -209,8 +214,8 @@ def _finish(
             "loop": played.loop,
             "parts": scene.parts,
             "as_filmed": shown.as_filmed,
-            "warnings": own,
-        },
+        }
+        | as_plain(own),
     )  # fmt: skip
 
 

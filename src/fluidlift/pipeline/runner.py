@@ -28,6 +28,7 @@ from fluidlift.io.kept_values import kept_value
 from fluidlift.io.stage_cache import Scratch, is_owner, mark_owner, save_stage
 from fluidlift.io.stage_codec import packed
 from fluidlift.machine import peak_memory_mb
+from fluidlift.messages import Notice
 from fluidlift.pipeline.work import Work
 from fluidlift.seams import Progress
 from fluidlift.source import source_hash
@@ -55,8 +56,8 @@ class Runner:
         self.keys: dict[str, str] = {}
         self.timings: dict[str, dict[str, Any]] = {}
         """of the stages that are done"""
-        self.warnings: list[str] = []
-        self.told: list[str] = []
+        self.warnings: list[Notice] = []
+        self.told: list[Notice] = []
         """those of the stages that were run, in order"""
         self._known: dict[int, tuple[Any, str]] = {}
         self._stale = False
@@ -128,7 +129,7 @@ class Runner:
         """The value, which is known to follow from others alone: their keys are its key."""
         return self._learned(value, digest_of([self._part(v) for v in of]))
 
-    def warn(self, text: str) -> None:
+    def warn(self, text: Notice) -> None:
         """Tell once, and remember for the report."""
         if text not in self.warnings:
             self.warnings.append(text)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from fluidlift.errors import InputRejected
+from fluidlift.messages import NONE, Notice
 from fluidlift.motion.steady_flow import mean_motion
 from fluidlift.pipeline import depths, given_body
 from fluidlift.pipeline.inputs import GivenFile
@@ -68,7 +69,7 @@ class Sight:
     tilt_known: bool
     height: float | None
     """of the camera above the water, in the units of its file, where that is known"""
-    unsure: str
+    unsure: Notice
     """what to say of that height; empty: nothing"""
     stood: standing.StandingBody | None = None
     """of a dam"""
@@ -103,7 +104,7 @@ class Sighted:
     known_scale: float | None
     """m per unit, of depth in metres"""
     seen_depth: depths.DepthFront | None
-    warnings: list[str]
+    warnings: list[Notice]
 
     @property
     def kind_source(self) -> str:
@@ -171,7 +172,7 @@ class _Moving:
 def _scale(
     seen: Sight, moving: _Moving, seen_depth: depths.DepthFront | None, c: GeometrySettings, fluid: FluidMasks,
     canonical: PinholeCamera,
-) -> tuple[MetricScale, str, list[str]]:  # fmt: skip
+) -> tuple[MetricScale, str, list[Notice]]:  # fmt: skip
     """Metres per canonical unit, in words, and warnings."""
     points, velocities, stood, warnings, size = moving.points, moving.velocities, seen.stood, [], c.size
     if c.drawn is not None and c.drawn.ruler is not None:
@@ -209,7 +210,7 @@ def _seen(
     evidence, kind, parts, up, heading = _kind_and_up(
         _Looked(clip, fluid, mask, motion, trust), given, config, known, pose_given, shaped=pictures is not None
     )
-    height, unsure, stood = None, "", None
+    height, unsure, stood = None, NONE, None
     if pose_given and kind.surveyed_level is not None:
         level, unsure = level_of(kind.surveyed_level, given.camera)
         height = float(known.position[2] - level)

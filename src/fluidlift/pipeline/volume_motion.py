@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from fluidlift.messages import Notice
 from fluidlift.pipeline.settings import MotionSettings
 from fluidlift.types import Grid, SurfaceMotion, VideoClip
 from fluidlift.types.stages import Geometry
@@ -43,32 +44,46 @@ def motion_options(config: MotionSettings) -> MotionOptions:
     )  # fmt: skip
 
 
-def motion_warnings(reports: list[dict[str, Any]], kind: str, free_fall_share: float) -> list[str]:
+def motion_warnings(reports: list[dict[str, Any]], kind: str, free_fall_share: float) -> list[Notice]:
     """What the user should know of the velocities."""
     warnings = []
     stuck = [r["frame"] for r in reports if not r.get("solve", {}).get("converged", True)]
     if stuck:
         warnings.append(
-            "the divergence-free solve of the target velocity did not converge on every frame: "
-            f"{len(stuck)} of {len(reports)}, the first is {stuck[0]}"
+            Notice(
+                "solve-not-converged",
+                "the divergence-free solve of the target velocity did not converge on every frame: "
+                f"{len(stuck)} of {len(reports)}, the first is {stuck[0]}",
+            )
         )
     shares = [r["observed_share"] for r in reports if r.get("observed_share") is not None]
     if shares and np.median(shares) < LITTLE_SEEN:
         warnings.append(
-            f"the motion was measured on {100 * np.median(shares):.0f} % of the fluid only; the rest is filled in: "
-            "speeds there are a guess; look at observed/ of fluidlift motion, and at a larger --max-size, more texture "
-            "or a higher frame rate"
+            Notice(
+                "little-motion-seen",
+                f"the motion was measured on {100 * np.median(shares):.0f} % of the fluid only; the rest is filled in: "
+                "speeds there are a guess; look at observed/ of fluidlift motion, and at a larger --max-size, "
+                "more texture "
+                "or a higher frame rate",
+            )
         )
     changes = [r["change_observed"] for r in reports if "change_observed" in r]
     if changes and np.median(changes) > DISAGREEMENT:
         warnings.append(
-            "the shape and the measured motion do not agree on one discharge: velocities of the seen surface were "
-            "changed by more than half"
+            Notice(
+                "discharge-disagrees",
+                "the shape and the measured motion do not agree on one discharge: velocities of the seen surface were "
+                "changed by more than half",
+            )
         )
     if free_fall_share > FAST_FALL:
         warnings.append(
-            f"the {kind} moves faster than optical flow can follow: on {100 * free_fall_share:.0f} % of its steep part "
-            "the speed comes from free fall at the given size"
+            Notice(
+                "speed-from-free-fall",
+                f"the {kind} moves faster than optical flow can follow: on {100 * free_fall_share:.0f} % of its "
+                f"steep part "
+                "the speed comes from free fall at the given size",
+            )
         )
     return warnings
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from fluidlift.io.stage_cache import Scratch
+from fluidlift.messages import Notice
 
 T = TypeVar("T")
 
@@ -24,7 +25,7 @@ class Work:
     """for large arrays"""
     step: Callable[[int, int], None] = lambda done, total: None
     """told (done, all)"""
-    warn: Callable[[str], None] = lambda text: None
+    warn: Callable[[Notice], None] = lambda text: None
     key: str = ""
     """of the stage's result, for files that are kept under it"""
     again: bool = False

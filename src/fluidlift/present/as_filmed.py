@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from fluidlift.messages import Notice
 from fluidlift.physics.inflow_schedule import InflowSchedule
 from fluidlift.scene.build import Scene
 from fluidlift.scene.footage import Footage
@@ -70,7 +71,7 @@ class Noted:
 
     as_filmed: dict[str, Any]
     """the card, or why there is `none`"""
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
 
 
 def card_of_run(

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from fluidlift.scene.build import Scene
     from fluidlift.scene.simulated_history import History
 
-OPEN = "open loop"
+OPEN = "loop-not-closed"
 """code of the warning that says why a loop is not closed"""
 FAINTEST = 1 / 255
 """opacity below which a splat is not drawn"""
@@ -130,7 +130,7 @@ def blended_poses(head: Float[np.ndarray, "b 7"], tail: Float[np.ndarray, "b 7"]
     return np.concatenate([(1.0 - share) * head[:, :3] + share * tail[:, :3], turn], axis=1)
 
 
-def close_loop(scene: Scene, history: History, file: Callable[[int], Path], checkpoint: Path) -> list[str]:
+def close_loop(scene: Scene, history: History, file: Callable[[int], Path], checkpoint: Path) -> list[Notice]:
     """Fade the end of a simulation into its beginning, on disk; why it was not done, or nothing.
 
     A fluid that is not the same at both ends is left as it was simulated: a vessel that fills has no loop, and two

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ FILM_MAX = 12_000_000
 
 def write_report(
     lift: Lift, simulation: Simulation, shown: Shown, folder: Path, preset: str, timings: dict[str, Any],
-    warnings: list[str],
+    warnings: Sequence[str],
 ) -> Path:  # fmt: skip
     """report.html and the overlay picture.
 

@@ -16,6 +16,7 @@ from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected
 from fluidlift.look.appearance import SteadyShading
 from fluidlift.machine import available_memory
+from fluidlift.messages import Notice
 from fluidlift.physics.inflow_schedule import InflowSchedule
 from fluidlift.scene.following import following
 from fluidlift.scene.footage import Footage
@@ -104,7 +105,7 @@ class Scene:
     """whether scene.yaml edits the terrain: the clip's picture no longer shows it"""
     changes: tuple[str, ...] = ()
     """parameters that scene.yaml changes, in words"""
-    notes: tuple[str, ...] = ()
+    notes: tuple[Notice, ...] = ()
     """what was done to what scene.yaml gives, for whom it concerns"""
     overlap: int = 0
     """frames simulated beyond `frames`, that a loop is closed with"""

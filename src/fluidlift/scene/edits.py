@@ -21,6 +21,7 @@ from fluidlift.io.scene_domain import require_inside
 from fluidlift.io.scene_look import Look
 from fluidlift.io.scene_path import PLAIN, names_of
 from fluidlift.io.scene_text import with_value, without
+from fluidlift.messages import Notice
 from fluidlift.scene import edit_history
 from fluidlift.scene.changes import Add, Change, Remove, Set
 from fluidlift.scene.edit_history import BY_HAND, Edit, History, text_hash, unified
@@ -196,7 +197,7 @@ class EditSession:
 
         return stale_parts(self.folder, self.edits, meshes=self.meshes)
 
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Notice]:
         """What is odd about the scene as it is: things mostly outside the domain or in the ground, edits that take very
         long to simulate, a look that is not drawn."""
         edits, manifest = self.edits, read_manifest(self.folder)
@@ -301,7 +302,7 @@ class EditSession:
         if kind.is_gas and edits.obstacles:
             raise InputRejected(f"{edits.obstacles[0].line}: an obstacle in a {kind}", "obstacles in a liquid")
 
-    def _inside(self, edits: SceneEdits) -> list[str]:
+    def _inside(self, edits: SceneEdits) -> list[Notice]:
         """Warnings about what lies mostly outside the domain, which the terrain's edits may move elsewhere."""
         if edits.terrain:
             return []

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from fluidlift.errors import InputRejected
+from fluidlift.messages import Notice
 from fluidlift.physics.inflow_schedule import InflowSchedule
 from fluidlift.types import FaceVelocity, Filmed, FluidAsset, Grid, TriangleMesh, matrix_from_quat
 
@@ -51,7 +52,10 @@ def following(scene: Scene, asset: FluidAsset, filmed: Filmed, share: float) -> 
     if force.shape != asset.grid.shape:
         raise InputRejected(f"a force on {force.shape} cells", f"{asset.grid.shape} cells", "make the asset again")
     if scene.changes or scene.inflow != InflowSchedule() or scene.terrain.grid != asset.grid:
-        note = "the force that keeps the filmed flow is left out, since this scene has another fluid, inflow or box"
+        note = Notice(
+            "force-left-out",
+            "the force that keeps the filmed flow is left out, since this scene has another fluid, inflow or box",
+        )
         return replace(scene, notes=(*scene.notes, note))
     untouched = _untouched(scene, asset)
     weight = share * untouched

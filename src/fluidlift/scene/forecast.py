@@ -14,13 +14,14 @@ from fluidlift.io.asset_folder import load_asset, read_parameters
 from fluidlift.io.asset_paths import asset_file
 from fluidlift.io.obstacles import Obstacle
 from fluidlift.io.scene import SceneEdits
+from fluidlift.messages import Notice
 from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.scene.open_water import open_water
 from fluidlift.scene.reshaping import Asked, changed_parameters, slow_edits
 from fluidlift.types import FluidAsset, Grid, matrix_from_quat
 
 
-def outlook(folder: Path, manifest: dict[str, Any], edits: SceneEdits, grid: Grid) -> list[str]:
+def outlook(folder: Path, manifest: dict[str, Any], edits: SceneEdits, grid: Grid) -> list[Notice]:
     """Warnings about edits that take very long, and about floating bodies that begin inside the ground.
 
     Args:
@@ -35,7 +36,7 @@ def outlook(folder: Path, manifest: dict[str, Any], edits: SceneEdits, grid: Gri
         return []
 
 
-def _slow(folder: Path, manifest: dict[str, Any], edits: SceneEdits, grid: Grid) -> list[str]:
+def _slow(folder: Path, manifest: dict[str, Any], edits: SceneEdits, grid: Grid) -> list[Notice]:
     fitted = read_parameters(asset_file(folder, "parameters.json"))[0]
     changes = dict(edits.parameters)
     step = changes.pop("time_step", None)
@@ -48,16 +49,16 @@ def _slow(folder: Path, manifest: dict[str, Any], edits: SceneEdits, grid: Grid)
     try:
         return slow_edits(asked)
     except InputRejected as error:  # the edit stands, and can be undone or weakened
-        return [f"this scene cannot be simulated as it is: {error}"]
+        return [Notice("scene-refused", f"this scene cannot be simulated as it is: {error}")]
 
 
-def _buried(folder: Path, edits: SceneEdits, grid: Grid) -> list[str]:
+def _buried(folder: Path, edits: SceneEdits, grid: Grid) -> list[Notice]:
     """Floating bodies that begin more than a cell deep in the ground, which the terrain's own edits may move."""
     free = [o for o in edits.obstacles if o.motion == "free"]
     if not free or edits.terrain:
         return []
     asset = load_asset(folder)
-    return [told for o in free if (told := _depth_told(o, asset))]
+    return [Notice("obstacle-in-ground", told) for o in free if (told := _depth_told(o, asset))]
 
 
 def _depth_told(obstacle: Obstacle, asset: FluidAsset) -> str:

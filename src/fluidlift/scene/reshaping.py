@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from fluidlift.errors import InputRejected
+from fluidlift.messages import Notice
 from fluidlift.types import FluidParameters, Gaussians, Grid, concatenate, sh_from_rgb
 
 if TYPE_CHECKING:
@@ -91,7 +92,7 @@ def with_terrain(scene: Scene, edits: Sequence[TerrainEdit]) -> Scene:
         painted=scene.rest.means,
         parameters=replace(scene.parameters, inflow_velocity=tuple(inflow)),
         reshaped=True,
-        notes=scene.notes + tuple(e.note for e in edits if isinstance(e, Replace) and e.note),
+        notes=scene.notes + tuple(Notice("terrain-mended", e.note) for e in edits if isinstance(e, Replace) and e.note),
     )
 
 
@@ -228,7 +229,7 @@ def demands(asked: Asked) -> list[tuple[float, str]]:
     return sorted(found, key=lambda d: -d[0])
 
 
-def slow_edits(scene: Scene | Asked) -> list[str]:
+def slow_edits(scene: Scene | Asked) -> list[Notice]:
     """A word about edits that make a simulation take far longer than usual, before it begins.
 
     Args:
@@ -253,11 +254,14 @@ def slow_edits(scene: Scene | Asked) -> list[str]:
         )  # fmt: skip
     if steps < SLOW:
         return []
-    return [f"{what} needs about {steps:.0f} steps from one frame to the next, where two or three are usual: this may "
-            "take very long"]  # fmt: skip
+    text = (
+        f"{what} needs about {steps:.0f} steps from one frame to the next, where two or three are usual: this may take "
+        "very long"
+    )
+    return [Notice("edit-takes-long", text)]
 
 
-def closed_inlet(scene: Scene, simulator: ParticleSimulator) -> list[str]:
+def closed_inlet(scene: Scene, simulator: ParticleSimulator) -> list[Notice]:
     """See that the obstacles leave the fluid a place and a way in; warnings where they close the inlet.
 
     Raises:
@@ -279,7 +283,7 @@ def closed_inlet(scene: Scene, simulator: ParticleSimulator) -> list[str]:
     bodies = simulator.bodies
     if not len(inlet) or bodies is None or not bodies.inside(inlet).all():
         return []
-    return [f"{named} over the whole inlet: nothing flows in while it is there"]
+    return [Notice("inlet-closed", f"{named} over the whole inlet: nothing flows in while it is there")]
 
 
 def in_words(scene: Scene) -> str:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from fluidlift.errors import InputRejected
+from fluidlift.messages import Notice
 from fluidlift.types import Gaussians, Particles, PinholeCamera, concatenate, kind_of, sh_from_rgb
 
 if TYPE_CHECKING:
@@ -142,7 +143,7 @@ class Dressing:
     def __init__(self, scene: Scene) -> None:
         self._scene, self._cell = scene, scene.terrain.grid.spacing
         self._camera = scene.camera
-        self.warnings: tuple[str, ...] = ()
+        self.warnings: tuple[Notice, ...] = ()
         """what is missing for the usual look, in words"""
         self._patches: TexturePatches | None = None
         self._surface: SurfaceMap | None = None
@@ -197,7 +198,7 @@ class Dressing:
             return None
         found = _footage(scene.film, scene.camera, own.means, self._cell)
         if isinstance(found, str):
-            self.warnings = (f"the film of the fluid {found}",)
+            self.warnings = (Notice("film-not-played", f"the film of the fluid {found}"),)
             return None
         self._camera = scene.camera.resized((found.mean.shape[1], found.mean.shape[0]))
         return found

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 
 from fluidlift.errors import require
+from fluidlift.messages import Notice
 from fluidlift.shape import chute, prism, slope
 from fluidlift.shape.view import PictureEvidence, habit_prior
 from fluidlift.types import FluidKind, KindEvidence, PinholeCamera, RigidTransform, UpEvidence, kind_of
@@ -29,12 +30,17 @@ STRAIGHT = 10.0
 """degrees: a larger lean of what falls is a thrown jet or wind, not a turned camera"""
 
 
-def doubts(evidence: KindEvidence) -> tuple[str, ...]:
+def doubts(evidence: KindEvidence) -> tuple[Notice, ...]:
     """What a user should know of how sure the kind is; empty where it is."""
     (best, share), (second, other) = sorted(evidence.scores.items(), key=lambda item: -item[1])[:2]
     if share >= LEAST_SURE:
         return ()
-    return (f"what kind of fluid this is, is unsure: {best} ({share:.2f}) or {second} ({other:.2f}); --kind decides",)
+    return (
+        Notice(
+            "kind-unsure",
+            f"what kind of fluid this is, is unsure: {best} ({share:.2f}) or {second} ({other:.2f}); --kind decides",
+        ),
+    )
 
 
 def estimate_kind(

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fluidlift.errors import InputRejected
+from fluidlift.messages import NONE, Notice
 from fluidlift.shape.heights import HeightModel
 from fluidlift.types import FluidKind, MetricScale, PinholeCamera, RigidTransform, Similarity3, UpEvidence, kind_of
 from fluidlift.types.hints import Ruler
@@ -254,11 +255,12 @@ def metric_scale(
     drop = float(-np.median(points[:, 2])) if camera_height is not None else 0.0
     surveyed = camera_height / drop if camera_height is not None and camera_height > 0 and drop > 0 else None
     if size is not None:
-        scale, warning = size / extent, ""
+        scale, warning = size / extent, NONE
         if surveyed is not None and not 1 / DISAGREEING < surveyed / scale < DISAGREEING:
-            warning = (
+            warning = Notice(
+                "size-disagrees",
                 f"the given size, {size:.3g} m across the fluid, is taken, but the camera file makes it "
-                f"{surveyed * extent:.3g} m; leave out --size to use the camera's"
+                f"{surveyed * extent:.3g} m; leave out --size to use the camera's",
             )
         return MetricScale(scale, "size", warning, across=size)
     if known_scale is not None:
@@ -281,8 +283,11 @@ def metric_scale(
     return MetricScale(
         1.0 / extent,
         "assumed",
-        f"the size of the fluid is unknown{because}: 1 m across is assumed, and speeds and gravity follow from it; "
-        "give --size METRES (or a camera file with a pose) for true units",
+        Notice(
+            "size-unknown",
+            f"the size of the fluid is unknown{because}: 1 m across is assumed, and speeds and gravity follow from it; "
+            "give --size METRES (or a camera file with a pose) for true units",
+        ),
         across=1.0,
         refusal=refusal,
     )

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 
 from fluidlift.errors import InputRejected, require
+from fluidlift.messages import Notice
 from fluidlift.shape.advancing import advancing_labels
 from fluidlift.shape.colour_growth import grown_from_streams, with_quiet_water
 from fluidlift.shape.evidence import Evidence, PairReader, fluid_score, gather_evidence, pair_reader
@@ -310,22 +311,31 @@ def trustworthy(score: np.ndarray) -> bool:
     return doubtful_part(score) <= 1.0
 
 
-def doubts(share: float, score: np.ndarray) -> tuple[str, ...]:
+def doubts(share: float, score: np.ndarray) -> tuple[Notice, ...]:
     """What a user should look at before he trusts the labels, from the part of the clip that is fluid and the score."""
     warnings = []
     if not trustworthy(score):
         warnings.append(
-            "more of the picture is doubtful than is fluid (a moving camera, or a fluid that hardly changes): "
-            "look at the overlay and give a --mask"
+            Notice(
+                "mask-doubtful",
+                "more of the picture is doubtful than is fluid (a moving camera, or a fluid that hardly changes): "
+                "look at the overlay and give a --mask",
+            )
         )
     elif doubtful_part(score) > MUCH_DOUBT:
         warnings.append(
-            f"what is fluid is doubtful in places as large as {100 * doubtful_part(score):.0f} % of it (still water, "
-            "noise, strong compression): look at the overlay; a --mask would help "
-            "(fluidlift mask finds one, with --roi and --click)"
+            Notice(
+                "mask-doubtful-in-places",
+                f"what is fluid is doubtful in places as large as {100 * doubtful_part(score):.0f} % of it (still "
+                f"water, "
+                "noise, strong compression): look at the overlay; a --mask would help "
+                "(fluidlift mask finds one, with --roi and --click)",
+            )
         )
     if share > 0.9:
-        warnings.append("nearly the whole picture was taken for fluid: was the camera moving?")
+        warnings.append(
+            Notice("mask-nearly-everything", "nearly the whole picture was taken for fluid: was the camera moving?")
+        )
     return tuple(warnings)
 
 

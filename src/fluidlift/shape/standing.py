@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 from scipy import ndimage, stats
 
 from fluidlift.errors import InputRejected
+from fluidlift.messages import Notice
 from fluidlift.shape.ground_mesh import ground_mesh
 from fluidlift.shape.place import STANDARD_GRAVITY
 from fluidlift.shape.prism import (
@@ -143,6 +144,13 @@ def standing_front(camera: PinholeCamera, found: StandingBody) -> FrontSurface:
     return FrontSurface(depth.astype(np.float32), np.zeros(depth.shape, np.float32), None)
 
 
+UNKNOWN_SIZE = (
+    "the size of the fluid is unknown (its front was not seen to run): 1 m across is assumed; give --size METRES (or a "
+    "camera file with a pose) for true units"
+)
+"""what is said where nothing tells the scale"""
+
+
 def standing_scale(
     found: StandingBody, *, size: float | None, height: float | None, speed: Callable[[], float]
 ) -> MetricScale:
@@ -165,10 +173,7 @@ def standing_scale(
         # s v_c = FRONT sqrt(g s h_c), for the scale s
         value = (front / FRONT) ** -2 * STANDARD_GRAVITY * found.height
         return MetricScale(value, "front", relative_error=FRONT_ERROR, across=value * across)
-    return MetricScale(
-        1.0 / across, "assumed", "the size of the fluid is unknown (its front was not seen to run): 1 m across is "
-        "assumed; give --size METRES (or a camera file with a pose) for true units", across=1.0,
-    )  # fmt: skip
+    return MetricScale(1.0 / across, "assumed", Notice("size-unknown", UNKNOWN_SIZE), across=1.0)
 
 
 def standing_setting(found: StandingBody, to_world: Similarity3, mainstream, *, longest: int, limit: int) -> Setting:

@@ -13,7 +13,7 @@ from fluidlift.types import Grid, TriangleMesh
 
 
 def signed_distance_from(
-    above: Float[np.ndarray, "nx ny nz"], spacing: float, slope: Float[np.ndarray, "nx ny nz"] | float = 1.0
+    above: Float[np.ndarray, "nx ny nz"], spacing: float, slope: Float[np.ndarray, "#nx #ny #nz"] | float = 1.0
 ) -> Float[np.ndarray, "nx ny nz"]:
     """Distance (m, positive where `above` > 0) to the zero set of a height above ground.
 

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from fluidlift.errors import require
+from fluidlift.messages import Notice
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,7 @@ class VideoClip:
     """name of the file, without its folder"""
     alpha: UInt8[np.ndarray, "t h w"] | None = None
     """alpha channel, where the file has one"""
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
     """what the reader noticed and the user should know"""
 
     def __post_init__(self) -> None:
@@ -63,7 +64,7 @@ class PixelLabels:
     """values of `Label`"""
     confidence: Float[np.ndarray, "t h w"]
     """0 (a guess) to 1 (given by the user), float16 at rest"""
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
 
     def __post_init__(self) -> None:
         require(self.labels.ndim == 3 and self.labels.dtype == np.uint8, f"labels {self.labels.shape}", "u8 [T,H,W]")

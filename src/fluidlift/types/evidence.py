@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from fluidlift.messages import NONE, Notice
+
 UNSURE = 12.0
 """degrees, error of the pitch from which the user is asked: a quarter of what lies between level and straight down, by
 which lengths along the view come out wrong by half and more"""
@@ -38,22 +40,30 @@ class UpEvidence:
     """degrees that the pitch is above what was seen, so that the far water does not take the cells of the near"""
 
     @property
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Notice]:
         """What the user should know of a tilt that little is known of, or that is not what was seen."""
         found = []
         if self.raised >= 1.0:
             seen = self.pitch - self.raised
             found.append(
-                f"the camera looks {seen:.0f} degrees down, and the scene is built as from {self.pitch:.0f}: a relief, "
-                "whose far shore is nearer than it is, since its near water would have too few cells; "
-                f"--pitch {seen:.0f} builds it true"
+                Notice(
+                    "view-as-relief",
+                    f"the camera looks {seen:.0f} degrees down, and the scene is built as from {self.pitch:.0f}: "
+                    f"a relief, "
+                    "whose far shore is nearer than it is, since its near water would have too few cells; "
+                    f"--pitch {seen:.0f} builds it true",
+                )
             )
         if self.error <= UNSURE:
             return found
         return [
             *found,
-            f"how far the camera looks down is known to {self.error:.0f} degrees only: {self.pitch:.0f} is the middle "
-            f"of what it may be ({self.source}); give --pitch, or a camera file, for a better shape",
+            Notice(
+                "tilt-unsure",
+                f"how far the camera looks down is known to {self.error:.0f} degrees only: {self.pitch:.0f} is "
+                f"the middle "
+                f"of what it may be ({self.source}); give --pitch, or a camera file, for a better shape",
+            ),
         ]
 
 
@@ -84,7 +94,7 @@ class MetricScale:
     value: float
     source: str
     """size, ruler, depth, camera, free fall, front, or assumed"""
-    warning: str = ""
+    warning: Notice = NONE
     relative_error: float | None = None
     """standard error over value; None: not known (nothing was measured, or what was given is taken as it is)"""
     across: float = 0.0

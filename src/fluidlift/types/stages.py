@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from fluidlift.errors import require
+from fluidlift.messages import Notice
 from fluidlift.types.camera import PinholeCamera
 from fluidlift.types.clip import PixelLabels, VideoClip
 from fluidlift.types.evidence import KindEvidence, MetricScale, SlopeEvidence, UpEvidence
@@ -39,7 +40,7 @@ class Read:
     """whether the shake was taken out"""
     cuts: tuple[int, ...] = ()
     """frames before which a cut was found"""
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
 
     def __post_init__(self) -> None:
         require(len(self.kept) == len(self.clip), f"{len(self.kept)} numbers for {len(self.clip)} frames")
@@ -61,7 +62,7 @@ class Flow:
     """that estimated it, or `GIVEN`"""
     trusted_as_given: bool = False
     """it came from a file without confidence, and is trusted everywhere"""
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
 
 
 GIVEN = "given"
@@ -81,7 +82,7 @@ class Segmentation:
     """share of the fluid on which optical flow is trusted"""
     user_mask: bool
     """whether the user gave it"""
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -91,7 +92,7 @@ class Bodies:
     name: str
     """of the generator"""
     frames: tuple[int, ...]
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -149,7 +150,7 @@ class Geometry:
     jets: tuple[dict[str, Any], ...] = ()
     """jets above what lies, in the world, m"""
     slope: SlopeEvidence | None = None
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
 
     def __post_init__(self) -> None:
         shape = self.mask.shape
@@ -187,7 +188,7 @@ class Refined:
     loss_history: tuple[float, ...] = ()
     psnr_later: tuple[tuple[float, float], ...] = ()
     """dB before and after, of the frames after the first"""
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -223,7 +224,7 @@ class Motion:
     """median over the targets, of what a moving front was sped up by"""
     free_fall_share: float
     """of the steep part, whose speed is that of free fall, at most"""
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
 
     def __post_init__(self) -> None:
         pairs, height, width = self.completed.shape[:3]
@@ -271,7 +272,7 @@ class Fit:
     extra: dict[str, float]
     """figures for the report"""
     loss_history: Float[np.ndarray, " n"]
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -311,7 +312,7 @@ class Calibration:
     """difference to the filmed flow that stays under the pull, over its speed"""
     frames: int | None = None
     """of the run"""
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
     dry: Bool[np.ndarray, "nx ny nz"] | None = None
     """cells that the clip shows dry throughout; None where that is not known"""
 
@@ -334,7 +335,7 @@ class Simulation:
     """first frame that this run simulated"""
     failed: str | None = None
     """why it broke down after its last frame; None where it did not"""
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
 
     def __post_init__(self) -> None:
         k = len(self.count)
@@ -361,7 +362,7 @@ class Shown:
     """where they show fluid"""
     flow: Float[np.ndarray, "k h w 2"] | None = None
     """px per frame, float16; NaN where they show no fluid"""
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -371,7 +372,7 @@ class MaskFiles:
     frames: int
     size: tuple[int, int]
     """px"""
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -380,4 +381,4 @@ class VelocityFiles:
 
     rows: tuple[dict[str, Any], ...]
     """what is known of each frame"""
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()

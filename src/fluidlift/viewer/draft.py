@@ -7,6 +7,7 @@ import threading
 from collections.abc import Sequence
 from typing import Any, Protocol
 
+from fluidlift.messages import Notice
 from fluidlift.types import FluidParameters
 
 QUIET = 0.7
@@ -49,7 +50,7 @@ class Session(Protocol):
         """Which of simulate and look the frames on disk no longer match; this takes a second or so."""
         ...
 
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Notice]:
         """What is odd about the scene as it is, and what its simulation will meet."""
         ...
 
@@ -210,7 +211,7 @@ class Draft:
         """Which of simulate and look the frames on disk no longer match."""
         return set(self._session.stale())
 
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Notice]:
         """What is odd about the scene as it is in the history; raises `InputRejected` for a broken scene.yaml."""
         return list(self._session.warnings())
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Bool
 
+from fluidlift.messages import Notice
 from fluidlift.pipeline.work import Work
 from fluidlift.scene.build import Scene, wave_speed
 from fluidlift.types import CellType, FaceVelocity, kind_of
@@ -100,9 +101,14 @@ def calibrate(
     warnings = []
     if left > STRONG:
         warnings.append(
-            f"shape, measured motion and mass do not fit together: drawn towards the filmed flow, the simulation still "
-            f"differs from it by {100 * left:.0f} % of its speed; the level will rise or fall; a --mask, --pitch or "
-            "--size that is known would help"
+            Notice(
+                "flow-not-held",
+                f"shape, measured motion and mass do not fit together: drawn towards the filmed flow, the "
+                f"simulation still "
+                f"differs from it by {100 * left:.0f} % of its speed; the level will rise or fall; a --mask, "
+                f"--pitch or "
+                "--size that is known would help",
+            )
         )
     return Calibration(force, size, speed, left, frames, tuple(warnings), dry)
 

@@ -16,6 +16,7 @@ from fluidlift.backends.generator_licence import require_accepted, require_use
 from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected, MissingPackage
 from fluidlift.io.asset_paths import asset_file
+from fluidlift.messages import Notice
 from fluidlift.pipeline.given_body import NOTE
 from fluidlift.pipeline.inputs import Inputs
 from fluidlift.pipeline.known_camera import known_field_of_view
@@ -51,7 +52,7 @@ def choice_of(config: GenerateSettings, field_of_view: float | None = None) -> g
     )  # fmt: skip
 
 
-def require_usable(inputs: Inputs, config: JobConfig, folder: Path) -> list[str]:
+def require_usable(inputs: Inputs, config: JobConfig, folder: Path) -> list[Notice]:
     """Look at everything that can be known of the generator before the clip is read; warnings about its use.
 
     Args:

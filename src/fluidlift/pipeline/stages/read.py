@@ -13,7 +13,7 @@ import numpy as np
 
 from fluidlift.errors import InputRejected
 from fluidlift.io.stage_cache import Scratch
-from fluidlift.messages import without
+from fluidlift.messages import Notice, without
 from fluidlift.pipeline.inputs import GivenFile
 from fluidlift.pipeline.settings import ReadSettings
 from fluidlift.pipeline.work import Work
@@ -117,7 +117,7 @@ def _chosen(array: np.ndarray, kept: np.ndarray, name: str, scratch: Scratch) ->
     return out
 
 
-def _told(before: tuple[str, ...], more: tuple[str, ...]) -> tuple[str, ...]:
+def _told(before: tuple[Notice, ...], more: tuple[Notice, ...]) -> tuple[Notice, ...]:
     return (*before, *(w for w in more if w not in before))
 
 
@@ -130,7 +130,7 @@ class _Shake:
     cuts: tuple[int, ...]
     runs: tuple[tuple[int, int], ...]
     """first frame and end of what can be used of each shot"""
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
 
 
 def _steady(clip: VideoClip, scratch: Scratch, *, correct: bool) -> tuple[VideoClip, _Shake]:
@@ -145,7 +145,7 @@ def _steady(clip: VideoClip, scratch: Scratch, *, correct: bool) -> tuple[VideoC
     return steady, _Shake(float(shake.shake_px), bool(shake.stabilised), cuts, shake.runs, shake.warnings)
 
 
-def _longest_run(shake: _Shake, frames: int, source: str, kept: np.ndarray) -> tuple[int, int, list[str]]:
+def _longest_run(shake: _Shake, frames: int, source: str, kept: np.ndarray) -> tuple[int, int, list[Notice]]:
     """First frame and end of the longest stretch of one view; what comes after a cut or a turn is another scene."""
     first, last = max(shake.runs, key=lambda run: run[1] - run[0])
     if last - first == frames:
@@ -160,4 +160,13 @@ def _longest_run(shake: _Shake, frames: int, source: str, kept: np.ndarray) -> t
         why.append(f"has {len(shake.cuts)} cut(s), at frame {', '.join(str(kept[c]) for c in shake.cuts)}")
     if last - first < max(b - a for a, b in pairwise((0, *shake.cuts, frames))):
         why.append("turns away from its view")
-    return first, last, [f"the clip {' and '.join(why)}: only frames {kept[first]} to {kept[last - 1]} are used"]
+    return (
+        first,
+        last,
+        [
+            Notice(
+                "clip-cut-short",
+                f"the clip {' and '.join(why)}: only frames {kept[first]} to {kept[last - 1]} are used",
+            )
+        ],
+    )

@@ -9,6 +9,7 @@ import numpy as np
 from fluidlift.backends.learned import MASK_METHODS, make_segmenter
 from fluidlift.backends.registry import ModelChoice
 from fluidlift.errors import InputRejected
+from fluidlift.messages import Notice
 from fluidlift.pipeline.fluid_found import sureness, trusted_share
 from fluidlift.pipeline.hints import NO_HINTS, Hints
 from fluidlift.pipeline.settings import GivenMask, SegmentSettings
@@ -60,8 +61,12 @@ def segment(
     trusted, sure = trusted_share(flow.flow, fluid.any_frame()), sureness(labels, areas.sum())
     if trusted < 0.1:
         warnings.append(
-            f"optical flow failed on {100 * (1 - trusted):.0f} % of the fluid: velocities there are filled in from the "
-            "mainstream; a clip with more texture or a higher frame rate would help"
+            Notice(
+                "flow-failed",
+                f"optical flow failed on {100 * (1 - trusted):.0f} % of the fluid: velocities there are filled in "
+                f"from the "
+                "mainstream; a clip with more texture or a higher frame rate would help",
+            )
         )
     kept = work.scratch.keep("labels", labels.labels), work.scratch.keep("confidence", _halved(work, labels.confidence))
     share = float(areas.mean() / (clip.size[0] * clip.size[1]))

@@ -71,8 +71,11 @@ def simulate(
     )
     if failed is None and len(history) < scene.simulated:
         warnings.append(
-            f"the re-simulation stopped after {len(history)} of {scene.simulated} frames, at twice the number of "
-            f"particles that --set simulate.max_particles={config.max_particles} allows"
+            Notice(
+                "simulation-too-many-particles",
+                f"the re-simulation stopped after {len(history)} of {scene.simulated} frames, at twice the number of "
+                f"particles that --set simulate.max_particles={config.max_particles} allows",
+            )
         )
     if scene.overlap:
         warnings += close_loop(scene, history, lambda k: frame_file(folder, FIRST_FRAME + k), checkpoint_file(folder))
@@ -91,14 +94,20 @@ def simulate(
     )
 
 
-def _simulation_warnings(kind: str, volumes: Sequence[float], leaks: Sequence[float]) -> list[str]:
+def _simulation_warnings(kind: str, volumes: Sequence[float], leaks: Sequence[float]) -> list[Notice]:
     warnings = []
     drift = volumes[-1] / max(volumes[0], 1e-12) - 1
     if drift < -0.5 or (drift > 0.5 and kind_of(kind).is_channel_flow):  # pours fill and smoke spreads
         word = "lost" if drift < 0 else "gained"
-        warnings.append(f"the re-simulation {word} {100 * abs(drift):.0f} % of its volume by its last frame")
+        warnings.append(
+            Notice(
+                "volume-drifts", f"the re-simulation {word} {100 * abs(drift):.0f} % of its volume by its last frame"
+            )
+        )
     if max(leaks) > 0.01:
-        warnings.append(f"up to {100 * max(leaks):.1f} % of the particles are inside the terrain")
+        warnings.append(
+            Notice("particles-in-ground", f"up to {100 * max(leaks):.1f} % of the particles are inside the terrain")
+        )
     return warnings
 
 

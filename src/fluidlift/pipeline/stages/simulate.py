@@ -111,7 +111,7 @@ def _simulation_warnings(kind: str, volumes: Sequence[float], leaks: Sequence[fl
     return warnings
 
 
-def _strayed(drained: float, volume: float, seconds: float) -> list[str]:
+def _strayed(drained: float, volume: float, seconds: float) -> list[Notice]:
     """What to say of the water (m^3) that got into dry cells, of which `volume` is left."""
     share = drained / max(volume * seconds, 1e-12)
     if share <= STRAYED:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import platform
 import tempfile
 import threading
@@ -115,20 +116,21 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--record", action="store_true", help="write benchmarks/results/studio.json")
     wanted = parser.parse_args()
+    load = os.getloadavg()[0]
     with tempfile.TemporaryDirectory() as folder:
         found = measured(Path(folder))
     for name, (clock, processors) in found.items():
         print(f"{name:32} {clock:6.1f} s, {processors:6.1f} s of processors")
     if wanted.record:
-        write(found)
+        write(found, load)
     return 0
 
 
 GOALS = {"drop to all findings": 20.0, "stroke to the changed mask": 2.0}
 
 
-def write(found: dict[str, tuple[float, float]]) -> None:
-    """The figures as a topic of docs/results.md."""
+def write(found: dict[str, tuple[float, float]], load: float) -> None:
+    """The figures as a topic of docs/results.md, with the load of the machine beforehand."""
     from benchmarks.report import text_of
 
     records = []
@@ -138,7 +140,9 @@ def write(found: dict[str, tuple[float, float]]) -> None:
         records.append({"subject": name, "figure": "processor time", "value": round(processors, 2)})
     content = {
         "title": "Studio",
-        "text": "A clip of 3 s at 512 px, looked at on 320 px, in a headless Chromium on the same machine; two cores.",
+        "text": "A clip of 3 s at 512 px, looked at on 320 px, in a headless Chromium on the same machine; two cores. "
+        f"Load of the machine before it began: {load:.1f} (0: quiet); what others take lengthens the time, and hardly the "
+        "processor time.",
         "rows": "subject",
         "command": "python benchmarks/studio.py --record",
         "date": date.today().isoformat(),

@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 
+import cv2
+import numpy as np
 import pytest
 
 from fluidlift.errors import InputRejected
@@ -109,6 +111,15 @@ def test_hints_of_another_clip_are_refused_and_a_renamed_one_is_the_same(tmp_pat
     (tmp_path / "other.mp4").write_bytes(b"milk")
     with pytest.raises(InputRejected, match=r"belongs to another clip than 'other.mp4'"):
         require_same_clip(hints, tmp_path / "other.mp4", "h.yaml")
+
+
+def test_a_sequence_is_known_by_its_pictures_whether_named_by_folder_or_pattern(tmp_path):
+    for number in (1, 2):
+        cv2.imwrite(str(tmp_path / f"{number:04d}.png"), np.full((16, 16, 3), 40 * number, np.uint8))
+    before = content_hash(tmp_path)
+    assert content_hash(tmp_path / "%04d.png") == before
+    cv2.imwrite(str(tmp_path / "0002.png"), np.zeros((16, 16, 3), np.uint8))
+    assert content_hash(tmp_path) != before
 
 
 def test_hints_lie_beside_their_clip(tmp_path):

@@ -193,9 +193,10 @@ def _read_hints(file: Path | None, clip: Path) -> Any:
     if file is None:
         return NOTHING_SAID
     from fluidlift.io.hints_file import read_hints, require_same_clip
+    from fluidlift.io.sequences import is_sequence
 
     hints = read_hints(file)
-    if clip.exists():  # that it is not there is said where the clip is read
+    if clip.exists() or is_sequence(clip):  # that it is not there is said where the clip is read
         require_same_clip(hints, clip, file.name)
     return hints
 

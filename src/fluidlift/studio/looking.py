@@ -20,7 +20,9 @@ from fluidlift.types.stages import Read, Segmentation
 
 LOG = logging.getLogger(__name__)
 LOOK_SIZE = 320
-"""px, longer side of the pictures that are looked at: what is seen there is what make sees, in a third of the time"""
+"""px, longer side of the pictures that are looked at"""
+LOOK_FLOW = "dis"
+"""flow of single pairs: the mask goes by it anyway, and kind, tilt and arrows come in a third of the time"""
 LOOK_SECONDS = 3.0
 """of a clip without a trim: what is found there is mostly true of the rest"""
 WORDS = {"read": "reading the clip", "flow": "measuring the motion", "segment": "finding the fluid",
@@ -191,10 +193,10 @@ def _same(a: Read | None, b: Read) -> bool:
 
 
 def look_config(hints: ClipHints) -> JobConfig:
-    """Settings of a look: small pictures, and a few seconds where nothing says which."""
+    """Settings of a look: small pictures, flow of pairs, and a few seconds where nothing says which."""
     from fluidlift.config import build_config
 
-    base = {"read.max_size": LOOK_SIZE, "read.duration": LOOK_SECONDS}
+    base = {"read.max_size": LOOK_SIZE, "read.duration": LOOK_SECONDS, "motion.method": LOOK_FLOW}
     return build_config(None, None, (), None, base=base | dict(hints.settings))
 
 

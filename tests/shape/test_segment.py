@@ -185,7 +185,8 @@ def test_what_swings_far_is_carried_and_no_fluid():
     jug, water = (slice(10, 25), slice(40, 100)), (slice(45, 85), slice(10, 60))
     assert float(np.median(evidence.carried[jug])) > 0.5 > 0.1 > float(np.median(evidence.carried[water]))
     assert float(np.median(fluid_score(replace(evidence, carried=0.0 * evidence.carried))[jug])) > 0.0
-    assert float(np.median(fluid_score(evidence)[jug])) < 0.0
+    score = fluid_score(evidence)[jug]
+    assert -3.0 <= float(np.median(score)) < 0.0, "colours and edges still have their say"
     fluid = segment(clip_of(pictures), flow).fluid[0]
     assert fluid[water].mean() > 0.95
     assert fluid[jug].mean() < 0.1

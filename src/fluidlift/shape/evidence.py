@@ -44,10 +44,13 @@ LARGEST_TREMBLE = 0.25
 """px, mean displacement of a still thing between frames of a stabilised clip"""
 LEAST_STEP = 0.1
 """px per frame: typical motion of a place below which its course is that of the noise"""
-CARRIED, PER_CARRIED = 0.35, 32.0
+CARRIED, PER_CARRIED = 0.35, 30.0
 """share of change above which it speaks for a solid, and log odds against fluid per unit above it (logistic regression
-on the score and this over 26 real clips, the slope of the score taken as one). Where the score speaks for fluid, real
+on both over 28 real clips, in units of the score's: `benchmarks/masks_fit.py`). Where the score speaks for fluid, real
 fluids have 0.01 to 0.25 (80th percentile, moving cameras apart), hands, jugs, kettles and a passer-by 0.4 to 0.7"""
+UNLIKELY = -3.0
+"""log odds below which being carried puts no place: spray that drifts with its fall may be, and colours and edges tell
+it from a hand, which they cannot once it is beyond doubt"""
 
 
 @dataclass(frozen=True)
@@ -245,7 +248,8 @@ def fluid_score(evidence: Evidence) -> np.ndarray:
     height, width = evidence.noise.shape
     both = 0.5 * (evidence.activity + evidence.fine_activity) - evidence.level
     score = both / 0.3 + 1.5 * evidence.streaming - 2.5 * evidence.swaying
-    score -= PER_CARRIED * np.maximum(evidence.carried - CARRIED, 0.0)
+    carried = score - PER_CARRIED * np.maximum(evidence.carried - CARRIED, 0.0)
+    score = np.maximum(carried, np.minimum(score, UNLIKELY))
     return np.clip(score, -12.0, 12.0).astype(np.float32).reshape(height, width)
 
 

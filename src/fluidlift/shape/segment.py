@@ -39,9 +39,9 @@ DOUBTFUL = 1.5
 """log odds: what lies nearer to zero could be either"""
 MUCH_DOUBT = 0.4
 """doubtful places as part of the fluid from which a user is told: with half of them wrong, a fifth of the mask is"""
-BIAS, IN_OUTLINE, OF_SCORE, LOUDEST = 0.46, 1.12, 0.32, 8.0
+BIAS, IN_OUTLINE, OF_SCORE, LOUDEST = 0.51, 1.21, 0.31, 8.0
 """log odds of fluid of a pixel whose score is 0 and outline unknown, for one inside an outline (against it, outside),
-per unit of the score, and the score beyond which it says no more: logistic regression on pixels of 26 real clips
+per unit of the score, and the score beyond which it says no more: logistic regression on pixels of 28 real clips
 (`benchmarks/masks_fit.py`). Of what has a chance of 0.8 by it, 8 in 10 are right, with each clip left out in turn"""
 
 

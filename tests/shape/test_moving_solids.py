@@ -5,7 +5,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from fluidlift.motion.optical_flow import DenseInverseSearch, flow_of_pair
-from fluidlift.shape.moving_solids import moving_solids
+from fluidlift.shape.moving_solids import SharedPairs, moving_solids
 from fluidlift.types.clip import VideoClip
 
 FRAMES, HEIGHT, WIDTH = 40, 180, 240
@@ -46,7 +46,8 @@ def found_in(pictures: np.ndarray) -> np.ndarray:
     noisy = pictures + rng.normal(size=pictures.shape)
     frames = np.clip(noisy, 0, 255).round().astype(np.uint8)[..., None].repeat(3, axis=-1)
     clip, estimator = VideoClip(frames, np.arange(FRAMES) / 25.0), DenseInverseSearch()
-    return moving_solids(clip, lambda t: flow_of_pair(frames[t], frames[t + 1], estimator), (HEIGHT, WIDTH))
+    flow = SharedPairs(clip, lambda t: flow_of_pair(frames[t], frames[t + 1], estimator))
+    return moving_solids(clip, flow, (HEIGHT, WIDTH))
 
 
 def test_a_hand_that_swings_is_a_solid_and_the_room_is_none():
@@ -78,4 +79,21 @@ def test_water_that_deforms_as_it_sways_is_none():
 def test_a_clip_that_is_too_short_shows_none():
     frames = np.zeros((6, HEIGHT, WIDTH, 3), np.uint8)
     clip = VideoClip(frames, np.arange(6) / 25.0)
-    assert not moving_solids(clip, lambda t: (np.zeros((HEIGHT, WIDTH, 2)), np.ones((HEIGHT, WIDTH))), (90, 120)).any()
+    flow = SharedPairs(clip, lambda t: (np.zeros((HEIGHT, WIDTH, 2)), np.ones((HEIGHT, WIDTH))))
+    assert not moving_solids(clip, flow, (90, 120)).any()
+
+
+def test_pairs_that_the_evidence_has_read_are_not_read_again():
+    frames, read = np.zeros((40, 30, 40, 3), np.uint8), []
+
+    def flow(t: int) -> tuple[np.ndarray, np.ndarray]:
+        read.append(t)
+        return np.full((30, 40, 2), 0.1 * t), np.ones((30, 40))
+
+    clip = VideoClip(frames, np.arange(40) / 25.0)
+    shared = SharedPairs(clip, flow)
+    for t in range(39):
+        shared(t)
+    moving_solids(clip, shared, (30, 40))
+    assert read == list(range(39))
+    assert np.allclose(shared.step(20), 2.0, atol=1e-3)  # float16 of a px or two

@@ -11,7 +11,7 @@ from fluidlift.errors import InputRejected
 from fluidlift.messages import code_of
 from fluidlift.shape.colour_growth import colour_odds, grown_from_streams, with_quiet_water
 from fluidlift.shape.evidence import fluid_score, gather_evidence
-from fluidlift.shape.segment import Label, LabelWriter, doubts, overlay, segment
+from fluidlift.shape.segment import Label, LabelWriter, doubts, overlay, segment, sureness
 from fluidlift.types.clip import VideoClip
 from fluidlift.types.flow import PixelFlow
 
@@ -159,12 +159,38 @@ def test_a_leaf_that_sways_is_background_though_it_changes():
     pictures, flow = swaying(np.random.default_rng(8))
     evidence = gather_evidence(clip_of(pictures), flow)
     leaf = (slice(10, 25), slice(30, 110))
-    # by its activity alone the leaf would pass for fluid: it is the swaying that tells
-    assert float(np.median(fluid_score(replace(evidence, swaying=0.0 * evidence.swaying))[leaf])) > 0.0
+    # by its activity alone the leaf would pass for fluid: it is its motion that tells
+    alone = replace(evidence, swaying=0.0 * evidence.swaying, carried=0.0 * evidence.carried)
+    assert float(np.median(fluid_score(alone)[leaf])) > 0.0
     assert float(np.median(fluid_score(evidence)[leaf])) < 0.0
     labels = segment(clip_of(pictures), flow)
     assert labels.fluid[0][45:85, 10:60].mean() > 0.95
     assert labels.fluid[0][10:25, 30:110].mean() < 0.1
+
+
+def with_jug(rng: np.random.Generator) -> tuple[np.ndarray, PixelFlow]:
+    """The stream, and above it something of a fine pattern that swings by 12 px to either side."""
+    pictures, flow = stream(rng)
+    jug, area = texture(rng, (HEIGHT, WIDTH), sigma=2.5), (slice(5, 30), slice(20, 120))
+    where = 12.0 * np.sin(0.8 * np.arange(FRAMES))
+    for t in range(FRAMES):
+        moved = cv2.warpAffine(jug, np.float32([[1, 0, where[t]], [0, 1, 0]]), (WIDTH, HEIGHT))
+        pictures[t][area] = (np.array([50.0, 110.0, 40.0]) + 40.0 * moved[..., None])[area]
+    flow.displacement[:, area[0], area[1], 0] = np.diff(where)[:, None, None]
+    return pictures, flow
+
+
+def test_what_swings_far_is_carried_and_no_fluid():
+    pictures, flow = with_jug(np.random.default_rng(12))
+    evidence = gather_evidence(clip_of(pictures), flow)
+    jug, water = (slice(10, 25), slice(40, 100)), (slice(45, 85), slice(10, 60))
+    assert float(np.median(evidence.carried[jug])) > 0.5 > 0.1 > float(np.median(evidence.carried[water]))
+    assert float(np.median(fluid_score(replace(evidence, carried=0.0 * evidence.carried))[jug])) > 0.0
+    score = fluid_score(evidence)[jug]
+    assert -3.0 <= float(np.median(score)) < 0.0, "colours and edges still have their say"
+    fluid = segment(clip_of(pictures), flow).fluid[0]
+    assert fluid[water].mean() > 0.95
+    assert fluid[jug].mean() < 0.1
 
 
 def smoke(rng: np.random.Generator, *, frames: int = 24) -> tuple[np.ndarray, np.ndarray]:
@@ -186,6 +212,28 @@ def test_smoke_that_rises_is_outlined_in_every_frame():
     # a front of 40 px, known to the 1 px of smoothing in the pictures; the first frames are the smallest
     for t in (2, 12, 23):
         assert overlap(labels.fluid[t], truth[t]) > 0.85, t
+
+
+def test_a_leaf_that_sways_beside_smoke_is_no_smoke_in_any_frame():
+    rng = np.random.default_rng(9)
+    pictures, truth = smoke(rng)
+    flow, leaf = no_flow(24), texture(rng, (HEIGHT, WIDTH), sigma=2.5)
+    area, where = (slice(40, 80), slice(5, 40)), 2.0 * np.sin(1.3 * np.arange(24))
+    for t in range(24):
+        moved = cv2.warpAffine(leaf, np.float32([[1, 0, where[t]], [0, 1, 0]]), (WIDTH, HEIGHT))
+        pictures[t][area] = (np.array([150.0, 160.0, 150.0]) + 40.0 * moved[..., None])[area]
+    flow.displacement[:, area[0], area[1], 0] = np.diff(where)[:, None, None]
+    fluid = segment(clip_of(pictures), flow).fluid
+    assert fluid[:, 45:75, 10:35].mean() < 0.05
+    assert overlap(fluid[12], truth[12]) > 0.85
+
+
+def test_an_outline_is_the_surer_the_more_the_score_agrees_and_never_below_a_half():
+    score = np.array([[-12.0, -3.0, 0.0, 3.0, 12.0]])
+    inside, outside = sureness(np.ones_like(score, bool), score), sureness(np.zeros_like(score, bool), score)
+    assert (np.diff(inside) >= 0.0).all() and (np.diff(outside) <= 0.0).all()
+    assert inside[0, 0] == 0.0 and outside[0, 4] == 0.0  # a label that is likelier wrong is not sure at all
+    assert 0.9 < inside[0, 4] < 1.0 and 0.8 < outside[0, 0] < 1.0  # and none is beyond doubt
 
 
 def test_the_trembling_shadow_of_smoke_is_no_smoke():

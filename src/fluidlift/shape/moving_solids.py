@@ -65,28 +65,61 @@ class _Tracks:
         return np.linalg.norm(self.places[-1] - self.places[0], axis=-1)
 
 
-def moving_solids(clip: VideoClip, flow: PairReader, shape: tuple[int, int]) -> np.ndarray:
+class SharedPairs:
+    """Reads the flow of pairs, and keeps what `moving_solids` will ask for of those that others read before.
+
+    At most `WINDOWS` of `WINDOW` seconds of steps as float16, whatever the length of the clip.
+    """
+
+    def __init__(self, clip: VideoClip, flow: PairReader) -> None:
+        """Of a clip and the reader of its flow."""
+        frames, height, width = clip.frames.shape[:3]
+        self._flow, self._scale = flow, working_scale(height, width, longest=SIZE)
+        self._wanted = {t for start, length in _windows(frames, clip.interval) for t in range(start, start + length)}
+        self._kept: dict[int, np.ndarray] = {}
+
+    def __call__(self, t: int) -> tuple[np.ndarray, np.ndarray]:
+        """Displacement [H,W,2], px, and confidence [H,W] from frame t to t + 1."""
+        displacement, confidence = self._flow(t)
+        if t in self._wanted and t not in self._kept:
+            self._kept[t] = self._shrunk(displacement).astype(np.float16)
+        return displacement, confidence
+
+    def step(self, t: int) -> np.ndarray:
+        """float32 [h,w,2]: displacement from frame t to t + 1 at the size at which solids are looked for, px of it."""
+        kept = self._kept.get(t)
+        return self._shrunk(self._flow(t)[0]) if kept is None else kept.astype(np.float32)
+
+    def _shrunk(self, displacement: np.ndarray) -> np.ndarray:
+        return shrink(np.nan_to_num(np.asarray(displacement, np.float32)), self._scale) * np.float32(self._scale)
+
+
+def _windows(frames: int, interval: float) -> list[tuple[int, int]]:
+    """First frame and pairs of each window; none of a clip that is too short."""
+    length = max(round(WINDOW / interval), 2)
+    if frames - 1 < SEEN * length:
+        return []
+    return [(int(start), length) for start in np.unique(np.linspace(0, frames - 1 - length, WINDOWS).astype(int))]
+
+
+def moving_solids(clip: VideoClip, flow: SharedPairs, shape: tuple[int, int]) -> np.ndarray:
     """bool [h,w]: where solids move in at least `SEEN` of the windows.
 
     Args:
         clip: from a camera that stands or sways a little.
-        flow: displacement [H,W,2], px, and confidence from frame t to t + 1.
+        flow: of its pairs.
         shape: h, w of the result.
     """
     frames, height, width = clip.frames.shape[:3]
-    length = max(round(WINDOW / clip.interval), 2)
-    nowhere = np.zeros(shape, bool)
-    if frames - 1 < SEEN * length:
-        return nowhere
+    windows = _windows(frames, clip.interval)
+    if not windows:
+        return np.zeros(shape, bool)
     scale = working_scale(height, width, longest=SIZE)
     seen: np.ndarray | int = 0
     total, squares, count = np.float32(0), np.float32(0), 0
-    for start in np.unique(np.linspace(0, frames - 1 - length, WINDOWS).astype(int)):
+    for start, length in windows:
         grey = [_grey(clip.frames[t], scale) for t in range(start, start + length + 1)]
-        steps = [
-            shrink(np.nan_to_num(np.asarray(flow(t)[0], np.float32)), scale) * scale
-            for t in range(start, start + length)
-        ]
+        steps = [flow.step(t) for t in range(start, start + length)]
         seen = seen + _solids_of_window(grey, steps)
         total = total + sum(steps)
         squares = squares + sum((step**2).sum(axis=-1) for step in steps)

@@ -90,3 +90,9 @@ def test_wrong_input_is_rejected_in_one_line_and_leaves_nothing(args, tmp_path):
     assert run.stdout == ""
     assert run.stderr.startswith("fluidlift: ") and len(run.stderr.strip().splitlines()) == 1
     assert list(tmp_path.iterdir()) == []
+
+
+def test_reading_a_scene_without_bodies_loads_nothing_that_bodies_need():
+    code = f"import fluidlift.scene.edits, sys; print(*sorted(set(sys.modules) & {HEAVY!r}))"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert (run.returncode, run.stdout.strip()) == (0, ""), run.stderr

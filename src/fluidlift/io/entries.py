@@ -14,6 +14,9 @@ from fluidlift.io.yaml_reader import composed
 Path = tuple[Any, ...]
 """keys and indices from the top of the file"""
 
+TERRAIN_EDITS = ("move", "rotate", "scale", "twist", "mesh")
+"""what an entry of the section `terrain` may do"""
+
 
 def line_numbers(text: str) -> dict[Path, int]:
     """The line (from 1) on which each entry stands, by its path. Empty where the text is no valid YAML."""

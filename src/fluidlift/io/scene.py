@@ -7,7 +7,7 @@ import re
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import yaml
 
@@ -15,15 +15,15 @@ from fluidlift.errors import InputRejected
 from fluidlift.io.asset_paths import asset_file
 from fluidlift.io.entries import Entries, line_numbers
 from fluidlift.io.limits import require_file, require_size
-from fluidlift.io.obstacles import Obstacle, read_obstacles
-from fluidlift.io.scene_emitters import read_emitters, read_inflow
 from fluidlift.io.scene_look import Look, read_look
-from fluidlift.io.scene_terrain import read_terrain
 from fluidlift.io.yaml_reader import MAX_BYTES, parse_yaml
-from fluidlift.physics.emitter import Emitter
 from fluidlift.physics.inflow_schedule import InflowSchedule
-from fluidlift.physics.terrain_edit import TerrainEdit
 from fluidlift.types.parameter_table import PARAMETERS
+
+if TYPE_CHECKING:  # what bodies and meshes need is loaded where a scene has some: reading a text takes no second
+    from fluidlift.io.obstacles import Obstacle
+    from fluidlift.physics.emitter import Emitter
+    from fluidlift.physics.terrain_edit import TerrainEdit
 
 SCENE_TEMPLATE = """\
 # What to change when this fluid is simulated again. SI units, z up.
@@ -125,13 +125,45 @@ def edits_of(text: str, folder: Path | str, *, meshes: Path | None = None) -> Sc
         _parameters(scene.part("parameters", "parameters")),
         scene.number("duration", None, low=1e-6, high=1e9, unit="s") if scene.given("duration") else None,
         scene.number("extend_downstream", 0.0, low=0.0, high=1e6, unit="m"),
-        read_obstacles(scene, place),
-        read_emitters(scene, place),
-        read_terrain(scene, place),
-        read_inflow(scene),
+        _obstacles(scene, place),
+        _emitters(scene, place),
+        _terrain(scene, place),
+        _inflow(scene),
         read_look(scene, Path(folder)),
         scene.flag("loop", False),
     )
+
+
+def _obstacles(scene: Entries, meshes: Path) -> tuple[Obstacle, ...]:
+    if scene.data.get("obstacles") is None:
+        return ()
+    from fluidlift.io.obstacles import read_obstacles
+
+    return read_obstacles(scene, meshes)
+
+
+def _emitters(scene: Entries, meshes: Path) -> tuple[Emitter, ...]:
+    if scene.data.get("emitters") is None:
+        return ()
+    from fluidlift.io.scene_emitters import read_emitters
+
+    return read_emitters(scene, meshes)
+
+
+def _terrain(scene: Entries, meshes: Path) -> tuple[TerrainEdit, ...]:
+    if scene.data.get("terrain") is None:
+        return ()
+    from fluidlift.io.scene_terrain import read_terrain
+
+    return read_terrain(scene, meshes)
+
+
+def _inflow(scene: Entries) -> InflowSchedule:
+    if scene.data.get("inflow") is None:
+        return InflowSchedule()
+    from fluidlift.io.scene_emitters import read_inflow
+
+    return read_inflow(scene)
 
 
 def _parameters(changes: Entries) -> dict[str, Any]:

@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from fluidlift.errors import InputRejected
-from fluidlift.io.entries import nearest
+from fluidlift.io.entries import TERRAIN_EDITS, nearest
 from fluidlift.io.scene import NAMES, SECTIONS
-from fluidlift.io.scene_terrain import TERRAIN_EDITS
 from fluidlift.io.scene_text import Path
 
 LISTS = ("obstacles", "emitters", "terrain")

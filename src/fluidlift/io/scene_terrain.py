@@ -8,12 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from fluidlift.errors import InputRejected
-from fluidlift.io.entries import Entries, nearest
+from fluidlift.io.entries import TERRAIN_EDITS, Entries, nearest
 from fluidlift.io.obstacles import FAR, mesh_file, rotation_of, scale_of
 from fluidlift.physics.terrain_edit import Move, Replace, Rotate, Scale, TerrainEdit, Twist, solid_ground
 from fluidlift.types import TriangleMesh, matrix_from_quat, triple
 
-TERRAIN_EDITS = ("move", "rotate", "scale", "twist", "mesh")
 _OF_A_MESH = ("mesh", "position", "rotation", "scale", "flip")
 _MOST = 64
 

@@ -25,9 +25,30 @@ Modules of the face:
     surface_appearance  What the splats of a simulated fluid look like in each frame
 """
 
-from fluidlift.scene.build import Scene, SimulationRequest, edited_scene, scene_of
-from fluidlift.scene.edits import Add, Change, EditSession, Remove, Set
-from fluidlift.scene.simulator import simulator_of
+from importlib import import_module as _import_module
+from typing import TYPE_CHECKING as _TYPE_CHECKING
+from typing import Any as _Any
+
+if _TYPE_CHECKING:
+    from fluidlift.scene.build import Scene, SimulationRequest, edited_scene, scene_of
+    from fluidlift.scene.edits import Add, Change, EditSession, Remove, Set
+    from fluidlift.scene.simulator import simulator_of
+
+_FACE = {
+    "build": ("Scene", "SimulationRequest", "edited_scene", "scene_of"),
+    "edits": ("Add", "Change", "EditSession", "Remove", "Set"),
+    "simulator": ("simulator_of",),
+}
+"""names by module: each is imported when it is first used, since an edit of a text needs no simulator"""
+_HOMES = {name: module for module, names in _FACE.items() for name in names}
+
+
+def __getattr__(name: str) -> _Any:
+    """A name of the face, imported now."""
+    if name not in _HOMES:
+        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+    return getattr(_import_module(f"{__name__}.{_HOMES[name]}"), name)
+
 
 __all__ = [
     "Add", "Change", "EditSession", "Remove", "Scene", "Set", "SimulationRequest", "build", "coarse_copy",

@@ -17,7 +17,6 @@ from fluidlift.io.asset_folder import read_manifest, read_parameters, read_scene
 from fluidlift.io.asset_lock import editing
 from fluidlift.io.asset_paths import asset_file
 from fluidlift.io.scene import SCENE_TEMPLATE, SECTIONS, SceneEdits, edits_of, plain_scene, read_edits, scene_text
-from fluidlift.io.scene_domain import require_inside
 from fluidlift.io.scene_look import Look
 from fluidlift.io.scene_path import PLAIN, names_of
 from fluidlift.io.scene_text import with_value, without
@@ -304,8 +303,10 @@ class EditSession:
 
     def _inside(self, edits: SceneEdits) -> list[Notice]:
         """Warnings about what lies mostly outside the domain, which the terrain's edits may move elsewhere."""
-        if edits.terrain:
+        if edits.terrain or not (edits.obstacles or edits.emitters):
             return []
+        from fluidlift.io.scene_domain import require_inside  # with bodies, and with what those need
+
         manifest = read_manifest(self.folder)
         grid, clip = _grid_of(manifest), manifest["frame_count"] * manifest["frame_interval"]
         above = HIGHEST * float((grid.high - grid.low).max())

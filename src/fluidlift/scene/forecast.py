@@ -5,20 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.io.asset_folder import load_asset, read_parameters
 from fluidlift.io.asset_paths import asset_file
-from fluidlift.io.obstacles import Obstacle
 from fluidlift.io.scene import SceneEdits
 from fluidlift.messages import Notice
-from fluidlift.numerics.sampling import sample_nodes
-from fluidlift.scene.open_water import open_water
 from fluidlift.scene.reshaping import Asked, changed_parameters, slow_edits
 from fluidlift.types import FluidAsset, Grid, matrix_from_quat
+
+if TYPE_CHECKING:
+    from fluidlift.io.obstacles import Obstacle
 
 
 def outlook(folder: Path, manifest: dict[str, Any], edits: SceneEdits, grid: Grid) -> list[Notice]:
@@ -62,6 +62,9 @@ def _buried(folder: Path, edits: SceneEdits, grid: Grid) -> list[Notice]:
 
 
 def _depth_told(obstacle: Obstacle, asset: FluidAsset) -> str:
+    from fluidlift.numerics.sampling import sample_nodes
+    from fluidlift.scene.open_water import open_water
+
     terrain, grid = asset.terrain, asset.grid
     points = np.asarray(obstacle.mesh.vertices, np.float64) @ matrix_from_quat(obstacle.rotation).T + obstacle.position
 

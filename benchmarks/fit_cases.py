@@ -6,7 +6,7 @@
 
 Cases are folders with truth.npz (see `fluidlift.evaluate.case`), looked for in `cases` below --shared, FLUIDLIFT_SHARED
 or a folder `shared` beside the repository. The first table separates the fit from the estimate of motion: its targets
-are the true velocities on the case's own grid (coarsened by two --coarsen times), the layout and the free surface come
+are the true velocities on the case's own grid (coarsened by two --coarsen times), the layout comes
 from the level set, the solids from their meshes. Half way between (`--velocities surface`), only the true velocity of
 the free surface is given, and what is below it comes from `motion.volume` as it does in the pipeline. The second table
 reads parameters.json of assets made from the clips.
@@ -27,13 +27,12 @@ import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy import ndimage
 
 from fluidlift.evaluate.case import Case, read_case
-from fluidlift.fit.coarsen import coarse_grid, coarsen_cells, coarsen_distance, coarsen_terrain, coarsen_velocity
+from fluidlift.fit.coarsen import coarse_grid, coarsen_cells, coarsen_terrain, coarsen_velocity
 from fluidlift.fit.loss import surface_cells
 from fluidlift.fit.optimize import fit_parameters
 from fluidlift.motion.volume import volume_velocity
@@ -69,8 +68,6 @@ class Exact:
     terrain: Terrain
     targets: list[FaceVelocity]
     cell_types: list[np.ndarray]
-    distances: list[np.ndarray] | None
-    """m, of the cell centres to the liquid's surface"""
     mainstream: np.ndarray
     inflow: np.ndarray
     """[3] m/s, true mean velocity of the faces that the inlet prescribes"""
@@ -142,7 +139,7 @@ def to_faces(velocity: np.ndarray, known: np.ndarray) -> FaceVelocity:
 
 
 def exact_case(case: Case, keys: list[int], coarsen: int) -> Exact:
-    """Layouts, surfaces and velocities of some key frames."""
+    """Layouts and velocities of some key frames."""
     grid, centers = case.grid, case.grid.centers()
     phi = solid_distance(case, grid.spacing)
     nx, ny, nz = grid.shape
@@ -150,7 +147,7 @@ def exact_case(case: Case, keys: list[int], coarsen: int) -> Exact:
     solid = np.mean(corners, axis=0) < 0
     inlet, outlet = inlet_cells(case, centers), outlet_cells(case, centers)
     empty_mesh = TriangleMesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int64))
-    targets, layouts, distances = [], [], []
+    targets, layouts = [], []
     for key in keys:
         velocity = case.velocity[key].astype(float)
         occupied = case.occupied(key)
@@ -161,16 +158,14 @@ def exact_case(case: Case, keys: list[int], coarsen: int) -> Exact:
         known = (velocity != 0).any(axis=-1) if case.level_set is not None else np.ones(grid.shape, bool)
         targets.append(to_faces(velocity, known))
         layouts.append(types)
-        if case.level_set is not None:
-            distances.append(case.level_set[key].astype(np.float32) * np.float32(grid.spacing))
     mean = np.mean([case.velocity[k].astype(float)[case.occupied(k)].mean(axis=0) for k in keys], axis=0)
     mainstream = mean / np.linalg.norm(mean)
     terrain = Terrain(grid, phi.astype(np.float32), mainstream, empty_mesh)
     for _ in range(coarsen):
         targets, layouts = [coarsen_velocity(t) for t in targets], [coarsen_cells(c) for c in layouts]
-        distances, terrain, grid = [coarsen_distance(d) for d in distances], coarsen_terrain(terrain), coarse_grid(grid)
+        terrain, grid = coarsen_terrain(terrain), coarse_grid(grid)
     inflow = inlet_velocity(targets[0], layouts[0])
-    return Exact(grid, terrain, targets, layouts, distances or None, mainstream, inflow)
+    return Exact(grid, terrain, targets, layouts, mainstream, inflow)
 
 
 def inlet_velocity(target: FaceVelocity, types: np.ndarray) -> np.ndarray:
@@ -238,14 +233,11 @@ def fit_exact(case: Case, args: argparse.Namespace, key: int, noise: float, prio
     targets = noisy(targets, noise, args.seed) if noise else targets
     x, y, z = case.scene["gravity"] if prior == "known" else WRONG_GRAVITY
     initial = FluidParameters(kinematic_viscosity=WATER, gravity=(x, y, z), wall_damping=0.3, restitution=0.05)
-    options: dict[str, Any] = {}
-    if exact.distances is not None:
-        options["liquid_distance"] = exact.distances if args.surface == "known" else None
     began = time.perf_counter()
     result = fit_parameters(
         targets, exact.cell_types, exact.terrain, exact.grid, case.interval, initial, kind=kind,
         mainstream=exact.mainstream, prior_sigmas={"gravity": GRAVITY_PRIOR[prior]}, max_seconds=args.seconds,
-        frames_per_window=args.frames, **options,
+        frames_per_window=args.frames,
     )  # fmt: skip
     given = "surface of " if args.velocities == "surface" else ""
     error = f", {100 * noise:.0f} % noise" if noise else ""
@@ -361,7 +353,6 @@ def main() -> None:
     parser.add_argument("--gravity", nargs="*", choices=tuple(GRAVITY_PRIOR), default=list(GRAVITY_PRIOR))
     parser.add_argument("--velocities", choices=("volume", "surface"), default="volume", help="which are given")
     parser.add_argument("--frames", type=int, help="length of the window; default: as the fit chooses")
-    parser.add_argument("--surface", choices=("known", "cells"), default="known", help="level set, or cell types alone")
     parser.add_argument("--seconds", type=float, default=60.0, help="per fit")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--assets", type=Path, nargs="*", default=[], help="asset folders made from the cases' clips")

@@ -85,17 +85,3 @@ def coarsen_terrain(terrain: Terrain) -> Terrain:
     wide = np.pad(phi, [(0, (n - 1) % 2) for n in phi.shape], mode="edge")
     nodes = np.ascontiguousarray(wide[::2, ::2, ::2])
     return Terrain(coarse_grid(terrain.grid), nodes, terrain.mainstream, terrain.mesh)
-
-
-def coarsen_distance(distance: Float[np.ndarray, "nx ny nz"]) -> Float[np.ndarray, "mx my mz"]:
-    """Distance (m) of cell centres to the surface: the mean of each 2 x 2 x 2 block, exact for a plane.
-
-    Where a count is odd, the block's other half continues linearly.
-    """
-    wide = np.asarray(distance, float)
-    for axis, n in enumerate(distance.shape):
-        if n % 2:
-            last = np.take(wide, [n - 1], axis)
-            wide = np.concatenate([wide, 2 * last - np.take(wide, [max(n - 2, 0)], axis)], axis)
-    nx, ny, nz = (n // 2 for n in wide.shape)
-    return wide.reshape(nx, 2, ny, 2, nz, 2).mean(axis=(1, 3, 5)).astype(np.float32)

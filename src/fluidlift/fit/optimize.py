@@ -21,7 +21,6 @@ from fluidlift.errors import require
 from fluidlift.fit.coarsen import (
     coarse_grid,
     coarsen_cells,
-    coarsen_distance,
     coarsen_seen,
     coarsen_terrain,
     coarsen_velocity,
@@ -73,18 +72,16 @@ class _Data:
     kind: FluidKind
     mainstream: np.ndarray | None
     observed: Sequence[np.ndarray] | None
-    distances: Sequence[np.ndarray] | None
 
     def scene(self) -> FitScene:
         return build_scene(
             self.targets, self.layouts, self.solid, self.grid, kind=self.kind, mainstream=self.mainstream,
-            observed=self.observed, distances=self.distances,
+            observed=self.observed,
         )  # fmt: skip
 
     def coarser(self) -> _Data:
         """Cells twice as wide."""
         cells = {id(c): coarsen_cells(c) for c in self.layouts}
-        levels = None if self.distances is None else {id(d): coarsen_distance(d) for d in self.distances}
         targets, views = [coarsen_velocity(t) for t in self.targets], None
         if self.observed is not None:
             targets, views = map(list, zip(*(coarsen_seen(t, o) for t, o in zip(self.targets, self.observed))))
@@ -95,7 +92,6 @@ class _Data:
             solid=coarsen_terrain(self.solid) if isinstance(self.solid, Terrain) else None,
             grid=coarse_grid(self.grid),
             observed=views,
-            distances=None if levels is None or self.distances is None else [levels[id(d)] for d in self.distances],
         )
 
 
@@ -110,7 +106,6 @@ def fit_parameters(
     kind: str | FluidKind = STREAM,
     mainstream: np.ndarray | None = None,
     observed: Sequence[np.ndarray] | np.ndarray | None = None,
-    liquid_distance: Sequence[np.ndarray] | np.ndarray | None = None,
     restarts: int = 1,
     settings: FitOptions | None = None,
     progress: Progress | None = None,
@@ -130,8 +125,6 @@ def fit_parameters(
         mainstream: unit direction of the outflow; default: the terrain's, or the mean velocity.
         observed: bool [nx,ny,nz], one or one per target: cells whose velocity was seen; what the targets hold elsewhere
             does not matter. None: all.
-        liquid_distance: m [nx,ny,nz], one or one per target: distance of cell centres to the liquid's surface, negative
-            inside; None: estimated from the cell types.
         restarts: starts from this many initial scales; the best counts, `FitResult.ends` holds all.
         settings: everything else; `changes` are fields of it, replaced.
         progress: called with (done, total): per cent of the work used.
@@ -149,8 +142,8 @@ def fit_parameters(
     layouts = _each(cell_types, n, grid, "layouts")
     assert layouts is not None
     require(all(t.shape == grid.shape for t in targets), "targets of another shape than the grid", str(grid.shape))
-    views, levels = _each(observed, n, grid, "observed cells"), _each(liquid_distance, n, grid, "distances")
-    data = _Data(targets, layouts, system_or_terrain, grid, kind_of(kind), mainstream, views, levels)
+    views = _each(observed, n, grid, "observed cells")
+    data = _Data(targets, layouts, system_or_terrain, grid, kind_of(kind), mainstream, views)
     nothing = _no_flow(data)
     if nothing:
         return _failure(initial, nothing)

@@ -16,7 +16,6 @@ from fluidlift.numerics.poisson import PoissonSystem
 from fluidlift.physics.pressure import build_system
 from fluidlift.physics.rollout import flatten
 from fluidlift.physics.rollout_domain import RolloutDomain, prepare_domain
-from fluidlift.physics.rollout_surface import surface_cells
 from fluidlift.types import CellType, FaceVelocity, FluidKind, Grid, Terrain, kind_of
 
 LONGEST_WINDOW = 25
@@ -77,25 +76,6 @@ def gas_layout(cell_types: np.ndarray) -> np.ndarray:
     return np.where(cell_types == CellType.EMPTY, CellType.FLUID, cell_types).astype(np.uint8)
 
 
-def with_surface(
-    cell_types: Sequence[np.ndarray],
-    distances: Sequence[np.ndarray | None],
-    terrain: Terrain | None,
-    grid: Grid,
-) -> tuple[list[np.ndarray], list[np.ndarray | None]]:
-    """Layouts that agree with the surfaces that are known (`rollout_surface.surface_cells`), and their distances, m."""
-    found: dict[tuple[int, int], tuple[np.ndarray, np.ndarray | None]] = {}
-    for types, level in zip(cell_types, distances):
-        if (id(types), id(level)) not in found:
-            known = (types, None)
-            if level is not None:
-                openings = build_system(np.asarray(types), terrain, grid).openings
-                known = surface_cells(types, level, openings, grid.spacing)
-            found[id(types), id(level)] = known
-    pairs = [found[id(t), id(d)] for t, d in zip(cell_types, distances)]
-    return [t for t, _ in pairs], [d for _, d in pairs]
-
-
 def build_scene(
     targets: Sequence[FaceVelocity],
     cell_types: Sequence[np.ndarray],
@@ -105,17 +85,14 @@ def build_scene(
     kind: str | FluidKind,
     mainstream: np.ndarray | None = None,
     observed: Sequence[np.ndarray | None] | None = None,
-    distances: Sequence[np.ndarray | None] | None = None,
     sweeps: int = 5,
 ) -> FitScene:
-    """Layouts, operators and scales of the targets. Known surfaces (`distances`) decide which cells hold liquid.
+    """Layouts, operators and scales of the targets.
 
     Raises:
         ValueError: shapes that do not match, or targets at rest.
     """
     kind, views = kind_of(kind), [None] * len(targets) if observed is None else list(observed)
-    if distances is not None and not kind.is_gas and not isinstance(system_or_terrain, PoissonSystem):
-        cell_types, distances = with_surface(cell_types, distances, system_or_terrain, grid)
     centers = [np.asarray(t.at_centers(), float) for t in targets]
     fluid = [np.asarray(c) == CellType.FLUID for c in cell_types]
     fluid = [f if v is None else f & v for f, v in zip(fluid, views)]
@@ -130,13 +107,13 @@ def build_scene(
         mean = inside.mean(axis=0)
         mainstream = mean / max(float(np.linalg.norm(mean)), 1e-12)
     along = np.asarray(mainstream, float)
-    known: dict[tuple[bytes, int], RolloutDomain] = {}
-    domains, levels = [], [None] * len(targets) if distances is None else list(distances)
-    for types, level in zip(cell_types, levels):
+    known: dict[bytes, RolloutDomain] = {}
+    domains = []
+    for types in cell_types:
         types = np.ascontiguousarray(types, np.uint8)
-        key = (types.tobytes(), 0 if level is None else id(level))
+        key = types.tobytes()
         if key not in known:
-            known[key] = _layout(types, system_or_terrain, grid, kind, along, sweeps, level)
+            known[key] = _layout(types, system_or_terrain, grid, kind, along, sweeps)
         domains.append(known[key])
     seen = [seen_faces(d, np.asarray(c), v) for d, c, v in zip(domains, cell_types, views)]
     flat = [np.where(s, flatten(t, torch.float64).numpy(), 0.0) for t, s in zip(targets, seen)]
@@ -157,7 +134,6 @@ def _layout(
     kind: FluidKind,
     mainstream: np.ndarray,
     sweeps: int,
-    distance: np.ndarray | None,
 ) -> RolloutDomain:
     gas = kind.is_gas
     if isinstance(system_or_terrain, PoissonSystem):
@@ -166,7 +142,7 @@ def _layout(
         system = build_system(gas_layout(types) if gas else types, system_or_terrain, grid, open_border=gas)
     smoke = (types == CellType.FLUID).astype(float) if gas else None
     outlet = mainstream if (types == CellType.OUTFLOW).any() else None
-    return prepare_domain(types, system, mainstream=outlet, smoke=smoke, sweeps=sweeps, distance=distance)
+    return prepare_domain(types, system, mainstream=outlet, smoke=smoke, sweeps=sweeps)
 
 
 def plan_windows(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Shaped, UInt8
 from scipy import ndimage
 
 from fluidlift.errors import require
@@ -13,8 +13,8 @@ MOVING_PX = 0.1
 
 
 def resample_nearest(
-    maps: Float[np.ndarray, "*t h w"], size: tuple[int, int], axes: tuple[int, int] = (-2, -1)
-) -> Float[np.ndarray, "*t h2 w2"]:
+    maps: Shaped[np.ndarray, "..."], size: tuple[int, int], axes: tuple[int, int] = (-2, -1)
+) -> Shaped[np.ndarray, "..."]:
     """Maps on another pixel raster: each new pixel centre takes the old pixel that it lies in.
 
     Nothing is mixed across the edge of a mask. Displacements keep their old unit (scale them by new / old size).

@@ -134,7 +134,7 @@ def relative_l2(values: Float[np.ndarray, "n 3"], truth: Float[np.ndarray, "n 3"
     return float(np.linalg.norm(values - truth)) / norm if norm > 0 else None
 
 
-def field_cosine(values: Float[np.ndarray, "n 3"], truth: Float[np.ndarray, "n 3"]) -> float | None:
+def field_cosine(values: Float[np.ndarray, "*n 3"], truth: Float[np.ndarray, "*n 3"]) -> float | None:
     """Inner product of two fields over the product of their norms; 0 for a field at rest, None for a truth at rest."""
     a, b = float(np.linalg.norm(values)), float(np.linalg.norm(truth))
     if b == 0:

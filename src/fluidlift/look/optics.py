@@ -40,7 +40,7 @@ def fresnel(cos_incident: Float[np.ndarray, "*n"], refractive_index: float) -> F
 
 
 def refract(
-    directions: Float[np.ndarray, "*n 3"], normals: Float[np.ndarray, "*n 3"], ratio: float
+    directions: Float[np.ndarray, "*n 3"], normals: Float[np.ndarray, "*m 3"], ratio: float
 ) -> tuple[Float[np.ndarray, "*n 3"], Bool[np.ndarray, "*n"]]:
     """Directions of light behind a surface (Snell), and False where it is reflected in total.
 
@@ -77,8 +77,8 @@ def transmittance(
 
 
 def deep_color(
-    absorption: Float[np.ndarray, "3"] | tuple[float, float, float], scattering: float, refractive_index: float = 1.0
-) -> Float[np.ndarray, "3"]:
+    absorption: Float[np.ndarray, " c"] | tuple[float, float, float], scattering: float, refractive_index: float = 1.0
+) -> Float[np.ndarray, " c"]:
     """Linear colour, under white light, of a body so deep that nothing is seen behind it.
 
     Of light in a half space with isotropic scattering the share R = (1 - s)(1 - 0.139 s) / (1 + 1.17 s) returns, where
@@ -96,7 +96,7 @@ def deep_color(
     return (1 - inside) * returned / (1 - inside * returned)
 
 
-def scattering_share(color: Float[np.ndarray, "3"], refractive_index: float = 1.0) -> Float[np.ndarray, "3"]:
+def scattering_share(color: Float[np.ndarray, " c"], refractive_index: float = 1.0) -> Float[np.ndarray, " c"]:
     """scattering / (absorption + scattering) of a deep body of this linear colour (0 to 1): the inverse of
     `deep_color`."""
     c, inside = np.clip(np.asarray(color, float), 0.0, 1.0), held_inside(refractive_index)

@@ -215,7 +215,9 @@ def splat_roughness(roughness: float) -> float:
     return (roughness**4 + SPLAT_ROUGHNESS**4) ** 0.25
 
 
-def reflectance(cosine: Float[np.ndarray, "*n"], roughness: float, refractive_index: float) -> Float[np.ndarray, "*n"]:
+def reflectance(
+    cosine: Float[np.ndarray, "*n"] | float, roughness: float, refractive_index: float
+) -> Float[np.ndarray, "*n"]:
     """Share of an even light that a rough surface reflects: Schlick's Fresnel term, averaged over the GGX lobe.
 
     Args:
@@ -225,7 +227,7 @@ def reflectance(cosine: Float[np.ndarray, "*n"], roughness: float, refractive_in
     """
     normal, grazing = _schlick(refractive_index)
     scale, offset = environment_brdf(cosine, roughness)
-    return np.clip(normal * scale + grazing * offset, 0.0, 1.0)
+    return np.asarray(np.clip(normal * scale + grazing * offset, 0.0, 1.0))
 
 
 def _schlick(refractive_index: float) -> tuple[float, float]:
@@ -238,7 +240,7 @@ def _schlick(refractive_index: float) -> tuple[float, float]:
 
 
 def environment_brdf(
-    cosine: Float[np.ndarray, "*n"], roughness: float
+    cosine: Float[np.ndarray, "*n"] | float, roughness: float
 ) -> tuple[Float[np.ndarray, "*n"], Float[np.ndarray, "*n"]]:
     """(A, B) such that a GGX surface with reflectance F0 along its normal reflects F0 A + B of an even light.
 
@@ -248,7 +250,7 @@ def environment_brdf(
     table = _brdf_table(float(roughness))
     at = np.sqrt(np.clip(cosine, 0.0, 1.0))
     nodes = np.linspace(0.0, 1.0, len(table))
-    return np.interp(at, nodes, table[:, 0]), np.interp(at, nodes, table[:, 1])
+    return np.asarray(np.interp(at, nodes, table[:, 0])), np.asarray(np.interp(at, nodes, table[:, 1]))
 
 
 @lru_cache(maxsize=64)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from scipy import ndimage
 
 from fluidlift.errors import require
@@ -65,7 +65,7 @@ class SurfaceMap:
         velocity = np.stack([_mean(m, count, 1.5) for m in moved], axis=-1)
         return cls(low, pitch, wet, height, velocity)
 
-    def at(self, field: Float[np.ndarray, "nx ny ..."], places: Float[np.ndarray, "n 2"]) -> np.ndarray:
+    def at(self, field: Shaped[np.ndarray, "nx ny ..."], places: Float[np.ndarray, "n 2"]) -> np.ndarray:
         """A field of the map at some places (x, y in m), between its columns by their distance."""
         return sampled(field, (np.asarray(places, np.float64) - self.low) / self.pitch - 0.5)
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Num
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
@@ -75,10 +75,17 @@ class Patches:
     """shear so far, no unit"""
     presences: Float[np.ndarray, " m"]
     """0 to 1"""
-    instants: Float[np.ndarray, " m"]
+    instants: Num[np.ndarray, " m"]
     """of the footage that they show, frames"""
     ends: Float[np.ndarray, " m"]
     """instants at which they give way"""
+
+    def __post_init__(self) -> None:
+        m = len(self.turns)
+        shapes = [(self.centers, (m, 2)), (self.sources, (m, 2))]
+        shapes += [(a, (m,)) for a in (self.turns, self.strains, self.presences, self.instants, self.ends)]
+        for array, shape in shapes:
+            require(array.shape == shape, f"patches with arrays of another shape, {array.shape}", str(shape))
 
     @classmethod
     def none(cls) -> Patches:

@@ -107,7 +107,7 @@ def open_region(box: Box, walls: Walls, capacity: Float[np.ndarray, "nx ny nz"])
 
 def moved_to(
     values: Float[np.ndarray, "nx ny nz"], old: tuple[int, int, int], new: tuple[int, int, int], shape: tuple[int, ...]
-) -> Float[np.ndarray, "nx ny nz"]:
+) -> Float[np.ndarray, "mx my mz"]:
     """Cell values of the region that begins at `old`, on the region of `shape` that begins at `new`; 0 where new."""
     out = np.zeros(shape, values.dtype)
     source, target = [], []

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, Integer, UInt8
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
@@ -84,12 +84,12 @@ def inlet_to_surface(
 
 
 def inlet_along_rim(
-    cell_types: UInt8[np.ndarray, "nx ny nz"],
+    cell_types: Integer[np.ndarray, "nx ny nz"],
     positions: Float[np.ndarray, "n 3"],
     velocity: FaceVelocity,
     grid: Grid,
     gravity: Float[np.ndarray, "3"],
-) -> UInt8[np.ndarray, "nx ny nz"]:
+) -> Integer[np.ndarray, "nx ny nz"]:
     """The cells with an inlet that follows the rim of a falling body without gaps, from its highest to its lowest cell.
 
     An inlet drawn on the plan of a steep curtain misses cells of its rim, and below each gap the curtain runs dry as

@@ -9,7 +9,7 @@ its present one. Liquid that hangs over air (a fall that leaves the box) has p =
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, Num, UInt8
 from numba import njit
 from scipy import ndimage
 
@@ -72,7 +72,7 @@ def surface_heights(
 
 
 def outlet_heads(
-    levels: Float[np.ndarray, "nx ny"], start: Float[np.ndarray, "nx ny"], walls: Walls
+    levels: Num[np.ndarray, "nx ny"], start: Num[np.ndarray, "nx ny"], walls: Walls
 ) -> Float[np.ndarray, "nx ny nz"] | None:
     """Depth (m) of OUTFLOW cells below the water level, in columns that hold standing liquid now; else 0.
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float, Int
 from numba import njit, prange
 
 from fluidlift.numerics.mesh_distance import MeshDistance
@@ -143,7 +143,7 @@ def _distances(shapes, points, reach, out, owner):
 
 def distances(
     shapes: Shapes, points: Float[np.ndarray, "n 3"], reach: float
-) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, " n"]]:
     """Distance (m) of points to the nearest body, at most `reach`, and its number (-1: none within reach)."""
     out, owner = np.empty(len(points)), np.empty(len(points), np.int64)
     _distances(shapes, np.ascontiguousarray(points), float(reach), out, owner)

@@ -68,7 +68,7 @@ class RolloutLists:
     closed: Int[np.ndarray, " c"]
     """walls: faces whose velocity is 0"""
     outflow: Int[np.ndarray, " o"]
-    outlet: Int[np.ndarray, " o"]
+    outlet: Int[np.ndarray, " h"]
     """faces that a head pushes"""
     couplings: Float[np.ndarray, " f"]
     """neighbours that a dynamic face is coupled with by viscosity, walls ahead and behind included"""

@@ -378,12 +378,17 @@ class Dressing:
             levels = np.array(state["skin.levels"], np.int64)
         except (KeyError, TypeError, ValueError) as error:
             raise InputRejected(f"the state of a surface that does not fit: {error}") from None
-        n = len(patches.turns)
-        shapes = [(patches.centers, (n, 2)), (patches.sources, (n, 2)), (places, (len(ids), 2)), (levels, ids.shape)]
-        shapes += [(a, (n,)) for a in (patches.turns, patches.strains, patches.presences, patches.instants)]
-        shapes += [(np.nan_to_num(patches.ends, posinf=0.0), (n,))]  # without footage they do not end
-        for array, shape in shapes:
-            if array.shape != shape or not np.isfinite(array).all():
-                raise InputRejected("the state of a surface with arrays of another shape, or not finite", "a whole one")
+        numbers = [
+            patches.centers,
+            patches.sources,
+            patches.turns,
+            patches.strains,
+            patches.presences,
+            patches.instants,
+        ]
+        numbers += [places, levels, np.nan_to_num(patches.ends, posinf=0.0)]  # without footage they do not end
+        fits = places.shape == (len(ids), 2) and levels.shape == ids.shape
+        if not fits or not all(np.isfinite(array).all() for array in numbers):
+            raise InputRejected("the state of a surface with arrays of another shape, or not finite", "a whole one")
         self._patches.state = patches
         self._skin.places, self._skin.ids, self._skin.levels, self._skin.next_id = places, ids, levels, next_id

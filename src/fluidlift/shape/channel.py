@@ -186,7 +186,7 @@ def _fill_channel(grid, plan, ground: _Ground, reach, seen: Footage, kind) -> Se
     return Setting(terrain, cells, plan.level, bed)
 
 
-def _kept_dry(grid: Grid, plan: Plan, dry: Bool[np.ndarray, "nx ny"]) -> Float[np.ndarray, "nx ny nz"]:
+def _kept_dry(grid: Grid, plan: Plan, dry: Bool[np.ndarray, "nx ny"]) -> Float[np.ndarray, "nx+1 ny+1 nz+1"]:
     """Signed distance (m, on the nodes) to ground that stands above the water wherever the clip stays dry.
 
     A bank of cells slopes; water that swells by half a cell runs up it by one, which is seven pixels of a clip. That

@@ -13,6 +13,7 @@ from scipy.sparse.linalg import splu
 from fluidlift.errors import require
 from fluidlift.shape.background import weight_of_unseen
 from fluidlift.types import SH_C0, CellType, Gaussians, PinholeCamera, Setting, decompose_covariances, sh_from_rgb
+from fluidlift.types.fluid_masks import FluidMasks
 
 COARSE = 256
 """px on the longer side of the picture in which a hole is filled, at most"""
@@ -35,7 +36,7 @@ class BackgroundPlate:
 
 def background_plate(
     frames: UInt8[np.ndarray, "t h w 3"],
-    fluid: Bool[np.ndarray, "t h w"],
+    fluid: Bool[np.ndarray, "t h w"] | FluidMasks,
     solid: Bool[np.ndarray, "h w"] | None = None,
 ) -> BackgroundPlate:
     """Median of the frames where they show no fluid; the rest inpainted from the ground around it.

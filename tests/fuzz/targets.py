@@ -81,9 +81,9 @@ def _values(folder: Path) -> None:
 
 
 def _shots(folder: Path) -> None:
-    from fluidlift.cli.batch import Batch, _shots
+    from fluidlift.cli.batch import Batch, shots_of
 
-    _shots(Batch((folder / "shots.yaml",), folder / "out"))
+    shots_of(Batch((folder / "shots.yaml",), folder / "out"))
 
 
 def _settings(folder: Path) -> None:

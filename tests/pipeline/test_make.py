@@ -314,7 +314,7 @@ def test_an_interrupt_in_a_fresh_folder_keeps_what_was_done(stream_clip, tmp_pat
 
     folder = tmp_path / "x.fluid"
     with monkeypatch.context() as patch:
-        patch.setattr(geometry, "_seen", stop)
+        patch.setattr(geometry, "sighted", stop)
         assert main(["make", str(stream_clip), "-o", str(folder), *hasty]) == FAILED
     assert [name for name in STAGES if any((folder / "work" / name).glob("*.json"))] == ["read", "flow", "segment"]
     assert main(["validate", str(folder)]) == REJECTED  # half an asset is none

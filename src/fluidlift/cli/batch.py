@@ -7,13 +7,16 @@ import sys
 from collections.abc import Callable
 from dataclasses import field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
 from fluidlift.cli.options import MOVED, Make, options_of
 from fluidlift.cli.quantities import Bytes, Seconds, command
 from fluidlift.errors import InputRejected
+
+if TYPE_CHECKING:
+    from fluidlift.farm.shots import Shot
 
 _OURS = ("clip", "out", "json", "print_config", "warnings_ok")
 """options of make that the batch itself gives"""
@@ -67,7 +70,7 @@ def run(wanted: Batch) -> int:
     Raises:
         InputRejected: a list that cannot be used, two shots of one name, no clips; nothing was made.
     """
-    from fluidlift.farm.shots import ShotOptions, read_shots, shard_of
+    from fluidlift.farm.shots import shard_of
 
     if wanted.status:
         return _status(wanted)
@@ -77,16 +80,23 @@ def run(wanted: Batch) -> int:
         raise InputRejected("--csv or --html without --status", "fluidlift batch FOLDER --status --html")
     if wanted.jobs < 1:
         raise InputRejected(f"--jobs {wanted.jobs}", "a whole number of 1 or more")
-    base: dict[str, Any] = {"preset": wanted.preset, "config": wanted.config and wanted.config.absolute()}
-    kinds = options_of(Make) | dict.fromkeys(MOVED, "")
-    shots = read_shots(
-        wanted.clips, ShotOptions({k: v for k, v in kinds.items() if k not in _OURS}),
-        base={k: v for k, v in base.items() if v is not None}, settings=wanted.set,
-    )  # fmt: skip
+    shots = shots_of(wanted)
     return _plan(wanted, len(shots)) if wanted.plan else _make(wanted, wanted.out, shard_of(shots, wanted.shard))
 
 
-def _make(wanted: Batch, out: Path, shots: list) -> int:
+def shots_of(wanted: Batch) -> list[Shot]:
+    """All that the command names, in its order; raises as `run`."""
+    from fluidlift.farm.shots import ShotOptions, read_shots
+
+    base: dict[str, Any] = {"preset": wanted.preset, "config": wanted.config and wanted.config.absolute()}
+    kinds = options_of(Make) | dict.fromkeys(MOVED, "")
+    return read_shots(
+        wanted.clips, ShotOptions({k: v for k, v in kinds.items() if k not in _OURS}),
+        base={k: v for k, v in base.items() if v is not None}, settings=wanted.set,
+    )  # fmt: skip
+
+
+def _make(wanted: Batch, out: Path, shots: list[Shot]) -> int:
     from fluidlift.farm.engine import Limits, make_shots
     from fluidlift.farm.summary import SUMMARY, summarise
     from fluidlift.io.atomic import require_writable

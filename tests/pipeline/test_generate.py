@@ -99,7 +99,7 @@ def stops_at_the_geometry(monkeypatch):
     def stop(*inputs):
         raise FluidliftError("no further")
 
-    monkeypatch.setattr(stage, "_seen", stop)
+    monkeypatch.setattr(stage, "sighted", stop)
 
 
 def test_after_every_failure_the_same_command_goes_on_from_the_last_finished_frame(

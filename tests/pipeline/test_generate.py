@@ -96,7 +96,7 @@ def test_the_bodies_of_a_generator_take_the_place_of_the_embedded_one(run, tmp_p
 def stops_at_the_geometry(monkeypatch):
     """What comes after the generator is not what is looked at."""
 
-    def stop(*inputs):
+    def stop(*inputs, **beside):
         raise FluidliftError("no further")
 
     monkeypatch.setattr(stage, "sighted", stop)

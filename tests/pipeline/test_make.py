@@ -309,7 +309,7 @@ def test_an_interrupted_job_goes_on_where_it_stopped(made, copy, quick, capsys, 
 
 
 def test_an_interrupt_in_a_fresh_folder_keeps_what_was_done(stream_clip, tmp_path, hasty, monkeypatch, capsys):
-    def stop(*inputs):
+    def stop(*inputs, **beside):
         raise KeyboardInterrupt
 
     folder = tmp_path / "x.fluid"

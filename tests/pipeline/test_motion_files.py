@@ -107,18 +107,13 @@ def test_flo_files_are_read_by_opencv_and_mark_what_is_no_fluid(demo, measured, 
 
 @pytest.mark.parametrize("kind", ["exr", "npz"])
 def test_its_own_raw_flow_given_back_gives_the_same_motion(demo, measured, tmp_path, kind):
-    """But for the rim of the mask, which our own flow finds on pictures of half the size."""
     source = measured
     if kind == "npz":
         source = measure(demo, tmp_path / "npz", "--raw", "--format", "npz")
     again = measure(demo, tmp_path / "again", "--flow", str(source / "raw_flow"))
     for number in range(1001, 1001 + PAIRS):
-        masks = [read_picture(folder / "mask" / f"{number}.png") == 255 for folder in (again, measured)]
-        both = masks[0] & masks[1]
-        assert both.sum() > 0.97 * (masks[0] | masks[1]).sum()
-        apart = np.abs(flow_of(again, number)[..., :2] - flow_of(measured, number)[..., :2])[both]
-        assert np.median(apart) < 0.01, "px"
-    assert (again / "velocity" / "1002.vdb").stat().st_size > 0
+        np.testing.assert_array_equal(flow_of(again, number), flow_of(measured, number))
+    assert (again / "velocity" / "1002.vdb").stat().st_size == (measured / "velocity" / "1002.vdb").stat().st_size
 
 
 def test_flow_of_the_whole_file_is_selected_by_the_start(demo, tmp_path):

@@ -1,6 +1,7 @@
 """The studio as a person uses it, in a real browser: drop, look, draw, drag, undo, make, shelf."""
 
 import time
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -215,7 +216,7 @@ def test_make_can_be_stopped_goes_on_and_lies_on_the_shelf(visit):
     visit.until(lambda: (desk.folder / "stream-copy.fluid").is_dir(), "what was restored")
 
 
-@pytest.mark.skipif(not pytest.importorskip("viser"), reason="viser is not installed")
+@pytest.mark.skipif(find_spec("viser") is None, reason="viser is not installed")
 def test_the_result_opens_in_the_viewer(visit):
     visit.tab("Shelf")
     with visit.page.expect_popup() as opened:

@@ -103,14 +103,12 @@ def _require_hints(config: SegmentSettings, hints: Hints) -> None:
 
 
 def _flow_for_masks(clip: VideoClip, flow: Flow) -> PixelFlow | PairReader:
-    """Flow of single pairs as they are, where ours is blind to what stands still: to a mask, rest is a finding.
-
-    To half of the picture's resolution, for masks are found on a smaller one."""
+    """Flow of single pairs as they are, where ours is blind to what stands still: to a mask, rest is a finding."""
     from fluidlift.motion.optical_flow import DenseInverseSearch, flow_of_pair
 
     if flow.method != "multiframe":
         return flow.flow
-    frames, estimator = clip.frames, DenseInverseSearch(finest=1)
+    frames, estimator = clip.frames, DenseInverseSearch()
     return lambda t: flow_of_pair(frames[t], frames[t + 1], estimator)
 
 

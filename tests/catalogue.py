@@ -208,8 +208,6 @@ def digests(folder: Path) -> dict[str, str]:
             del manifest["metrics"]["stages"], manifest["metrics"]["peak_memory_mb"]
             manifest["metrics"].get("fit_extra", {}).pop("seconds", None)
             manifest["hashes"].pop("report.html", None)
-            for part in (manifest, manifest["simulation"]):
-                part.pop("warning_codes", None)
             data = json.dumps(manifest, sort_keys=True).encode()
         name = str(path.parent if path.parts[0] == "frames" else path)
         found.setdefault(name, hashlib.sha256()).update(path.name.encode() + b"\0" + data)

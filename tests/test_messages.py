@@ -48,3 +48,9 @@ def test_codes_of_a_file_count_only_where_there_is_one_for_each_text():
         back = from_plain({"warnings": ["a", "b"], "warning_codes": codes})
         assert back == ["a", "b"] and [code_of(w) for w in back] == ["", ""]
     assert from_plain({}) == from_plain({"warnings": "text"}) == []
+
+
+def test_texts_for_files_are_plain():
+    """A subclass of str is nothing that YAML knows."""
+    (text,) = as_plain([Notice("dry", "no water")])["warnings"]
+    assert type(text) is str and text == "no water"

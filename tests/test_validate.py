@@ -249,7 +249,9 @@ def test_faults_of_the_usd_file_are_told(folder):
     stage.GetRootLayer().Save()
     assert "at 1002: opacities outside 0 to 1" in failed(folder)["USD"].detail
     update_manifest(folder, simulation={"frames": COUNT + 1})
-    assert "4 frames in the file, 5 in the manifest" in failed(folder)["USD shows the frames"].detail
+    assert "4 frames in the file, 5 in the manifest" in failed(folder)["USD shows its frames"].detail
+    update_manifest(folder, simulation={"frames": COUNT, "usd_frames": 1})
+    assert "4 frames in the file, 1 in the manifest" in failed(folder)["USD shows its frames"].detail
     (folder / "asset.usdc").unlink()
     assert "asset.usdc" in failed(folder)["USD"].detail
     (folder / "asset.usda").write_text("nothing")

@@ -43,9 +43,9 @@ def code_of(warning: str) -> str:
 
 
 def as_plain(warnings: Iterable[str]) -> dict[str, list[str]]:
-    """Texts, and as many codes beside them, as JSON holds both."""
+    """Texts, and as many codes beside them, as JSON and YAML hold both."""
     told = list(warnings)
-    return {"warnings": told, "warning_codes": [code_of(w) for w in told]}
+    return {"warnings": [str(w) for w in told], "warning_codes": [code_of(w) for w in told]}
 
 
 def from_plain(data: Mapping[str, Any]) -> list[Notice]:

@@ -252,9 +252,9 @@ def _usd(folder: Path, manifest: dict[str, Any]) -> Iterator[Finding]:
     told = manifest.get("simulation", {}).get("frames")
     if told is not None:
         first, last = frame_range(path)
-        count = last - first + 1  # the first alone, or all
-        wrong = "" if count in (1, told) else f"{count} frames in the file, {told} in the manifest"
-        yield _found("USD shows the frames", wrong, _SIM, f"{first} to {last}")
+        count, told = last - first + 1, manifest["simulation"].get("usd_frames", told)
+        wrong = "" if count == told else f"{count} frames in the file, {told} in the manifest"
+        yield _found("USD shows its frames", wrong, _SIM, f"{first} to {last}")
 
 
 def _preview(folder: Path, manifest: dict[str, Any]) -> Finding:

@@ -187,6 +187,7 @@ def test_the_scene_description_shows_the_first_frame(made):
 
     stage = Usd.Stage.Open(str(made.folder / "asset.usda"))
     assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (1001, 1001)
+    assert read_manifest(made.folder)["simulation"]["usd_frames"] == 1
     assert stage.GetTimeCodesPerSecond() == pytest.approx(25.0)
     assert UsdGeom.GetStageUpAxis(stage) == "Z"
     assert UsdGeom.GetStageMetersPerUnit(stage) == pytest.approx(1.0)

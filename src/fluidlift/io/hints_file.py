@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import yaml
 
@@ -15,7 +15,7 @@ from fluidlift.errors import InputRejected
 from fluidlift.io.atomic import plain, write_bytes
 from fluidlift.io.sequences import is_sequence, list_sequence
 from fluidlift.io.yaml_reader import read_yaml
-from fluidlift.types.hints import Click, ClipHints, ClipIdentity, Point, Region, Rim, Ruler
+from fluidlift.types.hints import Click, ClipHints, ClipIdentity, Point, Region, Rim, Ruler, What
 from fluidlift.types.kind import KINDS
 
 VERSION = 1
@@ -345,7 +345,7 @@ def _region(e: _Entry) -> Region:
     for p in line:
         x, y = e.numbers(e.place, p, 2)
         points.append((x, y))
-    return Region(what, tuple(points), width, time or 0.0, bool(moves))  # type: ignore[arg-type]
+    return Region(cast(What, what), tuple(points), width, time or 0.0, bool(moves))
 
 
 def _click(e: _Entry) -> Click:

@@ -38,10 +38,9 @@ class DenseInverseSearch(FlowEstimator):
     denser patches (about 10 % less end-point error on simulated rivers and honey).
     """
 
-    def __init__(self, *, finest: int = 0) -> None:
-        """Down to the picture halved `finest` times; each costs a third to a quarter of the next finer one."""
+    def __init__(self) -> None:
         self._algorithm = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-        self._algorithm.setFinestScale(finest)
+        self._algorithm.setFinestScale(0)
         self._algorithm.setPatchStride(3)
 
     def displacement(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:

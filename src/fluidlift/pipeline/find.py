@@ -15,6 +15,7 @@ from fluidlift.config import JobConfig
 from fluidlift.io.atomic import disk_errors
 from fluidlift.io.hints_file import content_hash
 from fluidlift.io.video import probe
+from fluidlift.messages import Notice, as_plain
 from fluidlift.pipeline import begin
 from fluidlift.pipeline.inputs import GivenFiles, Inputs
 from fluidlift.pipeline.runner import Runner
@@ -57,7 +58,7 @@ class View:
     """px per frame"""
     mean_confidence: Float[np.ndarray, "h w"]
     rest_frame: int
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
 
 
 def view(
@@ -84,7 +85,7 @@ class Found:
     read: Read
     segmentation: Segmentation
     view: View
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
 
     def facts(self) -> dict[str, Any]:
         """Plain data for the section `found` of a hints file, in px of the clip's own picture."""
@@ -116,8 +117,7 @@ class Found:
                 {"is": "fluid", "area": [_px(p, k) for p in line], "time": round(float(self.read.clip.times[frame]), 4)}
                 for line in outlines(np.asarray(self.segmentation.labels.labels[frame]) == Label.FLUID)
             ],
-            "warnings": list(self.warnings),
-        }
+        } | as_plain(self.warnings)
 
     def _typical(self) -> np.ndarray:
         frames = self.read.clip.frames

@@ -37,8 +37,11 @@ class Hints:
     @classmethod
     def drawn(cls, hints: ClipHints) -> Hints:
         """Those of a hints file, in px of the working picture (`ClipHints.at`)."""
-        box = None if hints.roi is None else tuple(round(v) for v in hints.roi)
-        return cls(box, tuple((*c.at, c.fluid) for c in hints.clicks))  # type: ignore[arg-type]
+        points = tuple((c.at[0], c.at[1], c.fluid) for c in hints.clicks)
+        if hints.roi is None:
+            return cls(None, points)
+        x, y, width, height = hints.roi
+        return cls((round(x), round(y), round(width), round(height)), points)
 
     def clicks(self) -> list[tuple[float, float, int]]:
         """The points as `shape.segment` takes them."""

@@ -213,6 +213,7 @@ def _finish(
             "look": played.look,
             "loop": played.loop,
             "parts": scene.parts,
+            "usd_frames": config.show.usd * (done.frames if config.show.usd_frames else 1),
             "as_filmed": shown.as_filmed,
         }
         | as_plain(own),

@@ -14,6 +14,7 @@ import webbrowser
 from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
 from importlib import resources
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -108,12 +109,8 @@ def studio(place: Path, request: StudioRequest | None = None, *, told: Callable[
 
 
 def _require_packages() -> None:
-    try:
-        import starlette
-        import uvicorn  # noqa: F401
-    except ImportError:
-        raise MissingPackage("The studio needs starlette and uvicorn: pip install 'fluidlift[studio]'") from None
-    del starlette
+    if find_spec("starlette") is None or find_spec("uvicorn") is None:
+        raise MissingPackage("The studio needs starlette and uvicorn: pip install 'fluidlift[studio]'")
 
 
 def app_of(desk: Desk, secret: str) -> Any:

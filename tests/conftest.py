@@ -22,7 +22,10 @@ HASTY = (
 """for tests that only ask what is said on the way"""
 
 FOREIGN = {"backends", "blender"}
-"""folders whose tests run a large package of others; tests that ask for `visitor` run a browser"""
+"""folders whose tests run a large package of others"""
+
+BROWSER = {"browser", "visitor"}
+"""fixtures that run a browser"""
 
 ASSET = {"made", "catalogue_asset", "finished", "finished_tank", "tank_folder"}
 """fixtures that make an asset, which takes seconds"""
@@ -52,7 +55,7 @@ def tier_of(item: pytest.Item, slow: set[str]) -> str:
     fixtures = set(item.fixturenames)
     if room == "test_whole_asset.py":
         return "whole"
-    if room in FOREIGN or "visitor" in fixtures:
+    if room in FOREIGN or BROWSER & fixtures:
         return "foreign"
     if room == "fuzz":
         return "ladder"

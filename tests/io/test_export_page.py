@@ -118,16 +118,24 @@ def test_a_page_with_another_number_of_frames_is_not_left_behind(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def browser():
-    """A headless Chromium that draws on the CPU."""
-    chromium = shutil.which("chromium")
+def chromium():
+    """Headless; draws on the CPU."""
+    program = shutil.which("chromium")
     playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright")
-    if chromium is None:
+    if program is None:
         pytest.skip("needs chromium (Debian: apt install chromium)")
     with playwright.sync_playwright() as p:
-        found = p.chromium.launch(executable_path=chromium, args=FLAGS)
+        found = p.chromium.launch(executable_path=program, args=FLAGS)
         yield found
         found.close()
+
+
+@pytest.fixture
+def browser(chromium):
+    """A window of its own, which closes with the test: a page that stays open draws on, on the processor."""
+    window = chromium.new_context(viewport={"width": CAMERA.size[0], "height": CAMERA.size[1]})
+    yield window
+    window.close()
 
 
 class Visit:
@@ -135,7 +143,7 @@ class Visit:
 
     def __init__(self, browser, path: Path, script: str = "") -> None:
         self.said: list[str] = []
-        self.page = browser.new_page(viewport={"width": CAMERA.size[0], "height": CAMERA.size[1]})
+        self.page = browser.new_page()
         if script:
             self.page.add_init_script(script)
         self.page.on("console", lambda m: self.said.append(m.text))

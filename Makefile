@@ -1,7 +1,7 @@
 # Works on a fresh machine with make and Python 3.11 or newer:
 #   make demo    make an asset from the clip that comes with the package
-#   make test    the checks of a newcomer: lint, types, import contracts, unit tests, one whole asset
-#   make check   every test: assets, packages of others and physics at full resolution as well
+#   make test    the checks of a newcomer: lint, import contracts, unit tests, one whole asset
+#   make check   types, and every test: assets, packages of others and physics at full resolution as well
 # Another interpreter: make demo PYTHON=python3.12; tests in another number of processes: make test WORKERS=4
 
 PYTHON ?= python3
@@ -15,8 +15,8 @@ PIP := $(BIN)/python -m pip install --disable-pip-version-check -c constraints.t
 
 help:
 	@echo "make demo    make an asset from the clip that comes with the package, in $(OUT)"
-	@echo "make test    lint, types, import contracts, unit tests, one whole asset"
-	@echo "make check   the first three and all tests"
+	@echo "make test    lint, import contracts, unit tests, one whole asset"
+	@echo "make check   lint, import contracts, types and all tests"
 	@echo "make lint    lint, types and import contracts only"
 	@echo "make format  let ruff put the source in order"
 	@echo "make clean   remove the environment, caches and the demo asset"
@@ -28,11 +28,9 @@ demo: $(VENV)/.core
 
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
-# Types are checked beside the tests: the checker takes a minute of one core, which lies idle while others end.
+# Without types: the checker takes two minutes of processor time.
 test: style compiled
-	@$(BIN)/pyright >$(VENV)/pyright.log 2>&1 & types=$$!; code=0; \
-	$(PYTEST) -m "unit or whole" || code=$$?; \
-	wait $$types || code=$$?; tail -n 20 $(VENV)/pyright.log; exit $$code
+	$(PYTEST) -m "unit or whole"
 
 check: lint compiled
 	$(PYTEST)

@@ -39,14 +39,18 @@ DURATIONS = Path(__file__).with_name("durations.json")
 """s of each test that took over a second, and of whole files whose shared fixtures did, on a warm machine with two
 cores; written by `pytest --record-durations`"""
 
-SLOW = 2.0
-"""s; what takes longer is no unit test: the tests of a newcomer are 2000, and end within five minutes"""
+SLOW = 1.5
+"""s; what takes longer is no unit test: the tests of a newcomer are 4500, and end within five minutes"""
+
+
+def recorded() -> dict[str, float]:
+    """What tests, and files, took when it was written down, s."""
+    return json.loads(DURATIONS.read_text(encoding="utf-8")) if DURATIONS.is_file() else {}
 
 
 def slow_tests() -> set[str]:
     """Tests, and files, that took longer than a unit test may."""
-    recorded = json.loads(DURATIONS.read_text(encoding="utf-8")) if DURATIONS.is_file() else {}
-    return {name for name, seconds in recorded.items() if seconds > SLOW}
+    return {name for name, seconds in recorded().items() if seconds > SLOW}
 
 
 def tier_of(item: pytest.Item, slow: set[str]) -> str:
@@ -104,8 +108,9 @@ class Stopwatch:
     def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
         """Unit tests that took too long, or the file of durations."""
         if self.record:
-            long = {name: round(s, 1) for name, s in sorted(self.seconds.items()) if s > 1.0}
-            DURATIONS.write_text(json.dumps(long, indent=1) + "\n", encoding="utf-8")
+            long = {name: round(s, 1) for name, s in self.seconds.items() if s > 1.0}
+            kept = {name: s for name, s in recorded().items() if name not in self.seconds}
+            DURATIONS.write_text(json.dumps(dict(sorted({**kept, **long}.items())), indent=1) + "\n", encoding="utf-8")
         elif self.slow_units:
             terminalreporter.section(f"unit tests that took over {SLOW:g} s here")
             for name in sorted(self.slow_units):

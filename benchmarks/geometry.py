@@ -51,7 +51,7 @@ from fluidlift.pipeline.stages.refine import refine
 from fluidlift.pipeline.work import Work
 from fluidlift.seams import Silence
 from fluidlift.shape.airborne import inside_body
-from fluidlift.shape.place import pose_up
+from fluidlift.shape.registration import pose_up
 from fluidlift.shape.surface import inflated_surface, level_surface
 from fluidlift.types import (
     CellType,

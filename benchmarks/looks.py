@@ -28,7 +28,7 @@ from fluidlift.evaluate.images import psnr, ssim
 from fluidlift.io.asset_folder import load_asset, read_manifest
 from fluidlift.io.scene_look import Look
 from fluidlift.look.materials import PRESETS
-from fluidlift.look.open_end import OpenEnd
+from fluidlift.look.outlet_section import OpenEnd
 from fluidlift.look.pictures import caption
 from fluidlift.look.rasterize import render
 from fluidlift.look.scenery import orbit_camera, side_camera, terrain_surfels

@@ -110,7 +110,7 @@ def _prepare(subject: Subject, folder: Path) -> None:
     scratch = folder / "scratch"
     scratch.mkdir(exist_ok=True)
     found = read(GivenFile(subject.video, ""), None, READING, work=Work.alone(scratch))
-    frames, estimator = np.array(found.clip.frames), DenseInverseSearch(finest=1)
+    frames, estimator = np.array(found.clip.frames), DenseInverseSearch()
     displacement = np.empty((len(frames) - 1, *frames.shape[1:3], 2), np.float16)
     confidence = np.empty(displacement.shape[:3], np.float16)
     for t in range(len(displacement)):

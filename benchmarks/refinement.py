@@ -37,12 +37,12 @@ from fluidlift.evaluate.score import score_depth
 from fluidlift.evaluate.space import align
 from fluidlift.look.rasterize import render
 from fluidlift.shape.fill import fill
-from fluidlift.shape.follow import follow
 from fluidlift.shape.generate import beneath_front, bounded_colours, front_gaussians, picture_colours
 from fluidlift.shape.losses import LossWeights
 from fluidlift.shape.prune import prune
 from fluidlift.shape.refine import refine
 from fluidlift.shape.unite import unite, window_length
+from fluidlift.shape.warm_start import follow
 from fluidlift.types import Gaussians, PinholeCamera, concatenate
 
 BEGIN, END = "<!-- refinement:begin -->", "<!-- refinement:end -->"

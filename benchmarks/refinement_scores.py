@@ -13,9 +13,9 @@ from scipy import ndimage
 from fluidlift.evaluate.images import psnr, ssim
 from fluidlift.evaluate.volumes import behind, in_picture, lookup, occupancy_iou
 from fluidlift.look.rasterize import render
+from fluidlift.shape.external_body import near_and_far
 from fluidlift.shape.fill import hull
 from fluidlift.shape.generate import front_gaussians
-from fluidlift.shape.given import near_and_far
 from fluidlift.shape.unite import unite, window_length
 from fluidlift.types import Gaussians, PinholeCamera, RigidTransform, concatenate
 

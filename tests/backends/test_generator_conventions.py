@@ -15,8 +15,8 @@ from fluidlift.backends.generator_view import tilted
 from fluidlift.errors import FluidliftError
 from fluidlift.io.ply import read_splats
 from fluidlift.look.rasterize import render
-from fluidlift.shape.given import canonical_from_given, near_and_far
-from fluidlift.shape.place import pose_up
+from fluidlift.shape.external_body import canonical_from_given, near_and_far
+from fluidlift.shape.registration import pose_up
 from fluidlift.types import (
     SH_C0,
     Gaussians,

@@ -20,7 +20,7 @@ from fluidlift.backends.generator_process import (
     environment,
 )
 from fluidlift.errors import MissingPackage
-from fluidlift.shape.given import near_and_far
+from fluidlift.shape.external_body import near_and_far
 
 RUNNER = Path(__file__).with_name("stand_in_runner.py")
 CARD = GeneratorCard(

@@ -16,7 +16,7 @@ from fluidlift.physics.inflow_schedule import InflowSchedule
 from fluidlift.pipeline.stages.calibrate import STRONG, calibrate
 from fluidlift.scene.build import SimulationRequest, scene_of
 from fluidlift.scene.coarse_copy import coarser
-from fluidlift.scene.following import following
+from fluidlift.scene.force_weight import following
 from fluidlift.scene.simulator import simulator_of
 from fluidlift.types import FaceVelocity, Filmed
 

@@ -15,7 +15,7 @@ from fluidlift.look.footage import FEWEST
 from fluidlift.pipeline.preview import preview_scene
 from fluidlift.scene.build import SimulationRequest, film_of, first_of_film, scene_of
 from fluidlift.scene.simulator import simulator_of
-from fluidlift.scene.surface_appearance import Dressing
+from fluidlift.scene.surface_appearance import SurfaceAppearance
 
 FRAMES = 4
 CONSEQUENCE = "its surface looks as it did at rest"
@@ -29,13 +29,13 @@ def film(path, count=16, size=(64, 48), fluid=True):
 
 
 def dressed(scene):
-    """The dressing, and the splats of the last of a few frames."""
-    simulator, dressing = simulator_of(scene), Dressing(scene)
+    """The appearance, and the splats of the last of a few frames."""
+    simulator, appearance = simulator_of(scene), SurfaceAppearance(scene)
     for k in range(FRAMES):
         if k:
             simulator.advance(scene.interval)
-        dressing.advance(simulator.particles, k)
-    return dressing, dressing.dressed(simulator.particles, FRAMES - 1)
+        appearance.advance(simulator.particles, k)
+    return appearance, appearance.dressed(simulator.particles, FRAMES - 1)
 
 
 def is_red(shown) -> bool:
@@ -48,15 +48,15 @@ def is_red(shown) -> bool:
 
 
 def test_the_surface_plays_the_film(channel, tmp_path):
-    dressing, shown = dressed(channel(FRAMES, film=film(tmp_path / "film.mp4")))
-    assert dressing.warnings == () and is_red(shown)
+    appearance, shown = dressed(channel(FRAMES, film=film(tmp_path / "film.mp4")))
+    assert appearance.warnings == () and is_red(shown)
 
 
 def test_a_fall_plays_its_film_on_a_map_over_the_picture(channel, tmp_path):
     """Without one it has no skin, as nothing else is known of how it looks over time."""
     path = film(tmp_path / "film.mp4")
-    dressing, shown = dressed(channel(FRAMES, kind="fall", film=path))
-    assert dressing.warnings == () and (shown.ids % 2 == 1).any() and is_red(shown)
+    appearance, shown = dressed(channel(FRAMES, kind="fall", film=path))
+    assert appearance.warnings == () and (shown.ids % 2 == 1).any() and is_red(shown)
     _, plain = dressed(channel(FRAMES, kind="fall"))
     assert (plain.ids % 2 == 0).all()
 
@@ -68,8 +68,8 @@ def test_a_film_smaller_than_the_clip_is_played_all_the_same(channel, tmp_path, 
     monkeypatch.setattr(footage_file, "LARGEST", 32)
     path = film(tmp_path / "film.mp4")
     for kind in ("stream", "fall"):
-        dressing, shown = dressed(channel(FRAMES, kind=kind, film=path))
-        assert dressing.warnings == () and is_red(shown)
+        appearance, shown = dressed(channel(FRAMES, kind=kind, film=path))
+        assert appearance.warnings == () and is_red(shown)
 
 
 def broken(path, fault):
@@ -92,24 +92,24 @@ def broken(path, fault):
 def test_a_film_that_cannot_be_played_is_a_warning_and_the_look_is_that_without_one(channel, tmp_path, fault):
     path = tmp_path / "film.mp4"
     word = broken(path, fault)
-    dressing = Dressing(channel(FRAMES, film=path))
-    (text,) = dressing.warnings
+    appearance = SurfaceAppearance(channel(FRAMES, film=path))
+    (text,) = appearance.warnings
     assert word in text and CONSEQUENCE in text and "make the asset" in text
-    plain = Dressing(channel(FRAMES))
+    plain = SurfaceAppearance(channel(FRAMES))
     assert plain.warnings == ()
     p = simulator_of(channel(FRAMES)).particles
     for k in range(2):  # the same particles at both instants: what differs is the look alone
-        dressing.advance(p, k)
+        appearance.advance(p, k)
         plain.advance(p, k)
-    one, two = dressing.dressed(p, 1), plain.dressed(p, 1)
+    one, two = appearance.dressed(p, 1), plain.dressed(p, 1)
     np.testing.assert_array_equal(one.ids, two.ids)
     np.testing.assert_array_equal(one.gaussians.sh, two.gaussians.sh)
     np.testing.assert_array_equal(one.gaussians.means, two.gaussians.means)
 
 
 def test_a_fall_without_its_film_is_told_as_well(channel, tmp_path):
-    dressing, shown = dressed(channel(FRAMES, kind="fall", film=tmp_path / "gone.mp4"))
-    assert CONSEQUENCE in dressing.warnings[0] and (shown.ids % 2 == 0).all()
+    appearance, shown = dressed(channel(FRAMES, kind="fall", film=tmp_path / "gone.mp4"))
+    assert CONSEQUENCE in appearance.warnings[0] and (shown.ids % 2 == 0).all()
 
 
 def test_a_film_is_taken_apart_once_and_again_when_it_has_changed(channel, tmp_path):
@@ -119,11 +119,11 @@ def test_a_film_is_taken_apart_once_and_again_when_it_has_changed(channel, tmp_p
     path = film(tmp_path / "film.mp4")
     scene, before = channel(FRAMES, film=path), _taken_apart.cache_info()
     for _ in range(2):
-        assert Dressing(scene).warnings == ()
+        assert SurfaceAppearance(scene).warnings == ()
     after = _taken_apart.cache_info()
     assert after.misses == before.misses + 1 and after.hits == before.hits + 1
     path.write_bytes(b"something else")
-    assert CONSEQUENCE in Dressing(scene).warnings[0]
+    assert CONSEQUENCE in SurfaceAppearance(scene).warnings[0]
 
 
 def test_another_film_is_another_look_and_a_missing_one_is_none(channel, tmp_path):

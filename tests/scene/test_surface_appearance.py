@@ -9,34 +9,34 @@ from scipy.spatial import cKDTree
 from fluidlift.errors import InputRejected
 from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.scene.simulator import simulator_of
-from fluidlift.scene.surface_appearance import CLEAR, FAINT, Dressing
+from fluidlift.scene.surface_appearance import CLEAR, FAINT, SurfaceAppearance
 from fluidlift.types import FluidParameters, sh_from_rgb
 
 FRAMES = 6
 
 
-def played(scene, frames: int = FRAMES, dressing: Dressing | None = None):
-    """Dressing and particles at the last frame."""
-    simulator, dressing = simulator_of(scene), Dressing(scene) if dressing is None else dressing
+def played(scene, frames: int = FRAMES, appearance: SurfaceAppearance | None = None):
+    """SurfaceAppearance and particles at the last frame."""
+    simulator, appearance = simulator_of(scene), SurfaceAppearance(scene) if appearance is None else appearance
     for k in range(frames):
         if k:
             simulator.advance(scene.interval)
-        dressing.advance(simulator.particles, k)
-    return dressing, simulator.particles
+        appearance.advance(simulator.particles, k)
+    return appearance, simulator.particles
 
 
 def test_the_first_frame_is_the_body_as_it_was_lifted(channel):
     scene = channel(2)
-    dressing, p = played(scene, 1)
-    shown = dressing.dressed(p, 0)
+    appearance, p = played(scene, 1)
+    shown = appearance.dressed(p, 0)
     np.testing.assert_array_equal(shown.gaussians.means, p.positions)
     np.testing.assert_array_equal(shown.gaussians.sh, scene.rest.sh[p.source])
     np.testing.assert_array_equal(shown.ids, 2 * p.ids)
 
 
 def test_later_frames_hold_all_particles_and_the_skin_over_them(channel):
-    dressing, p = played(channel(FRAMES))
-    shown = dressing.dressed(p, FRAMES - 1)
+    appearance, p = played(channel(FRAMES))
+    shown = appearance.dressed(p, FRAMES - 1)
     skin = shown.ids % 2 == 1
     np.testing.assert_array_equal(np.sort(shown.ids[~skin]), np.sort(2 * p.ids))
     np.testing.assert_array_equal(shown.velocities[~skin], p.velocities)
@@ -55,8 +55,8 @@ def test_later_frames_hold_all_particles_and_the_skin_over_them(channel):
 def test_what_falls_or_rises_and_what_is_turned_on_its_side_has_no_skin(channel):
     turned = channel(FRAMES, parameters=FluidParameters(inflow_velocity=(0.6, 0.0, 0.0), gravity=(0.0, 9.81, 0.0)))
     for scene in (channel(FRAMES, kind="fall"), turned):
-        dressing, p = played(scene, 3)
-        assert len(dressing.dressed(p, 2).ids) == len(p) and dressing.state() == {}
+        appearance, p = played(scene, 3)
+        assert len(appearance.dressed(p, 2).ids) == len(p) and appearance.state() == {}
 
 
 def test_skin_and_splats_stay_out_of_the_ground(channel):
@@ -65,8 +65,8 @@ def test_skin_and_splats_stay_out_of_the_ground(channel):
     rock = np.linalg.norm(nodes - [0.6, 0.4, 0.15], axis=-1) - 0.22
     terrain = replace(scene.terrain, signed_distance=np.minimum(scene.terrain.signed_distance, rock).astype(np.float32))
     scene = replace(scene, terrain=terrain)
-    dressing, p = played(scene)
-    shown = dressing.dressed(p, FRAMES - 1)
+    appearance, p = played(scene)
+    shown = appearance.dressed(p, FRAMES - 1)
     g = shown.gaussians
     room = sample_nodes(terrain.signed_distance, grid, g.means)
     skin = shown.ids % 2 == 1
@@ -81,8 +81,8 @@ def test_dye_shows_through_the_skin(channel):
     dyed = scene.rest.means[:, 1] > 0.4
     sh = np.where(dyed[:, None, None], sh_from_rgb(np.array([[1.0, 0.0, 0.0]])), scene.rest.sh)
     painted = np.where(dyed[:, None], np.nan, scene.rest.means)
-    dressing, p = played(replace(scene, rest=replace(scene.rest, sh=sh.astype(np.float32)), painted=painted))
-    shown = dressing.dressed(p, FRAMES - 1)
+    appearance, p = played(replace(scene, rest=replace(scene.rest, sh=sh.astype(np.float32)), painted=painted))
+    shown = appearance.dressed(p, FRAMES - 1)
     skin = shown.ids % 2 == 1
     rgb, y = shown.gaussians.rgb[skin], shown.gaussians.means[skin, 1]
     inner = shown.gaussians.means[skin, 0] > 0.4  # what has come in since is another matter
@@ -91,16 +91,16 @@ def test_dye_shows_through_the_skin(channel):
 
 def test_a_dressing_goes_on_where_another_one_stopped(channel):
     scene = channel(FRAMES)
-    simulator, first = simulator_of(scene), Dressing(scene)
+    simulator, first = simulator_of(scene), SurfaceAppearance(scene)
     for k in range(3):
         if k:
             simulator.advance(scene.interval)
         first.advance(simulator.particles, k)
-    second = Dressing(scene)
+    second = SurfaceAppearance(scene)
     second.restore(first.state())
     simulator.advance(scene.interval)
-    for dressing in (first, second):
-        dressing.advance(simulator.particles, 3)
+    for appearance in (first, second):
+        appearance.advance(simulator.particles, 3)
     one, two = (d.dressed(simulator.particles, 3) for d in (first, second))
     np.testing.assert_array_equal(one.gaussians.means, two.gaussians.means)
     np.testing.assert_array_equal(one.gaussians.sh, two.gaussians.sh)
@@ -109,8 +109,8 @@ def test_a_dressing_goes_on_where_another_one_stopped(channel):
 
 def test_the_first_frame_starts_it_afresh(channel):
     scene = channel(FRAMES)
-    dressing, _ = played(scene, 3)
-    again, p = played(scene, FRAMES, dressing)
+    appearance, _ = played(scene, 3)
+    again, p = played(scene, FRAMES, appearance)
     fresh, q = played(scene, FRAMES)
     np.testing.assert_allclose(p.positions, q.positions, atol=1e-5)  # sums of two threads
     assert abs(len(again.dressed(p, 5).ids) - len(fresh.dressed(q, 5).ids)) < 0.02 * len(p)
@@ -119,8 +119,8 @@ def test_the_first_frame_starts_it_afresh(channel):
 
 @pytest.mark.parametrize("fault", ["missing", "shape", "infinite"])
 def test_a_state_that_does_not_fit_changes_nothing(channel, fault):
-    dressing, _ = played(channel(FRAMES), 2)
-    before, state = dressing.state(), dressing.state()
+    appearance, _ = played(channel(FRAMES), 2)
+    before, state = appearance.state(), appearance.state()
     if fault == "missing":
         del state["skin.places"]
     elif fault == "shape":
@@ -128,16 +128,16 @@ def test_a_state_that_does_not_fit_changes_nothing(channel, fault):
     else:
         state["patches.centers"] = state["patches.centers"] * np.inf
     with pytest.raises(InputRejected, match="state of a surface"):
-        dressing.restore(state)
-    after = dressing.state()
+        appearance.restore(state)
+    after = appearance.state()
     assert before.keys() == after.keys()
     for name, array in before.items():
         np.testing.assert_array_equal(after[name], array, err_msg=name)
 
 
 def test_there_is_no_skin_in_an_obstacle(channel):
-    dressing, p = played(channel(FRAMES))
-    shown = dressing.dressed(p, FRAMES - 1, lambda points: np.hypot(points[:, 0] - 0.6, points[:, 1] - 0.4) < 0.15)
+    appearance, p = played(channel(FRAMES))
+    shown = appearance.dressed(p, FRAMES - 1, lambda points: np.hypot(points[:, 0] - 0.6, points[:, 1] - 0.4) < 0.15)
     away = np.hypot(*(shown.gaussians.means[:, :2] - [0.6, 0.4]).T)
     skin = shown.ids % 2 == 1
     assert (away[skin] >= 0.15).all() and (away[skin] < 0.2).any()

@@ -7,8 +7,8 @@ from scipy import ndimage
 from fluidlift.shape.channel import ChannelConfig, channel_setting
 from fluidlift.shape.chute import ChuteHeight, chute_pixels, find_chutes
 from fluidlift.shape.kind import level_camera
-from fluidlift.shape.place import PlacedHeight
 from fluidlift.shape.plan import Footage
+from fluidlift.shape.registration import PlacedHeight
 from fluidlift.shape.sections import SURE, estimate_sections
 from fluidlift.shape.slope import flow_patches, plane_axes
 from fluidlift.shape.surface import level_surface, stream_surface

@@ -6,7 +6,7 @@ import pytest
 from fluidlift.errors import InputRejected
 from fluidlift.shape.drawn import carried, drawn_pixels, frame_at
 from fluidlift.shape.kind import level_camera
-from fluidlift.shape.place import ruler_scale
+from fluidlift.shape.registration import ruler_scale
 from fluidlift.shape.view import drawn_rim, horizon_line, sky_of, tilt_of_horizon
 from fluidlift.shape.view.roundness import roundness_evidence
 from fluidlift.types import PinholeCamera, UpEvidence

@@ -10,8 +10,8 @@ import pytest
 from fluidlift.errors import InputRejected
 from fluidlift.look.rasterize import render
 from fluidlift.shape import refine as module
-from fluidlift.shape.guard import Frame, ShapeFigures, broken, neighbours, picture_and_figures, plain_color
 from fluidlift.shape.refine import refine
+from fluidlift.shape.regression_guard import Frame, ShapeFigures, broken, neighbours, picture_and_figures, plain_color
 from fluidlift.types.camera import PinholeCamera
 from fluidlift.types.gaussians import Gaussians, concatenate
 

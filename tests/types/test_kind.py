@@ -23,7 +23,7 @@ from fluidlift.shape.airborne import airborne_setting
 from fluidlift.shape.kind import KINDS as RECOGNISED
 from fluidlift.shape.kind import estimate_up, level_camera
 from fluidlift.shape.kinds import builder_of
-from fluidlift.shape.place import metric_scale
+from fluidlift.shape.registration import metric_scale
 from fluidlift.types import (
     KINDS,
     CellType,

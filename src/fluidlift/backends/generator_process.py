@@ -292,7 +292,7 @@ COVERED = 0.3
 
 def require_visible(gaussians: Gaussians, camera: PinholeCamera, picture: Picture, title: str) -> None:
     """Raise `GeneratorFailed` for a body that is empty, not finite, or not where the fluid is in the picture."""
-    from fluidlift.shape.given import near_and_far
+    from fluidlift.shape.external_body import near_and_far
 
     g, where = gaussians, f"of frame {picture.frame}"
     fields = (g.means, g.quats, g.scales, g.opacities, g.sh)

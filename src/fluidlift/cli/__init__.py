@@ -327,7 +327,7 @@ def _render(c: Render) -> int:
         c.background, c.format, c.look, c.material, c.environment, c.exposure, c.engine, c.samples,
     )  # fmt: skip
     with shown_progress() as progress:
-        return _told(render_asset(c.asset, c.out, request, progress=progress), c.json)
+        return _print_result(render_asset(c.asset, c.out, request, progress=progress), c.json)
 
 
 def _export(c: Export) -> int:
@@ -336,7 +336,7 @@ def _export(c: Export) -> int:
     frames = _pair(c.frames, "-", "--frames", "1001-1024")
     request = ExportRequest(c.to, c.up_axis, c.meters_per_unit, frames, c.fps)
     with shown_progress() as progress:
-        return _told(export_asset(c.asset, c.out, request, progress=progress), c.json)
+        return _print_result(export_asset(c.asset, c.out, request, progress=progress), c.json)
 
 
 def _pair(text: str | None, mark: str, option: str, example: str) -> tuple[int, int] | None:
@@ -393,7 +393,7 @@ def _mask(c: Mask) -> int:
         found = find_masks(
             Inputs(c.clip, camera=c.camera), c.out, config, hints=hints, force=c.force, progress=progress
         )
-    return _told(found, c.json)
+    return _print_result(found, c.json)
 
 
 def _motion(c: Motion) -> int:
@@ -412,10 +412,10 @@ def _motion(c: Motion) -> int:
         found = measure_motion(
             inputs, c.out, config, files=MotionFiles(c.format, c.raw), force=c.force, progress=progress
         )
-    return _told(found, c.json)
+    return _print_result(found, c.json)
 
 
-def _told(found: Any, as_json: bool) -> int:
+def _print_result(found: Any, as_json: bool) -> int:
     """What a command that writes files for other tools has found."""
     print(json.dumps(found.to_dict(), indent=1) if as_json else "\n".join(found.lines()))
     return WITH_WARNINGS if found.warnings else DONE

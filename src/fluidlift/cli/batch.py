@@ -105,7 +105,7 @@ def _make(wanted: Batch, out: Path, shots: list[Shot]) -> int:
     folder = out.absolute()
     folder.mkdir(parents=True, exist_ok=True)
     limits = Limits(wanted.jobs, wanted.time_limit, wanted.memory_limit, wanted.retry)
-    tell, part = _told(wanted)
+    tell, part = _printers(wanted)
     outcomes = []
     for outcome in make_shots(shots, folder, limits, tell, part):
         outcomes.append(outcome)
@@ -120,7 +120,7 @@ def _make(wanted: Batch, out: Path, shots: list[Shot]) -> int:
     return 1 if bad else 4 if any(o.warnings for o in outcomes) and not wanted.warnings_ok else 0
 
 
-def _told(wanted: Batch) -> tuple[Callable[[str], None], Callable[[str], None]]:
+def _printers(wanted: Batch) -> tuple[Callable[[str], None], Callable[[str], None]]:
     """Who prints lines for people, and how far the stages of a shot are, as "done of all"."""
 
     def line(text: str) -> None:

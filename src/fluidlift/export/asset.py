@@ -25,7 +25,7 @@ from fluidlift.export.splats import write_splats, write_spz_frames
 from fluidlift.export.usd import write_usd_files
 from fluidlift.export.volumes import write_volumes
 from fluidlift.io.frames import FIRST_FRAME, FluidFrame
-from fluidlift.io.written import Written
+from fluidlift.io.output_files import Written
 from fluidlift.messages import Notice
 from fluidlift.present.surfacing import surface_of
 from fluidlift.scene.splat_files import frame_numbers, frames_of, frames_told
@@ -78,7 +78,7 @@ def export_asset(folder: Path, out: Path, request: ExportRequest, *, progress: P
     progress.finished("export", seconds, False)
     for text in outcome.warnings:
         progress.warn(text)
-    return _told(out, request, outcome, interval, seconds)
+    return _summary(out, request, outcome, interval, seconds)
 
 
 def _job(
@@ -104,7 +104,7 @@ def _missing(job: ExportJob, manifest: dict[str, Any]) -> tuple[Notice, ...]:
             f"fluidlift sim {job.folder} makes the others"),)  # fmt: skip
 
 
-def _told(out: Path, request: ExportRequest, outcome: Outcome, interval: float, seconds: float) -> Written:
+def _summary(out: Path, request: ExportRequest, outcome: Outcome, interval: float, seconds: float) -> Written:
     facts = {
         "fps": round(1.0 / interval, 6), "to": request.to, "up_axis": OWN_AXES.get(request.to, request.up_axis),
         "meters_per_unit": request.meters_per_unit,

@@ -12,7 +12,7 @@ from fluidlift.export.job import (
     ExportJob,
 )
 from fluidlift.io.frames import FIRST_FRAME, MovingMesh
-from fluidlift.io.written import cleared
+from fluidlift.io.output_files import cleared
 from fluidlift.messages import Notice
 from fluidlift.types import TriangleMesh
 

@@ -12,7 +12,7 @@ from fluidlift.export.job import (
     write_terrain,
 )
 from fluidlift.io.frames import FluidFrame
-from fluidlift.io.written import cleared, numbered
+from fluidlift.io.output_files import cleared, numbered
 from fluidlift.types import TriangleMesh
 
 if TYPE_CHECKING:

@@ -59,7 +59,7 @@ def write_page_of(job: ExportJob) -> Outcome:
     plan = _plan(job, len(first))
     picked = job.picked[:: plan.every]
     bodies, missing = bodies_of(job.folder, picked)
-    warnings = [*_told(plan, len(first), job, len(picked)), *missing]
+    warnings = [*_warnings(plan, len(first), job, len(picked)), *missing]
 
     def frames(told: bool) -> Iterator[tuple[Gaussians, np.ndarray]]:
         for done, (g, number, _) in enumerate(frames_of(job.folder, picked)):
@@ -135,7 +135,7 @@ def _range_of(frames: Iterator[Gaussians]) -> Range:
     return Range.of(frames)
 
 
-def _told(plan: Plan, splats: int, job: ExportJob, frames: int) -> list[Notice]:
+def _warnings(plan: Plan, splats: int, job: ExportJob, frames: int) -> list[Notice]:
     """What was left out, in words."""
     told = []
     if plan.share < 1.0:

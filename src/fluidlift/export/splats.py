@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fluidlift.export.job import ExportJob, Outcome, write_terrain
-from fluidlift.io.written import cleared, numbered
+from fluidlift.io.output_files import cleared, numbered
 from fluidlift.scene.splat_files import frames_of
 from fluidlift.types import Similarity3
 

@@ -70,8 +70,8 @@ def _with_volumes(
 ) -> Iterator[FluidFrame]:
     """The frames of smoke, each with the name of its OpenVDB file."""
     from fluidlift.export.volumes import gridded
+    from fluidlift.io.output_files import cleared
     from fluidlift.io.volume_grid import VolumeGrid, velocity_grid, write_vdb
-    from fluidlift.io.written import cleared
 
     cleared(out / VOLUMES, [".vdb"])
     for k, frame in enumerate(frames):

@@ -40,6 +40,7 @@ Modules of the face:
     limits        How much a reader takes in before it says no, and the first look at any file that a user names
     obstacles     Obstacles of scene.yaml: what a person puts into the fluid, as read and checked, before physics
                   takes it over
+    output_files  What a command that writes files for other tools tells at its end
     page_frames   Frames of splats as a page on the web plays them: 16 bytes per splat, and of those only what
                   changes
     pictures      One still picture, read with care, and resampling
@@ -62,7 +63,6 @@ Modules of the face:
     views         Camera paths that a person writes: keyed views in a JSON file
     volume_grid   OpenVDB files written with NumPy: float and vector grids of cubic voxels, ZIP-compressed, active
                   voxels only
-    written       What a command that writes files for other tools tells at its end
     yaml_reader   YAML from strangers: scene.yaml, settings, lists of shots and values on the command line are all
                   read here
 """
@@ -94,6 +94,7 @@ __all__ = [
     "lens",
     "limits",
     "obstacles",
+    "output_files",
     "page_frames",
     "pictures",
     "ply",
@@ -111,6 +112,5 @@ __all__ = [
     "video",
     "views",
     "volume_grid",
-    "written",
     "yaml_reader",
 ]  # fmt: skip

@@ -19,9 +19,9 @@ Modules of the face:
     liquid              A liquid's surface as a camera sees it, and the light that it sends there
     materials           What a liquid is made of, for pictures: refractive index, absorption, scattering, glow
     mixing              The look of fluid that was drawn out further than its splats can show
-    open_end            The open end of a stream: where what is simulated ends, a picture shows a clean section
     optics              Light at the surface of a transparent body and inside it: Fresnel, Snell, Beer and Lambert
                         (Born and Wolf 1999), and the colour of a deep body that scatters (van de Hulst 1980)
+    outlet_section      The open end of a stream: where what is simulated ends, a picture shows a clean section
     picture_texture     What a fluid that falls or stands looks like in its film, by place in the picture
     pictures            Fields and curves as pictures for the report
     project             What makes any Gaussians drawable from one camera: colours for the view, nothing broken,
@@ -52,9 +52,36 @@ Modules of the face:
 """
 
 __all__ = [
-    "appearance", "camera_path", "display", "environment", "environment_lookup", "filmed_outline",
-    "fluid_normals", "footage", "ground_picture", "inflow", "liquid", "materials", "mixing", "open_end",
-    "optics", "picture_texture", "pictures", "project", "rasterize", "relight", "report", "scenery",
-    "screen_space", "seen_texture", "smoothstep", "surface_axes", "surface_map", "surface_skin",
-    "texture_patches", "transparent", "vessel", "wet_ground",
+    "appearance",
+    "camera_path",
+    "display",
+    "environment",
+    "environment_lookup",
+    "filmed_outline",
+    "fluid_normals",
+    "footage",
+    "ground_picture",
+    "inflow",
+    "liquid",
+    "materials",
+    "mixing",
+    "optics",
+    "outlet_section",
+    "picture_texture",
+    "pictures",
+    "project",
+    "rasterize",
+    "relight",
+    "report",
+    "scenery",
+    "screen_space",
+    "seen_texture",
+    "smoothstep",
+    "surface_axes",
+    "surface_map",
+    "surface_skin",
+    "texture_patches",
+    "transparent",
+    "vessel",
+    "wet_ground",
 ]  # fmt: skip

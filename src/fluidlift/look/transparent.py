@@ -16,10 +16,10 @@ import numpy as np
 from jaxtyping import Float
 
 from fluidlift.errors import require
-from fluidlift.look.carried_on import carried_on
 from fluidlift.look.liquid import LiquidSurface
 from fluidlift.look.project import sound
 from fluidlift.look.smoothstep import smoothstep
+from fluidlift.look.solid_contact import carried_on
 from fluidlift.numerics.nearest import nearest
 from fluidlift.numerics.splatting import Bins, Projected, View, bin_tiles, project
 from fluidlift.numerics.splatting_kernels import TILE, exp_negative

@@ -24,7 +24,7 @@ from scipy import ndimage
 
 from fluidlift.errors import require
 from fluidlift.motion.bed import WALLS, bed_velocity, film_share, speed_share
-from fluidlift.motion.extension import (
+from fluidlift.motion.extrapolation import (
     SNAP_CELLS,
     harmonic_extension,
     layered_extension,

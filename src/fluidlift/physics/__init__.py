@@ -8,10 +8,10 @@ Modules of the face:
                           "Presumed APIC Simulation")
     boundaries            Boundary conditions: walls (cut cells; free slip to no-slip), liquid cells, extrapolation,
                           particle collisions
+    channel_extension     Extrapolation of the channel: the terrain goes on downstream of the outlet as it is there
     deform                Deformation of particles and of the Gaussians they carry (paper: F <- (I + dt C) F, A = F
                           A0 F^T)
     emitter               Emitters: closed meshes in the world whose volume is kept full of fluid while they are on
-    extend                Extrapolation of the channel: the terrain goes on downstream of the outlet as it is there
     gas                   The gas simulator: smoke in air on a MAC grid, with MacCormack advection; tracers move by
                           RK2
     guidance              Nudging and other body forces that depend on place: a pull towards a known flow, and a
@@ -52,8 +52,32 @@ Modules of the face:
 """
 
 __all__ = [
-    "advection", "apic", "boundaries", "deform", "emitter", "extend", "gas", "guidance", "inflow_schedule",
-    "inlet", "numba_particles", "outlet", "preflight", "pressure", "rigid", "rigid_body", "rollout",
-    "rollout_domain", "rollout_pressure", "rollout_surface", "rollout_torch", "rollout_torch_domain",
-    "rotation", "stepping", "surface_tension", "terrain_edit", "terrain_reshape", "transfer",
+    "advection",
+    "apic",
+    "boundaries",
+    "channel_extension",
+    "deform",
+    "emitter",
+    "gas",
+    "guidance",
+    "inflow_schedule",
+    "inlet",
+    "numba_particles",
+    "outlet",
+    "preflight",
+    "pressure",
+    "rigid",
+    "rigid_body",
+    "rollout",
+    "rollout_domain",
+    "rollout_pressure",
+    "rollout_surface",
+    "rollout_torch",
+    "rollout_torch_domain",
+    "rotation",
+    "stepping",
+    "surface_tension",
+    "terrain_edit",
+    "terrain_reshape",
+    "transfer",
 ]  # fmt: skip

@@ -20,7 +20,7 @@ from fluidlift.shape import depth_surface, given_depth
 from fluidlift.shape import kind as kinds
 from fluidlift.shape.given_depth import DepthPictures, Holds, SceneDepth
 from fluidlift.shape.kinds import Observation, builder_of
-from fluidlift.shape.place import DISAGREEING
+from fluidlift.shape.registration import DISAGREEING
 from fluidlift.shape.surface import FrontSurface
 from fluidlift.types import FluidKind, MetricScale, PinholeCamera, UpEvidence
 from fluidlift.types.fluid_masks import FluidMasks

@@ -15,7 +15,7 @@ from fluidlift.io.asset_paths import asset_file
 from fluidlift.io.atomic import plain, write_json
 from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.io.limits import parse_json
-from fluidlift.io.written import cleared, numbered
+from fluidlift.io.output_files import cleared, numbered
 from fluidlift.messages import Notice, as_plain
 from fluidlift.motion.steady_flow import TRUSTED, spans_of
 from fluidlift.pipeline.inputs import Inputs

@@ -1,4 +1,4 @@
-"""A body that comes as files, the user's or a generator's: its surface as the clip's camera sees it, and its place.
+"""A body that comes as files, the user's or a generator's: its surface as the clip's camera sees it, and where it lies.
 
 A folder of the user's (`--geometry-from`) has one camera for all frames, which is also that of the clip, in metres and
 z up. A folder that the stage `generate` left has a camera per frame, each of the generator's own making, beside a
@@ -16,7 +16,7 @@ import numpy as np
 from fluidlift.errors import InputRejected
 from fluidlift.io.images import read_camera, read_json
 from fluidlift.io.ply import read_gaussians
-from fluidlift.shape import given, place, surface
+from fluidlift.shape import external_body, registration, surface
 from fluidlift.types import FluidKind, Gaussians, PinholeCamera, Similarity3, UpEvidence, kind_of
 from fluidlift.types.stages import Geometry
 
@@ -88,7 +88,7 @@ def up_of(
     seen = given_bodies(folder, size, [start])
     if kind_of(kind).nearly_level and tilt_of_sheet(seen.bodies[0]) > STEEPEST:
         return None
-    return replace(place.pose_up(seen.cameras[0])[0], source="generator", confidence=GENERATOR_TRUST)
+    return replace(registration.pose_up(seen.cameras[0])[0], source="generator", confidence=GENERATOR_TRUST)
 
 
 def tilt_of_sheet(body: Gaussians) -> float:
@@ -106,10 +106,10 @@ def given_front(
     seen, note = given_bodies(folder, canonical.size, [start]), note_of(folder)
     body, camera = seen.bodies[0], seen.cameras[0]
     if note is None:
-        to_canonical = given.canonical_from_given(camera, body)
+        to_canonical = external_body.canonical_from_given(camera, body)
     else:
-        to_canonical = given.into_view(body.means, camera, canonical)
-    near, far = given.near_and_far(body.transformed(to_canonical), canonical, mask)
+        to_canonical = external_body.into_view(body.means, camera, canonical)
+    near, far = external_body.near_and_far(body.transformed(to_canonical), canonical, mask)
     front = surface.given_surface(canonical, mask, near, kind)
     unit = float(np.median(near[mask]))
     half = np.where(mask, 0.5 * np.maximum(far - near, 0.0), 0.0) / unit
@@ -130,16 +130,16 @@ def placed_bodies(geometry: Geometry, folder: Path, frames: list[int]) -> list[G
     seen = given_bodies(folder, camera.size, frames)
     if note_of(folder) is None:
         assert geometry.known_scale is not None  # a user's body is in metres
-        to_canonical = given.canonical_from_given(seen.cameras[0], seen.bodies[0])
+        to_canonical = external_body.canonical_from_given(seen.cameras[0], seen.bodies[0])
         scale = 1.0 / geometry.known_scale
         moved = to_canonical.translation * (scale / to_canonical.scale)
         to_world = geometry.world_from_canonical @ Similarity3(scale, to_canonical.rotation, moved)
         return [b.transformed(to_world) for b in seen.bodies]
     depth, mask = geometry.depth, geometry.mask
-    first = given.into_view(seen.bodies[0].means, seen.cameras[0], camera)
-    near, _ = given.near_and_far(seen.bodies[0].transformed(first), camera, mask)
+    first = external_body.into_view(seen.bodies[0].means, seen.cameras[0], camera)
+    near, _ = external_body.near_and_far(seen.bodies[0].transformed(first), camera, mask)
     visible = mask & (depth > 0)
     # all middles at one depth: between neighbouring frames a fluid does not come nearer, a generator's guess does
     middle = float(np.median(depth[visible] / near[visible]))
-    views = [given.into_view(b.means, c, camera, depth=middle) for b, c in zip(seen.bodies, seen.cameras)]
+    views = [external_body.into_view(b.means, c, camera, depth=middle) for b, c in zip(seen.bodies, seen.cameras)]
     return [b.transformed(view) for b, view in zip(seen.bodies, views)]

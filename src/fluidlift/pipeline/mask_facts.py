@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from fluidlift.errors import InputRejected
-from fluidlift.io.written import cleared, digest_of, numbered
+from fluidlift.io.output_files import cleared, digest_of, numbered
 
 MASK_FACTS = "mask.json"
 """beside the pictures: what they belong to"""

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from fluidlift.config import JobConfig
-from fluidlift.io.written import Written, cleared, numbered
+from fluidlift.io.output_files import Written, cleared, numbered
 from fluidlift.pipeline import begin
 from fluidlift.pipeline.hints import NO_HINTS, Hints
 from fluidlift.pipeline.inputs import GivenFiles, Inputs

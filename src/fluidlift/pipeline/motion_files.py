@@ -12,7 +12,7 @@ import numpy as np
 
 from fluidlift.config import JobConfig
 from fluidlift.io.frames import FIRST_FRAME
-from fluidlift.io.written import Written, numbered
+from fluidlift.io.output_files import Written, numbered
 from fluidlift.messages import Notice, as_plain
 from fluidlift.motion.steady_flow import pairs_of
 from fluidlift.pipeline import begin

@@ -25,7 +25,7 @@ from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.scene.build import Scene, SimulationRequest, first_of_film, scene_of
 from fluidlift.scene.coarse_copy import PreviewSize, bears_coarser, coarse_asset, coarser, thinned
 from fluidlift.scene.simulator import preflight, simulator_of
-from fluidlift.scene.surface_appearance import Dressing
+from fluidlift.scene.surface_appearance import SurfaceAppearance
 from fluidlift.types import FluidAsset, Gaussians, TriangleMesh
 
 if TYPE_CHECKING:
@@ -118,16 +118,16 @@ def preview_frames(scene: Scene, cancelled: Callable[[], bool] = lambda: False) 
     Raises:
         FluidliftError: the simulation broke down; the frames before it were good.
     """
-    simulator, dressing = simulator_of(scene), Dressing(scene)
+    simulator, appearance = simulator_of(scene), SurfaceAppearance(scene)
     simulator.settings = replace(simulator.settings, max_substeps=MOST_SUBSTEPS)
-    yield _shown(scene, simulator, dressing, 0)
+    yield _shown(scene, simulator, appearance, 0)
     for number in range(1, scene.frames):
         parts = _parts(scene, simulator)
         for _ in range(parts):
             if cancelled():
                 return
             simulator.advance(scene.interval / parts)
-        frame = _shown(scene, simulator, dressing, number)
+        frame = _shown(scene, simulator, appearance, number)
         if not np.isfinite(frame.gaussians.means).all():
             raise FluidliftError(f"frame {number}: positions that are not finite")
         yield frame
@@ -148,10 +148,10 @@ def _parts(scene: Scene, simulator: Any) -> int:
     return max(1, int(np.ceil(steps / SUBSTEPS_AT_ONCE)))
 
 
-def _shown(scene: Scene, simulator: Any, dressing: Dressing, number: int) -> PreviewFrame:
-    dressing.advance(simulator.particles, number)
+def _shown(scene: Scene, simulator: Any, appearance: SurfaceAppearance, number: int) -> PreviewFrame:
+    appearance.advance(simulator.particles, number)
     inside = simulator.bodies.inside if scene.obstacles else None
-    shown = dressing.dressed(simulator.particles, number, inside)
+    shown = appearance.dressed(simulator.particles, number, inside)
     poses = np.zeros((0, 7))
     if scene.obstacles:
         poses = np.concatenate([simulator.bodies.position, simulator.bodies.orientation], axis=1)

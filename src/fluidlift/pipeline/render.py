@@ -12,7 +12,7 @@ import numpy as np
 
 from fluidlift.errors import InputRejected
 from fluidlift.io.frames import FIRST_FRAME
-from fluidlift.io.written import Written, cleared, numbered
+from fluidlift.io.output_files import Written, cleared, numbered
 from fluidlift.messages import Notice
 from fluidlift.present.frames import BACKGROUNDS, Drawn, FrameRenderer, SimulatedFrame
 from fluidlift.present.front_view import open_end

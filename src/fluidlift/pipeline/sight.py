@@ -19,8 +19,8 @@ from fluidlift.shape import (
     composite,
     dam,
     generate,
-    place,
     puddle,
+    registration,
     standing,
     surface,
     texture_gradient,
@@ -145,8 +145,8 @@ def sighted(
         )  # fmt: skip
     points, velocities = _surface_motion(canonical, visible, front.sighted, seen.motion, clip.interval)
     falls, trust = falling.pixels[visible], seen.trust[visible]
-    sighting = place.Sighting(trust, clip.interval, up.pitch)
-    moving = _Moving(points, velocities, falls, sighting, known_scale)
+    seen_velocities = registration.VelocityEvidence(trust, clip.interval, up.pitch)
+    moving = _Moving(points, velocities, falls, seen_velocities, known_scale)
     scale, sentence, told = _scale(seen, moving, seen_depth, c, fluid, canonical)
     warnings += told
     return Sighted(
@@ -164,7 +164,7 @@ class _Moving:
     """units per second"""
     falls: np.ndarray
     """bool: of jets"""
-    sighting: place.Sighting
+    seen_velocities: registration.VelocityEvidence
     known_scale: float | None
     """m per unit, of depth in metres"""
 
@@ -176,22 +176,22 @@ def _scale(
     """Metres per canonical unit, in words, and warnings."""
     points, velocities, stood, warnings, size = moving.points, moving.velocities, seen.stood, [], c.size
     if c.drawn is not None and c.drawn.ruler is not None:
-        scale = place.ruler_scale(canonical, points, c.drawn.ruler)
+        scale = registration.ruler_scale(canonical, points, c.drawn.ruler)
         return scale, scale.sentence, []
     if stood is not None:
         scale = standing.standing_scale(
             stood, size=size, height=seen.height,
-            speed=lambda: dam.front_speed(fluid, seen.start, canonical, stood) / moving.sighting.interval,
+            speed=lambda: dam.front_speed(fluid, seen.start, canonical, stood) / moving.seen_velocities.interval,
         )  # fmt: skip
     else:
-        scale = place.metric_scale(
+        scale = registration.metric_scale(
             seen.kind, points, velocities, size=size, camera_height=seen.height, known_scale=moving.known_scale,
-            seen=moving.sighting,
+            seen=moving.seen_velocities,
         )  # fmt: skip
     if seen_depth is not None:
         scale = depths.with_learned_scale(scale, seen_depth, points)
         warnings += depths.size_warnings(scale.across, seen_depth, seen.height, points)
-    scale, sentence = _told(composite.with_fall(scale, points, velocities, moving.falls, moving.sighting), seen)
+    scale, sentence = _told(composite.with_fall(scale, points, velocities, moving.falls, moving.seen_velocities), seen)
     return scale, sentence, warnings + [scale.warning] * bool(scale.warning)
 
 
@@ -267,7 +267,7 @@ def _kind_and_up(
     """Evidence for the kind, the kind, the tilt of the camera, and its heading where it was surveyed."""
     clip, fluid, mask, motion, trust = looked.clip, looked.fluid, looked.mask, looked.motion, looked.trust
     c, bodies = config, None if given.bodies is None else given.bodies.path
-    surveyed, heading = place.pose_up(known)
+    surveyed, heading = registration.pose_up(known)
     pitch = float(surveyed.pitch) if pose_given else _said_of_view(c, known, mask.shape).pitch
     pick = np.unique(np.linspace(0, len(clip) - 1, 8).astype(int))
     evidence = kinds.estimate_kind(clip.frames[pick], fluid[pick], motion, trust, pitch=pitch)

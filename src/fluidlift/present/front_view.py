@@ -13,7 +13,7 @@ from fluidlift.scene.footage import Footage
 from fluidlift.types import Gaussians, PinholeCamera, concatenate, kind_of
 
 if TYPE_CHECKING:
-    from fluidlift.look.open_end import OpenEnd
+    from fluidlift.look.outlet_section import OpenEnd
     from fluidlift.look.rasterize import Rendered
 
 
@@ -90,7 +90,7 @@ class FrontView:
 
 def open_end(scene: Scene) -> OpenEnd | None:
     """Where a stream is cut in pictures; None of other kinds."""
-    from fluidlift.look.open_end import OpenEnd
+    from fluidlift.look.outlet_section import OpenEnd
 
     if not kind_of(scene.kind).is_channel_flow:
         return None

@@ -19,7 +19,7 @@ from fluidlift.look.fluid_normals import OUTSIDE, fluid_depths, fluid_normals, f
 from fluidlift.look.ground_picture import Ground, place_of
 from fluidlift.look.liquid import Behind, LiquidSurface, shaded
 from fluidlift.look.materials import Material, material_named
-from fluidlift.look.open_end import OpenEnd
+from fluidlift.look.outlet_section import OpenEnd
 from fluidlift.look.rasterize import render
 from fluidlift.look.relight import relit
 from fluidlift.look.screen_space import mesh_surface, particle_surface
@@ -28,7 +28,7 @@ from fluidlift.look.transparent import splat_surface
 from fluidlift.look.vessel import Pane, before_glass, panes, vessel_apart
 from fluidlift.look.wet_ground import wetted
 from fluidlift.numerics.srgb import linear_from_srgb, srgb_from_linear
-from fluidlift.present.finer import Lit, averaged, enlarged
+from fluidlift.present.supersampling import Lit, averaged, enlarged
 from fluidlift.present.surfacing import RADIUS, surface_of
 from fluidlift.types import (
     FluidKind,

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from fluidlift.look.open_end import OpenEnd
+from fluidlift.look.outlet_section import OpenEnd
 from fluidlift.look.surface_skin import of_skin, painted_liquid
 from fluidlift.seams import Mesher
 from fluidlift.types import Gaussians, Terrain, TriangleMesh

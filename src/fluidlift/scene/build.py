@@ -18,8 +18,8 @@ from fluidlift.look.appearance import SteadyShading
 from fluidlift.machine import available_memory
 from fluidlift.messages import Notice
 from fluidlift.physics.inflow_schedule import InflowSchedule
-from fluidlift.scene.following import following
 from fluidlift.scene.footage import Footage
+from fluidlift.scene.force_weight import following
 from fluidlift.scene.reshaping import changed_parameters, with_emitters, with_terrain
 from fluidlift.scene.settings import SceneSettings
 from fluidlift.types import (
@@ -332,7 +332,7 @@ def extended(scene: Scene, length: float) -> Scene:
     Raises:
         InputRejected: a fluid that lies on nothing, that does not leave its box, or a length that memory cannot hold.
     """
-    from fluidlift.physics.extend import (
+    from fluidlift.physics.channel_extension import (
         extended_body,
         extended_downstream,
         extended_grid,

@@ -12,7 +12,7 @@ from fluidlift.scene.build import Scene, SimulationRequest
 from fluidlift.scene.reshaping import in_words
 from fluidlift.scene.simulated_history import History
 from fluidlift.scene.splat_files import checkpoint_file, frame_file
-from fluidlift.scene.surface_appearance import Dressing
+from fluidlift.scene.surface_appearance import SurfaceAppearance
 from fluidlift.source import source_hash
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ def state_parts(scene: Scene) -> dict[str, str]:
 
 def continued(
     simulator: ParticleSimulator,
-    dressing: Dressing,
+    appearance: SurfaceAppearance,
     scene: Scene,
     folder: Path,
     request: SimulationRequest,
@@ -67,7 +67,7 @@ def continued(
             raise InputRejected(f"the checkpoint of '{folder.name}' holds other obstacles", "a whole checkpoint")
         history = History.of(found.history, scene.simulated)
         if found.frames <= scene.simulated:
-            dressing.restore(found.state)
+            appearance.restore(found.state)
             simulator.restore(found.state)
         return history
     except (InputRejected, KeyError) as error:
@@ -80,7 +80,7 @@ def continued(
 
 def advance(
     simulator: ParticleSimulator,
-    dressing: Dressing,
+    appearance: SurfaceAppearance,
     scene: Scene,
     folder: Path,
     history: History,
@@ -93,7 +93,7 @@ def advance(
 
     Args:
         simulator: at the last frame of `history`.
-        dressing: at the same.
+        appearance: at the same.
         scene: that is simulated.
         folder: of the asset.
         history: of the frames that are there; the others are added.
@@ -119,21 +119,23 @@ def advance(
         p = simulator.particles
         if k and len(p) > max_particles * 2:
             return None
-        dressing.advance(p, k)
-        shown = dressing.dressed(p, k, simulator.bodies.inside if scene.obstacles else None)
+        appearance.advance(p, k)
+        shown = appearance.dressed(p, k, simulator.bodies.inside if scene.obstacles else None)
         write_gaussians(
             frame_file(folder, FIRST_FRAME + k), shown.gaussians, ids=shown.ids, velocities=shown.velocities
         )
         history.add(scene, simulator, p, substeps)
         # the first one says whose frames these are
         if len(history) % checkpoint_every == 0 or len(history) in (1, scene.simulated):
-            _save(simulator, dressing, scene, folder, history)
+            _save(simulator, appearance, scene, folder, history)
     step(scene.simulated, scene.simulated)
     return None
 
 
-def _save(simulator: ParticleSimulator, dressing: Dressing, scene: Scene, folder: Path, history: History) -> None:
+def _save(
+    simulator: ParticleSimulator, appearance: SurfaceAppearance, scene: Scene, folder: Path, history: History
+) -> None:
     from fluidlift.io.checkpoint import Checkpoint, write_checkpoint
 
-    kept = Checkpoint(len(history), state_parts(scene), simulator.state() | dressing.state(), history.arrays())
+    kept = Checkpoint(len(history), state_parts(scene), simulator.state() | appearance.state(), history.arrays())
     write_checkpoint(checkpoint_file(folder), kept)

@@ -137,7 +137,7 @@ def _taken_apart(film: Path, size: tuple[int, int], blur: float, written: tuple[
     return f"shows none: {AS_AT_REST}; make the asset again" if found is None else found
 
 
-class Dressing:
+class SurfaceAppearance:
     """Splats for the particles of a scene, frame by frame from the first one on."""
 
     def __init__(self, scene: Scene) -> None:

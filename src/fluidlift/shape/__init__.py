@@ -10,17 +10,15 @@ Modules of the face:
     drawn             What a person drew on a frame, as pixels, and carried to the other frames
     evidence          Motion segmentation cues for fluid: change against the clip's own noise, and motion that goes
                       somewhere
+    external_body     A body from elsewhere: Gaussians that another generator made, seen by a known camera
     fill              Fills a hollow body with Gaussians by the parity of random rays (paper: filling before the
                       simulation)
-    follow            Warm start of the frames after the first: each is refined from the Gaussians of the frame
-                      before it
     frame_pictures    Small steady pictures of a clip of any length: a bounded sample kept, the other frames made
                       when asked for
     framing           Where the fluid lies in the picture and in time: what a mask can say against itself before a
                       body is made of it
     generate          The embedded generator: from a picture, a mask and a model of the front surface to Gaussians,
                       without any weights
-    given             A body from elsewhere: Gaussians that another generator made, seen by a known camera
     given_depth       Depth that comes from elsewhere, a file or a learned model: one picture of several frames,
                       made comparable
     ground            What a fluid rests in: cells and terrain from its surface, and the ground's texture or colours
@@ -32,13 +30,13 @@ Modules of the face:
     kinds             How the body of each kind of fluid is built: one file per kind, found by its name
     off_picture       Extrapolation of a stream's surface beyond the edges of the picture: the seen one goes on as
                       in a mirror
-    place             Registration and scale, from the canonical frame of a single view to metres: the free scale,
-                      heading, origin
     prune             Denoises a body: takes out faint, stretched, huge, lonely and broken Gaussians (paper: before
                       the filling)
     puddle            Puddles that jets fall into, seen from above: told from a vessel seen from the side
     refine            Refines Gaussians on one frame, so that they carry every pixel of it, without bending the body
                       (paper: `loss_optGS`)
+    registration      Registration and scale, from the canonical frame of a single view to metres: the free scale,
+                      heading, origin
     rest_frames       Which frames of a clip become the body at rest
     segment           Which pixels of a clip are fluid, without learned weights
     standing          A body of liquid that stands on level ground and is let go (a dam break), and the basin that
@@ -51,11 +49,38 @@ Modules of the face:
                       that should be
     view              Which way is up: what a picture says of it beside the fluid's motion, as log likelihoods of
                       the camera's tilt
+    warm_start        Warm start of the frames after the first: each is refined from the Gaussians of the frame
+                      before it
 """
 
 __all__ = [
-    "composite", "dam", "depth_surface", "drawn", "evidence", "fill", "follow", "frame_pictures", "framing",
-    "generate", "given", "given_depth", "ground", "ground_texture", "hints", "kind", "kinds", "off_picture",
-    "place", "prune", "puddle", "refine", "rest_frames", "segment", "standing", "surface", "texture_gradient",
-    "unite", "view",
+    "composite",
+    "dam",
+    "depth_surface",
+    "drawn",
+    "evidence",
+    "external_body",
+    "fill",
+    "frame_pictures",
+    "framing",
+    "generate",
+    "given_depth",
+    "ground",
+    "ground_texture",
+    "hints",
+    "kind",
+    "kinds",
+    "off_picture",
+    "prune",
+    "puddle",
+    "refine",
+    "registration",
+    "rest_frames",
+    "segment",
+    "standing",
+    "surface",
+    "texture_gradient",
+    "unite",
+    "view",
+    "warm_start",
 ]  # fmt: skip

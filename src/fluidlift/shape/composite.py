@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from fluidlift.shape import airborne, jets, place
+from fluidlift.shape import airborne, jets, registration
 from fluidlift.shape.jet_column import Jet, with_columns
 from fluidlift.shape.kind import level_camera
 from fluidlift.shape.slope import LEVEL
@@ -109,13 +109,13 @@ def with_fall(
     points: Float[np.ndarray, "n 3"],
     velocities: Float[np.ndarray, "n 3"],
     falls: Bool[np.ndarray, " n"],
-    seen: place.Sighting,
+    seen: registration.VelocityEvidence,
 ) -> MetricScale:
     """The scale from the jets' free fall, where nothing else gives one."""
     if scale.source != "assumed" or not falls.any():
         return scale
-    part = place.Sighting(None if seen.trust is None else seen.trust[falls], seen.interval, seen.pitch)
-    found = place.metric_scale(POUR, points[falls], velocities[falls], seen=part)
+    part = registration.VelocityEvidence(None if seen.trust is None else seen.trust[falls], seen.interval, seen.pitch)
+    found = registration.metric_scale(POUR, points[falls], velocities[falls], seen=part)
     if found.source != "free fall":
         return scale
     return replace(found, across=scale.across * found.value / scale.value)

@@ -8,7 +8,7 @@ from typing import cast
 import numpy as np
 from jaxtyping import UInt8
 
-from fluidlift.shape import airborne, channel, generate, ground_mesh, ground_texture, place, plan
+from fluidlift.shape import airborne, channel, generate, ground_mesh, ground_texture, plan, registration
 from fluidlift.shape.jets import lying_pixels
 from fluidlift.types import Label, PinholeCamera, Setting, kind_of
 from fluidlift.types.fluid_masks import parts_of
@@ -23,7 +23,7 @@ def setting_around(
     grid = camera.pixel_grid()
     near = camera.unproject(grid[visible & ~falls], depth[visible & ~falls])
     if front.height is not None:
-        labels, height = seen_labels(fluid, start, united, falls), place.PlacedHeight(front.height, to_world)
+        labels, height = seen_labels(fluid, start, united, falls), registration.PlacedHeight(front.height, to_world)
         seen = plan.Footage(height, labels, near, camera, bulk, ever=fluid.any_frame(), **known)
         return channel.channel_setting(seen, channel.ChannelConfig(kind, c.cells, c.cell_limit, c.depth_ratio))
     back = depth + 2 * half

@@ -26,7 +26,6 @@ from fluidlift.numerics.harmonics import basis
 from fluidlift.numerics.splatting import View
 from fluidlift.numerics.splatting_torch import NumbaRasterizer, rotation_matrices
 from fluidlift.seams import Rasterizer
-from fluidlift.shape.guard import Frame, ShapeFigures, broken, neighbours, picture_and_figures, plain_color, psnr
 from fluidlift.shape.losses import (
     LossWeights,
     anisotropy_loss,
@@ -36,6 +35,15 @@ from fluidlift.shape.losses import (
     scale_loss,
     volume_loss,
 )  # fmt: skip
+from fluidlift.shape.regression_guard import (
+    Frame,
+    ShapeFigures,
+    broken,
+    neighbours,
+    picture_and_figures,
+    plain_color,
+    psnr,
+)
 from fluidlift.types.camera import PinholeCamera
 from fluidlift.types.gaussians import SH_C0, Gaussians, concatenate
 

@@ -18,7 +18,6 @@ from scipy import ndimage, stats
 from fluidlift.errors import InputRejected
 from fluidlift.messages import Notice
 from fluidlift.shape.ground_mesh import ground_mesh
-from fluidlift.shape.place import STANDARD_GRAVITY
 from fluidlift.shape.prism import (
     FARTHEST,
     GROUND,
@@ -32,6 +31,7 @@ from fluidlift.shape.prism import (
     tallest,
     whole_piece,
 )
+from fluidlift.shape.registration import STANDARD_GRAVITY
 from fluidlift.shape.surface import FrontSurface
 from fluidlift.shape.terrain import at_cells, to_corners, unit
 from fluidlift.types import CellType, Grid, MetricScale, PinholeCamera, Setting, Similarity3, Terrain, triple

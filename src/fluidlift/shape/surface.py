@@ -1,7 +1,7 @@
 """Where the visible surface of a fluid is: level planes, falling profiles, inflated silhouettes, given depths.
 
 Everything here lives in the canonical frame: origin at the camera, z up, y away from the viewer, lengths in units in
-which the fluid is about 1 away. `place` (shape/place.py) turns that into metres.
+which the fluid is about 1 away. `place` (shape/registration.py) turns that into metres.
 """
 
 from __future__ import annotations

@@ -5,8 +5,8 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Any
 
+from fluidlift.viewer.callbacks import heard
 from fluidlift.viewer.controls import Control, number, path_of, unbroken
-from fluidlift.viewer.hearing import heard
 
 if TYPE_CHECKING:
     from fluidlift.viewer.app import Viewer

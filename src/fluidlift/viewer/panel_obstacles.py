@@ -14,8 +14,8 @@ from fluidlift.scene.edits import Add, Remove
 from fluidlift.scene.forecast import place_told, placed
 from fluidlift.scene.open_water import open_water
 from fluidlift.types import kind_of
+from fluidlift.viewer.callbacks import heard
 from fluidlift.viewer.controls import unbroken
-from fluidlift.viewer.hearing import heard
 from fluidlift.viewer.mesh_files import MOST_BYTES, UNITS, kept_mesh, mesh_entry
 
 if TYPE_CHECKING:

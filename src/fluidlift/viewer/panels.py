@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fluidlift.io.frames import FIRST_FRAME
+from fluidlift.viewer.callbacks import heard
 from fluidlift.viewer.footage import GONE, WIDTH
-from fluidlift.viewer.hearing import heard
 from fluidlift.viewer.panel_fluid import FluidPanel
 from fluidlift.viewer.panel_obstacles import ObstaclePanel
 from fluidlift.viewer.panel_run import RunPanel

@@ -15,7 +15,7 @@ from fluidlift.shape import (
     generate,
     ground,
     ground_texture,
-    place,
+    registration,
     standing,
 )
 from fluidlift.types import (
@@ -51,7 +51,9 @@ def geometry(
     falls, trust, seen_depth = falling.pixels[visible], seen.trust[visible], s.seen_depth
     mainstream = mainstream_of(kind, velocities[~falls], trust[~falls]) if seen.stood is None else seen.stood.direction
     eye = seen.known.position if seen.pose_given else None
-    to_world, camera = place.place(canonical, points, scale.value, heading=seen.heading, eye=eye, mainstream=mainstream)
+    to_world, camera = registration.place(
+        canonical, points, scale.value, heading=seen.heading, eye=eye, mainstream=mainstream
+    )
     depth = (front.depth * scale.value).astype(np.float32)
     half = (front.half_thickness * scale.value).astype(np.float32)
     bulk = to_world.vectors(mainstream) / to_world.scale

@@ -163,7 +163,7 @@ def _followed(
     seen: _Seen, last: Gaussians, bodies: list[Gaussians], frames: list[int], draws: Rasterizer
 ) -> tuple[list[Gaussians], tuple[tuple[float, float], ...]]:
     """Bodies of the frames after the first, each from the one before; and their likeness before and after, dB."""
-    from fluidlift.shape.follow import follow
+    from fluidlift.shape.warm_start import follow
 
     clip, fluid, camera, c = seen.clip, seen.fluid, seen.geometry.camera, seen.config
     if c.refine_iterations == 0 or len(last) == 0:

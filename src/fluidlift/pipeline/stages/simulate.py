@@ -16,7 +16,7 @@ from fluidlift.scene.reshaping import closed_inlet
 from fluidlift.scene.simulation import advance, continued
 from fluidlift.scene.simulator import preflight, simulator_of
 from fluidlift.scene.splat_files import checkpoint_file, frame_file, require_room
-from fluidlift.scene.surface_appearance import Dressing
+from fluidlift.scene.surface_appearance import SurfaceAppearance
 from fluidlift.types import kind_of
 from fluidlift.types.stages import Simulation
 
@@ -52,8 +52,8 @@ def simulate(
     preflight(scene)
     simulator = simulator_of(scene, config.device)
     closed = closed_inlet(scene, simulator)
-    dressing = Dressing(scene)
-    history = continued(simulator, dressing, scene, folder, request or SimulationRequest(), config.max_particles)
+    appearance = SurfaceAppearance(scene)
+    history = continued(simulator, appearance, scene, folder, request or SimulationRequest(), config.max_particles)
     first = len(history)
     require_room(folder, scene.simulated - first, len(scene.body))
     for old in asset_files(folder, "frames/splats", (".ply",)):
@@ -63,10 +63,10 @@ def simulate(
         checkpoint_file(folder).unlink(missing_ok=True)
     step = (lambda done, total: None) if work is None else work.step
     failed = advance(
-        simulator, dressing, scene, folder, history, step, max_particles=config.max_particles,
+        simulator, appearance, scene, folder, history, step, max_particles=config.max_particles,
         checkpoint_every=config.checkpoint_every,
     )  # fmt: skip
-    warnings = [*scene.notes, *dressing.warnings, *closed] + (
+    warnings = [*scene.notes, *appearance.warnings, *closed] + (
         list(simulator.bodies.warnings) if scene.obstacles else []
     )
     if failed is None and len(history) < scene.simulated:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fluidlift.io.scene_look import Look
-from fluidlift.look.open_end import OpenEnd
+from fluidlift.look.outlet_section import OpenEnd
 from fluidlift.numerics.triangles import rasterize_closed
 from fluidlift.present.looks import Backdrop, Frame, Painter
 from fluidlift.types import CellType, Gaussians, Grid, PinholeCamera, Terrain, TriangleMesh, sh_from_rgb

@@ -53,7 +53,7 @@ class FreeFall:
 
 
 @dataclass(frozen=True)
-class Sighting:
+class VelocityEvidence:
     """How velocities were seen."""
 
     trust: Float[np.ndarray, " n"] | None = None
@@ -79,7 +79,7 @@ def fit_free_fall(
     points: Float[np.ndarray, "n 3"],
     velocities: Float[np.ndarray, "n 3"],
     *,
-    seen: Sighting | None = None,
+    seen: VelocityEvidence | None = None,
     bands: int = 12,
 ) -> FreeFall:
     """Acceleration of what falls, from v^2 = v0^2 + 2 g (z0 - z) (energy; no drag, no friction, steady in time).
@@ -96,7 +96,7 @@ def fit_free_fall(
         seen: how.
         bands: of height, with equal numbers of points.
     """
-    seen = seen or Sighting()
+    seen = seen or VelocityEvidence()
     weight = np.ones(len(points)) if seen.trust is None else np.asarray(seen.trust, float)
     falls = _free_part(points[:, 2], velocities, weight)
     if falls.sum() < max(FEWEST_FALLING, 10 * bands):
@@ -235,7 +235,7 @@ def metric_scale(
     size: float | None = None,
     camera_height: float | None = None,
     known_scale: float | None = None,
-    seen: Sighting | None = None,
+    seen: VelocityEvidence | None = None,
 ) -> MetricScale:
     """Metres per canonical unit (design: a single view has no scale of its own).
 

@@ -7,10 +7,10 @@ import pytest
 
 from fluidlift.shape.heights import PlaneHeight
 from fluidlift.shape.kind import level_camera
-from fluidlift.shape.place import (
+from fluidlift.shape.registration import (
     STANDARD_GRAVITY,
     PlacedHeight,
-    Sighting,
+    VelocityEvidence,
     fit_free_fall,
     metric_scale,
     place,
@@ -113,7 +113,7 @@ def filmed_fall(size, *, seed=0, outliers=0.15, noise=0.1, law=None):
 @pytest.mark.parametrize("outliers", [0.0, 0.15, 0.3])
 def test_a_filmed_fall_of_known_size_comes_out_in_its_interval(size, outliers):
     points, velocities, interval = filmed_fall(size, outliers=outliers)
-    found = metric_scale("pour", points, velocities, seen=Sighting(interval=interval))
+    found = metric_scale("pour", points, velocities, seen=VelocityEvidence(interval=interval))
     assert found.source == "free fall" and not found.warning
     # the points were made in units of the size; 95 % are 1.96 standard errors
     assert abs(found.value / size - 1.0) < 1.96 * found.relative_error * found.value / size
@@ -125,7 +125,7 @@ def test_the_standard_error_of_a_fall_is_the_scatter_over_repetitions():
     falls = []
     for seed in range(24):
         points, velocities, interval = filmed_fall(1.0, seed=seed)
-        falls.append(fit_free_fall(points, velocities, seen=Sighting(interval=interval)))
+        falls.append(fit_free_fall(points, velocities, seen=VelocityEvidence(interval=interval)))
     value, error = (np.array([getattr(f, n) for f in falls]) for n in ("acceleration", "standard_error"))
     # the deviation of 24 numbers is known to 15 %, and each error, from twelve bands, to 20 %
     assert np.std(value) == pytest.approx(np.median(error), rel=0.4)
@@ -136,7 +136,7 @@ def test_the_standard_error_of_a_fall_is_the_scatter_over_repetitions():
 def test_a_frame_between_two_pictures_is_no_lag():
     """Velocities from pictures are means over the interval: taken at its start, gravity would seem larger."""
     points, velocities, interval = filmed_fall(1.0, noise=0.0, outliers=0.0)
-    at_middle = fit_free_fall(points, velocities, seen=Sighting(interval=interval))
+    at_middle = fit_free_fall(points, velocities, seen=VelocityEvidence(interval=interval))
     # straight bands through a law that is exact
     assert at_middle.acceleration == pytest.approx(STANDARD_GRAVITY, rel=1e-3)
 
@@ -152,7 +152,7 @@ def test_a_frame_between_two_pictures_is_no_lag():
 )
 def test_a_fall_that_something_holds_back_gives_no_scale(law, word):
     points, velocities, interval = filmed_fall(1.0, law=law)
-    found = metric_scale("pour", points, velocities, seen=Sighting(interval=interval))
+    found = metric_scale("pour", points, velocities, seen=VelocityEvidence(interval=interval))
     assert found.source == "assumed" and word in found.refusal
     assert "--size" in found.warning and found.refusal in found.warning
 
@@ -160,7 +160,7 @@ def test_a_fall_that_something_holds_back_gives_no_scale(law, word):
 def test_a_jet_seen_from_above_says_less_about_its_drop():
     points, velocities, interval = filmed_fall(1.0)
     level, steep = (
-        metric_scale("pour", points, velocities, seen=Sighting(interval=interval, pitch=p)) for p in (0.0, 45.0)
+        metric_scale("pour", points, velocities, seen=VelocityEvidence(interval=interval, pitch=p)) for p in (0.0, 45.0)
     )
     assert level.value == steep.value
     # eight degrees more or less at 45 degrees: 14 % of the height
@@ -172,7 +172,7 @@ def test_a_pool_below_the_jet_does_not_fall():
     pool = RNG.uniform([-0.4, 1.0, -0.6], [0.4, 1.0, -0.31], (6000, 3))
     stirred = 0.3 * RNG.normal(size=pool.shape)
     found = metric_scale(
-        "pour", np.vstack([points, pool]), np.vstack([velocities, stirred]), seen=Sighting(interval=interval)
+        "pour", np.vstack([points, pool]), np.vstack([velocities, stirred]), seen=VelocityEvidence(interval=interval)
     )
     assert abs(found.value - 1.0) < 1.96 * found.relative_error
 
@@ -181,7 +181,7 @@ def test_distrusted_points_do_not_count():
     points, velocities, interval = filmed_fall(1.0, outliers=0.0)
     trust = np.ones(len(points))
     trust[:2000], velocities[:2000] = 0.0, 0.1 * velocities[:2000]
-    found = metric_scale("fall", points, velocities, seen=Sighting(trust, interval))
+    found = metric_scale("fall", points, velocities, seen=VelocityEvidence(trust, interval))
     assert abs(found.value - 1.0) < 1.96 * found.relative_error
 
 
@@ -192,13 +192,13 @@ def test_where_the_scale_comes_from_has_an_order():
     sources = []
     options = {"size": 3.0, "known_scale": 4.0, "camera_height": 6.0}
     while True:
-        found = metric_scale("fall", points, velocities, seen=Sighting(interval=interval), **options)
+        found = metric_scale("fall", points, velocities, seen=VelocityEvidence(interval=interval), **options)
         sources.append(found.source)
         if not options:
             break
         options.pop(next(iter(options)))
     assert sources == ["size", "depth", "camera", "free fall"]
-    assert metric_scale("stream", points, velocities, seen=Sighting(interval=interval)).source == "assumed"
+    assert metric_scale("stream", points, velocities, seen=VelocityEvidence(interval=interval)).source == "assumed"
 
 
 def test_a_size_that_the_camera_contradicts_is_taken_and_said_so():

@@ -7,7 +7,7 @@ from fluidlift.errors import InputRejected
 from fluidlift.numerics.ground_block import ground_mesh
 from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.physics.apic import LiquidSimulator
-from fluidlift.physics.extend import extended_body, extended_downstream, extended_velocity, find_outlet
+from fluidlift.physics.channel_extension import extended_body, extended_downstream, extended_velocity, find_outlet
 from fluidlift.types import CellType, FaceVelocity, FluidParameters, Grid, Particles, Terrain, TriangleMesh
 
 H = 0.1

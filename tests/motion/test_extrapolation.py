@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fluidlift.motion.extension import (
+from fluidlift.motion.extrapolation import (
     harmonic_extension,
     layered_extension,
     splat_samples,

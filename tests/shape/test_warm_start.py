@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from fluidlift.errors import InputRejected
-from fluidlift.shape.follow import carried, follow
 from fluidlift.shape.generate import front_gaussians
 from fluidlift.shape.refine import refine
+from fluidlift.shape.warm_start import carried, follow
 from fluidlift.types.camera import PinholeCamera
 from fluidlift.types.gaussians import Gaussians
 

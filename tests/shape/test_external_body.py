@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fluidlift.errors import InputRejected
-from fluidlift.shape.given import canonical_from_given, into_view, near_and_far
+from fluidlift.shape.external_body import canonical_from_given, into_view, near_and_far
 from fluidlift.types import Gaussians, PinholeCamera
 
 CENTRE, RADIUS = np.array([3.0, -2.0, 1.0]), 0.5

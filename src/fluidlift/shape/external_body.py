@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from fluidlift.errors import InputRejected
-from fluidlift.shape.place import pose_up
+from fluidlift.shape.registration import pose_up
 from fluidlift.types import Gaussians, PinholeCamera, Similarity3
 
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from fluidlift.look.carried_on import carried_on
 from fluidlift.look.liquid import LiquidSurface
+from fluidlift.look.solid_contact import carried_on
 from fluidlift.types import PinholeCamera
 
 CAMERA = PinholeCamera.looking(np.array([0.0, -2.0, 2.0]), np.array([0.0, 0.2, 0.0]), 45.0, (160, 120))

@@ -11,6 +11,8 @@ import math
 import numba as nb
 import numpy as np
 
+from fluidlift.numerics.sharing import shared
+
 BLUR = np.float32(0.3)
 """px^2 added to the diagonal of a 2D covariance"""
 ALPHA_MIN = np.float32(1.0 / 255.0)
@@ -68,10 +70,9 @@ def _tangent(view, x, z, axis):
     return min(max(t, low), high), t < low or t > high
 
 
-@nb.njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def project_kernel(view, means, quats, scales, opacities, uv, conics, depths, extents):
-    for i0 in nb.prange(means.shape[0]):
-        i = np.int64(i0)
+@shared(lambda view, means, *_: (0, means.shape[0]), error_model="numpy")
+def project_kernel(begin, end, view, means, quats, scales, opacities, uv, conics, depths, extents):
+    for i in range(begin, end):
         x, y, z = _camera_point(view, means, i)
         uv[i, 0], uv[i, 1], depths[i] = 0, 0, z
         conics[i, 0], conics[i, 1], conics[i, 2] = 1, 0, 1
@@ -105,10 +106,11 @@ def project_kernel(view, means, quats, scales, opacities, uv, conics, depths, ex
         extents[i, 0], extents[i, 1] = hx, hy
 
 
-@nb.njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def project_backward_kernel(view, means, quats, scales, conics, extents, g_uv, g_conics, g_means, g_quats, g_scales):
-    for i0 in nb.prange(means.shape[0]):
-        i = np.int64(i0)
+@shared(lambda view, means, *_: (0, means.shape[0]), error_model="numpy")
+def project_backward_kernel(
+    begin, end, view, means, quats, scales, conics, extents, g_uv, g_conics, g_means, g_quats, g_scales
+):
+    for i in range(begin, end):
         if extents[i, 0] > 0:
             _backward_one(view, means, quats, scales, conics, g_uv, g_conics, g_means, g_quats, g_scales, i)
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float
-from numba import njit, prange
+from numba import njit
 
 from fluidlift.errors import require
+from fluidlift.numerics.sharing import shared
 from fluidlift.types import Gaussians, Particles
 
 CHUNK = 2048
@@ -100,12 +101,12 @@ def _advanced_row(f, c, p, i, dt):
     )
 
 
-@njit(parallel=True, cache=True)
-def _update(deformation, affine, dt, max_stretch, out):
+@shared(lambda deformation, *_: (0, ((len(deformation)) + CHUNK - 1) // CHUNK))
+def _update(begin, end, deformation, affine, dt, max_stretch, out):
     n = len(deformation)
-    for chunk in prange((n + CHUNK - 1) // CHUNK):
+    for chunk in range(begin, end):
         f, a, v, g = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-        first = np.int64(chunk) * CHUNK
+        first = chunk * CHUNK
         for p in range(first, min(first + CHUNK, n)):
             f00, f01, f02 = _advanced_row(deformation, affine, p, 0, dt)
             f10, f11, f12 = _advanced_row(deformation, affine, p, 1, dt)
@@ -169,10 +170,9 @@ def updated_deformation_plain(
     return (u * np.clip(s, 1 / max_stretch, max_stretch)[:, None, :]) @ vt
 
 
-@njit(parallel=True, cache=True)
-def _deform(f, rest, quats, scales, max_ratio, max_size):
-    for p_ in prange(len(f)):
-        p = np.int64(p_)
+@shared(lambda f, *_: (0, len(f)))
+def _deform(begin, end, f, rest, quats, scales, max_ratio, max_size):
+    for p in range(begin, end):
         m, a, v = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
         finite = True
         for i in range(3):

@@ -4,6 +4,9 @@ A level of many cells is cut into parts of planes, one per thread. First the thr
 each half sweep one plane further from the borders of the part than the one before; then they fill in what is left
 around the borders. Red and black cells do not see their own colour, so the result is that of plain half sweeps, to the
 last bit. The levels below are visited by one thread, in one go.
+
+What is inlined is compiled once, with what calls it, instead of once for itself and once more for each that calls it.
+The functions of one plane are not: with them, Numba would take longer to find all types.
 """
 
 from __future__ import annotations
@@ -31,6 +34,8 @@ from fluidlift.numerics.multigrid_kernels import (
 )
 from fluidlift.numerics.sharing import in_order, shared
 
+NONE, FIRST = np.int64(0), np.int64(1)
+"""of one type with computed numbers, as `multigrid_kernels.RED`"""
 LEAST_PLANES = 12
 """planes per part: the borders of a part must not meet"""
 COARSEST_SWEEPS = 8
@@ -81,6 +86,12 @@ def _part(c, border, g):
     return (b, b, -1, 1) if border else (a, b, int(c > 0), -int(c < parts - 1))
 
 
+@njit(cache=True)
+def _all_planes(g):
+    """As `_part` of a level that is not cut."""
+    return FIRST, g[PLANES] - 1, NONE, NONE
+
+
 @shared(lambda border, levels, *_: (0, levels[0][PARTS] - border), least=1)
 def _down(begin, end, border, levels, work, operator, rows, segments):
     fine, coarse, _ = levels
@@ -111,7 +122,7 @@ def _residual(begin, end, g, vectors, operator, segments, sums):
     """q = A p, r = b - q, where vectors = (p, b, q, r)."""
     p, b, q, r = vectors
     for part in range(begin, end):
-        first, last, _, _ = _part(part, 0, g)
+        first, last, _, _ = _part(part, NONE, g)
         for i in range(first, last):
             apply_plane(i, g, p, q, operator, segments)
             sums[i] = residual_plane(i, g, b, q, r, segments)
@@ -120,12 +131,12 @@ def _residual(begin, end, g, vectors, operator, segments, sums):
 @shared(lambda g, *_: (0, g[PARTS]), least=1)
 def _descend(begin, end, g, vectors, step, scale, segments, sums):
     for part in range(begin, end):
-        first, last, _, _ = _part(part, 0, g)
+        first, last, _, _ = _part(part, NONE, g)
         for i in range(first, last):
             sums[i] = descend_plane(i, g, vectors, step, scale, segments)
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _sweep_coarsest(g, common, work, operator, segments, sums):
     """Many sweeps, forth and back."""
     half_sweeps = 4 * COARSEST_SWEEPS
@@ -140,18 +151,18 @@ def _sweep_coarsest(g, common, work, operator, segments, sums):
         sums[i] = dot_plane(i, g, work, segments)
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _cycle_alone(geometry, common, work, operator, rows, segments, sums):
     """A V-cycle by one thread. sums gets x . rhs of each plane of its finest level."""
     coarsest = len(geometry) - 1
     for l in range(coarsest):
         levels = (geometry[l], geometry[l + 1], common[l])
-        whole = (1, geometry[l, PLANES] - 1, 0, 0)
-        wave_down(whole, (1, geometry[l + 1, PLANES] - 1), levels, work, operator, rows, segments)
+        coarse_planes = (FIRST, geometry[l + 1, PLANES] - 1)
+        wave_down(_all_planes(geometry[l]), coarse_planes, levels, work, operator, rows, segments)
     _sweep_coarsest(geometry[coarsest], common[coarsest], work, operator, segments, sums)
     for l in range(coarsest - 1, -1, -1):
         levels = (geometry[l], geometry[l + 1], common[l])
-        wave_up((1, geometry[l, PLANES] - 1, 0, 0), levels, work, operator, rows, segments, sums)
+        wave_up(_all_planes(geometry[l]), levels, work, operator, rows, segments, sums)
 
 
 def cycle(h: Hierarchy, sums: np.ndarray) -> float:
@@ -210,6 +221,10 @@ def conjugate_gradients(
         low_rank: places, values, starts and inverse masses for `add_low_rank`.
     """
     g = h.geometry[0]
+    if g[PARTS] == 1 and len(low_rank[0]) == 0:
+        levels = (h.geometry, h.common, h.work, h.operator, h.rows, h.segments)
+        vectors = (np.zeros_like(b), np.zeros_like(b), np.zeros(len(b), np.float32))
+        return conjugate_gradients_alone(levels, p, b, goal, max_iterations, vectors)
     sums = np.zeros(g[PLANES])
     q, r, direction = np.zeros_like(b), np.zeros_like(b), np.zeros(len(b), np.float32)
 
@@ -253,7 +268,7 @@ def conjugate_gradients(
     return iterations, float(np.sqrt(squared))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, inline="always")
 def _true_residual(g, vectors, operator, segments):
     p, b, q, r = vectors
     total = 0.0
@@ -275,7 +290,7 @@ def conjugate_gradients_alone(level_arrays, p, b, goal, max_iterations, vectors)
     q, r, direction = vectors
     x, rhs, _ = work
     sums = np.zeros(g[PLANES])
-    whole = (1, g[PLANES] - 1, 0, 0)
+    whole = _all_planes(g)
     moved = (p, r, direction, q, rhs)
     squared, iterations = _true_residual(g, (p, b, q, r), operator, segments), 0
     for _ in range(RESTARTS):

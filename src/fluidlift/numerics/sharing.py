@@ -9,31 +9,20 @@ thread is free. Which thread does what changes no bit of what is written.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from typing import Any
 
 import numba
 import numpy as np
 from numba.core.compiler import Compiler
 
+X, Y, Z = np.int64(0), np.int64(1), np.int64(2)
+"""axes, for compiled functions: one that is given literal numbers is compiled once more for each of them"""
 PIECES = 16
 """per thread, of loops whose things take unequal times"""
 SMALL = 20_000
 """elements of the largest array under which another thread costs more than it gains: waking it takes 0.05 ms"""
-
-
-@contextmanager
-def in_pieces(count: int) -> Iterator[None]:
-    """Parallel loops over `count` things within are dealt out piece by piece to whichever thread is free.
-
-    Else each thread gets one equal share, and all wait for the last: for the slower core, for the one that another
-    program uses as well, or for the share that holds more. For loops over a few thousand things at most that take
-    milliseconds; others are better off with whole shares. Which thread does what changes no bit of what is written.
-    """
-    with numba.parallel_chunksize(max(1, count // (PIECES * numba.get_num_threads()))):
-        yield
 
 
 class _Apart(Compiler):

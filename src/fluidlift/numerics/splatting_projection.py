@@ -11,7 +11,7 @@ import math
 import numba as nb
 import numpy as np
 
-from fluidlift.numerics.sharing import shared
+from fluidlift.numerics.sharing import X, Y, Z, shared
 
 BLUR = np.float32(0.3)
 """px^2 added to the diagonal of a 2D covariance"""
@@ -85,11 +85,11 @@ def project_kernel(begin, end, view, means, quats, scales, opacities, uv, conics
         u, v = fx * x + view[14], fy * y + view[15]
         qw, qx, qy, qz, _ = _unit_quat(quats, i)
         row0, row1, row2 = _rotation(qw, qx, qy, qz)
-        m0 = _half(view, 0, row0, row1, row2, scales, i)
-        m1 = _half(view, 1, row0, row1, row2, scales, i)
-        m2 = _half(view, 2, row0, row1, row2, scales, i)
-        tx, _ = _tangent(view, x, z, 0)
-        ty, _ = _tangent(view, y, z, 1)
+        m0 = _half(view, X, row0, row1, row2, scales, i)
+        m1 = _half(view, Y, row0, row1, row2, scales, i)
+        m2 = _half(view, Z, row0, row1, row2, scales, i)
+        tx, _ = _tangent(view, x, z, X)
+        ty, _ = _tangent(view, y, z, Y)
         # rows of J m, with J = [fx (1, 0, -tx), fy (0, 1, -ty)]
         j0 = (fx * (m0[0] - tx * m2[0]), fx * (m0[1] - tx * m2[1]), fx * (m0[2] - tx * m2[2]))
         j1 = (fy * (m1[0] - ty * m2[0]), fy * (m1[1] - ty * m2[1]), fy * (m1[2] - ty * m2[2]))
@@ -120,12 +120,12 @@ def _backward_one(view, means, quats, scales, conics, g_uv, g_conics, g_means, g
     x, y, z = _camera_point(view, means, i)
     qw, qx, qy, qz, k = _unit_quat(quats, i)
     row0, row1, row2 = _rotation(qw, qx, qy, qz)
-    m0 = _half(view, 0, row0, row1, row2, scales, i)
-    m1 = _half(view, 1, row0, row1, row2, scales, i)
-    m2 = _half(view, 2, row0, row1, row2, scales, i)
+    m0 = _half(view, X, row0, row1, row2, scales, i)
+    m1 = _half(view, Y, row0, row1, row2, scales, i)
+    m2 = _half(view, Z, row0, row1, row2, scales, i)
     fx, fy = view[12] / z, view[13] / z
-    tx, held_x = _tangent(view, x, z, 0)
-    ty, held_y = _tangent(view, y, z, 1)
+    tx, held_x = _tangent(view, x, z, X)
+    ty, held_y = _tangent(view, y, z, Y)
     # inverse: d cov = -conic (d conic) conic, with the off-diagonal entry counted twice
     p, q, w = nb.float64(conics[i, 0]), nb.float64(conics[i, 1]), nb.float64(conics[i, 2])
     gp, gq, gw = nb.float64(g_conics[i, 0]), nb.float64(g_conics[i, 1]), nb.float64(g_conics[i, 2])

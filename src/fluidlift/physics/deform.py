@@ -7,7 +7,7 @@ from jaxtyping import Float
 from numba import njit
 
 from fluidlift.errors import require
-from fluidlift.numerics.sharing import shared
+from fluidlift.numerics.sharing import X, Y, Z, shared
 from fluidlift.types import Gaussians, Particles
 
 CHUNK = 2048
@@ -108,9 +108,9 @@ def _update(begin, end, deformation, affine, dt, max_stretch, out):
         f, a, v, g = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
         first = chunk * CHUNK
         for p in range(first, min(first + CHUNK, n)):
-            f00, f01, f02 = _advanced_row(deformation, affine, p, 0, dt)
-            f10, f11, f12 = _advanced_row(deformation, affine, p, 1, dt)
-            f20, f21, f22 = _advanced_row(deformation, affine, p, 2, dt)
+            f00, f01, f02 = _advanced_row(deformation, affine, p, X, dt)
+            f10, f11, f12 = _advanced_row(deformation, affine, p, Y, dt)
+            f20, f21, f22 = _advanced_row(deformation, affine, p, Z, dt)
             det = f00 * (f11 * f22 - f12 * f21) - f01 * (f10 * f22 - f12 * f20) + f02 * (f10 * f21 - f11 * f20)
             if not (det > 1e-6 and det < 1e6):
                 for i in range(3):

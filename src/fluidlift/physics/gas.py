@@ -14,7 +14,7 @@ from numba import njit
 
 from fluidlift.errors import FluidliftError, InputRejected, require
 from fluidlift.numerics.sampling import sample_nodes
-from fluidlift.numerics.sharing import shared
+from fluidlift.numerics.sharing import X, Y, Z, shared
 from fluidlift.physics import boundaries, transfer
 from fluidlift.physics.active_region import open_region
 from fluidlift.physics.advect_particles import leaving
@@ -48,9 +48,9 @@ def _trace_back(begin, end, q, u, v, w, axis, cells, out, low, high):
     for i in range(begin, end):
         for j in range(ny):
             for k in range(nz):
-                vx = u[i, j, k] if axis == 0 else _mean_of_four(u, axis, 0, i, j, k)
-                vy = v[i, j, k] if axis == 1 else _mean_of_four(v, axis, 1, i, j, k)
-                vz = w[i, j, k] if axis == 2 else _mean_of_four(w, axis, 2, i, j, k)
+                vx = u[i, j, k] if axis == 0 else _mean_of_four(u, axis, X, i, j, k)
+                vy = v[i, j, k] if axis == 1 else _mean_of_four(v, axis, Y, i, j, k)
+                vz = w[i, j, k] if axis == 2 else _mean_of_four(w, axis, Z, i, j, k)
                 x = min(max(i - cells * vx, 0.0), nx - 1.0)
                 y = min(max(j - cells * vy, 0.0), ny - 1.0)
                 z = min(max(k - cells * vz, 0.0), nz - 1.0)

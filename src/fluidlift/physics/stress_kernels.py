@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from fluidlift.numerics.sharing import in_order, shared
+from fluidlift.numerics.sharing import X, Y, Z, in_order, shared
 from fluidlift.physics.liquid_fractions import control_share
 
 AIR, SOLVED, FIXED, WALL = 0, 1, 2, 3
@@ -20,6 +20,8 @@ LEAST_GAP = 0.05
 """cells: faces nearer to a wall count as this far from it (conditioning)"""
 
 ONE, TWO, EIGHT = np.uint64(1), np.uint64(2), np.uint64(8)
+STAYS, MOVES = X, Y
+"""what half a cell does to a control volume along an axis, see `control_share`"""
 ZERO, FULL = np.float32(0.0), np.float32(1.0)
 """Unsigned indices need no check for negative ones, and numbers of single precision do not widen what they meet: with
 both, the inner loops become vector instructions, five times as fast."""
@@ -117,12 +119,12 @@ def weigh_stresses(begin, end, roles, clearance, octants, cells, resistance, num
                 if not _acts(roles, i, j, k):
                     continue
                 u, d, l = i - ONE, j - ONE, k - ONE
-                xx = _normal_factor(roles, clearance, wall_share, 0, i, j, k, i + ONE, j, k)
-                yy = _normal_factor(roles, clearance, wall_share, 1, i, j, k, i, j + ONE, k)
-                zz = _normal_factor(roles, clearance, wall_share, 2, i, j, k, i, j, k + ONE)
-                yz = number * _shear_factor(roles, clearance, wall_share, 1, 2, i, j, k, i, j, l, i, d, k)
-                xz = number * _shear_factor(roles, clearance, wall_share, 0, 2, i, j, k, i, j, l, u, j, k)
-                xy = number * _shear_factor(roles, clearance, wall_share, 0, 1, i, j, k, i, d, k, u, j, k)
+                xx = _normal_factor(roles, clearance, wall_share, X, i, j, k, i + ONE, j, k)
+                yy = _normal_factor(roles, clearance, wall_share, Y, i, j, k, i, j + ONE, k)
+                zz = _normal_factor(roles, clearance, wall_share, Z, i, j, k, i, j, k + ONE)
+                yz = number * _shear_factor(roles, clearance, wall_share, Y, Z, i, j, k, i, j, l, i, d, k)
+                xz = number * _shear_factor(roles, clearance, wall_share, X, Z, i, j, k, i, j, l, u, j, k)
+                xy = number * _shear_factor(roles, clearance, wall_share, X, Y, i, j, k, i, d, k, u, j, k)
                 centre = xx + yy + zz
                 if centre + yz + xz + xy == 0.0:
                     continue
@@ -130,10 +132,16 @@ def weigh_stresses(begin, end, roles, clearance, octants, cells, resistance, num
                 if viscosity > 0.0:
                     c = yz_here = xz_here = xy_here = viscosity
                 else:
-                    c = _stiffness(octants, cells, resistance, si, sj, sk, 0, 0, 0) if centre > 0.0 else 0.0
-                    yz_here = _stiffness(octants, cells, resistance, si, sj, sk, 0, 1, 1) if yz > 0.0 else 0.0
-                    xz_here = _stiffness(octants, cells, resistance, si, sj, sk, 1, 0, 1) if xz > 0.0 else 0.0
-                    xy_here = _stiffness(octants, cells, resistance, si, sj, sk, 1, 1, 0) if xy > 0.0 else 0.0
+                    c = _stiffness(octants, cells, resistance, si, sj, sk, STAYS, STAYS, STAYS) if centre > 0.0 else 0.0
+                    yz_here = (
+                        _stiffness(octants, cells, resistance, si, sj, sk, STAYS, MOVES, MOVES) if yz > 0.0 else 0.0
+                    )
+                    xz_here = (
+                        _stiffness(octants, cells, resistance, si, sj, sk, MOVES, STAYS, MOVES) if xz > 0.0 else 0.0
+                    )
+                    xy_here = (
+                        _stiffness(octants, cells, resistance, si, sj, sk, MOVES, MOVES, STAYS) if xy > 0.0 else 0.0
+                    )
                 c *= 2.0 * number
                 normal[0, i, j, k], normal[1, i, j, k], normal[2, i, j, k] = c * xx, c * yy, c * zz
                 shear[0, i, j, k], shear[1, i, j, k], shear[2, i, j, k] = yz * yz_here, xz * xz_here, xy * xy_here

@@ -112,7 +112,7 @@ def _background(background: tuple[float, ...] | np.ndarray | None, shape: tuple[
     fits = behind.ndim == 0 or behind.shape in ((shape[2],), shape)
     require(fits, f"background of shape {behind.shape}", f"one value per channel ({shape[2]}) or {shape}")
     whole = behind if behind.ndim == 3 else np.broadcast_to(behind, (1, 1, shape[2]))
-    return np.require(whole, requirements="CW")  # one kind of array, so that the kernel is compiled once
+    return np.require(whole, requirements=("C", "W"))  # one kind of array, so that the kernel is compiled once
 
 
 def _project_bounded(g: Gaussians, opacities: np.ndarray, camera: PinholeCamera) -> tuple[Projected, np.ndarray, Bins]:

@@ -86,7 +86,7 @@ def shared(
     """
 
     def decorate(function: Callable[..., None]) -> SharedLoop:
-        kernel = numba.njit(cache=True, nogil=True, pipeline_class=_Apart, **options)(function)
+        kernel = numba.njit(cache=True, nogil=True, no_cfunc_wrapper=True, pipeline_class=_Apart, **options)(function)
         return SharedLoop(kernel, extent, least, pieces)
 
     return decorate

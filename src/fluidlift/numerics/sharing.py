@@ -17,6 +17,8 @@ import numba
 import numpy as np
 from numba.core.compiler import Compiler
 
+njit: Any = numba.njit
+"""untyped: its stub does not know all options"""
 X, Y, Z = np.int64(0), np.int64(1), np.int64(2)
 """axes, for compiled functions: one that is given literal numbers is compiled once more for each of them"""
 PIECES = 16
@@ -86,7 +88,7 @@ def shared(
     """
 
     def decorate(function: Callable[..., None]) -> SharedLoop:
-        kernel = numba.njit(cache=True, nogil=True, no_cfunc_wrapper=True, pipeline_class=_Apart, **options)(function)
+        kernel = njit(cache=True, nogil=True, no_cfunc_wrapper=True, pipeline_class=_Apart, **options)(function)
         return SharedLoop(kernel, extent, least, pieces)
 
     return decorate

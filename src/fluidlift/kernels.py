@@ -29,6 +29,9 @@ from fluidlift.machine import cores
 
 PACKAGE = Path(__file__).parent
 LIST = PACKAGE / "kernels.json"
+RARELY = 50_000, 50, 1000
+"""thresholds of the garbage collector: a compiler keeps what it makes, and looking for garbage in that takes a tenth of
+its time"""
 
 
 @dataclass(frozen=True)
@@ -175,9 +178,12 @@ def compiling_beside(told: Callable[[str], None]) -> Iterator[None]:
         return
     told("first run of this installation: compiling beside it, once")
     worker = _worker(listed()[::-1])
+    before = gc.get_threshold()
+    gc.set_threshold(*RARELY)
     try:
         yield
     finally:
+        gc.set_threshold(*before)
         if worker.poll() is None:
             worker.terminate()
         elif worker.returncode == 0:
@@ -187,7 +193,7 @@ def compiling_beside(told: Callable[[str], None]) -> Iterator[None]:
 def main() -> int:
     """Compile what stands in standard input; 1 if something could not be compiled."""
     failed = 0
-    gc.set_threshold(50_000, 50, 1000)  # a compiler keeps what it makes: looking for garbage takes a tenth of its time
+    gc.set_threshold(*RARELY)
     for stage, function, types, seconds in json.load(sys.stdin):
         try:
             compile_kernel(Kernel(stage, function, tuple(types), seconds))

@@ -12,6 +12,8 @@ import numba as nb
 import numpy as np
 from jaxtyping import Float
 
+from fluidlift.numerics.sharing import shared
+
 _CHUNK = 2048
 
 
@@ -92,11 +94,11 @@ def picture_value(picture, across, down):
     )
 
 
-@nb.njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def lookup_kernel(picture, directions, out):
+@shared(lambda picture, directions, *_: (0, -(-directions.shape[0] // _CHUNK)), error_model="numpy")
+def lookup_kernel(begin, end, picture, directions, out):
     n = directions.shape[0]
-    for chunk in nb.prange(-(-n // _CHUNK)):
-        for k in range(np.int64(chunk) * _CHUNK, min((np.int64(chunk) + 1) * _CHUNK, n)):
+    for chunk in range(begin, end):
+        for k in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, n)):
             across, down = picture_place(directions[k, 0], directions[k, 1], directions[k, 2])
             if math.isfinite(across + down):
                 out[k, 0], out[k, 1], out[k, 2] = picture_value(picture, across, down)

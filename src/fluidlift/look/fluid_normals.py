@@ -21,6 +21,7 @@ from fluidlift.look.smoothstep import eased, smoothstep
 from fluidlift.look.surface_skin import without_skin
 from fluidlift.numerics.isosurface import surface_nets
 from fluidlift.numerics.sampling import sample_nodes
+from fluidlift.numerics.sharing import shared
 from fluidlift.types.gaussians import Gaussians
 from fluidlift.types.terrain import Terrain, TriangleMesh
 
@@ -161,17 +162,17 @@ def _base_and_weights(x, weights):
     return np.int64(base)
 
 
-@nb.njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def add_solid_kernel(distance, first, spacing, low, h, density):
+@shared(lambda distance, first, spacing, low, h, density: (0, density.shape[0]), error_model="numpy")
+def add_solid_kernel(begin, end, distance, first, spacing, low, h, density):
     """Adds the share of solid around each node; beyond the terrain's box that goes on for a few nodes."""
     limits = np.array(distance.shape) - 1
-    for i in nb.prange(density.shape[0]):
+    for i in range(begin, end):
         local, base = np.empty(3), np.empty(3, np.int64)
         for j in range(density.shape[1]):
             for k in range(density.shape[2]):
                 far = False
                 for axis in range(3):
-                    x = (low[axis] + h * (np.int64(i), j, k)[axis] - first[axis]) / spacing
+                    x = (low[axis] + h * (i, j, k)[axis] - first[axis]) / spacing
                     inside = min(max(x, 0.0), float(limits[axis]))
                     far = far or abs(x - inside) * spacing > 3 * h
                     base[axis] = min(np.int64(inside), limits[axis] - 1)
@@ -206,15 +207,15 @@ def gather_kernel(points, low, h, density):
                     density[i + u, j + v, k + t] += np.float32(w * c[t])
 
 
-@nb.njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def normals_kernel(points, low, h, density, normals, share):
+@shared(lambda points, *_: (0, -(-points.shape[0] // _CHUNK)), error_model="numpy")
+def normals_kernel(begin, end, points, low, h, density, normals, share):
     n = points.shape[0]
     nx, ny, nz = density.shape
     flat = BLUR * h * math.sqrt(2 * math.pi)
-    for chunk in nb.prange(-(-n // _CHUNK)):
+    for chunk in range(begin, end):
         w, d = np.empty((3, 3)), np.empty((3, 3))
         at = np.empty(3, np.int64)
-        for p in range(np.int64(chunk) * _CHUNK, min((np.int64(chunk) + 1) * _CHUNK, n)):
+        for p in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, n)):
             normals[p, 0], normals[p, 1], normals[p, 2], share[p] = 0.0, 0.0, 1.0, 0.0
             if not math.isfinite(points[p, 0] + points[p, 1] + points[p, 2]):
                 continue
@@ -258,12 +259,12 @@ def _density_at(x, y, z, density):
     return value
 
 
-@nb.njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def depths_kernel(points, normals, low, h, density, out):
+@shared(lambda points, *_: (0, -(-points.shape[0] // _CHUNK)), error_model="numpy")
+def depths_kernel(begin, end, points, normals, low, h, density, out):
     """Adds up the density along each normal, half a node at a time, to both sides until it ends."""
     n = points.shape[0]
-    for chunk in nb.prange(-(-n // _CHUNK)):
-        for p in range(np.int64(chunk) * _CHUNK, min((np.int64(chunk) + 1) * _CHUNK, n)):
+    for chunk in range(begin, end):
+        for p in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, n)):
             total = 0.0
             x, y, z = (points[p, 0] - low[0]) / h, (points[p, 1] - low[1]) / h, (points[p, 2] - low[2]) / h
             if not math.isfinite(x + y + z):

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
-from numba import njit, prange
 from scipy import ndimage
 
 from fluidlift.errors import require
+from fluidlift.numerics.sharing import shared
 
 BROAD = 0.03
 """standard deviation of the blur that separates the shade of a place from its fine look, shares of the picture's longer
@@ -121,10 +121,10 @@ def _sharpened(picture: np.ndarray, fluid: np.ndarray, blur: float) -> np.ndarra
     return np.clip(np.rint(sharp), 0, 255).astype(np.uint8)
 
 
-@njit(cache=True, parallel=True)
-def _residual(frames, fluid, mean, index, instant, out, share):
+@shared(lambda frames, fluid, mean, index, *_: (0, len(index)))
+def _residual(begin, end, frames, fluid, mean, index, instant, out, share):
     _, h, w, _ = frames.shape
-    for i in prange(len(index)):
+    for i in range(begin, end):
         y, x = min(max(index[i, 0], 0.0), h - 1.0), min(max(index[i, 1], 0.0), w - 1.0)
         r, c, t = min(int(y), h - 2), min(int(x), w - 2), instant[i]
         fy, fx = y - r, x - c

@@ -7,6 +7,8 @@ import math
 import numba as nb
 import numpy as np
 
+from fluidlift.numerics.sharing import shared
+
 TAPS = 12
 """places of the map that are looked at for a soft edge"""
 MARGIN = 0.3
@@ -40,17 +42,32 @@ def _texel(texture, u, v, k):
     return (1.0 - b) * upper + b * lower
 
 
-@nb.njit(cache=True, parallel=True, error_model="numpy")
+@shared(lambda face, *_: (0, face.shape[0]), error_model="numpy")
 def paint(
-    face, share, found, vertices, faces, smooth, colors, uv, texture, textured, view, crease, depth, albedo, normal
+    begin,
+    end,
+    face,
+    share,
+    found,
+    vertices,
+    faces,
+    smooth,
+    colors,
+    uv,
+    texture,
+    textured,
+    view,
+    crease,
+    depth,
+    albedo,
+    normal,
 ):
     """Depth, albedo and normal (world, towards the viewer) of a mesh's pixels that are nearer than what is there.
 
     view: fx, fy, cx, cy, then the camera's axes in the world (rotation, row by row). crease: cosine between a face and
     its smooth normal below which the face's own is taken.
     """
-    for row in nb.prange(face.shape[0]):
-        i = np.int64(row)
+    for i in range(begin, end):
         for j in range(face.shape[1]):
             f = face[i, j]
             if f < 0 or (depth[i, j] > 0 and depth[i, j] <= found[i, j]):
@@ -95,10 +112,10 @@ def paint(
             normal[i, j, 0], normal[i, j, 1], normal[i, j, 2] = sign * nx, sign * ny, sign * nz
 
 
-@nb.njit(cache=True, parallel=True)
-def world_points(pixels, depth, view, eye, points):
+@shared(lambda pixels, *_: (0, pixels.shape[0]))
+def world_points(begin, end, pixels, depth, view, eye, points):
     """Points [n,3] (m) seen at pixels (row, column) of a depth picture; `view` as of `paint`."""
-    for n in nb.prange(pixels.shape[0]):
+    for n in range(begin, end):
         i, j = pixels[n, 0], pixels[n, 1]
         z = depth[i, j]
         x, y = (j + 0.5 - view[2]) / view[0], (i + 0.5 - view[3]) / view[1]
@@ -106,8 +123,8 @@ def world_points(pixels, depth, view, eye, points):
             points[n, k] = eye[k] + z * (view[4 + k] * x + view[7 + k] * y + view[10 + k])
 
 
-@nb.njit(cache=True, parallel=True, error_model="numpy")
-def shadowed(points, normals, sun, toward, bias, solid, first, left, tiles, places, reach, lit):
+@shared(lambda points, *_: (0, points.shape[0]), error_model="numpy")
+def shadowed(begin, end, points, normals, sun, toward, bias, solid, first, left, tiles, places, reach, lit):
     """Share [n,3] of light from one direction at points, by the light's own picture of the scene.
 
     sun: f, cx, cy, rotation (row by row) and translation of the light's camera. bias: m, width of its pixels:
@@ -117,7 +134,7 @@ def shadowed(points, normals, sun, toward, bias, solid, first, left, tiles, plac
     texels around, weighted, which is the least that does not show the texels.
     """
     h, w = solid.shape
-    for n in nb.prange(points.shape[0]):
+    for n in range(begin, end):
         cos = normals[n, 0] * toward[0] + normals[n, 1] * toward[1] + normals[n, 2] * toward[2]
         if cos <= 0.0:
             lit[n, 0], lit[n, 1], lit[n, 2] = 0.0, 0.0, 0.0
@@ -164,14 +181,13 @@ def shadowed(points, normals, sun, toward, bias, solid, first, left, tiles, plac
         lit[n, 0], lit[n, 1], lit[n, 2] = r / taps, g / taps, b / taps
 
 
-@nb.njit(cache=True, parallel=True, error_model="numpy")
-def filled_in(coarse, step, depth, normal, alike, out):
+@shared(lambda coarse, step, depth, *_: (0, depth.shape[0]), error_model="numpy")
+def filled_in(begin, end, coarse, step, depth, normal, alike, out):
     """A picture known in every `step`-th row and column, at all pixels with a depth: between the four known pixels
     around, those count that lie on the same surface (depths within a share `alike`, similar normals)."""
-    h, w = depth.shape
+    _, w = depth.shape
     rows, columns = coarse.shape[0], coarse.shape[1]
-    for row in nb.prange(h):
-        i = np.int64(row)
+    for i in range(begin, end):
         for j in range(w):
             if depth[i, j] <= 0.0:
                 continue
@@ -195,10 +211,10 @@ def filled_in(coarse, step, depth, normal, alike, out):
                 out[i, j, 0], out[i, j, 1], out[i, j, 2] = x / total, y / total, z / total
 
 
-@nb.njit(cache=True, parallel=True)
-def lay_over(layer, layer_depth, image, depth):
+@shared(lambda layer, layer_depth, image, depth: (0, depth.shape[0]))
+def lay_over(begin, end, layer, layer_depth, image, depth):
     """A picture laid over another where its depth (m; 0: none) is smaller, in place."""
-    for row in nb.prange(depth.shape[0]):
+    for row in range(begin, end):
         for j in range(depth.shape[1]):
             z = layer_depth[row, j]
             if z > 0.0 and (depth[row, j] <= 0.0 or z < depth[row, j]):

@@ -38,7 +38,6 @@ from fluidlift.look.liquid_lookup import SLANTED, pyramid
 from fluidlift.look.materials import Material
 from fluidlift.look.optics import fresnel, transmittance
 from fluidlift.look.smoothstep import smoothstep
-from fluidlift.numerics.sharing import in_pieces
 from fluidlift.types.camera import PinholeCamera
 
 SHARP = 0.004
@@ -175,8 +174,7 @@ def shaded(
         *LUMINANCE,
     ])  # fmt: skip
     world = (*_pictures(environment), _STEPS, _DIM, SECOND_RADIATION / WAVELENGTHS)
-    with in_pieces(len(picture)):
-        shade(_arrays(surface), _scene(behind, surface), _eye(camera), world, numbers, picture)
+    shade(_arrays(surface), _scene(behind, surface), _eye(camera), world, numbers, picture)
     return picture
 
 

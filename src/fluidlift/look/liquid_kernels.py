@@ -20,6 +20,7 @@ from fluidlift.look.environment_stack import fading, place_of, value_at
 from fluidlift.look.liquid_lookup import blurred_end, borders, fetch_beyond, hides, seen_beside, shown_of_film
 from fluidlift.look.smoothstep import eased
 from fluidlift.look.transparent_rays import fanned, far_side, onward, seen_from, turned_normals
+from fluidlift.numerics.sharing import PIECES, shared
 
 STEPS = 3
 """times that the ray behind the liquid looks up how far away what it meets is"""
@@ -267,8 +268,8 @@ def _follow(i, j, surface, behind, eye, index, ray):
         fetch_beyond(picture, levels, u, v, APART * ray[WIDE] * gone * lens[0], rest, ray, COLOR)
 
 
-@nb.njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def follow(pixels, surface, behind, eye, index, rays):
+@shared(lambda pixels, *_: (0, pixels.shape[0]), error_model="numpy", pieces=PIECES)
+def follow(begin, end, pixels, surface, behind, eye, index, rays):
     """The numbers [n, NUMBERS] of every pixel of `pixels` (row, column): the share of light mirrored; the directions
     (world) of the mirrored ray and of the one that comes through; metres in the liquid; whether the latter's light is
     the environment's (1) or the picture's (0); the share of it that is mirrored at the far side instead, and the
@@ -278,7 +279,7 @@ def follow(pixels, surface, behind, eye, index, rays):
 
     surface, behind, eye: as of `shade`.
     """
-    for m in nb.prange(pixels.shape[0]):
+    for m in range(begin, end):
         _follow(pixels[m, 0], pixels[m, 1], surface, behind, eye, index, rays[m])
 
 
@@ -366,8 +367,8 @@ def _pixel(i, j, surface, behind, eye, world, numbers, ray, light):
         light[k] = share * mirror[k] + (1.0 - share) * light[k]
 
 
-@nb.njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def shade(surface, behind, eye, world, numbers, out):
+@shared(lambda surface, *_: (0, surface[0].shape[0]), error_model="numpy", pieces=PIECES)
+def shade(begin, end, surface, behind, eye, world, numbers, out):
     """Adds the liquid to `out`, a copy of the picture; what the numbers are says `liquid.shaded_plain`.
 
     surface: covered, depth, normals, normals of the far side (of no rows: none), thickness, carried colour, grain.
@@ -381,8 +382,7 @@ def shade(surface, behind, eye, world, numbers, out):
     image, levels, depth, rest = behind
     lens, rotation = eye
     values, places, steps, dim, waves = world
-    for row in nb.prange(covered.shape[0]):
-        i = np.int64(row)
+    for i in range(begin, end):
         ray, light = np.empty(NUMBERS), np.empty(6)
         # made once: to bundle arrays costs as much as a pixel
         liquid = (covered, surface_depth, normals, back_normals, thickness, carried, grain)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import numba as nb
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from fluidlift.numerics.sharing import shared
 from fluidlift.numerics.splatting_colors import colors
 from fluidlift.types.camera import PinholeCamera
 from fluidlift.types.gaussians import Gaussians
@@ -30,12 +30,11 @@ def sound(gaussians: Gaussians) -> Bool[np.ndarray, " n"]:
     return ok
 
 
-@nb.njit(cache=True, nogil=True, parallel=True)
-def sound_kernel(means, quats, scales, opacities, sh, ok):
+@shared(lambda means, *_: (0, means.shape[0]))
+def sound_kernel(begin, end, means, quats, scales, opacities, sh, ok):
     """`sound_plain` in one pass. A sum of zeros, each times a number, is 0 only if all of them are finite."""
     zero = np.float32(0)
-    for i0 in nb.prange(means.shape[0]):
-        i = np.int64(i0)
+    for i in range(begin, end):
         total, largest, least = zero * opacities[i], zero, scales[i, 0]
         for k in range(3):
             total += zero * means[i, k] + zero * scales[i, k]

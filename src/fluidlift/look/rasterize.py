@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba as nb
 import numpy as np
 from jaxtyping import Float
 
 from fluidlift.errors import require
 from fluidlift.look.project import LARGEST, bounded_scales, camera_depths, sound, view_colors
+from fluidlift.numerics.sharing import shared
 from fluidlift.numerics.splatting import Bins, Projected, View, bin_tiles, project, rasterize_drawn, tiles_met
 from fluidlift.numerics.splatting_kernels import WIDE_TILE
 from fluidlift.types.camera import PinholeCamera
@@ -78,15 +78,14 @@ def render(
     return Rendered(image, depth, light)
 
 
-@nb.njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def over_kernel(image, depth, light, behind):
+@shared(lambda image, *_: (0, image.shape[0]), error_model="numpy")
+def over_kernel(begin, end, image, depth, light, behind):
     """Features and depth (premultiplied) and the light that is left, before a background [h or 1,w or 1,c]. In place,
     and the light becomes the coverage: one pass over the picture, where array operations make eight with as many
     arrays."""
-    height, width, channels = image.shape
+    _, width, channels = image.shape
     one, zero = np.float32(1), np.float32(0)
-    for i0 in nb.prange(height):
-        i = np.int64(i0)
+    for i in range(begin, end):
         bi = min(i, behind.shape[0] - 1)
         for j in range(width):
             bj = min(j, behind.shape[1] - 1)
@@ -113,7 +112,7 @@ def _background(background: tuple[float, ...] | np.ndarray | None, shape: tuple[
     fits = behind.ndim == 0 or behind.shape in ((shape[2],), shape)
     require(fits, f"background of shape {behind.shape}", f"one value per channel ({shape[2]}) or {shape}")
     whole = behind if behind.ndim == 3 else np.broadcast_to(behind, (1, 1, shape[2]))
-    return np.ascontiguousarray(whole)
+    return np.require(whole, requirements=("C", "W"))  # one kind of array, so that the kernel is compiled once
 
 
 def _project_bounded(g: Gaussians, opacities: np.ndarray, camera: PinholeCamera) -> tuple[Projected, np.ndarray, Bins]:

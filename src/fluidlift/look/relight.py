@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 from functools import lru_cache
 
-import numba as nb
 import numpy as np
 from jaxtyping import Float
 
@@ -23,6 +22,7 @@ from fluidlift.look.environment_lookup import picture_place, picture_value
 from fluidlift.look.fluid_normals import fluid_normals
 from fluidlift.look.materials import Material
 from fluidlift.look.smoothstep import smoothstep
+from fluidlift.numerics.sharing import shared
 from fluidlift.numerics.srgb import linear_from_srgb
 from fluidlift.types.camera import PinholeCamera
 from fluidlift.types.gaussians import Gaussians
@@ -121,15 +121,15 @@ def _prepared(material: Material, environment: Environment, eye: np.ndarray) -> 
     return (environment.diffuse, sharper, duller, mirror), numbers
 
 
-@nb.njit(cache=True, nogil=True, parallel=True, error_model="numpy", fastmath={"contract"})
-def shade_kernel(means, normals, share, body, pictures, numbers, out):
+@shared(lambda means, *_: (0, -(-means.shape[0] // _CHUNK)), error_model="numpy", fastmath={"contract"})
+def shade_kernel(begin, end, means, normals, share, body, pictures, numbers, out):
     diffuse, sharper, duller, mirror = pictures
     ex, ey, ez, mean_r, mean_g, mean_b, dull = numbers
     one, last = np.float32(1), len(mirror) - 1
     dim = one - dull
     n = means.shape[0]
-    for chunk in nb.prange(-(-n // _CHUNK)):
-        for p in range(np.int64(chunk) * _CHUNK, min((np.int64(chunk) + 1) * _CHUNK, n)):
+    for chunk in range(begin, end):
+        for p in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, n)):
             nx, ny, nz = normals[p, 0], normals[p, 1], normals[p, 2]
             x, y, z = ex - means[p, 0], ey - means[p, 1], ez - means[p, 2]
             far = max(math.sqrt(x * x + y * y + z * z), np.float32(1e-12))

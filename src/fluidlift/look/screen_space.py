@@ -24,7 +24,6 @@ from fluidlift.look.screen_space_kernels import (
     unit_rows,
 )
 from fluidlift.look.screen_space_spheres import SIDE, place_spheres, sphere_chords, sphere_depths
-from fluidlift.numerics.sharing import in_pieces
 from fluidlift.numerics.srgb import linear_from_srgb
 from fluidlift.numerics.triangles import NEAR, banded, interpolated, rasterize_closed
 from fluidlift.types.camera import PinholeCamera
@@ -164,8 +163,7 @@ def _sphere_depth(points: np.ndarray, radius: float, camera: PinholeCamera) -> t
     """Depth of the nearest sphere (m; infinite: none), and the median depth of what is drawn (m; 0: nothing is)."""
     centres, box, starts, listed, across, down = _placed(points, radius, camera)
     depth = np.empty((camera.size[1], camera.size[0]), np.float32)
-    with in_pieces(len(starts)):
-        sphere_depths(centres, box, starts, listed, radius, across, down, depth)
+    sphere_depths(centres, box, starts, listed, radius, across, down, depth)
     drawn = centres[box[:, 4] > 0, 2]
     return depth, float(np.median(drawn)) if len(drawn) else 0.0
 
@@ -185,8 +183,7 @@ def _through_spheres(
     small = camera.resized((width // 2, height // 2)) if coarse else camera
     centres, box, starts, listed, across, down = _placed(points, radius, small)
     sums = np.zeros((6 if len(colors) else 2, small.size[1], small.size[0]), np.float32)
-    with in_pieces(len(starts)):
-        sphere_chords(centres, box, starts, listed, radius, across, down, depth, colors, sums)
+    sphere_chords(centres, box, starts, listed, radius, across, down, depth, colors, sums)
     step = 2 if coarse else 1
     sums[-1] = np.isfinite(depth[: step * small.size[1] : step, : step * small.size[0] : step])
     near = depth[::4, ::4]
@@ -223,11 +220,10 @@ def _close_notches(inverse: np.ndarray, radius: float, camera: PinholeCamera, ty
 def _smoothed(inverse: np.ndarray, radius: float, camera: PinholeCamera) -> np.ndarray:
     """Inverse depth as of `inverse_depths` without the bumps of the spheres."""
     limit, fall, other = np.float32(LIMIT * radius), np.float32(FALL * radius), np.empty_like(inverse)
-    with in_pieces(len(inverse)):
-        for share, samples in [*((share, max(PER_BELL, share / BUMP)) for share in SMOOTHING), (FINISH, math.inf)]:
-            apart = np.float32(samples)
-            narrow_range(inverse, other, True, camera.focal[0], share * radius, apart, limit, fall)
-            narrow_range(other, inverse, False, camera.focal[1], share * radius, apart, limit, fall)
+    for share, samples in [*((share, max(PER_BELL, share / BUMP)) for share in SMOOTHING), (FINISH, math.inf)]:
+        apart = np.float32(samples)
+        narrow_range(inverse, other, True, camera.focal[0], share * radius, apart, limit, fall)
+        narrow_range(other, inverse, False, camera.focal[1], share * radius, apart, limit, fall)
     return inverse
 
 

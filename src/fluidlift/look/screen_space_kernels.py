@@ -11,6 +11,8 @@ import math
 import numba as nb
 import numpy as np
 
+from fluidlift.numerics.sharing import PIECES, shared
+
 _FUSED = {"contract"}
 LARGEST_WINDOW = 40
 """pairs of pixels that one pass of the smoothing averages, however near the liquid is"""
@@ -25,13 +27,13 @@ SUMS, SUMS_K, SUMS_KK, SUMS_D, SUMS_KD = (np.uint64(k * LANES) for k in range(7,
 """places in the state of `_take_pair`, after the lowest at 0"""
 
 
-@nb.njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def inverse_depths(depth, ground, near, behind, q):
+@shared(lambda depth, ground, near, behind, q: (0, q.shape[0]), error_model="numpy")
+def inverse_depths(begin, end, depth, ground, near, behind, q):
     """Inverse depth (1/m) of the nearest spheres (m; infinite: none), also of those that lie more than `behind` (m)
     behind the ground that hides them, as a pond does behind a rock; else the negative one of the ground (m; 0: none),
     or 0: what the smoothing takes."""
     one = np.float32(1.0)
-    for row in nb.prange(q.shape[0]):
+    for row in range(begin, end):
         for col in range(q.shape[1]):
             z, bed = depth[row, col], ground[row, col]
             if z < np.inf and (bed <= 0 or z < bed or z > bed + behind):
@@ -116,8 +118,8 @@ def _stride_and_steps(own, factor, apart):
     return stride, min(max(int(np.float32(2.0) * most / np.float32(stride)), 1), LARGEST_WINDOW)
 
 
-@nb.njit(cache=True, parallel=True, nogil=True, error_model="numpy", fastmath=_FUSED)
-def narrow_range(q, out, across, focal, width, apart, limit, fall):
+@shared(lambda q, *_: (0, q.shape[0]), error_model="numpy", fastmath=_FUSED, pieces=PIECES)
+def narrow_range(begin, end, q, out, across, focal, width, apart, limit, fall):
     """One pass of smoothing along rows (`across`) or columns of inverse depth q (1/m; negative: of ground beside the
     liquid, 0: nothing there).
 
@@ -131,8 +133,7 @@ def narrow_range(q, out, across, focal, width, apart, limit, fall):
     """
     h, w = q.shape
     factor = np.float32(focal * width)
-    for r in nb.prange(h):
-        row = np.int64(r)
+    for row in range(begin, end):
         state = np.empty(12 * LANES, np.float32)
         outside = np.full(LANES, NEARER, np.float32)
         line = np.full(3 * w if across else 1, NEARER, np.float32)
@@ -164,11 +165,11 @@ def narrow_range(q, out, across, focal, width, apart, limit, fall):
                     out[row, first + n] = own[n] + (skk * state[k + SUMS_D] - sk * state[k + SUMS_KD]) / most
 
 
-@nb.njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def filled_notches(inverse, closed, least):
+@shared(lambda inverse, *_: (0, inverse.shape[0]), error_model="numpy")
+def filled_notches(begin, end, inverse, closed, least):
     """Inverse depths (1/m; 0 or less: no liquid) raised to those of `closed` where that is more than `least` (m)
     nearer, in place."""
-    for row in nb.prange(inverse.shape[0]):
+    for row in range(begin, end):
         for col in range(inverse.shape[1]):
             own, other = abs(inverse[row, col]), closed[row, col]
             if other - own > least * other * own:
@@ -189,16 +190,16 @@ def _slope(before, own, after, limit):
     return np.float32(0.0)
 
 
-@nb.njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def plane_normals(q, lens, rotation, limit, normal):
+@shared(lambda q, *_: (0, q.shape[0]), error_model="numpy")
+def plane_normals(begin, end, q, lens, rotation, limit, normal):
     """Unit normals (world, towards the viewer) of the surface of inverse depth q (1/m; 0 or less: none).
 
     On the plane n . p = 1 the inverse depth is n . (x/z, y/z, 1): its slopes in the picture are n, without error.
     limit: m, steps from pixel to pixel beyond which they belong to different surfaces.
     """
     h, w = q.shape
-    for row in nb.prange(h):
-        b = (np.int64(row) + 0.5 - lens[3]) / lens[1]
+    for row in range(begin, end):
+        b = (row + 0.5 - lens[3]) / lens[1]
         for col in range(w):
             own = q[row, col]
             if own <= 0:
@@ -218,8 +219,8 @@ def plane_normals(q, lens, rotation, limit, normal):
                 normal[row, col, k] = rotation[0, k] * x + rotation[1, k] * y + rotation[2, k] * z
 
 
-@nb.njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def depths_and_cover(q, ground, thickness, near, limits, depth, covered):
+@shared(lambda q, *_: (0, q.shape[0]), error_model="numpy")
+def depths_and_cover(begin, end, q, ground, thickness, near, limits, depth, covered):
     """Depth (m; 0: no liquid) of inverse depths q that the ground (m; 0: none) does not hide, and the share of each
     pixel that liquid of this thickness covers.
 
@@ -228,7 +229,7 @@ def depths_and_cover(q, ground, thickness, near, limits, depth, covered):
     """
     zero, one = np.float32(0.0), np.float32(1.0)
     thin, none, whole = limits[0], limits[1], limits[2]
-    for row in nb.prange(q.shape[0]):
+    for row in range(begin, end):
         for col in range(q.shape[1]):
             bed = ground[row, col]
             there = q[row, col] > zero and (bed <= zero or q[row, col] * bed > one)
@@ -252,10 +253,10 @@ def smooth_normals(vertices, faces, normals):
             normals[at, 2] += nz
 
 
-@nb.njit(cache=True, parallel=True, error_model="numpy")
-def unit_rows(vectors):
+@shared(lambda vectors: (0, vectors.shape[0]), error_model="numpy")
+def unit_rows(begin, end, vectors):
     """Vectors [n,3] made unit, in place; those of length 0 stay."""
-    for i in nb.prange(vectors.shape[0]):
+    for i in range(begin, end):
         length = math.sqrt(vectors[i, 0] ** 2 + vectors[i, 1] ** 2 + vectors[i, 2] ** 2)
         if length > 0:
             vectors[i, 0] /= length
@@ -263,13 +264,12 @@ def unit_rows(vectors):
             vectors[i, 2] /= length
 
 
-@nb.njit(cache=True, parallel=True, error_model="numpy")
-def spread_edges(hit, depth, normal, thickness, albedo, back_normal, covered):
+@shared(lambda hit, *_: (0, hit.shape[0]), error_model="numpy")
+def spread_edges(begin, end, hit, depth, normal, thickness, albedo, back_normal, covered):
     """Share of the pixels that is covered, from their neighbours (1 2 1 both ways), and values for pixels just outside
     an outline, which are those of their nearest neighbour inside: what they cover in part looks like it."""
     h, w = hit.shape
-    for row in nb.prange(h):
-        i = np.int64(row)
+    for i in range(begin, end):
         for j in range(w):
             total, best, best_i, best_j = 0, 0, -1, -1
             for di in range(-1, 2):

@@ -11,6 +11,7 @@ import math
 import numba as nb
 import numpy as np
 
+from fluidlift.numerics.sharing import PIECES, shared
 from fluidlift.numerics.triangles import BAND, scattered
 
 _FUSED = {"contract"}
@@ -22,10 +23,10 @@ FRESH = 128
 """spheres drawn until the farthest depths are looked for again"""
 
 
-@nb.njit(cache=True, parallel=True, error_model="numpy")
-def place_spheres(points, rotation, translation, radius, lens, size, near, centres, box):
+@shared(lambda points, *_: (0, points.shape[0]), error_model="numpy")
+def place_spheres(begin, end, points, rotation, translation, radius, lens, size, near, centres, box):
     """Centres in camera axes, and the columns and rows that each sphere may reach: exact bounds of its outline."""
-    for i in nb.prange(points.shape[0]):
+    for i in range(begin, end):
         x = rotation[0, 0] * points[i, 0] + rotation[0, 1] * points[i, 1] + rotation[0, 2] * points[i, 2]
         y = rotation[1, 0] * points[i, 0] + rotation[1, 1] * points[i, 1] + rotation[1, 2] * points[i, 2]
         z = rotation[2, 0] * points[i, 0] + rotation[2, 1] * points[i, 1] + rotation[2, 2] * points[i, 2]
@@ -101,8 +102,8 @@ def _draw_sphere(x, y, z, square, rows, first, last, wide, low, across, down, bu
                 buf[base + k] = min(buf[base + k], d)
 
 
-@nb.njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def sphere_depths(centres, box, starts, listed, radius, across, down, depth):
+@shared(lambda centres, box, starts, *_: (0, (starts.shape[0] - 1)), error_model="numpy", pieces=PIECES)
+def sphere_depths(begin, end, centres, box, starts, listed, radius, across, down, depth):
     """Camera z of the nearest sphere; infinite where there is none. across, down: x / z and y / z of pixel centres;
     `across` goes on for `SIDE` columns beyond the picture.
 
@@ -114,8 +115,8 @@ def sphere_depths(centres, box, starts, listed, radius, across, down, depth):
     height, width = depth.shape
     blocks = (width + SIDE - 1) // SIDE
     wide = (blocks + 1) * SIDE
-    for t in nb.prange(count):
-        band = scattered(np.int64(t), count)
+    for t in range(begin, end):
+        band = scattered(t, count)
         low, high = band * BAND, min(band * BAND + BAND, height) - 1
         order = np.empty((starts[band + 1] - starts[band], 7), np.float32)
         if order.shape[0] == 0:
@@ -141,8 +142,10 @@ def sphere_depths(centres, box, starts, listed, radius, across, down, depth):
             depth[row] = buf[(row - low) * wide : (row - low) * wide + width]
 
 
-@nb.njit(cache=True, parallel=True, nogil=True, error_model="numpy", fastmath=_FUSED)
-def sphere_chords(centres, box, starts, listed, radius, across, down, depth, colors, sums):
+@shared(
+    lambda centres, box, starts, *_: (0, (starts.shape[0] - 1)), error_model="numpy", fastmath=_FUSED, pieces=PIECES
+)
+def sphere_chords(begin, end, centres, box, starts, listed, radius, across, down, depth, colors, sums):
     """Five pictures: the sum of the lengths (m, along the ray) in all spheres, then colours of those less than a
     diameter from the nearest surface, weighted with their lengths and (1 - (distance / diameter)^2)^3, and these
     weights: on a surface seen at a slant a colour is as flat as the surface is, and what is deeper than it, and thus
@@ -154,8 +157,8 @@ def sphere_chords(centres, box, starts, listed, radius, across, down, depth, col
     square, reach = np.float32(radius * radius), np.float32(2.0 * radius)
     zero, one, support = np.float32(0.0), np.float32(1.0), np.float32(4.0) * square
     step = depth.shape[0] // sums.shape[1]
-    for t in nb.prange(count):
-        band = scattered(np.int64(t), count)
+    for t in range(begin, end):
+        band = scattered(t, count)
         low, high = band * BAND, min(band * BAND + BAND, sums.shape[1]) - 1
         for n in range(starts[band], starts[band + 1]):
             i = listed[n]

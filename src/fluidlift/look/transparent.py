@@ -11,7 +11,6 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 
-import numba as nb
 import numpy as np
 from jaxtyping import Float
 
@@ -21,6 +20,7 @@ from fluidlift.look.project import sound
 from fluidlift.look.smoothstep import smoothstep
 from fluidlift.look.solid_contact import carried_on
 from fluidlift.numerics.nearest import nearest
+from fluidlift.numerics.sharing import shared
 from fluidlift.numerics.splatting import Bins, Projected, View, bin_tiles, project
 from fluidlift.numerics.splatting_kernels import TILE, exp_negative
 from fluidlift.numerics.splatting_projection import REACH_MAX
@@ -223,16 +223,15 @@ def _packed(
     return np.ascontiguousarray(np.concatenate(columns, axis=1), np.float32)
 
 
-@nb.njit(cache=True, nogil=True, parallel=True, fastmath={"contract", "reassoc"}, error_model="numpy")
-def thickness_kernel(packed, starts, gaussians, backwards, skin, rays, total, first):
+@shared(lambda packed, starts, *_: (0, len(starts) - 1), fastmath={"contract", "reassoc"}, error_model="numpy")
+def thickness_kernel(begin, end, packed, starts, gaussians, backwards, skin, rays, total, first):
     """`thickness_plain`, tile by tile, in rows of 16 pixels without branches (see `numerics.splatting_kernels`).
     `backwards`: the farthest first; rays: metres per metre of camera z, and the depth up to which Gaussians count."""
     height, width = total.shape
     stretch, wall = rays
     tiles_x = -(-width // TILE)
     half, none, channels = np.float32(0.5), np.float32(0.0), first.shape[2]
-    for t0 in nb.prange(len(starts) - 1):
-        t = np.int64(t0)
+    for t in range(begin, end):
         if starts[t] == starts[t + 1]:
             continue
         x0, y0 = (t % tiles_x) * TILE, (t // tiles_x) * TILE

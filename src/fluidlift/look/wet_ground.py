@@ -11,7 +11,6 @@ import math
 from dataclasses import replace
 from functools import lru_cache
 
-import numba as nb
 import numpy as np
 from jaxtyping import Float
 
@@ -21,6 +20,7 @@ from fluidlift.look.liquid_kernels import CLOSED, RESTS, ROOM
 from fluidlift.look.materials import Material
 from fluidlift.look.optics import fresnel, wet_light, wet_table
 from fluidlift.look.smoothstep import eased, smoothstep
+from fluidlift.numerics.sharing import shared
 from fluidlift.types.camera import PinholeCamera
 
 ALBEDO = 0.4
@@ -73,8 +73,8 @@ def _slants(index: float) -> np.ndarray:
     return np.stack([enters / index**2, 1.0 / np.sqrt(np.maximum(1.0 - (1.0 - cos**2) / index**2, 1e-6)), enters])
 
 
-@nb.njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def dampen(liquid, ground, lens, pose, extinction, table, slants, shaded, direct, image):
+@shared(lambda liquid, *_: (0, liquid[1].shape[0]), error_model="numpy")
+def dampen(lead, stop, liquid, ground, lens, pose, extinction, table, slants, shaded, direct, image):
     """`wetted_plain`, pixel by pixel. liquid: covered, depth, normal, thickness, grain; ground: depth of what is
     behind, albedo and depth of the ground alone; table: of `optics.wet_table`; slants: of `_slants`;
     direct: of `Behind`, or empty."""
@@ -84,8 +84,7 @@ def dampen(liquid, ground, lens, pose, extinction, table, slants, shaded, direct
     # the table is even in the roots of depths, and the root of a product is that of its factors
     roots = last * np.sqrt(extinction / table[0, -1])
     steps, straight_in = slants.shape[1] - 1, slants[2, -1]
-    for row in nb.prange(near.shape[0]):
-        i = np.int64(row)
+    for i in range(lead, stop):
         y = (i + 0.5 - lens[3]) * lens[5]
         for j in range(near.shape[1]):
             z, end = np.float64(near[i, j]), np.float64(behind[i, j])

@@ -11,7 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
-from numba import njit, prange
+from numba import njit
+
+from fluidlift.numerics.sharing import shared
 
 
 @dataclass(frozen=True)
@@ -76,26 +78,23 @@ def free_constants(
     return FreeConstants(sizes, touched, np.einsum("im,jm->ij", free, free))
 
 
-@njit(parallel=True, cache=True)
-def _count_runs(unknown, wz, low, high):
+@shared(lambda unknown, wz, low, high, *_: (low[0], high[0]))
+def _count_runs(begin, end, unknown, wz, low, high, out):
     """int64 [nx,ny]: runs of unknown cells along z, cut at closed faces; only looked for from low to high - 1."""
-    out = np.zeros(unknown.shape[:2], np.int64)
-    for i_ in prange(low[0], high[0]):
-        i = np.int64(i_)
+    for i in range(begin, end):
         for j in range(low[1], high[1]):
             count = 0
             for k in range(low[2], high[2]):
                 if unknown[i, j, k] and not (k > 0 and unknown[i, j, k - 1] and wz[i, j, k] > 0):
                     count += 1
             out[i, j] = count
-    return out
 
 
-@njit(parallel=True, cache=True)
-def _fill_runs(unknown, wz, beside_known, offset, runs, grounded):
+@shared(lambda unknown, *_: (0, unknown.shape[0]))
+def _fill_runs(begin, end, unknown, wz, beside_known, offset, runs, grounded):
     """First and last cell of each run, and whether it borders on a known cell."""
-    nx, ny, nz = unknown.shape
-    for i in prange(nx):
+    _, ny, nz = unknown.shape
+    for i in range(begin, end):
         for j in range(ny):
             r = offset[i * ny + j]
             k = 0
@@ -186,7 +185,9 @@ def closed_components(
     if unknown.size == 0:
         return ClosedComponents(np.zeros((0, 4), np.int64), np.zeros(0, np.int64), np.zeros(0, np.int64))
     low, high = box if box is not None else (np.zeros(3, np.int64), np.array(unknown.shape))
-    offset = np.concatenate([[0], np.cumsum(_count_runs(unknown, wz, low, high))])
+    counts = np.zeros(unknown.shape[:2], np.int64)
+    _count_runs(unknown, wz, low, high, counts)
+    offset = np.concatenate([[0], np.cumsum(counts)])
     runs, grounded = np.empty((offset[-1], 4), np.int64), np.zeros(offset[-1], bool)
     _fill_runs(unknown, wz, beside_known, offset, runs, grounded)
     if grounded.all():

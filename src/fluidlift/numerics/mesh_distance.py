@@ -13,11 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from numba import njit, prange
+from numba import njit
 from scipy import ndimage
 
 from fluidlift.errors import require
 from fluidlift.messages import NONE, Notice
+from fluidlift.numerics.sharing import shared
 from fluidlift.types import Grid, TriangleMesh
 
 BAND = 2.0
@@ -80,7 +81,9 @@ def mesh_distance(mesh: TriangleMesh, spacing: float, *, margin: float | None = 
     i, j, k = np.asarray(ndimage.distance_transform_edt(nearest < 0, return_distances=False, return_indices=True))
     nearest = np.where(nearest < 0, nearest[i, j, k], nearest)
     for _ in range(FAR_PASSES):
-        nearest = _measure_far(triangles, origin, spacing, nearest, squared)
+        best = np.empty_like(nearest)
+        _measure_far(triangles, origin, spacing, nearest, squared, best)
+        nearest = best
     crossings = np.zeros(nearest.shape, np.int32)
     _count_crossings(triangles, origin, spacing, crossings)
     inside = np.cumsum(crossings, axis=0) > 0
@@ -134,12 +137,11 @@ def squared_distance_to_triangle(t, px, py, pz):
     )
 
 
-@njit(parallel=True, cache=True)
-def _measure_band(triangles, start, order, low, h, band, nearest, squared):
+@shared(lambda triangles, start, order, low, h, band, nearest, *_: (0, nearest.shape[0]))
+def _measure_band(begin, end, triangles, start, order, low, h, band, nearest, squared):
     """Nearest triangle of every node within `band` of the box around a triangle; planes across x are independent."""
-    nx, ny, nz = nearest.shape
-    for i_ in prange(nx):
-        i = np.int64(i_)
+    _, ny, nz = nearest.shape
+    for i in range(begin, end):
         x = low[0] + i * h
         for n in range(start[i], start[i + 1]):
             f = order[n]
@@ -158,13 +160,11 @@ def _measure_band(triangles, start, order, low, h, band, nearest, squared):
                         nearest[i, j, k] = f
 
 
-@njit(parallel=True, cache=True)
-def _measure_far(triangles, low, h, nearest, squared):
-    """Nodes are measured against their own triangle and those of their neighbours; returns the nearest ones."""
+@shared(lambda triangles, low, h, nearest, *_: (0, nearest.shape[0]))
+def _measure_far(begin, end, triangles, low, h, nearest, squared, best):
+    """Nodes are measured against their own triangle and those of their neighbours; best: the nearest ones."""
     nx, ny, nz = nearest.shape
-    best = np.empty_like(nearest)
-    for i_ in prange(nx):
-        i = np.int64(i_)
+    for i in range(begin, end):
         for j in range(ny):
             for k in range(nz):
                 x, y, z = low[0] + i * h, low[1] + j * h, low[2] + k * h
@@ -189,7 +189,6 @@ def _measure_far(triangles, low, h, nearest, squared):
                         distance = d
                         best[i, j, k] = f
                 squared[i, j, k] = distance
-    return best
 
 
 @njit(cache=True)

@@ -10,7 +10,7 @@ stays where it is while the cells grow, so that it lies nearer in cells; a cell 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from fluidlift.numerics.multigrid_kernels import (
     HALF,
@@ -23,6 +23,7 @@ from fluidlift.numerics.multigrid_kernels import (
     neighbour_starts,
     place,
 )
+from fluidlift.numerics.sharing import in_order, shared
 
 BLOCK = 8
 """t are visited in blocks of as many: a vector of single precision"""
@@ -37,12 +38,17 @@ AIR_LIMIT = 3.0
 but the coarse cell around it reaches further"""
 
 
-@njit(parallel=True, cache=True)
 def bounds(unknown):
     """int64 [nx,4]: first j, last j + 1, first k, last k + 1 of the unknown cells of each plane; 0 where none is."""
-    nx, ny, nz = unknown.shape
-    out = np.zeros((nx, 4), np.int64)
-    for i in prange(nx):
+    out = np.zeros((unknown.shape[0], 4), np.int64)
+    _bounds(unknown, out)
+    return out
+
+
+@shared(lambda unknown, *_: (0, unknown.shape[0]))
+def _bounds(begin, end, unknown, out):
+    _, ny, nz = unknown.shape
+    for i in range(begin, end):
         j0, j1, k0, k1 = ny, 0, nz, 0
         for j in range(ny):
             count = 0
@@ -60,7 +66,6 @@ def bounds(unknown):
                 k1 = max(k1, k)
         if j1 > 0:
             out[i, 0], out[i, 1], out[i, 2], out[i, 3] = j0, j1, k0, k1
-    return out
 
 
 def geometry_of(shape: tuple[int, ...]) -> np.ndarray:
@@ -79,8 +84,8 @@ def geometry_of(shape: tuple[int, ...]) -> np.ndarray:
     return np.array(lines, np.int64)
 
 
-@njit(parallel=True, cache=True)
-def assemble_finest(g, corner, unknown, weights, added, operator, ranges, beside_known):
+@shared(lambda g, *_: (1, g[PLANES] - 1))
+def assemble_finest(begin, end, g, corner, unknown, weights, added, operator, ranges, beside_known):
     """Couplings between unknown cells, weights towards known cells, the rows' ranges, and whether air is not 0.
 
     corner: indices of the first cell of the level in the arrays of the whole grid. added: of size 0 for none.
@@ -89,8 +94,7 @@ def assemble_finest(g, corner, unknown, weights, added, operator, ranges, beside
     wx, wy, wz = weights
     air, cx, cy, cz = operator
     first, last = ranges
-    for i_ in prange(1, g[PLANES] - 1):
-        i = np.int64(i_)
+    for i in range(begin, end):
         x = corner[0] + i - 1
         first_row = g[ROW_BASE] + i * g[ROWS]
         first[first_row : first_row + g[ROWS]] = g[LENGTH]
@@ -140,14 +144,13 @@ def _range_of_coarse_row(fine, i, j, ranges):
     return ((low + 1) // 2, high // 2 + 1) if high > 0 else (np.int64(1), np.int64(1))
 
 
-@njit(parallel=True, cache=True)
-def assemble_coarse(fine, coarse, inverse, operator, ranges):
+@shared(lambda fine, coarse, *_: (1, coarse[PLANES] - 1))
+def assemble_coarse(begin, end, fine, coarse, inverse, operator, ranges):
     """Sums over the fine cells of each coarse cell: of the couplings across its low sides, and of air."""
     half = np.float32(0.5)
     air, cx, cy, cz = operator
     first, last = ranges
-    for i_ in prange(1, coarse[PLANES] - 1):
-        i = np.int64(i_)
+    for i in range(begin, end):
         for j in range(1, coarse[ROWS] - 1):
             row = coarse[ROW_BASE] + i * coarse[ROWS] + j
             low, high = _range_of_coarse_row(fine, i, j, ranges)
@@ -189,39 +192,40 @@ def _span(g, i, ranges):
     return begin, min(end, g[HALF])
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
 def invert_diagonal(g, operator, ranges, inverse, common):
     """inverse = 1 / diagonal; common [3]: the largest couplings along x, y, z."""
-    air, cx, cy, cz = operator
     largest = np.zeros((g[PLANES], 3), np.float32)
-    for i_ in prange(1, g[PLANES] - 1):
-        i = np.int64(i_)
-        a, end = _span(g, i, ranges)
+    _invert_diagonal(g, operator, ranges, inverse, largest)
+    common[:] = largest.max(axis=0)
+
+
+@shared(lambda g, *_: (1, g[PLANES] - 1), error_model="numpy")
+def _invert_diagonal(begin, end, g, operator, ranges, inverse, largest):
+    air, cx, cy, cz = operator
+    for i in range(begin, end):
+        a, stop = _span(g, i, ranges)
         for s in range(2):
             own, _low, high, _left, right = neighbour_starts(g, i, s)
             o, f, u, r = U(own + a), U(own + 2 * g[HALF] + a), U(high + a), U(right + a)
             mx = my = mz = np.float32(0.0)
-            for t in range(U(end - a)):
+            for t in range(U(stop - a)):
                 total = np.float32(air[o + t]) + cx[o + t] + cx[f + t] + cz[o + t] + cz[u + t] + cy[o + t] + cy[r + t]
                 inverse[o + t] = np.float32(1.0) / total if total > 0 else np.float32(0.0)
                 mx, my, mz = max(mx, cx[o + t]), max(my, cy[o + t]), max(mz, cz[o + t])
             largest[i, 0] = max(largest[i, 0], mx)
             largest[i, 1] = max(largest[i, 1], my)
             largest[i, 2] = max(largest[i, 2], mz)
-    for axis in range(3):
-        common[axis] = largest[:, axis].max()
 
 
-@njit(parallel=True, cache=True)
-def classify(g, common, inverse, operator, ranges, same, blocks):
+@shared(lambda g, *_: (1, g[PLANES] - 1))
+def classify(lead, stop, g, common, inverse, operator, ranges, same, blocks):
     """What each block of t holds: nothing, `SAME` or `MIXED` couplings; whether all blocks of a row are `SAME`.
 
     Only pairs of unknown cells count: a closed face between two makes their blocks `MIXED`.
     """
     _, cx, cy, cz = operator
     wx, wy, wz = common[0], common[1], common[2]
-    for i_ in prange(1, g[PLANES] - 1):
-        i = np.int64(i_)
+    for i in range(lead, stop):
         begin, end = _span(g, i, ranges)
         for s in range(2):
             own, low, high, left, right = neighbour_starts(g, i, s)
@@ -279,13 +283,17 @@ def find_segments(g, blocks, offset, start, stop, same):
     return 2 * (stop[begun:used] - start[begun:used]).sum()
 
 
-@njit(parallel=True, cache=True)
 def load(g, corner, values, factor, cells, out):
     """out = factor * values at the unknown cells. Returns the sum of squares; not finite where some value is not."""
-    inverse, first, last = cells
     sums = np.zeros(g[PLANES])
-    for i_ in prange(1, g[PLANES] - 1):
-        i = np.int64(i_)
+    _load(g, corner, values, factor, cells, out, sums)
+    return in_order(sums)
+
+
+@shared(lambda g, *_: (1, g[PLANES] - 1))
+def _load(begin, end, g, corner, values, factor, cells, out, sums):
+    inverse, first, last = cells
+    for i in range(begin, end):
         for j in range(1, g[ROWS] - 1):
             row = g[ROW_BASE] + i * g[ROWS] + j
             for k in range(first[row], last[row]):
@@ -294,15 +302,13 @@ def load(g, corner, values, factor, cells, out):
                     value = factor * values[corner[0] + i - 1, corner[1] + k - 1, corner[2] + j - 1]
                     out[o] = value
                     sums[i] += value * value
-    return sums.sum()
 
 
-@njit(parallel=True, cache=True)
-def store(g, corner, values, cells, out):
+@shared(lambda g, *_: (1, g[PLANES] - 1))
+def store(begin, end, g, corner, values, cells, out):
     """out at the unknown cells = values."""
     inverse, first, last = cells
-    for i_ in prange(1, g[PLANES] - 1):
-        i = np.int64(i_)
+    for i in range(begin, end):
         for j in range(1, g[ROWS] - 1):
             row = g[ROW_BASE] + i * g[ROWS] + j
             for k in range(first[row], last[row]):
@@ -311,21 +317,17 @@ def store(g, corner, values, cells, out):
                     out[corner[0] + i - 1, corner[1] + k - 1, corner[2] + j - 1] = values[o]
 
 
-@njit(parallel=True, cache=True)
-def _sum_runs(g, corner, runs, values):
-    sums = np.zeros(len(runs))
-    for r_ in prange(len(runs)):
-        r = np.int64(r_)
+@shared(lambda g, corner, runs, *_: (0, len(runs)))
+def _sum_runs(begin, end, g, corner, runs, values, sums):
+    for r in range(begin, end):
         i, k = runs[r, 0] - corner[0] + 1, runs[r, 1] - corner[1] + 1
         for z in range(runs[r, 2], runs[r, 3]):
             sums[r] += values[place(g, i, z - corner[2] + 1, k)]
-    return sums
 
 
-@njit(parallel=True, cache=True)
-def _shift_runs(g, corner, runs, shift, values):
-    for r_ in prange(len(runs)):
-        r = np.int64(r_)
+@shared(lambda g, corner, runs, *_: (0, len(runs)))
+def _shift_runs(begin, end, g, corner, runs, shift, values):
+    for r in range(begin, end):
         i, k = runs[r, 0] - corner[0] + 1, runs[r, 1] - corner[1] + 1
         for z in range(runs[r, 2], runs[r, 3]):
             values[place(g, i, z - corner[2] + 1, k)] += shift[r]
@@ -335,7 +337,9 @@ def component_sums(
     g: np.ndarray, corner: np.ndarray, runs: np.ndarray, labels: np.ndarray, count: int, values: np.ndarray
 ) -> np.ndarray:
     """Sum of values over the cells of each component."""
-    return np.bincount(labels, weights=_sum_runs(g, corner, runs, values), minlength=count)
+    sums = np.zeros(len(runs))
+    _sum_runs(g, corner, runs, values, sums)
+    return np.bincount(labels, weights=sums, minlength=count)
 
 
 def shift_components(

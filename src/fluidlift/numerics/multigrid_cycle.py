@@ -4,6 +4,9 @@ A level of many cells is cut into parts of planes, one per thread. First the thr
 each half sweep one plane further from the borders of the part than the one before; then they fill in what is left
 around the borders. Red and black cells do not see their own colour, so the result is that of plain half sweeps, to the
 last bit. The levels below are visited by one thread, in one go.
+
+What is inlined is compiled once, with what calls it, instead of once for itself and once more for each that calls it.
+The functions of one plane are not: with them, Numba would take longer to find all types.
 """
 
 from __future__ import annotations
@@ -11,7 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from fluidlift.numerics.multigrid_kernels import (
     BLACK,
@@ -29,7 +32,10 @@ from fluidlift.numerics.multigrid_kernels import (
     wave_turn,
     wave_up,
 )
+from fluidlift.numerics.sharing import in_order, shared
 
+NONE, FIRST = np.int64(0), np.int64(1)
+"""of one type with computed numbers, as `multigrid_kernels.RED`"""
 LEAST_PLANES = 12
 """planes per part: the borders of a part must not meet"""
 COARSEST_SWEEPS = 8
@@ -80,11 +86,17 @@ def _part(c, border, g):
     return (b, b, -1, 1) if border else (a, b, int(c > 0), -int(c < parts - 1))
 
 
-@njit(parallel=True, cache=True)
-def _down(border, levels, work, operator, rows, segments):
+@njit(cache=True)
+def _all_planes(g):
+    """As `_part` of a level that is not cut."""
+    return FIRST, g[PLANES] - 1, NONE, NONE
+
+
+@shared(lambda border, levels, *_: (0, levels[0][PARTS] - border), least=1)
+def _down(begin, end, border, levels, work, operator, rows, segments):
     fine, coarse, _ = levels
-    for c_ in prange(fine[PARTS] - border):
-        reach = _part(np.int64(c_), border, fine)
+    for part in range(begin, end):
+        reach = _part(part, border, fine)
         a, b, da, db = reach
         # coarse planes whose fine planes and the neighbours of these are done
         first = (b - 3) // 2 if border else ((a + 6) // 2 if da else 1)
@@ -92,39 +104,39 @@ def _down(border, levels, work, operator, rows, segments):
         wave_down(reach, (first, last), levels, work, operator, rows, segments)
 
 
-@njit(parallel=True, cache=True)
-def _up(border, levels, work, operator, rows, segments, sums):
+@shared(lambda border, levels, *_: (0, levels[0][PARTS] - border), least=1)
+def _up(begin, end, border, levels, work, operator, rows, segments, sums):
     fine, _, _ = levels
-    for c_ in prange(fine[PARTS] - border):
-        wave_up(_part(np.int64(c_), border, fine), levels, work, operator, rows, segments, sums)
+    for part in range(begin, end):
+        wave_up(_part(part, border, fine), levels, work, operator, rows, segments, sums)
 
 
-@njit(parallel=True, cache=True)
-def _turn(border, g, vectors, factor, operator, segments, sums):
-    for c_ in prange(g[PARTS] - border):
-        wave_turn(_part(np.int64(c_), border, g), g, vectors, factor, operator, segments, sums)
+@shared(lambda border, g, *_: (0, g[PARTS] - border), least=1)
+def _turn(begin, end, border, g, vectors, factor, operator, segments, sums):
+    for part in range(begin, end):
+        wave_turn(_part(part, border, g), g, vectors, factor, operator, segments, sums)
 
 
-@njit(parallel=True, cache=True)
-def _residual(g, vectors, operator, segments, sums):
+@shared(lambda g, *_: (0, g[PARTS]), least=1)
+def _residual(begin, end, g, vectors, operator, segments, sums):
     """q = A p, r = b - q, where vectors = (p, b, q, r)."""
     p, b, q, r = vectors
-    for c_ in prange(g[PARTS]):
-        first, last, _, _ = _part(np.int64(c_), 0, g)
+    for part in range(begin, end):
+        first, last, _, _ = _part(part, NONE, g)
         for i in range(first, last):
             apply_plane(i, g, p, q, operator, segments)
             sums[i] = residual_plane(i, g, b, q, r, segments)
 
 
-@njit(parallel=True, cache=True)
-def _descend(g, vectors, step, scale, segments, sums):
-    for c_ in prange(g[PARTS]):
-        first, last, _, _ = _part(np.int64(c_), 0, g)
+@shared(lambda g, *_: (0, g[PARTS]), least=1)
+def _descend(begin, end, g, vectors, step, scale, segments, sums):
+    for part in range(begin, end):
+        first, last, _, _ = _part(part, NONE, g)
         for i in range(first, last):
             sums[i] = descend_plane(i, g, vectors, step, scale, segments)
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _sweep_coarsest(g, common, work, operator, segments, sums):
     """Many sweeps, forth and back."""
     half_sweeps = 4 * COARSEST_SWEEPS
@@ -139,27 +151,18 @@ def _sweep_coarsest(g, common, work, operator, segments, sums):
         sums[i] = dot_plane(i, g, work, segments)
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _cycle_alone(geometry, common, work, operator, rows, segments, sums):
     """A V-cycle by one thread. sums gets x . rhs of each plane of its finest level."""
     coarsest = len(geometry) - 1
     for l in range(coarsest):
         levels = (geometry[l], geometry[l + 1], common[l])
-        whole = (1, geometry[l, PLANES] - 1, 0, 0)
-        wave_down(whole, (1, geometry[l + 1, PLANES] - 1), levels, work, operator, rows, segments)
+        coarse_planes = (FIRST, geometry[l + 1, PLANES] - 1)
+        wave_down(_all_planes(geometry[l]), coarse_planes, levels, work, operator, rows, segments)
     _sweep_coarsest(geometry[coarsest], common[coarsest], work, operator, segments, sums)
     for l in range(coarsest - 1, -1, -1):
         levels = (geometry[l], geometry[l + 1], common[l])
-        wave_up((1, geometry[l, PLANES] - 1, 0, 0), levels, work, operator, rows, segments, sums)
-
-
-@njit(cache=True, nogil=True)
-def _in_order(sums):
-    """Their sum, one after the other: the same in and out of compiled code."""
-    total = 0.0
-    for value in sums:
-        total += value
-    return total
+        wave_up(_all_planes(geometry[l]), levels, work, operator, rows, segments, sums)
 
 
 def cycle(h: Hierarchy, sums: np.ndarray) -> float:
@@ -177,7 +180,7 @@ def cycle(h: Hierarchy, sums: np.ndarray) -> float:
     for pair in pairs[::-1]:
         for border in (0, 1):
             _up(border, pair, *arrays, sums)
-    return _in_order(sums)
+    return in_order(sums)
 
 
 @njit(cache=True)
@@ -218,6 +221,10 @@ def conjugate_gradients(
         low_rank: places, values, starts and inverse masses for `add_low_rank`.
     """
     g = h.geometry[0]
+    if g[PARTS] == 1 and len(low_rank[0]) == 0:
+        levels = (h.geometry, h.common, h.work, h.operator, h.rows, h.segments)
+        vectors = (np.zeros_like(b), np.zeros_like(b), np.zeros(len(b), np.float32))
+        return conjugate_gradients_alone(levels, p, b, goal, max_iterations, vectors)
     sums = np.zeros(g[PLANES])
     q, r, direction = np.zeros_like(b), np.zeros_like(b), np.zeros(len(b), np.float32)
 
@@ -228,7 +235,7 @@ def conjugate_gradients(
     def true_residual() -> float:
         _residual(g, (p, b, q, r), h.operator, h.segments, sums)
         if not with_terms:
-            return _in_order(sums)
+            return in_order(sums)
         add_low_rank(p, q, *low_rank)
         np.subtract(b, q, out=r)
         return float(np.square(r).sum())
@@ -248,12 +255,12 @@ def conjugate_gradients(
             factor = np.float32(0.0 if fresh else rz / previous)
             for border in range(min(g[PARTS], 2)):
                 _turn(border, g, turned, factor, h.operator, h.segments, sums)
-            curvature = _in_order(sums) + (add_low_rank(direction, q, *low_rank) if with_terms else 0.0)
+            curvature = in_order(sums) + (add_low_rank(direction, q, *low_rank) if with_terms else 0.0)
             if not curvature > 0:
                 break
             # rz and the direction belong to the scaled residual
             _descend(g, moved, rz / (scale * curvature), scale, h.segments, sums)
-            squared, fresh = _in_order(sums), False
+            squared, fresh = in_order(sums), False
             iterations += 1
         squared = true_residual()
         if not squared < 0.25 * before:
@@ -261,7 +268,7 @@ def conjugate_gradients(
     return iterations, float(np.sqrt(squared))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, inline="always")
 def _true_residual(g, vectors, operator, segments):
     p, b, q, r = vectors
     total = 0.0
@@ -283,7 +290,7 @@ def conjugate_gradients_alone(level_arrays, p, b, goal, max_iterations, vectors)
     q, r, direction = vectors
     x, rhs, _ = work
     sums = np.zeros(g[PLANES])
-    whole = (1, g[PLANES] - 1, 0, 0)
+    whole = _all_planes(g)
     moved = (p, r, direction, q, rhs)
     squared, iterations = _true_residual(g, (p, b, q, r), operator, segments), 0
     for _ in range(RESTARTS):
@@ -295,17 +302,17 @@ def conjugate_gradients_alone(level_arrays, p, b, goal, max_iterations, vectors)
             descend_plane(i, g, moved, 0.0, scale, segments)
         while iterations < max_iterations and squared > goal**2:
             _cycle_alone(geometry, common, work, operator, rows, segments, sums)
-            previous, rz = rz, _in_order(sums)
+            previous, rz = rz, in_order(sums)
             if not rz > 0:
                 break
             factor = np.float32(0.0 if fresh else rz / previous)
             wave_turn(whole, g, (direction, x, q), factor, operator, segments, sums)
-            curvature = _in_order(sums)
+            curvature = in_order(sums)
             if not curvature > 0:
                 break
             for i in range(1, g[PLANES] - 1):
                 sums[i] = descend_plane(i, g, moved, rz / (scale * curvature), scale, segments)
-            squared, fresh = _in_order(sums), False
+            squared, fresh = in_order(sums), False
             iterations += 1
         squared = _true_residual(g, (p, b, q, r), operator, segments)
         if not squared < 0.25 * before:

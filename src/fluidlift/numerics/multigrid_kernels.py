@@ -33,7 +33,8 @@ FAST = {"contract", "nsz", "reassoc"}
 PLANES, ROWS, LENGTH, HALF, BASE, ROW_BASE, SEGMENT_BASE, CELLS, PARTS = range(9)
 """columns of `geometry`, which has a line g per level: planes, rows and cells per row with ghosts, size of half a
 plane, where the level starts in the arrays of cells, rows and segment offsets, cells in segments, parts for threads"""
-RED, BLACK = 0, 1
+RED, BLACK = np.int64(0), np.int64(1)
+"""of one type with computed ones: a function that is given a literal number is compiled once more for it"""
 
 U = np.uint64
 
@@ -263,7 +264,7 @@ def descend_plane(i, g, vectors, step, scale, segments):
     return dot
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def wave_down(reach, coarse_planes, levels, work, operator, rows, segments):
     """Four half sweeps from x = 0, then the residual on the coarse planes from the first to the last - 1.
 
@@ -289,7 +290,7 @@ def wave_down(reach, coarse_planes, levels, work, operator, rows, segments):
         c += 1
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def wave_up(reach, levels, work, operator, rows, segments, sums):
     """The coarse correction and four half sweeps, in a wave as `wave_down`; sums gets x . rhs of each plane."""
     a, b, da, db = reach
@@ -306,7 +307,7 @@ def wave_up(reach, levels, work, operator, rows, segments, sums):
                     sums[i] = dot_plane(i, fine, work, segments)
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def wave_turn(reach, g, vectors, factor, operator, segments, sums):
     """direction = z + factor direction and q = A direction, in a wave; sums gets direction . q of each plane.
 

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from fluidlift.errors import require
+from fluidlift.numerics.sharing import shared
 
 _CHUNK = 256
 CELLS_PER_PARTICLE = 4
@@ -32,14 +33,14 @@ def cells_kernel(points, low, reach, shape, cells):
         cells[p] = number
 
 
-@nb.njit(cache=True, nogil=True, parallel=True, error_model="numpy", fastmath={"contract"})
-def mean_kernel(points, particles, values, starts, low, reach, shape, out, total):
+@shared(lambda points, *_: (0, -(-points.shape[0] // _CHUNK)), error_model="numpy", fastmath={"contract"})
+def mean_kernel(begin, end, points, particles, values, starts, low, reach, shape, out, total):
     """Sums over the particles (sorted by cell) of weight times value, divided by the sum of weights, which is kept."""
     n, width, one = points.shape[0], values.shape[1], np.float32(1)
     steep = np.float32(1.0 / (reach * reach))
-    for chunk in nb.prange(-(-n // _CHUNK)):
+    for chunk in range(begin, end):
         sums, at = np.empty(width, np.float32), np.empty(3, np.int64)
-        for p in range(np.int64(chunk) * _CHUNK, min((np.int64(chunk) + 1) * _CHUNK, n)):
+        for p in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, n)):
             x, y, z = points[p, 0], points[p, 1], points[p, 2]
             for axis in range(3):
                 at[axis] = np.int64(math.floor((points[p, axis] - low[axis]) / reach))

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Bool, Float
-from numba import njit, prange
+from numba import njit
 from scipy import ndimage
 
 from fluidlift.errors import require
+from fluidlift.numerics.sharing import shared
 from fluidlift.types import Grid
 
 
@@ -58,10 +59,9 @@ def distance_and_gradient(field, low, inverse_spacing, x, y, z):
     return value, gx * inverse_spacing, gy * inverse_spacing, gz * inverse_spacing
 
 
-@njit(parallel=True, cache=True)
-def _push(points, field, low, inverse_spacing, margin, inside):
-    for p_ in prange(len(points)):
-        p = np.int64(p_)
+@shared(lambda points, *_: (0, len(points)))
+def _push(begin, end, points, field, low, inverse_spacing, margin, inside):
+    for p in range(begin, end):
         x, y, z = np.float64(points[p, 0]), np.float64(points[p, 1]), np.float64(points[p, 2])
         for _ in range(8):
             value, gx, gy, gz = distance_and_gradient(field, low, inverse_spacing, x, y, z)

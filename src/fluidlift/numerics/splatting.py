@@ -21,7 +21,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from fluidlift.errors import require
-from fluidlift.numerics.sharing import in_pieces
 from fluidlift.numerics.splatting_binning import (
     LEAD,
     count_kernel,
@@ -289,8 +288,7 @@ def _composited(
     light = np.ones((height, width), packed.dtype)
     for band in _each_band(bins, slots=False):
         span = band.first, band.last, bins.tile, _stride(band.last - band.first)
-        with in_pieces(band.last - band.first):
-            raster_kernel(packed, bins.starts, band.gaussians, *span, image, last, light)
+        raster_kernel(packed, bins.starts, band.gaussians, *span, image, last, light)
     return image, last, light
 
 

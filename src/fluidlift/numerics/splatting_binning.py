@@ -13,17 +13,18 @@ import math
 import numba as nb
 import numpy as np
 
+from fluidlift.numerics.sharing import shared
+
 LEAD = 8
 """numbers of a packed Gaussian before its features: u, v, a/2, b, c/2, opacity, and the half height and width of its
 box; [[a, b], [b, c]] is the inverse covariance"""
 
 
-@nb.njit(cache=True, nogil=True, parallel=True)
-def pack_kernel(uv, conics, opacities, extents, features, order, drawn_only, packed):
+@shared(lambda uv, conics, opacities, extents, features, order, *_: (0, order.shape[0]))
+def pack_kernel(begin, end, uv, conics, opacities, extents, features, order, drawn_only, packed):
     """The drawn Gaussians in order of depth, one row each: the loops over pixels read no more than these. With
     `drawn_only` the rows of `features` come in that order already."""
-    for k0 in nb.prange(order.shape[0]):
-        k = np.int64(k0)
+    for k in range(begin, end):
         i = order[k]
         packed[k, 0], packed[k, 1] = uv[i, 0], uv[i, 1]
         packed[k, 2], packed[k, 3], packed[k, 4] = 0.5 * conics[i, 0], conics[i, 1], 0.5 * conics[i, 2]
@@ -35,11 +36,10 @@ def pack_kernel(uv, conics, opacities, extents, features, order, drawn_only, pac
             packed[k, c] = 0
 
 
-@nb.njit(cache=True, nogil=True, parallel=True)
-def sketch_kernel(uv, conics, extents, order, sketch):
+@shared(lambda uv, conics, extents, order, *_: (0, order.shape[0]))
+def sketch_kernel(begin, end, uv, conics, extents, order, sketch):
     """What binning reads, in order of depth: see `_columns`."""
-    for k0 in nb.prange(order.shape[0]):
-        k = np.int64(k0)
+    for k in range(begin, end):
         i = order[k]
         hx, hy = nb.float64(extents[i, 0]), nb.float64(extents[i, 1])
         lean = -nb.float64(conics[i, 1]) / nb.float64(conics[i, 0])
@@ -95,8 +95,8 @@ def _columns(sketch, k, row, tile, tiles_x):
     return first, last
 
 
-@nb.njit(cache=True, nogil=True, parallel=True)
-def count_kernel(sketch, tile, tiles_x, tiles_y, first, last, counts, pairs):
+@shared(lambda sketch, tile, tiles_x, tiles_y, first, last, counts, *_: (0, counts.shape[0]))
+def count_kernel(lead, stop, sketch, tile, tiles_x, tiles_y, first, last, counts, pairs):
     """Of the tiles first <= t < last: counts[chunk, t], Gaussians of a chunk that meet t; pairs[k], tiles that the k-th
     meets. `counts` is 0 before, and has one column more than there are tiles.
 
@@ -105,8 +105,7 @@ def count_kernel(sketch, tile, tiles_x, tiles_y, first, last, counts, pairs):
     chunks, n = counts.shape[0], sketch.shape[0]
     size = -(-n // chunks)
     row0, row1 = first // tiles_x, (last - 1) // tiles_x
-    for c0 in nb.prange(chunks):
-        chunk = np.int64(c0)
+    for chunk in range(lead, stop):
         for k in range(chunk * size, min((chunk + 1) * size, n)):
             x0, x1, y0, y1 = _box(sketch, k, tile, tiles_x, tiles_y)
             plain = x0 == x1 or y0 == y1  # the ellipse meets all tiles of its box
@@ -125,11 +124,10 @@ def count_kernel(sketch, tile, tiles_x, tiles_y, first, last, counts, pairs):
             counts[chunk, t] = running
 
 
-@nb.njit(cache=True, nogil=True, parallel=True)
-def places_kernel(counts, starts):
+@shared(lambda counts, starts: (0, starts.shape[0]))
+def places_kernel(begin, end, counts, starts):
     """Counts of chunks to where each chunk's part of each tile's list begins; `starts` are those of the lists."""
-    for t0 in nb.prange(starts.shape[0]):
-        t = np.int64(t0)
+    for t in range(begin, end):
         place = starts[t]
         for chunk in range(counts.shape[0]):
             n = counts[chunk, t]
@@ -137,15 +135,14 @@ def places_kernel(counts, starts):
             place += n
 
 
-@nb.njit(cache=True, nogil=True, parallel=True)
-def fill_kernel(sketch, tile, tiles_x, tiles_y, first, last, places, offsets, gaussians, slots):
+@shared(lambda sketch, tile, tiles_x, tiles_y, first, last, places, *_: (0, places.shape[0]))
+def fill_kernel(begin, end, sketch, tile, tiles_x, tiles_y, first, last, places, offsets, gaussians, slots):
     """Deal out the pairs of tiles first <= t < last: gaussians[place] = k, and the places of each k in `slots`, unless
     that is empty."""
     chunks, n = places.shape[0], sketch.shape[0]
     size = -(-n // chunks)
     row0, row1 = first // tiles_x, (last - 1) // tiles_x
-    for c0 in nb.prange(chunks):
-        chunk = np.int64(c0)
+    for chunk in range(begin, end):
         for k in range(chunk * size, min((chunk + 1) * size, n)):
             x0, x1, y0, y1 = _box(sketch, k, tile, tiles_x, tiles_y)
             plain = x0 == x1 or y0 == y1

@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from fluidlift.errors import require
+from fluidlift.numerics.sharing import shared
 
 _CHUNK = 4096
 _C0, _C1 = 0.28209479177387814, 0.4886025119029199
@@ -70,12 +71,12 @@ def _direction(means, position, i):
     return x * k, y * k, z * k, k
 
 
-@nb.njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def colors_kernel(means, sh, position, rows, out):
+@shared(lambda means, sh, position, rows, *_: (0, -(-rows.shape[0] // _CHUNK)), error_model="numpy")
+def colors_kernel(begin, end, means, sh, position, rows, out):
     n, count = rows.shape[0], sh.shape[1]
-    for chunk in nb.prange(-(-n // _CHUNK)):
+    for chunk in range(begin, end):
         basis = np.empty(16)
-        for p in range(np.int64(chunk) * _CHUNK, min((np.int64(chunk) + 1) * _CHUNK, n)):
+        for p in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, n)):
             i = rows[p]
             if count > 1:
                 x, y, z, _ = _direction(means, position, i)
@@ -89,12 +90,12 @@ def colors_kernel(means, sh, position, rows, out):
                 out[p, c] = max(total, 0.0)
 
 
-@nb.njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def colors_backward_kernel(means, sh, position, out, g_out, g_means, g_sh):
+@shared(lambda means, sh, *_: (0, -(-sh.shape[0] // _CHUNK)), error_model="numpy")
+def colors_backward_kernel(begin, end, means, sh, position, out, g_out, g_means, g_sh):
     n, count = sh.shape[0], sh.shape[1]
-    for chunk in nb.prange(-(-n // _CHUNK)):
+    for chunk in range(begin, end):
         basis, g = np.empty(16), np.empty(16)
-        for i in range(np.int64(chunk) * _CHUNK, min((np.int64(chunk) + 1) * _CHUNK, n)):
+        for i in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, n)):
             x, y, z, scale = _direction(means, position, i)
             _basis(x, y, z, count, basis)
             for k in range(count):

@@ -20,6 +20,7 @@ import numba as nb
 import numpy as np
 from numba.extending import overload
 
+from fluidlift.numerics.sharing import PIECES, shared
 from fluidlift.numerics.splatting_binning import LEAD
 from fluidlift.numerics.splatting_projection import ALPHA_MIN, BLUR
 
@@ -134,8 +135,13 @@ def _span(packed, k, x0, y0, tile):
     )
 
 
-@nb.njit(cache=True, nogil=True, parallel=True, fastmath=_FUSED, error_model="numpy")
-def raster_kernel(packed, starts, gaussians, first, last, tile, stride, image, apart, light):
+@shared(
+    lambda packed, starts, gaussians, first, last, *_: (0, last - first),
+    fastmath=_FUSED,
+    error_model="numpy",
+    pieces=PIECES,
+)
+def raster_kernel(lead, stop, packed, starts, gaussians, first, last, tile, stride, image, apart, light):
     """Tiles first <= t < last of the picture; where nothing is, the pictures stay as they were. `apart` takes the
     channel after those of `image`, unless it is empty. Block of 16 pixels: light, weights, then 16 per channel."""
     height, width = light.shape
@@ -145,8 +151,8 @@ def raster_kernel(packed, starts, gaussians, first, last, tile, stride, image, a
     size = (2 + channels) * LANES
     more = np.uint64(channels)
     one = packed.dtype.type(1.0)
-    for t0 in nb.prange(last - first):
-        t = first + (np.int64(t0) * stride) % (last - first)  # scattered: every thread gets dense and empty tiles
+    for t0 in range(lead, stop):
+        t = first + (t0 * stride) % (last - first)  # scattered: every thread gets dense and empty tiles
         x0, y0 = (t % tiles_x) * tile, (t // tiles_x) * tile
         begin, end = starts[t] - starts[first], starts[t + 1] - starts[first]
         rows, columns = min(tile, height - y0), min(tile, width - x0)
@@ -292,9 +298,14 @@ def _load_tile(buf, size, groups, tile, x0, y0, image, light, g_image, g_light):
             buf[at + LANES] = rest
 
 
-@nb.njit(cache=True, nogil=True, parallel=True, fastmath=_FUSED, error_model="numpy")
+@shared(
+    lambda packed, starts, gaussians, first, last, *_: (0, last - first),
+    fastmath=_FUSED,
+    error_model="numpy",
+    pieces=PIECES,
+)
 def raster_backward_kernel(
-    packed, starts, gaussians, first, last, tile, stride, image, light, g_image, g_light, records
+    lead, stop, packed, starts, gaussians, first, last, tile, stride, image, light, g_image, g_light, records
 ):
     """One record per pair: sums of v, v dx, v dx^2, v dy, v dx dy, v dy^2 (v = dL/dp), then of w g per channel.
 
@@ -305,8 +316,8 @@ def raster_backward_kernel(
     groups = (tile + LANES - 1) // LANES
     channels = packed.shape[1] - LEAD
     size = (4 + channels) * LANES
-    for t0 in nb.prange(last - first):
-        t = first + (np.int64(t0) * stride) % (last - first)
+    for t0 in range(lead, stop):
+        t = first + (t0 * stride) % (last - first)
         x0, y0 = (t % tiles_x) * tile, (t // tiles_x) * tile
         buf = np.zeros(tile * groups * size, packed.dtype)
         sums = np.zeros((3 + channels) * LANES, packed.dtype)
@@ -344,11 +355,10 @@ def raster_backward_kernel(
                     records[pair, SUMS + ch] += _sum(sums, np.uint64((3 + ch) * LANES))
 
 
-@nb.njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def gather_kernel(packed, order, offsets, slots, records, g_uv, g_conics, g_opacities, g_features):
+@shared(lambda packed, order, *_: (0, order.shape[0]), error_model="numpy")
+def gather_kernel(begin, end, packed, order, offsets, slots, records, g_uv, g_conics, g_opacities, g_features):
     """Sum the records of every Gaussian and add them, turned into gradients."""
-    for k0 in nb.prange(order.shape[0]):
-        k = np.int64(k0)
+    for k in range(begin, end):
         if offsets[k] == offsets[k + 1]:
             continue
         i = order[k]

@@ -11,6 +11,8 @@ import math
 import numba as nb
 import numpy as np
 
+from fluidlift.numerics.sharing import X, Y, Z, shared
+
 BLUR = np.float32(0.3)
 """px^2 added to the diagonal of a 2D covariance"""
 ALPHA_MIN = np.float32(1.0 / 255.0)
@@ -68,10 +70,9 @@ def _tangent(view, x, z, axis):
     return min(max(t, low), high), t < low or t > high
 
 
-@nb.njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def project_kernel(view, means, quats, scales, opacities, uv, conics, depths, extents):
-    for i0 in nb.prange(means.shape[0]):
-        i = np.int64(i0)
+@shared(lambda view, means, *_: (0, means.shape[0]), error_model="numpy")
+def project_kernel(begin, end, view, means, quats, scales, opacities, uv, conics, depths, extents):
+    for i in range(begin, end):
         x, y, z = _camera_point(view, means, i)
         uv[i, 0], uv[i, 1], depths[i] = 0, 0, z
         conics[i, 0], conics[i, 1], conics[i, 2] = 1, 0, 1
@@ -84,11 +85,11 @@ def project_kernel(view, means, quats, scales, opacities, uv, conics, depths, ex
         u, v = fx * x + view[14], fy * y + view[15]
         qw, qx, qy, qz, _ = _unit_quat(quats, i)
         row0, row1, row2 = _rotation(qw, qx, qy, qz)
-        m0 = _half(view, 0, row0, row1, row2, scales, i)
-        m1 = _half(view, 1, row0, row1, row2, scales, i)
-        m2 = _half(view, 2, row0, row1, row2, scales, i)
-        tx, _ = _tangent(view, x, z, 0)
-        ty, _ = _tangent(view, y, z, 1)
+        m0 = _half(view, X, row0, row1, row2, scales, i)
+        m1 = _half(view, Y, row0, row1, row2, scales, i)
+        m2 = _half(view, Z, row0, row1, row2, scales, i)
+        tx, _ = _tangent(view, x, z, X)
+        ty, _ = _tangent(view, y, z, Y)
         # rows of J m, with J = [fx (1, 0, -tx), fy (0, 1, -ty)]
         j0 = (fx * (m0[0] - tx * m2[0]), fx * (m0[1] - tx * m2[1]), fx * (m0[2] - tx * m2[2]))
         j1 = (fy * (m1[0] - ty * m2[0]), fy * (m1[1] - ty * m2[1]), fy * (m1[2] - ty * m2[2]))
@@ -105,10 +106,11 @@ def project_kernel(view, means, quats, scales, opacities, uv, conics, depths, ex
         extents[i, 0], extents[i, 1] = hx, hy
 
 
-@nb.njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def project_backward_kernel(view, means, quats, scales, conics, extents, g_uv, g_conics, g_means, g_quats, g_scales):
-    for i0 in nb.prange(means.shape[0]):
-        i = np.int64(i0)
+@shared(lambda view, means, *_: (0, means.shape[0]), error_model="numpy")
+def project_backward_kernel(
+    begin, end, view, means, quats, scales, conics, extents, g_uv, g_conics, g_means, g_quats, g_scales
+):
+    for i in range(begin, end):
         if extents[i, 0] > 0:
             _backward_one(view, means, quats, scales, conics, g_uv, g_conics, g_means, g_quats, g_scales, i)
 
@@ -118,12 +120,12 @@ def _backward_one(view, means, quats, scales, conics, g_uv, g_conics, g_means, g
     x, y, z = _camera_point(view, means, i)
     qw, qx, qy, qz, k = _unit_quat(quats, i)
     row0, row1, row2 = _rotation(qw, qx, qy, qz)
-    m0 = _half(view, 0, row0, row1, row2, scales, i)
-    m1 = _half(view, 1, row0, row1, row2, scales, i)
-    m2 = _half(view, 2, row0, row1, row2, scales, i)
+    m0 = _half(view, X, row0, row1, row2, scales, i)
+    m1 = _half(view, Y, row0, row1, row2, scales, i)
+    m2 = _half(view, Z, row0, row1, row2, scales, i)
     fx, fy = view[12] / z, view[13] / z
-    tx, held_x = _tangent(view, x, z, 0)
-    ty, held_y = _tangent(view, y, z, 1)
+    tx, held_x = _tangent(view, x, z, X)
+    ty, held_y = _tangent(view, y, z, Y)
     # inverse: d cov = -conic (d conic) conic, with the off-diagonal entry counted twice
     p, q, w = nb.float64(conics[i, 0]), nb.float64(conics[i, 1]), nb.float64(conics[i, 2])
     gp, gq, gw = nb.float64(g_conics[i, 0]), nb.float64(g_conics[i, 1]), nb.float64(g_conics[i, 2])

@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from fluidlift.errors import require
+from fluidlift.numerics.sharing import PIECES, shared
 from fluidlift.types.camera import PinholeCamera
 
 NEAR = 1e-3
@@ -168,9 +169,9 @@ def banded(box: Int[np.ndarray, "n 5"], height: int, side: int = 0) -> tuple[np.
     return starts, listed
 
 
-@nb.njit(cache=True, parallel=True)
-def _to_camera(points, rotation, translation, seen):
-    for i in nb.prange(points.shape[0]):
+@shared(lambda points, *_: (0, points.shape[0]))
+def _to_camera(begin, end, points, rotation, translation, seen):
+    for i in range(begin, end):
         for k in range(3):
             along = rotation[k, 0] * points[i, 0] + rotation[k, 1] * points[i, 1] + rotation[k, 2] * points[i, 2]
             seen[i, k] = along + translation[k]
@@ -202,9 +203,9 @@ def _reach(seen, corners, lens, near):
     return u0, u1, v0, v1
 
 
-@nb.njit(cache=True, parallel=True, error_model="numpy")
-def _prepare(seen, faces, lens, size, near, prepared, box):
-    for i in nb.prange(faces.shape[0]):
+@shared(lambda seen, faces, *_: (0, faces.shape[0]), error_model="numpy")
+def _prepare(begin, end, seen, faces, lens, size, near, prepared, box):
+    for i in range(begin, end):
         a, b, c = faces[i, 0], faces[i, 1], faces[i, 2]
         _cross(seen, b, c, i, prepared, 0)
         _cross(seen, c, a, i, prepared, 3)
@@ -268,12 +269,12 @@ def scattered(t, count):
     return 2 * t if t < half else 2 * (t - half) + 1
 
 
-@nb.njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def _nearest(prepared, box, starts, listed, lens, face, inverse):
+@shared(lambda prepared, box, starts, *_: (0, (starts.shape[0] - 1)), error_model="numpy", pieces=PIECES)
+def _nearest(begin, end, prepared, box, starts, listed, lens, face, inverse):
     height = face.shape[0]
     count = starts.shape[0] - 1
-    for t in nb.prange(count):
-        band = scattered(np.int64(t), count)
+    for t in range(begin, end):
+        band = scattered(t, count)
         low, high = band * BAND, min(band * BAND + BAND, height) - 1
         for n in range(starts[band], starts[band + 1]):
             i = listed[n]
@@ -294,12 +295,12 @@ def _nearest(prepared, box, starts, listed, lens, face, inverse):
                             face[row, col] = i
 
 
-@nb.njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def _closed(prepared, box, starts, listed, lens, face, inverse, inside):
+@shared(lambda prepared, box, starts, *_: (0, (starts.shape[0] - 1)), error_model="numpy", pieces=PIECES)
+def _closed(begin, end, prepared, box, starts, listed, lens, face, inverse, inside):
     height = inside.shape[0]
     count = starts.shape[0] - 1
-    for t in nb.prange(count):
-        band = scattered(np.int64(t), count)
+    for t in range(begin, end):
+        band = scattered(t, count)
         low, high = band * BAND, min(band * BAND + BAND, height) - 1
         for n in range(starts[band], starts[band + 1]):
             i = listed[n]
@@ -323,10 +324,10 @@ def _closed(prepared, box, starts, listed, lens, face, inverse, inside):
                                 face[back, row, col] = i
 
 
-@nb.njit(cache=True, parallel=True, error_model="numpy")
-def _resolve(p, face, lens, barycentric, depth):
-    for row in nb.prange(face.shape[0]):
-        y = (np.int64(row) + 0.5 - lens[3]) / lens[1]
+@shared(lambda p, face, *_: (0, face.shape[0]), error_model="numpy")
+def _resolve(begin, end, p, face, lens, barycentric, depth):
+    for row in range(begin, end):
+        y = (row + 0.5 - lens[3]) / lens[1]
         for col in range(face.shape[1]):
             i = face[row, col]
             if i < 0:
@@ -342,9 +343,9 @@ def _resolve(p, face, lens, barycentric, depth):
             depth[row, col] = 1.0 / (p[i, 9] * x + (p[i, 10] * y + p[i, 11]))
 
 
-@nb.njit(cache=True, parallel=True)
-def _interpolate(face, barycentric, values, faces, out):
-    for row in nb.prange(face.shape[0]):
+@shared(lambda face, *_: (0, face.shape[0]))
+def _interpolate(begin, end, face, barycentric, values, faces, out):
+    for row in range(begin, end):
         for col in range(face.shape[1]):
             i = face[row, col]
             if i < 0:

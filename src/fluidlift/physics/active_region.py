@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
-from numba import njit, prange
 
+from fluidlift.numerics.sharing import shared
 from fluidlift.physics.boundaries import Walls, beside_closed_faces
 from fluidlift.types import Grid, triple
 
@@ -26,11 +26,11 @@ Box = tuple[slice, slice, slice]
 """ranges of cells along x, y, z"""
 
 
-@njit(parallel=True, cache=True)
-def _extremes(positions, lows, highs):
+@shared(lambda positions, lows, *_: (0, len(lows)))
+def _extremes(begin, end, positions, lows, highs):
     n = len(positions)
-    for chunk in prange(len(lows)):
-        first = np.int64(chunk) * CHUNK
+    for chunk in range(begin, end):
+        first = chunk * CHUNK
         for p in range(first, min(first + CHUNK, n)):
             for a in range(3):
                 lows[chunk, a] = min(lows[chunk, a], positions[p, a])

@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Bool, Float
-from numba import njit, prange
 
+from fluidlift.numerics.sharing import shared
 from fluidlift.physics.boundaries import Walls
 from fluidlift.types import CellType
 
 BLOCK = 4096
 
 
-@njit(parallel=True, cache=True)
-def _displace(velocities, affine, dt, moves, farthest):
+@shared(lambda velocities, affine, dt, moves, farthest: (0, len(farthest)))
+def _displace(begin, end, velocities, affine, dt, moves, farthest):
     n = len(velocities)
     step = np.float32(dt)
     half = np.float32(0.5 * dt)
-    for block in prange(len(farthest)):
+    for block in range(begin, end):
         largest = np.float32(0.0)
-        first = np.int64(block) * BLOCK
+        first = block * BLOCK
         for p in range(first, min(first + BLOCK, n)):
             x, y, z = velocities[p, 0], velocities[p, 1], velocities[p, 2]
             for a in range(3):
@@ -53,13 +53,12 @@ def displacements_plain(
     return moves, float(np.abs(moves).max(initial=0.0))
 
 
-@njit(parallel=True, cache=True)
-def _mark_leaving(before, after, regions, low, high, h, mainstream, out):
+@shared(lambda before, after, *_: (0, len(after)))
+def _mark_leaving(begin, end, before, after, regions, low, high, h, mainstream, out):
     inverse = 1.0 / h
     outflow = np.uint8(CellType.OUTFLOW)
     nx, ny, nz = regions.shape
-    for p_ in prange(len(after)):
-        p = np.int64(p_)
+    for p in range(begin, end):
         gone = False
         for a in range(3):
             gone |= not (after[p, a] >= low[a] and after[p, a] < high[a])

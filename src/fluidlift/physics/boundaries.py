@@ -13,9 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
-from numba import njit, prange
+from numba import njit
 
 from fluidlift.numerics.sampling import gradient_nodes
+from fluidlift.numerics.sharing import shared
 from fluidlift.numerics.signed_distance import distance_and_gradient
 from fluidlift.physics.pressure import face_fractions
 from fluidlift.seams import CLEARANCE, CONTACT, WallShape
@@ -142,12 +143,11 @@ def liquid_cells(occupied: Bool[np.ndarray, "nx ny nz"], walls: Walls) -> np.nda
     return types
 
 
-@njit(parallel=True, cache=True)
-def _row_ranges(layer, first, last):
+@shared(lambda layer, *_: (0, layer.shape[0]))
+def _row_ranges(begin, end, layer, first, last):
     """The marked faces of each row along z lie in first <= k < last; in a row without any, first > last."""
-    nx, ny, nz = layer.shape
-    for i_ in prange(nx):
-        i = np.int64(i_)
+    _, ny, nz = layer.shape
+    for i in range(begin, end):
         for j in range(ny):
             low, high = 0, nz
             while low < nz and layer[i, j, low] == 0:
@@ -162,15 +162,14 @@ def _older(layer, number):
     return 0 < layer and layer < number
 
 
-@njit(parallel=True, cache=True)
-def _grow(field, layer, number, first, last, new_first, new_last):
+@shared(lambda field, *_: (0, field.shape[0]))
+def _grow(begin, end, field, layer, number, first, last, new_first, new_last):
     """One layer, in place: faces without a value take the mean of their neighbours that have an older one.
 
     `layer` says when a face got its value (1: known, 0: not yet), so it does not matter which face comes first.
     """
     nx, ny, nz = field.shape
-    for i_ in prange(nx):
-        i = np.int64(i_)
+    for i in range(begin, end):
         for j in range(ny):
             low, high = first[i, j] - 1, last[i, j] + 1
             for step in range(-1, 2, 2):
@@ -225,12 +224,11 @@ def extrapolate(
     return FaceVelocity(*out)
 
 
-@njit(parallel=True, cache=True)
-def _slide(u, v, w, opening, normals, axis, out):
+@shared(lambda u, v, w, opening, normals, axis, out: (0, out.shape[0]))
+def _slide(begin, end, u, v, w, opening, normals, axis, out):
     """Closed faces of one component lose the part of the local velocity that is normal to the wall."""
-    nx, ny, nz = out.shape
-    for i_ in prange(nx):
-        i = np.int64(i_)
+    _, ny, nz = out.shape
+    for i in range(begin, end):
         for j in range(ny):
             for k in range(nz):
                 if opening[i, j, k] > 0:
@@ -285,12 +283,13 @@ def _far_from_walls(field, low, inverse, x, y, z, reach):
     return min(min(a, b), min(c, d)) >= reach
 
 
-@njit(parallel=True, cache=True)
-def _collide(new, old, velocities, incoming, dt, field, regions, low, high, h, open_sides, restitution, keep):
+@shared(lambda new, *_: (0, len(new)))
+def _collide(
+    begin, end, new, old, velocities, incoming, dt, field, regions, low, high, h, open_sides, restitution, keep
+):
     inverse = 1.0 / h
     margin = CLEARANCE * h
-    for p_ in prange(len(new)):
-        p = np.int64(p_)
+    for p in range(begin, end):
         i = min(max(np.int64((old[p, 0] - low[0]) * inverse), 0), regions.shape[0] - 1)
         j = min(max(np.int64((old[p, 1] - low[1]) * inverse), 0), regions.shape[1] - 1)
         k = min(max(np.int64((old[p, 2] - low[2]) * inverse), 0), regions.shape[2] - 1)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float
-from numba import njit, prange
+from numba import njit
 
 from fluidlift.errors import require
+from fluidlift.numerics.sharing import X, Y, Z, shared
 from fluidlift.types import Gaussians, Particles
 
 CHUNK = 2048
@@ -100,16 +101,16 @@ def _advanced_row(f, c, p, i, dt):
     )
 
 
-@njit(parallel=True, cache=True)
-def _update(deformation, affine, dt, max_stretch, out):
+@shared(lambda deformation, *_: (0, ((len(deformation)) + CHUNK - 1) // CHUNK))
+def _update(begin, end, deformation, affine, dt, max_stretch, out):
     n = len(deformation)
-    for chunk in prange((n + CHUNK - 1) // CHUNK):
+    for chunk in range(begin, end):
         f, a, v, g = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-        first = np.int64(chunk) * CHUNK
+        first = chunk * CHUNK
         for p in range(first, min(first + CHUNK, n)):
-            f00, f01, f02 = _advanced_row(deformation, affine, p, 0, dt)
-            f10, f11, f12 = _advanced_row(deformation, affine, p, 1, dt)
-            f20, f21, f22 = _advanced_row(deformation, affine, p, 2, dt)
+            f00, f01, f02 = _advanced_row(deformation, affine, p, X, dt)
+            f10, f11, f12 = _advanced_row(deformation, affine, p, Y, dt)
+            f20, f21, f22 = _advanced_row(deformation, affine, p, Z, dt)
             det = f00 * (f11 * f22 - f12 * f21) - f01 * (f10 * f22 - f12 * f20) + f02 * (f10 * f21 - f11 * f20)
             if not (det > 1e-6 and det < 1e6):
                 for i in range(3):
@@ -169,10 +170,9 @@ def updated_deformation_plain(
     return (u * np.clip(s, 1 / max_stretch, max_stretch)[:, None, :]) @ vt
 
 
-@njit(parallel=True, cache=True)
-def _deform(f, rest, quats, scales, max_ratio, max_size):
-    for p_ in prange(len(f)):
-        p = np.int64(p_)
+@shared(lambda f, *_: (0, len(f)))
+def _deform(begin, end, f, rest, quats, scales, max_ratio, max_size):
+    for p in range(begin, end):
         m, a, v = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
         finite = True
         for i in range(3):

@@ -279,11 +279,11 @@ def continue_velocity(
     fields, sources, kept = [], [], []
     for axis, beside in enumerate(boundaries.touching_faces(skin)):
         new = velocity.components[axis]
-        field, known, valid = np.empty_like(new), np.empty(new.shape, bool), np.empty(new.shape, bool)
+        field, known = np.empty_like(new), np.empty(new.shape, bool)
+        valid = wet[axis] & (openings[axis] >= SURE_OPENING)
         surface_kernels.carry(
-            new, carried.components[axis], masses[axis], wet[axis], beside, openings[axis], SURE_OPENING, field, known,
-            valid,
-        )  # fmt: skip
+            new, carried.components[axis], masses[axis], wet[axis], beside, openings[axis], valid, field, known
+        )
         fields.append(field)
         kept.append(known)
         sources.append(known & (openings[axis] >= SURE_OPENING))

@@ -10,10 +10,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from fluidlift.errors import FluidliftError, InputRejected, require
 from fluidlift.numerics.sampling import sample_nodes
+from fluidlift.numerics.sharing import X, Y, Z, shared
 from fluidlift.physics import boundaries, transfer
 from fluidlift.physics.active_region import open_region
 from fluidlift.physics.advect_particles import leaving
@@ -40,17 +41,16 @@ def _mean_of_four(field, axis, other, i, j, k):
     return total * np.float32(0.25)
 
 
-@njit(parallel=True, cache=True)
-def _trace_back(q, u, v, w, axis, cells, out, low, high):
+@shared(lambda q, *_: (0, q.shape[0]))
+def _trace_back(begin, end, q, u, v, w, axis, cells, out, low, high):
     """out = q where the flow came from, `cells` = dt / h; low and high are the range of the eight values used."""
     nx, ny, nz = q.shape
-    for i_ in prange(nx):
-        i = np.int64(i_)
+    for i in range(begin, end):
         for j in range(ny):
             for k in range(nz):
-                vx = u[i, j, k] if axis == 0 else _mean_of_four(u, axis, 0, i, j, k)
-                vy = v[i, j, k] if axis == 1 else _mean_of_four(v, axis, 1, i, j, k)
-                vz = w[i, j, k] if axis == 2 else _mean_of_four(w, axis, 2, i, j, k)
+                vx = u[i, j, k] if axis == 0 else _mean_of_four(u, axis, X, i, j, k)
+                vy = v[i, j, k] if axis == 1 else _mean_of_four(v, axis, Y, i, j, k)
+                vz = w[i, j, k] if axis == 2 else _mean_of_four(w, axis, Z, i, j, k)
                 x = min(max(i - cells * vx, 0.0), nx - 1.0)
                 y = min(max(j - cells * vy, 0.0), ny - 1.0)
                 z = min(max(k - cells * vz, 0.0), nz - 1.0)

@@ -9,7 +9,9 @@ sheets and threads thinner than a cell.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
+
+from fluidlift.numerics.sharing import shared
 
 LEAST_SLOPE = 1e-3
 """of the sum of the slopes: a plane that is flatter along an axis counts as this flat (the formula divides by it)"""
@@ -67,11 +69,10 @@ def _octant_share(d, i, j, k, si, sj, sk):
     return cut_share(value, 0.5 * gx, 0.5 * gy, 0.5 * gz)
 
 
-@njit(parallel=True, cache=True)
-def _octants(distance, excluded, out):
-    nx, ny, nz = distance.shape
-    for i_ in prange(1, nx - 1):
-        i = np.int64(i_)
+@shared(lambda distance, *_: (1, distance.shape[0] - 1))
+def _octants(begin, end, distance, excluded, out):
+    _, ny, nz = distance.shape
+    for i in range(begin, end):
         for j in range(1, ny - 1):
             for k in range(1, nz - 1):
                 if excluded[i, j, k]:
@@ -100,11 +101,10 @@ def octant_shares(distance: np.ndarray, excluded: np.ndarray) -> np.ndarray:
     return out
 
 
-@njit(parallel=True, cache=True)
-def _cell_shares(octants, excluded, out):
-    nx, ny, nz = excluded.shape
-    for i_ in prange(nx):
-        i = np.int64(i_)
+@shared(lambda octants, excluded, *_: (0, excluded.shape[0]))
+def _cell_shares(begin, end, octants, excluded, out):
+    _, ny, nz = excluded.shape
+    for i in range(begin, end):
         for j in range(ny):
             for k in range(nz):
                 total = np.float32(0.0)

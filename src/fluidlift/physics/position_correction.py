@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float
-from numba import njit, prange
+from numba import njit
 
 from fluidlift.numerics.poisson import solve
 from fluidlift.numerics.sampling import sample_faces, sample_nodes
+from fluidlift.numerics.sharing import shared
 from fluidlift.physics.boundaries import mean_of_corners
 from fluidlift.physics.pressure import PressureSystem, subtract_gradient
 from fluidlift.physics.transfer import CellOrder, deposit_to_cells
@@ -111,13 +112,13 @@ def _trilinear(field, x, y, z):
     return low * (one - fx) + high * fx
 
 
-@njit(parallel=True, cache=True)
-def _sample_moves(positions, order, low, h, u, v, w, limit, moves):
+@shared(lambda positions, order, *_: (0, len(order)))
+def _sample_moves(begin, end, positions, order, low, h, u, v, w, limit, moves):
     inverse = np.float32(1.0 / h)
     half = np.float32(0.5)
     x0, y0, z0 = np.float32(low[0]), np.float32(low[1]), np.float32(low[2])
-    for m in prange(len(order)):
-        p = order[np.int64(m)]
+    for m in range(begin, end):
+        p = order[m]
         x = (positions[p, 0] - x0) * inverse
         y = (positions[p, 1] - y0) * inverse
         z = (positions[p, 2] - z0) * inverse

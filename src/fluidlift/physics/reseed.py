@@ -53,6 +53,17 @@ def inner_cells(wet: Bool[np.ndarray, "nx ny nz"], solid: Bool[np.ndarray, "nx n
 
 
 @njit(cache=True)
+def _sort_by_mass(index, masses):
+    """In place; equal ones stay in their order. A cell holds few: Numba's own sort takes seconds to compile."""
+    for n in range(1, len(index)):
+        own, m = index[n], n
+        while m > 0 and masses[index[m - 1]] > masses[own]:
+            index[m] = index[m - 1]
+            m -= 1
+        index[m] = own
+
+
+@njit(cache=True)
 def _choose(order, start, inner, masses, lightest, fewest, most, parents, first, second):
     """Indices of the particles to split, and pairs (heavier, lighter) to merge; returns how many of each."""
     n_split, n_merge = 0, 0
@@ -69,8 +80,8 @@ def _choose(order, start, inner, masses, lightest, fewest, most, parents, first,
                 parents[n_split] = best
                 n_split += 1
         elif count > most:
-            index = order[start[c] : start[c + 1]].copy()
-            by_mass = index[np.argsort(masses[index], kind="mergesort")]
+            by_mass = order[start[c] : start[c + 1]].copy()
+            _sort_by_mass(by_mass, masses)
             for pair in range((count - most + 1) // 2):
                 second[n_merge] = by_mass[2 * pair]
                 first[n_merge] = by_mass[2 * pair + 1]

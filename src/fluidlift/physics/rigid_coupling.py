@@ -17,8 +17,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
-from numba import njit, prange
+from numba import njit
 
+from fluidlift.numerics.sharing import shared
 from fluidlift.physics.boundaries import Walls
 from fluidlift.physics.rigid_walls import Cover, UnionWalls
 from fluidlift.types import CellType, FaceVelocity, triple
@@ -34,11 +35,10 @@ class BodyRows:
     """divergence (1/s) per velocity (m/s; first three) and angular velocity (rad/s) of the body"""
 
 
-@njit(parallel=True, cache=True)
-def _add_flux(axis, first, low, h, share, offset, center, velocity, spin, out):
+@shared(lambda axis, first, low, h, share, *_: (0, share.shape[0]))
+def _add_flux(begin, end, axis, first, low, h, share, offset, center, velocity, spin, out):
     """out += share x normal velocity of the body at the centre of the covered part."""
-    for i_ in prange(share.shape[0]):
-        i = np.int64(i_)
+    for i in range(begin, end):
         for j in range(share.shape[1]):
             for k in range(share.shape[2]):
                 if share[i, j, k] == 0.0:
@@ -96,12 +96,11 @@ class SolidVelocity:
         return self._mean
 
 
-@njit(parallel=True, cache=True)
-def _gather_rows(unknown, first, low, h, sx, sy, sz, fx, fy, fz, center, rows):
+@shared(lambda unknown, first, low, h, sx, sy, sz, fx, fy, fz, center, rows: (0, rows.shape[0]))
+def _gather_rows(begin, end, unknown, first, low, h, sx, sy, sz, fx, fy, fz, center, rows):
     """rows [bx,by,bz,6]: per cell of the box, sum over its faces of +-share (e, r x e) / h."""
     inverse = 1.0 / h
-    for i_ in prange(rows.shape[0]):
-        i = np.int64(i_)
+    for i in range(begin, end):
         for j in range(rows.shape[1]):
             for k in range(rows.shape[2]):
                 for m in range(6):
@@ -289,11 +288,10 @@ def surface_force(
     return out
 
 
-@njit(parallel=True, cache=True)
-def _slide(u, v, w, axis, body, first, last, low, h, closed_by, normals, center, velocity, spin, out):
+@shared(lambda u, v, w, axis, body, first, last, *_: (first[0], last[0]))
+def _slide(begin, end, u, v, w, axis, body, first, last, low, h, closed_by, normals, center, velocity, spin, out):
     """Faces closed by one body lose the part of the local velocity, relative to the body, that is normal to it."""
-    for i_ in prange(first[0], last[0]):
-        i = np.int64(i_)
+    for i in range(begin, end):
         for j in range(first[1], last[1]):
             for k in range(first[2], last[2]):
                 if closed_by[i, j, k] != body:

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Bool, Float
-from numba import njit, prange
+from numba import njit
 
+from fluidlift.numerics.sharing import shared
 from fluidlift.numerics.signed_distance import distance_and_gradient
 from fluidlift.physics.boundaries import CLEARANCE, Walls
 from fluidlift.physics.rigid_shapes import Shapes, body_distance, near_body
@@ -120,12 +121,11 @@ def _stop(velocities, p, nx, ny, nz, sx, sy, sz, value, touching, h, keep):
     velocities[p, 2] = sz + factor * (rz - normal * nz) + back * nz
 
 
-@njit(parallel=True, cache=True)
-def _push(positions, velocities, shapes, center, speed, spin, field, low, high, h, open_sides, keep, lost):
+@shared(lambda positions, *_: (0, len(positions)))
+def _push(begin, end, positions, velocities, shapes, center, speed, spin, field, low, high, h, open_sides, keep, lost):
     inverse = 1.0 / h
     margin = CLEARANCE * h
-    for p_ in prange(len(positions)):
-        p = np.int64(p_)
+    for p in range(begin, end):
         lost[p] = False
         x, y, z = np.float64(positions[p, 0]), np.float64(positions[p, 1]), np.float64(positions[p, 2])
         nearest, body = h, -1

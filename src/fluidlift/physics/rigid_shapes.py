@@ -7,9 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
-from numba import njit, prange
+from numba import njit
 
 from fluidlift.numerics.mesh_distance import MeshDistance
+from fluidlift.numerics.sharing import shared
 
 
 class Shapes(NamedTuple):
@@ -126,10 +127,9 @@ def near_body(shapes, b, x, y, z, reach):
     )
 
 
-@njit(parallel=True, cache=True)
-def _distances(shapes, points, reach, out, owner):
-    for p_ in prange(len(points)):
-        p = np.int64(p_)
+@shared(lambda shapes, points, *_: (0, len(points)))
+def _distances(begin, end, shapes, points, reach, out, owner):
+    for p in range(begin, end):
         out[p] = reach
         owner[p] = -1
         x, y, z = np.float64(points[p, 0]), np.float64(points[p, 1]), np.float64(points[p, 2])

@@ -12,8 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
-from numba import njit, prange
+from numba import njit
 
+from fluidlift.numerics.sharing import shared
 from fluidlift.numerics.signed_distance import distance_and_gradient
 from fluidlift.physics.active_region import ActiveRegion
 from fluidlift.physics.pressure import SMALLEST_OPENING
@@ -65,10 +66,9 @@ class Cover:
         return triple(slice(a, b + 1) for a, b in zip(self.low, self.high))
 
 
-@njit(parallel=True, cache=True)
-def _node_distances(shapes, body, low, h, out):
-    for i_ in prange(out.shape[0]):
-        i = np.int64(i_)
+@shared(lambda shapes, body, low, h, out: (0, out.shape[0]))
+def _node_distances(begin, end, shapes, body, low, h, out):
+    for i in range(begin, end):
         for j in range(out.shape[1]):
             for k in range(out.shape[2]):
                 value, _, _, _ = body_distance(shapes, body, low[0] + i * h, low[1] + j * h, low[2] + k * h)
@@ -111,14 +111,13 @@ def _solid_part_of_square(x, y, side, d00, d10, d01, d11):
     return 0.5 * (area + more), 0.5 * (mx + sx), 0.5 * (my + sy)
 
 
-@njit(parallel=True, cache=True)
-def _cover_faces(shapes, body, low, axis, h, distance, share, offset):
+@shared(lambda shapes, body, low, axis, h, distance, share, *_: (0, share.shape[0]))
+def _cover_faces(begin, end, shapes, body, low, axis, h, distance, share, offset):
     """Covered share of each face and its centre, from the body's distance at `PARTS` + 1 points along each side."""
     a0, a1, a2 = (0, 1, 0) if axis == 0 else (1, 0, 0)  # first axis of the face
     b0, b1, b2 = (0, 1, 0) if axis == 2 else (0, 0, 1)  # second axis of the face
     raised, side = RAISED * h, 1.0 / PARTS
-    for i_ in prange(share.shape[0]):
-        i = np.int64(i_)
+    for i in range(begin, end):
         for j in range(share.shape[1]):
             for k in range(share.shape[2]):
                 share[i, j, k] = 0.0
@@ -152,15 +151,14 @@ def _cover_faces(shapes, body, low, axis, h, distance, share, offset):
                     offset[i, j, k, 1] = (y / area - 0.5) * h
 
 
-@njit(parallel=True, cache=True)
-def _fill_cells(shapes, body, low, h, distance, volume, middle):
+@shared(lambda shapes, body, low, h, distance, volume, *_: (0, volume.shape[0]))
+def _fill_cells(begin, end, shapes, body, low, h, distance, volume, middle):
     """Share of each cell inside the body and the centre of that part: eight parts, cut by a plane each.
 
     The share of a cube below a plane is taken as linear in the plane's distance, and the centre of what is below as
     on the normal; both are exact for planes along the grid.
     """
-    for i_ in prange(volume.shape[0]):
-        i = np.int64(i_)
+    for i in range(begin, end):
         for j in range(volume.shape[1]):
             for k in range(volume.shape[2]):
                 corner = distance[i, j, k]
@@ -189,11 +187,10 @@ def _fill_cells(shapes, body, low, h, distance, volume, middle):
                     middle[i, j, k, 0], middle[i, j, k, 1], middle[i, j, k, 2] = mx / total, my / total, mz / total
 
 
-@njit(parallel=True, cache=True)
-def _wall_normals(shapes, bodies, axis, low, h, first, last, opening, before, closed_by, normals):
+@shared(lambda shapes, bodies, axis, low, h, first, last, *_: (first[0], last[0]))
+def _wall_normals(begin, end, shapes, bodies, axis, low, h, first, last, opening, before, closed_by, normals):
     """Unit normals on faces that bodies close, from the nearest body; `closed_by` gets its number."""
-    for i_ in prange(first[0], last[0]):
-        i = np.int64(i_)
+    for i in range(begin, end):
         for j in range(first[1], last[1]):
             for k in range(first[2], last[2]):
                 closed_by[i, j, k] = -1
@@ -216,12 +213,13 @@ def _wall_normals(shapes, bodies, axis, low, h, first, last, opening, before, cl
                 normals[i, j, k, 0], normals[i, j, k, 1], normals[i, j, k, 2] = nx, ny, nz
 
 
-@njit(parallel=True, cache=True)
-def _cell_facts(distance, ox, oy, oz, first, last, low, h, solid_code, solid, buried, regions, beside, capacity):
+@shared(lambda distance, ox, oy, oz, first, last, *_: (first[0], last[0]))
+def _cell_facts(
+    begin, end, distance, ox, oy, oz, first, last, low, h, solid_code, solid, buried, regions, beside, capacity
+):
     """Per cell: solid, buried, region, beside a mostly closed face, open share of the kernel (see `cell_capacity`)."""
     inverse = 1.0 / h
-    for i_ in prange(first[0], last[0]):
-        i = np.int64(i_)
+    for i in range(begin, end):
         for j in range(first[1], last[1]):
             for k in range(first[2], last[2]):
                 mean = 0.0

@@ -118,10 +118,8 @@ def _chebyshev(box, rho, sweeps, wide):
         n = min(SWEEPS_PER_WAVE, sweeps - begin)
         for front in range(box[3] + n - 1):
             for s in range(max(front - box[3] + 1, 0), min(n, front + 1)):
-                if (begin + s) % 2 == 0:
-                    _sweep_plane(front - s, box, omega[begin + s], x, other, coefficients)
-                else:
-                    _sweep_plane(front - s, box, omega[begin + s], other, x, coefficients)
+                before, after = (x, other) if (begin + s) % 2 == 0 else (other, x)
+                _sweep_plane(front - s, box, omega[begin + s], before, after, coefficients)
     return sweeps % 2 == 1
 
 

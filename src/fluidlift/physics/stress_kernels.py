@@ -8,8 +8,9 @@ stacked: [3, nx, ny, nz]. Only `first <= k < last` of each vertical column is vi
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
+from fluidlift.numerics.sharing import X, Y, Z, in_order, shared
 from fluidlift.physics.liquid_fractions import control_share
 
 AIR, SOLVED, FIXED, WALL = 0, 1, 2, 3
@@ -19,6 +20,8 @@ LEAST_GAP = 0.05
 """cells: faces nearer to a wall count as this far from it (conditioning)"""
 
 ONE, TWO, EIGHT = np.uint64(1), np.uint64(2), np.uint64(8)
+STAYS, MOVES = X, Y
+"""what half a cell does to a control volume along an axis, see `control_share`"""
 ZERO, FULL = np.float32(0.0), np.float32(1.0)
 """Unsigned indices need no check for negative ones, and numbers of single precision do not widen what they meet: with
 both, the inner loops become vector instructions, five times as fast."""
@@ -98,17 +101,17 @@ def _stiffness(octants, cells, resistance, i, j, k, across_x, across_y, across_z
     return share * viscosity
 
 
-@njit(parallel=True, cache=True)
-def weigh_stresses(roles, clearance, octants, cells, resistance, number, wall_share, normal, shear):
+@shared(lambda roles, *_: (1, roles.shape[1] - 1))
+def weigh_stresses(begin, end, roles, clearance, octants, cells, resistance, number, wall_share, normal, shear):
     """Weights of the normal stresses xx, yy, zz at cells and of the shear stresses yz, xz, xy at edges.
 
     normal[a] = 2 V nu dt / h^2 and shear[a] = V nu dt / h^2, where `number` is dt / h^2. A stress that would need the
     velocity of air is left out: the surface is free of it. `clearance` is the distance of the faces from walls, in
     cells, negative inside.
     """
-    _, nx, ny, nz = roles.shape
-    for i_ in prange(1, nx - 1):
-        i, si = np.uint64(i_), np.int64(i_)
+    _, _, ny, nz = roles.shape
+    for i_ in range(begin, end):
+        i, si = np.uint64(i_), i_
         for j in range(ONE, np.uint64(ny - 1)):
             sj = np.int64(j)
             for k in range(ONE, np.uint64(nz - 1)):
@@ -116,12 +119,12 @@ def weigh_stresses(roles, clearance, octants, cells, resistance, number, wall_sh
                 if not _acts(roles, i, j, k):
                     continue
                 u, d, l = i - ONE, j - ONE, k - ONE
-                xx = _normal_factor(roles, clearance, wall_share, 0, i, j, k, i + ONE, j, k)
-                yy = _normal_factor(roles, clearance, wall_share, 1, i, j, k, i, j + ONE, k)
-                zz = _normal_factor(roles, clearance, wall_share, 2, i, j, k, i, j, k + ONE)
-                yz = number * _shear_factor(roles, clearance, wall_share, 1, 2, i, j, k, i, j, l, i, d, k)
-                xz = number * _shear_factor(roles, clearance, wall_share, 0, 2, i, j, k, i, j, l, u, j, k)
-                xy = number * _shear_factor(roles, clearance, wall_share, 0, 1, i, j, k, i, d, k, u, j, k)
+                xx = _normal_factor(roles, clearance, wall_share, X, i, j, k, i + ONE, j, k)
+                yy = _normal_factor(roles, clearance, wall_share, Y, i, j, k, i, j + ONE, k)
+                zz = _normal_factor(roles, clearance, wall_share, Z, i, j, k, i, j, k + ONE)
+                yz = number * _shear_factor(roles, clearance, wall_share, Y, Z, i, j, k, i, j, l, i, d, k)
+                xz = number * _shear_factor(roles, clearance, wall_share, X, Z, i, j, k, i, j, l, u, j, k)
+                xy = number * _shear_factor(roles, clearance, wall_share, X, Y, i, j, k, i, d, k, u, j, k)
                 centre = xx + yy + zz
                 if centre + yz + xz + xy == 0.0:
                     continue
@@ -129,20 +132,26 @@ def weigh_stresses(roles, clearance, octants, cells, resistance, number, wall_sh
                 if viscosity > 0.0:
                     c = yz_here = xz_here = xy_here = viscosity
                 else:
-                    c = _stiffness(octants, cells, resistance, si, sj, sk, 0, 0, 0) if centre > 0.0 else 0.0
-                    yz_here = _stiffness(octants, cells, resistance, si, sj, sk, 0, 1, 1) if yz > 0.0 else 0.0
-                    xz_here = _stiffness(octants, cells, resistance, si, sj, sk, 1, 0, 1) if xz > 0.0 else 0.0
-                    xy_here = _stiffness(octants, cells, resistance, si, sj, sk, 1, 1, 0) if xy > 0.0 else 0.0
+                    c = _stiffness(octants, cells, resistance, si, sj, sk, STAYS, STAYS, STAYS) if centre > 0.0 else 0.0
+                    yz_here = (
+                        _stiffness(octants, cells, resistance, si, sj, sk, STAYS, MOVES, MOVES) if yz > 0.0 else 0.0
+                    )
+                    xz_here = (
+                        _stiffness(octants, cells, resistance, si, sj, sk, MOVES, STAYS, MOVES) if xz > 0.0 else 0.0
+                    )
+                    xy_here = (
+                        _stiffness(octants, cells, resistance, si, sj, sk, MOVES, MOVES, STAYS) if xy > 0.0 else 0.0
+                    )
                 c *= 2.0 * number
                 normal[0, i, j, k], normal[1, i, j, k], normal[2, i, j, k] = c * xx, c * yy, c * zz
                 shear[0, i, j, k], shear[1, i, j, k], shear[2, i, j, k] = yz * yz_here, xz * xz_here, xy * xy_here
 
 
-@njit(parallel=True, cache=True)
-def weigh_faces(roles, octants, cells, resistance, normal, shear, least, mass, inverse):
+@shared(lambda roles, *_: (1, roles.shape[1] - 1))
+def weigh_faces(begin, end, roles, octants, cells, resistance, normal, shear, least, mass, inverse):
     """Liquid share of the solved faces, at least `least`, and 1 / diagonal; 0 where there is no liquid."""
-    _, nx, ny, nz = roles.shape
-    for i_ in prange(1, nx - 1):
+    _, _, ny, nz = roles.shape
+    for i_ in range(begin, end):
         i = np.uint64(i_)
         for a in range(3):
             x, y, z = np.uint64(a == 0), np.uint64(a == 1), np.uint64(a == 2)
@@ -237,21 +246,17 @@ def _dot_column(x, y, i, j, low, high):
     return total
 
 
-@njit(cache=True)
-def _in_order(sums):
-    """Their sum, in the same order for any number of threads."""
-    total = 0.0
-    for n in range(len(sums)):
-        total += sums[n]
-    return total
-
-
-@njit(parallel=True, cache=True)
 def apply(x, out, mass, normal, shear, first, last):
     """out = A x on the solved faces (0 elsewhere), for x that holds the fixed velocities too; returns x . out."""
-    _, nx, ny, _ = x.shape
-    sums = np.zeros(nx)
-    for i_ in prange(1, nx - 1):
+    sums = np.zeros(x.shape[1])
+    _apply(x, out, mass, normal, shear, first, last, sums)
+    return in_order(sums)
+
+
+@shared(lambda x, *_: (1, x.shape[1] - 1))
+def _apply(begin, end, x, out, mass, normal, shear, first, last, sums):
+    ny = x.shape[2]
+    for i_ in range(begin, end):
         i = np.uint64(i_)
         total = 0.0
         for j in range(ONE, np.uint64(ny - 1)):
@@ -270,14 +275,13 @@ def apply(x, out, mass, normal, shear, first, last):
                 out[2, i, j, k] = value if m > ZERO else ZERO
             total += _dot_column(x, out, i, j, low, high)
         sums[i] = total
-    return _in_order(sums)
 
 
-@njit(parallel=True, cache=True)
-def residual(x, rhs, out, mass, normal, shear, first, last):
+@shared(lambda x, *_: (1, x.shape[1] - 1))
+def residual(begin, end, x, rhs, out, mass, normal, shear, first, last):
     """out = rhs - A x on the solved faces, 0 elsewhere."""
-    _, nx, ny, _ = x.shape
-    for i_ in prange(1, nx - 1):
+    ny = x.shape[2]
+    for i_ in range(begin, end):
         i = np.uint64(i_)
         for j in range(ONE, np.uint64(ny - 1)):
             low, high = np.uint64(first[i, j]), np.uint64(last[i, j])
@@ -295,10 +299,11 @@ def residual(x, rhs, out, mass, normal, shear, first, last):
                 out[2, i, j, k] = value if m > ZERO else ZERO
 
 
-def _half_sweep(x, rhs, mass, inverse, normal, shear, axis, color, first, last):
+@shared(lambda x, *_: (1, x.shape[1] - 1))
+def half_sweep(begin, end, x, rhs, mass, inverse, normal, shear, axis, color, first, last):
     """Gauss-Seidel on the faces of one component and colour; none of them is a neighbour of another."""
-    _, nx, ny, _ = x.shape
-    for i_ in prange(1, nx - 1):
+    ny = x.shape[2]
+    for i_ in range(begin, end):
         i = np.uint64(i_)
         for j in range(ONE, np.uint64(ny - 1)):
             start, high = np.uint64(first[i, j]), np.uint64(last[i, j])
@@ -317,8 +322,7 @@ def _half_sweep(x, rhs, mass, inverse, normal, shear, axis, color, first, last):
                     x[2, i, j, k] += inverse[2, i, j, k] * rest
 
 
-half_sweep = njit(parallel=True, cache=True)(_half_sweep)
-_half_sweep_alone = njit(cache=True)(_half_sweep)
+_half_sweep = half_sweep.kernel
 
 
 @njit(cache=True)
@@ -327,15 +331,20 @@ def sweeps_alone(x, rhs, mass, inverse, normal, shear, count, forward, first, la
     for _ in range(count):
         for s in range(6):
             t = s if forward else 5 - s
-            _half_sweep_alone(x, rhs, mass, inverse, normal, shear, t // 2, t % 2, first, last)
+            _half_sweep(1, x.shape[1] - 1, x, rhs, mass, inverse, normal, shear, t // 2, t % 2, first, last)
 
 
-@njit(parallel=True, cache=True)
 def descend(x, r, direction, q, step, mass, first, last):
     """x += step direction, r -= step q; returns r . r and |mass x|^2 of the solved faces."""
-    _, nx, ny, _ = x.shape
-    residuals, momenta = np.zeros(nx), np.zeros(nx)
-    for i_ in prange(1, nx - 1):
+    residuals, momenta = np.zeros((2, x.shape[1]))
+    _descend(x, r, direction, q, step, mass, first, last, residuals, momenta)
+    return in_order(residuals), in_order(momenta)
+
+
+@shared(lambda x, *_: (1, x.shape[1] - 1))
+def _descend(begin, end, x, r, direction, q, step, mass, first, last, residuals, momenta):
+    ny = x.shape[2]
+    for i_ in range(begin, end):
         i = np.uint64(i_)
         squared, momentum = 0.0, 0.0
         for a in range(3):
@@ -347,14 +356,13 @@ def descend(x, r, direction, q, step, mass, first, last):
                     moved = mass[a, i, j, k] * x[a, i, j, k]
                     momentum += moved * moved
         residuals[i], momenta[i] = squared, momentum
-    return _in_order(residuals), _in_order(momenta)
 
 
-@njit(parallel=True, cache=True)
-def scale_into(r, scale, inverse, cycles, rhs, z, first, last):
+@shared(lambda r, *_: (1, r.shape[1] - 1))
+def scale_into(begin, end, r, scale, inverse, cycles, rhs, z, first, last):
     """Prepare the preconditioner: rhs = scale r and z = 0; or z = scale r / diagonal where there are no cycles."""
-    _, nx, ny, _ = r.shape
-    for i_ in prange(1, nx - 1):
+    ny = r.shape[2]
+    for i_ in range(begin, end):
         i = np.uint64(i_)
         for a in range(3):
             for j in range(ONE, np.uint64(ny - 1)):
@@ -363,25 +371,29 @@ def scale_into(r, scale, inverse, cycles, rhs, z, first, last):
                     z[a, i, j, k] = 0.0 if cycles else scale * r[a, i, j, k] * inverse[a, i, j, k]
 
 
-@njit(parallel=True, cache=True)
 def dot(r, z, first, last):
     """r . z."""
-    _, nx, ny, _ = r.shape
-    sums = np.zeros(nx)
-    for i_ in prange(1, nx - 1):
+    sums = np.zeros(r.shape[1])
+    _dot(r, z, first, last, sums)
+    return in_order(sums)
+
+
+@shared(lambda r, *_: (1, r.shape[1] - 1))
+def _dot(begin, end, r, z, first, last, sums):
+    ny = r.shape[2]
+    for i_ in range(begin, end):
         i = np.uint64(i_)
         total = 0.0
         for j in range(ONE, np.uint64(ny - 1)):
             total += _dot_column(r, z, i, j, np.uint64(first[i, j]), np.uint64(last[i, j]))
         sums[i] = total
-    return _in_order(sums)
 
 
-@njit(parallel=True, cache=True)
-def turn(direction, z, factor, first, last):
+@shared(lambda direction, *_: (1, direction.shape[1] - 1))
+def turn(begin, end, direction, z, factor, first, last):
     """direction = z + factor direction."""
-    _, nx, ny, _ = direction.shape
-    for i_ in prange(1, nx - 1):
+    ny = direction.shape[2]
+    for i_ in range(begin, end):
         i = np.uint64(i_)
         for a in range(3):
             for j in range(ONE, np.uint64(ny - 1)):

@@ -19,8 +19,9 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numba import get_num_threads, njit, prange, set_num_threads
+from numba import get_num_threads, njit, set_num_threads
 
+from fluidlift.numerics.sharing import shared
 from fluidlift.physics import stress_kernels as kernels
 from fluidlift.physics.liquid_fractions import cell_shares
 
@@ -124,13 +125,12 @@ def assemble(
     )
 
 
-@njit(parallel=True, cache=True)
-def _merge_roles(roles, out):
+@shared(lambda roles, out: (1, out.shape[1] - 1))
+def _merge_roles(begin, end, roles, out):
     """Solved if one of the four fine faces is; else fixed, else wall, else air. The fine plane 2 is the coarse 2."""
     _, fx, fy, fz = roles.shape
-    _, nx, ny, nz = out.shape
-    for i_ in prange(1, nx - 1):
-        i = np.int64(i_)
+    _, _, ny, nz = out.shape
+    for i in range(begin, end):
         for a in range(3):
             for j in range(1, ny - 1):
                 for k in range(1, nz - 1):
@@ -144,13 +144,12 @@ def _merge_roles(roles, out):
                     out[a, i, j, k] = role
 
 
-@njit(parallel=True, cache=True)
-def _merge_cells(octants, excluded, resistance, out, out_excluded, out_resistance):
+@shared(lambda octants, excluded, resistance, out, out_excluded, *_: (1, out_excluded.shape[0] - 1))
+def _merge_cells(begin, end, octants, excluded, resistance, out, out_excluded, out_resistance):
     """Fine cells become the octants of coarse ones. Where a part of a coarse cell is excluded, the rest fills it."""
     fx, fy, fz = excluded.shape
-    nx, ny, nz = out_excluded.shape
-    for i_ in prange(1, nx - 1):
-        i = np.int64(i_)
+    _, ny, nz = out_excluded.shape
+    for i in range(begin, end):
         for j in range(1, ny - 1):
             for k in range(1, nz - 1):
                 count = 0
@@ -196,11 +195,10 @@ def _parents(n, across):
     return n // 2 + 1, n // 2 + 2 * (n & 1), 0.25
 
 
-@njit(parallel=True, cache=True)
-def _measure_reach(mass, coarse_mass, reach):
-    _, nx, ny, nz = mass.shape
-    for i_ in prange(1, nx - 1):
-        i = np.int64(i_)
+@shared(lambda mass, *_: (1, mass.shape[1] - 1))
+def _measure_reach(begin, end, mass, coarse_mass, reach):
+    _, _, ny, nz = mass.shape
+    for i in range(begin, end):
         for a in range(3):
             i0, i1, wi = _parents(i, a == 0)
             for j in range(1, ny - 1):
@@ -221,12 +219,11 @@ def _measure_reach(mass, coarse_mass, reach):
                         reach[a, i, j, k] = 1.0 / total
 
 
-@njit(parallel=True, cache=True)
-def _add_coarse(x, reach, coarse_x, first, last):
+@shared(lambda x, *_: (1, x.shape[1] - 1))
+def _add_coarse(begin, end, x, reach, coarse_x, first, last):
     """x += the coarse correction, interpolated linearly."""
-    _, nx, ny, _ = x.shape
-    for i_ in prange(1, nx - 1):
-        i = np.int64(i_)
+    ny = x.shape[2]
+    for i in range(begin, end):
         for a in range(3):
             i0, i1, wi = _parents(i, a == 0)
             for j in range(1, ny - 1):
@@ -241,11 +238,11 @@ def _add_coarse(x, reach, coarse_x, first, last):
                     x[a, i, j, k] += reach[a, i, j, k] * (low + np.float32(wk) * (high - low))
 
 
-@njit(parallel=True, cache=True)
-def _gather(rest, reach, coarse_mass, coarse_rhs, coarse_x, first, last):
+@shared(lambda rest, reach, coarse_mass, coarse_rhs, *_: (1, coarse_rhs.shape[1] - 1))
+def _gather(begin, end, rest, reach, coarse_mass, coarse_rhs, coarse_x, first, last):
     """The transpose of the interpolation, over 8 for the larger volume; the coarse guess becomes 0."""
-    _, nx, ny, _ = coarse_rhs.shape
-    for i_ in prange(1, nx - 1):
+    ny = coarse_rhs.shape[2]
+    for i_ in range(begin, end):
         i = np.uint64(i_)
         for a in range(3):
             ni, nj, nk = np.uint64(3 + (a != 0)), np.uint64(3 + (a != 1)), np.uint64(3 + (a != 2))

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from fluidlift.numerics.bspline import quadratic_weights
+from fluidlift.numerics.sharing import shared
 from fluidlift.numerics.signed_distance import distance_and_gradient
 from fluidlift.physics.liquid_fractions import cut_share
 
@@ -26,13 +27,12 @@ SOLID_DEPTH = 0.7
 """cells: from the centre of an almost open cell to the middle of its solid part"""
 
 
-@njit(parallel=True, cache=True)
-def open_volumes(nodes, low, h, out):
+@shared(lambda nodes, low, h, out: (0, out.shape[0]))
+def open_volumes(begin, end, nodes, low, h, out):
     """Open share of each cell, from its octants, each cut by the plane that fits the signed distance at its centre."""
-    nx, ny, nz = out.shape
+    _, ny, nz = out.shape
     inverse = 1.0 / h
-    for i_ in prange(nx):
-        i = np.int64(i_)
+    for i in range(begin, end):
         for j in range(ny):
             for k in range(nz):
                 x, y, z = low[0] + (i + 0.5) * h, low[1] + (j + 0.5) * h, low[2] + (k + 0.5) * h
@@ -52,14 +52,13 @@ def open_volumes(nodes, low, h, out):
                 out[i, j, k] = 0.125 * total
 
 
-@njit(parallel=True, cache=True)
-def three_point(field, side, out):
+@shared(lambda field, *_: (0, field.shape[0]))
+def three_point(begin, end, field, side, out):
     """Weights side, 1 - 2 side, side along each axis; the outermost cells are repeated (a mirror)."""
     nx, ny, nz = field.shape
     middle = np.float32(1.0 - 2.0 * side)
     outer = np.float32(side)
-    for i_ in prange(nx):
-        i = np.int64(i_)
+    for i in range(begin, end):
         a, b = max(i - 1, 0), min(i + 1, nx - 1)
         plane = np.empty((ny, nz), np.float32)
         for j in range(ny):
@@ -76,32 +75,35 @@ def three_point(field, side, out):
                 before, here = here, after
 
 
-@njit(parallel=True, cache=True)
 def deposit(positions, amounts, order, slab_start, low, h, out):
     """Amounts shared among 27 cells by quadratic splines; beyond the sides of the box they are mirrored."""
-    slabs = len(slab_start) - 1
+    for color in range(2):  # of slabs; those of one colour share no cell
+        _deposit(positions, amounts, order, slab_start, color, low, h, out)
+
+
+@shared(lambda positions, amounts, order, slab_start, color, *_: (0, (len(slab_start) - color) // 2))
+def _deposit(begin, end, positions, amounts, order, slab_start, color, low, h, out):
     nx, ny, nz = out.shape
     inverse = np.float32(1.0 / h)
     half = np.float32(0.5)
     x0, y0, z0 = np.float32(low[0]), np.float32(low[1]), np.float32(low[2])
-    for color in range(2):
-        for s_ in prange((slabs + 1 - color) // 2):
-            s = 2 * np.int64(s_) + color
-            for n in range(slab_start[s], slab_start[s + 1]):
-                p = order[n]
-                i, wx0, wx1, wx2 = quadratic_weights((positions[p, 0] - x0) * inverse - half)
-                j, wy0, wy1, wy2 = quadratic_weights((positions[p, 1] - y0) * inverse - half)
-                k, wz0, wz1, wz2 = quadratic_weights((positions[p, 2] - z0) * inverse - half)
-                k0, k1, k2 = min(max(k, 0), nz - 1), min(max(k + 1, 0), nz - 1), min(max(k + 2, 0), nz - 1)
-                for a in range(3):
-                    ii = min(max(i + a, 0), nx - 1)
-                    wa = amounts[p] * (wx0 if a == 0 else (wx1 if a == 1 else wx2))
-                    for b in range(3):
-                        jj = min(max(j + b, 0), ny - 1)
-                        w = wa * (wy0 if b == 0 else (wy1 if b == 1 else wy2))
-                        out[ii, jj, k0] += w * wz0
-                        out[ii, jj, k1] += w * wz1
-                        out[ii, jj, k2] += w * wz2
+    for m in range(begin, end):
+        s = 2 * m + color
+        for n in range(slab_start[s], slab_start[s + 1]):
+            p = order[n]
+            i, wx0, wx1, wx2 = quadratic_weights((positions[p, 0] - x0) * inverse - half)
+            j, wy0, wy1, wy2 = quadratic_weights((positions[p, 1] - y0) * inverse - half)
+            k, wz0, wz1, wz2 = quadratic_weights((positions[p, 2] - z0) * inverse - half)
+            k0, k1, k2 = min(max(k, 0), nz - 1), min(max(k + 1, 0), nz - 1), min(max(k + 2, 0), nz - 1)
+            for a in range(3):
+                ii = min(max(i + a, 0), nx - 1)
+                wa = amounts[p] * (wx0 if a == 0 else (wx1 if a == 1 else wx2))
+                for b in range(3):
+                    jj = min(max(j + b, 0), ny - 1)
+                    w = wa * (wy0 if b == 0 else (wy1 if b == 1 else wy2))
+                    out[ii, jj, k0] += w * wz0
+                    out[ii, jj, k1] += w * wz1
+                    out[ii, jj, k2] += w * wz2
 
 
 @njit(cache=True)
@@ -159,12 +161,11 @@ def _outward(fill, i, j, k):
     return scale * x, scale * y, scale * z
 
 
-@njit(parallel=True, cache=True)
-def continue_into_solid(layer, want, open_share, fill, distance, normal):
+@shared(lambda layer, want, open_share, fill, *_: (0, fill.shape[0]))
+def continue_into_solid(begin, end, layer, want, open_share, fill, distance, normal):
     """Distance and normal in the cells of one layer, by linear extrapolation from the layers before it."""
     nx, ny, nz = fill.shape
-    for i_ in prange(nx):
-        i = np.int64(i_)
+    for i in range(begin, end):
         for j in range(ny):
             for k in range(nz):
                 if layer[i, j, k] != want:
@@ -200,12 +201,11 @@ def continue_into_solid(layer, want, open_share, fill, distance, normal):
                     normal[i, j, k, 2] = sz / weights
 
 
-@njit(parallel=True, cache=True)
-def fill_solid(layer, deepest, open_share, distance, normal, virtual):
+@shared(lambda layer, deepest, open_share, distance, normal, virtual: (0, virtual.shape[0]))
+def fill_solid(begin, end, layer, deepest, open_share, distance, normal, virtual):
     """Virtual liquid: the share of each cell's solid part that lies below the continued surface."""
-    nx, ny, nz = virtual.shape
-    for i_ in prange(nx):
-        i = np.int64(i_)
+    _, ny, nz = virtual.shape
+    for i in range(begin, end):
         for j in range(ny):
             for k in range(nz):
                 if layer[i, j, k] == 0 or layer[i, j, k] > deepest:
@@ -243,12 +243,11 @@ def _curvature_at(f, i, j, k):
     return -total / squared**1.5
 
 
-@njit(parallel=True, cache=True)
-def curvature(smooth, fill, out):
+@shared(lambda smooth, fill, *_: (0, fill.shape[0]))
+def curvature(begin, end, smooth, fill, out):
     """Of the surfaces of equal `smooth`, within `DEPTH` of the surface of `fill`; else 0."""
-    nx, ny, nz = fill.shape
-    for i_ in prange(nx):
-        i = np.int64(i_)
+    _, ny, nz = fill.shape
+    for i in range(begin, end):
         for j in range(ny):
             for k in range(nz):
                 out[i, j, k] = 0.0
@@ -257,12 +256,11 @@ def curvature(smooth, fill, out):
                     out[i, j, k] = min(max(bend, -LARGEST_CURVATURE), LARGEST_CURVATURE)
 
 
-@njit(parallel=True, cache=True)
-def distance(fill, bend, band, out):
+@shared(lambda fill, *_: (0, fill.shape[0]))
+def distance(begin, end, fill, bend, band, out):
     """Distance with the shift by the blur taken back, at most `band`."""
-    nx, ny, nz = fill.shape
-    for i_ in prange(nx):
-        i = np.int64(i_)
+    _, ny, nz = fill.shape
+    for i in range(begin, end):
         for j in range(ny):
             for k in range(nz):
                 d = flat_distance(fill[i, j, k]) - 0.5 * VARIANCE * bend[i, j, k]
@@ -285,17 +283,11 @@ def _change_beside(new, old, sure, i, j, k):
     return total / np.float32(max(count, 1))
 
 
-@njit(parallel=True, cache=True)
-def carry(new, old, mass, wet, beside_skin, opening, least, out, known, valid):
+@shared(lambda new, *_: (0, new.shape[0]))
+def carry(begin, end, new, old, mass, wet, beside_skin, opening, valid, out, known):
     """One component of the velocity on wet faces and on faces of the skin: see `free_surface.continue_velocity`."""
-    nx, ny, nz = new.shape
-    for i_ in prange(nx):
-        i = np.int64(i_)
-        for j in range(ny):
-            for k in range(nz):
-                valid[i, j, k] = wet[i, j, k] and opening[i, j, k] >= least
-    for i_ in prange(nx):
-        i = np.int64(i_)
+    _, ny, nz = new.shape
+    for i in range(begin, end):
         for j in range(ny):
             for k in range(nz):
                 out[i, j, k] = new[i, j, k]

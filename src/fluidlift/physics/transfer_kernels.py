@@ -11,10 +11,11 @@ blocks of one colour never meet, so no atomics are needed and the sums do not de
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from fluidlift.numerics.bspline import quadratic_weights
 from fluidlift.numerics.lanes import first_half, lane, load4, load8, store, twice, vector4, vector8
+from fluidlift.numerics.sharing import shared
 
 BLOCK = 4
 """columns; the footprint of a block is 3 wider and must not pass the next block"""
@@ -90,8 +91,10 @@ def _scatter_component(sums, shape, along_x, along_y, along_z, m, v, cx, cy, cz)
     _add_row(sums, start + 2 * row, weights, x2 * y2, third)
 
 
-@njit(parallel=True, cache=True)
-def scatter(positions, velocities, affine, masses, order, start, blocks, low, h, cells, sums_u, sums_v, sums_w):
+@shared(lambda positions, velocities, affine, masses, order, start, blocks, *_: (0, len(blocks)))
+def scatter(
+    begin, end, positions, velocities, affine, masses, order, start, blocks, low, h, cells, sums_u, sums_v, sums_w
+):
     """Add the particles of some blocks (int64 [b,2], all of one colour) to the sums of mass and momentum per face.
 
     The sums are [fx+4, fy+4, fz+5, 2]. Particles more than a cell outside the box reach no face and are left out.
@@ -100,7 +103,7 @@ def scatter(positions, velocities, affine, masses, order, start, blocks, low, h,
     x0, y0, z0 = np.float32(low[0]), np.float32(low[1]), np.float32(low[2])
     nx, ny, nz = np.float32(cells[0] + 1), np.float32(cells[1] + 1), np.float32(cells[2] + 1)
     flat_u, flat_v, flat_w = sums_u.reshape(-1), sums_v.reshape(-1), sums_w.reshape(-1)
-    for b in prange(len(blocks)):
+    for b in range(begin, end):
         for i in range(BLOCK * blocks[b, 0], min(BLOCK * (blocks[b, 0] + 1), cells[0])):
             # the columns of a block that follow each other in y follow each other in the order, too
             first = start[(i * cells[1] + BLOCK * blocks[b, 1]) * cells[2]]
@@ -126,12 +129,11 @@ def scatter(positions, velocities, affine, masses, order, start, blocks, low, h,
                 _scatter_component(flat_w, sums_w.shape, center_x, center_y, face_z, m, v, cx, cy, cz)
 
 
-@njit(parallel=True, cache=True)
-def divide(sums, velocity, mass):
+@shared(lambda sums, velocity, mass: (0, mass.shape[0]))
+def divide(begin, end, sums, velocity, mass):
     """Velocity = momentum / mass (0 where there is none) without the ghost faces."""
-    ni, nj, nk = mass.shape
-    for i_ in prange(ni):
-        i = np.int64(i_)
+    _, nj, nk = mass.shape
+    for i in range(begin, end):
         for j in range(nj):
             for k in range(nk):
                 m = sums[i + GHOST, j + GHOST, k + GHOST, 0]
@@ -141,12 +143,12 @@ def divide(sums, velocity, mass):
                 )
 
 
-@njit(parallel=True, cache=True)
-def pad(field, out):
+@shared(lambda field, out: (0, out.shape[0]))
+def pad(begin, end, field, out):
     """Copy with ghost faces that repeat the outer ones."""
     ni, nj, nk = field.shape
-    for i_ in prange(out.shape[0]):
-        i = min(max(np.int64(i_) - GHOST, 0), ni - 1)
+    for i_ in range(begin, end):
+        i = min(max(i_ - GHOST, 0), ni - 1)
         for j_ in range(out.shape[1]):
             j = min(max(j_ - GHOST, 0), nj - 1)
             for k in range(GHOST):
@@ -202,8 +204,8 @@ def _clamp(x, low, high):
     return high if x > high else (x if x > low else low)
 
 
-@njit(parallel=True, cache=True)
-def gather(positions, order, low, h, u, v, w, velocities, affine):
+@shared(lambda positions, *_: (0, ((len(positions)) + CHUNK - 1) // CHUNK))
+def gather(begin, end, positions, order, low, h, u, v, w, velocities, affine):
     """Velocities and affine matrices from padded components.
 
     More than half a cell outside the box the velocity no longer changes, so positions are taken from there.
@@ -214,8 +216,8 @@ def gather(positions, order, low, h, u, v, w, velocities, affine):
     nx, ny, nz = v.shape[0] - 2 * GHOST, u.shape[1] - 2 * GHOST, u.shape[2] - 2 * GHOST - 1
     hx, hy, hz = np.float32(nx) + half, np.float32(ny) + half, np.float32(nz) + half
     flat_u, flat_v, flat_w = u.reshape(-1), v.reshape(-1), w.reshape(-1)
-    for chunk in prange((n + CHUNK - 1) // CHUNK):
-        first = np.int64(chunk) * CHUNK
+    for chunk in range(begin, end):
+        first = chunk * CHUNK
         for m in range(first, min(first + CHUNK, n)):
             p = order[m]
             x = _clamp((positions[p, 0] - x0) * inverse, -half, hx)
@@ -232,13 +234,13 @@ def gather(positions, order, low, h, u, v, w, velocities, affine):
             affine[p, 2, 0], affine[p, 2, 1], affine[p, 2, 2] = four * cx, four * cy, four * cz
 
 
-@njit(parallel=True, cache=True)
-def deposit(positions, amounts, order, start, blocks, low, h, out):
+@shared(lambda positions, amounts, order, start, blocks, *_: (0, len(blocks)))
+def deposit(begin, end, positions, amounts, order, start, blocks, low, h, out):
     """Amounts of the particles of some blocks, shared among the eight nearest cell centres."""
     nx, ny, nz = out.shape
     inverse, half = np.float32(1.0 / h), np.float32(0.5)
     x0, y0, z0 = np.float32(low[0]), np.float32(low[1]), np.float32(low[2])
-    for block in prange(len(blocks)):
+    for block in range(begin, end):
         for column in range(BLOCK * blocks[block, 0], min(BLOCK * (blocks[block, 0] + 1), nx)):
             first = start[(column * ny + BLOCK * blocks[block, 1]) * nz]
             last = start[(column * ny + min(BLOCK * (blocks[block, 1] + 1), ny)) * nz]
@@ -261,14 +263,13 @@ def deposit(positions, amounts, order, start, blocks, low, h, out):
                         out[ii, jj, k1] += upper
 
 
-@njit(parallel=True, cache=True)
+@shared(lambda index, *_: (0, len(index)))
 def select(
-    index, positions, velocities, affine, deformation, masses, source, ids,
+    begin, end, index, positions, velocities, affine, deformation, masses, source, ids,
     new_positions, new_velocities, new_affine, new_deformation, new_masses, new_source, new_ids,
 ):  # fmt: skip
     """Copy the rows of an index."""
-    for m_ in prange(len(index)):
-        m = np.int64(m_)
+    for m in range(begin, end):
         p = index[m]
         new_masses[m], new_source[m], new_ids[m] = masses[p], source[p], ids[p]
         for a in range(3):

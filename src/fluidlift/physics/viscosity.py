@@ -24,9 +24,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from numba import njit, prange
 
 from fluidlift.errors import require
+from fluidlift.numerics.sharing import shared
 from fluidlift.physics import stress_kernels as kernels
 from fluidlift.physics.liquid_fractions import octant_shares
 from fluidlift.physics.stress_multigrid import StressSystem, assemble, build_levels, fitting_threads, v_cycle
@@ -191,15 +191,14 @@ def _clearance(solid_distance: np.ndarray, region: Region) -> np.ndarray:
     return np.stack([mean_with_next(mean_with_next(nodes, (a + 1) % 3), (a + 2) % 3) for a in range(3)])
 
 
-@njit(parallel=True, cache=True)
-def _continue_behind_walls(x, clearance, mass, wall_share, buried):
+@shared(lambda x, *_: (1, x.shape[1] - 1))
+def _continue_behind_walls(begin, end, x, clearance, mass, wall_share, buried):
     """Velocities of the `buried` faces (bool [3,...], role WALL), linear through the wall's; in place.
 
     Before, they hold the velocity of the wall. Without friction they take over that of the liquid beside them.
     """
-    _, nx, ny, nz = x.shape
-    for i_ in prange(1, nx - 1):
-        i = np.int64(i_)
+    _, _, ny, nz = x.shape
+    for i in range(begin, end):
         for a in range(3):
             for j in range(1, ny - 1):
                 for k in range(1, nz - 1):

@@ -20,6 +20,7 @@ from scipy import ndimage
 
 from fluidlift.errors import require, required
 from fluidlift.numerics.sampling import sample_nodes
+from fluidlift.numerics.sharing import shared
 from fluidlift.shape.prune import body_size
 from fluidlift.types import triple
 from fluidlift.types.gaussians import Gaussians
@@ -77,16 +78,15 @@ def _splat_field(low, spacing, means, precisions, opacities, reach, field):
                         field[a, b, c] += opacities[n] * math.exp(-0.5 * q)
 
 
-@nb.njit(cache=True, parallel=True)
-def _odd_rays(voxels, starts, directions, rays, odd):
+@shared(lambda voxels, starts, *_: (0, starts.shape[0]))
+def _odd_rays(begin, end, voxels, starts, directions, rays, odd):
     """How many of the rays from each start (voxel units) cross the hull an odd number of times, until that is decided.
 
     A ray is mirrored where it meets the face of a terrain voxel: a surface over a bed is closed by its mirror image.
     """
     shape = voxels.shape
     limit = 2 * (shape[0] + shape[1] + shape[2])
-    for n0 in nb.prange(starts.shape[0]):
-        n = np.int64(n0)
+    for n in range(begin, end):
         count = 0
         for r in range(rays):
             m = (n * rays + r) % directions.shape[0]

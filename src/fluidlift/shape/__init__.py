@@ -30,6 +30,8 @@ Modules of the face:
     kind              What kind of fluid a clip shows, and where up is: decided from evidence that the report can
                       show
     kinds             How the body of each kind of fluid is built: one file per kind, found by its name
+    occluders         What stands before a fall and hides it (a plant, a post, a parapet), told from ground by what
+                      the water does there
     off_picture       Extrapolation of a stream's surface beyond the edges of the picture: the seen one goes on as
                       in a mirror
     place             Registration and scale, from the canonical frame of a single view to metres: the free scale,
@@ -55,7 +57,7 @@ Modules of the face:
 
 __all__ = [
     "composite", "dam", "depth_surface", "drawn", "evidence", "fill", "follow", "frame_pictures", "framing",
-    "generate", "given", "given_depth", "ground", "ground_texture", "hints", "kind", "kinds", "off_picture",
+    "generate", "given", "given_depth", "ground", "ground_texture", "hints", "kind", "kinds", "occluders", "off_picture",
     "place", "prune", "puddle", "refine", "rest_frames", "segment", "standing", "surface", "texture_gradient",
     "unite", "view",
 ]  # fmt: skip

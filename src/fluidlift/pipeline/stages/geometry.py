@@ -15,6 +15,7 @@ from fluidlift.shape import (
     generate,
     ground,
     ground_texture,
+    occluders,
     place,
     standing,
 )
@@ -45,10 +46,11 @@ def geometry(
         InputRejected: a fluid without a shape, or something given that does not fit.
     """
     s, clip, c = sighted(read, flow, segmentation, given, config, work=work), read.clip, config
-    fluid = FluidMasks(segmentation.labels.labels)
     seen, canonical, front, falling, visible = s.seen, s.canonical, s.front, s.falling, s.visible
     kind, parts, mask, points, velocities, scale = seen.kind, seen.parts, seen.mask, s.points, s.velocities, s.scale
     falls, trust, seen_depth = falling.pixels[visible], seen.trust[visible], s.seen_depth
+    hidden = _hidden(seen, segmentation)
+    fluid = FluidMasks(segmentation.labels.labels, hidden)
     mainstream = mainstream_of(kind, velocities[~falls], trust[~falls]) if seen.stood is None else seen.stood.direction
     eye = seen.known.position if seen.pose_given else None
     to_world, camera = place.place(canonical, points, scale.value, heading=seen.heading, eye=eye, mainstream=mainstream)
@@ -90,6 +92,7 @@ def geometry(
         rest_frame=seen.start,
         united_frames=seen.united,
         rocks=None if seen.stood is None else seen.stood.solid,
+        hidden=hidden,
         known_scale=s.known_scale,
         depth_source=None if seen_depth is None else seen_depth.meta,
         jets=tuple(falling.plain(to_world)),
@@ -102,15 +105,27 @@ def _coloured(
     setting: Setting, clip: VideoClip, fluid: FluidMasks, seen: Sight, falls: np.ndarray, camera: PinholeCamera
 ) -> tuple[Setting, np.ndarray]:
     """The setting with its ground as the clip shows it, and the picture without the fluid, u8 [h,w,3]."""
-    # the plate looks at a few frames only
-    plate = generate.background_plate(clip.frames, cast(Any, fluid), ground.solid_share(fluid.labels) > 0.5)
+    # the plate looks at a few frames only; what stands before the fluid is in it, and on no ground
+    filmed, stands, before = FluidMasks(fluid.labels), ground.solid_share(fluid.labels) > 0.5, fluid.hidden
+    stands, uncovered = (stands, True) if before is None else (stands | before, ~before)
+    plate = generate.background_plate(clip.frames, cast(Any, filmed), stands)
     picture = plate.image
     if setting.surface_height is not None:
         labels = ground.seen_labels(fluid, seen.start, seen.united, falls)
-        view = ground_texture.View(picture, camera, labels, np.asarray(plate.seen))
+        view = ground_texture.View(picture, camera, labels, np.asarray(plate.seen & uncovered))
         setting = ground.textured(setting, view)
-        picture = ground_texture.over_bed(picture, view.seen, setting.terrain.mesh, camera)
+        picture = ground_texture.over_bed(picture, np.asarray(plate.seen), setting.terrain.mesh, camera)
     return ground.finished(setting, picture, camera), picture
+
+
+def _hidden(seen: Sight, segmentation: Segmentation) -> np.ndarray | None:
+    """Pixels in which something stands before a fall."""
+    if not seen.kind.enters_over_rim:
+        return None
+    found = occluders.occluders(
+        seen.mask, FluidMasks(segmentation.labels.labels).any_frame(), seen.motion, seen.trust
+    )  # fmt: skip
+    return found if found.any() else None
 
 
 def _seen_speed(visible, velocities, trust) -> np.ndarray:

@@ -57,7 +57,7 @@ Modules of the face:
 
 __all__ = [
     "composite", "dam", "depth_surface", "drawn", "evidence", "fill", "follow", "frame_pictures", "framing",
-    "generate", "given", "given_depth", "ground", "ground_texture", "hints", "kind", "kinds", "occluders", "off_picture",
-    "place", "prune", "puddle", "refine", "rest_frames", "segment", "standing", "surface", "texture_gradient",
-    "unite", "view",
+    "generate", "given", "given_depth", "ground", "ground_texture", "hints", "kind", "kinds", "occluders",
+    "off_picture", "place", "prune", "puddle", "refine", "rest_frames", "segment", "standing", "surface",
+    "texture_gradient", "unite", "view",
 ]  # fmt: skip

@@ -19,6 +19,7 @@ from fluidlift.shape import (
     place,
     standing,
 )
+from fluidlift.shape.frame_pictures import typical_picture
 from fluidlift.types import (
     CellType,
     PinholeCamera,
@@ -105,26 +106,29 @@ def _coloured(
     setting: Setting, clip: VideoClip, fluid: FluidMasks, seen: Sight, falls: np.ndarray, camera: PinholeCamera
 ) -> tuple[Setting, np.ndarray]:
     """The setting with its ground as the clip shows it, and the picture without the fluid, u8 [h,w,3]."""
-    # the plate looks at a few frames only; what stands before the fluid is in it, and on no ground
-    filmed, stands, before = FluidMasks(fluid.labels), ground.solid_share(fluid.labels) > 0.5, fluid.hidden
-    stands, uncovered = (stands, True) if before is None else (stands | before, ~before)
-    plate = generate.background_plate(clip.frames, cast(Any, filmed), stands)
+    # the plate looks at a few frames only
+    solid = ground.solid_share(fluid.labels) > 0.5
+    solid = solid if fluid.hidden is None else solid & ~fluid.hidden
+    plate = generate.background_plate(clip.frames, cast(Any, fluid), solid)
     picture = plate.image
     if setting.surface_height is not None:
         labels = ground.seen_labels(fluid, seen.start, seen.united, falls)
-        view = ground_texture.View(picture, camera, labels, np.asarray(plate.seen & uncovered))
+        view = ground_texture.View(picture, camera, labels, np.asarray(plate.seen))
         setting = ground.textured(setting, view)
-        picture = ground_texture.over_bed(picture, np.asarray(plate.seen), setting.terrain.mesh, camera)
-    return ground.finished(setting, picture, camera), picture
+        picture = ground_texture.over_bed(picture, view.seen, setting.terrain.mesh, camera)
+    setting = ground.finished(setting, picture, camera)
+    if fluid.hidden is not None:  # what stands before the fluid is on no ground, but in the picture without the fluid
+        pick = np.unique(np.linspace(0, len(clip) - 1, 8).astype(int))
+        picture = np.where(fluid.hidden[..., None], typical_picture(clip.frames[pick]).astype(np.uint8), picture)
+    return setting, picture
 
 
 def _hidden(seen: Sight, segmentation: Segmentation) -> np.ndarray | None:
     """Pixels in which something stands before a fall."""
     if not seen.kind.enters_over_rim:
         return None
-    found = occluders.occluders(
-        seen.mask, FluidMasks(segmentation.labels.labels).any_frame(), seen.motion, seen.trust
-    )  # fmt: skip
+    ever = FluidMasks(segmentation.labels.labels).any_frame()
+    found = occluders.occluders(seen.mask, ever, seen.motion, seen.trust)
     return found if found.any() else None
 
 

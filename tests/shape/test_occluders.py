@@ -133,6 +133,7 @@ def test_odds_of_an_outline_are_those_of_the_two_models():
     before = Outline(1.0, 1.0, 0.0, narrow=0.6)
     within = Outline(0.4, 0.2, 0.38, narrow=0.6)
     assert before.probability > 0.999 and within.probability < 0.001
+    assert Outline(1.0, 1.0, 0.0, narrow=0.07).probability < SURE, "the wake of a twig is short"
     alike = Outline(0.7, float("nan"), 0.3 / np.pi * 2.0, narrow=0.6)  # half way between both in what is seen
     assert alike.probability == pytest.approx(PRIOR / (1 + PRIOR), abs=0.01)
     assert Outline(float("nan"), 1.0, 0.0, narrow=0.6).probability == 0.0, "nothing goes in"

@@ -81,7 +81,8 @@ class Outline:
         if not np.isfinite(self.enters):
             return 0.0
         # a cylinder of radius a: 1 - (a/r)^2 on the stagnation line; (a/r)^2 sin 2t aside, 2/pi of it in the mean
-        solid = (1.0 - self.narrow, WAKE, 2.0 / np.pi * self.narrow)
+        # the wake fills up with a / r
+        solid = (1.0 - self.narrow, 1.0 - (1.0 - WAKE) * np.sqrt(self.narrow), 2.0 / np.pi * self.narrow)
         odds = np.log(PRIOR)
         for seen, before, within in zip((self.enters, self.leaves, self.parts), (1.0, 1.0, 0.0), solid, strict=True):
             if np.isfinite(seen):

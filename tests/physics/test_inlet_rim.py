@@ -47,6 +47,16 @@ def test_the_inlet_of_a_curtain_has_no_gap_and_no_cell_that_is_fed_from_above():
     np.testing.assert_array_equal(cells[cells != types], CellType.INFLOW)
 
 
+@pytest.mark.parametrize("velocity", [(0.0, -0.1, -0.4), (0.0, -0.2, -0.15)])
+def test_the_rim_is_fed_without_a_gap_where_water_runs_over_it_as_where_it_falls(velocity):
+    types, positions, _ = curtain()
+    field = FaceVelocity(*(np.full(GRID.face_shape(a), v, np.float32) for a, v in enumerate(velocity)))
+    cells = inlet_along_rim(types, positions, field, GRID, np.array(G))
+    assert {tuple(c) for c in np.argwhere(cells == CellType.INFLOW)} == {
+        (x, behind(rim(x)), rim(x)) for x in range(FIRST, LAST)
+    }
+
+
 def test_no_inlet_is_made_below_the_lowest_one_that_was_given():
     types, positions, velocity = curtain()
     types[types == CellType.INFLOW] = CellType.FLUID

@@ -7,8 +7,8 @@ import pytest
 
 from fluidlift.numerics.signed_distance import distance_of_heights
 from fluidlift.scene.dry_cells import MARGIN, dry_cells
-from fluidlift.scene.simulator import simulator_of
-from fluidlift.types import CellType, Grid, PinholeCamera, Terrain, TriangleMesh
+from fluidlift.scene.simulator import simulator_of, within_outlet
+from fluidlift.types import CellType, FaceVelocity, Grid, PinholeCamera, Terrain, TriangleMesh
 
 GRID = Grid((20, 16, 12), 0.1, (-1.0, -0.8, 0.0))
 EYE = np.array([0.0, 0.0, 5.0])
@@ -96,3 +96,25 @@ def test_an_inlet_beside_the_filmed_fluid_is_closed_unless_all_of_it_is(channel)
     fed = simulator_of(replace(scene, dry=half))._walls.regions == CellType.INFLOW
     assert fed.any() and not (fed & half).any()
     assert (simulator_of(replace(scene, dry=inlet))._walls.regions == CellType.INFLOW).any()
+
+
+def test_a_fall_whose_rim_is_dry_is_fed_below_it(channel):
+    scene = channel(2)
+    inlet = scene.cell_types == CellType.INFLOW
+    half = inlet & (np.arange(inlet.shape[1]) < inlet.shape[1] // 2)[None, :, None]
+    down = FaceVelocity(
+        *(np.full(scene.terrain.grid.face_shape(a), v, np.float32) for a, v in enumerate((0.3, 0.0, -0.2)))
+    )
+    fall = replace(scene, kind="fall", velocity=down)
+    cells, body = within_outlet(replace(fall, dry=half))
+    new = (cells == CellType.INFLOW) & ~inlet
+    assert new.any() and not ((cells == CellType.INFLOW) & half).any()
+    below = np.zeros_like(half)
+    for steps in range(1, 4):
+        below[steps:] |= half[:-steps]  # the channel runs along x
+    columns, dry = np.unique(np.argwhere(new & below)[:, 1]), np.unique(np.argwhere(half)[:, 1])
+    assert len(np.intersect1d(columns, dry)) > 0.6 * len(dry), "as wide as what was closed"
+    at = np.clip(scene.terrain.grid.cell_of(body.positions), 0, np.array(half.shape) - 1)
+    assert not half[tuple(at.T)].any()
+    stream = within_outlet(replace(scene, dry=half))[0]
+    assert not ((stream == CellType.INFLOW) & ~inlet & below).any(), "a stream is not fed within"

@@ -9,7 +9,7 @@ import trimesh
 from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.physics.apic import LiquidSimulator
 from fluidlift.shape.airborne import airborne_setting, inside_body
-from fluidlift.shape.channel import BEYOND, MARGIN, OUTLET, ChannelConfig, channel_setting, upper_rim
+from fluidlift.shape.channel import BEYOND, MARGIN, OUTLET, ChannelConfig, above_rim, channel_setting, upper_rim
 from fluidlift.shape.heights import PlaneHeight
 from fluidlift.shape.plan import Footage
 from fluidlift.shape.terrain import signed_distance_from
@@ -559,3 +559,14 @@ def test_a_ragged_curtain_is_fed_along_its_whole_upper_edge_whichever_way_the_po
     assert rim[first, np.arange(2, 10)].all()
     assert rim[:, inner].sum(axis=0).max() <= 2
     assert not rim[8:, inner].any()
+
+
+def test_what_comes_over_a_rim_has_no_bank_there_but_has_its_sides():
+    h, n = 0.1, 14
+    i, j = np.indices((n, 11))
+    water = (i >= 4) & (j >= 2) & (j < 9)
+    level = -2.0 * h * i
+    open_end = above_rim(water, level, np.array([1.0, 0.0]), h, 3)
+    assert open_end[1:4, 2:9].all(), "the way down from there leads to the water"
+    assert not open_end[:1].any() and not open_end[:, [0, 1, 9, 10]].any()
+    assert not (open_end & water).any() and not above_rim(water[::-1], level, np.array([1.0, 0.0]), h, 3)[10:].any()

@@ -3,6 +3,7 @@ clip. One H.264 file, each picture with its mask below it."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +35,7 @@ def size_of_film(size: tuple[int, int]) -> tuple[int, int]:
 
 
 def write_footage(
-    path: Path, frames: UInt8[np.ndarray, "t h w 3"], fluid: Bool[np.ndarray, "t h w"], interval: float
+    path: Path, frames: Iterable[UInt8[np.ndarray, "h w 3"]], fluid: Iterable[Bool[np.ndarray, "h w"]], interval: float
 ) -> Path:
     """Write pictures (sRGB), and where they show fluid, `interval` seconds apart.
 
@@ -43,9 +44,9 @@ def write_footage(
         ValueError: no frames.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    size = size_of_film(fluid.shape[2:0:-1])
 
     def stacked(picture: np.ndarray, mask: np.ndarray) -> np.ndarray:
+        size = size_of_film((mask.shape[1], mask.shape[0]))
         marks = np.repeat(255 * mask[..., None].astype(np.uint8), 3, axis=-1)
         return np.concatenate([_even_sides(resample(np.asarray(p), size)) for p in (picture, marks)])
 

@@ -23,7 +23,7 @@ Modules of the face:
     recurrent_stencil_fit  Fitting the recurrent stencil to solved pressure problems, and judging it before use
                            (paper: `percnn_str_fit`)
     sampling               Trilinear interpolation of grid fields at points
-    sharing                How the work of a parallel loop is shared out
+    sharing                How the work of a loop is shared out among threads
     signed_distance        Signed distance fields (SDF) at grid nodes: making them, and keeping points outside the
                            solid
     similarity2            Similarities of the picture plane as matrices [2,3] that act on pixel indices (as

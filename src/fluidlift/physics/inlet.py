@@ -24,9 +24,6 @@ of a curtain at 80 degrees, and its rim has steps of that"""
 STEP = 2
 """cells that a sheet of cells may step back or forth from one layer to the next"""
 
-STEEP = 0.7
-"""cosine to gravity of a velocity that falls"""
-
 SHORE = 1.5
 """cells from what stands out of a fluid within which its splats have the colours of rocks and banks"""
 
@@ -94,8 +91,9 @@ def inlet_along_rim(
 
     An inlet drawn on the plan of a steep curtain misses cells of its rim, and below each gap the curtain runs dry as
     soon as it has fallen: a sheet comes down in strings. So between the ends of the inlet a cell of the body that moves
-    down becomes INFLOW where the way back along its velocity meets nothing wet. The way is looked for to either side as
-    well, across the curtain, which may lean: it is a staircase of cells.
+    down, however gently (over the rim water runs before it falls), becomes INFLOW where the way back along its velocity
+    meets nothing wet. The way is looked for to either side as well, across the curtain, which may lean: it is a
+    staircase of cells.
 
     Args:
         cell_types: `CellType`; those of an inlet without anything of the body are returned as they are.
@@ -115,7 +113,7 @@ def inlet_along_rim(
     down = down / np.linalg.norm(down)
     v = velocity.at_centers()[tuple(index.T)].astype(np.float64)
     speed = np.linalg.norm(v, axis=1)
-    falls = (speed > 0) & (v @ down > STEEP * speed) & (index @ down <= (given @ down).max())
+    falls = (v @ down > 0) & (index @ down <= (given @ down).max())
     index, along = index[falls], v[falls] / speed[falls, None]
     across = _across_sheet(np.argwhere(held), down, (given @ down).max())
     reach = LOOK_BACK + STEP + 1

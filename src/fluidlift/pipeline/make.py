@@ -28,6 +28,7 @@ from fluidlift.scene.settings import SceneSettings
 from fluidlift.scene.simulator import particle_work
 from fluidlift.scene.splat_files import require_room
 from fluidlift.seams import Progress, Silence
+from fluidlift.shape.occluders import Behind
 from fluidlift.types import Filmed, FluidAsset, kind_of
 from fluidlift.types.fluid_masks import FluidMasks
 from fluidlift.types.hints import NOTHING_SAID, ClipHints
@@ -164,7 +165,7 @@ def _calibrated(runner: Runner, lift: Lift, asset: FluidAsset, config: JobConfig
 
     scene = edited_scene(asset, SceneEdits(), None, SceneSettings.of(config), start=lift.geometry.rest_frame)
     target = mean_target(asset, lift.motion.velocities)
-    wet, s = FluidMasks(lift.labels.labels).any_frame(), config.simulate
+    wet, s = FluidMasks(lift.labels.labels, lift.geometry.hidden).any_frame(), config.simulate
     return runner.run("calibrate", calibrate, scene, target, wet, wanted=s.follow > 0, beside={"device": s.device})
 
 
@@ -180,7 +181,11 @@ def _write_film(lift: Lift, folder: Path) -> None:
     clip = lift.clip
     first = first_of_film(lift.geometry.rest_frame, len(clip))
     part = slice(first, first + MOST_FRAMES)
-    write_footage(film, clip.frames[part], FluidMasks(lift.labels.labels)[part], clip.interval)
+    frames, fluid, hidden = clip.frames[part], FluidMasks(lift.labels.labels)[part], lift.geometry.hidden
+    if hidden is not None:
+        behind = Behind.of(hidden, lift.geometry.mask)
+        frames, fluid = behind.pictures(frames), behind.pictures(fluid)
+    write_footage(film, frames, fluid, clip.interval)
 
 
 def _metrics(lift: Lift, calibration: Calibration) -> dict[str, Any]:

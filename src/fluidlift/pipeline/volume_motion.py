@@ -9,11 +9,12 @@ import numpy as np
 
 from fluidlift.messages import Notice
 from fluidlift.pipeline.settings import MotionSettings
-from fluidlift.types import Grid, SurfaceMotion, VideoClip
+from fluidlift.shape.occluders import near_occluders
+from fluidlift.types import Grid, PixelFlow, SurfaceMotion, VideoClip
 from fluidlift.types.stages import Geometry
 
 if TYPE_CHECKING:
-    from fluidlift.motion.sequence import FrameMotion, MotionOptions, MotionScene
+    from fluidlift.motion.sequence import FlowReader, FrameMotion, MotionOptions, MotionScene
 
 FAST_FALL = 0.3
 """share of the steep part whose speed is that of free fall, from which the user is told"""
@@ -28,10 +29,26 @@ def motion_scene(clip: VideoClip, geometry: Geometry) -> MotionScene:
     from fluidlift.motion.sequence import MotionScene
 
     g, setting = geometry, geometry.setting
+    trust = g.mean_confidence
+    if g.hidden is not None:
+        trust = np.where(near_occluders(g.hidden), np.float32(0), trust)
     return MotionScene(
         g.camera, g.sighted_depth, setting.terrain, setting.cell_types, g.kind, clip.interval, setting.surface_height,
-        setting.pool_level, prior=(g.mean_flow, g.mean_confidence),
+        setting.pool_level, prior=(g.mean_flow, trust),
     )  # fmt: skip
+
+
+def seen_beside(flow: FlowReader, geometry: Geometry) -> FlowReader:
+    """The flow, without confidence where something before the fluid moves, or stands, in its place."""
+    if geometry.hidden is None:
+        return flow
+    near = near_occluders(geometry.hidden)
+
+    def read(first: int, last: int) -> PixelFlow:
+        found = flow(first, last)
+        return PixelFlow(found.displacement, np.where(near, np.float32(0), found.confidence))
+
+    return read
 
 
 def motion_options(config: MotionSettings) -> MotionOptions:

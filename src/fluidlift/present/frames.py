@@ -22,6 +22,8 @@ from fluidlift.scene.footage import Footage
 from fluidlift.types import Gaussians, PinholeCamera, Similarity3, concatenate, matrix_from_quat
 
 BACKGROUNDS = ("auto", "plate", "terrain", "none")
+NEAR = 1e-3
+"""m, depth of what stands before the fluid in an unknown place: it hides all of it"""
 
 
 @dataclass(frozen=True)
@@ -169,13 +171,23 @@ class FrameRenderer:
         return _placed(self.footage.plate, self.scene.camera, camera)
 
     def _depth_of_rocks(self, camera: PinholeCamera) -> np.ndarray | None:
-        """Camera depth (m) of the rocks that the plate shows, 0 beside them; None where it shows none."""
-        if self.footage is None or not self.footage.rocks.any():
+        """Camera depth (m) of the rocks that the plate shows, and of what stands before the fluid, 0 beside them; None
+        where it shows none."""
+        if self.footage is None:
+            return None
+        rocks, before = self.footage.rocks, self.footage.before
+        stands = rocks if before is None else rocks | before
+        if not stands.any():
             return None
         if self._rock_depth is None or self._rock_depth[0] is not camera:
-            picture = self.footage.rocks[..., None].repeat(3, 2).astype(np.uint8) * 255
-            there = _placed(picture, self.scene.camera, camera, goes_on=False)[..., 0] > 0.5
-            depth = terrain_depth(self.scene.terrain, camera)
+
+            def placed(pixels: np.ndarray) -> np.ndarray:
+                picture = pixels[..., None].repeat(3, 2).astype(np.uint8) * 255
+                return _placed(picture, self.scene.camera, camera, goes_on=False)[..., 0] > 0.5
+
+            there, depth = placed(stands), terrain_depth(self.scene.terrain, camera)
+            if before is not None:
+                depth = np.where(placed(before), NEAR, depth)
             self._rock_depth = camera, np.where(there & np.isfinite(depth), depth, 0.0).astype(np.float32)
         return self._rock_depth[1]
 

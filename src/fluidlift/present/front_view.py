@@ -30,12 +30,14 @@ def before_ground(scene: Scene, footage: Footage | None) -> Callable[[Gaussians]
 
     if footage is None:
         return None
-    rocks = footage.rocks
+    rocks, before = footage.rocks, footage.before
     ground = rocks | ~footage.labels.fluid.any(axis=0) if kind_of(scene.kind).is_channel_flow else rocks
     if not ground.any():
         return None
     margin = scene.terrain.grid.spacing * np.where(rocks, *BEHIND)
     depth = terrain_depth(scene.terrain, scene.camera)
+    if before is not None:
+        depth = np.where(before, -np.inf, depth)
     return lambda g: visible_beside_rocks(g.means, scene.camera, depth, ground, margin=margin)
 
 

@@ -22,10 +22,12 @@ class Footage:
     """frame of the clip that the first simulated one shows"""
     rocks: np.ndarray
     """bool [H,W], pixels in which something solid stands in or before the fluid"""
+    before: np.ndarray | None = None
+    """bool [H,W], pixels in which something that is no part of the ground hides all fluid; None: nothing does"""
 
 
 def footage_of(read: Read, segmentation: Segmentation, geometry: Geometry) -> Footage:
     """The clip as the first stages saw it."""
     labels = segmentation.labels
     rocks = geometry.rocks if geometry.rocks is not None else labels.solid.mean(axis=0) > 0.5
-    return Footage(read.clip, labels, geometry.plate, geometry.rest_frame, rocks)
+    return Footage(read.clip, labels, geometry.plate, geometry.rest_frame, rocks, geometry.hidden)

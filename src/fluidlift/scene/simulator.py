@@ -92,17 +92,24 @@ def within_outlet(scene: Scene) -> tuple[np.ndarray, Particles]:
         return scene.cell_types, scene.body
     dry = np.zeros(scene.cell_types.shape, bool) if scene.dry is None else scene.dry
     cells, grid = thin_outlet(scene.cell_types), scene.terrain.grid
-    if kind.nearly_level:
-        cells = inlet_to_surface(cells, scene.body.positions, grid)
-    elif kind.enters_over_rim:
-        gravity = np.asarray(scene.parameters.gravity)
-        cells = inlet_along_rim(cells, scene.body.positions, scene.velocity, grid, gravity)
-    inlet = cells == CellType.INFLOW
-    if (inlet & ~dry).any():
-        cells = np.where(inlet & dry, np.uint8(CellType.EMPTY), cells)
     behind = dry | ((scene.cell_types == CellType.OUTFLOW) & (cells != CellType.OUTFLOW))
     at = np.clip(grid.cell_of(scene.body.positions), 0, np.asarray(grid.shape) - 1)
-    return cells, scene.body.select(~behind[tuple(at.T)])
+    body = scene.body.select(~behind[tuple(at.T)])
+    if kind.nearly_level:
+        cells = _undrained(inlet_to_surface(cells, scene.body.positions, grid), dry)
+    elif kind.enters_over_rim:
+        # where its rim is dry, a sheet begins below it
+        cells, gravity = _undrained(cells, dry), np.asarray(scene.parameters.gravity)
+        cells = np.where(dry & (cells == CellType.FLUID), np.uint8(CellType.EMPTY), cells)
+        cells = inlet_along_rim(cells, body.positions, scene.velocity, grid, gravity)
+        cells = _undrained(cells, dry)
+    return cells, body
+
+
+def _undrained(cells: np.ndarray, dry: np.ndarray) -> np.ndarray:
+    """The cells without inlets in dry ones, but where all of the inlet is dry."""
+    inlet = cells == CellType.INFLOW
+    return np.where(inlet & dry, np.uint8(CellType.EMPTY), cells) if (inlet & ~dry).any() else cells
 
 
 def preflight(scene: Scene) -> None:

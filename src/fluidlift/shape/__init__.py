@@ -28,6 +28,8 @@ Modules of the face:
     kind              What kind of fluid a clip shows, and where up is: decided from evidence that the report can
                       show
     kinds             How the body of each kind of fluid is built: one file per kind, found by its name
+    occluders         What stands before a fall and hides it (a plant, a post, a parapet), told from ground by what
+                      the water does there
     off_picture       Extrapolation of a stream's surface beyond the edges of the picture: the seen one goes on as
                       in a mirror
     prune             Denoises a body: takes out faint, stretched, huge, lonely and broken Gaussians (paper: before
@@ -70,6 +72,7 @@ __all__ = [
     "hints",
     "kind",
     "kinds",
+    "occluders",
     "off_picture",
     "prune",
     "puddle",

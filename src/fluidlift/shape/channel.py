@@ -86,7 +86,7 @@ def channel_setting(seen: Footage, config: ChannelConfig) -> Setting:
         spacing *= 1.05
     plan = with_seen(plan_of(seen, grid, extent), extent.visible, grid)
     thin = seen.surface.sheet(grid.centers()[:, :, 0, :2])
-    ground = _bed_and_banks(plan, grid, (depth, thin), extent, kind)
+    ground = _bed_and_banks(plan, grid, (depth, thin), extent, kind, seen.along)
     ground = _as_seen(ground, plan, grid, seen, extent)
     return _fill_channel(grid, plan, ground, extent.reach, seen, kind)
 
@@ -111,9 +111,11 @@ def _ground_samples(low, high, n: int = 24) -> np.ndarray:
 
 
 def _bed_and_banks(
-    plan: Plan, grid: Grid, depths: tuple[float, Float[np.ndarray, "nx ny"]], extent: Extent, kind: FluidKind
-) -> _Ground:
-    """Ground height and where there is water, per column; `depths`: the greatest, and the most that each column has."""
+    plan: Plan, grid: Grid, depths: tuple[float, Float[np.ndarray, "nx ny"]], extent: Extent, kind: FluidKind,
+    along: Float[np.ndarray, "2"],
+) -> _Ground:  # fmt: skip
+    """Ground height and where there is water, per column; `depths`: the greatest, and the most that each column has;
+    `along`: horizontal direction of the flow."""
     h, (depth, thin) = grid.spacing, depths
     wet, rock = plan.wet, plan.label == Label.SOLID  # rocks stand in the water: its banks are further out
     reach = cross_section.Reach(wet, rock, plan.level, plan.along, plan.speed, h)
@@ -121,6 +123,9 @@ def _bed_and_banks(
     steep = np.sqrt(1 + gx**2 + gy**2)  # thickness is meant across the sheet, columns are vertical
     steep = steep if kind.enters_over_rim else np.minimum(steep, EDGE)
     section = cross_section.depth_along(reach, depth, extent.width, kind)
+    if kind.enters_over_rim:  # what comes over it is as deep there as anywhere: its rim is no bank
+        foot_of_bank = int(np.ceil(depth / (cross_section.REPOSE * h)))
+        reach = replace(reach, wet=wet | above_rim(wet, plan.level, along, h, foot_of_bank))
     below = np.maximum(np.minimum(cross_section.thickness(reach, section, extent.width), thin), 0.7 * h)
     outside = distance_inside(~wet, h)
     bank = plan.level + steep * np.minimum(0.4 * h + 0.9 * outside, 0.5 * depth + 2.5 * h)
@@ -203,6 +208,33 @@ def _kept_dry(grid: Grid, plan: Plan, dry: Bool[np.ndarray, "nx ny"]) -> Float[n
     return np.maximum(away[..., None], grid.nodes()[..., 2] - top[..., None])
 
 
+def above_rim(
+    water: Bool[np.ndarray, "nx ny"], level: Float[np.ndarray, "nx ny"], along: Float[np.ndarray, "2"], spacing: float,
+    reach: int,
+) -> Bool[np.ndarray, "nx ny"]:  # fmt: skip
+    """Dry columns from which the way down leads to water within `reach` columns.
+
+    Args:
+        water, level, along, spacing: as of `upper_rim`.
+        reach: columns.
+    """
+    down = _down(level, along, spacing)[0]
+    here, found = np.moveaxis(np.indices(water.shape), 0, -1), np.zeros(water.shape, bool)
+    for steps in range(1, reach + 1):
+        below = np.moveaxis(here + np.rint(down * steps), -1, 0)
+        found |= ndimage.map_coordinates(water.astype(np.uint8), below, order=0, cval=0) > 0
+    return found & ~water
+
+
+def _down(
+    level: Float[np.ndarray, "nx ny"], along: Float[np.ndarray, "2"], spacing: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Horizontal direction [nx,ny,2] in which water runs from each column, and the slopes of its surface."""
+    gx, gy = np.gradient(ndimage.gaussian_filter(level, 1.0), spacing)
+    down = FLAT * np.asarray(along, float) - np.stack([gx, gy], axis=-1)
+    return down / np.maximum(np.linalg.norm(down, axis=-1, keepdims=True), 1e-12), gx, gy
+
+
 def upper_rim(
     water: Bool[np.ndarray, "nx ny"], level: Float[np.ndarray, "nx ny"], along: Float[np.ndarray, "2"], spacing: float
 ) -> Bool[np.ndarray, "nx ny"]:
@@ -222,9 +254,7 @@ def upper_rim(
     """
     if not water.any():
         return water
-    gx, gy = np.gradient(ndimage.gaussian_filter(level, 1.0), spacing)
-    down = FLAT * np.asarray(along, float) - np.stack([gx, gy], axis=-1)
-    down /= np.maximum(np.linalg.norm(down, axis=-1, keepdims=True), 1e-12)
+    down, gx, gy = _down(level, along, spacing)
     columns = np.maximum(INLET / np.sqrt(1 + gx**2 + gy**2), 1.0)
     up = np.moveaxis(np.indices(water.shape), 0, -1) - np.rint(down * columns[..., None])
     upstream = ndimage.map_coordinates(water.astype(np.uint8), np.moveaxis(up, -1, 0), order=0, cval=0) > 0

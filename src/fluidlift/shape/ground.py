@@ -43,6 +43,8 @@ def seen_labels(fluid, start: int, united: int, falls: np.ndarray) -> np.ndarray
     """`Label` of each pixel over the united frames; a rock is one though waves wash over it in some."""
     window = slice(start, start + united)
     solid, lying = solid_share(fluid.labels[window]) > 0.5, lying_pixels(generate.united_mask(fluid[window]), falls)
+    if fluid.hidden is not None:
+        solid = solid & ~fluid.hidden
     return np.where(solid, Label.SOLID, np.where(lying, Label.FLUID, Label.BACKGROUND)).astype(np.uint8)
 
 

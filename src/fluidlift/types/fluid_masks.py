@@ -11,16 +11,26 @@ from fluidlift.types import Label
 
 
 class FluidMasks:
-    """The fluid of each frame, bool [T,H,W], read from the labels when it is asked for."""
+    """The fluid of each frame, bool [T,H,W], read from the labels when it is asked for.
 
-    def __init__(self, labels: np.ndarray) -> None:
+    Args:
+        labels: `Label` of each pixel.
+        hidden: bool [H,W], pixels in which something stands before the fluid, which counts as fluid in all frames.
+    """
+
+    def __init__(self, labels: np.ndarray, hidden: np.ndarray | None = None) -> None:
         self.labels, self.shape, self.ndim = labels, labels.shape, 3
+        self.hidden = hidden
 
     def __len__(self) -> int:
         return len(self.labels)
 
     def __getitem__(self, index: Any) -> np.ndarray:
-        return np.asarray(self.labels[index]) == Label.FLUID
+        seen = np.asarray(self.labels[index]) == Label.FLUID
+        if self.hidden is None:
+            return seen
+        rest = index[1:] if isinstance(index, tuple) else ()
+        return seen | self.hidden[rest]
 
     def any_frame(self) -> np.ndarray:
         """bool [H,W]: fluid at some time."""

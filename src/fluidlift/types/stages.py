@@ -143,6 +143,8 @@ class Geometry:
     """frames from there on that become one body"""
     rocks: Bool[np.ndarray, "h w"] | None = None
     """pixels in which something solid stands in a dam's fluid; None: the labels say it"""
+    hidden: Bool[np.ndarray, "h w"] | None = None
+    """pixels in which something stands before the fluid, which goes on behind it; None: nothing does"""
     known_scale: float | None = None
     """m per canonical unit, where depth came in metres"""
     depth_source: dict[str, Any] | None = None

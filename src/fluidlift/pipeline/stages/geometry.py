@@ -15,9 +15,11 @@ from fluidlift.shape import (
     generate,
     ground,
     ground_texture,
+    occluders,
     registration,
     standing,
 )
+from fluidlift.shape.frame_pictures import typical_picture
 from fluidlift.types import (
     CellType,
     PinholeCamera,
@@ -45,10 +47,11 @@ def geometry(
         InputRejected: a fluid without a shape, or something given that does not fit.
     """
     s, clip, c = sighted(read, flow, segmentation, given, config, work=work), read.clip, config
-    fluid = FluidMasks(segmentation.labels.labels)
     seen, canonical, front, falling, visible = s.seen, s.canonical, s.front, s.falling, s.visible
     kind, parts, mask, points, velocities, scale = seen.kind, seen.parts, seen.mask, s.points, s.velocities, s.scale
     falls, trust, seen_depth = falling.pixels[visible], seen.trust[visible], s.seen_depth
+    hidden = _hidden(seen, segmentation)
+    fluid = FluidMasks(segmentation.labels.labels, hidden)
     mainstream = mainstream_of(kind, velocities[~falls], trust[~falls]) if seen.stood is None else seen.stood.direction
     eye = seen.known.position if seen.pose_given else None
     to_world, camera = registration.place(
@@ -92,6 +95,7 @@ def geometry(
         rest_frame=seen.start,
         united_frames=seen.united,
         rocks=None if seen.stood is None else seen.stood.solid,
+        hidden=hidden,
         known_scale=s.known_scale,
         depth_source=None if seen_depth is None else seen_depth.meta,
         jets=tuple(falling.plain(to_world)),
@@ -105,14 +109,29 @@ def _coloured(
 ) -> tuple[Setting, np.ndarray]:
     """The setting with its ground as the clip shows it, and the picture without the fluid, u8 [h,w,3]."""
     # the plate looks at a few frames only
-    plate = generate.background_plate(clip.frames, cast(Any, fluid), ground.solid_share(fluid.labels) > 0.5)
+    solid = ground.solid_share(fluid.labels) > 0.5
+    solid = solid if fluid.hidden is None else solid & ~fluid.hidden
+    plate = generate.background_plate(clip.frames, cast(Any, fluid), solid)
     picture = plate.image
     if setting.surface_height is not None:
         labels = ground.seen_labels(fluid, seen.start, seen.united, falls)
         view = ground_texture.View(picture, camera, labels, np.asarray(plate.seen))
         setting = ground.textured(setting, view)
         picture = ground_texture.over_bed(picture, view.seen, setting.terrain.mesh, camera)
-    return ground.finished(setting, picture, camera), picture
+    setting = ground.finished(setting, picture, camera)
+    if fluid.hidden is not None:  # what stands before the fluid is on no ground, but in the picture without the fluid
+        pick = np.unique(np.linspace(0, len(clip) - 1, 8).astype(int))
+        picture = np.where(fluid.hidden[..., None], typical_picture(clip.frames[pick]).astype(np.uint8), picture)
+    return setting, picture
+
+
+def _hidden(seen: Sight, segmentation: Segmentation) -> np.ndarray | None:
+    """Pixels in which something stands before a fall."""
+    if not seen.kind.enters_over_rim:
+        return None
+    ever = FluidMasks(segmentation.labels.labels).any_frame()
+    found = occluders.occluders(seen.mask, ever, seen.motion, seen.trust)
+    return found if found.any() else None
 
 
 def _seen_speed(visible, velocities, trust) -> np.ndarray:

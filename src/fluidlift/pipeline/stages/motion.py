@@ -8,7 +8,14 @@ import numpy as np
 
 from fluidlift.motion.steady_flow import pairs_of, spans_of
 from fluidlift.pipeline.settings import MotionSettings
-from fluidlift.pipeline.volume_motion import motion_options, motion_scene, motion_warnings, plain_report, seen_cells
+from fluidlift.pipeline.volume_motion import (
+    motion_options,
+    motion_scene,
+    motion_warnings,
+    plain_report,
+    seen_beside,
+    seen_cells,
+)
 from fluidlift.pipeline.work import Work
 from fluidlift.types import FaceVelocity, kind_of
 from fluidlift.types.fluid_masks import FluidMasks
@@ -25,7 +32,7 @@ def motion(
     from fluidlift.motion.sequence import motion_sequence
 
     clip, (width, height) = read.clip, read.clip.size
-    pairs, grid, masks = len(clip) - 1, geometry.grid, FluidMasks(segmentation.labels.labels)
+    pairs, grid, masks = len(clip) - 1, geometry.grid, FluidMasks(segmentation.labels.labels, geometry.hidden)
     start = min(geometry.rest_frame, pairs - 1)
     stands = kind_of(geometry.kind).starts_at_rest  # its body is known as it stands, not as it collapses
     targets = range(start, start if stands else min(start + config.targets, pairs))
@@ -37,10 +44,11 @@ def motion(
         completed[t] = np.nan
     found: list[TargetVelocity] = []
     seen: list[FrameMotion] = []
+    scene, options = motion_scene(clip, geometry), motion_options(config)
+    seen_flow = seen_beside(pairs_of(clip, flow.flow), geometry)
     for frame in motion_sequence(
-        pairs_of(clip, flow.flow), masks.__getitem__, pairs, motion_scene(clip, geometry), motion_options(config),
-        frames=wanted, volume_frames=targets,
-    ):  # fmt: skip
+        seen_flow, masks.__getitem__, pairs, scene, options, frames=wanted, volume_frames=targets
+    ):
         work.step(wanted.index(frame.frame), len(wanted))
         completed[frame.frame] = spans[frame.frame] * frame.displacement
         observed[frame.frame] = np.packbits(frame.observed, axis=-1)

@@ -13,7 +13,7 @@ from fluidlift.pipeline.inputs import GivenFile
 from fluidlift.pipeline.settings import RefineSettings
 from fluidlift.pipeline.work import Work
 from fluidlift.seams import Rasterizer
-from fluidlift.shape import generate
+from fluidlift.shape import generate, occluders
 from fluidlift.types import (
     CellType,
     Gaussians,
@@ -43,7 +43,8 @@ LATER = 5
 class _Seen:
     """What the bodies are made of."""
 
-    clip: VideoClip
+    frames: np.ndarray | occluders.Pictures
+    """u8 [T,H,W,3]"""
     fluid: np.ndarray
     """bool [T,H,W]"""
     flow: np.ndarray
@@ -89,10 +90,13 @@ def refine(
     clip, labels, c, camera, setting = read.clip, segmentation.labels, config, geometry.camera, geometry.setting
     start, united, depth = geometry.rest_frame, geometry.united_frames, geometry.depth
     h = setting.terrain.grid.spacing
-    fluid = labels.fluid
-    seen = _Seen(clip, fluid, flow.flow.displacement, geometry, config, work)
+    fluid, frames, mask = labels.fluid, clip.frames, geometry.mask
+    if geometry.hidden is not None:
+        behind = occluders.Behind.of(geometry.hidden, mask)
+        fluid, frames, mask = fluid | behind.hidden, behind.pictures(frames), mask | behind.hidden
+    seen = _Seen(frames, fluid, flow.flow.displacement, geometry, config, work)
     made, fitted, later = _bodies(seen, bodies)
-    colours = generate.fluid_colour_frame(clip.frames[start], fluid[start])
+    colours = generate.fluid_colour_frame(frames[start], fluid[start])
     hull = generate.hull_gaussians(colours, setting, camera, seed=config.seed)
     step = max(0.35 * h, 0.6 * c.stride * _pixel(depth, camera))
     # what another frame has nearer to the camera would hide the picture of the first
@@ -110,7 +114,7 @@ def refine(
         shell, spacing=h / 2, rays=c.rays, rng=np.random.default_rng(config.seed),
         max_added=max(c.max_gaussians - len(shell), least), closed_below=setting.terrain,
     )  # fmt: skip
-    mask, hull = geometry.mask, shell.select(slice(len(shown), None))
+    hull = shell.select(slice(len(shown), None))
     # what the picture contradicts goes: cells reach a little before the visible surface and beyond the silhouette
     allowed = (labels.labels[start : start + united] != Label.BACKGROUND).any(axis=0) | mask
     inside = [hull, _outside_solid(added, setting)]
@@ -144,7 +148,7 @@ def _bodies(
     """One body per united frame, each refined against its picture; those after the first start from the last."""
     from fluidlift.shape.prune import prune
 
-    g, clip, fluid = seen.geometry, seen.clip, seen.fluid
+    g, pictures, fluid = seen.geometry, seen.frames, seen.fluid
     frames = list(range(g.rest_frame, g.rest_frame + g.united_frames))
     if given is not None:
         placed = placed_bodies(g, given.path, frames)
@@ -152,7 +156,7 @@ def _bodies(
         bodies = [prune(b, min_opacity=0.05, max_stretch=12.0)[0] for b in placed]
     else:
         stride = seen.config.stride
-        bodies = [generate.front_gaussians(clip.frames[t], fluid[t], g.depth, g.camera, stride=stride) for t in frames]
+        bodies = [generate.front_gaussians(pictures[t], fluid[t], g.depth, g.camera, stride=stride) for t in frames]
     draws = best_rasterizer(seen.config.rasterizer, seen.work.warn)
     first, fitted = _refined(seen, bodies[0], draws)
     later, likeness = _followed(seen, first, bodies[1:], frames[1:], draws)
@@ -165,7 +169,7 @@ def _followed(
     """Bodies of the frames after the first, each from the one before; and their likeness before and after, dB."""
     from fluidlift.shape.warm_start import follow
 
-    clip, fluid, camera, c = seen.clip, seen.fluid, seen.geometry.camera, seen.config
+    pictures, fluid, camera, c = seen.frames, seen.fluid, seen.geometry.camera, seen.config
     if c.refine_iterations == 0 or len(last) == 0:
         return bodies, ()
     depth, out, likeness = seen.geometry.depth, [], []
@@ -174,11 +178,11 @@ def _followed(
             out.append(fresh)
             continue
         found = follow(
-            last, fresh, clip.frames[t], fluid[t], camera, motion=np.asarray(seen.flow[t - 1], np.float32),
+            last, fresh, pictures[t], fluid[t], camera, motion=np.asarray(seen.flow[t - 1], np.float32),
             depths=(depth, depth), iterations=max(c.refine_iterations // LATER, 1), seed=c.seed,
             max_gaussians=max(int(1.5 * len(fresh)), 1000), rasterizer=draws,
         )  # fmt: skip
-        last = generate.bounded_colours(found.gaussians, clip.frames[t], camera)
+        last = generate.bounded_colours(found.gaussians, pictures[t], camera)
         out.append(last)
         likeness.append((found.psnr_before, found.psnr_after))
     return out, tuple(likeness)
@@ -191,7 +195,7 @@ def _refined(seen: _Seen, front: Gaussians, draws: Rasterizer) -> tuple[Gaussian
     c, start, camera = seen.config, seen.geometry.rest_frame, seen.geometry.camera
     if c.refine_iterations == 0 or not len(front):
         return front, _Refinement()
-    picture = seen.clip.frames[start]
+    picture = seen.frames[start]
     found = refine_view(
         front, picture, seen.fluid[start], camera, iterations=c.refine_iterations, seed=c.seed,
         max_gaussians=max(int(1.5 * len(front)), 1000), rasterizer=draws, progress=seen.work.step,

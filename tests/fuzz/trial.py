@@ -20,6 +20,7 @@ from random import Random
 from typing import Any
 
 from fluidlift.errors import FluidliftError
+from fluidlift.io.confined import reading_here
 
 from .mutation import KINDS, Edit, mutated
 from .targets import TARGETS, Target
@@ -145,7 +146,10 @@ def run_target(name: str, inputs: int, seed: int, keep: Path | None = None) -> F
     place = Path(tempfile.mkdtemp(prefix="fuzz"))
     try:
         folder = Folder(TARGETS[name], place)
-        with contextlib.suppress(Exception):  # what the first call imports and compiles is no part of an input
+        with (
+            reading_here(),
+            contextlib.suppress(Exception),
+        ):  # what the first call imports and compiles is no part of an input
             folder.read(TARGETS[name].seed(0).pack(TARGETS[name].seed(0).data))
         for _ in range(inputs):
             data = drawn(TARGETS[name], random)
@@ -168,7 +172,7 @@ def run_target(name: str, inputs: int, seed: int, keep: Path | None = None) -> F
 def _one(folder: Folder, data: bytes, found: Found, watched: Watched, keep: Path | None) -> None:
     signal.setitimer(signal.ITIMER_REAL, SLOWEST)
     try:
-        with watched.only(folder.place):
+        with reading_here(), watched.only(folder.place):  # where a fault is seen, and the memory is this process's
             outcome = folder.read(data)
         setattr(found, outcome, getattr(found, outcome) + 1)
     except (Exception, TooSlow) as error:

@@ -33,7 +33,7 @@ FOLDER = ROOT / "benchmarks" / "results"
 PAGE = ROOT / "docs" / "results.md"
 LONGEST = 200
 """lines of the page"""
-ORDER = ("clips", "cases", "as_filmed", "geometry", "motion", "splats", "fit", "simulator", "peers", "cost")
+ORDER = ("clips", "cases", "as_filmed", "geometry", "motion", "splats", "fit", "simulator", "peers", "cost", "trust")
 """of the sections; other topics follow by name"""
 SAME = 0.005
 """relative difference that `--against` does not mention"""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -92,7 +93,24 @@ def resimulate(
     lift = recalled_lift(runner, manifest)
     with disk_errors(folder), writing(folder, "a simulation"):
         frames = play(runner, load_asset(folder), config, request, lift)
+        if not overrides and all(value is None for value in (flat or {}).values()):
+            note_as_shown(folder, request)
     return Made(folder, tuple(runner.told), time.perf_counter() - began, runner.timings, frames)
+
+
+def note_as_shown(folder: Path, request: SimulationRequest) -> None:
+    """Frames that were just simulated as scene.yaml says are not stale: noted, since finding it out takes seconds.
+
+    Args:
+        folder: of the asset.
+        request: of the simulation, which went by the settings of the asset; where it asked for something else than
+            scene.yaml says, nothing is noted.
+    """
+    from fluidlift.scene import EditSession
+
+    if (request.duration, request.fps, request.extend_downstream) == (None, None, None):
+        with suppress(InputRejected):
+            EditSession.open(folder, meshes=request.meshes).note_shown()
 
 
 def _check(request: SimulationRequest) -> None:

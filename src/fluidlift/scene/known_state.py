@@ -10,12 +10,13 @@ from __future__ import annotations
 import hashlib
 import json
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from fluidlift import __version__
+import fluidlift
 from fluidlift.errors import FluidliftError
 from fluidlift.io.asset_paths import asset_file
 from fluidlift.io.atomic import write_json
@@ -75,9 +76,16 @@ def _key(folder: Path, text: str, meshes: Path | None) -> str:
         names = ["manifest.json", "parameters.json", "work/simulate/owner", *(f"rest/{name}" for name in rest)]
         files = [asset_file(folder, name) for name in names]
         files += [checkpoint_file(folder), *(home / name for name in _files_of(parse_yaml(text)))]
-        facts = [__version__, text, None if meshes is None else str(meshes), names, [_facts(p) for p in files]]
+        facts = [_source(), text, None if meshes is None else str(meshes), names, [_facts(p) for p in files]]
         return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
     return ""
+
+
+@cache
+def _source() -> list[tuple[str, int, int]]:
+    """Every module of fluidlift with its size and time: another simulator may simulate the same scene otherwise."""
+    place = Path(fluidlift.__file__).parent
+    return sorted((p.name, (s := p.stat()).st_size, s.st_mtime_ns) for p in place.rglob("*.py"))
 
 
 def _facts(path: Path) -> tuple[int, int] | None:

@@ -25,6 +25,7 @@ from fluidlift.present import report
 from fluidlift.present.looping import OPEN
 from fluidlift.scene.build import Scene, SimulationRequest, scene_of
 from fluidlift.scene.footage import footage_of
+from fluidlift.scene.forecast import ahead
 from fluidlift.scene.recall import OF_CLIP, rest_frame_of, stage_keys
 from fluidlift.scene.reshaping import slow_edits
 from fluidlift.seams import Progress, Silence
@@ -157,9 +158,14 @@ def play(runner: Runner, asset: FluidAsset, config: JobConfig, request: Simulati
     seen = SeenLook(edits.look, edits.look.mark(folder) | color_mark(edits.obstacles))
     for text in outside:
         runner.progress.warn(text)
+
+    def tell() -> None:
+        runner.progress.say(ahead(folder, manifest, scene.simulated, scene.interval, len(scene.body)))
+
     done = runner.run(
         "simulate", simulate, scene, taken(SimulateSettings, config.simulate),
-        beside={"folder": folder, "request": request}, still_there=frames_still_there(folder), owns_files=True,
+        beside={"folder": folder, "request": request}, before=tell, still_there=frames_still_there(folder),
+        owns_files=True,
     )  # fmt: skip
     wanted = [folder / "preview.mp4"] * config.show.preview + [folder / "asset.usda"] * config.show.usd
     shown = runner.run(

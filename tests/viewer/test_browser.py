@@ -157,7 +157,7 @@ def test_a_drag_of_a_slider_is_one_edit_simulated_live_and_undo_redo_and_reset_f
         before = viewer.draft.scene
         visit.press("undo")
         visit.until(lambda before=before: viewer.draft.scene != before, "undo")
-    visit.says("No edits.")
+    visit.says("(undone)")
     visit.press("redo")
     visit.until(lambda: viewer.draft.scene.get("parameters"), "redo")
     visit.press("reset")

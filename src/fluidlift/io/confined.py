@@ -58,8 +58,8 @@ class Bounds:
 
     memory: int = 3 * 2**30
     """bytes, besides what the child holds anyway: for a file of 1 GiB and the largest picture, three times over"""
-    seconds: int = 60
-    """s of processor time: three times what the slowest mesh within its bounds takes"""
+    seconds: int = 120
+    """s of processor time: twice what the largest OBJ that is taken needs on a busy machine"""
     patience: float = 600.0
     """s on the clock, for what waits and takes no processor time: a drive that does not answer"""
 

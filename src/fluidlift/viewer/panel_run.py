@@ -59,8 +59,8 @@ class RunPanel:
         self.refresh()
 
     def _stopped(self, _: Any) -> None:
+        self._viewer.say("Stopping after this frame ...")  # first: what the work says at its end stays
         self._viewer.jobs.stop()
-        self._viewer.say("Stopping after this frame ...")
 
     # long work
 

@@ -2,6 +2,8 @@
 
 import json
 import shutil
+import subprocess
+import sys
 
 import pytest
 
@@ -151,3 +153,21 @@ def test_a_simulation_that_breaks_down_names_the_edit_before_it(asset, monkeypat
     said = capsys.readouterr().err
     assert "blew up. The last edit was: set parameters.gravity = [0, 0, -900]" in said
     assert "--undo" in said
+
+
+def test_what_a_fresh_asset_shows_is_told_without_building_the_scene(made, tmp_path):
+    from fluidlift.scene.edits import EditSession
+
+    asset = shutil.copytree(made.folder, tmp_path / "river.fluid")
+    code = f"""
+import sys
+from fluidlift.cli import main
+for options in (["--diff"], ["--history"], []):
+    assert main(["edit", {str(asset)!r}, *options]) == 0
+print("loaded:", *sorted(set(sys.modules) & {{"torch", "numba", "scipy", "cv2", "av", "pxr", "trimesh"}}))
+"""
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert run.returncode == 0, run.stderr
+    assert run.stdout.splitlines()[-1] == "loaded:"
+    assert run.stdout.count("the frames on disk show this scene") == 3
+    assert EditSession.open(asset).stale() == set()  # and that is true

@@ -289,6 +289,9 @@ class Progress(Protocol):
     def warn(self, text: str) -> None:
         """Something the user should know."""
 
+    def say(self, text: str) -> None:
+        """Something good to know, which is not kept."""
+
 
 class Silence:
     """No progress at all."""
@@ -303,4 +306,7 @@ class Silence:
         """Nothing."""
 
     def warn(self, text: str) -> None:
+        """Nothing."""
+
+    def say(self, text: str) -> None:
         """Nothing."""

@@ -13,13 +13,14 @@ import sysconfig
 import tempfile
 import time
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from random import Random
 from typing import Any
 
 from fluidlift.errors import FluidliftError
+from fluidlift.io.confined import reading_here
 
 from .mutation import KINDS, Edit, mutated
 from .targets import TARGETS, Target
@@ -108,9 +109,12 @@ class Found:
 
     target: str
     inputs: int = 0
+    formed: int = 0
+    """of the inputs, those that keep the form of their format"""
     accepted: int = 0
     refused: int = 0
     seconds: float = 0.0
+    """of processor time"""
     slowest: float = 0.0
     peak_bytes: int = 0
     raw: dict[str, int] = field(default_factory=dict)
@@ -127,13 +131,14 @@ def place_of(error: BaseException) -> str:
     return f"{type(error).__name__}{where}: {str(error)[:120]}"
 
 
-def run_target(name: str, inputs: int, seed: int, keep: Path | None = None) -> Found:
+def run_target(name: str, inputs: int, seed: int, keep: Path | None = None, *, formed: int = 0) -> Found:
     """Many inputs of one target, in this process.
 
     Args:
         name: of the target.
-        inputs: how many.
+        inputs: how many of which bytes are changed.
         seed: of what is drawn.
+        formed: how many more that keep the form of their format, drawn with Hypothesis.
         keep: folder for the inputs that ended in something else than a refusal.
     """
     found, random, watched = Found(name), Random(f"{name} {seed}"), Watched()
@@ -145,19 +150,16 @@ def run_target(name: str, inputs: int, seed: int, keep: Path | None = None) -> F
     place = Path(tempfile.mkdtemp(prefix="fuzz"))
     try:
         folder = Folder(TARGETS[name], place)
-        with contextlib.suppress(Exception):  # what the first call imports and compiles is no part of an input
+        with (
+            reading_here(),
+            contextlib.suppress(Exception),
+        ):  # what the first call imports and compiles is no part of an input
             folder.read(TARGETS[name].seed(0).pack(TARGETS[name].seed(0).data))
         for _ in range(inputs):
-            data = drawn(TARGETS[name], random)
-            began = time.perf_counter()
-            _one(folder, data, found, watched, keep)
-            took = time.perf_counter() - began
-            found.inputs, found.seconds, found.slowest = (
-                found.inputs + 1,
-                found.seconds + took,
-                max(found.slowest, took),
-            )
-            found.outside += watched.found
+            _one(folder, drawn(TARGETS[name], random), found, watched, keep)
+        if formed:
+            _draw_formed(folder, formed, f"{name} {seed}", lambda data: _one(folder, data, found, watched, keep))
+            found.formed = found.inputs - inputs
     finally:
         shutil.rmtree(place, ignore_errors=True)
     found.peak_bytes = peak_memory()
@@ -165,10 +167,32 @@ def run_target(name: str, inputs: int, seed: int, keep: Path | None = None) -> F
     return found
 
 
+def _draw_formed(folder: Folder, number: int, seed: str, take: Callable[[bytes], None]) -> None:
+    """Draw inputs with Hypothesis; all are taken, none is made smaller, and no file of examples is kept."""
+    import hypothesis
+
+    from .structures import inputs_of
+
+    kinds = hypothesis.settings(
+        max_examples=number, database=None, deadline=None, phases=[hypothesis.Phase.generate],
+        suppress_health_check=list(hypothesis.HealthCheck),
+    )  # fmt: skip
+    hypothesis.seed(seed)(kinds(hypothesis.given(inputs_of(folder.target.seeds()))(take)))()
+
+
 def _one(folder: Folder, data: bytes, found: Found, watched: Watched, keep: Path | None) -> None:
+    began, spent = time.perf_counter(), time.process_time()
+    _tried(folder, data, found, watched, keep)
+    found.inputs += 1
+    found.seconds += time.process_time() - spent
+    found.slowest = max(found.slowest, time.perf_counter() - began)
+    found.outside += watched.found
+
+
+def _tried(folder: Folder, data: bytes, found: Found, watched: Watched, keep: Path | None) -> None:
     signal.setitimer(signal.ITIMER_REAL, SLOWEST)
     try:
-        with watched.only(folder.place):
+        with reading_here(), watched.only(folder.place):  # where a fault is seen, and the memory is this process's
             outcome = folder.read(data)
         setattr(found, outcome, getattr(found, outcome) + 1)
     except (Exception, TooSlow) as error:
@@ -182,10 +206,11 @@ def _one(folder: Folder, data: bytes, found: Found, watched: Watched, keep: Path
 
 
 def main() -> None:
-    """Run one target in a process of its own: name, inputs, seed and folder to keep in; figures as JSON on stdout."""
-    name, inputs, seed, keep = sys.argv[1:5]
+    """Run one target in a process of its own: name, inputs, formed inputs, seed and folder to keep in; figures as JSON
+    on stdout."""
+    name, inputs, formed, seed, keep = sys.argv[1:6]
     resource.setrlimit(resource.RLIMIT_AS, (24 * 2**30, 24 * 2**30))
-    found = run_target(name, int(inputs), int(seed), Path(keep) if keep else None)
+    found = run_target(name, int(inputs), int(seed), Path(keep) if keep else None, formed=int(formed))
     print("\n" + json.dumps(vars(found)))
 
 

@@ -16,6 +16,7 @@ from fuzz.corpus import glb_file, scene_with_picture
 from fluidlift.errors import InputRejected
 from fluidlift.io import pictures, read_mesh
 from fluidlift.io.array_archive import mapped_array, release_pages
+from fluidlift.io.confined import reading_here
 from fluidlift.io.exr import channels_in
 from fluidlift.io.images import read_depth
 from fluidlift.io.limits import ReadLimits, parse_json
@@ -27,9 +28,10 @@ from fluidlift.io.read_mesh import read_any_mesh
 @pytest.fixture
 def memory():
     """Peak of what is allocated during a test, MB; NumPy tells tracemalloc."""
-    tracemalloc.start()
-    yield lambda: tracemalloc.get_traced_memory()[1] / 1e6
-    tracemalloc.stop()
+    with reading_here():
+        tracemalloc.start()
+        yield lambda: tracemalloc.get_traced_memory()[1] / 1e6
+        tracemalloc.stop()
 
 
 def png(width: int, height: int) -> bytes:

@@ -6,6 +6,7 @@ from PIL import Image
 
 from fluidlift.errors import InputRejected
 from fluidlift.io import mesh_textures
+from fluidlift.io.confined import reading_here
 from fluidlift.io.export_mesh import write_glb
 from fluidlift.io.read_mesh import read_any_mesh
 from fluidlift.numerics.textures import sample_texture
@@ -108,6 +109,14 @@ def test_a_picture_that_is_none_is_refused(tmp_path, data, words):
         read_any_mesh(square(tmp_path))
 
 
+@pytest.fixture
+def read_here():
+    """Bounds that a test sets hold in its own process."""
+    with reading_here():
+        yield
+
+
+@pytest.mark.usefixtures("read_here")
 def test_pictures_are_held_to_sizes(tmp_path, monkeypatch):
     quarters(tmp_path / "stone.png", 256)
     monkeypatch.setattr(mesh_textures, "MAX_SIDE", 64)

@@ -12,7 +12,7 @@ from fluidlift.errors import InputRejected
 from fluidlift.io.asset_folder import read_manifest
 from fluidlift.io.exr import read_channels
 from fluidlift.io.video import read_clip
-from fluidlift.pipeline.render import RenderRequest, render_asset
+from fluidlift.pipeline.render import RenderRequest, _beyond_clip, render_asset
 from fluidlift.present.frames import _placed
 from fluidlift.types import PinholeCamera
 
@@ -80,11 +80,21 @@ def test_keyed_views_move_the_camera(made, tmp_path):
     assert np.abs(first - last).mean() > 2
 
 
-def test_a_wider_picture_shows_more_and_stretches_nothing(made, tmp_path):
+def test_a_wider_picture_shows_more_and_stretches_nothing_and_says_so(made, tmp_path, capsys):
     for name, size in (("a", "96x64"), ("b", "128x64")):
         assert render(made, tmp_path / name, "--size", size, "--frames", "1001-1001") in WELL
+        beyond = "show more left and right than the clip, 96 x 64 px" in "".join(capsys.readouterr())
+        assert beyond == (name == "b")
     narrow, wide = (picture(tmp_path / n / "1001.png")[..., :3].astype(int) for n in "ab")
     np.testing.assert_allclose(wide[:, 16:112], narrow, atol=1)
+
+
+def test_only_pictures_of_another_shape_from_the_clips_camera_go_beyond_it():
+    told = [_beyond_clip((960, 540), RenderRequest(view=view, size=size))
+            for view, size in (("input", None), ("input", (1920, 1080)), ("side", (100, 100)), ("input", (100, 100)),
+                               ("input", (1920, 800)))]  # fmt: skip
+    assert [len(t) for t in told] == [0, 0, 0, 1, 1]
+    assert "above and below" in told[3][0] and "left and right" in told[4][0]
 
 
 def test_beyond_its_edges_a_plate_goes_on_as_in_a_mirror_and_its_rocks_do_not():

@@ -585,3 +585,102 @@ def test_only_what_an_edit_touches_is_stale(folder):
     assert "look.material changes nothing" in session.warnings()[0]  # and that is said
     session.apply([moves[0], looks[0]])
     assert session.stale() == {"simulate", "look"}
+
+
+@pytest.fixture
+def simulated(folder):
+    """The asset with a checkpoint and a manifest as its simulation leaves them."""
+    from fluidlift.config import JobConfig
+    from fluidlift.io.asset_folder import update_manifest
+    from fluidlift.io.checkpoint import Checkpoint, write_checkpoint
+    from fluidlift.scene.build import SimulationRequest, scene_of
+    from fluidlift.scene.simulation import state_parts
+    from fluidlift.scene.splat_files import checkpoint_file
+
+    scene = scene_of(load_asset(folder), folder, SimulationRequest(), JobConfig(), footage=None, start=0)
+    held = Checkpoint(scene.frames, state_parts(scene), {}, {"poses": np.zeros((scene.frames, 0, 7))})
+    write_checkpoint(checkpoint_file(folder), held)
+    update_manifest(
+        folder, simulation={"frames": scene.frames, "frame_interval": scene.interval, "seed": scene.seed}
+    )  # fmt: skip
+    return folder
+
+
+@pytest.fixture
+def built(monkeypatch):
+    """How often it was found out what is stale by building the scene."""
+    from fluidlift.scene import stale_frames
+
+    count, plain = [], stale_frames.stale_parts
+    monkeypatch.setattr(stale_frames, "stale_parts", lambda *a, **o: count.append(1) or plain(*a, **o))
+    return count
+
+
+def test_what_is_stale_is_found_out_once_for_each_scene(simulated, built):
+    session = EditSession.open(simulated)
+    for change, wanted in [(None, set()), (Set("parameters.gravity", [0, 0, -1]), {"simulate"})]:
+        if change is not None:
+            session.apply([change])
+        before = len(built)
+        assert [EditSession.open(simulated).standing() for _ in range(3)] == [(wanted, [])] * 3
+        assert len(built) == before + 1
+    session.undo()
+    assert session.standing() == (set(), [])
+    session.redo()
+    assert session.standing() == ({"simulate"}, [])
+    assert len(built) == 2
+
+
+@pytest.mark.parametrize(
+    "name", ["parameters.json", "manifest.json", "rest/terrain.npz", "work/checkpoint/simulation.npz", "rock.obj"]
+)
+def test_an_answer_is_forgotten_when_a_file_changes_that_it_depends_on(simulated, built, name):
+    write_obj(simulated / "rock.obj", box_mesh(np.full(3, 0.1)))
+    (simulated / "scene.yaml").write_text("obstacles:\n  - {mesh: rock.obj, position: [0.4, 0.3, 0.3]}\n")
+    session = EditSession.open(simulated)
+    first = session.standing()
+    assert session.standing() == first
+    known = len(built)
+    file = simulated / name
+    os.utime(file, ns=(0, file.stat().st_mtime_ns + 1_000_000))
+    assert session.standing() == first
+    assert len(built) == known + 1
+
+
+def test_a_warning_is_told_again_and_no_text_comes_from_the_memory(simulated, built):
+    session = EditSession.open(simulated)
+    session.set("look.material", "honey")
+    for _ in range(2):
+        stale, warnings = session.standing()
+        assert stale == set() and "look.material changes nothing" in warnings[0]
+    assert len(built) == 2
+
+
+@pytest.mark.parametrize("text", ["", "[", "[1]", '{"": ["simulate"]}', "x" * 10**6, "{}"])
+def test_a_damaged_memory_is_none(simulated, built, text):
+    session = EditSession.open(simulated)
+    session.standing()
+    kept = simulated / "work" / "stale.json"
+    answers = json.loads(kept.read_text())
+    kept.write_text(text)
+    assert session.standing() == (set(), [])
+    assert len(built) == 2
+    for wrong in ("simulate", ["everything"], [["look"]], None, {"simulate": 1}):
+        kept.write_text(json.dumps(dict.fromkeys(answers, wrong)))
+        assert session.standing() == (set(), [])
+
+
+def test_frames_that_were_just_simulated_are_noted_as_shown(simulated, built):
+    EditSession.open(simulated).note_shown()
+    assert EditSession.open(simulated).standing() == (set(), [])
+    assert built == []
+
+
+def test_an_asset_that_cannot_be_written_is_found_out_about_each_time(simulated, built, monkeypatch):
+    def full(*_, **__):
+        raise OSError(28, "no space")
+
+    monkeypatch.setattr("fluidlift.scene.known_state.write_json", full)
+    session = EditSession.open(simulated)
+    assert session.standing() == session.standing() == (set(), [])
+    assert len(built) == 2

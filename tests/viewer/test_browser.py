@@ -151,13 +151,13 @@ def test_a_drag_of_a_slider_is_one_edit_simulated_live_and_undo_redo_and_reset_f
     visit.live("gravity")
     drawn = viewer.draft.scene["parameters"]["gravity"]
     assert 11 < np.linalg.norm(drawn) <= 30
-    visit.tab("Save and run")
-    visit.says("+  gravity")  # the edit as a diff
+    visit.tab("Run")
+    visit.says("gravity")  # the edit in words
     while viewer.draft.scene.get("parameters"):  # one edit, unless the machine held the hand up for longer than a rest
         before = viewer.draft.scene
         visit.press("undo")
         visit.until(lambda before=before: viewer.draft.scene != before, "undo")
-    visit.says("No edits.")
+    visit.says("(undone)")
     visit.press("redo")
     visit.until(lambda: viewer.draft.scene.get("parameters"), "redo")
     visit.press("reset")
@@ -357,11 +357,9 @@ def test_a_mesh_file_is_uploaded_and_what_bounds_no_solid_is_refused(visit, view
 
 
 def test_edits_are_saved_simulated_in_full_stopped_exported_and_drawn(visit, viewer, tmp_path, monkeypatch):
-    visit.tab("Save and run")
+    visit.tab("Run")
     viewer.draft.move("parameters.density", 950.0, "density 950", time.monotonic())
-    visit.press("Save (scene.yaml)")
-    visit.says("All edits are in")
-    assert "950" in (viewer.folder / "scene.yaml").read_text()
+    visit.until(lambda: "950" in (viewer.folder / "scene.yaml").read_text(), "the edit on disk")
     visit.unfold("Export", "Export")
     visit.choose("format", "camera")
     visit.field("folder").fill(str(tmp_path / "out"))
@@ -403,7 +401,7 @@ def test_what_an_edit_leads_to_is_warned_about_until_it_is_undone(visit, viewer)
             "velocity": [100.0, 0.0, 0.0]}  # fmt: skip
     viewer.edited(lambda: viewer.draft.apply([Add("obstacles", fast)], "ball added"), moves=False)
     visit.says("obstacle 'ball' at 100 m/s needs about 80 steps")
-    visit.tab("Save and run")
+    visit.tab("Run")
     visit.press("undo")
     visit.until(lambda: not viewer.comparison.warnings, "no warning any more")
     visit.until(lambda: "needs about 80 steps" not in visit.page.inner_text("body"), "a page without it")

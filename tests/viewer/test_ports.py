@@ -1,5 +1,6 @@
 """Where the page is served, and to whom."""
 
+import gzip
 import socket
 import sys
 import urllib.error
@@ -122,6 +123,17 @@ def test_only_who_knows_the_address_is_let_in(served):
     assert status == 200 and b"<html" in body
     assert asked(f"http://{place}/{secret}")[0] == 200
     assert asked(f"http://{place}/{secret}/../../etc/passwd")[0] == 404
+
+
+@pytest.mark.parametrize("encoding", ["identity", "gzip"])
+def test_the_page_has_our_title_and_icon(served, encoding):
+    place, secret, _ = served
+    _, headers, body = asked(f"http://{place}/{secret}/?a=1", **{"Accept-Encoding": encoding})
+    assert int(headers["Content-Length"]) == len(body)
+    page = (gzip.decompress(body) if encoding == "gzip" else body).decode()
+    assert "<title>fluidlift</title>" in page and "<title>Viser" not in page
+    assert page.count(ports.ICON) == 1
+    assert "</html>" in page
 
 
 def test_no_other_page_may_show_this_one_in_a_frame(served):

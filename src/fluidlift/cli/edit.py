@@ -11,7 +11,7 @@ import tyro
 
 from fluidlift.cli import quantities
 from fluidlift.errors import FluidliftError, InputRejected
-from fluidlift.messages import Notice, as_plain
+from fluidlift.messages import as_plain, from_plain
 
 if TYPE_CHECKING:
     from fluidlift.scene.edit_history import Edit as Done
@@ -70,9 +70,9 @@ def run(command: Edit) -> int:
     if command.simulate:
         _simulate(session, command)
     told = _outcome(session, command, edit)
-    idle = session.edits.look.warning()
-    if edit is None or _look(session) == look:  # said once, of the edit that does it
-        told |= as_plain(w for w in told["warnings"] if w != idle)
+    if told["warnings"] and (edit is None or _look(session) == look):  # said once, of the edit that does it
+        idle = session.edits.look.warning()
+        told |= as_plain(w for w in from_plain(told) if w != idle)
     if command.json:
         print(json_module.dumps(told, indent=1))
     else:
@@ -173,18 +173,11 @@ def _simulate(session: EditSession, command: Edit) -> None:
 
 def _outcome(session: EditSession, command: Edit, edit: Done | None) -> dict[str, Any]:
     """All that is to be told, as plain values."""
-    warnings = session.warnings()
-    try:
-        stale = sorted(session.stale())
-    except InputRejected as error:  # the edit is done, and can be undone
-        stale, warnings = (
-            ["simulate"],
-            [*warnings, Notice("scene-refused", f"this scene cannot be simulated as it is: {error}")],
-        )
+    stale, warnings = session.standing()
     told = {
         "asset": str(session.folder),
         "edit": None if edit is None else edit.to_dict(),
-        "stale": stale,
+        "stale": sorted(stale),
         **as_plain(warnings),
         "can_undo": session.can_undo,
         "can_redo": session.can_redo,

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fluidlift.errors import InputRejected
+from fluidlift.io.confined import read_confined
 from fluidlift.io.exr import MAX_SIDE, read_channels
 from fluidlift.io.limits import ReadLimits, require_file, require_size
 
@@ -38,9 +39,12 @@ def read_environment_image(path: Path | str, *, limits: ReadLimits | None = None
 
     Raises:
         InputRejected: no such file, neither of these formats, cut off, too large, not twice as wide as high, or with
-            values that are not finite or below 0.
+            values that are not finite or below 0; or reading it takes more than `io.confined` lets it take.
     """
-    path, limits = require_file(path, "panorama"), limits or ReadLimits()
+    return read_confined(_read_environment, require_file(path, "panorama"), limits)
+
+
+def _read_environment(path: Path, limits: ReadLimits) -> np.ndarray:
     require_size(path, MAX_BYTES, "panorama")
     with path.open("rb") as file:
         start = file.read(16)

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from fluidlift.errors import InputRejected
+from fluidlift.io.confined import read_confined
 from fluidlift.io.limits import MAX_PIXEL_BYTES, ReadLimits, require_file, require_size
 
 _KINDS = {0: np.dtype("<u4"), 1: np.dtype("<f2"), 2: np.dtype("<f4")}
@@ -30,11 +31,15 @@ def read_channels(path: Path | str, *, limits: ReadLimits | None = None) -> dict
 
     Raises:
         InputRejected: no such file, damaged, a compression or layout that is not read, or more pixels than
-            `limits.max_pixels` or samples than `MAX_PIXEL_BYTES` for each of them.
+            `limits.max_pixels` or samples than `MAX_PIXEL_BYTES` for each of them; or reading it takes more than
+            `io.confined` lets it take.
     """
-    path = require_file(path, "OpenEXR file")
+    return read_confined(_read_channels, require_file(path, "OpenEXR file"), limits)
+
+
+def _read_channels(path: Path, limits: ReadLimits) -> dict[str, np.ndarray]:
     require_size(path, MAX_BYTES, "OpenEXR file")
-    return channels_in(path.read_bytes(), path.name, limits or ReadLimits())
+    return channels_in(path.read_bytes(), path.name, limits)
 
 
 def channels_in(data: bytes, file: str, limits: ReadLimits) -> dict[str, np.ndarray]:

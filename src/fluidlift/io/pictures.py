@@ -9,6 +9,7 @@ import numpy as np
 
 from fluidlift.errors import InputRejected
 from fluidlift.io.atomic import write_bytes
+from fluidlift.io.confined import read_confined
 from fluidlift.io.exr import MAX_SIDE, channels_in
 from fluidlift.io.limits import MAX_PIXEL_BYTES, ReadLimits, require_file, require_size
 from fluidlift.io.picture_headers import PictureHeader, picture_header
@@ -26,10 +27,12 @@ def read_picture(path: Path | str, *, limits: ReadLimits | None = None) -> np.nd
 
     Raises:
         InputRejected: no such file, not a picture, damaged, or more than `limits` and `MAX_PIXEL_BYTES` let in; all
-            of it before anything is decoded.
+            of it before anything is decoded; or decoding takes more than `io.confined` lets it take.
     """
-    limits = limits or ReadLimits()
-    path = require_file(path, "picture")
+    return read_confined(_read_picture, require_file(path, "picture"), limits)
+
+
+def _read_picture(path: Path, limits: ReadLimits) -> np.ndarray:
     if path.suffix.lower() not in PICTURE_SUFFIXES:
         raise InputRejected(
             f"'{path.name}' is not a picture of a known kind", "one of " + ", ".join(sorted(PICTURE_SUFFIXES))

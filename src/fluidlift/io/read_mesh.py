@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from fluidlift.errors import InputRejected
-from fluidlift.io.limits import parse_json, require_file, require_size
+from fluidlift.io.confined import read_confined
+from fluidlift.io.limits import ReadLimits, parse_json, require_file, require_size
 from fluidlift.io.mesh_textures import (
     MAX_PLAIN,
     Paint,
@@ -49,19 +50,11 @@ def read_any_mesh(path: Path | str) -> TriangleMesh:
 
     Raises:
         InputRejected: no such file, another format, larger than 256 MB, damaged, without triangles, with what this
-            reader does not know (compressed or sparse glTF, ASCII PLY), or with pictures that are missing or too large.
+            reader does not know (compressed or sparse glTF, ASCII PLY), or with pictures that are missing or too large;
+            or reading it takes more than `io.confined` lets it take.
     """
     path = require_file(path, "mesh file")
-    if path.suffix.lower() not in SUFFIXES:
-        raise InputRejected(f"'{path.name}' as a mesh", "a file that ends in " + ", ".join(SUFFIXES), "convert it")
-    require_size(path, _MAX_BYTES, "mesh file")
-    read = {".obj": _read_obj, ".ply": _read_ply, ".glb": _read_glb}[path.suffix.lower()]
-    try:
-        mesh = read(path)
-    except (ValueError, LookupError, TypeError, AttributeError, struct.error, ArithmeticError) as error:
-        raise InputRejected(
-            f"'{path.name}' cannot be read as a mesh ({str(error)[:200]})", "a whole file", "export it again"
-        ) from None
+    mesh = read_confined(_read_mesh, path)
     if not len(mesh.faces):
         raise InputRejected(f"'{path.name}' holds no triangles", "a closed surface of triangles")
     if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
@@ -69,6 +62,20 @@ def read_any_mesh(path: Path | str) -> TriangleMesh:
     if not np.isfinite(mesh.vertices).all():
         raise InputRejected(f"'{path.name}' has vertices that are not finite", "finite coordinates", "export it again")
     return mesh
+
+
+def _read_mesh(path: Path, limits: ReadLimits) -> TriangleMesh:
+    """The mesh as it is in the file; nothing of it is checked that reading does not need."""
+    if path.suffix.lower() not in SUFFIXES:
+        raise InputRejected(f"'{path.name}' as a mesh", "a file that ends in " + ", ".join(SUFFIXES), "convert it")
+    require_size(path, _MAX_BYTES, "mesh file")
+    read = {".obj": _read_obj, ".ply": _read_ply, ".glb": _read_glb}[path.suffix.lower()]
+    try:
+        return read(path)
+    except (ValueError, LookupError, TypeError, AttributeError, struct.error, ArithmeticError) as error:
+        raise InputRejected(
+            f"'{path.name}' cannot be read as a mesh ({str(error)[:200]})", "a whole file", "export it again"
+        ) from None
 
 
 def _read_ply(path: Path) -> TriangleMesh:

@@ -15,7 +15,7 @@ from fluidlift.io.hints_file import hints_data
 from fluidlift.pipeline import begin
 from fluidlift.pipeline.fit_request import request_of
 from fluidlift.pipeline.inputs import GivenFile, GivenFiles, Inputs
-from fluidlift.pipeline.resimulate import Made, play
+from fluidlift.pipeline.resimulate import Made, note_as_shown, play
 from fluidlift.pipeline.runner import Runner, gone_if_refused, require_stages
 from fluidlift.pipeline.settings import GenerateSettings, GivenView, MotionSettings, RefineSettings, taken
 from fluidlift.pipeline.stages import generate
@@ -85,6 +85,7 @@ def make(
         asset = _write_asset(runner, lift, config, given.provenance() | _provenance(hints))
         request = SimulationRequest(restart="simulate" in runner.force)
         frames = play(runner, asset, config, request, lift)
+        note_as_shown(folder, request)
     return Made(folder, tuple(runner.warnings), time.perf_counter() - began, runner.timings, frames)
 
 

@@ -89,6 +89,7 @@ def render_asset(
     scene = simulated_scene(folder, asset, manifest)
     numbers = frame_numbers(folder, int(played.get("frames", 0)), request.frames)
     poses, warnings = _poses(folder, scene, len(numbers) + numbers[0])
+    warnings = [*_beyond_clip(scene.camera.size, request), *warnings]
     painter = _painter(scene, folder, request)
     renderer = FrameRenderer(scene, footage, painter=painter, surfels=SURFELS)
     background = renderer.background(request.background, front=request.view == "input")
@@ -207,6 +208,19 @@ def _poses(folder: Path, scene: Scene, frames: int) -> tuple[np.ndarray | None, 
             )
         ]
     return poses, []
+
+
+def _beyond_clip(clip: tuple[int, int], request: RenderRequest) -> list[Notice]:
+    """What to say of pictures of another shape than the clip's, from its camera: they show what it never saw."""
+    from fluidlift.io.pictures import same_shape
+
+    if request.view != "input" or request.size is None or same_shape(clip, request.size):
+        return []
+    (width, height), (w, h) = clip, request.size
+    sides = "left and right" if w * height > h * width else "above and below"
+    return [Notice("picture-beyond-clip", f"pictures of {w} x {h} px show more {sides} than the clip, {width} x "
+                   f"{height} px, which saw no fluid and no ground there: the ends of both may be in view; a --size of "
+                   "its shape, or another --view, shows none")]  # fmt: skip
 
 
 def _cameras(scene: Scene, request: RenderRequest, count: int) -> list[PinholeCamera]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from fluidlift.present import report
 from fluidlift.present.looping import OPEN
 from fluidlift.scene.build import Scene, SimulationRequest, scene_of
 from fluidlift.scene.footage import footage_of
+from fluidlift.scene.forecast import ahead
 from fluidlift.scene.recall import OF_CLIP, rest_frame_of, stage_keys
 from fluidlift.scene.reshaping import slow_edits
 from fluidlift.seams import Progress, Silence
@@ -92,7 +94,24 @@ def resimulate(
     lift = recalled_lift(runner, manifest)
     with disk_errors(folder), writing(folder, "a simulation"):
         frames = play(runner, load_asset(folder), config, request, lift)
+        if not overrides and all(value is None for value in (flat or {}).values()):
+            note_as_shown(folder, request)
     return Made(folder, tuple(runner.told), time.perf_counter() - began, runner.timings, frames)
+
+
+def note_as_shown(folder: Path, request: SimulationRequest) -> None:
+    """Frames that were just simulated as scene.yaml says are not stale: noted, since finding it out takes seconds.
+
+    Args:
+        folder: of the asset.
+        request: of the simulation, which went by the settings of the asset; where it asked for something else than
+            scene.yaml says, nothing is noted.
+    """
+    from fluidlift.scene import EditSession
+
+    if (request.duration, request.fps, request.extend_downstream) == (None, None, None):
+        with suppress(InputRejected):
+            EditSession.open(folder, meshes=request.meshes).note_shown()
 
 
 def _check(request: SimulationRequest) -> None:
@@ -139,9 +158,14 @@ def play(runner: Runner, asset: FluidAsset, config: JobConfig, request: Simulati
     seen = SeenLook(edits.look, edits.look.mark(folder) | color_mark(edits.obstacles))
     for text in outside:
         runner.progress.warn(text)
+
+    def tell() -> None:
+        runner.progress.say(ahead(folder, manifest, scene.simulated, scene.interval, len(scene.body)))
+
     done = runner.run(
         "simulate", simulate, scene, taken(SimulateSettings, config.simulate),
-        beside={"folder": folder, "request": request}, still_there=frames_still_there(folder), owns_files=True,
+        beside={"folder": folder, "request": request}, before=tell, still_there=frames_still_there(folder),
+        owns_files=True,
     )  # fmt: skip
     wanted = [folder / "preview.mp4"] * config.show.preview + [folder / "asset.usda"] * config.show.usd
     shown = runner.run(

@@ -25,6 +25,7 @@ from fluidlift.scene import edit_history
 from fluidlift.scene.changes import Add, Change, Remove, Set
 from fluidlift.scene.edit_history import BY_HAND, Edit, History, text_hash, unified
 from fluidlift.scene.forecast import outlook
+from fluidlift.scene.known_state import recalled, remember
 from fluidlift.scene.reshaping import HIGHEST
 from fluidlift.scene.substances import SUBSTANCES
 from fluidlift.types import Grid, kind_of
@@ -195,6 +196,30 @@ class EditSession:
         from fluidlift.scene.stale_frames import stale_parts
 
         return stale_parts(self.folder, self.edits, meshes=self.meshes)
+
+    def standing(self) -> tuple[set[str], list[Notice]]:
+        """`stale()` and `warnings()`; from memory where both were found for this very scene and nothing was odd.
+
+        A scene that cannot be simulated is stale, and a warning.
+        """
+        text = scene_text(self.folder)
+        known = recalled(self.folder, text, meshes=self.meshes)
+        if known is not None:
+            return known, []
+        warnings = self.warnings()
+        try:
+            stale = self.stale()
+        except InputRejected as error:  # the edit is done, and can be undone
+            refused = Notice("scene-refused", f"this scene cannot be simulated as it is: {error}")
+            return {"simulate"}, [*warnings, refused]
+        if not warnings:
+            remember(self.folder, text, stale, meshes=self.meshes)
+        return stale, warnings
+
+    def note_shown(self) -> None:
+        """Remember for `standing` that the frames on disk show this scene: they have just been simulated."""
+        if not self.warnings():
+            remember(self.folder, scene_text(self.folder), set(), meshes=self.meshes)
 
     def warnings(self) -> list[Notice]:
         """What is odd about the scene as it is: things mostly outside the domain or in the ground, edits that take very

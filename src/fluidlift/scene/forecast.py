@@ -11,14 +11,44 @@ import numpy as np
 
 from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.io.asset_folder import load_asset, read_parameters
-from fluidlift.io.asset_paths import asset_file
+from fluidlift.io.asset_paths import asset_file, asset_files
 from fluidlift.io.scene import SceneEdits
 from fluidlift.messages import Notice
 from fluidlift.scene.reshaping import Asked, changed_parameters, slow_edits
+from fluidlift.scene.splat_files import BYTES_PER_SPLAT
 from fluidlift.types import FluidAsset, Grid, matrix_from_quat
 
 if TYPE_CHECKING:
     from fluidlift.io.obstacles import Obstacle
+
+
+def ahead(folder: Path, manifest: dict[str, Any], frames: int, interval: float, splats: int) -> str:
+    """What a simulation will take, in one line that is told before it begins: frames, disk, time, and what goes for it.
+
+    Args:
+        folder: of the asset.
+        manifest: of the asset, as the last simulation left it.
+        frames: to simulate.
+        interval: s between them.
+        splats: in each of them.
+    """
+    text = f"simulating {frames} frames ({frames * interval:.3g} s)"
+    there = len(asset_files(folder, "frames/splats", (".ply",)))
+    if there > frames:
+        text += f" in place of the {there} on disk"
+    text += f": about {max(frames * splats * BYTES_PER_SPLAT / 1e6, 1):.0f} MB of disk"
+    facts = manifest.get("metrics", {}).get("stages", {}).get("simulate", {})
+    done, seconds = manifest.get("simulation", {}).get("frames"), facts.get("seconds")
+    if isinstance(seconds, int | float) and isinstance(done, int) and done > 1 and seconds > 0:
+        text += f", and {in_time(seconds * frames / done)} if each takes as long as the last time"
+    return text
+
+
+def in_time(seconds: float) -> str:
+    """About how long, in words."""
+    if seconds < 90:
+        return f"{max(seconds, 1):.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
 def outlook(folder: Path, manifest: dict[str, Any], edits: SceneEdits, grid: Grid) -> list[Notice]:

@@ -226,6 +226,9 @@ class _LookProgress:
     def warn(self, text: str) -> None:
         """They are told with what was found."""
 
+    def say(self, text: str) -> None:
+        """Nothing is simulated here."""
+
 
 def wished_at(wish: Wish) -> Wish:
     """The wish with the time of now."""

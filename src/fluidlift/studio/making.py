@@ -149,6 +149,9 @@ class _Lines:
         """Something to know."""
         say(warning=text)
 
+    def say(self, text: str) -> None:
+        """What a line in a terminal is for; the page tells it by itself."""
+
 
 def main(clip: str, hints_file: str, asset: str, preset: str, pictures: str) -> int:
     """Make one asset; the exit code."""

@@ -46,6 +46,10 @@ class Session(Protocol):
         """All edits, as a unified diff."""
         ...
 
+    def history(self) -> Sequence[Any]:
+        """All edits, the oldest first: each says what it did (`what`) and whether it is undone."""
+        ...
+
     def stale(self) -> Any:
         """Which of simulate and look the frames on disk no longer match; this takes a second or so."""
         ...
@@ -206,6 +210,11 @@ class Draft:
         """All edits so far, as a unified diff."""
         with self._lock:
             return str(self._session.diff())
+
+    def history(self) -> list[tuple[str, bool]]:
+        """All edits, the oldest first: in words, and whether each is undone."""
+        with self._lock:
+            return [(str(edit.what), bool(edit.undone)) for edit in self._session.history()]
 
     def stale(self) -> set[str]:
         """Which of simulate and look the frames on disk no longer match."""

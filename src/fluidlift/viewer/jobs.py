@@ -66,6 +66,9 @@ class JobProgress:
     def warn(self, text: str) -> None:
         """Something the user should know."""
 
+    def say(self, text: str) -> None:
+        """Something good to know."""
+
 
 class Jobs:
     """Runs one piece of work at a time in a thread.

@@ -99,9 +99,7 @@ class FluidPanel:
         )
         self._exposure = gui.add_slider("exposure, stops", -STOPS, STOPS, 0.25, _stops(look))
         self._tint = gui.add_rgb("tint", _bytes(look.get("tint")))
-        gui.add_markdown(
-            "Colours are shown here; reflections, refraction and light in rendered pictures ('Save and run')."
-        )
+        gui.add_markdown("Colours are shown here; reflections, refraction and light in rendered pictures ('Run').")
         heard(self._style, lambda e, value: self._looked(e, "style", value))
         heard(self._material, self._materialised)
         heard(self._light, lambda e, value: self._looked(e, "environment", value))

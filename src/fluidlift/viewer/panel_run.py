@@ -1,10 +1,12 @@
-"""What becomes of the edits: undone, written, simulated in full, drawn, handed on."""
+"""What becomes of the edits: listed, simulated in full, drawn, handed on."""
 
 from __future__ import annotations
 
 import json
 import os
+import re
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,20 +22,22 @@ if TYPE_CHECKING:
 
 STILL = (960, 540)
 """px of a drawn picture"""
+SHOWN = 12
+"""edits that are listed"""
 
 
 class RunPanel:
-    """Undo, save, export, simulate, draw."""
+    """Edits in words, export, simulate, draw."""
 
     def __init__(self, viewer: Viewer) -> None:
         from fluidlift.export.job import FORMATS
 
         self._viewer, self._gui = viewer, viewer.server.gui
         gui = self._gui
-        self._history = gui.add_button_group("edits", ("undo", "redo", "reset"))
-        self._history.on_click(self._back)
-        gui.add_button("Save (scene.yaml)", icon="device-floppy").on_click(self._save)
-        self._diff = gui.add_markdown("")
+        gui.add_markdown("Every edit is in scene.yaml as soon as it is made.")
+        self._edits = gui.add_markdown("")
+        with gui.add_folder("As lines of scene.yaml", expand_by_default=False):
+            self._diff = gui.add_markdown("")
         # of whatever is being done: simulation, export or picture
         self._bar = gui.add_progress_bar(0.0, visible=False)
         self._stop = gui.add_button("Stop", icon="player-stop", color="red", visible=False)
@@ -54,24 +58,9 @@ class RunPanel:
             self._picture = gui.add_image(np.full((4, 6, 3), 230, np.uint8), format="jpeg", visible=False)
         self.refresh()
 
-    # history
-
-    def _back(self, _: Any) -> None:
-        viewer, what = self._viewer, str(self._history.value)
-        if viewer.refused():
-            return
-        told: list[str] = []
-        if viewer.edited(lambda: told.append(getattr(viewer.draft, what)())):
-            viewer.say(told[0] or "There is nothing to reset: this is the fluid as lifted.")
-
     def _stopped(self, _: Any) -> None:
+        self._viewer.say("Stopping after this frame ...")  # first: what the work says at its end stays
         self._viewer.jobs.stop()
-        self._viewer.say("Stopping after this frame ...")
-
-    def _save(self, _: Any) -> None:
-        viewer = self._viewer
-        if not viewer.refused():
-            viewer.edited(viewer.draft.commit, f"All edits are in {viewer.folder / 'scene.yaml'}", moves=False)
 
     # long work
 
@@ -124,9 +113,11 @@ class RunPanel:
         viewer = self._viewer
         if event.client is None or viewer.refused() or not viewer.edited(viewer.draft.commit, moves=False):
             return
-        if viewer.source != "saved frames":
-            viewer.say("Pictures are drawn of saved frames: choose them above, or simulate in full first.")
+        if not viewer.saved.count:
+            viewer.say("Pictures are drawn of saved frames, and there are none yet: simulate in full first.")
             return
+        if viewer.source != "saved frames":
+            viewer.set_source("saved frames")
         camera, number = _camera_of(event.client), FIRST_FRAME + viewer.timeline.frame
 
         def work(progress: JobProgress) -> str:
@@ -160,10 +151,11 @@ class RunPanel:
     def refresh(self) -> None:
         """Show what has been edited."""
         try:
-            diff = self._viewer.draft.diff().strip()
+            diff, edits = self._viewer.draft.diff().strip(), self._viewer.draft.history()
         except (FluidliftError, OSError) as error:
-            diff = str(error)
-        self._diff.content = f"```diff\n{diff[-4000:]}\n```" if diff else "No edits."
+            diff, edits = str(error), []
+        self._diff.content = f"```diff\n{diff[-4000:]}\n```" if diff else "Nothing differs from the fluid as lifted."
+        self._edits.content = in_words(edits)
         self._viewer.compare()
 
     def _frames_told(self) -> str:
@@ -171,6 +163,18 @@ class RunPanel:
         if stale is None:
             return "comparing the saved frames with the scene ..."
         return f"The saved frames are {'older than' if 'simulate' in stale else 'of'} this scene."
+
+
+def in_words(edits: Sequence[tuple[str, bool]]) -> str:
+    """The newest edits as Markdown, the last one first; those that are undone are struck through."""
+    shown = [f"~~{_literal(what)}~~ (undone)" if undone else _literal(what) for what, undone in reversed(edits)]
+    more = [f"and {len(shown) - SHOWN} before them"] * (len(shown) > SHOWN)
+    return "\n".join(f"- {text}" for text in [*shown[:SHOWN], *more]) or "No edits."
+
+
+def _literal(text: str) -> str:
+    """A text, which may name what a stranger named, without what Markdown makes of it."""
+    return re.sub(r"([\\`*_{}\[\]<>()#+!|~-])", r"\\\1", " ".join(text.split())[:200])
 
 
 def _camera_of(client: Any) -> PinholeCamera:

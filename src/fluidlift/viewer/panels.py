@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import shlex
 import time
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from fluidlift.errors import FluidliftError
 from fluidlift.io.frames import FIRST_FRAME
+from fluidlift.viewer import kept_views
 from fluidlift.viewer.callbacks import heard
 from fluidlift.viewer.footage import GONE, WIDTH
 from fluidlift.viewer.panel_fluid import FluidPanel
@@ -37,6 +40,9 @@ class Panels:
         self._status = gui.add_markdown("warming up ...")
         self._told = ""
         self._play_controls()
+        self._edits = gui.add_button_group("edits", ("undo", "redo", "reset"))
+        self._edits.on_click(lambda _: self._back(str(self._edits.value)))
+        self._keys()
         tabs = gui.add_tab_group()
         with tabs.add_tab("View"):
             self._view_controls()
@@ -44,7 +50,7 @@ class Panels:
             self.fluid = FluidPanel(viewer)
         with tabs.add_tab("Obstacles"):
             self.obstacles = ObstaclePanel(viewer)
-        with tabs.add_tab("Save and run"):
+        with tabs.add_tab("Run"):
             self.run = RunPanel(viewer)
         self._picture_panel()
 
@@ -73,6 +79,28 @@ class Panels:
             self._viewer.timeline.seek(int(frame) - FIRST_FRAME)
         self._viewer.redraw()
 
+    def _keys(self) -> None:
+        """What the page of an export does at the same keys, and undo."""
+        for label, key, modifier, act in (
+            ("Play or pause", "space", None, self._played),
+            ("Next frame", "arrowright", None, lambda _: self._step("forward")),
+            ("Frame before", "arrowleft", None, lambda _: self._step("back")),
+            ("First frame", "home", None, lambda _: self._step("first")),
+            ("Last frame", "end", None, lambda _: self._step("last")),
+            ("Undo the last edit", "Z", "cmd/ctrl", lambda _: self._back("undo")),
+            ("Redo the last edit", "Z", "cmd/ctrl+shift", lambda _: self._back("redo")),
+        ):
+            self._gui.add_command(label, hotkey=key, modifier=modifier).on_trigger(act)
+
+    def _back(self, what: str) -> None:
+        """Undo, redo or reset."""
+        viewer = self._viewer
+        if viewer.refused():
+            return
+        told: list[str] = []
+        if viewer.edited(lambda: told.append(getattr(viewer.draft, what)())):
+            viewer.say(told[0] or "There is nothing to reset: this is the fluid as lifted.")
+
     def _played(self, _: Any) -> None:
         with self._viewer.lock:
             timeline = self._viewer.timeline
@@ -83,7 +111,9 @@ class Panels:
         self._viewer.redraw()
 
     def _stepped(self, _: Any) -> None:
-        way = str(self._steps.value)
+        self._step(str(self._steps.value))
+
+    def _step(self, way: str) -> None:
         with self._viewer.lock:
             timeline = self._viewer.timeline
             timeline.pause()
@@ -113,6 +143,29 @@ class Panels:
         self._legend = gui.add_markdown("", visible=False)
         gui.add_button("Look from the input camera", icon="video").on_click(self._input_view)
         gui.add_button("Look from the side", icon="arrows-horizontal").on_click(self._side_view)
+        kept = gui.add_button_group(
+            "camera for render", ("keep", "forget"), hint="cameras of several frames make a path; forget takes all away"
+        )
+        kept.on_click(lambda event: self._kept_view(event, str(kept.value)))
+
+    def _kept_view(self, event: Any, what: str) -> None:
+        viewer = self._viewer
+        if event.client is None or viewer.refused():
+            return
+        if what == "forget":
+            viewer.say("Kept cameras are forgotten." if kept_views.forget(viewer.folder) else "No camera is kept.")
+            return
+        view, frame = event.client.camera, viewer.timeline.frame
+        key = kept_views.key_of(frame, view.position, view.look_at, float(view.fov), float(view.aspect))
+        try:
+            count = kept_views.keep(viewer.folder, key)
+        except (FluidliftError, OSError) as error:
+            viewer.say(str(error))
+            return
+        place = shlex.quote(str(viewer.folder))
+        path = f"a path of {count}" if count > 1 else "one, which stands still"
+        viewer.say(f"Camera of frame {FIRST_FRAME + frame} kept ({path}): `fluidlift render {place} --view "
+                   f"{shlex.quote(str(viewer.folder / kept_views.FILE))}`")  # fmt: skip
 
     def _ticked(self, event: Any, name: str, on: bool) -> None:
         if event.client is not None:  # else we ticked it ourselves
@@ -213,7 +266,7 @@ class Panels:
         elif viewer.saved.count:
             lines.append(f"**Saved frames**: {viewer.saved.count}")
         else:
-            lines.append("**No simulated frames yet**: see 'Save and run'")
+            lines.append("**No simulated frames yet**: see 'Run'")
         phase = viewer.preview.phase
         if phase == "warming up":
             lines.append("warming up the live preview ...")

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import gzip
+import re
 import secrets
 from collections.abc import Callable, Iterator
 from http import HTTPStatus
@@ -64,6 +66,26 @@ def _guarded(secret: str) -> Iterator[None]:
         sockets.serve = plain
 
 
+TITLE = "fluidlift"
+ICON = (
+    "data:image/svg+xml,%3Csvg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 32 32'%3E%3Cpath fill='%231c7ed6' "
+    "d='M16 2c6 9 9 13 9 18a9 9 0 0 1-18 0c0-5 3-9 9-18z'/%3E%3C/svg%3E"
+)
+"""a drop"""
+
+
+def _retitle(response: Any) -> None:
+    """The page of viser with our title and icon; as it is where it looks otherwise than that of version 1.1."""
+    body = response.body
+    packed = response.headers.get("Content-Encoding") == "gzip"
+    text = gzip.decompress(body) if packed else bytes(body)
+    text = re.sub(rb"<title>[^<]*</title>", f"<title>{TITLE}</title>".encode(), text, count=1)
+    text = re.sub(rb'(rel="icon"\s+href=")[^"]*', rb"\g<1>" + ICON.encode(), text, count=1)
+    response.body = gzip.compress(text) if packed else text
+    del response.headers["Content-Length"]
+    response.headers["Content-Length"] = str(len(response.body))
+
+
 def _guard(secret: str, answer: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
     """`answer` (which takes a connection and a request) for requests under `/secret` that no foreign page makes."""
 
@@ -74,6 +96,8 @@ def _guard(secret: str, answer: Callable[[Any, Any], Any]) -> Callable[[Any, Any
         if not same_origin(request.headers.get("Origin"), request.headers.get("Host", "")):
             return connection.respond(HTTPStatus.FORBIDDEN, "A page of another origin is not let in.\n")
         response = answer(connection, dataclasses.replace(request, path=path))
+        if response is not None and response.body and path.partition("?")[0] in ("", "/"):
+            _retitle(response)
         if response is not None:
             for name, value in PAGE_HEADERS.items():
                 response.headers[name] = value

@@ -29,11 +29,11 @@ class Recorder:
 
     def on_start(self, event: Any) -> None:
         """A compilation begins, perhaps within another."""
-        self._began.append(time.perf_counter())
+        self._began.append(time.process_time())
 
     def on_end(self, event: Any) -> None:
         """A compilation ended."""
-        seconds = time.perf_counter() - self._began.pop()
+        seconds = time.process_time() - self._began.pop()
         function = event.data["dispatcher"].py_func
         if not self._began and function.__module__.startswith("fluidlift.") and "<" not in function.__qualname__:
             name = f"{function.__module__}:{function.__qualname__}"

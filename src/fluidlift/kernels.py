@@ -44,7 +44,7 @@ class Kernel:
     """module:name"""
     types: tuple[str, ...]
     seconds: float
-    """that its compilation took where the list was recorded"""
+    """of processor time that its compilation took where the list was recorded"""
 
 
 def listed() -> list[Kernel]:

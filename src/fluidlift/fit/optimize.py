@@ -147,8 +147,9 @@ def fit_parameters(
     nothing = _no_flow(data)
     if nothing:
         return _failure(initial, nothing)
-    with single_thread():
-        result = _Fit(data, interval, initial, options, _budget(options, progress)).run()
+    budget = _budget(options, progress)
+    with single_thread(), budget.counted():
+        result = _Fit(data, interval, initial, options, budget).run()
     if data.kind.is_gas:
         return replace(result, extra=result.extra | {"buoyancy": math.hypot(*result.parameters.gravity)})
     return result

@@ -36,8 +36,8 @@ FAST = re.compile(r"(unit|whole)( or (unit|whole))*")
 COMMAND_LINE = re.compile(r"from fluidlift\.cli import (\([^)]*|[^\n]*)\bmain\b")
 
 DURATIONS = Path(__file__).with_name("durations.json")
-"""s of each test that took over a second, and of whole files whose shared fixtures did, on a warm machine with two
-cores; written by `pytest --record-durations`"""
+"""s of each test that took over a second, and of whole files whose shared fixtures did, on two cores with nothing
+compiled but what jobs call: a newcomer waits for what only tests compile; written by `pytest --record-durations`"""
 
 SLOW = 1.5
 """s; what takes longer is no unit test: the tests of a newcomer are 4500, and end within five minutes"""

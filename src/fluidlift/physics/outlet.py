@@ -14,6 +14,7 @@ from numba import njit
 from scipy import ndimage
 
 from fluidlift.physics.boundaries import Walls
+from fluidlift.physics.reseed import sort_by_mass
 from fluidlift.physics.transfer import CellOrder
 from fluidlift.types import CellType, FaceVelocity
 
@@ -139,7 +140,9 @@ def _mark_surplus(masses, order, start, cells, most, gone):
             held += masses[p]
         if held <= most:
             continue
-        for p in here[np.argsort(-masses[here], kind="mergesort")]:
+        lightest_first = here[::-1].copy()
+        sort_by_mass(lightest_first, masses)
+        for p in lightest_first[::-1]:  # the heaviest first; equal ones in their order
             if held <= most:
                 break
             gone[p] = True

@@ -53,7 +53,7 @@ def inner_cells(wet: Bool[np.ndarray, "nx ny nz"], solid: Bool[np.ndarray, "nx n
 
 
 @njit(cache=True)
-def _sort_by_mass(index, masses):
+def sort_by_mass(index, masses):
     """In place; equal ones stay in their order. A cell holds few: Numba's own sort takes seconds to compile."""
     for n in range(1, len(index)):
         own, m = index[n], n
@@ -81,7 +81,7 @@ def _choose(order, start, inner, masses, lightest, fewest, most, parents, first,
                 n_split += 1
         elif count > most:
             by_mass = order[start[c] : start[c + 1]].copy()
-            _sort_by_mass(by_mass, masses)
+            sort_by_mass(by_mass, masses)
             for pair in range((count - most + 1) // 2):
                 second[n_merge] = by_mass[2 * pair]
                 first[n_merge] = by_mass[2 * pair + 1]

@@ -210,6 +210,10 @@ def test_polygons_of_an_obj_are_bounded(tmp_path, memory, monkeypatch):
     (tmp_path / "many.obj").write_text(head + ("f " + "1 " * 8_000 + "\n") * 4)
     with pytest.raises(InputRejected, match="more than 30000 triangles"):
         read_any_mesh(tmp_path / "many.obj")
+    monkeypatch.setattr(read_mesh, "_MAX_LINES", 1000)
+    (tmp_path / "empty.obj").write_text(head + "\n" * 1000)
+    with pytest.raises(InputRejected, match="more than 1000 lines"):
+        read_any_mesh(tmp_path / "empty.obj")
     assert memory() < 20
 
 

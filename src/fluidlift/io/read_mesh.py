@@ -32,6 +32,8 @@ _MAX_NODES = 10_000
 MAX_VERTICES = 5_000_000
 MAX_TRIANGLES = 3_000_000
 """with their colours and texture coordinates they take 1 GB while they are read"""
+_MAX_LINES = 20_000_000
+"""of an OBJ: vertices, their normals and coordinates, and triangles, each at their most"""
 _MAX_LINE = 2**20
 """characters of a line of an OBJ"""
 _MAX_SCENE = 16 * 2**20
@@ -95,6 +97,7 @@ def _read_obj(path: Path) -> TriangleMesh:
     with path.open("r", encoding="utf-8", errors="replace") as file:
         for number, line in enumerate(file, start=1):
             try:
+                _require_count(number, _MAX_LINES, "lines")
                 obj.take(line)
             except ValueError as error:
                 raise ValueError(f"line {number}: {error}") from None

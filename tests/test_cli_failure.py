@@ -17,7 +17,7 @@ from catalogue import write_clip
 import fluidlift.cli as cli
 from fluidlift.cli import FAILED, TERMINATED, main
 from fluidlift.errors import InputRejected
-from fluidlift.progress import shown_progress
+from fluidlift.progress import PlainProgress, shown_progress
 
 
 @pytest.fixture
@@ -95,3 +95,19 @@ def test_a_scheduler_ends_a_run_as_a_person_does(tmp_path, sent):
     assert run.returncode == (TERMINATED if sent == signal.SIGTERM else FAILED), said
     assert "fluidlift: stopped. Finished stages and frames are kept" in said and "Traceback" not in said
     assert not list(Path(tmp_path).rglob("*.part*"))
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="has no such signals")
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_that_a_library_swallows_ends_the_run_at_its_next_step(sent):
+    progress = PlainProgress()
+    with cli._interruptible() as terminated:
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(sent)  # as an import within a bare `except:` loses it
+        assert terminated.is_set() == (sent == signal.SIGTERM)
+        with pytest.raises(KeyboardInterrupt):
+            progress.stage("flow", 2, 10)
+        with pytest.raises(KeyboardInterrupt):
+            progress.update(1, 2)
+    progress.stage("flow", 2, 10)  # of the next run
+    assert signal.getsignal(signal.SIGINT) == signal.default_int_handler

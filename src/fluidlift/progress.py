@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from typing import Any, TextIO
@@ -29,6 +30,16 @@ LABELS = {
 WARM_UP = 2
 """parts at the beginning of a stage that say nothing about the rest: of a simulation the body at rest, which takes no
 time, and the frame for which a fresh installation compiles"""
+
+
+interrupted = threading.Event()
+"""a person or a scheduler has asked for the end. The exception may get lost in a library, as imports within a bare
+`except:` lose it; then it is raised again by the next stage, or the next part of one"""
+
+
+def _go_on() -> None:
+    if interrupted.is_set() and threading.current_thread() is threading.main_thread():
+        raise KeyboardInterrupt
 
 
 class Pace:
@@ -74,12 +85,14 @@ class PlainProgress:
 
     def stage(self, name: str, number: int, count: int) -> None:
         """A stage begins."""
+        _go_on()
         self.head = f"[{number}/{count}] {LABELS.get(name, name)}"
         self._pace, self._last = Pace(), time.monotonic()
         print(f"{self.head} ...", file=self.stream, flush=True)
 
     def update(self, done: int, total: int) -> None:
         """Part of the current stage is done."""
+        _go_on()
         now = time.monotonic()
         self._pace.at(done, now)
         if now - self._last >= self.every and done < total:
@@ -126,6 +139,7 @@ class BarProgress:
 
     def stage(self, name: str, number: int, count: int) -> None:
         """A stage begins."""
+        _go_on()
         self.head = f"[{number}/{count}] {LABELS.get(name, name)}"
         if self._task is not None:
             self.bar.remove_task(self._task)
@@ -134,6 +148,7 @@ class BarProgress:
 
     def update(self, done: int, total: int) -> None:
         """Part of the current stage is done."""
+        _go_on()
         now = time.monotonic()
         self._pace.at(done, now)
         if self._task is not None and (now - self._last > 0.1 or done >= total):

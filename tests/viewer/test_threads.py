@@ -57,7 +57,7 @@ def test_an_asset_that_another_process_writes_is_told_and_left_alone_until_it_is
     until(lambda: viewer.preview.phase == "ready")
     monkeypatch.setattr(saved, "writer_of", lambda folder: Holder(os.getpid() + 1, "a simulation"))
     until(lambda: "Another process is writing this asset" in viewer.messages)
-    for button in (viewer.panels.run._save, viewer.panels.run._simulate, viewer.panels.run._export):
+    for button in (viewer.panels.run._simulate, viewer.panels.run._export):
         viewer.say("")
         button(None)
         assert viewer.messages.startswith("Another process is writing this asset") and not viewer.jobs.running

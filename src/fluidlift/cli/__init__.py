@@ -47,7 +47,7 @@ from fluidlift.cli.view import View
 from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.kernels import compiling_beside
 from fluidlift.messages import as_plain
-from fluidlift.progress import shown_progress
+from fluidlift.progress import interrupted, shown_progress
 
 Command = (
     Make
@@ -77,7 +77,7 @@ TERMINATED = 128 + signal.SIGTERM
 def main(argv: list[str] | None = None) -> int:
     """Run one command; the exit code."""
     try:
-        with _terminated_as_interrupted() as terminated:
+        with _interruptible() as terminated:
             code = _run(list(sys.argv[1:] if argv is None else argv))
             code = TERMINATED if terminated.is_set() else code
         sys.stdout.flush()
@@ -89,24 +89,29 @@ def main(argv: list[str] | None = None) -> int:
 
 
 @contextlib.contextmanager
-def _terminated_as_interrupted() -> Iterator[threading.Event]:
+def _interruptible() -> Iterator[threading.Event]:
     """SIGTERM, which schedulers and containers send, ends a run as Ctrl-C does: what is finished is kept, and said.
-    Gives what is set once it came."""
+    Gives what is set once it came. Both are remembered until the run has ended (`progress.interrupted`)."""
     terminated = threading.Event()
-    ours = threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
-    if not ours:
-        yield terminated
-        return
+    usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+    if threading.current_thread() is not threading.main_thread():
+        usual = {}
+    ours = {number: handler for number, handler in usual.items() if signal.getsignal(number) == handler}
 
     def interrupt(number: int, frame: Any) -> None:
-        terminated.set()
+        interrupted.set()
+        if number == signal.SIGTERM:
+            terminated.set()
         raise KeyboardInterrupt
 
-    signal.signal(signal.SIGTERM, interrupt)
+    for number in ours:
+        signal.signal(number, interrupt)
     try:
         yield terminated
     finally:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        interrupted.clear()
+        for number, handler in ours.items():
+            signal.signal(number, handler)
 
 
 def _run(args: list[str]) -> int:

@@ -107,8 +107,11 @@ def test_a_child_that_has_left_because_it_had_nothing_to_do_is_started_again(fil
 
 def test_time_is_counted_for_each_file(file):
     child, spent = Child(), Bounds(seconds=1)  # a second more is let pass, as limits are whole seconds
+    child.read(hostile_readers.whoami, file, ReadLimits(), spent)
+    first = child._process
     for _ in range(25):  # in all it takes longer than one file may
         child.read(hostile_readers.busy, file, ReadLimits(), spent)
+    assert child._process is first and first.poll() is None
     child.end()
 
 
@@ -139,6 +142,14 @@ def test_an_interrupted_request_leaves_no_answer_behind(file, monkeypatch):
     assert read_confined(hostile_readers.whoami, file).shape == (1,)
 
 
+def alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
 def test_the_child_ends_with_its_parent(file, tmp_path):
     code = (
         "import sys, hostile_readers\nfrom pathlib import Path\nfrom fluidlift.io.confined import read_confined\n"
@@ -149,14 +160,10 @@ def test_the_child_ends_with_its_parent(file, tmp_path):
     run = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, env=os.environ | {"PYTHONPATH": paths}
     )
-    child = int(run.stdout)
-    for _ in range(100):
-        try:
-            os.kill(child, 0)
-        except ProcessLookupError:
-            return
+    child, until = int(run.stdout), time.monotonic() + 10.0
+    while alive(child) and time.monotonic() < until:
         time.sleep(0.1)
-    raise AssertionError("it is still there")
+    assert not alive(child)
 
 
 def test_modules_of_the_current_folder_are_not_run(file, tmp_path, monkeypatch):

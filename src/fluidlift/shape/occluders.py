@@ -237,9 +237,8 @@ def at_outline(sheet: _Sheet, piece: Bool[np.ndarray, "h w"]) -> Outline:
     first, last = piece[:, across].argmax(axis=0), len(piece) - 1 - piece[::-1, across].argmax(axis=0)
     enters = _typical(sheet, usual, first[:, None] - away, across[:, None] + 0 * away)[0]
     leaves = _typical(sheet, usual, last[:, None] + away, across[:, None] + 0 * away)[0]
-    upper = np.arange(rows.min(), min(rows.min() + half, rows.max()) + 1).astype(
-        int
-    )  # upstream half of something round
+    # the upstream half of something round
+    upper = np.arange(rows.min(), int(np.ceil(min(rows.min() + half, rows.max()))) + 1)
     upper = upper[piece[upper].any(axis=1)]
     begins, ends = piece[upper].argmax(axis=1), piece.shape[1] - 1 - piece[upper][:, ::-1].argmax(axis=1)
     beside = upper[:, None] + 0 * away

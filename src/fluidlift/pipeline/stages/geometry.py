@@ -120,8 +120,8 @@ def _coloured(
         picture = ground_texture.over_bed(picture, view.seen, setting.terrain.mesh, camera)
     setting = ground.finished(setting, picture, camera)
     if fluid.hidden is not None:  # what stands before the fluid is on no ground, but in the picture without the fluid
-        pick = np.unique(np.linspace(0, len(clip) - 1, 8).astype(int))
-        picture = np.where(fluid.hidden[..., None], typical_picture(clip.frames[pick]).astype(np.uint8), picture)
+        typical = typical_picture(clip.frames, most=8).astype(np.uint8)
+        picture = np.where(fluid.hidden[..., None], typical, picture)
     return setting, picture
 
 

@@ -111,3 +111,17 @@ def test_an_interrupt_that_a_library_swallows_ends_the_run_at_its_next_step(sent
             progress.update(1, 2)
     progress.stage("flow", 2, 10)  # of the next run
     assert signal.getsignal(signal.SIGINT) == signal.default_int_handler
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="has no such signals")
+def test_an_interrupt_within_code_given_as_text_leaves_the_exit_code_alone(tmp_path):
+    (tmp_path / "run.py").write_text("""
+import signal, sys
+import fluidlift.cli as cli
+def command(_):  # as a dataclass is defined while a module is being imported
+    exec("signal.raise_signal(signal.SIGINT)")
+cli._COMMANDS[cli.Doctor] = command
+sys.exit(cli.main(["doctor"]))
+""")
+    run = subprocess.run([sys.executable, "-m", "run"], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert (run.returncode, "fluidlift: stopped." in run.stderr) == (FAILED, True), run.stderr

@@ -37,9 +37,15 @@ interrupted = threading.Event()
 `except:` lose it; then it is raised again by the next stage, or the next part of one"""
 
 
+class Interrupted(KeyboardInterrupt):
+    """What is raised then: a class of its own, since of `python -m` CPython remembers that a KeyboardInterrupt proper
+    has left code which `exec` was given as text (a dataclass being defined, say), and at the end sends the process
+    SIGINT in place of its exit code, although the exception was caught (`run_eval_code_obj` in CPython)."""
+
+
 def _go_on() -> None:
     if interrupted.is_set() and threading.current_thread() is threading.main_thread():
-        raise KeyboardInterrupt
+        raise Interrupted
 
 
 class Pace:

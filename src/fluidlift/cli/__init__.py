@@ -47,7 +47,7 @@ from fluidlift.cli.view import View
 from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.kernels import compiling_beside
 from fluidlift.messages import as_plain
-from fluidlift.progress import interrupted, shown_progress
+from fluidlift.progress import Interrupted, interrupted, shown_progress
 
 Command = (
     Make
@@ -102,7 +102,7 @@ def _interruptible() -> Iterator[threading.Event]:
         interrupted.set()
         if number == signal.SIGTERM:
             terminated.set()
-        raise KeyboardInterrupt
+        raise Interrupted
 
     for number in ours:
         signal.signal(number, interrupt)

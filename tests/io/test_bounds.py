@@ -34,16 +34,16 @@ def memory():
         tracemalloc.stop()
 
 
-def png(width: int, height: int) -> bytes:
-    """A picture of one colour, packed to next to nothing."""
+def png(width: int, height: int, rows: int | None = None) -> bytes:
+    """A picture of one colour, packed to next to nothing, or its beginning."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
     packer = zlib.compressobj(9)
-    rows = b"".join(packer.compress(bytes(1 + width)) for _ in range(height)) + packer.flush()
+    packed = b"".join(packer.compress(bytes(1 + width)) for _ in range(rows or height)) + packer.flush()
     head = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", packed) + chunk(b"IEND", b"")
 
 
 def jpeg_behind(padding: int) -> bytes:
@@ -69,7 +69,7 @@ def webp(width: int, height: int) -> bytes:
 
 
 @pytest.mark.parametrize(
-    "data", [png(60_000, 60_000)[:4096], jpeg_behind(3), tiff(60_000, 60_000), webp(60_000, 60_000)],
+    "data", [png(60_000, 60_000, 100)[:4096], jpeg_behind(3), tiff(60_000, 60_000), webp(60_000, 60_000)],
     ids=["png", "jpeg", "tiff", "webp"],
 )  # fmt: skip
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".tif"])

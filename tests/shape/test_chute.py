@@ -5,14 +5,15 @@ import pytest
 from scipy import ndimage
 
 from fluidlift.shape.channel import ChannelConfig, channel_setting
-from fluidlift.shape.chute import ChuteHeight, chute_pixels, find_chutes
+from fluidlift.shape.chute import ChuteHeight, chute_pixels, find_chutes, head_acceleration
+from fluidlift.shape.composite import with_chute
 from fluidlift.shape.kind import level_camera
 from fluidlift.shape.plan import Footage
-from fluidlift.shape.registration import PlacedHeight
+from fluidlift.shape.registration import PlacedHeight, VelocityEvidence
 from fluidlift.shape.sections import SURE, estimate_sections
 from fluidlift.shape.slope import flow_patches, plane_axes
 from fluidlift.shape.surface import level_surface, stream_surface
-from fluidlift.types import CellType, Label, PinholeCamera, Similarity3, UpEvidence
+from fluidlift.types import CellType, Label, MetricScale, PinholeCamera, Similarity3, UpEvidence
 
 SIZE = (192, 144)
 
@@ -66,6 +67,8 @@ def test_the_surface_of_a_chute_above_a_pool_lies_where_both_planes_are(slope, h
     camera, mask, motion, chute, depth = scene(slope, heading, pitch)
     front = stream_surface(camera, mask, motion, np.ones(mask.shape), 0.04)
     assert front.slope is not None and front.slope.chute == pytest.approx(slope, abs=OFF)
+    (part,) = front.chutes
+    assert (part & chute).sum() / (part | chute).sum() > 0.85
     seen = mask & (front.depth > 0)
     ratio = front.depth[seen] / depth[seen]
     error = np.abs(ratio / np.median(ratio) - 1.0)
@@ -96,6 +99,67 @@ def test_a_swift_thread_that_keeps_its_speed_on_level_water_is_no_chute(pitch):
     later, _ = camera.project(points + speed[..., None] * np.array([0.0, -1.0, 0.0]))
     motion = np.where(mask[..., None], later - grid, 0.0)
     assert stream_surface(camera, mask, motion, np.ones(mask.shape), 0.04).slope.chute == 0.0
+
+
+def test_a_chute_that_was_filmed_slowed_down_is_found_all_the_same():
+    camera, mask, motion, chute, _ = scene(45.0, -30.0, 40.0)
+    slow = motion * 0.4 / np.median(np.linalg.norm(motion[chute], axis=-1))  # px, of a weir at 72 frames per second
+    (found,) = chute_pixels(camera, mask, slow, np.ones(mask.shape))
+    (usual,) = chute_pixels(camera, mask, motion, np.ones(mask.shape))
+    assert (found & usual).sum() / (found | usual).sum() > 0.99
+
+
+def test_errors_of_the_flow_alone_are_no_chute():
+    camera, mask, motion, _, _ = scene(45.0, -30.0, 40.0, speed=0.0, pool=0.0)
+    noise = ndimage.gaussian_filter(np.random.default_rng(0).normal(size=motion.shape), (4, 4, 0))
+    noise *= 0.05 / noise.std()
+    assert chute_pixels(camera, mask, motion + noise, np.ones(mask.shape)) == []
+
+
+def sliding(gravity, *, n=2000, begin=0.3):
+    """Points on a chute of 40 degrees without friction, and their velocities."""
+    drop = np.random.default_rng(0).uniform(0.0, 0.5, n)
+    points = np.column_stack([drop / np.tan(np.radians(40.0)), np.zeros(n), -drop])
+    speed = np.sqrt(begin**2 + 2.0 * gravity * drop)
+    return points, speed[:, None] * np.array([np.cos(np.radians(40.0)), 0.0, -np.sin(np.radians(40.0))])
+
+
+@pytest.mark.parametrize("gravity", [0.05, 2.0, 30.0])
+def test_the_speed_on_a_chute_shows_gravity_in_its_own_units(gravity):
+    points, velocities = sliding(gravity)
+    noise = 1.0 + 0.1 * np.random.default_rng(1).normal(size=(len(points), 1))
+    found = head_acceleration(points, velocities * noise, np.ones(len(points)))
+    assert found == pytest.approx(gravity, rel=0.05)
+
+
+def test_a_chute_on_which_water_gets_no_faster_shows_none():
+    points, velocities = sliding(0.0)
+    assert head_acceleration(points, velocities, np.ones(len(points))) is None
+    assert head_acceleration(points, sliding(2.0)[1], np.zeros(len(points))) is None
+
+
+ASSUMED = MetricScale(0.5, "assumed", across=1.0)
+
+
+@pytest.mark.parametrize(
+    ("gravity", "across", "slowed"), [(9.81, 2.0, False), (0.981, 20.0, False), (0.05, 392.4, True)]
+)
+def test_an_unknown_size_is_the_one_at_which_a_chute_runs_as_filmed(gravity, across, slowed):
+    points, velocities = sliding(gravity)
+    part = [np.ones(len(points), bool)]
+    found = with_chute(ASSUMED, points, velocities, part, VelocityEvidence())
+    assert (found.source, found.warning != "") == ("chute", slowed)
+    assert found.across == pytest.approx(across, rel=0.01)
+    assert found.value / ASSUMED.value == pytest.approx(found.across / ASSUMED.across)
+    assert "chute" in found.sentence
+    given = MetricScale(0.5, "size", across=1.0)
+    assert with_chute(given, points, velocities, part, VelocityEvidence()) is given
+    assert with_chute(ASSUMED, points, velocities, [], VelocityEvidence()) is ASSUMED
+
+
+def test_a_size_beyond_belief_is_not_taken():
+    points, velocities = sliding(0.001)
+    assert with_chute(ASSUMED, points, velocities, [np.ones(len(points), bool)], VelocityEvidence()) is ASSUMED
 
 
 def test_a_plane_film_is_no_chute():
@@ -189,6 +253,8 @@ def test_a_stream_in_two_sections_is_told_from_one_slope_and_both_are_found(slop
     assert found.mean == pytest.approx(slope, abs=12.0)
     front = stream_surface(camera, mask, motion, np.ones(mask.shape), 0.04)
     assert front.slope is not None and front.slope.chute == pytest.approx(found.mean)
+    (part,) = front.chutes
+    assert (part & chute).sum() / (part | chute).sum() > 0.7  # its line is tried in steps of a tenth
     seen = mask & (front.depth > 0)
     ratio = front.depth[seen] / depth[seen]
     error = np.abs(ratio / np.median(ratio[~chute[seen]]) - 1.0)

@@ -146,7 +146,8 @@ def sighted(
     points, velocities = _surface_motion(canonical, visible, front.sighted, seen.motion, clip.interval)
     falls, trust = falling.pixels[visible], seen.trust[visible]
     seen_velocities = registration.VelocityEvidence(trust, clip.interval, up.pitch)
-    moving = _Moving(points, velocities, falls, seen_velocities, known_scale)
+    chutes = tuple(part[visible] for part in front.chutes)
+    moving = _Moving(points, velocities, falls, chutes, seen_velocities, known_scale)
     scale, sentence, told = _scale(seen, moving, seen_depth, c, fluid, canonical)
     warnings += told
     return Sighted(
@@ -164,6 +165,8 @@ class _Moving:
     """units per second"""
     falls: np.ndarray
     """bool: of jets"""
+    chutes: tuple[np.ndarray, ...]
+    """bool, of each"""
     seen_velocities: registration.VelocityEvidence
     known_scale: float | None
     """m per unit, of depth in metres"""
@@ -191,7 +194,9 @@ def _scale(
     if seen_depth is not None:
         scale = depths.with_learned_scale(scale, seen_depth, points)
         warnings += depths.size_warnings(scale.across, seen_depth, seen.height, points)
-    scale, sentence = _told(composite.with_fall(scale, points, velocities, moving.falls, moving.seen_velocities), seen)
+    scale = composite.with_fall(scale, points, velocities, moving.falls, moving.seen_velocities)
+    scale = composite.with_chute(scale, points, velocities, moving.chutes, moving.seen_velocities)
+    scale, sentence = _told(scale, seen)
     return scale, sentence, warnings + [scale.warning] * bool(scale.warning)
 
 

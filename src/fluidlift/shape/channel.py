@@ -86,7 +86,13 @@ def channel_setting(seen: Footage, config: ChannelConfig) -> Setting:
         spacing *= 1.05
     plan = with_seen(plan_of(seen, grid, extent), extent.visible, grid)
     thin = seen.surface.sheet(grid.centers()[:, :, 0, :2])
-    ground = _bed_and_banks(plan, grid, (depth, thin), extent, kind, seen.along)
+    rim = np.zeros_like(plan.wet)
+    if kind.enters_over_rim or seen.surface.steps:
+        foot_of_bank = int(np.ceil(depth / (cross_section.REPOSE * spacing)))
+        rim = above_rim(plan.wet, plan.level, seen.along, spacing, foot_of_bank)
+        if not kind.enters_over_rim:  # the back edge of the pool below a chute is a bank
+            rim &= _upper(plan.wet, plan.level)
+    ground = _bed_and_banks(plan, grid, (depth, thin), extent, kind, rim)
     ground = _as_seen(ground, plan, grid, seen, extent)
     return _fill_channel(grid, plan, ground, extent.reach, seen, kind)
 
@@ -112,10 +118,10 @@ def _ground_samples(low, high, n: int = 24) -> np.ndarray:
 
 def _bed_and_banks(
     plan: Plan, grid: Grid, depths: tuple[float, Float[np.ndarray, "nx ny"]], extent: Extent, kind: FluidKind,
-    along: Float[np.ndarray, "2"],
+    rim: Bool[np.ndarray, "nx ny"],
 ) -> _Ground:  # fmt: skip
     """Ground height and where there is water, per column; `depths`: the greatest, and the most that each column has;
-    `along`: horizontal direction of the flow."""
+    `rim`: what comes over it is as deep there as anywhere, it is no bank."""
     h, (depth, thin) = grid.spacing, depths
     wet, rock = plan.wet, plan.label == Label.SOLID  # rocks stand in the water: its banks are further out
     reach = cross_section.Reach(wet, rock, plan.level, plan.along, plan.speed, h)
@@ -123,9 +129,7 @@ def _bed_and_banks(
     steep = np.sqrt(1 + gx**2 + gy**2)  # thickness is meant across the sheet, columns are vertical
     steep = steep if kind.enters_over_rim else np.minimum(steep, EDGE)
     section = cross_section.depth_along(reach, depth, extent.width, kind)
-    if kind.enters_over_rim:  # what comes over it is as deep there as anywhere: its rim is no bank
-        foot_of_bank = int(np.ceil(depth / (cross_section.REPOSE * h)))
-        reach = replace(reach, wet=wet | above_rim(wet, plan.level, along, h, foot_of_bank))
+    reach = replace(reach, wet=wet | rim)
     below = np.maximum(np.minimum(cross_section.thickness(reach, section, extent.width), thin), 0.7 * h)
     outside = distance_inside(~wet, h)
     bank = plan.level + steep * np.minimum(0.4 * h + 0.9 * outside, 0.5 * depth + 2.5 * h)
@@ -258,5 +262,10 @@ def upper_rim(
     columns = np.maximum(INLET / np.sqrt(1 + gx**2 + gy**2), 1.0)
     up = np.moveaxis(np.indices(water.shape), 0, -1) - np.rint(down * columns[..., None])
     upstream = ndimage.map_coordinates(water.astype(np.uint8), np.moveaxis(up, -1, 0), order=0, cval=0) > 0
+    return water & ~upstream & _upper(water, level)
+
+
+def _upper(water: np.ndarray, level: np.ndarray) -> np.ndarray:
+    """Columns in the upper part of the drop, where a curtain or a chute begins."""
     low, high = level[water].min(), level[water].max()
-    return water & ~upstream & (level > low + 0.4 * (high - low))
+    return level > low + 0.4 * (high - low)

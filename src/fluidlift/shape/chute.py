@@ -36,8 +36,14 @@ AMISS = 12.0
 """degrees between the motion seen and that on the chute that explains it best, at most"""
 FEWEST = 60
 """pixels"""
+LEAST_EXCESS = 0.1
+"""px per frame: twice the error of optical flow at its best (`slope.LEAST_NOISE`); this is its mean over a clip. At 60
+and more frames per second, or slowed down, water that falls over a weir moves by 0.3 to 0.5"""
 SHEET = 0.1
 """greatest thickness of a chute over its width: that of a fall (`types.kind.FALL.depth_ratio`)"""
+SCALED = 0.5
+"""relative standard error of a size from a chute's speed: friction on the way, and what optical flow misses, enter its
+square. On a weir filmed at a quarter of its speed the size came out 16 to 17 times the true one, as it should"""
 FLANK = 0.25
 """of its half width, over which a chute's surface comes down to the fluid beside it"""
 
@@ -120,7 +126,7 @@ def chute_pixels(
     usual, spread = jets.lying_motion(mask, motion, trust, (motion * down).sum(-1) > DOWN * speed)
     excess = np.linalg.norm(motion - usual, axis=-1)
     goes_down = ((motion - usual) * down).sum(-1) > DOWN * excess
-    clear = (excess > max(jets.CONTRAST * spread, 0.5)) & (excess > jets.FASTER * speed)
+    clear = (excess > max(jets.CONTRAST * spread, LEAST_EXCESS)) & (excess > jets.FASTER * speed)
     fast = speed > np.linalg.norm(usual, axis=-1) / (1.0 - jets.FASTER)
     candidate = mask & (trust > jets.TRUSTED) & ((motion * down).sum(-1) > DOWN * speed) & goes_down & clear & fast
     label, count = cast(tuple[np.ndarray, int], ndimage.label(ndimage.binary_opening(candidate, iterations=2)))
@@ -284,3 +290,24 @@ def find_chutes(
         if chute is not None:
             found.append(chute)
     return found
+
+
+def head_acceleration(
+    points: Float[np.ndarray, "n 3"], velocities: Float[np.ndarray, "n 3"], trust: Float[np.ndarray, " n"]
+) -> float | None:
+    """Gravity as a chute shows it, length/s^2, from v^2 = v0^2 + 2 g (z0 - z) without friction; None where it shows
+    none. Medians of its uppermost tenth and of its lower half: a chute has too little height for `fit_free_fall`.
+
+    Args:
+        points: of its surface, z up, any unit of length.
+        velocities: in that unit per second.
+        trust: of them, 0 to 1.
+    """
+    known = trust > jets.TRUSTED
+    if known.sum() < FEWEST:
+        return None
+    z, energy = points[known, 2], 0.5 * np.square(velocities[known]).sum(axis=1)
+    top, low = z >= np.percentile(z, 90), z <= np.percentile(z, 50)
+    drop = float(np.median(z[top]) - np.median(z[low]))
+    gained = float(np.median(energy[low]) - np.median(energy[top]))
+    return gained / drop if drop > 0 and gained > 0 else None

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from fluidlift.shape import airborne, jets, registration
+from fluidlift.messages import NONE, Notice
+from fluidlift.shape import airborne, chute, jets, registration
 from fluidlift.shape.jet_column import Jet, with_columns
 from fluidlift.shape.kind import level_camera
 from fluidlift.shape.slope import LEVEL
 from fluidlift.shape.surface import FrontSurface
 from fluidlift.types import FluidKind, MetricScale, PinholeCamera, Setting, Similarity3, UpEvidence
 from fluidlift.types.kind import LOOKING_DOWN, POUR, STREAM
+
+LARGEST = 1000.0
+"""m across the fluid, to which a size from a chute is believed: footage that is slowed down ten times shows 10 m so"""
 
 
 @dataclass(frozen=True)
@@ -119,6 +124,38 @@ def with_fall(
     if found.source != "free fall":
         return scale
     return replace(found, across=scale.across * found.value / scale.value)
+
+
+def with_chute(
+    scale: MetricScale,
+    points: Float[np.ndarray, "n 3"],
+    velocities: Float[np.ndarray, "n 3"],
+    chutes: Sequence[Bool[np.ndarray, " n"]],
+    seen: registration.VelocityEvidence,
+) -> MetricScale:
+    """The scale from the speed on the largest chute, where nothing else gives one.
+
+    What runs down there must do so under 9.81 m/s^2 at the size that is taken (similarity after Froude). At a size that
+    is too small the water outruns what was filmed, and a chute that is fed as filmed falls dry.
+    """
+    if scale.source != "assumed" or not chutes:
+        return scale
+    part = max(chutes, key=lambda c: int(c.sum()))
+    trust = np.ones(len(points)) if seen.trust is None else seen.trust
+    gravity = chute.head_acceleration(points[part], velocities[part], trust[part])
+    if gravity is None:
+        return scale
+    value = registration.STANDARD_GRAVITY / gravity
+    across = scale.across * value / scale.value
+    if not registration.SHORTEST_FALL < across < LARGEST:
+        return scale
+    slowed = Notice(
+        "slowed-down",
+        f"the speed on its chute makes the fluid {across:.3g} m across: the clip is likely slowed down, or moves "
+        "faster than it shows. The asset keeps to the clip's time; --size METRES is true to scale, and runs faster",
+    )
+    warning = slowed if across > registration.LONGEST_FALL else NONE
+    return MetricScale(value, "chute", warning, relative_error=chute.SCALED, across=across)
 
 
 def composed(

@@ -38,6 +38,8 @@ class FrontSurface:
     """where its motion was asked how steep it runs"""
     is_gas: bool = False
     """whether it is seen within instead of at its surface"""
+    chutes: tuple[Bool[np.ndarray, "h w"], ...] = ()
+    """pixels of each chute that comes down onto it"""
 
     @property
     def sighted(self) -> Float[np.ndarray, "h w"]:
@@ -129,7 +131,8 @@ def _chutes_on_level(camera, mask, motion, trust) -> FrontSurface | None:
         return None
     steepest, heading = max(c.slope for c in found), float(np.degrees(found[0].heading))
     source = "a chute that comes down onto level water"
-    return replace(front, slope=SlopeEvidence(0.0, chute.AMISS, heading, 1.0, 0.0, source, steepest))
+    slopes = SlopeEvidence(0.0, chute.AMISS, heading, 1.0, 0.0, source, steepest)
+    return replace(front, slope=slopes, chutes=tuple(c.pixels for c in found))
 
 
 def _chute_above_pool(camera, mask, found: sections.SectionEvidence) -> FrontSurface | None:
@@ -154,7 +157,9 @@ def _chute_above_pool(camera, mask, found: sections.SectionEvidence) -> FrontSur
     source = "perspective of the motion: a chute above level water"
     heading = float(np.degrees(best.heading))
     evidence = SlopeEvidence(mean, found.standard_error, heading, 1.0 - found.share, mean, source, found.mean)
-    return replace(_from_height(camera, scaled, scale * depth), slope=evidence)
+    above = np.zeros_like(mask)
+    above[mask] = points[:, :2] @ ahead < scale * best.foot
+    return replace(_from_height(camera, scaled, scale * depth), slope=evidence, chutes=(above,))
 
 
 def _sloping_plane(camera: PinholeCamera, mask: np.ndarray, evidence: SlopeEvidence) -> FrontSurface:

@@ -60,8 +60,8 @@ class UpEvidence:
             *found,
             Notice(
                 "tilt-unsure",
-                f"how far the camera looks down is known to {self.error:.0f} degrees only: {self.pitch:.0f} is "
-                f"the middle "
+                f"how far the camera looks down is known to {self.error:.0f} degrees only: "
+                f"{self.pitch - self.raised:.0f} is the middle "
                 f"of what it may be ({self.source}); give --pitch, or a camera file, for a better shape",
             ),
         ]
@@ -93,7 +93,7 @@ class MetricScale:
 
     value: float
     source: str
-    """size, ruler, depth, camera, free fall, front, or assumed"""
+    """size, ruler, depth, camera, free fall, chute, front, or assumed"""
     warning: Notice = NONE
     relative_error: float | None = None
     """standard error over value; None: not known (nothing was measured, or what was given is taken as it is)"""
@@ -108,6 +108,7 @@ class MetricScale:
         words = {"size": "as given", "ruler": "by the ruler laid along it",
                  "depth": "from the given depth", "camera": "from the surveyed camera",
                  "free fall": "from free fall", "front": "from the speed of its front",
+                 "chute": "from the speed on its chute",
                  "assumed": "assumed"}  # fmt: skip
         error = "" if self.relative_error is None else f", ± {100 * 1.96 * self.relative_error:.0f} % (95 %)"
         return f"scale: {self.across:.3g} m across the fluid, {words[self.source]}{error}"

@@ -46,6 +46,13 @@ def test_a_camera_three_metres_above_the_water_gives_the_scale():
     assert scale.value == pytest.approx(3.0 / 0.6)
 
 
+def test_where_nothing_tells_the_usual_size_is_taken_and_said():
+    scale = metric_scale("stream", POINTS, STILL, usual=10.0)
+    assert (scale.source, scale.across) == ("assumed", 10.0) and "10 m across is assumed" in scale.warning
+    assert scale.value == pytest.approx(10.0 * metric_scale("stream", POINTS, STILL).value)
+    assert metric_scale("stream", POINTS, STILL, usual=10.0, size=3.0).across == 3.0
+
+
 def falling(acceleration, n=4000, noise=0.0):
     z = RNG.uniform(-1.0, 1.0, n)
     speed = np.sqrt(0.3**2 + 2 * acceleration * (1.0 - z)) * (1 + noise * RNG.normal(size=n))

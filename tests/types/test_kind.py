@@ -208,3 +208,12 @@ def test_the_habits_of_filming_are_shares(kind):
     mean, spread = kind.usual_pitch
     assert min(means) <= mean <= max(means)
     assert spread >= min(spreads)
+
+
+def test_the_usual_size_is_that_of_what_is_filmed_so():
+    river = kind_of("stream")
+    assert river.usual_size(5.0) == pytest.approx(river.sizes[0], rel=0.05)  # over a landscape
+    assert river.usual_size(60.0) == pytest.approx(river.sizes[1], rel=0.05)  # a pan, a table
+    between = [river.usual_size(pitch) for pitch in np.arange(5.0, 61.0, 5.0)]
+    assert (np.diff(between) < 0).all()
+    assert kind_of("pour").usual_size(8.0) == 1.0

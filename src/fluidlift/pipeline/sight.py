@@ -189,7 +189,7 @@ def _scale(
     else:
         scale = registration.metric_scale(
             seen.kind, points, velocities, size=size, camera_height=seen.height, known_scale=moving.known_scale,
-            seen=moving.seen_velocities,
+            seen=moving.seen_velocities, usual=seen.kind.usual_size(seen.up.pitch - seen.up.raised),
         )  # fmt: skip
     if seen_depth is not None:
         scale = depths.with_learned_scale(scale, seen_depth, points)

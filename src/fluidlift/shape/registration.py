@@ -236,11 +236,12 @@ def metric_scale(
     camera_height: float | None = None,
     known_scale: float | None = None,
     seen: VelocityEvidence | None = None,
+    usual: float = 1.0,
 ) -> MetricScale:
     """Metres per canonical unit (design: a single view has no scale of its own).
 
     In this order: a given size (what a person asks for wins; where a camera says clearly otherwise, there is a
-    warning), metric depth, a surveyed camera, free fall at 9.81 m/s^2 for what falls freely, one metre.
+    warning), metric depth, a surveyed camera, free fall at 9.81 m/s^2 for what falls freely, the usual size.
 
     Args:
         kind: of the fluid.
@@ -250,6 +251,7 @@ def metric_scale(
         camera_height: metres of a surveyed camera above the level of a stream.
         known_scale: metres per canonical unit, where the depth came in metres.
         seen: how the velocities were seen.
+        usual: m across such a fluid (`FluidKind.usual_size`).
     """
     extent = extent_of(points)
     drop = float(-np.median(points[:, 2])) if camera_height is not None else 0.0
@@ -281,14 +283,14 @@ def metric_scale(
             refusal = f"it would be {across:.3g} m across"
     because = f" (free fall does not tell: {refusal})" if refusal else ""
     return MetricScale(
-        1.0 / extent,
+        usual / extent,
         "assumed",
         Notice(
             "size-unknown",
-            f"the size of the fluid is unknown{because}: 1 m across is assumed, and speeds and gravity follow from it; "
-            "give --size METRES (or a camera file with a pose) for true units",
+            f"the size of the fluid is unknown{because}: {usual:.2g} m across is assumed, and speeds and gravity "
+            "follow from it; give --size METRES (or a camera file with a pose) for true units",
         ),
-        across=1.0,
+        across=usual,
         refusal=refusal,
     )
 

@@ -5,6 +5,7 @@ To add a kind: one entry in `KINDS`, and `shape/kinds/NAME.py` with the construc
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -60,6 +61,9 @@ class FluidKind:
     depth_ratio: float | None = None
     """greatest depth of a channel over its full width: a single view does not show the bed (a choice; --depth-ratio
     overrides). None: it runs in no channel"""
+    sizes: tuple[float, float] = (1.0, 1.0)
+    """m across what is seen of it, where nothing tells: filmed from beside, and looked down on. Its weight against its
+    motion goes with it (similarity after Froude): a river of 1 m runs level, and out of its bed, far too fast"""
     surveyed_level: tuple[str, str] | None = None
     """entry of a camera file with the height (m) of the plane under a surveyed camera, and that plane in a message;
     None: there is no such plane"""
@@ -96,6 +100,13 @@ class FluidKind:
         mean = sum(w * m for w, m, _ in self.pitch_habits)
         return mean, sum(w * (s**2 + (m - mean) ** 2) for w, m, s in self.pitch_habits) ** 0.5
 
+    def usual_size(self, pitch: float) -> float:
+        """M across it for a camera that looks so many degrees down: the mean of the logarithms of `sizes`, each weighed
+        by how likely people film so."""
+        shares = [w / s * math.exp(-0.5 * ((pitch - m) / s) ** 2) for w, m, s in self.pitch_habits]
+        beside = shares[0] / max(sum(shares), 1e-300)
+        return self.sizes[0] ** beside * self.sizes[1] ** (1.0 - beside)
+
     @property
     def falls_freely(self) -> bool:
         """Whether gravity alone sets its speed, so that 9.81 m/s^2 gives its size."""
@@ -119,13 +130,14 @@ class FluidKind:
 
 STREAM = FluidKind(
     "stream", pitch_prior=(10.0, 9.0), looked_down_on=0.35, kinematic_viscosity=1e-5, wall_damping=0.05, wall_layer=1.0,
-    is_channel_flow=True, depth_ratio=0.2, surveyed_level=("water_level_z", "the water stands"), recognised=True,
+    is_channel_flow=True, depth_ratio=0.2, sizes=(10.0, 1.0), surveyed_level=("water_level_z", "the water stands"),
+    recognised=True,
 )  # fmt: skip
 """rivers, brooks, puddles. Pitch over a landscape, by horizon or far shore of 14 real clips (read by hand, one of
 them surveyed): 2 to 29, mean 10, deviation 9; 8 of 22 clips look down"""
 FALL = FluidKind(
     "fall", pitch_prior=(8.0, 8.0), kinematic_viscosity=1e-5, wall_damping=0.05, wall_layer=0.75,
-    is_channel_flow=True, depth_ratio=0.1, energy_share=0.35, recognised=True,
+    is_channel_flow=True, depth_ratio=0.1, energy_share=0.35, sizes=(10.0, 1.0), recognised=True,
 )  # fmt: skip
 """waterfalls, curtains over rock"""
 POUR = FluidKind(

@@ -33,6 +33,8 @@ ALL = ClipHints(
     regions=(
         Region("fluid", ((1.0, 2.0), (50.0, 2.0), (50.0, 40.0))),
         Region("rock", ((5.0, 5.0), (9.0, 9.0)), width=6.0, time=0.4, moves=True),
+        Region("ledge", ((20.0, 5.0), (30.0, 5.0), (30.0, 12.0))),
+        Region("pool", ((20.0, 15.0), (30.0, 15.0), (30.0, 22.0))),
     ),
     clicks=(Click((64.0, 48.0), True), Click((3.0, 4.0), False)),
     roi=(0.0, 10.0, 600.0, 300.0),
@@ -64,7 +66,8 @@ def test_a_region_stands_in_one_line():
     [
         ({"colour": "red"}, "unknown entry 'colour'"),
         ({"kind": "soup"}, "kind = soup"),
-        ({"ledge": [[1, 2], [3, 4]]}, "nothing uses it yet"),
+        ({"ledge": [[1, 2], [3, 4]]}, "is: ledge, area"),
+        ({"pool": [[1, 2], [3, 4]]}, "is: pool, area"),
         ({"flow": []}, "nothing uses it yet"),
         ({"horizon": [[0, 1], [10, 2], [20, 3]]}, "one horizon: two points"),
         ({"horizon": [[5, 1], [5, 200]]}, "two points beside each other"),

@@ -5,14 +5,14 @@ import pytest
 from scipy import ndimage
 
 from fluidlift.shape.channel import ChannelConfig, channel_setting
-from fluidlift.shape.chute import ChuteHeight, chute_pixels, find_chutes, head_acceleration
+from fluidlift.shape.chute import USUAL, ChuteHeight, chute_pixels, find_chutes, head_acceleration, pieces
 from fluidlift.shape.composite import with_chute
 from fluidlift.shape.kind import level_camera
 from fluidlift.shape.plan import Footage
 from fluidlift.shape.registration import PlacedHeight, VelocityEvidence
 from fluidlift.shape.sections import SURE, estimate_sections
 from fluidlift.shape.slope import flow_patches, plane_axes
-from fluidlift.shape.surface import level_surface, stream_surface
+from fluidlift.shape.surface import chutes_on_level, level_surface, stream_surface
 from fluidlift.types import CellType, Label, MetricScale, PinholeCamera, Similarity3, UpEvidence
 
 SIZE = (192, 144)
@@ -160,6 +160,32 @@ def test_an_unknown_size_is_the_one_at_which_a_chute_runs_as_filmed(gravity, acr
 def test_a_size_beyond_belief_is_not_taken():
     points, velocities = sliding(0.001)
     assert with_chute(ASSUMED, points, velocities, [np.ones(len(points), bool)], VelocityEvidence()) is ASSUMED
+
+
+@pytest.mark.parametrize(("slope", "heading", "pitch"), SCENES)
+def test_a_marked_ledge_stands_where_no_motion_shows_it(slope, heading, pitch):
+    camera, mask, motion, chute, depth = scene(slope, heading, pitch)
+    unseen = motion * ~chute[..., None]
+    trust = np.where(chute, 0.0, 1.0)
+    assert chutes_on_level(camera, mask, unseen, trust) is None
+    front = chutes_on_level(camera, mask, unseen, trust, chute)
+    assert front is not None and front.slope is not None
+    assert front.slope.chute == pytest.approx(USUAL[0], abs=2.0)  # nothing says more
+    (part,) = front.chutes
+    assert (part == chute).all()
+    # nearer to the truth than level water is
+    level = level_surface(camera, mask & ~chute).depth
+    off, flat = (np.abs((d / depth)[chute] / np.median((d / depth)[mask & ~chute]) - 1.0) for d in (front.depth, level))
+    assert np.median(off) < 0.7 * np.median(flat)
+
+
+def test_a_mark_too_small_to_stand_is_left_out():
+    small = np.zeros((40, 60), bool)
+    small[3:6, 3:6] = True
+    assert pieces(small) == []
+    large = np.zeros((40, 60), bool)
+    large[10:30, 10:20], large[10:30, 30:50] = True, True
+    assert [int(p.sum()) for p in pieces(small | large)] == [400, 200]
 
 
 def test_a_plane_film_is_no_chute():

@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 
 from fluidlift.errors import InputRejected
-from fluidlift.shape.drawn import carried, drawn_pixels, frame_at
+from fluidlift.shape.composite import LEVEL_SAID, Parts, level_prior, with_marks
+from fluidlift.shape.drawn import LABELS, carried, drawn_pixels, frame_at
 from fluidlift.shape.kind import level_camera
 from fluidlift.shape.registration import ruler_scale
 from fluidlift.shape.view import drawn_rim, horizon_line, sky_of, tilt_of_horizon
 from fluidlift.shape.view.roundness import roundness_evidence
-from fluidlift.types import PinholeCamera, UpEvidence
-from fluidlift.types.hints import Ruler
+from fluidlift.types import Label, PinholeCamera, UpEvidence
+from fluidlift.types.hints import ClipHints, Region, Ruler
 
 LENS = PinholeCamera.from_fov(50.0, (320, 240))
 
@@ -81,3 +82,24 @@ def test_a_ruler_on_the_ground_gives_metres_per_unit():
     assert found.value == pytest.approx(3.0) and found.source == "ruler" and "ruler" in found.sentence
     with pytest.raises(InputRejected, match="horizon"):
         ruler_scale(camera, ground, Ruler((160.0, -400.0), (200.0, -400.0), 3.0))
+
+
+MARKED = ClipHints(regions=(
+    Region("ledge", ((10.0, 5.0), (30.0, 5.0), (30.0, 15.0), (10.0, 15.0))),
+    Region("pool", ((10.0, 20.0), (30.0, 20.0), (30.0, 30.0))),
+))  # fmt: skip
+
+
+def test_marked_ledges_and_pools_belong_to_the_parts_of_a_stream():
+    mask = np.zeros((40, 60), bool)
+    mask[:, 20:] = True
+    parts = with_marks(Parts((), mask), MARKED.view, mask)
+    assert parts.ledges is not None and parts.ledges[5:15, 20:30].all()
+    drawn = drawn_pixels(MARKED.regions[0].line, None, (40, 60))
+    assert (parts.ledges == drawn & mask).all() and parts.ledges.sum() < drawn.sum()
+    assert (parts.gentle == ~parts.ledges).all()
+    still = np.zeros((40, 60, 2))
+    assert level_prior(parts, still, np.ones((40, 60))) == LEVEL_SAID
+    assert with_marks(Parts((), mask), None, mask) == Parts((), mask)
+    assert level_prior(Parts((), mask), still, np.ones((40, 60))) < LEVEL_SAID
+    assert all(LABELS[word] == Label.FLUID for word in ("ledge", "pool"))

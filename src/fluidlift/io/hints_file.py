@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar, cast, get_args
 
 import yaml
 
@@ -25,8 +25,11 @@ MOST_POINTS = 2000
 """of one region"""
 FARTHEST = 1e6
 """px: a horizon outside the picture is still within this"""
-NOT_YET = {"level": "a pool that lies level", "ledge": "the line of a ledge", "flow": "the direction of the flow"}
-"""what a person could say and nothing uses yet: refused, so that nobody counts on it"""
+INSTEAD = {
+    "level": "mark the pool as a region: {is: pool, area: ...}", "pool": "mark it as a region: {is: pool, area: ...}",
+    "ledge": "mark what falls as a region: {is: ledge, area: ...}", "flow": "leave it out: nothing uses it yet",
+}  # fmt: skip
+"""what a person could write for something that is said elsewhere, or that nothing uses yet, and what to do"""
 FOUND = "found"
 """what `fluidlift hints` found; it is there to be looked at and copied from, and is not read"""
 HEAD = """\
@@ -68,9 +71,9 @@ def parse_hints(data: Any, name: str = "hints.yaml") -> ClipHints:
     version = top.whole("hints", 1, VERSION)
     if version is None:
         raise top.refused(f"no line 'hints: {VERSION}'", "a hints file", "begin it with that line")
-    for word, what in NOT_YET.items():
+    for word, what in INSTEAD.items():
         if word in top.data:
-            raise top.refused(f"'{word}' ({what})", "hints that have an effect", "leave it out: nothing uses it yet")
+            raise top.refused(f"'{word}'", "hints that have an effect", what)
     found = ClipHints(
         clip=top.part("clip", _identity),
         start=top.number("start", 0.0, 1e9),
@@ -330,7 +333,7 @@ def _rim(e: _Entry) -> Rim:
 
 
 def _region(e: _Entry) -> Region:
-    what = e.word("is", ("fluid", "not fluid", "rock", "sky"))
+    what = e.word("is", get_args(What))
     area, brush = e.take("area"), e.take("brush")
     width, time, moves = e.number("width", 0.1, FARTHEST), e.number("time", 0.0, 1e9), e.yes("moves")
     line = area if brush is None else brush

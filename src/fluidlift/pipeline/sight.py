@@ -26,7 +26,7 @@ from fluidlift.shape import (
     texture_gradient,
 )
 from fluidlift.shape import kind as kinds
-from fluidlift.shape.drawn import sky_pixels
+from fluidlift.shape.drawn import region_pixels
 from fluidlift.shape.frame_pictures import typical_picture
 from fluidlift.shape.framing import framing_warnings
 from fluidlift.shape.given_depth import DepthPictures
@@ -294,6 +294,7 @@ def _kind_and_up(
                 kind, parts = STREAM, composite.Parts(poured.jets, poured.lying, puddle=True)
     else:
         parts = composite.Parts((), mask)
+    parts = composite.with_marks(parts, c.drawn, mask)
     if pose_given:
         return evidence, kind, parts, surveyed, heading
     generated = given_body.note_of(bodies) is not None
@@ -303,7 +304,7 @@ def _kind_and_up(
             return evidence, kind, parts, upright, None
     texture = None
     if kind.nearly_level and c.pitch is None and not parts.puddle:
-        texture = texture_gradient.texture_patches(clip.frames, parts.lying & ~parts.falling)
+        texture = texture_gradient.texture_patches(clip.frames, parts.lying & parts.gentle)
     typical = typical_picture(clip.frames[pick]).astype(np.uint8)
     said = _said_of_view(c, known, mask.shape)
     picture = look_at(
@@ -311,7 +312,7 @@ def _kind_and_up(
         drawn_sky=said.sky, drawn_rims=said.rims,
     )  # fmt: skip
     up = kinds.estimate_up(
-        kind, parts.lying, motion, trust * ~parts.falling, known, picture, given=(said.pitch, said.roll),
+        kind, parts.lying, motion, trust * parts.gentle, known, picture, given=(said.pitch, said.roll),
         level_prior=composite.level_prior(parts, motion, trust),
     )  # fmt: skip
     if said.roll is None:
@@ -337,7 +338,7 @@ def _said_of_view(c: GeometrySettings, known: PinholeCamera, shape: tuple[int, .
     if drawn is None:
         return _SaidOfView(c.pitch, c.roll)
     pitch, roll = (c.pitch, c.roll) if drawn.horizon is None else tilt_of_horizon(known, drawn.horizon)
-    sky = sky_of(sky_pixels(drawn.sky, (shape[0], shape[1])))
+    sky = sky_of(region_pixels(drawn.sky, (shape[0], shape[1])))
     return _SaidOfView(pitch, roll, sky, tuple(drawn_rim(r.center, r.axes, r.turned) for r in drawn.rims))
 
 
@@ -357,7 +358,7 @@ def _observation(seen: Sight, canonical: PinholeCamera, interval: float) -> Obse
     return Observation(
         canonical, seen.parts.lying, seen.motion, seen.lying_trust, interval, camera_height=seen.height,
         tilt_known=seen.tilt_known, level_prior=composite.level_prior(seen.parts, seen.motion, seen.trust),
-        roll=seen.up.roll, standing=seen.stood,
+        roll=seen.up.roll, standing=seen.stood, ledges=seen.parts.ledges,
     )  # fmt: skip
 
 

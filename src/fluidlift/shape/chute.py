@@ -136,6 +136,13 @@ def chute_pixels(
     return sorted((_whole(p, mask) for p in parts), key=lambda p: -int(p.sum()))
 
 
+def pieces(marked: Bool[np.ndarray, "h w"]) -> list[Bool[np.ndarray, "h w"]]:
+    """Connected pieces of what a person marked, largest first, without those too small to stand."""
+    label, count = cast(tuple[np.ndarray, int], ndimage.label(marked))
+    found = [label == k for k in range(1, count + 1)]
+    return sorted((p for p in found if p.sum() >= FEWEST), key=lambda p: -int(p.sum()))
+
+
 def _whole(part: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """With the rim that opening and the blur of flow took from it."""
     return cast(np.ndarray, ndimage.binary_closing(part, iterations=2)) & mask | part
@@ -168,7 +175,7 @@ def foot_pixels(part: np.ndarray, mask: np.ndarray, motion: np.ndarray) -> Bool[
 
 def stand(
     camera: PinholeCamera, part: Bool[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"],
-    motion: Float[np.ndarray, "h w 2"], trust: Float[np.ndarray, "h w"], level: float,
+    motion: Float[np.ndarray, "h w 2"], trust: Float[np.ndarray, "h w"], level: float, *, sure: bool = False,
 ) -> Chute | None:  # fmt: skip
     """The chute that a piece of the picture shows, on a level surface; None where none explains its motion.
 
@@ -179,11 +186,17 @@ def stand(
         motion: px per frame.
         trust: of it.
         level: z of the surface at its foot.
+        sure: it is one, whatever its motion: it is as steep as that says, or as chutes usually are.
     """
     heading = _heading_below(camera, part, mask, motion, trust)
     if heading is None:
-        return None
+        if not sure:
+            return None
+        heading = -0.5 * np.pi  # towards the viewer
     seen = np.median(motion[part], axis=0)
+    unseen = float(np.linalg.norm(seen)) < LEAST_EXCESS
+    if unseen:
+        seen = jets.projected_vertical(camera)[part].mean(axis=0)
     rows, cols = np.nonzero(part)
     at = np.array([[float(np.median(cols)) + 0.5, float(np.median(rows)) + 0.5]])
     degrees = np.arange(0.0, MOST_SLOPE + 1.0, 1.0)
@@ -193,11 +206,16 @@ def stand(
         _, _, along, _ = slope.basis(camera, at, axes)
         cosine = float(along[0] @ seen) / max(float(np.linalg.norm(along[0]) * np.linalg.norm(seen)), 1e-12)
         off.append(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
-    belief = np.exp(-0.5 * ((np.array(off) / UNSURE) ** 2 + ((degrees - USUAL[0]) / USUAL[1]) ** 2))
-    if min(off) > AMISS:
-        return None
+    habit = np.exp(-0.5 * ((degrees - USUAL[0]) / USUAL[1]) ** 2)
+    belief = np.exp(-0.5 * (np.array(off) / UNSURE) ** 2) * habit
+    if unseen or min(off) > AMISS:
+        if not sure:
+            return None
+        belief = habit
     found = float((degrees * belief).sum() / belief.sum())
-    return None if found < LEAST_SLOPE else _placed(camera, part, seen, (found, heading), level)
+    if found < LEAST_SLOPE and not sure:
+        return None
+    return _placed(camera, part, seen, (max(found, LEAST_SLOPE), heading), level)
 
 
 def _heading_below(camera, part, mask, motion, trust) -> float | None:
@@ -266,6 +284,7 @@ def _placed(camera, part, seen: np.ndarray, angles: tuple[float, float], level: 
 def find_chutes(
     camera: PinholeCamera, mask: Bool[np.ndarray, "h w"], motion: Float[np.ndarray, "h w 2"],
     trust: Float[np.ndarray, "h w"], height: HeightModel,
+    marked: list[Bool[np.ndarray, "h w"]] | None = None,
 ) -> list[Chute]:  # fmt: skip
     """Chutes that come down onto a surface.
 
@@ -275,9 +294,10 @@ def find_chutes(
         motion: mean over the clip, px per frame.
         trust: of it.
         height: model of that surface, as it is without them.
+        marked: their pixels, as a person says; none: they are looked for.
     """
     found = []
-    for part in chute_pixels(camera, mask, motion, trust):
+    for part in marked or chute_pixels(camera, mask, motion, trust):
         rows, cols = np.nonzero(part)
         low = rows >= np.percentile(rows, 90)
         ray = camera.rays(np.array([[cols[low].mean() + 0.5, rows[low].mean() + 0.5]]))[0]
@@ -286,7 +306,7 @@ def find_chutes(
         level = -1.0
         for _ in range(8):  # where its foot's ray meets the surface
             level = float(height.height((ray[:2] * level / ray[2])[None])[0])
-        chute = stand(camera, part, mask, motion, trust, level) if level < 0 else None
+        chute = stand(camera, part, mask, motion, trust, level, sure=bool(marked)) if level < 0 else None
         if chute is not None:
             found.append(chute)
     return found

@@ -11,13 +11,17 @@ from jaxtyping import Bool, Float
 
 from fluidlift.messages import NONE, Notice
 from fluidlift.shape import airborne, chute, jets, registration
+from fluidlift.shape.drawn import region_pixels
 from fluidlift.shape.jet_column import Jet, with_columns
 from fluidlift.shape.kind import level_camera
 from fluidlift.shape.slope import LEVEL
 from fluidlift.shape.surface import FrontSurface
 from fluidlift.types import FluidKind, MetricScale, PinholeCamera, Setting, Similarity3, UpEvidence
+from fluidlift.types.hints import DrawnView
 from fluidlift.types.kind import LOOKING_DOWN, POUR, STREAM
 
+LEVEL_SAID = 0.999
+"""share of streams that are level among those of which a person says so"""
 LARGEST = 1000.0
 """m across the fluid, to which a size from a chute is believed: footage that is slowed down ten times shows 10 m so"""
 
@@ -31,11 +35,20 @@ class Parts:
     """the mask without what falls, and with what that hides"""
     puddle: bool = False
     """whether the lying part is a puddle: it has no downstream, so it is level"""
+    ledges: Bool[np.ndarray, "h w"] | None = None
+    """pixels of what comes down steeply onto the rest, as a person marked them"""
+    level: bool = False
+    """a person says that the rest is level"""
 
     @property
     def falling(self) -> Bool[np.ndarray, "h w"]:
         """Pixels of the jets."""
         return jets.airborne_pixels(list(self.outlines), self.lying.shape)
+
+    @property
+    def gentle(self) -> Bool[np.ndarray, "h w"]:
+        """All pixels but those of jets and marked ledges: their motion may be that of one plane."""
+        return ~self.falling if self.ledges is None else ~self.falling & ~self.ledges
 
 
 def split(
@@ -82,9 +95,19 @@ def with_roll(up: UpEvidence, parts: Parts, camera: PinholeCamera) -> UpEvidence
 
 
 def level_prior(parts: Parts, motion: Float[np.ndarray, "h w 2"], trust: Float[np.ndarray, "h w"]) -> float:
-    """Share of such streams that are level: few are where jets bring all there is."""
+    """Share of such streams that are level: few are where jets bring all there is, nearly all where one says so."""
+    if parts.level:
+        return LEVEL_SAID
     fed = not parts.puddle and jets.feed_all(list(parts.outlines), parts.lying, motion, trust)
     return jets.LEVEL_FED if fed else LEVEL
+
+
+def with_marks(parts: Parts, drawn: DrawnView | None, mask: Bool[np.ndarray, "h w"]) -> Parts:
+    """The parts, with the ledges and pools that a person marked on the working picture."""
+    if drawn is None:
+        return parts
+    ledges = region_pixels(drawn.ledges, (mask.shape[0], mask.shape[1])) & mask
+    return replace(parts, ledges=ledges if ledges.any() else None, level=drawn.level)
 
 
 @dataclass(frozen=True)

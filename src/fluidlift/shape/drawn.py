@@ -11,7 +11,10 @@ from jaxtyping import Bool, Float
 from fluidlift.types import Label
 from fluidlift.types.hints import Point, Region
 
-LABELS = {"fluid": Label.FLUID, "not fluid": Label.BACKGROUND, "rock": Label.SOLID, "sky": Label.BACKGROUND}
+LABELS = {
+    "fluid": Label.FLUID, "not fluid": Label.BACKGROUND, "rock": Label.SOLID, "sky": Label.BACKGROUND,
+    "ledge": Label.FLUID, "pool": Label.FLUID,
+}  # fmt: skip
 _SHIFT = 4
 """bits behind the point of the corners that OpenCV draws: a sixteenth of a pixel"""
 
@@ -81,8 +84,8 @@ def frame_at(times: Float[np.ndarray, " t"], time: float) -> int:
     return int(np.abs(np.asarray(times) - time).argmin())
 
 
-def sky_pixels(regions: Sequence[Region], shape: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
-    """Pixels that a person said are sky."""
+def region_pixels(regions: Sequence[Region], shape: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
+    """Pixels of all regions together."""
     found = np.zeros(shape, bool)
     for region in regions:
         found |= drawn_pixels(region.line, region.width, shape)

@@ -98,7 +98,7 @@ def stream_surface(
     Raises:
         InputRejected: the camera does not look down at the surface.
     """
-    below_chutes = _chutes_on_level(camera, mask, motion, trust)
+    below_chutes = chutes_on_level(camera, mask, motion, trust)
     if below_chutes is not None:
         return below_chutes
     patches = slope.flow_patches(mask, motion, trust)
@@ -113,15 +113,27 @@ def stream_surface(
     return _with_energy(camera, mask, front, patches, evidence, camera_height, interval)
 
 
-def _chutes_on_level(camera, mask, motion, trust) -> FrontSurface | None:
-    """A level surface with the chutes that come down onto it; None where there are none, or they are not seen."""
-    parts = chute.chute_pixels(camera, mask, motion, trust)
+def chutes_on_level(
+    camera: PinholeCamera, mask: Bool[np.ndarray, "h w"], motion: Float[np.ndarray, "h w 2"],
+    trust: Float[np.ndarray, "h w"], ledges: Bool[np.ndarray, "h w"] | None = None,
+) -> FrontSurface | None:  # fmt: skip
+    """A level surface with the chutes that come down onto it; None where there are none, or they are not seen.
+
+    Args:
+        camera: canonical, z up.
+        mask: fluid pixels.
+        motion: mean optical flow, px per interval.
+        trust: of the flow, 0 to 1.
+        ledges: pixels of the chutes, as a person marked them; None: they are looked for.
+    """
+    marked = [] if ledges is None else chute.pieces(ledges)
+    parts = marked or chute.chute_pixels(camera, mask, motion, trust)
     lying = mask & ~np.any(parts, axis=0) if parts else mask
     if not parts or not lying.any():
         return None
     level = level_surface(camera, lying)
     assert level.height is not None
-    found = chute.find_chutes(camera, mask, motion, trust, level.height)
+    found = chute.find_chutes(camera, mask, motion, trust, level.height, marked)
     if not found:
         return None
     model = chute.ChuteHeight(level.height, tuple(found))

@@ -10,7 +10,8 @@ from fluidlift.errors import InputRejected, require
 Point = tuple[float, float]
 """(x, y), px of the clip's picture, from its upper left corner"""
 
-What = Literal["fluid", "not fluid", "rock", "sky"]
+What = Literal["fluid", "not fluid", "rock", "sky", "ledge", "pool"]
+"""ledge and pool are fluid: what comes down steeply onto the fluid below, and what stands level"""
 SHAPE = 0.02
 """relative difference between the width over height of pictures that are of one shape: whole pixels at 64 px"""
 
@@ -148,20 +149,24 @@ class ClipHints:
     @property
     def view(self) -> DrawnView | None:
         """What of it says how the camera stands and how large things are; None: nothing of it does."""
-        sky = tuple(r for r in self.regions if r.what == "sky")
-        if self.horizon is None and self.ruler is None and not self.rims and not sky:
+        sky, ledges = (tuple(r for r in self.regions if r.what == what) for what in ("sky", "ledge"))
+        level = any(r.what == "pool" for r in self.regions)
+        if self.horizon is None and self.ruler is None and not (self.rims or sky or ledges or level):
             return None
-        return DrawnView(self.horizon, self.ruler, self.rims, sky)
+        return DrawnView(self.horizon, self.ruler, self.rims, sky, ledges, level)
 
 
 @dataclass(frozen=True)
 class DrawnView:
-    """What a person drew of the camera's tilt and of size, in px of the working picture."""
+    """What a person drew of the camera's tilt, of size and of the surface, in px of the working picture."""
 
     horizon: tuple[Point, Point] | None = None
     ruler: Ruler | None = None
     rims: tuple[Rim, ...] = ()
     sky: tuple[Region, ...] = ()
+    ledges: tuple[Region, ...] = ()
+    level: bool = False
+    """what does not come down a ledge is level"""
 
 
 NOTHING_SAID = ClipHints()

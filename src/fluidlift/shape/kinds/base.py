@@ -41,6 +41,8 @@ class Observation:
     """degrees that the picture is turned clockwise"""
     standing: StandingBody | None
     """of a fluid that starts at rest"""
+    ledges: Bool[np.ndarray, "h w"] | None = None
+    """pixels of what comes down steeply onto the rest, as a person marked them"""
 
 
 class BodyBuilder(Protocol):

@@ -7,7 +7,10 @@ from fluidlift.shape import depth_surface, surface
 
 class _Stream:
     def front_surface(self, seen):
-        return surface.stream_surface(
+        marked = None
+        if seen.ledges is not None:
+            marked = surface.chutes_on_level(seen.camera, seen.mask, seen.motion, seen.trust, seen.ledges)
+        return marked or surface.stream_surface(
             seen.camera, seen.mask, seen.motion, seen.trust, seen.interval, camera_height=seen.camera_height,
             tilt_known=seen.tilt_known, level_prior=seen.level_prior,
         )  # fmt: skip

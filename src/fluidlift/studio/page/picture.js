@@ -1,5 +1,5 @@
 // The clip with what was found and what was said on it, and the tools that draw. Points are px of the clip's own picture.
-const COLORS = { fluid: "#1ea0ff", "not fluid": "#ff5a4d", rock: "#ff9a2e", sky: "#b9a3ff" };
+const COLORS = { fluid: "#1ea0ff", "not fluid": "#ff5a4d", rock: "#ff9a2e", sky: "#b9a3ff", ledge: "#2fd3c9", pool: "#3c6cff" };
 const NEAR = 12; // px of the screen within which a handle is taken
 
 export class Picture {

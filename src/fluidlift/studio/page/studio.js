@@ -3,6 +3,7 @@ import { Picture } from "./picture.js";
 import { el, fill, panels } from "./panels.js";
 
 export const page = { state: null, tool: "look", what: "fluid", width: 24, moves: false, metres: 1 };
+const REGIONS = ["fluid", "not fluid", "rock", "sky", "ledge", "pool"];
 const $ = (id) => document.getElementById(id);
 let messageOf = "";
 
@@ -73,10 +74,10 @@ function options() {
   const moves = el("label", { title: "it goes with the flow to the other frames; else it is there in all" },
     el("input", { type: "checkbox", id: "moves", checked: page.moves, onchange: (e) => { page.moves = e.target.checked; } }), " goes with the flow");
   if (page.tool === "brush") {
-    fill(box, [what(["fluid", "not fluid", "rock", "sky"]), el("label", {}, "width ",
+    fill(box, [what(REGIONS), el("label", {}, "width ",
       el("input", { type: "range", min: 4, max: 120, value: page.width, "aria-label": "width of the brush", oninput: (e) => { page.width = +e.target.value; } })), moves]);
   } else if (page.tool === "area") {
-    fill(box, [what(["fluid", "not fluid", "rock", "sky"]), moves, "corner by corner; Enter closes"]);
+    fill(box, [what(REGIONS), moves, "corner by corner; Enter closes"]);
   } else if (page.tool === "click") {
     if (!["fluid", "not fluid"].includes(page.what)) page.what = "fluid";
     fill(box, [what(["fluid", "not fluid"])]);

@@ -49,6 +49,8 @@ READING = ReadSettings(
 )
 UNJUDGED = 128
 """value of a drawn mask where a person could not tell"""
+NO_WATER = patch("fluidlift.shape.segment.with_open_water", lambda evidence, region, barred: region)
+"""masks without what `open_water` adds, which it is fitted on"""
 
 
 @dataclass(frozen=True)
@@ -263,7 +265,7 @@ def main() -> None:
         ready = prepared(subject, args.work)
         began = time.process_time()
         try:
-            with patch("fluidlift.shape.segment.with_open_water", lambda _, region, __: region) if args.water else nullcontext():
+            with NO_WATER if args.water is not None else nullcontext():
                 found = segment(ready.clip, ready.flow)
         except Exception as error:  # a clip that is refused counts as one without a mask
             print(subject.name, error, flush=True)

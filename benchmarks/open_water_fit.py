@@ -1,9 +1,9 @@
 """Fits the weights of `shape.open_water` on pixels of wide water: `python benchmarks/open_water_fit.py`.
 
 `benchmarks/open_water_pixels.npz` holds up to 1500 judged pixels outside the mask that change and motion gave, of the
-middle of each clip: the three terms of `open_water.Field`, and whether it is fluid. `python benchmarks/masks.py --water`
-makes it anew where the clips are there. Printed are the weights, and the log loss and the share that is right where
-each clip is predicted by the others.
+middle of each clip: the three terms of `open_water.Field`, and whether it is fluid. `python benchmarks/masks.py
+--water FILE` makes it anew where the clips are there. Printed are the weights, and the log loss and the share that is
+right where each clip is predicted by the others.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from masks_fit import left_out, log_loss
+from masks_fit import fitted, left_out, log_loss
 
 TABLE = Path(__file__).resolve().parent / "open_water_pixels.npz"
 TERMS = ("wander", "colour", "height")
@@ -19,8 +19,6 @@ TERMS = ("wander", "colour", "height")
 
 def weights(columns: np.ndarray, fluid: np.ndarray, clip: np.ndarray) -> np.ndarray:
     """Weight of each column [n,k] and the bias; each clip counts alike."""
-    from masks_fit import fitted
-
     spread = columns.std(axis=0)
     found = fitted(columns / spread, fluid, 1.0 / np.bincount(clip)[clip])
     return np.append(found[:-1] / spread, found[-1])

@@ -27,10 +27,11 @@ def smooth(rng, sigma):
 def seen():
     """Evidence of a clip: ground above, water that hardly changes but drifts, lively water below, and a stone in it."""
 
-    def evidence(*, drift: int = 1, tremble: int = 0):
+    def evidence(*, drift: int = 1, tremble: int = 0, near: float = 4.0):
         rng = np.random.default_rng(3)
         ground = np.array([110.0, 105.0, 100.0]) + 12.0 * smooth(rng, 1.5)
-        faint, strong = smooth(rng, 2.0), smooth(rng, 2.0)
+        faint = smooth(rng, 2.0)
+        strong = np.where((ROWS > 95)[..., None], smooth(rng, near), smooth(rng, 2.0))
         frames = np.empty((FRAMES, HEIGHT, WIDTH, 3))
         for t in range(FRAMES):
             frames[t] = np.roll(ground, tremble * (t % 5), axis=1)
@@ -78,6 +79,11 @@ def test_a_fluid_that_is_not_wide_keeps_its_mask(seen):
 def test_nothing_is_added_where_the_camera_goes_on(seen):
     region = LIVELY & ~STONE
     assert with_open_water(seen(tremble=1), region, NOTHING) is region
+
+
+def test_a_body_that_does_not_recede_keeps_its_mask(seen):
+    region = LIVELY & ~STONE
+    assert with_open_water(seen(near=1.2), region, NOTHING) is region
 
 
 def test_without_quiet_water_the_mask_is_the_same_array(seen):

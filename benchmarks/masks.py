@@ -16,8 +16,10 @@ import platform
 import shutil
 import time
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
+from unittest.mock import patch
 
 import cv2
 import numpy as np
@@ -33,7 +35,9 @@ from fluidlift.pipeline.settings import ReadSettings
 from fluidlift.pipeline.stages.read import read
 from fluidlift.pipeline.work import Work
 from fluidlift.shape.evidence import fluid_score, gather_evidence
+from fluidlift.shape.frame_pictures import typical_picture
 from fluidlift.shape.moving_solids import SharedPairs, moving_solids
+from fluidlift.shape.open_water import field_around, lies_open, log_wander
 from fluidlift.shape.segment import overlay, segment
 from fluidlift.synthetic.demo import unpack_demo_case
 from fluidlift.types.clip import Label, PixelLabels, VideoClip
@@ -45,6 +49,8 @@ READING = ReadSettings(
 )
 UNJUDGED = 128
 """value of a drawn mask where a person could not tell"""
+NO_WATER = patch("fluidlift.shape.segment.with_open_water", lambda evidence, region, barred: region)
+"""masks without what `open_water` adds, which it is fitted on"""
 
 
 @dataclass(frozen=True)
@@ -202,6 +208,26 @@ def sampled_pixels(ready: Prepared, found: PixelLabels, most: int = 1500) -> dic
     return {name: values.ravel()[picked] for name, values in columns.items()}
 
 
+def water_pixels(ready: Prepared, found: PixelLabels, most: int = 1500) -> dict[str, np.ndarray] | None:
+    """What `shape.open_water` reads of some judged pixels outside the mask, and truth; None where it is not asked.
+
+    The mask is that without it: `main` switches it off for this.
+    """
+    t = list(ready.truth)[len(ready.truth) // 2]
+    evidence = gather_evidence(ready.clip, SharedPairs(ready.clip, ready.flow))
+    size = evidence.noise.shape[::-1]
+    region = cv2.resize((found.labels[t] == Label.FLUID).astype(np.float32), size) > 0.5
+    wander = log_wander(evidence)
+    if not lies_open(evidence, region, wander):
+        return None
+    truth = cv2.resize(ready.truth[t], size, interpolation=cv2.INTER_NEAREST)
+    places = np.flatnonzero((truth != UNJUDGED) & ~region)
+    picked = np.random.default_rng(0).permutation(places)[:most]
+    field = field_around(wander, typical_picture(evidence.pictures), region, region)
+    columns = {"wander": field.wander, "colour": field.colour, "height": field.height, "fluid": truth > UNJUDGED}
+    return {name: values.ravel()[picked] for name, values in columns.items()}
+
+
 def picture(frame: np.ndarray, labels: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """u8 [H,W,3]: what was found, blue, and the outline of what should be, red."""
     shown = overlay(np.ascontiguousarray(frame), labels)
@@ -215,7 +241,7 @@ def write_pixels(path: Path, pixels: dict[str, dict[str, np.ndarray]]) -> None:
     """One table of all clips: numbers alone, no pictures."""
     names = list(pixels)
     joined = {k: np.concatenate([pixels[n][k] for n in names]) for k in pixels[names[0]]}
-    joined |= {k: joined[k].astype(np.float16) for k in ("score", "carried")}
+    joined |= {k: v.astype(np.float16) for k, v in joined.items() if v.dtype.kind == "f"}
     clip = np.repeat(np.arange(len(names), dtype=np.uint8), [len(pixels[n]["fluid"]) for n in names])
     np.savez_compressed(path, names=np.array(names), clip=clip, **joined)
 
@@ -228,17 +254,19 @@ def main() -> None:
     parser.add_argument("--only", nargs="*", help="names of subjects")
     parser.add_argument("--overlays", type=Path, help="folder for pictures")
     parser.add_argument("--pixels", type=Path, help="file for a sample of pixels, which masks_fit.py reads")
+    parser.add_argument("--water", type=Path, help="file for a sample of pixels, which open_water_fit.py reads")
     parser.add_argument("--dry", action="store_true", help="write no results")
     args = parser.parse_args()
     args.work.mkdir(parents=True, exist_ok=True)
-    records, sure, ious, pixels = [], [], [], {}
+    records, sure, ious, pixels, water = [], [], [], {}, {}
     for subject in subjects(default_shared(), args.work, args.labels):
         if args.only and subject.name.removeprefix("clip ") not in args.only:
             continue
         ready = prepared(subject, args.work)
         began = time.process_time()
         try:
-            found = segment(ready.clip, ready.flow)
+            with NO_WATER if args.water is not None else nullcontext():
+                found = segment(ready.clip, ready.flow)
         except Exception as error:  # a clip that is refused counts as one without a mask
             print(subject.name, error, flush=True)
             continue
@@ -250,6 +278,8 @@ def main() -> None:
         records.append({"subject": subject.name, "figure": "time", "value": round(seconds, 1)})
         if args.pixels is not None:
             pixels[subject.name] = sampled_pixels(ready, found)
+        if args.water is not None and (some := water_pixels(ready, found)) is not None:
+            water[subject.name] = some
         if args.overlays is not None:
             args.overlays.mkdir(parents=True, exist_ok=True)
             t = list(ready.truth)[len(ready.truth) // 2]
@@ -263,6 +293,8 @@ def main() -> None:
             print(f"  {100 * share:4.1f} % of the pixels: chance {chance / share:.2f}, right {right / share:.2f}")
     if args.pixels is not None:
         write_pixels(args.pixels, pixels)
+    if args.water is not None:
+        write_pixels(args.water, water)
     if not args.dry:
         records.append({"subject": "all", "figure": "calibration error", "value": round(off, 3)})
         put("masks", records, date=time.strftime("%Y-%m-%d"), machine=f"{platform.machine()}, {platform.system()}")

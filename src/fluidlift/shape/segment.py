@@ -25,6 +25,7 @@ from fluidlift.shape.frame_pictures import typical_picture
 from fluidlift.shape.hints import VOICE, Clicks, Point, clicks_at, heed, holes_asked_for
 from fluidlift.shape.islands import without_ground
 from fluidlift.shape.moving_solids import SharedPairs, moving_solids
+from fluidlift.shape.open_water import with_open_water
 from fluidlift.shape.presence import Presence, always, grows, stay, watch
 from fluidlift.shape.region import clean_region, cut_along_edges, solids_in, still_pixels
 from fluidlift.shape.washed import bare_over_time, washed_ground
@@ -134,7 +135,7 @@ def segment(
         barred = (solids | solids_by_flow(evidence)) & (told <= 0.0)
         found = advancing_labels(evidence, score, presence, np.where(barred, -12.0, told))
     else:
-        found = staying_labels(evidence, score, presence, grown, small_inside, clicks, clip.interval)
+        found = staying_labels(evidence, score, presence, grown, small_inside, clicks, clip.interval, solids)
     tell(0.5, "labels")
     writer = LabelWriter((frames, height, width), out)
     share = write_labels(found, writer, small_inside, tell)
@@ -143,7 +144,7 @@ def segment(
 
 def staying_labels(
     evidence: Evidence, score: np.ndarray, presence: Presence, grown: np.ndarray | None, inside: np.ndarray,
-    clicks: Clicks, interval: float,
+    clicks: Clicks, interval: float, solids: np.ndarray,
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:  # fmt: skip
     """Labels and confidence of every frame of a fluid that stays in its bed.
 
@@ -155,6 +156,7 @@ def staying_labels(
         inside: bool [h,w], where fluid is looked for.
         clicks: what a person said of some pixels.
         interval: s between two frames.
+        solids: bool [h,w], what moves and is no fluid.
     """
     region = lasting_region(evidence, score, inside) if grown is None else clean_region(grown)
     rocks = asked = held = np.zeros_like(region)
@@ -163,6 +165,7 @@ def staying_labels(
         region = without_plants(evidence, score, region, interval)
         washed = washed_ground(evidence, region)
         region, rocks = without_ground(evidence, region)
+        region = with_open_water(evidence, region, rocks | solids | ~inside)
     if clicks:
         before = region
         region, told = heed(clicks, evidence, score, region)

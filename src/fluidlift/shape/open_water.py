@@ -190,4 +190,4 @@ def large_pieces(added: np.ndarray) -> np.ndarray:
     parts, stats = cv2.connectedComponentsWithStats(thick, connectivity=4)[1:3]
     large = stats[:, cv2.CC_STAT_AREA] >= SMALLEST * added.size
     large[0] = False
-    return large[parts]
+    return large[np.asarray(parts, int)]

@@ -20,6 +20,15 @@ from fluidlift.errors import InputRejected
 from fluidlift.progress import PlainProgress, shown_progress
 
 
+@pytest.fixture(autouse=True)
+def interruptible():
+    """Ctrl-C does what it does at a terminal, in this process and in what it starts: jobs of a shell in the background
+    begin with SIGINT ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 @pytest.fixture
 def broken(monkeypatch, tmp_path):
     """The command `doctor`, which raises what it is told to in the middle of a stage."""

@@ -162,10 +162,12 @@ def staying_labels(
     rocks = asked = held = np.zeros_like(region)
     washed = None
     if grown is None:
+        first = region
         region = without_plants(evidence, score, region, interval)
         washed = washed_ground(evidence, region)
         region, rocks = without_ground(evidence, region)
-        region = with_open_water(evidence, region, rocks | solids | ~inside)
+        taken = first & ~region  # plants and washed ground wander, too, and were told from water already
+        region = with_open_water(evidence, region, rocks | solids | taken | ~inside)
     if clicks:
         before = region
         region, told = heed(clicks, evidence, score, region)

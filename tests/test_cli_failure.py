@@ -19,6 +19,8 @@ from fluidlift.cli import FAILED, TERMINATED, main
 from fluidlift.errors import InputRejected
 from fluidlift.progress import PlainProgress, shown_progress
 
+SIGNALS = pytest.mark.skipif(sys.platform == "win32", reason="has no such signals")
+
 
 @pytest.fixture(autouse=True)
 def interruptible():
@@ -85,7 +87,7 @@ def test_a_refusal_is_still_a_refusal(broken, capsys):
     assert capsys.readouterr().err.splitlines()[-1] == "fluidlift: this. Needed: that."
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="has no such signals")
+@SIGNALS
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
 def test_a_scheduler_ends_a_run_as_a_person_does(tmp_path, sent):
     write_clip(tmp_path / "a.mp4", np.random.default_rng(0).integers(0, 255, (30, 96, 128, 3)).astype(np.uint8))
@@ -106,7 +108,7 @@ def test_a_scheduler_ends_a_run_as_a_person_does(tmp_path, sent):
     assert not list(Path(tmp_path).rglob("*.part*"))
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="has no such signals")
+@SIGNALS
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupt_that_a_library_swallows_ends_the_run_at_its_next_step(sent):
     progress = PlainProgress()
@@ -122,7 +124,7 @@ def test_an_interrupt_that_a_library_swallows_ends_the_run_at_its_next_step(sent
     assert signal.getsignal(signal.SIGINT) == signal.default_int_handler
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="has no such signals")
+@SIGNALS
 def test_an_interrupt_within_code_given_as_text_leaves_the_exit_code_alone(tmp_path):
     (tmp_path / "run.py").write_text("""
 import signal, sys

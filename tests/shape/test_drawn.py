@@ -1,13 +1,16 @@
 """What a person drew: pixels of it, carried by the flow, and what a horizon, a rim and a ruler say."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from fluidlift.errors import InputRejected
-from fluidlift.shape.composite import LEVEL_SAID, Parts, level_prior, with_marks
+from fluidlift.shape.composite import LEVEL_SAID, Parts, level_prior, unused_marks, with_marks
 from fluidlift.shape.drawn import LABELS, carried, drawn_pixels, frame_at
 from fluidlift.shape.kind import level_camera
 from fluidlift.shape.registration import ruler_scale
+from fluidlift.shape.surface import FrontSurface
 from fluidlift.shape.view import drawn_rim, horizon_line, sky_of, tilt_of_horizon
 from fluidlift.shape.view.roundness import roundness_evidence
 from fluidlift.types import Label, PinholeCamera, UpEvidence
@@ -101,5 +104,8 @@ def test_marked_ledges_and_pools_belong_to_the_parts_of_a_stream():
     still = np.zeros((40, 60, 2))
     assert level_prior(parts, still, np.ones((40, 60))) == LEVEL_SAID
     assert with_marks(Parts((), mask), None, mask) == Parts((), mask)
+    front = FrontSurface(np.ones((40, 60), np.float32), np.zeros((40, 60), np.float32), None)
+    assert [w.code for w in unused_marks(parts, front)] == ["ledge-not-used"]
+    assert unused_marks(parts, replace(front, chutes=(mask,))) == [] == unused_marks(Parts((), mask), front)
     assert level_prior(Parts((), mask), still, np.ones((40, 60))) < LEVEL_SAID
     assert all(LABELS[word] == Label.FLUID for word in ("ledge", "pool"))

@@ -133,7 +133,7 @@ def sighted(
     seen, pictures = _seen(read, flow, fluid, given, config, work)
     parts, mask = seen.parts, seen.mask
     up, canonical, front, known_scale, seen_depth = _surface(seen, pictures, fluid, given, clip.interval)
-    warnings = framing_warnings(mask, fluid.areas()) + up.warnings
+    warnings = framing_warnings(mask, fluid.areas()) + up.warnings + composite.unused_marks(parts, front)
     if c.kind == "auto":
         warnings += kinds.doubts(seen.evidence)
     front, falling = composite.standing(front, parts, canonical, mask)

@@ -110,6 +110,19 @@ def with_marks(parts: Parts, drawn: DrawnView | None, mask: Bool[np.ndarray, "h 
     return replace(parts, ledges=ledges if ledges.any() else None, level=drawn.level)
 
 
+def unused_marks(parts: Parts, front: FrontSurface) -> list[Notice]:
+    """What to say of marked ledges of which the surface holds none."""
+    if parts.ledges is None or front.chutes:
+        return []
+    return [
+        Notice(
+            "ledge-not-used",
+            "the marked ledge is not part of the shape: it is too small, or the fluid is no stream that runs on below "
+            "it; mark all of what falls, or give --kind stream",
+        )
+    ]
+
+
 @dataclass(frozen=True)
 class Composite:
     """The jets in space."""

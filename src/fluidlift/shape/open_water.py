@@ -155,7 +155,7 @@ def with_open_water(evidence: Evidence, region: np.ndarray, barred: np.ndarray) 
     Args:
         evidence: of the clip.
         region: bool [h,w], the fluid's outline.
-        barred: bool [h,w], what is no fluid in any case: rocks, hands.
+        barred: bool [h,w], what is no fluid in any case: rocks, hands, plants.
     """
     if region.mean() < WIDE:
         return region

@@ -134,7 +134,8 @@ STREAM = FluidKind(
     recognised=True,
 )  # fmt: skip
 """rivers, brooks, puddles. Pitch over a landscape, by horizon or far shore of 14 real clips (read by hand, one of
-them surveyed): 2 to 29, mean 10, deviation 9; 8 of 22 clips look down"""
+them surveyed): 2 to 29, mean 10, deviation 9; 8 of 22 clips look down. Over landscapes 12 real ones are, by eye, 8 to
+300 m across, six falls 3 to 300: 10 m was tried (a torrent's current and level gain by it), and errs less than 1"""
 FALL = FluidKind(
     "fall", pitch_prior=(8.0, 8.0), kinematic_viscosity=1e-5, wall_damping=0.05, wall_layer=0.75,
     is_channel_flow=True, depth_ratio=0.1, energy_share=0.35, sizes=(10.0, 1.0), recognised=True,

@@ -129,3 +129,21 @@ def test_a_jump_of_depth_is_seen_from_both_sides_and_not_across_the_rim_of_the_m
     assert (jump[:, 3:5] == 0.5).all() and not jump[:, [0, 1, 2, 5, 6, 7]].any()  # a metre over the nearer two
     mask[:, 4:] = False
     assert not depth_jump(depth, mask).any()
+
+
+@pytest.mark.parametrize("faint", [1e-6, 1e-9, 1e-15])
+def test_a_piece_that_is_hardly_known_takes_the_mean_of_what_it_is_given(faint: float) -> None:
+    rng = np.random.default_rng(0)
+    river, pond = np.zeros((2, 60, 80), bool)
+    river[:, :60], pond[20:32, 65:74] = True, True
+    weight = rng.uniform(0.0, 1.0, river.shape) * (river + faint * pond)
+    values = rng.normal(0.0, 5.0, (60, 80, 2))
+    angle = rng.uniform(0.0, 0.3, river.shape)
+    n = np.dstack([np.cos(angle), np.sin(angle)])
+    filled, reached, report = diffusion_interpolation(values, weight, river | pond, n, anisotropy=4.0)
+    assert (reached == river | pond).all() and report.converged
+    mean = (weight[..., None] * values)[pond].sum(axis=0) / weight[pond].sum()
+    # the least weight that counts, 1e-5 a pixel, moves it by that times 12 px squared times the values, 0.01
+    assert np.abs(filled[pond] - mean).max() < 0.02
+    alone, _, _ = diffusion_interpolation(values, weight * river, river, n, anisotropy=4.0)
+    np.testing.assert_allclose(filled[river], alone[river], atol=0.02)

@@ -24,6 +24,18 @@ ALONG_ROWS = 9.0
 _WET = (CellType.FLUID, CellType.INFLOW)
 
 
+MIXED = 2
+"""px around the fluid whose colours lens and coding mix with it"""
+
+SHORE = 5
+"""px inside wide fluid in which the plate goes over from the clip's picture to what is inpainted: less than what the
+outermost splats, 2 to 3 px wide, leave uncovered, and the blur of the blend. Begun outside, the shore shows a line of
+inpainted ground along all of its length"""
+
+WIDE = 3 * SHORE
+"""px from the rim, at least, in the middle of wide fluid. A thread or a jet would stay in the plate as a whole"""
+
+
 @dataclass(frozen=True)
 class BackgroundPlate:
     """The scene without its fluid."""
@@ -32,6 +44,8 @@ class BackgroundPlate:
     """sRGB, inpainted where no frame shows the background"""
     seen: Bool[np.ndarray, "h w"]
     """True where some frame shows the background"""
+    kept: Bool[np.ndarray, "h w"]
+    """True where the picture is the clip's: what is seen, and the rim of wide fluid"""
 
 
 def background_plate(
@@ -41,26 +55,38 @@ def background_plate(
 ) -> BackgroundPlate:
     """Median of the frames where they show no fluid; the rest inpainted from the ground around it.
 
+    Along the rim of wide fluid the median of all frames stays: the splats that cover it end about there.
+
     Args:
         frames: sRGB.
         fluid: per frame.
         solid: still things in the fluid: they stay in the picture, but the bed beside them is not painted with them.
     """
     pick = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), 25)).astype(int))
-    wet = np.stack([ndimage.binary_dilation(fluid[t], iterations=2) for t in pick])
+    covered = np.stack([fluid[t] for t in pick])
+    wet = np.stack([ndimage.binary_dilation(c, iterations=MIXED) for c in covered])
     if solid is not None:
         wet &= ~solid
     seen = ~np.all(wet, axis=0)
+    median = np.median(frames[pick], axis=0).astype(np.uint8)
     if not seen.any():
-        return BackgroundPlate(np.median(frames[pick], axis=0).astype(np.uint8), seen)
+        return BackgroundPlate(median, seen, seen)
     values = np.ma.masked_array(frames[pick], mask=np.repeat(wet[..., None], 3, axis=-1))
     image = np.clip(np.ma.median(values, axis=0).filled(0), 0, 255).astype(np.uint8)
     ground = seen if solid is None else seen & ~ndimage.binary_dilation(solid, iterations=3)
+    kept = seen | _rim_of_wide_fluid(np.all(covered, axis=0))
     if ground.any() and not seen.all():
         painted = _inpainted(image, ~ground)
-        blend = weight_of_unseen(seen)[..., None]
-        image = (image * (1 - blend) + painted * blend).astype(np.uint8)
-    return BackgroundPlate(image, seen)
+        blend = weight_of_unseen(kept)[..., None]
+        image = (np.where(seen[..., None], image, median) * (1 - blend) + painted * blend).astype(np.uint8)
+    return BackgroundPlate(image, seen, kept)
+
+
+def _rim_of_wide_fluid(fluid: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Pixels within `SHORE` inside, and `MIXED` outside, the outline of fluid that is `WIDE`."""
+    inside = ndimage.distance_transform_edt(np.pad(fluid, 1, mode="edge"))[1:-1, 1:-1]
+    wide = ndimage.distance_transform_edt(inside < WIDE) <= WIDE + MIXED
+    return wide & (inside <= SHORE)
 
 
 def _inpainted(image: np.ndarray, hole: np.ndarray) -> np.ndarray:

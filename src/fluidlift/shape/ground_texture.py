@@ -127,18 +127,18 @@ def textured(
 
 def over_bed(
     plate: UInt8[np.ndarray, "h w 3"],
-    seen: Bool[np.ndarray, "h w"],
+    kept: Bool[np.ndarray, "h w"],
     mesh: TriangleMesh,
     camera: PinholeCamera,
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """The scene without its fluid, with the textured ground where no frame shows what is behind the fluid.
+    """The scene without its fluid, with the textured ground where it is not the clip's own picture.
 
     Only ground that lies: a map from above has few texels on a wall, and the wall behind water that stands before the
     open sky is none. What the rim of the hole shows goes on there.
 
     Args:
         plate: sRGB.
-        seen: pixels of it that some frame shows.
+        kept: pixels of it that are the clip's.
         mesh: of the ground, as `textured` gives it.
         camera: of the plate, in the world.
     """
@@ -148,7 +148,7 @@ def over_bed(
         return plate
     uv = (mesh.uv[found.face] * found.barycentric[..., None]).sum(axis=-2)
     ground = 255.0 * sample_texture(mesh.texture, uv)
-    weight = (weight_of_unseen(seen) * drawn * (1.0 - _standing(mesh, found.face)))[..., None]
+    weight = (weight_of_unseen(kept) * drawn * (1.0 - _standing(mesh, found.face)))[..., None]
     return np.clip(np.round(plate * (1.0 - weight) + ground * weight), 0, 255).astype(np.uint8)
 
 

@@ -117,7 +117,7 @@ def _coloured(
         labels = ground.seen_labels(fluid, seen.start, seen.united, falls)
         view = ground_texture.View(picture, camera, labels, np.asarray(plate.seen))
         setting = ground.textured(setting, view)
-        picture = ground_texture.over_bed(picture, view.seen, setting.terrain.mesh, camera)
+        picture = ground_texture.over_bed(picture, plate.kept, setting.terrain.mesh, camera)
     setting = ground.finished(setting, picture, camera)
     if fluid.hidden is not None:  # what stands before the fluid is on no ground, but in the picture without the fluid
         typical = typical_picture(clip.frames, most=8).astype(np.uint8)

@@ -61,6 +61,15 @@ def test_what_ground_hides_from_the_camera_may_be_wet():
     assert dry[14, 8, 11], "above it"
 
 
+def test_nothing_comes_twice_as_near_as_the_nearest_fluid():
+    camera = PinholeCamera.looking(np.array([-1.2, 0.0, 0.6]), np.array([0.0, 0.0, 0.5]), 60.0, (300, 240))
+    types = types_of(flat())
+    types[15:, :, 1:3] = CellType.FLUID  # from x = 0.5 on: 1.7 m away
+    dry = dry_cells(flat(), camera, np.ones((240, 300), bool), types)
+    assert dry[4, 8, 5] and not dry[11, 8, 5], "0.65 and 1.35 m away"
+    assert not dry[types == CellType.FLUID].any()
+
+
 def test_a_picture_full_of_fluid_or_without_any_says_nothing():
     terrain, camera = flat(), camera_above()
     for wet in (np.ones((240, 300), bool), np.zeros((240, 300), bool)):

@@ -227,19 +227,6 @@ def test_a_sampled_height_goes_through_its_samples():
     np.testing.assert_allclose(SampledHeight(xyz).height(xyz[:, :2]), xyz[:, 2], atol=1e-3)
 
 
-def test_the_volume_of_a_round_silhouette_is_that_of_a_ball():
-    from fluidlift.shape.surface import rounded_volume
-
-    camera = PinholeCamera.from_fov(30, (160, 160))
-    level = kinds_level(camera)
-    grid = level.pixel_grid() - np.array(level.center)
-    radius_px = 30.0
-    mask = (grid**2).sum(-1) < radius_px**2
-    radius = radius_px / level.focal[0] * 2.0  # at a distance of 2
-    # pixels, the smoothing of the thickness and the growth of depth over the ball: 10 %
-    assert rounded_volume(level, mask, 2.0) == pytest.approx(4 / 3 * np.pi * radius**3, rel=0.1)
-
-
 def kinds_level(camera):
     from fluidlift.shape.kind import level_camera
 

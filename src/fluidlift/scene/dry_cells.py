@@ -3,7 +3,8 @@
 A mask says more than where the fluid is: whatever stands seen above dry ground, or before it, would have been filmed.
 Water that gets there in a simulation has left what was filmed (over a bank that is lower than the true one, or past
 what stands before it), and is taken out as at an outlet. What is hidden, beside the picture or within a cell of the
-filmed fluid is left alone.
+filmed fluid is left alone. So is nothing that comes much nearer to the camera than the fluid at rest: it would stand
+before the whole picture.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ from fluidlift.types import CellType, PinholeCamera, Terrain
 
 MARGIN = 1.0
 """cells from the filmed fluid, as the camera sees them: a simulated rim lies somewhere in a cell"""
+NEARER = 0.5
+"""of the depth of the nearest fluid at rest: what comes nearer looks twice as large as anything that was filmed"""
 STEP = 0.5
 """cells between two looks for ground on the way to the camera"""
 
@@ -37,12 +40,18 @@ def dry_cells(
     grid = terrain.grid
     require(wet.shape == camera.size[::-1], f"a mask {wet.shape}", f"{camera.size[::-1]}")
     dry = np.zeros(grid.shape, bool)
-    if not wet.any() or wet.all():
+    if not wet.any():
         return dry
     cells = np.argwhere(cell_types != CellType.SOLID)
     centres = grid.low + (cells + 0.5) * grid.spacing
     uv, depth = camera.project(centres)
     seen = (depth > 0) & ((uv >= 0) & (uv < np.array(camera.size))).all(axis=1)
+    fluid = seen & np.isin(cell_types[tuple(cells.T)], (CellType.FLUID, CellType.INFLOW))
+    if fluid.any():
+        near = seen & (depth < NEARER * np.percentile(depth[fluid], 1.0))
+        dry[tuple(cells[near].T)] = True
+    if wet.all():
+        return dry
     column, row = np.where(seen, uv.T, 0.0).astype(int)
     away = np.asarray(ndimage.distance_transform_edt(~wet))[row, column] * depth / camera.focal[0]
     beside = np.flatnonzero(seen & (away > MARGIN * grid.spacing))

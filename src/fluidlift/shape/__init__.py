@@ -13,6 +13,8 @@ Modules of the face:
     external_body     A body from elsewhere: Gaussians that another generator made, seen by a known camera
     fill              Fills a hollow body with Gaussians by the parity of random rays (paper: filling before the
                       simulation)
+    filled_vessel     The vessel that a pour fills: a solid of revolution about a vertical axis, from the silhouette
+                      of what it holds
     frame_pictures    Small steady pictures of a clip of any length: a bounded sample kept, the other frames made
                       when asked for
     framing           Where the fluid lies in the picture and in time: what a mask can say against itself before a
@@ -63,6 +65,7 @@ __all__ = [
     "evidence",
     "external_body",
     "fill",
+    "filled_vessel",
     "frame_pictures",
     "framing",
     "generate",

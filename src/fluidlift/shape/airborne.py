@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from fluidlift.errors import require
+from fluidlift.shape.filled_vessel import FilledVessel
 from fluidlift.shape.jet_column import Jet
 from fluidlift.shape.kinds import AirborneBuilder, builder_of
 from fluidlift.shape.terrain import at_cells, terrain_mesh, unit
@@ -17,6 +18,8 @@ from fluidlift.types import CellType, FluidKind, Grid, PinholeCamera, Setting, T
 PASSING = 0.25
 """speed along the stream at one of its ends over that of its swift part (90th percentile), above which fluid enters or
 leaves there. On the cases at hand dead ends have 0.1 to 0.2 of it, live ones 0.4 and more"""
+WALL = 2.4
+"""cells that the wall of a vessel is thick: less lets the pressure of what it holds through at some cells' corners"""
 AT_THE_END = 0.25
 """share of the length of the lying part within which a jet stands at its upstream end: what moves there spreads from
 it"""
@@ -33,8 +36,9 @@ def airborne_setting(
     kind: str | FluidKind,
     longest: int,
     cell_limit: int,
+    vessel: FilledVessel | None = None,
 ) -> Setting:
-    """A jet or a plume: free in the air above a floor; a jet that ends in a wider pool gets a vessel to hold it.
+    """A jet or a plume: free in the air above a floor, and the vessel in which its lower part stands.
 
     Args:
         front: camera depth of the near side, m.
@@ -46,6 +50,7 @@ def airborne_setting(
         kind: of the fluid, which is in the air.
         longest: cells along the longest side.
         cell_limit: most cells of the grid.
+        vessel: in the world, m; it stands on the floor.
 
     Raises:
         ValueError: a kind that is not in the air.
@@ -53,6 +58,8 @@ def airborne_setting(
     require(kind_of(kind).airborne, f"the kind '{kind}'", "a fluid in the air")
     builder = cast(AirborneBuilder, builder_of(kind))
     low, high = np.percentile(body, 0.2, axis=0), np.percentile(body, 99.8, axis=0)
+    if vessel is not None:  # what is seen lowest is its near side
+        low[2] = vessel.floor
     extent = high - low
     spacing = extent.max() / longest
     for _ in range(80):
@@ -67,16 +74,14 @@ def airborne_setting(
         spacing *= 1.05
     h = grid.spacing
     nodes, centers = grid.nodes(), grid.centers()
-    phi = nodes[..., 2] - low[2] + 0.5 * h
-    vessel = builder.vessel(body)
+    floor = low[2] if vessel is not None else low[2] - 0.5 * h
+    phi = nodes[..., 2] - floor
+    body_cells = inside_body(centers.reshape(-1, 3), front, back, mask, camera).reshape(grid.shape)
     if vessel is not None:
-        (cx, cy), radius, level = vessel
-        rim = level + 0.5 * (level - low[2])
-        r = np.hypot(nodes[..., 0] - cx, nodes[..., 1] - cy)
-        wall = np.maximum(np.abs(r - (radius + 1.5 * h)) - 1.2 * h, nodes[..., 2] - rim)
-        phi = np.minimum(phi, wall)
+        phi = np.minimum(phi, vessel.wall(nodes, WALL * h))
+        body_cells |= vessel.holds(centers)
     solid = at_cells(phi) < 0
-    fluid = inside_body(centers.reshape(-1, 3), front, back, mask, camera).reshape(grid.shape) & ~solid
+    fluid = body_cells & ~solid
     cells = np.full(grid.shape, CellType.EMPTY, np.uint8)
     cells[solid] = CellType.SOLID
     cells[fluid] = CellType.FLUID
@@ -84,8 +89,8 @@ def airborne_setting(
         cells[builder.inlet(fluid, centers[..., 2], h)] = CellType.INFLOW
     cells[builder.outlet(grid.shape) & ~solid] = CellType.OUTFLOW
     terrain = Terrain(grid, phi.astype(np.float32), unit(mainstream), terrain_mesh(grid, phi))
-    bed = np.full(grid.shape[:2], low[2] - 0.5 * h)
-    return Setting(terrain, cells, None, bed, None if vessel is None else vessel[2])
+    bed = np.full(grid.shape[:2], floor)
+    return Setting(terrain, cells, None, bed, None if vessel is None else vessel.level)
 
 
 def inside_body(

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from fluidlift.shape import airborne, channel, generate, ground_mesh, ground_texture, plan, registration
+from fluidlift.shape.filled_vessel import seen_higher
 from fluidlift.shape.jets import lying_pixels
 from fluidlift.types import Label, PinholeCamera, Setting, kind_of
 from fluidlift.types.fluid_masks import parts_of
@@ -32,10 +33,12 @@ def setting_around(
     later = fluid.any_frame()
     middle = np.median((depth + half)[visible])
     reach = camera.unproject(grid[later], np.full(int(later.sum()), middle))
+    vessel = front.vessel
     return airborne.airborne_setting(
         depth, back, visible, camera, np.concatenate([near, far, reach]), bulk,
         # smoke needs the whole box, and is cheap per cell: no free surface, few particles
         kind=kind, longest=c.cells, cell_limit=c.cell_limit * (2 if kind_of(kind).is_gas else 1),
+        vessel=None if vessel is None else seen_higher(vessel.transformed(to_world), camera, later),
     )  # fmt: skip
 
 

@@ -15,10 +15,10 @@ from scipy import ndimage
 from fluidlift.errors import InputRejected, require
 from fluidlift.shape import chute, sections, slope
 from fluidlift.shape.energy_line import Channel, energy_profile
+from fluidlift.shape.filled_vessel import FilledVessel
 from fluidlift.shape.heights import FOOT, HeightModel, PlaneHeight, ProfileAlongHeight, ProfileHeight, SampledHeight
 from fluidlift.shape.plume import SIGHT, section_half_thickness
 from fluidlift.types import FluidKind, PinholeCamera, SlopeEvidence, kind_of
-from fluidlift.types.kind import POUR
 
 FAR = 12.0
 """no part of a surface is taken to be further away than this many times the nearest part"""
@@ -40,6 +40,8 @@ class FrontSurface:
     """whether it is seen within instead of at its surface"""
     chutes: tuple[Bool[np.ndarray, "h w"], ...] = ()
     """pixels of each chute that comes down onto it"""
+    vessel: FilledVessel | None = None
+    """that holds its lower part"""
 
     @property
     def sighted(self) -> Float[np.ndarray, "h w"]:
@@ -358,15 +360,6 @@ def _half_thickness(mask: np.ndarray) -> np.ndarray:
     radius = np.maximum(ndimage.gaussian_filter(distance[tuple(index)], 3.0), distance)
     thickness = np.sqrt(np.maximum(2 * radius * distance - distance**2, 0.0))
     return ndimage.gaussian_filter(thickness, 1.5) * mask
-
-
-def rounded_volume(
-    camera: PinholeCamera, mask: Bool[np.ndarray, "h w"], distance: float, kind: str | FluidKind = POUR
-) -> float:
-    """Volume (cube of the unit of `distance`) of the body inflated from a silhouette whose middle is that far away."""
-    front = inflated_surface(camera, mask, kind)
-    pixel = (front.depth + front.half_thickness) / camera.focal[0]
-    return float((2.0 * front.half_thickness * pixel**2)[mask].sum()) * distance**3
 
 
 def given_surface(

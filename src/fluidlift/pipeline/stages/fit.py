@@ -168,22 +168,25 @@ def prior_widths(kind: FluidKind) -> dict[str, float]:
 
 
 def filling_rate(read: Read, masks: FluidMasks, geometry: Geometry) -> float | None:
-    """Volume (m^3/s) that a vessel gains over the clip, from its rounded silhouette; None where nothing fills.
+    """Volume (m^3/s) that a vessel gains over the clip, from the level in it; None where nothing fills.
 
     What a jet brings is seen better in the vessel than in the jet, whose speed is a blur and whose mask is too wide.
     """
-    from fluidlift.shape.surface import rounded_volume
+    from fluidlift.shape.filled_vessel import distance_ahead, filled_volume, find_vessel, seen_higher
 
     if not kind_of(geometry.kind).fills_vessel or geometry.setting.pool_level is None:
         return None
-    clip, depth = read.clip, geometry.depth
-    distance = float(np.median(depth[depth > 0]))
+    clip, camera, mask = read.clip, geometry.camera, geometry.mask
+    vessel = find_vessel(camera, mask, distance_ahead(camera, mask, geometry.depth + geometry.half_thickness))
+    if vessel is None:
+        return None
+    vessel = seen_higher(vessel, camera, masks.any_frame())
     times, volumes = [], []
     for t in np.unique(np.linspace(geometry.rest_frame, len(clip) - 1, 8).astype(int)):
-        if not masks[t].any():
-            continue
-        volumes.append(rounded_volume(geometry.camera, masks[t], distance))
-        times.append(float(clip.times[t]))
+        volume = filled_volume(vessel, camera, masks[t]) if masks[t].any() else None
+        if volume is not None:
+            volumes.append(volume)
+            times.append(float(clip.times[t]))
     if len(times) < 4:
         return None
     rate = float(np.polyfit(times, volumes, 1)[0])

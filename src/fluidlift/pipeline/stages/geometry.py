@@ -52,7 +52,12 @@ def geometry(
     falls, trust, seen_depth = falling.pixels[visible], seen.trust[visible], s.seen_depth
     hidden = _hidden(seen, segmentation)
     fluid = FluidMasks(segmentation.labels.labels, hidden)
-    mainstream = mainstream_of(kind, velocities[~falls], trust[~falls]) if seen.stood is None else seen.stood.direction
+    if front.vessel is not None:
+        mainstream = np.array(front.vessel.inflow)
+    elif seen.stood is not None:
+        mainstream = seen.stood.direction
+    else:
+        mainstream = mainstream_of(kind, velocities[~falls], trust[~falls])
     eye = seen.known.position if seen.pose_given else None
     to_world, camera = registration.place(
         canonical, points, scale.value, heading=seen.heading, eye=eye, mainstream=mainstream

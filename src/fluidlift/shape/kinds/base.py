@@ -67,7 +67,7 @@ class BodyBuilder(Protocol):
         ...
 
     def mainstream(self, bulk: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-        """Direction of the bulk flow (of any length), from the mean of the surface velocities."""
+        """Direction of the bulk flow (of any length), canonical, from the mean of the surface velocities."""
         ...
 
 
@@ -78,10 +78,6 @@ class AirborneBuilder(BodyBuilder, Protocol):
     """free space beside the body, of its larger width"""
     above: float
     """free space above it, of its height"""
-
-    def vessel(self, body: Float[np.ndarray, "n 3"]) -> tuple[tuple[float, float], float, float] | None:
-        """Axis, radius and filling height (m) of what holds its lower part; None: it stands in nothing."""
-        ...
 
     def inlet(
         self, fluid: Bool[np.ndarray, "nx ny nz"], z: Float[np.ndarray, "nx ny nz"], spacing: float

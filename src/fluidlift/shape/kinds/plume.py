@@ -21,9 +21,6 @@ class _Plume:
         bulk = bulk / max(np.linalg.norm(bulk), 1e-12)
         return np.array([bulk[0], bulk[1], max(bulk[2], 1.0)])
 
-    def vessel(self, body):
-        return None
-
     def inlet(self, fluid, z, spacing):
         return fluid & (z < z[fluid].min() + 3.0 * spacing)
 

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from fluidlift.shape import depth_surface, surface
+from fluidlift.shape.filled_vessel import distance_ahead, find_vessel, pool_depths
+from fluidlift.shape.surface import FrontSurface
 from fluidlift.types.kind import POUR
 
 
@@ -12,33 +16,16 @@ class _Pour:
     side, above = 0.35, 0.1
 
     def front_surface(self, seen):
-        return surface.inflated_surface(seen.camera, seen.mask, POUR, seen.roll)
+        return _with_pool(surface.inflated_surface(seen.camera, seen.mask, POUR, seen.roll), seen.camera, seen.mask)
 
     def depth_surface(self, scene, seen, slopes, usual):
-        return depth_surface.airborne_surface(scene, seen.camera, seen.mask, POUR), None
+        front = depth_surface.airborne_surface(scene, seen.camera, seen.mask, POUR)
+        return _with_pool(front, seen.camera, seen.mask), None
 
     def mainstream(self, bulk):
+        """Down, with the lean that is seen: how fast it comes nearer is read from a surface that was made round."""
         bulk = bulk / max(np.linalg.norm(bulk), 1e-12)
-        return np.array([bulk[0], bulk[1], -max(-bulk[2], 1.0)])
-
-    def vessel(self, body):
-        """A container around the lower part of a body, if that is much wider than the upper part and holds its width (a
-        pool that a jet falls into)."""
-        z = body[:, 2]
-        edges = np.linspace(z.min(), z.max(), 13)
-        widths = np.zeros(12)
-        for i in range(12):
-            layer = (z >= edges[i]) & (z <= edges[i + 1])
-            if layer.sum() > 5:
-                widths[i] = np.ptp(np.percentile(body[layer, 0], [2, 98]))
-        widest = np.percentile(widths, 90)
-        wide = widths > 0.6 * widest
-        first_narrow = int(np.argmin(wide)) if not wide.all() else 12
-        if first_narrow < 2 or first_narrow > 10 or np.median(widths[first_narrow:]) > 0.55 * widest:
-            return None
-        pool = body[z <= edges[first_narrow]]
-        centre = 0.5 * (np.percentile(pool[:, :2], 2, axis=0) + np.percentile(pool[:, :2], 98, axis=0))
-        return (float(centre[0]), float(centre[1])), 0.5 * float(widest), float(edges[first_narrow])
+        return np.array([bulk[0], 0.0, -max(-bulk[2], 1.0)])
 
     def inlet(self, fluid, z, spacing):
         return fluid & (z > z[fluid].max() - 2.0 * spacing)
@@ -49,6 +36,17 @@ class _Pour:
         sides[2:-2, 2:-2] = False
         sides[:, :, -2:] = False
         return sides
+
+
+def _with_pool(front: FrontSurface, camera, mask) -> FrontSurface:
+    """The surface of a pour, with what stands in a vessel below its jet as a solid of revolution."""
+    vessel = find_vessel(camera, mask, distance_ahead(camera, mask, front.depth + front.half_thickness))
+    if vessel is None:
+        return front
+    near, far = pool_depths(camera, mask, vessel)
+    held = np.isfinite(near)
+    depth, half = np.where(held, near, front.depth), np.where(held, 0.5 * (far - near), front.half_thickness)
+    return replace(front, depth=depth.astype(np.float32), half_thickness=half.astype(np.float32), vessel=vessel)
 
 
 BUILDER = _Pour()

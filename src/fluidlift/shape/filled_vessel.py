@@ -1,0 +1,316 @@
+"""The vessel that a pour fills: a solid of revolution about a vertical axis, from the silhouette of what it holds.
+
+Of a circle at height z and distance d from the eye the silhouette shows the half width r / sqrt(1 - (r/d)^2) in the
+vertical plane through the axis; its nearest point, at d - r, appears there at z d / (d - r) from the level of the eye.
+So floor and level follow from the lowest and highest rows of the silhouette, and the radius from the rows between.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import ndimage
+
+from fluidlift.errors import require
+from fluidlift.types import PinholeCamera, Similarity3, triple
+
+NARROW = 0.55
+"""of the widest row, at most: the jet that falls in. A jet that fills half of its glass is rare, and a body that is as
+wide above as below is none that stands in a vessel"""
+WIDER = 1.5
+"""of the jet's median width, from which a row shows more than the jet"""
+FOOT = 0.2
+"""of the widest row, at least: the vessel. A narrower part below is a stem or a reflection on the table"""
+PARTS = (1.0 / 6.0, 5.0 / 6.0)
+"""of the silhouette's height that the pool takes, at least and at most: less is a rim of drops, more leaves no jet"""
+BELOW = 0.1
+"""of the silhouette's height that may lie below the pool"""
+SHALLOW = 0.05
+"""radii between level and floor, below which the silhouette is that of the surface alone: no floor is seen"""
+DEEP = 1.0
+"""radii that such a pool is taken to be deep: as a half sphere is, between a plate and a mug"""
+SMOOTH = 0.015
+"""of the silhouette's height over which its outline is evened out: drops and notches of a mask"""
+TURNS, RADII = 33, 96
+"""places along half a circle, and circles, that are tried at each height"""
+ACROSS = 96
+"""places along a ray that are looked at in the pool"""
+
+
+@dataclass(frozen=True)
+class FilledVessel:
+    """What it holds, z up."""
+
+    axis: tuple[float, float]
+    """x, y"""
+    heights: Float[np.ndarray, " k"]
+    """z from the floor to as high as the radius is known, increasing"""
+    radii: Float[np.ndarray, " k"]
+    """of the inside at these heights, which goes on above and below"""
+    level: float
+    """z of the surface at the first instant"""
+    inflow: tuple[float, float, float] = (0.0, 0.0, -1.0)
+    """unit vector, the way that the jet falls in, as far as it leans to the side"""
+
+    @property
+    def floor(self) -> float:
+        """z of the lowest point inside."""
+        return float(self.heights[0])
+
+    @property
+    def rim(self) -> float:
+        """z of its upper edge, which is not seen: half as high again as it was filled."""
+        return float(self.heights[-1]) + 0.5 * (float(self.heights[-1]) - self.floor)
+
+    @property
+    def volume(self) -> float:
+        """Of what it holds at the first instant."""
+        z = np.linspace(self.floor, self.level, 200)
+        return float(np.trapezoid(np.pi * self.radius_at(z) ** 2, z))
+
+    def radius_at(self, z: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+        """Radius of the inside."""
+        return np.interp(z, self.heights, self.radii)
+
+    def holds(self, points: Float[np.ndarray, "*n 3"]) -> Bool[np.ndarray, "*n"]:
+        """Whether points are in what it holds at the first instant."""
+        z = points[..., 2]
+        away = np.hypot(points[..., 0] - self.axis[0], points[..., 1] - self.axis[1])
+        return (away < self.radius_at(z)) & (z > self.floor) & (z < self.level)
+
+    def wall(self, points: Float[np.ndarray, "*n 3"], thickness: float) -> Float[np.ndarray, "*n"]:
+        """Signed distance to its wall, negative within, of the first order: from the inside outwards, up to the rim.
+
+        Args:
+            points: world.
+            thickness: of the wall.
+        """
+        z = points[..., 2]
+        slope = np.gradient(self.radii, self.heights) if len(self.radii) > 1 else np.zeros(1)
+        lean = 1.0 / np.sqrt(1.0 + np.interp(z, self.heights, slope, left=0.0, right=0.0) ** 2)
+        away = np.hypot(points[..., 0] - self.axis[0], points[..., 1] - self.axis[1]) - self.radius_at(z)
+        return np.maximum(np.abs(lean * away - 0.5 * thickness) - 0.5 * thickness, z - self.rim)
+
+    def transformed(self, t: Similarity3) -> FilledVessel:
+        """As a similarity that keeps the vertical moves it."""
+        low = t.points(np.array([[*self.axis, 0.0]]))[0]
+        return FilledVessel(
+            (float(low[0]), float(low[1])), low[2] + t.scale * self.heights, t.scale * self.radii,
+            float(low[2] + t.scale * self.level), triple(t.rotation @ self.inflow),
+        )  # fmt: skip
+
+
+def distance_ahead(camera: PinholeCamera, mask: Bool[np.ndarray, "h w"], middle: Float[np.ndarray, "h w"]) -> float:
+    """Median distance along the ground from the camera to a body.
+
+    Args:
+        camera: that sees it.
+        mask: fluid pixels.
+        middle: camera depth of the body's middle.
+    """
+    rays = camera.rays(camera.pixel_grid()[mask])
+    return float(np.median(middle[mask] * (rays[:, :2] @ _level_axes(camera)[1])))
+
+
+def find_vessel(camera: PinholeCamera, mask: Bool[np.ndarray, "h w"], distance: float) -> FilledVessel | None:
+    """The vessel in which the lower part of a silhouette stands, if a much narrower jet falls into it; else None.
+
+    Args:
+        camera: its tilt and roll as known.
+        mask: fluid pixels.
+        distance: from the camera to the axis along the ground, in the unit of the result.
+    """
+    eye, (right, forward) = camera.position, _level_axes(camera)
+    plane = _Rectified.of(camera, mask, eye, right, forward, distance)
+    if plane is None:
+        return None
+    first, last = plane.pool()
+    count = len(plane.z)
+    if not PARTS[0] * count <= last - first <= PARTS[1] * count or first > BELOW * count:
+        return None
+    if np.median(plane.width[last:]) > NARROW * plane.widest:
+        return None
+    smooth = max(SMOOTH * count, 0.5)
+    half = 0.5 * plane.width
+    begins, ends = half[first], half[last - 1]
+    half[first:last] = ndimage.gaussian_filter1d(half[first:last], smooth, mode="nearest")
+    z, radius = plane.z[first:last], half[first:last] / np.sqrt(1.0 + np.square(half[first:last] / distance))
+    pixel = z[1] - z[0]
+    floor = _circle_at(z[0] - 0.5 * pixel, begins, (z, radius), distance, near=z[0] < 0.0)
+    level = _circle_at(z[-1] + 0.5 * pixel, ends, (z, radius), distance, near=z[-1] > 0.0)
+    middle = float(np.median(plane.middle[first:last]))
+    widest, radius = float(radius.max()), _largest_circles(z, plane.z, half, distance)
+    if level - floor < SHALLOW * widest:
+        floor, radius = level - DEEP * widest, np.full(len(z), widest)
+    heights = np.linspace(floor, level, max(len(z), 2))
+    axis = eye[:2] + middle * right + distance * forward
+    way = np.array([*(-plane.lean(last) * right), -1.0])
+    return FilledVessel(
+        (float(axis[0]), float(axis[1])), heights + eye[2], np.interp(heights, z, radius), level + float(eye[2]),
+        triple(way / np.linalg.norm(way)),
+    )  # fmt: skip
+
+
+def seen_higher(vessel: FilledVessel, camera: PinholeCamera, ever: Bool[np.ndarray, "h w"]) -> FilledVessel:
+    """The vessel with its radii as high as the clip shows it filled.
+
+    Args:
+        vessel: as it was filled at the first instant.
+        camera: in the same world.
+        ever: pixels that are fluid in at least one frame.
+    """
+    found = find_vessel(camera, ever, _ahead(vessel, camera))
+    if found is None:
+        return vessel
+    above = found.heights > vessel.level
+    heights, radii = (np.append(a, b[above]) for a, b in ((vessel.heights, found.heights), (vessel.radii, found.radii)))
+    return replace(vessel, heights=heights, radii=radii)
+
+
+def filled_volume(vessel: FilledVessel, camera: PinholeCamera, mask: Bool[np.ndarray, "h w"]) -> float | None:
+    """Volume that a vessel holds in a picture, from the level that a silhouette shows; None where it shows none.
+
+    Args:
+        vessel: in the world.
+        camera: in the world.
+        mask: fluid pixels.
+    """
+    found = find_vessel(camera, mask, _ahead(vessel, camera))
+    return None if found is None else replace(vessel, level=max(found.level, vessel.floor)).volume
+
+
+def _ahead(vessel: FilledVessel, camera: PinholeCamera) -> float:
+    """Distance to the axis along the ground, as the camera looks."""
+    return float((np.asarray(vessel.axis) - camera.position[:2]) @ _level_axes(camera)[1])
+
+
+def pool_depths(
+    camera: PinholeCamera, mask: Bool[np.ndarray, "h w"], vessel: FilledVessel
+) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
+    """Camera depth at which the ray of each fluid pixel enters and leaves what a vessel holds; nan where it does not.
+
+    Args:
+        camera: that sees it.
+        mask: fluid pixels.
+        vessel: in the camera's world.
+    """
+    eye, (_, forward) = camera.position, _level_axes(camera)
+    rays = camera.rays(camera.pixel_grid()[mask])
+    ahead = np.maximum(rays[:, :2] @ forward, 1e-6)
+    middle = float((np.asarray(vessel.axis) - eye[:2]) @ forward)
+    reach = float(vessel.radii.max())
+    step = 2.0 * reach / ACROSS
+    front, back = np.full((2, *mask.shape), np.nan)
+    entered, left = np.full((2, len(rays)), np.nan)
+    for away in middle - reach + step * (np.arange(ACROSS) + 0.5):
+        inside = vessel.holds(eye + rays * (away / ahead)[:, None])
+        entered = np.where(inside & np.isnan(entered), away - 0.5 * step, entered)
+        left = np.where(inside, away + 0.5 * step, left)
+    front[mask], back[mask] = entered / ahead, left / ahead
+    return front, back
+
+
+def _largest_circles(z: np.ndarray, rows: np.ndarray, half: np.ndarray, distance: float) -> np.ndarray:
+    """Radius of the largest level circle at each height that nowhere leaves the silhouette: seen from above, the front
+    of a shoulder hides the narrower part below it.
+
+    Args:
+        z: heights of the circles, from the eye.
+        rows: heights in the plane of the axis, increasing.
+        half: half the width of the silhouette there.
+        distance: of the axis.
+    """
+    pixel = rows[1] - rows[0]
+    turn = np.linspace(-0.5 * np.pi, 0.5 * np.pi, TURNS)
+    radii = np.linspace(0.0, 1.05 * float(half.max()), RADII)
+    near = distance / (distance - radii[:, None] * np.sin(turn))
+    aside = radii[:, None] * np.cos(turn) * near
+    fits = np.array([(aside <= np.interp(v * near, rows, half, 0.0, 0.0) + pixel).all(axis=1) for v in z])
+    return radii[np.maximum(np.argmin(np.column_stack([fits, np.zeros(len(z), bool)]), axis=1) - 1, 0)]
+
+
+def _circle_at(
+    row: float, half: float, profile: tuple[np.ndarray, np.ndarray], distance: float, *, near: bool
+) -> float:
+    """Height of the circle whose near (or far) arc appears at a height in the plane of the axis, `half` its chord."""
+    height = row
+    for _ in range(20):
+        away = np.sqrt(max(float(np.interp(height, *profile)) ** 2 - half**2, 0.0))
+        height = row * (distance - away if near else distance + away) / distance
+    return float(height)
+
+
+def _level_axes(camera: PinholeCamera) -> tuple[np.ndarray, np.ndarray]:
+    """Unit vectors x, y to the camera's right and ahead of it, along the ground."""
+    ahead = camera.rays(np.asarray(camera.center, float)[None])[0, :2]
+    size = float(np.linalg.norm(ahead))
+    require(size > 1e-6, "a camera that looks straight up or down on a pour", "a tilted one")
+    forward = ahead / size
+    return np.array([forward[1], -forward[0]]), forward
+
+
+@dataclass(frozen=True)
+class _Rectified:
+    """Rows of a silhouette in the vertical plane through the axis, from below."""
+
+    z: np.ndarray
+    """above the eye"""
+    width: np.ndarray
+    """of the widest run; 0 where there is none"""
+    middle: np.ndarray
+    """of it, to the right of the eye"""
+
+    @property
+    def widest(self) -> float:
+        return float(np.percentile(self.width, 90))
+
+    @classmethod
+    def of(cls, camera, mask, eye, right, forward, distance) -> _Rectified | None:
+        rays = camera.rays(camera.pixel_grid()[mask])
+        ahead = rays[:, :2] @ forward
+        rays, ahead = rays[ahead > 1e-3], ahead[ahead > 1e-3]
+        if not len(rays):
+            return None
+        x, z = distance * (rays[:, :2] @ right) / ahead, distance * rays[:, 2] / ahead
+        pitch = distance / max(camera.focal)
+        columns, rows = (np.arange(v.min(), v.max() + 2.0 * pitch, pitch) for v in (x, z))
+        if min(len(columns), len(rows)) < 12 or max(len(columns), len(rows)) > 4 * max(mask.shape):
+            return None
+        place = (eye[:2] + distance * forward + columns[:, None] * right)[None]
+        points = np.concatenate(
+            [np.broadcast_to(place, (len(rows), len(columns), 2)),
+             np.broadcast_to((eye[2] + rows)[:, None, None], (len(rows), len(columns), 1))], axis=-1,
+        )  # fmt: skip
+        row, column, depth = camera.nearest_pixels(points.reshape(-1, 3))
+        uv, _ = camera.project(points.reshape(-1, 3))
+        inside = (depth > 0) & ((uv >= 0) & (uv < np.array(camera.size))).all(axis=1)
+        shown = (mask[row, column] & inside).reshape(len(rows), len(columns))
+        runs = [_longest_run(line) for line in shown]
+        first, last = np.array([r[0] for r in runs]), np.array([r[1] for r in runs])
+        return cls(rows, (last - first) * pitch, columns[0] + 0.5 * (first + last - 1) * pitch)
+
+    def lean(self, last: int) -> float:
+        """Way to the right over height, of the jet above a row, but for rows that show what it falls into as well."""
+        width = self.width[last:]
+        rows = last + np.flatnonzero((width > 0) & (width < WIDER * np.median(width)))
+        return float(np.polyfit(self.z[rows], self.middle[rows], 1)[0]) if len(rows) > 2 else 0.0
+
+    def pool(self) -> tuple[int, int]:
+        """First row of the pool and the one after its last."""
+        widest = self.widest
+        wide = self.width > NARROW * widest
+        middle = int(np.argmax(np.where(self.width >= widest, 1, 0)))
+        above, below = np.flatnonzero(~wide[middle:]), np.flatnonzero(self.width[:middle] < FOOT * widest)
+        return int(below[-1]) + 1 if len(below) else 0, middle + int(above[0]) if len(above) else len(wide)
+
+
+def _longest_run(line: np.ndarray) -> tuple[int, int]:
+    """Begin and end of the longest run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], line, [False]]).astype(np.int8)))
+    if not len(edges):
+        return 0, 0
+    begins, ends = edges[::2], edges[1::2]
+    k = int(np.argmax(ends - begins))
+    return int(begins[k]), int(ends[k])

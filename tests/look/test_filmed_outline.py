@@ -1,10 +1,12 @@
 """The waterline of a film is that of its simulation wherever the two are within a cell of each other."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import ndimage
 
-from fluidlift.look.filmed_outline import FINER, RIM, WIDEST, FilmedOutline
+from fluidlift.look.filmed_outline import FINER, LEFT, RIM, WIDEST, FilmedOutline
 from fluidlift.look.footage import FluidFootage
 from fluidlift.look.surface_axes import PictureAxes, PlanAxes
 from fluidlift.look.surface_map import SurfaceMap
@@ -54,17 +56,17 @@ def test_a_rim_within_a_cell_is_moved_to_the_films(film):
     assert abs(waterline(after) - film) <= abs(waterline(before) - film) + 1e-9
 
 
-@pytest.mark.parametrize("film", [2.0, 3.1])
+@pytest.mark.parametrize("film", [1.8, 3.1])
 def test_a_rim_that_is_further_off_stays_as_it_is_simulated(film):
-    """Beyond one cell the two tell of different flows: only a band of a cell about the film's own line is its own."""
+    """There the two tell of different flows: only a band about the film's own line is its own."""
     before = simulated(2.5)
     after = FilmedOutline(CAMERA, filmed(film), CELL).cut(before, PlanAxes())
     x = before.middles()[..., 0]
     if film > 2.5:  # filled by a cell at most (two columns, and half of one where it ends)
         assert waterline(after) <= waterline(before) + FINER * CELL + 1e-9
         assert (after.wet >= before.wet).all()
-    else:  # what lies more than a cell from the film's water is left
-        far = x > film + FINER * CELL + PIXEL
+    else:  # what lies more than two cells from the film's water is left
+        far = x > film + LEFT * CELL + PIXEL
         assert (before.wet & far).any()
         np.testing.assert_array_equal(after.wet[far], before.wet[far])
 
@@ -78,6 +80,18 @@ def test_only_the_rim_is_touched():
     np.testing.assert_array_equal(after.wet[away], before.wet[away])
     np.testing.assert_array_equal(after.height, before.height)
     np.testing.assert_array_equal(after.velocity, before.velocity)
+
+
+@pytest.mark.parametrize(("half", "closed"), [(1.5, True), (3.5, False)])
+def test_a_hole_of_a_torn_sheet_is_closed_where_the_film_shows_fluid(half, closed):
+    before = simulated(3.7)
+    hole = (np.abs(before.middles() - 1.2) < half * CELL).all(axis=-1)
+    torn = replace(before, wet=before.wet & ~hole)
+    after = FilmedOutline(CAMERA, filmed(2.4), CELL).cut(torn, PlanAxes())
+    core = (np.abs(before.middles() - 1.2) < 0.5 * CELL).all(axis=-1)
+    assert (after.wet[core] == closed).all() and (torn.wet & hole).sum() == 0
+    beside = FilmedOutline(CAMERA, np.where(filmed(2.4) > 0, filmed(2.4), 0.0) + 50.0, CELL).cut(torn, PlanAxes())
+    assert not beside.wet[core].any(), "what the film shows dry stays so"
 
 
 def test_nothing_beyond_the_picture_is_touched():
@@ -112,8 +126,8 @@ def test_splats_have_no_room_beside_the_fluid_and_more_the_deeper_inside_they_ar
     np.testing.assert_allclose(room[:4], WIDEST * -away[:4], atol=WIDEST * (RIM + 0.6) * PIXEL)
     assert (np.diff(room[:4]) < 0).all() and (room[4:] == 0).all()
     np.testing.assert_array_equal(outline.inside(places), [True] * 4 + [False] * 2)
-    # a cell beside it, the simulation has its way
-    far = np.array([[2.4 + FINER * CELL + 2 * PIXEL, 2.0, LEVEL]])
+    # two cells beside it, the simulation has its way
+    far = np.array([[2.4 + LEFT * CELL + 2 * PIXEL, 2.0, LEVEL]])
     assert np.isposinf(outline.room(far)).all() and outline.inside(far).all()
 
 

@@ -1,7 +1,8 @@
 """The waterline of a film on the surface of its simulation, finer than the simulator's cells.
 
 A simulated rim lies somewhere in a cell, which is several pixels of the clip. Where the film shows fluid within one
-cell of it, the surface ends where the film's does. What is further off stays as it is simulated.
+cell of it, the surface ends where the film's does, and holes that are no wider than a few cells are closed: a sheet
+thinner than a cell tears between its particles. What is further off stays as it is simulated.
 """
 
 from __future__ import annotations
@@ -17,10 +18,19 @@ from fluidlift.look.surface_map import COLUMN, SurfaceMap, sampled
 from fluidlift.types import PinholeCamera
 
 FINER = 1.0
-"""cells within which the film decides"""
+"""cells by which the surface is extended to the film's outline"""
+
+LEFT = 2.0
+"""cells from the filmed fluid within which nothing is shown that the film shows dry: the simulation takes out what is
+further off (`scene.dry_cells`: cells whose middle is more than one cell away)"""
+
+HOLES = 2.0
+"""cells, half the width of holes that are closed where the film shows fluid"""
 
 RIM = 0.5
 """px: outline of a mask of whole pixels"""
+
+HOLE = round(HOLES / COLUMN)
 
 EVERYWHERE = 1e6
 """px to the outline of a fluid that fills the whole picture"""
@@ -46,23 +56,25 @@ class FilmedOutline:
         self._away_px = np.where(wet, -inside, outside).astype(np.float32)
 
     def inside(self, world: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-        """Which points (m) are seen in the fluid, or beyond `FINER` cells from it, or not at all."""
+        """Which points (m) are seen in the fluid, or beyond `LEFT` cells from it, or not at all."""
         away, pixel, seen = self._away(world)
-        return ~seen | (away <= RIM) | (away * pixel > FINER * self._cell)
+        return ~seen | (away <= RIM) | (away * pixel > LEFT * self._cell)
 
     def room(self, world: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        """Standard deviation (m) of splats at points at most; 0 where they are seen beside the fluid."""
+        """Standard deviation (m) of splats at points at most; 0 where they are seen beside the fluid, within `LEFT`
+        cells of it."""
         away, pixel, seen = self._away(world)
-        beyond = away * pixel > FINER * self._cell
+        beyond = away * pixel > LEFT * self._cell
         return np.where(seen & ~beyond, WIDEST * pixel * np.maximum(RIM - away, 0.0), np.inf)
 
     def cut(self, surface: SurfaceMap, axes: SurfaceAxes) -> SurfaceMap:
-        """The map with its wet columns as the film shows them, within `FINER` cells of the simulated rim."""
+        """The map with its wet columns as the film shows them, within some cells of the simulated rim."""
         shape = surface.wet.shape
         middles = np.concatenate([surface.middles(), surface.height[..., None]], axis=-1).reshape(-1, 3)
         away, pixel, seen = (a.reshape(shape) for a in self._away(axes.world_points(middles)))
         near = ndimage.binary_dilation(surface.wet, iterations=round(FINER / COLUMN))
-        beside = seen & (away > RIM) & (away * pixel <= FINER * self._cell)
+        near |= ndimage.binary_closing(np.pad(surface.wet, HOLE), iterations=HOLE)[HOLE:-HOLE, HOLE:-HOLE]
+        beside = seen & (away > RIM) & (away * pixel <= LEFT * self._cell)
         return replace(surface, wet=(surface.wet & ~beside) | (near & seen & (away <= RIM)))
 
     def _away(self, world: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

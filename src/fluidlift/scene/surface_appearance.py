@@ -36,6 +36,10 @@ MIXED = 0.42
 LARGEST = 1.2
 """standard deviation of a splat at most, cells"""
 
+DROP = 0.25
+"""the same of spray, in the air by itself: half of the spacing of particles. One that was drawn out before it came loose
+showed as a disc of five cells"""
+
 PATCH = 0.12
 """radius of a patch of the skin, shares of the body's longer side in plan"""
 
@@ -47,6 +51,9 @@ UPRIGHT = 0.9
 
 COVERED = ((-0.6, -0.3), (0.6, 1.0))
 """cells from the surface between which the skin takes over from what is below, and spray from the skin"""
+
+LONELY = 0.3
+"""share of the surroundings of a place that are surface below which what is there is spray: at a straight shore a half"""
 
 FAINT = 0.002
 """least opacity of a splat under the skin: not drawn, but there for other tools"""
@@ -311,8 +318,11 @@ class SurfaceAppearance:
         xy = places[:, :2]
         above = (places[:, 2] - surface.at(surface.height, xy)) / self._cell
         below, spray = COVERED
-        covered = smoothstep(above, *below) * (1 - smoothstep(above, *spray)) * (surface.presence(xy) > 0.5)
+        loose, presence = smoothstep(above, *spray), surface.presence(xy)
+        covered = smoothstep(above, *below) * (1 - loose) * (presence > 0.5)
+        loose = np.where(presence > LONELY, loose, 1.0)
         room = REACH * np.maximum(self._clearance(shown.means) + CLEAR * self._cell, CLEAR * self._cell)
+        room = np.minimum(room, (DROP * loose + LARGEST * (1 - loose)) * self._cell)
         if self._outline is not None:
             filmed = self._outline.room(shown.means)
             covered = np.where(filmed > 0, covered, 1.0)

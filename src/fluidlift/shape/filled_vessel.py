@@ -19,6 +19,8 @@ from fluidlift.types import PinholeCamera, Similarity3, triple
 NARROW = 0.55
 """of the widest row, at most: the jet that falls in. A jet that fills half of its glass is rare, and a body that is as
 wide above as below is none that stands in a vessel"""
+STEEPEST = np.tan(np.radians(15.0))
+"""way to the side over height of a jet that leans, at most (`jets.ALONG`): what leans more is no jet alone"""
 WIDER = 1.5
 """of the jet's median width, from which a row shows more than the jet"""
 FOOT = 0.2
@@ -35,7 +37,7 @@ SMOOTH = 0.015
 """of the silhouette's height over which its outline is evened out: drops and notches of a mask"""
 TURNS, RADII = 33, 96
 """places along half a circle, and circles, that are tried at each height"""
-ACROSS = 96
+ACROSS = 64
 """places along a ray that are looked at in the pool"""
 
 
@@ -295,7 +297,8 @@ class _Rectified:
         """Way to the right over height, of the jet above a row, but for rows that show what it falls into as well."""
         width = self.width[last:]
         rows = last + np.flatnonzero((width > 0) & (width < WIDER * np.median(width)))
-        return float(np.polyfit(self.z[rows], self.middle[rows], 1)[0]) if len(rows) > 2 else 0.0
+        lean = float(np.polyfit(self.z[rows], self.middle[rows], 1)[0]) if len(rows) > 2 else 0.0
+        return lean if abs(lean) < STEEPEST else 0.0
 
     def pool(self) -> tuple[int, int]:
         """First row of the pool and the one after its last."""

@@ -68,3 +68,17 @@ def test_no_particles_and_velocities_of_others_are_refused():
         SurfaceMap.of(np.zeros((0, 3)), np.zeros((0, 3)), CELL)
     with pytest.raises(ValueError, match="2 velocities"):
         SurfaceMap.of(np.zeros((3, 3)), np.zeros((2, 3)), CELL)
+
+
+def test_where_all_is_spray_the_surface_is_its_mean_and_not_the_maps_zero():
+    cell = 0.2
+    x, y = np.meshgrid(np.arange(0.05, 6.0, 0.1), np.arange(0.05, 6.0, 0.1), indexing="ij")
+    z = np.full(x.shape, 5.0)
+    apart = (np.hypot(x - 4.5, y - 4.5) < 0.6) | (np.hypot(x - 4.5, y - 4.5) > 2.2)
+    spray = np.hypot(x - 4.5, y - 4.5) < 0.6
+    z[spray] = np.where((np.indices(z.shape).sum(axis=0) % 2)[spray], 2.0, 8.0)  # 3 m off their mean, a cell is 0.2
+    positions = np.stack([x[apart], y[apart], z[apart]], axis=-1)
+    surface = SurfaceMap.of(positions, np.zeros_like(positions), cell)
+    assert surface.wet.sum() > 1000
+    assert surface.height[surface.wet].min() > 1.9 and surface.height.max() < 8.1
+    assert surface.at(surface.height, np.array([[4.5, 4.5]]))[0] == pytest.approx(5.0, abs=0.5)

@@ -16,6 +16,10 @@ COLUMN = 0.5
 SPRAY = 1.0
 """cells above its surroundings from which a particle is spray, or a jet, and not the surface"""
 
+FEW = 0.01
+"""of the surrounding columns whose heights count, below which they have no mean: it would be the map's zero, for a map over
+the picture the camera itself"""
+
 SKIN = 1.5
 """cells below the surface whose motion is that of the surface"""
 
@@ -101,9 +105,9 @@ def _level(top: np.ndarray, spray: float) -> tuple[np.ndarray, np.ndarray]:
     have = np.isfinite(top)
     z, around = np.where(have, top, 0.0), ndimage.uniform_filter(have.astype(np.float64), 3)
     wet = (have & (around > 0.3)) | (around > 0.6)
-    counted = have.astype(np.float64)
-    for _ in range(2):
-        rough = _mean(z * counted, counted, 2.0)
+    counted, rough = have.astype(np.float64), z
+    for _ in range(2):  # where all is spray, as its mean
+        rough = np.where(ndimage.gaussian_filter(counted, 2.0) > FEW, _mean(z * counted, counted, 2.0), rough)
         counted = (have & (np.abs(z - rough) < spray)).astype(np.float64)
     fine = _mean(z * counted, counted, 1.0)
     height = np.where(ndimage.gaussian_filter(counted, 1.0) > 0.05, fine, rough)

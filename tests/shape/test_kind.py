@@ -62,6 +62,16 @@ def test_the_kind_is_what_the_fluid_does(clip, kind):
     assert found.kind == kind, (found.scores, found.features)
 
 
+def test_what_falls_so_slowly_that_it_is_followed_is_no_pour():
+    """A strand three times as tall as wide that comes in above: metres high if optical flow follows it, else a jet."""
+    strand = (np.abs(COL - 80) < 13) & (ROW < 80)
+    frames, masks, move, _ = scene(strand, (0.0, 3.0), BLUE)
+    seen = [estimate_kind(frames, masks, move, np.where(strand, trust, 0.0)) for trust in (0.8, 0.1)]
+    assert [s.kind for s in seen] == ["fall", "pour"], [s.scores for s in seen]
+    assert [s.features["followed"] for s in seen] == [1.0, 0.0]
+    assert estimate_kind(*jet()).features["followed"] == 1.0, "a slender one stays a pour all the same"
+
+
 def test_what_is_fed_from_the_upper_border_is_no_dam():
     block = dam(top=-2)
     assert block[1][:, 0].any()

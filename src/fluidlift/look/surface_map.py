@@ -17,8 +17,8 @@ SPRAY = 1.0
 """cells above its surroundings from which a particle is spray, or a jet, and not the surface"""
 
 FEW = 0.01
-"""of the surrounding columns whose heights count, below which they have no mean: it would be the map's zero, for a map over
-the picture the camera itself"""
+"""of the surrounding columns whose heights count, below which they have no mean: it would be the map's zero, which over
+the picture is the camera itself"""
 
 SKIN = 1.5
 """cells below the surface whose motion is that of the surface"""

@@ -37,8 +37,8 @@ LARGEST = 1.2
 """standard deviation of a splat at most, cells"""
 
 DROP = 0.25
-"""the same of spray, in the air by itself: half of the spacing of particles. One that was drawn out before it came loose
-showed as a disc of five cells"""
+"""the same of spray, in the air by itself: half of the spacing of particles. One that was drawn out before it came
+loose showed as a disc of five cells"""
 
 PATCH = 0.12
 """radius of a patch of the skin, shares of the body's longer side in plan"""
@@ -53,7 +53,8 @@ COVERED = ((-0.6, -0.3), (0.6, 1.0))
 """cells from the surface between which the skin takes over from what is below, and spray from the skin"""
 
 LONELY = 0.3
-"""share of the surroundings of a place that are surface below which what is there is spray: at a straight shore a half"""
+"""share of the surroundings of a place that are surface, below which what is there is spray; at a straight shore it is
+a half"""
 
 FAINT = 0.002
 """least opacity of a splat under the skin: not drawn, but there for other tools"""

@@ -10,14 +10,15 @@ from jaxtyping import Bool, Float, Int, UInt8
 from fluidlift.errors import require
 from fluidlift.types import Gaussians, sh_from_rgb
 
-SIZES = (0.045, 0.1, 0.06)
-"""standard deviation of the splats of spray, foam and bubbles, cells: foam covers, spray is specks, bubbles are faint"""
+SIZES = (0.06, 0.16, 0.08)
+"""standard deviation of the splats of spray, foam and bubbles, cells: foam covers, spray is specks, bubbles are faint. Foam of
+smaller splats is drawn as dots: a cell of the demo is 4 pixels wide"""
 SHAPE = (0.8, 0.9, 1.0)
 """axes of a splat, shares of that: no other splat has them, so white water is told by them"""
-OPACITIES = (0.9, 0.85, 0.3)
+OPACITIES = (0.85, 0.6, 0.25)
 """of spray, foam and bubbles: those are seen through the water above them"""
-FADING = 0.3
-"""s before its end over which a particle fades"""
+FADING = 1.0
+"""s before its end over which a particle fades: foam thins out, it does not go out"""
 ALIKE = 1e-3
 """by how much a splat's size may differ: files hold logarithms in single precision"""
 BRIGHT = 0.7

@@ -23,7 +23,7 @@ from fluidlift.io.asset_paths import asset_file
 from fluidlift.io.atomic import atomic_write
 from fluidlift.io.footage_file import read_footage
 from fluidlift.io.hashes import digest
-from fluidlift.look.whitewater_splats import FilmedFoam, whitewater_splats
+from fluidlift.look.whitewater_splats import OPACITIES, SIZES, FilmedFoam, whitewater_splats
 from fluidlift.messages import Notice
 from fluidlift.physics.whitewater import LIFE, Ground, LiquidState, Range, Whitewater, WhitewaterLaw
 from fluidlift.scene.build import Scene
@@ -40,8 +40,8 @@ BY_ENERGY = (0.1, 0.9)
 FULL_RATE = 30.0
 """1/s, births in a full cell whose potentials are at their most, before it is fitted: with a life of 2 s and splats of
 0.1 cells, foam there covers the water"""
-COVERS = 0.07
-"""cells^2 that a splat of foam hides: a disc of 1.5 standard deviations"""
+COVERS = np.pi * (1.5 * SIZES[1]) ** 2 * OPACITIES[1]
+"""cells^2 that a splat of foam hides: a disc of 1.5 standard deviations, as far as it is opaque"""
 FITTED = (0.02, 50.0)
 """times `FULL_RATE` between which the rate is fitted"""
 SPREAD = 1

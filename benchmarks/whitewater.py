@@ -84,7 +84,9 @@ def against_film(scene: Scene, found: Measured, frames: int) -> dict:
 
     fluid = read_footage(scene.film, scene.camera.size)[1].mean(axis=0) > 0.5
     weight = np.maximum(ndimage.gaussian_filter(fluid.astype(float), BLUR * width), 1e-6)
-    maps = [ndimage.gaussian_filter(m * fluid, BLUR * width)[fluid] / weight[fluid] for m in (foam.places, made["cover"])]
+    maps = [
+        ndimage.gaussian_filter(m * fluid, BLUR * width)[fluid] / weight[fluid] for m in (foam.places, made["cover"])
+    ]
     cover = made.pop("cover")
     return made | {"share_of_film": float(foam.places[fluid].mean()), "share": float(cover[fluid].mean()),
                    "correlation": float(np.corrcoef(*maps)[0, 1])}  # fmt: skip

@@ -35,6 +35,9 @@ DAM = WhitewaterLaw(Range(0.12, 0.5), Range(8.0, 30.0), Range(0.05, 0.5), 200.0,
 """of a dam of 0.4 m, whose front closes in on itself by up to 0.11 m/s as it runs out, and by 0.8 m/s at the wall"""
 
 
+STILL = np.zeros((3, 3))
+
+
 def terrain(shape=(24, 16, 20), bed=0.0):
     """A level bed, whose box begins below it."""
     grid = Grid(shape, H)
@@ -42,7 +45,7 @@ def terrain(shape=(24, 16, 20), bed=0.0):
     return Terrain(grid, (grid.nodes()[..., 2] - bed).astype(np.float32), np.array([1.0, 0.0, 0.0]), mesh)
 
 
-def block(ground, velocity, gradient=np.zeros((3, 3)), low=(0.2, 0.2, 0.0), high=(1.0, 0.6, 0.5)):
+def block(ground, velocity, gradient=STILL, low=(0.2, 0.2, 0.0), high=(1.0, 0.6, 0.5)):
     """Water that moves as velocity + gradient (x - middle), eight particles to a cell."""
     low, high = np.asarray(low), np.asarray(high)
     count = np.round((high - low) / (0.5 * H)).astype(int)
@@ -65,7 +68,7 @@ TURN = np.array([[0.0, -3.0, 1.0], [3.0, 0.0, -2.0], [-1.0, 2.0, 0.0]])
 """1/s, a rotation"""
 
 
-@pytest.mark.parametrize("gradient", [np.zeros((3, 3)), TURN], ids=["uniform", "turning"])
+@pytest.mark.parametrize("gradient", [STILL, TURN], ids=["uniform", "turning"])
 def test_water_that_moves_as_one_traps_no_air_and_has_no_crests(flat, gradient):
     state = LiquidState.of(block(flat, (1.5, -0.4, 0.2), gradient), flat, 1000.0)
     # single precision, of speeds up to 3 m/s
@@ -264,9 +267,7 @@ def test_white_water_ends_at_outlets_in_bodies_and_with_its_life(flat):
 def test_more_than_the_limit_is_thinned_by_lot_and_known():
     ground = ground_of(terrain())
     body = block(ground, (1.0, 0, 0), np.diag([-4.0, 2.0, 2.0]))
-    free, held = (
-        Whitewater(ground, replace(LAW, trapped_rate=2000.0, most=most), G, 1000.0) for most in (10**6, 500)
-    )
+    free, held = (Whitewater(ground, replace(LAW, trapped_rate=2000.0, most=most), G, 1000.0) for most in (10**6, 500))
     for _ in range(3):
         free.advance(body, 0.02)
         before = held.ids

@@ -90,7 +90,9 @@ def test_a_film_without_foam_asks_for_none(channel, tmp_path):
     white = whitewater_of(scene, tmp_path)
     assert white is not None and white.particles is None and white.splats() is None
     _, _, shown = played(scene, white)
-    assert (kinds_of(shown.gaussians, H) < 0).all()
+    assert (kinds_of(shown.gaussians, H) < 0).all() and white.warnings == ()
+    asked = SceneWhitewater(replace(scene, whitewater_asked=True), None)
+    assert [w.code for w in asked.warnings] == ["whitewater-not-filmed"]
 
 
 def test_more_than_the_limit_is_said_once(foaming, found):
@@ -134,10 +136,10 @@ def test_a_state_goes_on_bit_for_bit(foaming, found):
 def test_what_is_born_goes_downstream_with_the_flow():
     births, flow = np.zeros((40, 10)), np.zeros((40, 10, 2))
     births[5, 5], flow[..., 0] = 1.0, 0.5
-    cover = carried_cover(births, flow, 0.1)
-    # 0.5 m/s over a mean life of 1.45 s are 7 cells
+    cover = carried_cover(births, flow, 0.1, 1.45, 1.0)
+    # 0.5 m/s over 1.45 s are 7 cells
     assert cover[6:11, 5].min() > 0 and cover[14:, 5].max() == 0 and cover[:4].max() == 0
-    still = carried_cover(births, 0 * flow, 0.1)
+    still = carried_cover(births, 0 * flow, 0.1, 1.45, 1.0)
     assert still.sum() == pytest.approx(cover.sum(), rel=0.1)
 
 

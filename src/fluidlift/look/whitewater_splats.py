@@ -11,8 +11,8 @@ from fluidlift.errors import require
 from fluidlift.types import Gaussians, sh_from_rgb
 
 SIZES = (0.06, 0.16, 0.08)
-"""standard deviation of the splats of spray, foam and bubbles, cells: foam covers, spray is specks, bubbles are faint. Foam of
-smaller splats is drawn as dots: a cell of the demo is 4 pixels wide"""
+"""standard deviation of the splats of spray, foam and bubbles, cells: foam covers, spray is specks, bubbles are faint.
+Foam of smaller splats is drawn as dots: a cell of the demo is 4 pixels wide"""
 SHAPE = (0.8, 0.9, 1.0)
 """axes of a splat, shares of that: no other splat has them, so white water is told by them"""
 OPACITIES = (0.85, 0.6, 0.25)

@@ -1,4 +1,4 @@
-"""White water: spray, foam and bubbles as secondary particles that a liquid makes and carries, and that do not act on it.
+"""White water: spray, foam and bubbles as particles that a liquid makes and carries, and that do not act on it.
 
 After Ihmsen, Akinci, Akinci, Teschner 2012 ("Unified spray, foam and air bubbles for particle-based fluids"), on the
 grid as FLIP Fluids has it. Where the surface traps air (I_ta), or a crest overtakes what is behind it (I_wc), and the
@@ -38,7 +38,7 @@ SPRAY, FOAM, BUBBLE = 0, 1, 2
 """kinds"""
 
 REACH = 3.0
-"""cells around a cell whose motion counts: a breaking front is two or three cells wide, as in FLIP Fluids (5^3 cells)"""
+"""cells around a cell whose motion counts: a breaking front is two or three cells wide (FLIP Fluids takes 5^3 cells)"""
 DEEP = 1.25
 """cells below the surface from which air is trapped; deeper there is none to trap"""
 TOWARDS = 0.6
@@ -219,7 +219,7 @@ def relative_motion(
 
 def _normals(distance: np.ndarray) -> Float[np.ndarray, "nx ny nz 3"]:
     """Of the surface, out of the liquid; 0 where there is none near."""
-    slope = np.stack(np.gradient(distance.astype(np.float64)), axis=-1)
+    slope = np.stack([*np.gradient(distance.astype(np.float64))], axis=-1)
     size = np.linalg.norm(slope, axis=-1, keepdims=True)
     return np.where(size > 1e-9, slope / np.maximum(size, 1e-9), 0.0)
 

@@ -123,6 +123,8 @@ class Scene:
     """bool [nx,ny,nz]: cells that the clip shows dry throughout, from which fluid is taken out"""
     whitewater: float = 0.0
     """times as much white water as the clip shows; 0: none is simulated"""
+    whitewater_asked: bool = False
+    """whether scene.yaml says how much: then it is said where there is none"""
     as_lifted: Scene | None = None
     """the same without edits, by which white water is measured; None where there is none"""
 
@@ -305,7 +307,8 @@ def edited_scene(
         lifted = edited_scene(
             asset, unchanged, plain, settings, footage=footage, start=start, film=film, filmed=filmed
         )  # fmt: skip
-        scene = replace(scene, whitewater=amount, as_lifted=lifted)
+        asked = edits.whitewater is not None
+        scene = replace(scene, whitewater=amount, whitewater_asked=asked, as_lifted=lifted)
     return replace(scene, overlap=loop_overlap(scene)) if edits.loop else scene
 
 

@@ -23,7 +23,7 @@ from fluidlift.io.asset_paths import asset_file
 from fluidlift.io.atomic import atomic_write
 from fluidlift.io.footage_file import read_footage
 from fluidlift.io.hashes import digest
-from fluidlift.look.whitewater_splats import OPACITIES, SIZES, FilmedFoam, whitewater_splats
+from fluidlift.look.whitewater_splats import FADING, OPACITIES, SIZES, FilmedFoam, whitewater_splats
 from fluidlift.messages import Notice
 from fluidlift.physics.whitewater import LIFE, Ground, LiquidState, Range, Whitewater, WhitewaterLaw
 from fluidlift.scene.build import Scene
@@ -103,7 +103,7 @@ def measured(scene: Scene, device: str = "cpu", step: Callable[[int, int], None]
     foam = filmed_foam(scene)
     if foam is None or foam.share == 0.0:
         return None
-    ground, shape = Ground.of(scene.terrain, scene.cell_types), scene.terrain.grid.shape[:2]
+    ground = Ground.of(scene.terrain, scene.cell_types)
     simulator = simulator_of(scene, device)
     first, count = (round(s / scene.interval) for s in (SETTLED, SETTLED + SECONDS))
     seen: list[Columns] = []
@@ -119,7 +119,7 @@ def measured(scene: Scene, device: str = "cpu", step: Callable[[int, int], None]
             seen.append(columns_of(state, scene))
     if not seen:
         return None
-    return _fitted(seen, foam, scene, shape)
+    return _fitted(seen, foam, scene.terrain.grid.spacing)
 
 
 def filmed_foam(scene: Scene) -> FilmedFoam | None:
@@ -150,12 +150,13 @@ def columns_of(state: LiquidState, scene: Scene) -> Columns:
     flow = [np.take_along_axis(c, top, axis=2)[..., 0] for c in (0.5 * (u[1:] + u[:-1]), 0.5 * (v[:, 1:] + v[:, :-1]))]
     energy = np.take_along_axis(state.energy, top, axis=2)[..., 0]
     return Columns(
-        on_grid(inside.any(axis=2), bool), on_grid(state.trapped.max(axis=2)), on_grid(state.crest.max(axis=2)),
+        on_grid(np.asarray(inside.any(axis=2)), bool), on_grid(state.trapped.max(axis=2)), on_grid(state.crest.max(axis=2)),
         on_grid(energy), on_grid(np.stack(flow, axis=-1)),
     )  # fmt: skip
 
 
-def _fitted(seen: list[Columns], foam: FilmedFoam, scene: Scene, shape: tuple[int, int]) -> Measured:
+def _fitted(seen: list[Columns], foam: FilmedFoam, spacing: float) -> Measured:
+    """Limits and rate by which as much of the surface foams as of the film's; `spacing` (m) of the columns."""
     wet = np.stack([c.wet for c in seen])
     trapped, crest, energy = (np.stack([getattr(c, name) for c in seen]) for name in ("trapped", "crest", "energy"))
     # two potentials that seldom meet share the foam
@@ -168,7 +169,9 @@ def _fitted(seen: list[Columns], foam: FilmedFoam, scene: Scene, shape: tuple[in
     low, high = (float(q) for q in np.quantile(energy[wet], BY_ENERGY))
     fast = Range(low, max(high, 1.25 * low, 1e-12))
     shares = (limits[0].share(trapped) + limits[1].share(crest)) * fast.share(energy) * wet
-    cover = carried_cover(shares.mean(axis=0), np.mean([c.velocity for c in seen], axis=0), scene.terrain.grid.spacing)
+    life, lasting = _lives(shares, fast.share(energy))
+    flow = np.mean([c.velocity for c in seen], axis=0)
+    cover = carried_cover(shares.mean(axis=0), flow, spacing, life, lasting)
     places = wet.mean(axis=0) > 0.5
     size = 2 * SPREAD + 1
     known = [ndimage.maximum_filter(v.max(axis=0), size) for v in (trapped, crest)]
@@ -177,18 +180,31 @@ def _fitted(seen: list[Columns], foam: FilmedFoam, scene: Scene, shape: tuple[in
     )
 
 
+def _lives(shares: np.ndarray, energies: np.ndarray) -> tuple[float, float]:
+    """s that what is born lives, and for how long it would cover as much without fading; means by births."""
+    life = LIFE[0] + (LIFE[1] - LIFE[0]) * energies
+    lasting = np.where(life > FADING, life - 0.5 * FADING, life**2 / (2.0 * FADING))
+    total = max(float(shares.sum()), 1e-12)
+    return max(float((shares * life).sum()) / total, LIFE[0]), float((shares * lasting).sum()) / total
+
+
 def carried_cover(
-    births: Float[np.ndarray, "nx ny"], velocity: Float[np.ndarray, "nx ny 2"], spacing: float
+    births: Float[np.ndarray, "nx ny"],
+    velocity: Float[np.ndarray, "nx ny 2"],
+    spacing: float,
+    life: float,
+    lasting: float,
 ) -> Float[np.ndarray, "nx ny"]:
-    """Mean cover (cells^2 per cell, may be over 1) of what is born at `FULL_RATE` times `births`, and goes with a steady
-    velocity (m/s) for its life: the births upstream, added up."""
-    pieces, life = 16, float(np.mean(LIFE))
+    """Mean cover (cells^2 per cell, may be over 1) of what is born at `FULL_RATE` times `births`, and goes with a
+    steady velocity (m/s) for its `life` (s), in which it covers as much as in `lasting` (s) without fading: the births
+    upstream, added up."""
+    pieces = 16
     at, total = np.indices(births.shape).astype(float), np.zeros(births.shape)
     for _ in range(pieces):
         total += ndimage.map_coordinates(births, at, order=1, cval=0.0)
         here = np.stack([ndimage.map_coordinates(velocity[..., a], at, order=1, mode="nearest") for a in range(2)])
         at = at - here * (life / pieces / spacing)
-    return FULL_RATE * COVERS * life / pieces * total
+    return FULL_RATE * COVERS * lasting / pieces * total
 
 
 def _factor(cover: np.ndarray, share: float) -> float:
@@ -246,17 +262,17 @@ def _plain(found: Measured | None, shape: tuple[int, int]) -> dict[str, np.ndarr
 
 
 def _read(arrays: dict[str, np.ndarray], scene: Scene) -> Measured | None:
-    shapes = {"rate": (), "share": (), "color": (3,)} | {n: (2,) for n in ("trapped", "crest", "energy")}
-    shapes |= {n: scene.terrain.grid.shape[:2] for n in ("trapped_known", "crest_known")}
+    shapes = {"rate": (), "share": (), "color": (3,)} | dict.fromkeys(("trapped", "crest", "energy"), (2,))
+    shapes |= dict.fromkeys(("trapped_known", "crest_known"), scene.terrain.grid.shape[:2])
     for name, shape in shapes.items():
         if arrays[name].shape != shape or not np.isfinite(arrays[name]).all():
             raise ValueError(f"{name} of shape {arrays[name].shape}")
     if arrays["share"] == 0:
         return None
-    ranges = (Range(*arrays[n].tolist()) for n in ("trapped", "crest", "energy"))
+    trapped, crest, energy = (Range(*arrays[n].tolist()) for n in ("trapped", "crest", "energy"))
     r, g, b = arrays["color"].tolist()
     return Measured(
-        *ranges, float(arrays["rate"]), float(arrays["share"]), (r, g, b), arrays["trapped_known"],
+        trapped, crest, energy, float(arrays["rate"]), float(arrays["share"]), (r, g, b), arrays["trapped_known"],
         arrays["crest_known"],
     )  # fmt: skip
 
@@ -290,11 +306,21 @@ class SceneWhitewater:
     @property
     def warnings(self) -> tuple[Notice, ...]:
         """What a person should know."""
+        if self._water is None and self._scene.whitewater_asked:
+            text = (
+                "there is no white water: the clip shows no foam (bright, grey pixels) to tell how much and where from"
+            )
+            return (Notice("whitewater-not-filmed", text),)
         if self._water is None or not self._water.thinned:
             return ()
         most = self._water.law.most
-        text = f"there was more white water than the {most} particles that are shown at once: it was thinned"
-        return (Notice("whitewater-thinned", f"{text}; set whitewater.amount lower"),)
+        return (
+            Notice(
+                "whitewater-thinned",
+                f"there was more white water than the {most} particles that are shown at once: it was thinned; set "
+                "whitewater.amount lower",
+            ),
+        )
 
     def advance(self, particles: Particles, number: int) -> None:
         """Go on to a frame; every frame after the last one, in order."""

@@ -145,12 +145,13 @@ def columns_of(state: LiquidState, scene: Scene) -> Columns:
         return whole
 
     inside = state.distance < 0
+    wet = np.asarray(inside.any(axis=2))
     top = np.where(inside.any(axis=2), state.grid.shape[2] - 1 - inside[:, :, ::-1].argmax(axis=2), 0)[..., None]
     u, v, _ = state.velocity.components
     flow = [np.take_along_axis(c, top, axis=2)[..., 0] for c in (0.5 * (u[1:] + u[:-1]), 0.5 * (v[:, 1:] + v[:, :-1]))]
     energy = np.take_along_axis(state.energy, top, axis=2)[..., 0]
     return Columns(
-        on_grid(np.asarray(inside.any(axis=2)), bool), on_grid(state.trapped.max(axis=2)), on_grid(state.crest.max(axis=2)),
+        on_grid(wet, bool), on_grid(state.trapped.max(axis=2)), on_grid(state.crest.max(axis=2)),
         on_grid(energy), on_grid(np.stack(flow, axis=-1)),
     )  # fmt: skip
 

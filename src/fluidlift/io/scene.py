@@ -81,13 +81,21 @@ class SceneEdits:
     look: Look = field(default_factory=Look)
     loop: bool = False
     """the last frame leads into the first"""
+    whitewater: float = 0.0
+    """times as much white water as the clip shows, 0 to `MOST_WHITEWATER`"""
 
 
-SECTIONS = ("parameters", "obstacles", "emitters", "terrain", "inflow", "look", "duration", "extend_downstream", "loop")
+SECTIONS = (
+    "parameters", "obstacles", "emitters", "terrain", "inflow", "look", "whitewater", "duration", "extend_downstream",
+    "loop",
+)  # fmt: skip
+
+MOST_WHITEWATER = 100.0
+"""times what the clip shows: more hides the water altogether"""
 
 NAMES = {
     "parameters": tuple(PARAMETERS), "look": tuple(Look().to_dict()),
-    "inflow": ("factor", "keyframes", "fluctuation", "period"),
+    "inflow": ("factor", "keyframes", "fluctuation", "period"), "whitewater": ("amount",),
 }  # fmt: skip
 """what can stand in the sections whose entries have names of their own"""
 
@@ -131,7 +139,13 @@ def edits_of(text: str, folder: Path | str, *, meshes: Path | None = None) -> Sc
         _inflow(scene),
         read_look(scene, Path(folder)),
         scene.flag("loop", False),
+        _whitewater(scene.part("whitewater", "whitewater")),
     )
+
+
+def _whitewater(given: Entries) -> float:
+    given.only(NAMES["whitewater"])
+    return given.number("amount", 0.0, low=0.0, high=MOST_WHITEWATER, unit="times what the clip shows")
 
 
 def _obstacles(scene: Entries, meshes: Path) -> tuple[Obstacle, ...]:

@@ -49,6 +49,8 @@ Modules of the face:
                         its walls do to a picture
     wet_ground          Ground that liquid stands on, in the picture behind that liquid: wet ground is darker than
                         dry ground
+    whitewater_splats   What white water looks like: small splats in the clip's foam colour, and where a clip shows
+                        foam at all
 """
 
 __all__ = [
@@ -84,4 +86,5 @@ __all__ = [
     "transparent",
     "vessel",
     "wet_ground",
+    "whitewater_splats",
 ]  # fmt: skip

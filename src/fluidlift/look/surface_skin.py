@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 
 from fluidlift.errors import require
 from fluidlift.look.surface_map import SurfaceMap
+from fluidlift.look.whitewater_splats import kinds_of
 from fluidlift.numerics.nearest import nearest
 from fluidlift.types import Gaussians, sh_from_rgb
 
@@ -47,8 +48,8 @@ CROWDED, BARE = 0.55, 0.75
 
 
 def of_skin(gaussians: Gaussians, cell: float) -> Bool[np.ndarray, " n"]:
-    """Which splats are a skin's, by their size, which no other splat has. They are no liquid, but paint on it, and
-    count for nothing in its volume, its surface and its shadow.
+    """Which splats are a skin's or white water's, by their size, which no other splat has. They are no liquid, but
+    paint on it, and count for nothing in its volume, its surface and its shadow.
 
     Args:
         gaussians: of a frame.
@@ -61,7 +62,7 @@ def of_skin(gaussians: Gaussians, cell: float) -> Bool[np.ndarray, " n"]:
         size = wanted * finer(level)
         like = np.flatnonzero(np.abs(least - size[0]) < ALIKE * size[0])
         found[like] |= (np.abs(np.sort(gaussians.scales[like], axis=1) / size - 1.0) < ALIKE).all(axis=1)
-    return found
+    return found | (kinds_of(gaussians, cell) >= 0)
 
 
 def level_for(apart: Float[np.ndarray, " n"], wanted: float) -> Int[np.ndarray, " n"]:

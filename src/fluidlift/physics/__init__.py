@@ -49,6 +49,8 @@ Modules of the face:
                           places
     transfer              P2G and G2P: affine particle-in-cell (APIC) transfers on the MAC grid (paper:
                           `particle_map`; Jiang et al. 2015)
+    whitewater            White water: spray, foam and bubbles as particles that a liquid makes and carries, and
+                          that do not act on it
 """
 
 __all__ = [
@@ -80,4 +82,5 @@ __all__ = [
     "terrain_edit",
     "terrain_reshape",
     "transfer",
+    "whitewater",
 ]  # fmt: skip

@@ -23,6 +23,7 @@ Modules of the face:
     simulator           The simulator of a scene, at its first instant
     splat_files         Where an asset keeps the frames of its simulation, and what goes on from them
     surface_appearance  What the splats of a simulated fluid look like in each frame
+    whitewater          The white water of a scene: how much of it its clip asks for, and its splats, frame by frame
 """
 
 from importlib import import_module as _import_module
@@ -54,5 +55,5 @@ __all__ = [
     "Add", "Change", "EditSession", "Remove", "Scene", "Set", "SimulationRequest", "build", "coarse_copy",
     "dry_cells", "edit_history", "edited_scene", "edits", "footage", "forecast", "open_water", "recall",
     "reshaping", "scene_of", "settings", "simulated_history", "simulation", "simulator", "simulator_of",
-    "splat_files", "surface_appearance",
+    "splat_files", "surface_appearance", "whitewater",
 ]  # fmt: skip

@@ -44,6 +44,10 @@ if TYPE_CHECKING:
 LOOP_FADE = (0.8, 1.5)
 """s: a shorter fade changes too much of the fluid in each frame, a longer one makes the clip one long fade"""
 
+FOAMS_UP_TO = 1e-3
+"""m^2/s: a thousand times water's, with the room that a fit leaves; chocolate, honey and lava are thicker, and the air
+that they trap does not come out of them as foam"""
+
 
 @dataclass(frozen=True)
 class SimulationRequest:
@@ -117,6 +121,10 @@ class Scene:
     """m/s^2 on the faces of the terrain's grid, beside gravity"""
     dry: np.ndarray | None = None
     """bool [nx,ny,nz]: cells that the clip shows dry throughout, from which fluid is taken out"""
+    whitewater: float = 0.0
+    """times as much white water as the clip shows; 0: none is simulated"""
+    as_lifted: Scene | None = None
+    """the same without edits, by which white water is measured; None where there is none"""
 
     @property
     def simulated(self) -> int:
@@ -157,6 +165,8 @@ class Scene:
             found["force"] = _hash(*self.force.components)
         if self.dry is not None:
             found["dry cells"] = _hash(self.dry)
+        if self.whitewater > 0:
+            found["white water"] = _hash(self.whitewater)
         if self.overlap:
             found["loop"] = _hash(self.frames, self.overlap)
         return found
@@ -260,6 +270,7 @@ def edited_scene(
     Raises:
         InputRejected: edits or a request that do not fit.
     """
+    from fluidlift.io.scene import SceneEdits
     from fluidlift.numerics.sampling import sample_faces
 
     request, settings = request or SimulationRequest(), settings or SceneSettings.of(JobConfig())
@@ -287,7 +298,36 @@ def edited_scene(
         scene = extended(scene, longer)
     scene = with_emitters(with_terrain(scene, edits.terrain), edits.emitters)
     scene = following(scene, asset, filmed or Filmed(), settings.follow)
+    amount = whitewater_amount(scene, edits.whitewater)
+    if amount > 0:
+        plain = SimulationRequest(fps=request.fps)
+        lifted = edited_scene(
+            asset, SceneEdits(), plain, settings, footage=footage, start=start, film=film, filmed=filmed
+        )  # fmt: skip
+        scene = replace(scene, whitewater=amount, as_lifted=lifted)
     return replace(scene, overlap=loop_overlap(scene)) if edits.loop else scene
+
+
+def whitewater_amount(scene: Scene, asked: float) -> float:
+    """How much white water a scene is simulated with, times what its clip shows: as much as is asked for.
+
+    Args:
+        scene: with all of its edits.
+        asked: what scene.yaml says.
+
+    Raises:
+        InputRejected: it is asked of smoke, or of what is too thick to foam.
+    """
+    thick = scene.parameters.kinematic_viscosity > FOAMS_UP_TO
+    if asked > 0 and (thick or kind_of(scene.kind).is_gas):
+        what = "a gas, which has no surface" if kind_of(scene.kind).is_gas else (
+            f"a liquid of {scene.parameters.kinematic_viscosity:.2g} m^2/s"
+        )  # fmt: skip
+        raise InputRejected(
+            f"whitewater.amount {asked:g} of {what}", f"a liquid of at most {FOAMS_UP_TO:g} m^2/s",
+            "set whitewater.amount to 0, or leave it out",
+        )  # fmt: skip
+    return asked
 
 
 def film_of(folder: Path) -> Path | None:

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from fluidlift.look.surface_map import SurfaceMap
     from fluidlift.look.texture_patches import TexturePatches
     from fluidlift.scene.build import Scene
+    from fluidlift.scene.whitewater import SceneWhitewater
 
 MAX_STRETCH = 3.0
 """longest axis over the mean one before a Gaussian starts again round: longer ones show as hair"""
@@ -146,13 +147,18 @@ def _taken_apart(film: Path, size: tuple[int, int], blur: float, written: tuple[
 
 
 class SurfaceAppearance:
-    """Splats for the particles of a scene, frame by frame from the first one on."""
+    """Splats for the particles of a scene, frame by frame from the first one on.
 
-    def __init__(self, scene: Scene) -> None:
+    Args:
+        scene: that is simulated.
+        whitewater: that is shown beside them; None: none is.
+    """
+
+    def __init__(self, scene: Scene, whitewater: SceneWhitewater | None = None) -> None:
+        self._whitewater = whitewater
         self._scene, self._cell = scene, scene.terrain.grid.spacing
         self._camera = scene.camera
-        self.warnings: tuple[Notice, ...] = ()
-        """what is missing for the usual look, in words"""
+        self._missing: tuple[Notice, ...] = ()
         self._patches: TexturePatches | None = None
         self._surface: SurfaceMap | None = None
         self._axes: SurfaceAxes
@@ -161,6 +167,11 @@ class SurfaceAppearance:
         self._own = scene.rest.select(np.arange(len(scene.rest) - sum(map(len, scene.emitter_looks))))
         if len(self._own) and len(scene.body):
             self._lay_skin()
+
+    @property
+    def warnings(self) -> tuple[Notice, ...]:
+        """What is missing for the usual look, in words."""
+        return self._missing + (() if self._whitewater is None else self._whitewater.warnings)
 
     def _lay_skin(self) -> None:
         from fluidlift.look.filmed_outline import FilmedOutline
@@ -206,7 +217,7 @@ class SurfaceAppearance:
             return None
         found = _footage(scene.film, scene.camera, own.means, self._cell)
         if isinstance(found, str):
-            self.warnings = (Notice("film-not-played", f"the film of the fluid {found}"),)
+            self._missing = (Notice("film-not-played", f"the film of the fluid {found}"),)
             return None
         self._camera = scene.camera.resized((found.mean.shape[1], found.mean.shape[0]))
         return found
@@ -262,6 +273,8 @@ class SurfaceAppearance:
 
     def advance(self, particles: Particles, number: int) -> None:
         """Bring what floats on the surface to a frame; every frame after the last one, in order."""
+        if self._whitewater is not None:
+            self._whitewater.advance(particles, number)
         if self._patches is None or not len(particles):
             return
         if number == 0:
@@ -275,13 +288,25 @@ class SurfaceAppearance:
         self._skin.advance(self._surface, interval, rng)
 
     def dressed(self, particles: Particles, number: int, inside: Inside | None = None) -> Dressed:
-        """The splats of a frame to which `advance` has come. Ids of particles are even, those of the skin odd.
+        """The splats of a frame to which `advance` has come. Ids of particles are even, those of the skin and of white
+        water odd.
 
         Args:
             particles: of the frame.
             number: of the frame, from 0.
             inside: (points [n,3]) -> whether they are in an obstacle, where there is no skin; None: no obstacles.
         """
+        bare = self._without_whitewater(particles, number, inside)
+        white = None if self._whitewater is None or not number else self._whitewater.splats(inside)
+        if white is None:
+            return bare
+        gaussians, ids, velocities = white
+        return Dressed(
+            concatenate([bare.gaussians, gaussians]), np.concatenate([bare.ids, ids]),
+            np.concatenate([bare.velocities, velocities]),
+        )  # fmt: skip
+
+    def _without_whitewater(self, particles: Particles, number: int, inside: Inside | None) -> Dressed:
         from fluidlift.look.mixing import mixed
         from fluidlift.physics.deform import deform_gaussians
 
@@ -366,11 +391,12 @@ class SurfaceAppearance:
 
     def state(self) -> dict[str, np.ndarray]:
         """What changes from frame to frame, as plain arrays."""
+        white = {} if self._whitewater is None else self._whitewater.state()
         if self._patches is None:
-            return {}
+            return white
         patches = {f"patches.{name}": np.array(value) for name, value in vars(self._patches.state).items()}
         skin = {f"skin.{name}": getattr(self._skin, name).copy() for name in ("places", "ids", "levels")}
-        return patches | skin | {"skin.next_id": np.array(self._skin.next_id, np.int64)}
+        return white | patches | skin | {"skin.next_id": np.array(self._skin.next_id, np.int64)}
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """Go to a state of `state`.
@@ -381,6 +407,8 @@ class SurfaceAppearance:
         from fluidlift.look.texture_patches import Patches
 
         if self._patches is None:
+            if self._whitewater is not None:
+                self._whitewater.restore(state)
             return
         try:
             parts = {n.removeprefix("patches."): np.array(a) for n, a in state.items() if n.startswith("patches.")}
@@ -401,5 +429,7 @@ class SurfaceAppearance:
         fits = places.shape == (len(ids), 2) and levels.shape == ids.shape
         if not fits or not all(np.isfinite(array).all() for array in numbers):
             raise InputRejected("the state of a surface with arrays of another shape, or not finite", "a whole one")
+        if self._whitewater is not None:
+            self._whitewater.restore(state)
         self._patches.state = patches
         self._skin.places, self._skin.ids, self._skin.levels, self._skin.next_id = places, ids, levels, next_id

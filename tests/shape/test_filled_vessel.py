@@ -95,6 +95,16 @@ def test_neither_a_jet_nor_a_ball_nor_a_wide_thing_above_a_narrow_one_stands_in_
         assert find_vessel(camera, mask, AWAY) is None
 
 
+@pytest.mark.parametrize("pitch", [90.0, 80.0, -90.0])
+def test_from_above_no_vessel_is_seen(pitch):
+    camera = camera_at(pitch)
+    v, u = np.mgrid[:240, :240]
+    mask = (np.hypot(u - 120, v - 150) < 60) | (np.abs(u - 120) < 8) & (v < 100)
+    away = distance_ahead(camera, mask, np.ones(mask.shape))
+    assert np.isfinite(away) and find_vessel(camera, mask, away) is None
+    assert find_vessel(camera_at(30.0), mask, AWAY) is not None, "or the picture tells nothing"
+
+
 def test_of_a_cup_that_is_looked_into_only_the_surface_is_seen_and_it_is_taken_to_be_as_deep_as_it_is_wide():
     camera = camera_at(35.0)
     flat = made(35.0, level=0.01)

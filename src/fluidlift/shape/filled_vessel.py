@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
-from fluidlift.errors import require
 from fluidlift.types import PinholeCamera, Similarity3, triple
 
 NARROW = 0.55
@@ -21,6 +20,8 @@ NARROW = 0.55
 wide above as below is none that stands in a vessel"""
 STEEPEST = np.tan(np.radians(15.0))
 """way to the side over height of a jet that leans, at most (`jets.ALONG`): what leans more is no jet alone"""
+STEEPEST_VIEW = np.sin(np.radians(70.0))
+"""sine of the tilt from which no silhouette from the side is seen: walls are a third as high as they are"""
 WIDER = 1.5
 """of the jet's median width, from which a row shows more than the jet"""
 FOOT = 0.2
@@ -124,6 +125,8 @@ def find_vessel(camera: PinholeCamera, mask: Bool[np.ndarray, "h w"], distance: 
         mask: fluid pixels.
         distance: from the camera to the axis along the ground, in the unit of the result.
     """
+    if abs(camera.camera_from_world.rotation[2, 2]) > STEEPEST_VIEW:
+        return None
     eye, (right, forward) = camera.position, _level_axes(camera)
     plane = _Rectified.of(camera, mask, eye, right, forward, distance)
     if plane is None:
@@ -245,11 +248,11 @@ def _circle_at(
 
 
 def _level_axes(camera: PinholeCamera) -> tuple[np.ndarray, np.ndarray]:
-    """Unit vectors x, y to the camera's right and ahead of it, along the ground."""
-    ahead = camera.rays(np.asarray(camera.center, float)[None])[0, :2]
-    size = float(np.linalg.norm(ahead))
-    require(size > 1e-6, "a camera that looks straight up or down on a pour", "a tilted one")
-    forward = ahead / size
+    """Unit vectors x, y to the camera's right and ahead of it, along the ground; of a look straight down, up the
+    picture."""
+    rotation = camera.camera_from_world.rotation
+    ahead = rotation[2, :2] if np.linalg.norm(rotation[2, :2]) > 1e-6 else -rotation[1, :2]
+    forward = ahead / np.linalg.norm(ahead)
     return np.array([forward[1], -forward[0]]), forward
 
 

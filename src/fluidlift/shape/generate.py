@@ -52,15 +52,18 @@ def background_plate(
     frames: UInt8[np.ndarray, "t h w 3"],
     fluid: Bool[np.ndarray, "t h w"] | FluidMasks,
     solid: Bool[np.ndarray, "h w"] | None = None,
+    *,
+    shore: bool = False,
 ) -> BackgroundPlate:
     """Median of the frames where they show no fluid; the rest inpainted from the ground around it.
 
-    Along the rim of wide fluid the median of all frames stays: the splats that cover it end about there.
+    Along the shore of wide fluid the median of all frames stays: the splats that cover it end about there.
 
     Args:
         frames: sRGB.
         fluid: per frame.
         solid: still things in the fluid: they stay in the picture, but the bed beside them is not painted with them.
+        shore: the fluid lies or falls on ground, and stays there. Of smoke and of jets a rim would be left in the air.
     """
     pick = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), 25)).astype(int))
     covered = np.stack([fluid[t] for t in pick])
@@ -74,7 +77,7 @@ def background_plate(
     values = np.ma.masked_array(frames[pick], mask=np.repeat(wet[..., None], 3, axis=-1))
     image = np.clip(np.ma.median(values, axis=0).filled(0), 0, 255).astype(np.uint8)
     ground = seen if solid is None else seen & ~ndimage.binary_dilation(solid, iterations=3)
-    kept = seen | _rim_of_wide_fluid(np.all(covered, axis=0))
+    kept = seen | _rim_of_wide_fluid(np.all(covered, axis=0)) if shore else seen
     if ground.any() and not seen.all():
         painted = _inpainted(image, ~ground)
         blend = weight_of_unseen(kept)[..., None]

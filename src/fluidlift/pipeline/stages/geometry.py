@@ -116,9 +116,10 @@ def _coloured(
     # the plate looks at a few frames only
     solid = ground.solid_share(fluid.labels) > 0.5
     solid = solid if fluid.hidden is None else solid & ~fluid.hidden
-    plate = generate.background_plate(clip.frames, cast(Any, fluid), solid)
+    on_ground = setting.surface_height is not None
+    plate = generate.background_plate(clip.frames, cast(Any, fluid), solid, shore=on_ground)
     picture = plate.image
-    if setting.surface_height is not None:
+    if on_ground:
         labels = ground.seen_labels(fluid, seen.start, seen.united, falls)
         view = ground_texture.View(picture, camera, labels, np.asarray(plate.seen))
         setting = ground.textured(setting, view)

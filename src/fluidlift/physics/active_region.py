@@ -59,13 +59,15 @@ def face_box(box: Box, axis: int) -> Box:
     return triple(slice(s.start, s.stop + (a == axis)) for a, s in enumerate(box))
 
 
+def inner_grid(grid: Grid, box: Box) -> Grid:
+    """The region's own grid."""
+    shape = triple(s.stop - s.start for s in box)
+    return Grid(shape, grid.spacing, triple(o + s.start * grid.spacing for o, s in zip(grid.origin, box)))
+
+
 def crop_walls(walls: Walls, box: Box) -> Walls:
     """The walls inside a region, on the region's own grid."""
-    grid = walls.grid
-    inner = Grid(
-        tuple(s.stop - s.start for s in box), grid.spacing,
-        tuple(o + s.start * grid.spacing for o, s in zip(grid.origin, box)),
-    )  # fmt: skip
+    inner = inner_grid(walls.grid, box)
     nodes = tuple(slice(s.start, s.stop + 1) for s in box)
     solid, buried, regions = (np.ascontiguousarray(c[box]) for c in (walls.solid, walls.buried, walls.regions))
     return Walls(

@@ -27,7 +27,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from fluidlift.errors import InputRejected, require
 from fluidlift.numerics.sampling import sample_centers, sample_faces, sample_nodes
 from fluidlift.physics import whitewater_kernels
-from fluidlift.physics.active_region import Box, region_around
+from fluidlift.physics.active_region import inner_grid, region_around
 from fluidlift.physics.boundaries import extrapolate
 from fluidlift.physics.free_surface import SolidShares, liquid_surface, solid_shares
 from fluidlift.physics.position_correction import cell_capacity
@@ -164,7 +164,7 @@ class LiquidState:
         """Of one or more particles inside the box, with masses (kg) at a density (kg/m^3)."""
         require(len(particles) > 0, "no particles", "one or more")
         box = region_around(particles.positions, ground.terrain.grid)
-        grid, solids = _within(ground.terrain.grid, box), ground.solids.inside(box)
+        grid, solids = inner_grid(ground.terrain.grid, box), ground.solids.inside(box)
         order = sort_by_cell(particles.positions, grid)
         wet = (np.diff(order.start) > 0).reshape(grid.shape)
         volumes = (particles.masses / density).astype(np.float32)
@@ -183,12 +183,6 @@ class LiquidState:
             grid, velocity, surface.distance, amount, trapped, np.where(asked, crest, 0.0),
             0.5 * np.einsum("...i,...i->...", moves, moves),
         )  # fmt: skip
-
-
-def _within(grid: Grid, box: Box) -> Grid:
-    shape = (box[0].stop - box[0].start, box[1].stop - box[1].start, box[2].stop - box[2].start)
-    x, y, z = (o + s.start * grid.spacing for o, s in zip(grid.origin, box))
-    return Grid(shape, grid.spacing, (x, y, z))
 
 
 def _at_middles(velocity: FaceVelocity) -> Float[np.ndarray, "nx ny nz 3"]:

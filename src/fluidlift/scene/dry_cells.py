@@ -3,8 +3,8 @@
 A mask says more than where the fluid is: whatever stands seen above dry ground, or before it, would have been filmed.
 Water that gets there in a simulation has left what was filmed (over a bank that is lower than the true one, or past
 what stands before it), and is taken out as at an outlet. What is hidden, beside the picture or within a cell of the
-filmed fluid is left alone. So is nothing that comes much nearer to the camera than the fluid at rest: it would stand
-before the whole picture.
+filmed fluid is left alone. What comes much nearer to the camera than the fluid at rest is dry wherever it is seen: it
+would stand before the whole picture.
 """
 
 from __future__ import annotations

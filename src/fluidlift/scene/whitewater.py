@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -240,10 +240,10 @@ def remembered(
             path.unlink(missing_ok=True)
     found = measured(scene, device, step)
     shape = scene.terrain.grid.shape[:2]
-    kept = _plain(found, shape)
+    kept: dict[str, Any] = _plain(found, shape)
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as stream:
-        np.savez_compressed(stream, **kept)  # type: ignore[arg-type]
+        np.savez_compressed(stream, **kept)
     return found
 
 

@@ -19,7 +19,8 @@ PASSING = 0.25
 """speed along the stream at one of its ends over that of its swift part (90th percentile), above which fluid enters or
 leaves there. On the cases at hand dead ends have 0.1 to 0.2 of it, live ones 0.4 and more"""
 WALL = 2.4
-"""cells that the wall of a vessel is thick: less lets the pressure of what it holds through at some cells' corners"""
+"""cells that the wall of a vessel is thick: one leaves no gap for steps from cell to cell, the rest is for a distance
+that is of the first order (a choice)"""
 AT_THE_END = 0.25
 """share of the length of the lying part within which a jet stands at its upstream end: what moves there spreads from
 it"""

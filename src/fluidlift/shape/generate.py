@@ -28,9 +28,8 @@ MIXED = 2
 """px around the fluid whose colours lens and coding mix with it"""
 
 SHORE = 5
-"""px inside wide fluid in which the plate goes over from the clip's picture to what is inpainted: less than what the
-outermost splats, 2 to 3 px wide, leave uncovered, and the blur of the blend. Begun outside, the shore shows a line of
-inpainted ground along all of its length"""
+"""px inside wide fluid up to which the plate is the clip's picture: the outermost splats are 2 to 3 px wide, and the
+blend into what is inpainted reaches 3 px. Begun outside, a line of painted ground ran along masks that are too small"""
 
 WIDE = 3 * SHORE
 """px from the rim, at least, in the middle of wide fluid. A thread or a jet would stay in the plate as a whole"""

@@ -19,7 +19,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
@@ -70,7 +69,8 @@ MOST = 50_000
 Inside = Callable[[np.ndarray], np.ndarray]
 
 
-class Range(NamedTuple):
+@dataclass(frozen=True)
+class Range:
     """What counts of a potential: nothing below `least`, all above `most`."""
 
     least: float

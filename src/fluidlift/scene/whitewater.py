@@ -8,21 +8,22 @@ lifted: that is in the film, which the surface plays.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy import ndimage
 
 from fluidlift.errors import FluidliftError, InputRejected
-from fluidlift.io.array_archive import DAMAGE, read_arrays
-from fluidlift.io.asset_paths import asset_file
-from fluidlift.io.atomic import atomic_write
 from fluidlift.io.footage_file import read_footage
 from fluidlift.io.hashes import digest
+from fluidlift.io.kept_values import kept_value
+from fluidlift.io.stage_cache import save_stage
+from fluidlift.io.stage_codec import packed
 from fluidlift.look.whitewater_splats import FADING, OPACITIES, SIZES, FilmedFoam, whitewater_splats
 from fluidlift.messages import Notice
 from fluidlift.physics.whitewater import LIFE, Ground, LiquidState, Range, Whitewater, WhitewaterLaw
@@ -49,7 +50,6 @@ SPREAD = 1
 IDS_FROM = 2**29
 """half of the ids of white water are above it, so that those of the particles and of the skin are others, and a loop
 can add as many again within 32 bits"""
-KEPT = ("trapped", "crest", "energy", "rate", "share", "color", "trapped_known", "crest_known")
 
 
 class Columns(NamedTuple):
@@ -90,6 +90,18 @@ class Measured:
         rate = amount * self.rate
         known = scene.terrain.grid, self.trapped_known, self.crest_known
         return WhitewaterLaw(self.trapped, self.crest, self.energy, rate, rate, known=known)
+
+
+@dataclass(frozen=True)
+class Kept:
+    """What an asset's folder keeps of a measure."""
+
+    found: Measured | None
+
+    def fits(self, scene: Scene) -> bool:
+        """Whether it can be of a scene."""
+        shape = scene.terrain.grid.shape[:2]
+        return self.found is None or self.found.trapped_known.shape == self.found.crest_known.shape == shape
 
 
 def measured(scene: Scene, device: str = "cpu", step: Callable[[int, int], None] | None = None) -> Measured | None:
@@ -231,19 +243,14 @@ def remembered(
         device: see `measured`.
         step: see `measured`.
     """
-    key = digest_of(scene)
-    path = asset_file(folder, f"work/whitewater/{key}.npz")
-    if path.is_file():
-        try:
-            return _read(read_arrays(path, KEPT), scene)
-        except DAMAGE + (InputRejected,):
-            path.unlink(missing_ok=True)
+    key, name = digest_of(scene), "whitewater"
+    kept = kept_value(folder, name, key, Kept)
+    if kept is not None and kept[0].fits(scene):
+        return kept[0].found
+    began = time.perf_counter()
     found = measured(scene, device, step)
-    shape = scene.terrain.grid.shape[:2]
-    kept: dict[str, Any] = _plain(found, shape)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_write(path) as stream:
-        np.savez_compressed(stream, **kept)
+    arrays, value = packed(Kept(found))
+    save_stage(folder, name, key, arrays, {"seconds": time.perf_counter() - began, "value": value})
     return found
 
 
@@ -254,28 +261,6 @@ def digest_of(scene: Scene) -> str:
     text = repr(sorted(scene.parts.items())) + source_hash(__name__) + repr(scene.camera.size)
     film = digest(scene.film) if scene.film is not None and scene.film.is_file() else ""
     return hashlib.sha256((text + film).encode()).hexdigest()[:16]
-
-
-def _plain(found: Measured | None, shape: tuple[int, int]) -> dict[str, np.ndarray]:
-    if found is None:
-        found = Measured(Range(0, 1), Range(0, 1), Range(0, 1), 0.0, 0.0, (0, 0, 0), np.zeros(shape), np.zeros(shape))
-    return {name: np.asarray(getattr(found, name), np.float64) for name in KEPT}
-
-
-def _read(arrays: dict[str, np.ndarray], scene: Scene) -> Measured | None:
-    shapes = {"rate": (), "share": (), "color": (3,)} | dict.fromkeys(("trapped", "crest", "energy"), (2,))
-    shapes |= dict.fromkeys(("trapped_known", "crest_known"), scene.terrain.grid.shape[:2])
-    for name, shape in shapes.items():
-        if arrays[name].shape != shape or not np.isfinite(arrays[name]).all():
-            raise ValueError(f"{name} of shape {arrays[name].shape}")
-    if arrays["share"] == 0:
-        return None
-    trapped, crest, energy = (Range(*arrays[n].tolist()) for n in ("trapped", "crest", "energy"))
-    r, g, b = arrays["color"].tolist()
-    return Measured(
-        trapped, crest, energy, float(arrays["rate"]), float(arrays["share"]), (r, g, b), arrays["trapped_known"],
-        arrays["crest_known"],
-    )  # fmt: skip
 
 
 class SceneWhitewater:

@@ -12,10 +12,12 @@ from fluidlift.io.footage_file import write_footage
 from fluidlift.io.scene import edits_of
 from fluidlift.look.surface_skin import of_skin
 from fluidlift.look.whitewater_splats import kinds_of
+from fluidlift.pipeline.runner import Runner
 from fluidlift.scene.build import edited_scene, whitewater_amount
 from fluidlift.scene.simulator import simulator_of
 from fluidlift.scene.surface_appearance import SurfaceAppearance
-from fluidlift.scene.whitewater import IDS_FROM, SceneWhitewater, carried_cover, measured, remembered, whitewater_of
+from fluidlift.scene.whitewater import IDS_FROM, Kept, SceneWhitewater, carried_cover, kept_measure, measured
+from fluidlift.seams import Silence
 from fluidlift.types import FluidParameters
 
 FRAMES = 5
@@ -87,8 +89,8 @@ def test_a_film_without_foam_asks_for_none(channel, tmp_path):
     lifted = channel(FRAMES, film=film(tmp_path / "film.mp4", foam=False))
     assert measured(lifted) is None and measured(replace(lifted, film=None)) is None
     scene = edited(lifted)
-    white = whitewater_of(scene, tmp_path)
-    assert white is not None and white.particles is None and white.splats() is None
+    white = SceneWhitewater(scene, None)
+    assert white.particles is None and white.splats() is None
     _, _, shown = played(scene, white)
     assert (kinds_of(shown.gaussians, H) < 0).all()
     assert [w.code for w in white.warnings] == ["whitewater-not-filmed"]
@@ -101,22 +103,34 @@ def test_more_than_the_limit_is_said_once(foaming, found):
     assert [w.code for w in white.warnings] == ["whitewater-thinned"] and "50000" in white.warnings[0]
 
 
+def measure_of(scene, folder):
+    """As the stage that simulates asks for it."""
+    runner = Runner(folder, ("simulate",), progress=Silence())
+
+    def stage(*, work) -> Kept:
+        return work.part("whitewater", kept_measure, scene, "cpu")
+
+    return runner.run("simulate", stage).found
+
+
 def test_a_measure_is_kept_and_read_again(foaming, found, tmp_path, monkeypatch):
     monkeypatch.setattr("fluidlift.scene.whitewater.measured", lambda *_: found)
-    first = remembered(foaming, tmp_path)
+    first = measure_of(foaming, tmp_path)
+    (tmp_path / "work/simulate").rename(tmp_path / "gone")
     monkeypatch.setattr("fluidlift.scene.whitewater.measured", lambda *_: pytest.fail("measured once more"))
-    again = remembered(foaming, tmp_path)
-    assert first is not None and again is not None
+    again = measure_of(foaming, tmp_path)
+    assert first is not None and again is not None and again is not first
     for name, value in vars(first).items():
         np.testing.assert_array_equal(value, getattr(again, name))
 
 
 def test_a_broken_measure_is_taken_anew(foaming, found, tmp_path, monkeypatch):
     monkeypatch.setattr("fluidlift.scene.whitewater.measured", lambda *_: found)
-    remembered(foaming, tmp_path)
+    measure_of(foaming, tmp_path)
+    (tmp_path / "work/simulate").rename(tmp_path / "gone")
     (file,) = (tmp_path / "work/whitewater").glob("*.npz")
     file.write_bytes(b"no arrays")
-    assert remembered(foaming, tmp_path) is not None and file.stat().st_size > 100
+    assert measure_of(foaming, tmp_path) is not None and file.stat().st_size > 100
 
 
 def test_a_state_goes_on_bit_for_bit(foaming, found):

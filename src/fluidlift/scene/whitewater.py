@@ -8,10 +8,8 @@ lifted: that is in the film, which the surface plays.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -20,16 +18,11 @@ from scipy import ndimage
 
 from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.io.footage_file import read_footage
-from fluidlift.io.hashes import digest
-from fluidlift.io.kept_values import kept_value
-from fluidlift.io.stage_cache import save_stage
-from fluidlift.io.stage_codec import packed
 from fluidlift.look.whitewater_splats import FADING, OPACITIES, SIZES, FilmedFoam, whitewater_splats
 from fluidlift.messages import Notice
 from fluidlift.physics.whitewater import LIFE, Ground, LiquidState, Range, Whitewater, WhitewaterLaw
 from fluidlift.scene.build import Scene
 from fluidlift.scene.simulator import simulator_of
-from fluidlift.source import source_hash
 from fluidlift.types import Gaussians, Particles
 
 SECONDS = 1.0
@@ -94,23 +87,22 @@ class Measured:
 
 @dataclass(frozen=True)
 class Kept:
-    """What an asset's folder keeps of a measure."""
+    """A measure as a stage keeps it."""
 
     found: Measured | None
 
-    def fits(self, scene: Scene) -> bool:
-        """Whether it can be of a scene."""
-        shape = scene.terrain.grid.shape[:2]
-        return self.found is None or self.found.trapped_known.shape == self.found.crest_known.shape == shape
+
+def kept_measure(scene: Scene, device: str) -> Kept:
+    """`measured`, as a part of a stage."""
+    return Kept(measured(scene, device))
 
 
-def measured(scene: Scene, device: str = "cpu", step: Callable[[int, int], None] | None = None) -> Measured | None:
+def measured(scene: Scene, device: str = "cpu") -> Measured | None:
     """What a scene as lifted and its film say about white water; None where the film shows none, or there is none.
 
     Args:
         scene: without edits.
         device: that moves particles, "cpu" or "cuda".
-        step: told (done, all) frames.
     """
     foam = filmed_foam(scene)
     if foam is None or foam.share == 0.0:
@@ -120,8 +112,6 @@ def measured(scene: Scene, device: str = "cpu", step: Callable[[int, int], None]
     first, count = (round(s / scene.interval) for s in (SETTLED, SETTLED + SECONDS))
     seen: list[Columns] = []
     for k in range(max(count, 2)):
-        if step is not None:
-            step(k, max(count, 2))
         try:
             simulator.advance(scene.interval)
         except FluidliftError:  # the simulation that follows says so
@@ -232,37 +222,6 @@ def _factor(cover: np.ndarray, share: float) -> float:
     return float(np.sqrt(low * high))
 
 
-def remembered(
-    scene: Scene, folder: Path, device: str = "cpu", step: Callable[[int, int], None] | None = None
-) -> Measured | None:
-    """`measured`, once for each asset: it is kept in its folder work/.
-
-    Args:
-        scene: without edits.
-        folder: of the asset.
-        device: see `measured`.
-        step: see `measured`.
-    """
-    key, name = digest_of(scene), "whitewater"
-    kept = kept_value(folder, name, key, Kept)
-    if kept is not None and kept[0].fits(scene):
-        return kept[0].found
-    began = time.perf_counter()
-    found = measured(scene, device, step)
-    arrays, value = packed(Kept(found))
-    save_stage(folder, name, key, arrays, {"seconds": time.perf_counter() - began, "value": value})
-    return found
-
-
-def digest_of(scene: Scene) -> str:
-    """What a measure of a scene depends on, as 16 letters."""
-    import hashlib
-
-    text = repr(sorted(scene.parts.items())) + source_hash(__name__) + repr(scene.camera.size)
-    film = digest(scene.film) if scene.film is not None and scene.film.is_file() else ""
-    return hashlib.sha256((text + film).encode()).hexdigest()[:16]
-
-
 class SceneWhitewater:
     """White water beside the splats of a scene, from its first frame on."""
 
@@ -337,19 +296,3 @@ class SceneWhitewater:
         if self._water is not None:
             prefix = "whitewater."
             self._water.restore({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
-
-
-def whitewater_of(
-    scene: Scene, folder: Path, device: str = "cpu", step: Callable[[int, int], None] | None = None
-) -> SceneWhitewater | None:
-    """The white water of a scene whose asset lies in a folder; None where it is to have none.
-
-    Args:
-        scene: that is simulated.
-        folder: of the asset.
-        device: see `measured`.
-        step: see `measured`.
-    """
-    if scene.whitewater <= 0 or scene.as_lifted is None:
-        return None
-    return SceneWhitewater(scene, remembered(scene.as_lifted, folder, device, step))

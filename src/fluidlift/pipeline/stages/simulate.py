@@ -17,7 +17,7 @@ from fluidlift.scene.simulation import advance, continued
 from fluidlift.scene.simulator import preflight, simulator_of
 from fluidlift.scene.splat_files import checkpoint_file, frame_file, require_room
 from fluidlift.scene.surface_appearance import SurfaceAppearance
-from fluidlift.scene.whitewater import whitewater_of
+from fluidlift.scene.whitewater import SceneWhitewater, kept_measure
 from fluidlift.types import kind_of
 from fluidlift.types.stages import Simulation
 
@@ -53,7 +53,11 @@ def simulate(
     preflight(scene)
     simulator = simulator_of(scene, config.device)
     closed = closed_inlet(scene, simulator)
-    appearance = SurfaceAppearance(scene, whitewater_of(scene, folder, config.device))
+    white = None
+    if scene.whitewater > 0 and scene.as_lifted is not None:
+        part = (work or Work.alone(folder)).part  # once for each asset
+        white = SceneWhitewater(scene, part("whitewater", kept_measure, scene.as_lifted, config.device).found)
+    appearance = SurfaceAppearance(scene, white)
     history = continued(simulator, appearance, scene, folder, request or SimulationRequest(), config.max_particles)
     first = len(history)
     require_room(folder, scene.simulated - first, len(scene.body))

@@ -146,3 +146,15 @@ def test_the_wall_stands_around_what_it_holds_and_moves_with_it():
         assert (vessel.wall(put(ring(r + 0.025)), thick) < 0).all() and not vessel.holds(put(ring(r + 0.025))).any()
         above = put(np.array([[glass.axis[0] + 0.27, glass.axis[1], glass.level + 0.4]]))
         assert (vessel.wall(above, thick) > 0).all()
+
+
+def test_a_frayed_surface_does_not_close_the_glass_above_it():
+    camera, truth = camera_at(15.0), made(15.0)
+    mask, rng = silhouette(camera, truth), np.random.default_rng(0)
+    edge = mask.argmax(axis=0)
+    for column in np.flatnonzero(mask.any(axis=0)):  # waves of up to 5 px take away from the upper edge
+        mask[edge[column] : edge[column] + rng.integers(0, 6), column] = False
+    found = find_vessel(camera, mask, AWAY)
+    assert found is not None
+    upper = np.linspace(found.level - 0.08, found.rim, 20)
+    np.testing.assert_allclose(found.radius_at(upper), 0.25, atol=0.02)

@@ -36,8 +36,8 @@ DEEP = 1.0
 """radii that such a pool is taken to be deep: as a half sphere is, between a plate and a mug"""
 SMOOTH = 0.015
 """of the silhouette's height over which its outline is evened out: drops and notches of a mask"""
-TURNS, RADII = 33, 96
-"""places along half a circle, and circles, that are tried at each height"""
+TURNS, RADII = 17, 96
+"""places along a quarter of a circle, and circles, that are tried at each height"""
 ACROSS = 64
 """places along a ray that are looked at in the pool"""
 
@@ -218,8 +218,9 @@ def pool_depths(
 
 
 def _largest_circles(z: np.ndarray, rows: np.ndarray, half: np.ndarray, distance: float) -> np.ndarray:
-    """Radius of the largest level circle at each height that nowhere leaves the silhouette: seen from above, the front
-    of a shoulder hides the narrower part below it.
+    """Radius of the largest level circle at each height whose lower half nowhere leaves the silhouette: seen from
+    above, the front of a shoulder hides the narrower part below it. Their upper halves are asked nothing: near the
+    level they lie on the silhouette's upper edge, which waves and the jet fray, and the glass would close above it.
 
     Args:
         z: heights of the circles, from the eye.
@@ -228,11 +229,14 @@ def _largest_circles(z: np.ndarray, rows: np.ndarray, half: np.ndarray, distance
         distance: of the axis.
     """
     pixel = rows[1] - rows[0]
-    turn = np.linspace(-0.5 * np.pi, 0.5 * np.pi, TURNS)
+    turn = np.linspace(0.0, 0.5 * np.pi, TURNS)
     radii = np.linspace(0.0, 1.05 * float(half.max()), RADII)
-    near = distance / (distance - radii[:, None] * np.sin(turn))
-    aside = radii[:, None] * np.cos(turn) * near
-    fits = np.array([(aside <= np.interp(v * near, rows, half, 0.0, 0.0) + pixel).all(axis=1) for v in z])
+    fits = np.zeros((len(z), RADII), bool)
+    for side, toward in ((z > 0.0, -1.0), (z <= 0.0, 1.0)):  # above the eye the far half is the lower one
+        scale = distance / (distance - toward * radii[:, None] * np.sin(turn))
+        aside = radii[:, None] * np.cos(turn) * scale
+        for k in np.flatnonzero(side):
+            fits[k] = (aside <= np.interp(z[k] * scale, rows, half, 0.0, 0.0) + pixel).all(axis=1)
     return radii[np.maximum(np.argmin(np.column_stack([fits, np.zeros(len(z), bool)]), axis=1) - 1, 0)]
 
 

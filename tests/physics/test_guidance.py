@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from fluidlift.physics.apic import LiquidSimulator
-from fluidlift.physics.guidance import Nudging, SteadyForce
-from fluidlift.types import FaceVelocity, FluidParameters, Grid, Particles, Terrain, TriangleMesh
+from fluidlift.physics.guidance import Guiding, Nudging, SteadyForce
+from fluidlift.types import FaceVelocity, FilmedMotion, FluidParameters, Grid, Particles, Terrain, TriangleMesh
 
 H = 0.1
 GRID = Grid((24, 16, 24), H)
@@ -129,6 +129,33 @@ def test_the_mean_force_keeps_the_flow_that_it_was_needed_for():
     # 2 % of what the unknown pull does in half a second
     assert alone.particles.velocities[:, 0].mean() == pytest.approx(start[0], abs=0.02 * 0.5)
     assert free.particles.velocities[:, 0].mean() == pytest.approx(start[0] - 0.5, abs=2e-3)
+
+
+def test_what_is_learnt_leaves_the_flow_behind_so_many_times_less():
+    """A pull that the model does not know of, a: v stays behind by a tau under a pull alone, by a tau / (1 + gain) in
+    the end where a force is learnt from it; and the mean is what the unknown pull takes."""
+    tau, unknown, gain = 0.1, -1.0, 3.0
+    nudging = Nudging(uniform(0, 0, 0), rates(1 / tau), gain=gain, learning=12 * tau, after=8.0)
+    v = uniform(0, 0, 0)
+    for _ in range(1000):
+        v = nudging.applied(uniform(float(v.u[5, 5, 5]) + 0.01 * unknown, 0, 0), masses(), WHOLE, 0.01)
+    # a step of 0.1 tau: of that order
+    np.testing.assert_allclose(nudging.behind().u, -unknown * tau / (1 + gain), rtol=0.06)
+    np.testing.assert_allclose(nudging.mean().u, -unknown, rtol=0.01)
+    with pytest.raises(ValueError, match="gain"):
+        Nudging(uniform(0, 0, 0), rates(1.0), gain=-1.0)
+
+
+def test_what_guides_is_between_the_frames_of_a_film_half_a_step_later():
+    frames = [uniform(s, 0, 0).components for s in (0.0, 4.0)]
+    film = FilmedMotion(*(np.stack(c).astype(np.float16) for c in zip(*frames)), 1.0)
+    out = Guiding(film, rates(1e6)).applied(uniform(9, 9, 9), masses(), WHOLE, 0.5, 0.25)
+    np.testing.assert_allclose(out.u, 2.0, atol=1e-3)  # at 0.5 s
+    assert not out.v.any()
+    gentle = Guiding(film, rates(2.0)).applied(uniform(0, 0, 0), masses(), WHOLE, 0.5, 0.75)
+    np.testing.assert_allclose(gentle.u, 4.0 * (1 - np.exp(-1.0)), rtol=1e-3)
+    with pytest.raises(ValueError, match="rates"):
+        Guiding(film, tuple(r[:-1] for r in rates(1.0)))
 
 
 def test_faces_without_liquid_do_not_count():

@@ -6,19 +6,21 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from fluidlift.config import JobConfig
+from fluidlift.config import JobConfig, build_config
 from fluidlift.errors import InputRejected
 from fluidlift.io.asset_folder import FILES, load_asset, read_manifest
 from fluidlift.io.force_file import read_filmed, write_filmed
 from fluidlift.messages import code_of
 from fluidlift.numerics.sampling import sample_faces
+from fluidlift.physics.guidance import Nudging
 from fluidlift.physics.inflow_schedule import InflowSchedule
 from fluidlift.pipeline.stages.calibrate import STRONG, calibrate
 from fluidlift.scene.build import SimulationRequest, scene_of
 from fluidlift.scene.coarse_copy import coarser
 from fluidlift.scene.force_weight import following
+from fluidlift.scene.settings import SceneSettings
 from fluidlift.scene.simulator import simulator_of
-from fluidlift.types import FaceVelocity, Filmed
+from fluidlift.types import CellType, FaceVelocity, Filmed, FilmedMotion, Grid
 
 FRAMES = 14
 
@@ -26,6 +28,11 @@ FRAMES = 14
 def of(scene) -> SimpleNamespace:
     """What counts of the asset that a scene comes from."""
     return SimpleNamespace(grid=scene.terrain.grid, terrain=scene.terrain)
+
+
+def shares(follow: float = 0.0, guide: float = 0.0) -> SceneSettings:
+    """How much of the filmed flow is kept."""
+    return SceneSettings(None, follow, guide, 0)
 
 
 def uniform(grid, acceleration) -> FaceVelocity:
@@ -80,13 +87,13 @@ def test_the_force_fades_around_what_was_put_in_and_stays_elsewhere(tmp_path, ch
     scene = channel(2)
     grid = scene.terrain.grid
     force, asset = uniform(grid, (1.0, 0.0, 0.0)), of(scene)
-    assert following(scene, asset, Filmed(force), 0.0).force is None
-    np.testing.assert_allclose(following(scene, asset, Filmed(force), 0.5).force.u, 0.5)
+    assert following(scene, asset, Filmed(force), shares(0.0)).force is None
+    np.testing.assert_allclose(following(scene, asset, Filmed(force), shares(0.5)).force.u, 0.5)
     dug = scene.terrain.signed_distance.copy()
     place = (2, 4, 2)
     dug[place] += grid.spacing
     there = following(
-        replace(scene, terrain=replace(scene.terrain, signed_distance=dug)), asset, Filmed(force), 1.0
+        replace(scene, terrain=replace(scene.terrain, signed_distance=dug)), asset, Filmed(force), shares(1.0)
     ).force
     assert there.u[place] == 0.0, "no force where the ground was dug"
     assert there.u[-1, 4, 2] == 1.0, "all of it ten cells from there: two of them were touched, and it needs six"
@@ -101,7 +108,7 @@ def test_another_fluid_or_inflow_takes_the_force_away_and_that_is_noted(channel,
         other = replace(scene, changes=("kinematic_viscosity",))
     else:
         other = replace(scene, inflow=InflowSchedule(((0.0, 2.0),)))
-    found = following(other, of(scene), Filmed(force), 1.0)
+    found = following(other, of(scene), Filmed(force), shares(1.0))
     assert found.force is None and found.dry is None and "left out" in found.notes[-1]
 
 
@@ -127,3 +134,97 @@ def test_a_damaged_force_is_refused_with_what_to_do(tmp_path):
     np.savez(tmp_path / FILES["force"], u=np.zeros((3, 2, 2)), v=np.zeros((2, 2, 2)), w=np.zeros((2, 2, 3)))
     with pytest.raises(InputRejected, match="make the asset again"):
         read_filmed(tmp_path)
+
+
+def film(grid, speeds, interval: float = 0.1, start: int = 0) -> FilmedMotion:
+    """Frames that all move along x."""
+    frames = [uniform(grid, (s, 0.0, 0.0)).components for s in speeds]
+    u, v, w = (np.stack(c).astype(np.float16) for c in zip(*frames))
+    return FilmedMotion(u, v, w, interval, start)
+
+
+def test_a_pool_at_rest_needs_no_force(channel):
+    """Gravity and pressure balance: a pull that saw the one without the other would carry a part of the weight."""
+    scene = channel(FRAMES)
+    still = FaceVelocity.zeros(scene.terrain.grid)
+    calm = replace(scene, velocity=still, body=replace(scene.body, velocities=np.zeros_like(scene.body.velocities)),
+                   cell_types=np.where(scene.cell_types == CellType.EMPTY, CellType.EMPTY, CellType.FLUID)
+                   .astype(np.uint8))  # fmt: skip
+    rates = tuple(np.full(c.shape, 10.0, np.float32) for c in still.components)
+    pull = Nudging(still, rates, after=0.2)
+    simulator = simulator_of(calm, forces=(pull,))
+    for _ in range(FRAMES):
+        simulator.advance(scene.interval)
+    inside = scene.cell_types == CellType.FLUID
+    assert abs(pull.mean().at_centers()[inside][:, 2].mean()) < 0.01 * 9.81
+
+
+def test_a_guided_run_goes_through_the_speeds_of_its_film_where_a_free_one_does_not(channel):
+    scene = channel(FRAMES)
+    speed = 2.0 * float(np.linalg.norm(scene.parameters.inflow_velocity))
+    asset, motion = of(scene), film(scene.terrain.grid, (speed, 0.0), interval=0.5 * FRAMES * scene.interval)
+    guided = following(scene, asset, Filmed(motion=motion), shares(guide=1.0))
+    assert guided.force is None and guided.guide is not None
+
+    def pace(of_scene) -> list[float]:
+        simulator, found = simulator_of(of_scene), []
+        for _ in range(FRAMES - 1):
+            simulator.advance(scene.interval)
+            found.append(float(simulator.particles.velocities[:, 0].mean()))
+        return found
+
+    swinging, free = pace(guided), pace(scene)
+    middle = FRAMES // 2 - 1
+    # the film's second frame, which stands still, is in the middle of the run
+    assert max(swinging[:middle]) - swinging[middle] > 3.0 * np.ptp(free)
+    assert max(swinging[middle:]) - swinging[middle] > 3.0 * np.ptp(free)
+    assert scene.parts.get("guide") is None and "guide" in guided.parts, "a run that goes on is not that of another"
+
+
+def test_a_guide_that_the_asset_lacks_is_said(channel):
+    scene = channel(2)
+    found = following(scene, of(scene), Filmed(), shares(guide=1.0))
+    assert found.guide is None and [code_of(n) for n in found.notes] == ["guide-missing"]
+
+
+def test_the_guide_fades_where_the_ground_was_dug(channel):
+    scene = channel(2)
+    dug = scene.terrain.signed_distance.copy()
+    dug[2, 4, 2] += scene.terrain.grid.spacing
+    edited = replace(scene, terrain=replace(scene.terrain, signed_distance=dug))
+    found = following(edited, of(scene), Filmed(motion=film(scene.terrain.grid, (1.0,))), shares(guide=1.0))
+    assert found.guide_rates[0][2, 4, 2] == 0.0 < found.guide_rates[0][-1, 4, 2]
+
+
+def test_the_motion_of_each_frame_is_kept_in_the_asset_and_read_when_asked_for(tmp_path, channel):
+    grid = channel(2).terrain.grid
+    motion = film(grid, (1.0, 2.0, 3.0), interval=0.04, start=1)
+    write_filmed(tmp_path, Filmed(motion=motion))
+    assert read_filmed(tmp_path).motion is None and not (tmp_path / FILES["force"]).exists()
+    found = read_filmed(tmp_path, motion=True).motion
+    assert found is not None and (found.interval, found.start) == (0.04, 1)
+    np.testing.assert_array_equal(found.u, motion.u)
+    write_filmed(tmp_path, Filmed())
+    assert not (tmp_path / FILES["motion"]).exists(), "that of an older run"
+    np.savez(tmp_path / FILES["motion"], u=motion.u, v=motion.v[:2], w=motion.w, interval=0.04, start=0)
+    with pytest.raises(InputRejected, match="make the asset again"):
+        read_filmed(tmp_path, motion=True)
+
+
+def test_a_coarser_copy_gets_a_coarser_motion(tmp_path, made):
+    asset, grid = coarser(load_asset(made.folder)), load_asset(made.folder).grid
+    write_filmed(tmp_path, Filmed(motion=film(grid, (1.0, 2.0))))
+    (empty := tmp_path / "empty").mkdir()
+    config = build_config(overrides=["simulate.guide=1"])
+    scene = scene_of(asset, empty, SimulationRequest(meshes=tmp_path), config, footage=None, start=0)
+    assert scene.guide is not None and scene.guide.shape == asset.grid.shape
+    np.testing.assert_allclose(scene.guide.u[:, 1:-1, 1:-1, 1:-1].mean(axis=(1, 2, 3)), (1.0, 2.0))
+
+
+def test_between_the_frames_of_a_film_the_way_is_even_and_it_begins_anew():
+    motion = film(Grid((2, 2, 2), 1.0), (0.0, 1.0, 2.0), interval=0.5, start=1)
+    assert motion.around(0.0) == (1, 2, 0.0)
+    assert motion.around(0.75) == (2, 0, pytest.approx(0.5))
+    assert motion.around(1.5) == (1, 2, pytest.approx(0.0))
+    with pytest.raises(ValueError, match="same frames"):
+        replace(motion, v=motion.v[:2])

@@ -164,7 +164,7 @@ def test_an_edited_asset_becomes_a_scene_without_a_file(made, asset, tmp_path):
     assert len(simulator.particles) > 0
     filmed = read_filmed(made.folder)
     assert filmed.force is not None
-    same = edited_scene(asset, SceneEdits(), settings=SceneSettings(None, 0.5, 0), filmed=filmed)
+    same = edited_scene(asset, SceneEdits(), settings=SceneSettings(None, 0.5, 0.0, 0), filmed=filmed)
     np.testing.assert_allclose(same.force.u, 0.5 * filmed.force.u)
 
 

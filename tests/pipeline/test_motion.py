@@ -4,7 +4,7 @@ import numpy as np
 
 from fluidlift.config import build_config
 from fluidlift.motion.sequence import MotionOptions
-from fluidlift.pipeline.settings import MotionSettings, taken
+from fluidlift.pipeline.settings import MotionSettings
 from fluidlift.pipeline.volume_motion import motion_options, motion_scene, motion_warnings, seen_cells
 from fluidlift.types import Grid, SurfaceMotion
 
@@ -13,7 +13,7 @@ GRID = Grid((4, 3, 2), 0.5, (0.0, 0.0, 0.0))
 
 def options(*overrides):
     """Of a job with these settings."""
-    return motion_options(taken(MotionSettings, build_config(overrides=overrides).motion))
+    return motion_options(MotionSettings.of(build_config(overrides=overrides)))
 
 
 def test_the_settings_say_what_the_motion_does_by_itself():

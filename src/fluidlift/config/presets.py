@@ -56,6 +56,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "simulate.frames": (1, 1e6),
     "simulate.max_particles": (100, 1e9),
     "simulate.follow": (0, 1),
+    "simulate.guide": (0, 1),
     "simulate.checkpoint_every": (1, 1e6),
     "show.width": (16, 16384),
 }

@@ -191,6 +191,8 @@ class SimulateConfig:
     """who moves the particles of a liquid: the CPU (Numba), or a GPU (NVIDIA Warp, `pip install "fluidlift[cuda]"`)"""
     follow: float = 1.0
     """how far it keeps to the filmed flow where geometry does not explain it: 0 pure physics, 1 as filmed"""
+    guide: float = 0.0
+    """how far it is drawn to the filmed velocity of each frame besides, over and over: 0 not at all, 1 as filmed"""
     checkpoint_every: int = 10
     """frames between checkpoints, from which a stopped simulation goes on"""
 

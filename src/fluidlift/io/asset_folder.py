@@ -75,13 +75,14 @@ FILES = {
     "camera": "rest/camera.json",
     "film": "rest/film.mp4",
     "force": "rest/force.npz",
+    "motion": "rest/motion.npz",
     "parameters": "parameters.json",
     "scene": "scene.yaml",
 }
 """where the parts lie, relative to the folder"""
 
-OPTIONAL = frozenset({"film", "force"})
-"""parts that not every asset has: smoke has no film, and only streams and falls are calibrated"""
+OPTIONAL = frozenset({"film", "force", "motion"})
+"""parts that not every asset has: smoke has no film, only streams and falls are calibrated, and motion is asked for"""
 
 _HASHED = frozenset(FILES) - {"scene"} | {"usd"}
 """parts whose SHA-256 the manifest keeps: all but what a person edits, and what is large"""

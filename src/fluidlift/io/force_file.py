@@ -1,7 +1,10 @@
-"""What an asset carries of the filmed flow: the steady body force that keeps it, and the cells where it never is."""
+"""What an asset carries of the filmed flow: the steady body force that keeps it, the cells where it never is, and its
+motion frame by frame, where that was asked for."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -12,40 +15,64 @@ from fluidlift.io.array_archive import read_arrays
 from fluidlift.io.asset_folder import FILES
 from fluidlift.io.asset_paths import asset_file
 from fluidlift.io.atomic import atomic_write
-from fluidlift.types import FaceVelocity, Filmed
+from fluidlift.types import FaceVelocity, Filmed, FilmedMotion
 
 
 def write_filmed(folder: Path, filmed: Filmed) -> None:
-    """Write it into an asset; one without a force takes away an older one."""
-    path = asset_file(folder, FILES["force"])
-    if filmed.force is None:
+    """Write it into an asset; what it lacks is taken away where an older run left it."""
+    arrays: dict[str, Any] = {}
+    if filmed.force is not None:
+        arrays = {n: c.astype(np.float32) for n, c in zip("uvw", filmed.force.components)}
+        if filmed.dry is not None:
+            arrays["dry"] = np.packbits(filmed.dry)
+    _write(asset_file(folder, FILES["force"]), arrays)
+    motion: dict[str, Any] = {}
+    if filmed.motion is not None:
+        motion = dict(zip("uvw", filmed.motion.components))
+        motion |= {"interval": np.float64(filmed.motion.interval), "start": np.int64(filmed.motion.start)}
+    _write(asset_file(folder, FILES["motion"]), motion)
+
+
+def _write(path: Path, arrays: dict[str, Any]) -> None:
+    if not arrays:
         path.unlink(missing_ok=True)
         return
     path.parent.mkdir(parents=True, exist_ok=True)
-    arrays: dict[str, Any] = {n: c.astype(np.float32) for n, c in zip("uvw", filmed.force.components)}
-    if filmed.dry is not None:
-        arrays["dry"] = np.packbits(filmed.dry)
     with atomic_write(path) as stream:
         np.savez_compressed(stream, **arrays)
 
 
-def read_filmed(folder: Path) -> Filmed:
+def read_filmed(folder: Path, *, motion: bool = False) -> Filmed:
     """That of an asset; nothing where it has none, no dry cells where an older version made it.
+
+    Args:
+        folder: of the asset.
+        motion: that of each frame, too: some megabytes.
 
     Raises:
         InputRejected: a damaged file.
     """
-    path = asset_file(folder, FILES["force"])
-    if not path.is_file():
-        return Filmed()
-    found = read_arrays(path, ("u", "v", "w"))
+    path, moving, force, dry = asset_file(folder, FILES["force"]), asset_file(folder, FILES["motion"]), None, None
+    if path.is_file():
+        found = read_arrays(path, ("u", "v", "w"))
+        with _named(path, "a force on the faces of a grid"):
+            force = FaceVelocity(*(np.asarray(found[n], np.float32) for n in "uvw"))
+            dry = _unpacked(found["dry"], force.shape) if "dry" in found else None
+    if not motion or not moving.is_file():
+        return Filmed(force, dry)
+    found = read_arrays(moving, ("u", "v", "w", "interval", "start"))
+    with _named(moving, "velocities of frames on the faces of a grid"):
+        u, v, w = (np.asarray(found[n], np.float16) for n in "uvw")
+        return Filmed(force, dry, FilmedMotion(u, v, w, float(found["interval"]), int(found["start"])))
+
+
+@contextmanager
+def _named(path: Path, wanted: str) -> Iterator[None]:
+    """What is wrong with arrays, as a word about their file."""
     try:
-        force = FaceVelocity(*(np.asarray(found[n], np.float32) for n in "uvw"))
-        return Filmed(force, _unpacked(found["dry"], force.shape) if "dry" in found else None)
+        yield
     except (IndexError, TypeError, ValueError) as error:
-        raise InputRejected(
-            f"'{path.name}': {error}", "a force on the faces of a grid", "make the asset again"
-        ) from None
+        raise InputRejected(f"'{path.name}': {error}", wanted, "make the asset again") from None
 
 
 def _unpacked(bits: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:

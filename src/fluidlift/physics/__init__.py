@@ -14,8 +14,8 @@ Modules of the face:
     emitter               Emitters: closed meshes in the world whose volume is kept full of fluid while they are on
     gas                   The gas simulator: smoke in air on a MAC grid, with MacCormack advection; tracers move by
                           RK2
-    guidance              Nudging and other body forces that depend on place: a pull towards a known flow, and a
-                          steady one that keeps it
+    guidance              Nudging and other body forces that depend on place: a pull towards a known flow, a steady
+                          one that keeps it, and one that goes through a film
     inflow_schedule       The inflow over time: a factor on the inflow's velocity, between keyframes, with a surge
                           of its own
     inlet                 The inlet: Dirichlet velocity in INFLOW cells (paper: v_in, v~_in) and gap-free emission

@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from numba import njit
 
 from fluidlift.numerics.sampling import gradient_nodes
@@ -222,6 +222,13 @@ def extrapolate(
             first, last = new_first, new_last
         out.append(field)
     return FaceVelocity(*out)
+
+
+def continued(velocity: FaceVelocity, cell_types: UInt8[np.ndarray, "nx ny nz"]) -> FaceVelocity:
+    """The velocity (m/s) of a liquid, continued into air and walls, where it is stored as 0."""
+    return extrapolate(
+        velocity, touching_faces(np.isin(cell_types, (CellType.FLUID, CellType.INFLOW, CellType.OUTFLOW)))
+    )
 
 
 @shared(lambda u, v, w, opening, normals, axis, out: (0, out.shape[0]))

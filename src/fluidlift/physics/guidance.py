@@ -1,4 +1,5 @@
-"""Nudging and other body forces that depend on place: a pull towards a known flow, and a steady one that keeps it.
+"""Nudging and other body forces that depend on place: a pull towards a known flow, a steady one that keeps it, and one
+that goes through a film.
 
 Nudging (Newtonian relaxation, Hoke and Anthes 1976) adds dv/dt = (v_target - v) / tau. Its time mean is what the
 model lacks to keep the target by itself (flux adjustment): applied alone, it is a force like gravity, and waves, wakes
@@ -15,7 +16,7 @@ from jaxtyping import Float
 
 from fluidlift.errors import require
 from fluidlift.physics.active_region import Box, face_box
-from fluidlift.types import FaceVelocity
+from fluidlift.types import FaceVelocity, FilmedMotion
 
 Masses = tuple[Float[np.ndarray, "..."], ...]
 """kg of liquid at the faces of each component"""
@@ -25,8 +26,9 @@ class BodyForce(ABC):
     """An acceleration in each place."""
 
     @abstractmethod
-    def applied(self, velocity: FaceVelocity, masses: Masses, box: Box, dt: float) -> FaceVelocity:
-        """The velocity (m/s) after dt (s), on the faces of the window `box` of the simulator's grid."""
+    def applied(self, velocity: FaceVelocity, masses: Masses, box: Box, dt: float, time: float = 0.0) -> FaceVelocity:
+        """The velocity (m/s) after dt (s), on the faces of the window `box` of the simulator's grid, from `time` (s) of
+        the simulation on."""
 
     @property
     def largest(self) -> float:
@@ -47,7 +49,7 @@ class SteadyForce(BodyForce):
         squares = [float(np.square(c).max(initial=0.0)) for c in acceleration.components]
         self._largest = float(np.sqrt(sum(squares)))
 
-    def applied(self, velocity: FaceVelocity, masses: Masses, box: Box, dt: float) -> FaceVelocity:
+    def applied(self, velocity: FaceVelocity, masses: Masses, box: Box, dt: float, time: float = 0.0) -> FaceVelocity:
         """v + a dt."""
         pairs = zip(velocity.components, self._acceleration.components)
         return FaceVelocity(*(v + np.float32(dt) * a[face_box(box, axis)] for axis, (v, a) in enumerate(pairs)))
@@ -60,12 +62,19 @@ class SteadyForce(BodyForce):
 
 @final
 class Nudging(BodyForce):
-    """A pull towards a velocity, and the mean of what it took.
+    """A pull towards a velocity, a force that is learnt from it, and the mean of what both took.
+
+    A pull alone stays behind: where drag or gravity act against it, the flow under it is as far from the target as the
+    pull has to be strong, and its mean, applied alone, keeps that flow and not the target. So a force follows the pull,
+    dF/dt = (gain pull - F) / learning (the integral part of a controller, with a leak): in a steady state the flow
+    stays behind 1 + gain times less. Without the leak it would grow for ever where no force can help, as across walls.
 
     Args:
         target: m/s, on the faces of the simulator's grid.
         rates: 1/s per component, of its faces; 0 where nothing is known.
         after: s of the simulation that do not count in the mean.
+        gain: of the learnt force over the pull in the long run; 0: none is learnt.
+        learning: s over which it is learnt.
     """
 
     def __init__(
@@ -74,23 +83,35 @@ class Nudging(BodyForce):
         rates: tuple[Float[np.ndarray, "..."], ...],
         *,
         after: float = 0.0,
+        gain: float = 0.0,
+        learning: float = 1.0,
     ) -> None:
         for rate, component in zip(rates, target.components):
             require(rate.shape == component.shape, f"rates {rate.shape}", str(component.shape))
-        self._target, self._rates = target, rates
+        require(gain >= 0 and learning > 0, f"gain {gain}, learning {learning} s", "0 or more, above 0 s")
+        self._target, self._rates, self._gain, self._learning = target, rates, gain, learning
+        self._learnt = [np.zeros(c.shape, np.float32) for c in target.components]
         self._sum = [np.zeros(c.shape, np.float32) for c in target.components]
+        self._behind = [np.zeros(c.shape, np.float32) for c in target.components]
         self._time = [np.zeros(c.shape, np.float32) for c in target.components]
         self._passed, self._after = 0.0, after
 
-    def applied(self, velocity: FaceVelocity, masses: Masses, box: Box, dt: float) -> FaceVelocity:
-        """v + (1 - exp(-dt / tau)) (v_target - v): the exact decay, which does not overshoot for any dt."""
-        out = []
+    def applied(self, velocity: FaceVelocity, masses: Masses, box: Box, dt: float, time: float = 0.0) -> FaceVelocity:
+        """v + (1 - exp(-dt / tau)) (v_target - v) + F dt: the decay is exact, and does not overshoot for any dt."""
+        out, part = [], np.float32(-np.expm1(-dt / self._learning))
         for axis, (v, mass) in enumerate(zip(velocity.components, masses)):
             faces = face_box(box, axis)
             share = -np.expm1(-np.float32(dt) * self._rates[axis][faces])
-            change = share * (self._target.components[axis][faces] - v)
-            wet = (mass > 0) & (self._passed >= self._after)
+            behind = self._target.components[axis][faces] - v
+            pull = share * behind
+            held, learnt = mass > 0, self._learnt[axis][faces]
+            if self._gain > 0:
+                wanted = np.float32(self._gain / dt) * pull
+                learnt += np.where(held, part * (wanted - learnt), np.float32(0))
+            change = pull + np.float32(dt) * learnt
+            wet = held & (self._passed >= self._after)
             self._sum[axis][faces] += np.where(wet, change, np.float32(0))
+            self._behind[axis][faces] += np.where(wet, np.float32(dt) * behind, np.float32(0))
             self._time[axis][faces] += np.where(wet, np.float32(dt), np.float32(0))
             out.append(v + change)
         self._passed += dt
@@ -101,6 +122,39 @@ class Nudging(BodyForce):
 
         Where liquid comes by only now and then, the pull is that of splashes.
         """
+        return self._mean(self._sum)
+
+    def behind(self) -> FaceVelocity:
+        """The mean of target - v (m/s) over the same time: what stayed in spite of all."""
+        return self._mean(self._behind)
+
+    def _mean(self, sums: list[np.ndarray]) -> FaceVelocity:
         least = 0.5 * max(self._passed - self._after, 0.0)
-        pairs = zip(self._sum, self._time)
+        pairs = zip(sums, self._time)
         return FaceVelocity(*(np.where(t > least, s / np.maximum(t, 1e-9), 0).astype(np.float32) for s, t in pairs))
+
+
+@final
+class Guiding(BodyForce):
+    """A pull towards the velocity of each frame of a film, over and over; linear in time between its frames.
+
+    Args:
+        film: on the faces of the simulator's grid.
+        rates: 1/s per component, of its faces; 0 where it does not count.
+    """
+
+    def __init__(self, film: FilmedMotion, rates: tuple[Float[np.ndarray, "..."], ...]) -> None:
+        for rate, component in zip(rates, film.components):
+            require(rate.shape == component.shape[1:], f"rates {rate.shape}", str(component.shape[1:]))
+        self._film, self._rates = film, rates
+
+    def applied(self, velocity: FaceVelocity, masses: Masses, box: Box, dt: float, time: float = 0.0) -> FaceVelocity:
+        """v + (1 - exp(-dt / tau)) (v_target - v), with the target half a step later."""
+        before, after, way = self._film.around(time + 0.5 * dt)
+        out = []
+        for axis, (v, rate, frames) in enumerate(zip(velocity.components, self._rates, self._film.components)):
+            faces = face_box(box, axis)
+            first, second = (frames[k][faces].astype(np.float32) for k in (before, after))
+            target = first + np.float32(way) * (second - first)
+            out.append(v - np.expm1(-np.float32(dt) * rate[faces]) * (target - v))
+        return FaceVelocity(*out)

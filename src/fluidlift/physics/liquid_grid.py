@@ -205,9 +205,12 @@ class LiquidGrid:
         rate = self._last_rate(region)
         bodies.predict(dt, rate)
         solid = bodies.face_velocity()
-        forced = add_gravity(carried, self.parameters.gravity, dt)
+        # a pull is held against the velocity that the step before ended with: with gravity, which the pressure is still
+        # to balance, it would carry a part of the liquid's weight
+        forced = carried
         for force in self._forces:
-            forced = force.applied(forced, masses, region.box, dt)
+            forced = force.applied(forced, masses, region.box, dt, time)
+        forced = add_gravity(forced, self.parameters.gravity, dt)
         velocity = self._impose(forced, region, outlet, time)
         known, system = self._known(layout, region, dt), self._system(layout, region, outlet)
         moving = _wet_faces(layout.wet | (layout.holding == CellType.FLUID), walls)

@@ -101,7 +101,7 @@ def _lifted(runner: Runner, given: GivenFiles, config: JobConfig, hints: ClipHin
     geometry = begin.shape(runner, seen, given, config, hints)
     settings = taken(RefineSettings, config.shape, seed=config.seed)
     refined = runner.run("refine", refine, *seen, geometry, given.geometry, settings)
-    moving = runner.run("motion", motion, *seen, geometry, taken(MotionSettings, config.motion))
+    moving = runner.run("motion", motion, *seen, geometry, MotionSettings.of(config, guide=True))
     fitted = runner.run("fit", fit, read, segmentation, geometry, moving, config.fit)
     return Lift(read, flow, segmentation, geometry, refined, moving, fitted)
 
@@ -149,7 +149,7 @@ def _write_asset(runner: Runner, lift: Lift, config: JobConfig, provenance: dict
         provenance=provenance | origin,
     )
     calibration = _calibrated(runner, lift, asset, config)
-    write_filmed(folder, Filmed(calibration.force, calibration.dry))
+    write_filmed(folder, Filmed(calibration.force, calibration.dry, lift.motion.filmed))
     save_asset(
         folder,
         asset,

@@ -19,7 +19,7 @@ from fluidlift.pipeline import begin
 from fluidlift.pipeline.frame_files import FrameWriter, MotionFiles, WritingPlace
 from fluidlift.pipeline.inputs import GivenFiles, Inputs
 from fluidlift.pipeline.runner import Runner, gone_if_refused, require_stages
-from fluidlift.pipeline.settings import MotionSettings, taken
+from fluidlift.pipeline.settings import MotionSettings
 from fluidlift.pipeline.volume_motion import motion_options, motion_scene, motion_warnings
 from fluidlift.pipeline.work import Work
 from fluidlift.seams import Progress, Silence
@@ -68,7 +68,7 @@ def measure_motion(
         seen = begin.look(runner, given, config)
         geometry = begin.shape(runner, seen, given, config)
         found = runner.run(
-            "velocities", write_velocities, *seen, geometry, files, taken(MotionSettings, config.motion),
+            "velocities", write_velocities, *seen, geometry, files, MotionSettings.of(config),
             beside={"place": WritingPlace(folder, inputs, "velocities" in runner.force)},
             still_there=lambda made: _all_there(folder, files, made), owns_files=True,
         )  # fmt: skip

@@ -257,6 +257,13 @@ class MotionSettings:
     divergence: str
     targets: int
     complete_every: int
+    every_frame: bool
+    """whether the volume velocity of all frames is wanted, to guide a simulation"""
+
+    @classmethod
+    def of(cls, config: JobConfig, *, guide: bool = False) -> MotionSettings:
+        """From those of a job; `guide` asks for the velocities that a guided simulation needs, where it wants them."""
+        return taken(cls, config.motion, every_frame=guide and config.simulate.guide > 0)
 
 
 @dataclass(frozen=True)

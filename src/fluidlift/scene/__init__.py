@@ -9,6 +9,8 @@ Modules of the face:
                         undone or not
     edits               Edits of an asset: one model behind scene.yaml, the command line, Python and the viewer
     footage             The clip that an asset comes from, where it is still at hand
+    force_weight        How far a scene keeps the force that holds the filmed flow: where a person changed it, the
+                        flow finds its own way
     forecast            What the next simulation will meet, said when an edit is made: from the files alone, without
                         building the scene
     open_water          Where on a fluid there is room for something new: not in the ground, the inlet, or what was
@@ -53,7 +55,7 @@ def __getattr__(name: str) -> _Any:
 
 __all__ = [
     "Add", "Change", "EditSession", "Remove", "Scene", "Set", "SimulationRequest", "build", "coarse_copy",
-    "dry_cells", "edit_history", "edited_scene", "edits", "footage", "forecast", "open_water", "recall",
+    "dry_cells", "edit_history", "edited_scene", "edits", "footage", "force_weight", "forecast", "open_water", "recall",
     "reshaping", "scene_of", "settings", "simulated_history", "simulation", "simulator", "simulator_of",
     "splat_files", "surface_appearance", "whitewater",
 ]  # fmt: skip

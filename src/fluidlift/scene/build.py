@@ -26,6 +26,7 @@ from fluidlift.types import (
     CellType,
     FaceVelocity,
     Filmed,
+    FilmedMotion,
     FluidAsset,
     FluidParameters,
     Gaussians,
@@ -121,6 +122,10 @@ class Scene:
     """m/s^2 on the faces of the terrain's grid, beside gravity"""
     dry: np.ndarray | None = None
     """bool [nx,ny,nz]: cells that the clip shows dry throughout, from which fluid is taken out"""
+    guide: FilmedMotion | None = None
+    """on the faces of the terrain's grid, towards which the flow is drawn; None: it runs free"""
+    guide_rates: tuple[np.ndarray, ...] = ()
+    """1/s, how fast, on the faces of each component"""
     whitewater: float = 0.0
     """times as much white water as the clip shows; 0: none is simulated"""
     as_lifted: Scene | None = None
@@ -163,6 +168,8 @@ class Scene:
             found["inflow"] = _hash(self.inflow)
         if self.force is not None:
             found["force"] = _hash(*self.force.components)
+        if self.guide is not None:
+            found["guide"] = _hash(*self.guide.components, self.guide.interval, self.guide.start, *self.guide_rates)
         if self.dry is not None:
             found["dry cells"] = _hash(self.dry)
         if self.whitewater > 0:
@@ -235,7 +242,7 @@ def scene_of(
     # edits that are tried out lie elsewhere than their asset
     home = folder if request.meshes is None or (folder / "manifest.json").is_file() else request.meshes
     settings = SceneSettings.of(config)
-    filmed = read_filmed(home) if settings.follow > 0 else None
+    filmed = read_filmed(home, motion=settings.guide > 0) if max(settings.follow, settings.guide) > 0 else None
     return edited_scene(
         asset, edits, request, settings, footage=footage, start=start, film=film_of(home), filmed=filmed
     )
@@ -297,7 +304,7 @@ def edited_scene(
     if longer > 0:
         scene = extended(scene, longer)
     scene = with_emitters(with_terrain(scene, edits.terrain), edits.emitters)
-    scene = following(scene, asset, filmed or Filmed(), settings.follow)
+    scene = following(scene, asset, filmed or Filmed(), settings)
     amount = whitewater_amount(scene, edits.whitewater)
     if amount > 0:
         plain = SimulationRequest(fps=request.fps)
@@ -358,12 +365,9 @@ def beyond_surface(asset: FluidAsset) -> FaceVelocity:
     The body's surface lies inside a layer of cells: what is there would take up to half of its speed from the air, and
     a stream of five cells would lose a fifth of its momentum before it moves. The air around smoke has its own.
     """
-    from fluidlift.physics.boundaries import extrapolate, touching_faces
+    from fluidlift.physics.boundaries import continued
 
-    if kind_of(asset.kind).is_gas:
-        return asset.velocity
-    liquid = np.isin(asset.cell_types, (CellType.FLUID, CellType.INFLOW, CellType.OUTFLOW))
-    return extrapolate(asset.velocity, touching_faces(liquid))
+    return asset.velocity if kind_of(asset.kind).is_gas else continued(asset.velocity, asset.cell_types)
 
 
 def extended(scene: Scene, length: float) -> Scene:

@@ -13,9 +13,10 @@ class SceneSettings:
 
     frames: int | None
     follow: float
+    guide: float
     seed: int
 
     @classmethod
     def of(cls, config: JobConfig) -> SceneSettings:
         """From those of a job."""
-        return cls(config.simulate.frames, config.simulate.follow, config.seed)
+        return cls(config.simulate.frames, config.simulate.follow, config.simulate.guide, config.seed)

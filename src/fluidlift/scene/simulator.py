@@ -54,10 +54,12 @@ def simulator_of(scene: Scene, device: str = "cpu", forces: Sequence[BodyForce] 
             buoyancy=float(np.linalg.norm(parameters.gravity)), supply=supply,
         )  # fmt: skip
     from fluidlift.physics.apic import LiquidSimulator
-    from fluidlift.physics.guidance import SteadyForce
+    from fluidlift.physics.guidance import Guiding, SteadyForce
 
     if scene.force is not None:
         forces = (*forces, SteadyForce(scene.force))
+    if scene.guide is not None:
+        forces = (*forces, Guiding(scene.guide, scene.guide_rates))
     cells, body = within_outlet(scene)
     simulator = LiquidSimulator(
         grid, scene.terrain, parameters, body, cell_types=cells, inflow_profile=scene.velocity,

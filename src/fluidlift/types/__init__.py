@@ -26,7 +26,7 @@ from fluidlift.types.asset import FORMAT_VERSION, FluidAsset
 from fluidlift.types.camera import PinholeCamera, ViewKey
 from fluidlift.types.clip import Label, PixelLabels, VideoClip
 from fluidlift.types.evidence import KindEvidence, MetricScale, SlopeEvidence, UpEvidence
-from fluidlift.types.filmed import Filmed
+from fluidlift.types.filmed import Filmed, FilmedMotion
 from fluidlift.types.flow import PixelFlow, SurfaceMotion
 from fluidlift.types.gaussians import SH_C0, Gaussians, concatenate, decompose_covariances, sh_from_rgb
 from fluidlift.types.grid import CellType, FaceVelocity, Grid, triple
@@ -44,7 +44,7 @@ __all__ = [
     "CellType",
     "Estimate",
     "FaceVelocity",
-    "Filmed",
+    "Filmed", "FilmedMotion",
     "FitResult",
     "FluidAsset",
     "FluidKind",

@@ -17,6 +17,7 @@ from fluidlift.messages import Notice
 from fluidlift.types.camera import PinholeCamera
 from fluidlift.types.clip import PixelLabels, VideoClip
 from fluidlift.types.evidence import KindEvidence, MetricScale, SlopeEvidence, UpEvidence
+from fluidlift.types.filmed import FilmedMotion
 from fluidlift.types.flow import PixelFlow
 from fluidlift.types.gaussians import Gaussians
 from fluidlift.types.grid import FaceVelocity, Grid
@@ -226,6 +227,8 @@ class Motion:
     """median over the targets, of what a moving front was sped up by"""
     free_fall_share: float
     """of the steep part, whose speed is that of free fall, at most"""
+    filmed: FilmedMotion | None = None
+    """of all frames, continued into air and walls, to guide a simulation; None: not asked for"""
     warnings: tuple[Notice, ...] = ()
 
     def __post_init__(self) -> None:

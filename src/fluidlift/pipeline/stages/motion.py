@@ -6,7 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fluidlift.io.footage_file import MOST_FRAMES
 from fluidlift.motion.steady_flow import pairs_of, spans_of
+from fluidlift.physics.boundaries import continued
 from fluidlift.pipeline.settings import MotionSettings
 from fluidlift.pipeline.volume_motion import (
     motion_options,
@@ -17,7 +19,8 @@ from fluidlift.pipeline.volume_motion import (
     seen_cells,
 )
 from fluidlift.pipeline.work import Work
-from fluidlift.types import FaceVelocity, kind_of
+from fluidlift.scene.build import first_of_film
+from fluidlift.types import FaceVelocity, FilmedMotion, kind_of
 from fluidlift.types.fluid_masks import FluidMasks
 from fluidlift.types.stages import Flow, Geometry, Motion, Read, Segmentation, TargetVelocity
 
@@ -36,7 +39,8 @@ def motion(
     start = min(geometry.rest_frame, pairs - 1)
     stands = kind_of(geometry.kind).starts_at_rest  # its body is known as it stands, not as it collapses
     targets = range(start, start if stands else min(start + config.targets, pairs))
-    wanted = sorted({start, *targets} | set(range(0, pairs, config.complete_every)))
+    film = _frames_of_film(geometry, pairs) if config.every_frame else range(0)
+    wanted = sorted({start, *targets, *film} | set(range(0, pairs, config.complete_every)))
     spans = spans_of(clip)
     completed = work.scratch.array("completed", (pairs, height, width, 2), np.float16)
     observed = work.scratch.array("observed", (pairs, height, -(-width // 8)), np.uint8)
@@ -44,19 +48,24 @@ def motion(
         completed[t] = np.nan
     found: list[TargetVelocity] = []
     seen: list[FrameMotion] = []
+    filmed: dict[int, FaceVelocity] = {}
     scene, options = motion_scene(clip, geometry), motion_options(config)
     seen_flow = seen_beside(pairs_of(clip, flow.flow), geometry)
     for frame in motion_sequence(
-        seen_flow, masks.__getitem__, pairs, scene, options, frames=wanted, volume_frames=targets
+        seen_flow, masks.__getitem__, pairs, scene, options, frames=wanted, volume_frames={*targets, *film}
     ):
         work.step(wanted.index(frame.frame), len(wanted))
         completed[frame.frame] = spans[frame.frame] * frame.displacement
         observed[frame.frame] = np.packbits(frame.observed, axis=-1)
         if frame.velocity is None or frame.surface is None:
             continue
+        velocity = FaceVelocity(*(component.astype(np.float32) for component in frame.velocity.components))
+        if frame.frame in film:
+            filmed[frame.frame] = continued(velocity, geometry.setting.cell_types)
+        if frame.frame not in targets:
+            continue
         wet = masks[frame.frame]
         share = float(frame.observed[wet].mean()) if wet.any() else None
-        velocity = FaceVelocity(*(component.astype(np.float32) for component in frame.velocity.components))
         cells = seen_cells(frame.surface, grid)
         found.append(TargetVelocity(frame.frame, velocity, cells, share, plain_report(frame)))
         seen.append(frame)
@@ -72,5 +81,24 @@ def motion(
         observed_bits=observed,
         front_factor=float(np.median(factors)) if factors else 1.0,
         free_fall_share=fast,
+        filmed=_film_of(filmed, film, start, clip.interval),
         warnings=tuple(motion_warnings([t.plain() for t in found], geometry.kind, fast)),
     )
+
+
+def _frames_of_film(geometry: Geometry, pairs: int) -> range:
+    """Those whose motion can guide a simulation: of what runs in a channel, where its surface's film is."""
+    if not kind_of(geometry.kind).is_channel_flow:
+        return range(0)
+    first = first_of_film(geometry.rest_frame, pairs + 1)
+    return range(min(first, pairs - 1), min(first + MOST_FRAMES, pairs))
+
+
+def _film_of(velocities: dict[int, FaceVelocity], film: range, start: int, interval: float) -> FilmedMotion | None:
+    """The velocities (m/s) of these frames; one without fluid moves as the known one before it, or the first."""
+    if not velocities:
+        return None
+    known = sorted(velocities)
+    each = [velocities[max((k for k in known if k <= t), default=known[0])].components for t in film]
+    u, v, w = (np.stack(c).astype(np.float16) for c in zip(*each))
+    return FilmedMotion(u, v, w, interval, start - film.start)

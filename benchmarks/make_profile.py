@@ -22,13 +22,12 @@ import time
 from collections import defaultdict
 from pathlib import Path
 from types import FrameType
-from typing import Any
 
 TICK = 0.005
 """s of processor time between two looks"""
 PARTS = ("kernels", "arrays", "own lines", "compilation", "disk")
-"""of a stage: compiled functions that threads share; NumPy, SciPy, OpenCV and torch inside their own Python; lines of the
-package, with what they call that is neither Python nor shared; Numba at work; files written and read, videos included"""
+"""of a stage: compiled functions that threads share; NumPy, SciPy, OpenCV and torch inside their own Python; lines of
+the package, with what they call that is neither Python nor shared; Numba at work; files written and read"""
 FILES = ("fluidlift/io/", "/av/", "pathlib.py", "shutil.py", "tempfile.py", "zipfile.py", "/json/")
 ARRAYS = ("/numpy/", "/scipy/", "/torch/", "/cv2/")
 

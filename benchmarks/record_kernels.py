@@ -1,7 +1,7 @@
 """Writes src/fluidlift/kernels.json: what the jobs of the package compile, stage by stage.
 
-    python benchmarks/record_kernels.py        makes the four assets of tests/catalogue.py with an empty cache, and
-                                               simulates one of them again with white water (5 min)
+    python benchmarks/record_kernels.py        makes the four assets of tests/catalogue.py with an empty cache, and a
+                                               small scene with white water (5 min)
 
 Run it when kernels were added, renamed or called with other types. Only what Python calls is listed: what a kernel
 calls is compiled with it.
@@ -14,6 +14,7 @@ import os
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -45,12 +46,35 @@ class Recorder:
             self.of_demo.setdefault((name, types), self.asset == "demo")
 
 
-def _with_whitewater(asset: Path) -> None:
-    """Simulate it again with twice the inflow, and with what breaks then: no asset has white water as lifted."""
-    from fluidlift.cli import main
+def _with_whitewater(place: Path) -> None:
+    """A small channel whose film shows foam, into which fast water runs: no asset of the catalogue has white water.
 
-    (asset / "scene.yaml").write_text("whitewater: {amount: 1.0}\ninflow: {factor: 2.0}\n", encoding="utf-8")
-    main(["sim", str(asset), "--duration", "0.2"])
+    Args:
+        place: folder for its film.
+    """
+    import numpy as np
+    from small_scene import striped_channel
+
+    from fluidlift.io.footage_file import write_footage
+    from fluidlift.scene.simulator import simulator_of
+    from fluidlift.scene.surface_appearance import SurfaceAppearance
+    from fluidlift.scene.whitewater import SceneWhitewater, measured
+
+    frames = np.full((16, 48, 64, 3), (40, 90, 120), np.uint8)
+    for k, frame in enumerate(frames):
+        for column in range(0, 64, 16):
+            frame[10:22, (column + k) % 60 : (column + k) % 60 + 4] = (225, 232, 235)
+    film = write_footage(place / "film.mp4", frames, np.ones(frames.shape[:3], bool), 0.04)
+    lifted = striped_channel(5, film=film)
+    fast = (lifted.body.positions[:, 0] > 0.3) & (lifted.body.positions[:, 0] < 0.7)
+    moves = np.where(fast[:, None], np.float32([3.0, 0.0, 0.0]), lifted.body.velocities)
+    scene = replace(lifted, body=replace(lifted.body, velocities=moves), whitewater=1.0, as_lifted=lifted)
+    simulator, appearance = simulator_of(scene), SurfaceAppearance(scene, SceneWhitewater(scene, measured(lifted)))
+    for k in range(5):
+        if k:
+            simulator.advance(scene.interval)
+        appearance.advance(simulator.particles, k)
+    appearance.dressed(simulator.particles, 4)
 
 
 def main() -> int:
@@ -79,9 +103,9 @@ def main() -> int:
             place = Path(cache) / "assets" / name
             place.mkdir(parents=True)
             recorder.asset = name
-            made = RECIPES[name](place)
-            if name == "stream":
-                _with_whitewater(made.folder)
+            RECIPES[name](place)
+        recorder.asset, recorder.stage = "white water", "simulate"
+        _with_whitewater(Path(cache))
         order = list(dict.fromkeys(row[0] for row in recorder.rows.values()))
         # what the demo, which is made first, does not call comes first: the process beside it begins at the end
         found = sorted(recorder.rows.items(), key=lambda item: (recorder.of_demo[item[0]], order.index(item[1][0])))

@@ -48,7 +48,7 @@ class Kernel:
 
 
 def listed() -> list[Kernel]:
-    """The kernels of the list, in the order in which a job calls them."""
+    """The kernels of the list, in the order in which a job calls them; first those that the demo does not call."""
     return [Kernel(s, f, tuple(t), c) for s, f, t, c in json.loads(LIST.read_text(encoding="utf-8"))]
 
 

@@ -58,6 +58,9 @@ class Generator(ABC):
 class FlowEstimator(ABC):
     """Motion of pixels between two pictures."""
 
+    any_thread = False
+    """whether several threads may ask at the same time"""
+
     @abstractmethod
     def displacement(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
         """float32 [H,W,2], px: where each pixel of `first` (u8 [H,W,3]) went in `second`."""

@@ -73,3 +73,14 @@ def test_few_or_broken_splats_pass_and_a_wrong_number_is_refused():
     assert np.isfinite(mixed(g, shear(4.0, len(g)), widest=0.5).sh).all()
     with pytest.raises(ValueError, match="deformations"):
         mixed(g, shear(4.0, 3), widest=0.5)
+
+
+def test_a_splat_that_keeps_its_colour_grows_as_one_that_shares_it():
+    g = chequered()
+    small = Gaussians(g.means, g.quats, 0.1 * g.scales, g.opacities, g.sh)
+    some = np.tile(np.eye(3), (len(g), 1, 1))
+    some[::2] = shear(4.0, len(g) // 2)
+    drawn, still = mixed(small, some, widest=9.0), mixed(small, np.tile(np.eye(3), (len(g), 1, 1)), widest=9.0)
+    inner = (np.abs(g.means[:, :2] - 5.5) < 4).all(1)
+    np.testing.assert_allclose(drawn.scales[inner], still.scales[inner], rtol=1e-6)
+    np.testing.assert_array_equal(drawn.sh[1::2], g.sh[1::2])

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
-from fluidlift.look.surface_map import SurfaceMap
+from fluidlift.look.surface_map import SurfaceMap, sampled
 
 CELL = 0.1
 STEP = 0.5 * CELL
@@ -82,3 +83,14 @@ def test_where_all_is_spray_the_surface_is_its_mean_and_not_the_maps_zero():
     assert surface.wet.sum() > 1000
     assert surface.height[surface.wet].min() > 1.9 and surface.height.max() < 8.1
     assert surface.at(surface.height, np.array([[4.5, 4.5]]))[0] == pytest.approx(5.0, abs=0.5)
+
+
+def test_a_picture_is_looked_up_as_scipy_does_it_to_the_last_bit():
+    rng = np.random.default_rng(0)
+    picture = rng.uniform(0, 1, (40, 31, 3)).astype(np.float32)
+    index = np.concatenate([rng.uniform(-5, 45, (4000, 2)), rng.integers(-1, 41, (200, 2))])
+    found = sampled(picture, index)
+    wanted = [ndimage.map_coordinates(picture[..., k], index.T, order=1, mode="nearest") for k in range(3)]
+    np.testing.assert_array_equal(found, np.stack(wanted, axis=-1))
+    broken = sampled(picture, np.array([[np.nan, 3.0], [2.0, np.inf]]))
+    np.testing.assert_array_equal(broken, [picture[0, 3], picture[2, -1]])

@@ -12,8 +12,10 @@ import pytest
 
 from fluidlift.motion.multiframe import (
     DARK,
+    MOST_AT_ONCE,
     REACH,
     SHORTEST,
+    each_pair,
     log_brightness,
     moving_detail,
     multiframe_flow,
@@ -261,15 +263,17 @@ def test_frames_on_disk_are_read_a_few_at_a_time(tmp_path: Path) -> None:
     path = tmp_path / "frames.npy"
     np.save(path, pictures(128 + 35 * drifting((2.0, 0.0), 60)))
     frames = np.load(path, mmap_mode="r")
+    estimator = DenseInverseSearch()
+    estimator.any_thread = False  # how many pairs lie in memory at the same time is a matter of chance else
     # the first call pays for what is loaded once
-    multiframe_flow(frames[:8], DenseInverseSearch())
+    multiframe_flow(frames[:8], estimator)
 
     def mapped(name: str, dtype: type, shape: tuple[int, ...]) -> np.memmap:
         return np.memmap(tmp_path / name, dtype, "w+", shape=shape)
 
     def most_memory(count: int, out: tuple[np.ndarray, np.ndarray] | None) -> float:
         tracemalloc.start()
-        multiframe_flow(frames[:count], DenseInverseSearch(), out=out)
+        multiframe_flow(frames[:count], estimator, out=out)
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         return peak
@@ -282,6 +286,33 @@ def test_frames_on_disk_are_read_a_few_at_a_time(tmp_path: Path) -> None:
     }
     # what is written to files is not in memory: not one picture of the 40 more
     assert most_memory(60, files[60]) - most_memory(20, files[20]) < picture
+
+
+@pytest.mark.parametrize("processors", [1, 2, 16])
+def test_pairs_side_by_side_are_few_and_come_in_order(monkeypatch: pytest.MonkeyPatch, processors: int) -> None:
+    monkeypatch.setattr("fluidlift.motion.multiframe.cores", lambda: processors)
+    begun: list[int] = []
+
+    def calls():
+        for k in range(40):
+            begun.append(k)
+            yield (k,)
+
+    ahead = []
+    for k, found in enumerate(each_pair(lambda n: n * n, calls(), DenseInverseSearch())):
+        assert found == k * k
+        ahead.append(len(begun) - k)
+    assert max(ahead) <= min(processors, MOST_AT_ONCE) + 1
+
+
+def test_flow_is_the_same_for_any_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    frames = pictures(128 + 35 * drifting((2.0, 0.0), 9))
+    side_by_side, alone = DenseInverseSearch(), DenseInverseSearch()
+    alone.any_thread = False
+    monkeypatch.setattr("fluidlift.motion.multiframe.cores", lambda: 4)
+    one, two = multiframe_flow(frames, alone), multiframe_flow(frames, side_by_side)
+    np.testing.assert_array_equal(one.displacement, two.displacement)
+    np.testing.assert_array_equal(one.confidence, two.confidence)
 
 
 @pytest.mark.parametrize("method", ["multiframe", "dis"])

@@ -82,9 +82,7 @@ def test_ground_that_flickers_in_the_light_of_a_plume_is_no_plume_and_its_quiet_
     activity = np.full((40, 40), 0.5, np.float32)
     activity[:, 15:25] = 1.6  # doubtful, by a third of the spread of still things
     activity[:10, 15:25] = 3.0
-    evidence = SimpleNamespace(
-        pictures=picture[None].repeat(3, axis=0), activity=activity, level=1.5, noise=np.ones((40, 40), np.float32)
-    )
+    evidence = SimpleNamespace(typical=picture, activity=activity, level=1.5, noise=np.ones((40, 40), np.float32))
     ground = smooth_ground(evidence, picture, known, lambda colours: np.zeros(colours.shape[:-1]))
     expected = np.zeros((40, 40), bool)
     expected[30:, 15:25] = True

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy import stats
+from scipy import special
 
 from fluidlift.fit.ranges import UNITS, ParameterSpace
 from fluidlift.types import Estimate
@@ -153,7 +153,7 @@ def block_scatter(
         used |= np.bincount(block, weights=rest**2, minlength=count) > 0
     sums = sums[used] - sums[used].mean(axis=0)
     freedom = max(len(sums) - parameters, 2)
-    student = stats.t.ppf(0.975, freedom) / stats.norm.ppf(0.975)
+    student = special.stdtrit(freedom, 0.975) / special.ndtri(0.975)  # Student's over the normal quantile
     return student**2 * len(sums) / freedom * np.einsum("bi,bj->ij", sums, sums)
 
 

@@ -20,6 +20,9 @@ RESOLVED = (2.0, 3.0)
 NEIGHBOURS = 12
 """splats that share a colour: those of two shells of a lattice"""
 
+SIXTH = 7
+"""place in the list of the nearest of the neighbour that says whether a splat stands alone; the first is itself"""
+
 APART = (3.0, 4.0)
 """distance to the sixth neighbour, in largest standard deviations, from which a splat is taken to stand alone: a sheet
 of splats at its pixels has 2.6"""
@@ -59,14 +62,21 @@ def mixed(shown: Gaussians, deformation: Float[np.ndarray, "n 3 3"], *, widest: 
     if len(at) == 0 or sound.sum() <= NEIGHBOURS:
         return shown
     around = np.flatnonzero(sound)
-    distance, near = nearest(shown.means[around], shown.means[at], NEIGHBOURS + 1, workers=-1)
-    weight = (1 - (distance / np.maximum(distance[:, -1:], 1e-12)) ** 2) ** 2 + 1e-9
-    weight /= weight.sum(axis=1, keepdims=True)
-    share, colours = share[at], shown.sh[:, 0]
-    sh, grown = shown.sh.copy(), shown.scales.copy()
-    sh[at, 0] += share[:, None] * (np.einsum("nk,nkc->nc", weight, colours[around[near]]) - colours[at])
-    gap = distance[:, 6] / np.maximum(size[at], 1e-12)
+    points, share, sh, grown = shown.means[around], share[at], shown.sh.copy(), shown.scales.copy()
+    blended, sixth = np.flatnonzero(share > 0), np.empty(len(at))
+    if len(blended):
+        distance, near = nearest(points, shown.means[at[blended]], NEIGHBOURS + 1, workers=-1)
+        weight = (1 - (distance / np.maximum(distance[:, -1:], 1e-12)) ** 2) ** 2 + 1e-9
+        weight /= weight.sum(axis=1, keepdims=True)
+        one, colours = at[blended], shown.sh[:, 0]
+        mean = np.einsum("nk,nkc->nc", weight, colours[around[near]])
+        sh[one, 0] += share[blended, None] * (mean - colours[one])
+        sixth[blended] = distance[:, SIXTH - 1]
+    kept = np.flatnonzero(share <= 0)
+    if len(kept):  # they may grow and keep their colour: one distance is enough
+        sixth[kept] = nearest(points, shown.means[at[kept]], np.array([SIXTH]), workers=-1)[0][:, 0]
+    gap = sixth / np.maximum(size[at], 1e-12)
     alone = np.clip((gap - APART[0]) / (APART[1] - APART[0]), 0.0, 1.0)
-    least = np.maximum(share, alone) * np.minimum(0.5 * distance[:, 6], widest)
+    least = np.maximum(share, alone) * np.minimum(0.5 * sixth, widest)
     grown[at] = np.maximum(shown.scales[at], least[:, None])
     return Gaussians(shown.means, shown.quats, grown, shown.opacities, sh)

@@ -15,14 +15,17 @@ once more over a gap of several frames, without the filter.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import TypeVar
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from fluidlift.errors import require
+from fluidlift.machine import cores
 from fluidlift.motion.confidence import (
     ROUND_TRIP_FLOOR,
     ROUND_TRIP_SHARE,
@@ -39,6 +42,7 @@ from fluidlift.motion.confidence import (
 from fluidlift.seams import FlowEstimator
 from fluidlift.types import PixelFlow
 
+T = TypeVar("T")
 Progress = Callable[[int, int], None]
 """called with (steps done, steps in all)"""
 
@@ -68,6 +72,8 @@ NEAR = 12.0
 """px: standard deviation of the surroundings in which moving detail makes rest doubtful"""
 NO_TRUST = 1e-4
 """weight of a frame without confidence in a mean over time: that of a confidence of one hundredth"""
+MOST_AT_ONCE = 4
+"""pairs that are measured side by side: each needs some thirty pictures' worth of arrays"""
 WORTH_A_LOOK = 0.01
 """share of the picture with texture and no detail that moves, from which slow motion is searched"""
 
@@ -239,17 +245,23 @@ def multiframe_flow(
     require(running_window(0, len(frames)) is not None, f"{len(frames)} frames", f"at least {SHORTEST + 1}")
     displacement, confidence = result_arrays(frames, out)
     pairs = len(displacement)
-    for t in range(pairs):
-        displacement[t], confidence[t] = flow_with_rest(frames, t, estimator)
+    each = ((frames, t, estimator) for t in range(pairs))
+    for t, found in enumerate(each_pair(flow_with_rest, each, estimator)):
+        displacement[t], confidence[t] = found
         if progress is not None:
             progress(t + 1, 2 * pairs)
-    earlier: deque[np.ndarray] = deque(maxlen=REACH)
-    for t in range(pairs):
-        own = np.array(displacement[t], np.float32)  # a copy: the array's own is overwritten below
-        window = [*earlier, own, *displacement[t + 1 : t + REACH + 1]]
-        surroundings = _trusted_mean(window, confidence[t - len(earlier) : t + REACH + 1])
-        earlier.append(own)
-        displacement[t] = refined(frames, t, own, surroundings, estimator)
+
+    def with_surroundings() -> Iterator[tuple[np.ndarray, int, np.ndarray, np.ndarray, FlowEstimator]]:
+        earlier: deque[np.ndarray] = deque(maxlen=REACH)
+        for t in range(pairs):
+            own = np.array(displacement[t], np.float32)  # a copy: the array's own is overwritten below
+            window = [*earlier, own, *displacement[t + 1 : t + REACH + 1]]
+            surroundings = _trusted_mean(window, confidence[t - len(earlier) : t + REACH + 1])
+            earlier.append(own)
+            yield frames, t, own, surroundings, estimator
+
+    for t, better in enumerate(each_pair(refined, with_surroundings(), estimator)):
+        displacement[t] = better
         if progress is not None:
             progress(pairs + t + 1, 2 * pairs)
     for t in range(pairs):
@@ -259,6 +271,31 @@ def multiframe_flow(
         assert here is not None
         confidence[t] *= agreement_over_time(before, here, after).astype(np.float16)
     return PixelFlow(displacement, confidence)
+
+
+def each_pair(measured: Callable[..., T], calls: Iterable[tuple], estimator: FlowEstimator) -> Iterator[T]:
+    """What `measured` finds for each of the calls' arguments, in order.
+
+    Pairs are measured side by side where the estimator bears it: OpenCV's search itself uses hardly more than one
+    thread. No more calls are begun ahead than there are threads, so memory stays that of a few pictures.
+    """
+    threads = min(cores(), MOST_AT_ONCE)
+    if threads < 2 or not estimator.any_thread:
+        for arguments in calls:
+            yield measured(*arguments)
+        return
+    begun: deque[Future[T]] = deque()
+    with ThreadPoolExecutor(threads, "flow") as pool:
+        try:
+            for arguments in calls:
+                begun.append(pool.submit(measured, *arguments))
+                if len(begun) > threads:
+                    yield begun.popleft().result()
+            while begun:
+                yield begun.popleft().result()
+        finally:
+            for call in begun:
+                call.cancel()
 
 
 def flow_with_rest(

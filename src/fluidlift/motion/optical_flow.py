@@ -5,6 +5,7 @@ What several frames say together is in `motion.multiframe`, how far flow is trus
 
 from __future__ import annotations
 
+import threading
 from typing import Any
 
 import cv2
@@ -13,7 +14,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from fluidlift.errors import require
 from fluidlift.motion.confidence import flow_confidence, grey, texture_strength, there_and_back
-from fluidlift.motion.multiframe import Progress, mean_flow, multiframe_flow, result_arrays, running_window
+from fluidlift.motion.multiframe import Progress, each_pair, mean_flow, multiframe_flow, result_arrays, running_window
 from fluidlift.seams import FlowEstimator
 from fluidlift.types import PixelFlow
 
@@ -38,10 +39,19 @@ class DenseInverseSearch(FlowEstimator):
     denser patches (about 10 % less end-point error on simulated rivers and honey).
     """
 
+    any_thread = True
+
     def __init__(self) -> None:
-        self._algorithm = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-        self._algorithm.setFinestScale(0)
-        self._algorithm.setPatchStride(3)
+        self._own = threading.local()  # OpenCV's object keeps its pictures in itself
+
+    @property
+    def _algorithm(self) -> Any:
+        if not hasattr(self._own, "algorithm"):
+            algorithm = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+            algorithm.setFinestScale(0)
+            algorithm.setPatchStride(3)
+            self._own.algorithm = algorithm
+        return self._own.algorithm
 
     def displacement(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
         """float32 [H,W,2], px: where each pixel of `first` (u8 [H,W,3] or grey [H,W]) went in `second`."""
@@ -51,6 +61,8 @@ class DenseInverseSearch(FlowEstimator):
 
 class Farneback(FlowEstimator):
     """Polynomial expansion (Farneback 2003), the estimator that the paper names."""
+
+    any_thread = True
 
     def displacement(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
         """float32 [H,W,2], px: where each pixel of `first` (u8 [H,W,3] or grey [H,W]) went in `second`."""
@@ -104,8 +116,9 @@ def estimate_flow(
         return multiframe_flow(frames, estimator, progress, out=out)
     displacement, confidence = result_arrays(frames, out)
     pairs = len(displacement)
-    for t in range(pairs):
-        displacement[t], confidence[t] = flow_of_pair(frames[t], frames[t + 1], estimator)
+    calls = ((frames[t], frames[t + 1], estimator) for t in range(pairs))
+    for t, found in enumerate(each_pair(flow_of_pair, calls, estimator)):
+        displacement[t], confidence[t] = found
         if progress is not None:
             progress(t + 1, pairs)
     return PixelFlow(displacement, confidence)

@@ -20,7 +20,7 @@ from fluidlift.physics.advect_particles import displacements, leaving
 from fluidlift.physics.emitter import Supply
 from fluidlift.physics.guidance import BodyForce
 from fluidlift.physics.liquid_grid import LiquidGrid
-from fluidlift.physics.numba_particles import ParticleWork
+from fluidlift.physics.numba_particles import NumbaMover, NumbaTransfer, ParticleWork
 from fluidlift.physics.outlet import surplus
 from fluidlift.physics.position_correction import fill_ratio, spreading
 from fluidlift.physics.pressure import build_system
@@ -137,6 +137,11 @@ class LiquidSimulator(ParticleSimulator):
             super().restore(before)
             raise
         self._liquid.restore(state)
+
+    @property
+    def any_thread(self) -> bool:
+        """See `ParticleSimulator`; a GPU belongs to the thread that began with it."""
+        return isinstance(self._work.transfer, NumbaTransfer) and isinstance(self._work.mover, NumbaMover)
 
     def _speed_gain(self) -> float:
         return super()._speed_gain() + sum(force.largest for force in self._forces)

@@ -241,6 +241,11 @@ class ParticleSimulator(ABC):
         return int(gone.sum())
 
     @property
+    def any_thread(self) -> bool:
+        """Whether `advance` may be called by another thread than the one that made the simulator."""
+        return True
+
+    @property
     def volume(self) -> float:
         """m^3 that the particles stand for: mass / density."""
         return float(self._particles.masses.sum(dtype=np.float64)) / self.parameters.density

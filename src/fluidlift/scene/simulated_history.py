@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Int
 
 from fluidlift.scene.build import Scene
 from fluidlift.types import Particles
@@ -40,10 +42,10 @@ class History:
         pose = np.zeros((0, 7)) if bodies is None else np.concatenate([bodies.position, bodies.orientation], axis=1)
         self.poses.append(pose)
         grid = scene.terrain.grid
-        occupied = np.unique(np.floor((particles.positions - grid.low) / grid.spacing).astype(np.int64), axis=0)
+        occupied = _distinct(np.floor((particles.positions - grid.low) / grid.spacing).astype(np.int64))
         inside = grid.contains(particles.positions)
         distance = sample_nodes(scene.terrain.signed_distance, grid, particles.positions[inside])
-        self.volume.append(len(occupied) * grid.spacing**3)
+        self.volume.append(occupied * grid.spacing**3)
         self.leak.append(float((distance < -0.1 * grid.spacing).mean()) if inside.any() else 0.0)
         self.count.append(len(particles))
         self.substeps.append(substeps)
@@ -63,3 +65,12 @@ class History:
         """The first frames of `arrays`."""
         figures = {name: arrays[name][:frames].tolist() for name in ("volume", "leak", "count", "substeps")}
         return cls(**figures, poses=list(arrays["poses"][:frames]))
+
+
+def _distinct(cells: Int[np.ndarray, "n 3"]) -> int:
+    """How many different cells there are. Numbered one by one where that fits: rows are sorted ten times as slowly."""
+    low = cells.min(axis=0, initial=np.iinfo(np.int64).max)
+    shape = [int(n) + 1 for n in (cells - low).max(axis=0, initial=0)]
+    if math.prod(shape) > 2**62:
+        return len(np.unique(cells, axis=0))
+    return len(np.unique(np.ravel_multi_index(tuple((cells - low).T), tuple(shape))))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,9 +15,10 @@ from fluidlift.scene.simulated_history import History
 from fluidlift.scene.splat_files import checkpoint_file, frame_file
 from fluidlift.scene.surface_appearance import SurfaceAppearance
 from fluidlift.source import source_hash
+from fluidlift.types import Particles
 
 if TYPE_CHECKING:
-    from fluidlift.physics.stepping import ParticleSimulator
+    from fluidlift.physics.stepping import ParticleSimulator, StepReport
 
 
 def state_parts(scene: Scene) -> dict[str, str]:
@@ -91,6 +93,9 @@ def advance(
 ) -> str | None:
     """Simulate and write the frames that are missing; why it broke down, if it did.
 
+    While a frame gets its look and is written, another thread simulates the next one; not where a checkpoint is due,
+    which holds the simulator's state.
+
     Args:
         simulator: at the last frame of `history`.
         appearance: at the same.
@@ -104,32 +109,43 @@ def advance(
     Raises:
         InputRejected: the disk is full.
     """
-    from fluidlift.io.ply import write_gaussians
-
-    for k in range(len(history), scene.simulated):
-        step(k, scene.simulated)
-        substeps = 0
-        if k:
-            try:
-                substeps = int(simulator.advance(scene.interval).substeps)
-            except InputRejected:
-                raise
-            except FluidliftError as error:
-                return f"frame {FIRST_FRAME + k} ({k} of {scene.simulated}): {error} {in_words(scene)}".rstrip()
-        p = simulator.particles
-        if k and len(p) > max_particles * 2:
-            return None
-        appearance.advance(p, k)
-        shown = appearance.dressed(p, k, simulator.bodies.inside if scene.obstacles else None)
-        write_gaussians(
-            frame_file(folder, FIRST_FRAME + k), shown.gaussians, ids=shown.ids, velocities=shown.velocities
-        )
-        history.add(scene, simulator, p, substeps)
-        # the first one says whose frames these are
-        if len(history) % checkpoint_every == 0 or len(history) in (1, scene.simulated):
-            _save(simulator, appearance, scene, folder, history)
+    with ThreadPoolExecutor(1, "simulation") as beside:
+        coming: Future[StepReport] | None = None
+        for k in range(len(history), scene.simulated):
+            step(k, scene.simulated)
+            substeps = 0
+            if k:
+                try:
+                    report = simulator.advance(scene.interval) if coming is None else coming.result()
+                    substeps = int(report.substeps)
+                except InputRejected:
+                    raise
+                except FluidliftError as error:
+                    return f"frame {FIRST_FRAME + k} ({k} of {scene.simulated}): {error} {in_words(scene)}".rstrip()
+            p, coming = simulator.particles, None
+            if k and len(p) > max_particles * 2:
+                return None
+            history.add(scene, simulator, p, substeps)
+            # the first one says whose frames these are
+            due = len(history) % checkpoint_every == 0 or len(history) in (1, scene.simulated)
+            if not due and simulator.any_thread and not scene.obstacles:  # these move on with the simulator
+                coming = beside.submit(simulator.advance, scene.interval)
+            _write_frame(simulator, appearance, scene, folder, p, k)
+            if due:
+                _save(simulator, appearance, scene, folder, history)
     step(scene.simulated, scene.simulated)
     return None
+
+
+def _write_frame(
+    simulator: ParticleSimulator, appearance: SurfaceAppearance, scene: Scene, folder: Path, p: Particles, k: int
+) -> None:
+    """Frame k, whose particles are p; the simulator may be on its way to the next one."""
+    from fluidlift.io.ply import write_gaussians
+
+    appearance.advance(p, k)
+    shown = appearance.dressed(p, k, simulator.bodies.inside if scene.obstacles else None)
+    write_gaussians(frame_file(folder, FIRST_FRAME + k), shown.gaussians, ids=shown.ids, velocities=shown.velocities)
 
 
 def _save(

@@ -10,7 +10,6 @@ import numpy as np
 from scipy.ndimage import convolve1d, gaussian_filter
 
 from fluidlift.shape.evidence import Evidence
-from fluidlift.shape.frame_pictures import typical_picture
 from fluidlift.shape.min_cut import geodesic_distance, spread
 from fluidlift.shape.presence import Presence
 
@@ -177,7 +176,7 @@ def smooth_ground(
         known: bool [h,w], where it is known.
         like_fluid: log odds of colours.
     """
-    typical = typical_picture(evidence.pictures)
+    typical = evidence.typical
     moved = (evidence.activity - evidence.level) / 0.3
     fluid = ~known & (np.maximum(moved, moved + like_fluid(typical)) > SURE)
     if not known.any() or not fluid.any():

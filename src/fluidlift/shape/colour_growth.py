@@ -8,7 +8,6 @@ from scipy.ndimage import convolve1d
 
 from fluidlift.shape.background import colour_bins
 from fluidlift.shape.evidence import Evidence
-from fluidlift.shape.frame_pictures import typical_picture
 from fluidlift.shape.min_cut import edge_weights, min_cut
 
 STIFFNESS = 4.0
@@ -65,7 +64,7 @@ def with_quiet_water(evidence: Evidence, score: np.ndarray, region: np.ndarray, 
         region: bool [h,w], what motion and edges gave.
         rounds: in which the colours are read anew from the larger region.
     """
-    picture = typical_picture(evidence.pictures)
+    picture = evidence.typical
     across, down = edge_weights(picture, STIFFNESS)
     chance = 1.0 / (1.0 + np.exp(-score))
     found = region
@@ -89,7 +88,7 @@ def grown_from_streams(evidence: Evidence, inside: np.ndarray, *, rounds: int = 
         inside: bool [h,w], where to look.
         rounds: at most, in which the colours are read anew.
     """
-    picture = typical_picture(evidence.pictures)
+    picture = evidence.typical
     rim = max(1, round(RIM * max(inside.shape)))
     middle = np.zeros_like(inside)
     middle[rim:-rim, rim:-rim] = True

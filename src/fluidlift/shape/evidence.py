@@ -18,7 +18,6 @@ from fluidlift.shape.frame_pictures import (
     burst_length,
     sampled_frames,
     shrink,
-    typical_picture,
     working_scale,
 )
 from fluidlift.types.clip import VideoClip
@@ -82,6 +81,11 @@ class Evidence:
     def pictures(self) -> np.ndarray:
         """float16 [S,h,w,3], brightness and two colour differences of the sampled frames, global flicker removed."""
         return self.source.kept
+
+    @property
+    def typical(self) -> np.ndarray:
+        """float32 [h,w,3], median of at most 31 of the pictures, not to be written into."""
+        return self.source.typical
 
 
 def distance_of_pictures(first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -216,7 +220,7 @@ def gather_evidence(clip: VideoClip, flow: PixelFlow | PairReader) -> Evidence:
     scale = working_scale(height, width)
     source = FramePictures(clip.frames, sampled_frames(frames, clip.interval), scale)
     pictures = source.kept
-    steep = sharpness(typical_picture(pictures))
+    steep = sharpness(source.typical)
     longest = max(1, burst_length(frames, clip.interval) // 3)
     slow_lag = int(np.clip(round(0.2 / clip.interval), 1, longest))
     quick, slow = lagged_change(pictures, source.pairs(1)), lagged_change(pictures, source.pairs(slow_lag))

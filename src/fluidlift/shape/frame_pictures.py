@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import cv2
 import numpy as np
 
@@ -97,6 +99,13 @@ class FramePictures:
         if place < len(self.sampled) and self.sampled[place] == t:
             return self.kept[place]
         return self._without_flicker(self._raw(t))
+
+    @cached_property
+    def typical(self) -> np.ndarray:
+        """float32 [h,w,3]: median of the sample, made once for all that ask (they must not write into it)."""
+        found = typical_picture(self.kept)
+        found.setflags(write=False)
+        return found
 
     def _raw(self, t: int) -> np.ndarray:
         small = shrink(np.ascontiguousarray(self._frames[t]), self._scale)

@@ -15,7 +15,6 @@ import numpy as np
 
 from fluidlift.errors import InputRejected
 from fluidlift.shape.evidence import Evidence
-from fluidlift.shape.frame_pictures import typical_picture
 from fluidlift.shape.min_cut import edge_weights, geodesic_distance, min_cut
 
 Point = tuple[float, float, int]
@@ -129,7 +128,7 @@ def holes_asked_for(region: np.ndarray, clicks: Clicks) -> np.ndarray:
 
 def look(evidence: Evidence) -> np.ndarray:
     """float32 [h,w,4]: smoothed colours of the typical picture and activity, in grey levels."""
-    colours = cv2.GaussianBlur(typical_picture(evidence.pictures), (0, 0), 1.0)
+    colours = cv2.GaussianBlur(evidence.typical, (0, 0), 1.0)
     lively = LIVELINESS * np.minimum(evidence.fine_activity, 2.0 * evidence.level)
     return np.dstack([colours, lively]).astype(np.float32)
 

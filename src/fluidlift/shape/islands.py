@@ -14,7 +14,6 @@ from scipy import ndimage
 
 from fluidlift.shape.colour_growth import STIFFNESS, colour_odds
 from fluidlift.shape.evidence import Evidence
-from fluidlift.shape.frame_pictures import typical_picture
 from fluidlift.shape.min_cut import disc, edge_weights, min_cut, spread
 from fluidlift.shape.region import SMALLEST_SOLID
 
@@ -46,7 +45,7 @@ def without_ground(evidence: Evidence, region: np.ndarray) -> tuple[np.ndarray, 
     if flowing < FLOWS:
         return region, rocks
     pace = evidence.streaming / (STOPPED * flowing)
-    picture = typical_picture(evidence.pictures)
+    picture = evidence.typical
     colour = colour_odds(picture, (region & (pace > 1.0)).astype(np.float32), (~region).astype(np.float32))
     odds = colour + np.clip(SURE * (pace - 1.0), -SURE, SURE)
     ground = region & ~min_cut(odds, *edge_weights(picture, STIFFNESS))

@@ -162,7 +162,7 @@ def with_open_water(evidence: Evidence, region: np.ndarray, barred: np.ndarray) 
     wander = log_wander(evidence)
     if not lies_open(evidence, region, wander):
         return region
-    picture = typical_picture(evidence.pictures)
+    picture = evidence.typical
     across, down = edge_weights(picture, STIFFNESS)
     closed = (barred | holes(region)) & ~region
     found = region

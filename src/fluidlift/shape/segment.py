@@ -21,7 +21,6 @@ from fluidlift.messages import Notice
 from fluidlift.shape.advancing import advancing_labels
 from fluidlift.shape.colour_growth import grown_from_streams, with_quiet_water
 from fluidlift.shape.evidence import Evidence, PairReader, fluid_score, gather_evidence, pair_reader, solids_by_flow
-from fluidlift.shape.frame_pictures import typical_picture
 from fluidlift.shape.hints import VOICE, Clicks, Point, clicks_at, heed, holes_asked_for
 from fluidlift.shape.islands import without_ground
 from fluidlift.shape.moving_solids import SharedPairs, moving_solids
@@ -263,7 +262,7 @@ def lasting_region(evidence: Evidence, score: np.ndarray, inside: np.ndarray) ->
     """bool [h,w]: the outline of a fluid that stays where it is."""
     if not (score > 0.0).any():
         return np.zeros(score.shape, bool)
-    region = cut_along_edges(typical_picture(evidence.pictures), evidence.fine_activity, evidence.level, score)
+    region = cut_along_edges(evidence.typical, evidence.fine_activity, evidence.level, score)
     region = clean_region(region)
     return clean_region(with_quiet_water(evidence, score, region) & inside) if region.any() else region
 

@@ -19,7 +19,6 @@ from fluidlift.shape.advancing import median_over_time
 from fluidlift.shape.background import colour_bins, colour_histogram
 from fluidlift.shape.colour_growth import DECISIVE, RARE, STIFFNESS
 from fluidlift.shape.evidence import Evidence
-from fluidlift.shape.frame_pictures import typical_picture
 from fluidlift.shape.islands import FLOWS, LARGEST, STOPPED, SURE
 from fluidlift.shape.min_cut import disc, edge_weights, min_cut, spread
 from fluidlift.shape.region import SMALLEST_SOLID
@@ -68,7 +67,7 @@ def most_often(evidence: Evidence, still: np.ndarray, where: np.ndarray) -> tupl
             same = first + second + third < limit
             alike[i] += same
             alike[j] += same
-    share, picture = np.ones(where.shape, np.float32), typical_picture(kept)
+    share, picture = np.ones(where.shape, np.float32), evidence.typical.copy()
     share[where] = alike.max(axis=0) / len(seen)
     picture[where] = np.take_along_axis(seen, alike.argmax(axis=0)[None, None], axis=0)[0].T
     return cv2.GaussianBlur(share, (0, 0), BLUR), picture

@@ -15,7 +15,6 @@ import numpy as np
 
 from fluidlift.shape.colour_growth import STIFFNESS, colour_odds
 from fluidlift.shape.evidence import Evidence
-from fluidlift.shape.frame_pictures import typical_picture
 from fluidlift.shape.islands import SURE
 from fluidlift.shape.min_cut import disc, edge_weights, min_cut
 from fluidlift.shape.region import clean_region
@@ -85,7 +84,7 @@ def without_plants(evidence: Evidence, score: np.ndarray, region: np.ndarray, in
     waves = np.maximum(few - back, 0.0) / STEP * (1.0 - evidence.streaming)
     if not (region & (waves > 1.0)).any():
         return region
-    picture = typical_picture(evidence.pictures)
+    picture = evidence.typical
     colour = colour_odds(picture, (region & (waves == 0.0)).astype(np.float32), (~region).astype(np.float32))
     odds = np.where(region, np.clip(score, -SURE, SURE) + colour - waves, -SURE)
     plants = region & ~min_cut(odds, *edge_weights(picture, STIFFNESS))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -125,7 +126,10 @@ def _panels(
     step: Callable[[int, int], None],
     painter: Painter | None,
 ) -> Iterator[np.ndarray]:
-    """Input | re-simulation | side view, frame by frame; keeps what the evaluation needs on the way."""
+    """Input | re-simulation | side view, frame by frame; keeps what the evaluation needs on the way.
+
+    The side view is drawn by another thread, where splats are shown as they are.
+    """
     from fluidlift.look.pictures import caption
 
     renderer, compared = FrameRenderer(scene, footage, painter=painter), 0
@@ -136,25 +140,33 @@ def _panels(
             compared = max(len(renderer.footage.clip) - renderer.footage.start, 1)
     size = _panel_size(scene.camera.size, config.width)
     side = _side_camera(scene, renderer, size)
-    for k, (gaussians, _, speeds) in enumerate(splat_frames(folder, len(poses))):
-        step(k, len(poses))
-        frame = SimulatedFrame(gaussians, speeds, poses[k])
-        rendered, front, velocity = renderer.measured(frame)
-        picture = to_bytes(rendered.image)
-        if k < BEYOND * compared:  # of the splats, whatever look the preview has
-            measured.frames.append(picture)
-            measured.mask.append(rendered.alpha > 0.5)
-        if k < compared:
-            measured.flow.append(_screen_velocity(front, velocity, scene.camera, scene.interval, rendered.alpha))
-        if painter is not None:
-            picture = renderer.shown(frame, scene.camera, "plate")
-        view = renderer.shown(frame, side, "terrain")
-        panels = [caption(_resized(picture, size), "re-simulation"), caption(view, "side view")]
-        if footage is not None:
-            time, clip = round(k * scene.interval / scene.clip_interval), footage.clip.frames[footage.start :]
-            again = time >= len(clip)  # beyond its end the clip begins again: a still would say nothing of the motion
-            panels.insert(0, caption(_resized(clip[time % len(clip)], size), "input, again" if again else "input"))
-        yield np.concatenate(panels, axis=1)
+    with ThreadPoolExecutor(1, "side view") as beside:
+        for k, (gaussians, _, speeds) in enumerate(splat_frames(folder, len(poses))):
+            step(k, len(poses))
+            frame = SimulatedFrame(gaussians, speeds, poses[k])
+            # another look keeps pictures of its own between two views
+            view = beside.submit(renderer.shown, frame, side, "terrain") if painter is None else None
+            rendered, front, velocity = renderer.measured(frame)
+            picture = to_bytes(rendered.image)
+            if k < BEYOND * compared:  # of the splats, whatever look the preview has
+                measured.frames.append(picture)
+                measured.mask.append(rendered.alpha > 0.5)
+            if k < compared:
+                measured.flow.append(_screen_velocity(front, velocity, scene.camera, scene.interval, rendered.alpha))
+            if painter is not None:
+                picture = renderer.shown(frame, scene.camera, "plate")
+            shown = renderer.shown(frame, side, "terrain") if view is None else view.result()
+            panels = [caption(_resized(picture, size), "re-simulation"), caption(shown, "side view")]
+            if footage is not None:
+                panels.insert(0, caption(*_input(footage, round(k * scene.interval / scene.clip_interval), size)))
+            yield np.concatenate(panels, axis=1)
+
+
+def _input(footage: Footage, time: int, size: tuple[int, int]) -> tuple[np.ndarray, str]:
+    """The clip's frame at a time (frames), and what it is; beyond its end the clip begins again, since a still would
+    say nothing of the motion."""
+    clip = footage.clip.frames[footage.start :]
+    return _resized(clip[time % len(clip)], size), "input, again" if time >= len(clip) else "input"
 
 
 def _side_camera(scene: Scene, renderer: FrameRenderer, size: tuple[int, int]) -> PinholeCamera:

@@ -203,11 +203,11 @@ def test_a_stream_too_slow_for_its_slope_drags_through_its_depth_like_a_viscous_
 
 def test_an_outlet_that_is_too_small_lets_the_surface_yield_before_it_speeds_up() -> None:
     types, grid = channel(30)
-    types[24:, :, 4:] = CellType.EMPTY
-    types[24:, :, 1:3] = CellType.SOLID  # one cell in five is left at the end
-    types[24:-1, :, 3], types[-1, :, 3] = CellType.FLUID, CellType.OUTFLOW
+    types[28:, :, 4:] = CellType.EMPTY
+    types[28:, :, 1:3] = CellType.SOLID  # one cell in five is left at the end
+    types[28:-1, :, 3], types[-1, :, 3] = CellType.FLUID, CellType.OUTFLOW
     surface = surface_of(grid, 0.59, [0.8, 0, 0])
-    surface.points[surface.points[:, 0] > 2.4, 2] = 0.39
+    surface.points[surface.points[:, 0] > 2.8, 2] = 0.39
     _, report = volume_velocity(surface, None, types, grid, kind="stream")
     closed = VolumeOptions(surface_mobility=1e-4)
     _, fast = volume_velocity(surface, None, types, grid, kind="stream", options=closed)
@@ -221,11 +221,11 @@ def test_an_outlet_that_is_too_small_lets_the_surface_yield_before_it_speeds_up(
 
 def test_a_stream_takes_in_no_more_than_its_ends_agree_on() -> None:
     types, grid = channel(30)
-    types[24:, :, 4:] = CellType.EMPTY
-    types[24:, :, 1:3] = CellType.SOLID  # one cell in five is left at the end
-    types[24:-1, :, 3], types[-1, :, 3] = CellType.FLUID, CellType.OUTFLOW
+    types[28:, :, 4:] = CellType.EMPTY
+    types[28:, :, 1:3] = CellType.SOLID  # one cell in five is left at the end
+    types[28:-1, :, 3], types[-1, :, 3] = CellType.FLUID, CellType.OUTFLOW
     surface = surface_of(grid, 0.59, [0.8, 0, 0])
-    surface.points[surface.points[:, 0] > 2.4, 2] = 0.39
+    surface.points[surface.points[:, 0] > 2.8, 2] = 0.39
     surface.velocities[surface.points[:, 0] < 0.4] *= 5.0  # a jet strikes the stream there
     _, closed = volume_velocity(
         surface, None, types, grid, kind="stream", options=VolumeOptions(surface_mobility=0.25 * 5 / 28**2)

@@ -34,6 +34,7 @@ from fluidlift.motion.extrapolation import (
     wall_distance,
 )
 from fluidlift.motion.volume_projection import (
+    DEPTH_ERROR,
     OBSERVED_ERROR,
     PROFILE_ERROR,
     agreed_limits,
@@ -152,6 +153,7 @@ class VolumeSolver:
         self._mouths = mouths_of(types, self._system, REACH * self._bed.depth)
         self._steady = kind.nearly_level and len(self._mouths) == 2
         self._rim = [end for end in self._mouths if end.inlet] if kind.enters_over_rim else []
+        self._below = float(np.hypot(PROFILE_ERROR, DEPTH_ERROR)) if kind.is_channel_flow else PROFILE_ERROR
         self._balanced = options.balanced if options.balanced is not None else not kind.is_gas
         if options.surface_mobility is not None:
             self._leak = np.full(grid.shape, options.surface_mobility, np.float32)
@@ -187,14 +189,14 @@ class VolumeSolver:
         extended = inward_only(extended, self._rim)
         start = balance_surface(extended, types, system.openings) if self._balanced else extended
         certain = np.ones_like(confidence) if self._options.even else confidence
-        mobility = held_ends(face_mobility(types, seen, certain, self._leak), self._rim)
+        mobility = held_ends(face_mobility(types, seen, certain, self._leak, self._below), self._rim)
         velocity, solve = weighted_projection(start, system, mobility, tolerance=tolerance)
         limits = self._end_limits(values, seen) if self._options.surface_mobility is None else []
         if self._steady and limits:
             velocity, other = self._believed(limits, velocity, seen, certain, tolerance)
             solve = max(solve, other or solve, key=lambda report: report.residual)
         elif any(abs(flux_through(velocity, e.outward)) > limit for e, limit in zip(self._mouths, limits)):
-            mobility = held_ends(face_mobility(types, seen, certain, np.ones_like(self._leak)), self._rim)
+            mobility = held_ends(face_mobility(types, seen, certain, np.ones_like(self._leak), self._below), self._rim)
             leaking, other = weighted_projection(extended, system, mobility, tolerance=tolerance)
             velocity = self._within(limits, velocity, leaking)
             solve = max(solve, other, key=lambda report: report.residual)

@@ -205,7 +205,7 @@ class SurfaceAppearance:
             texture, max(PATCH * across, FEWEST_CELLS * self._cell), footage=footage, edited=scene.edited,
             start=scene.film_start,
         )  # fmt: skip
-        if footage is not None and kind_of(scene.kind).is_channel_flow and not scene.edited:
+        if footage is not None and kind_of(scene.kind).lies_on_ground and not scene.edited:
             self._outline = FilmedOutline(self._camera, footage.outside, self._cell)
         self._plays = footage is not None
         self._begin_again()

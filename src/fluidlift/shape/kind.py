@@ -225,7 +225,7 @@ def estimate_up(
         tilt = slope.TiltEvidence(found, 0.0, left, float(np.clip(1.0 - left / sigma, 0.0, 1.0)))
         words = ["upright edges of the body"]
     elif kind.nearly_level:
-        tilt, words = _tilt_of_stream(mask, displacement, confidence, camera, picture, level_prior)
+        tilt, words = _tilt_of_plane(kind, mask, displacement, confidence, camera, picture, level_prior)
     else:
         tilt, words = _tilt_in_air(kind, mask, displacement, confidence, camera, picture)
     source = ", ".join(words) if words else f"usual view of a {kind}"
@@ -239,11 +239,16 @@ def estimate_up(
     )  # fmt: skip
 
 
-def _tilt_of_stream(
-    mask, displacement, confidence, camera, picture, level_prior
+def _tilt_of_plane(
+    kind, mask, displacement, confidence, camera, picture, level_prior
 ) -> tuple[slope.TiltEvidence, list[str]]:
-    """What its motion, its pattern and its surroundings say; and which of them spoke."""
+    """What its motion, its pattern and its surroundings say; and which of them spoke.
+
+    Waves and whirls of standing water are no motion of a plane as a whole: their perspective is not asked.
+    """
     tilted = _tilted(camera)
+    if not kind.runs_nearly_level:
+        return slope.estimate_tilt(camera, None, tilted, picture, kind=kind), picture.words
     # a chute is another plane than what it comes down onto
     steep = chute.chute_pixels(tilted(STREAM.usual_pitch[0], 0.0), mask, displacement, confidence)
     lying = confidence * ~np.any(steep, axis=0) if steep else confidence

@@ -78,7 +78,7 @@ def calibrate(
     from fluidlift.scene.dry_cells import dry_cells
     from fluidlift.scene.simulator import simulator_of
 
-    if not wanted or not kind_of(scene.kind).is_channel_flow or not len(scene.body):
+    if not wanted or not kind_of(scene.kind).lies_on_ground or not len(scene.body):
         return Calibration()
     grid, frames = scene.terrain.grid, min(scene.frames, LONGEST)
     speed = _typical_speed(target, scene.cell_types)

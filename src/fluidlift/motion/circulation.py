@@ -10,6 +10,10 @@ Of all fields that hold to this, u = v - grad q is the one nearest to the seen m
 -div(h grad q) = -div(h v). A train of waves that crosses a basin, also one that slows down towards a shore, is the
 gradient of something: all of it goes. A whirl has no gradient in it: all of it stays. What wells up in a boiling pot
 and flows apart has one and goes, too: its way back below the surface is not seen.
+
+Waves that are seen here and not there leave whirls that are none. What cannot be water, grad q, says how much of that
+there is: errors have no preference for fields with or without divergence, so as much power as goes is in what stays. It
+is taken off (Wiener): u is multiplied by (1 - <|grad q|^2> / <|u|^2>), or 0 where that is negative.
 """
 
 from __future__ import annotations
@@ -55,13 +59,14 @@ def circulating(
         return replace(surface, velocities=np.zeros_like(surface.velocities)), 0.0
     seen = harmonic_extension(values, known, columns, grid.spacing)[..., 0, :]
     kept = _projected(seen, depth, grid.spacing)
+    stays, goes = (float((np.square(f).sum(axis=-1) * depth).sum()) for f in (kept, seen - kept))
+    kept = kept * (max(1.0 - goes / stays, 0.0) if stays > 0 else 0.0)
     at = np.clip(plan.cell_of(flat)[:, :2], 0, np.array(plan.shape[:2]) - 1)
     velocities = np.zeros_like(surface.velocities)
     velocities[:, :2] = kept[tuple(at.T)]
-    before = float(np.square(surface.velocities[:, :2]).sum(axis=1).mean())
-    after = float(np.square(velocities).sum(axis=1).mean())
-    share = float(np.sqrt(after / before)) if before > 0 else 0.0
-    return replace(surface, velocities=velocities), min(share, 1.0)
+    whole = float((np.square(seen).sum(axis=-1) * depth).sum())
+    left = float((np.square(kept).sum(axis=-1) * depth).sum())
+    return replace(surface, velocities=velocities), (float(np.sqrt(left / whole)) if whole > 0 else 0.0)
 
 
 def _projected(velocity: np.ndarray, depth: np.ndarray, spacing: float) -> np.ndarray:

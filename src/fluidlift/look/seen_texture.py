@@ -60,6 +60,7 @@ class SeenTexture(TrustedMap):
         surface: of the body at rest.
         shading: what of the look stays in place; None: nothing.
         usable: which of the splats may lend their look.
+        level: the surface is a plane, which hides no part of itself: from flat above, splats on it seem to, by metres.
 
     Raises:
         ValueError: no splats.
@@ -73,6 +74,7 @@ class SeenTexture(TrustedMap):
         *,
         shading: SteadyShading | None = None,
         usable: Bool[np.ndarray, " n"] | None = None,
+        level: bool = False,
     ) -> None:
         require(len(body) > 0, "a body without Gaussians", "one or more")
         self._camera, self._shading = camera, shading
@@ -89,7 +91,9 @@ class SeenTexture(TrustedMap):
         width, height = camera.size
         row, col, _ = camera.nearest_pixels(points)
         inside = (depth > 0) & (uv > INSET).all(axis=1) & (uv < np.array([width, height]) - INSET).all(axis=1)
-        seen = inside & have[row, col] & (depth - drawn.depth[row, col] < BEHIND * surface.pitch)
+        seen = inside & have[row, col]
+        if not level:
+            seen &= depth - drawn.depth[row, col] < BEHIND * surface.pitch
         if shading is not None and shading.fixed is not None:
             seen &= ~shading.fixed[row, col]
         if usable is not None:

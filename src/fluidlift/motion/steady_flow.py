@@ -45,6 +45,29 @@ def mean_motion(clip: VideoClip, flow: PixelFlow, mask: np.ndarray) -> tuple[np.
     return mean, trust
 
 
+def bulk_motion(clip: VideoClip, flow: PixelFlow, fluid: Callable[[int], np.ndarray]) -> np.ndarray:
+    """Mean motion of the whole fluid in each pair of frames, px per `clip.interval`, float64 [n,2]; nan where nothing
+    was measured.
+
+    A stream has the same in every pair, since what comes in goes out. Waves pass, and swing to and fro.
+
+    Args:
+        clip: for its times.
+        flow: of all pairs.
+        fluid: bool [h,w] of a frame.
+    """
+    read, pairs = _rows(clip, flow), len(flow.confidence)
+    pick = np.unique(np.linspace(0, pairs - 1, min(pairs, MOST_PAIRS)).round().astype(int))
+    out = np.full((len(pick), 2), np.nan)
+    for row, t in enumerate(pick):
+        found = read([t], slice(None))
+        weight = found.confidence[0] * fluid(int(t))
+        total = float(weight.sum())
+        if total > 0:
+            out[row] = (weight[..., None] * found.displacement[0]).sum(axis=(0, 1)) / total
+    return out
+
+
 def _rows(clip: VideoClip, flow: PixelFlow) -> Callable[[Iterable[int], slice], PixelFlow]:
     """Reads rows of the flow of some pairs."""
     spans = spans_of(clip)

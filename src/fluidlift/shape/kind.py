@@ -34,6 +34,11 @@ FOLLOWED = 0.3
 """share of the fluid that is seen to fall with reliable flow, from which it is followed. Under gravity h metres take
 0.45 s times the root of h, so of a jet a few decimetres long a pixel moves by more per frame than its own pattern: of
 six pours 0 to 0.09 of the fluid is seen to fall so, of five falls and fountains 0.27 to 0.57"""
+FEWEST_PAIRS = 12
+"""pairs of frames: half a second, in which a wave rises or falls"""
+SHAKE = 0.05
+"""px per frame and axis that the bulk motion changes by where the fluid's does not: what steadying leaves of a camera's
+shake, and errors of optical flow (`slope.LEAST_NOISE`)"""
 STRAIGHT = 10.0
 """degrees: a larger lean of what falls is a thrown jet or wind, not a turned camera"""
 
@@ -58,6 +63,7 @@ def estimate_kind(
     confidence: Float[np.ndarray, "h w"],
     *,
     pitch: float | None = None,
+    bulk: Float[np.ndarray, "n 2"] | None = None,
 ) -> KindEvidence:
     """Weigh direction of motion, shape of the mask and colour against what each kind looks like.
 
@@ -67,9 +73,11 @@ def estimate_kind(
         displacement: mean optical flow, px per frame.
         confidence: of the flow, 0 to 1.
         pitch: known tilt of the camera, degrees below the horizon, or None.
+        bulk: mean motion of the whole fluid in each of many pairs of frames, px per frame, nan where it is not known
+            (`motion.steady_flow.bulk_motion`); None: nothing is known of how it changes.
     """
     require(fluid.shape == frames.shape[:3], f"masks {fluid.shape} for frames {frames.shape}")
-    f = _features(frames, fluid, displacement, confidence)
+    f = _features(frames, fluid, displacement, confidence) | {"swinging": swinging(bulk)}
     still = 1.0 - f["changing"]
     belief = {
         # smoke rises from below, is grey, and its outline changes; it neither hangs from above nor fills the picture
@@ -103,7 +111,19 @@ def estimate_kind(
         + 0.8 * f["wide"] * (0.5 + still) * (1 - f["falling"])
         + 2.0 * f["foreground"] * (1 - f["slender"])
         - 1.8 * f["falling"] * (1 - f["foreground"])
-        - 1.5 * f["rising"] * (1 - still * f["ground"]),
+        - 1.5 * f["rising"] * (1 - still * f["ground"])
+        - 3.0 * f["swinging"],
+        # what stays passes nothing on: what its crests carry to and fro is more than what goes one way. What ends
+        # within the picture has no other way
+        "basin": 0.6
+        + 0.8 * f["wide"] * (0.5 + still)
+        + 2.0 * f["foreground"] * (1 - f["slender"])
+        + (6.0 + 1.5 * f["enclosed"] * (1 - f["hanging"])) * f["swinging"]
+        - 4.0
+        - 2.4 * f["slender"]
+        - 2.0 * f["falling"]
+        - 2.0 * f["hanging"] * (1 - f["bulky"])
+        - 2.0 * f["changing"],
         # a body that stands comes down from where it was and spreads over ground that was dry
         "dam": 7.0 * f["collapsing"] - 2.0,
     }
@@ -157,11 +177,32 @@ def _features(frames, fluid, displacement, confidence) -> dict[str, float]:
         "ground": ground,
         "hanging": float(fluid[:, : max(2, height // 60)].any(axis=(1, 2)).mean() * (1 - ground)),
         "changing": float(np.clip(change / 0.3, 0.0, 1.0)),
+        "enclosed": float(np.clip(1.0 - _border_share(union) / 0.1, 0.0, 1.0)),
         "grey": float(np.clip(1.0 - chroma / 0.15, 0.0, 1.0)),
         "collapsing": _collapsing(fluid),
         "speed_px": float(total / max(float((confidence * union).sum()), 1e-9)),
         "area_share": float(union.sum() / (height * width)),
     }
+
+
+def _border_share(mask: np.ndarray) -> float:
+    """Share of the picture's border that a fluid meets."""
+    return float(np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).mean())
+
+
+def swinging(bulk: Float[np.ndarray, "n 2"] | None) -> float:
+    """Share of the bulk motion that is to and fro: its variance in time over its mean square, 0 to 1.
+
+    It is 0 where too little is known.
+
+    What runs through passes every section with the same discharge. Waves carry nothing in the mean.
+    """
+    known = np.zeros((0, 2)) if bulk is None else bulk[np.isfinite(bulk).all(axis=1)]
+    if len(known) < FEWEST_PAIRS:
+        return 0.0
+    changes = max(float(known.var(axis=0).sum()) - 2.0 * SHAKE**2, 0.0)
+    mean = float(np.square(known.mean(axis=0)).sum())
+    return changes / (changes + mean) if changes > 0 else 0.0
 
 
 def _collapsing(fluid: np.ndarray) -> float:

@@ -178,6 +178,7 @@ DAM = FluidKind(
 BASIN = FluidKind(
     "basin", pitch_prior=(10.0, 9.0), looked_down_on=0.5, kinematic_viscosity=1e-5, wall_damping=0.05, wall_layer=1.0,
     is_standing_water=True, depth_ratio=0.2, sizes=(10.0, 1.0), surveyed_level=("water_level_z", "the water stands"),
+    recognised=True,
 )  # fmt: skip
 """water that stays: sea, lake, pool, pot, cup. Over a landscape people film it as they film a river; as often they
 look down into a vessel (a choice)"""

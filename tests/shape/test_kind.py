@@ -96,6 +96,17 @@ def test_what_falls_rises_or_collapses_does_not_stay_however_it_swings(clip):
     assert wavy.kind == plain.kind, wavy.scores
 
 
+def test_what_is_stirred_in_a_vessel_stays_and_a_bend_of_a_river_does_not():
+    frames, masks, _, trust = pot()
+    whirl = np.where(masks[0][..., None], np.stack([-(ROW - 45.0) * 1.5, (COL - 80.0) / 1.5], axis=-1) / 12.0, 0.0)
+    stirred = estimate_kind(frames, masks, whirl, trust, bulk=np.zeros((30, 2)))
+    assert stirred.features["circling"] > 0.9 and stirred.kind == "basin", stirred.scores
+    assert estimate_kind(*pot()).features["circling"] == 0.0
+    frames, masks, _, trust = river()
+    bend = np.where(masks[0][..., None], np.stack([np.full((H, W), 3.0), (COL - 80.0) / 40.0], axis=-1), 0.0)
+    assert estimate_kind(frames, masks, bend, trust, bulk=np.tile([3.0, 0.0], (30, 1))).kind == "stream"
+
+
 def test_what_swings_is_not_a_shake_nor_a_few_frames():
     rng = np.random.default_rng(0)
     assert swinging(to_and_fro()) > 0.9

@@ -79,6 +79,8 @@ def estimate_kind(
     require(fluid.shape == frames.shape[:3], f"masks {fluid.shape} for frames {frames.shape}")
     f = _features(frames, fluid, displacement, confidence) | {"swinging": swinging(bulk)}
     still = 1.0 - f["changing"]
+    inside = f["enclosed"] * (1 - f["hanging"])  # what ends within the picture passes nothing on
+    staying = max(f["swinging"], inside * f["circling"])
     belief = {
         # smoke rises from below, is grey, and its outline changes; it neither hangs from above nor fills the picture
         "plume": 2.6 * f["rising"]
@@ -112,13 +114,12 @@ def estimate_kind(
         + 2.0 * f["foreground"] * (1 - f["slender"])
         - 1.8 * f["falling"] * (1 - f["foreground"])
         - 1.5 * f["rising"] * (1 - still * f["ground"])
-        - 3.0 * f["swinging"],
-        # what stays passes nothing on: what its crests carry to and fro is more than what goes one way. What ends
-        # within the picture has no other way
+        - 3.0 * staying,
+        # what stays passes nothing on: it goes to and fro, or round and round
         "basin": 0.6
         + 0.8 * f["wide"] * (0.5 + still)
         + 2.0 * f["foreground"] * (1 - f["slender"])
-        + (6.0 + 1.5 * f["enclosed"] * (1 - f["hanging"])) * f["swinging"]
+        + (6.0 + 1.5 * inside) * staying
         - 4.0
         - 2.4 * f["slender"]
         - 2.0 * f["falling"]
@@ -177,12 +178,37 @@ def _features(frames, fluid, displacement, confidence) -> dict[str, float]:
         "ground": ground,
         "hanging": float(fluid[:, : max(2, height // 60)].any(axis=(1, 2)).mean() * (1 - ground)),
         "changing": float(np.clip(change / 0.3, 0.0, 1.0)),
+        "circling": circling(displacement, weight),
         "enclosed": float(np.clip(1.0 - _border_share(union) / 0.1, 0.0, 1.0)),
         "grey": float(np.clip(1.0 - chroma / 0.15, 0.0, 1.0)),
         "collapsing": _collapsing(fluid),
         "speed_px": float(total / max(float((confidence * union).sum()), 1e-9)),
         "area_share": float(union.sum() / (height * width)),
     }
+
+
+def circling(displacement: Float[np.ndarray, "h w 2"], weight: Float[np.ndarray, "h w"]) -> float:
+    """How far a motion goes round its middle: its angular momentum over what it would be were it all across the radius.
+
+    Args:
+        displacement: px per frame.
+        weight: of each pixel, confidence times speed.
+
+    Returns:
+        0 (none, or half of it and less) to 1 (nine tenths).
+    """
+    total = float(weight.sum())
+    if total <= 0:
+        return 0.0
+    grid = np.stack(np.meshgrid(np.arange(weight.shape[1]), np.arange(weight.shape[0])), axis=-1)
+    arm = grid - (weight[..., None] * grid).sum(axis=(0, 1)) / total
+    # seen obliquely, a circle is an ellipse: both axes are made as long
+    spread = np.sqrt((weight[..., None] * arm**2).sum(axis=(0, 1)) / total)
+    arm, moved = arm / np.maximum(spread, 1.0), displacement / np.maximum(spread, 1.0)
+    trust = weight / np.maximum(np.linalg.norm(displacement, axis=-1), 1e-9)
+    turning = abs(float((trust * (arm[..., 0] * moved[..., 1] - arm[..., 1] * moved[..., 0])).sum()))
+    most = float((trust * np.linalg.norm(arm, axis=-1) * np.linalg.norm(moved, axis=-1)).sum())
+    return float(np.clip((turning / max(most, 1e-12) - 0.5) / 0.4, 0.0, 1.0))
 
 
 def _border_share(mask: np.ndarray) -> float:

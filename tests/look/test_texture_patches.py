@@ -374,3 +374,13 @@ def test_where_an_edit_makes_the_flow_unlike_the_film_new_patches_come_from_else
     young = same.state.instants < 40
     assert young.any()
     np.testing.assert_allclose(same.state.centers[young], same.state.sources[young], atol=0.02)
+
+
+def test_a_level_surface_seen_from_flat_above_lends_its_look():
+    """Splats on a plane seem to hide metres of it behind them; a plane does not."""
+    where = surface(lambda x, y: (0.0 * x, 0.0 * y))
+    flat = PinholeCamera.looking((2.0, -4.0, 0.85), (2.0, 2.0, 0.5), fov_degrees=40.0, size=(128, 128))
+    body = sheet(0.1)
+    trusted = {level: SeenTexture(body, flat, where, level=level).trust(where.columns()) for level in (False, True)}
+    assert (trusted[True] > 0.5).mean() > 0.9
+    assert (trusted[False] > 0.5).mean() < 0.6

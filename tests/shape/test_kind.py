@@ -72,9 +72,9 @@ def test_the_kind_is_what_the_fluid_does(clip, kind):
 
 
 def to_and_fro(pairs=30, mean=0.0, swing=1.0):
-    """Bulk motion, px per frame: a wave over a current, seen for a period and a half."""
+    """Bulk motion, px per frame, of water and ground: a wave over a current, seen for a period and a half."""
     time = np.linspace(0.0, 3.0 * np.pi, pairs)
-    return np.stack([0.2 * np.cos(time), mean + swing * np.sin(time)], axis=-1)
+    return np.stack([0.2 * np.cos(time), mean + swing * np.sin(time)], axis=-1), np.zeros((pairs, 2))
 
 
 def pot():
@@ -99,23 +99,26 @@ def test_what_falls_rises_or_collapses_does_not_stay_however_it_swings(clip):
 def test_what_is_stirred_in_a_vessel_stays_and_a_bend_of_a_river_does_not():
     frames, masks, _, trust = pot()
     whirl = np.where(masks[0][..., None], np.stack([-(ROW - 45.0) * 1.5, (COL - 80.0) / 1.5], axis=-1) / 12.0, 0.0)
-    stirred = estimate_kind(frames, masks, whirl, trust, bulk=np.zeros((30, 2)))
+    stirred = estimate_kind(frames, masks, whirl, trust, bulk=to_and_fro(swing=0.0))
     assert stirred.features["circling"] > 0.9 and stirred.kind == "basin", stirred.scores
     assert estimate_kind(*pot()).features["circling"] == 0.0
     frames, masks, _, trust = river()
     bend = np.where(masks[0][..., None], np.stack([np.full((H, W), 3.0), (COL - 80.0) / 40.0], axis=-1), 0.0)
-    assert estimate_kind(frames, masks, bend, trust, bulk=np.tile([3.0, 0.0], (30, 1))).kind == "stream"
+    assert estimate_kind(frames, masks, bend, trust, bulk=to_and_fro(mean=3.0, swing=0.0)).kind == "stream"
 
 
 def test_what_swings_is_not_a_shake_nor_a_few_frames():
     rng = np.random.default_rng(0)
-    assert swinging(to_and_fro()) > 0.9
-    assert swinging(rng.normal(0.0, SHAKE, (40, 2)) + [0.05, 0.0]) < 0.5
-    assert swinging(rng.normal(0.0, SHAKE, (40, 2)) + [1.0, 0.0]) < 0.01
-    assert swinging(to_and_fro(FEWEST_PAIRS - 1)) == 0.0 == swinging(None)
-    gaps = to_and_fro()
+    water, ground = to_and_fro()
+    assert swinging(water, ground) > 0.9
+    assert swinging(rng.normal(0.0, SHAKE, (30, 2)) + [0.05, 0.0], ground) < 0.5
+    assert swinging(rng.normal(0.0, SHAKE, (30, 2)) + [1.0, 0.0], ground) < 0.01
+    assert swinging(*to_and_fro(FEWEST_PAIRS - 1)) == 0.0
+    assert swinging(water + [0.3, 0.0], water) < 0.01, "all of the picture does, and the water runs on"
+    assert swinging(ground + [0.3, 0.0], water) < 0.01, "only the ground does"
+    gaps = water.copy()
     gaps[::3] = np.nan
-    assert swinging(gaps) == pytest.approx(swinging(to_and_fro()), abs=0.05)
+    assert swinging(gaps, ground * np.nan) == pytest.approx(swinging(water, ground), abs=0.05)
 
 
 def test_what_falls_so_slowly_that_it_is_followed_is_no_pour():

@@ -212,7 +212,8 @@ def _seen(
     motion, trust = mean_motion(clip, flow.flow, fluid.any_frame())
     known, pose_given = known_camera(given, config.fov, clip.size)
     pictures, known = _depth_pictures(read, given, config.fov, known, start, work)
-    looked = _Looked(clip, fluid, mask, motion, trust, bulk_motion(clip, flow.flow, fluid.__getitem__))
+    bulk = bulk_motion(clip, flow.flow, fluid.__getitem__, fluid.any_frame())
+    looked = _Looked(clip, fluid, mask, motion, trust, bulk)
     evidence, kind, parts, up, heading = _kind_and_up(
         looked, given, config, known, pose_given, shaped=pictures is not None
     )
@@ -265,8 +266,8 @@ class _Looked:
     mask: np.ndarray
     motion: np.ndarray
     trust: np.ndarray
-    bulk: np.ndarray
-    """mean motion of all of it in each pair of frames"""
+    bulk: tuple[np.ndarray, np.ndarray]
+    """mean motion of all of the fluid, and of the ground, in each pair of frames"""
 
 
 def _kind_and_up(

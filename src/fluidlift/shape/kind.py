@@ -63,7 +63,7 @@ def estimate_kind(
     confidence: Float[np.ndarray, "h w"],
     *,
     pitch: float | None = None,
-    bulk: Float[np.ndarray, "n 2"] | None = None,
+    bulk: tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]] | None = None,
 ) -> KindEvidence:
     """Weigh direction of motion, shape of the mask and colour against what each kind looks like.
 
@@ -73,11 +73,11 @@ def estimate_kind(
         displacement: mean optical flow, px per frame.
         confidence: of the flow, 0 to 1.
         pitch: known tilt of the camera, degrees below the horizon, or None.
-        bulk: mean motion of the whole fluid in each of many pairs of frames, px per frame, nan where it is not known
-            (`motion.steady_flow.bulk_motion`); None: nothing is known of how it changes.
+        bulk: mean motion of the whole fluid, and of the ground, in each of many pairs of frames, px per frame, nan
+            where it is not known (`motion.steady_flow.bulk_motion`); None: nothing is known of how it changes.
     """
     require(fluid.shape == frames.shape[:3], f"masks {fluid.shape} for frames {frames.shape}")
-    f = _features(frames, fluid, displacement, confidence) | {"swinging": swinging(bulk)}
+    f = _features(frames, fluid, displacement, confidence) | {"swinging": 0.0 if bulk is None else swinging(*bulk)}
     still = 1.0 - f["changing"]
     inside = f["enclosed"] * (1 - f["hanging"])  # what ends within the picture passes nothing on
     staying = max(f["swinging"], inside * f["circling"])
@@ -216,14 +216,19 @@ def _border_share(mask: np.ndarray) -> float:
     return float(np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).mean())
 
 
-def swinging(bulk: Float[np.ndarray, "n 2"] | None) -> float:
+def swinging(bulk: Float[np.ndarray, "n 2"], ground: Float[np.ndarray, "n 2"]) -> float:
     """Share of the bulk motion that is to and fro: its variance in time over its mean square, 0 to 1.
 
-    It is 0 where too little is known.
+    In the picture and against the ground: what only the camera does, or only the ground that it passes,
+    does not count. It is 0 where too little is known.
 
     What runs through passes every section with the same discharge. Waves carry nothing in the mean.
     """
-    known = np.zeros((0, 2)) if bulk is None else bulk[np.isfinite(bulk).all(axis=1)]
+    return min(_changing(bulk), _changing(bulk - np.where(np.isfinite(ground), ground, 0.0)))
+
+
+def _changing(bulk: np.ndarray) -> float:
+    known = bulk[np.isfinite(bulk).all(axis=1)]
     if len(known) < FEWEST_PAIRS:
         return 0.0
     changes = max(float(known.var(axis=0).sum()) - 2.0 * SHAKE**2, 0.0)

@@ -258,8 +258,8 @@ class SurfaceAppearance:
         if footage is not None:
             # each place shows its own film: shores, and what stands in the water's picture, as well
             usable = in_picture(own.means, scene.camera)
-            level = kind_of(scene.kind).is_standing_water
-            return SeenTexture(own, self._camera, surface, usable=usable, level=level)
+            plane = footage.outside <= 0 if kind_of(scene.kind).is_standing_water else None
+            return SeenTexture(own, self._camera, surface, usable=usable, plane=plane)
         along = own.means @ scene.terrain.mainstream
         share = (along - along.min()) / max(float(np.ptp(along)), 1e-12)
         usable = lends_look(scene, own) & (share > ENDS[0]) & (share < ENDS[1])

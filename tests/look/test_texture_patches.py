@@ -383,3 +383,17 @@ def test_a_level_surface_seen_from_flat_above_lends_its_look():
     body, seen = sheet(0.1), np.ones((128, 128), bool)
     lends = [SeenTexture(body, flat, where, plane=plane).trust(where.columns()) > 0.5 for plane in (None, seen)]
     assert lends[0].mean() < 0.6 and lends[1].mean() > 0.9
+
+
+def test_patches_of_a_sea_show_one_instant_and_begin_again_together():
+    where, rng = surface(lambda x, y: (0.0 * x, 0.0 * y)), np.random.default_rng(0)
+    texture = SeenTexture(sheet(), CAMERA, where)
+    sea = TexturePatches(texture, 0.6, footage=FILM, start=40.0, together=True)
+    ended, before = 0, 0.0
+    for frame in range(20):
+        sea.advance(where, STEP if frame else 0.0, rng)
+        staying = sea.state.instants[~sea.state.going]
+        assert len(staying) > 10 and np.ptp(staying) < 1e-9, "a crest is one thing from shore to shore"
+        ended += bool(frame) and bool(staying[0] < before - 1.0)
+        before = staying[0]
+    assert ended == 1 and before == 12.0, "after seven frames from the first one on"

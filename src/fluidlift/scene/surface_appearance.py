@@ -194,7 +194,7 @@ class SurfaceAppearance:
         scene, own = self._scene, self._own
         gravity = np.asarray(scene.parameters.gravity, np.float64)
         upright = -gravity[2] > UPRIGHT * max(float(np.linalg.norm(gravity)), 1e-12)
-        footage = self._film_of(own)
+        footage, stands = self._film_of(own), kind_of(scene.kind).is_standing_water
         if kind_of(scene.kind).nearly_level and upright:
             self._axes = PlanAxes()
         elif footage is not None:
@@ -214,10 +214,10 @@ class SurfaceAppearance:
         places = self._axes.points(own.means)
         across = float(np.ptp(places[self._axes.shown(places), :2], axis=0).max(initial=0.0))
         self._patches = TexturePatches(
-            texture, max(PATCH * across, FEWEST_CELLS * self._cell), footage=footage, edited=scene.edited,
-            start=scene.film_start,
+            texture, max(PATCH * across, FEWEST_CELLS * self._cell), footage=footage,
+            edited=scene.edited and not stands, start=scene.film_start, together=stands,
         )  # fmt: skip
-        if footage is not None and kind_of(scene.kind).is_standing_water and not scene.edited:
+        if footage is not None and stands and not scene.edited:
             self._level = float(np.median(surface.height[surface.wet]))
         if footage is not None and kind_of(scene.kind).lies_on_ground and not scene.edited:
             self._outline = FilmedOutline(self._camera, footage.outside, self._cell)

@@ -85,7 +85,7 @@ def pot():
 @pytest.mark.parametrize("clip", [river, pot])
 def test_water_that_moves_to_and_fro_stays(clip):
     wavy, steady = estimate_kind(*clip(), bulk=to_and_fro()), estimate_kind(*clip(), bulk=to_and_fro(mean=3.0))
-    assert wavy.kind == "basin" and wavy.scores["basin"] > 0.7, wavy.scores
+    assert wavy.kind == "basin" and wavy.scores["basin"] > 0.6, wavy.scores
     assert steady.kind == "stream" and steady.scores["basin"] < 0.15, steady.scores
     assert estimate_kind(*clip()).kind == "stream", "nothing is known of how it changes"
 

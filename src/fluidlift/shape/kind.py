@@ -114,7 +114,7 @@ def estimate_kind(
         + 2.0 * f["foreground"] * (1 - f["slender"])
         - 1.8 * f["falling"] * (1 - f["foreground"])
         - 1.5 * f["rising"] * (1 - still * f["ground"])
-        - 3.0 * staying,
+        - 1.5 * staying,
         # what stays passes nothing on: it goes to and fro, or round and round
         "basin": 0.6
         + 0.8 * f["wide"] * (0.5 + still)
@@ -129,7 +129,8 @@ def estimate_kind(
         "dam": 7.0 * f["collapsing"] - 2.0,
     }
     if pitch is not None:  # steep views of bodies in the air are rare
-        belief["stream"] += 1.5 * np.clip((pitch - 20.0) / 20.0, -1.0, 1.0)
+        for lies in ("stream", "basin"):
+            belief[lies] += 1.5 * np.clip((pitch - 20.0) / 20.0, -1.0, 1.0)
     values = SHARPNESS * np.array([belief[k] for k in KINDS])
     share = np.exp(values - values.max())
     share /= share.sum()

@@ -52,6 +52,14 @@ def held(clip, masks, renders, coverage=None) -> AsFilmed:
     return as_filmed(clip, masks, INTERVAL, renders, masks if coverage is None else coverage)
 
 
+def test_waves_over_water_that_stays_are_no_current(clip, masks):
+    card = as_filmed(clip, masks, INTERVAL, clip[::-1], masks, runs=False)
+    assert held(clip, masks, clip[::-1]).verdict == WRONG, "all of it runs backwards"
+    for key in ("current_error", "current_cosine"):
+        assert card[key].value is None and card[key].verdict is None and "waves" in card[key].note
+    assert card.verdict != WRONG
+
+
 def test_the_clip_itself_is_good_and_equal_in_every_figure(clip, masks):
     card = held(clip, masks, clip)
     assert card.verdict == GOOD and card.warning() is None and card.advice == ()

@@ -374,3 +374,26 @@ def test_where_an_edit_makes_the_flow_unlike_the_film_new_patches_come_from_else
     young = same.state.instants < 40
     assert young.any()
     np.testing.assert_allclose(same.state.centers[young], same.state.sources[young], atol=0.02)
+
+
+def test_a_level_surface_seen_from_flat_above_lends_its_look():
+    """Splats on a plane seem to hide metres of it behind them; a plane does not."""
+    where = surface(lambda x, y: (0.0 * x, 0.0 * y))
+    flat = PinholeCamera.looking((2.0, -4.0, 0.85), (2.0, 2.0, 0.5), fov_degrees=40.0, size=(128, 128))
+    body, seen = sheet(0.1), np.ones((128, 128), bool)
+    lends = [SeenTexture(body, flat, where, plane=plane).trust(where.columns()) > 0.5 for plane in (None, seen)]
+    assert lends[0].mean() < 0.6 and lends[1].mean() > 0.9
+
+
+def test_patches_of_a_sea_show_one_instant_and_begin_again_together():
+    where, rng = surface(lambda x, y: (0.0 * x, 0.0 * y)), np.random.default_rng(0)
+    texture = SeenTexture(sheet(), CAMERA, where)
+    sea = TexturePatches(texture, 0.6, footage=FILM, start=40.0, together=True)
+    ended, before = 0, 0.0
+    for frame in range(20):
+        sea.advance(where, STEP if frame else 0.0, rng)
+        staying = sea.state.instants[~sea.state.going]
+        assert len(staying) > 10 and np.ptp(staying) < 1e-9, "a crest is one thing from shore to shore"
+        ended += bool(frame) and bool(staying[0] < before - 1.0)
+        before = staying[0]
+    assert ended == 1 and before == 12.0, "after seven frames from the first one on"

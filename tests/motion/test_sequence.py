@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import weakref
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -103,6 +104,21 @@ def test_a_uniform_stream_has_its_speed_on_the_screen_on_the_surface_and_below()
     # the top cells; 10 % for what the bed's layer and the projection take
     assert inside[..., 0].mean() == pytest.approx(SPEED[0], rel=0.1)
     assert found.report.solve.converged
+
+
+def test_waves_that_pass_over_standing_water_are_no_motion_of_it() -> None:
+    """The same flow as of the stream, over the same water without ends."""
+    scene = channel("basin")
+    cells = np.where(np.isin(scene.cell_types, (CellType.INFLOW, CellType.OUTFLOW)), CellType.FLUID, scene.cell_types)
+    scene = replace(scene, cell_types=cells.astype(np.uint8))
+    clip = Clip(9)
+    (found,) = motion_sequence(clip, still_mask, 9, scene, frames=(), volume_frames=[4])
+    assert found.report is not None and found.velocity is not None
+    assert np.abs(found.displacement - clip.truth)[still_mask(0)].mean() < 0.1, "the pictures move all the same"
+    assert found.report.circulating is not None and found.report.circulating < 0.25
+    assert np.linalg.norm(found.velocity.at_centers().mean(axis=(0, 1))[1:4], axis=-1).max() < 0.05 * SPEED[0]
+    (stream,) = motion_sequence(clip, still_mask, 9, channel(), frames=(), volume_frames=[4])
+    assert stream.report is not None and stream.report.circulating is None
 
 
 def test_ground_that_was_dry_a_moment_ago_does_not_slow_a_front() -> None:

@@ -7,9 +7,10 @@ import pytest
 from scipy.spatial import cKDTree
 
 from fluidlift.errors import InputRejected
+from fluidlift.look.surface_map import SurfaceMap
 from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.scene.simulator import simulator_of
-from fluidlift.scene.surface_appearance import CLEAR, FAINT, SurfaceAppearance
+from fluidlift.scene.surface_appearance import CLEAR, FAINT, SurfaceAppearance, levelled
 from fluidlift.types import FluidParameters, sh_from_rgb
 
 FRAMES = 6
@@ -141,3 +142,10 @@ def test_there_is_no_skin_in_an_obstacle(channel):
     away = np.hypot(*(shown.gaussians.means[:, :2] - [0.6, 0.4]).T)
     skin = shown.ids % 2 == 1
     assert (away[skin] >= 0.15).all() and (away[skin] < 0.2).any()
+
+
+def test_a_calm_surface_is_level_and_a_splash_stands_out():
+    wet, rest = np.ones((3, 1), bool), np.zeros((3, 1))
+    heights = rest + [[0.04], [-0.08], [0.5]]
+    found = levelled(SurfaceMap(np.zeros(2), 0.1, wet, heights + 2.0, np.zeros((3, 1, 3))), 2.0, 0.1)
+    np.testing.assert_allclose(found.height[:, 0], [2.0, 2.0, 2.4])

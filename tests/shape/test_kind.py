@@ -3,7 +3,16 @@
 import numpy as np
 import pytest
 
-from fluidlift.shape.kind import KINDS, doubts, estimate_kind, estimate_up, level_camera
+from fluidlift.shape.kind import (
+    FEWEST_PAIRS,
+    KINDS,
+    SHAKE,
+    doubts,
+    estimate_kind,
+    estimate_up,
+    level_camera,
+    swinging,
+)
 from fluidlift.types import KindEvidence, PinholeCamera, UpEvidence, kind_of
 
 H, W, T = 90, 160, 6
@@ -60,6 +69,56 @@ def dam(top=25, edge=0):
 def test_the_kind_is_what_the_fluid_does(clip, kind):
     found = estimate_kind(*clip())
     assert found.kind == kind, (found.scores, found.features)
+
+
+def to_and_fro(pairs=30, mean=0.0, swing=1.0):
+    """Bulk motion, px per frame, of water and ground: a wave over a current, seen for a period and a half."""
+    time = np.linspace(0.0, 3.0 * np.pi, pairs)
+    return np.stack([0.2 * np.cos(time), mean + swing * np.sin(time)], axis=-1), np.zeros((pairs, 2))
+
+
+def pot():
+    """Water in an upright round vessel, looked down on."""
+    return scene(np.hypot(ROW - 45, (COL - 80) / 1.5) < 25, (1.0, 0.2), BLUE)
+
+
+@pytest.mark.parametrize("clip", [river, pot])
+def test_water_that_moves_to_and_fro_stays(clip):
+    wavy, steady = estimate_kind(*clip(), bulk=to_and_fro()), estimate_kind(*clip(), bulk=to_and_fro(mean=3.0))
+    assert wavy.kind == "basin" and wavy.scores["basin"] > 0.6, wavy.scores
+    assert steady.kind == "stream" and steady.scores["basin"] < 0.15, steady.scores
+    assert estimate_kind(*clip()).kind == "stream", "nothing is known of how it changes"
+
+
+@pytest.mark.parametrize("clip", [jet, curtain, smoke, dam])
+def test_what_falls_rises_or_collapses_does_not_stay_however_it_swings(clip):
+    plain, wavy = estimate_kind(*clip()), estimate_kind(*clip(), bulk=to_and_fro())
+    assert wavy.kind == plain.kind, wavy.scores
+
+
+def test_what_is_stirred_in_a_vessel_stays_and_a_bend_of_a_river_does_not():
+    frames, masks, _, trust = pot()
+    whirl = np.where(masks[0][..., None], np.stack([-(ROW - 45.0) * 1.5, (COL - 80.0) / 1.5], axis=-1) / 12.0, 0.0)
+    stirred = estimate_kind(frames, masks, whirl, trust, bulk=to_and_fro(swing=0.0))
+    assert stirred.features["circling"] > 0.9 and stirred.kind == "basin", stirred.scores
+    assert estimate_kind(*pot()).features["circling"] == 0.0
+    frames, masks, _, trust = river()
+    bend = np.where(masks[0][..., None], np.stack([np.full((H, W), 3.0), (COL - 80.0) / 40.0], axis=-1), 0.0)
+    assert estimate_kind(frames, masks, bend, trust, bulk=to_and_fro(mean=3.0, swing=0.0)).kind == "stream"
+
+
+def test_what_swings_is_not_a_shake_nor_a_few_frames():
+    rng = np.random.default_rng(0)
+    water, ground = to_and_fro()
+    assert swinging(water, ground) > 0.9
+    assert swinging(rng.normal(0.0, SHAKE, (30, 2)) + [0.05, 0.0], ground) < 0.5
+    assert swinging(rng.normal(0.0, SHAKE, (30, 2)) + [1.0, 0.0], ground) < 0.01
+    assert swinging(*to_and_fro(FEWEST_PAIRS - 1)) == 0.0
+    assert swinging(water + [0.3, 0.0], water) < 0.01, "all of the picture does, and the water runs on"
+    assert swinging(ground + [0.3, 0.0], water) < 0.01, "only the ground does"
+    gaps = water.copy()
+    gaps[::3] = np.nan
+    assert swinging(gaps, ground * np.nan) == pytest.approx(swinging(water, ground), abs=0.05)
 
 
 def test_what_falls_so_slowly_that_it_is_followed_is_no_pour():

@@ -368,6 +368,53 @@ def test_a_closed_puddle_has_a_bank_on_all_sides():
     assert -setting.bed_height.min() == pytest.approx(0.2 * 1.4, rel=0.1)
 
 
+def beach(shore=0.2, longest=48):
+    """Setting of water beyond a straight shore near the camera, cut by the picture on the three other sides."""
+    camera = PinholeCamera.looking((0.0, -3.0, 3.0), (0.0, 0.0, 0.0), 50.0, (132, 96))
+    rays = camera.rays(camera.pixel_grid())
+    ground = camera.position - rays * (camera.position[2] / rays[..., 2])[..., None]
+    labels = np.where(ground[..., 1] > -shore, Label.FLUID, Label.BACKGROUND).astype(np.uint8)
+    wet = labels == Label.FLUID
+    seen = Footage(
+        PlaneHeight((0.0, 0.0), 0.0), labels, ground[wet], camera, np.array([1.0, 0, 0]), closed=True, goes_on=True,
+        ever=wet,
+    )  # fmt: skip
+    return channel_setting(seen, ChannelConfig("basin", longest, 120_000))
+
+
+def test_standing_water_goes_on_where_the_picture_cuts_it_and_deepens_away_from_its_shore():
+    setting = beach()
+    cells, grid = setting.cell_types, setting.terrain.grid
+    assert set(np.unique(cells)) == {CellType.EMPTY, CellType.SOLID, CellType.FLUID}, "nothing flows in or out"
+    y = grid.centers()[0, :, 0, 1]
+    wet = (cells == CellType.FLUID).any(axis=2)
+    far = y > 0.0
+    assert wet[:, far].all(), "to the sides of the box, where its walls are"
+    assert not wet[:, y < -0.2 - 2 * grid.spacing].any()
+    depth = -setting.bed_height.mean(axis=0)
+    near = (y > -0.1) & (y < 0.3)
+    assert (np.diff(depth[near]) > -1e-3).all() and depth[near][-1] > depth[near][0] + grid.spacing
+    assert (-setting.bed_height[[0, -1]][:, y > 1.0] > 0.5 * depth.max()).all(), "a cut is no shore"
+    assert np.allclose(setting.surface_height, 0.0)
+
+
+def test_standing_water_at_rest_stays_at_rest():
+    setting = beach(longest=20)
+    grid, wet = setting.terrain.grid, setting.cell_types == CellType.FLUID
+    start = np.concatenate([grid.centers()[wet] + 0.25 * grid.spacing * np.array(o) for o in np.ndindex(2, 2, 2)])
+    start = start[sample_nodes(setting.terrain.signed_distance, grid, start) > 0]
+    simulator = LiquidSimulator(
+        grid, setting.terrain, FluidParameters(time_step=0.01), Particles.at_rest(start, 1.0, np.arange(len(start))),
+        cell_types=setting.cell_types,
+    )  # fmt: skip
+    for _ in range(4):
+        simulator.advance(0.05)
+    after = simulator.particles
+    assert len(after) == len(start)
+    assert np.abs(np.percentile(after.positions[:, 2], 99) - np.percentile(start[:, 2], 99)) < 0.5 * grid.spacing
+    assert np.linalg.norm(after.velocities, axis=1).mean() < 0.1 * np.sqrt(9.81 * grid.spacing)
+
+
 def test_a_dry_corner_beyond_the_end_of_the_stream_is_no_bank():
     from fluidlift.shape.plan import _without_corners
 

@@ -161,6 +161,8 @@ def as_filmed(
     interval: float,
     renders: UInt8[np.ndarray, "k h w 3"],
     coverage: Bool[np.ndarray, "k h w"],
+    *,
+    runs: bool = True,
 ) -> AsFilmed:
     """Hold a re-simulation against its clip.
 
@@ -172,6 +174,8 @@ def as_filmed(
         interval: s between frames, of both.
         renders: the re-simulation in the clip's camera, from the first frame of `clip` on; may be longer than it.
         coverage: pixels that its fluid covers.
+        runs: False: it stays where it is. What moves over it are waves, which the clip shows at another time: no
+            current to hold against another.
 
     Raises:
         ValueError: arrays that do not fit each other, or fewer than `FEWEST` frames.
@@ -198,8 +202,9 @@ def as_filmed(
         beyond = level(still, coverage[len(clip) :], places)
         beyond |= likeness(whole, statistics(later, still), places.fluid, places)
     notes = ("The fluid moves through the picture: after the end of the clip nothing is compared.",) if moves else ()
-    speed = _speed(whole, places.fluid)
-    figures = tuple(_figures(value, floor, beyond, speed))
+    for key in ("current_error", "current_cosine") if not runs else ():
+        value[key] = floor[key] = beyond[key] = NONE
+    figures = tuple(_figures(value, floor, beyond, _no_current(_speed(whole, places.fluid), runs=runs)))
     return AsFilmed(length, len(later), figures, notes, tuple(_advice(figures, value, beyond)))
 
 
@@ -313,13 +318,19 @@ _WORDS = {
 """figures in their order, with their units"""
 
 
-def _figures(value: dict[str, float], floor: dict[str, float], beyond: dict[str, float], speed: float):
+def _no_current(speed: float, *, runs: bool) -> str:
+    """Why no current is judged; empty where one is. `speed`: px per frame."""
+    if not runs:
+        return "not judged: waves that pass over water are no current"
+    return f"not judged: {speed:.2f} px/frame is less than what optical flow is wrong by" if speed < SLOWEST else ""
+
+
+def _figures(value: dict[str, float], floor: dict[str, float], beyond: dict[str, float], no_current: str):
     """Each figure with its verdict."""
     for key, (words, unit) in _WORDS.items():
+        note = no_current if key.startswith("current") else ""
         numbers = triple(_plain(x.get(key)) for x in (value, floor, beyond))
         verdicts = [v for v in (_judged(key, x, numbers[1]) for x in (numbers[0], numbers[2])) if v]
-        slow = key.startswith("current") and speed < SLOWEST
-        note = f"not judged: {speed:.2f} px/frame is less than what optical flow is wrong by" if slow else ""
         worst = max(verdicts, key=VERDICTS.index) if verdicts else None
         yield Likeness(key, words, *numbers, unit, worst, note)
 

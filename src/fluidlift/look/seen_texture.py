@@ -60,6 +60,8 @@ class SeenTexture(TrustedMap):
         surface: of the body at rest.
         shading: what of the look stays in place; None: nothing.
         usable: which of the splats may lend their look.
+        plane: pixels that show the fluid, where its surface is a plane, which hides no part of itself: from flat above,
+            splats on it seem to, by metres. All that is seen there may lend its look, whatever else is said.
 
     Raises:
         ValueError: no splats.
@@ -73,6 +75,7 @@ class SeenTexture(TrustedMap):
         *,
         shading: SteadyShading | None = None,
         usable: Bool[np.ndarray, " n"] | None = None,
+        plane: Bool[np.ndarray, "h w"] | None = None,
     ) -> None:
         require(len(body) > 0, "a body without Gaussians", "one or more")
         self._camera, self._shading = camera, shading
@@ -94,6 +97,8 @@ class SeenTexture(TrustedMap):
             seen &= ~shading.fixed[row, col]
         if usable is not None:
             seen &= usable[cKDTree(body.means[:, :2]).query(places.reshape(-1, 2))[1]]
+        if plane is not None:
+            seen = inside & plane[row, col]
         super().__init__(surface, ndimage.binary_closing(seen.reshape(surface.wet.shape)) & surface.wet)
 
     def seen_at(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:

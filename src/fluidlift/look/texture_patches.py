@@ -123,6 +123,8 @@ class TexturePatches:
         footage: the fluid over time; None: patches are pieces of the look at rest.
         edited: whether the fluid flows otherwise than it was filmed.
         start: instant of the footage, frames, that the body at rest shows.
+        together: all patches show the same instant: waves that pass over water that stays are one thing, from shore to
+            shore. At the end of the film all begin anew.
 
     Raises:
         ValueError: a radius that is not positive, or a texture without any usable place.
@@ -136,12 +138,14 @@ class TexturePatches:
         footage: FluidFootage | None = None,
         edited: bool = False,
         start: float = 0.0,
+        together: bool = False,
     ) -> None:
         require(radius > 0, f"radius {radius}", "positive metres")
         require(texture.usable, "a texture of which nothing was seen")
         self.state = Patches.none()
         self._texture, self._radius = texture, radius
         self._footage, self._edited, self._start = footage, edited, start
+        self._together = together
         self._good = texture.trust_within(radius)
         self._seen_flow = _gradients(texture.surface, SMOOTH * radius)[0]
 
@@ -220,17 +224,31 @@ class TexturePatches:
         here, own = surface.at(flow, centers), self._texture.surface.at(self._seen_flow, centers)
         like = np.linalg.norm(here - own, axis=1) < UNLIKE * np.linalg.norm(own, axis=1)
         at_home = (self._texture.trust(centers) > 0.5) & (like if self._edited else True)
+        if self._together:  # as far as a patch shows anything that was seen
+            at_home |= self._seen_within(centers)
         sources = np.array([
             c if home else self._source(c, rng) for c, home in zip(centers, at_home, strict=True)
         ])  # fmt: skip
         turns = np.where(at_home, 0.0, _wrapped(self._heading(surface, flow, centers, sources)))
         last, fade = len(self._footage) - 1.0, _fade_of(self._footage)
+        if self._together:
+            lasting = self.state.instants[~self.state.going]
+            now = float(np.median(lasting)) if len(lasting) else min(self._start, last) if first else 0.0
+            full = np.ones(n)
+            return Patches(
+                centers, sources, turns, 0 * full, full if first else full / fade, now * full, (last - fade) * full
+            )
         if first:
             begin = np.full(n, min(self._start, last))
             ends = begin + rng.uniform(0, 1, n) * np.maximum(last - fade - begin, 0.0)
             return Patches(centers, sources, turns, np.zeros(n), np.ones(n), begin, ends)
         begin = rng.uniform(0, 0.5 * last, n)
         return Patches(centers, sources, turns, np.zeros(n), np.full(n, 1 / fade), begin, np.full(n, last - fade))
+
+    def _seen_within(self, centers: np.ndarray) -> np.ndarray:
+        """Whether anything that was seen is within a radius of places."""
+        places = self._texture.surface.middles().reshape(-1, 2)
+        return nearest(places[self._texture.trust(places) > 0.5], centers)[0] < self._radius
 
     def _source(self, center: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Where a new patch takes its look from: near its place (foam is where rocks are), not the same again."""

@@ -7,7 +7,7 @@ the clip, and each frame's result depends on its own window alone: any subset of
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -15,12 +15,14 @@ from jaxtyping import Bool, Float, UInt8
 from fluidlift.errors import require
 from fluidlift.motion.air import with_air
 from fluidlift.motion.bed import WALLS
+from fluidlift.motion.circulation import circulating
 from fluidlift.motion.direction import mainstream_direction
 from fluidlift.motion.free_fall import downhill_of, with_free_fall
 from fluidlift.motion.front import raised_flow
 from fluidlift.motion.lift import depth_change, lift_flow
 from fluidlift.motion.mainstream import complete_flow
 from fluidlift.motion.screen_divergence import project_screen_divergence, validated_reach
+from fluidlift.motion.steady_flow import TRUSTED
 from fluidlift.motion.temporal import smoothed_flow
 from fluidlift.motion.volume import VolumeReport, VolumeSolver
 from fluidlift.types import FaceVelocity, FluidKind, PinholeCamera, PixelFlow, SurfaceMotion, Terrain, kind_of
@@ -336,14 +338,20 @@ def _lifted(
     body, body_after = now.on_body()
     if not body.any():
         return None, None, None, None, None
+    stays = kind_of(scene.kind).is_standing_water
+    if stays and scene.prior is not None:  # waves come and go; what circulates is in the mean
+        full, seen = scene.prior[0], scene.prior[1] > TRUSTED
     measured = surface = lift_flow(
         full, seen, body, now.depth, now.depth_after, scene.camera, scene.interval, mask_t1=body_after
     )
-    share = None
+    share = circulates = None
+    if stays:
+        surface, circulates = circulating(surface, cells, terrain.grid)
     if kind_of(scene.kind).falls_freely:
         down = downhill_of(surface.points, terrain.grid, scene.surface_height, scene.pool_level)
         surface, share = with_free_fall(surface, down, kind=scene.kind)
     velocity, report = solver.velocity(surface, tolerance=options.tolerance)
+    report = replace(report, circulating=circulates)
     if kind_of(scene.kind).is_gas:
         velocity, _ = with_air(velocity, cells, terrain, terrain.grid)
     return measured, surface, velocity, report, share

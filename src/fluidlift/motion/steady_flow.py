@@ -45,6 +45,36 @@ def mean_motion(clip: VideoClip, flow: PixelFlow, mask: np.ndarray) -> tuple[np.
     return mean, trust
 
 
+def bulk_motion(
+    clip: VideoClip, flow: PixelFlow, fluid: Callable[[int], np.ndarray], ever: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean motion of the whole fluid, and of what is never fluid, in each pair of frames, px per `clip.interval`.
+
+    A stream has the same in every pair, since what comes in goes out. Waves pass, and swing to and fro. So does all of
+    the picture in a hand that trembles, the ground with it.
+
+    Args:
+        clip: for its times.
+        flow: of all pairs.
+        fluid: bool [h,w] of a frame.
+        ever: bool [h,w], fluid in any frame.
+
+    Returns:
+        two arrays float64 [n,2]; nan where nothing was measured.
+    """
+    read, pairs = _rows(clip, flow), len(flow.confidence)
+    pick = np.unique(np.linspace(0, pairs - 1, min(pairs, MOST_PAIRS)).round().astype(int))
+    water, ground = np.full((2, len(pick), 2), np.nan)
+    for row, t in enumerate(pick):
+        found = read([t], slice(None))
+        for out, part in ((water, fluid(int(t))), (ground, ~ever)):
+            weight = found.confidence[0] * part
+            total = float(weight.sum())
+            if total > 0:
+                out[row] = (weight[..., None] * found.displacement[0]).sum(axis=(0, 1)) / total
+    return water, ground
+
+
 def _rows(clip: VideoClip, flow: PixelFlow) -> Callable[[Iterable[int], slice], PixelFlow]:
     """Reads rows of the flow of some pairs."""
     spans = spans_of(clip)

@@ -113,6 +113,8 @@ class VolumeReport:
     """relative change (2-norm) that the divergence-free solve made to the faces between observed cells, 0 to 1"""
     viscous: float = 0.0
     """how surely a stream is a viscous film, 0 to 1 (`motion.bed.film_share`)"""
+    circulating: float | None = None
+    """of standing water: speed of what circulates in it over that of what was seen, 0 to 1 (`motion.circulation`)"""
 
 
 class VolumeSolver:
@@ -140,25 +142,25 @@ class VolumeSolver:
         wall = "cubic" if kind.is_gas else wall  # a gas meets few walls, and never by its whole depth
         # the other wall functions span the whole depth: there is nothing left to interpolate
         # what is poured may be viscous, which drags through its depth: harmonic between the surface and the bed
-        layered = kind.is_channel_flow or wall != "cubic"
+        layered = kind.lies_on_ground or wall != "cubic"
         self._bed = _Bed(types, terrain, grid, kind, mainstream, wall, _typical_depth(types, grid.spacing))
         self._extension = options.extension or ("layered" if layered else "harmonic")
         self._share = self._bed.share() if self._extension == "layered" else None
         # the paper's layer is for fluid that is not viscous; whether a stream is shows only in its motion
-        asked = kind.nearly_level and wall == "cubic" and self._share is not None
+        asked = kind.runs_nearly_level and wall == "cubic" and self._share is not None
         self._film = replace(self._bed, wall="film").share() if asked else None
         # fluid passes freely through both ends
         self._system = build_system(np.where(types == CellType.INFLOW, CellType.OUTFLOW, types), terrain, grid)
         self._nearest, self._ends = nearest_cells(carrying), end_faces(types)
         self._mouths = mouths_of(types, self._system, REACH * self._bed.depth)
-        self._steady = kind.nearly_level and len(self._mouths) == 2
+        self._steady = kind.runs_nearly_level and len(self._mouths) == 2
         self._rim = [end for end in self._mouths if end.inlet] if kind.enters_over_rim else []
         self._below = float(np.hypot(PROFILE_ERROR, DEPTH_ERROR)) if kind.is_channel_flow else PROFILE_ERROR
         self._balanced = options.balanced if options.balanced is not None else not kind.is_gas
         if options.surface_mobility is not None:
             self._leak = np.full(grid.shape, options.surface_mobility, np.float32)
         else:
-            steady = 0.0 if kind.is_gas else passed_through(types, self._system.openings, however_narrow=self._steady)
+            steady = self._level_stays(kind)
             # between the two by ratio: they differ by orders of magnitude
             leak = self._closed() ** steady * YIELDING_SURFACE ** (1.0 - steady)
             self._leak = np.broadcast_to(leak, grid.shape).astype(np.float32)
@@ -203,6 +205,12 @@ class VolumeSolver:
         velocity = velocity if self._rim else continue_through_ends(velocity, self._ends)
         change = _change(extended, velocity, seen & (confidence > 0.5))
         return velocity, replace(_report(velocity, system, types, solve, change), viscous=viscous)
+
+    def _level_stays(self, kind: FluidKind) -> float | np.ndarray:
+        """How surely no level changes, 0 to 1, where it is not the same for all [nx,ny,nz]."""
+        if kind.is_gas or kind.is_standing_water:
+            return float(kind.is_standing_water)
+        return passed_through(self._types, self._system.openings, however_narrow=self._steady)
 
     def _closed(self) -> float:
         """Mobility of a closed surface."""

@@ -15,7 +15,7 @@ from fluidlift.scene.build import SimulationRequest, scene_of
 from fluidlift.scene.recall import footage_of_asset
 from fluidlift.scene.splat_files import frames_of
 from fluidlift.seams import Progress, Silence
-from fluidlift.types import VideoClip
+from fluidlift.types import VideoClip, kind_of
 
 if TYPE_CHECKING:
     from fluidlift.evaluate.as_filmed import AsFilmed
@@ -70,7 +70,8 @@ def card_against(folder: Path, video: Path, *, start: float = 0.0, progress: Pro
     progress.stage("compare", 1, 1)
     renders, coverage = _renders(folder, FrontView.of(scene, footage), range(first, last), progress)
     masks = np.broadcast_to(footage.labels.fluid.mean(axis=0) > 0.5, other.frames.shape[:3])
-    return as_filmed(other.frames, masks, interval, renders, coverage)
+    stands = kind_of(scene.kind).is_standing_water
+    return as_filmed(other.frames, masks, interval, renders, coverage, runs=not stands)
 
 
 def _check(other: VideoClip, clip: VideoClip, interval: float) -> None:

@@ -186,7 +186,7 @@ def depth_front(
     if evidence is not None:
         meta["slope"] = asdict(evidence)
     learned = pictures.source != "depth file"
-    if not learned and kind.is_channel_flow and fused.holds != "disparity":
+    if not learned and kind.lies_on_ground and fused.holds != "disparity":
         # a file is believed to its last wave, where it says something; what lies below follows the smooth surface
         known = mask & np.isfinite(scene.depth) & (scene.depth > 0)
         front = replace(front, depth=np.where(known, scene.depth, front.depth).astype(np.float32))

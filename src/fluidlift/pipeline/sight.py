@@ -9,7 +9,7 @@ import numpy as np
 
 from fluidlift.errors import InputRejected
 from fluidlift.messages import NONE, Notice
-from fluidlift.motion.steady_flow import mean_motion
+from fluidlift.motion.steady_flow import bulk_motion, mean_motion
 from fluidlift.pipeline import depths, given_body
 from fluidlift.pipeline.inputs import GivenFile
 from fluidlift.pipeline.known_camera import known_camera, lens_is_known, level_of
@@ -212,8 +212,10 @@ def _seen(
     motion, trust = mean_motion(clip, flow.flow, fluid.any_frame())
     known, pose_given = known_camera(given, config.fov, clip.size)
     pictures, known = _depth_pictures(read, given, config.fov, known, start, work)
+    bulk = bulk_motion(clip, flow.flow, fluid.__getitem__, fluid.any_frame())
+    looked = _Looked(clip, fluid, mask, motion, trust, bulk)
     evidence, kind, parts, up, heading = _kind_and_up(
-        _Looked(clip, fluid, mask, motion, trust), given, config, known, pose_given, shaped=pictures is not None
+        looked, given, config, known, pose_given, shaped=pictures is not None
     )
     height, unsure, stood = None, NONE, None
     if pose_given and kind.surveyed_level is not None:
@@ -264,6 +266,8 @@ class _Looked:
     mask: np.ndarray
     motion: np.ndarray
     trust: np.ndarray
+    bulk: tuple[np.ndarray, np.ndarray]
+    """mean motion of all of the fluid, and of the ground, in each pair of frames"""
 
 
 def _kind_and_up(
@@ -275,7 +279,7 @@ def _kind_and_up(
     surveyed, heading = registration.pose_up(known)
     pitch = float(surveyed.pitch) if pose_given else _said_of_view(c, known, mask.shape).pitch
     pick = np.unique(np.linspace(0, len(clip) - 1, 8).astype(int))
-    evidence = kinds.estimate_kind(clip.frames[pick], fluid[pick], motion, trust, pitch=pitch)
+    evidence = kinds.estimate_kind(clip.frames[pick], fluid[pick], motion, trust, pitch=pitch, bulk=looked.bulk)
     kind = kind_of(evidence.kind if c.kind == "auto" else c.kind)
     if kind.starts_at_rest and (shaped or bodies is not None):
         if c.kind != "auto":
@@ -303,7 +307,7 @@ def _kind_and_up(
         if upright is not None:
             return evidence, kind, parts, upright, None
     texture = None
-    if kind.nearly_level and c.pitch is None and not parts.puddle:
+    if kind.runs_nearly_level and c.pitch is None and not parts.puddle:
         texture = texture_gradient.texture_patches(clip.frames, parts.lying & parts.gentle)
     typical = typical_picture(clip.frames[pick]).astype(np.uint8)
     said = _said_of_view(c, known, mask.shape)

@@ -20,6 +20,8 @@ FAST_FALL = 0.3
 """share of the steep part whose speed is that of free fall, from which the user is told"""
 LITTLE_SEEN = 0.25
 """share of the fluid below which the result is more the completion's than the clip's, and the user is told"""
+WAVES = 0.5
+"""share of the seen speed that circulates, below which the user is told that the rest counts as waves"""
 DISAGREEMENT = 0.5
 """share by which the projection changes what was seen on the surface, from which the user is told"""
 
@@ -91,6 +93,17 @@ def motion_warnings(reports: list[dict[str, Any]], kind: str, free_fall_share: f
                 "discharge-disagrees",
                 "the shape and the measured motion do not agree on one discharge: velocities of the seen surface were "
                 "changed by more than half",
+            )
+        )
+    circulating = [r["circulating"] for r in reports if r.get("circulating") is not None]
+    if circulating and np.median(circulating) < WAVES:
+        warnings.append(
+            Notice(
+                "waves-not-simulated",
+                f"what is seen to move over the {kind} is taken for waves: only "
+                f"{100 * np.median(circulating):.0f} % of its speed can be water that circulates within its outline; "
+                "the re-simulation "
+                "is calm but for that, and the film on its surface shows the waves",
             )
         )
     if free_fall_share > FAST_FALL:

@@ -14,6 +14,7 @@ from fluidlift.messages import Notice
 from fluidlift.physics.inflow_schedule import InflowSchedule
 from fluidlift.scene.build import Scene
 from fluidlift.scene.footage import Footage
+from fluidlift.types import kind_of
 
 if TYPE_CHECKING:
     from fluidlift.evaluate.as_filmed import AsFilmed
@@ -94,7 +95,10 @@ def card_of_run(
     if reason is not None or footage is None:
         return Noted({"none": reason})
     first = footage.start
-    card = as_filmed(footage.clip.frames[first:], footage.labels.fluid[first:], scene.interval, renders, coverage)
+    card = as_filmed(
+        footage.clip.frames[first:], footage.labels.fluid[first:], scene.interval, renders, coverage,
+        runs=not kind_of(scene.kind).is_standing_water,
+    )  # fmt: skip
     warning = card.warning()
     return Noted(card.to_dict(), (warning,) if warning else ())
 

@@ -31,7 +31,7 @@ def before_ground(scene: Scene, footage: Footage | None) -> Callable[[Gaussians]
     if footage is None:
         return None
     rocks, before = footage.rocks, footage.before
-    ground = rocks | ~footage.labels.fluid.any(axis=0) if kind_of(scene.kind).is_channel_flow else rocks
+    ground = rocks | ~footage.labels.fluid.any(axis=0) if kind_of(scene.kind).lies_on_ground else rocks
     if not ground.any():
         return None
     margin = scene.terrain.grid.spacing * np.where(rocks, *BEHIND)

@@ -158,7 +158,7 @@ class Painter:
         self.look, self.terrain, self.engine = look, terrain, engine
         self.material: Material = material_named(look.material).tinted(look.tint)
         self.environment = environment_of(folder, look.environment)
-        self._samples, self._bed = samples, terrain if kind_of(kind).is_channel_flow else None
+        self._samples, self._bed = samples, terrain if kind_of(kind).lies_on_ground else None
         self._end = end
         self._finer, self._folder = 1 if engine == "mitsuba" else int(supersample), folder
         self._far: tuple[tuple, np.ndarray] | None = None

@@ -289,7 +289,7 @@ def edited_scene(
     body = Particles.at_rest(rest.means, 1.0, np.arange(len(rest)), sample_faces(velocity, grid, rest.means))
     shading = None
     # bodies in the air change their outline: nothing is steady
-    if footage is not None and kind_of(asset.kind).is_channel_flow:
+    if footage is not None and kind_of(asset.kind).lies_on_ground:
         shading = SteadyShading.of(footage.clip.frames, footage.labels.fluid, asset.camera)
     changes = dict(edits.parameters)
     longest_step = changes.pop("time_step", None)

@@ -80,6 +80,11 @@ of a Laplacian pyramid keeps half of its energy, which sharpening the film gives
 SMALLEST = 0.02
 """standard deviation of a splat at least, cells: files hold its logarithm"""
 
+CALM = 1.0
+"""cells within which the surface of standing water that nobody edited is shown level: particles come to rest unevenly,
+by half a cell, and sink by as much. From flat above such a swell hides lengths of water behind it, and the film with
+the waves is laid on a plane"""
+
 REACH = 0.5
 """standard deviation of a splat under the skin at most, shares of its distance from the ground and `CLEAR`: wider ones
 would lie over the rocks beside them"""
@@ -146,6 +151,12 @@ def _taken_apart(film: Path, size: tuple[int, int], blur: float, written: tuple[
     return f"shows none: {AS_AT_REST}; make the asset again" if found is None else found
 
 
+def levelled(surface: SurfaceMap, level: float, within: float) -> SurfaceMap:
+    """The map with what is within a distance of a level (both m) on it, and what is further off nearer by that."""
+    away = surface.height - level
+    return replace(surface, height=level + np.sign(away) * np.maximum(np.abs(away) - within, 0.0))
+
+
 class SurfaceAppearance:
     """Splats for the particles of a scene, frame by frame from the first one on.
 
@@ -163,6 +174,7 @@ class SurfaceAppearance:
         self._surface: SurfaceMap | None = None
         self._axes: SurfaceAxes
         self._outline: FilmedOutline | None = None
+        self._level: float | None = None
         self._plays = False
         self._own = scene.rest.select(np.arange(len(scene.rest) - sum(map(len, scene.emitter_looks))))
         if len(self._own) and len(scene.body):
@@ -182,7 +194,7 @@ class SurfaceAppearance:
         scene, own = self._scene, self._own
         gravity = np.asarray(scene.parameters.gravity, np.float64)
         upright = -gravity[2] > UPRIGHT * max(float(np.linalg.norm(gravity)), 1e-12)
-        footage = self._film_of(own)
+        footage, stands = self._film_of(own), kind_of(scene.kind).is_standing_water
         if kind_of(scene.kind).nearly_level and upright:
             self._axes = PlanAxes()
         elif footage is not None:
@@ -202,10 +214,12 @@ class SurfaceAppearance:
         places = self._axes.points(own.means)
         across = float(np.ptp(places[self._axes.shown(places), :2], axis=0).max(initial=0.0))
         self._patches = TexturePatches(
-            texture, max(PATCH * across, FEWEST_CELLS * self._cell), footage=footage, edited=scene.edited,
-            start=scene.film_start,
+            texture, max(PATCH * across, FEWEST_CELLS * self._cell), footage=footage,
+            edited=scene.edited and not stands, start=scene.film_start, together=stands,
         )  # fmt: skip
-        if footage is not None and kind_of(scene.kind).is_channel_flow and not scene.edited:
+        if footage is not None and stands and not scene.edited:
+            self._level = float(np.median(surface.height[surface.wet]))
+        if footage is not None and kind_of(scene.kind).lies_on_ground and not scene.edited:
             self._outline = FilmedOutline(self._camera, footage.outside, self._cell)
         self._plays = footage is not None
         self._begin_again()
@@ -243,7 +257,9 @@ class SurfaceAppearance:
         scene, own = self._scene, self._own
         if footage is not None:
             # each place shows its own film: shores, and what stands in the water's picture, as well
-            return SeenTexture(own, self._camera, surface, usable=in_picture(own.means, scene.camera))
+            usable = in_picture(own.means, scene.camera)
+            plane = footage.outside <= 0 if kind_of(scene.kind).is_standing_water else None
+            return SeenTexture(own, self._camera, surface, usable=usable, plane=plane)
         along = own.means @ scene.terrain.mainstream
         share = (along - along.min()) / max(float(np.ptp(along)), 1e-12)
         usable = lends_look(scene, own) & (share > ENDS[0]) & (share < ENDS[1])
@@ -259,6 +275,8 @@ class SurfaceAppearance:
             return None
         moving = self._axes.velocities(particles.positions, particles.velocities)
         surface = SurfaceMap.of(points[shown], moving[shown], self._cell)
+        if self._level is not None:
+            surface = levelled(surface, self._level, CALM * self._cell)
         return surface if self._outline is None else self._outline.cut(surface, self._axes)
 
     def _begin_again(self) -> None:

@@ -181,6 +181,8 @@ def _fill_channel(grid, plan, ground: _Ground, reach, seen: Footage, kind) -> Se
     cells[solid] = CellType.SOLID
     cells[fluid] = CellType.FLUID
     terrain = Terrain(grid, phi.astype(np.float32), unit(seen.mainstream), ground_mesh(grid, to_corners(ground.shown)))
+    if seen.goes_on:
+        terrain = _walled(terrain, _kept_dry(grid, plan, dry_columns(seen, plan, grid)))
     if seen.closed:
         return Setting(terrain, cells, plan.level, bed)
     start, stop = wide_ends(water, plan.along, reach, h, share=0.4)
@@ -191,8 +193,12 @@ def _fill_channel(grid, plan, ground: _Ground, reach, seen: Footage, kind) -> Se
     cells[~solid & (s > stop - 2.5 * h)] = CellType.OUTFLOW
     # before the outlet the water spreads as it likes
     wall = _kept_dry(grid, plan, dry_columns(seen, plan, grid) & (plan.along < stop - OUTLET * h))
-    terrain = replace(terrain, signed_distance=np.minimum(terrain.signed_distance, wall).astype(np.float32))
-    return Setting(terrain, cells, plan.level, bed)
+    return Setting(_walled(terrain, wall), cells, plan.level, bed)
+
+
+def _walled(terrain: Terrain, wall: Float[np.ndarray, "nx+1 ny+1 nz+1"]) -> Terrain:
+    """The terrain with a wall (signed distance, m, on the nodes) as ground."""
+    return replace(terrain, signed_distance=np.minimum(terrain.signed_distance, wall).astype(np.float32))
 
 
 def _kept_dry(grid: Grid, plan: Plan, dry: Bool[np.ndarray, "nx ny"]) -> Float[np.ndarray, "nx+1 ny+1 nz+1"]:

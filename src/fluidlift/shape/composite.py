@@ -77,7 +77,7 @@ def split(
     tilt = up or UpEvidence(LOOKING_DOWN[0], 0.0, "", 0.0)
     found: list[jets.Outline] = []
     neck = None
-    if kind.nearly_level:
+    if kind.runs_nearly_level:
         found = jets.find_jets(level_camera(camera, tilt), mask, motion, trust)
     elif kind.fills_vessel and free:
         neck = jets.find_neck(mask, pitch=tilt.pitch)

@@ -64,7 +64,7 @@ def depth_along(reach: Reach, depth: float, width: float, kind: str | FluidKind)
         reach: the water from above.
         depth: of a typical section, m.
         width: typical, m; what changes over less than half of it along the stream does not count.
-        kind: of the fluid; only what is nearly level has a straight bed.
+        kind: of the fluid; only what runs nearly level has a straight bed.
     """
     h = reach.spacing
     free = reach.wet & ~reach.rock
@@ -92,7 +92,7 @@ def depth_along(reach: Reach, depth: float, width: float, kind: str | FluidKind)
             flux = np.interp(np.arange(count), np.flatnonzero(good), flux[good])
             factor = np.clip((np.median(flux) / flux) ** CONTINUITY, 0.5, 2.0)
     section = depth * factor
-    if kind_of(kind).nearly_level and count > 2:
+    if kind_of(kind).runs_nearly_level and count > 2:
         bed = level - section
         line = np.polyval(np.polyfit(np.arange(count), bed, 1, w=np.sqrt(columns)), np.arange(count))
         section = np.clip(level - (STRAIGHT * line + (1 - STRAIGHT) * bed), 0.4 * depth, 2.5 * depth)

@@ -34,6 +34,11 @@ FOLLOWED = 0.3
 """share of the fluid that is seen to fall with reliable flow, from which it is followed. Under gravity h metres take
 0.45 s times the root of h, so of a jet a few decimetres long a pixel moves by more per frame than its own pattern: of
 six pours 0 to 0.09 of the fluid is seen to fall so, of five falls and fountains 0.27 to 0.57"""
+FEWEST_PAIRS = 12
+"""pairs of frames: half a second, in which a wave rises or falls"""
+SHAKE = 0.05
+"""px per frame and axis that the bulk motion changes by where the fluid's does not: what steadying leaves of a camera's
+shake, and errors of optical flow (`slope.LEAST_NOISE`)"""
 STRAIGHT = 10.0
 """degrees: a larger lean of what falls is a thrown jet or wind, not a turned camera"""
 
@@ -58,6 +63,7 @@ def estimate_kind(
     confidence: Float[np.ndarray, "h w"],
     *,
     pitch: float | None = None,
+    bulk: tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]] | None = None,
 ) -> KindEvidence:
     """Weigh direction of motion, shape of the mask and colour against what each kind looks like.
 
@@ -67,10 +73,14 @@ def estimate_kind(
         displacement: mean optical flow, px per frame.
         confidence: of the flow, 0 to 1.
         pitch: known tilt of the camera, degrees below the horizon, or None.
+        bulk: mean motion of the whole fluid, and of the ground, in each of many pairs of frames, px per frame, nan
+            where it is not known (`motion.steady_flow.bulk_motion`); None: nothing is known of how it changes.
     """
     require(fluid.shape == frames.shape[:3], f"masks {fluid.shape} for frames {frames.shape}")
-    f = _features(frames, fluid, displacement, confidence)
+    f = _features(frames, fluid, displacement, confidence) | {"swinging": 0.0 if bulk is None else swinging(*bulk)}
     still = 1.0 - f["changing"]
+    inside = f["enclosed"] * (1 - f["hanging"])  # what ends within the picture passes nothing on
+    staying = max(f["swinging"], inside * f["circling"])
     belief = {
         # smoke rises from below, is grey, and its outline changes; it neither hangs from above nor fills the picture
         "plume": 2.6 * f["rising"]
@@ -103,12 +113,24 @@ def estimate_kind(
         + 0.8 * f["wide"] * (0.5 + still) * (1 - f["falling"])
         + 2.0 * f["foreground"] * (1 - f["slender"])
         - 1.8 * f["falling"] * (1 - f["foreground"])
-        - 1.5 * f["rising"] * (1 - still * f["ground"]),
+        - 1.5 * f["rising"] * (1 - still * f["ground"])
+        - 1.5 * staying,
+        # what stays passes nothing on: it goes to and fro, or round and round
+        "basin": 0.6
+        + 0.8 * f["wide"] * (0.5 + still)
+        + 2.0 * f["foreground"] * (1 - f["slender"])
+        + (6.0 + 1.5 * inside) * staying
+        - 4.0
+        - 2.4 * f["slender"]
+        - 2.0 * f["falling"]
+        - 2.0 * f["hanging"] * (1 - f["bulky"])
+        - 2.0 * f["changing"],
         # a body that stands comes down from where it was and spreads over ground that was dry
         "dam": 7.0 * f["collapsing"] - 2.0,
     }
     if pitch is not None:  # steep views of bodies in the air are rare
-        belief["stream"] += 1.5 * np.clip((pitch - 20.0) / 20.0, -1.0, 1.0)
+        for lies in ("stream", "basin"):
+            belief[lies] += 1.5 * np.clip((pitch - 20.0) / 20.0, -1.0, 1.0)
     values = SHARPNESS * np.array([belief[k] for k in KINDS])
     share = np.exp(values - values.max())
     share /= share.sum()
@@ -157,11 +179,62 @@ def _features(frames, fluid, displacement, confidence) -> dict[str, float]:
         "ground": ground,
         "hanging": float(fluid[:, : max(2, height // 60)].any(axis=(1, 2)).mean() * (1 - ground)),
         "changing": float(np.clip(change / 0.3, 0.0, 1.0)),
+        "circling": circling(displacement, weight),
+        "enclosed": float(np.clip(1.0 - _border_share(union) / 0.1, 0.0, 1.0)),
         "grey": float(np.clip(1.0 - chroma / 0.15, 0.0, 1.0)),
         "collapsing": _collapsing(fluid),
         "speed_px": float(total / max(float((confidence * union).sum()), 1e-9)),
         "area_share": float(union.sum() / (height * width)),
     }
+
+
+def circling(displacement: Float[np.ndarray, "h w 2"], weight: Float[np.ndarray, "h w"]) -> float:
+    """How far a motion goes round its middle: its angular momentum over what it would be were it all across the radius.
+
+    Args:
+        displacement: px per frame.
+        weight: of each pixel, confidence times speed.
+
+    Returns:
+        0 (none, or half of it and less) to 1 (nine tenths).
+    """
+    total = float(weight.sum())
+    if total <= 0:
+        return 0.0
+    grid = np.stack(np.meshgrid(np.arange(weight.shape[1]), np.arange(weight.shape[0])), axis=-1)
+    arm = grid - (weight[..., None] * grid).sum(axis=(0, 1)) / total
+    # seen obliquely, a circle is an ellipse: both axes are made as long
+    spread = np.sqrt((weight[..., None] * arm**2).sum(axis=(0, 1)) / total)
+    arm, moved = arm / np.maximum(spread, 1.0), displacement / np.maximum(spread, 1.0)
+    trust = weight / np.maximum(np.linalg.norm(displacement, axis=-1), 1e-9)
+    turning = abs(float((trust * (arm[..., 0] * moved[..., 1] - arm[..., 1] * moved[..., 0])).sum()))
+    most = float((trust * np.linalg.norm(arm, axis=-1) * np.linalg.norm(moved, axis=-1)).sum())
+    return float(np.clip((turning / max(most, 1e-12) - 0.5) / 0.4, 0.0, 1.0))
+
+
+def _border_share(mask: np.ndarray) -> float:
+    """Share of the picture's border that a fluid meets."""
+    return float(np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).mean())
+
+
+def swinging(bulk: Float[np.ndarray, "n 2"], ground: Float[np.ndarray, "n 2"]) -> float:
+    """Share of the bulk motion that is to and fro: its variance in time over its mean square, 0 to 1.
+
+    In the picture and against the ground: what only the camera does, or only the ground that it passes,
+    does not count. It is 0 where too little is known.
+
+    What runs through passes every section with the same discharge. Waves carry nothing in the mean.
+    """
+    return min(_changing(bulk), _changing(bulk - np.where(np.isfinite(ground), ground, 0.0)))
+
+
+def _changing(bulk: np.ndarray) -> float:
+    known = bulk[np.isfinite(bulk).all(axis=1)]
+    if len(known) < FEWEST_PAIRS:
+        return 0.0
+    changes = max(float(known.var(axis=0).sum()) - 2.0 * SHAKE**2, 0.0)
+    mean = float(np.square(known.mean(axis=0)).sum())
+    return changes / (changes + mean) if changes > 0 else 0.0
 
 
 def _collapsing(fluid: np.ndarray) -> float:
@@ -225,7 +298,7 @@ def estimate_up(
         tilt = slope.TiltEvidence(found, 0.0, left, float(np.clip(1.0 - left / sigma, 0.0, 1.0)))
         words = ["upright edges of the body"]
     elif kind.nearly_level:
-        tilt, words = _tilt_of_stream(mask, displacement, confidence, camera, picture, level_prior)
+        tilt, words = _tilt_of_plane(kind, mask, displacement, confidence, camera, picture, level_prior)
     else:
         tilt, words = _tilt_in_air(kind, mask, displacement, confidence, camera, picture)
     source = ", ".join(words) if words else f"usual view of a {kind}"
@@ -239,11 +312,16 @@ def estimate_up(
     )  # fmt: skip
 
 
-def _tilt_of_stream(
-    mask, displacement, confidence, camera, picture, level_prior
+def _tilt_of_plane(
+    kind, mask, displacement, confidence, camera, picture, level_prior
 ) -> tuple[slope.TiltEvidence, list[str]]:
-    """What its motion, its pattern and its surroundings say; and which of them spoke."""
+    """What its motion, its pattern and its surroundings say; and which of them spoke.
+
+    Waves and whirls of standing water are no motion of a plane as a whole: their perspective is not asked.
+    """
     tilted = _tilted(camera)
+    if not kind.runs_nearly_level:
+        return slope.estimate_tilt(camera, None, tilted, picture, kind=kind), picture.words
     # a chute is another plane than what it comes down onto
     steep = chute.chute_pixels(tilted(STREAM.usual_pitch[0], 0.0), mask, displacement, confidence)
     lying = confidence * ~np.any(steep, axis=0) if steep else confidence

@@ -46,6 +46,8 @@ class Footage:
     """camera depth of the whole picture, m; nan where it is not known"""
     closed: bool = False
     """a puddle: it ends where it is seen to end, on all sides"""
+    goes_on: bool = False
+    """standing water, closed, of which the picture may cut a part off: it goes on there"""
     ever: Bool[np.ndarray, "h w"] | None = None
     """pixels that show fluid at some time of the clip; None: not known"""
 
@@ -201,7 +203,9 @@ def plan_of(seen: Footage, grid: Grid, extent: Extent | None = None) -> Plan:
         start, stop = wide_ends(known & (label != Label.BACKGROUND), s, reach, grid.spacing, share=0.8)
         start, stop = max(start, reach[0] + 3 * grid.spacing), min(stop, reach[1] - 3 * grid.spacing)
         source = known & (s >= min(start, stop)) & (s <= max(start, stop))
-    if not seen.closed:
+    if seen.goes_on:
+        label = _continued(label, known, grid, seen.along, across=1.0)
+    elif not seen.closed:
         label = _continued(label, source, grid, seen.along)
     if extent is not None:
         label = cleaned(label, extent.width, grid.spacing)
@@ -255,14 +259,14 @@ def cleaned(label: UInt8[np.ndarray, "nx ny"], width: float, spacing: float) -> 
     return label.astype(np.uint8)
 
 
-def _continued(label: np.ndarray, source: np.ndarray, grid: Grid, along: np.ndarray) -> np.ndarray:
-    """Columns outside `source` get the label of the nearest one inside it, nearness across the stream counting four
+def _continued(label: np.ndarray, source: np.ndarray, grid: Grid, along: np.ndarray, across: float = 4.0) -> np.ndarray:
+    """Columns outside `source` get the label of the nearest one inside it, nearness across the stream counting `across`
     times as much: a channel goes on along the stream."""
     if source.all() or not source.any():
         return label
     ground = grid.centers()[:, :, 0, :2]
-    across = np.array([-along[1], along[0]])
-    place = np.stack([ground @ along, 4.0 * (ground @ across)], axis=-1)
+    aside = np.array([-along[1], along[0]])
+    place = np.stack([ground @ along, across * (ground @ aside)], axis=-1)
     nearest = cKDTree(place[source]).query(place[~source])[1]
     out = label.copy()
     out[~source] = label[source][nearest]

@@ -20,7 +20,7 @@ from scipy.special import logsumexp
 
 from fluidlift.shape.texture_gradient import TexturePatches, texture_evidence, weighed
 from fluidlift.shape.view import PictureEvidence
-from fluidlift.types import PinholeCamera, SlopeEvidence
+from fluidlift.types import FluidKind, PinholeCamera, SlopeEvidence
 from fluidlift.types.kind import STREAM
 
 PATCHES = 160
@@ -147,7 +147,7 @@ def estimate_slope(
 
 def estimate_tilt(
     camera: PinholeCamera, patches: FlowPatches | None, tilted: Callable[[float, float], PinholeCamera],
-    picture: PictureEvidence, level_prior: float = LEVEL,
+    picture: PictureEvidence, level_prior: float = LEVEL, kind: FluidKind = STREAM,
 ) -> TiltEvidence:  # fmt: skip
     """Pitch and roll of the camera over a stream of unknown slope: means of their posterior.
 
@@ -160,6 +160,7 @@ def estimate_tilt(
         tilted: camera for a pitch and a roll, degrees.
         picture: what else shows the tilt.
         level_prior: share of such streams that are level.
+        kind: of the fluid, one that is nearly level: how people film it.
     """
     pitches, rolls = np.arange(-4.0, 89.0, 4.0), np.array([-4.0, 0.0, 4.0])
     slopes = np.array([0.0, 5.0, 10.0, 16.0, 22.0, 30.0, 38.0])
@@ -172,13 +173,13 @@ def estimate_tilt(
         best = np.array([[[best_heading(c, patches, np.radians(s)) for s in slopes] for c in row] for row in cameras])
     # the vanishing line of a plane that comes down towards the camera lies above the horizon
     rise = np.degrees(np.arctan(-np.tan(np.radians(slopes)) * np.sin(best[..., 1])))
-    habit = picture.lying(STREAM, pitches, cameras, rise) + np.log(prior)
+    habit = picture.lying(kind, pitches, cameras, rise) + np.log(prior)
     log = BELIEF * best[..., 0] + habit - 0.5 * ((rolls / ROLL) ** 2)[None, :, None]
     log += np.array([[picture.tilt(c) for c in row] for row in cameras])[..., None]
     if picture.texture is not None and patches is not None:
         seen = _texture_evidence([row[1] for row in cameras], picture.texture, slopes, best[:, 1, :, 1])
         log += weighed(seen, habit[:, 1])[:, None]
-    return tilt_posterior(pitches, rolls, logsumexp(log, axis=2), STREAM.usual_pitch)
+    return tilt_posterior(pitches, rolls, logsumexp(log, axis=2), kind.usual_pitch)
 
 
 def tilt_posterior(

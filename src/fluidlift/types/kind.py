@@ -51,6 +51,9 @@ class FluidKind:
     is_channel_flow: bool = False
     """open-channel flow: runs over ground, in at one open end and out at the other. It is steady, and turbulent: its
     speed is nearly the same at all depths but for a layer at the walls; it can be made longer"""
+    is_standing_water: bool = False
+    """stays where it is: lies on ground, and nothing flows in or out in the mean. So its surface is a level plane in
+    the mean, and its mean motion runs in circles within its outline. What travels over it are waves"""
     starts_at_rest: bool = False
     """a body that stands until it is let go: its shape is known as it stands, not as it collapses"""
     fills_vessel: bool = False
@@ -59,8 +62,8 @@ class FluidKind:
     """share of the drop's energy that is left to what falls freely: almost all in the air, a third over rock (a
     choice); None: it does not fall freely"""
     depth_ratio: float | None = None
-    """greatest depth of a channel over its full width: a single view does not show the bed (a choice; --depth-ratio
-    overrides). None: it runs in no channel"""
+    """greatest depth over full width of what lies on ground: a single view does not show the bed (a choice;
+    --depth-ratio overrides). None: it lies on none"""
     sizes: tuple[float, float] = (1.0, 1.0)
     """m across what is seen of it, where nothing tells: filmed from beside, and looked down on. Its weight against its
     motion goes with it (similarity after Froude): a river of 1 m runs level, and out of its bed, far too fast"""
@@ -74,11 +77,11 @@ class FluidKind:
         require(self.pitch_prior[1] > 0, f"a pitch prior {self.pitch_prior} of the kind '{self.name}'", "a width > 0")
         share = self.looked_down_on
         require(0.0 <= share < 1.0, f"a share {share} of the kind '{self.name}' that is looked down on", "0 to below 1")
-        both = self.airborne and self.is_channel_flow
-        require(not both, f"the kind '{self.name}' in the air and in a channel", "one of them")
+        both = self.airborne + self.is_channel_flow + self.is_standing_water
+        require(both <= 1, f"the kind '{self.name}' in the air, in a channel and at rest in a basin", "one of them")
         require(
-            self.is_channel_flow == (self.depth_ratio is not None), f"the kind '{self.name}'",
-            "a depth_ratio where it runs in a channel, and only there",
+            self.lies_on_ground == (self.depth_ratio is not None), f"the kind '{self.name}'",
+            "a depth_ratio where it lies on ground, and only there",
         )  # fmt: skip
 
     def __str__(self) -> str:
@@ -118,9 +121,25 @@ class FluidKind:
         return self.is_channel_flow and self.falls_freely
 
     @property
+    def lies_on_ground(self) -> bool:
+        """Whether a bed bears it and its surface is a height over that: it runs in a channel, or stands in a basin."""
+        return self.is_channel_flow or self.is_standing_water
+
+    @property
     def nearly_level(self) -> bool:
+        """Whether its surface is a plane close to level."""
+        return self.lies_on_ground and not self.falls_freely
+
+    @property
+    def runs_nearly_level(self) -> bool:
         """A channel flow whose surface is a plane close to level: the perspective of its motion shows the tilt."""
-        return self.is_channel_flow and not self.falls_freely
+        return self.is_channel_flow and self.nearly_level
+
+    @property
+    def is_driven_in_sight(self) -> bool:
+        """Whether what drives it (its weight on a slope, its fall, its buoyancy) is in the equations that are fitted. A
+        body that stands shows no motion yet; wind, a spoon or a flame under standing water are not seen."""
+        return not (self.starts_at_rest or self.is_standing_water)
 
     @property
     def has_mean_motion(self) -> bool:
@@ -156,8 +175,15 @@ DAM = FluidKind(
     starts_at_rest=True, surveyed_level=("ground_level_z", "the ground lies"), recognised=True,
 )  # fmt: skip
 """a column of liquid that is let go (dam break)"""
+BASIN = FluidKind(
+    "basin", pitch_prior=(10.0, 9.0), looked_down_on=0.5, kinematic_viscosity=1e-5, wall_damping=0.05, wall_layer=1.0,
+    is_standing_water=True, depth_ratio=0.2, sizes=(10.0, 1.0), surveyed_level=("water_level_z", "the water stands"),
+    recognised=True,
+)  # fmt: skip
+"""water that stays: sea, lake, pool, pot, cup. Over a landscape people film it as they film a river; as often they
+look down into a vessel (a choice)"""
 
-KINDS: dict[str, FluidKind] = {kind.name: kind for kind in (STREAM, FALL, POUR, PLUME, DAM)}
+KINDS: dict[str, FluidKind] = {kind.name: kind for kind in (STREAM, FALL, POUR, PLUME, DAM, BASIN)}
 """by name; the classifier, the command line and the reader of assets go through it"""
 
 if TYPE_CHECKING:

@@ -112,7 +112,7 @@ class Geometry:
     """Kind, camera, front surface, scale and terrain of the body at rest."""
 
     kind: str
-    """stream, fall, pour, plume or dam"""
+    """stream, fall, pour, plume, dam or basin"""
     kind_source: str
     """evidence, or user"""
     kind_evidence: KindEvidence

@@ -82,7 +82,7 @@ def calibrate(
     from fluidlift.scene.dry_cells import dry_cells
     from fluidlift.scene.simulator import simulator_of
 
-    if not wanted or not kind_of(scene.kind).is_channel_flow or not len(scene.body):
+    if not wanted or not kind_of(scene.kind).lies_on_ground or not len(scene.body):
         return Calibration()
     frames = min(scene.frames, LONGEST)
     speed = _typical(target, scene.cell_types)

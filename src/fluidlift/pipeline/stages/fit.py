@@ -117,9 +117,12 @@ def _check_request(request: FitRequest, kind: FluidKind) -> None:
             f"a known gravity for a {kind}, whose gravity stands for its buoyancy", "another parameter",
             "give gravity in scene.yaml, for the simulation",
         )  # fmt: skip
-    if kind.starts_at_rest and request.free:
+    if not kind.is_driven_in_sight and request.free:
+        why = "whose velocities are known as it stands, before it moves"
+        if kind.is_standing_water:
+            why = "whose motion is waves, or driven by what is not seen (wind, a spoon, heat)"
         raise InputRejected(
-            f"a fit of {', '.join(request.free)} to a {kind}, whose velocities are known as it stands, before it moves",
+            f"a fit of {', '.join(request.free)} to a {kind}, {why}",
             "values that you know", "leave out fit.free and give them with --hold or in scene.yaml",
         )  # fmt: skip
 
@@ -139,8 +142,9 @@ def _attempt(
     from fluidlift.fit.optimize import fit_parameters
 
     setting, kind = geometry.setting, kind_of(geometry.kind)
-    if kind.starts_at_rest:
-        reason = "a body at rest tells nothing of its parameters: they are those of such a fluid, or as given"
+    if not kind.is_driven_in_sight:
+        what = "standing water, whose drive is not seen," if kind.is_standing_water else "a body at rest"
+        reason = f"{what} tells nothing of its parameters: they are those of such a fluid, or as given"
         return FitResult(initial, {}, np.zeros(0), False, 0), Verdict("left", reason)
     try:
         with one_torch_thread():
@@ -210,6 +214,8 @@ def first_guess(
     inlet = cells == CellType.INFLOW
     wet = inlet | (cells == CellType.FLUID)
     bulk = mean[inlet].mean(axis=0) if inlet.any() else mean[wet].mean(axis=0)
+    if kind.is_standing_water:  # what is left of a mean over a whirl is no inflow
+        bulk = np.zeros(3)
     spread = np.std([t.at_centers()[inlet] for t in targets], axis=0).mean() if inlet.any() else 0.0
     outlet = np.zeros(cells.shape, bool)
     if (cells == CellType.OUTFLOW).any():
@@ -217,6 +223,7 @@ def first_guess(
 
         outlet = ndimage.binary_dilation(cells == CellType.OUTFLOW, iterations=2) & (cells == CellType.FLUID)
     out = float((mean[outlet] @ direction).mean()) if outlet.any() else float((mean[wet] @ direction).mean())
+    out = 0.0 if kind.is_standing_water else out
     speed = float(np.linalg.norm(mean[wet], axis=1).max()) if wet.any() else 0.0
     if filling is not None and inlet.any():
         # the mouth of the inlet is its cross-section across the stream, one layer of its cells

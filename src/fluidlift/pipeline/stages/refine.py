@@ -119,7 +119,7 @@ def refine(
     allowed = (labels.labels[start : start + united] != Label.BACKGROUND).any(axis=0) | mask
     inside = [hull, _outside_solid(added, setting)]
     inside = [generate.beneath_front(part, depth, mask, camera, smallest=KEPT, drop_above=True) for part in inside]
-    hull, added = (generate.within_silhouette(part, allowed, camera, smallest=KEPT) for part in inside)
+    hull, added = (_not_contradicted(part, geometry, allowed) for part in inside)
     if kind_of(geometry.kind).starts_at_rest:  # its sides tell nothing of the inside that is seen once it spreads
         colour = _later_colour(clip, fluid, start)
         hull, added = (replace(part, sh=sh_from_rgb(np.tile(colour, (len(part), 1)))) for part in (hull, added))
@@ -219,6 +219,20 @@ def _outside_solid(g: Gaussians, setting: Setting) -> Gaussians:
     g = g.select(inside)
     distance = sample_nodes(setting.terrain.signed_distance, grid, g.means)
     return g.select(distance > -0.25 * grid.spacing)
+
+
+def _not_contradicted(inside: Gaussians, geometry: Geometry, allowed: np.ndarray) -> Gaussians:
+    """What is within the silhouette; of standing water, what lies a cell below its surface as well.
+
+    A level surface that ends at a near shore has water behind that shore, where the picture shows the ground before it.
+    """
+    setting, camera = geometry.setting, geometry.camera
+    deep = np.zeros(len(inside), bool)
+    if kind_of(geometry.kind).is_standing_water and setting.surface_height is not None:
+        level = float(np.nanmedian(setting.surface_height))
+        deep = inside.means[:, 2] < level - setting.terrain.grid.spacing
+    seen = generate.within_silhouette(inside.select(~deep), allowed, camera, smallest=KEPT)
+    return concatenate([inside.select(deep), seen]) if deep.any() else seen
 
 
 def _bounded(g: Gaussians, most: int, seed: int) -> Gaussians:

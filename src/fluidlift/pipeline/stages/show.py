@@ -175,7 +175,7 @@ def _side_camera(scene: Scene, renderer: FrameRenderer, size: tuple[int, int]) -
 
     # a body in the air may fill its box later; what lies on a bed stays in it
     grid, around = scene.terrain.grid, scene.terrain.mesh.vertices
-    if not kind_of(scene.kind).is_channel_flow:
+    if not kind_of(scene.kind).lies_on_ground:
         inset = 0.18 * (grid.high - grid.low) * np.array([1.0, 1.0, 0.0])
         around = np.stack([grid.low + inset, grid.high - inset])
     return side_camera(scene.camera, scene.rest, renderer.ground, np.concatenate([scene.rest.means, around]), size=size)

@@ -102,7 +102,7 @@ def simulate(
 def _simulation_warnings(kind: str, volumes: Sequence[float], leaks: Sequence[float]) -> list[Notice]:
     warnings = []
     drift = volumes[-1] / max(volumes[0], 1e-12) - 1
-    if drift < -0.5 or (drift > 0.5 and kind_of(kind).is_channel_flow):  # pours fill and smoke spreads
+    if drift < -0.5 or (drift > 0.5 and kind_of(kind).lies_on_ground):  # pours fill and smoke spreads
         word = "lost" if drift < 0 else "gained"
         warnings.append(
             Notice(

@@ -1,0 +1,27 @@
+"""Basins: water that stays, whose surface is a level plane whatever travels over it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fluidlift.shape import depth_surface, surface
+
+LEVEL = ((1.0, 0.0, 0.5),)
+"""share, mean and standard deviation (degrees) of the slopes that it may have: none, but for errors of the depth"""
+
+
+class _Basin:
+    def front_surface(self, seen):
+        return surface.level_surface(seen.camera, seen.mask)
+
+    def depth_surface(self, scene, seen, slopes, usual):
+        return depth_surface.stream_surface(
+            scene, seen.camera, seen.mask, seen.motion, seen.trust, slopes=LEVEL, usual=usual
+        )
+
+    def mainstream(self, bulk):
+        """None: a level direction, for files that hold one."""
+        return np.array([bulk[0], bulk[1], 0.0])
+
+
+BUILDER = _Basin()

@@ -92,7 +92,9 @@ def test_a_raft_floats_and_the_usd_file_shows_where(asset):
     prim = UsdGeom.Xformable(stage.GetPrimAtPath("/Fluid/Bodies/raft"))
     heights = [prim.ComputeLocalToWorldTransform(1001 + k).Transform(Gf.Vec3d(0, 0, 0))[2] for k in range(10)]
     h = load_asset(asset).grid.spacing
-    assert heights[0] > heights[-1] > heights[0] - 3 * h  # it falls by a cell, into the water and not through the bed
+    # it falls into the water, and not through the bed; there it bobs, and stays afloat
+    assert heights[0] - 0.3 * h > min(heights) > heights[0] - 3 * h
+    assert max(heights) < heights[0] + 0.5 * h
     assert len(read_clip(asset / "preview.mp4")) == 10
     assert not (asset / "work" / "evaluation.npz").exists()  # there is no raft in the clip to compare with
 

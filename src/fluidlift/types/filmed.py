@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float16
+from jaxtyping import Bool, Float
 
 from fluidlift.errors import require
 from fluidlift.types.grid import FaceVelocity
@@ -19,10 +19,10 @@ class FilmedMotion:
         ValueError: no frames, arrays of different grids, or an interval that is not positive.
     """
 
-    u: Float16[np.ndarray, "t nx+1 ny nz"]
+    u: Float[np.ndarray, "t nx+1 ny nz"]
     """m/s"""
-    v: Float16[np.ndarray, "t nx ny+1 nz"]
-    w: Float16[np.ndarray, "t nx ny nz+1"]
+    v: Float[np.ndarray, "t nx ny+1 nz"]
+    w: Float[np.ndarray, "t nx ny nz+1"]
     interval: float
     """s between frames"""
     start: int = 0

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 GAIN = 2.0
 """of the force that is learnt over the pull: how many times less the flow stays behind. On a river, the demo and one
-that is filmed along the free run's mean velocity near the surface is off by 0.21, 0.13 and 0.26 of its size with 0, by 0.18,
+filmed along, the free run's mean velocity near the surface is off by 0.21, 0.13 and 0.26 of its size with 0, by 0.18,
 0.11 and 0.23 with 2; with 4 by 0.17, 0.12 and 0.22, with 10 the first has 0.22 again"""
 
 LEARNING = 12.0

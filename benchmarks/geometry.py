@@ -27,8 +27,8 @@ from typing import Any
 import cv2
 import numpy as np
 from clips import subjects as runs
-from motion_page import replace_section
 from motion_subjects import Subject, default_shared, prepare, subjects
+from page_section import replace_section
 from report import table
 from scipy import ndimage
 

@@ -21,7 +21,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from motion_page import replace_section
+from page_section import replace_section
 from report import table as rows_of
 
 from fluidlift.evaluate.images import psnr, ssim

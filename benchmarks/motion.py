@@ -24,7 +24,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from motion_page import replace_section, section
+from motion_page import BEGIN, END, section
 from motion_situations import situations
 from motion_steps import (
     STEPS,
@@ -39,6 +39,7 @@ from motion_steps import (
     volume_figures,
 )
 from motion_subjects import ROOT, Subject, Truth, default_shared, prepare, read_truth, real_clip, subjects
+from page_section import replace_section
 
 from fluidlift.evaluate.images import mask_iou
 from fluidlift.motion.cadence import examine_cadence, without_duplicates
@@ -195,7 +196,7 @@ def main() -> None:
     text = section(records, before)
     print(text)
     if args.page:
-        replace_section(args.page, text)
+        replace_section(args.page, text, BEGIN, END)
 
 
 if __name__ == "__main__":

@@ -15,9 +15,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from motion_page import replace_section
 from motion_steps import measured_frames
 from motion_subjects import Subject, Truth, default_shared, prepare, read_truth, subjects
+from page_section import replace_section
 from report import table
 
 from fluidlift.motion.multiframe import moving_detail

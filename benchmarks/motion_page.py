@@ -82,19 +82,6 @@ def pictures(records: Records) -> str:
     return "\n\n".join(["## Pictures", *links]) if links else ""
 
 
-def replace_section(page: Path, text: str, begin: str = BEGIN, end: str = END) -> None:
-    """Put the text between the markers of the page.
-
-    Raises:
-        ValueError: the page has no such markers.
-    """
-    old = page.read_text(encoding="utf-8")
-    if begin not in old or end not in old:
-        raise ValueError(f"{page.name} has no markers {begin} and {end}")
-    head, rest = old.split(begin, 1)
-    page.write_text(head + begin + "\n" + text + "\n" + end + rest.split(end, 1)[1], encoding="utf-8")
-
-
 def planar(records: Records, before: Records) -> str:
     """One table of steps for each clip with a truth."""
     lines = ["## Planar velocity, step by step"]

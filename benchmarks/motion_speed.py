@@ -34,7 +34,7 @@ for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 
 import cv2  # noqa: E402
 import numpy as np  # noqa: E402
-from motion_page import replace_section  # noqa: E402
+from page_section import replace_section  # noqa: E402
 
 BEGIN, END = "<!-- motion-speed:begin -->", "<!-- motion-speed:end -->"
 GOAL = 1.5

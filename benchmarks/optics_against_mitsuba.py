@@ -253,7 +253,7 @@ def main() -> None:
     text = page_section(found, a.width, a.samples)
     print(text)
     if a.page is not None:
-        from motion_page import replace_section
+        from page_section import replace_section
 
         replace_section(a.page, text, BEGIN, END)
 

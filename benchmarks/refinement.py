@@ -26,8 +26,8 @@ from typing import Any
 import cv2
 import numpy as np
 from geometry import body_of, shaped, still_asset
-from motion_page import replace_section
 from motion_subjects import ROOT, SCENES, Subject, Truth, default_shared, prepare, read_truth, subjects
+from page_section import replace_section
 from refinement_page import page
 from refinement_scores import Scored, flicker, score, side_camera
 from scipy import ndimage

@@ -25,7 +25,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from motion_page import replace_section
+from page_section import replace_section
 
 from fluidlift.errors import FluidliftError
 from fluidlift.numerics.splatting import View, bin_tiles, project, rasterize

@@ -28,8 +28,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from motion_page import replace_section
 from motion_subjects import Subject, default_shared, prepare, read_truth, subjects
+from page_section import replace_section
 
 from fluidlift.io.images import read_camera, read_distortion, read_mask, undistort_clip, undistort_mask
 from fluidlift.io.video import read_clip

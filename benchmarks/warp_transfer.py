@@ -1,6 +1,6 @@
 """Particle-grid transfers and the particle side of a step: Numba on the CPU, Warp on its CPU device and on the GPU.
 
-    python benchmarks/warp_transfer.py [--counts 100000 500000 2000000] [--repeats 7]
+    python benchmarks/warp_transfer.py [--counts 100000 500000 2000000] [--repeats 7] [--device cuda]
 
 Medians of the repeats after one warm-up. Eight particles per cell in a block of liquid. "kernel" has all arrays on the
 device; "call" is what the simulator waits for, copies from and to NumPy included. The share of bandwidth is the
@@ -18,6 +18,7 @@ from typing import Any
 import numba
 import numpy as np
 
+from fluidlift.errors import FluidliftError
 from fluidlift.physics import boundaries, transfer
 from fluidlift.physics.advect_particles import displacements
 from fluidlift.physics.numba_particles import NumbaMover, NumbaTransfer
@@ -154,14 +155,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--counts", type=int, nargs="+", default=[100_000, 500_000, 2_000_000])
     parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--device", nargs="*", default=["cpu", "cuda"], help="of Warp's")
     options = parser.parse_args()
-    devices = ["cpu"]
-    try:
-        from fluidlift.backends.warp_device import warp_device
+    devices: list[str] = []
+    for name in options.device:
+        try:
+            from fluidlift.backends.warp_device import warp_device
 
-        devices.append(warp_device("cuda").alias)
-    except Exception as error:  # say so and go on with what there is
-        print(f"no GPU: {error}")
+            devices.append(warp_device(name).alias)
+        except FluidliftError as error:  # say so and go on with what there is
+            print(error)
     peak = {"numba": cpu_bandwidth(options.repeats)} | {d: warp_bandwidth(d, options.repeats) for d in devices}
     print("copy: " + ", ".join(f"{name} {rate / 1e9:.1f} GB/s" for name, rate in peak.items()))
     for count in options.counts:

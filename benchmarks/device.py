@@ -1,0 +1,187 @@
+"""Everything that runs on a GPU, measured in one command: beside the CPU of the same machine, on the same work.
+
+    python benchmarks/device.py [--device cuda] [--only transfer simulation ...] [--limit 120] [--json device.json]
+
+Each part is a process of its own with a time limit, so that one that fails or hangs costs no other:
+
+  transfer    benchmarks/warp_transfer.py: P2G, G2P and the particle half of a step, share of the memory's bandwidth
+  simulation  a dam break, whole frames: the CPU's kernels, and `simulate.device=cuda`
+  rollout     the gradient of ten steps of the differentiable rollout: the CPU's kernels, and torch on the device
+  fit         a twin fitted by both: seconds, and how far the parameters are apart
+  splats      benchmarks/splatting.py with gsplat
+
+Seconds of wall time, medians after one warm-up. On "cpu" the parts run too, for trying them out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).parent
+SCRIPTS: dict[str, list[str]] = {
+    "transfer": ["warp_transfer.py", "--counts", "100000", "500000", "2000000"],
+    "splats": ["splatting.py", "--peers", "gsplat", "--repeats", "3"],
+}
+"""parts that are benchmarks of their own"""
+
+Figures = dict[str, float | str]
+
+
+def median(run: Callable[[], object], repeats: int) -> float:
+    """Seconds, after one warm-up."""
+    run()
+    times = []
+    for _ in range(repeats):
+        begin = time.perf_counter()
+        run()
+        times.append(time.perf_counter() - begin)
+    return statistics.median(times)
+
+
+def simulation(device: str, counts: tuple[int, ...] = (100_000, 500_000)) -> Figures:
+    """Seconds per frame of 1/30 s of a dam break that has begun to fall."""
+    from fluidlift.scene.simulator import particle_work
+    from fluidlift.synthetic.tanks import dam_break
+
+    found: Figures = {}
+    for count in counts:
+        cells = round((count / 8) ** (1 / 3))  # 8 particles in each of cells x cells / 2 x 2 cells
+        tank = dam_break(cells=cells, width_cells=cells // 2)
+        ends = {}
+        for name in dict.fromkeys(("cpu", device)):
+            simulator = tank.simulator(work=particle_work(name))
+            simulator.advance(1 / 30)  # compiles
+            begin = time.perf_counter()
+            reports = [simulator.advance(1 / 30) for _ in range(3)]
+            seconds = time.perf_counter() - begin
+            steps = sum(r.substeps for r in reports)
+            found[f"{len(tank.particles)} particles, {name}: s per frame"] = seconds / 3
+            found[f"{len(tank.particles)} particles, {name}: ms per substep"] = 1e3 * seconds / steps
+            ends[name] = simulator.particles.positions.mean(axis=0)
+        if device in ends:
+            apart = float(abs(ends[device] - ends["cpu"]).max()) / tank.grid.spacing
+            found[f"{len(tank.particles)} particles: centres of mass apart, cells"] = apart
+    return found
+
+
+def rollout(device: str, sizes: tuple[int, ...] = (32, 64, 96)) -> Figures:
+    """Seconds of the gradient of ten steps, and how far the gradients are apart."""
+    import torch
+    from rollout_gradient import SHAPES, box_with_pillar, distance
+
+    from fluidlift.physics.rollout import RolloutParameters, flatten, rollout
+    from fluidlift.physics.rollout_pressure import RolloutOptions
+    from fluidlift.physics.rollout_torch import rollout_on_device
+    from fluidlift.physics.rollout_torch_domain import TorchDomain
+    from fluidlift.types import FaceVelocity, Grid
+
+    found: Figures = {}
+    for n in sizes:
+        domain, physical = box_with_pillar(n, "float32")
+        start = FaceVelocity.zeros(Grid((n, n, n), 1.0 / n))
+        start.u[:] = 1.0
+        flat, options, placed = flatten(start, torch.float32), RolloutOptions(), TorchDomain.of(domain, device)
+        gradients: dict[str, list[float]] = {}
+
+        def run(where: str) -> None:
+            parameters = RolloutParameters.of(physical, torch.float32)  # noqa: B023 called within the turn
+            leaves = [getattr(parameters, name).requires_grad_() for name in SHAPES]
+            if where == "cpu":
+                end = rollout(flat, domain, parameters, steps=10, options=options)  # noqa: B023
+            else:
+                end = rollout_on_device(flat, placed, parameters, steps=10, options=options, device=device)  # noqa: B023
+            (end.velocity**2).mean().backward()
+            gradients[where] = [float(x) for leaf in leaves for x in leaf.grad.reshape(-1)]  # noqa: B023
+
+        for where, name in (("cpu", "cpu"), ("device", device)):
+            found[f"{n}^3, {name} ({where}): s"] = median(lambda: run(where), 3)  # noqa: B023
+        found[f"{n}^3: gradients apart, relative"] = distance(gradients["device"], gradients["cpu"])
+    return found
+
+
+def fit(device: str) -> Figures:
+    """Seconds of a fit, and its parameters against those of the CPU's, in their standard deviations."""
+    from fluidlift.fit.optimize import fit_parameters
+    from fluidlift.synthetic.twins import make_twin
+
+    found: Figures = {}
+    for scene, cells in (("river", (32, 16, 16)), ("honey", (48, 24, 24))):
+        twin = make_twin(scene, seed=0, noise=0.1, cells=cells, frames=5)
+        ends = {}
+        for name in ("cpu", device if device != "cpu" else "cpu:0"):
+            begin = time.perf_counter()
+            ends[name] = fit_parameters(
+                twin.frames, twin.cell_types, None, twin.grid, twin.interval, twin.start, mainstream=twin.mainstream,
+                steps_per_frame=twin.steps_per_frame, windows=1, start_rounds=1, device=name,
+                free=("kinematic_viscosity", "inflow_velocity", "outflow_velocity"),
+            )  # fmt: skip
+            found[f"{scene} {cells}, {name}: s"] = time.perf_counter() - begin
+        first, second = ends.values()
+        apart = [
+            abs(e.value - second.estimates[label].value) / e.sigma
+            for label, e in first.estimates.items()
+            if e.identifiable
+        ]
+        found[f"{scene} {cells}: largest difference, sigmas"] = max(apart)
+    return found
+
+
+PARTS: dict[str, Callable[[str], Figures]] = {"simulation": simulation, "rollout": rollout, "fit": fit}
+
+
+def machine_of(device: str) -> str:
+    """Name of the GPU, or of the processor."""
+    import torch
+
+    if device.startswith("cuda") and torch.cuda.is_available():
+        return torch.cuda.get_device_name(device)
+    return "CPU"
+
+
+def run_part(name: str, device: str, limit: float) -> Any:
+    """What a part prints, or why it failed."""
+    script = SCRIPTS.get(name)
+    command = [sys.executable, str(HERE / script[0]), *script[1:]] if script else [sys.executable, __file__]
+    command += [] if script else ["--part", name, "--device", device]
+    begin = time.perf_counter()
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=limit)
+        text, error = done.stdout, "" if done.returncode == 0 else done.stderr[-1500:]
+    except subprocess.TimeoutExpired as late:
+        text = (late.stdout or b"").decode() if isinstance(late.stdout, bytes) else late.stdout or ""
+        error = f"longer than {limit:g} s"
+    lines = text.strip().splitlines()
+    print(f"== {name}, {time.perf_counter() - begin:.0f} s\n" + "\n".join([*lines, error]).strip(), flush=True)
+    return {"lines": lines, "error": error}
+
+
+def main() -> None:
+    """Prints the figures of all parts, and writes them."""
+    names = [*SCRIPTS, *PARTS]
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="cuda", help="cuda, cuda:1... or cpu")
+    parser.add_argument("--only", nargs="*", choices=names, default=names)
+    parser.add_argument("--limit", type=float, default=120.0, help="s, of each part")
+    parser.add_argument("--json", type=Path, help="file for the figures")
+    parser.add_argument("--part", choices=list(PARTS), help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.part:
+        for name, value in PARTS[options.part](options.device).items():
+            print(f"{name} {value:.4g}" if isinstance(value, float) else f"{name} {value}", flush=True)
+        return
+    print(machine_of(options.device))
+    found = {name: run_part(name, options.device, options.limit) for name in options.only}
+    if options.json is not None:
+        options.json.write_text(json.dumps({"machine": machine_of(options.device), "parts": found}, indent=1))
+
+
+if __name__ == "__main__":
+    main()

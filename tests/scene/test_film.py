@@ -28,14 +28,14 @@ def film(path, count=16, size=(64, 48), fluid=True):
     return write_footage(path, frames, np.full((count, size[1], size[0]), fluid), 0.04)
 
 
-def dressed(scene):
+def dressed(scene, frames=FRAMES):
     """The appearance, and the splats of the last of a few frames."""
     simulator, appearance = simulator_of(scene), SurfaceAppearance(scene)
-    for k in range(FRAMES):
+    for k in range(frames):
         if k:
             simulator.advance(scene.interval)
         appearance.advance(simulator.particles, k)
-    return appearance, appearance.dressed(simulator.particles, FRAMES - 1)
+    return appearance, appearance.dressed(simulator.particles, frames - 1)
 
 
 def is_red(shown) -> bool:
@@ -50,6 +50,18 @@ def is_red(shown) -> bool:
 def test_the_surface_plays_the_film(channel, tmp_path):
     appearance, shown = dressed(channel(FRAMES, film=film(tmp_path / "film.mp4")))
     assert appearance.warnings == () and is_red(shown)
+
+
+@pytest.mark.parametrize("kind", ["stream", "fall"])
+def test_the_first_frame_shows_the_film_too_and_is_the_body_at_rest_without_one(channel, tmp_path, kind):
+    scene = channel(FRAMES, kind=kind, film=film(tmp_path / "film.mp4"))
+    _, first = dressed(scene, 1)
+    assert is_red(first)
+    particles = first.ids % 2 == 0
+    assert particles.sum() == len(scene.body)
+    np.testing.assert_array_equal(first.gaussians.means[particles], scene.body.positions)
+    _, plain = dressed(channel(FRAMES, kind=kind), 1)
+    assert (plain.ids % 2 == 0).all()
 
 
 def test_a_fall_plays_its_film_on_a_map_over_the_picture(channel, tmp_path):

@@ -113,6 +113,8 @@ def test_what_swings_is_not_a_shake_nor_a_few_frames():
     assert swinging(water, ground) > 0.9
     assert swinging(rng.normal(0.0, SHAKE, (30, 2)) + [0.05, 0.0], ground) < 0.5
     assert swinging(rng.normal(0.0, SHAKE, (30, 2)) + [1.0, 0.0], ground) < 0.01
+    jumps = np.where(np.arange(60)[:, None] % 20 == 5, [0.0, 4.0], [0.1, 0.1])  # frames left out of a slow stream
+    assert swinging(jumps, np.zeros((60, 2))) < 0.01
     assert swinging(*to_and_fro(FEWEST_PAIRS - 1)) == 0.0
     assert swinging(water + [0.3, 0.0], water) < 0.01, "all of the picture does, and the water runs on"
     assert swinging(ground + [0.3, 0.0], water) < 0.01, "only the ground does"

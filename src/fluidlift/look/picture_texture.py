@@ -32,4 +32,4 @@ class PictureTexture(TrustedMap):
 
     def index_of(self, places: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
         """Row and column in which places (X, Y in m) are seen."""
-        return self._axes.pixels(places)[:, ::-1] - 0.5
+        return self.appearing(self._axes.pixels(places)[:, ::-1] - 0.5)

@@ -31,6 +31,9 @@ class TrustedMap:
         seen: which of its columns were seen as what they are.
     """
 
+    shift: Float[np.ndarray, "h w 2"] | None = None
+    """px by which the splats that wear this look appear from their centres (`apparent_shift`); None: not at all"""
+
     def __init__(self, surface: SurfaceMap, seen: Bool[np.ndarray, "nx ny"]) -> None:
         self.surface, self._trust = surface, ndimage.gaussian_filter(seen.astype(np.float64), 1.0)
 
@@ -38,6 +41,10 @@ class TrustedMap:
     def usable(self) -> bool:
         """Whether any place can lend its look."""
         return bool(self._trust.max(initial=0.0) > 0.5)
+
+    def appearing(self, index: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+        """Row and column where splats appear that have their centres at others."""
+        return index if self.shift is None else index + sampled(self.shift, index)
 
     def trust(self, places: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
         """Share of the surroundings of places (x, y in m) that was seen and may lend its look, 0 to 1."""
@@ -102,8 +109,8 @@ class SeenTexture(TrustedMap):
         super().__init__(surface, ndimage.binary_closing(seen.reshape(surface.wet.shape)) & surface.wet)
 
     def seen_at(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
-        """Row and column of the picture in which points (m) are seen, whatever is before them."""
-        return self._camera.project(points)[0][:, ::-1] - 0.5
+        """Row and column of the picture in which splats at points (m) are seen, whatever is before them."""
+        return self.appearing(self._camera.project(points)[0][:, ::-1] - 0.5)
 
     def index_of(self, places: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
         """Row and column in which places (x, y in m) of the surface at rest were seen."""

@@ -31,8 +31,9 @@ FINEST = 4
 WIDTH = 0.55
 """standard deviation of a splat along the surface, spacings of the tracers: no gaps, no blur"""
 
-THICKNESS = 0.12
-"""across the surface, cells"""
+THICKNESS = 0.04
+"""across the surface, cells: a third of the width. Seen from 15 degrees above a splat is then as high as it would be
+without any thickness, to 10 %; three times as thick, a weir's finest band lost 7 %"""
 
 OPACITY = 0.9
 """of each: neighbours cover what is below"""

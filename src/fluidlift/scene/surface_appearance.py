@@ -186,6 +186,7 @@ class SurfaceAppearance:
         return self._missing + (() if self._whitewater is None else self._whitewater.warnings)
 
     def _lay_skin(self) -> None:
+        from fluidlift.look.apparent_shift import apparent_shift
         from fluidlift.look.filmed_outline import FilmedOutline
         from fluidlift.look.picture_texture import PictureTexture
         from fluidlift.look.surface_axes import PictureAxes, PlanAxes
@@ -223,6 +224,12 @@ class SurfaceAppearance:
             self._outline = FilmedOutline(self._camera, footage.outside, self._cell)
         self._plays = footage is not None
         self._begin_again()
+        if self._plays:
+            self._surface = surface
+            self._skin.advance(surface, 0.0, np.random.default_rng(scene.seed))
+            bare = self._skin.splats(surface, np.zeros((len(self._skin), 3)))
+            texture.shift = apparent_shift(self._axes.world_splats(bare), self._camera)
+            self._begin_again()
 
     def _film_of(self, own: Gaussians) -> FluidFootage | None:
         """The film that the surface plays, whose size the camera has from here on; one that cannot be is a warning."""
@@ -333,7 +340,9 @@ class SurfaceAppearance:
         if number:  # at rest nothing is drawn out
             shown = mixed(shown, particles.deformation, widest=MIXED * self._cell)
         shown = self._shaded(shown, particles.source)
-        if not number or self._patches is None or self._surface is None or not len(particles):
+        # without a film the body at rest is what was seen of its surface
+        at_rest = not number and not self._plays
+        if at_rest or self._patches is None or self._surface is None or not len(particles):
             return Dressed(shown, 2 * particles.ids, particles.velocities)
         return self._with_skin(shown, particles, self._surface, self._patches, inside)
 

@@ -218,7 +218,7 @@ def _border_share(mask: np.ndarray) -> float:
 
 
 def swinging(bulk: Float[np.ndarray, "n 2"], ground: Float[np.ndarray, "n 2"]) -> float:
-    """Share of the bulk motion that is to and fro: how it changes in time, over that and its mean, both squared, 0 to 1.
+    """Share of the bulk motion that is to and fro: the square of what changes over that and the square of its mean.
 
     In the picture and against the ground: what only the camera does, or only the ground that it passes,
     does not count. A swing lasts for many frames: what one pair has and the next one has not (a frame left out, noise)

@@ -181,3 +181,12 @@ def test_places_beyond_the_picture_are_its_border():
     beyond, _ = film.looked_up(np.array([[-5.0, 12.0], [200.0, 400.0]]), np.full(2, 2.0))
     border, _ = film.looked_up(np.array([[0.0, 12.0], [SIZE[0] - 1.0, SIZE[1] - 1.0]]), np.full(2, 2.0))
     np.testing.assert_allclose(beyond, border, atol=1e-7)
+
+
+def test_beyond_the_sides_of_the_picture_lies_its_mirror_image():
+    film = FluidFootage.of(lively(), everywhere(), INTERVAL)
+    height, width = SIZE
+    inside = np.array([[0.0, 0.0], [10.25, 30.5], [height - 1.0, width - 1.0]])
+    np.testing.assert_array_equal(film.within(inside), inside)
+    beside = np.array([[-3.0, 5.0], [height + 2.0, 5.0], [7.0, -0.5], [7.0, width + 9.0]])
+    np.testing.assert_allclose(film.within(beside), [[3, 5], [height - 4, 5], [7, 0.5], [7, width - 11]])

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 
 from fluidlift.errors import require
+from fluidlift.numerics.mirror import folded
 from fluidlift.numerics.sharing import shared
 
 BROAD = 0.03
@@ -81,6 +82,14 @@ class FluidFootage:
 
     def __len__(self) -> int:
         return len(self.frames)
+
+    def within(self, index: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+        """Row and column in the picture of places in it or beside it: beyond its sides lies its mirror image.
+
+        Its last row, continued, would be stripes.
+        """
+        sides = zip(index.T, self.outside.shape)
+        return np.stack([folded(along, 0.0, size - 1.0)[0] for along, size in sides], axis=-1)
 
     def looked_up(
         self, index: Float[np.ndarray, "n 2"], instants: Float[np.ndarray, " n"]

@@ -307,6 +307,8 @@ class TexturePatches:
         # at home, a point is looked up where it is seen now, also where the level has changed
         seen, rest = texture.seen_at(points), texture.index_of(points[:, :2])
         index = texture.index_of(sources) + (seen - rest)[point]
+        home = np.abs(index - seen[point]).max(axis=1, initial=0.0) < SAME
+        index, seen = footage.within(index), footage.within(seen)
         residual, wet = footage.looked_up(index, instants)
         shade = sampled(footage.shade, seen)
         there = sampled(footage.shade, index)
@@ -315,7 +317,7 @@ class TexturePatches:
         fine = sampled(footage.mean, index) - there
         weight = weight * np.clip(wet, 1e-2, 1.0)
         total = np.bincount(point, weight, minlength=n)
-        spread = _spread_of(point, instants, np.abs(index - seen[point]).max(axis=1, initial=0.0) < SAME, weight, n)
+        spread = _spread_of(point, instants, home, weight, n)
         still = _summed(point, (weight * gain)[:, None] * fine, n) / np.maximum(total, 1e-30)[:, None]
         lively = _summed(point, (weight * gain)[:, None] * residual, n) / np.maximum(spread, 1e-30)[:, None]
         return np.clip(shade + still + lively, 0.0, 1.0), total > 0

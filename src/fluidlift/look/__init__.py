@@ -2,6 +2,8 @@
 
 Modules of the face:
 
+    apparent_shift      Where overlapping splats of a surface appear: the nearer ones hide the near side of those
+                        behind them
     appearance          What of a fluid's look stays in place and what moves with it
     camera_path         Where a film is seen from: one camera for every frame
     display             Tone mapping: from linear light to what a display shows
@@ -54,7 +56,7 @@ Modules of the face:
 """
 
 __all__ = [
-    "appearance",
+    "apparent_shift", "appearance",
     "camera_path",
     "display",
     "environment",

@@ -35,8 +35,8 @@ THICKNESS = 0.04
 """across the surface, cells: a third of the width. Seen from 15 degrees above a splat is then as high as it would be
 without any thickness, to 10 %; three times as thick, a weir's finest band lost 7 %"""
 
-OPACITY = 0.9
-"""of each: neighbours cover what is below"""
+OPACITY = 0.98
+"""of each. Seen from straight above they let 2 % of what is below through (0.9: 4 %), at the same sharpness"""
 
 ALIKE = 1e-3
 """by how much a splat's size may differ from the skin's: files hold logarithms in single precision"""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeAlias
 
@@ -17,6 +17,7 @@ from fluidlift.types import (
     PinholeCamera,
     PixelFlow,
     PixelLabels,
+    SolveReport,
     TriangleMesh,
     VideoClip,
 )
@@ -275,6 +276,95 @@ class ParticleMover(ABC):
             walls: what they may run into.
             rules: of the step.
         """
+
+
+@dataclass(frozen=True)
+class Stepped:
+    """What a `LiquidStepper` found in one substep."""
+
+    farthest: float
+    """m, the largest component of a displacement; not a number where one is not"""
+    leaving: int
+    """particles that are out of the box or the outlet now"""
+    pressure: SolveReport
+    viscosity: tuple[SolveReport, ...] = ()
+
+
+class LiquidStepper(ABC):
+    """A liquid whose particles and grid stay where its substeps are done, such as on a GPU.
+
+    A state is what `physics.apic.LiquidSimulator` keeps of its particles; `time` is in s of the simulation.
+    """
+
+    @property
+    @abstractmethod
+    def count(self) -> int:
+        """Number of particles."""
+
+    @abstractmethod
+    def upload(self, particles: Particles) -> None:
+        """Replace all particles."""
+
+    @abstractmethod
+    def download(self, *, by_id: bool = False) -> Particles:
+        """A copy of the particles, in their present order or in that of their ids."""
+
+    @abstractmethod
+    def append(self, particles: Particles) -> None:
+        """Put particles behind the others."""
+
+    @abstractmethod
+    def lacking(self) -> np.ndarray:
+        """float64 [m,3], m: places of the inlet's lattice that lack a particle now."""
+
+    @abstractmethod
+    def carry(self, time: float) -> None:
+        """Particles in the inlet move as prescribed."""
+
+    @abstractmethod
+    def max_speed(self) -> float:
+        """m/s; not a number where one is not."""
+
+    @abstractmethod
+    def mass(self) -> float:
+        """kg of all particles."""
+
+    @abstractmethod
+    def wet_cells(self) -> int:
+        """How many cells of the box hold particles."""
+
+    @abstractmethod
+    def take_out(self, cells: np.ndarray) -> tuple[int, float]:
+        """Take out the particles in marked cells (bool [nx,ny,nz]): how many they were, and kg."""
+
+    @abstractmethod
+    def prepare(self, first_id: int, draw: Callable[[int], np.ndarray] | None) -> int:
+        """Begin a substep (at least one particle): particles in the order of their cells, and reseeded with `draw`.
+
+        Args:
+            first_id: of new particles.
+            draw: n -> float64 [n,3], directions in which halves part, of any length; None: no reseeding now.
+
+        Returns:
+            how many particles are new.
+        """
+
+    @abstractmethod
+    def step(self, dt: float, time: float) -> Stepped:
+        """Find the state after `dt` (s) of the particles that `prepare` put in order; it is not adopted yet."""
+
+    @abstractmethod
+    def adopt(self) -> None:
+        """The state that `step` found becomes the present one."""
+
+    @property
+    @abstractmethod
+    def head_rate(self) -> tuple[tuple[int, int, int], np.ndarray] | None:
+        """First cell of the last region, and there q / dt (float32, m^2/s^2): the first guess of the pressure."""
+
+    @abstractmethod
+    def restore_head_rate(self, rate: tuple[tuple[int, int, int], np.ndarray] | None) -> None:
+        """Go on from such a pressure."""
 
 
 class Progress(Protocol):

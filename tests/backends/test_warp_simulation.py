@@ -5,8 +5,15 @@ import pytest
 
 pytest.importorskip("warp", reason="the GPU back end, NVIDIA Warp, is not installed")
 
+from dataclasses import replace
+
+from small_scene import striped_channel
+
+from fluidlift.backends import warp_liquid, warp_particles
+from fluidlift.backends.warp_device import warp_device
 from fluidlift.errors import FluidliftError
-from fluidlift.scene.simulator import particle_work
+from fluidlift.physics.guidance import BodyForce
+from fluidlift.scene.simulator import left_to_the_cpu, particle_work, simulator_of
 from fluidlift.synthetic import tanks
 
 
@@ -38,3 +45,39 @@ def test_a_gpu_that_is_not_there_is_said():
         pytest.skip("there is a GPU")
     with pytest.raises(FluidliftError, match="sees no GPU"):
         particle_work("cuda")
+
+
+@pytest.fixture
+def no_gpu_needed(monkeypatch):
+    """What asks for a GPU gets Warp's CPU device."""
+    for module in (warp_liquid, warp_particles):
+        monkeypatch.setattr(module, "warp_device", lambda name: warp_device("cpu"))
+
+
+def test_a_scene_is_simulated_on_the_device_that_is_asked_for(no_gpu_needed):
+    scene, ends = striped_channel(3), []
+    for device in ("cpu", "cuda"):
+        simulator = simulator_of(scene, device)
+        assert left_to_the_cpu(simulator, device) == []
+        for _ in range(2):
+            simulator.advance(scene.interval)
+        ends.append(simulator.particles)
+    one, other = ends
+    np.testing.assert_array_equal(one.ids, other.ids)
+    np.testing.assert_array_equal(one.source, other.source)  # looks of what flows in
+    assert np.abs(one.positions - other.positions).max() < 0.02 * scene.terrain.grid.spacing
+    assert np.abs(one.positions - scene.body.positions[: len(one)]).max() > 0.01
+
+
+class Whim(BodyForce):
+    def applied(self, velocity, masses, box, dt, time=0.0):
+        return velocity
+
+
+def test_what_is_left_to_the_cpu_is_said(no_gpu_needed):
+    scene = striped_channel(2)
+    smoke = replace(scene, kind="plume")
+    for case, forces, word in ((scene, (Whim(),), "because of a force"), (smoke, (), "smoke is simulated on the CPU")):
+        (said,) = left_to_the_cpu(simulator_of(case, "cuda", forces), "cuda")
+        assert said.code == "device-not-used" and word in said
+        assert left_to_the_cpu(simulator_of(case, "cpu", forces), "cpu") == []

@@ -21,11 +21,13 @@ Modules of the face:
     registry           Registry of the back ends that are chosen by name: one table, by what they are for
     splashsurf         Surfaces of particles by splashsurf: marching cubes on the SPH density, weighted Laplacian
                        smoothing (Loeschner, Boettcher, Jeske and Bender 2023)
+    warp_liquid        The whole substep of a liquid on a Warp device: particles and grid stay there from step to
+                       step
     warp_particles     Particle-grid transfers by NVIDIA Warp, on the GPU or (slow, for tests) on the CPU
 """
 
 __all__ = [
     "depth_model", "generator_card", "generator_licence", "generator_process", "generators",
     "gsplat_rasterizer", "learned", "mitsuba_renderer", "mitsuba_scene", "monocular_depth", "registry",
-    "splashsurf", "warp_particles",
+    "splashsurf", "warp_liquid", "warp_particles",
 ]  # fmt: skip

@@ -43,8 +43,8 @@ def warp_device(name: str = "cuda") -> warp.Device:
     return warp.get_device(f"cuda:{number}")
 
 
-def empty(size: int, dtype: Any, device: warp.Device) -> warp.array:
-    """A Warp array [size] of `dtype` (a number, vector or matrix type) that nothing has been written to."""
+def empty(size: int | tuple[int, ...], dtype: Any, device: warp.Device) -> warp.array:
+    """A Warp array of a size or shape that nothing has been written to; `dtype`: a number, vector or matrix type."""
     import warp
 
     return warp.empty(size, dtype=dtype, device=device)

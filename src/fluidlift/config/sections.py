@@ -188,7 +188,7 @@ class SimulateConfig:
     max_particles: int = 150_000
     """most particles"""
     device: Literal["cpu", "cuda"] = "cpu"
-    """who moves the particles of a liquid: the CPU (Numba), or a GPU (NVIDIA Warp, `pip install "fluidlift[cuda]"`)"""
+    """who simulates a liquid: the CPU (Numba), or a GPU (NVIDIA Warp, `pip install "fluidlift[cuda]"`)"""
     follow: float = 1.0
     """how far it keeps to the filmed flow where geometry does not explain it: 0 pure physics, 1 as filmed"""
     guide: float = 0.0

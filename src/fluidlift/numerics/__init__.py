@@ -13,6 +13,12 @@ Modules of the face:
     mesh_normals           Normals of triangle meshes
     mirror                 Points continued beyond their ends by their own mirror image: what lies there, and moves
                            in from there
+    multigrid              Conjugate gradients preconditioned by a geometric multigrid V-cycle, for the cell Poisson
+                           equation
+    multigrid_assembly     Levels of the multigrid solver: the operator on the finest grid and on coarser ones
+                           (memory: `multigrid_kernels`)
+    multigrid_cycle        The V-cycle and the conjugate gradients of the multigrid solver (memory:
+                           `multigrid_kernels`)
     nearest                Nearest neighbours in a k-d tree
     outline                Where an outline ends
     particle_mean          What particles carry, at other points: means weighted by a kernel (Numba)
@@ -50,8 +56,8 @@ Modules of the face:
 
 __all__ = [
     "bspline", "ground_block", "harmonics", "isosurface", "lanes", "mesh_distance", "mesh_normals", "mirror",
-    "nearest", "outline", "particle_mean", "poisson", "recurrent_stencil", "recurrent_stencil_fit", "sampling",
-    "sharing", "signed_distance", "similarity2", "solid_mesh", "splatting", "splatting_colors",
-    "splatting_kernels", "splatting_projection", "splatting_torch", "srgb", "textures", "torch_multigrid",
-    "torch_poisson", "triangles",
+    "multigrid", "multigrid_assembly", "multigrid_cycle", "nearest", "outline", "particle_mean", "poisson",
+    "recurrent_stencil", "recurrent_stencil_fit", "sampling", "sharing", "signed_distance", "similarity2",
+    "solid_mesh", "splatting", "splatting_colors", "splatting_kernels", "splatting_projection",
+    "splatting_torch", "srgb", "textures", "torch_multigrid", "torch_poisson", "triangles",
 ]  # fmt: skip

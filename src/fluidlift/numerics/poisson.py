@@ -351,10 +351,11 @@ def solve(
         found = multigrid.solve(system.unknown, system.weights, system.spacing, rhs, **options, low_rank=terms)
     else:
         found = _solve_plain(system, rhs, method, **options, low_rank=tuple(low_rank))
-    return found.p, _judged(found, tolerance, method)
+    return found.p, judged(found, tolerance, method)
 
 
-def _judged(found: multigrid.Solution, tolerance: float, method: str) -> SolveReport:
+def judged(found: multigrid.Solution, tolerance: float, method: str) -> SolveReport:
+    """The report on what a solver found."""
     advice = []
     if not np.isfinite(found.residual) and found.iterations == 0:
         advice.append("the right side or the first guess is not finite")

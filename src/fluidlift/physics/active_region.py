@@ -44,8 +44,18 @@ def region_around(
     chunks = (len(positions) + CHUNK - 1) // CHUNK
     lows, highs = np.full((chunks, 3), np.inf, np.float32), np.full((chunks, 3), -np.inf, np.float32)
     _extremes(positions, lows, highs)
-    low = np.floor((lows.min(axis=0) - grid.low) / grid.spacing) - MARGIN
-    high = np.floor((highs.max(axis=0) - grid.low) / grid.spacing) + 1 + MARGIN
+    return region_of_extent(lows.min(axis=0), highs.max(axis=0), grid, kept)
+
+
+def region_of_extent(
+    lowest: Float[np.ndarray, "3"],
+    highest: Float[np.ndarray, "3"],
+    grid: Grid,
+    kept: tuple[np.ndarray, np.ndarray] | None = None,
+) -> Box:
+    """`region_around` particles whose least and largest coordinates are known, float32, m."""
+    low = np.floor((lowest - grid.low) / grid.spacing) - MARGIN
+    high = np.floor((highest - grid.low) / grid.spacing) + 1 + MARGIN
     if kept is not None:
         low, high = np.minimum(low, kept[0]), np.maximum(high, kept[1])
     last = np.asarray(grid.shape)

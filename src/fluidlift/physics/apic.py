@@ -17,7 +17,8 @@ from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.physics import transfer
 from fluidlift.physics.active_region import ActiveRegion
 from fluidlift.physics.advect_particles import displacements, leaving
-from fluidlift.physics.emitter import Supply
+from fluidlift.physics.device_liquid import DeviceSetup, left_to_the_host
+from fluidlift.physics.emitter import Emission, Supply
 from fluidlift.physics.guidance import BodyForce
 from fluidlift.physics.liquid_grid import LiquidGrid
 from fluidlift.physics.numba_particles import NumbaMover, NumbaTransfer, ParticleWork
@@ -35,10 +36,14 @@ from fluidlift.physics.stepping import (
     StepReport,
 )
 from fluidlift.physics.surface_tension import capillary_time_step
-from fluidlift.seams import MoveRules
+from fluidlift.seams import LiquidStepper, MoveRules
 from fluidlift.types import CellType, FaceVelocity, FluidParameters, Grid, Particles, SolveReport, Terrain
 
 __all__ = ["EmitSource", "LiquidSimulator", "SimulationSettings", "StepReport"]
+
+
+NOWHERE = np.zeros((0, 3), np.float32)
+"""places of particles where there is none"""
 
 
 def open_sky(gravity: tuple[float, float, float]) -> np.ndarray:
@@ -119,10 +124,22 @@ class LiquidSimulator(ParticleSimulator):
         self._liquid = LiquidGrid(
             self._surroundings, self._particles, transfer=self._work.transfer, bodies=self.bodies, forces=self._forces
         )
+        self.on_host_because = ""
+        """why the grid is left to the host though `work` could do the whole substep; "" where it does, or could not"""
+        self._stepper: LiquidStepper | None = None
+        """keeps the particles, in place of `_particles`"""
+        if self._work.liquid is not None:
+            self.on_host_because = left_to_the_host(self._surroundings, self._forces, len(self.bodies))
+            if not self.on_host_because:
+                solids, levels = self._liquid.solids, self._liquid.start_levels
+                self._stepper = self._work.liquid.begin(DeviceSetup(self._surroundings, solids, self._forces, levels))
+                self._stepper.upload(self._particles)
 
     def state(self) -> dict[str, np.ndarray]:
         """See `ParticleSimulator.state`; also that of the grid and of the bodies."""
         bodies = {f"bodies.{name}": value for name, value in self.bodies.state().items()}
+        if self._stepper is not None:
+            self._liquid.head_rate = self._stepper.head_rate
         return super().state() | self._liquid.state() | bodies
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
@@ -137,11 +154,66 @@ class LiquidSimulator(ParticleSimulator):
             super().restore(before)
             raise
         self._liquid.restore(state)
+        if self._stepper is not None:
+            self._stepper.upload(self._particles)
+            self._stepper.restore_head_rate(self._liquid.head_rate)
 
     @property
     def any_thread(self) -> bool:
         """See `ParticleSimulator`; a GPU belongs to the thread that began with it."""
-        return isinstance(self._work.transfer, NumbaTransfer) and isinstance(self._work.mover, NumbaMover)
+        host = isinstance(self._work.transfer, NumbaTransfer) and isinstance(self._work.mover, NumbaMover)
+        return host and self._stepper is None
+
+    @property
+    def particles(self) -> Particles:
+        """See `ParticleSimulator`."""
+        return super().particles if self._stepper is None else self._stepper.download(by_id=True)
+
+    @property
+    def volume(self) -> float:
+        """See `ParticleSimulator`."""
+        return super().volume if self._stepper is None else self._stepper.mass() / self.parameters.density
+
+    def _held(self) -> Particles:
+        return self._particles if self._stepper is None else self._stepper.download()
+
+    def _count(self) -> int:
+        return super()._count() if self._stepper is None else self._stepper.count
+
+    def _wet_volume(self) -> float:
+        return super()._wet_volume() if self._stepper is None else self._stepper.wet_cells() * self.grid.spacing**3
+
+    def _around(self, emission: Emission) -> np.ndarray:
+        if self._stepper is None:
+            return super()._around(emission)
+        begins = emission.is_new and emission.emitter.on(self.time)
+        return self._stepper.download().positions if begins and self._stepper.count else NOWHERE
+
+    def _missing(self) -> np.ndarray:
+        if self._stepper is None:
+            return super()._missing()
+        return self._inlet.jittered(self._stepper.lacking(), self._rng) if self._inlet.has_cells else NOWHERE
+
+    def _carry(self) -> None:
+        if self._stepper is None:
+            super()._carry()
+        else:
+            self._stepper.carry(self.time)
+
+    def _join(self, made: Particles) -> None:
+        if self._stepper is None:
+            super()._join(made)
+        else:
+            self._stepper.append(made)
+
+    def _drain(self) -> int:
+        if self._stepper is None:
+            return super()._drain()
+        if self.drains is None or not self._stepper.count:
+            return 0
+        number, mass = self._stepper.take_out(self.drains)
+        self.drained += mass / self.parameters.density
+        return number
 
     def _speed_gain(self) -> float:
         return super()._speed_gain() + sum(force.largest for force in self._forces)
@@ -153,9 +225,13 @@ class LiquidSimulator(ParticleSimulator):
         return step if step <= longest else remaining / np.ceil(remaining / longest - 1e-9)
 
     def _max_speed(self) -> float:
+        if self._stepper is not None:
+            return self._stepper.max_speed()
         return max(super()._max_speed(), self.bodies.max_speed(self.parameters.time_step))
 
     def _substep(self, dt: float, number: int, *, last_attempt: bool) -> Outcome | None:
+        if self._stepper is not None:
+            return self._stepped(self._stepper, dt, number, last_attempt=last_attempt)
         walls, bodies = self._walls, self.bodies
         before = bodies.state()
         if not len(self._particles):
@@ -173,17 +249,11 @@ class LiquidSimulator(ParticleSimulator):
         # particles in the inlet move as prescribed: walls beside it would hold back its rim
         self._inlet.carry(particles.positions, velocities, affine, self.time)
         moves, farthest = displacements(velocities, affine, dt)
-        farthest /= grid.spacing
-        if not farthest <= 3.0 * self.settings.courant:
+        if not self._near_enough(farthest):
             bodies.restore(before)
             if not last_attempt:
                 return None
-            raise FluidliftError(
-                f"Step {self._advances}, substep {number + 1}, t = {self.time:.4g} s: the simulation blew up (a "
-                f"particle would cross {farthest:.3g} cells in {dt:.3g} s; pressure residual "
-                f"{step.report.residual:.2g}). The state before it is kept. Use a smaller time_step, or check inflow "
-                "velocity, terrain and viscosity."
-            )
+            raise self._blown_up(farthest, step.report, dt, number)
         if self.settings.spread_crowds:
             volumes = (particles.masses / self.parameters.density).astype(np.float32)
             ratio = fill_ratio(particles.positions, volumes, grid, order, region.capacity)
@@ -206,6 +276,32 @@ class LiquidSimulator(ParticleSimulator):
             self._liquid.head_rate = step.head_rate
 
         return Outcome(state, int(gone.sum()), step.report, step.viscosity, adopt)
+
+    def _near_enough(self, farthest: float) -> bool:
+        """Whether a displacement (m) is one that a substep may have."""
+        return farthest / self.grid.spacing <= 3.0 * self.settings.courant
+
+    def _blown_up(self, farthest: float, report: SolveReport, dt: float, number: int) -> FluidliftError:
+        return FluidliftError(
+            f"Step {self._advances}, substep {number + 1}, t = {self.time:.4g} s: the simulation blew up (a "
+            f"particle would cross {farthest / self.grid.spacing:.3g} cells in {dt:.3g} s; pressure residual "
+            f"{report.residual:.2g}). The state before it is kept. Use a smaller time_step, or check inflow "
+            "velocity, terrain and viscosity."
+        )
+
+    def _stepped(self, stepper: LiquidStepper, dt: float, number: int, *, last_attempt: bool) -> Outcome | None:
+        """A substep where the particles are."""
+        if not stepper.count:
+            return Outcome(None, 0, SolveReport(True, 0, 0.0, "empty"), (), lambda: None)
+        tidy = number % TIDY_EVERY == 0 and self.settings.reseed
+        draw = (lambda n: self._rng.normal(size=(n, 3))) if tidy else None
+        self._next_id += stepper.prepare(self._next_id, draw)
+        done = stepper.step(dt, self.time)
+        if not self._near_enough(done.farthest):
+            if not last_attempt:
+                return None
+            raise self._blown_up(done.farthest, done.pressure, dt, number)
+        return Outcome(None, done.leaving, done.pressure, done.viscosity, stepper.adopt)
 
     def _tidied(self, order: transfer.CellOrder, region: ActiveRegion) -> transfer.CellOrder:
         """Reseed, and put the particles in the order of their cells, so that neighbours are close in memory."""

@@ -256,6 +256,21 @@ class Emission:
         places = places[grid.contains(places, clear)]
         return places[sample_nodes(self._walls.signed_distance, grid, places) > clear].astype(np.float32)
 
+    @property
+    def prescribed(self) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """Per component, faces (int64 [m,3]) that move as prescribed, and their velocity (float32 [m], m/s)."""
+        return self._faces, self._values
+
+    @property
+    def field(self) -> MeshDistance:
+        """Distance to the surface, m, negative inside, in a box around it."""
+        return self._distance
+
+    @property
+    def is_new(self) -> bool:
+        """Whether nothing has come out yet since it came on: `due` looks at the particles then."""
+        return bool(np.isnan(self.last))
+
     def impose(self, components: list[np.ndarray], first: tuple[int, int, int]) -> None:
         """Set the faces of its cells, in arrays that begin at cell `first`, in place."""
         for component, faces, values in zip(components, self._faces, self._values):

@@ -9,6 +9,7 @@ and obstacles are free.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import final
 
 import numpy as np
@@ -45,7 +46,7 @@ class SteadyForce(BodyForce):
     """
 
     def __init__(self, acceleration: FaceVelocity) -> None:
-        self._acceleration = acceleration
+        self._acceleration = self.acceleration = acceleration
         squares = [float(np.square(c).max(initial=0.0)) for c in acceleration.components]
         self._largest = float(np.sqrt(sum(squares)))
 
@@ -89,32 +90,40 @@ class Nudging(BodyForce):
         for rate, component in zip(rates, target.components):
             require(rate.shape == component.shape, f"rates {rate.shape}", str(component.shape))
         require(gain >= 0 and learning > 0, f"gain {gain}, learning {learning} s", "0 or more, above 0 s")
-        self._target, self._rates, self._gain, self._learning = target, rates, gain, learning
+        self.target, self.rates, self.gain, self.learning = target, rates, gain, learning
         self._learnt = [np.zeros(c.shape, np.float32) for c in target.components]
         self._sum = [np.zeros(c.shape, np.float32) for c in target.components]
         self._behind = [np.zeros(c.shape, np.float32) for c in target.components]
         self._time = [np.zeros(c.shape, np.float32) for c in target.components]
-        self._passed, self._after = 0.0, after
+        self.passed, self.after = 0.0, after
+        """s that it has acted, and that it has to until it counts"""
+        self.fetch: Callable[[], None] | None = None
+        """brings `memory` and `passed` here from where the force acts, such as a GPU"""
+
+    @property
+    def memory(self) -> tuple[list[np.ndarray], ...]:
+        """Per component: the learnt force (m/s^2), and the sums of change (m/s), of target - v (m) and of time (s)."""
+        return self._learnt, self._sum, self._behind, self._time
 
     def applied(self, velocity: FaceVelocity, masses: Masses, box: Box, dt: float, time: float = 0.0) -> FaceVelocity:
         """v + (1 - exp(-dt / tau)) (v_target - v) + F dt: the decay is exact, and does not overshoot for any dt."""
-        out, part = [], np.float32(-np.expm1(-dt / self._learning))
+        out, part = [], np.float32(-np.expm1(-dt / self.learning))
         for axis, (v, mass) in enumerate(zip(velocity.components, masses)):
             faces = face_box(box, axis)
-            share = -np.expm1(-np.float32(dt) * self._rates[axis][faces])
-            behind = self._target.components[axis][faces] - v
+            share = -np.expm1(-np.float32(dt) * self.rates[axis][faces])
+            behind = self.target.components[axis][faces] - v
             pull = share * behind
             held, learnt = mass > 0, self._learnt[axis][faces]
-            if self._gain > 0:
-                wanted = np.float32(self._gain / dt) * pull
+            if self.gain > 0:
+                wanted = np.float32(self.gain / dt) * pull
                 learnt += np.where(held, part * (wanted - learnt), np.float32(0))
             change = pull + np.float32(dt) * learnt
-            wet = held & (self._passed >= self._after)
+            wet = held & (self.passed >= self.after)
             self._sum[axis][faces] += np.where(wet, change, np.float32(0))
             self._behind[axis][faces] += np.where(wet, np.float32(dt) * behind, np.float32(0))
             self._time[axis][faces] += np.where(wet, np.float32(dt), np.float32(0))
             out.append(v + change)
-        self._passed += dt
+        self.passed += dt
         return FaceVelocity(*out)
 
     def mean(self) -> FaceVelocity:
@@ -129,7 +138,9 @@ class Nudging(BodyForce):
         return self._mean(self._behind)
 
     def _mean(self, sums: list[np.ndarray]) -> FaceVelocity:
-        least = 0.5 * max(self._passed - self._after, 0.0)
+        if self.fetch is not None:
+            self.fetch()
+        least = 0.5 * max(self.passed - self.after, 0.0)
         pairs = zip(sums, self._time)
         return FaceVelocity(*(np.where(t > least, s / np.maximum(t, 1e-9), 0).astype(np.float32) for s, t in pairs))
 
@@ -146,13 +157,13 @@ class Guiding(BodyForce):
     def __init__(self, film: FilmedMotion, rates: tuple[Float[np.ndarray, "..."], ...]) -> None:
         for rate, component in zip(rates, film.components):
             require(rate.shape == component.shape[1:], f"rates {rate.shape}", str(component.shape[1:]))
-        self._film, self._rates = film, rates
+        self.film, self.rates = film, rates
 
     def applied(self, velocity: FaceVelocity, masses: Masses, box: Box, dt: float, time: float = 0.0) -> FaceVelocity:
         """v + (1 - exp(-dt / tau)) (v_target - v), with the target half a step later."""
-        before, after, way = self._film.around(time + 0.5 * dt)
+        before, after, way = self.film.around(time + 0.5 * dt)
         out = []
-        for axis, (v, rate, frames) in enumerate(zip(velocity.components, self._rates, self._film.components)):
+        for axis, (v, rate, frames) in enumerate(zip(velocity.components, self.rates, self.film.components)):
             faces = face_box(box, axis)
             first, second = (frames[k][faces].astype(np.float32) for k in (before, after))
             target = first + np.float32(way) * (second - first)

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from fluidlift.numerics.sampling import sample_faces, sample_nodes
 from fluidlift.physics.boundaries import CLEARANCE, Walls, touching_faces
 from fluidlift.physics.emitter import PHASES, Emission, Supply
-from fluidlift.types import CellType, FaceVelocity, FluidParameters, Grid, Terrain
+from fluidlift.types import CellType, FaceVelocity, FluidParameters, Grid, Terrain, triple
 
 MODES = 12
 """plane waves that make up the inflow fluctuation"""
@@ -159,6 +159,49 @@ def clear_of_shore(
     return sample_nodes(terrain.signed_distance, terrain.grid, above) > reach
 
 
+@dataclass(frozen=True)
+class SteadyInflow:
+    """What the velocity of INFLOW cells is made of (`Inlet.velocity`), for those who evaluate it elsewhere."""
+
+    offset: Float[np.ndarray, "3"]
+    """m/s"""
+    profile: FaceVelocity | None
+    """m/s, on the faces of the whole box"""
+    gain: float
+    """of the profile"""
+    amplitude: float
+    """m/s"""
+    fluctuation: Fluctuation
+    faces: tuple[Int[np.ndarray, "m 3"], ...]
+    """per component, the faces with this velocity, and their centres (m)"""
+    points: tuple[Float[np.ndarray, "m 3"], ...]
+
+
+@dataclass(frozen=True)
+class InletLattice:
+    """The travelling lattice of places for particles around the INFLOW cells, at one instant.
+
+    Place (i, j, k) lies at `start` + `spacing` (i, j, k), shifted along the axis `along` by `spacing` times the phase
+    of its column, mod((index - turns) . PHASES, 1) over the two other axes.
+    """
+
+    start: Float[np.ndarray, "3"]
+    """m"""
+    spacing: float
+    """m"""
+    first: tuple[int, int, int]
+    """least index"""
+    counts: tuple[int, int, int]
+    """places along each axis"""
+    along: int
+    turns: Float[np.ndarray, "3"]
+    """whole spacings that the lattice has travelled"""
+    reach: float
+    """m: a place with a particle nearer than that lacks none"""
+    clear: float
+    """m: places are farther than that from the solid"""
+
+
 class Inlet:
     """What flows in: velocity as a function of place and time, and where new particles are due.
 
@@ -207,6 +250,21 @@ class Inlet:
             touched &= opening > 0
             self._faces.append(np.argwhere(touched))
             self._face_points.append(grid.faces(axis)[touched])
+
+    @property
+    def steady(self) -> SteadyInflow | None:
+        """What the velocity of INFLOW cells is made of; None without such cells."""
+        if not self._steady:
+            return None
+        return SteadyInflow(
+            self._offset, self._profile, self._gain, self._amplitude, self._fluctuation, tuple(self._faces),
+            tuple(self._face_points),
+        )  # fmt: skip
+
+    @property
+    def has_cells(self) -> bool:
+        """Whether there are INFLOW cells."""
+        return self._steady
 
     @property
     def active(self) -> bool:
@@ -309,8 +367,9 @@ class Inlet:
         lattice."""
         self.shift = self.shift + self.bulk * (dt * self.supply.schedule.travelled(time, dt))
 
-    def _lattice(self) -> Float[np.ndarray, "n 3"]:
-        """Points of the travelling lattice around the INFLOW cells.
+    @property
+    def lattice(self) -> InletLattice:
+        """The places of particles now. There are INFLOW cells.
 
         Each column along the flow has a phase of its own, which travels with it: particles arrive one by one and not
         layer by layer.
@@ -319,14 +378,21 @@ class Inlet:
         turns = np.floor(self.shift / s)
         start = grid.low + self._low * grid.spacing - 0.5 * s + self.shift - turns * s
         along = int(np.abs(self.bulk).argmax())
-        beside = [a for a in range(3) if a != along]
         # shifts and phases are up to a spacing long: a layer more at the end, and one at the beginning of each column
-        index = [
-            np.arange(-1 if a == along else 0, n + 1) for a, n in enumerate((self._high - self._low) * self._per_side)
-        ]
+        first = triple(-1 if a == along else 0 for a in range(3))
+        ends = (self._high - self._low) * self._per_side + 1
+        counts = triple(int(n) - f for n, f in zip(ends, first))
+        # every lattice point outside the solid: a wider berth would emit less than what flows through the opening
+        return InletLattice(start, s, first, counts, along, turns, 0.8 * s, CLEARANCE * grid.spacing)
+
+    def _places(self) -> Float[np.ndarray, "n 3"]:
+        """Points of the lattice."""
+        own = self.lattice
+        beside = [a for a in range(3) if a != own.along]
+        index = [np.arange(f, f + n) for f, n in zip(own.first, own.counts)]
         lattice = np.stack(np.meshgrid(*index, indexing="ij"), axis=-1).reshape(-1, 3)
-        points = start + s * lattice
-        points[:, along] += s * np.mod((lattice - turns)[:, beside] @ PHASES, 1.0)
+        points = own.start + own.spacing * lattice
+        points[:, own.along] += own.spacing * np.mod((lattice - own.turns)[:, beside] @ PHASES, 1.0)
         return points
 
     def missing(self, positions: Float[np.ndarray, "n 3"], rng: np.random.Generator) -> Float[np.ndarray, "m 3"]:
@@ -334,20 +400,24 @@ class Inlet:
         spacing from every particle, slightly jittered."""
         if not self._steady:
             return np.zeros((0, 3), np.float32)
-        grid, s = self._walls.grid, self.particle_spacing
-        candidates = self._lattice()
+        grid, own = self._walls.grid, self.lattice
+        candidates = self._places()
         candidates = candidates[grid.contains(candidates)]
         candidates = candidates[self.inside(candidates)]
-        # every lattice point outside the solid: a wider berth would emit less than what flows through the opening
-        clear = CLEARANCE * grid.spacing
+        clear = own.clear
         candidates = candidates[sample_nodes(self._walls.signed_distance, grid, candidates) > clear]
         margin = 2 * grid.spacing
         box_low, box_high = grid.low + self._low * grid.spacing - margin, grid.low + self._high * grid.spacing + margin
         near = positions[((positions > box_low) & (positions < box_high)).all(axis=1)]
         if len(near) and len(candidates):
-            distance, _ = cKDTree(near).query(candidates, distance_upper_bound=0.8 * s)
+            distance, _ = cKDTree(near).query(candidates, distance_upper_bound=own.reach)
             candidates = candidates[~np.isfinite(distance)]
-        jittered = candidates + rng.uniform(-0.1, 0.1, candidates.shape) * s
+        return self.jittered(candidates, rng)
+
+    def jittered(self, candidates: Float[np.ndarray, "m 3"], rng: np.random.Generator) -> Float[np.ndarray, "m 3"]:
+        """Places of the lattice, slightly jittered where that leaves them in the inlet."""
+        grid, clear = self._walls.grid, CLEARANCE * self._walls.grid.spacing
+        jittered = candidates + rng.uniform(-0.1, 0.1, candidates.shape) * self.particle_spacing
         astray = ~self.inside(jittered) | (sample_nodes(self._walls.signed_distance, grid, jittered) <= clear)
         jittered[astray] = candidates[astray]
         return np.clip(jittered, grid.low + clear, grid.high - clear).astype(np.float32)

@@ -92,11 +92,16 @@ class LiquidGrid:
         self._walls, self._inlet = s.walls, s.inlet
         self._transfer, self._bodies, self._forces = transfer, bodies, forces
         self._region = open_region(triple(slice(0, n) for n in s.grid.shape), s.walls, s.capacity)
-        self._solids = solid_shares(s.walls.signed_distance, s.grid)
-        self._region_solids = self._solids.inside(self._region.box)
+        self.solids = solid_shares(s.walls.signed_distance, s.grid)
+        self._region_solids = self.solids.inside(self._region.box)
         self.head_rate: tuple[tuple[int, int, int], np.ndarray] | None = None
         """first cell of the region of the last substep, and there q / dt: the first guess of the pressure"""
         self._start_levels = self._levels(particles) if (s.walls.regions == CellType.OUTFLOW).any() else None
+
+    @property
+    def start_levels(self) -> np.ndarray | None:
+        """Cells [nx,ny]: the water at the outlet at the start; None without an outlet."""
+        return self._start_levels
 
     def state(self) -> dict[str, np.ndarray]:
         """The water levels at the outlet, and the pressure as a first guess."""
@@ -127,7 +132,7 @@ class LiquidGrid:
     def _levels(self, particles: Particles) -> np.ndarray:
         order = transfer.sort_by_cell(particles.positions, self.grid)
         levels = water_levels((np.diff(order.start) > 0).reshape(self.grid.shape), self._walls)
-        surface = liquid_surface(particles.positions, self._volumes(particles), self.grid, order, self._solids)
+        surface = liquid_surface(particles.positions, self._volumes(particles), self.grid, order, self.solids)
         return surface_heights(levels, surface.distance, self.grid.spacing)
 
     def _volumes(self, particles: Particles) -> np.ndarray:
@@ -139,7 +144,7 @@ class LiquidGrid:
         box = region_around(positions, self.grid, self._inlet.cell_range if self._inlet.active else None)
         if box != self._region.box:
             self._region = open_region(box, self._walls, self._surroundings.capacity)
-            self._region_solids = self._solids.inside(box)
+            self._region_solids = self.solids.inside(box)
         return self._region
 
     def _outlet_faces(self, walls: Walls) -> tuple[np.ndarray, ...] | None:

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from fluidlift.physics import transfer
 from fluidlift.physics.boundaries import collide
 from fluidlift.physics.deform import updated_deformation
+from fluidlift.physics.device_liquid import DeviceLiquid
 from fluidlift.seams import GroupedByCell, MoveRules, ParticleMover, ParticleTransfer, WallShape
 from fluidlift.types import FaceVelocity, Grid, Particles
 
@@ -61,7 +62,9 @@ class NumbaMover(ParticleMover):
 
 @dataclass(frozen=True)
 class ParticleWork:
-    """Who does the particle half of a step."""
+    """Who does the particle half of a step, or all of it."""
 
     transfer: ParticleTransfer = field(default_factory=NumbaTransfer)
     mover: ParticleMover = field(default_factory=NumbaMover)
+    liquid: DeviceLiquid | None = None
+    """who does the whole substep of a liquid, where it can (`device_liquid.left_to_the_host`); None: the host"""

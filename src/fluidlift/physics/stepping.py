@@ -18,7 +18,7 @@ from fluidlift.errors import FluidliftError, InputRejected, require
 from fluidlift.numerics.sampling import sample_centers
 from fluidlift.numerics.signed_distance import push_outside
 from fluidlift.physics import boundaries, transfer
-from fluidlift.physics.emitter import Supply
+from fluidlift.physics.emitter import Emission, Supply
 from fluidlift.physics.inlet import Inlet
 from fluidlift.physics.no_bodies import NoBodies
 from fluidlift.physics.position_correction import cell_capacity
@@ -77,7 +77,8 @@ class StepReport:
 class Outcome:
     """Of one substep, not yet adopted."""
 
-    particles: Particles
+    particles: Particles | None
+    """None: they are kept elsewhere, and `adopt` knows where"""
     removed: int
     pressure: SolveReport
     viscosity: tuple[SolveReport, ...]
@@ -141,13 +142,19 @@ class ParticleSimulator(ABC):
     @property
     def particles(self) -> Particles:
         """The present state, in the order of the ids."""
-        return self._particles.select(np.argsort(self._particles.ids, kind="stable"))
+        held = self._held()
+        return held.select(np.argsort(held.ids, kind="stable"))
+
+    def _held(self) -> Particles:
+        """The present state, in the order in which it is kept."""
+        return self._particles
 
     def state(self) -> dict[str, np.ndarray]:
         """All that changes from step to step, as plain arrays: a simulator built with the same arguments goes on from
         it, after `restore`, bit for bit."""
         generator = json.dumps(self._rng.bit_generator.state).encode()
-        particles = {f"particles.{f.name}": getattr(self._particles, f.name).copy() for f in fields(Particles)}
+        held = self._held()
+        particles = {f"particles.{f.name}": getattr(held, f.name).copy() for f in fields(Particles)}
         return particles | {
             "time": np.float64(self.time),
             "drained": np.float64(self.drained),
@@ -213,7 +220,8 @@ class ParticleSimulator(ABC):
                 dt *= 0.5
                 attempt += 1
             retries += attempt
-            self._particles = outcome.particles
+            if outcome.particles is not None:
+                self._particles = outcome.particles
             outcome.adopt()
             self._inlet.travel(dt, self.time)
             self.time += dt
@@ -226,12 +234,12 @@ class ParticleSimulator(ABC):
         emitted += self._fill_inlet()  # what the last substep carried away leaves no gap in the frame
         return StepReport(
             duration, substeps, self._max_speed(), self.volume, self._wet_volume(), tuple(pressure), tuple(viscosity),
-            len(self._particles), emitted, removed, retries,
+            self._count(), emitted, removed, retries,
         )  # fmt: skip
 
     def _drain(self) -> int:
         """Take out what lies in cells that are drained; how many particles."""
-        if self.drains is None or not len(self._particles):
+        if self.drains is None or not self._count():
             return 0
         cells = np.clip(self.grid.cell_of(self._particles.positions), 0, np.asarray(self.grid.shape) - 1)
         gone = self.drains[tuple(cells.T)]
@@ -239,6 +247,10 @@ class ParticleSimulator(ABC):
             self.drained += float(self._particles.masses[gone].sum(dtype=np.float64)) / self.parameters.density
             self._particles = self._particles.select(~gone)
         return int(gone.sum())
+
+    def _count(self) -> int:
+        """Number of particles."""
+        return len(self._particles)
 
     @property
     def any_thread(self) -> bool:
@@ -309,17 +321,32 @@ class ParticleSimulator(ABC):
         inlet, before = self._inlet, self._next_id
         if inlet.switch(self.time):
             self._emitters_switched()
-        self._add(inlet.missing(self._particles.positions, self._rng), inlet.particle_spacing**3)
+        self._add(self._missing(), inlet.particle_spacing**3)
         for number, emission in enumerate(inlet.emissions):
-            places = emission.due(self.time, self._particles.positions)
+            places = emission.due(self.time, self._around(emission))
             look = inlet.supply.looks[number] if inlet.supply.looks else None
             self._add(places, emission.volume, look, emission.velocity)
-        if not inlet.active:
-            return self._next_id - before
-        velocities, affine = self._particles.velocities.copy(), self._particles.affine.copy()
-        inlet.carry(self._particles.positions, velocities, affine, self.time)
-        self._particles = replace(self._particles, velocities=velocities, affine=affine)
+        if inlet.active:
+            self._carry()
         return self._next_id - before
+
+    def _around(self, emission: Emission) -> np.ndarray:
+        """Positions (m) of the particles that an emitter has to look at."""
+        return self._particles.positions
+
+    def _missing(self) -> np.ndarray:
+        """Places (m) of the particles that INFLOW cells lack."""
+        return self._inlet.missing(self._particles.positions, self._rng)
+
+    def _carry(self) -> None:
+        """Particles in the inlet move as prescribed."""
+        velocities, affine = self._particles.velocities.copy(), self._particles.affine.copy()
+        self._inlet.carry(self._particles.positions, velocities, affine, self.time)
+        self._particles = replace(self._particles, velocities=velocities, affine=affine)
+
+    def _join(self, made: Particles) -> None:
+        """New particles behind the others."""
+        self._particles = self._particles.joined(made)
 
     def _add(
         self, places: np.ndarray, volume: float, look: np.ndarray | None = None, velocity: np.ndarray | None = None
@@ -344,7 +371,7 @@ class ParticleSimulator(ABC):
         moves = None if velocity is None else np.broadcast_to(velocity, positions.shape)
         made = Particles.at_rest(positions, mass, source, moves, first_id=self._next_id)
         self._next_id += len(positions)
-        self._particles = self._particles.joined(made)
+        self._join(made)
 
     def _emitters_switched(self) -> None:  # noqa: B027
         """An emitter has come on or gone off; for simulators that keep what depends on it."""

@@ -9,6 +9,7 @@ import numpy as np
 
 from fluidlift.errors import InputRejected
 from fluidlift.machine import available_memory
+from fluidlift.messages import Notice
 from fluidlift.scene.build import Scene, simulation_step
 from fluidlift.scene.reshaping import sides_open_to_air
 from fluidlift.scene.surface_appearance import lends_look
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def particle_work(device: str) -> ParticleWork:
-    """The back end that moves particles on a device, "cpu" or "cuda".
+    """The back end that simulates liquids, or moves their particles, on a device, "cpu" or "cuda".
 
     Raises:
         MissingPackage: NVIDIA Warp is not installed.
@@ -32,9 +33,24 @@ def particle_work(device: str) -> ParticleWork:
 
     if device == "cpu":
         return ParticleWork()
+    from fluidlift.backends.warp_liquid import WarpLiquids
     from fluidlift.backends.warp_particles import WarpMover, WarpTransfer
 
-    return ParticleWork(WarpTransfer(device), WarpMover(device))
+    return ParticleWork(WarpTransfer(device), WarpMover(device), WarpLiquids(device))
+
+
+def left_to_the_cpu(simulator: ParticleSimulator, device: str) -> list[Notice]:
+    """What to say of a device that was asked for and does not do all of the simulation."""
+    from fluidlift.physics.apic import LiquidSimulator
+
+    if device == "cpu":
+        return []
+    if not isinstance(simulator, LiquidSimulator):
+        return [Notice("device-not-used", f"simulate.device={device}: smoke is simulated on the CPU")]
+    if not simulator.on_host_because:
+        return []
+    return [Notice("device-not-used", f"simulate.device={device} moves the particles alone, and the CPU does the rest, "
+                   f"which takes longer, because of {simulator.on_host_because}")]  # fmt: skip
 
 
 def simulator_of(scene: Scene, device: str = "cpu", forces: Sequence[BodyForce] = ()) -> ParticleSimulator:

@@ -14,7 +14,7 @@ from fluidlift.present.looping import close_loop
 from fluidlift.scene.build import Scene, SimulationRequest
 from fluidlift.scene.reshaping import closed_inlet
 from fluidlift.scene.simulation import advance, continued
-from fluidlift.scene.simulator import preflight, simulator_of
+from fluidlift.scene.simulator import left_to_the_cpu, preflight, simulator_of
 from fluidlift.scene.splat_files import checkpoint_file, frame_file, require_room
 from fluidlift.scene.surface_appearance import SurfaceAppearance
 from fluidlift.scene.whitewater import SceneWhitewater, kept_measure
@@ -71,7 +71,7 @@ def simulate(
         simulator, appearance, scene, folder, history, step, max_particles=config.max_particles,
         checkpoint_every=config.checkpoint_every,
     )  # fmt: skip
-    warnings = [*scene.notes, *appearance.warnings, *closed] + (
+    warnings = [*scene.notes, *appearance.warnings, *closed, *left_to_the_cpu(simulator, config.device)] + (
         list(simulator.bodies.warnings) if scene.obstacles else []
     )
     if failed is None and len(history) < scene.simulated:

@@ -5,7 +5,9 @@
 Each part is a process of its own with a time limit, so that one that fails or hangs costs no other:
 
   transfer    benchmarks/warp_transfer.py: P2G, G2P and the particle half of a step, share of the memory's bandwidth
-  simulation  a dam break, whole frames: the CPU's kernels, and `simulate.device=cuda`
+  liquid      benchmarks/warp_liquid.py: the whole substep, by part, the CPU beside it
+  pressure    benchmarks/warp_poisson.py: pressure and viscosity, iterations, launches, share of the bandwidth
+  shown       a dam break of 500,000 particles simulated, taken to the host, deformed and drawn at 720p
   rollout     the gradient of ten steps of the differentiable rollout: the CPU's kernels, and torch on the device
   fit         a twin fitted by both: seconds, and how far the parameters are apart
   splats      benchmarks/splatting.py with gsplat
@@ -28,6 +30,8 @@ from typing import Any
 HERE = Path(__file__).parent
 SCRIPTS: dict[str, list[str]] = {
     "transfer": ["warp_transfer.py", "--counts", "100000", "500000", "2000000"],
+    "liquid": ["warp_liquid.py", "--check", "--host", "--frames", "6"],
+    "pressure": ["warp_poisson.py", "--no-check"],
     "splats": ["splatting.py", "--peers", "gsplat", "--repeats", "3"],
 }
 """parts that are benchmarks of their own"""
@@ -46,29 +50,50 @@ def median(run: Callable[[], object], repeats: int) -> float:
     return statistics.median(times)
 
 
-def simulation(device: str, counts: tuple[int, ...] = (100_000, 500_000)) -> Figures:
-    """Seconds per frame of 1/30 s of a dam break that has begun to fall."""
-    from fluidlift.scene.simulator import particle_work
-    from fluidlift.synthetic.tanks import dam_break
+def shown(device: str, count: int = 500_000) -> Figures:
+    """Seconds of a frame of 1/30 s, by part."""
+    import numpy as np
+    import torch
+    from warp_liquid import dam
 
-    found: Figures = {}
-    for count in counts:
-        cells = round((count / 8) ** (1 / 3))  # 8 particles in each of cells x cells / 2 x 2 cells
-        tank = dam_break(cells=cells, width_cells=cells // 2)
-        ends = {}
-        for name in dict.fromkeys(("cpu", device)):
-            simulator = tank.simulator(work=particle_work(name))
-            simulator.advance(1 / 30)  # compiles
-            begin = time.perf_counter()
-            reports = [simulator.advance(1 / 30) for _ in range(3)]
-            seconds = time.perf_counter() - begin
-            steps = sum(r.substeps for r in reports)
-            found[f"{len(tank.particles)} particles, {name}: s per frame"] = seconds / 3
-            found[f"{len(tank.particles)} particles, {name}: ms per substep"] = 1e3 * seconds / steps
-            ends[name] = simulator.particles.positions.mean(axis=0)
-        if device in ends:
-            apart = float(abs(ends[device] - ends["cpu"]).max()) / tank.grid.spacing
-            found[f"{len(tank.particles)} particles: centres of mass apart, cells"] = apart
+    from fluidlift.numerics.splatting import View
+    from fluidlift.numerics.splatting_torch import NumbaRasterizer
+    from fluidlift.physics.deform import deform_gaussians
+    from fluidlift.scene.simulator import particle_work
+    from fluidlift.types import Gaussians, sh_from_rgb
+
+    on_gpu = device != "cpu"
+    if on_gpu:
+        from fluidlift.backends.gsplat_rasterizer import GsplatRasterizer
+    rasterizer = GsplatRasterizer(device) if on_gpu else NumbaRasterizer()
+    tank = dam(count)
+    n, h = len(tank.particles), tank.grid.spacing
+    rest = Gaussians(
+        tank.particles.positions, np.tile(np.float32([1, 0, 0, 0]), (n, 1)), np.full((n, 3), 0.3 * h, np.float32),
+        np.full(n, 0.8, np.float32), sh_from_rgb(np.random.default_rng(0).random((n, 3))),
+    )  # fmt: skip
+    middle, away = 0.5 * (tank.grid.low + tank.grid.high), 1.5 * float(np.ptp([tank.grid.low, tank.grid.high], 0).max())
+    turn = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
+    view = View(turn, -turn @ (middle - [0.0, away, 0.0]), (1000.0, 1000.0), (640.0, 360.0), (1280, 720))
+    simulator = tank.simulator(work=particle_work(device))
+    taken: dict[str, list[float]] = {"simulated": [], "taken to the host": [], "deformed": [], "drawn": []}
+    for frame in range(9):
+        marks = [time.perf_counter()]
+        simulator.advance(1 / 30)
+        marks.append(time.perf_counter())
+        particles = simulator.particles
+        marks.append(time.perf_counter())
+        body = deform_gaussians(rest, particles)
+        marks.append(time.perf_counter())
+        operands = [torch.from_numpy(np.ascontiguousarray(a, np.float32)).to(device) for a in
+                    (body.means, body.quats, body.scales, body.opacities, body.rgb)]  # fmt: skip
+        rasterizer.splat(*operands, view).image.sum().item()
+        marks.append(time.perf_counter())
+        for part, begin, end in zip(taken, marks, marks[1:]):
+            if frame > 3:  # what is compiled is there then, and the column falls
+                taken[part].append(end - begin)
+    found: Figures = {f"{n} particles, {part}: ms": 1e3 * statistics.median(times) for part, times in taken.items()}
+    found["frames per second"] = 1e3 / sum(v for v in found.values() if isinstance(v, float))
     return found
 
 
@@ -134,7 +159,7 @@ def fit(device: str) -> Figures:
     return found
 
 
-PARTS: dict[str, Callable[[str], Figures]] = {"simulation": simulation, "rollout": rollout, "fit": fit}
+PARTS: dict[str, Callable[[str], Figures]] = {"shown": shown, "rollout": rollout, "fit": fit}
 
 
 def machine_of(device: str) -> str:
@@ -168,7 +193,7 @@ def main() -> None:
     names = [*SCRIPTS, *PARTS]
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cuda", help="cuda, cuda:1... or cpu")
-    parser.add_argument("--only", nargs="*", choices=names, default=names)
+    parser.add_argument("--only", nargs="*", choices=names, default=names, metavar="PART")
     parser.add_argument("--limit", type=float, default=120.0, help="s, of each part")
     parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--part", choices=list(PARTS), help=argparse.SUPPRESS)

@@ -12,9 +12,10 @@ from fluidlift.io.asset_folder import FILES, load_asset, read_manifest
 from fluidlift.io.force_file import read_filmed, write_filmed
 from fluidlift.messages import code_of
 from fluidlift.numerics.sampling import sample_faces
+from fluidlift.physics import guidance
 from fluidlift.physics.guidance import Nudging
 from fluidlift.physics.inflow_schedule import InflowSchedule
-from fluidlift.pipeline.stages.calibrate import STRONG, calibrate
+from fluidlift.pipeline.stages.calibrate import GAIN, STRONG, calibrate
 from fluidlift.scene.build import SimulationRequest, scene_of
 from fluidlift.scene.coarse_copy import coarser
 from fluidlift.scene.force_weight import following
@@ -72,6 +73,17 @@ def test_a_target_that_contradicts_shape_and_mass_is_said(channel):
 def test_smoke_and_pours_are_not_calibrated(channel):
     scene = replace(channel(2), kind="pour")
     assert calibrate(scene, scene.velocity).force is None
+
+
+def test_a_force_is_learnt_from_what_lies_and_not_from_what_falls(channel, monkeypatch):
+    gains = []
+    monkeypatch.setattr(
+        guidance, "Nudging", lambda *args, **given: gains.append(given["gain"]) or Nudging(*args, **given)
+    )
+    for kind in ("stream", "fall"):
+        scene = replace(channel(3), kind=kind)
+        calibrate(scene, scene.velocity)
+    assert gains == [GAIN, 0.0]
 
 
 def test_an_asset_of_a_stream_carries_its_force_and_says_how_strong_it_is(made):

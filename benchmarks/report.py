@@ -33,7 +33,9 @@ FOLDER = ROOT / "benchmarks" / "results"
 PAGE = ROOT / "docs" / "results.md"
 LONGEST = 200
 """lines of the page"""
-ORDER = ("clips", "cases", "as_filmed", "geometry", "motion", "splats", "fit", "simulator", "peers", "device", "cost", "trust")
+ORDER = (
+    "clips", "cases", "as_filmed", "geometry", "motion", "splats", "fit", "simulator", "peers", "device", "cost", "trust",
+)  # fmt: skip
 """of the sections; other topics follow by name"""
 SAME = 0.005
 """relative difference that `--against` does not mention"""

@@ -34,7 +34,8 @@ PAGE = ROOT / "docs" / "results.md"
 LONGEST = 200
 """lines of the page"""
 ORDER = (
-    "clips", "cases", "as_filmed", "geometry", "motion", "splats", "fit", "simulator", "peers", "device", "cost", "trust",
+    "clips", "cases", "as_filmed", "geometry", "motion", "splats",
+    "fit", "simulator", "peers", "device", "cost", "trust",
 )  # fmt: skip
 """of the sections; other topics follow by name"""
 SAME = 0.005

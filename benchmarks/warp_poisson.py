@@ -25,6 +25,7 @@ from fluidlift.backends.warp_device import warp_device
 from fluidlift.backends.warp_pressure import WarpPressure
 from fluidlift.backends.warp_viscosity import WarpViscosity
 from fluidlift.numerics.poisson import PoissonSystem, solve
+from fluidlift.physics.free_surface import surface_gaps
 from fluidlift.types import triple
 
 TOLERANCE = 1e-5
@@ -62,9 +63,8 @@ def falling(pressure: WarpPressure, shape: tuple[int, int, int]) -> tuple[wp.arr
     def faces(values: list[np.ndarray]) -> tuple[wp.array, wp.array, wp.array]:
         return triple(wp.array(v, dtype=wp.float32, device=device) for v in values)
 
-    on_device, gaps = wp.array(types, dtype=wp.uint8, device=device), faces([np.ones_like(o) for o in openings])
-    pressure.surface_gaps(wp.array(distance, dtype=wp.float32, device=device), on_device, gaps)
-    pressure.build(on_device, faces(openings), gaps)
+    on_device = wp.array(types, dtype=wp.uint8, device=device)
+    pressure.build(on_device, faces(openings), faces(list(surface_gaps(distance, types))))
     velocity = faces([np.full_like(o, v) for o, v in zip(openings, (0.0, 0.0, -9.81 * 0.002))])
     pressure.right_side(velocity)
     return velocity

@@ -74,17 +74,6 @@ def test_the_system_of_a_layout_is_the_same_to_the_last_bit(seed, open_border):
     assert wanted.unknown.any() and not wanted.unknown.all()
 
 
-def test_gaps_at_the_surface_are_the_same():
-    types, openings, distance, _ = random_layout(5)
-    system = device_system(types, openings)
-    out = faces([np.zeros(GRID.face_shape(a), np.float32) for a in range(3)])
-    system.surface_gaps(on_device(distance), on_device(types, warp.uint8), out)
-    wanted = free_surface.surface_gaps(distance, types)
-    for a in range(3):
-        np.testing.assert_allclose(out[a].numpy(), wanted[a], rtol=1e-6)
-    assert min(w.min() for w in wanted) == np.float32(free_surface.SMALLEST_GAP)
-
-
 def test_held_faces_have_no_weight_but_stay_open():
     types, openings, _, rng = pool()
     held = [rng.uniform(size=GRID.face_shape(a)) < 0.2 for a in range(3)]

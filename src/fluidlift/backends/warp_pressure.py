@@ -61,21 +61,15 @@ class WarpPressure:
         Raises:
             ValueError: an array of another shape.
         """
+        from fluidlift.backends import warp_faces
         from fluidlift.backends import warp_pressure_kernels as kernels
 
         require(types.shape == self.shape, f"cell types {types.shape}", str(self.shape))
-        marks = kernels.FaceMarks()
+        marks = warp_faces.Marks()
         marks.x, marks.y, marks.z = self._checked(held) if held is not None else (self._no_marks,) * 3
         given = [self._faces(openings), self._faces(gaps), marks, int(open_border)]
         out = [self.unknown, self._faces(self.weights), self._faces(self.openings)]
         self._launch(kernels.build, [types, *given, *out], more=1)
-
-    def surface_gaps(self, distance: warp.array, types: warp.array, out: Faces) -> None:
-        """`free_surface.surface_gaps`: fills float32 faces from float32 distances (m) and uint8 types [nx,ny,nz]."""
-        from fluidlift.backends import warp_pressure_kernels as kernels
-        from fluidlift.physics.free_surface import SMALLEST_GAP
-
-        self._launch(kernels.surface_gaps, [distance, types, SMALLEST_GAP, self._faces(out)], more=1)
 
     def right_side(self, velocity: Faces, known: warp.array | None = None) -> None:
         """`rhs` = -div(w v) + what known cells add.
@@ -128,9 +122,9 @@ class WarpPressure:
         return faces
 
     def _faces(self, faces: Faces | None) -> Any:
-        from fluidlift.backends import warp_pressure_kernels as kernels
+        from fluidlift.backends import warp_faces
 
-        out = kernels.Faces()
+        out = warp_faces.Faces()
         out.x, out.y, out.z = (self._none,) * 3 if faces is None else self._checked(faces)
         return out
 

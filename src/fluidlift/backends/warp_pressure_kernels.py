@@ -12,6 +12,7 @@ Optional arrays are of size 0 where they are not given.
 # Warp reads the annotations of kernels: they must not become strings
 import warp as wp
 
+from fluidlift.backends.warp_faces import Faces, Marks, cell_or, face, is_face, mark_of, put
 from fluidlift.types import CellType
 
 wp.set_module_options({"enable_backward": False})  # no gradients: halves the compile time
@@ -25,24 +26,6 @@ OUTSIDE = wp.constant(-1)
 """no cell: beyond the box"""
 
 
-@wp.struct
-class Faces:
-    """One number per face: [nx+1,ny,nz], [nx,ny+1,nz], [nx,ny,nz+1]."""
-
-    x: wp.array3d(dtype=float)
-    y: wp.array3d(dtype=float)
-    z: wp.array3d(dtype=float)
-
-
-@wp.struct
-class FaceMarks:
-    """As `Faces`, of bytes."""
-
-    x: wp.array3d(dtype=wp.uint8)
-    y: wp.array3d(dtype=wp.uint8)
-    z: wp.array3d(dtype=wp.uint8)
-
-
 @wp.func
 def inside(cells: wp.vec3i, i: int, j: int, k: int):
     return i >= 0 and j >= 0 and k >= 0 and i < cells[0] and j < cells[1] and k < cells[2]
@@ -54,47 +37,11 @@ def shape_of(cells: wp.array3d(dtype=wp.uint8)):
 
 
 @wp.func
-def face_at(faces: Faces, axis: int, i: int, j: int, k: int):
-    if axis == 0:
-        return faces.x[i, j, k]
-    if axis == 1:
-        return faces.y[i, j, k]
-    return faces.z[i, j, k]
-
-
-@wp.func
-def set_face(faces: Faces, axis: int, i: int, j: int, k: int, value: float):
-    if axis == 0:
-        faces.x[i, j, k] = value
-    elif axis == 1:
-        faces.y[i, j, k] = value
-    else:
-        faces.z[i, j, k] = value
-
-
-@wp.func
-def is_held(held: FaceMarks, axis: int, i: int, j: int, k: int):
+def is_held(held: Marks, axis: int, i: int, j: int, k: int):
     """Whether the velocity of a face is prescribed though no cell of inflow is beside it."""
     if held.x.shape[0] == 0:
         return False
-    if axis == 0:
-        return held.x[i, j, k] != wp.uint8(0)
-    if axis == 1:
-        return held.y[i, j, k] != wp.uint8(0)
-    return held.z[i, j, k] != wp.uint8(0)
-
-
-@wp.func
-def is_face(cells: wp.vec3i, axis: int, i: int, j: int, k: int):
-    """Whether the low side of cell i, j, k across an axis is a face of the grid (i, j, k up to nx, ny, nz)."""
-    return (i < cells[0] or axis == 0) and (j < cells[1] or axis == 1) and (k < cells[2] or axis == 2)
-
-
-@wp.func
-def type_at(types: wp.array3d(dtype=wp.uint8), i: int, j: int, k: int):
-    if inside(shape_of(types), i, j, k):
-        return int(types[i, j, k])
-    return OUTSIDE
+    return mark_of(held, axis, i, j, k) != 0
 
 
 @wp.func
@@ -111,11 +58,11 @@ def opening_and_weight(
 ):
     """Of the face on the low side of cell i, j, k."""
     c = beyond(axis, i, j, k, -1)
-    low = type_at(types, c[0], c[1], c[2])
-    high = type_at(types, i, j, k)
+    low = cell_or(types, c[0], c[1], c[2], OUTSIDE)
+    high = cell_or(types, i, j, k, OUTSIDE)
     opening = float(1.0)
     if openings.x.shape[0] > 0:
-        opening = face_at(openings, axis, i, j, k)
+        opening = face(openings, axis, i, j, k)
     if low == SOLID or high == SOLID:
         opening = 0.0
     if open_border == 0 and (low == OUTSIDE or high == OUTSIDE):
@@ -126,7 +73,7 @@ def opening_and_weight(
     if (low == FLUID or high == FLUID) and low != INFLOW and high != INFLOW:
         weight = opening
         if gaps.x.shape[0] > 0:
-            weight = weight / face_at(gaps, axis, i, j, k)
+            weight = weight / face(gaps, axis, i, j, k)
     return wp.vec2(opening, weight)
 
 
@@ -135,7 +82,7 @@ def build(
     types: wp.array3d(dtype=wp.uint8),
     given: Faces,
     gaps: Faces,
-    held: FaceMarks,
+    held: Marks,
     open_border: int,
     unknown: wp.array3d(dtype=wp.uint8),
     weights: Faces,
@@ -147,38 +94,18 @@ def build(
     reached = float(0.0)
     for axis in range(3):
         if is_face(cells, axis, i, j, k):
-            face = opening_and_weight(types, given, gaps, open_border, axis, i, j, k)
-            reached = wp.max(reached, face[1])
-            set_face(openings, axis, i, j, k, face[0])
-            set_face(weights, axis, i, j, k, wp.where(is_held(held, axis, i, j, k), 0.0, face[1]))
+            pair = opening_and_weight(types, given, gaps, open_border, axis, i, j, k)
+            reached = wp.max(reached, pair[1])
+            put(openings, axis, i, j, k, pair[0])
+            put(weights, axis, i, j, k, wp.where(is_held(held, axis, i, j, k), 0.0, pair[1]))
     if inside(cells, i, j, k):
         fluid = int(types[i, j, k]) == FLUID
         for axis in range(3):
             if fluid and reached == 0.0:
                 c = beyond(axis, i, j, k, 1)
-                face = opening_and_weight(types, given, gaps, open_border, axis, c[0], c[1], c[2])
-                reached = wp.max(reached, face[1])
+                pair = opening_and_weight(types, given, gaps, open_border, axis, c[0], c[1], c[2])
+                reached = wp.max(reached, pair[1])
         unknown[i, j, k] = wp.where(fluid and reached > 0.0, wp.uint8(1), wp.uint8(0))
-
-
-@wp.kernel
-def surface_gaps(distance: wp.array3d(dtype=float), types: wp.array3d(dtype=wp.uint8), smallest: float, gaps: Faces):
-    """Cells from the centre of a FLUID cell to the surface on the way to an EMPTY one (`free_surface.surface_gaps`)."""
-    i, j, k = wp.tid()
-    cells = shape_of(types)
-    for axis in range(3):
-        if is_face(cells, axis, i, j, k):
-            gap = float(1.0)
-            c = beyond(axis, i, j, k, -1)
-            low = type_at(types, c[0], c[1], c[2])
-            high = type_at(types, i, j, k)
-            if (low == FLUID and high == EMPTY) or (low == EMPTY and high == FLUID):
-                before = distance[c[0], c[1], c[2]]
-                wet = wp.where(low == FLUID, before, distance[i, j, k])
-                dry = wp.where(low == FLUID, distance[i, j, k], before)
-                if dry > 0.0:
-                    gap = wp.clamp(wet / (wet - dry), smallest, 1.0)
-            set_face(gaps, axis, i, j, k, gap)
 
 
 @wp.func
@@ -214,15 +141,15 @@ def right_side(
         for axis in range(3):
             low = beyond(axis, i, j, k, -1)
             high = beyond(axis, i, j, k, 1)
-            flux = wp.float64(face_at(velocity, axis, high[0], high[1], high[2]))
-            total -= flux * wp.float64(face_at(openings, axis, high[0], high[1], high[2]))
-            flux = wp.float64(face_at(velocity, axis, i, j, k))
-            total += flux * wp.float64(face_at(openings, axis, i, j, k))
+            flux = wp.float64(face(velocity, axis, high[0], high[1], high[2]))
+            total -= flux * wp.float64(face(openings, axis, high[0], high[1], high[2]))
+            flux = wp.float64(face(velocity, axis, i, j, k))
+            total += flux * wp.float64(face(openings, axis, i, j, k))
             if known.shape[0] > 0:
                 q = wp.float64(known_at(unknown, known, low[0], low[1], low[2]))
-                pull += q * wp.float64(face_at(weights, axis, i, j, k))
+                pull += q * wp.float64(face(weights, axis, i, j, k))
                 q = wp.float64(known_at(unknown, known, high[0], high[1], high[2]))
-                pull += q * wp.float64(face_at(weights, axis, high[0], high[1], high[2]))
+                pull += q * wp.float64(face(weights, axis, high[0], high[1], high[2]))
         total = total / spacing + pull / (spacing * spacing)
     rhs[i, j, k] = float(total)
 
@@ -254,15 +181,15 @@ def subtract_gradient(
     for axis in range(3):
         if is_face(cells, axis, i, j, k):
             value = float(0.0)
-            opening = face_at(openings, axis, i, j, k)
+            opening = face(openings, axis, i, j, k)
             if opening > 0.0:
-                value = face_at(velocity, axis, i, j, k)
-                weight = face_at(weights, axis, i, j, k)
+                value = face(velocity, axis, i, j, k)
+                weight = face(weights, axis, i, j, k)
                 if weight > 0.0:
                     c = beyond(axis, i, j, k, -1)
                     change = full_q(unknown, q, known, i, j, k) - full_q(unknown, q, known, c[0], c[1], c[2])
                     value -= change / spacing * (weight / opening)
-            set_face(out, axis, i, j, k, value)
+            put(out, axis, i, j, k, value)
 
 
 @wp.kernel

@@ -10,7 +10,7 @@ at rest."""
 # Warp reads the annotations of kernels: they must not become strings
 import warp as wp
 
-from fluidlift.backends.warp_pressure_kernels import FaceMarks, Faces, face_at, is_face, set_face
+from fluidlift.backends.warp_faces import Faces, Marks, face, is_face, put
 from fluidlift.backends.warp_stress_kernels import RING, Search, Stress, axis_step, is_within, node_count
 
 wp.set_module_options({"enable_backward": False})  # no gradients: halves the compile time
@@ -32,9 +32,9 @@ LEAST_SLOPE = wp.constant(wp.float64(1e-3))
 class Given:
     """What a viscous step begins with."""
 
-    solved: FaceMarks
-    fixed: FaceMarks
-    walls: FaceMarks
+    solved: Marks
+    fixed: Marks
+    walls: Marks
     liquid: wp.array3d(dtype=float)
     """[nx,ny,nz], m, distance from the surface at cell centres, negative inside"""
     solid: wp.array3d(dtype=float)
@@ -80,7 +80,7 @@ def is_grid_face(cells: wp.vec3i, axis: int, c: wp.vec3i):
 
 
 @wp.func
-def mark_at(marks: FaceMarks, axis: int, c: wp.vec3i):
+def mark_at(marks: Marks, axis: int, c: wp.vec3i):
     if axis == 0:
         return marks.x[c[0], c[1], c[2]] != wp.uint8(0)
     if axis == 1:
@@ -332,7 +332,7 @@ def weigh_faces(
         x = wp.float64(0.0)
         momentum = wp.float64(0.0)
         if role != AIR and is_grid_face(cells, a, c) and parts.buried[o] == wp.uint8(0):
-            x = wp.float64(face_at(velocity, a, c[0], c[1], c[2]))
+            x = wp.float64(face(velocity, a, c[0], c[1], c[2]))
         if role == SOLVED:
             b = (a + 1) % 3
             d = (a + 2) % 3
@@ -382,7 +382,7 @@ def new_velocity(velocity: Faces, stress: Stress, parts: Parts, search: Search, 
     o = a * node_count(nodes) + n
     if stress.mass[o] > 0.0 or parts.buried[o] != wp.uint8(0):
         return float(search.x[o])
-    return face_at(velocity, a, c[0], c[1], c[2])
+    return face(velocity, a, c[0], c[1], c[2])
 
 
 @wp.kernel
@@ -398,9 +398,9 @@ def carry_out(given: Given, velocity: Faces, stress: Stress, parts: Parts, searc
                 inner = c - unit(a)
             if mark_at(given.solved, a, c) and mark_at(given.solved, a, inner):
                 new = new_velocity(velocity, stress, parts, search, a, inner)
-                old = face_at(velocity, a, inner[0], inner[1], inner[2])
-                value = new + left * (face_at(velocity, a, c[0], c[1], c[2]) - old)
-                set_face(velocity, a, c[0], c[1], c[2], value)
+                old = face(velocity, a, inner[0], inner[1], inner[2])
+                value = new + left * (face(velocity, a, c[0], c[1], c[2]) - old)
+                put(velocity, a, c[0], c[1], c[2], value)
 
 
 @wp.kernel
@@ -411,4 +411,4 @@ def store(velocity: Faces, stress: Stress, parts: Parts, search: Search):
     c = node_of(stress.nodes, n)
     for a in range(3):
         if is_grid_face(cells, a, c):
-            set_face(velocity, a, c[0], c[1], c[2], new_velocity(velocity, stress, parts, search, a, c))
+            put(velocity, a, c[0], c[1], c[2], new_velocity(velocity, stress, parts, search, a, c))

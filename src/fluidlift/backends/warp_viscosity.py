@@ -116,9 +116,9 @@ class WarpViscosity:
         return SolveReport(residual <= tolerance * 1.01, self._expected, residual, "viscosity")
 
     def _faces(self, faces: Faces) -> Any:
-        from fluidlift.backends import warp_pressure_kernels as kernels
+        from fluidlift.backends import warp_faces
 
-        out = kernels.Faces()
+        out = warp_faces.Faces()
         out.x, out.y, out.z = self._checked(faces)
         return out
 
@@ -130,14 +130,14 @@ class WarpViscosity:
     def _given(
         self, roles: tuple[Faces, Faces, Faces], liquid: warp.array, solid: warp.array, wall_share: float
     ) -> Any:
-        from fluidlift.backends import warp_pressure_kernels, warp_stress_assembly
+        from fluidlift.backends import warp_faces, warp_stress_assembly
 
         nodes = tuple(n + 1 for n in self.shape)
         require(liquid.shape == self.shape, f"a liquid distance {liquid.shape}", str(self.shape))
         require(solid.shape == nodes, f"a solid distance {solid.shape}", str(nodes))
         given = warp_stress_assembly.Given()
         for name, faces in zip(("solved", "fixed", "walls"), roles):
-            marks = warp_pressure_kernels.FaceMarks()
+            marks = warp_faces.Marks()
             marks.x, marks.y, marks.z = self._checked(faces)
             setattr(given, name, marks)
         given.liquid, given.solid, given.spacing, given.wall_share = liquid, solid, self.spacing, wall_share

@@ -1,10 +1,13 @@
 """Tracers float with the surface and cover it evenly."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
 from fluidlift.look.fluid_normals import fluid_depths, fluid_normals, fluid_surface
+from fluidlift.look.rasterize import render
 from fluidlift.look.surface_map import SurfaceMap
 from fluidlift.look.surface_skin import (
     BARE,
@@ -18,7 +21,7 @@ from fluidlift.look.surface_skin import (
     painted_liquid,
     without_skin,
 )
-from fluidlift.types import Gaussians, concatenate
+from fluidlift.types import Gaussians, PinholeCamera, RigidTransform, concatenate
 
 CELL = 0.1
 SPACING = PITCH * CELL
@@ -77,6 +80,20 @@ def test_splats_lie_flat_on_a_slope_in_the_colours_given():
     normal = np.array([-0.5, 0, 1]) / np.sqrt(1.25)
     assert np.abs(thin @ normal).min() > np.cos(np.radians(3))
     np.testing.assert_allclose(g.means[inner, 2], 0.5 + 0.5 * g.means[inner, 0], atol=0.1 * CELL)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.7, 3.0])
+def test_a_skin_has_no_cracks_on_a_slope_and_is_known_there(tilt):
+    """Looked at from above, where its tracers are as far apart as on a level surface."""
+    where = surface(tilt=tilt)
+    skin = advanced(where, 2)
+    splats = skin.splats(where, np.full((len(skin), 3), 0.5))
+    down = RigidTransform(np.diag([1.0, -1.0, -1.0]), np.array([-1.0, 1.0, 50.0]))
+    camera = PinholeCamera((6000.0, 6000.0), (20.0, 20.0), (40, 40), down)
+    alpha = render(splats, camera).alpha[5:-5, 5:-5]
+    assert alpha.mean() > 0.93  # 0.95 where it is level
+    assert of_skin(splats, CELL).all()
+    assert not of_skin(replace(splats, scales=splats.scales * np.float32([1.0, 1.0, 1.01])), CELL).any()
 
 
 def test_what_has_run_dry_has_no_skin():

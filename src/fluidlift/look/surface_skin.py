@@ -38,6 +38,9 @@ without any thickness, to 10 %; three times as thick, a weir's finest band lost 
 OPACITY = 0.98
 """of each. Seen from straight above they let 2 % of what is below through (0.9: 4 %), at the same sharpness"""
 
+STEEPEST = 4.0
+"""by how much a splat is drawn out along a slope at most: one of 76 degrees"""
+
 ALIKE = 1e-3
 """by how much a splat's size may differ from the skin's: files hold logarithms in single precision"""
 UNDER = 1.5
@@ -62,7 +65,9 @@ def of_skin(gaussians: Gaussians, cell: float) -> Bool[np.ndarray, " n"]:
     for level in range(FINEST + 1):
         size = wanted * finer(level)
         like = np.flatnonzero(np.abs(least - size[0]) < ALIKE * size[0])
-        found[like] |= (np.abs(np.sort(gaussians.scales[like], axis=1) / size - 1.0) < ALIKE).all(axis=1)
+        apart = np.sort(gaussians.scales[like], axis=1) / size - 1.0
+        drawn_out = (apart[:, 2] > -ALIKE) & (apart[:, 2] < STEEPEST - 1.0 + ALIKE)
+        found[like] |= (np.abs(apart[:, :2]) < ALIKE).all(axis=1) & drawn_out
     return found | (kinds_of(gaussians, cell) >= 0)
 
 
@@ -212,11 +217,16 @@ class SurfaceSkin:
         slope = np.stack([*np.gradient(smooth, surface.pitch)], axis=-1)
         normal = np.concatenate([-surface.at(slope, self.places), np.ones((n, 1))], axis=1)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        # the shortest turn from z to the normal
-        quats = np.stack([1 + normal[:, 2], -normal[:, 1], normal[:, 0], np.zeros(n)], axis=-1)
+        # x along the steepest way, then the shortest turn from z to the normal
+        half = 0.5 * np.arctan2(-normal[:, 1], -normal[:, 0])
+        c, s, up = np.cos(half), np.sin(half), 1 + normal[:, 2]
+        x, y = normal[:, 0] * s - normal[:, 1] * c, normal[:, 0] * c + normal[:, 1] * s
+        quats = np.stack([up * c, x, y, up * s], axis=-1)
         quats /= np.linalg.norm(quats, axis=1, keepdims=True)
-        sizes = self._cell * np.array([WIDTH * PITCH, WIDTH * PITCH, THICKNESS])
-        scales = (finer(self.levels)[:, None] * sizes).astype(np.float32)
+        scales = finer(self.levels)[:, None] * self._cell * np.array([WIDTH * PITCH, WIDTH * PITCH, THICKNESS])
+        # tracers are as far apart on the map wherever they are: on a slope, farther in space
+        scales[:, 0] *= np.minimum(1.0 / normal[:, 2], STEEPEST)
+        scales = scales.astype(np.float32)
         return Gaussians(
             self.points(surface).astype(np.float32), quats.astype(np.float32), scales,
             np.full(n, OPACITY, np.float32), sh_from_rgb(np.clip(colors, 0.0, 1.0)),

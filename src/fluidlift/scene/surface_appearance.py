@@ -61,7 +61,8 @@ FAINT = 0.002
 """least opacity of a splat under the skin: not drawn, but there for other tools"""
 
 TINTED = 1.5
-"""cells about the surface within which particles wear the skin's colours"""
+"""cells about the surface within which particles wear the skin's colours; before a surface that is a map over the
+picture, all do"""
 
 CLEAR = 0.1
 """cells from the ground within which the skin is left out"""
@@ -365,6 +366,7 @@ class SurfaceAppearance:
         inside: Inside | None,
     ) -> Dressed:
         from fluidlift.look.smoothstep import smoothstep
+        from fluidlift.look.surface_axes import PictureAxes
         from fluidlift.look.surface_skin import dyed
 
         skin, axes, places = self._skin, self._axes, self._axes.points(particles.positions)
@@ -383,7 +385,9 @@ class SurfaceAppearance:
         scales = np.minimum(shown.scales, room[:, None]).astype(np.float32)
         opacities = np.minimum(shown.opacities, np.maximum(shown.opacities * (1 - covered), FAINT)).astype(np.float32)
         sh, own = shown.sh.copy(), self._own_colors(particles.source)
-        near = np.flatnonzero((np.abs(above) < TINTED) & (covered < 1) & ~own)
+        # on a map over the picture, spray before the surface is seen where its place on the map is
+        deepest = np.inf if isinstance(axes, PictureAxes) else TINTED
+        near = np.flatnonzero((above > -TINTED) & (above < deepest) & (covered < 1) & ~own)
         color, there = patches.colors(places[near])
         sh[near[there], :1] = sh_from_rgb(color[there])
         points = skin.points(surface)

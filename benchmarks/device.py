@@ -99,6 +99,14 @@ def shown(device: str, count: int = 500_000) -> Figures:
 
 def rollout(device: str, sizes: tuple[int, ...] = (32, 64, 96)) -> Figures:
     """Seconds of the gradient of ten steps, and how far the gradients are apart."""
+    found: Figures = {}
+    for n in sizes:
+        found |= rollout_of(n, device)
+    return found
+
+
+def rollout_of(n: int, device: str) -> Figures:
+    """`rollout` on n^3 cells."""
     import torch
     from rollout_gradient import SHAPES, box_with_pillar, distance
 
@@ -108,27 +116,27 @@ def rollout(device: str, sizes: tuple[int, ...] = (32, 64, 96)) -> Figures:
     from fluidlift.physics.rollout_torch_domain import TorchDomain
     from fluidlift.types import FaceVelocity, Grid
 
-    found: Figures = {}
-    for n in sizes:
-        domain, physical = box_with_pillar(n, "float32")
-        start = FaceVelocity.zeros(Grid((n, n, n), 1.0 / n))
-        start.u[:] = 1.0
-        flat, options, placed = flatten(start, torch.float32), RolloutOptions(), TorchDomain.of(domain, device)
-        gradients: dict[str, list[float]] = {}
+    domain, physical = box_with_pillar(n, "float32")
+    start = FaceVelocity.zeros(Grid((n, n, n), 1.0 / n))
+    start.u[:] = 1.0
+    flat, options, placed = flatten(start, torch.float32), RolloutOptions(), TorchDomain.of(domain, device)
+    gradients: dict[str, list[float]] = {}
 
-        def run(where: str) -> None:
-            parameters = RolloutParameters.of(physical, torch.float32)  # noqa: B023 called within the turn
-            leaves = [getattr(parameters, name).requires_grad_() for name in SHAPES]
-            if where == "cpu":
-                end = rollout(flat, domain, parameters, steps=10, options=options)  # noqa: B023
-            else:
-                end = rollout_on_device(flat, placed, parameters, steps=10, options=options, device=device)  # noqa: B023
-            (end.velocity**2).mean().backward()
-            gradients[where] = [float(x) for leaf in leaves for x in leaf.grad.reshape(-1)]  # noqa: B023
+    def on_host() -> None:
+        run("cpu", lambda parameters: rollout(flat, domain, parameters, steps=10, options=options))
 
-        for where, name in (("cpu", "cpu"), ("device", device)):
-            found[f"{n}^3, {name} ({where}): s"] = median(lambda: run(where), 3)  # noqa: B023
-        found[f"{n}^3: gradients apart, relative"] = distance(gradients["device"], gradients["cpu"])
+    def on_device() -> None:
+        given = {"steps": 10, "options": options, "device": device}
+        run("device", lambda parameters: rollout_on_device(flat, placed, parameters, **given))
+
+    def run(where: str, roll: Callable[[Any], Any]) -> None:
+        parameters = RolloutParameters.of(physical, torch.float32)
+        leaves = [getattr(parameters, name).requires_grad_() for name in SHAPES]
+        (roll(parameters).velocity ** 2).mean().backward()
+        gradients[where] = [float(x) for leaf in leaves for x in leaf.grad.reshape(-1)]
+
+    found: Figures = {f"{n}^3, CPU: s": median(on_host, 3), f"{n}^3, torch on {device}: s": median(on_device, 3)}
+    found[f"{n}^3: gradients apart, relative"] = distance(gradients["device"], gradients["cpu"])
     return found
 
 

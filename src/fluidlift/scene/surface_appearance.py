@@ -191,6 +191,7 @@ class SurfaceAppearance:
         from fluidlift.look.filmed_outline import FilmedOutline
         from fluidlift.look.picture_texture import PictureTexture
         from fluidlift.look.surface_axes import PictureAxes, PlanAxes
+        from fluidlift.look.surface_skin import SurfaceSkin
         from fluidlift.look.texture_patches import TexturePatches
 
         scene, own = self._scene, self._own
@@ -224,13 +225,12 @@ class SurfaceAppearance:
         if footage is not None and kind_of(scene.kind).lies_on_ground and not scene.edited:
             self._outline = FilmedOutline(self._camera, footage.outside, self._cell)
         self._plays = footage is not None
-        self._begin_again()
         if self._plays:
-            self._surface = surface
-            self._skin.advance(surface, 0.0, np.random.default_rng(scene.seed))
-            bare = self._skin.splats(surface, np.zeros((len(self._skin), 3)))
+            self._surface, skin = surface, SurfaceSkin(self._cell, self._level_at)
+            skin.advance(surface, 0.0, np.random.default_rng(scene.seed))
+            bare = skin.splats(surface, np.zeros((len(skin), 3)))
             texture.shift = apparent_shift(self._axes.world_splats(bare), self._camera)
-            self._begin_again()
+        self._begin_again()
 
     def _film_of(self, own: Gaussians) -> FluidFootage | None:
         """The film that the surface plays, whose size the camera has from here on; one that cannot be is a warning."""

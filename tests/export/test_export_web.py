@@ -20,6 +20,7 @@ from fluidlift.io.spz import read_spz
 from fluidlift.io.views import read_view
 from fluidlift.look.rasterize import render
 from fluidlift.messages import code_of
+from fluidlift.present.looping import FAINTEST
 from fluidlift.types import Gaussians, PinholeCamera
 
 WELL = (DONE, WITH_WARNINGS)
@@ -96,6 +97,17 @@ def test_a_page_that_grows_too_large_leaves_out_frames_then_splats_and_says_so(m
     assert "page-splats-thinned" in map(code_of, small.warnings)
     text = (tmp_path / "b.html").read_text(encoding="utf-8")
     assert small.warnings[0] in text  # who opens it is told as well
+
+
+def test_the_limit_of_a_page_counts_the_splats_that_it_draws(made, tmp_path, monkeypatch):
+    drawn = [int((frame(made, n).gaussians.opacities >= FAINTEST).sum()) for n in (1001, 1002)]
+    assert drawn[0] < len(frame(made, 1001).gaussians)
+    monkeypatch.setattr(page, "MOST_SPLATS", drawn[0])
+    told = export_asset(made.folder, tmp_path / "a.html", ExportRequest("html", frames=(1001, 1002)))
+    assert told.warnings == ()
+    monkeypatch.setattr(page, "MOST_SPLATS", drawn[0] // 2)
+    told = export_asset(made.folder, tmp_path / "b.html", ExportRequest("html", frames=(1001, 1002)))
+    assert [code_of(w) for w in told.warnings] == ["page-splats-thinned"]
 
 
 def test_thinning_keeps_the_same_splats_in_every_frame_and_the_room_they_fill():

@@ -55,18 +55,17 @@ def write_page_of(job: ExportJob) -> Outcome:
     from fluidlift.look.scenery import LIGHT
     from fluidlift.look.vessel import glass_of
 
-    first, ids, _ = next(frames_of(job.folder, job.picked[:1]))
+    first, ids = next(_drawn(job, job.picked[:1]))
     plan = _plan(job, len(first))
     picked = job.picked[:: plan.every]
     bodies, missing = bodies_of(job.folder, picked)
     warnings = [*_warnings(plan, len(first), job, len(picked)), *missing]
 
     def frames(told: bool) -> Iterator[tuple[Gaussians, np.ndarray]]:
-        for done, (g, number, _) in enumerate(frames_of(job.folder, picked)):
+        for done, (g, number) in enumerate(_drawn(job, picked)):
             if told:
                 job.progress.update(done, len(picked))
-            drawn = g.opacities >= FAINTEST
-            yield thinned(_seen(g.select(drawn), job.asset.camera), number[drawn], plan.share)
+            yield thinned(_seen(g, job.asset.camera), number, plan.share)
 
     held = _range_of(g for g, _ in frames(False))
     shown = thinned(first, ids, plan.share)[0]
@@ -82,6 +81,13 @@ def write_page_of(job: ExportJob) -> Outcome:
     words = (f"{path.name}: {size / 1e6:.1f} MB, {held.slots} splats at most, {len(picked)} frames; opens in any "
              "browser, without a network",)  # fmt: skip
     return Outcome(words, tuple(warnings), {"bytes": size, "frames": len(picked), "file": str(path)})
+
+
+def _drawn(job: ExportJob, picked: range) -> Iterator[tuple[Gaussians, np.ndarray]]:
+    """The splats of each frame that can be seen at all, with their ids: what the page draws, so what its limits count."""
+    for g, ids, _ in frames_of(job.folder, picked):
+        seen = g.opacities >= FAINTEST
+        yield g.select(seen), ids[seen]
 
 
 def thinned(gaussians: Gaussians, ids: np.ndarray, share: float) -> tuple[Gaussians, np.ndarray]:
@@ -119,7 +125,7 @@ def _plan(job: ExportJob, splats: int) -> Plan:
     from fluidlift.io.page_frames import FrameEncoder
 
     share = min(1.0, MOST_SPLATS / max(splats, 1))
-    sample = [thinned(g, i, share) for g, i, _ in frames_of(job.folder, job.picked[:SAMPLED])]
+    sample = [thinned(g, i, share) for g, i in _drawn(job, job.picked[:SAMPLED])]
     encoder = FrameEncoder(_range_of(g for g, _ in sample))
     sizes = [BASE64 * len(encoder.encode(*s)) for s in sample]
     excess = (sizes[0] + sizes[-1] * (len(job.picked) - 1)) / MOST_BYTES

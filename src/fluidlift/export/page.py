@@ -84,7 +84,7 @@ def write_page_of(job: ExportJob) -> Outcome:
 
 
 def _drawn(job: ExportJob, picked: range) -> Iterator[tuple[Gaussians, np.ndarray]]:
-    """The splats of each frame that can be seen at all, with their ids: what the page draws, so what its limits count."""
+    """The splats of each frame that can be seen, with their ids: those that the page draws and its limits count."""
     for g, ids, _ in frames_of(job.folder, picked):
         seen = g.opacities >= FAINTEST
         yield g.select(seen), ids[seen]

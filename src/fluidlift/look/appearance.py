@@ -91,7 +91,8 @@ class SteadyShading:
 
 def _saturation(color: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
     """0 for grey, 1 for pure colours."""
-    return 1.0 - color.min(axis=1) / np.maximum(color.max(axis=1), 1e-6)
+    r, g, b = color.T
+    return 1.0 - np.minimum(np.minimum(r, g), b) / np.maximum(np.maximum(np.maximum(r, g), b), 1e-6)
 
 
 def _base(frames: np.ndarray, fluid: np.ndarray, mask: np.ndarray) -> Float[np.ndarray, "h w 3"]:

@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 from fluidlift.errors import require
-from fluidlift.numerics.nearest import nearest
+from fluidlift.numerics.nearest import nearest_of_crowd
+from fluidlift.numerics.sharing import shared
 from fluidlift.types.gaussians import Gaussians
 
 RESOLVED = (2.0, 3.0)
@@ -22,6 +23,10 @@ NEIGHBOURS = 12
 
 SIXTH = 7
 """place in the list of the nearest of the neighbour that says whether a splat stands alone; the first is itself"""
+
+CROWD = 2.4
+"""widths of a splat of the inside within which it has `NEIGHBOURS` neighbours, as a rule: of the particles of a stream,
+eight to a cell and 0.42 cells wide, 99.5 in 100 do, and the search is fastest"""
 
 APART = (3.0, 4.0)
 """distance to the sixth neighbour, in largest standard deviations, from which a splat is taken to stand alone: a sheet
@@ -63,20 +68,36 @@ def mixed(shown: Gaussians, deformation: Float[np.ndarray, "n 3 3"], *, widest: 
         return shown
     around = np.flatnonzero(sound)
     points, share, sh, grown = shown.means[around], share[at], shown.sh.copy(), shown.scales.copy()
+    reach = CROWD * widest
     blended, sixth = np.flatnonzero(share > 0), np.empty(len(at))
     if len(blended):
-        distance, near = nearest(points, shown.means[at[blended]], NEIGHBOURS + 1, workers=-1)
-        weight = (1 - (distance / np.maximum(distance[:, -1:], 1e-12)) ** 2) ** 2 + 1e-9
-        weight /= weight.sum(axis=1, keepdims=True)
-        one, colours = at[blended], shown.sh[:, 0]
-        mean = np.einsum("nk,nkc->nc", weight, colours[around[near]])
-        sh[one, 0] += share[blended, None] * (mean - colours[one])
+        distance, near = nearest_of_crowd(points, shown.means[at[blended]], NEIGHBOURS + 1, reach)
+        one, mean = at[blended], np.empty((len(blended), 3), np.float64)
+        _mean_around(distance, around[near], shown.sh[:, 0], mean)
+        sh[one, 0] += share[blended, None] * (mean - shown.sh[one, 0])
         sixth[blended] = distance[:, SIXTH - 1]
     kept = np.flatnonzero(share <= 0)
     if len(kept):  # they may grow and keep their colour: one distance is enough
-        sixth[kept] = nearest(points, shown.means[at[kept]], np.array([SIXTH]), workers=-1)[0][:, 0]
+        sixth[kept] = nearest_of_crowd(points, shown.means[at[kept]], SIXTH, reach)[0][:, -1]
     gap = sixth / np.maximum(size[at], 1e-12)
     alone = np.clip((gap - APART[0]) / (APART[1] - APART[0]), 0.0, 1.0)
     least = np.maximum(share, alone) * np.minimum(0.5 * sixth, widest)
     grown[at] = np.maximum(shown.scales[at], least[:, None])
     return Gaussians(shown.means, shown.quats, grown, shown.opacities, sh)
+
+
+@shared(lambda distance, *_: (0, len(distance)))
+def _mean_around(begin, end, distance, near, colors, mean):
+    """Means of the colours of neighbours, the nearest first, with weights that are zero at the last."""
+    for p in range(begin, end):
+        last = max(distance[p, -1], 1e-12)
+        total = red = green = blue = 0.0
+        for k in range(distance.shape[1]):
+            away = distance[p, k] / last
+            weight = (1.0 - away * away) ** 2 + 1e-9
+            c = near[p, k]
+            total += weight
+            red += weight * colors[c, 0]
+            green += weight * colors[c, 1]
+            blue += weight * colors[c, 2]
+        mean[p, 0], mean[p, 1], mean[p, 2] = red / total, green / total, blue / total

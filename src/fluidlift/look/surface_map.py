@@ -91,13 +91,12 @@ def sampled(
     field: Float[np.ndarray, "nx ny ..."] | Int[np.ndarray, "nx ny ..."], index: Float[np.ndarray, "n 2"]
 ) -> np.ndarray:
     """Bilinear, at fractional indices; the nearest value outside."""
-    if field.ndim == 3 and field.dtype == np.float32 and field.flags.c_contiguous:
-        out = np.empty((len(index), field.shape[-1]), np.float32)
-        sampled_kernel(field, np.ascontiguousarray(index, np.float64), out)
-        return out
-    if field.ndim == 2:
+    if field.dtype not in (np.float32, np.float64):
         return ndimage.map_coordinates(field, index.T, order=1, mode="nearest")
-    return np.stack([sampled(field[..., k], index) for k in range(field.shape[-1])], axis=-1)
+    channels = field[..., None] if field.ndim == 2 else field
+    out = np.empty((len(index), channels.shape[-1]), field.dtype)
+    sampled_kernel(np.ascontiguousarray(channels), np.ascontiguousarray(index, np.float64), out)
+    return out[:, 0] if field.ndim == 2 else out
 
 
 @shared(lambda field, index, out: (0, len(index)))

@@ -193,7 +193,8 @@ class SurfaceSkin:
         lattice = lattice[surface.presence(lattice) > 0.5]
         lattice = lattice[self._levels(lattice) == level]
         if len(own) and len(lattice):
-            lattice = lattice[cKDTree(self.places[own]).query(lattice)[0] > BARE * spacing]
+            taken = nearest(self.places[own], lattice, within=BARE * spacing, workers=-1)[0]
+            lattice = lattice[np.isinf(taken)]
         fresh = lattice + rng.uniform(-0.25, 0.25, lattice.shape) * spacing
         self.places = np.concatenate([self.places, fresh])
         self.ids = np.concatenate([self.ids, self.next_id + np.arange(len(fresh))])

@@ -347,6 +347,8 @@ def _fade_of(footage: FluidFootage) -> float:
 
 def _turned(vectors: np.ndarray, angles: np.ndarray) -> np.ndarray:
     """Vectors [m,2] turned by angles [m], radians."""
+    if not angles.any():  # as all are where nothing was edited
+        return vectors
     cos, sin = np.cos(angles), np.sin(angles)
     return np.stack([cos * vectors[:, 0] - sin * vectors[:, 1], sin * vectors[:, 0] + cos * vectors[:, 1]], axis=-1)
 

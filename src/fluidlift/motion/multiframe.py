@@ -320,7 +320,8 @@ def flow_with_rest(
     gap = min(GAP, len(frames) - 1)
     start = int(np.clip(pair - (gap - 1) // 2, 0, len(frames) - 1 - gap))
     ends = log_brightness(frames[start]), log_brightness(frames[start + gap])
-    slow = flow_of_detail(ends, frames[start], estimator, gap)
+    # an error of half a pixel over the gap is an eighth per frame
+    slow = flow_of_detail(ends, frames[start], estimator.halved, gap)
     speed = (slow.displacement**2).sum(axis=-1)
     share = share / (1.0 + (speed / SLOW**2) ** 2)
     displacement = fast.displacement + share[..., None] * (slow.displacement - fast.displacement)

@@ -4,33 +4,21 @@ The weight is (1 - d^2 / reach^2)^3 (Mueller, Charypar and Gross 2003), which ne
 spline that reaches 4/3 as far. The mean is that of Shepard: the weights are divided by their sum, so that an even field
 stays even at the rim of a body, where half a kernel is empty.
 
-Particles are sorted into cells as wide as the kernel reaches; a point looks into 27 of them. The cells repeat in space,
-so that a stray particle far away costs no memory: what lies in a cell by that alone is too far to weigh.
+Particles are sorted into cells as wide as the kernel reaches; a point looks into 27 of them.
 """
 
 from __future__ import annotations
 
 import math
 
-import numba as nb
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from fluidlift.errors import require
+from fluidlift.numerics.cell_list import CellList
 from fluidlift.numerics.sharing import shared
 
 _CHUNK = 256
-CELLS_PER_PARTICLE = 4
-"""at most, of the cells that are kept"""
-
-
-@nb.njit(cache=True, nogil=True)
-def cells_kernel(points, low, reach, shape, cells):
-    for p in range(points.shape[0]):
-        number = 0
-        for axis in range(3):
-            number = number * shape[axis] + np.int64(math.floor((points[p, axis] - low[axis]) / reach)) % shape[axis]
-        cells[p] = number
 
 
 @shared(lambda points, *_: (0, -(-points.shape[0] // _CHUNK)), error_model="numpy", fastmath={"contract"})
@@ -79,15 +67,10 @@ def kernel_mean(
     """
     require(len(particles) > 0, "no particles", "one or more")
     require(np.isfinite(reach) and reach > 0, f"a reach of {reach}", "positive metres")
-    low = particles.min(axis=0).astype(np.float64)
-    shape = _cells(particles.max(axis=0) - low, reach, CELLS_PER_PARTICLE * len(particles) + 1000)
-    cells = np.empty(len(particles), np.int64)
-    cells_kernel(particles, low, reach, shape, cells)
-    order = np.argsort(cells, kind="stable")
-    starts = np.concatenate([[0], np.cumsum(np.bincount(cells, minlength=int(shape.prod())))])
+    low, reach, shape, order, starts = CellList.of(particles, reach)
     out, total = np.empty((len(points), values.shape[1]), np.float32), np.empty(len(points), np.float32)
     sorted_values = np.ascontiguousarray(values[order], np.float32)
-    mean_kernel(points, particles[order], sorted_values, starts, low, float(reach), shape, out, total)
+    mean_kernel(points, particles[order], sorted_values, starts, low, reach, shape, out, total)
     lost = np.flatnonzero(total <= 0)
     if len(lost):
         from scipy.spatial import KDTree
@@ -106,12 +89,3 @@ def kernel_mean_plain(
     squared = ((points[:, None].astype(np.float64) - particles) ** 2).sum(axis=2)
     weights = np.maximum(1.0 - squared / reach**2, 0.0) ** 3
     return (weights @ values / weights.sum(axis=1, keepdims=True)).astype(np.float32)
-
-
-def _cells(extent: Float[np.ndarray, "3"], reach: float, most: int) -> Int[np.ndarray, "3"]:
-    """Cells along each axis before they repeat: 3 or more, so that the 27 around a point differ."""
-    shape = np.clip(np.floor(extent / reach) + 1, 3, most)
-    while shape.prod() > most and shape.max() > 3:
-        longest = int(shape.argmax())
-        shape[longest] = max(3, shape[longest] // 2)
-    return shape.astype(np.int64)

@@ -170,24 +170,38 @@ def updated_deformation_plain(
     return (u * np.clip(s, 1 / max_stretch, max_stretch)[:, None, :]) @ vt
 
 
+@njit(cache=True)
+def _axes(turn, sizes, out):
+    """R S of a splat, from its quaternion (w, x, y, z) and its standard deviations."""
+    w, x, y, z = np.float64(turn[0]), np.float64(turn[1]), np.float64(turn[2]), np.float64(turn[3])
+    unit = max(w * w + x * x + y * y + z * z, 1e-24)
+    k = 2.0 / unit
+    out[0, 0], out[0, 1], out[0, 2] = 1.0 - k * (y * y + z * z), k * (x * y - w * z), k * (x * z + w * y)
+    out[1, 0], out[1, 1], out[1, 2] = k * (x * y + w * z), 1.0 - k * (x * x + z * z), k * (y * z - w * x)
+    out[2, 0], out[2, 1], out[2, 2] = k * (x * z - w * y), k * (y * z + w * x), 1.0 - k * (x * x + y * y)
+    for i in range(3):
+        for j in range(3):
+            out[i, j] *= sizes[j]
+
+
 @shared(lambda f, *_: (0, len(f)))
-def _deform(begin, end, f, rest, quats, scales, max_ratio, max_size):
+def _deform(begin, end, f, source, turns, sizes, quats, scales, max_ratio, max_size):
+    """Axes and standard deviations of F A0 F^T = (F R S) (F R S)^T."""
+    m, a, v, own = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     for p in range(begin, end):
-        m, a, v = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+        _axes(turns[source[p]], sizes[source[p]], own)
+        for i in range(3):
+            for j in range(3):
+                m[i, j] = np.float64(f[p, i, 0]) * own[0, j] + f[p, i, 1] * own[1, j] + f[p, i, 2] * own[2, j]
         finite = True
         for i in range(3):
             for j in range(3):
-                m[i, j] = (
-                    np.float64(f[p, i, 0]) * rest[p, 0, j] + f[p, i, 1] * rest[p, 1, j] + f[p, i, 2] * rest[p, 2, j]
-                )
-        for i in range(3):
-            for j in range(3):
-                a[i, j] = m[i, 0] * f[p, j, 0] + m[i, 1] * f[p, j, 1] + m[i, 2] * f[p, j, 2]
+                a[i, j] = m[i, 0] * m[j, 0] + m[i, 1] * m[j, 1] + m[i, 2] * m[j, 2]
                 finite = finite and np.isfinite(a[i, j])
         if not finite:
             for i in range(3):
                 for j in range(3):
-                    a[i, j] = rest[p, i, j]
+                    a[i, j] = own[i, 0] * own[j, 0] + own[i, 1] * own[j, 1] + own[i, 2] * own[j, 2]
         _eigen(a, v)
         volume = 1.0
         for e in range(3):
@@ -269,7 +283,7 @@ def deform_gaussians(
     require(in_range, "a particle whose source is no rest Gaussian", f"0 to {len(rest) - 1}")
     quats, scales = np.zeros((n, 4), np.float32), np.zeros((n, 3), np.float32)
     if n:
-        covariances = rest.covariances().astype(np.float32)[source]
         deformation = np.ascontiguousarray(particles.deformation, np.float32)
-        _deform(deformation, covariances, quats, scales, float(max_stretch), float(max_size))
+        turns, sizes = (np.ascontiguousarray(a, np.float32) for a in (rest.quats, rest.scales))
+        _deform(deformation, source, turns, sizes, quats, scales, float(max_stretch), float(max_size))
     return Gaussians(particles.positions, quats, scales, rest.opacities[source], rest.sh[source])

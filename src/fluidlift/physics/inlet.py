@@ -250,6 +250,7 @@ class Inlet:
             touched &= opening > 0
             self._faces.append(np.argwhere(touched))
             self._face_points.append(grid.faces(axis)[touched])
+        self._face_means = [self._mean(points) for points in self._face_points]
 
     @property
     def steady(self) -> SteadyInflow | None:
@@ -311,11 +312,18 @@ class Inlet:
     def velocity(self, points: Float[np.ndarray, "n 3"], time: float) -> Float[np.ndarray, "n 3"]:
         """Prescribed velocity of INFLOW cells, m/s: the profile, scaled and shifted so that its mean over them is the
         bulk velocity, plus the fluctuation; all of it times the schedule's factor."""
+        return self._varied(self._mean(points), points, time)
+
+    def _mean(self, points: np.ndarray) -> np.ndarray:
+        """Velocity [n,3] without the fluctuation and the schedule, m/s."""
         out = np.broadcast_to(self._offset, (len(points), 3)).copy()
         if self._profile is not None and self._gain > 0:
             out += self._gain * sample_faces(self._profile, self._walls.grid, points)
-        if self._amplitude > 0:
-            out += self._amplitude * self._fluctuation(points, time)
+        return out
+
+    def _varied(self, mean: np.ndarray, points: np.ndarray, time: float) -> np.ndarray:
+        """`_mean` of the points at a time (s), with what changes."""
+        out = mean + self._amplitude * self._fluctuation(points, time) if self._amplitude > 0 else mean
         return out * self.supply.schedule.factor(time)
 
     def impose(self, velocity: FaceVelocity, time: float, first: tuple[int, int, int] = (0, 0, 0)) -> FaceVelocity:
@@ -325,7 +333,8 @@ class Inlet:
         out = [component.copy() for component in velocity.components]
         if self._steady:
             for axis, new in enumerate(out):
-                new[tuple((self._faces[axis] - first).T)] = self.velocity(self._face_points[axis], time)[:, axis]
+                found = self._varied(self._face_means[axis], self._face_points[axis], time)
+                new[tuple((self._faces[axis] - first).T)] = found[:, axis]
         for e in self.running:
             e.impose(out, first)
         return FaceVelocity(*out)
@@ -345,14 +354,22 @@ class Inlet:
     def inside(self, positions: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
         """Particles in INFLOW cells."""
         grid = self._walls.grid
-        low, high = (grid.low + c * grid.spacing for c in (self._low, self._high))
-        out = np.ones(len(positions), bool)
-        for axis in range(3):
-            out &= (positions[:, axis] >= low[axis]) & (positions[:, axis] <= high[axis])
-        near = np.flatnonzero(out)
+        out, near = np.zeros(len(positions), bool), self._around(positions, 0.0)
         cells = np.clip(grid.cell_of(positions[near]), 0, np.asarray(grid.shape) - 1)
         out[near] = self._cells[tuple(cells.T)]
         return out
+
+    def _around(self, positions: Float[np.ndarray, "n 3"], margin: float) -> Int[np.ndarray, " k"]:
+        """Numbers of the particles in the box of the INFLOW cells, and up to a margin (m) beside it.
+
+        Most are out of it along its shortest side, so that is looked at first.
+        """
+        grid, found = self._walls.grid, np.arange(len(positions))
+        low, high = grid.low + self._low * grid.spacing - margin, grid.low + self._high * grid.spacing + margin
+        for axis in np.argsort(self._high - self._low, kind="stable"):
+            along = positions[found, axis] if len(found) < len(positions) else positions[:, axis]
+            found = found[(along >= low[axis]) & (along <= high[axis])]
+        return found
 
     def holds(self, positions: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
         """Whether a particle may be put there: in INFLOW cells, clear of walls."""
@@ -406,9 +423,7 @@ class Inlet:
         candidates = candidates[self.inside(candidates)]
         clear = own.clear
         candidates = candidates[sample_nodes(self._walls.signed_distance, grid, candidates) > clear]
-        margin = 2 * grid.spacing
-        box_low, box_high = grid.low + self._low * grid.spacing - margin, grid.low + self._high * grid.spacing + margin
-        near = positions[((positions > box_low) & (positions < box_high)).all(axis=1)]
+        near = positions[self._around(positions, 2 * grid.spacing)]
         if len(near) and len(candidates):
             distance, _ = cKDTree(near).query(candidates, distance_upper_bound=own.reach)
             candidates = candidates[~np.isfinite(distance)]

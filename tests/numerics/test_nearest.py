@@ -1,0 +1,32 @@
+"""Neighbours that are looked for in cells are those of a search among all."""
+
+import numpy as np
+import pytest
+
+from fluidlift.numerics.nearest import nearest, nearest_of_crowd
+
+
+def crowd() -> np.ndarray:
+    """Eight particles to a cell of 0.1 m in a slab, a shaken lattice; two strays far away."""
+    rng = np.random.default_rng(5)
+    at = (np.stack(np.meshgrid(*map(np.arange, (24, 20, 8)), indexing="ij"), -1).reshape(-1, 3) + 0.5) * 0.05
+    at = at + rng.normal(scale=0.015, size=at.shape)
+    return np.concatenate([at, [[80.0, -3.0, 2.0], [1.0, 0.5, 3.0]]]).astype(np.float32)
+
+
+@pytest.mark.parametrize("width", [0.05, 0.1, 0.4])
+def test_the_nearest_in_cells_are_those_of_a_tree(width):
+    points = crowd()
+    places = np.concatenate([points[::3], points[-2:], np.float32([[1.1, 0.4, 0.7]])])
+    for count in (1, 7, 13):
+        distance, index = nearest_of_crowd(points, places, count, width)
+        wanted = np.reshape(nearest(points, places, count)[0], distance.shape)
+        np.testing.assert_allclose(distance, wanted, rtol=1e-5, atol=1e-6)
+        named = np.linalg.norm(points[index].astype(float) - places[:, None], axis=2)
+        np.testing.assert_allclose(named, wanted, rtol=1e-5, atol=1e-6)
+        assert all(len(set(row)) == count for row in index)
+
+
+def test_more_neighbours_than_points_are_refused():
+    with pytest.raises(ValueError, match="4 neighbours among 3 points"):
+        nearest_of_crowd(crowd()[:3], crowd()[:3], 4, 0.1)

@@ -32,12 +32,14 @@ from fluidlift.look.outlet_section import OpenEnd
 from fluidlift.look.pictures import caption
 from fluidlift.look.rasterize import render
 from fluidlift.look.scenery import orbit_camera, side_camera, terrain_surfels
+from fluidlift.look.stream_slab import Slab
 from fluidlift.look.vessel import glass_of
 from fluidlift.numerics.srgb import linear_from_srgb, srgb_from_linear
-from fluidlift.present.looks import Backdrop, Frame, Painter
+from fluidlift.present.looks import Frame, Painter
+from fluidlift.present.without_fluid import Backdrop
 from fluidlift.scene.recall import footage_of_asset
 from fluidlift.scene.splat_files import splat_frames
-from fluidlift.types import FluidAsset, Gaussians, Grid, PinholeCamera, Terrain, TriangleMesh, kind_of
+from fluidlift.types import CellType, FluidAsset, Gaussians, Grid, PinholeCamera, Terrain, TriangleMesh, kind_of
 
 BEGIN, END = "<!-- looks:begin -->", "<!-- looks:end -->"
 SPEED_BEGIN, SPEED_END = "<!-- looks-speed:begin -->", "<!-- looks-speed:end -->"
@@ -128,9 +130,12 @@ def sheet(folder: Path, out: Path) -> None:
 
 def tile(asset: FluidAsset, folder: Path, look: Look, fluid: Gaussians, velocities: np.ndarray, view: str):
     """One picture of a sheet."""
-    lying = kind_of(asset.kind).is_channel_flow
-    end = OpenEnd.of(asset.cell_types, asset.grid, asset.terrain.mainstream) if lying else None
-    painter = Painter(look, asset.terrain, folder, kind=asset.kind, end=end)
+    ends = []
+    if kind_of(asset.kind).is_channel_flow:
+        kinds = (CellType.INFLOW, CellType.OUTFLOW)
+        ends = [OpenEnd.of(asset.cell_types, asset.grid, asset.terrain.mainstream, kind=k) for k in kinds]
+    slab = Slab(tuple(end for end in ends if end is not None), asset.rest.means)
+    painter = Painter(look, asset.terrain, folder, kind=asset.kind, slab=slab)
     width = 480
     size = (width, max(2, 2 * round(width * asset.camera.size[1] / asset.camera.size[0] / 2)))
     around = np.concatenate([asset.rest.means, asset.terrain.mesh.vertices])

@@ -12,7 +12,7 @@ from fluidlift.backends.gsplat_rasterizer import GsplatRasterizer, best_rasteriz
 from fluidlift.errors import FluidliftError, MissingPackage
 from fluidlift.numerics import splatting
 from fluidlift.numerics.splatting import View
-from fluidlift.numerics.splatting_colors import view_colors
+from fluidlift.numerics.splatting_colors_torch import view_colors
 from fluidlift.numerics.splatting_torch import NumbaRasterizer
 
 

@@ -7,8 +7,10 @@ import pytest
 
 from fluidlift.io.scene_look import Look
 from fluidlift.look.outlet_section import OpenEnd
+from fluidlift.look.stream_slab import Slab
 from fluidlift.numerics.triangles import rasterize_closed
-from fluidlift.present.looks import Backdrop, Frame, Painter
+from fluidlift.present.looks import Frame, Painter
+from fluidlift.present.without_fluid import Backdrop
 from fluidlift.types import CellType, Gaussians, Grid, PinholeCamera, Terrain, TriangleMesh, sh_from_rgb
 
 H = 0.1
@@ -97,7 +99,8 @@ def test_a_ragged_end_is_cut_before_the_terrain_and_kept_on_a_plate(style, engin
     camera = PinholeCamera.looking(np.array([2.05, 0.39, 4.0]), np.array([2.05, 0.4, 0.2]), 20.0, (80, 48))
     look, frame = Look(style, "milk", "white"), Frame(fluid, np.zeros_like(p))
     end = OpenEnd.of(cells(), GRID, STREAM)
-    cut, whole = (Painter(look, terrain, Path(), engine=engine, end=e) for e in (end, None))
+    assert end is not None
+    cut, whole = (Painter(look, terrain, Path(), engine=engine, slab=s) for s in (Slab((end,)), None))
     bare, ragged = (q.picture(frame, camera, Backdrop()).image.mean(axis=-1) for q in (cut, whole))
     right = int(np.floor(camera.project(np.array([[2.05, 0.4, 0.3]]))[0][0, 0]))
     # milk is white, the floor dark; splats stand out by most of their spacing of 0.05 m, some 3 px
@@ -121,6 +124,7 @@ def test_what_lies_behind_the_section_leaves_no_film_beside_it():
                       sh_from_rgb(np.full((len(p), 3), 0.5)))  # fmt: skip
     terrain = Terrain(GRID, np.ones(tuple(n + 1 for n in CELLS), np.float32), np.float32([1, 0, 0]), EMPTY)
     end = OpenEnd.of(cells(), GRID, STREAM)
-    mesh, _ = surface_of(fluid, np.zeros_like(p), terrain, SplashsurfMesher(), clamped=False, end=end)
+    assert end is not None
+    mesh, _ = surface_of(fluid, np.zeros_like(p), terrain, SplashsurfMesher(), clamped=False, ends=(end,))
     # the highest particles lie at 0.275 m, and a surface stands a radius of 0.04 m outside them
     assert mesh.vertices[:, 2].max() < 0.33

@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 
 from fluidlift.look.liquid import LiquidSurface
-from fluidlift.look.solid_contact import carried_on
-from fluidlift.types import PinholeCamera
+from fluidlift.look.outlet_section import OpenEnd
+from fluidlift.look.solid_contact import carried_on, settled
+from fluidlift.types import Grid, PinholeCamera, Terrain, TriangleMesh
 
 CAMERA = PinholeCamera.looking(np.array([0.0, -2.0, 2.0]), np.array([0.0, 0.2, 0.0]), 45.0, (160, 120))
+NOTHING = TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), int))
 REACH, DEEP, BANK, STEEP = 0.1, 0.3, 0.5, np.tan(np.radians(60))
 """m; m; y of the foot of a bank, m; its slope"""
 SHORE = BANK + DEEP / STEEP
@@ -55,3 +57,21 @@ def test_what_there_was_stays_and_nothing_comes_where_no_ground_is_near():
     assert open_end.any() and not found.covered[open_end].any()
     air = carried_on(surface, np.zeros_like(ground), CAMERA, REACH)
     np.testing.assert_array_equal(air.covered, surface.covered)
+
+
+def test_the_rim_of_a_surface_lies_on_its_shore_and_its_section_keeps_its_edge():
+    grid = Grid((20, 20, 8), 0.1)
+    terrain = Terrain(grid, (grid.nodes()[..., 0] - 0.5).astype(np.float32), np.array([0.0, 1.0, 0.0]), NOTHING)
+    # a surface at z = 0.4 from the shore at x = 0.5 on, rounded over a cell there as particles round it
+    x, y = (a.ravel() for a in np.meshgrid(np.arange(0.5, 1.5, 0.02), np.arange(0.5, 1.5, 0.02)))
+    bent = np.clip(1.0 - (x - 0.5) / 0.1, 0.0, 0.95)
+    normals = np.stack([-bent, np.zeros_like(x), np.sqrt(1.0 - bent**2)], -1)
+    points = np.stack([x, y, np.full_like(x, 0.4)], -1)
+    found = settled(points, normals, terrain)
+    rim = x < 0.56
+    assert normals[rim, 2].mean() < 0.8 and found[rim, 2].min() > 0.99
+    np.testing.assert_array_equal(found[x > 0.75], normals[x > 0.75].astype(np.float32))
+    end = OpenEnd(np.array([0.0, 1.0, 0.0]), 1.48, 0.1)
+    kept = settled(points, normals, terrain, (end,))
+    np.testing.assert_array_equal(kept[y > 1.45], normals[y > 1.45].astype(np.float32))
+    assert kept[rim & (y < 1.3), 2].min() > 0.99

@@ -16,7 +16,8 @@ from fluidlift.look.materials import material_named
 from fluidlift.look.scenery import terrain_surfels
 from fluidlift.look.vessel import pane_share, panes, vessel_apart
 from fluidlift.present import looks
-from fluidlift.present.looks import Backdrop, Frame, Painter
+from fluidlift.present.looks import Frame, Painter
+from fluidlift.present.without_fluid import Backdrop
 from fluidlift.shape.terrain import terrain_mesh
 from fluidlift.types import Gaussians, Grid, PinholeCamera, Terrain, TriangleMesh, sh_from_rgb
 

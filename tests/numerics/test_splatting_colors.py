@@ -5,7 +5,8 @@ import pytest
 import torch
 
 from fluidlift.numerics.harmonics import basis
-from fluidlift.numerics.splatting_colors import colors, view_colors, view_colors_plain
+from fluidlift.numerics.splatting_colors import colors
+from fluidlift.numerics.splatting_colors_torch import view_colors, view_colors_plain
 
 EYE = np.array([0.3, -2.0, 0.8])
 

@@ -8,6 +8,7 @@ from fluidlift.config.of_asset import settings_of
 from fluidlift.io.asset_folder import load_asset, read_manifest
 from fluidlift.pipeline.settings import ShowSettings, taken
 from fluidlift.pipeline.stages import show
+from fluidlift.present.front_view import open_end
 from fluidlift.scene.build import SimulationRequest, scene_of
 from fluidlift.types.gaussians import concatenate
 
@@ -17,7 +18,7 @@ def test_from_the_side_a_stream_ends_where_its_section_is(made, monkeypatch):
     config = settings_of(read_manifest(made.folder), (), {}, sections=("simulate", "show"), work="a picture")
     request = SimulationRequest(fps=1.0 / asset.interval)
     scene = scene_of(asset, made.folder, request, config, footage=None, start=0)
-    end, settings = show.open_end(scene), taken(ShowSettings, config.show)
+    end, settings = open_end(scene), taken(ShowSettings, config.show)
     assert end is not None
     fluid, *_ = next(iter(show.splat_frames(made.folder, 1)))
     stream = fluid.select(end.before(fluid.means))

@@ -12,7 +12,8 @@ from fluidlift.io.asset_folder import load_asset
 from fluidlift.io.exr import read_channels
 from fluidlift.io.exr_write import write_channels
 from fluidlift.io.scene_look import Look
-from fluidlift.present.looks import Backdrop, Frame, Painter
+from fluidlift.present.looks import Frame, Painter
+from fluidlift.present.without_fluid import Backdrop
 from fluidlift.scene.splat_files import splat_frames
 from fluidlift.types import Gaussians, Grid, PinholeCamera, Terrain, TriangleMesh
 

@@ -343,6 +343,20 @@ def test_at_the_rim_of_wide_fluid_the_plate_shows_the_clip_and_of_a_jet_nothing(
     assert (background_plate(frames, fluid).kept == plate.seen).all(), "smoke and jets leave none in the air"
 
 
+def test_fluid_that_the_masks_of_a_few_frames_have_missed_is_no_ground():
+    frames = np.tile(BROWN, (10, 120, 160, 1)).astype(np.uint8)
+    fluid = np.zeros(frames.shape[:3], bool)
+    fluid[:, 30:90] = True
+    frames[fluid] = BLUE
+    fluid[2, 55:65, 40:60] = False  # blue as ever
+    fluid[3, 55:65, 100:120] = False
+    frames[3, 55:65, 100:120] = BROWN  # there the water has gone
+    plate = background_plate(frames, fluid, shore=True)
+    assert not plate.seen[58:62, 45:55].any() and plate.seen[58:62, 105:115].all()
+    to_bank, to_water = (np.abs(plate.image[60, 50].astype(int) - c).sum() for c in (BROWN, BLUE))
+    assert to_bank < 0.2 * to_water
+
+
 def test_rocks_stay_in_the_plate_but_do_not_colour_the_bed_beside_them():
     frames, fluid, stone = passing_blob(rock=True)
     plate = background_plate(frames, fluid, stone)

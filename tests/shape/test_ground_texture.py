@@ -135,6 +135,37 @@ def test_the_bed_under_water_is_of_the_stuff_of_its_rim_and_not_of_specks_that_t
     np.testing.assert_allclose(colour, np.tile([110.0, 90.0, 60.0], (9, 1)), atol=8.0)
 
 
+def test_a_bank_does_not_wear_the_water_that_the_clip_shows_there():
+    # the model's bank reaches over what the clip shows as water: nobody has seen what lies under that
+    y = GRID.nodes()[:, :, 0, 1]
+    heights = np.where(np.abs(y) < 0.4, -0.2, 0.02)
+    rays = CAMERA.rays(CAMERA.pixel_grid())
+    ground = CAMERA.position - rays * (CAMERA.position[2] / rays[..., 2])[..., None]
+    wet = np.abs(ground[..., 1]) < 0.6
+    plate = np.where(wet[..., None], (20.0, 140.0, 160.0), (110.0, 90.0, 60.0))
+    mesh = seen_on(heights, plate=plate, level=np.zeros((24, 16)), seen=~wet)
+    for place in (0.5, -0.5, 0.0):  # both banks, and the bed between them
+        colour, _ = colour_at(mesh, np.linspace(-0.8, 0.8, 7), np.full(7, place))
+        bank, water = (np.linalg.norm(colour - c, axis=1) for c in ([110, 90, 60], [20, 140, 160]))
+        assert (bank < 0.2 * water).all()
+
+
+def test_the_bed_under_water_is_as_grainy_as_its_rim():
+    y = GRID.nodes()[:, :, 0, 1]
+    heights = np.where(np.abs(y) < 0.4, -0.2, 0.02)
+    rays = CAMERA.rays(CAMERA.pixel_grid())
+    ground = CAMERA.position - rays * (CAMERA.position[2] / rays[..., 2])[..., None]
+    wet = np.abs(ground[..., 1]) < 0.45
+    stones = np.random.default_rng(0).normal(0, 15, (150, 200, 1))
+    plate = np.clip(np.where(wet[..., None], (20.0, 140.0, 160.0), (110.0, 90.0, 60.0)) + stones, 0, 255)
+    mesh = seen_on(heights, plate=plate, level=np.zeros((24, 16)), seen=~wet)
+    texture = mesh.texture[:-STRIP].astype(float)
+    rows = len(texture)
+    # y runs from -1 m at the lower edge to 1 m
+    bed, bank = (texture[int(rows * (0.5 - y / 2)) - 4 :][:8, :, 0].std() for y in (0.0, 0.6))
+    assert bed > 0.5 * bank > 2.0
+
+
 def rock_in_a_channel():
     """Ground with a bank of 45 degrees and a rock whose sides fall at 60 degrees, water at z = 0, and its picture."""
     nodes = GRID.nodes()[:, :, 0]

@@ -23,7 +23,7 @@ Modules of the face:
     mixing              The look of fluid that was drawn out further than its splats can show
     optics              Light at the surface of a transparent body and inside it: Fresnel, Snell, Beer and Lambert
                         (Born and Wolf 1999), and the colour of a deep body that scatters (van de Hulst 1980)
-    outlet_section      The open end of a stream: where what is simulated ends, a picture shows a clean section
+    outlet_section      The open ends of a stream: where what is simulated ends, a picture shows a clean section
     picture_texture     What a fluid that falls or stands looks like in its film, by place in the picture
     pictures            Fields and curves as pictures for the report
     project             What makes any Gaussians drawable from one camera: colours for the view, nothing broken,
@@ -39,6 +39,8 @@ Modules of the face:
                         picture, or of a mesh
     seen_texture        What the surface of a body at rest looks like to the camera that saw it, by place in plan
     smoothstep          From 0 to 1 with level ends (smoothstep), for arrays and for compiled loops
+    solid_contact       A liquid's surface carried on to the solid that it meets
+    stream_slab         A piece of a stream as a slab that one can pick up, and how it goes on beyond its ends
     surface_axes        The axes over which the surface of a liquid is a map: the plan for what lies, the picture
                         for what falls or stands
     surface_map         The free surface of a liquid that lies, as a map over the plan: where it is, how high it
@@ -81,6 +83,8 @@ __all__ = [
     "screen_space",
     "seen_texture",
     "smoothstep",
+    "solid_contact",
+    "stream_slab",
     "surface_axes",
     "surface_map",
     "surface_skin",

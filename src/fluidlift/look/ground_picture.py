@@ -20,6 +20,7 @@ from fluidlift.look.ground_light import Around, Casters, GroundLight, direct_lig
 from fluidlift.look.liquid import Behind
 from fluidlift.look.materials import Material
 from fluidlift.look.screen_space_kernels import smooth_normals, unit_rows
+from fluidlift.look.smoothstep import smoothstep
 from fluidlift.numerics.srgb import linear_from_srgb
 from fluidlift.numerics.triangles import rasterize_triangles
 from fluidlift.types.camera import PinholeCamera
@@ -38,6 +39,12 @@ GRAY = 0.5
 """sRGB of meshes without colours"""
 CREASE = 0.7
 """cosine between a face and its smooth normal below which the face's own is taken: edges stay edges"""
+BROAD = 0.08
+"""of the picture's longer side: over this, what ground slopes by is evened out"""
+BROADLY = 8
+"""px between those that are taken for it"""
+LYING = tuple(np.cos(np.radians([65.0, 50.0])))
+"""cosine of slopes: what is steeper than the first stands, what is less steep than the second lies"""
 CLEFT = 0.02
 """share of the ambient light that gets into the narrowest cleft, which none of the directions meets"""
 
@@ -78,15 +85,22 @@ class Ground:
 
     Args:
         meshes, environment, lit: as of `ground_picture`.
+        casters: what throws shadows in place of these meshes, as `casters` of another ground.
     """
 
     def __init__(
-        self, meshes: Sequence[TriangleMesh], environment: Environment, lit: GroundLight | None = None
+        self,
+        meshes: Sequence[TriangleMesh],
+        environment: Environment,
+        lit: GroundLight | None = None,
+        *,
+        casters: Casters | None = None,
     ) -> None:
         self.meshes, self.environment, self.lit = [m for m in meshes if len(m.faces)], environment, lit or GroundLight()
-        self.casters = Casters.of(self.meshes)
+        self.casters = casters or Casters.of(self.meshes)
         self.around = Around.of(environment, self.lit.directions)
         self._last: tuple[tuple, _Surfaces] | None = None
+        self._near: tuple[tuple, np.ndarray] | None = None
 
     def picture(
         self,
@@ -133,11 +147,30 @@ class Ground:
 
     def depth(self, camera: PinholeCamera) -> Float[np.ndarray, "h w"]:
         """Camera z (m; 0: none) of these meshes: of the ground that a photograph in place of its picture shows."""
-        return self._seen(camera).depth
+        key = place_of(camera)
+        if self._last is not None and self._last[0] == key:
+            return self._last[1].depth
+        if self._near is None or self._near[0] != key:
+            nearest = np.full(camera.size[::-1], np.inf, np.float32)
+            for mesh in self.meshes:
+                found = rasterize_triangles(mesh.vertices, mesh.faces, camera)
+                nearest = np.where(found.hit, np.minimum(nearest, found.depth), nearest)
+            self._near = key, np.where(np.isfinite(nearest), nearest, 0.0).astype(np.float32)
+        return self._near[1]
 
     def albedo(self, camera: PinholeCamera) -> Float[np.ndarray, "h w 3"]:
         """Linear; 0 where there is none of these meshes."""
         return self._seen(camera).albedo
+
+    def lying(self, camera: PinholeCamera) -> Float[np.ndarray, "h w"]:
+        """1 where these meshes lie, 0 where they stand, as they are seen at large: the foot of a rock and a low bank
+        are parts of ground that lies."""
+        import cv2
+
+        normal = self._seen(camera).normal[::BROADLY, ::BROADLY]
+        mean = cv2.GaussianBlur(normal, (0, 0), BROAD * max(normal.shape))
+        upward = mean[..., 2] / np.maximum(np.linalg.norm(mean, axis=-1), 1e-12)
+        return cv2.resize(smoothstep(upward, *LYING).astype(np.float32), camera.size)
 
     def _seen(self, camera: PinholeCamera) -> _Surfaces:
         key = place_of(camera)

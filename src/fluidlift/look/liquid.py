@@ -134,6 +134,7 @@ def shaded(
     environment: Environment,
     *,
     usual: float | None = None,
+    before: Float[np.ndarray, "h w 3"] | None = None,
 ) -> Float[np.ndarray, "h w 3"]:
     """The finished picture: `behind`, with the liquid before it where it is nearer.
 
@@ -157,6 +158,7 @@ def shaded(
         environment: the light.
         usual: luminance (linear) of the carried colour that is `WARM`, for what glows; None: the mean of this picture.
             One number for a whole film keeps the glow of things that stay.
+        before: linear, what is seen beside the liquid; None: the same that is seen through it.
 
     Returns:
         Linear float32.
@@ -165,7 +167,7 @@ def shaded(
         ValueError: pictures of different sizes.
     """
     _check(surface, behind, camera)
-    picture = behind.image.copy()
+    picture = behind.image.copy() if before is None else np.array(before, np.float32)
     if usual is None:
         usual = _usual(surface, behind) if max(material.emission) > 0 else 1.0
     numbers = np.array([

@@ -1,7 +1,7 @@
-"""The open end of a stream: where what is simulated ends, a picture shows a clean section.
+"""The open ends of a stream: where what is simulated ends, a picture shows a clean section.
 
-In its outlet liquid leaves the box. What is there thins out, and some of it lies about behind: none of that is what was
-seen or simulated, and drawn as it is the end is ragged.
+In its outlet liquid leaves the box. What is there thins out, and some of it lies about behind; in its inlet it fills up
+only. None of that is what was seen or simulated, and drawn as it is the ends are ragged.
 """
 
 from __future__ import annotations
@@ -25,18 +25,26 @@ class OpenEnd:
     """An upright plane across the stream."""
 
     along: Float[np.ndarray, "3"]
-    """unit, horizontal, downstream"""
+    """unit, horizontal, out of the body: downstream at the outlet, upstream at the inlet"""
     at: float
     """m along it"""
     spacing: float
     """m, of the cells"""
 
     @classmethod
-    def of(cls, cells: UInt8[np.ndarray, "nx ny nz"], grid: Grid, mainstream: Float[np.ndarray, "3"]) -> OpenEnd | None:
-        """Where liquid meets the outlet: half a cell into it; None where it meets none, or falls."""
+    def of(
+        cls,
+        cells: UInt8[np.ndarray, "nx ny nz"],
+        grid: Grid,
+        mainstream: Float[np.ndarray, "3"],
+        *,
+        kind: CellType = CellType.OUTFLOW,
+    ) -> OpenEnd | None:
+        """Where liquid meets the outlet (or the inlet, `CellType.INFLOW`): half a cell into it; None where it meets
+        none, or falls."""
         flat = np.array([mainstream[0], mainstream[1], 0.0])
         level = float(np.linalg.norm(flat))
-        wet, out = cells == CellType.FLUID, cells == CellType.OUTFLOW
+        wet, out = cells == CellType.FLUID, cells == kind
         first = np.zeros(out.shape, bool)
         for axis in (0, 1):
             for step in (1, -1):
@@ -45,7 +53,7 @@ class OpenEnd:
                 first |= out & beside
         if level < LEVEL or not first.any():
             return None
-        flat /= level
+        flat /= level if kind == CellType.OUTFLOW else -level
         return cls(flat, float(np.median(grid.centers()[first] @ flat)), grid.spacing)
 
     def before(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:

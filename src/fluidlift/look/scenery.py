@@ -173,10 +173,20 @@ def _cut(area: np.ndarray, corners: tuple[np.ndarray, np.ndarray, np.ndarray], s
     return _Places(*(np.concatenate(column) for column in zip(*found, strict=True)))
 
 
-def terrain_depth(terrain: Terrain, camera: PinholeCamera, *, steps: int = 96) -> Float[np.ndarray, "h w"]:
-    """Camera depth (m) at which each pixel's ray meets the terrain; inf where it does not (sphere tracing)."""
+def terrain_depth(
+    terrain: Terrain, camera: PinholeCamera, *, steps: int = 96, where: Bool[np.ndarray, "h w"] | None = None
+) -> Float[np.ndarray, "h w"]:
+    """Camera depth (m) at which each pixel's ray meets the terrain; inf where it does not (sphere tracing), and beside
+    the pixels that are asked for."""
+    if where is not None:
+        out = np.full(where.shape, np.inf)
+        out[where] = _met(terrain, camera, camera.rays(camera.pixel_grid()[where]), steps)
+        return out
+    return _met(terrain, camera, camera.rays(camera.pixel_grid()).reshape(-1, 3), steps).reshape(camera.size[::-1])
+
+
+def _met(terrain: Terrain, camera: PinholeCamera, rays: np.ndarray, steps: int) -> np.ndarray:
     grid = terrain.grid
-    rays = camera.rays(camera.pixel_grid()).reshape(-1, 3)
     length = np.linalg.norm(rays, axis=1)
     eye = camera.position
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -196,7 +206,7 @@ def terrain_depth(terrain: Terrain, camera: PinholeCamera, *, steps: int = 96) -
         # the distance transform is not exact: step a little less than it allows
         z[active] += np.where(close, 0.0, np.maximum(0.8 * distance, 0.05 * grid.spacing) / length[active])
         active = active[~close & (z[active] < far[active])]
-    return np.where(hit, z, np.inf).reshape(camera.size[1], camera.size[0])
+    return np.where(hit, z, np.inf)
 
 
 def visible_beside_rocks(

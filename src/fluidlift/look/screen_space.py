@@ -227,7 +227,13 @@ def _smoothed(inverse: np.ndarray, radius: float, camera: PinholeCamera) -> np.n
     return inverse
 
 
-def mesh_surface(mesh: TriangleMesh, camera: PinholeCamera, *, radius: float = 0.0) -> LiquidSurface:
+def mesh_surface(
+    mesh: TriangleMesh,
+    camera: PinholeCamera,
+    *,
+    radius: float = 0.0,
+    normals: Float[np.ndarray, "v 3"] | None = None,
+) -> LiquidSurface:
     """The surface of a closed mesh, with its smooth normals; the colours of its vertices are what it carries.
 
     Thickness is all of the liquid along the ray, in however many parts. A mesh with holes gives wrong ones there.
@@ -236,6 +242,7 @@ def mesh_surface(mesh: TriangleMesh, camera: PinholeCamera, *, radius: float = 0
         mesh: m, world.
         camera: who looks.
         radius: m, of the particles that the mesh was made of: it knows nothing finer. 0: it is exact.
+        normals: unit, outward, with which light is mirrored and bent on the near side; None: those of the mesh.
     """
     require(np.isfinite(radius) and radius >= 0, f"a radius of {radius}", "0 m or more")
     found = rasterize_closed(mesh.vertices, mesh.faces, camera)
@@ -246,6 +253,8 @@ def mesh_surface(mesh: TriangleMesh, camera: PinholeCamera, *, radius: float = 0
     unit_rows(values)
     values[:, 3:] = GRAY if mesh.colors is None else linear_from_srgb(mesh.colors)
     front = interpolated(found.front, values, faces)
+    if normals is not None:
+        front[..., :3] = interpolated(found.front, np.ascontiguousarray(normals, np.float32), faces)
     normal, albedo = np.ascontiguousarray(front[..., :3]), np.ascontiguousarray(front[..., 3:])
     back = interpolated(found.back, values[:, :3], faces)
     unit_rows(normal.reshape(-1, 3))

@@ -7,15 +7,20 @@ goes on to where the ground comes out of it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from fluidlift.look.liquid import LiquidSurface
+from fluidlift.look.outlet_section import OpenEnd
 from fluidlift.look.smoothstep import smoothstep
+from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.types.camera import PinholeCamera
+from fluidlift.types.terrain import Terrain
 
 BELL = 0.5
 """of the reach: standard deviation of the weights of what is around, whose plane goes on"""
@@ -29,6 +34,15 @@ LEVEL = (0.6, 0.9)
 """upward part of normals from which on liquid goes on, in part and whole: no fall does, nor the face of an open end"""
 SAMPLES = 3.0
 """px in a standard deviation at which the means are taken: they change slowly"""
+RIM = (0.8, 2.2)
+"""cells from the ground up to which, and from which on, the surface is a rim, and is not: there it is rounded by the
+particles that it is made of, and mirrors the sun all along a shore"""
+FAR = (3.0, 6.0)
+"""cells to the liquid beside it from which on a rim keeps its own normals, in part and whole: a film is all rim"""
+BESIDE = 48
+"""vertices of it whose mean normal that is: single ones glitter"""
+CUT = 0.6
+"""cells before a section up to which its edge rounds the normals"""
 DEEPER = 1.5
 """of the thickness around, up to which (and the reach) it may be thicker here: over an edge, where the ground falls
 off, liquid does not go on level"""
@@ -81,6 +95,42 @@ def carried_on(
     at = (pixels.T - step // 2) / step
     found = np.stack([ndimage.map_coordinates(k, at, order=1, mode="nearest") for k in (*layers, share)], axis=-1)
     return _filled(surface, ground, pixels, found, camera.rays(grid[tuple(pixels.T)]), reach)
+
+
+def settled(
+    points: Float[np.ndarray, "v 3"],
+    normals: Float[np.ndarray, "v 3"],
+    terrain: Terrain,
+    ends: Sequence[OpenEnd] = (),
+) -> Float[np.ndarray, "v 3"]:
+    """Normals of a surface with those of the liquid beside it along its rim on the ground: water wets its shore, and
+    does not lie on it like a drop. At the sections of open ends it keeps its own.
+
+    Args:
+        points: of the surface, m.
+        normals: unit, outward.
+        terrain: that it lies on.
+        ends: where it is cut.
+    """
+    points = np.asarray(points)
+    distance = sample_nodes(terrain.signed_distance, terrain.grid, points) / terrain.grid.spacing
+    level = normals[:, 2] > LEVEL[0]
+    inner = np.flatnonzero(level & (distance > RIM[1]))
+    rim = (normals[:, 2] > 0.0) & (distance < RIM[1])
+    for end in ends:
+        rim &= points @ end.along - end.at < -CUT * end.spacing
+    rim = np.flatnonzero(rim)
+    if not len(inner) or not len(rim):
+        return normals
+    found = cKDTree(points[inner]).query(points[rim], k=min(BESIDE, len(inner)))
+    away, nearest = (np.asarray(part).reshape(len(rim), -1) for part in found)
+    beside = normals[inner[nearest]].mean(axis=1)
+    share = 1.0 - smoothstep(distance[rim].astype(np.float32), *RIM)
+    share = share * (1.0 - smoothstep((away[:, 0] / terrain.grid.spacing).astype(np.float32), *FAR))
+    out = np.array(normals, np.float32)
+    out[rim] += share[:, None] * (beside - out[rim])
+    out[rim] /= np.maximum(np.linalg.norm(out[rim], axis=1, keepdims=True), 1e-9)
+    return out
 
 
 def _planes(

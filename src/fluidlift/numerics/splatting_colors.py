@@ -2,43 +2,40 @@
 
 Order and sign are those of 3D Gaussian Splatting (Kerbl et al. 2023), as in `harmonics.basis`: a colour is
 max(0.5 + sum_k sh_k Y_k(d), 0), where d is the unit direction from the camera to the Gaussian's centre.
-`view_colors` and `view_colors_plain` are the same function, compiled and for reading.
+With gradients, and for reading: `splatting_colors_torch`.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numba as nb
 import numpy as np
-import torch
 from jaxtyping import Float, Int
-from torch import Tensor
 
 from fluidlift.errors import require
 from fluidlift.numerics.sharing import shared
 
 _CHUNK = 4096
-_C0, _C1 = 0.28209479177387814, 0.4886025119029199
-_C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
-_C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
+C0, C1 = 0.28209479177387814, 0.4886025119029199
+C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
+C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
 
 
 @nb.njit(cache=True)
 def _basis(x, y, z, count, out):
-    out[0] = _C0
+    out[0] = C0
     if count > 1:
-        out[1], out[2], out[3] = -_C1 * y, _C1 * z, -_C1 * x
+        out[1], out[2], out[3] = -C1 * y, C1 * z, -C1 * x
     if count > 4:
-        out[4], out[5], out[7] = _C2[0] * x * y, -_C2[0] * y * z, -_C2[0] * x * z
-        out[6], out[8] = _C2[1] * (2.0 * z * z - x * x - y * y), _C2[2] * (x * x - y * y)
+        out[4], out[5], out[7] = C2[0] * x * y, -C2[0] * y * z, -C2[0] * x * z
+        out[6], out[8] = C2[1] * (2.0 * z * z - x * x - y * y), C2[2] * (x * x - y * y)
     if count > 9:
-        out[9], out[15] = -_C3[0] * y * (3.0 * x * x - y * y), -_C3[0] * x * (x * x - 3.0 * y * y)
-        out[10], out[14] = _C3[1] * x * y * z, _C3[4] * z * (x * x - y * y)
+        out[9], out[15] = -C3[0] * y * (3.0 * x * x - y * y), -C3[0] * x * (x * x - 3.0 * y * y)
+        out[10], out[14] = C3[1] * x * y * z, C3[4] * z * (x * x - y * y)
         ring = 4.0 * z * z - x * x - y * y
-        out[11], out[13] = -_C3[2] * y * ring, -_C3[2] * x * ring
-        out[12] = _C3[3] * z * (2.0 * z * z - 3.0 * x * x - 3.0 * y * y)
+        out[11], out[13] = -C3[2] * y * ring, -C3[2] * x * ring
+        out[12] = C3[3] * z * (2.0 * z * z - 3.0 * x * x - 3.0 * y * y)
 
 
 @nb.njit(cache=True)
@@ -46,14 +43,14 @@ def _basis_backward(x, y, z, count, g):
     """Gradient of sum_k g_k Y_k(x, y, z), with Y taken as the polynomials above."""
     gx, gy, gz = 0.0, 0.0, 0.0
     if count > 1:
-        gx, gy, gz = -_C1 * g[3], -_C1 * g[1], _C1 * g[2]
+        gx, gy, gz = -C1 * g[3], -C1 * g[1], C1 * g[2]
     if count > 4:
-        a, b, c = _C2
+        a, b, c = C2
         gx += a * (y * g[4] - z * g[7]) + 2.0 * x * (c * g[8] - b * g[6])
         gy += a * (x * g[4] - z * g[5]) - 2.0 * y * (c * g[8] + b * g[6])
         gz += -a * (y * g[5] + x * g[7]) + 4.0 * b * z * g[6]
     if count > 9:
-        a, b, c, d, e = _C3
+        a, b, c, d, e = C3
         xx, yy, zz = x * x, y * y, z * z
         gx += -6.0 * a * x * y * g[9] + b * y * z * g[10] + 2.0 * c * x * y * g[11] - 6.0 * d * x * z * g[12]
         gx += -c * (4.0 * zz - 3.0 * xx - yy) * g[13] + 2.0 * e * x * z * g[14] - 3.0 * a * (xx - yy) * g[15]
@@ -82,7 +79,7 @@ def colors_kernel(begin, end, means, sh, position, rows, out):
                 x, y, z, _ = _direction(means, position, i)
                 _basis(x, y, z, count, basis)
             else:
-                basis[0] = _C0
+                basis[0] = C0
             for c in range(3):
                 total = 0.5
                 for k in range(count):
@@ -128,42 +125,3 @@ def colors(
     out = np.empty((len(rows), 3), sh.dtype)
     colors_kernel(means, sh, np.asarray(position, np.float64), rows, out)
     return out
-
-
-class _ViewColors(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, means: Tensor, sh: Tensor, position: np.ndarray) -> Tensor:
-        arrays = means.detach().contiguous().numpy(), sh.detach().contiguous().numpy()
-        out = colors(*arrays, position)
-        ctx.saved = (*arrays, position, out)
-        return torch.from_numpy(out)
-
-    @staticmethod
-    def backward(ctx: Any, g_out: Tensor) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
-        means, sh, position, out = ctx.saved
-        g_means, g_sh = np.empty_like(means), np.empty_like(sh)
-        colors_backward_kernel(means, sh, position, out, g_out.contiguous().numpy(), g_means, g_sh)
-        return torch.from_numpy(g_means), torch.from_numpy(g_sh), None
-
-
-def view_colors(means: Float[Tensor, "n 3"], sh: Float[Tensor, "n k 3"], position: np.ndarray) -> Float[Tensor, "n 3"]:
-    """`colors` with gradients to the harmonics and, through the line of sight, to the means."""
-    return _ViewColors.apply(means, sh, np.asarray(position, np.float64))
-
-
-def view_colors_plain(
-    means: Float[Tensor, "n 3"], sh: Float[Tensor, "n k 3"], position: np.ndarray
-) -> Float[Tensor, "n 3"]:
-    """The plain twin of `view_colors`."""
-    d = means - torch.as_tensor(position, dtype=means.dtype)
-    x, y, z = (d / d.norm(dim=1, keepdim=True).clamp(min=1e-12)).unbind(1)
-    values = [
-        torch.full_like(x, _C0), -_C1 * y, _C1 * z, -_C1 * x,
-        _C2[0] * x * y, -_C2[0] * y * z, _C2[1] * (2 * z * z - x * x - y * y), -_C2[0] * x * z,
-        _C2[2] * (x * x - y * y),
-        -_C3[0] * y * (3 * x * x - y * y), _C3[1] * x * y * z, -_C3[2] * y * (4 * z * z - x * x - y * y),
-        _C3[3] * z * (2 * z * z - 3 * x * x - 3 * y * y), -_C3[2] * x * (4 * z * z - x * x - y * y),
-        _C3[4] * z * (x * x - y * y), -_C3[0] * x * (x * x - 3 * y * y),
-    ]  # fmt: skip
-    basis = torch.stack(values[: sh.shape[1]], 1)
-    return (0.5 + torch.einsum("nk,nkc->nc", basis, sh)).clamp(min=0)

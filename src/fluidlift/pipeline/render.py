@@ -15,7 +15,7 @@ from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.io.output_files import Written, cleared, numbered
 from fluidlift.messages import Notice
 from fluidlift.present.frames import BACKGROUNDS, Drawn, FrameRenderer, SimulatedFrame
-from fluidlift.present.front_view import open_end
+from fluidlift.present.front_view import slab_of
 from fluidlift.present.looks import Painter
 from fluidlift.scene.build import Scene
 from fluidlift.scene.recall import footage_of_asset, simulated_poses, simulated_scene
@@ -139,7 +139,7 @@ def _painter(scene: Scene, folder: Path, request: RenderRequest) -> Painter | No
         engine=request.engine,
         samples=request.samples,
         supersample=request.supersample,
-        end=open_end(scene),
+        slab=slab_of(scene),
     )
 
 

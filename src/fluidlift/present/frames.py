@@ -9,19 +9,29 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy import ndimage
 
 from fluidlift.errors import InputRejected
 from fluidlift.look.rasterize import Rendered, render
 from fluidlift.look.scenery import mesh_surfels, terrain_depth, terrain_surfels
+from fluidlift.look.smoothstep import smoothstep
 from fluidlift.look.vessel import glass_of
 from fluidlift.numerics.srgb import linear_from_srgb, srgb_from_linear
 from fluidlift.present.front_view import FrontView, open_end, to_bytes
-from fluidlift.present.looks import Backdrop, Frame, Painter, placed_bodies
+from fluidlift.present.looks import Frame, Painter, placed_bodies
+from fluidlift.present.without_fluid import Backdrop
 from fluidlift.scene.build import Scene
 from fluidlift.scene.footage import Footage
-from fluidlift.types import Gaussians, PinholeCamera, Similarity3, concatenate, matrix_from_quat
+from fluidlift.types import Gaussians, PinholeCamera, Similarity3, concatenate, kind_of, matrix_from_quat
 
 BACKGROUNDS = ("auto", "plate", "terrain", "none")
+RIM = 2
+"""px beside the fluid that lens and coding mix with it"""
+RING = 6
+"""px around what stands in the fluid over which a picture of it runs into the bed: a simulated liquid keeps off solids
+by up to a cell"""
+SOMETIMES = 0.1
+"""share of the frames from which on a pixel counts as one of the fluid: its plate may show fluid that masks missed"""
 NEAR = 1e-3
 """m, depth of what stands before the fluid in an unknown place: it hides all of it"""
 
@@ -68,6 +78,7 @@ class FrameRenderer:
         self.front_view = FrontView.of(scene, footage)
         self._most = {} if surfels is None else {"most": surfels}
         self._rock_depth: tuple[PinholeCamera, np.ndarray | None] | None = None
+        self._shown: tuple[PinholeCamera, Backdrop] | None = None
         self._end = open_end(scene)
 
     def background(self, asked: str, *, front: bool) -> str:
@@ -139,9 +150,16 @@ class FrameRenderer:
     def _backdrop(self, camera: PinholeCamera, background: str) -> Backdrop:
         if background != "plate":
             return Backdrop(cut_out=background == "none")
-        plate = linear_from_srgb(self._plate(camera)).astype(np.float32)
+        if self._shown is None or self._shown[0] is not camera:
+            self._shown = camera, self._on_plate(camera)
+        return self._shown[1]
+
+    def _on_plate(self, camera: PinholeCamera) -> Backdrop:
+        fluid = self._filmed_fluid(camera)
+        plate = linear_from_srgb(self._plate(camera, dry=fluid is not None)).astype(np.float32)
         coarse = max(camera.focal[0] / self.scene.camera.focal[0], 1.0)
-        return Backdrop(plate, self._depth_of_rocks(camera), coarse)
+        drawn = None if fluid is None else _placed(self._beside_rocks, self.scene.camera, camera)[..., 0]
+        return Backdrop(plate, self._depth_of_rocks(camera), coarse, fluid, drawn)
 
     @cached_property
     def ground(self) -> Gaussians:
@@ -164,19 +182,68 @@ class FrameRenderer:
         poses = () if frame.poses is None else frame.poses
         return [s.transformed(Similarity3(1.0, matrix_from_quat(p[3:]), p[:3])) for s, p in zip(self._shapes, poses)]
 
-    def _plate(self, camera: PinholeCamera) -> np.ndarray:
-        """sRGB [h,w,3] in [0, 1] of the clip without its fluid; grey where it is not at hand."""
+    def _plate(self, camera: PinholeCamera, *, dry: bool = False) -> np.ndarray:
+        """sRGB [h,w,3] in [0, 1] of the clip without its fluid (dry: nor on what stands in it); grey where it is not at
+        hand."""
         if self.footage is None:
             return np.full((*camera.size[::-1], 3), 0.5, np.float32)
-        return _placed(self.footage.plate, self.scene.camera, camera)
+        return _placed(self._dry_plate if dry else self.footage.plate, self.scene.camera, camera)
+
+    def _filmed_fluid(self, camera: PinholeCamera) -> np.ndarray | None:
+        """Where the plate shows the clip's fluid or a guess in its place, 0 to 1: around the fluid, which leaves a rim
+        in it, and not on what stands in or before it. None: it shows none, or its ground is not known."""
+        if self.footage is None or not kind_of(self.scene.kind).lies_on_ground:
+            return None
+        picture = self._fluid_pixels[..., None].repeat(3, 2).astype(np.uint8) * 255
+        return np.clip(_placed(picture, self.scene.camera, camera)[..., 0], 0.0, 1.0)
+
+    @cached_property
+    def _stands(self) -> np.ndarray:
+        """bool [H,W] of the clip: something stands in or before the fluid."""
+        assert self.footage is not None
+        rocks, before = self.footage.rocks, self.footage.before
+        return rocks if before is None else rocks | before
+
+    @cached_property
+    def _dry_plate(self) -> np.ndarray:
+        """The clip's plate without the rim that fluid leaves on what stands in it. That goes on as it is inside: also
+        over the ring around it up to which a simulated liquid does not reach."""
+        assert self.footage is not None
+        core = _without_rim(self._stands)
+        if not core.any():
+            return self.footage.plate
+        nearest = ndimage.distance_transform_edt(~core, return_distances=False, return_indices=True)
+        rim = self._filmed_around & ~core
+        return np.where(rim[..., None], self.footage.plate[tuple(nearest)], self.footage.plate)
+
+    @cached_property
+    def _beside_rocks(self) -> np.ndarray:
+        """u8 [H,W,3], how much of the bed is drawn: 255 but for the ring around what stands in the fluid."""
+        away = ndimage.distance_transform_edt(~self._stands)
+        share = smoothstep(np.asarray(away, np.float32), 0.0, RING)
+        return (255.0 * share + 0.5).astype(np.uint8)[..., None].repeat(3, 2)
+
+    @cached_property
+    def _filmed_around(self) -> np.ndarray:
+        """bool [H,W], what stands in the fluid, and the ring around it."""
+        near = ndimage.binary_dilation(self._stands, iterations=RING)
+        return self._stands | (near & self._fluid_pixels)
+
+    @cached_property
+    def _fluid_pixels(self) -> np.ndarray:
+        """bool [H,W], where the plate shows the clip's fluid or a guess in its place: a little more than the fluid,
+        which leaves a rim in it, with what its masks have missed."""
+        assert self.footage is not None
+        sometimes = self.footage.labels.fluid.mean(axis=0) > SOMETIMES
+        around = ndimage.binary_dilation(sometimes, iterations=RIM)
+        return ndimage.binary_fill_holes(around | self._stands) & ~self._stands
 
     def _depth_of_rocks(self, camera: PinholeCamera) -> np.ndarray | None:
         """Camera depth (m) of the rocks that the plate shows, and of what stands before the fluid, 0 beside them; None
         where it shows none."""
         if self.footage is None:
             return None
-        rocks, before = self.footage.rocks, self.footage.before
-        stands = rocks if before is None else rocks | before
+        before, stands = self.footage.before, self._stands
         if not stands.any():
             return None
         if self._rock_depth is None or self._rock_depth[0] is not camera:
@@ -185,11 +252,22 @@ class FrameRenderer:
                 picture = pixels[..., None].repeat(3, 2).astype(np.uint8) * 255
                 return _placed(picture, self.scene.camera, camera, goes_on=False)[..., 0] > 0.5
 
-            there, depth = placed(stands), terrain_depth(self.scene.terrain, camera)
+            there = placed(stands)
+            depth = terrain_depth(self.scene.terrain, camera, where=there)
             if before is not None:
                 depth = np.where(placed(before), NEAR, depth)
             self._rock_depth = camera, np.where(there & np.isfinite(depth), depth, 0.0).astype(np.float32)
         return self._rock_depth[1]
+
+
+def _without_rim(stands: np.ndarray) -> np.ndarray:
+    """bool [h,w]: pixels of things without those that are mixed with the fluid beside them; those of what is so thin
+    that nothing would be left stay."""
+    core = ndimage.binary_erosion(stands, iterations=RIM + 1, border_value=1)
+    parts, count = ndimage.label(stands)
+    thick = np.zeros(count + 1, bool)
+    thick[parts[core]] = True
+    return np.where(thick[parts], core, stands)
 
 
 def _sky(camera: PinholeCamera) -> np.ndarray:

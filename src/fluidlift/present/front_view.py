@@ -10,12 +10,12 @@ import numpy as np
 
 from fluidlift.scene.build import Scene
 from fluidlift.scene.footage import Footage
-from fluidlift.types import Gaussians, PinholeCamera, concatenate, kind_of
+from fluidlift.types import CellType, Gaussians, PinholeCamera, concatenate, kind_of
 
 if TYPE_CHECKING:
     from fluidlift.look.outlet_section import OpenEnd
     from fluidlift.look.rasterize import Rendered
-
+    from fluidlift.look.stream_slab import Slab
 
 BEHIND = (1.5, 0.5)
 """cells behind the terrain from which fluid is hidden: at rocks, whose shape is a guess, and where it is always dry"""
@@ -97,6 +97,18 @@ def open_end(scene: Scene) -> OpenEnd | None:
     if not kind_of(scene.kind).is_channel_flow:
         return None
     return OpenEnd.of(scene.cell_types, scene.terrain.grid, scene.terrain.mainstream)
+
+
+def slab_of(scene: Scene) -> Slab:
+    """Where a stream and its ground are cut in looks (other kinds are not), and how high its fluid stands."""
+    from fluidlift.look.outlet_section import OpenEnd
+    from fluidlift.look.stream_slab import Slab
+
+    ends = [open_end(scene)]
+    if kind_of(scene.kind).is_channel_flow:
+        grid, along = scene.terrain.grid, scene.terrain.mainstream
+        ends.append(OpenEnd.of(scene.cell_types, grid, along, kind=CellType.INFLOW))
+    return Slab(tuple(end for end in ends if end is not None), scene.rest.means)
 
 
 def to_bytes(image: np.ndarray) -> np.ndarray:

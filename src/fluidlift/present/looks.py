@@ -23,13 +23,17 @@ from fluidlift.look.outlet_section import OpenEnd
 from fluidlift.look.rasterize import render
 from fluidlift.look.relight import relit
 from fluidlift.look.screen_space import mesh_surface, particle_surface
+from fluidlift.look.solid_contact import settled
+from fluidlift.look.stream_slab import Slab
 from fluidlift.look.surface_skin import painted_liquid
 from fluidlift.look.transparent import splat_surface
 from fluidlift.look.vessel import Pane, before_glass, panes, vessel_apart
 from fluidlift.look.wet_ground import wetted
+from fluidlift.numerics.mesh_normals import vertex_normals
 from fluidlift.numerics.srgb import linear_from_srgb, srgb_from_linear
 from fluidlift.present.supersampling import Lit, averaged, enlarged
 from fluidlift.present.surfacing import RADIUS, surface_of
+from fluidlift.present.without_fluid import Backdrop, GroundPictures, Shade, wet_behind
 from fluidlift.types import (
     FluidKind,
     Gaussians,
@@ -74,20 +78,6 @@ class Frame:
     """obstacles, in the world"""
 
 
-@dataclass(frozen=True)
-class Backdrop:
-    """What is behind the fluid."""
-
-    picture: np.ndarray | None = None
-    """[h,w,3] linear, which shows the ground as well; None: the terrain before the environment"""
-    depth: np.ndarray | None = None
-    """[h,w] camera z (m) at which the picture hides the fluid, 0 where it does not; None: nowhere"""
-    coarse: float = 1.0
-    """px of the picture that were one px of the clip"""
-    cut_out: bool = False
-    """the terrain hides the fluid and the obstacles, and is not drawn itself"""
-
-
 def placed_bodies(obstacles: Sequence[Obstacle], poses: np.ndarray) -> list[TriangleMesh]:
     """Meshes of obstacles where they are: poses [b,7], position (m) and orientation (w, x, y, z)."""
     return [
@@ -124,8 +114,8 @@ class Painter:
         kind: of the fluid; what lies on a bed has no surface towards it.
         engine: of the look surface, one of `ENGINES`.
         samples: per pixel, of Mitsuba.
-        end: of a stream; before the terrain it ends there in a clean section. Not on a plate, which goes on behind it,
-            nor cut out; None: it is drawn as far as its particles go.
+        slab: of a stream; before the terrain it ends there in clean sections, and the ground with it. Before a clip's
+            plate it goes on beyond them. None: it is drawn as far as its particles go.
         supersample: pictures are drawn this many times as wide and as high, and averaged in linear light: edges become
             smooth, at the price of so many pixels. Mitsuba's are smooth as they are.
 
@@ -145,7 +135,7 @@ class Painter:
         engine: str = "mesh",
         samples: int = 64,
         supersample: int = 1,
-        end: OpenEnd | None = None,
+        slab: Slab | None = None,
     ) -> None:
         require(1 <= supersample <= 8, f"a supersample of {supersample}", "1 to 8")
         if engine not in ENGINES:
@@ -159,13 +149,15 @@ class Painter:
         self.material: Material = material_named(look.material).tinted(look.tint)
         self.environment = environment_of(folder, look.environment)
         self._samples, self._bed = samples, terrain if kind_of(kind).lies_on_ground else None
-        self._end = end
+        self._slab = slab or Slab()
         self._finer, self._folder = 1 if engine == "mitsuba" else int(supersample), folder
         self._far: tuple[tuple, np.ndarray] | None = None
+        self._taken: tuple[Backdrop, Backdrop] | None = None
         self._panes: tuple[tuple, tuple[Pane, Pane]] | None = None
         # the ground that hides, and the glass of a pour that does not
         ground, cell = terrain.mesh, terrain.grid.spacing
-        self._solid, self._vessel = vessel_apart(ground, cell) if kind_of(kind).fills_vessel else (ground, None)
+        whole, self._vessel = vessel_apart(ground, cell) if kind_of(kind).fills_vessel else (ground, None)
+        self._grounds = GroundPictures(whole, terrain.grid, self._slab, self.environment)
         _ = self._final if engine == "mitsuba" else self._mesher  # what is missing is said before anything is drawn
 
     @cached_property
@@ -194,52 +186,82 @@ class Painter:
         """
         if self._final is not None:
             return self._traced(frame, camera, backdrop)
+        if self._taken is None or self._taken[0] is not backdrop:
+            self._taken = backdrop, self._finer_backdrop(backdrop, camera)
         if self._finer == 1:
-            return self._drawn(frame, camera, backdrop)
+            return self._drawn(frame, camera, self._taken[1])
         k = self._finer
         wide = camera.resized((k * camera.size[0], k * camera.size[1]))
-        finer = replace(
+        return averaged(self._drawn(frame, wide, self._taken[1]), k)
+
+    def _finer_backdrop(self, backdrop: Backdrop, camera: PinholeCamera) -> Backdrop:
+        """The backdrop with the pixels in which pictures are drawn."""
+        if backdrop.fluid is not None and backdrop.depth is not None:
+            backdrop = replace(backdrop, depth=self._grounds.depth_of_rocks(camera, backdrop.depth))
+        k = self._finer
+        if k == 1:
+            return backdrop
+        return replace(
             backdrop,
             picture=enlarged(backdrop.picture, k),
             depth=enlarged(backdrop.depth, k),
+            fluid=enlarged(backdrop.fluid, k),
+            drawn=enlarged(backdrop.drawn, k),
             coarse=k * backdrop.coarse,
         )
-        return averaged(self._drawn(frame, wide, finer), k)
 
     def _drawn(self, frame: Frame, camera: PinholeCamera, backdrop: Backdrop) -> Lit:
         """One frame, with the pixels of the camera."""
-        end = None if backdrop.picture is not None or backdrop.cut_out else self._end
-        mesh = (
-            None
-            if self._mesher is None
-            else surface_of(frame.fluid, frame.velocities, self.terrain, self._mesher, clamped=False, end=end)[0]
-        )
-        if end is not None:
-            kept = end.before(frame.fluid.means)
+        if backdrop.fluid is not None and self._slab.ends:
+            fluid, velocities = self._slab.beyond(frame.fluid, frame.velocities, camera)
+            frame = replace(frame, fluid=fluid, velocities=velocities)
+        ends = self._ends(backdrop)
+        mesh = None
+        if self._mesher is not None:
+            mesh, _ = surface_of(
+                frame.fluid, frame.velocities, self.terrain, self._mesher, clamped=False, ends=ends
+            )  # fmt: skip
+        if ends:
+            kept = self._slab.before(frame.fluid.means)
             frame = replace(frame, fluid=frame.fluid.select(kept), velocities=frame.velocities[kept])
-        behind = self._behind(frame, mesh or self._caster(frame, backdrop), camera, backdrop)
+        beside, through, bed = self._pictures(camera, backdrop, self._shade(frame, mesh, backdrop))
         if self.look.style == "relit":
-            lit = self._relit(frame.fluid, camera, self._through_far_wall(behind, camera, backdrop), backdrop.cut_out)
+            lit = self._relit(frame.fluid, camera, self._through_far_wall(beside, camera, backdrop), backdrop.cut_out)
         else:
-            lit = self._refracting(frame.fluid, mesh, camera, behind, backdrop)
+            lit = self._refracting(frame.fluid, mesh, camera, (beside, through, bed), backdrop)
         walls = self._glass(camera, backdrop)
         return lit if walls is None else replace(lit, image=walls[0].over(lit.image, lit.depth))
 
     def _refracting(
-        self, fluid: Gaussians, mesh: TriangleMesh | None, camera: PinholeCamera, behind: Behind, backdrop: Backdrop
+        self,
+        fluid: Gaussians,
+        mesh: TriangleMesh | None,
+        camera: PinholeCamera,
+        pictures: tuple[Behind, Behind, Ground | None],
+        backdrop: Backdrop,
     ) -> Lit:
-        """A liquid that shows what lies behind it."""
-        surface = self._liquid(fluid, mesh, camera, behind)
-        if backdrop.picture is None:  # a plate shows its ground as it was
-            ground = self._ground.albedo(camera), self._ground.depth(camera)
-            shaded_there = self.look.style == "transparent" or mesh is not None
-            behind = wetted(behind, surface, camera, self.material, ground, shaded=shaded_there)
-        behind = self._through_far_wall(behind, camera, backdrop)
-        image = shaded(surface, behind, camera, self.material, self.environment, usual=self._usual)
+        """A liquid that shows what lies behind it. pictures: as `_pictures` gives them."""
+        beside, through, bed = pictures
+        surface = self._liquid(fluid, mesh, camera, beside, self._ends(backdrop))
+        if through is not beside:  # what hides the liquid is not in the picture through it
+            hidden = (beside.depth > 0) & (surface.depth >= beside.depth)
+            surface = replace(surface, covered=np.where(hidden, np.float32(0.0), surface.covered))
+        one = through is beside
+        if bed is not None:  # else a plate shows its ground as it was
+            ground = bed.albedo(camera), bed.depth(camera)
+            shaded_there = backdrop.picture is None and (self.look.style == "transparent" or mesh is not None)
+            wet = wetted(through, surface, camera, self.material, ground, shaded=shaded_there)
+            beside = wet if one else wetted(beside, surface, camera, self.material, ground, shaded=shaded_there)
+            through = wet if one else wet_behind(through, wet, beside)
+        beside = self._through_far_wall(beside, camera, backdrop)
+        through = beside if one else self._through_far_wall(through, camera, backdrop)
+        image = shaded(
+            surface, through, camera, self.material, self.environment, usual=self._usual, before=beside.image
+        )
         if backdrop.cut_out:
-            light = np.maximum(image - (1.0 - surface.covered[..., None]) * behind.image, 0.0)
+            light = np.maximum(image - (1.0 - surface.covered[..., None]) * beside.image, 0.0)
             return Lit(light, surface.covered, surface.depth)
-        return Lit(image, np.ones_like(surface.covered), np.where(surface.covered > 0.5, surface.depth, behind.depth))
+        return Lit(image, np.ones_like(surface.covered), np.where(surface.covered > 0.5, surface.depth, beside.depth))
 
     def display(self, linear: np.ndarray) -> np.ndarray:
         """Light of `picture` for a display, linear in [0, 1], with the look's exposure."""
@@ -252,7 +274,7 @@ class Painter:
 
     def seen_behind(self, camera: PinholeCamera) -> np.ndarray:
         """Linear [h,w,3] behind everything: a file's environment as it is; of a built-in one the sky, and below the
-        horizon a pale floor, before which a dark liquid and a dark ground both stand out."""
+        horizon a pale floor with the ground's shadow, before which a dark liquid and a dark ground both stand out."""
         key = place_of(camera)
         if self._far is None or self._far[0] != key:
             self._far = key, self._surroundings(camera)
@@ -267,21 +289,49 @@ class Painter:
             self.environment.toward(rays)
         )  # fmt: skip
         above = np.clip(rise / HORIZON + 0.5, 0.0, 1.0)
-        return (sky * above + (FLOOR + 0.2 * np.clip(rise + 1.0, 0.0, 1.0)) * (1.0 - above)).astype(np.float32)
+        floor = (FLOOR + 0.2 * np.clip(rise + 1.0, 0.0, 1.0)) * self._grounds.light_on_floor(camera)
+        return (sky * above + floor * (1.0 - above)).astype(np.float32)
 
-    def _behind(self, frame: Frame, mesh: TriangleMesh | None, camera: PinholeCamera, backdrop: Backdrop) -> Behind:
-        """The picture without the fluid."""
-        far = self.seen_behind(camera) if backdrop.picture is None else backdrop.picture
-        depth = np.zeros(far.shape[:2], np.float32) if backdrop.depth is None else backdrop.depth
-        ground = self._ground if backdrop.picture is None else self._no_ground
-        if backdrop.picture is not None and self.look.style == "surface" and self._bed is not None:
-            # the plate shows the ground: a liquid that touches it must not look through air. A vessel may be of glass
-            depth = np.where(depth > 0, depth, self._ground.depth(camera))
+    def _ends(self, backdrop: Backdrop) -> tuple[OpenEnd, ...]:
+        """Where the liquid is cut: before the terrain, and neither on a plate nor cut out."""
+        return () if backdrop.picture is not None or backdrop.cut_out else self._slab.ends
+
+    def _shade(self, frame: Frame, mesh: TriangleMesh | None, backdrop: Backdrop) -> Shade:
         # what is drawn as splats hides what is behind it, and lets no light through to the ground either
         clear = None if self.look.style == "relit" else self.material
         # the caster made of splats stands outside of them: ground in between is beside the fluid, not under it
         inset = 0.0 if self._mesher is not None else OUTSIDE * 0.5 * self.terrain.grid.spacing
-        found = ground.picture(camera, Behind(far, depth), mesh, material=clear, bodies=frame.bodies, inset=inset)
+        return Shade(mesh or self._caster(frame, backdrop), clear, frame.bodies, inset)
+
+    def _pictures(
+        self, camera: PinholeCamera, backdrop: Backdrop, shade: Shade
+    ) -> tuple[Behind, Behind, Ground | None]:
+        """The picture without the fluid, beside it and through it, and the ground that is drawn in the latter; None: a
+        photograph shows it."""
+        if backdrop.fluid is not None:
+            beside, through = self._grounds.on_plate(camera, backdrop, shade.bodies)
+            if shade.bodies:
+                drawn = self._no_ground.picture(camera, beside, bodies=shade.bodies)
+                beside = replace(beside, image=drawn.image, depth=drawn.depth)
+            return beside, through, self._grounds.bed
+        beside = self._behind(camera, backdrop, shade)
+        if backdrop.picture is not None:
+            return beside, beside, None
+        if backdrop.cut_out or self.look.style == "relit":
+            return beside, beside, self._grounds.ground
+        return beside, *self._grounds.through(camera, beside, self.seen_behind(camera), shade)
+
+    def _behind(self, camera: PinholeCamera, backdrop: Backdrop, shade: Shade) -> Behind:
+        """The picture without the fluid, a plate's as it is."""
+        far = self.seen_behind(camera) if backdrop.picture is None else backdrop.picture
+        depth = np.zeros(far.shape[:2], np.float32) if backdrop.depth is None else backdrop.depth
+        ground = self._grounds.ground if backdrop.picture is None else self._no_ground
+        if backdrop.picture is not None and self.look.style == "surface" and self._bed is not None:
+            # the plate shows the ground: a liquid that touches it must not look through air. A vessel may be of glass
+            depth = np.where(depth > 0, depth, self._grounds.ground.depth(camera))
+        found = ground.picture(
+            camera, Behind(far, depth), shade.caster, material=shade.material, bodies=shade.bodies, inset=shade.inset
+        )
         # nobody knows what is around a clip: its own rim and mean fit it better than another world's sky
         on_plate = backdrop.picture is not None
         return replace(found, goes_on=on_plate, coarse=backdrop.coarse if on_plate else 1.0)
@@ -293,10 +343,6 @@ class Painter:
         if self.look.style == "surface" or (bare and not frame.bodies):
             return None
         return fluid_surface(frame.fluid, 0.5 * self.terrain.grid.spacing)
-
-    @cached_property
-    def _ground(self) -> Ground:
-        return Ground([self._solid], self.environment)
 
     @cached_property
     def _no_ground(self) -> Ground:
@@ -355,10 +401,16 @@ class Painter:
         return Lit(image, np.ones_like(drawn.alpha), np.where(drawn.alpha > 0.5, drawn.depth, behind.depth))
 
     def _liquid(
-        self, fluid: Gaussians, mesh: TriangleMesh | None, camera: PinholeCamera, behind: Behind
+        self,
+        fluid: Gaussians,
+        mesh: TriangleMesh | None,
+        camera: PinholeCamera,
+        behind: Behind,
+        ends: Sequence[OpenEnd],
     ) -> LiquidSurface:
         if mesh is not None:
-            return mesh_surface(mesh, camera, radius=RADIUS * self.terrain.grid.spacing)
+            normals = None if self._bed is None else settled(mesh.vertices, vertex_normals(mesh), self._bed, ends)
+            return mesh_surface(mesh, camera, radius=RADIUS * self.terrain.grid.spacing, normals=normals)
         fluid = painted_liquid(fluid, self.terrain.grid.spacing)
         free = self._bed is None  # what lies on a bed has its far side there: no second surface to bend light at
         if self.look.style == "transparent":
@@ -376,10 +428,10 @@ class Painter:
         from fluidlift.backends.mitsuba_scene import FinalScene, resting
 
         assert self._final is not None
-        end = None if backdrop.picture is not None else self._end
-        mesh, _ = surface_of(frame.fluid, frame.velocities, self.terrain, self._need_mesher(), clamped=False, end=end)
+        ends = () if backdrop.picture is not None else self._slab.ends
+        mesh, _ = surface_of(frame.fluid, frame.velocities, self.terrain, self._need_mesher(), clamped=False, ends=ends)
         mesh = resting(mesh, self.terrain)
-        ground = [self._solid] if len(self._solid.faces) else []
+        ground = [self._grounds.solid] if len(self._grounds.solid.faces) else []
         image, alpha = self._final.picture_and_alpha(
             FinalScene(
                 mesh, self.material, camera, self.environment.radiance, (*ground, *frame.bodies),
@@ -387,7 +439,7 @@ class Painter:
                 samples=self._samples, show_environment=False, usual=self._usual,
             )
         )  # fmt: skip
-        behind = self._behind(frame, None, camera, Backdrop(backdrop.picture))
+        behind = self._behind(camera, Backdrop(backdrop.picture), Shade(bodies=frame.bodies))
         far = self.seen_behind(camera) if backdrop.picture is None else backdrop.picture
         depth = mesh_surface(mesh, camera).depth
         nearer = (depth > 0) & ((behind.depth == 0) | (depth < behind.depth))

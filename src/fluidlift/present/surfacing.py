@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -23,7 +24,7 @@ def surface_of(
     mesher: Mesher,
     *,
     clamped: bool = True,
-    end: OpenEnd | None = None,
+    ends: Sequence[OpenEnd] = (),
 ) -> tuple[TriangleMesh, np.ndarray]:
     """The surface with the splats' colours (sRGB) at its vertices, and its velocity [v,3] there, m/s.
 
@@ -33,9 +34,9 @@ def surface_of(
         terrain: that the surface stays out of.
         mesher: of particles.
         clamped: whether it does; the surface of particles itself stands a little outside them, and dips into the bed.
-        end: of a stream, where the surface ends in a flat section; None: it goes as far as the particles.
+        ends: of a stream, where the surface ends in flat sections; at others it goes as far as the particles.
     """
-    if end is not None:
+    for end in ends:
         kept, places = end.carried_on(fluid.means)
         fluid, velocities = replace(fluid.select(kept), means=places), velocities[kept]
     velocities = velocities[~of_skin(fluid, terrain.grid.spacing)]
@@ -44,7 +45,9 @@ def surface_of(
     mesh, found = mesher.surface(fluid.means, RADIUS * terrain.grid.spacing, carried)
     vertices = outside_solid(mesh.vertices, terrain) if clamped else np.asarray(mesh.vertices)
     surface = TriangleMesh(vertices, mesh.faces, np.clip(found["rgb"], 0.0, 1.0))
-    return surface if end is None else end.section(surface), found["velocity"]
+    for end in ends:
+        surface = end.section(surface)
+    return surface, found["velocity"]
 
 
 def outside_solid(points: np.ndarray, terrain: Terrain) -> np.ndarray:

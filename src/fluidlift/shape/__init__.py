@@ -2,6 +2,8 @@
 
 Modules of the face:
 
+    background        Background subtraction: the still scene behind a fluid that moves through the picture; what
+                      stands out from it
     composite         A body of two parts in the geometry: what lies, and the jets that fall onto it
     dam               A body of liquid that is let go: when, and what the masks of the clip say of its shape and of
                       its basin
@@ -49,6 +51,8 @@ Modules of the face:
                       given depths
     texture_gradient  What the fluid's own pattern (foam, ripples) says about the plane it lies on: shape from
                       texture
+    texture_grain     Grain of a texture where it was not seen: random pieces of the seen one, blended so that they
+                      stay as lively
     unite             Makes the bodies of several frames one (paper: union over N frames), and says how many frames
                       that should be
     view              Which way is up: what a picture says of it beside the fluid's motion, as log likelihoods of
@@ -58,6 +62,7 @@ Modules of the face:
 """
 
 __all__ = [
+    "background",
     "composite",
     "dam",
     "depth_surface",
@@ -86,6 +91,7 @@ __all__ = [
     "standing",
     "surface",
     "texture_gradient",
+    "texture_grain",
     "unite",
     "view",
     "warm_start",

@@ -75,13 +75,40 @@ def background_plate(
         return BackgroundPlate(median, seen, seen)
     values = np.ma.masked_array(frames[pick], mask=np.repeat(wet[..., None], 3, axis=-1))
     image = np.clip(np.ma.median(values, axis=0).filled(0), 0, 255).astype(np.uint8)
-    ground = seen if solid is None else seen & ~ndimage.binary_dilation(solid, iterations=3)
+    beside = np.zeros_like(seen) if solid is None else ndimage.binary_dilation(solid, iterations=3)
+    if shore:
+        seen = _without_missed(seen, wet.mean(axis=0), image, median, beside)
+    ground = seen & ~beside
     kept = seen | _rim_of_wide_fluid(np.all(covered, axis=0)) if shore else seen
     if ground.any() and not seen.all():
         painted = _inpainted(image, ~ground)
         blend = weight_of_unseen(kept)[..., None]
         image = (np.where(seen[..., None], image, median) * (1 - blend) + painted * blend).astype(np.uint8)
     return BackgroundPlate(image, seen, kept)
+
+
+def _without_missed(
+    seen: np.ndarray, share: np.ndarray, image: np.ndarray, usual: np.ndarray, beside: np.ndarray
+) -> np.ndarray:
+    """What is seen, bool [h,w], without fluid that the masks of a few frames have missed.
+
+    Most of the time fluid is there, and its colours are nearer to those of that fluid than to those of the ground
+    around.
+
+    Args:
+        seen: pixels that some frame shows without fluid.
+        share: [h,w] of the frames in which they are fluid.
+        image: [h,w,3], what is seen without it.
+        usual: [h,w,3], what is usually seen.
+        beside: bool [h,w], what lends the ground no colours.
+    """
+    doubtful = seen & (share > 0.5)
+    sure = seen & ~doubtful & ~beside
+    if not doubtful.any() or not sure.any():
+        return seen
+    ground = _inpainted(image, ~sure).astype(np.float32)
+    to_ground, to_fluid = (np.abs(image - other).sum(axis=-1) for other in (ground, usual.astype(np.float32)))
+    return seen & ~(doubtful & (to_fluid < to_ground))
 
 
 def _rim_of_wide_fluid(fluid: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:

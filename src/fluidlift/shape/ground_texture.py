@@ -1,7 +1,7 @@
 """The ground's texture: the picture laid on a terrain as a map seen from above, as fine as the picture itself.
 
-What the camera does not see (behind rocks and banks, beyond the picture) is no part of the picture: it goes on as the
-seen ground beside it, and a rock is not painted on what lies behind it.
+What the camera does not see (behind rocks and banks, under the fluid, beyond the picture) is no part of the picture: it
+goes on as the seen ground beside it, and neither a rock nor water is painted on what lies behind it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,9 @@ from scipy import ndimage
 from fluidlift.numerics.textures import sample_texture
 from fluidlift.numerics.triangles import rasterize_triangles
 from fluidlift.shape.background import filled_in, weight_of_unseen
+from fluidlift.shape.generate import MIXED
 from fluidlift.shape.ground_mesh import PARTS, cut_colour
+from fluidlift.shape.texture_grain import grain
 from fluidlift.types import Grid, Label, PinholeCamera, TriangleMesh
 
 LONGEST = 2048
@@ -46,6 +48,12 @@ GRAIN = 0.005
 
 EVEN = 0.02
 """of the map's longer side: over this, ground that is not seen is evened out"""
+
+SOFT = 0.008
+"""of the map's longer side: over this, the rock under water and the bed run into each other"""
+
+LEAST = 0.4
+"""of the grain of the ground is left where it stands; of a rock's none, which would hang about its foot"""
 
 REPOSE = np.tan(np.radians(35.0))
 """slope that gravel lies at, at most: the foot of a rock under water is of rock where it is steeper"""
@@ -100,6 +108,8 @@ class _Map:
     """bool [h,w]: bed under the water, where it lies"""
     wall: np.ndarray
     """bool [h,w]: ground that stands behind water"""
+    level: np.ndarray
+    """float32 [h,w]: 1 where the ground itself lies, 0 where it stands: there a map has few texels"""
 
 
 def textured(
@@ -209,8 +219,8 @@ def _map(top: np.ndarray, level: np.ndarray, view: View, texel: float) -> _Map:
     row, col, _ = camera.nearest_pixels(ground)
     painted = (view.labels[row, col] == Label.SOLID).reshape(height, width)
     sky = sky_pixels(view.plate, camera)[row, col].reshape(height, width)
-    # the rim of a rock's picture is mixed with what is behind it
-    painted_well = cv2.erode(painted.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    painted_well = _without_rim(view.labels == Label.SOLID)[row, col].reshape(height, width)
+    seen = view.seen[row, col].reshape(height, width)
     z_ground, z_water = (points[:, 2].reshape(height, width) for points in (ground, surface))
     rock = _feet(rock, z_ground, z_water, texel)
     wet = (z_ground < z_water) & ~rock
@@ -218,8 +228,10 @@ def _map(top: np.ndarray, level: np.ndarray, view: View, texel: float) -> _Map:
     lies = looked_up(_lying(1.0 / np.sqrt(1.0 + steps[0] ** 2 + steps[1] ** 2)), True) > 0.5
     drowned, wall = wet & lies, wet & ~lies
     known = inside.reshape(height, width) & ~hidden & ~sky & np.where(rock, painted_well, ~painted)
-    known &= ~drowned | view.seen[row, col].reshape(height, width)
-    return _Map(image.astype(np.float32), known, rock, drowned, wall)
+    known &= wall | rock | seen  # a pixel that always shows fluid shows neither bed nor bank
+    slopes = np.gradient(z_ground, texel)
+    level_there = _lying(1.0 / np.sqrt(1.0 + slopes[0] ** 2 + slopes[1] ** 2))
+    return _Map(image.astype(np.float32), known, rock, drowned, wall, level_there)
 
 
 def sky_pixels(plate: UInt8[np.ndarray, "h w 3"], camera: PinholeCamera) -> Bool[np.ndarray, "h w"]:
@@ -248,6 +260,17 @@ def sky_pixels(plate: UInt8[np.ndarray, "h w 3"], camera: PinholeCamera) -> Bool
     core = cv2.dilate(core, square)
     parts = cv2.connectedComponents(core, connectivity=4)[1]
     return cv2.dilate(((core > 0) & np.isin(parts, parts[0][core[0] > 0])).astype(np.uint8), square) > 0
+
+
+def _without_rim(rock: np.ndarray) -> np.ndarray:
+    """bool [h,w]: the pixels of rocks without those that are mixed with what is beside them, `MIXED` of them; of a
+    rock of which nothing would be left, without one."""
+    parts, count = ndimage.label(rock)
+    square = np.ones((3, 3), np.uint8)
+    well, little = (cv2.erode(rock.astype(np.uint8), square, iterations=k) > 0 for k in (MIXED, 1))
+    large = np.zeros(count + 1, bool)
+    large[parts[well]] = True
+    return np.where(large[parts], well, little)
 
 
 def _feet(rock: np.ndarray, height: np.ndarray, level: np.ndarray, texel: float) -> np.ndarray:
@@ -289,18 +312,35 @@ def hidden_ground(top: Float[np.ndarray, "nx ny 3"], eye: Float[np.ndarray, "3"]
 
 
 def _continued(found: _Map) -> np.ndarray:
-    """Unknown texels from the known ones: rock from rock, the bed from itself and its rim, dry ground from dry."""
+    """Unknown texels from the known ones: rock from rock, the bed from itself and its rim, dry ground from dry.
+
+    Each goes on in its evened-out colours with its grain. Under water what goes on as rock runs into what goes on as
+    bed: nobody has seen a line between them.
+    """
     dry = ~found.rock & ~found.drowned & ~found.wall
     out = found.image
     bed = _of_the_bed(found, dry)
-    for part, beside in ((found.rock, found.rock), (found.drowned, bed), (found.wall, found.wall), (dry, dry)):
+    for part, beside in ((found.drowned, bed), (found.rock, found.rock), (found.wall, found.wall), (dry, dry)):
         source = found.known & beside
         hole = part & ~source
         if not source.any():
             source = found.known
         if hole.any() and source.any():
-            out = np.where(hole[..., None], _filled(found.image, source), out)
+            weight = hole.astype(np.float32)
+            least = LEAST
+            if part is found.rock:
+                weight, least = _blurred_into(hole, found.drowned), 0.0
+            filling = _filled(found, source, least)
+            out = np.where(weight[..., None] > 0.0, out + weight[..., None] * (filling - out), out)
     return out
+
+
+def _blurred_into(hole: np.ndarray, beside: np.ndarray) -> np.ndarray:
+    """Weight of a hole's filling, float32 [h,w]: 1 in it, and less and less over what lies beside it."""
+    sigma = SOFT * max(hole.shape)
+    both = cv2.GaussianBlur((hole | beside).astype(np.float32), (0, 0), sigma)
+    soft = cv2.GaussianBlur(hole.astype(np.float32), (0, 0), sigma) / np.maximum(both, 1e-6)
+    return np.where(hole, 1.0, np.where(beside, np.minimum(2.0 * soft, 1.0), 0.0)).astype(np.float32)
 
 
 def _of_the_bed(found: _Map, dry: np.ndarray) -> np.ndarray:
@@ -320,10 +360,13 @@ def _of_the_bed(found: _Map, dry: np.ndarray) -> np.ndarray:
     return usual & (found.drowned | (dry & near))
 
 
-def _filled(image: np.ndarray, source: np.ndarray) -> np.ndarray:
-    """Evened-out colours of the source everywhere."""
+def _filled(found: _Map, source: np.ndarray, least: float) -> np.ndarray:
+    """Evened-out colours of the source everywhere, with its grain where the ground lies, and `least` of it on a
+    wall, where it is drawn out."""
     sigma = EVEN * max(source.shape)
-    return cv2.GaussianBlur(filled_in(_mean(image, source, sigma), source), (0, 0), 0.5 * sigma)
+    mean = _mean(found.image, source, sigma)
+    fine = np.maximum(found.level, least)[..., None] * grain(found.image, mean, source)
+    return cv2.GaussianBlur(filled_in(mean, source), (0, 0), 0.5 * sigma) + fine
 
 
 def _mean(image: np.ndarray, source: np.ndarray, sigma: float) -> np.ndarray:

@@ -15,7 +15,7 @@ from fluidlift.pipeline.settings import ShowSettings
 from fluidlift.pipeline.work import Work
 from fluidlift.present.as_filmed import BEYOND, Reel, card_of_run
 from fluidlift.present.frames import FrameRenderer, SimulatedFrame
-from fluidlift.present.front_view import open_end, to_bytes
+from fluidlift.present.front_view import slab_of, to_bytes
 from fluidlift.present.looks import Painter
 from fluidlift.scene.build import Scene
 from fluidlift.scene.footage import Footage
@@ -113,7 +113,7 @@ def _painter(scene: Scene, folder: Path, look: Look | None) -> Painter | None:
     """Of another look than the splats' own."""
     if look is None or look.style == "splats":
         return None
-    return Painter(look, scene.terrain, folder, kind=scene.kind, end=open_end(scene))
+    return Painter(look, scene.terrain, folder, kind=scene.kind, slab=slab_of(scene))
 
 
 def _panels(

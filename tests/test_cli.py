@@ -385,6 +385,19 @@ def test_inspect_tells_what_a_clip_is(stream_clip, capsys):
     assert "frame count" in capsys.readouterr().out
 
 
+def test_inspect_warns_of_what_make_warns_of_in_the_frames(stream_clip, tmp_path, capsys, clip_file):
+    frames = read_clip(stream_clip).frames
+    cut = clip_file(tmp_path / "cut.mp4", np.concatenate([frames, 255 - frames[:, ::-1]]))
+    assert main(["inspect", str(cut), "--json"]) == WITH_WARNINGS
+    info = json.loads(capsys.readouterr().out)
+    assert "clip-cut-short" in info["warning_codes"] and info["camera"].startswith("the camera ")
+    assert main(["inspect", str(cut), "--header-only"]) == DONE
+    assert "clip-cut-short" not in capsys.readouterr().out
+    long = clip_file(tmp_path / "long.mp4", np.tile(frames, (61, 1, 1, 1)))
+    assert main(["inspect", str(long)]) == WITH_WARNINGS
+    assert "make would not take it as it is" in capsys.readouterr().out
+
+
 def test_mask_writes_pictures_that_make_accepts(stream_clip, tmp_path, capsys, hasty):
     found = tmp_path / "found"
     assert main(["mask", str(stream_clip), "-o", str(found)]) in (DONE, WITH_WARNINGS)

@@ -18,7 +18,7 @@ from fluidlift.io.hints_file import (
     require_same_clip,
     write_hints,
 )
-from fluidlift.types.hints import Click, ClipHints, ClipIdentity, Region, Rim, Ruler
+from fluidlift.types.hints import Arrow, Click, ClipHints, ClipIdentity, Region, Rim, Ruler
 
 CLIP = {"name": "river.mp4", "size": [640, 360], "frames": 75}
 ALL = ClipHints(
@@ -38,6 +38,8 @@ ALL = ClipHints(
     ),
     clicks=(Click((64.0, 48.0), True), Click((3.0, 4.0), False)),
     roi=(0.0, 10.0, 600.0, 300.0),
+    flow=(Arrow((100.0, 200.0), (160.0, 220.0)), Arrow((300.0, 200.0), (360.0, 190.0))),
+    level=((50.0, 90.0), (600.0, 88.0)),
 )
 
 
@@ -68,7 +70,13 @@ def test_a_region_stands_in_one_line():
         ({"kind": "soup"}, "kind = soup"),
         ({"ledge": [[1, 2], [3, 4]]}, "is: ledge, area"),
         ({"pool": [[1, 2], [3, 4]]}, "is: pool, area"),
-        ({"flow": []}, "nothing uses it yet"),
+        ({"flow": [[1, 2, 3, 4]]}, r"flow\[1\] is no mapping"),
+        ({"flow": [{"at": [1, 2]}]}, r"flow\[1\].to = None"),
+        ({"flow": [{"at": [1, 2], "to": [2, 2]}]}, r"flow\[1\] has no direction"),
+        ({"flow": [{"at": [1, 2], "to": [9, 2], "speed": 3}]}, r"unknown entry 'flow\[1\].speed'"),
+        ({"flow": {"at": [1, 2], "to": [9, 2]}}, "flow is no list"),
+        ({"level": [[1, 2], [3, 4], [5, 6]]}, "3 points of a level"),
+        ({"level": [[5, 1], [5, 200]]}, "two points beside each other"),
         ({"horizon": [[0, 1], [10, 2], [20, 3]]}, "one horizon: two points"),
         ({"horizon": [[5, 1], [5, 200]]}, "two points beside each other"),
         ({"ruler": {"from": [0, 0], "to": [1, 0], "metres": 1}}, "at least 2 px apart"),
@@ -97,8 +105,9 @@ def test_two_horizons_are_refused(tmp_path):
 
 
 def test_points_need_the_size_that_they_are_counted_in():
-    with pytest.raises(InputRejected, match="without the size of the picture"):
-        parse_hints({"hints": 1, "horizon": [[0, 1], [9, 1]]})
+    for drawn in ({"horizon": [[0, 1], [9, 1]]}, {"flow": [{"at": [0, 1], "to": [9, 1]}]}, {"level": [[0, 1], [9, 1]]}):
+        with pytest.raises(InputRejected, match="without the size of the picture"):
+            parse_hints({"hints": 1} | drawn)
 
 
 def test_a_file_that_is_no_hints_file_is_told():
@@ -133,6 +142,7 @@ def test_hints_lie_beside_their_clip(tmp_path):
 def test_points_follow_the_picture_and_another_shape_is_refused():
     half = ALL.at((320, 180))
     assert half.horizon == ((-10.0, 50.25), (350.0, 48.0))
+    assert half.flow[0] == Arrow((50.0, 100.0), (80.0, 110.0)) and half.level == ((25.0, 45.0), (300.0, 44.0))
     assert half.regions[1].width == 3.0 and half.rims[0].axes == (40.0, 15.0)
     assert half.clip.sha256 == ALL.clip.sha256
     with pytest.raises(InputRejected, match="640 x 360 picture for a clip of 320 x 320"):

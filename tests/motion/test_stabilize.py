@@ -53,6 +53,14 @@ def test_a_still_camera_is_left_alone():
     assert report.shake_px < 0.05 and report.drift_px < 0.05 and report.cuts == () and report.warnings == ()
 
 
+def test_the_path_of_the_camera_is_told_as_it_went():
+    places = np.linspace(0, 12, FRAMES)[:, None] * np.array([[-1.0, 0.25]])  # `places` shift the picture
+    _, report = stabilise(clip_of(shaken(places)))
+    went = report.path - report.path[0]
+    assert went == pytest.approx(-(places - places[0]), abs=0.4)
+    assert np.abs(report.path).min() < 0.1  # it is told from the frame that all are laid on
+
+
 def test_a_mild_shake_is_measured_and_taken_out():
     places = np.random.default_rng(1).normal(scale=1.2, size=(FRAMES, 2))
     steady, report = stabilise(clip_of(shaken(places)))

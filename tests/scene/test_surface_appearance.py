@@ -53,6 +53,13 @@ def test_later_frames_hold_all_particles_and_the_skin_over_them(channel):
     np.testing.assert_allclose(shown.velocities[skin][:, 0].mean(), 0.6, rtol=0.2)
 
 
+def test_how_many_splats_a_frame_has_is_known_before_it_is_simulated(channel):
+    for scene in (channel(FRAMES), channel(FRAMES, kind="fall")):
+        expected = SurfaceAppearance(scene).splats
+        appearance, p = played(scene, 3)
+        assert expected == pytest.approx(len(appearance.dressed(p, 2).ids), rel=0.1)
+
+
 def test_what_falls_or_rises_and_what_is_turned_on_its_side_has_no_skin(channel):
     turned = channel(FRAMES, parameters=FluidParameters(inflow_velocity=(0.6, 0.0, 0.0), gravity=(0.0, 9.81, 0.0)))
     for scene in (channel(FRAMES, kind="fall"), turned):

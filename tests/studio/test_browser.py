@@ -1,5 +1,6 @@
 """The studio as a person uses it, in a real browser: drop, look, draw, drag, undo, make, shelf."""
 
+import base64
 import time
 from importlib.util import find_spec
 from pathlib import Path
@@ -131,6 +132,74 @@ def test_a_rim_is_drawn_and_moved_by_its_handles(visit):
     assert visit.desk.history.hints.rims[0].center == pytest.approx((0.4 * w, 0.4 * h), abs=2.0)
 
 
+def test_an_arrow_that_was_found_is_turned_by_its_head_and_moved_by_its_tail(visit):
+    visit.page.keyboard.press("f")
+    w, h = visit.desk.info["size"]
+    found = [x for x in visit.page.evaluate("window.studio.handles()") if x["kind"] == "arrow-found"]
+    assert len(found) > 3
+    arrow = min(found, key=lambda x: abs(x["from"][0] / w - 0.5) + abs(x["from"][1] / h - 0.5))
+    (ax, ay), (bx, by) = arrow["from"], arrow["at"]
+    visit.drag((bx / w, by / h), ((2 * ax - bx) / w, (2 * ay - by) / h))
+    visit.until(lambda: len(visit.desk.history.hints.flow) == 1, "the arrow")
+    said = visit.desk.history.hints.flow[0]
+    assert said.at == pytest.approx((ax, ay), abs=0.2) and said.to == pytest.approx((2 * ax - bx, 2 * ay - by), abs=2.0)
+    visit.looked()
+    near = min(visit.desk.looking.look.facts["flow"], key=lambda a: abs(a["at"][0] - ax) + abs(a["at"][1] - ay))
+    assert (near["to"][0] - near["at"][0]) * (bx - ax) + (near["to"][1] - near["at"][1]) * (by - ay) < 0
+    visit.says("arrow 1 of the flow")
+    visit.shown()
+    visit.drag((ax / w, ay / h), (ax / w + 0.1, ay / h))
+    visit.until(lambda: visit.desk.history.hints.flow[0].at[0] > ax + 0.05 * w, "the arrow elsewhere")
+    assert len(visit.desk.history.hints.flow) == 1
+    visit.press("Undo")
+    visit.press("Undo")
+    visit.until(lambda: visit.desk.history.hints.flow == (), "no arrow")
+
+
+def test_a_new_arrow_and_a_level_line_are_drawn_and_taken_back_by_their_lines(visit):
+    visit.page.keyboard.press("f")
+    w, _ = visit.desk.info["size"]
+    visit.drag((0.02, 0.02), (0.1, 0.02))  # where no arrow was found
+    visit.until(lambda: len(visit.desk.history.hints.flow) == 1, "the arrow")
+    assert visit.desk.history.hints.flow[0].direction == pytest.approx((1.0, 0.0), abs=0.05)
+    visit.page.get_by_label("take back: arrow 1 of the flow").click()
+    visit.until(lambda: visit.desk.history.hints.flow == (), "no arrow")
+    visit.page.keyboard.press("l")
+    visit.drag((0.1, 0.5), (0.9, 0.5))
+    visit.until(lambda: visit.desk.history.hints.level is not None, "the level line")
+    visit.shown()
+    visit.drag((0.9, 0.5), (0.9, 0.6))
+    visit.until(lambda: visit.desk.history.hints.level[1][1] > visit.desk.history.hints.level[0][1] + 2, "it is tilted")
+    visit.looked()
+    assert abs(visit.desk.looking.look.facts["roll"]) > 1.0 and visit.desk.history.hints.level[1][0] > 0.8 * w
+
+
+def test_a_ledge_that_runs_uphill_is_told_in_the_picture_with_the_way_out(visit):
+    visit.page.keyboard.press("a")
+    visit.page.get_by_label("what is there").select_option("ledge")
+    for place in ((0.3, 0.3), (0.7, 0.3), (0.7, 0.8), (0.3, 0.8)):
+        visit.page.mouse.click(*visit.at(*place))
+    visit.page.keyboard.press("Enter")
+    visit.until(lambda: len(visit.desk.history.hints.regions) == 1, "the ledge")
+    visit.page.keyboard.press("f")
+    visit.shown()
+    visit.desk.change(lambda history: history.change({"add": "flow", "item": arrow_up(visit.desk)}))
+    visit.says("ledge 1 runs uphill: arrow 1 of the flow points up it")
+    visit.page.get_by_label("take back: arrow 1 of the flow").click()
+    visit.until(lambda: not visit.desk.looking.look.error, "the end of the trouble")
+
+
+def arrow_up(desk):
+    w, h = desk.info["size"]
+    return {"at": [0.5 * w, 0.7 * h], "to": [0.5 * w, 0.4 * h]}
+
+
+def test_what_is_known_of_the_camera_and_the_parts_stands_beside_the_picture(visit):
+    visit.says("stands still")
+    rows = visit.page.locator("#found tr").all_inner_texts()
+    assert any(row.startswith("Slope") for row in rows) and any(row.startswith("Camera") for row in rows)
+
+
 def test_strokes_that_leave_no_fluid_are_told_with_the_way_back(visit):
     visit.page.keyboard.press("a")
     visit.page.get_by_label("what is there").select_option("not fluid")
@@ -190,6 +259,44 @@ def test_a_file_that_is_no_clip_is_refused_in_the_page(visit, tmp_path):
     visit.says("broken.mp4")
     visit.page.get_by_label("clip", exact=True).select_option("stream.mp4")
     visit.looked()
+
+
+DROP = """([name, data]) => {
+  const bytes = Uint8Array.from(atob(data), (c) => c.charCodeAt(0)), carried = new DataTransfer();
+  carried.items.add(new File([bytes], name, { type: "video/mp4" }));
+  const stage = document.getElementById("stage");
+  for (const kind of ["dragenter", "dragover", "drop"])
+    stage.dispatchEvent(new DragEvent(kind, { dataTransfer: carried, bubbles: true, cancelable: true }));
+}"""
+
+
+def test_a_clip_is_dropped_on_the_picture(visit, stream_clip):
+    visit.page.evaluate(DROP, ["dropped.mp4", base64.b64encode(stream_clip.read_bytes()).decode()])
+    visit.until(lambda: visit.desk.clip is not None and visit.desk.clip.name == "dropped.mp4", "the clip")
+    assert (visit.desk.folder / "dropped.mp4").read_bytes() == stream_clip.read_bytes()
+    assert "over" not in (visit.page.locator("#stage").get_attribute("class") or "")
+    visit.looked()
+    visit.page.get_by_label("clip", exact=True).select_option("stream.mp4")
+    visit.looked()
+
+
+def test_a_page_that_is_closed_in_the_middle_of_a_make_does_not_end_it(visitor, served, window):
+    other = visitor(served)
+    other.tab("Make")
+    other.page.locator("#make").click()
+    other.until(lambda: len(served.desk.making.state.finished) >= 1, "the first stage")
+    other.page.close()
+    window.page.wait_for_timeout(300)
+    state = served.desk.making.state
+    assert state.running or state.outcome.startswith("made"), state
+    window.until(lambda: len(served.desk.making.state.finished) >= 2, "the next stage")
+    again = visitor(served)
+    again.tab("Make")
+    again.says("read:")
+    again.page.close()
+    served.desk.making.stop()
+    window.until(lambda: not served.desk.making.state.running, "the stop")
+    assert window.complaints == []
 
 
 def test_make_can_be_stopped_goes_on_and_lies_on_the_shelf(visit):

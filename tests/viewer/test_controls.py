@@ -5,12 +5,12 @@ import pytest
 
 from fluidlift.types import FluidParameters
 from fluidlift.types.parameters import Estimate
-from fluidlift.viewer.controls import INFLOW, WHOLE, controls_of, direction, number, path_of, turned
+from fluidlift.viewer.controls import INFLOW, WHITEWATER, WHOLE, controls_of, direction, number, path_of, turned
 
 FITTED = FluidParameters(
     kinematic_viscosity=3e-5, gravity=(0.2, 0.1, -9.7), inflow_velocity=(0.4, 0.0, -0.1), wall_damping=0.3
 )
-VALUES = FITTED.to_dict() | {INFLOW: 1.0}
+VALUES = FITTED.to_dict() | {INFLOW: 1.0, WHITEWATER: 0.0}
 
 
 def control(key, fitted=FITTED, kind="stream"):
@@ -23,7 +23,7 @@ def control(key, fitted=FITTED, kind="stream"):
 )
 def test_every_fitted_value_is_inside_its_range_and_under_the_mark_of_its_slider(kind, fitted):
     for c in controls_of(fitted, kind):
-        value = c.read(fitted.to_dict() | {INFLOW: 1.0})
+        value = c.read(fitted.to_dict() | {INFLOW: 1.0, WHITEWATER: 0.0})
         assert c.low <= value <= c.high
         assert c.value_of(c.slider_of(c.fitted)) == c.fitted
         assert c.unit in c.told(value) and c.range_told()
@@ -53,7 +53,7 @@ def test_what_a_control_writes_it_reads_again_and_parameters_accept_it(c):
         written = c.write(VALUES, value)
         if c.key != "gravity_heading":
             assert c.read(VALUES | written) == pytest.approx(value, rel=1e-3, abs=2e-2)
-        FITTED.updated({k: v for k, v in written.items() if k != INFLOW})
+        FITTED.updated({k: v for k, v in written.items() if k not in (INFLOW, WHITEWATER)})
 
 
 def test_gravity_keeps_its_strength_when_it_is_tilted_and_its_direction_when_it_is_stronger():
@@ -114,7 +114,7 @@ def test_numbers_are_told_as_a_person_writes_them(value, text):
 def test_a_number_and_its_unit_stay_in_one_line(c):
     from fluidlift.viewer.panel_fluid import _label
 
-    amount = _label(c, c.fitted).removeprefix(f"{c.label} ").removeprefix("(10^x) ")
+    amount = _label(c, c.fitted).removeprefix(f"{c.label} ")
     assert amount and not set(amount) & set(" /-._")  # viser lets a line end behind each of these
     read = amount
     for old, new in WHOLE.items():
@@ -136,4 +136,7 @@ def test_what_was_not_fitted_is_not_called_so():
     assert found["kinematic_viscosity"].hint.endswith("fitted to the motion; 95 %: 4e-7 to 3e-6 m^2/s")
     assert (found["density"].origin, found["gravity"].origin, found[INFLOW].origin) == ("prior", "given", "fitted")
     assert found["density"].hint.endswith("prior, not determined by the clip")
+    assert found["density"].known == "1000 kg/m^3; prior, not determined by the clip"
+    assert found["kinematic_viscosity"].known == "1e-6 m^2/s (95 %: 4e-7 to 3e-6 m^2/s); fitted to the motion"
+    assert found[WHITEWATER].known == "" and found[WHITEWATER].fitted == 0.0
     assert found["surface_tension"].origin == "lifted"

@@ -355,18 +355,9 @@ def _pair(text: str | None, mark: str, option: str, example: str) -> tuple[int, 
 
 
 def _inspect(c: Inspect) -> int:
-    from fluidlift.io.video import probe
+    from fluidlift.cli.inspect import run
 
-    info = probe(c.clip, fps=c.fps).to_dict()
-    if c.json:
-        print(json.dumps(info, indent=1, default=str))
-        return DONE
-    for name, value in info.items():
-        if name not in ("warnings", "warning_codes"):
-            print(f"{name.replace('_', ' '):16} {value}")
-    for text in info.get("warnings", ()):
-        print(f"warning: {text}")
-    return WITH_WARNINGS if info.get("warnings") else DONE
+    return WITH_WARNINGS if run(c) else DONE
 
 
 LONGEST = {"read.max_frames": 20_000}

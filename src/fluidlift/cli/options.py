@@ -253,12 +253,14 @@ class Export:
 
 @command
 class Inspect:
-    """Tell what a clip is, and what would be warned about."""
+    """Tell what a clip is, and what `make` would warn of when it reads it: shake, cuts, repeated frames and more."""
 
     clip: Clip
     """a video, a folder of pictures or a pattern"""
     fps: float | None = None
     """frames per second of an image sequence"""
+    header_only: bool = False
+    """read the header alone, at once; else its frames are looked at as `make` would"""
     json: bool = False
     """print as JSON"""
 

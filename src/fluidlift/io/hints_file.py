@@ -15,21 +15,21 @@ from fluidlift.errors import InputRejected
 from fluidlift.io.atomic import plain, write_bytes
 from fluidlift.io.sequences import is_sequence, list_sequence
 from fluidlift.io.yaml_reader import read_yaml
-from fluidlift.types.hints import Click, ClipHints, ClipIdentity, Point, Region, Rim, Ruler, What
+from fluidlift.types.hints import Arrow, Click, ClipHints, ClipIdentity, Point, Region, Rim, Ruler, What
 from fluidlift.types.kind import KINDS
 
 VERSION = 1
 MOST = 400
-"""regions, clicks or rims of a file"""
+"""regions, clicks, rims or arrows of a file"""
 MOST_POINTS = 2000
 """of one region"""
 FARTHEST = 1e6
 """px: a horizon outside the picture is still within this"""
 INSTEAD = {
-    "level": "mark the pool as a region: {is: pool, area: ...}", "pool": "mark it as a region: {is: pool, area: ...}",
-    "ledge": "mark what falls as a region: {is: ledge, area: ...}", "flow": "leave it out: nothing uses it yet",
+    "pool": "mark it as a region: {is: pool, area: ...}",
+    "ledge": "mark what falls as a region: {is: ledge, area: ...}",
 }  # fmt: skip
-"""what a person could write for something that is said elsewhere, or that nothing uses yet, and what to do"""
+"""what a person could write for something that is said elsewhere, and what to do"""
 FOUND = "found"
 """what `fluidlift hints` found; it is there to be looked at and copied from, and is not read"""
 HEAD = """\
@@ -86,11 +86,14 @@ def parse_hints(data: Any, name: str = "hints.yaml") -> ClipHints:
         regions=top.several("regions", _region),
         clicks=top.several("clicks", _click),
         roi=top.part("roi", _box),
+        flow=top.several("flow", _arrow),
+        level=top.part("level", _level),
     )
     top.data.pop(FOUND, None)
     top.nothing_else()
-    drawn = (found.horizon, found.ruler, found.roi)
-    if found.clip is None and (any(d is not None for d in drawn) or found.rims or found.regions or found.clicks):
+    drawn = (found.horizon, found.ruler, found.roi, found.level)
+    several = (found.rims, found.regions, found.clicks, found.flow)
+    if found.clip is None and (any(d is not None for d in drawn) or any(several)):
         raise top.refused(
             "points without the size of the picture that they are px of", "clip: {size: [width, height]}",
             "let fluidlift hints CLIP write it",
@@ -120,6 +123,10 @@ def hints_data(hints: ClipHints) -> dict[str, Any]:
         data["clicks"] = [{"at": _rounded(c.at), "fluid": c.fluid} for c in hints.clicks]
     if hints.roi is not None:
         data["roi"] = _rounded(hints.roi)
+    if hints.flow:
+        data["flow"] = [{"at": _rounded(a.at), "to": _rounded(a.to)} for a in hints.flow]
+    if hints.level is not None:
+        data["level"] = [_rounded(p) for p in hints.level]
     return data
 
 
@@ -300,6 +307,19 @@ def _identity(entry: _Entry, place: str, value: Any) -> ClipIdentity:
 def _horizon(entry: _Entry, place: str, value: Any) -> tuple[Point, Point]:
     if isinstance(value, list) and len(value) > 2:
         raise entry.refused(f"{len(value)} points of a horizon", "one horizon: two points", "leave the others out")
+    return _two_beside(entry, place, value)
+
+
+def _level(entry: _Entry, place: str, value: Any) -> tuple[Point, Point]:
+    if isinstance(value, list) and len(value) > 2:
+        raise entry.refused(
+            f"{len(value)} points of a level", "two points along the edge of still water", "leave the others out"
+        )
+    return _two_beside(entry, place, value)
+
+
+def _two_beside(entry: _Entry, place: str, value: Any) -> tuple[Point, Point]:
+    """Two points of a line across the picture, the left one first."""
     if not isinstance(value, list) or len(value) != 2:
         raise entry.refused(f"{place} = {str(value)[:60]}", "two points of it, such as [[0, 120], [640, 112]]")
     ends = []
@@ -356,6 +376,15 @@ def _click(e: _Entry) -> Click:
     if fluid is None:
         raise e.refused(f"{e.place} does not say what is there", "fluid: true or false")
     return Click(at, fluid)
+
+
+def _arrow(e: _Entry) -> Arrow:
+    at, to = e.point("at"), e.point("to")
+    if math.dist(at, to) < 2.0:
+        raise e.refused(
+            f"{e.place} has no direction", "'at' (where the fluid is) and 'to' (where it runs) 2 px apart or more"
+        )
+    return Arrow(at, to)
 
 
 def _box(entry: _Entry, place: str, value: Any) -> tuple[float, float, float, float]:

@@ -50,6 +50,9 @@ class ShakeReport:
     runs: tuple[tuple[int, int], ...]
     """first frame and end of what can be used of each shot: where the camera moved on, that is a part of it"""
     warnings: tuple[Notice, ...] = ()
+    path: np.ndarray | None = None
+    """[T,2] px from the middle of the picture that its shot is laid on: where the middle of each frame lies on it;
+    None: it was not looked for"""
 
 
 class GreyFrames(Sequence[np.ndarray]):
@@ -91,11 +94,18 @@ def stabilise(
     warnings: list[Notice] = []
     if blind:
         warnings.append(
-            Notice("camera-not-seen", f"no features that stay, to see the camera by, in {blind} frames: assumed still")
+            Notice(
+                "camera-not-seen",
+                f"in {blind} frames nothing is seen that stands still and has edges, so whether the camera moved is "
+                "not known: it is taken to stand still, and if it did not, its motion counts as the fluid's. Where it "
+                "was on a tripod nothing is lost; else use a part of the clip that shows more of what stands around "
+                "(--start, --duration)",
+            )
         )
     shake, drift = shake_and_drift(motions, width, height, cuts)
     if shake <= STEADY_PX and drift <= STEADY_DRIFT_PX:
-        return clip, ShakeReport(shake, drift, False, cuts, shots, tuple(warnings))
+        path = path_of(motions, clip.size)
+        return clip, ShakeReport(shake, drift, False, cuts, shots, tuple(warnings), path)
     runs, laid = [], motions.copy()
     for first, last in shots:
         begin, end, reference = steady_run(motions[first:last], clip.size, least_overlap)
@@ -116,14 +126,26 @@ def stabilise(
                     "what is near still moves",
                 )
             )
-        return steady, ShakeReport(shake, drift, True, cuts, tuple(runs), tuple(warnings))
+        return steady, ShakeReport(shake, drift, True, cuts, tuple(runs), tuple(warnings), path_of(laid, clip.size))
     warnings.append(
         Notice(
             "camera-motion-unclear",
             f"a camera motion of {shake:.1f} px per frame does not read the same twice: not corrected",
         )
     )
-    return clip, ShakeReport(shake, drift, False, cuts, shots, tuple(warnings))
+    return clip, ShakeReport(shake, drift, False, cuts, shots, tuple(warnings), path_of(laid, clip.size))
+
+
+def path_of(motions: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """float64 [T,2], px from the middle of the common picture: where the middle of each frame lies on it.
+
+    Args:
+        motions: [T,2,3], of each frame from that picture.
+        size: width, height, px.
+    """
+    middle = 0.5 * np.asarray(size, float)
+    backs = [inverse(motion) for motion in motions]
+    return np.array([back[:, :2] @ middle + back[:, 2] - middle for back in backs]).reshape(-1, 2)
 
 
 def steady_run(motions: np.ndarray, size: tuple[int, int], least_overlap: float) -> tuple[int, int, int]:

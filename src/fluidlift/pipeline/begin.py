@@ -5,7 +5,7 @@ from __future__ import annotations
 from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected
 from fluidlift.pipeline import depths, given_body
-from fluidlift.pipeline.hints import NO_HINTS, Hints, require_no_contradiction
+from fluidlift.pipeline.hints import NO_HINTS, Hints, require_no_contradiction, require_possible
 from fluidlift.pipeline.inputs import GivenFiles
 from fluidlift.pipeline.runner import Runner
 from fluidlift.pipeline.settings import (
@@ -60,6 +60,7 @@ def look(
     clip = runner.run("read", read, given.clip, given.camera, taken(ReadSettings, config.read))
 
     drawn = said.at(clip.clip.size)
+    require_possible(drawn, clip.clip.size)
     if drawn.roi is not None or drawn.clicks:
         hints = Hints.drawn(drawn)
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -17,10 +16,12 @@ from fluidlift.io.hints_file import content_hash
 from fluidlift.io.video import probe
 from fluidlift.messages import Notice, as_plain
 from fluidlift.pipeline import begin
+from fluidlift.pipeline.found_parts import Line, Part, lines_of, outlines, parts_of
 from fluidlift.pipeline.inputs import GivenFiles, Inputs
 from fluidlift.pipeline.runner import Runner
-from fluidlift.pipeline.settings import GeometrySettings, GivenView
+from fluidlift.pipeline.settings import GeometrySettings, GivenView, ReadSettings, taken
 from fluidlift.pipeline.sight import sighted
+from fluidlift.pipeline.stages.read import read
 from fluidlift.pipeline.work import Work
 from fluidlift.seams import Progress, Silence
 from fluidlift.shape.frame_pictures import typical_picture
@@ -36,10 +37,10 @@ ARROWS = 9
 """along the longer side of the picture, of which those on the fluid are told"""
 LEAST_TRUST = 0.3
 """of the mean flow at an arrow"""
-CORNERS = 0.004
-"""of the longer side: how far an outline may be from the mask's"""
-SMALLEST = 0.002
-"""of the picture: pieces of the mask whose outline is told"""
+PATH_POINTS = 60
+"""of the camera's path that are told"""
+STILL_PX = 1.0
+"""camera motion below this (`motion.stabilize.STEADY_DRIFT_PX`) counts as none"""
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,12 @@ class View:
     """px per frame"""
     mean_confidence: Float[np.ndarray, "h w"]
     rest_frame: int
+    parts: tuple[Part, ...] = ()
+    lines: tuple[Line, ...] = ()
+    level_share: float | None = None
+    """probability that a stream runs level; None: nothing was asked"""
+    slope: float = 0.0
+    """degrees that it falls along its way"""
     warnings: tuple[Notice, ...] = ()
 
 
@@ -70,10 +77,11 @@ def view(
         InputRejected: as `pipeline.sight.sighted`.
     """
     s = sighted(read, flow, segmentation, given, config, work=work)
-    seen = s.seen
+    seen, slope = s.seen, s.front.slope
     return View(
         seen.kind.name, seen.evidence, s.up, s.scale, s.sentence, s.canonical, seen.mask, np.asarray(seen.motion),
-        np.asarray(seen.trust), seen.start, tuple(s.warnings),
+        np.asarray(seen.trust), seen.start, parts_of(s), lines_of(s), None if slope is None else slope.level_share,
+        0.0 if slope is None else slope.slope, tuple(s.warnings),
     )  # fmt: skip
 
 
@@ -90,7 +98,7 @@ class Found:
     def facts(self) -> dict[str, Any]:
         """Plain data for the section `found` of a hints file, in px of the clip's own picture."""
         g, (width, height) = self.view, self.read.clip.size
-        k = self.identity.size[0] / width
+        k = self.scaling
         up = replace(g.up, pitch=g.up.pitch - g.up.raised)  # as it was seen, not as a relief is built
         scores = sorted(g.kind_evidence.scores.items(), key=lambda item: -item[1])
         level = level_camera(g.camera, up)
@@ -111,13 +119,21 @@ class Found:
                 {"center": _px(r.center, k), "axes": _px(r.axes, k), "turned": round(_turned(r.covariance), 1)}
                 for r in find_rims(self._typical())
             ],
-            "fluid_share": round(self.segmentation.fluid_share, 4),
-            "fluid_sure": round(self.segmentation.confidence_mean, 2),
+            "parts": [_part_data(part, k) for part in g.parts],
+            "lines": [{"is": line.what, "line": [_px(p, k) for p in line.points]} for line in g.lines],
+            "camera": camera_facts(self.read, self.identity.size),
+            **_slope_facts(g),
+            **fluid_facts(self.segmentation),
             "mask": [
                 {"is": "fluid", "area": [_px(p, k) for p in line], "time": round(float(self.read.clip.times[frame]), 4)}
                 for line in outlines(np.asarray(self.segmentation.labels.labels[frame]) == Label.FLUID)
             ],
         } | as_plain(self.warnings)
+
+    @property
+    def scaling(self) -> float:
+        """px of the clip's own picture per px of the working one."""
+        return self.identity.size[0] / self.read.clip.size[0]
 
     def _typical(self) -> np.ndarray:
         frames = self.read.clip.frames
@@ -132,7 +148,50 @@ class Found:
             f"the camera looks {g.up.pitch:.0f} ± {g.up.error:.0f} degrees below the horizon (from {g.up.source})",
             g.scale_sentence,
             f"fluid covers {100 * self.segmentation.fluid_share:.0f} % of the picture",
+            camera_facts(self.read, self.identity.size)["words"],
+            *(f"{part.what}: {part.probability:.2f}" for part in g.parts[1:]),
         ]
+
+
+def camera_facts(read: Read, size: tuple[int, int]) -> dict[str, Any]:
+    """How the camera moved, in px of a picture of `size`: in words, how far, and where it looked over time.
+
+    The path is that of the picture's middle on the picture that all frames are laid on.
+    """
+    k, moved = size[0] / read.clip.size[0], read.moved_px
+    if read.path is None:
+        return {"words": "whether the camera moves was not asked", "moves": None}
+    if moved <= STILL_PX and read.shake_px <= STILL_PX:
+        return {"words": "the camera stands still", "moves": 0.0}
+    done = "taken out" if read.stabilised else "left as it is"
+    pick = np.unique(np.linspace(0, len(read.path) - 1, min(len(read.path), PATH_POINTS)).round().astype(int))
+    middle = 0.5 * np.asarray(size, float)
+    return {
+        "words": f"the camera moves by {k * moved:.0f} px, and shakes by {k * read.shake_px:.1f} px per frame: {done}",
+        "moves": round(k * moved, 1),
+        "shakes": round(k * read.shake_px, 2),
+        "taken_out": read.stabilised,
+        "path": [_px(middle / k + p, k) for p in read.path[pick]],
+        "times": [round(float(t), 3) for t in read.clip.times[pick]],
+    }
+
+
+def fluid_facts(segmentation: Segmentation) -> dict[str, Any]:
+    """How much of the picture is fluid, and how sure that is."""
+    return {
+        "fluid_share": round(segmentation.fluid_share, 4), "fluid_sure": round(segmentation.confidence_mean, 2),
+    }  # fmt: skip
+
+
+def _slope_facts(g: View) -> dict[str, Any]:
+    if g.level_share is None:
+        return {}
+    return {"slope": round(g.slope, 1), "level_probability": round(g.level_share, 2)}
+
+
+def _part_data(part: Part, k: float) -> dict[str, Any]:
+    area = {"area": [_px(p, k) for p in part.area]} if part.area else {}
+    return {"is": part.what, "probability": round(part.probability, 2)} | area
 
 
 def identity_of(clip: Path, fps: float | None = None) -> ClipIdentity:
@@ -145,9 +204,28 @@ def identity_of(clip: Path, fps: float | None = None) -> ClipIdentity:
     return ClipIdentity(clip.name, info.size, info.frame_count, content_hash(clip))
 
 
+def read_alone(inputs: Inputs, folder: Path, config: JobConfig, *, progress: Progress | None = None) -> Read:
+    """The clip as `make` would read it, and no more.
+
+    Args:
+        inputs: the clip.
+        folder: for its frames, which are mapped from there.
+        config: of the job.
+        progress: where progress is told.
+
+    Raises:
+        InputRejected: a clip that cannot be used.
+    """
+    given = GivenFiles.of(inputs)
+    runner = Runner(folder, ("read",), progress=progress or Silence())
+    with disk_errors(folder):
+        return runner.run("read", read, given.clip, given.camera, taken(ReadSettings, config.read))
+
+
 def find_hints(
     inputs: Inputs, folder: Path, config: JobConfig, hints: ClipHints = NOTHING_SAID, *,
     progress: Progress | None = None, told: Callable[[str, Any], None] = lambda name, value: None,
+    memory: dict[str, tuple[str, Any]] | None = None,
 ) -> Found:  # fmt: skip
     """Read, flow, segment and view, with the hints that there are.
 
@@ -158,12 +236,13 @@ def find_hints(
         hints: of a person, with the clip's identity.
         progress: where progress is told.
         told: gets the name and the value of each stage as it ends.
+        memory: given to each call of one process, it saves what a click does not change (`Runner`).
 
     Raises:
         InputRejected: an input that cannot be used.
     """
     stages = begin.stages_of(FIND_STAGES, hints)
-    runner = Runner(folder, stages, progress=progress or Silence(), value_told=told)
+    runner = Runner(folder, stages, progress=progress or Silence(), value_told=told, memory=memory)
     given = GivenFiles.of(inputs)
     with disk_errors(folder):
         seen = begin.look(runner, given, config, said=hints)
@@ -193,14 +272,6 @@ def arrows(g: View) -> list[tuple[tuple[float, float], tuple[float, float]]]:
         return []
     length = step / fastest
     return [((float(a[0]), float(a[1])), (float(a[0] + length * w[0]), float(a[1] + length * w[1]))) for a, w in found]
-
-
-def outlines(mask: np.ndarray) -> list[list[tuple[float, float]]]:
-    """Outlines of the pieces of a mask, bool [h,w], the largest first, px, with few corners; holes are left out."""
-    found, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    large = sorted((c for c in found if cv2.contourArea(c) > SMALLEST * mask.size), key=cv2.contourArea, reverse=True)
-    lines = (cv2.approxPolyDP(c, CORNERS * max(mask.shape), True)[:, 0] + 0.5 for c in large)
-    return [[(float(u), float(v)) for u, v in line] for line in lines if len(line) >= 3]
 
 
 def _px(point: Any, k: float) -> list[float]:

@@ -10,6 +10,7 @@ import numpy as np
 from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected
 from fluidlift.pipeline.inputs import GivenFiles
+from fluidlift.shape import drawn, drawn_flow
 from fluidlift.types.hints import ClipHints
 
 
@@ -58,6 +59,8 @@ def require_no_contradiction(hints: ClipHints, config: JobConfig, given: GivenFi
         raise InputRejected(
             "two horizons: one drawn in the hints, and --pitch or --roll", "one of them", "leave one out"
         )
+    if hints.level is not None and s.roll is not None:
+        raise InputRejected("two levels: a line drawn in the hints, and --roll", "one of them", "leave one out")
     if hints.ruler is not None and s.size is not None:
         raise InputRejected("two sizes: a ruler in the hints, and --size", "one of them", "leave one out")
     if given.camera is not None and (hints.horizon is not None or hints.fov is not None):
@@ -68,6 +71,20 @@ def require_no_contradiction(hints: ClipHints, config: JobConfig, given: GivenFi
             raise InputRejected(
                 "a camera file, and a horizon or a field of view in the hints", "one of them", "leave one out"
             )
+
+
+def require_possible(hints: ClipHints, size: tuple[int, int]) -> None:
+    """Raise `InputRejected` where what was drawn cannot be: water that runs up a ledge, two horizons.
+
+    Args:
+        hints: px of the working picture.
+        size: width and height of it.
+    """
+    marked = {what: [r for r in hints.regions if r.what == what] for what in ("ledge", "sky")}
+    shape = (size[1], size[0])
+    ledges = [drawn.drawn_pixels(r.line, r.width, shape) for r in marked["ledge"]] if hints.flow else []
+    drawn_flow.require_downhill(hints.flow, ledges, hints.horizon)
+    drawn_flow.require_one_horizon(hints.horizon, hints.level, [p for r in marked["sky"] for p in r.line], size[1])
 
 
 def _numbers(text: str, count: int, option: str, form: str) -> list[float]:

@@ -159,12 +159,12 @@ def play(runner: Runner, asset: FluidAsset, config: JobConfig, request: Simulati
     for text in outside:
         runner.progress.warn(text)
 
-    def tell() -> None:
-        runner.progress.say(ahead(folder, manifest, scene.simulated, scene.interval, len(scene.body)))
+    def tell(splats: int) -> None:
+        runner.progress.say(ahead(folder, manifest, scene.simulated, scene.interval, splats))
 
     done = runner.run(
         "simulate", simulate, scene, taken(SimulateSettings, config.simulate),
-        beside={"folder": folder, "request": request}, before=tell, still_there=frames_still_there(folder),
+        beside={"folder": folder, "request": request, "told": tell}, still_there=frames_still_there(folder),
         owns_files=True,
     )  # fmt: skip
     wanted = [folder / "preview.mp4"] * config.show.preview + [folder / "asset.usda"] * config.show.usd

@@ -45,14 +45,17 @@ class Runner:
         force: names of stages to run again, with all that come after.
         progress: where progress is told.
         value_told: gets the name and the value of each stage as it ends.
+        memory: key and value of what stages asked to be remembered, by name; given to the next runner it saves that
+            work. None: nothing is remembered.
     """
 
     def __init__(
         self, folder: Path, stages: tuple[str, ...], *, force: frozenset[str] = frozenset(), progress: Progress,
         value_told: Callable[[str, Any], None] = lambda name, value: None,
+        memory: dict[str, tuple[str, Any]] | None = None,
     ) -> None:  # fmt: skip
         self.folder, self.stages, self.force, self.progress = folder, stages, force, progress
-        self._value_told = value_told
+        self._value_told, self._memory = value_told, memory
         self.keys: dict[str, str] = {}
         self.timings: dict[str, dict[str, Any]] = {}
         """of the stages that are done"""
@@ -172,7 +175,9 @@ class Runner:
         scratch, began = Scratch(self.folder, name), time.perf_counter()
         if "work" in inspect.signature(stage).parameters:
             named = named | {
-                "work": Work(scratch, self.progress.update, self.warn, key, self._stale, self._part_of_stage)
+                "work": Work(
+                    scratch, self.progress.update, self.warn, key, self._stale, self._part_of_stage, self._remembered
+                )
             }
         try:
             value = stage(*inputs, **named)
@@ -188,6 +193,16 @@ class Runner:
         key = self._key(name, function, inputs, named)
         found = kept_value(self.folder, name, key, result_type(function))
         return self._learned((found or self._worked(name, key, function, inputs, named))[0], key)
+
+    def _remembered(self, name: str, function: Callable[..., T], *inputs: Any) -> T:
+        """What a function gives, from memory where its inputs are those of the last time."""
+        if self._memory is None:
+            return function(*inputs)
+        key = self._key(name, function, inputs, {})
+        known = self._memory.get(name)
+        if known is None or known[0] != key:
+            known = self._memory[name] = key, function(*inputs)
+        return known[1]
 
     def _note(self, name: str, value: Any, key: str, seconds: float, cached: bool) -> None:
         self._learned(value, key)

@@ -27,6 +27,7 @@ from fluidlift.shape import (
 )
 from fluidlift.shape import kind as kinds
 from fluidlift.shape.drawn import region_pixels
+from fluidlift.shape.drawn_flow import heard
 from fluidlift.shape.frame_pictures import typical_picture
 from fluidlift.shape.framing import framing_warnings
 from fluidlift.shape.given_depth import DepthPictures
@@ -38,6 +39,7 @@ from fluidlift.types import (
     KindEvidence,
     MetricScale,
     PinholeCamera,
+    SaidFlow,
     UpEvidence,
     VideoClip,
     kind_of,
@@ -75,6 +77,9 @@ class Sight:
     """of a dam"""
     kind_free: bool = True
     """evidence decided on the kind"""
+    said_flow: SaidFlow | None = None
+    """what a person says of the direction of the flow; `motion` holds it"""
+    told: tuple[Notice, ...] = ()
 
     @property
     def lying_trust(self) -> np.ndarray:
@@ -130,10 +135,11 @@ def sighted(
     """
     clip, c = read.clip, config
     fluid = FluidMasks(segmentation.labels.labels)
-    seen, pictures = _seen(read, flow, fluid, given, config, work)
+    seen, pictures = _seen(read, flow, segmentation, given, config, work)
     parts, mask = seen.parts, seen.mask
     up, canonical, front, known_scale, seen_depth = _surface(seen, pictures, fluid, given, clip.interval)
     warnings = framing_warnings(mask, fluid.areas()) + up.warnings + composite.unused_marks(parts, front)
+    warnings += [*seen.told, *_unused_flow(seen, front.vessel is not None)]
     if c.kind == "auto":
         warnings += kinds.doubts(seen.evidence)
     front, falling = composite.standing(front, parts, canonical, mask)
@@ -201,18 +207,21 @@ def _scale(
 
 
 def _seen(
-    read: Read, flow: Flow, fluid: FluidMasks, given: GivenView, config: GeometrySettings, work: Work
+    read: Read, flow: Flow, segmentation: Segmentation, given: GivenView, config: GeometrySettings, work: Work
 ) -> tuple[Sight, DepthPictures | None]:
     """Mask, motion, kind and camera; and depth pictures where there are some."""
-    clip = read.clip
+    clip, fluid = read.clip, FluidMasks(segmentation.labels.labels)
     start, united = united_range(clip, fluid, config.longest_union)
     mask = generate.united_mask(fluid[start : start + united])
     if not mask.any():
         mask = fluid[start]
-    motion, trust = mean_motion(clip, flow.flow, fluid.any_frame())
+    motion, trust, bulk = work.remembered("motion at large", _motion_at_large, read, flow, segmentation)
+    arrows = () if config.drawn is None else config.drawn.flow
+    said = heard(arrows, mask, motion, trust) if arrows else None
+    if said is not None:
+        motion, trust = said.mean(motion, trust)
     known, pose_given = known_camera(given, config.fov, clip.size)
     pictures, known = _depth_pictures(read, given, config.fov, known, start, work)
-    bulk = bulk_motion(clip, flow.flow, fluid.__getitem__, fluid.any_frame())
     looked = _Looked(clip, fluid, mask, motion, trust, bulk)
     evidence, kind, parts, up, heading = _kind_and_up(
         looked, given, config, known, pose_given, shaped=pictures is not None
@@ -230,9 +239,19 @@ def _seen(
     tilt_known = pose_given or config.pitch is not None or horizon
     seen = Sight(
         start, united, mask, motion, trust, known, pose_given, evidence, kind, parts, up, heading, tilt_known, height,
-        unsure, stood, config.kind == "auto",
+        unsure, stood, config.kind == "auto", *((None, ()) if said is None else (said.flow, said.warnings)),
     )  # fmt: skip
     return seen, pictures
+
+
+def _motion_at_large(
+    read: Read, flow: Flow, segmentation: Segmentation
+) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    """Mean motion over the clip with its confidence, and the bulk motion of fluid and ground in each pair of frames."""
+    fluid = FluidMasks(segmentation.labels.labels)
+    ever = fluid.any_frame()
+    motion, trust = mean_motion(read.clip, flow.flow, ever)
+    return motion, trust, bulk_motion(read.clip, flow.flow, fluid.__getitem__, ever)
 
 
 def _surface(seen: Sight, pictures: DepthPictures | None, fluid: FluidMasks, given: GivenView, interval: float):
@@ -247,6 +266,19 @@ def _surface(seen: Sight, pictures: DepthPictures | None, fluid: FluidMasks, giv
         return up, canonical, front, known_scale, None
     found = depths.depth_front(pictures, fluid, seen.known, up, seen.kind, observed, expected=front)
     return found.up, kinds.level_camera(seen.known, found.up), found.front, found.known_scale, found
+
+
+def _unused_flow(seen: Sight, in_vessel: bool) -> list[Notice]:
+    """What to say of a direction of the flow that the way of the fluid does not follow."""
+    if seen.said_flow is None or (seen.stood is None and not in_vessel):
+        return []
+    return [
+        Notice(
+            "flow-not-used",
+            "the direction of the flow that was drawn does not decide where a body that is let go runs, or how a jet "
+            "falls into its vessel: that is read from their outlines; give --kind stream or fall if it is neither",
+        )
+    ]
 
 
 def _told(scale: MetricScale, seen: Sight) -> tuple[MetricScale, str]:
@@ -342,6 +374,8 @@ def _said_of_view(c: GeometrySettings, known: PinholeCamera, shape: tuple[int, .
     if drawn is None:
         return _SaidOfView(c.pitch, c.roll)
     pitch, roll = (c.pitch, c.roll) if drawn.horizon is None else tilt_of_horizon(known, drawn.horizon)
+    if drawn.level_line is not None and drawn.horizon is None:
+        roll = tilt_of_horizon(known, drawn.level_line)[1]
     sky = sky_of(region_pixels(drawn.sky, (shape[0], shape[1])))
     return _SaidOfView(pitch, roll, sky, tuple(drawn_rim(r.center, r.axes, r.turned) for r in drawn.rims))
 

@@ -41,13 +41,18 @@ def motion_scene(clip: VideoClip, geometry: Geometry) -> MotionScene:
 
 
 def seen_beside(flow: FlowReader, geometry: Geometry) -> FlowReader:
-    """The flow, without confidence where something before the fluid moves, or stands, in its place."""
-    if geometry.hidden is None:
+    """The flow as a person says that it runs, and without confidence where something before the fluid moves, or stands,
+    in its place."""
+    said, hidden = geometry.said_flow, geometry.hidden
+    if hidden is None and said is None:
         return flow
-    near = near_occluders(geometry.hidden)
+    near = None if hidden is None else near_occluders(hidden)
 
     def read(first: int, last: int) -> PixelFlow:
         found = flow(first, last)
+        found = found if said is None else said.turned(found)
+        if near is None:
+            return found
         return PixelFlow(found.displacement, np.where(near, np.float32(0), found.confidence))
 
     return read

@@ -33,6 +33,9 @@ class Work:
     part: Callable[..., Any] = _alone
     """`part(name, function, *inputs, **named)` is `function(*inputs, **named)`; what is slow is kept between runs"""
 
+    remembered: Callable[..., Any] = _alone
+    """likewise; kept in memory alone, the last value of each name, where the run is one of several of one process"""
+
     @classmethod
     def alone(cls, folder: Path) -> Work:
         """Of a stage that is called by itself."""

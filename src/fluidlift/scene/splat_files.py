@@ -12,8 +12,8 @@ from fluidlift.io.asset_paths import asset_file
 from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.types import Gaussians
 
-BYTES_PER_SPLAT = 80
-"""of disk, in a frame's file"""
+BYTES_PER_SPLAT = 84
+"""of disk, in a frame's file: 17 numbers of a splat, its id and its velocity, of 4 bytes each"""
 
 
 def frame_file(folder: Path, number: int) -> Path:

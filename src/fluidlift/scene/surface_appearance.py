@@ -177,9 +177,15 @@ class SurfaceAppearance:
         self._outline: FilmedOutline | None = None
         self._level: float | None = None
         self._plays = False
+        self._tracers = 0
         self._own = scene.rest.select(np.arange(len(scene.rest) - sum(map(len, scene.emitter_looks))))
         if len(self._own) and len(scene.body):
             self._lay_skin()
+
+    @property
+    def splats(self) -> int:
+        """Of the first frame: those of the body and of the skin over it."""
+        return len(self._scene.body) + self._tracers
 
     @property
     def warnings(self) -> tuple[Notice, ...]:
@@ -226,8 +232,11 @@ class SurfaceAppearance:
             self._outline = FilmedOutline(self._camera, footage.outside, self._cell)
         self._plays = footage is not None
         if self._plays:
-            self._surface, skin = surface, SurfaceSkin(self._cell, self._level_at)
-            skin.advance(surface, 0.0, np.random.default_rng(scene.seed))
+            self._surface = surface
+        skin = SurfaceSkin(self._cell, self._level_at if self._plays else None)
+        skin.advance(surface, 0.0, np.random.default_rng(scene.seed))
+        self._tracers = len(skin)
+        if self._plays:
             bare = skin.splats(surface, np.zeros((len(skin), 3)))
             texture.shift = apparent_shift(self._axes.world_splats(bare), self._camera)
         self._begin_again()

@@ -10,6 +10,7 @@ Modules of the face:
     depth_surface     A fluid's visible surface from a depth picture: what the picture can say is taken from it, the
                       rest from physics
     drawn             What a person drew on a frame, as pixels, and carried to the other frames
+    drawn_flow        The direction of the flow as a person drew it: arrows, each of which counts as given around it
     evidence          Motion segmentation cues for fluid: change against the clip's own noise, and motion that goes
                       somewhere
     external_body     A body from elsewhere: Gaussians that another generator made, seen by a known camera
@@ -67,6 +68,7 @@ __all__ = [
     "dam",
     "depth_surface",
     "drawn",
+    "drawn_flow",
     "evidence",
     "external_body",
     "fill",

@@ -12,6 +12,8 @@ are read one by one and may lie in a file, and labels may be written to arrays o
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -77,6 +79,41 @@ class LabelWriter:
         self._last = (labels, sure)
 
 
+@dataclass(frozen=True)
+class Clues:
+    """What a clip shows of its fluid, before a person says anything: all that is slow in finding it."""
+
+    evidence: Evidence
+    solids: np.ndarray
+    """bool [h,w], what moves and is no fluid"""
+    inside: np.ndarray
+    """bool [h,w], where fluid is looked for"""
+
+    @cached_property
+    def score(self) -> np.ndarray:
+        """float32 [h,w], log odds of fluid."""
+        possible = self.inside & ~self.solids
+        return np.where(possible, fluid_score(self.evidence), -12.0).astype(np.float32)
+
+    @cached_property
+    def presence(self) -> Presence:
+        """When it is there."""
+        return watch(self.evidence, self.score > 0.0)
+
+    @cached_property
+    def grown(self) -> np.ndarray | None:
+        """bool [h,w], the fluid grown from its streams, where change does not tell it; else None."""
+        return None if trustworthy(self.score) else grown_from_streams(self.evidence, self.inside)
+
+
+def clues_of(clip: VideoClip, flow: PixelFlow | PairReader, roi: tuple[int, int, int, int] | None = None) -> Clues:
+    """The clues of a clip of at least 2 frames; operands as those of `segment`."""
+    pairs = SharedPairs(clip, pair_reader(flow))
+    evidence = gather_evidence(clip, pairs)
+    inside = shrink_mask(region_of_interest(roi, *clip.frames.shape[1:3]), evidence.noise.shape)
+    return Clues(evidence, moving_solids(clip, pairs, evidence.noise.shape), inside)
+
+
 def segment(
     clip: VideoClip,
     flow: PixelFlow | PairReader,
@@ -86,6 +123,7 @@ def segment(
     points: Sequence[Point] = (),
     progress: Progress | None = None,
     out: tuple[np.ndarray, np.ndarray] | None = None,
+    clues: Callable[[], Clues] | None = None,
 ) -> PixelLabels:
     """Labels of every frame.
 
@@ -99,6 +137,7 @@ def segment(
             around them (`fluidlift.shape.hints`); not looked at where a mask is given.
         progress: told how far the work has got.
         out: labels u8 and confidence float16 [T,H,W] to write to, such as memory maps; None: new arrays.
+        clues: gives those of this clip and flow where they may be known already; None: they are found.
 
     Raises:
         InputRejected: nothing moves, or the region or the mask is empty, or a point lies outside.
@@ -116,19 +155,15 @@ def segment(
         found = flow.displacement.shape
         require(found == (frames - 1, height, width, 2), f"flow {found}", f"{(frames - 1, height, width, 2)}")
     tell(0.0, "evidence")
-    pairs = SharedPairs(clip, pair_reader(flow))
-    evidence = gather_evidence(clip, pairs)
-    small_inside = shrink_mask(inside, evidence.noise.shape)
+    known = clues_of(clip, flow, roi) if clues is None else clues()
+    evidence, solids, score = known.evidence, known.solids, known.score
+    small_inside, seen = known.inside, score > 0.0
     clicks = clicks_at(points, clip.size, evidence.noise.shape)
-    solids = moving_solids(clip, pairs, evidence.noise.shape)
-    score = np.where(small_inside & ~solids, fluid_score(evidence), -12.0).astype(np.float32)
-    seen = score > 0.0
     if (seen.mean() < 1e-3 or float(score.max()) < 1.0) and len(clicks.fluid) == 0:
         raise InputRejected("nothing moves in this clip", "a fluid that moves before a camera that stands still",
                             "give a --mask")  # fmt: skip
     tell(0.3, "presence")
-    presence = watch(evidence, seen)
-    grown = None if trustworthy(score) else grown_from_streams(evidence, small_inside)
+    presence, grown = known.presence, known.grown
     if grown is None and grows(presence, score > 2.0):
         told = heed(clicks, evidence, score, score > 0.0)[1] if clicks else np.zeros_like(score)
         barred = (solids | solids_by_flow(evidence)) & (told <= 0.0)

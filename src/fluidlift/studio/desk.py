@@ -109,7 +109,7 @@ class Desk:
                     "masks": look.masks if seen is not None else 0,
                     "times": [] if read is None else [round(float(t), 4) for t in read.clip.times],
                     "read_warnings": [] if read is None else list(read.warnings),
-                    "facts": look.facts, "waited": round(look.waited, 2),
+                    "facts": look.facts, "so_far": look.so_far, "waited": round(look.waited, 2),
                 },
                 "make": self.making.state.to_dict(),
                 "shelf": self._shown,

@@ -16,8 +16,8 @@ from fluidlift.types.hints import ClipHints, ClipIdentity
 
 MOST_STEPS = 100
 """that can be undone"""
-LISTS = ("regions", "clicks", "rims")
-WHOLE = ("start", "duration", "kind", "fov", "horizon", "ruler", "roi")
+LISTS = ("regions", "clicks", "rims", "flow")
+WHOLE = ("start", "duration", "kind", "fov", "horizon", "ruler", "roi", "level")
 
 
 class HintsHistory:

@@ -64,6 +64,9 @@ class Look:
     read: Read | None = None
     segmentation: Segmentation | None = None
     facts: dict[str, Any] | None = None
+    """all of them, of the last look that came to its end"""
+    so_far: dict[str, Any] = field(default_factory=dict)
+    """what the stages of a look have told before that: the camera's path, how much is fluid"""
     pictures: int = 0
     """changes with the frames"""
     masks: int = 0
@@ -87,6 +90,8 @@ class Looking:
         self._wish: Wish | None = None
         self._ended = False
         self._done: Wish | None = None
+        self._memory: dict[str, tuple[str, Any]] = {}
+        """what a click does not change, of the last clip"""
         self.look = Look()
         self._thread = threading.Thread(target=self._run, name="looking", daemon=True)
         self._thread.start()
@@ -152,9 +157,12 @@ class Looking:
     def _work(self, wish: Wish) -> None:
         from fluidlift.pipeline.find import find_hints
 
+        with self._wake:
+            self.look.so_far = {}
         found = find_hints(
             Inputs(wish.clip), wish.room, look_config(wish.hints), wish.hints,
             progress=_LookProgress(self, wish), told=lambda name, value: self.told(wish, name, value),
+            memory=self._memory,
         )  # fmt: skip
         facts = found.facts()
         with self._wake:
@@ -165,16 +173,22 @@ class Looking:
 
     def told(self, wish: Wish, name: str, value: Any) -> None:
         """A stage has ended."""
+        from fluidlift.pipeline.find import camera_facts, fluid_facts
+
         if name == "segment" and wish.hints.regions:
             return  # the mask without the regions would flicker by
+        clip = wish.hints.clip
         with self._wake:
             look = self.look
             if look.clip != wish.clip:
                 raise _Overtaken("another clip")
-            if isinstance(value, Read) and not _same(look.read, value):
-                look.read, look.pictures = value, look.pictures + 1
+            if isinstance(value, Read):
+                look.so_far = look.so_far | {"camera": camera_facts(value, clip.size if clip else value.clip.size)}
+                if not _same(look.read, value):
+                    look.read, look.pictures = value, look.pictures + 1
             elif isinstance(value, Segmentation):
                 look.segmentation, look.masks = value, look.masks + 1
+                look.so_far = look.so_far | fluid_facts(value)
         self._changed()
 
     def progress(self, wish: Wish, **what: Any) -> None:

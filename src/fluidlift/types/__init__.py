@@ -27,7 +27,7 @@ from fluidlift.types.camera import PinholeCamera, ViewKey
 from fluidlift.types.clip import Label, PixelLabels, VideoClip
 from fluidlift.types.evidence import KindEvidence, MetricScale, SlopeEvidence, UpEvidence
 from fluidlift.types.filmed import Filmed, FilmedMotion
-from fluidlift.types.flow import PixelFlow, SurfaceMotion
+from fluidlift.types.flow import PixelFlow, SaidFlow, SurfaceMotion
 from fluidlift.types.gaussians import SH_C0, Gaussians, concatenate, decompose_covariances, sh_from_rgb
 from fluidlift.types.grid import CellType, FaceVelocity, Grid, triple
 from fluidlift.types.kind import KINDS, FluidKind, kind_of
@@ -44,7 +44,8 @@ __all__ = [
     "CellType",
     "Estimate",
     "FaceVelocity",
-    "Filmed", "FilmedMotion",
+    "Filmed",
+    "FilmedMotion",
     "FitResult",
     "FluidAsset",
     "FluidKind",
@@ -59,6 +60,7 @@ __all__ = [
     "PixelFlow",
     "PixelLabels",
     "RigidTransform",
+    "SaidFlow",
     "Setting",
     "Similarity3",
     "SlopeEvidence",

@@ -29,6 +29,33 @@ class PixelFlow:
 
 
 @dataclass(frozen=True)
+class SaidFlow:
+    """What a person says of the direction of the flow, as a change of what was measured; the same for all frames."""
+
+    turn: Float[np.ndarray, "h w 2 2"]
+    """what a measured displacement is multiplied by"""
+    kept: Float[np.ndarray, "h w"]
+    """share of its confidence that it keeps; 0 where its direction says nothing, and the mainstream takes its place"""
+    way: Float[np.ndarray, "h w 2"]
+    """unit vector of what was said, times how far it counts there, 0 to 1"""
+
+    def __post_init__(self) -> None:
+        shape = self.kept.shape
+        found = self.turn.shape, self.way.shape
+        require(found == ((*shape, 2, 2), (*shape, 2)), f"turn and way {found}", f"those of {shape} pixels")
+
+    @property
+    def counts(self) -> Bool[np.ndarray, "h w"]:
+        """Pixels for which an arrow speaks more than what was measured."""
+        return np.linalg.norm(self.way, axis=-1) > 0.5
+
+    def turned(self, flow: PixelFlow) -> PixelFlow:
+        """Measured flow as it is then, float32."""
+        displacement = np.einsum("hwij,thwj->thwi", self.turn, np.asarray(flow.displacement, np.float32))
+        return PixelFlow(displacement.astype(np.float32), (flow.confidence * self.kept).astype(np.float32))
+
+
+@dataclass(frozen=True)
 class SurfaceMotion:
     """Velocity of points on the visible surface at one instant."""
 

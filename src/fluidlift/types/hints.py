@@ -78,6 +78,21 @@ class Click:
 
 
 @dataclass(frozen=True)
+class Arrow:
+    """Where the fluid runs at a place; its length says nothing."""
+
+    at: Point
+    to: Point
+
+    @property
+    def direction(self) -> Point:
+        """Unit vector in the picture, x to the right and y down."""
+        dx, dy = self.to[0] - self.at[0], self.to[1] - self.at[1]
+        length = max((dx**2 + dy**2) ** 0.5, 1e-9)
+        return dx / length, dy / length
+
+
+@dataclass(frozen=True)
 class ClipHints:
     """All that a person says of one clip."""
 
@@ -99,6 +114,9 @@ class ClipHints:
     clicks: tuple[Click, ...] = ()
     roi: tuple[float, float, float, float] | None = None
     """x, y, width, height: fluid is looked for inside only"""
+    flow: tuple[Arrow, ...] = ()
+    level: tuple[Point, Point] | None = None
+    """along the edge of still water that lies square to the view, left and right"""
 
     @property
     def settings(self) -> dict[str, float | str]:
@@ -144,16 +162,18 @@ class ClipHints:
             ),
             clicks=tuple(replace(c, at=moved(c.at)) for c in self.clicks),
             roi=None if self.roi is None else (self.roi[0] * kx, self.roi[1] * ky, self.roi[2] * kx, self.roi[3] * ky),
+            flow=tuple(Arrow(moved(a.at), moved(a.to)) for a in self.flow),
+            level=None if self.level is None else (moved(self.level[0]), moved(self.level[1])),
         )  # fmt: skip
 
     @property
     def view(self) -> DrawnView | None:
         """What of it says how the camera stands and how large things are; None: nothing of it does."""
         sky, ledges = (tuple(r for r in self.regions if r.what == what) for what in ("sky", "ledge"))
-        level = any(r.what == "pool" for r in self.regions)
-        if self.horizon is None and self.ruler is None and not (self.rims or sky or ledges or level):
+        level = self.level is not None or any(r.what == "pool" for r in self.regions)
+        if self.horizon is None and self.ruler is None and not (self.rims or sky or ledges or level or self.flow):
             return None
-        return DrawnView(self.horizon, self.ruler, self.rims, sky, ledges, level)
+        return DrawnView(self.horizon, self.ruler, self.rims, sky, ledges, level, self.flow, self.level)
 
 
 @dataclass(frozen=True)
@@ -167,6 +187,8 @@ class DrawnView:
     ledges: tuple[Region, ...] = ()
     level: bool = False
     """what does not come down a ledge is level"""
+    flow: tuple[Arrow, ...] = ()
+    level_line: tuple[Point, Point] | None = None
 
 
 NOTHING_SAID = ClipHints()

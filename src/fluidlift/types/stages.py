@@ -18,7 +18,7 @@ from fluidlift.types.camera import PinholeCamera
 from fluidlift.types.clip import PixelLabels, VideoClip
 from fluidlift.types.evidence import KindEvidence, MetricScale, SlopeEvidence, UpEvidence
 from fluidlift.types.filmed import FilmedMotion
-from fluidlift.types.flow import PixelFlow
+from fluidlift.types.flow import PixelFlow, SaidFlow
 from fluidlift.types.gaussians import Gaussians
 from fluidlift.types.grid import FaceVelocity, Grid
 from fluidlift.types.parameters import Estimate, FluidParameters
@@ -42,8 +42,12 @@ class Read:
     cuts: tuple[int, ...] = ()
     """frames before which a cut was found"""
     warnings: tuple[Notice, ...] = ()
+    path: Float[np.ndarray, "t 2"] | None = None
+    """px from the middle of the steady picture: where the middle of each frame lay, as the camera moved; None: it was
+    not looked for"""
 
     def __post_init__(self) -> None:
+        require(self.path is None or len(self.path) == len(self.clip), "a path of other frames")
         require(len(self.kept) == len(self.clip), f"{len(self.kept)} numbers for {len(self.clip)} frames")
         require(self.decoded >= len(self.kept), f"{len(self.kept)} of {self.decoded} frames kept")
 
@@ -51,6 +55,15 @@ class Read:
     def dropped(self) -> list[int]:
         """Numbers of the decoded frames that were left out."""
         return np.setdiff1d(np.arange(self.decoded), self.kept).tolist()
+
+    @property
+    def moved_px(self) -> float:
+        """Largest distance between two places that the camera looked at, px; 0 where that is not known."""
+        if self.path is None or not len(self.path):
+            return 0.0
+        return float(
+            np.linalg.norm(self.path[:, None] - self.path[None, :: max(1, len(self.path) // 100)], axis=-1).max()
+        )
 
 
 @dataclass(frozen=True)
@@ -153,6 +166,8 @@ class Geometry:
     jets: tuple[dict[str, Any], ...] = ()
     """jets above what lies, in the world, m"""
     slope: SlopeEvidence | None = None
+    said_flow: SaidFlow | None = None
+    """what a person says of the direction of the flow; `mean_flow` holds it"""
     warnings: tuple[Notice, ...] = ()
 
     def __post_init__(self) -> None:

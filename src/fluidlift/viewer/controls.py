@@ -13,7 +13,9 @@ from fluidlift.types.parameter_table import PARAMETERS, Scale
 
 STEPS = 200
 """of a slider, about"""
-INFLOW = "inflow.factor"
+INFLOW, WHITEWATER = "inflow.factor", "whitewater.amount"
+MOST_FOAM = 4.0
+"""end of the slider of white water: times what the clip shows; scene.yaml takes more"""
 ESTIMATES = {INFLOW: "inflow_velocity", "gravity": "gravity_z", "gravity_tilt": "gravity", "gravity_heading": "gravity"}
 """what a control moves, by its name among the estimates, where that is another"""
 WHOLE = str.maketrans({
@@ -23,7 +25,7 @@ WHOLE = str.maketrans({
 """signs at which lines are broken, and those that stand for them"""
 
 Values = dict[str, Any]
-"""of `FluidParameters`, by name, and `inflow.factor`"""
+"""of `FluidParameters`, by name, `inflow.factor` and `whitewater.amount`"""
 
 
 def path_of(name: str) -> str:
@@ -50,6 +52,8 @@ class Control:
     log: bool = False
     """the slider moves the power of ten"""
     hint: str = ""
+    known: str = ""
+    """value before any edit, interval and source, as the report has them; empty: nothing is known of it"""
     origin: str = "lifted"
     """a word on where `fitted` comes from, its mark on the slider: fitted, given, prior"""
 
@@ -149,6 +153,7 @@ def controls_of(
         found.append(_plain("inflow_fluctuation", fitted, span=(0.0, max(speed, 0.1))))
     if liquid:
         found += [_plain(name, fitted) for name in ("density", "surface_tension", "wall_damping", "restitution")]
+        found.append(_whitewater())
     return tuple(_with_origin(control, estimates or {}) for control in found)
 
 
@@ -162,9 +167,12 @@ def _with_origin(control: Control, estimates: Mapping[str, Estimate]) -> Control
     known = max([e for e in parts if e.fitted] or parts, key=lambda e: e.sigma)
     origin = "given" if known.sigma == 0 else "fitted" if known.fitted else "prior"
     told = known.source or origin
+    value = f"{number(known.value, 3)} {known.unit}".strip()
     if known.interval is not None and known.fitted:
-        told += f"; 95 %: {number(known.interval[0], 3)} to {number(known.interval[1], 3)} {known.unit}".rstrip()
-    return replace(control, origin=origin, hint=f"{control.hint}. {told}".lstrip(". "))
+        between = f"95 %: {number(known.interval[0], 3)} to {number(known.interval[1], 3)} {known.unit}".rstrip()
+        told, value = f"{told}; {between}", f"{value} ({between})"
+    words = f"{value}; {known.source or origin}"
+    return replace(control, origin=origin, hint=f"{control.hint}. {told}".lstrip(". "), known=words)
 
 
 def _length(vector: Any) -> float:
@@ -238,4 +246,13 @@ def _inflow(speed: float) -> Control:
     return Control(
         INFLOW, "inflow", "×", 0.0, 4.0, 1.0, lambda p: float(p[INFLOW]), lambda p, v: {INFLOW: v},
         hint=f"times the clip's own, {speed:.3g} m/s",
+    )  # fmt: skip
+
+
+def _whitewater() -> Control:
+    return Control(
+        WHITEWATER, "white water", "×", 0.0, MOST_FOAM, 0.0, lambda p: float(p[WHITEWATER]),
+        lambda p, v: {WHITEWATER: v}, origin="none",
+        hint="spray, foam and bubbles where an edit makes the water break, times what the clip shows; drawn by a full "
+        "simulation ('Run'), not live",
     )  # fmt: skip

@@ -98,16 +98,17 @@ class Draft:
 
     @property
     def fitted(self) -> dict[str, Any]:
-        """Parameters without any edit, by name, and `inflow.factor`."""
-        return self._fitted.to_dict() | {"inflow.factor": 1.0}
+        """Parameters without any edit, by name, `inflow.factor` and `whitewater.amount`."""
+        return self._fitted.to_dict() | {"inflow.factor": 1.0, "whitewater.amount": 0.0}
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """All parameters as they would be simulated, by name, and `inflow.factor`."""
+        """All parameters as they would be simulated, by name, `inflow.factor` and `whitewater.amount`."""
         scene, known = self.scene, self._fitted.to_dict()
         changed = scene.get("parameters") or {}
         inflow = {"inflow.factor": float((scene.get("inflow") or {}).get("factor", 1.0))}
-        return known | {k: v for k, v in changed.items() if k in known} | inflow
+        foam = {"whitewater.amount": float((scene.get("whitewater") or {}).get("amount", 0.0))}
+        return known | {k: v for k, v in changed.items() if k in known} | inflow | foam
 
     @property
     def look(self) -> dict[str, Any]:

@@ -35,14 +35,18 @@ class FluidPanel:
 
     def _add_slider(self, control: Control, value: float) -> None:
         low, high, step = control.slider
-        power = " The slider and its box hold x of 10^x; 'Type a value' takes the value itself." if control.log else ""
-        slider = self._gui.add_slider(
-            _label(control, value), low, high, step, control.slider_of(value), marks=_marks(control),
-            hint=f"{control.range_told()}. {control.hint}.{power}",
-        )  # fmt: skip
-        heard(slider, lambda event, at: self._slid(event, control, at))
+        label, marks, hint = _label(control, value), _marks(control), f"{control.range_told()}. {control.hint}."
+        at = control.slider_of(value)
+        if control.log:  # a slider's own box would hold the power of ten: a slider of several thumbs has none
+            hint += " 'Type a value' takes the number itself."
+            slider = self._gui.add_multi_slider(label, low, high, step, (at,), marks=marks, hint=hint)
+        else:
+            slider = self._gui.add_slider(label, low, high, step, at, marks=marks, hint=hint)
+        heard(slider, lambda event, at: self._slid(event, control, _one(at)))
         self._sliders[control.key] = slider
         self._by_label[control.label] = control
+        if control.known:
+            self._gui.add_markdown(f"*{control.known}*")
 
     def _slid(self, event: Any, control: Control, at: float) -> None:
         if event.client is None:
@@ -70,8 +74,14 @@ class FluidPanel:
         value, problem = control.typed(self._text.value)
         if value is not None:
             self._set(control, value)
-            self._sliders[control.key].value = control.slider_of(value)
+            self._place(control, value)
         self._viewer.say(problem)
+
+    def _place(self, control: Control, value: float) -> None:
+        """Move a slider that is not there yet."""
+        slider, at = self._sliders[control.key], control.slider_of(value)
+        if _one(slider.value) != at:
+            slider.value = (at,) if control.log else at
 
     # look
 
@@ -130,9 +140,7 @@ class FluidPanel:
             slider, value = self._sliders[control.key], control.read(values)
             if slider.label != _label(control, value):
                 slider.label = _label(control, value)
-            place = control.slider_of(value)
-            if slider.value != place:
-                slider.value = place
+            self._place(control, value)
         for handle, name in ((self._style, "style"), (self._material, "material"), (self._light, "environment")):
             value = _known(look.get(name), handle.options)
             if handle.value != value:
@@ -146,9 +154,13 @@ class FluidPanel:
 def _label(control: Control, value: float) -> str:
     """With three digits: more would wrap. The box beside the slider, and typing, have them all. Lines break before
     the number, not between it and its unit."""
-    name = f"{control.label} (10^x)" if control.log else control.label
     amount = f"{number(value, 3)} {control.unit}".strip().replace(" °", "°")
-    return f"{name} {unbroken(amount)}"
+    return f"{control.label} {unbroken(amount)}"
+
+
+def _one(value: Any) -> float:
+    """Place of a slider, which may be one of several thumbs."""
+    return float(value[0] if isinstance(value, tuple | list) else value)
 
 
 def _marks(control: Control) -> tuple[tuple[float, str], ...]:

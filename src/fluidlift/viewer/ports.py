@@ -74,13 +74,22 @@ ICON = (
 """a drop"""
 
 
+FLAT = "new Float32Array([-2,-2,2,-2,2,2,-2,2]),2"
+SOLID = "new Float32Array([-2,-2,0,2,-2,0,2,2,0,-2,2,0]),3"
+"""the square that viser 1.1 draws for each splat, and the same with a third coordinate: without one its bounds are no
+numbers, which three.js says in the console for each frame of splats"""
+RUN = b"e.textContent=code;"
+"""where viser's page runs its own program, which it has unpacked"""
+
+
 def _retitle(response: Any) -> None:
-    """The page of viser with our title and icon; as it is where it looks otherwise than that of version 1.1."""
+    """The page of viser with our title and icon, and bounds for splats; as it is where it is not version 1.1's."""
     body = response.body
     packed = response.headers.get("Content-Encoding") == "gzip"
     text = gzip.decompress(body) if packed else bytes(body)
     text = re.sub(rb"<title>[^<]*</title>", f"<title>{TITLE}</title>".encode(), text, count=1)
     text = re.sub(rb'(rel="icon"\s+href=")[^"]*', rb"\g<1>" + ICON.encode(), text, count=1)
+    text = text.replace(RUN, f'e.textContent=code.replace("{FLAT}","{SOLID}");'.encode(), 1)
     response.body = gzip.compress(text) if packed else text
     del response.headers["Content-Length"]
     response.headers["Content-Length"] = str(len(response.body))

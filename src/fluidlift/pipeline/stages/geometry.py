@@ -23,6 +23,7 @@ from fluidlift.shape.frame_pictures import typical_picture
 from fluidlift.types import (
     CellType,
     PinholeCamera,
+    SaidFlow,
     Setting,
     VideoClip,
 )
@@ -57,7 +58,8 @@ def geometry(
     elif seen.stood is not None:
         mainstream = seen.stood.direction
     else:
-        mainstream = mainstream_of(kind, velocities[~falls], trust[~falls])
+        counted = trust if seen.said_flow is None else trust * _said(seen.said_flow, visible & ~falling.pixels)[visible]
+        mainstream = mainstream_of(kind, velocities[~falls], counted[~falls])
     eye = seen.known.position if seen.pose_given else None
     to_world, camera = registration.place(
         canonical, points, scale.value, heading=seen.heading, eye=eye, mainstream=mainstream
@@ -106,8 +108,14 @@ def geometry(
         depth_source=None if seen_depth is None else seen_depth.meta,
         jets=tuple(falling.plain(to_world)),
         slope=front.slope,
+        said_flow=seen.said_flow,
         warnings=tuple(s.warnings),
     )
+
+
+def _said(flow: SaidFlow, visible: np.ndarray) -> np.ndarray:
+    """bool [h,w]: pixels whose motion says where the mainstream runs, those that a person's arrows speak for."""
+    return flow.counts if (flow.counts & visible).any() else np.ones(visible.shape, bool)
 
 
 def _coloured(

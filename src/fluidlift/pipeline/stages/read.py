@@ -60,7 +60,8 @@ def read(clip: GivenFile, camera: GivenFile | None, config: ReadSettings, *, wor
     alpha = None if alpha is None else scratch.keep("alpha", alpha)
     used = VideoClip(scratch.keep("frames", frames), steady.times[first:last], found.source, alpha)
     said = (*found.warnings, *(w for w in shake.warnings if w not in found.warnings), *warnings)
-    return Read(used, kept, decoded, shake.shake_px, shake.stabilised, shake.cuts, said)
+    path = None if shake.path is None else shake.path[first:last]
+    return Read(used, kept, decoded, shake.shake_px, shake.stabilised, shake.cuts, said, path)
 
 
 def _without_distortion(clip: VideoClip, file: Path | None, scratch: Scratch) -> VideoClip:
@@ -131,6 +132,8 @@ class _Shake:
     runs: tuple[tuple[int, int], ...]
     """first frame and end of what can be used of each shot"""
     warnings: tuple[Notice, ...] = ()
+    path: np.ndarray | None = None
+    """[T,2] px, as in `motion.stabilize.ShakeReport`"""
 
 
 def _steady(clip: VideoClip, scratch: Scratch, *, correct: bool) -> tuple[VideoClip, _Shake]:
@@ -142,7 +145,9 @@ def _steady(clip: VideoClip, scratch: Scratch, *, correct: bool) -> tuple[VideoC
         return clip, _Shake(0.0, False, cuts, tuple(pairwise((0, *cuts, len(clip)))))
     steady, shake = stabilise(clip, out=scratch.array("steady", clip.frames.shape, np.uint8))
     cuts = tuple(int(c) for c in shake.cuts)
-    return steady, _Shake(float(shake.shake_px), bool(shake.stabilised), cuts, shake.runs, shake.warnings)
+    return steady, _Shake(
+        float(shake.shake_px), bool(shake.stabilised), cuts, shake.runs, shake.warnings, shake.path
+    )  # fmt: skip
 
 
 def _longest_run(shake: _Shake, frames: int, source: str, kept: np.ndarray) -> tuple[int, int, list[Notice]]:

@@ -21,6 +21,7 @@ from fluidlift.types.stages import Flow, Read, Segmentation
 
 if TYPE_CHECKING:
     from fluidlift.shape.evidence import PairReader
+    from fluidlift.shape.segment import Clues
 
 
 def segment(
@@ -50,6 +51,7 @@ def segment(
         labels = segment_clip(
             clip, _flow_for_masks(clip, flow), user_mask=drawn, roi=hints.roi, points=hints.clicks(),
             progress=lambda part, _: work.step(round(100 * part), 100), out=out,
+            clues=lambda: work.remembered("clues", clues, read, flow, hints.roi),
         )  # fmt: skip
     fluid = FluidMasks(labels.labels)
     areas = fluid.areas()
@@ -71,6 +73,13 @@ def segment(
     kept = work.scratch.keep("labels", labels.labels), work.scratch.keep("confidence", _halved(work, labels.confidence))
     share = float(areas.mean() / (clip.size[0] * clip.size[1]))
     return Segmentation(PixelLabels(*kept), share, sure, trusted, mask is not None, tuple(warnings))
+
+
+def clues(read: Read, flow: Flow, roi: tuple[int, int, int, int] | None) -> Clues:
+    """What the clip shows of its fluid before a person says anything."""
+    from fluidlift.shape.segment import clues_of
+
+    return clues_of(read.clip, _flow_for_masks(read.clip, flow), roi)
 
 
 def require_usable(clip: VideoClip, mask: GivenMask | None, config: SegmentSettings, hints: Hints) -> None:

@@ -33,6 +33,7 @@ def simulate(
     folder: Path,
     request: SimulationRequest | None = None,
     work: Work | None = None,
+    told: Callable[[int], None] = lambda splats: None,
 ) -> Simulation:
     """Frames of a scene, as splats with ids and velocities.
 
@@ -46,6 +47,7 @@ def simulate(
         folder: of the asset, where the frames go.
         request: whether to go on from a checkpoint.
         work: told how many frames are done.
+        told: gets how many splats a frame will have, about, before the first one is simulated.
 
     Raises:
         InputRejected: a scene that cannot be simulated, said before anything is written; or the disk is full.
@@ -60,7 +62,8 @@ def simulate(
     appearance = SurfaceAppearance(scene, white)
     history = continued(simulator, appearance, scene, folder, request or SimulationRequest(), config.max_particles)
     first = len(history)
-    require_room(folder, scene.simulated - first, len(scene.body))
+    told(appearance.splats)
+    require_room(folder, scene.simulated - first, appearance.splats)
     for old in asset_files(folder, "frames/splats", (".ply",)):
         if not (old.stem.isdigit() and 0 <= int(old.stem) - FIRST_FRAME < first):
             old.unlink()

@@ -29,7 +29,7 @@ const warning = (text) => el("p", { class: "warning" }, text);
 
 export function panels(state, doing) {
   const look = state.look, facts = look?.facts, hints = state.hints ?? {};
-  panel("found", [state.clip?.name, facts, look?.warnings, hints.kind, hints.horizon, hints.ruler], () => found(state, doing));
+  panel("found", [state.clip?.name, facts, look?.so_far, look?.warnings, hints.kind, hints.horizon, hints.level, hints.ruler], () => found(state, doing));
   panel("said", [state.clip?.name, hints, state.broken], () => said(state, doing));
   panel("about", [state.clip, look?.read_warnings], () => about(state));
   making(state, doing);
@@ -37,8 +37,9 @@ export function panels(state, doing) {
   panel("trash", [state.trash], () => trash(state, doing));
 }
 
+// what a look has told so far stands beside what the last whole one found
 function found(state, { change }) {
-  const facts = state.look?.facts, hints = state.hints ?? {};
+  const facts = state.look?.facts, known = { ...facts, ...state.look?.so_far }, hints = state.hints ?? {};
   if (!state.clip) return [el("p", { class: "soft" }, "No clip is open.")];
   const scores = facts ? Object.entries(facts.probability) : [];
   const chosen = el("select", { id: "kind", "aria-label": "kind", onchange: (e) => change({ set: "kind", to: e.target.value || null }) },
@@ -54,9 +55,16 @@ function found(state, { change }) {
     const error = hints.horizon ? "as drawn" : `± ${facts.pitch_error.toFixed(0)}°, from ${facts.tilt_from}`;
     rows.push(["Tilt", `looks ${facts.pitch.toFixed(0)}° down (${error})`]);
     rows.push(["Scale", facts.scale.replace(/^scale: /, "")]);
-    rows.push(["Fluid", `${Math.round(100 * facts.fluid_share)} % of the picture, sure ${facts.fluid_sure.toFixed(2)}`]);
-    rows.push(["Lens", `${facts.field_of_view.toFixed(0)}° across`]);
   }
+  if (known.fluid_share !== undefined) rows.push(["Fluid", `${Math.round(100 * known.fluid_share)} % of the picture, sure ${known.fluid_sure.toFixed(2)}`]);
+  const parts = (facts?.parts ?? []).slice(1);
+  parts.forEach((part, k) => rows.push([k ? "" : "Parts", `${part.is} ${part.probability.toFixed(2)}`]));
+  if (facts?.level_probability !== undefined) {
+    const level = facts.level_probability.toFixed(2);
+    rows.push(["Slope", facts.slope >= 1 ? `falls by ${facts.slope.toFixed(0)}° (level: ${level})` : `level (${level})`]);
+  }
+  if (known.camera) rows.push(["Camera", known.camera.words.replace(/^the camera /, "")]);
+  if (facts) rows.push(["Lens", `${facts.field_of_view.toFixed(0)}° across`]);
   const told = (state.look?.warnings ?? []).map(warning);
   return [el("table", {}, ...rows.map(([a, b]) => el("tr", {}, el("th", {}, a), el("td", {}, b)))), ...told];
 }
@@ -71,10 +79,12 @@ function said(state, { change, act }) {
   if (hints.kind) item(`kind: ${hints.kind}`, { set: "kind", to: null });
   if (hints.fov) item(`field of view: ${hints.fov}°`, { set: "fov", to: null });
   if (hints.horizon) item("a horizon", { set: "horizon", to: null });
+  if (hints.level) item("a level line", { set: "level", to: null });
   if (hints.ruler) item(`a ruler of ${hints.ruler.metres} m`, { set: "ruler", to: null });
   if (hints.roi) item("fluid only inside a box", { set: "roi", to: null });
   (hints.rims ?? []).forEach((r, k) => item(`rim ${k + 1}`, { remove: "rims", at: k }));
   (hints.regions ?? []).forEach((r, k) => item(`${r.is}: ${r.area ? "area" : "brush"} ${k + 1}${r.moves ? `, from ${(r.time ?? 0).toFixed(2)} s with the flow` : ""}`, { remove: "regions", at: k }));
+  (hints.flow ?? []).forEach((a, k) => item(`arrow ${k + 1} of the flow`, { remove: "flow", at: k }));
   (hints.clicks ?? []).forEach((c, k) => item(`click ${k + 1}: ${c.fluid ? "fluid" : "not fluid"}`, { remove: "clicks", at: k }));
   if (!items.length) return [el("p", { class: "soft" }, state.clip ? "Nothing yet. Choose a tool above the picture." : "")];
   return [el("ul", { class: "said" }, ...items), el("p", { class: "soft" }, `on disk: ${state.hints_file}`)];

@@ -1,5 +1,6 @@
 // The clip with what was found and what was said on it, and the tools that draw. Points are px of the clip's own picture.
 const COLORS = { fluid: "#1ea0ff", "not fluid": "#ff5a4d", rock: "#ff9a2e", sky: "#b9a3ff", ledge: "#2fd3c9", pool: "#3c6cff" };
+const MINE = "#5dff9b"; // of lines that a person drew
 const NEAR = 12; // px of the screen within which a handle is taken
 
 export class Picture {
@@ -123,10 +124,23 @@ export class Picture {
         ];
       });
     }
+    if (this.page.tool === "arrow") {
+      const mine = (this.hints.flow ?? []).flatMap((a, k) => [{ kind: "arrow-to", k, at: a.to }, { kind: "arrow-at", k, at: a.at }]);
+      return [...mine, ...this.foundArrows().map((a) => ({ kind: "arrow-found", from: a.at, at: a.to }))];
+    }
+    if (this.page.tool === "level" && this.hints.level) {
+      return this.hints.level.map((p, k) => ({ kind: "level", k, at: p }));
+    }
     if (this.page.tool === "ruler" && this.hints.ruler) {
       return ["from", "to"].map((k) => ({ kind: "ruler", k, at: this.hints.ruler[k] }));
     }
     return [];
+  }
+
+  // the arrows that were found; beside one that was drawn there is none
+  foundArrows() {
+    const near = this.size[0] / 14;
+    return (this.facts?.flow ?? []).filter((f) => !(this.hints.flow ?? []).some((a) => Math.hypot(a.at[0] - f.at[0], a.at[1] - f.at[1]) < near));
   }
 
   down(e) {
@@ -146,7 +160,7 @@ export class Picture {
       this.line = [p];
     } else if (this.held) {
       this.line = this.held.kind === "horizon" ? this.handles().map((x) => x.at) : null;
-    } else if (tool === "ruler" || tool === "rim") {
+    } else if (["ruler", "rim", "arrow", "level"].includes(tool)) {
       this.line = [p, p];
     }
     this.draw();
@@ -161,7 +175,7 @@ export class Picture {
     else if (e.buttons && this.line && this.page.tool === "brush") {
       const last = this.line[this.line.length - 1];
       if (Math.hypot(p[0] - last[0], p[1] - last[1]) > Math.max(2, this.page.width / 8)) this.line.push(p);
-    } else if (e.buttons && this.line && ["ruler", "rim"].includes(this.page.tool)) this.line[1] = p;
+    } else if (e.buttons && this.line && ["ruler", "rim", "arrow", "level"].includes(this.page.tool)) this.line[1] = p;
     if (this.held || this.line || this.page.tool === "brush") this.draw();
   }
 
@@ -172,7 +186,11 @@ export class Picture {
     this.line = null;
     if (held?.kind === "horizon") this.change({ set: "horizon", to: line });
     else if (held?.kind === "ruler") this.change({ set: "ruler", to: { ...this.hints.ruler, [held.k]: held.at } });
+    else if (held?.kind === "level") this.change({ set: "level", to: this.hints.level.map((p, k) => (k === held.k ? held.at : p)) });
+    else if (held?.kind.startsWith("arrow")) this.turnArrow(held);
     else if (held) this.moveRim(held);
+    else if (line && tool === "arrow" && this.long(line)) this.change({ add: "flow", item: { at: line[0], to: line[1] } });
+    else if (line && tool === "level" && this.long(line)) this.change({ set: "level", to: line });
     else if (line && tool === "brush") this.sendRegion({ brush: line, width: this.page.width });
     else if (line && tool === "ruler" && this.long(line)) this.change({ set: "ruler", to: { from: line[0], to: line[1], metres: this.page.metres } });
     else if (line && tool === "rim" && this.long(line)) {
@@ -183,6 +201,17 @@ export class Picture {
   }
 
   long([a, b]) { return Math.hypot(a[0] - b[0], a[1] - b[1]) > 4; }
+
+  // an arrow that was found and is turned becomes one that was drawn; one is moved by its tail as a whole
+  turnArrow({ kind, k, at, from }) {
+    if (kind === "arrow-found") {
+      if (this.long([from, at])) this.change({ add: "flow", item: { at: from, to: at } });
+      return;
+    }
+    const arrow = this.hints.flow[k];
+    const moved = kind === "arrow-to" ? { at: arrow.at, to: at } : { at, to: [arrow.to[0] + at[0] - arrow.at[0], arrow.to[1] + at[1] - arrow.at[1]] };
+    if (this.long([moved.at, moved.to])) this.change({ put: "flow", at: k, item: moved });
+  }
 
   moveRim({ kind, k, at }) {
     const rim = { ...this.hints.rims[k] }, dx = at[0] - rim.center[0], dy = at[1] - rim.center[1];
@@ -232,7 +261,15 @@ export class Picture {
 
   drawArrows(c) {
     c.strokeStyle = "rgba(255,255,255,0.95)"; c.lineWidth = 1.6 * this.unit;
-    for (const { at, to } of this.facts?.flow ?? []) this.arrow(c, at, to);
+    const turned = this.held?.kind === "arrow-found" ? this.held.from : null;
+    for (const { at, to } of this.foundArrows()) if (at !== turned) this.arrow(c, at, to);
+    c.strokeStyle = MINE; c.lineWidth = 3 * this.unit;
+    (this.hints.flow ?? []).forEach(({ at, to }, k) => {
+      const held = this.held?.k === k && this.held.kind.startsWith("arrow-") ? this.held : null;
+      if (held?.kind === "arrow-at") this.arrow(c, held.at, [to[0] + held.at[0] - at[0], to[1] + held.at[1] - at[1]]);
+      else this.arrow(c, at, held ? held.at : to);
+    });
+    if (turned) this.arrow(c, turned, this.held.at);
   }
 
   arrow(c, a, b) {
@@ -261,10 +298,52 @@ export class Picture {
     for (const k of this.hints.clicks ?? []) this.dot(c, k.at, k.fluid ? COLORS.fluid : COLORS["not fluid"], 5);
     for (const r of this.hints.rims ?? []) this.ellipse(c, r, "#ffe14d", []);
     if (!this.hints.rims) for (const r of this.facts?.rims ?? []) this.ellipse(c, r, "#ffe14d", [5 * u, 5 * u]);
+    this.drawFoundLines(c);
+    this.drawPath(c);
+    const level = this.hints.level;
+    if (level) {
+      const held = this.held?.kind === "level" ? this.held : null;
+      c.strokeStyle = COLORS.pool; c.lineWidth = 3 * u;
+      this.path(c, level.map((p, k) => (held?.k === k ? held.at : p)), false); c.stroke();
+    }
     const ruler = this.hints.ruler;
     if (ruler) this.measure(c, ruler.from, ruler.to, `${ruler.metres} m`);
     const horizon = this.page.tool === "horizon" ? this.handles().map((x) => x.at) : (this.hints.horizon ?? this.facts?.horizon);
     if (horizon && !(this.page.tool === "horizon" && this.line)) this.drawHorizon(c, horizon, !this.hints.horizon);
+  }
+
+  // ledges, levels and the vessel as found: dashed, as all that was not said; and how sure they are
+  drawFoundLines(c) {
+    const u = this.unit, facts = this.facts;
+    if (!facts) return;
+    c.lineWidth = 2 * u; c.lineJoin = "round";
+    for (const { is, line } of facts.lines ?? []) {
+      c.strokeStyle = is === "level" ? COLORS.pool : COLORS.ledge;
+      c.setLineDash(is === "crest" ? [] : [7 * u, 5 * u]);
+      this.path(c, line, false); c.stroke();
+    }
+    c.setLineDash([7 * u, 5 * u]); c.font = `bold ${13 * u}px system-ui`;
+    for (const { is, area, probability } of facts.parts ?? []) {
+      if (!area) continue;
+      c.strokeStyle = c.fillStyle = is === "ledge" ? COLORS.ledge : is === "pool" ? COLORS.pool : "#ffe14d";
+      if (is === "jet" || is === "vessel") { this.path(c, area, true); c.stroke(); }
+      const top = area.reduce((a, b) => (b[1] < a[1] ? b : a)), text = `${is} ${probability.toFixed(2)}`;
+      const x = Math.max(2 * u, Math.min(this.size[0] - c.measureText(text).width - 2 * u, top[0])), y = Math.max(14 * u, top[1] - 6 * u);
+      c.save(); c.setLineDash([]); c.lineWidth = 4 * u; c.strokeStyle = c.fillStyle; c.strokeText(text, x, y);
+      c.fillStyle = "#10202a"; c.fillText(text, x, y); c.restore();
+    }
+    c.setLineDash([]);
+  }
+
+  // where the middle of the frames lay on the steady picture, as the camera moved; a dot is the frame in view
+  drawPath(c) {
+    const camera = this.state.look?.so_far?.camera ?? this.facts?.camera, u = this.unit;
+    if (!camera?.path) return;
+    c.strokeStyle = "#ff6bd6"; c.lineWidth = 2 * u; c.lineJoin = "round";
+    this.path(c, camera.path, false); c.stroke();
+    const now = this.times[this.number] ?? 0;
+    const k = camera.times.reduce((best, t, i) => (Math.abs(t - now) < Math.abs(camera.times[best] - now) ? i : best), 0);
+    this.dot(c, camera.path[k], "#ff6bd6", 4);
   }
 
   drawHorizon(c, [a, b], guessed) {
@@ -305,9 +384,13 @@ export class Picture {
     else if (tool === "rim" && this.line) {
       const [a, b] = this.line;
       this.ellipse(c, { center: [(a[0] + b[0]) / 2, (a[1] + b[1]) / 2], axes: [Math.abs(a[0] - b[0]) / 2, Math.abs(a[1] - b[1]) / 2] }, "#ffe14d", []);
+    } else if (tool === "arrow" && this.line) {
+      c.strokeStyle = MINE; c.lineWidth = 3 * u; this.arrow(c, ...this.line);
+    } else if (tool === "level" && this.line) {
+      c.strokeStyle = COLORS.pool; c.lineWidth = 3 * u; this.path(c, this.line, false); c.stroke();
     } else if (tool === "horizon" && this.line) this.drawHorizon(c, this.line, false);
     const held = this.held && this.held.kind !== "horizon" ? [this.held] : [];
     const handles = tool === "horizon" && this.line ? this.line.map((at) => ({ at })) : this.handles();
-    for (const x of [...handles, ...held]) this.dot(c, x.at, "#5dff9b", 6);
+    for (const x of [...handles, ...held]) this.dot(c, x.at, MINE, x.kind === "arrow-found" ? 4 : 6);
   }
 }

@@ -85,6 +85,10 @@ function options() {
     fill(box, [el("label", {}, el("input", { type: "number", id: "metres", min: 0.001, step: "any", value: page.metres, oninput: (e) => { page.metres = +e.target.value; } }), " m long; then drag along it")]);
   } else if (page.tool === "horizon") {
     fill(box, ["drag its ends; it may lie outside the picture"]);
+  } else if (page.tool === "arrow") {
+    fill(box, ["drag the head of an arrow to turn it, its tail to move it; or drag a new one"]);
+  } else if (page.tool === "level") {
+    fill(box, ["drag along the far edge of still water, or the level in a glass"]);
   } else if (page.tool === "rim") {
     fill(box, ["drag a box around a round, level rim"]);
   } else {
@@ -182,7 +186,7 @@ for (const name of ["dragenter", "dragover"]) window.addEventListener(name, (e) 
 window.addEventListener("dragleave", (e) => { if (!e.relatedTarget) stage.classList.remove("over"); });
 window.addEventListener("drop", (e) => { e.preventDefault(); stage.classList.remove("over"); addClip(e.dataTransfer.files[0]); });
 
-const KEYS = { v: "look", b: "brush", a: "area", c: "click", h: "horizon", r: "ruler", e: "rim" };
+const KEYS = { v: "look", b: "brush", a: "area", c: "click", h: "horizon", r: "ruler", e: "rim", f: "arrow", l: "level" };
 window.addEventListener("keydown", (e) => {
   if (["INPUT", "SELECT", "TEXTAREA"].includes(e.target.tagName) && e.target.type !== "range" && e.target.type !== "checkbox") return;
   const key = e.key.toLowerCase();
@@ -197,7 +201,7 @@ window.addEventListener("keydown", (e) => {
 });
 
 // where tests and the curious find the picture and its tools
-window.studio = { get size() { return picture.size; }, get tool() { return page.tool; }, handles: () => picture.handles(), drawn: () => picture.drawn() };
+window.studio = { get size() { return picture.size; }, get tool() { return page.tool; }, handles: () => picture.handles(), change, drawn: () => picture.drawn() };
 picture.told = (number, time, running) => {
   $("frame").value = number;
   $("time").textContent = time === null ? "" : `${time.toFixed(2)} s`;

@@ -19,7 +19,8 @@ Modules of the face:
                             (memory: `multigrid_kernels`)
     multigrid_cycle         The V-cycle and the conjugate gradients of the multigrid solver (memory:
                             `multigrid_kernels`)
-    nearest                 Nearest neighbours in a k-d tree
+    nearest                 Nearest neighbours: in a k-d tree, or, where points lie about evenly, in the cells
+                            around a place
     outline                 Where an outline ends
     particle_mean           What particles carry, at other points: means weighted by a kernel (Numba)
     poisson                 The Poisson equation on irregular cell domains (Dirichlet and Neumann): system, plain

@@ -19,6 +19,7 @@ EXTRAS = {
     "gsplat": ("gsplat", "pip install 'fluidlift[gsplat]', with a GPU"),
     "Warp": ("warp", "pip install 'fluidlift[cuda]'"),
     "learned models": ("transformers", "pip install 'fluidlift[learned]'"),
+    "data sets": ("pyarrow", "pip install 'fluidlift[dataset]'"),
     "splashsurf": ("pysplashsurf", "pip install pysplashsurf"),
 }
 """what is not needed, by the module that it brings, and how to get it"""

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from fluidlift.errors import InputRejected
+from fluidlift.io.hashes import file_hash
 from fluidlift.io.kept_values import kept_value, last_value
 from fluidlift.io.stage_cache import load_stage, save_stage
 from fluidlift.machine import peak_memory_mb
 from fluidlift.pipeline import runner as running
-from fluidlift.pipeline.inputs import GivenFile, Weights, file_hash
+from fluidlift.pipeline.inputs import GivenFile, Weights
 from fluidlift.pipeline.runner import Runner, digest_of
 from fluidlift.pipeline.settings import BESIDE
 from fluidlift.pipeline.work import Work

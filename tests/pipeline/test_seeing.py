@@ -9,11 +9,12 @@ import pytest
 
 from fluidlift.config import build_config
 from fluidlift.errors import InputRejected
+from fluidlift.io.hashes import file_hash
 from fluidlift.messages import code_of
 from fluidlift.motion.optical_flow import estimate_flow, mean_flow
 from fluidlift.motion.steady_flow import mean_motion, pairs_of, spans_of
 from fluidlift.pipeline.hints import NO_HINTS, Hints
-from fluidlift.pipeline.inputs import GivenFile, file_hash
+from fluidlift.pipeline.inputs import GivenFile
 from fluidlift.pipeline.runner import Runner
 from fluidlift.pipeline.settings import FlowSettings, ReadSettings, SegmentSettings, taken
 from fluidlift.pipeline.stages import segment as segmenting

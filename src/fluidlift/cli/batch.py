@@ -56,6 +56,8 @@ class Batch:
     """with --status: a row per shot"""
     html: bool = False
     """with --status: write status.html, a page with pictures of all shots, the most doubtful first"""
+    dataset: bool = False
+    """write dataset.parquet into the folder as well, an index with a row per asset; with --status of what is there"""
     progress: Literal["lines", "openjd"] = "lines"
     """how progress is told; openjd: as tasks of Open Job Description do"""
     warnings_ok: bool = False
@@ -72,6 +74,10 @@ def run(wanted: Batch) -> int:
     """
     from fluidlift.farm.shots import shard_of
 
+    if wanted.dataset:
+        from fluidlift.farm.dataset import require_parquet
+
+        require_parquet()
     if wanted.status:
         return _status(wanted)
     if wanted.out is None:
@@ -112,6 +118,8 @@ def _make(wanted: Batch, out: Path, shots: list[Shot]) -> int:
         tell(f"[{len(outcomes)}/{len(shots)}] {outcome.line()}")
         summarise(folder)
     summarise(folder)
+    if wanted.dataset:
+        _index(folder)
     bad = [o for o in outcomes if not o.well]
     if wanted.json:
         print((folder / SUMMARY).read_text(encoding="utf-8"), end="")
@@ -176,9 +184,20 @@ def _status(wanted: Batch) -> int:
         print(as_csv(found.outcomes), end="")
     else:
         print("\n".join(found.lines()))
+    if wanted.dataset:
+        _index(folder)
     if wanted.html:
         from fluidlift.farm.page import page
 
         write_bytes(folder / "status.html", page(folder, found).encode())
         print(f"page: {folder / 'status.html'}", file=sys.stderr)
     return 0
+
+
+def _index(folder: Path) -> None:
+    """Write the index of a data set, and say so."""
+    from fluidlift.farm.dataset import write_index
+    from fluidlift.farm.summary import status_of
+
+    path, rows = write_index(folder, status_of(folder).outcomes)
+    print(f"data set: {path}, {rows} assets", file=sys.stderr)

@@ -178,7 +178,7 @@ def film_statistics(
 
 def mean_flow(frames: np.ndarray, masks: np.ndarray, pairs: Sequence[int]) -> Float[np.ndarray, "h w 2"]:
     """Mean displacement from the frames `pairs` to those after them, px/frame, where they show fluid; else NaN."""
-    estimator = DenseInverseSearch(half=True)  # a mean over many pairs of a field that is compared as a whole
+    estimator = DenseInverseSearch()
     total, weight = np.zeros((*frames.shape[1:3], 2)), np.zeros(frames.shape[1:3])
     for t in pairs:
         total += estimator.displacement(frames[t], frames[t + 1]) * masks[t][..., None]

@@ -2,6 +2,7 @@
 
 Modules of the face:
 
+    dataset  A data set of assets: an index in Parquet with a row per asset, and what its rows name as arrays
     engine   Shots made on this machine, each in a process of its own with its share of the cores, its memory and
              its time
     page     A thousand results on one page, which works offline: overlay and preview of each shot, the most
@@ -13,4 +14,4 @@ Modules of the face:
     summary  How far a folder of shots is: counts, rate, failures by class; as text, JSON and CSV
 """
 
-__all__ = ["engine", "page", "plans", "shots", "state", "summary"]
+__all__ = ["dataset", "engine", "page", "plans", "shots", "state", "summary"]

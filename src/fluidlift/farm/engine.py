@@ -13,7 +13,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from platform import node
 
@@ -107,8 +107,11 @@ def _shot(shot: Shot, folder: Path, limits: Limits, running: _Running, tell: Tel
         if not ours:
             tell(f"{shot.name}: being made by another batch, left to it")
             return None
-        if is_finished(folder, known, fingerprint):
-            return known
+        if known is not None and is_finished(folder, known, fingerprint):
+            now = replace(known, clip=str(shot.clip), licence=shot.licence, source=shot.source)
+            if now != known:
+                write_outcome(folder, now)
+            return now
         if running.stopped or not _wanted(known, limits.retry):
             return None
         outcome = _made(shot, folder, fingerprint, limits, running, tell, part)
@@ -147,7 +150,7 @@ def _made(
         [str(w) for w in found.get("warnings", ())], reason, _failure(outcome, code, reason),
         str(card.get("verdict") or ""), max((s.get("peak_memory_mb", 0.0) for s in stages.values()), default=0.0),
         node(), __version__, datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"), fingerprint,
-        manifest_digest(folder, shot.name),
+        manifest_digest(folder, shot.name), str(shot.clip), shot.licence, shot.source,
     )  # fmt: skip
 
 

@@ -18,6 +18,8 @@ from fluidlift.io.hashes import digest
 
 VIDEOS = frozenset({".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".mxf", ".gif"})
 LISTS = (".yaml", ".yml")
+NOTES = ("licence", "source")
+"""keys of a row that say where its clip is from"""
 _SHARD = re.compile(r"([1-9][0-9]{0,6})/([1-9][0-9]{0,6})", re.ASCII)
 
 
@@ -28,6 +30,10 @@ class Shot:
     clip: Path
     name: str
     options: dict[str, Any]
+    licence: str = ""
+    """of the clip, for people and for the index of a data set; making does not depend on it"""
+    source: str = ""
+    """where the clip is from, likewise"""
 
     def arguments(self, folder: Path) -> list[str]:
         """Of the command line that makes it, below `folder`."""
@@ -67,7 +73,7 @@ class ShotOptions:
     @property
     def known(self) -> list[str]:
         """All keys of a row."""
-        return ["clip", "name", *self.types]
+        return ["clip", "name", *NOTES, *self.types]
 
 
 def read_shots(
@@ -96,8 +102,9 @@ def read_shots(
         for row in rows:
             clip = row.pop("clip")
             name = str(row.pop("name", clip.stem or "clip"))
+            notes = {key: str(row.pop(key, "")) for key in NOTES}
             row["set"] = [*settings, *row.get("set", ())]
-            shots.append(Shot(clip, name, dict(base) | row))
+            shots.append(Shot(clip, name, dict(base) | row, **notes))
     _require_names(shots)
     return shots
 

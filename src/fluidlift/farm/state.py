@@ -57,6 +57,12 @@ class Outcome:
     fingerprint: str = ""
     manifest: str = ""
     """SHA-256 of the asset's manifest.json"""
+    clip: str = ""
+    """its path"""
+    licence: str = ""
+    """of the clip, as the list gives it"""
+    source: str = ""
+    """of the clip, as the list gives it"""
 
     @property
     def well(self) -> bool:

@@ -15,6 +15,18 @@ def digest(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+def file_hash(path: Path) -> str:
+    """SHA-256 of a file with its name, or of all files of a folder with theirs."""
+    found = hashlib.sha256()
+    files = [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file())
+    for file in files:
+        found.update(file.name.encode())
+        with file.open("rb") as stream:
+            while block := stream.read(1 << 20):
+                found.update(block)
+    return found.hexdigest()
+
+
 def digests(folder: Path | str, names: Iterable[str]) -> dict[str, str]:
     """SHA-256 of those files of an asset that are there, by their names in it; raises as `asset_file`."""
     paths = {name: asset_file(folder, name) for name in sorted(set(names))}

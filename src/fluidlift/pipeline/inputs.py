@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from fluidlift.errors import InputRejected
+from fluidlift.io.hashes import file_hash
 
 _OPTIONS = {"geometry": ("--geometry-from", "folder")}
 """option and what it takes, where they are not --name and a file"""
@@ -106,15 +106,3 @@ class GivenFiles:
         """Names and hashes, for a manifest."""
         given = {k: v for k, v in vars(self).items() if v is not None}
         return {"inputs": {k: {"name": v.path.name, "sha256": v.content} for k, v in given.items()}}
-
-
-def file_hash(path: Path) -> str:
-    """SHA-256 of a file, or of all files of a folder with their names."""
-    digest = hashlib.sha256()
-    files = [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file())
-    for file in files:
-        digest.update(file.name.encode())
-        with file.open("rb") as stream:
-            while block := stream.read(1 << 20):
-                digest.update(block)
-    return digest.hexdigest()

@@ -338,7 +338,7 @@ def test_clear_liquids_show_the_clip_and_cloudy_ones_themselves():
     assert red > 3 * blue
 
 
-def test_honey_is_pale_where_it_is_thin_and_deep_gold_where_it_is_deep():
+def test_honey_is_light_where_it_is_thin_and_dark_and_red_where_it_is_deep():
     g = layer(0.2)
     own = np.full((len(g), 3), 0.6, np.float32)
     normals, share = np.tile(np.float32([0, 0, 1]), (len(g), 1)), np.ones(len(g), np.float32)
@@ -346,13 +346,12 @@ def test_honey_is_pale_where_it_is_thin_and_deep_gold_where_it_is_deep():
     body = body_color(g, own, PRESETS["honey"], depths)
     np.testing.assert_allclose(body[0], own[0], rtol=1e-5)  # what is behind no honey is as it was
     assert (np.diff(body[:, 0]) <= 1e-6).all()  # darker and darker; float32
-    np.testing.assert_allclose(body[-1], PRESETS["honey"].albedo, rtol=0.02)  # and in the end its own gold
+    np.testing.assert_allclose(body[-1], PRESETS["honey"].albedo, rtol=0.02)  # and in the end its own brown
     middle = body[3 * len(g) // 100]  # 3 cm
     assert body[0, 1] > 1.4 * middle[1] and middle[0] / middle[2] > 4 * body[0, 0] / body[0, 2]
     args = (normals, share, CAMERA, PRESETS["honey"], Environment.white())
     thin, thick = (relit(g, *args, depths=np.full(len(g), d)).mean(axis=0) for d in (0.003, 0.05))
-    assert thin @ (1, 1, 1) > 1.1 * thick @ (1, 1, 1)
-    assert thick[0] / thick[2] > 2.5 * thin[0] / thin[2] and thick[0] > thick[1] > thick[2]
+    assert thin @ (1, 1, 1) > 1.5 * thick @ (1, 1, 1)
 
 
 def test_hot_parts_glow_yellow_and_cool_ones_red_or_not_at_all():

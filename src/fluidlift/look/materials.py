@@ -94,13 +94,12 @@ MUDDY_WATER = Material(
 take more blue than red."""
 
 HONEY = Material(
-    "honey", 1.49, absorption=(1.6, 4.5, 45.0), scattering=18.0, albedo=(0.3024, 0.1745, 0.0293), roughness=0.04
+    "honey", 1.49, absorption=(3.0, 16.0, 70.0), scattering=6.0, albedo=(0.110, 0.0277, 0.0068), roughness=0.04
 )
-"""Index at 18 % water. Water white, as acacia honey is, by the USDA's colour standard (absorbance of at most 0.0945
-through 3.15 cm at 560 nm, so 6.9 per metre; here 0.06). Red falls as brown spectra do with wavelength, by some 0.0165
-per nm; in the blue flavonoids and carotenes absorb, too: 0.2 through 1 cm at 465 nm, as light honeys have at 450 nm.
-Cloudy with pollen and fine crystals, by eye: a body some centimetres deep is gold by what it scatters. A darker class
-(16 per metre), and clear, made of a stream of it plum jam. Its albedo is `optics.deep_color` of the rest."""
+"""Index at 18 % water. White to extra light amber, by the USDA's colour standard (absorbance of 0.19 to 0.6 through
+3.15 cm at 560 nm, so 14 to 43 per metre); red and blue after the usual fall of brown spectra with wavelength. A little
+cloudy, by eye. What comes through a spoon of it is gold; a deep body returns little, and that is brown: its albedo is
+`optics.deep_color` of the rest."""
 
 LAVA = Material(
     "lava", 1.58, absorption=(300.0, 300.0, 300.0), scattering=3000.0, albedo=(0.035, 0.030, 0.028), roughness=0.45,

@@ -74,6 +74,9 @@ NO_TRUST = 1e-4
 """weight of a frame without confidence in a mean over time: that of a confidence of one hundredth"""
 MOST_AT_ONCE = 4
 """pairs that are measured side by side: each needs some thirty pictures' worth of arrays"""
+HALVED_FROM = 200
+"""px of the shorter side from which slow motion is measured at half the resolution: with 208 the errors are the same, on
+a made clip of 64 px the first frame of its asset came out 7 % further from the clip"""
 WORTH_A_LOOK = 0.01
 """share of the picture with texture and no detail that moves, from which slow motion is searched"""
 
@@ -321,7 +324,8 @@ def flow_with_rest(
     start = int(np.clip(pair - (gap - 1) // 2, 0, len(frames) - 1 - gap))
     ends = log_brightness(frames[start]), log_brightness(frames[start + gap])
     # an error of half a pixel over the gap is an eighth per frame
-    slow = flow_of_detail(ends, frames[start], estimator.halved, gap)
+    coarser = estimator.halved if min(frames.shape[1:3]) >= HALVED_FROM else estimator
+    slow = flow_of_detail(ends, frames[start], coarser, gap)
     speed = (slow.displacement**2).sum(axis=-1)
     share = share / (1.0 + (speed / SLOW**2) ** 2)
     displacement = fast.displacement + share[..., None] * (slow.displacement - fast.displacement)

@@ -75,7 +75,7 @@ NO_TRUST = 1e-4
 MOST_AT_ONCE = 4
 """pairs that are measured side by side: each needs some thirty pictures' worth of arrays"""
 HALVED_FROM = 200
-"""px of the shorter side from which slow motion is measured at half the resolution: with 208 the errors are the same, on
+"""px of the shorter side from which slow motion is measured at half the resolution: with 208 errors are the same, on
 a made clip of 64 px the first frame of its asset came out 7 % further from the clip"""
 WORTH_A_LOOK = 0.01
 """share of the picture with texture and no detail that moves, from which slow motion is searched"""

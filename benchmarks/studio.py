@@ -110,7 +110,7 @@ def measured(folder: Path) -> dict[str, tuple[float, float]]:
         arrow = {"at": [150, 150], "to": [150, 110]}
         clock.start()
         page.evaluate("(item) => window.studio.change({ add: 'flow', item })", arrow)
-        clock.until(lambda: len(desk.history.hints.flow) == 1)  # type: ignore[union-attr]
+        clock.until(lambda: desk.history is not None and len(desk.history.hints.flow) == 1)
         found["arrow to the changed findings"] = clock.until(lambda: look.idle)
         page.get_by_label("kind", exact=True).select_option("fall")
         clock.start()

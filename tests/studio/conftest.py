@@ -124,6 +124,14 @@ class Window:
             mouse.move(*point, steps=6)
         mouse.up()
 
+    def area(self, what, *corners):
+        """An area with corners at these places, and what is there."""
+        self.page.keyboard.press("a")
+        self.page.get_by_label("what is there").select_option(what)
+        for place in corners:
+            self.page.mouse.click(*self.at(*place))
+        self.page.keyboard.press("Enter")
+
     def looked(self):
         """Wait until all is found for the hints there are."""
         self.until(lambda: self.desk.looking.look.facts is not None and not self.desk.looking.look.words, "the look")

@@ -85,11 +85,7 @@ def test_a_stroke_changes_the_mask_and_undo_takes_it_back(visit):
 
 
 def test_an_area_is_closed_by_enter_and_taken_back_by_its_line(visit):
-    visit.page.keyboard.press("a")
-    visit.page.get_by_label("what is there").select_option("not fluid")
-    for place in ((0.1, 0.4), (0.3, 0.4), (0.3, 0.6), (0.1, 0.6)):
-        visit.page.mouse.click(*visit.at(*place))
-    visit.page.keyboard.press("Enter")
+    visit.area("not fluid", (0.1, 0.4), (0.3, 0.4), (0.3, 0.6), (0.1, 0.6))
     visit.until(lambda: label_at(visit, 0.2, 0.5) == Label.BACKGROUND, "the mask without the area")
     visit.page.get_by_label("take back: not fluid: area 1").click()
     visit.until(lambda: label_at(visit, 0.2, 0.5) == Label.FLUID, "the mask as before")
@@ -175,11 +171,7 @@ def test_a_new_arrow_and_a_level_line_are_drawn_and_taken_back_by_their_lines(vi
 
 
 def test_a_ledge_that_runs_uphill_is_told_in_the_picture_with_the_way_out(visit):
-    visit.page.keyboard.press("a")
-    visit.page.get_by_label("what is there").select_option("ledge")
-    for place in ((0.3, 0.3), (0.7, 0.3), (0.7, 0.8), (0.3, 0.8)):
-        visit.page.mouse.click(*visit.at(*place))
-    visit.page.keyboard.press("Enter")
+    visit.area("ledge", (0.3, 0.3), (0.7, 0.3), (0.7, 0.8), (0.3, 0.8))
     visit.until(lambda: len(visit.desk.history.hints.regions) == 1, "the ledge")
     visit.page.keyboard.press("f")
     visit.shown()
@@ -201,11 +193,7 @@ def test_what_is_known_of_the_camera_and_the_parts_stands_beside_the_picture(vis
 
 
 def test_strokes_that_leave_no_fluid_are_told_with_the_way_back(visit):
-    visit.page.keyboard.press("a")
-    visit.page.get_by_label("what is there").select_option("not fluid")
-    for place in ((0.001, 0.001), (0.999, 0.001), (0.999, 0.999), (0.001, 0.999)):
-        visit.page.mouse.click(*visit.at(*place))
-    visit.page.keyboard.press("Enter")
+    visit.area("not fluid", (0.001, 0.001), (0.999, 0.001), (0.999, 0.999), (0.001, 0.999))
     visit.says("leave no fluid (region 1 takes it away)")
     visit.press("Undo")
     visit.until(lambda: not visit.desk.looking.look.error, "the end of the trouble")

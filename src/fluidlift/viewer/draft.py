@@ -79,7 +79,8 @@ class Draft:
     @property
     def pending(self) -> bool:
         """Whether something is not in the history yet."""
-        return bool(self._pending)
+        with self._lock:  # what is being written is pending until it is written
+            return bool(self._pending)
 
     def forget(self) -> None:
         """scene.yaml may have been changed by somebody else: read it again."""

@@ -218,7 +218,7 @@ def water_pixels(ready: Prepared, found: PixelLabels, most: int = 1500) -> dict[
     size = evidence.noise.shape[::-1]
     region = cv2.resize((found.labels[t] == Label.FLUID).astype(np.float32), size) > 0.5
     wander = log_wander(evidence)
-    if not lies_open(evidence, region, wander):
+    if not lies_open(region, wander):
         return None
     truth = cv2.resize(ready.truth[t], size, interpolation=cv2.INTER_NEAREST)
     places = np.flatnonzero((truth != UNJUDGED) & ~region)

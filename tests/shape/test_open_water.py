@@ -15,6 +15,7 @@ QUIET = (ROWS >= 45) & (ROWS < 70)
 LIVELY = ROWS >= 70
 FAR = ROWS >= 53
 """from the bank, by what wander is pooled over in so small a picture"""
+NARROW = (COLUMNS > 70) & (COLUMNS < 130)
 STONE = (ROWS - 95) ** 2 + (COLUMNS - 80) ** 2 < 8**2
 
 
@@ -27,7 +28,7 @@ def smooth(rng, sigma):
 def seen():
     """Evidence of a clip: ground above, water that hardly changes but drifts, lively water below, and a stone in it."""
 
-    def evidence(*, drift: int = 1, tremble: int = 0, near: float = 4.0):
+    def evidence(*, drift: int = 1, tremble: int = 0, near: float = 4.0, narrow: bool = False):
         rng = np.random.default_rng(3)
         ground = np.array([110.0, 105.0, 100.0]) + 12.0 * smooth(rng, 1.5)
         faint = smooth(rng, 2.0)
@@ -35,8 +36,8 @@ def seen():
         frames = np.empty((FRAMES, HEIGHT, WIDTH, 3))
         for t in range(FRAMES):
             frames[t] = np.roll(ground, tremble * (t % 5), axis=1)
-            frames[t][QUIET] = (np.array([70.0, 90.0, 110.0]) + 4.0 * np.roll(faint, drift * t, axis=1))[QUIET]
-            lively = LIVELY & ~STONE
+            quiet, lively = (x & (NARROW | (not narrow)) for x in (QUIET, LIVELY & ~STONE))
+            frames[t][quiet] = (np.array([70.0, 90.0, 110.0]) + 4.0 * np.roll(faint, drift * t, axis=1))[quiet]
             frames[t][lively] = (np.array([70.0, 90.0, 110.0]) + 25.0 * np.roll(strong, 3 * t, axis=1))[lively]
         frames += rng.normal(size=frames.shape)
         video = VideoClip(np.clip(frames, 0, 255).round().astype(np.uint8), np.arange(FRAMES) / 25.0)
@@ -72,8 +73,20 @@ def test_what_is_barred_stays_out(seen):
 
 
 def test_a_fluid_that_is_not_wide_keeps_its_mask(seen):
-    narrow = LIVELY & (COLUMNS > 60) & (COLUMNS < 140)
-    assert with_open_water(seen(), narrow, NOTHING) is narrow
+    region = LIVELY & NARROW
+    assert with_open_water(seen(narrow=True), region, NOTHING) is region
+
+
+def test_wide_water_of_which_a_part_was_found_is_found_whole(seen):
+    found = with_open_water(seen(), LIVELY & (COLUMNS > 110), NOTHING)
+    water = (LIVELY | (QUIET & FAR)) & ~STONE
+    assert found[water].mean() > 0.95
+    assert found[ROWS < 45].mean() < 0.02
+
+
+def test_a_part_that_does_not_wander_is_not_made_whole(seen):
+    bank = (ROWS < 40) & (COLUMNS > 110)
+    assert with_open_water(seen(), bank, NOTHING) is bank
 
 
 def test_nothing_is_added_where_the_camera_goes_on(seen):

@@ -264,8 +264,13 @@ def solids_by_flow(evidence: Evidence) -> np.ndarray:
 
 def separating_level(activity: np.ndarray, *, lowest: float = np.log(1.8), highest: float = np.log(10.0)) -> float:
     """Otsu's threshold of the activity, held between factors of the noise that cannot be doubted."""
-    top = max(float(activity.max()), 1e-3)
-    counts, edges = np.histogram(np.minimum(activity, np.log(100.0)), bins=128, range=(0.0, min(top, np.log(100.0))))
+    top = min(max(float(activity.max()), 1e-3), float(np.log(100.0)))
+    return float(np.clip(otsu_threshold(np.minimum(activity, np.log(100.0)), 0.0, top), lowest, highest))
+
+
+def otsu_threshold(values: np.ndarray, lowest: float, highest: float) -> float:
+    """What parts values between two bounds into two classes that differ most (Otsu 1979), over 128 bins."""
+    counts, edges = np.histogram(values, bins=128, range=(lowest, highest))
     centres = 0.5 * (edges[1:] + edges[:-1])
     weight = np.cumsum(counts)
     mass = np.cumsum(counts * centres)
@@ -273,5 +278,4 @@ def separating_level(activity: np.ndarray, *, lowest: float = np.log(1.8), highe
     with np.errstate(divide="ignore", invalid="ignore"):
         between = weight * rest * (mass / weight - (mass[-1] - mass) / rest) ** 2
     between = np.nan_to_num(between)
-    best = centres[between >= (1.0 - 1e-3) * between.max()].mean()  # the middle of a gap between two populations
-    return float(np.clip(best, lowest, highest))
+    return float(centres[between >= (1.0 - 1e-3) * between.max()].mean())  # the middle of a gap between two classes

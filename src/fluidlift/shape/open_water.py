@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 
 from fluidlift.shape.colour_growth import STIFFNESS, colour_odds
-from fluidlift.shape.evidence import Evidence, distance_of_pictures
+from fluidlift.shape.evidence import Evidence, distance_of_pictures, otsu_threshold
 from fluidlift.shape.frame_pictures import typical_picture
 from fluidlift.shape.min_cut import disc, edge_weights, min_cut
 from fluidlift.shape.region import clean_region
@@ -29,6 +29,11 @@ from fluidlift.shape.region import clean_region
 WIDE = 0.3
 """part of the picture that moving water must fill. Of 15 real clips of rivers, falls and surf those with less (brooks,
 cascades, a fall in its pool: 0.12 to 0.24) have ferns and wet rock beside the water that wander as quiet water does"""
+MODES_APART = 4.2
+"""distance of the means of the two modes of the log of the wander, over their spread, from which it alone tells how
+far the water goes"""
+MOSTLY = 0.8
+"""part of the mask that is in the upper mode there: it is found by another clue, and has to agree"""
 UNSTEADY = 0.3
 """px of wander of the quiet part of what is around the fluid, from which the camera itself goes on and wander tells
 nothing: 0.41 to 0.74 in three clips where it does, 0 to 0.22 where it stands or is held"""
@@ -103,11 +108,10 @@ def log_wander(evidence: Evidence) -> np.ndarray:
     return cv2.GaussianBlur(cv2.erode(pooled, disc(RIM * longest)), (0, 0), FINE)
 
 
-def lies_open(evidence: Evidence, region: np.ndarray, wander: np.ndarray) -> bool:
+def lies_open(region: np.ndarray, wander: np.ndarray) -> bool:
     """Whether a region, bool [h,w], is wide water that lies, before a camera that stands.
 
     Args:
-        evidence: of the clip.
         region: what moves in it.
         wander: float32 [h,w], of `log_wander`.
     """
@@ -147,27 +151,48 @@ def field_around(wander: np.ndarray, picture: np.ndarray, region: np.ndarray, fo
     )
 
 
+def water_that_wanders(wander: np.ndarray, region: np.ndarray) -> np.ndarray:
+    """bool [h,w]: what wanders around a region, where the picture has two clear modes of wander; else the region.
+
+    Change, or the colour of what streams, may have found too small a part of wide water: its quiet part has this mode.
+
+    Args:
+        wander: float32 [h,w], of `log_wander`.
+        region: bool [h,w], the mask.
+    """
+    lively = wander > otsu_threshold(wander, float(wander.min()), float(wander.max()))
+    upper, lower = wander[lively], wander[~lively]
+    apart = float(upper.mean() - lower.mean()) / max(float(np.sqrt(0.5 * (upper.var() + lower.var()))), 1e-6)
+    if apart < MODES_APART or (lively & region).sum() < MOSTLY * region.sum():
+        return region
+    parts = cv2.connectedComponents(lively.astype(np.uint8), connectivity=4)[1]
+    held = np.bincount(parts[lively & region], minlength=parts.max() + 1)
+    return parts == held.argmax()
+
+
 def with_open_water(evidence: Evidence, region: np.ndarray, barred: np.ndarray) -> np.ndarray:
     """The region, bool [h,w], and the quiet water beside it where it is wide; else the same array.
 
-    Nothing is taken away, and holes in the region stay as they are.
+    Nothing is taken away, and holes in the region stay as they are. A region that is not wide is held to be a part of
+    wide water where what wanders around it is that (`water_that_wanders`).
 
     Args:
         evidence: of the clip.
         region: bool [h,w], the fluid's outline.
         barred: bool [h,w], what is no fluid in any case: rocks, hands, plants.
     """
-    if region.mean() < WIDE:
+    if not region.any():
         return region
     wander = log_wander(evidence)
-    if not lies_open(evidence, region, wander):
+    whole = region if region.mean() >= WIDE else water_that_wanders(wander, region)
+    if not lies_open(whole, wander):
         return region
     picture = evidence.typical
     across, down = edge_weights(picture, STIFFNESS)
     closed = (barred | holes(region)) & ~region
-    found = region
+    found = (region | whole) & ~closed
     for _ in range(ROUNDS):
-        odds = np.clip(field_around(wander, picture, region, found).odds, -SURE, SURE)
+        odds = np.clip(field_around(wander, picture, whole, found).odds, -SURE, SURE)
         odds[region], odds[closed] = GIVEN, -GIVEN
         larger = min_cut(odds, across, down) | region
         if np.array_equal(larger, found):

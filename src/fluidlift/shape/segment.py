@@ -202,6 +202,8 @@ def staying_labels(
         region, rocks = without_ground(evidence, region)
         taken = first & ~region  # plants and washed ground wander, too, and were told from water already
         region = with_open_water(evidence, region, rocks | solids | taken | ~inside)
+    else:
+        region = with_open_water(evidence, region, solids | ~inside)
     if clicks:
         before = region
         region, told = heed(clicks, evidence, score, region)

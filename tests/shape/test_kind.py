@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from fluidlift.shape.kind import (
     FEWEST_PAIRS,
@@ -69,6 +70,27 @@ def dam(top=25, edge=0):
 def test_the_kind_is_what_the_fluid_does(clip, kind):
     found = estimate_kind(*clip())
     assert found.kind == kind, (found.scores, found.features)
+
+
+def towards_the_viewer(near=4.0, far=0.2):
+    """A curtain's outline and motion, with a pattern that moves by `far` px per frame at its top and `near` below."""
+    frames, masks, *flow = curtain()
+    pattern = gaussian_filter(np.random.default_rng(0).normal(size=(H, W)), 2.0, mode="wrap")
+    pattern *= 30.0 / pattern.std()
+    step = np.interp(np.arange(H), [12, 75], [far, near])
+    for t in range(T):
+        moved = [np.interp(np.arange(W) - step[y] * t, np.arange(W), pattern[y], period=W) for y in range(H)]
+        frames[t] = np.where(masks[t][..., None], np.clip(frames[t] + np.stack(moved)[..., None], 0, 255), frames[t])
+    return frames, masks, *flow
+
+
+def test_what_recedes_comes_towards_the_viewer_and_does_not_fall():
+    lying, upright = (estimate_kind(*towards_the_viewer(far=far)) for far in (0.2, 4.0))
+    assert lying.features["receding"] > 0.8
+    assert upright.features["receding"] == 0.0
+    assert upright.kind == "fall"
+    assert lying.scores["fall"] < 0.5 * upright.scores["fall"]
+    assert lying.scores["stream"] > 2.0 * upright.scores["stream"]
 
 
 def to_and_fro(pairs=30, mean=0.0, swing=1.0):

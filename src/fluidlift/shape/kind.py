@@ -11,6 +11,7 @@ from scipy import ndimage
 from fluidlift.errors import require
 from fluidlift.messages import Notice
 from fluidlift.shape import chute, prism, slope
+from fluidlift.shape.open_water import recession
 from fluidlift.shape.view import PictureEvidence, habit_prior
 from fluidlift.types import FluidKind, KindEvidence, PinholeCamera, RigidTransform, UpEvidence, kind_of
 from fluidlift.types.kind import KINDS as FLUID_KINDS
@@ -34,6 +35,9 @@ FOLLOWED = 0.3
 """share of the fluid that is seen to fall with reliable flow, from which it is followed. Under gravity h metres take
 0.45 s times the root of h, so of a jet a few decimetres long a pixel moves by more per frame than its own pattern: of
 six pours 0 to 0.09 of the fluid is seen to fall so, of five falls and fountains 0.27 to 0.57"""
+RECEDES = (1.0, 2.0)
+"""growth of the log of the wander over the picture's height (`open_water.recession`) from which a fluid may lie, and
+from which it does: six falls and fountains have -0.6 to 0.9, eleven of 16 streams, seas and brooks 1.0 to 3.3"""
 FEWEST_PAIRS = 12
 """pairs of frames: half a second, in which a wave rises or falls"""
 SHAKE = 0.05
@@ -78,6 +82,8 @@ def estimate_kind(
     """
     require(fluid.shape == frames.shape[:3], f"masks {fluid.shape} for frames {frames.shape}")
     f = _features(frames, fluid, displacement, confidence) | {"swinging": 0.0 if bulk is None else swinging(*bulk)}
+    # down in the picture is towards the viewer on what recedes from him; a jet that splashes at its foot does not
+    f["falling"] *= 1.0 - f["receding"] * (1.0 - f["slender"])
     still = 1.0 - f["changing"]
     inside = f["enclosed"] * (1 - f["hanging"])  # what ends within the picture passes nothing on
     staying = max(f["swinging"], inside * f["circling"])
@@ -183,6 +189,7 @@ def _features(frames, fluid, displacement, confidence) -> dict[str, float]:
         "enclosed": float(np.clip(1.0 - _border_share(union) / 0.1, 0.0, 1.0)),
         "grey": float(np.clip(1.0 - chroma / 0.15, 0.0, 1.0)),
         "collapsing": _collapsing(fluid),
+        "receding": float(np.clip((recession(frames, union) - RECEDES[0]) / (RECEDES[1] - RECEDES[0]), 0.0, 1.0)),
         "speed_px": float(total / max(float((confidence * union).sum()), 1e-9)),
         "area_share": float(union.sum() / (height * width)),
     }

@@ -21,8 +21,15 @@ import cv2
 import numpy as np
 
 from fluidlift.shape.colour_growth import STIFFNESS, colour_odds
-from fluidlift.shape.evidence import Evidence, distance_of_pictures, otsu_threshold
-from fluidlift.shape.frame_pictures import typical_picture
+from fluidlift.shape.evidence import (
+    Evidence,
+    distance_of_pictures,
+    lagged_change,
+    noise_map,
+    otsu_threshold,
+    sharpness,
+)
+from fluidlift.shape.frame_pictures import FramePictures, typical_picture, working_scale
 from fluidlift.shape.min_cut import disc, edge_weights, min_cut
 from fluidlift.shape.region import clean_region
 
@@ -91,21 +98,48 @@ class Field:
 
 
 def log_wander(evidence: Evidence) -> np.ndarray:
-    """float32 [h,w]: log of about the px by which what a place shows moves, and `STILL`; the least within `RIM`."""
-    kept, longest = evidence.pictures, max(evidence.noise.shape)
-    typical = typical_picture(kept)
+    """float32 [h,w], of `wander_of` the pictures of a clip."""
+    kept = evidence.pictures
     picked = np.unique(np.linspace(0, len(kept) - 1, min(COMPARED, len(kept))).round().astype(int))
-    departure = sum(distance_of_pictures(kept[k], typical) for k in picked) / len(picked)
+    return wander_of(kept[picked], typical_picture(kept), evidence.noise)
+
+
+def wander_of(pictures: np.ndarray, typical: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """float32 [h,w]: log of about the px by which what a place shows moves, and `STILL`; the least within `RIM`.
+
+    Args:
+        pictures: [n,h,w,3], opponent colours.
+        typical: float32 [h,w,3], their median.
+        noise: float32 [h,w], mean absolute change of a still thing from picture to picture, grey levels.
+    """
+    longest = max(noise.shape)
+    departure = sum(distance_of_pictures(picture, typical) for picture in pictures) / len(pictures)
     steep = np.zeros(typical.shape[:2], np.float32)
     for channel in range(3):
         plane = np.ascontiguousarray(typical[..., channel])
         steep += np.hypot(
             cv2.Sobel(plane, cv2.CV_32F, 1, 0, scale=0.125), cv2.Sobel(plane, cv2.CV_32F, 0, 1, scale=0.125)
         )
-    beyond = np.maximum(departure - NOISE_OF_MEAN * evidence.noise, 0.0).astype(np.float32)
+    beyond = np.maximum(departure - NOISE_OF_MEAN * noise, 0.0).astype(np.float32)
     beyond, steep = (cv2.GaussianBlur(x, (0, 0), FINE) for x in (beyond, steep))
     pooled = cv2.GaussianBlur(np.log(beyond / (steep + FLAT) + STILL), (0, 0), SHARED * longest)
     return cv2.GaussianBlur(cv2.erode(pooled, disc(RIM * longest)), (0, 0), FINE)
+
+
+def recession(frames: np.ndarray, region: np.ndarray) -> float:
+    """By how much the log of the wander grows within a region from the top of the picture to its bottom.
+
+    What moves on water that lies moves by fewer px the farther it is, which is the higher up in the picture.
+
+    Args:
+        frames: u8 [n,h,w,3], sRGB, a few of a clip.
+        region: bool [h,w].
+    """
+    source = FramePictures(frames, np.arange(len(frames)), working_scale(*region.shape))
+    noise = noise_map(lagged_change(source.kept, source.pairs(1)), sharpness(source.typical))
+    wander = wander_of(source.kept, source.typical, noise)
+    inside = cv2.resize(region.astype(np.float32), wander.shape[::-1], interpolation=cv2.INTER_AREA) > 0.99
+    return growth_downwards(wander, inside) * len(inside) if inside.any() else 0.0
 
 
 def lies_open(region: np.ndarray, wander: np.ndarray) -> bool:

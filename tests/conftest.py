@@ -27,6 +27,9 @@ FOREIGN = {"backends", "blender"}
 BROWSER = {"browser", "visitor"}
 """fixtures that run a browser"""
 
+CLUSTER = {"ray"}
+"""fixtures that begin the processes of Ray"""
+
 ASSET = {"made", "catalogue_asset", "finished", "finished_tank", "tank_folder"}
 """fixtures that make an asset, which takes seconds"""
 
@@ -59,7 +62,7 @@ def tier_of(item: pytest.Item, slow: set[str]) -> str:
     fixtures = set(item.fixturenames)
     if room == "test_whole_asset.py":
         return "whole"
-    if room in FOREIGN or BROWSER & fixtures:
+    if room in FOREIGN or (BROWSER | CLUSTER) & fixtures:
         return "foreign"
     if room == "fuzz":
         return "ladder"

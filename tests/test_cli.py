@@ -395,6 +395,9 @@ def test_inspect_warns_of_what_make_warns_of_in_the_frames(stream_clip, tmp_path
     assert "clip-cut-short" not in capsys.readouterr().out
     long = clip_file(tmp_path / "long.mp4", np.tile(frames, (61, 1, 1, 1)))
     assert main(["inspect", str(long)]) == WITH_WARNINGS
+    assert "stand for it" in capsys.readouterr().out
+    still = clip_file(tmp_path / "still.mp4", frames[:1])
+    assert main(["inspect", str(still)]) == WITH_WARNINGS
     assert "make would not take it as it is" in capsys.readouterr().out
 
 

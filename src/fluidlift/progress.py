@@ -11,6 +11,7 @@ from typing import Any, TextIO
 
 LABELS = {
     "compile": "compiling",
+    "window": "looking through the clip",
     "read": "reading the clip",
     "flow": "optical flow",
     "segment": "finding the fluid",

@@ -11,6 +11,8 @@ from fluidlift.farm.shots import Shot
 
 MAKE = """
 import json, os, pathlib, sys, time
+from fluidlift.farm.guard import end_with_parent
+end_with_parent()
 args = dict(a.removeprefix("--").split("=", 1) for a in sys.argv if a.startswith("--") and "=" in a)
 out = pathlib.Path(sys.argv[sys.argv.index("--out") + 1])
 with (out.parent / (out.stem + ".runs")).open("a") as runs:

@@ -11,7 +11,7 @@ import pytest
 from fluidlift.cli import main
 from fluidlift.errors import InputRejected
 from fluidlift.farm.dataset import COLUMNS, INDEX, read_index, sample_of, samples, write_index
-from fluidlift.farm.engine import make_shots
+from fluidlift.farm.local import LocalEngine
 from fluidlift.farm.shots import ShotOptions, read_shots
 from fluidlift.farm.state import Outcome, list_names, read_outcome, write_outcome
 from fluidlift.io.asset_folder import load_asset, read_manifest
@@ -107,7 +107,7 @@ def test_licence_and_source_of_a_list_reach_the_state_and_change_nothing_else(tm
     plain, noted = listed(""), listed("  licence: CC-BY-4.0\n  source: https://example.org/a\n")
     assert plain[0].fingerprint() == noted[0].fingerprint() and plain[0].arguments(out) == noted[0].arguments(out)
     for shots in (plain, noted):
-        list(make_shots(shots, out, limits, lambda text: None))
+        list(LocalEngine().shots(shots, out, limits, lambda text: None, lambda text: None))
     found = read_outcome(out, "a")
     assert (found.licence, found.source, found.clip) == ("CC-BY-4.0", "https://example.org/a", str(clip))
     assert runs(out, "a") == 1

@@ -10,15 +10,17 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from fluidlift.farm.engine import environment, make_shots
+from fluidlift.farm.local import LocalEngine
+from fluidlift.farm.making import environment
 from fluidlift.farm.state import claimed, is_running, names_of, read_outcome
-from fluidlift.farm.summary import status_of, summarise
+from fluidlift.farm.summary import Summary, status_of
 from fluidlift.machine import THREADS, cores
 
 
-def made(shots, folder: Path, limits, told=None):
+def made(shots, folder: Path, limits, told=None, jobs=1):
     folder.mkdir(exist_ok=True)
-    return {o.name: o for o in make_shots(shots, folder, limits, ([] if told is None else told).append)}
+    tell = ([] if told is None else told).append
+    return {o.name: o for o in LocalEngine(jobs).shots(shots, folder, limits, tell, lambda text: None)}
 
 
 def test_a_shot_that_is_finished_is_not_started_again(tmp_path, limits, shot, runs):
@@ -49,8 +51,8 @@ def test_each_failure_has_its_class_and_can_be_tried_again_alone(tmp_path, limit
         shot("f", "foamy"),
         shot("g"),
     ]
-    bounded = replace(limits, seconds=5.0, memory=150e6, jobs=2)
-    found = made(shots, out, bounded)
+    bounded = replace(limits, seconds=5.0, memory=150e6)
+    found = made(shots, out, bounded, jobs=2)
     assert {n: o.failure for n, o in found.items()} == {
         "w": "input", "b": "crash", "s": "time", "m": "memory", "f": "", "g": "",
     }  # fmt: skip
@@ -66,8 +68,8 @@ def test_each_failure_has_its_class_and_can_be_tried_again_alone(tmp_path, limit
 def test_cores_are_divided_among_the_jobs(tmp_path, limits, shot, monkeypatch):
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(8)), raising=False)
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
-    assert environment(3) == dict.fromkeys(THREADS, "2") and environment(20)["OMP_NUM_THREADS"] == "1"
-    made([shot("a")], tmp_path / "out", replace(limits, jobs=4))
+    assert environment(2) == dict.fromkeys(THREADS, "2") and environment(0)["OMP_NUM_THREADS"] == "1"
+    made([shot("a")], tmp_path / "out", limits, jobs=4)
     assert json.loads((tmp_path / "out" / "a.fluid" / "manifest.json").read_text())["threads"] == "2"
     monkeypatch.setenv("OMP_NUM_THREADS", "3")
     assert cores() == 3
@@ -83,7 +85,7 @@ def test_two_batches_on_one_folder_make_each_shot_once_and_lose_none(tmp_path, l
     for batch in batches:
         batch.join()
     assert [runs(out, n) for n in "abcd"] == [1, 1, 1, 1]
-    summarise(out)
+    Summary(out).write()
     assert sorted(row["name"] for row in json.loads((out / "batch.json").read_text())) == list("abcd")
     assert sorted(names_of(out)) == list("abcd")
 
@@ -92,7 +94,7 @@ def test_a_shot_that_another_process_makes_is_left_to_it(tmp_path, limits, shot,
     out, told = tmp_path / "out", []
     out.mkdir()
     with claimed(out, "a") as ours:
-        assert ours and is_running(out, "a")
+        assert ours is not None and is_running(out, "a")
         assert made([shot("a"), shot("b")], out, limits, told).keys() == {"b"}
         assert status_of(out).running == ("a",)
     assert any("left to it" in line for line in told)
@@ -105,12 +107,13 @@ def test_sigterm_ends_the_makes_too_and_what_is_left_is_made_by_the_next_run(tmp
 import sys
 from pathlib import Path
 from fluidlift import cli
-from fluidlift.farm import engine
+from fluidlift.farm import engine, local
 from fluidlift.farm.shots import Shot
 limits = engine.Limits(program={limits.program!r})
 shots = [Shot(Path({str(shot("a").clip)!r}), "a", {{}}), Shot(Path({str(shot("s").clip)!r}), "s", {{"kind": "slow"}})]
 Path({str(out)!r}).mkdir()
-cli._COMMANDS[cli.Doctor] = lambda c: [0 for o in engine.make_shots(shots, Path({str(out)!r}), limits, print)] and 0
+made = local.LocalEngine().shots(shots, Path({str(out)!r}), limits, print, print)
+cli._COMMANDS[cli.Doctor] = lambda c: [0 for o in made] and 0
 sys.exit(cli.main(["doctor"]))
 """
     batch = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)

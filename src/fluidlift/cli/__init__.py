@@ -45,6 +45,7 @@ from fluidlift.cli.options import (
 from fluidlift.cli.studio import Studio
 from fluidlift.cli.view import View
 from fluidlift.errors import FluidliftError, InputRejected
+from fluidlift.farm.guard import end_with_parent
 from fluidlift.kernels import compiling_beside
 from fluidlift.messages import as_plain
 from fluidlift.progress import Interrupted, interrupted, shown_progress
@@ -76,6 +77,7 @@ TERMINATED = 128 + signal.SIGTERM
 
 def main(argv: list[str] | None = None) -> int:
     """Run one command; the exit code."""
+    end_with_parent()
     try:
         with _interruptible() as terminated:
             code = _run(list(sys.argv[1:] if argv is None else argv))

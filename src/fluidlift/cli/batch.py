@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -16,6 +17,7 @@ from fluidlift.cli.quantities import Bytes, Seconds, command
 from fluidlift.errors import InputRejected
 
 if TYPE_CHECKING:
+    from fluidlift.farm.engine import Engine
     from fluidlift.farm.shots import Shot
 
 _OURS = ("clip", "out", "json", "print_config", "warnings_ok")
@@ -31,14 +33,28 @@ class Batch:
     out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """folder for the assets (NAME.fluid), their logs (NAME.log), what became of each (NAME.state.json) and the summary
     (batch.json); needed but for --status"""
-    jobs: int = 1
-    """clips at a time; each takes the memory of a make of its own, and its share of the cores"""
+    jobs: int | None = None
+    """clips at a time; each takes the memory of a make of its own, and its share of the cores; by default one, and with
+    --engine ray as many as its machines hold"""
+    engine: Literal["local", "ray"] = "local"
+    """who makes them: processes of this machine, or tasks of Ray, on this machine or on a cluster (--address)"""
+    address: str | None = None
+    """of the head of a Ray cluster, such as 10.0.0.5:6379"""
+    cores: int | None = None
+    """of each clip; by default those of this machine over --jobs, and with --engine ray two"""
+    gpus: float | None = None
+    """of each clip, with --engine ray; by default none"""
+    tries: int | None = None
+    """how often a clip is tried that broke down, ran out of memory (with twice as much then) or lost its machine; by
+    default once, and with --engine ray three times"""
     preset: str | None = None
     """of all shots that name none: draft, standard, hero"""
     config: Path | None = None
     """YAML file with settings, of all shots that name none"""
     set: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default_factory=tuple)
     """one setting for all shots; may be repeated"""
+    shots: Literal["auto"] | None = None
+    """auto: a clip with cuts becomes a shot, and an asset, for each of its parts: NAME_01, NAME_02, ..."""
     time_limit: Seconds | None = None
     """that a shot may take, such as 30min; it counts as failed then"""
     memory_limit: Bytes | None = None
@@ -53,7 +69,9 @@ class Batch:
     status: bool = False
     """tell how far a folder is, and make nothing"""
     csv: bool = False
-    """with --status: a row per shot"""
+    """write the summary as batch.csv too, a row per shot; with --status print it"""
+    parquet: bool = False
+    """write the summary as batch.parquet too"""
     html: bool = False
     """with --status: write status.html, a page with pictures of all shots, the most doubtful first"""
     dataset: bool = False
@@ -74,7 +92,7 @@ def run(wanted: Batch) -> int:
     """
     from fluidlift.farm.shots import shard_of
 
-    if wanted.dataset:
+    if wanted.dataset or wanted.parquet:
         from fluidlift.farm.dataset import require_parquet
 
         require_parquet()
@@ -82,11 +100,10 @@ def run(wanted: Batch) -> int:
         return _status(wanted)
     if wanted.out is None:
         raise InputRejected("no -o", "the folder for the assets, such as -o assets/")
-    if wanted.csv or wanted.html:
-        raise InputRejected("--csv or --html without --status", "fluidlift batch FOLDER --status --html")
-    if wanted.jobs < 1:
-        raise InputRejected(f"--jobs {wanted.jobs}", "a whole number of 1 or more")
-    shots = shots_of(wanted)
+    if wanted.html:
+        raise InputRejected("--html without --status", "fluidlift batch FOLDER --status --html")
+    _require_counts(wanted)
+    shots = _parted(wanted, wanted.out, shots_of(wanted))
     return _plan(wanted, len(shots)) if wanted.plan else _make(wanted, wanted.out, shard_of(shots, wanted.shard))
 
 
@@ -102,22 +119,67 @@ def shots_of(wanted: Batch) -> list[Shot]:
     )  # fmt: skip
 
 
-def _make(wanted: Batch, out: Path, shots: list[Shot]) -> int:
-    from fluidlift.farm.engine import Limits, make_shots
-    from fluidlift.farm.summary import SUMMARY, summarise
+def _parted(wanted: Batch, out: Path, shots: list[Shot]) -> list[Shot]:
+    """The shots, where it is asked for one for each part of a clip with cuts."""
+    if wanted.shots is None:
+        return shots
+    from fluidlift.farm.cuts import parted
     from fluidlift.io.atomic import require_writable
 
     require_writable(out)
     folder = out.absolute()
     folder.mkdir(parents=True, exist_ok=True)
-    limits = Limits(wanted.jobs, wanted.time_limit, wanted.memory_limit, wanted.retry)
+    return parted(shots, folder, _printers(wanted)[0])
+
+
+def _require_counts(wanted: Batch) -> None:
+    for name in ("jobs", "cores", "tries"):
+        value = getattr(wanted, name)
+        if value is not None and value < 1:
+            raise InputRejected(f"--{name} {value}", "a whole number of 1 or more")
+    if wanted.gpus is not None and wanted.gpus < 0:
+        raise InputRejected(f"--gpus {wanted.gpus:g}", "0 or more")
+    if wanted.engine != "ray" and (wanted.address is not None or wanted.gpus is not None):
+        raise InputRejected("--address or --gpus without --engine ray", "the engine that has them", "--engine ray")
+
+
+def _engine(wanted: Batch) -> Engine:
+    if wanted.engine == "ray":
+        from fluidlift.farm.ray_cluster import RayEngine
+
+        return RayEngine(wanted.address, wanted.jobs, wanted.cores, wanted.gpus or 0.0)
+    from fluidlift.farm.local import LocalEngine
+
+    return LocalEngine(wanted.jobs or 1)
+
+
+TRIES = {"local": 1, "ray": 3}
+"""by engine: of many machines one is lost now and then"""
+
+
+def _make(wanted: Batch, out: Path, shots: list[Shot]) -> int:
+    from fluidlift.farm.engine import Limits
+    from fluidlift.farm.summary import SUMMARY, Pace, Summary
+    from fluidlift.io.atomic import require_writable
+
+    require_writable(out)
+    folder = out.absolute()
+    folder.mkdir(parents=True, exist_ok=True)
+    limits = Limits(
+        wanted.time_limit, wanted.memory_limit, wanted.retry, wanted.tries or TRIES[wanted.engine], wanted.cores
+    )
     tell, part = _printers(wanted)
-    outcomes = []
-    for outcome in make_shots(shots, folder, limits, tell, part):
-        outcomes.append(outcome)
-        tell(f"[{len(outcomes)}/{len(shots)}] {outcome.line()}")
-        summarise(folder)
-    summarise(folder)
+    outcomes, pace, summary = [], Pace(len(shots)), Summary(folder)
+    try:
+        for outcome in _engine(wanted).shots(shots, folder, limits, tell, part):
+            outcomes.append(outcome)
+            tell(f"[{len(outcomes)}/{len(shots)}] {outcome.line()}{pace.after(outcome)}")
+            summary.write_now_and_then()
+    except BaseException:
+        with suppress(InputRejected):  # a full disk, which has been said
+            summary.write()
+        raise
+    summary.write(table=wanted.csv, parquet=wanted.parquet)
     if wanted.dataset:
         _index(folder)
     bad = [o for o in outcomes if not o.well]
@@ -139,12 +201,13 @@ def _printers(wanted: Batch) -> tuple[Callable[[str], None], Callable[[str], Non
         done, _, count = text.partition("/")
         print(f"openjd_progress: {100 * (int(done) - 1) / int(count):.1f}", flush=True)
 
-    single = wanted.progress == "openjd" and wanted.jobs == 1
+    single = wanted.progress == "openjd" and wanted.jobs in (None, 1)
     return line, part if single else (lambda text: None)
 
 
 def _plan(wanted: Batch, shots: int) -> int:
     """Write a job instead of doing it; paths in it are absolute, as other machines of the farm see them."""
+    from fluidlift.farm.engine import TASK_CORES, TASK_MEMORY
     from fluidlift.farm.plans import Plan, written
     from fluidlift.io.atomic import require_writable
     from fluidlift.machine import cores
@@ -155,19 +218,20 @@ def _plan(wanted: Batch, shots: int) -> int:
     folder.mkdir(parents=True, exist_ok=True)
     arguments = [str(p.absolute()) for p in wanted.clips] + ["-o", str(folder)]
     given = {"preset": wanted.preset, "config": wanted.config and wanted.config.absolute(),
-             "time-limit": wanted.time_limit, "memory-limit": wanted.memory_limit}  # fmt: skip
+             "time-limit": wanted.time_limit, "memory-limit": wanted.memory_limit, "cores": wanted.cores,
+             "shots": wanted.shots}  # fmt: skip
     arguments += [f"--{name}={value}" for name, value in given.items() if value is not None]
     arguments += [f"--set={text}" for text in wanted.set]
-    plan = Plan(arguments, shots, min(cores(), TASK_CORES), wanted.memory_limit or TASK_MEMORY, wanted.time_limit)
+    plan = Plan(
+        arguments,
+        shots,
+        wanted.cores or min(cores(), TASK_CORES),
+        wanted.memory_limit or TASK_MEMORY,
+        wanted.time_limit,
+    )
     path = written(wanted.plan, plan, folder)
     print(f"{shots} tasks; plan: {path}\nIts paths are those of this machine: they must be the same on the farm's.")
     return 0
-
-
-TASK_CORES = 2
-"""of a task of a farm: a make is 1.5 times as fast on two as on one, and little faster on more"""
-TASK_MEMORY = 4e9
-"""bytes: a make of the demo takes 1.0 GB, one of a clip of 3 s at 512 px 1.4 GB; longer clips and finer cells more"""
 
 
 def _status(wanted: Batch) -> int:
@@ -184,6 +248,10 @@ def _status(wanted: Batch) -> int:
         print(as_csv(found.outcomes), end="")
     else:
         print("\n".join(found.lines()))
+    if wanted.parquet:
+        from fluidlift.farm.summary import write_parquet
+
+        print(f"summary: {write_parquet(folder, found.outcomes)}", file=sys.stderr)
     if wanted.dataset:
         _index(folder)
     if wanted.html:

@@ -38,7 +38,7 @@ class Part:
     start: Seconds | None = None
     """where in the clip it begins, such as 12 or 12s; by default at its first frame"""
     duration: Seconds | None = None
-    """how much of it is used; by default all, up to read.max_frames frames"""
+    """how much of it is used; by default all; of a longer clip than read.max_frames frames a part that is like it"""
     fps: float | None = None
     """frames per second of an image sequence"""
 

@@ -24,7 +24,7 @@ class ReadConfig:
     max_pixels: int = 50_000_000
     """largest picture accepted, px"""
     max_frames: int = 600
-    """most frames accepted"""
+    """most frames taken; of a longer clip a part of so many stands for it"""
     stabilise: bool = True
     """take out mild camera shake"""
 

@@ -2,16 +2,21 @@
 
 Modules of the face:
 
-    dataset  A data set of assets: an index in Parquet with a row per asset, and what its rows name as arrays
-    engine   Shots made on this machine, each in a process of its own with its share of the cores, its memory and
-             its time
-    page     A thousand results on one page, which works offline: overlay and preview of each shot, the most
-             doubtful first
-    plans    Jobs for other schedulers: an Open Job Description template, a Slurm array script, or one command per
-             line
-    shots    Lists of shots: clips, folders of videos, or YAML with options of `make` for each
-    state    What became of each shot: one small file beside its asset, and one lock while somebody makes it
-    summary  How far a folder of shots is: counts, rate, failures by class; as text, JSON and CSV
+    cuts         A clip of several shots becomes several shots: its cuts are found, and each part is a shot of its
+                 own
+    dataset      A data set of assets: an index in Parquet with a row per asset, and what its rows name as arrays
+    engine       Who makes shots: the seam behind which processes of this machine and a cluster are alike
+    guard        A make ends with who started it, also where that was killed: nobody would take what it makes, or
+                 count its memory
+    local        The engine of one machine: a process per shot, some at a time
+    page         A thousand results on one page, which works offline: overlay and preview of each shot, the most
+                 doubtful first
+    plans        Jobs for other schedulers: an Open Job Description template, a Slurm array script, or one command
+                 per line
+    ray_cluster  The engine of many machines: a task of Ray per shot, on one machine or on a cluster that is there
+    shots        Lists of shots: clips, folders of videos, or YAML with options of `make` for each
+    state        What became of each shot: one small file beside its asset, and one lock while somebody makes it
+    summary      How far a folder of shots is: counts, rate, failures by class; as text, JSON, CSV and Parquet
 """
 
-__all__ = ["dataset", "engine", "page", "plans", "shots", "state", "summary"]
+__all__ = ["cuts", "dataset", "engine", "guard", "local", "page", "plans", "ray_cluster", "shots", "state", "summary"]

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from fluidlift.farm.shots import is_name
-from fluidlift.io.asset_lock import held
+from fluidlift.io.asset_lock import held, held_file
 from fluidlift.io.atomic import atomic_write
 from fluidlift.io.hashes import digest
 
@@ -108,10 +108,18 @@ def manifest_digest(folder: Path, name: str) -> str:
 
 
 @contextmanager
-def claimed(folder: Path, name: str) -> Iterator[bool]:
-    """Whether this process may make a shot; it alone does while the block runs."""
-    with held(folder / f"{name}{LOCK}", f"making {name}") as ours:
-        yield ours
+def claimed(folder: Path, name: str, *, wait: float = 0.0) -> Iterator[int | None]:
+    """The right to make a shot, which one process has while the block runs; None where another one does.
+
+    What is given is the lock's file descriptor. A process that is handed it holds the lock as well, until it ends.
+
+    Args:
+        folder: of the batch.
+        name: of the shot.
+        wait: s to wait for it.
+    """
+    with held_file(folder / f"{name}{LOCK}", f"making {name}", wait=wait) as file:
+        yield file
 
 
 def is_running(folder: Path, name: str) -> bool:

@@ -1,19 +1,22 @@
-"""How far a folder of shots is: counts, rate, failures by class; as text, JSON and CSV."""
+"""How far a folder of shots is: counts, rate, failures by class; as text, JSON, CSV and Parquet."""
 
 from __future__ import annotations
 
 import csv
 import dataclasses
+import datetime
 import io
 import json
+import time
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from fluidlift.farm.state import Outcome, is_running, names_of, read_outcome
 
-SUMMARY = "batch.json"
+SUMMARY, TABLE, PARQUET = "batch.json", "batch.csv", "batch.parquet"
 _HIDDEN = ("fingerprint", "manifest")
 
 
@@ -104,10 +107,89 @@ def as_csv(outcomes: Sequence[Outcome]) -> str:
     return file.getvalue()
 
 
-def summarise(folder: Path) -> None:
-    """Write batch.json: every shot of the folder that ended, whichever batch made it."""
-    from fluidlift.io.atomic import atomic_write
+def write_parquet(folder: Path, outcomes: Sequence[Outcome]) -> Path:
+    """Write batch.parquet: a row per shot that ended.
 
-    found = [o for name in names_of(folder) if (o := read_outcome(folder, name)) is not None]
-    with atomic_write(folder / SUMMARY) as file:
-        file.write((json.dumps(rows(found), indent=1) + "\n").encode())
+    Args:
+        folder: of the batch.
+        outcomes: of its shots.
+
+    Raises:
+        InputRejected: the folder cannot be written.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    from fluidlift.io.atomic import atomic_path
+
+    path = folder / PARQUET
+    kinds = {"float": pa.float64(), "list[str]": pa.list_(pa.string())}
+    fields = [f for f in dataclasses.fields(Outcome) if f.name not in _HIDDEN]
+    schema = pa.schema([(f.name, kinds.get(str(f.type), pa.string())) for f in fields])
+    with atomic_path(path) as temporary:
+        pq.write_table(pa.Table.from_pylist(rows(outcomes), schema=schema), temporary)
+    return path
+
+
+@dataclass
+class Summary:
+    """batch.json of a folder: every shot that ended, whichever batch made it.
+
+    Reading what became of ten thousand shots takes long: while shots are made it is written so seldom that a twentieth
+    of the time at most goes into it.
+    """
+
+    folder: Path
+    _next: float = 0.0
+
+    def write_now_and_then(self) -> None:
+        """Write it where it is time to."""
+        if (began := time.monotonic()) >= self._next:
+            self.write()
+            self._next = time.monotonic() + 20.0 * (time.monotonic() - began)
+
+    def write(self, *, table: bool = False, parquet: bool = False) -> None:
+        """Write it.
+
+        Args:
+            table: batch.csv as well.
+            parquet: batch.parquet as well.
+
+        Raises:
+            InputRejected: the folder cannot be written.
+        """
+        from fluidlift.io.asset_lock import held
+        from fluidlift.io.atomic import atomic_write, write_bytes
+
+        found = [o for name in names_of(self.folder) if (o := read_outcome(self.folder, name)) is not None]
+        # machines do not know each other's processes, and would take a summary half written for a leftover
+        with held(self.folder / ".summary.lock", "writing the summary", wait=10.0):
+            with atomic_write(self.folder / SUMMARY) as file:
+                file.write((json.dumps(rows(found), indent=1) + "\n").encode())
+            if table:
+                write_bytes(self.folder / TABLE, as_csv(found).encode())
+            if parquet:
+                write_parquet(self.folder, found)
+
+
+@dataclass
+class Pace:
+    """How long a batch will take, by how fast its shots ended so far."""
+
+    count: int
+    """of all shots"""
+    began: float = dataclasses.field(default_factory=time.time)
+    ended: int = 0
+    made: int = 0
+    """by this batch"""
+
+    def after(self, outcome: Outcome) -> str:
+        """What to say behind the line of a shot that ended; nothing of the last one, nor of what was done before."""
+        self.ended += 1
+        with suppress(ValueError):
+            self.made += datetime.datetime.fromisoformat(outcome.ended).timestamp() >= self.began - 1.0
+        left = self.count - self.ended
+        if not self.made or not left:
+            return ""
+        seconds = (time.time() - self.began) / self.made * left
+        return f"; about {seconds / 60:.0f} min left" if seconds >= 90 else f"; about {seconds:.0f} s left"

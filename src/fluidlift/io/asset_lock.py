@@ -109,6 +109,13 @@ def held(path: Path, work: str, *, wait: float = 0.0) -> Iterator[bool]:
         work: what is done, in words, for others to read; empty: only to see whether it is free.
         wait: s to wait for it.
     """
+    with held_file(path, work, wait=wait) as file:
+        yield file is not None
+
+
+@contextmanager
+def held_file(path: Path, work: str, *, wait: float = 0.0) -> Iterator[int | None]:
+    """As `held`: the file descriptor by which the lock is held, or None. Who inherits it holds the lock as well."""
     with disk_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         file = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o644)
@@ -121,7 +128,7 @@ def held(path: Path, work: str, *, wait: float = 0.0) -> Iterator[bool]:
             with suppress(OSError):  # a full disk: the lock holds all the same
                 os.ftruncate(file, 0)
                 os.pwrite(file, note, 0)
-        yield ours
+        yield file if ours else None
     finally:
         os.close(file)
 

@@ -40,7 +40,7 @@ from fluidlift.messages import Notice, as_plain
 from fluidlift.types import VideoClip
 from fluidlift.types.clip import is_variable
 
-__all__ = ["ClipInfo", "ReadLimits", "frames_before", "probe", "read_clip", "write_video"]
+__all__ = ["ClipInfo", "ReadLimits", "frame_times", "frames_before", "probe", "read_clip", "write_video"]
 
 
 def read_clip(
@@ -265,15 +265,24 @@ def frames_before(path: Path | str, start: float, fps: float, limits: ReadLimits
         fps: frames per second of pictures.
         limits: as in `read_clip`.
     """
+    return sum(time < start - 5e-7 for time in frame_times(path, fps, limits))
+
+
+def frame_times(path: Path | str, fps: float, limits: ReadLimits | None = None) -> list[float]:
+    """Times of the frames of a clip, s from the first one, by their time stamps alone; frames without one are left out.
+
+    Args:
+        path: as in `read_clip`.
+        fps: frames per second of pictures.
+        limits: as in `read_clip`.
+    """
     path = Path(path)
     if is_sequence(path):
         numbers = [number for number, _ in list_sequence(path)]
-        times = [(number - numbers[0]) / fps for number in numbers]
-    else:
-        with open_video(path, limits or ReadLimits()) as (container, stream):
-            stamps = {float(p.pts * p.time_base) for p in _packets(container, stream, Notes()) if p.pts is not None}
-        times = [stamp - min(stamps) for stamp in stamps]
-    return sum(time < start - 5e-7 for time in times)
+        return [(number - numbers[0]) / fps for number in numbers]
+    with open_video(path, limits or ReadLimits()) as (container, stream):
+        stamps = sorted({float(p.pts * p.time_base) for p in _packets(container, stream, Notes()) if p.pts is not None})
+    return [stamp - stamps[0] for stamp in stamps]
 
 
 def _packets(container: av.container.InputContainer, stream: av.VideoStream, notes: Notes) -> Iterator[av.Packet]:

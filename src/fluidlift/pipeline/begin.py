@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+
 from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected
 from fluidlift.pipeline import depths, given_body
 from fluidlift.pipeline.hints import NO_HINTS, Hints, require_no_contradiction, require_possible
-from fluidlift.pipeline.inputs import GivenFiles
+from fluidlift.pipeline.inputs import GivenFile, GivenFiles
 from fluidlift.pipeline.runner import Runner
 from fluidlift.pipeline.settings import (
     FlowSettings,
@@ -24,9 +27,12 @@ from fluidlift.pipeline.stages.flow import estimated_flow, given_flow
 from fluidlift.pipeline.stages.geometry import geometry
 from fluidlift.pipeline.stages.read import read
 from fluidlift.pipeline.stages.segment import require_usable, segment
+from fluidlift.pipeline.stages.window import WindowSettings, window
 from fluidlift.types.hints import NOTHING_SAID, ClipHints
 from fluidlift.types.stages import Flow, Geometry, Read, Segmentation
 
+WINDOW = "window"
+"""the stage that a job on a long clip has before read"""
 CORRECT = "correct"
 """the stage that a job with regions in its hints has after segment"""
 
@@ -37,6 +43,32 @@ def stages_of(stages: tuple[str, ...], hints: ClipHints) -> tuple[str, ...]:
         return stages
     at = stages.index("segment") + 1
     return (*stages[:at], CORRECT, *stages[at:])
+
+
+def within(runner: Runner, clip: GivenFile, config: JobConfig) -> JobConfig:
+    """The settings of a job, for a clip of more frames than it takes with a part of the clip that stands for it.
+
+    The part stands in the settings as if it had been given by --start and --duration, for masks and flow as well.
+
+    Args:
+        runner: of the job, which gets one stage more then.
+        clip: video file or image sequence.
+        config: of the job.
+
+    Raises:
+        InputRejected: a clip that cannot be used.
+    """
+    from fluidlift.io.limits import ReadLimits
+    from fluidlift.io.video import frame_times
+
+    read = config.read
+    end = math.inf if read.duration is None else read.start + read.duration
+    times = frame_times(clip.path, read.fps, ReadLimits(max_pixels=read.max_pixels))
+    if sum(read.start - 5e-7 <= time < end - 5e-7 for time in times) <= read.max_frames:
+        return config
+    runner.stages = (WINDOW, *runner.stages)
+    part = runner.run(WINDOW, window, clip, taken(WindowSettings, read, frames=read.max_frames))
+    return replace(config, read=replace(read, start=part.start, duration=part.duration))
 
 
 def look(

@@ -219,7 +219,9 @@ def read_alone(inputs: Inputs, folder: Path, config: JobConfig, *, progress: Pro
     given = GivenFiles.of(inputs)
     runner = Runner(folder, ("read",), progress=progress or Silence())
     with disk_errors(folder):
-        return runner.run("read", read, given.clip, given.camera, taken(ReadSettings, config.read))
+        config = begin.within(runner, given.clip, config)
+        found = runner.run("read", read, given.clip, given.camera, taken(ReadSettings, config.read))
+    return replace(found, warnings=tuple(runner.warnings))  # with that of a long clip
 
 
 def find_hints(
@@ -245,6 +247,7 @@ def find_hints(
     runner = Runner(folder, stages, progress=progress or Silence(), value_told=told, memory=memory)
     given = GivenFiles.of(inputs)
     with disk_errors(folder):
+        config = begin.within(runner, given.clip, config)
         seen = begin.look(runner, given, config, said=hints)
         found = runner.run(
             "view", view, *seen, GivenView.of(given, config), begin.geometry_settings(seen[0], config, hints)

@@ -79,6 +79,7 @@ def make(
         runner.warn(text)
     with gone_if_refused(runner, "motion"), writing(folder, "fluidlift make"):
         given = GivenFiles.of(inputs)
+        config = begin.within(runner, given.clip, config)
         lift = _lifted(runner, given, config, hints)
         frames = config.simulate.frames or len(lift.clip) - lift.geometry.rest_frame
         require_room(folder, frames, len(lift.refined.body))

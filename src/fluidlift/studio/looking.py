@@ -25,7 +25,8 @@ LOOK_FLOW = "dis"
 """flow of single pairs: the mask goes by it anyway, and kind, tilt and arrows come in a third of the time"""
 LOOK_SECONDS = 3.0
 """of a clip without a trim: what is found there is mostly true of the rest"""
-WORDS = {"read": "reading the clip", "flow": "measuring the motion", "segment": "finding the fluid",
+WORDS = {"window": "looking through the clip", "read": "reading the clip",
+         "flow": "measuring the motion", "segment": "finding the fluid",
          "correct": "putting your regions in", "view": "kind, tilt and scale"}  # fmt: skip
 
 

@@ -27,6 +27,20 @@ from fluidlift.types.transforms import Similarity3
 
 
 @dataclass(frozen=True)
+class Window:
+    """Which part of a long clip stands for it."""
+
+    start: float
+    """s into the clip"""
+    duration: float
+    """s"""
+    warnings: tuple[Notice, ...] = ()
+
+    def __post_init__(self) -> None:
+        require(self.start >= 0 and self.duration > 0, f"a window of {self.duration} s at {self.start} s")
+
+
+@dataclass(frozen=True)
 class Read:
     """The clip as it is worked on: without lens distortion, repeated frames, shake and cuts."""
 

@@ -160,8 +160,9 @@ def _longest_run(shake: _Shake, frames: int, source: str, kept: np.ndarray) -> t
             f"'{source}' shows another view at nearly every frame", "a stretch of at least 2 frames from one camera",
             "trim it with --start and --duration",
         )  # fmt: skip
-    why = []
+    why, advice = [], ""
     if shake.cuts:
+        advice = "; fluidlift batch CLIP --shots auto makes an asset of each shot"
         why.append(f"has {len(shake.cuts)} cut(s), at frame {', '.join(str(kept[c]) for c in shake.cuts)}")
     if last - first < max(b - a for a, b in pairwise((0, *shake.cuts, frames))):
         why.append("turns away from its view")
@@ -171,7 +172,7 @@ def _longest_run(shake: _Shake, frames: int, source: str, kept: np.ndarray) -> t
         [
             Notice(
                 "clip-cut-short",
-                f"the clip {' and '.join(why)}: only frames {kept[first]} to {kept[last - 1]} are used",
+                f"the clip {' and '.join(why)}: only frames {kept[first]} to {kept[last - 1]} are used{advice}",
             )
         ],
     )

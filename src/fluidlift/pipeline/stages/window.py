@@ -1,0 +1,121 @@
+"""The stage of a long clip, before all others: a part of it that stands for the whole.
+
+What is simulated and drawn again frame by frame is bounded (`read.max_frames`), so of a longer clip a part is made that
+is as the whole is. All of it is looked through in small pictures, which lie on disk, and of its longest shot the window
+is taken whose pieces are most as the shot usually is: its mean picture, and how much moves.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from fluidlift.errors import InputRejected
+from fluidlift.messages import Notice
+from fluidlift.pipeline.inputs import GivenFile
+from fluidlift.pipeline.settings import BESIDE
+from fluidlift.pipeline.work import Work
+from fluidlift.types.stages import Window
+
+SMALL = 128
+"""px, longer side of the pictures that are looked through"""
+LAYOUT = (32, 18)
+"""px, width and height of mean pictures, as in `motion.stabilize`"""
+PLACES = 8
+"""at which a window may begin, per length of a window"""
+MOST = 200_000
+"""frames that are looked through: two hours at 25 per second, and 5 GB of small pictures"""
+LEAST_MOTION = 0.05
+"""grey levels from frame to frame that are no motion: noise of a camera on a tripod is more"""
+LEVELS = 10.0
+"""grey levels of difference between mean pictures that count as much as motion that is e times as strong"""
+
+
+@dataclass(frozen=True)
+class WindowSettings:
+    """How long it may be."""
+
+    frames: int
+    start: float
+    """s into the clip, before which nothing is taken"""
+    duration: float | None
+    """s behind that, after which nothing is taken"""
+    fps: float
+    max_pixels: int = field(metadata=BESIDE)
+
+
+def window(clip: GivenFile, config: WindowSettings, *, work: Work) -> Window:
+    """Look through the clip and choose.
+
+    Args:
+        clip: video file or image sequence.
+        config: how long.
+        work: room for small frames.
+
+    Raises:
+        InputRejected: a clip that cannot be used.
+    """
+    from fluidlift.io.limits import ReadLimits
+    from fluidlift.io.sequences import is_sequence
+    from fluidlift.io.video import read_clip
+    from fluidlift.motion.stabilize import GreyFrames, find_cuts
+
+    seen = read_clip(
+        clip.path, start=config.start, duration=config.duration, max_size=SMALL,
+        fps=config.fps if is_sequence(clip.path) else None,
+        limits=ReadLimits(max_pixels=config.max_pixels, max_frames=MOST), store=work.scratch,
+    )  # fmt: skip
+    edges = (0, *find_cuts(GreyFrames(seen.frames)), len(seen))
+    first, last = max(pairwise(edges), key=lambda shot: shot[1] - shot[0])
+    length = min(config.frames, last - first)
+    if length < 2:
+        raise InputRejected(f"'{seen.source}' is cut at every frame", "a stretch of one view", "trim it with --start")
+    begin, levels, motion = _nearest(seen.frames[first:last], length)
+    begin += first
+    times = np.append(seen.times, seen.times[-1] + seen.interval)
+    # halfway between two frames, so that rounding of times takes none from the window
+    start = config.start if begin == 0 else round(float(times[begin - 1] + times[begin]) / 2.0, 6)
+    end = round(float(times[begin + length - 1] + times[begin + length]) / 2.0, 6)
+    whole = "its longest shot" if len(edges) > 2 else "all"
+    told = Notice(
+        "window-of-a-long-clip",
+        f"the clip has {len(seen)} frames: the {length} from {start:.2f} to {end:.2f} s stand for it (their "
+        f"pictures differ from those of {whole} by {levels:.1f} levels of 255, and move {motion:.2f} times as much). "
+        "Another part: --start and --duration; more frames: --set read.max_frames=NUMBER",
+    )
+    return Window(start, round(end - start, 6), (told,))
+
+
+def _nearest(frames: UInt8[np.ndarray, "t h w 3"], length: int) -> tuple[int, float, float]:
+    """First frame of the window that is most as the clip usually is, piece by piece; how far its pieces' mean pictures
+    are from the usual one, in levels, and its motion over the usual one. Frames are read one after the other."""
+    step = max(length // PLACES, 1)
+    pictures, moved = _pieces(frames, step)
+    levels = np.abs(pictures - np.median(pictures, axis=0)).mean(axis=(1, 2))
+    ratios = (moved + LEAST_MOTION) / (np.median(moved) + LEAST_MOTION)
+    unlike = levels / LEVELS + np.abs(np.log(ratios))
+    per = max(min(length // step, len(unlike)), 1)
+    k = int(np.argmin([unlike[i : i + per].sum() for i in range(len(unlike) - per + 1)]))
+    window = slice(k, k + per)
+    return min(k * step, len(frames) - length), float(levels[window].mean()), float(ratios[window].mean())
+
+
+def _pieces(
+    frames: UInt8[np.ndarray, "t h w 3"], step: int
+) -> tuple[Float[np.ndarray, "n h w"], Float[np.ndarray, " n"]]:
+    """Of each piece of so many frames, without what is left over: mean of the grey pictures (`LAYOUT`), and of how
+    much (levels) each frame differs from the one before."""
+    count = len(frames) // step
+    sums, moved = np.zeros((count, *LAYOUT[::-1])), np.zeros(count)
+    before = None
+    for t in range(count * step):
+        grey = cv2.cvtColor(np.ascontiguousarray(frames[t]), cv2.COLOR_RGB2GRAY).astype(np.float32)
+        sums[t // step] += cv2.resize(grey, LAYOUT, interpolation=cv2.INTER_AREA)
+        if before is not None:
+            moved[t // step] += float(np.abs(grey - before).mean())
+        before = grey
+    return sums / step, moved / step

@@ -34,7 +34,7 @@ PAGE = ROOT / "docs" / "results.md"
 LONGEST = 200
 """lines of the page"""
 ORDER = (
-    "clips", "cases", "as_filmed", "geometry", "motion", "splats",
+    "clips", "cases", "as_filmed", "hinted", "geometry", "motion", "splats",
     "fit", "simulator", "peers", "device", "cost", "trust",
 )  # fmt: skip
 """of the sections; other topics follow by name"""

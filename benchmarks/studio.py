@@ -147,7 +147,7 @@ GOALS = {("drop to all findings", "time"): 20.0, ("stroke to the changed mask", 
 
 def write(found: dict[str, tuple[float, float]], load: float) -> None:
     """The figures among those of speed, with the load of the machine beforehand."""
-    from benchmarks.report import put
+    from report import put
 
     records = []
     for name, both in found.items():

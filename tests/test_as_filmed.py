@@ -60,6 +60,13 @@ def test_waves_over_water_that_stays_are_no_current(clip, masks):
     assert card.verdict != WRONG
 
 
+def test_water_that_stays_and_is_missing_is_advised_on_without_frames_after_the_clip(clip, masks):
+    half = masks.copy()
+    half[:, :, : W // 2] = False
+    card = as_filmed(clip, masks, INTERVAL, clip, half, runs=False)
+    assert card["level"].verdict == WRONG and "missing" in card.advice[0]
+
+
 def test_the_clip_itself_is_good_and_equal_in_every_figure(clip, masks):
     card = held(clip, masks, clip)
     assert card.verdict == GOOD and card.warning() is None and card.advice == ()

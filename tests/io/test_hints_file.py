@@ -34,7 +34,7 @@ ALL = ClipHints(
         Region("fluid", ((1.0, 2.0), (50.0, 2.0), (50.0, 40.0))),
         Region("rock", ((5.0, 5.0), (9.0, 9.0)), width=6.0, time=0.4, moves=True),
         Region("ledge", ((20.0, 5.0), (30.0, 5.0), (30.0, 12.0))),
-        Region("pool", ((20.0, 15.0), (30.0, 15.0), (30.0, 22.0))),
+        Region("pool", ((20.0, 15.0), (30.0, 15.0), (30.0, 22.0)), begins=0.5, ends=1.25),
     ),
     clicks=(Click((64.0, 48.0), True), Click((3.0, 4.0), False)),
     roi=(0.0, 10.0, 600.0, 300.0),
@@ -77,6 +77,8 @@ def test_a_region_stands_in_one_line():
         ({"flow": {"at": [1, 2], "to": [9, 2]}}, "flow is no list"),
         ({"level": [[1, 2], [3, 4], [5, 6]]}, "3 points of a level"),
         ({"level": [[5, 1], [5, 200]]}, "two points beside each other"),
+        ({"horizon": [[0, 1], [10, 2]], "pitch": 30}, "two horizons: one drawn, and a pitch"),
+        ({"pitch": 91}, "pitch = 91"),
         ({"horizon": [[0, 1], [10, 2], [20, 3]]}, "one horizon: two points"),
         ({"horizon": [[5, 1], [5, 200]]}, "two points beside each other"),
         ({"ruler": {"from": [0, 0], "to": [1, 0], "metres": 1}}, "at least 2 px apart"),
@@ -85,6 +87,10 @@ def test_a_region_stands_in_one_line():
         ({"regions": [{"is": "fluid", "brush": [[0, 0]]}]}, "'brush' and 'width'"),
         ({"regions": [{"is": "mud", "area": []}]}, r"regions\[1\].is = mud"),
         ({"regions": [{"is": "rock", "area": [[0, 0], [9, 0], [9, "x"]]}]}, "a number from"),
+        (
+            {"regions": [{"is": "rock", "brush": [[0, 0]], "width": 4, "from": 2, "until": 1}]},
+            "an end after its beginning",
+        ),
         ({"clicks": [{"at": [1, 2]}]}, "fluid: true or false"),
         ({"start": -1}, "start = -1"),
         ({"fov": ".nan"}, "fov = .nan"),
@@ -139,6 +145,17 @@ def test_hints_lie_beside_their_clip(tmp_path):
     assert hints_beside(tmp_path / "shot" / "%04d.png") == tmp_path / "shot.hints.yaml"
 
 
+def test_all_points_move_together_and_nothing_else_does():
+    moved = ALL.moved((3.0, -2.0))
+    assert moved.has_points and not ClipHints(ALL.clip, kind="dam").has_points
+    assert moved.horizon == tuple((x + 3.0, y - 2.0) for x, y in ALL.horizon)
+    assert moved.regions[1].line[0] == (ALL.regions[1].line[0][0] + 3.0, ALL.regions[1].line[0][1] - 2.0)
+    assert moved.regions[1].width == ALL.regions[1].width and moved.rims[0].axes == ALL.rims[0].axes
+    assert moved.roi[2:] == ALL.roi[2:] and moved.ruler.metres == ALL.ruler.metres
+    back = moved.moved((-3.0, 2.0))
+    assert hints_data(back) == hints_data(ALL)
+
+
 def test_points_follow_the_picture_and_another_shape_is_refused():
     half = ALL.at((320, 180))
     assert half.horizon == ((-10.0, 50.25), (350.0, 48.0))
@@ -147,6 +164,11 @@ def test_points_follow_the_picture_and_another_shape_is_refused():
     assert half.clip.sha256 == ALL.clip.sha256
     with pytest.raises(InputRejected, match="640 x 360 picture for a clip of 320 x 320"):
         ALL.at((320, 320))
+
+
+def test_a_camera_that_looks_straight_down_is_said_by_a_number():
+    hints = parse_hints({"hints": 1, "pitch": 90})
+    assert hints.settings == {"shape.pitch": 90.0} and hints_data(hints) == {"hints": 1, "pitch": 90.0}
 
 
 def test_data_leave_out_what_was_not_said():

@@ -1,13 +1,17 @@
 """Regions that a person drew, over the labels that were found."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from fluidlift.errors import InputRejected
+from fluidlift.messages import code_of
+from fluidlift.pipeline.hints import laid_on, time_laid_on
 from fluidlift.pipeline.stages.correct import correct
 from fluidlift.pipeline.work import Work
 from fluidlift.types import Label, PixelFlow, PixelLabels, VideoClip
-from fluidlift.types.hints import Region
+from fluidlift.types.hints import Click, ClipHints, ClipIdentity, Region
 from fluidlift.types.stages import Flow, Read, Segmentation
 
 SIZE = (32, 24)
@@ -31,11 +35,45 @@ def corrected(tmp_path, *regions):
     return correct(*seen(), tuple(regions), work=Work.alone(tmp_path))
 
 
+def shaken():
+    """A clip whose second frame looks 6 px to the right of the first and 2 px below it, laid on the first."""
+    path = np.array([[0.0, 0.0], [6.0, 2.0], [0.0, 0.0]])
+    return replace(seen()[0], stabilised=True, path=path)
+
+
+@pytest.mark.parametrize(("time", "lies"), [(0.1, (11.0, 9.0)), (0.0, (5.0, 7.0)), (None, (5.0, 7.0))])
+def test_a_point_lies_where_the_frame_that_it_was_drawn_on_was_laid(time, lies):
+    w, h = SIZE
+    hints = ClipHints(ClipIdentity("made", (2 * w, 2 * h), time=time), clicks=(Click((10.0, 14.0), True),))
+    drawn, said = laid_on(hints, shaken())
+    assert drawn.clicks[0].at == lies and not said
+    assert laid_on(hints, replace(shaken(), stabilised=False))[0].clicks[0].at == (5.0, 7.0)
+
+
+def test_points_of_a_frame_that_is_not_in_use_are_told_where_the_camera_moves():
+    hints = ClipHints(ClipIdentity("made", SIZE, time=7.0), clicks=(Click((10.0, 14.0), True),))
+    assert code_of(laid_on(hints, shaken())[1]) == "hints-of-another-part"
+    assert not laid_on(replace(hints, clicks=()), shaken())[1] and not laid_on(hints, seen()[0])[1]
+
+
+def test_the_frame_that_others_are_laid_on_is_known_by_its_time():
+    assert time_laid_on(shaken()) == 0.0 and time_laid_on(seen()[0]) is None
+
+
 def test_a_region_counts_as_given_in_all_frames(tmp_path):
     found = corrected(tmp_path, ROCK)
     assert (found.labels.labels[:, 13, 13] == Label.SOLID).all()
     assert (found.labels.confidence[:, 13, 13] == 1.0).all() and found.labels.confidence[0, 20, 2] == 0.5
     assert found.fluid_share < 0.5
+
+
+def test_a_region_is_there_while_it_is_said_to_be(tmp_path):
+    fills = replace(ROCK, what="not fluid", begins=0.1, ends=0.2)
+    shown = corrected(tmp_path, fills).labels.labels[:, 13, 13]
+    assert shown.tolist() == [Label.FLUID, Label.BACKGROUND, Label.FLUID]
+    later = replace(ROCK, moves=True, begins=0.1)
+    shown = corrected(tmp_path, later).labels.labels
+    assert not (shown[0] == Label.SOLID).any() and (shown[1] == Label.SOLID).any()
 
 
 def test_later_regions_lie_over_earlier_ones(tmp_path):

@@ -8,7 +8,10 @@ import pytest
 from fluidlift.config import build_config
 from fluidlift.errors import InputRejected
 from fluidlift.pipeline.stages import fit as stage
-from fluidlift.types import CellType, FaceVelocity, Grid, kind_of
+from fluidlift.shape.filled_vessel import FilledVessel, pool_depths
+from fluidlift.shape.kind import level_camera
+from fluidlift.types import CellType, FaceVelocity, Grid, Label, PinholeCamera, UpEvidence, VideoClip, kind_of
+from fluidlift.types.fluid_masks import FluidMasks
 
 GRID = Grid((12, 6, 5), 0.05, (0.0, 0.0, 0.0))
 X = np.array([1.0, 0.0, 0.0])
@@ -90,6 +93,41 @@ def test_what_fills_the_vessel_is_what_the_inlet_brings(guess):
     assert found.inflow_velocity == pytest.approx((0.5, 0.0, 0.0))
     # a vessel that fills faster than the jet moves was measured wrongly: the jet's speed is the limit
     assert guess([flow(2.0)], kind="pour", filling=9.0 * mouth).inflow_velocity == pytest.approx((2.0, 0.0, 0.0))
+
+
+SIDE = 200
+"""px of a picture of a glass"""
+
+
+def glass(rises):
+    """A glass 0.5 m wide, 2 m away, that fills by some m within ten frames, and what counts of its geometry."""
+    camera, away, times = (
+        level_camera(PinholeCamera.from_fov(40.0, (SIDE, SIDE)), UpEvidence(0.0, 0.0, "", 0.0)),
+        2.0,
+        10,
+    )
+    whole, labels = np.ones((SIDE, SIDE), bool), np.full((times, SIDE, SIDE), Label.BACKGROUND, np.uint8)
+    jet = FilledVessel((0.0, away), np.array([-0.4, 0.7]), np.full(2, 0.05), 0.6)
+    for t in range(times):
+        level = -0.1 + rises * t / (times - 1)
+        held = FilledVessel((0.0, away), np.array([-0.4, level]), np.full(2, 0.25), level)
+        shown = [np.isfinite(pool_depths(camera, whole, vessel)[0]) for vessel in (jet, held)]
+        labels[t][shown[0] | shown[1]] = Label.FLUID
+    clip = VideoClip(np.zeros((times, SIDE, SIDE, 3), np.uint8), INTERVAL * np.arange(times), "made")
+    flat = np.full((SIDE, SIDE), away, np.float32)
+    geometry = SimpleNamespace(
+        kind="pour", setting=SimpleNamespace(pool_level=-0.1), camera=camera, mask=labels[0] == Label.FLUID,
+        depth=flat, half_thickness=np.zeros_like(flat), rest_frame=0,
+    )  # fmt: skip
+    return SimpleNamespace(clip=clip), FluidMasks(labels), geometry
+
+
+def test_a_vessel_gains_what_its_level_rises_by():
+    seconds, area = 9 * INTERVAL, np.pi * 0.25**2
+    # a pixel of 7 mm, by which radius and rise are known, is 6 % of the area and 4 % of the rise
+    assert stage.filling_rate(*glass(0.2)) == pytest.approx(0.2 * area / seconds, rel=0.12)
+    row = 2.0 / PinholeCamera.from_fov(40.0, (SIDE, SIDE)).focal[0]
+    assert stage.filling_rate(*glass(0.0)) == pytest.approx(row * area / seconds, rel=0.1), "more would be seen"
 
 
 @pytest.mark.parametrize("kind", ["stream", "fall", "pour", "plume"])

@@ -5,12 +5,14 @@ import pytest
 
 from fluidlift.shape.filled_vessel import (
     FilledVessel,
+    behind_its_wall,
     distance_ahead,
     filled_volume,
     find_vessel,
     pool_depths,
     seen_higher,
 )
+from fluidlift.shape.hints import polygon_mask
 from fluidlift.shape.kind import level_camera
 from fluidlift.types import PinholeCamera, Similarity3, UpEvidence
 
@@ -158,3 +160,36 @@ def test_a_frayed_surface_does_not_close_the_glass_above_it():
     assert found is not None
     upper = np.linspace(found.level - 0.08, found.rim, 20)
     np.testing.assert_allclose(found.radius_at(upper), 0.25, atol=0.02)
+
+
+@pytest.mark.parametrize("above", [0.04, 0.08])  # from a third of its radius on, the edge hides its widest row
+def test_a_cup_that_is_looked_into_holds_what_its_near_wall_hides(above):
+    camera, truth = camera_at(35.0), made(35.0)
+    whole = np.ones((240, 240), bool)
+    disc, opening = (_disc(camera, truth, z) for z in (truth.level, truth.level + above))
+    hidden = disc & ~opening
+    jet = FilledVessel(truth.axis, np.array([truth.floor, truth.level]), np.full(2, 0.03), truth.level + 0.25)
+    falls = np.isfinite(pool_depths(camera, whole, jet)[0]) & ~np.isfinite(pool_depths(camera, whole, truth)[0])
+    found = find_vessel(camera, (disc & ~hidden) | falls, AWAY)
+    assert found is not None and found.looked_into
+    pixel = AWAY / camera.focal[0] / np.cos(np.radians(35.0))
+    assert found.level == pytest.approx(truth.level, abs=3.0 * pixel)
+    assert found.rim - found.level == pytest.approx(above, abs=3.0 * pixel)
+    walls = behind_its_wall(found, camera, disc & ~hidden)
+    assert walls[hidden].mean() > 0.9 and not walls[disc & ~hidden].any()
+    moved = found.transformed(Similarity3(2.0, np.eye(3), np.array([0.0, 0.0, 1.0])))
+    assert moved.looked_into and moved.rim == pytest.approx(1.0 + 2.0 * found.rim)
+
+
+def test_a_glass_seen_from_the_side_hides_nothing():
+    camera, truth = camera_at(12.0), made(12.0)
+    found = find_vessel(camera, silhouette(camera, truth), AWAY)
+    assert found is not None and not found.looked_into
+    assert not behind_its_wall(found, camera, np.zeros((240, 240), bool)).any()
+
+
+def _disc(camera: PinholeCamera, vessel: FilledVessel, z: float) -> np.ndarray:
+    """Where a level disc of the vessel's width is seen at some height."""
+    turns = np.linspace(0.0, 2.0 * np.pi, 200)
+    ring = [vessel.axis[0] + 0.25 * np.cos(turns), vessel.axis[1] + 0.25 * np.sin(turns), np.full(200, z)]
+    return polygon_mask([camera.project(np.stack(ring, axis=1))[0]], *camera.size[::-1])

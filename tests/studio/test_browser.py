@@ -84,6 +84,25 @@ def test_a_stroke_changes_the_mask_and_undo_takes_it_back(visit):
     visit.until(lambda: label_at(visit, 0.5, 0.5) == Label.SOLID, "the mask with the rock again")
 
 
+def test_the_mask_is_cleared_and_painted_anew_from_a_frame_on(visit):
+    visit.page.keyboard.press("b")
+    picture = visit.page.locator("#picture").bounding_box()
+    visit.press("clear the mask")
+    visit.says("leave no fluid")
+    last = len(visit.desk.looking.look.read.clip) - 1
+    visit.page.get_by_label("frame", exact=True).fill(str(last // 2))
+    visit.page.get_by_label("what is there").select_option("fluid")
+    visit.page.get_by_label("from here on").check()
+    visit.drag((0.3, 0.5), (0.7, 0.5))
+    visit.until(lambda: label_at(visit, 0.5, 0.5, 0) == Label.BACKGROUND, "the mask without what was found")
+    assert label_at(visit, 0.5, 0.5, last) == Label.FLUID and label_at(visit, 0.1, 0.5, last) == Label.BACKGROUND
+    visit.says("s on")
+    visit.page.get_by_label("from here on").uncheck()
+    visit.page.get_by_label("frame", exact=True).fill("0")
+    visit.page.keyboard.press("r")
+    assert visit.page.locator("#picture").bounding_box() == picture, "it stays where it is whichever tool is taken"
+
+
 def test_an_area_is_closed_by_enter_and_taken_back_by_its_line(visit):
     visit.area("not fluid", (0.1, 0.4), (0.3, 0.4), (0.3, 0.6), (0.1, 0.6))
     visit.until(lambda: label_at(visit, 0.2, 0.5) == Label.BACKGROUND, "the mask without the area")
@@ -103,7 +122,11 @@ def test_the_horizon_is_dragged_and_the_tilt_follows(visit):
     visit.looked()
     (_, left), (_, right) = visit.desk.history.hints.horizon
     assert left == pytest.approx(-0.2 * h, abs=0.02 * h) and right == pytest.approx(left, abs=0.02 * h)
-    visit.says("(as drawn)")
+    visit.says("(as said)")
+    visit.page.fill("#pitch", "70")
+    visit.page.keyboard.press("Enter")
+    visit.until(lambda: visit.desk.history.hints.pitch == 70.0, "the pitch in its place")
+    assert visit.desk.history.hints.horizon is None
 
 
 def test_kind_and_ruler_are_taken(visit):

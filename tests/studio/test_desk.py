@@ -61,6 +61,21 @@ def test_items_are_replaced_and_removed_by_their_place(history):
     assert history.hints.clicks == ()
 
 
+def test_points_stay_where_they_were_drawn_though_another_frame_is_shown(history, tmp_path):
+    click = {"at": [10.0, 20.0], "fluid": True}
+    history.shown_time = 0.5
+    history.change({"add": "clicks", "item": click})
+    assert read_hints(history.file).clip.time == 0.5 and history.shown["clicks"] == [click]
+    again = steps_of(tmp_path)  # another trim is laid on another frame, which looks 4 px to the right
+    assert again.time == 0.5
+    again.shown_time, again.shift = 1.5, (-4.0, 0.0)
+    assert again.shown["clicks"] == [{"at": [6.0, 20.0], "fluid": True}]
+    again.change({"put": "clicks", "at": 0, "item": {"at": [8.0, 20.0], "fluid": True}})
+    assert read_hints(again.file).clicks[0].at == (12.0, 20.0) and read_hints(again.file).clip.time == 0.5
+    again.undo()
+    assert read_hints(again.file).clicks[0].at == (10.0, 20.0)
+
+
 @pytest.mark.parametrize(
     "step",
     [

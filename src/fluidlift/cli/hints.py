@@ -17,6 +17,7 @@ def run(command: Hints) -> int:
     from fluidlift.io.hints_file import hints_beside, read_hints, require_same_clip, write_hints
     from fluidlift.pipeline import Inputs
     from fluidlift.pipeline.find import find_hints, identity_of
+    from fluidlift.pipeline.hints import time_laid_on
     from fluidlift.types.hints import NOTHING_SAID
 
     clip, part = command.clip, command.part
@@ -26,12 +27,15 @@ def run(command: Hints) -> int:
     if file.exists():
         hints = read_hints(file)
         require_same_clip(hints, clip, file.name)
+        identity = replace(identity, time=None if hints.clip is None else hints.clip.time)
     said = {"start": part.start, "duration": part.duration}
     hints = replace(hints, clip=identity, **{k: v for k, v in said.items() if v is not None})
     flat = {"read.fps": part.fps, "read.max_size": command.max_size}
     config = build_config(None, None, (), flat, base=dict(hints.settings))
     with tempfile.TemporaryDirectory() as room, shown_progress() as progress:
         found = find_hints(Inputs(clip), Path(room) / "look", config, hints, progress=progress)
+    if not hints.has_points:  # what is copied from the section `found` lies in the picture of this frame
+        hints = replace(hints, clip=replace(identity, time=time_laid_on(found.read)))
     write_hints(file, hints, found.facts())
     if command.json:
         print(json.dumps(found.facts(), indent=1))

@@ -203,7 +203,8 @@ def as_filmed(
         beyond |= likeness(whole, statistics(later, still), places.fluid, places)
     notes = ("The fluid moves through the picture: after the end of the clip nothing is compared.",) if moves else ()
     for key in ("current_error", "current_cosine") if not runs else ():
-        value[key] = floor[key] = beyond[key] = NONE
+        for figures_of in (value, floor, beyond) if beyond else (value, floor):
+            figures_of[key] = NONE
     figures = tuple(_figures(value, floor, beyond, _no_current(_speed(whole, places.fluid), runs=runs)))
     return AsFilmed(length, len(later), figures, notes, tuple(_advice(figures, value, beyond)))
 

@@ -80,6 +80,7 @@ def parse_hints(data: Any, name: str = "hints.yaml") -> ClipHints:
         duration=top.number("duration", 1e-6, 1e9),
         kind=top.word("kind", tuple(KINDS)),
         fov=top.number("fov", 2.0, 165.0),
+        pitch=top.number("pitch", -90.0, 90.0),
         horizon=top.part("horizon", _horizon),
         ruler=top.part("ruler", _ruler),
         rims=top.several("rims", _rim),
@@ -91,9 +92,9 @@ def parse_hints(data: Any, name: str = "hints.yaml") -> ClipHints:
     )
     top.data.pop(FOUND, None)
     top.nothing_else()
-    drawn = (found.horizon, found.ruler, found.roi, found.level)
-    several = (found.rims, found.regions, found.clicks, found.flow)
-    if found.clip is None and (any(d is not None for d in drawn) or any(several)):
+    if found.pitch is not None and found.horizon is not None:
+        raise top.refused("two horizons: one drawn, and a pitch", "one of them", "leave one out")
+    if found.clip is None and found.has_points:
         raise top.refused(
             "points without the size of the picture that they are px of", "clip: {size: [width, height]}",
             "let fluidlift hints CLIP write it",
@@ -106,7 +107,7 @@ def hints_data(hints: ClipHints) -> dict[str, Any]:
     data: dict[str, Any] = {"hints": VERSION}
     if hints.clip is not None:
         data["clip"] = {k: v for k, v in plain(asdict(hints.clip)).items() if v is not None}
-    for name in ("start", "duration", "kind", "fov"):
+    for name in ("start", "duration", "kind", "fov", "pitch"):
         if (value := getattr(hints, name)) is not None:
             data[name] = value if isinstance(value, str) else round(value, 4)
     if hints.horizon is not None:
@@ -205,7 +206,7 @@ def _region_data(r: Region) -> dict[str, Any]:
         data |= {"time": round(r.time, 4), "moves": True}
     elif r.time:
         data["time"] = round(r.time, 4)
-    return data
+    return data | {name: round(v, 4) for name, v in (("from", r.begins), ("until", r.ends)) if v is not None}
 
 
 class _Entry:
@@ -298,8 +299,9 @@ def _identity(entry: _Entry, place: str, value: Any) -> ClipIdentity:
     if min(size) < 1 or size != tuple(int(v) for v in size):
         raise e.refused(f"{e.at('size')} = {list(size)}", "width and height of the clip's picture, px")
     found = ClipIdentity(
-        e.word("name") or "", (int(size[0]), int(size[1])), e.whole("frames", 1, 10**9), e.word("sha256")
-    )
+        e.word("name") or "", (int(size[0]), int(size[1])), e.whole("frames", 1, 10**9), e.word("sha256"),
+        e.number("time", 0.0, 1e9),
+    )  # fmt: skip
     e.nothing_else()
     return found
 
@@ -356,6 +358,7 @@ def _region(e: _Entry) -> Region:
     what = e.word("is", get_args(What))
     area, brush = e.take("area"), e.take("brush")
     width, time, moves = e.number("width", 0.1, FARTHEST), e.number("time", 0.0, 1e9), e.yes("moves")
+    begins, ends = e.number("from", 0.0, 1e9), e.number("until", 0.0, 1e9)
     line = area if brush is None else brush
     if what is None or (area is None) == (brush is None) or not isinstance(line, list):
         raise e.refused(f"{e.place} is no region", "'is', and either 'area' (corners) or 'brush' (a way) with 'width'")
@@ -368,7 +371,9 @@ def _region(e: _Entry) -> Region:
     for p in line:
         x, y = e.numbers(e.place, p, 2)
         points.append((x, y))
-    return Region(cast(What, what), tuple(points), width, time or 0.0, bool(moves))
+    if begins is not None and ends is not None and ends <= begins:
+        raise e.refused(f"{e.place} is there from {begins:g} s until {ends:g} s", "an end after its beginning")
+    return Region(cast(What, what), tuple(points), width, time or 0.0, bool(moves), begins, ends)
 
 
 def _click(e: _Entry) -> Click:

@@ -51,12 +51,14 @@ def refined_similarity(
     x, y = np.meshgrid(*(np.arange(n, dtype=np.float32) - c for n, c in zip(size, center)))
     x, y = x / WORKING_SIZE, y / WORKING_SIZE  # so that turning and scaling count in px, as shifting does
     inner = (slice(RIM, -RIM), slice(RIM, -RIM))
+    x, y = x[inner].ravel(), y[inner].ravel()
+    jacobian = np.empty((len(x), 4))
     width, fits, textured = np.inf, np.zeros(0, bool), np.zeros(0, bool)
     for _ in range(iterations):
-        gx, gy, error = _linearised(still, moved, motion, size)
-        jacobian = np.stack([gx, gy, gx * x + gy * y, gy * x - gx * y], axis=-1)[inner].reshape(-1, 4)
-        difference = error[inner].ravel()
-        textured = (jacobian[:, :2] ** 2).sum(axis=1) > LEAST_GRADIENT**2
+        gx, gy, difference = (a[inner].ravel() for a in _linearised(still, moved, motion, size))
+        for k, column in enumerate((gx, gy, gx * x + gy * y, gy * x - gx * y)):
+            jacobian[:, k] = column
+        textured = jacobian[:, 0] ** 2 + jacobian[:, 1] ** 2 > LEAST_GRADIENT**2
         if textured.sum() < 100:
             return np.asarray(guess, np.float64), 0.0, 0
         spread = 1.4826 * float(np.median(np.abs(difference[textured])))

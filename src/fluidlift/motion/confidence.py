@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from fluidlift.numerics.short_axis import summed
 from fluidlift.seams import FlowEstimator
 
 ROUND_TRIP_FLOOR = 0.3
@@ -72,8 +73,8 @@ def round_trip(forward: Float[np.ndarray, "h w 2"], backward: Float[np.ndarray, 
     u, v = np.meshgrid(np.arange(w, dtype=np.float32), np.arange(h, dtype=np.float32))
     u, v = u + forward[..., 0], v + forward[..., 1]
     back = cv2.remap(np.ascontiguousarray(backward), u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    error = ((forward + back) ** 2).sum(axis=-1)
-    tolerance = ROUND_TRIP_FLOOR**2 + ROUND_TRIP_SHARE**2 * (forward**2).sum(axis=-1)
+    error = summed((forward + back) ** 2)
+    tolerance = ROUND_TRIP_FLOOR**2 + ROUND_TRIP_SHARE**2 * summed(forward**2)
     inside = (u >= -0.5) & (u <= w - 0.5) & (v >= -0.5) & (v <= h - 0.5)
     return (inside * tolerance / (tolerance + error)).astype(np.float32)
 
@@ -135,9 +136,9 @@ def agreement_over_time(
         along = cv2.remap(
             other, u + side * flow[..., 0], v + side * flow[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
         )
-        here = ((other - flow) ** 2).sum(axis=-1)
-        distances.append(np.sqrt(np.minimum(here, ((along - flow) ** 2).sum(axis=-1))))
+        here = summed((other - flow) ** 2)
+        distances.append(np.sqrt(np.minimum(here, summed((along - flow) ** 2))))
     if not distances:
         return np.ones((h, w), np.float32)
-    tolerance = ROUND_TRIP_FLOOR**2 + ROUND_TRIP_SHARE**2 * (flow**2).sum(axis=-1)
+    tolerance = ROUND_TRIP_FLOOR**2 + ROUND_TRIP_SHARE**2 * summed(flow**2)
     return (tolerance / (tolerance + np.mean(distances, axis=0) ** 2)) ** SHARED_FAILURE

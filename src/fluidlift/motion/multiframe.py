@@ -39,6 +39,7 @@ from fluidlift.motion.confidence import (
     texture_strength,
     there_and_back,
 )
+from fluidlift.numerics.short_axis import summed
 from fluidlift.seams import FlowEstimator
 from fluidlift.types import PixelFlow
 
@@ -326,11 +327,11 @@ def flow_with_rest(
     # an error of half a pixel over the gap is an eighth per frame
     coarser = estimator.halved if min(frames.shape[1:3]) >= HALVED_FROM else estimator
     slow = flow_of_detail(ends, frames[start], coarser, gap)
-    speed = (slow.displacement**2).sum(axis=-1)
+    speed = summed(slow.displacement**2)
     share = share / (1.0 + (speed / SLOW**2) ** 2)
     displacement = fast.displacement + share[..., None] * (slow.displacement - fast.displacement)
     # little detail moves, but it moves as the pictures do: the two support each other, unless both say rest
-    between = ((slow.displacement - fast.displacement) ** 2).sum(axis=-1)
+    between = summed((slow.displacement - fast.displacement) ** 2)
     tolerance = ROUND_TRIP_FLOOR**2 + ROUND_TRIP_SHARE**2 * speed
     agreed = tolerance / (tolerance + between) * speed / (speed + ROUND_TRIP_FLOOR**2)
     support = np.maximum(fast.moving, slow.confidence * agreed)
@@ -366,8 +367,8 @@ def refined(
     first, second = as_pictures((detail[0], back))
     remainder = finite(estimator.displacement(first, second))
     found = mean + remainder
-    tolerance = ROUND_TRIP_FLOOR**2 + ROUND_TRIP_SHARE**2 * (mean**2).sum(axis=-1)
-    doubt = np.minimum((remainder**2).sum(axis=-1), ((found - displacement) ** 2).sum(axis=-1))
+    tolerance = ROUND_TRIP_FLOOR**2 + ROUND_TRIP_SHARE**2 * summed(mean**2)
+    doubt = np.minimum(summed(remainder**2), summed((found - displacement) ** 2))
     found = mean + (tolerance / (tolerance + doubt))[..., None] * remainder
     moving = moving_share(detail[0], frames[pair])[..., None]
     return (moving * found + (1.0 - moving) * displacement).astype(np.float32)
@@ -416,7 +417,7 @@ def mean_flow(
         weight = weight * (mask[: len(d)] if mask.ndim == 3 else mask[None])
     mean = _weighted_mean(d, weight)
     for _ in range(2):
-        distance = ((d - mean) ** 2).sum(axis=-1)
+        distance = summed((d - mean) ** 2)
         total = np.maximum(weight.sum(axis=0), 1e-6)
         spread = (weight * distance).sum(axis=0) / total
         kept = np.where(distance <= trim**2 * np.maximum(spread, LEAST_SPREAD**2), weight, 0.0)
@@ -424,9 +425,9 @@ def mean_flow(
     total = kept.sum(axis=0)
     held = np.maximum(total, 1e-6)
     typical = (kept * flow.confidence).sum(axis=0) / held
-    deviation = (kept * ((d - mean) ** 2).sum(axis=-1)).sum(axis=0) / held
+    deviation = (kept * summed((d - mean) ** 2)).sum(axis=0) / held
     frames = total**2 / np.maximum((kept**2).sum(axis=0), 1e-6)
-    tolerance = ROUND_TRIP_FLOOR**2 + ROUND_TRIP_SHARE**2 * (mean**2).sum(axis=-1)
+    tolerance = ROUND_TRIP_FLOOR**2 + ROUND_TRIP_SHARE**2 * summed(mean**2)
     certain = tolerance / (tolerance + deviation / np.maximum(frames, 1.0))
     return mean, (typical * certain * total / (total + evidence**2)).astype(np.float32)
 

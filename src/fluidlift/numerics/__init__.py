@@ -31,6 +31,7 @@ Modules of the face:
                             (paper: `percnn_str_fit`)
     sampling                Trilinear interpolation of grid fields at points
     sharing                 How the work of a loop is shared out among threads
+    short_axis              Sums and lengths over a last axis of two or three: colours and vectors of pictures
     signed_distance         Signed distance fields (SDF) at grid nodes: making them, and keeping points outside the
                             solid
     similarity2             Similarities of the picture plane as matrices [2,3] that act on pixel indices (as
@@ -60,7 +61,7 @@ Modules of the face:
 __all__ = [
     "bspline", "ground_block", "harmonics", "isosurface", "lanes", "mesh_distance", "mesh_normals", "mirror",
     "multigrid", "multigrid_assembly", "multigrid_cycle", "nearest", "outline", "particle_mean", "poisson",
-    "recurrent_stencil", "recurrent_stencil_fit", "sampling", "sharing", "signed_distance", "similarity2",
-    "solid_mesh", "splatting", "splatting_colors", "splatting_colors_torch", "splatting_kernels",
+    "recurrent_stencil", "recurrent_stencil_fit", "sampling", "sharing", "short_axis", "signed_distance",
+    "similarity2", "solid_mesh", "splatting", "splatting_colors", "splatting_colors_torch", "splatting_kernels",
     "splatting_projection", "splatting_torch", "srgb", "textures", "torch_multigrid", "torch_poisson", "triangles",
 ]  # fmt: skip

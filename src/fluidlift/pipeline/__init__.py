@@ -4,6 +4,7 @@ Modules of the face:
 
     find        What is found of a clip before anything is made of it: mask, kind, tilt, flow, scale, for a person
                 to correct
+    hints       What a person says about where the fluid is, on the command line or in a hints file
     make        From a clip to an asset folder
     preview     Simulation while somebody edits: a coarse copy of the scene, frame by frame, the newest wish first
     refit       The parameters of a finished asset, fitted again: `fluidlift fit`
@@ -70,6 +71,7 @@ __all__ = [
     "card_of",
     "find",
     "find_masks",
+    "hints",
     "make",
     "measure_motion",
     "preview",

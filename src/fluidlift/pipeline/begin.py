@@ -8,7 +8,7 @@ from dataclasses import replace
 from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected
 from fluidlift.pipeline import depths, given_body
-from fluidlift.pipeline.hints import NO_HINTS, Hints, require_no_contradiction, require_possible
+from fluidlift.pipeline.hints import NO_HINTS, Hints, laid_on, require_no_contradiction, require_possible
 from fluidlift.pipeline.inputs import GivenFile, GivenFiles
 from fluidlift.pipeline.runner import Runner
 from fluidlift.pipeline.settings import (
@@ -91,7 +91,9 @@ def look(
     mask, finder = GivenMask.of(given, config), SegmentSettings.of(config)
     clip = runner.run("read", read, given.clip, given.camera, taken(ReadSettings, config.read))
 
-    drawn = said.at(clip.clip.size)
+    drawn, notice = laid_on(said, clip)
+    if notice:
+        runner.warn(notice)
     require_possible(drawn, clip.clip.size)
     if drawn.roi is not None or drawn.clicks:
         hints = Hints.drawn(drawn)
@@ -130,4 +132,4 @@ def shape(
 
 def geometry_settings(read: Read, config: JobConfig, said: ClipHints) -> GeometrySettings:
     """What geometry is told."""
-    return taken(GeometrySettings, config.shape, drawn=said.at(read.clip.size).view)
+    return taken(GeometrySettings, config.shape, drawn=laid_on(said, read)[0].view)

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 
 from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected
+from fluidlift.messages import NONE, Notice
 from fluidlift.pipeline.inputs import GivenFiles
 from fluidlift.shape import drawn, drawn_flow
-from fluidlift.types.hints import ClipHints
+from fluidlift.shape.drawn import frame_at
+from fluidlift.types.hints import ClipHints, ClipIdentity, Point
+from fluidlift.types.stages import Read
 
 
 @dataclass(frozen=True)
@@ -52,6 +56,45 @@ class Hints:
 NO_HINTS = Hints()
 
 
+def laid_on(hints: ClipHints, read: Read) -> tuple[ClipHints, Notice]:
+    """Hints in px of the working picture that all frames are laid on, and what to say of it.
+
+    Where the camera's motion was taken out, a point of the frame that it was drawn on (`ClipIdentity.time`) lies where
+    the middle of that frame went: turning and zoom of a hand-held camera move it by less than a person's hand does.
+
+    Raises:
+        InputRejected: a picture of another shape.
+    """
+    drawn = hints.at(read.clip.size)
+    shift = picture_shift(read, None if hints.clip is None else hints.clip.time)
+    if shift is None:
+        return drawn, NONE
+    times, time = read.clip.times, cast(ClipIdentity, hints.clip).time
+    near = read.clip.interval
+    unseen = hints.has_points and not times[0] - near <= cast(float, time) <= times[-1] + near
+    said = Notice(
+        "hints-of-another-part",
+        f"the hints were drawn on the picture at {time:.2f} s, which is not among those in use, and the camera moves: "
+        "where they lie is a guess; look at the mask, and draw them again on this part",
+    )
+    return drawn.moved(shift), said if unseen else NONE
+
+
+def picture_shift(read: Read, time: float | None) -> Point | None:
+    """px of the working picture from the frame at a time, s, to the one that all are laid on; None: it is that one."""
+    if time is None or not read.stabilised or read.path is None:
+        return None
+    x, y = read.path[frame_at(read.clip.times, time)]
+    return float(x), float(y)
+
+
+def time_laid_on(read: Read) -> float | None:
+    """s into the clip of the frame that the others are laid on; None where the camera's motion was not taken out."""
+    if not read.stabilised or read.path is None:
+        return None
+    return round(float(read.clip.times[int(np.linalg.norm(read.path, axis=1).argmin())]), 4)
+
+
 def require_no_contradiction(hints: ClipHints, config: JobConfig, given: GivenFiles) -> None:
     """Raise `InputRejected` where a hints file and what stands beside it say the same thing twice."""
     s = config.shape
@@ -63,13 +106,13 @@ def require_no_contradiction(hints: ClipHints, config: JobConfig, given: GivenFi
         raise InputRejected("two levels: a line drawn in the hints, and --roll", "one of them", "leave one out")
     if hints.ruler is not None and s.size is not None:
         raise InputRejected("two sizes: a ruler in the hints, and --size", "one of them", "leave one out")
-    if given.camera is not None and (hints.horizon is not None or hints.fov is not None):
+    if given.camera is not None and any(v is not None for v in (hints.horizon, hints.pitch, hints.fov)):
         from fluidlift.io.images import read_json
 
         posed = {"R", "frames"} & set(read_json(given.camera.path, "camera file"))
         if hints.fov is not None or posed:
             raise InputRejected(
-                "a camera file, and a horizon or a field of view in the hints", "one of them", "leave one out"
+                "a camera file, and a horizon, a pitch or a field of view in the hints", "one of them", "leave one out"
             )
 
 

@@ -22,7 +22,7 @@ from fluidlift.pipeline.make import fit_figures
 from fluidlift.pipeline.runner import Runner
 from fluidlift.pipeline.stages.fit import fit
 from fluidlift.present import report
-from fluidlift.scene.recall import OF_CLIP, recalled, stage_keys
+from fluidlift.scene.recall import OF_CLIP, recalled, stage_keys, that_counts
 from fluidlift.seams import Progress, Silence
 from fluidlift.types.stages import Fit, Geometry, Lift, Motion, Read, Segmentation, Shown, Simulation
 
@@ -126,7 +126,8 @@ def _recalled(runner: Runner, manifest: dict[str, Any]) -> tuple[Read, Segmentat
     """What the fit starts from."""
     keys, values = stage_keys(manifest), {}
     for name in NEEDED:
-        values[name] = runner.recall(name, keys[name], OF_CLIP[name]) if name in keys else None
+        stage = that_counts(name, keys)
+        values[name] = runner.recall(stage, keys[stage], OF_CLIP[name]) if stage in keys else None
     missing = [name for name in NEEDED if values[name] is None]
     if missing:
         made = manifest.get("provenance", {}).get("versions", {})

@@ -26,7 +26,7 @@ from fluidlift.present.looping import OPEN
 from fluidlift.scene.build import Scene, SimulationRequest, scene_of
 from fluidlift.scene.footage import footage_of
 from fluidlift.scene.forecast import ahead
-from fluidlift.scene.recall import OF_CLIP, rest_frame_of, stage_keys
+from fluidlift.scene.recall import OF_CLIP, rest_frame_of, stage_keys, that_counts
 from fluidlift.scene.reshaping import slow_edits
 from fluidlift.seams import Progress, Silence
 from fluidlift.types import FluidAsset
@@ -268,7 +268,8 @@ def recalled_lift(runner: Runner, manifest: dict[str, Any]) -> Lift | None:
     """What `make` found in the clip; None where any of it is gone, and the runner knows nothing of it then."""
     keys, values = stage_keys(manifest), []
     for name, kind in OF_CLIP.items():
-        value = runner.recall(name, keys[name], kind) if name in keys else None
+        stage = that_counts(name, keys)
+        value = runner.recall(stage, keys[stage], kind) if stage in keys else None
         if value is None:
             runner.forget()
             return None

@@ -222,7 +222,7 @@ def _seen(
         motion, trust = said.mean(motion, trust)
     known, pose_given = known_camera(given, config.fov, clip.size)
     pictures, known = _depth_pictures(read, given, config.fov, known, start, work)
-    looked = _Looked(clip, fluid, mask, motion, trust, bulk)
+    looked = _Looked(clip, fluid, mask, motion, trust, bulk if said is None else None)
     evidence, kind, parts, up, heading = _kind_and_up(
         looked, given, config, known, pose_given, shaped=pictures is not None
     )
@@ -298,8 +298,9 @@ class _Looked:
     mask: np.ndarray
     motion: np.ndarray
     trust: np.ndarray
-    bulk: tuple[np.ndarray, np.ndarray]
-    """mean motion of all of the fluid, and of the ground, in each pair of frames"""
+    bulk: tuple[np.ndarray, np.ndarray] | None
+    """mean motion of all of the fluid, and of the ground, in each pair of frames; None: a person said where it runs, so
+    that it does not swing to and fro"""
 
 
 def _kind_and_up(

@@ -28,6 +28,8 @@ OF_CLIP: dict[str, type] = {
     "fit": Fit,
 }  # fmt: skip
 """stages that need the clip, and what they leave"""
+CORRECTED = {"segment": "correct"}
+"""stages whose value is replaced by that of another where that was run: labels with a person's regions over them"""
 
 
 def footage_of_asset(folder: Path, manifest: dict[str, Any]) -> Footage | None:
@@ -38,9 +40,15 @@ def footage_of_asset(folder: Path, manifest: dict[str, Any]) -> Footage | None:
 
 def recalled(folder: Path, manifest: dict[str, Any], name: str) -> Any:
     """The value of one stage of `OF_CLIP` that an asset was made from; None where it is gone."""
-    key = stage_keys(manifest).get(name)
-    found = None if key is None else kept_value(folder, name, key, OF_CLIP[name])
+    keys = stage_keys(manifest)
+    stage = that_counts(name, keys)
+    found = None if stage not in keys else kept_value(folder, stage, keys[stage], OF_CLIP[name])
     return None if found is None else found[0]
+
+
+def that_counts(name: str, keys: dict[str, str]) -> str:
+    """The stage, of those with a key, whose value counts as that of a stage."""
+    return CORRECTED[name] if CORRECTED.get(name) in keys else name
 
 
 def stage_keys(manifest: dict[str, Any]) -> dict[str, str]:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from fluidlift.numerics.short_axis import summed
 from fluidlift.shape.frame_pictures import (
     FramePictures,
     burst_length,
@@ -90,7 +91,7 @@ class Evidence:
 
 def distance_of_pictures(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """float32 [h,w]: absolute difference, colour counted as brightness is."""
-    return np.abs(first.astype(np.float32) - second.astype(np.float32)).sum(axis=-1)
+    return summed(np.abs(first.astype(np.float32) - second.astype(np.float32)))
 
 
 def pool(log_ratio: np.ndarray, sigma: float) -> np.ndarray:
@@ -197,7 +198,7 @@ def flow_evidence(
         walked += step * np.clip(sure, 0.0, 1.0)
         path += np.hypot(step[..., 0], step[..., 1])
         total += step
-        squares += (step**2).sum(axis=-1)
+        squares += summed(step**2)
         np.maximum(farthest, np.hypot(walked[..., 0], walked[..., 1]), out=farthest)
     floor = noise * len(pairs)
     before, after = (cv2.GaussianBlur(np.maximum(x - floor, 0.0), (0, 0), sigma) for x in (before, after))

@@ -34,6 +34,8 @@ SHALLOW = 0.05
 """radii between level and floor, below which the silhouette is that of the surface alone: no floor is seen"""
 DEEP = 1.0
 """radii that such a pool is taken to be deep: as a half sphere is, between a plate and a mug"""
+FREEBOARD = 0.1
+"""radii that the edge of such a vessel stands above the level at least, which it would run over"""
 SMOOTH = 0.015
 """of the silhouette's height over which its outline is evened out: drops and notches of a mask"""
 TURNS, RADII = 17, 96
@@ -56,6 +58,10 @@ class FilledVessel:
     """z of the surface at the first instant"""
     inflow: tuple[float, float, float] = (0.0, 0.0, -1.0)
     """unit vector, the way that the jet falls in, as far as it leans to the side"""
+    looked_into: bool = False
+    """only its surface is seen: its near wall hides the rest of what it holds"""
+    edge: float | None = None
+    """z of its upper edge where that is seen, by what it hides"""
 
     @property
     def floor(self) -> float:
@@ -64,7 +70,9 @@ class FilledVessel:
 
     @property
     def rim(self) -> float:
-        """z of its upper edge, which is not seen: half as high again as it was filled."""
+        """z of its upper edge; where that is not seen, half as high again as it was filled."""
+        if self.edge is not None:
+            return self.edge
         return float(self.heights[-1]) + 0.5 * (float(self.heights[-1]) - self.floor)
 
     @property
@@ -101,7 +109,8 @@ class FilledVessel:
         low = t.points(np.array([[*self.axis, 0.0]]))[0]
         return FilledVessel(
             (float(low[0]), float(low[1])), low[2] + t.scale * self.heights, t.scale * self.radii,
-            float(low[2] + t.scale * self.level), triple(t.rotation @ self.inflow),
+            float(low[2] + t.scale * self.level), triple(t.rotation @ self.inflow), self.looked_into,
+            None if self.edge is None else float(low[2] + t.scale * self.edge),
         )  # fmt: skip
 
 
@@ -147,15 +156,33 @@ def find_vessel(camera: PinholeCamera, mask: Bool[np.ndarray, "h w"], distance: 
     level = _circle_at(z[-1] + 0.5 * pixel, ends, (z, radius), distance, near=z[-1] > 0.0)
     middle = float(np.median(plane.middle[first:last]))
     widest, radius = float(radius.max()), _largest_circles(z, plane.z, half, distance)
-    if level - floor < SHALLOW * widest:
+    looked_into, edge = bool(level - floor < SHALLOW * widest), None
+    if looked_into:  # the lowest row shows the nearest point of the edge
+        seen = (z[0] - 0.5 * pixel) * (distance - widest) / distance
+        edge = float(max(seen, level + FREEBOARD * widest) + eye[2])
         floor, radius = level - DEEP * widest, np.full(len(z), widest)
     heights = np.linspace(floor, level, max(len(z), 2))
     axis = eye[:2] + middle * right + distance * forward
     way = np.array([*(-plane.lean(last) * right), -1.0])
     return FilledVessel(
         (float(axis[0]), float(axis[1])), heights + eye[2], np.interp(heights, z, radius), level + float(eye[2]),
-        triple(way / np.linalg.norm(way)),
+        triple(way / np.linalg.norm(way)), looked_into, edge,
     )  # fmt: skip
+
+
+def behind_its_wall(
+    vessel: FilledVessel, camera: PinholeCamera, ever: Bool[np.ndarray, "h w"]
+) -> Bool[np.ndarray, "h w"]:
+    """Pixels behind which a vessel that is looked into holds fluid though none is seen there: its near wall hides it.
+
+    Args:
+        vessel: in the camera's world.
+        camera: that sees it.
+        ever: pixels that are fluid in at least one frame.
+    """
+    if not vessel.looked_into:
+        return np.zeros(ever.shape, bool)
+    return np.isfinite(pool_depths(camera, np.ones(ever.shape, bool), vessel)[0]) & ~ever
 
 
 def seen_higher(vessel: FilledVessel, camera: PinholeCamera, ever: Bool[np.ndarray, "h w"]) -> FilledVessel:

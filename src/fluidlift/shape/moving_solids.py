@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from fluidlift.numerics.short_axis import lengths, summed
 from fluidlift.numerics.similarity2 import composed, inverse
 from fluidlift.shape.evidence import PairReader
 from fluidlift.shape.frame_pictures import shrink, working_scale
@@ -122,7 +123,7 @@ def moving_solids(clip: VideoClip, flow: SharedPairs, shape: tuple[int, int]) ->
         steps = [flow.step(t) for t in range(start, start + length)]
         seen = seen + _solids_of_window(grey, steps)
         total = total + sum(steps)
-        squares = squares + sum((step**2).sum(axis=-1) for step in steps)
+        squares = squares + sum(summed(step**2) for step in steps)
         count += length
     mean, mean_square = np.linalg.norm(total, axis=-1) / count, squares / count
     steady = mean / np.maximum(np.sqrt(mean_square), AGREES_PX)
@@ -217,7 +218,7 @@ def _moving_alike(motions: list[np.ndarray], steps: list[np.ndarray], features: 
         turned = composed(after, inverse(motion))
         expected = place @ (turned[:, :2] - np.eye(2)).T.astype(np.float32) + turned[:, 2].astype(np.float32)
         seen = cv2.remap(step, place[..., 0], place[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        error += np.linalg.norm(seen - expected, axis=-1)
-        length += np.linalg.norm(expected, axis=-1)
+        error += lengths(seen - expected)
+        length += lengths(expected)
     still = length < 0.5 * LEAST_MOVE * max(height, width)
     return (near > 0) & ~still & (error < np.maximum(AGREES * length, AGREES_PX * len(steps)))

@@ -29,7 +29,7 @@ from fluidlift.shape.moving_solids import SharedPairs, moving_solids
 from fluidlift.shape.open_water import with_open_water
 from fluidlift.shape.presence import Presence, always, grows, stay, watch
 from fluidlift.shape.region import clean_region, cut_along_edges, solids_in, still_pixels
-from fluidlift.shape.washed import bare_over_time, washed_ground
+from fluidlift.shape.washed import WashedGround, bare_over_time, washed_ground
 from fluidlift.shape.waterline import dry_over_time
 from fluidlift.shape.waving import without_plants
 from fluidlift.types.clip import Label, PixelLabels, VideoClip
@@ -80,6 +80,17 @@ class LabelWriter:
 
 
 @dataclass(frozen=True)
+class Bed:
+    """The outline of a fluid that stays in its bed, bool [h,w] each."""
+
+    region: np.ndarray
+    rocks: np.ndarray
+    """what stands in it"""
+    washed: WashedGround | None = None
+    """ground that it runs over now and then"""
+
+
+@dataclass(frozen=True)
 class Clues:
     """What a clip shows of its fluid, before a person says anything: all that is slow in finding it."""
 
@@ -88,6 +99,8 @@ class Clues:
     """bool [h,w], what moves and is no fluid"""
     inside: np.ndarray
     """bool [h,w], where fluid is looked for"""
+    interval: float
+    """s between two frames"""
 
     @cached_property
     def score(self) -> np.ndarray:
@@ -105,13 +118,28 @@ class Clues:
         """bool [h,w], the fluid grown from its streams, where change does not tell it; else None."""
         return None if trustworthy(self.score) else grown_from_streams(self.evidence, self.inside)
 
+    @cached_property
+    def bed(self) -> Bed:
+        """Where it is, if it stays in its bed."""
+        evidence, score = self.evidence, self.score
+        if self.grown is not None:
+            region = with_open_water(evidence, clean_region(self.grown), self.solids | ~self.inside)
+            return Bed(region, np.zeros_like(region))
+        first = lasting_region(evidence, score, self.inside)
+        region = without_plants(evidence, score, first, self.interval)
+        washed = washed_ground(evidence, region)
+        region, rocks = without_ground(evidence, region)
+        taken = first & ~region  # plants and washed ground wander, too, and were told from water already
+        region = with_open_water(evidence, region, rocks | self.solids | taken | ~self.inside)
+        return Bed(region, rocks, washed)
+
 
 def clues_of(clip: VideoClip, flow: PixelFlow | PairReader, roi: tuple[int, int, int, int] | None = None) -> Clues:
     """The clues of a clip of at least 2 frames; operands as those of `segment`."""
     pairs = SharedPairs(clip, pair_reader(flow))
     evidence = gather_evidence(clip, pairs)
     inside = shrink_mask(region_of_interest(roi, *clip.frames.shape[1:3]), evidence.noise.shape)
-    return Clues(evidence, moving_solids(clip, pairs, evidence.noise.shape), inside)
+    return Clues(evidence, moving_solids(clip, pairs, evidence.noise.shape), inside, clip.interval)
 
 
 def segment(
@@ -169,41 +197,23 @@ def segment(
         barred = (solids | solids_by_flow(evidence)) & (told <= 0.0)
         found = advancing_labels(evidence, score, presence, np.where(barred, -12.0, told))
     else:
-        found = staying_labels(evidence, score, presence, grown, small_inside, clicks, clip.interval, solids)
+        found = staying_labels(known, clicks)
     tell(0.5, "labels")
     writer = LabelWriter((frames, height, width), out)
     share = write_labels(found, writer, small_inside, tell)
     return PixelLabels(writer.labels, writer.confidence, warnings=doubts(share, score))
 
 
-def staying_labels(
-    evidence: Evidence, score: np.ndarray, presence: Presence, grown: np.ndarray | None, inside: np.ndarray,
-    clicks: Clicks, interval: float, solids: np.ndarray,
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:  # fmt: skip
+def staying_labels(known: Clues, clicks: Clicks) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Labels and confidence of every frame of a fluid that stays in its bed.
 
     Args:
-        evidence: of the clip.
-        score: log odds of fluid, float32 [h,w].
-        presence: when it is there.
-        grown: bool [h,w], the fluid where change says nothing and it was grown from its streams; else None.
-        inside: bool [h,w], where fluid is looked for.
+        known: what the clip shows.
         clicks: what a person said of some pixels.
-        interval: s between two frames.
-        solids: bool [h,w], what moves and is no fluid.
     """
-    region = lasting_region(evidence, score, inside) if grown is None else clean_region(grown)
-    rocks = asked = held = np.zeros_like(region)
-    washed = None
-    if grown is None:
-        first = region
-        region = without_plants(evidence, score, region, interval)
-        washed = washed_ground(evidence, region)
-        region, rocks = without_ground(evidence, region)
-        taken = first & ~region  # plants and washed ground wander, too, and were told from water already
-        region = with_open_water(evidence, region, rocks | solids | taken | ~inside)
-    else:
-        region = with_open_water(evidence, region, solids | ~inside)
+    evidence, score, presence, grown = known.evidence, known.score, known.presence, known.grown
+    region, rocks, washed = known.bed.region, known.bed.rocks, known.bed.washed
+    asked = held = np.zeros_like(region)
     if clicks:
         before = region
         region, told = heed(clicks, evidence, score, region)

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from fluidlift.errors import FluidliftError, InputRejected
-from fluidlift.io.hints_file import hints_beside, hints_data
+from fluidlift.io.hints_file import hints_beside
 from fluidlift.studio.clips import Strip, clip_at, clips_in, jpeg
 from fluidlift.studio.history import HintsHistory
 from fluidlift.studio.looking import Looking, Wish, wished_at
@@ -88,6 +88,7 @@ class Desk:
             look, history = self.looking.look, self.history
             read, seen = look.read, look.segmentation
             ours = look.clip == self.clip
+            self._lay_hints()
             return {
                 "version": self.version,
                 "folder": str(self.folder),
@@ -95,7 +96,7 @@ class Desk:
                 "clip": self.info,
                 "error": self.error,
                 "broken": None if self.broken is None else self.broken.name,
-                "hints": None if history is None else hints_data(history.hints),
+                "hints": None if history is None else history.shown,
                 "hints_file": None if history is None else history.file.name,
                 "undo": history is not None and history.can_undo,
                 "redo": history is not None and history.can_redo,
@@ -175,9 +176,21 @@ class Desk:
         with self.lock:
             if self.history is None:
                 raise InputRejected("no clip is open", "a clip", "choose one first")
+            self._lay_hints()
             act(self.history)
             self._ask()
         self.changed()
+
+    def _lay_hints(self) -> None:
+        """Where the points of the hints lie on the picture that is shown: another trim may be laid on another frame."""
+        from fluidlift.pipeline.hints import picture_shift, time_laid_on
+
+        history, read = self.history, self.looking.look.read
+        if history is None or read is None or self.looking.look.clip != self.clip:
+            return
+        history.shown_time = time_laid_on(read)
+        shift, k = picture_shift(read, history.time) or (0.0, 0.0), history.size[0] / read.clip.size[0]
+        history.shift = (round(k * shift[0], 1), round(k * shift[1], 1))  # tenths, as the file has them
 
     def fresh_hints(self) -> None:
         """Move a hints file that cannot be used aside, and begin anew."""

@@ -12,12 +12,12 @@ from fluidlift.errors import InputRejected
 from fluidlift.io.atomic import disk_errors, write_json
 from fluidlift.io.hints_file import hints_data, parse_hints, read_found, read_hints, require_same_clip, write_hints
 from fluidlift.io.limits import read_json
-from fluidlift.types.hints import ClipHints, ClipIdentity
+from fluidlift.types.hints import ClipHints, ClipIdentity, Point
 
 MOST_STEPS = 100
 """that can be undone"""
 LISTS = ("regions", "clicks", "rims", "flow")
-WHOLE = ("start", "duration", "kind", "fov", "horizon", "ruler", "roi", "level")
+WHOLE = ("start", "duration", "kind", "fov", "pitch", "horizon", "ruler", "roi", "level")
 
 
 class HintsHistory:
@@ -36,6 +36,10 @@ class HintsHistory:
     def __init__(self, clip: Path, file: Path, steps: Path, identity: ClipIdentity) -> None:
         self.clip, self.file, self._steps, self._identity = clip, file, steps, identity
         self.found: dict[str, Any] = {}
+        self.shift: Point = (0.0, 0.0)
+        """px from the points of the file to where they lie on the picture that is shown"""
+        self.shown_time: float | None = None
+        """s: the frame that the picture which is shown is that of, where the camera moves"""
         self._written: bytes | None = None
         self._undone: list[dict[str, Any]] = []
         self._done: list[dict[str, Any]] = []
@@ -48,6 +52,21 @@ class HintsHistory:
                 self._undone = [d for d in kept["undone"] if isinstance(d, dict)][-MOST_STEPS:]
             except (InputRejected, KeyError, TypeError):
                 steps.unlink()  # only a convenience is lost
+
+    @property
+    def time(self) -> float | None:
+        """s into the clip: the frame whose picture the points of the file lie in."""
+        return self._identity.time
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the clip's picture, px."""
+        return self._identity.size
+
+    @property
+    def shown(self) -> dict[str, Any]:
+        """The hints as plain data, with their points on the picture that is shown."""
+        return hints_data(self.hints.moved(self.shift))
 
     @property
     def can_undo(self) -> bool:
@@ -67,11 +86,12 @@ class HintsHistory:
         read = read_hints(self.file)
         require_same_clip(read, self.clip, self.file.name)
         self.hints, self.found, self._written = read.at(self._identity.size), read_found(self.file), now
+        self._identity = replace(self._identity, time=None if read.clip is None else read.clip.time)
         self.hints = replace(self.hints, clip=self._identity)
         return True
 
     def change(self, what: dict[str, Any]) -> None:
-        """One step, in the form of the file.
+        """One step, in the form of the file; points are those of the picture that is shown.
 
         `{"set": name, "to": value}` (null takes it back), `{"add": list, "item": data}`,
         `{"put": list, "at": number, "item": data}` or `{"remove": list, "at": number}`.
@@ -81,8 +101,10 @@ class HintsHistory:
         """
         self.refresh()
         before = hints_data(self.hints)
-        after = parse_hints(_changed(before, what), self.file.name)
-        self._save(after)
+        if not self.hints.has_points:  # the first point says which picture they lie in
+            self._identity, self.shift = replace(self._identity, time=self.shown_time), (0.0, 0.0)
+        after = parse_hints(_changed(self.shown, what), self.file.name)
+        self._save(after.moved((-self.shift[0], -self.shift[1])))
         self._done, self._undone = [*self._done, before][-MOST_STEPS:], []
         self._save_steps()
 

@@ -27,6 +27,9 @@ class ClipIdentity:
     frames: int | None = None
     sha256: str | None = None
     """of its content"""
+    time: float | None = None
+    """s into the clip: points lie in the picture of this frame, where the camera moves; None: in the picture that the
+    frames in use are laid on"""
 
 
 @dataclass(frozen=True)
@@ -42,8 +45,14 @@ class Region:
     """s into the clip: the frame that it was drawn on"""
     moves: bool = False
     """it goes with the fluid, by the optical flow, to the other frames; else it is there in all of them"""
+    begins: float | None = None
+    """s into the clip: the first frame that it is there in; None: that of the clip"""
+    ends: float | None = None
+    """s into the clip: it is there in the frames before; None: to the end"""
 
     def __post_init__(self) -> None:
+        backwards = self.begins is not None and self.ends is not None and self.ends <= self.begins
+        require(not backwards, f"a region from {self.begins} s until {self.ends} s", "an end after its beginning")
         least = 3 if self.width is None else 1
         require(len(self.line) >= least, f"a region of {len(self.line)} points", f"{least} or more")
         require(self.width is None or self.width > 0, f"a brush {self.width} px wide", "more than 0")
@@ -105,6 +114,8 @@ class ClipHints:
     kind: str | None = None
     fov: float | None = None
     """degrees across the longer side"""
+    pitch: float | None = None
+    """degrees by which the camera looks below the horizon; 90: straight down, where no horizon can be drawn"""
     horizon: tuple[Point, Point] | None = None
     """two points of it, left and right; outside the picture where it is not in it"""
     ruler: Ruler | None = None
@@ -123,6 +134,7 @@ class ClipHints:
         """Those that are settings of a job, by dotted name."""
         found = {
             "read.start": self.start, "read.duration": self.duration, "shape.kind": self.kind, "shape.fov": self.fov,
+            "shape.pitch": self.pitch,
         }  # fmt: skip
         return {name: value for name, value in found.items() if value is not None}
 
@@ -140,30 +152,41 @@ class ClipHints:
                 f"hints drawn on a {w} x {h} picture for a clip of {width} x {height} px",
                 "hints and a clip of one shape", "draw them again on this clip (fluidlift studio)",
             )  # fmt: skip
-        kx, ky = width / w, height / h
-        mean = (kx * ky) ** 0.5
+        return replace(self._mapped((width / w, height / h), (0.0, 0.0)), clip=replace(self.clip, size=(width, height)))
 
-        def moved(p: Point) -> Point:
-            return p[0] * kx, p[1] * ky
+    def moved(self, by: Point) -> ClipHints:
+        """The same with all points moved by this, px."""
+        return self if by == (0.0, 0.0) else self._mapped((1.0, 1.0), by)
 
+    @property
+    def has_points(self) -> bool:
+        """Whether anything of it lies somewhere in the picture."""
+        whole = (self.horizon, self.ruler, self.roi, self.level)
+        return any(w is not None for w in whole) or any((self.rims, self.regions, self.clicks, self.flow))
+
+    def _mapped(self, k: Point, by: Point) -> ClipHints:
+        mean = (k[0] * k[1]) ** 0.5
+
+        def to(p: Point) -> Point:
+            return p[0] * k[0] + by[0], p[1] * k[1] + by[1]
+
+        def line(ends: tuple[Point, Point] | None) -> tuple[Point, Point] | None:
+            return None if ends is None else (to(ends[0]), to(ends[1]))
+
+        ruler, roi = self.ruler, self.roi
         return replace(
             self,
-            clip=replace(self.clip, size=(width, height)),
-            horizon=None if self.horizon is None else (moved(self.horizon[0]), moved(self.horizon[1])),
-            ruler=None if self.ruler is None else replace(
-                self.ruler, begin=moved(self.ruler.begin), end=moved(self.ruler.end)
-            ),
-            rims=tuple(
-                replace(r, center=moved(r.center), axes=(r.axes[0] * mean, r.axes[1] * mean)) for r in self.rims
-            ),
+            horizon=line(self.horizon),
+            ruler=None if ruler is None else replace(ruler, begin=to(ruler.begin), end=to(ruler.end)),
+            rims=tuple(replace(r, center=to(r.center), axes=(r.axes[0] * mean, r.axes[1] * mean)) for r in self.rims),
             regions=tuple(
-                replace(r, line=tuple(moved(p) for p in r.line), width=None if r.width is None else r.width * mean)
+                replace(r, line=tuple(to(p) for p in r.line), width=None if r.width is None else r.width * mean)
                 for r in self.regions
             ),
-            clicks=tuple(replace(c, at=moved(c.at)) for c in self.clicks),
-            roi=None if self.roi is None else (self.roi[0] * kx, self.roi[1] * ky, self.roi[2] * kx, self.roi[3] * ky),
-            flow=tuple(Arrow(moved(a.at), moved(a.to)) for a in self.flow),
-            level=None if self.level is None else (moved(self.level[0]), moved(self.level[1])),
+            clicks=tuple(replace(c, at=to(c.at)) for c in self.clicks),
+            roi=None if roi is None else (*to((roi[0], roi[1])), roi[2] * k[0], roi[3] * k[1]),
+            flow=tuple(Arrow(to(a.at), to(a.to)) for a in self.flow),
+            level=line(self.level),
         )  # fmt: skip
 
     @property

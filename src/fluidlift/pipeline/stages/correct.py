@@ -41,11 +41,14 @@ def correct(
                 f"region {number} ({region.what}) lies outside the {shape[2]} x {shape[1]} picture",
                 "points inside the picture", "move it, or take it out of the hints",
             )  # fmt: skip
+        held = _frames_of(region, read.clip.times)
         if not region.moves:
-            labels[:, mask], confidence[:, mask] = LABELS[region.what], 1.0
+            for t in np.flatnonzero(held):
+                labels[t, mask], confidence[t, mask] = LABELS[region.what], 1.0
             continue
         for t, there in carried(mask, flow.flow.displacement, frame_at(read.clip.times, region.time)):
-            labels[t, there], confidence[t, there] = LABELS[region.what], 1.0
+            if held[t]:
+                labels[t, there], confidence[t, there] = LABELS[region.what], 1.0
     fluid = FluidMasks(labels)
     areas = fluid.areas()
     if not areas.any():
@@ -58,6 +61,13 @@ def correct(
     share = float(areas.mean() / (shape[1] * shape[2]))
     trusted = trusted_share(flow.flow, fluid.any_frame())
     return Segmentation(kept, share, sureness(kept, float(areas.sum())), trusted, segmentation.user_mask)
+
+
+def _frames_of(region: Region, times: np.ndarray) -> np.ndarray:
+    """bool [T]: in which frames, s into the clip, a region is there."""
+    begins, ends = (v if v is not None else k * np.inf for v, k in ((region.begins, -1.0), (region.ends, 1.0)))
+    slack = 1e-3  # s: files hold tenths of milliseconds
+    return (times >= begins - slack) & (times < ends - slack)
 
 
 def nothing_found(read: Read, *, work: Work) -> Segmentation:

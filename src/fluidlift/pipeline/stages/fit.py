@@ -172,16 +172,19 @@ def prior_widths(kind: FluidKind) -> dict[str, float]:
 
 
 def filling_rate(read: Read, masks: FluidMasks, geometry: Geometry) -> float | None:
-    """Volume (m^3/s) that a vessel gains over the clip, from the level in it; None where nothing fills.
+    """Volume (m^3/s) that a vessel gains over the clip, from the level in it; None where no level is seen.
 
-    What a jet brings is seen better in the vessel than in the jet, whose speed is a blur and whose mask is too wide.
+    What a jet brings is seen better in the vessel than in the jet, whose speed is a blur and whose mask is too wide. A
+    level that is not seen to rise may still do so by a row of the picture while the clip lasts; by more it does not,
+    however fast the jet falls: the vessel would run over.
     """
     from fluidlift.shape.filled_vessel import distance_ahead, filled_volume, find_vessel, seen_higher
 
     if not kind_of(geometry.kind).fills_vessel or geometry.setting.pool_level is None:
         return None
     clip, camera, mask = read.clip, geometry.camera, geometry.mask
-    vessel = find_vessel(camera, mask, distance_ahead(camera, mask, geometry.depth + geometry.half_thickness))
+    ahead = distance_ahead(camera, mask, geometry.depth + geometry.half_thickness)
+    vessel = find_vessel(camera, mask, ahead)
     if vessel is None:
         return None
     vessel = seen_higher(vessel, camera, masks.any_frame())
@@ -194,7 +197,8 @@ def filling_rate(read: Read, masks: FluidMasks, geometry: Geometry) -> float | N
     if len(times) < 4:
         return None
     rate = float(np.polyfit(times, volumes, 1)[0])
-    return rate if rate > 0 else None
+    row = ahead / max(camera.focal) * np.pi * float(vessel.radius_at(np.array(vessel.level))) ** 2
+    return max(rate, row / max(times[-1] - times[0], clip.interval))
 
 
 def first_guess(

@@ -8,10 +8,11 @@ import numpy as np
 
 from fluidlift.errors import InputRejected
 from fluidlift.pipeline.settings import GeometrySettings, GivenView
-from fluidlift.pipeline.sight import Sight, mainstream_of, sighted
+from fluidlift.pipeline.sight import Sight, Sighted, mainstream_of, sighted
 from fluidlift.pipeline.work import Work
 from fluidlift.shape import (
     composite,
+    filled_vessel,
     generate,
     ground,
     ground_texture,
@@ -25,6 +26,7 @@ from fluidlift.types import (
     PinholeCamera,
     SaidFlow,
     Setting,
+    Similarity3,
     VideoClip,
 )
 from fluidlift.types.fluid_masks import FluidMasks
@@ -102,7 +104,7 @@ def geometry(
         plate=picture,
         rest_frame=seen.start,
         united_frames=seen.united,
-        rocks=None if seen.stood is None else seen.stood.solid,
+        rocks=_solid_before(s, fluid, camera, to_world),
         hidden=hidden,
         known_scale=s.known_scale,
         depth_source=None if seen_depth is None else seen_depth.meta,
@@ -147,6 +149,16 @@ def _hidden(seen: Sight, segmentation: Segmentation) -> np.ndarray | None:
     ever = FluidMasks(segmentation.labels.labels).any_frame()
     found = occluders.occluders(seen.mask, ever, seen.motion, seen.trust)
     return found if found.any() else None
+
+
+def _solid_before(s: Sighted, fluid: FluidMasks, camera: PinholeCamera, to_world: Similarity3) -> np.ndarray | None:
+    """Pixels in which something solid stands in or before the fluid; None: those of the labels."""
+    if s.seen.stood is not None:
+        return s.seen.stood.solid
+    if s.front.vessel is None or not s.front.vessel.looked_into:
+        return None
+    walls = filled_vessel.behind_its_wall(s.front.vessel.transformed(to_world), camera, fluid.any_frame())
+    return walls | (ground.solid_share(fluid.labels) > 0.5)
 
 
 def _seen_speed(visible, velocities, trust) -> np.ndarray:

@@ -117,6 +117,8 @@ def refine(
     hull = shell.select(slice(len(shown), None))
     # what the picture contradicts goes: cells reach a little before the visible surface and beyond the silhouette
     allowed = (labels.labels[start : start + united] != Label.BACKGROUND).any(axis=0) | mask
+    if geometry.rocks is not None and setting.pool_level is not None:  # the near wall of a vessel that is looked into
+        allowed = allowed | geometry.rocks
     inside = [hull, _outside_solid(added, setting)]
     inside = [generate.beneath_front(part, depth, mask, camera, smallest=KEPT, drop_above=True) for part in inside]
     hull, added = (_not_contradicted(part, geometry, allowed) for part in inside)

@@ -29,7 +29,7 @@ const warning = (text) => el("p", { class: "warning" }, text);
 
 export function panels(state, doing) {
   const look = state.look, facts = look?.facts, hints = state.hints ?? {};
-  panel("found", [state.clip?.name, facts, look?.so_far, look?.warnings, hints.kind, hints.horizon, hints.level, hints.ruler], () => found(state, doing));
+  panel("found", [state.clip?.name, facts, look?.so_far, look?.warnings, hints.kind, hints.pitch, hints.horizon, hints.level, hints.ruler], () => found(state, doing));
   panel("said", [state.clip?.name, hints, state.broken], () => said(state, doing));
   panel("about", [state.clip, look?.read_warnings], () => about(state));
   making(state, doing);
@@ -52,7 +52,7 @@ function found(state, { change }) {
     rows.push(["", el("span", {}, bar, `${name} ${share.toFixed(2)}`)]);
   }
   if (facts) {
-    const error = hints.horizon ? "as drawn" : `± ${facts.pitch_error.toFixed(0)}°, from ${facts.tilt_from}`;
+    const error = hints.horizon || hints.pitch !== undefined ? "as said" : `± ${facts.pitch_error.toFixed(0)}°, from ${facts.tilt_from}`;
     rows.push(["Tilt", `looks ${facts.pitch.toFixed(0)}° down (${error})`]);
     rows.push(["Scale", facts.scale.replace(/^scale: /, "")]);
   }
@@ -78,12 +78,13 @@ function said(state, { change, act }) {
   if (hints.start !== undefined || hints.duration !== undefined) item(`used: ${(hints.start ?? 0).toFixed(2)} s, ${(hints.duration ?? 0).toFixed(2)} s long`, { set: ["start", "duration"], to: [null, null] });
   if (hints.kind) item(`kind: ${hints.kind}`, { set: "kind", to: null });
   if (hints.fov) item(`field of view: ${hints.fov}°`, { set: "fov", to: null });
+  if (hints.pitch !== undefined) item(`looks ${hints.pitch}° down`, { set: "pitch", to: null });
   if (hints.horizon) item("a horizon", { set: "horizon", to: null });
   if (hints.level) item("a level line", { set: "level", to: null });
   if (hints.ruler) item(`a ruler of ${hints.ruler.metres} m`, { set: "ruler", to: null });
   if (hints.roi) item("fluid only inside a box", { set: "roi", to: null });
   (hints.rims ?? []).forEach((r, k) => item(`rim ${k + 1}`, { remove: "rims", at: k }));
-  (hints.regions ?? []).forEach((r, k) => item(`${r.is}: ${r.area ? "area" : "brush"} ${k + 1}${r.moves ? `, from ${(r.time ?? 0).toFixed(2)} s with the flow` : ""}`, { remove: "regions", at: k }));
+  (hints.regions ?? []).forEach((r, k) => item(`${r.is}: ${r.area ? "area" : "brush"} ${k + 1}${r.moves ? `, from ${(r.time ?? 0).toFixed(2)} s with the flow` : ""}${r.from === undefined ? "" : `, from ${r.from.toFixed(2)} s on`}`, { remove: "regions", at: k }));
   (hints.flow ?? []).forEach((a, k) => item(`arrow ${k + 1} of the flow`, { remove: "flow", at: k }));
   (hints.clicks ?? []).forEach((c, k) => item(`click ${k + 1}: ${c.fluid ? "fluid" : "not fluid"}`, { remove: "clicks", at: k }));
   if (!items.length) return [el("p", { class: "soft" }, state.clip ? "Nothing yet. Choose a tool above the picture." : "")];

@@ -184,7 +184,7 @@ export class Picture {
     this.held = null;
     if (tool === "area") return;
     this.line = null;
-    if (held?.kind === "horizon") this.change({ set: "horizon", to: line });
+    if (held?.kind === "horizon") this.change({ set: ["horizon", "pitch"], to: [line, null] });
     else if (held?.kind === "ruler") this.change({ set: "ruler", to: { ...this.hints.ruler, [held.k]: held.at } });
     else if (held?.kind === "level") this.change({ set: "level", to: this.hints.level.map((p, k) => (k === held.k ? held.at : p)) });
     else if (held?.kind.startsWith("arrow")) this.turnArrow(held);
@@ -224,7 +224,14 @@ export class Picture {
   sendRegion(line) {
     const region = { is: this.page.what, ...line, time: this.times[this.number] ?? 0 };
     if (this.page.moves) region.moves = true;
+    if (this.page.begins) region.from = region.time;
     this.change({ add: "regions", item: region });
+  }
+
+  // all that lies so far is taken away: what is painted after it is all there is
+  clearMask() {
+    const [w, h] = this.size;
+    this.change({ add: "regions", item: { is: "not fluid", area: [[0, 0], [w, 0], [w, h], [0, h]] } });
   }
 
   finish() {
@@ -290,6 +297,7 @@ export class Picture {
     c.save(); c.beginPath(); c.rect(0, 0, w, h); c.clip();
     for (const r of this.hints.regions ?? []) {
       if (r.moves && Math.abs((r.time ?? 0) - now) > 0.02) continue;
+      if (now < (r.from ?? -1) - 0.001 || now >= (r.until ?? 1e9) - 0.001) continue;
       c.strokeStyle = c.fillStyle = COLORS[r.is]; c.lineJoin = c.lineCap = "round";
       if (r.area) { this.path(c, r.area, true); c.lineWidth = 1.5 * u; c.stroke(); if (waiting) { c.globalAlpha = 0.35; c.fill(); c.globalAlpha = 1; } }
       else { this.path(c, r.brush.length > 1 ? r.brush : [r.brush[0], r.brush[0]], false); c.globalAlpha = waiting ? 0.45 : 0.12; c.lineWidth = r.width; c.stroke(); c.globalAlpha = 1; }

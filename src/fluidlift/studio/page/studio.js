@@ -2,7 +2,7 @@
 import { Picture } from "./picture.js";
 import { el, fill, panels } from "./panels.js";
 
-export const page = { state: null, tool: "look", what: "fluid", width: 24, moves: false, metres: 1 };
+export const page = { state: null, tool: "look", what: "fluid", width: 24, moves: false, begins: false, metres: 1 };
 const REGIONS = ["fluid", "not fluid", "rock", "sky", "ledge", "pool"];
 const $ = (id) => document.getElementById(id);
 let messageOf = "";
@@ -71,20 +71,26 @@ function options() {
   box.dataset.of = needed;
   const what = (words) => el("select", { "aria-label": "what is there", onchange: (e) => { page.what = e.target.value; } },
     ...words.map((w) => el("option", { selected: w === page.what }, w)));
-  const moves = el("label", { title: "it goes with the flow to the other frames; else it is there in all" },
-    el("input", { type: "checkbox", id: "moves", checked: page.moves, onchange: (e) => { page.moves = e.target.checked; } }), " goes with the flow");
+  const check = (name, words, title) => el("label", { title },
+    el("input", { type: "checkbox", id: name, checked: page[name], onchange: (e) => { page[name] = e.target.checked; } }), ` ${words}`);
+  const moves = check("moves", "goes with the flow", "it goes with the flow to the other frames; else it is there in all");
+  const begins = check("begins", "from here on", "it is there from this frame on: a level that rises, a front that comes");
+  const clear = el("button", { title: "nothing is fluid; then paint what is", onclick: () => picture.clearMask() }, "clear the mask");
   if (page.tool === "brush") {
     fill(box, [what(REGIONS), el("label", {}, "width ",
-      el("input", { type: "range", min: 4, max: 120, value: page.width, "aria-label": "width of the brush", oninput: (e) => { page.width = +e.target.value; } })), moves]);
+      el("input", { type: "range", min: 4, max: 120, value: page.width, "aria-label": "width of the brush", oninput: (e) => { page.width = +e.target.value; } })), moves, begins, clear]);
   } else if (page.tool === "area") {
-    fill(box, [what(REGIONS), moves, "corner by corner; Enter closes"]);
+    fill(box, [what(REGIONS), moves, begins, clear, "corner by corner; Enter closes"]);
   } else if (page.tool === "click") {
     if (!["fluid", "not fluid"].includes(page.what)) page.what = "fluid";
     fill(box, [what(["fluid", "not fluid"])]);
   } else if (page.tool === "ruler") {
     fill(box, [el("label", {}, el("input", { type: "number", id: "metres", min: 0.001, step: "any", value: page.metres, oninput: (e) => { page.metres = +e.target.value; } }), " m long; then drag along it")]);
   } else if (page.tool === "horizon") {
-    fill(box, ["drag its ends; it may lie outside the picture"]);
+    const down = el("input", { type: "number", id: "pitch", min: -90, max: 90, step: "any", placeholder: "90: straight", onchange: (e) => {
+      if (e.target.value !== "") change({ set: ["pitch", "horizon"], to: [+e.target.value, null] });
+    } });
+    fill(box, ["drag its ends; it may lie outside the picture. Or: the camera looks", el("label", {}, down, "° down")]);
   } else if (page.tool === "arrow") {
     fill(box, ["drag the head of an arrow to turn it, its tail to move it; or drag a new one"]);
   } else if (page.tool === "level") {
@@ -92,7 +98,7 @@ function options() {
   } else if (page.tool === "rim") {
     fill(box, ["drag a box around a round, level rim"]);
   } else {
-    fill(box, []);
+    fill(box, ["this is what was found; a tool puts it right"]);
   }
 }
 

@@ -149,6 +149,7 @@ def simulation() -> stages.Simulation:
 
 
 VALUES = {
+    "Window": lambda: stages.Window(1.25, 2.5, (Notice("odd", "odd"),)),
     "Read": read,
     "Flow": flow,
     "Segmentation": segmentation,

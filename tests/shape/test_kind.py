@@ -14,7 +14,7 @@ from fluidlift.shape.kind import (
     level_camera,
     swinging,
 )
-from fluidlift.types import BulkMotion, KindEvidence, PinholeCamera, UpEvidence, kind_of
+from fluidlift.types import KindEvidence, PinholeCamera, UpEvidence, kind_of
 
 H, W, T = 90, 160, 6
 BLUE, GREY = (60, 110, 160), (150, 150, 150)
@@ -94,14 +94,9 @@ def test_what_recedes_comes_towards_the_viewer_and_does_not_fall():
 
 
 def to_and_fro(pairs=30, mean=0.0, swing=1.0):
-    """Bulk motion, px per frame: a wave over a current, seen for a period and a half."""
+    """Bulk motion, px per frame, of water and ground: a wave over a current, seen for a period and a half."""
     time = np.linspace(0.0, 3.0 * np.pi, pairs)
-    return BulkMotion(np.stack([0.2 * np.cos(time), mean + swing * np.sin(time)], axis=-1), np.zeros((pairs, 2)))
-
-
-def ripples(lasting, pace=1.0, pairs=30):
-    """Bulk motion of water whose places move to and fro, each for itself."""
-    return BulkMotion(np.full((pairs, 2), 0.1), np.zeros((pairs, 2)), pace, lasting)
+    return np.stack([0.2 * np.cos(time), mean + swing * np.sin(time)], axis=-1), np.zeros((pairs, 2))
 
 
 def pot():
@@ -123,17 +118,6 @@ def test_what_falls_rises_or_collapses_does_not_stay_however_it_swings(clip):
     assert wavy.kind == plain.kind, wavy.scores
 
 
-def test_lying_water_that_ripples_stays():
-    """Of the same motion in the mean: where each place goes to and fro, waves pass; else it runs."""
-    lying = towards_the_viewer(far=0.2)
-    waves, stream, slow = (estimate_kind(*lying, bulk=ripples(*m)) for m in ((0.2,), (0.9,), (0.2, 0.1)))
-    assert waves.features["rippling"] == 1.0
-    assert stream.features["rippling"] == slow.features["rippling"] == 0.0
-    assert waves.scores["basin"] > 5.0 * stream.scores["basin"]
-    upright = [estimate_kind(*towards_the_viewer(far=4.0), bulk=ripples(share)) for share in (0.2, 0.9)]
-    assert upright[0].scores == upright[1].scores, "spray of a fall goes everywhere, too"
-
-
 def test_what_is_stirred_in_a_vessel_stays_and_a_bend_of_a_river_does_not():
     frames, masks, _, trust = pot()
     whirl = np.where(masks[0][..., None], np.stack([-(ROW - 45.0) * 1.5, (COL - 80.0) / 1.5], axis=-1) / 12.0, 0.0)
@@ -147,14 +131,13 @@ def test_what_is_stirred_in_a_vessel_stays_and_a_bend_of_a_river_does_not():
 
 def test_what_swings_is_not_a_shake_nor_a_few_frames():
     rng = np.random.default_rng(0)
-    water, ground = to_and_fro().fluid, to_and_fro().ground
+    water, ground = to_and_fro()
     assert swinging(water, ground) > 0.9
     assert swinging(rng.normal(0.0, SHAKE, (30, 2)) + [0.05, 0.0], ground) < 0.5
     assert swinging(rng.normal(0.0, SHAKE, (30, 2)) + [1.0, 0.0], ground) < 0.01
     jumps = np.where(np.arange(60)[:, None] % 20 == 5, [0.0, 4.0], [0.1, 0.1])  # frames left out of a slow stream
     assert swinging(jumps, np.zeros((60, 2))) < 0.01
-    few = to_and_fro(FEWEST_PAIRS - 1)
-    assert swinging(few.fluid, few.ground) == 0.0
+    assert swinging(*to_and_fro(FEWEST_PAIRS - 1)) == 0.0
     assert swinging(water + [0.3, 0.0], water) < 0.01, "all of the picture does, and the water runs on"
     assert swinging(ground + [0.3, 0.0], water) < 0.01, "only the ground does"
     gaps = water.copy()

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from fluidlift.types import BulkMotion, PixelFlow, VideoClip
+from fluidlift.types import PixelFlow, VideoClip
 from fluidlift.types.clip import is_variable
 
 MOST_PAIRS = 600
@@ -45,8 +45,10 @@ def mean_motion(clip: VideoClip, flow: PixelFlow, mask: np.ndarray) -> tuple[np.
     return mean, trust
 
 
-def bulk_motion(clip: VideoClip, flow: PixelFlow, fluid: Callable[[int], np.ndarray], ever: np.ndarray) -> BulkMotion:
-    """Mean motion of the whole fluid, and of what is never fluid, in each pair of frames, and how steady each place is.
+def bulk_motion(
+    clip: VideoClip, flow: PixelFlow, fluid: Callable[[int], np.ndarray], ever: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean motion of the whole fluid, and of what is never fluid, in each pair of frames, px per `clip.interval`.
 
     A stream has the same in every pair, since what comes in goes out. Waves pass, and swing to and fro. So does all of
     the picture in a hand that trembles, the ground with it.
@@ -56,29 +58,21 @@ def bulk_motion(clip: VideoClip, flow: PixelFlow, fluid: Callable[[int], np.ndar
         flow: of all pairs.
         fluid: bool [h,w] of a frame.
         ever: bool [h,w], fluid in any frame.
+
+    Returns:
+        two arrays float64 [n,2]; nan where nothing was measured.
     """
     read, pairs = _rows(clip, flow), len(flow.confidence)
     pick = np.unique(np.linspace(0, pairs - 1, min(pairs, MOST_PAIRS)).round().astype(int))
     water, ground = np.full((2, len(pick), 2), np.nan)
-    trust, squares = np.zeros(ever.shape), np.zeros(ever.shape)
-    total = np.zeros((*ever.shape, 2))
     for row, t in enumerate(pick):
-        found, now = read([t], slice(None)), fluid(int(t))
-        for out, part in ((water, now), (ground, ~ever)):
+        found = read([t], slice(None))
+        for out, part in ((water, fluid(int(t))), (ground, ~ever)):
             weight = found.confidence[0] * part
-            if weight.sum() > 0:
-                out[row] = (weight[..., None] * found.displacement[0]).sum(axis=(0, 1)) / weight.sum()
-        moved = found.displacement[0] - np.nan_to_num(ground[row]).astype(np.float32)
-        weight = found.confidence[0] * now
-        trust += weight
-        total += weight[..., None] * moved
-        squares += weight * (moved**2).sum(axis=-1)
-    known = trust > 0
-    lasting = float(((total[known] ** 2).sum(axis=-1) / trust[known]).sum())
-    square, weight = float(squares.sum()), float(trust.sum())
-    return BulkMotion(
-        water, ground, (square / weight) ** 0.5 if weight > 0 else 0.0, (lasting / square) ** 0.5 if square > 0 else 1.0
-    )
+            total = float(weight.sum())
+            if total > 0:
+                out[row] = (weight[..., None] * found.displacement[0]).sum(axis=(0, 1)) / total
+    return water, ground
 
 
 def _rows(clip: VideoClip, flow: PixelFlow) -> Callable[[Iterable[int], slice], PixelFlow]:

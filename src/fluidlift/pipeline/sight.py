@@ -35,7 +35,6 @@ from fluidlift.shape.kinds import Observation, builder_of
 from fluidlift.shape.rest_frames import FEWEST_PIXELS, rest_frame, united_range
 from fluidlift.shape.view import Ellipse, Skyline, as_relief, drawn_rim, look_at, sky_of, tilt_of_horizon
 from fluidlift.types import (
-    BulkMotion,
     FluidKind,
     KindEvidence,
     MetricScale,
@@ -245,7 +244,9 @@ def _seen(
     return seen, pictures
 
 
-def _motion_at_large(read: Read, flow: Flow, segmentation: Segmentation) -> tuple[np.ndarray, np.ndarray, BulkMotion]:
+def _motion_at_large(
+    read: Read, flow: Flow, segmentation: Segmentation
+) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
     """Mean motion over the clip with its confidence, and the bulk motion of fluid and ground in each pair of frames."""
     fluid = FluidMasks(segmentation.labels.labels)
     ever = fluid.any_frame()
@@ -297,8 +298,9 @@ class _Looked:
     mask: np.ndarray
     motion: np.ndarray
     trust: np.ndarray
-    bulk: BulkMotion | None
-    """of all of the fluid; None: a person said where it runs, so that it does not swing to and fro"""
+    bulk: tuple[np.ndarray, np.ndarray] | None
+    """mean motion of all of the fluid, and of the ground, in each pair of frames; None: a person said where it runs, so
+    that it does not swing to and fro"""
 
 
 def _kind_and_up(

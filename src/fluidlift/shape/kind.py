@@ -13,7 +13,7 @@ from fluidlift.messages import Notice
 from fluidlift.shape import chute, prism, slope
 from fluidlift.shape.open_water import recession
 from fluidlift.shape.view import PictureEvidence, habit_prior
-from fluidlift.types import BulkMotion, FluidKind, KindEvidence, PinholeCamera, RigidTransform, UpEvidence, kind_of
+from fluidlift.types import FluidKind, KindEvidence, PinholeCamera, RigidTransform, UpEvidence, kind_of
 from fluidlift.types.kind import KINDS as FLUID_KINDS
 from fluidlift.types.kind import STREAM
 
@@ -38,10 +38,6 @@ six pours 0 to 0.09 of the fluid is seen to fall so, of five falls and fountains
 RECEDES = (1.0, 1.5)
 """growth of the log of the wander over the picture's height (`open_water.recession`) from which a fluid may lie, and
 from which it does: six falls and fountains have -0.6 to 0.9, eleven of 16 streams, seas and brooks 1.0 to 3.3"""
-LASTS = (0.4, 0.7)
-"""share of the motion that lasts (`types.BulkMotion`) up to which water ripples and carries nothing, and
-from which it runs: of real clips of 2 s whose motion is clear 16 streams, falls and fountains have 0.79 to 0.98, two
-beaches 0.35 and 0.44, a boiling pot 0.24, a calm river under ripples 0.63"""
 FEWEST_PAIRS = 12
 """pairs of frames: half a second, in which a wave rises or falls"""
 SHAKE = 0.05
@@ -71,7 +67,7 @@ def estimate_kind(
     confidence: Float[np.ndarray, "h w"],
     *,
     pitch: float | None = None,
-    bulk: BulkMotion | None = None,
+    bulk: tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]] | None = None,
 ) -> KindEvidence:
     """Weigh direction of motion, shape of the mask and colour against what each kind looks like.
 
@@ -81,17 +77,16 @@ def estimate_kind(
         displacement: mean optical flow, px per frame.
         confidence: of the flow, 0 to 1.
         pitch: known tilt of the camera, degrees below the horizon, or None.
-        bulk: of the fluid in each of many pairs of frames, px per frame; None: nothing is known of how it changes.
+        bulk: mean motion of the whole fluid, and of the ground, in each of many pairs of frames, px per frame, nan
+            where it is not known (`motion.steady_flow.bulk_motion`); None: nothing is known of how it changes.
     """
     require(fluid.shape == frames.shape[:3], f"masks {fluid.shape} for frames {frames.shape}")
-    f = _features(frames, fluid, displacement, confidence)
-    f["swinging"] = 0.0 if bulk is None else swinging(bulk.fluid, bulk.ground)
-    f["rippling"] = 0.0 if bulk is None else rippling(bulk)
+    f = _features(frames, fluid, displacement, confidence) | {"swinging": 0.0 if bulk is None else swinging(*bulk)}
     # down in the picture is towards the viewer on what recedes from him; a jet that splashes at its foot does not
     f["falling"] *= 1.0 - f["receding"] * (1.0 - f["slender"])
     still = 1.0 - f["changing"]
     inside = f["enclosed"] * (1 - f["hanging"])  # what ends within the picture passes nothing on
-    staying = max(f["swinging"], inside * f["circling"], f["receding"] * f["rippling"])
+    staying = max(f["swinging"], inside * f["circling"])
     belief = {
         # smoke rises from below, is grey, and its outline changes; it neither hangs from above nor fills the picture
         "plume": 2.6 * f["rising"]
@@ -239,16 +234,6 @@ def swinging(bulk: Float[np.ndarray, "n 2"], ground: Float[np.ndarray, "n 2"]) -
     What runs through passes every section with the same discharge. Waves carry nothing in the mean.
     """
     return min(_changing(bulk), _changing(bulk - np.where(np.isfinite(ground), ground, 0.0)))
-
-
-def rippling(bulk: BulkMotion) -> float:
-    """0 to 1: how far the motion of each place is to and fro, in water whose motion is clear.
-
-    Small waves cancel each other in the mean over all of the water, so that its bulk does not swing.
-    """
-    if len(bulk.fluid) < FEWEST_PAIRS or bulk.pace < CLEAR_PX:
-        return 0.0
-    return float(np.clip((LASTS[1] - bulk.lasting) / (LASTS[1] - LASTS[0]), 0.0, 1.0))
 
 
 def _changing(bulk: np.ndarray) -> float:

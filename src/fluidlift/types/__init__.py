@@ -27,7 +27,7 @@ from fluidlift.types.camera import PinholeCamera, ViewKey
 from fluidlift.types.clip import Label, PixelLabels, VideoClip
 from fluidlift.types.evidence import KindEvidence, MetricScale, SlopeEvidence, UpEvidence
 from fluidlift.types.filmed import Filmed, FilmedMotion
-from fluidlift.types.flow import BulkMotion, PixelFlow, SaidFlow, SurfaceMotion
+from fluidlift.types.flow import PixelFlow, SaidFlow, SurfaceMotion
 from fluidlift.types.gaussians import SH_C0, Gaussians, concatenate, decompose_covariances, sh_from_rgb
 from fluidlift.types.grid import CellType, FaceVelocity, Grid, triple
 from fluidlift.types.kind import KINDS, FluidKind, kind_of
@@ -41,7 +41,6 @@ __all__ = [
     "FORMAT_VERSION",
     "KINDS",
     "SH_C0",
-    "BulkMotion",
     "CellType",
     "Estimate",
     "FaceVelocity",

@@ -73,18 +73,3 @@ class SurfaceMotion:
             f"points {self.points.shape}, velocities {self.velocities.shape}, observed {self.observed.shape}",
             "[n,3], [n,3], [n]",
         )
-
-
-@dataclass(frozen=True)
-class BulkMotion:
-    """How all of a fluid moves, px per `clip.interval`."""
-
-    fluid: Float[np.ndarray, "n 2"]
-    """mean motion of the whole of it, in each of some pairs of frames; nan where nothing was measured"""
-    ground: Float[np.ndarray, "n 2"]
-    """the same of what is never fluid"""
-    pace: float = 0.0
-    """root mean square of the motion of a place against the ground, over all of the fluid and all pairs"""
-    lasting: float = 1.0
-    """the same of the mean motion of each place, over `pace`: 1 where the flow is steady, 0 where all of it goes to and
-    fro"""

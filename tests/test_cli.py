@@ -165,15 +165,8 @@ def test_a_body_that_is_lost_in_its_grid_is_rejected(stream_clip, out, capsys, h
     assert "no cell" in said and "shape.cells" in said
 
 
-@pytest.mark.parametrize(
-    ("options", "setting"),
-    [(["--max-frames", "5"], "read.max_frames"), (["--max-pixels=1000"], "read.max_pixels")],
-    ids=["frames", "pixels"],
-)
-def test_a_limit_is_named_by_its_setting_and_may_be_given_as_the_option_that_it_was(
-    stream_clip, out, capsys, hasty, options, setting
-):
-    assert f"--set {setting}=" in rejected(capsys, "make", stream_clip, "-o", out, *options, *hasty)
+def test_a_limit_is_named_by_its_setting_and_may_be_given_as_the_option_that_it_was(stream_clip, out, capsys, hasty):
+    assert "--set read.max_pixels=" in rejected(capsys, "make", stream_clip, "-o", out, "--max-pixels=1000", *hasty)
 
 
 @pytest.mark.parametrize(

@@ -80,7 +80,7 @@ def test_an_asset_of_a_long_clip_says_so(film, tmp_path, hasty):
     from fluidlift.cli import WITH_WARNINGS, main
 
     folder = tmp_path / "long.fluid"
-    assert main(["make", str(film), "-o", str(folder), "--size", "2", *hasty, "--set", "read.max_frames=12"]) == 4
+    assert main(["make", str(film), "-o", str(folder), "--size", "2", *hasty, "--max-frames", "12"]) == 4
     manifest = json.loads((folder / "manifest.json").read_text())
     assert manifest["provenance"]["config"]["read"]["duration"] == pytest.approx(12 / 25, abs=1e-3)
     assert "window-of-a-long-clip" in json.dumps(manifest) and WITH_WARNINGS == 4

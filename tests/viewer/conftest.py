@@ -162,6 +162,11 @@ class Visit:
         self.page.wait_for_timeout(1000 * after)
         self.page.evaluate("() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
 
+    def close_notices(self):
+        """Put away what the page's library lays over the scene: its note that the browser draws without a GPU."""
+        for close in self.page.locator(".mantine-Notification-closeButton").all():
+            close.click()
+
     def says(self, text):
         self.page.get_by_text(text).locator("visible=true").first.wait_for()
 

@@ -232,6 +232,7 @@ def test_an_obstacle_is_added_dragged_sized_let_float_and_removed(visit, viewer)
     pauses = itertools.chain((0.3, 0.6, 1.2), itertools.repeat(3.0))
 
     def drag():
+        visit.close_notices()
         viewer.stage.look_from_input(visit.client().camera)  # each drag beside the arrow turned the view
         visit.drawn(next(pauses))
         grasped = np.array(entry["position"]) + 0.6 * gizmo.scale * along

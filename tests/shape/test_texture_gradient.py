@@ -6,13 +6,7 @@ import pytest
 
 from fluidlift.shape.kind import estimate_up, level_camera
 from fluidlift.shape.slope import plane_axes
-from fluidlift.shape.texture_gradient import (
-    PATTERNLESS,
-    or_silent,
-    texture_evidence,
-    texture_patches,
-    weighed,
-)
+from fluidlift.shape.texture_gradient import PATTERNLESS, texture_evidence, texture_patches, weighed
 from fluidlift.shape.view import PictureEvidence
 from fluidlift.types import PinholeCamera, UpEvidence
 
@@ -150,14 +144,3 @@ def test_the_size_of_the_picture_changes_nothing():
     (a, b), (c, d) = found
     # pictures shrunk to the same size: the same windows but for a rounding of grey levels and of the mask's rim
     assert a - b == pytest.approx(c - d, rel=0.2, abs=1.0)
-
-
-def test_what_may_say_nothing_rules_no_plane_out():
-    """A likelihood that is 0 for the usual plane leaves it the share in which it would say nothing."""
-    habit, share = np.log([0.9, 0.1]), 0.1
-    log = or_silent(np.array([-1e4, 0.0]), habit, share) + habit
-    silent = 0.1  # the mean likelihood under the habit
-    np.testing.assert_allclose(np.exp(log), [0.9 * share * silent, 0.1 * (1.0 - share + share * silent)])
-    impossible = or_silent(np.array([-np.inf, 0.0, -3.0]), np.log([0.5, 0.25, 0.25]), share)
-    assert impossible[0] == -np.inf and np.isfinite(impossible[1:]).all()
-    assert (or_silent(np.full(2, -np.inf), habit, share) == -np.inf).all(), "no plane is seen"

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 from scipy.special import logsumexp
 
-from fluidlift.shape.texture_gradient import TexturePatches, or_silent, texture_evidence, weighed
+from fluidlift.shape.texture_gradient import TexturePatches, texture_evidence, weighed
 from fluidlift.shape.view import PictureEvidence
 from fluidlift.types import FluidKind, PinholeCamera, SlopeEvidence
 from fluidlift.types.kind import STREAM
@@ -48,10 +48,6 @@ BELIEF = 0.5
 """power that the evidence for the tilt is taken to: as it stands, the error of the pitch is 1.2 to 1.5 times what the
 posterior says on three sets of made streams (238, of which 58 with measured optical flow), so weighed 1.0 to 1.06
 times. The motion still draws the pitch up by some 4 degrees: no motion speaks against a steep view"""
-UNTOLD = 0.1
-"""prior share of streams whose motion says nothing of their plane (rapids with ledges, reflections, a camera that walks
-on), so that no plane is ruled out by it. Of 16 real streams and seas one that is filmed at 0 degrees, a torrent, moves
-from 50 to 29, a calm river from 10 to 8 (8 by its horizon), the others by less than 2; three made ones by 0.3"""
 ROLL = 2.5
 """degrees, standard deviation of how far people hold a camera off the level"""
 FREEDOM = np.array([0.08, 0.25, 0.6, 1.2])
@@ -178,12 +174,11 @@ def estimate_tilt(
     # the vanishing line of a plane that comes down towards the camera lies above the horizon
     rise = np.degrees(np.arctan(-np.tan(np.radians(slopes)) * np.sin(best[..., 1])))
     habit = picture.lying(kind, pitches, cameras, rise) + np.log(prior)
-    habit = habit - 0.5 * ((rolls / ROLL) ** 2)[None, :, None]
-    log = habit if patches is None else habit + or_silent(BELIEF * best[..., 0], habit, UNTOLD)
-    log = log + np.array([[picture.tilt(c) for c in row] for row in cameras])[..., None]
+    log = BELIEF * best[..., 0] + habit - 0.5 * ((rolls / ROLL) ** 2)[None, :, None]
+    log += np.array([[picture.tilt(c) for c in row] for row in cameras])[..., None]
     if picture.texture is not None and patches is not None:
         seen = _texture_evidence([row[1] for row in cameras], picture.texture, slopes, best[:, 1, :, 1])
-        log = log + weighed(seen, habit[:, 1])[:, None]
+        log += weighed(seen, habit[:, 1])[:, None]
     return tilt_posterior(pitches, rolls, logsumexp(log, axis=2), kind.usual_pitch)
 
 

@@ -128,25 +128,11 @@ def weighed(evidence: Float[np.ndarray, "..."], habit: Float[np.ndarray, "..."])
 
     Args:
         evidence: logarithms, for each plane.
-        habit: logarithms of the prior, for each plane.
+        habit: logarithms of the prior, for each plane: a pattern that says nothing is as likely under all of them.
     """
-    return or_silent(BELIEF * evidence, habit, PATTERNLESS)
-
-
-def or_silent(log: Float[np.ndarray, "..."], habit: Float[np.ndarray, "..."], share: float) -> Float[np.ndarray, "..."]:
-    """Log likelihood of what says nothing in a share of all cases: it is as likely under all planes then.
-
-    Args:
-        log: where it speaks, for each plane, but for a constant; minus infinity: that plane is impossible in any case.
-        habit: logarithms of the prior, for each plane.
-        share: 0 to 1.
-    """
-    possible = np.isfinite(log)
-    if not possible.any():
-        return log
-    log = log - log.max()
-    silent = logsumexp((log + habit)[possible]) - logsumexp(habit[possible])
-    return np.where(possible, np.logaddexp(log + np.log(1.0 - share), silent + np.log(share)), -np.inf)
+    log = BELIEF * (evidence - evidence.max())
+    silent = logsumexp(log + habit) - logsumexp(habit)
+    return np.logaddexp(log + np.log(1.0 - PATTERNLESS), silent + np.log(PATTERNLESS))
 
 
 def _shrunk(picture: np.ndarray, size: tuple[int, int]) -> np.ndarray:

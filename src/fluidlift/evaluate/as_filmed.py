@@ -202,9 +202,8 @@ def as_filmed(
         beyond = level(still, coverage[len(clip) :], places)
         beyond |= likeness(whole, statistics(later, still), places.fluid, places)
     notes = ("The fluid moves through the picture: after the end of the clip nothing is compared.",) if moves else ()
-    for key in ("current_error", "current_cosine") if not runs else ():
-        for figures_of in (value, floor, beyond) if beyond else (value, floor):
-            figures_of[key] = NONE
+    for known in () if runs else (value, floor, beyond):
+        known.update((key, NONE) for key in ("current_error", "current_cosine") if key in known)
     figures = tuple(_figures(value, floor, beyond, _no_current(_speed(whole, places.fluid), runs=runs)))
     return AsFilmed(length, len(later), figures, notes, tuple(_advice(figures, value, beyond)))
 

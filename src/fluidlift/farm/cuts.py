@@ -21,12 +21,8 @@ from fluidlift.io.hashes import digest
 
 FOUND = ".cuts.json"
 """suffix of a file beside the assets: where a clip is cut, so that it is looked through once"""
-SMALL = 128
-"""px, longer side of pictures that cuts are looked for in: their layouts are 32 x 18"""
 LEAST = 0.5
 """s; what is shorter is no shot to make: a flow is averaged over some ten frames, and titles flash by as fast"""
-MOST = 200_000
-"""frames: two hours at 25 per second, and 5 GB of small pictures"""
 
 
 @dataclass(frozen=True)
@@ -113,21 +109,16 @@ def cuts_of(
     Raises:
         InputRejected: a clip that cannot be used.
     """
-    from fluidlift.io.limits import ReadLimits
     from fluidlift.io.stage_cache import Scratch
-    from fluidlift.io.video import read_clip
+    from fluidlift.io.video import before_frame, look_through
     from fluidlift.motion.stabilize import GreyFrames, find_cuts
 
     with tempfile.TemporaryDirectory() as room:
-        read = read_clip(
-            clip, start=start or 0.0, duration=duration, max_size=SMALL, fps=fps,
-            limits=ReadLimits(max_frames=MOST), store=Scratch(room, "cuts"),
-        )  # fmt: skip
+        read = look_through(clip, Scratch(room, "cuts"), start=start or 0.0, duration=duration, fps=fps)
         times = read.times
         edges = find_cuts(GreyFrames(read.frames))
         end = float(times[-1] + read.interval)
-    # halfway between two frames, so that rounding of times takes none from one part to the other
-    between = [round(float(times[e - 1] + times[e]) / 2.0, 6) for e in edges]
+    between = [before_frame(times, e) for e in edges]
     begins = [start or 0.0, *between]
     last = None if duration is None else round((start or 0.0) + duration, 6)
     ends = [*between, last]

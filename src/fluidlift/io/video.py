@@ -40,7 +40,10 @@ from fluidlift.messages import Notice, as_plain
 from fluidlift.types import VideoClip
 from fluidlift.types.clip import is_variable
 
-__all__ = ["ClipInfo", "ReadLimits", "frame_times", "frames_before", "probe", "read_clip", "write_video"]
+__all__ = [
+    "ClipInfo", "ReadLimits", "before_frame", "frame_times", "frames_before", "look_through", "probe", "read_clip",
+    "write_video",
+]  # fmt: skip
 
 
 def read_clip(
@@ -254,6 +257,40 @@ def probe(path: Path | str, *, fps: float | None = None, limits: ReadLimits | No
         warnings=tuple(notes.lines),
         **info,
     )
+
+
+LOOKED_AT = 128
+"""px, longer side of the pictures that a clip is looked through in: layouts (`motion.stabilize`) are 32 x 18"""
+MOST_LOOKED_AT = 200_000
+"""frames: two hours at 25 per second, and 5 GB of small pictures"""
+
+
+def look_through(
+    path: Path | str, store: FrameStore, *, start: float = 0.0, duration: float | None = None,
+    fps: float | None = None, max_pixels: int = ReadLimits.max_pixels,
+) -> VideoClip:  # fmt: skip
+    """All of a clip, however long, in small pictures that lie in a file.
+
+    Args:
+        path: as in `read_clip`.
+        store: where they lie.
+        start: s into the clip.
+        duration: s; None: to the end.
+        fps: frames per second of pictures; not looked at for a video.
+        max_pixels: largest picture accepted, px.
+
+    Raises:
+        InputRejected: as in `read_clip`.
+    """
+    return read_clip(
+        path, start=start, duration=duration, max_size=LOOKED_AT, fps=fps if is_sequence(path) else None,
+        limits=ReadLimits(max_pixels=max_pixels, max_frames=MOST_LOOKED_AT), store=store,
+    )  # fmt: skip
+
+
+def before_frame(times: np.ndarray, number: int) -> float:
+    """s halfway between a frame (not the first) and the one before, so that rounding of times takes it from no part."""
+    return round(float(times[number - 1] + times[number]) / 2.0, 6)
 
 
 def frames_before(path: Path | str, start: float, fps: float, limits: ReadLimits | None = None) -> int:

@@ -21,14 +21,10 @@ from fluidlift.pipeline.settings import BESIDE
 from fluidlift.pipeline.work import Work
 from fluidlift.types.stages import Window
 
-SMALL = 128
-"""px, longer side of the pictures that are looked through"""
 LAYOUT = (32, 18)
 """px, width and height of mean pictures, as in `motion.stabilize`"""
 PLACES = 8
 """at which a window may begin, per length of a window"""
-MOST = 200_000
-"""frames that are looked through: two hours at 25 per second, and 5 GB of small pictures"""
 LEAST_MOTION = 0.05
 """grey levels from frame to frame that are no motion: noise of a camera on a tripod is more"""
 LEVELS = 10.0
@@ -59,15 +55,12 @@ def window(clip: GivenFile, config: WindowSettings, *, work: Work) -> Window:
     Raises:
         InputRejected: a clip that cannot be used.
     """
-    from fluidlift.io.limits import ReadLimits
-    from fluidlift.io.sequences import is_sequence
-    from fluidlift.io.video import read_clip
+    from fluidlift.io.video import before_frame, look_through
     from fluidlift.motion.stabilize import GreyFrames, find_cuts
 
-    seen = read_clip(
-        clip.path, start=config.start, duration=config.duration, max_size=SMALL,
-        fps=config.fps if is_sequence(clip.path) else None,
-        limits=ReadLimits(max_pixels=config.max_pixels, max_frames=MOST), store=work.scratch,
+    seen = look_through(
+        clip.path, work.scratch, start=config.start, duration=config.duration, fps=config.fps,
+        max_pixels=config.max_pixels,
     )  # fmt: skip
     edges = (0, *find_cuts(GreyFrames(seen.frames)), len(seen))
     first, last = max(pairwise(edges), key=lambda shot: shot[1] - shot[0])
@@ -77,9 +70,8 @@ def window(clip: GivenFile, config: WindowSettings, *, work: Work) -> Window:
     begin, levels, motion = _nearest(seen.frames[first:last], length)
     begin += first
     times = np.append(seen.times, seen.times[-1] + seen.interval)
-    # halfway between two frames, so that rounding of times takes none from the window
-    start = config.start if begin == 0 else round(float(times[begin - 1] + times[begin]) / 2.0, 6)
-    end = round(float(times[begin + length - 1] + times[begin + length]) / 2.0, 6)
+    start = config.start if begin == 0 else before_frame(times, begin)
+    end = before_frame(times, begin + length)
     whole = "its longest shot" if len(edges) > 2 else "all"
     told = Notice(
         "window-of-a-long-clip",

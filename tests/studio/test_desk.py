@@ -92,6 +92,13 @@ def test_a_step_that_does_not_hold_changes_nothing(history, step):
     assert history.file.read_bytes() == before and history.hints.kind == "dam"
 
 
+def test_a_step_leaves_every_point_of_the_steps_before_as_it_is(history, tmp_path):
+    history.change({"add": "clicks", "item": {"at": [141.18269, 62.40001], "fluid": True}})
+    clicks = history.hints.clicks
+    history.change({"add": "flow", "item": {"at": [15.123, 15.123], "to": [15.123, 11.456]}})
+    assert history.hints.clicks == clicks == steps_of(tmp_path).hints.clicks
+
+
 def test_what_another_program_writes_is_taken_over(history):
     history.change({"set": "kind", "to": "dam"})
     history.file.write_text(history.file.read_text().replace("dam", "fall"))

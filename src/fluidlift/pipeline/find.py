@@ -24,10 +24,8 @@ from fluidlift.pipeline.sight import sighted
 from fluidlift.pipeline.stages.read import read
 from fluidlift.pipeline.work import Work
 from fluidlift.seams import Progress, Silence
-from fluidlift.shape.frame_pictures import typical_picture
 from fluidlift.shape.kind import level_camera
-from fluidlift.shape.view import horizon_line
-from fluidlift.shape.view.rims import find_rims
+from fluidlift.shape.view import Ellipse, horizon_line
 from fluidlift.types import KindEvidence, Label, MetricScale, PinholeCamera, UpEvidence
 from fluidlift.types.hints import NOTHING_SAID, ClipHints, ClipIdentity
 from fluidlift.types.stages import Flow, Read, Segmentation
@@ -66,6 +64,8 @@ class View:
     slope: float = 0.0
     """degrees that it falls along its way"""
     warnings: tuple[Notice, ...] = ()
+    rims: tuple[Ellipse, ...] = ()
+    """of vessels"""
 
 
 def view(
@@ -82,6 +82,7 @@ def view(
         seen.kind.name, seen.evidence, s.up, s.scale, s.sentence, s.canonical, seen.mask, np.asarray(seen.motion),
         np.asarray(seen.trust), seen.start, parts_of(s), lines_of(s), None if slope is None else slope.level_share,
         0.0 if slope is None else slope.slope, tuple(s.warnings),
+        seen.rims,
     )  # fmt: skip
 
 
@@ -117,7 +118,7 @@ class Found:
             "flow": [{"at": _px(a, k), "to": _px(b, k)} for a, b in arrows(g)],
             "rims": [
                 {"center": _px(r.center, k), "axes": _px(r.axes, k), "turned": round(_turned(r.covariance), 1)}
-                for r in find_rims(self._typical())
+                for r in g.rims
             ],
             "parts": [_part_data(part, k) for part in g.parts],
             "lines": [{"is": line.what, "line": [_px(p, k) for p in line.points]} for line in g.lines],
@@ -134,10 +135,6 @@ class Found:
     def scaling(self) -> float:
         """px of the clip's own picture per px of the working one."""
         return self.identity.size[0] / self.read.clip.size[0]
-
-    def _typical(self) -> np.ndarray:
-        frames = self.read.clip.frames
-        return typical_picture(frames[:: max(1, len(frames) // 8)]).astype(np.uint8)
 
     def lines(self) -> list[str]:
         """For people."""

@@ -33,7 +33,7 @@ from fluidlift.shape.framing import framing_warnings
 from fluidlift.shape.given_depth import DepthPictures
 from fluidlift.shape.kinds import Observation, builder_of
 from fluidlift.shape.rest_frames import FEWEST_PIXELS, rest_frame, united_range
-from fluidlift.shape.view import Ellipse, Skyline, as_relief, drawn_rim, look_at, sky_of, tilt_of_horizon
+from fluidlift.shape.view import Ellipse, Skyline, as_relief, drawn_rim, find_rims, look_at, sky_of, tilt_of_horizon
 from fluidlift.types import (
     FluidKind,
     KindEvidence,
@@ -80,6 +80,8 @@ class Sight:
     said_flow: SaidFlow | None = None
     """what a person says of the direction of the flow; `motion` holds it"""
     told: tuple[Notice, ...] = ()
+    rims: tuple[Ellipse, ...] = ()
+    """of vessels, as they were found"""
 
     @property
     def lying_trust(self) -> np.ndarray:
@@ -222,7 +224,10 @@ def _seen(
         motion, trust = said.mean(motion, trust)
     known, pose_given = known_camera(given, config.fov, clip.size)
     pictures, known = _depth_pictures(read, given, config.fov, known, start, work)
-    looked = _Looked(clip, fluid, mask, motion, trust, bulk if said is None else None)
+    pick = np.unique(np.linspace(0, len(clip) - 1, 8).astype(int))
+    typical = typical_picture(clip.frames[pick]).astype(np.uint8)
+    rims = work.remembered("rims", find_rims, typical)
+    looked = _Looked(clip, fluid, mask, motion, trust, bulk if said is None else None, pick, typical, rims)
     evidence, kind, parts, up, heading = _kind_and_up(
         looked, given, config, known, pose_given, shaped=pictures is not None
     )
@@ -239,7 +244,7 @@ def _seen(
     tilt_known = pose_given or config.pitch is not None or horizon
     seen = Sight(
         start, united, mask, motion, trust, known, pose_given, evidence, kind, parts, up, heading, tilt_known, height,
-        unsure, stood, config.kind == "auto", *((None, ()) if said is None else (said.flow, said.warnings)),
+        unsure, stood, config.kind == "auto", *((None, ()) if said is None else (said.flow, said.warnings)), rims,
     )  # fmt: skip
     return seen, pictures
 
@@ -301,6 +306,12 @@ class _Looked:
     bulk: tuple[np.ndarray, np.ndarray] | None
     """mean motion of all of the fluid, and of the ground, in each pair of frames; None: a person said where it runs, so
     that it does not swing to and fro"""
+    pick: np.ndarray
+    """frames that stand for the clip"""
+    typical: np.ndarray
+    """their picture"""
+    rims: tuple[Ellipse, ...]
+    """of vessels, in that picture"""
 
 
 def _kind_and_up(
@@ -311,8 +322,8 @@ def _kind_and_up(
     c, bodies = config, None if given.bodies is None else given.bodies.path
     surveyed, heading = registration.pose_up(known)
     pitch = float(surveyed.pitch) if pose_given else _said_of_view(c, known, mask.shape).pitch
-    pick = np.unique(np.linspace(0, len(clip) - 1, 8).astype(int))
-    evidence = kinds.estimate_kind(clip.frames[pick], fluid[pick], motion, trust, pitch=pitch, bulk=looked.bulk)
+    frames, shown = clip.frames[looked.pick], fluid[looked.pick]
+    evidence = kinds.estimate_kind(frames, shown, motion, trust, pitch=pitch, bulk=looked.bulk)
     kind = kind_of(evidence.kind if c.kind == "auto" else c.kind)
     if kind.starts_at_rest and (shaped or bodies is not None):
         if c.kind != "auto":
@@ -342,11 +353,10 @@ def _kind_and_up(
     texture = None
     if kind.runs_nearly_level and c.pitch is None and not parts.puddle:
         texture = texture_gradient.texture_patches(clip.frames, parts.lying & parts.gentle)
-    typical = typical_picture(clip.frames[pick]).astype(np.uint8)
     said = _said_of_view(c, known, mask.shape)
     picture = look_at(
-        kind, typical, fluid.any_frame(), parts.lying, texture, stays=parts.puddle,
-        drawn_sky=said.sky, drawn_rims=said.rims,
+        kind, looked.typical, fluid.any_frame(), parts.lying, texture, stays=parts.puddle,
+        drawn_sky=said.sky, rims=said.rims or looked.rims,
     )  # fmt: skip
     up = kinds.estimate_up(
         kind, parts.lying, motion, trust * parts.gentle, known, picture, given=(said.pitch, said.roll),

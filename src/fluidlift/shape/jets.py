@@ -146,8 +146,8 @@ def _robust_fit(terms, values, weight, start) -> tuple[np.ndarray, float, np.nda
     for _ in range(20):
         if (robust > 0).sum() < FEWEST:
             return found, np.inf, weight
-        root = np.sqrt(robust)[:, None]
-        found, *_ = np.linalg.lstsq(terms * root, values * root, rcond=None)
+        weighted = (terms * robust[:, None]).T  # normal equations: six columns and thousands of rows
+        found, *_ = np.linalg.lstsq(weighted @ terms, weighted @ values, rcond=None)
         rest = np.linalg.norm(values - terms @ found, axis=1)
         spread = float(np.median(rest)) / 1.17  # the median of the norm of two standard normal numbers
         robust = weight * np.square(1.0 - np.clip(rest / max(4.685 * spread, 1e-6), 0.0, 1.0) ** 2)

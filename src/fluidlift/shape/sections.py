@@ -155,7 +155,7 @@ def _evaluated(
     camera: PinholeCamera, patches: FlowPatches, chute: float, share: float, heading: float
 ) -> BrokenSlope | None:
     s = _ground_along(camera, patches, heading)
-    foot = float(np.quantile(s, share))
+    foot = slope.quantile(s, share)
     above = s < foot
     if abs(foot) > 1e3 or s.max() > 1e3 or min(above.sum(), (~above).sum()) < FEWEST:
         return None
@@ -175,7 +175,7 @@ def _columns(camera, patches, surface: tuple[float, float, float], above: np.nda
     facing = np.where(above, -parts[0][1] @ steep[2] / max(drop, 1e-9), -parts[1][1] @ level[2])
     if drop <= 0 or facing.min() <= facing.max() / slope.FARTHEST:
         return None
-    inverse = facing / np.median(facing)
+    inverse = facing / slope.quantile(facing, 0.5)
     along, across = (np.where(above[:, None], a, b) * inverse[:, None] for a, b in zip(parts[0][2:], parts[1][2:]))
     points = parts[0][1] / facing[:, None]
     s = points @ level[0]

@@ -321,8 +321,9 @@ def field_evidence(
         return -np.inf, np.zeros(len(usual))
     columns = columns * speed
     rest = motion - columns[..., 0]  # the prior mean is a uniform field
-    normal = np.einsum("nik,n,nij->kj", columns, weight, columns)
-    moment = np.einsum("nik,n,ni->k", columns, weight, rest)
+    flat = columns.reshape(-1, len(usual))
+    weighted = (np.repeat(weight, 2)[:, None] * flat).T
+    normal, moment = weighted @ flat, weighted @ rest.reshape(-1)
     energy = float((weight[:, None] * rest**2).sum())
     looks = 2.0 * weight.sum()
     size = max(float(np.average(np.linalg.norm(motion, axis=1), weights=patches.weight)), 1e-9)
@@ -336,10 +337,10 @@ def field_evidence(
     misfit = energy / noise[:, None] ** 2 - (right * found).sum(-1)
     log = -looks * np.log(noise)[:, None] - 0.5 * misfit - 0.5 * np.linalg.slogdet(scaled)[1]
     share = np.exp(log - log.max())
-    share /= share.sum()
-    field = np.einsum("ab,abk->k", share, spread[None] * found)
+    evidence = float(log.max() + np.log(share.mean()))
+    field = np.einsum("ab,abk->k", share / share.sum(), spread[None] * found)
     field[0] += 1.0
-    return float(logsumexp(log) - np.log(log.size)), field / max(abs(field[0]), 1e-9)
+    return evidence, field / max(abs(field[0]), 1e-9)
 
 
 def _robust_weights(at: np.ndarray, motion: np.ndarray, weight: np.ndarray) -> np.ndarray:
@@ -371,7 +372,7 @@ def _columns(camera: PinholeCamera, patches: FlowPatches, axes: np.ndarray) -> n
     if (facing <= 0).mean() > BEYOND:
         return None
     facing = np.maximum(facing, facing.max() / FARTHEST)
-    inverse = facing / np.median(facing)
+    inverse = facing / quantile(facing, 0.5)
     points = ray / inverse[:, None]
     l, c = to_unit(points @ axes[0]), to_unit(points @ axes[1])
     along, across = along * inverse[:, None], across * inverse[:, None]
@@ -396,11 +397,17 @@ def field_columns(
     fields = [one, c, c**2 - 1 / 3, c**3 - 0.6 * c, c**4 - 0.2, l, l * c, l**2 - 1 / 3]
     # a bend turns the whole profile: what is smooth is the direction, V_c / V_l
     speed = _downstream(patches.motion, along, across)
-    speed = np.clip(speed / max(float(np.median(speed)), 1e-12), 0.0, 3.0)
+    speed = np.clip(speed / max(quantile(speed, 0.5), 1e-12), 0.0, 3.0)
     turned = [speed * f for f in (one, c, l, l * c, l**2 - 1 / 3)]
     return np.stack([along * f[:, None] for f in fields] + [across * f[:, None] for f in turned], axis=-1)
 
 
+def quantile(values: np.ndarray, share: float) -> float:
+    """As `np.quantile`, which takes ten times as long for some hundred values; it is asked thousands of times."""
+    ordered = np.sort(values)
+    return float(np.interp(share * (len(ordered) - 1), np.arange(len(ordered)), ordered))
+
+
 def to_unit(values: np.ndarray) -> np.ndarray:
-    low, high = np.percentile(values, [2.0, 98.0])
+    low, high = quantile(values, 0.02), quantile(values, 0.98)
     return (values - 0.5 * (low + high)) / max(0.5 * (high - low), 1e-9)

@@ -142,7 +142,9 @@ class HintsHistory:
         hints = replace(hints, clip=self._identity)
         with disk_errors(self.file):
             write_hints(self.file, hints, self.found)
-        self.hints, self._written = hints, self.file.read_bytes()
+        # as the file has them: points are rounded there, and would do all work anew when they change with the next step
+        self.hints = replace(parse_hints(hints_data(hints), self.file.name), clip=self._identity)
+        self._written = self.file.read_bytes()
 
     def _save_steps(self) -> None:
         with disk_errors(self._steps):

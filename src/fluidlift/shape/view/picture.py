@@ -85,7 +85,7 @@ class PictureEvidence:
 def look_at(
     kind: FluidKind, picture: UInt8[np.ndarray, "h w 3"], ever: Bool[np.ndarray, "h w"],
     fluid: Bool[np.ndarray, "h w"], texture: TexturePatches | None = None, *, stays: bool = False,
-    drawn_sky: Skyline | None = None, drawn_rims: tuple[Ellipse, ...] = (),
+    drawn_sky: Skyline | None = None, rims: tuple[Ellipse, ...] | None = None,
 ) -> PictureEvidence:  # fmt: skip
     """Sky, plumb lines, rims, the shape of a pool and its waterline.
 
@@ -97,9 +97,9 @@ def look_at(
         texture: of that fluid.
         stays: it has no downstream: a puddle.
         drawn_sky: as a person marked it; it takes the place of what is found.
-        drawn_rims: likewise.
+        rims: of vessels, as a person drew them or as they were found before; None: they are looked for.
     """
-    sky, rims = drawn_sky or skyline(picture, ever), drawn_rims or find_rims(picture)
+    sky, rims = drawn_sky or skyline(picture, ever), find_rims(picture) if rims is None else rims
     lies = kind.nearly_level and bool(fluid.any())
     pool = round_pool(fluid) if lies else None
     if kind.fills_vessel:

@@ -107,8 +107,14 @@ def test_without_quiet_water_the_mask_is_the_same_array(seen):
 def test_rims_and_patches_are_no_pieces():
     rim = (ROWS >= 40) & (ROWS < 42)
     patch = (ROWS < 12) & (COLUMNS < 12)
-    assert not large_pieces(rim | patch).any()
-    assert large_pieces(rim | patch | QUIET)[QUIET].mean() > 0.95
+    assert not large_pieces(rim | patch, LIVELY).any()
+    assert large_pieces(rim | patch | QUIET, LIVELY)[QUIET].mean() > 0.95
+
+
+def test_a_piece_that_no_water_leads_to_is_not_added():
+    beyond = (ROWS >= 10) & (ROWS < 40)
+    assert not large_pieces(beyond, LIVELY).any()
+    assert not large_pieces(beyond, LIVELY | ((ROWS >= 40) & (COLUMNS < 4))).any()
 
 
 def test_a_bay_at_the_picture_s_edge_is_no_hole():

@@ -7,7 +7,7 @@ Each part is a process of its own with a time limit, so that one that fails or h
   transfer    benchmarks/warp_transfer.py: P2G, G2P and the particle half of a step, share of the memory's bandwidth
   liquid      benchmarks/warp_liquid.py: the whole substep, by part, the CPU beside it
   pressure    benchmarks/warp_poisson.py: pressure and viscosity, iterations, launches, share of the bandwidth
-  shown       a dam break of 500,000 particles simulated, taken to the host, deformed and drawn at 720p
+  shown       a dam break of 500,000 particles simulated, deformed and drawn at 720p; by way of the host, too
   rollout     the gradient of ten steps of the differentiable rollout: the CPU's kernels, and torch on the device
   fit         a twin fitted by both: seconds, and how far the parameters are apart
   splats      benchmarks/splatting.py with gsplat
@@ -23,7 +23,7 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -50,59 +50,127 @@ def median(run: Callable[[], object], repeats: int) -> float:
     return statistics.median(times)
 
 
-def shown(device: str, count: int = 500_000) -> Figures:
-    """Seconds of a frame of 1/30 s, by part."""
+class Shown:
+    """A dam break that is simulated on a device, and drawn from there or by way of the host.
+
+    Args:
+        device: "cuda", "cuda:1"... or "cpu", whose pictures our own rasteriser draws.
+        count: of its particles, about.
+    """
+
+    def __init__(self, device: str, count: int) -> None:
+        import numpy as np
+        import torch
+        from warp_liquid import dam
+
+        from fluidlift.backends.gsplat_rasterizer import GsplatRasterizer
+        from fluidlift.backends.warp_device import warp_device
+        from fluidlift.backends.warp_liquid import WarpLiquids
+        from fluidlift.errors import FluidliftError
+        from fluidlift.numerics.splatting import View
+        from fluidlift.numerics.splatting_torch import NumbaRasterizer
+        from fluidlift.physics.numba_particles import ParticleWork
+        from fluidlift.types import Gaussians
+
+        self.device, self._warp, self._rasterizer = device, warp_device(device), NumbaRasterizer()
+        self.not_drawn = ""
+        """why there are no pictures"""
+        if device != "cpu":
+            try:
+                self._rasterizer = GsplatRasterizer(device)
+            except FluidliftError as error:
+                self.not_drawn = str(error)
+        tank = dam(count)
+        self.count, h = len(tank.particles), tank.grid.spacing
+        rgb = np.random.default_rng(0).random((self.count, 3))
+        self.rest = Gaussians.isotropic(tank.particles.positions, 0.3 * h, rgb, 0.8)
+        looks = self.rest.opacities, self.rest.rgb.astype(np.float32)
+        self.looks = [torch.from_numpy(np.ascontiguousarray(a)).to(device) for a in looks]
+        low, high = tank.grid.low, tank.grid.high
+        away, turn = 1.5 * float((high - low).max()), np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
+        place = -turn @ (0.5 * (low + high) - [0.0, away, 0.0])
+        self.view = View(turn, place, (1000.0, 1000.0), (640.0, 360.0), (1280, 720))
+        self.simulator = tank.simulator(work=ParticleWork(liquid=WarpLiquids(device)))
+
+    def settled(self) -> None:
+        """Waits for the device."""
+        import warp as wp
+
+        wp.synchronize_device(self._warp)
+
+    def on_the_device(self) -> list[Any]:
+        """Operands of a rasteriser, by the kernel that works where the particles are."""
+        import torch
+
+        found = self.simulator.splats(self.rest)
+        assert found is not None
+        means, quats, scales, source = (
+            torch.from_dlpack(a) for a in (found.means, found.quats, found.scales, found.source)
+        )
+        opacities, rgb = self.looks
+        return [means, quats, scales, opacities[source], rgb[source]]
+
+    def drawn(self, operands: list[Any]) -> Any:
+        """The picture, complete."""
+        means, quats, scales, opacities, rgb = operands
+        image = self._rasterizer.splat(means, quats, scales, opacities, rgb, self.view).image
+        image.sum().item()
+        return image
+
+
+def shown(device: str, count: int | None = None) -> Iterator[Figures]:
+    """Seconds of a frame of 1/30 s, by part, drawn from where it is simulated; and what the way over the host takes.
+
+    Warp's CPU device has one thread: there are fewer particles on it.
+    """
     import numpy as np
     import torch
-    from warp_liquid import dam
 
-    from fluidlift.numerics.splatting import View
-    from fluidlift.numerics.splatting_torch import NumbaRasterizer
     from fluidlift.physics.deform import deform_gaussians
-    from fluidlift.scene.simulator import particle_work
-    from fluidlift.types import Gaussians, sh_from_rgb
 
-    on_gpu = device != "cpu"
-    if on_gpu:
-        from fluidlift.backends.gsplat_rasterizer import GsplatRasterizer
-    rasterizer = GsplatRasterizer(device) if on_gpu else NumbaRasterizer()
-    tank = dam(count)
-    n, h = len(tank.particles), tank.grid.spacing
-    rest = Gaussians(
-        tank.particles.positions, np.tile(np.float32([1, 0, 0, 0]), (n, 1)), np.full((n, 3), 0.3 * h, np.float32),
-        np.full(n, 0.8, np.float32), sh_from_rgb(np.random.default_rng(0).random((n, 3))),
-    )  # fmt: skip
-    middle, away = 0.5 * (tank.grid.low + tank.grid.high), 1.5 * float(np.ptp([tank.grid.low, tank.grid.high], 0).max())
-    turn = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
-    view = View(turn, -turn @ (middle - [0.0, away, 0.0]), (1000.0, 1000.0), (640.0, 360.0), (1280, 720))
-    simulator = tank.simulator(work=particle_work(device))
-    taken: dict[str, list[float]] = {"simulated": [], "taken to the host": [], "deformed": [], "drawn": []}
-    for frame in range(9):
-        marks = [time.perf_counter()]
-        simulator.advance(1 / 30)
-        marks.append(time.perf_counter())
-        particles = simulator.particles
-        marks.append(time.perf_counter())
-        body = deform_gaussians(rest, particles)
-        marks.append(time.perf_counter())
-        operands = [torch.from_numpy(np.ascontiguousarray(a, np.float32)).to(device) for a in
-                    (body.means, body.quats, body.scales, body.opacities, body.rgb)]  # fmt: skip
-        rasterizer.splat(*operands, view).image.sum().item()
-        marks.append(time.perf_counter())
-        for part, begin, end in zip(taken, marks, marks[1:]):
-            if frame > 3:  # what is compiled is there then, and the column falls
-                taken[part].append(end - begin)
-    found: Figures = {f"{n} particles, {part}: ms": 1e3 * statistics.median(times) for part, times in taken.items()}
-    found["frames per second"] = 1e3 / sum(v for v in found.values() if isinstance(v, float))
-    return found
+    scene = Shown(device, count or (500_000 if device != "cpu" else 20_000))
+    taken: dict[str, list[float]] = {}
+    apart = 0.0
+
+    def timed(part: str, work: Callable[..., Any], *operands: Any) -> Any:
+        begin = time.perf_counter()
+        out = work(*operands)
+        scene.settled()
+        taken.setdefault(part, []).append(time.perf_counter() - begin)
+        return out
+
+    def raised(body: Any) -> list[Any]:
+        arrays = body.means, body.quats, body.scales, body.opacities, body.rgb
+        return [torch.from_numpy(np.ascontiguousarray(a, np.float32)).to(device) for a in arrays]
+
+    for _ in range(9):
+        timed("simulated", scene.simulator.advance, 1 / 30)
+        operands = timed("deformed, on the device", scene.on_the_device)
+        image = None if scene.not_drawn else timed("drawn", scene.drawn, operands)
+        particles = timed("by way of the host: taken there", getattr, scene.simulator, "particles")
+        body = timed("by way of the host: deformed, on the CPU", deform_gaussians, scene.rest, particles)
+        operands = timed("by way of the host: taken back", raised, body)
+        if image is not None:
+            apart = max(apart, float((scene.drawn(operands) - image).abs().max()))
+    # what is compiled is there after some frames, and the column falls
+    milliseconds = {part: 1e3 * statistics.median(times[4:]) for part, times in taken.items()}
+    found: Figures = {f"{scene.count} particles, {part}: ms": value for part, value in milliseconds.items()}
+    if scene.not_drawn:
+        yield found | {"not drawn:": scene.not_drawn}
+        return
+    here = sum(milliseconds[part] for part in ("simulated", "deformed, on the device", "drawn"))
+    found["frames per second"] = 1e3 / here
+    found["frames per second, by way of the host"] = 1e3 / (
+        sum(milliseconds.values()) - milliseconds["deformed, on the device"]
+    )
+    found["pictures of both apart, of 1"] = apart
+    yield found
 
 
-def rollout(device: str, sizes: tuple[int, ...] = (32, 64, 96)) -> Figures:
+def rollout(device: str, sizes: tuple[int, ...] = (32, 48, 64, 96)) -> Iterator[Figures]:
     """Seconds of the gradient of ten steps, and how far the gradients are apart."""
-    found: Figures = {}
     for n in sizes:
-        found |= rollout_of(n, device)
-    return found
+        yield rollout_of(n, device)
 
 
 def rollout_of(n: int, device: str) -> Figures:
@@ -140,20 +208,20 @@ def rollout_of(n: int, device: str) -> Figures:
     return found
 
 
-def fit(device: str) -> Figures:
+def fit(device: str) -> Iterator[Figures]:
     """Seconds of a fit, and its parameters against those of the CPU's, in their standard deviations."""
     from fluidlift.fit.optimize import fit_parameters
     from fluidlift.synthetic.twins import make_twin
 
-    found: Figures = {}
     for scene, cells in (("river", (32, 16, 16)), ("honey", (48, 24, 24))):
         twin = make_twin(scene, seed=0, noise=0.1, cells=cells, frames=5)
+        found: Figures = {}
         ends = {}
         for name in ("cpu", device if device != "cpu" else "cpu:0"):
             begin = time.perf_counter()
             ends[name] = fit_parameters(
                 twin.frames, twin.cell_types, None, twin.grid, twin.interval, twin.start, mainstream=twin.mainstream,
-                steps_per_frame=twin.steps_per_frame, windows=1, start_rounds=1, device=name,
+                steps_per_frame=twin.steps_per_frame, windows=1, start_rounds=1, device=name, device_from=0,
                 free=("kinematic_viscosity", "inflow_velocity", "outflow_velocity"),
             )  # fmt: skip
             found[f"{scene} {cells}, {name}: s"] = time.perf_counter() - begin
@@ -164,10 +232,10 @@ def fit(device: str) -> Figures:
             if e.identifiable
         ]
         found[f"{scene} {cells}: largest difference, sigmas"] = max(apart)
-    return found
+        yield found
 
 
-PARTS: dict[str, Callable[[str], Figures]] = {"shown": shown, "rollout": rollout, "fit": fit}
+PARTS: dict[str, Callable[[str], Iterator[Figures]]] = {"shown": shown, "rollout": rollout, "fit": fit}
 
 
 def machine_of(device: str) -> str:
@@ -207,8 +275,9 @@ def main() -> None:
     parser.add_argument("--part", choices=list(PARTS), help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.part:
-        for name, value in PARTS[options.part](options.device).items():
-            print(f"{name} {value:.4g}" if isinstance(value, float) else f"{name} {value}", flush=True)
+        for found in PARTS[options.part](options.device):  # told at once: a part that is cut short has told something
+            for name, value in found.items():
+                print(f"{name} {value:.4g}" if isinstance(value, float) else f"{name} {value}", flush=True)
         return
     print(machine_of(options.device))
     found = {name: run_part(name, options.device, options.limit) for name in options.only}

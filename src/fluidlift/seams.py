@@ -296,6 +296,39 @@ class Stepped:
     viscosity: tuple[SolveReport, ...] = ()
 
 
+class DeviceArray(Protocol):
+    """An array that lies where a back end works; torch takes it without a copy (`torch.from_dlpack`)."""
+
+    def __dlpack__(self, *, stream: int | None = None) -> Any:
+        """See the Python array API standard."""
+        ...
+
+    def __dlpack_device__(self) -> tuple[Any, int]:
+        """See the Python array API standard."""
+        ...
+
+    def numpy(self) -> np.ndarray:
+        """For the host."""
+        ...
+
+
+@dataclass(frozen=True)
+class CarriedSplats:
+    """The Gaussians that particles carried at one instant (`physics.deform.deform_gaussians`), where the particles lie.
+
+    Opacities and colours are those of the rest Gaussians of `source`, which do not change.
+    """
+
+    means: DeviceArray
+    """float32 [n,3], m"""
+    quats: DeviceArray
+    """float32 [n,4], w x y z"""
+    scales: DeviceArray
+    """float32 [n,3], m"""
+    source: DeviceArray
+    """int64 [n]: the rest Gaussian of each"""
+
+
 class LiquidStepper(ABC):
     """A liquid whose particles and grid stay where its substeps are done, such as on a GPU.
 
@@ -314,6 +347,19 @@ class LiquidStepper(ABC):
     @abstractmethod
     def download(self, *, by_id: bool = False) -> Particles:
         """A copy of the particles, in their present order or in that of their ids."""
+
+    @abstractmethod
+    def splats(self, rest: Gaussians, *, max_stretch: float, max_size: float, by_id: bool = False) -> CarriedSplats:
+        """The Gaussians that the particles carry now, in arrays that outlive the present state.
+
+        Args:
+            rest: the undeformed Gaussians; not to be changed between calls.
+            max_stretch, max_size: see `physics.deform.deform_gaussians`.
+            by_id: in the order of the ids, or in the present one.
+
+        Raises:
+            ValueError: a particle whose source is no rest Gaussian.
+        """
 
     @abstractmethod
     def append(self, particles: Particles) -> None:

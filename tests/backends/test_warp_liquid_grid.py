@@ -203,7 +203,7 @@ def test_the_inlet_lacks_particles_where_it_does_on_the_host(state, bulk):
         np.testing.assert_allclose(inlet.jittered(found, np.random.default_rng(1)), expected, atol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["surface", "layout", "velocity", "sorting", "step", "inlet", "force"])
+@pytest.mark.parametrize("name", ["surface", "layout", "velocity", "sorting", "step", "inlet", "force", "splat"])
 def test_the_kernels_compile_for_a_gpu_that_is_not_here(name, tmp_path):
     module = importlib.import_module(f"fluidlift.backends.warp_{name}_kernels")
     paths = warp.compile_aot_module(module, arch=90, module_dir=tmp_path, use_ptx=True)

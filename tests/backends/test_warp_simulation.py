@@ -12,8 +12,14 @@ from small_scene import striped_channel
 from fluidlift.backends import warp_liquid, warp_particles
 from fluidlift.backends.warp_device import warp_device
 from fluidlift.errors import FluidliftError
+from fluidlift.io.frames import FIRST_FRAME
+from fluidlift.io.ply import read_gaussians
+from fluidlift.physics import deform
 from fluidlift.physics.guidance import BodyForce
+from fluidlift.pipeline.settings import SimulateSettings
+from fluidlift.pipeline.stages.simulate import simulate
 from fluidlift.scene.simulator import left_to_the_cpu, particle_work, simulator_of
+from fluidlift.scene.splat_files import frame_file
 from fluidlift.synthetic import tanks
 
 
@@ -81,3 +87,20 @@ def test_what_is_left_to_the_cpu_is_said(no_gpu_needed):
         (said,) = left_to_the_cpu(simulator_of(case, "cuda", forces), "cuda")
         assert said.code == "device-not-used" and word in said
         assert left_to_the_cpu(simulator_of(case, "cpu", forces), "cpu") == []
+
+
+def test_frames_are_written_with_splats_that_the_device_deformed(no_gpu_needed, monkeypatch, tmp_path):
+    scene, frames = striped_channel(3), []
+    for device in ("cpu", "cuda"):
+        if device == "cuda":
+            monkeypatch.setattr(deform, "_deform", None)  # nothing is left to the host
+        done = simulate(scene, SimulateSettings(10_000, device, 10), folder=tmp_path / device)
+        assert done.failed is None and done.frames == 3
+        frames.append(read_gaussians(frame_file(tmp_path / device, FIRST_FRAME + 2)))
+    one, other = frames
+    assert len(one) == len(other) > 300
+    h = scene.terrain.grid.spacing
+    # particles of both differ by up to 0.02 cells, and what they carry by a part of that
+    assert np.abs(one.means - other.means).max() < 0.02 * h
+    assert np.abs(one.covariances() - other.covariances()).max() < 0.02 * np.square(one.scales).max()
+    assert np.ptp(other.scales, axis=1).max() > 0.01 * other.scales.max()  # some are drawn out

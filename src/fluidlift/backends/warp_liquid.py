@@ -20,6 +20,7 @@ from fluidlift.backends.warp_liquid_grid import WarpOutlet, continue_velocity, d
 from fluidlift.backends.warp_particle_store import ParticleStore
 from fluidlift.backends.warp_projection import WarpProjection
 from fluidlift.backends.warp_region import WarpBox, WarpRegion
+from fluidlift.backends.warp_splats import WarpSplats
 from fluidlift.physics.active_region import Box, moved_to, region_of_extent
 from fluidlift.physics.boundaries import CLEARANCE
 from fluidlift.physics.device_liquid import DeviceLiquid, DeviceSetup
@@ -27,8 +28,8 @@ from fluidlift.physics.liquid_grid import STRONG
 from fluidlift.physics.position_correction import LARGEST_MOVE
 from fluidlift.physics.reseed import LIGHTEST_PARENT, SPLIT_DISTANCE
 from fluidlift.physics.viscosity import NEGLIGIBLE
-from fluidlift.seams import CONTACT, LiquidStepper, Stepped
-from fluidlift.types import Particles, SolveReport
+from fluidlift.seams import CONTACT, CarriedSplats, LiquidStepper, Stepped
+from fluidlift.types import Gaussians, Particles, SolveReport
 
 if TYPE_CHECKING:
     import warp
@@ -69,6 +70,7 @@ class WarpLiquid(LiquidStepper):
         levels, pull = setup.start_levels, max(-gravity[2], 0.0)
         self._outlet = None if levels is None else WarpOutlet(levels, pull, device)
         self._has_outlet = setup.start_levels is not None
+        self._splats: WarpSplats | None = None
         self._pressure: WarpProjection
         self._drag: WarpDrag | None = None
         self._box: Box | None = None
@@ -95,6 +97,13 @@ class WarpLiquid(LiquidStepper):
     def download(self, *, by_id: bool = False) -> Particles:
         """See `LiquidStepper`."""
         return self._store.download(by_id=by_id)
+
+    def splats(self, rest: Gaussians, *, max_stretch: float, max_size: float, by_id: bool = False) -> CarriedSplats:
+        """See `LiquidStepper`."""
+        if self._splats is None or self._splats.rest is not rest:
+            self._splats = WarpSplats(rest, self._device)
+        arrays = self._store.arrays(by_id=by_id)
+        return self._splats.carried(arrays, self._store.count, max_stretch=max_stretch, max_size=max_size)
 
     def append(self, particles: Particles) -> None:
         """See `LiquidStepper`."""

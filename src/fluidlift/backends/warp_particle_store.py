@@ -51,10 +51,14 @@ class ParticleStore:
 
     def download(self, *, by_id: bool = False) -> Particles:
         """A copy for the host, in the present order or in that of the ids."""
-        arrays = self._by_id() if by_id and self.count else self._now
+        arrays = self.arrays(by_id=by_id)
         found = [arrays[name][: self.count].numpy() for name in FIELDS]
         # on the CPU these are the arrays themselves
         return Particles(*(found if self._device.is_cuda else [values.copy() for values in found]))
+
+    def arrays(self, *, by_id: bool = False) -> dict[str, warp.array]:
+        """The present state by `FIELDS`, in the present order or, until the next step, in that of the ids."""
+        return self._by_id() if by_id and self.count else self._now
 
     def _by_id(self) -> dict[str, warp.array]:
         """The particles in the order of their ids, where the next state will be written: a host would take as long to

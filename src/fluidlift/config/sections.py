@@ -168,7 +168,7 @@ class FitConfig:
     max_seconds: float = 180.0
     """s, the last resort: what the clock ends is not reproducible"""
     device: str = "cpu"
-    """where the flow is rolled out: cpu, or cuda"""
+    """where the flow is rolled out: cpu, or cuda where that is faster"""
     method: Literal["lm", "adam"] = "lm"
     """Levenberg-Marquardt, or Adam as in the paper"""
     free: tuple[str, ...] = ()

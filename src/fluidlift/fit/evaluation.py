@@ -104,9 +104,10 @@ class Budget:
             used = max(self.rollouts / self.max_rollouts, self.work / self.max_work)
             self.progress(round(100 * min(used, 1.0)), 100)
 
-    def each(self, task: Callable[..., Any], *arguments: Sequence[Any]) -> list[Any]:
-        """The task for each set of arguments, side by side, results in order."""
-        if self.workers <= 1:
+    def each(self, problem: FitProblem, task: Callable[..., Any], *arguments: Sequence[Any]) -> list[Any]:
+        """The task for each set of arguments, side by side where the problem is rolled out on the CPU (a device is busy
+        with one rollout), results in order."""
+        if self.workers <= 1 or problem.placed:
             return [task(*a) for a in zip(*arguments)]
         with ThreadPoolExecutor(self.workers, initializer=_one_thread) as pool:
             return list(pool.map(task, *arguments))
@@ -170,7 +171,7 @@ def evaluate(
     guesses: Sequence[Sequence[np.ndarray]] | None = None,
 ) -> Evaluation:
     """Roll all windows out."""
-    rows = budget.each(lambda w: _rolled(problem, space, raw, w, guesses), list(range(len(problem.windows))))
+    rows = budget.each(problem, lambda w: _rolled(problem, space, raw, w, guesses), list(range(len(problem.windows))))
     budget.count(problem)
     found, potentials, reports = zip(*rows)
     return Evaluation(np.array(raw, float), list(found), list(potentials), sum(reports, ()))
@@ -186,7 +187,7 @@ def losses(
         return float(np.square(found, dtype=float).sum())
 
     n = len(problem.windows)
-    found = budget.each(one, [p for p in range(len(points)) for _ in range(n)], list(range(n)) * len(points))
+    found = budget.each(problem, one, [p for p in range(len(points)) for _ in range(n)], list(range(n)) * len(points))
     budget.count(problem, len(points))
     return [sum(found[p * n : (p + 1) * n]) for p in range(len(points))]
 
@@ -244,7 +245,7 @@ def jacobian(
         columns[w][p] = (there.ravel() - base.residuals[w].ravel()) / h[p]
 
     n = len(problem.windows)
-    budget.each(one, [p for p in range(len(h)) for _ in range(n)], list(range(n)) * len(h))
+    budget.each(problem, one, [p for p in range(len(h)) for _ in range(n)], list(range(n)) * len(h))
     budget.count(problem, len(h))
     for p in range(len(h)):
         # where the rollout breaks down there is no derivative to be had: the variable stays

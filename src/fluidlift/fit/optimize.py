@@ -156,8 +156,7 @@ def fit_parameters(
 
 
 def _budget(options: FitOptions, progress: Progress | None) -> Budget:
-    # a device is busy with one window
-    workers = 1 if options.device != "cpu" else options.workers or cores()
+    workers = options.workers or cores()
     return Budget(time.monotonic() + options.max_seconds, options.max_rollouts, options.max_work, workers, progress)
 
 
@@ -249,10 +248,26 @@ class _Fit:
         )
         return plan, space
 
+    def device(self, scene: FitScene, tell: bool) -> str:
+        """Where layouts of this size are rolled out fastest: the device that was asked for, or the CPU."""
+        asked, needed = self.options.device, self.options.device_from * self.budget.workers
+        if asked == "cpu":
+            return asked
+        cells = max(int(d.system.unknown.sum()) for d in {id(d): d for d in scene.domains}.values())
+        if cells >= needed:
+            return asked
+        if tell:
+            self.notes.append(
+                f"rolled out on the CPU: {cells} cells are too few for {asked}, which is faster than "
+                f"{self.budget.workers} threads from {needed} on"
+            )
+        return "cpu"
+
     def problem(self, scene: FitScene, plan: WindowPlan, space: ParameterSpace, tell: bool = True) -> FitProblem:
         """The windows, fewer where all of them are too much work for a handful of iterations."""
         o = self.options
-        problem = build_problem(scene, plan, weights=o.weights, options=o.options, compare=o.compare, device=o.device)
+        device = self.device(scene, tell)
+        problem = build_problem(scene, plan, weights=o.weights, options=o.options, compare=o.compare, device=device)
         columns, n = len(space.fitted) + 2, len(problem.windows)
         room = min(o.max_work / (problem.work / n), float(o.max_rollouts))
         affordable = max(int(room / (PLANNED_ITERATIONS * columns)), 1)

@@ -57,7 +57,7 @@ def corrected_starts(
         found = (begin + unit * move).detach()
         return found if bool(torch.isfinite(found).all()) else begin
 
-    starts = budget.each(one, list(range(len(problem.windows))))
+    starts = budget.each(problem, one, list(range(len(problem.windows))))
     budget.count(problem, (1 + BACKWARD) * float(np.mean(calls)))
     return problem.with_starts(starts)
 
@@ -95,7 +95,7 @@ def profile(
     """
     n = len(problem.windows)
     found = budget.each(
-        lambda i: _window_profile(problem, space, here.raw, i, slopes.columns[i], iterations), list(range(n))
+        problem, lambda i: _window_profile(problem, space, here.raw, i, slopes.columns[i], iterations), list(range(n))
     )
     budget.count(problem, len(here.raw) * iterations * (1 + BACKWARD))
     columns, moves = [f[0] for f in found], [f[1] for f in found]

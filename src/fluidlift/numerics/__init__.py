@@ -49,6 +49,7 @@ Modules of the face:
     splatting_torch         Differentiable Gaussian splatting in torch: the fast kernels of `splatting` as autograd
                             functions, and a plain twin
     srgb                    The sRGB curve (IEC 61966-2-1) between linear light and what pictures store
+    symmetric3              Axes of many symmetric 3x3 matrices at a time, for Numba kernels: cyclic Jacobi in lanes
     textures                Pictures on surfaces
     torch_multigrid         The Poisson equation on irregular domains on any torch device: multigrid-preconditioned
                             conjugate gradients
@@ -63,5 +64,6 @@ __all__ = [
     "multigrid", "multigrid_assembly", "multigrid_cycle", "nearest", "outline", "particle_mean", "poisson",
     "recurrent_stencil", "recurrent_stencil_fit", "sampling", "sharing", "short_axis", "signed_distance",
     "similarity2", "solid_mesh", "splatting", "splatting_colors", "splatting_colors_torch", "splatting_kernels",
-    "splatting_projection", "splatting_torch", "srgb", "textures", "torch_multigrid", "torch_poisson", "triangles",
+    "splatting_projection", "splatting_torch", "srgb", "symmetric3", "textures", "torch_multigrid", "torch_poisson",
+    "triangles",
 ]  # fmt: skip

@@ -38,6 +38,11 @@ class _Apart(Compiler):
         self.state.flags.noalias = True
 
 
+def apart(function: Callable[..., None]) -> Any:
+    """Decorator that compiles a part of a kernel whose arrays do not overlap, with divisions by zero as in C."""
+    return njit(cache=True, nogil=True, no_cfunc_wrapper=True, pipeline_class=_Apart, error_model="numpy")(function)
+
+
 class SharedLoop:
     """A compiled function whose first arguments are `begin` and `end`; it is called without them."""
 

@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from fluidlift.errors import FluidliftError, InputRejected
+from fluidlift.errors import FluidliftError, InputRejected, require
 from fluidlift.physics import transfer
 from fluidlift.physics.active_region import ActiveRegion
 from fluidlift.physics.advect_particles import displacements, leaving
@@ -36,8 +36,17 @@ from fluidlift.physics.stepping import (
     StepReport,
 )
 from fluidlift.physics.surface_tension import capillary_time_step
-from fluidlift.seams import LiquidStepper, MoveRules
-from fluidlift.types import CellType, FaceVelocity, FluidParameters, Grid, Particles, SolveReport, Terrain
+from fluidlift.seams import CarriedSplats, LiquidStepper, MoveRules
+from fluidlift.types import (
+    CellType,
+    FaceVelocity,
+    FluidParameters,
+    Gaussians,
+    Grid,
+    Particles,
+    SolveReport,
+    Terrain,
+)
 
 __all__ = ["EmitSource", "LiquidSimulator", "SimulationSettings", "StepReport"]
 
@@ -168,6 +177,33 @@ class LiquidSimulator(ParticleSimulator):
     def particles(self) -> Particles:
         """See `ParticleSimulator`."""
         return super().particles if self._stepper is None else self._stepper.download(by_id=True)
+
+    def splats(self, rest: Gaussians, *, max_stretch: float = 12.0, max_size: float = np.inf) -> CarriedSplats | None:
+        """The Gaussians that the particles carry now, in the order in which they are kept, where they lie; None: on the
+        host.
+
+        Args: see `deformed`.
+
+        Raises:
+            ValueError: a source outside the rest Gaussians.
+        """
+        if self._stepper is None:
+            return None
+        return self._stepper.splats(rest, max_stretch=max_stretch, max_size=max_size)
+
+    def deformed(
+        self, rest: Gaussians, particles: Particles, *, max_stretch: float = 12.0, max_size: float = np.inf
+    ) -> Gaussians:
+        """See `ParticleSimulator`."""
+        if self._stepper is None:
+            return super().deformed(rest, particles, max_stretch=max_stretch, max_size=max_size)
+        carried = self._stepper.splats(rest, max_stretch=max_stretch, max_size=max_size, by_id=True)
+        quats, scales = carried.quats.numpy(), carried.scales.numpy()
+        same = len(quats) == len(particles)
+        require(same, f"{len(particles)} particles", f"the {len(quats)} of the present state")
+        return Gaussians(
+            particles.positions, quats, scales, rest.opacities[particles.source], rest.sh[particles.source]
+        )
 
     @property
     def volume(self) -> float:

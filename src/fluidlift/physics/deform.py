@@ -8,6 +8,7 @@ from numba import njit
 
 from fluidlift.errors import require
 from fluidlift.numerics.sharing import X, Y, Z, shared
+from fluidlift.numerics.symmetric3 import LANES, axes_of, matrices
 from fluidlift.types import Gaussians, Particles
 
 CHUNK = 2048
@@ -171,73 +172,103 @@ def updated_deformation_plain(
 
 
 @njit(cache=True)
-def _axes(turn, sizes, out):
-    """R S of a splat, from its quaternion (w, x, y, z) and its standard deviations."""
+def _axes(turn, sizes):
+    """R S of a splat, row by row, from its quaternion (w, x, y, z) and its standard deviations."""
     w, x, y, z = np.float64(turn[0]), np.float64(turn[1]), np.float64(turn[2]), np.float64(turn[3])
     unit = max(w * w + x * x + y * y + z * z, 1e-24)
-    k = 2.0 / unit
-    out[0, 0], out[0, 1], out[0, 2] = 1.0 - k * (y * y + z * z), k * (x * y - w * z), k * (x * z + w * y)
-    out[1, 0], out[1, 1], out[1, 2] = k * (x * y + w * z), 1.0 - k * (x * x + z * z), k * (y * z - w * x)
-    out[2, 0], out[2, 1], out[2, 2] = k * (x * z - w * y), k * (y * z + w * x), 1.0 - k * (x * x + y * y)
-    for i in range(3):
-        for j in range(3):
-            out[i, j] *= sizes[j]
+    k, a, b, c = 2.0 / unit, sizes[0], sizes[1], sizes[2]
+    return (
+        (1.0 - k * (y * y + z * z)) * a, (k * (x * y - w * z)) * b, (k * (x * z + w * y)) * c,
+        (k * (x * y + w * z)) * a, (1.0 - k * (x * x + z * z)) * b, (k * (y * z - w * x)) * c,
+        (k * (x * z - w * y)) * a, (k * (y * z + w * x)) * b, (1.0 - k * (x * x + y * y)) * c,
+    )  # fmt: skip
 
 
-@shared(lambda f, *_: (0, len(f)))
+@njit(cache=True)
+def _moved(f, p, own):
+    """F R S of particle p, row by row."""
+    m00, m01, m02, m10, m11, m12, m20, m21, m22 = own
+    x0, x1, x2 = np.float64(f[p, 0, 0]), np.float64(f[p, 0, 1]), np.float64(f[p, 0, 2])
+    y0, y1, y2 = np.float64(f[p, 1, 0]), np.float64(f[p, 1, 1]), np.float64(f[p, 1, 2])
+    z0, z1, z2 = np.float64(f[p, 2, 0]), np.float64(f[p, 2, 1]), np.float64(f[p, 2, 2])
+    return (
+        x0 * m00 + x1 * m10 + x2 * m20, x0 * m01 + x1 * m11 + x2 * m21, x0 * m02 + x1 * m12 + x2 * m22,
+        y0 * m00 + y1 * m10 + y2 * m20, y0 * m01 + y1 * m11 + y2 * m21, y0 * m02 + y1 * m12 + y2 * m22,
+        z0 * m00 + z1 * m10 + z2 * m20, z0 * m01 + z1 * m11 + z2 * m21, z0 * m02 + z1 * m12 + z2 * m22,
+    )  # fmt: skip
+
+
+@njit(cache=True)
+def _squared(m):
+    """M M^T: xx, xy, xz, yy, yz, zz."""
+    x0, x1, x2, y0, y1, y2, z0, z1, z2 = m
+    return (
+        x0 * x0 + x1 * x1 + x2 * x2, x0 * y0 + x1 * y1 + x2 * y2, x0 * z0 + x1 * z1 + x2 * z2,
+        y0 * y0 + y1 * y1 + y2 * y2, y0 * z0 + y1 * z1 + y2 * z2, z0 * z0 + z1 * z1 + z2 * z2,
+    )  # fmt: skip
+
+
+@njit(cache=True)
+def _finite(a):
+    """Whether all six numbers are."""
+    return (
+        np.isfinite(a[0]) and np.isfinite(a[1]) and np.isfinite(a[2])
+        and np.isfinite(a[3]) and np.isfinite(a[4]) and np.isfinite(a[5])
+    )  # fmt: skip
+
+
+@njit(cache=True)
+def _quaternion(v, n):
+    """w, x, y, z of the rotation in lane n; the largest of the four squared components is safe to divide by."""
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = v[0][n], v[1][n], v[2][n], v[3][n], v[4][n], v[5][n], v[6][n], v[7][n], v[8][n]
+    d = xx + yy + zz
+    if d >= xx and d >= yy and d >= zz:
+        w = np.sqrt(max(1.0 + d, 0.0)) / 2.0
+        return w, (zy - yz) / (4 * w), (xz - zx) / (4 * w), (yx - xy) / (4 * w)
+    if xx >= yy and xx >= zz:
+        x = np.sqrt(max(1.0 + xx - yy - zz, 0.0)) / 2.0
+        return (zy - yz) / (4 * x), x, (yx + xy) / (4 * x), (xz + zx) / (4 * x)
+    if yy >= zz:
+        y = np.sqrt(max(1.0 - xx + yy - zz, 0.0)) / 2.0
+        return (xz - zx) / (4 * y), (yx + xy) / (4 * y), y, (zy + yz) / (4 * y)
+    z = np.sqrt(max(1.0 - xx - yy + zz, 0.0)) / 2.0
+    return (yx - xy) / (4 * z), (xz + zx) / (4 * z), (zy + yz) / (4 * z), z
+
+
+@shared(lambda f, *_: (0, (len(f) + LANES - 1) // LANES))
 def _deform(begin, end, f, source, turns, sizes, quats, scales, max_ratio, max_size):
-    """Axes and standard deviations of F A0 F^T = (F R S) (F R S)^T."""
-    m, a, v, own = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    for p in range(begin, end):
-        _axes(turns[source[p]], sizes[source[p]], own)
-        for i in range(3):
-            for j in range(3):
-                m[i, j] = np.float64(f[p, i, 0]) * own[0, j] + f[p, i, 1] * own[1, j] + f[p, i, 2] * own[2, j]
-        finite = True
-        for i in range(3):
-            for j in range(3):
-                a[i, j] = m[i, 0] * m[j, 0] + m[i, 1] * m[j, 1] + m[i, 2] * m[j, 2]
-                finite = finite and np.isfinite(a[i, j])
-        if not finite:
-            for i in range(3):
-                for j in range(3):
-                    a[i, j] = own[i, 0] * own[j, 0] + own[i, 1] * own[j, 1] + own[i, 2] * own[j, 2]
-        _eigen(a, v)
-        volume = 1.0
-        for e in range(3):
-            scales[p, e] = np.sqrt(max(a[e, e], 1e-18))
-            volume *= scales[p, e]
-        size = volume ** (1.0 / 3.0)
-        limit = max_ratio * size
-        needle = not finite
-        for e in range(3):
-            needle = needle or scales[p, e] > limit
-        for e in range(3):
-            if needle:
-                scales[p, e] = size
-            scales[p, e] = min(max(scales[p, e], 1e-3 * size), max_size)
-        d = v[0, 0] + v[1, 1] + v[2, 2]
-        if needle:
-            quats[p, 0], quats[p, 1], quats[p, 2], quats[p, 3] = 1.0, 0.0, 0.0, 0.0
-            continue
-        # the largest of the four squared components is safe to divide by
-        best, largest = 0, d
-        for e in range(3):
-            if v[e, e] > largest:
-                best, largest = e + 1, v[e, e]
-        if best == 0:
-            w = np.sqrt(max(1.0 + d, 0.0)) / 2.0
-            x, y, z = (v[2, 1] - v[1, 2]) / (4 * w), (v[0, 2] - v[2, 0]) / (4 * w), (v[1, 0] - v[0, 1]) / (4 * w)
-        elif best == 1:
-            x = np.sqrt(max(1.0 + v[0, 0] - v[1, 1] - v[2, 2], 0.0)) / 2.0
-            w, y, z = (v[2, 1] - v[1, 2]) / (4 * x), (v[1, 0] + v[0, 1]) / (4 * x), (v[0, 2] + v[2, 0]) / (4 * x)
-        elif best == 2:
-            y = np.sqrt(max(1.0 - v[0, 0] + v[1, 1] - v[2, 2], 0.0)) / 2.0
-            w, x, z = (v[0, 2] - v[2, 0]) / (4 * y), (v[1, 0] + v[0, 1]) / (4 * y), (v[2, 1] + v[1, 2]) / (4 * y)
-        else:
-            z = np.sqrt(max(1.0 - v[0, 0] - v[1, 1] + v[2, 2], 0.0)) / 2.0
-            w, x, y = (v[1, 0] - v[0, 1]) / (4 * z), (v[0, 2] + v[2, 0]) / (4 * z), (v[2, 1] + v[1, 2]) / (4 * z)
-        quats[p, 0], quats[p, 1], quats[p, 2], quats[p, 3] = w, x, y, z
+    """Axes and standard deviations of F A0 F^T = (F R S) (F R S)^T, `LANES` particles at a time."""
+    a, v, going, finite = matrices(), matrices(), np.empty(LANES, np.bool_), np.empty(LANES, np.bool_)
+    last = len(f) - 1
+    for group in range(begin, end):
+        first = group * LANES
+        for n in range(LANES):
+            p = min(first + n, last)  # lanes that are left over repeat the last one
+            own = _axes(turns[source[p]], sizes[source[p]])
+            square = _squared(_moved(f, p, own))
+            finite[n] = _finite(square)
+            if not finite[n]:
+                square = _squared(own)
+            a[0][n], a[4][n], a[8][n] = square[0], square[3], square[5]
+            a[1][n] = a[3][n] = square[1]
+            a[2][n] = a[6][n] = square[2]
+            a[5][n] = a[7][n] = square[4]
+        axes_of(a, v, going)
+        for n in range(min(LANES, last + 1 - first)):
+            p = first + n
+            x, y, z = np.sqrt(max(a[0][n], 1e-18)), np.sqrt(max(a[4][n], 1e-18)), np.sqrt(max(a[8][n], 1e-18))
+            x, y, z = np.float32(x), np.float32(y), np.float32(z)
+            size = (1.0 * x * y * z) ** (1.0 / 3.0)
+            limit, least = max_ratio * size, 1e-3 * size
+            turn = (1.0, 0.0, 0.0, 0.0)
+            if not finite[n] or x > limit or y > limit or z > limit:
+                x = y = z = np.float32(size)
+            else:
+                turn = _quaternion(v, n)
+            scales[p, 0], scales[p, 1], scales[p, 2] = (
+                min(max(x, least), max_size), min(max(y, least), max_size), min(max(z, least), max_size),
+            )  # fmt: skip
+            quats[p, 0], quats[p, 1], quats[p, 2], quats[p, 3] = turn
 
 
 def deformed_covariances(

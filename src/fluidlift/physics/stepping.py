@@ -18,13 +18,14 @@ from fluidlift.errors import FluidliftError, InputRejected, require
 from fluidlift.numerics.sampling import sample_centers
 from fluidlift.numerics.signed_distance import push_outside
 from fluidlift.physics import boundaries, transfer
+from fluidlift.physics.deform import deform_gaussians
 from fluidlift.physics.emitter import Emission, Supply
 from fluidlift.physics.inlet import Inlet
 from fluidlift.physics.no_bodies import NoBodies
 from fluidlift.physics.position_correction import cell_capacity
 from fluidlift.physics.rigid import RigidBodies
 from fluidlift.physics.surroundings import SimulationSettings, Surroundings
-from fluidlift.types import FaceVelocity, FluidParameters, Grid, Particles, SolveReport, Terrain
+from fluidlift.types import FaceVelocity, FluidParameters, Gaussians, Grid, Particles, SolveReport, Terrain
 
 TIDY_EVERY = 4
 """substeps between two tidyings: particles put in the order of their cells, thin and crowded cells reseeded"""
@@ -148,6 +149,21 @@ class ParticleSimulator(ABC):
     def _held(self) -> Particles:
         """The present state, in the order in which it is kept."""
         return self._particles
+
+    def deformed(
+        self, rest: Gaussians, particles: Particles, *, max_stretch: float = 12.0, max_size: float = np.inf
+    ) -> Gaussians:
+        """`deform.deform_gaussians`, done where the particles are.
+
+        Args:
+            rest: the undeformed Gaussians.
+            particles: as `particles` gave them, before the next `advance` where that may not be called by any thread.
+            max_stretch, max_size: see there.
+
+        Raises:
+            ValueError: a source outside the rest Gaussians.
+        """
+        return deform_gaussians(rest, particles, max_stretch=max_stretch, max_size=max_size)
 
     def state(self) -> dict[str, np.ndarray]:
         """All that changes from step to step, as plain arrays: a simulator built with the same arguments goes on from

@@ -144,7 +144,8 @@ def _write_frame(
     from fluidlift.io.ply import write_gaussians
 
     appearance.advance(p, k)
-    shown = appearance.dressed(p, k, simulator.bodies.inside if scene.obstacles else None)
+    inside = simulator.bodies.inside if scene.obstacles else None
+    shown = appearance.dressed(p, k, inside, simulator.deformed)
     write_gaussians(frame_file(folder, FIRST_FRAME + k), shown.gaussians, ids=shown.ids, velocities=shown.velocities)
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
@@ -92,6 +92,14 @@ would lie over the rocks beside them"""
 
 
 Inside = Callable[[np.ndarray], np.ndarray]
+
+
+class Deform(Protocol):
+    """`physics.deform.deform_gaussians`, or whoever does its work (`physics.stepping.ParticleSimulator.deformed`)."""
+
+    def __call__(self, rest: Gaussians, particles: Particles, *, max_stretch: float, max_size: float) -> Gaussians:
+        """See there."""
+        ...
 
 
 class Dressed(NamedTuple):
@@ -322,7 +330,9 @@ class SurfaceAppearance:
         self._patches.advance(self._surface, interval, rng)
         self._skin.advance(self._surface, interval, rng)
 
-    def dressed(self, particles: Particles, number: int, inside: Inside | None = None) -> Dressed:
+    def dressed(
+        self, particles: Particles, number: int, inside: Inside | None = None, deform: Deform | None = None
+    ) -> Dressed:
         """The splats of a frame to which `advance` has come. Ids of particles are even, those of the skin and of white
         water odd.
 
@@ -330,8 +340,9 @@ class SurfaceAppearance:
             particles: of the frame.
             number: of the frame, from 0.
             inside: (points [n,3]) -> whether they are in an obstacle, where there is no skin; None: no obstacles.
+            deform: who deforms the splats of the body at rest; None: `deform_gaussians`.
         """
-        bare = self._without_whitewater(particles, number, inside)
+        bare = self._without_whitewater(particles, number, inside, deform)
         white = None if self._whitewater is None or not number else self._whitewater.splats(inside)
         if white is None:
             return bare
@@ -341,12 +352,14 @@ class SurfaceAppearance:
             np.concatenate([bare.velocities, velocities]),
         )  # fmt: skip
 
-    def _without_whitewater(self, particles: Particles, number: int, inside: Inside | None) -> Dressed:
+    def _without_whitewater(
+        self, particles: Particles, number: int, inside: Inside | None, deform: Deform | None
+    ) -> Dressed:
         from fluidlift.look.mixing import mixed
         from fluidlift.physics.deform import deform_gaussians
 
-        scene = self._scene
-        shown = deform_gaussians(scene.rest, particles, max_stretch=MAX_STRETCH, max_size=LARGEST * self._cell)
+        scene, carry = self._scene, deform or deform_gaussians
+        shown = carry(scene.rest, particles, max_stretch=MAX_STRETCH, max_size=LARGEST * self._cell)
         if number:  # at rest nothing is drawn out
             shown = mixed(shown, particles.deformation, widest=MIXED * self._cell)
         shown = self._shaded(shown, particles.source)

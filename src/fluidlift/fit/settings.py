@@ -18,10 +18,11 @@ DEFAULT_FREE = tuple(FITTABLE)
 SCALES = ((1.0, 1.0), (0.05, 0.5), (20.0, 2.0), (0.2, 1.5), (5.0, 0.7))
 """factors of viscosity and of the velocities at the ends, of restarts"""
 
-DEVICE_FROM = 70_000
-"""unknown cells for each worker from which a device rolls out faster than the CPU. On an H100 ten steps and their
-gradient take 0.5 s for 2,000 cells and 0.8 s for 73,000, since thousands of launches wait for each other; one thread of
-the CPU beside it takes 0.02 s and 0.9 s, and each worker has a rollout of its own"""
+DEVICE_FROM = 100_000
+"""unknown cells for each worker from which a device rolls out faster than the CPU. Ten steps and their gradient take a
+GPU 0.5 to 0.8 s from 2,000 cells to 170,000, since thousands of launches wait for each other. One thread of the CPU
+beside it takes as long for 70,000 cells (beside an H100) and for 130,000 (beside an H200), and each worker has a
+rollout of its own"""
 
 
 def there(device: str) -> bool:

@@ -72,6 +72,15 @@ def test_the_kind_is_what_the_fluid_does(clip, kind):
     assert found.kind == kind, (found.scores, found.features)
 
 
+@pytest.mark.parametrize("rising", [0.7, 1.0])
+def test_what_hangs_from_above_is_no_pour_where_all_of_it_goes_up(rising):
+    """Steam that leaves the picture at its top; of a jet that moves by more than its pattern only a part seems to."""
+    frames, masks, displacement, trust = scene((np.abs(COL - 80) < 12) & (ROW < 55), (0.0, -3.0), (190, 130, 100))
+    displacement[ROW < 55 * (1.0 - rising)] *= -1.0
+    scores = estimate_kind(frames, masks, displacement, trust).scores
+    assert (scores["pour"] < scores["plume"]) == (rising == 1.0), scores
+
+
 def towards_the_viewer(near=4.0, far=0.2):
     """A curtain's outline and motion, with a pattern that moves by `far` px per frame at its top and `near` below."""
     frames, masks, *flow = curtain()

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from fluidlift.motion.mainstream import OBSERVED_CONFIDENCE
 from fluidlift.motion.multiframe import mean_flow
 from fluidlift.motion.temporal import (
-    TRUSTED,
     along_path,
     backward,
     forward,
@@ -86,7 +86,7 @@ def test_what_the_near_pairs_did_not_see_is_known_from_foam_that_passed_before()
     assert np.allclose(smooth[..., 0], 3.0, atol=0.02)
     # it tells far more than the near pairs do, and is no observation of this frame
     _, alone = smoothed_flow(PixelFlow(flow, confidence), 6, EVERYWHERE, along_paths=False)
-    assert (trust > 10 * alone).all() and (trust > 0.2).all() and (trust < TRUSTED).all()
+    assert (trust > 10 * alone).all() and (trust > 0.2).all() and (trust < OBSERVED_CONFIDENCE).all()
 
 
 def test_paths_that_leave_the_fluid_count_nothing() -> None:

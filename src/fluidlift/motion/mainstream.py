@@ -32,7 +32,8 @@ from fluidlift.motion.direction import checked_flow, gaussian_blur
 from fluidlift.motion.interpolation import depth_jump, diffusion_interpolation
 
 OBSERVED_CONFIDENCE = 0.4
-"""flow of at least this confidence is left alone"""
+"""Flow of at least this confidence is left alone. More than `types.flow.TRUSTED`: what was seen at other times alone
+has up to 0.39 (`temporal.OTHER_TIMES`) and is no observation of this frame. At 0.3 errors differ by up to 1 %"""
 ANISOTROPY = 4.0
 """Neighbours along the stream tell as much as those 4 times nearer across it. On seven simulated clips 2 to 8 give the
 same error within 4 %; 1 (no direction) is up to a quarter worse where hidden patches are filled."""

@@ -22,10 +22,10 @@ from fluidlift.motion.front import raised_flow
 from fluidlift.motion.lift import depth_change, lift_flow
 from fluidlift.motion.mainstream import complete_flow
 from fluidlift.motion.screen_divergence import project_screen_divergence, validated_reach
-from fluidlift.motion.steady_flow import TRUSTED
 from fluidlift.motion.temporal import smoothed_flow
 from fluidlift.motion.volume import VolumeReport, VolumeSolver
 from fluidlift.types import FaceVelocity, FluidKind, PinholeCamera, PixelFlow, SurfaceMotion, Terrain, kind_of
+from fluidlift.types.flow import TRUSTED
 
 FlowReader = Callable[[int, int], PixelFlow]
 """(first, last) -> the flow of the pairs first to last - 1"""

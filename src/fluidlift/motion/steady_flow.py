@@ -15,8 +15,6 @@ from fluidlift.types.clip import is_variable
 
 MOST_PAIRS = 600
 """of a clip from which its mean motion is taken, evenly spread where there are more"""
-TRUSTED = 0.3
-"""confidence from which flow counts as measured"""
 
 
 def spans_of(clip: VideoClip) -> np.ndarray:

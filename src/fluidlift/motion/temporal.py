@@ -27,12 +27,10 @@ from numba import njit
 
 from fluidlift.errors import require
 from fluidlift.motion.confidence import ROUND_TRIP_FLOOR, ROUND_TRIP_SHARE
+from fluidlift.motion.mainstream import OBSERVED_CONFIDENCE
 from fluidlift.motion.multiframe import EVIDENCE, LEAST_SPREAD, NO_TRUST, TRIM
 from fluidlift.types import PixelFlow
 
-TRUSTED = 0.4
-"""confidence from which the near pairs stand alone; at half of it and below the longer mean takes their place.
-It is the threshold of the mainstream (`mainstream.OBSERVED_CONFIDENCE`)."""
 OTHER_TIMES = 0.5
 """Trust in the longer mean over that in the near pairs. What was seen at other times is evidence for the filling, below
 the threshold of the mainstream, and no observation of this frame. 0.3 to 0.7 give the same error within 1 % on eight
@@ -74,10 +72,11 @@ def smoothed_flow(
     values, trust = fixed[:2]
     if along_paths and half_window > 0:
         values, trust = _joined(fixed, mean_of_samples(*listed(along_path(window, at, mask, half_window), rows, cols)))
-    failed = np.flatnonzero(trust < TRUSTED)
+    # those that the mainstream trusts stand alone; at half of its threshold and below the longer mean takes their place
+    failed = np.flatnonzero(trust < OBSERVED_CONFIDENCE)
     if along_paths and len(window) > len(near) and len(failed):
         long, long_trust, _ = mean_of_samples(*listed(window, rows[failed], cols[failed]))
-        share = np.clip(2.0 * trust[failed] / TRUSTED - 1.0, 0.0, 1.0)[:, None]
+        share = np.clip(2.0 * trust[failed] / OBSERVED_CONFIDENCE - 1.0, 0.0, 1.0)[:, None]
         values[failed] = share * values[failed] + (1.0 - share) * long
         trust[failed] = np.maximum(trust[failed], OTHER_TIMES * long_trust)
     mean, confidence = np.zeros((*mask.shape, 2), np.float32), np.zeros(mask.shape, np.float32)

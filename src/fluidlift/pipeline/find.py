@@ -27,14 +27,13 @@ from fluidlift.seams import Progress, Silence
 from fluidlift.shape.kind import level_camera
 from fluidlift.shape.view import Ellipse, horizon_line
 from fluidlift.types import KindEvidence, Label, MetricScale, PinholeCamera, UpEvidence
+from fluidlift.types.flow import TRUSTED
 from fluidlift.types.hints import NOTHING_SAID, ClipHints, ClipIdentity
 from fluidlift.types.stages import Flow, Read, Segmentation
 
 FIND_STAGES = ("read", "flow", "segment", "view")
 ARROWS = 9
 """along the longer side of the picture, of which those on the fluid are told"""
-LEAST_TRUST = 0.3
-"""of the mean flow at an arrow"""
 PATH_POINTS = 60
 """of the camera's path that are told"""
 STILL_PX = 1.0
@@ -261,7 +260,7 @@ def arrows(g: View) -> list[tuple[tuple[float, float], tuple[float, float]]]:
     for v in np.arange(0.5 * step, height, step):
         for u in np.arange(0.5 * step, width, step):
             part = np.s_[int(max(v - step / 2, 0)) : int(v + step / 2), int(max(u - step / 2, 0)) : int(u + step / 2)]
-            seen = g.mask[part] & (g.mean_confidence[part] > LEAST_TRUST)
+            seen = g.mask[part] & (g.mean_confidence[part] > TRUSTED)
             if seen.sum() < 0.1 * step * step:
                 continue
             rows, columns = np.nonzero(seen)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from fluidlift.motion.steady_flow import TRUSTED
 from fluidlift.types import Label, PixelFlow, PixelLabels
+from fluidlift.types.flow import TRUSTED
 from fluidlift.types.fluid_masks import parts_of
 
 

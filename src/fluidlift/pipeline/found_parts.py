@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from fluidlift.types import PinholeCamera, kind_of
+from fluidlift.types.flow import TRUSTED
 
 if TYPE_CHECKING:
     from fluidlift.pipeline.sight import Sighted
@@ -20,8 +21,6 @@ SMALLEST = 0.002
 """of the picture: pieces of a mask whose outline is told"""
 ALIKE = np.cos(np.radians(30.0))
 """of the angle between two motions that count as the same direction"""
-TRUSTED = 0.3
-"""confidence from which flow counts as measured"""
 TURNS, RINGS = 48, 16
 """points of a circle, and heights of a vessel, that are drawn"""
 STRETCHES = 12

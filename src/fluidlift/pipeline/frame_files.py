@@ -17,11 +17,12 @@ from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.io.limits import parse_json
 from fluidlift.io.output_files import cleared, numbered
 from fluidlift.messages import Notice, as_plain
-from fluidlift.motion.steady_flow import TRUSTED, spans_of
+from fluidlift.motion.steady_flow import spans_of
 from fluidlift.pipeline.inputs import Inputs
 from fluidlift.pipeline.mask_facts import MASK_FACTS, cleared_masks, require_unchanged, sealed
 from fluidlift.pipeline.volume_motion import FAST_FALL, plain_report
 from fluidlift.types import CellType, FaceVelocity, PixelFlow, SurfaceMotion, VideoClip
+from fluidlift.types.flow import TRUSTED
 from fluidlift.types.fluid_masks import FluidMasks
 from fluidlift.types.stages import Geometry
 

@@ -18,6 +18,7 @@ from fluidlift.io.images import read_camera, read_json
 from fluidlift.io.ply import read_gaussians
 from fluidlift.shape import external_body, registration, surface
 from fluidlift.types import FluidKind, Gaussians, PinholeCamera, Similarity3, UpEvidence, kind_of
+from fluidlift.types.kind import STEEPEST_STREAM
 from fluidlift.types.stages import Geometry
 
 NOTE = "generator.json"
@@ -59,9 +60,6 @@ def given_bodies(folder: Path, size: tuple[int, int], frames: list[int]) -> Seen
     return SeenBodies([read_gaussians(files[min(t, len(files) - 1)]) for t in frames], [camera] * len(frames))
 
 
-STEEPEST = 45.0
-"""degrees by which the sheet that a generator made of a stream may be tilted: what is steeper is a fall, or stands on
-edge because the generator took the camera for a level one"""
 FLAT = 0.5
 """thickness of a body over its width (standard deviations) from which it is no sheet, and says nothing"""
 GENERATOR_TRUST = 0.5
@@ -86,7 +84,8 @@ def up_of(
     if not note["knows_up"]:
         return None
     seen = given_bodies(folder, size, [start])
-    if kind_of(kind).nearly_level and tilt_of_sheet(seen.bodies[0]) > STEEPEST:
+    # a sheet that stands steeper was made by a generator that took the camera for a level one
+    if kind_of(kind).nearly_level and tilt_of_sheet(seen.bodies[0]) > STEEPEST_STREAM:
         return None
     return replace(registration.pose_up(seen.cameras[0])[0], source="generator", confidence=GENERATOR_TRUST)
 

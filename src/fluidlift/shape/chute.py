@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from fluidlift.shape import jets, slope
-from fluidlift.shape.heights import HeightModel
+from fluidlift.shape.heights import FARTHEST, HeightModel
 from fluidlift.types import PinholeCamera
 
 DOWN = np.cos(np.radians(75.0))
@@ -258,7 +258,7 @@ def _placed(camera, part, seen: np.ndarray, angles: tuple[float, float], level: 
     rays = camera.rays(uv)
     facing = -(rays @ axes[2])
     drop = -float(foot @ axes[2])
-    if drop <= 0 or facing.min() <= facing.max() / slope.FARTHEST:
+    if drop <= 0 or facing.min() <= facing.max() / FARTHEST:
         return None
     points = rays * (drop / facing)[:, None]
     ahead = np.array([np.cos(heading), np.sin(heading)])

@@ -20,8 +20,9 @@ from fluidlift.shape.heights import HeightModel, ProfileHeight
 from fluidlift.shape.plume import SIGHT
 from fluidlift.shape.surface import FrontSurface, inflated_surface, intersect_height
 from fluidlift.shape.view import Scene, habit_prior
+from fluidlift.shape.view.habit import ROLL
 from fluidlift.types import FluidKind, Grid, Label, PinholeCamera, SlopeEvidence, UpEvidence, kind_of
-from fluidlift.types.kind import STREAM
+from fluidlift.types.kind import STEEPEST_STREAM, STREAM
 
 SLOPES: tuple[tuple[float, float, float], ...] = ((0.7, 0.5, 2.0), (0.3, 0.0, 20.0))
 """share, mean and standard deviation (degrees, down is positive) of how streams slope: most are nearly level, films and
@@ -37,10 +38,6 @@ LEAN = 0.05
 """way back per height of a fall that stands upright: a height model knows one height over each point of the ground"""
 KNOTS = 12
 """of a profile along the stream: its pieces are about as long as a stream is wide"""
-USUAL_ROLL = 5.0
-"""degrees, standard deviation of how far people turn a camera about its axis"""
-STEEPEST = 60.0
-"""degrees: a stream that stands steeper in its depth does not belong to the camera's tilt"""
 
 
 @dataclass(frozen=True)
@@ -132,7 +129,7 @@ def up_from_depth(
         pitch, roll = float(np.degrees(-np.arcsin(np.clip(up[2], -1, 1)))), float(np.degrees(np.arctan2(up[0], -up[1])))
         pitches.append(pitch)
         rolls.append(roll)
-        belief.append(np.exp(habit_prior(STREAM, np.array([pitch]), Scene())[0] - 0.5 * (roll / USUAL_ROLL) ** 2))
+        belief.append(np.exp(habit_prior(STREAM, np.array([pitch]), Scene())[0] - 0.5 * (roll / ROLL) ** 2))
     weight = share * np.asarray(belief) + 1e-30
     best = float((angles * weight).sum() / weight.sum()) if flow is not None else 0.0
     k = int(np.argmin(np.abs(angles - best)))
@@ -199,7 +196,7 @@ def stream_surface(
     rotation = camera.camera_from_world.rotation
     normal = plane_normal(camera, scene.depth, mask) @ rotation
     tilt = float(np.degrees(np.arccos(np.clip(normal[2], -1.0, 1.0))))
-    if tilt > STEEPEST:
+    if tilt > STEEPEST_STREAM:
         raise InputRejected(
             f"a {scene.source} in which the stream stands {tilt:.0f} degrees steep",
             "depth of this view, and the camera's tilt that belongs to it",
@@ -307,7 +304,7 @@ def _profile(s, z, before, error, slopes) -> tuple[tuple[np.ndarray, np.ndarray]
 
 def _weighed(measured: float, error: float, slopes: tuple[tuple[float, float, float], ...]) -> float:
     """Mean of the slope (degrees) after the measurement. Water runs downhill."""
-    angles = np.arange(0.0, STEEPEST, 0.25)
+    angles = np.arange(0.0, STEEPEST_STREAM, 0.25)
     belief = _share_of(angles, slopes) * np.exp(-0.5 * np.square((angles - measured) / max(error, 0.1)))
     total = float(belief.sum())
     return float((angles * belief).sum() / total) if total > 1e-300 else max(measured, 0.0)

@@ -17,7 +17,9 @@ from jaxtyping import Bool, Float
 
 from fluidlift.errors import InputRejected
 from fluidlift.messages import Notice
+from fluidlift.shape.view.habit import ROLL
 from fluidlift.types import SaidFlow
+from fluidlift.types.flow import TRUSTED
 from fluidlift.types.hints import Arrow
 
 REACH = 0.25
@@ -37,10 +39,8 @@ KNOWN = 0.1
 LEAST_PX = 0.05
 """px per frame: the error of optical flow at its best (`slope.LEAST_NOISE`)"""
 AGAINST = 60.0
-"""degrees between an arrow and what was measured with `SURE` confidence around it, from which the user is told"""
-SURE = 0.3
-"""confidence from which a measured motion is one (`kind.RELIABLE`)"""
-PARALLEL = 5.0
+"""degrees between an arrow and what was measured with `TRUSTED` confidence around it, from which the user is told"""
+PARALLEL = 2.0 * ROLL
 """degrees between a level line and the horizon, at most: twice how far people hold a camera off the level"""
 OVERLAP = 0.03
 """of the picture's height that a stroke of sky may hang over the horizon"""
@@ -140,7 +140,7 @@ def _change_at(
     (dx, dy), (mx, my) = arrow.direction, total / np.linalg.norm(total)
     cosine, sine = dx * mx + dy * my, mx * dy - my * dx
     degrees = float(np.degrees(np.arctan2(abs(sine), cosine)))
-    return np.array([[cosine, -sine], [sine, cosine]]), degrees if sure > SURE else None
+    return np.array([[cosine, -sine], [sine, cosine]]), degrees if sure > TRUSTED else None
 
 
 def _likeness(way: np.ndarray, motion: np.ndarray, trust: np.ndarray) -> np.ndarray:
@@ -155,7 +155,7 @@ def _likeness(way: np.ndarray, motion: np.ndarray, trust: np.ndarray) -> np.ndar
 
 def _usual_speed(mask: np.ndarray, motion: np.ndarray, trust: np.ndarray) -> float:
     """px per frame: median of what was measured on the fluid; one where nothing was."""
-    known = mask & (trust > SURE)
+    known = mask & (trust > TRUSTED)
     speeds = np.linalg.norm(motion[known], axis=-1)
     return max(float(np.median(speeds)), LEAST_PX) if known.any() else 1.0
 

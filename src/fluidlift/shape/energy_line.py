@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from fluidlift.shape.slope import STEEPEST
+from fluidlift.types.kind import STEEPEST_STREAM
 
 MANNING = 0.035
 """s/m^(1/3), roughness of natural streams (Chow 1959, table 5-6: 0.03 clean and straight, 0.04 winding, 0.05 stony)"""
@@ -57,7 +57,7 @@ def energy_profile(
     pace = np.clip(fitted / usual, 0.3, 3.0)
     radius = np.maximum(HYDRAULIC * channel.depth_share * channel.width / pace, 1e-3)
     friction = np.square(MANNING * MEAN_OF_SURFACE * usual * pace) / radius ** (4.0 / 3.0)
-    friction = np.minimum(friction, np.tan(np.radians(STEEPEST)))
+    friction = np.minimum(friction, np.tan(np.radians(STEEPEST_STREAM)))
     step = np.diff(run)
     fall = gained + np.concatenate([[0.0], np.cumsum(0.5 * (friction[1:] + friction[:-1]) * step)])
     missing = np.sin(np.radians(channel.slope)) * (run[-1] - run[0]) - fall[-1]

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from fluidlift.errors import InputRejected, require
+from fluidlift.shape.heights import FARTHEST
 
 Holds = Literal["metres", "relative", "disparity"]
 """what a depth picture holds: metres; depth up to a factor; inverse depth up to a factor and an offset"""
@@ -28,8 +29,6 @@ INVERTED = -0.5
 """rank correlation with the depth that is expected, below which near and far are taken to be exchanged"""
 JUMP = 0.04
 """relative change of depth from pixel to pixel, beyond what a plane shows, that is an edge"""
-FARTHEST = 12.0
-"""a fluid's far end is at most this many times as far as its near end (that of `surface.FAR`)"""
 
 
 @dataclass(frozen=True)

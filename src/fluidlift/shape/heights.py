@@ -12,6 +12,9 @@ from fluidlift.numerics.nearest import nearest
 
 FOOT = 1.0
 """degrees: slope of what runs below a fall. A basin is level and a stream hardly steeper; more would empty either"""
+FARTHEST = 12.0
+"""ratio of the largest and the smallest depth that a fluid's surface is believed to have: what would be farther counts
+as that far, and hardly moves"""
 
 
 class HeightModel(ABC):

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
+from fluidlift.shape.view.habit import ROLL
 from fluidlift.types import PinholeCamera
 
 ALONG = np.cos(np.radians(25.0))
@@ -49,9 +50,8 @@ FEWEST = 40
 BLUR = 4.0
 """px over which flow passes from one motion to another"""
 TRUSTED = 0.1
-"""confidence of flow below which it is not looked at"""
-LEVEL_HABIT = 3.0
-"""degrees, standard deviation of the roll of cameras that people hold level"""
+"""confidence of flow below which it is not looked at. Jets are thin and fast: with the 0.3 that counts as measured
+elsewhere (`types.flow.TRUSTED`) the scale of a thread of honey changes 400-fold, that of a chute by a quarter"""
 BODY_SHARE, NECK_SHARE = 0.8, 0.25
 """of a puddle under threads: its share of the mask at least, and the width of the threads over its own at most. A
 vessel seen from the side is filled by a jet of a third of its width, and less of the mask is in it"""
@@ -337,14 +337,14 @@ def lying_pixels(mask: Bool[np.ndarray, "h w"], airborne: Bool[np.ndarray, "h w"
 
 def roll_of(outlines: list[Outline], camera: PinholeCamera) -> float:
     """Degrees clockwise by which the picture is turned, as far as jets say so against the habit of holding a camera
-    level (`LEVEL_HABIT`); weighted by how well an axis is known from an outline of its length and width.
+    level (`view.habit.ROLL`); weighted by how well an axis is known from an outline of its length and width.
 
     Args:
         outlines: of the jets.
         camera: without roll, tilted as it is believed to be.
     """
     down = projected_vertical(camera)
-    total, weight = 0.0, 1.0 / LEVEL_HABIT**2
+    total, weight = 0.0, 1.0 / ROLL**2
     for outline in outlines:
         axis = outline.centers[-1] - outline.centers[0]
         length = float(np.linalg.norm(axis))

@@ -13,7 +13,9 @@ from fluidlift.messages import Notice
 from fluidlift.shape import chute, prism, slope
 from fluidlift.shape.open_water import recession
 from fluidlift.shape.view import PictureEvidence, habit_prior
+from fluidlift.shape.view.habit import ROLL
 from fluidlift.types import FluidKind, KindEvidence, PinholeCamera, RigidTransform, UpEvidence, kind_of
+from fluidlift.types.flow import TRUSTED
 from fluidlift.types.kind import KINDS as FLUID_KINDS
 from fluidlift.types.kind import STREAM
 
@@ -27,8 +29,6 @@ written"""
 LEAST_SURE = 0.7
 """share of the belief below which a user is told what else it could be: of the same clips 10 are, 2 of the 4 wrong ones
 among them"""
-RELIABLE = 0.3
-"""confidence of flow from which a pixel's motion counts as followed (as speeds of the seen surface do)"""
 CLEAR_PX = 0.3
 """px per frame: six times the error of optical flow at its best (`slope.LEAST_NOISE`)"""
 FOLLOWED = 0.3
@@ -165,7 +165,7 @@ def _features(frames, fluid, displacement, confidence) -> dict[str, float]:
         return float(weight[np.abs((angle - centre + 180) % 360 - 180) < span].sum() / total)
 
     falling, rising = within(90, 40), within(-90, 50)
-    followed = union & (confidence > RELIABLE) & (speed > CLEAR_PX) & (np.abs(angle - 90) < 40)
+    followed = union & (confidence > TRUSTED) & (speed > CLEAR_PX) & (np.abs(angle - 90) < 40)
     # the shape of what moves: still water around a jet says nothing about the jet
     moving = union & (weight > 0.25 * np.percentile(weight[union], 95))
     moving = ndimage.binary_opening(moving) if ndimage.binary_opening(moving).any() else union
@@ -369,10 +369,10 @@ def _without_motion(kind, tilted, picture, lean) -> slope.TiltEvidence:
     """The posterior of pitch and roll from habit, the pictures, and the lean of what falls (degrees)."""
     if len(kind.pitch_habits) == 1 and lean is None and not picture.speaks:
         return slope.TiltEvidence(kind.pitch_prior[0], 0.0, kind.pitch_prior[1], 0.0)  # free of the grid's rounding
-    pitches, rolls = np.arange(-24.0, 89.0, 1.0), np.arange(-5.0, 5.01, 0.5) * slope.ROLL
-    log = habit_prior(kind, pitches, picture.scene)[:, None] - 0.5 * (rolls / slope.ROLL) ** 2
+    pitches, rolls = np.arange(-24.0, 89.0, 1.0), np.arange(-5.0, 5.01, 0.5) * ROLL
+    log = habit_prior(kind, pitches, picture.scene)[:, None] - 0.5 * (rolls / ROLL) ** 2
     if lean is not None:
-        log = log - 0.5 * ((rolls - lean) / slope.ROLL) ** 2
+        log = log - 0.5 * ((rolls - lean) / ROLL) ** 2
     if picture.speaks:
         known = rolls[::2]  # and between them
         seen = np.array([[picture.tilt(tilted(float(p), float(r))) for r in known] for p in pitches])

@@ -18,9 +18,8 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from fluidlift.shape.region import SMALLEST_SOLID
+from fluidlift.types.flow import TRUSTED
 
-TRUSTED = 0.3
-"""confidence from which flow counts as measured, as `motion.steady_flow`"""
 FALLING = 0.3
 """of the sheet's fast part (its 90th percentile): what is slower lies in a pool or comes over the rim"""
 MEASURED = 0.1

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from scipy.special import logsumexp
 
 from fluidlift.shape import slope
+from fluidlift.shape.heights import FARTHEST
 from fluidlift.shape.slope import FlowPatches
 from fluidlift.types import PinholeCamera
 
@@ -173,7 +174,7 @@ def _columns(camera, patches, surface: tuple[float, float, float], above: np.nda
     drop = np.cos(angle) - np.sin(angle) * foot  # of the chute's plane below the camera
     parts = [slope.basis(camera, patches.at, axes) for axes in (steep, level)]
     facing = np.where(above, -parts[0][1] @ steep[2] / max(drop, 1e-9), -parts[1][1] @ level[2])
-    if drop <= 0 or facing.min() <= facing.max() / slope.FARTHEST:
+    if drop <= 0 or facing.min() <= facing.max() / FARTHEST:
         return None
     inverse = facing / slope.quantile(facing, 0.5)
     along, across = (np.where(above[:, None], a, b) * inverse[:, None] for a, b in zip(parts[0][2:], parts[1][2:]))

@@ -18,10 +18,12 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 from scipy.special import logsumexp
 
+from fluidlift.shape.heights import FARTHEST
 from fluidlift.shape.texture_gradient import TexturePatches, texture_evidence, weighed
 from fluidlift.shape.view import PictureEvidence
+from fluidlift.shape.view.habit import ROLL
 from fluidlift.types import FluidKind, PinholeCamera, SlopeEvidence
-from fluidlift.types.kind import STREAM
+from fluidlift.types.kind import STEEPEST_STREAM, STREAM
 
 PATCHES = 160
 """pieces that the fluid's picture is cut into"""
@@ -31,13 +33,8 @@ Chosen with `USUAL` among 16 settings on 150 made streams with eddies; from 0.12
 changes (6.0 to 6.4 degrees there). On 150 others it is 6.2 (+- 0.8); 16 if all are taken as level"""
 FEWEST = 12
 """patches that a plane is read from"""
-FARTHEST = 12.0
-"""ratio of the largest and the smallest depth that a surface is believed to have: what would be farther counts as that
-far, and hardly moves"""
 BEYOND = 0.1
 """share of the patches that may lie above a plane's vanishing line (spray, errors of the mask) where it is possible"""
-STEEPEST = 50.0
-"""degrees; what is steeper is a fall"""
 LEVEL = 0.6
 """prior share of streams that are level within a degree or two (rivers, channels; the others are films and chutes)"""
 STEEP = 20.0
@@ -48,8 +45,6 @@ BELIEF = 0.5
 """power that the evidence for the tilt is taken to: as it stands, the error of the pitch is 1.2 to 1.5 times what the
 posterior says on three sets of made streams (238, of which 58 with measured optical flow), so weighed 1.0 to 1.06
 times. The motion still draws the pitch up by some 4 degrees: no motion speaks against a steep view"""
-ROLL = 2.5
-"""degrees, standard deviation of how far people hold a camera off the level"""
 FREEDOM = np.array([0.08, 0.25, 0.6, 1.2])
 """how far the field may be from uniform, as multiples of `USUAL`; each as likely"""
 NOISE = np.array([0.015, 0.03, 0.06, 0.12, 0.24])
@@ -129,7 +124,7 @@ def estimate_slope(
     """
     if patches is None:
         return SlopeEvidence(0.0, STEEP, 0.0, 1.0, 0.0, "prior: too little motion to tell")
-    slopes = np.arange(0.0, STEEPEST + 1.0, 2.0)
+    slopes = np.arange(0.0, STEEPEST_STREAM + 1.0, 2.0)
     log = np.array([heading_evidence(camera, patches, np.radians(s))[0] for s in slopes])
     if not np.isfinite(log).any():
         return SlopeEvidence(0.0, STEEP, 0.0, 1.0, 0.0, "prior: no plane is seen by the camera in all of it")

@@ -16,12 +16,17 @@ from fluidlift.errors import InputRejected, require
 from fluidlift.shape import chute, sections, slope
 from fluidlift.shape.energy_line import Channel, energy_profile
 from fluidlift.shape.filled_vessel import FilledVessel
-from fluidlift.shape.heights import FOOT, HeightModel, PlaneHeight, ProfileAlongHeight, ProfileHeight, SampledHeight
+from fluidlift.shape.heights import (
+    FARTHEST,
+    FOOT,
+    HeightModel,
+    PlaneHeight,
+    ProfileAlongHeight,
+    ProfileHeight,
+    SampledHeight,
+)
 from fluidlift.shape.plume import SIGHT, section_half_thickness
 from fluidlift.types import FluidKind, PinholeCamera, SlopeEvidence, kind_of
-
-FAR = 12.0
-"""no part of a surface is taken to be further away than this many times the nearest part"""
 
 
 @dataclass(frozen=True)
@@ -54,7 +59,7 @@ def level_surface(camera: PinholeCamera, mask: Bool[np.ndarray, "h w"]) -> Front
     down = -camera.rays(camera.pixel_grid())[..., 2]
     below = down[mask]
     require(len(below) > 0, "an empty mask")
-    visible = down > max(float(np.percentile(below, 99)) / FAR, 1e-3)
+    visible = down > max(float(np.percentile(below, 99)) / FARTHEST, 1e-3)
     if not (visible & mask).any():
         raise InputRejected(
             "the camera looks above the horizon at every fluid pixel",
@@ -140,7 +145,7 @@ def chutes_on_level(
         return None
     model = chute.ChuteHeight(level.height, tuple(found))
     near = 0.5 * float(level.depth[lying & (level.depth > 0)].min())
-    front = _from_height(camera, model, intersect_height(camera, model, near, FAR * 2.0 * near))
+    front = _from_height(camera, model, intersect_height(camera, model, near, FARTHEST * 2.0 * near))
     if not (front.depth[mask] > 0).mean() > 0.9:
         return None
     steepest, heading = max(c.slope for c in found), float(np.degrees(found[0].heading))
@@ -159,7 +164,7 @@ def _chute_above_pool(camera, mask, found: sections.SectionEvidence) -> FrontSur
     along, z = best.height((best.foot - 3.0 * usual, best.foot + 3.0 * usual))
     ahead = (float(np.cos(best.heading)), float(np.sin(best.heading)))
     model = ProfileAlongHeight(ahead, along, z)
-    depth = intersect_height(camera, model, 0.1 * usual, FAR * usual)
+    depth = intersect_height(camera, model, 0.1 * usual, FARTHEST * usual)
     if not (depth[mask] > 0).mean() > 0.98:
         return None
     scale = 1.0 / float(np.median(depth[mask & (depth > 0)]))
@@ -180,7 +185,7 @@ def _sloping_plane(camera: PinholeCamera, mask: np.ndarray, evidence: SlopeEvide
     """A plane at depth 1 in the median over the fluid."""
     axes = slope.plane_axes(np.radians(evidence.slope), np.radians(evidence.heading))
     facing = -camera.rays(camera.pixel_grid()) @ axes[2]
-    visible = facing > max(float(np.percentile(facing[mask], 99)) / FAR, 1e-3)
+    visible = facing > max(float(np.percentile(facing[mask], 99)) / FARTHEST, 1e-3)
     drop = float(np.median(facing[mask & visible]))
     normal = axes[2]
     plane = PlaneHeight((-normal[0] / normal[2], -normal[1] / normal[2]), -drop / normal[2])
@@ -208,7 +213,7 @@ def _with_energy(camera, mask, front, patches, evidence, camera_height, interval
     z = start - (fall - np.interp(middle, ground, fall)) / metres
     ahead = (float(np.cos(heading)), float(np.sin(heading)))
     profile = ProfileAlongHeight(ahead, ground, z)
-    bent = _from_height(camera, profile, intersect_height(camera, profile, 0.2, FAR))
+    bent = _from_height(camera, profile, intersect_height(camera, profile, 0.2, FARTHEST))
     if not (bent.depth[seen] > 0).mean() > 0.98:
         return front
     mean = float(np.degrees(np.arctan2(fall[-1] - fall[0], metres * (ground[-1] - ground[0]))))

@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 from scipy.special import logsumexp
 
+from fluidlift.shape.heights import FARTHEST
 from fluidlift.types import PinholeCamera
 
 WINDOW = 32
@@ -52,8 +53,6 @@ BELIEF, PATTERNLESS = 0.2, 0.5
 what the posterior says; from 0.1 to 0.3 and 0.4 to 0.7 it is 8.1 to 8.2 degrees. On 100 others it is 7.9; 8.7 by the
 motion alone on both. Without the second it is 9.6 and twice what the posterior says: a pattern that is not the same all
 over is sure of a wrong plane"""
-FARTHEST = 12.0
-"""ratio of the largest and the smallest depth that a plane is believed to have"""
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,9 @@ from jaxtyping import Bool, Float
 
 from fluidlift.errors import require
 
+TRUSTED = 0.3
+"""confidence from which the flow of a pixel counts as measured, wherever that is asked"""
+
 
 @dataclass(frozen=True)
 class PixelFlow:

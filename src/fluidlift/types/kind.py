@@ -17,6 +17,8 @@ STRAIGHT_DOWN = (88.0, 5.0)
 """the same of drones and cameras on a stand over a table: 85 and 88 in two clips"""
 STRAIGHT = 0.25
 """share of the latter (two of ten, one added to each)"""
+STEEPEST_STREAM = 50.0
+"""degrees; what is steeper is a fall, or something that was taken for a stream"""
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,8 @@ SKY_OVER, SKY_DOWN = 0.44, 0.1
 ROUND_OVER, ROUND_DOWN, ROUND_VESSEL = 0.06, 0.36, 0.7
 """share of each in which a round pool or the rim of a vessel is found (0 of 14; 3 of 9), and of those that look down on
 what falls into a vessel (3 of 4; 4 of 6 with one added)"""
+ROLL = 2.5
+"""degrees, standard deviation of how far people hold a camera off the level"""
 FAR_SHORE = (3.0, 1.1)
 """degrees, and standard deviation of its logarithm: how far below the horizon the farthest water of a landscape is.
 Half of all are between 1.4 and 6.3: a man (1.6 m) sees the far end of 15 to 65 m of water so. By hand, on 14 real

@@ -93,8 +93,8 @@ def estimate_kind(
     inside = f["enclosed"] * (1 - f["hanging"])  # what ends within the picture passes nothing on
     staying = max(f["swinging"], inside * f["circling"])
     belief = {
-        # smoke rises from below, is grey, and its outline changes; it neither hangs from above, unless all of it goes up
-        # there, nor fills the picture
+        # smoke rises from below, is grey, and its outline changes; it neither hangs from above (unless all of it goes
+        # up), nor fills the picture
         "plume": 2.6 * f["rising"]
         + 1.2 * f["grey"] * (0.3 + f["rising"])
         + 0.8 * f["changing"]

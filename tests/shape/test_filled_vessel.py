@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.ndimage import label
 
 from fluidlift.shape.filled_vessel import (
     FilledVessel,
@@ -148,6 +149,31 @@ def test_the_wall_stands_around_what_it_holds_and_moves_with_it():
         assert (vessel.wall(put(ring(r + 0.025)), thick) < 0).all() and not vessel.holds(put(ring(r + 0.025))).any()
         above = put(np.array([[glass.axis[0] + 0.27, glass.axis[1], glass.level + 0.4]]))
         assert (vessel.wall(above, thick) > 0).all()
+
+
+@pytest.mark.parametrize("narrow", [0.05, 0.15])
+def test_the_wall_has_no_gap_where_its_radius_jumps(narrow):
+    """Cells that are open inside and outside of a wall of 2.4 cells do not touch, not even by a corner."""
+    h, step = 0.02, 0.15
+    glass = FilledVessel((0.0, 0.0), np.array([0.0, step - 0.001, step + 0.001, 0.4]), np.array([0.2, 0.2, 1, 1]), 0.4)
+    glass.radii[2:] = 0.2 + narrow
+    axes = (np.arange(-0.5, 0.5, h), np.arange(-0.5, 0.5, h), np.arange(0.0, glass.rim, h))
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    open_cells = glass.wall(points, 2.4 * h) > 0
+    parts = label(open_cells, np.ones((3, 3, 3)))[0]
+    inside, outside = parts[len(axes[0]) // 2, len(axes[1]) // 2], parts[0, 0]
+    assert inside.all() and outside.all() and not set(inside) & set(outside)
+
+
+def test_a_ragged_surface_is_no_neck_of_what_is_filled_later():
+    camera = camera_at(12.0)
+    first, last = made(12.0, level=0.2), made(12.0, level=0.35)
+    early, late = silhouette(camera, first), silhouette(camera, last)
+    found = find_vessel(camera, early, AWAY)
+    assert found is not None
+    found.radii[found.heights > first.level - 0.06] *= 0.7
+    z = np.linspace(first.floor + 0.02, last.level - 0.02, 40)
+    np.testing.assert_allclose(seen_higher(found, camera, early | late).radius_at(z), 0.25, atol=0.02)
 
 
 def test_a_frayed_surface_does_not_close_the_glass_above_it():

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from fluidlift.types import PinholeCamera, Similarity3, triple
 
@@ -40,6 +41,8 @@ SMOOTH = 0.015
 """of the silhouette's height over which its outline is evened out: drops and notches of a mask"""
 TURNS, RADII = 17, 96
 """places along a quarter of a circle, and circles, that are tried at each height"""
+FINE = 1.0 / 64.0
+"""of a wall's thickness between the places of its outline that distances are measured to: a hundredth of it is lost"""
 ACROSS = 64
 """places along a ray that are looked at in the pool"""
 
@@ -92,17 +95,21 @@ class FilledVessel:
         return (away < self.radius_at(z)) & (z > self.floor) & (z < self.level)
 
     def wall(self, points: Float[np.ndarray, "*n 3"], thickness: float) -> Float[np.ndarray, "*n"]:
-        """Signed distance to its wall, negative within, of the first order: from the inside outwards, up to the rim.
+        """Signed distance to its wall, negative within: from the inside outwards, up to the rim.
 
         Args:
             points: world.
-            thickness: of the wall.
+            thickness: of the wall, as thick where it steps outwards as where it is upright.
         """
-        z = points[..., 2]
-        slope = np.gradient(self.radii, self.heights) if len(self.radii) > 1 else np.zeros(1)
-        lean = 1.0 / np.sqrt(1.0 + np.interp(z, self.heights, slope, left=0.0, right=0.0) ** 2)
-        away = np.hypot(points[..., 0] - self.axis[0], points[..., 1] - self.axis[1]) - self.radius_at(z)
-        return np.maximum(np.abs(lean * away - 0.5 * thickness) - 0.5 * thickness, z - self.rim)
+        z, r = points[..., 2], np.hypot(points[..., 0] - self.axis[0], points[..., 1] - self.axis[1])
+        heights = np.concatenate([[min(self.floor, float(z.min())) - thickness], self.heights, [self.rim + thickness]])
+        outline = np.stack([self.radius_at(heights), heights], axis=-1)
+        steps = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(outline, axis=0), axis=1))])
+        along = np.arange(0.0, steps[-1], FINE * thickness)
+        places = np.stack([np.interp(along, steps, column) for column in outline.T], axis=-1)
+        away = cKDTree(places).query(np.stack([r, z], axis=-1))[0]
+        away = np.where(r > self.radius_at(z), away, -away)
+        return np.maximum(np.abs(away - 0.5 * thickness) - 0.5 * thickness, z - self.rim)
 
     def transformed(self, t: Similarity3) -> FilledVessel:
         """As a similarity that keeps the vertical moves it."""
@@ -188,6 +195,9 @@ def behind_its_wall(
 def seen_higher(vessel: FilledVessel, camera: PinholeCamera, ever: Bool[np.ndarray, "h w"]) -> FilledVessel:
     """The vessel with its radii as high as the clip shows it filled.
 
+    Above the widest row of what it holds at first, that may narrow because the vessel does or because its surface is
+    ragged: where it was filled later, the wider of both is the vessel's.
+
     Args:
         vessel: as it was filled at the first instant.
         camera: in the same world.
@@ -197,7 +207,9 @@ def seen_higher(vessel: FilledVessel, camera: PinholeCamera, ever: Bool[np.ndarr
     if found is None:
         return vessel
     above = found.heights > vessel.level
-    heights, radii = (np.append(a, b[above]) for a, b in ((vessel.heights, found.heights), (vessel.radii, found.radii)))
+    ragged = (vessel.heights > vessel.heights[np.argmax(vessel.radii)]) & (vessel.heights < found.heights[-1])
+    first = np.where(ragged, np.maximum(vessel.radii, found.radius_at(vessel.heights)), vessel.radii)
+    heights, radii = (np.append(a, b[above]) for a, b in ((vessel.heights, found.heights), (first, found.radii)))
     return replace(vessel, heights=heights, radii=radii)
 
 

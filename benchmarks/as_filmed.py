@@ -3,6 +3,7 @@
     python benchmarks/as_filmed.py river.fluid honey.fluid
     python benchmarks/as_filmed.py --make river.mp4 honey.mp4 --work runs
     python benchmarks/as_filmed.py --make river.mp4 --work runs --held-out
+    python benchmarks/as_filmed.py --make clips/*/video.mp4 --seconds 1.2 --jobs 16 --limit 400 --thin
 
 Figures are those of `fluidlift evaluate ASSET` (docs/cli.md), each with the same figure between the halves of the clip
 in brackets and, after a comma, that of the frames after the clip's end. `--make` makes drafts and simulates them to
@@ -14,15 +15,25 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
+import shutil
 import subprocess
 import sys
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import cv2
+import numpy as np
 from report import table
 
 from fluidlift.evaluate.as_filmed import AsFilmed, Likeness
 from fluidlift.io.asset_folder import read_manifest
 from fluidlift.io.video import probe
+from fluidlift.machine import THREADS, cores
 from fluidlift.pipeline import card_against, card_of
 
 COLUMNS = {
@@ -36,23 +47,83 @@ WELL = (0, 4)
 """exit codes: done, done with warnings"""
 
 
-def fluidlift(*words: str) -> None:
-    """Run a command; stop where it fails."""
-    done = subprocess.run([sys.executable, "-m", "fluidlift.cli", *words], check=False)
+def fluidlift(*words: str, threads: int = 0) -> None:
+    """Run a command, on so many threads; stop where it fails."""
+    env = os.environ | dict.fromkeys(THREADS, str(threads)) if threads else None
+    done = subprocess.run([sys.executable, "-m", "fluidlift.cli", *words], check=False, env=env)
     if done.returncode not in WELL:
         raise SystemExit(f"fluidlift {' '.join(words)}: exit code {done.returncode}")
 
 
-def made(clip: Path, work: Path, held_out: bool) -> tuple[Path, float]:
-    """The asset of a clip, played to three times its length, and the seconds of the clip that it was made from."""
-    name = clip.parent.name if clip.stem == "video" else clip.stem
-    info = probe(clip)
-    seconds = info.duration * (2.0 / 3.0 if held_out else 1.0)
-    folder = work / f"{name}{'_held_out' * held_out}.fluid"
-    if not (folder / "manifest.json").is_file():
-        fluidlift("make", str(clip), "-o", str(folder), *(("--duration", f"{seconds:.4f}") if held_out else ()))
-        fluidlift("sim", str(folder), "--duration", f"{LENGTH * seconds:.4f}")
-    return folder, seconds
+@dataclass(frozen=True)
+class Way:
+    """How assets are made."""
+
+    work: Path
+    held_out: bool = False
+    seconds: float | None = None
+    """of each clip, from its middle; None: the whole"""
+    size: int | None = None
+    """px of the longer side; None: as the preset says"""
+    threads: int = 0
+    """of each; 0: as many as there are"""
+    thin: bool = False
+    end: float = float("inf")
+    """time.monotonic, s, after which nothing is begun"""
+
+    def part(self, clip: Path) -> tuple[float, float]:
+        """s: where what is taken of a clip begins, and how long it is."""
+        whole = probe(clip).duration
+        taken = min(self.seconds or whole, whole)
+        return 0.5 * (whole - taken), taken
+
+    def made(self, clip: Path, folder: Path) -> float:
+        """Make the asset and play it to three times its length; gives the s of the clip after what it was made from."""
+        start, taken = self.part(clip)
+        made = taken * (2.0 / 3.0 if self.held_out else 1.0)
+        if not (folder / "manifest.json").is_file():
+            part = ("--start", f"{start:.4f}", "--duration", f"{made:.4f}") if self.seconds or self.held_out else ()
+            size = ("--max-size", str(self.size)) if self.size else ()
+            fluidlift("make", str(clip), "-o", str(folder), *part, *size, threads=self.threads)
+            fluidlift("sim", str(folder), "--duration", f"{LENGTH * made:.4f}", threads=self.threads)
+        return start + made
+
+    def card(self, clip: Path) -> tuple[str, dict[str, Any] | None]:
+        """Name and card, as plain values, of one clip; no card where the time was over."""
+        name = (clip.parent.name if clip.stem == "video" else clip.stem) + "_held_out" * self.held_out
+        kept, folder = self.work / f"{name}.json", self.work / f"{name}.fluid"
+        if kept.is_file():
+            return name, json.loads(kept.read_text(encoding="utf-8"))
+        if time.monotonic() > self.end:
+            return name, None
+        began = time.monotonic()
+        try:
+            after = self.made(clip, folder)
+        except SystemExit as failure:
+            return name, {"none": str(failure)}
+        took = time.monotonic() - began
+        found = card_against(folder, clip, start=after) if self.held_out else card_of(read_manifest(folder))
+        plain = {"none": found} if isinstance(found, str) else found.to_dict()
+        plain |= {"took": round(took, 1), "kind": read_manifest(folder).get("kind")}
+        picture(folder / "preview.mp4", kept.with_suffix(".jpg"), 1.0 / LENGTH)
+        kept.write_text(json.dumps(plain, indent=1) + "\n", encoding="utf-8")
+        if self.thin:
+            shutil.rmtree(folder)
+        return name, plain
+
+
+def picture(film: Path, out: Path, filmed: float) -> None:
+    """The first, the last filmed and the last frame of a preview, one below the other."""
+    frames = list(_frames(film))
+    if frames:
+        shown = [frames[round(share * (len(frames) - 1))] for share in (0.0, filmed, 1.0)]
+        cv2.imwrite(str(out), np.vstack(shown), [cv2.IMWRITE_JPEG_QUALITY, 80])
+
+
+def _frames(film: Path) -> Iterator[np.ndarray[Any, Any]]:
+    reader = cv2.VideoCapture(str(film))
+    while (read := reader.read())[0]:
+        yield read[1]
 
 
 def text_of(figure: Likeness) -> str:
@@ -75,16 +146,25 @@ def main() -> None:
     parser.add_argument("--make", nargs="+", type=Path, default=[], metavar="CLIP", help="clips to make drafts of")
     parser.add_argument("--held-out", action="store_true", help="make from two thirds, hold against the last one")
     parser.add_argument("--work", type=Path, default=Path("runs"), help="folder for what is made")
+    parser.add_argument("--seconds", type=float, help="of each clip, from its middle")
+    parser.add_argument("--max-size", type=int, help="longer side, px")
+    parser.add_argument("--jobs", type=int, default=1, help="clips at once")
+    parser.add_argument("--limit", type=float, default=float("inf"), help="s, after which none is begun")
+    parser.add_argument("--thin", action="store_true", help="remove each asset when its card is written")
     parser.add_argument("--json", type=Path, help="file for the cards")
     a = parser.parse_args()
-    cards = {folder.stem: card_of(read_manifest(folder)) for folder in a.assets}
-    for clip in a.make:
-        a.work.mkdir(parents=True, exist_ok=True)
-        folder, seconds = made(clip, a.work, a.held_out)
-        cards[folder.stem] = card_against(folder, clip, start=seconds) if a.held_out else card_of(read_manifest(folder))
+    plain: dict[str, Any] = {}
+    for folder in a.assets:
+        card = card_of(read_manifest(folder))
+        plain[folder.stem] = {"none": card} if isinstance(card, str) else card.to_dict()
+    a.work.mkdir(parents=True, exist_ok=True)
+    threads = max(cores() // a.jobs, 1) if a.jobs > 1 else 0
+    way = Way(a.work, a.held_out, a.seconds, a.max_size, threads, a.thin, time.monotonic() + a.limit)
+    with ThreadPoolExecutor(a.jobs) as several:
+        plain |= {name: card for name, card in several.map(way.card, a.make) if card is not None}
+    cards = {name: c["none"] if "none" in c else AsFilmed.from_dict(c) for name, c in plain.items()}
     print("\n".join(table(["asset", "verdict", *COLUMNS.values()], [row(*item) for item in cards.items()])))
     if a.json:
-        plain = {name: {"none": c} if isinstance(c, str) else c.to_dict() for name, c in cards.items()}
         a.json.write_text(json.dumps(plain, indent=1) + "\n", encoding="utf-8")
 
 

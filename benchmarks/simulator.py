@@ -41,6 +41,8 @@ from peers.runner import (
     title,
 )
 
+from fluidlift.machine import cores
+
 
 def dam(cells: int, block: tuple[int, int, int], **more: Any) -> Scene:
     """A cubic box of 1 m."""
@@ -207,18 +209,17 @@ def memory_per_particle(bench: Bench) -> None:
 
 
 def threads(bench: Bench) -> None:
-    """One thread and two."""
+    """One thread, and twice as many as long as the machine has them."""
+    counts = [1 << k for k in range(cores().bit_length())]
     rows = []
     for cells, block in ((64, (25, 20, 25)), (128, (50, 25, 50))):
         scene = short_steps(dam(cells, block))
-        runs = bench.rounds_of({str(k): (lambda s=scene, k=k: bench.ours(s | {"threads": k})) for k in (1, 2)})
-        both = [runs["1"], runs["2"]]
-        rows.append([
-            title(scene), *(show(middle(r, "ms_step")) for r in both), ratio(*both, "ms_step"),
-            *(show(middle(r, "cpu_ms_step")) for r in both),
-        ])  # fmt: skip
-    columns = ["particles, box", "ms, one thread", "ms, two threads", "speed-up", "CPU ms, one", "CPU ms, two"]
-    bench.table("Threads", columns, rows)
+        runs = bench.rounds_of({str(k): (lambda s=scene, k=k: bench.ours(s | {"threads": k})) for k in counts})
+        for k in counts:
+            both = [runs["1"], runs[str(k)]]
+            rows.append([title(scene), str(k), show(middle(both[1], "ms_step")), ratio(*both, "ms_step"),
+                         show(middle(both[1], "cpu_ms_step"))])  # fmt: skip
+    bench.table("Threads", ["particles, box", "threads", "ms per step", "speed-up", "CPU ms per step"], rows)
 
 
 def box_size(bench: Bench) -> None:

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import av
 import av.container
@@ -26,6 +26,8 @@ CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,gif,mxf"
 files. Only containers that hold their own data are let in."""
 
 _WHITELIST = {"format_whitelist": CONTAINERS, "protocol_whitelist": "file"}
+_TOLERANT: dict[str, Any] = {"metadata_errors": "replace"} if int(av.__version__.split(".")[0]) < 19 else {}
+"""a title that is no UTF-8 is no reason to refuse a video (PyAV 19 has no such word any more)"""
 _ITU709, _UNSPECIFIED = 1, 2
 
 
@@ -55,7 +57,7 @@ def open_video(path: Path | str, limits: ReadLimits) -> Iterator[tuple[av.contai
     """
     path = require_file(path, "video")
     try:
-        container = av.open(str(path.resolve()), container_options=_WHITELIST, metadata_errors="replace")
+        container = av.open(str(path.resolve()), container_options=_WHITELIST, **_TOLERANT)
     except (av.error.FFmpegError, OSError):
         raise _not_a_video(path) from None
     with container:

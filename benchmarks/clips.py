@@ -128,12 +128,13 @@ def hand_mask_iou(asset: Path, mask: Path) -> float:
     """Intersection over union of the pixels that are fluid in most frames and a mask that a person drew."""
     import numpy as np
 
+    from fluidlift.evaluate import arrays_of_run
     from fluidlift.evaluate.images import mask_iou
+    from fluidlift.io.asset_folder import read_manifest
     from fluidlift.io.images import read_mask
     from fluidlift.types import Label
 
-    with np.load(asset / "work" / "evaluation.npz", allow_pickle=False) as arrays:
-        labels = arrays["labels"]
+    labels = arrays_of_run(asset, read_manifest(asset))["labels"]
     found = (labels == Label.FLUID).mean(axis=0) > 0.5
     drawn = read_mask(mask, (found.shape[1], found.shape[0]), len(labels))
     return float(np.mean(mask_iou(found[None], drawn[None])))

@@ -24,9 +24,9 @@ INTERVAL = 0.04
 
 
 def frames(folder: Path, count: int, splats: int) -> None:
-    """frames/splats/####.ply of a body that moves."""
+    """The frames of a body that moves."""
     from fluidlift.io.frames import FIRST_FRAME
-    from fluidlift.io.ply import write_gaussians
+    from fluidlift.scene.splat_files import write_frame
     from fluidlift.types import Gaussians, sh_from_rgb
 
     rng = np.random.default_rng(0)
@@ -46,14 +46,13 @@ def frames(folder: Path, count: int, splats: int) -> None:
         g = Gaussians(
             moved, turned, scales * (1 + 0.2 * np.sin(phase)[:, None]), np.full(splats, 0.8), sh_from_rgb(rgb)
         )
-        path = folder / "frames" / "splats" / f"{FIRST_FRAME + k:04d}.ply"
-        write_gaussians(path, g, ids=number, velocities=velocity)
+        write_frame(folder, FIRST_FRAME + k, g, ids=number, velocities=velocity)
 
 
 def asset(folder: Path, count: int, splats: int) -> None:
     """A finished asset with such frames."""
     from fluidlift.io.asset_folder import save_asset, update_manifest
-    from fluidlift.io.ply import read_gaussians
+    from fluidlift.scene.splat_files import frame_file, read_frame
     from fluidlift.types import (
         FaceVelocity,
         FluidAsset,
@@ -74,7 +73,7 @@ def asset(folder: Path, count: int, splats: int) -> None:
     corners = np.array([[-1, -0.5, 0], [1, -0.5, 0], [1, 0.5, 0], [-1, 0.5, 0]], np.float32)
     mesh = TriangleMesh(corners, np.array([[0, 1, 2], [0, 2, 3]]), np.full((4, 3), 0.5, np.float32))
     save_asset(folder, FluidAsset(
-        kind="stream", rest=read_gaussians(folder / "frames" / "splats" / "1001.ply"),
+        kind="stream", rest=read_frame(frame_file(folder, 1001)).gaussians,
         terrain=Terrain(grid, distance, np.array([1.0, 0, 0]), mesh), grid=grid,
         cell_types=np.ones(grid.shape, np.uint8), velocity=FaceVelocity.zeros(grid), parameters=FluidParameters(),
         estimates={}, camera=PinholeCamera.looking(np.array([0.0, -2.5, 1.2]), np.zeros(3), 50, (640, 360)),

@@ -29,10 +29,10 @@ from fluidlift.evaluate.as_filmed import WRONG
 from fluidlift.evaluate.images import mask_iou
 from fluidlift.io.asset_folder import read_manifest
 from fluidlift.io.hints_file import read_hints
+from fluidlift.io.kept_values import recalled
 from fluidlift.io.video import probe, read_clip
 from fluidlift.pipeline import Inputs, card_of
 from fluidlift.pipeline.find import Found, find_hints
-from fluidlift.scene.recall import recalled
 from fluidlift.shape.drawn import frame_at
 from fluidlift.shape.segment import overlay
 from fluidlift.types.clip import Label

@@ -23,11 +23,10 @@ import numpy as np
 from fluidlift.io.asset_folder import load_asset, read_manifest, save_asset
 from fluidlift.look.rasterize import render
 from fluidlift.pipeline import resimulate
-from fluidlift.present.looping import read_frame
 from fluidlift.scene import EditSession
 from fluidlift.scene.coarse_copy import coarser
 from fluidlift.scene.recall import footage_of_asset
-from fluidlift.scene.splat_files import frame_file
+from fluidlift.scene.splat_files import frame_file, read_frame
 
 PARTS = 8
 """along each side of the picture"""

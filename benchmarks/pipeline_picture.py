@@ -21,6 +21,7 @@ import numpy as np
 
 from fluidlift.io.asset_folder import load_asset
 from fluidlift.pipeline import RenderRequest, render_asset
+from fluidlift.scene.splat_files import frame_files
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -77,7 +78,7 @@ def compose(folder: Path, path: Path) -> None:
     """Two rows of three tiles, with arrows from each to the next."""
     figures = Figures.of(folder / "report.html")
     both = figures.named("Frame 0: the clip")
-    last = 1000 + len(list((folder / "frames" / "splats").glob("*.ply")))
+    last = 1000 + len(frame_files(folder))
     tiles = [
         both[:, : both.shape[1] // 2], figures.named("Frame 0: what is taken for fluid"), drawn(folder, 1001),
         figures.named("The same after averaging"), None, drawn(folder, last),

@@ -31,8 +31,8 @@ from pathlib import Path
 import numpy as np
 
 from fluidlift.io.asset_folder import update_manifest
-from fluidlift.io.ply import write_gaussians
 from fluidlift.pipeline.preview import Wish
+from fluidlift.scene.splat_files import write_frame
 from fluidlift.types import Gaussians
 from fluidlift.viewer.app import Viewer, ViewRequest
 
@@ -51,7 +51,6 @@ def resident() -> float:
 def synthetic(source: Path, out: Path, frames: int, splats: int) -> Path:
     """A copy of an asset with so many frames of so many splats."""
     shutil.copytree(source, out, ignore=shutil.ignore_patterns("work", "*.usda", "*.usdc", "splats", "preview.mp4"))
-    (out / "frames" / "splats").mkdir(parents=True)
     rng = np.random.default_rng(0)
     quats = rng.normal(size=(splats, 4))
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
@@ -59,8 +58,7 @@ def synthetic(source: Path, out: Path, frames: int, splats: int) -> Path:
     body = (quats, rng.uniform(0.003, 0.01, (splats, 3)), np.full(splats, 0.8), rng.normal(0, 0.5, (splats, 1, 3)))
     velocities = np.tile((0.5, 0.0, 0.0), (splats, 1))
     for k in range(frames):
-        path = out / "frames" / "splats" / f"{1001 + k}.ply"
-        write_gaussians(path, Gaussians(means + 0.01 * k, *body), ids=np.arange(splats), velocities=velocities)
+        write_frame(out, 1001 + k, Gaussians(means + 0.01 * k, *body), ids=np.arange(splats), velocities=velocities)
     update_manifest(out, simulation={"frames": frames})
     return out
 

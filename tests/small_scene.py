@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fluidlift.io.kept_values import kept_value
+from fluidlift.io.kept_values import OF_CLIP, kept_value
 from fluidlift.scene.build import Scene
-from fluidlift.scene.recall import OF_CLIP
 from fluidlift.types import (
     CellType,
     FaceVelocity,

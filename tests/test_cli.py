@@ -11,7 +11,8 @@ import yaml
 
 from fluidlift import __version__
 from fluidlift.cli import DONE, FAILED, REJECTED, USAGE, WITH_WARNINGS, main
-from fluidlift.io.asset_folder import load_asset
+from fluidlift.evaluate import arrays_of_run
+from fluidlift.io.asset_folder import load_asset, read_manifest
 from fluidlift.io.images import write_png
 from fluidlift.io.video import read_clip
 from fluidlift.messages import code_of
@@ -271,7 +272,7 @@ def test_a_simulation_with_too_many_particles_stops_and_says_so(stream_clip, tmp
     few = ("--set", "simulate.max_particles=100")
     code = main(["make", str(stream_clip), "-o", str(folder), "--size", "2", *hasty, *few])
     assert "stopped after 1 of 2 frames" in warnings_of(folder, code)
-    assert [p.name for p in (folder / "frames" / "splats").iterdir()] == ["1001.ply"]
+    assert [p.name for p in (folder / "frames" / "splats").iterdir()] == ["1001.flsp"]
 
 
 def test_after_a_cut_the_rest_is_left_out_and_said_so(pictures, clip_file, tmp_path, hasty):
@@ -345,8 +346,7 @@ def test_a_given_depth_is_in_metres(stream_clip, tmp_path, hasty):
     file, folder = tmp_path / "depth.npz", tmp_path / "x.fluid"
     np.savez(file, depth=depth)
     assert main(["make", str(stream_clip), "-o", str(folder), "--depth", str(file), *hasty]) in (DONE, WITH_WARNINGS)
-    with np.load(folder / "work" / "evaluation.npz") as found:
-        seen = found["front_depth"]
+    seen = arrays_of_run(folder, read_manifest(folder))["front_depth"]
     where = seen > 0
     np.testing.assert_allclose(seen[where], depth[where], rtol=1e-3)
 
@@ -413,7 +413,7 @@ def test_validate_tells_every_check_and_fails_with_the_first_bad_one(made, tmp_p
     assert main(["validate", str(made.folder), "--json"]) == DONE
     assert all(f["passed"] for f in json.loads(capsys.readouterr().out))
     bad = shutil.copytree(made.folder, tmp_path / "bad.fluid")
-    (bad / "frames" / "splats" / "1002.ply").unlink()
+    (bad / "frames" / "splats" / "1002.flsp").unlink()
     assert main(["validate", str(bad)]) == FAILED
     assert "FAILED  splat frames" in capsys.readouterr().out
 

@@ -171,3 +171,27 @@ print("loaded:", *sorted(set(sys.modules) & {{"torch", "numba", "scipy", "cv2", 
     assert run.stdout.splitlines()[-1] == "loaded:"
     assert run.stdout.count("the frames on disk show this scene") == 3
     assert EditSession.open(asset).stale() == set()  # and that is true
+
+
+def test_looking_at_edits_and_taking_them_back_builds_no_scene_whose_state_is_not_known(made, tmp_path):
+    """An asset that was copied, or met by a newer version: nothing is in memory."""
+    from fluidlift.scene.edits import EditSession
+    from fluidlift.scene.known_state import KNOWN
+
+    asset = shutil.copytree(made.folder, tmp_path / "river.fluid")
+    EditSession.open(asset).set("parameters.density", 900)
+    (asset / KNOWN).unlink(missing_ok=True)
+    code = f"""
+import sys
+from fluidlift.cli import main
+for options in (["--diff"], ["--history"], ["--undo"], ["--redo"], ["--history", "--json"]):
+    assert main(["edit", {str(asset)!r}, *options]) == 0
+print("loaded:", *sorted(set(sys.modules) & {{"torch", "numba", "scipy", "cv2", "av", "pxr", "trimesh"}}))
+"""
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert run.returncode == 0, run.stderr
+    assert run.stdout.splitlines()[-1] == "loaded:"
+    assert run.stdout.count(f"whether the frames on disk show this scene: fluidlift edit {asset}") == 4
+    assert '"stale": null' in run.stdout
+    assert edit(asset) in WELL  # this looks
+    assert EditSession.open(asset).known_standing() == {"simulate"}

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fluidlift.errors import InputRejected
-from fluidlift.evaluate import Case, evaluate_arrays, read_case
+from fluidlift.evaluate import Case, arrays_of_run, evaluate_arrays, read_case
 from fluidlift.evaluate.images import (
     depth_error,
     depth_scale,
@@ -473,3 +473,10 @@ def test_a_surface_at_half_speed_has_half_its_speed_as_error():
     assert sheet["surface.velocity.share_found"] == pytest.approx(0.5, abs=0.02)
     del run["flow_completed"]
     assert evaluate_arrays(an_asset(), run, {}, case)["surface.velocity.error"] is None
+
+
+def test_arrays_of_an_asset_of_an_earlier_version_come_from_its_file_and_of_one_without_work_there_are_none(tmp_path):
+    assert arrays_of_run(tmp_path, {}) == {}
+    (tmp_path / "work").mkdir()
+    np.savez_compressed(tmp_path / "work" / "evaluation.npz", labels=np.ones((2, 3, 4), np.uint8))
+    assert arrays_of_run(tmp_path, {})["labels"].shape == (2, 3, 4)

@@ -15,14 +15,13 @@ from fluidlift.cli import REJECTED, main
 from fluidlift.errors import InputRejected
 from fluidlift.io.asset_folder import save_asset, update_manifest
 from fluidlift.io.asset_lock import editing, writing
-from fluidlift.io.asset_paths import asset_file, asset_files
+from fluidlift.io.asset_paths import asset_file
 from fluidlift.io.checkpoint import Checkpoint, write_checkpoint
-from fluidlift.io.ply import write_gaussians
 from fluidlift.io.stage_cache import Scratch, load_stage, save_stage
-from fluidlift.scene.splat_files import checkpoint_file, frame_file
+from fluidlift.scene.splat_files import checkpoint_file, frame_file, frame_files, write_frame
 
 PLACES = (
-    "frames", "frames/splats", "frames/splats/1002.ply", "work", "work/simulate", "work/checkpoint",
+    "frames", "frames/splats", "frames/splats/1002.flsp", "work", "work/simulate", "work/checkpoint",
     "work/checkpoint/simulation.npz", "work/simulate/k.json", "rest", "rest/velocity.npz", "edits", "scene.yaml",
     "manifest.json", "preview.mp4", "mask",
 )  # fmt: skip
@@ -56,7 +55,7 @@ def whole(tmp_path_factory):
     folder = save_asset(place / "a.fluid", small_asset())
     for number in (1001, 1002):
         ids, moving = np.arange(20), np.zeros((20, 3), np.float32)
-        write_gaussians(folder / f"frames/splats/{number}.ply", random_gaussians(20), ids=ids, velocities=moving)
+        write_frame(folder, number, random_gaussians(20), ids=ids, velocities=moving)
     (folder / "frames/splats/notes.json").write_text("{}")
     save_stage(folder, "simulate", "k", {"a": np.ones(3)}, {})
     held = Checkpoint(2, {"grid": "ab"}, {"x": np.ones(3)}, {"volume": np.ones(2)})
@@ -116,9 +115,9 @@ def test_no_command_goes_through_a_link(whole, linked, watched, tmp_path, capsys
         ("edits", lambda folder: editing(folder).__enter__()),
         ("rest", lambda folder: save_asset(folder, small_asset())),
         ("manifest.json", lambda folder: update_manifest(folder, warnings=[])),
-        ("frames", lambda folder: asset_files(folder, "frames/splats", (".ply",))),
-        ("frames/splats/1002.ply", lambda folder: asset_files(folder, "frames/splats", (".ply",))),
-        ("frames/splats", lambda folder: asset_file(folder, "frames/splats/1001.ply")),
+        ("frames", lambda folder: frame_files(folder)),
+        ("frames/splats/1002.flsp", lambda folder: frame_files(folder)),
+        ("frames/splats", lambda folder: asset_file(folder, "frames/splats/1001.flsp")),
     ],
 )
 def test_no_function_goes_through_a_link(linked, name, do):
@@ -141,7 +140,7 @@ def test_an_asset_may_itself_be_reached_through_a_link(whole, tmp_path, capsys):
     assert main(["edit", str(tmp_path / "b.fluid"), "--diff"]) != REJECTED, capsys.readouterr().err
 
 
-@pytest.mark.parametrize("name", ["frames", "frames/splats", "frames/splats/1001.ply", "work", "work/checkpoint"])
+@pytest.mark.parametrize("name", ["frames", "frames/splats", "frames/splats/1001.flsp", "work", "work/checkpoint"])
 def test_the_simulation_has_its_paths_from_the_same_place(linked, name):
     asset, _ = linked(name)
     with pytest.raises(InputRejected, match="is a link"):

@@ -14,8 +14,9 @@ from fluidlift.cli import DONE, FAILED, REJECTED, main
 from fluidlift.errors import InputRejected
 from fluidlift.io.asset_folder import load_asset, read_manifest, save_asset, update_manifest, write_parameters
 from fluidlift.io.export_usd import write_usd
-from fluidlift.io.ply import read_splats, write_gaussians
+from fluidlift.io.ply import write_gaussians
 from fluidlift.io.video import write_video
+from fluidlift.scene.splat_files import frame_file, frame_files, read_frame, write_frame
 from fluidlift.types import (
     CellType,
     Estimate,
@@ -66,8 +67,7 @@ def whole(tmp_path_factory) -> Path:
     for k in range(COUNT):
         moved = dataclasses.replace(asset.rest, means=asset.rest.means + velocities * np.float32(0.04 * k))
         frames.append((moved, ids, velocities))
-        path = folder / "frames" / "splats" / f"{1001 + k}.ply"
-        write_gaussians(path, moved, ids=ids, velocities=velocities)
+        write_frame(folder, 1001 + k, moved, ids=ids, velocities=velocities)
     write_usd(folder / "asset.usda", frames=frames, interval=0.04, camera=asset.camera)
     write_video(folder / "preview.mp4", np.zeros((COUNT, 48, 64, 3), np.uint8), 25.0)
     files = {"usd": "asset.usda", "preview": "preview.mp4"}
@@ -93,7 +93,7 @@ def test_a_whole_asset_passes_every_check(whole):
 
 
 def test_every_failure_says_what_to_do_in_words_and_in_json(folder, capsys):
-    frame(folder, 1002).unlink()
+    frame_file(folder, 1002).unlink()
     assert main(["validate", str(folder)]) == FAILED
     assert "FAILED  splat frames are complete: frame 1002 is missing" in capsys.readouterr().out
     assert main(["validate", str(folder), "--json"]) == FAILED
@@ -135,7 +135,7 @@ def test_the_scene_may_be_changed_by_a_person(folder):
 
 def test_a_missing_file_is_named_and_the_rest_is_still_looked_at(folder):
     (folder / "rest" / "velocity.npz").unlink()
-    frame(folder, 1003).unlink()
+    frame_file(folder, 1003).unlink()
     found = failed(folder)
     assert "'rest/velocity.npz' is missing" in found["files of the manifest are there"].detail
     assert {"parts can be read", "splat frames are complete"} <= found.keys()
@@ -172,17 +172,12 @@ def test_a_newer_format_is_refused_with_what_to_do(folder, capsys):
 # frames ---------------------------------------------------------------------------------------------------------
 
 
-def frame(folder: Path, number: int) -> Path:
-    return folder / "frames" / "splats" / f"{number}.ply"
-
-
 def rewrite(folder: Path, number: int, **changes) -> None:
     """Write one frame again with other ids, velocities or Gaussians."""
-    splats = read_splats(frame(folder, number))
-    ids = changes.get("ids", splats.extras["id"])
-    velocities = np.stack([splats.extras[v] for v in ("vx", "vy", "vz")], axis=-1)
+    splats = read_frame(frame_file(folder, number))
     given = changes.get("gaussians", lambda g: g)(splats.gaussians)
-    write_gaussians(frame(folder, number), given, ids=ids, velocities=changes.get("velocities", velocities))
+    ids, velocities = changes.get("ids", splats.ids), changes.get("velocities", splats.velocities)
+    write_frame(folder, number, given, ids=ids, velocities=velocities)
 
 
 def flat(g: Gaussians) -> Gaussians:
@@ -201,18 +196,35 @@ def flat(g: Gaussians) -> Gaussians:
 def test_a_fault_of_a_frame_in_the_middle_is_found_and_the_frame_is_named(folder, check, changes):
     rewrite(folder, 1002, **changes)
     found = failed(folder)
-    assert found.keys() == {check} and "1002.ply" in found[check].detail
+    assert found.keys() == {check} and frame_file(folder, 1002).name in found[check].detail
 
 
 def test_a_frame_that_is_damaged_or_no_frame_of_ours_is_named(folder):
-    frame(folder, 1002).write_bytes(frame(folder, 1002).read_bytes()[:2000])
-    write_gaussians(frame(folder, 1003), load_asset(folder).rest)  # without ids and velocities
+    frame_file(folder, 1002).write_bytes(frame_file(folder, 1002).read_bytes()[:500])
+    frame_file(folder, 1003).unlink()
+    write_gaussians(folder / "frames" / "splats" / "1003.ply", load_asset(folder).rest)  # without ids and velocities
     detail = failed(folder)["every frame can be read"].detail
-    assert "1002.ply" in detail and "1003.ply: no property 'vx'" in detail
+    assert "1002.flsp" in detail and "'1003.ply' has no id, vx, vy, vz" in detail
+
+
+def test_frames_of_an_older_version_are_as_good(folder):
+    before = [read_frame(file) for file in frame_files(folder)]
+    for number, (g, ids, velocities, *_) in enumerate(before, 1001):
+        frame_file(folder, number).unlink()
+        write_gaussians(folder / "frames" / "splats" / f"{number}.ply", g, ids=ids, velocities=velocities)
+    assert [f.suffix for f in frame_files(folder)] == [".ply"] * COUNT
+    assert failed(folder) == {}
+    assert all(np.array_equal(read_frame(f).ids, b.ids) for f, b in zip(frame_files(folder), before))
+
+
+def test_a_frame_that_is_there_twice_is_named(folder):
+    g, ids, velocities, *_ = read_frame(frame_file(folder, 1002))
+    write_gaussians(folder / "frames" / "splats" / "1002.ply", g, ids=ids, velocities=velocities)
+    assert "frame 1002 is there twice" in failed(folder)["splat frames are complete"].detail
 
 
 def test_frames_that_the_manifest_does_not_know_are_named(folder):
-    shutil.copy(frame(folder, 1004), frame(folder, 1005))
+    shutil.copy(frame_file(folder, 1004), frame_file(folder, 1005))
     assert "frame 1005" in failed(folder)["splat frames are complete"].detail
 
 

@@ -18,8 +18,8 @@ def test_the_exit_code_says_whether_there_were_warnings(made):
     "name",
     [
         "manifest.json", "parameters.json", "scene.yaml", "rest/gaussians.ply", "rest/terrain.glb", "rest/velocity.vdb",
-        "rest/camera.json", "frames/splats/1001.ply", f"frames/splats/{1000 + FRAMES}.ply", "asset.usda", "preview.mp4",
-        "report.html", "mask_overlay.png", "work/evaluation.npz",
+        "rest/camera.json", "frames/splats/1001.flsp", f"frames/splats/{1000 + FRAMES}.flsp", "asset.usda",
+        "preview.mp4", "report.html", "mask_overlay.png",
     ],
 )  # fmt: skip
 def test_every_part_of_the_asset_is_there(made, name):

@@ -15,13 +15,13 @@ from scipy import ndimage
 from fluidlift.config import build_config
 from fluidlift.io.asset_folder import load_asset, read_manifest, save_asset
 from fluidlift.io.kept_values import last_value
-from fluidlift.io.ply import read_splats
 from fluidlift.physics.transfer import particles_to_grid, sort_by_cell
 from fluidlift.pipeline import Inputs, RenderRequest, make, render_asset, resimulate
 from fluidlift.scene import EditSession, SimulationRequest
 from fluidlift.scene.coarse_copy import coarser
 from fluidlift.scene.footage import Footage
 from fluidlift.scene.recall import footage_of_asset
+from fluidlift.scene.splat_files import frame_file, read_frame
 from fluidlift.synthetic.demo import demo_clip
 from fluidlift.types import FluidAsset, Grid, Particles
 from fluidlift.types.stages import Simulation
@@ -104,14 +104,13 @@ class Bench:
 
     def splats(self, number: int):
         """Gaussians and velocities [n,3] (m/s) of the particles of a frame, without the skin over them (odd ids)."""
-        found = read_splats(self.folder / "frames" / "splats" / f"{number}.ply")
-        particles = found.extras["id"] % 2 == 0
-        velocities = np.stack([found.extras[v] for v in ("vx", "vy", "vz")], axis=-1)
-        return found.gaussians.select(particles), velocities[particles]
+        found = read_frame(frame_file(self.folder, number))
+        particles = found.ids % 2 == 0
+        return found.gaussians.select(particles), found.velocities[particles]
 
     def all_splats(self, number: int):
         """Gaussians of a frame as they are drawn, the skin among them."""
-        return read_splats(self.folder / "frames" / "splats" / f"{number}.ply").gaussians
+        return read_frame(frame_file(self.folder, number)).gaussians
 
     def last(self):
         """Those of the last frame."""

@@ -10,7 +10,8 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
-from .facts import frames, read_bodies
+from .facts import frame_of, frames, read_bodies
+from .packed import SUFFIX, read_packed
 from .ply import columns, read_ply, whole_numbers
 
 COLLECTION = "fluid asset"
@@ -103,7 +104,7 @@ def _attribute(mesh: bpy.types.Mesh, name: str, kind: str):
 
 def fill_points(mesh: bpy.types.Mesh, file: Path) -> None:
     """The splats of one frame as points with attributes."""
-    table, _ = read_ply(file)
+    table = read_packed(file) if file.suffix == SUFFIX else read_ply(file)[0]
     mesh.clear_geometry()
     points = columns(table, "x", "y", "z")
     if points is None:
@@ -140,7 +141,7 @@ def show_frame(thing: bpy.types.Object, number: int) -> None:
         OSError, ValueError: the file has gone, or is none; what was shown stays.
     """
     first, last = thing["fluidlift_frames"]
-    file = Path(thing["fluidlift_folder"]) / f"{min(max(number, first), last)}.ply"
+    file = frame_of(Path(thing["fluidlift_folder"]), min(max(number, first), last))
     shown = f"{file} {file.stat().st_mtime_ns}"
     if thing.get("fluidlift_shown") == shown:
         return

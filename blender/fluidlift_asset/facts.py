@@ -122,10 +122,16 @@ def _json(file: Path) -> Any:
         raise RuntimeError(f"{file} cannot be read ({error}): is the asset damaged?") from None
 
 
-def frames(folder: Path, suffix: str = ".ply") -> range:
+def frame_of(folder: Path, number: int, suffix: str = "") -> Path:
+    """The file of a frame with that suffix; without one: packed splats or, where there are none, PLY."""
+    packed = folder / f"{number}.flsp"
+    return packed if not suffix and packed.is_file() else folder / f"{number}{suffix or '.ply'}"
+
+
+def frames(folder: Path, suffix: str = "") -> range:
     """Numbers of a sequence from 1001 on, as far as its files are there without a gap."""
     last = FIRST
-    while (folder / f"{last}{suffix}").is_file():
+    while frame_of(folder, last, suffix).is_file():
         last += 1
     return range(FIRST, last)
 
@@ -134,5 +140,5 @@ def up_to_date(made: Path, source: Path, suffix: str) -> bool:
     """Whether every frame of `source` has a younger file in `made`, and `made` has no others."""
     numbers = frames(source)
     return len(numbers) > 0 and frames(made, suffix) == numbers and all(
-        (made / f"{n}{suffix}").stat().st_mtime >= (source / f"{n}.ply").stat().st_mtime for n in numbers
+        (made / f"{n}{suffix}").stat().st_mtime >= frame_of(source, n).stat().st_mtime for n in numbers
     )  # fmt: skip

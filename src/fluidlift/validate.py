@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from fluidlift.errors import InputRejected
-from fluidlift.io.asset_paths import asset_file, asset_files
+from fluidlift.io.asset_paths import asset_file
 from fluidlift.types import FluidAsset
 
 SHOWN = 5
@@ -186,9 +186,10 @@ class _Faults:
 def _frames(folder: Path, manifest: dict[str, Any]) -> Iterator[Finding]:
     """The simulated frames: their number, and each of them."""
     from fluidlift.io.frames import FIRST_FRAME
+    from fluidlift.scene.splat_files import frame_files
 
     simulation = manifest.get("simulation", {})
-    files = asset_files(folder, "frames/splats", (".ply",))
+    files = frame_files(folder)
     told = simulation.get("frames")
     if not files and told is None:
         yield Finding("splat frames are complete", True, "none: nothing was simulated yet")
@@ -198,6 +199,7 @@ def _frames(folder: Path, manifest: dict[str, Any]) -> Iterator[Finding]:
     faults = [f"frame {n} is missing" for n in wanted if n not in set(numbers)]
     extra = [n for n in numbers if n not in wanted]
     faults += [f"frame {n} is not one of the {told} of the manifest" for n in extra]
+    faults += [f"frame {n} is there twice" for n, after in zip(numbers, numbers[1:]) if n == after]
     yield _found("splat frames are complete", faults, _SIM, f"{len(numbers)}, as the manifest says")
     interval = float(simulation.get("frame_interval", manifest["frame_interval"]))
     found = _look_at([f for f in files if f.stem.isdigit()], interval)
@@ -212,17 +214,15 @@ def _frames(folder: Path, manifest: dict[str, Any]) -> Iterator[Finding]:
 def _look_at(files: list[Path], interval: float) -> _Faults:
     """All frames, one after the other; of the one before only ids, positions and velocities are kept."""
     from fluidlift.io.frame_checks import Particles, gaussian_faults, identity_faults, particle_faults
-    from fluidlift.io.ply import read_splats
+    from fluidlift.scene.splat_files import read_frame
 
     found, before, last = _Faults(), None, -1
     for file in files:
         try:
-            splats = read_splats(file)
-            velocities = np.stack([splats.extras[v] for v in ("vx", "vy", "vz")], axis=-1)
-            now = Particles(splats.extras["id"], splats.gaussians.means, velocities)
-        except (InputRejected, KeyError) as error:
-            what = error.got if isinstance(error, InputRejected) else f"no property {error}"
-            found.read.append(f"{file.name}: {what}")
+            splats = read_frame(file)
+            now = Particles(splats.ids, splats.gaussians.means, splats.velocities)
+        except InputRejected as error:
+            found.read.append(f"{file.name}: {error.got}")
             before = None
             continue
         own, number = particle_faults(now), int(file.stem)

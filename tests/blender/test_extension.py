@@ -16,9 +16,10 @@ import pytest
 
 from fluidlift.backends.mitsuba_scene import medium
 from fluidlift.io.asset_folder import load_asset, read_manifest, update_manifest
-from fluidlift.io.ply import read_mesh, read_splats
+from fluidlift.io.ply import read_mesh
 from fluidlift.io.scene import read_edits
 from fluidlift.look.materials import HONEY
+from fluidlift.scene.splat_files import frame_file, frame_files, read_frame
 
 ROOT = Path(__file__).resolve().parents[2]
 FRAMES = 4
@@ -43,7 +44,7 @@ def seen(request, made, tmp_path_factory):
     call = blender(request.param)
     folder = shortened(shutil.copytree(made.folder, tmp_path_factory.mktemp("blender") / "copy.fluid"))
     before = (folder / "parameters.json").read_bytes()
-    splats = {n: read_splats(folder / "frames" / "splats" / f"{n}.ply") for n in (1001, last(folder))}
+    splats = {n: read_frame(frame_file(folder, n)) for n in (1001, last(folder))}
     command = Path(sys.executable).with_name("fluidlift")
     script = Path(__file__).with_name("in_blender.py")
     call += [str(script), "--", str(ROOT / "blender" / "fluidlift_asset"), str(folder), str(command)]
@@ -56,7 +57,7 @@ def seen(request, made, tmp_path_factory):
 
 def shortened(folder):
     """The asset with its first frames alone: what is exported for Blender takes as long as there are frames."""
-    for file in (folder / "frames" / "splats").glob("*.ply"):
+    for file in frame_files(folder):
         if int(file.stem) > 1000 + FRAMES:
             file.unlink()
     update_manifest(folder, simulation=read_manifest(folder)["simulation"] | {"frames": FRAMES})
@@ -84,7 +85,7 @@ def test_splats_arrive_in_metres_upright_with_velocities(seen, which):
     found, _, splats, _ = seen
     number = min(splats) if which == "first" else max(splats)
     means = splats[number].gaussians.means
-    speed = np.stack([splats[number].extras[v] for v in ("vx", "vy", "vz")], -1)
+    speed = splats[number].velocities
     got = found[which]["splats"]
     assert got["vertices"] == len(means)
     np.testing.assert_allclose([got["low"], got["high"]], [means.min(0), means.max(0)], atol=1e-6)

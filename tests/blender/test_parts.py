@@ -8,12 +8,14 @@ import subprocess
 import sys
 import tomllib
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from fluidlift.io.packed_splats import read_packed, write_packed
 from fluidlift.io.ply import write_gaussians, write_mesh
 from fluidlift.look.materials import PRESETS
 from fluidlift.types import Gaussians, TriangleMesh
@@ -45,6 +47,46 @@ def test_meshes_and_splats_are_read_as_they_were_written(tmp_path):
     table, faces = ply.read_ply(tmp_path / "b.ply")
     assert len(faces) == 0 and (table["id"] == np.arange(7)).all()
     np.testing.assert_allclose(np.exp(table["scale_0"]), 0.02, rtol=1e-5)
+
+
+def test_packed_frames_are_read_as_fluidlift_reads_them(tmp_path):
+    packed, rng, n = part("packed"), np.random.default_rng(0), 300
+    splats = Gaussians.isotropic(rng.normal(size=(n, 3)), 0.02, rng.uniform(size=(n, 3)), rng.uniform(0.1, 0.9, n))
+    for degree in (0, 2):
+        sh = np.concatenate([splats.sh, rng.normal(size=(n, (degree + 1) ** 2 - 1, 3))], axis=1)
+        path = tmp_path / f"{degree}.flsp"
+        write_packed(path, replace(splats, sh=sh), ids=np.arange(n) * 7 - 3, velocities=rng.normal(size=(n, 3)))
+        table, own = packed.read_packed(path), read_packed(path)
+        for names, values in (
+            ("x y z", own.gaussians.means), ("vx vy vz", own.velocities),
+            ("f_dc_0 f_dc_1 f_dc_2", own.gaussians.sh[:, 0]),
+            ("scale_0 scale_1 scale_2", np.log(own.gaussians.scales)),
+        ):  # fmt: skip
+            found = part("ply").columns(table, *names.split())
+            np.testing.assert_allclose(found, values, rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(1 / (1 + np.exp(-table["opacity"])), own.gaussians.opacities, rtol=1e-5)
+        np.testing.assert_array_equal(part("ply").whole_numbers(table, "id"), own.ids)
+
+
+def test_a_packed_frame_that_is_damaged_or_lies_is_refused(tmp_path):
+    g, path = Gaussians.isotropic(np.eye(3), 0.02, np.full((3, 3), 0.5)), tmp_path / "a.flsp"
+    data = write_packed(path, g, ids=np.arange(3), velocities=np.eye(3)).read_bytes()
+    claims = data[:8] + (5_000_000).to_bytes(4, "little") + data[12:]
+    for bad, words in (
+        (data[:40], "no packed frame"), (b"PLSF" + data[4:], "no packed frame"), (data[:-20], "damaged|too early"),
+        (data[:4] + b"\x02" + data[5:], "version 2"), (claims, "damaged"), (data[:8] + b"\xff" * 4 + data[12:], "says"),
+    ):  # fmt: skip
+        path.write_bytes(bad)
+        with pytest.raises(ValueError, match=words):
+            part("packed").read_packed(path)
+
+
+def test_a_frame_is_the_packed_one_or_where_that_is_not_there_the_ply_of_an_older_version(tmp_path):
+    facts = part("facts")
+    for name in ("1001.ply", "1002.flsp", "1003.ply", "1003.flsp"):
+        (tmp_path / name).write_text("")
+    assert [facts.frame_of(tmp_path, n).suffix for n in facts.frames(tmp_path)] == [".ply", ".flsp", ".flsp"]
+    assert facts.frames(tmp_path, ".vdb") == range(1001, 1001)
 
 
 @pytest.mark.parametrize(("cut", "words"), [(-20, "ends before"), (2, "no PLY")])

@@ -13,13 +13,12 @@ from fluidlift.cli import DONE, REJECTED, WITH_WARNINGS, main
 from fluidlift.errors import InputRejected
 from fluidlift.export.volumes import gridded, level_set
 from fluidlift.io.asset_folder import load_asset, read_manifest
-from fluidlift.io.frames import FluidFrame
 from fluidlift.io.ply import read_mesh, read_splats
 from fluidlift.io.stage_cache import mark_owner, save_stage
 from fluidlift.io.stage_codec import packed
 from fluidlift.io.validate_usd import validate_usd
 from fluidlift.numerics.sampling import sample_nodes
-from fluidlift.scene.splat_files import frame_numbers
+from fluidlift.scene.splat_files import frame_file, frame_numbers, read_frame
 from fluidlift.types import TriangleMesh
 from fluidlift.types.stages import Simulation
 
@@ -34,7 +33,7 @@ def test_the_surface_holds_the_particles_and_stays_out_of_the_bed(made, tmp_path
     assert export(made, tmp_path / "out") in WELL
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["1001.ply", "1002.ply", "terrain.glb"]
     mesh, asset = read_mesh(tmp_path / "out" / "1002.ply"), load_asset(made.folder)
-    splats = read_splats(made.folder / "frames" / "splats" / "1002.ply").gaussians
+    splats = read_frame(frame_file(made.folder, 1002)).gaussians
     h = asset.grid.spacing
     low, high = np.percentile(splats.means, [1, 99], axis=0)
     assert (mesh.vertices.min(0) < low + h).all() and (mesh.vertices.max(0) > high - h).all()
@@ -47,11 +46,11 @@ def test_other_tools_read_the_surface_with_its_velocities(made, tmp_path):
     assert export(made, tmp_path / "out") in WELL
     other = trimesh.load(tmp_path / "out" / "1001.ply", process=False)
     data = other.metadata["_ply_raw"]["vertex"]["data"]
-    own = read_splats(made.folder / "frames" / "splats" / "1001.ply")
+    own = read_frame(frame_file(made.folder, 1001))
     _, nearest = cKDTree(own.gaussians.means).query(np.asarray(other.vertices), k=8)
-    beside = own.extras["vx"][nearest].mean(axis=1)
+    beside = own.velocities[:, 0][nearest].mean(axis=1)
     # both are means over the neighbourhood, with other weights
-    assert np.median(np.abs(data["vx"] - beside)) < 0.25 * np.std(own.extras["vx"])
+    assert np.median(np.abs(data["vx"] - beside)) < 0.25 * np.std(own.velocities[:, 0])
     assert len(other.visual.vertex_colors) == len(other.vertices)
 
 
@@ -82,9 +81,9 @@ def test_obj_files_hold_the_same_surface(made, tmp_path):
 def test_splats_come_back_as_they_were(made, tmp_path):
     assert export(made, tmp_path / "out", "--to", "splats", "--up-axis", "y") in WELL
     back = read_splats(tmp_path / "out" / "1001.ply")
-    own = read_splats(made.folder / "frames" / "splats" / "1001.ply")
+    own = read_frame(frame_file(made.folder, 1001))
     np.testing.assert_allclose(back.gaussians.means, own.gaussians.means, atol=1e-5)
-    np.testing.assert_array_equal(back.extras["id"], own.extras["id"])
+    np.testing.assert_array_equal(back.extras["id"], own.ids)
 
 
 def test_usd_holds_the_surface_at_every_frame(made, tmp_path):
@@ -131,8 +130,8 @@ def test_a_place_that_cannot_be_written_is_refused(made, capsys, command):
 def test_a_frame_that_is_missing_in_the_middle_is_named(tmp_path):
     for k in (1001, 1002, 1004):
         (tmp_path / "frames" / "splats").mkdir(parents=True, exist_ok=True)
-        (tmp_path / "frames" / "splats" / f"{k}.ply").touch()
-    with pytest.raises(InputRejected, match=r"frame 1003 is missing: frames/splats/1003\.ply.*--restart"):
+        (tmp_path / "frames" / "splats" / f"{k}.flsp").touch()
+    with pytest.raises(InputRejected, match=r"frame 1003 is missing: frames/splats/1003\.flsp.*--restart"):
         frame_numbers(tmp_path, 4, (1002, 1004))
     assert frame_numbers(tmp_path, 4, (1004, 1004)) == range(3, 4)
     assert frame_numbers(tmp_path, 4, None) == range(2)
@@ -146,22 +145,20 @@ def test_a_page_that_was_not_asked_for_says_how(made, tmp_path, capsys):
 
 
 def test_volumes_hold_the_motion_and_the_amount_of_the_fluid(made):
-    asset, splats = load_asset(made.folder), read_splats(made.folder / "frames" / "splats" / "1002.ply")
-    velocities = np.stack([splats.extras[v] for v in ("vx", "vy", "vz")], axis=-1)
-    frame = FluidFrame(splats.gaussians, splats.extras["id"], velocities)
+    asset, frame = load_asset(made.folder), read_frame(frame_file(made.folder, 1002))
     velocity, density, grid = gridded(frame, asset.grid)
     filled = density > 0
     offset = (grid.low - asset.grid.low) / asset.grid.spacing
     np.testing.assert_allclose(offset, np.round(offset), atol=1e-6)  # on the cells of the simulation
-    liquid = splats.extras["id"] % 2 == 0  # odd ones are the skin's, which is no liquid
+    liquid = frame.ids % 2 == 0  # odd ones are the skin's, which is no liquid
     assert liquid.any() and (~liquid).any()
     held = np.zeros(filled.shape, bool)
-    held[tuple(grid.cell_of(splats.gaussians.means[liquid]).T)] = True
+    held[tuple(grid.cell_of(frame.gaussians.means[liquid]).T)] = True
     np.testing.assert_array_equal(filled, held)
     assert density.max() == 1.0
     # a cell's velocity is a mean of what is in it and beside it
     mean = velocity.at_centers()[filled].mean(axis=0)
-    np.testing.assert_allclose(mean, velocities[liquid].mean(axis=0), atol=0.5 * velocities.std())
+    np.testing.assert_allclose(mean, frame.velocities[liquid].mean(axis=0), atol=0.5 * frame.velocities.std())
 
 
 def test_the_level_set_of_a_ball_is_its_distance_and_knows_its_inside():

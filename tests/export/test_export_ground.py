@@ -11,8 +11,9 @@ from pxr import Usd, UsdGeom
 from fluidlift.cli import DONE, WITH_WARNINGS, main
 from fluidlift.io import export_page as page
 from fluidlift.io.asset_folder import load_asset, read_manifest, update_manifest
-from fluidlift.io.ply import AXES, read_splats, write_gaussians
+from fluidlift.io.ply import AXES, read_splats
 from fluidlift.look.rasterize import render
+from fluidlift.scene.splat_files import frame_file, read_frame, write_frame
 from fluidlift.types import Gaussians, PinholeCamera, RigidTransform
 
 WELL = (DONE, WITH_WARNINGS)
@@ -128,13 +129,11 @@ def test_a_channel_made_longer_is_longer_in_exports(copy, tmp_path):
 
 def test_a_file_with_other_axes_and_units_shows_the_same_picture_to_who_takes_it_as_it_stands(copy, tmp_path):
     """Splats with harmonics of degree 3, y up in centimetres, read without looking at the file's own words."""
-    frame = copy / "frames" / "splats" / "1001.ply"
-    splats, rng = read_splats(frame), np.random.default_rng(0)
+    splats, rng = read_frame(frame_file(copy, 1001)), np.random.default_rng(0)
     g = splats.gaussians
     sh = np.concatenate([g.sh[:, :1], rng.normal(0, 0.1, (len(g), 15, 3))], axis=1)
     g = Gaussians(g.means, g.quats, g.scales, g.opacities, sh)
-    speed = np.stack([splats.extras[v] for v in ("vx", "vy", "vz")], axis=1)
-    write_gaussians(frame, g, ids=splats.extras["id"], velocities=speed)
+    g = read_frame(write_frame(copy, 1001, g, ids=splats.ids, velocities=splats.velocities)).gaussians  # as it is kept
     out = exported(copy, tmp_path / "out", "splats", "--up-axis", "y", "--meters-per-unit", "0.01")
     data = (out / "1001.ply").read_bytes()
     assert b"axes y_up" in data
@@ -147,5 +146,5 @@ def test_a_file_with_other_axes_and_units_shows_the_same_picture_to_who_takes_it
     ours, theirs = render(g, camera).image, render(found, moved).image
     # single precision of harmonics that were turned; splats at the edge of what is drawn (1/255) may come or go
     assert np.abs(theirs - ours).mean() < 1e-4
-    unturned = Gaussians(found.means, found.quats, found.scales, found.opacities, sh)
+    unturned = Gaussians(found.means, found.quats, found.scales, found.opacities, g.sh)
     assert np.abs(render(unturned, moved).image - ours).mean() > 1e-3

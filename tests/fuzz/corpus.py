@@ -8,6 +8,7 @@ import json
 import struct
 import tempfile
 import zipfile
+import zlib
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -23,6 +24,7 @@ from fluidlift.io.checkpoint import Checkpoint, write_checkpoint
 from fluidlift.io.export_mesh import write_glb
 from fluidlift.io.exr_write import write_channels
 from fluidlift.io.flow_files import write_flow
+from fluidlift.io.packed_splats import COLUMNS, write_packed
 from fluidlift.io.ply import write_gaussians, write_mesh
 from fluidlift.io.scene import SCENE_TEMPLATE
 from fluidlift.io.spz import write_spz
@@ -200,6 +202,35 @@ def splats() -> list[Seed]:
     g = random_gaussians(30)
     moving = np.zeros((30, 3), np.float32)
     return [Seed(_written(lambda p: write_gaussians(p, g, ids=np.arange(30), velocities=moving), "a.ply"))]
+
+
+@cache
+def packed() -> list[Seed]:
+    """A packed frame: as it is, its head and records, and the lowest bytes of each column in a stream again."""
+    g, head = random_gaussians(300), 12 + 28 * len(COLUMNS)
+    moving = np.random.default_rng(3).normal(size=(300, 3)).astype(np.float32)
+    data = _written(lambda p: write_packed(p, g, ids=np.arange(300), velocities=moving), "a.flsp")
+    records = [list(struct.unpack_from("<di4I", data, 12 + 28 * k)) for k in range(len(COLUMNS))]
+    starts = head + np.cumsum([0, *(sum(r[2:]) for r in records)])
+
+    def inside(k: int) -> Seed:
+        """The first plane of a column."""
+        start, size = int(starts[k]), records[k][2]
+
+        def pack(plane: bytes) -> bytes:
+            stream = zlib.compress(plane, 1)
+            told = [*records[:k], [*records[k][:2], len(stream), *records[k][3:]], *records[k + 1 :]]
+            return b"".join([data[:12], *(struct.pack("<di4I", *r) for r in told), data[head:start], stream,
+                             data[start + size :]])  # fmt: skip
+
+        kept = data[start : start + size]
+        try:
+            return Seed(zlib.decompress(kept), pack)
+        except zlib.error:  # one that is kept as it is
+            return Seed(kept, pack)
+
+    whole = [Seed(data), Seed(data[:head], lambda h: h + data[head:])]
+    return whole + [inside(k) for k in range(len(COLUMNS)) if records[k][2]]
 
 
 @cache

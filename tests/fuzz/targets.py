@@ -165,6 +165,12 @@ def _frame_parts() -> dict[str, bytes]:
     return corpus.asset_parts() | {"frames/splats/1002.ply": splats.data}
 
 
+def _packed(folder: Path) -> None:
+    from fluidlift.io.packed_splats import read_packed
+
+    read_packed(folder / "a.flsp")
+
+
 def _mesh(name: str) -> Callable[[Path], object]:
     def read(folder: Path) -> object:
         from fluidlift.io.read_mesh import read_any_mesh
@@ -267,7 +273,8 @@ def _stage_files() -> dict[str, bytes]:
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         scratch = Scratch(folder, "flow")
-        long = scratch.array("long", (4, 3), np.float32)
+        long = scratch.array("long", (40, 3), np.float32)  # no numbers that are better packed
+        long[:] = np.random.default_rng(0).normal(size=(40, 3))
         save_stage(folder, "flow", "k", {"a": np.ones(3), "long": long}, {"n": 1}, scratch=scratch)
         mark_owner(folder, "flow", "k")
         return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
@@ -334,6 +341,7 @@ TARGETS: dict[str, Target] = {
     "terrain": Target(_part("rest/terrain.npz"), _asset, "rest/terrain.npz", corpus.asset_parts, slow=True),
     "velocity": Target(_part("rest/velocity.npz"), _asset, "rest/velocity.npz", corpus.asset_parts, slow=True),
     "frames": Target(corpus.splats, _validated, "frames/splats/1001.ply", _frame_parts, slow=True),
+    "packed-frames": Target(corpus.packed, _validated, "frames/splats/1001.flsp", _frame_parts, slow=True),
     "force": Target(_force_files, _force, "rest/force.npz"),
     "history": Target(_history_files, _history, "edits/history.jsonl"),
     "obj": Target(_text(corpus.OBJ), _mesh("a.obj"), "a.obj", _beside_obj),
@@ -341,6 +349,7 @@ TARGETS: dict[str, Target] = {
     "glb": Target(corpus.glb, _mesh("a.glb"), "a.glb"),
     "mesh-ply": Target(corpus.mesh_plys, _mesh("a.ply"), "a.ply"),
     "splats": Target(corpus.splats, _splats, "a.ply"),
+    "packed": Target(corpus.packed, _packed, "a.flsp"),
     "spz": Target(corpus.spz, _spz, "a.spz"),
     "picture": Target(corpus.pictures, _picture, "a.png"),
     "mask": Target(corpus.pictures, _mask, "a.png"),

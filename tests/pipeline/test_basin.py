@@ -10,8 +10,8 @@ from catalogue import QUICK, write_clip
 
 from fluidlift.cli import DONE, REJECTED, WITH_WARNINGS, main
 from fluidlift.io.asset_folder import load_asset, read_manifest
-from fluidlift.io.ply import read_splats
 from fluidlift.look.surface_skin import without_skin
+from fluidlift.scene.splat_files import frame_files, read_frame
 from fluidlift.types import CellType
 
 FRAMES, PERIOD, SWING = 36, 24, 5.0
@@ -102,9 +102,9 @@ def test_a_whirl_goes_round_and_nowhere(basins):
 
 @pytest.mark.parametrize("film", [seiche, whirl])
 def test_it_stays_where_it_is(basins, film):
-    files = sorted((basins[film] / "frames" / "splats").glob("*.ply"))
+    files = frame_files(basins[film])
     cell = load_asset(basins[film]).grid.spacing
-    first, last = (without_skin(read_splats(f).gaussians, cell).means for f in (files[0], files[-1]))
+    first, last = (without_skin(read_frame(f).gaussians, cell).means for f in (files[0], files[-1]))
     assert len(files) == 5 and len(last) > 0.97 * len(first)
     np.testing.assert_allclose(last.mean(axis=0), first.mean(axis=0), atol=0.03 * np.ptp(first[:, :2], axis=0).max())
 

@@ -5,9 +5,9 @@ import pytest
 
 from fluidlift.cli import DONE, REJECTED, WITH_WARNINGS, main
 from fluidlift.io.asset_folder import load_asset, read_manifest
-from fluidlift.io.ply import read_splats
 from fluidlift.look.surface_skin import without_skin
 from fluidlift.pipeline import card_of
+from fluidlift.scene.splat_files import frame_files, read_frame
 from fluidlift.types import CellType
 from fluidlift.validate import validate_asset
 
@@ -57,9 +57,9 @@ def test_nothing_flows_in_or_out_and_it_starts_at_rest(folder):
 
 
 def test_it_falls_and_spreads_and_keeps_its_body(folder):
-    frames = sorted((folder / "frames" / "splats").glob("*.ply"))
+    frames = frame_files(folder)
     cell = load_asset(folder).grid.spacing
-    shown = (read_splats(path).gaussians for path in (frames[0], frames[-1]))
+    shown = (read_frame(path).gaussians for path in (frames[0], frames[-1]))
     first, last = (without_skin(gaussians, cell).means for gaussians in shown)
     assert len(frames) == 8 and len(last) == pytest.approx(len(first), rel=0.01)
     assert np.percentile(last[:, 2], 95) < np.percentile(first[:, 2], 95) - 0.1

@@ -11,7 +11,6 @@ from fluidlift.cli import DONE, FAILED, REJECTED, WITH_WARNINGS, main
 from fluidlift.config import build_config
 from fluidlift.io.asset_folder import load_asset, read_manifest
 from fluidlift.io.force_file import read_filmed
-from fluidlift.io.ply import read_splats
 from fluidlift.io.scene import SceneEdits
 from fluidlift.io.video import read_clip
 from fluidlift.look.rasterize import render
@@ -23,6 +22,7 @@ from fluidlift.scene.build import edited_scene, scene_of
 from fluidlift.scene.footage import footage_of
 from fluidlift.scene.settings import SceneSettings
 from fluidlift.scene.simulator import simulator_of
+from fluidlift.scene.splat_files import frame_files, read_frame
 from fluidlift.types import CellType, Label
 from fluidlift.validate import validate_asset
 
@@ -116,13 +116,19 @@ def test_the_camera_of_the_asset_sees_the_body_where_the_video_shows_it(asset, f
 
 
 def splats(made, k):
-    return read_splats(made.folder / "frames" / "splats" / f"{1001 + k}.ply")
+    return read_frame(made.folder / "frames" / "splats" / f"{1001 + k}.flsp")
+
+
+def lost(frame):
+    """m, that packing moves a splat along an axis at most: a hundredth of the median smallest axis, which comes back to
+    a half of a thousandth."""
+    return 0.01 * np.median(frame.gaussians.scales.min(axis=1)) * 1.0005
 
 
 def test_the_particles_of_the_first_frame_are_the_rest_body_without_what_lies_behind_the_outlet(made, asset):
     first = splats(made, 0)
-    particle = first.extras["id"].astype(int) % 2 == 0  # odd ones are the skin's
-    ids = first.extras["id"].astype(int)[particle] // 2
+    particle = first.ids.astype(int) % 2 == 0  # odd ones are the skin's
+    ids = first.ids.astype(int)[particle] // 2
     assert (np.diff(ids) > 0).all() and ids[-1] < len(asset.rest)
     gone = np.setdiff1d(np.arange(len(asset.rest)), ids)
     cells = asset.grid.cell_of(asset.rest.means[gone])
@@ -130,7 +136,7 @@ def test_the_particles_of_the_first_frame_are_the_rest_body_without_what_lies_be
     # the simulator pushes those that begin inside a wall out of it: few, and by less than a cell
     rest = asset.rest.select(ids)
     moved = np.linalg.norm(first.gaussians.means[particle] - rest.means, axis=1)
-    assert (moved > 0).mean() < 0.1
+    assert (moved > np.sqrt(3) * lost(first)).mean() < 0.1
     assert moved.max() < asset.grid.spacing
 
 
@@ -151,13 +157,13 @@ def test_the_files_hold_what_was_simulated(made, finished, asset):
     for _ in range(2):
         simulator.advance(asset.interval)
     p, shown = simulator.particles, splats(made, 2)
-    order, particle = np.argsort(p.ids), np.flatnonzero(shown.extras["id"] % 2 == 0)  # odd ones are the skin's
-    written = particle[np.argsort(shown.extras["id"][particle])]
-    np.testing.assert_array_equal(shown.extras["id"][written], 2 * p.ids[order])
-    # the same program on the same numbers; sums over particles may be taken in another order by another thread
-    tolerance = 1e-4 * asset.grid.spacing
+    order, particle = np.argsort(p.ids), np.flatnonzero(shown.ids % 2 == 0)  # odd ones are the skin's
+    written = particle[np.argsort(shown.ids[particle])]
+    np.testing.assert_array_equal(shown.ids[written], 2 * p.ids[order])
+    # the same program on the same numbers, packed; sums over particles may be taken in another order by another thread
+    tolerance = lost(shown) + 1e-4 * asset.grid.spacing
     np.testing.assert_allclose(shown.gaussians.means[written], p.positions[order], atol=tolerance)
-    velocity = np.stack([shown.extras[k] for k in ("vx", "vy", "vz")], axis=-1)
+    velocity = shown.velocities
     np.testing.assert_allclose(velocity[written], p.velocities[order], atol=1e-3 * np.abs(p.velocities).max())
 
 
@@ -178,13 +184,13 @@ def test_an_edited_asset_becomes_a_scene_without_a_file(made, asset, tmp_path):
 
 
 def test_every_frame_has_a_splat_per_particle(made, finished):
-    counts = [int((splats(made, k).extras["id"] % 2 == 0).sum()) for k in range(FRAMES)]
+    counts = [int((splats(made, k).ids % 2 == 0).sum()) for k in range(FRAMES)]
     assert counts == finished.simulation.count.tolist()
 
 
 def test_particles_keep_their_ids_and_move_with_the_stream(made, asset):
     before, after = splats(made, 0), splats(made, 3)
-    common, i, j = np.intersect1d(before.extras["id"], after.extras["id"], return_indices=True)
+    common, i, j = np.intersect1d(before.ids, after.ids, return_indices=True)
     assert len(common) > 0.5 * len(before.gaussians)  # the others have left through the outlet
     shift = np.median(after.gaussians.means[j] - before.gaussians.means[i], axis=0)
     assert shift[0] > 0.1 * 3 * asset.interval * np.linalg.norm(asset.parameters.inflow_velocity)
@@ -286,7 +292,7 @@ def test_an_edited_duration_is_simulated_and_nothing_before_it_runs_again(made, 
     run(made, copy, "--json", "--set", "show.usd=false", quick=quick)
     stages = outcome(capsys)["stages"]
     assert [name for name in STAGES if not stages[name]["cached"]] == ["simulate", "show"]
-    assert len(list((copy / "frames" / "splats").glob("*.ply"))) == 4  # 0.16 s at 25 per second
+    assert len(frame_files(copy)) == 4  # 0.16 s at 25 per second
 
 
 def test_a_given_body_replaces_the_embedded_generator(made, tmp_path, hasty, asset):
@@ -362,12 +368,12 @@ def failed(folder):
 
 
 def test_a_missing_frame_is_found(copy):
-    (copy / "frames" / "splats" / "1004.ply").unlink()
+    (copy / "frames" / "splats" / "1004.flsp").unlink()
     assert "splat frames are complete" in failed(copy)
 
 
 def test_a_damaged_frame_is_found(copy):
-    middle = copy / "frames" / "splats" / "1002.ply"
+    middle = copy / "frames" / "splats" / "1002.flsp"
     middle.write_bytes(middle.read_bytes()[:1000])
     assert failed(copy) == ["every frame can be read"]
 

@@ -9,12 +9,12 @@ import pytest
 
 from fluidlift.cli import DONE, FAILED, REJECTED, WITH_WARNINGS, main
 from fluidlift.errors import FluidliftError
-from fluidlift.io import ply
+from fluidlift.evaluate import arrays_of_run
 from fluidlift.io.asset_folder import load_asset, read_manifest
-from fluidlift.io.ply import read_splats
 from fluidlift.io.video import read_clip
 from fluidlift.physics.stepping import ParticleSimulator
-from fluidlift.scene import simulator
+from fluidlift.scene import simulator, splat_files
+from fluidlift.scene.splat_files import frame_files, read_frame
 
 FRAMES = 6
 WELL = (DONE, WITH_WARNINGS)
@@ -41,7 +41,7 @@ def sim(folder, *options):
 
 
 def frames(folder):
-    return {p.name: p.read_bytes() for p in sorted((folder / "frames" / "splats").glob("*.ply"))}
+    return {p.name: p.read_bytes() for p in frame_files(folder)}
 
 
 @pytest.fixture
@@ -94,7 +94,7 @@ def test_a_simulation_that_was_stopped_goes_on_bit_for_bit(asset, made, monkeypa
         stop_at(patch, 5, KeyboardInterrupt())  # on the way to the sixth frame; checkpoints after 2 and 4
         assert sim(asset, "--restart", "--checkpoint-every", "2") == FAILED
     assert "goes on from there" in capsys.readouterr().err
-    assert list(frames(asset)) == [f"{1001 + k}.ply" for k in range(5)]
+    assert list(frames(asset)) == [f"{1001 + k}.flsp" for k in range(5)]
     calls = []
     advance = ParticleSimulator.advance
     monkeypatch.setattr(ParticleSimulator, "advance", lambda self, t: (calls.append(t), advance(self, t))[1])
@@ -104,7 +104,7 @@ def test_a_simulation_that_was_stopped_goes_on_bit_for_bit(asset, made, monkeypa
 
 
 def test_a_kill_while_a_frame_is_written_leaves_what_can_be_continued(asset, made, monkeypatch):
-    write = ply.write_gaussians
+    write = splat_files.write_packed
 
     def killed(path, *args, **options):
         if path.stem == "1005":
@@ -112,7 +112,7 @@ def test_a_kill_while_a_frame_is_written_leaves_what_can_be_continued(asset, mad
         return write(path, *args, **options)
 
     with monkeypatch.context() as patch:
-        patch.setattr(ply, "write_gaussians", killed)
+        patch.setattr(splat_files, "write_packed", killed)
         with pytest.raises(SystemExit):
             sim(asset, "--restart", "--checkpoint-every", "2")
     assert sim(asset, "--resume") in WELL
@@ -165,7 +165,7 @@ def test_without_resume_another_scene_starts_at_the_first_frame(asset, made, adv
     (asset / "scene.yaml").write_text("parameters: {kinematic_viscosity: 0.01}\nduration: 0.12\n")
     assert sim(asset) in WELL
     assert len(advances) == 2
-    assert frames(asset)["1003.ply"] != frames(made.folder)["1003.ply"]
+    assert frames(asset)["1003.flsp"] != frames(made.folder)["1003.flsp"]
     simulation = read_manifest(asset)["simulation"]
     assert simulation["parameters"]["kinematic_viscosity"] == 0.01
     # the frames of the first scene are gone, although its result is still in the cache
@@ -173,28 +173,28 @@ def test_without_resume_another_scene_starts_at_the_first_frame(asset, made, adv
     advances.clear()
     assert sim(asset, "--duration", "0.12") in WELL
     assert len(advances) == 2
-    assert frames(asset)["1003.ply"] == frames(made.folder)["1003.ply"]
+    assert frames(asset)["1003.flsp"] == frames(made.folder)["1003.flsp"]
 
 
 def test_twice_the_frames_per_second_show_the_same_motion_in_between(asset, made):
     assert sim(asset, "--fps", "50", "--duration", "0.24") in WELL
     slow, fast = sorted(frames(made.folder)), sorted(frames(asset))
     assert len(fast) == 2 * len(slow)
-    splats = [read_splats(folder / "frames" / "splats" / name) for folder, name in
+    splats = [read_frame(folder / "frames" / "splats" / name) for folder, name in
               ((made.folder, slow[4]), (asset, fast[8]))]  # fmt: skip
-    _, i, j = np.intersect1d(*(s.extras["id"] for s in splats), return_indices=True)
+    _, i, j = np.intersect1d(*(s.ids for s in splats), return_indices=True)
     apart = np.linalg.norm(splats[0].gaussians.means[i] - splats[1].gaussians.means[j], axis=1)
     # other substeps, and turbulence that they seed: most particles stay within half a cell of each other
     assert np.median(apart) < 0.5 * load_asset(asset).grid.spacing
     assert read_manifest(asset)["simulation"]["frame_interval"] == pytest.approx(0.02)
-    assert not (asset / "work" / "evaluation.npz").exists()  # its pictures are of other times
+    assert arrays_of_run(asset, read_manifest(asset)) == {}  # its pictures are of other times
 
 
 def test_a_river_is_made_longer_downstream(asset, made):
     assert sim(asset, "--extend-downstream", "1.0", "--duration", "0.12") in WELL
     before, grid = load_asset(made.folder).grid, read_manifest(asset)["simulation"]["grid"]
     assert grid["shape"][0] == before.shape[0] + int(np.ceil(1.0 / before.spacing))
-    last = read_splats(asset / "frames" / "splats" / "1003.ply").gaussians.means
+    last = read_frame(asset / "frames" / "splats" / "1003.flsp").gaussians.means
     assert (last[:, 0] > before.high[0] + 0.8).sum() > 50
     assert main(["validate", str(asset)]) == DONE
     # the asset itself stays as long as the clip shows it
@@ -209,9 +209,9 @@ def test_an_asset_without_its_work_folder_is_simulated_too(asset, made):
     report = (made.folder / "report.html").read_bytes()
     assert (asset / "report.html").read_bytes() == report
     for name, data in frames(made.folder).items():  # the same motion; the look has no shading to stay in place
-        one, two = read_splats(made.folder / "frames/splats" / name), read_splats(asset / "frames/splats" / name)
+        one, two = read_frame(made.folder / "frames/splats" / name), read_frame(asset / "frames/splats" / name)
         # the skin takes its look from other places where no clip says what stands still
-        means = [s.gaussians.means[s.extras["id"] % 2 == 0] for s in (one, two)]
+        means = [s.gaussians.means[s.ids % 2 == 0] for s in (one, two)]
         np.testing.assert_array_equal(*means, err_msg=f"{name} {len(data)}")
 
 

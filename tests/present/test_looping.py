@@ -8,25 +8,23 @@ import pytest
 
 from fluidlift.config import build_config
 from fluidlift.errors import InputRejected
-from fluidlift.io.frames import FIRST_FRAME
+from fluidlift.io.frames import FIRST_FRAME, FluidFrame
 from fluidlift.look.rasterize import render
 from fluidlift.pipeline.resimulate import resimulate
 from fluidlift.pipeline.settings import SimulateSettings, taken
 from fluidlift.pipeline.stages.simulate import simulate
 from fluidlift.pipeline.work import Work
 from fluidlift.present.looping import (
-    SplatFrame,
     blended,
     blended_poses,
     changed_over,
     faded,
     patch_size,
-    read_frame,
     seam,
 )
 from fluidlift.scene.build import LOOP_FADE, loop_overlap
 from fluidlift.scene.edits import EditSession
-from fluidlift.scene.splat_files import checkpoint_file, frame_file
+from fluidlift.scene.splat_files import checkpoint_file, frame_file, frame_files, read_frame
 from fluidlift.types import CellType, FluidParameters, Gaussians
 
 
@@ -39,7 +37,7 @@ def frame(ids, opacity=0.9, shift=0.0):
     ids = np.asarray(ids)
     means = np.stack([0.1 * ids + shift, 0.4 + 0.0 * ids, 0.2 + 0.0 * ids], axis=1)
     gaussians = Gaussians.isotropic(means, 0.05, np.full((len(ids), 3), 0.7), opacity)
-    return SplatFrame(gaussians, ids, np.zeros((len(ids), 3), np.float32))
+    return FluidFrame(gaussians, ids, np.zeros((len(ids), 3), np.float32))
 
 
 @pytest.mark.parametrize("share", [0.0, 0.2, 0.5, 0.9, 1.0])
@@ -54,7 +52,7 @@ def test_two_bodies_that_fade_into_each_other_let_through_as_much_light_as_one(s
         for means in (loose, sheet):
             n = len(means)
             gaussians = Gaussians.isotropic(means, 0.03, np.full((n, 3), 0.7), rng.uniform(0.7, 0.96, n))
-            yield SplatFrame(gaussians, np.arange(n), np.zeros((n, 3), np.float32))
+            yield FluidFrame(gaussians, np.arange(n), np.zeros((n, 3), np.float32))
 
     def opacity(gaussians):
         return render(gaussians, camera).alpha[16:32, 24:40].mean()
@@ -105,7 +103,7 @@ def test_what_is_shown_while_it_fades_stays_about_as_much_as_one_body_without_op
     def body():
         means = rng.uniform(0, [2.0, 0.6, 0.2], (5000, 3))
         gaussians = Gaussians.isotropic(means, 0.02, np.full((5000, 3), 0.5), 0.9)
-        return SplatFrame(gaussians, np.arange(5000), np.zeros((5000, 3), np.float32))
+        return FluidFrame(gaussians, np.arange(5000), np.zeros((5000, 3), np.float32))
 
     head, tail = body(), body()
     patch = patch_size(head.gaussians.means)
@@ -139,7 +137,7 @@ def test_the_seam_of_a_loop_is_no_larger_than_the_clips_own_steps(tmp_path, chan
     assert result.frames == 20
     assert result.warnings == ()
     assert {len(v) for v in (result.volume, result.leak, result.count, result.poses)} == {20}
-    assert len(list((tmp_path / "loop" / "frames" / "splats").glob("*.ply"))) == 20
+    assert len(frame_files(tmp_path / "loop")) == 20
     across, mean, largest = seam(pictures(tmp_path / "loop", 20, camera))
     before, usual, _ = seam(pictures(tmp_path / "plain", 20, camera))
     assert across < 1.2 * usual  # the frame that follows the last one is the next of the simulation: a step like any
@@ -187,7 +185,7 @@ def test_a_vessel_that_fills_has_no_loop_and_keeps_its_frames(tmp_path, channel)
     result = simulate(channel(12, overlap=4, cell_types=cells), config, folder=tmp_path / "loop")
     assert any("not closed" in w and "more fluid at its end" in w for w in result.warnings)
     simulate(channel(12, cell_types=cells), config, folder=tmp_path / "plain")
-    files = [sorted((tmp_path / n / "frames" / "splats").glob("*.ply")) for n in ("loop", "plain")]
+    files = [frame_files(tmp_path / n) for n in ("loop", "plain")]
     assert len(files[0]) == 12
     assert [p.read_bytes() for p in files[0]] == [p.read_bytes() for p in files[1]]
 

@@ -20,6 +20,7 @@ from fluidlift.io.scene import SCENE_TEMPLATE, SceneEdits, read_edits
 from fluidlift.numerics.solid_mesh import box_mesh, moments
 from fluidlift.scene import edit_history
 from fluidlift.scene.edits import Add, EditSession, Remove, Set
+from fluidlift.scene.splat_files import frame_files
 from fluidlift.scene.substances import SUBSTANCES
 from fluidlift.types import (
     CellType,
@@ -547,7 +548,7 @@ def test_by_hand_by_command_in_python_and_in_the_viewer_give_the_same_simulation
         rest = edits.parameters, edits.duration, edits.inflow, edits.look, edits.loop
         plain.append((rest, [repr(x) for o in edits.obstacles for x in o.plain()], scene.parts, scene.frames))
         simulate(scene, taken(SimulateSettings, JobConfig().simulate), folder=folder)
-        shown.append([p.read_bytes() for p in sorted((folder / "frames" / "splats").glob("*.ply"))])
+        shown.append([p.read_bytes() for p in frame_files(folder)])
     assert plain[0] == plain[1] == plain[2] == plain[3]
     assert len(shown[0]) == 3 and shown[0] == shown[1] == shown[2] == shown[3]
 

@@ -9,7 +9,7 @@ from fluidlift.scene.forecast import ahead, in_time
 def folder(tmp_path):
     (tmp_path / "frames" / "splats").mkdir(parents=True)
     for number in range(1001, 1041):
-        (tmp_path / "frames" / "splats" / f"{number}.ply").write_bytes(b"ply")
+        (tmp_path / "frames" / "splats" / f"{number}.flsp").write_bytes(b"FLSP")
     return tmp_path
 
 
@@ -19,13 +19,13 @@ def manifest(seconds, frames=40):
 
 def test_a_shorter_simulation_says_what_it_takes_the_place_of(folder):
     told = ahead(folder, {}, 5, 0.04, 100_000)
-    assert told == "simulating 5 frames (0.2 s) in place of the 40 on disk: about 42 MB of disk"
+    assert told == "simulating 5 frames (0.2 s) in place of the 40 on disk: about 9 MB of disk"
     assert "in place of" not in ahead(folder, {}, 40, 0.04, 100_000)
 
 
 def test_the_time_of_the_last_simulation_says_how_long_the_next_takes(folder):
     told = ahead(folder, manifest(80.0), 400, 0.04, 100_000)
-    assert told.endswith("(16 s): about 3360 MB of disk, and 13 min if each takes as long as the last time")
+    assert told.endswith("(16 s): about 720 MB of disk, and 13 min if each takes as long as the last time")
 
 
 @pytest.mark.parametrize("found", [{}, manifest(None), manifest("long"), manifest(1.0, 0), manifest(0.0), manifest(-1)])

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from fluidlift.io.kept_values import recalled
 from fluidlift.pipeline.runner import Runner
 from fluidlift.pipeline.stages.correct import correct, nothing_found
-from fluidlift.scene.recall import recalled
 from fluidlift.seams import Silence
 from fluidlift.types import Label, PixelFlow, VideoClip
 from fluidlift.types.hints import Region

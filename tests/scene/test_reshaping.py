@@ -16,7 +16,6 @@ from fluidlift.physics.stepping import ParticleSimulator
 from fluidlift.physics.terrain_edit import Rotate
 from fluidlift.pipeline.settings import SimulateSettings, taken
 from fluidlift.pipeline.stages.simulate import simulate
-from fluidlift.present.looping import read_frame
 from fluidlift.scene.reshaping import (
     changed_parameters,
     in_words,
@@ -26,7 +25,7 @@ from fluidlift.scene.reshaping import (
     with_terrain,
 )
 from fluidlift.scene.simulator import simulator_of
-from fluidlift.scene.splat_files import frame_file
+from fluidlift.scene.splat_files import frame_file, frame_files, read_frame
 from fluidlift.types import FluidParameters, TriangleMesh
 
 CONFIG = taken(SimulateSettings, build_config().simulate)
@@ -182,4 +181,4 @@ def test_an_obstacle_in_the_place_of_all_of_the_fluid_is_refused(channel, tmp_pa
     whole = Obstacle("block", box_mesh(np.full(3, 4.0)), line="scene.yaml, line 7")
     with pytest.raises(InputRejected, match="line 7: obstacle 'block' in the place of all of the fluid"):
         simulate(channel(6, obstacles=(whole,)), CONFIG, folder=tmp_path)
-    assert not list(tmp_path.rglob("*.ply"))
+    assert not frame_files(tmp_path)

@@ -59,16 +59,15 @@ def tank(cells=(12, 8, 8), spacing=0.05) -> FluidAsset:
 def write_tank(folder: Path) -> Path:
     """The tank as a finished asset."""
     from fluidlift.io.asset_folder import save_asset, update_manifest
-    from fluidlift.io.ply import write_gaussians
     from fluidlift.pipeline.preview import PreviewSize, coarse_asset, preview_frames, preview_scene
+    from fluidlift.scene.splat_files import write_frame
 
     asset = tank()
     save_asset(folder, asset)
     scene = preview_scene(coarse_asset(asset, PreviewSize()), folder, {}, FRAMES)
     for frame in preview_frames(scene):
-        path = folder / "frames" / "splats" / f"{1001 + frame.number}.ply"
         ids = np.arange(len(frame.gaussians))
-        write_gaussians(path, frame.gaussians, ids=ids, velocities=frame.velocities)
+        write_frame(folder, 1001 + frame.number, frame.gaussians, ids=ids, velocities=frame.velocities)
     update_manifest(folder, simulation={"frames": FRAMES, "frame_interval": INTERVAL})
     return folder
 

@@ -20,7 +20,7 @@ from fluidlift.viewer.saved import SavedFrames
 def test_frames_are_counted_and_missing_ones_named(tank_folder):
     found = SavedFrames(tank_folder)
     assert (found.count, found.interval, found.missing()) == (8, 0.04, [])
-    (tank_folder / "frames" / "splats" / "1003.ply").unlink()
+    (tank_folder / "frames" / "splats" / "1003.flsp").unlink()
     assert found.missing() == [1003]
 
 

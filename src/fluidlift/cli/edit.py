@@ -14,6 +14,7 @@ from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.messages import as_plain, from_plain
 
 if TYPE_CHECKING:
+    from fluidlift.messages import Notice
     from fluidlift.scene.edit_history import Edit as Done
     from fluidlift.scene.edits import Change, EditSession
 
@@ -173,11 +174,11 @@ def _simulate(session: EditSession, command: Edit) -> None:
 
 def _outcome(session: EditSession, command: Edit, edit: Done | None) -> dict[str, Any]:
     """All that is to be told, as plain values."""
-    stale, warnings = session.standing()
+    stale, warnings = _standing(session, command)
     told = {
         "asset": str(session.folder),
         "edit": None if edit is None else edit.to_dict(),
-        "stale": sorted(stale),
+        "stale": None if stale is None else sorted(stale),
         **as_plain(warnings),
         "can_undo": session.can_undo,
         "can_redo": session.can_redo,
@@ -188,6 +189,14 @@ def _outcome(session: EditSession, command: Edit, edit: Done | None) -> dict[str
     if command.history:
         told["history"] = [e.to_dict() | {"undone": e.undone} for e in session.history()]
     return told
+
+
+def _standing(session: EditSession, command: Edit) -> tuple[set[str] | None, list[Notice]]:
+    """What the frames do not show, and what is odd. What is only looked at, or was there before, is not built for that:
+    None where the answer is not in memory."""
+    shown = command.diff or command.history or command.undo or command.redo
+    asks = command.simulate or command.reset or bool(command.material or command.remove or command.add or command.set)
+    return (session.known_standing(), []) if shown and not asks else session.standing()
 
 
 def _lines(session: EditSession, command: Edit, told: dict[str, Any], nothing: bool) -> list[str]:
@@ -201,8 +210,10 @@ def _lines(session: EditSession, command: Edit, told: dict[str, Any], nothing: b
     return lines + [f"warning: {text}" for text in told["warnings"]] + _next(session.folder, told["stale"])
 
 
-def _next(folder: Path, stale: list[str]) -> list[str]:
+def _next(folder: Path, stale: list[str] | None) -> list[str]:
     """What has become stale, and what to run."""
+    if stale is None:
+        return [f"whether the frames on disk show this scene: fluidlift edit {_quoted(folder)}"]
     if "simulate" in stale:
         return ["the frames on disk show another scene; next:", f"  fluidlift sim {_quoted(folder)}"]
     if "look" in stale:

@@ -10,7 +10,8 @@ import numpy as np
 
 from fluidlift.errors import FluidliftError
 from fluidlift.evaluate.alignment import score_aligned
-from fluidlift.evaluate.case import Case, read_arrays, read_case, read_json
+from fluidlift.evaluate.case import Case, read_case, read_json
+from fluidlift.evaluate.of_run import arrays_of_run
 from fluidlift.evaluate.planar import (
     Arrays,
     picked,
@@ -112,22 +113,20 @@ def evaluate_asset(folder: Path, truth: Path, *, rows: tuple[int, int] | None = 
     """Score an asset folder against a case folder.
 
     Args:
-        folder: the asset; its `work/evaluation.npz` holds the arrays of the run (see `evaluate_arrays`).
+        folder: the asset; its folder `work` holds the arrays of the run (`arrays_of_run`).
         truth: the case; see `read_case`.
         rows: score the flow only on these picture rows [first, last) of the truth.
 
     Raises:
-        InputRejected: the asset or the case cannot be read. A missing evaluation.npz only leaves figures out.
+        InputRejected: the asset or the case cannot be read. A missing folder `work` only leaves figures out.
     """
     from fluidlift.io.asset_folder import load_asset
-    from fluidlift.io.asset_paths import asset_file
 
     folder = Path(folder)
     case = read_case(Path(truth))
     asset = load_asset(folder)
-    stored = asset_file(folder, "work/evaluation.npz")
-    arrays = read_arrays(stored) if stored.is_file() else {}
     manifest = read_json(folder / "manifest.json")
+    arrays = arrays_of_run(folder, manifest)
     frames, _ = picked(arrays, "resim_frames", 4, 3)
     video = None
     if frames is not None:

@@ -11,8 +11,8 @@ import numpy as np
 from fluidlift.errors import InputRejected
 from fluidlift.export.job import ExportRequest, Outcome
 from fluidlift.io.frames import FIRST_FRAME
+from fluidlift.io.kept_values import recalled
 from fluidlift.io.output_files import cleared, numbered
-from fluidlift.scene.recall import recalled
 from fluidlift.seams import Progress
 from fluidlift.types import FluidAsset, Label, PinholeCamera
 from fluidlift.types.stages import Flow, Motion, Segmentation

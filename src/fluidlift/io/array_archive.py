@@ -13,7 +13,7 @@ import tempfile
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
@@ -35,6 +35,10 @@ _MAX_ARRAYS = 2**30
 """bytes of all arrays of a part of an asset"""
 _IN_MEMORY = 64 * 2**20
 """bytes of an array; larger ones of an npz are unpacked into a file without a name, and mapped"""
+_UNPACKED = 4
+"""times the size of a file of packed arrays that they may take, if that is more than `_MAX_ARRAYS`"""
+_TRIED = 2**16
+"""bytes of an array that tell whether packing pays"""
 _PIECE = 2**20
 _HEADS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
@@ -157,6 +161,43 @@ def _pieces(stream: IO[bytes], size: int, name: str) -> Iterator[bytes]:
         yield piece
     while stream.read(_PIECE):
         pass
+
+
+def write_packed_arrays(file: IO[bytes], arrays: Mapping[str, np.ndarray]) -> None:
+    """An npz whose arrays are packed where that makes them smaller: pictures and masks, and not the noise of most
+    floats. What `most_unpacked` allows is kept to.
+
+    Args:
+        file: at its beginning.
+        arrays: of numbers, by their names.
+    """
+    total = sum(np.asarray(a).nbytes for a in arrays.values())
+    for packed in (True, False):
+        file.seek(0)
+        file.truncate()
+        with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED, compresslevel=1) as archive:
+            for name, array in arrays.items():
+                member = zipfile.ZipInfo(f"{name}.npy")
+                member.compress_type = zipfile.ZIP_DEFLATED if packed and packs_to(array, 0.75) else zipfile.ZIP_STORED
+                with archive.open(member, "w", force_zip64=True) as stream:
+                    np.lib.format.write_array(stream, np.asarray(array), allow_pickle=False)
+        if total <= most_unpacked(file.tell()):
+            return
+
+
+def most_unpacked(size: int) -> int:
+    """Bytes that the arrays of a file of `write_packed_arrays` may take in all."""
+    return max(_UNPACKED * size, _MAX_ARRAYS)
+
+
+def packs_to(array: np.ndarray, share: float) -> bool:
+    """Whether deflate leaves less than a share of an array, tried on a part from its middle."""
+    array = np.asarray(array)
+    flat = array.reshape(-1) if array.flags.c_contiguous else array.ravel()
+    wanted = _TRIED // max(array.itemsize, 1)
+    start = max((flat.size - wanted) // 2, 0)
+    part = flat[start : start + wanted].tobytes()
+    return len(zlib.compress(part, 1)) < share * len(part)
 
 
 def read_arrays(path: Path, needed: Sequence[str]) -> dict[str, np.ndarray]:

@@ -26,7 +26,7 @@ import numpy as np
 from jsonschema.exceptions import best_match
 
 from fluidlift.errors import InputRejected
-from fluidlift.io.array_archive import read_arrays
+from fluidlift.io.array_archive import read_arrays, write_packed_arrays
 from fluidlift.io.asset_paths import asset_file, require_no_links
 from fluidlift.io.atomic import (
     atomic_path,
@@ -366,7 +366,7 @@ def _write_terrain(folder: Path, asset: FluidAsset) -> None:
     }
     arrays |= {k: v for k in ("colors", "uv", "texture") if (v := getattr(terrain.mesh, k)) is not None}
     with atomic_write(asset_file(folder, FILES["terrain"])) as file:
-        np.savez(file, **arrays)
+        write_packed_arrays(file, arrays)
     glb = asset_file(folder, FILES["terrain_mesh"])
     if len(terrain.mesh.faces):
         from fluidlift.io.export_mesh import write_glb  # trimesh is slow to import
@@ -389,7 +389,7 @@ def _read_terrain(path: Path) -> Terrain:
 def _write_velocity(folder: Path, asset: FluidAsset) -> None:
     v = asset.velocity
     with atomic_write(asset_file(folder, FILES["velocity"])) as file:
-        np.savez(file, u=v.u, v=v.v, w=v.w, cell_types=asset.cell_types)
+        write_packed_arrays(file, {"u": v.u, "v": v.v, "w": v.w, "cell_types": asset.cell_types})
     fluid = np.isin(asset.cell_types, (CellType.FLUID, CellType.INFLOW, CellType.OUTFLOW))
     density = VolumeGrid("density", fluid.astype(np.float32), asset.grid.spacing, asset.grid.origin)
     write_vdb(asset_file(folder, FILES["velocity_volume"]), [density, velocity_grid(v, asset.grid, active=fluid)])

@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from fluidlift.io.stage_cache import load_stage, owner_of
 from fluidlift.io.stage_codec import Mistyped, unpacked
+from fluidlift.types.stages import Fit, Flow, Geometry, Motion, Read, Refined, Segmentation
 
 T = TypeVar("T")
+
+OF_CLIP: dict[str, type] = {
+    "read": Read, "flow": Flow, "segment": Segmentation, "geometry": Geometry, "refine": Refined, "motion": Motion,
+    "fit": Fit,
+}  # fmt: skip
+"""stages that need the clip, and what they leave"""
+CORRECTED = {"segment": "correct"}
+"""stages whose value is replaced by that of another where that was run: labels with a person's regions over them"""
 
 
 def kept_value(folder: Path, name: str, key: str, kind: type[T]) -> tuple[T, float] | None:
@@ -28,3 +37,27 @@ def last_value(folder: Path, name: str, kind: type[T]) -> T | None:
     key = owner_of(folder, name)
     found = None if key is None else kept_value(folder, name, key, kind)
     return None if found is None else found[0]
+
+
+def recalled(folder: Path, manifest: dict[str, Any], name: str) -> Any:
+    """The value of one stage of `OF_CLIP` that an asset was made from; None where it is gone."""
+    keys = stage_keys(manifest)
+    stage = that_counts(name, keys)
+    found = None if stage not in keys else kept_value(folder, stage, keys[stage], OF_CLIP[name])
+    return None if found is None else found[0]
+
+
+def that_counts(name: str, keys: dict[str, str]) -> str:
+    """The stage, of those with a key, whose value counts as that of a stage."""
+    return CORRECTED[name] if CORRECTED.get(name) in keys else name
+
+
+def stage_keys(manifest: dict[str, Any]) -> dict[str, str]:
+    """Keys of the cached values that an asset was made from; those that are none are left out."""
+    keys = manifest.get("provenance", {}).get("stages", {})
+    return {n: k for n, k in keys.items() if is_key(k)} if isinstance(keys, dict) else {}
+
+
+def is_key(text: Any) -> bool:
+    """Whether this can be the key of a value."""
+    return isinstance(text, str) and len(text) == 64 and text.isalnum() and text.isascii()

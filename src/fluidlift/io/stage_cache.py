@@ -1,9 +1,9 @@
 """Results of stages under work/<stage>/<key>.npz and .json, so that a killed or repeated run resumes.
 
 The JSON file is written last and names the arrays: without it, or when anything does not match, there is no cache.
-Arrays are not compressed, because writing must cost little beside the stage itself.
+Arrays are packed where a glance says that it pays, and as fast as it goes: writing must cost little beside the stage.
 
-Arrays that grow with the clip (frames, flow, labels) lie in files of their own, <key>.<name>.npy. A stage writes them
+Arrays that grow with the clip (frames, flow) lie in files of their own, <key>.<name>.npy. A stage writes them
 part by part through `Scratch`, and they are mapped, not read, when they come back: memory does not grow with the clip.
 Their size and header are checked, their content is not (that would mean to read them).
 """
@@ -23,7 +23,15 @@ from typing import Any
 import numpy as np
 
 from fluidlift.errors import InputRejected, require
-from fluidlift.io.array_archive import DAMAGE, array_in, mapped_array, members_of
+from fluidlift.io.array_archive import (
+    DAMAGE,
+    array_in,
+    mapped_array,
+    members_of,
+    most_unpacked,
+    packs_to,
+    write_packed_arrays,
+)
 from fluidlift.io.asset_paths import asset_file
 from fluidlift.io.atomic import (
     atomic_write,
@@ -43,6 +51,8 @@ WORK_MARKER = ".fluidlift"
 
 _KINDS = "fiubcU"
 """of arrays, as NumPy's `dtype.kind`"""
+_MOST_PACKED = 128 * 2**20
+"""bytes of an array that is packed though it has a file of its own"""
 _KEPT = 2
 """results kept per stage: going back to the settings before is free"""
 
@@ -209,22 +219,32 @@ def save_stage(
     mark_work_folder(folder)
     facts.unlink(missing_ok=True)
     mapped = {} if scratch is None else {n: p for n, a in arrays.items() if (p := scratch.file_of(a)) is not None}
+    mapped = {n: path for n, path in mapped.items() if not _better_packed(arrays[n])}
     require(len(set(mapped.values())) == len(mapped), "one array under two names", "a copy")
     held: dict[str, Any] = {f"{name}.": array for name, array in arrays.items() if name not in mapped}
     with atomic_write(data) as file:
-        np.savez(file, **held)
+        write_packed_arrays(file, held)
     with disk_errors(folder):
         for name, path in mapped.items():
             made = arrays[name]
             if isinstance(made, np.memmap):
                 made.flush()
             os.replace(path, _mapped(data, name))
+    for old in data.parent.glob(f"{key}.*.npy"):  # of a result of the same name that was forced away
+        if old not in {_mapped(data, name) for name in mapped}:
+            old.unlink(missing_ok=True)
     if scratch is not None:
         scratch.discard()
     shapes = {name: [list(np.shape(a)), np.asarray(a).dtype.str] for name, a in arrays.items()}
     known = {"stage": stage, "key": key, "arrays": shapes, "mapped": sorted(mapped), "meta": plain(meta)}
     write_json(facts, known | {"sum": _sum(known)})
     _forget_old(data.parent, key)
+
+
+def _better_packed(array: np.ndarray) -> bool:
+    """Whether an array with a file of its own is packed with the others: what is mostly one number (labels, flow that
+    was filled in), and unpacked within a second. Who has it mapped keeps it: a file lives as long as its last map."""
+    return array.nbytes <= _MOST_PACKED and packs_to(array, 0.4)
 
 
 def _mapped(data: Path, name: str) -> Path:
@@ -245,8 +265,8 @@ def load_stage(folder: Path | str, stage: str, key: str) -> tuple[dict[str, np.n
         known = parse_json(facts.read_bytes())
         if known.pop("sum") != _sum(known):
             return None
-        with zipfile.ZipFile(data) as archive:  # not packed: no larger in memory than on disk
-            members = members_of(archive, data.stat().st_size)
+        with zipfile.ZipFile(data) as archive:
+            members = members_of(archive, most_unpacked(data.stat().st_size))
             arrays = {name.removesuffix("."): array_in(archive, m, _KINDS) for name, m in members.items()}
         for name in known["mapped"]:
             path = _mapped(data, name)

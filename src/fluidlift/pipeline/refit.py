@@ -14,7 +14,7 @@ from fluidlift.config import JobConfig
 from fluidlift.config.of_asset import settings_of
 from fluidlift.errors import InputRejected
 from fluidlift.fit.outcome import in_words
-from fluidlift.io.kept_values import last_value
+from fluidlift.io.kept_values import OF_CLIP, last_value, recalled, stage_keys, that_counts
 from fluidlift.machine import peak_memory_mb
 from fluidlift.messages import Notice, as_plain, from_plain
 from fluidlift.pipeline.fit_request import request_of
@@ -22,7 +22,6 @@ from fluidlift.pipeline.make import fit_figures
 from fluidlift.pipeline.runner import Runner
 from fluidlift.pipeline.stages.fit import fit
 from fluidlift.present import report
-from fluidlift.scene.recall import OF_CLIP, recalled, stage_keys, that_counts
 from fluidlift.seams import Progress, Silence
 from fluidlift.types.stages import Fit, Geometry, Lift, Motion, Read, Segmentation, Shown, Simulation
 

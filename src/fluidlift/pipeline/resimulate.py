@@ -9,12 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from fluidlift.config import JobConfig
 from fluidlift.config.of_asset import SECOND_HALF_SECTIONS, settings_of
 from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.io.asset_paths import asset_file
+from fluidlift.io.kept_values import OF_CLIP, stage_keys, that_counts
 from fluidlift.machine import peak_memory_mb
 from fluidlift.messages import Notice, as_plain, code_of, from_plain
 from fluidlift.pipeline.runner import Runner
@@ -26,7 +25,7 @@ from fluidlift.present.looping import OPEN
 from fluidlift.scene.build import Scene, SimulationRequest, scene_of
 from fluidlift.scene.footage import footage_of
 from fluidlift.scene.forecast import ahead
-from fluidlift.scene.recall import OF_CLIP, rest_frame_of, stage_keys, that_counts
+from fluidlift.scene.recall import rest_frame_of
 from fluidlift.scene.reshaping import slow_edits
 from fluidlift.seams import Progress, Silence
 from fluidlift.types import FluidAsset
@@ -197,9 +196,8 @@ class Played:
 def _finish(
     runner: Runner, scene: Scene, manifest: dict[str, Any], config: JobConfig, lift: Lift | None, played: Played
 ) -> None:
-    """Report, figures for `evaluate`, manifest, which is given as it was before."""
+    """Report, and the manifest, which is given as it was before."""
     from fluidlift.io.asset_folder import update_manifest
-    from fluidlift.io.atomic import atomic_write
 
     folder, done, shown = runner.folder, played.simulation, played.shown
     before = set(from_plain(manifest.get("simulation", {})))
@@ -212,13 +210,8 @@ def _finish(
     runner.warnings[:] = [w for w in from_plain(manifest) if w not in before] + own
     if lift is not None:
         report.write_report(lift, done, shown, folder, config.preset, runner.timings, runner.warnings)
-        figures = asset_file(folder, "work/evaluation.npz")
-        if shown.pictures is not None:
-            held: dict[str, Any] = evaluation_arrays(lift, done, shown)
-            with atomic_write(figures) as stream:
-                np.savez_compressed(stream, **held)
-        else:
-            figures.unlink(missing_ok=True)  # of frames that are no longer there
+    # versions before kept there what `evaluate` takes from the values of the stages, for frames that are gone by now
+    asset_file(folder, "work/evaluation.npz").unlink(missing_ok=True)
     update_manifest(
         folder,
         files={name: file for name, file in PARTS.items() if (folder / file).is_file()},
@@ -242,26 +235,6 @@ def _finish(
         }
         | as_plain(own),
     )  # fmt: skip
-
-
-def evaluation_arrays(lift: Lift, simulation: Simulation, shown: Shown) -> dict[str, np.ndarray]:
-    """What `fluidlift evaluate` compares with a truth; needs the pictures of frames that the clip has, too."""
-    g, m = lift.geometry, lift.motion
-    assert shown.pictures is not None and shown.coverage is not None and shown.flow is not None
-    return {
-        "labels": lift.labels.labels,
-        "front_depth": g.sighted_depth * g.mask,
-        "flow_raw": lift.flow.flow.displacement,
-        "flow_completed": m.completed,
-        "flow_observed": m.observed().view(np.uint8),
-        "resim_flow": shown.flow[:-1],
-        "resim_mask": shown.coverage,
-        "resim_frames": shown.pictures,
-        "first_frame": np.array(g.rest_frame, np.int64),
-        "fit_frames": np.array([m.frames[0], m.frames[-1] + 1] if m.frames else [0, 0]),
-        "particle_volume": simulation.volume,
-        "leak_share": simulation.leak,
-    }
 
 
 def recalled_lift(runner: Runner, manifest: dict[str, Any]) -> Lift | None:

@@ -21,16 +21,17 @@ since those of the beginning live on.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
 
+from fluidlift.io.frames import FIRST_FRAME, FluidFrame
 from fluidlift.messages import Notice
-from fluidlift.types import Gaussians, concatenate
+from fluidlift.scene.splat_files import checkpoint_file, frame_file, read_frame, write_frame
+from fluidlift.types import concatenate
 
 if TYPE_CHECKING:
     from fluidlift.scene.build import Scene
@@ -50,14 +51,6 @@ LEAST = 0.02
 """share of a place from which on what is shown there counts"""
 DRIFT = 0.15
 """share of the fluid's volume that the end may have more or less than the beginning"""
-
-
-class SplatFrame(NamedTuple):
-    """What lies on disk of one frame."""
-
-    gaussians: Gaussians
-    ids: np.ndarray
-    velocities: np.ndarray
 
 
 def faded(opacities: Float[np.ndarray, " n"], weight: float | Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
@@ -93,7 +86,7 @@ def patch_size(points: Float[np.ndarray, "n 3"]) -> float:
     return PATCH * float(np.ptp(np.percentile(points, [2, 98], axis=0), axis=0).max()) if len(points) else np.inf
 
 
-def blended(head: SplatFrame, tail: SplatFrame, share: float, patch: float = np.inf) -> SplatFrame:
+def blended(head: FluidFrame, tail: FluidFrame, share: float, patch: float = np.inf) -> FluidFrame:
     """Two frames over each other.
 
     Args:
@@ -109,12 +102,12 @@ def blended(head: SplatFrame, tail: SplatFrame, share: float, patch: float = np.
         opacities = faded(frame.gaussians.opacities, weight)
         seen = (opacities >= FAINTEST) & (weight >= LEAST)
         shown = replace(frame.gaussians, opacities=opacities).select(seen)
-        parts.append(SplatFrame(shown, frame.ids[seen], frame.velocities[seen]))
+        parts.append(FluidFrame(shown, frame.ids[seen], frame.velocities[seen]))
     first, second = parts
     # an even number: what is even stays a particle, what is odd of the skin
     apart = 2 * (int(max(head.ids.max(initial=-1), tail.ids.max(initial=-1))) // 2 + 1)
     both = 0.0 < share < 1.0
-    return SplatFrame(
+    return FluidFrame(
         concatenate([first.gaussians, second.gaussians]),
         np.concatenate([first.ids, second.ids + apart * both]),
         np.concatenate([first.velocities, second.velocities]),
@@ -130,7 +123,7 @@ def blended_poses(head: Float[np.ndarray, "b 7"], tail: Float[np.ndarray, "b 7"]
     return np.concatenate([(1.0 - share) * head[:, :3] + share * tail[:, :3], turn], axis=1)
 
 
-def close_loop(scene: Scene, history: History, file: Callable[[int], Path], checkpoint: Path) -> list[Notice]:
+def close_loop(scene: Scene, history: History, folder: Path) -> list[Notice]:
     """Fade the end of a simulation into its beginning, on disk; why it was not done, or nothing.
 
     A fluid that is not the same at both ends is left as it was simulated: a vessel that fills has no loop, and two
@@ -140,20 +133,19 @@ def close_loop(scene: Scene, history: History, file: Callable[[int], Path], chec
     Args:
         scene: with an `overlap`.
         history: of all frames; brought down to those that stay.
-        file: of each frame.
-        checkpoint: of the simulation.
+        folder: of the asset, where the frames and the checkpoint are.
     """
     count, fade = scene.frames, scene.overlap
     if len(history) < scene.simulated:
         return [Notice(OPEN, "the loop is not closed: the simulation ended early")]
-    checkpoint.unlink(missing_ok=True)
+    checkpoint_file(folder).unlink(missing_ok=True)
     volume = np.array(history.volume)
     drift = volume[count:].mean() / max(volume[:fade].mean(), 1e-12) - 1.0
     steady = abs(drift) <= DRIFT
     if steady:
-        _fade(history, count, fade, file)
+        _fade(history, count, fade, folder)
     for k in range(count, scene.simulated):
-        file(k).unlink()
+        frame_file(folder, FIRST_FRAME + k).unlink()
     for figures in (history.volume, history.leak, history.count, history.substeps, history.poses):
         del figures[count:]
     if steady:
@@ -166,31 +158,23 @@ def close_loop(scene: Scene, history: History, file: Callable[[int], Path], chec
     return [Notice(OPEN, text)]
 
 
-def _fade(history: History, count: int, fade: int, file: Callable[[int], Path]) -> None:
+def _fade(history: History, count: int, fade: int, folder: Path) -> None:
     """Lay the `fade` frames after the first `count` over those from the beginning."""
-    from fluidlift.io.ply import write_gaussians
+
+    def frame(k: int) -> FluidFrame:
+        return read_frame(frame_file(folder, FIRST_FRAME + k))
 
     volume, poses = np.array(history.volume), list(history.poses)
-    patch = patch_size(read_frame(file(0)).gaussians.means)
+    patch = patch_size(frame(0).gaussians.means)
     for k in range(fade):
         # as much of the fluid changes over in each frame; bodies set out and arrive gently
         share, glide = 1.0 - k / fade, 0.5 * (1.0 + np.cos(np.pi * k / fade))
-        shown = blended(read_frame(file(k)), read_frame(file(count + k)), share, patch)
-        write_gaussians(file(k), shown.gaussians, ids=shown.ids, velocities=shown.velocities)
+        shown = blended(frame(k), frame(count + k), share, patch)
+        write_frame(folder, FIRST_FRAME + k, shown.gaussians, ids=shown.ids, velocities=shown.velocities)
         history.volume[k] = float((1 - share) * volume[k] + share * volume[count + k])
         history.count[k] = len(shown.ids)
         history.leak[k] = max(history.leak[k], history.leak[count + k])
         history.poses[k] = blended_poses(poses[k], poses[count + k], glide)
-
-
-def read_frame(path: Path) -> SplatFrame:
-    """A frame from disk."""
-    from fluidlift.io.ply import read_splats
-
-    found = read_splats(path)
-    return SplatFrame(
-        found.gaussians, found.extras["id"], np.stack([found.extras[v] for v in ("vx", "vy", "vz")], axis=-1)
-    )
 
 
 def seam(pictures: Float[np.ndarray, "t h w c"]) -> tuple[float, float, float]:

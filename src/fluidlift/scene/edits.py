@@ -197,6 +197,11 @@ class EditSession:
 
         return stale_parts(self.folder, self.edits, meshes=self.meshes)
 
+    def known_standing(self) -> set[str] | None:
+        """`stale()` where it was found for this very scene before and nothing was odd; None: the scene has to be built
+        for that."""
+        return recalled(self.folder, scene_text(self.folder), meshes=self.meshes)
+
     def standing(self) -> tuple[set[str], list[Notice]]:
         """`stale()` and `warnings()`; from memory where both were found for this very scene and nothing was odd.
 

@@ -11,11 +11,11 @@ import numpy as np
 
 from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.io.asset_folder import load_asset, read_parameters
-from fluidlift.io.asset_paths import asset_file, asset_files
+from fluidlift.io.asset_paths import asset_file
 from fluidlift.io.scene import SceneEdits
 from fluidlift.messages import Notice
 from fluidlift.scene.reshaping import Asked, changed_parameters, slow_edits
-from fluidlift.scene.splat_files import BYTES_PER_SPLAT
+from fluidlift.scene.splat_files import BYTES_PER_SPLAT, frame_files
 from fluidlift.types import FluidAsset, Grid, matrix_from_quat
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ def ahead(folder: Path, manifest: dict[str, Any], frames: int, interval: float, 
         splats: in each of them.
     """
     text = f"simulating {frames} frames ({frames * interval:.3g} s)"
-    there = len(asset_files(folder, "frames/splats", (".ply",)))
+    there = len(frame_files(folder))
     if there > frames:
         text += f" in place of the {there} on disk"
     text += f": about {max(frames * splats * BYTES_PER_SPLAT / 1e6, 1):.0f} MB of disk"

@@ -8,58 +8,17 @@ from typing import Any
 import numpy as np
 
 from fluidlift.config.of_asset import SECOND_HALF_SECTIONS, settings_of
-from fluidlift.io.kept_values import kept_value, last_value
+from fluidlift.io.kept_values import last_value, recalled
 from fluidlift.scene.build import Scene, SimulationRequest, scene_of
 from fluidlift.scene.footage import Footage, footage_of
 from fluidlift.types import FluidAsset
-from fluidlift.types.stages import (
-    Fit,
-    Flow,
-    Geometry,
-    Motion,
-    Read,
-    Refined,
-    Segmentation,
-    Simulation,
-)
-
-OF_CLIP: dict[str, type] = {
-    "read": Read, "flow": Flow, "segment": Segmentation, "geometry": Geometry, "refine": Refined, "motion": Motion,
-    "fit": Fit,
-}  # fmt: skip
-"""stages that need the clip, and what they leave"""
-CORRECTED = {"segment": "correct"}
-"""stages whose value is replaced by that of another where that was run: labels with a person's regions over them"""
+from fluidlift.types.stages import Simulation
 
 
 def footage_of_asset(folder: Path, manifest: dict[str, Any]) -> Footage | None:
     """The clip that an asset comes from; None where it is no longer at hand."""
     found = [recalled(folder, manifest, name) for name in ("read", "segment", "geometry")]
     return None if any(value is None for value in found) else footage_of(*found)
-
-
-def recalled(folder: Path, manifest: dict[str, Any], name: str) -> Any:
-    """The value of one stage of `OF_CLIP` that an asset was made from; None where it is gone."""
-    keys = stage_keys(manifest)
-    stage = that_counts(name, keys)
-    found = None if stage not in keys else kept_value(folder, stage, keys[stage], OF_CLIP[name])
-    return None if found is None else found[0]
-
-
-def that_counts(name: str, keys: dict[str, str]) -> str:
-    """The stage, of those with a key, whose value counts as that of a stage."""
-    return CORRECTED[name] if CORRECTED.get(name) in keys else name
-
-
-def stage_keys(manifest: dict[str, Any]) -> dict[str, str]:
-    """Keys of the cached values that an asset was made from; those that are none are left out."""
-    keys = manifest.get("provenance", {}).get("stages", {})
-    return {n: k for n, k in keys.items() if is_key(k)} if isinstance(keys, dict) else {}
-
-
-def is_key(text: Any) -> bool:
-    """Whether this can be the key of a value."""
-    return isinstance(text, str) and len(text) == 64 and text.isalnum() and text.isascii()
 
 
 def rest_frame_of(manifest: dict[str, Any], footage: Footage | None) -> int:

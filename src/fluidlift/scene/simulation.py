@@ -12,7 +12,7 @@ from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.scene.build import Scene, SimulationRequest
 from fluidlift.scene.reshaping import in_words
 from fluidlift.scene.simulated_history import History
-from fluidlift.scene.splat_files import checkpoint_file, frame_file
+from fluidlift.scene.splat_files import checkpoint_file, frame_file, write_frame
 from fluidlift.scene.surface_appearance import SurfaceAppearance
 from fluidlift.source import source_hash
 from fluidlift.types import Particles
@@ -141,12 +141,10 @@ def _write_frame(
     simulator: ParticleSimulator, appearance: SurfaceAppearance, scene: Scene, folder: Path, p: Particles, k: int
 ) -> None:
     """Frame k, whose particles are p; the simulator may be on its way to the next one."""
-    from fluidlift.io.ply import write_gaussians
-
     appearance.advance(p, k)
     inside = simulator.bodies.inside if scene.obstacles else None
     shown = appearance.dressed(p, k, inside, simulator.deformed)
-    write_gaussians(frame_file(folder, FIRST_FRAME + k), shown.gaussians, ids=shown.ids, velocities=shown.velocities)
+    write_frame(folder, FIRST_FRAME + k, shown.gaussians, ids=shown.ids, velocities=shown.velocities)
 
 
 def _save(

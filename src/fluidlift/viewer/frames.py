@@ -104,18 +104,13 @@ def read_frame(folder: Path, index: int, *, cell: float = math.nan) -> SplatFram
     Raises:
         FrameMissing: it is not there, or not (yet) whole.
     """
-    from fluidlift.io.ply import read_splats
-    from fluidlift.scene.splat_files import frame_file
+    from fluidlift.scene import splat_files
 
     try:
-        splats = read_splats(frame_file(folder, FIRST_FRAME + index))
+        frame = splat_files.read_frame(splat_files.frame_file(folder, FIRST_FRAME + index))
     except (InputRejected, OSError) as error:
         raise FrameMissing(f"Frame {FIRST_FRAME + index} is not there: {error}") from None
-    names = ("vx", "vy", "vz")
-    known = all(v in splats.extras for v in names)
-    still = np.zeros((len(splats.gaussians), 3), np.float32)
-    velocities = np.stack([splats.extras[v] for v in names], axis=-1) if known else still
-    return splat_frame(splats.gaussians, velocities, cell=cell)
+    return splat_frame(frame.gaussians, frame.velocities, cell=cell)
 
 
 T = TypeVar("T", bound=Sized)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from fluidlift.io.asset_paths import asset_files
 from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.messages import Notice
 from fluidlift.pipeline.settings import SimulateSettings
@@ -15,7 +14,7 @@ from fluidlift.scene.build import Scene, SimulationRequest
 from fluidlift.scene.reshaping import closed_inlet
 from fluidlift.scene.simulation import advance, continued
 from fluidlift.scene.simulator import left_to_the_cpu, preflight, simulator_of
-from fluidlift.scene.splat_files import checkpoint_file, frame_file, require_room
+from fluidlift.scene.splat_files import checkpoint_file, frame_file, frame_files, require_room
 from fluidlift.scene.surface_appearance import SurfaceAppearance
 from fluidlift.scene.whitewater import SceneWhitewater, kept_measure
 from fluidlift.types import kind_of
@@ -64,7 +63,7 @@ def simulate(
     first = len(history)
     told(appearance.splats)
     require_room(folder, scene.simulated - first, appearance.splats)
-    for old in asset_files(folder, "frames/splats", (".ply",)):
+    for old in frame_files(folder):
         if not (old.stem.isdigit() and 0 <= int(old.stem) - FIRST_FRAME < first):
             old.unlink()
     if first == 0:
@@ -86,7 +85,7 @@ def simulate(
             )
         )
     if scene.overlap:
-        warnings += close_loop(scene, history, lambda k: frame_file(folder, FIRST_FRAME + k), checkpoint_file(folder))
+        warnings += close_loop(scene, history, folder)
     arrays = history.arrays()
     warnings += _simulation_warnings(scene.kind, history.volume, history.leak)
     warnings += _strayed(simulator.drained, simulator.volume, scene.interval * (len(history) - 1))

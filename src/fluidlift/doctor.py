@@ -19,6 +19,7 @@ EXTRAS = {
     "gsplat": ("gsplat", "pip install 'fluidlift[gsplat]', with a GPU"),
     "Warp": ("warp", "pip install 'fluidlift[cuda]'"),
     "learned models": ("transformers", "pip install 'fluidlift[learned]'"),
+    "paths of moving cameras": ("pycolmap", "pip install 'fluidlift[camera]'"),
     "data sets": ("pyarrow", "pip install 'fluidlift[dataset]'"),
     "splashsurf": ("pysplashsurf", "pip install pysplashsurf"),
 }

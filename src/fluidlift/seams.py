@@ -10,6 +10,7 @@ from typing import Any, Protocol, TypeAlias
 import numpy as np
 
 from fluidlift.types import (
+    CameraPath,
     FaceVelocity,
     Gaussians,
     Grid,
@@ -84,6 +85,24 @@ class DepthEstimator(ABC):
     @abstractmethod
     def depth(self, image: np.ndarray, camera: PinholeCamera) -> np.ndarray:
         """float32 [H,W], camera z in m up to one factor, of a u8 [H,W,3] picture."""
+
+
+class PoseSolver(ABC):
+    """Structure from motion: poses of a camera that goes somewhere."""
+
+    @abstractmethod
+    def solve(
+        self, places: np.ndarray, size: tuple[int, int], focal: float, *, told: bool = False
+    ) -> CameraPath | None:
+        """Poses of all frames and a sparse cloud; None where the tracks do not resolve to one scene.
+
+        Args:
+            places: float64 [n,t,2], px from the upper left corner: where each frame shows what stands; not a number
+                where it does not.
+            size: of the picture, px.
+            focal: px, a first guess.
+            told: it is known, and stays.
+        """
 
 
 class SplatView(Protocol):

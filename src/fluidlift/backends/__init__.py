@@ -2,6 +2,7 @@
 
 Modules of the face:
 
+    colmap_poses       COLMAP's solvers (pycolmap, BSD): poses of a moving camera from tracks of what stands
     depth_model        What a learned model of depth is, and what it says about one picture
     generator_card     What has to be known of a third-party generator before it is used: its terms, what it needs,
                        and where it is from
@@ -27,7 +28,7 @@ Modules of the face:
 """
 
 __all__ = [
-    "depth_model", "generator_card", "generator_licence", "generator_process", "generators",
+    "colmap_poses", "depth_model", "generator_card", "generator_licence", "generator_process", "generators",
     "gsplat_rasterizer", "learned", "mitsuba_renderer", "mitsuba_scene", "monocular_depth", "registry",
     "splashsurf", "warp_liquid", "warp_particles",
 ]  # fmt: skip

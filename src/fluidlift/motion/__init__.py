@@ -2,20 +2,22 @@
 
 Modules of the face:
 
-    cadence       Frames that repeat: frame-rate conversion (telecine, GIFs played as video) and stretches where the
-                  picture stands
-    lift          Scene flow: optical flow unprojected by depth (paper: V_surf), the one place where px/frame
-                  becomes m/s
-    optical_flow  Optical flow between neighbouring frames (paper: V_2D): the estimators, and the one door to all of
-                  them
-    sequence      Velocities of a whole clip, frame by frame (paper: v_gt): flow, mainstream, lift, volume, with a
-                  window in memory
-    stabilize     Video stabilisation: shake and drift taken out, cuts found
-    steady_flow   The measured flow as it would be at a steady frame rate
-    volume        From the surface to the whole volume (paper: V_vol): extension, bed, and a projection that keeps
-                  what was seen
+    cadence        Frames that repeat: frame-rate conversion (telecine, GIFs played as video) and stretches where
+                   the picture stands
+    lift           Scene flow: optical flow unprojected by depth (paper: V_surf), the one place where px/frame
+                   becomes m/s
+    moving_camera  A clip of a camera that goes somewhere as from one that stands: each frame drawn again from one
+                   place
+    optical_flow   Optical flow between neighbouring frames (paper: V_2D): the estimators, and the one door to all
+                   of them
+    sequence       Velocities of a whole clip, frame by frame (paper: v_gt): flow, mainstream, lift, volume, with a
+                   window in memory
+    stabilize      Video stabilisation: shake and drift taken out, cuts found
+    steady_flow    The measured flow as it would be at a steady frame rate
+    volume         From the surface to the whole volume (paper: V_vol): extension, bed, and a projection that keeps
+                   what was seen
 """
 
 __all__ = [
-    "cadence", "lift", "optical_flow", "sequence", "stabilize", "steady_flow", "volume",
+    "cadence", "lift", "moving_camera", "optical_flow", "sequence", "stabilize", "steady_flow", "volume",
 ]  # fmt: skip

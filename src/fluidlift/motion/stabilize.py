@@ -17,7 +17,9 @@ import numpy as np
 from fluidlift.errors import require
 from fluidlift.messages import Notice
 from fluidlift.motion.camera_motion import camera_motion
+from fluidlift.motion.moving_camera import Walked, Walking, drawn_again, walked
 from fluidlift.numerics.similarity2 import composed, inverse
+from fluidlift.types import MeasuredView
 from fluidlift.types.clip import VideoClip
 
 STEADY_PX = 0.3
@@ -27,10 +29,15 @@ STEADY_DRIFT_PX = 1.0
 FAR = 0.04
 """part of the longer side. Of 34 real clips the hand-held ones drift by 0.003 to 0.06 of it, those whose camera goes
 somewhere by 0.02 to 0.2; parallax shows from 0.02 on (a tap before a wall)"""
+MAY_WALK = 0.005
+"""part of the longer side (2.5 px of 512) from which it is looked whether a camera went somewhere. One that drifts by
+less shows no parallax that features could be read to"""
 SEARCH = 0.16
 """part of the longer side that a feature may have moved since its key frame"""
 LEAST_OVERLAP = 0.7
 """part of the picture that all frames used must see: what some of them did not see has no motion of its own there"""
+NEAR_TOLD = ("camera-path-unknown", "camera-extra-missing")
+"""warnings that say already that what is near still moves"""
 MENDED = 0.6
 """the shake that is left, as part of what was, below which the correction is kept"""
 
@@ -53,6 +60,10 @@ class ShakeReport:
     path: np.ndarray | None = None
     """[T,2] px from the middle of the picture that its shot is laid on: where the middle of each frame lies on it;
     None: it was not looked for"""
+    view: MeasuredView | None = None
+    """how the camera stood over the water, where it went somewhere and its path was found"""
+    fluid_evidence: np.ndarray | None = None
+    """float32 [h,w], log odds of fluid from that path, of the whole picture at a size of its own"""
 
 
 class GreyFrames(Sequence[np.ndarray]):
@@ -72,14 +83,16 @@ class GreyFrames(Sequence[np.ndarray]):
 
 
 def stabilise(
-    clip: VideoClip, *, least_overlap: float = LEAST_OVERLAP, out: np.ndarray | None = None
-) -> tuple[VideoClip, ShakeReport]:
+    clip: VideoClip, *, least_overlap: float = LEAST_OVERLAP, out: np.ndarray | None = None,
+    walking: Walking | None = None,
+) -> tuple[VideoClip, ShakeReport]:  # fmt: skip
     """The clip as from a camera that stands still, and how the camera moved.
 
     Args:
         clip: any number of frames; they are read one after the other and may lie in a file.
         least_overlap: part of the picture that each frame used must share with the one all are laid on, 0 to 1.
         out: u8 [T,H,W,3], where steady frames are written if there are any (such as a memory map); None: a new array.
+        walking: with what a camera that goes somewhere is looked for; None: it is taken to turn only.
 
     Returns:
         The same clip when nothing was to mend, or nothing could be.
@@ -113,11 +126,20 @@ def stabilise(
         back = inverse(motions[first + reference])
         laid[first:last] = [composed(motion, back) for motion in motions[first:last]]
     steady = warp_back(clip, laid, runs, out)
+    if walking is not None and drift > MAY_WALK * max(width, height):
+        first, last = max(runs, key=lambda run: run[1] - run[0])
+        walk, said = walked(GreyFrames(clip.frames, first, last), walking)
+        if walk is not None:
+            _laid_anew(clip, steady, walk, (first, last))
+            path = path_of(laid, clip.size)
+            seen = walk.view, walk.fluid_evidence
+            return steady, ShakeReport(shake, drift, True, cuts, tuple(runs), tuple(warnings), path, *seen)
+        warnings += [] if said is None else [said]
     left = max(
         shake_and_drift(motions_of_shots(steady.frames[a:b], (), reach)[0], width, height, ())[0] for a, b in runs
     )
     if left < max(MENDED * shake, STEADY_PX):
-        if drift > FAR * max(width, height):
+        if drift > FAR * max(width, height) and not any(w.code in NEAR_TOLD for w in warnings):
             warnings.append(
                 Notice(
                     "camera-moves-far",
@@ -134,6 +156,15 @@ def stabilise(
         )
     )
     return clip, ShakeReport(shake, drift, False, cuts, shots, tuple(warnings), path_of(laid, clip.size))
+
+
+def _laid_anew(clip: VideoClip, steady: VideoClip, walk: Walked, run: tuple[int, int]) -> None:
+    """Write one run of frames over what was laid as of a camera that only turns."""
+    part = slice(*run)
+    alpha = None if steady.alpha is None or clip.alpha is None else steady.alpha[part]
+    if alpha is not None and clip.alpha is not None:
+        alpha[:] = clip.alpha[part]
+    drawn_again(clip.frames[part], walk, steady.frames[part], alpha)
 
 
 def path_of(motions: np.ndarray, size: tuple[int, int]) -> np.ndarray:

@@ -89,7 +89,7 @@ def look(
     depths.require_weights(config.depth)
     require_no_contradiction(said, config, given)
     mask, finder = GivenMask.of(given, config), SegmentSettings.of(config)
-    clip = runner.run("read", read, given.clip, given.camera, taken(ReadSettings, config.read))
+    clip = runner.run("read", read, given.clip, given.camera, ReadSettings.of(config))
 
     drawn, notice = laid_on(said, clip)
     if notice:

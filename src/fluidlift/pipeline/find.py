@@ -19,7 +19,7 @@ from fluidlift.pipeline import begin
 from fluidlift.pipeline.found_parts import Line, Part, lines_of, outlines, parts_of
 from fluidlift.pipeline.inputs import GivenFiles, Inputs
 from fluidlift.pipeline.runner import Runner
-from fluidlift.pipeline.settings import GeometrySettings, GivenView, ReadSettings, taken
+from fluidlift.pipeline.settings import GeometrySettings, GivenView, ReadSettings
 from fluidlift.pipeline.sight import sighted
 from fluidlift.pipeline.stages.read import read
 from fluidlift.pipeline.work import Work
@@ -216,7 +216,7 @@ def read_alone(inputs: Inputs, folder: Path, config: JobConfig, *, progress: Pro
     runner = Runner(folder, ("read",), progress=progress or Silence())
     with disk_errors(folder):
         config = begin.within(runner, given.clip, config)
-        found = runner.run("read", read, given.clip, given.camera, taken(ReadSettings, config.read))
+        found = runner.run("read", read, given.clip, given.camera, ReadSettings.of(config))
     return replace(found, warnings=tuple(runner.warnings))  # with that of a long clip
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, field, fields
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -44,8 +45,15 @@ class ReadSettings:
     max_size: int
     fps: float
     stabilise: bool
+    poses: bool
+    """whether the path of a camera that goes somewhere can be found: with the extra installed, it is read anew"""
     max_pixels: int = field(metadata=BESIDE)
     max_frames: int = field(metadata=BESIDE)
+
+    @classmethod
+    def of(cls, config: JobConfig) -> ReadSettings:
+        """From those of a job."""
+        return taken(cls, config.read, poses=find_spec("pycolmap") is not None)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from fluidlift.messages import NONE, Notice
 from fluidlift.motion.steady_flow import bulk_motion, mean_motion
 from fluidlift.pipeline import depths, given_body
 from fluidlift.pipeline.inputs import GivenFile
-from fluidlift.pipeline.known_camera import known_camera, lens_is_known, level_of
+from fluidlift.pipeline.known_camera import USUAL_FIELD_OF_VIEW, known_camera, lens_is_known, level_of
 from fluidlift.pipeline.settings import GeometrySettings, GivenView
 from fluidlift.pipeline.work import Work
 from fluidlift.shape import (
@@ -33,7 +33,17 @@ from fluidlift.shape.framing import framing_warnings
 from fluidlift.shape.given_depth import DepthPictures
 from fluidlift.shape.kinds import Observation, builder_of
 from fluidlift.shape.rest_frames import FEWEST_PIXELS, rest_frame, united_range
-from fluidlift.shape.view import Ellipse, Skyline, as_relief, drawn_rim, find_rims, look_at, sky_of, tilt_of_horizon
+from fluidlift.shape.view import (
+    Ellipse,
+    MeasuredPlane,
+    Skyline,
+    as_relief,
+    drawn_rim,
+    find_rims,
+    look_at,
+    sky_of,
+    tilt_of_horizon,
+)
 from fluidlift.types import (
     FluidKind,
     KindEvidence,
@@ -223,11 +233,15 @@ def _seen(
     if said is not None:
         motion, trust = said.mean(motion, trust)
     known, pose_given = known_camera(given, config.fov, clip.size)
+    if read.view is not None and np.isfinite(read.view.focal_error) and not lens_is_known(given, config.fov):
+        known = replace(known, focal=(read.view.focal, read.view.focal))
     pictures, known = _depth_pictures(read, given, config.fov, known, start, work)
     pick = np.unique(np.linspace(0, len(clip) - 1, 8).astype(int))
     typical = typical_picture(clip.frames[pick]).astype(np.uint8)
     rims = work.remembered("rims", find_rims, typical)
-    looked = _Looked(clip, fluid, mask, motion, trust, bulk if said is None else None, pick, typical, rims)
+    looked = _Looked(
+        clip, fluid, mask, motion, trust, bulk if said is None else None, pick, typical, rims, _measured_plane(read)
+    )
     evidence, kind, parts, up, heading = _kind_and_up(
         looked, given, config, known, pose_given, shaped=pictures is not None
     )
@@ -312,6 +326,17 @@ class _Looked:
     """their picture"""
     rims: tuple[Ellipse, ...]
     """of vessels, in that picture"""
+    plane: MeasuredPlane | None = None
+    """of the water, where the camera's path tells it"""
+
+
+def _measured_plane(read: Read) -> MeasuredPlane | None:
+    """The plane of the water in the axes of the camera."""
+    if read.view is None:
+        return None
+    stood = UpEvidence(read.view.pitch, read.view.roll, "path of the camera", 1.0)
+    any_lens = PinholeCamera.from_fov(USUAL_FIELD_OF_VIEW, read.clip.size)
+    return MeasuredPlane(kinds.level_camera(any_lens, stood).camera_from_world.rotation[:, 2])
 
 
 def _kind_and_up(
@@ -358,6 +383,7 @@ def _kind_and_up(
         kind, looked.typical, fluid.any_frame(), parts.lying, texture, stays=parts.puddle,
         drawn_sky=said.sky, rims=said.rims or looked.rims,
     )  # fmt: skip
+    picture = replace(picture, plane=looked.plane if kind.nearly_level else None)
     up = kinds.estimate_up(
         kind, parts.lying, motion, trust * parts.gentle, known, picture, given=(said.pitch, said.roll),
         level_prior=composite.level_prior(parts, motion, trust),

@@ -15,7 +15,7 @@ from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.look.report import Figure, Section, report_html
 from fluidlift.present.as_filmed import card_of
 from fluidlift.types import CellType
-from fluidlift.types.stages import Fit, Geometry, Lift, Refined, Shown, Simulation
+from fluidlift.types.stages import Fit, Geometry, Lift, Read, Refined, Shown, Simulation
 
 FILM_MAX = 12_000_000
 """bytes of a preview that goes into the page: it should still open at once and fit into a mail"""
@@ -155,9 +155,27 @@ def _section_seeing(lift: Lift, overlay) -> Section:
         ["mean confidence on the fluid", found.confidence_mean],
         ["share of the picture", found.fluid_share],
         ["camera shake", f"{read.shake_px:.2f} px per frame" + (", taken out" if read.stabilised else "")],
+        *_view_rows(read),
         ["optical flow trusted on", f"{100 * found.flow_trusted:.0f} % of the fluid"],
     ]
     return Section("What is fluid", figures, rows)
+
+
+def _view_rows(read: Read) -> list[list[Any]]:
+    """What the path of a camera that went somewhere has measured."""
+    view = read.view
+    if view is None:
+        return []
+    lens = f"focal length {view.focal:.0f} px"
+    if not np.isfinite(view.focal_error):
+        lens += " (assumed: the path does not tell it)"
+    elif view.focal_error > 0:
+        lens += f" (measured, to {100 * view.focal_error:.0f} %)"
+    return [
+        ["path of the camera", f"found from {view.points} points that stand, seen to {view.error_px:.2f} px; {lens}"],
+        ["plane of the water", f"measured: the camera looks {view.pitch:.1f} degrees down on it, rolled by "
+         f"{view.roll:.1f}; {100 * view.support:.0f} % of the shore lies on it"],
+    ]  # fmt: skip
 
 
 def _section_body(g: Geometry, fitted: Refined) -> Section:

@@ -101,12 +101,17 @@ class Clues:
     """bool [h,w], where fluid is looked for"""
     interval: float
     """s between two frames"""
+    said: np.ndarray | None = None
+    """float32 [h,w], log odds of fluid from elsewhere"""
 
     @cached_property
     def score(self) -> np.ndarray:
         """float32 [h,w], log odds of fluid."""
         possible = self.inside & ~self.solids
-        return np.where(possible, fluid_score(self.evidence), -12.0).astype(np.float32)
+        found = fluid_score(self.evidence)
+        if self.said is not None:
+            found = np.clip(found + self.said / OF_SCORE, -12.0, 12.0)  # the score is as many times too loud
+        return np.where(possible, found, -12.0).astype(np.float32)
 
     @cached_property
     def presence(self) -> Presence:
@@ -134,12 +139,20 @@ class Clues:
         return Bed(region, rocks, washed)
 
 
-def clues_of(clip: VideoClip, flow: PixelFlow | PairReader, roi: tuple[int, int, int, int] | None = None) -> Clues:
-    """The clues of a clip of at least 2 frames; operands as those of `segment`."""
+def clues_of(
+    clip: VideoClip, flow: PixelFlow | PairReader, roi: tuple[int, int, int, int] | None = None,
+    said: np.ndarray | None = None,
+) -> Clues:  # fmt: skip
+    """The clues of a clip of at least 2 frames; operands as those of `segment`.
+
+    `said` are log odds of fluid from elsewhere, float32 [h,w] of the whole picture at any size.
+    """
     pairs = SharedPairs(clip, pair_reader(flow))
     evidence = gather_evidence(clip, pairs)
     inside = shrink_mask(region_of_interest(roi, *clip.frames.shape[1:3]), evidence.noise.shape)
-    return Clues(evidence, moving_solids(clip, pairs, evidence.noise.shape), inside, clip.interval)
+    if said is not None:
+        said = cv2.resize(said, evidence.noise.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    return Clues(evidence, moving_solids(clip, pairs, evidence.noise.shape), inside, clip.interval, said)
 
 
 def segment(

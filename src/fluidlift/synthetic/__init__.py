@@ -7,6 +7,8 @@ Modules of the face:
     moving_texture  Small clips with exactly known motion: a procedural texture carried along a flow that a formula
                     gives
     record          Runs a synthetic scene and writes its case folder: the clip, the camera, and the exact truth
+    riverside       A river between banks, boulders and trees, filmed by a camera on a known path: truth for cameras
+                    that go somewhere
     scenes          Small scenes whose truth is known because this project simulates them itself: a stream, a pour,
                     honey, a dam
     tanks           Standard scenes of free-surface flow, ready for the liquid simulator: the set-ups that
@@ -16,5 +18,5 @@ Modules of the face:
 """
 
 __all__ = [
-    "analytic", "demo", "moving_texture", "record", "scenes", "tanks", "twins",
+    "analytic", "demo", "moving_texture", "record", "riverside", "scenes", "tanks", "twins",
 ]  # fmt: skip

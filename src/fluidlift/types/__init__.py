@@ -24,6 +24,7 @@ Modules of the face:
 
 from fluidlift.types.asset import FORMAT_VERSION, FluidAsset
 from fluidlift.types.camera import PinholeCamera, ViewKey
+from fluidlift.types.camera_path import CameraPath, MeasuredView
 from fluidlift.types.clip import Label, PixelLabels, VideoClip
 from fluidlift.types.evidence import KindEvidence, MetricScale, SlopeEvidence, UpEvidence
 from fluidlift.types.filmed import Filmed, FilmedMotion
@@ -41,6 +42,7 @@ __all__ = [
     "FORMAT_VERSION",
     "KINDS",
     "SH_C0",
+    "CameraPath",
     "CellType",
     "Estimate",
     "FaceVelocity",
@@ -54,6 +56,7 @@ __all__ = [
     "Grid",
     "KindEvidence",
     "Label",
+    "MeasuredView",
     "MetricScale",
     "Particles",
     "PinholeCamera",

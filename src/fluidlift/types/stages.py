@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from fluidlift.errors import require
 from fluidlift.messages import Notice
 from fluidlift.types.camera import PinholeCamera
+from fluidlift.types.camera_path import MeasuredView
 from fluidlift.types.clip import PixelLabels, VideoClip
 from fluidlift.types.evidence import KindEvidence, MetricScale, SlopeEvidence, UpEvidence
 from fluidlift.types.filmed import FilmedMotion
@@ -59,6 +60,10 @@ class Read:
     path: Float[np.ndarray, "t 2"] | None = None
     """px from the middle of the steady picture: where the middle of each frame lay, as the camera moved; None: it was
     not looked for"""
+    view: MeasuredView | None = None
+    """how the camera stood over the water, where it went somewhere and its path tells that"""
+    fluid_evidence: Float[np.ndarray, "h w"] | None = None
+    """log odds of fluid of the whole picture, at a size of its own, where the camera's path tells what stands"""
 
     def __post_init__(self) -> None:
         require(self.path is None or len(self.path) == len(self.clip), "a path of other frames")

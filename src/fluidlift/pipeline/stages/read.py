@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,11 +16,16 @@ from fluidlift.errors import InputRejected
 from fluidlift.io.stage_cache import Scratch
 from fluidlift.messages import Notice, without
 from fluidlift.pipeline.inputs import GivenFile
+from fluidlift.pipeline.known_camera import USUAL_FIELD_OF_VIEW
 from fluidlift.pipeline.settings import ReadSettings
 from fluidlift.pipeline.work import Work
-from fluidlift.types import VideoClip
+from fluidlift.seams import PoseSolver
+from fluidlift.types import MeasuredView, PinholeCamera, VideoClip
 from fluidlift.types.fluid_masks import parts_of
 from fluidlift.types.stages import Read
+
+if TYPE_CHECKING:
+    from fluidlift.motion.moving_camera import Walking
 
 
 def read(clip: GivenFile, camera: GivenFile | None, config: ReadSettings, *, work: Work) -> Read:
@@ -51,7 +57,8 @@ def read(clip: GivenFile, camera: GivenFile | None, config: ReadSettings, *, wor
     decoded = len(found)
     found = _without_distortion(found, None if camera is None else camera.path, scratch)
     found, kept = _without_repeats(found, scratch)
-    steady, shake = _steady(found, scratch, correct=config.stabilise)
+    walking = _walking(clip, camera, found.size)
+    steady, shake = _steady(found, scratch, walking, correct=config.stabilise)
     first, last, warnings = _longest_run(shake, len(steady), found.source, kept)
     frames, alpha = steady.frames, steady.alpha
     if last - first < len(steady):
@@ -61,7 +68,9 @@ def read(clip: GivenFile, camera: GivenFile | None, config: ReadSettings, *, wor
     used = VideoClip(scratch.keep("frames", frames), steady.times[first:last], found.source, alpha)
     said = (*found.warnings, *(w for w in shake.warnings if w not in found.warnings), *warnings)
     path = None if shake.path is None else shake.path[first:last]
-    return Read(used, kept, decoded, shake.shake_px, shake.stabilised, shake.cuts, said, path)
+    return Read(
+        used, kept, decoded, shake.shake_px, shake.stabilised, shake.cuts, said, path, shake.view, shake.fluid_evidence
+    )
 
 
 def _without_distortion(clip: VideoClip, file: Path | None, scratch: Scratch) -> VideoClip:
@@ -134,19 +143,41 @@ class _Shake:
     warnings: tuple[Notice, ...] = ()
     path: np.ndarray | None = None
     """[T,2] px, as in `motion.stabilize.ShakeReport`"""
+    view: MeasuredView | None = None
+    fluid_evidence: np.ndarray | None = None
 
 
-def _steady(clip: VideoClip, scratch: Scratch, *, correct: bool) -> tuple[VideoClip, _Shake]:
+def _walking(clip: GivenFile, camera: GivenFile | None, size: tuple[int, int]) -> Walking:
+    """What is known of the lens, and who finds the path of a camera that goes somewhere."""
+    from fluidlift.io.images import read_camera
+    from fluidlift.io.lens import lens_field_of_view
+    from fluidlift.motion.moving_camera import Lens, Walking
+
+    if camera is not None:
+        return Walking(Lens(float(max(read_camera(camera.path, size).focal)), told=True), _pose_solver)
+    said = lens_field_of_view(clip.path)
+    guess = PinholeCamera.from_fov(said or USUAL_FIELD_OF_VIEW, size)
+    return Walking(Lens(float(guess.focal[0]), told=bool(said)), _pose_solver)
+
+
+def _pose_solver() -> PoseSolver:
+    from fluidlift.backends.colmap_poses import ColmapPoses
+
+    return ColmapPoses()
+
+
+def _steady(clip: VideoClip, scratch: Scratch, walking: Walking, *, correct: bool) -> tuple[VideoClip, _Shake]:
     """The clip as from a camera that stands still, and how the camera moved."""
     from fluidlift.motion.stabilize import GreyFrames, find_cuts, stabilise
 
     if not correct:
         cuts = tuple(int(c) for c in find_cuts(GreyFrames(clip.frames)))
         return clip, _Shake(0.0, False, cuts, tuple(pairwise((0, *cuts, len(clip)))))
-    steady, shake = stabilise(clip, out=scratch.array("steady", clip.frames.shape, np.uint8))
+    steady, shake = stabilise(clip, out=scratch.array("steady", clip.frames.shape, np.uint8), walking=walking)
     cuts = tuple(int(c) for c in shake.cuts)
     return steady, _Shake(
-        float(shake.shake_px), bool(shake.stabilised), cuts, shake.runs, shake.warnings, shake.path
+        float(shake.shake_px), bool(shake.stabilised), cuts, shake.runs, shake.warnings, shake.path,
+        shake.view, shake.fluid_evidence,
     )  # fmt: skip
 
 

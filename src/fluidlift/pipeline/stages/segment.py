@@ -79,7 +79,7 @@ def clues(read: Read, flow: Flow, roi: tuple[int, int, int, int] | None) -> Clue
     """What the clip shows of its fluid before a person says anything."""
     from fluidlift.shape.segment import clues_of
 
-    return clues_of(read.clip, _flow_for_masks(read.clip, flow), roi)
+    return clues_of(read.clip, _flow_for_masks(read.clip, flow), roi, read.fluid_evidence)
 
 
 def require_usable(clip: VideoClip, mask: GivenMask | None, config: SegmentSettings, hints: Hints) -> None:

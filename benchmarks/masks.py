@@ -45,7 +45,14 @@ from fluidlift.types.clip import Label, PixelLabels, VideoClip
 UNFIT = ("cascade", "dyntex_fountain", "waterfall")
 """clips whose mask_hand.png covers other water than the clip shows"""
 READING = ReadSettings(
-    start=0.0, duration=None, max_size=512, fps=25.0, stabilise=True, max_pixels=50_000_000, max_frames=600
+    start=0.0,
+    duration=None,
+    max_size=512,
+    fps=25.0,
+    stabilise=True,
+    poses=True,
+    max_pixels=50_000_000,
+    max_frames=600,
 )
 UNJUDGED = 128
 """value of a drawn mask where a person could not tell"""

@@ -93,7 +93,7 @@ class Stages:
         view = settings.GivenView.of(given, c)
         match name:
             case "read":
-                told = settings.taken(settings.ReadSettings, c.read)
+                told = settings.ReadSettings.of(c)
                 return stages.read.read(given.clip, given.camera, told, work=work)
             case "flow":
                 return stages.flow.estimated_flow(*before, settings.FlowSettings.of(c), work=work)

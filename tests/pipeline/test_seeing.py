@@ -16,7 +16,7 @@ from fluidlift.motion.steady_flow import mean_motion, pairs_of, spans_of
 from fluidlift.pipeline.hints import NO_HINTS, Hints
 from fluidlift.pipeline.inputs import GivenFile
 from fluidlift.pipeline.runner import Runner
-from fluidlift.pipeline.settings import FlowSettings, ReadSettings, SegmentSettings, taken
+from fluidlift.pipeline.settings import FlowSettings, ReadSettings, SegmentSettings
 from fluidlift.pipeline.stages import segment as segmenting
 from fluidlift.pipeline.stages.flow import estimated_flow
 from fluidlift.pipeline.stages.read import read
@@ -51,7 +51,7 @@ def opened(clip, folder, *overrides):
     """A runner that has read a clip, what it has read, and the settings."""
     runner, config = Runner(folder, ("read", "flow"), progress=Silence()), build_config(overrides=overrides)
     given = GivenFile(clip, file_hash(clip))
-    return runner, runner.run("read", read, given, None, taken(ReadSettings, config.read)), config
+    return runner, runner.run("read", read, given, None, ReadSettings.of(config)), config
 
 
 def watched(clip, folder, *overrides):

@@ -11,7 +11,7 @@ from fluidlift.errors import InputRejected
 from fluidlift.messages import code_of
 from fluidlift.shape.colour_growth import colour_odds, grown_from_streams, with_quiet_water
 from fluidlift.shape.evidence import fluid_score, gather_evidence
-from fluidlift.shape.segment import Label, LabelWriter, doubts, overlay, segment, sureness
+from fluidlift.shape.segment import OF_SCORE, Label, LabelWriter, clues_of, doubts, overlay, segment, sureness
 from fluidlift.types.clip import VideoClip
 from fluidlift.types.flow import PixelFlow
 
@@ -495,3 +495,15 @@ def test_the_more_of_the_picture_could_be_either_the_stronger_the_warning():
     (strong,) = doubts(0.4, score)
     assert "more of the picture is doubtful than is fluid" in strong
     assert "mask-nearly-everything" in map(code_of, doubts(0.95, score))
+
+
+def test_what_is_known_to_stand_counts_against_fluid_in_the_units_of_the_score(river):
+    clip, flow = river
+    half = np.zeros((2, 2), np.float32)
+    half[:, 1] = -2.4  # the right half: seen the same from several places
+    plain, told = clues_of(clip, flow).score, clues_of(clip, flow, said=half).score
+    left, right = slice(0, plain.shape[1] // 4), slice(3 * plain.shape[1] // 4, None)
+    assert np.array_equal(told[:, left], plain[:, left])
+    free = np.abs(plain[:, right]) < 4.0  # the score ends at 12
+    assert (told[:, right] - plain[:, right])[free] == pytest.approx(-2.4 / OF_SCORE, abs=1e-3)
+    assert (told[:, right] > 0).sum() < (plain[:, right] > 0).sum()

@@ -24,6 +24,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import cv2
@@ -139,6 +140,17 @@ def row(name: str, card: AsFilmed | str) -> list[str]:
     return [name, str(card.verdict), *(text_of(card[key]) for key in COLUMNS)]
 
 
+def medians(cards: list[AsFilmed]) -> list[str]:
+    """The last row of the table: medians of the values, of the floors, and of what comes after the clips' ends."""
+    cells = []
+    for key in COLUMNS:
+        columns = zip(*((f.value, f.floor, f.beyond) for f in (card[key] for card in cards)), strict=True)
+        known = [[v for v in column if v is not None] for column in columns]
+        value, floor, beyond = (f"{median(v):.2f}" if v else "-" for v in known)
+        cells.append(f"{value} ({floor}), {beyond}")
+    return [f"median of {len(cards)}", "", *cells]
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -163,7 +175,10 @@ def main() -> None:
     with ThreadPoolExecutor(a.jobs) as several:
         plain |= {name: card for name, card in several.map(way.card, a.make) if card is not None}
     cards = {name: c["none"] if "none" in c else AsFilmed.from_dict(c) for name, c in plain.items()}
-    print("\n".join(table(["asset", "verdict", *COLUMNS.values()], [row(*item) for item in cards.items()])))
+    rows = [row(*item) for item in cards.items()]
+    judged = [card for card in cards.values() if isinstance(card, AsFilmed)]
+    rows += [medians(judged)] if len(judged) > 1 else []
+    print("\n".join(table(["asset", "verdict", *COLUMNS.values()], rows)))
     if a.json:
         a.json.write_text(json.dumps(plain, indent=1) + "\n", encoding="utf-8")
 

@@ -13,13 +13,12 @@ from fluidlift.backends import warp_liquid, warp_particles
 from fluidlift.backends.warp_device import warp_device
 from fluidlift.errors import FluidliftError
 from fluidlift.io.frames import FIRST_FRAME
-from fluidlift.io.ply import read_gaussians
 from fluidlift.physics import deform
 from fluidlift.physics.guidance import BodyForce
 from fluidlift.pipeline.settings import SimulateSettings
 from fluidlift.pipeline.stages.simulate import simulate
 from fluidlift.scene.simulator import left_to_the_cpu, particle_work, simulator_of
-from fluidlift.scene.splat_files import frame_file
+from fluidlift.scene.splat_files import frame_file, read_frame
 from fluidlift.synthetic import tanks
 
 
@@ -96,7 +95,7 @@ def test_frames_are_written_with_splats_that_the_device_deformed(no_gpu_needed, 
             monkeypatch.setattr(deform, "_deform", None)  # nothing is left to the host
         done = simulate(scene, SimulateSettings(10_000, device, 10), folder=tmp_path / device)
         assert done.failed is None and done.frames == 3
-        frames.append(read_gaussians(frame_file(tmp_path / device, FIRST_FRAME + 2)))
+        frames.append(read_frame(frame_file(tmp_path / device, FIRST_FRAME + 2)).gaussians)
     one, other = frames
     assert len(one) == len(other) > 300
     h = scene.terrain.grid.spacing

@@ -29,6 +29,10 @@ def lively(**more) -> np.ndarray:
     return np.clip(WATER + noise(**more), 0, 255).astype(np.uint8)
 
 
+def looked_up(film: FluidFootage, index: np.ndarray, instants: np.ndarray, *, home: bool = True):
+    return film.looked_up(index, instants, np.full(len(index), home))
+
+
 def at_pixels(mask: np.ndarray) -> np.ndarray:
     return np.argwhere(mask).astype(np.float64)
 
@@ -38,8 +42,8 @@ def test_mean_and_residual_add_up_to_each_picture():
     film = FluidFootage.of(frames, everywhere(), INTERVAL)
     index = at_pixels(everywhere()[0])
     for t in (0, 5, FRAMES - 1):
-        residual, share = film.looked_up(index, np.full(len(index), float(t)))
-        whole = film.mean.reshape(-1, 3) + residual
+        mean, residual, share = looked_up(film, index, np.full(len(index), float(t)))
+        whole = mean + residual
         # single precision; a level of the picture is 4e-3
         np.testing.assert_allclose(whole, frames[t].reshape(-1, 3) / 255.0, atol=1e-5)
         assert (share == 1).all()
@@ -52,7 +56,7 @@ def test_residuals_of_a_place_cancel_over_the_time_in_which_it_is_fluid():
     frames = np.where(fluid[..., None], lively(), BANK).astype(np.uint8)
     film = FluidFootage.of(frames, fluid, INTERVAL)
     index = at_pixels(everywhere()[0])
-    total = sum(film.looked_up(index, np.full(len(index), float(t)))[0] for t in range(FRAMES))
+    total = sum(looked_up(film, index, np.full(len(index), float(t)))[1] for t in range(FRAMES))
     assert np.abs(total).max() < 1e-5 * FRAMES  # sums of single precision
     assert np.abs(255 * film.mean[:, 40:] - WATER).mean() < 12, "grain of twelve levels over six frames, and no bank"
 
@@ -73,20 +77,34 @@ def test_what_is_broad_is_shade_and_what_is_small_is_fine():
     np.testing.assert_allclose(fine, np.broadcast_to(stripes[inner], (48, 48)), atol=1.0)
 
 
-def test_the_rim_shows_no_bank():
-    """An edge that runs through pixels mixes two colours there; beside the fluid goes on what is well inside."""
+def oblique_shore() -> tuple[np.ndarray, np.ndarray, FluidFootage]:
+    """Picture, pixels that mix water and bank, and the film: an edge that runs through pixels mixes two colours."""
     y, x = np.indices(SIZE)
     away = 0.8 * (x - 30.3) + 0.6 * (y - 24.0)  # px from an oblique waterline, water to its left
     covered = np.clip(0.5 - cv2.GaussianBlur(away, (0, 0), 0.7), 0, 1)[..., None]  # antialiased over a pixel
     picture = np.round(covered * WATER + (1 - covered) * BANK)
     frames = np.repeat(picture[None].astype(np.uint8), FRAMES, axis=0)
     fluid = np.repeat((covered[..., 0] >= 0.5)[None], FRAMES, axis=0)
-    film = FluidFootage.of(frames, fluid, INTERVAL)
     mixed = fluid[0] & (np.abs(picture - WATER).max(axis=-1) > 5)
     assert mixed.sum() > 20, "the mask must take in pixels that are mixed for this to say anything"
-    assert np.abs(255 * film.mean - WATER).max() < 1.5 and np.abs(255 * film.shade - WATER).max() < 1.5  # rounding
-    residual, share = film.looked_up(at_pixels(mixed), np.zeros(mixed.sum()))
+    return picture, mixed, FluidFootage.of(frames, fluid, INTERVAL)
+
+
+def test_the_rim_shows_no_bank_in_other_places():
+    """What goes on beside the fluid, and what another place is given, is what is well inside."""
+    _, mixed, film = oblique_shore()
+    assert np.abs(255 * film.inner - WATER).max() < 1.5 and np.abs(255 * film.shade - WATER).max() < 1.5  # rounding
+    mean, residual, share = looked_up(film, at_pixels(mixed), np.zeros(mixed.sum()), home=False)
+    assert np.abs(255 * mean - WATER).max() < 1.5
     assert (residual == 0).all() and (share == 0).all(), "nothing comes and goes in a mixed pixel"
+
+
+def test_the_rim_is_as_filmed_in_its_own_place():
+    """Else a line of the inside's colour stands along every shore."""
+    picture, mixed, film = oblique_shore()
+    mean, residual, share = looked_up(film, at_pixels(mixed), np.zeros(mixed.sum()))
+    np.testing.assert_allclose(255 * (mean + residual), picture[mixed], atol=1e-3)  # single precision
+    assert (share == 1).all()
 
 
 def test_threads_that_are_no_wider_than_a_rim_are_kept():
@@ -98,8 +116,8 @@ def test_threads_that_are_no_wider_than_a_rim_are_kept():
     frames[:, :, 10:12] = (250, 250, 250)
     film = FluidFootage.of(frames, fluid, INTERVAL)
     np.testing.assert_allclose(film.mean[:, 10:12], 250 / 255, atol=1e-6)
-    assert film.fluid[:, :, 10:12].all()
-    assert not film.fluid[:, 20, 30:60].any() and film.fluid[0, 20 + RIM + 1, 45], "a wide body loses its rim"
+    assert film.pure[:, 10:12].all()
+    assert not film.pure[20, 30:60].any() and film.pure[20 + RIM + 1, 45], "a wide body has a rim"
 
 
 def test_a_film_that_is_too_short_or_shows_no_fluid_is_none():
@@ -159,8 +177,8 @@ def test_a_place_is_looked_up_in_the_nearest_frame():
     frames[:] = 10 * np.arange(FRAMES)[:, None, None, None]
     film = FluidFootage.of(frames, everywhere(), INTERVAL)
     instants = np.array([-3.0, 2.4, 2.6, FRAMES - 1.2, FRAMES + 7.0])
-    residual, _ = film.looked_up(np.full((5, 2), 20.0), instants)
-    found = 255 * (residual + film.mean[20, 20])[:, 0]
+    mean, residual, _ = looked_up(film, np.full((5, 2), 20.0), instants)
+    found = 255 * (mean + residual)[:, 0]
     np.testing.assert_allclose(found, 10 * np.array([0, 2, 3, FRAMES - 1, FRAMES - 1]), atol=1e-3)  # single precision
 
 
@@ -170,16 +188,16 @@ def test_the_share_of_fluid_is_bilinear_between_pixels():
     film = FluidFootage.of(lively(), fluid, INTERVAL)
     columns = np.array([30.0, 31.0, 31.25, 31.5, 32.0, 40.0])
     index = np.stack([np.full(6, 20.0), columns], axis=-1)
-    residual, share = film.looked_up(index, np.full(6, 3.0))
+    _, residual, share = looked_up(film, index, np.full(6, 3.0))
     np.testing.assert_allclose(share, [1, 1, 0.75, 0.5, 0, 0], atol=1e-6)
     assert (residual[-2:] == 0).all(), "what is dry adds nothing"
-    np.testing.assert_allclose(film.looked_up(index, np.full(6, 4.0))[1], 1.0, atol=1e-6)  # wet again
+    np.testing.assert_allclose(looked_up(film, index, np.full(6, 4.0))[2], 1.0, atol=1e-6)  # wet again
 
 
 def test_places_beyond_the_picture_are_its_border():
     film = FluidFootage.of(lively(), everywhere(), INTERVAL)
-    beyond, _ = film.looked_up(np.array([[-5.0, 12.0], [200.0, 400.0]]), np.full(2, 2.0))
-    border, _ = film.looked_up(np.array([[0.0, 12.0], [SIZE[0] - 1.0, SIZE[1] - 1.0]]), np.full(2, 2.0))
+    _, beyond, _ = looked_up(film, np.array([[-5.0, 12.0], [200.0, 400.0]]), np.full(2, 2.0))
+    _, border, _ = looked_up(film, np.array([[0.0, 12.0], [SIZE[0] - 1.0, SIZE[1] - 1.0]]), np.full(2, 2.0))
     np.testing.assert_allclose(beyond, border, atol=1e-7)
 
 

@@ -366,6 +366,23 @@ def test_water_that_an_edit_stops_shows_a_still():
     np.testing.assert_allclose(after.centers[inner], before.centers[inner], atol=1e-6)
 
 
+def test_what_was_filmed_is_shown_in_its_place_up_to_where_the_film_ends():
+    """A patch whose middle lies beside the filmed fluid covers some of it, with the look of that place."""
+    fluid = np.ones((60, 128, 128), bool)
+    fluid[:, :, :64] = False
+    film = noise_film(fluid=fluid)
+    patches = played(0, film, start=9.0)
+    beside = patches.state.centers[:, 0] < -0.1
+    near = patches.state.centers[:, 0] > -0.5  # of a radius of 0.6 m
+    assert (beside & near).any(), "or nothing is tried"
+    np.testing.assert_array_equal(patches.state.sources[near], patches.state.centers[near])
+    points, index = pixels()
+    filmed = index[:, 1] >= 64
+    color, there = patches.colors(points[filmed])
+    assert there.all()
+    np.testing.assert_allclose(color, shown_at(film, index[filmed], 9), atol=1e-5)
+
+
 def test_where_an_edit_makes_the_flow_unlike_the_film_new_patches_come_from_elsewhere():
     """A place that now flows three times as fast looks otherwise than it was filmed."""
     patches = played(80, edited=True, now=uniform(1.5))

@@ -202,6 +202,17 @@ def test_behind_a_fluid_the_picture_shows_the_ground_and_elsewhere_what_was_film
     assert far.any() and (picture[far] == plate[far]).all()
 
 
+def test_the_cut_side_of_the_ground_is_no_part_of_the_picture_without_fluid():
+    """The block ends somewhere; the scene does not, and earth is nothing that the clip shows there."""
+    plate, seen = np.full((150, 200, 3), (30, 60, 120), np.uint8), np.zeros((150, 200), bool)
+    seen[:2] = True
+    view = View(plate, CAMERA, np.full((150, 200), Label.BACKGROUND, np.uint8), seen)
+    mesh = textured(ground_mesh(GRID, np.zeros((25, 17))), GRID, DRY, view)
+    uv, _ = CAMERA.project(np.array([[0.0, -1.0, -0.1]]))  # on the side towards the camera, below much that lies
+    x, y = np.round(uv[0] - 0.5).astype(int)
+    np.testing.assert_array_equal(over_bed(plate, seen, mesh, CAMERA)[y, x], plate[y, x])
+
+
 FACING = PinholeCamera.looking((0.0, -4.0, 0.5), (0.0, 0.0, 0.4), 50.0, (200, 150))
 """level: the horizon is in the middle of its picture"""
 

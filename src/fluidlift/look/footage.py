@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 
 from fluidlift.errors import require
+from fluidlift.look.surface_map import sampled
 from fluidlift.numerics.mirror import folded
 from fluidlift.numerics.sharing import shared
 
@@ -20,7 +21,8 @@ SHOWN = 0.1
 """share of the film in which a place is fluid, from which its look counts: rarer, it is spray, or ground with noise"""
 
 RIM = 2
-"""px inside its outline in which a pixel may show half of the bank: lens, coding and mask are no sharper than that"""
+"""px inside its outline in which a pixel may show half of the bank: lens, coding and mask are no sharper than that. It
+does in its own place, as filmed, and nowhere else"""
 
 SHARPER = 2
 """steps of the deconvolution. Of 1, 2 and 3, 2 is nearest to the energy of clips in three bands (0.9 to 1.1 of it)"""
@@ -43,7 +45,11 @@ class FluidFootage:
     interval: float
     """s between frames"""
     mean: Float[np.ndarray, "h w 3"]
-    """of the frames in which a pixel is fluid, 0 to 1; beside the fluid that of the nearest fluid"""
+    """of the frames in which a pixel is fluid, 0 to 1; beside the fluid that of the nearest pixel"""
+    inner: Float[np.ndarray, "h w 3"]
+    """the same where nothing but fluid is shown; at the rim too that of the nearest inside"""
+    pure: Bool[np.ndarray, "h w"]
+    """pixels that show nothing but fluid: not those at its rim"""
     shade: Float[np.ndarray, "h w 3"]
     """the broad part of it"""
     outside: Float[np.ndarray, "h w"]
@@ -70,15 +76,19 @@ class FluidFootage:
         for picture, mask in zip(frames, fluid, strict=True):
             total += picture * mask[..., None]
         mean = total / (255.0 * len(frames) * np.maximum(weight, 1e-6)[..., None])
-        outside, own = ndimage.distance_transform_edt(~known), _without_rim(known)
+        outside, seen = ndimage.distance_transform_edt(~known, return_indices=True)
+        own = _without_rim(known)
         nearest = ndimage.distance_transform_edt(~own, return_distances=False, return_indices=True)
         # what is rarely fluid, or mixed with the bank, counts less or nothing in the blur
         weight, sigma = np.where(own, weight, np.float32(0)), BROAD * max(weight.shape)
         spread = np.maximum(ndimage.gaussian_filter(weight, sigma), 1e-6)
         blurred = [ndimage.gaussian_filter(mean[..., k] * weight, sigma) / spread for k in range(3)]
         shade = np.stack(blurred, axis=-1)[tuple(nearest)]
-        mean = mean[tuple(nearest)].astype(np.float32)
-        return cls(frames, fluid & own, interval, mean, shade.astype(np.float32), outside.astype(np.float32))
+        inner = mean[tuple(nearest)].astype(np.float32)
+        mean = mean[tuple(seen)].astype(np.float32)
+        return cls(
+            frames, fluid & known, interval, mean, inner, own, shade.astype(np.float32), outside.astype(np.float32)
+        )
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -92,18 +102,20 @@ class FluidFootage:
         return np.stack([folded(along, 0.0, size - 1.0)[0] for along, size in sides], axis=-1)
 
     def looked_up(
-        self, index: Float[np.ndarray, "n 2"], instants: Float[np.ndarray, " n"]
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """What differs from the mean at places of the picture [n,3], 0 to 1, and the share of fluid there [n].
+        self, index: Float[np.ndarray, "n 2"], instants: Float[np.ndarray, " n"], home: Bool[np.ndarray, " n"]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Mean of places of the picture [n,3], 0 to 1, what differs from it [n,3], and the share of fluid there [n].
 
         Args:
             index: row and column, bilinear between pixels.
             instants: frames, counted from 0; the nearest one is taken, since a mean of two would show both.
+            home: whether it is shown in its own place, with the rim as it was filmed.
         """
         frame = np.clip(np.rint(instants), 0, len(self) - 1).astype(np.int64)
         out, share = np.zeros((len(index), 3), np.float32), np.zeros(len(index), np.float32)
-        _residual(self.frames, self.fluid, self.mean, index.astype(np.float64), frame, out, share)
-        return out, share
+        _residual(self.frames, self.fluid, self.pure, self.mean, index.astype(np.float64), frame, home, out, share)
+        steady = np.where(home[:, None], sampled(self.mean, index), sampled(self.inner, index))
+        return steady, out, share
 
 
 def _without_rim(fluid: np.ndarray) -> np.ndarray:
@@ -130,8 +142,8 @@ def _sharpened(picture: np.ndarray, fluid: np.ndarray, blur: float) -> np.ndarra
     return np.clip(np.rint(sharp), 0, 255).astype(np.uint8)
 
 
-@shared(lambda frames, fluid, mean, index, *_: (0, len(index)))
-def _residual(begin, end, frames, fluid, mean, index, instant, out, share):
+@shared(lambda frames, fluid, pure, mean, index, *_: (0, len(index)))
+def _residual(begin, end, frames, fluid, pure, mean, index, instant, home, out, share):
     _, h, w, _ = frames.shape
     for i in range(begin, end):
         y, x = min(max(index[i, 0], 0.0), h - 1.0), min(max(index[i, 1], 0.0), w - 1.0)
@@ -140,7 +152,7 @@ def _residual(begin, end, frames, fluid, mean, index, instant, out, share):
         for a in range(2):
             for b in range(2):
                 weight = (fy if a else 1.0 - fy) * (fx if b else 1.0 - fx)
-                if fluid[t, r + a, c + b]:
+                if fluid[t, r + a, c + b] and (home[i] or pure[r + a, c + b]):
                     share[i] += weight
                     for k in range(3):
                         out[i, k] += weight * (frames[t, r + a, c + b, k] / 255.0 - mean[r + a, c + b, k])

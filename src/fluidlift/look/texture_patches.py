@@ -224,7 +224,7 @@ class TexturePatches:
         here, own = surface.at(flow, centers), self._texture.surface.at(self._seen_flow, centers)
         like = np.linalg.norm(here - own, axis=1) < UNLIKE * np.linalg.norm(own, axis=1)
         at_home = (self._texture.trust(centers) > 0.5) & (like if self._edited else True)
-        if self._together:  # as far as a patch shows anything that was seen
+        if self._together or not self._edited:  # as far as a patch shows anything that was seen
             at_home |= self._seen_within(centers)
         sources = np.array([
             c if home else self._source(c, rng) for c, home in zip(centers, at_home, strict=True)
@@ -309,12 +309,12 @@ class TexturePatches:
         index = texture.index_of(sources) + (seen - rest)[point]
         home = np.abs(index - seen[point]).max(axis=1, initial=0.0) < SAME
         index, seen = footage.within(index), footage.within(seen)
-        residual, wet = footage.looked_up(index, instants)
+        mean, residual, wet = footage.looked_up(index, instants, home)
         shade = sampled(footage.shade, seen)
         there = sampled(footage.shade, index)
         brighter = shade[point].mean(axis=1) / np.maximum(there.mean(axis=1), 1e-3)
         gain = np.clip(brighter, 1 / LARGEST_RATIO, LARGEST_RATIO)
-        fine = sampled(footage.mean, index) - there
+        fine = mean - there
         weight = weight * np.clip(wet, 1e-2, 1.0)
         total = np.bincount(point, weight, minlength=n)
         spread = _spread_of(point, instants, home, weight, n)

@@ -153,8 +153,12 @@ def over_bed(
         camera: of the plate, in the world.
     """
     found = rasterize_triangles(mesh.vertices, mesh.faces, camera)
-    drawn = found.face >= 0
-    if mesh.uv is None or mesh.texture is None or not drawn.any():
+    if mesh.uv is None or mesh.texture is None:
+        return plate
+    # where the block is cut off it shows earth, and the scene goes on
+    on_map = mesh.uv[..., 1].max(axis=1) * mesh.texture.shape[0] < mesh.texture.shape[0] - 0.5 * STRIP
+    drawn = (found.face >= 0) & on_map[found.face]
+    if not drawn.any():
         return plate
     uv = (mesh.uv[found.face] * found.barycentric[..., None]).sum(axis=-2)
     ground = 255.0 * sample_texture(mesh.texture, uv)

@@ -48,8 +48,16 @@ def examine() -> dict[str, str]:
         found[name] = "installed" if find_spec(module) else f"not installed, an extra: {remedy}"
     for name, (program, remedy) in PROGRAMS.items():
         found[name] = "installed" if shutil.which(program) else f"not found ({remedy})"
+    found["models in the cache"] = _models()
     found["GPU"] = _gpu()
     return found
+
+
+def _models() -> str:
+    from fluidlift.backends.model_cache import all_kept
+    from fluidlift.backends.model_table import MODELS
+
+    return ", ".join(f"{m.name} ({m.bytes / 1e6:.0f} MB)" for m in all_kept(MODELS)) or "none (fluidlift models)"
 
 
 def _gpu() -> str:

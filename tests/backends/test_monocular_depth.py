@@ -212,6 +212,22 @@ def test_moge_gives_metres_and_the_field_of_view(moge, tmp_path):
     np.testing.assert_array_equal(model.depth(picture(), camera), found.values)
 
 
+def test_moges_normals_come_along_where_it_has_them(moge, monkeypatch, tmp_path):
+    plain = StandIn.infer
+    weights = moge_file(tmp_path, neck={}, scale_head={})
+    assert model_of("moge", weights).guess(picture(), None).normals is None
+    slanted = torch.tensor([0.0, -3.0, -4.0]).expand(H, W, 3).clone()  # up and towards the camera, not of length 1
+    slanted[:5] = 0.0  # the sky
+
+    def infer(self, image, **options):
+        return plain(self, image, **options) | {"normal": slanted}
+
+    monkeypatch.setattr(StandIn, "infer", infer)
+    normals = model_of("moge", weights).guess(picture(), None).normals
+    assert normals.shape == (H, W, 3) and np.isnan(normals[:5]).all()
+    np.testing.assert_allclose(normals[5:], np.broadcast_to([0.0, -0.6, -0.8], (H - 5, W, 3)), atol=1e-6)
+
+
 def test_moges_first_version_knows_no_metres(moge, tmp_path):
     assert model_of("moge", moge_file(tmp_path)).guess(picture(), None).holds == "relative"
 
@@ -242,8 +258,14 @@ def test_packages_that_are_missing_are_named_with_the_command(monkeypatch, tmp_p
 
 @pytest.mark.parametrize("name", ["da3metric-large", "da3mono-large"])
 def test_depth_anything_3_gives_metres_where_it_can(name, monkeypatch, tmp_path):
+    save_file = pytest.importorskip("safetensors.torch", reason="safetensors is not installed").save_file
+
     class Network(torch.nn.Module):
         model_name = name
+
+        def __init__(self):
+            super().__init__()
+            self.head, self.body = torch.nn.Linear(2, 2), torch.nn.Linear(2, 2)
 
         @classmethod
         def from_pretrained(cls, folder, local_files_only):
@@ -262,7 +284,15 @@ def test_depth_anything_3_gives_metres_where_it_can(name, monkeypatch, tmp_path)
     monkeypatch.setitem(sys.modules, "depth_anything_3.api", api)
     with pytest.raises(InputRejected, match=r"model\.safetensors"):
         model_of("depth-anything-3", tmp_path)
-    (tmp_path / "model.safetensors").write_bytes(b"")
+    whole = Network().state_dict()
+    # the package's own loader would leave what lacks as it was drawn
+    save_file({k: v for k, v in whole.items() if k != "head.bias"}, str(tmp_path / "model.safetensors"))
+    with pytest.raises(InputRejected, match=r"lacks 1 tensors, such as head\.bias"):
+        model_of("depth-anything-3", tmp_path)
+    (tmp_path / "model.safetensors").write_bytes(b"nonsense")
+    with pytest.raises(InputRejected, match="damaged"):
+        model_of("depth-anything-3", tmp_path)
+    save_file(whole, str(tmp_path / "model.safetensors"))
     model = model_of("depth-anything-3", tmp_path)
     assert model.guess(picture(), None).holds == "relative"
     camera = PinholeCamera.from_fov(60.0, (W, H))

@@ -8,11 +8,15 @@ import pytest
 
 from fluidlift.errors import InputRejected
 from fluidlift.shape.depth_surface import (
+    MODEL_TILT,
     airborne_surface,
+    facing,
     fall_surface,
+    model_normal,
     solid_heights,
     stream_surface,
     up_from_depth,
+    weighed_up,
 )
 from fluidlift.shape.given_depth import SceneDepth
 from fluidlift.shape.kind import level_camera
@@ -117,6 +121,57 @@ def test_level_water_tells_up(pitch, roll):
     # a level stream cannot be told from one that falls: the mean of what streams do is some degrees
     assert up.pitch == pytest.approx(pitch, abs=1.0) and up.roll == pytest.approx(roll, abs=5.0)
     assert 0 <= slope < 5.0
+
+
+def normals_of(camera: PinholeCamera, seed: int = 0, waves: float = 0.2) -> np.ndarray:
+    """Normals of level water with waves (radians), in the axes of the camera, of two frames."""
+    up = camera.camera_from_world.rotation[:, 2]
+    rippled = up + waves * np.random.default_rng(seed).normal(size=(2, H, W, 3))
+    return (rippled / np.linalg.norm(rippled, axis=-1, keepdims=True)).astype(np.float16)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize(("pitch", "roll"), [(20.0, 0.0), (40.0, 6.0), (70.0, -4.0)])
+def test_the_normals_of_level_water_tell_up(pitch, roll, sign):
+    camera = view(pitch, roll)
+    normals = sign * normals_of(camera)
+    normals[:, :20] = np.nan  # the sky
+    fluid = np.stack([BAND, BAND])
+    up = facing(normals, fluid, BAND, LENS)
+    off = np.degrees(np.arccos(up @ camera.camera_from_world.rotation[:, 2]))
+    # a median of 6000 normals that waves of 11 degrees tilt; the steepest turn away, and are taken for their backs
+    assert off < 1.5
+
+
+def test_few_normals_or_such_as_point_everywhere_say_nothing():
+    few = np.zeros((1, H, W), bool)
+    few[0, 40, 40:60] = True
+    assert facing(normals_of(view(40.0))[:1], few, BAND, LENS) is None
+    random = np.random.default_rng(0).normal(size=(1, H, W, 3))
+    random /= np.linalg.norm(random, axis=-1, keepdims=True)
+    assert facing(random, BAND[None], BAND, LENS) is None
+
+
+def test_two_answers_of_a_model_are_taken_together_and_tell_its_error_by_their_difference():
+    depth, motion = sloping(view(40.0), 0.0)
+    alone, error = model_normal(LENS, depth, BAND, None)
+    assert error == MODEL_TILT and up_from_depth(scene(depth), LENS, BAND, motion, SURE, normal=alone)[0].pitch > 38
+    other = view(60.0).camera_from_world.rotation[:, 2]  # 20 degrees away
+    both, error = model_normal(LENS, depth, BAND, other)
+    assert error == pytest.approx(10.0, abs=0.1)
+    assert both @ alone == pytest.approx(both @ other, abs=1e-3) and np.linalg.norm(both) == pytest.approx(1.0)
+
+
+def test_a_model_is_weighed_beside_what_the_clip_shows():
+    model = UpEvidence(40.0, 2.0, "plane of the depth of moge", 0.8)
+    vague = weighed_up(UpEvidence(20.0, 0.0, "usual view", 0.1, 18.0), model, 4.5)
+    assert vague.pitch == pytest.approx(38.8, abs=0.1) and vague.error == pytest.approx(10.0)  # one of them is wrong
+    sure = weighed_up(UpEvidence(43.0, 0.0, "sky", 0.9, 1.0), model, 4.5)
+    assert sure.pitch == pytest.approx(42.9, abs=0.1) and sure.error == pytest.approx(1.5)
+    assert "moge (5 %)" in sure.source and "sky" in sure.source
+    unknown = weighed_up(UpEvidence(20.0, 0.0, "", 0.0), model, 4.5)
+    assert unknown.pitch == 40.0 and unknown.error == 4.5
+    assert weighed_up(UpEvidence(20.0, 1.0, "user and sky", 0.5, 6.0), model, 4.5).roll == 1.0
 
 
 def test_a_fall_stands():

@@ -16,7 +16,8 @@ from fluidlift.backends.depth_pictures import (
     to_picture,
     to_tensor,
 )
-from fluidlift.backends.model_weights import Announce, say
+from fluidlift.backends.model_table import DA3
+from fluidlift.backends.model_weights import Announce, require_all_tensors, say
 from fluidlift.backends.pair_network import memory_errors, torch_device
 from fluidlift.backends.sam2_video import MEAN, SPREAD
 from fluidlift.errors import InputRejected, MissingPackage
@@ -93,10 +94,7 @@ class DepthAnything3(DepthModel):
         try:
             from depth_anything_3.api import DepthAnything3 as Network  # pyright: ignore[reportMissingImports]
         except ModuleNotFoundError as error:
-            raise MissingPackage(
-                f"{error.name} is not installed. Needed: for Depth Anything 3. "
-                "Do: pip install git+https://github.com/ByteDance-Seed/Depth-Anything-3.git."
-            ) from None
+            raise MissingPackage(f"{error.name} is not installed. Needed: for Depth Anything 3. Do: {DA3}.") from None
         except (ImportError, RuntimeError, OSError) as error:
             reason = str(error).partition("\n")[0]
             raise MissingPackage(
@@ -115,6 +113,7 @@ class DepthAnything3(DepthModel):
         except (OSError, ValueError, KeyError, RuntimeError, TypeError) as error:
             reason = " ".join(str(error).split())[:200]
             raise InputRejected(f"'{folder.name}' cannot be loaded ({reason})", "a model of Depth Anything 3") from None
+        require_all_tensors(network, _weights_file(weights))
         self._model = network.to(self._device).eval()
         self.canonical = "metric" in str(getattr(network, "model_name", "")).lower()
 
@@ -144,6 +143,16 @@ class DepthAnything3(DepthModel):
                 answer = answer * np.float32(camera.focal[0] * answer.shape[1] / camera.size[0] / CANONICAL_FOCAL)
         depth = require_answer(_nearest(answer, size), "Depth Anything 3")
         return Guess(depth, "metres" if metres else "relative", view)
+
+
+def _weights_file(weights: Path | str) -> Path:
+    """That the tensors were read from: in the folder, or in the hub's cache."""
+    path = Path(weights) / "model.safetensors"
+    if path.is_file():
+        return path
+    from huggingface_hub import hf_hub_download
+
+    return Path(hf_hub_download(repo_id=str(weights), filename=path.name, local_files_only=True))
 
 
 def _nearest(values: np.ndarray, size: tuple[int, int]) -> np.ndarray:

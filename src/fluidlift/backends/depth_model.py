@@ -23,6 +23,8 @@ class Guess:
     """metres; depth up to a factor; inverse depth up to factor and offset"""
     field_of_view: float | None = None
     """degrees across the longer side, where it says that"""
+    normals: Float[np.ndarray, "h w 3"] | None = None
+    """unit normals of the surfaces in camera axes (x right, y down, z forward), where it gives them; nan elsewhere"""
 
 
 class DepthModel(DepthEstimator):

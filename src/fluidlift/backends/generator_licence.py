@@ -1,4 +1,4 @@
-"""The terms of third-party generators: shown before the first use, accepted by the user, remembered by their text."""
+"""The terms of third-party models: shown before the first use, accepted by the user, remembered by their text."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import json
 import os
 from contextlib import suppress
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Protocol
 
 from fluidlift.backends.generator_card import GeneratorCard
 from fluidlift.errors import InputRejected
@@ -16,7 +16,36 @@ from fluidlift.messages import NONE, Notice
 Use = Literal["research", "commercial"]
 
 
-def terms_of(card: GeneratorCard) -> str:
+class Terms(Protocol):
+    """What a card says of its terms: that of a generator, or of a model whose weights are fetched."""
+
+    @property
+    def name(self) -> str:
+        """By which they are remembered."""
+        ...
+
+    @property
+    def title(self) -> str:
+        """For people."""
+        ...
+
+    @property
+    def licence(self) -> str:
+        """In words."""
+        ...
+
+    @property
+    def licence_commercial(self) -> bool:
+        """Whether commercial use is not forbidden."""
+        ...
+
+    @property
+    def home(self) -> str:
+        """Address."""
+        ...
+
+
+def terms_of(card: Terms) -> str:
     """What a user has to read."""
     allowed = "allowed" if card.licence_commercial else "NOT allowed"
     return f"{card.title}: {card.licence} Commercial use: {allowed}. {card.home}"
@@ -28,12 +57,12 @@ def memory_file() -> Path:
     return Path(base) / "fluidlift" / "licences.json"
 
 
-def is_accepted(card: GeneratorCard) -> bool:
+def is_accepted(card: Terms) -> bool:
     """Whether the user has accepted these very terms before; other terms under the same name count as new."""
     return _remembered().get(card.name) == _digest(card)
 
 
-def remember(card: GeneratorCard) -> None:
+def remember(card: Terms) -> None:
     """Note that the user has accepted the terms; a folder that cannot be written only means to be asked again."""
     path = memory_file()
     with suppress(OSError):
@@ -88,7 +117,7 @@ def require_use(card: GeneratorCard, use: Use | None, others: tuple[GeneratorCar
     )
 
 
-def _digest(card: GeneratorCard) -> str:
+def _digest(card: Terms) -> str:
     return hashlib.sha256(terms_of(card).encode()).hexdigest()
 
 

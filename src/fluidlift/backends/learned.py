@@ -67,5 +67,9 @@ def make_segmenter(
 
 def _given(choice: ModelChoice, name: str, what: str) -> Path | str:
     if choice.weights is None:
-        raise InputRejected(f"no weights for {name}", what, "name it (docs/learned_models.md says where to get it)")
+        raise InputRejected(
+            f"no weights for {name}",
+            what,
+            "fluidlift models get NAME, or name a file of your own (docs/learned_models.md)",
+        )
     return choice.weights

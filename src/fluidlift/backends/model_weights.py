@@ -98,6 +98,33 @@ def _checkpoint(path: Path, purpose: str) -> Any:
         ) from None
 
 
+def require_all_tensors(network: torch.nn.Module, path: Path) -> None:
+    """See that a .safetensors file has every tensor of a network that a loader of others filled from it.
+
+    Loaders that let some lack leave them as noise.
+
+    Raises:
+        InputRejected: a tensor lacks, or the file is damaged.
+        MissingPackage: safetensors is missing.
+    """
+    try:
+        from safetensors import SafetensorError, safe_open
+    except ImportError:
+        raise missing("safetensors", "to read .safetensors weights") from None
+    try:
+        with safe_open(path, framework="pt") as file:
+            there = set(file.keys())
+    except (SafetensorError, OSError, ValueError) as error:
+        raise InputRejected(
+            f"'{path.name}' is damaged ({error})", "a whole .safetensors file", "copy it again"
+        ) from None
+    state = network.state_dict()
+    shared = {state[name].data_ptr() for name in there & state.keys()}  # a tensor with two names is stored once
+    lacking = [k for k, v in state.items() if k not in there and v.numel() and v.data_ptr() not in shared]
+    if lacking:
+        raise InputRejected(f"'{path.name}' lacks {len(lacking)} tensors, such as {lacking[0]}", "whole weights")
+
+
 def fill_network(network: torch.nn.Module, state: Mapping[str, torch.Tensor], name: str, hint: str = "") -> None:
     """Load every tensor of `state` into its place.
 

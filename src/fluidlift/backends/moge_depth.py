@@ -1,6 +1,7 @@
-"""MoGe (Wang et al. 2025, Microsoft): depth in metres and the field of view of one picture, by its authors' package.
+"""MoGe (Wang et al. 2025, Microsoft): depth in metres, field of view and normals of a picture, by its authors' package.
 
-The package is not on the registry of packages: `pip install git+https://github.com/microsoft/MoGe.git`.
+The package is not on the registry of packages; the last commit of its second version is installed (`INSTALL`), whose
+weights these are: the third needs other packages.
 A checkpoint holds its own description (`model_config`) and tensors (`model`). The authors' loader lets tensors that
 lack pass, and they would stay noise; here they are refused.
 """
@@ -15,13 +16,14 @@ import numpy as np
 
 from fluidlift.backends.depth_model import DepthModel, Guess
 from fluidlift.backends.depth_pictures import longer_field_of_view, require_answer, require_picture, to_picture
+from fluidlift.backends.model_table import MOGE
 from fluidlift.backends.model_weights import Announce, say
 from fluidlift.backends.pair_network import memory_errors, torch_device
 from fluidlift.errors import InputRejected, MissingPackage
 from fluidlift.types import PinholeCamera
 
 LICENCE = "MoGe: code and weights are MIT (Microsoft), its encoder DINOv2 Apache-2.0 (Meta)."
-INSTALL = "pip install git+https://github.com/microsoft/MoGe.git"
+INSTALL = MOGE
 
 
 class MogeDepth(DepthModel):
@@ -49,7 +51,7 @@ class MogeDepth(DepthModel):
         self._model = self._model.to(self._device).eval()
 
     def guess(self, image: np.ndarray, camera: PinholeCamera | None) -> Guess:
-        """Depth (metres of the second version, up to a factor of the first) and the field of view.
+        """Depth (metres of the second version, up to a factor of the first), field of view, and normals if it has them.
 
         A camera that is known fixes the field of view that the model works with.
 
@@ -69,7 +71,17 @@ class MogeDepth(DepthModel):
         # intrinsics are in units of the picture's width and height
         horizontal = float(2.0 * np.degrees(np.arctan(0.5 / float(found["intrinsics"][..., 0, 0]))))
         holds = "metres" if self.metric else "relative"
-        return Guess(depth, holds, longer_field_of_view(horizontal, (height, width)))
+        return Guess(depth, holds, longer_field_of_view(horizontal, (height, width)), _normals(found.get("normal")))
+
+
+def _normals(found: Any) -> np.ndarray | None:
+    """float32 [H,W,3], nan where there are none (the sky); None of versions that give none."""
+    if found is None:
+        return None
+    normals = found.reshape(-1, *found.shape[-3:])[0].float().cpu().numpy()
+    length = np.linalg.norm(normals, axis=-1, keepdims=True)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(length > 0.5, normals / length, np.nan).astype(np.float32)  # a masked one is 0
 
 
 def _module(name: str) -> Any:
@@ -139,5 +151,5 @@ def _file_of(weights: Path | str, allow_download: bool) -> Path:
     except (OSError, ValueError) as error:
         reason = " ".join(str(error).split())[:200]
         raise InputRejected(
-            f"'{weights}' cannot be fetched ({reason})", "a name such as Ruicheng/moge-2-vitl"
+            f"'{weights}' cannot be fetched ({reason})", "a name such as Ruicheng/moge-2-vits-normal"
         ) from None

@@ -23,6 +23,8 @@ def make_depth_estimator(name: str, choice: ModelChoice) -> DepthModel:
     kind = class_of(DEPTH, name)
     if choice.weights is None:
         raise InputRejected(
-            f"no weights for {name}", "a file or folder with them", "name it (docs/depth.md says where to get it)"
+            f"no weights for {name}",
+            "a file or folder with them",
+            "fluidlift models get NAME, or name a file of your own (docs/depth.md)",
         )
     return kind(choice.weights, device=choice.device, allow_download=choice.allow_download, announce=choice.announce)

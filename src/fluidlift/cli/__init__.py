@@ -24,6 +24,7 @@ from fluidlift import __version__
 from fluidlift.cli.batch import Batch
 from fluidlift.cli.edit import Edit
 from fluidlift.cli.failure import failure_line
+from fluidlift.cli.models import Models
 from fluidlift.cli.optional import REGISTRY
 from fluidlift.cli.options import (
     MOVED,
@@ -68,6 +69,7 @@ Command = (
     | Validate
     | Demo
     | Generators
+    | Models
     | Doctor
 )
 DONE, FAILED, USAGE, REJECTED, WITH_WARNINGS = 0, 1, 2, 3, 4
@@ -177,6 +179,8 @@ def _make(c: Make) -> int:
     }  # fmt: skip
     hints = _read_hints(c.input.hints, c.clip)
     config = build_config(q.preset, c.settings.config, c.settings.set, flat, base=dict(hints.settings))
+    if b.models is not None:
+        config = _with_models(config, c)
     if c.settings.print_config:
         import yaml
 
@@ -191,6 +195,18 @@ def _make(c: Make) -> int:
         geometry=b.geometry_from, flow=c.input.flow, hints=hints, force=c.settings.force, as_json=c.json,
     )  # fmt: skip
     return DONE if c.warnings_ok and code == WITH_WARNINGS else code
+
+
+def _with_models(config: Any, c: Make) -> Any:
+    """The settings with the models of `--models`, which are told."""
+    from fluidlift.pipeline import Inputs
+    from fluidlift.pipeline.models import with_models
+
+    files = Inputs(c.clip, mask=c.input.mask, depth=c.input.depth, geometry=c.body.geometry_from, flow=c.input.flow)
+    chosen = with_models(config, files, str(c.body.models))
+    for line in chosen.told:
+        print(f"models: {line}", file=sys.stderr)
+    return chosen.config
 
 
 def _read_hints(file: Path | None, clip: Path) -> Any:
@@ -493,6 +509,12 @@ def _generators(c: Generators) -> int:
     return show(c)
 
 
+def _models(c: Models) -> int:
+    from fluidlift.cli.models import run
+
+    return run(c)
+
+
 def _doctor(c: Doctor) -> int:
     from fluidlift.doctor import examine
 
@@ -517,5 +539,5 @@ def _doctor(c: Doctor) -> int:
 _COMMANDS = {
     Make: _make, Batch: _batch, Fit: _fit, Sim: _sim, Edit: _edit, Studio: _studio, View: _view, Render: _render,
     Export: _export, Inspect: _inspect, Hints: _hints, Mask: _mask, Motion: _motion, Evaluate: _evaluate,
-    Validate: _validate, Demo: _demo, Generators: _generators, Doctor: _doctor,
+    Validate: _validate, Demo: _demo, Generators: _generators, Models: _models, Doctor: _doctor,
 }  # fmt: skip

@@ -67,12 +67,15 @@ class MakeInput(Input):
 
 @command
 class Body:
-    """Learned depth, or a body that something else made."""
+    """Learned models, or a body that something else made."""
 
+    models: str | None = None
+    """learned models of your cache: none (the default), auto (what is there and helps), or names with commas between
+    them (`fluidlift models`)"""
     depth_model: Literal["none", "moge", "depth-anything", "depth-anything-3", "depth-pro"] | None = None
     """learned depth, moge advised; it needs --depth-weights (docs/depth.md)"""
     depth_weights: Path | None = None
-    """file or folder of the weights of --depth-model"""
+    """file or folder of the weights of --depth-model, or model:NAME of your cache"""
     geometry_from: Path | None = None
     """folder of Gaussian PLY files and camera.json: replaces the embedded generator"""
     generator: str | None = None
@@ -138,7 +141,7 @@ class Make:
     quality: tyro.conf.OmitArgPrefixes[Quality] = field(default_factory=Quality)
     """how fine"""
     body: tyro.conf.OmitArgPrefixes[Body] = field(default_factory=Body)
-    """learned depth, or a body that something else made"""
+    """learned models, or a body that something else made"""
     settings: tyro.conf.OmitArgPrefixes[Settings] = field(default_factory=Settings)
     """all else: --print-config lists every setting, such as read.max_pixels (docs/cli.md)"""
 
@@ -402,5 +405,5 @@ def options_of(command: type) -> dict[str, str]:
     found: dict[str, str] = {}
     for f in fields(command):
         group = f.default_factory if is_dataclass(f.default_factory) else None
-        found |= {f.name: str(f.type)} if group is None else options_of(group)
+        found |= {f.name.rstrip("_"): str(f.type)} if group is None else options_of(group)
     return found

@@ -14,6 +14,7 @@ from fluidlift.backends.registry import ModelChoice
 from fluidlift.config import DepthConfig
 from fluidlift.errors import InputRejected
 from fluidlift.messages import Notice
+from fluidlift.pipeline.inputs import OF_CACHE
 from fluidlift.pipeline.settings import DepthModel, GivenDepth, GivenView
 from fluidlift.pipeline.work import Work
 from fluidlift.shape import depth_surface, given_depth
@@ -82,6 +83,7 @@ def pictures_of(
         f"depth of {given.model.model}",
         MODEL_FLOOR,
         found.field_of_view,
+        None if found.normals is None else np.asarray(found.normals),
     )
 
 
@@ -96,11 +98,12 @@ def require_weights(config: DepthConfig) -> None:
     if config.weights is None:
         raise InputRejected(
             f"--depth-model {config.model} without its weights", "a file or folder with them",
-            "--depth-weights PATH; docs/depth.md says where to get them",
+            "--depth-weights PATH, or fluidlift models get NAME and make --models NAME",
         )  # fmt: skip
-    if not config.download and not os.path.exists(os.path.expanduser(config.weights)):
+    there = config.weights.startswith(OF_CACHE) or os.path.exists(os.path.expanduser(config.weights))
+    if not config.download and not there:
         raise InputRejected(
-            f"weights '{config.weights}' that are not there", "an existing file or folder",
+            f"weights '{config.weights}' that are not there", "an existing file or folder, or model:NAME of the cache",
             "check --depth-weights, or --set depth.download=true for a name on the hub",
         )  # fmt: skip
 
@@ -150,7 +153,9 @@ def depth_by_model(
         work.step(len(guesses), len(frames))
     views = [g.field_of_view for g in guesses if g.field_of_view is not None]
     values = np.stack([g.values for g in guesses])
-    return DepthGuess(values, guesses[0].holds, float(np.median(views)) if views else None)
+    normals = [g.normals for g in guesses if g.normals is not None]
+    faces = np.stack(normals).astype(np.float16) if len(normals) == len(guesses) else None
+    return DepthGuess(values, guesses[0].holds, float(np.median(views)) if views else None, faces)
 
 
 def depth_front(
@@ -171,21 +176,27 @@ def depth_front(
     Raises:
         InputRejected: a depth that says nothing about the fluid, or cannot be of this view.
     """
-    mask = seen.mask
-    fused = given_depth.fuse(pictures, np.stack([fluid[t] for t in pictures.frames]), mask)
+    mask, shown = seen.mask, np.stack([fluid[t] for t in pictures.frames])
+    fused = given_depth.fuse(pictures, shown, mask)
     scene = given_depth.scene_depth(fused, expected.depth, mask)
     meta: dict[str, Any] = {
         "source": scene.source, "frames": scene.frames, "flicker": scene.flicker, "holds": fused.holds,
     }  # fmt: skip
     slopes, usual = depth_surface.slopes_by_motion(expected.slope), expected.height
+    learned = pictures.source != "depth file"
     if kind.nearly_level and not seen.tilt_known and fused.holds != "disparity":
-        up, slope = depth_surface.up_from_depth(scene, camera, mask, seen.motion, seen.trust)
+        normal, error = None, 0.0
+        if learned:
+            faces = pictures.normals
+            faces = None if faces is None else depth_surface.facing(faces, shown, mask, camera)
+            normal, error = depth_surface.model_normal(camera, scene.depth, mask, faces)
+        found, slope = depth_surface.up_from_depth(scene, camera, mask, seen.motion, seen.trust, normal=normal)
+        up = depth_surface.weighed_up(up, found, error) if learned else found
         slopes, usual = ((1.0, slope, 0.5),), None
     level = kinds.level_camera(camera, up)
     front, evidence = builder_of(kind).depth_surface(scene, replace(seen, camera=level), slopes=slopes, usual=usual)
     if evidence is not None:
         meta["slope"] = asdict(evidence)
-    learned = pictures.source != "depth file"
     if not learned and kind.lies_on_ground and fused.holds != "disparity":
         # a file is believed to its last wave, where it says something; what lies below follows the smooth surface
         known = mask & np.isfinite(scene.depth) & (scene.depth > 0)

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from fluidlift.backends.model_cache import kept
 from fluidlift.errors import InputRejected
-from fluidlift.io.hashes import file_hash
+from fluidlift.io.hashes import digest, file_hash
 
+OF_CACHE = "model:"
+"""what weights begin with that are a model of the user's cache: no file that lies about is taken for it"""
 _OPTIONS = {"geometry": ("--geometry-from", "folder")}
 """option and what it takes, where they are not --name and a file"""
 
@@ -50,20 +54,53 @@ class Weights:
     """Weights of a learned model, by their content where they are files here, else by their name."""
 
     name: str
+    """file, folder, or name on the hub: what a back end is given"""
     content: str
+    model: str | None = None
+    """name of the model, where it is one of the user's cache"""
 
     @property
     def cache_key(self) -> str:
         """What a stage's key knows of them."""
         return self.content
 
+    @property
+    def label(self) -> str:
+        """Its name, without where it is."""
+        return self.model or Path(self.name).name
+
+    @property
+    def files(self) -> dict[str, str]:
+        """SHA-256 of each file; none of what is a name on the hub."""
+        if self.model is not None:
+            return dict(part.split(":") for part in self.content.split())
+        path = Path(self.name)
+        files = [path] if path.is_file() else sorted(p for p in path.glob("*") if p.is_file())
+        return {file.name: digest(file) for file in files}
+
     @classmethod
     def of(cls, name: str | None) -> Weights | None:
-        """Of a file, a folder, or a name on the hub."""
+        """Of a file, a folder, a model of the user's cache (model:NAME), or a name on the hub.
+
+        Raises:
+            InputRejected: a model that is not in the cache, or not what was fetched.
+        """
         if name is None:
             return None
-        path = Path(name)
-        return cls(name, file_hash(path) if path.exists() else name)
+        if name.startswith(OF_CACHE):
+            return cls._of_cache(name.removeprefix(OF_CACHE))
+        path = Path(os.path.expanduser(name))
+        return cls(str(path), file_hash(path)) if path.exists() else cls(name, name)
+
+    @classmethod
+    def _of_cache(cls, name: str) -> Weights:
+        model = kept(name)
+        if model is None:
+            raise InputRejected(
+                f"the model {name} is not in the cache of this machine", "one that is", f"fluidlift models get {name}"
+            )
+        model.require_whole()
+        return cls(str(model.path), " ".join(f"{k}:{v}" for k, v in sorted(model.hashes.items())), name)
 
 
 @dataclass(frozen=True)

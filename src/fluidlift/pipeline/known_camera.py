@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from fluidlift.messages import NONE, Notice
@@ -12,6 +14,10 @@ from fluidlift.types import PinholeCamera
 
 USUAL_FIELD_OF_VIEW = 50.0
 """degrees across the longer side, where nothing says better: between a phone's main lens (65) and a short telephoto"""
+USUAL_SPREAD = 0.4
+"""relative standard deviation of the focal length then: 65 degrees are 0.3 away in its logarithm, 30 degrees 0.6"""
+MODEL_LENS_ERROR = 0.08
+"""relative standard error of a learned model's focal length: assumed, some 3.5 degrees of 50; none was measured here"""
 
 
 def known_field_of_view(given: GivenView, fov: float | None, size: tuple[int, int]) -> tuple[float, bool]:
@@ -42,6 +48,20 @@ def known_camera(given: GivenView, fov: float | None, size: tuple[int, int]) -> 
     camera = read_camera(given.camera.path, size)
     data = read_json(given.camera.path, "camera file")
     return camera, "R" in data or "frames" in data
+
+
+def with_model_lens(camera: PinholeCamera, error: float, field_of_view: float) -> PinholeCamera:
+    """The camera with the focal length that its own evidence and a learned model's field of view give together.
+
+    Args:
+        camera: as it is taken to be without the model.
+        error: relative standard deviation of its focal length: `USUAL_SPREAD` where nothing says it.
+        field_of_view: degrees across the longer side, by the model.
+    """
+    seen = float(PinholeCamera.from_fov(field_of_view, camera.size).focal[0])
+    weights = np.array([max(error, 1e-3), MODEL_LENS_ERROR]) ** -2.0
+    focal = float(np.exp(weights @ np.log([camera.focal[0], seen]) / weights.sum()))
+    return replace(camera, focal=(focal, focal))
 
 
 def level_of(level: tuple[str, str], camera: GivenFile | None) -> tuple[float, Notice]:

@@ -15,6 +15,7 @@ from fluidlift.io.hints_file import hints_data
 from fluidlift.pipeline import begin
 from fluidlift.pipeline.fit_request import request_of
 from fluidlift.pipeline.inputs import GivenFile, GivenFiles, Inputs
+from fluidlift.pipeline.models import UsedModel, require_use, used_models
 from fluidlift.pipeline.resimulate import Made, note_as_shown, play
 from fluidlift.pipeline.runner import Runner, gone_if_refused, require_stages
 from fluidlift.pipeline.settings import GenerateSettings, GivenView, MotionSettings, RefineSettings, taken
@@ -73,6 +74,8 @@ def make(
     particle_work(config.simulate.device)  # a device that is not there is said now, not after the fit
     request_of(config.fit)  # so is a parameter that is not known
     warnings = generate.require_usable(inputs, config, folder)
+    models = used_models(config, inputs)
+    warnings += require_use(models, config.generate.use)
     began = time.perf_counter()
     runner = Runner(folder, stages, force=frozenset(force), progress=progress or Silence(), value_told=value_told)
     for text in warnings:
@@ -83,16 +86,18 @@ def make(
         lift = _lifted(runner, given, config, hints)
         frames = config.simulate.frames or len(lift.clip) - lift.geometry.rest_frame
         require_room(folder, frames, len(lift.refined.body))
-        asset = _write_asset(runner, lift, config, given.provenance() | _provenance(hints))
+        origin = given.provenance() | _provenance(hints, models)
+        asset = _write_asset(runner, lift, config, origin)
         request = SimulationRequest(restart="simulate" in runner.force)
         frames = play(runner, asset, config, request, lift)
         note_as_shown(folder, request)
     return Made(folder, tuple(runner.warnings), time.perf_counter() - began, runner.timings, frames)
 
 
-def _provenance(hints: ClipHints) -> dict[str, Any]:
-    """What a person said, for a manifest."""
-    return {} if hints == NOTHING_SAID else {"hints": hints_data(hints)}
+def _provenance(hints: ClipHints, models: tuple[UsedModel, ...]) -> dict[str, Any]:
+    """What a person said, and which learned models looked, for a manifest."""
+    said = {} if hints == NOTHING_SAID else {"hints": hints_data(hints)}
+    return said | ({"models": [model.to_dict() for model in models]} if models else {})
 
 
 def _lifted(runner: Runner, given: GivenFiles, config: JobConfig, hints: ClipHints) -> Lift:

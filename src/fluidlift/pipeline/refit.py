@@ -161,7 +161,8 @@ def _write_report(
     known = {
         k: t for k, t in timings.items() if isinstance(t, dict) and {"seconds", "cached", "peak_memory_mb"} <= t.keys()
     }
-    report.write_report(lift, done, shown, folder, config.preset, known | fresh, runner.warnings)
+    models = manifest.get("provenance", {}).get("models", ())
+    report.write_report(lift, done, shown, folder, config.preset, known | fresh, runner.warnings, models)
 
 
 def _number(asset: Any, label: str) -> float | None:

@@ -209,7 +209,8 @@ def _finish(
     ]
     runner.warnings[:] = [w for w in from_plain(manifest) if w not in before] + own
     if lift is not None:
-        report.write_report(lift, done, shown, folder, config.preset, runner.timings, runner.warnings)
+        models = manifest.get("provenance", {}).get("models", ())
+        report.write_report(lift, done, shown, folder, config.preset, runner.timings, runner.warnings, models)
     # versions before kept there what `evaluate` takes from the values of the stages, for frames that are gone by now
     asset_file(folder, "work/evaluation.npz").unlink(missing_ok=True)
     update_manifest(

@@ -12,7 +12,14 @@ from fluidlift.messages import NONE, Notice
 from fluidlift.motion.steady_flow import bulk_motion, mean_motion
 from fluidlift.pipeline import depths, given_body
 from fluidlift.pipeline.inputs import GivenFile
-from fluidlift.pipeline.known_camera import USUAL_FIELD_OF_VIEW, known_camera, lens_is_known, level_of
+from fluidlift.pipeline.known_camera import (
+    USUAL_FIELD_OF_VIEW,
+    USUAL_SPREAD,
+    known_camera,
+    lens_is_known,
+    level_of,
+    with_model_lens,
+)
 from fluidlift.pipeline.settings import GeometrySettings, GivenView
 from fluidlift.pipeline.work import Work
 from fluidlift.shape import (
@@ -420,11 +427,14 @@ def _said_of_view(c: GeometrySettings, known: PinholeCamera, shape: tuple[int, .
 def _depth_pictures(
     read: Read, given: GivenView, fov: float | None, known: PinholeCamera, start: int, work: Work
 ) -> tuple[DepthPictures | None, PinholeCamera]:
-    """Depth from a file or a model, and the camera with the model's field of view where nothing else says it."""
+    """Depth from a file or a model, and the camera with the model's field of view, weighed against the rest, where the
+    lens was not told."""
     told = lens_is_known(given, fov)
     pictures = depths.pictures_of(read, given, known if told else None, start, work)
     if pictures is not None and not told and pictures.field_of_view is not None:
-        known = PinholeCamera.from_fov(pictures.field_of_view, known.size)
+        measured = read.view is not None and np.isfinite(read.view.focal_error)
+        error = read.view.focal_error if measured and read.view is not None else USUAL_SPREAD
+        known = with_model_lens(known, error, pictures.field_of_view)
     return pictures, known
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ FILM_MAX = 12_000_000
 
 def write_report(
     lift: Lift, simulation: Simulation, shown: Shown, folder: Path, preset: str, timings: dict[str, Any],
-    warnings: Sequence[str],
+    warnings: Sequence[str], models: Sequence[Mapping[str, Any]] = (),
 ) -> Path:  # fmt: skip
     """report.html and the overlay picture.
 
@@ -35,6 +35,7 @@ def write_report(
         preset: of the job.
         timings: of the stages.
         warnings: for its head.
+        models: learned ones that looked at the clip, as the manifest has them.
     """
     from fluidlift.io.atomic import write_bytes
     from fluidlift.io.images import write_png
@@ -48,7 +49,8 @@ def write_report(
     sections = [
         _section_as_filmed(shown),
         _section_outcome(lift, shown),
-        _section_seeing(lift, overlay),
+        _section_seeing(lift, overlay, models),
+        *_section_models(models),
         _section_body(lift.geometry, lift.refined),
         _section_motion(lift),
         _section_parameters(lift.fit, lift.geometry.scale_sentence),
@@ -128,7 +130,20 @@ def _section_outcome(lift: Lift, seen: Shown) -> Section:
     return Section("Input and re-simulation", figures)
 
 
-def _section_seeing(lift: Lift, overlay) -> Section:
+def _section_models(models: Sequence[Mapping[str, Any]]) -> list[Section]:
+    """Which learned models looked at the clip, to the bit; nothing where none did."""
+    if not models:
+        return []
+    rows = [
+        [m["for"], m["name"], m["method"], m.get("terms", "see its page"),
+         ", ".join(f"{name} {sha256}" for name, sha256 in m["files"].items())]
+        for m in models
+    ]  # fmt: skip
+    note = "A learned model can be wrong, too: look at the mask and the distance of the surface."
+    return [Section("Learned models", rows=rows, header=["for", "model", "by", "licence", "SHA-256"], notes=[note])]
+
+
+def _section_seeing(lift: Lift, overlay, models: Sequence[Mapping[str, Any]]) -> Section:
     from fluidlift.look.pictures import colour_map
 
     clip, labels = lift.clip, lift.labels
@@ -150,8 +165,9 @@ def _section_seeing(lift: Lift, overlay) -> Section:
         )
     )
     found, read = lift.segmentation, lift.read
+    by = next((f"by {m['name']}" for m in models if m["for"] == "masks"), "from motion and colour")
     rows = [
-        ["mask", "given by the user" if found.user_mask else "found from motion and colour"],
+        ["mask", "given by the user" if found.user_mask else f"found {by}"],
         ["mean confidence on the fluid", found.confidence_mean],
         ["share of the picture", found.fluid_share],
         ["camera shake", f"{read.shake_px:.2f} px per frame" + (", taken out" if read.stabilised else "")],

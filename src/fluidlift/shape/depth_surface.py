@@ -34,8 +34,16 @@ CROWN = 0.03
 tenth, rivers waves of some hundredths)"""
 COARSE = 0.01
 """relative error of slow changes from which the depth is a learned one, whose bends are not believed"""
+MODEL_TILT = 4.5
+"""degrees, standard deviation of the tilt by the plane of a learned depth: true depth of two streams, spoilt as models
+spoil it, put up 4.3 and 4.6 degrees off (docs/depth.md)"""
 LEAN = 0.05
 """way back per height of a fall that stands upright: a height model knows one height over each point of the ground"""
+FEWEST_NORMALS = 64
+"""px of fluid, in all frames together, whose normals tell a plane"""
+ALIGNED = 0.7
+"""length of the mean of unit normals below which they are of no plane: half of all directions, at random, have 0.5,
+waves as steep as 20 degrees 0.94"""
 KNOTS = 12
 """of a profile along the stream: its pieces are about as long as a stream is wide"""
 
@@ -109,16 +117,49 @@ def plane_normal(camera: PinholeCamera, depth: Float[np.ndarray, "h w"], mask: B
     return normal / np.linalg.norm(normal)
 
 
+def facing(
+    normals: Float[np.ndarray, "n h w 3"], fluid: Bool[np.ndarray, "n h w"], area: Bool[np.ndarray, "h w"],
+    camera: PinholeCamera,
+) -> Float[np.ndarray, "3"] | None:  # fmt: skip
+    """Unit normal, in the camera's own axes, of the plane that most of the fluid's surface lies in, by its normals.
+
+    Waves tilt them to all sides, which a median evens out. What is seen faces the camera, whichever sign they have.
+
+    Args:
+        normals: of some frames, camera axes; nan: not known.
+        fluid: mask of each of them.
+        area: the fluid that it is wanted of.
+        camera: its pose is not used.
+
+    Returns:
+        None where too little of the fluid has normals.
+    """
+    use = fluid & area & np.isfinite(normals).all(axis=-1)
+    if use.sum() < FEWEST_NORMALS:
+        return None
+    grid = camera.pixel_grid()
+    ray = np.concatenate([(grid - camera.center) / camera.focal, np.ones((*grid.shape[:2], 1))], axis=-1)
+    found = normals[use].astype(np.float64)
+    away = (found * np.broadcast_to(ray, normals.shape)[use]).sum(axis=-1) > 0
+    found[away] *= -1.0
+    if np.linalg.norm(found.mean(axis=0)) < ALIGNED:
+        return None
+    middle = np.median(found, axis=0)
+    return middle / np.linalg.norm(middle)
+
+
 def up_from_depth(
     scene: SceneDepth, camera: PinholeCamera, mask: Bool[np.ndarray, "h w"], displacement: Float[np.ndarray, "h w 2"],
     confidence: Float[np.ndarray, "h w"], *, slopes: tuple[tuple[float, float, float], ...] = SLOPES,
+    normal: Float[np.ndarray, "3"] | None = None,
 ) -> tuple[UpEvidence, float]:  # fmt: skip
     """Up and slope (degrees) of a stream whose camera's tilt nobody knows, from the plane that its depth lies in.
 
     The plane is level across the stream. How far it falls along it cannot be seen: each slope asks for another tilt of
-    the camera, and the likeliest pair is taken (mean over what is possible).
+    the camera, and the likeliest pair is taken (mean over what is possible). `normal` of that plane: see `facing`; by
+    default that of the depth.
     """
-    normal = plane_normal(camera, scene.depth, mask)
+    normal = plane_normal(camera, scene.depth, mask) if normal is None else normal
     flow = _flow_on_plane(camera, normal, mask, displacement, confidence)
     angles = np.arange(0.0, 45.5, 0.5)
     share = _share_of(angles, slopes)
@@ -134,6 +175,43 @@ def up_from_depth(
     best = float((angles * weight).sum() / weight.sum()) if flow is not None else 0.0
     k = int(np.argmin(np.abs(angles - best)))
     return UpEvidence(pitches[k], rolls[k], f"plane of the {scene.source}", 0.8), float(angles[k])
+
+
+def model_normal(
+    camera: PinholeCamera, depth: Float[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"], faces: np.ndarray | None
+) -> tuple[np.ndarray, float]:
+    """Unit normal of a stream by a learned model, and its standard deviation in degrees.
+
+    Depth and normals are two answers of one network about the same plane: their mean is taken, and by how much they
+    differ tells, too, how far it can be off.
+    """
+    plane = plane_normal(camera, depth, mask)
+    if faces is None:
+        return plane, MODEL_TILT
+    apart = float(np.degrees(np.arccos(np.clip(plane @ faces, -1.0, 1.0))))
+    both = plane + faces
+    return both / max(float(np.linalg.norm(both)), 1e-9), max(MODEL_TILT, 0.5 * apart)
+
+
+def weighed_up(seen: UpEvidence, by_model: UpEvidence, error: float) -> UpEvidence:
+    """Up by what the clip shows and by a learned model: each counts by how sure it is.
+
+    Where both are far apart, one of them is wrong, and the spread says so.
+
+    Args:
+        seen: by motion, sky, plumb lines and more; its error is the spread of what the pitch may be.
+        by_model: by a learned depth.
+        error: of that, degrees.
+    """
+    if seen.error <= 0.0:  # nothing is known of how sure it is
+        return replace(by_model, error=error)
+    weights = np.array([seen.error, error]) ** -2.0
+    share = weights / weights.sum()
+    pitch, roll = (float(share @ [getattr(seen, n), getattr(by_model, n)]) for n in ("pitch", "roll"))
+    spread = max(float(weights.sum() ** -0.5), 0.5 * abs(seen.pitch - by_model.pitch))
+    roll = seen.roll if seen.source.startswith("user") else roll
+    source = f"{by_model.source} ({100 * share[1]:.0f} %), {seen.source}"
+    return UpEvidence(pitch, roll, source, max(seen.confidence, by_model.confidence), spread)
 
 
 def _share_of(degrees: np.ndarray, slopes: tuple[tuple[float, float, float], ...]) -> np.ndarray:

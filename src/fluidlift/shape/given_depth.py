@@ -46,6 +46,8 @@ class DepthPictures:
     """relative error that slow changes over the picture have at least"""
     field_of_view: float | None = None
     """degrees across the longer side, where a model says it"""
+    normals: Float[np.ndarray, "n h w 3"] | None = None
+    """unit normals of the surfaces in camera axes, where a model gives them; nan elsewhere"""
 
     def __post_init__(self) -> None:
         require(self.values.ndim == 3, f"depth of shape {self.values.shape}", "[n,H,W]")

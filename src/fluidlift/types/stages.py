@@ -137,6 +137,8 @@ class DepthGuess:
     """metres, relative or disparity"""
     field_of_view: float | None
     """degrees across the longer side, where the model says it"""
+    normals: Float[np.ndarray, "k h w 3"] | None = None
+    """unit normals in camera axes, where the model gives them; nan elsewhere"""
 
 
 @dataclass(frozen=True)

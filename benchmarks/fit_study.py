@@ -150,6 +150,8 @@ def before_and_after(scenes: Sequence[str], seeds: int) -> tuple[list[str], list
             if seed == 0:
                 lines += [f"### {scene}", "", *_parameter_table(whole, found, sets)]
             log.append({"scene": scene, "seed": seed, **{k: vars(m) for k, m in found_misfits[-1].items()}})
+            if seed == 0:
+                log[-1]["parameters"] = parameter_values(whole, found, sets)
         for label in ("before", "after"):
             some = [m[label] for m in found_misfits]
             totals.append([
@@ -159,6 +161,17 @@ def before_and_after(scenes: Sequence[str], seeds: int) -> tuple[list[str], list
     lines += ["### Simulated velocity against the exact one, from the exact first frame", ""]
     head = ["scene", "", "relative L2, median", "worst seed", "cosine, median"]
     return lines + table(head, totals), log
+
+
+def parameter_values(whole: Twin, found: FitResult, sets: dict[str, FluidParameters]) -> dict[str, dict[str, float]]:
+    """Value of each parameter, mean speed and mean pressure, by name and by set."""
+    out = {
+        f"{label} [{e.unit}]" if e.unit else label: {k: float(true_value(p, label)) for k, p in sets.items()}
+        for label, e in found.estimates.items()
+    }
+    states = {k: state_of(whole, p) for k, p in sets.items()}
+    means = ("mean speed [m/s]", "mean pressure [Pa]")
+    return out | {name: {k: s[i] for k, s in states.items()} for i, name in enumerate(means)}
 
 
 def _parameter_table(whole: Twin, found: FitResult, sets: dict[str, FluidParameters]) -> list[str]:

@@ -32,6 +32,18 @@ def test_finer_presets_are_finer():
         assert figure(draft) < figure(standard) < figure(hero)
 
 
+def test_the_preset_of_the_paper_is_its_method_throughout():
+    config = build_config("paper")
+    motion, fit, simulate = config.motion, config.fit, config.simulate
+    assert (motion.method, motion.filling) == ("farneback", "sum")
+    assert (motion.divergence, motion.constraint) == ("paper", "hard")
+    assert (motion.half_window, motion.reach, motion.along_paths, motion.wall) == (0, 0, False, "cubic")
+    assert (fit.method, fit.pressure, fit.advection_gradient) == ("adam", "recurrent", "upwind")
+    assert (fit.compare, fit.start_rounds, fit.free) == ("last", 0, ("all",))
+    assert (simulate.skin, simulate.follow, simulate.guide) == (False, 0.0, 0.0)
+    assert config.shape == build_config("draft").shape  # as fine as draft: what differs is the method
+
+
 def test_later_sources_win(tmp_path):
     file = tmp_path / "job.yaml"
     file.write_text("shape:\n  cells: 50\n  stride: 5\n  rays: 11\nfit:\n  max_seconds: 7\n")

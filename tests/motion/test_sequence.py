@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import gc
+import math
 import weakref
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from fluidlift.motion.lift import depth_change
+from fluidlift.motion.screen_divergence import project_screen_divergence
 from fluidlift.motion.sequence import (
     FrameMotion,
     MotionOptions,
@@ -297,6 +300,35 @@ def test_what_no_frame_of_the_window_saw_is_filled_with_the_mean_of_the_clip() -
     assert error((truth, np.full(dark.shape, 0.8, np.float32))) < 0.5 * error(None)
 
 
+@pytest.mark.parametrize("filling", ["diffusion", "sum"])
+def test_a_hard_constraint_is_the_projection_with_an_infinite_reach(filling) -> None:
+    """On a stream with a gap in its flow, filled in either way."""
+    scene = channel()
+
+    def gap(first: int, last: int) -> PixelFlow:
+        found = Clip(6, noise=0.4)(first, last)
+        confidence = found.confidence.copy()
+        confidence[:, 18:30, 24:44] = 0.0
+        return PixelFlow(found.displacement, confidence)
+
+    def made(constraint: str) -> FrameMotion:
+        options = MotionOptions(
+            half_window=0, reach=0, along_paths=False, filling=filling, divergence="paper", constraint=constraint
+        )
+        (found,) = motion_sequence(gap, still_mask, 6, scene, options, frames=[3])
+        return found
+
+    free, hard, depth = made("none"), made("hard"), scene.depth_at(3)
+    body = still_mask(3) & (depth > 0)
+    rate = depth_change(free.displacement, body, depth, depth, mask_t1=body)
+    near = np.where(body, depth, 1.0)
+    wanted, _ = project_screen_divergence(
+        free.displacement, body, free.observed & body, near, rate, CAMERA, form="paper", reach=math.inf
+    )
+    np.testing.assert_allclose(hard.displacement[body], wanted[body], atol=1e-6)
+    assert np.abs(hard.displacement - free.displacement)[~free.observed].max() > 0.01
+
+
 def test_wrong_input_is_named() -> None:
     scene = MotionScene(CAMERA, None, None, None, "stream", INTERVAL)
     with pytest.raises(ValueError, match="frames"):
@@ -309,5 +341,9 @@ def test_wrong_input_is_named() -> None:
         list(motion_sequence(lambda a, b: Clip(4)(0, 2), still_mask, 4, scene, frames=[1]))
     with pytest.raises(ValueError, match="wall"):
         MotionOptions(wall="slip")
+    with pytest.raises(ValueError, match="filling"):
+        MotionOptions(filling="guess")
+    with pytest.raises(ValueError, match="constraint"):
+        MotionOptions(constraint="soft")
     with pytest.raises(ValueError, match="half window"):
         MotionOptions(half_window=-1)

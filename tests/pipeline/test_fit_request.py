@@ -5,7 +5,7 @@ import pytest
 
 from fluidlift.config import build_config
 from fluidlift.errors import InputRejected
-from fluidlift.pipeline.fit_request import FitRequest, parameter_named, request_of, startable
+from fluidlift.pipeline.fit_request import NAMES, FitRequest, parameter_named, request_of, startable
 from fluidlift.types import FluidParameters
 
 GUESS = FluidParameters(inflow_velocity=(0.3, 0.0, -0.4), outflow_velocity=0.2, inflow_fluctuation=0.1)
@@ -37,6 +37,13 @@ def test_lists_come_with_commas_from_the_command_line_and_as_lists_from_files():
     one = asked("free=gravity,viscosity", "hold=density=998,restitution=0")
     two = asked("free=[gravity, viscosity]", "hold={density: 998, restitution: 0}")
     assert one == two == FitRequest(("gravity", "kinematic_viscosity"), {"density": 998.0, "restitution": 0.0})
+
+
+def test_all_is_every_parameter_but_those_that_are_known():
+    request = asked("free=all", "hold=density=998")
+    assert request.everything and request.free == ()
+    assert set(request.free_of(("gravity",))) == set(NAMES) - {"density"}
+    assert asked("free=gravity").free_of(("viscosity",)) == ("gravity",)
 
 
 def test_a_vector_is_given_by_its_length_or_by_three_numbers():

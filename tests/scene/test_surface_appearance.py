@@ -67,6 +67,15 @@ def test_what_falls_or_rises_and_what_is_turned_on_its_side_has_no_skin(channel)
         assert len(appearance.dressed(p, 2).ids) == len(p) and appearance.state() == {}
 
 
+def test_without_a_skin_the_deformed_splats_are_all_there_is(channel):
+    scene = replace(channel(FRAMES), skin=False)
+    appearance, p = played(scene)
+    shown = appearance.dressed(p, FRAMES - 1)
+    np.testing.assert_array_equal(shown.ids, 2 * p.ids)
+    np.testing.assert_array_equal(shown.gaussians.means, p.positions)
+    assert appearance.state() == {} and scene.cache_key != channel(FRAMES).cache_key
+
+
 def test_skin_and_splats_stay_out_of_the_ground(channel):
     scene = channel(FRAMES)
     nodes, grid = scene.terrain.grid.nodes(), scene.terrain.grid

@@ -94,8 +94,9 @@ class Body:
 class Quality:
     """How fine, and how repeatable."""
 
-    preset: Literal["draft", "standard", "hero"] | None = None
-    """draft (the default): minutes on a laptop; standard: finer; hero: as fine as the machine allows"""
+    preset: Literal["draft", "standard", "hero", "paper"] | None = None
+    """draft (the default): minutes on a laptop; standard: finer; hero: as fine as the machine allows; paper: as fine as
+    draft, by the method of the paper throughout, to compare with"""
     max_size: int | None = None
     """longer side of the working pictures, px"""
     seed: int | None = None

@@ -25,7 +25,7 @@ def build_config(
     """Base, preset, then file, then flat options, then `section.name=value` overrides; later ones win.
 
     Args:
-        preset: draft, standard or hero; None: the file's, or draft.
+        preset: draft, standard, hero or paper; None: the file's, or draft.
         file: YAML with the sections of `JobConfig`.
         overrides: texts such as "fit.max_seconds=60".
         flat: values by dotted name, from command-line options; None values are left out.

@@ -20,7 +20,19 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
         "simulate": {"max_particles": 900_000},
         "show": {"width": 768},
     },
-}
+    # as fine as draft, by the paper's method (docs/paper_map.md says where it still differs)
+    "paper": {
+        "motion": {
+            "method": "farneback", "half_window": 0, "reach": 0, "along_paths": False, "filling": "sum",
+            "divergence": "paper", "constraint": "hard", "wall": "cubic",
+        },
+        "fit": {
+            "method": "adam", "pressure": "recurrent", "advection_gradient": "upwind", "compare": "last",
+            "start_rounds": 0, "free": ("all",), "max_seconds": 900.0,
+        },
+        "simulate": {"follow": 0.0, "skin": False},
+    },
+}  # fmt: skip
 
 RANGES: dict[str, tuple[float, float]] = {
     "seed": (0, 2**63 - 1),
@@ -53,6 +65,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "fit.max_work": (0, 1e18),
     "fit.max_seconds": (0, 1e9),
     "fit.restarts": (0, 4),
+    "fit.start_rounds": (0, 10),
     "simulate.frames": (1, 1e6),
     "simulate.max_particles": (100, 1e9),
     "simulate.follow": (0, 1),

@@ -151,8 +151,12 @@ class MotionConfig:
     """average along the fluid's paths too; false: at fixed pixels, over half_window alone"""
     wall: Literal["cubic", "log", "film"] = "cubic"
     """how the velocity falls off towards the bed: third-order, the log law of rivers, or a laminar film"""
+    filling: Literal["diffusion", "sum"] = "diffusion"
+    """how failed pixels take their neighbours' motion: diffusion inside the mask, or the paper's sum"""
     divergence: Literal["paper", "exact"] = "exact"
     """form of the screen-divergence constraint"""
+    constraint: Literal["validated", "hard", "none"] = "validated"
+    """how strictly it is met: as hidden patches of the clip bear it out, exactly (the paper), or not at all"""
     targets: int = 8
     """consecutive frames whose volume velocity is computed"""
     complete_every: int = 6
@@ -171,8 +175,16 @@ class FitConfig:
     """where the flow is rolled out: cpu, or cuda where that is faster"""
     method: Literal["lm", "adam"] = "lm"
     """Levenberg-Marquardt, or Adam as in the paper"""
+    pressure: Literal["implicit", "jacobi", "recurrent"] = "implicit"
+    """way through the pressure: solved, a hundred sweeps, or the paper's recurrent convolution, fitted to this flow"""
+    advection_gradient: Literal["exact", "upwind"] = "exact"
+    """of advection in the analytic gradient; upwind: the paper's surrogate"""
+    compare: Literal["all", "last"] = "all"
+    """frames of a window that count: all, or its last alone as in the paper"""
+    start_rounds: int = 2
+    """times that the first frame of a window is corrected; 0: it is what the video gave, as in the paper"""
     free: tuple[str, ...] = ()
-    """parameters to fit, such as gravity,viscosity; none: all that the clip can tell something about"""
+    """parameters to fit, such as gravity,viscosity, or all; none: those that the clip can tell something about"""
     hold: tuple[str, ...] = ()
     """values that are known, such as viscosity=1e-6: they are taken as they are"""
     restarts: int = 0
@@ -193,6 +205,8 @@ class SimulateConfig:
     """how far it keeps to the filmed flow where geometry does not explain it: 0 pure physics, 1 as filmed"""
     guide: float = 0.0
     """how far it is drawn to the filmed velocity of each frame besides, over and over: 0 not at all, 1 as filmed"""
+    skin: bool = True
+    """play the clip's film on a skin over what lies, falls or is poured; false (the paper): deformed splats alone"""
     checkpoint_every: int = 10
     """frames between checkpoints, from which a stopped simulation goes on"""
 
@@ -215,7 +229,7 @@ class ShowConfig:
 class JobConfig:
     """Everything about one job that is not its input."""
 
-    preset: Literal["draft", "standard", "hero"] = "draft"
+    preset: Literal["draft", "standard", "hero", "paper"] = "draft"
     seed: int = 0
     read: ReadConfig = field(default_factory=ReadConfig)
     shape: ShapeConfig = field(default_factory=ShapeConfig)

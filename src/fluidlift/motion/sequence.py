@@ -6,6 +6,7 @@ the clip, and each frame's result depends on its own window alone: any subset of
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 
@@ -21,6 +22,7 @@ from fluidlift.motion.free_fall import downhill_of, with_free_fall
 from fluidlift.motion.front import raised_flow
 from fluidlift.motion.lift import depth_change, lift_flow
 from fluidlift.motion.mainstream import complete_flow
+from fluidlift.motion.neighbour_sum import complete_by_sum
 from fluidlift.motion.screen_divergence import project_screen_divergence, validated_reach
 from fluidlift.motion.temporal import smoothed_flow
 from fluidlift.motion.volume import VolumeReport, VolumeSolver
@@ -37,6 +39,9 @@ DepthReader = Callable[[int], Float[np.ndarray, "h w"]]
 
 FRONT_HALF_WINDOW = 30
 """frames on either side over which a silhouette's growth is followed at most"""
+
+STRICTNESS = ("validated", "hard", "none")
+"""words for how strictly the screen divergence is met"""
 
 LEVEL = 0.05
 """sine of the slope below which a surface counts as level: 3 degrees, the error of a pitch that was estimated from one
@@ -98,8 +103,12 @@ class MotionOptions:
     """frames on either side that are asked where the near ones fail"""
     along_paths: bool = True
     """average along the fluid's paths too (`motion.temporal`); False: at fixed pixels, over `half_window` alone"""
+    filling: str = "diffusion"
+    """how failed pixels take others' motion: diffusion (`motion.mainstream`) or sum (`motion.neighbour_sum`)"""
     divergence: str = "exact"
     """form of the screen-divergence constraint: exact or paper"""
+    constraint: str = "validated"
+    """how strictly it is met: "validated" (as far as hidden patches bear it out), "hard" (the paper) or "none" """
     wall: str = "cubic"
     """wall function, one of `motion.bed.WALLS`"""
     tolerance: float = 1e-4
@@ -110,6 +119,8 @@ class MotionOptions:
         require(self.reach >= 0, f"a reach of {self.reach} frames", "0 or more")
         require(self.wall in WALLS, f"wall function '{self.wall}'", "one of " + ", ".join(WALLS))
         require(self.divergence in ("exact", "paper"), f"form '{self.divergence}'", "exact or paper")
+        require(self.filling in ("diffusion", "sum"), f"filling by '{self.filling}'", "diffusion or sum")
+        require(self.constraint in STRICTNESS, f"constraint '{self.constraint}'", " or ".join(STRICTNESS))
 
 
 @dataclass(frozen=True)
@@ -246,6 +257,8 @@ class _Clip:
         the motion of a frame.
         """
         downhill = screen_downhill(scene)
+        if options.constraint != "validated":
+            return cls(downhill, math.inf if options.constraint == "hard" and scene.depth is not None else 0.0)
         for t in (*range(pairs // 2, pairs), *range(pairs // 2 - 1, -1, -1)) if scene.depth is not None else ():
             now = _Instant.of(mask, t, scene)
             body, body_after = now.on_body()
@@ -300,6 +313,9 @@ def _filled(
     mask, depth = now.mask, now.depth
     mean, trust = smoothed_flow(near, at, mask, half_window=options.half_window, along_paths=options.along_paths)
     direction = mainstream_direction(mean, trust, mask, downhill=downhill)
+    if options.filling == "sum":
+        full, seen = complete_by_sum(mean, trust, mask, direction)
+        return full, seen, trust
     with_depth = depth is not None and bool((depth[mask] > 0).all())
     prior = scene.prior if kind_of(scene.kind).has_mean_motion else None
     full, seen = complete_flow(mean, trust, mask, direction, depth if with_depth else None, prior=prior)

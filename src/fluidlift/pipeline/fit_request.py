@@ -28,10 +28,12 @@ class FitRequest:
     """names; empty: all that the clip can tell something about"""
     held: dict[str, Value] = field(default_factory=dict)
     """known values; a number for a vector is its length"""
+    everything: bool = False
+    """whether all that there is shall be fitted"""
 
     def free_of(self, usual: tuple[str, ...]) -> tuple[str, ...]:
         """The names to fit, where `usual` would be fitted otherwise."""
-        return tuple(name for name in self.free or usual if name not in self.held)
+        return tuple(name for name in (NAMES if self.everything else self.free or usual) if name not in self.held)
 
     def applied(self, guess: FluidParameters, *, along: np.ndarray) -> FluidParameters:
         """The first guess with the known values in it.
@@ -74,7 +76,8 @@ def request_of(config: FitConfig) -> FitRequest:
             raise InputRejected(f"the known value '{text}'", "name=value, such as viscosity=1e-6")
         name = parameter_named(word.strip())
         held[name] = _value(name, value.strip())
-    free = tuple(dict.fromkeys(parameter_named(word) for word in config.free))
+    everything = config.free == ("all",)
+    free = () if everything else tuple(dict.fromkeys(parameter_named(word) for word in config.free))
     both = [name for name in free if name in held]
     if both:
         raise InputRejected(f"{both[0]} is to be fitted and known", "one of --free and --hold")
@@ -83,7 +86,7 @@ def request_of(config: FitConfig) -> FitRequest:
             "a known time_step", "another parameter: the fit divides the frame interval by a whole number of its own",
             "give time_step in scene.yaml, for the simulation",
         )  # fmt: skip
-    return FitRequest(free, held)
+    return FitRequest(free, held, everything)
 
 
 def parameter_named(word: str) -> str:

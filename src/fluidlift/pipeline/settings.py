@@ -262,7 +262,9 @@ class MotionSettings:
     reach: int
     along_paths: bool
     wall: str
+    filling: str
     divergence: str
+    constraint: str
     targets: int
     complete_every: int
     every_frame: bool

@@ -64,7 +64,7 @@ def motion_options(config: MotionSettings) -> MotionOptions:
 
     return MotionOptions(
         half_window=config.half_window, reach=max(config.reach, config.half_window), along_paths=config.along_paths,
-        divergence=config.divergence, wall=config.wall,
+        filling=config.filling, divergence=config.divergence, constraint=config.constraint, wall=config.wall,
     )  # fmt: skip
 
 

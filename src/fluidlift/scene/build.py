@@ -118,6 +118,8 @@ class Scene:
     """of the fluid, which its surface plays; None, or a file that cannot be played: it looks as it did at rest"""
     film_start: int = 0
     """frame of the film that the body at rest shows"""
+    skin: bool = True
+    """whether the film, or what was seen at rest, lies on a skin over the particles; else they alone are shown"""
     force: FaceVelocity | None = None
     """m/s^2 on the faces of the terrain's grid, beside gravity"""
     dry: np.ndarray | None = None
@@ -174,6 +176,8 @@ class Scene:
             found["dry cells"] = _hash(self.dry)
         if self.whitewater > 0:
             found["white water"] = _hash(self.whitewater)
+        if not self.skin:
+            found["skin"] = _hash(self.skin)
         if self.overlap:
             found["loop"] = _hash(self.frames, self.overlap)
         return found
@@ -298,7 +302,7 @@ def edited_scene(
         asset.parameters.updated(changes), asset.camera, interval, asset.interval,
         wanted or settings.frames or clip_frames, settings.seed, edits.obstacles, shading,
         longest_step=longest_step, inflow=edits.inflow, changes=changed_parameters(asset.parameters, changes),
-        film=film, film_start=start - first_of_film(start, asset.frame_count),
+        film=film, film_start=start - first_of_film(start, asset.frame_count), skin=settings.skin,
     )  # fmt: skip
     longer = edits.extend_downstream if request.extend_downstream is None else request.extend_downstream
     if longer > 0:

@@ -15,8 +15,11 @@ class SceneSettings:
     follow: float
     guide: float
     seed: int
+    skin: bool = True
+    """whether the surface plays the clip's film"""
 
     @classmethod
     def of(cls, config: JobConfig) -> SceneSettings:
         """From those of a job."""
-        return cls(config.simulate.frames, config.simulate.follow, config.simulate.guide, config.seed)
+        c = config.simulate
+        return cls(c.frames, c.follow, c.guide, config.seed, c.skin)

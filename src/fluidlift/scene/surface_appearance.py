@@ -187,7 +187,7 @@ class SurfaceAppearance:
         self._plays = False
         self._tracers = 0
         self._own = scene.rest.select(np.arange(len(scene.rest) - sum(map(len, scene.emitter_looks))))
-        if len(self._own) and len(scene.body):
+        if scene.skin and len(self._own) and len(scene.body):
             self._lay_skin()
 
     @property

@@ -140,6 +140,8 @@ def _attempt(
 ) -> tuple[FitResult, Verdict]:  # fmt: skip
     """One fit, judged; equations without a solution are a failure like others."""
     from fluidlift.fit.optimize import fit_parameters
+    from fluidlift.fit.pressure_route import with_route
+    from fluidlift.fit.settings import FitOptions
 
     setting, kind = geometry.setting, kind_of(geometry.kind)
     if not kind.is_driven_in_sight:
@@ -148,12 +150,21 @@ def _attempt(
         return FitResult(initial, {}, np.zeros(0), False, 0), Verdict("left", reason)
     try:
         with one_torch_thread():
+            options = FitOptions(
+                method=config.method, free=free, prior_sigmas=prior_widths(kind), compare=config.compare,
+                start_rounds=config.start_rounds, max_work=config.max_work, max_seconds=config.max_seconds,
+                device=config.device,
+            )  # fmt: skip
+            options, notes = with_route(
+                options, config.pressure, config.advection_gradient, motion.velocities, setting.cell_types,
+                setting.terrain, initial, (interval, kind),
+            )  # fmt: skip
             found = fit_parameters(
                 motion.velocities, setting.cell_types, setting.terrain, setting.terrain.grid, interval, initial,
-                kind=kind, mainstream=setting.terrain.mainstream, method=config.method, free=free,
-                prior_sigmas=prior_widths(kind), restarts=config.restarts + 1, max_work=config.max_work,
-                max_seconds=config.max_seconds, device=config.device, progress=work.step,
+                kind=kind, mainstream=setting.terrain.mainstream, restarts=config.restarts + 1, settings=options,
+                progress=work.step,
             )  # fmt: skip
+            found = replace(found, notes=(*notes, *found.notes))
     except (np.linalg.LinAlgError, FloatingPointError) as error:
         return FitResult(initial, {}, np.zeros(0), False, 0), Verdict("failed", f"no solution ({error})")
     return found, verdict(found)

@@ -1,0 +1,1 @@
+"""The page that holds our figures against the paper's."""

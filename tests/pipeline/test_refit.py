@@ -42,10 +42,10 @@ def outcome(monkeypatch):
     """Lets the fit end in a chosen way: changes of a good result, or an exception."""
 
     def end(changes=None, *, error=None, calls=None, **extra):
-        def fit(targets, cells, terrain, grid, interval, initial, *, free, restarts=1, **options):
-            options |= {"restarts": restarts}
+        def fit(targets, cells, terrain, grid, interval, initial, *, settings, restarts=1, **options):
+            options |= vars(settings) | {"restarts": restarts}
             if calls is not None:
-                calls.append((initial, free, options))
+                calls.append((initial, settings.free, options))
             if error is not None:
                 raise error
             from fluidlift.fit.outcome import first_guess_as_result

@@ -29,6 +29,7 @@ from fluidlift.pipeline.inputs import GivenFiles
 from fluidlift.pipeline.runner import Runner
 from fluidlift.pipeline.settings import GivenView
 from fluidlift.pipeline.sight import Sighted, sighted
+from fluidlift.pipeline.work import Work
 from fluidlift.seams import Silence
 from fluidlift.shape import depth_surface
 from fluidlift.types import PinholeCamera
@@ -99,21 +100,6 @@ class Spoilt(DepthModel):
         return Guess(values, "metres", view, normals)
 
 
-class _Plain:
-    """Work of a stage that keeps nothing."""
-
-    def part(self, name: str, function: Any, *given: Any) -> Any:
-        """Done now."""
-        return function(*given, work=self)
-
-    def remembered(self, name: str, function: Any, *given: Any) -> Any:
-        """Done now."""
-        return function(*given)
-
-    def step(self, done: int, of: int) -> None:
-        """Nobody listens."""
-
-
 def looked(truth: Truth, work: Path, seed: int, way: str) -> Sighted:
     """What geometry begins with, where such a model looks."""
     dummy = work / "no_weights"
@@ -138,7 +124,7 @@ def looked(truth: Truth, work: Path, seed: int, way: str) -> Sighted:
         depth_surface.weighed_up = lambda seen, by_model, error: by_model
     try:
         asked = begin.geometry_settings(seen[0], config, NOTHING_SAID)
-        return sighted(*seen, GivenView.of(given, config), asked, work=_Plain())  # type: ignore[arg-type]
+        return sighted(*seen, GivenView.of(given, config), asked, work=Work.alone(work))
     finally:
         depths.pictures_of, depths.make_depth_estimator, depth_surface.weighed_up = before, maker, weigh
 

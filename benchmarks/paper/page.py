@@ -21,9 +21,11 @@ makes of the same question. The paper's pictures are not shown here, and its cli
 clip and of scenes that this project simulates and films itself, so that the truth is known. Which equation is which
 function, and where we differ: [paper_map.md](paper_map.md).
 
-Written by `python -m benchmarks.paper` from [benchmarks/results](../benchmarks/results/paper.json); about an hour on
-two cores, seconds where its work folder is still there (`--only STEP` and `--again STEP` for one part, `--page` for the
-text alone). Tables of other benchmarks have their own commands.
+Written by `python -m benchmarks.paper` from [benchmarks/results](../benchmarks/results/paper.json); by its
+parts about an hour on two cores (never timed in one go), seconds where its work folder is still there (`--only STEP`
+and `--again STEP` for one part, `--page` for the text alone). What is re-simulated here was drawn before patches of the
+film stayed in their own places up to its end ([looks.md](looks.md#the-film-that-a-surface-plays)), which brings
+re-simulations nearer to their clips. Tables of other benchmarks have their own commands.
 """
 
 Table = Callable[["Results"], list[str]]

@@ -17,6 +17,8 @@ from fluidlift.errors import InputRejected
 
 VARIABLE = "FLUIDLIFT_MODELS"
 """environment variable with another folder, such as one on a larger disk or one that a farm shares"""
+ELSEWHERE = f"name another folder with {VARIABLE}"
+"""what to do where models cannot be kept"""
 RECORD = "model.json"
 _RECORD_BYTES = 64 * 2**10
 
@@ -128,9 +130,8 @@ def alone(name: str) -> Iterator[None]:
         file = os.open(path, os.O_CREAT | os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
     except OSError as error:
         raise InputRejected(
-            f"'{path.parent}' cannot be written ({error.strerror})", "a folder that can be written",
-            f"name another one with {VARIABLE}",
-        ) from None  # fmt: skip
+            f"'{path.parent}' cannot be written ({error.strerror})", "a folder that can be written", ELSEWHERE
+        ) from None
     try:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -94,8 +94,3 @@ class ModelCard:
         """Size of all files; None: not known, or there are none."""
         sizes = [f.bytes for f in self.files]
         return None if not sizes or None in sizes else sum(s for s in sizes if s is not None)
-
-    @property
-    def weights(self) -> str:
-        """What of the files a back end is given: the only one, else (an empty name) the folder with all."""
-        return self.files[0].name if len(self.files) == 1 else ""

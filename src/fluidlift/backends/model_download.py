@@ -18,9 +18,10 @@ from pathlib import Path
 from typing import IO, Any
 
 from fluidlift import __version__
-from fluidlift.backends.model_cache import VARIABLE
+from fluidlift.backends.model_cache import ELSEWHERE
 from fluidlift.backends.model_card import ModelFile
 from fluidlift.errors import FluidliftError, InputRejected
+from fluidlift.io.atomic import disk_errors
 
 Told = Callable[[int, int | None], None]
 """called with (bytes there, bytes in all where that is known)"""
@@ -82,15 +83,13 @@ def fetch(file: ModelFile, target: Path, transport: Transport = HTTPS, told: Tol
         if attempt:
             time.sleep(transport.pause * 2 ** (attempt - 1))
         try:
-            with _opened(target, fresh=file.sha256 is None) as out:
+            with disk_errors(target, ELSEWHERE), _opened(target, fresh=file.sha256 is None) as out:
                 return _received(file, out, opener, transport, told)
         except _Cut as cut:
             reason = str(cut)
         except urllib.error.HTTPError as error:
             raise _refused(file, error) from None
         except (urllib.error.URLError, http.client.HTTPException, OSError) as error:
-            if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-                raise _full(target) from None
             reason = str(getattr(error, "reason", error)) or type(error).__name__
     kept = "what came is kept, and the same command goes on; or " if file.sha256 is not None else ""
     raise FluidliftError(
@@ -120,14 +119,10 @@ def copy(file: ModelFile, source: Path, target: Path, told: Told = lambda done, 
             raise InputRejected(f"'{source}' is no plain file", f"the file {file.name}", "check --from")
         _require_size(file, facts.st_size, f"'{source.name}'")
         try:
-            with _opened(target, fresh=True) as out:
+            with disk_errors(target, ELSEWHERE), _opened(target, fresh=True) as out:
                 return _poured(file, held, out, hashlib.sha256(), facts.st_size, told)
         except _Cut:
             raise InputRejected(f"'{source}' became shorter while it was read", "a file at rest") from None
-        except OSError as error:
-            if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-                raise _full(target) from None
-            raise
 
 
 @contextmanager
@@ -145,11 +140,6 @@ def _opened(path: Path, *, fresh: bool) -> Iterator[IO[bytes]]:
             raise InputRejected(
                 f"'{path}' is in the way ({error.strerror})", "a plain file or nothing", "delete it"
             ) from None
-    except PermissionError as error:
-        raise InputRejected(
-            f"'{path.parent}' cannot be written ({error.strerror})", "a folder that can be written",
-            f"name another one with {VARIABLE}",
-        ) from None  # fmt: skip
     with os.fdopen(number, "r+b") as file:
         facts = os.fstat(number)
         if not stat.S_ISREG(facts.st_mode) or facts.st_nlink != 1:
@@ -247,13 +237,6 @@ def _refused(file: ModelFile, error: urllib.error.HTTPError) -> FluidliftError:
         f"The server answers {error.code} for '{file.name}' ({why}). Needed: {file.address}. "
         "Do: fetch it in a browser and bring it with --from."
     )
-
-
-def _full(target: Path) -> InputRejected:
-    return InputRejected(
-        f"disk full while writing '{target}'", "room for the model",
-        f"free some space, or name a folder on another disk with {VARIABLE}; the same command then goes on",
-    )  # fmt: skip
 
 
 class _Redirects(urllib.request.HTTPRedirectHandler):

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from fluidlift.backends.model_cache import (
+    ELSEWHERE,
     RECORD,
-    VARIABLE,
     KeptModel,
     alone,
     begun_folder,
@@ -93,7 +93,7 @@ def _require_room(card: ModelCard, begun: Path) -> None:
     if free < needed:
         raise InputRejected(
             f"{free / 1e6:.0f} MB free on the disk of '{models_folder()}'", f"about {needed / 1e6:.0f} MB",
-            f"free some space, or name a folder on another disk with {VARIABLE}",
+            f"free some space, or {ELSEWHERE}",
         )  # fmt: skip
 
 

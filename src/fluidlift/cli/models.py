@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 TRANSPORT: Transport | None = None
 """how files are fetched; None: by https"""
 _WIDTH = 110
+_USE = "fluidlift make CLIP --models "
 _TERMS = {"allowed": "allowed", "conditions": "conditions", "research": "research only"}
 _COMMERCIAL = {"allowed": "allowed", "conditions": "see these conditions", "research": "NOT allowed"}
 
@@ -139,11 +140,7 @@ def explained(card: ModelCard) -> list[str]:
     if there is None:
         return lines + (part("here", f"no: fluidlift models get {card.name}") if card.files else [])
     checked = {"card": "as known here", "trusted": "as you vouched for"}.get(there.checked, "vouched for by nobody")
-    return lines + part("here", f"yes, {size_text(there.bytes)}, hashes {checked}") + _how_used(card)
-
-
-def _how_used(card: ModelCard) -> list[str]:
-    return [f"{'use':14}fluidlift make CLIP --models {card.name}"]
+    return lines + part("here", f"yes, {size_text(there.bytes)}, hashes {checked}") + part("use", _USE + card.name)
 
 
 def _get(card: ModelCard, c: Models) -> int:
@@ -166,7 +163,7 @@ def _get(card: ModelCard, c: Models) -> int:
     print(f"{card.name} is here ({size_text(got.bytes)})")
     if lacking := lacking_packages(card):
         print(f"it needs {', '.join(lacking)}: {card.install}")
-    print("\n".join(_how_used(card)).replace("use".ljust(14), "use it: "))
+    print(f"use it: {_USE}{card.name}")
     return 0
 
 

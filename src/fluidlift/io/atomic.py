@@ -23,8 +23,12 @@ from fluidlift.errors import InputRejected
 
 
 @contextmanager
-def disk_errors(path: Path | str) -> Iterator[None]:
+def disk_errors(path: Path | str, elsewhere: str = "choose another folder with -o") -> Iterator[None]:
     """Translate what the operating system says about a full or forbidden disk.
+
+    Args:
+        path: that is written.
+        elsewhere: how a user names another place.
 
     Raises:
         InputRejected: no space, too large a file, no permission, or a read-only file system. Other errors pass
@@ -35,16 +39,16 @@ def disk_errors(path: Path | str) -> Iterator[None]:
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             raise InputRejected(
-                f"disk full while writing '{path}'", "free space", "free some space or choose another folder with -o"
+                f"disk full while writing '{path}'", "free space", f"free some space or {elsewhere}"
             ) from error
         if error.errno == errno.EFBIG:
             raise InputRejected(
                 f"a file larger than it may be while writing '{path}'", "a limit (ulimit -f) or a disk for larger ones",
-                "raise the limit, or choose another folder with -o",
+                f"raise the limit, or {elsewhere}",
             ) from error  # fmt: skip
         if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
             raise InputRejected(
-                f"'{path}' cannot be written ({error.strerror})", "permission to write there", "choose another folder"
+                f"'{path}' cannot be written ({error.strerror})", "permission to write there", elsewhere
             ) from error
         raise
 

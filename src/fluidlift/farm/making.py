@@ -60,6 +60,9 @@ class Making:
     """told "done of all" of the stages of a shot that is the only one, for farms"""
     processes: list[subprocess.Popen] = field(default_factory=list)
     stopped: bool = False
+    settle: float = 0.0
+    """s after a make was killed from outside until that is written down: where the killer ends this process next, it
+    was no failure of the shot"""
 
     def stop(self) -> None:
         """Tell all to end, and insist on it after a while."""
@@ -131,6 +134,8 @@ def _made(shot: Shot, folder: Path, fingerprint: str, limits: Limits, making: Ma
         told, over = _watched(process, log, limits, began, making)
     making.processes.remove(process)
     code = process.returncode
+    if code == -signal.SIGKILL and not over and not making.stopped:
+        time.sleep(making.settle)
     outcome = "failed" if over else _OUTCOMES.get(code, "failed")
     found: dict = {}
     with contextlib.suppress(ValueError, TypeError):

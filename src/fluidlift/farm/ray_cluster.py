@@ -36,6 +36,8 @@ _ELSEWHERE = 60.0
 """s until a shot that somebody else makes is left to him: the makes of a machine that was lost end sooner"""
 _LOOK = 120.0
 """s that a machine has to answer; the first process of a cold node takes ten"""
+_SETTLE = 3.0
+"""s, `Making.settle`: a worker whose driver died kills what it started, then leaves within 0.1 s on an idle machine"""
 _LAST = 40.0
 """s that cancelled tasks have to end their makes"""
 
@@ -210,7 +212,7 @@ def _make(shot: Shot, folder: Path, limits: Limits, version: str) -> Outcome | N
     require_fit([Machine(node(), __version__)], folder, ours=Machine("", version))
     with suppress(ValueError):  # a batch that a shell began in the background ignores it, and so would a cancelled task
         signal.signal(signal.SIGINT, signal.default_int_handler)
-    return make_shot(shot, folder, limits, Making())
+    return make_shot(shot, folder, limits, Making(settle=_SETTLE))
 
 
 @dataclass

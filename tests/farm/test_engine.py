@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from fluidlift.farm.local import LocalEngine
-from fluidlift.farm.making import environment
+from fluidlift.farm.making import Making, environment, make_shot
 from fluidlift.farm.state import claimed, is_running, names_of, read_outcome
 from fluidlift.farm.summary import Summary, status_of
 from fluidlift.machine import THREADS, cores
@@ -142,3 +142,17 @@ def test_a_damaged_or_strange_state_is_no_state(tmp_path, limits, shot, runs):
     assert read_outcome(out, "a") is None
     (out / "shots.json").write_text('["../../x", "a", 3]')
     assert names_of(out) == ["a"]
+
+
+def test_a_make_that_is_killed_is_not_written_down_at_once_where_its_maker_may_be_next(tmp_path, limits, shot):
+    making, out = Making(settle=1.0), tmp_path / "out"
+    out.mkdir()
+    maker = threading.Thread(target=make_shot, args=(shot("s", "slow"), out, limits, making))
+    maker.start()
+    while not making.processes:
+        time.sleep(0.01)
+    making.processes[0].kill()
+    time.sleep(0.5)
+    assert read_outcome(out, "s") is None
+    maker.join()
+    assert (known := read_outcome(out, "s")) is not None and known.failure == "memory"

@@ -38,7 +38,7 @@ from fluidlift.shape.evidence import fluid_score, gather_evidence
 from fluidlift.shape.frame_pictures import typical_picture
 from fluidlift.shape.moving_solids import SharedPairs, moving_solids
 from fluidlift.shape.open_water import field_around, lies_open, log_wander
-from fluidlift.shape.segment import overlay, segment
+from fluidlift.shape.segment import clues_of, overlay, segment
 from fluidlift.synthetic.demo import unpack_demo_case
 from fluidlift.types.clip import Label, PixelLabels, VideoClip
 
@@ -81,6 +81,8 @@ class Prepared:
     """float16 [T-1,H,W,2], px"""
     confidence: np.ndarray
     """float16 [T-1,H,W]"""
+    said: np.ndarray | None
+    """log odds of fluid that the camera's path told"""
     truth: dict[int, np.ndarray]
     """frame: u8 [H,W], 255 fluid, 0 none, `UNJUDGED`"""
 
@@ -116,13 +118,16 @@ def prepared(subject: Subject, work: Path) -> Prepared:
     clip = VideoClip(np.load(folder / "frames.npy", mmap_mode="r"), np.load(folder / "times.npy"), subject.name)
     kept = np.load(folder / "kept.npy")
     flows = (np.load(folder / f"{name}.npy", mmap_mode="r") for name in ("displacement", "confidence"))
-    return Prepared(clip, *flows, _truth(subject, clip, kept, np.load(folder / "middle.npy")))
+    said = np.load(folder / "said.npy") if (folder / "said.npy").is_file() else None
+    return Prepared(clip, *flows, said, _truth(subject, clip, kept, np.load(folder / "middle.npy")))
 
 
 def _prepare(subject: Subject, folder: Path) -> None:
     scratch = folder / "scratch"
     scratch.mkdir(exist_ok=True)
     found = read(GivenFile(subject.video, ""), None, READING, work=Work.alone(scratch))
+    if found.fluid_evidence is not None:
+        np.save(folder / "said.npy", found.fluid_evidence)
     frames, estimator = np.array(found.clip.frames), DenseInverseSearch()
     displacement = np.empty((len(frames) - 1, *frames.shape[1:3], 2), np.float16)
     confidence = np.empty(displacement.shape[:3], np.float16)
@@ -273,7 +278,9 @@ def main() -> None:
         began = time.process_time()
         try:
             with NO_WATER if args.water is not None else nullcontext():
-                found = segment(ready.clip, ready.flow)
+                found = segment(
+                    ready.clip, ready.flow, clues=lambda ready=ready: clues_of(ready.clip, ready.flow, said=ready.said)
+                )
         except Exception as error:  # a clip that is refused counts as one without a mask
             print(subject.name, error, flush=True)
             continue

@@ -59,6 +59,21 @@ def test_a_hand_that_swings_is_a_solid_and_the_room_is_none():
     assert not found[around].any()
 
 
+def test_an_arm_that_reaches_in_steadily_is_a_solid():
+    pictures, look = room(), (150.0 + 25.0 * texture(1, (HEIGHT, WIDTH))).astype(np.float32)
+    rows, columns = np.mgrid[0:HEIGHT, 0:WIDTH].astype(np.float32)
+    where = np.zeros(pictures.shape, bool)
+    for t in range(FRAMES):
+        ahead = columns - 1.2 * t
+        hand = ((ahead - 70.0) / 26.0) ** 2 + ((rows - 90.0) / 40.0) ** 2 < 1.0
+        moved = cv2.warpAffine(look, np.float32([[1, 0, 1.2 * t], [0, 1, 0]]), (WIDTH, HEIGHT))
+        pictures[t], where[t] = np.where(hand, moved, pictures[t]), hand
+    found = found_in(pictures)
+    assert found[where.all(axis=0)].mean() > 0.9
+    around = cv2.dilate(where.any(axis=0).astype(np.uint8), np.ones((21, 21))) == 0
+    assert not found[around].any()
+
+
 def test_a_sheet_of_foam_that_slides_by_is_none_though_it_does_not_deform():
     pictures = room()
     for t in range(FRAMES):

@@ -214,6 +214,23 @@ def test_smoke_that_rises_is_outlined_in_every_frame():
         assert overlap(labels.fluid[t], truth[t]) > 0.85, t
 
 
+def test_a_thin_jet_that_moves_along_is_outlined_though_the_ground_has_its_colours():
+    rng, frames = np.random.default_rng(3), 30
+    pictures, truth = still_room(rng, frames=frames) + 60.0, np.zeros((frames, HEIGHT, WIDTH), bool)
+    pictures[:, :, : WIDTH // 3] = (45.0 + 12.0 * texture(rng, (HEIGHT, WIDTH)))[:, : WIDTH // 3, None]
+    for t in range(frames):
+        left = 70 + round(0.2 * t)
+        truth[t, 5:50, left : left + 4] = True
+        beads = 45.0 + 12.0 * texture(rng, (45, 1), sigma=1.0)  # too fast to be followed
+        pictures[t][truth[t]] = np.repeat(beads, 4, axis=0)
+    for t in range(frames):  # what it falls into is red, and rises
+        red = np.array([170.0, 40.0, 40.0]) + 25.0 * texture(rng, (t + 10, 40))[..., None]
+        pictures[t][HEIGHT - t - 10 :, 55:95] = red
+    fluid = segment(clip_of(pictures), no_flow(frames)).fluid
+    for t in (3, 15, 27):
+        assert fluid[t][truth[t]].mean() > 0.8, t
+
+
 def test_a_leaf_that_sways_beside_smoke_is_no_smoke_in_any_frame():
     rng = np.random.default_rng(9)
     pictures, truth = smoke(rng)

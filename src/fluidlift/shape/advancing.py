@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import cv2
 import numpy as np
 
 from fluidlift.shape.background import (
@@ -17,7 +18,7 @@ from fluidlift.shape.background import (
     typical_contrast,
 )
 from fluidlift.shape.evidence import POOLING, Evidence, change_over_time, pool
-from fluidlift.shape.min_cut import spread
+from fluidlift.shape.min_cut import disc, spread
 from fluidlift.shape.presence import Presence
 from fluidlift.shape.region import clean_region, solids_in, still_pixels
 from fluidlift.types.clip import Label
@@ -26,6 +27,9 @@ SHADOW = 0.2
 """factor on changes of brightness against the sign of the fluid's own contrast"""
 FAINTEST = 0.5
 """of the fluid's typical contrast with the background: an outline lies where fluid and background mix half and half"""
+SPANNED = 0.02
+"""part of the longer side: where background was seen on both sides of a gap that is narrower (radius), what is filled
+in between is believed as if it had been seen. A jet is that thin, and is always somewhere within its sway"""
 GAP = 0.012
 """part of the longer side: gaps between puffs that are narrower (radius) are fluid in the shade of other fluid"""
 
@@ -62,6 +66,8 @@ def odds_over_time(
     the sign of the fluid's contrast, though it moves as the fluid does. That steady fluid stands still says nothing.
     """
     scene = still_background(evidence, presence, domain)
+    across = cv2.morphologyEx(scene.known.astype(np.uint8), cv2.MORPH_CLOSE, disc(SPANNED * max(domain.shape))) > 0
+    known = scene.known | (across & ~scene.steady)
     contrast, brightens = typical_contrast(evidence, presence, scene.background, scene.known)
     threshold = np.maximum(4.0 * evidence.noise, FAINTEST * contrast)
     background, tinted = filled_in(scene.background, scene.known), is_tinted(evidence, presence, scene)
@@ -83,7 +89,7 @@ def odds_over_time(
         told = np.where(scene.steady, np.maximum(moved, 0.0), moved)
         guessed = np.clip(told, -3.0, 3.0) + scene.like_fluid(picture)
         guessed[shaded & (2.0 * size > threshold)] = -DECISIVE
-        best = np.where(scene.known, seen, guessed) + hint
+        best = np.where(known, seen, guessed) + hint
         yield np.clip(np.where(domain, best, -12.0), -12.0, 12.0).astype(np.float32)
 
 

@@ -3,7 +3,8 @@
 A solid keeps its look and moves as one: over a few tenths of a second its features are found again (pyramidal
 Lucas-Kanade) and agree on a similarity (RANSAC), where those of a fluid deform and go out. And it does not keep moving
 the same way at the same place: it is held, sways with a camera that is held, or passes. A current does, so a sheet of
-foam that slides by without deforming is no solid.
+foam that slides by without deforming is no solid. Where a clip is too short for that, a solid takes its outline along:
+its leading or trailing end keeps up with its motion, where a current flows through an outline that stays.
 """
 
 from __future__ import annotations
@@ -49,6 +50,15 @@ AGREES_PX = 0.25
 STEADY = 0.5
 """length of the mean motion of a place as part of its root mean square. Of the same clips: solids 0.04 to 0.37 (10th
 percentile to 90th), water that flows 0.6 to 1"""
+TRAVELS = 0.02
+"""part of the longer side that a solid goes in the course of a clip before its ends are looked at: three times
+`LEAST_MOVE`, above what their places differ by from window to window"""
+HOLDS_TOGETHER = 0.75
+"""of the windows in which it must be seen then"""
+KEEPS_UP = 0.5
+"""speed of its leading or trailing end over its own: half way between a current's (0) and a solid's (1)"""
+END = 5.0
+"""per cent of a solid's pixels that lie beyond what counts as its end"""
 
 
 @dataclass(frozen=True)
@@ -116,19 +126,49 @@ def moving_solids(clip: VideoClip, flow: SharedPairs, shape: tuple[int, int]) ->
     if not windows:
         return np.zeros(shape, bool)
     scale = working_scale(height, width, longest=SIZE)
-    seen: np.ndarray | int = 0
+    masks, means = [], []
     total, squares, count = np.float32(0), np.float32(0), 0
     for start, length in windows:
         grey = [_grey(clip.frames[t], scale) for t in range(start, start + length + 1)]
         steps = [flow.step(t) for t in range(start, start + length)]
-        seen = seen + _solids_of_window(grey, steps)
+        masks.append(_solids_of_window(grey, steps))
+        means.append(sum(steps) / np.float32(length))
         total = total + sum(steps)
         squares = squares + sum(summed(step**2) for step in steps)
         count += length
     mean, mean_square = np.linalg.norm(total, axis=-1) / count, squares / count
     steady = mean / np.maximum(np.sqrt(mean_square), AGREES_PX)
-    found = (seen >= SEEN) & (steady < STEADY)
+    seen = np.sum(masks, axis=0)
+    found = (seen >= SEEN) & ((steady < STEADY) | _travelling(masks, means, [start for start, _ in windows]))
     return cv2.resize(found.astype(np.uint8), shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
+
+
+def _travelling(masks: list[np.ndarray], means: list[np.ndarray], starts: list[int]) -> np.ndarray:
+    """bool [h,w]: what a solid sweeps over that takes its outline along.
+
+    Args:
+        masks: bool [h,w], where solids move in each window.
+        means: float32 [h,w,2], mean flow of each, px per frame.
+        starts: first frame of each.
+    """
+    seen, found = np.sum(masks, axis=0), np.zeros(masks[0].shape, bool)
+    count, parts = cv2.connectedComponents((seen >= SEEN).astype(np.uint8))
+    for part in range(1, count):
+        own = parts == part
+        windows = [k for k, mask in enumerate(masks) if (mask & own).any()]
+        if len(windows) < HOLDS_TOGETHER * len(masks):
+            continue
+        motion = np.mean([means[k][masks[k] & own].mean(axis=0) for k in windows], axis=0)
+        speed, times = float(np.linalg.norm(motion)), np.array([starts[k] for k in windows], float)
+        if speed * (times[-1] - times[0]) < TRAVELS * max(found.shape):
+            continue
+        along = [np.argwhere(masks[k] & own)[:, ::-1] @ (motion / speed) for k in windows]
+        ends = np.array([np.percentile(places, (END, 100.0 - END)) for places in along])
+        first, second = np.triu_indices(len(times), 1)
+        slopes = (ends[second] - ends[first]) / (times[second] - times[first])[:, None]  # Theil and Sen
+        if np.median(slopes, axis=0).max() > KEEPS_UP * speed:
+            found |= own
+    return found
 
 
 def _grey(frame: np.ndarray, scale: float) -> np.ndarray:
@@ -204,7 +244,7 @@ def _motions(places: np.ndarray) -> list[np.ndarray]:
 
 
 def _moving_alike(motions: list[np.ndarray], steps: list[np.ndarray], features: np.ndarray) -> np.ndarray:
-    """bool [h,w]: pixels of the first frame, near these features [n,2], whose optical flow is that of the solid."""
+    """bool [h,w]: pixels of the first frame about these features [n,2] whose optical flow is that of the solid."""
     height, width = steps[0].shape[:2]
     near = np.zeros((height, width), np.uint8)
     cv2.fillConvexPoly(near, cv2.convexHull(features).astype(np.int32), 1)
@@ -221,4 +261,7 @@ def _moving_alike(motions: list[np.ndarray], steps: list[np.ndarray], features: 
         error += lengths(seen - expected)
         length += lengths(expected)
     still = length < 0.5 * LEAST_MOVE * max(height, width)
-    return (near > 0) & ~still & (error < np.maximum(AGREES * length, AGREES_PX * len(steps)))
+    solid = (near > 0) & ~still & (error < np.maximum(AGREES * length, AGREES_PX * len(steps)))
+    # a smooth sleeve goes on as far as its flow does
+    parts = cv2.connectedComponents((solid | (~still & (error < AGREES * length))).astype(np.uint8))[1]
+    return np.isin(parts, np.unique(parts[solid]))

@@ -207,7 +207,8 @@ def segment(
     presence, grown = known.presence, known.grown
     if grown is None and grows(presence, score > 2.0):
         told = heed(clicks, evidence, score, score > 0.0)[1] if clicks else np.zeros_like(score)
-        barred = (solids | solids_by_flow(evidence)) & (told <= 0.0)
+        # a jet that sways with its jug changes as its flow says too: where all clues together speak for fluid, it is
+        barred = (solids | (solids_by_flow(evidence) & (score <= 0.0))) & (told <= 0.0)
         found = advancing_labels(evidence, score, presence, np.where(barred, -12.0, told))
     else:
         found = staying_labels(known, clicks)

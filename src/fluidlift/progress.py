@@ -21,11 +21,18 @@ LABELS = {
     "masks": "writing the masks",
     "motion": "velocities",
     "velocities": "velocities of every frame",
+    "elsewhere": "velocities of other times",
     "fit": "fitting the physics",
     "calibrate": "calibrating the flow",
     "simulate": "re-simulating",
     "show": "rendering and writing",
 }
+
+
+def label_of(name: str) -> str:
+    """Of a stage, for people; that of a stretch of a long clip, `read_2`, has its number."""
+    stage, _, number = name.rpartition("_")
+    return f"{LABELS[stage]}, time {number}" if stage in LABELS and number.isdecimal() else LABELS.get(name, name)
 
 
 WARM_UP = 2
@@ -93,7 +100,7 @@ class PlainProgress:
     def stage(self, name: str, number: int, count: int) -> None:
         """A stage begins."""
         _go_on()
-        self.head = f"[{number}/{count}] {LABELS.get(name, name)}"
+        self.head = f"[{number}/{count}] {label_of(name)}"
         self._pace, self._last = Pace(), time.monotonic()
         print(f"{self.head} ...", file=self.stream, flush=True)
 
@@ -147,7 +154,7 @@ class BarProgress:
     def stage(self, name: str, number: int, count: int) -> None:
         """A stage begins."""
         _go_on()
-        self.head = f"[{number}/{count}] {LABELS.get(name, name)}"
+        self.head = f"[{number}/{count}] {label_of(name)}"
         if self._task is not None:
             self.bar.remove_task(self._task)
         self._task = self.bar.add_task(self.head.replace("[", r"\["), total=None, parts="", left="")

@@ -8,7 +8,8 @@ import pytest
 import yaml
 from catalogue import stream_pictures, write_clip
 
-from fluidlift.cli import main
+from fluidlift.cli import REJECTED, main
+from fluidlift.errors import InputRejected
 from fluidlift.farm.cuts import Cut, cuts_of, parted
 from fluidlift.farm.shots import Shot
 from fluidlift.io.video import read_clip
@@ -63,3 +64,56 @@ def test_a_plan_has_a_task_for_each_part(film, tmp_path, capsys):
     job = yaml.safe_load((out / "plan.openjd.yaml").read_text())
     assert "1-3" in json.dumps(job["steps"][0]["parameterSpace"]) and "--shots=auto" in json.dumps(job)
     assert "film: 3 shots" in capsys.readouterr().out
+
+
+def asked_for(monkeypatch, codes) -> list[tuple]:
+    """What `make` is asked to make, which ends with these codes, or raises them."""
+    found: list[tuple] = []
+
+    def run_job(clip, out, config, **rest) -> int:
+        found.append((out.name, config.read.start, config.read.duration))
+        if isinstance(code := codes[out.name], Exception):
+            raise code
+        return code
+
+    monkeypatch.setattr("fluidlift.cli._run_job", run_job)
+    return found
+
+
+def test_make_makes_each_shot_and_ends_as_the_worst(film, tmp_path, monkeypatch, capsys):
+    codes = {"film_01.fluid": 0, "film_02.fluid": 4, "film_03.fluid": 0}
+    found = asked_for(monkeypatch, codes)
+    words = ["make", str(film), "-o", str(tmp_path / "film.fluid"), "--shots", "auto", "--size", "2"]
+    assert main(words) == 4
+    assert found == [("film_01.fluid", 0.0, 0.78), ("film_02.fluid", 0.78, 0.64), ("film_03.fluid", 1.42, None)]
+    assert "3 of 3 shots made" in capsys.readouterr().out and not list(tmp_path.iterdir())
+    assert main([*words, "--warnings-ok"]) == 0
+    codes["film_01.fluid"] = InputRejected("no fluid", "a fluid")
+    found.clear()
+    assert main(words) == 1 and len(found) == 3
+    said = capsys.readouterr()
+    assert "film_01.fluid: no fluid" in said.err and "2 of 3 shots made" in said.out
+
+
+def test_make_looks_for_shots_in_the_part_that_settings_ask_for(film, tmp_path, monkeypatch):
+    found = asked_for(monkeypatch, {"a_01.fluid": 0, "a_02.fluid": 0, "b.fluid": 0})
+    out = ["--shots", "auto", "-o", str(tmp_path / "a.fluid")]
+    assert main(["make", str(film), *out, "--set", "read.start=0.2", "--duration", "1.22"]) == 0
+    assert found == [("a_01.fluid", 0.2, 0.58), ("a_02.fluid", 0.78, 0.64)]
+    assert main(["make", str(film), "--shots", "auto", "-o", str(tmp_path / "b.fluid"), "--duration", "0.7"]) == 0
+    assert found[2:] == [("b.fluid", 0.0, 0.7)]  # one shot: as without the option
+
+
+def test_make_refuses_what_is_known_of_one_view_for_several(film, tmp_path, monkeypatch, capsys):
+    found = asked_for(monkeypatch, {})
+    (tmp_path / "camera.json").write_text("{}")
+    words = ["make", str(film), "-o", str(tmp_path / "a.fluid"), "--shots", "auto"]
+    assert main([*words, "--camera", str(tmp_path / "camera.json")]) == REJECTED
+    said = capsys.readouterr().err
+    assert "--camera" in said and "fluidlift batch" in said and not found
+
+
+def test_rows_of_a_list_have_no_shots_of_their_own(film, tmp_path, capsys):
+    (tmp_path / "shots.yaml").write_text(f"- clip: {film}\n  shots: auto\n")
+    assert main(["batch", str(tmp_path / "shots.yaml"), "-o", str(tmp_path / "out")]) == REJECTED
+    assert "unknown option 'shots'" in capsys.readouterr().err

@@ -22,6 +22,7 @@ from fluidlift.farm.local import LocalEngine
 from fluidlift.farm.ray_cluster import RayEngine
 from fluidlift.farm.ray_session import session
 from fluidlift.farm.state import claimed, is_running, read_outcome
+from fluidlift.farm.store import Store
 
 # not imported here: what it listens on is decided when it is
 pytestmark = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs ray")
@@ -73,6 +74,25 @@ def test_the_bytes_are_those_of_the_local_engine(ray, tmp_path):
     assert main([*options, "-o", str(tmp_path / "ray"), "--engine", "ray", "--csv"]) == 0
     assert digests(tmp_path / "ray" / "stream.fluid") == digests(tmp_path / "local" / "stream.fluid")
     assert (tmp_path / "ray" / "batch.csv").read_text().splitlines()[1].startswith('stream,"done')
+
+
+def test_each_machine_makes_in_a_folder_of_its_own_what_belongs_on_a_store(ray, tmp_path, limits, shot, runs):
+    store = Store(f"file://{tmp_path}/there", tmp_path / "scratch")
+    store.require()
+    store.pull()
+    told: list[str] = []
+    shots = [shot("a"), shot("b"), shot("w", "wrong")]
+    engine = RayEngine(cores=1, store=store)
+    first = made(shots, store.folder, limits, engine, told)
+    assert {n: o.outcome for n, o in first.items()} == {"a": "done", "b": "done", "w": "rejected"}
+    assert sorted(p.name for p in (tmp_path / "there").glob("*.state.json")) == [f"{n}.state.json" for n in "abw"]
+    assert (tmp_path / "there" / "a.fluid" / "manifest.json").is_file() and not (store.folder / "a.fluid").exists()
+    found = made(shots, store.folder, limits, engine)
+    assert found["a"] == first["a"] and [runs(store.folder, n) for n in "abw"] == [1, 1, 2]
+    (tmp_path / "there").rename(tmp_path / "gone")
+    (tmp_path / "there").write_text("no folder")
+    with pytest.raises(InputRejected, match="cannot be written"):
+        made(shots, store.folder, limits, engine)
 
 
 def test_failures_are_tried_again_by_their_class(ray, tmp_path, limits, shot, runs):

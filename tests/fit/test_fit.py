@@ -248,3 +248,21 @@ def test_buoyancy_of_a_plume_twin_is_found():
     assert found.parameters.gravity == pytest.approx(truth.gravity, abs=0.15)
     assert found.extra["buoyancy"] == pytest.approx(float(np.hypot(0.3, 2.5)), rel=0.05)
     assert not found.estimates["density"].identifiable
+
+
+def test_stretches_of_another_time_are_fitted_together_and_no_window_goes_from_one_to_the_next(twin):
+    """The last four frames of a channel that is speeding up, and then the first four."""
+    frames = [*twin[3:], *twin[:4]]
+    domain = build_scene(frames, [channel()] * 8, None, GRID, kind="stream", mainstream=DOWNSTREAM, firsts=(0, 4))
+    plan = plan_windows(domain, INTERVAL, windows=4, steps_per_frame=2)
+    assert {s < 4 for s in plan.starts} == {True, False} and all(
+        s + plan.frames < (4 if s < 4 else 8) for s in plan.starts
+    )
+    together = fit(frames, firsts=(0, 4))
+    assert not together.reason and together.extra["windows"] == 2
+    # velocities are exact, so one clip or two stretches of it tell the same; as one clip there is a jump back in time
+    assert together.parameters.inflow_velocity[0] == pytest.approx(TRUTH.inflow_velocity[0], rel=0.02)
+    joined = fit(frames, windows=7)
+    assert together.extra["loss"] < 0.1 * joined.extra["loss"]
+    with pytest.raises(ValueError, match="stretches"):
+        fit(frames, firsts=(0, 8))

@@ -12,6 +12,7 @@ from fluidlift.messages import code_of
 from fluidlift.pipeline import Inputs, begin
 from fluidlift.pipeline.find import read_alone
 from fluidlift.pipeline.inputs import GivenFiles
+from fluidlift.pipeline.other_times import same_view
 from fluidlift.pipeline.runner import Runner
 from fluidlift.seams import Silence
 
@@ -84,3 +85,72 @@ def test_an_asset_of_a_long_clip_says_so(film, tmp_path, hasty):
     manifest = json.loads((folder / "manifest.json").read_text())
     assert manifest["provenance"]["config"]["read"]["duration"] == pytest.approx(12 / 25, abs=1e-3)
     assert "window-of-a-long-clip" in json.dumps(manifest) and WITH_WARNINGS == 4
+
+
+STEPS = np.repeat((2, 2, 3, 2), 60)
+"""px per frame of a stream whose third minute, as it were, is faster"""
+
+
+@pytest.fixture(scope="module")
+def uneven(tmp_path_factory):
+    """240 frames of a stream with these steps."""
+    first, last = stream_pictures(2, step=128)  # two halves of one texture, the rock and the banks with each
+    still = (first == last).all(axis=-1, keepdims=True)
+    texture = np.concatenate([last, first], axis=1)
+    frames = [np.where(still, first, np.roll(texture, s, axis=1)[:, : first.shape[1]]) for s in np.cumsum(STEPS)]
+    return write_clip(tmp_path_factory.mktemp("uneven") / "uneven.mp4", np.stack(frames))
+
+
+def quarter(start: float) -> int:
+    """Of that clip; a part begins half a frame before its first."""
+    return int(25 * start + 0.75) // 60
+
+
+def test_other_times_lie_apart_in_the_clip_and_beside_the_window(uneven, tmp_path):
+    config = build_config(None, None, ("read.max_frames=24", "motion.targets=4"), {})
+    runner = Runner(tmp_path, ("read",), progress=Silence())
+    made, others = begin.windows(runner, GivenFiles.of(Inputs(uneven)).clip, config)
+    parts = sorted((c.read.start, end_of(c.read)) for c in (made, *others))
+    assert len(others) == 3 and all(a[1] <= b[0] + 1e-6 for a, b in zip(parts, parts[1:]))
+    assert {quarter(start) for start, _ in parts} == {0, 1, 2, 3}  # one in each quarter
+    assert [round(25 * (c.read.duration or 0)) for c in others] == [20, 20, 20]
+
+
+def test_a_stretch_is_of_the_same_view_where_the_ground_lies_in_its_place(uneven, tmp_path):
+    whole = read_clip(uneven).frames
+    clips = [write_clip(tmp_path / "a.mp4", whole[:12]), write_clip(tmp_path / "b.mp4", whole[150:162]),
+             write_clip(tmp_path / "c.mp4", np.roll(whole[150:162], 4, axis=2))]  # fmt: skip
+    config = build_config(None, None, (), {})
+    a, b, c = (read_alone(Inputs(clip), tmp_path / clip.stem, config) for clip in clips)
+    assert same_view(a, b) and not same_view(a, c)
+
+
+def test_a_long_clip_is_fitted_to_several_times_of_it(uneven, tmp_path, hasty, capsys):
+    from fluidlift.cli import WITH_WARNINGS, main
+
+    folder = tmp_path / "long.fluid"
+    more = [
+        "--kind",
+        "stream",
+        "--size",
+        "2",
+        "--set",
+        "read.max_frames=24",
+        "--set",
+        "motion.targets=2",
+        "--set",
+        "fit.max_seconds=120",
+    ]
+    assert main(["make", str(uneven), "-o", str(folder), *hasty, *more]) == WITH_WARNINGS
+    manifest = json.loads((folder / "manifest.json").read_text())
+    times = manifest["metrics"]["elsewhere"]
+    assert len(times) == 3 and all(t["targets"] == 2 for t in times)
+    fast = [t["apart"] for t in times if quarter(t["start"]) == 2]
+    usual = [t["apart"] for t in times if quarter(t["start"]) != 2]
+    # three px per frame are half as much again as two; what is measured of them is off by a tenth
+    assert len(fast) == 1 and 0.35 < fast[0] < 0.65 and max(usual) < 0.15
+    assert manifest["metrics"]["fit_extra"]["windows"] == 4
+    assert "other times" in " ".join(manifest["metrics"]["fit"]["notes"])
+    capsys.readouterr()
+    assert main(["fit", str(folder), "--json"]) in (0, WITH_WARNINGS)
+    assert json.loads((folder / "manifest.json").read_text())["metrics"]["fit_extra"]["windows"] == 4

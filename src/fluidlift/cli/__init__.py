@@ -166,6 +166,15 @@ def _meant(word: str) -> list[str]:
 
 
 def _make(c: Make) -> int:
+    if c.part.shots is None or c.settings.print_config:
+        return _make_one(c)
+    from fluidlift.cli.shots import make_each
+
+    return make_each(c, c.out or default_folder(c.clip), _config_of(c)[0].read, _make_one)
+
+
+def _config_of(c: Make) -> tuple[Any, Any]:
+    """The settings of a make, and its hints."""
     from fluidlift.config import build_config
 
     s, p, q, b = c.scene, c.part, c.quality, c.body
@@ -178,7 +187,12 @@ def _make(c: Make) -> int:
         "generate.use": b.use,
     }  # fmt: skip
     hints = _read_hints(c.input.hints, c.clip)
-    config = build_config(q.preset, c.settings.config, c.settings.set, flat, base=dict(hints.settings))
+    return build_config(q.preset, c.settings.config, c.settings.set, flat, base=dict(hints.settings)), hints
+
+
+def _make_one(c: Make) -> int:
+    config, hints = _config_of(c)
+    b = c.body
     if b.models is not None:
         config = _with_models(config, c)
     if c.settings.print_config:

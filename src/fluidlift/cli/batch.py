@@ -13,14 +13,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from fluidlift.cli.options import MOVED, Make, options_of
-from fluidlift.cli.quantities import Bytes, Seconds, command
+from fluidlift.cli.quantities import Bytes, Folder, Seconds, command
 from fluidlift.errors import InputRejected
 
 if TYPE_CHECKING:
     from fluidlift.farm.engine import Engine
     from fluidlift.farm.shots import Shot
+    from fluidlift.farm.store import Store
 
-_OURS = ("clip", "out", "json", "print_config", "warnings_ok")
+_OURS = ("clip", "out", "json", "print_config", "warnings_ok", "shots")
 """options of make that the batch itself gives"""
 
 
@@ -30,9 +31,11 @@ class Batch:
 
     clips: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="CLIPS")]
     """clips, folders of videos, or a list (.yaml) of shots, each with options of make; with --status the folder"""
-    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    out: Annotated[Folder | None, tyro.conf.arg(aliases=["-o"])] = None
     """folder for the assets (NAME.fluid), their logs (NAME.log), what became of each (NAME.state.json) and the summary
-    (batch.json); needed but for --status"""
+    (batch.json); needed but for --status. Or a URL that fsspec knows, such as s3://bucket/assets"""
+    scratch: Path | None = None
+    """with a URL: where each machine makes what is put there; by default below the user's cache folder"""
     jobs: int | None = None
     """clips at a time; each takes the memory of a make of its own, and its share of the cores; by default one, and with
     --engine ray as many as its machines hold"""
@@ -96,15 +99,44 @@ def run(wanted: Batch) -> int:
         from fluidlift.farm.dataset import require_parquet
 
         require_parquet()
+    store, out = _store(wanted), wanted.out
+    if store is not None:
+        out = store.folder
+    assert not isinstance(out, str)
     if wanted.status:
-        return _status(wanted)
-    if wanted.out is None:
+        return _status(wanted, out or wanted.clips[0])
+    if out is None:
         raise InputRejected("no -o", "the folder for the assets, such as -o assets/")
     if wanted.html:
         raise InputRejected("--html without --status", "fluidlift batch FOLDER --status --html")
     _require_counts(wanted)
-    shots = _parted(wanted, wanted.out, shots_of(wanted))
-    return _plan(wanted, len(shots)) if wanted.plan else _make(wanted, wanted.out, shard_of(shots, wanted.shard))
+    shots = _parted(wanted, out, shots_of(wanted))
+    return _plan(wanted, out, len(shots)) if wanted.plan else _make(wanted, out, shard_of(shots, wanted.shard), store)
+
+
+def _store(wanted: Batch) -> Store | None:
+    """Where a batch puts its assets, once it was looked at and what is known of its shots was fetched.
+
+    Raises:
+        InputRejected: it cannot be used, or for what is asked.
+    """
+    if not isinstance(wanted.out, str):
+        if wanted.scratch is not None:
+            raise InputRejected("--scratch with a folder", "a URL as -o", "leave it out: assets are made in the folder")
+        return None
+    for option in ("plan", "html", "dataset"):
+        if getattr(wanted, option):
+            raise InputRejected(
+                f"--{option} with the URL of a store", "a folder: what it reads or writes are files of a machine",
+                "for a plan give each task the URL and --shard i/n; else fetch the assets, or mount the store",
+            )  # fmt: skip
+    from fluidlift.farm.store import Store
+
+    store = Store(wanted.out, wanted.scratch)
+    if not wanted.status:
+        store.require()
+    store.pull()
+    return store
 
 
 def shots_of(wanted: Batch) -> list[Shot]:
@@ -143,22 +175,23 @@ def _require_counts(wanted: Batch) -> None:
         raise InputRejected("--address or --gpus without --engine ray", "the engine that has them", "--engine ray")
 
 
-def _engine(wanted: Batch) -> Engine:
+def _engine(wanted: Batch, store: Store | None) -> Engine:
     if wanted.engine == "ray":
         from fluidlift.farm.ray_cluster import RayEngine
 
-        return RayEngine(wanted.address, wanted.jobs, wanted.cores, wanted.gpus or 0.0)
+        return RayEngine(wanted.address, wanted.jobs, wanted.cores, wanted.gpus or 0.0, store)
     from fluidlift.farm.local import LocalEngine
 
-    return LocalEngine(wanted.jobs or 1)
+    return LocalEngine(wanted.jobs or 1, store)
 
 
 TRIES = {"local": 1, "ray": 3}
 """by engine: of many machines one is lost now and then"""
 
 
-def _make(wanted: Batch, out: Path, shots: list[Shot]) -> int:
+def _make(wanted: Batch, out: Path, shots: list[Shot], store: Store | None) -> int:
     from fluidlift.farm.engine import Limits
+    from fluidlift.farm.state import LISTED, list_names
     from fluidlift.farm.summary import SUMMARY, Pace, Summary
     from fluidlift.io.atomic import require_writable
 
@@ -169,24 +202,33 @@ def _make(wanted: Batch, out: Path, shots: list[Shot]) -> int:
         wanted.time_limit, wanted.memory_limit, wanted.retry, wanted.tries or TRIES[wanted.engine], wanted.cores
     )
     tell, part = _printers(wanted)
+    if store is not None:
+        list_names(folder, [shot.name for shot in shots])
+        store.put_file(LISTED)
+        tell(f"made in {folder}; locks do not reach {store.url}: no two batches at a time should make the same shots")
     outcomes, pace, summary = [], Pace(len(shots)), Summary(folder)
     try:
-        for outcome in _engine(wanted).shots(shots, folder, limits, tell, part):
+        for outcome in _engine(wanted, store).shots(shots, folder, limits, tell, part):
             outcomes.append(outcome)
             tell(f"[{len(outcomes)}/{len(shots)}] {outcome.line()}{pace.after(outcome)}")
             summary.write_now_and_then()
     except BaseException:
         with suppress(InputRejected):  # a full disk, which has been said
             summary.write()
+            if store is not None:
+                store.put_files()
         raise
     summary.write(table=wanted.csv, parquet=wanted.parquet)
+    if store is not None:
+        store.put_files()
     if wanted.dataset:
         _index(folder)
     bad = [o for o in outcomes if not o.well]
     if wanted.json:
         print((folder / SUMMARY).read_text(encoding="utf-8"), end="")
     else:
-        print(f"{len(outcomes) - len(bad)} of {len(outcomes)} made; summary: {out / SUMMARY}")
+        told = out / SUMMARY if store is None else store.where(SUMMARY)
+        print(f"{len(outcomes) - len(bad)} of {len(outcomes)} made; summary: {told}")
     return 1 if bad else 4 if any(o.warnings for o in outcomes) and not wanted.warnings_ok else 0
 
 
@@ -205,16 +247,16 @@ def _printers(wanted: Batch) -> tuple[Callable[[str], None], Callable[[str], Non
     return line, part if single else (lambda text: None)
 
 
-def _plan(wanted: Batch, shots: int) -> int:
+def _plan(wanted: Batch, out: Path, shots: int) -> int:
     """Write a job instead of doing it; paths in it are absolute, as other machines of the farm see them."""
     from fluidlift.farm.engine import TASK_CORES, TASK_MEMORY
     from fluidlift.farm.plans import Plan, written
     from fluidlift.io.atomic import require_writable
     from fluidlift.machine import cores
 
-    assert wanted.out is not None and wanted.plan is not None
-    require_writable(wanted.out)
-    folder = wanted.out.absolute()
+    assert wanted.plan is not None
+    require_writable(out)
+    folder = out.absolute()
     folder.mkdir(parents=True, exist_ok=True)
     arguments = [str(p.absolute()) for p in wanted.clips] + ["-o", str(folder)]
     given = {"preset": wanted.preset, "config": wanted.config and wanted.config.absolute(),
@@ -234,11 +276,10 @@ def _plan(wanted: Batch, shots: int) -> int:
     return 0
 
 
-def _status(wanted: Batch) -> int:
+def _status(wanted: Batch, folder: Path) -> int:
     from fluidlift.farm.summary import as_csv, status_of
     from fluidlift.io.atomic import write_bytes
 
-    folder = wanted.out or wanted.clips[0]
     if not folder.is_dir():
         raise InputRejected(f"'{folder}'", "the folder of a batch")
     found = status_of(folder)

@@ -44,6 +44,15 @@ class Part:
 
 
 @command
+class MakePart(Part):
+    """Which part of the clip."""
+
+    shots: Literal["auto"] | None = None
+    """auto: a clip with cuts becomes an asset for each of its shots, OUT_01.fluid, OUT_02.fluid, ...; by default its
+    longest one is made"""
+
+
+@command
 class Input:
     """Files beside the clip."""
 
@@ -137,7 +146,7 @@ class Make:
     """files beside the clip; what is not given is estimated"""
     scene: tyro.conf.OmitArgPrefixes[Scene] = field(default_factory=Scene)
     """what you know of the fluid and of the camera"""
-    part: tyro.conf.OmitArgPrefixes[Part] = field(default_factory=Part)
+    part: tyro.conf.OmitArgPrefixes[MakePart] = field(default_factory=MakePart)
     """which part of the clip"""
     quality: tyro.conf.OmitArgPrefixes[Quality] = field(default_factory=Quality)
     """how fine"""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Annotated, Any, TypeVar, dataclass_transform, get_type_hints
 
 import tyro
@@ -32,6 +33,22 @@ Degrees = Annotated[float, _spec("DEGREES", DEGREES)]
 """such as 12, 12deg or 0.2rad"""
 Bytes = Annotated[float, _spec("BYTES", BYTES)]
 """such as 8GB or 512MiB"""
+
+
+def _folder(text: str) -> Path | str:
+    from fluidlift.farm.store import is_url
+
+    return text if is_url(text) else Path(text)
+
+
+Folder = Annotated[
+    Path | str,
+    PrimitiveConstructorSpec(
+        nargs=1, metavar="FOLDER|URL", instance_from_str=lambda args: _folder(args[0]),
+        is_instance=lambda value: isinstance(value, Path | str), str_from_instance=lambda value: [str(value)],
+    ),
+]  # fmt: skip
+"""such as assets/ or s3://bucket/assets"""
 
 _NO_DEFAULTS = ("not given", "False", "")
 HINT = tyro.conf.arg(help_behavior_hint=lambda label: "" if label in _NO_DEFAULTS else f"(default: {label})")

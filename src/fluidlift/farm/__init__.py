@@ -16,7 +16,22 @@ Modules of the face:
     ray_cluster  The engine of many machines: a task of Ray per shot, on one machine or on a cluster that is there
     shots        Lists of shots: clips, folders of videos, or YAML with options of `make` for each
     state        What became of each shot: one small file beside its asset, and one lock while somebody makes it
+    store        Assets on an object store, or on anything else that fsspec reaches by a URL such as
+                 s3://bucket/assets
     summary      How far a folder of shots is: counts, rate, failures by class; as text, JSON, CSV and Parquet
 """
 
-__all__ = ["cuts", "dataset", "engine", "guard", "local", "page", "plans", "ray_cluster", "shots", "state", "summary"]
+__all__ = [
+    "cuts",
+    "dataset",
+    "engine",
+    "guard",
+    "local",
+    "page",
+    "plans",
+    "ray_cluster",
+    "shots",
+    "state",
+    "store",
+    "summary",
+]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -37,14 +37,14 @@ class Cut:
     """that it lasts"""
 
 
-def parted(shots: Sequence[Shot], folder: Path, tell: Callable[[str], None]) -> list[Shot]:
+def parted(shots: Sequence[Shot], folder: Path | None, tell: Callable[[str], None]) -> list[Shot]:
     """The shots, those with cuts as several: NAME_01, NAME_02, ..., with a start and a duration of their own.
 
     A clip that cannot be read stays one shot, whose make says why. Parts under `LEAST` seconds are left out, and told.
 
     Args:
         shots: of a list.
-        folder: where what was found is kept.
+        folder: where what was found is kept; None: nowhere.
         tell: lines for people.
 
     Raises:
@@ -76,23 +76,32 @@ def _part(shot: Shot, number: int, part: Cut) -> Shot:
     return replace(shot, name=f"{shot.name}_{number:02d}", options=options)
 
 
-def _parts_of(shot: Shot, folder: Path) -> list[Cut]:
+def _parts_of(shot: Shot, folder: Path | None) -> list[Cut]:
     """Of one clip, from the file that says so where it is of this clip; none where it cannot be read."""
-    path = folder / f"{shot.name}{FOUND}"
     span = {name: shot.options.get(name) for name in ("start", "duration", "fps")}
+    if folder is None:
+        return _looked_for(shot.clip, span)
+    path = folder / f"{shot.name}{FOUND}"
     asked = {"clip": digest(shot.clip) if shot.clip.is_file() else "", "span": {k: str(v) for k, v in span.items()}}
     if asked["clip"]:
         with suppress(OSError, ValueError, TypeError, KeyError):
             kept = json.loads(path.read_bytes())
             if kept["asked"] == asked:
                 return [Cut(float(c["start"]), c["end"], float(c["seconds"])) for c in kept["parts"]]
-    try:
-        parts = cuts_of(shot.clip, **{k: None if v is None else float(v) for k, v in span.items()})
-    except (InputRejected, ValueError):
-        return []
+    parts = _looked_for(shot.clip, span)
+    if not parts:
+        return parts
     with atomic_write(path) as file:
         file.write((json.dumps({"asked": asked, "parts": [vars(part) for part in parts]}, indent=1) + "\n").encode())
     return parts
+
+
+def _looked_for(clip: Path, span: Mapping[str, Any]) -> list[Cut]:
+    """As `cuts_of`; none where the clip cannot be read."""
+    try:
+        return cuts_of(clip, **{k: None if v is None else float(v) for k, v in span.items()})
+    except (InputRejected, ValueError):
+        return []
 
 
 def cuts_of(

@@ -12,6 +12,7 @@ from fluidlift.farm.making import Making, make_shot
 from fluidlift.farm.preflight import looked_at, require_fit
 from fluidlift.farm.shots import Shot
 from fluidlift.farm.state import Outcome, list_names
+from fluidlift.farm.store import Store
 from fluidlift.machine import available_memory, cores
 
 
@@ -21,6 +22,8 @@ class LocalEngine:
 
     jobs: int = 1
     """at a time"""
+    store: Store | None = None
+    """where assets belong, which are made in the folder; None: there"""
 
     def shots(self, shots: list[Shot], folder: Path, limits: Limits, tell: Tell, part: Tell) -> Iterator[Outcome]:
         """As `Engine.shots`."""
@@ -29,7 +32,7 @@ class LocalEngine:
         limits = limits if limits.threads else replace(limits, threads=max(cores() // self.jobs, 1))
         making = Making(tell, part)
         with ThreadPoolExecutor(self.jobs) as pool:
-            waiting = [pool.submit(_shot, shot, folder, limits, making) for shot in shots]
+            waiting = [pool.submit(_shot, shot, folder, limits, making, self.store) for shot in shots]
             try:
                 for one in as_completed(waiting):
                     if (outcome := one.result()) is not None:
@@ -40,12 +43,12 @@ class LocalEngine:
                 raise
 
 
-def _shot(shot: Shot, folder: Path, limits: Limits, making: Making) -> Outcome | None:
+def _shot(shot: Shot, folder: Path, limits: Limits, making: Making, store: Store | None) -> Outcome | None:
     """As `make_shot`, as often as it can help."""
     outcome = None
     bounds: Limits | None = limits
     while bounds is not None:
-        last = make_shot(shot, folder, bounds, making)
+        last = make_shot(shot, folder, bounds, making, store)
         outcome = outcome if last is None else last
         bounds = None if last is None or making.stopped else next_limits(last, bounds, available_memory())
         if bounds is not None and last is not None:

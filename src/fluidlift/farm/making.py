@@ -10,6 +10,7 @@ import datetime
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -32,6 +33,7 @@ from fluidlift.farm.state import (
     read_outcome,
     write_outcome,
 )
+from fluidlift.farm.store import Store
 from fluidlift.io.atomic import require_free_space
 from fluidlift.machine import THREADS, cores, group_memory
 
@@ -71,7 +73,7 @@ class Making:
             _end(process)
 
 
-def make_shot(shot: Shot, folder: Path, limits: Limits, making: Making) -> Outcome | None:
+def make_shot(shot: Shot, folder: Path, limits: Limits, making: Making, store: Store | None = None) -> Outcome | None:
     """What became of one; None where somebody else makes it, or it is not wanted.
 
     Args:
@@ -79,27 +81,35 @@ def make_shot(shot: Shot, folder: Path, limits: Limits, making: Making) -> Outco
         folder: for its asset, log and state.
         limits: of this try.
         making: where the process is listed while it runs.
+        store: where its files belong in the end; None: where they are made.
 
     Raises:
-        InputRejected: the disk of the folder is full.
+        InputRejected: the disk of the folder is full, or the store cannot be read.
     """
     fingerprint = shot.fingerprint()
     with claimed(folder, shot.name, wait=_HANDOVER) as lock:
         if lock is None:
             making.tell(f"{shot.name}: being made by another batch, left to it")
             return None
-        if (known := _known(shot, folder, fingerprint)) is not None:
+        known = _known(shot, folder, fingerprint) if store is None else store.finished(shot)
+        if known is not None:
             return known
         if making.stopped or not is_wanted(folder, shot.name, limits.retry):
             return None
         require_free_space(folder, ROOM)
         outcome = _made(shot, folder, fingerprint, limits, making, lock)
+        if store is not None:
+            outcome = store.put(outcome)
         write_outcome(folder, outcome)
+        if store is not None and outcome.well:
+            shutil.rmtree(folder / f"{shot.name}.fluid")
         return outcome
 
 
-def finished(shot: Shot, folder: Path) -> Outcome | None:
+def finished(shot: Shot, folder: Path, store: Store | None = None) -> Outcome | None:
     """What is known of a shot with which nothing is left to do; None of others, and of one that somebody makes."""
+    if store is not None:
+        return store.finished(shot)
     known = read_outcome(folder, shot.name)
     if known is None or not known.well:  # the clip, which may be large, is not read in vain
         return None

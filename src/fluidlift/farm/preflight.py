@@ -11,10 +11,12 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from platform import node, python_version
+from typing import Any
 
 from fluidlift import __version__
-from fluidlift.errors import InputRejected
+from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.farm.making import ROOM
+from fluidlift.farm.store import Store
 from fluidlift.io.asset_lock import held
 from fluidlift.source import ROOT
 
@@ -58,8 +60,8 @@ def looked_at(folder: Path, note: str = "", clips: Sequence[Path] = ()) -> Machi
         note: what the batch wrote into the file `NOTE` of the folder, which it holds; empty: this is its machine.
         clips: that must be there.
     """
-    began = time.time()
-    mine = Machine(node(), __version__, source_digest(), python_version(), began)
+    mine = _mine()
+    began = mine.clock
     trial = folder / f".looking.{uuid.uuid4().hex}"
     try:
         sees = not note or note in _note(folder)
@@ -74,6 +76,26 @@ def looked_at(folder: Path, note: str = "", clips: Sequence[Path] = ()) -> Machi
             trial.unlink(missing_ok=True)
     missing = next((str(clip) for clip in clips if not clip.exists()), "")
     return replace(mine, file_clock=late, free=space, sees=sees, locks=locks, missing=missing)
+
+
+def looked_at_store(told: dict[str, Any], clips: Sequence[Path] = ()) -> Machine:
+    """This machine, of a batch whose assets belong on a store: its own folder, and whether it reaches the store.
+
+    Args:
+        told: fields of the `Store`.
+        clips: that must be there.
+    """
+    try:
+        store = Store(**told)
+        store.require()
+        return looked_at(store.folder, "", clips)
+    except (FluidliftError, OSError) as error:
+        return replace(_mine(), error=" ".join(str(error).split()))
+
+
+def _mine() -> Machine:
+    """This machine, and nothing of a folder."""
+    return Machine(node(), __version__, source_digest(), python_version(), time.time())
 
 
 def _note(folder: Path) -> str:

@@ -26,6 +26,7 @@ from fluidlift.farm.preflight import NOTE, Machine, looked_at, require_fit
 from fluidlift.farm.ray_session import session
 from fluidlift.farm.shots import Shot
 from fluidlift.farm.state import LOG, Outcome, claimed, list_names, write_outcome
+from fluidlift.farm.store import Store
 from fluidlift.io.asset_lock import held
 
 AHEAD = 2
@@ -54,6 +55,8 @@ class RayEngine:
     """of each shot; None: `TASK_CORES`, or all of the largest machine where that has fewer"""
     gpus: float = 0.0
     """of each shot"""
+    store: Store | None = None
+    """where assets belong, which each machine makes in a folder of its own; None: the folder, which all share"""
 
     def shots(self, shots: list[Shot], folder: Path, limits: Limits, tell: Tell, part: Tell) -> Iterator[Outcome]:
         """As `Engine.shots`.
@@ -64,12 +67,12 @@ class RayEngine:
         with session(self.address) as ray:
             cluster = _Cluster(ray)
             task = cluster.task_of(self, limits)
-            for line in cluster.looked_at(folder, shots):
+            for line in cluster.looked_at(folder, shots, self.store):
                 tell(line)
             tell(f"{cluster.words()}; each shot: {task.words()}")
             list_names(folder, [shot.name for shot in shots])
             limits = replace(limits, threads=task.cores, memory=task.memory)
-            batch = _Batch(cluster, task, folder, tell, deque(_Try(shot, limits) for shot in shots))
+            batch = _Batch(cluster, task, folder, tell, deque(_Try(shot, limits) for shot in shots), self.store)
             try:
                 yield from batch.outcomes(self.jobs)
             finally:
@@ -144,7 +147,7 @@ class _Cluster:
             )  # fmt: skip
         return task
 
-    def looked_at(self, folder: Path, shots: list[Shot]) -> list[str]:
+    def looked_at(self, folder: Path, shots: list[Shot], store: Store | None) -> list[str]:
         """What should be known of the machines, before work starts.
 
         Raises:
@@ -155,7 +158,7 @@ class _Cluster:
         with held(folder / NOTE, note, wait=_LOOK):
             ours = looked_at(folder)
             require_fit([ours], folder)
-            asked = {self._asked(node["NodeID"], folder, note, clips): node for node in self.machines()}
+            asked = {self._asked(node["NodeID"], store or folder, note, clips): node for node in self.machines()}
             notes: list[str] = []
             until = time.monotonic() + _LOOK
             while asked:
@@ -169,9 +172,10 @@ class _Cluster:
                     notes += require_fit([machine], folder, ours=replace(ours, clock=time.time()))
         return list(dict.fromkeys(notes))
 
-    def _asked(self, node: str, folder: Path, note: str, clips: list[Path]) -> Any:
+    def _asked(self, node: str, where: Path | Store, note: str, clips: list[Path]) -> Any:
         strategy = self.ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy(node, soft=False)
-        return _looker(self.ray).options(scheduling_strategy=strategy).remote(folder, note, clips)
+        told = vars(where) if isinstance(where, Store) else where  # there may be no fluidlift
+        return _looker(self.ray).options(scheduling_strategy=strategy).remote(told, note, clips)
 
     def _answer(self, ref: Any, node: dict[str, Any]) -> Machine | None:
         """What a machine said of itself; None of one that is gone meanwhile."""
@@ -186,11 +190,11 @@ class _Cluster:
 def _looker(ray: Any) -> Any:
     """The task that looks at its machine. It travels as it stands, as there may be no fluidlift, or another one."""
 
-    def look(folder, note, clips):
+    def look(where, note, clips):
         import platform
 
         try:
-            from fluidlift.farm.preflight import looked_at
+            from fluidlift.farm.preflight import looked_at, looked_at_store
         except ImportError as error:
             found = {"host": platform.node(), "error": f"no fluidlift of this version ({error})"}
             with suppress(ImportError):
@@ -198,21 +202,23 @@ def _looker(ray: Any) -> Any:
 
                 found |= {"error": "", "version": fluidlift.__version__}
             return found
-        return dict(vars(looked_at(folder, note, clips)))
+        return dict(vars(looked_at_store(where, clips) if isinstance(where, dict) else looked_at(where, note, clips)))
 
     return ray.remote(num_cpus=0, max_retries=0)(look)
 
 
-def _make(shot: Shot, folder: Path, limits: Limits, version: str) -> Outcome | None:
+def _make(shot: Shot, place: Path | Store, limits: Limits, version: str) -> Outcome | None:
     """What a task does.
 
     Raises:
         InputRejected: its machine, which came after the others were looked at, has another version of fluidlift.
     """
+    store = place if isinstance(place, Store) else None
+    folder = place.folder if isinstance(place, Store) else place
     require_fit([Machine(node(), __version__)], folder, ours=Machine("", version))
     with suppress(ValueError):  # a batch that a shell began in the background ignores it, and so would a cancelled task
         signal.signal(signal.SIGINT, signal.default_int_handler)
-    return make_shot(shot, folder, limits, Making(settle=_SETTLE))
+    return make_shot(shot, folder, limits, Making(settle=_SETTLE), store)
 
 
 @dataclass
@@ -224,6 +230,7 @@ class _Batch:
     folder: Path
     tell: Tell
     waiting: deque[_Try]
+    store: Store | None = None
     flying: dict[Any, _Try] = field(default_factory=dict)
 
     def outcomes(self, jobs: int | None) -> Iterator[Outcome]:
@@ -259,7 +266,7 @@ class _Batch:
             one = self.waiting.popleft()
             if one.not_before > time.monotonic():
                 self.waiting.append(one)
-            elif (known := finished(one.shot, self.folder)) is not None:
+            elif (known := finished(one.shot, self.folder, self.store)) is not None:
                 yield known
             elif is_wanted(self.folder, one.shot.name, one.limits.retry):
                 self.flying[self._started(one)] = one
@@ -269,11 +276,13 @@ class _Batch:
             num_cpus=self.task.cores, memory=int(one.limits.memory or self.task.memory), num_gpus=self.task.gpus,
             max_retries=0, scheduling_strategy="SPREAD", name=one.shot.name,
         )  # fmt: skip
-        return task.remote(one.shot, self.folder, one.limits, __version__)
+        return task.remote(one.shot, self.store or self.folder, one.limits, __version__)
 
     def _ended(self, ref: Any, one: _Try) -> Outcome | None:
         """What became of a try; None where there is another one, or somebody else makes the shot."""
         outcome = self._result(ref, one)
+        if outcome is not None and self.store is not None:  # the machine that made it wrote that into its own folder
+            write_outcome(self.folder, outcome)
         if outcome is None:
             return self._elsewhere(one)
         limits = next_limits(outcome, one.limits, self.cluster.largest("memory"))
@@ -314,6 +323,7 @@ class _Batch:
         )  # fmt: skip
         with claimed(folder, name) as lock:
             if lock is not None:
+                outcome = outcome if self.store is None else self.store.put(outcome)
                 write_outcome(folder, outcome)
         return outcome
 

@@ -27,7 +27,7 @@ LISTED = "shots.json"
 WELL = ("done", "done, warnings")
 FAILURES = ("input", "memory", "time", "crash", "stopped")
 """classes of failure: what `make` refuses; memory or time ran out; it broke down; it was told to end"""
-_LARGEST = 1 << 20
+LARGEST = 1 << 20
 """bytes of a state file that are read: warnings are some hundred characters each"""
 
 
@@ -79,9 +79,17 @@ class Outcome:
 
 def read_outcome(folder: Path, name: str) -> Outcome | None:
     """What became of a shot; None where nothing has, or what is there is damaged."""
-    with suppress(OSError, ValueError, TypeError):
+    try:
         with os.fdopen(os.open(folder / f"{name}{STATE}", os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0)), "rb") as file:
-            found = json.loads(file.read(_LARGEST))
+            return parsed_outcome(file.read(LARGEST), name)
+    except OSError:
+        return None
+
+
+def parsed_outcome(data: bytes, name: str) -> Outcome | None:
+    """What a state file says of a shot; None of one that is damaged, or of another shot."""
+    with suppress(ValueError, TypeError, KeyError):
+        found = json.loads(data)
         known = {f.name: type(f.default) for f in fields(Outcome)}
         if found["name"] == name and all(isinstance(found[k], str) for k in ("outcome", "failure", "fingerprint")):
             return Outcome(**{k: v for k, v in found.items() if k in known})

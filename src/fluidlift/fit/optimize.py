@@ -72,11 +72,12 @@ class _Data:
     kind: FluidKind
     mainstream: np.ndarray | None
     observed: Sequence[np.ndarray] | None
+    firsts: tuple[int, ...] = (0,)
 
     def scene(self) -> FitScene:
         return build_scene(
             self.targets, self.layouts, self.solid, self.grid, kind=self.kind, mainstream=self.mainstream,
-            observed=self.observed,
+            observed=self.observed, firsts=self.firsts,
         )  # fmt: skip
 
     def coarser(self) -> _Data:
@@ -106,6 +107,7 @@ def fit_parameters(
     kind: str | FluidKind = STREAM,
     mainstream: np.ndarray | None = None,
     observed: Sequence[np.ndarray] | np.ndarray | None = None,
+    firsts: Sequence[int] = (0,),
     restarts: int = 1,
     settings: FitOptions | None = None,
     progress: Progress | None = None,
@@ -125,6 +127,8 @@ def fit_parameters(
         mainstream: unit direction of the outflow; default: the terrain's, or the mean velocity.
         observed: bool [nx,ny,nz], one or one per target: cells whose velocity was seen; what the targets hold elsewhere
             does not matter. None: all.
+        firsts: targets with which another stretch of consecutive frames begins, of the same fluid at another time; 0
+            is the first of them.
         restarts: starts from this many initial scales; the best counts, `FitResult.ends` holds all.
         settings: everything else; `changes` are fields of it, replaced.
         progress: called with (done, total): per cent of the work used.
@@ -143,7 +147,7 @@ def fit_parameters(
     assert layouts is not None
     require(all(t.shape == grid.shape for t in targets), "targets of another shape than the grid", str(grid.shape))
     views = _each(observed, n, grid, "observed cells")
-    data = _Data(targets, layouts, system_or_terrain, grid, kind_of(kind), mainstream, views)
+    data = _Data(targets, layouts, system_or_terrain, grid, kind_of(kind), mainstream, views, tuple(firsts))
     nothing = _no_flow(data)
     if nothing:
         return _failure(initial, nothing)

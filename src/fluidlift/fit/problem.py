@@ -219,7 +219,7 @@ def _window(
         targets.append(velocity.reshape(-1, 3)[cells[-1]])
         masks.append(torch.from_numpy(mask[at]))
     smooth, known = (
-        smooth_in_time(scene.flat, scene.seen, start)
+        smooth_in_time(scene.flat, scene.seen, start, within=scene.stretch(start))
         if scene.noise > 0.02 * scene.speed
         else (scene.flat[start], scene.seen[start])
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -57,6 +58,16 @@ class FitScene:
     seen: tuple[Bool[np.ndarray, " f"], ...]
     noise: float
     """standard deviation of the error of one face in one target, m/s"""
+    firsts: tuple[int, ...] = (0,)
+    """targets with which a stretch of consecutive frames begins"""
+
+    def stretches(self) -> list[range]:
+        """Targets that follow each other in time."""
+        return [range(a, b) for a, b in pairwise((*self.firsts, len(self.targets)))]
+
+    def stretch(self, frame: int) -> range:
+        """The one that a target belongs to."""
+        return next(r for r in self.stretches() if frame in r)
 
     def inflow_values(self) -> Float[np.ndarray, "t f"]:
         """Targets as flat vectors, NaN off the inflow faces and where they were not seen."""
@@ -86,16 +97,19 @@ def build_scene(
     mainstream: np.ndarray | None = None,
     observed: Sequence[np.ndarray | None] | None = None,
     sweeps: int = 5,
+    firsts: Sequence[int] = (0,),
 ) -> FitScene:
     """Layouts, operators and scales of the targets.
 
     Raises:
-        ValueError: shapes that do not match, or targets at rest.
+        ValueError: stretches without targets, shapes that do not match, or targets at rest.
     """
     kind, views = kind_of(kind), [None] * len(targets) if observed is None else list(observed)
     centers = [np.asarray(t.at_centers(), float) for t in targets]
     fluid = [np.asarray(c) == CellType.FLUID for c in cell_types]
     fluid = [f if v is None else f & v for f, v in zip(fluid, views)]
+    ends = (*firsts, len(targets))
+    require(ends[0] == 0 and all(a < b for a, b in pairwise(ends)), f"stretches from {tuple(firsts)}", "0, ascending")
     inside = np.concatenate([c[f] for c, f in zip(centers, fluid)])
     speeds = np.linalg.norm(inside, axis=-1)
     require(speeds.size > 0, "no FLUID cell that was seen in any frame", "cell types with fluid")
@@ -117,13 +131,14 @@ def build_scene(
         domains.append(known[key])
     seen = [seen_faces(d, np.asarray(c), v) for d, c, v in zip(domains, cell_types, views)]
     flat = [np.where(s, flatten(t, torch.float64).numpy(), 0.0) for t, s in zip(targets, seen)]
-    noise = noise_of(flat, seen)
+    noise = noise_of(flat, seen, firsts)
     # errors add 3 / 2 of their square to that of a cell's velocity: taken out of the mean speed
     share = max(1 - 1.5 * noise**2 / float(np.square(speeds).mean()), 0.04)
     return FitScene(
         targets=tuple(targets), cell_types=tuple(cell_types), domains=tuple(domains), grid=grid,
         mainstream=along, speed=math.sqrt(share) * float(speeds.mean()),
         fast=float(np.percentile(speeds, 95)), observed=tuple(views), flat=tuple(flat), seen=tuple(seen), noise=noise,
+        firsts=tuple(firsts),
     )  # fmt: skip
 
 
@@ -161,7 +176,7 @@ def plan_windows(
     size, but no longer than fluid needs to cross half of the layout (a quarter, for one frame), half of the clip, nor
     25 steps (paper: "longer for steady-state, shorter for highly dynamic fluids"). The layout is frozen within a
     window: where a free surface is not quite in balance, `fall` (m/s^2) acts on it all along, so it may change the
-    velocity by twice its size at most.
+    velocity by twice its size at most. Each window lies in one stretch, and each stretch has one or more.
     """
     h = scene.grid.spacing
     courant = scene.fast * interval / h
@@ -178,20 +193,27 @@ def plan_windows(
     length = max(1, min(round(crossing), round(1 / max(change, 1e-3)), longest))
     if count > 1:
         # half of the clip at most, so that windows differ
-        length = min(length, count // 2)
+        length = min(length, *(max(len(r) // 2, 1) for r in scene.stretches()))
     length = frames or length
     if count == 1:
         return WindowPlan((0,), length, steps, True)
-    require(length < count, f"windows of {length} frames in {count} targets", "shorter windows")
-    last = count - 1 - length
-    starts = sorted({round(x) for x in np.linspace(0, last, min(windows, last + 1))})
+    shortest = min(len(r) for r in scene.stretches())
+    require(length < shortest, f"windows of {length} frames in {shortest} targets", "shorter windows")
+    each = max(windows // len(scene.firsts), 1)
+    starts = sorted({f for r in scene.stretches() for f in _spread(r, length, each)})
     return WindowPlan(tuple(starts), length, steps, False)
+
+
+def _spread(stretch: range, length: int, count: int) -> set[int]:
+    """First frames of so many windows of a stretch, from its first to its last."""
+    last = len(stretch) - 1 - length
+    return {stretch[0] + round(x) for x in np.linspace(0, last, min(count, last + 1))}
 
 
 def _change(scene: FitScene) -> float:
     """Root mean square change of a cell's velocity from frame to frame, less what errors make of it, m/s."""
     power = []
-    for i in range(len(scene.targets) - 1):
+    for i in (i for r in scene.stretches() for i in r[:-1]):
         both = scene.counted(i) & scene.counted(i + 1)
         difference = scene.targets[i + 1].at_centers() - scene.targets[i].at_centers()
         if both.any():

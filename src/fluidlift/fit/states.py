@@ -40,17 +40,22 @@ def seen_faces(domain: RolloutDomain, cell_types: np.ndarray, observed: np.ndarr
     return is_open & np.concatenate(parts)
 
 
-def noise_of(frames: Sequence[Float[np.ndarray, " f"]], seen: Sequence[Bool[np.ndarray, " f"]]) -> float:
+def noise_of(
+    frames: Sequence[Float[np.ndarray, " f"]], seen: Sequence[Bool[np.ndarray, " f"]], firsts: Sequence[int] = (0,)
+) -> float:
     """Standard deviation of the error of a face that is independent from frame to frame, m/s.
 
     The smallest of the root mean square differences of first to third order in time, each scaled to what independent
-    errors would give: a change of the flow itself only raises it. 0 for one frame.
+    errors would give: a change of the flow itself only raises it. 0 for one frame. Frames on both sides of one of
+    `firsts`, with which another stretch of time begins, are not compared.
     """
     found = []
     for weights in DIFFERENCES:
         n = len(weights)
         total, count = 0.0, 0
         for t in range(len(frames) - n + 1):
+            if any(t < first < t + n for first in firsts):
+                continue
             all_seen = np.logical_and.reduce(seen[t : t + n])
             difference = np.zeros(len(all_seen))
             for w, f in zip(weights, frames[t : t + n]):
@@ -63,13 +68,19 @@ def noise_of(frames: Sequence[Float[np.ndarray, " f"]], seen: Sequence[Bool[np.n
 
 
 def smooth_in_time(
-    frames: Sequence[Float[np.ndarray, " f"]], seen: Sequence[Bool[np.ndarray, " f"]], at: int, *, reach: int = 2
+    frames: Sequence[Float[np.ndarray, " f"]],
+    seen: Sequence[Bool[np.ndarray, " f"]],
+    at: int,
+    *,
+    reach: int = 2,
+    within: range | None = None,
 ) -> tuple[Float[np.ndarray, " f"], Bool[np.ndarray, " f"]]:
     """Value at frame `at` of the straight line through `reach` frames on either side, face by face.
 
-    Faces seen less than three times take their mean. The second result marks faces seen at all.
+    Faces seen less than three times take their mean. The second result marks faces seen at all. `within` are the frames
+    that follow each other there; None: all.
     """
-    near = [t for t in range(at - reach, at + reach + 1) if 0 <= t < len(frames)]
+    near = [t for t in range(at - reach, at + reach + 1) if t in (within or range(len(frames)))]
     m = np.stack([seen[t] for t in near]).astype(float)
     y = np.stack([np.asarray(frames[t], float) for t in near])
     x = np.array([t - at for t in near], float)[:, None]

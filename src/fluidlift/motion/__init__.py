@@ -2,6 +2,8 @@
 
 Modules of the face:
 
+    align          Subpixel image registration (robust Gauss-Newton) on a reference, by all pixels of the part that
+                   stands still
     cadence        Frames that repeat: frame-rate conversion (telecine, GIFs played as video) and stretches where
                    the picture stands
     lift           Scene flow: optical flow unprojected by depth (paper: V_surf), the one place where px/frame
@@ -19,5 +21,5 @@ Modules of the face:
 """
 
 __all__ = [
-    "cadence", "lift", "moving_camera", "optical_flow", "sequence", "stabilize", "steady_flow", "volume",
+    "align", "cadence", "lift", "moving_camera", "optical_flow", "sequence", "stabilize", "steady_flow", "volume",
 ]  # fmt: skip

@@ -45,10 +45,21 @@ def stages_of(stages: tuple[str, ...], hints: ClipHints) -> tuple[str, ...]:
     return (*stages[:at], CORRECT, *stages[at:])
 
 
+SAMPLE = 16
+"""frames of a stretch at another time, beside those whose velocity is wanted: eight on either side are asked where
+these fail (`motion.reach` of six, and the flow of neighbours)"""
+
+
 def within(runner: Runner, clip: GivenFile, config: JobConfig) -> JobConfig:
+    """As `windows`, of the part that is made."""
+    return windows(runner, clip, config)[0]
+
+
+def windows(runner: Runner, clip: GivenFile, config: JobConfig) -> tuple[JobConfig, tuple[JobConfig, ...]]:
     """The settings of a job, for a clip of more frames than it takes with a part of the clip that stands for it.
 
-    The part stands in the settings as if it had been given by --start and --duration, for masks and flow as well.
+    The part stands in the settings as if it had been given by --start and --duration, for masks and flow as well. The
+    others are those of short stretches at other times, whose motion may count too; none of a clip that is made whole.
 
     Args:
         runner: of the job, which gets one stage more then.
@@ -65,10 +76,13 @@ def within(runner: Runner, clip: GivenFile, config: JobConfig) -> JobConfig:
     end = math.inf if read.duration is None else read.start + read.duration
     times = frame_times(clip.path, read.fps, ReadLimits(max_pixels=read.max_pixels))
     if sum(read.start - 5e-7 <= time < end - 5e-7 for time in times) <= read.max_frames:
-        return config
+        return config, ()
     runner.stages = (WINDOW, *runner.stages)
-    part = runner.run(WINDOW, window, clip, taken(WindowSettings, read, frames=read.max_frames))
-    return replace(config, read=replace(read, start=part.start, duration=part.duration))
+    sample = config.motion.targets + SAMPLE
+    part = runner.run(WINDOW, window, clip, taken(WindowSettings, read, frames=read.max_frames, sample=sample))
+    parts = [replace(config, read=replace(read, start=s, duration=d)) for s, d in
+             ((part.start, part.duration), *part.elsewhere)]  # fmt: skip
+    return parts[0], tuple(parts[1:])
 
 
 def look(

@@ -16,6 +16,7 @@ from fluidlift.pipeline import begin
 from fluidlift.pipeline.fit_request import request_of
 from fluidlift.pipeline.inputs import GivenFile, GivenFiles, Inputs
 from fluidlift.pipeline.models import UsedModel, require_use, used_models
+from fluidlift.pipeline.other_times import moved_elsewhere
 from fluidlift.pipeline.resimulate import Made, note_as_shown, play
 from fluidlift.pipeline.runner import Runner, gone_if_refused, require_stages
 from fluidlift.pipeline.settings import GenerateSettings, GivenView, MotionSettings, RefineSettings, taken
@@ -82,8 +83,8 @@ def make(
         runner.warn(text)
     with gone_if_refused(runner, "motion"), writing(folder, "fluidlift make"):
         given = GivenFiles.of(inputs)
-        config = begin.within(runner, given.clip, config)
-        lift = _lifted(runner, given, config, hints)
+        config, others = begin.windows(runner, given.clip, config)
+        lift = _lifted(runner, given, config, hints, others)
         frames = config.simulate.frames or len(lift.clip) - lift.geometry.rest_frame
         require_room(folder, frames, len(lift.refined.body))
         origin = given.provenance() | _provenance(hints, models)
@@ -100,16 +101,21 @@ def _provenance(hints: ClipHints, models: tuple[UsedModel, ...]) -> dict[str, An
     return said | ({"models": [model.to_dict() for model in models]} if models else {})
 
 
-def _lifted(runner: Runner, given: GivenFiles, config: JobConfig, hints: ClipHints) -> Lift:
-    """From the clip to the parameters."""
+def _lifted(
+    runner: Runner, given: GivenFiles, config: JobConfig, hints: ClipHints, others: tuple[JobConfig, ...]
+) -> Lift:
+    """From the clip to the parameters; `others` are stretches of a long clip whose motion counts as well."""
+    files = given
     read, flow, segmentation = seen = begin.look(runner, given, config, said=hints)
     given = _with_bodies(runner, read, segmentation, given, config)
     geometry = begin.shape(runner, seen, given, config, hints)
     settings = taken(RefineSettings, config.shape, seed=config.seed)
     refined = runner.run("refine", refine, *seen, geometry, given.geometry, settings)
     moving = runner.run("motion", motion, *seen, geometry, MotionSettings.of(config, guide=True))
-    fitted = runner.run("fit", fit, read, segmentation, geometry, moving, config.fit)
-    return Lift(read, flow, segmentation, geometry, refined, moving, fitted)
+    more = moved_elsewhere(runner, files, others, (read, segmentation, geometry, moving))
+    also = () if more is None else (more,)
+    fitted = runner.run("fit", fit, read, segmentation, geometry, moving, config.fit, *also)
+    return Lift(read, flow, segmentation, geometry, refined, moving, fitted, more)
 
 
 def _with_bodies(
@@ -171,7 +177,8 @@ def _calibrated(runner: Runner, lift: Lift, asset: FluidAsset, config: JobConfig
     from fluidlift.io.scene import SceneEdits
 
     scene = edited_scene(asset, SceneEdits(), None, SceneSettings.of(config), start=lift.geometry.rest_frame)
-    target = mean_target(asset, lift.motion.velocities)
+    also = [] if lift.elsewhere is None else [v for stretch in lift.elsewhere.velocities for v in stretch]
+    target = mean_target(asset, [*lift.motion.velocities, *also])
     wet, s = FluidMasks(lift.labels.labels, lift.geometry.hidden).any_frame(), config.simulate
     return runner.run("calibrate", calibrate, scene, target, wet, wanted=s.follow > 0, beside={"device": s.device})
 
@@ -202,6 +209,7 @@ def _metrics(lift: Lift, calibration: Calibration) -> dict[str, Any]:
         "up": asdict(g.up),
         "scale": asdict(g.scale) | {"sentence": g.scale_sentence},
         "rest_frame": g.rest_frame,
+        **_times(lift),
         "gaussians": len(lift.refined.body),
         "refine_psnr_after": lift.refined.psnr_after,
         "divergence_max": max((r.get("divergence_max", 0.0) for r in reports), default=None),
@@ -211,6 +219,14 @@ def _metrics(lift: Lift, calibration: Calibration) -> dict[str, Any]:
         "fit": fit_figures(lift.fit),
         "calibration": {k: getattr(calibration, k) for k in ("acceleration", "speed", "left", "frames")},
     }
+
+
+def _times(lift: Lift) -> dict[str, Any]:
+    """At which other times of a long clip its motion was taken, and how far that is from the motion that is made."""
+    if lift.elsewhere is None:
+        return {}
+    return {"elsewhere": [{"start": s.start, "targets": len(s.targets), "apart": round(s.apart, 4)}
+                          for s in lift.elsewhere.stretches]}  # fmt: skip
 
 
 def fit_figures(fit: Fit) -> dict[str, Any]:

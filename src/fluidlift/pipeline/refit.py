@@ -19,11 +19,12 @@ from fluidlift.machine import peak_memory_mb
 from fluidlift.messages import Notice, as_plain, from_plain
 from fluidlift.pipeline.fit_request import request_of
 from fluidlift.pipeline.make import fit_figures
+from fluidlift.pipeline.other_times import STAGE
 from fluidlift.pipeline.runner import Runner
 from fluidlift.pipeline.stages.fit import fit
 from fluidlift.present import report
 from fluidlift.seams import Progress, Silence
-from fluidlift.types.stages import Fit, Geometry, Lift, Motion, Read, Segmentation, Shown, Simulation
+from fluidlift.types.stages import Elsewhere, Fit, Geometry, Lift, Motion, Read, Segmentation, Shown, Simulation
 
 NEEDED = ("read", "segment", "geometry", "motion")
 """stages whose cached results the fit starts from"""
@@ -90,7 +91,8 @@ def refit(
     read, segmentation, geometry, moved = _recalled(runner, manifest)
     before = load_asset(folder)
     with disk_errors(folder), writing(folder, "a fit"):
-        found = runner.run("fit", fit, read, segmentation, geometry, moved, config.fit)
+        also = _elsewhere(runner, manifest)
+        found = runner.run("fit", fit, read, segmentation, geometry, moved, config.fit, *also)
         runner.warnings[:] = [w for w in from_plain(manifest) if w not in _last_warnings(manifest)]
         runner.warnings += found.warnings
         write_parameters(folder, found.parameters, found.estimates)
@@ -140,6 +142,13 @@ def _recalled(runner: Runner, manifest: dict[str, Any]) -> tuple[Read, Segmentat
             f"run 'fluidlift make CLIP -o {name}' again with its clip, and then the fit",
         )  # fmt: skip
     return values["read"], values["segment"], values["geometry"], values["motion"]
+
+
+def _elsewhere(runner: Runner, manifest: dict[str, Any]) -> tuple[Elsewhere, ...]:
+    """Velocities at other times of a long clip, where `make` had some; as arguments of the fit."""
+    key = stage_keys(manifest).get(STAGE)
+    found = None if key is None else runner.recall(STAGE, key, Elsewhere)
+    return () if found is None else (found,)
 
 
 def _write_report(

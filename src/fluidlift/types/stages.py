@@ -35,10 +35,13 @@ class Window:
     """s into the clip"""
     duration: float
     """s"""
+    elsewhere: tuple[tuple[float, float], ...] = ()
+    """s into the clip and s: short parts at other times whose motion may count as well"""
     warnings: tuple[Notice, ...] = ()
 
     def __post_init__(self) -> None:
-        require(self.start >= 0 and self.duration > 0, f"a window of {self.duration} s at {self.start} s")
+        for start, duration in ((self.start, self.duration), *self.elsewhere):
+            require(start >= 0 and duration > 0, f"a window of {duration} s at {start} s")
 
 
 @dataclass(frozen=True)
@@ -294,6 +297,31 @@ class Motion:
 
 
 @dataclass(frozen=True)
+class Stretch:
+    """What moved at another time of a long clip."""
+
+    start: float
+    """s into the clip"""
+    targets: tuple[TargetVelocity, ...]
+    """of consecutive frames, in the same cells"""
+    apart: float
+    """root mean square difference of its mean velocity in the fluid to that of the part that is made, over that"""
+
+
+@dataclass(frozen=True)
+class Elsewhere:
+    """Velocities of other times of a long clip, of the same fluid in the same view."""
+
+    stretches: tuple[Stretch, ...]
+    warnings: tuple[Notice, ...] = ()
+
+    @property
+    def velocities(self) -> list[list[FaceVelocity]]:
+        """m/s, of each stretch."""
+        return [[t.velocity for t in stretch.targets] for stretch in self.stretches]
+
+
+@dataclass(frozen=True)
 class Fit:
     """Physical parameters, and how well they are known."""
 
@@ -327,6 +355,8 @@ class Lift:
     refined: Refined
     motion: Motion
     fit: Fit
+    elsewhere: Elsewhere | None = None
+    """of a long clip"""
 
     @property
     def clip(self) -> VideoClip:

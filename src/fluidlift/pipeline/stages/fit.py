@@ -28,7 +28,7 @@ from fluidlift.pipeline.fit_request import FitRequest, request_of, startable
 from fluidlift.pipeline.work import Work
 from fluidlift.types import CellType, FaceVelocity, FitResult, FluidKind, FluidParameters, kind_of
 from fluidlift.types.fluid_masks import FluidMasks
-from fluidlift.types.stages import Fit, Geometry, Motion, Read, Segmentation
+from fluidlift.types.stages import Elsewhere, Fit, Geometry, Motion, Read, Segmentation
 
 AT_WALLS = ("restitution", "wall_damping")
 """not fitted unless asked for: how the velocity falls off towards a wall under water was not seen but assumed
@@ -36,7 +36,14 @@ AT_WALLS = ("restitution", "wall_damping")
 
 
 def fit(
-    read: Read, segmentation: Segmentation, geometry: Geometry, motion: Motion, config: FitConfig, *, work: Work
+    read: Read,
+    segmentation: Segmentation,
+    geometry: Geometry,
+    motion: Motion,
+    config: FitConfig,
+    elsewhere: Elsewhere | None = None,
+    *,
+    work: Work,
 ) -> Fit:
     """Physical parameters that make the grid move like the targets; the first guess where the fit fails.
 
@@ -46,6 +53,7 @@ def fit(
         geometry: of the body.
         motion: velocities that the fit explains.
         config: what is asked of the fit.
+        elsewhere: velocities at other times of a long clip, which it explains as well.
         work: told how far it is.
 
     Raises:
@@ -67,7 +75,7 @@ def fit(
     free = request.free_of(usual)
     moved = _told_by_velocities(kind, free, lambda: outline_rises(masks, geometry.rest_frame))
     start = startable(initial, request.held)
-    found, judged = _attempt(geometry, motion, read.clip.interval, config, start, moved, work)
+    found, judged = _attempt(geometry, (motion, elsewhere), read.clip.interval, config, start, moved, work)
     parameters, estimates = found.parameters, dict(found.estimates)
     if not judged.usable:
         # the buoyancy of smoke was guessed from its speed by the fit
@@ -135,15 +143,17 @@ def _told_by_velocities(kind: FluidKind, free: tuple[str, ...], rises: Callable[
 
 
 def _attempt(
-    geometry: Geometry, motion: Motion, interval: float, config: FitConfig, initial: FluidParameters,
-    free: tuple[str, ...], work: Work,
+    geometry: Geometry, moved: tuple[Motion, Elsewhere | None], interval: float, config: FitConfig,
+    initial: FluidParameters, free: tuple[str, ...], work: Work,
 ) -> tuple[FitResult, Verdict]:  # fmt: skip
     """One fit, judged; equations without a solution are a failure like others."""
     from fluidlift.fit.optimize import fit_parameters
     from fluidlift.fit.pressure_route import with_route
     from fluidlift.fit.settings import FitOptions
 
-    setting, kind = geometry.setting, kind_of(geometry.kind)
+    setting, kind, (motion, elsewhere) = geometry.setting, kind_of(geometry.kind), moved
+    stretches = [motion.velocities, *([] if elsewhere is None else elsewhere.velocities)]
+    firsts = [0, *np.cumsum([len(s) for s in stretches[:-1]], dtype=int).tolist()]
     if not kind.is_driven_in_sight:
         what = "standing water, whose drive is not seen," if kind.is_standing_water else "a body at rest"
         reason = f"{what} tells nothing of its parameters: they are those of such a fluid, or as given"
@@ -153,21 +163,32 @@ def _attempt(
             options = FitOptions(
                 method=config.method, free=free, prior_sigmas=prior_widths(kind), compare=config.compare,
                 start_rounds=config.start_rounds, max_work=config.max_work, max_seconds=config.max_seconds,
-                device=config.device,
+                device=config.device, windows=max(FitOptions.windows, len(stretches)),
             )  # fmt: skip
             options, notes = with_route(
                 options, config.pressure, config.advection_gradient, motion.velocities, setting.cell_types,
                 setting.terrain, initial, (interval, kind),
             )  # fmt: skip
             found = fit_parameters(
-                motion.velocities, setting.cell_types, setting.terrain, setting.terrain.grid, interval, initial,
-                kind=kind, mainstream=setting.terrain.mainstream, restarts=config.restarts + 1, settings=options,
+                [v for s in stretches for v in s], setting.cell_types, setting.terrain, setting.terrain.grid, interval,
+                initial, kind=kind, mainstream=setting.terrain.mainstream, firsts=firsts,
+                restarts=config.restarts + 1, settings=options,
                 progress=work.step,
             )  # fmt: skip
-            found = replace(found, notes=(*notes, *found.notes))
+            found = replace(found, notes=(*notes, *_times(elsewhere), *found.notes))
     except (np.linalg.LinAlgError, FloatingPointError) as error:
         return FitResult(initial, {}, np.zeros(0), False, 0), Verdict("failed", f"no solution ({error})")
     return found, verdict(found)
+
+
+def _times(elsewhere: Elsewhere | None) -> list[str]:
+    """What is said of a fit to several times of a clip."""
+    if elsewhere is None:
+        return []
+    times = ", ".join(f"{s.start:.1f} s" for s in elsewhere.stretches)
+    apart = max(s.apart for s in elsewhere.stretches)
+    return [f"fitted to motion at other times of the clip as well, from {times} on: its mean is off by "
+            f"{100 * apart:.0f} % of the speed at most"]  # fmt: skip
 
 
 def prior_widths(kind: FluidKind) -> dict[str, float]:

@@ -27,6 +27,11 @@ PLACES = 8
 """at which a window may begin, per length of a window"""
 LEAST_MOTION = 0.05
 """grey levels from frame to frame that are no motion: noise of a camera on a tripod is more"""
+ELSEWHERE = 4
+"""parts of equal length of a long shot, each of which lends its motion by the stretch of it that is most as usual; with
+the window that lies in one of them as many times are looked at"""
+LIKE = 1.0
+"""how far a stretch may be from usual, to count: pictures by `LEVELS`, or motion e times as strong"""
 LEVELS = 10.0
 """grey levels of difference between mean pictures that count as much as motion that is e times as strong"""
 
@@ -41,6 +46,8 @@ class WindowSettings:
     duration: float | None
     """s behind that, after which nothing is taken"""
     fps: float
+    sample: int
+    """frames of each of the parts at other times"""
     max_pixels: int = field(metadata=BESIDE)
 
 
@@ -67,11 +74,18 @@ def window(clip: GivenFile, config: WindowSettings, *, work: Work) -> Window:
     length = min(config.frames, last - first)
     if length < 2:
         raise InputRejected(f"'{seen.source}' is cut at every frame", "a stretch of one view", "trim it with --start")
-    begin, levels, motion = _nearest(seen.frames[first:last], length)
+    pieces = _unlike(seen.frames[first:last], max(length // PLACES, 1))
+    begin, levels, motion = _nearest(pieces, last - first, length)
+    others = [first + k for k in _others(pieces, range(begin, begin + length), config.sample)]
     begin += first
     times = np.append(seen.times, seen.times[-1] + seen.interval)
-    start = config.start if begin == 0 else before_frame(times, begin)
-    end = before_frame(times, begin + length)
+
+    def span(at: int, frames: int) -> tuple[float, float]:
+        start = config.start if at == 0 else before_frame(times, at)
+        return start, round(before_frame(times, at + frames) - start, 6)
+
+    start, duration = span(begin, length)
+    end = start + duration
     whole = "its longest shot" if len(edges) > 2 else "all"
     told = Notice(
         "window-of-a-long-clip",
@@ -79,21 +93,60 @@ def window(clip: GivenFile, config: WindowSettings, *, work: Work) -> Window:
         f"pictures differ from those of {whole} by {levels:.1f} levels of 255, and move {motion:.2f} times as much). "
         "Another part: --start and --duration; more frames: --set read.max_frames=NUMBER",
     )
-    return Window(start, round(end - start, 6), (told,))
+    return Window(start, duration, tuple(span(at, config.sample) for at in others), (told,))
 
 
-def _nearest(frames: UInt8[np.ndarray, "t h w 3"], length: int) -> tuple[int, float, float]:
-    """First frame of the window that is most as the clip usually is, piece by piece; how far its pieces' mean pictures
-    are from the usual one, in levels, and its motion over the usual one. Frames are read one after the other."""
-    step = max(length // PLACES, 1)
+@dataclass(frozen=True)
+class _Pieces:
+    """How far the pieces of a shot are from what is usual in it."""
+
+    step: int
+    """frames of each"""
+    levels: Float[np.ndarray, " n"]
+    """grey levels between mean pictures"""
+    ratios: Float[np.ndarray, " n"]
+    """of motion"""
+
+    @property
+    def unlike(self) -> Float[np.ndarray, " n"]:
+        """Both in one number, 0 for what is as usual."""
+        return self.levels / LEVELS + np.abs(np.log(self.ratios))
+
+
+def _unlike(frames: UInt8[np.ndarray, "t h w 3"], step: int) -> _Pieces:
+    """Of each piece of so many frames, which are read one after the other."""
     pictures, moved = _pieces(frames, step)
     levels = np.abs(pictures - np.median(pictures, axis=0)).mean(axis=(1, 2))
-    ratios = (moved + LEAST_MOTION) / (np.median(moved) + LEAST_MOTION)
-    unlike = levels / LEVELS + np.abs(np.log(ratios))
-    per = max(min(length // step, len(unlike)), 1)
+    return _Pieces(step, levels, (moved + LEAST_MOTION) / (np.median(moved) + LEAST_MOTION))
+
+
+def _nearest(pieces: _Pieces, frames: int, length: int) -> tuple[int, float, float]:
+    """First frame of the window that is most as the clip usually is, piece by piece; how far its pieces' mean pictures
+    are from the usual one, in levels, and its motion over the usual one."""
+    unlike = pieces.unlike
+    per = max(min(length // pieces.step, len(unlike)), 1)
     k = int(np.argmin([unlike[i : i + per].sum() for i in range(len(unlike) - per + 1)]))
     window = slice(k, k + per)
-    return min(k * step, len(frames) - length), float(levels[window].mean()), float(ratios[window].mean())
+    first = min(k * pieces.step, frames - length)
+    return first, float(pieces.levels[window].mean()), float(pieces.ratios[window].mean())
+
+
+def _others(pieces: _Pieces, window: range, sample: int) -> list[int]:
+    """First frames of stretches of so many frames at other times: of each of `ELSEWHERE` parts of the shot the one that
+    is most as usual, where it is near enough to that and beside the window."""
+    unlike, step = pieces.unlike, pieces.step
+    per = -(-sample // step)
+    found = []
+    for part in np.array_split(np.arange(len(unlike)), ELSEWHERE):
+        if not len(part) or part[0] * step <= window[len(window) // 2] < (part[-1] + 1) * step:
+            continue  # the window stands for this part
+        places = [int(k) for k in part[: len(part) - per + 1]]
+        places = [k for k in places if (k + per) * step <= window.start or k * step >= window.stop]
+        if places:
+            best = min(places, key=lambda k: float(unlike[k : k + per].mean()))
+            if unlike[best : best + per].mean() <= LIKE:
+                found.append(best * step)
+    return found
 
 
 def _pieces(

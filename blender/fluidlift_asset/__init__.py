@@ -14,10 +14,11 @@ from bpy.app.handlers import persistent
 from . import build
 from .command import Call, find_command, run
 from .edits import changes, panel_values, read_scene, read_settings
-from .facts import EXPORTED, read_facts, require_asset, up_to_date
+from .facts import EXPORTED, frames, read_facts, require_asset, up_to_date
 from .ground import rest_on
 from .light import SUN, light_up
 from .materials import LIQUIDS, liquid_material, turns_in_volumes
+from .meshing import Meshing
 from .waiting import waiting
 
 bl_info = {
@@ -32,6 +33,8 @@ bl_info = {
 
 KEPT = ("fluid surface", "fluid splats", build.TERRAIN, "clip camera", SUN)
 """objects that a refresh leaves, with what a person did to them; the sequences among them get the new frames"""
+MESHING = Meshing()
+"""of the surfaces that are not there yet"""
 
 
 class Preferences(bpy.types.AddonPreferences):
@@ -164,21 +167,46 @@ class ImportAsset(Guarded, bpy.types.Operator):
         return {"FINISHED"}
 
 
-def export(context: bpy.types.Context, folder: Path, volumes: bool) -> list[str]:
-    """Have the command write what Blender reads, where that is older than the frames; what it warns about."""
+def export(context: bpy.types.Context, folder: Path, volumes: bool, *, wait: bool | None = None) -> list[str]:
+    """Have the command write what Blender reads, where that is older than the frames; what it warns about.
+
+    wait: for the surfaces of all frames; else for that of the current one, and the others come later. None: where
+    nobody looks at a window.
+    """
     into, source = folder / EXPORTED, folder / "frames" / "splats"
-    said = ""
+    said, scene, wait = "", context.scene, bpy.app.background if wait is None else wait
+    MESHING.stop()
     wanted = [("surface", "mesh", ".ply")] + ([("volume", "vdb", ".vdb")] if volumes else [])
     for name, form, suffix in wanted:
         if not up_to_date(into / name, source, suffix):
-            with waiting(context, f"writing the {name} of each frame") as told:
-                said += run([command_of(context), "export", str(folder), "-o", str(into / name), "--to", form], told)
+            words = [command_of(context), "export", str(folder), "-o", str(into / name), "--to", form]
+            later, numbers = name == "surface" and not wait, frames(source)
+            one: list[str] = []
+            if later and numbers:
+                number = min(max(scene.frame_current, numbers[0]), numbers[-1])
+                one = ["--frames", f"{number}-{number}"]
+            with waiting(context, f"writing the {name} of {'this' if one else 'each'} frame") as told:
+                said += run([*words, *one], told)
+            if one:
+                MESHING.begin(words, lambda: follow_timeline(scene), lambda said: surfaces_came(scene, folder))
     return [line.strip() for line in said.splitlines() if line.strip().startswith("warning:")]
+
+
+def surfaces_came(scene: bpy.types.Scene, folder: Path) -> None:
+    """Obstacles were brought in where they are in one frame: now with their motion."""
+    bodies = [thing for thing in build.objects() if build.BODY in thing]
+    if bodies:
+        into = bodies[0].users_collection[0]
+        for thing in bodies:
+            bpy.data.objects.remove(thing, do_unlink=True)
+        build.bodies_of(into, folder / EXPORTED / "surface")
+        scene.frame_set(scene.frame_current)
 
 
 def assemble(context: bpy.types.Context, folder: Path, into: bpy.types.Collection, splats: bool) -> None:
     """What a simulation changes: the sequences, obstacles, volumes and the timeline."""
-    surface = build.sequence(into, "fluid surface", "surface", folder / EXPORTED / "surface")
+    numbers = frames(folder / "frames" / "splats")
+    surface = build.sequence(into, "fluid surface", "surface", folder / EXPORTED / "surface", numbers)
     if surface is None:
         raise RuntimeError(f"{folder.name} has no simulated frames: run fluidlift sim")
     if splats:
@@ -370,7 +398,14 @@ def follow_timeline(scene: bpy.types.Scene, *_) -> None:
             try:
                 build.show_frame(thing, scene.frame_current)
             except (OSError, ValueError) as error:  # a frame that is just being written: the last one stays
-                print(f"fluidlift: {error}")
+                if MESHING.call is None:
+                    print(f"fluidlift: {error}")
+
+
+@persistent
+def surfaces_first(*_) -> None:
+    """Pictures show the surfaces of their own frames."""
+    MESHING.wait()
 
 
 def menu(self, context: bpy.types.Context) -> None:
@@ -386,9 +421,12 @@ def register() -> None:
     bpy.types.Scene.fluidlift = bpy.props.PointerProperty(type=Settings)
     bpy.types.TOPBAR_MT_file_import.append(menu)
     bpy.app.handlers.frame_change_pre.append(follow_timeline)
+    bpy.app.handlers.render_init.append(surfaces_first)
 
 
 def unregister() -> None:
+    MESHING.stop()
+    bpy.app.handlers.render_init.remove(surfaces_first)
     bpy.app.handlers.frame_change_pre.remove(follow_timeline)
     bpy.types.TOPBAR_MT_file_import.remove(menu)
     del bpy.types.Scene.fluidlift

@@ -119,10 +119,12 @@ FILLERS = {"surface": fill_surface, "splats": fill_points}
 """how the sequences that follow the timeline are read"""
 
 
-def sequence(into: bpy.types.Collection, name: str, kind: str, folder: Path) -> bpy.types.Object | None:
+def sequence(
+    into: bpy.types.Collection, name: str, kind: str, folder: Path, numbers: range | None = None
+) -> bpy.types.Object | None:
     """An object whose mesh follows the timeline: that of an earlier import with its materials and modifiers, or a new
-    one. None where there are no files."""
-    numbers = frames(folder)
+    one. None where there are no files. numbers: of its frames, where files are still to come; None: of the files."""
+    numbers = frames(folder) if numbers is None else numbers
     if not numbers:
         return None
     thing = into.objects.get(name)

@@ -244,6 +244,12 @@ for move in ((finished, aside), (aside, finished)):  # an asset as it is handed 
     shutil.rmtree(Path(asset, "blender"))
     bpy.ops.fluidlift.refresh()
     out.setdefault("warned", settings.told)
+shutil.rmtree(Path(asset, "blender"))
+scene.frame_set(scene.frame_start + 1)
+fluidlift_asset.export(bpy.context, Path(asset), False, wait=False)
+out["one at once"] = sorted(p.name for p in Path(asset, "blender", "surface").glob("*.ply"))
+fluidlift_asset.surfaces_first()  # what a picture waits for
+out["all before a picture"] = len(list(Path(asset, "blender", "surface").glob("1*.ply")))
 body = next(o for o in scene.objects if o.get("fluidlift_body") == "ball")
 bpy.context.view_layer.objects.active = body
 bpy.ops.fluidlift.remove_obstacle()

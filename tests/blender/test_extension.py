@@ -101,6 +101,12 @@ def test_the_surface_is_that_of_the_export(seen):
     np.testing.assert_allclose(got["low"], np.asarray(exported.vertices).min(0), atol=1e-6)
 
 
+def test_the_surface_of_one_frame_is_made_before_those_of_the_others(seen):
+    found = seen[0]
+    assert set(found["one at once"]) <= {"1002.ply"}  # the command for all may have begun by clearing it away
+    assert found["all before a picture"] == found["after"][1] - 1000
+
+
 def test_the_camera_stands_where_the_clips_stood(seen, made):
     asset, found = load_asset(made.folder), seen[0]["camera"]
     matrix = np.array(found["matrix"])

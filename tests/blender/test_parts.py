@@ -1,6 +1,7 @@
 """The extension's parts that need no Blender: they read what fluidlift writes, and know the same liquids."""
 
 import ast
+import importlib
 import importlib.util
 import json
 import os
@@ -10,7 +11,7 @@ import tomllib
 import zipfile
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -30,6 +31,58 @@ def part(name, folder=FOLDER / "fluidlift_asset"):
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.fixture
+def meshing(monkeypatch):
+    """The module that has surfaces made, in a Blender of which there is no more than it asks for."""
+    timers, scene = [], SimpleNamespace(fluidlift=SimpleNamespace(told=""))
+    fake = ModuleType("bpy")
+    fake.app = SimpleNamespace(timers=SimpleNamespace(register=lambda call, first_interval: timers.append(call)))
+    fake.context = SimpleNamespace(scene=scene)
+    package = ModuleType("in_part")
+    package.__path__ = [str(FOLDER / "fluidlift_asset")]
+    monkeypatch.setitem(sys.modules, "bpy", fake)
+    monkeypatch.setitem(sys.modules, "in_part", package)
+    for name in ("in_part.command", "in_part.meshing"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    yield SimpleNamespace(module=importlib.import_module("in_part.meshing"), timers=timers, scene=scene)
+
+
+def waiting_for(go: Path, end: str) -> list[str]:
+    """A command that says how far it is, and ends so once a file is there."""
+    code = f"""import pathlib, sys, time
+print("[1/1] export: 10 of 40", flush=True)
+while not pathlib.Path({str(go)!r}).exists(): time.sleep(0.01)
+{end}"""
+    return [sys.executable, "-c", code]
+
+
+def test_surfaces_are_made_while_blender_goes_on(meshing, tmp_path):
+    work, looks, ended = meshing.module.Meshing(), [], []
+    work.begin(waiting_for(tmp_path / "go", "print('made')"), lambda: looks.append(1), ended.append)
+    assert meshing.timers == [work.tick]
+    while "25 %" not in meshing.scene.fluidlift.told:
+        assert work.tick() == meshing.module.EVERY
+    assert looks and not ended
+    (tmp_path / "go").touch()
+    work.wait()
+    assert len(ended) == 1 and "made" in ended[0] and work.tick() is None
+    assert meshing.scene.fluidlift.told == "surfaces: done"
+
+
+def test_a_command_that_fails_or_is_replaced_ends_nothing(meshing, tmp_path):
+    work, ended = meshing.module.Meshing(), []
+    (tmp_path / "go").touch()
+    work.begin(waiting_for(tmp_path / "go", "sys.exit('no disk')"), lambda: None, ended.append)
+    work.wait()
+    assert not ended and "no disk" in meshing.scene.fluidlift.told
+    work.begin(waiting_for(tmp_path / "never", ""), lambda: None, ended.append)
+    first = work.call
+    work.begin(waiting_for(tmp_path / "never", ""), lambda: None, ended.append)
+    assert first.process.returncode and work.call is not first
+    work.stop()
+    assert work.tick() is None and not ended
 
 
 def test_meshes_and_splats_are_read_as_they_were_written(tmp_path):

@@ -46,6 +46,15 @@ def test_a_broken_picture_is_refused(tmp_path):
         read_picture(tmp_path / "a.png")
 
 
+@pytest.mark.parametrize("claimed", [2**31 - 1, 1_526_731_728])
+def test_a_png_whose_chunk_claims_more_than_the_file_has_takes_no_memory(tmp_path, claimed):
+    path = write_png(tmp_path / "a.png", np.zeros((4, 5, 3), np.uint16))
+    data = path.read_bytes()
+    path.write_bytes(data[:33] + claimed.to_bytes(4, "big") + data[37:])  # the chunk after the header
+    with pytest.raises(InputRejected, match="claims"):
+        read_picture(path)
+
+
 @pytest.mark.parametrize("top", [1, 255, 65535])
 def test_white_is_fluid_in_masks_of_any_depth(tmp_path, top):
     mask = disc()
@@ -113,7 +122,17 @@ def test_depth_that_cannot_be_used_is_refused(tmp_path):
     (tmp_path / "t.npz").write_bytes(b"PK\x03\x04 no archive")
     np.save(tmp_path / "n.npy", np.full((48, 64), np.nan))
     write_png(tmp_path / "8.png", np.ones((48, 64), np.uint8))
-    cases = {"p.npy": "numbers", "d.exr": "damaged", "t.npz": "cannot be read", "n.npy": "no valid", "8.png": "8 bits"}
+    np.save(tmp_path / "0.npy", np.ones((0, 48, 64), np.float32))
+    np.save(tmp_path / "e.npy", np.ones((1, 0), np.float32))  # next to nothing, of any shape
+    cases = {
+        "e.npy": "another aspect ratio",
+        "0.npy": "at least one frame",
+        "p.npy": "numbers",
+        "d.exr": "damaged",
+        "t.npz": "cannot be read",
+        "n.npy": "no valid",
+        "8.png": "8 bits",
+    }
     for name, reason in cases.items():
         with pytest.raises(InputRejected, match=reason):
             read_depth(tmp_path / name, SIZE)

@@ -149,7 +149,7 @@ def simulation() -> stages.Simulation:
 
 
 VALUES = {
-    "Window": lambda: stages.Window(1.25, 2.5, (Notice("odd", "odd"),)),
+    "Window": lambda: stages.Window(1.25, 2.5, ((61.5, 0.8),), (Notice("odd", "odd"),)),
     "Read": read,
     "Flow": flow,
     "Segmentation": segmentation,
@@ -160,6 +160,8 @@ VALUES = {
     "Refined": refined,
     "TargetVelocity": lambda: motion().targets[0],
     "Motion": motion,
+    "Stretch": lambda: stages.Stretch(61.5, tuple(motion().targets), 0.25),
+    "Elsewhere": lambda: stages.Elsewhere((stages.Stretch(61.5, tuple(motion().targets), 0.25),), (Notice("w", "w"),)),
     "Fit": fit,
     "Lift": lambda: stages.Lift(read(), flow(), segmentation(), geometry(True), refined(), motion(), fit()),
     "Calibration": lambda: stages.Calibration(velocity(), 0.1, 0.2, 0.3, 14, (Notice("w", "w"),)),

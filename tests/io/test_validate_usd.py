@@ -197,6 +197,12 @@ def test_a_broken_file_is_a_fault_not_a_crash(tmp_path):
 # frames in memory -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("what", ["startTimeCode", "endTimeCode", "timeCodesPerSecond"])
+def test_a_dictionary_in_place_of_a_number_is_a_fault_not_a_crash(tmp_path, what):
+    (tmp_path / "a.usda").write_text(f"#usda 1.0\n(\n    {what} = {{\n        int a = 1\n    }}\n)\n")
+    assert validate_usd(tmp_path / "a.usda") != []
+
+
 def particles(gaussians, **changes) -> Particles:
     positions = gaussians(200).means
     return Particles(np.arange(200), positions, np.zeros_like(positions))._replace(**changes)

@@ -16,7 +16,7 @@ from fluidlift.look.materials import material_named
 from fluidlift.look.scenery import terrain_surfels
 from fluidlift.look.vessel import pane_share, panes, vessel_apart
 from fluidlift.present import looks
-from fluidlift.present.looks import Frame, Painter
+from fluidlift.present.looks import Frame, Painter, Quality
 from fluidlift.present.without_fluid import Backdrop
 from fluidlift.shape.terrain import terrain_mesh
 from fluidlift.types import Gaussians, Grid, PinholeCamera, Terrain, TriangleMesh, sh_from_rgb
@@ -132,7 +132,9 @@ def test_glass_is_darkest_at_its_outline_and_stands_in_the_right_order():
 
 def _drawn(style: str, material: str, kind: str, **more) -> np.ndarray:
     engine = more.pop("engine", "mesh")
-    painter = Painter(Look(style, material, "white"), pour(), Path(), kind=kind, engine=engine, samples=16)
+    painter = Painter(
+        Look(style, material, "white"), pour(), Path(), kind=kind, engine=engine, quality=Quality(samples=16)
+    )
     fluid = water()
     return painter.picture(Frame(fluid, np.zeros_like(fluid.means)), beside(), Backdrop(**more)).image
 

@@ -12,7 +12,7 @@ from fluidlift.io.asset_folder import load_asset
 from fluidlift.io.exr import read_channels
 from fluidlift.io.exr_write import write_channels
 from fluidlift.io.scene_look import Look
-from fluidlift.present.looks import Frame, Painter
+from fluidlift.present.looks import Frame, Painter, Quality
 from fluidlift.present.without_fluid import Backdrop
 from fluidlift.scene.splat_files import splat_frames
 from fluidlift.types import Gaussians, Grid, PinholeCamera, Terrain, TriangleMesh
@@ -147,7 +147,7 @@ def test_a_finer_picture_averaged_is_the_same_picture_with_smooth_edges(made):
     fluid, _, velocities = next(iter(splat_frames(made.folder, 1)))
     camera = asset.camera.resized((96, 64))
     look = Look("relit", "honey")
-    plain, fine = (Painter(look, asset.terrain, made.folder, supersample=k) for k in (1, 2))
+    plain, fine = (Painter(look, asset.terrain, made.folder, quality=Quality(k)) for k in (1, 2))
     a, b = (p.picture(Frame(fluid, velocities), camera, Backdrop(cut_out=True)) for p in (plain, fine))
     assert b.image.shape == a.image.shape and b.alpha.shape == a.alpha.shape == b.depth.shape
     # it is the finer picture, averaged
@@ -167,7 +167,7 @@ def test_a_finer_picture_averaged_is_the_same_picture_with_smooth_edges(made):
     assert bare.mean() > 0.1
     np.testing.assert_allclose(kept.image[bare], plate[bare], atol=1e-6)
     with pytest.raises(ValueError, match="supersample"):
-        Painter(look, asset.terrain, made.folder, supersample=0)
+        Quality(0)
 
 
 @pytest.mark.parametrize("look", [Look("relit", "source"), Look("transparent", "milk")], ids=lambda look: look.style)

@@ -362,6 +362,7 @@ def _render(c: Render) -> int:
     request = RenderRequest(
         c.view, _pair(c.size, "x", "--size", "1920x1080"), _pair(c.frames, "-", "--frames", "1001-1024"),
         c.background, c.format, c.look, c.material, c.environment, c.exposure, c.engine, c.samples,
+        draft=c.draft,
     )  # fmt: skip
     with shown_progress() as progress:
         return _print_result(render_asset(c.asset, c.out, request, progress=progress), c.json)

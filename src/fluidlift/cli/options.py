@@ -236,6 +236,8 @@ class Render:
     """of the look surface: mesh; screen (faster, softer); mitsuba (path tracing, for final frames)"""
     samples: int = 64
     """light paths per pixel, of mitsuba"""
+    draft: bool = False
+    """to try looks in half of the time: rough edges, softer shadows, a coarser surface; 8 samples of mitsuba"""
     json: bool = False
     """print the outcome as JSON"""
 

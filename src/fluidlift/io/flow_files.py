@@ -129,15 +129,17 @@ class FlowFiles:
         if isinstance(self._source, FlowArray):
             name = f"{self._source.name} (frame {self._start + t})"
             displacement, confidence = self._source.pair(t)
-            up = bool(self._layout.v_up)
+            displacement, up = displacement.astype(np.float32), bool(self._layout.v_up)
         else:
             name = f"{self._source[t].name} (frame {self._start + t})"
             displacement, confidence, up = read_pair(self._source[t], self._layout, self._limits)
-        displacement = displacement.astype(np.float32)
-        known = np.abs(displacement) < UNKNOWN  # before the scale, which must not bring the marker into reach
-        factor = np.float32(self._layout.scale) * np.array([1, -1 if up else 1], np.float32)
-        scaled = np.where(known, displacement, np.float32(np.nan)) * factor
-        return name, (scaled.shape[1], scaled.shape[0]), scaled, confidence
+            displacement = displacement.astype(np.float32, copy=not displacement.flags.writeable)
+        # in place and by channel: a picture may have 35 million pixels, and every copy is 300 MB
+        for c, sign in enumerate((1, -1 if up else 1)):
+            part = displacement[..., c]
+            part[~(np.abs(part) < UNKNOWN)] = np.nan  # before the scale, which must not bring the marker into reach
+            part *= np.float32(self._layout.scale) * np.float32(sign)
+        return name, (displacement.shape[1], displacement.shape[0]), displacement, confidence
 
 
 def open_flow(
@@ -269,7 +271,10 @@ def _from_kitti(path: Path, limits: ReadLimits) -> Pair:
     picture = read_picture(path, limits=limits)
     if picture.dtype != np.uint16 or picture.ndim != 3 or picture.shape[2] != 3:
         raise InputRejected(f"'{path.name}' is not 16-bit RGB", "flow as KITTI stores it", "write .flo or .exr")
-    return (picture[..., :2].astype(np.float32) - 2**15) / 64, (picture[..., 2] > 0).astype(np.float32)
+    displacement = picture[..., :2].astype(np.float32)
+    displacement -= 2**15
+    displacement /= 64
+    return displacement, (picture[..., 2] > 0).astype(np.float32)
 
 
 def cleaned_flow(displacement: Float[np.ndarray, "h w 2"], confidence: Float[np.ndarray, "h w"] | None) -> Pair:
@@ -278,8 +283,10 @@ def cleaned_flow(displacement: Float[np.ndarray, "h w 2"], confidence: Float[np.
     with np.errstate(over="ignore", invalid="ignore"):
         known = np.hypot(displacement[..., 0], displacement[..., 1]) <= np.hypot(width, height)  # False for NaN
     trust = np.ones((height, width), np.float32) if confidence is None else confidence.astype(np.float32)
-    trust = np.where(known, np.clip(np.nan_to_num(trust, nan=0.0), 0.0, 1.0), 0.0)
-    return np.where(known[..., None], displacement, 0.0).astype(np.float32), trust.astype(np.float32)
+    np.nan_to_num(trust, copy=False, nan=0.0)
+    np.clip(trust, 0.0, 1.0, out=trust)
+    trust[~known] = 0.0
+    return np.where(known[..., None], displacement, 0.0).astype(np.float32, copy=False), trust
 
 
 def resized_flow(

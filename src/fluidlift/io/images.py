@@ -143,6 +143,8 @@ def read_depth(
         raise InputRejected(f"'{path.name}' holds an array {depth.shape}", "[H,W] or [T,H,W]")
     _require_shape(depth.shape[:-3:-1], size, f"the depth '{path.name}'")
     layers = depth[None] if depth.ndim == 2 else depth
+    if len(layers) == 0:
+        raise InputRejected(f"'{path.name}' holds an array {depth.shape}", "at least one frame of depth")
     if len(layers) > limits.max_frames or layers[0].size > limits.max_pixels:
         raise InputRejected(
             f"'{path.name}' holds an array {depth.shape}",

@@ -43,6 +43,12 @@ def picture_header(data: bytes) -> PictureHeader:
 
 def _png(data: bytes) -> PictureHeader:
     width, height, bits, color = struct.unpack_from(">IIBB", data, 16)
+    at = 8
+    while at + 8 <= len(data):  # decoders make room for what a chunk claims: 65 bytes took 2 GB
+        length = struct.unpack_from(">I", data, at)[0]
+        if length > len(data):
+            raise ValueError(f"a chunk claims {length} bytes of {len(data)}")
+        at += 12 + length
     channels = {0: 1, 2: 3, 3: 4, 4: 4, 6: 4}.get(color, 4)  # palettes and grey with alpha become four
     return PictureHeader("PNG", width, height, channels * (2 if bits > 8 else 1))
 

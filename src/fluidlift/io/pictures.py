@@ -135,10 +135,11 @@ def fitted_size(size: tuple[int, int], max_size: int) -> tuple[int, int]:
 
 
 def same_shape(source: tuple[int, int], target: tuple[int, int]) -> bool:
-    """Whether pictures of these sizes (width, height) have the same aspect ratio, up to one pixel of rounding."""
+    """Whether pictures of these sizes (width, height) have the same aspect ratio, up to one pixel of rounding; what has
+    no pixels has none."""
     small, large = sorted((source, target), key=max)
     scale = max(small) / max(large)
-    return all(abs(large[a] * scale - small[a]) <= 1.0 for a in (0, 1))
+    return min(small) > 0 and all(abs(large[a] * scale - small[a]) <= 1.0 for a in (0, 1))
 
 
 def resample(picture: np.ndarray, size: tuple[int, int]) -> np.ndarray:

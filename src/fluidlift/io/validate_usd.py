@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from pxr import Sdf, Usd, UsdGeom, UsdUtils, UsdValidation
+from pxr import Sdf, Tf, Usd, UsdGeom, UsdUtils, UsdValidation
 
 from fluidlift.errors import InputRejected, MissingPackage, required
 from fluidlift.io.limits import require_file
@@ -41,15 +41,18 @@ def validate_usd(path: Path | str) -> list[str]:
     for error in errors:
         sites = ", ".join(str(s.GetPrim().GetPath()) for s in error.GetSites() if s.IsPrim())
         faults.append(f"{error.GetName()}: {error.GetMessage()} {sites}".strip())
-    first, last = stage.GetStartTimeCode(), stage.GetEndTimeCode()
+    try:
+        first, last, of_stage = stage.GetStartTimeCode(), stage.GetEndTimeCode(), _stage_faults(stage)
+    except Tf.ErrorException:  # a dictionary in place of a number, say
+        return [*faults, "time codes or units that are no numbers"]
     if not (abs(first) < MOST_CODES and abs(last) < MOST_CODES):  # a nan fails, too
         return [*faults, f"time codes from {first:g} to {last:g}"]
-    faults += _stage_faults(stage)
+    faults += of_stage
     codes = range(int(first), int(last) + 1)
     for prim in stage.Traverse():
         try:
             faults += prim_faults(prim, codes)
-        except (TypeError, ValueError, OverflowError) as error:
+        except (TypeError, ValueError, OverflowError, Tf.ErrorException) as error:
             faults.append(f"{prim.GetPath()}: values of another type than its schema's ({error})")
     return faults
 

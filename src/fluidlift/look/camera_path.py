@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
-from scipy.interpolate import PchipInterpolator
 
 from fluidlift.errors import require
 from fluidlift.look.scenery import orbit_camera
@@ -62,6 +61,8 @@ def keyed_path(keys: Sequence[ViewKey], frames: int, size: tuple[int, int]) -> l
     Raises:
         ValueError: no keys, two of one frame, or an eye at its target on the way.
     """
+    from scipy.interpolate import PchipInterpolator  # a third of a second that other cameras need not wait
+
     require(len(keys) > 0 and frames > 0, f"{len(keys)} keys and {frames} frames", "at least one of each")
     ordered = sorted(keys, key=lambda k: k.frame)
     times = np.array([k.frame for k in ordered], float)

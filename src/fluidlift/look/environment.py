@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from fluidlift.errors import InputRejected, require
 from fluidlift.look.environment_built_in import sky_radiance, studio_radiance
-from fluidlift.look.environment_filter import clamped_cosine, convolved, ggx_lobe, resized, solid_angles
+from fluidlift.look.environment_filter import Lobe, clamped_cosine, convolved, ggx_lobe, resized, solid_angles
 from fluidlift.look.environment_lookup import grid_directions, lookup
 
 BUILT_IN = ("white", "sky", "studio")
@@ -142,16 +142,28 @@ class Environment:
         return self.radiance if len(self.radiance) <= LIGHT_ROWS else resized(self.radiance, LIGHT_ROWS)
 
     @cached_property
+    def _uniform(self) -> bool:
+        """The same light from everywhere: every mean of it is that light."""
+        return bool((self.radiance == self.radiance[0, 0]).all())
+
+    def _filtered(self, rows: int, lobe: Lobe) -> np.ndarray:
+        if self._uniform:
+            return np.full((rows, 2 * rows, 3), self.radiance[0, 0], np.float32)
+        return convolved(resized(self._small, rows), lobe)
+
+    @cached_property
     def _levels(self) -> tuple[np.ndarray, ...]:
-        return tuple(convolved(resized(self._small, rows), ggx_lobe(roughness)) for roughness, rows in LEVELS)
+        return tuple(self._filtered(rows, ggx_lobe(roughness)) for roughness, rows in LEVELS)
 
     @cached_property
     def diffuse(self) -> Float[np.ndarray, "h 2*h 3"]:
         """The picture of the irradiance over pi, by normal."""
-        return convolved(resized(self._small, DIFFUSE_ROWS), clamped_cosine)
+        return self._filtered(DIFFUSE_ROWS, clamped_cosine)
 
     @cached_property
     def _light(self) -> tuple[np.ndarray, np.ndarray, float]:
+        if self._uniform:
+            return np.array([0.0, 0.0, 1.0], np.float32), np.zeros(3, np.float32), 0.0
         small = resized(self._small, LIGHT_ROWS)
         directions = grid_directions(LIGHT_ROWS)
         weights = np.broadcast_to(solid_angles(LIGHT_ROWS)[:, None], small.shape[:2])

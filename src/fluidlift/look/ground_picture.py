@@ -29,7 +29,9 @@ from fluidlift.types.terrain import TriangleMesh
 if TYPE_CHECKING:
     from fluidlift.look.environment import Environment
 
-__all__ = ["Ground", "GroundLight", "ground_picture", "place_of", "received", "spread_directions", "surroundings"]
+__all__ = [
+    "GRAY", "Ground", "GroundLight", "ground_picture", "place_of", "received", "spread_directions", "surroundings",
+]  # fmt: skip
 
 STEP = 3
 """px between pixels whose ambient light is found"""

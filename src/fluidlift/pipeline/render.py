@@ -16,7 +16,7 @@ from fluidlift.io.output_files import Written, cleared, numbered
 from fluidlift.messages import Notice
 from fluidlift.present.frames import BACKGROUNDS, Drawn, FrameRenderer, SimulatedFrame
 from fluidlift.present.front_view import slab_of
-from fluidlift.present.looks import Painter
+from fluidlift.present.looks import Painter, Quality
 from fluidlift.scene.build import Scene
 from fluidlift.scene.recall import footage_of_asset, simulated_poses, simulated_scene
 from fluidlift.scene.splat_files import frame_numbers, frames_of, frames_told
@@ -61,6 +61,8 @@ class RenderRequest:
     """light paths per pixel, of mitsuba"""
     supersample: int = 2
     """of other looks than splats: they are drawn so many times finer and averaged"""
+    draft: bool = False
+    """looks are only tried: `Quality.draft`, in place of `supersample` and `samples`"""
 
 
 def render_asset(
@@ -137,8 +139,7 @@ def _painter(scene: Scene, folder: Path, request: RenderRequest) -> Painter | No
         folder,
         kind=scene.kind,
         engine=request.engine,
-        samples=request.samples,
-        supersample=request.supersample,
+        quality=Quality.draft() if request.draft else Quality(request.supersample, request.samples),
         slab=slab_of(scene),
     )
 
@@ -226,7 +227,7 @@ def _beyond_clip(clip: tuple[int, int], request: RenderRequest) -> list[Notice]:
 def _cameras(scene: Scene, request: RenderRequest, count: int) -> list[PinholeCamera]:
     """One per frame."""
     from fluidlift.io.views import read_view
-    from fluidlift.look.camera_path import keyed_path, orbit_path
+    from fluidlift.look import camera_path
     from fluidlift.look.scenery import orbit_camera, side_camera, terrain_surfels
     from fluidlift.look.vessel import glass_of
 
@@ -241,11 +242,11 @@ def _cameras(scene: Scene, request: RenderRequest, count: int) -> list[PinholeCa
     if request.view == "top":
         return [orbit_camera(camera, around, azimuth=0.0, elevation=89.0, size=size)] * count
     if request.view == "turn":
-        return orbit_path(camera, around, count, size=size)
+        return camera_path.orbit_path(camera, around, count, size=size)
     found = read_view(Path(request.view))
     if isinstance(found, PinholeCamera):
         return [found if request.size is None else _fitted(found, request.size)] * count
-    return keyed_path(found, count, size)
+    return camera_path.keyed_path(found, count, size)
 
 
 def _surroundings(scene: Scene) -> np.ndarray:

@@ -24,9 +24,9 @@ FOOT = 5
 """cells beside what stands out of the water that its foot, and its colours, may reach"""
 SUNK = 1.0
 """cells below the liquid at rest that a foot ends, at least: it hides nothing of a wave's hollow"""
-OWN = (1.0, 4.0)
+OWN = (0.0, 1.5)
 """cells beside it from which on, and up to which, its foot takes on the colours of the bed: there it is covered by
-what covers the bed"""
+what covers the bed. Farther out the pale stone of a rock stands around it under water like a halo"""
 EVEN = 1.0
 """cells over which the colours of the bed are evened out where they are not seen"""
 

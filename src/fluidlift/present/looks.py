@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fluidlift.errors import InputRejected, require
+from fluidlift.errors import InputRejected
 from fluidlift.io.scene_look import Look
 from fluidlift.look.display import displayed
 from fluidlift.look.environment import BUILT_IN, LUMINANCE, Environment, built_in
@@ -31,7 +31,7 @@ from fluidlift.look.vessel import Pane, before_glass, panes, vessel_apart
 from fluidlift.look.wet_ground import wetted
 from fluidlift.numerics.mesh_normals import vertex_normals
 from fluidlift.numerics.srgb import linear_from_srgb, srgb_from_linear
-from fluidlift.present.supersampling import Lit, averaged, enlarged
+from fluidlift.present.supersampling import Lit, Quality, averaged, enlarged
 from fluidlift.present.surfacing import RADIUS, surface_of
 from fluidlift.present.without_fluid import Backdrop, GroundPictures, Shade, wet_behind
 from fluidlift.types import (
@@ -113,14 +113,11 @@ class Painter:
         folder: of the asset, where environments lie.
         kind: of the fluid; what lies on a bed has no surface towards it.
         engine: of the look surface, one of `ENGINES`.
-        samples: per pixel, of Mitsuba.
+        quality: how finely.
         slab: of a stream; before the terrain it ends there in clean sections, and the ground with it. Before a clip's
             plate it goes on beyond them. None: it is drawn as far as its particles go.
-        supersample: pictures are drawn this many times as wide and as high, and averaged in linear light: edges become
-            smooth, at the price of so many pixels. Mitsuba's are smooth as they are.
 
     Raises:
-        ValueError: a factor that is not 1 to 8.
         InputRejected: an unknown material, environment or engine.
         MissingPackage: the engine or the mesher is not installed.
     """
@@ -133,11 +130,9 @@ class Painter:
         *,
         kind: str | FluidKind = STREAM,
         engine: str = "mesh",
-        samples: int = 64,
-        supersample: int = 1,
+        quality: Quality | None = None,
         slab: Slab | None = None,
     ) -> None:
-        require(1 <= supersample <= 8, f"a supersample of {supersample}", "1 to 8")
         if engine not in ENGINES:
             near = difflib.get_close_matches(engine, ENGINES, 1)
             raise InputRejected(f"no engine '{engine}'", ", ".join(ENGINES), f"did you mean {near[0]}?" if near else "")
@@ -148,16 +143,16 @@ class Painter:
         self.look, self.terrain, self.engine = look, terrain, engine
         self.material: Material = material_named(look.material).tinted(look.tint)
         self.environment = environment_of(folder, look.environment)
-        self._samples, self._bed = samples, terrain if kind_of(kind).lies_on_ground else None
+        self._quality, self._bed = quality or Quality(), terrain if kind_of(kind).lies_on_ground else None
         self._slab = slab or Slab()
-        self._finer, self._folder = 1 if engine == "mitsuba" else int(supersample), folder
+        self._finer, self._folder = 1 if engine == "mitsuba" else self._quality.supersample, folder
         self._far: tuple[tuple, np.ndarray] | None = None
         self._taken: tuple[Backdrop, Backdrop] | None = None
         self._panes: tuple[tuple, tuple[Pane, Pane]] | None = None
         # the ground that hides, and the glass of a pour that does not
         ground, cell = terrain.mesh, terrain.grid.spacing
         whole, self._vessel = vessel_apart(ground, cell) if kind_of(kind).fills_vessel else (ground, None)
-        self._grounds = GroundPictures(whole, terrain.grid, self._slab, self.environment)
+        self._grounds = GroundPictures(whole, terrain.grid, self._slab, self.environment, self._quality.light)
         _ = self._final if engine == "mitsuba" else self._mesher  # what is missing is said before anything is drawn
 
     @cached_property
@@ -166,7 +161,7 @@ class Painter:
             return None
         from fluidlift.backends.splashsurf import SplashsurfMesher
 
-        return SplashsurfMesher()
+        return SplashsurfMesher(draft=self._quality.coarse)
 
     @cached_property
     def _final(self) -> MitsubaRenderer | None:
@@ -346,7 +341,7 @@ class Painter:
 
     @cached_property
     def _no_ground(self) -> Ground:
-        return Ground([], self.environment)
+        return Ground([], self.environment, self._quality.light)
 
     def _glass(self, camera: PinholeCamera, backdrop: Backdrop) -> tuple[Pane, Pane] | None:
         """The vessel's walls before and behind the fluid, kept for a camera that stands still. None on a plate, which
@@ -436,7 +431,7 @@ class Painter:
             FinalScene(
                 mesh, self.material, camera, self.environment.radiance, (*ground, *frame.bodies),
                 panes=() if self._vessel is None else (self._vessel.sheet,),
-                samples=self._samples, show_environment=False, usual=self._usual,
+                samples=self._quality.samples, show_environment=False, usual=self._usual,
             )
         )  # fmt: skip
         behind = self._behind(camera, Backdrop(backdrop.picture), Shade(bodies=frame.bodies))

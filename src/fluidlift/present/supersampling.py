@@ -2,9 +2,35 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
+
+from fluidlift.errors import require
+from fluidlift.look.ground_picture import GroundLight
+
+
+@dataclass(frozen=True)
+class Quality:
+    """How much work a picture gets."""
+
+    supersample: int = 1
+    """1 to 8: pictures are drawn so many times as wide and as high, and averaged in linear light: edges become smooth,
+    at the price of so many pixels. Mitsuba's are smooth as they are"""
+    samples: int = 64
+    """light paths per pixel, of Mitsuba"""
+    light: GroundLight = field(default_factory=GroundLight)
+    """on the ground"""
+    coarse: bool = False
+    """the surface's mesh has larger triangles"""
+
+    def __post_init__(self) -> None:
+        require(1 <= self.supersample <= 8, f"a supersample of {self.supersample}", "1 to 8")
+
+    @classmethod
+    def draft(cls) -> Quality:
+        """To try a look: rough edges, and shadows that are softer and of fewer directions."""
+        return cls(samples=8, light=GroundLight(directions=6, shadow=512), coarse=True)
 
 
 @dataclass(frozen=True)

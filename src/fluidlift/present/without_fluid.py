@@ -15,11 +15,12 @@ import numpy as np
 from scipy import ndimage
 
 from fluidlift.look.environment import Environment
-from fluidlift.look.ground_picture import Ground, place_of
+from fluidlift.look.ground_picture import GRAY, Ground, GroundLight, place_of
 from fluidlift.look.inflow import surface_level
 from fluidlift.look.liquid import Behind
 from fluidlift.look.materials import Material
 from fluidlift.look.stream_slab import Slab
+from fluidlift.numerics.srgb import linear_from_srgb
 from fluidlift.present.bed import Beds, beds_of
 from fluidlift.types import Grid, PinholeCamera, TriangleMesh
 
@@ -31,6 +32,8 @@ NEAR = 0.02
 """of the picture's longer side: standard deviation of the weights of what is around"""
 FLOOR = 3.0
 """of the size of a block of ground: half the width of the floor on which it throws a shadow"""
+WHITE = Environment.white()
+"""the light on ground that is drawn on a clip's plate"""
 SQUARE = ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0))
 MET = 0.5
 """cells below the water: what a ray meets there is still a part of a rock that stands out of it"""
@@ -78,9 +81,13 @@ class GroundPictures:
         grid: of the terrain.
         slab: where a stream is cut.
         environment: the light.
+        lit: how finely its shadows are drawn.
     """
 
-    def __init__(self, whole: TriangleMesh, grid: Grid, slab: Slab, environment: Environment) -> None:
+    def __init__(
+        self, whole: TriangleMesh, grid: Grid, slab: Slab, environment: Environment, lit: GroundLight | None = None
+    ) -> None:
+        self._lit = lit or GroundLight()
         self._grid, self._slab, self._environment, self._whole = grid, slab, environment, whole
         self.solid = slab.cut(whole, grid)
         self._farther: tuple[tuple[bool, ...], Ground] | None = None
@@ -89,7 +96,7 @@ class GroundPictures:
     @cached_property
     def ground(self) -> Ground:
         """As it is."""
-        return Ground([self.solid], self._environment)
+        return Ground([self.solid], self._environment, self._lit)
 
     def light_on_floor(self, camera: PinholeCamera) -> np.ndarray:
         """Share [h,w,3] of the light that the ground leaves the floor that it stands on, 1 beside it."""
@@ -101,10 +108,10 @@ class GroundPictures:
         middle, reach = 0.5 * (low + high), FLOOR * float(np.linalg.norm(high - low))
         corners = [(middle[0] + x * reach, middle[1] + y * reach, low[2]) for x, y in SQUARE]
         floor = TriangleMesh(np.array(corners), np.array([[0, 1, 2], [0, 2, 3]]))
-        open_, shaded = (Ground([floor], self._environment, casters=c) for c in (None, self.ground.casters))
         empty = Behind(np.zeros(shape, np.float32), np.zeros(shape[:2], np.float32))
-        lit, left = (g.picture(camera, empty) for g in (open_, shaded))
-        share = np.clip(left.image / np.maximum(lit.image, 1e-6), 0.0, 1.0)
+        left = Ground([floor], self._environment, self._lit, casters=self.ground.casters).picture(camera, empty)
+        in_the_open = linear_from_srgb(np.array(GRAY)) * self._environment.irradiance(np.array([0.0, 0.0, 1.0]))
+        share = np.clip(left.image / np.maximum(in_the_open, 1e-6), 0.0, 1.0)
         return np.where((left.depth > 0)[..., None], share, 1.0).astype(np.float32)
 
     @cached_property
@@ -119,12 +126,12 @@ class GroundPictures:
         """Where a clip's plate shows fluid: no rock stands out of it, since the plate shows the rocks. It goes on
         beyond the ends. Its light is that of a white sky: under the clip's own the plate has its colours."""
         low = self._slab.carried_on(self._beds.sunk)
-        return Ground([low], Environment.white(), casters=self._level.casters)
+        return Ground([low], WHITE, self._lit, casters=self._level.casters)
 
     @cached_property
     def _around(self) -> Ground:
         """Where a clip's plate shows dry ground."""
-        return Ground([self._slab.carried_on(self.solid)], Environment.white())
+        return Ground([self._slab.carried_on(self.solid)], WHITE, self._lit)
 
     def through(self, camera: PinholeCamera, beside: Behind, far: np.ndarray, shade: Shade) -> tuple[Behind, Ground]:
         """Before the terrain: what is seen through the liquid, and the ground of that picture.
@@ -141,7 +148,7 @@ class GroundPictures:
         if self._farther is None or self._farther[0] != inside:
             seen = replace(self._slab, ends=tuple(e for e, i in zip(self._slab.ends, inside, strict=True) if i))
             mesh = seen.carried_on(self._beds.level)
-            self._farther = inside, Ground([mesh], self._environment, casters=self.ground.casters)
+            self._farther = inside, Ground([mesh], self._environment, self._lit, casters=self.ground.casters)
         low, s = self._farther[1], shade
         empty = Behind(far, np.zeros(far.shape[:2], np.float32))
         found = low.picture(camera, empty, s.caster, material=s.material, bodies=s.bodies, inset=s.inset)
@@ -157,7 +164,7 @@ class GroundPictures:
 
     @cached_property
     def _cut(self) -> Ground:
-        return Ground([self._beds.cut], self._environment)
+        return Ground([self._beds.cut], self._environment, self._lit)
 
     def on_plate(
         self, camera: PinholeCamera, backdrop: Backdrop, bodies: Sequence[TriangleMesh] = ()
@@ -207,7 +214,7 @@ class GroundPictures:
 
     @cached_property
     def _level(self) -> Ground:
-        return Ground([self._slab.carried_on(self._beds.level)], Environment.white())
+        return Ground([self._slab.carried_on(self._beds.level)], WHITE, self._lit)
 
     def depth_of_rocks(self, camera: PinholeCamera, depth: np.ndarray) -> np.ndarray:
         """Camera z (m) of what a clip's plate shows in its fluid, 0 beside it. A ray that misses the model of a rock

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import shlex
 import time
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from fluidlift.errors import FluidliftError
 from fluidlift.io.frames import FIRST_FRAME
-from fluidlift.viewer import kept_views
+from fluidlift.viewer import kept_layout, kept_views
 from fluidlift.viewer.callbacks import heard
 from fluidlift.viewer.footage import GONE, WIDTH
 from fluidlift.viewer.panel_fluid import FluidPanel
@@ -39,6 +40,7 @@ class Panels:
         gui = self._gui
         self._status = gui.add_markdown("warming up ...")
         self._told = ""
+        self._layout = kept_layout.read()
         self._play_controls()
         self._edits = gui.add_button_group("edits", ("undo", "redo", "reset"))
         self._edits.on_click(lambda _: self._back(str(self._edits.value)))
@@ -53,6 +55,7 @@ class Panels:
         with tabs.add_tab("Run"):
             self.run = RunPanel(viewer)
         self._picture_panel()
+        self._arrange()
 
     # time
 
@@ -89,6 +92,7 @@ class Panels:
             ("Last frame", "end", None, lambda _: self._step("last")),
             ("Undo the last edit", "Z", "cmd/ctrl", lambda _: self._back("undo")),
             ("Redo the last edit", "Z", "cmd/ctrl+shift", lambda _: self._back("redo")),
+            ("Fold the controls, or unfold them", "p", None, lambda _: self._lay_out(folded=not self._layout.folded)),
         ):
             self._gui.add_command(label, hotkey=key, modifier=modifier).on_trigger(act)
 
@@ -143,6 +147,11 @@ class Panels:
         self._legend = gui.add_markdown("", visible=False)
         gui.add_button("Look from the input camera", icon="video").on_click(self._input_view)
         gui.add_button("Look from the side", icon="arrows-horizontal").on_click(self._side_view)
+        film = gui.add_dropdown(
+            "input video", tuple(kept_layout.FILMS), initial_value=self._layout.film,
+            hint="size of its window; it is kept for other assets, and so is whether the controls are folded (key p)",
+        )  # fmt: skip
+        heard(film, lambda event, size: None if event.client is None else self._lay_out(film=str(size)))
         kept = gui.add_button_group(
             "camera for render", ("keep", "forget"), hint="cameras of several frames make a path; forget takes all away"
         )
@@ -209,11 +218,23 @@ class Panels:
     # input video
 
     def _picture_panel(self) -> None:
-        panel = self._gui.add_panel()
+        panel = self._film = self._gui.add_panel()
         with panel.add_tab("Input video", icon="video"):
             self._picture_note = self._gui.add_markdown("looking for the input video ...")
             self._picture = self._gui.add_image(np.full((4, 6, 3), 230, np.uint8), format="jpeg", visible=False)
-        panel.float(x=12, y=12, width=340)
+        panel.float(x=12, y=12, width=kept_layout.FILMS[self._layout.film])
+
+    def _lay_out(self, **changes: Any) -> None:
+        """Arrange the page otherwise, from now on."""
+        self._layout = replace(self._layout, **changes)
+        kept_layout.keep(self._layout)
+        self._arrange()
+
+    def _arrange(self) -> None:
+        controls, film = self._gui.main_panel, self._film
+        (controls.minimize if self._layout.folded else controls.expand)()
+        film.set_width(kept_layout.FILMS[self._layout.film])
+        (film.minimize if self._layout.film == "folded" else film.expand)()
 
     def show_picture(self, index: int) -> None:
         """The picture of the video at the time of a frame, from 0."""

@@ -17,6 +17,10 @@ from fluidlift.served import FIRST_PORT, PAGE_HEADERS, free_port, is_local, know
 __all__ = ["FIRST_PORT", "PAGE_HEADERS", "free_port", "is_local", "open_server", "require_viser", "same_origin"]
 
 
+CONTROLS = 320
+"""px, width of the controls; on a laptop's screen (1366 px) less than a quarter of it"""
+
+
 def require_viser() -> Any:
     """The package viser.
 
@@ -46,6 +50,7 @@ def open_server(host: str, port: int, label: str) -> tuple[Any, str]:
     server.request_share_url = lambda *_, **__: None  # would open a tunnel through somebody else's machine
     server.gui.configure_theme(control_width="large", dark_mode=False, show_logo=False, show_share_button=False)
     server.gui.main_panel.dock_right()  # what floats over the scene hides new obstacles
+    server.gui.main_panel.set_width(CONTROLS)
     return server, secret
 
 

@@ -41,14 +41,22 @@ def picture_header(data: bytes) -> PictureHeader:
     raise ValueError("it does not begin as PNG, JPEG, BMP, TIFF, WebP or OpenEXR do")
 
 
-def _png(data: bytes) -> PictureHeader:
-    width, height, bits, color = struct.unpack_from(">IIBB", data, 16)
+def require_whole_chunks(data: bytes) -> None:
+    """Decoders make room for what a chunk of a PNG claims: one file of 65 bytes took 2 GB.
+
+    Raises:
+        ValueError: a chunk that claims more than the file has.
+    """
     at = 8
-    while at + 8 <= len(data):  # decoders make room for what a chunk claims: 65 bytes took 2 GB
+    while at + 8 <= len(data):
         length = struct.unpack_from(">I", data, at)[0]
         if length > len(data):
             raise ValueError(f"a chunk claims {length} bytes of {len(data)}")
         at += 12 + length
+
+
+def _png(data: bytes) -> PictureHeader:
+    width, height, bits, color = struct.unpack_from(">IIBB", data, 16)
     channels = {0: 1, 2: 3, 3: 4, 4: 4, 6: 4}.get(color, 4)  # palettes and grey with alpha become four
     return PictureHeader("PNG", width, height, channels * (2 if bits > 8 else 1))
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -12,8 +14,10 @@ from fluidlift.io.atomic import write_bytes
 from fluidlift.io.confined import read_confined
 from fluidlift.io.exr import MAX_SIDE, channels_in
 from fluidlift.io.limits import MAX_PIXEL_BYTES, ReadLimits, require_file, require_size
-from fluidlift.io.picture_headers import PictureHeader, picture_header
+from fluidlift.io.picture_headers import PictureHeader, picture_header, require_whole_chunks
 from fluidlift.numerics.srgb import srgb_from_linear
+
+T = TypeVar("T")
 
 PICTURE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".exr"})
 MAX_BYTES = 2**30
@@ -69,12 +73,7 @@ def picture_in(data: bytes, name: str, limits: ReadLimits) -> np.ndarray:
 
 def checked_header(data: bytes, name: str, limits: ReadLimits) -> PictureHeader:
     """The header of a picture that may be decoded; raises as `read_picture`."""
-    try:
-        head = picture_header(data)
-    except ValueError as error:
-        raise InputRejected(
-            f"'{name}' cannot be decoded ({error})", "an undamaged picture", "export it again"
-        ) from None
+    head = _undamaged(name, picture_header, data)
     size = head.width * head.height
     if max(head.width, head.height) > MAX_SIDE or size > limits.max_pixels:
         raise InputRejected(
@@ -87,7 +86,19 @@ def checked_header(data: bytes, name: str, limits: ReadLimits) -> PictureHeader:
             f"'{name}' has {head.pixel_bytes} bytes in each of its {size} pixels",
             f"at most {MAX_PIXEL_BYTES * limits.max_pixels} bytes", "export it with fewer channels, or smaller",
         )  # fmt: skip
+    if head.kind == "PNG":
+        _undamaged(name, require_whole_chunks, data)
     return head
+
+
+def _undamaged(name: str, read: Callable[[bytes], T], data: bytes) -> T:
+    """What is read; raises `InputRejected` where that is damaged."""
+    try:
+        return read(data)
+    except ValueError as error:
+        raise InputRejected(
+            f"'{name}' cannot be decoded ({error})", "an undamaged picture", "export it again"
+        ) from None
 
 
 def _from_channels(name: str, channels: dict[str, np.ndarray]) -> np.ndarray:

@@ -6,7 +6,8 @@ from scipy import ndimage
 
 from fluidlift.shape.channel import ChannelConfig, channel_setting
 from fluidlift.shape.chute import USUAL, ChuteHeight, chute_pixels, find_chutes, head_acceleration, pieces
-from fluidlift.shape.composite import with_chute
+from fluidlift.shape.composite import Parts, trust_beside_jets, with_chute
+from fluidlift.shape.jets import Outline
 from fluidlift.shape.kind import level_camera
 from fluidlift.shape.plan import Footage
 from fluidlift.shape.registration import PlacedHeight, VelocityEvidence
@@ -107,6 +108,25 @@ def test_a_chute_that_was_filmed_slowed_down_is_found_all_the_same():
     (found,) = chute_pixels(camera, mask, slow, np.ones(mask.shape))
     (usual,) = chute_pixels(camera, mask, motion, np.ones(mask.shape))
     assert (found & usual).sum() / (found | usual).sum() > 0.99
+
+
+def test_what_spreads_fast_from_the_foot_of_a_jet_is_no_chute():
+    camera, mask, motion, chute, _ = scene(45.0, -30.0, 40.0)
+    rows, cols = np.nonzero(chute)
+    at, trust = (int(np.median(cols)), int(rows.min())), np.ones(mask.shape)
+
+    def front_with(u: int, v: int):
+        """Where a jet of 6 px stands in the picture, over fluid."""
+        pixels = np.zeros_like(mask)
+        pixels[max(v - 20, 0) : v + 6, u - 3 : u + 3] = True
+        outline = Outline(pixels, np.array([[u, v - 20.0], [u, v + 6.0]]), np.array([3.0, 3.0]), False)
+        known = trust_beside_jets(Parts((outline,), mask), camera, motion, trust * ~pixels)
+        return chutes_on_level(camera, mask, motion, known)
+
+    assert front_with(*at) is None
+    away = int(cols.max()) + 40 if cols.max() + 43 < SIZE[0] else int(cols.min()) - 40
+    far = front_with(away, at[1])
+    assert far is not None and (far.chutes[0] & chute).sum() > 0.9 * chute.sum()
 
 
 def test_errors_of_the_flow_alone_are_no_chute():

@@ -440,8 +440,9 @@ def _depth_pictures(
 
 def _observation(seen: Sight, canonical: PinholeCamera, interval: float) -> Observation:
     """What lies, as the builder of its kind wants it."""
+    trust = composite.trust_beside_jets(seen.parts, canonical, seen.motion, seen.lying_trust)
     return Observation(
-        canonical, seen.parts.lying, seen.motion, seen.lying_trust, interval, camera_height=seen.height,
+        canonical, seen.parts.lying, seen.motion, trust, interval, camera_height=seen.height,
         tilt_known=seen.tilt_known, level_prior=composite.level_prior(seen.parts, seen.motion, seen.trust),
         roll=seen.up.roll, standing=seen.stood, ledges=seen.parts.ledges,
     )  # fmt: skip

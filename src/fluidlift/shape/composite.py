@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy import ndimage
 
 from fluidlift.messages import NONE, Notice
 from fluidlift.shape import airborne, chute, jets, registration
@@ -100,6 +101,18 @@ def level_prior(parts: Parts, motion: Float[np.ndarray, "h w 2"], trust: Float[n
         return LEVEL_SAID
     fed = not parts.puddle and jets.feed_all(list(parts.outlines), parts.lying, motion, trust)
     return jets.LEVEL_FED if fed else LEVEL
+
+
+def trust_beside_jets(
+    parts: Parts, camera: PinholeCamera, motion: Float[np.ndarray, "h w 2"], trust: Float[np.ndarray, "h w"]
+) -> Float[np.ndarray, "h w"]:
+    """Trust in the motion of what lies, none in what spreads from the foot of a jet: that is as fast as what comes down
+    a chute, and says nothing of a slope."""
+    if not parts.outlines:
+        return trust
+    near = ndimage.binary_dilation(parts.falling, iterations=2 * round(jets.BLUR))
+    spreads = [p for p in chute.chute_pixels(camera, parts.lying, motion, trust) if (p & near).any()]
+    return trust * ~np.any(spreads, axis=0) if spreads else trust
 
 
 def with_marks(parts: Parts, drawn: DrawnView | None, mask: Bool[np.ndarray, "h w"]) -> Parts:

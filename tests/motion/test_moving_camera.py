@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fluidlift.errors import MissingPackage
-from fluidlift.motion.moving_camera import Lens, Walking, drawn_again, walked
+from fluidlift.motion.moving_camera import GAIN, Lens, Walking, drawn_again, gain, walked
 from fluidlift.motion.parallax import OFF_PLANE, parallax_of
 from fluidlift.motion.stabilize import GreyFrames, stabilise
 from fluidlift.motion.tracks import follow
@@ -121,6 +121,16 @@ def test_what_stands_stands_and_what_flows_is_found(filmed, walks, path):
     assert (wet & ~dry).sum() / (wet | ~dry).sum() > 0.85
     against = cv2.resize(found.fluid_evidence, SIZE)
     assert against.max() <= 0 and against[dry].mean() < 4 * against[~dry].mean()
+
+
+@needs_colmap
+def test_a_path_along_which_no_more_stands_still_is_not_believed(filmed, walks):
+    frames, laid = filmed["sideways"].frames, np.empty_like(filmed["sideways"].frames)
+    drawn_again(frames, walks["sideways"], laid)
+    grey, already = GreyFrames(frames), GreyFrames(laid)
+    assert gain(grey, grey, walks["sideways"]) > 2 * GAIN and gain(grey, already, walks["sideways"]) <= 0.0
+    found, said = walked(grey, Walking(Lens(GUESS), colmap), already)
+    assert found is None and said is not None and said.code == "camera-path-unknown" and "things" in said
 
 
 @needs_colmap

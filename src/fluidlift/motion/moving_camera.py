@@ -25,6 +25,14 @@ from fluidlift.types import CameraPath, MeasuredView
 
 CLOSE_FIT = 0.5
 """px, median error of the path's points above which it is not believed. A corner is found to 0.2 px"""
+GAIN = 0.1
+"""of the picture that must stand better, drawn again, than as from a camera that only turns, less what stands worse. Of
+real clips 0.28 and 0.33 where the camera went, 0.14 of a flood in nine frames, 0.00 to 0.06 where hands with a jug or a
+kettle moved before one that sways: two things that move as wholes agree on one path, too"""
+BETTER = 2.0
+"""grey levels from frame to frame below which nothing is said: noise, and the blur of drawing again"""
+SAMPLES = 9
+"""frames in which that is looked at"""
 REACH = 3.0
 """px of working size over which depth is taken from what is known beside"""
 
@@ -147,12 +155,15 @@ def _filled(values: np.ndarray, known: np.ndarray) -> np.ndarray:
     return out
 
 
-def walked(grey: Sequence[np.ndarray], walking: Walking) -> tuple[Walked | None, Notice | None]:
+def walked(
+    grey: Sequence[np.ndarray], walking: Walking, steady: Sequence[np.ndarray] | None = None
+) -> tuple[Walked | None, Notice | None]:
     """How a camera went, where it did and that can be told; else a notice where it did and cannot.
 
     Args:
         grey: u8 [H,W] pictures of one view.
         walking: what is known of the lens, and who finds poses.
+        steady: the same pictures, laid as of a camera that only turns; None: they stand no better than `grey`.
     """
     tracks = follow(grey)
     parallax = parallax_of(tracks)
@@ -170,6 +181,8 @@ def walked(grey: Sequence[np.ndarray], walking: Walking) -> tuple[Walked | None,
             "tripod",
         )
     found, why = _believed(grey, path)
+    if found is not None and gain(grey, grey if steady is None else steady, found) < GAIN:
+        found, why = None, "what moves may be things, for along its path no more of the picture stands still"
     if found is not None:
         return found, None
     return None, Notice(
@@ -189,6 +202,24 @@ def _believed(grey: Sequence[np.ndarray], path: CameraPath | None) -> tuple[Walk
     path = path.from_frame(reference)
     swept = sweep(grey, path, reference)
     return Walked(path, reference, swept, water_plane(swept, path)), ""
+
+
+def gain(grey: Sequence[np.ndarray], steady: Sequence[np.ndarray], walk: Walked) -> float:
+    """Share of the picture that stands better along a path, less the share that stands worse.
+
+    Args:
+        grey: u8 [H,W] pictures.
+        steady: the same, as they stand without the path.
+        walk: the path.
+    """
+    size, here = grey[0].shape[::-1], walk.reference
+    inverse = walk.inverse_depth(size)
+    changes = []
+    for t in np.unique(np.linspace(0, len(grey) - 1, SAMPLES).round().astype(int)):
+        again = cv2.remap(grey[t], *walk.maps(int(t), size, inverse), cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        changes.append((cv2.absdiff(again, grey[here]), cv2.absdiff(steady[t], steady[here])))
+    after, before = (np.median(each, axis=0) for each in zip(*changes))
+    return float((after < before - BETTER).mean() - (after > before + BETTER).mean())
 
 
 def drawn_again(frames: np.ndarray, walk: Walked, out: np.ndarray, alpha: np.ndarray | None = None) -> None:

@@ -128,7 +128,8 @@ def stabilise(
     steady = warp_back(clip, laid, runs, out)
     if walking is not None and drift > MAY_WALK * max(width, height):
         first, last = max(runs, key=lambda run: run[1] - run[0])
-        walk, said = walked(GreyFrames(clip.frames, first, last), walking)
+        laid_plainly = GreyFrames(steady.frames, first, last)
+        walk, said = walked(GreyFrames(clip.frames, first, last), walking, laid_plainly)
         if walk is not None:
             _laid_anew(clip, steady, walk, (first, last))
             path = path_of(laid, clip.size)

@@ -338,7 +338,7 @@ def test_clear_liquids_show_the_clip_and_cloudy_ones_themselves():
     assert red > 3 * blue
 
 
-def test_honey_shows_what_is_behind_where_it_is_thin_and_is_gold_where_it_is_deep():
+def test_honey_is_light_where_it_is_thin_and_dark_and_red_where_it_is_deep():
     g = layer(0.2)
     own = np.full((len(g), 3), 0.6, np.float32)
     normals, share = np.tile(np.float32([0, 0, 1]), (len(g), 1)), np.ones(len(g), np.float32)
@@ -351,8 +351,7 @@ def test_honey_shows_what_is_behind_where_it_is_thin_and_is_gold_where_it_is_dee
     assert body[0, 1] > 1.4 * middle[1] and middle[0] / middle[2] > 4 * body[0, 0] / body[0, 2]
     args = (normals, share, CAMERA, PRESETS["honey"], Environment.white())
     thin, thick = (relit(g, *args, depths=np.full(len(g), d)).mean(axis=0) for d in (0.003, 0.05))
-    assert thick[2] < 0.3 * thick[0] and thin[2] > 0.7 * thin[0]  # no blue comes back from within, all from behind it
-    assert thick[0] > 0.4 and 0.4 < thick[1] / thick[0] < 0.7  # bright, and between orange and yellow: no brown
+    assert thin @ (1, 1, 1) > 1.5 * thick @ (1, 1, 1)
 
 
 def test_hot_parts_glow_yellow_and_cool_ones_red_or_not_at_all():

@@ -59,7 +59,7 @@ class Material:
 
     def before_white(self, depth: float) -> np.ndarray:
         """Linear colour [3] of `depth` metres of it before a white ground, for previews without rays: a spoon of honey
-        is paler than a barrel. Without the mirror of its surface, its glow and what it carries."""
+        is gold, though a barrel is brown. Without the mirror of its surface, its glow and what it carries."""
         absorption = np.asarray(self.absorption)
         left = np.exp(-(absorption + self.scattering) * depth)
         own = (1.0 - left) * np.asarray(self.albedo) if self.scattering > 0 else 0.0
@@ -94,12 +94,12 @@ MUDDY_WATER = Material(
 take more blue than red."""
 
 HONEY = Material(
-    "honey", 1.49, absorption=(1.1, 6.5, 65.0), scattering=45.0, albedo=(0.490, 0.238, 0.0476), roughness=0.04
+    "honey", 1.49, absorption=(3.0, 16.0, 70.0), scattering=6.0, albedo=(0.110, 0.0277, 0.0068), roughness=0.04
 )
-"""Index at 18 % water. Water white, the lightest of the USDA's colour classes (absorbance of at most 0.0945 through
-3.15 cm at 560 nm, so 6.9 per metre); red and blue after the steep fall of the spectra of light honeys with wavelength.
-Cloudy as honey is that nobody filtered (wax, pollen, first crystals), by eye: a deep body of clear honey returns next
-to no light, and is brown, where this one is gold. Its albedo is `optics.deep_color` of the rest."""
+"""Index at 18 % water. White to extra light amber, by the USDA's colour standard (absorbance of 0.19 to 0.6 through
+3.15 cm at 560 nm, so 14 to 43 per metre); red and blue after the usual fall of brown spectra with wavelength. A little
+cloudy, by eye. What comes through a spoon of it is gold; a deep body returns little, and that is brown: its albedo is
+`optics.deep_color` of the rest."""
 
 LAVA = Material(
     "lava", 1.58, absorption=(300.0, 300.0, 300.0), scattering=3000.0, albedo=(0.035, 0.030, 0.028), roughness=0.45,

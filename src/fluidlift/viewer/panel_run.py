@@ -144,7 +144,9 @@ class RunPanel:
             self._exporting = state.running
             if self._exported.content != state.told:
                 self._exported.content = state.told
-        text = state.told if state.running else self._frames_told()
+        # a message above goes with the next edit, or with an event of one that comes late: how a run ended stays here
+        ended = "" if state.name == "export" else state.outcome
+        text = state.told if state.running else "\n\n".join(filter(None, (ended, self._frames_told())))
         if self._state.content != text:
             self._state.content = text
 

@@ -5,7 +5,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from fluidlift.motion.optical_flow import DenseInverseSearch, flow_of_pair
-from fluidlift.shape.moving_solids import SharedPairs, moving_solids
+from fluidlift.shape.moving_solids import SharedPairs, _moving_alike, moving_solids
 from fluidlift.types.clip import VideoClip
 
 FRAMES, HEIGHT, WIDTH = 40, 180, 240
@@ -72,6 +72,19 @@ def test_an_arm_that_reaches_in_steadily_is_a_solid():
     assert found[where.all(axis=0)].mean() > 0.9
     around = cv2.dilate(where.any(axis=0).astype(np.uint8), np.ones((21, 21))) == 0
     assert not found[around].any()
+
+
+def test_a_solid_goes_on_beyond_its_features_as_far_as_its_motion_does_and_not_into_what_moves_otherwise():
+    steps, motion = [], np.array([2.0, 0.0], np.float32)
+    for _ in range(10):
+        step = np.zeros((HEIGHT, WIDTH, 2), np.float32)
+        step[60:120, :200] = motion  # a smooth sleeve behind the hand
+        step[120:150, :200] = (0.0, 2.0)  # a jet
+        steps.append(step)
+    features = np.float32([(x, y) for x in (140, 170) for y in (70, 110)])
+    motions = [np.float64([[1, 0, 2.0 * t], [0, 1, 0]]) for t in range(11)]
+    solid = _moving_alike(motions, steps, features)
+    assert solid[65:115, 5:175].mean() > 0.95 and not solid[125:].any() and not solid[:55].any()
 
 
 def test_a_sheet_of_foam_that_slides_by_is_none_though_it_does_not_deform():

@@ -30,7 +30,8 @@ GAIN = 0.1
 real clips 0.28 and 0.33 where the camera went, 0.14 of a flood in nine frames, 0.00 to 0.06 where hands with a jug or a
 kettle moved before one that sways: two things that move as wholes agree on one path, too"""
 BETTER = 2.0
-"""grey levels from frame to frame below which nothing is said: noise, and the blur of drawing again"""
+"""grey levels, of the difference to the frame of reference, by which a pixel stands better or worse: less is noise, or
+the blur of drawing again"""
 SAMPLES = 9
 """frames in which that is looked at"""
 REACH = 3.0

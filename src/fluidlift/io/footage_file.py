@@ -1,5 +1,5 @@
 """A small film of the fluid that an asset carries: what its surface looks like over time, for simulations without the
-clip. One H.264 file, each picture with its mask below it."""
+clip. One H.264 file, each picture with its mask below it; of smoke its color, with its opacity below it."""
 
 from __future__ import annotations
 
@@ -43,15 +43,30 @@ def write_footage(
         InputRejected: the disk is full or may not be written.
         ValueError: no frames.
     """
+    return _write(path, zip(frames, (255 * m.astype(np.uint8) for m in fluid), strict=True), interval)
+
+
+def write_smoke(
+    path: Path, layers: Iterable[tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]]], interval: float
+) -> Path:
+    """Write colors (sRGB) and opacities (of 255) of smoke, `interval` seconds apart.
+
+    Raises:
+        InputRejected: the disk is full or may not be written.
+        ValueError: no frames.
+    """
+    return _write(path, layers, interval)
+
+
+def _write(path: Path, pairs: Iterable[tuple[np.ndarray, np.ndarray]], interval: float) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
 
-    def stacked(picture: np.ndarray, mask: np.ndarray) -> np.ndarray:
-        size = size_of_film((mask.shape[1], mask.shape[0]))
-        marks = np.repeat(255 * mask[..., None].astype(np.uint8), 3, axis=-1)
+    def stacked(picture: np.ndarray, below: np.ndarray) -> np.ndarray:
+        size = size_of_film((below.shape[1], below.shape[0]))
+        marks = np.repeat(below[..., None], 3, axis=-1)
         return np.concatenate([_even_sides(resample(np.asarray(p), size)) for p in (picture, marks)])
 
-    pairs = (stacked(f, m) for f, m in zip(frames, fluid, strict=True))
-    return write_video(path, pairs, 1.0 / interval, quality=QUALITY, repeatable=True)
+    return write_video(path, (stacked(*pair) for pair in pairs), 1.0 / interval, quality=QUALITY, repeatable=True)
 
 
 def read_footage(path: Path, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, float]:
@@ -64,6 +79,13 @@ def read_footage(path: Path, size: tuple[int, int]) -> tuple[np.ndarray, np.ndar
     Raises:
         InputRejected: not such a file, one that lacks frames, or larger than an asset's film may be.
     """
+    frames, below, interval = read_smoke(path, size)
+    return frames, below > 127, interval
+
+
+def read_smoke(path: Path, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, float]:
+    """Colors u8 [T,H,W,3] and opacities u8 [T,H,W] of smoke, as `write_smoke` wrote them, and the seconds between
+    frames. See `read_footage`."""
     require_file(path, "film")
     require_size(path, MOST_BYTES, "film")
     clip = read_clip(path, max_size=2 * LARGEST + 16, limits=LIMITS)
@@ -78,8 +100,8 @@ def read_footage(path: Path, size: tuple[int, int]) -> tuple[np.ndarray, np.ndar
             "make the asset again",
         )
     frames = np.asarray(clip.frames)
-    fluid = frames[:, rows : rows + height, :width].min(axis=-1) > 127
-    return np.ascontiguousarray(frames[:, :height, :width]), fluid, float(clip.interval)
+    below = frames[:, rows : rows + height, :width].min(axis=-1)
+    return np.ascontiguousarray(frames[:, :height, :width]), below, float(clip.interval)
 
 
 def _even_sides(picture: np.ndarray) -> np.ndarray:

@@ -12,6 +12,7 @@ from typing import Any
 from fluidlift import __version__
 from fluidlift.config import JobConfig
 from fluidlift.io.hints_file import hints_data
+from fluidlift.look.smoke_film import smoke_layers
 from fluidlift.pipeline import begin
 from fluidlift.pipeline.fit_request import request_of
 from fluidlift.pipeline.inputs import GivenFile, GivenFiles, Inputs
@@ -184,21 +185,20 @@ def _calibrated(runner: Runner, lift: Lift, asset: FluidAsset, config: JobConfig
 
 
 def _write_film(lift: Lift, folder: Path) -> None:
-    """The film that the fluid's surface plays; smoke has none."""
+    """The film that the fluid's surface plays; of smoke, its color and opacity."""
     from fluidlift.io.asset_folder import FILES
-    from fluidlift.io.footage_file import MOST_FRAMES, write_footage
+    from fluidlift.io.footage_file import MOST_FRAMES, write_footage, write_smoke
 
-    film = folder / FILES["film"]
-    if kind_of(lift.geometry.kind).is_gas:
-        film.unlink(missing_ok=True)  # of an earlier run, as something else
-        return
-    clip = lift.clip
+    film, clip = folder / FILES["film"], lift.clip
     first = first_of_film(lift.geometry.rest_frame, len(clip))
     part = slice(first, first + MOST_FRAMES)
     frames, fluid, hidden = clip.frames[part], FluidMasks(lift.labels.labels)[part], lift.geometry.hidden
     if hidden is not None:
         behind = Behind.of(hidden, lift.geometry.mask)
         frames, fluid = behind.pictures(frames), behind.pictures(fluid)
+    if kind_of(lift.geometry.kind).is_gas:
+        write_smoke(film, smoke_layers(frames, fluid, lift.geometry.plate), clip.interval)
+        return
     write_footage(film, frames, fluid, clip.interval)
 
 

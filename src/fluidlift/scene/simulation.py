@@ -63,7 +63,7 @@ def continued(
                 f"frame {FIRST_FRAME + missing[0]}, after which the checkpoint goes on, is not there any more",
                 f"all {frames} frames before the checkpoint", "leave out --resume to start at the first frame",
             )  # fmt: skip
-        most = len(scene.body) + 2 * max_particles
+        most = len(scene.body) + 2 * max(max_particles, len(scene.body))
         found = read_checkpoint(path, max_bytes=4 * simulation_bytes(scene.terrain.grid, most))
         if found.history["poses"].shape != (found.frames, len(scene.obstacles), 7):
             raise InputRejected(f"the checkpoint of '{folder.name}' holds other obstacles", "a whole checkpoint")
@@ -103,7 +103,7 @@ def advance(
         folder: of the asset.
         history: of the frames that are there; the others are added.
         step: told (done, all).
-        max_particles: beyond twice as many the simulation ends.
+        max_particles: beyond twice as many, and twice those at rest, the simulation ends.
         checkpoint_every: frames.
 
     Raises:
@@ -123,7 +123,7 @@ def advance(
                 except FluidliftError as error:
                     return f"frame {FIRST_FRAME + k} ({k} of {scene.simulated}): {error} {in_words(scene)}".rstrip()
             p, coming = simulator.particles, None
-            if k and len(p) > max_particles * 2:
+            if k and len(p) > 2 * max(max_particles, len(scene.body)):
                 return None
             history.add(scene, simulator, p, substeps)
             # the first one says whose frames these are

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from fluidlift.look.surface_map import SurfaceMap
     from fluidlift.look.texture_patches import TexturePatches
     from fluidlift.scene.build import Scene
+    from fluidlift.scene.smoke_appearance import SmokeAppearance
     from fluidlift.scene.whitewater import SceneWhitewater
 
 MAX_STRETCH = 3.0
@@ -186,8 +187,13 @@ class SurfaceAppearance:
         self._level: float | None = None
         self._plays = False
         self._tracers = 0
+        self._smoke: SmokeAppearance | None = None
         self._own = scene.rest.select(np.arange(len(scene.rest) - sum(map(len, scene.emitter_looks))))
-        if scene.skin and len(self._own) and len(scene.body):
+        if not (scene.skin and len(self._own) and len(scene.body)):
+            return
+        if kind_of(scene.kind).is_gas:
+            self._smoke = self._smoke_of()
+        else:
             self._lay_skin()
 
     @property
@@ -249,10 +255,22 @@ class SurfaceAppearance:
             texture.shift = apparent_shift(self._axes.world_splats(bare), self._camera)
         self._begin_again()
 
+    def _smoke_of(self) -> SmokeAppearance | None:
+        """How thin the smoke is; None without its film, which is a warning where there should be one."""
+        from fluidlift.scene.smoke_appearance import SmokeAppearance, smoke_film
+
+        if self._scene.film is None:
+            return None
+        found = smoke_film(self._scene.film, self._camera.size)
+        if isinstance(found, str):
+            self._missing = (Notice("film-not-played", f"the film of the smoke {found}"),)
+            return None
+        return SmokeAppearance(self._scene, found)
+
     def _film_of(self, own: Gaussians) -> FluidFootage | None:
         """The film that the surface plays, whose size the camera has from here on; one that cannot be is a warning."""
         scene = self._scene
-        if scene.film is None or kind_of(scene.kind).is_gas:
+        if scene.film is None:
             return None
         found = _footage(scene.film, scene.camera, own.means, self._cell)
         if isinstance(found, str):
@@ -360,6 +378,8 @@ class SurfaceAppearance:
 
         scene, carry = self._scene, deform or deform_gaussians
         shown = carry(scene.rest, particles, max_stretch=MAX_STRETCH, max_size=LARGEST * self._cell)
+        if self._smoke is not None:
+            return Dressed(*self._smoke.dressed(shown, particles, number))
         if number:  # at rest nothing is drawn out
             shown = mixed(shown, particles.deformation, widest=MIXED * self._cell)
         shown = self._shaded(shown, particles.source)

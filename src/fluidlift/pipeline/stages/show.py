@@ -23,6 +23,10 @@ from fluidlift.scene.splat_files import splat_frames
 from fluidlift.types import PinholeCamera, kind_of
 from fluidlift.types.stages import Shown, Simulation
 
+COVERS, COVERS_THIN = 0.5, 0.15
+"""opacity from which a pixel counts as covered by a liquid, and by smoke: masks go around all of it that can be seen.
+The films of two plumes overlap them by 0.95 and 0.91 (intersection over union) at 0.15, by 0.70 and 0.53 at 0.5"""
+
 
 @dataclass(frozen=True)
 class SeenLook:
@@ -138,6 +142,7 @@ def _panels(
         edited = scene.obstacles or scene.emitters or scene.overlap or scene.changes
         if scene.interval == scene.clip_interval and not edited:
             compared = max(len(renderer.footage.clip) - renderer.footage.start, 1)
+    covers = COVERS_THIN if kind_of(scene.kind).is_gas else COVERS
     size = _panel_size(scene.camera.size, config.width)
     side = _side_camera(scene, renderer, size)
     with ThreadPoolExecutor(1, "side view") as beside:
@@ -150,7 +155,7 @@ def _panels(
             picture = to_bytes(rendered.image)
             if k < BEYOND * compared:  # of the splats, whatever look the preview has
                 measured.frames.append(picture)
-                measured.mask.append(rendered.alpha > 0.5)
+                measured.mask.append(rendered.alpha > covers)
             if k < compared:
                 measured.flow.append(_screen_velocity(front, velocity, scene.camera, scene.interval, rendered.alpha))
             if painter is not None:

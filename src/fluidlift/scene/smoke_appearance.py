@@ -1,0 +1,262 @@
+"""What the splats of simulated smoke look like in each frame: as thin as its film shows it, or as it was carried.
+
+A particle carries an amount of smoke, which is the area that its splat would darken (m^2). Unedited, the film says how
+opaque each line of sight is, and the particles on it share that out. Where a person changed the flow, and beyond what
+the film ever shows, each keeps the amount that it had at rest: smoke that spreads gets thinner.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from scipy import ndimage
+
+from fluidlift.errors import InputRejected
+from fluidlift.look.surface_map import sampled
+from fluidlift.types import Gaussians, Particles, PinholeCamera, concatenate, sh_from_rgb
+
+if TYPE_CHECKING:
+    from fluidlift.look.smoke_film import SmokeFilm
+    from fluidlift.scene.build import Scene
+
+WIDEST = 1.0
+"""standard deviation of a splat at most, cells: the simulator knows nothing finer"""
+
+APPEARS = 1.0
+"""s, after the end of the film, over which smoke comes to be seen where the film never showed any"""
+
+ABOUT = 2.0
+"""standard deviation (px) up to which the smoke about a particle at rest counts as its own"""
+
+ASTRAY = 6.0
+"""cells from the simulated smoke within which smoke that the film shows is shown as well: a plume of ten cells that the
+simulator turns another way, its eddies above all. What is further off shows that the simulation is another one"""
+
+LACKING = 0.5
+"""share of the film's optical depth under which simulated smoke leaves a place to be filled"""
+
+SEEN = 0.03
+"""optical depth from which a place is filled"""
+
+FINER = 4.0
+"""places for splats that fill, to a cell's width"""
+
+FAINT = 0.002
+"""least opacity of a splat: not drawn, but there for other tools"""
+
+FAR = 1e6
+"""px beside the picture at most"""
+
+AS_BODY = "its smoke looks as dense as the body at rest"
+"""what follows where there is no film to play"""
+
+
+def smoke_film(path: Path, size: tuple[int, int]) -> SmokeFilm | str:
+    """The film of an asset's smoke; or what is wrong with it, in words.
+
+    Args:
+        path: its file.
+        size: of the clip, px.
+    """
+    from fluidlift.io.footage_file import read_smoke
+    from fluidlift.look.smoke_film import SmokeFilm
+
+    if not path.is_file():
+        return f"is missing: {AS_BODY}; make the asset again"
+    try:
+        return SmokeFilm(*read_smoke(path, size))
+    except InputRejected as error:
+        return f"is damaged ({error.got}): {AS_BODY}; make the asset again"
+
+
+class SmokeAppearance:
+    """Splats for the particles of smoke.
+
+    Args:
+        scene: that is simulated.
+        film: of the smoke.
+    """
+
+    def __init__(self, scene: Scene, film: SmokeFilm) -> None:
+        from fluidlift.look.smoke_splats import shared_depth
+
+        self._film, self._scene = film, scene
+        height, width = film.opacities.shape[1:]
+        self._camera: PinholeCamera = scene.camera.resized((width, height))
+        self._start = scene.film_start * film.interval
+        self._whole = self._start + (scene.frames - 1) * scene.interval
+        color, depth = film.layer(min(scene.film_start, len(film) - 1))
+        uv, pixel = self._seen(scene.rest.means)
+        wide = self._widest(pixel)
+        narrow = np.minimum(wide, ABOUT)  # of the same smoke, and sooner done
+        self._amounts = shared_depth(uv, narrow, depth, np.zeros(len(uv))) * _area(narrow, pixel)
+        self._colors = sampled(color, uv[:, ::-1] - 0.5)
+
+    def _seen(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where points (m) are seen, px, and m of a pixel there."""
+        uv, depth = self._camera.project(points)
+        behind = depth <= 0
+        uv = np.clip(np.where(behind[:, None], -FAR, uv), -FAR, FAR)
+        return uv, np.maximum(depth, 1e-6) / self._camera.focal[0]
+
+    def _widest(self, pixel: np.ndarray) -> np.ndarray:
+        return WIDEST * self._scene.terrain.grid.spacing / pixel
+
+    def dressed(self, shown: Gaussians, particles: Particles, number: int) -> tuple[Gaussians, np.ndarray, np.ndarray]:
+        """The splats of a frame, round, as dense and of the color that the smoke has there; ids, even of particles and
+        odd of splats where the film shows smoke that the simulation lacks; and velocities, m/s.
+
+        Args:
+            shown: one splat for each particle.
+            particles: of the frame.
+            number: of the frame, from 0.
+        """
+        from fluidlift.look.smoke_splats import depth_of, drawn_splats, opacity_of, shared_depth
+
+        uv, pixel = self._seen(particles.positions)
+        wide = self._widest(pixel)
+        carried = self._amounts[particles.source] / _area(wide, pixel)
+        colors = self._colors[particles.source]
+        depth, share, film = self._depth(uv, wide, carried, self._start + number * self._scene.interval)
+        if film is not None:
+            at = sampled(share, uv[:, ::-1] - 0.5) * self._inside(uv)
+            colors = colors + at[:, None] * (sampled(film, uv[:, ::-1] - 0.5) - colors)
+        drawn, widths = drawn_splats(uv, wide, depth, _chance(particles.ids))
+        weight = np.zeros(len(uv))
+        weight[drawn] = shared_depth(uv[drawn], widths[drawn], depth, carried[drawn])
+        sh = shown.sh.copy()
+        sh[:, 1:] = 0.0
+        own = self._own_colors(particles.source)
+        sh[:, :1] = np.where(own[:, None, None], shown.sh[:, :1], sh_from_rgb(colors))
+        scales = np.repeat((widths * pixel)[:, None], 3, axis=1).astype(np.float32)
+        opacities = np.maximum(opacity_of(weight), FAINT).astype(np.float32)
+        found = replace(shown, scales=scales, opacities=opacities, sh=sh), 2 * particles.ids, particles.velocities
+        if film is None or not drawn.any():
+            return found
+        there = depth_of(uv[drawn], widths[drawn], weight[drawn], self._camera.size)
+        more = self._filled(particles, uv, pixel, np.where(share > LACKING, depth, 0.0), there, film)
+        return tuple(join([a, b]) for join, a, b in zip((concatenate, np.concatenate, np.concatenate), found, more))
+
+    def _filled(
+        self, particles: Particles, uv: np.ndarray, pixel: np.ndarray, depth: np.ndarray, there: np.ndarray,
+        film: np.ndarray,
+    ) -> tuple[Gaussians, np.ndarray, np.ndarray]:  # fmt: skip
+        """Splats where a film shows smoke and the simulation has little of it, as far from the camera as the simulated
+        smoke next to them.
+
+        Args:
+            particles: of the frame.
+            uv: where they are seen, px.
+            pixel: m of a pixel there.
+            depth: optical depth in the film.
+            there: optical depth of the simulated smoke.
+            film: its colors.
+        """
+        from fluidlift.look.smoke_splats import FINEST, TOGETHER, opacity_of, shared_depth
+
+        cell = self._scene.terrain.grid.spacing / float(np.median(pixel))
+        near = _NearestSmoke.of(uv, pixel * self._camera.focal[0], particles.velocities, depth.shape)
+        lacking = (depth > SEEN) & (there < LACKING * depth) & (near.away <= ASTRAY * cell)
+        step = max(round(cell / FINER), 1)
+        lattice = np.zeros(depth.shape, bool)
+        lattice[::step, ::step] = True
+        rows, columns = np.nonzero(lacking & lattice)
+        each = round(TOGETHER / (2.0 * np.pi * FINEST**2))
+        index = (np.repeat(rows * depth.shape[1] + columns, each) * each + np.tile(np.arange(each), len(rows))).astype(
+            int
+        )
+        at = np.repeat(np.stack([columns, rows], axis=1), each, axis=0) + step * np.stack(
+            [_chance(3 * index), _chance(3 * index + 1)], axis=1
+        )
+        far = near.distances(rows, columns, each) + (_chance(3 * index + 2) - 0.5) * near.thickness(rows, columns, each)
+        widths = np.full(len(index), FINEST * step)
+        weight = shared_depth(at, widths, np.maximum(depth - there, 0.0), np.zeros(len(index)))
+        gaussians = Gaussians.isotropic(
+            self._camera.unproject(at, far), widths * far / self._camera.focal[0], sampled(film, at[:, ::-1] - 0.5)
+        )
+        opacities = np.maximum(opacity_of(weight), FAINT).astype(np.float32)
+        moving = near.velocities(rows, columns, each)
+        return replace(gaussians, opacities=opacities), 2 * index + 1, moving.astype(particles.velocities.dtype)
+
+    def _depth(
+        self, uv: np.ndarray, wide: np.ndarray, carried: np.ndarray, time: float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+        """Optical depth of each pixel at a time of the film, how far it is the film's, and the film's colors."""
+        from fluidlift.look.smoke_splats import depth_of
+
+        shown = self._film.shown
+        if self._scene.edited:
+            return depth_of(uv, wide, carried, self._camera.size), np.zeros(shown.shape), None
+        color, depth = self._film.at(time, self._whole)
+        # as long as it lasts, the film shows all that there is
+        after = np.clip((time - (len(self._film) - 1) * self._film.interval) / APPEARS, 0.0, 1.0)
+        share = np.where(shown, 1.0, 1.0 - after)
+        if after > 0.0:
+            depth = share * depth + (1.0 - share) * depth_of(uv, wide, carried, self._camera.size)
+        return depth, share, color
+
+    def _own_colors(self, source: np.ndarray) -> np.ndarray:
+        painted = self._scene.painted
+        return np.zeros(len(source), bool) if painted is None else ~np.all(np.isfinite(painted[source]), axis=1)
+
+    def _inside(self, uv: np.ndarray) -> np.ndarray:
+        return ((uv >= 0) & (uv <= np.array(self._camera.size))).all(axis=1)
+
+
+class _NearestSmoke(NamedTuple):
+    """The simulated smoke that is seen next to each pixel."""
+
+    away: np.ndarray
+    """px to it, [h,w]"""
+    index: np.ndarray
+    """row and column of it, [2,h,w]"""
+    means: np.ndarray
+    """[h,w,5]: distance from the camera and its square (m, m^2), velocity (m/s)"""
+
+    @classmethod
+    def of(cls, uv: np.ndarray, distance: np.ndarray, velocities: np.ndarray, shape: tuple[int, int]) -> _NearestSmoke:
+        """Of particles seen at places (px) of a picture, at distances from the camera (m)."""
+        cells = np.floor(uv).astype(np.int64)
+        inside = ((cells >= 0) & (cells < np.array(shape[::-1]))).all(axis=1)
+        flat = cells[inside, 1] * shape[1] + cells[inside, 0]
+        values = np.concatenate([distance[:, None], distance[:, None] ** 2, velocities], axis=1)[inside]
+        size = shape[0] * shape[1]
+        count = np.bincount(flat, minlength=size)
+        means = [np.bincount(flat, weights=v, minlength=size) / np.maximum(count, 1) for v in values.T]
+        empty = count.reshape(shape) == 0
+        if empty.all():
+            return cls(np.full(shape, np.inf), np.zeros((2, *shape), int), np.zeros((*shape, 5)))
+        away, index = ndimage.distance_transform_edt(empty, return_indices=True)
+        return cls(away, index, np.stack(means, axis=-1).reshape(*shape, 5))
+
+    def _at(self, rows: np.ndarray, columns: np.ndarray, each: int) -> np.ndarray:
+        return np.repeat(self.means[tuple(self.index[:, rows, columns])], each, axis=0)
+
+    def distances(self, rows: np.ndarray, columns: np.ndarray, each: int) -> np.ndarray:
+        """m, of the smoke next to pixels, so many times each."""
+        return self._at(rows, columns, each)[:, 0]
+
+    def thickness(self, rows: np.ndarray, columns: np.ndarray, each: int) -> np.ndarray:
+        """m, of that smoke along the view: of a body that is as thick everywhere, from its spread."""
+        found = self._at(rows, columns, each)
+        return np.sqrt(12.0 * np.maximum(found[:, 1] - found[:, 0] ** 2, 0.0))
+
+    def velocities(self, rows: np.ndarray, columns: np.ndarray, each: int) -> np.ndarray:
+        """m/s, of that smoke."""
+        return self._at(rows, columns, each)[:, 2:]
+
+
+def _area(widths: np.ndarray, pixel: np.ndarray) -> np.ndarray:
+    """Area (m^2) that splats of a standard deviation (px) darken by an optical depth of 1."""
+    return 2.0 * np.pi * np.square(widths * pixel)
+
+
+def _chance(ids: np.ndarray) -> np.ndarray:
+    """A number from 0 to 1 for each id, the same in each frame (the mixing steps of Steele et al. 2014, SplitMix64)."""
+    x = np.asarray(ids).astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+    x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return (x ^ (x >> np.uint64(31))).astype(np.float64) / 2.0**64

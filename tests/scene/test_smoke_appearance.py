@@ -1,0 +1,143 @@
+"""Smoke is as thin as its film, fills what the simulation lacks, and where it was edited keeps the amount that it has."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fluidlift.io.footage_file import write_smoke
+from fluidlift.look.rasterize import render
+from fluidlift.look.smoke_film import SmokeFilm
+from fluidlift.scene.smoke_appearance import APPEARS, ASTRAY, FAINT, SmokeAppearance
+from fluidlift.scene.surface_appearance import SurfaceAppearance
+from fluidlift.types import Gaussians, Particles
+
+FRAMES, INTERVAL = 10, 0.04
+COLOR = np.array([0.8, 0.5, 0.3])
+
+
+def puff(opacity: float = 0.4, count: int = FRAMES) -> SmokeFilm:
+    """A round one that grows a little, in the middle of what `from_above` sees of the channel."""
+    v, u = np.mgrid[:48, :64] + 0.5
+    away = np.hypot(u - 32, v - 24)
+    grown = [opacity * np.exp(-np.square(away / (7 + 0.2 * t)) / 2) for t in range(count)]
+    colors = np.broadcast_to(np.rint(255 * COLOR), (count, 48, 64, 3)).astype(np.uint8)
+    return SmokeFilm(colors, np.rint(255 * np.stack(grown)).astype(np.uint8), INTERVAL)
+
+
+def smoke(channel, **more):
+    """The scene of a channel whose body is smoke: eight particles to each cell, the film's whole picture wide."""
+    return channel(FRAMES, kind="plume", **more)
+
+
+def shown(scene, film, number=0, particles=None):
+    particles = scene.body if particles is None else particles
+    return SmokeAppearance(scene, film).dressed(scene.rest.select(particles.source), particles, number)
+
+
+def alpha(gaussians: Gaussians, scene) -> np.ndarray:
+    return render(gaussians, scene.camera).alpha
+
+
+@pytest.mark.parametrize("number", [0, 6])
+@pytest.mark.parametrize("opacity", [0.1, 0.4, 0.9])
+def test_it_is_as_thin_as_its_film(channel, number, opacity):
+    scene, film = smoke(channel), puff(opacity)
+    gaussians, ids, velocities = shown(scene, film, number)
+    wanted = film.opacities[number] / 255.0
+    assert np.abs(alpha(gaussians, scene) - wanted).mean() < 0.1 * wanted.mean()
+    there = gaussians.opacities > FAINT
+    assert np.abs(gaussians.rgb[there] - COLOR).max() < 0.02
+    assert len(ids) == len(np.unique(ids)) == len(velocities) == len(gaussians)
+
+
+def test_what_the_simulation_lacks_is_filled_as_far_off_as_the_smoke_beside_it(channel):
+    scene, film = smoke(channel), puff(0.5)
+    gone = np.abs(scene.body.positions[:, 0] - 0.6) < 0.1  # a gap of two cells through the middle
+    left = scene.body.select(~gone)
+    gaussians, ids, velocities = shown(scene, film, 3, left)
+    more = ids % 2 == 1
+    assert more.any() and not (ids[~more] % 2).any()
+    wanted = film.opacities[3] / 255.0
+    bare = alpha(gaussians.select(~more), scene)
+    assert np.abs(alpha(gaussians, scene) - wanted).mean() < 0.15 * wanted.mean() < np.abs(bare - wanted).mean()
+    z = scene.body.positions[:, 2]
+    assert z.min() - 0.05 < gaussians.means[more, 2].min() and gaussians.means[more, 2].max() < z.max() + 0.05
+    assert np.abs(velocities[more] - [0.6, 0, 0]).max() < 1e-4
+    again = shown(scene, film, 3, left)
+    assert (again[1] == ids).all() and (again[0].means == gaussians.means).all()
+
+
+def test_far_from_all_simulated_smoke_nothing_is_filled(channel):
+    scene = smoke(channel)
+    left = scene.body.select(scene.body.positions[:, 0] < 0.15)
+    gaussians, ids, _ = shown(scene, puff(0.5), 3, left)
+    reach = 0.15 + (ASTRAY + 1) * 0.1
+    assert not (gaussians.means[ids % 2 == 1, 0] > reach).any()
+    assert not shown(scene, puff(0.5), 3, scene.body.select(slice(0, 0)))[1].size
+
+
+def test_where_the_film_shows_none_there_is_none(channel):
+    scene, film = smoke(channel), puff()
+    empty = SmokeFilm(film.colors, np.zeros_like(film.opacities), INTERVAL)
+    gaussians, ids, _ = shown(scene, empty)
+    assert (gaussians.opacities <= FAINT).all() and not (ids % 2).any() and alpha(gaussians, scene).max() < 1e-3
+
+
+def test_edited_smoke_keeps_its_amount_and_thins_as_it_spreads(channel):
+    scene, film = smoke(channel, changes=("gravity",)), puff(0.4)
+    middle = np.array([0.6, 0.4, 0.2])
+    depth = []
+    for factor in (1.0, 1.5):
+        spread = replace(scene.body, positions=(middle + factor * (scene.body.positions - middle)).astype(np.float32))
+        gaussians, ids, _ = shown(scene, film, 5, spread)
+        assert not (ids % 2).any()
+        depth.append(-np.log1p(-np.minimum(alpha(gaussians, scene), 0.99)))
+    assert depth[1][24, 32] == pytest.approx(depth[0][24, 32] / 1.5**2, rel=0.2)
+    assert depth[0].sum() == pytest.approx(-np.log1p(-film.opacities[0] / 255.0).sum(), rel=0.1)
+
+
+def test_a_color_of_its_own_stays(channel):
+    painted = np.full((len(channel(2).rest), 3), np.nan)
+    scene = smoke(channel, painted=painted)
+    painted[::2] = scene.rest.means[::2]
+    gaussians, ids, _ = shown(scene, puff())
+    dyed = np.zeros(len(ids), bool)
+    dyed[: len(scene.body)] = np.isnan(painted[scene.body.source]).any(axis=1)
+    np.testing.assert_allclose(gaussians.rgb[dyed], scene.rest.rgb[scene.body.source][dyed[: len(scene.body)]])
+    assert np.abs(gaussians.rgb[: len(scene.body)][~dyed[: len(scene.body)]] - COLOR).max() < 0.02
+
+
+def test_after_the_end_of_the_film_smoke_shows_where_it_never_was(channel):
+    scene = smoke(channel)
+    scene = replace(scene, frames=100)
+    one = puff()
+    opacities = one.opacities.copy()
+    opacities[:, :, 40:] = 0  # the film shows none on the right
+    film = SmokeFilm(one.colors, opacities, INTERVAL)
+    aside = replace(scene.body, source=scene.body.source[::-1].copy())  # what is there came from the left
+    soon, late = (
+        alpha(shown(scene, film, k, aside)[0], scene)[:, 44:].mean()
+        for k in (FRAMES - 1, FRAMES + round(APPEARS / INTERVAL))
+    )
+    assert soon < 1e-3 < 0.02 < late
+
+
+@pytest.mark.parametrize("fault", ["missing", "damaged"])
+def test_a_film_that_is_gone_or_damaged_is_said_and_the_smoke_looks_as_at_rest(channel, tmp_path, fault):
+    film, path = puff(), tmp_path / "film.mp4"
+    write_smoke(path, zip(film.colors, film.opacities, strict=True), INTERVAL)
+    whole = SurfaceAppearance(smoke(channel, film=path))
+    path.unlink() if fault == "missing" else path.write_bytes(path.read_bytes()[:700])
+    scene = smoke(channel, film=path)
+    broken = SurfaceAppearance(scene)
+    assert whole.warnings == () and [w.code for w in broken.warnings] == ["film-not-played"]
+    assert fault in broken.warnings[0] and "make the asset again" in broken.warnings[0]
+    first = broken.dressed(scene.body, 0)
+    assert (first.gaussians.opacities == scene.rest.opacities).all()
+
+
+def test_no_particles_are_no_splats(channel):
+    none = Particles.at_rest(np.zeros((0, 3)), 1.0)
+    gaussians, ids, velocities = shown(smoke(channel), puff(), 2, none)
+    assert len(gaussians) == len(ids) == len(velocities) == 0

@@ -1,37 +1,51 @@
-"""A surveyed river beside the surface velocities and the discharge that another program found: RIVeR's example *Pisco*.
+"""A surveyed river beside the surface velocities and the discharge that other programs find: RIVeR's example *Pisco*.
 
-    python benchmarks/surveyed_river.py                    velocities of the surface, from the clip alone
-    python benchmarks/surveyed_river.py pisco.fluid        and the depth and the discharge of an asset
+    python benchmarks/surveyed_river.py                                 velocities of the surface, from the clip alone
+    python benchmarks/surveyed_river.py --openpiv PYTHON                and OpenPIV's on the same frames
+    python benchmarks/surveyed_river.py pisco.fluid --openpiv PYTHON    and depth and discharge of an asset
 
 The case lies below FLUIDLIFT_SHARED (or a folder `shared` beside the repository) in `cases/pisco`: a clip, the map
 from its pixels to metres on the water, the surveyed section, and RIVeR's velocities at some hundred nodes (medians of
 particle image velocimetry over all pairs). The survey is a measurement; velocities and discharge of RIVeR are another
-program's estimate. `fluidlift make` is given the clip alone.
+program's estimate, and so are OpenPIV's. An asset that is not there is made (`fluidlift make`) of the clip alone.
 
-Velocities: the flow of the clip, its mean over the pairs, carried to metres by the same map. Discharge by
-velocity-area, as RIVeR does it: surface speed across the section, times the surveyed depth, times alpha (1 in its
-example; 0.85 is usual). An asset's discharge is that of its own bed: what passes its sections per second, the median
-over them, at the size at which the river is as wide as surveyed (lengths and speeds grow alike, a discharge with their
-third power); its depth is the greatest of each section over its width.
+Ours: the flow of the clip, its mean over the pairs, carried to metres by the map. OpenPIV (GPL: with a Python of its
+own, never a dependency): its default settings on the same frames, laid onto the water by the same map at the median
+footprint of a pixel, without what stands still (`velocimetry.py`); the mean over the pairs of each window, where that
+is more than twice its own standard error.
+
+Discharge by velocity-area, as RIVeR does it: surface speed across the section, times the surveyed depth, times alpha (1
+in its example; 0.85 is usual). Where a program has measured nothing, its speed is drawn straight between the stations
+beside, and to zero at the banks. RIVeR's own nodes go through the same sum, beside what RIVeR itself makes of them.
+An asset's discharge is that of its own bed: what passes its sections per second, the median over them, at the size at
+which the river is as wide as surveyed (lengths and speeds grow alike, a discharge with their third power); its depth is
+the greatest of each section over its width.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
+import functools
 import json
 import platform
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from motion_subjects import default_shared
 from report import put
+from scipy.spatial import cKDTree
+from velocimetry import WINDOW, Ground, moving, peer_velocity
 
+from fluidlift.config import build_config
 from fluidlift.io.asset_folder import load_asset
 from fluidlift.io.video import read_clip
 from fluidlift.motion.optical_flow import estimate_flow, mean_flow
+from fluidlift.pipeline import Inputs, make
 from fluidlift.types import CellType
 
 SURVEYED = (1920, 1080)
@@ -42,32 +56,104 @@ STATIONS = 60
 """points of the section"""
 NEAR = 3
 """px around a node or a station, over which the median is taken"""
+CLOSE = 0.25
+"""share of RIVeR's speed within which a node counts as near"""
+RIVER_DISCHARGE, RIVER_ERROR = 50.5, 9.1
+"""m3/s, and its uncertainty: what RIVeR gives out for this clip"""
+
+
+@dataclass(frozen=True)
+class Case:
+    """The folder of the case."""
+
+    folder: Path
+
+    @functools.cached_property
+    def map(self) -> np.ndarray:
+        """Pixel (x, y, 1) of the surveyed pictures -> metres on the water (east, north), homogeneous [3,3]."""
+        return np.array(json.loads((self.folder / "transformation.json").read_text(encoding="utf-8")))
+
+    @functools.cached_property
+    def nodes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Pixels [n,2] and RIVeR's velocities [n,2] (m/s, east and north)."""
+        with (self.folder / "river_velocities.csv").open(encoding="utf-8") as file:
+            rows = [{k: float(x) for k, x in row.items()} for row in csv.DictReader(file)]
+        return (
+            np.array([[r["px"], r["py"]] for r in rows]),
+            np.array([[r["v_east_m_s"], r["v_north_m_s"]] for r in rows]),
+        )
+
+    @functools.cached_property
+    def survey(self) -> np.ndarray:
+        """Distance from the left bank and height of the bed [n,2], m."""
+        with (self.folder / "pisco_section.csv").open(encoding="utf-8") as file:
+            return np.array([[float(r["d"]), float(r["h"])] for r in csv.DictReader(file)])
+
+    @functools.cached_property
+    def section(self) -> Section:
+        """Its stations."""
+        told = json.loads((self.folder / "section.json").read_text(encoding="utf-8"))["section1"]
+        depth = np.maximum(told["level"] - self.survey[:, 1], 0.0)
+        share = (np.arange(STATIONS) + 0.5) / STATIONS
+        ends = np.array([[told["xl"], told["yl"]], [told["xr"], told["yr"]]])
+        across = np.array([told["east_r"] - told["east_l"], told["north_r"] - told["north_l"]])
+        pixels = ends[0] + share[:, None] * (ends[1] - ends[0])
+        along = np.linalg.norm(metres(self.map, pixels) - [told["east_l"], told["north_l"]], axis=1)
+        return Section(
+            pixels, along, np.interp(along + told["left_station"], self.survey[:, 0], depth),
+            np.array([-across[1], across[0]]) / np.linalg.norm(across), float(depth.max()),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Section:
+    """Stations across the river."""
+
+    pixels: np.ndarray
+    """[n,2], of the surveyed pictures"""
+    along: np.ndarray
+    """m from the left end"""
+    depth: np.ndarray
+    """m, surveyed"""
+    normal: np.ndarray
+    """unit vector across it (east, north)"""
+    deepest: float
+    """m, surveyed"""
+
+    def discharge(self, velocities: np.ndarray) -> float:
+        """m3/s of surface velocities [n,2] at the stations; not a number: not measured there.
+
+        Raises:
+            ValueError: nothing was measured at any station.
+        """
+        speed = velocities @ self.normal
+        known = np.isfinite(speed)
+        if not known.any():
+            raise ValueError("no station of the section was measured")
+        step = self.along[1] - self.along[0]
+        places = np.concatenate([[self.along[0] - step / 2], self.along[known], [self.along[-1] + step / 2]])
+        filled = np.interp(self.along, places, np.concatenate([[0.0], speed[known], [0.0]]))
+        return abs(float(np.trapezoid(filled * self.depth, self.along)))
 
 
 def metres(map_: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Places [n,2] (m) of pixels [n,2]."""
+    """Places [n,2] (m) of pixels [n,2]; with the inverse of the map pixels of places."""
     x = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1) @ map_.T
     return x[:, :2] / x[:, 2:]
 
 
-def speeds(case: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Velocity [H,W,2] (m/s, east and north) of each pixel of the clip, how far it is trusted, and the map's pixels."""
-    clip = read_clip(case / "video.mp4", max_size=FULL)
-    found, trust = mean_flow(estimate_flow(clip.frames))
-    height, width = trust.shape
+def ours(case: Case) -> tuple[np.ndarray, np.ndarray]:
+    """Our velocities [n,2] (m/s) at the nodes and at the stations."""
+    clip = read_clip(case.folder / "video.mp4", max_size=FULL)
+    found, _ = mean_flow(estimate_flow(clip.frames))
+    height, width = found.shape[:2]
     u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     scale = np.array(SURVEYED) / [width, height]
     here = np.stack([u, v], axis=-1).reshape(-1, 2)
     there = here + found.reshape(-1, 2)
-    map_ = np.array(json.loads((case / "transformation.json").read_text(encoding="utf-8")))
-    moved = (metres(map_, there * scale) - metres(map_, here * scale)) / clip.interval
-    return moved.reshape(height, width, 2), trust, scale
-
-
-def surveyed(case: Path) -> np.ndarray:
-    """Distance from the left bank and height of the bed [n,2], m."""
-    with (case / "pisco_section.csv").open(encoding="utf-8") as file:
-        return np.array([[float(r["d"]), float(r["h"])] for r in csv.DictReader(file)])
+    moved = (metres(case.map, there * scale) - metres(case.map, here * scale)) / clip.interval
+    field = moved.reshape(height, width, 2)
+    return around(field, case.nodes[0] / scale), around(field, case.section.pixels / scale)
 
 
 def around(field: np.ndarray, pixels: np.ndarray) -> np.ndarray:
@@ -79,47 +165,86 @@ def around(field: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     return np.array(out)
 
 
-def of_clip(case: Path) -> dict[str, float]:
-    """Our velocities beside RIVeR's at its nodes, and the discharge through the surveyed section."""
-    field, _, scale = speeds(case)
-    with (case / "river_velocities.csv").open(encoding="utf-8") as file:
-        rows = [{k: float(x) for k, x in row.items()} for row in csv.DictReader(file)]
-    nodes = np.array([[r["px"], r["py"]] for r in rows]) / scale
-    theirs = np.array([[r["v_east_m_s"], r["v_north_m_s"]] for r in rows])
-    ours = around(field, nodes)
-    size = np.linalg.norm(theirs, axis=1)
-    cosine = (ours * theirs).sum(axis=1) / np.maximum(np.linalg.norm(ours, axis=1) * size, 1e-9)
-    section = json.loads((case / "section.json").read_text(encoding="utf-8"))["section1"]
-    survey = surveyed(case)
-    depth = np.maximum(section["level"] - survey[:, 1], 0.0)
-    share = (np.arange(STATIONS) + 0.5) / STATIONS
-    ends = np.array([[section["xl"], section["yl"]], [section["xr"], section["yr"]]])
-    across = np.array([section["east_r"] - section["east_l"], section["north_r"] - section["north_l"]])
-    length = float(np.linalg.norm(across))
-    normal = np.array([-across[1], across[0]]) / length
-    pixels = ends[0] + share[:, None] * (ends[1] - ends[0])
-    map_ = np.array(json.loads((case / "transformation.json").read_text(encoding="utf-8")))
-    ground = metres(map_, pixels)
-    along = np.linalg.norm(ground - [section["east_l"], section["north_l"]], axis=1)
-    speed = around(field, pixels / scale) @ normal
-    deep = np.interp(along + section["left_station"], survey[:, 0], depth)
-    discharge = abs(float(np.trapezoid(speed * deep, along)))
+def ground_of(case: Case, scale: np.ndarray) -> Ground:
+    """A raster on the water over nodes and section; `scale` is surveyed px per px of the clip."""
+    pixels = np.concatenate([case.nodes[0], case.section.pixels])
+    at = metres(case.map, pixels)
+    right, below = metres(case.map, pixels + [scale[0], 0.0]) - at, metres(case.map, pixels + [0.0, scale[1]]) - at
+    area = right[:, 0] * below[:, 1] - right[:, 1] * below[:, 0]
+    spacing = float(np.sqrt(np.median(np.abs(area))))
+    low, high = at.min(axis=0) - WINDOW * spacing, at.max(axis=0) + WINDOW * spacing
+    columns, rows = np.ceil((high - low) / spacing).astype(int)
+    return Ground(low[0] + (np.arange(columns) + 0.5) * spacing, high[1] - (np.arange(rows) + 0.5) * spacing, spacing)
+
+
+def openpiv(case: Case, python: str) -> tuple[np.ndarray, np.ndarray]:
+    """OpenPIV's velocities [n,2] (m/s) at the nodes and at the stations; not a number where it measured nothing."""
+    clip = read_clip(case.folder / "video.mp4", max_size=FULL)
+    scale = np.array(SURVEYED) / clip.size
+    ground = ground_of(case, scale)
+    x, y = np.meshgrid(ground.x, ground.y)
+    at = metres(np.linalg.inv(case.map), np.stack([x, y], axis=-1).reshape(-1, 2)) / scale - 0.5
+    at = at.reshape(*x.shape, 2).astype(np.float32)
+    above = [
+        cv2.remap(cv2.cvtColor(f, cv2.COLOR_RGB2GRAY), at[..., 0], at[..., 1], cv2.INTER_CUBIC,
+                  borderMode=cv2.BORDER_REPLICATE) for f in np.asarray(clip.frames)
+    ]  # fmt: skip
+    column, row, velocity, significant = peer_velocity(python, moving(np.stack(above)), ground, clip.interval)
+    inside = np.all((at >= 0) & (at < np.array(clip.size) - 1), axis=-1)
+    j, i = (np.clip(p.astype(int), 0, n - 1) for p, n in ((column, x.shape[1]), (row, x.shape[0])))
+    known = significant & inside[i, j]
+    places = np.stack([ground.x[j], ground.y[i]], axis=-1)[known]
+    reach = WINDOW * ground.spacing
+    return tuple(
+        nearest(places, velocity[known], metres(case.map, pixels), reach)
+        for pixels in (case.nodes[0], case.section.pixels)
+    )  # pyright: ignore[reportReturnType]
+
+
+def nearest(places: np.ndarray, values: np.ndarray, wanted: np.ndarray, reach: float) -> np.ndarray:
+    """Values [n,2] of the places that are nearest to those wanted; not a number beyond `reach` (m)."""
+    found = np.full((len(wanted), 2), np.nan)
+    if len(places):
+        away, which = cKDTree(places).query(wanted)
+        found[away <= reach] = values[which][away <= reach]
+    return found
+
+
+def beside_river(case: Case, nodes: np.ndarray, stations: np.ndarray) -> dict[str, float]:
+    """Velocities at nodes and stations [n,2] beside RIVeR's, and the discharge through the surveyed section."""
+    theirs, known = case.nodes[1], np.isfinite(nodes).all(axis=1)
+    mine, theirs = nodes[known], theirs[known]
+    size, speed = np.linalg.norm(theirs, axis=1), np.linalg.norm(mine, axis=1)
+    cosine = (mine * theirs).sum(axis=1) / np.maximum(speed * size, 1e-9)
+    discharge = case.section.discharge(stations)
     return {
-        "speed over RIVeR's, median of nodes": float(np.median(np.linalg.norm(ours, axis=1) / size)),
+        "nodes measured": float(known.mean()),
+        "speed over RIVeR's, median of nodes": float(np.median(speed / size)),
         "direction against RIVeR's, median cosine": float(np.median(cosine)),
-        "nodes within 25 % of RIVeR's speed": float(np.mean(np.abs(np.linalg.norm(ours, axis=1) / size - 1) < 0.25)),
-        "discharge through the surveyed section, alpha 1, m3/s": discharge,
-        "discharge through the surveyed section, alpha 0.85, m3/s": 0.85 * discharge,
-        "surveyed greatest depth over width": float(depth.max() / np.ptp(survey[:, 0])),
+        f"nodes within {100 * CLOSE:.0f} % of RIVeR's speed": float(np.mean(np.abs(speed / size - 1) < CLOSE)),
+        "stations measured": float(np.isfinite(stations).all(axis=1).mean()),
+        "discharge through the surveyed section, alpha 1": discharge,
+        "discharge through the surveyed section, alpha 0.85": 0.85 * discharge,
     }
 
 
-def of_asset(folder: Path, case: Path) -> dict[str, float]:
+def river(case: Case) -> dict[str, float]:
+    """RIVeR's own nodes by our sum, and what RIVeR makes of them."""
+    at = metres(case.map, case.nodes[0])
+    away, _ = cKDTree(at).query(at, k=2)
+    spacing = float(np.median(np.asarray(away)[:, 1]))
+    stations = nearest(at, case.nodes[1], metres(case.map, case.section.pixels), spacing)
+    found = beside_river(case, case.nodes[1], stations)
+    wanted = {k: v for k, v in found.items() if k.startswith(("stations", "discharge"))}
+    return wanted | {"discharge given out": RIVER_DISCHARGE, "its uncertainty": RIVER_ERROR}
+
+
+def of_asset(folder: Path, case: Case) -> dict[str, float]:
     """Depth and discharge of an asset's own bed."""
     asset = load_asset(folder)
     grid, liquid = asset.grid, np.isin(asset.cell_types, (CellType.FLUID, CellType.INFLOW, CellType.OUTFLOW))
     h, flow = grid.spacing, asset.velocity.at_centers()
-    direction = np.asarray(asset.terrain.mainstream, np.float64)
+    direction = np.asarray(asset.terrain.mainstream, np.float64) * [1.0, 1.0, 0.0]  # sections are upright
     direction /= np.linalg.norm(direction)
     station = np.floor(grid.centers() @ direction / h).astype(int)
     station -= station.min()
@@ -133,36 +258,64 @@ def of_asset(folder: Path, case: Path) -> dict[str, float]:
     np.maximum.at(deepest, own[columns], deep[columns])
     middle = count > 0.5 * np.median(count[count > 0])
     width = float(np.median(wide[middle]))
-    size = float(np.ptp(surveyed(case)[:, 0])) / width
+    surveyed = float(np.ptp(case.survey[:, 0]))
+    share = float(np.median(deepest[middle] / wide[middle]))
     return {
-        "greatest depth over width, median of sections": float(np.median(deepest[middle] / wide[middle])),
-        "discharge of the asset at the surveyed width, m3/s": float(np.median(through[middle])) * size**3,
-        "mean speed of the asset at the surveyed width, m/s": float(
-            np.median(through[middle] / (count[middle] * h * h))
-        )
-        * size,
-        "width of the asset before that, m": width,
+        "greatest depth over width": share,
+        "greatest depth": share * surveyed,
+        "discharge of its own bed": float(np.median(through[middle])) * (surveyed / width) ** 3,
+        "mean speed": float(np.median(through[middle] / (count[middle] * h * h))) * surveyed / width,
+        "width before that": width,
     }
+
+
+def made(folder: Path, case: Case) -> Path:
+    """The asset; made of the clip alone where there is none."""
+    if not (folder / "manifest.json").is_file():
+        make(Inputs(case.folder / "video.mp4"), folder, build_config("draft"))
+    return folder
+
+
+UNITS = {"discharge": "m3/s", "its uncertainty": "m3/s", "greatest depth": "m", "mean speed": "m/s", "width": "m"}
+"""of figures by their beginning; the others have none"""
+
+
+def unit_of(figure: str) -> str:
+    """Of a figure."""
+    return next((u for k, u in UNITS.items() if figure.startswith(k)), "") if "over" not in figure else ""
 
 
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("asset", nargs="?", type=Path)
+    parser.add_argument("asset", nargs="?", type=Path, help="made where it is not there")
+    parser.add_argument("--openpiv", help="interpreter that has the package openpiv")
     parser.add_argument("--dry", action="store_true", help="write no results")
     args = parser.parse_args()
     shared = default_shared()
     if shared is None or not (shared / "cases" / "pisco").is_dir():
         parser.error("the case pisco is not there: set FLUIDLIFT_SHARED to the folder that holds cases/pisco")
-    figures = of_clip(shared / "cases" / "pisco") | (
-        {} if args.asset is None else of_asset(args.asset, shared / "cases" / "pisco")
-    )
-    for name, value in figures.items():
-        print(f"{name:60} {value:.3g}")
+    case = Case(shared / "cases" / "pisco")
+    width = float(np.ptp(case.survey[:, 0]))
+    found = {"survey": {"greatest depth over width": case.section.deepest / width,
+                        "greatest depth": case.section.deepest}, "RIVeR": river(case)}  # fmt: skip
+    mine = ours(case)
+    found["ours"] = beside_river(case, *mine)
+    if args.openpiv:
+        theirs = openpiv(case, args.openpiv)
+        found["OpenPIV"] = beside_river(case, *theirs)
+        both = [np.linalg.norm(v[0], axis=1) for v in (mine, theirs)]
+        found["ours"]["speed over OpenPIV's, median of nodes"] = float(np.nanmedian(both[0] / both[1]))
+    if args.asset is not None:
+        found["our asset"] = of_asset(made(args.asset, case), case)
+    for subject, figures in found.items():
+        for name, value in figures.items():
+            print(f"{subject:10} {name:55} {value:8.3g} {unit_of(name)}")
     if not args.dry:
         records: list[dict[str, Any]] = [
-            {"subject": "Pisco", "figure": k, "value": float(f"{v:.3g}")} for k, v in figures.items()
-        ]
+            {"subject": subject, "figure": k, "value": float(f"{v:.3g}"), "unit": unit_of(k)}
+            for subject, figures in found.items() for k, v in figures.items()
+        ]  # fmt: skip
         put("river", records, date=time.strftime("%Y-%m-%d"), machine=f"{platform.machine()}, {platform.system()}")
 
 

@@ -25,11 +25,20 @@ def test_a_wrong_kind_is_answered_with_the_kinds_there_are_in_their_order(capsys
     assert "('auto', 'stream', 'fall', 'pour', 'plume', 'dam', 'basin')" in said
 
 
-@pytest.mark.parametrize("command", ["make", "motion", "mask", "sim", "fit", "render", "export", "inspect"])
+@pytest.mark.parametrize("command", ["make", "motion", "mask", "studio", "sim", "fit", "render", "export", "inspect"])
 def test_help_does_not_offer_none(command, capsys):
     code, said = shown(capsys, command, "--help")
     assert code == 0
     assert "None" not in said and "(default: )" not in said and "default: not given" not in said
+
+
+def test_learned_models_are_asked_for_alike_wherever_a_clip_is_looked_at(capsys):
+    told = {}
+    for command in ("make", "mask", "motion", "studio"):
+        _, said = shown(capsys, command, "--help")
+        text = " ".join(said[said.rindex("--models STR") :].replace("│", " ").split())
+        told[command] = text.partition("(`fluidlift models`)")[0]
+    assert len(set(told.values())) == 1 and "names with commas" in told["make"]
 
 
 def test_help_of_make_has_its_options_in_groups(capsys):

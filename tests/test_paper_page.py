@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 LARGEST = 3_000_000
 """bytes of all its pictures: a page that a telephone loads, and a repository that stays small"""
-WITHOUT = {"generators", "smoke"}
+WITHOUT = {"generators"}
 """sections that say why nothing was measured"""
 
 

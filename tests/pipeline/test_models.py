@@ -175,6 +175,38 @@ def test_a_name_for_what_is_given_is_a_contradiction(table, stick):
         with_models(build_config(overrides=["generate.name=trellis"]), CLIP, "depth-1")
 
 
+def test_a_job_with_fewer_stages_takes_fewer_models(table, stick):
+    bring(table, stick, "depth-1", "flow-2")
+    chosen = with_models(JobConfig(), CLIP, "auto", places=("masks", "flow"))
+    assert chosen.config.depth == JobConfig().depth and chosen.config.motion.method == "sea-raft"
+    with pytest.raises(InputRejected, match="depth-1, which is for depth"):
+        with_models(JobConfig(), CLIP, "flow-2,depth-1", places=("masks", "flow"))
+
+
+@pytest.mark.parametrize(
+    ("command", "asked", "says"),
+    [
+        ("mask", "depth-1", "a model for masks or flow"), ("mask", "flow-2", "models get flow-2"),
+        ("motion", "depth-1", "models get depth-1"), ("motion", "masks-9", "no model"),
+    ],
+)  # fmt: skip
+def test_mask_and_motion_know_the_option(capsys, table, stream_clip, tmp_path, command, asked, says):
+    out = tmp_path / "out"
+    assert main([command, str(stream_clip), "-o", str(out), "--models", asked]) == REJECTED
+    assert says in capsys.readouterr().err and not out.exists()
+
+
+def test_motion_measures_with_the_model_that_it_was_told(capsys, table, stick, stream_clip, tmp_path):
+    bring(table, stick, "depth-1")
+    job = ["motion", str(stream_clip), "-o", str(tmp_path / "out"), "--kind", "stream", "--duration", "0.3",
+           "--max-size", "96", "--models", "auto", "--json"]  # fmt: skip
+    assert main(job) in (DONE, WITH_WARNINGS)
+    said = capsys.readouterr()
+    assert "models: depth by depth-1" in said.err
+    (model,) = json.loads(said.out)["provenance"]["models"]
+    assert model["name"] == "depth-1" and model["files"].keys() == {"moge.pt"}
+
+
 def test_a_stage_depends_on_what_is_in_the_weights_and_not_on_where_they_are(table, stick, monkeypatch, tmp_path):
     bring(table, stick, "depth-1")
     config = with_models(JobConfig(), CLIP, "depth-1").config

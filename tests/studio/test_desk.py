@@ -3,18 +3,24 @@
 import asyncio
 import json
 import shutil
+from dataclasses import replace
+from inspect import signature
 
 import numpy as np
 import pytest
 
 pytest.importorskip("starlette", reason="starlette is not installed: pip install 'fluidlift[studio]'")
 
+from fluidlift.cli import REJECTED, main
 from fluidlift.errors import InputRejected
 from fluidlift.io.hints_file import read_hints
+from fluidlift.pipeline.models import Chosen, ModelWish
 from fluidlift.studio.app import app_of, open_desk
 from fluidlift.studio.clips import name_for
 from fluidlift.studio.history import HintsHistory
-from fluidlift.studio.looking import LOOK_SECONDS, LOOK_SIZE, Wish, look_config
+from fluidlift.studio.looking import LOOK_FLOW, LOOK_SECONDS, LOOK_SIZE, Wish, look_config
+from fluidlift.studio.making import MakeJob
+from fluidlift.studio.making import main as making
 from fluidlift.studio.shelf import Shelf
 from fluidlift.studio.stage_pictures import StagePictures, flow_picture
 from fluidlift.types.hints import ClipHints, ClipIdentity
@@ -230,6 +236,43 @@ def test_a_newer_wish_overtakes_slow_work_only_where_that_depends_on_it(desk, tm
         assert looking.overtaken(old, between=True)
         assert looking.overtaken(old, between=False) == at_once
     looking._wish = None
+
+
+def test_every_preset_can_be_made_and_no_other(desk, monkeypatch):
+    from fluidlift.config import PRESETS
+
+    asked = []
+    monkeypatch.setattr(desk.making, "start", lambda job: asked.append(job.preset) or True)
+    desk.open("stream.mp4")
+    assert desk.state()["presets"] == list(PRESETS)
+    for preset in desk.state()["presets"]:
+        desk.make(preset)
+    assert asked == ["draft", "standard", "hero", "paper"]
+    with pytest.raises(InputRejected, match="'best'"):
+        desk.make("best")
+
+
+def test_learned_models_of_a_studio_count_in_looks_and_makes(desk, monkeypatch, tmp_path):
+    seen = []
+
+    def taken(config, inputs, asked):
+        seen.append(asked)
+        learned = replace(config.motion, method="sea-raft")
+        return Chosen(replace(config, segment=replace(config.segment, method="sam2"), motion=learned), ("masks by x",))
+
+    monkeypatch.setattr("fluidlift.pipeline.models.with_models", taken)
+    wish = ModelWish("x", "research")
+    look = look_config(ClipHints(), wish)
+    assert (look.segment.method, look.motion.method) == ("sam2", LOOK_FLOW)  # flow of pairs is what a look has time for
+    assert look.generate.use == "research" and seen == ["x"]
+    job = MakeJob(tmp_path / "a.mp4", None, tmp_path / "a.fluid", "draft", tmp_path, wish)
+    assert job.arguments()[-2:] == ["x", "research"] and len(job.arguments()) == len(signature(making).parameters)
+
+
+def test_a_studio_with_a_model_that_is_not_there_is_not_opened(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("FLUIDLIFT_MODELS", str(tmp_path / "cache"))
+    assert main(["studio", str(tmp_path), "--no-browser", "--models", "depth-pro"]) == REJECTED
+    assert "fluidlift models get depth-pro" in capsys.readouterr().err
 
 
 def test_colours_of_the_flow_tell_directions_apart():

@@ -193,8 +193,8 @@ def _config_of(c: Make) -> tuple[Any, Any]:
 def _make_one(c: Make) -> int:
     config, hints = _config_of(c)
     b = c.body
-    if b.models is not None:
-        config = _with_models(config, c)
+    files = {"mask": c.input.mask, "depth": c.input.depth, "geometry": b.geometry_from, "flow": c.input.flow}
+    config = _with_models(config, c.clip, b.models, files)
     if c.settings.print_config:
         import yaml
 
@@ -205,19 +205,22 @@ def _make_one(c: Make) -> int:
 
         config = accepted_by_asking(config)
     code = _run_job(
-        c.clip, c.out or default_folder(c.clip), config, mask=c.input.mask, camera=c.input.camera, depth=c.input.depth,
-        geometry=b.geometry_from, flow=c.input.flow, hints=hints, force=c.settings.force, as_json=c.json,
+        c.clip, c.out or default_folder(c.clip), config, camera=c.input.camera, hints=hints, force=c.settings.force,
+        as_json=c.json, **files,
     )  # fmt: skip
     return DONE if c.warnings_ok and code == WITH_WARNINGS else code
 
 
-def _with_models(config: Any, c: Make) -> Any:
-    """The settings with the models of `--models`, which are told."""
+def _with_models(
+    config: Any, clip: Path, asked: str | None, files: dict[str, Path | None], places: tuple[str, ...] | None = None
+) -> Any:
+    """The settings of a job on these files with the models of `--models`, which are told; as they are without it."""
+    if asked is None:
+        return config
     from fluidlift.pipeline import Inputs
-    from fluidlift.pipeline.models import with_models
+    from fluidlift.pipeline.models import PLACES, with_models
 
-    files = Inputs(c.clip, mask=c.input.mask, depth=c.input.depth, geometry=c.body.geometry_from, flow=c.input.flow)
-    chosen = with_models(config, files, str(c.body.models))
+    chosen = with_models(config, Inputs(clip, **files), asked, places=places or PLACES)
     for line in chosen.told:
         print(f"models: {line}", file=sys.stderr)
     return chosen.config
@@ -414,9 +417,13 @@ def _mask(c: Mask) -> int:
     from fluidlift.pipeline import Hints, Inputs, find_masks
 
     p = c.part
-    flat = {"read.start": p.start, "read.duration": p.duration, "read.fps": p.fps, "read.max_size": c.max_size}
+    flat = {
+        "read.start": p.start, "read.duration": p.duration, "read.fps": p.fps, "read.max_size": c.max_size,
+        "generate.use": c.learned.use,
+    }  # fmt: skip
     _require_sections(c.set, ("read", "segment", "motion"))
     config = build_config(None, None, c.set, flat, base=LONGEST)
+    config = _with_models(config, c.clip, c.learned.models, {}, ("masks", "flow"))
     hints = Hints.of(c.roi, c.click, c.not_here)
     with shown_progress() as progress:
         found = find_masks(
@@ -433,10 +440,13 @@ def _motion(c: Motion) -> int:
     flat = {
         "shape.kind": s.kind, "shape.size": s.size, "shape.fov": s.fov, "shape.pitch": s.pitch, "shape.roll": s.roll,
         "read.start": p.start, "read.duration": p.duration, "read.fps": p.fps, "read.max_size": c.max_size,
+        "generate.use": c.learned.use,
     }  # fmt: skip
     _require_sections(c.set, ("read", "segment", "shape", "depth", "motion"))
     config = build_config(None, c.config, c.set, flat, base=LONGEST)
-    inputs = Inputs(c.clip, mask=c.input.mask, camera=c.input.camera, depth=c.input.depth, flow=c.input.flow)
+    files = {"mask": c.input.mask, "depth": c.input.depth, "flow": c.input.flow}
+    config = _with_models(config, c.clip, c.learned.models, files)
+    inputs = Inputs(c.clip, camera=c.input.camera, **files)
     with shown_progress() as progress:
         found = measure_motion(
             inputs, c.out, config, files=MotionFiles(c.format, c.raw), force=c.force, progress=progress

@@ -75,12 +75,20 @@ class MakeInput(Input):
 
 
 @command
-class Body:
-    """Learned models, or a body that something else made."""
+class Learned:
+    """Learned models, which see some things better."""
 
     models: str | None = None
     """learned models of your cache: none (the default), auto (what is there and helps), or names with commas between
     them (`fluidlift models`)"""
+    use: Literal["research", "commercial"] | None = None
+    """what the result is for; a model or a generator whose terms forbid that is refused"""
+
+
+@command
+class Body(Learned):
+    """Learned models, or a body that something else made."""
+
     depth_model: Literal["none", "moge", "depth-anything", "depth-anything-3", "depth-pro"] | None = None
     """learned depth, moge advised; it needs --depth-weights (docs/depth.md)"""
     depth_weights: Path | None = None
@@ -95,8 +103,6 @@ class Body:
     """folder of the generator's own code, where that is a checkout and not installed"""
     accept_licence: tyro.conf.UseAppendAction[tuple[str, ...]] = field(default_factory=tuple)
     """name of a generator whose licence you have read and accept; remembered; may be repeated"""
-    use: Literal["research", "commercial"] | None = None
-    """what the asset is for; a generator whose terms forbid that is refused"""
 
 
 @command
@@ -320,6 +326,8 @@ class Mask:
     """run this stage (read, flow, segment, masks) and all after it again; may be repeated"""
     json: bool = False
     """print the outcome as JSON"""
+    learned: tyro.conf.OmitArgPrefixes[Learned] = field(default_factory=Learned)
+    """learned models, which see some things better"""
     part: tyro.conf.OmitArgPrefixes[Part] = field(default_factory=Part)
     """which part of the clip"""
 
@@ -346,6 +354,8 @@ class Motion:
     """run this stage (read, flow, segment, geometry, velocities) and all after it again; may be repeated"""
     json: bool = False
     """print the outcome as JSON"""
+    learned: tyro.conf.OmitArgPrefixes[Learned] = field(default_factory=Learned)
+    """learned models, which see some things better"""
     input: tyro.conf.OmitArgPrefixes[Input] = field(default_factory=Input)
     """files beside the clip; what is not given is estimated"""
     scene: tyro.conf.OmitArgPrefixes[Scene] = field(default_factory=Scene)

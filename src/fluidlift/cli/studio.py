@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import field
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
+from fluidlift.cli.options import Learned
 from fluidlift.cli.quantities import command
 
 
@@ -20,11 +22,16 @@ class Studio:
     """of the page; the next free one where it is in use"""
     browser: bool = True
     """the page opens in the default browser; --no-browser leaves that to you"""
+    learned: tyro.conf.OmitArgPrefixes[Learned] = field(default_factory=Learned)
+    """learned models, which see some things better"""
 
 
 def run(wanted: Studio) -> int:
     """Serve the page until Ctrl-C; the exit code."""
+    from fluidlift.pipeline.models import NONE, ModelWish
     from fluidlift.studio.app import StudioRequest, studio
 
-    studio(wanted.place, StudioRequest(wanted.port, wanted.browser), told=lambda line: print(line, flush=True))
+    learned = ModelWish(wanted.learned.models or NONE, wanted.learned.use)
+    request = StudioRequest(wanted.port, wanted.browser, learned)
+    studio(wanted.place, request, told=lambda line: print(line, flush=True))
     return 0

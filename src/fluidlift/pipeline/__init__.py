@@ -6,8 +6,8 @@ Modules of the face:
                 to correct
     hints       What a person says about where the fluid is, on the command line or in a hints file
     make        From a clip to an asset folder
-    models      Learned models by name: which of the user's cache a job takes (`make --models`), and which one a job
-                has used
+    models      Learned models by name: which of the user's cache a job takes (`--models`), and which one a job has
+                used
     preview     Simulation while somebody edits: a coarse copy of the scene, frame by frame, the newest wish first
     refit       The parameters of a finished asset, fitted again: `fluidlift fit`
     render      Pictures of a finished asset from any camera: a film, numbered PNG with transparency, or numbered

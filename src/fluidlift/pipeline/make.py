@@ -16,7 +16,7 @@ from fluidlift.look.smoke_film import smoke_layers
 from fluidlift.pipeline import begin
 from fluidlift.pipeline.fit_request import request_of
 from fluidlift.pipeline.inputs import GivenFile, GivenFiles, Inputs
-from fluidlift.pipeline.models import UsedModel, require_use, used_models
+from fluidlift.pipeline.models import UsedModel, provenance_of, require_use, used_models
 from fluidlift.pipeline.other_times import moved_elsewhere
 from fluidlift.pipeline.resimulate import Made, note_as_shown, play
 from fluidlift.pipeline.runner import Runner, gone_if_refused, require_stages
@@ -99,7 +99,7 @@ def make(
 def _provenance(hints: ClipHints, models: tuple[UsedModel, ...]) -> dict[str, Any]:
     """What a person said, and which learned models looked, for a manifest."""
     said = {} if hints == NOTHING_SAID else {"hints": hints_data(hints)}
-    return said | ({"models": [model.to_dict() for model in models]} if models else {})
+    return said | provenance_of(models)
 
 
 def _lifted(

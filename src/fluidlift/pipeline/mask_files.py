@@ -15,6 +15,7 @@ from fluidlift.pipeline import begin
 from fluidlift.pipeline.hints import NO_HINTS, Hints
 from fluidlift.pipeline.inputs import GivenFiles, Inputs
 from fluidlift.pipeline.mask_facts import cleared_masks, require_unchanged, sealed
+from fluidlift.pipeline.models import provenance_of, require_use, used_models
 from fluidlift.pipeline.runner import Runner, gone_if_refused, require_stages
 from fluidlift.pipeline.work import Work
 from fluidlift.seams import Progress, Silence
@@ -51,8 +52,12 @@ def find_masks(
 
     require_stages(force, MASK_STAGES)
     check_output_folder(folder)
+    models = used_models(config, inputs)
+    warnings = require_use(models, config.generate.use)
     began = time.perf_counter()
     runner = Runner(folder, MASK_STAGES, force=frozenset(force), progress=progress or Silence())
+    for text in warnings:
+        runner.warn(text)
     with gone_if_refused(runner, "segment"):
         read, _, segmentation = begin.look(runner, GivenFiles.of(inputs), config, hints)
         found = runner.run(
@@ -65,7 +70,7 @@ def find_masks(
         )  # fmt: skip
     return Written(
         folder, time.perf_counter() - began, tuple(runner.warnings), runner.timings,
-        _facts(segmentation, folder, found), _words(segmentation, folder, found),
+        _facts(segmentation, folder, found) | provenance_of(models), _words(segmentation, folder, found),
     )  # fmt: skip
 
 

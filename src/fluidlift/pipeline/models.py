@@ -1,4 +1,4 @@
-"""Learned models by name: which of the user's cache a job takes (`make --models`), and which one a job has used.
+"""Learned models by name: which of the user's cache a job takes (`--models`), and which one a job has used.
 
 A job's settings name what it takes (`depth.model`, `depth.weights`), so that the same settings give the same asset on
 every machine that has these models; `auto` is only a way to fill them in.
@@ -40,8 +40,32 @@ TASKS = (
     _Task("depth", "depth", "model", "depth model", ("depth", "geometry")),
     _Task("flow", "motion", "method", "flow method", ("flow",)),
 )
+PLACES = tuple(task.word for task in TASKS)
+"""all that a job with every stage can take"""
 NEEDS_WORDS = ("sam3",)
 """back ends that look for words: which ones, only a person knows, so that `auto` leaves them alone"""
+
+
+@dataclass(frozen=True)
+class ModelWish:
+    """What a person says of learned models, for all clips of a session."""
+
+    models: str = NONE
+    """as `with_models` is asked"""
+    use: str | None = None
+    """what the results are for"""
+
+    def on(self, config: JobConfig, inputs: Inputs) -> Chosen:
+        """`with_models` for a job.
+
+        Raises:
+            InputRejected, MissingPackage: as `with_models`.
+        """
+        use = config.generate.use if self.use is None else self.use
+        return with_models(replace(config, generate=replace(config.generate, use=use)), inputs, self.models)
+
+
+NO_MODELS = ModelWish()
 
 
 @dataclass(frozen=True)
@@ -70,7 +94,7 @@ class UsedModel:
         return {"for": self.task, "method": self.method, "name": self.name, "files": self.files} | known
 
 
-def with_models(config: JobConfig, inputs: Inputs, asked: str) -> Chosen:
+def with_models(config: JobConfig, inputs: Inputs, asked: str, *, places: tuple[str, ...] = PLACES) -> Chosen:
     """The settings of a job with learned models filled in.
 
     Args:
@@ -78,6 +102,7 @@ def with_models(config: JobConfig, inputs: Inputs, asked: str) -> Chosen:
         inputs: its files: what is given is not estimated.
         asked: none; auto: for masks, depth and flow the first model of the table that is in the cache and can run; or
             names with commas between them.
+        places: what the stages of this job can take, of `PLACES`.
 
     Raises:
         InputRejected: a name that is not known or not in the cache, two models for one thing, or one that has nothing
@@ -88,11 +113,15 @@ def with_models(config: JobConfig, inputs: Inputs, asked: str) -> Chosen:
     if names in ([], [NONE]):
         return Chosen(config)
     if names == [AUTO]:
-        return _automatic(config, inputs)
+        return _automatic(config, inputs, places)
     done: dict[str, str] = {}
     for name in names:
         card = model_of(name)
         task = _task_of(card)
+        if task.word not in places:
+            raise InputRejected(
+                f"--models {name}, which is for {task.word}", f"a model for {' or '.join(places)}", "leave it out here"
+            )
         if task.word in done:
             raise InputRejected(f"--models {asked}, two for {task.word}", "one of them", f"leave out {name}")
         _require_free(card, task, config, inputs)
@@ -128,6 +157,11 @@ def used_models(config: JobConfig, inputs: Inputs) -> tuple[UsedModel, ...]:
     return tuple(found)
 
 
+def provenance_of(models: tuple[UsedModel, ...]) -> dict[str, Any]:
+    """For what a job writes about itself; nothing where it took none."""
+    return {"models": [model.to_dict() for model in models]} if models else {}
+
+
 def require_use(models: tuple[UsedModel, ...], use: str | None) -> list[Notice]:
     """Warnings about models whose terms allow research only, where nothing was said about the use.
 
@@ -152,10 +186,10 @@ def require_use(models: tuple[UsedModel, ...], use: str | None) -> list[Notice]:
     ]
 
 
-def _automatic(config: JobConfig, inputs: Inputs) -> Chosen:
+def _automatic(config: JobConfig, inputs: Inputs, places: tuple[str, ...]) -> Chosen:
     told = []
     for task in TASKS:
-        if _occupied(task, config, inputs) is not None:
+        if task.word not in places or _occupied(task, config, inputs) is not None:
             continue
         for card in MODELS:
             if card.back_end[0] != task.purpose or card.back_end[1] in NEEDS_WORDS or kept(card.name) is None:

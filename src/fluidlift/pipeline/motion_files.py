@@ -18,6 +18,7 @@ from fluidlift.motion.steady_flow import pairs_of
 from fluidlift.pipeline import begin
 from fluidlift.pipeline.frame_files import FrameWriter, MotionFiles, WritingPlace
 from fluidlift.pipeline.inputs import GivenFiles, Inputs
+from fluidlift.pipeline.models import provenance_of, require_use, used_models
 from fluidlift.pipeline.runner import Runner, gone_if_refused, require_stages
 from fluidlift.pipeline.settings import MotionSettings
 from fluidlift.pipeline.volume_motion import motion_options, motion_scene, motion_warnings
@@ -61,8 +62,12 @@ def measure_motion(
     files = files or MotionFiles()
     require_stages(force, MOTION_STAGES)
     check_output_folder(folder)
+    models = used_models(config, inputs)
+    warnings = require_use(models, config.generate.use)
     began = time.perf_counter()
     runner = Runner(folder, MOTION_STAGES, force=frozenset(force), progress=progress or Silence())
+    for text in warnings:
+        runner.warn(text)
     with gone_if_refused(runner, "geometry"):
         given = GivenFiles.of(inputs)
         seen = begin.look(runner, given, config)
@@ -72,7 +77,8 @@ def measure_motion(
             beside={"place": WritingPlace(folder, inputs, "velocities" in runner.force)},
             still_there=lambda made: _all_there(folder, files, made), owns_files=True,
         )  # fmt: skip
-        facts = _facts(seen, geometry, found) | {"provenance": given.provenance()} | as_plain(runner.warnings)
+        facts = _facts(seen, geometry, found) | {"provenance": given.provenance() | provenance_of(models)}
+        facts |= as_plain(runner.warnings)
         facts |= {"per_frame": list(found.rows)}
         write_json(folder / "motion.json", facts)
     return Written(

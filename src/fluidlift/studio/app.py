@@ -18,8 +18,11 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from fluidlift.config import JobConfig
 from fluidlift.errors import FluidliftError, InputRejected, MissingPackage
 from fluidlift.io.atomic import new_temporary
+from fluidlift.pipeline import Inputs
+from fluidlift.pipeline.models import NO_MODELS, ModelWish
 from fluidlift.served import PAGE_HEADERS, free_port, knows, same_origin
 from fluidlift.studio.clips import LARGEST, clips_in, name_for
 from fluidlift.studio.desk import Desk
@@ -50,16 +53,22 @@ class StudioRequest:
     """the next free one is taken where it is not"""
     browser: bool = True
     """open the page in the default browser"""
+    learned: ModelWish = NO_MODELS
+    """models that looks and makes take"""
 
 
-def open_desk(place: Path) -> tuple[Desk, str | None]:
+def open_desk(place: Path, learned: ModelWish = NO_MODELS) -> tuple[Desk, str | None]:
     """The desk of a folder, or of the folder of a clip, and the name of that clip.
+
+    Args:
+        place: the folder, or the clip.
+        learned: models that its looks and makes take.
 
     Raises:
         InputRejected: no such folder or clip.
     """
     if place.is_dir():
-        return Desk(place.absolute()), None
+        return Desk(place.absolute(), learned), None
     if not place.is_file():
         raise InputRejected(
             f"no such clip or folder: '{place}'", "a video, or a folder of videos and assets", "check the name"
@@ -69,7 +78,7 @@ def open_desk(place: Path) -> tuple[Desk, str | None]:
         raise InputRejected(
             f"'{place.name}' is no video by its name", "a video file", "for picture sequences: fluidlift hints"
         )
-    return Desk(folder), place.name
+    return Desk(folder, learned), place.name
 
 
 def studio(place: Path, request: StudioRequest | None = None, *, told: Callable[[str], None] = print) -> None:
@@ -81,14 +90,16 @@ def studio(place: Path, request: StudioRequest | None = None, *, told: Callable[
         told: takes lines for a person.
 
     Raises:
-        MissingPackage: starlette or uvicorn is not installed.
-        InputRejected: no such place, or no port is free.
+        MissingPackage: starlette or uvicorn is not installed, or what a model needs.
+        InputRejected: no such place, no port is free, or models that cannot be taken.
     """
     _require_packages()
     import uvicorn
 
     request = request or StudioRequest()
-    desk, name = open_desk(place)
+    for line in request.learned.on(JobConfig(), Inputs(place)).told:
+        told(f"models: {line}")
+    desk, name = open_desk(place, request.learned)
     try:
         port, secret = free_port(HOST, request.port), secrets.token_urlsafe(16)
         address = f"http://{HOST}:{port}/{secret}/"

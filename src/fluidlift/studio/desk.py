@@ -17,18 +17,19 @@ from typing import Any
 import cv2
 import numpy as np
 
+from fluidlift.config import PRESETS
 from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.io.hints_file import hints_beside
+from fluidlift.pipeline.models import NO_MODELS, ModelWish
 from fluidlift.studio.clips import Strip, clip_at, clips_in, jpeg
 from fluidlift.studio.history import HintsHistory
 from fluidlift.studio.looking import Looking, Wish, wished_at
-from fluidlift.studio.making import Making
+from fluidlift.studio.making import MakeJob, Making
 from fluidlift.studio.shelf import SUFFIX, Shelf
 from fluidlift.types import Label
 
 ROOM = ".fluidlift-studio"
 """folder of what is kept between two visits: looks, steps, trash. All of it but the trash can be made again"""
-PRESETS = ("draft", "standard", "hero")
 COLORS = {Label.FLUID: (255, 150, 0, 105), Label.SOLID: (0, 140, 255, 120)}
 """blue, green, red, alpha of the labels' picture"""
 LOADED = "fluidlift.pipeline.find"
@@ -41,10 +42,11 @@ class Desk:
 
     Args:
         folder: of clips and assets.
+        learned: models that looks and makes take.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self.folder, self.room = folder, folder / ROOM
+    def __init__(self, folder: Path, learned: ModelWish = NO_MODELS) -> None:
+        self.folder, self.room, self.learned = folder, folder / ROOM, learned
         self.version = 0
         """changes with what is shown"""
         self.lock = threading.RLock()
@@ -92,6 +94,7 @@ class Desk:
             return {
                 "version": self.version,
                 "folder": str(self.folder),
+                "presets": list(PRESETS),
                 "clips": clips_in(self.folder),
                 "clip": self.info,
                 "error": self.error,
@@ -155,7 +158,8 @@ class Desk:
 
     def _ask(self) -> None:
         assert self.clip is not None and self.history is not None
-        self.looking.ask(wished_at(Wish(self.clip, self.history.hints, self.room / self.clip.name / "look")))
+        room = self.room / self.clip.name / "look"
+        self.looking.ask(wished_at(Wish(self.clip, self.history.hints, room, learned=self.learned)))
 
     def _found(self, wish: Wish, facts: dict[str, Any]) -> None:
         with self.lock:
@@ -251,7 +255,8 @@ class Desk:
                 raise InputRejected("no clip is open", "a clip", "choose one first")
             file = self.history.file if self.history.file.exists() else None
             asset = self.folder / (self.clip.stem + SUFFIX)
-            if not self.making.start(self.clip, file, asset, preset, self.room / "making"):
+            job = MakeJob(self.clip, file, asset, preset, self.room / "making", self.learned)
+            if not self.making.start(job):
                 raise InputRejected("an asset is being made", "one at a time", "wait for it, or stop it")
 
     def _make_changed(self) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 from fluidlift.config import JobConfig
 from fluidlift.errors import FluidliftError
 from fluidlift.pipeline import Inputs
+from fluidlift.pipeline.models import NO_MODELS, ModelWish
 from fluidlift.types.hints import ClipHints
 from fluidlift.types.stages import Read, Segmentation
 
@@ -44,6 +45,8 @@ class Wish:
     """folder of what is kept between looks"""
     asked: float = 0.0
     """time of the clock at which it was wished"""
+    learned: ModelWish = NO_MODELS
+    """models; those for flow are left to the make, for the reason of `LOOK_FLOW`"""
 
     @property
     def slow_part(self) -> tuple[Any, ...]:
@@ -161,7 +164,7 @@ class Looking:
         with self._wake:
             self.look.so_far = {}
         found = find_hints(
-            Inputs(wish.clip), wish.room, look_config(wish.hints), wish.hints,
+            Inputs(wish.clip), wish.room, look_config(wish.hints, wish.learned), wish.hints,
             progress=_LookProgress(self, wish), told=lambda name, value: self.told(wish, name, value),
             memory=self._memory,
         )  # fmt: skip
@@ -207,12 +210,23 @@ def _same(a: Read | None, b: Read) -> bool:
     return np.array_equal(a.clip.times, b.clip.times) and np.array_equal(a.clip.frames[0], b.clip.frames[0])
 
 
-def look_config(hints: ClipHints) -> JobConfig:
-    """Settings of a look: small pictures, flow of pairs, and a few seconds where nothing says which."""
+def look_config(hints: ClipHints, learned: ModelWish = NO_MODELS) -> JobConfig:
+    """Settings of a look: small pictures, flow of pairs, and a few seconds where nothing says which.
+
+    Args:
+        hints: of a person.
+        learned: models, of which those for masks and depth count.
+
+    Raises:
+        InputRejected: models that cannot be taken.
+        MissingPackage: a named one lacks its packages.
+    """
     from fluidlift.config import build_config
 
-    base = {"read.max_size": LOOK_SIZE, "read.duration": LOOK_SECONDS, "motion.method": LOOK_FLOW}
-    return build_config(None, None, (), None, base=base | dict(hints.settings))
+    base = {"read.max_size": LOOK_SIZE, "read.duration": LOOK_SECONDS}
+    config = build_config(None, None, (), None, base=base | dict(hints.settings))
+    taken = learned.on(config, Inputs(Path())).config
+    return replace(taken, motion=replace(config.motion, method=LOOK_FLOW))
 
 
 class _LookProgress:

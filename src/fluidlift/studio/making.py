@@ -1,6 +1,7 @@
 """Make, in a process of its own, so that it can be stopped at any time; stages that are done are kept.
 
-python -m fluidlift.studio.making CLIP HINTS ASSET PRESET PICTURES tells its progress as JSON, one object a line.
+python -m fluidlift.studio.making CLIP HINTS ASSET PRESET PICTURES MODELS USE
+tells its progress as JSON, one object a line.
 """
 
 from __future__ import annotations
@@ -18,9 +19,31 @@ from pathlib import Path
 from typing import Any
 
 from fluidlift.errors import FluidliftError
+from fluidlift.pipeline.models import NO_MODELS, ModelWish
 
 STOP_SECONDS = 20.0
 """that a process may take to end by itself"""
+
+
+@dataclass(frozen=True)
+class MakeJob:
+    """What is made."""
+
+    clip: Path
+    hints: Path | None
+    asset: Path
+    """folder to write"""
+    preset: str
+    pictures: Path
+    """folder for those of the stages"""
+    learned: ModelWish = NO_MODELS
+
+    def arguments(self) -> list[str]:
+        """Of `main`."""
+        return [
+            str(self.clip), str(self.hints or ""), str(self.asset), self.preset, str(self.pictures),
+            self.learned.models, self.learned.use or "",
+        ]  # fmt: skip
 
 
 @dataclass
@@ -58,14 +81,13 @@ class Making:
         self._stopped = False
         self.state = MakeState()
 
-    def start(self, clip: Path, hints: Path | None, asset: Path, preset: str, pictures: Path) -> bool:
-        """Begin, with pictures of the stages in a folder; False where one is running."""
+    def start(self, job: MakeJob) -> bool:
+        """Begin; False where one is running."""
         with self._lock:
             if self.state.running:
                 return False
-            self.state, self._stopped = MakeState(asset.name, running=True, stage="beginning"), False
-            command = [sys.executable, "-m", "fluidlift.studio.making", str(clip), str(hints or ""), str(asset), preset]
-            command.append(str(pictures))
+            self.state, self._stopped = MakeState(job.asset.name, running=True, stage="beginning"), False
+            command = [sys.executable, "-m", "fluidlift.studio.making", *job.arguments()]
             self._process = subprocess.Popen(
                 command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
             )
@@ -153,7 +175,7 @@ class _Lines:
         """What a line in a terminal is for; the page tells it by itself."""
 
 
-def main(clip: str, hints_file: str, asset: str, preset: str, pictures: str) -> int:
+def main(clip: str, hints_file: str, asset: str, preset: str, pictures: str, models: str, use: str) -> int:
     """Make one asset; the exit code."""
     from fluidlift.config import build_config
     from fluidlift.io.asset_folder import read_manifest
@@ -167,6 +189,7 @@ def main(clip: str, hints_file: str, asset: str, preset: str, pictures: str) -> 
         hints = read_hints(hints_file) if hints_file else NOTHING_SAID
         require_same_clip(hints, Path(clip), Path(hints_file).name)
         config = build_config(preset, base=dict(hints.settings))
+        config = ModelWish(models, use or None).on(config, Inputs(Path(clip))).config
         shown = StagePictures(Path(pictures))
         made = make(
             Inputs(Path(clip)), Path(asset), config, hints=hints, progress=_Lines(), value_told=shown.told
@@ -184,7 +207,7 @@ def main(clip: str, hints_file: str, asset: str, preset: str, pictures: str) -> 
 if __name__ == "__main__":
     # who listens may be gone: then there is nobody to tell
     with contextlib.suppress(BrokenPipeError):
-        code = main(*sys.argv[1:6])
+        code = main(*sys.argv[1:8])
         sys.stdout.flush()
         os._exit(code)
     os._exit(1)

@@ -49,6 +49,7 @@ function render() {
     el("option", { value: "", disabled: true, selected: !state.clip }, "choose"),
     ...state.clips.map((name) => el("option", { value: name, selected: state.clip?.name === name }, name)),
   ]);
+  if (!$("preset").length) fill($("preset"), state.presets.map((name) => el("option", {}, name)));
   $("working").textContent = working(state);
   $("empty").hidden = !!state.clip;
   $("undo").disabled = !state.undo;

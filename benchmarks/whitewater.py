@@ -1,10 +1,12 @@
 """White water of an asset: as much as its clip shows, where it does, and what it costs.
 
-    python benchmarks/whitewater.py ASSET [--frames 50]
+    python benchmarks/whitewater.py ASSET [--frames 50] [--potentials]
 
-Simulates the asset twice. As lifted, with white water everywhere (also where the film shows it): the share of the
-fluid's pixels that foam covers, from the clip's camera, against the film's, and the correlation of the two maps. Then
-with its scene.yaml: particles of each kind, and the processor time of the liquid and of its white water.
+Simulates the asset twice. As lifted, with white water everywhere (`whitewater.everywhere`), measured by the first half
+of the film alone: the share of the fluid's pixels that foam covers, from the clip's camera, against that in the other
+half, and the correlation of the two maps. `--potentials` leaves the film's places out: foam is born where the simulated
+flow breaks, and nowhere else. Then with its scene.yaml: particles of each kind, and the processor time of the liquid
+and of its white water.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ import argparse
 import json
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,23 +25,28 @@ from scipy import ndimage
 from fluidlift.config import JobConfig
 from fluidlift.io.asset_folder import load_asset
 from fluidlift.io.scene import SceneEdits
-from fluidlift.physics.whitewater import FOAM, Ground, Whitewater
+from fluidlift.look.whitewater_splats import FilmedFoam
+from fluidlift.physics.whitewater import FOAM, Ground, Whitewater, WhitewaterLaw
 from fluidlift.scene.build import Scene, SimulationRequest, scene_of
 from fluidlift.scene.simulator import simulator_of
-from fluidlift.scene.whitewater import Measured, filmed_foam, measured
+from fluidlift.scene.whitewater import SETTLED, Measured, measured
 
 BLUR = 0.03
 """of the maps before they are compared, shares of the picture's width: that of a patch of foam"""
 
 
-def of_scene(scene: Scene, water: Whitewater, frames: int, camera=None) -> dict:
-    """Particles, processor time, and the mean picture of foam of the second half."""
+def of_scene(scene: Scene, law: Callable[[bool], WhitewaterLaw], frames: int, camera=None) -> dict:
+    """Particles, processor time, and the mean picture of foam of the second half; `law` by whether the flow has
+    settled."""
+    ground = Ground.of(scene.terrain, scene.cell_types)
+    water = Whitewater(ground, law(False), scene.parameters.gravity, scene.parameters.density, scene.seed)
     simulator, liquid, white, cover, kinds = simulator_of(scene), 0.0, 0.0, None, []
     for k in range(frames):
         begin = time.process_time()
         simulator.advance(scene.interval)
         middle = time.process_time()
         particles = simulator.particles
+        water.law = law(k + 1 > round(SETTLED / scene.interval))
         water.advance(particles, scene.interval, simulator.bodies.inside if scene.obstacles else None)
         if k > 1:  # the first ones compile
             liquid, white = liquid + middle - begin, white + time.process_time() - middle
@@ -46,7 +54,7 @@ def of_scene(scene: Scene, water: Whitewater, frames: int, camera=None) -> dict:
         if camera is not None and k >= frames // 2:
             cover = covered(water, camera, scene.terrain.grid.spacing) + (0.0 if cover is None else cover)
     found = {"kinds": kinds[-1], "born_per_second": water.next_id / (frames * scene.interval), "liquid_s": liquid,
-             "white_s": white, "cost": 1 + white / liquid}  # fmt: skip
+             "white_s": white, "cost": 1 + white / liquid, "thinned": water.thinned}  # fmt: skip
     return found if cover is None else found | {"cover": cover / (frames - frames // 2)}
 
 
@@ -70,26 +78,37 @@ def covered(water: Whitewater, camera, cell: float) -> np.ndarray:
     return 1.0 - clear
 
 
-def against_film(scene: Scene, found: Measured, frames: int) -> dict:
-    """As lifted, with white water everywhere, against the film."""
-    foam = filmed_foam(scene)
-    assert foam is not None
+def against_film(scene: Scene, found: Measured, foam: FilmedFoam, frames: int, potentials: bool) -> dict:
+    """As lifted, with white water everywhere, against a film."""
     height, width = foam.places.shape
     camera = scene.camera.resized((width, height))
-    law = replace(found.law(scene, 1.0), known=None)
-    ground = Ground.of(scene.terrain, scene.cell_types)
-    water = Whitewater(ground, law, scene.parameters.gravity, scene.parameters.density, scene.seed)
-    made = of_scene(scene, water, frames, camera)
+
+    def law(settled: bool) -> WhitewaterLaw:
+        own = found.law(scene, 1.0, not potentials, settled=settled)
+        return replace(own, known=None) if potentials else own
+
+    made = of_scene(scene, law, frames, camera)
+    return made | compared(foam, made.pop("cover"))
+
+
+def compared(foam: FilmedFoam, cover: np.ndarray) -> dict:
+    """Shares, and the correlation of the blurred maps, where a film shows fluid most of the time."""
+    fluid = foam.seen > 0.5
+    width = BLUR * cover.shape[1]
+    weight = np.maximum(ndimage.gaussian_filter(fluid.astype(float), width), 1e-6)
+    maps = [ndimage.gaussian_filter(m * fluid, width)[fluid] / weight[fluid] for m in (foam.places, cover)]
+    return {"share_of_film": float(foam.places[fluid].mean()), "share": float(cover[fluid].mean()),
+            "correlation": float(np.corrcoef(*maps)[0, 1])}  # fmt: skip
+
+
+def halves(scene: Scene) -> tuple[FilmedFoam, FilmedFoam]:
+    """The foam of the first half of a scene's film, and of the second."""
     from fluidlift.io.footage_file import read_footage
 
-    fluid = read_footage(scene.film, scene.camera.size)[1].mean(axis=0) > 0.5
-    weight = np.maximum(ndimage.gaussian_filter(fluid.astype(float), BLUR * width), 1e-6)
-    maps = [
-        ndimage.gaussian_filter(m * fluid, BLUR * width)[fluid] / weight[fluid] for m in (foam.places, made["cover"])
-    ]
-    cover = made.pop("cover")
-    return made | {"share_of_film": float(foam.places[fluid].mean()), "share": float(cover[fluid].mean()),
-                   "correlation": float(np.corrcoef(*maps)[0, 1])}  # fmt: skip
+    assert scene.film is not None
+    frames, fluid, _ = read_footage(scene.film, scene.camera.size)
+    middle = len(frames) // 2
+    return FilmedFoam.of(frames[:middle], fluid[:middle]), FilmedFoam.of(frames[middle:], fluid[middle:])
 
 
 def main() -> int:
@@ -97,22 +116,25 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("asset", type=Path)
     parser.add_argument("--frames", type=int, default=50)
+    parser.add_argument("--potentials", action="store_true")
     given = parser.parse_args()
     asset, request, config = load_asset(given.asset), SimulationRequest(), JobConfig()
     lifted = scene_of(asset, given.asset, request, config, footage=None, start=0, edits=SceneEdits())
-    found = measured(lifted)
-    if found is None:
+    first, second = halves(lifted)
+    found = measured(lifted, foam=first)
+    if found is None or not second.share:
         print("the film shows no foam")
         return 0
     told = {"trapped": found.trapped, "crest": found.crest, "energy": found.energy, "rate": found.rate}
-    print(json.dumps(told | {"share": found.share, "color": found.color}, default=float))
-    print(json.dumps({"as lifted": against_film(lifted, found, given.frames)}), flush=True)
+    print(json.dumps(told | {"share": found.share, "color": found.color}, default=vars))
+    print(json.dumps({"halves of the film": compared(second, first.places)}))
+    made = against_film(lifted, found, second, given.frames, given.potentials)
+    print(json.dumps({"as lifted": made}), flush=True)
     scene = scene_of(asset, given.asset, request, config, footage=None, start=0)
     if scene.whitewater > 0:
-        ground = Ground.of(scene.terrain, scene.cell_types)
-        law = found.law(lifted, scene.whitewater)
-        water = Whitewater(ground, law, scene.parameters.gravity, scene.parameters.density, scene.seed)
-        print(json.dumps({"with scene.yaml": of_scene(scene, water, given.frames)}))
+        amount, everywhere = scene.whitewater, scene.whitewater_everywhere
+        made = of_scene(scene, lambda settled: found.law(lifted, amount, everywhere, settled=settled), given.frames)
+        print(json.dumps({"with scene.yaml": made}))
     return 0
 
 

@@ -14,12 +14,13 @@ from bpy.app.handlers import persistent
 from . import build
 from .command import Call, find_command, run
 from .edits import changes, panel_values, read_scene, read_settings
-from .facts import EXPORTED, frames, read_facts, require_asset, up_to_date
+from .facts import EXPORTED, WHITEWATER, frames, read_facts, require_asset, up_to_date
 from .ground import rest_on
 from .light import SUN, light_up
 from .materials import LIQUIDS, liquid_material, turns_in_volumes
 from .meshing import Meshing
 from .waiting import waiting
+from .whitewater import drawn_as_points
 
 bl_info = {
     "name": "fluidlift assets",
@@ -31,7 +32,8 @@ bl_info = {
     "category": "Import-Export",
 }
 
-KEPT = ("fluid surface", "fluid splats", build.TERRAIN, "clip camera", SUN)
+WHITE = "fluid white water"
+KEPT = ("fluid surface", "fluid splats", WHITE, build.TERRAIN, "clip camera", SUN)
 """objects that a refresh leaves, with what a person did to them; the sequences among them get the new frames"""
 MESHING = Meshing()
 """of the surfaces that are not there yet"""
@@ -177,8 +179,10 @@ def export(context: bpy.types.Context, folder: Path, volumes: bool, *, wait: boo
     said, scene, wait = "", context.scene, bpy.app.background if wait is None else wait
     MESHING.stop()
     wanted = [("surface", "mesh", ".ply")] + ([("volume", "vdb", ".vdb")] if volumes else [])
+    white = read_facts(folder).whitewater
     for name, form, suffix in wanted:
-        if not up_to_date(into / name, source, suffix):
+        made = [into / name] + ([into / name / WHITEWATER] if white and name == "surface" else [])
+        if not all(up_to_date(m, source, suffix) for m in made):
             words = [command_of(context), "export", str(folder), "-o", str(into / name), "--to", form]
             later, numbers = name == "surface" and not wait, frames(source)
             one: list[str] = []
@@ -215,17 +219,31 @@ def assemble(context: bpy.types.Context, folder: Path, into: bpy.types.Collectio
         if points is not None and first:
             points.hide_render = True
             points.hide_set(True)  # as dots they would cover the surface in every view
+    facts = read_facts(folder)
+    show_whitewater(into, folder / EXPORTED / "surface" / WHITEWATER, numbers if facts.whitewater else range(0))
     ground = build.terrain_of(into, folder / EXPORTED / "surface" / "terrain.glb")
-    rest_on(surface, ground, read_facts(folder).cell)
+    rest_on(surface, ground, facts.cell)
     build.bodies_of(into, folder / EXPORTED / "surface")
     build.volume_of(into, folder / EXPORTED / "volume")
-    scene, rate = context.scene, 1.0 / read_facts(folder).interval
+    scene, rate = context.scene, 1.0 / facts.interval
     scene.render.fps = max(1, round(rate))
     scene.render.fps_base = scene.render.fps / rate
     scene.frame_start, scene.frame_end = surface["fluidlift_frames"]
     scene.render.use_lock_interface = True  # the sequences change meshes while Blender draws pictures
     scene.frame_set(min(max(scene.frame_current, scene.frame_start), scene.frame_end))
     follow_timeline(scene)
+
+
+def show_whitewater(into: bpy.types.Collection, folder: Path, numbers: range) -> None:
+    """Points of spray, foam and bubbles, with a material each; without numbers, none."""
+    if numbers:
+        drawn_as_points(build.sequence(into, WHITE, "whitewater", folder, numbers))
+    elif WHITE in into.objects:
+        thing = into.objects[WHITE]
+        mesh = thing.data
+        bpy.data.objects.remove(thing, do_unlink=True)
+        if mesh.users == 0:
+            bpy.data.meshes.remove(mesh)
 
 
 class Simulate(Guarded, bpy.types.Operator):

@@ -71,7 +71,7 @@ def fill_surface(mesh: bpy.types.Mesh, file: Path) -> None:
 
 
 def attributes(mesh: bpy.types.Mesh, table: np.ndarray) -> None:
-    """What the vertices carry: velocity, colour, and of splats size, opacity and id."""
+    """What the vertices carry: velocity, colour, of splats size, opacity and id, of white water kind as well."""
     velocity = columns(table, "vx", "vy", "vz")
     if velocity is not None:
         _attribute(mesh, "velocity", "FLOAT_VECTOR").data.foreach_set("vector", velocity.ravel())
@@ -85,16 +85,26 @@ def attributes(mesh: bpy.types.Mesh, table: np.ndarray) -> None:
         linear = np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
         full = np.concatenate([linear, np.ones((len(linear), 1))], axis=1).astype(np.float32)
         _attribute(mesh, COLOR, "FLOAT_COLOR").data.foreach_set("color", full.ravel())
-    scale, opacity = columns(table, "scale_0", "scale_1", "scale_2"), columns(table, "opacity")
-    number = whole_numbers(table, "id")
-    if scale is not None:
-        _attribute(mesh, "radius", "FLOAT").data.foreach_set("value", np.exp(scale).mean(axis=1).astype(np.float32))
+    for name, values in sizes(table).items():
+        _attribute(mesh, name, "FLOAT").data.foreach_set("value", values)
+    for name in ("id", "kind"):
+        number = whole_numbers(table, name)
+        if number is not None:
+            _attribute(mesh, name, "INT").data.foreach_set("value", number)
+
+
+def sizes(table: np.ndarray) -> dict[str, np.ndarray]:
+    """Radius (m) and opacity of points: as white water has them, or of the logarithms and logits of splats."""
+    scale, radius = columns(table, "scale_0", "scale_1", "scale_2"), columns(table, "radius")
+    opacity, found = columns(table, "opacity"), {}
+    if radius is not None:
+        found["radius"] = np.ascontiguousarray(radius[:, 0])
+    elif scale is not None:
+        found["radius"] = np.exp(scale).mean(axis=1).astype(np.float32)
     if opacity is not None:
-        _attribute(mesh, "opacity", "FLOAT").data.foreach_set(
-            "value", (1 / (1 + np.exp(-opacity[:, 0]))).astype(np.float32)
-        )
-    if number is not None:
-        _attribute(mesh, "id", "INT").data.foreach_set("value", number)
+        straight = opacity[:, 0] if radius is not None else 1 / (1 + np.exp(-opacity[:, 0]))
+        found["opacity"] = np.ascontiguousarray(straight, np.float32)
+    return found
 
 
 def _attribute(mesh: bpy.types.Mesh, name: str, kind: str):
@@ -103,8 +113,10 @@ def _attribute(mesh: bpy.types.Mesh, name: str, kind: str):
 
 
 def fill_points(mesh: bpy.types.Mesh, file: Path) -> None:
-    """The splats of one frame as points with attributes."""
+    """The splats or the white water of one frame as points with attributes."""
     table = read_packed(file) if file.suffix == SUFFIX else read_ply(file)[0]
+    if len(table) > MOST_POINTS:
+        raise ValueError(f"{file}: {len(table)} points, at most {MOST_POINTS} are shown")
     mesh.clear_geometry()
     points = columns(table, "x", "y", "z")
     if points is None:
@@ -115,7 +127,9 @@ def fill_points(mesh: bpy.types.Mesh, file: Path) -> None:
     mesh.update()
 
 
-FILLERS = {"surface": fill_surface, "splats": fill_points}
+MOST_POINTS = 5_000_000
+"""of a frame: as many splats as a packed one holds"""
+FILLERS = {"surface": fill_surface, "splats": fill_points, "whitewater": fill_points}
 """how the sequences that follow the timeline are read"""
 
 

@@ -11,6 +11,8 @@ FIRST = 1001
 """number of the first frame"""
 EXPORTED = "blender"
 """folder in the asset: what is written for Blender"""
+WHITEWATER = "whitewater"
+"""folder beside the meshes: points of white water"""
 
 
 class Facts(NamedTuple):
@@ -27,6 +29,8 @@ class Facts(NamedTuple):
     """m, of the simulation's grid"""
     fitted: dict[str, Any]
     """parameters as they were lifted, without any edit"""
+    whitewater: bool = False
+    """whether the frames were simulated with white water"""
 
 
 def require_asset(folder: Path | None) -> Path:
@@ -62,6 +66,7 @@ def read_facts(folder: Path) -> Facts:
             tuple(float(t) for t in look.get("tint", (1.0, 1.0, 1.0))) if styled else (1.0, 1.0, 1.0),
             float((played.get("grid") or manifest["grid"])["spacing"]),
             dict(fitted["values"]),
+            "white water" in dict(played.get("parts") or {}),
         )
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise RuntimeError(f"{folder.name} does not say what an asset says ({error}): is it damaged?") from None

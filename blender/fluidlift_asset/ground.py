@@ -39,7 +39,7 @@ def rest_on(surface: bpy.types.Object, ground: bpy.types.Object | None, cell: fl
 def _tree(ground: bpy.types.Object, cell: float) -> bpy.types.NodeTree:
     """Points whose normal is against that of the ground beside them, moved to beneath it."""
     tree = bpy.data.node_groups.new(MODIFIER, "GeometryNodeTree")
-    _geometry_sockets(tree)
+    geometry_sockets(tree)
     nodes, links = tree.nodes, tree.links
     kinds = {"in": "NodeGroupInput", "out": "NodeGroupOutput", "ground": "GeometryNodeObjectInfo",
              "nearest": "GeometryNodeProximity", "above": "GeometryNodeSampleNearestSurface",
@@ -55,18 +55,21 @@ def _tree(ground: bpy.types.Object, cell: float) -> bpy.types.NodeTree:
     links.new(made["normal"].outputs[0], _enabled(made["above"].inputs, "Value"))
     up = _enabled(made["above"].outputs, "Value")
 
-    facing, downward = _math(tree, "ShaderNodeVectorMath", "DOT_PRODUCT"), _math(tree, "ShaderNodeMath", "LESS_THAN")
+    facing, downward = (
+        operation(tree, "ShaderNodeVectorMath", "DOT_PRODUCT"),
+        operation(tree, "ShaderNodeMath", "LESS_THAN"),
+    )
     links.new(made["normal"].outputs[0], facing.inputs[0])
     links.new(up, facing.inputs[1])
     links.new(facing.outputs["Value"], downward.inputs[0])
     downward.inputs[1].default_value = DOWN
-    close, both = _math(tree, "ShaderNodeMath", "LESS_THAN"), _math(tree, "ShaderNodeMath", "MULTIPLY")
+    close, both = operation(tree, "ShaderNodeMath", "LESS_THAN"), operation(tree, "ShaderNodeMath", "MULTIPLY")
     links.new(made["nearest"].outputs["Distance"], close.inputs[0])
     close.inputs[1].default_value = NEAR * cell
     links.new(downward.outputs[0], both.inputs[0])
     links.new(close.outputs[0], both.inputs[1])
 
-    below, place = _math(tree, "ShaderNodeVectorMath", "SCALE"), _math(tree, "ShaderNodeVectorMath", "ADD")
+    below, place = operation(tree, "ShaderNodeVectorMath", "SCALE"), operation(tree, "ShaderNodeVectorMath", "ADD")
     links.new(up, below.inputs[0])
     below.inputs["Scale"].default_value = -SUNK * cell
     links.new(made["nearest"].outputs["Position"], place.inputs[0])
@@ -78,7 +81,7 @@ def _tree(ground: bpy.types.Object, cell: float) -> bpy.types.NodeTree:
     return tree
 
 
-def _geometry_sockets(tree: bpy.types.NodeTree) -> None:
+def geometry_sockets(tree: bpy.types.NodeTree) -> None:
     """One geometry in, one out; Blender 4 has another way to say so."""
     if hasattr(tree, "interface"):
         for way in ("INPUT", "OUTPUT"):
@@ -88,9 +91,10 @@ def _geometry_sockets(tree: bpy.types.NodeTree) -> None:
         tree.outputs.new("NodeSocketGeometry", "Geometry")
 
 
-def _math(tree: bpy.types.NodeTree, kind: str, operation: str) -> bpy.types.Node:
+def operation(tree: bpy.types.NodeTree, kind: str, name: str) -> bpy.types.Node:
+    """A node that can do several things, set to one of them."""
     node = tree.nodes.new(kind)
-    node.operation = operation
+    node.operation = name
     return node
 
 

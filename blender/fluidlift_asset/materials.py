@@ -105,6 +105,45 @@ def body_material() -> bpy.types.Material:
     return material
 
 
+class Foam(NamedTuple):
+    """A kind of white water."""
+
+    roughness: float
+    refractive_index: float
+
+
+WHITEWATER = {"spray": Foam(0.1, 1.333), "foam": Foam(0.8, 1.1), "bubbles": Foam(0.3, 1.333)}
+"""by their numbers: spray is drops, which glitter; foam is walls of water around air, matte and next to without gloss;
+bubbles are faint by their opacity"""
+
+
+def whitewater_material(kind: str) -> bpy.types.Material:
+    """Of a kind of white water, as a person left it or new: the points' own colour, as opaque as they are."""
+    title = f"fluidlift {kind}"
+    material = bpy.data.materials.get(title)
+    if material is not None:
+        return material
+    material = bpy.data.materials.new(title)
+    if material.node_tree is None:
+        material.use_nodes = True
+    material.diffuse_color = (0.85, 0.87, 0.9, 1.0)
+    if hasattr(material, "blend_method"):  # EEVEE's of older versions takes points for solid otherwise
+        material.blend_method = "HASHED"
+    nodes, links = material.node_tree.nodes, material.node_tree.links
+    nodes.clear()
+    output, shader = nodes.new("ShaderNodeOutputMaterial"), nodes.new("ShaderNodeBsdfPrincipled")
+    output.location = (320, 0)
+    links.new(shader.outputs[0], output.inputs["Surface"])
+    _set(shader, ("IOR",), WHITEWATER[kind].refractive_index)
+    _set(shader, ("Roughness",), WHITEWATER[kind].roughness)
+    _colors_of_vertices(material, shader, (1.0, 1.0, 1.0))
+    opacity = nodes.new("ShaderNodeAttribute")
+    opacity.location = (-220, -200)
+    opacity.attribute_name = "opacity"
+    links.new(opacity.outputs["Fac"], shader.inputs["Alpha"])
+    return material
+
+
 def _set(shader: bpy.types.ShaderNode, names: tuple, value) -> None:
     """The first input of these names that this version of Blender has."""
     for name in names:

@@ -166,6 +166,42 @@ def painted_body() -> list:
     return found
 
 
+def white_water() -> dict:
+    """What becomes of three frames of white water: none, one particle of each kind, and none asked for any more."""
+    folder, kinds = Path(asset).with_name("white") / "whitewater", [0, 1, 2]
+    folder.mkdir(parents=True)
+    fields = [f"property float {a}" for a in ("x", "y", "z", "vx", "vy", "vz", "radius", "opacity")]
+    fields += [f"property uchar {c}" for c in ("red", "green", "blue")] + [f"property int {a}" for a in ("kind", "id")]
+    for number, own in ((1001, []), (1002, kinds)):
+        header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(own)}", *fields, "end_header\n"]
+        rows = (struct.pack("<8f3B2i", k, 0, 1, 0, k, 0, 0.25, 0.5, 255, 255, 255, k, 2**29 + k) for k in own)
+        (folder / f"{number}.ply").write_bytes("\n".join(header).encode() + b"".join(rows))
+    into = fluidlift_asset.build.collection(tuple(o.name for o in fluidlift_asset.build.objects()))
+    fluidlift_asset.show_whitewater(into, folder, range(1001, 1003))
+    thing = bpy.data.objects[fluidlift_asset.WHITE]
+    found = {"materials": [m.name for m in thing.data.materials], "points": []}
+    for number in (1001, 1002):
+        fluidlift_asset.build.show_frame(thing, number)
+        found["points"].append(len(thing.data.vertices))
+    values = {n: a.data for n, a in thing.data.attributes.items()}
+    found["told"] = {n: [v.value for v in values[n]] for n in ("kind", "id", "radius", "opacity")}
+    found["velocity"] = [list(v.vector) for v in values["velocity"]]
+    bpy.context.view_layer.update()
+    found["drawn"] = []
+    for one in bpy.context.evaluated_depsgraph_get().object_instances:  # an instance is there for its own turn only
+        if one.object.type == "POINTCLOUD":
+            cloud = one.object.data
+            places, radii = [list(p.co) for p in cloud.points], [p.radius for p in cloud.points]
+            found["drawn"].append([cloud.materials[0].name, places, radii, "velocity" in cloud.attributes])
+    mine = thing.data.materials[1]
+    mine.diffuse_color = (1.0, 0.0, 0.0, 1.0)
+    fluidlift_asset.show_whitewater(into, folder, range(1001, 1003))  # a refresh: nothing is added or put back
+    found["kept"] = [len(thing.modifiers), len(thing.data.materials), list(mine.diffuse_color)]
+    fluidlift_asset.show_whitewater(into, folder, range(0))
+    found["gone"] = fluidlift_asset.WHITE not in bpy.data.objects
+    return found
+
+
 def waited() -> dict:
     """What stands in the status bar and beside the pointer while a command is at work."""
     bar, pointer = [], []
@@ -204,6 +240,7 @@ out["panel"] = panel()
 out["waited"] = waited()
 out["contact"] = contact()
 out["painted"] = painted_body()
+out["white"] = white_water()
 out["blur"] = blurred_by_velocity()
 out["colors"] = shows_its_colors()
 

@@ -72,6 +72,20 @@ def test_all_parts_arrive(seen):
     assert {"fluid surface", "fluid splats", "clip camera", "terrain"} <= set(seen[0]["objects"])
 
 
+def test_white_water_has_points_of_its_own_with_a_material_per_kind(seen):
+    found = seen[0]["white"]
+    assert found["materials"] == ["fluidlift spray", "fluidlift foam", "fluidlift bubbles"]
+    assert found["points"] == [0, 3]
+    assert found["told"]["kind"] == [0, 1, 2] and found["told"]["id"] == [2**29, 2**29 + 1, 2**29 + 2]
+    assert found["told"]["radius"] == [0.25] * 3 and found["told"]["opacity"] == [0.5] * 3
+    assert found["velocity"] == [[0.0, float(k), 0.0] for k in range(3)]
+    drawn = {name: (places, radii, moves) for name, places, radii, moves in found["drawn"]}
+    for k, name in enumerate(found["materials"]):
+        assert drawn[name] == ([[float(k), 0.0, 1.0]], [0.375], True)  # 1.5 times the splat's own
+    # a refresh changes nothing of it; without white water it goes
+    assert found["kept"] == [1, 3, [1.0, 0.0, 0.0, 1.0]] and found["gone"]
+
+
 def test_frames_and_rate_are_those_of_the_asset(seen, made):
     found, asset = seen[0], load_asset(made.folder)
     assert found["range"] == [1001, 1000 + FRAMES]

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from fluidlift.export.splats import kind_column
+from fluidlift.export.whitewater import with_kinds
+from fluidlift.io.frames import FluidFrame
 from fluidlift.io.ply import read_splats, write_gaussians
 from fluidlift.look.surface_skin import of_skin, without_skin
 from fluidlift.look.whitewater_splats import WHITE, FilmedFoam, kinds_of, whitewater_splats
@@ -18,18 +20,23 @@ def splats(n=60, cell=CELL):
     return whitewater_splats(rng.normal(size=(n, 3)), kinds, rng.uniform(0, 2, n), (0.9, 0.92, 0.95), cell), kinds
 
 
+def told(gaussians):
+    """A frame of them, at rest."""
+    return FluidFrame(gaussians, np.arange(len(gaussians)), np.zeros((len(gaussians), 3), np.float32))
+
+
 def test_kinds_are_told_by_size_also_from_a_file(tmp_path):
     white, kinds = splats()
     body = Gaussians.isotropic(np.random.default_rng(1).normal(size=(50, 3)), 0.16 * CELL, np.full((50, 3), 0.4), 0.9)
     both = concatenate([body, white])
-    write_gaussians(tmp_path / "frame.ply", both, extras=kind_column(kinds_of(both, CELL)))
+    write_gaussians(tmp_path / "frame.ply", both, extras=kind_column(with_kinds(told(both), CELL)))
     read = read_splats(tmp_path / "frame.ply")
     wanted = np.concatenate([np.full(50, -1), kinds])
     np.testing.assert_array_equal(kinds_of(read.gaussians, CELL), wanted)
     np.testing.assert_array_equal(read.extras["kind"], wanted)
     np.testing.assert_array_equal(of_skin(read.gaussians, CELL), wanted >= 0)
     assert len(without_skin(both, CELL)) == 50 and (kinds_of(both, 1.1 * CELL) < 0).all()
-    assert kind_column(kinds_of(body, CELL)) == {} and len(kinds_of(Gaussians.empty(), CELL)) == 0
+    assert kind_column(told(body)) == {} and len(kinds_of(Gaussians.empty(), CELL)) == 0
 
 
 def test_foam_is_denser_than_bubbles_and_fades_before_its_end():

@@ -16,6 +16,7 @@ from fluidlift.physics.whitewater import (
     Ground,
     LiquidState,
     Range,
+    SeenBirths,
     Whitewater,
     WhitewaterLaw,
     fallen,
@@ -178,6 +179,31 @@ def test_a_state_goes_on_bit_for_bit_and_one_that_does_not_fit_is_refused(dam):
         second.restore({k: v for k, v in kept.items() if k != "lives"})
     with pytest.raises(InputRejected, match="another shape"):
         second.restore(kept | {"lives": np.full(len(water), np.nan)})
+
+
+@pytest.mark.parametrize(("speed", "share"), [(1.0, 1.0), (2.0, 1.0), (0.5, 0.25), (0.0, 0.0)])
+def test_as_many_are_born_in_a_column_as_are_asked_for_and_fewer_in_slower_water(flat, speed, share):
+    water, shape = block(flat, (speed, 0.0, 0.0)), flat.terrain.grid.shape[:2]
+    rate, full = np.zeros(shape), np.full(shape, 0.5)  # m^2/s^2 of 1 m/s
+    rate[8:16, 6:10] = 50.0
+    law = replace(LAW, trapped_rate=0.0, crest_rate=0.0, seen=SeenBirths(flat.terrain.grid, rate, full))
+    white = Whitewater(flat, law, G, 1000.0)
+    state = LiquidState.of(water, flat, 1000.0)
+    white._bear(state, water, 1.0)
+    # 1600 a second, within four standard deviations and what the particles' lattice leaves uneven
+    assert white.next_id == pytest.approx(1600 * share, abs=240)
+    if share:
+        depth = 0.5 - white.positions[:, 2]
+        assert np.median(depth) < 1.1 * H  # at the surface
+
+
+def test_a_state_of_more_than_the_law_allows_is_refused(flat):
+    white = Whitewater(flat, replace(LAW, most=10), G, 1000.0)
+    other = Whitewater(flat, LAW, G, 1000.0, positions=np.zeros((11, 3)), velocities=np.zeros((11, 3)),
+                       lives=np.ones(11), kinds=np.zeros(11, np.uint8), ids=np.arange(11))  # fmt: skip
+    with pytest.raises(InputRejected, match="11 particles"):
+        white.restore(other.state())
+    assert len(white) == 0
 
 
 def one_of(ground, place, velocity=(0.0, 0.0, 0.0), law=LAW):

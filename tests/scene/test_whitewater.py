@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import ndimage
 from small_asset import small_asset
 from small_scene import H, striped_channel
 
@@ -83,6 +84,25 @@ def test_the_scene_as_lifted_makes_next_to_none_since_its_film_shows_it(foaming,
     plain, changed = replace(foaming, whitewater=1.0, as_lifted=foaming), edited(foaming)
     few, many = (played(s, SceneWhitewater(s, found))[2] for s in (plain, changed))
     assert (kinds_of(few.gaussians, H) >= 0).sum() < 0.1 * (kinds_of(many.gaussians, H) >= 0).sum()
+
+
+def test_everywhere_there_is_white_water_where_the_film_shows_foam(foaming, found):
+    assert found.filmed.sum() > 100 and (found.filmed >= 0).all()
+    plain = replace(foaming, whitewater=1.0, as_lifted=foaming)
+    white = SceneWhitewater(replace(plain, whitewater_everywhere=True), found)
+    _, _, shown = played(replace(plain, whitewater_everywhere=True), white)
+    born = white.particles
+    assert born is not None and born.next_id == pytest.approx(
+        found.filmed.sum() * (FRAMES - 1) * foaming.interval, rel=0.25
+    )
+    kinds = kinds_of(shown.gaussians, H)
+    column = foaming.terrain.grid.cell_of(shown.gaussians.means[kinds == 1])
+    beside = ndimage.maximum_filter(found.filmed, 3)[column[:, 0], column[:, 1]]
+    assert (kinds == 1).sum() > 10 and (beside > 0).mean() > 0.9
+    # the jerk with which a body begins is known, and makes none
+    alone = SceneWhitewater(plain, found)
+    played(plain, alone)
+    assert alone.particles is not None and alone.particles.next_id < 0.05 * born.next_id
 
 
 def test_a_film_without_foam_asks_for_none(channel, tmp_path):
@@ -175,8 +195,10 @@ def test_smoke_and_honey_refuse_it(channel, kind, viscosity):
 
 def test_the_dial_is_read_and_checked(tmp_path):
     assert edits_of("whitewater:\n  amount: 0.5\n", tmp_path).whitewater == 0.5
+    assert not edits_of("whitewater: {amount: 1}\n", tmp_path).whitewater_everywhere
+    assert edits_of("whitewater: {amount: 1, everywhere: true}\n", tmp_path).whitewater_everywhere
     assert edits_of("whitewater:\n", tmp_path).whitewater == 0.0
-    for wrong in ("amount: -1", "amount: 1e9", "amount: much", "ammount: 1"):
+    for wrong in ("everywhere: 3", "amount: -1", "amount: 1e9", "amount: much", "ammount: 1"):
         with pytest.raises(InputRejected, match="line 2"):
             edits_of(f"whitewater:\n  {wrong}\n", tmp_path)
 

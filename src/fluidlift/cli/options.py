@@ -259,7 +259,8 @@ class Export:
     to: str = "mesh"
     """mesh (surface, PLY with colours and velocities), obj, splats (PLY), spz (small splats), gltf (one frame, GLB),
     html (a page that plays offline), vdb (velocity, density, level set), usd (one file with surface, splats, terrain
-    and camera), usd-clips (a file per frame), camera (JSON), flow (EXR), flo, masks (PNG)"""
+    and camera), usd-clips (a file per frame), camera (JSON), flow (EXR), flo, masks (PNG). White water is in each of
+    them that shows the fluid"""
     up_axis: Literal["z", "y"] = "z"
     """of mesh, obj, splats and usd; the others have their own"""
     meters_per_unit: float = 1.0

@@ -24,6 +24,7 @@ from fluidlift.export.mesh import write_meshes
 from fluidlift.export.splats import write_splats, write_spz_frames
 from fluidlift.export.usd import write_usd_files
 from fluidlift.export.volumes import write_volumes
+from fluidlift.export.whitewater import has_whitewater, with_kinds
 from fluidlift.io.frames import FIRST_FRAME, FluidFrame
 from fluidlift.io.output_files import Written
 from fluidlift.messages import Notice
@@ -90,7 +91,7 @@ def _job(
     numbers = frame_numbers(folder, int(played.get("frames", 0)), request.frames)
     step = every(request.fps, interval)
     asset = as_simulated(folder, asset, manifest)
-    return ExportJob(folder, out, asset, request, numbers[::step], step * interval, progress)
+    return ExportJob(folder, out, asset, request, numbers[::step], step * interval, progress, has_whitewater(manifest))
 
 
 def _missing(job: ExportJob, manifest: dict[str, Any]) -> tuple[Notice, ...]:
@@ -142,8 +143,10 @@ def _frames(job: ExportJob) -> Iterator[FluidFrame]:
         mesher = SplashsurfMesher()
     for done, (gaussians, ids, velocities) in enumerate(frames_of(job.folder, job.picked)):
         job.progress.update(done, len(job.picked))
-        if mesher is None:
-            yield FluidFrame(gaussians, ids, velocities)
-            continue
-        mesh, moving = surface_of(gaussians, velocities, asset.terrain, mesher)
-        yield FluidFrame(gaussians, ids, velocities, mesh, moving)
+        frame = FluidFrame(gaussians, ids, velocities)
+        if job.whitewater:
+            frame = with_kinds(frame, asset.grid.spacing)
+        if mesher is not None:
+            mesh, moving = surface_of(gaussians, velocities, asset.terrain, mesher)
+            frame = frame._replace(surface=mesh, surface_velocities=moving)
+        yield frame

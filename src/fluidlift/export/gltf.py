@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from fluidlift.export.job import ExportJob, Outcome
+from fluidlift.export.whitewater import whitewater_of
 from fluidlift.io.frames import FIRST_FRAME
 
 if TYPE_CHECKING:
@@ -21,7 +22,8 @@ def hero_of(picked: range) -> int:
 
 
 def write_hero(job: ExportJob, surfaced: Callable[[range], FluidFrame]) -> Outcome:
-    """One frame as hero.glb (splats, terrain, camera) and surface.glb (the surface as a mesh instead of the splats).
+    """One frame as hero.glb (splats, terrain, camera) and surface.glb (the surface as a mesh instead of the splats, and
+    white water as points).
 
     Args:
         job: whose middle frame is taken.
@@ -35,7 +37,8 @@ def write_hero(job: ExportJob, surfaced: Callable[[range], FluidFrame]) -> Outco
     write_gltf(job.out / HERO, gaussians=frame.gaussians, meshes=ground, camera=job.asset.camera)
     written = HERO
     if frame.surface is not None and len(frame.surface.faces):
-        write_gltf(job.out / SURFACE, meshes=ground | {"surface": frame.surface}, camera=job.asset.camera)
+        write_gltf(job.out / SURFACE, meshes=ground | {"surface": frame.surface}, camera=job.asset.camera,
+                   whitewater=whitewater_of(frame))  # fmt: skip
         written += f" (splats) and {SURFACE} (mesh)"
     told = f"glTF holds one instant: frame {FIRST_FRAME + k} as {written}; another with --frames"
     return Outcome((told,), (), {"frames": 1, "first": FIRST_FRAME + k})

@@ -61,6 +61,8 @@ class ExportJob:
     interval: float
     """s between those"""
     progress: Progress
+    whitewater: bool = False
+    """whether the frames were simulated with white water"""
 
     @property
     def numbers(self) -> range:

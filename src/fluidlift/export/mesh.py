@@ -11,6 +11,7 @@ from fluidlift.export.job import (
     Outcome,
     write_terrain,
 )
+from fluidlift.export.whitewater import WhitewaterFiles
 from fluidlift.io.frames import FluidFrame
 from fluidlift.io.output_files import cleared, numbered
 from fluidlift.types import TriangleMesh
@@ -20,11 +21,13 @@ if TYPE_CHECKING:
 
 
 def write_meshes(job: ExportJob, frames: Iterator[FluidFrame]) -> Outcome:
-    """Numbered files of the surface and the terrain, in the axes and units that are asked for; with PLY the bodies."""
+    """Numbered files of the surface, of white water and the terrain, in the axes and units that are asked for; with PLY
+    the bodies."""
     from fluidlift.io.export_mesh import write_mesh, write_obj
 
     to, place = job.request.to, job.place
     cleared(job.out, [suffix := ".obj" if to == "obj" else ".ply"])
+    white = WhitewaterFiles(job.out, place, job.unit)
     for k, frame in zip(job.numbers, frames, strict=True):
         path = numbered(job.out, k, suffix)
         assert frame.surface is not None and frame.surface_velocities is not None  # frames of meshed formats have both
@@ -33,5 +36,6 @@ def write_meshes(job: ExportJob, frames: Iterator[FluidFrame]) -> Outcome:
             write_obj(path, mesh, comment=job.unit)
         else:
             write_mesh(path, mesh, velocities=place.vectors(frame.surface_velocities), comment=job.unit)
+        white.write(k, frame)
     write_terrain(job)
     return Outcome(warnings=write_bodies(job) if to == "mesh" else ())

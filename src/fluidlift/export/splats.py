@@ -9,7 +9,6 @@ import numpy as np
 
 from fluidlift.export.job import ExportJob, Outcome, write_terrain
 from fluidlift.io.output_files import cleared, numbered
-from fluidlift.look.whitewater_splats import kinds_of
 from fluidlift.scene.splat_files import frames_of
 from fluidlift.types import Similarity3
 
@@ -30,9 +29,9 @@ def write_spz_frames(job: ExportJob) -> Outcome:
     return Outcome((f"{each:.2f} MB per frame; the format has no place for ids and velocities",), (), {"bytes": size})
 
 
-def kind_column(kinds: np.ndarray) -> dict[str, np.ndarray]:
-    """The property `kind` of frames with white water: 0 spray, 1 foam, 2 bubbles, -1 all else; none in others."""
-    return {"kind": kinds.astype(np.int32)} if (kinds >= 0).any() else {}
+def kind_column(frame: FluidFrame) -> dict[str, np.ndarray]:
+    """The property `kind` of a fluid with white water, in every frame: 0 spray, 1 foam, 2 bubbles, -1 all else."""
+    return {} if frame.kinds is None else {"kind": np.asarray(frame.kinds, np.int32)}
 
 
 def write_splats(job: ExportJob, frames: Iterator[FluidFrame]) -> Outcome:
@@ -43,10 +42,9 @@ def write_splats(job: ExportJob, frames: Iterator[FluidFrame]) -> Outcome:
     scale, axes = Similarity3(job.place.scale), f"{job.request.up_axis}_up"
     for k, frame in zip(job.numbers, frames, strict=True):
         velocities = frame.velocities * np.float32(scale.scale)
-        kinds = kinds_of(frame.gaussians, job.asset.grid.spacing)
         write_gaussians(
             numbered(job.out, k, ".ply"), frame.gaussians.transformed(scale), ids=frame.ids, velocities=velocities,
-            axes=axes, comments=[job.unit], extras=kind_column(kinds),
+            axes=axes, comments=[job.unit], extras=kind_column(frame),
         )  # fmt: skip
     write_terrain(job)
     return Outcome()

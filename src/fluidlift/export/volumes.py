@@ -1,4 +1,4 @@
-"""OpenVDB files of frames: velocity, density and, of liquids, the level set."""
+"""OpenVDB files of frames: velocity, density and, of liquids, the level set and white water."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from fluidlift.export.job import (
     ExportJob,
     Outcome,
 )
+from fluidlift.export.whitewater import whitewater_grids
 from fluidlift.io.frames import FluidFrame
 from fluidlift.io.output_files import cleared, numbered
 from fluidlift.types import FaceVelocity, Grid, TriangleMesh
@@ -28,7 +29,8 @@ FULL = 50.0
 
 
 def write_volumes(job: ExportJob, frames: Iterator[FluidFrame]) -> Outcome:
-    """Numbered OpenVDB files: `vel` (m/s) and `density` on cells of the simulation, `surface` (m) on half of them."""
+    """Numbered OpenVDB files: `vel` (m/s) and `density` on cells of the simulation, `surface` (m) on half of them, and
+    `spray`, `foam` and `bubbles` (1/m) on whole ones."""
     from fluidlift.io.volume_grid import VolumeGrid, velocity_grid, write_vdb
 
     cleared(job.out, [".vdb"])
@@ -39,6 +41,7 @@ def write_volumes(job: ExportJob, frames: Iterator[FluidFrame]) -> Outcome:
         grids = [velocity_grid(velocity, grid, active=filled), VolumeGrid("density", density, h, grid.origin, filled)]
         if frame.surface is not None and len(frame.surface.faces):
             grids.append(level_set(frame.surface, 0.5 * h))
+        grids += whitewater_grids(frame, job.asset.grid)
         write_vdb(numbered(job.out, k, ".vdb"), grids)
     return Outcome()
 

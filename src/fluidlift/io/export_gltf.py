@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from fluidlift.errors import require
+from fluidlift.io.frames import FluidFrame
 from fluidlift.io.glb import INDICES, Glb
 from fluidlift.io.ply import AXES
 from fluidlift.numerics.mesh_normals import vertex_normals
@@ -32,6 +33,7 @@ def write_gltf(
     gaussians: Gaussians | None = None,
     meshes: dict[str, TriangleMesh] | None = None,
     camera: PinholeCamera | None = None,
+    whitewater: FluidFrame | None = None,
 ) -> Path:
     """Write a .glb with what is given.
 
@@ -39,6 +41,7 @@ def write_gltf(
         gaussians: world, m; become the node "fluid".
         meshes: by name, world, m; those without faces are left out, because glTF allows none.
         camera: becomes the node "camera". glTF has no place for a principal point off the middle: `extras` keeps K.
+        whitewater: with kinds, and nothing else in it; becomes the node "white water", points without size.
 
     Raises:
         ValueError: nothing to write.
@@ -51,6 +54,8 @@ def write_gltf(
         glb.add("nodes", {"name": "fluid", "mesh": _splats(glb, gaussians)})
     for name, mesh in shown.items():
         glb.add("nodes", {"name": name, "mesh": _mesh(glb, mesh, name)})
+    if whitewater is not None and len(whitewater.gaussians):
+        glb.add("nodes", {"name": "white water", "mesh": _whitewater(glb, whitewater)})
     if camera is not None:
         glb.add("nodes", _camera(glb, camera))
     return glb.write(path)
@@ -60,8 +65,7 @@ def _splats(glb: Glb, gaussians: Gaussians) -> int:
     g = gaussians.transformed(Similarity3(rotation=_GLTF_FROM_WORLD))
     n = len(g)
     quats = g.quats / np.maximum(np.linalg.norm(g.quats, axis=1, keepdims=True), 1e-12)
-    rgb = np.round(255 * linear_from_srgb(g.rgb.astype(np.float64)))
-    fallback = np.concatenate([rgb, np.round(255 * np.clip(g.opacities, 0, 1))[:, None]], axis=1).astype(np.uint8)
+    fallback = _colors(g)
     attributes = {
         "POSITION": glb.array(g.means, bounds=True),
         "COLOR_0": glb.array(fallback, normalized=True),
@@ -77,6 +81,30 @@ def _splats(glb: Glb, gaussians: Gaussians) -> int:
             "sortingMethod": "cameraDistance"}  # fmt: skip
     return glb.add("meshes", {
         "name": "splats", "primitives": [{"attributes": attributes, "mode": 0, "extensions": {SPLATS: said}}],
+    })  # fmt: skip
+
+
+def _colors(g: Gaussians) -> np.ndarray:
+    """u8 [n,4], linear light and opacity."""
+    rgb = np.round(255 * linear_from_srgb(g.rgb.astype(np.float64)))
+    return np.concatenate([rgb, np.round(255 * np.clip(g.opacities, 0, 1))[:, None]], axis=1).astype(np.uint8)
+
+
+def _whitewater(glb: Glb, white: FluidFrame) -> int:
+    """Points. What glTF has no name for stands in attributes of the application, which begin with an underscore."""
+    assert white.kinds is not None
+    turned = [(a.astype(np.float64) @ _GLTF_FROM_WORLD.T).astype(np.float32)
+              for a in (white.gaussians.means, np.asarray(white.velocities))]  # fmt: skip
+    attributes = {
+        "POSITION": glb.array(turned[0], bounds=True),
+        "COLOR_0": glb.array(_colors(white.gaussians), normalized=True),
+        "_VELOCITY": glb.array(turned[1]),
+        "_KIND": glb.array(white.kinds.astype(np.float32)),
+    }
+    look = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+    material = glb.add("materials", {"name": "white water", "pbrMetallicRoughness": look, "alphaMode": "BLEND"})
+    return glb.add("meshes", {
+        "name": "white water", "primitives": [{"attributes": attributes, "material": material, "mode": 0}],
     })  # fmt: skip
 
 

@@ -1,7 +1,8 @@
 """OpenUSD: a layer that a person opens and edits (fluid.usda) over the heavy payload (fluid.usdc).
 
 Splats are `ParticleField3DGaussianSplat` (usd-core 26.3 or newer). Readers that do not know the schema, Blender for
-one, show the `Points` of the same frames, with velocities and stable ids.
+one, show the `Points` of the same frames, with velocities and stable ids. White water is among the splats, and beside
+the points a prim of its own, whose primvar `kind` tells spray, foam and bubbles.
 
 Everything is turned and scaled into the axes and units that the file states; there is no transform at the root.
 Renderers of splats are young: many place the centres by the transform and forget the harmonics, or the orientations.
@@ -89,7 +90,7 @@ def write_usd(
     Args:
         path: ends in .usda.
         frames: `FluidFrame`s or tuples (gaussians, ids, velocities), world, m and m/s; taken one by one, never all in
-            memory. Their arrays are put in the order of the ids.
+            memory. Their arrays are put in the order of the ids. All of them tell kinds, or none does.
         interval: s between frames; frames per second is its inverse.
         terrain: solid surface with colours, or with a texture.
         camera: of the video.
@@ -127,9 +128,11 @@ def write_usd(
         times = (settings.start_frame, settings.start_frame + count - 1)
         _set_times(stage, times)
         files += into.finish()
+        whitewater = bool(stage.GetPrimAtPath("/Fluid/Whitewater"))
         stage.GetRootLayer().Save()
     reload(payload)
-    write_bytes(path, _interface(path, fps, times, attributes or {}, settings).encode())
+    interface = _interface(path, fps, times, attributes or {}, settings, whitewater=whitewater)
+    write_bytes(path, interface.encode())
     reload(path)
     return [path, payload, *files]
 
@@ -140,7 +143,13 @@ def _rate(interval: float) -> float:
 
 
 def _interface(
-    path: Path, fps: float, times: tuple[int, int], attributes: Mapping[str, Any], settings: UsdSettings
+    path: Path,
+    fps: float,
+    times: tuple[int, int],
+    attributes: Mapping[str, Any],
+    settings: UsdSettings,
+    *,
+    whitewater: bool,
 ) -> str:
     """The text layer: a reference to the heavy data, the parameters, and a switch between representations."""
     layer = Sdf.Layer.CreateAnonymous(".usda")
@@ -158,7 +167,8 @@ def _interface(
     for name, value in attributes.items():
         _custom_attribute(root, name, value, settings.place)
     variants = root.GetVariantSets().AddVariantSet("representation")
-    shown = {"all": (), "splats": ("Points", "Surface"), "points": ("Splats", "Surface"),
+    white = ("Whitewater",) if whitewater else ()  # among the splats it is one of them
+    shown = {"all": (), "splats": ("Points", "Surface", *white), "points": ("Splats", "Surface"),
              "surface": ("Splats", "Points")}  # fmt: skip
     for variant, hidden in shown.items():
         variants.AddVariant(variant)
@@ -223,9 +233,11 @@ def _write_beside(
 
 def _write_frames(stage: Usd.Stage, frames: Iterable[FluidFrame | tuple], into: Frames, settings: UsdSettings) -> int:
     """The moving prims; the number of frames."""
-    count, volumes = 0, {}
+    count, volumes, whitewater = 0, {}, None
     for count, given in enumerate(frames, start=1):  # the count is the result
         frame = ordered(FluidFrame.of(given))
+        whitewater = frame.kinds is not None if whitewater is None else whitewater
+        require(whitewater == (frame.kinds is not None), "kinds of white water in some frames", "in all or in none")
         code = settings.start_frame + count - 1
         into.add(placed(frame, settings.place), code)
         if frame.volume is not None:

@@ -40,6 +40,14 @@ class FluidFrame(NamedTuple):
     """[v,3], m/s, of the vertices of `surface`"""
     volume: str | None = None
     """name of this frame's OpenVDB file, relative to the USD file"""
+    kinds: np.ndarray | None = None
+    """int [n], of white water: 0 spray, 1 foam, 2 bubbles; -1 all else. None: the fluid has none in any frame"""
+
+    def part(self, keep: np.ndarray) -> FluidFrame:
+        """The Gaussians of a mask or of indices, with their ids, velocities and kinds; all else is left out."""
+        kinds = None if self.kinds is None else np.asarray(self.kinds)[keep]
+        gaussians = self.gaussians.select(keep)
+        return FluidFrame(gaussians, np.asarray(self.ids)[keep], np.asarray(self.velocities)[keep], kinds=kinds)
 
     @staticmethod
     def of(given: FluidFrame | tuple) -> FluidFrame:
@@ -57,4 +65,6 @@ class FluidFrame(NamedTuple):
         if self.surface is not None and self.surface_velocities is not None:
             v = len(self.surface.vertices)
             require(np.shape(self.surface_velocities) == (v, 3), "surface velocities of the wrong shape", f"({v}, 3)")
+        if self.kinds is not None:
+            require(np.shape(self.kinds) == (n,), f"kinds {np.shape(self.kinds)} for {n} Gaussians", "[n]")
         return self

@@ -155,10 +155,11 @@ def write_points(
     *,
     colors: Float[np.ndarray, "n 3"] | None = None,
     extras: Mapping[str, np.ndarray] | None = None,
+    comment: str = "metres, z up",
 ) -> Path:
-    """Write a point cloud in world axes; colours are sRGB in [0, 1]."""
+    """Write a point cloud as it stands; colours are sRGB in [0, 1]. The comment says in which axes and units."""
     columns = _vertex_columns(points, colors) | dict(extras or {})
-    write_elements(path, [("vertex", named_records(columns, len(points)))], ["metres, z up"])
+    write_elements(path, [("vertex", named_records(columns, len(points)))], [comment])
     return Path(path)
 
 

@@ -83,6 +83,8 @@ class SceneEdits:
     """the last frame leads into the first"""
     whitewater: float = 0.0
     """times as much white water as the clip shows, 0 to `MOST_WHITEWATER`"""
+    whitewater_everywhere: bool = False
+    """also where the clip shows it, and not only where edits make more of it"""
 
 
 SECTIONS = (
@@ -95,7 +97,7 @@ MOST_WHITEWATER = 100.0
 
 NAMES = {
     "parameters": tuple(PARAMETERS), "look": tuple(Look().to_dict()),
-    "inflow": ("factor", "keyframes", "fluctuation", "period"), "whitewater": ("amount",),
+    "inflow": ("factor", "keyframes", "fluctuation", "period"), "whitewater": ("amount", "everywhere"),
 }  # fmt: skip
 """what can stand in the sections whose entries have names of their own"""
 
@@ -139,13 +141,14 @@ def edits_of(text: str, folder: Path | str, *, meshes: Path | None = None) -> Sc
         _inflow(scene),
         read_look(scene, Path(folder)),
         scene.flag("loop", False),
-        _whitewater(scene.part("whitewater", "whitewater")),
+        *_whitewater(scene.part("whitewater", "whitewater")),
     )
 
 
-def _whitewater(given: Entries) -> float:
+def _whitewater(given: Entries) -> tuple[float, bool]:
     given.only(NAMES["whitewater"])
-    return given.number("amount", 0.0, low=0.0, high=MOST_WHITEWATER, unit="times what the clip shows")
+    amount = given.number("amount", 0.0, low=0.0, high=MOST_WHITEWATER, unit="times what the clip shows")
+    return amount, given.flag("everywhere", False)
 
 
 def _obstacles(scene: Entries, meshes: Path) -> tuple[Obstacle, ...]:

@@ -139,7 +139,8 @@ def _points_faults(prim: Usd.Prim, time: Usd.TimeCode) -> list[str]:
     if points is None:
         return ["no points"]
     n = len(points)
-    names = ("points", "widths", "ids", "velocities", "primvars:displayColor")
+    names = ("points", "widths", "ids", "velocities", "primvars:displayColor", "primvars:displayOpacity",
+             "primvars:kind")  # fmt: skip
     expected: dict[str, tuple[int, ...]] = dict.fromkeys(names, (n,))
     faults = _lengths(prim, time, expected, f"{n} points")
     ids, widths = _array(prim, time, "ids"), _array(prim, time, "widths")
@@ -147,6 +148,11 @@ def _points_faults(prim: Usd.Prim, time: Usd.TimeCode) -> list[str]:
         faults.append("ids that occur twice")
     if widths is not None and len(widths) and not widths.min() > 0:
         faults.append("widths of 0 or less")
+    kinds, opacity = _array(prim, time, "primvars:kind"), _array(prim, time, "primvars:displayOpacity")
+    if prim.GetName() == "Whitewater" and (kinds is None or (len(kinds) and not 0 <= kinds.min() <= kinds.max() <= 2)):
+        faults.append("kinds other than 0, 1 and 2")
+    if opacity is not None and len(opacity) and not 0 <= opacity.min() <= opacity.max() <= 1:
+        faults.append("opacities outside 0 to 1")
     return faults + (_extent_faults(prim, time, points) if n and not faults else [])
 
 

@@ -36,12 +36,12 @@ class Frames(Protocol):
 
 
 class _Defaults:
-    """The payload's default values: the first frame with splats, and the first surface."""
+    """The payload's default values: the first frame with splats, the first with white water, and the first surface."""
 
     def __init__(self, stage: Usd.Stage, half: bool) -> None:
         self.stage, self.half = stage, half
         self.prims: FluidPrims | None = None
-        self.splats_shown = self.surface_shown = False
+        self.splats_shown = self.surface_shown = self.white_shown = False
 
     def see(self, frame: FluidFrame) -> FluidPrims:
         """The payload's prims, after a look at a frame."""
@@ -52,6 +52,10 @@ class _Defaults:
         if fresh or (not self.splats_shown and len(g)):
             self.prims.set(frame._replace(surface=None), now)
             self.splats_shown = len(g) > 0
+        if frame.kinds is not None and not self.white_shown:
+            white = np.asarray(frame.kinds) >= 0
+            self.prims.set_whitewater(frame.part(white), now)
+            self.white_shown = bool(white.any())
         if frame.surface is not None and not self.surface_shown:
             self.prims.set_surface(frame.surface, frame.surface_velocities, now)
             self.surface_shown = len(frame.surface.faces) > 0
@@ -117,7 +121,7 @@ class ClippedFrames:
         path = self._folder / f"{self._stem}.manifest.usda"
         with atomic_path(path) as temporary:
             manifest = _new_stage(temporary, self._fps, None)
-            for name in ("Splats", "Points", "Surface"):
+            for name in ("Splats", "Points", "Whitewater", "Surface"):
                 prim = self._stage.GetPrimAtPath(f"/Fluid/{name}")
                 if prim:
                     _declare(manifest, prim)

@@ -1,4 +1,4 @@
-"""The moving prims of an exported fluid, one sample at a time: splats, points, surface."""
+"""The moving prims of an exported fluid, one sample at a time: splats, points, white water, surface."""
 
 from __future__ import annotations
 
@@ -23,27 +23,40 @@ _SMALLEST = 1e-9
 
 
 class FluidPrims:
-    """/Fluid/Splats, /Fluid/Points and, once there is one, /Fluid/Surface of a stage."""
+    """/Fluid/Splats, /Fluid/Points and, where frames have them, /Fluid/Whitewater and /Fluid/Surface of a stage."""
 
     def __init__(self, stage: Usd.Stage, coefficients: int, half: bool) -> None:
         self.stage, self.coefficients, self.half = stage, coefficients, half
         self.surface: UsdGeom.Mesh | None = None
+        self.white: UsdGeom.Points | None = None
         self._define_splats()
-        self.points = UsdGeom.Points.Define(stage, "/Fluid/Points")
-        self.points.CreateWidthsAttr()
-        self.points.SetWidthsInterpolation(UsdGeom.Tokens.vertex)
-        self.colors = self.points.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
+        self.points = _defined_points(stage, "/Fluid/Points")
 
     def set(self, frame: FluidFrame, time: Usd.TimeCode) -> int:
         """Write one frame, in the axes and units of the file; about how many bytes it took."""
         require(frame.gaussians.sh.shape[1] == self.coefficients, "harmonics whose degree changes over time")
         self._set_splats(frame.gaussians, time)
-        self._set_points(frame, time)
+        if frame.kinds is None:
+            _set_points(self.points, frame, time)
+        else:
+            white = np.asarray(frame.kinds) >= 0
+            _set_points(self.points, frame.part(~white), time)
+            self.set_whitewater(frame.part(white), time)
         written = len(frame.gaussians) * (90 + 12 * self.coefficients)
         if frame.surface is not None:
             self.set_surface(frame.surface, frame.surface_velocities, time)
             written += 12 * (3 * len(frame.surface.vertices) + len(frame.surface.faces))
         return written
+
+    def set_whitewater(self, frame: FluidFrame, time: Usd.TimeCode) -> None:
+        """Write the points of white water; `frame` holds nothing else."""
+        points = _defined_whitewater(self.stage) if self.white is None else self.white
+        self.white = points
+        _set_points(points, frame, time)
+        kinds = np.ascontiguousarray(frame.kinds, np.int32)
+        UsdGeom.PrimvarsAPI(points).GetPrimvar("kind").Set(Vt.IntArray.FromNumpy(kinds), time)
+        opacity = np.ascontiguousarray(np.clip(frame.gaussians.opacities, 0, 1), np.float32)
+        points.GetDisplayOpacityPrimvar().Set(Vt.FloatArray.FromNumpy(opacity), time)
 
     def set_surface(self, surface: TriangleMesh, velocities: np.ndarray | None, time: Usd.TimeCode) -> None:
         """Write the surface; velocities [v,3] are what motion blur is made of: another frame has other vertices."""
@@ -80,15 +93,33 @@ class FluidPrims:
         self.harmonics.Set(vec3(g.sh.reshape(-1, 3), self.half), time)
         self.splats.CreateExtentAttr().Set(extent(g.means, SIGMAS * _deviations(g)), time)
 
-    def _set_points(self, frame: FluidFrame, time: Usd.TimeCode) -> None:
-        g = frame.gaussians
-        widths = (2.0 * np.cbrt(np.prod(g.scales.astype(np.float64), axis=1))).astype(np.float32)
-        self.points.CreatePointsAttr().Set(Vt.Vec3fArray.FromNumpy(g.means), time)
-        self.points.CreateWidthsAttr().Set(Vt.FloatArray.FromNumpy(widths), time)
-        self.points.CreateIdsAttr().Set(Vt.Int64Array.FromNumpy(np.ascontiguousarray(frame.ids, np.int64)), time)
-        self.points.CreateVelocitiesAttr().Set(vec3(frame.velocities), time)
-        self.colors.Set(vec3(linear_colors(g.rgb)), time)
-        self.points.CreateExtentAttr().Set(extent(g.means, 0.5 * widths[:, None]), time)
+
+def _defined_points(stage: Usd.Stage, path: str) -> UsdGeom.Points:
+    points = UsdGeom.Points.Define(stage, path)
+    points.CreateWidthsAttr()
+    points.SetWidthsInterpolation(UsdGeom.Tokens.vertex)
+    points.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
+    return points
+
+
+def _defined_whitewater(stage: Usd.Stage) -> UsdGeom.Points:
+    points = _defined_points(stage, "/Fluid/Whitewater")
+    points.CreateDisplayOpacityPrimvar(UsdGeom.Tokens.vertex)
+    primvars = UsdGeom.PrimvarsAPI(points)
+    kind = primvars.CreatePrimvar("kind", Sdf.ValueTypeNames.IntArray, UsdGeom.Tokens.vertex)
+    kind.GetAttr().SetDocumentation("0 spray, 1 foam, 2 bubbles")
+    return points
+
+
+def _set_points(points: UsdGeom.Points, frame: FluidFrame, time: Usd.TimeCode) -> None:
+    g = frame.gaussians
+    widths = (2.0 * np.cbrt(np.prod(g.scales.astype(np.float64), axis=1))).astype(np.float32)
+    points.CreatePointsAttr().Set(Vt.Vec3fArray.FromNumpy(g.means), time)
+    points.CreateWidthsAttr().Set(Vt.FloatArray.FromNumpy(widths), time)
+    points.CreateIdsAttr().Set(Vt.Int64Array.FromNumpy(np.ascontiguousarray(frame.ids, np.int64)), time)
+    points.CreateVelocitiesAttr().Set(vec3(frame.velocities), time)
+    points.GetDisplayColorPrimvar().Set(vec3(linear_colors(g.rgb)), time)
+    points.CreateExtentAttr().Set(extent(g.means, 0.5 * widths[:, None]), time)
 
 
 def ordered(frame: FluidFrame) -> FluidFrame:
@@ -97,9 +128,8 @@ def ordered(frame: FluidFrame) -> FluidFrame:
     if len(ids) < 2 or (np.diff(ids) > 0).all():
         return frame
     order = np.argsort(ids, kind="stable")
-    return frame._replace(
-        gaussians=frame.gaussians.select(order), ids=ids[order], velocities=np.asarray(frame.velocities)[order]
-    )
+    own = frame.part(order)
+    return frame._replace(gaussians=own.gaussians, ids=own.ids, velocities=own.velocities, kinds=own.kinds)
 
 
 def placed(frame: FluidFrame, place: Similarity3 | None) -> FluidFrame:

@@ -44,6 +44,8 @@ class FilmedFoam:
     """sRGB, 0 to 1"""
     places: Float[np.ndarray, "h w"]
     """share of the time in which each pixel shows foam, of that in which it shows fluid"""
+    seen: Float[np.ndarray, "h w"]
+    """share of the time in which each pixel shows fluid"""
 
     @classmethod
     def of(cls, frames: UInt8[np.ndarray, "t h w 3"], fluid: Bool[np.ndarray, "t h w"]) -> FilmedFoam:
@@ -54,7 +56,7 @@ class FilmedFoam:
         require(frames.shape[:3] == fluid.shape, f"{frames.shape} pictures for masks {fluid.shape}", "one each")
         known, none = fluid.sum(axis=0), np.zeros(fluid.shape[1:])
         if not fluid.any():
-            return cls(0.0, WHITE, none)
+            return cls(0.0, WHITE, none, none)
         middle = float(np.median(frames[fluid] @ _LUMA))
         count, total, pixels = none.copy(), np.zeros(3), 0
         for picture, mask in zip(frames, fluid):
@@ -63,7 +65,7 @@ class FilmedFoam:
             total, pixels = total + picture[found].sum(axis=0, dtype=np.float64), pixels + int(found.sum())
         share = pixels / int(fluid.sum())
         r, g, b = (total / (255.0 * pixels)).tolist() if share >= FEWEST else WHITE
-        return cls(share if share >= FEWEST else 0.0, (r, g, b), count / np.maximum(known, 1))
+        return cls(share if share >= FEWEST else 0.0, (r, g, b), count / np.maximum(known, 1), known / len(fluid))
 
 
 def foam_pixels(picture: UInt8[np.ndarray, "h w 3"], middle: float) -> Bool[np.ndarray, "h w"]:

@@ -83,6 +83,26 @@ class Range:
 
 
 @dataclass(frozen=True)
+class SeenBirths:
+    """Births where a clip shows foam, in columns of a grid, whatever the potentials are."""
+
+    grid: Grid
+    rate: Float[np.ndarray, "nx ny"]
+    """1/s, in the whole column, in the flow as lifted"""
+    energy: Float[np.ndarray, "nx ny"]
+    """m^2/s^2, at the surface, from which on it has all of that; slower water has as much less as it has energy less"""
+
+    def in_cells(self, state: LiquidState) -> Float[np.ndarray, "nx ny nz"]:
+        """Per second, in cells of the state, were they full: in the layer of a cell under the surface."""
+        rate, energy = _in_columns((self.grid, self.rate, self.energy), state.grid)
+        layer = (state.distance < 0) & (state.distance > -state.grid.spacing)
+        filled = (state.amount * layer).sum(axis=2, keepdims=True)
+        fast = np.clip(state.energy / np.maximum(energy, 1e-12), 0.0, 1.0)
+        # a film of water is no column: at least a quarter of a cell
+        return np.where(layer, rate * fast / np.maximum(filled, 0.25), 0.0)
+
+
+@dataclass(frozen=True)
 class WhitewaterLaw:
     """How much white water a liquid makes."""
 
@@ -100,13 +120,16 @@ class WhitewaterLaw:
     """particles at once"""
     known: tuple[Grid, Float[np.ndarray, "nx ny"], Float[np.ndarray, "nx ny"]] | None = None
     """trapped (m/s) and crest (1/s) of each column up to which no white water is made: what is shown there already"""
+    seen: SeenBirths | None = None
+    """beside those of the potentials"""
 
     def births(self, state: LiquidState) -> Float[np.ndarray, "nx ny nz"]:
         """Per second, in cells of the state, were they full."""
         floors = (0.0, 0.0) if self.known is None else _in_columns(self.known, state.grid)
         made = self.trapped_rate * self.trapped.share(state.trapped, floors[0])
         made += self.crest_rate * self.crest.share(state.crest, floors[1])
-        return made * self.energy.share(state.energy)
+        made = made * self.energy.share(state.energy)
+        return made if self.seen is None else made + self.seen.in_cells(state)
 
 
 def _in_columns(
@@ -410,6 +433,8 @@ class Whitewater:
         fits = x.shape == v.shape == (n, 3) and lives.shape == kinds.shape == (n,) and counts.shape == (3,)
         if not fits or not all(np.isfinite(a).all() for a in (x, v, lives)) or (kinds > BUBBLE).any():
             raise InputRejected("a state of white water with arrays of another shape, or not finite", "a whole one")
+        if n > self.law.most:
+            raise InputRejected(f"a state of {n} particles of white water", f"at most {self.law.most}")
         self.positions, self.velocities, self.lives, self.kinds, self.ids = x, v, lives, kinds, ids
         self.next_id, self.steps, self.thinned = int(counts[0]), int(counts[1]), bool(counts[2])
 

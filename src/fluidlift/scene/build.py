@@ -130,6 +130,8 @@ class Scene:
     """1/s, how fast, on the faces of each component"""
     whitewater: float = 0.0
     """times as much white water as the clip shows; 0: none is simulated"""
+    whitewater_everywhere: bool = False
+    """also where the clip shows it"""
     as_lifted: Scene | None = None
     """the same without edits, by which white water is measured; None where there is none"""
 
@@ -175,7 +177,7 @@ class Scene:
         if self.dry is not None:
             found["dry cells"] = _hash(self.dry)
         if self.whitewater > 0:
-            found["white water"] = _hash(self.whitewater)
+            found["white water"] = _hash(self.whitewater, *["everywhere"] * self.whitewater_everywhere)
         if not self.skin:
             found["skin"] = _hash(self.skin)
         if self.overlap:
@@ -315,7 +317,7 @@ def edited_scene(
         lifted = edited_scene(
             asset, SceneEdits(), plain, settings, footage=footage, start=start, film=film, filmed=filmed
         )  # fmt: skip
-        scene = replace(scene, whitewater=amount, as_lifted=lifted)
+        scene = replace(scene, whitewater=amount, as_lifted=lifted, whitewater_everywhere=edits.whitewater_everywhere)
     return replace(scene, overlap=loop_overlap(scene)) if edits.loop else scene
 
 

@@ -3,11 +3,13 @@
 What is bright and grey in the clip's film is foam (`look.whitewater_splats`). The scene is simulated as it was lifted
 for a second, and the limits of the potentials are put where as much of its surface lies above them as the film shows
 foam. In the edited scene white water is born where a place exceeds them, and all that the place had in the scene as
-lifted: that is in the film, which the surface plays.
+lifted: that is in the film, which the surface plays. Where it is asked for everywhere, what the film shows is born as
+well, at its places (`scene.filmed_foam`).
 """
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -20,8 +22,18 @@ from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.io.footage_file import read_footage
 from fluidlift.look.whitewater_splats import FADING, OPACITIES, SIZES, FilmedFoam, whitewater_splats
 from fluidlift.messages import Notice
-from fluidlift.physics.whitewater import LIFE, Ground, LiquidState, Range, Whitewater, WhitewaterLaw
+from fluidlift.physics.whitewater import (
+    FOAM,
+    LIFE,
+    Ground,
+    LiquidState,
+    Range,
+    SeenBirths,
+    Whitewater,
+    WhitewaterLaw,
+)
 from fluidlift.scene.build import Scene
+from fluidlift.scene.filmed_foam import births_in_columns
 from fluidlift.scene.simulator import simulator_of
 from fluidlift.types import Gaussians, Particles
 
@@ -40,6 +52,8 @@ FITTED = (0.02, 50.0)
 """times `FULL_RATE` between which the rate is fitted"""
 SPREAD = 1
 """cells around a column whose potentials count as its own: waves are not in the same place each time"""
+LEAST_AFLOAT = 0.25
+"""share of white water that counts as foam at least: from less the film's foam would take four times as much"""
 IDS_FROM = 2**29
 """half of the ids of white water are above it, so that those of the particles and of the skin are others, and a loop
 can add as many again within 32 bits"""
@@ -58,6 +72,8 @@ class Columns(NamedTuple):
     """m^2/s^2, where the most is trapped"""
     velocity: np.ndarray
     """[nx,ny,2], m/s"""
+    height: np.ndarray
+    """m, of the middle of the highest cell with liquid; not a number where there is none"""
 
 
 @dataclass(frozen=True)
@@ -73,16 +89,24 @@ class Measured:
     """of foam in the film; 0: none"""
     color: tuple[float, float, float]
     """sRGB"""
-    trapped_known: Float[np.ndarray, "nx ny"]
-    """m/s, the most in each column in all frames"""
-    crest_known: Float[np.ndarray, "nx ny"]
+    trapped_known: Float[np.ndarray, "2 nx ny"]
+    """m/s, the most in each column, before `SETTLED` and after"""
+    crest_known: Float[np.ndarray, "2 nx ny"]
     """1/s"""
+    filmed: Float[np.ndarray, "nx ny"]
+    """1/s, births in each column by which the scene as lifted shows the film's foam"""
+    energy_known: Float[np.ndarray, "nx ny"]
+    """m^2/s^2, the least in each column in all frames"""
 
-    def law(self, scene: Scene, amount: float) -> WhitewaterLaw:
-        """For a scene edited from `scene`, with `amount` times as much."""
-        rate = amount * self.rate
-        known = scene.terrain.grid, self.trapped_known, self.crest_known
-        return WhitewaterLaw(self.trapped, self.crest, self.energy, rate, rate, known=known)
+    def law(self, scene: Scene, amount: float, everywhere: bool = False, *, settled: bool = True) -> WhitewaterLaw:
+        """For a scene edited from `scene`, with `amount` times as much; everywhere: also where the film shows it.
+
+        A body that is let go jerks, and would foam all over: until it has `settled` what counts is more than that.
+        """
+        rate, grid = amount * self.rate, scene.terrain.grid
+        known = grid, self.trapped_known[int(settled)], self.crest_known[int(settled)]
+        seen = SeenBirths(grid, amount * self.filmed, self.energy_known) if everywhere else None
+        return WhitewaterLaw(self.trapped, self.crest, self.energy, rate, rate, known=known, seen=seen)
 
 
 @dataclass(frozen=True)
@@ -97,31 +121,70 @@ def kept_measure(scene: Scene, device: str) -> Kept:
     return Kept(measured(scene, device))
 
 
-def measured(scene: Scene, device: str = "cpu") -> Measured | None:
+def measured(scene: Scene, device: str = "cpu", foam: FilmedFoam | None = None) -> Measured | None:
     """What a scene as lifted and its film say about white water; None where the film shows none, or there is none.
 
     Args:
         scene: without edits.
         device: that moves particles, "cpu" or "cuda".
+        foam: of the film, or of a part of it; None: of all of it.
     """
-    foam = filmed_foam(scene)
+    foam = filmed_foam(scene) if foam is None else foam
     if foam is None or foam.share == 0.0:
         return None
-    ground = Ground.of(scene.terrain, scene.cell_types)
+    probe = _Probe(scene, foam)
     simulator = simulator_of(scene, device)
     first, count = (round(s / scene.interval) for s in (SETTLED, SETTLED + SECONDS))
     seen: list[Columns] = []
-    for k in range(max(count, 2)):
+    for _ in range(max(count, 2)):
         try:
             simulator.advance(scene.interval)
         except FluidliftError:  # the simulation that follows says so
             break
-        if k >= first and len(simulator.particles):
-            state = LiquidState.of(simulator.particles, ground, scene.parameters.density)
-            seen.append(columns_of(state, scene))
-    if not seen:
+        if len(simulator.particles):
+            seen.append(probe.columns(simulator.particles))
+    if len(seen) <= first:
         return None
-    return _fitted(seen, foam, scene.terrain.grid.spacing)
+    return _fitted(seen, first, foam, scene, probe.afloat)
+
+
+class _Probe:
+    """White water that is born where the film shows foam, to know how much of it stays at the surface: what the flow
+    carries under covers nothing."""
+
+    def __init__(self, scene: Scene, foam: FilmedFoam) -> None:
+        self._scene, self._foam = scene, foam
+        self._ground = Ground.of(scene.terrain, scene.cell_types)
+        self._water: Whitewater | None = None
+        self._floating, self._all = 0.0, 0.0
+
+    @property
+    def afloat(self) -> float:
+        """Share of what covers, were it all at the surface, that is foam; 1 where nothing was born."""
+        return self._floating / self._all if self._all > 0 else 1.0
+
+    def columns(self, particles: Particles) -> Columns:
+        """Those of the next frame."""
+        scene = self._scene
+        if self._water is None:
+            state = LiquidState.of(particles, self._ground, scene.parameters.density)
+            self._water = self._begun(columns_of(state, scene))
+            return columns_of(state, scene)
+        state = self._water.advance(particles, scene.interval)
+        assert state is not None  # there are particles
+        fading = np.clip(self._water.lives / FADING, 0.0, 1.0)
+        self._floating += float(fading[self._water.kinds == FOAM].sum())
+        self._all += float(fading.sum())
+        return columns_of(state, scene)
+
+    def _begun(self, now: Columns) -> Whitewater:
+        scene, grid, nothing = self._scene, self._scene.terrain.grid, Range(0.0, 1.0)
+        lasting = np.full(now.wet.shape, float(np.mean(LIFE)))
+        rate = births_in_columns(self._foam, scene.camera, grid, now.height, 0.0 * now.velocity, lasting, COVERS)
+        low, high = (float(q) for q in np.quantile(now.energy[now.wet], BY_ENERGY))
+        seen = SeenBirths(grid, rate, 0.0 * rate)
+        law = WhitewaterLaw(nothing, nothing, Range(low, max(high, 1.25 * low, 1e-12)), 0.0, 0.0, seen=seen)
+        return Whitewater(self._ground, law, scene.parameters.gravity, scene.parameters.density, scene.seed)
 
 
 def filmed_foam(scene: Scene) -> FilmedFoam | None:
@@ -141,8 +204,8 @@ def columns_of(state: LiquidState, scene: Scene) -> Columns:
     first = np.round((state.grid.low - grid.low) / grid.spacing).astype(int)
     box = tuple(slice(a, a + n) for a, n in zip(first[:2], state.grid.shape[:2]))
 
-    def on_grid(values: np.ndarray, kind: type = float) -> np.ndarray:
-        whole = np.zeros((*grid.shape[:2], *values.shape[2:]), kind)
+    def on_grid(values: np.ndarray, beside: float | bool = 0.0) -> np.ndarray:
+        whole = np.full((*grid.shape[:2], *values.shape[2:]), beside)
         whole[box] = values
         return whole
 
@@ -152,14 +215,21 @@ def columns_of(state: LiquidState, scene: Scene) -> Columns:
     u, v, _ = state.velocity.components
     flow = [np.take_along_axis(c, top, axis=2)[..., 0] for c in (0.5 * (u[1:] + u[:-1]), 0.5 * (v[:, 1:] + v[:, :-1]))]
     energy = np.take_along_axis(state.energy, top, axis=2)[..., 0]
+    height = np.where(wet, state.grid.low[2] + (top[..., 0] + 0.5) * grid.spacing, np.nan)
     return Columns(
-        on_grid(wet, bool), on_grid(state.trapped.max(axis=2)), on_grid(state.crest.max(axis=2)),
-        on_grid(energy), on_grid(np.stack(flow, axis=-1)),
+        on_grid(wet, False), on_grid(state.trapped.max(axis=2)), on_grid(state.crest.max(axis=2)),
+        on_grid(energy), on_grid(np.stack(flow, axis=-1)), on_grid(height, np.nan),
     )  # fmt: skip
 
 
-def _fitted(seen: list[Columns], foam: FilmedFoam, spacing: float) -> Measured:
-    """Limits and rate by which as much of the surface foams as of the film's; `spacing` (m) of the columns."""
+def _fitted(frames: list[Columns], settled: int, foam: FilmedFoam, scene: Scene, afloat: float) -> Measured:
+    """Limits and rate by which as much of the surface foams as of the film's, and births at its places, of which a
+    share stays `afloat`. The flow has `settled` with that frame."""
+    grid, seen = scene.terrain.grid, frames[settled:]
+    reached = [
+        np.stack([_reached(np.stack([getattr(c, name) for c in part])) if part else np.zeros(grid.shape[:2])
+                  for part in (frames[:settled], seen)]) for name in ("trapped", "crest")
+    ]  # fmt: skip
     wet = np.stack([c.wet for c in seen])
     trapped, crest, energy = (np.stack([getattr(c, name) for c in seen]) for name in ("trapped", "crest", "energy"))
     # two potentials that seldom meet share the foam
@@ -174,21 +244,43 @@ def _fitted(seen: list[Columns], foam: FilmedFoam, spacing: float) -> Measured:
     shares = (limits[0].share(trapped) + limits[1].share(crest)) * fast.share(energy) * wet
     life, lasting = _lives(shares, fast.share(energy))
     flow = np.mean([c.velocity for c in seen], axis=0)
-    cover = carried_cover(shares.mean(axis=0), flow, spacing, life, lasting)
+    cover = carried_cover(shares.mean(axis=0), flow, grid.spacing, life, lasting)
     places = wet.mean(axis=0) > 0.5
-    size = 2 * SPREAD + 1
-    known = [ndimage.maximum_filter(v.max(axis=0), size) for v in (trapped, crest)]
+    with np.errstate(all="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # columns that were never wet
+        height = np.nanmedian(np.stack([c.height for c in seen]), axis=0)
+    lasts = _lasting(LIFE[0] + (LIFE[1] - LIFE[0]) * fast.share(energy).mean(axis=0))
+    filmed = births_in_columns(foam, scene.camera, grid, height, flow, lasts, COVERS) / max(afloat, LEAST_AFLOAT)
+    rate = FULL_RATE * _factor(cover[places], foam.share)
     return Measured(
-        limits[0], limits[1], fast, FULL_RATE * _factor(cover[places], foam.share), foam.share, foam.color, *known
+        limits[0],
+        limits[1],
+        fast,
+        rate,
+        foam.share,
+        foam.color,
+        *reached,
+        filmed=filmed,
+        energy_known=energy.min(axis=0),
     )
+
+
+def _reached(potential: Float[np.ndarray, "t nx ny"]) -> Float[np.ndarray, "nx ny"]:
+    """The most in each column and beside it, in all frames; 0 where there are none."""
+    return ndimage.maximum_filter(potential.max(axis=0, initial=0.0), 2 * SPREAD + 1)
 
 
 def _lives(shares: np.ndarray, energies: np.ndarray) -> tuple[float, float]:
     """s that what is born lives, and for how long it would cover as much without fading; means by births."""
     life = LIFE[0] + (LIFE[1] - LIFE[0]) * energies
-    lasting = np.where(life > FADING, life - 0.5 * FADING, life**2 / (2.0 * FADING))
+    lasting = _lasting(life)
     total = max(float(shares.sum()), 1e-12)
     return max(float((shares * life).sum()) / total, LIFE[0]), float((shares * lasting).sum()) / total
+
+
+def _lasting(life: np.ndarray) -> np.ndarray:
+    """s for which what lives so long (s) would cover as much without fading."""
+    return np.where(life > FADING, life - 0.5 * FADING, life**2 / (2.0 * FADING))
 
 
 def carried_cover(
@@ -239,9 +331,16 @@ class SceneWhitewater:
         scene, found = self._scene, self._found
         if found is None or scene.as_lifted is None:
             return
-        law = found.law(scene.as_lifted, scene.whitewater)
+        law = self._law(0)
         ground = Ground.of(scene.terrain, scene.cell_types)
         self._water = Whitewater(ground, law, scene.parameters.gravity, scene.parameters.density, scene.seed)
+
+    def _law(self, number: int) -> WhitewaterLaw:
+        """At a frame."""
+        scene, found = self._scene, self._found
+        assert scene.as_lifted is not None and found is not None
+        settled = number > round(SETTLED / scene.interval)
+        return found.law(scene.as_lifted, scene.whitewater, scene.whitewater_everywhere, settled=settled)
 
     @property
     def particles(self) -> Whitewater | None:
@@ -272,6 +371,7 @@ class SceneWhitewater:
         if number == 0:
             self._begin_again()
         elif self._water is not None:
+            self._water.law = self._law(number)
             self._water.advance(particles, self._scene.interval)
 
     def splats(

@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from fluidlift.export.whitewater import with_kinds
+from fluidlift.io.frames import FluidFrame
 from fluidlift.io.scene_look import Look
 from fluidlift.pipeline.settings import ShowSettings
 from fluidlift.pipeline.work import Work
@@ -92,7 +94,7 @@ def show(
         told = count if config.usd_frames else 1
         write_usd(
             folder / "asset.usda",
-            frames=splat_frames(folder, told),
+            frames=_told(scene, folder, told),
             interval=scene.interval,
             terrain=scene.terrain.mesh,
             camera=scene.camera,
@@ -111,6 +113,12 @@ def show(
         return Shown(count, card.as_filmed, warnings=card.warnings)
     flow = np.stack(measured.flow).astype(np.float16)
     return Shown(count, card.as_filmed, frames[:compared], mask[:compared], flow, card.warnings)
+
+
+def _told(scene: Scene, folder: Path, count: int) -> Iterator[FluidFrame | tuple]:
+    """The frames that the USD file holds."""
+    frames = splat_frames(folder, count)
+    return frames if scene.whitewater == 0 else (with_kinds(f, scene.terrain.grid.spacing) for f in frames)
 
 
 def _painter(scene: Scene, folder: Path, look: Look | None) -> Painter | None:

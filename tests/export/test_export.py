@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,13 +14,14 @@ from fluidlift.cli import DONE, REJECTED, WITH_WARNINGS, main
 from fluidlift.errors import InputRejected
 from fluidlift.export.volumes import gridded, level_set
 from fluidlift.io.asset_folder import load_asset, read_manifest
+from fluidlift.io.frames import FluidFrame
 from fluidlift.io.ply import read_mesh, read_splats
 from fluidlift.io.stage_cache import mark_owner, save_stage
 from fluidlift.io.stage_codec import packed
 from fluidlift.io.validate_usd import validate_usd
 from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.scene.splat_files import frame_file, frame_numbers, read_frame
-from fluidlift.types import TriangleMesh
+from fluidlift.types import Gaussians, Grid, TriangleMesh
 from fluidlift.types.stages import Simulation
 
 WELL = (DONE, WITH_WARNINGS)
@@ -159,6 +161,19 @@ def test_volumes_hold_the_motion_and_the_amount_of_the_fluid(made):
     # a cell's velocity is a mean of what is in it and beside it
     mean = velocity.at_centers()[filled].mean(axis=0)
     np.testing.assert_allclose(mean, frame.velocities[liquid].mean(axis=0), atol=0.5 * frame.velocities.std())
+
+
+def test_the_density_of_smoke_is_what_its_splats_take_out_of_a_beam():
+    """Fog of that extinction in the cells takes as much light in all as the splats do: 2 pi s^2 a each."""
+    rng = np.random.default_rng(0)
+    opacity = rng.uniform(0.02, 0.2, 500)
+    smoke = Gaussians.isotropic(rng.uniform(0, 1, (500, 3)), 0.05, np.full((500, 3), 0.5), opacity)
+    frame = FluidFrame(smoke, np.arange(500), np.zeros((500, 3), np.float32))
+    _, density, grid = gridded(frame, Grid((10, 10, 10), 0.1), smoke=True)
+    drawn = opacity.astype(np.float32) - 1 / 255
+    assert density.sum() * grid.spacing**3 == pytest.approx(2 * np.pi * 0.05**2 * drawn.sum(), rel=1e-4)
+    hidden = replace(smoke, opacities=np.full(500, 0.002, np.float32))  # there for other tools, but not drawn
+    assert not gridded(frame._replace(gaussians=hidden), Grid((10, 10, 10), 0.1), smoke=True)[1].any()
 
 
 def test_the_level_set_of_a_ball_is_its_distance_and_knows_its_inside():

@@ -9,7 +9,7 @@ import pytest
 from fluidlift.cli import REJECTED, WITH_WARNINGS, main
 from fluidlift.config import JobConfig
 from fluidlift.io.asset_folder import FILES, load_asset, read_manifest
-from fluidlift.io.footage_file import read_footage, write_footage
+from fluidlift.io.footage_file import read_footage, read_smoke, write_footage
 from fluidlift.io.video import read_clip
 from fluidlift.look.footage import FEWEST
 from fluidlift.pipeline.preview import preview_scene
@@ -182,10 +182,17 @@ def test_a_stream_carries_the_clip_with_its_masks(made, finished):
     assert not [w for w in said_of(made.folder) if "film" in w]
 
 
-def test_smoke_carries_none(catalogue_asset):
-    folder = catalogue_asset("plume").folder
-    assert not (folder / FILES["film"]).exists() and "film" not in read_manifest(folder)["files"]
-    assert film_of(folder) is None
+def test_smoke_carries_its_color_and_opacity(catalogue_asset):
+    job = catalogue_asset("plume")
+    manifest, clip = read_manifest(job.folder), read_clip(job.clip)
+    assert film_of(job.folder) == job.folder / FILES["film"] and FILES["film"] in manifest["hashes"]
+    colors, opacities, _ = read_smoke(job.folder / FILES["film"], clip.size)
+    behind, a = 25.0, opacities[..., None] / 255.0
+    shown = clip.frames[first_of_film(manifest["metrics"]["rest_frame"], len(clip)) :]
+    smoke = shown.min(axis=-1) > 80
+    again = a * colors + (1 - a) * behind
+    assert np.abs(again - shown)[smoke].mean() < 12  # grain of two pixels, coded twice
+    assert opacities[smoke].mean() > 60 > 5 > opacities[shown.max(axis=-1) < 40].mean()
 
 
 @pytest.mark.parametrize("fault", ["missing", "damaged"])

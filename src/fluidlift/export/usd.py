@@ -75,7 +75,7 @@ def _with_volumes(
 
     cleared(out / VOLUMES, [".vdb"])
     for k, frame in enumerate(frames):
-        velocity, density, grid = gridded(frame, asset.grid)
+        velocity, density, grid = gridded(frame, asset.grid, smoke=True)
         filled = density > 0
         path = out / VOLUMES / f"{start_frame + k:04d}.vdb"
         density_grid = VolumeGrid("density", density, asset.grid.spacing, grid.origin, filled)

@@ -11,10 +11,10 @@ from fluidlift.export.job import (
     ExportJob,
     Outcome,
 )
-from fluidlift.export.whitewater import whitewater_grids
+from fluidlift.export.whitewater import shadow_of, whitewater_grids
 from fluidlift.io.frames import FluidFrame
 from fluidlift.io.output_files import cleared, numbered
-from fluidlift.types import FaceVelocity, Grid, TriangleMesh
+from fluidlift.types import FaceVelocity, Grid, TriangleMesh, kind_of
 
 if TYPE_CHECKING:
     from fluidlift.io.volume_grid import VolumeGrid
@@ -36,7 +36,7 @@ def write_volumes(job: ExportJob, frames: Iterator[FluidFrame]) -> Outcome:
     cleared(job.out, [".vdb"])
     h = job.asset.grid.spacing
     for k, frame in zip(job.numbers, frames, strict=True):
-        velocity, density, grid = gridded(frame, job.asset.grid)
+        velocity, density, grid = gridded(frame, job.asset.grid, smoke=kind_of(job.asset.kind).is_gas)
         filled = density > 0
         grids = [velocity_grid(velocity, grid, active=filled), VolumeGrid("density", density, h, grid.origin, filled)]
         if frame.surface is not None and len(frame.surface.faces):
@@ -58,12 +58,14 @@ def level_set(mesh: TriangleMesh, spacing: float) -> VolumeGrid:
     return VolumeGrid("surface", values, spacing, (x, y, z), stored, grid_class="level set", background=band)
 
 
-def gridded(frame: FluidFrame, cells: Grid) -> tuple[FaceVelocity, np.ndarray, Grid]:
+def gridded(frame: FluidFrame, cells: Grid, *, smoke: bool = False) -> tuple[FaceVelocity, np.ndarray, Grid]:
     """Velocity and density of a frame on cells that lie on those of the simulation, as far as its particles reach.
 
     Density is the opacity of the splats in a cell next to that of a full one, at most 1: the share of a cell that a
-    liquid fills, and how thick smoke is. A skin is no liquid.
+    liquid fills. A skin is no liquid. Of smoke it is the extinction, 1/m: what the splats of a cell take out of a beam,
+    without what they have for a rasteriser that draws nothing below a least opacity.
     """
+    from fluidlift.look.smoke_splats import DRAWN
     from fluidlift.look.surface_skin import of_skin
     from fluidlift.physics.transfer import particles_to_grid
     from fluidlift.types import Particles
@@ -76,6 +78,11 @@ def gridded(frame: FluidFrame, cells: Grid) -> tuple[FaceVelocity, np.ndarray, G
     grid = Grid((nx, ny, nz), h, (x, y, z))
     velocity, _ = particles_to_grid(Particles.at_rest(points, 1.0, velocities=frame.velocities[liquid]), grid)
     flat = np.ravel_multi_index(tuple(grid.cell_of(points).T), grid.shape)
-    amount = np.bincount(flat, weights=frame.gaussians.opacities[liquid], minlength=grid.cells).reshape(grid.shape)
+    splats = frame.gaussians.select(liquid)
+    if smoke:
+        taken = shadow_of(splats, np.maximum(splats.opacities.astype(np.float64) - DRAWN, 0.0))
+        found = np.bincount(flat, weights=taken / h**3, minlength=grid.cells).reshape(grid.shape)
+        return velocity, found.astype(np.float32), grid
+    amount = np.bincount(flat, weights=splats.opacities, minlength=grid.cells).reshape(grid.shape)
     full = np.percentile(amount[amount > 0], FULL)
     return velocity, np.clip(amount / max(float(full), 1e-12), 0.0, 1.0).astype(np.float32), grid

@@ -11,7 +11,7 @@ import numpy as np
 from fluidlift.io.frames import FluidFrame
 from fluidlift.io.output_files import cleared, numbered
 from fluidlift.look.whitewater_splats import kinds_of
-from fluidlift.types import Grid, Similarity3
+from fluidlift.types import Gaussians, Grid, Similarity3
 
 if TYPE_CHECKING:
     from fluidlift.io.volume_grid import VolumeGrid
@@ -91,11 +91,15 @@ def whitewater_grids(frame: FluidFrame, cells: Grid) -> list[VolumeGrid]:
     grids = []
     for number, name in enumerate(KINDS):
         g = white.gaussians.select(white.kinds == number)
-        taken = 2.0 * np.pi * np.cbrt(np.prod(g.scales.astype(np.float64), axis=1)) ** 2 * g.opacities
-        values, first = spread((g.means - cells.low) / h, taken / h**3)
+        values, first = spread((g.means - cells.low) / h, shadow_of(g, g.opacities) / h**3)
         x, y, z = (cells.low + h * first).tolist()
         grids.append(VolumeGrid(name, values, h, (x, y, z), values > 0))
     return grids
+
+
+def shadow_of(gaussians: Gaussians, opacities: np.ndarray) -> np.ndarray:
+    """m^2 [n] that splats of some opacities take out of a beam: 2 pi s^2 a."""
+    return 2.0 * np.pi * np.cbrt(np.prod(gaussians.scales.astype(np.float64), axis=1)) ** 2 * opacities
 
 
 def spread(places: np.ndarray, amounts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

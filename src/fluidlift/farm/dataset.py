@@ -20,7 +20,7 @@ from jaxtyping import Float, UInt8
 from fluidlift.errors import InputRejected
 from fluidlift.farm.state import Outcome
 from fluidlift.io.asset_folder import load_asset, read_manifest, read_parameters
-from fluidlift.types import FluidParameters, Gaussians
+from fluidlift.types import FluidParameters, Gaussians, kind_of
 
 INDEX = "dataset.parquet"
 
@@ -64,7 +64,8 @@ class Sample:
     row: dict[str, Any]
     """of the index"""
     frames: UInt8[np.ndarray, "t h w 3"]
-    """sRGB: of the clip where it lies at its place with its content, else the film of the fluid in the asset"""
+    """sRGB: of the clip where it lies at its place with its content, else the film of the fluid in the asset; of smoke
+    none, whose film is its color and opacity"""
     of_clip: bool
     """whether the frames are the clip's"""
     gaussians: Gaussians
@@ -217,7 +218,7 @@ def _film_of(place: Path, size: tuple[int, int]) -> np.ndarray:
     from fluidlift.scene.build import film_of
 
     film = film_of(place)
-    if film is None:
+    if film is None or kind_of(read_manifest(place)["kind"]).is_gas:  # of smoke it is color and opacity, no picture
         width, height = size_of_film(size)
         return np.zeros((0, height, width, 3), np.uint8)
     return read_footage(film, size)[0]

@@ -38,6 +38,10 @@ Modules of the face:
     screen_space        The surface of a liquid in a picture: of particles, drawn as spheres and smoothed in the
                         picture, or of a mesh
     seen_texture        What the surface of a body at rest looks like to the camera that saw it, by place in plan
+    smoke_film          How opaque smoke is in each place of a film, and its own color there: matting before a known
+                        background
+    smoke_splats        Smoke as splats: how wide and how opaque they are for all of them together to be as thin as
+                        what was filmed
     smoothstep          From 0 to 1 with level ends (smoothstep), for arrays and for compiled loops
     solid_contact       A liquid's surface carried on to the solid that it meets
     stream_slab         A piece of a stream as a slab that one can pick up, and how it goes on beyond its ends
@@ -82,6 +86,8 @@ __all__ = [
     "scenery",
     "screen_space",
     "seen_texture",
+    "smoke_film",
+    "smoke_splats",
     "smoothstep",
     "solid_contact",
     "stream_slab",

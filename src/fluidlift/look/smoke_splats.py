@@ -48,7 +48,7 @@ def drawn_splats(
     chance: Float[np.ndarray, " n"],
 ) -> tuple[Bool[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Which splats are drawn, and their standard deviation, px: as many at a place as its optical depth takes, so wide
-    that `TOGETHER` of them overlap.
+    that `TOGETHER` of them overlap. Beside the picture all are, as wide as they may be.
 
     Args:
         uv: where they are seen, px.
@@ -57,12 +57,16 @@ def drawn_splats(
         chance: 0 to 1, a number of each splat that stays the same over the frames: it says which are left out.
     """
     widest = np.maximum(widest, FINEST)
-    at, overlap, here = uv[:, ::-1] - 0.5, 2.0 * np.pi * FINEST**2, np.empty(len(uv))
+    at, beside = uv[:, ::-1] - 0.5, ~((uv >= 0) & (uv <= np.array(depth.shape[::-1]))).all(axis=1)
+    if beside.all():
+        return beside, widest
     here = sampled(np.asarray(depth, np.float32), at)
-    drawn = chance * overlap * sampled(_crowd(uv, depth.shape, FINEST), at) < np.maximum(here / FAINTEST, TOGETHER)
-    overlap = 2.0 * np.pi * np.square(widest)
-    around = overlap * sampled(_crowd(uv[drawn], depth.shape, float(np.median(widest))), at)
-    return drawn, np.clip(widest * np.sqrt(TOGETHER / np.maximum(around, 1e-6)), FINEST, widest)
+    overlap = 2.0 * np.pi * FINEST**2 * sampled(_crowd(uv, depth.shape, FINEST), at)
+    drawn = beside | (chance * overlap < np.maximum(here / FAINTEST, TOGETHER))
+    smooth = float(np.median(widest[~beside]))
+    overlap = 2.0 * np.pi * np.square(widest) * sampled(_crowd(uv[drawn], depth.shape, smooth), at)
+    found = np.clip(widest * np.sqrt(TOGETHER / np.maximum(overlap, 1e-6)), FINEST, widest)
+    return drawn, np.where(beside, widest, found)
 
 
 def _crowd(uv: np.ndarray, shape: tuple[int, ...], sigma: float) -> np.ndarray:
@@ -112,7 +116,7 @@ def shared_depth(
     weight, mean, at = np.maximum(first, LEAST), np.empty(len(uv)), uv[:, ::-1] - 0.5
     for _ in range(ROUNDS):
         total = depth_of(uv, widths, weight, size)
-        _gathered(uv, drawn, depth / np.maximum(total, LEAST * depth), mean)
+        _gathered(uv, drawn, depth / np.maximum(total, np.maximum(LEAST * depth, 1e-9)), mean)
         weight = np.where(mean >= 0, weight * mean, first)
         over = depth_of(uv, widths, weight, size) / np.maximum(depth, 1e-9)
         weight = np.where(mean >= 0, weight / np.maximum(sampled(over.astype(np.float32), at), 1.0), first)

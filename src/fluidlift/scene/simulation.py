@@ -15,7 +15,7 @@ from fluidlift.scene.simulated_history import History
 from fluidlift.scene.splat_files import checkpoint_file, frame_file, write_frame
 from fluidlift.scene.surface_appearance import SurfaceAppearance
 from fluidlift.source import source_hash
-from fluidlift.types import Particles
+from fluidlift.types import Particles, kind_of
 
 if TYPE_CHECKING:
     from fluidlift.physics.stepping import ParticleSimulator, StepReport
@@ -103,12 +103,13 @@ def advance(
         folder: of the asset.
         history: of the frames that are there; the others are added.
         step: told (done, all).
-        max_particles: beyond twice as many, and twice those at rest, the simulation ends.
+        max_particles: beyond twice as many, of smoke or twice those at rest, the simulation ends.
         checkpoint_every: frames.
 
     Raises:
         InputRejected: the disk is full.
     """
+    most = max(max_particles, len(scene.rest) if kind_of(scene.kind).is_gas else 0)  # smoke spreads, a liquid does not
     with ThreadPoolExecutor(1, "simulation") as beside:
         coming: Future[StepReport] | None = None
         for k in range(len(history), scene.simulated):
@@ -123,7 +124,7 @@ def advance(
                 except FluidliftError as error:
                     return f"frame {FIRST_FRAME + k} ({k} of {scene.simulated}): {error} {in_words(scene)}".rstrip()
             p, coming = simulator.particles, None
-            if k and len(p) > 2 * max(max_particles, len(scene.body)):
+            if k and len(p) > 2 * most:
                 return None
             history.add(scene, simulator, p, substeps)
             # the first one says whose frames these are

@@ -1,8 +1,8 @@
 """What the splats of simulated smoke look like in each frame: as thin as its film shows it, or as it was carried.
 
 A particle carries an amount of smoke, which is the area that its splat would darken (m^2). Unedited, the film says how
-opaque each line of sight is, and the particles on it share that out. Where a person changed the flow, and beyond what
-the film ever shows, each keeps the amount that it had at rest: smoke that spreads gets thinner.
+opaque each line of sight is, and the particles on it share that out. Where a person changed the flow, and beside the
+picture, each keeps the amount that it had at rest: smoke that spreads gets thinner.
 """
 
 from __future__ import annotations
@@ -25,11 +25,8 @@ if TYPE_CHECKING:
 WIDEST = 1.0
 """standard deviation of a splat at most, cells: the simulator knows nothing finer"""
 
-APPEARS = 1.0
-"""s, after the end of the film, over which smoke comes to be seen where the film never showed any"""
-
-ABOUT = 2.0
-"""standard deviation (px) up to which the smoke about a particle at rest counts as its own"""
+CARRIED = 0.5
+"""standard deviation of the smoke that a particle carries, cells: the spacing of particles"""
 
 ASTRAY = 6.0
 """cells from the simulated smoke within which smoke that the film shows is shown as well: a plume of ten cells that the
@@ -91,8 +88,7 @@ class SmokeAppearance:
         color, depth = film.layer(min(scene.film_start, len(film) - 1))
         uv, pixel = self._seen(scene.rest.means)
         wide = self._widest(pixel)
-        narrow = np.minimum(wide, ABOUT)  # of the same smoke, and sooner done
-        self._amounts = shared_depth(uv, narrow, depth, np.zeros(len(uv))) * _area(narrow, pixel)
+        self._amounts = shared_depth(uv, CARRIED * wide, depth, np.zeros(len(uv))) * _area(CARRIED * wide, pixel)
         self._colors = sampled(color, uv[:, ::-1] - 0.5)
 
     def _seen(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -118,15 +114,19 @@ class SmokeAppearance:
 
         uv, pixel = self._seen(particles.positions)
         wide = self._widest(pixel)
-        carried = self._amounts[particles.source] / _area(wide, pixel)
+        about = CARRIED * wide
+        carried = self._amounts[particles.source] / _area(about, pixel)
         colors = self._colors[particles.source]
-        depth, share, film = self._depth(uv, wide, carried, self._start + number * self._scene.interval)
-        if film is not None:
-            at = sampled(share, uv[:, ::-1] - 0.5) * self._inside(uv)
-            colors = colors + at[:, None] * (sampled(film, uv[:, ::-1] - 0.5) - colors)
+        inside = ((uv >= 0) & (uv <= np.array(self._camera.size))).all(axis=1)
+        if self._scene.edited:
+            film, depth = None, depth_of(uv, about, carried, self._camera.size)
+        else:
+            film, depth = self._film.at(self._start + number * self._scene.interval, self._whole)
+            colors = np.where(inside[:, None], sampled(film, uv[:, ::-1] - 0.5), colors)
         drawn, widths = drawn_splats(uv, wide, depth, _chance(particles.ids))
-        weight = np.zeros(len(uv))
-        weight[drawn] = shared_depth(uv[drawn], widths[drawn], depth, carried[drawn])
+        widths, weight = np.where(inside, widths, about), np.zeros(len(uv))
+        first = carried * np.square(about / widths)
+        weight[drawn] = shared_depth(uv[drawn], widths[drawn], depth, first[drawn])
         sh = shown.sh.copy()
         sh[:, 1:] = 0.0
         own = self._own_colors(particles.source)
@@ -137,7 +137,7 @@ class SmokeAppearance:
         if film is None or not drawn.any():
             return found
         there = depth_of(uv[drawn], widths[drawn], weight[drawn], self._camera.size)
-        more = self._filled(particles, uv, pixel, np.where(share > LACKING, depth, 0.0), there, film)
+        more = self._filled(particles, uv, pixel, depth, there, film)
         return tuple(join([a, b]) for join, a, b in zip((concatenate, np.concatenate, np.concatenate), found, more))
 
     def _filled(
@@ -181,29 +181,9 @@ class SmokeAppearance:
         moving = near.velocities(rows, columns, each)
         return replace(gaussians, opacities=opacities), 2 * index + 1, moving.astype(particles.velocities.dtype)
 
-    def _depth(
-        self, uv: np.ndarray, wide: np.ndarray, carried: np.ndarray, time: float
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-        """Optical depth of each pixel at a time of the film, how far it is the film's, and the film's colors."""
-        from fluidlift.look.smoke_splats import depth_of
-
-        shown = self._film.shown
-        if self._scene.edited:
-            return depth_of(uv, wide, carried, self._camera.size), np.zeros(shown.shape), None
-        color, depth = self._film.at(time, self._whole)
-        # as long as it lasts, the film shows all that there is
-        after = np.clip((time - (len(self._film) - 1) * self._film.interval) / APPEARS, 0.0, 1.0)
-        share = np.where(shown, 1.0, 1.0 - after)
-        if after > 0.0:
-            depth = share * depth + (1.0 - share) * depth_of(uv, wide, carried, self._camera.size)
-        return depth, share, color
-
     def _own_colors(self, source: np.ndarray) -> np.ndarray:
         painted = self._scene.painted
         return np.zeros(len(source), bool) if painted is None else ~np.all(np.isfinite(painted[source]), axis=1)
-
-    def _inside(self, uv: np.ndarray) -> np.ndarray:
-        return ((uv >= 0) & (uv <= np.array(self._camera.size))).all(axis=1)
 
 
 class _NearestSmoke(NamedTuple):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fluidlift.look.smoke_film import OPAQUE, TINT, SmokeFilm, smoke_color, smoke_layer, smoke_layers
+from fluidlift.look.smoke_film import OPAQUE, TINT, SmokeFilm, behind_smoke, smoke_color, smoke_layer, smoke_layers
 
 SIZE = (64, 80)
 GREY = np.array([0.75, 0.75, 0.8])
@@ -118,3 +118,32 @@ def test_a_film_of_a_few_frames_can_be_played_for_long():
     for count in (1, 2, 5):
         color, depth = film(count).at(7.0, 9.0)
         assert np.isfinite(color).all() and np.isfinite(depth).all()
+
+
+# what is behind it ------------------------------------------------------------------------------------------------
+
+
+def test_what_is_behind_thin_smoke_that_comes_and_goes_is_seen():
+    """All of the middle is always in the mask; the guess there is flat, and the wall is not."""
+    drifting = np.stack([0.5 * np.roll(plume(1.0)[0], 9 * t, axis=1) for t in range(9)])
+    frames, _, behind = pictures(drifting, wall(0.15))
+    masks, guess = np.zeros((9, *SIZE), bool), behind.copy()
+    masks[:, 10:54, 10:70] = True
+    guess[10:54, 10:70] = 77
+    found = behind_smoke(frames, masks, guess)
+    inner = np.s_[14:50, 14:66]
+    assert np.abs(found.astype(int) - behind)[inner].mean() < 0.3 * np.abs(guess.astype(int) - behind)[inner].mean()
+    np.testing.assert_array_equal(found[:10], behind[:10])
+
+
+def test_smoke_that_stands_is_not_taken_for_what_is_behind_it():
+    standing = plume(0.8)[:1] * (1 + 0.05 * np.sin(np.arange(9)))[:, None, None]
+    frames, fluid, behind = pictures(standing, np.full((*SIZE, 3), 0.1))
+    found = behind_smoke(frames, fluid, behind)
+    assert np.abs(found.astype(int) - behind).max() <= 3
+
+
+def test_where_the_guess_is_seen_it_stays():
+    frames, fluid, behind = pictures(plume(0.5), wall(0.2))
+    fluid[0] = False
+    assert behind_smoke(frames, fluid, behind) is behind

@@ -82,7 +82,7 @@ FILES = {
 """where the parts lie, relative to the folder"""
 
 OPTIONAL = frozenset({"film", "force", "motion"})
-"""parts that not every asset has: older smoke has no film, only streams and falls are calibrated, and motion is asked for"""
+"""parts that not every asset has: old smoke has no film, only streams and falls are calibrated, motion is asked for"""
 
 _HASHED = frozenset(FILES) - {"scene"} | {"usd"}
 """parts whose SHA-256 the manifest keeps: all but what a person edits, and what is large"""

@@ -25,6 +25,16 @@ TRIES = 6
 FEWEST = 300
 """pixels, over the frames that are looked at, that tell how opaque smoke is at least: some ten patches of `_gone`"""
 
+LEAST_OF = 8
+"""of so many frames one counts for what a pixel shows with the least smoke"""
+
+GOES = (0.5, 1.5)
+"""by how much smoke changes at a pixel, over how far that is from the background with the least: from the second on
+all of that is background, up to the first all of it smoke"""
+
+STILL = 0.04
+"""change of a pixel (0 to 1, root of the sum over channels) under which smoke stands still: the noise of a clip"""
+
 AGREES = 0.5
 """correlation, over places, of opacity and what has gone of the grain, from which the background is believed; on made
 smoke it is 0.98"""
@@ -98,12 +108,13 @@ def smoke_color(
     require(fluid.shape == frames.shape[:3], f"masks {fluid.shape} for pictures {frames.shape}", "one each")
     back = behind.astype(np.float32) / 255.0
     away = frames.astype(np.float32) / 255.0 - back
-    size = np.where(fluid, np.linalg.norm(away, axis=-1), 0.0)
     if not fluid.any():
         return SmokeColor(np.ones(3), False)
-    thick = fluid & (size >= np.quantile(size[fluid], 1.0 - THICKEST))
+    direction = _direction(away, fluid)
+    along = np.where(fluid, away @ direction, -np.inf)
+    thick = fluid & (along >= np.quantile(along[fluid], 1.0 - THICKEST))
     under = np.broadcast_to(back, away.shape)[thick].mean(axis=0)
-    toward = away[thick].mean(axis=0)
+    toward = direction * max(float(along[thick].mean()), 1e-3)
     own = _grain(back)
     power = _power(own)
     # where smoke always is, the background is a guess, and has no grain that could be told from it
@@ -124,6 +135,51 @@ def smoke_color(
     if a.std() < 1e-3 or g.std() < 1e-3 or np.corrcoef(a, g)[0, 1] < AGREES:
         return SmokeColor(_within(under, toward / OPAQUE), False)
     return SmokeColor(color, True)
+
+
+def behind_smoke(
+    frames: UInt8[np.ndarray, "t h w 3"], fluid: Bool[np.ndarray, "t h w"], guess: UInt8[np.ndarray, "h w 3"]
+) -> UInt8[np.ndarray, "h w 3"]:
+    """A guess of what is behind smoke, as the clip itself shows it where smoke is always there and lets it through.
+
+    A pixel's own picture with the least smoke (the mean of a few) is what is behind, with some smoke. How far it is
+    from the guess towards the smoke's color is background where the smoke comes and goes by more than that, and smoke
+    where it stands; how far it is in other directions is background.
+
+    Args:
+        frames: of the clip, spread over it.
+        fluid: where the smoke is.
+        guess: the picture without it, right where `fluid` is not.
+    """
+    back = guess.astype(np.float32) / 255.0
+    always = np.all(fluid, axis=0)
+    if not always.any():
+        return guess
+    away = frames.astype(np.float32) / 255.0 - back
+    direction = _direction(away, fluid).astype(np.float32)
+    along = away @ direction
+    order = np.argsort(along, axis=0)[: max(len(frames) // LEAST_OF, 1)]
+    least = np.take_along_axis(away, order[..., None], axis=0).mean(axis=0)
+    excess = np.maximum(least @ direction, 0.0)
+    comes = (along.max(axis=0) - excess) / np.maximum(excess, 1.0 / 255.0)
+    smoke = np.clip((GOES[1] - comes) / (GOES[1] - GOES[0]), 0.0, 1.0) * excess
+    found = back + least - smoke[..., None] * direction
+    weight = np.clip(ndimage.distance_transform_edt(always) / (BEYOND * max(always.shape)), 0.0, 1.0)[..., None]
+    return _bytes(back + weight * (found - back))
+
+
+def _direction(away: np.ndarray, fluid: np.ndarray) -> np.ndarray:
+    """Unit vector (sRGB) from the background towards the smoke: what comes and goes is smoke, and what is wrong with
+    the background stays. So each pixel counts by how far it is from its own picture with the least smoke."""
+    size = np.where(fluid, np.linalg.norm(away, axis=-1), np.inf)
+    least = np.take_along_axis(away, size.argmin(axis=0)[None, ..., None], axis=0)
+    moved = np.where(fluid[..., None], away - least, 0.0)
+    far = np.linalg.norm(moved, axis=-1)
+    if far.max() < STILL:  # nothing comes and goes
+        moved, far = np.where(fluid[..., None], away, 0.0), np.where(fluid, size, 0.0)
+    thick = fluid & (far >= np.quantile(far[fluid], 1.0 - THICKEST))
+    mean = moved[thick].mean(axis=0)
+    return mean / max(float(np.linalg.norm(mean)), 1e-6)
 
 
 def _gone(shown: np.ndarray, own: np.ndarray, power: np.ndarray) -> np.ndarray:

@@ -133,30 +133,42 @@ def opacity_of(weight: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
 
 
 @njit(cache=True, nogil=True)
+def _falls_off(middle, sigma, size, out):
+    """exp(-d^2 / 2 sigma^2) along one axis, at the middles of the pixels within `REACH` sigma of a place, into `out`;
+    the first of them and the one after the last."""
+    first = max(int(np.ceil(middle - REACH * sigma)), 0)
+    end = min(int(np.floor(middle + REACH * sigma)), size - 1) + 1
+    for k in range(first, end):
+        out[k - first] = np.exp(-0.5 * ((k - middle) / sigma) ** 2)
+    return first, end
+
+
+@njit(cache=True, nogil=True)
 def _spread(uv, sigma, weight, out):
     """Adds weight x exp(-d^2 / 2 sigma^2) of each splat to the middles of the pixels within `REACH` sigma."""
     height, width = out.shape
+    across, down = np.empty(width), np.empty(height)
     for i in range(len(uv)):
-        reach = REACH * sigma[i]
-        x, y = uv[i, 0] - 0.5, uv[i, 1] - 0.5
-        scale = -0.5 / (sigma[i] * sigma[i])
-        for r in range(max(int(np.ceil(y - reach)), 0), min(int(np.floor(y + reach)), height - 1) + 1):
-            for c in range(max(int(np.ceil(x - reach)), 0), min(int(np.floor(x + reach)), width - 1) + 1):
-                out[r, c] += weight[i] * np.exp(scale * ((r - y) * (r - y) + (c - x) * (c - x)))
+        left, right = _falls_off(uv[i, 0] - 0.5, sigma[i], width, across)
+        top, bottom = _falls_off(uv[i, 1] - 0.5, sigma[i], height, down)
+        for r in range(top, bottom):
+            part = weight[i] * down[r - top]
+            for c in range(left, right):
+                out[r, c] += part * across[c - left]
 
 
 @njit(cache=True, nogil=True)
 def _gathered(uv, sigma, field, out):
     """Mean of a field over each splat, with the weights of `_spread`; -1 beside the picture."""
     height, width = field.shape
+    across, down = np.empty(width), np.empty(height)
     for i in range(len(uv)):
-        reach = REACH * sigma[i]
-        x, y = uv[i, 0] - 0.5, uv[i, 1] - 0.5
-        scale = -0.5 / (sigma[i] * sigma[i])
+        left, right = _falls_off(uv[i, 0] - 0.5, sigma[i], width, across)
+        top, bottom = _falls_off(uv[i, 1] - 0.5, sigma[i], height, down)
         total, weights = 0.0, 0.0
-        for r in range(max(int(np.ceil(y - reach)), 0), min(int(np.floor(y + reach)), height - 1) + 1):
-            for c in range(max(int(np.ceil(x - reach)), 0), min(int(np.floor(x + reach)), width - 1) + 1):
-                w = np.exp(scale * ((r - y) * (r - y) + (c - x) * (c - x)))
-                total += w * field[r, c]
-                weights += w
+        for r in range(top, bottom):
+            for c in range(left, right):
+                part = down[r - top] * across[c - left]
+                total += part * field[r, c]
+                weights += part
         out[i] = total / weights if weights > 0.0 else -1.0

@@ -7,6 +7,7 @@ from typing import Any, cast
 import numpy as np
 
 from fluidlift.errors import InputRejected
+from fluidlift.look.smoke_film import behind_smoke
 from fluidlift.pipeline.settings import GeometrySettings, GivenView
 from fluidlift.pipeline.sight import Sight, Sighted, mainstream_of, sighted
 from fluidlift.pipeline.work import Work
@@ -31,6 +32,9 @@ from fluidlift.types import (
 )
 from fluidlift.types.fluid_masks import FluidMasks
 from fluidlift.types.stages import Flow, Geometry, Read, Segmentation
+
+BEHIND = 24
+"""frames that what is behind smoke is looked for in"""
 
 
 def geometry(
@@ -130,6 +134,10 @@ def _coloured(
     on_ground = setting.surface_height is not None
     plate = generate.background_plate(clip.frames, cast(Any, fluid), solid, shore=on_ground)
     picture = plate.image
+    if seen.kind.is_gas:
+        pick = np.unique(np.linspace(0, len(clip) - 1, BEHIND).round().astype(int))
+        masks = np.stack([fluid[t] for t in pick]) & ~plate.seen
+        picture = behind_smoke(clip.frames[pick], masks, picture)
     if on_ground:
         labels = ground.seen_labels(fluid, seen.start, seen.united, falls)
         view = ground_texture.View(picture, camera, labels, np.asarray(plate.seen))

@@ -3,7 +3,16 @@
 import numpy as np
 import pytest
 
-from fluidlift.look.smoke_film import OPAQUE, TINT, SmokeFilm, behind_smoke, smoke_color, smoke_layer, smoke_layers
+from fluidlift.look.smoke_film import (
+    OPAQUE,
+    TINT,
+    SmokeFilm,
+    behind_smoke,
+    shown_from,
+    smoke_color,
+    smoke_layer,
+    smoke_layers,
+)
 
 SIZE = (64, 80)
 GREY = np.array([0.75, 0.75, 0.8])
@@ -147,3 +156,10 @@ def test_where_the_guess_is_seen_it_stays():
     frames, fluid, behind = pictures(plume(0.5), wall(0.2))
     fluid[0] = False
     assert behind_smoke(frames, fluid, behind) is behind
+
+
+def test_smoke_counts_from_the_opacity_that_its_masks_go_to():
+    opacities = np.rint(255 * plume(0.8)).astype(np.uint8)
+    for bound in (0.05, 0.2, 0.5):
+        assert shown_from(opacities, opacities > 255 * bound, 0.15) == pytest.approx(bound, abs=0.006)
+    assert shown_from(opacities, np.zeros(opacities.shape, bool), 0.15) == 0.15

@@ -304,3 +304,20 @@ class SmokeFilm:
     def shown(self) -> Bool[np.ndarray, "h w"]:
         """Where there is smoke at any time."""
         return self.opacities.max(axis=0) > 255.0 * SHOWN
+
+
+def shown_from(opacities: UInt8[np.ndarray, "t h w"], fluid: Bool[np.ndarray, "t h w"], usual: float) -> float:
+    """Opacity (0 to 1) from which a film's smoke counts as such in its masks: with it as the bound, both overlap best.
+
+    Args:
+        opacities: of the film, of 255.
+        fluid: the masks of the same frames.
+        usual: where there is no smoke.
+    """
+    inside, outside = (np.bincount(opacities[part], minlength=256) for part in (fluid, ~fluid))
+    if not inside.any():
+        return usual
+    # of each bound: what is as opaque or more
+    both, beside = (np.cumsum(part[::-1])[::-1] for part in (inside, outside))
+    overlap = both / (inside.sum() + beside)
+    return float((1 + overlap[1:].argmax()) / 255.0)

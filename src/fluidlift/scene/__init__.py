@@ -23,6 +23,8 @@ Modules of the face:
     simulation          A scene played frame by frame, with a checkpoint every few frames that another run goes on
                         from
     simulator           The simulator of a scene, at its first instant
+    smoke_appearance    What the splats of simulated smoke look like in each frame: as thin as its film shows it, or
+                        as it was carried
     splat_files         Where an asset keeps the frames of its simulation, and what goes on from them
     surface_appearance  What the splats of a simulated fluid look like in each frame
     whitewater          The white water of a scene: how much of it its clip asks for, and its splats, frame by frame
@@ -57,5 +59,5 @@ __all__ = [
     "Add", "Change", "EditSession", "Remove", "Scene", "Set", "SimulationRequest", "build", "coarse_copy",
     "dry_cells", "edit_history", "edited_scene", "edits", "footage", "force_weight", "forecast", "open_water", "recall",
     "reshaping", "scene_of", "settings", "simulated_history", "simulation", "simulator", "simulator_of",
-    "splat_files", "surface_appearance", "whitewater",
+    "smoke_appearance", "splat_files", "surface_appearance", "whitewater",
 ]  # fmt: skip

@@ -123,6 +123,14 @@ def test_beyond_its_end_it_goes_on_without_a_jump():
     assert np.ptp(depths[30:]) > 0.8 * np.ptp(filmed)  # and does not stand still
 
 
+def test_smoke_that_still_comes_to_new_places_at_the_end_spreads():
+    v, u = np.mgrid[:40, :40]
+    for rises, wanted in ((0.0, False), (0.8, True)):
+        top = [30 - rises * t + 1.5 * np.sin(t) for t in range(24)]
+        frames = np.stack([np.where((v > y) & (np.abs(u - 20) < 6), 150, 0) for y in top]).astype(np.uint8)
+        assert SmokeFilm(np.zeros((*frames.shape, 3), np.uint8), frames, 0.04).spreads == wanted
+
+
 def test_a_film_of_a_few_frames_can_be_played_for_long():
     for count in (1, 2, 5):
         color, depth = film(count).at(7.0, 9.0)

@@ -8,7 +8,7 @@ import pytest
 from fluidlift.io.footage_file import write_smoke
 from fluidlift.look.rasterize import render
 from fluidlift.look.smoke_film import SmokeFilm
-from fluidlift.scene.smoke_appearance import ASTRAY, FAINT, SmokeAppearance
+from fluidlift.scene.smoke_appearance import ASTRAY, FAINT, HANDED_OVER, SmokeAppearance
 from fluidlift.scene.surface_appearance import SurfaceAppearance
 from fluidlift.types import Gaussians, Particles
 
@@ -118,6 +118,21 @@ def test_beside_the_picture_smoke_keeps_its_amount(channel):
     back = replace(gaussians, means=(gaussians.means - [2.0, 0.0, 0.0]).astype(np.float32))
     taken = -np.log1p(-alpha(back, scene)).sum()
     assert taken == pytest.approx(-np.log1p(-(puff().opacities[0] / 255.0)).sum(), rel=0.15)
+
+
+def test_after_the_end_of_its_film_smoke_that_still_spread_goes_on_as_simulated(channel):
+    scene, film = replace(smoke(channel), frames=100), puff(0.4)
+    steady = np.repeat(film.opacities[:1], FRAMES, axis=0)
+    late = steady.copy()
+    late[:7, :, 34:] = 0  # comes to the right half at the end
+    for opacities, wanted in ((steady, False), (late, True)):
+        one = SmokeFilm(film.colors, opacities, INTERVAL)
+        assert one.spreads == wanted
+        away = replace(scene.body, positions=(scene.body.positions + [0.0, 0.25, 0.0]).astype(np.float32))
+        number = FRAMES + round(HANDED_OVER / INTERVAL) + 1
+        seen = alpha(shown(scene, one, number, away)[0], scene)
+        row = float((seen.sum(axis=1) * np.arange(48)).sum() / seen.sum())
+        assert (abs(row - 23.5) > 6) == wanted  # where the simulation has it, or where the film did
 
 
 @pytest.mark.parametrize("fault", ["missing", "damaged"])

@@ -78,6 +78,10 @@ LATE = 1 / 3
 SHOWN = 0.02
 """opacity from which a place shows smoke"""
 
+NEW = 0.05
+"""part of the smoke of the last frame in places that showed none in the first two thirds, from which it still spreads:
+eddies of a steady plume reach beyond its outline by less"""
+
 
 @dataclass(frozen=True)
 class SmokeColor:
@@ -300,10 +304,19 @@ class SmokeFilm:
             return max(end, 0)
         return first + int(np.abs(small[first:end] - small[-1]).mean(axis=(1, 2)).argmin())
 
+    @property
+    def end(self) -> float:
+        """s, of its last frame"""
+        return (len(self) - 1) * self.interval
+
     @cached_property
-    def shown(self) -> Bool[np.ndarray, "h w"]:
-        """Where there is smoke at any time."""
-        return self.opacities.max(axis=0) > 255.0 * SHOWN
+    def spreads(self) -> bool:
+        """Whether the smoke still comes to places at the end where it never was before: then it is no steady plume."""
+        late = round((1.0 - LATE) * len(self))
+        if not 0 < late < len(self):
+            return False
+        new = self.opacities[:late].max(axis=0) <= 255.0 * SHOWN
+        return float(self.opacities[-1][new].sum()) > NEW * float(self.opacities[-1].sum())
 
 
 def shown_from(opacities: UInt8[np.ndarray, "t h w"], fluid: Bool[np.ndarray, "t h w"], usual: float) -> float:

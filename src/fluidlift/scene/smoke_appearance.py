@@ -1,8 +1,9 @@
 """What the splats of simulated smoke look like in each frame: as thin as its film shows it, or as it was carried.
 
 A particle carries an amount of smoke, which is the area that its splat would darken (m^2). Unedited, the film says how
-opaque each line of sight is, and the particles on it share that out. Where a person changed the flow, and beside the
-picture, each keeps the amount that it had at rest: smoke that spreads gets thinner.
+opaque each line of sight is, and the particles on it share that out. Where a person changed the flow, beside the
+picture, and after the end of a film in which the smoke still spread, each keeps the amount that it had at rest: smoke
+that spreads gets thinner.
 """
 
 from __future__ import annotations
@@ -24,6 +25,9 @@ if TYPE_CHECKING:
 
 WIDEST = 1.0
 """standard deviation of a splat at most, cells: the simulator knows nothing finer"""
+
+HANDED_OVER = 0.5
+"""s after the end of the film over which smoke that still spread there goes on as it is simulated"""
 
 CARRIED = 0.5
 """standard deviation of the smoke that a particle carries, cells: the spacing of particles"""
@@ -118,11 +122,15 @@ class SmokeAppearance:
         carried = self._amounts[particles.source] / _area(about, pixel)
         colors = self._colors[particles.source]
         inside = ((uv >= 0) & (uv <= np.array(self._camera.size))).all(axis=1)
-        if self._scene.edited:
-            film, depth = None, depth_of(uv, about, carried, self._camera.size)
-        else:
-            film, depth = self._film.at(self._start + number * self._scene.interval, self._whole)
-            colors = np.where(inside[:, None], sampled(film, uv[:, ::-1] - 0.5), colors)
+        time, film, filmed = self._start + number * self._scene.interval, None, np.zeros(0)
+        share = self._filmed(time)
+        own = depth_of(uv, about, carried, self._camera.size) if share < 1.0 else 0.0
+        if share > 0.0:
+            film, filmed = self._film.at(time, self._whole)
+            at = share * inside[:, None]
+            colors = (1.0 - at) * colors + at * sampled(film, uv[:, ::-1] - 0.5)
+            filmed = share * filmed
+        depth = np.asarray(own if film is None else filmed + (1.0 - share) * own)
         drawn, widths = drawn_splats(uv, wide, depth, _chance(particles.ids))
         widths, weight = np.where(inside, widths, about), np.zeros(len(uv))
         first = carried * np.square(about / widths)
@@ -137,7 +145,7 @@ class SmokeAppearance:
         if film is None or not drawn.any():
             return found
         there = depth_of(uv[drawn], widths[drawn], weight[drawn], self._camera.size)
-        more = self._filled(particles, uv, pixel, depth, there, film)
+        more = self._filled(particles, uv, pixel, filmed, there, film)
         return tuple(join([a, b]) for join, a, b in zip((concatenate, np.concatenate, np.concatenate), found, more))
 
     def _filled(
@@ -180,6 +188,14 @@ class SmokeAppearance:
         opacities = np.maximum(opacity_of(weight), FAINT).astype(np.float32)
         moving = near.velocities(rows, columns, each)
         return replace(gaussians, opacities=opacities), 2 * index + 1, moving.astype(particles.velocities.dtype)
+
+    def _filmed(self, time: float) -> float:
+        """How far the film says at a time of it how thin the smoke is, 0 to 1."""
+        if self._scene.edited:
+            return 0.0
+        if not self._film.spreads:
+            return 1.0
+        return float(np.clip(1.0 - (time - self._film.end) / HANDED_OVER, 0.0, 1.0))
 
     def _own_colors(self, source: np.ndarray) -> np.ndarray:
         painted = self._scene.painted

@@ -3,6 +3,7 @@
     python benchmarks/surveyed_river.py                                 velocities of the surface, from the clip alone
     python benchmarks/surveyed_river.py --openpiv PYTHON                and OpenPIV's on the same frames
     python benchmarks/surveyed_river.py pisco.fluid --openpiv PYTHON    and depth and discharge of an asset
+    python benchmarks/surveyed_river.py pisco.fluid --camera --dry      of one that is made with a camera by the map
 
 The case lies below FLUIDLIFT_SHARED (or a folder `shared` beside the repository) in `cases/pisco`: a clip, the map
 from its pixels to metres on the water, the surveyed section, and RIVeR's velocities at some hundred nodes (medians of
@@ -18,8 +19,9 @@ Discharge by velocity-area, as RIVeR does it: surface speed across the section, 
 in its example; 0.85 is usual). Where a program has measured nothing, its speed is drawn straight between the stations
 beside, and to zero at the banks. RIVeR's own nodes go through the same sum, beside what RIVeR itself makes of them.
 An asset's discharge is that of its own bed: what passes its sections per second, the median over them, at the size at
-which the river is as wide as surveyed (lengths and speeds grow alike, a discharge with their third power); its depth is
-the greatest of each section over its width.
+which the surveyed section is as long as surveyed (lengths and speeds grow alike, a discharge with their third power):
+its ends are looked for on the asset's water by the asset's camera. Its depth is the greatest of the sections that
+this one crosses, and over width it is that of each section over its own.
 """
 
 from __future__ import annotations
@@ -29,6 +31,7 @@ import csv
 import functools
 import json
 import platform
+import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,7 +49,7 @@ from fluidlift.io.asset_folder import load_asset
 from fluidlift.io.video import read_clip
 from fluidlift.motion.optical_flow import estimate_flow, mean_flow
 from fluidlift.pipeline import Inputs, make
-from fluidlift.types import CellType
+from fluidlift.types import CellType, FluidAsset
 
 SURVEYED = (1920, 1080)
 """px of the pictures that the case's map and nodes belong to"""
@@ -58,6 +61,8 @@ NEAR = 3
 """px around a node or a station, over which the median is taken"""
 CLOSE = 0.25
 """share of RIVeR's speed within which a node counts as near"""
+FOCAL = 1500.0
+"""px of the surveyed pictures: the map alone says 1300 by its lengths and 1730 by its angles"""
 RIVER_DISCHARGE, RIVER_ERROR = 50.5, 9.1
 """m3/s, and its uncertainty: what RIVeR gives out for this clip"""
 
@@ -257,26 +262,62 @@ def of_asset(folder: Path, case: Case) -> dict[str, float]:
     deepest = np.zeros(len(count))
     np.maximum.at(deepest, own[columns], deep[columns])
     middle = count > 0.5 * np.median(count[count > 0])
-    width = float(np.median(wide[middle]))
-    surveyed = float(np.ptp(case.survey[:, 0]))
-    share = float(np.median(deepest[middle] / wide[middle]))
+    own_water = np.isin(asset.cell_types, (CellType.FLUID, CellType.INFLOW))  # outlets reach up to the air
+    places = on_water(asset, own_water, case.section.pixels * (np.array(asset.camera.size) / SURVEYED))
+    length = float(np.linalg.norm(places[-1] - places[0]))
+    size = float(np.ptp(case.section.along)) / length
+    inside = np.floor((places[:, :2] - grid.low[:2]) / h).astype(int)
+    here = np.unique(own[tuple(np.clip(inside, 0, np.array(own.shape) - 1).T)])
     return {
-        "greatest depth over width": share,
-        "greatest depth": share * surveyed,
-        "discharge of its own bed": float(np.median(through[middle])) * (surveyed / width) ** 3,
-        "mean speed": float(np.median(through[middle] / (count[middle] * h * h))) * surveyed / width,
-        "width before that": width,
+        "greatest depth over width": float(np.median(deepest[middle] / wide[middle])),
+        "greatest depth": float(np.median(deepest[here])) * size,
+        "area of its sections": float(np.median(count[here])) * (h * size) ** 2,
+        "discharge of its own bed": float(np.median(through[middle])) * size**3,
+        "mean speed": float(np.median(through[here] / (np.maximum(count[here], 1) * h * h))) * size,
+        "width before that": length,
     }
 
 
-def made(folder: Path, case: Case) -> Path:
-    """The asset; made of the clip alone where there is none."""
+def on_water(asset: FluidAsset, liquid: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Places [n,3] of pixels of the asset's camera on the plane through the top of its `liquid` cells, m."""
+    grid = asset.grid
+    top = grid.low[2] + (grid.shape[2] - np.argmax(liquid[:, :, ::-1], axis=2)) * grid.spacing
+    wet = np.asarray(liquid.any(axis=2))
+    at = grid.centers()[:, :, 0, :2][wet]
+    plane, *_ = np.linalg.lstsq(np.c_[at, np.ones(len(at))], top[wet], rcond=None)
+    rays, eye, up = asset.camera.rays(pixels), asset.camera.position, np.array([-plane[0], -plane[1], 1.0])
+    return eye + ((plane[2] - eye @ up) / (rays @ up))[:, None] * rays
+
+
+def made(folder: Path, case: Case, with_camera: bool) -> Path:
+    """The asset; made of the clip alone where there is none, or of the clip and a camera by the map."""
     if not (folder / "manifest.json").is_file():
-        make(Inputs(case.folder / "video.mp4"), folder, build_config("draft"))
+        with tempfile.TemporaryDirectory() as scratch:
+            camera = Path(scratch) / "camera.json"
+            camera.write_text(json.dumps(camera_of(case)), encoding="utf-8")
+            inputs = Inputs(case.folder / "video.mp4", camera=camera if with_camera else None)
+            make(inputs, folder, build_config("draft"))
     return folder
 
 
-UNITS = {"discharge": "m3/s", "its uncertainty": "m3/s", "greatest depth": "m", "mean speed": "m/s", "width": "m"}
+def camera_of(case: Case) -> dict[str, Any]:
+    """A camera file (m, z up, the water at 0): the rotation that is nearest to the map at `FOCAL`."""
+    to_pixels = np.linalg.inv(case.map)
+    k = np.array([[FOCAL, 0.0, SURVEYED[0] / 2], [0.0, FOCAL, SURVEYED[1] / 2], [0.0, 0.0, 1.0]])
+    found = np.linalg.inv(k) @ to_pixels
+    found *= np.sign(found[2] @ [*metres(case.map, case.nodes[0]).mean(axis=0), 1.0])  # the water lies before it
+    found /= np.linalg.norm(found[:, :2], axis=0).mean()
+    u, _, v = np.linalg.svd(found[:, :2], full_matrices=False)
+    axes = u @ v
+    rotation = np.column_stack([axes, np.cross(axes[:, 0], axes[:, 1])])
+    size = FULL / SURVEYED[0]
+    k[:2] *= size
+    return {"width": FULL, "height": round(size * SURVEYED[1]), "K": k.tolist(), "R": rotation.tolist(),
+            "t": found[:, 2].tolist(), "water_level_z": 0.0}  # fmt: skip
+
+
+UNITS = {"discharge": "m3/s", "its uncertainty": "m3/s", "greatest depth": "m", "mean speed": "m/s", "width": "m",
+         "area": "m2"}  # fmt: skip
 """of figures by their beginning; the others have none"""
 
 
@@ -290,6 +331,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("asset", nargs="?", type=Path, help="made where it is not there")
     parser.add_argument("--openpiv", help="interpreter that has the package openpiv")
+    parser.add_argument("--camera", action="store_true", help="make the asset with a camera by the map")
     parser.add_argument("--dry", action="store_true", help="write no results")
     args = parser.parse_args()
     shared = default_shared()
@@ -298,7 +340,9 @@ def main() -> None:
     case = Case(shared / "cases" / "pisco")
     width = float(np.ptp(case.survey[:, 0]))
     found = {"survey": {"greatest depth over width": case.section.deepest / width,
-                        "greatest depth": case.section.deepest}, "RIVeR": river(case)}  # fmt: skip
+                        "greatest depth": case.section.deepest,
+                        "area of its sections": float(np.trapezoid(case.section.depth, case.section.along))},
+             "RIVeR": river(case)}  # fmt: skip
     mine = ours(case)
     found["ours"] = beside_river(case, *mine)
     if args.openpiv:
@@ -307,7 +351,7 @@ def main() -> None:
         both = [np.linalg.norm(v[0], axis=1) for v in (mine, theirs)]
         found["ours"]["speed over OpenPIV's, median of nodes"] = float(np.nanmedian(both[0] / both[1]))
     if args.asset is not None:
-        found["our asset"] = of_asset(made(args.asset, case), case)
+        found["our asset"] = of_asset(made(args.asset, case, args.camera), case)
     for subject, figures in found.items():
         for name, value in figures.items():
             print(f"{subject:10} {name:55} {value:8.3g} {unit_of(name)}")

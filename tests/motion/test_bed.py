@@ -161,6 +161,19 @@ def test_films_of_honey_are_told_from_rivers_by_their_speed_for_slope_and_depth(
     assert film_share(level, still, 0.3) == 0.0
 
 
+def test_a_river_on_a_slope_that_was_guessed_is_no_film_and_honey_on_a_steep_one_is() -> None:
+    # 2 m/s and 2 m deep, level, seen as a tenth of that on a plane that falls by 5 degrees, give or take 8
+    points, velocities = sloping_surface(np.tan(np.radians(5)), 0.2)
+    assert film_share(points, velocities, 0.2) == 1.0  # were the slope known
+    assert film_share(points, velocities, 0.2, slope_error=np.tan(np.radians(8))) == 0.0
+    # honey on 22 degrees: no error of 8 makes water as slow as this
+    speed = 9.81 * np.sin(np.radians(22)) * 0.04**2 / (2 * 0.007)
+    points, velocities = sloping_surface(np.tan(np.radians(22)), speed)
+    assert film_share(points, velocities, 0.04, slope_error=np.tan(np.radians(8))) > 0.75
+    # a slope that is said to be better known than one view shows is not taken at its word
+    assert film_share(points, velocities, 0.04, slope_error=0.0) == film_share(points, velocities, 0.04)
+
+
 def test_a_stream_that_gains_speed_as_it_falls_has_no_friction_to_explain() -> None:
     points, velocities = sloping_surface(0.3, 1.0)
     fast = np.sqrt(0.05**2 + 2 * 9.81 * 0.3 * points[:, :1])  # z + v^2 / 2g is the same everywhere

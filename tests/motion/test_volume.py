@@ -201,6 +201,22 @@ def test_a_stream_too_slow_for_its_slope_drags_through_its_depth_like_a_viscous_
     assert share(2.0) > share(0.6) > share(0.2)  # by degrees
 
 
+def test_a_slow_stream_whose_slope_may_be_an_error_keeps_its_speed_through_its_depth() -> None:
+    # one section, 0.2 m/s, falls by one in twelve: as it stands a film, whose mean is 2/3 of the surface's speed;
+    # level within one standard error of one in ten, a river, whose mean is 0.85 of it and more
+    types, grid = channel(36, 6, 9, 6)
+    height = 6 - np.arange(36) // 12
+    for i, n in enumerate(height):
+        types[i, :, 1 + n :] = CellType.EMPTY
+    surface = surface_of(grid, 0.0, [0.2, 0, 0])
+    surface.points[:, 2] = 0.1 * (height[grid.cell_of(surface.points)[:, 0]] + 0.9)
+    known, unknown = (
+        volume_velocity(surface, None, types, grid, kind="stream", slope_error=error)[1] for error in (0.0, 0.1)
+    )
+    assert known.viscous == 1.0 and unknown.viscous == 0.0
+    assert unknown.flux_out > 1.2 * known.flux_out
+
+
 def test_an_outlet_that_is_too_small_lets_the_surface_yield_before_it_speeds_up() -> None:
     types, grid = channel(30)
     types[28:, :, 4:] = CellType.EMPTY

@@ -14,6 +14,7 @@ from fluidlift.shape.cross_section import (
     rock_height,
     swiftness,
     thickness,
+    usual_depth,
 )
 
 H, WIDTH = 0.05, 1.0
@@ -31,6 +32,32 @@ def reach(*, speed=None, fall=0.0, rock=None):
 def test_a_stream_of_one_speed_is_as_deep_everywhere():
     water, _, _ = reach(speed=lambda x: 0 * x + 0.7)
     np.testing.assert_allclose(depth_along(water, 0.2, WIDTH, "stream"), 0.2, rtol=1e-6)
+
+
+def parker(discharge: float, gravel: float) -> tuple[float, float]:
+    """Width and mean depth (m) of a river full to its banks, m3/s and m (Parker and others 2007)."""
+    q = (discharge**2 / 9.81) ** 0.2
+    return 4.63 * q * (discharge / (np.sqrt(9.81 * gravel) * gravel**2)) ** 0.0667, 0.382 * q
+
+
+@pytest.mark.parametrize("discharge", [5.0, 50.0, 500.0, 5000.0])
+def test_a_river_in_metres_is_as_deep_as_gravel_rivers_of_its_width(discharge: float) -> None:
+    width, depth = parker(discharge, 0.05)
+    assert usual_depth(width, 0.2) == pytest.approx(depth, rel=0.02)
+    # sand-like and boulder-like gravel differ by less than what a fifth of the width is off
+    for gravel in (0.0125, 0.2):
+        width, depth = parker(discharge, gravel)
+        assert usual_depth(width, 0.2) == pytest.approx(depth, rel=0.25)
+        assert 0.2 * width > 3.0 * depth
+
+
+def test_small_channels_keep_their_share_and_depth_grows_with_width_without_a_jump() -> None:
+    assert usual_depth(0.5, 0.2) == pytest.approx(0.1) and usual_depth(1.0, 0.2) == pytest.approx(0.2)
+    widths = np.geomspace(0.2, 300.0, 400)
+    depths = np.array([usual_depth(w, 0.2) for w in widths])
+    steps = np.diff(np.log(depths)) / np.diff(np.log(widths))
+    assert (steps > 0).all() and (steps < 1.0 + 1e-9).all()  # never deeper for its width than a narrower one
+    assert usual_depth(20.0, 0.01) == pytest.approx(0.2)  # what is said to be shallow is not made deeper
 
 
 def test_without_speeds_the_width_alone_decides():

@@ -347,6 +347,25 @@ def test_where_the_clip_is_not_known_nothing_is_a_wall():
     np.testing.assert_array_equal(plain.phi, unknown.phi)
 
 
+@pytest.mark.parametrize("closed", [False, True])
+def test_a_river_of_known_metres_is_shallow_and_a_pond_and_an_assumed_size_are_not(closed):
+    camera = PinholeCamera.looking((0.0, -60.0, 60.0), (0.0, 0.0, 0.0), 50.0, (132, 96))
+    rays = camera.rays(camera.pixel_grid())
+    ground = camera.position - rays * (camera.position[2] / rays[..., 2])[..., None]
+    labels = np.where(np.abs(ground[..., 1]) < 12.0, Label.FLUID, Label.BACKGROUND).astype(np.uint8)
+    water, along = ground[labels == Label.FLUID], np.array([1.0, 0, 0])
+    seen = Footage(PlaneHeight((0.0, 0.0), 0.0), labels, water, camera, along, closed=closed)
+    deepest = []
+    for in_metres in (False, True):
+        setting = channel_setting(seen, ChannelConfig("stream", 48, 120_000, in_metres=in_metres))
+        wet = (setting.cell_types == CellType.FLUID).any(axis=2)
+        deepest.append(float((setting.surface_height - setting.bed_height)[wet].max()))
+    if closed:
+        assert deepest[0] == deepest[1]
+    else:  # 24 m wide: a fifth of it, and 1.0 m by Parker and others 2007, to a cell
+        assert deepest[0] == pytest.approx(4.8, abs=0.5) and deepest[1] == pytest.approx(1.0, abs=0.3)
+
+
 def test_a_closed_puddle_has_a_bank_on_all_sides():
     camera = PinholeCamera.looking((0.0, -3.0, 3.0), (0.0, 0.0, 0.0), 50.0, (132, 96))
     rays = camera.rays(camera.pixel_grid())

@@ -22,7 +22,8 @@ gauging with floats uses (Rantz 1982, USGS Water-Supply Paper 2175: 0.85 to 0.86
 GRAVITY = 9.81
 """m/s^2"""
 SLOPE_ERROR = 0.05
-"""slope that a stream must exceed to count: 3 degrees, the error of a pitch that was estimated from one view"""
+"""slope that a stream must exceed to count, at least: 3 degrees. One view tells no pitch better than that; where less
+is known of the slope, that error counts"""
 VISCOUS_RATIO, TURBULENT_RATIO = 1.0, 2.5
 """Surface speed over the shear velocity sqrt(g h S), up to which a stream is surely a viscous film, and from which on
 it is taken to be turbulent. Water is faster than the first for its slope and depth even among boulders twice as tall
@@ -120,12 +121,23 @@ def speed_share(
     return profile(distance, np.asarray(depth, np.float64))
 
 
-def film_share(points: Float[np.ndarray, "n 3"], velocities: Float[np.ndarray, "n 3"], depth: float) -> float:
+def film_share(
+    points: Float[np.ndarray, "n 3"],
+    velocities: Float[np.ndarray, "n 3"],
+    depth: float,
+    *,
+    slope_error: float = SLOPE_ERROR,
+) -> float:
     """How surely a stream is a viscous film, 0 to 1: whether it is too slow for its slope to be turbulent.
 
     The energy line z + v^2 / 2g over the surface falls along the stream by what friction takes; its slope S, the depth
     h and gravity give the shear velocity sqrt(g h S) of a steady stream, and the surface speed over that is compared
-    with `VISCOUS_RATIO` and `TURBULENT_RATIO`. It goes with the root of the scale, so an assumed size does little.
+    with `VISCOUS_RATIO` and `TURBULENT_RATIO`. It goes with the root of the scale: a size that was assumed ten times
+    too small makes it a third.
+
+    Nearly all hangs on S, whose error is the picture's and not the fluid's: a level river that is guessed to fall by 5
+    degrees is several times too slow for that. So what counts is what is left of the slope after one standard error: a
+    film must fall surely.
 
     A fluid is the same all along: where one of `SECTIONS` pieces is hardly a film, the whole is none, if another is
     surely steep. Taken at once, a chute and the pool below it are as steep as both together and as slow as the pool.
@@ -134,31 +146,37 @@ def film_share(points: Float[np.ndarray, "n 3"], velocities: Float[np.ndarray, "
         points: of the surface, m, z up.
         velocities: m/s.
         depth: typical, m.
+        slope_error: standard error of the surface's slope (rise over run); below `SLOPE_ERROR` that counts.
     """
+    error = max(slope_error, SLOPE_ERROR)
     speed = np.linalg.norm(velocities, axis=-1).astype(np.float64)
     along = np.asarray(velocities, np.float64)[:, :2].sum(axis=0)
     along = along / max(float(np.linalg.norm(along)), 1e-12)
     s = np.asarray(points, np.float64)[:, :2] @ along
     order = np.argsort(s, kind="stable")
-    whole, _ = _film_share_of(np.asarray(points), speed, along, depth)
+    whole, _ = _film_share_of(np.asarray(points), speed, along, depth, error)
     if whole == 0.0 or len(order) < SECTIONS * FEWEST:
         return whole
     pieces = np.array_split(order, SECTIONS)
-    shares, falls = zip(*(_film_share_of(np.asarray(points)[p], speed[p], along, depth) for p in pieces))
-    # a slope over a part of the length has that much more error: a jet on a puddle makes one piece seem steep
-    known = max(falls) + SLOPE_ERROR > SECTIONS**1.5 * SLOPE_ERROR
+    shares, falls = zip(*(_film_share_of(np.asarray(points)[p], speed[p], along, depth, error) for p in pieces))
+    # a slope over a part of the length has that much more error: a jet on a puddle makes one piece seem steep. How the
+    # whole plane leans is wrong for all pieces alike, and says nothing of their differences
+    known = max(falls) > SECTIONS**1.5 * SLOPE_ERROR
     return whole * min(2.0 * min(shares), 1.0) if known else whole  # pieces scatter more than the whole
 
 
-def _film_share_of(points: np.ndarray, speed: np.ndarray, along: np.ndarray, depth: float) -> tuple[float, float]:
-    """`film_share` of a piece whose surface is a plane, and by how much its slope exceeds `SLOPE_ERROR`."""
+def _film_share_of(
+    points: np.ndarray, speed: np.ndarray, along: np.ndarray, depth: float, slope_error: float
+) -> tuple[float, float]:
+    """`film_share` of a piece whose surface is a plane, and its slope."""
     head = points[:, 2] + speed**2 / (2.0 * GRAVITY)
     flat = np.asarray(points, np.float64)[:, :2]
     fall, *_ = np.linalg.lstsq(flat - flat.mean(axis=0), head - head.mean(), rcond=None)
-    slope = -float(fall @ along) - SLOPE_ERROR
-    if slope <= 0:
+    slope = -float(fall @ along)
+    sure = slope - slope_error
+    if sure <= 0:
         return 0.0, slope
-    ratio = float(np.median(speed)) / np.sqrt(GRAVITY * depth * slope)
+    ratio = float(np.median(speed)) / np.sqrt(GRAVITY * depth * sure)
     return float(np.clip((TURBULENT_RATIO - ratio) / (TURBULENT_RATIO - VISCOUS_RATIO), 0.0, 1.0)), slope
 
 

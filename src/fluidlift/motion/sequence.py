@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from fluidlift.errors import require
 from fluidlift.motion.air import with_air
-from fluidlift.motion.bed import WALLS
+from fluidlift.motion.bed import SLOPE_ERROR, WALLS
 from fluidlift.motion.circulation import circulating
 from fluidlift.motion.direction import mainstream_direction
 from fluidlift.motion.free_fall import downhill_of, with_free_fall
@@ -71,6 +71,8 @@ class MotionScene:
     """z below which a pour stands in its vessel, m"""
     prior: tuple[Float[np.ndarray, "h w 2"], Float[np.ndarray, "h w"]] | None = None
     """mean motion of the clip, px/frame, and its confidence: a neighbour more for what a frame did not see"""
+    slope_error: float = SLOPE_ERROR
+    """standard error of the slope (rise over run) of a stream's surface along it"""
 
     def __post_init__(self) -> None:
         require(self.interval > 0, f"interval {self.interval}", "positive seconds")
@@ -277,7 +279,10 @@ class _Clip:
 def _solver(scene: MotionScene, options: MotionOptions) -> VolumeSolver:
     terrain, cells = scene.terrain, scene.cell_types
     assert terrain is not None and cells is not None
-    return VolumeSolver(terrain, cells, terrain.grid, kind=scene.kind, mainstream=terrain.mainstream, wall=options.wall)
+    return VolumeSolver(
+        terrain, cells, terrain.grid, kind=scene.kind, mainstream=terrain.mainstream, wall=options.wall,
+        slope_error=scene.slope_error,
+    )  # fmt: skip
 
 
 def _frame_motion(

@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 
 from fluidlift.errors import require
-from fluidlift.motion.bed import WALLS, bed_velocity, film_share, speed_share
+from fluidlift.motion.bed import SLOPE_ERROR, WALLS, bed_velocity, film_share, speed_share
 from fluidlift.motion.extrapolation import (
     SNAP_CELLS,
     harmonic_extension,
@@ -129,6 +129,7 @@ class VolumeSolver:
         kind: str | FluidKind,
         mainstream: Float[np.ndarray, "3"] | None = None,
         wall: str = "cubic",
+        slope_error: float = SLOPE_ERROR,
         options: VolumeOptions | None = None,
     ) -> None:
         """Prepare; see `volume_velocity`."""
@@ -149,6 +150,7 @@ class VolumeSolver:
         # the paper's layer is for fluid that is not viscous; whether a stream is shows only in its motion
         asked = kind.runs_nearly_level and wall == "cubic" and self._share is not None
         self._film = replace(self._bed, wall="film").share() if asked else None
+        self._slope_error = slope_error
         # fluid passes freely through both ends
         self._system = build_system(np.where(types == CellType.INFLOW, CellType.OUTFLOW, types), terrain, grid)
         self._nearest, self._ends = nearest_cells(carrying), end_faces(types)
@@ -220,9 +222,11 @@ class VolumeSolver:
 
     def _viscous(self, surface: SurfaceMotion) -> float:
         """How surely this is a viscous film, 0 to 1; 0 where it is not asked."""
+        if self._film is None:
+            return 0.0
         known = surface.observed if surface.observed.any() else slice(None)
         points, velocities = surface.points[known], surface.velocities[known]
-        return 0.0 if self._film is None else film_share(points, velocities, self._bed.depth)
+        return film_share(points, velocities, self._bed.depth, slope_error=self._slope_error)
 
     def _end_limits(self, values: Float[np.ndarray, "nx ny nz 4"], seen: Bool[np.ndarray, "nx ny nz"]) -> list[float]:
         """Flux that each end can carry, in face areas times m/s, from the fastest surface observed near it: whatever
@@ -285,6 +289,7 @@ def volume_velocity(
     kind: str | FluidKind,
     mainstream: Float[np.ndarray, "3"] | None = None,
     wall: str = "cubic",
+    slope_error: float = SLOPE_ERROR,
     tolerance: float = 1e-4,
     options: VolumeOptions | None = None,
 ) -> tuple[FaceVelocity, VolumeReport]:
@@ -299,6 +304,7 @@ def volume_velocity(
         mainstream: unit direction of the bulk flow; None: that of the nearest surface.
         wall: wall function, one of `motion.bed.WALLS`; a plume keeps "cubic". A stream with "cubic" that is too slow
             for its slope takes "film" instead, by degrees (`motion.bed.film_share`).
+        slope_error: standard error of the slope (rise over run) of the surface, which a film must exceed.
         tolerance: relative residual of the projection.
         options: see there; None: the usual ones.
 
@@ -309,7 +315,9 @@ def volume_velocity(
         ValueError: cell types of the wrong shape, an unknown wall, or no fluid cell near any sample.
         InputRejected: an unknown kind.
     """
-    solver = VolumeSolver(terrain, cell_types, grid, kind=kind, mainstream=mainstream, wall=wall, options=options)
+    solver = VolumeSolver(
+        terrain, cell_types, grid, kind=kind, mainstream=mainstream, wall=wall, slope_error=slope_error, options=options
+    )
     return solver.velocity(surface, tolerance=tolerance)
 
 

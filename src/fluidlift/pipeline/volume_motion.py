@@ -37,6 +37,7 @@ def motion_scene(clip: VideoClip, geometry: Geometry) -> MotionScene:
     return MotionScene(
         g.camera, g.sighted_depth, setting.terrain, setting.cell_types, g.kind, clip.interval, setting.surface_height,
         setting.pool_level, prior=(g.mean_flow, trust),
+        slope_error=0.0 if g.slope is None else float(np.tan(np.radians(min(g.slope.error, 45.0)))),
     )  # fmt: skip
 
 

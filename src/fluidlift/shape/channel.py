@@ -57,7 +57,9 @@ class ChannelConfig:
     cell_limit: int
     """most cells of the grid"""
     depth_ratio: float | None = None
-    """greatest depth over the full width; None: usual for the kind"""
+    """greatest depth over the full width; None: usual for the kind, and of a stream in metres for its width"""
+    in_metres: bool = False
+    """whether the width is known in metres, and not that of an assumed size"""
 
 
 def channel_setting(seen: Footage, config: ChannelConfig) -> Setting:
@@ -77,6 +79,8 @@ def channel_setting(seen: Footage, config: ChannelConfig) -> Setting:
     ratio = kind.depth_ratio if config.depth_ratio is None else config.depth_ratio
     share = required(ratio, f"the kind '{kind}'", "a channel flow")
     depth = share * extent.width
+    if config.in_metres and config.depth_ratio is None and kind.runs_nearly_level and not seen.closed:
+        depth = cross_section.usual_depth(extent.width, share)
     spacing = max((extent.high - extent.low).max() / config.longest, depth / 10)
     spacing = min(spacing, depth / 4)  # fewer than four cells hold no velocity profile
     for _ in range(60):

@@ -28,6 +28,14 @@ by about 35 % along a reach, and a surface speed misjudges the mean one by about
 STRAIGHT = 0.5
 """how far the bed is drawn to a straight line along the stream: a reach's bed is straighter than its water"""
 
+RIVER_DEPTH, RIVER_POWER = 0.067, 0.857
+"""mean depth of a river of 1 m's width, m, and the power of its width (m) that it goes with. Parker and others 2007
+(Journal of Geophysical Research 112, F04005) for rivers full to their banks in gravel of size D: depth = 0.382 q and
+width = 4.63 q (Q / (sqrt(g D) D^2))^0.0667 with q = (Q^2 / g)^(1/5); Q is eliminated, D is 50 mm. With four times that
+it is 1.2 times as deep. A bed between banks is nearly flat here, so its mean depth is the one that carries the water"""
+RIVERS = (1.0, 5.0)
+"""m: width up to which nothing is known of a channel (a flume, a gutter, a film), and from which it is such a river"""
+
 
 @dataclass(frozen=True)
 class Reach:
@@ -52,6 +60,22 @@ def distance_inside(inside: Bool[np.ndarray, "nx ny"], spacing: float) -> Float[
         return np.full(inside.shape, spacing * max(inside.shape) / 2)
     pad = max(inside.shape)
     return ndimage.distance_transform_edt(np.pad(inside, pad, mode="edge"))[pad:-pad, pad:-pad] * spacing
+
+
+def usual_depth(width: float, ratio: float) -> float:
+    """Depth (m) of the flat bed of a stream whose width is known in metres.
+
+    Small channels are `ratio` times as deep as wide; rivers are shallower, the wider the more (`RIVER_DEPTH`); between
+    both (`RIVERS`) by their logarithms.
+
+    Args:
+        width: m, positive.
+        ratio: depth over width of small channels.
+    """
+    small, large = RIVERS
+    known = float(np.clip(np.log(width / small) / np.log(large / small), 0.0, 1.0))
+    assumed = ratio * width
+    return min(assumed, assumed ** (1.0 - known) * (RIVER_DEPTH * width**RIVER_POWER) ** known)
 
 
 def depth_along(reach: Reach, depth: float, width: float, kind: str | FluidKind) -> Float[np.ndarray, "nx ny"]:

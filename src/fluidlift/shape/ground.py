@@ -16,9 +16,10 @@ from fluidlift.types.fluid_masks import parts_of
 
 
 def setting_around(
-    kind, front, fluid, start, united, camera, to_world, depth, half, bulk, c, falls, **known
+    kind, front, fluid, start, united, camera, to_world, depth, half, bulk, c, falls, *, in_metres=False, **known
 ) -> Setting:
-    """Terrain and cells around a surface; what is known beside it goes to `plan.Footage`."""
+    """Terrain and cells around a surface, whose size is known `in_metres` or assumed; what is known beside it goes to
+    `plan.Footage`."""
     mask = generate.united_mask(fluid[start : start + united])
     visible = mask & (depth > 0)
     grid = camera.pixel_grid()
@@ -26,7 +27,9 @@ def setting_around(
     if front.height is not None:
         labels, height = seen_labels(fluid, start, united, falls), registration.PlacedHeight(front.height, to_world)
         seen = plan.Footage(height, labels, near, camera, bulk, ever=fluid.any_frame(), **known)
-        return channel.channel_setting(seen, channel.ChannelConfig(kind, c.cells, c.cell_limit, c.depth_ratio))
+        return channel.channel_setting(
+            seen, channel.ChannelConfig(kind, c.cells, c.cell_limit, c.depth_ratio, in_metres)
+        )
     back = depth + 2 * half
     far = camera.unproject(grid[visible], back[visible])
     # the box holds what the clip shows later, in the same vertical plane

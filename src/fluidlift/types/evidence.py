@@ -86,6 +86,13 @@ class SlopeEvidence:
     chute: float = 0.0
     """degrees of the steepest chute that comes down onto it; 0: there is none"""
 
+    @property
+    def error(self) -> float:
+        """Degrees that `slope` is off, root mean square over both models: level, and falling by `likeliest` give or
+        take `standard_error`. A slope of 5 between a level one and one of 10 is not known to a degree."""
+        falling = self.standard_error**2 + (self.likeliest - self.slope) ** 2
+        return float((self.level_share * self.slope**2 + (1.0 - self.level_share) * falling) ** 0.5)
+
 
 @dataclass(frozen=True)
 class MetricScale:

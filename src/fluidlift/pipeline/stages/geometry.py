@@ -80,7 +80,8 @@ def geometry(
         setting = ground.setting_around(
             kind, front, fluid, seen.start, seen.united, camera, to_world, depth, half, bulk, c, falling.pixels,
             speed=None if kind.is_standing_water else _seen_speed(visible, velocities * scale.value, seen.trust),
-            scene_depth=scene, closed=parts.puddle or kind.is_standing_water, goes_on=kind.is_standing_water,
+            scene_depth=scene, in_metres=scale.source != "assumed",
+            closed=parts.puddle or kind.is_standing_water, goes_on=kind.is_standing_water,
         )  # fmt: skip
         setting = composite.composed(setting, falling, to_world, points[~falls], velocities[~falls], camera)
     if not (setting.cell_types == CellType.FLUID).any():

@@ -5,7 +5,18 @@ import pytest
 from scipy import ndimage
 
 from fluidlift.shape.channel import ChannelConfig, channel_setting
-from fluidlift.shape.chute import USUAL, ChuteHeight, chute_pixels, find_chutes, head_acceleration, pieces
+from fluidlift.shape.chute import (
+    LOSES,
+    USUAL,
+    Chute,
+    ChuteHeight,
+    chute_pixels,
+    energy_kept,
+    find_chutes,
+    head_acceleration,
+    pieces,
+    stand,
+)
 from fluidlift.shape.composite import Parts, trust_beside_jets, with_chute
 from fluidlift.shape.jets import Outline
 from fluidlift.shape.kind import level_camera
@@ -19,9 +30,9 @@ from fluidlift.types import CellType, Label, MetricScale, PinholeCamera, Similar
 SIZE = (192, 144)
 
 
-def scene(slope, heading, pitch, *, speed=0.05, pool=0.012, half_width=0.13, length=0.3):
+def scene(slope, heading, pitch, *, speed=0.05, pool=0.012, half_width=0.13, length=0.3, energy=None):
     """A chute that runs down onto a pool that goes on the same way: camera, mask, px per frame, which pixels show the
-    chute, true depth."""
+    chute, true depth. `energy`: of the share of the way (0 at its top), times that at the mean speed."""
     camera = level_camera(PinholeCamera.from_fov(50.0, SIZE), UpEvidence(pitch, 0.0, "", 1.0))
     steep, level = (plane_axes(np.radians(a), np.radians(heading)) for a in (slope, 0.0))
     grid = camera.pixel_grid()
@@ -37,7 +48,9 @@ def scene(slope, heading, pitch, *, speed=0.05, pool=0.012, half_width=0.13, len
     wet = np.isfinite(below) & (np.abs(q @ level[1]) < 0.5) & (q @ level[0] > -0.15) & (q @ level[0] < 0.6)
     mask = chute | wet
     depth = np.where(chute, onto, np.where(wet, below, 0.0))
-    velocity = np.where(chute[..., None], speed * steep[0], pool * level[0])
+    share = np.clip(run / length + 1.0, 0.0, 1.0)
+    fast = speed * np.sqrt(np.ones_like(share) if energy is None else energy(share))
+    velocity = np.where(chute[..., None], fast[..., None] * steep[0], pool * level[0])
     points = rays * np.where(mask, depth, 1.0)[..., None]
     later, _ = camera.project(points + np.where(mask[..., None], velocity, 0.0))
     return camera, mask, np.where(mask[..., None], later - grid, 0.0), chute, depth
@@ -127,6 +140,93 @@ def test_what_spreads_fast_from_the_foot_of_a_jet_is_no_chute():
     away = int(cols.max()) + 40 if cols.max() + 43 < SIZE[0] else int(cols.min()) - 40
     far = front_with(away, at[1])
     assert far is not None and (far.chutes[0] & chute).sum() > 0.9 * chute.sum()
+
+
+def with_friction(first, last, lengths):
+    """v^2 down a slope under gravity and a drag in proportion to v^2: from `first` towards `last`, where both balance,
+    over that many e-folds."""
+    return lambda share: last + (first - last) * np.exp(-lengths * share)
+
+
+RUNS = {
+    "no friction": lambda share: 0.4 + 1.2 * share,
+    "friction": with_friction(0.4, 1.2, 3.0),
+    "balanced": with_friction(1.0, 1.0, 1.0),
+    "enters faster than it can keep": with_friction(1.25, 0.9, 2.0),
+}
+
+
+@pytest.mark.parametrize("run", RUNS)
+@pytest.mark.parametrize(("slope", "heading", "pitch"), SCENES)
+def test_water_that_runs_down_keeps_its_energy_with_friction_and_without(slope, heading, pitch, run):
+    camera, mask, motion, chute, _ = scene(slope, heading, pitch, energy=RUNS[run])
+    trust = np.ones(mask.shape)
+    foot = camera.rays(np.array([[0.5 * SIZE[0], 0.45 * SIZE[1]]]))[0]
+    true = Chute(tuple(foot), np.radians(heading), slope, 0.13, 0.3, chute)
+    assert energy_kept(camera, true, motion, trust) > 1.0 - LOSES
+    # and on the plane as it is found
+    level = level_surface(camera, mask & ~chute).height
+    assert level is not None
+    assert len(find_chutes(camera, mask, motion, trust, level)) == 1
+
+
+@pytest.mark.parametrize("end", [0.3, 1.0, 2.5])
+def test_the_energy_that_is_kept_is_measured_on_a_plane_in_perspective(end):
+    seen = []
+
+    def energy(share):
+        seen.append(share)
+        return 1.0 + (end - 1.0) * share
+
+    camera, _, motion, chute, _ = scene(45.0, -30.0, 40.0, speed=0.005, energy=energy)
+    foot = camera.rays(np.array([[0.5 * SIZE[0], 0.45 * SIZE[1]]]))[0]
+    true = Chute(tuple(foot), np.radians(-30.0), 45.0, 0.13, 0.3, chute)
+    first, last = (1.0 + (end - 1.0) * share for share in np.percentile(seen[0][chute], [2, 98]))
+    assert energy_kept(camera, true, motion, np.ones(chute.shape)) == pytest.approx(last / first, rel=0.05)
+
+
+def outflow(pitch, towards, drift, *, power):
+    """Level water that spreads from a place of the picture within 30 degrees of a heading, its speed as 1 / r^power,
+    over water that drifts slowly along another heading (degrees): camera, mask, px per frame."""
+    camera = level_camera(PinholeCamera.from_fov(50.0, SIZE), UpEvidence(pitch, 0.0, "", 1.0))
+    grid = camera.pixel_grid()
+    mask = np.indices((SIZE[1], SIZE[0]))[0] > 30
+    front = level_surface(camera, mask)
+    mask &= front.depth > 0
+    points = camera.unproject(grid, np.where(mask, front.depth, 1.0).astype(float))
+    away = points[..., :2] - points[55, 90, :2]
+    r = np.maximum(np.linalg.norm(away, axis=-1), 1e-6)
+    to, on = (np.array([np.cos(a), np.sin(a)]) for a in np.radians([towards, drift]))
+    inside = (r > 0.08) & (r < 0.35) & (away @ to > np.cos(np.radians(30.0)) * r)
+    velocity = 0.004 * on + away / r[..., None] * np.where(inside, 0.05 * (0.1 / r) ** power, 0.0)[..., None]
+    later, _ = camera.project(points + np.concatenate([velocity, np.zeros((*r.shape, 1))], axis=-1))
+    return camera, mask, np.where(mask[..., None], later - grid, 0.0)
+
+
+@pytest.mark.parametrize("power", [1.0, 1.5], ids=["a film", "a film that friction slows"])
+@pytest.mark.parametrize(
+    ("pitch", "towards", "drift"), [(30.0, -40.0, 0.0), (45.0, -125.0, -160.0), (35.0, -50.0, 10.0)]
+)
+def test_what_spreads_from_a_source_on_the_level_is_no_chute(pitch, towards, drift, power):
+    camera, mask, motion = outflow(pitch, towards, drift, power=power)
+    trust = np.ones(mask.shape)
+    (part,) = chute_pixels(camera, mask, motion, trust)  # it is fast, runs down the picture and ends on the fluid
+    level = level_surface(camera, mask & ~part).height
+    assert level is not None
+    stood = stand(camera, part, mask, motion, trust, -1.0)
+    assert stood is not None and stood.slope > 20.0  # and leans as a chute does
+    assert energy_kept(camera, stood, motion, trust) < 1.0 - LOSES
+    assert find_chutes(camera, mask, motion, trust, level) == []
+    assert chutes_on_level(camera, mask, motion, trust) is None
+    assert find_chutes(camera, mask, motion, trust, level, [part])  # a person may know better
+
+
+def test_where_too_little_is_known_a_chute_is_not_said_to_slow_down():
+    camera, mask, motion, chute, _ = scene(45.0, -30.0, 40.0)
+    level = level_surface(camera, mask & ~chute).height
+    assert level is not None
+    (found,) = find_chutes(camera, mask, motion, np.ones(mask.shape), level)
+    assert energy_kept(camera, found, motion * 0.0, np.zeros(mask.shape)) == 1.0
 
 
 def test_errors_of_the_flow_alone_are_no_chute():

@@ -57,7 +57,7 @@ def drawn_splats(
         chance: 0 to 1, a number of each splat that stays the same over the frames: it says which are left out.
     """
     widest = np.maximum(widest, FINEST)
-    at, beside = uv[:, ::-1] - 0.5, ~((uv >= 0) & (uv <= np.array(depth.shape[::-1]))).all(axis=1)
+    at, beside = uv[:, ::-1] - 0.5, ~np.all((uv >= 0) & (uv <= np.array(depth.shape[::-1])), axis=1)
     if beside.all():
         return beside, widest
     here = sampled(np.asarray(depth, np.float32), at)

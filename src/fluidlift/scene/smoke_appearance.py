@@ -121,7 +121,7 @@ class SmokeAppearance:
         about = CARRIED * wide
         carried = self._amounts[particles.source] / _area(about, pixel)
         colors = self._colors[particles.source]
-        inside = ((uv >= 0) & (uv <= np.array(self._camera.size))).all(axis=1)
+        inside = np.all((uv >= 0) & (uv <= np.array(self._camera.size)), axis=1)
         time, film, filmed = self._start + number * self._scene.interval, None, np.zeros(0)
         share = self._filmed(time)
         own = depth_of(uv, about, carried, self._camera.size) if share < 1.0 else 0.0
@@ -146,7 +146,11 @@ class SmokeAppearance:
             return found
         there = depth_of(uv[drawn], widths[drawn], weight[drawn], self._camera.size)
         more = self._filled(particles, uv, pixel, filmed, there, film)
-        return tuple(join([a, b]) for join, a, b in zip((concatenate, np.concatenate, np.concatenate), found, more))
+        return (
+            concatenate([found[0], more[0]]),
+            np.concatenate([found[1], more[1]]),
+            np.concatenate([found[2], more[2]]),
+        )
 
     def _filled(
         self, particles: Particles, uv: np.ndarray, pixel: np.ndarray, depth: np.ndarray, there: np.ndarray,

@@ -191,7 +191,8 @@ def test_smoke_carries_its_color_and_opacity(catalogue_asset):
     shown = clip.frames[first_of_film(manifest["metrics"]["rest_frame"], len(clip)) :]
     smoke = shown.min(axis=-1) > 80
     again = a * colors + (1 - a) * behind
-    assert np.abs(again - shown)[smoke].mean() < 12  # grain of two pixels, coded twice
+    # grain of two pixels between 90 and 230, of which the color of smoke keeps 38 to either side (`TINT`)
+    assert np.abs(again - shown)[smoke].mean() < 20
     assert opacities[smoke].mean() > 60 > 5 > opacities[shown.max(axis=-1) < 40].mean()
 
 

@@ -6,9 +6,10 @@ background known and one color of thick smoke, a film of it becomes two: its col
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any, Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -240,9 +241,19 @@ def _bytes(values: np.ndarray) -> np.ndarray:
     return np.clip(np.rint(255.0 * values), 0, 255).astype(np.uint8)
 
 
-def smoke_layers(
-    frames: Sequence[np.ndarray] | np.ndarray, fluid: Sequence[np.ndarray] | np.ndarray, behind: np.ndarray
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+class Frames(Protocol):
+    """Pictures or masks one by one, of which a few are in memory at a time."""
+
+    def __len__(self) -> int:
+        """How many there are."""
+        ...
+
+    def __getitem__(self, index: int, /) -> Any:
+        """One of them."""
+        ...
+
+
+def smoke_layers(frames: Frames, fluid: Frames, behind: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Color and opacity of each picture of a film, as `smoke_layer`.
 
     Args:
@@ -278,7 +289,7 @@ class SmokeFilm:
 
     def at(self, seconds: float, whole: float) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
         """Color and optical depth at a time of a film that is played for `whole` seconds: as filmed, and where that is
-        longer, its later part again and again, each time faded over (video texture; Schoedl et al. 2000)."""
+        longer, its later part again and again, each time faded over (video texture; Schödl et al. 2000)."""
         t, last = seconds / self.interval, len(self) - 1
         if last == 0 or whole / self.interval <= last + 0.5:
             return self.layer(int(np.clip(round(t), 0, last)))

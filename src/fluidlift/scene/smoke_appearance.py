@@ -9,6 +9,7 @@ that spreads gets thinner.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -62,11 +63,19 @@ def smoke_film(path: Path, size: tuple[int, int]) -> SmokeFilm | str:
         path: its file.
         size: of the clip, px.
     """
+    if not path.is_file():
+        return f"is missing: {AS_BODY}; make the asset again"
+    written = path.stat()
+    return _read(path, size, (written.st_mtime_ns, written.st_size))
+
+
+@lru_cache(maxsize=1)
+def _read(path: Path, size: tuple[int, int], written: tuple[int, int]) -> SmokeFilm | str:
+    """As `smoke_film`, of a file as it was `written`. The last one is kept: a live preview begins anew with every
+    edit."""
     from fluidlift.io.footage_file import read_smoke
     from fluidlift.look.smoke_film import SmokeFilm
 
-    if not path.is_file():
-        return f"is missing: {AS_BODY}; make the asset again"
     try:
         return SmokeFilm(*read_smoke(path, size))
     except InputRejected as error:
@@ -124,13 +133,13 @@ class SmokeAppearance:
         inside = np.all((uv >= 0) & (uv <= np.array(self._camera.size)), axis=1)
         time, film, filmed = self._start + number * self._scene.interval, None, np.zeros(0)
         share = self._filmed(time)
-        own = depth_of(uv, about, carried, self._camera.size) if share < 1.0 else 0.0
+        simulated = depth_of(uv, about, carried, self._camera.size) if share < 1.0 else 0.0
         if share > 0.0:
             film, filmed = self._film.at(time, self._whole)
             at = share * inside[:, None]
             colors = (1.0 - at) * colors + at * sampled(film, uv[:, ::-1] - 0.5)
             filmed = share * filmed
-        depth = np.asarray(own if film is None else filmed + (1.0 - share) * own)
+        depth = np.asarray(simulated if film is None else filmed + (1.0 - share) * simulated)
         drawn, widths = drawn_splats(uv, wide, depth, _chance(particles.ids))
         widths, weight = np.where(inside, widths, about), np.zeros(len(uv))
         first = carried * np.square(about / widths)
@@ -177,9 +186,7 @@ class SmokeAppearance:
         lattice[::step, ::step] = True
         rows, columns = np.nonzero(lacking & lattice)
         each = round(TOGETHER / (2.0 * np.pi * FINEST**2))
-        index = (np.repeat(rows * depth.shape[1] + columns, each) * each + np.tile(np.arange(each), len(rows))).astype(
-            int
-        )
+        index = np.repeat((rows * depth.shape[1] + columns) * each, each) + np.tile(np.arange(each), len(rows))
         at = np.repeat(np.stack([columns, rows], axis=1), each, axis=0) + step * np.stack(
             [_chance(3 * index), _chance(3 * index + 1)], axis=1
         )

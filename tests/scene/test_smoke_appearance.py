@@ -66,6 +66,7 @@ def test_what_the_simulation_lacks_is_filled_as_far_off_as_the_smoke_beside_it(c
     z = scene.body.positions[:, 2]
     assert z.min() - 0.05 < gaussians.means[more, 2].min() and gaussians.means[more, 2].max() < z.max() + 0.05
     assert np.abs(velocities[more] - [0.6, 0, 0]).max() < 1e-4
+    assert not set(ids[more]) & set(shown(scene, film, 4, left)[1])  # of another frame: they were not carried there
     again = shown(scene, film, 3, left)
     assert (again[1] == ids).all() and (again[0].means == gaussians.means).all()
 

@@ -46,6 +46,9 @@ SEEN = 0.03
 FINER = 4.0
 """places for splats that fill, to a cell's width"""
 
+ANEW = 4
+"""frames after which the ids of splats that fill come again"""
+
 FAINT = 0.002
 """least opacity of a splat: not drawn, but there for other tools"""
 
@@ -154,7 +157,9 @@ class SmokeAppearance:
         if film is None or not drawn.any():
             return found
         there = depth_of(uv[drawn], widths[drawn], weight[drawn], self._camera.size)
-        more = self._filled(particles, uv, pixel, filmed, there, film)
+        gaussians, places, moving = self._filled(particles, uv, pixel, filmed, there, film)
+        # they are there for one frame: none of the next ones is the same
+        more = gaussians, 2 * (ANEW * places + number % ANEW) + 1, moving
         return (
             concatenate([found[0], more[0]]),
             np.concatenate([found[1], more[1]]),
@@ -166,7 +171,7 @@ class SmokeAppearance:
         film: np.ndarray,
     ) -> tuple[Gaussians, np.ndarray, np.ndarray]:  # fmt: skip
         """Splats where a film shows smoke and the simulation has little of it, as far from the camera as the simulated
-        smoke next to them.
+        smoke next to them; a number of the place of each; velocities (m/s).
 
         Args:
             particles: of the frame.
@@ -198,7 +203,7 @@ class SmokeAppearance:
         )
         opacities = np.maximum(opacity_of(weight), FAINT).astype(np.float32)
         moving = near.velocities(rows, columns, each)
-        return replace(gaussians, opacities=opacities), 2 * index + 1, moving.astype(particles.velocities.dtype)
+        return replace(gaussians, opacities=opacities), index, moving.astype(particles.velocities.dtype)
 
     def _filmed(self, time: float) -> float:
         """How far the film says at a time of it how thin the smoke is, 0 to 1."""

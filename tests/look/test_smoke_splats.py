@@ -5,6 +5,7 @@ import pytest
 
 from fluidlift.look.rasterize import render
 from fluidlift.look.smoke_splats import (
+    BLUR,
     DRAWN,
     FAINTEST,
     REACH,
@@ -15,6 +16,7 @@ from fluidlift.look.smoke_splats import (
     opacity_of,
     shared_depth,
 )
+from fluidlift.numerics import splatting_projection
 from fluidlift.types import Gaussians, PinholeCamera
 
 SIZE = (64, 64)
@@ -93,6 +95,10 @@ def test_thin_smoke_is_drawn_with_fewer_splats_that_can_be_seen():
     weight = shared_depth(uv[drawn], widths[drawn], depth, np.zeros(int(drawn.sum())))
     assert 0.02 < drawn.mean() < 0.6
     assert np.median(weight) > 0.3 * FAINTEST and (opacity_of(weight) > DRAWN).mean() > 0.8
+
+
+def test_the_rasteriser_is_the_one_that_it_is_made_for():
+    assert splatting_projection.BLUR == np.float32(BLUR) and splatting_projection.ALPHA_MIN == np.float32(DRAWN)
 
 
 def test_no_splats_are_no_smoke():

@@ -33,7 +33,9 @@ def smoke(channel, **more):
 def shown(scene, film, number=0, particles=None):
     particles = scene.body if particles is None else particles
     bare = replace(scene.rest.select(particles.source), means=particles.positions)
-    return SmokeAppearance(scene, film).dressed(bare, particles, number)
+    painted = scene.rest.means if scene.painted is None else scene.painted
+    own = ~np.isfinite(painted[particles.source]).all(axis=1)
+    return SmokeAppearance(scene, film).dressed(bare, particles, number, own)
 
 
 def alpha(gaussians: Gaussians, scene) -> np.ndarray:

@@ -28,17 +28,16 @@ FAINTEST = 0.03
 nothing below 1/255. Where there are more splats than it takes at this depth, some are left out for the others"""
 
 DRAWN = 1 / 255
-"""opacity of the least part of a splat that rasterisers draw"""
+"""opacity of the least part of a splat that rasterisers draw (`numerics.splatting_projection.ALPHA_MIN`)"""
 
 ROUNDS = 3
 """steps of the correction that brings the splats' sum to the film's depth"""
-
 
 LEAST = 1e-3
 """optical depth from which a splat is corrected at least, for smoke to be seen where there was none at first"""
 
 BLUR = 0.3
-"""variance (px^2) that the rasteriser adds to each splat"""
+"""variance (px^2) that the rasteriser adds to each splat (`numerics.splatting_projection.BLUR`)"""
 
 
 def drawn_splats(

@@ -18,6 +18,7 @@ from scipy import ndimage
 
 from fluidlift.errors import InputRejected
 from fluidlift.look.surface_map import sampled
+from fluidlift.scene.surface_appearance import FAINT
 from fluidlift.types import Gaussians, Particles, PinholeCamera, concatenate, sh_from_rgb
 
 if TYPE_CHECKING:
@@ -48,9 +49,6 @@ FINER = 4.0
 
 ANEW = 4
 """frames after which the ids of splats that fill come again"""
-
-FAINT = 0.002
-"""least opacity of a splat: not drawn, but there for other tools"""
 
 FAR = 1e6
 """px beside the picture at most"""
@@ -117,7 +115,9 @@ class SmokeAppearance:
     def _widest(self, pixel: np.ndarray) -> np.ndarray:
         return WIDEST * self._scene.terrain.grid.spacing / pixel
 
-    def dressed(self, shown: Gaussians, particles: Particles, number: int) -> tuple[Gaussians, np.ndarray, np.ndarray]:
+    def dressed(
+        self, shown: Gaussians, particles: Particles, number: int, own: np.ndarray
+    ) -> tuple[Gaussians, np.ndarray, np.ndarray]:
         """The splats of a frame, round, as dense and of the color that the smoke has there; ids, even of particles and
         odd of splats where the film shows smoke that the simulation lacks; and velocities, m/s.
 
@@ -125,6 +125,7 @@ class SmokeAppearance:
             shown: one splat for each particle.
             particles: of the frame.
             number: of the frame, from 0.
+            own: bool, which particles bring a color of their own.
         """
         from fluidlift.look.smoke_splats import depth_of, drawn_splats, opacity_of, shared_depth
 
@@ -149,7 +150,6 @@ class SmokeAppearance:
         weight[drawn] = shared_depth(uv[drawn], widths[drawn], depth, first[drawn])
         sh = shown.sh.copy()
         sh[:, 1:] = 0.0
-        own = self._own_colors(particles.source)
         sh[:, :1] = np.where(own[:, None, None], shown.sh[:, :1], sh_from_rgb(colors))
         scales = np.repeat((widths * pixel)[:, None], 3, axis=1).astype(np.float32)
         opacities = np.maximum(opacity_of(weight), FAINT).astype(np.float32)
@@ -212,10 +212,6 @@ class SmokeAppearance:
         if not self._film.spreads:
             return 1.0
         return float(np.clip(1.0 - (time - self._film.end) / HANDED_OVER, 0.0, 1.0))
-
-    def _own_colors(self, source: np.ndarray) -> np.ndarray:
-        painted = self._scene.painted
-        return np.zeros(len(source), bool) if painted is None else ~np.all(np.isfinite(painted[source]), axis=1)
 
 
 class _NearestSmoke(NamedTuple):

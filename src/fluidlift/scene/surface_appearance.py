@@ -379,7 +379,7 @@ class SurfaceAppearance:
         scene, carry = self._scene, deform or deform_gaussians
         shown = carry(scene.rest, particles, max_stretch=MAX_STRETCH, max_size=LARGEST * self._cell)
         if self._smoke is not None:
-            return Dressed(*self._smoke.dressed(shown, particles, number))
+            return Dressed(*self._smoke.dressed(shown, particles, number, self._own_colors(particles.source)))
         if number:  # at rest nothing is drawn out
             shown = mixed(shown, particles.deformation, widest=MIXED * self._cell)
         shown = self._shaded(shown, particles.source)

@@ -8,9 +8,11 @@ import pytest
 from fluidlift.io.footage_file import write_smoke
 from fluidlift.look.rasterize import render
 from fluidlift.look.smoke_film import SmokeFilm
+from fluidlift.physics.inlet import beside_inlet
+from fluidlift.scene.simulator import SOURCE
 from fluidlift.scene.smoke_appearance import ASTRAY, FAINT, HANDED_OVER, SmokeAppearance
 from fluidlift.scene.surface_appearance import SurfaceAppearance
-from fluidlift.types import Gaussians, Particles
+from fluidlift.types import CellType, Gaussians, Particles
 
 FRAMES, INTERVAL = 10, 0.04
 COLOR = np.array([0.8, 0.5, 0.3])
@@ -26,8 +28,11 @@ def puff(opacity: float = 0.4, count: int = FRAMES) -> SmokeFilm:
 
 
 def smoke(channel, **more):
-    """The scene of a channel whose body is smoke: eight particles to each cell, the film's whole picture wide."""
-    return channel(FRAMES, kind="plume", **more)
+    """The scene of a channel whose body is smoke: eight particles to each cell, the film's whole picture wide, and none
+    of its ends open."""
+    cells = channel(FRAMES).cell_types
+    closed = np.where(cells == CellType.OUTFLOW, CellType.FLUID, cells)
+    return channel(FRAMES, kind="plume", **{"cell_types": closed} | more)
 
 
 def shown(scene, film, number=0, particles=None):
@@ -100,6 +105,30 @@ def test_edited_smoke_keeps_its_amount_and_thins_as_it_spreads(channel):
         depth.append(-np.log1p(-np.minimum(alpha(gaussians, scene), 0.99)))
     assert depth[1][24, 32] == pytest.approx(depth[0][24, 32] / 1.5**2, rel=0.2)
     assert depth[0].sum() == pytest.approx(-np.log1p(-(film.opacities[0] / 255.0)).sum(), rel=0.1)
+
+
+def test_what_flows_in_has_as_much_smoke_as_the_film_shows_about_the_inlet_in_the_mean(channel):
+    scene, film = smoke(channel, changes=("gravity",)), puff(0.4)
+    weak = film.opacities.astype(float)
+    weak[0] *= 0.5  # the source is weak at first
+    film = SmokeFilm(film.colors, np.rint(weak).astype(np.uint8), INTERVAL)
+    near = beside_inlet(scene.rest.means, scene.cell_types, scene.terrain.grid, SOURCE)
+    columns = np.unique(np.floor(scene.camera.project(scene.rest.means[near])[0][:, 0]).astype(int))
+    shares = [film.layer(t)[1][:, columns.min() : columns.max() + 1].sum() for t in range(FRAMES)]
+    came = replace(scene.body, ids=scene.body.ids + len(scene.body))
+    depths = [-np.log1p(-alpha(shown(scene, film, 5, body)[0], scene)).sum() for body in (scene.body, came)]
+    assert 1.5 < np.mean(shares) / shares[0] == pytest.approx(depths[1] / depths[0], rel=0.1)
+
+
+def test_it_fades_out_where_it_leaves_the_box_unless_the_film_shows_it_there(channel):
+    cells = np.array(channel(2).cell_types)
+    cells[cells == CellType.INFLOW] = CellType.FLUID
+    edited = smoke(channel, cell_types=cells, changes=("gravity",))
+    even = SmokeFilm(puff().colors, np.full((FRAMES, 48, 64), 100, np.uint8), INTERVAL)
+    column = alpha(shown(edited, even, 5)[0], edited)[20:28].mean(axis=0)
+    assert column[50] < 0.15 * column[14] and (np.diff(column[14:50:6]) < 0).all()
+    filmed = alpha(shown(smoke(channel, cell_types=cells), even, 5)[0], edited)[20:28].mean(axis=0)
+    assert filmed[50] == pytest.approx(100 / 255, rel=0.15)
 
 
 def test_a_color_of_its_own_stays(channel):

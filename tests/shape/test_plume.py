@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from fluidlift.shape.kinds import builder_of
 from fluidlift.shape.plume import SIGHT, section_half_thickness
 
 ROW, COL = np.mgrid[:120, :100]
@@ -53,3 +54,14 @@ def test_smoke_is_seen_where_its_light_comes_from_in_the_mean(depth, share):
     weight = sigma * np.exp(-np.cumsum(sigma) / len(s))
     assert (weight @ s) / weight.sum() == pytest.approx(share, abs=0.01)  # two digits are given
     assert (share - SIGHT) * (2.0 - depth) >= 0.0  # that of an optical depth of 2
+
+
+def test_its_inlet_is_as_wide_as_the_stem_above_where_the_silhouette_is_round_below():
+    x, y, z = np.meshgrid(*(np.arange(20) + 0.5,) * 3, indexing="ij")
+    stem = np.hypot(x - 10, y - 10) < 5
+    body = stem & ((z > 8) | (np.hypot(np.hypot(x - 10, y - 10), z - 8) < 5))  # a ball's lower half
+    inlet = builder_of("plume").inlet(body, z, 1.0)
+    layers = np.flatnonzero(inlet.any(axis=(0, 1)))
+    assert list(layers) == [3, 4, 5] and body[:, :, 3].sum() < 0.4 * stem[:, :, 3].sum()
+    above = body[:, :, 6]
+    assert all((inlet[:, :, k] == above).all() for k in layers)

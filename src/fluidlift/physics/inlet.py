@@ -144,6 +144,17 @@ def _across_sheet(cells: Int[np.ndarray, "n 3"], down: Float[np.ndarray, "3"], l
     return vectors[:, int(values.argmin())]
 
 
+def beside_inlet(
+    points: Float[np.ndarray, "n 3"], cell_types: Integer[np.ndarray, "nx ny nz"], grid: Grid, reach: float
+) -> Bool[np.ndarray, " n"]:
+    """Whether points (m) lie in the inlet or within so many cells of it; none do where there is no inlet."""
+    inlet = cell_types == CellType.INFLOW
+    if not inlet.any():
+        return np.zeros(len(points), bool)
+    index = np.clip(grid.cell_of(np.asarray(points)), 0, np.asarray(grid.shape) - 1)
+    return ndimage.distance_transform_edt(~inlet)[tuple(index.T)] <= reach
+
+
 def clear_of_shore(
     points: Float[np.ndarray, "n 3"], level: Float[np.ndarray, " n"], terrain: Terrain
 ) -> Bool[np.ndarray, " n"]:

@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     from fluidlift.physics.numba_particles import ParticleWork
     from fluidlift.physics.stepping import ParticleSimulator
 
+SOURCE = 3.0
+"""cells from the inlet within which smoke looks as it does when it comes in: it has hardly spread there, and is wide
+enough to differ from place to place"""
+
 
 def particle_work(device: str) -> ParticleWork:
     """The back end that simulates liquids, or moves their particles, on a device, "cpu" or "cuda".
@@ -88,14 +92,17 @@ def simulator_of(scene: Scene, device: str = "cpu", forces: Sequence[BodyForce] 
 
 def inflow_look(scene: Scene, own: Gaussians, speed: float) -> InflowLook:
     """What flows in at a speed (m/s) looks like the body's own Gaussians; of what lies, as the clip shows it away from
-    rocks and banks."""
+    rocks and banks; of smoke, which thins as it rises, as it is at its source."""
     from fluidlift.look.inflow import InflowLook
+    from fluidlift.physics.inlet import beside_inlet
 
     # a sheet that falls has no level to keep to
     terrain, lying, usable = scene.terrain, kind_of(scene.kind).nearly_level, None
     spacing = 0.5 * terrain.grid.spacing
     if lying and len(own):
         usable = lends_look(scene, own)
+    elif kind_of(scene.kind).is_gas:
+        usable = beside_inlet(own.means, scene.cell_types, terrain.grid, SOURCE)
     return InflowLook(own, terrain.mainstream, speed, spacing, usable=usable, run=scene.inflow.run, lying=lying)
 
 

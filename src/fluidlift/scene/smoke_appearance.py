@@ -3,7 +3,8 @@
 A particle carries an amount of smoke, which is the area that its splat would darken (m^2). Unedited, the film says how
 opaque each line of sight is, and the particles on it share that out. Where a person changed the flow, beside the
 picture, and after the end of a film in which the smoke still spread, each keeps the amount that it had at rest: smoke
-that spreads gets thinner.
+that spreads gets thinner. What flows in then has as much as the film shows about the inlet in the mean. Towards the
+open sides of the box smoke fades out, where the simulation ends.
 """
 
 from __future__ import annotations
@@ -17,9 +18,10 @@ import numpy as np
 from scipy import ndimage
 
 from fluidlift.errors import InputRejected
+from fluidlift.look.smoothstep import smoothstep
 from fluidlift.look.surface_map import sampled
 from fluidlift.scene.surface_appearance import FAINT
-from fluidlift.types import Gaussians, Particles, PinholeCamera, concatenate, sh_from_rgb
+from fluidlift.types import CellType, Gaussians, Particles, PinholeCamera, concatenate, sh_from_rgb
 
 if TYPE_CHECKING:
     from fluidlift.look.smoke_film import SmokeFilm
@@ -49,6 +51,16 @@ FINER = 4.0
 
 ANEW = 4
 """frames after which the ids of splats that fill come again"""
+
+LEAVING = 8.0
+"""cells before the open sides of the box over which smoke fades out that no film shows there: most of the free space
+that a draft's box has around what was filmed"""
+
+STRONGER = 4.0
+"""times, by which smoke at the inlet may differ from that of the first instant, either way: more is another scene"""
+
+LOOKED_AT = 12
+"""frames, spread over the film, that the mean at the inlet is taken of"""
 
 FAR = 1e6
 """px beside the picture at most"""
@@ -104,6 +116,41 @@ class SmokeAppearance:
         wide = self._widest(pixel)
         self._amounts = shared_depth(uv, CARRIED * wide, depth, np.zeros(len(uv))) * _area(CARRIED * wide, pixel)
         self._colors = sampled(color, uv[:, ::-1] - 0.5)
+        self._first = int(scene.body.ids.max()) + 1 if len(scene.body.ids) else 0
+        self._inflow = self._inflow_over_first(uv, depth)
+        leaves = scene.cell_types == CellType.OUTFLOW
+        self._away = ndimage.distance_transform_edt(~leaves) if leaves.any() else np.full(leaves.shape, np.inf)
+
+    def _inflow_over_first(self, uv: np.ndarray, depth: np.ndarray) -> float:
+        """Smoke at the inlet in the mean of the film, over that of the first instant.
+
+        Args:
+            uv: where the body at rest is seen, px.
+            depth: optical depth of the film's first instant.
+        """
+        from fluidlift.physics.inlet import beside_inlet
+        from fluidlift.scene.simulator import SOURCE
+
+        scene = self._scene
+        near = beside_inlet(scene.rest.means, scene.cell_types, scene.terrain.grid, SOURCE)
+        cells = np.floor(uv[near]).astype(np.int64)
+        cells = cells[((cells >= 0) & (cells < np.array(depth.shape[::-1]))).all(axis=1)]
+        if not len(cells):
+            return 1.0
+        there = np.zeros(depth.shape, bool)
+        there[cells[:, 1], cells[:, 0]] = True
+        looked = np.unique(np.linspace(0, len(self._film) - 1, LOOKED_AT).round().astype(int))
+        mean = np.mean([self._film.layer(t)[1][there].sum() for t in looked])
+        return float(np.clip(mean / max(depth[there].sum(), 1e-9), 1.0 / STRONGER, STRONGER))
+
+    def _carried(self, particles: Particles, about: np.ndarray, pixel: np.ndarray) -> np.ndarray:
+        """Optical depth that particles bring, each over a width (px): what they had at rest or came in with, and none
+        where they leave."""
+        grid = self._scene.terrain.grid
+        cells = np.clip(grid.cell_of(particles.positions), 0, np.asarray(grid.shape) - 1)
+        amounts = self._amounts[particles.source] / _area(about, pixel)
+        came_in = np.where(particles.ids >= self._first, self._inflow, 1.0)
+        return amounts * came_in * smoothstep(self._away[tuple(cells.T)], 0.0, LEAVING)
 
     def _seen(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where points (m) are seen, px, and m of a pixel there."""
@@ -132,7 +179,7 @@ class SmokeAppearance:
         uv, pixel = self._seen(particles.positions)
         wide = self._widest(pixel)
         about = CARRIED * wide
-        carried = self._amounts[particles.source] / _area(about, pixel)
+        carried = self._carried(particles, about, pixel)
         colors = self._colors[particles.source]
         inside = np.all((uv >= 0) & (uv <= np.array(self._camera.size)), axis=1)
         time, film, filmed = self._start + number * self._scene.interval, None, np.zeros(0)

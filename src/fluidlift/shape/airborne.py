@@ -87,7 +87,7 @@ def airborne_setting(
     cells[solid] = CellType.SOLID
     cells[fluid] = CellType.FLUID
     if fluid.any():
-        cells[builder.inlet(fluid, centers[..., 2], h)] = CellType.INFLOW
+        cells[builder.inlet(fluid, centers[..., 2], h) & ~solid] = CellType.INFLOW
     cells[builder.outlet(grid.shape) & ~solid] = CellType.OUTFLOW
     terrain = Terrain(grid, phi.astype(np.float32), unit(mainstream), terrain_mesh(grid, phi))
     bed = np.full(grid.shape[:2], floor)

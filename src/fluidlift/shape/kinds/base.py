@@ -82,7 +82,7 @@ class AirborneBuilder(BodyBuilder, Protocol):
     def inlet(
         self, fluid: Bool[np.ndarray, "nx ny nz"], z: Float[np.ndarray, "nx ny nz"], spacing: float
     ) -> Bool[np.ndarray, "nx ny nz"]:
-        """Fluid cells through which it enters; z of cell centres and spacing in m."""
+        """Cells through which it enters, in the solid as well; z of cell centres and spacing in m."""
         ...
 
     def outlet(self, shape: tuple[int, int, int]) -> Bool[np.ndarray, "nx ny nz"]:

@@ -7,6 +7,9 @@ import numpy as np
 from fluidlift.shape import depth_surface, surface
 from fluidlift.types.kind import PLUME
 
+FOOT = 3
+"""cells that the inlet is tall: what is thinner falls through between two of the places that particles come from"""
+
 
 class _Plume:
     side, above = 0.2, 0.2
@@ -22,7 +25,12 @@ class _Plume:
         return np.array([bulk[0], bulk[1], max(bulk[2], 1.0)])
 
     def inlet(self, fluid, z, spacing):
-        return fluid & (z < z[fluid].min() + 3.0 * spacing)
+        """The foot of the stem, as wide as the stem above it: the silhouette is round where the picture or the vessel
+        cuts it off, and there the smoke is not."""
+        lowest = z[fluid].min() - 0.5 * spacing
+        foot = (z > lowest) & (z < lowest + FOOT * spacing)
+        stem = np.any(fluid & (z > lowest) & (z < lowest + (FOOT + 1) * spacing), axis=2)
+        return foot & stem[..., None]
 
     def outlet(self, shape):
         """All faces but the floor."""

@@ -2,6 +2,7 @@
 
 A fluid never does the same thing twice, so pictures are not compared one by one but by what they are like over time.
 The floor of a figure is the same figure between the two halves of the clip: no re-simulation can be asked for less.
+The current of a clip whose own halves hardly agree on it does not fail for being as unlike.
 """
 
 from __future__ import annotations
@@ -195,7 +196,9 @@ def as_filmed(
     value = level(masks[:length], coverage[:length], places) | likeness(whole, within, places.fluid, places)
     first, second = statistics(clip[:half], masks[:half], 0.0), statistics(clip[-half:], masks[-half:], 0.0)
     floor = likeness(first, second, places.steady, places)
-    floor["level"] = float("nan") if moves else float(mask_iou(masks[:half], masks[-half:]).mean())
+    floor["level"] = float(mask_iou(masks[:half], masks[-half:]).mean())
+    if moves:  # its halves differ because it is elsewhere
+        floor.update((key, float("nan")) for key in ("level", "current_error", "current_cosine"))
     beyond: dict[str, float] = {}
     if len(later):
         still = np.broadcast_to(places.fluid, later.shape[:3])
@@ -357,12 +360,26 @@ def _judged(key: str, value: float | None, floor: float | None) -> str | None:
         case "liveliness":
             good, usable = LIVELINESS[0] <= value <= LIVELINESS[1], LIVELINESS[2] <= value <= LIVELINESS[3]
         case "current_error":
-            good, usable = (value <= limit for limit in CURRENT_ERROR)
+            good, usable = value <= CURRENT_ERROR[0], value <= max(CURRENT_ERROR[1], _off_by_chance(least))
         case "current_cosine":
-            good, usable = (value >= limit for limit in CURRENT_COSINE)
+            wanted = CURRENT_COSINE[1] if floor is None else min(CURRENT_COSINE[1], _of_whole(floor))
+            good, usable = value >= CURRENT_COSINE[0], value >= wanted
         case _:
             return None
     return GOOD if good else USABLE if usable else WRONG
+
+
+def _of_whole(cosine: float) -> float:
+    """What two films of a clip's length agree to in direction where its halves agree to a cosine: means over twice as
+    many frames have half the variance, and 1 / cosine - 1 is that variance over the current's square."""
+    return 2.0 * cosine / (1.0 + cosine) if cosine > 0.0 else 0.0
+
+
+def _off_by_chance(error: float) -> float:
+    """As `_of_whole`, of the relative error e of the current: e^2 / 2 is the share of that variance in the square of
+    what is measured."""
+    share = min(0.5 * error**2, 1.0)
+    return float(np.sqrt(2.0 * share / (2.0 - share)))
 
 
 def _advice(figures: tuple[Likeness, ...], value: dict[str, float], beyond: dict[str, float]):

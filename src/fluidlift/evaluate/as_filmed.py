@@ -1,8 +1,9 @@
 """How near a re-simulation stays to its own clip, without a truth: figures, their floors, a verdict and advice.
 
 A fluid never does the same thing twice, so pictures are not compared one by one but by what they are like over time.
-The floor of a figure is the same figure between the two halves of the clip: no re-simulation can be asked for less.
-The current of a clip whose own halves hardly agree on it does not fail for being as unlike.
+The floor of a figure is the same figure between the two halves of the clip (the current, which is of the last third
+alone: between that and the first third): no re-simulation can be asked for less. The current of a clip that hardly
+agrees with itself on it does not fail for being as unlike.
 """
 
 from __future__ import annotations
@@ -15,7 +16,19 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 from fluidlift.errors import require
-from fluidlift.evaluate.film import BANDS, CELL, LEAST, FilmStatistics, Foam, Places, film_statistics
+from fluidlift.evaluate.film import (
+    BANDS,
+    CELL,
+    LATE,
+    LEAST,
+    MOST,
+    FilmStatistics,
+    Foam,
+    Places,
+    film_statistics,
+    mean_flow,
+    spread,
+)
 from fluidlift.evaluate.images import mask_iou
 from fluidlift.messages import Notice
 from fluidlift.types import triple
@@ -189,13 +202,13 @@ def as_filmed(
     moves = places.stays < STAYS
     later = renders[len(clip) :] if not moves and len(renders) - len(clip) >= FEWEST else renders[:0]
 
-    def statistics(frames: np.ndarray, where: np.ndarray, late: float = 2.0 / 3.0) -> FilmStatistics:
+    def statistics(frames: np.ndarray, where: np.ndarray, late: float = LATE) -> FilmStatistics:
         return film_statistics(frames, where, places, foam, interval=interval, late=late)
 
     whole, within = statistics(clip[:length], masks[:length]), statistics(renders[:length], masks[:length])
     value = level(masks[:length], coverage[:length], places) | likeness(whole, within, places.fluid, places)
     first, second = statistics(clip[:half], masks[:half], 0.0), statistics(clip[-half:], masks[-half:], 0.0)
-    floor = likeness(first, second, places.steady, places)
+    floor = likeness(first, second, places.steady, places) | _own_current(clip[:length], masks[:length], whole, places)
     floor["level"] = float(mask_iou(masks[:half], masks[-half:]).mean())
     if moves:  # its halves differ because it is elsewhere
         floor.update((key, float("nan")) for key in ("level", "current_error", "current_cosine"))
@@ -213,7 +226,7 @@ def as_filmed(
 
 def level(masks: np.ndarray, coverage: np.ndarray, places: Places) -> dict[str, float]:
     """Where the fluid stands in the last third: IoU, share of the ring that it covers, share of it that is missing."""
-    late = slice(2 * len(masks) // 3, None)
+    late = slice(int(LATE * len(masks)), None)
     seen = coverage[late].mean(axis=0)
     known = masks[late].any()
     return {
@@ -295,6 +308,14 @@ def current(a: np.ndarray, b: np.ndarray, inside: np.ndarray) -> tuple[float, fl
     return error, float((one * other).sum()) / length if length > 1e-9 else 0.0
 
 
+def _own_current(clip: np.ndarray, masks: np.ndarray, whole: FilmStatistics, places: Places) -> dict[str, float]:
+    """The floor of the current, which is of the last third alone: that of the first third against it."""
+    third = max(len(clip) - int(LATE * len(clip)), 2)
+    flow = mean_flow(clip[:third], masks[:third], spread(0, third - 1, MOST))
+    error, cosine = current(whole.flow, flow, places.steady)
+    return {"current_error": error, "current_cosine": cosine}
+
+
 def _speed(film: FilmStatistics, inside: np.ndarray) -> float:
     return _mean(np.linalg.norm(film.flow, axis=-1), inside)
 
@@ -360,26 +381,13 @@ def _judged(key: str, value: float | None, floor: float | None) -> str | None:
         case "liveliness":
             good, usable = LIVELINESS[0] <= value <= LIVELINESS[1], LIVELINESS[2] <= value <= LIVELINESS[3]
         case "current_error":
-            good, usable = value <= CURRENT_ERROR[0], value <= max(CURRENT_ERROR[1], _off_by_chance(least))
+            good, usable = value <= CURRENT_ERROR[0], value <= max(CURRENT_ERROR[1], min(least, 1.0))
         case "current_cosine":
-            wanted = CURRENT_COSINE[1] if floor is None else min(CURRENT_COSINE[1], _of_whole(floor))
+            wanted = CURRENT_COSINE[1] if floor is None else min(CURRENT_COSINE[1], max(floor, 0.0))
             good, usable = value >= CURRENT_COSINE[0], value >= wanted
         case _:
             return None
     return GOOD if good else USABLE if usable else WRONG
-
-
-def _of_whole(cosine: float) -> float:
-    """What two films of a clip's length agree to in direction where its halves agree to a cosine: means over twice as
-    many frames have half the variance, and 1 / cosine - 1 is that variance over the current's square."""
-    return 2.0 * cosine / (1.0 + cosine) if cosine > 0.0 else 0.0
-
-
-def _off_by_chance(error: float) -> float:
-    """As `_of_whole`, of the relative error e of the current: e^2 / 2 is the share of that variance in the square of
-    what is measured."""
-    share = min(0.5 * error**2, 1.0)
-    return float(np.sqrt(2.0 * share / (2.0 - share)))
 
 
 def _advice(figures: tuple[Likeness, ...], value: dict[str, float], beyond: dict[str, float]):

@@ -18,6 +18,9 @@ ZONES = 4
 """along each side of the fluid's bounding box, in which colours are compared"""
 MOST = 16
 """frames, and pairs of them, that a costly figure is taken from, evenly spread: more change it in its third digit"""
+LATE = 2.0 / 3.0
+"""share of the frames before the last third, whose current, bands and colours count: there a re-simulation has left
+what it was given"""
 LAGS = (0.2, 0.5, 1.0)
 """s after which the picture is looked for downstream: less than, about and more than the life of a ripple"""
 STARTS = 8
@@ -139,7 +142,7 @@ def film_statistics(
     foam: Foam,
     *,
     interval: float,
-    late: float = 2.0 / 3.0,
+    late: float = LATE,
 ) -> FilmStatistics:
     """Statistics of a film.
 
@@ -149,7 +152,7 @@ def film_statistics(
         places: of the clip.
         foam: of the clip.
         interval: s between frames.
-        late: share of the frames before what is called the last third.
+        late: share of the frames before those that count for current, bands and colours.
     """
     shape = frames.shape[1:3]
     total, weight = np.zeros((*shape, 3), np.float64), np.zeros(shape, np.float64)

@@ -128,6 +128,33 @@ def test_without_features_the_camera_is_assumed_still_and_the_report_says_so():
     assert "camera-not-seen" in map(code_of, report.warnings)
 
 
+def rising(frames: int, life: float) -> np.ndarray:
+    """A textured plume before black that rises by 3 px a frame and changes its look with a memory of `life` frames."""
+    rng = np.random.default_rng(0)
+    keep, pattern, shown = np.exp(-1.0 / life), scene(5), []
+    for _ in range(frames):
+        grain = cv2.GaussianBlur(rng.normal(size=pattern.shape).astype(np.float32), (0, 0), 3.0)
+        pattern = np.roll(pattern, -3, axis=0)
+        pattern = 120.0 + keep * (pattern - 120.0) + np.sqrt(1.0 - keep**2) * 45.0 * grain / grain.std()
+        shown.append(pattern[20 : 20 + HEIGHT, 20 : 20 + WIDTH].copy())
+    columns = np.arange(WIDTH)
+    return np.stack(shown) * (np.abs(columns - 0.5 * WIDTH) < 0.2 * WIDTH)
+
+
+def test_a_plume_before_black_does_not_carry_the_camera_along():
+    """It moves as one from frame to frame, and its features are all that there are: followed, it would stand still."""
+    frames = rising(48, 6.0)
+    same, report = stabilise(clip_of(frames))
+    assert not report.stabilised and report.drift_px == 0.0 and same.frames.shape == (48, HEIGHT, WIDTH, 3)
+    assert "camera-not-seen" in map(code_of, report.warnings)
+
+
+def test_a_long_way_of_a_camera_over_a_scene_is_believed():
+    pan = panned(9 * np.arange(48))
+    _, report = stabilise(clip_of(pan), least_overlap=0.3)
+    assert report.stabilised and report.drift_px > 150.0
+
+
 def test_a_cut_is_found_at_the_first_frame_of_the_new_shot():
     clip = clip_of(np.concatenate([shaken(np.zeros((8, 2)), 0), shaken(np.zeros((9, 2)), 5)]))
     same, report = stabilise(clip)

@@ -28,7 +28,7 @@ after it and had moved; of water, surf, honey and smoke 0 to 16 %"""
 WINDOWS = 8
 """stretches looked at, spread over the clip"""
 SEEN = 2
-"""of them in which a pixel must be of a solid: puffs of smoke and crests hold together once"""
+"""of them, none of which overlap, in which a pixel must be of a solid: puffs of smoke and crests hold together once"""
 ALIKE = 0.9
 """correlation of the surroundings of a feature before and after"""
 PATCH = 15
@@ -138,9 +138,21 @@ def moving_solids(clip: VideoClip, flow: SharedPairs, shape: tuple[int, int]) ->
         count += length
     mean, mean_square = np.linalg.norm(total, axis=-1) / count, squares / count
     steady = mean / np.maximum(np.sqrt(mean_square), AGREES_PX)
-    seen = np.sum(masks, axis=0)
+    seen = _apart(masks, windows)
     found = (seen >= SEEN) & ((steady < STEADY) | _travelling(masks, means, [start for start, _ in windows]))
     return cv2.resize(found.astype(np.uint8), shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
+
+
+def _apart(masks: list[np.ndarray], windows: list[tuple[int, int]]) -> np.ndarray:
+    """int [h,w]: in how many windows a pixel is of a solid, of those that share no time: in a short clip they overlap,
+    and what holds together once would be seen twice."""
+    seen = np.zeros(masks[0].shape, int)
+    over = np.zeros(masks[0].shape, int)
+    for mask, (start, length) in zip(masks, windows, strict=True):
+        new = mask & (start >= over)
+        seen[new] += 1
+        over[new] = start + length
+    return seen
 
 
 def _travelling(masks: list[np.ndarray], means: list[np.ndarray], starts: list[int]) -> np.ndarray:

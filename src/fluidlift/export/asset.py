@@ -28,7 +28,10 @@ from fluidlift.export.whitewater import has_whitewater, with_kinds
 from fluidlift.io.frames import FIRST_FRAME, FluidFrame
 from fluidlift.io.output_files import Written
 from fluidlift.messages import Notice
+from fluidlift.numerics.mesh_normals import vertex_normals
+from fluidlift.present.surface_waves import SurfaceWaves, waves_of
 from fluidlift.present.surfacing import surface_of
+from fluidlift.scene.recall import simulated_scene
 from fluidlift.scene.splat_files import frame_numbers, frames_of, frames_told
 from fluidlift.seams import Progress, Silence
 from fluidlift.types import FluidAsset, kind_of
@@ -72,7 +75,11 @@ def export_asset(folder: Path, out: Path, request: ExportRequest, *, progress: P
         require_writable(out.parent if page else out)
         with disk_errors(out):
             outcome = _written(job)
-        outcome = replace(outcome, warnings=(*_missing(job, manifest), *outcome.warnings))
+        none = (job.waves,) if isinstance(job.waves, Notice) else ()
+        if isinstance(job.waves, SurfaceWaves):
+            told = (outcome.facts or {}) | {"waves": job.waves.facts}
+            outcome = replace(outcome, words=(*outcome.words, job.waves.told), facts=told)
+        outcome = replace(outcome, warnings=(*_missing(job, manifest), *none, *outcome.warnings))
         outcome = replace(outcome, facts={"frames": len(job.picked), "first": FIRST_FRAME + job.picked.start}
                           | (outcome.facts or {}))  # fmt: skip
     seconds = time.perf_counter() - began
@@ -90,8 +97,26 @@ def _job(
     interval = float(played.get("frame_interval", asset.interval))
     numbers = frame_numbers(folder, int(played.get("frames", 0)), request.frames)
     step = every(request.fps, interval)
-    asset = as_simulated(folder, asset, manifest)
-    return ExportJob(folder, out, asset, request, numbers[::step], step * interval, progress, has_whitewater(manifest))
+    shown = as_simulated(folder, asset, manifest)
+    job = ExportJob(folder, out, shown, request, numbers[::step], step * interval, progress, has_whitewater(manifest))
+    return replace(job, waves=_waves(job, asset, manifest))
+
+
+def _waves(job: ExportJob, asset: FluidAsset, manifest: dict[str, Any]) -> SurfaceWaves | Notice | None:
+    """On the surface of the frames, where the format has one; None where none are asked for.
+
+    Args:
+        job: of the asset on the ground that its frames flow over.
+        asset: as it was lifted.
+        manifest: of it.
+    """
+    from fluidlift.io.scene import read_edits
+
+    amount = read_edits(job.folder).waves
+    if amount == 0 or kind_of(asset.kind).is_gas or job.request.to not in (*MESHED, "vdb"):
+        return None
+    numbers = frame_numbers(job.folder, int(manifest.get("simulation", {}).get("frames", 0)), None)
+    return waves_of(simulated_scene(job.folder, asset, manifest), asset, job.folder, numbers, amount)
 
 
 def _missing(job: ExportJob, manifest: dict[str, Any]) -> tuple[Notice, ...]:
@@ -148,5 +173,8 @@ def _frames(job: ExportJob) -> Iterator[FluidFrame]:
             frame = with_kinds(frame, asset.grid.spacing)
         if mesher is not None:
             mesh, moving = surface_of(gaussians, velocities, asset.terrain, mesher)
+            if isinstance(job.waves, SurfaceWaves):
+                now = job.picked[done] * job.waves.interval
+                mesh, moving = job.waves.raised(mesh, vertex_normals(mesh), moving, now)
             frame = frame._replace(surface=mesh, surface_velocities=moving)
         yield frame

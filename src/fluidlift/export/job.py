@@ -12,6 +12,7 @@ import numpy as np
 
 from fluidlift.errors import InputRejected
 from fluidlift.messages import Notice
+from fluidlift.present.surface_waves import SurfaceWaves
 from fluidlift.seams import Progress
 from fluidlift.types import FluidAsset, Similarity3
 
@@ -63,6 +64,8 @@ class ExportJob:
     progress: Progress
     whitewater: bool = False
     """whether the frames were simulated with white water"""
+    waves: SurfaceWaves | Notice | None = None
+    """on the surface, or why there are none; None: none are asked for"""
 
     @property
     def numbers(self) -> range:

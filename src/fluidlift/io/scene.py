@@ -85,19 +85,24 @@ class SceneEdits:
     """times as much white water as the clip shows, 0 to `MOST_WHITEWATER`"""
     whitewater_everywhere: bool = False
     """also where the clip shows it, and not only where edits make more of it"""
+    waves: float = 0.0
+    """times as high as the clip shows them, 0 to `MOST_WAVES`, on meshes and in the looks transparent and surface"""
 
 
 SECTIONS = (
-    "parameters", "obstacles", "emitters", "terrain", "inflow", "look", "whitewater", "duration", "extend_downstream",
-    "loop",
+    "parameters", "obstacles", "emitters", "terrain", "inflow", "look", "whitewater", "waves", "duration",
+    "extend_downstream", "loop",
 )  # fmt: skip
 
 MOST_WHITEWATER = 100.0
 """times what the clip shows: more hides the water altogether"""
+MOST_WAVES = 100.0
+"""times as high as the clip shows them: most break before"""
 
 NAMES = {
     "parameters": tuple(PARAMETERS), "look": tuple(Look().to_dict()),
     "inflow": ("factor", "keyframes", "fluctuation", "period"), "whitewater": ("amount", "everywhere"),
+    "waves": ("amount",),
 }  # fmt: skip
 """what can stand in the sections whose entries have names of their own"""
 
@@ -105,7 +110,7 @@ NAMES = {
 def home_of(name: Any) -> str:
     """Where a name that stands in a wrong place belongs, in words; "" where it is known nowhere."""
     sections = [section for section, names in NAMES.items() if name in names]
-    return f"write it under {sections[0]}" if sections else "write it at the left margin" * (name in SECTIONS)
+    return f"write it under {' or '.join(sections)}" if sections else "write it at the left margin" * (name in SECTIONS)
 
 
 def read_edits(folder: Path | str, *, meshes: Path | None = None) -> SceneEdits:
@@ -142,6 +147,7 @@ def edits_of(text: str, folder: Path | str, *, meshes: Path | None = None) -> Sc
         read_look(scene, Path(folder)),
         scene.flag("loop", False),
         *_whitewater(scene.part("whitewater", "whitewater")),
+        _waves(scene.part("waves", "waves")),
     )
 
 
@@ -149,6 +155,11 @@ def _whitewater(given: Entries) -> tuple[float, bool]:
     given.only(NAMES["whitewater"])
     amount = given.number("amount", 0.0, low=0.0, high=MOST_WHITEWATER, unit="times what the clip shows")
     return amount, given.flag("everywhere", False)
+
+
+def _waves(given: Entries) -> float:
+    given.only(NAMES["waves"])
+    return given.number("amount", 0.0, low=0.0, high=MOST_WAVES, unit="times as high as the clip shows them")
 
 
 def _obstacles(scene: Entries, meshes: Path) -> tuple[Obstacle, ...]:

@@ -50,11 +50,17 @@ Modules of the face:
     surface_map         The free surface of a liquid that lies, as a map over the plan: where it is, how high it
                         stands, how it moves
     surface_skin        Surface appearance: a skin of small splats over the free surface of a liquid
+    surface_windows     Squares of a filmed surface, resampled to metres over the plan: what its spectrum is taken
+                        from
     texture_patches     Advected textures (Lagrangian patches): the fine look of a liquid's surface, on patches that
                         are not drawn out
     transparent         The surface of a liquid straight from its splats, without a mesh
     vessel              What a pour falls into, as thin glass: which faces of the ground are the vessel, and what
                         its walls do to a picture
+    wave_relief         Waves played on the surface of a simulated liquid: its small-scale relief, as height and
+                        slope at any place and time
+    wave_spectrum       Waves that a film of a surface shows: its brightness by wavenumber and frequency, and slopes
+                        from brightness
     wet_ground          Ground that liquid stands on, in the picture behind that liquid: wet ground is darker than
                         dry ground
     whitewater_splats   What white water looks like: small splats in the clip's foam colour, and where a clip shows
@@ -94,9 +100,12 @@ __all__ = [
     "surface_axes",
     "surface_map",
     "surface_skin",
+    "surface_windows",
     "texture_patches",
     "transparent",
     "vessel",
+    "wave_relief",
+    "wave_spectrum",
     "wet_ground",
     "whitewater_splats",
 ]  # fmt: skip

@@ -66,6 +66,8 @@ Modules of the face:
                           `particle_map`; Jiang et al. 2015)
     viscosity             Implicit viscosity (backward Euler), components coupled by the full stress (paper:
                           `eq::v`, second term)
+    wave_dispersion       Linear waves on a liquid's free surface: how frequency and wavenumber belong together
+                          (gravity and capillarity)
     whitewater            White water: spray, foam and bubbles as particles that a liquid makes and carries, and
                           that do not act on it
 """
@@ -108,5 +110,6 @@ __all__ = [
     "terrain_reshape",
     "transfer",
     "viscosity",
+    "wave_dispersion",
     "whitewater",
 ]  # fmt: skip

@@ -7,27 +7,32 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from fluidlift.errors import InputRejected
 from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.io.output_files import Written, cleared, numbered
+from fluidlift.io.scene_look import Look
 from fluidlift.messages import Notice
 from fluidlift.present.frames import BACKGROUNDS, Drawn, FrameRenderer, SimulatedFrame
 from fluidlift.present.front_view import slab_of
 from fluidlift.present.looks import Painter, Quality
+from fluidlift.present.surface_waves import SurfaceWaves, waves_of
 from fluidlift.scene.build import Scene
 from fluidlift.scene.recall import footage_of_asset, simulated_poses, simulated_scene
 from fluidlift.scene.splat_files import frame_numbers, frames_of, frames_told
 from fluidlift.seams import Progress, Silence
-from fluidlift.types import PinholeCamera
+from fluidlift.types import FluidAsset, PinholeCamera
 
 VIEWS = ("input", "side", "top", "turn")
 FILMS = (".mp4", ".mov")
 PICTURES = (".png", ".exr")
 SURFELS = 200_000
 """of the terrain: stills are looked at longer than the preview"""
+WAVING = ("transparent", "surface")
+"""looks in which a surface has waves: the splats of others carry the film, which shows them"""
 SIZES = (16, 8192)
 """px, of a side of the picture"""
 
@@ -81,6 +86,7 @@ def render_asset(
     """
     from fluidlift.io.asset_folder import load_asset, read_manifest
     from fluidlift.io.atomic import disk_errors, require_writable
+    from fluidlift.io.scene import read_edits
 
     request, progress, began = request or RenderRequest(), progress or Silence(), time.perf_counter()
     _check(request, out)
@@ -92,7 +98,11 @@ def render_asset(
     numbers = frame_numbers(folder, int(played.get("frames", 0)), request.frames)
     poses, warnings = _poses(folder, scene, len(numbers) + numbers[0])
     warnings = [*_beyond_clip(scene.camera.size, request), *warnings]
-    painter = _painter(scene, folder, request)
+    edits = read_edits(folder)
+    look = _look(request, edits.look)
+    waves, said = _waves(scene, asset, folder, played, edits.waves * (look.style in WAVING))
+    warnings += said
+    painter = _painter(scene, folder, request, look, waves)
     renderer = FrameRenderer(scene, footage, painter=painter, surfels=SURFELS)
     background = renderer.background(request.background, front=request.view == "input")
     cameras = _cameras(scene, request, len(numbers))
@@ -109,27 +119,37 @@ def render_asset(
     facts = {"frames": len(numbers), "first": FIRST_FRAME + numbers[0], "size": list(size), "view": request.view,
              "look": "splats" if painter is None else painter.look.style, "out": str(out)}  # fmt: skip
     words = (f"{frames_told(len(numbers))} of {size[0]} x {size[1]} px: {out}",)
+    if waves is not None:
+        facts, words = facts | {"waves": waves.facts}, (*words, waves.told)
     return Written(out, seconds, tuple(warnings), {"render": {"seconds": round(seconds, 3)}}, facts, words)
 
 
-def _painter(scene: Scene, folder: Path, request: RenderRequest) -> Painter | None:
-    """Of the look that is asked for or that scene.yaml names; None: the splats as they were lifted."""
-    from fluidlift.io.scene import read_edits
+def _look(request: RenderRequest, look: Look) -> Look:
+    """The one that is asked for; what is not, as scene.yaml names it.
 
+    Raises:
+        InputRejected: an unknown look, material or environment, or one that a look does not show.
+    """
     asked = {"style": request.look, "material": _checked_material(request), "environment": request.environment,
              "exposure": request.exposure}  # fmt: skip
-    look = read_edits(folder).look
     if request.engine != "mesh" and request.look is None:
         asked["style"] = "surface"
     if request.environment is not None and Path(request.environment).is_file():
         asked["environment"] = str(Path(request.environment).resolve())
     look = replace(look, **{k: v for k, v in asked.items() if v is not None})
+    if look.style == "splats" and (request.material is not None or request.environment is not None):
+        raise InputRejected(
+            "a material or an environment for splats as they were lifted", "another look",
+            "add --look relit, transparent or surface",
+        )  # fmt: skip
+    return look
+
+
+def _painter(
+    scene: Scene, folder: Path, request: RenderRequest, look: Look, waves: SurfaceWaves | None
+) -> Painter | None:
+    """Of a look; None: the splats as they were lifted."""
     if look.style == "splats":
-        if request.material is not None or request.environment is not None:
-            raise InputRejected(
-                "a material or an environment for splats as they were lifted", "another look",
-                "add --look relit, transparent or surface",
-            )  # fmt: skip
         return None
     if request.engine == "mitsuba" and request.background == "none":
         raise InputRejected("Mitsuba without the ground", "--background plate or terrain", "or use --engine mesh")
@@ -141,7 +161,19 @@ def _painter(scene: Scene, folder: Path, request: RenderRequest) -> Painter | No
         engine=request.engine,
         quality=Quality.draft() if request.draft else Quality(request.supersample, request.samples),
         slab=slab_of(scene),
+        waves=waves,
     )
+
+
+def _waves(
+    scene: Scene, asset: FluidAsset, folder: Path, played: dict[str, Any], amount: float
+) -> tuple[SurfaceWaves | None, list[Notice]]:
+    """Of the frames on disk; none where none are asked for, or filmed, which is said."""
+    if amount == 0:
+        return None, []
+    numbers = frame_numbers(folder, int(played.get("frames", 0)), None)
+    found = waves_of(scene, asset, folder, numbers, amount)
+    return (None, [found]) if isinstance(found, Notice) else (found, [])
 
 
 def _checked_material(request: RenderRequest) -> str | None:
@@ -276,7 +308,7 @@ def _pictures(
 ) -> Iterator[Drawn]:
     """Each frame, from its camera."""
     for k, camera, (fluid, _, velocities) in zip(numbers, cameras, frames_of(folder, numbers), strict=True):
-        frame = SimulatedFrame(fluid, velocities, None if poses is None else poses[k])
+        frame = SimulatedFrame(fluid, velocities, None if poses is None else poses[k], k * renderer.scene.interval)
         yield renderer.draw(frame, camera, background)
 
 

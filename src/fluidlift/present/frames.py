@@ -59,6 +59,8 @@ class SimulatedFrame:
     """[n,3], m/s"""
     poses: np.ndarray | None = None
     """[b,7] of the obstacles: position (m) and orientation (w, x, y, z); None: they are not drawn"""
+    time: float = 0.0
+    """s from the first frame"""
 
 
 class FrameRenderer:
@@ -145,7 +147,7 @@ class FrameRenderer:
 
     def _painted(self, frame: SimulatedFrame) -> Frame:
         bodies = [] if frame.poses is None else placed_bodies(self.scene.obstacles, frame.poses)
-        return Frame(frame.fluid, frame.velocities, bodies)
+        return Frame(frame.fluid, frame.velocities, bodies, frame.time)
 
     def _backdrop(self, camera: PinholeCamera, background: str) -> Backdrop:
         if background != "plate":

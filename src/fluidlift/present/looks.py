@@ -32,6 +32,7 @@ from fluidlift.look.wet_ground import wetted
 from fluidlift.numerics.mesh_normals import vertex_normals
 from fluidlift.numerics.srgb import linear_from_srgb, srgb_from_linear
 from fluidlift.present.supersampling import Lit, Quality, averaged, enlarged
+from fluidlift.present.surface_waves import SurfaceWaves
 from fluidlift.present.surfacing import RADIUS, surface_of
 from fluidlift.present.without_fluid import Backdrop, GroundPictures, Shade, wet_behind
 from fluidlift.types import (
@@ -76,6 +77,8 @@ class Frame:
     """[n,3], m/s"""
     bodies: Sequence[TriangleMesh] = ()
     """obstacles, in the world"""
+    time: float = 0.0
+    """s from the first frame, by which waves move on"""
 
 
 def placed_bodies(obstacles: Sequence[Obstacle], poses: np.ndarray) -> list[TriangleMesh]:
@@ -116,6 +119,7 @@ class Painter:
         quality: how finely.
         slab: of a stream; before the terrain it ends there in clean sections, and the ground with it. Before a clip's
             plate it goes on beyond them. None: it is drawn as far as its particles go.
+        waves: on the surface of the looks transparent and surface; None: it is as smooth as it was simulated.
 
     Raises:
         InputRejected: an unknown material, environment or engine.
@@ -132,6 +136,7 @@ class Painter:
         engine: str = "mesh",
         quality: Quality | None = None,
         slab: Slab | None = None,
+        waves: SurfaceWaves | None = None,
     ) -> None:
         if engine not in ENGINES:
             near = difflib.get_close_matches(engine, ENGINES, 1)
@@ -144,7 +149,7 @@ class Painter:
         self.material: Material = material_named(look.material).tinted(look.tint)
         self.environment = environment_of(folder, look.environment)
         self._quality, self._bed = quality or Quality(), terrain if kind_of(kind).lies_on_ground else None
-        self._slab = slab or Slab()
+        self._slab, self._waves = slab or Slab(), waves
         self._finer, self._folder = 1 if engine == "mitsuba" else self._quality.supersample, folder
         self._far: tuple[tuple, np.ndarray] | None = None
         self._taken: tuple[Backdrop, Backdrop] | None = None
@@ -223,13 +228,13 @@ class Painter:
         if self.look.style == "relit":
             lit = self._relit(frame.fluid, camera, self._through_far_wall(beside, camera, backdrop), backdrop.cut_out)
         else:
-            lit = self._refracting(frame.fluid, mesh, camera, (beside, through, bed), backdrop)
+            lit = self._refracting(frame, mesh, camera, (beside, through, bed), backdrop)
         walls = self._glass(camera, backdrop)
         return lit if walls is None else replace(lit, image=walls[0].over(lit.image, lit.depth))
 
     def _refracting(
         self,
-        fluid: Gaussians,
+        frame: Frame,
         mesh: TriangleMesh | None,
         camera: PinholeCamera,
         pictures: tuple[Behind, Behind, Ground | None],
@@ -237,7 +242,9 @@ class Painter:
     ) -> Lit:
         """A liquid that shows what lies behind it. pictures: as `_pictures` gives them."""
         beside, through, bed = pictures
-        surface = self._liquid(fluid, mesh, camera, beside, self._ends(backdrop))
+        surface = self._liquid(frame, mesh, camera, beside, self._ends(backdrop))
+        if self._waves is not None:
+            surface = self._waves.tilted(surface, camera, frame.time)
         if through is not beside:  # what hides the liquid is not in the picture through it
             hidden = (beside.depth > 0) & (surface.depth >= beside.depth)
             surface = replace(surface, covered=np.where(hidden, np.float32(0.0), surface.covered))
@@ -397,14 +404,17 @@ class Painter:
 
     def _liquid(
         self,
-        fluid: Gaussians,
+        frame: Frame,
         mesh: TriangleMesh | None,
         camera: PinholeCamera,
         behind: Behind,
         ends: Sequence[OpenEnd],
     ) -> LiquidSurface:
+        fluid = frame.fluid
         if mesh is not None:
             normals = None if self._bed is None else settled(mesh.vertices, vertex_normals(mesh), self._bed, ends)
+            if self._waves is not None and normals is not None:  # whose slope is added for each pixel
+                mesh, _ = self._waves.raised(mesh, normals, None, frame.time)
             return mesh_surface(mesh, camera, radius=RADIUS * self.terrain.grid.spacing, normals=normals)
         fluid = painted_liquid(fluid, self.terrain.grid.spacing)
         free = self._bed is None  # what lies on a bed has its far side there: no second surface to bend light at
@@ -425,6 +435,8 @@ class Painter:
         assert self._final is not None
         ends = () if backdrop.picture is not None else self._slab.ends
         mesh, _ = surface_of(frame.fluid, frame.velocities, self.terrain, self._need_mesher(), clamped=False, ends=ends)
+        if self._waves is not None:
+            mesh, _ = self._waves.raised(mesh, vertex_normals(mesh), None, frame.time)
         mesh = resting(mesh, self.terrain)
         ground = [self._grounds.solid] if len(self._grounds.solid.faces) else []
         image, alpha = self._final.picture_and_alpha(

@@ -27,6 +27,8 @@ Modules of the face:
                         as it was carried
     splat_files         Where an asset keeps the frames of its simulation, and what goes on from them
     surface_appearance  What the splats of a simulated fluid look like in each frame
+    waves               Waves of a scene: what its film says of them, and how they are played on its simulated
+                        surface
     whitewater          The white water of a scene: how much of it its clip asks for, and its splats, frame by frame
 """
 
@@ -59,5 +61,5 @@ __all__ = [
     "Add", "Change", "EditSession", "Remove", "Scene", "Set", "SimulationRequest", "build", "coarse_copy",
     "dry_cells", "edit_history", "edited_scene", "edits", "footage", "force_weight", "forecast", "open_water", "recall",
     "reshaping", "scene_of", "settings", "simulated_history", "simulation", "simulator", "simulator_of",
-    "smoke_appearance", "splat_files", "surface_appearance", "whitewater",
+    "smoke_appearance", "splat_files", "surface_appearance", "waves", "whitewater",
 ]  # fmt: skip

@@ -102,6 +102,25 @@ def test_what_recedes_comes_towards_the_viewer_and_does_not_fall():
     assert lying.scores["stream"] > 2.0 * upright.scores["stream"]
 
 
+def poured_into_a_tray():
+    """A pool that fills half the picture; from the foot of a jet at its far side it spreads downwards as 1 / r."""
+    pool = ((ROW - 50) / 36.0) ** 2 + ((COL - 80) / 60.0) ** 2 < 1
+    frames, masks, _, trust = scene(pool, (0.0, 1.0), (190, 130, 60))
+    r = np.stack([COL - 80.0, ROW - 18.0], axis=-1)
+    away = np.maximum(np.linalg.norm(r, axis=-1, keepdims=True), 4.0)
+    outward = np.where((ROW > 18)[..., None] & (np.abs(r[..., :1]) < 0.5 * r[..., 1:]), 20.0 * r / away**2, 0.0)
+    return frames, masks, np.where(masks[0][..., None], outward, 0.0), trust
+
+
+def test_what_spreads_in_its_pool_and_slows_down_does_not_fall(monkeypatch):
+    found = estimate_kind(*poured_into_a_tray())
+    assert found.features["spreading"] > 0.9
+    assert found.kind == "stream" and found.scores["stream"] > 0.6, found.scores
+    assert estimate_kind(*curtain()).features["spreading"] == 0.0
+    monkeypatch.setattr("fluidlift.shape.kind.spreading", lambda *_: 0.0)
+    assert estimate_kind(*poured_into_a_tray()).kind == "fall", "its speed is what tells them apart"
+
+
 def to_and_fro(pairs=30, mean=0.0, swing=1.0):
     """Bulk motion, px per frame, of water and ground: a wave over a current, seen for a period and a half."""
     time = np.linspace(0.0, 3.0 * np.pi, pairs)

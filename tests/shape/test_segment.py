@@ -96,6 +96,22 @@ def test_a_stream_that_stays_in_its_bed_keeps_its_labels_from_frame_to_frame(riv
     assert np.mean(fluid[1:] != fluid[:-1]) < 0.001 * fluid.mean()
 
 
+def test_an_edge_that_a_stabilizer_filled_with_a_mirror_image_is_no_fluid(river, monkeypatch):
+    pictures, flow = stream(np.random.default_rng(3))
+    displacement = flow.displacement.copy()
+    for t, strip in enumerate(np.linspace(4, 16, FRAMES).round().astype(int)):
+        pictures[t, HEIGHT - strip :] = pictures[t, HEIGHT - 2 * strip : HEIGHT - strip][::-1]
+        displacement[min(t, FRAMES - 2), HEIGHT - strip :, :, 1] = -1.6  # twice what the frame moves by
+    clip, moved = clip_of(pictures), replace(flow, displacement=displacement)
+    labels = segment(clip, moved)
+    assert not labels.fluid[:, HEIGHT - 16 :].any()
+    assert [code_of(w) for w in labels.warnings] == ["mirrored-edge"]
+    assert overlap(labels.fluid[FRAMES // 2], stream_mask() & ~rock_mask()) > 0.92
+    monkeypatch.setattr("fluidlift.shape.segment.mirrored_edges", lambda frames: np.zeros(frames.shape[1:3], bool))
+    assert segment(clip, moved).fluid[:, HEIGHT - 16 :].any()
+    assert not any(code_of(w) == "mirrored-edge" for w in segment(*river).warnings)
+
+
 def test_the_same_clip_gives_the_same_labels(river):
     first, second = segment(*river), segment(*river)
     assert np.array_equal(first.labels, second.labels) and np.array_equal(first.confidence, second.confidence)

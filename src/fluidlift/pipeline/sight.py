@@ -368,8 +368,10 @@ def _kind_and_up(
         kind, parts = composite.split(
             kind, known, surveyed if pose_given else None, mask, motion, trust, free=c.kind == "auto"
         )
-        if kind.fills_vessel and c.kind == "auto":
-            poured = puddle.jets_into_puddle(known, surveyed if pose_given else None, mask, motion, trust)
+        if c.kind == "auto" and (kind.fills_vessel or kinds.spreads(evidence)):
+            tilt = surveyed if pose_given else None
+            poured = puddle.jet_over_spreading(tilt, mask) if kinds.spreads(evidence) else None
+            poured = poured or puddle.jets_into_puddle(known, tilt, mask, motion, trust)
             if poured is not None:
                 kind, parts = STREAM, composite.Parts(poured.jets, poured.lying, puddle=True)
     else:

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
-from fluidlift.shape import jets, slope
+from fluidlift.shape import jets, slope, spreading
 from fluidlift.shape.heights import FARTHEST, HeightModel
 from fluidlift.types import PinholeCamera
 
@@ -345,10 +345,7 @@ def energy_kept(
     _, _, along, across = slope.basis(camera, uv, axes)
     velocity = np.linalg.solve(np.stack([along, across], axis=-1), motion[known][..., None])[..., 0] * depth[:, None]
     way = (rays * depth[:, None] - foot) @ axes[0]
-    # gravity and a steady friction change v^2 along a line: v^2 = v0^2 + 2 a s
-    rise, start = np.polyfit(way, np.square(velocity).sum(axis=1), 1, w=np.sqrt(trust[known]))
-    upper, lower = (max(float(start + rise * s), 0.0) for s in np.percentile(way, [2, 98]))
-    return lower / upper if upper > 0 else np.inf
+    return spreading.energy_kept(way, np.square(velocity).sum(axis=1), trust[known])
 
 
 def head_acceleration(

@@ -12,6 +12,7 @@ from fluidlift.errors import require
 from fluidlift.messages import Notice
 from fluidlift.shape import chute, prism, slope
 from fluidlift.shape.open_water import recession
+from fluidlift.shape.spreading import CLEAR_PX, FALLS, spreading
 from fluidlift.shape.view import PictureEvidence, habit_prior
 from fluidlift.shape.view.habit import ROLL
 from fluidlift.types import FluidKind, KindEvidence, PinholeCamera, RigidTransform, UpEvidence, kind_of
@@ -29,8 +30,6 @@ written"""
 LEAST_SURE = 0.7
 """share of the belief below which a user is told what else it could be: of the same clips 10 are, 2 of the 4 wrong ones
 among them"""
-CLEAR_PX = 0.3
-"""px per frame: six times the error of optical flow at its best (`slope.LEAST_NOISE`)"""
 FOLLOWED = 0.3
 """share of the fluid that is seen to fall with reliable flow, from which it is followed. Under gravity h metres take
 0.45 s times the root of h, so of a jet a few decimetres long a pixel moves by more per frame than its own pattern: of
@@ -47,6 +46,8 @@ FEWEST_PAIRS = 12
 SHAKE = 0.05
 """px per frame and axis that the bulk motion changes by where the fluid's does not: what steadying leaves of a camera's
 shake, and errors of optical flow (`slope.LEAST_NOISE`)"""
+SPREADS = 0.5
+"""of `spreading.spreading`, from which it is taken to: of 34 real clips one has more than 0, and 1"""
 STRAIGHT = 10.0
 """degrees: a larger lean of what falls is a thrown jet or wind, not a turned camera"""
 
@@ -62,6 +63,15 @@ def doubts(evidence: KindEvidence) -> tuple[Notice, ...]:
             f"what kind of fluid this is, is unsure: {best} ({share:.2f}) or {second} ({other:.2f}); --kind decides",
         ),
     )
+
+
+def spreads(evidence: KindEvidence) -> bool:
+    """Whether it spreads over what it lies on, from where it comes down.
+
+    On a slope it would keep its speed (a film under its friction: v = g sin(slope) h^2 / (3 nu)) or gain some, so that
+    a pool of what spreads is level.
+    """
+    return evidence.features.get("spreading", 0.0) > SPREADS
 
 
 def estimate_kind(
@@ -86,8 +96,10 @@ def estimate_kind(
     """
     require(fluid.shape == frames.shape[:3], f"masks {fluid.shape} for frames {frames.shape}")
     f = _features(frames, fluid, displacement, confidence) | {"swinging": 0.0 if bulk is None else swinging(*bulk)}
-    # down in the picture is towards the viewer on what recedes from him; a jet that splashes at its foot does not
-    f["falling"] *= 1.0 - f["receding"] * (1.0 - f["slender"])
+    # down in the picture is towards the viewer on what recedes from him, and on what spreads and loses its speed; a jet
+    # that splashes at its foot seems to recede
+    f["falling"] *= 1.0 - max(f["receding"] * (1.0 - f["slender"]), f["spreading"])
+    f["followed"] *= 1.0 - f["spreading"]
     still = 1.0 - f["changing"]
     lifted = float(np.clip((f["rising"] - ALL_RISES[0]) / (ALL_RISES[1] - ALL_RISES[0]), 0.0, 1.0))
     inside = f["enclosed"] * (1 - f["hanging"])  # what ends within the picture passes nothing on
@@ -164,8 +176,8 @@ def _features(frames, fluid, displacement, confidence) -> dict[str, float]:
     def within(centre: float, span: float) -> float:
         return float(weight[np.abs((angle - centre + 180) % 360 - 180) < span].sum() / total)
 
-    falling, rising = within(90, 40), within(-90, 50)
-    followed = union & (confidence > TRUSTED) & (speed > CLEAR_PX) & (np.abs(angle - 90) < 40)
+    falling, rising = within(90, FALLS), within(-90, 50)
+    followed = union & (confidence > TRUSTED) & (speed > CLEAR_PX) & (np.abs(angle - 90) < FALLS)
     # the shape of what moves: still water around a jet says nothing about the jet
     moving = union & (weight > 0.25 * np.percentile(weight[union], 95))
     moving = ndimage.binary_opening(moving) if ndimage.binary_opening(moving).any() else union
@@ -196,6 +208,7 @@ def _features(frames, fluid, displacement, confidence) -> dict[str, float]:
         "enclosed": float(np.clip(1.0 - _border_share(union) / 0.1, 0.0, 1.0)),
         "grey": float(np.clip(1.0 - chroma / 0.15, 0.0, 1.0)),
         "collapsing": _collapsing(fluid),
+        "spreading": spreading(union, displacement, confidence),
         "receding": float(np.clip((recession(frames, union) - RECEDES[0]) / (RECEDES[1] - RECEDES[0]), 0.0, 1.0)),
         "speed_px": float(total / max(float((confidence * union).sum()), 1e-9)),
         "area_share": float(union.sum() / (height * width)),

@@ -2,6 +2,8 @@
 
 Where a jet ends in a still pool the silhouette alone does not tell a puddle that lies from a body that hangs: the jet
 is seen by its motion (shape/jets.py), and a pool that is round lies where its outline is an ellipse wider than tall.
+What spreads from its foot (shape/spreading.py) moves faster than a smooth jet seems to: there the silhouette says which
+is the jet.
 """
 
 from __future__ import annotations
@@ -11,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from fluidlift.shape.jets import Outline, airborne_pixels, find_jets, lying_pixels
+from fluidlift.shape.jets import Outline, airborne_pixels, find_jets, find_neck, lying_pixels
 from fluidlift.shape.kind import level_camera
 from fluidlift.shape.region import largest_piece
 from fluidlift.shape.view.roundness import POOL_LIKENESS, fit_ellipse
@@ -53,6 +55,22 @@ def jets_into_puddle(
     tilt = up or UpEvidence(LOOKING_DOWN[0], 0.0, "", 0.0)
     found = find_jets(level_camera(camera, tilt), mask, motion, trust)
     found = [down_to_landing(outline, mask, motion, trust) for outline in found]
+    return _poured(found, up, mask)
+
+
+def jet_over_spreading(up: UpEvidence | None, mask: Bool[np.ndarray, "h w"]) -> Poured | None:
+    """The jet that the silhouette shows above a round pool in which it spreads; None where it shows none.
+
+    Args:
+        up: tilt of the camera, where that is known.
+        mask: fluid pixels.
+    """
+    neck = find_neck(mask, pitch=LOOKING_DOWN[0] if up is None else up.pitch)
+    return None if neck is None else _poured([neck], up, mask)
+
+
+def _poured(found: list[Outline], up: UpEvidence | None, mask: np.ndarray) -> Poured | None:
+    """The jets with their pool, where that is one that is seen from above."""
     airborne = airborne_pixels(found, mask.shape)
     # wet traces on a bowl's rim, and what is left of a jet at the picture's edge, have no part in the outline
     lying = lying_pixels(airborne | largest_piece(mask & ~airborne), airborne)

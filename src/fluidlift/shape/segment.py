@@ -25,6 +25,7 @@ from fluidlift.shape.colour_growth import grown_from_streams, with_quiet_water
 from fluidlift.shape.evidence import Evidence, PairReader, fluid_score, gather_evidence, pair_reader, solids_by_flow
 from fluidlift.shape.hints import VOICE, Clicks, Point, clicks_at, heed, holes_asked_for
 from fluidlift.shape.islands import without_ground
+from fluidlift.shape.mirrored_edges import mirrored_edges
 from fluidlift.shape.moving_solids import SharedPairs, moving_solids
 from fluidlift.shape.open_water import with_open_water
 from fluidlift.shape.presence import Presence, always, grows, stay, watch
@@ -103,6 +104,8 @@ class Clues:
     """s between two frames"""
     said: np.ndarray | None = None
     """float32 [h,w], log odds of fluid from elsewhere"""
+    mirrored: float = 0.0
+    """share of the picture that only mirrors the rest of it, at its edges"""
 
     @cached_property
     def score(self) -> np.ndarray:
@@ -149,10 +152,13 @@ def clues_of(
     """
     pairs = SharedPairs(clip, pair_reader(flow))
     evidence = gather_evidence(clip, pairs)
-    inside = shrink_mask(region_of_interest(roi, *clip.frames.shape[1:3]), evidence.noise.shape)
+    mirrored = mirrored_edges(clip.frames)
+    inside = region_of_interest(roi, *clip.frames.shape[1:3]) & ~mirrored
+    inside = shrink_mask(inside, evidence.noise.shape)
     if said is not None:
         said = cv2.resize(said, evidence.noise.shape[::-1], interpolation=cv2.INTER_LINEAR)
-    return Clues(evidence, moving_solids(clip, pairs, evidence.noise.shape), inside, clip.interval, said)
+    solids = moving_solids(clip, pairs, evidence.noise.shape)
+    return Clues(evidence, solids, inside, clip.interval, said, float(mirrored.mean()))
 
 
 def segment(
@@ -215,7 +221,7 @@ def segment(
     tell(0.5, "labels")
     writer = LabelWriter((frames, height, width), out)
     share = write_labels(found, writer, small_inside, tell)
-    return PixelLabels(writer.labels, writer.confidence, warnings=doubts(share, score))
+    return PixelLabels(writer.labels, writer.confidence, warnings=doubts(share, score) + mirror_notice(known.mirrored))
 
 
 def staying_labels(known: Clues, clicks: Clicks) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -416,6 +422,20 @@ def doubts(share: float, score: np.ndarray) -> tuple[Notice, ...]:
             Notice("mask-nearly-everything", "nearly the whole picture was taken for fluid: was the camera moving?")
         )
     return tuple(warnings)
+
+
+def mirror_notice(share: float) -> tuple[Notice, ...]:
+    """What to say of edges that only mirror the picture."""
+    if share == 0.0:
+        return ()
+    return (
+        Notice(
+            "mirrored-edge",
+            f"edges of the picture, {max(100 * share, 1):.0f} % of it, mirror what lies within, as a stabilizer fills "
+            "what a moved frame leaves open: no fluid is looked for there; a clip that is cropped, or as it was "
+            "filmed, shows more",
+        ),
+    )
 
 
 def overlay(frame: np.ndarray, labels: np.ndarray) -> np.ndarray:

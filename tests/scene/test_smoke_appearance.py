@@ -78,12 +78,16 @@ def test_what_the_simulation_lacks_is_filled_as_far_off_as_the_smoke_beside_it(c
     assert (again[1] == ids).all() and (again[0].means == gaussians.means).all()
 
 
-def test_far_from_all_simulated_smoke_nothing_is_filled(channel):
+def test_far_from_all_simulated_smoke_what_fills_fades_out(channel):
+    even = SmokeFilm(puff().colors, np.full((FRAMES, 48, 64), 100, np.uint8), INTERVAL)
     scene = smoke(channel)
     left = scene.body.select(scene.body.positions[:, 0] < 0.15)
-    gaussians, ids, _ = shown(scene, puff(0.5), 3, left)
-    reach = 0.15 + (ASTRAY + 1) * 0.1
-    assert not (gaussians.means[ids % 2 == 1, 0] > reach).any()
+    gaussians, ids, _ = shown(scene, even, 3, left)
+    end = 0.15 + (2 * ASTRAY + 1) * 0.1
+    assert (ids % 2 == 1).any() and not (gaussians.means[ids % 2 == 1, 0] > end).any()
+    columns = scene.camera.project(np.array([[0.15 + 0.1 * k, 0.4, 0.2] for k in (2, ASTRAY + 2, ASTRAY + 4)]))[0][:, 0]
+    near, fading, gone = (alpha(gaussians, scene)[20:28, int(c)].mean() for c in columns)
+    assert near == pytest.approx(100 / 255, rel=0.15) and 0.9 * near > fading > gone
     assert not shown(scene, puff(0.5), 3, scene.body.select(slice(0, 0)))[1].size
 
 

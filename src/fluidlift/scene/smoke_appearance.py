@@ -38,10 +38,14 @@ CARRIED = 0.5
 
 ASTRAY = 6.0
 """cells from the simulated smoke within which smoke that the film shows is shown as well: a plume of ten cells that the
-simulator turns another way, its eddies above all. What is further off shows that the simulation is another one"""
+simulator turns another way, its eddies above all. Over as many again it fades out: what is further off shows that the
+simulation is another one"""
 
 LACKING = 0.5
 """share of the film's optical depth under which simulated smoke leaves a place to be filled"""
+
+SPOT = 0.1
+"""opacity by which a place of thick smoke that lacks less is seen as a spot"""
 
 SEEN = 0.03
 """optical depth from which a place is filled"""
@@ -232,7 +236,9 @@ class SmokeAppearance:
 
         cell = self._scene.terrain.grid.spacing / float(np.median(pixel))
         near = _NearestSmoke.of(uv, pixel * self._camera.focal[0], particles.velocities, depth.shape)
-        lacking = (depth > SEEN) & (there < LACKING * depth) & (near.away <= ASTRAY * cell)
+        depth = depth * (1.0 - smoothstep(near.away, ASTRAY * cell, 2.0 * ASTRAY * cell))
+        holes = (there < LACKING * depth) | (np.exp(-there) - np.exp(-depth) > SPOT)
+        lacking = (depth > SEEN) & holes
         step = max(round(cell / FINER), 1)
         lattice = np.zeros(depth.shape, bool)
         lattice[::step, ::step] = True

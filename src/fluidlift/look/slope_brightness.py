@@ -32,7 +32,7 @@ def brightness_of_slope(incidence: float, body: float, *, horizon: float = 1.0) 
     """
 
     def light(s: float) -> float:
-        reflected = float(fresnel(np.cos(np.clip(incidence - s, 0.0, 0.5 * np.pi)), WATER))
+        reflected = float(_mirrored(np.array([incidence - s]))[0])
         elevation = np.clip(0.5 * np.pi - incidence + 2.0 * s, 0.0, 0.5 * np.pi)
         sky = horizon + (1.0 - horizon) * np.sin(elevation)
         # irradiance over pi of such a sky, in its zenith's radiance
@@ -45,14 +45,19 @@ def brightness_of_slope(incidence: float, body: float, *, horizon: float = 1.0) 
 def level_brightness(incidence: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
     """Brightness of level water of usual body at angles (radians from the plumb line), under a uniform sky of 1; above
     the horizon that of the horizon."""
-    share = fresnel(np.cos(np.clip(incidence, 0.0, 0.5 * np.pi)), WATER)
+    share = _mirrored(incidence)
     return share + (1.0 - share) * BODY[1]
 
 
 def mirrored_share(incidence: float) -> float:
     """Of the light that such water sends at an angle (radians from the plumb line), what it mirrors."""
-    share = float(fresnel(np.cos(np.clip(incidence, 0.0, 0.5 * np.pi)), WATER))
-    return share / float(level_brightness(np.asarray(incidence)))
+    angle = np.array([incidence])
+    return float((_mirrored(angle) / level_brightness(angle))[0])
+
+
+def _mirrored(incidence: np.ndarray) -> np.ndarray:
+    """Fresnel's reflectance of water at angles [n] (radians from the plumb line)."""
+    return fresnel(np.cos(np.clip(incidence, 0.0, 0.5 * np.pi)), WATER)
 
 
 def gain_and_range(incidence: float, mirrored: float = 0.0) -> tuple[float, tuple[float, float]]:

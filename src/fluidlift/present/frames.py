@@ -32,6 +32,8 @@ RING = 6
 by up to a cell"""
 SOMETIMES = 0.1
 """share of the frames from which on a pixel counts as one of the fluid: its plate may show fluid that masks missed"""
+PALE = 0.5
+"""mean sRGB, 0 to 1, from which smoke that is seen through is told from a pale sky by little"""
 NEAR = 1e-3
 """m, depth of what stands before the fluid in an unknown place: it hides all of it"""
 
@@ -140,7 +142,8 @@ class FrameRenderer:
             )[0]
         # as in the other looks, what thins out behind the section of a stream is not drawn before the terrain
         fluid = frame.fluid if self._end is None else frame.fluid.select(self._end.before(frame.fluid.means))
-        return render(concatenate([self.ground, *self._solids(frame), fluid]), camera, background=_sky(camera))
+        sky = _sky(camera, self._pale)
+        return render(concatenate([self.ground, *self._solids(frame), fluid]), camera, background=sky)
 
     def _seen(self, frame: SimulatedFrame) -> Gaussians:
         return concatenate([frame.fluid, *self._solids(frame)])
@@ -162,6 +165,11 @@ class FrameRenderer:
         coarse = max(camera.focal[0] / self.scene.camera.focal[0], 1.0)
         drawn = None if fluid is None else _placed(self._beside_rocks, self.scene.camera, camera)[..., 0]
         return Backdrop(plate, self._depth_of_rocks(camera), coarse, fluid, drawn)
+
+    @cached_property
+    def _pale(self) -> bool:
+        """Whether the fluid is smoke that would hardly be seen before a pale sky."""
+        return kind_of(self.scene.kind).is_gas and bool(np.mean(self.scene.rest.rgb) > PALE)
 
     @cached_property
     def ground(self) -> Gaussians:
@@ -272,10 +280,12 @@ def _without_rim(stands: np.ndarray) -> np.ndarray:
     return np.where(thick[parts], core, stands)
 
 
-def _sky(camera: PinholeCamera) -> np.ndarray:
-    """sRGB [h,w,3] behind the terrain: pale, darker towards the bottom."""
+def _sky(camera: PinholeCamera, pale_fluid: bool) -> np.ndarray:
+    """sRGB [h,w,3] behind the terrain: pale, and dim behind a pale fluid that is seen through; darker towards the
+    bottom."""
     width, height = camera.size
-    return np.linspace(0.93, 0.78, height, dtype=np.float32)[:, None, None] * np.ones((1, width, 3), np.float32)
+    ends = (0.32, 0.2) if pale_fluid else (0.93, 0.78)
+    return np.linspace(*ends, height, dtype=np.float32)[:, None, None] * np.ones((1, width, 3), np.float32)
 
 
 def _encoded(rgb: np.ndarray, alpha: np.ndarray, depth: np.ndarray) -> Drawn:

@@ -1,0 +1,21 @@
+"""What stands behind the terrain in pictures of frames."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fluidlift.present.frames import FrameRenderer, SimulatedFrame
+from fluidlift.types import PinholeCamera, RigidTransform
+
+
+@pytest.mark.parametrize(("kind", "grey", "dim"), [("plume", 0.8, True), ("plume", 0.2, False), ("stream", 0.8, False)])
+def test_pale_smoke_is_shown_before_a_dim_sky(channel, kind, grey, dim):
+    scene = channel(2, kind=kind)
+    scene = replace(scene, rest=replace(scene.rest, sh=np.full_like(scene.rest.sh, (grey - 0.5) / 0.2820948)))
+    up = PinholeCamera((96.0, 96.0), (32.0, 24.0), (64, 48), RigidTransform(np.eye(3), -np.array([0.6, 0.4, 2.4])))
+    frame = SimulatedFrame(scene.rest, np.zeros((len(scene.rest), 3)))
+    sky = FrameRenderer(scene, None).draw(frame, up, "terrain").shown
+    assert np.ptp(sky.mean(axis=-1), axis=1).max() < 1e-6  # nothing else is seen
+    contrast = abs(float(sky.mean()) - grey)
+    assert contrast > (0.4 if dim or grey < 0.5 else 0.0) and (float(sky.mean()) < 0.4) == dim

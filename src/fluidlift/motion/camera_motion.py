@@ -30,8 +30,10 @@ LEAST_ALTERNATIVE = 0.2
 
 PROBES = 12
 """frames, spread over the shot, from which it is looked whether the scene holds together on its way"""
+PATCH = 15
+"""px, side of the surroundings of a feature by which it is known again: as wide as what tracks it (17)"""
 LEAST_WAY = 2.5
-"""px that a camera goes before that can be told from standing still: patches of 15 px look the same after less"""
+"""px that a camera goes before that can be told from standing still: such surroundings look the same after less"""
 FOUND_AGAIN, LOST = 0.8, 0.5
 """correlation of a feature's surroundings with those where the camera's motion carries it, above which it was found
 again, and with those at its old place, below which it has moved"""
@@ -138,11 +140,11 @@ def _cells_found_again(first: np.ndarray, second: np.ndarray, motion: np.ndarray
 
 
 def _alike(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """float32 [H,W]: normalised cross-correlation of two pictures in a window of 15 px about each pixel."""
+    """float32 [H,W]: normalised cross-correlation of two pictures in a window (`PATCH`) about each pixel."""
     a, b = (np.asarray(picture, np.float32) for picture in (first, second))
 
     def mean(x: np.ndarray) -> np.ndarray:
-        return cv2.boxFilter(x, cv2.CV_32F, (15, 15))
+        return cv2.boxFilter(x, cv2.CV_32F, (PATCH, PATCH))
 
     a, b = a - mean(a).mean(), b - mean(b).mean()
     covariance = mean(a * b) - mean(a) * mean(b)

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from fluidlift.motion.align import refined_similarity
+from fluidlift.motion.confidence import photometric_agreement
 from fluidlift.numerics.similarity2 import composed, inverse
 
 GRID = (8, 6)
@@ -30,16 +31,14 @@ LEAST_ALTERNATIVE = 0.2
 
 PROBES = 12
 """frames, spread over the shot, from which it is looked whether the scene holds together on its way"""
-PATCH = 15
-"""px, side of the surroundings of a feature by which it is known again: as wide as what tracks it (17)"""
 LEAST_WAY = 2.5
 """px that a camera goes before that can be told from standing still: such surroundings look the same after less"""
 FOUND_AGAIN, LOST = 0.8, 0.5
-"""correlation of a feature's surroundings with those where the camera's motion carries it, above which it was found
-again, and with those at its old place, below which it has moved"""
+"""photometric agreement of a feature's surroundings with those where the camera's motion carries it, above which it was
+found again, and with those at its old place, below which it has moved"""
 SCENE = 5.0
 """cells of the grid with such features over half of the way or `limit` / 2 px. Of 34 clips of 3 s, seven need more than
-one key frame: four cameras that moved (hands, one that walks over a torrent) have 7 to 23 cells, three that stood
+one key frame: four cameras that moved (hands, one that walks over a torrent) have 8 to 23 cells, three that stood
 before smoke and a jet 1 to 3"""
 
 
@@ -77,7 +76,7 @@ def camera_motion(grey: Sequence[np.ndarray], *, limit: float) -> np.ndarray | N
     if len(first.features) < 4 * LEAST_CELLS:
         return None
     motions = np.tile(np.eye(2, 3), (len(grey), 1, 1))
-    lost, chained_once = 0, False
+    lost, several_keys = 0, False
     for order in (range(middle + 1, len(grey)), range(middle - 1, -1, -1)):
         key, key_frame, before = first, middle, middle
         for t in order:
@@ -86,10 +85,10 @@ def camera_motion(grey: Sequence[np.ndarray], *, limit: float) -> np.ndarray | N
                 nearer = _KeyFrame.of(grey[before], motions[before])
                 chained, agreed = nearer.motion_to(grey[t], motions[before], limit)
                 if agreed:
-                    key, key_frame, found, chained_once = nearer, before, chained, True
+                    key, key_frame, found, several_keys = nearer, before, chained, True
             lost += not agreed
             motions[t], before = found, t
-    if lost > 0.5 * (len(grey) - 1) or (chained_once and not scene_holds(grey, motions, limit)):
+    if lost > 0.5 * (len(grey) - 1) or (several_keys and not scene_holds(grey, motions, limit)):
         return None
     return motions
 
@@ -129,27 +128,16 @@ def _cells_found_again(first: np.ndarray, second: np.ndarray, motion: np.ndarray
     features = spread_features(first)[:, 0]
     if not len(features):
         return 0
-    back = cv2.warpAffine(second, motion, (width, height), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
-    seen = cv2.warpAffine(np.ones_like(second), motion, (width, height), flags=cv2.WARP_INVERSE_MAP)
+    pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float32)
+    flow = (pixels @ motion[:, :2].T + motion[:, 2] - pixels).astype(np.float32)
+    a, b = first.astype(np.float32), second.astype(np.float32)
     here = np.round(features).astype(int)
-    here = here[seen[here[:, 1], here[:, 0]] > 0]
-    carried, stayed = (_alike(first, picture)[here[:, 1], here[:, 0]] for picture in (back, second))
+    there = here + flow[here[:, 1], here[:, 0]]
+    here = here[((there >= 0) & (there <= np.array([width - 1, height - 1]))).all(axis=1)]
+    carried, stayed = (photometric_agreement(a, b, f)[here[:, 1], here[:, 0]] for f in (flow, np.zeros_like(flow)))
     moved = here[(carried > FOUND_AGAIN) & (stayed < LOST)]
     columns, rows = (moved * np.array(GRID) // np.array([width, height])).T
     return len(np.unique(rows * GRID[0] + columns))
-
-
-def _alike(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """float32 [H,W]: normalised cross-correlation of two pictures in a window (`PATCH`) about each pixel."""
-    a, b = (np.asarray(picture, np.float32) for picture in (first, second))
-
-    def mean(x: np.ndarray) -> np.ndarray:
-        return cv2.boxFilter(x, cv2.CV_32F, (PATCH, PATCH))
-
-    a, b = a - mean(a).mean(), b - mean(b).mean()
-    covariance = mean(a * b) - mean(a) * mean(b)
-    variance = (mean(a * a) - mean(a) ** 2) * (mean(b * b) - mean(b) ** 2)
-    return covariance / np.sqrt(np.maximum(variance, 1e-6))
 
 
 @dataclass(frozen=True)

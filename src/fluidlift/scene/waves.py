@@ -41,8 +41,7 @@ def filmed_waves(scene: Scene) -> FilmedWaves | Notice:
     Args:
         scene: without edits, as its clip shows it.
     """
-    kind = kind_of(scene.kind)
-    if kind.is_gas or not (kind.is_channel_flow or kind.is_standing_water) or kind.falls_freely:
+    if not kind_of(scene.kind).nearly_level:
         return _none(f"a {scene.kind} has no surface that lies")
     if scene.film is None or not scene.film.is_file():
         return _none("there is no film of the surface")

@@ -22,10 +22,6 @@ from fluidlift.scene.build import Scene
 from fluidlift.scene.splat_files import frames_of
 from fluidlift.types import kind_of
 
-WATER_TENSION = 0.0728
-"""N/m, of clean water at 20 degrees Celsius"""
-DEEP = 1e3
-"""m, a depth that no wave feels"""
 SMOOTH = 2.0
 """columns over which a current is smoothed: what carries waves is wider than they are"""
 
@@ -55,12 +51,10 @@ def filmed_waves(scene: Scene) -> FilmedWaves | Notice:
     return _none(f"the clip shows none that can be told: {WHY_NOT[found]}") if isinstance(found, str) else found
 
 
-def medium_of(scene: Scene, depth: float = DEEP) -> WaveMedium:
-    """What waves run on, over a depth (m)."""
-    gravity = float(np.linalg.norm(scene.parameters.gravity))
-    # simulated without tension, filmed water has it all the same
-    tension = scene.parameters.surface_tension or WATER_TENSION
-    return WaveMedium(depth, gravity, tension / scene.parameters.density)
+def medium_of(scene: Scene, depth: float = WaveMedium.depth) -> WaveMedium:
+    """What waves run on, over a depth (m). Simulated without tension, filmed water has its own all the same."""
+    gravity, tension = float(np.linalg.norm(scene.parameters.gravity)), scene.parameters.surface_tension
+    return WaveMedium(depth, gravity, tension / scene.parameters.density if tension else WaveMedium.tension)
 
 
 def _none(why: str) -> Notice:

@@ -51,7 +51,7 @@ WELL = (0, 4)
 def fluidlift(*words: str, threads: int = 0) -> None:
     """Run a command, on so many threads; stop where it fails."""
     env = os.environ | dict.fromkeys(THREADS, str(threads)) if threads else None
-    done = subprocess.run([sys.executable, "-m", "fluidlift.cli", *words], check=False, env=env)
+    done = subprocess.run([sys.executable, "-m", "fluidlift", *words], check=False, env=env)
     if done.returncode not in WELL:
         raise SystemExit(f"fluidlift {' '.join(words)}: exit code {done.returncode}")
 

@@ -33,7 +33,7 @@ def export(asset: Path, folder: Path) -> None:
     from fluidlift.io.ply import read_mesh
 
     for name, options in FORMATS.items():
-        command = [sys.executable, "-m", "fluidlift.cli", "export", str(asset), "-o", str(folder / name), *options]
+        command = [sys.executable, "-m", "fluidlift", "export", str(asset), "-o", str(folder / name), *options]
         subprocess.run([*command, "--frames", f"{FRAMES[0]}-{FRAMES[1]}"], check=True, stdout=subprocess.DEVNULL)
     expected = {}
     for number in range(FRAMES[0], FRAMES[1] + 1):

@@ -102,7 +102,7 @@ def run(subject: Subject, preset: str, work: Path, extra: list[str]) -> dict[str
     """Make an asset and measure it."""
     label = f"{subject.name.replace(' ', '_')}.{preset}"
     asset, log = work / f"{label}.fluid", work / f"{label}.log"
-    command = [sys.executable, "-m", "fluidlift.cli", "make", str(subject.clip), "-o", str(asset), "--preset", preset]
+    command = [sys.executable, "-m", "fluidlift", "make", str(subject.clip), "-o", str(asset), "--preset", preset]
     command += ["--force", "read", *subject.options, *extra]
     code, seconds, peak = measured(command, log)
     record: dict[str, Any] = {

@@ -84,7 +84,7 @@ def asset(folder: Path, count: int, splats: int) -> None:
 
 def exported(folder: Path, out: Path, to: str, last: int) -> dict:
     """Seconds, bytes and peak memory of one export, in a process of its own."""
-    command = [sys.executable, "-m", "fluidlift.cli", "export", str(folder), "-o", str(out), "--to", to,
+    command = [sys.executable, "-m", "fluidlift", "export", str(folder), "-o", str(out), "--to", to,
                "--frames", f"1001-{last}", "--json"]  # fmt: skip
     began = time.perf_counter()
     told, error = out.with_suffix(".json"), out.with_suffix(".log")

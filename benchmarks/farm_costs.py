@@ -41,7 +41,7 @@ PARTS = {
 
 def measured(clip: Path, preset: str, folder: Path) -> dict[str, float]:
     """Seconds, memory and disk of one make."""
-    words = [sys.executable, "-m", "fluidlift.cli", "make", str(clip), "--out", str(folder), "--preset", preset]
+    words = [sys.executable, "-m", "fluidlift", "make", str(clip), "--out", str(folder), "--preset", preset]
     began = time.monotonic()
     process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     _, status, used = os.wait4(process.pid, 0)

@@ -142,7 +142,7 @@ def make() -> Rung:
 
     def run() -> None:
         with tempfile.TemporaryDirectory() as folder:
-            command = [sys.executable, "-m", "fluidlift.cli", "make", str(clip), "-o", f"{folder}/asset"]
+            command = [sys.executable, "-m", "fluidlift", "make", str(clip), "-o", f"{folder}/asset"]
             command += ["--preset", "draft", "--duration", "0.5"]
             done = subprocess.run(command, env=os.environ | ONE_THREAD, capture_output=True, text=True)
             if done.returncode not in (0, 4):  # 4: done, with warnings

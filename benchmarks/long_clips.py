@@ -60,7 +60,7 @@ def measured(seconds: float, room: Path) -> dict[str, float]:
     from fluidlift.io.video import write_video
 
     clip = write_video(room / f"{seconds:g}.mp4", pictures(int(seconds * RATE)), RATE)
-    words = [sys.executable, "-m", "fluidlift.cli", "make", str(clip), "--out", str(room / f"{seconds:g}.fluid")]
+    words = [sys.executable, "-m", "fluidlift", "make", str(clip), "--out", str(room / f"{seconds:g}.fluid")]
     words += ["--size", "3", *(word for text in SETTINGS for word in ("--set", text))]
     began = time.monotonic()
     process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)

@@ -149,7 +149,7 @@ def memory(seconds: float, extra: list[str]) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         clip = Path(folder) / "clip.mp4"
         frames = looped(clip, seconds)
-        command = [sys.executable, "-m", "fluidlift.cli", "motion", str(clip), "-o", str(Path(folder) / "out")]
+        command = [sys.executable, "-m", "fluidlift", "motion", str(clip), "-o", str(Path(folder) / "out")]
         command += ["--set", f"shape.cells={LOOPED_CELLS}", *extra]
         began = time.perf_counter()
         with (Path(folder) / "log").open("w+") as log:

@@ -30,7 +30,7 @@ def seconds_of(clip: Path, duration: float, threads: int, folder: Path) -> dict[
     """s of each stage of one draft on the first processors of those that this process may use."""
     shutil.rmtree(folder, ignore_errors=True)
     used = sorted(os.sched_getaffinity(0))[:threads]
-    command = [sys.executable, "-m", "fluidlift.cli", "make", str(clip), "-o", str(folder), "--duration", str(duration)]
+    command = [sys.executable, "-m", "fluidlift", "make", str(clip), "-o", str(folder), "--duration", str(duration)]
     done = subprocess.run(
         command, check=False, env=os.environ | dict.fromkeys(THREADS, str(threads)), capture_output=True,
         preexec_fn=lambda: os.sched_setaffinity(0, used),

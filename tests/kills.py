@@ -58,7 +58,7 @@ class Outcome:
 
 def started(clip: Path, folder: Path) -> subprocess.Popen[str]:
     """A `make` whose stderr can be read."""
-    command = [sys.executable, "-m", "fluidlift.cli", "make", str(clip), "--out", str(folder), *OPTIONS]
+    command = [sys.executable, "-m", "fluidlift", "make", str(clip), "--out", str(folder), *OPTIONS]
     return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
 
 

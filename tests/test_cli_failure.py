@@ -92,7 +92,7 @@ def test_a_refusal_is_still_a_refusal(broken, capsys):
 def test_a_scheduler_ends_a_run_as_a_person_does(tmp_path, sent):
     write_clip(tmp_path / "a.mp4", np.random.default_rng(0).integers(0, 255, (30, 96, 128, 3)).astype(np.uint8))
     run = subprocess.Popen(
-        [sys.executable, "-m", "fluidlift.cli", "make", str(tmp_path / "a.mp4"), "-o", str(tmp_path / "a.fluid")],
+        [sys.executable, "-m", "fluidlift", "make", str(tmp_path / "a.mp4"), "-o", str(tmp_path / "a.fluid")],
         stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True,
         env={**os.environ, "FLUIDLIFT_DEBUG": ""}, start_new_session=True,
     )  # fmt: skip

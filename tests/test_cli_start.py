@@ -24,7 +24,7 @@ print("loaded:", *sorted(set(sys.modules) & {heavy!r}), file=sys.stderr)
 
 
 def fluidlift(*args: str, cwd=None) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "fluidlift.cli", *args]
+    command = [sys.executable, "-m", "fluidlift", *args]
     return subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=cwd)
 
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from fluidlift.look.filmed_outline import FINER, LEFT, RIM, WIDEST, FilmedOutline
+from fluidlift.look.filmed_outline import FINER, LEFT, RIM, TORN, WIDEST, FilmedOutline, reach
 from fluidlift.look.footage import FluidFootage
 from fluidlift.look.surface_axes import PictureAxes, PlanAxes
-from fluidlift.look.surface_map import SurfaceMap
+from fluidlift.look.surface_map import MARGIN, SurfaceMap
 from fluidlift.types import PinholeCamera
 
 CELL, LEVEL = 0.2, 0.5
@@ -29,12 +29,12 @@ def filmed(shore: float) -> np.ndarray:
     return FluidFootage.of(frames, np.repeat(wet[None], 8, axis=0), 0.04).outside
 
 
-def simulated(shore: float, axes=None, low: float = 0.3) -> SurfaceMap:
+def simulated(shore: float, axes=None, low: float = 0.3, margin: int = MARGIN) -> SurfaceMap:
     """Water to the left of x = `shore`."""
     x, y, z = np.meshgrid(np.arange(low, shore, 0.05), np.arange(0.3, 3.7, 0.05), [0.45, LEVEL], indexing="ij")
     world = np.stack([x, y, z], axis=-1).reshape(-1, 3)
     points = world if axes is None else axes.points(world)
-    return SurfaceMap.of(points, np.zeros_like(points), CELL)
+    return SurfaceMap.of(points, np.zeros_like(points), CELL, margin=margin)
 
 
 def waterline(surface: SurfaceMap) -> float:
@@ -140,3 +140,14 @@ def test_the_same_holds_on_a_map_over_the_picture():
     middle = np.abs(before.middles()[0, :, 1]) < 1.0
     line = np.max(np.where(after.wet[:, middle], after.middles()[:, middle, 0], -np.inf)) + 0.5 * after.pitch
     assert line == pytest.approx(0.4, abs=0.5 * before.pitch + PIXEL)
+
+
+@pytest.mark.parametrize("film", [3.1, 3.9])
+def test_a_sheet_that_breaks_up_in_the_air_is_followed_further(film):
+    """Three cells are filled up, where a stream would be by one; of seven, no more than six are."""
+    axes = PictureAxes(CAMERA, 8.0)
+    before = simulated(2.5, axes, margin=2 + reach(axes))
+    after = FilmedOutline(CAMERA, filmed(film), CELL).cut(before, axes)
+    middle = np.abs(before.middles()[0, :, 1]) < 1.0
+    line = np.max(np.where(after.wet[:, middle], after.middles()[:, middle, 0], -np.inf)) + 0.5 * after.pitch
+    assert line == pytest.approx(min(film - 2.0, 0.5 + TORN * CELL), abs=before.pitch + PIXEL)

@@ -12,10 +12,11 @@ from fluidlift.io.asset_folder import FILES, load_asset, read_manifest
 from fluidlift.io.footage_file import read_footage, read_smoke, write_footage
 from fluidlift.io.video import read_clip
 from fluidlift.look.footage import FEWEST
+from fluidlift.look.surface_skin import WIDTH
 from fluidlift.pipeline.preview import preview_scene
 from fluidlift.scene.build import SimulationRequest, film_of, first_of_film, scene_of
 from fluidlift.scene.simulator import simulator_of
-from fluidlift.scene.surface_appearance import SurfaceAppearance
+from fluidlift.scene.surface_appearance import DROP, FINE, SurfaceAppearance
 
 FRAMES = 4
 CONSEQUENCE = "its surface looks as it did at rest"
@@ -71,6 +72,34 @@ def test_a_fall_plays_its_film_on_a_map_over_the_picture(channel, tmp_path):
     assert appearance.warnings == () and (shown.ids % 2 == 1).any() and is_red(shown)
     _, plain = dressed(channel(FRAMES, kind="fall"))
     assert (plain.ids % 2 == 0).all()
+
+
+def test_drops_before_a_sheet_are_as_sharp_as_the_film_while_nobody_edits_it(channel, tmp_path):
+    """Spray hangs before the sheet of a fall: a quarter of a cell wide it would blur what the film shows there."""
+    path, largest = film(tmp_path / "film.mp4"), []
+    for changes in ((), ("gravity",)):
+        scene = channel(FRAMES, kind="fall", film=path, changes=changes)
+        simulator, appearance = simulator_of(scene), SurfaceAppearance(scene)
+        appearance.advance(simulator.particles, 0)
+        particles = simulator.particles
+        top = int(np.argmax(particles.positions[:, 2]))
+        moved = particles.positions.copy()
+        moved[top, 2] += 0.4  # the camera looks from above: four cells before the sheet, at 1.6 m from it
+        shown = appearance.dressed(replace(particles, positions=moved), 0)
+        largest.append(float(shown.gaussians.scales[np.flatnonzero(shown.ids == 2 * particles.ids[top])].max()))
+        depth = 2.4 - moved[top, 2]
+    assert largest[0] == pytest.approx(WIDTH * FINE * depth / 96.0, rel=0.02)
+    assert largest[1] == pytest.approx(DROP * 0.1, rel=0.02) and largest[1] > largest[0]
+
+
+def test_patches_that_stay_at_home_are_few(channel, tmp_path):
+    """Where two meet, what moves in the film breaks off; nothing shears those of a scene that nobody edited."""
+    path = film(tmp_path / "film.mp4")
+    few, many = (
+        len(dressed(channel(FRAMES, film=path, changes=changes), 1)[0].state()["patches.turns"])
+        for changes in ((), ("gravity",))
+    )
+    assert 1 <= few < many  # the channel is so short that the patches of an edited one are of the least size
 
 
 def test_a_film_smaller_than_the_clip_is_played_all_the_same(channel, tmp_path, monkeypatch):
@@ -179,7 +208,7 @@ def test_a_stream_carries_the_clip_with_its_masks(made, finished):
     assert np.abs(frames.astype(int) - clip.frames[first:]).mean() < 6
     labels = finished.lift.labels.labels
     assert (fluid != (labels[first:] == 1)).mean() < 0.01  # FLUID; the coder rounds the mask's corners
-    assert not [w for w in said_of(made.folder) if "film" in w]
+    assert not [w for w in said_of(made.folder) if CONSEQUENCE in w]
 
 
 def test_smoke_carries_its_color_and_opacity(catalogue_asset):

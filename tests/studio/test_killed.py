@@ -25,7 +25,7 @@ class Studio:
     """`fluidlift studio` in a process of its own, and what its page would ask."""
 
     def __init__(self, folder):
-        command = [sys.executable, "-m", "fluidlift.cli", "studio", str(folder), "--no-browser", "--port", "18460"]
+        command = [sys.executable, "-m", "fluidlift", "studio", str(folder), "--no-browser", "--port", "18460"]
         self.process = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True,
             env=os.environ | {"PYTHONUNBUFFERED": "1"},

@@ -37,7 +37,7 @@ from fluidlift.farm.store import Store
 from fluidlift.io.atomic import require_free_space
 from fluidlift.machine import THREADS, cores, group_memory
 
-MAKE = (sys.executable, "-m", "fluidlift.cli")
+MAKE = (sys.executable, "-m", "fluidlift")
 """what makes a shot, given the arguments of `fluidlift`"""
 ROOM = 600_000_000
 """bytes that are free before a shot begins: what a draft of the demo takes, with its cache; a full disk fails all"""

@@ -2,7 +2,8 @@
 
 A simulated rim lies somewhere in a cell, which is several pixels of the clip. Where the film shows fluid within one
 cell of it, the surface ends where the film's does, and holes that are no wider than a few cells are closed: a sheet
-thinner than a cell tears between its particles. What is further off stays as it is simulated.
+thinner than a cell tears between its particles. A sheet in the air, seen as a map over the picture, is followed
+further. What is further off stays as it is simulated.
 """
 
 from __future__ import annotations
@@ -13,12 +14,17 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
-from fluidlift.look.surface_axes import SurfaceAxes
+from fluidlift.look.surface_axes import PictureAxes, SurfaceAxes
 from fluidlift.look.surface_map import COLUMN, SurfaceMap, sampled
 from fluidlift.types import PinholeCamera
 
 FINER = 1.0
 """cells by which the surface is extended to the film's outline"""
+
+TORN = 6.0
+"""the same of what falls, cells: a sheet or a jet that breaks up into drops is thinner than the simulator's cells,
+which keep a few particles of it. As far as what a film of smoke shows may be from what is simulated
+(`scene.smoke_appearance`)"""
 
 LEFT = 2.0
 """cells from the filmed fluid within which nothing is shown that the film shows dry: the simulation takes out what is
@@ -37,6 +43,11 @@ EVERYWHERE = 1e6
 
 WIDEST = 0.4
 """standard deviation of a splat at most, shares of its distance from the outline: what is seen of it ends there"""
+
+
+def reach(axes: SurfaceAxes) -> int:
+    """Columns of a map over some axes by which the surface is extended at most."""
+    return round((TORN if isinstance(axes, PictureAxes) else FINER) / COLUMN)
 
 
 class FilmedOutline:
@@ -72,7 +83,7 @@ class FilmedOutline:
         shape = surface.wet.shape
         middles = np.concatenate([surface.middles(), surface.height[..., None]], axis=-1).reshape(-1, 3)
         away, pixel, seen = (a.reshape(shape) for a in self._away(axes.world_points(middles)))
-        near = ndimage.binary_dilation(surface.wet, iterations=round(FINER / COLUMN))
+        near = ndimage.binary_dilation(surface.wet, iterations=reach(axes))
         near |= ndimage.binary_closing(np.pad(surface.wet, HOLE), iterations=HOLE)[HOLE:-HOLE, HOLE:-HOLE]
         beside = seen & (away > RIM) & (away * pixel <= LEFT * self._cell)
         return replace(surface, wet=(surface.wet & ~beside) | (near & seen & (away <= RIM)))

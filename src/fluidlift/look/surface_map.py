@@ -42,13 +42,21 @@ class SurfaceMap:
     """m/s"""
 
     @classmethod
-    def of(cls, positions: Float[np.ndarray, "n 3"], velocities: Float[np.ndarray, "n 3"], cell: float) -> SurfaceMap:
+    def of(
+        cls,
+        positions: Float[np.ndarray, "n 3"],
+        velocities: Float[np.ndarray, "n 3"],
+        cell: float,
+        *,
+        margin: int = MARGIN,
+    ) -> SurfaceMap:
         """The surface of the particles at some positions (m) with velocities (m/s).
 
         Args:
             positions: one or more.
             velocities: of each of them.
             cell: width of the simulator's cells, m.
+            margin: empty columns around the liquid.
 
         Raises:
             ValueError: no particles, or another number of velocities.
@@ -56,8 +64,8 @@ class SurfaceMap:
         require(len(positions) > 0, "no particles", "one or more")
         require(len(positions) == len(velocities), f"{len(velocities)} velocities", f"{len(positions)}")
         pitch, z = COLUMN * cell, np.asarray(positions[:, 2], np.float64)
-        low = positions[:, :2].min(axis=0).astype(np.float64) - (MARGIN + 0.5) * pitch
-        size = np.ceil((positions[:, :2].max(axis=0) - low) / pitch).astype(int) + MARGIN + 1
+        low = positions[:, :2].min(axis=0).astype(np.float64) - (margin + 0.5) * pitch
+        size = np.ceil((positions[:, :2].max(axis=0) - low) / pitch).astype(int) + margin + 1
         index = np.floor((positions[:, :2] - low) / pitch).astype(int)
         column = index[:, 0] * size[1] + index[:, 1]
         top = np.full(size.prod(), -np.inf)

@@ -303,7 +303,7 @@ class Desk:
         known = self._views.get(name)
         if known is not None and known[0].poll() is None:
             return known[1]
-        command = [sys.executable, "-m", "fluidlift.cli", "view", str(path)]
+        command = [sys.executable, "-m", "fluidlift", "view", str(path)]
         process = subprocess.Popen(
             command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
             env=os.environ | {"PYTHONUNBUFFERED": "1"},

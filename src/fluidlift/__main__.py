@@ -1,4 +1,4 @@
-"""python -m fluidlift.cli"""
+"""python -m fluidlift: the command line, where its script is not on the path."""
 
 import sys
 

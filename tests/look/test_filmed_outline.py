@@ -151,3 +151,20 @@ def test_a_sheet_that_breaks_up_in_the_air_is_followed_further(film):
     middle = np.abs(before.middles()[0, :, 1]) < 1.0
     line = np.max(np.where(after.wet[:, middle], after.middles()[:, middle, 0], -np.inf)) + 0.5 * after.pitch
     assert line == pytest.approx(min(film - 2.0, 0.5 + TORN * CELL), abs=before.pitch + PIXEL)
+
+
+def test_what_fills_its_vessel_may_rise_above_its_film_but_not_leave_it_sideways():
+    """The camera looks along -z with y up in its picture: filmed up to y = 2, in a vessel from x = 1.2 to 2.8."""
+    rows, columns = np.mgrid[0:160, 0:160]
+    x, y = 2.0 + (columns + 0.5 - 80) * PIXEL, 2.0 - (rows + 0.5 - 80) * PIXEL
+    wet = (np.abs(x - 2.0) < 0.8) & (y < 2.0)
+    outside = ndimage.distance_transform_edt(~wet)
+    above, beside, low = np.array([[2.0, 2.3, LEVEL]]), np.array([[3.0, 1.0, LEVEL]]), np.array([[2.0, 1.0, LEVEL]])
+    stays, rises = (FilmedOutline(CAMERA, outside, CELL, rises=r) for r in (False, True))
+    assert not stays.inside(above).any() and rises.inside(above).all()
+    for outline in (stays, rises):
+        assert not outline.inside(beside).any() and outline.inside(low).all()
+    # nothing is added to what is simulated: its level is its own
+    before = simulated(1.6)
+    assert (rises.cut(before, PlanAxes()).wet <= before.wet).all()
+    assert (stays.cut(before, PlanAxes()).wet & ~before.wet).any()

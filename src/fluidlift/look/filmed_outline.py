@@ -57,12 +57,19 @@ class FilmedOutline:
         camera: that took it.
         outside: px from each pixel to the nearest one that shows fluid.
         cell: width of the simulator's cells, m.
+        rises: what is above the fluid, in the picture, is within its outline: a vessel goes on to fill. Nothing is
+            added then.
     """
 
-    def __init__(self, camera: PinholeCamera, outside: Float[np.ndarray, "h w"], cell: float) -> None:
-        self._camera, self._cell = camera, cell
-        # to the nearest pixel beside the fluid, as negative px inside; the picture's border is none
+    def __init__(
+        self, camera: PinholeCamera, outside: Float[np.ndarray, "h w"], cell: float, *, rises: bool = False
+    ) -> None:
+        self._camera, self._cell, self._rises = camera, cell, rises
         wet = outside <= 0
+        if rises:
+            wet = np.logical_or.accumulate(wet[::-1], axis=0)[::-1]
+            outside = ndimage.distance_transform_edt(~wet)
+        # to the nearest pixel beside the fluid, as negative px inside; the picture's border is none
         inside = np.full(outside.shape, EVERYWHERE) if wet.all() else ndimage.distance_transform_edt(wet)
         self._away_px = np.where(wet, -inside, outside).astype(np.float32)
 
@@ -86,7 +93,8 @@ class FilmedOutline:
         near = ndimage.binary_dilation(surface.wet, iterations=reach(axes))
         near |= ndimage.binary_closing(np.pad(surface.wet, HOLE), iterations=HOLE)[HOLE:-HOLE, HOLE:-HOLE]
         beside = seen & (away > RIM) & (away * pixel <= LEFT * self._cell)
-        return replace(surface, wet=(surface.wet & ~beside) | (near & seen & (away <= RIM)))
+        added = near & seen & (away <= RIM) & (not self._rises)
+        return replace(surface, wet=(surface.wet & ~beside) | added)
 
     def _away(self, world: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """px from the fluid, m of a pixel there, and whether it is in the picture."""

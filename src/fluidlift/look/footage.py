@@ -93,6 +93,13 @@ class FluidFootage:
     def __len__(self) -> int:
         return len(self.frames)
 
+    @property
+    def stays(self) -> float:
+        """Share of what is mostly fluid in a half of the film that is so in both: 1 where its outline stays."""
+        half = len(self) // 2
+        first, second = (part.mean(axis=0) > 0.5 for part in (self.fluid[:half], self.fluid[-half:]))
+        return float((first & second).sum() / max(int((first | second).sum()), 1))
+
     def within(self, index: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
         """Row and column in the picture of places in it or beside it: beyond its sides lies its mirror image.
 

@@ -87,6 +87,10 @@ of a Laplacian pyramid keeps half of its energy, which sharpening the film gives
 SMALLEST = 0.02
 """standard deviation of a splat at least, cells: files hold its logarithm"""
 
+STAYS = 0.95
+"""share of a film's fluid that must be the same in both halves for its outline to hold for what does not lie: a vessel
+that fills goes on to do so after the film. Two people who draw the outline of water agree as much"""
+
 CALM = 1.0
 """cells within which the surface of standing water that nobody edited is shown level: particles come to rest unevenly,
 by half a cell, and sink by as much. From flat above such a swell hides lengths of water behind it, and the film with
@@ -248,8 +252,9 @@ class SurfaceAppearance:
         )  # fmt: skip
         if footage is not None and stands and not scene.edited:
             self._level = float(np.median(surface.height[surface.wet]))
-        if footage is not None and kind_of(scene.kind).lies_on_ground and not scene.edited:
-            self._outline = FilmedOutline(self._camera, footage.outside, self._cell)
+        if footage is not None and not scene.edited:
+            rises = not kind_of(scene.kind).lies_on_ground and footage.stays < STAYS
+            self._outline = FilmedOutline(self._camera, footage.outside, self._cell, rises=rises)
         self._plays = footage is not None
         if self._plays:
             self._surface = surface

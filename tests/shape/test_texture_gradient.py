@@ -144,3 +144,17 @@ def test_the_size_of_the_picture_changes_nothing():
     (a, b), (c, d) = found
     # pictures shrunk to the same size: the same windows but for a rounding of grey levels and of the mask's rim
     assert a - b == pytest.approx(c - d, rel=0.2, abs=1.0)
+
+
+@pytest.mark.parametrize("pitch", [40.0, 75.0])
+def test_the_pattern_of_standing_water_shows_how_far_it_is_looked_down_on(pitch):
+    pictures, mask = filmed(tilted(pitch), UP, [pattern(i) for i in range(3)])
+    still = np.zeros((*mask.shape, 2)), np.zeros(mask.shape)
+    seen = PictureEvidence(texture=texture_patches(pictures, mask))
+    found, usual, in_pot = (
+        estimate_up("basin", mask, *still, tilted(0.0), picture)
+        for picture in (seen, PictureEvidence(), PictureEvidence(texture=seen.texture, contained=True))
+    )
+    assert abs(found.pitch - pitch) < 0.5 * abs(usual.pitch - pitch), (found, usual)
+    assert "pattern" in found.source and "pattern" not in usual.source
+    assert in_pot == usual, "what stirs in a vessel is not the same all over"

@@ -385,7 +385,7 @@ def _kind_and_up(
         if upright is not None:
             return evidence, kind, parts, upright, None
     texture = None
-    if kind.runs_nearly_level and c.pitch is None and not parts.puddle:
+    if kind.nearly_level and c.pitch is None and not parts.puddle:
         texture = texture_gradient.texture_patches(clip.frames, parts.lying & parts.gentle)
     said = _said_of_view(c, known, mask.shape)
     picture = look_at(

@@ -144,14 +144,14 @@ def estimate_tilt(
     camera: PinholeCamera, patches: FlowPatches | None, tilted: Callable[[float, float], PinholeCamera],
     picture: PictureEvidence, level_prior: float = LEVEL, kind: FluidKind = STREAM,
 ) -> TiltEvidence:  # fmt: skip
-    """Pitch and roll of the camera over a stream of unknown slope: means of their posterior.
+    """Pitch and roll of the camera over a stream of unknown slope, or standing water: means of their posterior.
 
     The motion and the pattern show the plane's tilt against the camera, not gravity: priors share it out between both,
     and what is seen beside the fluid.
 
     Args:
         camera: for its focal length.
-        patches: of the motion; None: too little is known of it.
+        patches: of the motion; None: too little is known of it, or it is none of the plane.
         tilted: camera for a pitch and a roll, degrees.
         picture: what else shows the tilt.
         level_prior: share of such streams that are level.
@@ -171,7 +171,7 @@ def estimate_tilt(
     habit = picture.lying(kind, pitches, cameras, rise) + np.log(prior)
     log = BELIEF * best[..., 0] + habit - 0.5 * ((rolls / ROLL) ** 2)[None, :, None]
     log += np.array([[picture.tilt(c) for c in row] for row in cameras])[..., None]
-    if picture.texture is not None and patches is not None:
+    if picture.texture is not None and (patches is not None or kind.is_standing_water):
         seen = _texture_evidence([row[1] for row in cameras], picture.texture, slopes, best[:, 1, :, 1])
         log += weighed(seen, habit[:, 1])[:, None]
     return tilt_posterior(pitches, rolls, logsumexp(log, axis=2), kind.usual_pitch)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from fluidlift.numerics.cell_list import CellList, cells_kernel
 from fluidlift.numerics.nearest import nearest, nearest_of_crowd
 
 
@@ -30,3 +31,13 @@ def test_the_nearest_in_cells_are_those_of_a_tree(width):
 def test_more_neighbours_than_points_are_refused():
     with pytest.raises(ValueError, match="4 neighbours among 3 points"):
         nearest_of_crowd(crowd()[:3], crowd()[:3], 4, 0.1)
+
+
+def test_points_lie_in_the_order_of_their_cells_and_within_one_in_their_own():
+    points = crowd()
+    found = CellList.of(points, 0.1)
+    cells = np.empty(len(points), np.int64)
+    cells_kernel(points, found.low, found.width, found.shape, cells)
+    np.testing.assert_array_equal(found.order, np.argsort(cells, kind="stable"))
+    np.testing.assert_array_equal(np.diff(found.starts), np.bincount(cells, minlength=int(found.shape.prod())))
+    assert found.starts[0] == 0

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from fluidlift.numerics.poisson import LowRankTerm, PoissonSystem
+from fluidlift.physics import pressure
 from fluidlift.physics.free_surface import surface_gaps
-from fluidlift.physics.pressure import build_system, divergence, face_fractions, project
+from fluidlift.physics.pressure import build_system, divergence, face_fractions, project, subtract_gradient
 from fluidlift.types import CellType, FaceVelocity, Grid, Terrain, TriangleMesh
 
 GRID = Grid((12, 10, 8), 0.1)
@@ -233,3 +234,19 @@ def test_gaps_that_are_not_positive_are_refused():
     gaps = tuple(np.zeros(GRID.face_shape(a), np.float32) for a in range(3))
     with pytest.raises(ValueError, match="positive"):
         build_system(types, None, GRID, gaps=gaps)
+
+
+@pytest.mark.parametrize("near", [False, True], ids=["centres of air", "surface between"])
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_compiled_loops_over_faces_give_the_bits_of_array_operations(near, kind, monkeypatch):
+    rng = np.random.default_rng(2)
+    gaps = tuple(rng.uniform(0.05, 1.0, GRID.face_shape(a)).astype(np.float32) for a in range(3)) if near else None
+    system = build_system(layered_types(), sphere_terrain(), GRID, open_border=near, gaps=gaps)
+    velocity, q = random_velocity(), rng.normal(size=GRID.shape).astype(kind)
+    fast = divergence(velocity, GRID, system), *subtract_gradient(velocity, system, q).components
+    monkeypatch.setattr(pressure, "_plain_numbers", lambda velocity, system: False)
+    plain = divergence(velocity, GRID, system), *subtract_gradient(velocity, system, q).components
+    for one, other in zip(fast, plain, strict=True):
+        assert one.dtype == other.dtype
+        np.testing.assert_array_equal(one, other)
+    assert np.ptp(plain[1]) > 0 and not np.array_equal(plain[1], velocity.u)

@@ -19,3 +19,25 @@ def test_pale_smoke_is_shown_before_a_dim_sky(channel, kind, grey, dim):
     assert np.ptp(sky.mean(axis=-1), axis=1).max() < 1e-6  # nothing else is seen
     contrast = abs(float(sky.mean()) - grey)
     assert contrast > (0.4 if dim or grey < 0.5 else 0.0) and (float(sky.mean()) < 0.4) == dim
+
+
+def test_the_motion_in_the_picture_is_drawn_with_it(channel):
+    scene = channel(2)
+    renderer = FrameRenderer(scene, None)
+    velocity = np.tile([0.5, 0.0, 0.0], (len(scene.rest), 1))
+    frame = SimulatedFrame(scene.rest, velocity)
+    alone, nothing = renderer.measured(frame, moving=False)
+    both, motion = renderer.measured(frame, moving=True)
+    assert nothing is None and motion is not None
+    for name in ("image", "depth", "alpha"):
+        np.testing.assert_array_equal(getattr(both, name), getattr(alone, name))
+    known = np.isfinite(motion).all(axis=-1)
+    np.testing.assert_array_equal(known, alone.alpha > 0.3)
+    before, _ = scene.camera.project(scene.rest.means)
+    after, _ = scene.camera.project(scene.rest.means + scene.interval * velocity)
+    steps = after - before
+    # a pixel shows a mean of splats: no further than they
+    for axis in range(2):
+        low, high = steps[:, axis].min(), steps[:, axis].max()
+        assert low - 1e-3 <= motion[known][:, axis].min() and motion[known][:, axis].max() <= high + 1e-3
+    assert np.abs(steps).max() > 0.1 and known.mean() > 0.01

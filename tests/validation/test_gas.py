@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from fluidlift.numerics.sampling import sample_nodes
-from fluidlift.physics.gas import GasSimulator, advect_maccormack
+from fluidlift.physics.gas import GasSimulator
+from fluidlift.physics.maccormack import advect_maccormack
 from fluidlift.physics.pressure import divergence
+from fluidlift.physics.stepping import SimulationSettings
 from fluidlift.types import CellType, FaceVelocity, FluidParameters, Grid, Particles
 
 H = 0.1
@@ -108,3 +110,52 @@ def test_an_initial_velocity_that_is_not_finite_is_refused(scene):
         GasSimulator(
             grid, scene.terrain(grid), AIR, nobody(), cell_types=scene.cells(grid), buoyancy=0.0, velocity=wind
         )
+
+
+def wind_over(scene, grid, speed, smoke):
+    """Smoke in the lower part of a box, at one speed (m/s), and wind in its upper half."""
+    wind = FaceVelocity.zeros(grid)
+    wind.u[:, :, grid.shape[2] // 2 :] = speed
+    wind.u[:, :, : grid.shape[2] // 2] = smoke
+    body = scene.body(grid, lambda p: p[:, 2] < 0.4 * grid.high[2])
+    parameters = FluidParameters(density=1.2, time_step=0.1)
+    return GasSimulator(
+        grid, scene.terrain(grid), parameters, body, cell_types=scene.cells(grid), buoyancy=0.0, velocity=wind
+    )
+
+
+def test_substeps_are_those_of_the_smoke_where_air_beside_it_is_not_much_faster(scene):
+    grid = Grid((12, 6, 12), H)
+    # 0.4 cells of smoke a frame; air crosses 2.2 cells, and 4.5 of which each substep takes 2.5 at most
+    assert wind_over(scene, grid, 2.2, 0.4).advance(0.1).substeps == 1
+    assert wind_over(scene, grid, 4.5, 0.4).advance(0.1).substeps == 2
+    simulator = wind_over(scene, grid, 2.2, 1.4)
+    simulator.advance(0.1)  # particles are at rest before it
+    assert simulator.advance(0.1).substeps == 3
+
+
+def test_air_that_is_continued_into_the_ground_does_not_count(scene):
+    grid = Grid((12, 6, 12), H)
+    simulator = wind_over(scene, grid, 1.0, 1.0)
+    velocity = FaceVelocity(*(c.copy() for c in simulator.velocity.components))
+    closed = simulator._walls.openings[2] == 0
+    assert closed.any()
+    velocity.w[closed] = 50.0
+    assert simulator._fastest_air(velocity) == simulator._fastest_air(simulator.velocity) < 2.0
+
+
+def test_smoke_that_nobody_looks_at_moves_as_smoke_that_is_shown(scene):
+    grid = Grid((10, 10, 14), H)
+    body = scene.body(grid, lambda p: np.linalg.norm(p - [0.5, 0.5, 0.4], axis=1) < 0.25)
+    shown, bare = (
+        GasSimulator(
+            grid, scene.terrain(grid), AIR, body, cell_types=scene.cells(grid), buoyancy=2.0,
+            settings=SimulationSettings(deform=deform),
+        )
+        for deform in (True, False)
+    )  # fmt: skip
+    for simulator in (shown, bare):
+        simulator.advance(0.4)
+    np.testing.assert_array_equal(shown.particles.positions, bare.particles.positions)
+    assert np.abs(shown.particles.deformation - np.eye(3)).max() > 0.05
+    np.testing.assert_array_equal(bare.particles.deformation, np.tile(np.eye(3), (len(bare.particles), 1, 1)))

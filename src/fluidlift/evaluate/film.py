@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from fluidlift.motion.optical_flow import DenseInverseSearch
+from fluidlift.motion.optical_flow import DenseInverseSearch, each_pair
 
 BANDS = 4
 """of the Laplacian pyramid, the finest first: details of 1, 2, 4 and 8 px"""
@@ -183,8 +183,9 @@ def mean_flow(frames: np.ndarray, masks: np.ndarray, pairs: Sequence[int]) -> Fl
     """Mean displacement from the frames `pairs` to those after them, px/frame, where they show fluid; else NaN."""
     estimator = DenseInverseSearch()
     total, weight = np.zeros((*frames.shape[1:3], 2)), np.zeros(frames.shape[1:3])
-    for t in pairs:
-        total += estimator.displacement(frames[t], frames[t + 1]) * masks[t][..., None]
+    calls = ((frames[t], frames[t + 1]) for t in pairs)
+    for t, move in zip(pairs, each_pair(estimator.displacement, calls, estimator)):
+        total += move * masks[t][..., None]
         weight += masks[t]
     with np.errstate(invalid="ignore"):
         return total / weight[..., None]

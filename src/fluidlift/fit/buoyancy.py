@@ -18,6 +18,7 @@ from fluidlift.errors import FluidliftError
 from fluidlift.fit.coarsen import coarsen_cells, coarsen_terrain, coarsen_velocity
 from fluidlift.numerics.outline import upper_end
 from fluidlift.physics.gas import GasSimulator
+from fluidlift.physics.surroundings import SimulationSettings
 from fluidlift.types import CellType, FaceVelocity, FluidParameters, Particles, PinholeCamera, Terrain
 
 MOST_CELLS = 64_000
@@ -201,6 +202,7 @@ def _simulator(smoke: RisingSmoke, buoyancy: float) -> GasSimulator:
     return GasSimulator(
         grid, smoke.terrain, parameters, particles, cell_types=smoke.cell_types, buoyancy=buoyancy,
         velocity=smoke.velocity, inflow_profile=smoke.velocity, particles_per_cell=PER_SIDE**3,
+        settings=SimulationSettings(deform=False),
     )  # fmt: skip
 
 

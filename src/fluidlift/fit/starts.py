@@ -13,6 +13,7 @@ raised to damp them.
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +27,13 @@ from fluidlift.fit.ranges import ParameterSpace
 
 PROBE = 0.02
 """largest change of a face, in units of U, that a directional derivative is measured with"""
+SETTLED = 1e-3
+"""of the objective: where no more than that is left to gain, a start is found. A quadratic whose curvature is at least
+that of the departures is lowered by g^2 / (2 curvature) at most"""
+
+
+class _Settled(Exception):
+    """There is next to nothing left to gain."""
 
 
 def corrected_starts(
@@ -38,6 +46,9 @@ def corrected_starts(
     def one(index: int) -> Tensor:
         begin, unit = problem.windows[index].start.clone(), problem.speed
         move = torch.zeros_like(begin, requires_grad=True)
+        # of the departure alone: what the loss adds makes the valley steeper, so that less is left to gain
+        curvature = 2.0 * begin.numel() * unit**2 * problem.start_weight(index)
+        inverse = torch.where(curvature > 0, 1.0 / curvature, 0.0)
         optimizer = torch.optim.LBFGS(
             [move], lr=1.0, max_iter=iterations, max_eval=2 * iterations, history_size=iterations,
             line_search_fn="strong_wolfe", tolerance_grad=0.0, tolerance_change=0.0,
@@ -51,9 +62,13 @@ def corrected_starts(
             total = total * begin.numel()
             total.backward()
             calls[index] += 1
+            assert move.grad is not None
+            if 0.5 * float((move.grad**2 * inverse).sum()) < SETTLED * float(total.detach()):
+                raise _Settled
             return total
 
-        optimizer.step(closure)
+        with contextlib.suppress(_Settled):  # `move` is where it was found then
+            optimizer.step(closure)
         found = (begin + unit * move).detach()
         return found if bool(torch.isfinite(found).all()) else begin
 

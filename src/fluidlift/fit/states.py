@@ -112,17 +112,23 @@ def _fill(values: np.ndarray, known: np.ndarray, inside: np.ndarray) -> np.ndarr
         out = np.where(known, out, wide[tuple(slice(n) for n in values.shape)])
     else:
         out = np.where(known, out, out[known].mean())
-    weight = np.pad(inside.astype(float), 1)
-    box = tuple(slice(1, -1) for _ in range(3))
+    count = _neighbours(np.pad(inside.astype(float), 1))
+    still, mean = known | (count == 0), np.maximum(count, 1.0)
+    wide = np.zeros([n + 2 for n in values.shape])
+    box = wide[1:-1, 1:-1, 1:-1]
     for _ in range(FILL_SWEEPS):
-        wide = np.pad(np.where(inside, out, 0.0), 1)
-        total, count = np.zeros_like(out), np.zeros_like(out)
-        for axis in range(3):
-            for shift in (-1, 1):
-                total += np.roll(wide, shift, axis)[box]
-                count += np.roll(weight, shift, axis)[box]
-        out = np.where(known | (count == 0), out, total / np.maximum(count, 1.0))
+        box[...] = np.where(inside, out, 0.0)
+        out = np.where(still, out, _neighbours(wide) / mean)
     return out
+
+
+def _neighbours(wide: np.ndarray) -> np.ndarray:
+    """Sum of the six neighbours of each entry, of an array with a border of one."""
+    total = np.zeros([n - 2 for n in wide.shape])
+    for axis in range(3):
+        for side in (slice(2, None), slice(None, -2)):
+            total += wide[tuple(side if a == axis else slice(1, -1) for a in range(3))]
+    return total
 
 
 def fill_hidden(

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
-from scipy.spatial import cKDTree
 
 from fluidlift.errors import require
 from fluidlift.look.surface_map import SurfaceMap
+from fluidlift.look.tracer_spacing import bare_points, not_crowded
 from fluidlift.look.whitewater_splats import kinds_of
 from fluidlift.numerics.nearest import nearest
 from fluidlift.types import Gaussians, sh_from_rgb
@@ -184,17 +184,16 @@ class SurfaceSkin:
         spacing, own = PITCH * self._cell * float(finer(level)), np.flatnonzero(self.levels == level)
         if len(own) > 1:
             keep = np.ones(len(self), bool)
-            keep[own] = _sparse(self.places[own], self.ids[own], CROWDED * spacing)
+            keep[own] = not_crowded(self.places[own], self.ids[own], CROWDED * spacing)
             self._keep(keep)
             own = np.flatnonzero(self.levels == level)
         low = np.floor(surface.low / spacing)
         count = np.ceil(np.array(surface.wet.shape) * surface.pitch / spacing).astype(int) + 1
-        lattice = ((low + np.moveaxis(np.indices(tuple(count)), 0, -1) + 0.5) * spacing).reshape(-1, 2)
+        # few are bare: only these are asked where they are
+        bare = bare_points(self.places[own], low, spacing, (int(count[0]), int(count[1])), BARE * spacing)
+        lattice = (low + np.argwhere(bare) + 0.5) * spacing
         lattice = lattice[surface.presence(lattice) > 0.5]
         lattice = lattice[self._levels(lattice) == level]
-        if len(own) and len(lattice):
-            taken = nearest(self.places[own], lattice, within=BARE * spacing, workers=-1)[0]
-            lattice = lattice[np.isinf(taken)]
         fresh = lattice + rng.uniform(-0.25, 0.25, lattice.shape) * spacing
         self.places = np.concatenate([self.places, fresh])
         self.ids = np.concatenate([self.ids, self.next_id + np.arange(len(fresh))])
@@ -232,14 +231,3 @@ class SurfaceSkin:
             self.points(surface).astype(np.float32), quats.astype(np.float32), scales,
             np.full(n, OPACITY, np.float32), sh_from_rgb(np.clip(colors, 0.0, 1.0)),
         )  # fmt: skip
-
-
-def _sparse(places: np.ndarray, ids: np.ndarray, apart: float) -> np.ndarray:
-    """Which places stay so that the younger of each close pair goes."""
-    pairs = cKDTree(places).query_pairs(apart, output_type="ndarray")
-    keep = np.ones(len(places), bool)
-    if len(pairs):
-        first, second = pairs.T
-        younger = np.where(ids[first] > ids[second], first, second)
-        keep[younger] = False
-    return keep

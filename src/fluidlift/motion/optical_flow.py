@@ -23,6 +23,7 @@ __all__ = [
     "METHODS",
     "DenseInverseSearch",
     "Farneback",
+    "each_pair",
     "estimate_flow",
     "flow_confidence",
     "flow_of_pair",

@@ -3,6 +3,8 @@
 Modules of the face:
 
     bspline                 The quadratic B-spline of particle-grid transfers
+    cell_list               Points sorted into cubes of space, so that what is near a place is found in 27 of them
+                            (cell list, Numba)
     ground_block            The ground as a block that one can pick up: a surface over its box, closed at the sides
                             and below
     harmonics               Real spherical harmonics up to degree 3, in the order and sign of 3D Gaussian Splatting
@@ -60,9 +62,9 @@ Modules of the face:
 """
 
 __all__ = [
-    "bspline", "ground_block", "harmonics", "isosurface", "lanes", "mesh_distance", "mesh_normals", "mirror",
-    "multigrid", "multigrid_assembly", "multigrid_cycle", "nearest", "outline", "particle_mean", "poisson",
-    "recurrent_stencil", "recurrent_stencil_fit", "sampling", "sharing", "short_axis", "signed_distance",
+    "bspline", "cell_list", "ground_block", "harmonics", "isosurface", "lanes", "mesh_distance", "mesh_normals",
+    "mirror", "multigrid", "multigrid_assembly", "multigrid_cycle", "nearest", "outline", "particle_mean",
+    "poisson", "recurrent_stencil", "recurrent_stencil_fit", "sampling", "sharing", "short_axis", "signed_distance",
     "similarity2", "solid_mesh", "splatting", "splatting_colors", "splatting_colors_torch", "splatting_kernels",
     "splatting_projection", "splatting_torch", "srgb", "symmetric3", "textures", "torch_multigrid", "torch_poisson",
     "triangles",

@@ -42,8 +42,8 @@ class CellList(NamedTuple):
         shape = _cells(points.max(axis=0) - low, width, CELLS_PER_POINT * len(points) + 1000)
         cells = np.empty(len(points), np.int64)
         cells_kernel(points, low, float(width), shape, cells)
-        order = np.argsort(cells, kind="stable")
-        starts = np.concatenate([[0], np.cumsum(np.bincount(cells, minlength=int(shape.prod())))])
+        order, starts = np.empty(len(points), np.int64), np.zeros(int(shape.prod()) + 1, np.int64)
+        sort_kernel(cells, starts, order)
         return cls(low, float(width), shape, order, starts)
 
 
@@ -63,3 +63,17 @@ def cells_kernel(points, low, width, shape, cells):
         for axis in range(3):
             number = number * shape[axis] + np.int64(math.floor((points[p, axis] - low[axis]) / width)) % shape[axis]
         cells[p] = number
+
+
+@nb.njit(cache=True, nogil=True)
+def sort_kernel(cells, starts, order):
+    """Points in the order of their cells, those of one cell in their own, and where each cell begins (counting sort);
+    `starts` holds zeros before."""
+    for c in cells:
+        starts[c + 1] += 1
+    for c in range(len(starts) - 1):
+        starts[c + 1] += starts[c]
+    following = starts.copy()
+    for p in range(len(cells)):
+        order[following[cells[p]]] = p
+        following[cells[p]] += 1

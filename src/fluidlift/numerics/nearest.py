@@ -74,8 +74,10 @@ def _in_cells(points: np.ndarray, places: np.ndarray, count: int, width: float) 
     """The nearest of the points in the 27 cells around each place; at infinity where there are too few."""
     cells = CellList.of(points, width)
     distance, index = np.empty((len(places), count)), np.zeros((len(places), count), np.int64)
+    # neighbouring places one after the other: what they look at is in the cache already
+    turn = CellList.of(places, width).order
     _nearest_kernel(
-        places, np.ascontiguousarray(points[cells.order]), cells.order, cells.starts, cells.low, cells.width,
+        places, turn, np.ascontiguousarray(points[cells.order]), cells.order, cells.starts, cells.low, cells.width,
         cells.shape, distance, index,
     )  # fmt: skip
     return distance, index
@@ -91,12 +93,13 @@ def _insert(best, which, d, n):
 
 
 @shared(lambda places, *_: (0, len(places)), error_model="numpy")
-def _nearest_kernel(begin, end, places, points, order, starts, low, width, shape, distance, index):
+def _nearest_kernel(begin, end, places, turn, points, order, starts, low, width, shape, distance, index):
     """Insertion into a list that is sorted by the squared distance, cell by cell from the middle one on."""
     count = distance.shape[1]
     best, which = np.empty(count, np.float32), np.empty(count, np.int64)
     cell, inside, gap = np.empty((3, 3), np.int64), np.empty(3), np.empty((3, 3), np.float32)
-    for p in range(begin, end):
+    for t in range(begin, end):
+        p = turn[t]
         x, y, z = places[p, 0], places[p, 1], places[p, 2]
         for axis in range(3):
             along = (places[p, axis] - low[axis]) / width

@@ -35,6 +35,9 @@ def add_buoyancy(
     up = -down / size if size > 0 else np.array([0.0, 0.0, 1.0])
     out = []
     for axis, component in enumerate(velocity.components):
+        if up[axis] == 0.0:
+            out.append(component.copy())
+            continue
         pad = [(0, 0)] * 3
         pad[axis] = (1, 1)
         wide = np.moveaxis(np.pad(concentration, pad, mode="edge"), axis, 0)

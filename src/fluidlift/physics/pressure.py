@@ -20,6 +20,7 @@ from jaxtyping import Float
 
 from fluidlift.errors import require
 from fluidlift.numerics.poisson import LowRankTerm, PoissonSystem, solve
+from fluidlift.physics.pressure_kernels import accelerated, outflow
 from fluidlift.types import CellType, FaceVelocity, Grid, SolveReport, Terrain, triple
 
 Faces = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -27,6 +28,8 @@ Faces = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 SMALLEST_OPENING = 0.02
 """open fractions below this are closed: slivers of faces carry no flow worth their bad conditioning"""
+NO_GAP = np.zeros((0, 0, 0), np.float32)
+"""the surface passes through the centres of the cells of air"""
 
 
 @dataclass(frozen=True)
@@ -168,6 +171,10 @@ def divergence(
     with the velocity given there (prescribed; 0 at a wall).
     """
     h = grid.spacing
+    if isinstance(system, PressureSystem) and solid_velocity is None and _plain_numbers(velocity, system):
+        out = np.empty(system.unknown.shape)
+        outflow(system.unknown, *velocity.components, *system.openings, float(h), out)
+        return out
     flux = [c.astype(np.float64) for c in velocity.components]
     if isinstance(system, PressureSystem):
         flux = [f * w for f, w in zip(flux, system.openings)]
@@ -214,6 +221,9 @@ def subtract_gradient(
     `known` is q in the cells that are not unknown (default 0), `jumps` what q is above that on the liquid's side of
     the surface (per face).
     """
+    usual = known is None and jumps is None and solid_velocity is None
+    if isinstance(system, PressureSystem) and usual and _plain_numbers(velocity, system) and _contiguous(q):
+        return _accelerated(velocity, system, q)
     q = np.where(system.unknown, q, 0.0 if known is None else known)
     exact = isinstance(system, PressureSystem)
     out = []
@@ -232,6 +242,29 @@ def subtract_gradient(
             new = np.where(system.openings[axis] > 0, new, wall)
         out.append(np.ascontiguousarray(new, component.dtype))
     return FaceVelocity(*out)
+
+
+def _accelerated(velocity: FaceVelocity, system: PressureSystem, q: np.ndarray) -> FaceVelocity:
+    """`subtract_gradient` as it mostly is: air at p = 0, walls at rest."""
+    out = []
+    for axis, (component, weight, opening) in enumerate(zip(velocity.components, system.weights, system.openings)):
+        gap, new = system.gaps[axis], np.empty_like(component)
+        none = gap is None
+        accelerated(
+            component, weight, opening, NO_GAP if none else gap, system.unknown, q, axis, float(system.spacing), new
+        )
+        out.append(new)
+    return FaceVelocity(*out)
+
+
+def _plain_numbers(velocity: FaceVelocity, system: PressureSystem) -> bool:
+    """Whether all arrays are as simulators have them: one kind of array, so that kernels are compiled once."""
+    faces = (*velocity.components, *system.weights, *system.openings, *(g for g in system.gaps if g is not None))
+    return all(a.dtype == np.float32 and a.flags.c_contiguous for a in faces) and system.unknown.flags.c_contiguous
+
+
+def _contiguous(q: np.ndarray) -> bool:
+    return q.dtype in (np.float32, np.float64) and q.flags.c_contiguous
 
 
 def project(

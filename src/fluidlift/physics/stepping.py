@@ -293,12 +293,16 @@ class ParticleSimulator(ABC):
         """m/s^2, largest acceleration by body forces."""
         return float(np.linalg.norm(self.parameters.gravity))
 
+    def _reach(self) -> float:
+        """m, that particles cross in a substep at most."""
+        return self.settings.courant * self.grid.spacing
+
     def _substep_length(self, remaining: float) -> float:
-        """Equal substeps within the CFL limit (`settings.courant`), the gain of speed by body forces included."""
+        """Equal substeps within the CFL limit (`_reach`), the gain of speed by body forces included."""
         longest = min(self.parameters.time_step, remaining)
         gain = self._speed_gain()
-        # (speed + gain dt) dt <= courant h
-        reach, speed = self.settings.courant * self.grid.spacing, self._max_speed()
+        # (speed + gain dt) dt <= reach
+        reach, speed = self._reach(), self._max_speed()
         limit = 2.0 * reach / (speed + np.sqrt(speed**2 + 4.0 * gain * reach)) if speed + gain > 0 else np.inf
         return remaining / np.ceil(remaining / min(longest, limit) - 1e-9)
 

@@ -29,6 +29,8 @@ class SimulationSettings:
     """per call of `advance`"""
     max_stretch: float = 4.0
     """of the deformation of a particle"""
+    deform: bool = True
+    """carry the deformation of smoke's particles along; False: what they look like is not asked for"""
     spread_crowds: bool = True
     """correct clumps of particles"""
     separate_from_walls: bool = True
@@ -70,6 +72,9 @@ class Surroundings:
         `distance` to the liquid's surface as for `viscosity.diffuse`; closed faces move with `solid`, or rest.
         The liquid drags free `bodies`.
         """
+        number = self.parameters.kinematic_viscosity * dt / self.grid.spacing**2
+        if number < NEGLIGIBLE:
+            return velocity, ()
         walls = region.walls
         fixed = self.inlet.face_masks(tuple(w.shape for w in wet), region.first)
         if prescribed is not None:
@@ -86,8 +91,7 @@ class Surroundings:
         stopped = FaceVelocity(
             *(np.where(o == 0, r, c) for o, r, c in zip(walls.openings, resting.components, velocity.components))
         )
-        number = self.parameters.kinematic_viscosity * dt / self.grid.spacing**2
-        dragged = bodies.dragged() if bodies is not None and number >= NEGLIGIBLE else ()
+        dragged = bodies.dragged() if bodies is not None else ()
         roles = FaceRoles(solved, tuple(head_on), tuple(beside), distance, walls.signed_distance, solid, dragged)
         new, change, reports = diffuse_with_bodies(
             stopped, roles, viscosity=self.parameters.kinematic_viscosity, dt=dt, spacing=self.grid.spacing,

@@ -128,9 +128,13 @@ class FrameRenderer:
             return self.painter.shown(self._painted(frame), camera, self._backdrop(camera, background))
         return to_bytes(self._splatted(frame, camera, background).image)
 
-    def measured(self, frame: SimulatedFrame) -> tuple[Rendered, Gaussians, np.ndarray]:
-        """The splats as the clip's camera sees them, whatever the look: `FrontView.drawn`."""
-        return self.front_view.drawn(frame.fluid, frame.velocities, self._solids(frame))
+    def measured(self, frame: SimulatedFrame, *, moving: bool) -> tuple[Rendered, np.ndarray | None]:
+        """The splats as the clip's camera sees them, whatever the look, and their motion in it where it is asked for:
+        `FrontView.measured`."""
+        solids = self._solids(frame)
+        if moving:
+            return self.front_view.measured(frame.fluid, frame.velocities, solids, self.scene.interval)
+        return self.front_view.drawn(frame.fluid, frame.velocities, solids)[0], None
 
     # --- inside -----------------------------------------------------------------------------------------------------
 

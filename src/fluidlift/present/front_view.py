@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,6 +19,10 @@ if TYPE_CHECKING:
 
 BEHIND = (1.5, 0.5)
 """cells behind the terrain from which fluid is hidden: at rocks, whose shape is a guess, and where it is always dry"""
+COVERED = 0.3
+"""opacity from which a pixel has a motion"""
+FARTHEST = 1e3
+"""px per frame that a splat moves at most: more is beyond any picture, and one of them would outshine all others"""
 
 
 def before_ground(scene: Scene, footage: Footage | None) -> Callable[[Gaussians], np.ndarray] | None:
@@ -82,12 +86,47 @@ class FrontView:
         """
         from fluidlift.look.rasterize import render
 
-        if self.seen_of is not None:
-            keep = self.seen_of(gaussians)
-            gaussians, velocity = gaussians.select(keep), velocity[keep]
+        gaussians, velocity = self._seen(gaussians, velocity)
         behind = self.plate if plate is None else plate
         picture = render(concatenate([gaussians, *solids]), camera or self.camera, background=behind)
         return picture, gaussians, velocity
+
+    def measured(
+        self, gaussians: Gaussians, velocity: np.ndarray, solids: Sequence[Gaussians], interval: float
+    ) -> tuple[Rendered, np.ndarray]:
+        """The picture with its coverage, and its motion, float32 [H,W,2] px per frame, NaN where it shows no fluid.
+
+        Colours and motion of a splat are composited together: what costs most is to find which splats a pixel sees.
+
+        Args:
+            gaussians: of the fluid.
+            velocity: [n,3], m/s.
+            solids: of the obstacles; they are taken to rest.
+            interval: s between frames.
+        """
+        from fluidlift.look.project import view_colors
+        from fluidlift.look.rasterize import render
+
+        gaussians, velocity = self._seen(gaussians, velocity)
+        shown = concatenate([gaussians, *solids])
+        before, z0 = self.camera.project(gaussians.means)
+        after, z1 = self.camera.project(gaussians.means + velocity * interval)
+        ahead = (z0 > 0) & (z1 > 0) & np.isfinite(velocity).all(axis=1)
+        move = np.zeros((len(shown), 2), np.float32)
+        move[: len(gaussians)][ahead] = np.clip((after - before)[ahead], -FARTHEST, FARTHEST)
+        features = np.concatenate([view_colors(shown, self.camera), move], axis=1)
+        behind = np.concatenate([self.plate, np.zeros_like(self.plate[..., :2])], axis=-1)
+        drawn = render(shown, self.camera, background=behind, features=features)
+        alpha = drawn.alpha[..., None]
+        motion = np.where(alpha > COVERED, drawn.image[..., 3:] / np.maximum(alpha, COVERED), np.nan)
+        return replace(drawn, image=np.ascontiguousarray(drawn.image[..., :3])), motion.astype(np.float32)
+
+    def _seen(self, gaussians: Gaussians, velocity: np.ndarray) -> tuple[Gaussians, np.ndarray]:
+        """What the ground leaves over of splats and their velocities."""
+        if self.seen_of is None:
+            return gaussians, velocity
+        keep = self.seen_of(gaussians)
+        return gaussians.select(keep), velocity[keep]
 
 
 def open_end(scene: Scene) -> OpenEnd | None:

@@ -158,13 +158,13 @@ def _panels(
             frame = SimulatedFrame(gaussians, speeds, poses[k])
             # another look keeps pictures of its own between two views
             view = beside.submit(renderer.shown, frame, side, "terrain") if painter is None else None
-            rendered, front, velocity = renderer.measured(frame)
+            rendered, motion = renderer.measured(frame, moving=k < compared)
             picture = to_bytes(rendered.image)
             if k < BEYOND * compared:  # of the splats, whatever look the preview has
                 measured.frames.append(picture)
                 measured.mask.append(rendered.alpha > covers)
-            if k < compared:
-                measured.flow.append(_screen_velocity(front, velocity, scene.camera, scene.interval, rendered.alpha))
+            if motion is not None:
+                measured.flow.append(motion)
             if painter is not None:
                 picture = renderer.shown(frame, scene.camera, "plate")
             shown = renderer.shown(frame, side, "terrain") if view is None else view.result()
@@ -222,15 +222,3 @@ def _resized(picture: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     if picture.shape[1::-1] == tuple(size):
         return picture
     return cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
-
-
-def _screen_velocity(gaussians, velocity, camera: PinholeCamera, interval: float, alpha) -> np.ndarray:
-    """Motion of the re-simulation in the picture, px per frame; NaN where it shows no fluid."""
-    from fluidlift.look.rasterize import render
-
-    before, z0 = camera.project(gaussians.means)
-    after, z1 = camera.project(gaussians.means + velocity * interval)
-    ok = (z0 > 0) & (z1 > 0)
-    move = np.where(ok[:, None], after - before, 0.0).astype(np.float32)
-    drawn = render(gaussians, camera, features=np.clip(move, -1e3, 1e3)).image
-    return np.where(alpha[..., None] > 0.3, drawn / np.maximum(alpha, 0.3)[..., None], np.nan)

@@ -51,6 +51,8 @@ from fluidlift.kernels import compiling_beside
 from fluidlift.messages import as_plain
 from fluidlift.progress import Interrupted, interrupted, shown_progress
 
+__all__ = ["main"]
+
 Command = (
     Make
     | Batch

@@ -75,6 +75,18 @@ def test_smoke_and_pours_are_not_calibrated(channel):
     assert calibrate(scene, scene.velocity).force is None
 
 
+def test_of_a_pour_that_stays_the_cells_that_the_clip_shows_dry_are_kept_and_no_force(channel):
+    scene = replace(channel(2), kind="pour")
+    wet = np.zeros(scene.camera.size[::-1], bool)
+    wet[:, :20] = True  # 96 px per 1.8 to 2 m: x below some 0.38 m
+    found = calibrate(scene, scene.velocity, wet)
+    assert found.force is not None and not any(c.any() for c in found.force.components)
+    assert found.frames is None and found.dry is not None
+    centres = scene.terrain.grid.low + (np.argwhere(found.dry) + 0.5) * scene.terrain.grid.spacing
+    assert len(centres) and centres[:, 0].min() > 0.38
+    assert calibrate(replace(scene, kind="plume"), scene.velocity, wet).dry is None
+
+
 def test_a_force_is_learnt_from_what_lies_and_not_from_what_falls(channel, monkeypatch):
     gains = []
     monkeypatch.setattr(

@@ -12,6 +12,7 @@ from fluidlift.errors import require
 from fluidlift.look.surface_map import sampled
 from fluidlift.numerics.mirror import folded
 from fluidlift.numerics.sharing import shared
+from fluidlift.types.fluid_masks import share_that_stays
 
 BROAD = 0.03
 """standard deviation of the blur that separates the shade of a place from its fine look, shares of the picture's longer
@@ -95,10 +96,8 @@ class FluidFootage:
 
     @property
     def stays(self) -> float:
-        """Share of what is mostly fluid in a half of the film that is so in both: 1 where its outline stays."""
-        half = len(self) // 2
-        first, second = (part.mean(axis=0) > 0.5 for part in (self.fluid[:half], self.fluid[-half:]))
-        return float((first & second).sum() / max(int((first | second).sum()), 1))
+        """`share_that_stays` of its fluid."""
+        return share_that_stays(self.fluid)
 
     def within(self, index: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
         """Row and column in the picture of places in it or beside it: beyond its sides lies its mirror image.

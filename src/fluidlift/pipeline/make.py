@@ -33,7 +33,7 @@ from fluidlift.scene.splat_files import require_room
 from fluidlift.seams import Progress, Silence
 from fluidlift.shape.occluders import Behind
 from fluidlift.types import Filmed, FluidAsset, kind_of
-from fluidlift.types.fluid_masks import FluidMasks
+from fluidlift.types.fluid_masks import STAYS, FluidMasks, share_that_stays
 from fluidlift.types.hints import NOTHING_SAID, ClipHints
 from fluidlift.types.stages import Bodies, Calibration, Fit, Lift, Read, Segmentation
 
@@ -180,7 +180,10 @@ def _calibrated(runner: Runner, lift: Lift, asset: FluidAsset, config: JobConfig
     scene = edited_scene(asset, SceneEdits(), None, SceneSettings.of(config), start=lift.geometry.rest_frame)
     also = [] if lift.elsewhere is None else [v for stretch in lift.elsewhere.velocities for v in stretch]
     target = mean_target(asset, [*lift.motion.velocities, *also])
-    wet, s = FluidMasks(lift.labels.labels, lift.geometry.hidden).any_frame(), config.simulate
+    masks, s = FluidMasks(lift.labels.labels, lift.geometry.hidden), config.simulate
+    # what fills a vessel, or collapses, goes where it was not filmed
+    known = kind_of(asset.kind).lies_on_ground or share_that_stays(masks) > STAYS
+    wet = masks.any_frame() if known else None
     return runner.run("calibrate", calibrate, scene, target, wet, wanted=s.follow > 0, beside={"device": s.device})
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from fluidlift.errors import InputRejected
 from fluidlift.messages import Notice
 from fluidlift.types import Gaussians, Particles, PinholeCamera, concatenate, kind_of, sh_from_rgb
+from fluidlift.types.fluid_masks import STAYS
 
 if TYPE_CHECKING:
     from fluidlift.look.filmed_outline import FilmedOutline
@@ -86,10 +87,6 @@ of a Laplacian pyramid keeps half of its energy, which sharpening the film gives
 
 SMALLEST = 0.02
 """standard deviation of a splat at least, cells: files hold its logarithm"""
-
-STAYS = 0.95
-"""share of a film's fluid that must be the same in both halves for its outline to hold for what does not lie: a vessel
-that fills goes on to do so after the film. Two people who draw the outline of water agree as much"""
 
 CALM = 1.0
 """cells within which the surface of standing water that nobody edited is shown level: particles come to rest unevenly,

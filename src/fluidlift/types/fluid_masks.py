@@ -45,6 +45,29 @@ class FluidMasks:
         return np.concatenate(parts).astype(float)
 
 
+STAYS = 0.95
+"""share of a fluid that must be the same in both halves of its clip for its outline to hold after the clip as well: a
+vessel that fills goes on to do so. Two people who draw the outline of water agree as much"""
+
+
+def share_that_stays(masks: np.ndarray | FluidMasks) -> float:
+    """Share of what is fluid in most frames of one half of a clip that is so in both: 1 where the outline stays.
+
+    Args:
+        masks: bool [T,H,W], read frame by frame.
+    """
+
+    def mostly(frames: range) -> np.ndarray:
+        total = np.zeros(masks.shape[1:], np.int64)
+        for t in frames:
+            total += masks[t]
+        return 2 * total > len(frames)
+
+    half = max(len(masks) // 2, 1)
+    first, second = mostly(range(half)), mostly(range(len(masks) - half, len(masks)))
+    return float((first & second).sum() / max(int((first | second).sum()), 1))
+
+
 PART_BYTES = 2**25
 """of an array on disk that are copied or looked at in one go"""
 

@@ -73,7 +73,8 @@ def calibrate(
     Args:
         scene: unedited.
         target: m/s, on the faces of its grid.
-        wet: pixels of the clip that are fluid in at least one frame; None: nothing is known to stay dry.
+        wet: pixels of the clip that are fluid in at least one frame; None: nothing is known to stay dry. Of what falls
+            or is poured it is all that is taken: no run is made, and no force learnt.
         wanted: False leaves all as it is.
         device: of the simulation.
         work: told how many frames are done.
@@ -85,17 +86,20 @@ def calibrate(
     from fluidlift.scene.dry_cells import dry_cells
     from fluidlift.scene.simulator import simulator_of
 
-    if not wanted or not kind_of(scene.kind).lies_on_ground or not len(scene.body):
+    kind = kind_of(scene.kind)
+    if not wanted or kind.is_gas or not len(scene.body):
         return Calibration()
+    dry = None if wet is None else dry_cells(scene.terrain, scene.camera, wet, scene.cell_types)
+    if not kind.lies_on_ground:
+        return Calibration() if dry is None else Calibration(FaceVelocity.zeros(scene.terrain.grid), dry=dry)
     frames = min(scene.frames, LONGEST)
     speed = _typical(target, scene.cell_types)
     if speed <= 0:
         return Calibration()
     wave, rate = wave_speed(scene), pull_rate(scene, speed)
     rates = tuple(np.full(c.shape, rate, np.float32) for c in target.components)
-    gain = GAIN if kind_of(scene.kind).nearly_level else 0.0
+    gain = GAIN if kind.nearly_level else 0.0
     pull = Nudging(target, rates, after=SETTLED * frames * scene.interval, gain=gain, learning=LEARNING / rate)
-    dry = None if wet is None else dry_cells(scene.terrain, scene.camera, wet, scene.cell_types)
     simulator = simulator_of(replace(scene, force=None, dry=dry), device, forces=(pull,))
     for k in range(1, frames):
         if work is not None:

@@ -88,7 +88,8 @@ def simulate(
         warnings += close_loop(scene, history, folder)
     arrays = history.arrays()
     warnings += _simulation_warnings(scene.kind, history.volume, history.leak)
-    warnings += _strayed(simulator.drained, simulator.volume, scene.interval * (len(history) - 1))
+    if kind_of(scene.kind).lies_on_ground:  # what is poured, and spreads no further, runs off in any case
+        warnings += _strayed(simulator.drained, simulator.volume, scene.interval * (len(history) - 1))
     return Simulation(
         volume=arrays["volume"],
         leak=arrays["leak"],

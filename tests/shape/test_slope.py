@@ -7,13 +7,17 @@ from fluidlift.shape.energy_line import Channel, energy_profile
 from fluidlift.shape.heights import ProfileAlongHeight
 from fluidlift.shape.kind import level_camera
 from fluidlift.shape.slope import (
+    STEEP,
+    STEEP_RIVER,
+    SlopePrior,
     estimate_slope,
     estimate_tilt,
     flow_patches,
     plane_axes,
+    steepness,
 )
 from fluidlift.shape.surface import stream_surface
-from fluidlift.shape.view import PictureEvidence
+from fluidlift.shape.view import PictureEvidence, sky_of
 from fluidlift.types import PinholeCamera, UpEvidence
 
 SIZE = (128, 96)
@@ -91,10 +95,31 @@ def test_the_heading_belongs_to_the_slope_that_is_taken(slope):
 @pytest.mark.parametrize("slope", [0.0, 10.0])
 def test_where_level_streams_are_rare_less_evidence_makes_a_slope(slope):
     scene = film(slope, -20.0, 31.0, 0.75)
-    usual, rare = evidence_of(*scene), evidence_of(*scene, level_prior=0.1)
+    usual, rare = evidence_of(*scene), evidence_of(*scene, prior=SlopePrior(level=0.1))
     odds = [(1 - e.level_share) / e.level_share for e in (usual, rare)]
     assert odds[1] / odds[0] == pytest.approx((0.9 / 0.1) / (0.4 / 0.6))
     assert rare.likeliest == pytest.approx(usual.likeliest)
+
+
+def test_under_the_open_sky_a_channel_is_hardly_steeper_than_a_cascade():
+    """The same motion: a film that is filmed from near may fall by 30 degrees, a river does not."""
+    scene = film(30.0, -20.0, 31.0, 0.75)
+    near, river = (evidence_of(*scene, prior=SlopePrior(steep=s)) for s in (STEEP, STEEP_RIVER))
+    assert river.likeliest < near.likeliest and river.slope <= near.slope
+    assert steepness(PictureEvidence()) == STEEP
+    assert steepness(PictureEvidence(sky=sky_of(np.arange(96)[:, None] < np.full(128, 20)))) == STEEP_RIVER
+
+
+def test_ripples_that_each_move_their_own_way_say_nothing_of_a_slope():
+    """Motion of each piece as large as the mean, in any direction: no plane is told, and what is left is the prior."""
+    camera, mask, motion = film(0.0, -20.0, 12.0, 0.75)
+    usual = np.linalg.norm(motion[mask], axis=-1).mean()
+    shares = []
+    for seed in range(5):
+        coarse = np.random.default_rng(seed).normal(0.0, 0.7 * usual, (12, 16, 2))
+        ripples = np.repeat(np.repeat(coarse, 8, axis=0), 8, axis=1)
+        shares.append(evidence_of(camera, mask, np.where(mask[..., None], motion + ripples, motion)).level_share)
+    assert np.median(shares) > 0.25
 
 
 def test_where_level_streams_are_rare_less_of_the_tilt_is_the_cameras():

@@ -40,6 +40,7 @@ from fluidlift.shape.framing import framing_warnings
 from fluidlift.shape.given_depth import DepthPictures
 from fluidlift.shape.kinds import Observation, builder_of
 from fluidlift.shape.rest_frames import FEWEST_PIXELS, rest_frame, united_range
+from fluidlift.shape.slope import STEEP, SlopePrior, steepness
 from fluidlift.shape.view import (
     Ellipse,
     MeasuredPlane,
@@ -99,6 +100,8 @@ class Sight:
     told: tuple[Notice, ...] = ()
     rims: tuple[Ellipse, ...] = ()
     """of vessels, as they were found"""
+    steep: float = STEEP
+    """degrees, scale of the prior of the slope of a stream that is not level"""
 
     @property
     def lying_trust(self) -> np.ndarray:
@@ -249,7 +252,7 @@ def _seen(
     looked = _Looked(
         clip, fluid, mask, motion, trust, bulk if said is None else None, pick, typical, rims, _measured_plane(read)
     )
-    evidence, kind, parts, up, heading = _kind_and_up(
+    evidence, kind, parts, up, heading, steep = _kind_and_up(
         looked, given, config, known, pose_given, shaped=pictures is not None
     )
     height, unsure, stood = None, NONE, None
@@ -266,6 +269,7 @@ def _seen(
     seen = Sight(
         start, united, mask, motion, trust, known, pose_given, evidence, kind, parts, up, heading, tilt_known, height,
         unsure, stood, config.kind == "auto", *((None, ()) if said is None else (said.flow, said.warnings)), rims,
+        steep,
     )  # fmt: skip
     return seen, pictures
 
@@ -349,7 +353,7 @@ def _measured_plane(read: Read) -> MeasuredPlane | None:
 def _kind_and_up(
     looked: _Looked, given: GivenView, config: GeometrySettings, known: PinholeCamera, pose_given: bool, *, shaped: bool
 ):
-    """Evidence for the kind, the kind, the tilt of the camera, and its heading where it was surveyed."""
+    """Evidence for the kind, the kind, the tilt of the camera, its heading where surveyed, and `slope.steepness`."""
     clip, fluid, mask, motion, trust = looked.clip, looked.fluid, looked.mask, looked.motion, looked.trust
     c, bodies = config, None if given.bodies is None else given.bodies.path
     surveyed, heading = registration.pose_up(known)
@@ -378,12 +382,12 @@ def _kind_and_up(
         parts = composite.Parts((), mask)
     parts = composite.with_marks(parts, c.drawn, mask)
     if pose_given:
-        return evidence, kind, parts, surveyed, heading
+        return evidence, kind, parts, surveyed, heading, STEEP
     generated = given_body.note_of(bodies) is not None
     if bodies is not None and not (generated and (c.pitch is not None or c.roll is not None)):
         upright = given_body.up_of(bodies, surveyed, kind, rest_frame(fluid.areas()), clip.size)
         if upright is not None:
-            return evidence, kind, parts, upright, None
+            return evidence, kind, parts, upright, None, STEEP
     texture = None
     if kind.nearly_level and c.pitch is None and not parts.puddle:
         texture = texture_gradient.texture_patches(clip.frames, parts.lying & parts.gentle)
@@ -401,7 +405,7 @@ def _kind_and_up(
         up = composite.with_roll(up, parts, known)
     if c.pitch is None and kind.nearly_level and not shaped:
         up = as_relief(up, parts.lying & ~parts.falling, lambda tilted: kinds.level_camera(known, tilted))
-    return evidence, kind, parts, up, None
+    return evidence, kind, parts, up, None, steepness(picture)
 
 
 @dataclass(frozen=True)
@@ -443,10 +447,10 @@ def _depth_pictures(
 def _observation(seen: Sight, canonical: PinholeCamera, interval: float) -> Observation:
     """What lies, as the builder of its kind wants it."""
     trust = composite.trust_beside_jets(seen.parts, canonical, seen.motion, seen.lying_trust)
+    slopes = SlopePrior(composite.level_prior(seen.parts, seen.motion, seen.trust), seen.steep)
     return Observation(
         canonical, seen.parts.lying, seen.motion, trust, interval, camera_height=seen.height,
-        tilt_known=seen.tilt_known, level_prior=composite.level_prior(seen.parts, seen.motion, seen.trust),
-        roll=seen.up.roll, standing=seen.stood, ledges=seen.parts.ledges,
+        tilt_known=seen.tilt_known, slopes=slopes, roll=seen.up.roll, standing=seen.stood, ledges=seen.parts.ledges,
     )  # fmt: skip
 
 

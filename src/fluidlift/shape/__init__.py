@@ -46,6 +46,8 @@ Modules of the face:
                       heading, origin
     rest_frames       Which frames of a clip become the body at rest
     segment           Which pixels of a clip are fluid, without learned weights
+    slope             How steep a stream or a film runs, and how the camera is tilted over it, from the perspective
+                      of its motion
     standing          A body of liquid that stands on level ground and is let go (a dam break), and the basin that
                       it spreads in
     surface           Where the visible surface of a fluid is: level planes, falling profiles, inflated silhouettes,
@@ -90,6 +92,7 @@ __all__ = [
     "registration",
     "rest_frames",
     "segment",
+    "slope",
     "standing",
     "surface",
     "texture_gradient",

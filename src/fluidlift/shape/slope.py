@@ -39,6 +39,9 @@ LEVEL = 0.6
 """prior share of streams that are level within a degree or two (rivers, channels; the others are films and chutes)"""
 STEEP = 20.0
 """degrees, scale of the half-normal prior of the slope of the others"""
+STEEP_RIVER = 6.0
+"""degrees, the same under the open sky: channels of rivers and brooks fall by 1 % (pools and riffles) to 25 % at most
+(cascades; Montgomery and Buffington 1997), of 14 degrees; films and boards are filmed from near"""
 UNMODELLED = 2.0
 """actual over computed standard error of the slope, on made streams with eddies, bends and uneven profiles."""
 BELIEF = 0.5
@@ -47,8 +50,10 @@ posterior says on three sets of made streams (238, of which 58 with measured opt
 times. The motion still draws the pitch up by some 4 degrees: no motion speaks against a steep view"""
 FREEDOM = np.array([0.08, 0.25, 0.6, 1.2])
 """how far the field may be from uniform, as multiples of `USUAL`; each as likely"""
-NOISE = np.array([0.015, 0.03, 0.06, 0.12, 0.24])
-"""px over the mean displacement; each as likely"""
+NOISE = np.array([0.015, 0.03, 0.06, 0.12, 0.24, 0.48, 0.96])
+"""px over the mean displacement; each as likely. Ripples of calm water move each on its own way, and their mean over a
+second is as uncertain as it is large: with 0.24 at most, a river that mirrors its trees was level with a probability of
+0.02, on a slope of 25 +- 20 degrees"""
 TURNS = np.radians(np.arange(-12.0, 13.0, 3.0))
 """about the headings that fit the mean motion: the steeper a plane, the more headings look alike, and the best alone
 draws slopes down"""
@@ -59,6 +64,20 @@ USUAL = np.array([1.0, 0.25, 0.5, 0.2, 0.3, 0.18, 0.15, 0.2, 0.05, 0.08, 0.2, 0.
 parabola across has -0.5 to -1 in c^2; a stream that gets half as fast again along the view 0.2 in l; banks that close
 by 5 degrees 0.09 in c of V_c, a bend by 10 degrees 0.18 in its l. What changes along the stream must be rarer than what
 changes across it, or perspective says nothing: twice the deviations of l and of c in V_c cost about one degree"""
+
+
+@dataclass(frozen=True)
+class SlopePrior:
+    """How steep such streams are, before their motion is looked at."""
+
+    level: float = LEVEL
+    """share of them that are level"""
+    steep: float = STEEP
+    """degrees, scale of the half-normal prior of the slope of the others"""
+
+
+USUAL_SLOPES = SlopePrior()
+"""where nothing is known of what lies around"""
 
 
 @dataclass(frozen=True)
@@ -109,7 +128,11 @@ def flow_patches(
 
 
 def estimate_slope(
-    camera: PinholeCamera, patches: FlowPatches | None, *, tilt_known: bool = True, level_prior: float = LEVEL
+    camera: PinholeCamera,
+    patches: FlowPatches | None,
+    *,
+    tilt_known: bool = True,
+    prior: SlopePrior = USUAL_SLOPES,
 ) -> SlopeEvidence:
     """Slope of a stream under a camera whose tilt is known, or was estimated by `estimate_tilt`.
 
@@ -120,18 +143,18 @@ def estimate_slope(
         camera: canonical, z up.
         patches: of the motion; None: nothing is known, and level is taken.
         tilt_known: the camera's tilt was given.
-        level_prior: share of such streams that are level.
+        prior: of the slope.
     """
     if patches is None:
-        return SlopeEvidence(0.0, STEEP, 0.0, 1.0, 0.0, "prior: too little motion to tell")
+        return SlopeEvidence(0.0, prior.steep, 0.0, 1.0, 0.0, "prior: too little motion to tell")
     slopes = np.arange(0.0, STEEPEST_STREAM + 1.0, 2.0)
     log = np.array([heading_evidence(camera, patches, np.radians(s))[0] for s in slopes])
     if not np.isfinite(log).any():
-        return SlopeEvidence(0.0, STEEP, 0.0, 1.0, 0.0, "prior: no plane is seen by the camera in all of it")
+        return SlopeEvidence(0.0, prior.steep, 0.0, 1.0, 0.0, "prior: no plane is seen by the camera in all of it")
     likelihood = np.exp(log - log.max())
-    share = likelihood * falling_prior(slopes)
+    share = likelihood * falling_prior(slopes, prior.steep)
     falling = float(share.sum())
-    level = level_prior * likelihood[0] / (level_prior * likelihood[0] + (1.0 - level_prior) * falling)
+    level = prior.level * likelihood[0] / (prior.level * likelihood[0] + (1.0 - prior.level) * falling)
     mean = float((share * slopes).sum() / max(falling, 1e-300))
     error = float(np.sqrt((share * (slopes - mean) ** 2).sum() / max(falling, 1e-300)))
     slope = (mean if level < 0.5 else 0.0) if tilt_known else (1.0 - level) * mean
@@ -159,7 +182,8 @@ def estimate_tilt(
     """
     pitches, rolls = np.arange(-4.0, 89.0, 4.0), np.array([-4.0, 0.0, 4.0])
     slopes = np.array([0.0, 5.0, 10.0, 16.0, 22.0, 30.0, 38.0])
-    prior = np.where(slopes > 0, (1.0 - level_prior) * falling_prior(slopes), level_prior)
+    others = falling_prior(slopes, steepness(picture))
+    prior = np.where(slopes > 0, (1.0 - level_prior) * others, level_prior)
     cameras = [[tilted(float(p), float(r)) for r in rolls] for p in pitches]
     if patches is None:
         slopes, prior = slopes[:1], np.ones(1)
@@ -242,9 +266,14 @@ def _downstream(motion: np.ndarray, along: np.ndarray, across: np.ndarray) -> np
     return (motion[:, 0] * across[:, 1] - motion[:, 1] * across[:, 0]) / determinant
 
 
-def falling_prior(slopes: np.ndarray) -> np.ndarray:
-    """Half-normal over slopes > 0 (degrees), per step of the grid; sums to 1."""
-    prior = np.exp(-0.5 * (slopes / STEEP) ** 2) * np.gradient(slopes) * (slopes > 0)
+def steepness(picture: PictureEvidence) -> float:
+    """Degrees: scale of the prior of the slope of what is not level, by what is seen around it."""
+    return STEEP if picture.sky is None else STEEP_RIVER
+
+
+def falling_prior(slopes: np.ndarray, steep: float = STEEP) -> np.ndarray:
+    """Half-normal of a scale `steep` over slopes > 0 (degrees), per step of the grid; sums to 1."""
+    prior = np.exp(-0.5 * (slopes / steep) ** 2) * np.gradient(slopes) * (slopes > 0)
     return prior / prior.sum()
 
 

@@ -79,7 +79,7 @@ def stream_surface(
     *,
     camera_height: float | None = None,
     tilt_known: bool = True,
-    level_prior: float = slope.LEVEL,
+    prior: slope.SlopePrior = slope.USUAL_SLOPES,
 ) -> FrontSurface:
     """The surface of a stream or a film: as steep as its motion shows, and lower where it has become faster.
 
@@ -100,7 +100,7 @@ def stream_surface(
         interval: s.
         camera_height: m above the water, where surveyed.
         tilt_known: the camera's tilt was given.
-        level_prior: share of such streams that are level.
+        prior: of the slope.
 
     Raises:
         InputRejected: the camera does not look down at the surface.
@@ -112,7 +112,7 @@ def stream_surface(
     broken = _chute_above_pool(camera, mask, sections.estimate_sections(camera, patches))
     if broken is not None:
         return broken
-    evidence = slope.estimate_slope(camera, patches, tilt_known=tilt_known, level_prior=level_prior)
+    evidence = slope.estimate_slope(camera, patches, tilt_known=tilt_known, prior=prior)
     front = level_surface(camera, mask) if evidence.slope == 0 else _sloping_plane(camera, mask, evidence)
     front = replace(front, slope=evidence)
     if patches is None or camera_height is None or camera_height <= 0:

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from fluidlift.shape.depth_surface import DepthSlope
     from fluidlift.shape.given_depth import SceneDepth
     from fluidlift.shape.heights import HeightModel
+    from fluidlift.shape.slope import SlopePrior
     from fluidlift.shape.standing import StandingBody
     from fluidlift.shape.surface import FrontSurface
     from fluidlift.types import PinholeCamera
@@ -35,8 +36,8 @@ class Observation:
     """of a surveyed camera above the water, m"""
     tilt_known: bool
     """whether the tilt is surveyed or the user's"""
-    level_prior: float
-    """share of such channel flows that are level"""
+    slopes: SlopePrior
+    """of such channel flows"""
     roll: float
     """degrees that the picture is turned clockwise"""
     standing: StandingBody | None

@@ -12,7 +12,7 @@ class _Stream:
             marked = surface.chutes_on_level(seen.camera, seen.mask, seen.motion, seen.trust, seen.ledges)
         return marked or surface.stream_surface(
             seen.camera, seen.mask, seen.motion, seen.trust, seen.interval, camera_height=seen.camera_height,
-            tilt_known=seen.tilt_known, level_prior=seen.level_prior,
+            tilt_known=seen.tilt_known, prior=seen.slopes,
         )  # fmt: skip
 
     def depth_surface(self, scene, seen, slopes, usual):

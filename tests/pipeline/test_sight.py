@@ -39,7 +39,7 @@ def found(looked):
 
 
 def test_a_pool_in_which_a_jet_spreads_is_level_and_closed():
-    _, kind, parts, up, _ = found(tray(slows=1.0))
+    _, kind, parts, up, *_ = found(tray(slows=1.0))
     assert kind.name == "stream" and parts.puddle and len(parts.outlines) == 1
     assert parts.falling[30:45, 100].all() and not parts.falling[75:].any(), "what spreads is no jet, fast as it is"
     # a level circle is as flat as the sine of the tilt; the habit of such views pulls at it

@@ -7,6 +7,7 @@ from fluidlift.shape.energy_line import Channel, energy_profile
 from fluidlift.shape.heights import ProfileAlongHeight
 from fluidlift.shape.kind import level_camera
 from fluidlift.shape.slope import (
+    LEVEL,
     STEEP,
     STEEP_RIVER,
     SlopePrior,
@@ -110,16 +111,17 @@ def test_under_the_open_sky_a_channel_is_hardly_steeper_than_a_cascade():
     assert steepness(PictureEvidence(sky=sky_of(np.arange(96)[:, None] < np.full(128, 20)))) == STEEP_RIVER
 
 
-def test_ripples_that_each_move_their_own_way_say_nothing_of_a_slope():
-    """Motion of each piece as large as the mean, in any direction: no plane is told, and what is left is the prior."""
+def test_ripples_that_each_move_their_own_way_say_little_of_a_slope():
+    """Motion of each piece as large as the mean, in any direction: what is left is near the prior, either way. Were
+    such noise not reckoned with, one of these four would be level with a probability of 0.02, one of 0.99."""
     camera, mask, motion = film(0.0, -20.0, 12.0, 0.75)
     usual = np.linalg.norm(motion[mask], axis=-1).mean()
-    shares = []
-    for seed in range(5):
-        coarse = np.random.default_rng(seed).normal(0.0, 0.7 * usual, (12, 16, 2))
+    for seed in range(4):
+        coarse = np.random.default_rng(seed).normal(0.0, usual, (12, 16, 2))
         ripples = np.repeat(np.repeat(coarse, 8, axis=0), 8, axis=1)
-        shares.append(evidence_of(camera, mask, np.where(mask[..., None], motion + ripples, motion)).level_share)
-    assert np.median(shares) > 0.25
+        found = evidence_of(camera, mask, np.where(mask[..., None], motion + ripples, motion))
+        odds = (1.0 - found.level_share) / found.level_share * LEVEL / (1.0 - LEVEL)
+        assert 1.0 / 20.0 < odds < 20.0
 
 
 def test_where_level_streams_are_rare_less_of_the_tilt_is_the_cameras():

@@ -73,8 +73,8 @@ def calibrate(
     Args:
         scene: unedited.
         target: m/s, on the faces of its grid.
-        wet: pixels of the clip that are fluid in at least one frame; None: nothing is known to stay dry. Of what falls
-            or is poured it is all that is taken: no run is made, and no force learnt.
+        wet: pixels of the clip that are fluid in at least one frame; None: nothing is known to stay dry. Of what
+            does not lie on ground it is all that is taken: no run is made, and no force learnt.
         wanted: False leaves all as it is.
         device: of the simulation.
         work: told how many frames are done.

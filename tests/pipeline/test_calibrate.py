@@ -77,14 +77,17 @@ def test_smoke_and_pours_are_not_calibrated(channel):
 
 def test_of_a_pour_that_stays_the_cells_that_the_clip_shows_dry_are_kept_and_no_force(channel):
     scene = replace(channel(2), kind="pour")
-    wet = np.zeros(scene.camera.size[::-1], bool)
-    wet[:, :20] = True  # 96 px per 1.8 to 2 m: x below some 0.38 m
-    found = calibrate(scene, scene.velocity, wet)
+    shares = np.zeros(scene.camera.size[::-1], np.float32)
+    shares[:, :20] = 0.9  # 96 px per 1.8 to 2 m: x below some 0.38 m
+    shares[:, :10] = 1.0
+    found = calibrate(scene, scene.velocity, shares)
     assert found.force is not None and not any(c.any() for c in found.force.components)
     assert found.frames is None and found.dry is not None
     centres = scene.terrain.grid.low + (np.argwhere(found.dry) + 0.5) * scene.terrain.grid.spacing
     assert len(centres) and centres[:, 0].min() > 0.38
-    assert calibrate(replace(scene, kind="plume"), scene.velocity, wet).dry is None
+    always = scene.terrain.grid.low + (np.argwhere(found.wet) + 0.5) * scene.terrain.grid.spacing
+    assert len(always) and always[:, 0].max() < 0.2
+    assert calibrate(replace(scene, kind="plume"), scene.velocity, shares).dry is None
 
 
 def test_a_force_is_learnt_from_what_lies_and_not_from_what_falls(channel, monkeypatch):
@@ -141,13 +144,14 @@ def test_a_coarser_copy_gets_a_coarser_force(tmp_path, made):
     grid = load_asset(made.folder).grid
     dry = np.zeros(grid.shape, bool)
     dry[:4, :3] = True
-    write_filmed(tmp_path, Filmed(uniform(grid, (1.0, 2.0, 3.0)), dry))
+    write_filmed(tmp_path, Filmed(uniform(grid, (1.0, 2.0, 3.0)), dry, dry[::-1]))
     (tmp_path / "empty").mkdir()
     scene = scene_of(asset, tmp_path / "empty", SimulationRequest(meshes=tmp_path), JobConfig(), footage=None, start=0)
     assert scene.force.shape == asset.grid.shape
     np.testing.assert_allclose(scene.force.w[1:-1, 1:-1, 1:-1], 3.0)
     assert scene.dry.shape == asset.grid.shape and scene.dry[:2, 0].all() and not scene.dry[2:].any()
     assert not scene.dry[:, 1:].any(), "a wide cell is dry where all of it is"
+    assert scene.wet.any() and not (scene.wet & scene.dry).any(), "cells that stay wet are kept beside them"
 
 
 def test_a_damaged_force_is_refused_with_what_to_do(tmp_path):

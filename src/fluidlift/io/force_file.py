@@ -1,10 +1,11 @@
-"""What an asset carries of the filmed flow: the steady body force that keeps it, the cells where it never is, and its
-motion frame by frame, where that was asked for."""
+"""What an asset carries of the filmed flow: the steady body force that keeps it, the cells where it never is and where
+it always is, and its motion frame by frame, where that was asked for."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,8 @@ def write_filmed(folder: Path, filmed: Filmed) -> None:
     arrays: dict[str, Any] = {}
     if filmed.force is not None:
         arrays = {n: c.astype(np.float32) for n, c in zip("uvw", filmed.force.components)}
-        if filmed.dry is not None:
-            arrays["dry"] = np.packbits(filmed.dry)
+        known = {"dry": filmed.dry, "wet": filmed.wet}
+        arrays |= {name: np.packbits(cells) for name, cells in known.items() if cells is not None}
     _write(asset_file(folder, FILES["force"]), arrays)
     motion: dict[str, Any] = {}
     if filmed.motion is not None:
@@ -43,7 +44,7 @@ def _write(path: Path, arrays: dict[str, Any]) -> None:
 
 
 def read_filmed(folder: Path, *, motion: bool = False) -> Filmed:
-    """That of an asset; nothing where it has none, no dry cells where an older version made it.
+    """That of an asset; nothing where it has none, no dry or wet cells where an older version made it.
 
     Args:
         folder: of the asset.
@@ -52,18 +53,19 @@ def read_filmed(folder: Path, *, motion: bool = False) -> Filmed:
     Raises:
         InputRejected: a damaged file.
     """
-    path, moving, force, dry = asset_file(folder, FILES["force"]), asset_file(folder, FILES["motion"]), None, None
+    path, moving, kept = asset_file(folder, FILES["force"]), asset_file(folder, FILES["motion"]), Filmed()
     if path.is_file():
         found = read_arrays(path, ("u", "v", "w"))
         with _named(path, "a force on the faces of a grid"):
             force = FaceVelocity(*(np.asarray(found[n], np.float32) for n in "uvw"))
-            dry = _unpacked(found["dry"], force.shape) if "dry" in found else None
+            dry, wet = (_unpacked(found[n], n, force.shape) if n in found else None for n in ("dry", "wet"))
+            kept = Filmed(force, dry, wet)
     if not motion or not moving.is_file():
-        return Filmed(force, dry)
+        return kept
     found = read_arrays(moving, ("u", "v", "w", "interval", "start"))
     with _named(moving, "velocities of frames on the faces of a grid"):
         u, v, w = (np.asarray(found[n], np.float16) for n in "uvw")
-        return Filmed(force, dry, FilmedMotion(u, v, w, float(found["interval"]), int(found["start"])))
+        return replace(kept, motion=FilmedMotion(u, v, w, float(found["interval"]), int(found["start"])))
 
 
 @contextmanager
@@ -75,10 +77,9 @@ def _named(path: Path, wanted: str) -> Iterator[None]:
         raise InputRejected(f"'{path.name}': {error}", wanted, "make the asset again") from None
 
 
-def _unpacked(bits: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
+def _unpacked(bits: np.ndarray, name: str, shape: tuple[int, int, int]) -> np.ndarray:
     """bool [nx,ny,nz] from a bit per cell."""
     count = int(np.prod(shape))
-    require(
-        bits.dtype == np.uint8 and bits.shape == ((count + 7) // 8,), f"dry {bits.dtype} {bits.shape}", "a bit per cell"
-    )
+    right = bits.dtype == np.uint8 and bits.shape == ((count + 7) // 8,)
+    require(right, f"{name} {bits.dtype} {bits.shape}", "a bit per cell")
     return np.unpackbits(bits, count=count).astype(bool).reshape(shape)

@@ -28,7 +28,7 @@ which keep a few particles of it. As far as what a film of smoke shows may be fr
 
 LEFT = 2.0
 """cells from the filmed fluid within which nothing is shown that the film shows dry: the simulation takes out what is
-further off (`scene.dry_cells`: cells whose middle is more than one cell away)"""
+further off (`scene.filmed_cells`: cells whose middle is more than one cell away)"""
 
 HOLES = 2.0
 """cells, half the width of holes that are closed where the film shows fluid"""

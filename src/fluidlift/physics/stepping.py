@@ -23,6 +23,7 @@ from fluidlift.physics.emitter import Emission, Supply
 from fluidlift.physics.inlet import Inlet
 from fluidlift.physics.no_bodies import NoBodies
 from fluidlift.physics.position_correction import cell_capacity
+from fluidlift.physics.refill import Refill
 from fluidlift.physics.rigid import RigidBodies
 from fluidlift.physics.surroundings import SimulationSettings, Surroundings
 from fluidlift.types import FaceVelocity, FluidParameters, Gaussians, Grid, Particles, SolveReport, Terrain
@@ -131,6 +132,10 @@ class ParticleSimulator(ABC):
         """bool [nx,ny,nz]: cells whose particles are taken out at the end of every `advance`; None: none are"""
         self.drained = 0.0
         """m^3 that were taken out there"""
+        self.refill: Refill | None = None
+        """cells that are kept from running dry, at the end of every `advance`; None: none are"""
+        self.refilled = 0.0
+        """m^3 that were put in there"""
         self._particles = self._prepared(particles)
         self._next_id = int(particles.ids.max()) + 1 if len(particles) else 0
         self._emit_source = emit_source or self._nearest_source(particles)
@@ -174,6 +179,7 @@ class ParticleSimulator(ABC):
         return particles | {
             "time": np.float64(self.time),
             "drained": np.float64(self.drained),
+            "refilled": np.float64(self.refilled),
             "counts": np.array([self._advances, self._next_id], np.int64),
             "generator": np.frombuffer(generator, np.uint8),
             "inlet_shift": self._inlet.shift.copy(),
@@ -190,7 +196,7 @@ class ParticleSimulator(ABC):
             particles = Particles(**{f.name: np.array(state[f"particles.{f.name}"]) for f in fields(Particles)})
             generator = json.loads(bytes(state["generator"]))
             counts, shift, time = state["counts"], np.array(state["inlet_shift"], np.float64), float(state["time"])
-            drained = float(state.get("drained", 0.0))
+            drained, refilled = float(state.get("drained", 0.0)), float(state.get("refilled", 0.0))
             emitted = np.array(state.get("emitted_until", np.zeros(0)), np.float64)
             require(counts.shape == (2,) and shift.shape == (3,), "counters of another shape")
             require(emitted.shape == (len(self._inlet.emissions),), "a simulation state with other emitters")
@@ -201,7 +207,7 @@ class ParticleSimulator(ABC):
         except (KeyError, TypeError, ValueError) as error:
             raise InputRejected(f"a simulation state that does not fit: {error}") from None
         self._particles, self._rng, self.time = particles, fresh, time
-        self.drained = drained
+        self.drained, self.refilled = drained, refilled
         self._advances, self._next_id = int(counts[0]), int(counts[1])
         self._inlet.shift = shift
         for emission, last in zip(self._inlet.emissions, emitted):
@@ -248,6 +254,7 @@ class ParticleSimulator(ABC):
         self.time = end
         removed += self._drain()
         emitted += self._fill_inlet()  # what the last substep carried away leaves no gap in the frame
+        emitted += self._fill_dry()
         return StepReport(
             duration, substeps, self._max_speed(), self.volume, self._wet_volume(), tuple(pressure), tuple(viscosity),
             self._count(), emitted, removed, retries,
@@ -263,6 +270,19 @@ class ParticleSimulator(ABC):
             self.drained += float(self._particles.masses[gone].sum(dtype=np.float64)) / self.parameters.density
             self._particles = self._particles.select(~gone)
         return int(gone.sum())
+
+    def _fill_dry(self) -> int:
+        """Put fluid into cells that are kept from running dry; how many particles."""
+        if self.refill is None:
+            return 0
+        spacing = self._inlet.particle_spacing
+        places = self.refill.missing(self._held().positions, spacing, self._rng)
+        places = places[~self.bodies.inside(places)] if len(places) else places
+        if len(places):
+            self._join(self.refill.particles(places, self.parameters.density * spacing**3, self._next_id))
+            self._next_id += len(places)
+            self.refilled += len(places) * spacing**3
+        return len(places)
 
     def _count(self) -> int:
         """Number of particles."""

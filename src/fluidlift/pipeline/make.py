@@ -162,7 +162,7 @@ def _write_asset(runner: Runner, lift: Lift, config: JobConfig, provenance: dict
         provenance=provenance | origin,
     )
     calibration = _calibrated(runner, lift, asset, config)
-    write_filmed(folder, Filmed(calibration.force, calibration.dry, lift.motion.filmed))
+    write_filmed(folder, Filmed(calibration.force, calibration.dry, calibration.wet, lift.motion.filmed))
     save_asset(
         folder,
         asset,
@@ -183,8 +183,8 @@ def _calibrated(runner: Runner, lift: Lift, asset: FluidAsset, config: JobConfig
     masks, s = FluidMasks(lift.labels.labels, lift.geometry.hidden), config.simulate
     # what fills a vessel, or collapses, goes where it was not filmed
     known = kind_of(asset.kind).lies_on_ground or share_that_stays(masks) > STAYS
-    wet = masks.any_frame() if known else None
-    return runner.run("calibrate", calibrate, scene, target, wet, wanted=s.follow > 0, beside={"device": s.device})
+    shares = masks.shares() if known else None
+    return runner.run("calibrate", calibrate, scene, target, shares, wanted=s.follow > 0, beside={"device": s.device})
 
 
 def _write_film(lift: Lift, folder: Path) -> None:

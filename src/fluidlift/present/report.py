@@ -107,7 +107,7 @@ def _section_as_filmed(shown: Shown) -> Section:
         return Section("As filmed", notes=[f"How near the re-simulation stays to the clip is not known: {card}."])
     said = card.sentence()
     how = f"{card.frames} frames were compared with the clip at the same time, {card.beyond} after its end. "
-    how += "The floor is the same figure between the two halves of the clip."
+    how += "The floor is the same figure between the two halves of the clip (current: its first and last third)."
     return Section(
         "As filmed", (), card.rows(), HEADER, [said[:1].upper() + said[1:] + ".", how, *card.notes, *card.advice]
     )

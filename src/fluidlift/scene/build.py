@@ -124,6 +124,8 @@ class Scene:
     """m/s^2 on the faces of the terrain's grid, beside gravity"""
     dry: np.ndarray | None = None
     """bool [nx,ny,nz]: cells that the clip shows dry throughout, from which fluid is taken out"""
+    wet: np.ndarray | None = None
+    """bool [nx,ny,nz]: cells that the clip shows wet throughout, which are filled where they run dry"""
     guide: FilmedMotion | None = None
     """on the faces of the terrain's grid, towards which the flow is drawn; None: it runs free"""
     guide_rates: tuple[np.ndarray, ...] = ()
@@ -176,6 +178,8 @@ class Scene:
             found["guide"] = _hash(*self.guide.components, self.guide.interval, self.guide.start, *self.guide_rates)
         if self.dry is not None:
             found["dry cells"] = _hash(self.dry)
+        if self.wet is not None:
+            found["wet cells"] = _hash(self.wet)
         if self.whitewater > 0:
             found["white water"] = _hash(self.whitewater, *["everywhere"] * self.whitewater_everywhere)
         if not self.skin:

@@ -42,10 +42,11 @@ leave planar errors of 1.76 and 1.74 px, with forces 1.6 times as strong for the
 
 
 def following(scene: Scene, asset: FluidAsset, filmed: Filmed, settings: SceneSettings) -> Scene:
-    """The scene with shares of what the asset knows of the filmed flow: its force, dry cells, and motion as a guide.
+    """The scene with shares of what the asset knows of the filmed flow: its force, cells that stay dry or wet, and
+    motion as a guide.
 
-    They fade out around what was put in or dug out, and cells there may get wet. All are left out, with a note, where
-    the fluid itself, its inflow or the box is another one.
+    They fade out around what was put in or dug out, and cells there may get wet or dry. All are left out, with a note,
+    where the fluid itself, its inflow or the box is another one.
 
     Args:
         scene: with all edits.
@@ -63,7 +64,9 @@ def following(scene: Scene, asset: FluidAsset, filmed: Filmed, settings: SceneSe
     motion = filmed.motion if settings.guide > 0 else None
     if force is None and motion is None:
         return scene
-    force, dry, motion = _on_grid_of(asset, force, filmed.dry if force is not None else None, motion)
+    kept = replace(filmed, motion=motion) if force is not None else Filmed(motion=motion)
+    kept = _on_grid_of(asset, kept)
+    force, motion = kept.force, kept.motion
     if scene.changes or scene.inflow != InflowSchedule() or scene.terrain.grid != asset.grid:
         note = Notice(
             "force-left-out",
@@ -73,8 +76,9 @@ def following(scene: Scene, asset: FluidAsset, filmed: Filmed, settings: SceneSe
     untouched = _untouched(scene, asset)
     if force is not None:
         weight = settings.follow * untouched
-        kept = FaceVelocity(*(_on_faces(weight, axis) * c for axis, c in enumerate(force.components)))
-        scene = replace(scene, force=kept, dry=None if dry is None else dry & (untouched >= 1.0))
+        faded = FaceVelocity(*(_on_faces(weight, axis) * c for axis, c in enumerate(force.components)))
+        dry, wet = (None if cells is None else cells & (untouched >= 1.0) for cells in (kept.dry, kept.wet))
+        scene = replace(scene, force=faded, dry=dry, wet=wet)
     if motion is None:
         return scene
     weight = settings.guide * pull_rate(scene, _typical_speed(motion)) * untouched
@@ -94,28 +98,29 @@ def _typical_speed(motion: FilmedMotion) -> float:
     return float(np.sqrt(sum(squares)))
 
 
-def _on_grid_of(
-    asset: FluidAsset, force: FaceVelocity | None, dry: np.ndarray | None, motion: FilmedMotion | None
-) -> tuple[FaceVelocity | None, np.ndarray | None, FilmedMotion | None]:
-    """What was filmed on the grid of a copy of the asset with wider cells.
+def _on_grid_of(asset: FluidAsset, filmed: Filmed) -> Filmed:
+    """What was filmed, of which something is known, on the grid of a copy of the asset with wider cells.
 
     Raises:
         InputRejected: it is of another grid.
     """
     from fluidlift.fit.coarsen import coarsen_velocity
 
-    fine = [part.shape for part in (force, motion) if part is not None]
-    if any(part != fine[0] for part in fine) or (dry is not None and dry.shape != fine[0]):
+    fine = [part.shape for part in (filmed.force, filmed.motion, filmed.dry, filmed.wet) if part is not None]
+    if any(part != fine[0] for part in fine):
         raise InputRejected(f"a filmed flow on {fine} cells", "one grid", "make the asset again")
     shape = fine[0]
     while max(shape) > max(asset.grid.shape) and min(shape) > 1:
-        force = None if force is None else coarsen_velocity(force)
-        dry = None if dry is None else _coarser(dry)
-        motion = None if motion is None else _coarser_motion(motion)
+        filmed = Filmed(
+            None if filmed.force is None else coarsen_velocity(filmed.force),
+            None if filmed.dry is None else _coarser(filmed.dry),
+            None if filmed.wet is None else _coarser(filmed.wet),
+            None if filmed.motion is None else _coarser_motion(filmed.motion),
+        )
         shape = tuple(-(-n // 2) for n in shape)
     if shape != asset.grid.shape:
         raise InputRejected(f"a filmed flow on {shape} cells", f"{asset.grid.shape} cells", "make the asset again")
-    return force, dry, motion
+    return filmed
 
 
 def _coarser_motion(motion: FilmedMotion) -> FilmedMotion:
@@ -127,9 +132,9 @@ def _coarser_motion(motion: FilmedMotion) -> FilmedMotion:
     return FilmedMotion(u, v, w, motion.interval, motion.start)
 
 
-def _coarser(dry: Bool[np.ndarray, "nx ny nz"]) -> Bool[np.ndarray, "mx my mz"]:
-    """Cells twice as wide that are dry throughout; an odd last layer goes as `coarsen_velocity` has it."""
-    even = np.pad(dry, [(0, n % 2) for n in dry.shape], mode="edge")
+def _coarser(cells: Bool[np.ndarray, "nx ny nz"]) -> Bool[np.ndarray, "mx my mz"]:
+    """Cells twice as wide that are so throughout; an odd last layer goes as `coarsen_velocity` has it."""
+    even = np.pad(cells, [(0, n % 2) for n in cells.shape], mode="edge")
     return np.logical_and.reduce([even[i::2, j::2, k::2] for i, j, k in np.ndindex(2, 2, 2)])
 
 

@@ -75,6 +75,7 @@ def simulator_of(scene: Scene, device: str = "cpu", forces: Sequence[BodyForce] 
         )  # fmt: skip
     from fluidlift.physics.apic import LiquidSimulator
     from fluidlift.physics.guidance import Guiding, SteadyForce
+    from fluidlift.physics.refill import Refill
 
     if scene.force is not None:
         forces = (*forces, SteadyForce(scene.force))
@@ -87,6 +88,8 @@ def simulator_of(scene: Scene, device: str = "cpu", forces: Sequence[BodyForce] 
         open_sides=sides_open_to_air(parameters.gravity), forces=forces,
     )  # fmt: skip
     simulator.drains = scene.dry
+    if scene.wet is not None and scene.wet.any():
+        simulator.refill = Refill(scene.wet, scene.velocity, body, scene.terrain)
     return simulator
 
 

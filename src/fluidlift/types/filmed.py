@@ -65,5 +65,7 @@ class Filmed:
     """m/s^2 beside gravity, that keeps the filmed flow; None: none"""
     dry: Bool[np.ndarray, "nx ny nz"] | None = None
     """cells that the clip shows dry throughout; None: not known"""
+    wet: Bool[np.ndarray, "nx ny nz"] | None = None
+    """cells that it shows wet throughout; None: not known"""
     motion: FilmedMotion | None = None
     """that a simulation can be guided by; None: it was not asked for"""

@@ -39,6 +39,13 @@ class FluidMasks:
             seen |= self[part].any(axis=0)
         return seen
 
+    def shares(self) -> np.ndarray:
+        """float32 [H,W]: of the frames, those in which each pixel is fluid."""
+        total = np.zeros(self.shape[1:], np.int64)
+        for part in parts_of(self.labels):
+            total += self[part].sum(axis=0)
+        return (total / max(len(self), 1)).astype(np.float32)
+
     def areas(self) -> np.ndarray:
         """float [T]: px of each frame."""
         parts = [self[part].sum(axis=(1, 2)) for part in parts_of(self.labels)]

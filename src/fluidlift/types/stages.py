@@ -386,6 +386,8 @@ class Calibration:
     warnings: tuple[Notice, ...] = ()
     dry: Bool[np.ndarray, "nx ny nz"] | None = None
     """cells that the clip shows dry throughout; None where that is not known"""
+    wet: Bool[np.ndarray, "nx ny nz"] | None = None
+    """those that it shows wet throughout, likewise"""
 
 
 @dataclass(frozen=True)

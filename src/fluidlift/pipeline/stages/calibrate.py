@@ -12,7 +12,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Float
 
 from fluidlift.messages import Notice
 from fluidlift.pipeline.work import Work
@@ -62,7 +62,7 @@ def mean_target(asset: FluidAsset, targets: Sequence[FaceVelocity]) -> FaceVeloc
 def calibrate(
     scene: Scene,
     target: FaceVelocity,
-    wet: Bool[np.ndarray, "h w"] | None = None,
+    shares: Float[np.ndarray, "h w"] | None = None,
     *,
     wanted: bool = True,
     device: str = "cpu",
@@ -73,7 +73,7 @@ def calibrate(
     Args:
         scene: unedited.
         target: m/s, on the faces of its grid.
-        wet: pixels of the clip that are fluid in at least one frame; None: nothing is known to stay dry. Of what
+        shares: of the clip's frames in which each pixel is fluid; None: nothing is known to stay dry, or wet. Of what
             does not lie on ground it is all that is taken: no run is made, and no force learnt.
         wanted: False leaves all as it is.
         device: of the simulation.
@@ -83,15 +83,18 @@ def calibrate(
         FluidliftError: the simulation broke down.
     """
     from fluidlift.physics.guidance import Nudging
-    from fluidlift.scene.dry_cells import dry_cells
+    from fluidlift.scene.filmed_cells import dry_cells, wet_cells
     from fluidlift.scene.simulator import simulator_of
 
     kind = kind_of(scene.kind)
     if not wanted or kind.is_gas or not len(scene.body):
         return Calibration()
-    dry = None if wet is None else dry_cells(scene.terrain, scene.camera, wet, scene.cell_types)
+    grid, dry, wet = scene.terrain.grid, None, None
+    if shares is not None:
+        dry = dry_cells(scene.terrain, scene.camera, shares > 0, scene.cell_types)
+        wet = wet_cells(grid, scene.camera, shares, scene.body.positions) & ~dry
     if not kind.lies_on_ground:
-        return Calibration() if dry is None else Calibration(FaceVelocity.zeros(scene.terrain.grid), dry=dry)
+        return Calibration() if dry is None else Calibration(FaceVelocity.zeros(grid), dry=dry, wet=wet)
     frames = min(scene.frames, LONGEST)
     speed = _typical(target, scene.cell_types)
     if speed <= 0:
@@ -100,7 +103,7 @@ def calibrate(
     rates = tuple(np.full(c.shape, rate, np.float32) for c in target.components)
     gain = GAIN if kind.nearly_level else 0.0
     pull = Nudging(target, rates, after=SETTLED * frames * scene.interval, gain=gain, learning=LEARNING / rate)
-    simulator = simulator_of(replace(scene, force=None, dry=dry), device, forces=(pull,))
+    simulator = simulator_of(replace(scene, force=None, dry=dry, wet=wet), device, forces=(pull,))
     for k in range(1, frames):
         if work is not None:
             work.step(k, frames)
@@ -120,7 +123,7 @@ def calibrate(
                 "--size that is known would help",
             )
         )
-    return Calibration(force, size, speed, left, frames, tuple(warnings), dry)
+    return Calibration(force, size, speed, left, frames, tuple(warnings), dry, wet)
 
 
 def _typical(field: FaceVelocity, cell_types: np.ndarray) -> float:

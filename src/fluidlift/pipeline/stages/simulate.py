@@ -89,7 +89,9 @@ def simulate(
     arrays = history.arrays()
     warnings += _simulation_warnings(scene.kind, history.volume, history.leak)
     if kind_of(scene.kind).lies_on_ground:  # what is poured, and spreads no further, runs off in any case
-        warnings += _strayed(simulator.drained, simulator.volume, scene.interval * (len(history) - 1))
+        seconds = scene.interval * (len(history) - 1)
+        warnings += _strayed(simulator.drained, simulator.volume, seconds)
+        warnings += _refilled(simulator.refilled, simulator.volume, seconds)
     return Simulation(
         volume=arrays["volume"],
         leak=arrays["leak"],
@@ -127,6 +129,16 @@ def _strayed(drained: float, volume: float, seconds: float) -> list[Notice]:
     return [Notice("strayed", f"in each second {100 * share:.0f} % of the fluid got where the clip shows none, and was "
                    "taken out: shape or inflow is wrong there; correct the mask (fluidlift mask), or give --kind or "
                    "--pitch")]  # fmt: skip
+
+
+def _refilled(refilled: float, volume: float, seconds: float) -> list[Notice]:
+    """What to say of the water (m^3) that was put into cells that had run dry, of which `volume` is there."""
+    share = refilled / max(volume * seconds, 1e-12)
+    if share <= STRAYED:
+        return []
+    return [Notice("refilled", f"in each second {100 * share:.0f} % of the fluid was put in where the clip shows some "
+                   "at all times and the simulation ran dry: less flows in than out; give --size or --pitch, or --set "
+                   "simulate.follow=0 to see it without")]  # fmt: skip
 
 
 def frames_still_there(folder: Path) -> Callable[[Simulation], bool]:

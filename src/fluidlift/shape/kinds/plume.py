@@ -26,10 +26,11 @@ class _Plume:
 
     def inlet(self, fluid, z, spacing):
         """The foot of the stem, as wide as the stem above it: the silhouette is round where the picture or the vessel
-        cuts it off, and there the smoke is not."""
+        cuts it off, and there the smoke is not. It stands on the ground: through a slit below it, all that flows in
+        would be drawn from the sides."""
         lowest = z[fluid].min() - 0.5 * spacing
-        foot = (z > lowest) & (z < lowest + FOOT * spacing)
-        stem = np.any(fluid & (z > lowest) & (z < lowest + (FOOT + 1) * spacing), axis=2)
+        foot = z < lowest + FOOT * spacing
+        stem = np.any(fluid & (z < lowest + (FOOT + 1) * spacing), axis=2)
         return foot & stem[..., None]
 
     def outlet(self, shape):

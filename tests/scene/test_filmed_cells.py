@@ -1,14 +1,16 @@
-"""Cells that the clip shows dry: by what the camera sees of them, and what a simulation does there."""
+"""Cells that the clip shows dry, or wet: by what the camera sees of them, and what a simulation does there."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from fluidlift.numerics.signed_distance import distance_of_heights
-from fluidlift.scene.dry_cells import MARGIN, dry_cells
+from fluidlift.physics.refill import Refill
+from fluidlift.scene.filmed_cells import MARGIN, dry_cells, wet_cells
 from fluidlift.scene.simulator import simulator_of, within_outlet
-from fluidlift.types import CellType, FaceVelocity, Grid, PinholeCamera, Terrain, TriangleMesh
+from fluidlift.types import CellType, FaceVelocity, Grid, Particles, PinholeCamera, Terrain, TriangleMesh
 
 GRID = Grid((20, 16, 12), 0.1, (-1.0, -0.8, 0.0))
 EYE = np.array([0.0, 0.0, 5.0])
@@ -95,6 +97,69 @@ def test_fluid_that_gets_into_dry_cells_is_taken_out_and_counted(channel):
     again = simulator_of(replace(scene, dry=dry))
     again.restore(kept.state())
     assert again.drained == kept.drained
+
+
+def test_cells_of_the_body_that_are_fluid_in_nearly_all_frames_are_wet():
+    camera = camera_above()
+    shares = np.where(wet_half(camera), np.float32(0.97), np.float32(0.9))
+    body = GRID.centers()[:, :, 3].reshape(-1, 3)
+    wet = wet_cells(GRID, camera, shares, body)
+    centres = GRID.centers()
+    assert wet[centres[..., 0] < -0.1].any() and not wet[centres[..., 0] > 0.1].any()
+    np.testing.assert_array_equal(np.unique(np.argwhere(wet)[:, 2]), [3])
+    with pytest.raises(ValueError, match="shares"):
+        wet_cells(GRID, camera, np.ones((3, 3), np.float32), body)
+
+
+def leaking(channel, wet):
+    """The channel after two frames in which it ran out of its middle, whose cells may be kept wet."""
+    scene = channel(3)
+    middle = np.zeros(scene.terrain.grid.shape, bool)
+    middle[3:8] = True
+    simulator = simulator_of(replace(scene, wet=middle if wet else None))
+    at_rest = held(simulator)
+    simulator.drains = middle
+    for _ in range(2):
+        report = simulator.advance(scene.interval)
+    lost = middle & at_rest & ~ndimage.binary_dilation(held(simulator), np.ones((3, 3, 3)))
+    return simulator, lost, report
+
+
+def held(simulator):
+    """Cells with particles."""
+    grid = simulator.grid
+    found = np.zeros(grid.shape, bool)
+    found[tuple(np.clip(grid.cell_of(simulator.particles.positions), 0, np.array(grid.shape) - 1).T)] = True
+    return found
+
+
+def test_cells_that_the_clip_shows_wet_do_not_run_dry(channel):
+    free, lost, before = leaking(channel, wet=False)
+    assert lost.sum() > 20 and free.refilled == 0
+    kept, lost, report = leaking(channel, wet=True)
+    assert not lost.any() and report.emitted >= before.emitted + 8 * 3 * 8 * 2
+    assert kept.refilled > 0.4 * kept.drained > 0, "most of what ran out, but for cells beside those that are full"
+    assert kept.volume > free.volume
+    again = simulator_of(channel(3))
+    again.restore(kept.state())
+    assert again.refilled == kept.refilled > 0
+
+
+def test_what_fills_a_dry_cell_moves_as_filmed_and_keeps_clear_of_ground():
+    velocity = FaceVelocity(*(np.full(GRID.face_shape(a), v, np.float32) for a, v in enumerate((0.3, 0.0, -0.2))))
+    body = Particles.at_rest(GRID.centers()[4:12, 4:12, :3].reshape(-1, 3), 1.0)
+    refill = Refill(np.ones(GRID.shape, bool), velocity, body, flat())
+    rng = np.random.default_rng(0)
+    assert not len(refill.missing(body.positions, 0.05, rng))
+    half = body.positions[body.positions[:, 0] < -0.2]
+    places = refill.missing(half, 0.05, rng)
+    cells = np.unique(GRID.cell_of(places), axis=0)
+    assert len(places) == 8 * len(cells) and cells[:, 0].min() == GRID.cell_of(half)[:, 0].max() + 2
+    assert cells[:, 0].max() == 11, "not beyond the body at rest"
+    assert cells[:, 2].min() == 1, "the ground lies below z = 0.1"
+    new = refill.particles(places, 2.0, 70)
+    np.testing.assert_allclose(new.velocities, np.tile(np.float32([0.3, 0.0, -0.2]), (len(new), 1)), atol=1e-6)
+    assert new.ids[0] == 70 and (new.masses == 2.0).all()
 
 
 def test_an_inlet_beside_the_filmed_fluid_is_closed_unless_all_of_it_is(channel):

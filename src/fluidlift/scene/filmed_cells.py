@@ -1,21 +1,24 @@
-"""Cells in which the clip shows no fluid at any time.
+"""Cells in which the clip shows no fluid at any time, and those in which it shows some at all times.
 
 A mask says more than where the fluid is: whatever stands seen above dry ground, or before it, would have been filmed.
 Water that gets there in a simulation has left what was filmed (over a bank that is lower than the true one, or past
 what stands before it), and is taken out as at an outlet. What is hidden, beside the picture or within a cell of the
 filmed fluid is left alone. What comes much nearer to the camera than the fluid at rest is dry wherever it is seen: it
 would stand before the whole picture.
+
+Where fluid is seen in nearly every frame, none may go missing: what runs dry there is filled again (`physics.refill`).
 """
 
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from fluidlift.errors import require
 from fluidlift.numerics.sampling import sample_nodes
-from fluidlift.types import CellType, PinholeCamera, Terrain
+from fluidlift.types import CellType, Grid, PinholeCamera, Terrain
+from fluidlift.types.fluid_masks import STAYS
 
 MARGIN = 1.0
 """cells from the filmed fluid, as the camera sees them: a simulated rim lies somewhere in a cell"""
@@ -58,6 +61,27 @@ def dry_cells(
     open_view = ~_hidden(terrain, centres[beside], camera.position)
     dry[tuple(cells[beside[open_view]].T)] = True
     return dry
+
+
+def wet_cells(
+    grid: Grid, camera: PinholeCamera, share: Float[np.ndarray, "h w"], body: Float[np.ndarray, "n 3"]
+) -> Bool[np.ndarray, "nx ny nz"]:
+    """Cells of the fluid at rest that the clip shows wet throughout.
+
+    Args:
+        grid: of the cells.
+        camera: of the clip.
+        share: of the clip's frames in which each pixel is fluid.
+        body: the particles at rest, m.
+    """
+    require(share.shape == camera.size[::-1], f"shares {share.shape}", f"{camera.size[::-1]}")
+    wet = np.zeros(grid.shape, bool)
+    cells = np.unique(np.clip(grid.cell_of(body), 0, np.asarray(grid.shape) - 1), axis=0)
+    uv, depth = camera.project(grid.low + (cells + 0.5) * grid.spacing)
+    seen = (depth > 0) & ((uv >= 0) & (uv < np.array(camera.size))).all(axis=1)
+    column, row = np.where(seen, uv.T, 0.0).astype(int)
+    wet[tuple(cells[seen & (share[row, column] >= STAYS)].T)] = True
+    return wet
 
 
 def _hidden(terrain: Terrain, points: np.ndarray, eye: np.ndarray) -> Bool[np.ndarray, " n"]:

@@ -27,7 +27,7 @@ Modules of the face:
     footage_file   A small film of the fluid that an asset carries: what its surface looks like over time, for
                    simulations without the clip
     force_file     What an asset carries of the filmed flow: the steady body force that keeps it, the cells where it
-                   never is, and its motion frame by frame, where that was asked for
+                   never is and where it always is, and its motion frame by frame, where that was asked for
     frame_checks   Is a frame of particles sound, and does it continue the one before? Words, not exceptions
     frames         One instant of an animated fluid, as the exporters take it
     hashes         SHA-256 of files: whether they are still what was written

@@ -4,7 +4,6 @@ Modules of the face:
 
     build               What is simulated: an asset's body in its terrain, with what a person changed
     coarse_copy         An asset on wider cells and with fewer Gaussians, for a simulation that follows a hand
-    dry_cells           Cells in which the clip shows no fluid at any time
     edit_history        The history of an asset's scene.yaml: every edit as the lines it took away and put in,
                         undone or not
     edits               Edits of an asset: one model behind scene.yaml, the command line, Python and the viewer

@@ -121,7 +121,7 @@ def leaking(channel, wet):
     simulator.drains = middle
     for _ in range(2):
         report = simulator.advance(scene.interval)
-    lost = middle & at_rest & ~ndimage.binary_dilation(held(simulator), np.ones((3, 3, 3)))
+    lost = middle & at_rest & ~ndimage.binary_dilation(held(simulator), np.ones((5, 5, 5)))
     return simulator, lost, report
 
 
@@ -135,10 +135,10 @@ def held(simulator):
 
 def test_cells_that_the_clip_shows_wet_do_not_run_dry(channel):
     free, lost, before = leaking(channel, wet=False)
-    assert lost.sum() > 20 and free.refilled == 0
+    assert lost.sum() > 10 and free.refilled == 0
     kept, lost, report = leaking(channel, wet=True)
-    assert not lost.any() and report.emitted >= before.emitted + 8 * 3 * 8 * 2
-    assert kept.refilled > 0.4 * kept.drained > 0, "most of what ran out, but for cells beside those that are full"
+    assert not lost.any() and report.emitted >= before.emitted + 8 * 2 * 8 * 2
+    assert kept.refilled > 0.3 * kept.drained > 0, "what ran out, but for cells beside those that are full"
     assert kept.volume > free.volume
     again = simulator_of(channel(3))
     again.restore(kept.state())
@@ -148,13 +148,15 @@ def test_cells_that_the_clip_shows_wet_do_not_run_dry(channel):
 def test_what_fills_a_dry_cell_moves_as_filmed_and_keeps_clear_of_ground():
     velocity = FaceVelocity(*(np.full(GRID.face_shape(a), v, np.float32) for a, v in enumerate((0.3, 0.0, -0.2))))
     body = Particles.at_rest(GRID.centers()[4:12, 4:12, :3].reshape(-1, 3), 1.0)
-    refill = Refill(np.ones(GRID.shape, bool), velocity, body, flat())
+    refill = Refill(np.ones(GRID.shape, bool), velocity, body, flat(), camera_above())
     rng = np.random.default_rng(0)
     assert not len(refill.missing(body.positions, 0.05, rng))
     half = body.positions[body.positions[:, 0] < -0.2]
     places = refill.missing(half, 0.05, rng)
     cells = np.unique(GRID.cell_of(places), axis=0)
-    assert len(places) == 8 * len(cells) and cells[:, 0].min() == GRID.cell_of(half)[:, 0].max() + 2
+    assert len(places) == 8 * len(cells) and 1 <= cells[:, 0].min() - GRID.cell_of(half)[:, 0].max() <= 2
+    nearer = body.positions + np.float32([0.0, 0.0, 0.3])
+    assert not len(refill.missing(nearer, 0.05, rng)), "what came nearer is no hole"
     assert cells[:, 0].max() == 11, "not beyond the body at rest"
     assert cells[:, 2].min() == 1, "the ground lies below z = 0.1"
     new = refill.particles(places, 2.0, 70)

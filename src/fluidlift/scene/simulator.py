@@ -89,7 +89,7 @@ def simulator_of(scene: Scene, device: str = "cpu", forces: Sequence[BodyForce] 
     )  # fmt: skip
     simulator.drains = scene.dry
     if scene.wet is not None and scene.wet.any():
-        simulator.refill = Refill(scene.wet, scene.velocity, body, scene.terrain)
+        simulator.refill = Refill(scene.wet, scene.velocity, body, scene.terrain, scene.camera)
     return simulator
 
 

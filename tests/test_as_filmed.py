@@ -115,6 +115,16 @@ def test_water_on_its_banks_shows_in_level_and_ring(clip, masks):
     assert any("none was filmed" in text for text in card.advice)
 
 
+def test_what_a_frame_of_the_clip_did_not_see_is_no_fluid_too_much(clip, masks):
+    seen = np.ones(masks.shape, bool)
+    seen[T // 2 :, :, : W // 3] = False  # the camera looked further to the right
+    known = masks & seen
+    card = as_filmed(clip, known, INTERVAL, clip, masks, seen=seen)
+    assert card["level"].value == pytest.approx(1.0) and card["level"].floor == pytest.approx(1.0)
+    blind = as_filmed(clip, known, INTERVAL, clip, masks)
+    assert blind["level"].value == pytest.approx(2 / 3, abs=0.01) and blind["level"].verdict == WRONG
+
+
 def test_water_that_ran_dry_is_missing(clip, masks):
     gone = masks.copy()
     gone[2 * T // 3 :] = False

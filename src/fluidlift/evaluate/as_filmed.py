@@ -177,6 +177,7 @@ def as_filmed(
     coverage: Bool[np.ndarray, "k h w"],
     *,
     runs: bool = True,
+    seen: np.ndarray | None = None,
 ) -> AsFilmed:
     """Hold a re-simulation against its clip.
 
@@ -190,6 +191,8 @@ def as_filmed(
         coverage: pixels that its fluid covers.
         runs: False: it stays where it is. What moves over it are waves, which the clip shows at another time: no
             current to hold against another.
+        seen: bool [T,H,W], pixels that each frame of the clip saw, where it was steadied: where none was filmed no
+            fluid is missing or too much. None: all.
 
     Raises:
         ValueError: arrays that do not fit each other, or fewer than `FEWEST` frames.
@@ -206,10 +209,11 @@ def as_filmed(
         return film_statistics(frames, where, places, foam, interval=interval, late=late)
 
     whole, within = statistics(clip[:length], masks[:length]), statistics(renders[:length], masks[:length])
-    value = level(masks[:length], coverage[:length], places) | likeness(whole, within, places.fluid, places)
+    value = level(masks[:length], coverage[:length], places, seen) | likeness(whole, within, places.fluid, places)
     first, second = statistics(clip[:half], masks[:half], 0.0), statistics(clip[-half:], masks[-half:], 0.0)
     floor = likeness(first, second, places.steady, places) | _own_current(clip[:length], masks[:length], whole, places)
-    floor["level"] = float(mask_iou(masks[:half], masks[-half:]).mean())
+    both = True if seen is None else seen[:half] & seen[-half:]
+    floor["level"] = float(mask_iou(masks[:half] & both, masks[-half:] & both).mean())
     if moves:  # its halves differ because it is elsewhere
         floor.update((key, float("nan")) for key in ("level", "current_error", "current_cosine"))
     beyond: dict[str, float] = {}
@@ -224,15 +228,16 @@ def as_filmed(
     return AsFilmed(length, len(later), figures, notes, tuple(_advice(figures, value, beyond)))
 
 
-def level(masks: np.ndarray, coverage: np.ndarray, places: Places) -> dict[str, float]:
-    """Where the fluid stands in the last third: IoU, share of the ring that it covers, share of it that is missing."""
-    late = slice(int(LATE * len(masks)), None)
-    seen = coverage[late].mean(axis=0)
-    known = masks[late].any()
+def level(masks: np.ndarray, coverage: np.ndarray, places: Places, seen: np.ndarray | None = None) -> dict[str, float]:
+    """Where the fluid stands in the last third: IoU in what is `seen` (None: all), share of the ring that it covers,
+    share of it that is missing."""
+    late = slice(int(LATE * len(masks)), len(masks))
+    covered, known = coverage[late].mean(axis=0), masks[late].any()
+    within = True if seen is None else seen[late]
     return {
-        "level": float(mask_iou(masks[late], coverage[late]).mean()) if known else float("nan"),
-        "flooded": _mean(seen, places.ring),
-        "missing": 1.0 - _mean(seen, places.always),
+        "level": float(mask_iou(masks[late] & within, coverage[late] & within).mean()) if known else float("nan"),
+        "flooded": _mean(covered, places.ring),
+        "missing": 1.0 - _mean(covered, places.always),
     }
 
 

@@ -13,6 +13,8 @@ from itertools import pairwise
 
 import cv2
 import numpy as np
+from jaxtyping import Bool, UInt8
+from scipy import ndimage
 
 from fluidlift.errors import require
 from fluidlift.messages import Notice
@@ -271,6 +273,23 @@ def shake_and_drift(motions: np.ndarray, width: int, height: int, cuts: tuple[in
     within[[cut - 1 for cut in cuts]] = False
     shake = float(np.percentile(steps[within], 95)) if within.any() else 0.0
     return shake, float(np.linalg.norm(moved, axis=-1).mean(axis=-1).max())
+
+
+def own_pixels(frames: UInt8[np.ndarray, "t h w 3"]) -> Bool[np.ndarray, "t h w"]:
+    """What each frame of a steadied clip saw itself: elsewhere, in from the picture's edge, it repeats a neighbour to
+    the bit (`warp_back`).
+
+    Which of two such frames is the one that saw it is not asked: both count as blind there.
+    """
+    own = np.ones(frames.shape[:3], bool)
+    for t in range(1, len(frames)):
+        same = (frames[t] == frames[t - 1]).all(axis=-1)
+        edge = np.zeros(same.shape, bool)
+        edge[[0, -1]], edge[:, [0, -1]] = same[[0, -1]], same[:, [0, -1]]
+        repeated = ndimage.binary_propagation(edge, mask=same)
+        own[t] &= ~repeated
+        own[t - 1] &= ~repeated
+    return own
 
 
 def warp_back(

@@ -88,16 +88,17 @@ def card_of_run(
         coverage: bool [K,H,W], pixels that the fluid covers.
     """
     from fluidlift.evaluate.as_filmed import FEWEST, as_filmed
+    from fluidlift.motion.stabilize import own_pixels
 
     reason = why_not(scene, footage, preview=preview)
     if reason is None and len(renders) < FEWEST:
         reason = f"the simulation ended early: too few frames, {len(renders)} where {FEWEST} are needed"
     if reason is not None or footage is None:
         return Noted({"none": reason})
-    first = footage.start
+    frames = footage.clip.frames[footage.start :]
     card = as_filmed(
-        footage.clip.frames[first:], footage.labels.fluid[first:], scene.interval, renders, coverage,
-        runs=not kind_of(scene.kind).is_standing_water,
+        frames, footage.labels.fluid[footage.start :], scene.interval, renders, coverage,
+        runs=not kind_of(scene.kind).is_standing_water, seen=own_pixels(frames) if footage.steadied else None,
     )  # fmt: skip
     warning = card.warning()
     return Noted(card.to_dict(), (warning,) if warning else ())

@@ -5,7 +5,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from fluidlift.shape.evidence import gather_evidence
-from fluidlift.shape.open_water import holes, large_pieces, log_wander, with_open_water
+from fluidlift.shape.open_water import holes, is_part_of_all, large_pieces, log_wander, with_open_water
 from fluidlift.types.clip import VideoClip
 from fluidlift.types.flow import PixelFlow
 
@@ -120,3 +120,42 @@ def test_a_piece_that_no_water_leads_to_is_not_added():
 def test_a_bay_at_the_picture_s_edge_is_no_hole():
     region = LIVELY & ~STONE & ~((ROWS > 110) & (COLUMNS > 140))
     assert np.array_equal(holes(region), STONE)
+
+
+CLIFF = (ROWS < 30) & (COLUMNS < 45)
+FOAM = (ROWS + 0.6 * COLUMNS < 110) & ~CLIFF
+"""runs out of three sides of the picture: the bright part of water that is everywhere but at the cliff"""
+
+
+@pytest.fixture(scope="module")
+def from_above():
+    """Evidence of water that is looked straight down on, as lively everywhere, and a still cliff."""
+    rng = np.random.default_rng(5)
+    waves, cliff = smooth(rng, 2.0), np.array([90.0, 85.0, 75.0]) + 12.0 * smooth(rng, 1.5)
+    frames = np.empty((FRAMES, HEIGHT, WIDTH, 3))
+    for t in range(FRAMES):
+        water = np.where(FOAM[..., None], [190.0, 195.0, 200.0], [40.0, 80.0, 95.0])
+        frames[t] = np.where(CLIFF[..., None], cliff, water + 12.0 * np.roll(waves, t, axis=1))
+    frames += rng.normal(size=frames.shape)
+    video = VideoClip(np.clip(frames, 0, 255).round().astype(np.uint8), np.arange(FRAMES) / 25.0)
+    flow = np.zeros((FRAMES - 1, HEIGHT, WIDTH, 2), np.float32)
+    return gather_evidence(video, PixelFlow(flow, np.ones(flow.shape[:3], np.float32)))
+
+
+def test_water_from_above_of_which_its_foam_was_found_is_found_whole(from_above):
+    found = with_open_water(from_above, FOAM, CLIFF & (ROWS < 20) & (COLUMNS < 35))
+    inner = (ROWS > 36) | (COLUMNS > 51)
+    assert found[inner].mean() > 0.95
+    assert found[(ROWS < 22) & (COLUMNS < 37)].mean() < 0.1
+
+
+def test_what_does_not_run_out_of_the_picture_keeps_its_mask(from_above):
+    tray = FOAM & (ROWS > 34) & (COLUMNS > 4)
+    assert not is_part_of_all(tray, log_wander(from_above))
+    assert is_part_of_all(FOAM, log_wander(from_above))
+
+
+def test_what_has_still_surroundings_is_not_all(seen):
+    wander = log_wander(seen(drift=0))
+    assert not is_part_of_all(LIVELY, wander)
+    assert not is_part_of_all(~FOAM, np.full(FOAM.shape, np.log(0.9 + 0.2))), "all moves as a camera does"

@@ -8,7 +8,7 @@ slightest tremble of the camera or of the codec changes the brightness.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -18,6 +18,7 @@ from fluidlift.shape.frame_pictures import (
     FramePictures,
     burst_length,
     sampled_frames,
+    shown,
     shrink,
     working_scale,
 )
@@ -87,6 +88,15 @@ class Evidence:
     def typical(self) -> np.ndarray:
         """float32 [h,w,3], median of at most 31 of the pictures, not to be written into."""
         return self.source.typical
+
+    @property
+    def colours(self) -> np.ndarray:
+        """u8 [h,w,3], sRGB, of the same."""
+        return shown(self.typical)
+
+    def without_carried(self) -> Evidence:
+        """The same, where nothing is held to be carried through the picture."""
+        return replace(self, carried=np.zeros_like(self.carried))
 
 
 def distance_of_pictures(first: np.ndarray, second: np.ndarray) -> np.ndarray:

@@ -15,10 +15,18 @@ SHORTEST_BURST, LONGEST_BURST = 16, 50
 """frames"""
 
 
+OPPONENT = np.array([[0.299, 0.587, 0.114], [0.5, 0.0, -0.5], [-0.25, 0.5, -0.25]], np.float32)
+"""brightness and two colour differences of red, green and blue"""
+
+
 def opponent(frames: np.ndarray) -> np.ndarray:
     """Brightness and two colour differences, float32 [...,3] of u8 [...,3] sRGB; linear, so noise stays noise."""
-    matrix = np.array([[0.299, 0.587, 0.114], [0.5, 0.0, -0.5], [-0.25, 0.5, -0.25]], np.float32)
-    return cv2.transform(frames.astype(np.float32), matrix)
+    return cv2.transform(frames.astype(np.float32), OPPONENT)
+
+
+def shown(picture: np.ndarray) -> np.ndarray:
+    """u8 [h,w,3], sRGB, of opponent colours, float32 [h,w,3]."""
+    return np.clip(np.rint(cv2.transform(picture, np.linalg.inv(OPPONENT))), 0.0, 255.0).astype(np.uint8)
 
 
 def working_scale(height: int, width: int, *, longest: int = 384) -> float:

@@ -14,7 +14,7 @@ from fluidlift.shape import chute, passing, prism, slope
 from fluidlift.shape.frame_pictures import typical_picture
 from fluidlift.shape.open_water import recession
 from fluidlift.shape.spreading import CLEAR_PX, FALLS, spreading
-from fluidlift.shape.view import PictureEvidence, habit_prior, open_horizon
+from fluidlift.shape.view import PictureEvidence, habit_prior, horizon_evidence, open_horizon
 from fluidlift.shape.view.habit import ROLL
 from fluidlift.types import FluidKind, KindEvidence, PinholeCamera, RigidTransform, UpEvidence, kind_of
 from fluidlift.types.flow import TRUSTED
@@ -226,11 +226,11 @@ def _open_water(frames, fluid, displacement, confidence, bulk) -> dict[str, floa
     trust = np.where(fluid.mean(axis=0) > 0.25, confidence, 0.0)
     known = bulk[1][np.isfinite(bulk[1]).all(axis=1)]
     ground = known.mean(axis=0) if len(known) else np.zeros(2)
+    horizon = open_horizon(typical_picture(frames).astype(np.uint8), ever)
     return {
         "returning": passing.returning(displacement, trust, ground),
         "bay": passing.bay(fluid.mean(axis=0) > 0.5) * passing.undirected(displacement, trust, ground),
-        "horizon": open_horizon(typical_picture(frames).astype(np.uint8), ever)
-        * (1.0 - passing.across(displacement, trust, ground)),
+        "horizon": 0.0 if horizon is None else horizon.share * (1.0 - passing.across(displacement, trust, ground)),
     }
 
 
@@ -369,6 +369,8 @@ def _tilt_of_plane(
     pattern is, where it is not in a vessel.
     """
     tilted = _tilted(camera)
+    if picture.horizon is not None:
+        return _without_motion(kind, tilted, replace(picture, waterline=None), None), picture.words
     if not kind.runs_nearly_level:
         if picture.contained:
             picture = replace(picture, texture=None)
@@ -413,6 +415,8 @@ def _without_motion(kind, tilted, picture, lean) -> slope.TiltEvidence:
         known = rolls[::2]  # and between them
         seen = np.array([[picture.tilt(tilted(float(p), float(r))) for r in known] for p in pitches])
         log += np.array([np.interp(rolls, known, row) for row in seen])
+    if picture.horizon is not None:
+        log += horizon_evidence(tilted(0.0, 0.0), picture.horizon, pitches, rolls)
     return slope.tilt_posterior(pitches, rolls, log, kind.usual_pitch)
 
 

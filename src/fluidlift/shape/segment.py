@@ -27,9 +27,11 @@ from fluidlift.shape.hints import VOICE, Clicks, Point, clicks_at, heed, holes_a
 from fluidlift.shape.islands import without_ground
 from fluidlift.shape.mirrored_edges import mirrored_edges
 from fluidlift.shape.moving_solids import SharedPairs, moving_solids
+from fluidlift.shape.open_sea import reaching_over, sea_horizon, with_sea
 from fluidlift.shape.open_water import with_open_water
 from fluidlift.shape.presence import Presence, always, grows, stay, watch
 from fluidlift.shape.region import clean_region, cut_along_edges, solids_in, still_pixels
+from fluidlift.shape.view import OpenHorizon
 from fluidlift.shape.washed import WashedGround, bare_over_time, washed_ground
 from fluidlift.shape.waterline import dry_over_time
 from fluidlift.shape.waving import without_plants
@@ -106,6 +108,8 @@ class Clues:
     """float32 [h,w], log odds of fluid from elsewhere"""
     mirrored: float = 0.0
     """share of the picture that only mirrors the rest of it, at its edges"""
+    horizon: OpenHorizon | None = None
+    """px at working size, on which open water ends"""
 
     @cached_property
     def score(self) -> np.ndarray:
@@ -116,15 +120,25 @@ class Clues:
             found = np.clip(found + self.said / OF_SCORE, -12.0, 12.0)  # the score is as many times too loud
         return np.where(possible, found, -12.0).astype(np.float32)
 
+    @property
+    def told(self) -> np.ndarray:
+        """float32 [h,w], the score, but not against quiet water that the horizon told: it would be too far to move."""
+        if self.horizon is None:
+            return self.score
+        return np.where(self.bed.region, np.maximum(self.score, np.float32(DOUBTFUL)), self.score)
+
     @cached_property
     def presence(self) -> Presence:
-        """When it is there."""
-        return watch(self.evidence, self.score > 0.0)
+        """When it is there. The sea always is, though its quiet parts move now and then only."""
+        found = watch(self.evidence, self.score > 0.0)
+        return found if self.horizon is None else always(found)
 
     @cached_property
     def grown(self) -> np.ndarray | None:
         """bool [h,w], the fluid grown from its streams, where change does not tell it; else None."""
-        return None if trustworthy(self.score) else grown_from_streams(self.evidence, self.inside)
+        if self.horizon is not None or trustworthy(self.score):
+            return None
+        return grown_from_streams(self.evidence, self.inside)
 
     @cached_property
     def bed(self) -> Bed:
@@ -135,6 +149,10 @@ class Clues:
             return Bed(region, np.zeros_like(region))
         first = lasting_region(evidence, score, self.inside)
         region = without_plants(evidence, score, first, self.interval)
+        if self.horizon is not None:
+            # nothing passes on a sea: what goes nowhere, or looks the same between two waves, is no rock for that
+            found = with_sea(evidence, region, self.solids | ~self.inside, self.horizon)
+            return Bed(found, np.zeros_like(found))
         washed = washed_ground(evidence, region)
         region, rocks = without_ground(evidence, region)
         taken = first & ~region  # plants and washed ground wander, too, and were told from water already
@@ -158,7 +176,10 @@ def clues_of(
     if said is not None:
         said = cv2.resize(said, evidence.noise.shape[::-1], interpolation=cv2.INTER_LINEAR)
     solids = moving_solids(clip, pairs, evidence.noise.shape)
-    return Clues(evidence, solids, inside, clip.interval, said, float(mirrored.mean()))
+    horizon = sea_horizon(evidence)
+    if horizon is not None:
+        evidence, solids = evidence.without_carried(), reaching_over(solids, horizon)
+    return Clues(evidence, solids, inside, clip.interval, said, float(mirrored.mean()), horizon)
 
 
 def segment(
@@ -211,7 +232,7 @@ def segment(
                             "give a --mask")  # fmt: skip
     tell(0.3, "presence")
     presence, grown = known.presence, known.grown
-    if grown is None and grows(presence, score > 2.0):
+    if grown is None and known.horizon is None and grows(presence, score > 2.0):
         told = heed(clicks, evidence, score, score > 0.0)[1] if clicks else np.zeros_like(score)
         # a jet that sways with its jug changes as its flow says too: where all clues together speak for fluid, it is
         barred = (solids | (solids_by_flow(evidence) & (score <= 0.0))) & (told <= 0.0)
@@ -221,7 +242,8 @@ def segment(
     tell(0.5, "labels")
     writer = LabelWriter((frames, height, width), out)
     share = write_labels(found, writer, small_inside, tell)
-    return PixelLabels(writer.labels, writer.confidence, warnings=doubts(share, score) + mirror_notice(known.mirrored))
+    told = doubts(share, known.told) + mirror_notice(known.mirrored)
+    return PixelLabels(writer.labels, writer.confidence, warnings=told)
 
 
 def staying_labels(known: Clues, clicks: Clicks) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -244,7 +266,7 @@ def staying_labels(known: Clues, clicks: Clicks) -> Iterator[tuple[np.ndarray, n
     if grown is not None:  # change says nothing in such a clip: neither when the fluid came nor what is a rock
         presence, still = always(presence), np.zeros_like(still)
     still = still | asked | rocks
-    found = lasting_labels(score, region, still, presence)
+    found = lasting_labels(known.told, region, still, presence)
     if grown is None:
         outline, solid = solids_in(region, still)
         dry = dry_over_time(evidence, outline, solid, presence.picked)

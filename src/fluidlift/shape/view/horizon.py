@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 
+from fluidlift.shape.view.open_horizon import OpenHorizon
 from fluidlift.types import PinholeCamera
 
 LONGEST = 256
@@ -37,6 +38,10 @@ SKYLINE = 6.0
 """degrees, mean height of the lowest part of a skyline above the horizon (exponential): woods at a bend, hills"""
 AMISS = 1.5
 """degrees, how far an outline may be on the wrong side of the horizon: errors of the outline and of the lens"""
+ON_LINE = 0.7
+"""degrees, errors of pitch and roll by the line on which open water ends: a row of 256 px is 0.2, half a step of the
+leans it is looked for at 0.25, distortion of a phone's lens a few px of the picture; from the deck of a ship and from a
+cliff of 50 m the sea's horizon lies 0.1 to 0.2 below the level (dip, 0.03 degrees times the root of the metres)"""
 MISTAKEN = 0.06
 """probability that what was taken for sky or for level water is none (1 of 9 skies of 34 clips: tiles of a kitchen)"""
 
@@ -104,6 +109,24 @@ def tilt_of_horizon(
     up = np.cross(rays[1], rays[0])  # y is down: from right to left the normal points up
     up = up / np.linalg.norm(up)
     return float(np.degrees(np.arcsin(np.clip(-up[2], -1.0, 1.0)))), float(np.degrees(np.arctan2(up[0], -up[1])))
+
+
+def horizon_evidence(
+    camera: PinholeCamera, horizon: OpenHorizon, pitches: Float[np.ndarray, " p"], rolls: Float[np.ndarray, " r"]
+) -> Float[np.ndarray, "p r"]:
+    """Log likelihood of pitches and rolls (degrees) given the line on which open water ends.
+
+    Args:
+        camera: for its lens; its pose is not used.
+        horizon: of the picture.
+        pitches: degrees below the horizon.
+        rolls: degrees clockwise.
+    """
+    pitch, roll = tilt_of_horizon(camera, horizon.ends)
+    off = np.square(pitches - pitch)[:, None] + np.square(rolls - roll)
+    log = -0.5 * off / ON_LINE**2 - np.log(2.0 * np.pi * ON_LINE**2)
+    right = horizon.share * (1.0 - MISTAKEN)
+    return np.logaddexp(np.log(right) + log, np.log1p(-right) - 2.0 * np.log(90.0))
 
 
 def horizon_line(camera: PinholeCamera) -> tuple[tuple[float, float], tuple[float, float]]:

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, UInt8
 from fluidlift.shape.texture_gradient import TexturePatches
 from fluidlift.shape.view.habit import Scene, habit_prior, runs_out
 from fluidlift.shape.view.horizon import MISTAKEN, Skyline, farthest_elevation, skyline, skyline_evidence, upper_outline
+from fluidlift.shape.view.open_horizon import OpenHorizon, open_horizon
 from fluidlift.shape.view.plumb import PlumbLines, plumb_evidence, plumb_lines
 from fluidlift.shape.view.rims import find_rims
 from fluidlift.shape.view.roundness import (
@@ -61,6 +62,8 @@ class PictureEvidence:
     """the fluid is a round pool, or in a vessel: it stirs in one place, and its motion and far edge are no stream's"""
     plane: MeasuredPlane | None = None
     """of the water"""
+    horizon: OpenHorizon | None = None
+    """on which standing water ends"""
 
     def tilt(self, camera: PinholeCamera) -> float:
         """Log likelihood of a camera (level frame, z up) given sky, plumb lines and what is round."""
@@ -92,16 +95,18 @@ class PictureEvidence:
     @property
     def speaks(self) -> bool:
         """Whether `tilt` says anything."""
-        found = (self.sky, self.lines, self.pool, self.plane)
+        found = (self.sky, self.lines, self.pool, self.plane, self.horizon)
         return any(f is not None for f in found) or bool(self.rims)
 
     @property
     def words(self) -> list[str]:
         """Names of what speaks for the tilt, for the report."""
         named = {
-            "path of the camera": self.plane, "sky": self.sky, "plumb lines": self.lines,
+            "horizon of open water": self.horizon, "path of the camera": self.plane, "sky": self.sky,
+            "plumb lines": self.lines,
             "roundness of the pool": self.pool,
-            "rims of vessels": self.rims or None, "upper end of the water": self.waterline,
+            "rims of vessels": self.rims or None,
+            "upper end of the water": self.waterline if self.horizon is None else None,
         }  # fmt: skip
         return [name for name, found in named.items() if found is not None]
 
@@ -131,4 +136,8 @@ def look_at(
     contained = stays or pool is not None or any(rim.share_inside(fluid) > IN_VESSEL for rim in rims)
     scene = Scene(runs_out(fluid) if lies else None, sky is not None, pool is not None or bool(rims))
     waterline = upper_outline(fluid) if lies and not contained else None
-    return PictureEvidence(sky, plumb_lines(picture, ~ever), pool, rims, waterline, texture, scene, contained)
+    # what runs on may fall over a brink, which looks the same
+    horizon = open_horizon(picture, ever) if kind.is_standing_water and not contained else None
+    return PictureEvidence(
+        sky, plumb_lines(picture, ~ever), pool, rims, waterline, texture, scene, contained, horizon=horizon
+    )

@@ -6,6 +6,8 @@ Modules of the face:
                         behind them
     appearance          What of a fluid's look stays in place and what moves with it
     camera_path         Where a film is seen from: one camera for every frame
+    clear_water         Water that one sees through: where its bent rays meet the bed, the bed's own colours, and
+                        what the water absorbs
     display             Tone mapping: from linear light to what a display shows
     environment         The light around a scene: a picture of all directions, and what surfaces of any roughness
                         see of it
@@ -70,6 +72,7 @@ Modules of the face:
 __all__ = [
     "apparent_shift", "appearance",
     "camera_path",
+    "clear_water",
     "display",
     "environment",
     "environment_lookup",

@@ -154,7 +154,7 @@ def _write_asset(runner: Runner, lift: Lift, config: JobConfig, provenance: dict
         cell_types=g.setting.cell_types,
         velocity=lift.motion.velocities[0],
         parameters=lift.fit.parameters,
-        estimates=lift.fit.estimates,
+        estimates=lift.fit.estimates | ({} if g.bed is None else g.bed.estimates),
         camera=g.camera,
         world_from_canonical=g.world_from_canonical,
         interval=clip.interval,

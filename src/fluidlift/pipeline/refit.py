@@ -95,7 +95,8 @@ def refit(
         found = runner.run("fit", fit, read, segmentation, geometry, moved, config.fit, *also)
         runner.warnings[:] = [w for w in from_plain(manifest) if w not in _last_warnings(manifest)]
         runner.warnings += found.warnings
-        write_parameters(folder, found.parameters, found.estimates)
+        seen = {} if geometry.bed is None else geometry.bed.estimates
+        write_parameters(folder, found.parameters, found.estimates | seen)
         _write_report(runner, found, (read, segmentation, geometry, moved), config, manifest)
         origin = manifest.get("provenance", {})
         stored = origin.get("config")

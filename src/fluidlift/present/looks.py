@@ -13,12 +13,13 @@ import numpy as np
 
 from fluidlift.errors import InputRejected
 from fluidlift.io.scene_look import Look
+from fluidlift.look.clear_water import absorption_in
 from fluidlift.look.display import displayed
 from fluidlift.look.environment import BUILT_IN, LUMINANCE, Environment, built_in
 from fluidlift.look.fluid_normals import OUTSIDE, fluid_depths, fluid_normals, fluid_surface
 from fluidlift.look.ground_picture import Ground, place_of
 from fluidlift.look.liquid import Behind, LiquidSurface, shaded
-from fluidlift.look.materials import Material, material_named
+from fluidlift.look.materials import WATER, Material, material_named
 from fluidlift.look.outlet_section import OpenEnd
 from fluidlift.look.rasterize import render
 from fluidlift.look.relight import relit
@@ -106,6 +107,20 @@ def environment_of(folder: Path, name: str) -> Environment:
     return Environment(read_environment_image(path))
 
 
+def _as_filmed(material: Material, folder: Path) -> Material:
+    """Water that absorbs what the clip's own does, where the bed that is seen through it tells that."""
+    from fluidlift.io.asset_folder import FILES, read_parameters
+    from fluidlift.io.asset_paths import asset_file
+
+    if material is not WATER:
+        return material
+    try:
+        found = absorption_in(read_parameters(asset_file(folder, FILES["parameters"]))[1])
+    except InputRejected:  # no asset lies there
+        return material
+    return material if found is None else replace(material, absorption=found)
+
+
 class Painter:
     """Draws the frames of one asset in one look. What stays from frame to frame is kept: the ground's shadows, and for
     a camera that stands still the ground's picture.
@@ -146,7 +161,7 @@ class Painter:
                 f"the engine {engine} with the look {look.style}", "the look surface", "add --look surface"
             )
         self.look, self.terrain, self.engine = look, terrain, engine
-        self.material: Material = material_named(look.material).tinted(look.tint)
+        self.material: Material = _as_filmed(material_named(look.material), folder).tinted(look.tint)
         self.environment = environment_of(folder, look.environment)
         self._quality, self._bed = quality or Quality(), terrain if kind_of(kind).lies_on_ground else None
         self._slab, self._waves = slab or Slab(), waves

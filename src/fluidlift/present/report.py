@@ -12,9 +12,10 @@ import numpy as np
 from fluidlift.fit.outcome import TIES, how_sure, in_words
 from fluidlift.io.asset_paths import asset_file
 from fluidlift.io.frames import FIRST_FRAME
+from fluidlift.look.clear_water import CHANNELS, NAME, absorption_in
 from fluidlift.look.report import Figure, Section, report_html
 from fluidlift.present.as_filmed import card_of
-from fluidlift.types import CellType
+from fluidlift.types import CellType, kind_of
 from fluidlift.types.stages import Fit, Geometry, Lift, Read, Refined, Shown, Simulation
 
 FILM_MAX = 12_000_000
@@ -240,9 +241,24 @@ def _surface_rows(geometry: Geometry) -> list[list[str]]:
         level = f"level with a probability of {slope.level_share:.2f}"
         steep = f"{slope.slope:.1f} ± {slope.standard_error:.1f} degrees, {level} ({slope.source})"
         rows.append(["slope of the surface", steep])
+    if kind_of(geometry.kind).is_channel_flow:
+        rows.append(["bed under the water", _bed_in_words(geometry)])
     if geometry.jets:
         rows.append(["jets above it", str(len(geometry.jets))])
     return rows
+
+
+def _bed_in_words(geometry: Geometry) -> str:
+    """How much of the bed is seen, and what its water absorbs."""
+    bed = geometry.bed
+    if bed is None:
+        return "not seen through the water: its texture goes on from the banks"
+    known = [bed.estimates[f"{NAME}_{c}"] for c in CHANNELS]
+    said = f"seen through {100 * bed.share:.0f} % of it, as it is painted on the ground"
+    if absorption_in(bed.estimates) is None:
+        return f"{said}; what the water absorbs cannot be told from it (pure water's is taken)"
+    parts = [f"{e.value:.2f} ({e.interval[0]:.2f} to {e.interval[1]:.2f})" for e in known if e.interval is not None]
+    return f"{said}; the water absorbs, for the depth that was built, per m of red, green and blue {', '.join(parts)}"
 
 
 def _section_motion(lift: Lift) -> Section:

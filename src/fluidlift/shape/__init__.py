@@ -45,6 +45,8 @@ Modules of the face:
     registration      Registration and scale, from the canonical frame of a single view to metres: the free scale,
                       heading, origin
     rest_frames       Which frames of a clip become the body at rest
+    seen_bed          Whether the bed is seen through the water, where, and what it looks like: the still layer of a
+                      moving picture
     segment           Which pixels of a clip are fluid, without learned weights
     slope             How steep a stream or a film runs, and how the camera is tilted over it, from the perspective
                       of its motion
@@ -91,6 +93,7 @@ __all__ = [
     "refine",
     "registration",
     "rest_frames",
+    "seen_bed",
     "segment",
     "slope",
     "standing",

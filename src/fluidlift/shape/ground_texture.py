@@ -40,6 +40,9 @@ PER_PIXEL = 8
 RIM = 0.05
 """of the map's longer side: as far from the water, dry ground says what its bed is made of"""
 
+RIM_LEAST = 50
+"""texels whose colours tell what is usual"""
+
 ODD = 3.0
 """standard deviations (robust) from the rim's middle colour: that is grass, or water that the mask has missed"""
 
@@ -91,7 +94,9 @@ class View:
     labels: UInt8[np.ndarray, "h w"]
     """what each pixel shows"""
     seen: Bool[np.ndarray, "h w"]
-    """pixels of the plate that some frame shows without fluid"""
+    """pixels of the plate that some frame shows without fluid, or its bed through it"""
+    bed: Bool[np.ndarray, "h w"] | None = None
+    """pixels of the latter sort: that is the bed, whatever its colour; None: there are none"""
 
 
 @dataclass(frozen=True)
@@ -110,6 +115,8 @@ class _Map:
     """bool [h,w]: ground that stands behind water"""
     level: np.ndarray
     """float32 [h,w]: 1 where the ground itself lies, 0 where it stands: there a map has few texels"""
+    bed: np.ndarray
+    """bool [h,w]: bed that is seen through the water"""
 
 
 def textured(
@@ -235,7 +242,8 @@ def _map(top: np.ndarray, level: np.ndarray, view: View, texel: float) -> _Map:
     known &= wall | rock | seen  # a pixel that always shows fluid shows neither bed nor bank
     slopes = np.gradient(z_ground, texel)
     level_there = _lying(1.0 / np.sqrt(1.0 + slopes[0] ** 2 + slopes[1] ** 2))
-    return _Map(image.astype(np.float32), known, rock, drowned, wall, level_there)
+    bed = np.zeros_like(known) if view.bed is None else view.bed[row, col].reshape(height, width) & known & drowned
+    return _Map(image.astype(np.float32), known, rock, drowned, wall, level_there, bed)
 
 
 def sky_pixels(plate: UInt8[np.ndarray, "h w 3"], camera: PinholeCamera) -> Bool[np.ndarray, "h w"]:
@@ -351,9 +359,11 @@ def _of_the_bed(found: _Map, dry: np.ndarray) -> np.ndarray:
     """bool [h,w]: bed, and dry ground close to it, in colours that are usual there."""
     if not found.drowned.any():
         return found.drowned
+    if found.bed.sum() >= RIM_LEAST:  # what is seen of it tells more than its rim
+        return found.bed
     near = ndimage.distance_transform_edt(~found.drowned) < RIM * max(dry.shape)
     rim = found.known & dry & near
-    if rim.sum() < 50:
+    if rim.sum() < RIM_LEAST:
         return found.drowned
     colour = _mean(found.image, found.known, GRAIN * max(dry.shape))
     middle = np.median(colour[rim], axis=0)

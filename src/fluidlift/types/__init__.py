@@ -26,7 +26,7 @@ from fluidlift.types.asset import FORMAT_VERSION, FluidAsset
 from fluidlift.types.camera import PinholeCamera, ViewKey
 from fluidlift.types.camera_path import CameraPath, MeasuredView
 from fluidlift.types.clip import Label, PixelLabels, VideoClip
-from fluidlift.types.evidence import KindEvidence, MetricScale, SlopeEvidence, UpEvidence
+from fluidlift.types.evidence import BedEvidence, KindEvidence, MetricScale, SlopeEvidence, UpEvidence
 from fluidlift.types.filmed import Filmed, FilmedMotion
 from fluidlift.types.flow import PixelFlow, SaidFlow, SurfaceMotion
 from fluidlift.types.gaussians import SH_C0, Gaussians, concatenate, decompose_covariances, sh_from_rgb
@@ -42,6 +42,7 @@ __all__ = [
     "FORMAT_VERSION",
     "KINDS",
     "SH_C0",
+    "BedEvidence",
     "CameraPath",
     "CellType",
     "Estimate",

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Bool
 
 from fluidlift.messages import NONE, Notice
+from fluidlift.types.parameters import Estimate
 
 UNSURE = 12.0
 """degrees, error of the pitch from which the user is asked: a quarter of what lies between level and straight down, by
@@ -92,6 +96,18 @@ class SlopeEvidence:
         take `standard_error`. A slope of 5 between a level one and one of 10 is not known to a degree."""
         falling = self.standard_error**2 + (self.likeliest - self.slope) ** 2
         return float((self.level_share * self.slope**2 + (1.0 - self.level_share) * falling) ** 0.5)
+
+
+@dataclass(frozen=True)
+class BedEvidence:
+    """Where a stream's bed is seen through its water, and what that tells of the water."""
+
+    seen: Bool[np.ndarray, "h w"]
+    """pixels that show it"""
+    share: float
+    """of the fluid's pixels, 0 to 1"""
+    estimates: dict[str, Estimate] = field(default_factory=dict)
+    """the share, and what the water absorbs per channel, 1/m"""
 
 
 @dataclass(frozen=True)

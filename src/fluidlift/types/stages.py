@@ -17,7 +17,7 @@ from fluidlift.messages import Notice
 from fluidlift.types.camera import PinholeCamera
 from fluidlift.types.camera_path import MeasuredView
 from fluidlift.types.clip import PixelLabels, VideoClip
-from fluidlift.types.evidence import KindEvidence, MetricScale, SlopeEvidence, UpEvidence
+from fluidlift.types.evidence import BedEvidence, KindEvidence, MetricScale, SlopeEvidence, UpEvidence
 from fluidlift.types.filmed import FilmedMotion
 from fluidlift.types.flow import PixelFlow, SaidFlow
 from fluidlift.types.gaussians import Gaussians
@@ -192,6 +192,8 @@ class Geometry:
     slope: SlopeEvidence | None = None
     said_flow: SaidFlow | None = None
     """what a person says of the direction of the flow; `mean_flow` holds it"""
+    bed: BedEvidence | None = None
+    """of a stream's bed; None: it is not seen through the water"""
     warnings: tuple[Notice, ...] = ()
 
     def __post_init__(self) -> None:

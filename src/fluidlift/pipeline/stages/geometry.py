@@ -8,6 +8,7 @@ import numpy as np
 
 from fluidlift.errors import InputRejected
 from fluidlift.look.smoke_film import behind_smoke
+from fluidlift.pipeline.bed_seen import BedPicture, bed_of
 from fluidlift.pipeline.settings import GeometrySettings, GivenView
 from fluidlift.pipeline.sight import Sight, Sighted, mainstream_of, sighted
 from fluidlift.pipeline.work import Work
@@ -89,7 +90,8 @@ def geometry(
             f"as a {kind}, the fluid fills no cell of the grid beside those of its inlet", "a larger or thicker body",
             "check the mask and --kind, or raise --set shape.cells=...",
         )  # fmt: skip
-    setting, picture = _coloured(setting, clip, fluid, seen, falling.pixels, camera)
+    bed = bed_of(clip, fluid, seen, setting, camera, depth)
+    setting, picture = _coloured(setting, clip, fluid, seen, falling.pixels, camera, bed)
     return Geometry(
         kind=kind.name,
         kind_source=s.kind_source,
@@ -116,6 +118,7 @@ def geometry(
         jets=tuple(falling.plain(to_world)),
         slope=front.slope,
         said_flow=seen.said_flow,
+        bed=None if bed is None else bed.evidence,
         warnings=tuple(s.warnings),
     )
 
@@ -126,9 +129,18 @@ def _said(flow: SaidFlow, visible: np.ndarray) -> np.ndarray:
 
 
 def _coloured(
-    setting: Setting, clip: VideoClip, fluid: FluidMasks, seen: Sight, falls: np.ndarray, camera: PinholeCamera
+    setting: Setting,
+    clip: VideoClip,
+    fluid: FluidMasks,
+    seen: Sight,
+    falls: np.ndarray,
+    camera: PinholeCamera,
+    bed: BedPicture | None = None,
 ) -> tuple[Setting, np.ndarray]:
-    """The setting with its ground as the clip shows it, and the picture without the fluid, u8 [h,w,3]."""
+    """The setting with its ground as the clip shows it, and the picture without the fluid, u8 [h,w,3].
+
+    bed: what is seen of it through the water.
+    """
     # the plate looks at a few frames only
     solid = ground.solid_share(fluid.labels) > 0.5
     solid = solid if fluid.hidden is None else solid & ~fluid.hidden
@@ -141,7 +153,11 @@ def _coloured(
         picture = behind_smoke(clip.frames[pick], masks, picture)
     if on_ground:
         labels = ground.seen_labels(fluid, seen.start, seen.united, falls)
-        view = ground_texture.View(picture, camera, labels, np.asarray(plate.seen))
+        shown, known = picture, np.asarray(plate.seen)
+        if bed is not None:  # under water it is seen; what the plate shows there is inpainted
+            shown, known = np.where((bed.known & ~known)[..., None], bed.picture, picture), known | bed.known
+        under = None if bed is None else bed.known & ~np.asarray(plate.seen)
+        view = ground_texture.View(shown, camera, labels, known, under)
         setting = ground.textured(setting, view)
         picture = ground_texture.over_bed(picture, plate.kept, setting.terrain.mesh, camera)
     setting = ground.finished(setting, picture, camera)

@@ -37,6 +37,7 @@ Modules of the face:
     preflight             What would fail during a simulation, said before it begins, with the numbers
     pressure              Pressure projection to a divergence-free face velocity, with cut cells (paper: `eq::v`,
                           first term; `divProj`)
+    refill                Cells that are kept from running dry, since fluid is known to be in them at all times
     reseed                Particle reseeding by splitting and merging: inner cells get neither empty of particles
                           nor stuffed with them
     rigid                 Rigid bodies in the liquid: their state, and what a substep of the simulator asks of them
@@ -92,6 +93,7 @@ __all__ = [
     "position_correction",
     "preflight",
     "pressure",
+    "refill",
     "reseed",
     "rigid",
     "rigid_body",

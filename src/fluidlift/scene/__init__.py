@@ -7,6 +7,8 @@ Modules of the face:
     edit_history        The history of an asset's scene.yaml: every edit as the lines it took away and put in,
                         undone or not
     edits               Edits of an asset: one model behind scene.yaml, the command line, Python and the viewer
+    filmed_cells        Cells in which the clip shows no fluid at any time, and those in which it shows some at all
+                        times
     footage             The clip that an asset comes from, where it is still at hand
     force_weight        How far a scene keeps the force that holds the filmed flow: where a person changed it, the
                         flow finds its own way
@@ -58,7 +60,7 @@ def __getattr__(name: str) -> _Any:
 
 __all__ = [
     "Add", "Change", "EditSession", "Remove", "Scene", "Set", "SimulationRequest", "build", "coarse_copy",
-    "dry_cells", "edit_history", "edited_scene", "edits", "footage", "force_weight", "forecast", "open_water", "recall",
-    "reshaping", "scene_of", "settings", "simulated_history", "simulation", "simulator", "simulator_of",
+    "edit_history", "edited_scene", "edits", "filmed_cells", "footage", "force_weight", "forecast", "open_water",
+    "recall", "reshaping", "scene_of", "settings", "simulated_history", "simulation", "simulator", "simulator_of",
     "smoke_appearance", "splat_files", "surface_appearance", "waves", "whitewater",
 ]  # fmt: skip

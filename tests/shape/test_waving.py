@@ -14,7 +14,7 @@ FRAMES, HEIGHT, WIDTH, INTERVAL = 30, 120, 192, 0.08
 ROWS, COLUMNS = np.mgrid[0:HEIGHT, 0:WIDTH]
 FERN = (ROWS >= 65) & (ROWS < 90) & (COLUMNS > 50) & (COLUMNS < 110)
 BED = (ROWS >= 30) & (ROWS < 90) & ~FERN
-BROWN, BLUE = (112.0, 120.0, 92.0), (60.0, 90.0, 130.0)
+BROWN, BLUE = (62.0, 70.0, 42.0), (60.0, 90.0, 130.0)
 
 
 def smooth(rng, sigma):

@@ -18,10 +18,8 @@ BROAD = 0.03
 """standard deviation of the blur that separates the shade of a place from its fine look, shares of the picture's longer
 side; as `look.appearance`"""
 
-SHOWN = 0.5
-"""share of the film in which a place is fluid, from which its look counts: rarer, it mostly shows the bank, spray or
-noise. With 0.1 a torrent's current was off by 0.50 (cosine 0.79), with 0.5 by 0.43 (0.90); a cascade 0.55 and 0.46, a
-waterfall 0.37 and 0.40, a fountain 0.24 and 0.28 (0.22 after the clip, both)"""
+SHOWN = 0.1
+"""share of the film in which a place is fluid, from which its look counts: rarer, it is spray, or ground with noise"""
 
 RIM = 2
 """px inside its outline in which a pixel may show half of the bank: lens, coding and mask are no sharper than that. It

@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from fluidlift.config import build_config
+from fluidlift.messages import code_of
 from fluidlift.numerics.signed_distance import distance_of_heights
 from fluidlift.physics.refill import Refill
+from fluidlift.pipeline.settings import SimulateSettings, taken
+from fluidlift.pipeline.stages import simulate
 from fluidlift.scene.filmed_cells import MARGIN, dry_cells, wet_cells
 from fluidlift.scene.simulator import simulator_of, within_outlet
 from fluidlift.types import CellType, FaceVelocity, Grid, Particles, PinholeCamera, Terrain, TriangleMesh
@@ -143,6 +147,27 @@ def test_cells_that_the_clip_shows_wet_do_not_run_dry(channel):
     again = simulator_of(channel(3))
     again.restore(kept.state())
     assert again.refilled == kept.refilled > 0
+
+
+@pytest.mark.parametrize("kind", ["stream", "pour"])
+def test_much_water_that_is_put_in_is_told_of_all_kinds(channel, tmp_path, monkeypatch, kind):
+    middle = np.zeros(channel(3).terrain.grid.shape, bool)
+    middle[3:8] = True
+
+    def leaking_simulator(scene, device):
+        simulator = simulator_of(scene, device)
+        simulator.drains = middle
+        return simulator
+
+    monkeypatch.setattr(simulate, "simulator_of", leaking_simulator)
+    config = taken(SimulateSettings, build_config().simulate)
+    told = {}
+    for wet in (None, middle):
+        scene = channel(3, kind=kind, wet=wet)
+        found = simulate.simulate(scene, config, folder=tmp_path / f"{kind}{wet is None}")
+        told[wet is None] = {code_of(w) for w in found.warnings}
+    assert "refilled" in told[False] and "refilled" not in told[True]
+    assert ("strayed" in told[True]) == (kind == "stream")
 
 
 def test_what_fills_a_dry_cell_moves_as_filmed_and_keeps_clear_of_ground():

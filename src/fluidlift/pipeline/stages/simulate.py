@@ -22,7 +22,7 @@ from fluidlift.types.stages import Simulation
 
 STRAYED = 0.25
 """of the fluid per second, from which that which leaves the filmed places is a warning: with as much the surface sinks
-within a few seconds where no inlet makes up for it"""
+within a few seconds where no inlet makes up for it; and that which is put in where it ran dry, likewise"""
 
 
 def simulate(
@@ -88,10 +88,10 @@ def simulate(
         warnings += close_loop(scene, history, folder)
     arrays = history.arrays()
     warnings += _simulation_warnings(scene.kind, history.volume, history.leak)
+    there = max(simulator.volume * scene.interval * (len(history) - 1), 1e-12)
     if kind_of(scene.kind).lies_on_ground:  # what is poured, and spreads no further, runs off in any case
-        seconds = scene.interval * (len(history) - 1)
-        warnings += _strayed(simulator.drained, simulator.volume, seconds)
-        warnings += _refilled(simulator.refilled, simulator.volume, seconds)
+        warnings += _strayed(simulator.drained / there)
+    warnings += _refilled(simulator.refilled / there)
     return Simulation(
         volume=arrays["volume"],
         leak=arrays["leak"],
@@ -121,9 +121,8 @@ def _simulation_warnings(kind: str, volumes: Sequence[float], leaks: Sequence[fl
     return warnings
 
 
-def _strayed(drained: float, volume: float, seconds: float) -> list[Notice]:
-    """What to say of the water (m^3) that got into dry cells, of which `volume` is left."""
-    share = drained / max(volume * seconds, 1e-12)
+def _strayed(share: float) -> list[Notice]:
+    """What to say of the water that got into dry cells: 1/s, of what is left."""
     if share <= STRAYED:
         return []
     return [Notice("strayed", f"in each second {100 * share:.0f} % of the fluid got where the clip shows none, and was "
@@ -131,9 +130,8 @@ def _strayed(drained: float, volume: float, seconds: float) -> list[Notice]:
                    "--pitch")]  # fmt: skip
 
 
-def _refilled(refilled: float, volume: float, seconds: float) -> list[Notice]:
-    """What to say of the water (m^3) that was put into cells that had run dry, of which `volume` is there."""
-    share = refilled / max(volume * seconds, 1e-12)
+def _refilled(share: float) -> list[Notice]:
+    """What to say of the water that was put into cells that had run dry: 1/s, of what is there at the end."""
     if share <= STRAYED:
         return []
     return [Notice("refilled", f"in each second {100 * share:.0f} % of the fluid was put in where the clip shows some "

@@ -35,6 +35,16 @@ def test_the_surface_is_where_the_highest_particles_are(slope):
     assert off.min() > -0.1 * STEP and off.max() < 1.1 * STEP
 
 
+@pytest.mark.parametrize("slope", [0.0, 0.3])
+def test_its_slope_is_that_of_the_water(slope):
+    points = pool(lambda x, y: 0.5 + slope * (x - y))
+    surface = SurfaceMap.of(points, np.zeros_like(points), CELL)
+    found = surface.slope(middle(surface))
+    # heights are known to a layer of particles: over three columns, to a third of a layer per column
+    np.testing.assert_allclose(np.median(found, axis=0), [slope, -slope], atol=0.03)
+    assert np.abs(found - [slope, -slope]).max() < 0.2
+
+
 def test_a_drop_in_the_air_and_a_jet_do_not_lift_the_surface():
     points = pool()
     still = SurfaceMap.of(points, np.zeros_like(points), CELL)

@@ -144,13 +144,14 @@ def test_a_coarser_copy_gets_a_coarser_force(tmp_path, made):
     grid = load_asset(made.folder).grid
     dry = np.zeros(grid.shape, bool)
     dry[:4, :3] = True
-    write_filmed(tmp_path, Filmed(uniform(grid, (1.0, 2.0, 3.0)), dry, dry[::-1]))
+    write_filmed(tmp_path, Filmed(uniform(grid, (1.0, 2.0, 3.0)), dry, 0.4, dry[::-1]))
     (tmp_path / "empty").mkdir()
     scene = scene_of(asset, tmp_path / "empty", SimulationRequest(meshes=tmp_path), JobConfig(), footage=None, start=0)
     assert scene.force.shape == asset.grid.shape
     np.testing.assert_allclose(scene.force.w[1:-1, 1:-1, 1:-1], 3.0)
     assert scene.dry.shape == asset.grid.shape and scene.dry[:2, 0].all() and not scene.dry[2:].any()
     assert not scene.dry[:, 1:].any(), "a wide cell is dry where all of it is"
+    assert scene.dry_for == 0.4
     assert scene.wet.any() and not (scene.wet & scene.dry).any(), "cells that stay wet are kept beside them"
 
 

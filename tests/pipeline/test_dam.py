@@ -5,6 +5,7 @@ import pytest
 
 from fluidlift.cli import DONE, REJECTED, WITH_WARNINGS, main
 from fluidlift.io.asset_folder import load_asset, read_manifest
+from fluidlift.io.force_file import read_filmed
 from fluidlift.look.surface_skin import without_skin
 from fluidlift.pipeline import card_of
 from fluidlift.scene.splat_files import frame_files, read_frame
@@ -69,6 +70,10 @@ def test_it_falls_and_spreads_and_keeps_its_body(folder):
     asset = load_asset(folder)
     assert asset.grid.contains(last).mean() > 0.999
     assert all(finding.passed for finding in validate_asset(folder))
+
+
+def test_what_collapses_keeps_all_its_fluid_wherever_its_film_shows_none(folder):
+    assert read_filmed(folder).dry is None
 
 
 def test_a_fit_of_its_parameters_is_refused_and_says_why(folder, case, capsys):

@@ -17,6 +17,7 @@ from fluidlift.pipeline.preview import preview_scene
 from fluidlift.scene.build import SimulationRequest, film_of, first_of_film, scene_of
 from fluidlift.scene.simulator import simulator_of
 from fluidlift.scene.surface_appearance import DROP, FINE, SurfaceAppearance
+from fluidlift.types import PinholeCamera
 
 FRAMES = 4
 CONSEQUENCE = "its surface looks as it did at rest"
@@ -90,6 +91,28 @@ def test_drops_before_a_sheet_are_as_sharp_as_the_film_while_nobody_edits_it(cha
         depth = 2.4 - moved[top, 2]
     assert largest[0] == pytest.approx(WIDTH * FINE * depth / 96.0, rel=0.02)
     assert largest[1] == pytest.approx(DROP * 0.1, rel=0.02) and largest[1] > largest[0]
+
+
+def test_the_skin_is_finer_where_the_surface_is_steep_in_the_picture(channel, tmp_path):
+    """Tracers lie on a map from above: on a chute that is seen from its foot, neighbours are far apart."""
+    size = (128, 96)
+    path = film(tmp_path / "film.mp4", size=size)
+    foot = PinholeCamera.looking(np.array([-1.0, 0.4, 0.8]), np.array([0.6, 0.4, 0.5]), 50.0, size)
+
+    def level(camera, slope):
+        scene = channel(1, film=path, camera=camera)
+        appearance, particles = SurfaceAppearance(scene), simulator_of(scene).particles
+        places = particles.positions.copy()
+        places[:, 2] += np.clip(slope * (places[:, 0] - 0.4), 0.0, 0.6)
+        appearance.advance(replace(particles, positions=places), 0)
+        state = appearance.state()
+        x = state["skin.places"][:, 0]
+        return np.median(state["skin.levels"][(x > 0.5) & (x < 0.6)])
+
+    # from its foot 2.2 times as far apart; from above it is only nearer to the camera, by a sixth
+    assert level(foot, 2.0) - level(foot, 0.0) == 2
+    above = channel(1).camera.resized(size)
+    assert level(above, 2.0) - level(above, 0.0) <= 1
 
 
 def test_patches_that_stay_at_home_are_few(channel, tmp_path):

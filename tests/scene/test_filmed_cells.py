@@ -12,9 +12,20 @@ from fluidlift.numerics.signed_distance import distance_of_heights
 from fluidlift.physics.refill import Refill
 from fluidlift.pipeline.settings import SimulateSettings, taken
 from fluidlift.pipeline.stages import simulate
-from fluidlift.scene.filmed_cells import MARGIN, dry_cells, wet_cells
+from fluidlift.scene.filmed_cells import MARGIN, dry_cells, filmed_shares, wet_cells
 from fluidlift.scene.simulator import simulator_of, within_outlet
-from fluidlift.types import CellType, FaceVelocity, Grid, Particles, PinholeCamera, Terrain, TriangleMesh
+from fluidlift.types import (
+    CellType,
+    FaceVelocity,
+    Grid,
+    Label,
+    Particles,
+    PinholeCamera,
+    Terrain,
+    TriangleMesh,
+    kind_of,
+)
+from fluidlift.types.fluid_masks import FluidMasks
 
 GRID = Grid((20, 16, 12), 0.1, (-1.0, -0.8, 0.0))
 EYE = np.array([0.0, 0.0, 5.0])
@@ -101,6 +112,33 @@ def test_fluid_that_gets_into_dry_cells_is_taken_out_and_counted(channel):
     again = simulator_of(replace(scene, dry=dry))
     again.restore(kept.state())
     assert again.drained == kept.drained
+
+
+def test_an_outline_that_grows_is_known_to_the_end_of_its_clip_and_one_that_stays_for_good():
+    labels = np.full((20, 30, 30), Label.BACKGROUND, np.uint8)
+    for t, frame in enumerate(labels):
+        frame[25 - t : 25, 10:20] = Label.FLUID
+    grows, stays = FluidMasks(labels), FluidMasks(labels[-1:].repeat(4, axis=0))
+    for kind, masks, dry_for in (("pour", grows, 0.8), ("pour", stays, np.inf), ("stream", grows, np.inf)):
+        shares, known = filmed_shares(kind_of(kind), masks, 0.8)
+        assert known == dry_for
+        np.testing.assert_array_equal(shares, masks.shares())
+    assert filmed_shares(kind_of("dam"), grows, 0.8)[0] is None, "it would lose fluid that nothing brings back"
+
+
+def test_of_an_outline_that_grows_cells_stay_dry_as_long_as_its_clip(channel):
+    scene = channel(6)
+    grid, dry = scene.terrain.grid, np.zeros(scene.terrain.grid.shape, bool)
+    dry[grid.shape[0] // 2 :] = True
+    simulator = simulator_of(replace(scene, dry=dry, dry_for=2.5 * scene.interval))
+    for k in range(1, 6):
+        simulator.advance(scene.interval)
+        if k == 2:
+            within, drained = (dry & held(simulator)).any(), simulator.drained
+    assert not within and drained > 0, "while the clip lasts"
+    assert (dry & held(simulator)).any() and simulator.drained == drained, "afterwards nobody has seen what is there"
+    for_good = replace(scene, dry=dry)
+    assert for_good.parts["dry cells"] != replace(for_good, dry_for=1.0).parts["dry cells"]
 
 
 def test_cells_of_the_body_that_are_fluid_in_nearly_all_frames_are_wet():

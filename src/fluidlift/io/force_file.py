@@ -26,6 +26,8 @@ def write_filmed(folder: Path, filmed: Filmed) -> None:
         arrays = {n: c.astype(np.float32) for n, c in zip("uvw", filmed.force.components)}
         known = {"dry": filmed.dry, "wet": filmed.wet}
         arrays |= {name: np.packbits(cells) for name, cells in known.items() if cells is not None}
+        if np.isfinite(filmed.dry_for):
+            arrays["dry_for"] = np.float64(filmed.dry_for)
     _write(asset_file(folder, FILES["force"]), arrays)
     motion: dict[str, Any] = {}
     if filmed.motion is not None:
@@ -59,7 +61,7 @@ def read_filmed(folder: Path, *, motion: bool = False) -> Filmed:
         with _named(path, "a force on the faces of a grid"):
             force = FaceVelocity(*(np.asarray(found[n], np.float32) for n in "uvw"))
             dry, wet = (_unpacked(found[n], n, force.shape) if n in found else None for n in ("dry", "wet"))
-            kept = Filmed(force, dry, wet)
+            kept = Filmed(force, dry, float(found.get("dry_for", np.inf)), wet)
     if not motion or not moving.is_file():
         return kept
     found = read_arrays(moving, ("u", "v", "w", "interval", "start"))

@@ -24,6 +24,9 @@ the picture is the camera itself"""
 SKIN = 1.5
 """cells below the surface whose motion is that of the surface"""
 
+SMOOTH = 1.5
+"""standard deviation of the blur before a slope is taken, columns"""
+
 MARGIN = 4
 """empty columns around the liquid"""
 
@@ -85,6 +88,11 @@ class SurfaceMap:
     def presence(self, places: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
         """How much of the surroundings of places (m) is liquid: 1/2 on a straight shore."""
         return self.at(ndimage.gaussian_filter(self.wet.astype(np.float64), 0.7), places)
+
+    def slope(self, places: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+        """Gradient of the height at places (m), of what is wider than a cell."""
+        smooth = ndimage.gaussian_filter(self.height, SMOOTH)
+        return self.at(np.stack([*np.gradient(smooth, self.pitch)], axis=-1), places)
 
     def columns(self) -> Float[np.ndarray, "m 2"]:
         """Middles (x, y in m) of the wet columns."""

@@ -213,9 +213,7 @@ class SurfaceSkin:
     def splats(self, surface: SurfaceMap, colors: Float[np.ndarray, "n 3"]) -> Gaussians:
         """Flat splats that lie on the surface now, in sRGB colours (of each tracer) from any side."""
         n = len(self)
-        smooth = ndimage.gaussian_filter(surface.height, 1.5)
-        slope = np.stack([*np.gradient(smooth, surface.pitch)], axis=-1)
-        normal = np.concatenate([-surface.at(slope, self.places), np.ones((n, 1))], axis=1)
+        normal = np.concatenate([-surface.slope(self.places), np.ones((n, 1))], axis=1)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         # x along the steepest way, then the shortest turn from z to the normal
         half = 0.5 * np.arctan2(-normal[:, 1], -normal[:, 0])

@@ -130,6 +130,8 @@ class ParticleSimulator(ABC):
         """rigid bodies; nothing comes out of inlets and emitters where one is"""
         self.drains: np.ndarray | None = None
         """bool [nx,ny,nz]: cells whose particles are taken out at the end of every `advance`; None: none are"""
+        self.drains_until = np.inf
+        """s, after which none are"""
         self.drained = 0.0
         """m^3 that were taken out there"""
         self.refill: Refill | None = None
@@ -252,7 +254,7 @@ class ParticleSimulator(ABC):
             pressure.append(outcome.pressure)
             viscosity.extend(outcome.viscosity)
         self.time = end
-        removed += self._drain()
+        removed += self._drain() if self.time <= self.drains_until else 0
         emitted += self._fill_inlet()  # what the last substep carried away leaves no gap in the frame
         emitted += self._fill_dry()
         return StepReport(

@@ -27,13 +27,14 @@ from fluidlift.pipeline.stages.fit import fit
 from fluidlift.pipeline.stages.motion import motion
 from fluidlift.pipeline.stages.refine import refine
 from fluidlift.scene.build import SimulationRequest, edited_scene, first_of_film
+from fluidlift.scene.filmed_cells import filmed_shares
 from fluidlift.scene.settings import SceneSettings
 from fluidlift.scene.simulator import particle_work
 from fluidlift.scene.splat_files import require_room
 from fluidlift.seams import Progress, Silence
 from fluidlift.shape.occluders import Behind
 from fluidlift.types import Filmed, FluidAsset, kind_of
-from fluidlift.types.fluid_masks import STAYS, FluidMasks, share_that_stays
+from fluidlift.types.fluid_masks import FluidMasks
 from fluidlift.types.hints import NOTHING_SAID, ClipHints
 from fluidlift.types.stages import Bodies, Calibration, Fit, Lift, Read, Segmentation
 
@@ -162,7 +163,9 @@ def _write_asset(runner: Runner, lift: Lift, config: JobConfig, provenance: dict
         provenance=provenance | origin,
     )
     calibration = _calibrated(runner, lift, asset, config)
-    write_filmed(folder, Filmed(calibration.force, calibration.dry, calibration.wet, lift.motion.filmed))
+    write_filmed(
+        folder, Filmed(calibration.force, calibration.dry, calibration.dry_for, calibration.wet, lift.motion.filmed)
+    )
     save_asset(
         folder,
         asset,
@@ -181,10 +184,11 @@ def _calibrated(runner: Runner, lift: Lift, asset: FluidAsset, config: JobConfig
     also = [] if lift.elsewhere is None else [v for stretch in lift.elsewhere.velocities for v in stretch]
     target = mean_target(asset, [*lift.motion.velocities, *also])
     masks, s = FluidMasks(lift.labels.labels, lift.geometry.hidden), config.simulate
-    # what fills a vessel, or collapses, goes where it was not filmed
-    known = kind_of(asset.kind).lies_on_ground or share_that_stays(masks) > STAYS
-    shares = masks.shares() if known else None
-    return runner.run("calibrate", calibrate, scene, target, shares, wanted=s.follow > 0, beside={"device": s.device})
+    left = (len(masks) - lift.geometry.rest_frame) * asset.interval
+    shares, dry_for = filmed_shares(kind_of(asset.kind), masks, left)
+    return runner.run(
+        "calibrate", calibrate, scene, target, shares, dry_for, wanted=s.follow > 0, beside={"device": s.device}
+    )
 
 
 def _write_film(lift: Lift, folder: Path) -> None:

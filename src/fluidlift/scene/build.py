@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -124,6 +125,8 @@ class Scene:
     """m/s^2 on the faces of the terrain's grid, beside gravity"""
     dry: np.ndarray | None = None
     """bool [nx,ny,nz]: cells that the clip shows dry throughout, from which fluid is taken out"""
+    dry_for: float = math.inf
+    """s for which it is"""
     wet: np.ndarray | None = None
     """bool [nx,ny,nz]: cells that the clip shows wet throughout, which are filled where they run dry"""
     guide: FilmedMotion | None = None
@@ -177,7 +180,7 @@ class Scene:
         if self.guide is not None:
             found["guide"] = _hash(*self.guide.components, self.guide.interval, self.guide.start, *self.guide_rates)
         if self.dry is not None:
-            found["dry cells"] = _hash(self.dry)
+            found["dry cells"] = _hash(self.dry, *[self.dry_for] * math.isfinite(self.dry_for))
         if self.wet is not None:
             found["wet cells"] = _hash(self.wet)
         if self.whitewater > 0:

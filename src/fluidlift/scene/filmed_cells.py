@@ -11,14 +11,16 @@ Where fluid is seen in nearly every frame, none may go missing: what runs dry th
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from fluidlift.errors import require
 from fluidlift.numerics.sampling import sample_nodes
-from fluidlift.types import CellType, Grid, PinholeCamera, Terrain
-from fluidlift.types.fluid_masks import STAYS
+from fluidlift.types import CellType, FluidKind, Grid, PinholeCamera, Terrain
+from fluidlift.types.fluid_masks import STAYS, FluidMasks, share_that_stays
 
 MARGIN = 1.0
 """cells from the filmed fluid, as the camera sees them: a simulated rim lies somewhere in a cell"""
@@ -26,6 +28,26 @@ NEARER = 0.5
 """of the depth of the nearest fluid at rest: what comes nearer looks twice as large as anything that was filmed"""
 STEP = 0.5
 """cells between two looks for ground on the way to the camera"""
+
+
+def filmed_shares(
+    kind: FluidKind, masks: FluidMasks, left: float
+) -> tuple[Float[np.ndarray, "h w"] | None, float]:  # fmt: skip
+    """Share of a clip's frames in which each pixel is fluid, and for how long (s) what is dry in all of them stays so.
+
+    The outline of what lies on ground or falls steadily stays as it was filmed. One that grows, as that of a vessel
+    which fills, goes on to do so after its clip. Nothing (None) is said of what collapses: no inlet would make up for
+    fluid that was taken out.
+
+    Args:
+        kind: of the fluid.
+        masks: of the clip.
+        left: s of the clip from the body at rest on.
+    """
+    stays = kind.lies_on_ground or share_that_stays(masks) > STAYS
+    if kind.starts_at_rest and not stays:
+        return None, math.inf
+    return masks.shares(), math.inf if stays else left
 
 
 def dry_cells(

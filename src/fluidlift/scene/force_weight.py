@@ -78,7 +78,7 @@ def following(scene: Scene, asset: FluidAsset, filmed: Filmed, settings: SceneSe
         weight = settings.follow * untouched
         faded = FaceVelocity(*(_on_faces(weight, axis) * c for axis, c in enumerate(force.components)))
         dry, wet = (None if cells is None else cells & (untouched >= 1.0) for cells in (kept.dry, kept.wet))
-        scene = replace(scene, force=faded, dry=dry, wet=wet)
+        scene = replace(scene, force=faded, dry=dry, dry_for=kept.dry_for, wet=wet)
     if motion is None:
         return scene
     weight = settings.guide * pull_rate(scene, _typical_speed(motion)) * untouched
@@ -114,6 +114,7 @@ def _on_grid_of(asset: FluidAsset, filmed: Filmed) -> Filmed:
         filmed = Filmed(
             None if filmed.force is None else coarsen_velocity(filmed.force),
             None if filmed.dry is None else _coarser(filmed.dry),
+            filmed.dry_for,
             None if filmed.wet is None else _coarser(filmed.wet),
             None if filmed.motion is None else _coarser_motion(filmed.motion),
         )

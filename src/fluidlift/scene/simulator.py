@@ -87,7 +87,7 @@ def simulator_of(scene: Scene, device: str = "cpu", forces: Sequence[BodyForce] 
         seed=scene.seed, emit_source=look, bodies=scene.bodies, work=particle_work(device), supply=supply,
         open_sides=sides_open_to_air(parameters.gravity), forces=forces,
     )  # fmt: skip
-    simulator.drains = scene.dry
+    simulator.drains, simulator.drains_until = scene.dry, scene.dry_for
     if scene.wet is not None and scene.wet.any():
         simulator.refill = Refill(scene.wet, scene.velocity, body, scene.terrain, scene.camera)
     return simulator

@@ -288,16 +288,24 @@ class SurfaceAppearance:
         return found
 
     def _level_at(self, places: np.ndarray) -> np.ndarray:
-        """How fine the skin is at places of the map: as the film's pixels are there, 0 beside its picture."""
+        """How fine the skin is at places of the map: as the film's pixels are there, 0 beside its picture.
+
+        Where the surface is steep (a chute seen from its foot), neighbours on the map are far apart in the picture.
+        """
         from fluidlift.look.surface_skin import PITCH, level_for
 
         assert self._surface is not None
-        heights = self._surface.at(self._surface.height, places)
-        world = self._axes.world_points(np.concatenate([places, heights[:, None]], axis=1))
+        heights, slopes = self._surface.at(self._surface.height, places), self._surface.slope(places)
+        points = np.concatenate([places, heights[:, None]], axis=1)
+        world = self._axes.world_points(points)
         camera = self._camera
         uv, depth = camera.project(world)
         inside = (depth > 0) & ((uv >= 0) & (uv <= np.array(camera.size))).all(axis=1)
         apart = PITCH * self._cell * camera.focal[0] / np.maximum(depth, 1e-6)
+        steep = np.linalg.norm(slopes, axis=1, keepdims=True)
+        uphill = PITCH * self._cell * np.concatenate([slopes / np.maximum(steep, 1e-9), steep], axis=1)
+        beside = camera.project(self._axes.world_points(points + uphill))[0]
+        apart = np.maximum(apart, np.linalg.norm(beside - uv, axis=1))
         return np.where(inside, level_for(apart, FINE), 0)
 
     def _seen_texture(self, surface: SurfaceMap, footage: FluidFootage | None) -> SeenTexture:

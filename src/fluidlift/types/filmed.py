@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,6 +66,8 @@ class Filmed:
     """m/s^2 beside gravity, that keeps the filmed flow; None: none"""
     dry: Bool[np.ndarray, "nx ny nz"] | None = None
     """cells that the clip shows dry throughout; None: not known"""
+    dry_for: float = math.inf
+    """s from the body at rest for which they stay so: an outline that grows has them to the end of its clip"""
     wet: Bool[np.ndarray, "nx ny nz"] | None = None
     """cells that it shows wet throughout; None: not known"""
     motion: FilmedMotion | None = None

@@ -6,6 +6,7 @@ A stage is a function from such values to the next one. Between runs they lie in
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -388,6 +389,8 @@ class Calibration:
     warnings: tuple[Notice, ...] = ()
     dry: Bool[np.ndarray, "nx ny nz"] | None = None
     """cells that the clip shows dry throughout; None where that is not known"""
+    dry_for: float = math.inf
+    """s from the body at rest for which they stay so"""
     wet: Bool[np.ndarray, "nx ny nz"] | None = None
     """those that it shows wet throughout, likewise"""
 

@@ -7,6 +7,7 @@ force in each place (flux adjustment), and the asset keeps it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -63,6 +64,7 @@ def calibrate(
     scene: Scene,
     target: FaceVelocity,
     shares: Float[np.ndarray, "h w"] | None = None,
+    dry_for: float = math.inf,
     *,
     wanted: bool = True,
     device: str = "cpu",
@@ -75,6 +77,7 @@ def calibrate(
         target: m/s, on the faces of its grid.
         shares: of the clip's frames in which each pixel is fluid; None: nothing is known to stay dry, or wet. Of what
             does not lie on ground it is all that is taken: no run is made, and no force learnt.
+        dry_for: s from the body at rest for which what is known to stay dry does.
         wanted: False leaves all as it is.
         device: of the simulation.
         work: told how many frames are done.
@@ -94,7 +97,9 @@ def calibrate(
         dry = dry_cells(scene.terrain, scene.camera, shares > 0, scene.cell_types)
         wet = wet_cells(grid, scene.camera, shares, scene.body.positions) & ~dry
     if not kind.lies_on_ground:
-        return Calibration() if dry is None else Calibration(FaceVelocity.zeros(grid), dry=dry, wet=wet)
+        return (
+            Calibration() if dry is None else Calibration(FaceVelocity.zeros(grid), dry=dry, dry_for=dry_for, wet=wet)
+        )
     frames = min(scene.frames, LONGEST)
     speed = _typical(target, scene.cell_types)
     if speed <= 0:
@@ -103,7 +108,7 @@ def calibrate(
     rates = tuple(np.full(c.shape, rate, np.float32) for c in target.components)
     gain = GAIN if kind.nearly_level else 0.0
     pull = Nudging(target, rates, after=SETTLED * frames * scene.interval, gain=gain, learning=LEARNING / rate)
-    simulator = simulator_of(replace(scene, force=None, dry=dry, wet=wet), device, forces=(pull,))
+    simulator = simulator_of(replace(scene, force=None, dry=dry, dry_for=dry_for, wet=wet), device, forces=(pull,))
     for k in range(1, frames):
         if work is not None:
             work.step(k, frames)
@@ -123,7 +128,7 @@ def calibrate(
                 "--size that is known would help",
             )
         )
-    return Calibration(force, size, speed, left, frames, tuple(warnings), dry, wet)
+    return Calibration(force, size, speed, left, frames, tuple(warnings), dry, dry_for, wet)
 
 
 def _typical(field: FaceVelocity, cell_types: np.ndarray) -> float:

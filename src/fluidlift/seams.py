@@ -276,6 +276,8 @@ class MoveRules:
     """of the tangential velocity that survives the step at a wall"""
     max_stretch: float
     """largest singular value of the deformation"""
+    deform: bool = True
+    """False: the deformation is not asked for, and may stay as it is"""
 
 
 class ParticleMover(ABC):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fluidlift.numerics.cell_list import CellList, cells_kernel
-from fluidlift.numerics.nearest import nearest, nearest_of_crowd
+from fluidlift.numerics.nearest import FEW, nearest, nearest_of_crowd, nearest_of_few
 
 
 def crowd() -> np.ndarray:
@@ -41,3 +41,15 @@ def test_points_lie_in_the_order_of_their_cells_and_within_one_in_their_own():
     np.testing.assert_array_equal(found.order, np.argsort(cells, kind="stable"))
     np.testing.assert_array_equal(np.diff(found.starts), np.bincount(cells, minlength=int(found.shape.prod())))
     assert found.starts[0] == 0
+
+
+@pytest.mark.parametrize("points", [1, 5, 40, FEW + 1])
+@pytest.mark.parametrize("within", [0.2, np.inf])
+def test_few_points_are_found_as_by_the_tree(points, within):
+    rng = np.random.default_rng(points)
+    some, places = rng.uniform(0.0, 1.0, (points, 2)), rng.uniform(-0.2, 1.2, (300, 2))
+    count = min(4, points)
+    away, index = nearest_of_few(some, places, count, within=within)
+    wanted, which = nearest(some, places, np.arange(1, count + 1), within=within)
+    np.testing.assert_array_equal(index, which)
+    np.testing.assert_allclose(away, wanted, rtol=1e-12)  # rounding of a sum of two squares

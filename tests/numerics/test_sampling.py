@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from fluidlift.numerics.sampling import gradient_nodes, sample_centers, sample_faces, sample_nodes
+from fluidlift.numerics.sampling import (
+    gradient_nodes,
+    interpolate,
+    interpolate_plain,
+    sample_centers,
+    sample_faces,
+    sample_nodes,
+)
 from fluidlift.types import FaceVelocity, Grid
 
 GRID = Grid((5, 4, 6), 0.5, (1.0, -2.0, 0.3))
@@ -52,3 +59,24 @@ def test_the_nearest_sample_continues_outside():
     field = GRID.nodes() @ SLOPE
     far = np.array([[-100.0, -100.0, -100.0], [100.0, 100.0, 100.0]])
     assert sample_nodes(field, GRID, far) == pytest.approx([field[0, 0, 0], field[-1, -1, -1]])
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+@pytest.mark.parametrize("shape", [(5, 6, 7), (1, 4, 2), (5, 6, 7, 3), (3, 1, 1, 2, 2)])
+def test_the_compiled_loop_gives_the_bits_of_the_plain_one(kind, shape):
+    rng = np.random.default_rng(3)
+    field, first = rng.normal(size=shape).astype(kind), rng.normal(size=3)
+    # a third of the points lie outside
+    points = first + rng.uniform(-0.3, 1.0, (400, 3))
+    for places in (points, points.astype(np.float32)):
+        found, plain = interpolate(field, first, 0.13, places), interpolate_plain(field, first, 0.13, places)
+        assert found.dtype == plain.dtype
+        np.testing.assert_array_equal(found, plain)
+
+
+def test_half_precision_is_interpolated_in_single():
+    field = np.zeros((2, 2, 2), np.float16)
+    field[1] = 1.0
+    found = interpolate(field, np.zeros(3), 1.0, np.array([[0.25, 0.0, 0.0]]))
+    assert found.dtype == np.float32
+    assert found == pytest.approx([0.25])

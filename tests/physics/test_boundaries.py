@@ -5,6 +5,7 @@ import pytest
 
 from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.physics import boundaries
+from fluidlift.physics.emitter import PHASES
 from fluidlift.physics.forces import add_buoyancy, add_gravity
 from fluidlift.physics.inlet import Inlet, random_fluctuation
 from fluidlift.physics.outlet import hold_columns, outlet_heads, surface_heights, water_levels
@@ -162,6 +163,29 @@ def test_a_full_inlet_misses_nothing_and_an_empty_one_all():
     assert len(inlet.missing(new, rng)) == 0
     half_gone = new[new[:, 1] < 0.3]
     assert len(inlet.missing(half_gone, rng)) == len(new) - len(half_gone)
+
+
+@pytest.mark.parametrize("bulk", [(2.0, 0.0, 0.0), (-0.3, 0.1, -1.0)])
+def test_an_inlet_that_runs_askew_has_all_the_places_of_its_lattice(bulk):
+    regions = np.zeros(GRID.shape, np.uint8)
+    steps = np.arange(6)
+    regions[steps, steps, np.minimum(2 + steps, 6)] = CellType.INFLOW
+    inlet = Inlet(walls_of(regions=regions), FluidParameters(inflow_velocity=bulk), None, 0, 8)
+    for _ in range(5):
+        own = inlet.lattice
+        index = [np.arange(f, f + n) for f, n in zip(own.first, own.counts, strict=True)]
+        every = np.stack(np.meshgrid(*index, indexing="ij"), axis=-1).reshape(-1, 3)
+        beside = [a for a in range(3) if a != own.along]
+        places = own.start + own.spacing * every
+        places[:, own.along] += own.spacing * np.mod((every - own.turns)[:, beside] @ PHASES, 1.0)
+        cells = np.clip(GRID.cell_of(places), 0, np.array(GRID.shape) - 1)
+        there = GRID.contains(places) & (regions[tuple(cells.T)] == CellType.INFLOW)
+        there &= sample_nodes(walls_of().signed_distance, GRID, places) > own.clear
+        found = inlet.missing(np.zeros((0, 3), np.float32), np.random.default_rng(0))
+        # a tenth of the spacing to either side is jitter
+        assert len(found) == there.sum() > 0
+        np.testing.assert_allclose(found, places[there], atol=0.11 * own.spacing)
+        inlet.travel(0.013)
 
 
 def test_without_inflow_cells_the_inlet_is_idle():

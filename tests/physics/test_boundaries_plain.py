@@ -118,3 +118,24 @@ def test_velocity_slides_like_the_plain_model(grid, shape, seed):
         np.testing.assert_allclose(a, b, atol=3e-6)  # float32 sums of a dozen numbers up to 4
         changed += int((a != c).sum())
     assert changed > 20
+
+
+def test_particles_go_the_same_way_whether_or_not_they_are_drawn_out():
+    from fluidlift.physics.numba_particles import NumbaMover
+
+    walls = walls_of(GRIDS[0], "rough", 2)
+    old, incoming, velocities = flying(walls, 2)
+    n, labels = len(old), np.zeros(len(old), np.int64)
+    unit = np.broadcast_to(np.eye(3, dtype=np.float32), (n, 3, 3)).copy()
+    shear = np.zeros_like(unit)
+    shear[:, 0, 1] = 5.0
+    particles = Particles(old, incoming, shear, unit, np.ones(n, np.float32), labels, labels)
+    moves = (DT * velocities).astype(np.float32)
+    drawn, left = (
+        NumbaMover().moved(particles, moves, velocities, shear, walls, MoveRules(DT, 0.3, 0.9, 4.0, deform))
+        for deform in (True, False)
+    )
+    np.testing.assert_array_equal(drawn.positions, left.positions)
+    np.testing.assert_array_equal(drawn.velocities, left.velocities)
+    np.testing.assert_array_equal(left.deformation, unit)
+    assert np.abs(drawn.deformation - unit).max() > 0.01

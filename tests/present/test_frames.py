@@ -41,3 +41,17 @@ def test_the_motion_in_the_picture_is_drawn_with_it(channel):
         low, high = steps[:, axis].min(), steps[:, axis].max()
         assert low - 1e-3 <= motion[known][:, axis].min() and motion[known][:, axis].max() <= high + 1e-3
     assert np.abs(steps).max() > 0.1 and known.mean() > 0.01
+
+
+def test_splats_that_are_not_drawn_change_nothing(channel):
+    scene = channel(2)
+    renderer, rest = FrameRenderer(scene, None), scene.rest
+    half = np.arange(len(rest)) % 2 == 0
+    faint = replace(rest, opacities=np.where(half, rest.opacities, np.float32(0.002)))
+    velocity = np.tile([0.5, 0.0, 0.0], (len(rest), 1))
+    frames = SimulatedFrame(faint, velocity), SimulatedFrame(rest.select(half), velocity[half])
+    (all_of_them, motion), (some, other) = (renderer.measured(f, moving=True) for f in frames)
+    for name in ("image", "depth", "alpha"):
+        np.testing.assert_array_equal(getattr(all_of_them, name), getattr(some, name))
+    np.testing.assert_array_equal(motion, other)
+    assert some.alpha.max() > 0.5

@@ -192,8 +192,8 @@ def test_much_water_that_is_put_in_is_told_of_all_kinds(channel, tmp_path, monke
     middle = np.zeros(channel(3).terrain.grid.shape, bool)
     middle[3:8] = True
 
-    def leaking_simulator(scene, device):
-        simulator = simulator_of(scene, device)
+    def leaking_simulator(scene, device, **more):
+        simulator = simulator_of(scene, device, **more)
         simulator.drains = middle
         return simulator
 

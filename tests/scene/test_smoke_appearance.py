@@ -189,3 +189,16 @@ def test_no_particles_are_no_splats(channel):
     none = Particles.at_rest(np.zeros((0, 3)), 1.0)
     gaussians, ids, velocities = shown(smoke(channel), puff(), 2, none)
     assert len(gaussians) == len(ids) == len(velocities) == 0
+
+
+def test_it_is_round_however_far_its_particles_are_drawn_out(channel, tmp_path):
+    film = puff()
+    write_smoke(tmp_path / "film.mp4", zip(film.colors, film.opacities, strict=True), INTERVAL)
+    scene = smoke(channel, film=tmp_path / "film.mp4")
+    appearance, body = SurfaceAppearance(scene), scene.body
+    assert not appearance.draws_out and SurfaceAppearance(channel(2)).draws_out
+    long = replace(body, deformation=body.deformation * np.array([3.0, 0.5, 0.6], np.float32))
+    rest, stretched = (appearance.dressed(p, 3, None).gaussians for p in (body, long))
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        np.testing.assert_array_equal(getattr(rest, name), getattr(stretched, name))
+    assert np.ptp(stretched.scales, axis=1).max() == 0.0

@@ -27,6 +27,8 @@ Progress = Callable[[int, int], None]
 """called with (done, total)"""
 DIFFERENCE = 0.02
 """raw step of the forward differences: a few per cent, far above the 1e-5 that pressure solves leave"""
+UNSEEN = ("density",)
+"""parameters that no velocity shows: it scales the pressure of a single fluid and drops out of its motion"""
 CHUNK = 1 << 16
 """residuals that are widened to double precision at a time"""
 BACKWARD = 2.0
@@ -232,24 +234,26 @@ def jacobian(
     """By forward differences; None where the budget is spent. The columns of `reuse` are overwritten.
 
     A dozen global parameters against many thousand residuals: one rollout per parameter, started from the pressures
-    of the base rollout, costs less than one adjoint per residual or than carrying tangents.
+    of the base rollout, costs less than one adjoint per residual or than carrying tangents. What is `UNSEEN` needs
+    none: its derivatives are 0.
     """
     if budget.spent:
         return None
     # towards the prior, where the rollout is least likely to break down
     h = np.where(base.raw <= space.prior_raw, DIFFERENCE, -DIFFERENCE)
     columns = [np.empty((len(h), r.size), np.float32) for r in base.residuals] if reuse is None else reuse.columns
+    acting = [p for p, f in enumerate(space.fitted) if f.name not in UNSEEN]
 
     def one(p: int, w: int) -> None:
         there, _, _ = _rolled(problem, space, base.raw + np.where(np.arange(len(h)) == p, h, 0.0), w, base.guesses)
         columns[w][p] = (there.ravel() - base.residuals[w].ravel()) / h[p]
 
     n = len(problem.windows)
-    budget.each(problem, one, [p for p in range(len(h)) for _ in range(n)], list(range(n)) * len(h))
-    budget.count(problem, len(h))
+    budget.each(problem, one, [p for p in acting for _ in range(n)], list(range(n)) * len(acting))
+    budget.count(problem, len(acting))
     for p in range(len(h)):
         # where the rollout breaks down there is no derivative to be had: the variable stays
-        if not all(np.isfinite(c[p]).all() for c in columns):
+        if p not in acting or not all(np.isfinite(c[p]).all() for c in columns):
             for c in columns:
                 c[p] = 0
     return Jacobian(columns, *products(columns, base.residuals))

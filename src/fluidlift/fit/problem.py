@@ -79,6 +79,8 @@ class FitProblem:
     """standard deviation of the error of a component of a cell's target velocity, m/s"""
     placed: dict[int, TorchDomain] = field(default_factory=dict)
     """layouts on the device, by `id`; empty on "cpu" """
+    begun: dict[int, tuple[Tensor, Tensor]] = field(default_factory=dict)
+    """the start of a window and its divergence-free part, by number: what dozens of rollouts begin with"""
 
     @property
     def work(self) -> float:
@@ -94,7 +96,7 @@ class FitProblem:
     ) -> Run:
         """DiffSim^n of one window, cut at its marks; differentiable in the parameters and in `start`."""
         w = self.windows[index]
-        flat = self._divergence_free(w.start if start is None else start, w.domains[0])
+        flat = self._begun(index) if start is None else self._divergence_free(start, w.domains[0])
         velocities, potentials, reports, begin = [], [], [], 0
         for mark, cells in zip(w.marks, w.cells):
             part = slice(begin, mark)
@@ -116,6 +118,14 @@ class FitProblem:
             return rollout(flat, domains, parameters, **given)
         layouts = [self.placed[id(d)] for d in domains]
         return rollout_torch.rollout_on_device(flat, layouts, parameters, device=self.device, **given)
+
+    def _begun(self, index: int) -> Float[Tensor, " f"]:
+        """The divergence-free part of a window's own start: no parameter acts on it, so it is found once."""
+        start = self.windows[index].start
+        known = self.begun.get(index)
+        if known is None or known[0] is not start:  # problems with other windows share what is known
+            known = self.begun[index] = (start, self._divergence_free(start, self.windows[index].domains[0]))
+        return known[1]
 
     def _divergence_free(self, flat: Tensor, domain: RolloutDomain) -> Tensor:
         if not self.placed:

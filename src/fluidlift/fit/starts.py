@@ -13,7 +13,6 @@ raised to damp them.
 
 from __future__ import annotations
 
-import contextlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,16 +23,13 @@ from torch import Tensor
 from fluidlift.fit.evaluation import BACKWARD, Budget, Evaluation, Jacobian, products
 from fluidlift.fit.problem import FitProblem
 from fluidlift.fit.ranges import ParameterSpace
+from fluidlift.numerics.lbfgs import lowered
 
 PROBE = 0.02
 """largest change of a face, in units of U, that a directional derivative is measured with"""
 SETTLED = 1e-3
 """of the objective: where no more than that is left to gain, a start is found. A quadratic whose curvature is at least
 that of the departures is lowered by g^2 / (2 curvature) at most"""
-
-
-class _Settled(Exception):
-    """There is next to nothing left to gain."""
 
 
 def corrected_starts(
@@ -44,32 +40,31 @@ def corrected_starts(
     calls = [0] * len(problem.windows)
 
     def one(index: int) -> Tensor:
-        begin, unit = problem.windows[index].start.clone(), problem.speed
-        move = torch.zeros_like(begin, requires_grad=True)
+        begin, unit = problem.windows[index].start, problem.speed
+        count, known = begin.numel(), []
         # of the departure alone: what the loss adds makes the valley steeper, so that less is left to gain
-        curvature = 2.0 * begin.numel() * unit**2 * problem.start_weight(index)
+        curvature = 2.0 * count * unit**2 * problem.start_weight(index)
         inverse = torch.where(curvature > 0, 1.0 / curvature, 0.0)
-        optimizer = torch.optim.LBFGS(
-            [move], lr=1.0, max_iter=iterations, max_eval=2 * iterations, history_size=iterations,
-            line_search_fn="strong_wolfe", tolerance_grad=0.0, tolerance_change=0.0,
-        )  # fmt: skip
 
-        def closure() -> Tensor:
-            optimizer.zero_grad()
+        def objective(point: np.ndarray) -> tuple[float, np.ndarray]:
+            move = torch.from_numpy(point).requires_grad_()
             start = begin + unit * move
-            total = problem.loss(index, problem.roll(index, parameters, start=start)) + problem.departure(index, start)
+            run = problem.roll(index, parameters, known or None, start)
+            known[:] = run.potentials  # first guesses for the next one, which is near
+            total = problem.loss(index, run) + problem.departure(index, start)
             # single precision: the gradient of a mean over many faces would be tiny
-            total = total * begin.numel()
+            total = total * count
             total.backward()
             calls[index] += 1
             assert move.grad is not None
-            if 0.5 * float((move.grad**2 * inverse).sum()) < SETTLED * float(total.detach()):
-                raise _Settled
-            return total
+            return float(total.detach()), move.grad.numpy()
 
-        with contextlib.suppress(_Settled):  # `move` is where it was found then
-            optimizer.step(closure)
-        found = (begin + unit * move).detach()
+        def settled(value: float, gradient: np.ndarray) -> bool:
+            return 0.5 * float((torch.from_numpy(gradient) ** 2 * inverse).sum()) < SETTLED * value
+
+        still = np.zeros(count, np.float32)
+        move = lowered(objective, still, steps=iterations, evaluations=2 * iterations, settled=settled)
+        found = begin + unit * torch.from_numpy(move)
         return found if bool(torch.isfinite(found).all()) else begin
 
     starts = budget.each(problem, one, list(range(len(problem.windows))))
@@ -140,24 +135,33 @@ def _window_profile(
             return (problem.residual(index, there).reshape(-1) - at.detach()) / step
 
     def adjoint(rows: Tensor) -> Tensor:
-        return torch.autograd.grad(at, start, rows, retain_graph=True)[0]
+        # a scalar has its gradient without torch's symbolic shapes, which take half a second to load
+        (at * rows).sum().backward(retain_graph=True)
+        found, start.grad = start.grad, None
+        assert found is not None
+        return found
 
     out, moves = [], []
     for column in columns:
         target = torch.from_numpy(column)
         move, image = torch.zeros_like(weight), torch.zeros_like(at)
+        if not column.any():
+            out.append(torch.cat([target, move]).numpy())
+            moves.append(move.numpy())
+            continue
         rest = -adjoint(target)
         eased = rest / scale
         direction, power = eased.clone(), float((rest * eased).sum())
         first = power
-        for _ in range(iterations):
+        for turn in range(iterations):
             if power <= 1e-4 * first or power == 0:
                 break
             moved = forward(direction)
-            back = weight * direction + adjoint(moved)
-            alpha = power / float((direction * back).sum())
+            alpha = power / float((weight * direction**2).sum() + (moved**2).sum())
             move, image = move + alpha * direction, image + alpha * moved
-            rest = rest - alpha * back
+            if turn == iterations - 1:
+                break  # what is left is not asked for
+            rest = rest - alpha * (weight * direction + adjoint(moved))
             eased = rest / scale
             power, before = float((rest * eased).sum()), power
             direction = eased + power / before * direction

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
@@ -87,7 +88,12 @@ class SurfaceMap:
 
     def presence(self, places: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
         """How much of the surroundings of places (m) is liquid: 1/2 on a straight shore."""
-        return self.at(ndimage.gaussian_filter(self.wet.astype(np.float64), 0.7), places)
+        return self.at(self._share, places)
+
+    @cached_property
+    def _share(self) -> Float[np.ndarray, "nx ny"]:
+        """Of the surroundings of each column that is wet: asked for again and again in a frame."""
+        return ndimage.gaussian_filter(self.wet.astype(np.float64), 0.7)
 
     def slope(self, places: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
         """Gradient of the height at places (m), of what is wider than a cell."""

@@ -175,12 +175,22 @@ class SurfaceSkin:
         self.places = self.places + interval * surface.at(surface.velocity[..., :2], self.places)
         levels = self._levels(self.places)
         self._keep((surface.presence(self.places) > 0.5) & (levels == self.levels))
-        present = np.unique(self._levels(surface.columns())) if surface.wet.any() else np.zeros(0, np.int64)
-        for level in present:
-            self._fill(surface, int(level), rng)
+        if not surface.wet.any():
+            return
+        columns = self._levels(surface.middles().reshape(-1, 2)).reshape(surface.wet.shape)
+        # a place is as far from the camera as the four columns around it, or between them; on a ridge slopes cancel
+        # out between two columns, where a slope (blurred over three) is at most a level less than beside it
+        least, most = ndimage.minimum_filter(columns, 3) - 1, ndimage.maximum_filter(columns, 3)
+        for level in np.unique(columns[surface.wet]):
+            self._fill(surface, int(level), (least <= level) & (level <= most), rng)
 
-    def _fill(self, surface: SurfaceMap, level: int, rng: np.random.Generator) -> None:
-        """Tracers of a level go where they are crowded, and come where they are drawn apart."""
+    def _fill(
+        self, surface: SurfaceMap, level: int, about: Bool[np.ndarray, "nx ny"], rng: np.random.Generator
+    ) -> None:
+        """Tracers of a level go where they are crowded, and come where they are drawn apart.
+
+        `about` says in which columns of the map there can be places of that level.
+        """
         spacing, own = PITCH * self._cell * float(finer(level)), np.flatnonzero(self.levels == level)
         if len(own) > 1:
             keep = np.ones(len(self), bool)
@@ -192,6 +202,8 @@ class SurfaceSkin:
         # few are bare: only these are asked where they are
         bare = bare_points(self.places[own], low, spacing, (int(count[0]), int(count[1])), BARE * spacing)
         lattice = (low + np.argwhere(bare) + 0.5) * spacing
+        column = np.clip(np.floor((lattice - surface.low) / surface.pitch).astype(int), 0, np.array(about.shape) - 1)
+        lattice = lattice[about[column[:, 0], column[:, 1]]]
         lattice = lattice[surface.presence(lattice) > 0.5]
         lattice = lattice[self._levels(lattice) == level]
         fresh = lattice + rng.uniform(-0.25, 0.25, lattice.shape) * spacing

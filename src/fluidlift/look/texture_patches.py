@@ -21,7 +21,7 @@ from fluidlift.look.footage import FluidFootage
 from fluidlift.look.picture_texture import PictureTexture
 from fluidlift.look.seen_texture import SeenTexture
 from fluidlift.look.surface_map import SurfaceMap, sampled
-from fluidlift.numerics.nearest import nearest
+from fluidlift.numerics.nearest import nearest, nearest_of_few
 
 APART = 0.6
 """radii between patches: each place is covered by several"""
@@ -269,7 +269,7 @@ class TexturePatches:
         if n == 0 or len(s) == 0:
             return np.zeros((n, 3)), np.zeros(n, bool)
         places, most = np.asarray(points[:, :2], np.float64), min(OVERLAP, len(s))
-        away, patches = nearest(s.centers, places, np.arange(1, most + 1), within=self._radius)
+        away, patches = nearest_of_few(s.centers, places, most, within=self._radius)
         point, rank = np.nonzero(np.isfinite(away))
         patch, distance = patches[point, rank], away[point, rank]
         weight = ((1 - (distance / self._radius) ** 2) ** 2 * s.presences[patch]) ** SHARPNESS

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fluidlift.errors import require
+from fluidlift.numerics.sharing import shared
 from fluidlift.types import FaceVelocity, Grid
 
 
@@ -23,7 +24,11 @@ def _trilinear(
     return corners, local
 
 
-def _interpolate(field: np.ndarray, first: np.ndarray, spacing: float, points: np.ndarray) -> np.ndarray:
+def interpolate_plain(
+    field: Float[np.ndarray, "nx ny nz ..."], first: Float[np.ndarray, "3"], spacing: float,
+    points: Float[np.ndarray, "n 3"],
+) -> Float[np.ndarray, "n ..."]:  # fmt: skip
+    """Values [n,...] of a field at points (m), in array operations; its first sample is at `first` (m)."""
     corners, local = _trilinear(field, first, spacing, points)
     fx, fy, fz = (local[:, a].reshape(-1, *[1] * (field.ndim - 3)) for a in range(3))
     along_z = [corners[c] * (1 - fz) + corners[c + 1] * fz for c in (0, 2, 4, 6)]
@@ -32,16 +37,54 @@ def _interpolate(field: np.ndarray, first: np.ndarray, spacing: float, points: n
     return out.astype(np.result_type(field.dtype, np.float32))
 
 
+def interpolate(
+    field: Float[np.ndarray, "nx ny nz ..."], first: Float[np.ndarray, "3"], spacing: float,
+    points: Float[np.ndarray, "n 3"],
+) -> Float[np.ndarray, "n ..."]:  # fmt: skip
+    """The same bits as `interpolate_plain`, point by point."""
+    if field.dtype not in (np.float32, np.float64):
+        return interpolate_plain(field, first, spacing, points)
+    channels = np.ascontiguousarray(field).reshape(*field.shape[:3], -1)
+    out = np.empty((len(points), channels.shape[3]), field.dtype)
+    _interpolate_kernel(
+        np.ascontiguousarray(points, np.float64), channels, np.asarray(first, np.float64), float(spacing), out
+    )
+    return out.reshape(len(points), *field.shape[3:])
+
+
+@shared(lambda points, *_: (0, len(points)), least=500)
+def _interpolate_kernel(begin, end, points, field, first, spacing, out):
+    """All channels at once."""
+    base, top, local = np.empty(3, np.int64), np.empty(3, np.int64), np.empty(3)
+    for p in range(begin, end):
+        for axis in range(3):
+            limit = field.shape[axis] - 1
+            at = (points[p, axis] - first[axis]) / spacing
+            at = min(at, np.float64(limit)) if at > 0.0 else 0.0  # so is what is not a number
+            base[axis] = min(np.int64(at), max(limit - 1, 0))
+            local[axis] = at - base[axis]
+            top[axis] = min(base[axis] + 1, limit)
+        (i0, j0, k0), (i1, j1, k1) = base, top
+        x, y, z = local
+        for c in range(field.shape[3]):
+            near = field[i0, j0, k0, c] * (1 - z) + field[i0, j0, k1, c] * z
+            far = field[i0, j1, k0, c] * (1 - z) + field[i0, j1, k1, c] * z
+            low = near * (1 - y) + far * y
+            near = field[i1, j0, k0, c] * (1 - z) + field[i1, j0, k1, c] * z
+            far = field[i1, j1, k0, c] * (1 - z) + field[i1, j1, k1, c] * z
+            out[p, c] = low * (1 - x) + (near * (1 - y) + far * y) * x
+
+
 def sample_nodes(field: Float[np.ndarray, "nx+1 ny+1 nz+1 ..."], grid: Grid, points: Float[np.ndarray, "n 3"]):
     """Values [n,...] of a field at the cell corners, interpolated at points (m)."""
     require(field.shape[:3] == tuple(n + 1 for n in grid.shape), f"node field {field.shape}", "one more than the cells")
-    return _interpolate(field, grid.low, grid.spacing, points)
+    return interpolate(field, grid.low, grid.spacing, points)
 
 
 def sample_centers(field: Float[np.ndarray, "nx ny nz ..."], grid: Grid, points: Float[np.ndarray, "n 3"]):
     """Values [n,...] of a field at the cell centres, interpolated at points (m)."""
     require(field.shape[:3] == grid.shape, f"cell field {field.shape}", str(grid.shape))
-    return _interpolate(field, grid.low + 0.5 * grid.spacing, grid.spacing, points)
+    return interpolate(field, grid.low + 0.5 * grid.spacing, grid.spacing, points)
 
 
 def sample_faces(velocity: FaceVelocity, grid: Grid, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
@@ -51,7 +94,7 @@ def sample_faces(velocity: FaceVelocity, grid: Grid, points: Float[np.ndarray, "
     for axis, component in enumerate(velocity.components):
         offset = np.full(3, 0.5)
         offset[axis] = 0.0
-        out.append(_interpolate(component, grid.low + offset * grid.spacing, grid.spacing, points))
+        out.append(interpolate(component, grid.low + offset * grid.spacing, grid.spacing, points))
     return np.stack(out, axis=-1)
 
 

@@ -10,6 +10,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from fluidlift.numerics.sampling import sample_faces, sample_nodes
+from fluidlift.numerics.sharing import shared
 from fluidlift.physics.boundaries import CLEARANCE, Walls, touching_faces
 from fluidlift.physics.emitter import PHASES, Emission, Supply
 from fluidlift.types import CellType, FaceVelocity, FluidParameters, Grid, Terrain, triple
@@ -247,6 +248,8 @@ class Inlet:
             return
         index = np.argwhere(self._cells)
         self._low, self._high = index.min(axis=0), index.max(axis=0) + 1
+        self._beside = ndimage.binary_dilation(self._cells, np.ones((3, 3, 3), bool))
+        self._numbers = self._lattice_of_cells(index - self._low)
         centers = grid.low + (index + 0.5) * grid.spacing
         if profile is not None:
             mean = sample_faces(profile, grid, centers).mean(axis=0, dtype=np.float64)
@@ -364,23 +367,17 @@ class Inlet:
 
     def inside(self, positions: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
         """Particles in INFLOW cells."""
-        grid = self._walls.grid
-        out, near = np.zeros(len(positions), bool), self._around(positions, 0.0)
-        cells = np.clip(grid.cell_of(positions[near]), 0, np.asarray(grid.shape) - 1)
-        out[near] = self._cells[tuple(cells.T)]
-        return out
+        return self._within(positions, self._cells, 0)
 
-    def _around(self, positions: Float[np.ndarray, "n 3"], margin: float) -> Int[np.ndarray, " k"]:
-        """Numbers of the particles in the box of the INFLOW cells, and up to a margin (m) beside it.
+    def _within(self, positions: np.ndarray, cells: Bool[np.ndarray, "nx ny nz"], margin: int) -> np.ndarray:
+        """Which positions lie in some of the cells, all of which are at most a margin (cells) beside the INFLOW cells.
 
-        Most are out of it along its shortest side, so that is looked at first.
+        What is beyond the sides of the box belongs to its last cells.
         """
-        grid, found = self._walls.grid, np.arange(len(positions))
-        low, high = grid.low + self._low * grid.spacing - margin, grid.low + self._high * grid.spacing + margin
-        for axis in np.argsort(self._high - self._low, kind="stable"):
-            along = positions[found, axis] if len(found) < len(positions) else positions[:, axis]
-            found = found[(along >= low[axis]) & (along <= high[axis])]
-        return found
+        grid, out = self._walls.grid, np.empty(len(positions), bool)
+        low, high = (grid.low + end * grid.spacing for end in (self._low - margin, self._high + margin))
+        _within_kernel(np.ascontiguousarray(positions), (low, high), (grid.low, grid.spacing), cells, out)
+        return out
 
     def holds(self, positions: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
         """Whether a particle may be put there: in INFLOW cells, clear of walls."""
@@ -413,12 +410,25 @@ class Inlet:
         # every lattice point outside the solid: a wider berth would emit less than what flows through the opening
         return InletLattice(start, s, first, counts, along, turns, 0.8 * s, CLEARANCE * grid.spacing)
 
+    def _lattice_of_cells(self, index: Int[np.ndarray, "m 3"]) -> Int[np.ndarray, "n 3"]:
+        """Numbers, in their order, of the places that are in one of the cells (counted from the first one on) at some
+        time: the lattice fills the box of all INFLOW cells, and along a rim that runs askew few of its places matter.
+
+        Along its axis a place lies up to a spacing and a half beyond half a spacing below its number, beside it half a
+        spacing to either side.
+        """
+        own, per = self.lattice, self._per_side
+        wanted = np.zeros(own.counts, bool)
+        first = index * per - own.first
+        reach = [range(-1 if a == own.along else 0, per + 1) for a in range(3)]
+        for step in np.stack(np.meshgrid(*reach, indexing="ij"), axis=-1).reshape(-1, 3):
+            wanted[tuple((first + step).T)] = True
+        return np.argwhere(wanted) + own.first
+
     def _places(self) -> Float[np.ndarray, "n 3"]:
-        """Points of the lattice."""
-        own = self.lattice
+        """Points of the lattice that may lie in INFLOW cells."""
+        own, lattice = self.lattice, self._numbers
         beside = [a for a in range(3) if a != own.along]
-        index = [np.arange(f, f + n) for f, n in zip(own.first, own.counts)]
-        lattice = np.stack(np.meshgrid(*index, indexing="ij"), axis=-1).reshape(-1, 3)
         points = own.start + own.spacing * lattice
         points[:, own.along] += own.spacing * np.mod((lattice - own.turns)[:, beside] @ PHASES, 1.0)
         return points
@@ -434,7 +444,8 @@ class Inlet:
         candidates = candidates[self.inside(candidates)]
         clear = own.clear
         candidates = candidates[sample_nodes(self._walls.signed_distance, grid, candidates) > clear]
-        near = positions[self._around(positions, 2 * grid.spacing)]
+        # what is as near as that to a place lies in its own cell or in one beside it
+        near = positions[self._within(positions, self._beside, 1)]
         if len(near) and len(candidates):
             distance, _ = cKDTree(near).query(candidates, distance_upper_bound=own.reach)
             candidates = candidates[~np.isfinite(distance)]
@@ -447,3 +458,19 @@ class Inlet:
         astray = ~self.inside(jittered) | (sample_nodes(self._walls.signed_distance, grid, jittered) <= clear)
         jittered[astray] = candidates[astray]
         return np.clip(jittered, grid.low + clear, grid.high - clear).astype(np.float32)
+
+
+@shared(lambda positions, *_: (0, len(positions)), least=2000)
+def _within_kernel(begin, end, positions, corners, grid, cells, out):
+    """Whether positions lie between two corners, ends included, and in one of the cells."""
+    (low, high), (origin, spacing), at = corners, grid, np.empty(3, np.int64)
+    for p in range(begin, end):
+        there = True
+        for axis in range(3):
+            x = np.float64(positions[p, axis])
+            if not (x >= low[axis] and x <= high[axis]):
+                there = False
+                break
+            cell = np.int64(np.floor((x - origin[axis]) / spacing))
+            at[axis] = min(max(cell, 0), cells.shape[axis] - 1)
+        out[p] = there and cells[at[0], at[1], at[2]]

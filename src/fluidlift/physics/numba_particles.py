@@ -54,7 +54,9 @@ class NumbaMover(ParticleMover):
             positions, particles.positions, new_velocities, particles.velocities, walls, dt=rules.dt,
             restitution=rules.restitution, tangential_share=rules.tangential_share,
         )  # fmt: skip
-        deformation = updated_deformation(particles.deformation, affine, rules.dt, max_stretch=rules.max_stretch)
+        deformation = particles.deformation
+        if rules.deform:
+            deformation = updated_deformation(deformation, affine, rules.dt, max_stretch=rules.max_stretch)
         return replace(
             particles, positions=positions, velocities=new_velocities, affine=affine, deformation=deformation
         )

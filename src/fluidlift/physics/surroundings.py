@@ -30,7 +30,7 @@ class SimulationSettings:
     max_stretch: float = 4.0
     """of the deformation of a particle"""
     deform: bool = True
-    """carry the deformation of smoke's particles along; False: what they look like is not asked for"""
+    """carry the deformation of the particles along; False: what they look like is not asked for"""
     spread_crowds: bool = True
     """correct clumps of particles"""
     separate_from_walls: bool = True

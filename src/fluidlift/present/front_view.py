@@ -106,7 +106,12 @@ class FrontView:
         """
         from fluidlift.look.project import view_colors
         from fluidlift.look.rasterize import render
+        from fluidlift.numerics.splatting_projection import ALPHA_MIN
 
+        # of smoke most splats are not drawn: what they would show is not worked out
+        drawn = gaussians.opacities > ALPHA_MIN
+        if not drawn.all():
+            gaussians, velocity = gaussians.select(drawn), velocity[drawn]
         gaussians, velocity = self._seen(gaussians, velocity)
         shown = concatenate([gaussians, *solids])
         before, z0 = self.camera.project(gaussians.means)
@@ -116,10 +121,10 @@ class FrontView:
         move[: len(gaussians)][ahead] = np.clip((after - before)[ahead], -FARTHEST, FARTHEST)
         features = np.concatenate([view_colors(shown, self.camera), move], axis=1)
         behind = np.concatenate([self.plate, np.zeros_like(self.plate[..., :2])], axis=-1)
-        drawn = render(shown, self.camera, background=behind, features=features)
-        alpha = drawn.alpha[..., None]
-        motion = np.where(alpha > COVERED, drawn.image[..., 3:] / np.maximum(alpha, COVERED), np.nan)
-        return replace(drawn, image=np.ascontiguousarray(drawn.image[..., :3])), motion.astype(np.float32)
+        picture = render(shown, self.camera, background=behind, features=features)
+        alpha = picture.alpha[..., None]
+        motion = np.where(alpha > COVERED, picture.image[..., 3:] / np.maximum(alpha, COVERED), np.nan)
+        return replace(picture, image=np.ascontiguousarray(picture.image[..., :3])), motion.astype(np.float32)
 
     def _seen(self, gaussians: Gaussians, velocity: np.ndarray) -> tuple[Gaussians, np.ndarray]:
         """What the ground leaves over of splats and their velocities."""

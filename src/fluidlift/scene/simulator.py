@@ -57,10 +57,21 @@ def left_to_the_cpu(simulator: ParticleSimulator, device: str) -> list[Notice]:
                    f"which takes longer, because of {simulator.on_host_because}")]  # fmt: skip
 
 
-def simulator_of(scene: Scene, device: str = "cpu", forces: Sequence[BodyForce] = ()) -> ParticleSimulator:
-    """The simulator at the first instant. Smoke is simulated on the CPU, without `forces`."""
-    from fluidlift.physics.emitter import Supply
+def simulator_of(
+    scene: Scene, device: str = "cpu", forces: Sequence[BodyForce] = (), *, deform: bool = True
+) -> ParticleSimulator:
+    """The simulator at the first instant. Smoke is simulated on the CPU, without `forces`.
 
+    Args:
+        scene: that is simulated.
+        device: that moves particles, "cpu" or "cuda".
+        forces: beside those of the scene.
+        deform: False where nobody looks at how particles are drawn out.
+    """
+    from fluidlift.physics.emitter import Supply
+    from fluidlift.physics.surroundings import SimulationSettings
+
+    settings = SimulationSettings(deform=deform)
     parameters = simulation_step(scene)
     own = scene.rest.select(np.arange(len(scene.rest) - sum(map(len, scene.emitter_looks))))
     look = inflow_look(scene, own, float(np.linalg.norm(parameters.inflow_velocity)))
@@ -71,7 +82,7 @@ def simulator_of(scene: Scene, device: str = "cpu", forces: Sequence[BodyForce] 
         return GasSimulator(
             grid, scene.terrain, parameters, scene.body, cell_types=scene.cell_types, inflow_profile=scene.velocity,
             velocity=scene.velocity, seed=scene.seed, emit_source=look,
-            buoyancy=float(np.linalg.norm(parameters.gravity)), supply=supply,
+            buoyancy=float(np.linalg.norm(parameters.gravity)), supply=supply, settings=settings,
         )  # fmt: skip
     from fluidlift.physics.apic import LiquidSimulator
     from fluidlift.physics.guidance import Guiding, SteadyForce
@@ -85,7 +96,7 @@ def simulator_of(scene: Scene, device: str = "cpu", forces: Sequence[BodyForce] 
     simulator = LiquidSimulator(
         grid, scene.terrain, parameters, body, cell_types=cells, inflow_profile=scene.velocity,
         seed=scene.seed, emit_source=look, bodies=scene.bodies, work=particle_work(device), supply=supply,
-        open_sides=sides_open_to_air(parameters.gravity), forces=forces,
+        open_sides=sides_open_to_air(parameters.gravity), forces=forces, settings=settings,
     )  # fmt: skip
     simulator.drains, simulator.drains_until = scene.dry, scene.dry_for
     if scene.wet is not None and scene.wet.any():

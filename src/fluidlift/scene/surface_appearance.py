@@ -173,6 +173,13 @@ def levelled(surface: SurfaceMap, level: float, within: float) -> SurfaceMap:
     return replace(surface, height=level + np.sign(away) * np.maximum(np.abs(away) - within, 0.0))
 
 
+def _round(rest: Gaussians, particles: Particles) -> Gaussians:
+    """The splats of particles without a turn, as wide and as dense as at rest."""
+    turns, source = np.zeros((len(particles), 4), np.float32), particles.source
+    turns[:, 0] = 1.0
+    return Gaussians(particles.positions, turns, rest.scales[source], rest.opacities[source], rest.sh[source])
+
+
 class SurfaceAppearance:
     """Splats for the particles of a scene, frame by frame from the first one on.
 
@@ -206,6 +213,11 @@ class SurfaceAppearance:
     def splats(self) -> int:
         """Of the first frame: those of the body and of the skin over it."""
         return len(self._scene.body) + self._tracers
+
+    @property
+    def draws_out(self) -> bool:
+        """Whether splats are drawn out as their particles are; smoke that has its film is drawn round."""
+        return self._smoke is None
 
     @property
     def warnings(self) -> tuple[Notice, ...]:
@@ -395,9 +407,10 @@ class SurfaceAppearance:
         from fluidlift.physics.deform import deform_gaussians
 
         scene, carry = self._scene, deform or deform_gaussians
-        shown = carry(scene.rest, particles, max_stretch=MAX_STRETCH, max_size=LARGEST * self._cell)
         if self._smoke is not None:
+            shown = _round(scene.rest, particles)
             return Dressed(*self._smoke.dressed(shown, particles, number, self._own_colors(particles.source)))
+        shown = carry(scene.rest, particles, max_stretch=MAX_STRETCH, max_size=LARGEST * self._cell)
         if number:  # at rest nothing is drawn out
             shown = mixed(shown, particles.deformation, widest=MIXED * self._cell)
         shown = self._shaded(shown, particles.source)

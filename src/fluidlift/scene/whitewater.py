@@ -133,7 +133,7 @@ def measured(scene: Scene, device: str = "cpu", foam: FilmedFoam | None = None) 
     if foam is None or foam.share == 0.0:
         return None
     probe = _Probe(scene, foam)
-    simulator = simulator_of(scene, device)
+    simulator = simulator_of(scene, device, deform=False)
     first, count = (round(s / scene.interval) for s in (SETTLED, SETTLED + SECONDS))
     seen: list[Columns] = []
     for _ in range(max(count, 2)):

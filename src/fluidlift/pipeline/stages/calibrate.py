@@ -108,7 +108,8 @@ def calibrate(
     rates = tuple(np.full(c.shape, rate, np.float32) for c in target.components)
     gain = GAIN if kind.nearly_level else 0.0
     pull = Nudging(target, rates, after=SETTLED * frames * scene.interval, gain=gain, learning=LEARNING / rate)
-    simulator = simulator_of(replace(scene, force=None, dry=dry, dry_for=dry_for, wet=wet), device, forces=(pull,))
+    known = replace(scene, force=None, dry=dry, dry_for=dry_for, wet=wet)
+    simulator = simulator_of(known, device, forces=(pull,), deform=False)
     for k in range(1, frames):
         if work is not None:
             work.step(k, frames)

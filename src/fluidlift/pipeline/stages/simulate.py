@@ -52,13 +52,13 @@ def simulate(
         InputRejected: a scene that cannot be simulated, said before anything is written; or the disk is full.
     """
     preflight(scene)
-    simulator = simulator_of(scene, config.device)
-    closed = closed_inlet(scene, simulator)
     white = None
     if scene.whitewater > 0 and scene.as_lifted is not None:
         part = (work or Work.alone(folder)).part  # once for each asset
         white = SceneWhitewater(scene, part("whitewater", kept_measure, scene.as_lifted, config.device).found)
     appearance = SurfaceAppearance(scene, white)
+    simulator = simulator_of(scene, config.device, deform=appearance.draws_out)
+    closed = closed_inlet(scene, simulator)
     history = continued(simulator, appearance, scene, folder, request or SimulationRequest(), config.max_particles)
     first = len(history)
     told(appearance.splats)

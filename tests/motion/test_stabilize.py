@@ -123,7 +123,7 @@ def test_of_a_camera_that_turns_away_the_longest_run_of_one_view_is_used():
 
 
 def test_a_run_is_the_longest_around_any_frame():
-    motions = np.tile(np.eye(2, 3), (40, 1, 1))
+    motions = np.tile(np.eye(3), (40, 1, 1))
     motions[:, 0, 2] = np.where(np.arange(40) < 25, 0.0, 100.0)
     assert steady_run(motions, (200, 100), 0.7) == (0, 25, 20)
     assert steady_run(motions, (200, 100), 0.5)[:2] == (0, 40)
@@ -192,7 +192,7 @@ def test_layouts_are_compared_without_their_brightness_and_contrast():
 
 
 def test_shake_counts_steps_and_drift_counts_distance():
-    motions = np.tile(np.eye(2, 3), (11, 1, 1))
+    motions = np.tile(np.eye(3), (11, 1, 1))
     motions[:, 0, 2] = 0.5 * (np.arange(11) - 5)
     shake, drift = shake_and_drift(motions, 100, 80, ())
     assert shake == pytest.approx(0.5) and drift == pytest.approx(2.5)

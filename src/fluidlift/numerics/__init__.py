@@ -9,6 +9,8 @@ Modules of the face:
                             and below
     harmonics               Real spherical harmonics up to degree 3, in the order and sign of 3D Gaussian Splatting
                             (Kerbl et al. 2023)
+    homography2             Homographies of the picture plane as matrices [3,3] that act on pixel indices (as
+                            cv2.warpPerspective takes them)
     isosurface              Triangles of a level set: naive surface nets (Gibson 1998), vectorised
     lanes                   Four or eight single-precision numbers at once, for Numba kernels
     lbfgs                   The least of a smooth function of many numbers, from its gradient: L-BFGS (Nocedal and
@@ -64,7 +66,7 @@ Modules of the face:
 """
 
 __all__ = [
-    "bspline", "cell_list", "ground_block", "harmonics", "isosurface", "lanes", "lbfgs", "mesh_distance",
+    "bspline", "cell_list", "ground_block", "harmonics", "homography2", "isosurface", "lanes", "lbfgs", "mesh_distance",
     "mesh_normals", "mirror", "multigrid", "multigrid_assembly", "multigrid_cycle", "nearest", "outline",
     "particle_mean", "poisson", "recurrent_stencil", "recurrent_stencil_fit", "sampling", "sharing", "short_axis",
     "signed_distance", "similarity2", "solid_mesh", "splatting", "splatting_colors", "splatting_colors_torch",

@@ -43,9 +43,10 @@ NEAR_TOLD = ("camera-path-unknown", "camera-extra-missing")
 MENDED = 0.6
 """the shake that is left, as part of what was, below which the correction is kept"""
 WAY_MENDED = 0.25
-"""the drift that is left, as part of what was, below which it is kept as well: where single frames are read badly, the
-shake tells of these alone. Of real clips that were taken back for their shake, 0.08 and 0.16 is left where the
-camera did tilt and sway, 0.44 and 0.76 where a jet or surf moved before one that hardly did"""
+"""the drift that is left, as part of what was (more than `STEADY_DRIFT_PX`), below which it is kept as well: where
+single frames are read badly, the shake tells of these alone. Of real clips that were taken back for their shake, 0.08
+and 0.16 is left where the camera did tilt and sway, 0.44 and 0.76 where a jet or surf moved before one that hardly
+did"""
 
 
 @dataclass(frozen=True)
@@ -143,7 +144,8 @@ def stabilise(
         warnings += [] if said is None else [said]
     again = [shake_and_drift(motions_of_shots(steady.frames[a:b], (), reach)[0], width, height, ()) for a, b in runs]
     left, away = (max(each) for each in zip(*again))
-    if left < max(MENDED * shake, STEADY_PX) or (left < shake and away < WAY_MENDED * drift):
+    on_its_way = drift > STEADY_DRIFT_PX and left < shake and away < WAY_MENDED * drift
+    if left < max(MENDED * shake, STEADY_PX) or on_its_way:
         if drift > FAR * max(width, height) and not any(w.code in NEAR_TOLD for w in warnings):
             warnings.append(
                 Notice(

@@ -5,7 +5,7 @@ linear model and errors of known ratio this is total least squares, which unlike
 consistent (Fuller, Measurement Error Models, 1987): trusted, the errors of a start pass for shear, and viscosity is
 raised to damp them.
 
-* `corrected_starts` finds the start by L-BFGS on the adjoint gradient, at fixed parameters.
+* `corrected_starts` finds the start by L-BFGS (SciPy's) on the adjoint gradient, at fixed parameters.
 * `profile` finds how that start moves with each parameter, and so the derivative of all residuals along it (variable
   projection; Golub & Pereyra 1973). What is left of a column says how much the data know of a parameter once the
   start has explained what it can.
@@ -18,18 +18,25 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.optimize import fmin_l_bfgs_b
 from torch import Tensor
 
 from fluidlift.fit.evaluation import BACKWARD, Budget, Evaluation, Jacobian, products
 from fluidlift.fit.problem import FitProblem
 from fluidlift.fit.ranges import ParameterSpace
-from fluidlift.numerics.lbfgs import lowered
 
 PROBE = 0.02
 """largest change of a face, in units of U, that a directional derivative is measured with"""
 SETTLED = 1e-3
 """of the objective: where no more than that is left to gain, a start is found. A quadratic whose curvature is at least
 that of the departures is lowered by g^2 / (2 curvature) at most"""
+
+
+class _Settled(Exception):
+    """A start that will do: the search goes on until it is told to end."""
+
+    def __init__(self, point: np.ndarray) -> None:
+        self.point = point.copy()
 
 
 def corrected_starts(
@@ -47,7 +54,7 @@ def corrected_starts(
         inverse = torch.where(curvature > 0, 1.0 / curvature, 0.0)
 
         def objective(point: np.ndarray) -> tuple[float, np.ndarray]:
-            move = torch.from_numpy(point).requires_grad_()
+            move = torch.as_tensor(point, dtype=torch.float32).requires_grad_()
             start = begin + unit * move
             run = problem.roll(index, parameters, known or None, start)
             known[:] = run.potentials  # first guesses for the next one, which is near
@@ -57,14 +64,18 @@ def corrected_starts(
             total.backward()
             calls[index] += 1
             assert move.grad is not None
-            return float(total.detach()), move.grad.numpy()
+            value = float(total.detach())
+            if 0.5 * float((move.grad**2 * inverse).sum()) < SETTLED * value:
+                raise _Settled(point)
+            return value, move.grad.double().numpy()
 
-        def settled(value: float, gradient: np.ndarray) -> bool:
-            return 0.5 * float((torch.from_numpy(gradient) ** 2 * inverse).sum()) < SETTLED * value
-
-        still = np.zeros(count, np.float32)
-        move = lowered(objective, still, steps=iterations, evaluations=2 * iterations, settled=settled)
-        found = begin + unit * torch.from_numpy(move)
+        # as many past steps as there are make up the curvature; when to end is said by the two bounds and above
+        bounds = {"maxiter": iterations, "maxfun": 2 * iterations, "m": iterations, "factr": 0.0, "pgtol": 0.0}
+        try:
+            move = fmin_l_bfgs_b(objective, np.zeros(count), **bounds)[0]
+        except _Settled as end:
+            move = end.point
+        found = begin + unit * torch.as_tensor(move, dtype=torch.float32)
         return found if bool(torch.isfinite(found).all()) else begin
 
     starts = budget.each(problem, one, list(range(len(problem.windows))))

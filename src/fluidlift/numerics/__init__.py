@@ -13,8 +13,6 @@ Modules of the face:
                             cv2.warpPerspective takes them)
     isosurface              Triangles of a level set: naive surface nets (Gibson 1998), vectorised
     lanes                   Four or eight single-precision numbers at once, for Numba kernels
-    lbfgs                   The least of a smooth function of many numbers, from its gradient: L-BFGS (Nocedal and
-                            Wright 2006, algorithm 7.5)
     mesh_distance           Signed distance of a closed triangle mesh on a grid of its own frame
     mesh_normals            Normals of triangle meshes
     mirror                  Points continued beyond their ends by their own mirror image: what lies there, and moves
@@ -66,7 +64,7 @@ Modules of the face:
 """
 
 __all__ = [
-    "bspline", "cell_list", "ground_block", "harmonics", "homography2", "isosurface", "lanes", "lbfgs", "mesh_distance",
+    "bspline", "cell_list", "ground_block", "harmonics", "homography2", "isosurface", "lanes", "mesh_distance",
     "mesh_normals", "mirror", "multigrid", "multigrid_assembly", "multigrid_cycle", "nearest", "outline",
     "particle_mean", "poisson", "recurrent_stencil", "recurrent_stencil_fit", "sampling", "sharing", "short_axis",
     "signed_distance", "similarity2", "solid_mesh", "splatting", "splatting_colors", "splatting_colors_torch",

@@ -97,8 +97,13 @@ class SurfaceMap:
 
     def slope(self, places: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
         """Gradient of the height at places (m), of what is wider than a cell."""
+        return self.at(self._slopes, places)
+
+    @cached_property
+    def _slopes(self) -> Float[np.ndarray, "nx ny 2"]:
+        """Of each column: asked for as often."""
         smooth = ndimage.gaussian_filter(self.height, SMOOTH)
-        return self.at(np.stack([*np.gradient(smooth, self.pitch)], axis=-1), places)
+        return np.stack([*np.gradient(smooth, self.pitch)], axis=-1)
 
     def columns(self) -> Float[np.ndarray, "m 2"]:
         """Middles (x, y in m) of the wet columns."""

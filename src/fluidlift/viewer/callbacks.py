@@ -1,11 +1,14 @@
-"""What a person does on the page, as it was when they did it."""
+"""What a person does on the page, as it was when they did it, and what controls show."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import viser
 
 LOG = logging.getLogger(__name__)
 
@@ -22,6 +25,16 @@ def heard(handle: Any, act: Callable[[Any, Any], None]) -> None:
         asyncio.get_running_loop().run_in_executor(None, act, event, handle.value).add_done_callback(_surprised)
 
     handle.on_update(arrived)
+
+
+def show(server: viser.ViserServer, handle: Any, value: Any) -> None:
+    """Have a control show what the scene holds; soon, and only where it shows something else.
+
+    It is set in the server's event loop, between two messages of the page: set from another thread in the midst of one,
+    it would take the place of what a person has just chosen before `heard` has read it.
+    """
+    if handle.value != value:
+        server.get_event_loop().call_soon_threadsafe(setattr, handle, "value", value)
 
 
 def _surprised(done: asyncio.Future[None]) -> None:

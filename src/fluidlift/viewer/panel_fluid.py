@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Any
 
-from fluidlift.viewer.callbacks import heard
+from fluidlift.viewer.callbacks import heard, show
 from fluidlift.viewer.controls import Control, number, path_of, unbroken
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ class FluidPanel:
         """Move a slider that is not there yet."""
         slider, at = self._sliders[control.key], control.slider_of(value)
         if _one(slider.value) != at:
-            slider.value = (at,) if control.log else at
+            show(self._viewer.server, slider, (at,) if control.log else at)
 
     # look
 
@@ -142,13 +142,9 @@ class FluidPanel:
                 slider.label = _label(control, value)
             self._place(control, value)
         for handle, name in ((self._style, "style"), (self._material, "material"), (self._light, "environment")):
-            value = _known(look.get(name), handle.options)
-            if handle.value != value:
-                handle.value = value
-        if self._exposure.value != _stops(look):
-            self._exposure.value = _stops(look)
-        if tuple(self._tint.value) != _bytes(look.get("tint")):
-            self._tint.value = _bytes(look.get("tint"))
+            show(self._viewer.server, handle, _known(look.get(name), handle.options))
+        show(self._viewer.server, self._exposure, _stops(look))
+        show(self._viewer.server, self._tint, _bytes(look.get("tint")))
 
 
 def _label(control: Control, value: float) -> str:

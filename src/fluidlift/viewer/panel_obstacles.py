@@ -14,7 +14,7 @@ from fluidlift.scene.edits import Add, Remove
 from fluidlift.scene.forecast import place_told, placed
 from fluidlift.scene.open_water import open_water
 from fluidlift.types import kind_of
-from fluidlift.viewer.callbacks import heard
+from fluidlift.viewer.callbacks import heard, show
 from fluidlift.viewer.controls import unbroken
 from fluidlift.viewer.mesh_files import MOST_BYTES, UNITS, kept_mesh, mesh_entry
 
@@ -178,7 +178,7 @@ class ObstaclePanel:
             return
         if entry is None:  # typed into the box of a slider that is greyed out
             self._viewer.say(f"width {width:g} m: no obstacle is chosen. Choose one, or add one first.")
-            self._size.value = _short(self._size_now)
+            show(self._viewer.server, self._size, _short(self._size_now))
             return
         if "mesh" in entry:
             now = self._mesh_width(entry)
@@ -202,7 +202,7 @@ class ObstaclePanel:
         if event.client is not None and (entry is None or entry.get("motion") != "free"):
             thing = "no obstacle is chosen" if entry is None else f"{entry['name']} stands still"
             self._viewer.say(f"density {density:g}: {thing}, and only what floats freely has one that counts.")
-            self._density.value = min(max(float((entry or {}).get("density", 500.0)), 20.0), 3000.0)
+            show(self._viewer.server, self._density, _density(entry))
             return
         self._set(event, "density", float(density))
 
@@ -229,8 +229,7 @@ class ObstaclePanel:
             viewer.chosen = ""
         if self._chosen.options != (NONE, *names):
             self._chosen.options = (NONE, *names)
-        if self._chosen.value != (viewer.chosen or NONE):
-            self._chosen.value = viewer.chosen or NONE
+        show(viewer.server, self._chosen, viewer.chosen or NONE)
         entry = self._entry()
         for handle in (self._size, self._motion, self._remove):
             handle.disabled = entry is None
@@ -240,13 +239,11 @@ class ObstaclePanel:
             self._where.content = "No obstacle is chosen." if names else "There are no obstacles yet."
             return
         self._tell(entry)
-        motion = FLOATS if entry.get("motion") == "free" else STILL
-        if self._motion.value != motion:
-            self._motion.value = motion
-        self._density.value = min(max(float(entry.get("density", 500.0)), 20.0), 3000.0)
+        show(viewer.server, self._motion, FLOATS if entry.get("motion") == "free" else STILL)
+        show(viewer.server, self._density, _density(entry))
         width = self._mesh_width(entry) if "mesh" in entry else _width(entry)
         if width is not None:
-            self._size.value = min(max(width, self._size.min), self._size.max)
+            show(viewer.server, self._size, min(max(width, self._size.min), self._size.max))
 
     def _at(self, place: Any) -> list[float]:
         """A place as it is written: to a hundredth of a cell."""
@@ -313,6 +310,11 @@ def _width(entry: dict[str, Any]) -> float | None:
         return 2 * float(entry["radius"])
     size = entry.get("size")
     return float(size[0]) if isinstance(size, list | tuple) else (float(size) if size else None)
+
+
+def _density(entry: dict[str, Any] | None) -> float:
+    """kg/m^3, within what the slider has."""
+    return min(max(float((entry or {}).get("density", 500.0)), 20.0), 3000.0)
 
 
 def _short(value: float, digits: int = 4) -> float:

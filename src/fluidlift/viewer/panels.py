@@ -12,7 +12,7 @@ import numpy as np
 from fluidlift.errors import FluidliftError
 from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.viewer import kept_layout, kept_views
-from fluidlift.viewer.callbacks import heard
+from fluidlift.viewer.callbacks import heard, show
 from fluidlift.viewer.footage import GONE, WIDTH
 from fluidlift.viewer.panel_fluid import FluidPanel
 from fluidlift.viewer.panel_obstacles import ObstaclePanel
@@ -183,7 +183,7 @@ class Panels:
     def show_parts(self, changes: dict[str, bool]) -> None:
         """These are on or off now."""
         for name, on in changes.items():
-            _assign(self._checks[name], "value", on)
+            show(self._viewer.server, self._checks[name], on)
 
     def _input_view(self, event: Any) -> None:
         if event.client is None:
@@ -262,10 +262,10 @@ class Panels:
         last = FIRST_FRAME + max(timeline.count - 1, 1)
         if self._frame.max != last:
             self._frame.max = last
-        _assign(self._frame, "value", min(FIRST_FRAME + timeline.frame, last))
+        show(viewer.server, self._frame, min(FIRST_FRAME + timeline.frame, last))
         _assign(self._time, "content", f"**{timeline.label}** of {(timeline.count - 1) * timeline.interval:.2f} s")
         _assign(self._play, "label", "Pause" if timeline.playing else "Play")
-        _assign(self._source, "value", viewer.source)
+        show(viewer.server, self._source, viewer.source)
         _assign(self._status, "content", self._state_told())
         self._tell_arrows()
         self.run.tick()

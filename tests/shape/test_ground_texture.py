@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import ndimage
 from scipy.ndimage import binary_dilation, binary_erosion
 
 from fluidlift.numerics.textures import sample_texture
@@ -200,6 +201,19 @@ def test_behind_a_fluid_the_picture_shows_the_ground_and_elsewhere_what_was_film
     np.testing.assert_allclose(picture[v, u], (110, 90, 60), atol=12.0)  # the bed
     far = binary_erosion(seen, iterations=8)  # beyond the blend of 1.5 px
     assert far.any() and (picture[far] == plate[far]).all()
+
+
+def test_no_edge_runs_along_the_rim_of_the_fluid_where_the_ground_has_other_colours_than_the_picture():
+    mesh, plate, seen = rock_in_a_channel()
+    hole = ndimage.distance_transform_edt(~seen)
+    painted = plate.astype(np.uint8) + np.uint8(40) * seen[..., None].astype(np.uint8)
+    picture, own = (over_bed(p, seen, mesh, CAMERA).astype(float) for p in (painted, plate.astype(np.uint8)))
+    brighter = (picture - own).mean(axis=-1)
+    inside = binary_erosion(np.ones_like(seen), iterations=12)  # of the picture
+    rim, middle = inside & (hole > 0) & (hole < 2), inside & (hole > 20)
+    assert rim.any() and middle.any()
+    assert np.median(brighter[rim]) > 20.0  # of the 40 beside it
+    assert np.abs(brighter[middle]).max() < 2.0
 
 
 def test_the_cut_side_of_the_ground_is_no_part_of_the_picture_without_fluid():

@@ -32,8 +32,17 @@ LIMIT = 1.0
 FADE = (2.0, 12.0)
 """frames in which patches come and go, at least and at most; in between, a third of the time that the limit takes"""
 
+FILM_FADE = 1 / 6
+"""of the film, in which its patches come and go: of 1/4, made films that drift by a quarter of a pixel per frame
+seem to drift otherwise by 0.25 of it, of 1/6 by 0.22, of 1/9, where they pop, by 0.24"""
+
+BEGIN = 0.15
+"""of the film, within which a patch begins that follows another one: from half of it on, patches give way so often that
+the same films seem to drift otherwise by 0.5 of their speed; from the start on, all films would repeat themselves"""
+
 SHARPNESS = 8
-"""power of the weights: blends of two patterns have less contrast than either, and stay narrow"""
+"""power of the weights: blends of two patterns have less contrast than either, and stay narrow; between places, not in
+time where patches stay"""
 
 OVERLAP = 8
 """patches that share a place at most"""
@@ -156,6 +165,8 @@ class TexturePatches:
         bare = surface.columns()
         if not len(bare):
             return
+        if self._stays:
+            self._begin_anew(surface, rng)
         lasting = self.state.centers[~self.state.going]
         uncovered = np.ones(len(bare), bool)
         if len(lasting):
@@ -164,11 +175,25 @@ class TexturePatches:
         if len(centers):
             self.state = self.state.joined(self._fresh(centers, interval == 0, surface, rng))
 
+    @property
+    def _stays(self) -> bool:
+        """Patches stay in their places, each with the film's own motion in it."""
+        return self._footage is not None and not self._edited
+
+    def _begin_anew(self, surface: SurfaceMap, rng: np.random.Generator) -> None:
+        """A patch that has come to the end of its film gives way to one in its own place."""
+        going = self.state.going
+        last, lasting = self.state.centers[going], self.state.centers[~going]
+        if len(last) and len(lasting):
+            last = last[nearest(lasting, last)[0] > 0]
+        if len(last):
+            self.state = self.state.joined(self._fresh(np.unique(last, axis=0), False, surface, rng))
+
     def _carry(self, surface: SurfaceMap, interval: float) -> None:
         s, (flow, spin, shear) = self.state, _gradients(surface, SMOOTH * self._radius)
         rate = surface.at(shear, s.centers)
         moved, turns, instants = interval * surface.at(flow, s.centers), s.turns, s.instants
-        if self._footage is not None and not self._edited:
+        if self._stays and self._footage is not None:
             rate, moved = np.zeros(len(s)), np.zeros((len(s), 2))
             instants = s.instants + interval / self._footage.interval
         elif self._footage is not None:
@@ -242,7 +267,7 @@ class TexturePatches:
             begin = np.full(n, min(self._start, last))
             ends = begin + rng.uniform(0, 1, n) * np.maximum(last - fade - begin, 0.0)
             return Patches(centers, sources, turns, np.zeros(n), np.ones(n), begin, ends)
-        begin = rng.uniform(0, 0.5 * last, n)
+        begin = rng.uniform(0, BEGIN * last, n)
         return Patches(centers, sources, turns, np.zeros(n), np.full(n, 1 / fade), begin, np.full(n, last - fade))
 
     def _seen_within(self, centers: np.ndarray) -> np.ndarray:
@@ -272,7 +297,10 @@ class TexturePatches:
         away, patches = nearest_of_few(s.centers, places, most, within=self._radius)
         point, rank = np.nonzero(np.isfinite(away))
         patch, distance = patches[point, rank], away[point, rank]
-        weight = ((1 - (distance / self._radius) ** 2) ** 2 * s.presences[patch]) ** SHARPNESS
+        weight = (1 - (distance / self._radius) ** 2) ** (2 * SHARPNESS)
+        # in one place one instant of the film goes over into another, both with the same motion: a front that runs
+        # outwards would have one of its own
+        weight = weight * s.presences[patch] ** (1 if self._stays else SHARPNESS)
         heaviest = np.zeros(n)
         np.maximum.at(heaviest, point, weight)
         counts = weight > 1e-3 * heaviest[point]
@@ -342,7 +370,7 @@ def _spread_of(point: np.ndarray, instants: np.ndarray, home: np.ndarray, weight
 
 def _fade_of(footage: FluidFootage) -> float:
     """Frames of the footage over which a patch comes or goes."""
-    return min(FADE[1], len(footage) / 4)
+    return min(FADE[1], FILM_FADE * len(footage))
 
 
 def _turned(vectors: np.ndarray, angles: np.ndarray) -> np.ndarray:

@@ -58,6 +58,10 @@ SOFT = 0.008
 LEAST = 0.4
 """of the grain of the ground is left where it stands; of a rock's none, which would hang about its foot"""
 
+SEAM = 0.02
+"""of the picture's longer side: over this, what is drawn behind the fluid goes over from the colours around it to the
+ground's own"""
+
 REPOSE = np.tan(np.radians(35.0))
 """slope that gravel lies at, at most: the foot of a rock under water is of rock where it is steeper"""
 
@@ -169,8 +173,26 @@ def over_bed(
         return plate
     uv = (mesh.uv[found.face] * found.barycentric[..., None]).sum(axis=-2)
     ground = 255.0 * sample_texture(mesh.texture, uv)
+    ground += _membrane(plate - ground, kept & drawn)
     weight = (weight_of_unseen(kept) * drawn * (1.0 - _standing(mesh, found.face)))[..., None]
     return np.clip(np.round(plate * (1.0 - weight) + ground * weight), 0, 255).astype(np.uint8)
+
+
+def _membrane(difference: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    """What is added to the ground that is drawn into a hole, so that no edge runs along its rim, float32 [h,w,3].
+
+    The difference from the picture is taken over at the rim and evened out from there (Perez, Gangnet, Blake 2003,
+    "Poisson image editing": the membrane of seamless cloning), and fades inwards: far from the rim the ground's own
+    colours are the better guess.
+
+    Args:
+        difference: of the picture to the ground, float [h,w,3].
+        kept: bool [h,w], where the picture is the clip's.
+    """
+    if not kept.any():
+        return np.zeros(difference.shape, np.float32)
+    away = ndimage.distance_transform_edt(~kept) / (SEAM * max(kept.shape))
+    return filled_in(difference.astype(np.float32), kept) * np.exp(-away)[..., None].astype(np.float32)
 
 
 def _standing(mesh: TriangleMesh, face: np.ndarray) -> np.ndarray:

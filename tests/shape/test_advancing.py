@@ -8,6 +8,7 @@ import pytest
 
 from fluidlift.shape.advancing import median_over_time
 from fluidlift.shape.background import (
+    _told_apart,
     colour_histogram,
     filled_in,
     fluid_colour,
@@ -161,3 +162,20 @@ def test_the_steady_stem_of_a_plume_is_fluid_and_its_shadow_on_a_mottled_floor_i
     for t in (2, 12, 20, 28):  # 0.27 to 0.40 without the stem; an outline of 250 px known to 1 px is 0.88
         assert (fluid[t] & truth[t]).sum() / (fluid[t] | truth[t]).sum() > 0.85, t
     assert fluid[:, 134:142, 5:45].mean() < 0.02
+
+
+def test_what_came_over_a_place_and_lies_still_is_no_background_of_it_and_shade_that_came_is():
+    ground, dark, shade = (np.float32(colour) for colour in ((150.0, 10.0, 0.0), (40.0, 12.0, 4.0), (120.0, 8.0, 0.0)))
+    before = np.broadcast_to(ground, (4, 6, 3)).copy()
+    after = before.copy()
+    after[:, :2], after[:, 2:4] = dark, shade  # a heap of chocolate; its shadow; nothing
+    before[3], after[3] = dark, ground  # a row that it has left
+
+    def like_fluid(colours: np.ndarray) -> np.ndarray:
+        return np.where(colours[..., 0] < 60.0, 3.0, -3.0)
+
+    often = np.full((4, 6), 10.0, np.float32)
+    found, count = _told_apart([(before, often), (after, often)], np.full((4, 6), 5.0, np.float32), like_fluid)
+    assert np.allclose(found[:3, :2], ground) and np.allclose(found[3], ground)
+    assert np.allclose(found[:3, 2:4], 0.5 * (ground + shade)) and np.allclose(found[:3, 4:], ground)
+    assert (count[:, :2] == 10.0).all() and (count[:3, 2:] == 20.0).all()

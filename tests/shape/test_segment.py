@@ -210,14 +210,18 @@ def test_what_swings_far_is_carried_and_no_fluid():
 
 
 def smoke(rng: np.random.Generator, *, frames: int = 24) -> tuple[np.ndarray, np.ndarray]:
-    """A grey cloud that rises over a dark still wall; pictures and true masks."""
+    """A grey cloud that rises over a dark still wall and turns over as it does; pictures and true masks."""
     pictures = 0.4 * still_room(rng, frames=frames)
     truth = np.zeros((frames, HEIGHT, WIDTH), bool)
-    grain = texture(rng, (HEIGHT, WIDTH), sigma=2.5)
+    grain, other = (
+        texture(rng, (HEIGHT, WIDTH), sigma=2.5),
+        texture(np.random.default_rng(90), (HEIGHT, WIDTH), sigma=2.5),
+    )
     for t in range(frames):
-        top = HEIGHT - 10 - 4 * t
+        top, turned = HEIGHT - 10 - 4 * t, 0.15 * t  # of one look for half a second: no board that is pushed in
         truth[t, max(top, 5) :, 60:100] = True
-        cloud = 170.0 + 25.0 * np.roll(grain, -4 * t, axis=0)[..., None].repeat(3, axis=-1)
+        look = np.cos(turned) * grain + np.sin(turned) * other
+        cloud = 170.0 + 25.0 * np.roll(look, -4 * t, axis=0)[..., None].repeat(3, axis=-1)
         pictures[t][truth[t]] = cloud[truth[t]]
     return pictures, truth
 

@@ -37,6 +37,10 @@ LEAST_TINT = 8.0
 """grey levels: before a ground to which the fluid would give less tint of its own, the tint tells nothing"""
 MIXED = 0.5
 """of the way from the ground's colour to the fluid's from which what stands still can be fluid"""
+LEAST_SEEN = 3
+"""frames of a place without fluid from which its picture is known"""
+TOLD = 1.0
+"""log odds by which colours tell which of two pictures of a place is the fluid: one is three times as likely"""
 RIM = 0.012
 """part of the longer side: so far a steady column is thinner, and nearer to its ground's colours, than its core"""
 
@@ -67,17 +71,13 @@ def still_background(evidence: Evidence, presence: Presence, domain: np.ndarray)
     water shows those of the background. The scene's colours are those of all that is known, so that ground of one
     colour with the smoke is believed where the rest of that ground is.
     """
-    total, count = np.zeros((*domain.shape, 3), np.float32), np.zeros(domain.shape, np.float32)
-    for t in range(presence.frames):
-        free = ((t < presence.first - 1) | (t > presence.last + 1)).astype(np.float32)
-        total += free[..., None] * evidence.source[t].astype(np.float32)
-        count += free
-    background = total / np.maximum(count, 1.0)[..., None]
+    bare = _bare(evidence, presence)
     pictures = np.stack([evidence.source[t] for t in presence.picked])
     moving, around = colour_histogram(pictures[presence.active]), colour_histogram(pictures[:, ~domain])
+    background, count = _told_apart(bare, 4.0 * evidence.noise, colour_test(moving, around)[0])
     faint = evidence.activity > FAINT * evidence.level
     quiet = quiet_fluid(background, domain, moving, around, faint)
-    seen = count >= 3
+    seen = count >= LEAST_SEEN
     own = without_background(moving, around)
     alien = rarer_around(background, own, around, COMMONER)
     ground = filled_in(background, seen & ~domain & ~quiet & ~spread(alien, RIM * max(domain.shape)))
@@ -93,6 +93,42 @@ def still_background(evidence: Evidence, presence: Presence, domain: np.ndarray)
     if trust > OWN:
         domain &= steady | ~smooth_ground(evidence, background, known, like_fluid)
     return StillScene(background, known, steady, like_fluid, fluid)
+
+
+def _bare(evidence: Evidence, presence: Presence) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Mean pictures, float32 [h,w,3], of each place before the fluid came and after it was last seen, of how many."""
+    found = []
+    for free in (lambda t: t < presence.first - 1, lambda t: t > presence.last + 1):
+        total, count = np.zeros((*presence.first.shape, 3), np.float32), np.zeros(presence.first.shape, np.float32)
+        for t in range(presence.frames):
+            here = free(t).astype(np.float32)
+            total += here[..., None] * evidence.source[t].astype(np.float32)
+            count += here
+        found.append((total / np.maximum(count, 1.0)[..., None], count))
+    return found
+
+
+def _told_apart(
+    bare: list[tuple[np.ndarray, np.ndarray]], limit: np.ndarray, like_fluid: Callable[[np.ndarray], np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """What is behind, float32 [h,w,3], and of how many frames, float32 [h,w].
+
+    A heap that grows comes over a place and stays, and lies still there: what is seen after is the fluid, not what is
+    behind it. So where the two pictures are not the same, that one counts which looks less like fluid, if one does.
+
+    Args:
+        bare: the pictures before and after, and of how many frames they are.
+        limit: float32 [h,w], grey levels, within which they are the same.
+        like_fluid: log odds of fluid of opponent colours.
+    """
+    (before, early), (after, late) = bare
+    odds = like_fluid(after) - like_fluid(before)
+    differ = (early >= LEAST_SEEN) & (late >= LEAST_SEEN) & (np.abs(after - before).sum(axis=-1) > limit)
+    early = np.where(differ & (odds < -TOLD), 0.0, early)
+    late = np.where(differ & (odds > TOLD), 0.0, late)
+    count = early + late
+    total = early[..., None] * before + late[..., None] * after
+    return (total / np.maximum(count, 1.0)[..., None]).astype(np.float32), count
 
 
 def fluid_colour(pictures: np.ndarray, active: np.ndarray, ground: np.ndarray) -> np.ndarray:

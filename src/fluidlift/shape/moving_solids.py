@@ -195,7 +195,7 @@ def _solids_of_window(grey: list[np.ndarray], steps: list[np.ndarray]) -> np.nda
         steps: K optical flows float32 [h,w,2], px per frame.
     """
     found = np.zeros(grey[0].shape, bool)
-    tracks = _tracks(grey)
+    tracks = tracked(grey)
     if tracks is None:
         return found
     left = tracks.kept & (tracks.moved > LEAST_MOVE * max(grey[0].shape))
@@ -209,7 +209,7 @@ def _solids_of_window(grey: list[np.ndarray], steps: list[np.ndarray]) -> np.nda
             break
         agree = np.flatnonzero(left)[inliers[:, 0] > 0]
         left[agree] = False
-        motions = _motions(np.ascontiguousarray(tracks.places[:, agree]))
+        motions = motions_of(np.ascontiguousarray(tracks.places[:, agree]))
         solid = _moving_alike(motions, steps, tracks.places[0][agree])
         columns, rows = np.clip(tracks.places[0].astype(int), 0, np.array(solid.shape[::-1]) - 1).T
         inside = solid[rows, columns]
@@ -219,9 +219,14 @@ def _solids_of_window(grey: list[np.ndarray], steps: list[np.ndarray]) -> np.nda
     return found
 
 
-def _tracks(grey: list[np.ndarray]) -> _Tracks | None:
-    """Features followed from frame to frame, forwards and back; None where there are none."""
-    corners = cv2.goodFeaturesToTrack(grey[0], 600, 0.01, 5, blockSize=5)
+def tracked(grey: list[np.ndarray], where: np.ndarray | None = None) -> _Tracks | None:
+    """Features followed from frame to frame, forwards and back; None where there are none.
+
+    Args:
+        grey: pictures u8 [h,w].
+        where: u8 [h,w], not 0 where features are looked for in the first; None: everywhere.
+    """
+    corners = cv2.goodFeaturesToTrack(grey[0], 600, 0.01, 5, mask=where, blockSize=5)
     if corners is None:
         return None
     places, kept = [corners], np.ones(len(corners), bool)
@@ -246,7 +251,7 @@ def _likeness(first: np.ndarray, here: np.ndarray, second: np.ndarray, there: np
     return float((a * b).sum() / max(np.linalg.norm(a) * np.linalg.norm(b), 1e-6))
 
 
-def _motions(places: np.ndarray) -> list[np.ndarray]:
+def motions_of(places: np.ndarray) -> list[np.ndarray]:
     """Similarities [2,3] of every frame of a window from its first, by the features [K+1,n,2] of one solid."""
     motions = [np.eye(2, 3)]
     for there in places[1:]:

@@ -35,12 +35,14 @@ ROUNDS = 3
 """in which the colours are read anew"""
 
 
-def sea_horizon(evidence: Evidence) -> OpenHorizon | None:
+def sea_horizon(evidence: Evidence, layers: np.ndarray | None = None) -> OpenHorizon | None:
     """The horizon of open water that a clip shows, px at working size; None where it shows none.
 
-    Waves keep their shape for a while, as what is carried through the picture does, so all that changes is asked.
+    Waves keep their shape for a while, as what is carried through the picture does, so all that changes is asked, but
+    for `layers`, bool [h,w], which leave ground behind: the edge of an arm is as straight.
     """
-    moving = clean_region(fluid_score(evidence.without_carried()) > 0.0)
+    changes = fluid_score(evidence.without_carried()) > 0.0
+    moving = clean_region(changes if layers is None else changes & ~layers)
     return open_horizon(evidence.colours, moving)
 
 

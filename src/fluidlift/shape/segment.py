@@ -21,6 +21,7 @@ import numpy as np
 from fluidlift.errors import InputRejected, require
 from fluidlift.messages import Notice
 from fluidlift.shape.advancing import advancing_labels
+from fluidlift.shape.carried_layers import by_either, carried_layers
 from fluidlift.shape.colour_growth import grown_from_streams, with_quiet_water
 from fluidlift.shape.evidence import Evidence, PairReader, fluid_score, gather_evidence, pair_reader, solids_by_flow
 from fluidlift.shape.hints import VOICE, Clicks, Point, clicks_at, heed, holes_asked_for
@@ -31,6 +32,7 @@ from fluidlift.shape.open_sea import reaching_over, sea_horizon, with_sea
 from fluidlift.shape.open_water import with_open_water
 from fluidlift.shape.presence import Presence, always, grows, stay, watch
 from fluidlift.shape.region import clean_region, cut_along_edges, solids_in, still_pixels
+from fluidlift.shape.thin_outlines import slimmed
 from fluidlift.shape.view import OpenHorizon
 from fluidlift.shape.washed import WashedGround, bare_over_time, washed_ground
 from fluidlift.shape.waterline import dry_over_time
@@ -148,7 +150,7 @@ class Clues:
             region = with_open_water(evidence, clean_region(self.grown), self.solids | ~self.inside)
             return Bed(region, np.zeros_like(region))
         first = lasting_region(evidence, score, self.inside)
-        region = without_plants(evidence, score, first, self.interval)
+        region = without_plants(evidence, score, slimmed(evidence, first), self.interval)
         if self.horizon is not None:
             # nothing passes on a sea: what goes nowhere, or looks the same between two waves, is no rock for that
             found = with_sea(evidence, region, self.solids | ~self.inside, self.horizon)
@@ -175,8 +177,10 @@ def clues_of(
     inside = shrink_mask(inside, evidence.noise.shape)
     if said is not None:
         said = cv2.resize(said, evidence.noise.shape[::-1], interpolation=cv2.INTER_LINEAR)
-    solids = moving_solids(clip, pairs, evidence.noise.shape)
-    horizon = sea_horizon(evidence)
+    size = evidence.noise.shape
+    layers = carried_layers(clip, size)
+    solids = by_either(layers, moving_solids(clip, pairs, size))
+    horizon = sea_horizon(evidence, layers)
     if horizon is not None:
         evidence, solids = evidence.without_carried(), reaching_over(solids, horizon)
     return Clues(evidence, solids, inside, clip.interval, said, float(mirrored.mean()), horizon)

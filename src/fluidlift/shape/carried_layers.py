@@ -20,7 +20,7 @@ from scipy import ndimage
 from fluidlift.numerics.similarity2 import composed, inverse
 from fluidlift.shape.frame_pictures import shrink, working_scale
 from fluidlift.shape.min_cut import disc
-from fluidlift.shape.moving_solids import LEAST_FEATURES, LEAST_MOVE, SIZE, SOLIDS, TOLERANCE, motions_of, tracked
+from fluidlift.shape.moving_solids import LEAST_FEATURES, LEAST_MOVE, SIZE, carried_alike, tracked
 from fluidlift.types.clip import VideoClip
 
 STRETCH = 1.1
@@ -110,18 +110,7 @@ def _swept(grey: list[np.ndarray]) -> np.ndarray:
     tracks = tracked([_even(picture) for picture in grey], changes)
     if tracks is None:
         return found
-    left = tracks.kept & (tracks.moved > LEAST_MOVE * max(grey[0].shape))
-    cv2.setRNGSeed(0)
-    for _ in range(SOLIDS):
-        if left.sum() < LEAST_FEATURES:
-            break
-        options = {"method": cv2.RANSAC, "ransacReprojThreshold": TOLERANCE, "maxIters": 500}
-        similarity, inliers = cv2.estimateAffinePartial2D(tracks.places[0][left], tracks.places[-1][left], **options)
-        if similarity is None or inliers.sum() < LEAST_FEATURES:
-            break
-        agree = np.flatnonzero(left)[inliers[:, 0] > 0]
-        left[agree] = False
-        motions = motions_of(np.ascontiguousarray(tracks.places[:, agree]))
+    for agree, motions in carried_alike(tracks, LEAST_MOVE * max(grey[0].shape)):
         stretch = _Stretch(pictures, [motions[t] for t in picked], noise)
         layer = _layer(stretch, tracks.places[0][agree])
         if layer.any() and _leaves_ground(stretch, layer):

@@ -9,6 +9,7 @@ its leading or trailing end keeps up with its motion, where a current flows thro
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -198,18 +199,7 @@ def _solids_of_window(grey: list[np.ndarray], steps: list[np.ndarray]) -> np.nda
     tracks = tracked(grey)
     if tracks is None:
         return found
-    left = tracks.kept & (tracks.moved > LEAST_MOVE * max(grey[0].shape))
-    cv2.setRNGSeed(0)
-    for _ in range(SOLIDS):
-        if left.sum() < LEAST_FEATURES:
-            break
-        options = {"method": cv2.RANSAC, "ransacReprojThreshold": TOLERANCE, "maxIters": 500}
-        similarity, inliers = cv2.estimateAffinePartial2D(tracks.places[0][left], tracks.places[-1][left], **options)
-        if similarity is None or inliers.sum() < LEAST_FEATURES:
-            break
-        agree = np.flatnonzero(left)[inliers[:, 0] > 0]
-        left[agree] = False
-        motions = motions_of(np.ascontiguousarray(tracks.places[:, agree]))
+    for agree, motions in carried_alike(tracks, LEAST_MOVE * max(grey[0].shape)):
         solid = _moving_alike(motions, steps, tracks.places[0][agree])
         columns, rows = np.clip(tracks.places[0].astype(int), 0, np.array(solid.shape[::-1]) - 1).T
         inside = solid[rows, columns]
@@ -217,6 +207,30 @@ def _solids_of_window(grey: list[np.ndarray], steps: list[np.ndarray]) -> np.nda
             for motion in motions[:: max(len(steps) // 4, 1)]:
                 found |= cv2.warpAffine(solid.astype(np.uint8), motion, solid.shape[::-1]) > 0
     return found
+
+
+def carried_alike(tracks: _Tracks, least: float) -> Iterator[tuple[np.ndarray, list[np.ndarray]]]:
+    """Features that one similarity carries from the first frame to the last, the largest group first.
+
+    Args:
+        tracks: of features.
+        least: px that a feature moves at least.
+
+    Yields:
+        Indices [n] of the features, and their similarities [2,3] of every frame from the first.
+    """
+    left = tracks.kept & (tracks.moved > least)
+    cv2.setRNGSeed(0)
+    for _ in range(SOLIDS):
+        if left.sum() < LEAST_FEATURES:
+            return
+        options = {"method": cv2.RANSAC, "ransacReprojThreshold": TOLERANCE, "maxIters": 500}
+        similarity, inliers = cv2.estimateAffinePartial2D(tracks.places[0][left], tracks.places[-1][left], **options)
+        if similarity is None or inliers.sum() < LEAST_FEATURES:
+            return
+        agree = np.flatnonzero(left)[inliers[:, 0] > 0]
+        left[agree] = False
+        yield agree, _motions(np.ascontiguousarray(tracks.places[:, agree]))
 
 
 def tracked(grey: list[np.ndarray], where: np.ndarray | None = None) -> _Tracks | None:
@@ -251,7 +265,7 @@ def _likeness(first: np.ndarray, here: np.ndarray, second: np.ndarray, there: np
     return float((a * b).sum() / max(np.linalg.norm(a) * np.linalg.norm(b), 1e-6))
 
 
-def motions_of(places: np.ndarray) -> list[np.ndarray]:
+def _motions(places: np.ndarray) -> list[np.ndarray]:
     """Similarities [2,3] of every frame of a window from its first, by the features [K+1,n,2] of one solid."""
     motions = [np.eye(2, 3)]
     for there in places[1:]:

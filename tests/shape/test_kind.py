@@ -81,6 +81,14 @@ def test_what_hangs_from_above_is_no_pour_where_all_of_it_goes_up(rising):
     assert (scores["pour"] < scores["plume"]) == (rising == 1.0), scores
 
 
+@pytest.mark.parametrize("top", [0, 20])
+def test_what_is_wide_is_no_stream_where_all_of_it_goes_up_and_out_at_the_top(top):
+    """Steam over a cup, in warm light; water that recedes does so below the sky and the far bank."""
+    clip = scene((np.abs(COL - 80) < 55) & (ROW >= top) & (ROW < top + 45), (0.0, -3.0), (190, 130, 100))
+    scores = estimate_kind(*clip).scores
+    assert (scores["plume"] > scores["stream"]) == (top == 0), scores
+
+
 def towards_the_viewer(near=4.0, far=0.2):
     """A curtain's outline and motion, with a pattern that moves by `far` px per frame at its top and `near` below."""
     frames, masks, *flow = curtain()

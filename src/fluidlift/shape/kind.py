@@ -108,8 +108,8 @@ def estimate_kind(
     lies = 1.0 - f["slender"]  # what runs off the drops beside a jet goes any way
     staying = max(f["swinging"], inside * f["circling"], lies * f["returning"], f["horizon"], f["bay"])
     belief = {
-        # smoke rises from below, is grey, and its outline changes; it neither hangs from above (unless all of it goes
-        # up), nor fills the picture
+        # smoke rises from below, is grey, and its outline changes; it neither hangs from above, nor fills the picture,
+        # unless all of it goes up and out at the top
         "plume": 2.6 * f["rising"]
         + 1.2 * f["grey"] * (0.3 + f["rising"])
         + 0.8 * f["changing"]
@@ -117,7 +117,7 @@ def estimate_kind(
         - 1.0 * f["sideways"]
         - 2.5 * f["hanging"] * (1 - lifted)
         - 1.5 * (1 - f["grey"])
-        - 2.0 * still * max(f["wide"], f["ground"]),
+        - 2.0 * still * max(f["wide"] * (1 - lifted * f["hanging"]), f["ground"]),
         # a jet hangs from above, falls and is slender; what falls a few decimetres is too fast for optical flow
         "pour": 1.6 * f["falling"]
         - 2.0 * f["followed"]

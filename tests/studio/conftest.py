@@ -134,6 +134,8 @@ class Window:
 
     def looked(self):
         """Wait until all is found for the hints there are."""
+        with self.desk.lock:  # hints that change meanwhile are asked for under it: before, an older look is the last
+            pass
         self.until(lambda: self.desk.looking.look.facts is not None and not self.desk.looking.look.words, "the look")
         self.until(lambda: self.desk.looking.idle, "the look at the last hints")
 

@@ -50,6 +50,7 @@ READING = ReadSettings(
     max_size=512,
     fps=25.0,
     stabilise=True,
+    crop="none",
     poses=True,
     max_pixels=50_000_000,
     max_frames=600,

@@ -8,9 +8,15 @@ import numpy as np
 import pytest
 
 from fluidlift.cli import REJECTED, WITH_WARNINGS, main
+from fluidlift.config import build_config
+from fluidlift.errors import InputRejected
 from fluidlift.io.exr_write import write_channels
 from fluidlift.io.flow_files import write_flow
-from fluidlift.io.pictures import read_picture
+from fluidlift.io.pictures import read_picture, write_png
+from fluidlift.messages import code_of
+from fluidlift.pipeline import Inputs
+from fluidlift.pipeline import make as make_asset
+from fluidlift.pipeline.find import read_alone
 
 TELECINE = [t + d for t in range(0, 12, 4) for d in (0, 1, 1, 2, 3)]
 """four frames shown in five, as a film at 24 frames per second is at 30"""
@@ -154,3 +160,49 @@ def test_files_of_uneven_frames_hold_displacements_and_speeds_follow_the_times(w
                 assert np.median(stored["displacement"][mask][:, 0]) == pytest.approx(2.0 * span, rel=0.25), (name, t)
     speeds = [row["surface_speed_median"] for row in facts["per_frame"]]
     np.testing.assert_allclose(speeds, np.median(speeds), rtol=0.25)
+
+
+@pytest.fixture
+def letterboxed(write, pictures):
+    """A clip with black bars of 24 rows above and below its 96, and its pictures without them."""
+    frames = pictures(10, size=(160, 96))
+    return write(np.pad(frames, ((0, 0), (24, 24), (0, 0), (0, 0)))), frames
+
+
+def test_bars_are_cut_off_where_nothing_but_the_clip_is_given(letterboxed, tmp_path):
+    clip, frames = letterboxed
+    found = read_alone(Inputs(clip), tmp_path / "read", build_config(None, None, (), {}))
+    assert [code_of(w) for w in found.warnings if "bars" in w] == ["bars-cut-off"]
+    assert found.clip.size == (160, 94)
+    assert np.abs(found.clip.frames[0].astype(int) - frames[0, 1:-1]).mean() < 3
+
+
+def test_a_setting_keeps_the_bars(letterboxed, tmp_path):
+    config = build_config(None, None, (), {"read.crop": "none"})
+    found = read_alone(Inputs(letterboxed[0]), tmp_path / "read", config)
+    assert [code_of(w) for w in found.warnings if "bars" in w] == ["bars-stay"]
+    assert found.clip.size == (160, 144)
+
+
+def test_masks_are_those_of_the_whole_picture_so_that_they_can_be_given_back(letterboxed, look):
+    _, said, facts = look(letterboxed[0])
+    assert facts["size"] == [160, 144] and "black bars" in said
+
+
+@pytest.mark.parametrize(("given", "crop"), [({}, "auto"), ({"mask": True}, "none")])
+def test_make_cuts_bars_off_only_where_no_file_holds_for_the_whole_picture(
+    letterboxed, tmp_path, monkeypatch, given, crop
+):
+    clip, _ = letterboxed
+    mask = tmp_path / "mask.png"
+    write_png(mask, np.full((144, 160), 255, np.uint8))
+    read_with = []
+
+    def stop(runner, given_clip, config):
+        read_with.append(config.read.crop)
+        raise InputRejected("enough", "no more")
+
+    monkeypatch.setattr("fluidlift.pipeline.begin.windows", stop)
+    with pytest.raises(InputRejected, match="enough"):
+        make_asset(Inputs(clip, mask=mask if given else None), tmp_path / "asset", build_config(None, None, (), {}))
+    assert read_with == [crop]

@@ -27,6 +27,9 @@ class ReadConfig:
     """most frames taken; of a longer clip a part of so many stands for it"""
     stabilise: bool = True
     """take out mild camera shake"""
+    crop: Literal["auto", "none"] = "auto"
+    """auto cuts off black bars beside the picture (letterbox, pillarbox), where nothing but the clip is given: hints
+    and files hold for the whole picture, bars and all"""
 
 
 @dataclass(frozen=True)

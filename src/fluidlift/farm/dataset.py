@@ -11,6 +11,7 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -201,6 +202,7 @@ def sample_of(folder: Path, row: dict[str, Any]) -> Sample:
 
 def _clip_of(place: Path, row: dict[str, Any]) -> np.ndarray | None:
     """The frames that make read; None where the clip is not there, or is another one."""
+    from fluidlift.io.bars import find_bars
     from fluidlift.io.hashes import file_hash
     from fluidlift.io.video import read_clip
 
@@ -208,9 +210,12 @@ def _clip_of(place: Path, row: dict[str, Any]) -> np.ndarray | None:
     if not path.is_file() or file_hash(path) != row["clip_sha256"]:
         return None
     read = read_manifest(place)["provenance"]["config"]["read"]
-    return read_clip(
-        path, start=read["start"], duration=read["duration"], max_size=read["max_size"], fps=read["fps"]
-    ).frames
+    decode = partial(
+        read_clip, path, start=read["start"], duration=read["duration"], max_size=read["max_size"], fps=read["fps"]
+    )
+    frames = decode().frames
+    bars = find_bars(frames) if read.get("crop") == "auto" else None
+    return frames if bars is None else decode(window=bars).frames
 
 
 def _film_of(place: Path, size: tuple[int, int]) -> np.ndarray:

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from fluidlift.errors import InputRejected
+from fluidlift.io.bars import Window
 from fluidlift.io.decode import Notes
 from fluidlift.io.limits import ReadLimits
 from fluidlift.io.pictures import fitted_size, resample_with_alpha, same_shape
@@ -52,6 +53,8 @@ class Wanted:
     """s"""
     max_size: int
     """px"""
+    window: Window | None = None
+    """the part of each picture that is kept; None: all of it"""
 
 
 class _InMemory:
@@ -81,6 +84,7 @@ class Collector:
 
     def __init__(self, wanted: Wanted, limits: ReadLimits, notes: Notes, store: FrameStore | None) -> None:
         self.name, self.start, self.end, self.max_size = wanted.name, wanted.start, wanted.end, wanted.max_size
+        self.window = wanted.window
         self.limits, self.notes = limits, notes
         self.in_memory = store is None
         self.store: FrameStore = store or _InMemory()
@@ -103,6 +107,9 @@ class Collector:
 
     def add(self, time: float, rgb: np.ndarray, alpha: np.ndarray | None, shape: tuple[int, int]) -> None:
         """Keep a frame; `shape` is its size (width, height) with square pixels."""
+        if self.window is not None:
+            rgb, alpha = self.window.of(rgb), None if alpha is None else self.window.of(alpha)
+            shape = self.window.size(shape)
         if self.size is None:
             self.size = fitted_size(shape, self.max_size)
             if min(self.size) < MIN_SIDE:

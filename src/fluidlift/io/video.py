@@ -21,6 +21,7 @@ import av.error
 import numpy as np
 
 from fluidlift.errors import InputRejected, require
+from fluidlift.io.bars import Window
 from fluidlift.io.collect import MIN_SIDE, Collector, FrameStore, Wanted
 from fluidlift.io.decode import (
     Notes,
@@ -55,6 +56,7 @@ def read_clip(
     fps: float | None = None,
     limits: ReadLimits | None = None,
     store: FrameStore | None = None,
+    window: Window | None = None,
 ) -> VideoClip:
     """Decode a clip, scaled down so that its long side has at most `max_size` px (area average).
 
@@ -67,6 +69,7 @@ def read_clip(
         limits: on frame size, number of frames and memory.
         store: where frames and alpha are collected, under the names decoded and alpha; None: in memory. In a store, the
             limit on memory does not count.
+        window: the part of each picture that is decoded; None: all of it.
 
     Returns:
         A clip whose `times` count from the first frame of the file.
@@ -81,7 +84,7 @@ def read_clip(
         raise InputRejected(f"a duration of {duration} s", "more than 0 seconds", "change --duration")
     require(max_size >= MIN_SIDE, f"max_size {max_size}", f"at least {MIN_SIDE} px")
     path, notes = Path(path), Notes()
-    wanted = Wanted(path.name, start, math.inf if duration is None else start + duration, max_size)
+    wanted = Wanted(path.name, start, math.inf if duration is None else start + duration, max_size, window)
     collector = Collector(wanted, limits, notes, store)
     if is_sequence(path):
         _read_sequence(path, fps, limits, collector, notes)

@@ -45,6 +45,11 @@ def stages_of(stages: tuple[str, ...], hints: ClipHints) -> tuple[str, ...]:
     return (*stages[:at], CORRECT, *stages[at:])
 
 
+def uncropped(config: JobConfig) -> JobConfig:
+    """The settings of a job on the whole picture: what is said and given in px of it, or written for it, stays true."""
+    return replace(config, read=replace(config.read, crop="none"))
+
+
 SAMPLE = 16
 """frames of a stretch at another time, beside those whose velocity is wanted: eight on either side are asked where
 these fail (`motion.reach` of six, and the flow of neighbours)"""

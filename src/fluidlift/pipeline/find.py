@@ -243,7 +243,7 @@ def find_hints(
     runner = Runner(folder, stages, progress=progress or Silence(), value_told=told, memory=memory)
     given = GivenFiles.of(inputs)
     with disk_errors(folder):
-        config = begin.within(runner, given.clip, config)
+        config = begin.within(runner, given.clip, begin.uncropped(config))
         seen = begin.look(runner, given, config, said=hints)
         found = runner.run(
             "view", view, *seen, GivenView.of(given, config), begin.geometry_settings(seen[0], config, hints)

@@ -85,6 +85,8 @@ def make(
         runner.warn(text)
     with gone_if_refused(runner, "motion"), writing(folder, "fluidlift make"):
         given = GivenFiles.of(inputs)
+        if hints != NOTHING_SAID or given != GivenFiles(given.clip):
+            config = begin.uncropped(config)
         config, others = begin.windows(runner, given.clip, config)
         lift = _lifted(runner, given, config, hints, others)
         frames = config.simulate.frames or len(lift.clip) - lift.geometry.rest_frame

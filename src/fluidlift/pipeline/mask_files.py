@@ -59,6 +59,7 @@ def find_masks(
     for text in warnings:
         runner.warn(text)
     with gone_if_refused(runner, "segment"):
+        config = begin.uncropped(config)
         read, _, segmentation = begin.look(runner, GivenFiles.of(inputs), config, hints)
         found = runner.run(
             "masks", write_masks, read, segmentation, undistorted=inputs.camera is not None,

@@ -69,7 +69,7 @@ def measure_motion(
     for text in warnings:
         runner.warn(text)
     with gone_if_refused(runner, "geometry"):
-        given = GivenFiles.of(inputs)
+        given, config = GivenFiles.of(inputs), begin.uncropped(config)
         seen = begin.look(runner, given, config)
         geometry = begin.shape(runner, seen, given, config)
         found = runner.run(

@@ -45,6 +45,7 @@ class ReadSettings:
     max_size: int
     fps: float
     stabilise: bool
+    crop: str
     poses: bool
     """whether the path of a camera that goes somewhere can be found: with the extra installed, it is read anew"""
     max_pixels: int = field(metadata=BESIDE)

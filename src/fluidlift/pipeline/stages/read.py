@@ -6,6 +6,7 @@ Frames go to disk as they are decoded and are mapped from there on: memory does 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -25,7 +26,14 @@ from fluidlift.types.fluid_masks import parts_of
 from fluidlift.types.stages import Read
 
 if TYPE_CHECKING:
+    from fluidlift.io.bars import Window
     from fluidlift.motion.moving_camera import Walking
+
+BARS_STAY = Notice(
+    "bars-stay",
+    "the clip has black bars beside its picture, which are taken for ground: make cuts them off where nothing but the "
+    "clip is given; else give a clip without them (ffmpeg -vf cropdetect tells where they are)",
+)
 
 
 def read(clip: GivenFile, camera: GivenFile | None, config: ReadSettings, *, work: Work) -> Read:
@@ -40,12 +48,14 @@ def read(clip: GivenFile, camera: GivenFile | None, config: ReadSettings, *, wor
     Raises:
         InputRejected: a clip that cannot be used.
     """
+    from fluidlift.io.bars import find_bars
     from fluidlift.io.limits import ReadLimits
     from fluidlift.io.sequences import is_sequence
     from fluidlift.io.video import read_clip
 
     scratch = work.scratch
-    found = read_clip(
+    decode = partial(
+        read_clip,
         clip.path,
         start=config.start,
         duration=config.duration,
@@ -54,6 +64,13 @@ def read(clip: GivenFile, camera: GivenFile | None, config: ReadSettings, *, wor
         limits=ReadLimits(max_pixels=config.max_pixels, max_frames=config.max_frames),
         store=scratch,
     )
+    found = decode()
+    bars = find_bars(found.frames)
+    if bars is not None and config.crop == "none":
+        found = replace(found, warnings=(*found.warnings, BARS_STAY))
+    elif bars is not None:
+        found = decode(window=bars)
+        found = replace(found, warnings=(*found.warnings, _cut_off(bars)))
     decoded = len(found)
     found = _without_distortion(found, None if camera is None else camera.path, scratch)
     found, kept = _without_repeats(found, scratch)
@@ -70,6 +87,16 @@ def read(clip: GivenFile, camera: GivenFile | None, config: ReadSettings, *, wor
     path = None if shake.path is None else shake.path[first:last]
     return Read(
         used, kept, decoded, shake.shake_px, shake.stabilised, shake.cuts, said, path, shake.view, shake.fluid_evidence
+    )
+
+
+def _cut_off(bars: Window) -> Notice:
+    wide = f"{100 * bars.left:.1f} to {100 * bars.right:.1f} % of its width"
+    high = f"{100 * bars.top:.1f} to {100 * bars.bottom:.1f} % of its height"
+    return Notice(
+        "bars-cut-off",
+        f"the black bars beside the picture are cut off: what is left is {wide} and {high}; --set read.crop=none keeps "
+        "all of it",
     )
 
 

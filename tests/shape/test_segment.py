@@ -544,3 +544,39 @@ def test_what_is_known_to_stand_counts_against_fluid_in_the_units_of_the_score(r
     free = np.abs(plain[:, right]) < 4.0  # the score ends at 12
     assert (told[:, right] - plain[:, right])[free] == pytest.approx(-2.4 / OF_SCORE, abs=1e-3)
     assert (told[:, right] > 0).sum() < (plain[:, right] > 0).sum()
+
+
+def sinking_column(rng: np.random.Generator, color: np.ndarray) -> tuple[np.ndarray, PixelFlow, np.ndarray]:
+    """A teal body with foam that is let go: its upper part, of a color of its own, sinks as a whole within ten of 40
+    frames, while what lies below spreads to the right all the time. Pictures, exact flow, and the first frame's mask."""
+    count = 40
+    pictures, flow = still_room(rng, frames=count), np.zeros((count - 1, HEIGHT, WIDTH, 2), np.float32)
+    above = color + 25.0 * texture(rng, (HEIGHT, WIDTH), sigma=1.5)[..., None]
+    first = np.zeros((HEIGHT, WIDTH), bool)
+    for t in range(count):
+        sunk, right = 3 * min(t, 10), 70 + 2 * t
+        upper, lower = (slice(30 + sunk, 65), slice(40, 70)), (slice(65, 100), slice(40, right))
+        foam = texture(rng, (HEIGHT, WIDTH), sigma=1.5)[..., None]
+        pictures[t][lower] = (np.array([30.0, 120.0, 125.0]) + 40.0 * foam)[lower]
+        pictures[t][upper] = shift(above, (sunk, 0, 0), order=1)[upper]
+        if t < count - 1:
+            flow[t][lower] = rng.normal(scale=2.0, size=(35, right - 40, 2))
+            flow[t][upper] = (0.0, 3.0) if t < 10 else (0.0, 0.0)
+        if t == 0:
+            first[upper] = first[lower] = True
+    return pictures, PixelFlow(flow, np.ones(flow.shape[:3], np.float32)), first
+
+
+def test_what_leaves_as_a_whole_in_the_colors_of_the_fluid_is_fluid():
+    pictures, flow, first = sinking_column(np.random.default_rng(5), np.array([30.0, 120.0, 125.0]))
+    labels = segment(clip_of(pictures), flow).labels
+    top = np.s_[34:60, 44:66]
+    assert first[top].all() and (labels[0][top] == Label.FLUID).mean() > 0.9
+    assert (labels[-1][34:55, 44:66] == Label.FLUID).mean() < 0.05
+
+
+def test_what_leaves_as_a_whole_in_other_colors_is_none():
+    pictures, flow, _ = sinking_column(np.random.default_rng(5), np.array([205.0, 150.0, 120.0]))  # a hand
+    labels = segment(clip_of(pictures), flow).labels
+    assert (labels[0][34:55, 44:66] == Label.FLUID).mean() < 0.1
+    assert (labels[0][74:92, 44:66] == Label.FLUID).mean() > 0.9

@@ -12,6 +12,7 @@ from scipy.ndimage import convolve1d, gaussian_filter
 from fluidlift.shape.evidence import Evidence
 from fluidlift.shape.min_cut import geodesic_distance, spread
 from fluidlift.shape.presence import Presence
+from fluidlift.shape.region import clean_region
 
 DECISIVE = 3.5
 """log odds at which colour alone is held to say no more"""
@@ -41,6 +42,10 @@ LEAST_SEEN = 3
 """frames of a place without fluid from which its picture is known"""
 TOLD = 1.0
 """log odds by which colours tell which of two pictures of a place is the fluid: one is three times as likely"""
+MEAN = 5
+"""px of the working picture over which odds of colours are averaged: the foam on water has specks of any colour"""
+BESIDE = 0.05
+"""part of the longer side: so near to what is carried, what moves may be a part of it"""
 RIM = 0.012
 """part of the longer side: so far a steady column is thinner, and nearer to its ground's colours, than its core"""
 
@@ -196,6 +201,31 @@ def colour_test(moving: np.ndarray, around: np.ndarray) -> tuple[Callable[[np.nd
         return trust * np.clip(np.log((fluid[bins] + rare) / (around[bins] + rare)), -DECISIVE, DECISIVE)
 
     return like_fluid, trust
+
+
+def in_own_colours(evidence: Evidence, score: np.ndarray, presence: Presence, where: np.ndarray) -> np.ndarray:
+    """bool [h,w]: places that were seen in colours that the moving fluid has, and nothing around it.
+
+    The top of a body of liquid that is let go leaves as a whole, in one direction and for good: by its motion it could
+    be a hand. A hand has other colours than what it pours.
+
+    Args:
+        evidence: of the clip.
+        score: float32 [h,w], log odds of fluid by change and motion.
+        presence: of what has a score above 0.
+        where: bool [h,w], the places that are asked for.
+    """
+    domain = spread(clean_region(score > -1.0), 0.01 * max(score.shape)) | where
+    moves = presence.active & ~spread(where, BESIDE * max(score.shape))  # its rim has its colours, and a score above 0
+    if not where.any() or not moves.any() or domain.all():
+        return np.zeros_like(where)
+    pictures = np.stack([evidence.source[t] for t in presence.picked]).astype(np.float32)
+    moving, around = colour_histogram(pictures[moves]), colour_histogram(pictures[:, ~domain])
+    like_fluid, trust = colour_test(moving, around)
+    if trust <= OWN:
+        return np.zeros_like(where)
+    likest = np.max([cv2.blur(like_fluid(p).astype(np.float32), (MEAN, MEAN)) for p in pictures], axis=0)
+    return where & (likest > SURE)
 
 
 def smooth_ground(

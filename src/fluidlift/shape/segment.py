@@ -21,6 +21,7 @@ import numpy as np
 from fluidlift.errors import InputRejected, require
 from fluidlift.messages import Notice
 from fluidlift.shape.advancing import advancing_labels
+from fluidlift.shape.background import in_own_colours
 from fluidlift.shape.carried_layers import by_either, carried_layers
 from fluidlift.shape.colour_growth import grown_from_streams, with_quiet_water
 from fluidlift.shape.evidence import Evidence, PairReader, fluid_score, gather_evidence, pair_reader, solids_by_flow
@@ -239,7 +240,11 @@ def segment(
     if grown is None and known.horizon is None and grows(presence, score > 2.0):
         told = heed(clicks, evidence, score, score > 0.0)[1] if clicks else np.zeros_like(score)
         # a jet that sways with its jug changes as its flow says too: where all clues together speak for fluid, it is
-        barred = (solids | (solids_by_flow(evidence) & (score <= 0.0))) & (told <= 0.0)
+        carried = solids_by_flow(evidence) & (score <= 0.0)
+        fluid = in_own_colours(evidence, score, presence, carried & ~solids)
+        barred = (solids | (carried & ~fluid)) & (told <= 0.0)
+        # where its colours speak for it, motion no longer speaks against it: how it differs from what is behind decides
+        score = np.where(fluid, np.maximum(score, np.float32(0.0)), score)
         found = advancing_labels(evidence, score, presence, np.where(barred, -12.0, told))
     else:
         found = staying_labels(known, clicks)

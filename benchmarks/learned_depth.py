@@ -111,7 +111,7 @@ def looked(truth: Truth, work: Path, seed: int, way: str) -> Sighted:
     seen = begin.look(runner, given, config)
 
     def model(name: str, choice: Any) -> DepthModel:
-        frames = depths._frames(len(seen[0].clip), model.start, config.depth.frames)
+        frames = depths.spread_frames(len(seen[0].clip), model.start, config.depth.frames)
         return Spoilt(truth, frames, seed, way == "with normals")
 
     def pictures(read, given, camera, start, work):

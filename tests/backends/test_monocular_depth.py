@@ -84,7 +84,7 @@ def test_without_weights_every_model_says_what_it_needs(name):
 
 
 def test_other_names_are_a_mistake():
-    with pytest.raises(ValueError, match="moge, depth-anything"):
+    with pytest.raises(ValueError, match="moge, moge-onnx, depth-anything"):
         make_depth_estimator("midas", ModelChoice("w"))
 
 

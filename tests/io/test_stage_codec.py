@@ -155,6 +155,8 @@ VALUES = {
     "Segmentation": segmentation,
     "Bodies": lambda: stages.Bodies("trellis", (1, 2)),
     "DepthGuess": lambda: stages.DepthGuess(floats(2, H, W), "metres", 55.0),
+    "ViewGuesses": lambda: stages.ViewGuesses("geocalib", *floats(3, 2), floats(2, 3), floats(2)),
+    "ViewGuesses of nothing": lambda: stages.ViewGuesses("geocalib", *floats(3, 0), floats(0, 3), floats(0)),
     "Geometry": lambda: geometry(True),
     "Geometry without a height": lambda: geometry(False),
     "Refined": refined,

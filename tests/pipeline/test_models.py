@@ -25,10 +25,10 @@ from fluidlift.errors import InputRejected, MissingPackage
 from fluidlift.io.asset_folder import read_manifest
 from fluidlift.messages import code_of, from_plain
 from fluidlift.pipeline import Inputs
-from fluidlift.pipeline.inputs import Weights
+from fluidlift.pipeline.inputs import GivenFile, GivenFiles, Weights
 from fluidlift.pipeline.known_camera import USUAL_SPREAD, with_model_lens
 from fluidlift.pipeline.models import require_use, used_models, with_models
-from fluidlift.pipeline.settings import FlowSettings, SegmentSettings
+from fluidlift.pipeline.settings import DepthModel, FlowSettings, SegmentSettings
 from fluidlift.pipeline.stages.flow import flow_method
 from fluidlift.types import PinholeCamera
 
@@ -100,6 +100,33 @@ def table(monkeypatch, tmp_path, stick):
     monkeypatch.setattr(model_table, "MODELS", cards)
     monkeypatch.setattr("fluidlift.pipeline.models.MODELS", cards)
     return {c.name: c for c in cards}
+
+
+@pytest.fixture
+def seeing(table, stick, monkeypatch):
+    """A model of the view beside the others: a small GeoCalib, whose field is that of a camera that looks 70 degrees
+    down and is turned by 4."""
+    from fluidlift.backends.geocalib import GeoCalib
+    from fluidlift.backends.geocalib_network import GeoCalibNetwork, NetworkShape
+    from fluidlift.backends.perspective_field import field_of_camera
+
+    torch.manual_seed(0)
+    state = GeoCalibNetwork(NetworkShape((8, 8, 8, 8), (1, 1, 1, 1), (8, 8, 8, 8), 8, 8)).state_dict()
+    torch.save({"model": state}, stick / "geocalib-pinhole.tar")
+    data = (stick / "geocalib-pinhole.tar").read_bytes()
+    file = ModelFile("geocalib-pinhole.tar", "https://x.y/z", len(data), hashlib.sha256(data).hexdigest())
+    card = ModelCard("view-1", "view-1", ("tilt",), ("view model", "geocalib"), "Its terms.", "allowed", "https://x.y",
+                     (file,))  # fmt: skip
+    monkeypatch.setattr(model_table, "MODELS", (*model_table.MODELS, card))
+    monkeypatch.setattr("fluidlift.pipeline.models.MODELS", model_table.MODELS)
+
+    def field(self, image):
+        height, width = image.shape[:2]
+        return field_of_camera(70.0, 4.0, 1.1 * width, (width, height)), 1.0
+
+    monkeypatch.setattr(GeoCalib, "field", field)
+    get_model(card, Wanted(stick))
+    return file.sha256
 
 
 def bring(table, stick, *names):
@@ -301,3 +328,61 @@ def test_a_models_lens_counts_by_how_sure_it_is():
     assert assumed.focal[0] == assumed.focal[1] == pytest.approx(model, rel=0.03)  # the usual view says next to nothing
     measured = with_model_lens(usual, 0.01, 70.0)
     assert measured.focal[0] == pytest.approx(usual.focal[0], rel=0.01)  # the path of the camera says it better
+
+
+def test_a_model_of_the_view_has_something_to_do_where_the_tilt_is_open(seeing, tmp_path):
+    chosen = with_models(JobConfig(), CLIP, "auto")
+    assert (chosen.config.view.model, chosen.config.view.weights) == ("geocalib", "model:view-1")
+    assert any(line.startswith("tilt by view-1") for line in chosen.told)
+    lens, pose = tmp_path / "lens.json", tmp_path / "pose.json"
+    facts = {"width": 96, "height": 64, "K": [[90, 0, 48], [0, 90, 32], [0, 0, 1]]}
+    lens.write_text(json.dumps(facts), encoding="utf-8")
+    pose.write_text(json.dumps(facts | {"R": np.eye(3).tolist(), "t": [0, 0, 0]}), encoding="utf-8")
+    assert with_models(JobConfig(), replace(CLIP, camera=lens), "auto").config.view.model == "geocalib"
+    assert with_models(JobConfig(), replace(CLIP, camera=pose), "auto").config.view.model == "none"
+    with pytest.raises(InputRejected, match="together with --camera"):
+        with_models(JobConfig(), replace(CLIP, camera=pose), "view-1")
+    assert used_models(chosen.config, replace(CLIP, camera=pose)) == ()
+    told = build_config(overrides=["shape.pitch=20", "shape.roll=0", "shape.fov=50"])
+    assert with_models(told, CLIP, "auto").config == told
+    with pytest.raises(InputRejected, match="--pitch, --roll and --fov"):
+        with_models(told, CLIP, "view-1")
+
+
+def test_an_asset_counts_what_a_model_of_the_view_says(capsys, seeing, stream_clip, hasty, tmp_path):
+    def up_of(out, *more):
+        job = ["make", str(stream_clip), "-o", str(out), "--kind", "stream", *hasty, *more]
+        assert main(job) in (DONE, WITH_WARNINGS)
+        return read_manifest(out)
+
+    alone = up_of(tmp_path / "alone.fluid")["metrics"]["up"]
+    manifest = up_of(tmp_path / "x.fluid", "--models", "view-1")
+    up = manifest["metrics"]["up"]
+    assert "tilt by view-1" in capsys.readouterr().err
+    assert "geocalib (70 degrees, within 5)" in up["source"] and "geocalib" not in alone["source"]
+    assert abs(up["pitch"] - 70.0) < abs(alone["pitch"] - 70.0) and up["error"] < alone["error"]
+    assert up["roll"] == pytest.approx(4.0, abs=2.0) and abs(alone["roll"]) < 2.0
+    (model,) = manifest["provenance"]["models"]
+    assert model["for"] == "tilt" and model["files"] == {"geocalib-pinhole.tar": seeing}
+    assert main(["make", str(stream_clip), "-o", str(tmp_path / "y.fluid"), "--set", "view.model=geocalib"]) == REJECTED
+    assert "without its weights" in capsys.readouterr().err
+
+
+def test_a_model_of_depth_in_another_python_needs_no_package_here(table, stick, monkeypatch):
+    """What it lacks there is told there."""
+    lacking = replace(table["depth-1"], packages=("no_such_package",))
+    monkeypatch.setattr(model_table, "MODELS", (lacking,))
+    monkeypatch.setattr("fluidlift.pipeline.models.MODELS", (lacking,))
+    bring({"depth-1": lacking}, stick, "depth-1")
+    with pytest.raises(MissingPackage, match="pip install it"):
+        with_models(JobConfig(), CLIP, "depth-1")
+    elsewhere = build_config(overrides=["depth.python=/somewhere/bin/python"])
+    for asked in ("depth-1", "auto"):
+        chosen = with_models(elsewhere, CLIP, asked).config
+        assert (chosen.depth.model, chosen.depth.python) == ("moge", "/somewhere/bin/python")
+    given = GivenFiles(GivenFile(CLIP.clip, "0"))
+    there, here = (
+        DepthModel.of(given, replace(chosen, depth=replace(chosen.depth, python=p))) for p in ("~/x/bin/python", None)
+    )
+    assert there is not None and here is not None and here.python is None
+    assert there.python == Path.home() / "x" / "bin" / "python"

@@ -548,7 +548,7 @@ def test_what_is_known_to_stand_counts_against_fluid_in_the_units_of_the_score(r
 
 def sinking_column(rng: np.random.Generator, color: np.ndarray) -> tuple[np.ndarray, PixelFlow, np.ndarray]:
     """A teal body with foam that is let go: its upper part, of a color of its own, sinks as a whole within ten of 40
-    frames, while what lies below spreads to the right all the time. Pictures, exact flow, and the first frame's mask."""
+    frames, while what lies below spreads to the right. Pictures, exact flow, and the mask of the first frame."""
     count = 40
     pictures, flow = still_room(rng, frames=count), np.zeros((count - 1, HEIGHT, WIDTH, 2), np.float32)
     above = color + 25.0 * texture(rng, (HEIGHT, WIDTH), sigma=1.5)[..., None]

@@ -31,6 +31,8 @@ Modules of the face:
     registry           Registry of the back ends that are chosen by name: one table, by what they are for
     splashsurf         Surfaces of particles by splashsurf: marching cubes on the SPH density, weighted Laplacian
                        smoothing (Loeschner, Boettcher, Jeske and Bender 2023)
+    view_model         What a learned model of the view is (which way is up, how wide is the picture), what it says,
+                       and which there are
     warp_liquid        The whole substep of a liquid on a Warp device: particles and grid stay there from step to
                        step
     warp_particles     Particle-grid transfers by NVIDIA Warp, on the GPU or (slow, for tests) on the CPU
@@ -40,5 +42,5 @@ __all__ = [
     "colmap_poses", "depth_model", "generator_card", "generator_licence", "generator_process", "generators",
     "gsplat_rasterizer", "learned", "mitsuba_renderer", "mitsuba_scene", "model_cache", "model_card",
     "model_download", "model_get", "model_table", "monocular_depth", "registry",
-    "splashsurf", "warp_liquid", "warp_particles",
+    "splashsurf", "view_model", "warp_liquid", "warp_particles",
 ]  # fmt: skip

@@ -94,12 +94,15 @@ class DepthAnything3(DepthModel):
         try:
             from depth_anything_3.api import DepthAnything3 as Network  # pyright: ignore[reportMissingImports]
         except ModuleNotFoundError as error:
-            raise MissingPackage(f"{error.name} is not installed. Needed: for Depth Anything 3. Do: {DA3}.") from None
+            raise MissingPackage(
+                f"{error.name} is not installed. Needed: for Depth Anything 3. Do: {DA3}, in an environment of its "
+                "own, whose Python --set depth.python=PATH names."
+            ) from None
         except (ImportError, RuntimeError, OSError) as error:
             reason = str(error).partition("\n")[0]
             raise MissingPackage(
                 f"Depth Anything 3's package does not start ({reason}). Needed: packages that fit each other. "
-                "Do: install it in an environment of its own, and pass its depth with --depth."
+                "Do: install it in an environment of its own, and name its Python with --set depth.python=PATH."
             ) from None
         folder = Path(weights)
         if not allow_download and not (folder / "model.safetensors").is_file():

@@ -38,6 +38,7 @@ class _Hub(NamedTuple):
 
 _MOGE_SMALL = _Hub("Ruicheng/moge-2-vits-normal", "679230677b4d282c6f304189a93e98e14f085902")
 _MOGE_BASE = _Hub("Ruicheng/moge-2-vitb-normal", "54ad3a693e61907ea4633d13dec6ee682fa09419")
+_MOGE_ONNX = _Hub("Ruicheng/moge-2-vits-normal-onnx", "e50ffda41565591092adea54c6ac83d6212e1e23")
 _SAM2 = _Hub("facebook/sam2.1-hiera-tiny", "de431c4043854a71d8101e17995dfe596bf101a5")
 _SEA_RAFT = _Hub("MemorySlices/Tartan-C-T-TSKH-spring540x960-M", "eb97ef34ba5d856c3fa2cdcd073150c057ac8b69")
 _DA2 = _Hub("depth-anything/Depth-Anything-V2-Small-hf", "5426e4f0f36572d16453bbda7a8389317b1bef99")
@@ -68,6 +69,26 @@ MODELS: tuple[ModelCard, ...] = (
             "model.pt", 419_110_160, "16b8110e86d5dc5a849db120ca96ef3a223fd30b0c9146d1d81db504073da5f6"
         ),),
         ("moge",), MOGE, notes=("As the small one, with 104 million parameters.",),
+    ),
+    ModelCard(
+        "moge-2-vits-normal-onnx", "MoGe-2, small, with normals, as an ONNX file (Wang et al. 2025)",
+        ("depth", "tilt", "focal length"), ("depth model", "moge-onnx"), _MOGE_TERMS, "allowed", _MOGE_ONNX.page,
+        (_MOGE_ONNX.file(
+            "model.onnx", 140_852_051, "24eacb5dc7a2c54c7bc98f7de085ffbed79ad006ea5b664c2c2cdc02ff3a52f0"
+        ),),
+        ("onnxruntime",), "pip install 'fluidlift[onnx]'",
+        notes=("The small one by ONNX Runtime, which comes from the package registry. Its page names no licence; that "
+               "of the same weights as a checkpoint is MIT.",),
+    ),
+    ModelCard(
+        "geocalib", "GeoCalib (Veicht et al. 2024)", ("tilt", "focal length"), ("view model", "geocalib"),
+        "The authors' code is Apache-2.0, and none of it is needed; their weights are CC BY 4.0: every use is allowed, "
+        "with their names (Veicht, Sarlin, Lindenberger, Pollefeys: GeoCalib, ECCV 2024).",
+        "allowed", "https://github.com/cvg/GeoCalib",
+        (ModelFile("geocalib-pinhole.tar", "https://github.com/cvg/GeoCalib/releases/download/v1.0/geocalib-pinhole.tar",
+                   116_074_121, "86d6aeacd8bbd974c59ce39f61854e00d36911c732ad89be471476fd708722ac"),),
+        cpu="5 s a picture (one core)",
+        notes=("One more witness of how the camera stands, for every kind of fluid, beside any model of depth.",),
     ),
     ModelCard(
         "depth-anything-v2-small", "Depth Anything V2, small (Yang et al. 2024)", ("depth",),

@@ -20,11 +20,15 @@ def make_depth_estimator(name: str, choice: ModelChoice) -> DepthModel:
         FluidliftError: no such device.
         ValueError: another name.
     """
-    kind = class_of(DEPTH, name)
+    kind = class_of(DEPTH, name)  # of another Python: which imports none of its packages yet
     if choice.weights is None:
         raise InputRejected(
             f"no weights for {name}",
             "a file or folder with them",
             "fluidlift models get NAME, or name a file of your own (docs/depth.md)",
         )
+    if choice.python is not None:
+        from fluidlift.backends.depth_process import DepthProcess
+
+        return DepthProcess(name, choice)
     return kind(choice.weights, device=choice.device, allow_download=choice.allow_download, announce=choice.announce)

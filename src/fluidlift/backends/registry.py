@@ -14,9 +14,11 @@ BACK_ENDS: dict[str, dict[str, str]] = {
     "flow method": {"raft": "torchvision_raft:TorchvisionRaft", "sea-raft": "sea_raft:SeaRaft"},
     "mask method": {"sam2": "sam2_video:Sam2Video", "sam3": "sam3_video:Sam3Video"},
     "depth model": {
-        "moge": "moge_depth:MogeDepth", "depth-anything": "depth_anything:DepthAnything",
+        "moge": "moge_depth:MogeDepth", "moge-onnx": "moge_onnx:MogeOnnx",
+        "depth-anything": "depth_anything:DepthAnything",
         "depth-anything-3": "depth_anything:DepthAnything3", "depth-pro": "depth_pro:DepthPro",
     },
+    "view model": {"geocalib": "geocalib:GeoCalib"},
     "generator": {
         "triplane-gaussian": "triplane_gaussian:TriplaneGaussianGenerator", "trellis": "trellis:TrellisGenerator",
         "triposplat": "triposplat:TripoSplatGenerator", "lgm": "lgm:LgmGenerator", "sharp": "sharp:SharpGenerator",
@@ -37,6 +39,10 @@ class ModelChoice:
     """whether weights may be fetched"""
     announce: Announce = say
     """is told the licence before the weights are touched"""
+    python: Path | None = None
+    """of the environment in which a model of depth is installed; None: this one"""
+    seconds: float = 600.0
+    """that one picture may take there, the loading of the weights with the first"""
 
 
 def names(purpose: str) -> tuple[str, ...]:

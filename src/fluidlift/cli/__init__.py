@@ -196,7 +196,7 @@ def _make_one(c: Make) -> int:
     config, hints = _config_of(c)
     b = c.body
     files = {"mask": c.input.mask, "depth": c.input.depth, "geometry": b.geometry_from, "flow": c.input.flow}
-    config = _with_models(config, c.clip, b.models, files)
+    config = _with_models(config, c.clip, b.models, files | {"camera": c.input.camera})
     if c.settings.print_config:
         import yaml
 
@@ -444,10 +444,10 @@ def _motion(c: Motion) -> int:
         "read.start": p.start, "read.duration": p.duration, "read.fps": p.fps, "read.max_size": c.max_size,
         "generate.use": c.learned.use,
     }  # fmt: skip
-    _require_sections(c.set, ("read", "segment", "shape", "depth", "motion"))
+    _require_sections(c.set, ("read", "segment", "shape", "depth", "view", "motion"))
     config = build_config(None, c.config, c.set, flat, base=LONGEST)
     files = {"mask": c.input.mask, "depth": c.input.depth, "flow": c.input.flow}
-    config = _with_models(config, c.clip, c.learned.models, files)
+    config = _with_models(config, c.clip, c.learned.models, files | {"camera": c.input.camera})
     inputs = Inputs(c.clip, camera=c.input.camera, **files)
     with shown_progress() as progress:
         found = measure_motion(

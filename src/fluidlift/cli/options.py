@@ -89,7 +89,7 @@ class Learned:
 class Body(Learned):
     """Learned models, or a body that something else made."""
 
-    depth_model: Literal["none", "moge", "depth-anything", "depth-anything-3", "depth-pro"] | None = None
+    depth_model: Literal["none", "moge", "moge-onnx", "depth-anything", "depth-anything-3", "depth-pro"] | None = None
     """learned depth, moge advised; it needs --depth-weights (docs/depth.md)"""
     depth_weights: Path | None = None
     """file or folder of the weights of --depth-model, or model:NAME of your cache"""

@@ -18,9 +18,11 @@ from fluidlift.config.sections import (
     ShapeConfig,
     ShowConfig,
     SimulateConfig,
+    ViewConfig,
 )
 
 __all__ = [
     "PRESETS", "RANGES", "DepthConfig", "FitConfig", "GenerateConfig", "JobConfig", "MotionConfig",
-    "ReadConfig", "SegmentConfig", "ShapeConfig", "ShowConfig", "SimulateConfig", "build_config", "of_asset",
+    "ReadConfig", "SegmentConfig", "ShapeConfig", "ShowConfig", "SimulateConfig", "ViewConfig", "build_config",
+    "of_asset",
 ]  # fmt: skip

@@ -56,6 +56,8 @@ RANGES: dict[str, tuple[float, float]] = {
     "shape.longest_union": (1, 1000),
     "depth.frames": (1, 1000),
     "depth.scale": (1e-9, 1e9),
+    "depth.seconds": (0.01, 1e7),
+    "view.frames": (1, 1000),
     "generate.frame_seconds": (0.01, 1e7),
     "motion.flow_scale": (-1e9, 1e9),
     "motion.half_window": (0, 50),

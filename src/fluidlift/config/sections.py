@@ -70,7 +70,7 @@ class ShapeConfig:
 class DepthConfig:
     """Depth from a file (`--depth`) or from a learned model."""
 
-    model: Literal["none", "moge", "depth-anything", "depth-anything-3", "depth-pro"] = "none"
+    model: Literal["none", "moge", "moge-onnx", "depth-anything", "depth-anything-3", "depth-pro"] = "none"
     """which model looks at the pictures; they need weights"""
     weights: str | None = None
     """file or folder (or name on the hub, where a download is allowed) of the weights of a model"""
@@ -78,12 +78,30 @@ class DepthConfig:
     """where a model runs: cpu, or cuda"""
     download: bool = False
     """whether weights may be fetched"""
+    python: str | None = None
+    """Python of the environment in which a model is installed, where it cannot be in this one; none: this one"""
+    seconds: float = 600.0
+    """s that one picture may take there, the loading of the weights with the first"""
     frames: int = 7
     """pictures that a model looks at; their median counts"""
     holds: Literal["auto", "metres", "relative", "disparity"] = "auto"
     """what a depth file holds: metres, depth up to a factor, or inverse depth up to factor and offset; auto: metres"""
     scale: float | None = None
     """m per stored unit of a depth file; None: 0.001 (millimetres) for 16-bit pictures, 1 for floats"""
+
+
+@dataclass(frozen=True)
+class ViewConfig:
+    """Tilt and focal length of the camera by a learned model, as one more witness."""
+
+    model: Literal["none", "geocalib"] = "none"
+    """which model looks at the pictures; it needs weights"""
+    weights: str | None = None
+    """file or folder of its weights, or model:NAME of the cache"""
+    device: str = "cpu"
+    """where it runs: cpu, or cuda"""
+    frames: int = 5
+    """pictures that it looks at; their median counts, and their spread"""
 
 
 @dataclass(frozen=True)
@@ -237,6 +255,7 @@ class JobConfig:
     read: ReadConfig = field(default_factory=ReadConfig)
     shape: ShapeConfig = field(default_factory=ShapeConfig)
     depth: DepthConfig = field(default_factory=DepthConfig)
+    view: ViewConfig = field(default_factory=ViewConfig)
     segment: SegmentConfig = field(default_factory=SegmentConfig)
     generate: GenerateConfig = field(default_factory=GenerateConfig)
     motion: MotionConfig = field(default_factory=MotionConfig)

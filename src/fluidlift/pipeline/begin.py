@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected
-from fluidlift.pipeline import depths, given_body
+from fluidlift.pipeline import depths, given_body, views
 from fluidlift.pipeline.hints import NO_HINTS, Hints, laid_on, require_no_contradiction, require_possible
 from fluidlift.pipeline.inputs import GivenFile, GivenFiles
 from fluidlift.pipeline.runner import Runner
@@ -106,6 +106,7 @@ def look(
         InputRejected: an input that cannot be used.
     """
     depths.require_weights(config.depth)
+    views.require_weights(config.view)
     require_no_contradiction(said, config, given)
     mask, finder = GivenMask.of(given, config), SegmentSettings.of(config)
     clip = runner.run("read", read, given.clip, given.camera, ReadSettings.of(config))

@@ -74,7 +74,7 @@ def pictures_of(
         return _from_file(read, given.depth, start)
     if given.model is None:
         return None
-    pick = _frames(len(read.clip), start, given.model.frames)
+    pick = spread_frames(len(read.clip), start, given.model.frames)
     found = work.part("depth", depth_by_model, read, given.model, pick, camera)
     return DepthPictures(
         np.asarray(found.values),
@@ -117,7 +117,8 @@ def require_file(read: Read, given: GivenDepth) -> None:
     _from_file(read, given, 0)
 
 
-def _frames(count: int, start: int, most: int) -> list[int]:
+def spread_frames(count: int, start: int, most: int) -> list[int]:
+    """Numbers of at most `most` frames, evenly from `start` to the end of a clip of `count`."""
     return [int(t) for t in np.unique(np.linspace(start, count - 1, min(most, count - start)).round())]
 
 
@@ -137,7 +138,7 @@ def _from_file(read: Read, given: GivenDepth, start: int) -> DepthPictures:
                 "cut it as the clip is cut",
             )  # fmt: skip
         values = values[kept]
-    pick = _frames(len(clip), start, given.frames)
+    pick = spread_frames(len(clip), start, given.frames)
     return DepthPictures(values[pick], tuple(pick), holds, "depth file", FILE_FLOOR)
 
 
@@ -146,7 +147,9 @@ def depth_by_model(
 ) -> DepthGuess:
     """What a learned model says of some frames, one after the other."""
     weights = None if model.weights is None else model.weights.name
-    estimator = make_depth_estimator(model.model, ModelChoice(weights, model.device, model.download))
+    estimator = make_depth_estimator(
+        model.model, ModelChoice(weights, model.device, model.download, python=model.python, seconds=model.seconds)
+    )
     guesses: list[Guess] = []
     for t in frames:
         guesses.append(estimator.guess(np.ascontiguousarray(read.clip.frames[t]), camera))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -35,7 +36,7 @@ def lens_is_known(given: GivenView, fov: float | None) -> bool:
 
 def known_camera(given: GivenView, fov: float | None, size: tuple[int, int]) -> tuple[PinholeCamera, bool]:
     """The camera file's camera, or one from the field of view; and whether its pose is known."""
-    from fluidlift.io.images import read_camera, read_json
+    from fluidlift.io.images import read_camera
 
     bodies = None if given.bodies is None else given.bodies.path
     if bodies is not None and given_body.note_of(bodies) is None:
@@ -46,8 +47,19 @@ def known_camera(given: GivenView, fov: float | None, size: tuple[int, int]) -> 
 
         return PinholeCamera.from_fov(fov or lens_field_of_view(given.clip.path) or USUAL_FIELD_OF_VIEW, size), False
     camera = read_camera(given.camera.path, size)
-    data = read_json(given.camera.path, "camera file")
-    return camera, "R" in data or "frames" in data
+    return camera, tells_pose(given.camera.path)
+
+
+def tells_pose(path: Path) -> bool:
+    """Whether a camera file says where the camera stands, and not its lens alone.
+
+    Raises:
+        InputRejected: it cannot be read.
+    """
+    from fluidlift.io.images import read_json
+
+    data = read_json(path, "camera file")
+    return "R" in data or "frames" in data
 
 
 def with_model_lens(camera: PinholeCamera, error: float, field_of_view: float) -> PinholeCamera:

@@ -16,6 +16,7 @@ from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected, MissingPackage
 from fluidlift.messages import Notice
 from fluidlift.pipeline.inputs import OF_CACHE, Inputs, Weights
+from fluidlift.pipeline.known_camera import tells_pose
 
 NONE, AUTO = "none", "auto"
 
@@ -39,6 +40,7 @@ TASKS = (
     _Task("masks", "segment", "method", "mask method", ("mask",)),
     _Task("depth", "depth", "model", "depth model", ("depth", "geometry")),
     _Task("flow", "motion", "method", "flow method", ("flow",)),
+    _Task("tilt", "view", "model", "view model", ("camera",)),
 )
 PLACES = tuple(task.word for task in TASKS)
 """all that a job with every stage can take"""
@@ -100,8 +102,8 @@ def with_models(config: JobConfig, inputs: Inputs, asked: str, *, places: tuple[
     Args:
         config: of the job, as it was asked for: what it names already stays.
         inputs: its files: what is given is not estimated.
-        asked: none; auto: for masks, depth and flow the first model of the table that is in the cache and can run; or
-            names with commas between them.
+        asked: none; auto: for masks, depth, flow and tilt the first model of the table that is in the cache and can
+            run; or names with commas between them.
         places: what the stages of this job can take, of `PLACES`.
 
     Raises:
@@ -129,7 +131,7 @@ def with_models(config: JobConfig, inputs: Inputs, asked: str, *, places: tuple[
             raise InputRejected(
                 f"the model {name} is not in the cache", "one that is", f"fluidlift models get {name}"
             )  # fmt: skip
-        if lacking := lacking_packages(card):
+        if lacking := _lacking(card, config):
             raise MissingPackage(f"{', '.join(lacking)} is not installed. Needed: for {name}. Do: {card.install}.")
         done[task.word] = name
         config = _taken(config, task, card)
@@ -146,7 +148,7 @@ def used_models(config: JobConfig, inputs: Inputs) -> tuple[UsedModel, ...]:
     for task in TASKS:
         section = getattr(config, task.section)
         method = getattr(section, task.option)
-        if not _learned(task, method) or _given(task, inputs) is not None:
+        if not _learned(task, method) or _settled(task, config, inputs) is not None:
             continue
         weights = Weights.of(section.weights)
         if weights is None:
@@ -197,7 +199,7 @@ def _automatic(config: JobConfig, inputs: Inputs, places: tuple[str, ...]) -> Ch
             if config.generate.use == "commercial" and card.terms != "allowed":
                 told.append(f"{card.name} is left out: its terms ({card.terms}) and --use commercial")
                 continue
-            if lacking := lacking_packages(card):
+            if lacking := _lacking(card, config):
                 told.append(f"{card.name} is left out: {', '.join(lacking)} is not installed ({card.install})")
                 continue
             config = _taken(config, task, card)
@@ -206,12 +208,20 @@ def _automatic(config: JobConfig, inputs: Inputs, places: tuple[str, ...]) -> Ch
     return Chosen(config, tuple(told) or ("no learned model is in the cache that could help here: fluidlift models",))
 
 
+def _lacking(card: ModelCard, config: JobConfig) -> list[str]:
+    """Packages that a model lacks; of one that runs in another Python that is told there."""
+    elsewhere = config.depth.python is not None and card.back_end[0] == "depth model"
+    return [] if elsewhere else lacking_packages(card)
+
+
 def _task_of(card: ModelCard) -> _Task:
     for task in TASKS:
         if task.purpose == card.back_end[0]:
             return task
     raise InputRejected(
-        f"{card.name} is a generator", "a model for masks, depth or flow", f"--generator {card.name}, without --models"
+        f"{card.name} is a generator",
+        "a model for masks, depth, flow or tilt",
+        f"--generator {card.name}, without --models",
     )
 
 
@@ -228,15 +238,23 @@ def _learned(task: _Task, method: str) -> bool:
     return method in names(task.purpose)
 
 
-def _given(task: _Task, inputs: Inputs) -> str | None:
-    return next((name for name in task.files if getattr(inputs, name) is not None), None)
+def _settled(task: _Task, config: JobConfig, inputs: Inputs) -> str | None:
+    """What leaves a model of this task nothing to do, as an option."""
+    given = next((name for name in task.files if getattr(inputs, name) is not None), None)
+    if task.word == "tilt":
+        if given is not None and not (inputs.camera is not None and tells_pose(inputs.camera)):
+            given = None  # a lens alone leaves the tilt open
+        s = config.shape
+        if given is None and None not in (s.pitch, s.roll, s.fov):
+            return "--pitch, --roll and --fov"
+    return None if given is None else {"geometry": "--geometry-from"}.get(given, f"--{given}")
 
 
 def _occupied(task: _Task, config: JobConfig, inputs: Inputs) -> str | None:
     """What does a task already, as an option; None: nothing that a person chose."""
-    given = _given(task, inputs)
-    if given is not None:
-        return {"geometry": "--geometry-from"}.get(given, f"--{given}")
+    settled = _settled(task, config, inputs)
+    if settled is not None:
+        return settled
     if task.word == "depth" and config.generate.name is not None:
         return f"--generator {config.generate.name}"
     method = getattr(getattr(config, task.section), task.option)

@@ -161,6 +161,8 @@ class DepthModel:
     source: str
     """hash of the source of the model, which is chosen by name"""
     frames: int
+    python: Path | None = field(metadata=BESIDE)
+    seconds: float = field(metadata=BESIDE)
     device: str = field(metadata=BESIDE)
     download: bool = field(metadata=BESIDE)
 
@@ -170,7 +172,29 @@ class DepthModel:
         if config.depth.model == "none" or given.depth is not None or given.geometry is not None:
             return None
         d = config.depth
-        return taken(cls, d, weights=Weights.of(d.weights), source=_source_of("depth model", d.model))
+        python = None if d.python is None else Path(os.path.expanduser(d.python))
+        source = _source_of("depth model", d.model)
+        return taken(cls, d, weights=Weights.of(d.weights), source=source, python=python)
+
+
+@dataclass(frozen=True)
+class ViewModel:
+    """A learned model of the camera's tilt and focal length."""
+
+    model: str
+    weights: Weights | None
+    source: str
+    """hash of the source of the model, which is chosen by name"""
+    frames: int
+    device: str = field(metadata=BESIDE)
+
+    @classmethod
+    def of(cls, config: JobConfig) -> ViewModel | None:
+        """Where one is to look at the pictures."""
+        v = config.view
+        if v.model == "none":
+            return None
+        return taken(cls, v, weights=Weights.of(v.weights), source=_source_of("view model", v.model))
 
 
 @dataclass(frozen=True)
@@ -184,11 +208,15 @@ class GivenView:
     """folder of Gaussian PLY files, the user's or a generator's"""
     depth: GivenDepth | None = None
     model: DepthModel | None = None
+    view: ViewModel | None = None
 
     @classmethod
     def of(cls, given: GivenFiles, config: JobConfig) -> GivenView:
         """Of a job."""
-        return cls(given.clip, given.camera, given.geometry, GivenDepth.of(given, config), DepthModel.of(given, config))
+        return cls(
+            given.clip, given.camera, given.geometry, GivenDepth.of(given, config), DepthModel.of(given, config),
+            ViewModel.of(config),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,10 @@ import numpy as np
 from fluidlift.errors import InputRejected
 from fluidlift.messages import NONE, Notice
 from fluidlift.motion.steady_flow import bulk_motion, mean_motion
-from fluidlift.pipeline import depths, given_body
+from fluidlift.pipeline import depths, given_body, views
 from fluidlift.pipeline.inputs import GivenFile
 from fluidlift.pipeline.known_camera import (
+    MODEL_LENS_ERROR,
     USUAL_FIELD_OF_VIEW,
     USUAL_SPREAD,
     known_camera,
@@ -43,6 +44,7 @@ from fluidlift.shape.rest_frames import FEWEST_PIXELS, rest_frame, united_range
 from fluidlift.shape.slope import STEEP, SlopePrior, steepness
 from fluidlift.shape.view import (
     Ellipse,
+    LearnedTilt,
     MeasuredPlane,
     Skyline,
     as_relief,
@@ -245,13 +247,15 @@ def _seen(
     known, pose_given = known_camera(given, config.fov, clip.size)
     if read.view is not None and np.isfinite(read.view.focal_error) and not lens_is_known(given, config.fov):
         known = replace(known, focal=(read.view.focal, read.view.focal))
-    pictures, known = _depth_pictures(read, given, config.fov, known, start, work)
+    pictures, known, lens_error = _depth_pictures(read, given, config.fov, known, start, work)
+    learned, known = (None, known) if pose_given else _learned_tilt(read, given, config, known, lens_error, start, work)
     pick = np.unique(np.linspace(0, len(clip) - 1, 8).astype(int))
     typical = typical_picture(clip.frames[pick]).astype(np.uint8)
     rims = work.remembered("rims", find_rims, typical)
     looked = _Looked(
-        clip, fluid, mask, motion, trust, bulk if said is None else None, pick, typical, rims, _measured_plane(read)
-    )
+        clip, fluid, mask, motion, trust, bulk if said is None else None, pick, typical, rims, _measured_plane(read),
+        learned,
+    )  # fmt: skip
     evidence, kind, parts, up, heading, steep = _kind_and_up(
         looked, given, config, known, pose_given, shaped=pictures is not None
     )
@@ -339,6 +343,8 @@ class _Looked:
     """of vessels, in that picture"""
     plane: MeasuredPlane | None = None
     """of the water, where the camera's path tells it"""
+    learned: LearnedTilt | None = None
+    """of the camera, by a learned model of the view"""
 
 
 def _measured_plane(read: Read) -> MeasuredPlane | None:
@@ -396,7 +402,7 @@ def _kind_and_up(
         kind, looked.typical, fluid.any_frame(), parts.lying, texture, stays=parts.puddle,
         drawn_sky=said.sky, rims=said.rims or looked.rims,
     )  # fmt: skip
-    picture = replace(picture, plane=looked.plane if kind.nearly_level else None)
+    picture = replace(picture, plane=looked.plane if kind.nearly_level else None, learned=looked.learned)
     up = kinds.estimate_up(
         kind, parts.lying, motion, trust * parts.gentle, known, picture, given=(said.pitch, said.roll),
         level_prior=composite.level_prior(parts, motion, trust),
@@ -432,16 +438,36 @@ def _said_of_view(c: GeometrySettings, known: PinholeCamera, shape: tuple[int, .
 
 def _depth_pictures(
     read: Read, given: GivenView, fov: float | None, known: PinholeCamera, start: int, work: Work
-) -> tuple[DepthPictures | None, PinholeCamera]:
+) -> tuple[DepthPictures | None, PinholeCamera, float]:
     """Depth from a file or a model, and the camera with the model's field of view, weighed against the rest, where the
-    lens was not told."""
+    lens was not told; and the relative standard deviation of its focal length then, 0 where it was told."""
     told = lens_is_known(given, fov)
     pictures = depths.pictures_of(read, given, known if told else None, start, work)
-    if pictures is not None and not told and pictures.field_of_view is not None:
-        measured = read.view is not None and np.isfinite(read.view.focal_error)
-        error = read.view.focal_error if measured and read.view is not None else USUAL_SPREAD
+    if told:
+        return pictures, known, 0.0
+    measured = read.view is not None and np.isfinite(read.view.focal_error)
+    error = read.view.focal_error if measured and read.view is not None else USUAL_SPREAD
+    if pictures is not None and pictures.field_of_view is not None:
         known = with_model_lens(known, error, pictures.field_of_view)
-    return pictures, known
+        error = float((max(error, 1e-3) ** -2.0 + MODEL_LENS_ERROR**-2.0) ** -0.5)
+    return pictures, known, error
+
+
+def _learned_tilt(
+    read: Read, given: GivenView, c: GeometrySettings, known: PinholeCamera, lens_error: float, start: int, work: Work
+) -> tuple[LearnedTilt | None, PinholeCamera]:  # fmt: skip
+    """What a learned model of the view says of the tilt, and the camera with the focal length that it counts for.
+
+    Args:
+        lens_error: relative standard deviation of the focal length without it; 0: it was told.
+    """
+    if given.view is None or None not in (c.pitch, c.roll, c.fov):
+        return None, known
+    found = views.view_of(read, given.view, known if lens_error <= 0.0 else None, start, work)
+    if found is None:
+        return None, known
+    camera = found.lens(known, lens_error)
+    return found.tilt(camera), camera
 
 
 def _observation(seen: Sight, canonical: PinholeCamera, interval: float) -> Observation:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -31,7 +31,8 @@ class Work:
     again: bool = False
     """this stage, or one before it, was asked for again: what was kept of an earlier run does not count"""
     part: Callable[..., Any] = _alone
-    """`part(name, function, *inputs, **named)` is `function(*inputs, **named)`; what is slow is kept between runs"""
+    """`part(name, function, *inputs, **named)` is `function(*inputs, work=..., **named)`; what is slow is kept between
+    runs"""
 
     remembered: Callable[..., Any] = _alone
     """likewise; kept in memory alone, the last value of each name, where the run is one of several of one process"""
@@ -39,4 +40,5 @@ class Work:
     @classmethod
     def alone(cls, folder: Path) -> Work:
         """Of a stage that is called by itself."""
-        return cls(Scratch(folder, "alone"))
+        work = cls(Scratch(folder, "alone"))
+        return replace(work, part=lambda name, function, *inputs, **named: function(*inputs, work=work, **named))

@@ -320,10 +320,10 @@ def estimate_up(
     """The camera's tilt: median pitch and mean roll of the posterior, and how much of the habit's spread it took away.
 
     How people hold cameras at such a fluid is the prior. Sky and plumb lines (`fluidlift.shape.view`) speak beside all
-    kinds, the upper end of the water for a stream. Over a stream, the perspective of its motion and of its pattern
-    shows the tilt as well (`slope.estimate_tilt`); of motion across the picture, or a pattern that is not the same all
-    over, that is little. The edges of a body that stands point to what lies below the camera (`prism.upright_tilt`).
-    What falls does so along the vertical, which gives the roll.
+    kinds, a learned model of the view where one was asked, and the upper end of the water for a stream. Over a stream,
+    the perspective of its motion and of its pattern shows the tilt as well (`slope.estimate_tilt`); of motion across
+    the picture, or a pattern that is not the same all over, that is little. The edges of a body that stands point to
+    what lies below the camera (`prism.upright_tilt`). What falls does so along the vertical, which gives the roll.
 
     Args:
         kind: of the fluid.
@@ -339,12 +339,14 @@ def estimate_up(
     picture = picture or PictureEvidence()
     pitch, roll = given
     if kind.starts_at_rest and mask.any():
-        mean, sigma = kind.usual_pitch
-        found, left = prism.upright_tilt(
-            mask, lambda p: level_camera(camera, UpEvidence(p, roll or 0.0, "", 0.0)), (mean, sigma)
-        )
-        tilt = slope.TiltEvidence(found, 0.0, left, float(np.clip(1.0 - left / sigma, 0.0, 1.0)))
-        words = ["upright edges of the body"]
+        (mean, sigma), lean, words = kind.usual_pitch, 0.0, ["upright edges of the body"]
+        before = mean, sigma
+        if picture.learned is not None:
+            before, lean = picture.learned.pooled_pitch(before), picture.learned.pooled_roll(ROLL)
+            words.append(picture.learned.words)
+        turned = lean if roll is None else roll
+        found, left = prism.upright_tilt(mask, lambda p: level_camera(camera, UpEvidence(p, turned, "", 0.0)), before)
+        tilt = slope.TiltEvidence(found, lean, left, float(np.clip(1.0 - left / sigma, 0.0, 1.0)))
     elif kind.nearly_level:
         tilt, words = _tilt_of_plane(kind, mask, displacement, confidence, camera, picture, level_prior)
     else:
@@ -417,6 +419,7 @@ def _without_motion(kind, tilted, picture, lean) -> slope.TiltEvidence:
         log += np.array([np.interp(rolls, known, row) for row in seen])
     if picture.horizon is not None:
         log += horizon_evidence(tilted(0.0, 0.0), picture.horizon, pitches, rolls)
+    log = picture.with_learned(log, pitches, rolls)
     return slope.tilt_posterior(pitches, rolls, log, kind.usual_pitch)
 
 

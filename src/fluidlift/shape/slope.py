@@ -181,6 +181,8 @@ def estimate_tilt(
         kind: of the fluid, one that is nearly level: how people film it.
     """
     pitches, rolls = np.arange(-4.0, 89.0, 4.0), np.array([-4.0, 0.0, 4.0])
+    if picture.learned is not None:
+        rolls = picture.learned.rolls(ROLL)
     slopes = np.array([0.0, 5.0, 10.0, 16.0, 22.0, 30.0, 38.0])
     others = falling_prior(slopes, steepness(picture))
     prior = np.where(slopes > 0, (1.0 - level_prior) * others, level_prior)
@@ -198,7 +200,8 @@ def estimate_tilt(
     if picture.texture is not None and (patches is not None or kind.is_standing_water):
         seen = _texture_evidence([row[1] for row in cameras], picture.texture, slopes, best[:, 1, :, 1])
         log += weighed(seen, habit[:, 1])[:, None]
-    return tilt_posterior(pitches, rolls, logsumexp(log, axis=2), kind.usual_pitch)
+    log = picture.with_learned(np.asarray(logsumexp(log, axis=2)), pitches, rolls)
+    return tilt_posterior(pitches, rolls, log, kind.usual_pitch)
 
 
 def tilt_posterior(

@@ -146,6 +146,23 @@ class DepthGuess:
 
 
 @dataclass(frozen=True)
+class ViewGuesses:
+    """What a learned model says of the camera of some pictures: those of which it says something."""
+
+    model: str
+    pitch: Float[np.ndarray, " k"]
+    """degrees below the horizon"""
+    roll: Float[np.ndarray, " k"]
+    """degrees that the picture is turned clockwise"""
+    focal: Float[np.ndarray, " k"]
+    """px of the picture"""
+    errors: Float[np.ndarray, "k 3"]
+    """standard errors: pitch and roll, degrees, and focal length, relative (0 where it was told)"""
+    pitch_by_focal: Float[np.ndarray, " k"]
+    """degrees that the pitch rises by with the logarithm of the focal length"""
+
+
+@dataclass(frozen=True)
 class Geometry:
     """Kind, camera, front surface, scale and terrain of the body at rest."""
 

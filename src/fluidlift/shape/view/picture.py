@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, UInt8
 from fluidlift.shape.texture_gradient import TexturePatches
 from fluidlift.shape.view.habit import Scene, habit_prior, runs_out
 from fluidlift.shape.view.horizon import MISTAKEN, Skyline, farthest_elevation, skyline, skyline_evidence, upper_outline
+from fluidlift.shape.view.learned import LearnedTilt
 from fluidlift.shape.view.open_horizon import OpenHorizon, open_horizon
 from fluidlift.shape.view.plumb import PlumbLines, plumb_evidence, plumb_lines
 from fluidlift.shape.view.rims import find_rims
@@ -64,6 +65,14 @@ class PictureEvidence:
     """of the water"""
     horizon: OpenHorizon | None = None
     """on which standing water ends"""
+    learned: LearnedTilt | None = None
+    """by a learned model of the view; not in `tilt`: it is asked of pitch and roll themselves (`with_learned`)"""
+
+    def with_learned(
+        self, log: Float[np.ndarray, "p r"], pitches: Float[np.ndarray, " p"], rolls: Float[np.ndarray, " r"]
+    ) -> Float[np.ndarray, "p r"]:
+        """A log posterior of pitches and rolls (degrees), with what a learned model says where there is one."""
+        return log if self.learned is None else log + self.learned.log(pitches, rolls)
 
     def tilt(self, camera: PinholeCamera) -> float:
         """Log likelihood of a camera (level frame, z up) given sky, plumb lines and what is round."""
@@ -94,8 +103,8 @@ class PictureEvidence:
 
     @property
     def speaks(self) -> bool:
-        """Whether `tilt` says anything."""
-        found = (self.sky, self.lines, self.pool, self.plane, self.horizon)
+        """Whether anything says how the camera is tilted."""
+        found = (self.sky, self.lines, self.pool, self.plane, self.horizon, self.learned)
         return any(f is not None for f in found) or bool(self.rims)
 
     @property
@@ -108,7 +117,8 @@ class PictureEvidence:
             "rims of vessels": self.rims or None,
             "upper end of the water": self.waterline if self.horizon is None else None,
         }  # fmt: skip
-        return [name for name, found in named.items() if found is not None]
+        words = [name for name, found in named.items() if found is not None]
+        return words if self.learned is None else [*words, self.learned.words]
 
 
 def look_at(

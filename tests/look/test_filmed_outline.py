@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from fluidlift.look.filmed_outline import FINER, LEFT, RIM, TORN, WIDEST, FilmedOutline, reach
+from fluidlift.look.filmed_outline import FINER, LEFT, RIM, TORN, WIDEST, FilmedOutline, FilmedOutlines, reach
 from fluidlift.look.footage import FluidFootage
+from fluidlift.look.rasterize import render
 from fluidlift.look.surface_axes import PictureAxes, PlanAxes
 from fluidlift.look.surface_map import MARGIN, SurfaceMap
+from fluidlift.look.surface_skin import SurfaceSkin
 from fluidlift.types import PinholeCamera
 
 CELL, LEVEL = 0.2, 0.5
@@ -100,7 +102,7 @@ def test_nothing_beyond_the_picture_is_touched():
         (2.0, 2.0, 8.5), (2.0, 2.0, LEVEL), fov_degrees=12.0, size=(64, 64), up=(0.0, 1.0, 0.0)
     )
     before, half = simulated(3.7), 8.0 * np.tan(np.radians(6.0))
-    dry = FilmedOutline(near, np.full((64, 64), 1.0), CELL)  # a film that is dry all over, right at its fluid
+    dry = FilmedOutline(near, np.full((64, 64), 3.0), CELL)  # a film that is dry all over, right beside its fluid
     after = dry.cut(before, PlanAxes())
     inside = (np.abs(before.middles() - 2.0) < half - 1e-6).all(axis=-1)
     np.testing.assert_array_equal(after.wet[~inside], before.wet[~inside])
@@ -160,11 +162,103 @@ def test_what_fills_its_vessel_may_rise_above_its_film_but_not_leave_it_sideways
     wet = (np.abs(x - 2.0) < 0.8) & (y < 2.0)
     outside = ndimage.distance_transform_edt(~wet)
     above, beside, low = np.array([[2.0, 2.3, LEVEL]]), np.array([[3.0, 1.0, LEVEL]]), np.array([[2.0, 1.0, LEVEL]])
-    stays, rises = (FilmedOutline(CAMERA, outside, CELL, rises=r) for r in (False, True))
+    stays, rises = (FilmedOutline(CAMERA, outside, CELL, rises=px) for px in (0, 16))
     assert not stays.inside(above).any() and rises.inside(above).all()
+    assert not rises.inside(np.array([[2.0, 2.6, LEVEL]])).any(), "16 px are 0.43 m"
     for outline in (stays, rises):
         assert not outline.inside(beside).any() and outline.inside(low).all()
-    # nothing is added to what is simulated: its level is its own
+    # what the film shows is filled up; above it the level is the simulation's own
     before = simulated(1.6)
-    assert (rises.cut(before, PlanAxes()).wet <= before.wet).all()
-    assert (stays.cut(before, PlanAxes()).wet & ~before.wet).any()
+    up = np.arange(before.wet.shape[1]) * before.pitch + before.low[1] > 2.0 + before.pitch
+    both = [outline.cut(before, PlanAxes()).wet & ~before.wet for outline in (stays, rises)]
+    assert all(added[:, ~up].any() for added in both) and not both[1][:, up].any()
+
+
+def covered(wet: np.ndarray, level: int) -> np.ndarray:
+    """Pixels that the skin of a pool covers, which stands further than a film (bool [160,160]) shows it."""
+    outline = FilmedOutline(CAMERA, ndimage.distance_transform_edt(~wet), CELL)
+    surface = outline.cut(simulated(3.7), PlanAxes())
+    skin = SurfaceSkin(CELL, lambda places: np.full(len(places), level))
+    for _ in range(3):
+        skin.advance(surface, 0.0, np.random.default_rng(2))
+    splats = skin.splats(surface, np.ones((len(skin), 3)))
+    return render(splats.select(outline.inside(splats.means.astype(np.float64))), CAMERA).alpha > 0.5
+
+
+@pytest.mark.parametrize("width", [3, 7, 20, 60])
+@pytest.mark.parametrize("level", [1, 2])
+def test_a_skin_covers_what_the_film_shows_and_not_a_pixel_more_on_either_side(width, level):
+    """A jet of some px from the upper to the lower side of the picture: its splats are 1.3 and 0.9 px apart."""
+    wet = np.zeros((160, 160), bool)
+    wet[:, 70 : 70 + width] = True
+    found = covered(wet, level)[40:120]  # rows where the pool is; 15 px beside the film it has its way
+    found[:, :56] = found[:, 84 + width :] = False
+    # half a pixel on either side is what a mask of whole pixels is known to, and so is the border of what is covered
+    assert found.sum(axis=1).mean() == pytest.approx(width, abs=1.0)
+    assert not found[:, :69].any() and not found[:, 71 + width :].any()
+    assert found[:, 71 : 69 + width].mean() > 0.97
+
+
+def footage(wet: np.ndarray) -> FluidFootage:
+    """A film of masks bool [t,160,160]."""
+    found = FluidFootage.of(np.zeros((*wet.shape, 3), np.uint8), wet, 0.04)
+    assert found is not None
+    return found
+
+
+def swaying(frames: int = 12) -> np.ndarray:
+    """A jet of 12 px that goes a pixel to the right with every frame, and is missed in one of them."""
+    wet = np.zeros((frames, 160, 160), bool)
+    for t in range(frames):
+        wet[t, 40:120, 60 + t : 72 + t] = True
+    wet[5] = False
+    return wet
+
+
+def seen_inside(outline: FilmedOutline, row: int = 80) -> np.ndarray:
+    """Columns of a row of the picture whose middles are inside."""
+    uv = np.stack([np.arange(160) + 0.5, np.full(160, row + 0.5)], axis=-1)
+    return np.flatnonzero(outline.inside(CAMERA.unproject(uv, np.full(160, 8.0))) & (np.abs(uv[:, 0] - 72) < 14))
+
+
+def test_what_sways_is_as_wide_as_each_frame_shows_it():
+    wet = swaying()
+    outlines = FilmedOutlines(CAMERA, footage(wet), CELL, rises=False)
+    for t in (1, 3, 8, 10):
+        columns = seen_inside(outlines.at(t))
+        # ten whole pixels, less that at either rim of which the splat would stand out
+        assert (columns.min(), columns.max()) == (60 + t + 1, 71 + t - 1)
+    assert len(seen_inside(outlines.at(5))) >= 8, "a mask that failed once opens no hole"
+    union = FilmedOutline(CAMERA, footage(wet).outside, CELL)
+    assert len(seen_inside(union)) > len(seen_inside(outlines.at(8))) + 4, "or this says nothing"
+
+
+@pytest.mark.parametrize("rises", [False, True])
+def test_after_its_film_a_fluid_keeps_its_last_outline_unless_it_came_back_to_what_it_was(rises):
+    outlines = FilmedOutlines(CAMERA, footage(swaying()), CELL, rises=rises)
+    last, after = outlines.at(11.0), outlines.at(30.0)
+    np.testing.assert_array_equal(seen_inside(last), seen_inside(after))
+    assert outlines.at(30.0) is after, "the same outline is not made twice"
+    # what came back to where it was goes on with what its surface shows; what fills does not sink again
+    again = seen_inside(outlines.at(30.0, shown=3.0))
+    np.testing.assert_array_equal(again, seen_inside(last if rises else outlines.at(3.0)))
+
+
+def test_a_vessel_goes_on_to_fill_as_fast_as_it_was_filmed_beside_a_jet_that_stays_as_wide():
+    """A pool that rises by two px a frame, to row 76 in the last of 12, below a jet of 8 px."""
+    wet = np.zeros((12, 160, 160), bool)
+    wet[:, 20:120, 76:84] = True
+    for t in range(12):
+        wet[t, 98 - 2 * t : 120, 40:120] = True
+    outlines = FilmedOutlines(CAMERA, footage(wet), CELL, rises=True)
+
+    def top(outline: FilmedOutline, column: int) -> int:
+        uv = np.stack([np.full(160, column + 0.5), np.arange(160) + 0.5], axis=-1)
+        beside = np.flatnonzero(~outline.inside(CAMERA.unproject(uv, np.full(160, 8.0))))
+        return int(beside[beside < 110].max()) + 1
+
+    assert [top(outlines.at(t), 60) for t in (2.0, 8.0)] == [95, 83], "a pixel inside"
+    # by the majority of three frames the last is one behind
+    assert top(outlines.at(21.0), 60) == pytest.approx(77 + 2 - 20, abs=1)
+    jet, later = seen_inside(outlines.at(11.0), 40), seen_inside(outlines.at(15.0), 40)
+    np.testing.assert_array_equal(jet, later)

@@ -115,6 +115,38 @@ def test_the_skin_is_finer_where_the_surface_is_steep_in_the_picture(channel, tm
     assert level(above, 2.0) - level(above, 0.0) <= 1
 
 
+def widths_shown(scene, frames) -> list[int]:
+    """Columns of the clip's picture in which there is a tracer of the skin, in each frame."""
+    simulator, appearance, found = simulator_of(scene), SurfaceAppearance(scene), []
+    for k in range(frames):
+        if k:
+            simulator.advance(scene.interval)
+        appearance.advance(simulator.particles, k)
+        shown = appearance.dressed(simulator.particles, k)
+        uv, _ = scene.camera.project(shown.gaussians.means[shown.ids % 2 == 1])
+        found.append(len(np.unique(np.floor(uv[(uv[:, 0] > 8) & (uv[:, 0] < 56), 0]))))
+    return found
+
+
+@pytest.mark.parametrize("kind", ["pour", "basin", "stream"])
+def test_what_pours_or_stands_is_as_wide_as_each_frame_shows_it(channel, tmp_path, kind):
+    """Its film grows by a column of pixels each frame; the outline of a stream is around all that it ever shows."""
+    count = 12
+    wet = np.zeros((count, 48, 64), bool)
+    for t in range(count):
+        wet[t, :, 8 : 44 + t] = True
+    grain = np.random.default_rng(0).integers(0, 255, (count, 48, 64, 3)).astype(np.uint8)
+    path = write_footage(tmp_path / "film.mp4", grain, wet, 0.04)
+    widths = widths_shown(channel(count, kind=kind, film=path), count)
+    seen = [44 + t - 8 for t in range(count)]
+    if kind == "stream":
+        assert np.ptp(widths) <= 1
+    else:  # a pixel at the rim is covered by splats whose middles are inside it
+        np.testing.assert_allclose(widths[1:-1], seen[1:-1], atol=2)
+    edited = widths_shown(channel(2, kind=kind, film=path, changes=("gravity",)), 2)
+    assert min(edited) > max(seen), "where somebody changes how it flows it is where it flows"
+
+
 def test_patches_that_stay_at_home_are_few(channel, tmp_path):
     """Where two meet, what moves in the film breaks off; nothing shears those of a scene that nobody edited."""
     path = film(tmp_path / "film.mp4")

@@ -8,6 +8,8 @@ Modules of the face:
     asset_paths    Paths below an asset, none of which leads out of it: asset folders come from strangers, and they
                    hold no links
     atomic         Files that are either whole or absent, and disk errors that say what to do
+    bars           Letterbox and pillarbox: flat black bars that editing put beside a picture, and the picture
+                   between them
     checkpoint     Checkpoints: the state of a simulation between two frames, from which it goes on bit for bit
     collect        Decoded frames become a clip: which are kept, how large, and where they lie meanwhile
     decode         Video files through PyAV, with the doors shut: no playlists, no networks, no frames beyond the
@@ -76,6 +78,7 @@ __all__ = [
     "asset_lock",
     "asset_paths",
     "atomic",
+    "bars",
     "checkpoint",
     "collect",
     "decode",

@@ -133,7 +133,8 @@ class TexturePatches:
         edited: whether the fluid flows otherwise than it was filmed.
         start: instant of the footage, frames, that the body at rest shows.
         together: all patches show the same instant: waves that pass over water that stays are one thing, from shore to
-            shore. At the end of the film all begin anew.
+            shore, and so is a jet. At the end of the film all begin anew.
+        again: instant of the footage, frames, at which they then begin.
 
     Raises:
         ValueError: a radius that is not positive, or a texture without any usable place.
@@ -148,13 +149,14 @@ class TexturePatches:
         edited: bool = False,
         start: float = 0.0,
         together: bool = False,
+        again: float = 0.0,
     ) -> None:
         require(radius > 0, f"radius {radius}", "positive metres")
         require(texture.usable, "a texture of which nothing was seen")
         self.state = Patches.none()
         self._texture, self._radius = texture, radius
         self._footage, self._edited, self._start = footage, edited, start
-        self._together = together
+        self._together, self._again = together, again
         self._good = texture.trust_within(radius)
         self._seen_flow = _gradients(texture.surface, SMOOTH * radius)[0]
 
@@ -174,6 +176,13 @@ class TexturePatches:
         centers = _spread(bare, uncovered, APART * self._radius, rng)
         if len(centers):
             self.state = self.state.joined(self._fresh(centers, interval == 0, surface, rng))
+
+    @property
+    def leading(self) -> float | None:
+        """Instant of the footage, frames, of the patch that is most present; None without patches or footage."""
+        if self._footage is None or not len(self.state):
+            return None
+        return float(self.state.instants[int(np.argmax(self.state.presences))])
 
     @property
     def _stays(self) -> bool:
@@ -258,7 +267,7 @@ class TexturePatches:
         last, fade = len(self._footage) - 1.0, _fade_of(self._footage)
         if self._together:
             lasting = self.state.instants[~self.state.going]
-            now = float(np.median(lasting)) if len(lasting) else min(self._start, last) if first else 0.0
+            now = float(np.median(lasting)) if len(lasting) else min(self._start, last) if first else self._again
             full = np.ones(n)
             return Patches(
                 centers, sources, turns, 0 * full, full if first else full / fade, now * full, (last - fade) * full

@@ -31,6 +31,9 @@ from fluidlift.types import FaceVelocity, FluidParameters, Gaussians, Grid, Part
 TIDY_EVERY = 4
 """substeps between two tidyings: particles put in the order of their cells, thin and crowded cells reseeded"""
 
+ARRIVED = 0.5
+"""of the speed at the inlet, below which fluid is no part of a jet any more (a choice: what falls gets faster)"""
+
 
 @dataclass(frozen=True)
 class Emitted:
@@ -281,9 +284,11 @@ class ParticleSimulator(ABC):
         places = self.refill.missing(self._held().positions, spacing, self._rng)
         places = places[~self.bodies.inside(places)] if len(places) else places
         if len(places):
-            self._join(self.refill.particles(places, self.parameters.density * spacing**3, self._next_id))
+            made = self.refill.particles(places, self.parameters.density * spacing**3, self._next_id)
+            made = replace(made, masses=(made.masses * self._liquid_share(made.velocities)).astype(np.float32))
+            self._join(made)
             self._next_id += len(places)
-            self.refilled += len(places) * spacing**3
+            self.refilled += float(made.masses.sum(dtype=np.float64)) / self.parameters.density
         return len(places)
 
     def _count(self) -> int:
@@ -345,12 +350,24 @@ class ParticleSimulator(ABC):
         per_cell = crowd / capacity
         volumes = grid.spacing**3 / np.maximum(per_cell, np.median(per_cell))
         as_float = {n: np.ascontiguousarray(getattr(kept, n), np.float32) for n in ("velocities", "affine")}
+        volumes = volumes * self._liquid_share(kept.velocities)
         return replace(
             kept,
             masses=(self.parameters.density * volumes).astype(np.float32),
             deformation=np.ascontiguousarray(kept.deformation, np.float32),
             **as_float,
         )
+
+    def _liquid_share(self, velocities: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        """Share of what is seen that is liquid where it moves at velocities (m/s): `settings.discharge_speed`.
+
+        What falls on from the inlet does not get slower; what is much slower has arrived somewhere.
+        """
+        speed = np.linalg.norm(np.asarray(velocities, np.float64), axis=1)
+        falls = speed > ARRIVED * np.linalg.norm(self._inlet.bulk)
+        if self.settings.discharge_speed is None or not falls.any():
+            return np.ones(len(velocities))
+        return np.where(falls, np.minimum(self.settings.discharge_speed / np.maximum(speed, 1e-9), 1.0), 1.0)
 
     def _nearest_source(self, particles: Particles) -> EmitSource:
         if not len(particles):
@@ -363,7 +380,8 @@ class ParticleSimulator(ABC):
         inlet, before = self._inlet, self._next_id
         if inlet.switch(self.time):
             self._emitters_switched()
-        self._add(self._missing(), inlet.particle_spacing**3)
+        share = float(self._liquid_share(inlet.bulk[None])[0])
+        self._add(self._missing(), inlet.particle_spacing**3 * share)
         for number, emission in enumerate(inlet.emissions):
             places = emission.due(self.time, self._around(emission))
             look = inlet.supply.looks[number] if inlet.supply.looks else None

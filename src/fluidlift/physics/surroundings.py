@@ -37,6 +37,9 @@ class SimulationSettings:
     """let liquid leave a wall that would have to hold it by suction"""
     reseed: bool = True
     """split and merge particles inside the liquid where cells run empty or crowded"""
+    discharge_speed: float | None = None
+    """m/s: discharge of the inlet over its section, where that is less than the speed at which it flows in. The liquid
+    is then a share of what is seen of it, this over the speed (continuity); None: all of it"""
     prescribe_outflow: bool = False
     """True: the outlet's faces move with `outflow_velocity` along the mainstream; False: free outflow"""
 

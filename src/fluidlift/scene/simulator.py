@@ -14,7 +14,7 @@ from fluidlift.messages import Notice
 from fluidlift.scene.build import Scene, simulation_step
 from fluidlift.scene.reshaping import sides_open_to_air
 from fluidlift.scene.surface_appearance import lends_look
-from fluidlift.types import CellType, Gaussians, Particles, kind_of
+from fluidlift.types import CellType, FluidParameters, Gaussians, Particles, kind_of
 
 if TYPE_CHECKING:
     from fluidlift.look.inflow import InflowLook
@@ -80,9 +80,9 @@ def simulator_of(
     from fluidlift.physics.emitter import Supply
     from fluidlift.physics.surroundings import SimulationSettings
 
-    settings = SimulationSettings(deform=deform)
     crossed = BESIDE_OBSTACLES if scene.obstacles else CROSSED
-    parameters = simulation_step(scene)
+    parameters, discharge = as_fast_as_filmed(scene, simulation_step(scene))
+    settings = SimulationSettings(deform=deform, discharge_speed=discharge)
     own = scene.rest.select(np.arange(len(scene.rest) - sum(map(len, scene.emitter_looks))))
     look = inflow_look(scene, own, float(np.linalg.norm(parameters.inflow_velocity)))
     grid, supply = scene.terrain.grid, Supply(scene.inflow, scene.emitters, scene.emitter_looks)
@@ -113,6 +113,26 @@ def simulator_of(
     if scene.wet is not None and scene.wet.any():
         simulator.refill = Refill(scene.wet, scene.velocity, body, scene.terrain, scene.camera)
     return simulator
+
+
+def as_fast_as_filmed(scene: Scene, parameters: FluidParameters) -> tuple[FluidParameters, float | None]:
+    """The parameters of what pours with an inflow that is as fast as the jet was filmed, and the speed (m/s) that its
+    discharge has over its section; None where that is no slower.
+
+    How much a vessel gains says what flows in, and the mask of a jet is wider than the jet: over its section the
+    discharge would creep, and a jet that begins to fall from that speed is a thread after its own width (A v is
+    constant along it), so that it tears below its inlet. What is seen of it is as wide as it was filmed, falls as it
+    was filmed, and brings what its vessel gains: a share of it is liquid.
+    """
+    given = float(np.linalg.norm(parameters.inflow_velocity))
+    inlet = scene.cell_types == CellType.INFLOW
+    if not kind_of(scene.kind).fills_vessel or given <= 0 or not inlet.any():
+        return parameters, None
+    filmed = float(np.linalg.norm(scene.velocity.at_centers()[inlet].mean(axis=0)))
+    if filmed <= given:
+        return parameters, None
+    faster = tuple(float(v) * filmed / given for v in parameters.inflow_velocity)
+    return parameters.updated({"inflow_velocity": faster}), given
 
 
 def inflow_look(scene: Scene, own: Gaussians, speed: float) -> InflowLook:

@@ -20,7 +20,7 @@ from fluidlift.types import Gaussians, Particles, PinholeCamera, concatenate, ki
 from fluidlift.types.fluid_masks import STAYS
 
 if TYPE_CHECKING:
-    from fluidlift.look.filmed_outline import FilmedOutline
+    from fluidlift.look.filmed_outline import FilmedOutline, FilmedOutlines
     from fluidlift.look.footage import FluidFootage
     from fluidlift.look.seen_texture import SeenTexture
     from fluidlift.look.surface_axes import SurfaceAxes
@@ -50,6 +50,9 @@ AT_HOME = 0.6
 """the same where patches stay, since they show what was filmed in their own place: nothing shears them, and where two
 meet, the motion of the film breaks off. Of 0.12, 0.3 and 0.6 a fall's current is off by 0.65, 0.46 and 0.44 (after its
 clip 0.64, 0.50 and 0.35)"""
+
+LATER = 0.5
+"""of a film whose fluid is not where it was, at which it begins anew: what its later half shows is nearer to its end"""
 
 FEWEST_CELLS = 4.0
 """radius of a patch at least, cells"""
@@ -197,6 +200,9 @@ class SurfaceAppearance:
         self._surface: SurfaceMap | None = None
         self._axes: SurfaceAxes
         self._outline: FilmedOutline | None = None
+        self._outlines: FilmedOutlines | None = None
+        self._pace = 1.0
+        """frames of the film per frame of the scene"""
         self._level: float | None = None
         self._plays = False
         self._tracers = 0
@@ -226,7 +232,7 @@ class SurfaceAppearance:
 
     def _lay_skin(self) -> None:
         from fluidlift.look.apparent_shift import apparent_shift
-        from fluidlift.look.filmed_outline import FilmedOutline
+        from fluidlift.look.filmed_outline import FilmedOutline, FilmedOutlines
         from fluidlift.look.picture_texture import PictureTexture
         from fluidlift.look.surface_axes import PictureAxes, PlanAxes
         from fluidlift.look.surface_skin import SurfaceSkin
@@ -255,15 +261,23 @@ class SurfaceAppearance:
         places = self._axes.points(own.means)
         across = float(np.ptp(places[self._axes.shown(places), :2], axis=0).max(initial=0.0))
         radius = AT_HOME if footage is not None and not scene.edited else PATCH
+        # a jet is one thing: pieces of it from different instants do not fit together where it sways
+        pours = not kind_of(scene.kind).lies_on_ground and not scene.edited
+        changes = pours and footage is not None and footage.stays < STAYS
         self._patches = TexturePatches(
             texture, max(radius * across, FEWEST_CELLS * self._cell), footage=footage,
-            edited=scene.edited and not stands, start=scene.film_start, together=stands,
+            edited=scene.edited and not stands, start=scene.film_start, together=stands or pours,
+            again=LATER * len(footage) if changes and footage is not None else 0.0,
         )  # fmt: skip
         if footage is not None and stands and not scene.edited:
             self._level = float(np.median(surface.height[surface.wet]))
         if footage is not None and not scene.edited:
-            rises = not kind_of(scene.kind).lies_on_ground and footage.stays < STAYS
-            self._outline = FilmedOutline(self._camera, footage.outside, self._cell, rises=rises)
+            if not (pours or stands):
+                self._outline = FilmedOutline(self._camera, footage.outside, self._cell)
+            else:
+                self._outlines = FilmedOutlines(self._camera, footage, self._cell, rises=changes)
+                self._outline = self._outlines.at(scene.film_start)
+                self._pace = scene.interval / footage.interval
         self._plays = footage is not None
         if self._plays:
             self._surface = surface
@@ -372,6 +386,9 @@ class SurfaceAppearance:
             self._begin_again()
         rng = np.random.default_rng([self._scene.seed, number])
         interval = self._scene.interval if number else 0.0
+        if self._outlines is not None:
+            instant, leading = self._scene.film_start + number * self._pace, self._patches.leading
+            self._outline = self._outlines.at(instant, None if leading is None else leading + self._pace)
         self._surface = self._surface_of(particles)
         if self._surface is None:
             return

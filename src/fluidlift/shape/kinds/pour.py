@@ -11,6 +11,12 @@ from fluidlift.shape.filled_vessel import distance_ahead, find_vessel, pool_dept
 from fluidlift.shape.surface import FrontSurface
 from fluidlift.types.kind import POUR
 
+LAYERS = 2.0
+"""cells that the inlet is tall"""
+UPPER = 3
+"""of the body's layers, the upper third says how wide its jet is, by its upper quartile: its end is narrower, and its
+foot spreads"""
+
 
 class _Pour:
     side, above = 0.35, 0.1
@@ -28,7 +34,15 @@ class _Pour:
         return np.array([bulk[0], 0.0, -max(-bulk[2], 1.0)])
 
     def inlet(self, fluid, z, spacing):
-        return fluid & (z > z[fluid].max() - 2.0 * spacing)
+        """The upper end of the jet, over all of its section: a jet that leans, or that the picture's edge cuts on a
+        slant, does not begin in one layer. Fed by its tip alone it would run dry within its own length."""
+        layers = np.flatnonzero(fluid.any(axis=(0, 1)))
+        count = fluid.sum(axis=(0, 1))
+        section = float(np.percentile(count[layers[-max(len(layers) // UPPER, 1) :]], 75.0))
+        slant = 2.0 * np.sqrt(section / np.pi)  # as high as it is wide: an end at 45 degrees
+        top = np.where(fluid, z, -np.inf).max(axis=2, keepdims=True)
+        starts = top > z[fluid].max() - (slant + LAYERS) * spacing
+        return fluid & starts & (z > top - LAYERS * spacing)
 
     def outlet(self, shape):
         """What pours leaves sideways over the floor."""

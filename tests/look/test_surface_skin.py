@@ -176,3 +176,20 @@ def test_a_skin_adds_nothing_to_the_body_that_it_floats_on():
     np.testing.assert_array_equal(belongs[:n], share)
     np.testing.assert_array_equal(fluid_depths(both, found, 0.5 * CELL)[:n], fluid_depths(body, normals, 0.5 * CELL))
     np.testing.assert_array_equal(fluid_surface(both, 0.5 * CELL).vertices, fluid_surface(body, 0.5 * CELL).vertices)
+
+
+def test_a_tracer_whose_sheet_is_gone_does_not_fly_to_the_one_behind_it():
+    def level(height: float) -> SurfaceMap:
+        x, y = np.meshgrid(*[np.arange(0.025, 2.0, 0.05)] * 2, indexing="ij")
+        points = np.stack([x.ravel(), y.ravel(), np.where(x < 1.0, height, 1.0).ravel()], axis=-1)
+        return SurfaceMap.of(points, np.zeros_like(points), 0.1)
+
+    rng, skin = np.random.default_rng(0), SurfaceSkin(0.1)
+    skin.advance(level(1.0), 0.0, rng)
+    before = set(skin.ids.tolist())
+    skin.advance(level(0.95), 0.04, rng)  # it sinks
+    assert len(before) > 1000 and len(before & set(skin.ids.tolist())) > 0.97 * len(before)
+    skin.advance(level(0.2), 0.04, rng)
+    stayed = skin.places[np.isin(skin.ids, list(before))]
+    assert len(stayed) > 50 and stayed[:, 0].min() > 0.8
+    assert len(skin) > 0.9 * len(before), "others are there in their place"

@@ -26,7 +26,7 @@ def again(looked, hints):
     """The stages that hints have done again, and the runner's values."""
     clip, folder, config, _, _ = looked
     runner = Runner(folder, begin.stages_of(FIND_STAGES, hints), progress=Silence())
-    given = GivenFiles.of(Inputs(clip))
+    given, config = GivenFiles.of(Inputs(clip)), begin.uncropped(config)
     found = begin.look(runner, given, config, said=hints)
     settings = begin.geometry_settings(found[0], config, hints)
     seen = runner.run("view", view, *found, GivenView.of(given, config), settings)

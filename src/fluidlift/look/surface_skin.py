@@ -49,6 +49,9 @@ SEEN, HIDING = 3.0, 0.5
 """cells: of depth over which what is seen of dye under a skin falls to 1/e; of pure dye that let 1/e through"""
 CROWDED, BARE = 0.55, 0.75
 """spacings to the next tracer below which one of two goes, and above which a new one comes"""
+JUMP, SPEEDS = 3.0, 4.0
+"""cells, beyond so many times its own way in a frame, by which a tracer's height changes at most: where it changes by
+more, what it lay on is gone, and it would be seen to fly to what lies behind (`io.frame_checks` asks the same)"""
 
 
 def of_skin(gaussians: Gaussians, cell: float) -> Bool[np.ndarray, " n"]:
@@ -164,6 +167,8 @@ class SurfaceSkin:
         self.places: Float[np.ndarray, "n 2"] = np.zeros((0, 2))
         self.ids: Int[np.ndarray, " n"] = np.zeros(0, np.int64)
         self.levels: Int[np.ndarray, " n"] = np.zeros(0, np.int64)
+        self.heights: Float[np.ndarray, " n"] = np.zeros(0)
+        """m, at which they were last; nan: not yet"""
         self.next_id = 0
         self._cell, self._level_at = cell, level_at
 
@@ -172,11 +177,17 @@ class SurfaceSkin:
 
     def advance(self, surface: SurfaceMap, interval: float, rng: np.random.Generator) -> None:
         """Float with the surface for an interval (s), and fill what has come apart."""
-        self.places = self.places + interval * surface.at(surface.velocity[..., :2], self.places)
-        levels = self._levels(self.places)
-        self._keep((surface.presence(self.places) > 0.5) & (levels == self.levels))
-        if not surface.wet.any():
-            return
+        velocity = surface.at(surface.velocity, self.places)
+        self.places = self.places + interval * velocity[:, :2]
+        levels, height = self._levels(self.places), surface.at(surface.height, self.places)
+        risen = np.abs(height - np.where(np.isfinite(self.heights), self.heights, height))
+        stays = risen <= JUMP * self._cell + SPEEDS * interval * np.linalg.norm(velocity, axis=1)
+        self._keep((surface.presence(self.places) > 0.5) & (levels == self.levels) & stays)
+        if surface.wet.any():
+            self._fill_all(surface, rng)
+        self.heights = surface.at(surface.height, self.places)
+
+    def _fill_all(self, surface: SurfaceMap, rng: np.random.Generator) -> None:
         columns = self._levels(surface.middles().reshape(-1, 2)).reshape(surface.wet.shape)
         # a place is as far from the camera as the four columns around it, or between them; on a ridge slopes cancel
         # out between two columns, where a slope (blurred over three) is at most a level less than beside it
@@ -210,13 +221,15 @@ class SurfaceSkin:
         self.places = np.concatenate([self.places, fresh])
         self.ids = np.concatenate([self.ids, self.next_id + np.arange(len(fresh))])
         self.levels = np.concatenate([self.levels, np.full(len(fresh), level)])
+        self.heights = np.concatenate([self.heights, np.full(len(fresh), np.nan)])
         self.next_id += len(fresh)
 
     def _levels(self, places: np.ndarray) -> np.ndarray:
         return np.zeros(len(places), np.int64) if self._level_at is None else self._level_at(places)
 
     def _keep(self, index: np.ndarray) -> None:
-        self.places, self.ids, self.levels = self.places[index], self.ids[index], self.levels[index]
+        self.places, self.ids = self.places[index], self.ids[index]
+        self.levels, self.heights = self.levels[index], self.heights[index]
 
     def points(self, surface: SurfaceMap) -> Float[np.ndarray, "n 3"]:
         """Where the tracers are, m."""

@@ -520,7 +520,7 @@ class SurfaceAppearance:
         if self._patches is None:
             return white
         patches = {f"patches.{name}": np.array(value) for name, value in vars(self._patches.state).items()}
-        skin = {f"skin.{name}": getattr(self._skin, name).copy() for name in ("places", "ids", "levels")}
+        skin = {f"skin.{name}": getattr(self._skin, name).copy() for name in ("places", "ids", "levels", "heights")}
         return white | patches | skin | {"skin.next_id": np.array(self._skin.next_id, np.int64)}
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
@@ -539,7 +539,7 @@ class SurfaceAppearance:
             parts = {n.removeprefix("patches."): np.array(a) for n, a in state.items() if n.startswith("patches.")}
             patches, places = Patches(**parts), np.array(state["skin.places"], np.float64)
             ids, next_id = np.array(state["skin.ids"], np.int64), int(state["skin.next_id"])
-            levels = np.array(state["skin.levels"], np.int64)
+            levels, heights = np.array(state["skin.levels"], np.int64), np.array(state["skin.heights"], np.float64)
         except (KeyError, TypeError, ValueError) as error:
             raise InputRejected(f"the state of a surface that does not fit: {error}") from None
         numbers = [
@@ -550,11 +550,12 @@ class SurfaceAppearance:
             patches.presences,
             patches.instants,
         ]
-        numbers += [places, levels, np.nan_to_num(patches.ends, posinf=0.0)]  # without footage they do not end
-        fits = places.shape == (len(ids), 2) and levels.shape == ids.shape
+        numbers += [places, levels, heights, np.nan_to_num(patches.ends, posinf=0.0)]  # without footage they do not end
+        fits = places.shape == (len(ids), 2) and levels.shape == heights.shape == ids.shape
         if not fits or not all(np.isfinite(array).all() for array in numbers):
             raise InputRejected("the state of a surface with arrays of another shape, or not finite", "a whole one")
         if self._whitewater is not None:
             self._whitewater.restore(state)
         self._patches.state = patches
-        self._skin.places, self._skin.ids, self._skin.levels, self._skin.next_id = places, ids, levels, next_id
+        self._skin.places, self._skin.ids, self._skin.next_id = places, ids, next_id
+        self._skin.levels, self._skin.heights = levels, heights

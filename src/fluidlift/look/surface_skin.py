@@ -49,8 +49,8 @@ SEEN, HIDING = 3.0, 0.5
 """cells: of depth over which what is seen of dye under a skin falls to 1/e; of pure dye that let 1/e through"""
 CROWDED, BARE = 0.55, 0.75
 """spacings to the next tracer below which one of two goes, and above which a new one comes"""
-JUMP, SPEEDS = 3.0, 4.0
-"""cells, beyond so many times its own way in a frame, by which a tracer's height changes at most: where it changes by
+JUMP, SPEEDS = 1.0, 4.0
+"""cell, beyond so many times its own way in a frame, by which a tracer's height changes at most: where it changes by
 more, what it lay on is gone, and it would be seen to fly to what lies behind (`io.frame_checks` asks the same)"""
 
 

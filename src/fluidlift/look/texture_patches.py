@@ -274,7 +274,8 @@ class TexturePatches:
             )
         if first:
             begin = np.full(n, min(self._start, last))
-            ends = begin + rng.uniform(0, 1, n) * np.maximum(last - fade - begin, 0.0)
+            # as many give way in each frame: where many fall on one, it differs from the next as unrelated ones do
+            ends = begin + (rng.permutation(n) + rng.uniform(0, 1, n)) / n * np.maximum(last - fade - begin, 0.0)
             return Patches(centers, sources, turns, np.zeros(n), np.ones(n), begin, ends)
         begin = rng.uniform(0, BEGIN * last, n)
         return Patches(centers, sources, turns, np.zeros(n), np.full(n, 1 / fade), begin, np.full(n, last - fade))

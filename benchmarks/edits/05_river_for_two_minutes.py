@@ -51,13 +51,14 @@ shown = [render(b.all_splats(FIRST + k), asset.camera, background=plate).image[m
 across, between, _ = seam(np.clip(np.stack(shown), 0.0, 1.0)[:, None])
 clip = np.stack([f[mask] for f in footage.clip.frames])[:, None] / 255.0
 own = seam(clip)[1]
-# inside the clip's mask, from the clip's camera: the seam is one step of the loop, with as many patches that give way as
-# in any other, so it is held against their mean, and that against the clip's (of eight, uncertain by a thirtieth).
+# inside the clip's mask, from the clip's camera: the seam is one step of the loop, with as many patches that give way
+# as in any other, so it is held against their mean, and that against the clip's (of eight, uncertain by a thirtieth).
 # Frames of two unrelated instants differ by 1.2 to 1.4 times the clip's mean
 b.check(
     "the loop has no seam",
     across <= 1.05 * between and between <= 1.05 * own,
-    f"change at the seam {across:.4f}, between the loop's other frames {between:.4f}, of the clip {own:.4f} (sRGB, 0 to 1)",
+    f"change at the seam {across:.4f}, between the loop's other frames {between:.4f}, of the clip {own:.4f} (sRGB, 0 "
+    "to 1)",
 )
 b.film("05_loop")
 end(b)

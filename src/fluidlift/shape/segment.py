@@ -241,7 +241,8 @@ def segment(
         told = heed(clicks, evidence, score, score > 0.0)[1] if clicks else np.zeros_like(score)
         # a jet that sways with its jug changes as its flow says too: where all clues together speak for fluid, it is
         carried = solids_by_flow(evidence) & (score <= 0.0)
-        fluid = in_own_colours(evidence, score, presence, carried & ~solids)
+        leaves = carried & ~solids & (evidence.streaming > evidence.swaying)  # what sways in its colours is a plant
+        fluid = in_own_colours(evidence, score, presence, leaves)
         barred = (solids | (carried & ~fluid)) & (told <= 0.0)
         # where its colours speak for it, motion no longer speaks against it: how it differs from what is behind decides
         score = np.where(fluid, np.maximum(score, np.float32(0.0)), score)

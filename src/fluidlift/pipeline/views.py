@@ -26,23 +26,10 @@ ANY_LENS = 8.0
 
 
 @dataclass(frozen=True)
-class LearnedView:
-    """What a model says of the camera of a whole clip."""
+class LearnedView(ViewGuess):
+    """What a model says of the camera of a whole clip; its pitch is that at its own focal length."""
 
-    model: str
-    pitch: float
-    """degrees below the horizon, at its own focal length"""
-    roll: float
-    """degrees clockwise"""
-    focal: float
-    """px"""
-    pitch_error: float
-    roll_error: float
-    """degrees, standard errors"""
-    focal_error: float
-    """relative; 0 where it was told the focal length"""
-    pitch_by_focal: float
-    """degrees that the pitch rises by with the logarithm of the focal length"""
+    model: str = ""
 
     @classmethod
     def of(cls, found: ViewGuesses) -> LearnedView | None:
@@ -55,8 +42,8 @@ class LearnedView:
         error = np.sqrt(np.mean(found.errors**2, axis=0) + spread**2)
         told = not found.errors[:, 2].any()
         return cls(
-            found.model, float(pitch), float(roll), float(np.exp(focal)), float(error[0]), float(error[1]),
-            0.0 if told else float(error[2]), float(np.median(found.pitch_by_focal)),
+            float(pitch), float(roll), float(np.exp(focal)), float(error[0]), float(error[1]),
+            0.0 if told else float(error[2]), float(np.median(found.pitch_by_focal)), found.model,
         )  # fmt: skip
 
     def lens(self, camera: PinholeCamera, error: float) -> PinholeCamera:

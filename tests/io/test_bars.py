@@ -4,7 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from fluidlift.io.bars import Window, find_bars
+from fluidlift.io.bars import Window, between_bars, find_bars
+from fluidlift.types import VideoClip
 
 
 def scene(frames: int = 8, size: tuple[int, int] = (160, 96), seed: int = 0) -> np.ndarray:
@@ -93,3 +94,18 @@ def test_a_window_takes_whole_pixels_at_any_size():
     assert window.of(np.zeros((36, 64, 3))).shape == (24, 32, 3)
     with pytest.raises(ValueError, match="window"):
         Window(0.5, 0.0, 0.5, 1.0)
+
+
+def test_a_clip_is_read_again_between_its_bars_and_else_once():
+    frames, asked = barred(scene(), (20, 20), (0, 0)), []
+
+    def decode(window: Window | None = None) -> VideoClip:
+        asked.append(window)
+        kept = frames if window is None else np.stack([window.of(f) for f in frames])
+        return VideoClip(kept, np.arange(len(kept)) / 25.0)
+
+    clip, bars = between_bars(decode)
+    assert clip.size == (160, 94) and bars is not None and asked == [None, bars]
+    frames, asked = scene(), []
+    clip, bars = between_bars(decode)
+    assert clip.size == (160, 96) and bars is None and asked == [None]

@@ -28,8 +28,8 @@ class ReadConfig:
     stabilise: bool = True
     """take out mild camera shake"""
     crop: Literal["auto", "none"] = "auto"
-    """auto cuts off black bars beside the picture (letterbox, pillarbox), where nothing but the clip is given: hints
-    and files hold for the whole picture, bars and all"""
+    """auto: `make` cuts off black bars beside the picture (letterbox, pillarbox), where nothing but the clip is given:
+    hints and files hold for the whole picture, bars and all"""
 
 
 @dataclass(frozen=True)

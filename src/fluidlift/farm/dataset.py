@@ -202,7 +202,7 @@ def sample_of(folder: Path, row: dict[str, Any]) -> Sample:
 
 def _clip_of(place: Path, row: dict[str, Any]) -> np.ndarray | None:
     """The frames that make read; None where the clip is not there, or is another one."""
-    from fluidlift.io.bars import find_bars
+    from fluidlift.io.bars import between_bars
     from fluidlift.io.hashes import file_hash
     from fluidlift.io.video import read_clip
 
@@ -213,9 +213,7 @@ def _clip_of(place: Path, row: dict[str, Any]) -> np.ndarray | None:
     decode = partial(
         read_clip, path, start=read["start"], duration=read["duration"], max_size=read["max_size"], fps=read["fps"]
     )
-    frames = decode().frames
-    bars = find_bars(frames) if read.get("crop") == "auto" else None
-    return frames if bars is None else decode(window=bars).frames
+    return (between_bars(decode)[0] if read.get("crop") == "auto" else decode()).frames
 
 
 def _film_of(place: Path, size: tuple[int, int]) -> np.ndarray:

@@ -6,13 +6,14 @@ horizon where there is none, and a picture that is smaller than it need be.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import cast
 
 import numpy as np
 from jaxtyping import Num, UInt8
 
 from fluidlift.errors import require
+from fluidlift.types import VideoClip
 
 BLACK = 24
 """levels of 255 of a bar's color at most: black of limited range that was not expanded is 16"""
@@ -88,6 +89,17 @@ def find_bars(frames: UInt8[np.ndarray, "t h w 3"]) -> Window | None:
     return Window(columns.start / width, rows.start / height, columns.stop / width, rows.stop / height)
 
 
+def between_bars(decode: Callable[..., VideoClip]) -> tuple[VideoClip, Window | None]:
+    """A clip without the bars beside its picture, and what was kept of it; None: it has none.
+
+    Args:
+        decode: reads it, and of each picture the `window` where it is given one, as `io.video.read_clip` does.
+    """
+    found = decode()
+    bars = find_bars(found.frames)
+    return (found, None) if bars is None else (decode(window=bars), bars)
+
+
 def _between(far: np.ndarray) -> slice | None:
     """Lines [n] between two bars of lines, without the one at each edge that may show both; None: no bars."""
     first, last = _bar(far), _bar(far[::-1])
@@ -105,4 +117,4 @@ def _bar(far: np.ndarray) -> int | None:
     if not LEAST <= count < len(far) or ends.min() < count - 1:
         return None
     straight = float((np.abs(ends - count) <= 1).mean())
-    return cast(int, count) if straight >= STRAIGHT else None
+    return count if straight >= STRAIGHT else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -42,6 +43,7 @@ def card_against(folder: Path, video: Path, *, start: float = 0.0, progress: Pro
     """
     from fluidlift.evaluate.as_filmed import FEWEST, as_filmed
     from fluidlift.io.asset_folder import load_asset, read_manifest
+    from fluidlift.io.bars import between_bars
     from fluidlift.io.video import read_clip
 
     progress, manifest, asset = progress or Silence(), read_manifest(folder), load_asset(folder)
@@ -58,7 +60,9 @@ def card_against(folder: Path, video: Path, *, start: float = 0.0, progress: Pro
             f"'{folder.name}' cannot be held against footage", "frames as they were filmed", reason or ""
         )
     count, own = int(played.get("frames", 0)), len(footage.clip) - footage.start
-    other = read_clip(video, start=start, duration=(count + 1) * interval, max_size=max(asset.camera.size))
+    decode = partial(read_clip, video, start=start, duration=(count + 1) * interval, max_size=max(asset.camera.size))
+    read = manifest["provenance"]["config"]["read"]
+    other = between_bars(decode)[0] if read.get("crop") == "auto" else decode()
     _check(other, footage.clip, interval)
     first = own if count - own >= FEWEST else 0
     last = min(count, first + len(other))

@@ -48,7 +48,7 @@ def read(clip: GivenFile, camera: GivenFile | None, config: ReadSettings, *, wor
     Raises:
         InputRejected: a clip that cannot be used.
     """
-    from fluidlift.io.bars import find_bars
+    from fluidlift.io.bars import between_bars, find_bars
     from fluidlift.io.limits import ReadLimits
     from fluidlift.io.sequences import is_sequence
     from fluidlift.io.video import read_clip
@@ -64,13 +64,11 @@ def read(clip: GivenFile, camera: GivenFile | None, config: ReadSettings, *, wor
         limits=ReadLimits(max_pixels=config.max_pixels, max_frames=config.max_frames),
         store=scratch,
     )
-    found = decode()
-    bars = find_bars(found.frames)
-    if bars is not None and config.crop == "none":
-        found = replace(found, warnings=(*found.warnings, BARS_STAY))
-    elif bars is not None:
-        found = decode(window=bars)
+    found, bars = between_bars(decode) if config.crop == "auto" else (decode(), None)
+    if bars is not None:
         found = replace(found, warnings=(*found.warnings, _cut_off(bars)))
+    elif config.crop == "none" and find_bars(found.frames) is not None:
+        found = replace(found, warnings=(*found.warnings, BARS_STAY))
     decoded = len(found)
     found = _without_distortion(found, None if camera is None else camera.path, scratch)
     found, kept = _without_repeats(found, scratch)

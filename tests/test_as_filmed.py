@@ -230,3 +230,25 @@ def test_the_verdict_is_the_worst_of_those_that_are_judged():
     assert AsFilmed(9, 0, (figures[1],)).verdict is None
     assert AsFilmed(9, 0, (figures[1],)).sentence().startswith("as filmed: not judged")
     assert VERDICTS[-1] == WRONG
+
+
+def filling(frames: int, first: int, last: int) -> np.ndarray:
+    """[frames,H,W]: the row of the surface goes from `first` to `last`, each filled from the left to the right."""
+    rows = np.linspace(first, last, frames)[:, None, None]
+    place = np.arange(H)[:, None] + 1.0 - np.arange(W) / W
+    return (place > rows) & (np.arange(H) < STREAM.stop)[:, None]
+
+
+@pytest.mark.parametrize(("first", "last", "judged"), [(24, 16, 0), (16, 24, 0), (21, 20, 50)])
+def test_a_vessel_that_goes_on_to_fill_is_not_held_against_how_full_it_was(clip, first, last, judged):
+    fills = filling(3 * T, first, first + 3 * (last - first))
+    card = as_filmed(clip, fills[:T], INTERVAL, np.concatenate([clip] * 3), fills)
+    assert abs(card.beyond - judged) <= 2 and "steadily" in card.notes[0]
+    assert card["level"].verdict == GOOD
+
+
+def test_a_level_that_goes_up_and_down_is_held_to_its_mean_after_the_clip():
+    clip, rows = film(), (20 + 3 * np.sin(np.linspace(0, 2 * np.pi, T))).round().astype(int)
+    waves = np.stack([filling(1, row, row)[0] for row in rows])
+    card = as_filmed(clip, waves, INTERVAL, np.concatenate([clip] * 3), np.concatenate([waves] * 3))
+    assert card.beyond == 2 * T and card.notes == ()

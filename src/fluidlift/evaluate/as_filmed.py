@@ -26,6 +26,7 @@ from fluidlift.evaluate.film import (
     Foam,
     Places,
     film_statistics,
+    growth,
     mean_flow,
     spread,
 )
@@ -60,6 +61,9 @@ FOLLOWED = 0.1
 """correlation: what is less alike downstream in the clip is chance, and no number to divide by"""
 STAYS = 0.8
 """share of the fluid that must be the same in both halves of a clip for frames after its end to be held against it"""
+GROWS = 0.05
+"""of the area that the fluid has on average: by how much more or less of it than a frame after the clip's end may show,
+where the fluid grows or shrinks steadily, for that frame to be held against the clip. A level of 0.95 is good"""
 FEWEST = 6
 """frames: the last third of fewer has no pair, and a half no mean"""
 FEWEST_AT_A_PLACE = 0.005
@@ -203,7 +207,9 @@ def as_filmed(
     require(length >= FEWEST, f"{length} frames", f"{FEWEST} or more")
     places, foam, half = Places.of(masks), Foam.of(clip, masks), len(clip) // 2
     moves = places.stays < STAYS
-    later = renders[len(clip) :] if not moves and len(renders) - len(clip) >= FEWEST else renders[:0]
+    longer = max(len(renders) - len(clip), 0)
+    after = 0 if moves else _comparable(longer, len(clip), growth(masks))
+    later = renders[len(clip) : len(clip) + after] if after >= FEWEST else renders[:0]
 
     def statistics(frames: np.ndarray, where: np.ndarray, late: float = LATE) -> FilmStatistics:
         return film_statistics(frames, where, places, foam, interval=interval, late=late)
@@ -219,13 +225,28 @@ def as_filmed(
     beyond: dict[str, float] = {}
     if len(later):
         still = np.broadcast_to(places.fluid, later.shape[:3])
-        beyond = level(still, coverage[len(clip) :], places)
+        beyond = level(still, coverage[len(clip) : len(clip) + len(later)], places)
         beyond |= likeness(whole, statistics(later, still), places.fluid, places)
-    notes = ("The fluid moves through the picture: after the end of the clip nothing is compared.",) if moves else ()
+    notes = _notes(moves, longer, len(later))
     for known in () if runs else (value, floor, beyond):
         known.update((key, NONE) for key in ("current_error", "current_cosine") if key in known)
     figures = tuple(_figures(value, floor, beyond, _no_current(_speed(whole, places.fluid), runs=runs)))
     return AsFilmed(length, len(later), figures, notes, tuple(_advice(figures, value, beyond)))
+
+
+def _comparable(longer: int, frames: int, grows: float) -> int:
+    """Of `longer` frames after the end of a clip of `frames`, those with as much fluid as it has on average."""
+    return longer if not grows else int(np.clip(GROWS / abs(grows) - frames / 2, 0, longer))
+
+
+def _notes(moves: bool, longer: int, judged: int) -> tuple[str, ...]:
+    """What is not compared after the end of the clip, and why; `longer`: frames there, `judged`: those compared."""
+    if moves:
+        return ("The fluid moves through the picture: after the end of the clip nothing is compared.",)
+    if longer >= FEWEST and judged < longer:
+        part = f"only {judged} frames are" if judged else "nothing is"
+        return (f"The fluid grows or shrinks steadily: after the end of the clip {part} compared.",)
+    return ()
 
 
 def level(masks: np.ndarray, coverage: np.ndarray, places: Places, seen: np.ndarray | None = None) -> dict[str, float]:

@@ -33,6 +33,10 @@ further than where a wrong level shows"""
 CELL = 1.0 / 32.0
 """side of the places in which foam is counted, over the longer side of the picture"""
 
+STEADY_GROWTH = 0.8
+"""share of the variance of a fluid's area that its growth explains: of a whole wave, which comes back, a straight line
+explains 6 / pi^2 = 0.61"""
+
 NO_MAP: Any = None
 """OpenCV takes the rows from a second map unless there is none, which its stub does not know"""
 
@@ -66,6 +70,20 @@ class Places:
     def stays(self) -> float:
         """Share of what is mostly fluid in one half of the clip that is so in both: 1 where the outline stays."""
         return float(self.steady.sum() / max(int((self.fluid | self.steady).sum()), 1))
+
+
+def growth(masks: Bool[np.ndarray, "t h w"]) -> float:
+    """Share of its mean area by which a fluid grows from frame to frame (negative: shrinks), as in a vessel that fills.
+
+    Least squares over the frames; 0 where a straight line does not explain `STEADY_GROWTH` of the variance, as with
+    waves on a beach.
+    """
+    areas = masks.reshape(len(masks), -1).sum(axis=1).astype(float)
+    if len(masks) < 3 or areas.std() <= 1e-9 * areas.mean():
+        return 0.0
+    time = np.arange(len(masks))
+    slope = np.polyfit(time, areas, 1)[0]
+    return float(slope / areas.mean()) if np.corrcoef(time, areas)[0, 1] ** 2 > STEADY_GROWTH else 0.0
 
 
 def _grown(mask: np.ndarray, radius: int) -> np.ndarray:

@@ -194,6 +194,21 @@ def test_the_share_of_fluid_is_bilinear_between_pixels():
     np.testing.assert_allclose(looked_up(film, index, np.full(6, 4.0))[2], 1.0, atol=1e-6)  # wet again
 
 
+def test_what_sways_covers_what_it_does_at_an_instant_and_what_was_never_filmed_stays():
+    fluid = everywhere()
+    fluid[6:, :, 32:48] = False  # it has swayed to the left
+    fluid[:, :, 56:] = False  # what no frame shows is not the film's to hide
+    fluid[3, 10:30] = False  # a mask that failed once
+    fluid[:9, 20:24, 10:14] = False  # and one that failed in a place for a while
+    film = FluidFootage.of(lively(), fluid, INTERVAL)
+    columns = np.array([20.0, 31.25, 40.0, 60.0])
+    index = np.stack([np.full(4, 20.0), columns], axis=-1)
+    np.testing.assert_allclose(film.covers(index, np.full(4, 2.4)), 1.0, atol=1e-6)
+    np.testing.assert_allclose(film.covers(index, np.full(4, 3.0)), 1.0, atol=1e-6)
+    np.testing.assert_allclose(film.covers(index, np.full(4, 8.0)), [1, 0.75, 0, 1], atol=1e-6)
+    assert film.covers(np.array([[22.0, 12.0]]), np.zeros(1)) == 1.0
+
+
 def test_places_beyond_the_picture_are_its_border():
     film = FluidFootage.of(lively(), everywhere(), INTERVAL)
     _, beyond, _ = looked_up(film, np.array([[-5.0, 12.0], [200.0, 400.0]]), np.full(2, 2.0))

@@ -59,7 +59,7 @@ def places(count: int = 60, inset: float = 1.2) -> np.ndarray:
 
 def test_at_the_first_instant_the_body_is_seen_as_it_is():
     points = places()
-    color, there = patches_over(lambda x, y: (0 * x, 0 * y), 0).colors(points)
+    color, there, _ = patches_over(lambda x, y: (0 * x, 0 * y), 0).colors(points)
     expected = np.clip(pattern(points[:, 0], points[:, 1]), 0, 1)
     # pixels are 3.3 cm wide, a tenth of the pattern's half wave
     assert there.all() and np.abs(color[:, 0] - expected).mean() < 0.02
@@ -67,7 +67,7 @@ def test_at_the_first_instant_the_body_is_seen_as_it_is():
 
 def test_a_flow_without_shear_carries_the_pattern_along():
     points = places()
-    color, _ = patches_over(lambda x, y: (0.5 + 0 * x, 0.2 + 0 * y), 20).colors(points)
+    color, *_ = patches_over(lambda x, y: (0.5 + 0 * x, 0.2 + 0 * y), 20).colors(points)
     carried = np.clip(pattern(points[:, 0] - 0.5, points[:, 1] - 0.2), 0, 1)
     still = np.clip(pattern(points[:, 0], points[:, 1]), 0, 1)
     assert np.abs(color[:, 0] - carried).mean() < 0.03
@@ -77,7 +77,7 @@ def test_a_flow_without_shear_carries_the_pattern_along():
 def test_a_flow_that_turns_turns_the_pattern():
     turned = 0.6
     speed, points = turned / 1.0, places(inset=1.5)
-    color, _ = patches_over(lambda x, y: (-speed * (y - 2), speed * (x - 2)), 100, interval=0.01).colors(points)
+    color, *_ = patches_over(lambda x, y: (-speed * (y - 2), speed * (x - 2)), 100, interval=0.01).colors(points)
     away, cos, sin = points[:, :2] - 2.0, np.cos(-turned), np.sin(-turned)
     x, y = 2 + cos * away[:, 0] - sin * away[:, 1], 2 + sin * away[:, 0] + cos * away[:, 1]
     assert np.abs(color[:, 0] - np.clip(pattern(x, y), 0, 1)).mean() < 0.06  # the middle of each patch moves exactly
@@ -132,7 +132,7 @@ def test_new_patches_show_what_was_seen_of_the_fluid_and_not_what_was_not():
     patches = TexturePatches(texture, 0.6)
     for k in range(61):
         patches.advance(where, 0.05 if k else 0.0, np.random.default_rng([2, k]))
-    color, there = patches.colors(places(40, inset=0.2))
+    color, there, _ = patches.colors(places(40, inset=0.2))
     # a source is good from four fifths on: its last fifth shows where no other patch is
     assert there.all() and (color[:, 0] > 0.3).mean() < 0.02 and color[:, 0].mean() < 0.22
 
@@ -243,7 +243,7 @@ def test_one_patch_at_home_shows_the_clips_own_picture(instant):
     patches = played(0)
     patches.state = at_home(np.zeros((1, 2)), np.array([float(instant)]))
     points, index = pixels(inset=56)
-    color, there = patches.colors(points)
+    color, there, _ = patches.colors(points)
     assert there.all()
     np.testing.assert_allclose(color, shown_at(FILM, index, instant), atol=1e-5)  # single precision
 
@@ -253,7 +253,7 @@ def test_patches_of_one_instant_show_together_what_one_of_them_shows():
     patches = played(0, start=9.0)
     points, index = pixels()
     assert len(patches.state) > 10
-    color, there = patches.colors(points)
+    color, there, _ = patches.colors(points)
     assert there.all()
     np.testing.assert_allclose(color, shown_at(FILM, index, 9), atol=1e-5)
 
@@ -266,7 +266,7 @@ def test_a_surface_seen_in_plan_shows_the_clips_own_picture_whatever_its_level()
     index = pixels()[1]
     for depth in (9.5, 9.3):  # the surface as it was, and 20 cm higher
         points = CAMERA.unproject(index[:, ::-1] + 0.5, np.full(len(index), depth))
-        color, there = patches.colors(points)
+        color, there, _ = patches.colors(points)
         assert there.all()
         np.testing.assert_allclose(color, shown_at(FILM, index, 9), atol=1e-4)  # single precision of the projection
 
@@ -409,7 +409,7 @@ def test_what_was_filmed_is_shown_in_its_place_up_to_where_the_film_ends():
     np.testing.assert_array_equal(patches.state.sources[near], patches.state.centers[near])
     points, index = pixels()
     filmed = index[:, 1] >= 64
-    color, there = patches.colors(points[filmed])
+    color, there, _ = patches.colors(points[filmed])
     assert there.all()
     np.testing.assert_allclose(color, shown_at(film, index[filmed], 9), atol=1e-5)
 

@@ -147,6 +147,28 @@ def test_what_pours_or_stands_is_as_wide_as_each_frame_shows_it(channel, tmp_pat
     assert min(edited) > max(seen), "where somebody changes how it flows it is where it flows"
 
 
+@pytest.mark.parametrize("kind", ["stream", "fall"])
+def test_what_sways_is_seen_where_its_film_shows_it_at_that_instant(channel, tmp_path, kind):
+    """Beside the fluid of an instant its skin and its body are there, and are not seen."""
+    count, edges = 40, (50, 44, 38, 32)
+    wet = np.zeros((count, 48, 64), bool)
+    for t in range(count):
+        wet[t, :, 8 : edges[min(t, 3)] if t < 8 else 50] = True
+    grain = np.random.default_rng(0).integers(0, 255, (count, 48, 64, 3)).astype(np.uint8)
+    scene = channel(4, kind=kind, film=write_footage(tmp_path / "film.mp4", grain, wet, 0.04))
+    simulator, appearance = simulator_of(scene), SurfaceAppearance(scene)
+    for k, edge in enumerate(edges):
+        if k:
+            simulator.advance(scene.interval)
+        appearance.advance(simulator.particles, k)
+        shown = appearance.dressed(simulator.particles, k).gaussians
+        column = scene.camera.project(shown.means)[0][:, 0]
+        there, left = (column > 10) & (column < min(edge, 48) - 3), (column > edge + 3) & (column < 48)
+        assert np.mean(shown.opacities[there] > 0.3) > 0.2, "the skin, not the body under it"
+        if k > 1:  # three frames of forty later less than a tenth of the patches have given way
+            assert left.sum() > 20 and np.mean(shown.opacities[left] > 0.05) < 0.1
+
+
 def test_patches_that_stay_at_home_are_few(channel, tmp_path):
     """Where two meet, what moves in the film breaks off; nothing shears those of a scene that nobody edited."""
     path = film(tmp_path / "film.mp4")

@@ -343,6 +343,18 @@ def test_at_the_rim_of_wide_fluid_the_plate_shows_the_clip_and_of_a_jet_nothing(
     assert (background_plate(frames, fluid).kept == plate.seen).all(), "smoke and jets leave none in the air"
 
 
+def test_where_wide_fluid_sways_its_rim_is_not_left_in_the_plate():
+    """The ground beside it is seen up to what it always covers: a line of fluid would stand in the open."""
+    frames = np.tile(BROWN, (9, 120, 160, 1)).astype(np.uint8)
+    fluid = np.zeros(frames.shape[:3], bool)
+    for t in range(9):
+        fluid[t, :, 30 + 5 * abs(t - 4) : 130] = True
+    frames[fluid] = BLUE
+    plate = background_plate(frames, fluid, shore=True)
+    assert np.abs(plate.image[60, :60].astype(int) - BROWN).max() <= 12
+    assert plate.kept[60, 126:130].all() and np.abs(plate.image[60, 129].astype(int) - BLUE).max() <= 2
+
+
 def test_fluid_that_the_masks_of_a_few_frames_have_missed_is_no_ground():
     frames = np.tile(BROWN, (10, 120, 160, 1)).astype(np.uint8)
     fluid = np.zeros(frames.shape[:3], bool)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -122,6 +123,36 @@ class FluidFootage:
         _residual(self.frames, self.fluid, self.pure, self.mean, index.astype(np.float64), frame, home, out, share)
         steady = np.where(home[:, None], sampled(self.mean, index), sampled(self.inner, index))
         return steady, out, share
+
+
+    def covers(
+        self, index: Float[np.ndarray, "n 2"], instants: Float[np.ndarray, " n"]
+    ) -> Float[np.ndarray, " n"]:
+        """Share 0 to 1 of fluid in places of the picture at instants of the film: 0 where a fluid that sways has left.
+
+        1 where the film never shows fluid: what is simulated there is not the film's to hide.
+
+        Args:
+            index: row and column, bilinear between pixels.
+            instants: frames, counted from 0; the nearest one counts.
+        """
+        frame = np.clip(np.rint(instants), 0, len(self) - 1).astype(np.int64)
+        h, w = self.outside.shape
+        row, column = (np.clip(along, 0.0, size - 1.0) for along, size in zip(index.T, (h, w)))
+        r, c = np.minimum(row.astype(np.int64), h - 2), np.minimum(column.astype(np.int64), w - 2)
+        found = np.zeros(len(index), np.float32)
+        for a, b in np.ndindex(2, 2):
+            weight = np.where(a, row - r, 1.0 - row + r) * np.where(b, column - c, 1.0 - column + c)
+            found += weight * (self._settled[frame, r + a, c + b] | (self.outside[r + a, c + b] > 0))
+        return found
+
+    @cached_property
+    def _settled(self) -> Bool[np.ndarray, "t h w"]:
+        """Fluid by the majority of each frame and its neighbours, without holes: of a mask that failed for a while none
+        is opened, and what always stands in the fluid is none of it."""
+        before, after = self.fluid[[0, *range(len(self) - 1)]], self.fluid[[*range(1, len(self)), len(self) - 1]]
+        most = (self.fluid & (before | after)) | (before & after)
+        return np.stack([ndimage.binary_fill_holes(wet) for wet in most])
 
 
 def _without_rim(fluid: np.ndarray) -> np.ndarray:

@@ -86,6 +86,17 @@ class SurfaceMap:
         """A field of the map at some places (x, y in m), between its columns by their distance."""
         return sampled(field, (np.asarray(places, np.float64) - self.low) / self.pitch - 0.5)
 
+    def mean(
+        self, values: Float[np.ndarray, " n"], places: Float[np.ndarray, "n 2"], elsewhere: float
+    ) -> Float[np.ndarray, "nx ny"]:
+        """Field of the map with the mean of the values of the places (x, y in m) in each column; `elsewhere` in columns
+        without any."""
+        index = np.clip(((places - self.low) / self.pitch).astype(np.int64), 0, np.array(self.wet.shape) - 1)
+        column, n = np.ravel_multi_index(tuple(index.T), self.wet.shape), self.wet.size
+        count = np.bincount(column, minlength=n)
+        found = np.where(count > 0, np.bincount(column, values, minlength=n) / np.maximum(count, 1), elsewhere)
+        return found.reshape(self.wet.shape)
+
     def presence(self, places: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
         """How much of the surroundings of places (m) is liquid: 1/2 on a straight shore."""
         return self.at(self._share, places)

@@ -298,11 +298,12 @@ class TexturePatches:
         nearest = np.argsort(((places - center) ** 2).sum(axis=1))[: max(len(places) // 10, 1)]
         return places[rng.choice(nearest)]
 
-    def colors(self, points: Float[np.ndarray, "n 3"]) -> tuple[np.ndarray, np.ndarray]:
-        """sRGB [n,3] at points (m) of the surface, in the shade of their place, and whether a patch is there [n]."""
+    def colors(self, points: Float[np.ndarray, "n 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """sRGB [n,3] at points (m) of the surface, in the shade of their place, whether a patch is there [n], and how
+        much of the fluid that the patches show [n], 0 to 1: with a film, less where a fluid that sways has left."""
         s, n = self.state, len(points)
         if n == 0 or len(s) == 0:
-            return np.zeros((n, 3)), np.zeros(n, bool)
+            return np.zeros((n, 3)), np.zeros(n, bool), np.ones(n)
         places, most = np.asarray(points[:, :2], np.float64), min(OVERLAP, len(s))
         away, patches = nearest_of_few(s.centers, places, most, within=self._radius)
         point, rank = np.nonzero(np.isfinite(away))
@@ -327,12 +328,13 @@ class TexturePatches:
         color = color * np.clip(bright, 1 / LARGEST_RATIO, LARGEST_RATIO)[:, None]
         total = np.bincount(point, weight, minlength=n)
         mean = _summed(point, weight[:, None] * color, n) / np.maximum(total, 1e-30)[:, None]
-        return np.clip(mean, 0.0, 1.0), total > 0
+        return np.clip(mean, 0.0, 1.0), total > 0, np.ones(n)
 
     def _played(
         self, points: np.ndarray, point: np.ndarray, sources: np.ndarray, instants: np.ndarray, weight: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Colours [n,3] and whether there are any [n], from pairs of a point and a place of the footage.
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Colours [n,3], whether there are any [n], and how much of the fluid is [n], from pairs of a point and a place
+        of the footage.
 
         colour = shade + sum w gain fine / sum w + sum w gain residual / sqrt(sum w^2): the shade is that of the point's
         own place; what differs from the mean keeps its variance where patches overlap (Gagnon et al. 2019). A patch
@@ -353,12 +355,14 @@ class TexturePatches:
         brighter = shade[point].mean(axis=1) / np.maximum(there.mean(axis=1), 1e-3)
         gain = np.clip(brighter, 1 / LARGEST_RATIO, LARGEST_RATIO)
         fine = mean - there
+        covers = np.bincount(point, weight * footage.covers(index, instants), minlength=n)
+        covers /= np.maximum(np.bincount(point, weight, minlength=n), 1e-30)
         weight = weight * np.clip(wet, 1e-2, 1.0)
         total = np.bincount(point, weight, minlength=n)
         spread = _spread_of(point, instants, home, weight, n)
         still = _summed(point, (weight * gain)[:, None] * fine, n) / np.maximum(total, 1e-30)[:, None]
         lively = _summed(point, (weight * gain)[:, None] * residual, n) / np.maximum(spread, 1e-30)[:, None]
-        return np.clip(shade + still + lively, 0.0, 1.0), total > 0
+        return np.clip(shade + still + lively, 0.0, 1.0), total > 0, covers
 
 
 def _summed(point: np.ndarray, values: np.ndarray, n: int) -> np.ndarray:

@@ -201,6 +201,8 @@ class SurfaceAppearance:
         self._axes: SurfaceAxes
         self._outline: FilmedOutline | None = None
         self._outlines: FilmedOutlines | None = None
+        self._sways = False
+        """whether it lies within all that its film ever shows, and covers of that what its patches show just then"""
         self._pace = 1.0
         """frames of the film per frame of the scene"""
         self._level: float | None = None
@@ -273,7 +275,7 @@ class SurfaceAppearance:
             self._level = float(np.median(surface.height[surface.wet]))
         if footage is not None and not scene.edited:
             if not (pours or stands):
-                self._outline = FilmedOutline(self._camera, footage.outside, self._cell)
+                self._outline, self._sways = FilmedOutline(self._camera, footage.outside, self._cell), True
             else:
                 self._outlines = FilmedOutlines(self._camera, footage, self._cell, rises=changes)
                 self._outline = self._outlines.at(scene.film_start)
@@ -482,10 +484,10 @@ class SurfaceAppearance:
         # what is in the air before a surface shows the film where it is seen, as on a map over the picture it always is
         deepest = np.inf if self._outline is not None or isinstance(axes, PictureAxes) else TINTED
         near = np.flatnonzero((above > -TINTED) & (above < deepest) & (covered < 1) & ~own)
-        color, there = patches.colors(places[near])
+        color, there, _ = patches.colors(places[near])
         sh[near[there], :1] = sh_from_rgb(color[there])
         points = skin.points(surface)
-        color, there = patches.colors(points)
+        color, there, covers = patches.colors(points)
         color = dyed(color, points, surface, replace(shown, means=axes.points(shown.means)), own, self._cell)
         world = axes.world_points(points)
         if self._outline is None:
@@ -495,6 +497,9 @@ class SurfaceAppearance:
         if inside is not None:
             there &= ~inside(world)
         tracers = axes.world_splats(skin.splats(surface, color).select(there))
+        if self._sways and covers.min(initial=1.0) < 1.0:
+            tracers = replace(tracers, opacities=tracers.opacities * covers[there].astype(np.float32))
+            opacities *= surface.at(surface.mean(covers, skin.places, 1.0), xy).astype(np.float32)
         speeds = axes.world_velocities(points[there], surface.at(surface.velocity, skin.places[there]))
         return Dressed(
             concatenate([replace(shown, scales=scales, opacities=opacities, sh=sh), tracers]),

@@ -79,7 +79,11 @@ def background_plate(
     if shore:
         seen = _without_missed(seen, wet.mean(axis=0), image, median, beside)
     ground = seen & ~beside
-    kept = seen | _rim_of_wide_fluid(np.all(covered, axis=0)) if shore else seen
+    kept = seen
+    if shore:
+        # where the fluid sways, the ground beside it is seen up to what it always covers
+        dry = ndimage.binary_dilation(~covered.any(axis=0), iterations=SHORE)
+        kept = seen | (_rim_of_wide_fluid(np.all(covered, axis=0)) & dry)
     if ground.any() and not seen.all():
         painted = _inpainted(image, ~ground)
         blend = weight_of_unseen(kept)[..., None]

@@ -124,10 +124,7 @@ class FluidFootage:
         steady = np.where(home[:, None], sampled(self.mean, index), sampled(self.inner, index))
         return steady, out, share
 
-
-    def covers(
-        self, index: Float[np.ndarray, "n 2"], instants: Float[np.ndarray, " n"]
-    ) -> Float[np.ndarray, " n"]:
+    def covers(self, index: Float[np.ndarray, "n 2"], instants: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
         """Share 0 to 1 of fluid in places of the picture at instants of the film: 0 where a fluid that sways has left.
 
         1 where the film never shows fluid: what is simulated there is not the film's to hide.

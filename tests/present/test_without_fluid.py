@@ -91,6 +91,25 @@ def test_the_plate_shows_the_bed_where_the_clip_shows_water_and_no_rock_beside_i
     np.testing.assert_array_equal(beside.image[ashore], backdrop.picture[ashore])
 
 
+def test_beyond_the_ends_liquid_is_hidden_where_the_clip_is_dry_and_nowhere_else():
+    """A mirror image of the stream knows no bend of it and no far shore: it stood before the trees."""
+    camera = PinholeCamera.looking(np.array([0.3, 0.6, 0.5]), np.array([1.6, 0.6, 0.2]), 60.0, SIZE)
+    backdrop, _, _ = filmed(camera)
+    assert backdrop.picture is not None and backdrop.fluid is not None
+    height, width = backdrop.fluid.shape
+    fluid = np.zeros((height, width), np.float32)
+    fluid[:, : width // 2] = 1.0
+    pictures = GroundPictures(ground(), GRID, Slab(ENDS, liquid()), Environment.white())
+    beside, _ = pictures.on_plate(camera, Backdrop(backdrop.picture, None, 1.0, fluid))
+    points = camera.unproject(camera.pixel_grid(), beside.depth)
+    ahead = camera.rays(camera.pixel_grid()) @ ENDS[0].along > 1e-6
+    dry = (fluid < 0.5) & ahead
+    assert dry.sum() > 3000 and (beside.depth[dry] > 0).all()
+    assert (points[dry] @ ENDS[0].along <= ENDS[0].at + 1e-4).all(), "no farther than the section"
+    whole = pictures.on_plate(camera, Backdrop(backdrop.picture, None, 1.0, np.ones_like(fluid)))[0]
+    np.testing.assert_array_equal(beside.depth[fluid > 0.5], whole.depth[fluid > 0.5])
+
+
 def test_a_ray_that_misses_the_model_of_a_rock_has_the_depth_of_its_neighbour():
     backdrop, _, rock = filmed()
     assert backdrop.depth is not None

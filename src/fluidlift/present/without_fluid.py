@@ -189,7 +189,8 @@ class GroundPictures:
         rocks = np.zeros(plate.shape[:2], np.float32) if backdrop.depth is None else backdrop.depth
         hole = np.maximum(fluid, rocks > 0)
         drawn = fluid if backdrop.drawn is None else fluid * backdrop.drawn
-        dry, wet = self._around.depth(camera), lit.depth > 0
+        wet = lit.depth > 0
+        dry = np.where(hole > 0.5, self._around.depth(camera), self._dry(camera))
         found = []
         for share, depth in (
             (drawn, np.where(rocks > 0, rocks, np.where((fluid > 0.5) & wet, lit.depth, dry))),
@@ -199,6 +200,22 @@ class GroundPictures:
             found.append(Behind(image, depth, goes_on=True, coarse=backdrop.coarse))
         self._plate = backdrop, place_of(camera), (found[0], found[1])
         return found[0], found[1]
+
+    def _dry(self, camera: PinholeCamera) -> np.ndarray:
+        """Camera z (m) of ground that the plate shows: what is modelled of it, and no farther than the ends.
+
+        Beyond them liquid goes on as a mirror image, which knows no bend of the river and no far shore: where the clip
+        is dry it is hidden.
+        """
+        depth = self._around.depth(camera)
+        rays = camera.rays(camera.pixel_grid())
+        for end in self._slab.ends:
+            left = end.at - float(camera.position @ end.along)
+            if left > 0:
+                ahead = rays @ end.along
+                beyond = np.where(ahead > 1e-9, left / np.maximum(ahead, 1e-9), 0.0).astype(np.float32)
+                depth = np.where((beyond > 0) & ((depth <= 0) | (depth > beyond)), beyond, depth)
+        return depth
 
     def _cleared(self, camera: PinholeCamera, depth: np.ndarray, hidden: np.ndarray) -> np.ndarray:
         """Camera z with that of the bed where something hides the liquid: light that is bent beside a rock comes from

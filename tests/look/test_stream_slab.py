@@ -112,3 +112,28 @@ def test_what_stands_out_of_the_liquid_and_is_no_bank_is_an_island():
     assert island[16, 8] and not island[:, 0].any() and (tops[island] > 0.25).all()
     assert Slab().islands(mesh, GRID) is None
     assert Slab(still=still).islands(ground_mesh(GRID, np.full((17, 9), 0.1)), GRID) is None
+
+
+def test_a_stream_that_goes_down_goes_on_down_beyond_both_ends():
+    """As a plain mirror image the upper part of a fall would stand before it, and hide it."""
+    x, y = (np.arange(0.4, 1.3, 0.05)[:, None] * np.ones((1, 16)), np.arange(0.025, 0.8, 0.05) * np.ones((18, 1)))
+    down = np.where(x < 0.8, 0.6, 0.2) - 0.02 * x  # a ledge in a stream with a slope
+    still = np.stack([x, y, down], axis=-1).reshape(-1, 3)
+    fluid = Gaussians(
+        still.astype(np.float32), np.tile([1.0, 0, 0, 0], (len(still), 1)).astype(np.float32),
+        np.full((len(still), 3), 0.02, np.float32), np.ones(len(still), np.float32),
+        np.zeros((len(still), 1, 3), np.float32),
+    )  # fmt: skip
+    camera = PinholeCamera.looking(np.array([0.8, -9.0, 0.4]), np.array([0.8, 0.4, 0.4]), 60.0, (200, 200))
+    found, _ = Slab((OUT, IN), still).beyond(fluid, np.zeros((len(still), 3)), camera)
+    beyond = found.means[found.means[:, 0] > 1.25]
+    upstream = found.means[found.means[:, 0] < 0.35]
+    assert len(beyond) > 200 and len(upstream) > 200
+    assert beyond[:, 2].max() < 0.2, "no higher than at the outlet"
+    assert beyond[beyond[:, 0] > 1.9][:, 2].max() < -0.1, "the next ledge"
+    assert upstream[:, 2].min() > 0.55 and upstream[upstream[:, 0] < -0.3][:, 2].min() > 0.9
+    plain, _ = Slab((OUT, IN)).beyond(fluid, np.zeros((len(still), 3)), camera)
+    assert plain.means[plain.means[:, 0] > 1.9][:, 2].min() > 0.5, "without a level it is the mirror image"
+    ground = TriangleMesh(still - [0, 0, 0.1], np.array([[0, 1, 16]]))
+    image = Slab((OUT,), still).carried_on(ground).vertices[len(still) :]
+    assert image[:, 2].max() < 0.15

@@ -42,6 +42,8 @@ class Material:
     """linear radiance of the hottest part; 1 is a white sheet in the light of the environment"""
     carried: float = 0.0
     """0 to 1: how much the colour of the splats shows in the body, in place of the albedo"""
+    foams: bool = False
+    """where it falls and breaks it is white with air, as its splats show it (`surface_foam`)"""
 
     def __post_init__(self) -> None:
         one = f"material '{self.name}' with"
@@ -84,12 +86,13 @@ class Material:
         )  # fmt: skip
 
 
-WATER = Material("water", 1.333, absorption=(0.27, 0.056, 0.010))
+WATER = Material("water", 1.333, absorption=(0.27, 0.056, 0.010), foams=True)
 """Absorption of pure water, Pope and Fry 1997 (Applied Optics 36, 8710): 0.27, 0.056 and 0.010 per metre."""
 
 MUDDY_WATER = Material(
-    "muddy_water", 1.334, absorption=(0.9, 1.6, 3.4), scattering=22.0, albedo=(0.30, 0.185, 0.085), carried=0.15
-)
+    "muddy_water", 1.334, absorption=(0.9, 1.6, 3.4), scattering=22.0, albedo=(0.30, 0.185, 0.085), carried=0.15,
+    foams=True,
+)  # fmt: skip
 """A river in flood: some 50 mg of silt a litre, which scatter about 0.4 m^2/g (Kirk 1994), brown by iron and humus that
 take more blue than red."""
 

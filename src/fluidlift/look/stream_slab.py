@@ -2,16 +2,19 @@
 
 What is simulated is a box. Before the terrain, ground and liquid end together in clean sections. Before a clip's plate,
 which shows the whole world, both go on beyond the box as their own mirror images, as the plate does beyond its rim: an
-end in the middle of a picture is a pane of glass that nobody filmed.
+end in the middle of a picture is a pane of glass that nobody filmed. Downhill stays downhill there: what stands higher
+than the liquid at the end lies as much lower in the image. As it is, the mirror image of a fall would stand before it.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from fluidlift.look.inflow import surface_level
 from fluidlift.look.outlet_section import OpenEnd
@@ -28,6 +31,8 @@ from fluidlift.types import (
 
 MARGIN = 0.05
 """of a picture's size: so far beyond its rim the liquid goes on, since light that is bent comes from there"""
+LEVELS = 8
+"""columns of the liquid at rest whose mean is its level: of one, the image would go down in steps"""
 
 
 @dataclass(frozen=True)
@@ -55,7 +60,7 @@ class Slab:
         parts, speeds = [fluid], [velocities]
         for end in self.ends:
             way = np.eye(3) - 2.0 * np.outer(end.along, end.along)
-            means = fluid.means - 2.0 * (fluid.means @ end.along - end.at)[:, None] * end.along
+            means = self._image(fluid.means, end)
             seen = np.flatnonzero(_near_picture(means, camera))
             # the mirror image of an ellipsoid is one that was turned: its axes have no sign
             turned = quat_from_matrix(-way @ matrix_from_quat(fluid.quats[seen]))
@@ -88,7 +93,7 @@ class Slab:
     def carried_on(self, mesh: TriangleMesh) -> TriangleMesh:
         """A mesh that is cut at the ends, with what a mirror in each of them shows of it."""
         points, count = np.asarray(mesh.vertices, np.float64), len(mesh.vertices)
-        images = [points - 2.0 * (points @ e.along - e.at)[:, None] * e.along for e in self.ends]
+        images = [self._image(points, end) for end in self.ends]
         if not images:
             return mesh
         faces = [mesh.faces, *(mesh.faces[:, ::-1] + (k + 1) * count for k in range(len(images)))]
@@ -99,6 +104,31 @@ class Slab:
             colors=None if mesh.colors is None else np.concatenate([mesh.colors] * len(faces)),
             uv=None if mesh.uv is None else np.concatenate([mesh.uv, *[mesh.uv[:, ::-1]] * len(images)]),
         )
+
+    def _image(self, points: np.ndarray, end: OpenEnd) -> np.ndarray:
+        """Points behind an end, m, of points before it."""
+        foot = points - (points @ end.along - end.at)[:, None] * end.along
+        image = 2.0 * foot - points
+        if self._columns is not None:
+            image[:, 2] -= 2.0 * (self._level(points) - self._level(foot))
+        return image
+
+    @cached_property
+    def _columns(self) -> tuple[cKDTree, np.ndarray] | None:
+        """Columns of the liquid at rest, and the height (m) of each."""
+        if self.still is None or not len(self.still) or not self.ends:
+            return None
+        spacing, still = self.ends[0].spacing, np.asarray(self.still, np.float64)
+        places = np.unique(np.floor(still[:, :2] / spacing), axis=0)
+        places = (places + 0.5) * spacing
+        return cKDTree(places), surface_level(still, spacing)(places)
+
+    def _level(self, points: np.ndarray) -> np.ndarray:
+        """z (m) of the liquid at rest at places."""
+        assert self._columns is not None
+        columns, heights = self._columns
+        nearest = columns.query(points[:, :2], k=min(LEVELS, len(heights)))[1]
+        return heights[nearest.reshape(len(points), -1)].mean(axis=1)
 
     def islands(self, ground: TriangleMesh, grid: Grid) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
         """Heights (m) of a block of ground over its nodes, the level of the liquid there, and bool: what stands out of

@@ -17,8 +17,8 @@ from fluidlift.io.output_files import Written, cleared, numbered
 from fluidlift.io.scene_look import Look
 from fluidlift.messages import Notice
 from fluidlift.present.frames import BACKGROUNDS, Drawn, FrameRenderer, SimulatedFrame
-from fluidlift.present.front_view import slab_of
-from fluidlift.present.looks import Painter, Quality
+from fluidlift.present.front_view import slab_of, white_of
+from fluidlift.present.looks import OnSurface, Painter, Quality
 from fluidlift.present.surface_waves import SurfaceWaves, waves_of
 from fluidlift.scene.build import Scene
 from fluidlift.scene.recall import footage_of_asset, simulated_poses, simulated_scene
@@ -161,7 +161,7 @@ def _painter(
         engine=request.engine,
         quality=Quality.draft() if request.draft else Quality(request.supersample, request.samples),
         slab=slab_of(scene),
-        waves=waves,
+        on_surface=OnSurface(waves, white_of(scene)),
     )
 
 

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from fluidlift.look.outlet_section import OpenEnd
     from fluidlift.look.rasterize import Rendered
     from fluidlift.look.stream_slab import Slab
+    from fluidlift.look.surface_foam import FilmedWhite
 
 BEHIND = (1.5, 0.5)
 """cells behind the terrain from which fluid is hidden: at rocks, whose shape is a guess, and where it is always dry"""
@@ -153,6 +154,13 @@ def slab_of(scene: Scene) -> Slab:
         grid, along = scene.terrain.grid, scene.terrain.mainstream
         ends.append(OpenEnd.of(scene.cell_types, grid, along, kind=CellType.INFLOW))
     return Slab(tuple(end for end in ends if end is not None), scene.rest.means)
+
+
+def white_of(scene: Scene) -> FilmedWhite:
+    """By what foam is told in the colours of a scene's fluid."""
+    from fluidlift.look.surface_foam import FilmedWhite
+
+    return FilmedWhite.of(scene.camera, scene.rest.rgb)
 
 
 def to_bytes(image: np.ndarray) -> np.ndarray:

@@ -26,6 +26,7 @@ from fluidlift.look.relight import relit
 from fluidlift.look.screen_space import mesh_surface, particle_surface
 from fluidlift.look.solid_contact import settled
 from fluidlift.look.stream_slab import Slab
+from fluidlift.look.surface_foam import FilmedWhite, with_foam
 from fluidlift.look.surface_skin import painted_liquid
 from fluidlift.look.transparent import splat_surface
 from fluidlift.look.vessel import Pane, before_glass, panes, vessel_apart
@@ -82,6 +83,16 @@ class Frame:
     """s from the first frame, by which waves move on"""
 
 
+@dataclass(frozen=True)
+class OnSurface:
+    """What is on the surface of a liquid in the looks transparent and surface."""
+
+    waves: SurfaceWaves | None = None
+    """None: it is as smooth as it was simulated"""
+    white: FilmedWhite | None = None
+    """what of its colours is foam; None: nothing is"""
+
+
 def placed_bodies(obstacles: Sequence[Obstacle], poses: np.ndarray) -> list[TriangleMesh]:
     """Meshes of obstacles where they are: poses [b,7], position (m) and orientation (w, x, y, z)."""
     return [
@@ -134,7 +145,7 @@ class Painter:
         quality: how finely.
         slab: of a stream; before the terrain it ends there in clean sections, and the ground with it. Before a clip's
             plate it goes on beyond them. None: it is drawn as far as its particles go.
-        waves: on the surface of the looks transparent and surface; None: it is as smooth as it was simulated.
+        on_surface: what there is beside the liquid; None: nothing.
 
     Raises:
         InputRejected: an unknown material, environment or engine.
@@ -151,7 +162,7 @@ class Painter:
         engine: str = "mesh",
         quality: Quality | None = None,
         slab: Slab | None = None,
-        waves: SurfaceWaves | None = None,
+        on_surface: OnSurface | None = None,
     ) -> None:
         if engine not in ENGINES:
             near = difflib.get_close_matches(engine, ENGINES, 1)
@@ -164,7 +175,8 @@ class Painter:
         self.material: Material = _as_filmed(material_named(look.material), folder).tinted(look.tint)
         self.environment = environment_of(folder, look.environment)
         self._quality, self._bed = quality or Quality(), terrain if kind_of(kind).lies_on_ground else None
-        self._slab, self._waves = slab or Slab(), waves
+        on_surface = on_surface or OnSurface()
+        self._slab, self._waves, self._white = slab or Slab(), on_surface.waves, on_surface.white
         self._finer, self._folder = 1 if engine == "mitsuba" else self._quality.supersample, folder
         self._far: tuple[tuple, np.ndarray] | None = None
         self._taken: tuple[Backdrop, Backdrop] | None = None
@@ -275,6 +287,10 @@ class Painter:
         image = shaded(
             surface, through, camera, self.material, self.environment, usual=self._usual, before=beside.image
         )
+        if self.material.foams and self._white is not None:
+            nearer = (beside.depth <= 0) | (surface.depth < beside.depth)
+            cover = nearer * self._white.cover(surface, camera, self.material.refractive_index)
+            image = with_foam(image, surface, cover, self.environment)
         if backdrop.cut_out:
             light = np.maximum(image - (1.0 - surface.covered[..., None]) * beside.image, 0.0)
             return Lit(light, surface.covered, surface.depth)
@@ -439,7 +455,8 @@ class Painter:
             normals = normals * np.maximum(share, INNER)[:, None]
             return splat_surface(fluid, normals, camera, volume=apart**3, far_side=free, ground=behind.depth)
         radius = RADIUS * self.terrain.grid.spacing
-        shows = self.material.carried > 0 or max(self.material.emission) > 0  # else its colours change nothing
+        m = self.material
+        shows = m.carried > 0 or max(m.emission) > 0 or m.foams  # else its colours change nothing
         colors = linear_from_srgb(np.clip(fluid.rgb, 0.0, 1.0)) if shows else None
         return particle_surface(fluid.means, radius, camera, colors, ground=behind.depth, far_side=free)
 

@@ -17,8 +17,8 @@ from fluidlift.pipeline.settings import ShowSettings
 from fluidlift.pipeline.work import Work
 from fluidlift.present.as_filmed import BEYOND, Reel, card_of_run
 from fluidlift.present.frames import FrameRenderer, SimulatedFrame
-from fluidlift.present.front_view import slab_of, to_bytes
-from fluidlift.present.looks import Painter
+from fluidlift.present.front_view import slab_of, to_bytes, white_of
+from fluidlift.present.looks import OnSurface, Painter
 from fluidlift.scene.build import Scene
 from fluidlift.scene.footage import Footage
 from fluidlift.scene.splat_files import splat_frames
@@ -124,7 +124,8 @@ def _painter(scene: Scene, folder: Path, look: Look | None) -> Painter | None:
     """Of another look than the splats' own."""
     if look is None or look.style == "splats":
         return None
-    return Painter(look, scene.terrain, folder, kind=scene.kind, slab=slab_of(scene))
+    white = OnSurface(white=white_of(scene))
+    return Painter(look, scene.terrain, folder, kind=scene.kind, slab=slab_of(scene), on_surface=white)
 
 
 def _panels(

@@ -49,6 +49,8 @@ Modules of the face:
     stream_slab         A piece of a stream as a slab that one can pick up, and how it goes on beyond its ends
     surface_axes        The axes over which the surface of a liquid is a map: the plan for what lies, the picture
                         for what falls or stands
+    surface_foam        White water on the surface of a clear liquid: what its splats show brighter than it could
+                        mirror
     surface_map         The free surface of a liquid that lies, as a map over the plan: where it is, how high it
                         stands, how it moves
     surface_skin        Surface appearance: a skin of small splats over the free surface of a liquid
@@ -101,6 +103,7 @@ __all__ = [
     "solid_contact",
     "stream_slab",
     "surface_axes",
+    "surface_foam",
     "surface_map",
     "surface_skin",
     "surface_windows",

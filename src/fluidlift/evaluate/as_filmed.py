@@ -181,6 +181,7 @@ def as_filmed(
     coverage: Bool[np.ndarray, "k h w"],
     *,
     runs: bool = True,
+    fills: bool = False,
     seen: np.ndarray | None = None,
 ) -> AsFilmed:
     """Hold a re-simulation against its clip.
@@ -195,6 +196,8 @@ def as_filmed(
         coverage: pixels that its fluid covers.
         runs: False: it stays where it is. What moves over it are waves, which the clip shows at another time: no
             current to hold against another.
+        fills: it fills or drains what it stands in: where it grows or shrinks steadily it goes on to. Else it comes
+            back, as a fall in the wind.
         seen: bool [T,H,W], pixels that each frame of the clip saw, where it was steadied: where none was filmed no
             fluid is missing or too much. None: all.
 
@@ -208,7 +211,7 @@ def as_filmed(
     places, foam, half = Places.of(masks), Foam.of(clip, masks), len(clip) // 2
     moves = places.stays < STAYS
     longer = max(len(renders) - len(clip), 0)
-    after = 0 if moves else _comparable(longer, len(clip), growth(masks))
+    after = 0 if moves else _comparable(longer, len(clip), growth(masks) if fills else 0.0)
     later = renders[len(clip) : len(clip) + after] if after >= FEWEST else renders[:0]
 
     def statistics(frames: np.ndarray, where: np.ndarray, late: float = LATE) -> FilmStatistics:

@@ -98,7 +98,8 @@ def card_of_run(
     frames = footage.clip.frames[footage.start :]
     card = as_filmed(
         frames, footage.labels.fluid[footage.start :], scene.interval, renders, coverage,
-        runs=not kind_of(scene.kind).is_standing_water, seen=own_pixels(frames) if footage.steadied else None,
+        runs=not kind_of(scene.kind).is_standing_water, fills=kind_of(scene.kind).fills_vessel,
+        seen=own_pixels(frames) if footage.steadied else None,
     )  # fmt: skip
     warning = card.warning()
     return Noted(card.to_dict(), (warning,) if warning else ())

@@ -35,7 +35,7 @@ SECONDS = 1.2
 SHOWS = {
     "beach_waves": "basin", "brague_flood": "stream", "calm_river_reflect": "stream", "cascade": "stream fall",
     "chatelet_fountain": "fall pour", "chocolate_pancakes": "pour", "coffee_cup": "pour", "corn_boil": "basin",
-    "dyntex_fountain": "fall", "forest_brook": "stream", "garden_tap": "pour", "geul_river": "stream",
+    "dyntex_fountain": "fountain", "forest_brook": "stream", "garden_tap": "pour", "geul_river": "stream",
     "grill_smoke": "plume", "honey_sieve": "stream", "latte_art": "pour", "lava_night": "stream",
     "navizence_drone": "stream", "niagara_river": "stream", "niagara_side": "fall", "pour_glass": "pour",
     "pour_over": "pour", "pour_tumbler": "pour", "scalarflow_smoke": "plume", "sea_inlet": "basin", "splash": "pour",

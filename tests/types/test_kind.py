@@ -35,7 +35,7 @@ from fluidlift.types import (
     UpEvidence,
     kind_of,
 )
-from fluidlift.types.kind import BASIN, DAM, FALL, PLUME, POUR, STREAM
+from fluidlift.types.kind import BASIN, DAM, FALL, FOUNTAIN, PLUME, POUR, STREAM
 from fluidlift.viewer.controls import controls_of
 
 ROOT = Path(fluidlift.__file__).parent
@@ -102,7 +102,7 @@ def test_no_code_decides_by_the_name_of_a_kind():
 def test_a_name_gives_its_kind_and_an_unknown_one_the_names_that_there_are():
     assert [kind_of(name).name for name in KINDS] == list(KINDS)
     assert kind_of(DAM) is DAM and str(DAM) == "dam"
-    with pytest.raises(InputRejected, match=r"'lava'.*stream, fall, pour, plume, dam, basin"):
+    with pytest.raises(InputRejected, match=r"'lava'.*stream, fall, pour, plume, dam, basin, fountain"):
         kind_of("lava")
 
 
@@ -118,14 +118,15 @@ def test_kinds_differ_in_physics():
         question: [k.name for k in KINDS.values() if getattr(k, question)]
         for question in ("is_gas", "airborne", "is_channel_flow", "is_standing_water", "lies_on_ground", "falls_freely",
                          "enters_over_rim", "nearly_level", "runs_nearly_level", "starts_at_rest", "fills_vessel",
-                         "has_mean_motion", "is_driven_in_sight")
+                         "has_mean_motion", "is_level_throughout", "rises_from_pool", "is_driven_in_sight")
     }  # fmt: skip
     assert said == {
         "is_gas": ["plume"], "airborne": ["pour", "plume"], "is_channel_flow": ["stream", "fall"],
-        "is_standing_water": ["basin"], "lies_on_ground": ["stream", "fall", "basin"],
-        "falls_freely": ["fall", "pour"], "enters_over_rim": ["fall"], "nearly_level": ["stream", "basin"],
+        "is_standing_water": ["basin", "fountain"], "lies_on_ground": ["stream", "fall", "basin", "fountain"],
+        "falls_freely": ["fall", "pour"], "enters_over_rim": ["fall"], "nearly_level": ["stream", "basin", "fountain"],
+        "is_level_throughout": ["stream", "basin"], "rises_from_pool": ["fountain"],
         "runs_nearly_level": ["stream"], "starts_at_rest": ["dam"], "fills_vessel": ["pour"],
-        "has_mean_motion": ["stream", "fall", "pour", "basin"],
+        "has_mean_motion": ["stream", "fall", "pour", "basin", "fountain"],
         "is_driven_in_sight": ["stream", "fall", "pour", "plume"],
     }  # fmt: skip
 
@@ -139,6 +140,7 @@ def test_kinds_differ_in_physics():
         {"depth_ratio": None},
         {"is_channel_flow": False},
         {"is_standing_water": True},
+        {"rises_from_pool": True},
     ],
     ids=str,
 )
@@ -147,7 +149,7 @@ def test_a_kind_that_contradicts_itself_is_refused(changed):
         replace(STREAM, **changed)
 
 
-@pytest.mark.parametrize("kind", [FALL, POUR, PLUME, DAM, STREAM, BASIN], ids=str)
+@pytest.mark.parametrize("kind", [FALL, POUR, PLUME, DAM, STREAM, BASIN, FOUNTAIN], ids=str)
 def test_every_kind_has_a_builder(kind):
     bulk = np.array([0.3, 0.1, -0.2])
     direction = builder_of(kind).mainstream(bulk)

@@ -16,10 +16,13 @@ Modules of the face:
                    window in memory
     stabilize      Video stabilisation: shake and drift taken out, cuts found
     steady_flow    The measured flow as it would be at a steady frame rate
+    thrown_up      How a fountain moves: every drop as a stone does, from its nozzle to its apex and back into the
+                   pool
     volume         From the surface to the whole volume (paper: V_vol): extension, bed, and a projection that keeps
                    what was seen
 """
 
 __all__ = [
-    "align", "cadence", "lift", "moving_camera", "optical_flow", "sequence", "stabilize", "steady_flow", "volume",
+    "align", "cadence", "lift", "moving_camera", "optical_flow", "sequence", "stabilize", "steady_flow", "thrown_up",
+    "volume",
 ]  # fmt: skip

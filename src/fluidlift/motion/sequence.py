@@ -25,6 +25,7 @@ from fluidlift.motion.mainstream import complete_flow
 from fluidlift.motion.neighbour_sum import complete_by_sum
 from fluidlift.motion.screen_divergence import project_screen_divergence, validated_reach
 from fluidlift.motion.temporal import smoothed_flow
+from fluidlift.motion.thrown_up import Flight, with_flights
 from fluidlift.motion.volume import VolumeReport, VolumeSolver
 from fluidlift.types import FaceVelocity, FluidKind, PinholeCamera, PixelFlow, SurfaceMotion, Terrain, kind_of
 from fluidlift.types.flow import TRUSTED
@@ -69,6 +70,8 @@ class MotionScene:
     """z of the free surface over each column, m, of fluids that lie on something"""
     pool_level: float | None = None
     """z below which a pour stands in its vessel, m"""
+    flights: tuple[Flight, ...] = ()
+    """of the columns of a fountain"""
     prior: tuple[Float[np.ndarray, "h w 2"], Float[np.ndarray, "h w"]] | None = None
     """mean motion of the clip, px/frame, and its confidence: a neighbour more for what a frame did not see"""
     slope_error: float = SLOPE_ERROR
@@ -373,6 +376,8 @@ def _lifted(
         surface, share = with_free_fall(surface, down, kind=scene.kind)
     velocity, report = solver.velocity(surface, tolerance=options.tolerance)
     report = replace(report, circulating=circulates)
+    if scene.flights and scene.surface_height is not None:
+        velocity = with_flights(velocity, scene.flights, cells, scene.surface_height, terrain.grid)
     if kind_of(scene.kind).is_gas:
         velocity, _ = with_air(velocity, cells, terrain, terrain.grid)
     return measured, surface, velocity, report, share

@@ -242,14 +242,11 @@ class LiquidSimulator(ParticleSimulator):
         else:
             self._stepper.append(made)
 
-    def _drain(self) -> int:
+    def _take_out(self, cells: np.ndarray) -> tuple[int, float]:
         if self._stepper is None:
-            return super()._drain()
-        if self.drains is None or not self._stepper.count:
-            return 0
-        number, mass = self._stepper.take_out(self.drains)
-        self.drained += mass / self.parameters.density
-        return number
+            return super()._take_out(cells)
+        number, mass = self._stepper.take_out(cells)
+        return number, mass / self.parameters.density
 
     def _speed_gain(self) -> float:
         return super()._speed_gain() + sum(force.largest for force in self._forces)

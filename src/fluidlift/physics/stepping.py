@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from fluidlift.errors import FluidliftError, InputRejected, require
@@ -141,6 +141,7 @@ class ParticleSimulator(ABC):
         """cells that are kept from running dry, at the end of every `advance`; None: none are"""
         self.refilled = 0.0
         """m^3 that were put in there"""
+        self._kept: tuple[float, np.ndarray] | None = None
         self._particles = self._prepared(particles)
         self._next_id = int(particles.ids.max()) + 1 if len(particles) else 0
         self._emit_source = emit_source or self._nearest_source(particles)
@@ -260,21 +261,54 @@ class ParticleSimulator(ABC):
         removed += self._drain() if self.time <= self.drains_until else 0
         emitted += self._fill_inlet()  # what the last substep carried away leaves no gap in the frame
         emitted += self._fill_dry()
+        removed += self._draw_off()
         return StepReport(
             duration, substeps, self._max_speed(), self.volume, self._wet_volume(), tuple(pressure), tuple(viscosity),
             self._count(), emitted, removed, retries,
         )  # fmt: skip
 
+    def keep_volume(self, cells: Bool[np.ndarray, "nx ny nz"]) -> None:
+        """Draw what flows in from these cells, from now on: the volume stays as it is at the first instant.
+
+        Where a pump throws a pool up it takes as much from it as it lifts.
+
+        Raises:
+            ValueError: cells of another grid, or none.
+        """
+        require(
+            cells.shape == self.grid.shape and bool(cells.any()), f"cells {cells.shape}", f"some of {self.grid.shape}"
+        )
+        self._kept = self.volume, np.argwhere(cells)
+
     def _drain(self) -> int:
         """Take out what lies in cells that are drained; how many particles."""
         if self.drains is None or not self._count():
             return 0
-        cells = np.clip(self.grid.cell_of(self._particles.positions), 0, np.asarray(self.grid.shape) - 1)
-        gone = self.drains[tuple(cells.T)]
-        if gone.any():
-            self.drained += float(self._particles.masses[gone].sum(dtype=np.float64)) / self.parameters.density
-            self._particles = self._particles.select(~gone)
-        return int(gone.sum())
+        number, volume = self._take_out(self.drains)
+        self.drained += volume
+        return number
+
+    def _draw_off(self) -> int:
+        """Take out what is there beyond the volume that is kept, of as many cells; how many particles."""
+        if self._kept is None:
+            return 0
+        volume, cells = self._kept
+        many = int((self.volume - volume) / self.grid.spacing**3)
+        if many < 1:
+            return 0
+        chosen = np.zeros(self.grid.shape, bool)
+        chosen[tuple(cells[self._rng.choice(len(cells), min(many, len(cells)), replace=False)].T)] = True
+        return self._take_out(chosen)[0]
+
+    def _take_out(self, cells: Bool[np.ndarray, "nx ny nz"]) -> tuple[int, float]:
+        """Take out what lies in cells: how many particles, m^3."""
+        at = np.clip(self.grid.cell_of(self._particles.positions), 0, np.asarray(self.grid.shape) - 1)
+        gone = cells[tuple(at.T)]
+        if not gone.any():
+            return 0, 0.0
+        volume = float(self._particles.masses[gone].sum(dtype=np.float64)) / self.parameters.density
+        self._particles = self._particles.select(~gone)
+        return int(gone.sum()), volume
 
     def _fill_dry(self) -> int:
         """Put fluid into cells that are kept from running dry; how many particles."""
@@ -351,6 +385,8 @@ class ParticleSimulator(ABC):
         volumes = grid.spacing**3 / np.maximum(per_cell, np.median(per_cell))
         as_float = {n: np.ascontiguousarray(getattr(kept, n), np.float32) for n in ("velocities", "affine")}
         volumes = volumes * self._liquid_share(kept.velocities)
+        if self.settings.airy_above is not None:
+            volumes = np.where(kept.positions[:, 2] > self.settings.airy_above, self.settings.airy, 1.0) * volumes
         return replace(
             kept,
             masses=(self.parameters.density * volumes).astype(np.float32),
@@ -381,6 +417,7 @@ class ParticleSimulator(ABC):
         if inlet.switch(self.time):
             self._emitters_switched()
         share = float(self._liquid_share(inlet.bulk[None])[0])
+        share *= 1.0 if self.settings.airy_above is None else self.settings.airy
         self._add(self._missing(), inlet.particle_spacing**3 * share)
         for number, emission in enumerate(inlet.emissions):
             places = emission.due(self.time, self._around(emission))

@@ -32,6 +32,7 @@ from fluidlift.shape import (
     standing,
     surface,
     texture_gradient,
+    thrown,
 )
 from fluidlift.shape import kind as kinds
 from fluidlift.shape.drawn import region_pixels
@@ -67,6 +68,10 @@ from fluidlift.types import (
 from fluidlift.types.fluid_masks import FluidMasks
 from fluidlift.types.kind import STREAM
 from fluidlift.types.stages import Flow, Read, Segmentation
+
+USUALLY = 0.25
+"""share of the frames in which a pixel is fluid, from which it counts to the body that may be thrown up: spray comes
+and goes"""
 
 
 @dataclass(frozen=True)
@@ -254,11 +259,13 @@ def _seen(
     rims = work.remembered("rims", find_rims, typical)
     looked = _Looked(
         clip, fluid, mask, motion, trust, bulk if said is None else None, pick, typical, rims, _measured_plane(read),
-        learned,
+        learned, work.remembered("up and down", _up_and_down, read, segmentation),
     )  # fmt: skip
     evidence, kind, parts, up, heading, steep = _kind_and_up(
         looked, given, config, known, pose_given, shaped=pictures is not None
     )
+    if kind.rises_from_pool:  # what falls back is taken to land in it, seen or not
+        mask = mask | parts.lying
     height, unsure, stood = None, NONE, None
     if pose_given and kind.surveyed_level is not None:
         level, unsure = level_of(kind.surveyed_level, given.camera)
@@ -286,6 +293,11 @@ def _motion_at_large(
     ever = fluid.any_frame()
     motion, trust = mean_motion(read.clip, flow.flow, ever)
     return motion, trust, bulk_motion(read.clip, flow.flow, fluid.__getitem__, ever)
+
+
+def _up_and_down(read: Read, segmentation: Segmentation) -> thrown.Thrown:
+    """What of the fluid rises and what falls, over consecutive frames."""
+    return thrown.thrown(read.clip.frames, FluidMasks(segmentation.labels.labels).shares() > USUALLY)
 
 
 def _surface(seen: Sight, pictures: DepthPictures | None, fluid: FluidMasks, given: GivenView, interval: float):
@@ -345,6 +357,8 @@ class _Looked:
     """of the water, where the camera's path tells it"""
     learned: LearnedTilt | None = None
     """of the camera, by a learned model of the view"""
+    ways: thrown.Thrown | None = None
+    """how much goes up and how much comes down"""
 
 
 def _measured_plane(read: Read) -> MeasuredPlane | None:
@@ -365,7 +379,7 @@ def _kind_and_up(
     surveyed, heading = registration.pose_up(known)
     pitch = float(surveyed.pitch) if pose_given else _said_of_view(c, known, mask.shape).pitch
     frames, shown = clip.frames[looked.pick], fluid[looked.pick]
-    evidence = kinds.estimate_kind(frames, shown, motion, trust, pitch=pitch, bulk=looked.bulk)
+    evidence = kinds.estimate_kind(frames, shown, motion, trust, pitch=pitch, bulk=looked.bulk, ways=looked.ways)
     kind = kind_of(evidence.kind if c.kind == "auto" else c.kind)
     if kind.starts_at_rest and (shaped or bodies is not None):
         if c.kind != "auto":

@@ -243,8 +243,9 @@ class SurfaceAppearance:
         scene, own = self._scene, self._own
         gravity = np.asarray(scene.parameters.gravity, np.float64)
         upright = -gravity[2] > UPRIGHT * max(float(np.linalg.norm(gravity)), 1e-12)
-        footage, stands = self._film_of(own), kind_of(scene.kind).is_standing_water
-        if kind_of(scene.kind).nearly_level and upright:
+        kind = kind_of(scene.kind)
+        footage, stands = self._film_of(own), kind.is_standing_water and kind.is_level_throughout
+        if kind.is_level_throughout and upright:
             self._axes = PlanAxes()
         elif footage is not None:
             self._axes = PictureAxes(self._camera, float(np.median(self._camera.project(own.means)[1])))
@@ -264,7 +265,7 @@ class SurfaceAppearance:
         across = float(np.ptp(places[self._axes.shown(places), :2], axis=0).max(initial=0.0))
         radius = AT_HOME if footage is not None and not scene.edited else PATCH
         # a jet is one thing: pieces of it from different instants do not fit together where it sways
-        pours = not kind_of(scene.kind).lies_on_ground and not scene.edited
+        pours = (kind.rises_from_pool or not kind.lies_on_ground) and not scene.edited
         changes = pours and footage is not None and footage.stays < STAYS
         self._patches = TexturePatches(
             texture, max(radius * across, FEWEST_CELLS * self._cell), footage=footage,

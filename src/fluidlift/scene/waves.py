@@ -37,7 +37,7 @@ def filmed_waves(scene: Scene) -> FilmedWaves | Notice:
     Args:
         scene: without edits, as its clip shows it.
     """
-    if not kind_of(scene.kind).nearly_level:
+    if not kind_of(scene.kind).is_level_throughout:
         return _none(f"a {scene.kind} has no surface that lies")
     if scene.film is None or not scene.film.is_file():
         return _none("there is no film of the surface")

@@ -2,6 +2,7 @@
 
 Modules of the face:
 
+    airborne          The place of a body that moves through the air: a jet above its pool, a plume above a floor
     background        Background subtraction: the still scene behind a fluid that moves through the picture; what
                       stands out from it
     composite         A body of two parts in the geometry: what lies, and the jets that fall onto it
@@ -30,6 +31,7 @@ Modules of the face:
     ground_texture    The ground's texture: the picture laid on a terrain as a map seen from above, as fine as the
                       picture itself
     hints             What the user says about a mask: points that are fluid or are not, polygons, a rectangle
+    jet_column        A jet in space: a round column that stands vertically on the surface of the fluid below it
     kind              What kind of fluid a clip shows, and where up is: decided from evidence that the report can
                       show
     kinds             How the body of each kind of fluid is built: one file per kind, found by its name
@@ -58,6 +60,8 @@ Modules of the face:
                       texture
     texture_grain     Grain of a texture where it was not seen: random pieces of the seen one, blended so that they
                       stay as lively
+    thrown            Water that is thrown up: whether a body in the picture both rises and falls, and stands free
+                      of its background
     unite             Makes the bodies of several frames one (paper: union over N frames), and says how many frames
                       that should be
     view              Which way is up: what a picture says of it beside the fluid's motion, as log likelihoods of
@@ -67,6 +71,7 @@ Modules of the face:
 """
 
 __all__ = [
+    "airborne",
     "background",
     "composite",
     "dam",
@@ -84,6 +89,7 @@ __all__ = [
     "ground",
     "ground_texture",
     "hints",
+    "jet_column",
     "kind",
     "kinds",
     "occluders",
@@ -100,6 +106,7 @@ __all__ = [
     "surface",
     "texture_gradient",
     "texture_grain",
+    "thrown",
     "unite",
     "view",
     "warm_start",

@@ -21,6 +21,11 @@ leaves there. On the cases at hand dead ends have 0.1 to 0.2 of it, live ones 0.
 WALL = 2.4
 """cells that the wall of a vessel is thick: one leaves no gap for steps from cell to cell, the rest is for a distance
 that is of the first order (a choice)"""
+NOZZLE, NARROWEST = 0.25, 1.2
+"""radius of what a fountain rises out of over that of what it lands in, and in cells: what rises takes a sixteenth of
+the section that what falls has (a choice, real nozzles are thinner than any cell); a cell alone lets nothing through"""
+MOUTH = 2.0
+"""cells over the surface that are its mouth: of one alone particles leave gaps"""
 AT_THE_END = 0.25
 """share of the length of the lying part within which a jet stands at its upstream end: what moves there spreads from
 it"""
@@ -141,7 +146,8 @@ def with_jets(
     cells = np.concatenate([setting.cell_types, np.repeat(lid, extra, axis=2)], axis=2).astype(np.uint8)
     centers = taller.centers()
     below = centers[..., 2] < np.asarray(setting.surface_height)[..., None]
-    for kind in (CellType.INFLOW, CellType.OUTFLOW):
+    rising = any(jet.nozzle is not None for jet in jets)
+    for kind in () if rising else (CellType.INFLOW, CellType.OUTFLOW):
         if _is_open(setting, kind, jets, (points, velocities), camera):
             break
         cells = np.where(cells == kind, np.where(below, CellType.FLUID, CellType.EMPTY), cells).astype(np.uint8)
@@ -151,10 +157,35 @@ def with_jets(
             continue
         end = centers[inside][:, 2].max()
         cells[inside] = CellType.FLUID
-        cells[inside & (centers[..., 2] > end - 2.5 * h)] = CellType.INFLOW
+        if jet.nozzle is None:
+            cells[inside & (centers[..., 2] > end - 2.5 * h)] = CellType.INFLOW
+        else:
+            level = np.asarray(setting.surface_height)
+            aside = np.hypot(*(centers[..., a] - jet.nozzle[a] for a in (0, 1)))
+            above = centers[..., 2] - level[..., None]
+            pipe = _pipe(jet, taller, level)
+            phi = np.minimum(phi, pipe).astype(np.float32)
+            cells[at_cells(pipe) < 0] = CellType.SOLID
+            mouth = (aside <= nozzle_radius(jet, h)) & (above > 0) & (above < MOUTH * h)
+            cells[mouth & (cells != CellType.SOLID)] = CellType.INFLOW
     solid = setting.terrain
     terrain = Terrain(taller, phi, solid.mainstream, solid.mesh)
     return replace(setting, terrain=terrain, cell_types=cells)
+
+
+def nozzle_radius(jet: Jet, h: float) -> float:
+    """Radius (m) of what a jet rises out of, on cells h wide."""
+    return max(NOZZLE * float(jet.radius.max()), NARROWEST * h)
+
+
+def _pipe(jet: Jet, grid: Grid, level: np.ndarray) -> Float[np.ndarray, "nx+1 ny+1 nz+1"]:
+    """Signed distance (m, on the nodes) to the pipe that a jet comes out of, up to the surface of its pool (m, per
+    column): through an open foot it would draw up the pool itself."""
+    assert jet.nozzle is not None
+    nodes = grid.nodes()
+    aside = np.hypot(nodes[..., 0] - jet.nozzle[0], nodes[..., 1] - jet.nozzle[1])
+    column = np.clip(grid.cell_of(np.array([[*jet.nozzle, grid.low[2]]]))[0, :2], 0, np.array(grid.shape[:2]) - 1)
+    return np.maximum(aside - nozzle_radius(jet, grid.spacing), nodes[..., 2] - float(level[tuple(column)]))
 
 
 def _is_open(setting: Setting, kind: CellType, jets: list[Jet], seen, camera: PinholeCamera) -> bool:

@@ -13,6 +13,7 @@ from scipy import ndimage
 from fluidlift.messages import NONE, Notice
 from fluidlift.shape import airborne, chute, jets, registration
 from fluidlift.shape.drawn import region_pixels
+from fluidlift.shape.fountain_columns import find_columns
 from fluidlift.shape.jet_column import Jet, with_columns
 from fluidlift.shape.kind import level_camera
 from fluidlift.shape.slope import LEVEL
@@ -75,9 +76,12 @@ def split(
         trust: of it.
         free: whether the kind may change (the user did not give it).
     """
-    tilt = up or UpEvidence(LOOKING_DOWN[0], 0.0, "", 0.0)
+    usual = kind.pitch_prior[0] if kind.rises_from_pool else LOOKING_DOWN[0]
+    tilt = up or UpEvidence(usual, 0.0, "", 0.0)
     found: list[jets.Outline] = []
     neck = None
+    if kind.rises_from_pool:
+        return kind, Parts(*_rising(mask, motion, trust, tilt))
     if kind.runs_nearly_level:
         found = jets.find_jets(level_camera(camera, tilt), mask, motion, trust)
     elif kind.fills_vessel and free:
@@ -87,9 +91,15 @@ def split(
     return kind, Parts(tuple(found), lying, puddle=neck is not None)
 
 
+def _rising(mask, motion, trust, tilt: UpEvidence) -> tuple[tuple[jets.Outline, ...], np.ndarray]:
+    """Columns and pool of a fountain."""
+    found, pool = find_columns(mask, motion, trust, pitch=tilt.pitch)
+    return tuple(found), pool
+
+
 def with_roll(up: UpEvidence, parts: Parts, camera: PinholeCamera) -> UpEvidence:
     """The tilt, with the roll that the jets show."""
-    if not parts.outlines:
+    if not parts.outlines or any(o.nozzle is not None for o in parts.outlines):  # wind leans what is thrown up
         return up
     roll = jets.roll_of(list(parts.outlines), level_camera(camera, replace(up, roll=0.0)))
     return replace(up, roll=roll, source=f"{up.source}; roll from the direction of a jet")

@@ -16,16 +16,35 @@ from fluidlift.types.fluid_masks import parts_of
 
 
 def setting_around(
-    kind, front, fluid, start, united, camera, to_world, depth, half, bulk, c, falls, *, in_metres=False, **known
+    kind,
+    front,
+    fluid,
+    start,
+    united,
+    camera,
+    to_world,
+    depth,
+    half,
+    bulk,
+    c,
+    falls,
+    *,
+    in_metres=False,
+    pool=None,
+    **known,
 ) -> Setting:
-    """Terrain and cells around a surface, whose size is known `in_metres` or assumed; what is known beside it goes to
+    """Terrain and cells around a surface, whose size is known `in_metres` or assumed; `pool`, pixels that lie
+    whether they are seen to or not; what is known beside it goes to
     `plan.Footage`."""
     mask = generate.united_mask(fluid[start : start + united])
+    mask = mask if pool is None else mask | pool
     visible = mask & (depth > 0)
     grid = camera.pixel_grid()
     near = camera.unproject(grid[visible & ~falls], depth[visible & ~falls])
     if front.height is not None:
-        labels, height = seen_labels(fluid, start, united, falls), registration.PlacedHeight(front.height, to_world)
+        labels = seen_labels(fluid, start, united, falls)
+        labels = labels if pool is None else np.where(pool, Label.FLUID, labels).astype(np.uint8)
+        height = registration.PlacedHeight(front.height, to_world)
         seen = plan.Footage(height, labels, near, camera, bulk, ever=fluid.any_frame(), **known)
         return channel.channel_setting(
             seen, channel.ChannelConfig(kind, c.cells, c.cell_limit, c.depth_ratio, in_metres)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -24,6 +25,8 @@ class Jet:
     """increasing, from below the foot to the top"""
     radius: Float[np.ndarray, " k"]
     """at these heights"""
+    nozzle: tuple[float, float] | None = None
+    """x, y of where it rises out of the surface; None: it falls onto that"""
 
     def __post_init__(self) -> None:
         require(len(self.z) == len(self.radius) >= 2, f"{len(self.z)} heights, {len(self.radius)} radii", "two or more")
@@ -46,7 +49,11 @@ class Jet:
         """In another frame whose z axis is up as well."""
         t = target_from_source
         x, y, _ = t.points(np.array([[self.axis[0], self.axis[1], 0.0]]))[0]
-        return Jet((float(x), float(y)), t.scale * self.z + t.translation[2], t.scale * self.radius)
+        nozzle = None
+        if self.nozzle is not None:
+            out = t.points(np.array([[*self.nozzle, 0.0]]))[0]
+            nozzle = float(out[0]), float(out[1])
+        return Jet((float(x), float(y)), t.scale * self.z + t.translation[2], t.scale * self.radius, nozzle)
 
     def seen(self, camera: PinholeCamera) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
         """Camera depth of its near side and half its extent along the ray, camera depth too; 0 where no ray meets it.
@@ -73,7 +80,16 @@ class Jet:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values."""
-        return {"axis": list(self.axis), "z": self.z.tolist(), "radius": self.radius.tolist()}
+        out = {"axis": list(self.axis), "z": self.z.tolist(), "radius": self.radius.tolist()}
+        return out if self.nozzle is None else out | {"nozzle": list(self.nozzle)}
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Jet:
+        """Of `to_dict`."""
+        axis, nozzle = ((None if p is None else (float(p[0]), float(p[1]))) for p in (data["axis"], data.get("nozzle")))
+        require(axis is not None, "a jet without an axis")
+        assert axis is not None
+        return cls(axis, np.asarray(data["z"], float), np.asarray(data["radius"], float), nozzle)
 
 
 def stand(outline: Outline, camera: PinholeCamera, front: FrontSurface) -> Jet | None:
@@ -116,7 +132,13 @@ def stand(outline: Outline, camera: PinholeCamera, front: FrontSurface) -> Jet |
     z, radius = z[fresh], radius[fresh]
     # it goes on down to a radius below the surface, which may slope
     below = min(ground, float(foot[2])) - float(radius[0])
-    return Jet((float(axis[0]), float(axis[1])), np.concatenate([[below], z]), np.concatenate([[radius[0]], radius]))
+    nozzle = None
+    if outline.nozzle is not None:  # in the vertical plane through the axis that faces the viewer
+        aside = (outline.nozzle[0] - float(u)) * float(middle[-1]) / focal
+        nozzle = float(axis[0] + aside * away[1]), float(axis[1] - aside * away[0])
+    return Jet(
+        (float(axis[0]), float(axis[1])), np.concatenate([[below], z]), np.concatenate([[radius[0]], radius]), nozzle
+    )  # fmt: skip
 
 
 def with_columns(

@@ -68,6 +68,8 @@ class Outline:
     """px"""
     cut: bool
     """whether its top lies at the picture's edge"""
+    nozzle: tuple[float, float] | None = None
+    """(u, v), px, of where it rises out of its pool; None: it falls from above"""
 
 
 def projected_vertical(camera: PinholeCamera) -> Float[np.ndarray, "h w 2"]:

@@ -4,6 +4,8 @@ Modules of the face:
 
     analytic        Velocity fields that are known in closed form, sampled on the faces of a MAC grid
     demo            The clip that comes with the package, and its truth
+    fountain        Small clips of water in the air over a pool, by a formula: fountains, and falls and spouts that
+                    are none
     moving_texture  Small clips with exactly known motion: a procedural texture carried along a flow that a formula
                     gives
     record          Runs a synthetic scene and writes its case folder: the clip, the camera, and the exact truth
@@ -18,5 +20,5 @@ Modules of the face:
 """
 
 __all__ = [
-    "analytic", "demo", "moving_texture", "record", "riverside", "scenes", "tanks", "twins",
+    "analytic", "demo", "fountain", "moving_texture", "record", "riverside", "scenes", "tanks", "twins",
 ]  # fmt: skip

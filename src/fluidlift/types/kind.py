@@ -56,6 +56,8 @@ class FluidKind:
     is_standing_water: bool = False
     """stays where it is: lies on ground, and nothing flows in or out in the mean. So its surface is a level plane in
     the mean, and its mean motion runs in circles within its outline. What travels over it are waves"""
+    rises_from_pool: bool = False
+    """thrown up out of the pool that it falls back into: the pool stays, and what is in the air passes through it"""
     starts_at_rest: bool = False
     """a body that stands until it is let go: its shape is known as it stands, not as it collapses"""
     fills_vessel: bool = False
@@ -81,6 +83,11 @@ class FluidKind:
         require(0.0 <= share < 1.0, f"a share {share} of the kind '{self.name}' that is looked down on", "0 to below 1")
         both = self.airborne + self.is_channel_flow + self.is_standing_water
         require(both <= 1, f"the kind '{self.name}' in the air, in a channel and at rest in a basin", "one of them")
+        require(
+            self.is_standing_water or not self.rises_from_pool,
+            f"the kind '{self.name}' out of a pool",
+            "one that stays",
+        )
         require(
             self.lies_on_ground == (self.depth_ratio is not None), f"the kind '{self.name}'",
             "a depth_ratio where it lies on ground, and only there",
@@ -131,6 +138,11 @@ class FluidKind:
     def nearly_level(self) -> bool:
         """Whether its surface is a plane close to level."""
         return self.lies_on_ground and not self.falls_freely
+
+    @property
+    def is_level_throughout(self) -> bool:
+        """Whether all of it is such a plane, and nothing of it stands in the air."""
+        return self.nearly_level and not self.rises_from_pool
 
     @property
     def runs_nearly_level(self) -> bool:
@@ -184,8 +196,15 @@ BASIN = FluidKind(
 )  # fmt: skip
 """water that stays: sea, lake, pool, pot, cup. Over a landscape people film it as they film a river; as often they
 look down into a vessel (a choice)"""
+FOUNTAIN = FluidKind(
+    "fountain", pitch_prior=(8.0, 8.0), kinematic_viscosity=1e-5, wall_damping=0.05, wall_layer=1.0,
+    is_standing_water=True, rises_from_pool=True, depth_ratio=0.1, sizes=(5.0, 1.0),
+    surveyed_level=("water_level_z", "the water stands"), recognised=True,
+)  # fmt: skip
+"""jets that rise out of a pool and fall back into it. People film them as they film falls, from beside. Half of the
+jets in parks rise by less than some 3 m, their pools are twice as wide (a choice); basins are shallow"""
 
-KINDS: dict[str, FluidKind] = {kind.name: kind for kind in (STREAM, FALL, POUR, PLUME, DAM, BASIN)}
+KINDS: dict[str, FluidKind] = {kind.name: kind for kind in (STREAM, FALL, POUR, PLUME, DAM, BASIN, FOUNTAIN)}
 """by name; the classifier, the command line and the reader of assets go through it"""
 
 if TYPE_CHECKING:

@@ -167,7 +167,7 @@ class Geometry:
     """Kind, camera, front surface, scale and terrain of the body at rest."""
 
     kind: str
-    """stream, fall, pour, plume, dam or basin"""
+    """stream, fall, pour, plume, dam, basin or fountain"""
     kind_source: str
     """evidence, or user"""
     kind_evidence: KindEvidence

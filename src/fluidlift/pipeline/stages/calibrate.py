@@ -92,6 +92,8 @@ def calibrate(
     kind = kind_of(scene.kind)
     if not wanted or kind.is_gas or not len(scene.body):
         return Calibration()
+    if kind.rises_from_pool:  # it flies by itself; what strays lands in the pool
+        return Calibration()
     grid, dry, wet = scene.terrain.grid, None, None
     if shares is not None:
         dry = dry_cells(scene.terrain, scene.camera, shares > 0, scene.cell_types)

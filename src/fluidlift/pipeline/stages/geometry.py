@@ -83,6 +83,7 @@ def geometry(
             speed=None if kind.is_standing_water else _seen_speed(visible, velocities * scale.value, seen.trust),
             scene_depth=scene, in_metres=scale.source != "assumed",
             closed=parts.puddle or kind.is_standing_water, goes_on=kind.is_standing_water,
+            pool=parts.lying if kind.rises_from_pool else None,
         )  # fmt: skip
         setting = composite.composed(setting, falling, to_world, points[~falls], velocities[~falls], camera)
     if not (setting.cell_types == CellType.FLUID).any():

@@ -35,6 +35,10 @@ WHOLE = 6
 """splats that a cell of the body may take inside, whatever the limit for all of it: with less than three quarters of
 the usual eight it holds less than its own mass, and a large shallow body sags as soon as it moves"""
 
+DROPS = 0.125
+"""share of what fills a cell that fills one of spray: one particle per cell is enough to fly, where there is no
+pressure"""
+
 LATER = 5
 """how much fewer steps the frames after the first take, as they start from the last"""
 
@@ -122,6 +126,8 @@ def refine(
     inside = [hull, _outside_solid(added, setting)]
     inside = [generate.beneath_front(part, depth, mask, camera, smallest=KEPT, drop_above=True) for part in inside]
     hull, added = (_not_contradicted(part, geometry, allowed) for part in inside)
+    if kind_of(geometry.kind).rises_from_pool:
+        added = _as_spray(added, geometry, config.seed)
     if kind_of(geometry.kind).starts_at_rest:  # its sides tell nothing of the inside that is seen once it spreads
         colour = _later_colour(clip, fluid, start)
         hull, added = (replace(part, sh=sh_from_rgb(np.tile(colour, (len(part), 1)))) for part in (hull, added))
@@ -135,6 +141,17 @@ def refine(
         body, len(front), len(hull), len(added), len(front) - len(shown), str(pruned), fitted.psnr_before,
         fitted.psnr_after, fitted.kept, fitted.loss_history, later,
     )  # fmt: skip
+
+
+def _as_spray(inside: Gaussians, geometry: Geometry, seed: int) -> Gaussians:
+    """What fills a body, with a share of it above its pool: drops far apart."""
+    grid, level = geometry.setting.terrain.grid, geometry.setting.surface_height
+    if level is None:
+        return inside
+    at = np.clip(grid.cell_of(inside.means), 0, np.asarray(grid.shape) - 1)
+    flies = inside.means[:, 2] > np.asarray(level)[at[:, 0], at[:, 1]]
+    kept = np.random.default_rng(seed).random(len(inside)) < DROPS
+    return inside.select(~flies | kept)
 
 
 def _later_colour(clip: VideoClip, fluid, start: int) -> np.ndarray:

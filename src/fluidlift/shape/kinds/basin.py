@@ -10,11 +10,15 @@ LEVEL = ((1.0, 0.0, 0.5),)
 """share, mean and standard deviation (degrees) of the slopes that it may have: none, but for errors of the depth"""
 
 
-class _Basin:
+class Basin:
+    """Construction of a level body."""
+
     def front_surface(self, seen):
+        """A level plane."""
         return surface.level_surface(seen.camera, seen.mask)
 
     def depth_surface(self, scene, seen, slopes, usual):
+        """A level plane, as far off as the depth says."""
         return depth_surface.stream_surface(
             scene, seen.camera, seen.mask, seen.motion, seen.trust, slopes=LEVEL, usual=usual
         )
@@ -24,4 +28,4 @@ class _Basin:
         return np.array([bulk[0], bulk[1], 0.0])
 
 
-BUILDER = _Basin()
+BUILDER = Basin()

@@ -13,7 +13,7 @@ export function el(tag, attributes = {}, ...children) {
 export function fill(parent, children) { parent.replaceChildren(...children); }
 
 const $ = (id) => document.getElementById(id);
-const KINDS = ["stream", "fall", "pour", "plume", "dam", "basin"];
+const KINDS = ["stream", "fall", "pour", "plume", "dam", "basin", "fountain"];
 const PICTURED = new Set(["read", "flow", "segment", "correct", "geometry", "motion"]);
 const shown = new Map();
 

@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-from made_waves import DEEP, MadeWaves, brightness
-from scipy import ndimage
+from made_waves import DEEP, STEP, MadeWaves, brightness, window
 
 from fluidlift.look.surface_map import SurfaceMap
 from fluidlift.look.surface_windows import windows_of
@@ -11,40 +10,6 @@ from fluidlift.look.wave_spectrum import WHY_NOT, FilmedWaves, SurfaceWindow, wa
 from fluidlift.numerics.srgb import srgb_from_linear
 from fluidlift.physics.wave_dispersion import STEEPEST, WaveMedium
 from fluidlift.types import PinholeCamera
-
-PITCH, STEP, SEEN_AT = 0.06, 0.04, 1.2
-
-
-def pattern(shape, rng, width=1.5):
-    made = ndimage.gaussian_filter(rng.normal(size=shape), width)
-    return made / made.std()
-
-
-def window(waves, current, *, frames=90, measured=None, medium=DEEP, seed=0, **shown):
-    """Seen along x, and the slope's variance in it, weighed as the spectrum weighs it; shown: contrasts beside it."""
-    rng, size = np.random.default_rng(seed), 56
-    foam, bed, noise = (shown.get(name, usual) for name, usual in (("foam", 0.05), ("bed", 0.1), ("noise", 0.02)))
-    places = np.stack(np.meshgrid(*[(np.arange(size) + 0.5) * PITCH] * 2, indexing="ij"), axis=-1)
-    drifting, lying = pattern((400, 400), rng), pattern((size, size), rng)
-    hann = [np.hanning(n + 2)[1:-1] for n in (frames, size)]
-    taper, total, found = np.outer(hann[1], hann[1]) ** 2, 0.0, []
-    for t in range(frames):
-        at = np.moveaxis((places - np.array(current) * t * STEP) / PITCH + 150, -1, 0)
-        seen = foam * ndimage.map_coordinates(drifting, at, order=1, mode="wrap")
-        seen = seen + bed * lying + noise * rng.normal(size=(size, size))
-        slope = np.zeros((size, size, 2))
-        if waves is not None:
-            reach = waves.wavevectors * PITCH / (2 * np.pi)
-            blurred = np.sinc(reach[:, 0]) ** 2 * np.sinc(reach[:, 1])  # of a pixel, and of a place
-            slope = waves.slopes(places, t * STEP)
-            seen = seen + np.log(brightness(SEEN_AT, waves.slopes(places, t * STEP, blurred)[..., 0]))
-        total += hann[0][t] ** 2 * float(((slope**2).sum(axis=-1) * taper).sum())
-        found.append(seen)
-    truth = total / float((hann[0] ** 2).sum() * taper.sum())
-    flow = tuple(current if measured is None else measured)
-    return SurfaceWindow(
-        np.stack(found), PITCH, STEP, flow, 0.0, medium, (1.0, 0.0), SEEN_AT, 4 * PITCH
-    ), truth  # fmt: skip
 
 
 @pytest.mark.parametrize(

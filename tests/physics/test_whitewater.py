@@ -11,6 +11,7 @@ from fluidlift.physics import whitewater
 from fluidlift.physics.whitewater import (
     BUBBLE,
     FOAM,
+    LIFE,
     RISE,
     SPRAY,
     Ground,
@@ -195,6 +196,44 @@ def test_as_many_are_born_in_a_column_as_are_asked_for_and_fewer_in_slower_water
     if share:
         depth = 0.5 - white.positions[:, 2]
         assert np.median(depth) < 1.1 * H  # at the surface
+
+
+def seen_law(flat, **parts):
+    none = np.zeros(flat.terrain.grid.shape[:2])
+    return replace(LAW, trapped_rate=0.0, crest_rate=0.0, seen=SeenBirths(flat.terrain.grid, none, none, **parts))
+
+
+def test_what_a_film_shows_is_there_from_the_first_step_on_and_of_any_age(flat):
+    there = np.zeros(flat.terrain.grid.shape[:2])
+    there[6:18, 5:11] = 4.0
+    water = Whitewater(flat, seen_law(flat, there=there), G, 1000.0)
+    liquid = block(flat, (1.0, 0.0, 0.0))
+    water.advance(liquid, 0.01)
+    many = len(water)
+    assert many == pytest.approx(there.sum(), rel=0.2)
+    longest = LIFE[0] + (LIFE[1] - LIFE[0]) * float(LAW.energy.share(np.array(0.5)))
+    assert np.histogram(water.lives, 4, (0.0, longest))[0] == pytest.approx(np.full(4, many / 4), rel=0.4)
+    water.advance(liquid, 0.01)
+    assert len(water) <= many and water.next_id == many  # once
+
+
+def test_foam_breaks_up_where_a_film_says_so(flat):
+    there = np.full(flat.terrain.grid.shape[:2], 10.0)
+    breaking = np.zeros_like(there)
+    breaking[12:] = 5.0
+    water = Whitewater(flat, seen_law(flat, there=there, breaking=breaking), G, 1000.0)
+    liquid = block(flat, (0.0, 0.0, 0.0))
+    for _ in range(20):  # 0.2 s in still water
+        water.advance(liquid, 0.01)
+    on = water.kinds == FOAM
+    right = flat.terrain.grid.cell_of(water.positions)[:, 0] >= 12
+    free = Whitewater(flat, seen_law(flat, there=there), G, 1000.0)
+    for _ in range(20):
+        free.advance(liquid, 0.01)
+    beside = flat.terrain.grid.cell_of(free.positions)[:, 0] >= 12
+    assert (on & ~right).sum() == pytest.approx(((free.kinds == FOAM) & ~beside).sum(), rel=0.05)
+    share = (on & right).sum() / ((free.kinds == FOAM) & beside).sum()
+    assert share == pytest.approx(np.exp(-1.0), rel=0.2)
 
 
 def test_a_state_of_more_than_the_law_allows_is_refused(flat):

@@ -140,3 +140,10 @@ def test_what_was_not_fitted_is_not_called_so():
     assert found["kinematic_viscosity"].known == "1e-6 m^2/s (95 %: 4e-7 to 3e-6 m^2/s); fitted to the motion"
     assert found[WHITEWATER].known == "" and found[WHITEWATER].fitted == 0.0
     assert found["surface_tension"].origin == "lifted"
+
+
+def test_the_dial_of_white_water_says_how_much_foam_the_clip_shows_and_stays_at_none():
+    share = Estimate(0.078, 0.005, False, 0.0, "", (0.059, 0.103), "measured: bright, grey pixels")
+    (found,) = (c for c in controls_of(FITTED, "stream", {"foam_share": share}) if c.key == WHITEWATER)
+    assert found.known == "foam on 0.078 (95 %: 0.059 to 0.103); measured: bright, grey pixels"
+    assert found.origin == "none" and found.fitted == 0.0

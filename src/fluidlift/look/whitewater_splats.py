@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
@@ -46,6 +46,8 @@ class FilmedFoam:
     """share of the time in which each pixel shows foam, of that in which it shows fluid"""
     seen: Float[np.ndarray, "h w"]
     """share of the time in which each pixel shows fluid"""
+    by_frame: Float[np.ndarray, "t 2"] = field(default_factory=lambda: np.zeros((0, 2)))
+    """pixels of foam, and of fluid, in each frame"""
 
     @classmethod
     def of(cls, frames: UInt8[np.ndarray, "t h w 3"], fluid: Bool[np.ndarray, "t h w"]) -> FilmedFoam:
@@ -58,14 +60,16 @@ class FilmedFoam:
         if not fluid.any():
             return cls(0.0, WHITE, none, none)
         middle = float(np.median(frames[fluid] @ _LUMA))
-        count, total, pixels = none.copy(), np.zeros(3), 0
-        for picture, mask in zip(frames, fluid):
+        count, total, pixels, by_frame = none.copy(), np.zeros(3), 0, np.zeros((len(frames), 2))
+        for k, (picture, mask) in enumerate(zip(frames, fluid)):
             found = mask & foam_pixels(picture, middle)
             count += found
+            by_frame[k] = found.sum(), mask.sum()
             total, pixels = total + picture[found].sum(axis=0, dtype=np.float64), pixels + int(found.sum())
         share = pixels / int(fluid.sum())
         r, g, b = (total / (255.0 * pixels)).tolist() if share >= FEWEST else WHITE
-        return cls(share if share >= FEWEST else 0.0, (r, g, b), count / np.maximum(known, 1), known / len(fluid))
+        places = count / np.maximum(known, 1)
+        return cls(share if share >= FEWEST else 0.0, (r, g, b), places, known / len(fluid), by_frame)
 
 
 def foam_pixels(picture: UInt8[np.ndarray, "h w 3"], middle: float) -> Bool[np.ndarray, "h w"]:

@@ -2,6 +2,8 @@
 
 Modules of the face:
 
+    block_bootstrap         How sure means of a record are whose samples hang together: resampling by blocks of it
+                            (Künsch 1989)
     bspline                 The quadratic B-spline of particle-grid transfers
     cell_list               Points sorted into cubes of space, so that what is near a place is found in 27 of them
                             (cell list, Numba)
@@ -64,10 +66,10 @@ Modules of the face:
 """
 
 __all__ = [
-    "bspline", "cell_list", "ground_block", "harmonics", "homography2", "isosurface", "lanes", "mesh_distance",
-    "mesh_normals", "mirror", "multigrid", "multigrid_assembly", "multigrid_cycle", "nearest", "outline",
-    "particle_mean", "poisson", "recurrent_stencil", "recurrent_stencil_fit", "sampling", "sharing", "short_axis",
-    "signed_distance", "similarity2", "solid_mesh", "splatting", "splatting_colors", "splatting_colors_torch",
-    "splatting_kernels", "splatting_projection", "splatting_torch", "srgb", "symmetric3", "textures",
-    "torch_multigrid", "torch_poisson", "triangles",
+    "block_bootstrap", "bspline", "cell_list", "ground_block", "harmonics", "homography2", "isosurface", "lanes",
+    "mesh_distance", "mesh_normals", "mirror", "multigrid", "multigrid_assembly", "multigrid_cycle", "nearest",
+    "outline", "particle_mean", "poisson", "recurrent_stencil", "recurrent_stencil_fit", "sampling", "sharing",
+    "short_axis", "signed_distance", "similarity2", "solid_mesh", "splatting", "splatting_colors",
+    "splatting_colors_torch", "splatting_kernels", "splatting_projection", "splatting_torch", "srgb", "symmetric3",
+    "textures", "torch_multigrid", "torch_poisson", "triangles",
 ]  # fmt: skip

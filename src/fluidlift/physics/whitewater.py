@@ -91,15 +91,29 @@ class SeenBirths:
     """1/s, in the whole column, in the flow as lifted"""
     energy: Float[np.ndarray, "nx ny"]
     """m^2/s^2, at the surface, from which on it has all of that; slower water has as much less as it has energy less"""
+    there: Float[np.ndarray, "nx ny"] | None = None
+    """particles in the whole column in the steady state, of any age: they are there from the first step on. None: it
+    begins bare"""
+    breaking: Float[np.ndarray, "nx ny"] | None = None
+    """1/s, of the foam in each column that ends before its age: where a clip's foam breaks up. None: none does"""
 
     def in_cells(self, state: LiquidState) -> Float[np.ndarray, "nx ny nz"]:
-        """Per second, in cells of the state, were they full: in the layer of a cell under the surface."""
+        """Births per second, in cells of the state, were they full: in the layer of a cell under the surface."""
         rate, energy = _in_columns((self.grid, self.rate, self.energy), state.grid)
+        return self._spread(rate, np.clip(state.energy / np.maximum(energy, 1e-12), 0.0, 1.0), state)
+
+    def at_first(self, state: LiquidState) -> Float[np.ndarray, "nx ny nz"]:
+        """Particles that are there already, in cells of the state, were they full."""
+        if self.there is None:
+            return np.zeros(state.grid.shape)
+        there, _ = _in_columns((self.grid, self.there, self.energy), state.grid)
+        return self._spread(there, 1.0, state)
+
+    def _spread(self, columns: np.ndarray, share: np.ndarray | float, state: LiquidState) -> np.ndarray:
         layer = (state.distance < 0) & (state.distance > -state.grid.spacing)
         filled = (state.amount * layer).sum(axis=2, keepdims=True)
-        fast = np.clip(state.energy / np.maximum(energy, 1e-12), 0.0, 1.0)
         # a film of water is no column: at least a quarter of a cell
-        return np.where(layer, rate * fast / np.maximum(filled, 0.25), 0.0)
+        return np.where(layer, columns * share / np.maximum(filled, 0.25), 0.0)
 
 
 @dataclass(frozen=True)
@@ -306,6 +320,7 @@ class Whitewater:
         self._bear(state, particles, interval)
         self.kinds = told(state, self.positions)
         self._end(inside)
+        self._break(interval)
         self._thin()
         return state
 
@@ -364,13 +379,19 @@ class Whitewater:
         cell = np.clip(state.grid.cell_of(particles.positions), 0, np.array(state.grid.shape) - 1)
         at = tuple(cell.T)
         full = particles.masses.astype(np.float64) / (self.density * h**3)
-        wanted = self.law.births(state)[at] * full * interval
+        wanted, older = self.law.births(state)[at] * full * interval, np.zeros(0)
         draw = rng.random(len(wanted))
-        many = float(wanted.sum())
+        seen = self.law.seen
+        if self.steps == 1 and seen is not None and seen.there is not None:  # what the film shows has begun before it
+            older = seen.at_first(state)[at] * full
+        many = float(wanted.sum() + older.sum())
         if many > self.law.most:
-            wanted, self.thinned = wanted * (self.law.most / many), True
+            wanted, older, self.thinned = wanted * (self.law.most / many), older * (self.law.most / many), True
         count = np.floor(wanted + draw).astype(np.int64)
-        parent = np.repeat(np.arange(len(count)), count)
+        parent, fresh = np.repeat(np.arange(len(count)), count), int(count.sum())
+        if len(older):
+            more = np.floor(older + rng.random(len(older))).astype(np.int64)
+            parent = np.concatenate([parent, np.repeat(np.arange(len(more)), more)])
         if not len(parent):
             return
         n, cells = len(parent), tuple(c[parent] for c in at)
@@ -382,7 +403,10 @@ class Whitewater:
         # what closes in is thrown out sideways
         v = v + state.trapped[cells][:, None] * disc
         least, most = LIFE
-        lives = least + (most - least) * self.law.energy.share(state.energy[cells]) - back * interval
+        lives = least + (most - least) * self.law.energy.share(state.energy[cells])
+        lives[:fresh] -= back[:fresh] * interval
+        if n > fresh:
+            lives[fresh:] *= rng.random(n - fresh)  # in the steady state of any age
         self.positions, self.velocities = np.concatenate([self.positions, x]), np.concatenate([self.velocities, v])
         self.lives = np.concatenate([self.lives, lives])
         self.ids = np.concatenate([self.ids, self.next_id + np.arange(n)])
@@ -398,6 +422,19 @@ class Whitewater:
         if inside is not None and keep.any():
             keep[keep] = ~inside(self.positions[keep])
         self._keep(keep)
+
+    def _break(self, interval: float) -> None:
+        """Foam ends where a clip's does."""
+        seen = self.law.seen
+        if seen is None or seen.breaking is None or not len(self):
+            return
+        grid = seen.grid
+        cell = np.floor((self.positions[:, :2] - grid.low[:2]) / grid.spacing).astype(np.int64)
+        there = ((cell >= 0) & (cell < grid.shape[:2])).all(axis=1) & (self.kinds == FOAM)
+        cell = np.clip(cell, 0, np.array(grid.shape[:2]) - 1)
+        rate = np.where(there, seen.breaking[cell[:, 0], cell[:, 1]], 0.0)
+        rng = np.random.default_rng([self.seed, self.steps, 1])
+        self._keep(rng.random(len(self)) < np.exp(-rate * interval))
 
     def _thin(self) -> None:
         """Down to the most that the law allows, by a number that each id has: those that stay are the same ones."""

@@ -23,6 +23,7 @@ from fluidlift.pipeline.other_times import STAGE
 from fluidlift.pipeline.runner import Runner
 from fluidlift.pipeline.stages.fit import fit
 from fluidlift.present import report
+from fluidlift.scene.filmed_numbers import NAMES
 from fluidlift.seams import Progress, Silence
 from fluidlift.types.stages import Elsewhere, Fit, Geometry, Lift, Motion, Read, Segmentation, Shown, Simulation
 
@@ -96,6 +97,7 @@ def refit(
         runner.warnings[:] = [w for w in from_plain(manifest) if w not in _last_warnings(manifest)]
         runner.warnings += found.warnings
         seen = {} if geometry.bed is None else geometry.bed.estimates
+        seen = seen | {name: e for name, e in before.estimates.items() if name in NAMES}
         write_parameters(folder, found.parameters, found.estimates | seen)
         _write_report(runner, found, (read, segmentation, geometry, moved), config, manifest)
         origin = manifest.get("provenance", {})

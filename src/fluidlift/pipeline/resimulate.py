@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,12 +23,14 @@ from fluidlift.pipeline.stages.simulate import frames_still_there, simulate
 from fluidlift.present import report
 from fluidlift.present.looping import OPEN
 from fluidlift.scene.build import Scene, SimulationRequest, scene_of
+from fluidlift.scene.filmed_numbers import NAMES
 from fluidlift.scene.footage import footage_of
 from fluidlift.scene.forecast import ahead
 from fluidlift.scene.recall import rest_frame_of
 from fluidlift.scene.reshaping import slow_edits
+from fluidlift.scene.whitewater_law import LAW
 from fluidlift.seams import Progress, Silence
-from fluidlift.types import FluidAsset
+from fluidlift.types import Estimate, FluidAsset
 from fluidlift.types.stages import Lift, Shown, Simulation
 
 SECOND_HALF = ("simulate", "show")
@@ -200,6 +202,8 @@ def _finish(
     from fluidlift.io.asset_folder import update_manifest
 
     folder, done, shown = runner.folder, played.simulation, played.shown
+    if done.estimates:
+        write_filmed_numbers(folder, done.estimates)
     before = set(from_plain(manifest.get("simulation", {})))
     own = [
         *played.warnings,
@@ -236,6 +240,17 @@ def _finish(
         }
         | as_plain(own),
     )  # fmt: skip
+
+
+def write_filmed_numbers(folder: Path, found: Mapping[str, Estimate]) -> None:
+    """Foam and waves beside the other parameters of an asset, in the place of those that were there; the law of white
+    water stays as it was where this simulation did not show it (it went on from a checkpoint)."""
+    from fluidlift.io.asset_folder import read_parameters, write_parameters
+
+    parameters, before = read_parameters(asset_file(folder, "parameters.json"))
+    others = {name: e for name, e in before.items() if name not in NAMES}
+    known = {name: e for name, e in before.items() if name in LAW} | dict(found)
+    write_parameters(folder, parameters, others | {name: known[name] for name in NAMES if name in known})
 
 
 def recalled_lift(runner: Runner, manifest: dict[str, Any]) -> Lift | None:

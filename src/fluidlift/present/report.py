@@ -15,6 +15,7 @@ from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.look.clear_water import CHANNELS, NAME, absorption_in
 from fluidlift.look.report import Figure, Section, report_html
 from fluidlift.present.as_filmed import card_of
+from fluidlift.scene.filmed_numbers import NAMES
 from fluidlift.types import CellType, kind_of
 from fluidlift.types.stages import Fit, Geometry, Lift, Read, Refined, Shown, Simulation
 
@@ -54,7 +55,7 @@ def write_report(
         *_section_models(models),
         _section_body(lift.geometry, lift.refined),
         _section_motion(lift),
-        _section_parameters(lift.fit, lift.geometry.scale_sentence),
+        _section_parameters(lift.fit, lift.geometry.scale_sentence, _filmed_rows(folder)),
         _section_simulation(simulation),
         _section_next(folder),
         Section(
@@ -308,10 +309,20 @@ def _section_motion(lift: Lift) -> Section:
     )
 
 
-def _section_parameters(fit: Fit, scale: str) -> Section:
+def _filmed_rows(folder: Path) -> list[list[Any]]:
+    """Foam and waves, as the parameters of the asset have them."""
+    from fluidlift.io.asset_folder import read_parameters
+
+    known = read_parameters(asset_file(folder, "parameters.json"))[1]
+    rows = [{"name": n, **vars(known[n])} for n in NAMES if n in known]
+    return [[r["name"], r["value"], r["unit"], in_words(r), how_sure(r), "", r["source"]] for r in rows]
+
+
+def _section_parameters(fit: Fit, scale: str, beside: list[list[Any]]) -> Section:
     from fluidlift.look.pictures import curve
 
     rows = [[r["name"], r["value"], r["unit"], in_words(r), how_sure(r), r["prior"], r["source"]] for r in fit.table]
+    rows += beside
     loss = fit.loss_history
     figures = []
     if len(loss):

@@ -9,6 +9,8 @@ Modules of the face:
     edits               Edits of an asset: one model behind scene.yaml, the command line, Python and the viewer
     filmed_cells        Cells in which the clip shows no fluid at any time, and those in which it shows some at all
                         times
+    filmed_numbers      What a film says of its foam and waves, as numbers with intervals, for the parameters of an
+                        asset
     footage             The clip that an asset comes from, where it is still at hand
     force_weight        How far a scene keeps the force that holds the filmed flow: where a person changed it, the
                         flow finds its own way
@@ -31,6 +33,8 @@ Modules of the face:
     waves               Waves of a scene: what its film says of them, and how they are played on its simulated
                         surface
     whitewater          The white water of a scene: how much of it its clip asks for, and its splats, frame by frame
+    whitewater_law      How much white water a flow makes for the foam of its film: three limits and a rate, with
+                        how sure each is
 """
 
 from importlib import import_module as _import_module
@@ -60,7 +64,7 @@ def __getattr__(name: str) -> _Any:
 
 __all__ = [
     "Add", "Change", "EditSession", "Remove", "Scene", "Set", "SimulationRequest", "build", "coarse_copy",
-    "edit_history", "edited_scene", "edits", "filmed_cells", "footage", "force_weight", "forecast", "open_water",
-    "recall", "reshaping", "scene_of", "settings", "simulated_history", "simulation", "simulator", "simulator_of",
-    "smoke_appearance", "splat_files", "surface_appearance", "waves", "whitewater",
+    "edit_history", "edited_scene", "edits", "filmed_cells", "filmed_numbers", "footage", "force_weight", "forecast",
+    "open_water", "recall", "reshaping", "scene_of", "settings", "simulated_history", "simulation", "simulator",
+    "simulator_of", "smoke_appearance", "splat_files", "surface_appearance", "waves", "whitewater", "whitewater_law",
 ]  # fmt: skip

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -20,11 +20,10 @@ from scipy import ndimage
 
 from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.io.footage_file import read_footage
-from fluidlift.look.whitewater_splats import FADING, OPACITIES, SIZES, FilmedFoam, whitewater_splats
+from fluidlift.look.whitewater_splats import FADING, FilmedFoam, whitewater_splats
 from fluidlift.messages import Notice
 from fluidlift.physics.whitewater import (
     FOAM,
-    LIFE,
     Ground,
     LiquidState,
     Range,
@@ -33,27 +32,30 @@ from fluidlift.physics.whitewater import (
     WhitewaterLaw,
 )
 from fluidlift.scene.build import Scene
-from fluidlift.scene.filmed_foam import births_in_columns
+from fluidlift.scene.filmed_foam import SMOOTH, births_in_columns
 from fluidlift.scene.simulator import simulator_of
-from fluidlift.types import Gaussians, Particles
+from fluidlift.scene.whitewater_law import (
+    BY_ENERGY,
+    COVERS,
+    SurfaceRecord,
+    lasting,
+    law_estimates,
+    law_of,
+    life_of,
+)
+from fluidlift.types import Estimate, Gaussians, Particles
 
 SECONDS = 1.0
 """s over which the scene as lifted is looked at"""
 SETTLED = 0.2
 """s after which that begins: the first frames have the jerk of a body that is let go"""
-BY_ENERGY = (0.1, 0.9)
-"""quantiles of the surface's energy between which it counts from nothing to all"""
-FULL_RATE = 30.0
-"""1/s, births in a full cell whose potentials are at their most, before it is fitted: with a life of 2 s and splats of
-0.1 cells, foam there covers the water"""
-COVERS = np.pi * (1.5 * SIZES[1]) ** 2 * OPACITIES[1]
-"""cells^2 that a splat of foam hides: a disc of 1.5 standard deviations, as far as it is opaque"""
-FITTED = (0.02, 50.0)
-"""times `FULL_RATE` between which the rate is fitted"""
 SPREAD = 1
 """cells around a column whose potentials count as its own: waves are not in the same place each time"""
-LEAST_AFLOAT = 0.25
-"""share of white water that counts as foam at least: from less the film's foam would take four times as much"""
+FASTEST = 5.0
+"""1/s, with which foam breaks up at most where the film's does: bubbles burst within tenths of a second"""
+KEPT = 0.3
+"""s in which foam that is short of the film's comes back, while that is measured: a tenth of its life, so that it stays
+near, and longer than a frame, so that it does not flicker"""
 IDS_FROM = 2**29
 """half of the ids of white water are above it, so that those of the particles and of the skin are others, and a loop
 can add as many again within 32 bits"""
@@ -97,6 +99,12 @@ class Measured:
     """1/s, births in each column by which the scene as lifted shows the film's foam"""
     energy_known: Float[np.ndarray, "nx ny"]
     """m^2/s^2, the least in each column in all frames"""
+    there: Float[np.ndarray, "nx ny"]
+    """particles in each column that show the film's foam, of any age, so some of them faded"""
+    breaking: Float[np.ndarray, "nx ny"]
+    """1/s, of the foam in each column that ends before its age"""
+    estimates: dict[str, Estimate] = field(default_factory=dict)
+    """limits and rate, and how sure they are"""
 
     def law(self, scene: Scene, amount: float, everywhere: bool = False, *, settled: bool = True) -> WhitewaterLaw:
         """For a scene edited from `scene`, with `amount` times as much; everywhere: also where the film shows it.
@@ -105,7 +113,11 @@ class Measured:
         """
         rate, grid = amount * self.rate, scene.terrain.grid
         known = grid, self.trapped_known[int(settled)], self.crest_known[int(settled)]
-        seen = SeenBirths(grid, amount * self.filmed, self.energy_known) if everywhere else None
+        seen = (
+            SeenBirths(grid, amount * self.filmed, self.energy_known, amount * self.there, self.breaking)
+            if everywhere
+            else None
+        )
         return WhitewaterLaw(self.trapped, self.crest, self.energy, rate, rate, known=known, seen=seen)
 
 
@@ -132,59 +144,107 @@ def measured(scene: Scene, device: str = "cpu", foam: FilmedFoam | None = None) 
     foam = filmed_foam(scene) if foam is None else foam
     if foam is None or foam.share == 0.0:
         return None
-    probe = _Probe(scene, foam)
-    simulator = simulator_of(scene, device, deform=False)
-    first, count = (round(s / scene.interval) for s in (SETTLED, SETTLED + SECONDS))
-    seen: list[Columns] = []
-    for _ in range(max(count, 2)):
+    watch, simulator = FlowWatch(scene, foam), simulator_of(scene, device, deform=False)
+    for _ in range(watch.wanted):
         try:
             simulator.advance(scene.interval)
         except FluidliftError:  # the simulation that follows says so
             break
-        if len(simulator.particles):
-            seen.append(probe.columns(simulator.particles))
-    if len(seen) <= first:
-        return None
-    return _fitted(seen, first, foam, scene, probe.afloat)
+        watch.see(simulator.particles)
+    return watch.found()
 
 
-class _Probe:
-    """White water that is born where the film shows foam, to know how much of it stays at the surface: what the flow
-    carries under covers nothing."""
+class FlowWatch:
+    """A scene as lifted, looked at frame by frame as it is simulated, for `SETTLED` and `SECONDS`.
+
+    Beside its potentials: white water that begins as the film shows it, and is born as a steady flow asks for
+    (`scene.filmed_foam`) and as much more or less as it is short of the film's, or over it. So the births that keep the
+    film's foam on this flow are known, with what is carried under, and covers nothing, what gathers, and what comes
+    in askew.
+    """
 
     def __init__(self, scene: Scene, foam: FilmedFoam) -> None:
         self._scene, self._foam = scene, foam
+        self._settled, count = (round(s / scene.interval) for s in (SETTLED, SETTLED + SECONDS))
+        self.wanted = max(count, 2)
+        """frames, after the one at rest"""
+        self._seen: list[Columns] = []
         self._ground = Ground.of(scene.terrain, scene.cell_types)
         self._water: Whitewater | None = None
-        self._floating, self._all = 0.0, 0.0
+        self._mean_height, self._mean_flow = np.zeros(0), np.zeros(0)
+        self._asked: list[np.ndarray] = []
+        """1/s, that foam in each column had to become more"""
+        self._number = np.zeros(0)
+        """of the film's in each"""
 
-    @property
-    def afloat(self) -> float:
-        """Share of what covers, were it all at the surface, that is foam; 1 where nothing was born."""
-        return self._floating / self._all if self._all > 0 else 1.0
+    def see(self, particles: Particles) -> None:
+        """The next frame; more than are wanted, and empty ones, are not looked at."""
+        if len(self._seen) < self.wanted and len(particles):
+            self._seen.append(self._columns(particles))
 
-    def columns(self, particles: Particles) -> Columns:
-        """Those of the next frame."""
+    def found(self) -> Measured | None:
+        """What was seen says about white water; None where the flow did not settle."""
+        if len(self._seen) <= self._settled:
+            return None
+        # the last births were asked for, and nobody saw what became of them
+        asked = np.mean(self._asked[self._settled : -1] or self._asked[-1:], axis=0)
+        filmed = np.stack(_apart(asked, self._number, self._number))
+        return _fitted(self._seen, self._settled, self._foam, self._scene, filmed)
+
+    def _columns(self, particles: Particles) -> Columns:
         scene = self._scene
         if self._water is None:
-            state = LiquidState.of(particles, self._ground, scene.parameters.density)
-            self._water = self._begun(columns_of(state, scene))
-            return columns_of(state, scene)
-        state = self._water.advance(particles, scene.interval)
-        assert state is not None  # there are particles
-        fading = np.clip(self._water.lives / FADING, 0.0, 1.0)
-        self._floating += float(fading[self._water.kinds == FOAM].sum())
-        self._all += float(fading.sum())
-        return columns_of(state, scene)
-
-    def _begun(self, now: Columns) -> Whitewater:
-        scene, grid, nothing = self._scene, self._scene.terrain.grid, Range(0.0, 1.0)
-        lasting = np.full(now.wet.shape, float(np.mean(LIFE)))
-        rate = births_in_columns(self._foam, scene.camera, grid, now.height, 0.0 * now.velocity, lasting, COVERS)
+            now = columns_of(LiquidState.of(particles, self._ground, scene.parameters.density), scene)
+            self._mean_height, self._mean_flow = now.height, now.velocity
+        else:
+            state = self._water.advance(particles, scene.interval)
+            assert state is not None  # there are particles
+            now, weight = columns_of(state, scene), 1.0 / (len(self._seen) + 1)
+            known = np.isfinite(self._mean_height)
+            higher = self._mean_height + weight * (now.height - self._mean_height)
+            self._mean_height = np.where(
+                known & np.isfinite(now.height), higher, np.where(known, self._mean_height, now.height)
+            )
+            self._mean_flow = self._mean_flow + weight * (now.velocity - self._mean_flow)
         low, high = (float(q) for q in np.quantile(now.energy[now.wet], BY_ENERGY))
-        seen = SeenBirths(grid, rate, 0.0 * rate)
-        law = WhitewaterLaw(nothing, nothing, Range(low, max(high, 1.25 * low, 1e-12)), 0.0, 0.0, seen=seen)
-        return Whitewater(self._ground, law, scene.parameters.gravity, scene.parameters.density, scene.seed)
+        fast = Range(low, max(high, 1.25 * low, 1e-12))  # of this frame: the jerk of the first ones is not the flow's
+        life = life_of(fast.share(now.energy))
+        shown = births_in_columns(
+            self._foam, scene.camera, scene.terrain.grid, self._mean_height, self._mean_flow, lasting(life), COVERS
+        )
+        if self._water is None:
+            asked, there = shown.balance, shown.number * life / lasting(life)
+            floats = shown.number
+        else:
+            floats, there = self._floating(), None
+            asked = shown.balance + (shown.number - floats) / KEPT
+        births, breaking = _apart(asked, floats, shown.number)
+        self._asked.append(asked)
+        self._number = shown.number
+        nothing = Range(0.0, 1.0)
+        seen = SeenBirths(scene.terrain.grid, births, 0.0 * births, there, breaking)
+        law = WhitewaterLaw(nothing, nothing, fast, 0.0, 0.0, seen=seen)
+        if self._water is None:
+            self._water = Whitewater(self._ground, law, scene.parameters.gravity, scene.parameters.density, scene.seed)
+        self._water.law = law
+        return now
+
+    def _floating(self) -> np.ndarray:
+        """[nx,ny] particles of foam in each column, those that fade by as much as they are seen; means around it."""
+        water, grid = self._water, self._scene.terrain.grid
+        assert water is not None
+        own = water.kinds == FOAM
+        cell = np.clip(grid.cell_of(water.positions[own]), 0, np.array(grid.shape) - 1)
+        found = np.zeros(grid.shape[:2])
+        np.add.at(found, (cell[:, 0], cell[:, 1]), np.clip(water.lives[own] / FADING, 0.0, 1.0))
+        return ndimage.gaussian_filter(found, SMOOTH)
+
+
+def _apart(asked: np.ndarray, floats: np.ndarray, number: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Births (1/s) and breaking (1/s, of the foam that floats) by which foam becomes more or less, as asked (1/s); none
+    are born where the film has none, by its `number`."""
+    births = np.where(number > 0, np.maximum(asked, 0.0), 0.0)
+    return births, np.clip(-asked / np.maximum(floats, 1e-6), 0.0, FASTEST)
 
 
 def filmed_foam(scene: Scene) -> FilmedFoam | None:
@@ -222,96 +282,41 @@ def columns_of(state: LiquidState, scene: Scene) -> Columns:
     )  # fmt: skip
 
 
-def _fitted(frames: list[Columns], settled: int, foam: FilmedFoam, scene: Scene, afloat: float) -> Measured:
-    """Limits and rate by which as much of the surface foams as of the film's, and births at its places, of which a
-    share stays `afloat`. The flow has `settled` with that frame."""
+def _fitted(frames: list[Columns], settled: int, foam: FilmedFoam, scene: Scene, filmed: np.ndarray) -> Measured:
+    """Limits and rate by which as much of the surface foams as of the film's, with the births and the breaking at its
+    places, `filmed` [2,nx,ny]. The flow has `settled` with that frame."""
     grid, seen = scene.terrain.grid, frames[settled:]
     reached = [
         np.stack([_reached(np.stack([getattr(c, name) for c in part])) if part else np.zeros(grid.shape[:2])
                   for part in (frames[:settled], seen)]) for name in ("trapped", "crest")
     ]  # fmt: skip
-    wet = np.stack([c.wet for c in seen])
-    trapped, crest, energy = (np.stack([getattr(c, name) for c in seen]) for name in ("trapped", "crest", "energy"))
-    # two potentials that seldom meet share the foam
-    quantile = 1.0 - 0.5 * foam.share
-    limits = []
-    for values in (trapped, crest):
-        # SPlisHSPlasH's FoamGenerator takes the mean of the frames' maxima as well
-        least, most = np.quantile(values[wet], quantile), np.mean([v[w].max(initial=0.0) for v, w in zip(values, wet)])
-        limits.append(Range(float(least), float(max(most, 1.25 * least, 1e-9))))
-    low, high = (float(q) for q in np.quantile(energy[wet], BY_ENERGY))
-    fast = Range(low, max(high, 1.25 * low, 1e-12))
-    shares = (limits[0].share(trapped) + limits[1].share(crest)) * fast.share(energy) * wet
-    life, lasting = _lives(shares, fast.share(energy))
-    flow = np.mean([c.velocity for c in seen], axis=0)
-    cover = carried_cover(shares.mean(axis=0), flow, grid.spacing, life, lasting)
-    places = wet.mean(axis=0) > 0.5
+    record = SurfaceRecord(*(np.stack([getattr(c, name) for c in seen]) for name in SurfaceRecord._fields))
+    law = law_of(record, foam.share, grid.spacing)
     with np.errstate(all="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # columns that were never wet
         height = np.nanmedian(np.stack([c.height for c in seen]), axis=0)
-    lasts = _lasting(LIFE[0] + (LIFE[1] - LIFE[0]) * fast.share(energy).mean(axis=0))
-    filmed = births_in_columns(foam, scene.camera, grid, height, flow, lasts, COVERS) / max(afloat, LEAST_AFLOAT)
-    rate = FULL_RATE * _factor(cover[places], foam.share)
+    life = life_of(law.energy.share(record.energy).mean(axis=0))
+    lasts, flow = lasting(life), record.velocity.mean(axis=0)
+    shown = births_in_columns(foam, scene.camera, grid, height, flow, lasts, COVERS)
     return Measured(
-        limits[0],
-        limits[1],
-        fast,
-        rate,
+        law.trapped,
+        law.crest,
+        law.energy,
+        law.rate,
         foam.share,
         foam.color,
         *reached,
-        filmed=filmed,
-        energy_known=energy.min(axis=0),
+        filmed=filmed[0],
+        breaking=filmed[1],
+        there=shown.number * life / lasts,
+        energy_known=record.energy.min(axis=0),
+        estimates=law_estimates(record, foam, grid.spacing),
     )
 
 
 def _reached(potential: Float[np.ndarray, "t nx ny"]) -> Float[np.ndarray, "nx ny"]:
     """The most in each column and beside it, in all frames; 0 where there are none."""
     return ndimage.maximum_filter(potential.max(axis=0, initial=0.0), 2 * SPREAD + 1)
-
-
-def _lives(shares: np.ndarray, energies: np.ndarray) -> tuple[float, float]:
-    """s that what is born lives, and for how long it would cover as much without fading; means by births."""
-    life = LIFE[0] + (LIFE[1] - LIFE[0]) * energies
-    lasting = _lasting(life)
-    total = max(float(shares.sum()), 1e-12)
-    return max(float((shares * life).sum()) / total, LIFE[0]), float((shares * lasting).sum()) / total
-
-
-def _lasting(life: np.ndarray) -> np.ndarray:
-    """s for which what lives so long (s) would cover as much without fading."""
-    return np.where(life > FADING, life - 0.5 * FADING, life**2 / (2.0 * FADING))
-
-
-def carried_cover(
-    births: Float[np.ndarray, "nx ny"],
-    velocity: Float[np.ndarray, "nx ny 2"],
-    spacing: float,
-    life: float,
-    lasting: float,
-) -> Float[np.ndarray, "nx ny"]:
-    """Mean cover (cells^2 per cell, may be over 1) of what is born at `FULL_RATE` times `births`, and goes with a
-    steady velocity (m/s) for its `life` (s), in which it covers as much as in `lasting` (s) without fading: the births
-    upstream, added up."""
-    pieces = 16
-    at, total = np.indices(births.shape).astype(float), np.zeros(births.shape)
-    for _ in range(pieces):
-        total += ndimage.map_coordinates(births, at, order=1, cval=0.0)
-        here = np.stack([ndimage.map_coordinates(velocity[..., a], at, order=1, mode="nearest") for a in range(2)])
-        at = at - here * (life / pieces / spacing)
-    return FULL_RATE * COVERS * lasting / pieces * total
-
-
-def _factor(cover: np.ndarray, share: float) -> float:
-    """By which to multiply a mean cover so that a random one of that mean hides a share of the surface."""
-    low, high = FITTED
-    for _ in range(40):
-        middle = float(np.sqrt(low * high))
-        if (1.0 - np.exp(-middle * cover)).mean() < share:
-            low = middle
-        else:
-            high = middle
-    return float(np.sqrt(low * high))
 
 
 class SceneWhitewater:

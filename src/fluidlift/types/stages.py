@@ -431,6 +431,8 @@ class Simulation:
     failed: str | None = None
     """why it broke down after its last frame; None where it did not"""
     warnings: tuple[Notice, ...] = ()
+    estimates: dict[str, Estimate] = field(default_factory=dict)
+    """foam and waves that the film of the asset shows, and the law of its white water; empty where it was edited"""
 
     def __post_init__(self) -> None:
         k = len(self.count)

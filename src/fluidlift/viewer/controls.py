@@ -16,8 +16,11 @@ STEPS = 200
 INFLOW, WHITEWATER = "inflow.factor", "whitewater.amount"
 MOST_FOAM = 4.0
 """end of the slider of white water: times what the clip shows; scene.yaml takes more"""
-ESTIMATES = {INFLOW: "inflow_velocity", "gravity": "gravity_z", "gravity_tilt": "gravity", "gravity_heading": "gravity"}
+ESTIMATES = {INFLOW: "inflow_velocity", "gravity": "gravity_z", "gravity_tilt": "gravity", "gravity_heading": "gravity",
+             WHITEWATER: "foam_share"}  # fmt: skip
 """what a control moves, by its name among the estimates, where that is another"""
+BESIDE = {WHITEWATER: "foam on "}
+"""words before a number that a control does not move itself: it moves times that"""
 WHOLE = str.maketrans({
     " ": "\N{NO-BREAK SPACE}", "/": "\N{DIVISION SLASH}", "-": "\N{MINUS SIGN}",
     ".": "\N{ONE DOT LEADER}\N{WORD JOINER}",
@@ -171,7 +174,8 @@ def _with_origin(control: Control, estimates: Mapping[str, Estimate]) -> Control
     if known.interval is not None and known.fitted:
         between = f"95 %: {number(known.interval[0], 3)} to {number(known.interval[1], 3)} {known.unit}".rstrip()
         told, value = f"{told}; {between}", f"{value} ({between})"
-    words = f"{value}; {known.source or origin}"
+    words = f"{BESIDE.get(control.key, '')}{value}; {known.source or origin}"
+    origin = control.origin if control.key in BESIDE else origin
     return replace(control, origin=origin, hint=f"{control.hint}. {told}".lstrip(". "), known=words)
 
 

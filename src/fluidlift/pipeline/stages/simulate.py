@@ -11,13 +11,14 @@ from fluidlift.pipeline.settings import SimulateSettings
 from fluidlift.pipeline.work import Work
 from fluidlift.present.looping import close_loop
 from fluidlift.scene.build import Scene, SimulationRequest
+from fluidlift.scene.filmed_numbers import WatchedFlow, film_estimates
 from fluidlift.scene.reshaping import closed_inlet
 from fluidlift.scene.simulation import advance, continued
 from fluidlift.scene.simulator import left_to_the_cpu, preflight, simulator_of
 from fluidlift.scene.splat_files import checkpoint_file, frame_file, frame_files, require_room
 from fluidlift.scene.surface_appearance import SurfaceAppearance
 from fluidlift.scene.whitewater import SceneWhitewater, kept_measure
-from fluidlift.types import kind_of
+from fluidlift.types import Estimate, kind_of
 from fluidlift.types.stages import Simulation
 
 STRAYED = 0.25
@@ -52,11 +53,13 @@ def simulate(
         InputRejected: a scene that cannot be simulated, said before anything is written; or the disk is full.
     """
     preflight(scene)
-    white = None
+    white, known = None, None
     if scene.whitewater > 0 and scene.as_lifted is not None:
         part = (work or Work.alone(folder)).part  # once for each asset
-        white = SceneWhitewater(scene, part("whitewater", kept_measure, scene.as_lifted, config.device).found)
-    appearance = SurfaceAppearance(scene, white)
+        known = part("whitewater", kept_measure, scene.as_lifted, config.device).found
+        white = SceneWhitewater(scene, known)
+    watch = WatchedFlow.of(scene) if white is None else None
+    appearance = SurfaceAppearance(scene, white or watch)
     simulator = simulator_of(scene, config.device, deform=appearance.draws_out)
     closed = closed_inlet(scene, simulator)
     history = continued(simulator, appearance, scene, folder, request or SimulationRequest(), config.max_particles)
@@ -92,6 +95,13 @@ def simulate(
     if kind_of(scene.kind).lies_on_ground:  # what is poured, and spreads no further, runs off in any case
         warnings += _strayed(simulator.drained / there)
     warnings += _refilled(simulator.refilled / there)
+    estimates: dict[str, Estimate] = {}
+    if white is not None and scene.as_lifted is not None:
+        estimates = film_estimates(scene.as_lifted) | ({} if known is None else known.estimates)
+    elif not scene.edited:
+        estimates = film_estimates(scene)
+    if watch is not None and failed is None:
+        estimates |= watch.estimates
     return Simulation(
         volume=arrays["volume"],
         leak=arrays["leak"],
@@ -101,6 +111,7 @@ def simulate(
         resumed_at=first,
         failed=failed,
         warnings=tuple(warnings),
+        estimates=estimates,
     )
 
 

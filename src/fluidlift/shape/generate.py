@@ -82,7 +82,7 @@ def background_plate(
     kept = seen
     if shore:
         # where the fluid sways, the ground beside it is seen up to what it always covers
-        dry = ndimage.binary_dilation(~covered.any(axis=0), iterations=SHORE)
+        dry = ndimage.binary_dilation(~np.any(covered, axis=0), iterations=SHORE)
         kept = seen | (_rim_of_wide_fluid(np.all(covered, axis=0)) & dry)
     if ground.any() and not seen.all():
         painted = _inpainted(image, ~ground)

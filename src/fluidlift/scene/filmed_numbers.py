@@ -50,8 +50,10 @@ def film_estimates(scene: Scene) -> dict[str, Estimate]:
 
 
 def _foams(scene: Scene) -> bool:
-    """Whether what is bright on it can be foam: smoke, honey and lava have none."""
-    return not kind_of(scene.kind).is_gas and scene.parameters.kinematic_viscosity <= FOAMS_UP_TO
+    """Whether what is bright on it can be foam: smoke, honey and lava have none. What is let go is at no time what it
+    was before, and has no mean that an interval could be of."""
+    kind = kind_of(scene.kind)
+    return not (kind.is_gas or kind.starts_at_rest) and scene.parameters.kinematic_viscosity <= FOAMS_UP_TO
 
 
 def wave_estimates(waves: FilmedWaves, level: float = LEVEL, *, optics: bool = True) -> dict[str, Estimate]:

@@ -22,7 +22,7 @@ def shown(capsys, *arguments):
 def test_a_wrong_kind_is_answered_with_the_kinds_there_are_in_their_order(capsys):
     code, said = shown(capsys, "make", "x.mp4", "--kind", "river")
     assert code == USAGE
-    assert "('auto', 'stream', 'fall', 'pour', 'plume', 'dam', 'basin')" in said
+    assert "('auto', 'stream', 'fall', 'pour', 'plume', 'dam', 'basin', 'fountain')" in said
 
 
 @pytest.mark.parametrize("command", ["make", "motion", "mask", "studio", "sim", "fit", "render", "export", "inspect"])

@@ -362,3 +362,17 @@ def test_frames_in_a_store_are_those_in_memory(make_video, tmp_path):
 @pytest.mark.parametrize(("start", "frames"), [(0.0, 0), (0.08, 2), (0.1, 3)])
 def test_frames_before_the_start_are_counted_without_decoding(make_video, start, frames):
     assert frames_before(make_video(), start, 25.0) == frames
+
+
+def test_a_video_that_is_taken_away_while_it_is_opened_is_refused(tmp_path, monkeypatch):
+    """A page asks for the preview of an asset that is being made again."""
+    path = write_video(tmp_path / "clip.mp4", np.zeros((4, 32, 48, 3), np.uint8), 25.0)
+    opened = av.open
+
+    def gone(*args, **kwargs):
+        path.unlink()
+        return opened(*args, **kwargs)
+
+    monkeypatch.setattr(av, "open", gone)
+    with pytest.raises(InputRejected, match="cannot be read"):
+        probe(path)

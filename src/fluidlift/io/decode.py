@@ -85,8 +85,11 @@ def open_video(path: Path | str, limits: ReadLimits) -> Iterator[tuple[av.contai
 
 def _not_a_video(path: Path) -> InputRejected:
     """Why FFmpeg refused, as far as the first bytes tell."""
-    with path.open("rb") as file:
-        head = file.read(512)
+    try:
+        with path.open("rb") as file:
+            head = file.read(512)
+    except OSError as error:  # another process has taken it away, or may read it alone
+        return InputRejected(f"'{path.name}' cannot be read ({error.strerror or error})", "a video that stays there")
     accepted = "a video (mp4, mov, mkv, webm, avi, mpeg, mxf, gif) or numbered pictures"
     if path.suffix.lower() in PICTURE_SUFFIXES:
         return InputRejected(f"'{path.name}' is one picture", accepted, "give the folder of the frames, and --fps")

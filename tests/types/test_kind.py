@@ -118,13 +118,14 @@ def test_kinds_differ_in_physics():
         question: [k.name for k in KINDS.values() if getattr(k, question)]
         for question in ("is_gas", "airborne", "is_channel_flow", "is_standing_water", "lies_on_ground", "falls_freely",
                          "enters_over_rim", "nearly_level", "runs_nearly_level", "starts_at_rest", "fills_vessel",
-                         "has_mean_motion", "is_level_throughout", "rises_from_pool", "is_driven_in_sight")
+                         "has_mean_motion", "is_level_throughout", "is_still_water", "rises_from_pool",
+                         "is_driven_in_sight")
     }  # fmt: skip
     assert said == {
         "is_gas": ["plume"], "airborne": ["pour", "plume"], "is_channel_flow": ["stream", "fall"],
         "is_standing_water": ["basin", "fountain"], "lies_on_ground": ["stream", "fall", "basin", "fountain"],
         "falls_freely": ["fall", "pour"], "enters_over_rim": ["fall"], "nearly_level": ["stream", "basin", "fountain"],
-        "is_level_throughout": ["stream", "basin"], "rises_from_pool": ["fountain"],
+        "is_level_throughout": ["stream", "basin"], "is_still_water": ["basin"], "rises_from_pool": ["fountain"],
         "runs_nearly_level": ["stream"], "starts_at_rest": ["dam"], "fills_vessel": ["pour"],
         "has_mean_motion": ["stream", "fall", "pour", "basin", "fountain"],
         "is_driven_in_sight": ["stream", "fall", "pour", "plume"],

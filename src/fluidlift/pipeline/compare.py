@@ -74,7 +74,7 @@ def card_against(folder: Path, video: Path, *, start: float = 0.0, progress: Pro
     progress.stage("compare", 1, 1)
     renders, coverage = _renders(folder, FrontView.of(scene, footage), range(first, last), progress)
     masks = np.broadcast_to(footage.labels.fluid.mean(axis=0) > 0.5, other.frames.shape[:3])
-    stands = kind_of(scene.kind).is_standing_water
+    stands = kind_of(scene.kind).is_still_water
     return as_filmed(other.frames, masks, interval, renders, coverage, runs=not stands)
 
 

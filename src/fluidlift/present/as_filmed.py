@@ -95,10 +95,10 @@ def card_of_run(
         reason = f"the simulation ended early: too few frames, {len(renders)} where {FEWEST} are needed"
     if reason is not None or footage is None:
         return Noted({"none": reason})
-    frames = footage.clip.frames[footage.start :]
+    frames, kind = footage.clip.frames[footage.start :], kind_of(scene.kind)
     card = as_filmed(
         frames, footage.labels.fluid[footage.start :], scene.interval, renders, coverage,
-        runs=not kind_of(scene.kind).is_standing_water, fills=kind_of(scene.kind).fills_vessel,
+        runs=not kind.is_still_water, fills=kind.fills_vessel,
         seen=own_pixels(frames) if footage.steadied else None,
     )  # fmt: skip
     warning = card.warning()

@@ -244,7 +244,7 @@ class SurfaceAppearance:
         gravity = np.asarray(scene.parameters.gravity, np.float64)
         upright = -gravity[2] > UPRIGHT * max(float(np.linalg.norm(gravity)), 1e-12)
         kind = kind_of(scene.kind)
-        footage, stands = self._film_of(own), kind.is_standing_water and kind.is_level_throughout
+        footage, stands = self._film_of(own), kind.is_still_water
         if kind.is_level_throughout and upright:
             self._axes = PlanAxes()
         elif footage is not None:

@@ -145,6 +145,11 @@ class FluidKind:
         return self.nearly_level and not self.rises_from_pool
 
     @property
+    def is_still_water(self) -> bool:
+        """Whether what travels over it are waves alone, and no current."""
+        return self.is_standing_water and not self.rises_from_pool
+
+    @property
     def runs_nearly_level(self) -> bool:
         """A channel flow whose surface is a plane close to level: the perspective of its motion shows the tilt."""
         return self.is_channel_flow and self.nearly_level

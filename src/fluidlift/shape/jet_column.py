@@ -86,10 +86,9 @@ class Jet:
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Jet:
         """Of `to_dict`."""
-        axis, nozzle = ((None if p is None else (float(p[0]), float(p[1]))) for p in (data["axis"], data.get("nozzle")))
-        require(axis is not None, "a jet without an axis")
-        assert axis is not None
-        return cls(axis, np.asarray(data["z"], float), np.asarray(data["radius"], float), nozzle)
+        (x, y), nozzle = data["axis"], data.get("nozzle")
+        nozzle = None if nozzle is None else (float(nozzle[0]), float(nozzle[1]))
+        return cls((float(x), float(y)), np.asarray(data["z"], float), np.asarray(data["radius"], float), nozzle)
 
 
 def stand(outline: Outline, camera: PinholeCamera, front: FrontSurface) -> Jet | None:

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
-from fluidlift.look.footage import FluidFootage
+from fluidlift.look.footage import AGREE, FluidFootage
 from fluidlift.look.surface_axes import PictureAxes, SurfaceAxes
 from fluidlift.look.surface_map import COLUMN, SurfaceMap, sampled
 from fluidlift.types import PinholeCamera
@@ -47,9 +47,6 @@ THIN = 2
 FASTEST = 75.0
 """percentile of the columns of a fluid by which it is said to rise: its level does in most of them, that of drops on
 its walls, or of a jet that comes over them, in few (a choice)"""
-
-AGREE = 3
-"""frames of which most have to show fluid in a place: the least of which one can be outvoted"""
 
 EVERYWHERE = 1e6
 """px to the outline of a fluid that fills the whole picture"""
@@ -151,8 +148,8 @@ class FilmedOutlines:
 
     def __init__(self, camera: PinholeCamera, footage: FluidFootage, cell: float, *, rises: bool) -> None:
         self._camera, self._cell, self._rises = camera, cell, rises
-        self._fluid = footage.fluid
-        self._rate = _rise(footage.fluid) if rises else 0.0
+        self._footage = footage
+        self._rate = _rise(footage) if rises else 0.0
         self._made: tuple[int, int, FilmedOutline] | None = None
 
     def at(self, instant: float, shown: float | None = None) -> FilmedOutline:
@@ -162,36 +159,27 @@ class FilmedOutlines:
             instant: frames from the first one of the film.
             shown: instant of the film that the surface shows then; None: as far as it is known, the last.
         """
-        last = len(self._fluid) - 1
+        last = len(self._footage) - 1
         after = instant > last
         if after and not self._rises and shown is not None:
             instant = shown
         frame = int(np.clip(round(instant), 0, last))
         higher = int(np.ceil(self._rate * (instant - last))) if after and self._rises else 0
         if self._made is None or self._made[:2] != (frame, higher):
-            wet = self._wet(frame)
+            wet = self._footage.settled(frame)
             outside = ndimage.distance_transform_edt(~wet) if wet.any() else np.full(wet.shape, EVERYWHERE)
             self._made = frame, higher, FilmedOutline(self._camera, outside, self._cell, rises=higher)
         return self._made[2]
 
-    def _wet(self, frame: int) -> Bool[np.ndarray, "h w"]:
-        return 2 * self._fluid[_around(frame, len(self._fluid) - 1)].sum(axis=0) > AGREE
 
-
-def _rise(fluid: Bool[np.ndarray, "t h w"]) -> float:
+def _rise(footage: FluidFootage) -> float:
     """Px per frame by which the upper ends of a fluid's columns rise where they rise fastest: not where a jet stands
     on them, whose end does not."""
-    last = len(fluid) - 1
-    first, final = (2 * fluid[_around(t, last)].sum(axis=0) > AGREE for t in (0, last))
+    last = len(footage) - 1
+    first, final = footage.settled(0), footage.settled(last)
     both = first.any(axis=0) & final.any(axis=0)
     apart = last + 1 - AGREE
     if not both.any() or apart < 1:
         return 0.0
     rise = first.argmax(axis=0)[both] - final.argmax(axis=0)[both]
     return max(float(np.percentile(rise, FASTEST)), 0.0) / apart
-
-
-def _around(frame: int, last: int) -> slice:
-    """`AGREE` frames about one, within the film."""
-    first = int(np.clip(frame - AGREE // 2, 0, max(last + 1 - AGREE, 0)))
-    return slice(first, first + AGREE)

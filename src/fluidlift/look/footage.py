@@ -29,6 +29,9 @@ does in its own place, as filmed, and nowhere else"""
 SHARPER = 2
 """steps of the deconvolution. Of 1, 2 and 3, 2 is nearest to the energy of clips in three bands (0.9 to 1.1 of it)"""
 
+AGREE = 3
+"""frames of which most have to show fluid in a place: the least of which one can be outvoted"""
+
 FEWEST = 8
 """frames: a shorter film has no life of its own to show"""
 
@@ -140,16 +143,19 @@ class FluidFootage:
         found = np.zeros(len(index), np.float32)
         for a, b in np.ndindex(2, 2):
             weight = np.where(a, row - r, 1.0 - row + r) * np.where(b, column - c, 1.0 - column + c)
-            found += weight * (self._settled[frame, r + a, c + b] | (self.outside[r + a, c + b] > 0))
+            found += weight * (self._whole[frame, r + a, c + b] | (self.outside[r + a, c + b] > 0))
         return found
 
+    def settled(self, frame: int) -> Bool[np.ndarray, "h w"]:
+        """Fluid by the majority of a frame and its neighbours: a mask that failed once opens no hole."""
+        first = int(np.clip(frame - AGREE // 2, 0, max(len(self) - AGREE, 0)))
+        return 2 * self.fluid[first : first + AGREE].sum(axis=0) > AGREE
+
     @cached_property
-    def _settled(self) -> Bool[np.ndarray, "t h w"]:
-        """Fluid by the majority of each frame and its neighbours, without holes: of a mask that failed for a while none
-        is opened, and what always stands in the fluid is none of it."""
-        before, after = self.fluid[[0, *range(len(self) - 1)]], self.fluid[[*range(1, len(self)), len(self) - 1]]
-        most = (self.fluid & (before | after)) | (before & after)
-        return np.stack([ndimage.binary_fill_holes(wet) for wet in most])
+    def _whole(self) -> Bool[np.ndarray, "t h w"]:
+        """`settled` without holes: of a mask that failed for a while none is opened, and what always stands in the
+        fluid is none of it."""
+        return np.stack([ndimage.binary_fill_holes(self.settled(t)) for t in range(len(self))])
 
 
 def _without_rim(fluid: np.ndarray) -> np.ndarray:

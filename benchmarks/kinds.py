@@ -1,6 +1,7 @@
 """How often the kind is right that is found of a clip, and whether it is as sure as it is right.
 
     python benchmarks/kinds.py --work runs/kinds [--only name] [--size 320] [--window middle] [--crops SEED] [--record]
+    python benchmarks/kinds.py --work runs/kinds [--made] --table benchmarks/kind_features.json
 
 Clips are looked for below FLUIDLIFT_SHARED, or a folder `shared` beside the repository: 1.2 s of each, at 320 px, from
 around its middle frame (`--window first` and `last`: its ends). Only mask, flow, kind and tilt are found; what the work
@@ -9,16 +10,20 @@ kinds. A clip counts as right where the likeliest kind is one of them. `--record
 
 `--crops` looks at a part of each picture instead, drawn by a seed: two thirds of either side with half of the fluid or
 more (by the hand mask, where there is one), every second one mirrored. These are pictures that nobody has looked at.
+`--made` looks at made clips. `--table` adds the features of what was looked at to the table of `kinds_fit.py`, in place
+of those that it has of the same.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import platform
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import date
+from itertools import islice
 from pathlib import Path
 
 import cv2
@@ -48,12 +53,16 @@ BINS = (0.0, 0.6, 0.8, 1.0)
 """of the probability of the likeliest kind: some ten clips in each"""
 
 
+FRAMES = 30
+"""of a made clip"""
 FLUID = 200
 """grey level of a hand mask from which a pixel is fluid (255; 128 is not judged)"""
 CROPPED = 2 / 3
 """of either side of a picture, in a crop of it"""
 ENOUGH = 0.5
 """of the fluid, that a crop should show"""
+CUT = {"dyntex_fountain": "fountain fall"}
+"""what parts of pictures show where it is something else: without its top a fountain cannot be told from a fall"""
 DRAWN = 40
 """crops of which the first with enough is taken, else that with most"""
 
@@ -72,10 +81,10 @@ class Judged:
     right: bool
 
 
-def judged(name: str, scores: dict[str, float]) -> Judged:
-    """The likeliest kind of a clip, and whether it is one that the clip shows."""
+def judged(name: str, scores: dict[str, float], shown: str) -> Judged:
+    """The likeliest kind of a clip, and whether it is one of those that it shows."""
     kind, share = max(scores.items(), key=lambda item: item[1])
-    shows = SHOWS[name].split()
+    shows = shown.split()
     return Judged(name, kind, share, sum(scores[k] for k in shows), kind in shows)
 
 
@@ -143,6 +152,86 @@ def write(clips: Sequence[Judged], figures: dict[str, float], command: str) -> N
     put("kinds", records, command=command, date=date.today().isoformat(), machine=machine)
 
 
+def made_clips() -> dict[str, tuple[str, Callable[[], tuple[np.ndarray, float]]]]:
+    """Name, kinds, and what gives the pictures and the frames per second, of clips made by the package."""
+    from fluidlift.synthetic.clear_stream import ClearStream, film_of_bed
+    from fluidlift.synthetic.fountain import FRAME_RATE, filmed_airborne
+    from fluidlift.synthetic.hand_pour import hand_pour
+    from fluidlift.synthetic.record import record
+    from fluidlift.synthetic.riverside import Riverside, film, walk
+    from fluidlift.synthetic.scenes import scene_of
+    from fluidlift.types import PinholeCamera
+
+    steep = PinholeCamera.looking((0.0, -2.6, 4.5), (0.0, 0.0, 0.0), 50.0, (192, 128))
+    oblique = PinholeCamera.looking((0.0, -5.0, 2.8), (0.0, 0.3, 0.0), 40.0, (192, 128))
+
+    def bed(seed: int) -> np.ndarray:
+        return film_of_bed(ClearStream.make(seed), (steep, oblique)[seed], FRAMES).frames
+
+    def simulated(name: str, seed: int) -> tuple[np.ndarray, float]:
+        scene = scene_of(name, size=(240, 176), seed=seed, cells=48)
+        return record(scene, FRAMES).frames, scene.fps
+
+    airborne = dict.fromkeys(("single", "row", "froth", "inclined", "windy"), "fountain")
+    airborne |= {"fall": "fall", "weir": "fall stream", "spout": "pour fall"}
+    clips: dict[str, tuple[str, Callable[[], tuple[np.ndarray, float]]]] = {}
+    for seed in range(2):
+        for name, shows in airborne.items():
+            clips[f"air {name} {seed}"] = shows, lambda n=name, s=seed: (filmed_airborne(n, s).frames, FRAME_RATE)
+        for path in ("standing", "turning"):
+            cameras = walk(path, FRAMES)
+            clips[f"riverside {path} {seed}"] = (
+                "stream",
+                lambda c=cameras, s=seed: (film(Riverside.make(s), c).frames, 25.0),
+            )
+        clips[f"clear {seed}"] = "stream", lambda s=seed: (bed(s), 25.0)
+        clips[f"scene dam {seed}"] = "dam", lambda s=seed: simulated("dam", s)
+    for seed in range(8):
+        clips[f"hand {seed}"] = "pour", lambda s=seed: (hand_pour(s).frames, 25.0)
+    for name, shows in (("stream", "stream"), ("pour", "pour"), ("honey", "stream")):
+        clips[f"scene {name} 0"] = shows, lambda n=name: simulated(n, 0)
+    return clips
+
+
+def add_to_table(table: Path, looks: Sequence[dict[str, object]]) -> None:
+    """Put looks into a table, in place of those of the same part of the same clip."""
+    kept = json.loads(table.read_text(encoding="utf-8"))["looks"] if table.is_file() else []
+    known = {(look["clip"], look["part"]): look for look in [*kept, *looks]}
+    lines = ",\n".join(json.dumps(known[key]) for key in sorted(known))
+    table.write_text('{"looks": [\n' + lines + "\n]}\n", encoding="utf-8")
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What is looked at."""
+
+    name: str
+    part: str
+    shows: str
+    video: Callable[[], Path]
+    """writes it, where it is not there"""
+
+
+def real_subjects(shared: Path, work: Path, window: str, seed: int | None) -> Iterator[Subject]:
+    """Clips, or parts of their pictures."""
+    for name, shows in sorted(SHOWS.items()):
+        for video in islice(shared.glob(f"clips*/{name}/video.mp4"), 1):
+            if seed is None:
+                yield Subject(name, window, shows, lambda v=video: v)
+            else:
+                out = work / f"{name}_{window}_crop{seed}.mp4"
+                yield Subject(
+                    name, f"{window} crop {seed}", CUT.get(name, shows), lambda v=video, o=out: crop(v, o, seed)
+                )
+
+
+def made_subjects(work: Path) -> Iterator[Subject]:
+    """Clips of the package."""
+    for name, (shows, frames) in made_clips().items():
+        out = work / f"{name.replace(' ', '_')}.mp4"
+        yield Subject(name, "made", shows, lambda f=frames, o=out: write_video(o, *f(), quality=14, repeatable=True))
+
+
 def main() -> int:
     """Look, judge, tell."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -151,31 +240,37 @@ def main() -> int:
     parser.add_argument("--size", type=int, default=320, help="px of the longer side")
     parser.add_argument("--window", choices=("first", "middle", "last"), default="middle", help="part of each clip")
     parser.add_argument("--crops", type=int, metavar="SEED", help="parts of the pictures instead; not recorded")
+    parser.add_argument("--made", action="store_true", help="clips that the package makes instead; not recorded")
+    parser.add_argument("--table", type=Path, help="table of features to add to")
     parser.add_argument("--record", action="store_true", help="write benchmarks/results/kinds.json")
     wanted = parser.parse_args()
     shared = default_shared()
-    if shared is None:
+    if shared is None and not wanted.made:
         raise SystemExit("no clips: set FLUIDLIFT_SHARED")
-    clips = []
-    for name in sorted(SHOWS):
-        video = next(iter(shared.glob(f"clips*/{name}/video.mp4")), None)
-        if video is None or (wanted.only and name not in wanted.only):
+    wanted.work.mkdir(parents=True, exist_ok=True)
+    subjects = (
+        made_subjects(wanted.work) if wanted.made else real_subjects(shared, wanted.work, wanted.window, wanted.crops)
+    )
+    clips, looks = [], []
+    for s in subjects:
+        if wanted.only and s.name not in wanted.only:
             continue
-        folder = f"{name}_{wanted.size}_{wanted.window}"
-        if wanted.crops is not None:
-            folder += f"_crop{wanted.crops}"
-            wanted.work.mkdir(parents=True, exist_ok=True)
-            video = crop(video, wanted.work / f"{folder}.mp4", wanted.crops)
-        view = found(video, wanted.work / folder, wanted.size, wanted.window)
-        clips.append(judged(name, view.kind_evidence.scores))
-        told = sorted(view.kind_evidence.scores.items(), key=lambda item: -item[1])[:3]
-        print(f"{name:20} {'right' if clips[-1].right else 'WRONG'}", " ".join(f"{k} {v:.2f}" for k, v in told),
+        folder = wanted.work / f"{s.name}_{wanted.size}_{s.part}".replace(" ", "_")
+        view = found(s.video(), folder, wanted.size, "middle" if wanted.made else wanted.window)
+        evidence = view.kind_evidence
+        clips.append(judged(s.name, evidence.scores, s.shows))
+        features = {name: round(float(value), 3) for name, value in evidence.features.items()}
+        looks.append({"clip": s.name.replace("_", " "), "part": s.part, "shows": s.shows, "features": features})
+        told = sorted(evidence.scores.items(), key=lambda item: -item[1])[:3]
+        print(f"{s.name:20} {'right' if clips[-1].right else 'WRONG'}", " ".join(f"{k} {v:.2f}" for k, v in told),
               f"-> {view.kind}, tilt {view.up.pitch - view.up.raised:.1f}", flush=True)  # fmt: skip
     if not clips:
         raise SystemExit("none of the clips is there")
+    if wanted.table:
+        add_to_table(wanted.table, looks)
     figures = calibration(clips)
     print(f"{len(clips)} clips: " + ", ".join(f"{k} {v:.3f}" for k, v in figures.items()))
-    if wanted.record and wanted.crops is None:
+    if wanted.record and wanted.crops is None and not wanted.made:
         write(clips, figures, "python benchmarks/kinds.py --work runs/kinds --record")
     return 0
 

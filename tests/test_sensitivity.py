@@ -39,12 +39,12 @@ def test_whole_numbers_stay_whole_and_collections_keep_their_form(tuned):
 def test_numbers_are_found_also_where_several_share_a_line_and_physics_is_left_out(numbers):
     found, left_out = numbers
     keys = {c.key for c in found}
-    assert {"shape.kind.SHARPNESS", "shape.view.habit.OPEN_OVER", "shape.view.habit.OPEN_DOWN"} <= keys
+    assert {"shape.kind.LEAST_SURE", "shape.view.habit.OPEN_OVER", "shape.view.habit.OPEN_DOWN"} <= keys
     assert "shape.registration.STANDARD_GRAVITY" in left_out and not keys & set(left_out)
     early = {c.key for c in found if c.at_import}
     # a default argument; a constant made of another; a compiled kernel that holds it
     assert {"motion.mainstream.OBSERVED_CONFIDENCE", "shape.generate.SHORE", "motion.multiframe.TRIM"} <= early
-    assert "shape.kind.SHARPNESS" not in early
+    assert "shape.kind.LEAST_SURE" not in early
 
 
 def test_a_number_is_scaled_in_every_module_that_imports_it(tuned, monkeypatch):

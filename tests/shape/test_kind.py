@@ -14,6 +14,7 @@ from fluidlift.shape.kind import (
     level_camera,
     swinging,
 )
+from fluidlift.shape.view.roundness import Ellipse, fit_ellipse
 from fluidlift.types import KindEvidence, PinholeCamera, UpEvidence, kind_of
 
 H, W, T = 90, 160, 6
@@ -352,3 +353,13 @@ def test_a_level_camera_sees_the_vertical_upright_and_the_horizon_at_its_pitch()
     rolled = level_camera(CAMERA, UpEvidence(30.0, 10.0, "", 1.0)).camera_from_world.rotation
     np.testing.assert_allclose(rolled @ rolled.T, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(rolled[2], forward, atol=1e-12)  # turned about the line of sight
+
+
+def test_what_lies_in_a_vessel_is_hardly_a_stream():
+    frames, masks, *flow = pot()
+    rim = fit_ellipse(masks[0])
+    seen, plain = (estimate_kind(frames, masks, *flow, rims=rims).scores for rims in ((rim,), ()))
+    odds = [scores["stream"] / (scores["basin"] + scores["pour"]) for scores in (plain, seen)]
+    assert odds[0] > 8.0 * odds[1] and plain["basin"] < seen["basin"] > seen["fall"], (plain, seen)
+    beside = Ellipse((20.0, 20.0), rim.covariance / 16.0, 1.0)
+    assert estimate_kind(frames, masks, *flow, rims=(beside,)).scores == plain

@@ -377,9 +377,13 @@ def _kind_and_up(
     clip, fluid, mask, motion, trust = looked.clip, looked.fluid, looked.mask, looked.motion, looked.trust
     c, bodies = config, None if given.bodies is None else given.bodies.path
     surveyed, heading = registration.pose_up(known)
-    pitch = float(surveyed.pitch) if pose_given else _said_of_view(c, known, mask.shape).pitch
+    said = _said_of_view(c, known, mask.shape)
+    pitch = float(surveyed.pitch) if pose_given else said.pitch
     frames, shown = clip.frames[looked.pick], fluid[looked.pick]
-    evidence = kinds.estimate_kind(frames, shown, motion, trust, pitch=pitch, bulk=looked.bulk, ways=looked.ways)
+    evidence = kinds.estimate_kind(
+        frames, shown, motion, trust, pitch=pitch, bulk=looked.bulk, ways=looked.ways,
+        rims=said.rims or looked.rims,
+    )
     kind = kind_of(evidence.kind if c.kind == "auto" else c.kind)
     if kind.starts_at_rest and (shaped or bodies is not None):
         if c.kind != "auto":

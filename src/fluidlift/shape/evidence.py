@@ -1,6 +1,6 @@
 """Motion segmentation cues for fluid: change against the clip's own noise, and motion that goes somewhere.
 
-Nothing here was learned from data. All thresholds are relative to the noise of the clip, which is read from
+Nothing here but `CARRIED` was fitted to data. All thresholds are relative to the noise of the clip, which is read from
 the quietest part of the picture, separately for flat and for sharply drawn places: where an edge is sharp, the
 slightest tremble of the camera or of the codec changes the brightness.
 """

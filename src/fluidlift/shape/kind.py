@@ -12,10 +12,11 @@ from fluidlift.errors import require
 from fluidlift.messages import Notice
 from fluidlift.shape import chute, passing, prism, slope
 from fluidlift.shape.frame_pictures import typical_picture
+from fluidlift.shape.kind_weights import WEIGHTS
 from fluidlift.shape.open_water import recession
 from fluidlift.shape.spreading import CLEAR_PX, FALLS, spreading
 from fluidlift.shape.thrown import Thrown
-from fluidlift.shape.view import PictureEvidence, habit_prior, horizon_evidence, open_horizon
+from fluidlift.shape.view import Ellipse, PictureEvidence, habit_prior, horizon_evidence, open_horizon
 from fluidlift.shape.view.habit import ROLL
 from fluidlift.types import FluidKind, KindEvidence, PinholeCamera, RigidTransform, UpEvidence, kind_of
 from fluidlift.types.flow import TRUSTED
@@ -25,10 +26,6 @@ from fluidlift.types.kind import STREAM
 KINDS: tuple[str, ...] = tuple(name for name, kind in FLUID_KINDS.items() if kind.recognised)
 """names of the kinds whose evidence is weighed"""
 
-SHARPNESS = 0.9
-"""log odds per unit of belief. Of 34 real clips with known kinds, chosen on a half that was drawn by lot: log loss is
-least at 0.9 to 1.0 there (0.45; 0.47 at 0.75, 0.63 at 2) and the calibration error at 0.9 (0.09; 0.16 at 0.75). On the
-other half they are 0.29 and 0.08"""
 LEAST_SURE = 0.7
 """share of the belief below which a user is told what else it could be: of the same clips 7 are, all 4 wrong ones
 among them"""
@@ -43,6 +40,9 @@ ALL_RISES = (0.8, 0.95)
 """share of the motion that goes up from which a fluid may rise as a whole, and from which it does. The pattern of a jet
 moves by more than itself between two frames, and seems to go any way: up to 0.74 of it rises in seven pours, 0.98 to 1
 in smoke and in steam"""
+IN_VESSEL = 0.1
+"""share of the fluid within one rim from which it is in a vessel: splashes and jets are beside it. Of 30 real streams,
+falls, seas and plumes none has a rim, of ten pours and pots four do"""
 FEWEST_PAIRS = 12
 """pairs of frames: half a second, in which a wave rises or falls"""
 SHAKE = 0.05
@@ -96,8 +96,11 @@ def estimate_kind(
     pitch: float | None = None,
     bulk: tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]] | None = None,
     ways: Thrown | None = None,
+    rims: tuple[Ellipse, ...] = (),
 ) -> KindEvidence:
     """Weigh direction of motion, shape of the mask and colour against what each kind looks like.
+
+    A softmax of weighed terms (`terms`); their weights (`shape.kind_weights`) are fitted.
 
     Args:
         frames: sRGB pictures (a few, spread over the clip, are enough).
@@ -109,6 +112,7 @@ def estimate_kind(
             where it is not known (`motion.steady_flow.bulk_motion`); None: nothing is known of how it changes.
         ways: how much of it goes up and how much comes down (`shape.thrown`), from consecutive frames; None: nothing
             is known of that.
+        rims: of vessels that are seen.
     """
     require(fluid.shape == frames.shape[:3], f"masks {fluid.shape} for frames {frames.shape}")
     f = _features(frames, fluid, displacement, confidence) | {"swinging": 0.0 if bulk is None else swinging(*bulk)}
@@ -119,71 +123,55 @@ def estimate_kind(
     f["followed"] *= 1.0 - f["spreading"]
     f["thrown"] = 0.0 if ways is None else thrown_up(ways) * f["followed"]
     f["returning"] *= 1.0 - f["thrown"]  # what rises comes back as well
-    still = 1.0 - f["changing"]
-    lifted = float(np.clip((f["rising"] - ALL_RISES[0]) / (ALL_RISES[1] - ALL_RISES[0]), 0.0, 1.0))
-    inside = f["enclosed"] * (1 - f["hanging"])  # what ends within the picture passes nothing on
-    lies = 1.0 - f["slender"]  # what runs off the drops beside a jet goes any way
-    staying = max(f["swinging"], inside * f["circling"], lies * f["returning"], f["horizon"], f["bay"])
-    belief = {
-        # smoke rises from below, is grey, and its outline changes; it neither hangs from above, nor fills the picture,
-        # unless all of it goes up and out at the top
-        "plume": 2.6 * f["rising"]
-        + 1.2 * f["grey"] * (0.3 + f["rising"])
-        + 0.8 * f["changing"]
-        - 2.0 * f["falling"]
-        - 1.0 * f["sideways"]
-        - 2.5 * f["hanging"] * (1 - lifted)
-        - 1.5 * (1 - f["grey"])
-        - 2.0 * still * max(f["wide"] * (1 - lifted * f["hanging"]), f["ground"]),
-        # a jet hangs from above, falls and is slender; what falls a few decimetres is too fast for optical flow
-        "pour": 1.6 * f["falling"]
-        - 2.0 * f["followed"]
-        + 2.4 * f["slender"]
-        + 1.6 * f["hanging"]
-        - 1.2 * f["wide"]
-        - 2.5 * f["bulky"]
-        - 0.8 * f["rising"]
-        - 2.0 * lifted
-        - 0.8 * f["sideways"],
-        # a curtain falls, is not slender, and slow enough in the picture to be followed, as it is metres high
-        "fall": 2.8 * f["falling"]
-        + 1.0 * f["followed"]
-        - 1.6 * f["slender"]
-        - 1.2 * f["rising"]
-        - 1.4 * f["sideways"]
-        - f["foreground"]
-        - 3.0 * f["thrown"],
-        # what rises as well as it falls, free of its background, is thrown up: no brink does that
-        "fountain": 7.0 * f["thrown"] - 2.0,
-        # a stream runs across the picture, or along the line of sight and then fills the foreground
-        "stream": 0.6
-        + 1.8 * f["sideways"]
-        + 0.8 * f["wide"] * (0.5 + still) * (1 - f["falling"])
-        + 2.0 * f["foreground"] * (1 - f["slender"])
-        - 1.8 * f["falling"] * (1 - f["foreground"])
-        - 1.5 * f["rising"] * (1 - still * f["ground"])
-        - 1.5 * staying,
-        # what stays passes nothing on: it goes to and fro, round and round, or has but one side to go to
-        "basin": 0.6
-        + 0.8 * f["wide"] * (0.5 + still)
-        + 2.0 * f["foreground"] * (1 - f["slender"])
-        + (6.0 + 1.5 * inside) * staying
-        - 4.0
-        - 2.4 * f["slender"]
-        - 2.0 * f["falling"]
-        - 2.0 * f["hanging"] * (1 - f["bulky"])
-        - 2.0 * f["changing"],
-        # a body that stands comes down from where it was and spreads over ground that was dry
-        "dam": 7.0 * f["collapsing"] - 2.0,
-    }
-    if pitch is not None:  # steep views of bodies in the air are rare
-        for lies in ("stream", "basin"):
-            belief[lies] += 1.5 * np.clip((pitch - 20.0) / 20.0, -1.0, 1.0)
-    values = SHARPNESS * np.array([belief[k] for k in KINDS])
+    wet = fluid.any(axis=0)
+    f["vessel"] = min(max((rim.share_inside(wet) for rim in rims), default=0.0) / IN_VESSEL, 1.0)
+    weighed = terms(f, pitch)
+    values = np.array([sum(w * weighed[term] for term, w in WEIGHTS[kind].items()) for kind in KINDS])
     share = np.exp(values - values.max())
     share /= share.sum()
     best = KINDS[int(np.argmax(share))]
     return KindEvidence(best, {k: float(s) for k, s in zip(KINDS, share)}, f)
+
+
+def terms(f: dict[str, float], pitch: float | None) -> dict[str, float]:
+    """What is weighed for each kind, from features of 0 to 1; those that are products say when a feature counts.
+
+    Args:
+        f: `KindEvidence.features`.
+        pitch: known tilt of the camera, degrees below the horizon, or None.
+    """
+    still, passes_by = 1.0 - f["changing"], 1.0 - f["slender"]  # what runs off the drops beside a jet goes any way
+    lifted = float(np.clip((f["rising"] - ALL_RISES[0]) / (ALL_RISES[1] - ALL_RISES[0]), 0.0, 1.0))
+    inside = f["enclosed"] * (1.0 - f["hanging"])  # what ends within the picture passes nothing on
+    staying = max(f["swinging"], inside * f["circling"], passes_by * f["returning"], f["horizon"], f["bay"])
+    plain = ("rising", "sideways", "falling", "followed", "slender", "wide", "bulky", "hanging", "changing", "grey",
+             "foreground", "thrown", "vessel", "collapsing")  # fmt: skip
+    return (
+        {"always": 1.0}
+        | {name: f[name] for name in plain}
+        | {
+            "grey and rising": f["grey"] * f["rising"],
+            # it goes up and out at the top
+            "lifted": lifted,
+            "hanging, not lifted": f["hanging"] * (1.0 - lifted),
+            "hanging, not bulky": f["hanging"] * (1.0 - f["bulky"]),
+            # a steady jet keeps its outline; what rises by its heat puffs, the thinner the faster
+            "slender and still": f["slender"] * still,
+            # its outline stays, from side to side or along the lower edge of the picture
+            "filling": still * max(f["wide"] * (1.0 - lifted * f["hanging"]), f["ground"]),
+            "wide and still": f["wide"] * (0.5 + still),
+            "wide, not falling": f["wide"] * (0.5 + still) * (1.0 - f["falling"]),
+            # along the line of sight a body runs out of the foreground or into it
+            "wide foreground": f["foreground"] * passes_by,
+            "falling, far": f["falling"] * (1.0 - f["foreground"]),
+            "rising, not filling": f["rising"] * (1.0 - still * f["ground"]),
+            # it goes to and fro, round and round, or has but one side to go to
+            "staying": staying,
+            "staying inside": staying * inside,
+            # steep views of bodies in the air are rare
+            "seen from above": 0.0 if pitch is None else float(np.clip((pitch - 20.0) / 20.0, -1.0, 1.0)),
+        }
+    )
 
 
 def _features(frames, fluid, displacement, confidence) -> dict[str, float]:

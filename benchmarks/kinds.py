@@ -41,14 +41,15 @@ SHOWS = {
     "beach_waves": "basin", "brague_flood": "stream", "calm_river_reflect": "stream", "cascade": "stream fall",
     "chatelet_fountain": "fall pour", "chocolate_pancakes": "pour", "coffee_cup": "pour", "corn_boil": "basin",
     "dyntex_fountain": "fountain", "forest_brook": "stream", "garden_tap": "pour", "geul_river": "stream",
-    "grill_smoke": "plume", "honey_sieve": "stream", "latte_art": "pour", "lava_night": "stream",
+    "grill_smoke": "plume", "honey_sieve": "stream", "latte_art": "basin", "lava_night": "stream",
     "navizence_drone": "stream", "niagara_river": "stream", "niagara_side": "fall", "pour_glass": "pour",
-    "pour_over": "pour", "pour_tumbler": "pour", "scalarflow_smoke": "plume", "sea_inlet": "basin", "splash": "pour",
-    "steam_cup": "plume", "sunset_beach": "basin", "surf_topdown": "basin", "tall_fall": "fall",
+    "pour_over": "basin pour", "pour_tumbler": "pour", "scalarflow_smoke": "plume", "sea_inlet": "basin",
+    "splash": "pour", "steam_cup": "plume", "sunset_beach": "basin", "surf_topdown": "basin", "tall_fall": "fall",
     "tawi_river": "stream", "wall_cascade": "fall", "waterfall": "fall", "woods_torrent": "stream",
     "woods_weir": "stream fall",
 }  # fmt: skip
-"""what each clip shows, by name; honey lies in a tray under its jet, a weir is a stream with a ledge"""
+"""what each clip shows, by name; honey lies in a tray under its jet, a weir is a stream with a ledge, latte art is a cup
+that is looked into (as a pour all of it would stand upright in the air)"""
 BINS = (0.0, 0.6, 0.8, 1.0)
 """of the probability of the likeliest kind: some ten clips in each"""
 

@@ -27,7 +27,7 @@ from fluidlift.shape.kind import KINDS, terms
 
 TABLE = Path(__file__).resolve().parent / "kind_features.json"
 WEIGHTS = Path(__file__).resolve().parents[1] / "src" / "fluidlift" / "shape" / "kind_weights.py"
-SPREAD = 0.5
+SPREAD = 0.35
 """log odds: standard deviation of a weight about that set by hand; see the table that is printed"""
 SPREADS = (0.2, 0.35, 0.5, 0.7, 1.0, 1.5)
 """that are tried"""
@@ -35,7 +35,7 @@ LEAST = 0.05
 """log odds: smaller weights are left out"""
 BY_HAND = {
     # smoke rises from below, is grey, and its outline changes; it neither hangs from above, nor fills the picture,
-    # unless all of it goes up and out at the top; a thin plume puffs (at 1.5 Hz over the root of its width in metres)
+    # unless all of it goes up and out at the top; a thin plume puffs
     "plume": {"always": -1.35, "rising": 2.34, "grey": 1.67, "grey and rising": 1.08, "changing": 0.72,
               "falling": -1.8, "sideways": -0.9, "hanging, not lifted": -2.25, "filling": -1.8,
               "slender and still": -0.9},
@@ -54,7 +54,7 @@ BY_HAND = {
     # what stays passes nothing on: it goes to and fro, round and round, or has but one side to go to
     "basin": {"always": -3.06, "wide and still": 0.72, "wide foreground": 1.8, "staying": 5.4, "staying inside": 1.35,
               "slender": -2.16, "falling": -1.8, "hanging, not bulky": -1.8, "changing": -1.8,
-              "seen from above": 1.35},
+              "seen from above": 1.35, "within a rim": 0.9},
     # a body that stands comes down from where it was and spreads over ground that was dry
     "dam": {"always": -1.8, "collapsing": 6.3},
 }  # fmt: skip

@@ -124,7 +124,8 @@ def estimate_kind(
     f["thrown"] = 0.0 if ways is None else thrown_up(ways) * f["followed"]
     f["returning"] *= 1.0 - f["thrown"]  # what rises comes back as well
     wet = fluid.any(axis=0)
-    f["vessel"] = min(max((rim.share_inside(wet) for rim in rims), default=0.0) / IN_VESSEL, 1.0)
+    f["within a rim"] = max((rim.share_inside(wet) for rim in rims), default=0.0)
+    f["vessel"] = min(f["within a rim"] / IN_VESSEL, 1.0)
     weighed = terms(f, pitch)
     values = np.array([sum(w * weighed[term] for term, w in WEIGHTS[kind].items()) for kind in KINDS])
     share = np.exp(values - values.max())
@@ -140,29 +141,33 @@ def terms(f: dict[str, float], pitch: float | None) -> dict[str, float]:
         f: `KindEvidence.features`.
         pitch: known tilt of the camera, degrees below the horizon, or None.
     """
-    still, passes_by = 1.0 - f["changing"], 1.0 - f["slender"]  # what runs off the drops beside a jet goes any way
+    still = 1.0 - f["changing"]
+    slender = f["slender"] * (1.0 - f["within a rim"])  # what moves on a liquid in its vessel is no jet
+    lies = 1.0 - slender  # what runs off the drops beside a jet goes any way
     lifted = float(np.clip((f["rising"] - ALL_RISES[0]) / (ALL_RISES[1] - ALL_RISES[0]), 0.0, 1.0))
     inside = f["enclosed"] * (1.0 - f["hanging"])  # what ends within the picture passes nothing on
-    staying = max(f["swinging"], inside * f["circling"], passes_by * f["returning"], f["horizon"], f["bay"])
-    plain = ("rising", "sideways", "falling", "followed", "slender", "wide", "bulky", "hanging", "changing", "grey",
-             "foreground", "thrown", "vessel", "collapsing")  # fmt: skip
+    staying = max(f["swinging"], inside * f["circling"], lies * f["returning"], f["horizon"], f["bay"])
+    plain = ("rising", "sideways", "falling", "followed", "wide", "bulky", "hanging", "changing", "grey",
+             "foreground", "thrown", "vessel", "within a rim", "collapsing")  # fmt: skip
     return (
         {"always": 1.0}
         | {name: f[name] for name in plain}
         | {
+            "slender": slender,
             "grey and rising": f["grey"] * f["rising"],
             # it goes up and out at the top
             "lifted": lifted,
             "hanging, not lifted": f["hanging"] * (1.0 - lifted),
             "hanging, not bulky": f["hanging"] * (1.0 - f["bulky"]),
-            # a steady jet keeps its outline; what rises by its heat puffs, the thinner the faster
-            "slender and still": f["slender"] * still,
+            # a steady jet keeps its outline; what rises by its heat puffs, the thinner the faster (at 1.5 Hz over the
+            # root of its width in metres: Cetegen and Ahmed 1993)
+            "slender and still": slender * still * (1.0 - f["followed"]),
             # its outline stays, from side to side or along the lower edge of the picture
             "filling": still * max(f["wide"] * (1.0 - lifted * f["hanging"]), f["ground"]),
             "wide and still": f["wide"] * (0.5 + still),
             "wide, not falling": f["wide"] * (0.5 + still) * (1.0 - f["falling"]),
             # along the line of sight a body runs out of the foreground or into it
-            "wide foreground": f["foreground"] * passes_by,
+            "wide foreground": f["foreground"] * lies,
             "falling, far": f["falling"] * (1.0 - f["foreground"]),
             "rising, not filling": f["rising"] * (1.0 - still * f["ground"]),
             # it goes to and fro, round and round, or has but one side to go to

@@ -48,8 +48,8 @@ SHOWS = {
     "tawi_river": "stream", "wall_cascade": "fall", "waterfall": "fall", "woods_torrent": "stream",
     "woods_weir": "stream fall",
 }  # fmt: skip
-"""what each clip shows, by name; honey lies in a tray under its jet, a weir is a stream with a ledge, latte art is a cup
-that is looked into (as a pour all of it would stand upright in the air)"""
+"""what each clip shows, by name; honey lies in a tray under its jet, a weir is a stream with a ledge, latte art a cup
+looked into (as a pour all of it would stand upright in the air)"""
 BINS = (0.0, 0.6, 0.8, 1.0)
 """of the probability of the likeliest kind: some ten clips in each"""
 

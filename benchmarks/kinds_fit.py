@@ -54,7 +54,7 @@ BY_HAND = {
     # what stays passes nothing on: it goes to and fro, round and round, or has but one side to go to
     "basin": {"always": -3.06, "wide and still": 0.72, "wide foreground": 1.8, "staying": 5.4, "staying inside": 1.35,
               "slender": -2.16, "falling": -1.8, "hanging, not bulky": -1.8, "changing": -1.8,
-              "seen from above": 1.35, "within a rim": 0.9},
+              "seen from above": 1.35, "contained": 0.9},
     # a body that stands comes down from where it was and spreads over ground that was dry
     "dam": {"always": -1.8, "collapsing": 6.3},
 }  # fmt: skip

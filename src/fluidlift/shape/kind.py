@@ -124,8 +124,7 @@ def estimate_kind(
     f["thrown"] = 0.0 if ways is None else thrown_up(ways) * f["followed"]
     f["returning"] *= 1.0 - f["thrown"]  # what rises comes back as well
     wet = fluid.any(axis=0)
-    f["within a rim"] = max((rim.share_inside(wet) for rim in rims), default=0.0)
-    f["vessel"] = min(f["within a rim"] / IN_VESSEL, 1.0)
+    f["contained"] = max((rim.share_inside(wet) for rim in rims), default=0.0)
     weighed = terms(f, pitch)
     values = np.array([sum(w * weighed[term] for term, w in WEIGHTS[kind].items()) for kind in KINDS])
     share = np.exp(values - values.max())
@@ -142,17 +141,18 @@ def terms(f: dict[str, float], pitch: float | None) -> dict[str, float]:
         pitch: known tilt of the camera, degrees below the horizon, or None.
     """
     still = 1.0 - f["changing"]
-    slender = f["slender"] * (1.0 - f["within a rim"])  # what moves on a liquid in its vessel is no jet
+    slender = f["slender"] * (1.0 - f["contained"])  # what moves on a liquid in its vessel is no jet
     lies = 1.0 - slender  # what runs off the drops beside a jet goes any way
     lifted = float(np.clip((f["rising"] - ALL_RISES[0]) / (ALL_RISES[1] - ALL_RISES[0]), 0.0, 1.0))
     inside = f["enclosed"] * (1.0 - f["hanging"])  # what ends within the picture passes nothing on
     staying = max(f["swinging"], inside * f["circling"], lies * f["returning"], f["horizon"], f["bay"])
     plain = ("rising", "sideways", "falling", "followed", "wide", "bulky", "hanging", "changing", "grey",
-             "foreground", "thrown", "vessel", "within a rim", "collapsing")  # fmt: skip
+             "foreground", "thrown", "contained", "collapsing")  # fmt: skip
     return (
         {"always": 1.0}
         | {name: f[name] for name in plain}
         | {
+            "vessel": min(f["contained"] / IN_VESSEL, 1.0),
             "slender": slender,
             "grey and rising": f["grey"] * f["rising"],
             # it goes up and out at the top

@@ -8,8 +8,8 @@ from fluidlift.backends.warp_device import warp_device
 from fluidlift.backends.warp_particle_store import ParticleStore
 from fluidlift.backends.warp_region import WarpBox, WarpRegion
 from fluidlift.physics import boundaries, transfer
+from fluidlift.physics.boundaries import cell_capacity
 from fluidlift.physics.free_surface import SolidShares, solid_shares
-from fluidlift.physics.position_correction import cell_capacity
 from fluidlift.types import CellType, FaceVelocity, Grid, Particles, Terrain, TriangleMesh
 
 GRID = Grid((14, 9, 11), 0.1, (-0.4, 2.0, 0.0))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fluidlift.backends.warp_device import warp_device
-from fluidlift.physics import free_surface, pressure
+from fluidlift.physics import boundaries, free_surface, pressure
 from fluidlift.types import CellType, FaceVelocity, Grid, triple
 
 warp = pytest.importorskip("warp")
@@ -48,7 +48,7 @@ def pool(seed=0):
     types[0][types[0] == CellType.FLUID] = CellType.INFLOW
     types[-1][types[-1] == CellType.FLUID] = CellType.OUTFLOW
     nodes = GRID.nodes() - GRID.low
-    openings = pressure.face_fractions(nodes[..., 2] - 0.13 - 0.1 * np.sin(5 * nodes[..., 0]))
+    openings = boundaries.face_fractions(nodes[..., 2] - 0.13 - 0.1 * np.sin(5 * nodes[..., 0]))
     return types, openings, distance, rng
 
 

@@ -3,22 +3,10 @@
 import numpy as np
 
 from fluidlift.numerics.sampling import sample_nodes
-from fluidlift.numerics.signed_distance import distance_of_heights, distance_of_mask, push_outside
+from fluidlift.numerics.signed_distance import distance_of_heights, push_outside
 from fluidlift.types import Grid
 
 GRID = Grid((16, 14, 12), 0.1, (-0.3, 0.2, 0.0))
-
-
-def test_a_half_space_has_an_exact_distance():
-    solid = np.zeros((9, 9, 9), bool)
-    solid[:, :, :4] = True
-    distance = distance_of_mask(solid, 0.5)
-    np.testing.assert_allclose(distance[2, 3], 0.5 * (np.arange(9) - 3.5), atol=1e-6)
-
-
-def test_masks_without_a_surface_are_far_from_it():
-    assert (distance_of_mask(np.zeros((3, 3, 3), bool), 1.0) > 5).all()
-    assert (distance_of_mask(np.ones((3, 3, 3), bool), 1.0) < -5).all()
 
 
 def test_a_tilted_bed_has_its_true_distance():

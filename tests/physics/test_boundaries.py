@@ -5,12 +5,12 @@ import pytest
 
 from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.physics import boundaries
+from fluidlift.physics.boundaries import cell_capacity
 from fluidlift.physics.emitter import PHASES
 from fluidlift.physics.forces import add_buoyancy, add_gravity
 from fluidlift.physics.inlet import Inlet, random_fluctuation
 from fluidlift.physics.outlet import hold_columns, outlet_heads, surface_heights, water_levels
 from fluidlift.physics.position_correction import (
-    cell_capacity,
     fill_ratio,
     limited_moves,
     limited_moves_plain,

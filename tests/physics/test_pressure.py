@@ -5,8 +5,9 @@ import pytest
 
 from fluidlift.numerics.poisson import LowRankTerm, PoissonSystem
 from fluidlift.physics import pressure
+from fluidlift.physics.boundaries import face_fractions
 from fluidlift.physics.free_surface import surface_gaps
-from fluidlift.physics.pressure import build_system, divergence, face_fractions, project, subtract_gradient
+from fluidlift.physics.pressure import build_system, divergence, project, subtract_gradient
 from fluidlift.types import CellType, FaceVelocity, Grid, Terrain, TriangleMesh
 
 GRID = Grid((12, 10, 8), 0.1)

@@ -10,9 +10,9 @@ from fluidlift.numerics.poisson import PoissonSystem
 from fluidlift.numerics.solid_mesh import flipped
 from fluidlift.physics import boundaries, free_surface, transfer
 from fluidlift.physics.active_region import open_region
+from fluidlift.physics.boundaries import cell_capacity, face_fractions
 from fluidlift.physics.forces import add_gravity
-from fluidlift.physics.position_correction import cell_capacity
-from fluidlift.physics.pressure import build_system, divergence, face_fractions, project
+from fluidlift.physics.pressure import build_system, divergence, project
 from fluidlift.physics.rigid import RigidBodies, RigidBody, Trajectory
 from fluidlift.physics.rigid_body import slowed
 from fluidlift.types import CellType, FaceVelocity, Grid, Particles, Terrain, TriangleMesh, matrix_from_quat

@@ -8,8 +8,8 @@ import pytest
 from fluidlift.physics import boundaries
 from fluidlift.physics import stress_kernels as kernels
 from fluidlift.physics.active_region import open_region
+from fluidlift.physics.boundaries import cell_capacity
 from fluidlift.physics.face_clearance import face_clearance
-from fluidlift.physics.position_correction import cell_capacity
 from fluidlift.physics.rigid import RigidBodies, RigidBody
 from fluidlift.physics.viscosity import FaceRoles, build_system, diffuse, diffuse_with_bodies
 from fluidlift.physics.viscous_bodies import DraggedBody

@@ -16,10 +16,9 @@ from fluidlift.physics import guidance
 from fluidlift.physics.guidance import Nudging
 from fluidlift.physics.inflow_schedule import InflowSchedule
 from fluidlift.pipeline.stages.calibrate import GAIN, STRONG, calibrate
-from fluidlift.scene.build import SimulationRequest, scene_of
+from fluidlift.scene.build import SceneSettings, SimulationRequest, scene_of
 from fluidlift.scene.coarse_copy import coarser
 from fluidlift.scene.force_weight import following
-from fluidlift.scene.settings import SceneSettings
 from fluidlift.scene.simulator import simulator_of
 from fluidlift.types import CellType, FaceVelocity, Filmed, FilmedMotion, Grid
 

@@ -18,9 +18,8 @@ from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.pipeline import STAGES, Inputs, card_of, make
 from fluidlift.pipeline.stages import fit, geometry, simulate
 from fluidlift.scene import SimulationRequest
-from fluidlift.scene.build import edited_scene, scene_of
+from fluidlift.scene.build import SceneSettings, edited_scene, scene_of
 from fluidlift.scene.footage import footage_of
-from fluidlift.scene.settings import SceneSettings
 from fluidlift.scene.simulator import simulator_of
 from fluidlift.scene.splat_files import frame_files, read_frame
 from fluidlift.types import CellType, Label

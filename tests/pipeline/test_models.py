@@ -24,12 +24,14 @@ from fluidlift.config import JobConfig, build_config
 from fluidlift.errors import InputRejected, MissingPackage
 from fluidlift.io.asset_folder import read_manifest
 from fluidlift.messages import code_of, from_plain
-from fluidlift.pipeline import Inputs
+from fluidlift.pipeline import Inputs, begin
 from fluidlift.pipeline.inputs import GivenFile, GivenFiles, Weights
 from fluidlift.pipeline.known_camera import USUAL_SPREAD, with_model_lens
 from fluidlift.pipeline.models import require_use, used_models, with_models
-from fluidlift.pipeline.settings import DepthModel, FlowSettings, SegmentSettings
+from fluidlift.pipeline.runner import Runner
+from fluidlift.pipeline.settings import DepthModelSettings, FlowSettings, SegmentSettings
 from fluidlift.pipeline.stages.flow import flow_method
+from fluidlift.seams import Silence
 from fluidlift.types import PinholeCamera
 
 CLIP = Inputs(Path("clip.mp4"))
@@ -260,6 +262,15 @@ def test_a_model_that_was_changed_or_is_gone_is_not_used(table, stick, tmp_path)
         used_models(config, CLIP)
 
 
+def test_a_model_of_the_flow_that_is_gone_is_missed_before_the_clip_is_read(table, tmp_path):
+    clip, work = tmp_path / "clip.mp4", tmp_path / "work"
+    clip.write_bytes(b"no video")
+    config = build_config(overrides=["motion.method=sea-raft", "motion.weights=model:flow-2"])
+    with pytest.raises(InputRejected, match="models get flow-2"):
+        begin.look(Runner(work, ("read",), progress=Silence()), GivenFiles.of(Inputs(clip)), config)
+    assert not work.exists()
+
+
 def test_a_file_of_the_same_name_is_not_taken_for_a_model(table, stick, monkeypatch, tmp_path):
     bring(table, stick, "flow-2")
     monkeypatch.chdir(tmp_path)
@@ -382,7 +393,8 @@ def test_a_model_of_depth_in_another_python_needs_no_package_here(table, stick, 
         assert (chosen.depth.model, chosen.depth.python) == ("moge", "/somewhere/bin/python")
     given = GivenFiles(GivenFile(CLIP.clip, "0"))
     there, here = (
-        DepthModel.of(given, replace(chosen, depth=replace(chosen.depth, python=p))) for p in ("~/x/bin/python", None)
+        DepthModelSettings.of(given, replace(chosen, depth=replace(chosen.depth, python=p)))
+        for p in ("~/x/bin/python", None)
     )
     assert there is not None and here is not None and here.python is None
     assert there.python == Path.home() / "x" / "bin" / "python"

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
-from fluidlift.config import ViewConfig
+from fluidlift.config import JobConfig, ViewConfig
 from fluidlift.errors import InputRejected
 from fluidlift.pipeline.known_camera import USUAL_SPREAD
-from fluidlift.pipeline.views import LearnedView, require_weights
+from fluidlift.pipeline.models import require_weights
+from fluidlift.pipeline.views import LearnedView
 from fluidlift.types import PinholeCamera
 from fluidlift.types.stages import ViewGuesses
 
@@ -67,7 +68,7 @@ def test_its_tilt_follows_the_lens_that_is_taken_in_the_end():
 
 @pytest.mark.parametrize(("weights", "says"), [(None, "without its weights"), ("nowhere.tar", "not there")])
 def test_weights_are_asked_for_before_the_clip_is_read(weights, says):
-    require_weights(ViewConfig())
-    require_weights(ViewConfig("geocalib", "model:geocalib"))
+    require_weights(JobConfig())
+    require_weights(JobConfig(view=ViewConfig("geocalib", "model:geocalib")))
     with pytest.raises(InputRejected, match=says):
-        require_weights(ViewConfig("geocalib", weights))
+        require_weights(JobConfig(view=ViewConfig("geocalib", weights)))

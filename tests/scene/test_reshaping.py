@@ -19,12 +19,11 @@ from fluidlift.pipeline.stages.simulate import simulate
 from fluidlift.scene.reshaping import (
     changed_parameters,
     in_words,
-    sides_open_to_air,
     slow_edits,
     with_emitters,
     with_terrain,
 )
-from fluidlift.scene.simulator import simulator_of
+from fluidlift.scene.simulator import sides_open_to_air, simulator_of
 from fluidlift.scene.splat_files import frame_file, frame_files, read_frame
 from fluidlift.types import FluidParameters, TriangleMesh
 

@@ -1,5 +1,6 @@
 """Vessels that pours fill: floor, level, radii and volume from silhouettes of known solids of revolution."""
 
+import cv2
 import numpy as np
 import pytest
 from scipy.ndimage import label
@@ -13,7 +14,6 @@ from fluidlift.shape.filled_vessel import (
     pool_depths,
     seen_higher,
 )
-from fluidlift.shape.hints import polygon_mask
 from fluidlift.shape.kind import level_camera
 from fluidlift.types import PinholeCamera, Similarity3, UpEvidence
 
@@ -218,4 +218,5 @@ def _disc(camera: PinholeCamera, vessel: FilledVessel, z: float) -> np.ndarray:
     """Where a level disc of the vessel's width is seen at some height."""
     turns = np.linspace(0.0, 2.0 * np.pi, 200)
     ring = [vessel.axis[0] + 0.25 * np.cos(turns), vessel.axis[1] + 0.25 * np.sin(turns), np.full(200, z)]
-    return polygon_mask([camera.project(np.stack(ring, axis=1))[0]], *camera.size[::-1])
+    corners = np.round(camera.project(np.stack(ring, axis=1))[0] - 0.5).astype(np.int32)
+    return cv2.fillPoly(np.zeros(camera.size[::-1], np.uint8), [corners], 1) > 0

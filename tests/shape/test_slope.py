@@ -125,10 +125,10 @@ def test_ripples_that_each_move_their_own_way_say_little_of_a_slope():
 
 
 def test_where_level_streams_are_rare_less_of_the_tilt_is_the_cameras():
-    camera, mask, motion = film(15.0, -60.0, 31.0, 0.75)
+    _, mask, motion = film(15.0, -60.0, 31.0, 0.75)
     patches = flow_patches(mask, motion, np.ones(mask.shape))
     assert patches is not None
-    usual, rare = (estimate_tilt(camera, patches, tilted, PictureEvidence(), p) for p in (0.6, 0.1))
+    usual, rare = (estimate_tilt(patches, tilted, PictureEvidence(), p) for p in (0.6, 0.1))
     assert rare.pitch < usual.pitch - 5.0
 
 
@@ -145,10 +145,10 @@ def test_under_an_estimated_tilt_the_slope_is_the_mean_over_both_models():
 
 
 def test_a_uniform_stream_towards_the_viewer_shows_the_tilt_better_than_the_prior():
-    camera, mask, motion = film(0.0, -60.0, 25.0)
+    _, mask, motion = film(0.0, -60.0, 25.0)
     patches = flow_patches(mask, motion, np.ones(mask.shape))
     assert patches is not None
-    found = estimate_tilt(camera, patches, tilted, PictureEvidence())
+    found = estimate_tilt(patches, tilted, PictureEvidence())
     assert abs(found.pitch - 25.0) < 7.5  # half of the prior's error
     assert found.pitch_error < 13.0
     assert 0.0 < found.gained <= 1.0
@@ -156,11 +156,11 @@ def test_a_uniform_stream_towards_the_viewer_shows_the_tilt_better_than_the_prio
 
 def test_a_stream_across_the_view_leaves_the_tilt_to_the_prior():
     # its streamlines stay parallel in the picture at any pitch; a profile across it looks like a little perspective
-    camera, mask, motion = film(0.0, 0.0, 40.0, 0.75)
+    _, mask, motion = film(0.0, 0.0, 40.0, 0.75)
     patches = flow_patches(mask, motion, np.ones(mask.shape))
     assert patches is not None
-    found = estimate_tilt(camera, patches, tilted, PictureEvidence())
-    without = estimate_tilt(camera, None, tilted, PictureEvidence())
+    found = estimate_tilt(patches, tilted, PictureEvidence())
+    without = estimate_tilt(None, tilted, PictureEvidence())
     assert abs(found.pitch - without.pitch) < 6.5  # a quarter of the prior's error
     assert found.pitch_error > 0.5 * without.pitch_error  # straight from above there would be no perspective at all
 

@@ -8,7 +8,7 @@ from scipy import ndimage
 from fluidlift.numerics.sampling import sample_nodes
 from fluidlift.physics import apic
 from fluidlift.physics.apic import LiquidSimulator, SimulationSettings
-from fluidlift.physics.pressure import face_fractions
+from fluidlift.physics.boundaries import face_fractions
 from fluidlift.synthetic import filling, tanks
 from fluidlift.synthetic.gauges import Gauge
 from fluidlift.types import CellType, FluidParameters, Grid, Particles

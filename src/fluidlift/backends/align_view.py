@@ -124,7 +124,7 @@ def align_view(
         _Comparison.of(_thinned(body, n, seed), middle, image, mask, width)
         for n, width in zip(_COUNTS, _SIZES, strict=True)
     ]
-    found = sorted((stages[0].loss(pose), i, pose) for i, pose in enumerate(_directions(stages[0], mask, focal)))
+    found = sorted((stages[0].loss(pose), i, pose) for i, pose in enumerate(_directions(stages[0], focal)))
     if not found or not math.isfinite(found[0][0]):
         raise FluidliftError("no direction shows the body. Needed: a body that can be seen. Do: try another seed.")
     fitted = [_refined(stages[1], pose, focal, 8, free_focal=False) for pose in _distinct(found, _KEPT[0])]
@@ -192,7 +192,7 @@ class _Comparison:
         return float((drawn & seen).sum() / max((drawn | seen).sum(), 1))
 
 
-def _directions(stage: _Comparison, mask: np.ndarray, focal: float) -> Iterator[_Pose]:
+def _directions(stage: _Comparison, focal: float) -> Iterator[_Pose]:
     """All directions, each with the distance and the place in the picture that fit the silhouette's."""
     wanted, radius = _place(stage.target[..., 3], stage.crop)
     spread = stage.body.means - stage.middle

@@ -73,8 +73,3 @@ class Evaluation:
     def table(self) -> list[tuple[str, str, str, str]]:
         """Rows (key, value, unit, note) in the order of measurement."""
         return [(f.key, f.text, f.unit, f.note) for f in self.figures]
-
-    def markdown(self) -> str:
-        """The table as Markdown."""
-        lines = ["| figure | value | unit | note |", "|---|---|---|---|"]
-        return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in self.table()])

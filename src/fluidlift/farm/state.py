@@ -25,8 +25,6 @@ STATE, LOCK, LOG = ".state.json", ".lock", ".log"
 LISTED = "shots.json"
 """names of all shots of a folder, in the order in which batches named them"""
 WELL = ("done", "done, warnings")
-FAILURES = ("input", "memory", "time", "crash", "stopped")
-"""classes of failure: what `make` refuses; memory or time ran out; it broke down; it was told to end"""
 LARGEST = 1 << 20
 """bytes of a state file that are read: warnings are some hundred characters each"""
 
@@ -45,7 +43,8 @@ class Outcome:
     reason: str = ""
     """what a make that failed said last"""
     failure: str = ""
-    """one of `FAILURES`, or empty"""
+    """class of failure: input (`make` refuses it), memory or time (which ran out), crash, stopped (it was told to end);
+    or empty"""
     verdict: str = ""
     """of the asset, as filmed: good, usable, does not hold; empty: not measured"""
     peak_memory_mb: float = 0.0

@@ -200,6 +200,18 @@ def packs_to(array: np.ndarray, share: float) -> bool:
     return len(zlib.compress(part, 1)) < share * len(part)
 
 
+def read_packed_arrays(path: Path, kinds: str = "fiub") -> dict[str, np.ndarray]:
+    """What `write_packed_arrays` wrote.
+
+    Raises:
+        InputRejected: more than `most_unpacked` allows.
+        ValueError: as `members_of` and `array_in`; what zipfile raises for damage (`DAMAGE`).
+    """
+    with zipfile.ZipFile(path) as archive:
+        members = members_of(archive, most_unpacked(path.stat().st_size))
+        return {name: array_in(archive, member, kinds) for name, member in members.items()}
+
+
 def read_arrays(path: Path, needed: Sequence[str]) -> dict[str, np.ndarray]:
     """The arrays of an npz; pickles and oversize content are refused before anything is unpacked.
 

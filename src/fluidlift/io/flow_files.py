@@ -174,31 +174,6 @@ def open_flow(
     return FlowFiles(numbered_flow(path, pairs, start, layout.first_number), size, layout, limits, start)
 
 
-def read_flow(
-    path: Path | str,
-    size: tuple[int, int],
-    pairs: int,
-    *,
-    start: int = 0,
-    layout: FlowLayout | None = None,
-    limits: ReadLimits | None = None,
-) -> PixelFlow:
-    """All of `open_flow` in memory: displacement float32 [pairs,H,W,2], confidence float16 [pairs,H,W].
-
-    Raises:
-        InputRejected: as `open_flow`, or more bytes than `limits.max_bytes`.
-    """
-    limits = limits or ReadLimits()
-    needed = pairs * size[0] * size[1] * 10
-    if needed > limits.max_bytes:
-        raise InputRejected(
-            f"the flow of {pairs} pairs of {size[0]} x {size[1]} px takes {needed} bytes",
-            f"at most {limits.max_bytes} bytes",
-            "shorten the clip, or make the pictures smaller",
-        )
-    return open_flow(path, size, pairs, start=start, layout=layout, limits=limits).window(0, pairs)
-
-
 def read_pair(path: Path, layout: FlowLayout, limits: ReadLimits) -> tuple[np.ndarray, np.ndarray | None, bool]:
     """What one file holds: displacement [H,W,2] as stored, confidence [H,W] or None, and whether v points up.
 

@@ -14,7 +14,6 @@ import hashlib
 import json
 import os
 import re
-import zipfile
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -25,11 +24,9 @@ import numpy as np
 from fluidlift.errors import InputRejected, require
 from fluidlift.io.array_archive import (
     DAMAGE,
-    array_in,
     mapped_array,
-    members_of,
-    most_unpacked,
     packs_to,
+    read_packed_arrays,
     write_packed_arrays,
 )
 from fluidlift.io.asset_paths import asset_file
@@ -43,7 +40,7 @@ from fluidlift.io.atomic import (
     write_bytes,
     write_json,
 )
-from fluidlift.io.limits import MAX_TEXT_BYTES, parse_json, require_size
+from fluidlift.io.limits import read_json
 from fluidlift.types.fluid_masks import parts_of
 
 WORK_MARKER = ".fluidlift"
@@ -261,13 +258,10 @@ def load_stage(folder: Path | str, stage: str, key: str) -> tuple[dict[str, np.n
     if not (data.is_file() and facts.is_file()) or data.is_symlink() or facts.is_symlink():
         return None
     try:
-        require_size(facts, MAX_TEXT_BYTES, "cache")
-        known = parse_json(facts.read_bytes())
+        known = read_json(facts, "cache")
         if known.pop("sum") != _sum(known):
             return None
-        with zipfile.ZipFile(data) as archive:
-            members = members_of(archive, most_unpacked(data.stat().st_size))
-            arrays = {name.removesuffix("."): array_in(archive, m, _KINDS) for name, m in members.items()}
+        arrays = {name.removesuffix("."): a for name, a in read_packed_arrays(data, _KINDS).items()}
         for name in known["mapped"]:
             path = _mapped(data, name)
             if path.is_symlink() or not re.fullmatch(r"[A-Za-z0-9_-]{1,64}", name):

@@ -5,23 +5,10 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float
 from numba import njit
-from scipy import ndimage
 
 from fluidlift.errors import require
 from fluidlift.numerics.sharing import shared
 from fluidlift.types import Grid
-
-
-def distance_of_mask(solid: Bool[np.ndarray, "..."], spacing: float) -> Float[np.ndarray, "..."]:
-    """Signed distance (m, positive outside) to the surface half way between solid and open samples."""
-    require(solid.dtype == bool, f"mask of type {solid.dtype}", "bool")
-    if not solid.any():
-        return np.full(solid.shape, spacing * sum(solid.shape), np.float32)
-    outside = np.asarray(ndimage.distance_transform_edt(~solid))
-    if solid.all():
-        return np.full(solid.shape, -spacing * sum(solid.shape), np.float32)
-    inside = np.asarray(ndimage.distance_transform_edt(solid))
-    return (spacing * np.where(solid, 0.5 - inside, outside - 0.5)).astype(np.float32)
 
 
 def distance_of_heights(heights: Float[np.ndarray, "nx+1 ny+1"], grid: Grid) -> Float[np.ndarray, "nx+1 ny+1 nz+1"]:

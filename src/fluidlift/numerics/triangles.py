@@ -118,14 +118,6 @@ def interpolated(
     return out
 
 
-def interpolated_corners(fragments: Fragments, values: Float[np.ndarray, "f 3 c"]) -> Float[np.ndarray, "h w c"]:
-    """Values of the faces' own corners, such as texture coordinates, at the pixels; 0 where no face is seen."""
-    shape = np.shape(values)
-    require(len(shape) == 3 and shape[1] == 3, f"values of shape {shape}", "[f, 3, c]")
-    corners = np.arange(3 * shape[0], dtype=np.int32).reshape(-1, 3)
-    return interpolated(fragments, np.reshape(values, (-1, shape[2])), corners)
-
-
 def _indices(faces: np.ndarray, count: int) -> np.ndarray:
     f = np.ascontiguousarray(faces)
     require(f.ndim == 2 and f.shape[1] == 3, f"faces of shape {f.shape}", "[f, 3]")

@@ -96,7 +96,7 @@ class ActiveRegion:
     walls: Walls
     """cut to the region"""
     capacity: Float[np.ndarray, "nx ny nz"]
-    """of `crowding.cell_capacity`"""
+    """of `boundaries.cell_capacity`"""
     wall_cells: Bool[np.ndarray, "nx ny nz"]
     """cells with a face that is mostly closed"""
 

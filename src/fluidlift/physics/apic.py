@@ -295,7 +295,7 @@ class LiquidSimulator(ParticleSimulator):
             spread = spreading(particles.positions, ratio, region.capacity, held, grid, order)
             moves = moves if spread is None else moves + spread
         keep = (1.0 - self.parameters.wall_damping) ** (dt / self.parameters.time_step)
-        rules = MoveRules(dt, self.parameters.restitution, keep, self.settings.max_stretch, self.settings.deform)
+        rules = MoveRules(dt, self.parameters.restitution, keep, self.settings.max_stretch, self.deforms)
         state = self._work.mover.moved(particles, moves, velocities, affine, walls, rules)
         gone = leaving(particles.positions, state.positions, walls, self._mainstream)
         full = self.parameters.density * grid.spacing**3

@@ -15,12 +15,14 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from numba import njit
 
-from fluidlift.numerics.sampling import gradient_nodes
+from fluidlift.numerics.sampling import gradient_nodes, sample_nodes
 from fluidlift.numerics.sharing import shared
 from fluidlift.numerics.signed_distance import distance_and_gradient
-from fluidlift.physics.pressure import face_fractions
 from fluidlift.seams import CLEARANCE, CONTACT, WallShape
 from fluidlift.types import CellType, FaceVelocity, Grid, Terrain
+
+SMALLEST_OPENING = 0.02
+"""open fractions below this are closed: slivers of faces carry no flow worth their bad conditioning"""
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,35 @@ class Walls:
     """u8 [nx,ny,nz]: INFLOW, OUTFLOW, SOLID or EMPTY (everywhere else)"""
     open_sides: Bool[np.ndarray, "3 2"]
     """sides of the box (axis, low/high) that let particles and fluid out everywhere"""
+
+
+def _open_share_of_triangle(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """Share of a triangle where the linear function with corner values a, b, c is positive."""
+    low, middle, high = np.sort(np.stack([a, b, c]), axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        one_below = 1.0 - low * low / ((low - middle) * (low - high))
+        two_below = high * high / ((high - low) * (high - middle))
+    return np.select([low >= 0, high <= 0, middle >= 0], [1.0, 0.0, one_below], two_below)
+
+
+def face_fractions(signed_distance: Float[np.ndarray, "nx+1 ny+1 nz+1"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Cut cells: open share of every face across x, y and z, float32, from the signed distance at the nodes.
+
+    Each square is cut into triangles along both diagonals, and the two results are averaged (no preferred diagonal).
+    The surface is raised by a thousandth of the largest step between nodes (one cell's width), so that a face which
+    lies in a flat surface is closed and not open by a rounding error.
+    """
+    distance = np.asarray(signed_distance, np.float64)
+    step = max(float(np.abs(np.diff(distance, axis=axis)).max(initial=0.0)) for axis in range(3))
+    fractions = []
+    for axis in range(3):
+        phi = np.moveaxis(distance - 1e-3 * step, axis, 0)
+        a, b, c, d = phi[:, :-1, :-1], phi[:, 1:, :-1], phi[:, 1:, 1:], phi[:, :-1, 1:]
+        parts = [(a, b, c), (a, c, d), (b, c, d), (a, b, d)]
+        share = sum(_open_share_of_triangle(*corners) for corners in parts) / 4.0
+        share = np.where(share < SMALLEST_OPENING, 0.0, share)
+        fractions.append(np.ascontiguousarray(np.moveaxis(share, 0, axis), np.float32))
+    return tuple(fractions)
 
 
 def build_walls(terrain: Terrain, regions: np.ndarray, open_sides: np.ndarray) -> Walls:
@@ -110,6 +141,22 @@ def mean_of_corners(field: Float[np.ndarray, "nx+1 ny+1 nz+1"]) -> Float[np.ndar
         along = np.moveaxis(field, axis, 0)
         field = np.moveaxis(0.5 * (along[1:] + along[:-1]), 0, axis)
     return field
+
+
+def cell_capacity(signed_distance: Float[np.ndarray, "nx+1 ny+1 nz+1"], grid: Grid) -> Float[np.ndarray, "nx ny nz"]:
+    """Share (0 to 1) of the trilinear kernel around each cell centre that is not solid, from 4^3 samples."""
+    capacity = np.ones(grid.shape, np.float32)
+    nodes = np.asarray(signed_distance)
+    near = np.abs(mean_of_corners(nodes)) < 2.0 * grid.spacing
+    centers = grid.centers()[near]
+    total = np.zeros(len(centers))
+    offsets = np.array([-0.75, -0.25, 0.25, 0.75])
+    for step in np.ndindex(4, 4, 4):
+        shift = offsets[list(step)]
+        weight = 0.125 * np.prod(1.0 - np.abs(shift))
+        total += weight * (sample_nodes(nodes, grid, centers + shift * grid.spacing) > 0)
+    capacity[near] = total
+    return capacity
 
 
 def liquid_cells(occupied: Bool[np.ndarray, "nx ny nz"], walls: Walls) -> np.ndarray:

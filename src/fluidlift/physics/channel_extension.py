@@ -143,7 +143,7 @@ def extended_downstream(terrain: Terrain, cell_types: np.ndarray, length: float)
     distance = _extended_distance(terrain, outlet, grid)
     mesh = _extended_mesh(terrain, outlet, grid, distance)
     longer = Terrain(grid, distance.astype(np.float32), terrain.mainstream, mesh)
-    return longer, _extended_cells(terrain, cell_types, outlet, longer)
+    return longer, _extended_cells(cell_types, outlet, longer)
 
 
 def _extended_distance(terrain: Terrain, outlet: Outlet, grid: Grid) -> np.ndarray:
@@ -199,7 +199,7 @@ def _embedded(cells: np.ndarray, outlet: Outlet, grid: Grid) -> tuple[np.ndarray
     return out, place
 
 
-def _extended_cells(terrain: Terrain, cell_types: np.ndarray, outlet: Outlet, longer: Terrain) -> np.ndarray:
+def _extended_cells(cell_types: np.ndarray, outlet: Outlet, longer: Terrain) -> np.ndarray:
     grid = longer.grid
     out, _ = _embedded(cell_types, outlet, grid)
     centers = grid.centers()

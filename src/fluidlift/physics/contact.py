@@ -20,7 +20,7 @@ from fluidlift.physics.contact_search import Contacts
 
 REST_GAP = 0.05
 """cells between bodies at rest: open enough for the film of liquid between them to carry pressure (faces that are open
-by less than `pressure.SMALLEST_OPENING` count as closed)"""
+by less than `boundaries.SMALLEST_OPENING` count as closed)"""
 SLACK = 0.01
 """cells of overlap with the gap that are left alone"""
 RECOVERY = 0.2
@@ -31,7 +31,7 @@ SWEEPS = 60
 
 
 @dataclass
-class Motion:
+class BodyMotion:
     """Velocities of b bodies and how they answer to impulses; changed by contacts."""
 
     center: Float[np.ndarray, "b 3"]
@@ -164,7 +164,7 @@ class ContactSolver:
         motion: of the bodies; its velocities are changed.
     """
 
-    def __init__(self, contacts: Contacts, motion: Motion) -> None:
+    def __init__(self, contacts: Contacts, motion: BodyMotion) -> None:
         self.contacts, self.motion = contacts, motion
         self._frames, self._levers, self._turns, self._soft, self._across = _prepare(
             contacts.first, contacts.second, contacts.points, contacts.normals, motion.center, motion.inverse_mass,

@@ -196,7 +196,7 @@ class GasSimulator(ParticleSimulator):
             restitution=0.0, tangential_share=1.0,
         )  # fmt: skip
         deformation = particles.deformation
-        if self.settings.deform:
+        if self.deforms:
             deformation = updated_deformation(deformation, affine, dt, max_stretch=self.settings.max_stretch)
         state = replace(particles, positions=positions, velocities=velocities, affine=affine, deformation=deformation)
         gone = leaving(particles.positions, positions, self._walls, self._mainstream)

@@ -241,7 +241,7 @@ class Inlet:
         self.shift = np.zeros(3)
         """m, by which the emission pattern has travelled"""
         self.emissions = tuple(Emission(e, walls, self.particle_spacing) for e in self.supply.emitters)
-        self.running: tuple[Emission, ...] = ()
+        self.running = tuple(e for e in self.emissions if e.emitter.on(0.0))
         """emissions that are on"""
         self._profile, self._gain, self._offset = profile, 0.0, self.bulk
         if not self._steady:

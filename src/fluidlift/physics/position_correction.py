@@ -12,9 +12,8 @@ from jaxtyping import Float
 from numba import njit
 
 from fluidlift.numerics.poisson import solve
-from fluidlift.numerics.sampling import sample_faces, sample_nodes
+from fluidlift.numerics.sampling import sample_faces
 from fluidlift.numerics.sharing import shared
-from fluidlift.physics.boundaries import mean_of_corners
 from fluidlift.physics.pressure import PressureSystem, subtract_gradient
 from fluidlift.physics.transfer import CellOrder, deposit_to_cells
 from fluidlift.types import FaceVelocity, Grid
@@ -28,22 +27,6 @@ LARGEST_LACK = 0.3
 """of cells without a face to the air"""
 LARGEST_MOVE = 0.2
 """cells per step"""
-
-
-def cell_capacity(signed_distance: Float[np.ndarray, "nx+1 ny+1 nz+1"], grid: Grid) -> Float[np.ndarray, "nx ny nz"]:
-    """Share (0 to 1) of the trilinear kernel around each cell centre that is not solid, from 4^3 samples."""
-    capacity = np.ones(grid.shape, np.float32)
-    nodes = np.asarray(signed_distance)
-    near = np.abs(mean_of_corners(nodes)) < 2.0 * grid.spacing
-    centers = grid.centers()[near]
-    total = np.zeros(len(centers))
-    offsets = np.array([-0.75, -0.25, 0.25, 0.75])
-    for step in np.ndindex(4, 4, 4):
-        shift = offsets[list(step)]
-        weight = 0.125 * np.prod(1.0 - np.abs(shift))
-        total += weight * (sample_nodes(nodes, grid, centers + shift * grid.spacing) > 0)
-    capacity[near] = total
-    return capacity
 
 
 def fill_ratio(

@@ -20,14 +20,13 @@ from jaxtyping import Float
 
 from fluidlift.errors import require
 from fluidlift.numerics.poisson import LowRankTerm, PoissonSystem, solve
+from fluidlift.physics.boundaries import face_fractions
 from fluidlift.physics.pressure_kernels import accelerated, outflow
 from fluidlift.types import CellType, FaceVelocity, Grid, SolveReport, Terrain, triple
 
 Faces = tuple[np.ndarray, np.ndarray, np.ndarray]
 """one array per axis: [nx+1,ny,nz], [nx,ny+1,nz], [nx,ny,nz+1]"""
 
-SMALLEST_OPENING = 0.02
-"""open fractions below this are closed: slivers of faces carry no flow worth their bad conditioning"""
 NO_GAP = np.zeros((0, 0, 0), np.float32)
 """the surface passes through the centres of the cells of air"""
 
@@ -58,35 +57,6 @@ class PressureSystem(PoissonSystem):
     def openings(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Open fractions across x, y, z."""
         return (self.open_x, self.open_y, self.open_z)
-
-
-def _open_share_of_triangle(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """Share of a triangle where the linear function with corner values a, b, c is positive."""
-    low, middle, high = np.sort(np.stack([a, b, c]), axis=0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        one_below = 1.0 - low * low / ((low - middle) * (low - high))
-        two_below = high * high / ((high - low) * (high - middle))
-    return np.select([low >= 0, high <= 0, middle >= 0], [1.0, 0.0, one_below], two_below)
-
-
-def face_fractions(signed_distance: Float[np.ndarray, "nx+1 ny+1 nz+1"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Cut cells: open share of every face across x, y and z, float32, from the signed distance at the nodes.
-
-    Each square is cut into triangles along both diagonals, and the two results are averaged (no preferred diagonal).
-    The surface is raised by a thousandth of the largest step between nodes (one cell's width), so that a face which
-    lies in a flat surface is closed and not open by a rounding error.
-    """
-    distance = np.asarray(signed_distance, np.float64)
-    step = max(float(np.abs(np.diff(distance, axis=axis)).max(initial=0.0)) for axis in range(3))
-    fractions = []
-    for axis in range(3):
-        phi = np.moveaxis(distance - 1e-3 * step, axis, 0)
-        a, b, c, d = phi[:, :-1, :-1], phi[:, 1:, :-1], phi[:, 1:, 1:], phi[:, :-1, 1:]
-        parts = [(a, b, c), (a, c, d), (b, c, d), (a, b, d)]
-        share = sum(_open_share_of_triangle(*corners) for corners in parts) / 4.0
-        share = np.where(share < SMALLEST_OPENING, 0.0, share)
-        fractions.append(np.ascontiguousarray(np.moveaxis(share, 0, axis), np.float32))
-    return tuple(fractions)
 
 
 def _beside(mask: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:

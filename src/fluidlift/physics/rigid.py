@@ -21,7 +21,7 @@ from fluidlift.numerics.solid_mesh import hull_points, moments, surface_points
 from fluidlift.physics import rigid_coupling
 from fluidlift.physics.active_region import ActiveRegion
 from fluidlift.physics.boundaries import Walls, slide_along_walls
-from fluidlift.physics.contact import ContactSolver, Motion
+from fluidlift.physics.contact import BodyMotion, ContactSolver
 from fluidlift.physics.contact_search import Contacts, find_contacts, spread_points
 from fluidlift.physics.rigid_body import RigidBody, Trajectory, material_pairs, slowed, within_reach
 from fluidlift.physics.rigid_coupling import BodyRows, SolidVelocity
@@ -231,7 +231,7 @@ class RigidBodies:
         speed = np.sqrt(np.square(self.velocity).sum(1)) + self._radius * np.sqrt(np.square(spin).sum(1))
         reach = np.where(self.active, SAFE_REACH * h + dt * speed, -np.inf)
         contacts = find_contacts(self._shapes, self._surface, moving, self._static, reach)
-        motion = Motion(
+        motion = BodyMotion(
             self.center, self.velocity.copy(), spin, np.where(moving, 1.0 / self.mass, 0.0),
             np.where(moving[:, None, None], self._inverse_world_inertia(), 0.0),
         )  # fmt: skip
@@ -240,7 +240,7 @@ class RigidBodies:
             self._solver.expect(self._known_keys, self._known_impulses * (dt / self._known_step))
             self._adopt(contacts, motion)
 
-    def _adopt(self, contacts: Contacts, motion: Motion) -> None:
+    def _adopt(self, contacts: Contacts, motion: BodyMotion) -> None:
         """Take over the velocities of bodies in contact."""
         before = self.spin
         touched = np.zeros(len(self.bodies), bool)

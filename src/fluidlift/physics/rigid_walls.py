@@ -17,12 +17,12 @@ from numba import njit
 from fluidlift.numerics.sharing import shared
 from fluidlift.numerics.signed_distance import distance_and_gradient
 from fluidlift.physics.active_region import ActiveRegion
-from fluidlift.physics.pressure import SMALLEST_OPENING
+from fluidlift.physics.boundaries import SMALLEST_OPENING
 from fluidlift.physics.rigid_shapes import Shapes, body_distance
 from fluidlift.types import CellType, triple
 
 RAISED = 1e-3
-"""cells by which a body's surface is raised, as the terrain's is (see `pressure.face_fractions`)"""
+"""cells by which a body's surface is raised, as the terrain's is (see `boundaries.face_fractions`)"""
 PARTS = 2
 """pieces of a face's side between which a body's distance is linear"""
 CUT = 1e-3

@@ -56,7 +56,7 @@ def surface_cells(
     Args:
         cell_types: `CellType`.
         distance: m, to the surface, negative in the liquid.
-        openings: open share of the faces (`pressure.face_fractions`, or of `pressure.build_system`).
+        openings: open share of the faces (`boundaries.face_fractions`, or of `pressure.build_system`).
         spacing: cell width, m.
 
     Returns:

@@ -18,11 +18,11 @@ from fluidlift.errors import FluidliftError, InputRejected, require
 from fluidlift.numerics.sampling import sample_centers
 from fluidlift.numerics.signed_distance import push_outside
 from fluidlift.physics import boundaries, transfer
+from fluidlift.physics.boundaries import cell_capacity
 from fluidlift.physics.deform import deform_gaussians
 from fluidlift.physics.emitter import Emission, Supply
 from fluidlift.physics.inlet import Inlet
 from fluidlift.physics.no_bodies import NoBodies
-from fluidlift.physics.position_correction import cell_capacity
 from fluidlift.physics.refill import Refill
 from fluidlift.physics.rigid import RigidBodies
 from fluidlift.physics.surroundings import SimulationSettings, Surroundings
@@ -125,7 +125,6 @@ class ParticleSimulator(ABC):
         self._capacity = cell_capacity(terrain.signed_distance, grid)
         self._mainstream = np.asarray(terrain.mainstream, np.float64)
         self._inlet = Inlet(self._walls, parameters, inflow_profile, seed, settings.particles_per_cell, supply)
-        self._inlet.switch(0.0)
         self._surroundings = Surroundings(
             grid, parameters, settings, self._walls, self._capacity, self._mainstream, self._inlet
         )
@@ -137,6 +136,8 @@ class ParticleSimulator(ABC):
         """s, after which none are"""
         self.drained = 0.0
         """m^3 that were taken out there"""
+        self.deforms = settings.deform
+        """whether the deformation of particles is carried along; may be turned off before the first step"""
         self.refill: Refill | None = None
         """cells that are kept from running dry, at the end of every `advance`; None: none are"""
         self.refilled = 0.0

@@ -27,9 +27,8 @@ from fluidlift.errors import InputRejected, require
 from fluidlift.numerics.sampling import sample_centers, sample_faces, sample_nodes
 from fluidlift.physics import whitewater_kernels
 from fluidlift.physics.active_region import inner_grid, region_around
-from fluidlift.physics.boundaries import extrapolate
+from fluidlift.physics.boundaries import cell_capacity, extrapolate
 from fluidlift.physics.free_surface import SolidShares, liquid_surface, solid_shares
-from fluidlift.physics.position_correction import cell_capacity
 from fluidlift.physics.transfer import deposit_to_cells, particles_to_grid, sort_by_cell
 from fluidlift.types import CellType, FaceVelocity, Grid, Particles, Terrain
 

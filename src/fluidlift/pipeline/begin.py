@@ -7,19 +7,17 @@ from dataclasses import replace
 
 from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected
-from fluidlift.pipeline import depths, given_body, views
-from fluidlift.pipeline.hints import NO_HINTS, Hints, laid_on, require_no_contradiction, require_possible
+from fluidlift.pipeline import depths, given_body
+from fluidlift.pipeline.hints import NO_HINTS, Hints, laid_on, require_no_contradiction
 from fluidlift.pipeline.inputs import GivenFile, GivenFiles
+from fluidlift.pipeline.models import require_weights
 from fluidlift.pipeline.runner import Runner
 from fluidlift.pipeline.settings import (
-    FlowSettings,
     GeometrySettings,
     GivenDepth,
     GivenFlow,
-    GivenMask,
     GivenView,
-    ReadSettings,
-    SegmentSettings,
+    LookSettings,
     taken,
 )
 from fluidlift.pipeline.stages.correct import correct, nothing_found
@@ -105,33 +103,31 @@ def look(
     Raises:
         InputRejected: an input that cannot be used.
     """
-    depths.require_weights(config.depth)
-    views.require_weights(config.view)
+    require_weights(config)
     require_no_contradiction(said, config, given)
-    mask, finder = GivenMask.of(given, config), SegmentSettings.of(config)
-    clip = runner.run("read", read, given.clip, given.camera, ReadSettings.of(config))
+    told = LookSettings.of(given, config)
+    clip = runner.run("read", read, given.clip, given.camera, told.read)
 
     drawn, notice = laid_on(said, clip)
     if notice:
         runner.warn(notice)
-    require_possible(drawn, clip.clip.size)
     if drawn.roi is not None or drawn.clicks:
         hints = Hints.drawn(drawn)
 
     def first() -> None:
-        require_usable(clip.clip, mask, finder, hints)
+        require_usable(clip.clip, told.mask, told.segment, hints)
         if given.depth is not None:
             depths.require_file(clip, taken(GivenDepth, config.depth, file=given.depth))
         if given.geometry is not None:
             given_body.given_bodies(given.geometry.path, clip.clip.size, [0])
 
-    own = GivenFlow.of(given, config)
-    if own is None:
-        flow = runner.run("flow", estimated_flow, clip, FlowSettings.of(config), before=first)
+    if isinstance(told.flow, GivenFlow):
+        flow = runner.run("flow", given_flow, clip, told.flow, before=first)
     else:
-        flow = runner.run("flow", given_flow, clip, own, before=first)
+        flow = runner.run("flow", estimated_flow, clip, told.flow, before=first)
+    finder = None if told.mask is not None else told.segment
     try:
-        found = runner.run("segment", segment, clip, flow, mask, None if mask is not None else finder, hints)
+        found = runner.run("segment", segment, clip, flow, told.mask, finder, hints)
     except InputRejected:
         if not any(r.what == "fluid" for r in drawn.regions):
             raise

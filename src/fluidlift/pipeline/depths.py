@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -11,11 +10,9 @@ import numpy as np
 from fluidlift.backends.depth_model import Guess
 from fluidlift.backends.monocular_depth import make_depth_estimator
 from fluidlift.backends.registry import ModelChoice
-from fluidlift.config import DepthConfig
 from fluidlift.errors import InputRejected
 from fluidlift.messages import Notice
-from fluidlift.pipeline.inputs import OF_CACHE
-from fluidlift.pipeline.settings import DepthModel, GivenDepth, GivenView
+from fluidlift.pipeline.settings import DepthModelSettings, GivenDepth, GivenView
 from fluidlift.pipeline.work import Work
 from fluidlift.shape import depth_surface, given_depth
 from fluidlift.shape import kind as kinds
@@ -87,27 +84,6 @@ def pictures_of(
     )
 
 
-def require_weights(config: DepthConfig) -> None:
-    """Say before the clip is read that a model lacks its weights.
-
-    Raises:
-        InputRejected: a model without weights, or weights that are not there and may not be fetched.
-    """
-    if config.model == "none":
-        return
-    if config.weights is None:
-        raise InputRejected(
-            f"--depth-model {config.model} without its weights", "a file or folder with them",
-            "--depth-weights PATH, or fluidlift models get NAME and make --models NAME",
-        )  # fmt: skip
-    there = config.weights.startswith(OF_CACHE) or os.path.exists(os.path.expanduser(config.weights))
-    if not config.download and not there:
-        raise InputRejected(
-            f"weights '{config.weights}' that are not there", "an existing file or folder, or model:NAME of the cache",
-            "check --depth-weights, or --set depth.download=true for a name on the hub",
-        )  # fmt: skip
-
-
 def require_file(read: Read, given: GivenDepth) -> None:
     """Say before the flow is computed that a depth file cannot be of this clip.
 
@@ -143,7 +119,7 @@ def _from_file(read: Read, given: GivenDepth, start: int) -> DepthPictures:
 
 
 def depth_by_model(
-    read: Read, model: DepthModel, frames: list[int], camera: PinholeCamera | None, *, work: Work
+    read: Read, model: DepthModelSettings, frames: list[int], camera: PinholeCamera | None, *, work: Work
 ) -> DepthGuess:
     """What a learned model says of some frames, one after the other."""
     weights = None if model.weights is None else model.weights.name

@@ -63,12 +63,15 @@ def laid_on(hints: ClipHints, read: Read) -> tuple[ClipHints, Notice]:
     the middle of that frame went: turning and zoom of a hand-held camera move it by less than a person's hand does.
 
     Raises:
-        InputRejected: a picture of another shape.
+        InputRejected: a picture of another shape, or what cannot be: water that runs up a ledge, two horizons.
     """
     drawn = hints.at(read.clip.size)
     shift = picture_shift(read, None if hints.clip is None else hints.clip.time)
     if shift is None:
+        _require_possible(drawn, read.clip.size)
         return drawn, NONE
+    drawn = drawn.moved(shift)
+    _require_possible(drawn, read.clip.size)
     times, time = read.clip.times, cast(ClipIdentity, hints.clip).time
     near = read.clip.interval
     unseen = hints.has_points and not times[0] - near <= cast(float, time) <= times[-1] + near
@@ -77,7 +80,7 @@ def laid_on(hints: ClipHints, read: Read) -> tuple[ClipHints, Notice]:
         f"the hints were drawn on the picture at {time:.2f} s, which is not among those in use, and the camera moves: "
         "where they lie is a guess; look at the mask, and draw them again on this part",
     )
-    return drawn.moved(shift), said if unseen else NONE
+    return drawn, said if unseen else NONE
 
 
 def picture_shift(read: Read, time: float | None) -> Point | None:
@@ -116,7 +119,7 @@ def require_no_contradiction(hints: ClipHints, config: JobConfig, given: GivenFi
             )
 
 
-def require_possible(hints: ClipHints, size: tuple[int, int]) -> None:
+def _require_possible(hints: ClipHints, size: tuple[int, int]) -> None:
     """Raise `InputRejected` where what was drawn cannot be: water that runs up a ledge, two horizons.
 
     Args:

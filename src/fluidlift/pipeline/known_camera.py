@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,33 +22,35 @@ MODEL_LENS_ERROR = 0.08
 """relative standard error of a learned model's focal length: assumed, some 3.5 degrees of 50; none was measured here"""
 
 
+class KnownCamera(NamedTuple):
+    """A camera, and what of it somebody knows."""
+
+    camera: PinholeCamera
+    pose_given: bool
+    lens_told: bool
+    """the user, a camera file or the clip's file says how wide the picture is"""
+
+
 def known_field_of_view(given: GivenView, fov: float | None, size: tuple[int, int]) -> tuple[float, bool]:
     """Degrees across the longer side, and whether that was told: by the user, a camera file or the lens."""
-    focal = max(known_camera(given, fov, size)[0].focal)
-    return float(2 * np.degrees(np.arctan(0.5 * max(size) / focal))), lens_is_known(given, fov)
+    known = known_camera(given, fov, size)
+    return float(2 * np.degrees(np.arctan(0.5 * max(size) / max(known.camera.focal)))), known.lens_told
 
 
-def lens_is_known(given: GivenView, fov: float | None) -> bool:
-    """Whether the user (`fov`, degrees), a camera file or the clip's file says how wide the picture is."""
+def known_camera(given: GivenView, fov: float | None, size: tuple[int, int]) -> KnownCamera:
+    """The camera file's camera, or one from the field of view (`fov`, degrees)."""
+    from fluidlift.io.images import read_camera
     from fluidlift.io.lens import lens_field_of_view
 
-    return bool(given.camera is not None or fov or lens_field_of_view(given.clip.path))
-
-
-def known_camera(given: GivenView, fov: float | None, size: tuple[int, int]) -> tuple[PinholeCamera, bool]:
-    """The camera file's camera, or one from the field of view; and whether its pose is known."""
-    from fluidlift.io.images import read_camera
-
     bodies = None if given.bodies is None else given.bodies.path
+    wide = None if given.camera is not None else fov or lens_field_of_view(given.clip.path)
+    told = given.camera is not None or bool(wide)
     if bodies is not None and given_body.note_of(bodies) is None:
         # its camera is the one that saw the body; its world is not the user's
-        return read_camera(bodies / "camera.json", size), False
+        return KnownCamera(read_camera(bodies / "camera.json", size), False, told)
     if given.camera is None:
-        from fluidlift.io.lens import lens_field_of_view
-
-        return PinholeCamera.from_fov(fov or lens_field_of_view(given.clip.path) or USUAL_FIELD_OF_VIEW, size), False
-    camera = read_camera(given.camera.path, size)
-    return camera, tells_pose(given.camera.path)
+        return KnownCamera(PinholeCamera.from_fov(wide or USUAL_FIELD_OF_VIEW, size), False, told)
+    return KnownCamera(read_camera(given.camera.path, size), tells_pose(given.camera.path), told)
 
 
 def tells_pose(path: Path) -> bool:

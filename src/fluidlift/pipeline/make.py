@@ -16,19 +16,18 @@ from fluidlift.look.smoke_film import smoke_layers
 from fluidlift.pipeline import begin
 from fluidlift.pipeline.fit_request import request_of
 from fluidlift.pipeline.inputs import GivenFile, GivenFiles, Inputs
-from fluidlift.pipeline.models import UsedModel, provenance_of, require_use, used_models
+from fluidlift.pipeline.models import UsedModel, allowed_models, provenance_of
 from fluidlift.pipeline.other_times import moved_elsewhere
 from fluidlift.pipeline.resimulate import Made, note_as_shown, play
-from fluidlift.pipeline.runner import Runner, gone_if_refused, require_stages
+from fluidlift.pipeline.runner import Runner, gone_if_refused
 from fluidlift.pipeline.settings import GenerateSettings, GivenView, MotionSettings, RefineSettings, taken
 from fluidlift.pipeline.stages import generate
 from fluidlift.pipeline.stages.calibrate import calibrate, mean_target
 from fluidlift.pipeline.stages.fit import fit
 from fluidlift.pipeline.stages.motion import motion
 from fluidlift.pipeline.stages.refine import refine
-from fluidlift.scene.build import SimulationRequest, edited_scene, first_of_film
+from fluidlift.scene.build import SceneSettings, SimulationRequest, edited_scene, first_of_film
 from fluidlift.scene.filmed_cells import filmed_shares
-from fluidlift.scene.settings import SceneSettings
 from fluidlift.scene.simulator import particle_work
 from fluidlift.scene.splat_files import require_room
 from fluidlift.seams import Progress, Silence
@@ -71,17 +70,15 @@ def make(
     from fluidlift.io.asset_folder import check_output_folder
     from fluidlift.io.asset_lock import writing
 
-    stages = begin.stages_of(generate.stages_of(STAGES, config), hints)
-    require_stages(force, stages)
+    began, generates = time.perf_counter(), config.generate.name is not None
+    stages = begin.stages_of(generate.stages_of(STAGES) if generates else STAGES, hints)
+    runner = Runner(folder, stages, force=frozenset(force), progress=progress or Silence(), value_told=value_told)
     check_output_folder(folder)
     particle_work(config.simulate.device)  # a device that is not there is said now, not after the fit
     request_of(config.fit)  # so is a parameter that is not known
-    warnings = generate.require_usable(inputs, config, folder)
-    models = used_models(config, inputs)
-    warnings += require_use(models, config.generate.use)
-    began = time.perf_counter()
-    runner = Runner(folder, stages, force=frozenset(force), progress=progress or Silence(), value_told=value_told)
-    for text in warnings:
+    warnings = generate.require_usable(inputs, config, folder) if generates else []
+    models, terms = allowed_models(config, inputs)
+    for text in warnings + terms:
         runner.warn(text)
     with gone_if_refused(runner, "motion"), writing(folder, "fluidlift make"):
         given = GivenFiles.of(inputs)

@@ -15,8 +15,8 @@ from fluidlift.pipeline import begin
 from fluidlift.pipeline.hints import NO_HINTS, Hints
 from fluidlift.pipeline.inputs import GivenFiles, Inputs
 from fluidlift.pipeline.mask_facts import cleared_masks, require_unchanged, sealed
-from fluidlift.pipeline.models import provenance_of, require_use, used_models
-from fluidlift.pipeline.runner import Runner, gone_if_refused, require_stages
+from fluidlift.pipeline.models import allowed_models, provenance_of
+from fluidlift.pipeline.runner import Runner, gone_if_refused
 from fluidlift.pipeline.work import Work
 from fluidlift.seams import Progress, Silence
 from fluidlift.types import Label
@@ -50,12 +50,10 @@ def find_masks(
     """
     from fluidlift.io.asset_folder import check_output_folder
 
-    require_stages(force, MASK_STAGES)
-    check_output_folder(folder)
-    models = used_models(config, inputs)
-    warnings = require_use(models, config.generate.use)
     began = time.perf_counter()
     runner = Runner(folder, MASK_STAGES, force=frozenset(force), progress=progress or Silence())
+    check_output_folder(folder)
+    models, warnings = allowed_models(config, inputs)
     for text in warnings:
         runner.warn(text)
     with gone_if_refused(runner, "segment"):

@@ -6,6 +6,7 @@ every machine that has these models; `auto` is only a way to fill them in.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -159,6 +160,16 @@ def used_models(config: JobConfig, inputs: Inputs) -> tuple[UsedModel, ...]:
     return tuple(found)
 
 
+def allowed_models(config: JobConfig, inputs: Inputs) -> tuple[tuple[UsedModel, ...], list[Notice]]:
+    """The learned models of a job, and warnings about their terms.
+
+    Raises:
+        InputRejected: as `used_models` and `require_use`.
+    """
+    models = used_models(config, inputs)
+    return models, require_use(models, config.generate.use)
+
+
 def provenance_of(models: tuple[UsedModel, ...]) -> dict[str, Any]:
     """For what a job writes about itself; nothing where it took none."""
     return {"models": [model.to_dict() for model in models]} if models else {}
@@ -186,6 +197,46 @@ def require_use(models: tuple[UsedModel, ...], use: str | None) -> list[Notice]:
             "--use commercial",
         )
     ]
+
+
+def require_weights(config: JobConfig) -> None:
+    """Say before the clip is read that a model of depth or of the view lacks its weights.
+
+    Raises:
+        InputRejected: a model without weights, or weights that are not there and may not be fetched.
+    """
+    d, v = config.depth, config.view
+    _require_weights(
+        d.model, d.weights, f"--depth-model {d.model}", "--depth-weights PATH", fetched=d.download,
+        check="check --depth-weights, or --set depth.download=true for a name on the hub",
+    )  # fmt: skip
+    _require_weights(v.model, v.weights, f"view.model={v.model}", "--set view.weights=PATH", check="check view.weights")
+
+
+def _require_weights(
+    model: str, weights: str | None, asked: str, option: str, *, check: str, fetched: bool = False
+) -> None:
+    """`require_weights` of one model.
+
+    Args:
+        model, weights: as the job has them.
+        asked: how the model was asked for.
+        option: how its weights are given.
+        check: what to do about weights that are not there.
+        fetched: whether such ones may be fetched.
+    """
+    if model == "none":
+        return
+    if weights is None:
+        raise InputRejected(
+            f"{asked} without its weights", "a file or folder with them",
+            f"{option}, or fluidlift models get NAME and make --models NAME",
+        )  # fmt: skip
+    there = weights.startswith(OF_CACHE) or os.path.exists(os.path.expanduser(weights))
+    if not (there or fetched):
+        raise InputRejected(
+            f"weights '{weights}' that are not there", "an existing file or folder, or model:NAME of the cache", check
+        )
 
 
 def _automatic(config: JobConfig, inputs: Inputs, places: tuple[str, ...]) -> Chosen:

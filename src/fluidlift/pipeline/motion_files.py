@@ -18,8 +18,8 @@ from fluidlift.motion.steady_flow import pairs_of
 from fluidlift.pipeline import begin
 from fluidlift.pipeline.frame_files import FrameWriter, MotionFiles, WritingPlace
 from fluidlift.pipeline.inputs import GivenFiles, Inputs
-from fluidlift.pipeline.models import provenance_of, require_use, used_models
-from fluidlift.pipeline.runner import Runner, gone_if_refused, require_stages
+from fluidlift.pipeline.models import allowed_models, provenance_of
+from fluidlift.pipeline.runner import Runner, gone_if_refused
 from fluidlift.pipeline.settings import MotionSettings
 from fluidlift.pipeline.volume_motion import motion_options, motion_scene, motion_warnings
 from fluidlift.pipeline.work import Work
@@ -60,12 +60,10 @@ def measure_motion(
     from fluidlift.io.atomic import write_json
 
     files = files or MotionFiles()
-    require_stages(force, MOTION_STAGES)
-    check_output_folder(folder)
-    models = used_models(config, inputs)
-    warnings = require_use(models, config.generate.use)
     began = time.perf_counter()
     runner = Runner(folder, MOTION_STAGES, force=frozenset(force), progress=progress or Silence())
+    check_output_folder(folder)
+    models, warnings = allowed_models(config, inputs)
     for text in warnings:
         runner.warn(text)
     with gone_if_refused(runner, "geometry"):

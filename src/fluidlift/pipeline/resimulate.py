@@ -156,7 +156,6 @@ def play(runner: Runner, asset: FluidAsset, config: JobConfig, request: Simulati
     start = rest_frame_of(manifest, footage)
     scene = scene_of(asset, folder, request, config, footage=footage, start=start, edits=edits)
     outside = require_inside(edits, scene.terrain.grid, seconds=scene.frames * scene.interval) + slow_edits(scene)
-    seen = SeenLook(edits.look, edits.look.mark(folder) | color_mark(edits.obstacles))
     for text in outside:
         runner.progress.warn(text)
 
@@ -168,6 +167,7 @@ def play(runner: Runner, asset: FluidAsset, config: JobConfig, request: Simulati
         beside={"folder": folder, "request": request, "told": tell}, still_there=frames_still_there(folder),
         owns_files=True,
     )  # fmt: skip
+    seen = SeenLook(edits.look, edits.look.mark(folder) | color_mark(edits.obstacles))
     wanted = [folder / "preview.mp4"] * config.show.preview + [folder / "asset.usda"] * config.show.usd
     shown = runner.run(
         "show", show, scene, done, footage, seen, taken(ShowSettings, config.show), beside={"folder": folder},

@@ -13,7 +13,7 @@ import json
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from enum import Enum
@@ -47,6 +47,9 @@ class Runner:
         value_told: gets the name and the value of each stage as it ends.
         memory: key and value of what stages asked to be remembered, by name; given to the next runner it saves that
             work. None: nothing is remembered.
+
+    Raises:
+        InputRejected: a stage to run again that there is not.
     """
 
     def __init__(
@@ -54,6 +57,9 @@ class Runner:
         value_told: Callable[[str, Any], None] = lambda name, value: None,
         memory: dict[str, tuple[str, Any]] | None = None,
     ) -> None:  # fmt: skip
+        unknown = sorted(force - set(stages))
+        if unknown:
+            raise InputRejected(f"unknown stage '{unknown[0]}'", "one of " + ", ".join(stages))
         self.folder, self.stages, self.force, self.progress = folder, stages, force, progress
         self._value_told, self._memory = value_told, memory
         self.keys: dict[str, str] = {}
@@ -243,10 +249,3 @@ def gone_if_refused(runner: Runner, until: str) -> Iterator[None]:
         if fresh and until not in runner.timings:
             shutil.rmtree(runner.folder, ignore_errors=True)
         raise
-
-
-def require_stages(force: Iterable[str], stages: tuple[str, ...]) -> None:
-    """Raise `InputRejected` for a stage that there is not."""
-    unknown = set(force) - set(stages)
-    if unknown:
-        raise InputRejected(f"unknown stage '{sorted(unknown)[0]}'", "one of " + ", ".join(stages))

@@ -136,6 +136,26 @@ class SegmentSettings:
 
 
 @dataclass(frozen=True)
+class LookSettings:
+    """What the stages that look at the clip are told."""
+
+    read: ReadSettings
+    flow: FlowSettings | GivenFlow
+    mask: GivenMask | None
+    segment: SegmentSettings
+
+    @classmethod
+    def of(cls, given: GivenFiles, config: JobConfig) -> LookSettings:
+        """Of a job.
+
+        Raises:
+            InputRejected: weights that are not there.
+        """
+        flow = GivenFlow.of(given, config) or FlowSettings.of(config)
+        return cls(ReadSettings.of(config), flow, GivenMask.of(given, config), SegmentSettings.of(config))
+
+
+@dataclass(frozen=True)
 class GivenDepth:
     """The user's depth file, and what its numbers mean."""
 
@@ -153,7 +173,7 @@ class GivenDepth:
 
 
 @dataclass(frozen=True)
-class DepthModel:
+class DepthModelSettings:
     """A learned model of depth."""
 
     model: str
@@ -167,7 +187,7 @@ class DepthModel:
     download: bool = field(metadata=BESIDE)
 
     @classmethod
-    def of(cls, given: GivenFiles, config: JobConfig) -> DepthModel | None:
+    def of(cls, given: GivenFiles, config: JobConfig) -> DepthModelSettings | None:
         """Where one is to look at the pictures: nothing better was given."""
         if config.depth.model == "none" or given.depth is not None or given.geometry is not None:
             return None
@@ -178,7 +198,7 @@ class DepthModel:
 
 
 @dataclass(frozen=True)
-class ViewModel:
+class ViewModelSettings:
     """A learned model of the camera's tilt and focal length."""
 
     model: str
@@ -189,7 +209,7 @@ class ViewModel:
     device: str = field(metadata=BESIDE)
 
     @classmethod
-    def of(cls, config: JobConfig) -> ViewModel | None:
+    def of(cls, config: JobConfig) -> ViewModelSettings | None:
         """Where one is to look at the pictures."""
         v = config.view
         if v.model == "none":
@@ -207,15 +227,15 @@ class GivenView:
     bodies: GivenFile | None = None
     """folder of Gaussian PLY files, the user's or a generator's"""
     depth: GivenDepth | None = None
-    model: DepthModel | None = None
-    view: ViewModel | None = None
+    model: DepthModelSettings | None = None
+    view: ViewModelSettings | None = None
 
     @classmethod
     def of(cls, given: GivenFiles, config: JobConfig) -> GivenView:
         """Of a job."""
         return cls(
-            given.clip, given.camera, given.geometry, GivenDepth.of(given, config), DepthModel.of(given, config),
-            ViewModel.of(config),
+            given.clip, given.camera, given.geometry, GivenDepth.of(given, config),
+            DepthModelSettings.of(given, config), ViewModelSettings.of(config),
         )  # fmt: skip
 
 

@@ -17,7 +17,6 @@ from fluidlift.pipeline.known_camera import (
     USUAL_FIELD_OF_VIEW,
     USUAL_SPREAD,
     known_camera,
-    lens_is_known,
     level_of,
     with_model_lens,
 )
@@ -140,11 +139,6 @@ class Sighted:
     seen_depth: depths.DepthFront | None
     warnings: list[Notice]
 
-    @property
-    def kind_source(self) -> str:
-        """evidence, or user."""
-        return "evidence" if self.seen.kind_free else "user"
-
 
 def sighted(
     read: Read, flow: Flow, segmentation: Segmentation, given: GivenView, config: GeometrySettings, *, work: Work
@@ -249,10 +243,10 @@ def _seen(
     said = heard(arrows, mask, motion, trust) if arrows else None
     if said is not None:
         motion, trust = said.mean(motion, trust)
-    known, pose_given = known_camera(given, config.fov, clip.size)
-    if read.view is not None and np.isfinite(read.view.focal_error) and not lens_is_known(given, config.fov):
+    known, pose_given, lens_told = known_camera(given, config.fov, clip.size)
+    if read.view is not None and np.isfinite(read.view.focal_error) and not lens_told:
         known = replace(known, focal=(read.view.focal, read.view.focal))
-    pictures, known, lens_error = _depth_pictures(read, given, config.fov, known, start, work)
+    pictures, known, lens_error = _depth_pictures(read, given, lens_told, known, start, work)
     learned, known = (None, known) if pose_given else _learned_tilt(read, given, config, known, lens_error, start, work)
     pick = np.unique(np.linspace(0, len(clip) - 1, 8).astype(int))
     typical = typical_picture(clip.frames[pick]).astype(np.uint8)
@@ -381,7 +375,13 @@ def _kind_and_up(
     pitch = float(surveyed.pitch) if pose_given else said.pitch
     frames, shown = clip.frames[looked.pick], fluid[looked.pick]
     evidence = kinds.estimate_kind(
-        frames, shown, motion, trust, pitch=pitch, bulk=looked.bulk, ways=looked.ways,
+        frames,
+        shown,
+        motion,
+        trust,
+        pitch=pitch,
+        bulk=looked.bulk,
+        ways=looked.ways,
         rims=said.rims or looked.rims,
     )
     kind = kind_of(evidence.kind if c.kind == "auto" else c.kind)
@@ -407,8 +407,8 @@ def _kind_and_up(
     parts = composite.with_marks(parts, c.drawn, mask)
     if pose_given:
         return evidence, kind, parts, surveyed, heading, STEEP
-    generated = given_body.note_of(bodies) is not None
-    if bodies is not None and not (generated and (c.pitch is not None or c.roll is not None)):
+    tilted = c.pitch is not None or c.roll is not None
+    if bodies is not None and not (tilted and given_body.note_of(bodies) is not None):
         upright = given_body.up_of(bodies, surveyed, kind, rest_frame(fluid.areas()), clip.size)
         if upright is not None:
             return evidence, kind, parts, upright, None, STEEP
@@ -455,11 +455,10 @@ def _said_of_view(c: GeometrySettings, known: PinholeCamera, shape: tuple[int, .
 
 
 def _depth_pictures(
-    read: Read, given: GivenView, fov: float | None, known: PinholeCamera, start: int, work: Work
+    read: Read, given: GivenView, told: bool, known: PinholeCamera, start: int, work: Work
 ) -> tuple[DepthPictures | None, PinholeCamera, float]:
     """Depth from a file or a model, and the camera with the model's field of view, weighed against the rest, where the
     lens was not told; and the relative standard deviation of its focal length then, 0 where it was told."""
-    told = lens_is_known(given, fov)
     pictures = depths.pictures_of(read, given, known if told else None, start, work)
     if told:
         return pictures, known, 0.0
@@ -523,13 +522,3 @@ def _surface_motion(camera, visible, depth, motion, interval) -> tuple[np.ndarra
     col = np.clip(end[:, 0] - 0.5, 0, depth.shape[1] - 1)
     later = ndimage.map_coordinates(whole, np.stack([row, col]), order=1)
     return points, (camera.unproject(end, later) - points) / interval
-
-
-def mainstream_of(kind: FluidKind, velocities: np.ndarray, trust: np.ndarray) -> np.ndarray:
-    """Bulk direction: confident and fast motion counts most; bodies in the air move along the vertical."""
-    speed = np.linalg.norm(velocities, axis=1)
-    capped = velocities * np.minimum(1.0, np.percentile(speed, 95) / np.maximum(speed, 1e-12))[:, None]
-    bulk = (capped * (trust * np.linalg.norm(capped, axis=1))[:, None]).sum(axis=0)
-    bulk = builder_of(kind).mainstream(bulk)
-    norm = np.linalg.norm(bulk)
-    return bulk / norm if norm > 1e-12 else np.array([1.0, 0.0, 0.0])

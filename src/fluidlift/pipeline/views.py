@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fluidlift.backends.registry import ModelChoice
 from fluidlift.backends.view_model import ViewGuess, make_view_estimator
-from fluidlift.config import ViewConfig
-from fluidlift.errors import InputRejected
 from fluidlift.pipeline.depths import spread_frames
-from fluidlift.pipeline.inputs import OF_CACHE
-from fluidlift.pipeline.settings import ViewModel
+from fluidlift.pipeline.settings import ViewModelSettings
 from fluidlift.pipeline.work import Work
 from fluidlift.shape.view import LearnedTilt
 from fluidlift.types import PinholeCamera
@@ -72,7 +68,9 @@ class LearnedView(ViewGuess):
         return LearnedTilt(self.model, self.pitch + float(moved), self.roll, self.pitch_error, self.roll_error)
 
 
-def view_of(read: Read, model: ViewModel, camera: PinholeCamera | None, start: int, work: Work) -> LearnedView | None:
+def view_of(
+    read: Read, model: ViewModelSettings, camera: PinholeCamera | None, start: int, work: Work
+) -> LearnedView | None:
     """What a model says of some frames from `start` on; None where it sees nothing in them.
 
     Args:
@@ -91,7 +89,7 @@ def view_of(read: Read, model: ViewModel, camera: PinholeCamera | None, start: i
 
 
 def view_by_model(
-    read: Read, model: ViewModel, frames: list[int], camera: PinholeCamera | None, *, work: Work
+    read: Read, model: ViewModelSettings, frames: list[int], camera: PinholeCamera | None, *, work: Work
 ) -> ViewGuesses:
     """What a learned model says of some frames, one after the other."""
     weights = None if model.weights is None else model.weights.name
@@ -106,23 +104,3 @@ def view_by_model(
         np.array([getattr(g, name) for g in found], float) for name in ("pitch", "roll", "focal", "pitch_by_focal")
     )
     return ViewGuesses(model.model, pitch, roll, focal, np.array(errors, float).reshape(-1, 3), by_focal)
-
-
-def require_weights(config: ViewConfig) -> None:
-    """Say before the clip is read that a model lacks its weights.
-
-    Raises:
-        InputRejected: a model without weights, or weights that are not there.
-    """
-    if config.model == "none":
-        return
-    if config.weights is None:
-        raise InputRejected(
-            f"view.model={config.model} without its weights", "a file or folder with them",
-            "--set view.weights=PATH, or fluidlift models get NAME and make --models NAME",
-        )  # fmt: skip
-    if not config.weights.startswith(OF_CACHE) and not os.path.exists(os.path.expanduser(config.weights)):
-        raise InputRejected(
-            f"weights '{config.weights}' that are not there", "an existing file or folder, or model:NAME of the cache",
-            "check view.weights",
-        )  # fmt: skip

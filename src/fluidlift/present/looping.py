@@ -35,7 +35,7 @@ from fluidlift.types import concatenate
 
 if TYPE_CHECKING:
     from fluidlift.scene.build import Scene
-    from fluidlift.scene.simulated_history import History
+    from fluidlift.scene.simulated_history import FrameHistory
 
 OPEN = "loop-not-closed"
 """code of the warning that says why a loop is not closed"""
@@ -123,7 +123,7 @@ def blended_poses(head: Float[np.ndarray, "b 7"], tail: Float[np.ndarray, "b 7"]
     return np.concatenate([(1.0 - share) * head[:, :3] + share * tail[:, :3], turn], axis=1)
 
 
-def close_loop(scene: Scene, history: History, folder: Path) -> list[Notice]:
+def close_loop(scene: Scene, history: FrameHistory, folder: Path) -> list[Notice]:
     """Fade the end of a simulation into its beginning, on disk; why it was not done, or nothing.
 
     A fluid that is not the same at both ends is left as it was simulated: a vessel that fills has no loop, and two
@@ -158,7 +158,7 @@ def close_loop(scene: Scene, history: History, folder: Path) -> list[Notice]:
     return [Notice(OPEN, text)]
 
 
-def _fade(history: History, count: int, fade: int, folder: Path) -> None:
+def _fade(history: FrameHistory, count: int, fade: int, folder: Path) -> None:
     """Lay the `fade` frames after the first `count` over those from the beginning."""
 
     def frame(k: int) -> FluidFrame:

@@ -21,7 +21,6 @@ Modules of the face:
     recall              Values of an asset's earlier runs, where they are still in its folder work/
     reshaping           Edits of the world around a fluid, before it is simulated: terrain, emitters, and what was
                         changed in words
-    settings            What a scene takes from a job, beside its asset and its edits
     simulated_history   Figures of each simulated frame, as they come
     simulation          A scene played frame by frame, with a checkpoint every few frames that another run goes on
                         from
@@ -65,6 +64,6 @@ def __getattr__(name: str) -> _Any:
 __all__ = [
     "Add", "Change", "EditSession", "Remove", "Scene", "Set", "SimulationRequest", "build", "coarse_copy",
     "edit_history", "edited_scene", "edits", "filmed_cells", "filmed_numbers", "footage", "force_weight", "forecast",
-    "open_water", "recall", "reshaping", "scene_of", "settings", "simulated_history", "simulation", "simulator",
+    "open_water", "recall", "reshaping", "scene_of", "simulated_history", "simulation", "simulator",
     "simulator_of", "smoke_appearance", "splat_files", "surface_appearance", "waves", "whitewater", "whitewater_law",
 ]  # fmt: skip

@@ -22,9 +22,7 @@ from fluidlift.physics.inflow_schedule import InflowSchedule
 from fluidlift.scene.footage import Footage
 from fluidlift.scene.force_weight import following
 from fluidlift.scene.reshaping import changed_parameters, with_emitters, with_terrain
-from fluidlift.scene.settings import SceneSettings
 from fluidlift.types import (
-    CellType,
     FaceVelocity,
     Filmed,
     FilmedMotion,
@@ -41,7 +39,6 @@ if TYPE_CHECKING:
     from fluidlift.io.obstacles import Obstacle
     from fluidlift.io.scene import SceneEdits
     from fluidlift.physics.emitter import Emitter
-    from fluidlift.physics.rigid_body import RigidBody
 
 LOOP_FADE = (0.8, 1.5)
 """s: a shorter fade changes too much of the fluid in each frame, a longer one makes the clip one long fade"""
@@ -67,6 +64,24 @@ class SimulationRequest:
     """go on from the checkpoint, or say why not"""
     restart: bool = False
     """begin again, although a checkpoint fits"""
+
+
+@dataclass(frozen=True)
+class SceneSettings:
+    """What a scene takes from the job, beside its asset and its edits."""
+
+    frames: int | None
+    follow: float
+    guide: float
+    seed: int
+    skin: bool = True
+    """whether the surface plays the clip's film"""
+
+    @classmethod
+    def of(cls, config: JobConfig) -> SceneSettings:
+        """From those of a job."""
+        c = config.simulate
+        return cls(c.frames, c.follow, c.guide, config.seed, c.skin)
 
 
 @dataclass(frozen=True)
@@ -195,11 +210,6 @@ class Scene:
     def cache_key(self) -> list[Any]:
         """What the keys of stages know of it: how it goes, and how long and from where it is seen."""
         return [self.parts, self.frames, self.clip_interval, self.camera.to_dict()]
-
-    @cached_property
-    def bodies(self) -> tuple[RigidBody, ...]:
-        """The obstacles as bodies; raises `InputRejected` where a mesh bounds no solid."""
-        return tuple(o.body((self.simulated - 1) * self.interval) for o in self.obstacles)
 
 
 def _hash(*values: Any) -> str:
@@ -432,27 +442,3 @@ def loop_overlap(scene: Scene) -> int:
     speed = max(speed, float(np.linalg.norm(scene.parameters.inflow_velocity)), 1e-6)
     fade = float(np.clip(0.25 * length / speed, *LOOP_FADE))
     return int(np.clip(round(fade / scene.interval), 2, scene.frames // 2))
-
-
-def wave_speed(scene: Scene) -> float:
-    """Of a long gravity wave on the fluid where it is deep, m/s."""
-    h, wet = scene.terrain.grid.spacing, (scene.cell_types == CellType.FLUID).sum(axis=2)
-    depth = h * float(np.percentile(wet[wet > 0], 90)) if (wet > 0).any() else h
-    return float(np.sqrt(np.linalg.norm(scene.parameters.gravity) * depth))
-
-
-def simulation_step(scene: Scene) -> FluidParameters:
-    """The same physics with the simulator's own longest step.
-
-    The fit's step is that of its grid, which must resolve a gravity wave over one cell. The simulator adapts
-    to the flow and only needs steps in which a wave does not cross more than a cell or so; a `time_step` in scene.yaml
-    is taken instead. Wall damping is a share per step and is converted, so that walls take the same share per second.
-    """
-    parameters, interval = scene.parameters, min(scene.interval, scene.clip_interval)
-    h = scene.terrain.grid.spacing
-    longest = interval if kind_of(scene.kind).is_gas else h / max(wave_speed(scene), 1e-6)
-    step = float(np.clip(longest, interval / 8, interval))
-    if scene.longest_step is not None:
-        step = min(float(scene.longest_step), scene.interval)
-    damping = 1.0 - (1.0 - parameters.wall_damping) ** (step / parameters.time_step)
-    return replace(parameters, time_step=step, wall_damping=float(np.clip(damping, 0.0, 1.0)))

@@ -24,8 +24,7 @@ from fluidlift.types import (
 )
 
 if TYPE_CHECKING:
-    from fluidlift.scene.build import Scene
-    from fluidlift.scene.settings import SceneSettings
+    from fluidlift.scene.build import Scene, SceneSettings
 
 TOUCHED = 0.1
 """cells by which edited terrain differs from the filmed one, from which its place counts as touched"""
@@ -87,7 +86,7 @@ def following(scene: Scene, asset: FluidAsset, filmed: Filmed, settings: SceneSe
 
 def pull_rate(scene: Scene, speed: float) -> float:
     """1/s of a pull towards a flow of this speed (m/s)."""
-    from fluidlift.scene.build import wave_speed
+    from fluidlift.scene.simulator import wave_speed
 
     return max(speed, wave_speed(scene)) / (PULL * scene.terrain.grid.spacing)
 

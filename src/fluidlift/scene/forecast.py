@@ -61,7 +61,7 @@ def outlook(folder: Path, manifest: dict[str, Any], edits: SceneEdits, grid: Gri
         grid: that it was lifted on.
     """
     try:
-        return _slow(folder, manifest, edits, grid) + _buried(folder, edits, grid)
+        return _slow(folder, manifest, edits, grid) + _buried(folder, edits)
     except (FluidliftError, OSError):
         return []
 
@@ -82,7 +82,7 @@ def _slow(folder: Path, manifest: dict[str, Any], edits: SceneEdits, grid: Grid)
         return [Notice("scene-refused", f"this scene cannot be simulated as it is: {error}")]
 
 
-def _buried(folder: Path, edits: SceneEdits, grid: Grid) -> list[Notice]:
+def _buried(folder: Path, edits: SceneEdits) -> list[Notice]:
     """Floating bodies that begin more than a cell deep in the ground, which the terrain's own edits may move."""
     free = [o for o in edits.obstacles if o.motion == "free"]
     if not free or edits.terrain:

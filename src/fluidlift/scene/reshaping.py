@@ -29,32 +29,6 @@ SHADE = 0.04
 """by which they are lighter or darker than the colour: water without any pattern does not show that it moves"""
 HIGHEST = 2.0
 """longest sides of the box above it at which an emitter may be"""
-TURNED = 0.7
-"""share of gravity along an axis from which its side of the box is one that liquid falls out of: from 45 degrees
-on it is as much below as the floor; a tank that is tilted less stays a tank"""
-
-
-def sides_open_to_air(gravity: tuple[float, float, float]) -> np.ndarray:
-    """bool [3,2] (axis, low/high): sides of an asset's box without a wall.
-
-    The sky of the clip, which is the side that gravity points away from (the top where there is none), and, once
-    gravity is turned, those that it points to: no ground was seen there, and what falls must not pile up at an
-    invisible wall. The low side of z is the ground.
-    """
-    from fluidlift.physics.apic import open_sky
-
-    g = np.asarray(gravity, np.float64)
-    if not g.any():
-        return open_sky((0.0, 0.0, -1.0))
-    out = open_sky(gravity)
-    for axis in range(3):
-        down = int(g[axis] > 0)
-        if abs(g[axis]) > TURNED * np.linalg.norm(g) and (axis, down) != (2, 0):
-            out[axis, down] = True
-            out[2, 1] = True  # the sky stays open, whatever falls
-    return out
-
-
 SLOW = 20.0
 """steps from one frame to the next from which a simulation takes many times as long as usual: two or three"""
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class History:
+class FrameHistory:
     """Figures of each frame so far."""
 
     volume: list[float] = field(default_factory=list)
@@ -61,7 +61,7 @@ class History:
         }
 
     @classmethod
-    def of(cls, arrays: dict[str, np.ndarray], frames: int) -> History:
+    def of(cls, arrays: dict[str, np.ndarray], frames: int) -> FrameHistory:
         """The first frames of `arrays`."""
         figures = {name: arrays[name][:frames].tolist() for name in ("volume", "leak", "count", "substeps")}
         return cls(**figures, poses=list(arrays["poses"][:frames]))

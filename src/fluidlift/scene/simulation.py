@@ -11,7 +11,7 @@ from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.scene.build import Scene, SimulationRequest
 from fluidlift.scene.reshaping import in_words
-from fluidlift.scene.simulated_history import History
+from fluidlift.scene.simulated_history import FrameHistory
 from fluidlift.scene.splat_files import checkpoint_file, frame_file, write_frame
 from fluidlift.scene.surface_appearance import SurfaceAppearance
 from fluidlift.source import source_hash
@@ -33,7 +33,7 @@ def continued(
     folder: Path,
     request: SimulationRequest,
     max_particles: int,
-) -> History:
+) -> FrameHistory:
     """Bring the simulator, and what floats on its surface, to the last checkpoint of this scene.
 
     Returns:
@@ -46,7 +46,7 @@ def continued(
     from fluidlift.physics.preflight import simulation_bytes
 
     if request.restart:
-        return History()
+        return FrameHistory()
     path = checkpoint_file(folder)
     try:
         frames, parts = read_parts(path)
@@ -67,14 +67,14 @@ def continued(
         found = read_checkpoint(path, max_bytes=4 * simulation_bytes(scene.terrain.grid, most))
         if found.history["poses"].shape != (found.frames, len(scene.obstacles), 7):
             raise InputRejected(f"the checkpoint of '{folder.name}' holds other obstacles", "a whole checkpoint")
-        history = History.of(found.history, scene.simulated)
+        history = FrameHistory.of(found.history, scene.simulated)
         if found.frames <= scene.simulated:
             appearance.restore(found.state)
             simulator.restore(found.state)
         return history
     except (InputRejected, KeyError) as error:
         if not request.resume:
-            return History()
+            return FrameHistory()
         if isinstance(error, KeyError):
             raise InputRejected(f"the checkpoint of '{folder.name}' lacks {error}", "a whole checkpoint") from None
         raise
@@ -85,7 +85,7 @@ def advance(
     appearance: SurfaceAppearance,
     scene: Scene,
     folder: Path,
-    history: History,
+    history: FrameHistory,
     step: Callable[[int, int], None],
     *,
     max_particles: int,
@@ -149,7 +149,7 @@ def _write_frame(
 
 
 def _save(
-    simulator: ParticleSimulator, appearance: SurfaceAppearance, scene: Scene, folder: Path, history: History
+    simulator: ParticleSimulator, appearance: SurfaceAppearance, scene: Scene, folder: Path, history: FrameHistory
 ) -> None:
     from fluidlift.io.checkpoint import Checkpoint, write_checkpoint
 

@@ -11,9 +11,7 @@ import numpy as np
 from fluidlift.errors import InputRejected
 from fluidlift.machine import available_memory
 from fluidlift.messages import Notice
-from fluidlift.scene.build import Scene, simulation_step
-from fluidlift.scene.reshaping import sides_open_to_air
-from fluidlift.scene.surface_appearance import lends_look
+from fluidlift.scene.build import Scene
 from fluidlift.types import CellType, FluidParameters, Gaussians, Particles, kind_of
 
 if TYPE_CHECKING:
@@ -37,6 +35,10 @@ the step is long"""
 SPRAY = 0.02
 """share of the water in the air over a fountain that is liquid: what looks white is drops far apart, and a nozzle is
 much thinner than the cells that stand for it (a choice). With 0.1 a pool of 60 m^3 is thrown up within 20 s"""
+
+TURNED = 0.7
+"""share of gravity along an axis from which its side of the box is one that liquid falls out of: from 45 degrees
+on it is as much below as the floor; a tank that is tilted less stays a tank"""
 
 
 def particle_work(device: str) -> ParticleWork:
@@ -109,9 +111,10 @@ def simulator_of(
     if scene.guide is not None:
         forces = (*forces, Guiding(scene.guide, scene.guide_rates))
     cells, body = within_outlet(scene)
+    bodies = tuple(o.body((scene.simulated - 1) * scene.interval) for o in scene.obstacles)
     simulator = LiquidSimulator(
         grid, scene.terrain, parameters, body, cell_types=cells, inflow_profile=scene.velocity,
-        seed=scene.seed, emit_source=look, bodies=scene.bodies, work=particle_work(device), supply=supply,
+        seed=scene.seed, emit_source=look, bodies=bodies, work=particle_work(device), supply=supply,
         open_sides=sides_open_to_air(parameters.gravity), forces=forces,
         settings=replace(settings, courant=crossed),
     )  # fmt: skip
@@ -162,6 +165,30 @@ def as_fast_as_filmed(scene: Scene, parameters: FluidParameters) -> tuple[FluidP
     return parameters.updated({"inflow_velocity": faster}), given
 
 
+def wave_speed(scene: Scene) -> float:
+    """Of a long gravity wave on the fluid where it is deep, m/s."""
+    h, wet = scene.terrain.grid.spacing, (scene.cell_types == CellType.FLUID).sum(axis=2)
+    depth = h * float(np.percentile(wet[wet > 0], 90)) if (wet > 0).any() else h
+    return float(np.sqrt(np.linalg.norm(scene.parameters.gravity) * depth))
+
+
+def simulation_step(scene: Scene) -> FluidParameters:
+    """The same physics with the simulator's own longest step.
+
+    The fit's step is that of its grid, which must resolve a gravity wave over one cell. The simulator adapts
+    to the flow and only needs steps in which a wave does not cross more than a cell or so; a `time_step` in scene.yaml
+    is taken instead. Wall damping is a share per step and is converted, so that walls take the same share per second.
+    """
+    parameters, interval = scene.parameters, min(scene.interval, scene.clip_interval)
+    h = scene.terrain.grid.spacing
+    longest = interval if kind_of(scene.kind).is_gas else h / max(wave_speed(scene), 1e-6)
+    step = float(np.clip(longest, interval / 8, interval))
+    if scene.longest_step is not None:
+        step = min(float(scene.longest_step), scene.interval)
+    damping = 1.0 - (1.0 - parameters.wall_damping) ** (step / parameters.time_step)
+    return replace(parameters, time_step=step, wall_damping=float(np.clip(damping, 0.0, 1.0)))
+
+
 def inflow_look(scene: Scene, own: Gaussians, speed: float) -> InflowLook:
     """What flows in at a speed (m/s) looks like the body's own Gaussians; of what lies, as the clip shows it away from
     rocks and banks; of smoke, which thins as it rises, as it is at its source."""
@@ -176,6 +203,37 @@ def inflow_look(scene: Scene, own: Gaussians, speed: float) -> InflowLook:
     elif kind_of(scene.kind).is_gas:
         usable = beside_inlet(own.means, scene.cell_types, terrain.grid, SOURCE)
     return InflowLook(own, terrain.mainstream, speed, spacing, usable=usable, run=scene.inflow.run, lying=lying)
+
+
+def lends_look(scene: Scene, own: Gaussians) -> np.ndarray:
+    """Which of the body's own Gaussians show the fluid as such: in the picture, away from rocks and banks."""
+    from fluidlift.look.inflow import surface_level
+    from fluidlift.physics.inlet import clear_of_shore
+    from fluidlift.shape.off_picture import in_picture
+
+    level = surface_level(own.means, 0.5 * scene.terrain.grid.spacing)(own.means[:, :2])
+    return in_picture(own.means, scene.camera) & clear_of_shore(own.means, level, scene.terrain)
+
+
+def sides_open_to_air(gravity: tuple[float, float, float]) -> np.ndarray:
+    """bool [3,2] (axis, low/high): sides of an asset's box without a wall.
+
+    The sky of the clip, which is the side that gravity points away from (the top where there is none), and, once
+    gravity is turned, those that it points to: no ground was seen there, and what falls must not pile up at an
+    invisible wall. The low side of z is the ground.
+    """
+    from fluidlift.physics.apic import open_sky
+
+    g = np.asarray(gravity, np.float64)
+    if not g.any():
+        return open_sky((0.0, 0.0, -1.0))
+    out = open_sky(gravity)
+    for axis in range(3):
+        down = int(g[axis] > 0)
+        if abs(g[axis]) > TURNED * np.linalg.norm(g) and (axis, down) != (2, 0):
+            out[axis, down] = True
+            out[2, 1] = True  # the sky stays open, whatever falls
+    return out
 
 
 def within_outlet(scene: Scene) -> tuple[np.ndarray, Particles]:

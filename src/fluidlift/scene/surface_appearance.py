@@ -16,6 +16,7 @@ import numpy as np
 
 from fluidlift.errors import InputRejected
 from fluidlift.messages import Notice
+from fluidlift.scene.simulator import lends_look
 from fluidlift.types import Gaussians, Particles, PinholeCamera, concatenate, kind_of, sh_from_rgb
 from fluidlift.types.fluid_masks import STAYS
 
@@ -119,16 +120,6 @@ class Dressed(NamedTuple):
     ids: np.ndarray
     velocities: np.ndarray
     """m/s"""
-
-
-def lends_look(scene: Scene, own: Gaussians) -> np.ndarray:
-    """Which of the body's own Gaussians show the fluid as such: in the picture, away from rocks and banks."""
-    from fluidlift.look.inflow import surface_level
-    from fluidlift.physics.inlet import clear_of_shore
-    from fluidlift.shape.off_picture import in_picture
-
-    level = surface_level(own.means, 0.5 * scene.terrain.grid.spacing)(own.means[:, :2])
-    return in_picture(own.means, scene.camera) & clear_of_shore(own.means, level, scene.terrain)
 
 
 def _footage(film: Path, camera: PinholeCamera, means: np.ndarray, cell: float) -> FluidFootage | str:

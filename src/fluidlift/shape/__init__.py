@@ -30,7 +30,7 @@ Modules of the face:
     ground            What a fluid rests in: cells and terrain from its surface, and the ground's texture or colours
     ground_texture    The ground's texture: the picture laid on a terrain as a map seen from above, as fine as the
                       picture itself
-    hints             What the user says about a mask: points that are fluid or are not, polygons, a rectangle
+    hints             What the user says about a mask: points that are fluid or are not, a rectangle
     jet_column        A jet in space: a round column that stands vertically on the surface of the fluid below it
     kind              What kind of fluid a clip shows, and where up is: decided from evidence that the report can
                       show

@@ -1,4 +1,4 @@
-"""What the user says about a mask: points that are fluid or are not, polygons, a rectangle.
+"""What the user says about a mask: points that are fluid or are not, a rectangle.
 
 A point speaks for its surroundings: for what can be reached from it without crossing an edge (geodesic distance) and
 looks and moves as it does. Where points of both kinds could speak, the nearer one does. So that one point does not
@@ -72,24 +72,6 @@ def clicks_at(points: Sequence[Point], size: tuple[int, int], shape: tuple[int, 
         found[label].append((int(x * shape[1] / size[0]), int(y * shape[0] / size[1])))
     fluid, other = (np.array(found[label], int).reshape(-1, 2) for label in (1, 0))
     return Clicks(fluid, other)
-
-
-def polygon_mask(polygons: Sequence[Sequence[tuple[float, float]]], height: int, width: int) -> np.ndarray:
-    """bool [H,W], True inside any of the polygons (corners x, y in px).
-
-    Raises:
-        InputRejected: a polygon of fewer than three corners, or none of them in the picture.
-    """
-    mask = np.zeros((height, width), np.uint8)
-    for polygon in polygons:
-        corners = np.asarray(polygon, float)
-        if corners.ndim != 2 or corners.shape[0] < 3 or corners.shape[1] != 2 or not np.isfinite(corners).all():
-            raise InputRejected(f"a polygon {corners.shape}", "three corners x,y or more", "add corners")
-        cv2.fillPoly(mask, [np.round(corners - 0.5).astype(np.int32)], 1)
-    if not mask.any():
-        raise InputRejected("polygons that hold no pixel", f"corners inside the {width} x {height} picture",
-                            "move the corners")  # fmt: skip
-    return mask > 0
 
 
 def heed(clicks: Clicks, evidence: Evidence, score: np.ndarray, region: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

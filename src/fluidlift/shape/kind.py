@@ -390,14 +390,14 @@ def _tilt_of_plane(
         if picture.contained:
             picture = replace(picture, texture=None)
         words = [] if picture.texture is None else ["perspective of its pattern"]
-        return slope.estimate_tilt(camera, None, tilted, picture, kind=kind), words + picture.words
+        return slope.estimate_tilt(None, tilted, picture, kind=kind), words + picture.words
     # a chute is another plane than what it comes down onto
     steep = chute.chute_pixels(tilted(STREAM.usual_pitch[0], 0.0), mask, displacement, confidence)
     lying = confidence * ~np.any(steep, axis=0) if steep else confidence
     if steep:
         picture = replace(picture, texture=None)
     patches = None if picture.contained else slope.flow_patches(mask, displacement, lying)
-    tilt = slope.estimate_tilt(camera, patches, tilted, picture, level_prior)
+    tilt = slope.estimate_tilt(patches, tilted, picture, level_prior)
     motion = [] if patches is None else ["perspective of the flow"]
     pattern = ["perspective of its pattern"] if picture.texture is not None and patches is not None else []
     return tilt, motion + pattern + picture.words

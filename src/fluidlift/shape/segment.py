@@ -20,24 +20,24 @@ import numpy as np
 
 from fluidlift.errors import InputRejected, require
 from fluidlift.messages import Notice
-from fluidlift.shape.advancing import advancing_labels
 from fluidlift.shape.background import in_own_colours
 from fluidlift.shape.carried_layers import by_either, carried_layers
 from fluidlift.shape.colour_growth import grown_from_streams, with_quiet_water
 from fluidlift.shape.evidence import Evidence, PairReader, fluid_score, gather_evidence, pair_reader, solids_by_flow
 from fluidlift.shape.hints import VOICE, Clicks, Point, clicks_at, heed, holes_asked_for
-from fluidlift.shape.islands import without_ground
+from fluidlift.shape.intermittently_wet import WashedGround, bare_over_time, washed_ground
 from fluidlift.shape.mirrored_edges import mirrored_edges
+from fluidlift.shape.moving_front import advancing_labels
 from fluidlift.shape.moving_solids import SharedPairs, moving_solids
 from fluidlift.shape.open_sea import reaching_over, sea_horizon, with_sea
 from fluidlift.shape.open_water import with_open_water
 from fluidlift.shape.presence import Presence, always, grows, stay, watch
 from fluidlift.shape.region import clean_region, cut_along_edges, solids_in, still_pixels
+from fluidlift.shape.still_regions import without_ground
 from fluidlift.shape.thin_outlines import slimmed
+from fluidlift.shape.vegetation import without_plants
 from fluidlift.shape.view import OpenHorizon
-from fluidlift.shape.washed import WashedGround, bare_over_time, washed_ground
 from fluidlift.shape.waterline import dry_over_time
-from fluidlift.shape.waving import without_plants
 from fluidlift.types.clip import Label, PixelLabels, VideoClip
 from fluidlift.types.flow import PixelFlow
 

@@ -164,8 +164,8 @@ def estimate_slope(
 
 
 def estimate_tilt(
-    camera: PinholeCamera, patches: FlowPatches | None, tilted: Callable[[float, float], PinholeCamera],
-    picture: PictureEvidence, level_prior: float = LEVEL, kind: FluidKind = STREAM,
+    patches: FlowPatches | None, tilted: Callable[[float, float], PinholeCamera], picture: PictureEvidence,
+    level_prior: float = LEVEL, kind: FluidKind = STREAM,
 ) -> TiltEvidence:  # fmt: skip
     """Pitch and roll of the camera over a stream of unknown slope, or standing water: means of their posterior.
 
@@ -173,7 +173,6 @@ def estimate_tilt(
     and what is seen beside the fluid.
 
     Args:
-        camera: for its focal length.
         patches: of the motion; None: too little is known of it, or it is none of the plane.
         tilted: camera for a pitch and a roll, degrees.
         picture: what else shows the tilt.

@@ -67,7 +67,7 @@ def level_surface(camera: PinholeCamera, mask: Bool[np.ndarray, "h w"]) -> Front
             "give --pitch with a larger value, or another --kind",
         )
     drop = float(np.median(down[mask & visible]))
-    return _from_height(camera, PlaneHeight((0.0, 0.0), -drop), np.where(visible, drop / np.maximum(down, 1e-6), 0.0))
+    return _from_height(PlaneHeight((0.0, 0.0), -drop), np.where(visible, drop / np.maximum(down, 1e-6), 0.0))
 
 
 def stream_surface(
@@ -145,7 +145,7 @@ def chutes_on_level(
         return None
     model = chute.ChuteHeight(level.height, tuple(found))
     near = 0.5 * float(level.depth[lying & (level.depth > 0)].min())
-    front = _from_height(camera, model, intersect_height(camera, model, near, FARTHEST * 2.0 * near))
+    front = _from_height(model, intersect_height(camera, model, near, FARTHEST * 2.0 * near))
     if not (front.depth[mask] > 0).mean() > 0.9:
         return None
     steepest, heading = max(c.slope for c in found), float(np.degrees(found[0].heading))
@@ -178,7 +178,7 @@ def _chute_above_pool(camera, mask, found: sections.SectionEvidence) -> FrontSur
     evidence = SlopeEvidence(mean, found.standard_error, heading, 1.0 - found.share, mean, source, found.mean)
     above = np.zeros_like(mask)
     above[mask] = points[:, :2] @ ahead < scale * best.foot
-    return replace(_from_height(camera, scaled, scale * depth), slope=evidence, chutes=(above,))
+    return replace(_from_height(scaled, scale * depth), slope=evidence, chutes=(above,))
 
 
 def _sloping_plane(camera: PinholeCamera, mask: np.ndarray, evidence: SlopeEvidence) -> FrontSurface:
@@ -189,7 +189,7 @@ def _sloping_plane(camera: PinholeCamera, mask: np.ndarray, evidence: SlopeEvide
     drop = float(np.median(facing[mask & visible]))
     normal = axes[2]
     plane = PlaneHeight((-normal[0] / normal[2], -normal[1] / normal[2]), -drop / normal[2])
-    return _from_height(camera, plane, np.where(visible, drop / np.maximum(facing, 1e-6), 0.0))
+    return _from_height(plane, np.where(visible, drop / np.maximum(facing, 1e-6), 0.0))
 
 
 def _with_energy(camera, mask, front, patches, evidence, camera_height, interval):
@@ -213,7 +213,7 @@ def _with_energy(camera, mask, front, patches, evidence, camera_height, interval
     z = start - (fall - np.interp(middle, ground, fall)) / metres
     ahead = (float(np.cos(heading)), float(np.sin(heading)))
     profile = ProfileAlongHeight(ahead, ground, z)
-    bent = _from_height(camera, profile, intersect_height(camera, profile, 0.2, FARTHEST))
+    bent = _from_height(profile, intersect_height(camera, profile, 0.2, FARTHEST))
     if not (bent.depth[seen] > 0).mean() > 0.98:
         return front
     mean = float(np.degrees(np.arctan2(fall[-1] - fall[0], metres * (ground[-1] - ground[0]))))
@@ -269,7 +269,7 @@ def falling_surface(
     away, z = up[order], np.maximum.accumulate(points[order, 2])
     keep = np.concatenate([[True], np.diff(away) > 1e-6])
     profile = ProfileHeight(away[keep], z[keep], uphill)
-    return _from_height(camera, profile, intersect_height(camera, profile, 0.2 * depth.min(), 3.0 * depth.max()))
+    return _from_height(profile, intersect_height(camera, profile, 0.2 * depth.min(), 3.0 * depth.max()))
 
 
 FACE = (78.0, 12.0, 30.0)
@@ -391,8 +391,8 @@ def given_surface(
     rows, cols = np.where(valid)
     pick = np.linspace(0, len(rows) - 1, min(len(rows), 20000)).astype(int)
     points = camera.unproject(np.stack([cols[pick] + 0.5, rows[pick] + 0.5], -1), filled[rows[pick], cols[pick]])
-    return _from_height(camera, SampledHeight(points), filled)
+    return _from_height(SampledHeight(points), filled)
 
 
-def _from_height(camera: PinholeCamera, model: HeightModel, depth: np.ndarray) -> FrontSurface:
+def _from_height(model: HeightModel, depth: np.ndarray) -> FrontSurface:
     return FrontSurface(depth.astype(np.float32), np.zeros_like(depth, dtype=np.float32), model)

@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 from scipy.ndimage import convolve1d
 
-from fluidlift.shape.advancing import median_over_time
 from fluidlift.shape.background import colour_bins
 from fluidlift.shape.evidence import POOLING, Evidence
 from fluidlift.shape.min_cut import disc, spread
+from fluidlift.shape.moving_front import median_over_time
 
 REACH = 0.04
 """part of the longer side: how far a waterline may go back, and the width of the strip of ground that is looked at"""

@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from fluidlift.messages import Notice
 from fluidlift.pipeline.work import Work
-from fluidlift.scene.build import Scene, wave_speed
+from fluidlift.scene.build import Scene
 from fluidlift.scene.force_weight import pull_rate
 from fluidlift.types import CellType, FaceVelocity, kind_of
 from fluidlift.types.stages import Calibration
@@ -87,7 +87,7 @@ def calibrate(
     """
     from fluidlift.physics.guidance import Nudging
     from fluidlift.scene.filmed_cells import dry_cells, wet_cells
-    from fluidlift.scene.simulator import simulator_of
+    from fluidlift.scene.simulator import simulator_of, wave_speed
 
     kind = kind_of(scene.kind)
     if not wanted or kind.is_gas or not len(scene.body):

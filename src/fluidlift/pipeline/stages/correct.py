@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from fluidlift.errors import InputRejected
-from fluidlift.pipeline.fluid_found import sureness, trusted_share
+from fluidlift.pipeline.fluid_found import fluid_figures
 from fluidlift.pipeline.work import Work
 from fluidlift.shape.drawn import LABELS, carried, drawn_pixels, frame_at
 from fluidlift.types import Label, PixelLabels
-from fluidlift.types.fluid_masks import FluidMasks
 from fluidlift.types.hints import Region
 from fluidlift.types.stages import Flow, Read, Segmentation
 
@@ -49,18 +48,15 @@ def correct(
         for t, there in carried(mask, flow.flow.displacement, frame_at(read.clip.times, region.time)):
             if held[t]:
                 labels[t, there], confidence[t, there] = LABELS[region.what], 1.0
-    fluid = FluidMasks(labels)
-    areas = fluid.areas()
-    if not areas.any():
+    figures = fluid_figures(PixelLabels(labels, confidence), flow.flow)
+    if figures is None:
         taken = [str(k) for k, r in enumerate(regions, 1) if LABELS[r.what] != Label.FLUID]
         raise InputRejected(
             f"the regions of the hints leave no fluid (region {', '.join(taken)} takes it away)",
             "at least one pixel of fluid", "take one of them back, or draw fluid",
         )  # fmt: skip
     kept = PixelLabels(work.scratch.keep("labels", labels), work.scratch.keep("confidence", confidence))
-    share = float(areas.mean() / (shape[1] * shape[2]))
-    trusted = trusted_share(flow.flow, fluid.any_frame())
-    return Segmentation(kept, share, sureness(kept, float(areas.sum())), trusted, segmentation.user_mask)
+    return Segmentation(kept, *figures, segmentation.user_mask)
 
 
 def _frames_of(region: Region, times: np.ndarray) -> np.ndarray:

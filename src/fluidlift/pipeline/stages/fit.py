@@ -26,7 +26,7 @@ from fluidlift.fit.rising import outline_rises, with_buoyancy
 from fluidlift.machine import one_torch_thread
 from fluidlift.pipeline.fit_request import FitRequest, request_of, startable
 from fluidlift.pipeline.work import Work
-from fluidlift.types import CellType, FaceVelocity, FitResult, FluidKind, FluidParameters, kind_of
+from fluidlift.types import CellType, Estimate, FaceVelocity, FitResult, FluidKind, FluidParameters, kind_of
 from fluidlift.types.fluid_masks import FluidMasks
 from fluidlift.types.stages import Elsewhere, Fit, Geometry, Motion, Read, Segmentation
 
@@ -86,10 +86,7 @@ def fit(
     known = {name: getattr(initial, name) for name in request.held}
     parameters = replace(parameters, **known)
     if "wall_damping" not in (*free, *known):
-        d = sticking(kind, motion.reports)
-        parameters = replace(parameters, wall_damping=d)
-        if "wall_damping" in estimates:
-            estimates["wall_damping"] = replace(estimates["wall_damping"], value=d, prior=d)
+        parameters, estimates = _at_walls(parameters, estimates, sticking(kind, motion.reports))
     estimates = {n: as_given(n, e, initial) if family(n) in known else e for n, e in estimates.items()}
     lift: dict[str, float] = {}
     if moved != free:
@@ -118,6 +115,16 @@ def fit(
         loss_history=np.asarray(found.loss_history, np.float64),
         warnings=tuple(judged.warnings()),
     )
+
+
+def _at_walls(
+    parameters: FluidParameters, estimates: dict[str, Estimate], damping: float
+) -> tuple[FluidParameters, dict[str, Estimate]]:
+    """Both with a wall damping that was not fitted."""
+    if "wall_damping" in estimates:
+        as_known = replace(estimates["wall_damping"], value=damping, prior=damping)
+        estimates = estimates | {"wall_damping": as_known}
+    return replace(parameters, wall_damping=damping), estimates
 
 
 def _check_request(request: FitRequest, kind: FluidKind) -> None:

@@ -34,10 +34,8 @@ _KEPT = 2
 """folders of bodies: going back to the settings before is free"""
 
 
-def stages_of(stages: tuple[str, ...], config: JobConfig) -> tuple[str, ...]:
-    """The stages of a job: with `generate` before the geometry where a generator is asked."""
-    if config.generate.name is None:
-        return stages
+def stages_of(stages: tuple[str, ...]) -> tuple[str, ...]:
+    """The stages of a job that asks a generator: with `generate` before the geometry."""
     at = stages.index("geometry")
     return (*stages[:at], STAGE, *stages[at:])
 
@@ -57,7 +55,7 @@ def require_usable(inputs: Inputs, config: JobConfig, folder: Path) -> list[Noti
 
     Args:
         inputs: of the job.
-        config: of the job.
+        config: of the job, which names a generator.
         folder: of the asset: where it is there already, its bodies may be too, and the generator is not needed.
 
     Raises:
@@ -65,9 +63,7 @@ def require_usable(inputs: Inputs, config: JobConfig, folder: Path) -> list[Noti
         MissingPackage: the generator is not installed.
     """
     c = config.generate
-    if c.name is None:
-        return []
-    card = generators.card_of(c.name)
+    card = generators.card_of(str(c.name))
     other = next((k for k in ("geometry", "depth") if getattr(inputs, k) is not None), None)
     if other is not None or config.depth.model != "none":
         option = {"geometry": "--geometry-from", "depth": "--depth", None: f"--depth-model {config.depth.model}"}[other]

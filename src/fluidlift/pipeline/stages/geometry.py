@@ -10,7 +10,7 @@ from fluidlift.errors import InputRejected
 from fluidlift.look.smoke_film import behind_smoke
 from fluidlift.pipeline.bed_seen import BedPicture, bed_of
 from fluidlift.pipeline.settings import GeometrySettings, GivenView
-from fluidlift.pipeline.sight import Sight, Sighted, mainstream_of, sighted
+from fluidlift.pipeline.sight import Sight, Sighted, sighted
 from fluidlift.pipeline.work import Work
 from fluidlift.shape import (
     composite,
@@ -23,8 +23,10 @@ from fluidlift.shape import (
     standing,
 )
 from fluidlift.shape.frame_pictures import typical_picture
+from fluidlift.shape.kinds import builder_of
 from fluidlift.types import (
     CellType,
+    FluidKind,
     PinholeCamera,
     SaidFlow,
     Setting,
@@ -55,37 +57,19 @@ def geometry(
         InputRejected: a fluid without a shape, or something given that does not fit.
     """
     s, clip, c = sighted(read, flow, segmentation, given, config, work=work), read.clip, config
-    seen, canonical, front, falling, visible = s.seen, s.canonical, s.front, s.falling, s.visible
-    kind, parts, mask, points, velocities, scale = seen.kind, seen.parts, seen.mask, s.points, s.velocities, s.scale
-    falls, trust, seen_depth = falling.pixels[visible], seen.trust[visible], s.seen_depth
+    seen, front, falling, kind, mask, scale, seen_depth = (
+        s.seen, s.front, s.falling, s.seen.kind, s.seen.mask, s.scale, s.seen_depth
+    )  # fmt: skip
     hidden = _hidden(seen, segmentation)
     fluid = FluidMasks(segmentation.labels.labels, hidden)
-    if front.vessel is not None:
-        mainstream = np.array(front.vessel.inflow)
-    elif seen.stood is not None:
-        mainstream = seen.stood.direction
-    else:
-        counted = trust if seen.said_flow is None else trust * _said(seen.said_flow, visible & ~falling.pixels)[visible]
-        mainstream = mainstream_of(kind, velocities[~falls], counted[~falls])
+    mainstream = _mainstream(s)
     eye = seen.known.position if seen.pose_given else None
     to_world, camera = registration.place(
-        canonical, points, scale.value, heading=seen.heading, eye=eye, mainstream=mainstream
+        s.canonical, s.points, scale.value, heading=seen.heading, eye=eye, mainstream=mainstream
     )
     depth = (front.depth * scale.value).astype(np.float32)
     half = (front.half_thickness * scale.value).astype(np.float32)
-    bulk = to_world.vectors(mainstream) / to_world.scale
-    scene = None if seen_depth is None else np.where(mask, np.nan, seen_depth.scene.depth * scale.value)
-    if seen.stood is not None:
-        setting = standing.standing_setting(seen.stood, to_world, bulk, longest=c.cells, limit=c.cell_limit)
-    else:
-        setting = ground.setting_around(
-            kind, front, fluid, seen.start, seen.united, camera, to_world, depth, half, bulk, c, falling.pixels,
-            speed=None if kind.is_standing_water else _seen_speed(visible, velocities * scale.value, seen.trust),
-            scene_depth=scene, in_metres=scale.source != "assumed",
-            closed=parts.puddle or kind.is_standing_water, goes_on=kind.is_standing_water,
-            pool=parts.lying if kind.rises_from_pool else None,
-        )  # fmt: skip
-        setting = composite.composed(setting, falling, to_world, points[~falls], velocities[~falls], camera)
+    setting = _setting(s, fluid, camera, to_world, depth, half, to_world.vectors(mainstream) / to_world.scale, c)
     if not (setting.cell_types == CellType.FLUID).any():
         raise InputRejected(
             f"as a {kind}, the fluid fills no cell of the grid beside those of its inlet", "a larger or thicker body",
@@ -95,7 +79,7 @@ def geometry(
     setting, picture = _coloured(setting, clip, fluid, seen, falling.pixels, camera, bed)
     return Geometry(
         kind=kind.name,
-        kind_source=s.kind_source,
+        kind_source="evidence" if seen.kind_free else "user",
         kind_evidence=seen.evidence,
         up=s.up,
         scale=scale,
@@ -124,9 +108,64 @@ def geometry(
     )
 
 
+def _mainstream(s: Sighted) -> np.ndarray:
+    """Canonical direction in which the body runs as a whole: as its jet, or what stands, is let go; else by its
+    motion, beside what falls."""
+    seen = s.seen
+    if s.front.vessel is not None:
+        return np.array(s.front.vessel.inflow)
+    if seen.stood is not None:
+        return seen.stood.direction
+    lies, counted = ~s.falling.pixels[s.visible], seen.trust[s.visible]
+    if seen.said_flow is not None:
+        counted = counted * _said(seen.said_flow, s.visible & ~s.falling.pixels)[s.visible]
+    return _mainstream_of(seen.kind, s.velocities[lies], counted[lies])
+
+
+def _setting(
+    s: Sighted, fluid: FluidMasks, camera: PinholeCamera, to_world: Similarity3, depth: np.ndarray,
+    half: np.ndarray, bulk: np.ndarray, config: GeometrySettings,
+) -> Setting:  # fmt: skip
+    """Terrain and cells, without colors.
+
+    Args:
+        s: the fluid as it is seen.
+        fluid: its masks.
+        camera: in the world.
+        to_world: from the canonical frame.
+        depth: camera z of the surface, m.
+        half: half of the body's thickness there, m.
+        bulk: unit vector in the world, in which the body runs as a whole.
+        config: the cells.
+    """
+    seen, kind, parts = s.seen, s.seen.kind, s.seen.parts
+    if seen.stood is not None:
+        return standing.standing_setting(seen.stood, to_world, bulk, longest=config.cells, limit=config.cell_limit)
+    scene = None if s.seen_depth is None else np.where(seen.mask, np.nan, s.seen_depth.scene.depth * s.scale.value)
+    speed = None if kind.is_standing_water else _seen_speed(s.visible, s.velocities * s.scale.value, seen.trust)
+    setting = ground.setting_around(
+        kind, s.front, fluid, seen.start, seen.united, camera, to_world, depth, half, bulk, config, s.falling.pixels,
+        speed=speed, scene_depth=scene, in_metres=s.scale.source != "assumed",
+        closed=parts.puddle or kind.is_standing_water, goes_on=kind.is_standing_water,
+        pool=parts.lying if kind.rises_from_pool else None,
+    )  # fmt: skip
+    lies = ~s.falling.pixels[s.visible]
+    return composite.composed(setting, s.falling, to_world, s.points[lies], s.velocities[lies], camera)
+
+
 def _said(flow: SaidFlow, visible: np.ndarray) -> np.ndarray:
     """bool [h,w]: pixels whose motion says where the mainstream runs, those that a person's arrows speak for."""
     return flow.counts if (flow.counts & visible).any() else np.ones(visible.shape, bool)
+
+
+def _mainstream_of(kind: FluidKind, velocities: np.ndarray, trust: np.ndarray) -> np.ndarray:
+    """Bulk direction: confident and fast motion counts most; bodies in the air move along the vertical."""
+    speed = np.linalg.norm(velocities, axis=1)
+    capped = velocities * np.minimum(1.0, np.percentile(speed, 95) / np.maximum(speed, 1e-12))[:, None]
+    bulk = (capped * (trust * np.linalg.norm(capped, axis=1))[:, None]).sum(axis=0)
+    bulk = builder_of(kind).mainstream(bulk)
+    norm = np.linalg.norm(bulk)
+    return bulk / norm if norm > 1e-12 else np.array([1.0, 0.0, 0.0])
 
 
 def _coloured(

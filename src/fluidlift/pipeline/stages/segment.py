@@ -10,13 +10,13 @@ from fluidlift.backends.learned import MASK_METHODS, make_segmenter
 from fluidlift.backends.registry import ModelChoice
 from fluidlift.errors import InputRejected
 from fluidlift.messages import Notice
-from fluidlift.pipeline.fluid_found import sureness, trusted_share
+from fluidlift.pipeline.fluid_found import fluid_figures
 from fluidlift.pipeline.hints import NO_HINTS, Hints
 from fluidlift.pipeline.settings import GivenMask, SegmentSettings
 from fluidlift.pipeline.work import Work
 from fluidlift.seams import Segmenter
 from fluidlift.types import PixelFlow, PixelLabels, VideoClip
-from fluidlift.types.fluid_masks import FluidMasks, parts_of
+from fluidlift.types.fluid_masks import parts_of
 from fluidlift.types.stages import Flow, Read, Segmentation
 
 if TYPE_CHECKING:
@@ -53,26 +53,22 @@ def segment(
             progress=lambda part, _: work.step(round(100 * part), 100), out=out,
             clues=lambda: work.remembered("clues", clues, read, flow, hints.roi),
         )  # fmt: skip
-    fluid = FluidMasks(labels.labels)
-    areas = fluid.areas()
-    if not areas.any():
+    found = fluid_figures(labels, flow.flow)
+    if found is None:
         raise InputRejected(
             f"no fluid was found in '{clip.source}'", "a region that moves", "draw it and pass it with --mask"
         )
     warnings = list(labels.warnings)
-    trusted, sure = trusted_share(flow.flow, fluid.any_frame()), sureness(labels, areas.sum())
-    if trusted < 0.1:
+    if found.trusted < 0.1:
         warnings.append(
             Notice(
                 "flow-failed",
-                f"optical flow failed on {100 * (1 - trusted):.0f} % of the fluid: velocities there are filled in "
-                f"from the "
-                "mainstream; a clip with more texture or a higher frame rate would help",
+                f"optical flow failed on {100 * (1 - found.trusted):.0f} % of the fluid: velocities there are filled "
+                "in from the mainstream; a clip with more texture or a higher frame rate would help",
             )
         )
     kept = work.scratch.keep("labels", labels.labels), work.scratch.keep("confidence", _halved(work, labels.confidence))
-    share = float(areas.mean() / (clip.size[0] * clip.size[1]))
-    return Segmentation(PixelLabels(*kept), share, sure, trusted, mask is not None, tuple(warnings))
+    return Segmentation(PixelLabels(*kept), *found, mask is not None, tuple(warnings))
 
 
 def clues(read: Read, flow: Flow, roi: tuple[int, int, int, int] | None) -> Clues:

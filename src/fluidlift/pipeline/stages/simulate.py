@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.messages import Notice
@@ -13,13 +14,17 @@ from fluidlift.present.looping import close_loop
 from fluidlift.scene.build import Scene, SimulationRequest
 from fluidlift.scene.filmed_numbers import WatchedFlow, film_estimates
 from fluidlift.scene.reshaping import closed_inlet
+from fluidlift.scene.simulated_history import FrameHistory
 from fluidlift.scene.simulation import advance, continued
 from fluidlift.scene.simulator import left_to_the_cpu, preflight, simulator_of
 from fluidlift.scene.splat_files import checkpoint_file, frame_file, frame_files, require_room
 from fluidlift.scene.surface_appearance import SurfaceAppearance
-from fluidlift.scene.whitewater import SceneWhitewater, kept_measure
+from fluidlift.scene.whitewater import Measured, SceneWhitewater, kept_measure
 from fluidlift.types import Estimate, kind_of
 from fluidlift.types.stages import Simulation
+
+if TYPE_CHECKING:
+    from fluidlift.physics.stepping import ParticleSimulator
 
 STRAYED = 0.25
 """of the fluid per second, from which that which leaves the filmed places is a warning: with as much the surface sinks
@@ -58,10 +63,11 @@ def simulate(
         part = (work or Work.alone(folder)).part  # once for each asset
         known = part("whitewater", kept_measure, scene.as_lifted, config.device).found
         white = SceneWhitewater(scene, known)
+    simulator = simulator_of(scene, config.device)
+    closed = closed_inlet(scene, simulator)
     watch = WatchedFlow.of(scene) if white is None else None
     appearance = SurfaceAppearance(scene, white or watch)
-    simulator = simulator_of(scene, config.device, deform=appearance.draws_out)
-    closed = closed_inlet(scene, simulator)
+    simulator.deforms = appearance.draws_out
     history = continued(simulator, appearance, scene, folder, request or SimulationRequest(), config.max_particles)
     first = len(history)
     told(appearance.splats)
@@ -90,16 +96,8 @@ def simulate(
     if scene.overlap:
         warnings += close_loop(scene, history, folder)
     arrays = history.arrays()
-    warnings += _simulation_warnings(scene.kind, history.volume, history.leak)
-    there = max(simulator.volume * scene.interval * (len(history) - 1), 1e-12)
-    if kind_of(scene.kind).lies_on_ground:  # what is poured, and spreads no further, runs off in any case
-        warnings += _strayed(simulator.drained / there)
-    warnings += _refilled(simulator.refilled / there)
-    estimates: dict[str, Estimate] = {}
-    if white is not None and scene.as_lifted is not None:
-        estimates = film_estimates(scene.as_lifted) | ({} if known is None else known.estimates)
-    elif not scene.edited:
-        estimates = film_estimates(scene)
+    warnings += _simulation_warnings(scene, simulator, history)
+    estimates = _estimates(scene, known)
     if watch is not None and failed is None:
         estimates |= watch.estimates
     return Simulation(
@@ -115,10 +113,18 @@ def simulate(
     )
 
 
-def _simulation_warnings(kind: str, volumes: Sequence[float], leaks: Sequence[float]) -> list[Notice]:
-    warnings = []
+def _estimates(scene: Scene, known: Measured | None) -> dict[str, Estimate]:
+    """What the film says of foam and waves, and with white water what was measured of it in the scene as lifted."""
+    if scene.whitewater > 0 and scene.as_lifted is not None:
+        return film_estimates(scene.as_lifted) | ({} if known is None else known.estimates)
+    return {} if scene.edited else film_estimates(scene)
+
+
+def _simulation_warnings(scene: Scene, simulator: ParticleSimulator, history: FrameHistory) -> list[Notice]:
+    """What to say of volume that was lost or gained, of particles in the ground, in dry cells, and put in."""
+    warnings, volumes, leaks, lies = [], history.volume, history.leak, kind_of(scene.kind).lies_on_ground
     drift = volumes[-1] / max(volumes[0], 1e-12) - 1
-    if drift < -0.5 or (drift > 0.5 and kind_of(kind).lies_on_ground):  # pours fill and smoke spreads
+    if drift < -0.5 or (drift > 0.5 and lies):  # pours fill and smoke spreads
         word = "lost" if drift < 0 else "gained"
         warnings.append(
             Notice(
@@ -129,7 +135,10 @@ def _simulation_warnings(kind: str, volumes: Sequence[float], leaks: Sequence[fl
         warnings.append(
             Notice("particles-in-ground", f"up to {100 * max(leaks):.1f} % of the particles are inside the terrain")
         )
-    return warnings
+    there = max(simulator.volume * scene.interval * (len(history) - 1), 1e-12)
+    if lies:  # what is poured, and spreads no further, runs off in any case
+        warnings += _strayed(simulator.drained / there)
+    return warnings + _refilled(simulator.refilled / there)
 
 
 def _strayed(share: float) -> list[Notice]:

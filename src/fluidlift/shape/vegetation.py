@@ -15,9 +15,9 @@ import numpy as np
 
 from fluidlift.shape.colour_growth import STIFFNESS, colour_odds
 from fluidlift.shape.evidence import Evidence
-from fluidlift.shape.islands import SURE
 from fluidlift.shape.min_cut import disc, edge_weights, min_cut
 from fluidlift.shape.region import clean_region
+from fluidlift.shape.still_regions import SURE
 
 APART = 0.45
 """s between pictures that are compared: the period of plants is about one, half of it brings the other end"""

@@ -5,8 +5,8 @@ import pytest
 from scipy.ndimage import binary_erosion, gaussian_filter
 
 from fluidlift.shape.evidence import fluid_score, gather_evidence
+from fluidlift.shape.intermittently_wet import most_often, washed_ground
 from fluidlift.shape.segment import lasting_region, segment
-from fluidlift.shape.washed import most_often, washed_ground
 from fluidlift.types.clip import Label, VideoClip
 from fluidlift.types.flow import PixelFlow
 

@@ -15,13 +15,13 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
-from fluidlift.shape.advancing import median_over_time
 from fluidlift.shape.background import colour_bins, colour_histogram
 from fluidlift.shape.colour_growth import DECISIVE, RARE, STIFFNESS
 from fluidlift.shape.evidence import Evidence
-from fluidlift.shape.islands import FLOWS, LARGEST, STOPPED, SURE
 from fluidlift.shape.min_cut import disc, edge_weights, min_cut, spread
+from fluidlift.shape.moving_front import median_over_time
 from fluidlift.shape.region import SMALLEST_SOLID
+from fluidlift.shape.still_regions import FLOWS, LARGEST, STOPPED, SURE
 from fluidlift.shape.waterline import BINS
 
 COMPARED = 36

@@ -5,8 +5,8 @@ import pytest
 from scipy.ndimage import binary_dilation, gaussian_filter
 
 from fluidlift.shape.evidence import fluid_score, gather_evidence
-from fluidlift.shape.islands import without_ground
 from fluidlift.shape.segment import Label, lasting_region, segment
+from fluidlift.shape.still_regions import without_ground
 from fluidlift.types.clip import VideoClip
 from fluidlift.types.flow import PixelFlow
 

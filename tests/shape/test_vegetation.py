@@ -6,7 +6,7 @@ from scipy.ndimage import binary_erosion, gaussian_filter, shift
 
 from fluidlift.shape.evidence import fluid_score, gather_evidence
 from fluidlift.shape.segment import lasting_region, segment
-from fluidlift.shape.waving import coming_back, without_plants
+from fluidlift.shape.vegetation import coming_back, without_plants
 from fluidlift.types.clip import VideoClip
 from fluidlift.types.flow import PixelFlow
 

@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 
-from fluidlift.shape.advancing import median_over_time
 from fluidlift.shape.background import (
     _told_apart,
     colour_histogram,
@@ -18,6 +17,7 @@ from fluidlift.shape.background import (
     steady_fluid,
     without_background,
 )
+from fluidlift.shape.moving_front import median_over_time
 from fluidlift.shape.segment import segment
 from fluidlift.types.clip import VideoClip
 

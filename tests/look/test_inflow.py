@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fluidlift.look.inflow import ENDS, InflowLook, surface_level
+from fluidlift.look.inflow import ENDS, InflowLook, columns_of, surface_level
 from fluidlift.types import Gaussians
 
 ALONG = np.array([1.0, 0.0, 0.0])
@@ -90,3 +90,13 @@ def test_the_level_is_the_highest_point_of_a_column_and_the_nearest_one_beside()
 def test_a_body_without_splats_is_refused():
     with pytest.raises(ValueError, match="without Gaussians"):
         InflowLook(Gaussians.empty(), ALONG, 1.0, 0.1)
+
+
+def test_columns_are_those_that_rows_sorted_one_by_one_give():
+    rng = np.random.default_rng(3)
+    for points in (rng.normal(0, 4, (3000, 3)), np.array([[0.0, 0, 0], [1e17, -1e17, 0], [0.05, 0.01, 2]])):
+        cell, of = columns_of(points, 0.3)
+        expected, which = np.unique(np.floor(points[:, :2] / 0.3), axis=0, return_inverse=True)
+        np.testing.assert_array_equal(cell, expected)
+        np.testing.assert_array_equal(of, which.reshape(-1))
+    assert columns_of(np.zeros((0, 3)), 0.3)[0].shape == (0, 2)

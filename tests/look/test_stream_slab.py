@@ -137,3 +137,29 @@ def test_a_stream_that_goes_down_goes_on_down_beyond_both_ends():
     ground = TriangleMesh(still - [0, 0, 0.1], np.array([[0, 1, 16]]))
     image = Slab((OUT,), still).carried_on(ground).vertices[len(still) :]
     assert image[:, 2].max() < 0.15
+
+
+def test_images_left_out_beforehand_are_those_that_no_camera_would_see(monkeypatch):
+    rng = np.random.default_rng(4)
+    still = rng.uniform((0.3, 0, 0.1), (1.3, 0.8, 0.2), (4000, 3))
+    still[:, 2] += 0.2 * (still[:, 0] - 0.3)  # it falls upstream: levels move images up and down
+    n = len(still)
+    splats = Gaussians(
+        still.astype(np.float32), np.tile(np.float32([1, 0, 0, 0]), (n, 1)), np.full((n, 3), 0.02, np.float32),
+        np.ones(n, np.float32), np.zeros((n, 1, 3), np.float32),
+    )  # fmt: skip
+    slab, speeds = Slab((OUT, IN), still), np.zeros((n, 3), np.float32)
+    for eye in ((2.2, 0.4, 1.0), (0.8, -1.5, 0.6), (0.9, 0.4, 2.0)):
+        camera = PinholeCamera.looking(np.array(eye), np.array([1.4, 0.4, 0.1]), 30.0, (48, 32))
+        with monkeypatch.context() as m:
+            found, _ = slab.beyond(splats, speeds, camera)
+            m.setattr(Slab, "_may_be_seen", lambda self, points, end, camera: np.ones(len(points), bool))
+            whole, _ = slab.beyond(splats, speeds, camera)
+        np.testing.assert_allclose(found.means, whole.means, atol=1e-6)
+        assert 0 < len(found)
+        # what is seen is what a projection puts near the picture
+        images = np.concatenate([slab._image(splats.means[slab.before(splats.means)], end) for end in slab.ends])
+        uv, z = camera.project(images)
+        room = 0.05 * 48
+        near = (z > 0) & (uv > -room).all(axis=1) & (uv < np.array([48, 32]) + room).all(axis=1)
+        assert len(found) == slab.before(splats.means).sum() + near.sum()

@@ -1,12 +1,13 @@
 """Foam on clear water: what a film shows brighter than its surface could mirror, from wherever it is looked at."""
 
+import cv2
 import numpy as np
 import pytest
 
 from fluidlift.look.environment import Environment
 from fluidlift.look.liquid import LiquidSurface
 from fluidlift.look.materials import HONEY, MUDDY_WATER, WATER
-from fluidlift.look.surface_foam import ALBEDO, DARKEST_WHITE, FilmedWhite, with_foam
+from fluidlift.look.surface_foam import ALBEDO, BROAD, DARKEST_WHITE, FINE, FilmedWhite, _smoothed, with_foam
 from fluidlift.types import PinholeCamera
 
 SIZE = (64, 48)
@@ -87,3 +88,23 @@ def test_foam_is_matt_and_hides_as_much_of_the_water_as_it_covers():
 
 def test_waters_foam_and_honey_does_not():
     assert WATER.foams and MUDDY_WATER.foams and not HONEY.foams
+
+
+def test_compiled_and_plain_foam_agree_and_a_broad_bell_is_found_in_a_small_picture():
+    camera, rng = looking_at(30.0).resized((320, 200)), np.random.default_rng(5)
+    depth = rng.uniform(1.0, 2.0, (200, 320)) * (rng.uniform(size=(200, 320)) > 0.2)
+    normal = rng.normal(size=(200, 320, 3)) + [0, 0, 2]
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    full = np.ones((200, 320), np.float32)
+    surface = LiquidSurface(depth, normal, full, rng.uniform(size=(200, 320, 3)), full)
+    white = FilmedWhite(np.array([1.0, -1.0, 2.0]), 0.5)
+    np.testing.assert_allclose(
+        white.cover(surface, camera, 1.333), white.cover_plain(surface, camera, 1.333), atol=1e-5
+    )
+    for size in ((700, 500), (501, 701)):
+        picture = rng.normal(size=(*size, 3))
+        picture /= np.linalg.norm(picture, axis=-1, keepdims=True)
+        picture = (picture * (np.arange(size[1])[None, :, None] > 200)).astype(np.float32)
+        sigma = BROAD * max(size)
+        assert sigma > 2 * FINE  # smaller pictures are blurred as they are
+        assert np.abs(_smoothed(picture) - cv2.GaussianBlur(picture, (0, 0), sigma)).max() < 0.01

@@ -4,7 +4,20 @@ import numpy as np
 import pytest
 
 from fluidlift.look import transparent
-from fluidlift.look.transparent import LEAD, mean_volume, splat_surface, splatted_thickness, thickness_plain
+from fluidlift.look.transparent import (
+    AWAY,
+    COVERED,
+    LEAD,
+    LEANING,
+    _eye,
+    facing_plain,
+    mean_volume,
+    rated_plain,
+    splat_surface,
+    splatted_thickness,
+    thickness_plain,
+)
+from fluidlift.look.transparent_kernels import far_normals, rated
 from fluidlift.types import Gaussians, PinholeCamera
 
 
@@ -171,3 +184,19 @@ def test_wrong_arguments_are_told():
         splat_surface(g, g.means, ahead(), colors=np.zeros((2, 3)))
     with pytest.raises(ValueError, match="volume"):
         splat_surface(g, g.means, ahead(), volume=0.0)
+
+
+def test_compiled_and_plain_surfaces_agree():
+    camera, rng = ahead(), np.random.default_rng(6)
+    height, width = camera.size[::-1]
+    total = rng.uniform(0, 0.1, (height, width)).astype(np.float32)
+    skin = rng.normal(size=(height, width, 8)).astype(np.float32)
+    skin[..., 0], skin[::5, ::7] = 0.02 * np.abs(skin[..., 0]), 0.0
+    found = [np.empty_like(total), np.empty_like(total), *(np.empty((height, width, 3), np.float32) for _ in range(2))]
+    rated(total, skin, _eye(camera), np.array([*(0.05 * c for c in COVERED), *AWAY, LEANING]), *found)
+    for mine, plain in zip(found, rated_plain(total, skin, camera, 0.05), strict=True):
+        np.testing.assert_allclose(mine, plain, atol=2e-6)
+    rays = camera.rays(camera.pixel_grid())
+    far_normals(skin, _eye(camera), LEANING, found[2])
+    away = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+    np.testing.assert_allclose(found[2], facing_plain(skin[..., 2:5], away), atol=2e-6)

@@ -2,24 +2,20 @@
 
 import numpy as np
 import pytest
+from level_slabs import ABSORBS, CAMERA, INDEX, drawn, floor, slab
 
 from fluidlift.backends.mitsuba_renderer import MitsubaRenderer
 from fluidlift.backends.mitsuba_scene import FinalScene
 from fluidlift.look.environment import Environment
 from fluidlift.look.environment_lookup import grid_directions
 from fluidlift.look.ground_picture import Ground
-from fluidlift.look.liquid import shaded
 from fluidlift.look.materials import Material
 from fluidlift.look.optics import fresnel, held_inside, wet_light
 from fluidlift.look.screen_space import mesh_surface
 from fluidlift.look.wet_ground import standing, wetted, wetted_plain
-from fluidlift.numerics.srgb import srgb_from_linear
 from fluidlift.types import PinholeCamera, TriangleMesh
 
-INDEX = 1.49
-ABSORBS = (3.0, 16.0, 70.0)
 HONEY = Material("clear honey", INDEX, absorption=ABSORBS)
-CAMERA = PinholeCamera.looking(np.array([0.0, -0.02, 1.2]), np.zeros(3), 4.0, (16, 16))
 
 
 def equation(absorption: float, depth: float, albedo: float, index: float = INDEX) -> float:
@@ -37,38 +33,15 @@ def equation(absorption: float, depth: float, albedo: float, index: float = INDE
     return r + (1 - r) * np.exp(-absorption * depth) * sent / index**2
 
 
-def slab(depth: float, sunk: float = 0.0, half: float = 0.25) -> TriangleMesh:
-    sides = [(x, y, z) for z in (-sunk, depth) for y in (-half, half) for x in (-half, half)]
-    faces = [[0, 2, 1], [1, 2, 3], [4, 5, 6], [5, 7, 6], [0, 1, 4], [1, 5, 4], [2, 6, 3], [3, 6, 7], [0, 4, 2],
-             [2, 4, 6], [1, 3, 5], [3, 7, 5]]  # fmt: skip
-    return TriangleMesh(np.array(sides), np.array(faces), np.full((8, 3), 0.5))
-
-
-def floor(albedo: float, half: float = 0.3) -> TriangleMesh:
-    corners = half * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
-    color = float(srgb_from_linear(np.array([albedo]))[0])
-    return TriangleMesh(corners, np.array([[0, 1, 2], [0, 2, 3]]), np.full((4, 3), color))
-
-
-def drawn(depth: float, albedo: float, material: Material = HONEY, *, casts: bool = True) -> np.ndarray:
-    world = Environment.white()
-    ground = Ground([floor(albedo)], world)
-    surface = mesh_surface(slab(depth), CAMERA)
-    dry = ground.picture(CAMERA, None, slab(depth) if casts else None, material=material)
-    there = ground.albedo(CAMERA), ground.depth(CAMERA)
-    behind = wetted(dry, surface, CAMERA, material, there, shaded=casts)
-    return shaded(surface, behind, CAMERA, material, world).mean(axis=(0, 1))
-
-
 @pytest.mark.parametrize("albedo", [0.9, 0.35, 0.15])
 @pytest.mark.parametrize("depth", [0.01, 0.03])
 def test_a_slab_on_matt_ground_is_as_bright_as_the_equation_says(albedo, depth):
     expected = np.array([equation(a, depth, albedo) for a in ABSORBS])
     # light comes to the ground by twelve directions here, by all in the equation: 0.3 % of even light. Dry ground
     # would be off by up to 0.4
-    np.testing.assert_allclose(drawn(depth, albedo), expected, rtol=0.01, atol=0.001)
+    np.testing.assert_allclose(drawn(depth, albedo, HONEY), expected, rtol=0.01, atol=0.001)
     # without a body that throws a shadow, even light is exact: only the lens' few degrees are left
-    np.testing.assert_allclose(drawn(depth, albedo, casts=False), expected, rtol=0.01, atol=0.001)
+    np.testing.assert_allclose(drawn(depth, albedo, HONEY, casts=False), expected, rtol=0.01, atol=0.001)
 
 
 @pytest.mark.parametrize("albedo", [0.9, 0.35])

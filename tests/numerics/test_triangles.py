@@ -40,6 +40,21 @@ def test_it_draws_what_every_ray_against_every_face_gives(spread, facing):
     np.testing.assert_allclose(found.barycentric[i, j], shares[i, j, f], atol=1e-5)  # of slivers, float32
 
 
+def test_slivers_across_the_picture_are_drawn_as_every_ray_meets_them():
+    # of whose boxes next to nothing is theirs: only the columns that a row can have are asked
+    rng = np.random.default_rng(7)
+    one, way = rng.uniform(-1.5, 1.5, (400, 3)), rng.normal(size=(400, 3))
+    thin = rng.normal(size=(400, 3)) * rng.choice([1e-3, 0.03, 0.2], (400, 1))
+    vertices = np.stack([one - way, one + way, one + thin], axis=1).reshape(-1, 3)
+    faces = np.arange(len(vertices)).reshape(-1, 3)
+    found = rasterize_triangles(vertices, faces, CAMERA)
+    np.testing.assert_array_equal(found.face, nearest(crossings(vertices, faces, CAMERA)[0]))
+    assert len(np.unique(found.face)) > 100
+    whole = rasterize_closed(vertices, faces, CAMERA)
+    front = rasterize_triangles(vertices, faces, CAMERA, facing="front")
+    np.testing.assert_array_equal(whole.front.face, front.face)
+
+
 def test_values_are_interpolated_in_space_and_not_in_the_picture():
     # a floor that runs away from the camera: its height, seen through the vertices, is the point's own
     vertices = np.array([[-4.0, -2, -1], [4, -2, -1], [4, 20, -1], [-4, 20, -1]])

@@ -24,7 +24,8 @@ Modules of the face:
     materials           What a liquid is made of, for pictures: refractive index, absorption, scattering, glow
     mixing              The look of fluid that was drawn out further than its splats can show
     optics              Light at the surface of a transparent body and inside it: Fresnel, Snell, Beer and Lambert
-                        (Born and Wolf 1999), and the colour of a deep body that scatters (van de Hulst 1980)
+                        (Born and Wolf 1999), and the colour of a deep body that scatters (van de Hulst 1980) and
+                        what a layer of it lets through (Kubelka, Munk 1931)
     outlet_section      The open ends of a stream: where what is simulated ends, a picture shows a clean section
     picture_texture     What a fluid that falls or stands looks like in its film, by place in the picture
     pictures            Fields and curves as pictures for the report

@@ -19,7 +19,7 @@ from scipy import ndimage
 from fluidlift.errors import require
 from fluidlift.look.ground_kernels import TILE, shadowed, tap_places
 from fluidlift.look.materials import Material
-from fluidlift.look.optics import fresnel, transmittance
+from fluidlift.look.optics import fresnel, held_inside, passed, transmittance
 from fluidlift.numerics.triangles import rasterize_closed, rasterize_triangles
 from fluidlift.types.camera import PinholeCamera
 from fluidlift.types.terrain import TriangleMesh
@@ -162,7 +162,9 @@ class Casters:
         closed = rasterize_closed(self.caster.vertices, self.caster.faces, sun)
         m = self.material
         inside = np.maximum(closed.inside - 2.0 * self.inset, 0.0)
-        through = transmittance(np.asarray(m.absorption) + m.scattering, inside)
+        fade, cloud = (np.asarray(part, np.float32) for part in m.fluxes)
+        held = held_inside(float(m.refractive_index))
+        through = passed(fade, cloud, held, inside[..., None]) if cloud.any() else transmittance(fade, inside)
         through *= float(1.0 - fresnel(np.ones(1), m.refractive_index)[0])
         hit = closed.front.hit
         first = closed.front.depth + np.float32(self.inset) * hit

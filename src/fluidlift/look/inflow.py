@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from fluidlift.errors import require
@@ -27,6 +27,9 @@ LEVEL = 0.5
 
 SHALLOW = 1.5
 """spacings below the surface to which the visible splats reach; deeper places take the one nearest to their image"""
+
+MOST_COLUMNS = 2.0**52
+"""that can be numbered in double precision"""
 
 
 class InflowLook:
@@ -83,8 +86,23 @@ def surface_level(means: Float[np.ndarray, "n 3"], spacing: float) -> Callable[[
     """(x, y [n,2]) -> z [n] of the highest of some points (m) in columns of a width (m); the nearest column's beside
     them."""
     means = np.asarray(means, np.float64)
-    cell, of = np.unique(np.floor(means[:, :2] / spacing), axis=0, return_inverse=True)
+    cell, of = columns_of(means, spacing)
     top = np.full(len(cell), -np.inf)
-    np.maximum.at(top, of.ravel(), means[:, 2])
+    np.maximum.at(top, of, means[:, 2])
     columns = cKDTree((cell + 0.5) * spacing)
     return lambda xy: top[columns.query(xy)[1].reshape(-1)]
+
+
+def columns_of(
+    points: Float[np.ndarray, "n 2+d"], spacing: float
+) -> tuple[Float[np.ndarray, "m 2"], Int[np.ndarray, " n"]]:
+    """Columns of a width (m) that hold points, in cells, by x and then y; and which of them each point lies in. What
+    `np.unique` says of rows, in a sixth of the time: whole numbers are sorted faster than rows."""
+    cell = np.floor(np.asarray(points, np.float64)[:, :2] / spacing)
+    low, extent = (cell.min(axis=0), np.ptp(cell, axis=0) + 1.0) if len(cell) else (np.zeros(2), np.full(2, np.inf))
+    if not (np.isfinite(extent).all() and extent.prod() < MOST_COLUMNS):  # numbers of columns would not be exact
+        found, of = np.unique(cell, axis=0, return_inverse=True)
+        return found, of.reshape(-1)
+    number = ((cell[:, 0] - low[0]) * extent[1] + (cell[:, 1] - low[1])).astype(np.int64)
+    there, of = np.unique(number, return_inverse=True)
+    return np.stack([there // int(extent[1]), there % int(extent[1])], axis=1) + low, of.reshape(-1)

@@ -20,6 +20,8 @@ from fluidlift.look.liquid_kernels import (
     BEYOND,
     COLOR,
     FARTHER,
+    FREE,
+    HAZE,
     INWARD,
     MIRROR,
     NUMBERS,
@@ -36,7 +38,7 @@ from fluidlift.look.liquid_kernels import (
 )
 from fluidlift.look.liquid_lookup import SLANTED, pyramid
 from fluidlift.look.materials import Material
-from fluidlift.look.optics import fresnel, transmittance
+from fluidlift.look.optics import cloud_seen, fresnel, held_inside, transmittance
 from fluidlift.look.smoothstep import smoothstep
 from fluidlift.types.camera import PinholeCamera
 
@@ -144,9 +146,9 @@ def shaded(
     share that is mirrored on the far side (Fresnel's, up to all of it) is followed on inside to where it gets out, and
     looked up there. Light that comes from outside the picture is the environment's. Picture and
     environment are as blurred as the light of a pixel is fanned out by both sides. On the way
-    exp(-(absorption + scattering) d) is left, and if it scatters, the rest is the body's own colour, lit by the
-    environment's irradiance (`Material.albedo` is the limit of a deep body). A clear liquid in a uniformly white world
-    is white, whatever its shape.
+    exp(-absorption d) is left; of a cloudy liquid what `optics.cloud_seen` says, with what is scattered forward, and
+    the body has its own colour, lit by the environment's irradiance (`Material.albedo` is the limit of a deep body). A
+    clear liquid in a uniformly white world is white, whatever its shape.
 
     Not there: reflections of the ground in the liquid, shadows on the liquid, caustics.
 
@@ -173,10 +175,11 @@ def shaded(
     numbers = np.array([
         material.refractive_index, material.roughness, material.scattering, _straight(material), DULL, material.carried,
         SHARP, max(usual, 1e-6), COOL, HOT, WARM, CONTRAST, *material.absorption, *material.albedo, *material.emission,
-        *LUMINANCE,
+        *LUMINANCE, *np.concatenate(material.fluxes), held_inside(float(material.refractive_index)),
     ])  # fmt: skip
     world = (*_pictures(environment), _STEPS, _DIM, SECOND_RADIATION / WAVELENGTHS)
-    shade(_arrays(surface), _scene(behind, surface), _eye(camera), world, numbers, picture)
+    scene = _scene(behind, surface, bool(material.fluxes[1].any()))
+    shade(_arrays(surface), scene, _eye(camera), world, numbers, picture)
     return picture
 
 
@@ -187,9 +190,9 @@ def _arrays(surface: LiquidSurface) -> tuple:
     )  # fmt: skip
 
 
-def _scene(behind: Behind, surface: LiquidSurface) -> tuple:
-    # only where a far side is known is it known how wide its light is fanned out
-    return *pyramid(behind.image, deep=surface.back_normal is not None), behind.depth, behind.rest
+def _scene(behind: Behind, surface: LiquidSurface, cloudy: bool = True) -> tuple:
+    # only where a far side is known is it known how wide its light is fanned out; a cloud scatters it as well
+    return *pyramid(behind.image, deep=cloudy or surface.back_normal is not None), behind.depth, behind.rest
 
 
 def shaded_plain(
@@ -206,14 +209,24 @@ def shaded_plain(
     # so do both sides for what comes through, or it sparkles where the sun is
     far = environment.blurred(rays.through, np.sqrt(np.maximum(rays.wide - SHARP, 0.0)))
     through = np.where(rays.surroundings[:, None], far, rays.color)
-    extinction = np.asarray(material.absorption) + material.scattering
+    (fade, cloud), held = material.fluxes, held_inside(float(material.refractive_index))
+    path, both = rays.path[:, None], (rays.path + rays.farther)[:, None]
     second = np.where(rays.beyond[:, None], environment.blurred(rays.inward, DIM), rays.second)
-    second = second * transmittance(extinction, rays.farther)
-    through += rays.turned[:, None] * (second - through)
-    inside = through * transmittance(extinction, rays.path)
-    # the body's own colour takes the place of the light that is lost on the way
-    left = rays.turned[:, None] * transmittance(extinction, rays.farther) + 1.0 - rays.turned[:, None]
-    seen = (1.0 - transmittance(extinction, rays.path) * left) * (material.scattering > 0)
+    back = rays.turned[:, None]
+    extinction = np.asarray(material.absorption) + material.scattering
+    if cloud.any():
+        # light that is scattered forward shows no sharp picture
+        free = rays.free[:, None]
+        straight, hazy, near = cloud_seen((fade, cloud), extinction, held, path, free)
+        haze = np.where(rays.surroundings[:, None], through, rays.haze)
+        inside = (1.0 - back) * (straight * through + hazy * haze)
+        straight, hazy, far = cloud_seen((fade, cloud), extinction, held, both, free)
+        inside += back * second * (straight + hazy)
+    else:
+        # the body's own colour takes the place of the light that is lost on the way
+        near, far = 1.0 - transmittance(extinction, rays.path), 1.0 - transmittance(extinction, both[:, 0])
+        inside = (1.0 - back) * through * (1.0 - near) + back * second * (1.0 - far)
+    seen = ((1.0 - back) * near + back * far) * (material.scattering > 0)
     carried = surface.albedo[rows, columns]
     albedo = np.asarray(material.albedo, np.float32) * (1.0 - material.carried) + material.carried * carried
     inside += seen * albedo * environment.irradiance(surface.normal[rows, columns])
@@ -318,6 +331,10 @@ class Followed:
     """of the normals in the pixel, GGX's alpha"""
     wide: Float[np.ndarray, " n"]
     """how wide what comes through is fanned out, in the same units"""
+    haze: Float[np.ndarray, "n 3"]
+    """linear, the picture's mean over as far as light is scattered aside on its way; 0 where it is not the picture's"""
+    free: Float[np.ndarray, " n"]
+    """0, where the liquid rests on something, to 1: of the far side"""
 
 
 def followed(
@@ -335,7 +352,7 @@ def followed(
     return Followed(
         r[:, SHARE], three(MIRROR), three(THROUGH), r[:, PATH], r[:, OUTSIDE] > 0, r[:, TURNED], three(INWARD),
         r[:, FARTHER], r[:, BEYOND] > 0, three(SECOND), three(COLOR), r[:, SPREAD],
-        r[:, WIDE],
+        r[:, WIDE], three(HAZE), r[:, FREE],
     )  # fmt: skip
 
 

@@ -45,9 +45,9 @@ APART = 4.0 / math.sqrt(3.0)
 """the next pixel's light goes 4 WIDE beside this one's; a bilinear look-up of means over a texel is as wide as a box of
 sqrt(3) texels"""
 SHARE, MIRROR, THROUGH, PATH, OUTSIDE, TURNED, INWARD, COLOR, SPREAD = 0, 1, 4, 7, 8, 9, 10, 13, 16
-FARTHER, BEYOND, SECOND, WIDE = 17, 18, 19, 22
+FARTHER, BEYOND, SECOND, WIDE, PLACE, HAZE, FREE = 17, 18, 19, 22, 23, 25, 28
 """places in the numbers of a ray: see `follow`"""
-NUMBERS = 23
+NUMBERS = 29
 """of a ray"""
 
 
@@ -264,8 +264,19 @@ def _follow(i, j, surface, behind, eye, index, ray):
     )  # fmt: skip
     ray[OUTSIDE] = 0.0 if held else 1.0
     _turned(rotation, ox, oy, oz, ray, THROUGH)
+    ray[PLACE], ray[PLACE + 1], ray[FREE] = u, v, free
     if held:
         fetch_beyond(picture, levels, u, v, APART * ray[WIDE] * gone * lens[0], rest, ray, COLOR)
+
+
+@nb.njit(cache=True, error_model="numpy", forceinline=True, _nrt=False)
+def _hazed(i, j, surface, behind, eye, ray):
+    """What is seen by light that is scattered forward on its way: it comes from about as far to the side as it went."""
+    picture, levels, _, rest = behind
+    if ray[OUTSIDE] > 0.0:
+        return
+    wide = ray[PATH] * eye[0][0] / max(np.float64(surface[1][i, j]), 1e-6)
+    fetch_beyond(picture, levels, ray[PLACE], ray[PLACE + 1], wide, rest, ray, HAZE)
 
 
 @shared(lambda pixels, *_: (0, pixels.shape[0]), error_model="numpy", pieces=PIECES)
@@ -275,12 +286,15 @@ def follow(begin, end, pixels, surface, behind, eye, index, rays):
     the environment's (1) or the picture's (0); the share of it that is mirrored at the far side instead, and the
     direction in which that is seen; the picture's colour; the spread of normals, in the units of GGX's alpha; and of
     what is mirrored at the far side the metres that it goes on inside, whether it is the environment's (1), and the
-    picture's colour; and how wide what comes through is fanned out, in the units of that spread.
+    picture's colour; how wide what comes through is fanned out, in the units of that spread; where in the picture it
+    comes from (px); the picture's colour as wide around there as light is scattered; and how free the far side is, from
+    0, where the liquid rests on something, to 1.
 
     surface, behind, eye: as of `shade`.
     """
     for m in range(begin, end):
         _follow(pixels[m, 0], pixels[m, 1], surface, behind, eye, index, rays[m])
+        _hazed(pixels[m, 0], pixels[m, 1], surface, behind, eye, rays[m])
 
 
 @nb.njit(cache=True, inline="always")
@@ -306,10 +320,27 @@ def _blurred(values, places, steps, roughness, ray, at):
     return r0 + s * (r1 - r0), g0 + s * (g1 - g0), b0 + s * (b1 - b0)
 
 
+@nb.njit(cache=True, inline="always")
+def _cloud_seen(fade, cloud, extinction, inside, way, free):
+    """`optics.cloud_seen`, compiled."""
+    left, held = math.exp(-fade * way), 1.0 - inside
+    many = max(1.0 - cloud * cloud * left * left, 1e-30)
+    through, back = (1.0 - cloud * cloud) * left / many, cloud * (1.0 - left * left) / many
+    straight = min(math.exp(-extinction * way), through)
+    near, twice = 1.0 - inside * back, left * left
+    many = max(1.0 - cloud * cloud * twice * twice, 1e-30)
+    slanted, again = (1.0 - cloud * cloud) * twice / many, 1.0 - inside * cloud * (1.0 - twice * twice) / many
+    f = held * again / (again * again - inside * inside * slanted * slanted)
+    b = inside * slanted / again * f
+    haze = (1.0 - free) * (through / near - straight) + free * ((through - straight) * f + back * b)
+    own = (1.0 - free) * held * back / near + free * (back * f + (through - straight) * b)
+    return straight, haze, own * (1.0 - inside * cloud) / (held * cloud)
+
+
 @nb.njit(cache=True, error_model="numpy", forceinline=True, _nrt=False)
 def _come_through(ray, values, places, steps, dim, numbers, light):
     """What comes through, of the picture behind or the environment, and of what is mirrored at the far side, after its
-    way inside; and the share of light, of each colour, that scattering and absorption take from both together."""
+    way inside; and how much of its own colour the body shows in its place: of a clear one all that it takes."""
     back = ray[TURNED]
     light[0], light[1], light[2] = ray[COLOR], ray[COLOR + 1], ray[COLOR + 2]
     if ray[OUTSIDE] > 0.0 and back < 1.0:
@@ -319,8 +350,20 @@ def _come_through(ray, values, places, steps, dim, numbers, light):
     if back > 0.0 and ray[BEYOND] > 0.0:
         r, g, b = _looked_up(values, places, dim, ray, INWARD)
     for k in range(3):
-        lost = numbers[12 + k] + numbers[2]
+        lost, cloud = numbers[24 + k], numbers[27 + k]
         inner, left = (r if k == 0 else (g if k == 1 else b)), 1.0
+        if cloud > 0.0:
+            taken = numbers[12 + k] + numbers[2]
+            straight, haze, own = _cloud_seen(lost, cloud, taken, numbers[30], ray[PATH], ray[FREE])
+            light[3 + k] = own
+            light[k] = straight * light[k] + haze * (light[k] if ray[OUTSIDE] > 0.0 else ray[HAZE + k])
+            if back > 0.0:
+                both = ray[PATH] + ray[FARTHER]
+                straight, haze, own = _cloud_seen(lost, cloud, taken, numbers[30], both, ray[FREE])
+                inner *= straight + haze
+                light[k] = inner if back >= 1.0 else light[k] + back * (inner - light[k])
+                light[3 + k] += back * (own - light[3 + k])
+            continue
         if back > 0.0:
             left = fading(lost * ray[FARTHER])
             # all of it: what would come through was not looked up
@@ -353,6 +396,8 @@ def _pixel(i, j, surface, behind, eye, world, numbers, ray, light):
     index, roughness, scattering = numbers[0], numbers[1], numbers[2]
     straight, dull, sharp = numbers[3], numbers[4], numbers[6]
     _follow(i, j, surface, behind, eye, index, ray)
+    if numbers[27] + numbers[28] + numbers[29] > 0.0:
+        _hazed(i, j, surface, behind, eye, ray)
     _come_through(ray, values, places, steps, dim, numbers, light)
     if scattering > 0.0:
         normals, carried = surface[2], surface[5]
@@ -376,7 +421,8 @@ def shade(begin, end, surface, behind, eye, world, numbers, out):
     1/fy) and rotation. world: pictures of the environment, ever duller, and that of the irradiance, as `stacked` gives
     them; roughnesses of the former; which of them is seen by what was mirrored at the far side; second radiation
     constant over wavelengths. numbers: index, roughness, scattering, straight, dull, carried share, sharp, usual, cool,
-    hot, warm, contrast, then absorption, albedo, emission and weights of luminance.
+    hot, warm, contrast, then absorption, albedo, emission, weights of luminance, fading, cloud (`Material.fluxes`) and
+    the share of light that the surface holds inside.
     """
     covered, surface_depth, normals, back_normals, thickness, carried, grain = surface
     image, levels, depth, rest = behind

@@ -1,5 +1,5 @@
 """Light at the surface of a transparent body and inside it: Fresnel, Snell, Beer and Lambert (Born and Wolf 1999), and
-the colour of a deep body that scatters (van de Hulst 1980)."""
+the colour of a deep body that scatters (van de Hulst 1980) and what a layer of it lets through (Kubelka, Munk 1931)."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from jaxtyping import Bool, Float
 
 from fluidlift.errors import require
 
+WHITEST = 1.0 - 1e-6
+"""linear colour of a deep cloudy body, at most: one that absorbs nothing has no depth at which light has faded"""
 WET_DEEP = 6.0
 """optical depth from which ground below a liquid is too dark to matter"""
 
@@ -74,6 +76,91 @@ def transmittance(
     """Share of the light left after `thickness` metres (Beer and Lambert): exp(-absorption thickness)."""
     depth = np.maximum(np.asarray(thickness), 0.0)
     return np.exp(-depth[..., None] * np.asarray(absorption, depth.dtype))
+
+
+def passed(
+    fade: Float[np.ndarray, "*c"], cloud: Float[np.ndarray, "*c"], inside: float, depth: Float[np.ndarray, "*n"]
+) -> Float[np.ndarray, "*n"]:
+    """Share of light that gets through `depth` metres of a cloudy body, straight on or scattered forward.
+
+    Two fluxes of light, one each way (Kubelka and Munk 1931; Kubelka 1948): T = (1 - R^2) e / (1 - R^2 e^2) with
+    e = exp(-fade depth). What the layer sends back, R_d = R (1 - e^2) / (1 - R^2 e^2), is thrown onto it by the surface
+    again and again: T / (1 - inside R_d). Of a clear body (R = 0) that is Beer and Lambert's e. The arrays are
+    broadcast.
+
+    Args:
+        fade: 1/m, of light far inside; `cloud`: R, what a half space of it returns (`two_fluxes`).
+        inside: share of even light that the surface throws back (`held_inside`).
+        depth: m, 0 or more.
+    """
+    left, r = np.exp(-fade * depth), cloud * cloud
+    return (1.0 - r) * left / np.maximum(1.0 - r * left * left - inside * cloud * (1.0 - left * left), 1e-30)
+
+
+def shown_of_cloud(
+    fade: Float[np.ndarray, "*c"], cloud: Float[np.ndarray, "*c"], inside: float, depth: Float[np.ndarray, "*n"]
+) -> Float[np.ndarray, "*n"]:
+    """How much of the colour of a deep body (`deep_color`) `depth` metres of it have before black, 0 to 1.
+
+    Of two fluxes R_d / R = (1 - e^2) / (1 - R^2 e^2) with e = exp(-fade depth) returns; the surface throws a share
+    `inside` of that back, again and again. Arguments otherwise as of `passed`.
+    """
+    left = np.exp(-2.0 * fade * depth)
+    part = (1.0 - left) / np.maximum(1.0 - cloud * cloud * left, 1e-30)
+    return part * (1.0 - inside * cloud) / (1.0 - inside * cloud * part)
+
+
+def cloud_seen(
+    fluxes: tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]],
+    extinction: Float[np.ndarray, " c"],
+    inside: float,
+    depth: Float[np.ndarray, "n 1"],
+    free: Float[np.ndarray, "n 1"],
+) -> tuple[Float[np.ndarray, "n c"], Float[np.ndarray, "n c"], Float[np.ndarray, "n c"]]:
+    """What is seen of `depth` metres of a cloudy body, straight on: the share of what is behind that comes straight
+    through, the share that is scattered forward, and how much of the body's own colour shows (1: that of a deep one).
+
+    A ray of sight, followed backwards, is scattered or not. What is scattered meets surfaces from inside, of which each
+    throws a share `inside` back. Where the body rests on something (free 0) that is its near surface, and the rest of
+    the light is `passed`. Else (free 1) it is both: f and b of what reaches the near and the far one end up before it.
+
+    Args:
+        fluxes: fading (1/m) and cloud (`two_fluxes`).
+        extinction: 1/m.
+        inside, depth: as of `passed`.
+        free: of its far side, 0 to 1.
+    """
+    fade, cloud = fluxes
+    left = np.exp(-fade * depth)
+    many = np.maximum(1.0 - (cloud * left) ** 2, 1e-30)
+    through, back = (1.0 - cloud**2) * left / many, cloud * (1.0 - left * left) / many
+    straight = np.minimum(np.exp(-extinction * depth), through)
+    near = 1.0 - inside * back
+    # what surfaces throw back runs at a slant: even light goes twice the depth (Kubelka's K = 2 a)
+    twice = left * left
+    many = np.maximum(1.0 - (cloud * twice) ** 2, 1e-30)
+    slanted, again = (1.0 - cloud**2) * twice / many, 1.0 - inside * cloud * (1.0 - twice * twice) / many
+    f = (1.0 - inside) * again / (again * again - (inside * slanted) ** 2)
+    b = inside * slanted / again * f
+    haze = (1.0 - free) * (through / near - straight) + free * ((through - straight) * f + back * b)
+    own = (1.0 - free) * (1.0 - inside) * back / near + free * (back * f + (through - straight) * b)
+    return straight, haze, own * (1.0 - inside * cloud) / ((1.0 - inside) * np.maximum(cloud, 1e-30))
+
+
+def two_fluxes(
+    extinction: Float[np.ndarray, " c"], color: Float[np.ndarray, " c"], refractive_index: float = 1.0
+) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:
+    """Fading (1/m) and cloud (R, what a half space returns under its surface) of a body of an extinction (1/m) whose
+    colour (linear) when deep is known.
+
+    Of light that is scattered half goes on, so that light fades by less than the extinction: along a path by
+    K (1 + R) / (1 - R), where K is what is absorbed. Both follow from `scattering_share`.
+    """
+    c = np.clip(np.asarray(color, float), 0.0, WHITEST)
+    share, inside = scattering_share(c, refractive_index), held_inside(refractive_index)
+    cloud = c / (1 - inside + inside * c)
+    absorbed = np.asarray(extinction, float) * (1.0 - share)
+    return absorbed * (1.0 + cloud) / (1.0 - cloud), cloud
 
 
 def deep_color(

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from fluidlift.look.inflow import surface_level
+from fluidlift.look.inflow import columns_of, surface_level
 from fluidlift.look.outlet_section import OpenEnd
 from fluidlift.numerics.ground_block import PARTS
 from fluidlift.types import (
@@ -60,11 +60,13 @@ class Slab:
         parts, speeds = [fluid], [velocities]
         for end in self.ends:
             way = np.eye(3) - 2.0 * np.outer(end.along, end.along)
-            means = self._image(fluid.means, end)
-            seen = np.flatnonzero(_near_picture(means, camera))
+            may = np.flatnonzero(self._may_be_seen(fluid.means, end, camera))
+            means = self._image(fluid.means[may], end)
+            near = _near_picture(means, camera)
+            means, seen = means[near], may[near]
             # the mirror image of an ellipsoid is one that was turned: its axes have no sign
             turned = quat_from_matrix(-way @ matrix_from_quat(fluid.quats[seen]))
-            image = replace(fluid.select(seen), means=means[seen].astype(fluid.means.dtype), quats=turned)
+            image = replace(fluid.select(seen), means=means.astype(fluid.means.dtype), quats=turned)
             parts.append(replace(image, quats=image.quats.astype(fluid.quats.dtype)))
             speeds.append((velocities[seen] @ way).astype(velocities.dtype))
         return concatenate(parts), np.concatenate(speeds)
@@ -113,22 +115,29 @@ class Slab:
             image[:, 2] -= 2.0 * (self._level(points) - self._level(foot))
         return image
 
+    def _may_be_seen(self, points: np.ndarray, end: OpenEnd, camera: PinholeCamera) -> np.ndarray:
+        """bool [n]: the image of a point behind an end may lie near the picture. Which of them do says `_near_picture`;
+        of most it can be told without the levels, by the most that these move an image up or down."""
+        image = points - 2.0 * (points @ end.along - end.at)[:, None] * end.along
+        moved = 0.0 if self._columns is None else 2.0 * float(np.ptp(self._columns[1]))
+        return _near_picture(image, camera, upward=moved)
+
     @cached_property
     def _columns(self) -> tuple[cKDTree, np.ndarray] | None:
         """Columns of the liquid at rest, and the height (m) of each."""
         if self.still is None or not len(self.still) or not self.ends:
             return None
         spacing, still = self.ends[0].spacing, np.asarray(self.still, np.float64)
-        places = np.unique(np.floor(still[:, :2] / spacing), axis=0)
-        places = (places + 0.5) * spacing
+        places = (columns_of(still, spacing)[0] + 0.5) * spacing
         return cKDTree(places), surface_level(still, spacing)(places)
 
     def _level(self, points: np.ndarray) -> np.ndarray:
         """z (m) of the liquid at rest at places."""
         assert self._columns is not None
         columns, heights = self._columns
-        nearest = columns.query(points[:, :2], k=min(LEVELS, len(heights)))[1]
-        return heights[nearest.reshape(len(points), -1)].mean(axis=1)
+        count = min(LEVELS, len(heights))
+        nearest = columns.query(points[:, :2], k=count, workers=-1)[1]
+        return heights[nearest.reshape(len(points), count)].mean(axis=1)
 
     def islands(self, ground: TriangleMesh, grid: Grid) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
         """Heights (m) of a block of ground over its nodes, the level of the liquid there, and bool: what stands out of
@@ -155,8 +164,15 @@ def _heights(ground: TriangleMesh, grid: Grid) -> np.ndarray | None:
     return top[..., 2] if np.allclose(top[0, 0, :2], grid.low[:2], atol=1e-3 * grid.spacing) else None
 
 
-def _near_picture(points: np.ndarray, camera: PinholeCamera) -> np.ndarray:
-    """bool [n]: in the picture or close to its rim."""
-    uv, depth = camera.project(points)
-    room = MARGIN * max(camera.size)
-    return (depth > 0) & (uv > -room).all(axis=-1) & (uv < np.array(camera.size) + room).all(axis=-1)
+def _near_picture(points: np.ndarray, camera: PinholeCamera, upward: float = 0.0) -> np.ndarray:
+    """bool [n]: in the picture or close to its rim. upward: m by which points may be moved up or down, to where it is
+    asked whether any place on the way is."""
+    pose, (width, height), room = camera.camera_from_world, camera.size, MARGIN * max(camera.size)
+    seen, (fx, fy), (cx, cy) = pose.points(points), camera.focal, camera.center
+    # each side of the picture is a plane through the eye, on whose inner side these are positive
+    sides = np.array([
+        [0.0, 0.0, 1.0], [fx, 0.0, cx + room], [-fx, 0.0, width + room - cx], [0.0, fy, cy + room],
+        [0.0, -fy, height + room - cy],
+    ])  # fmt: skip
+    reach = upward * np.abs(sides @ np.asarray(pose.rotation, np.float64)[:, 2])
+    return np.asarray((seen @ sides.T + reach > 0.0).all(axis=-1))

@@ -19,6 +19,7 @@ from fluidlift.look.liquid import LiquidSurface
 from fluidlift.look.project import sound
 from fluidlift.look.smoothstep import smoothstep
 from fluidlift.look.solid_contact import carried_on
+from fluidlift.look.transparent_kernels import far_normals, rated
 from fluidlift.numerics.nearest import nearest
 from fluidlift.numerics.sharing import shared
 from fluidlift.numerics.splatting import Bins, Projected, View, bin_tiles, project
@@ -113,8 +114,9 @@ def splat_surface(
     if not far_side:  # it lies on the ground
         return seen if ground is None else carried_on(seen, np.asarray(ground, np.float32), camera, REACH * spacing)
     _, skin = splatted_thickness(g, features[:, :3], camera, volume, SKIN * spacing, far=True, wall=wall)
-    away = camera.rays(camera.pixel_grid())
-    return replace(seen, back_normal=_facing(skin[..., 2:5], away / np.linalg.norm(away, axis=-1, keepdims=True)))
+    back = np.empty((height, width, 3), np.float32)
+    far_normals(skin, _eye(camera), LEANING, back)
+    return replace(seen, back_normal=back)
 
 
 def _even(
@@ -294,20 +296,35 @@ def _surface(
     total: np.ndarray, skin: np.ndarray, camera: PinholeCamera, spacing: float, ground: np.ndarray | None
 ) -> LiquidSurface:
     """Sums along the rays to the surface that they make."""
+    covered, depth = np.empty_like(total), np.empty_like(total)
+    normal, albedo = (np.empty((*total.shape, 3), np.float32) for _ in range(2))
+    numbers = np.array([*(spacing * share for share in COVERED), *AWAY, LEANING])
+    rated(total, skin, _eye(camera), numbers, covered, depth, normal, albedo)
+    thickness = np.where(covered > 0, _even(total, depth, camera, spacing, ground), 0.0)
+    return LiquidSurface(np.maximum(depth, 0.0), normal, thickness, albedo, covered, grain=FILM * spacing)
+
+
+def _eye(camera: PinholeCamera) -> tuple[np.ndarray, np.ndarray]:
+    lens = np.array([*camera.focal, *camera.center], np.float64)
+    return lens, np.ascontiguousarray(camera.camera_from_world.rotation, np.float64)
+
+
+def rated_plain(
+    total: Float[np.ndarray, "h w"], skin: Float[np.ndarray, "h w 8"], camera: PinholeCamera, spacing: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Cover, depth (m), normal and colour of a surface, from metres of liquid on each ray and sums over its skin
+    (`splatted_thickness`): the twin of `transparent_kernels.rated`, for reading."""
     rays = camera.rays(camera.pixel_grid())
     away = np.linalg.norm(rays, axis=-1)
-    rim = smoothstep(_cosine(skin[..., 2:5], -rays / away[..., None]), *AWAY)
+    toward = -rays / away[..., None]
+    rim = smoothstep(_cosine(skin[..., 2:5], toward), *AWAY)
     covered = smoothstep(total / spacing, *COVERED) * rim
     found = np.maximum(skin[..., 0], 1e-12)
     there = covered > 0
     # half of the skin lies before its middle; metres along the ray are more than those of camera z
     depth = np.where(there, skin[..., 1] / found - 0.5 * skin[..., 0] / away, 0.0)
-    toward = -rays / away[..., None]
-    normal = _facing(skin[..., 2:5], toward)
     albedo = np.clip(skin[..., 5:8] / found[..., None], 0.0, 1.0) * there[..., None]
-    even = _even(total, depth, camera, spacing, ground)
-    thickness = np.where(there, even, 0.0)
-    return LiquidSurface(np.maximum(depth, 0.0), normal, thickness, albedo, covered, grain=FILM * spacing)
+    return covered, depth, facing_plain(skin[..., 2:5], toward), albedo
 
 
 def _cosine(vectors: np.ndarray, toward: np.ndarray) -> np.ndarray:
@@ -315,7 +332,7 @@ def _cosine(vectors: np.ndarray, toward: np.ndarray) -> np.ndarray:
     return np.einsum("hwk,hwk->hw", _unit(vectors, toward), toward)
 
 
-def _facing(vectors: np.ndarray, toward: np.ndarray) -> np.ndarray:
+def facing_plain(vectors: np.ndarray, toward: np.ndarray) -> np.ndarray:
     """Unit normals on the side of `toward`, at least by `LEANING`."""
     normal = _unit(vectors, toward)
     cosine = np.clip(np.einsum("hwk,hwk->hw", normal, toward), -1.0, 1.0)[..., None]

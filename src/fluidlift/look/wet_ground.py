@@ -11,6 +11,7 @@ import math
 from dataclasses import replace
 from functools import lru_cache
 
+import numba as nb
 import numpy as np
 from jaxtyping import Float
 
@@ -18,7 +19,7 @@ from fluidlift.look.environment_stack import fading
 from fluidlift.look.liquid import Behind, LiquidSurface
 from fluidlift.look.liquid_kernels import CLOSED, RESTS, ROOM
 from fluidlift.look.materials import Material
-from fluidlift.look.optics import fresnel, wet_light, wet_table
+from fluidlift.look.optics import fresnel, held_inside, wet_light, wet_table
 from fluidlift.look.smoothstep import eased, smoothstep
 from fluidlift.numerics.sharing import shared
 from fluidlift.types.camera import PinholeCamera
@@ -53,11 +54,12 @@ def wetted(
     """
     image = behind.image.copy()
     pose = np.ascontiguousarray(camera.camera_from_world.rotation, np.float64)
-    extinction = np.asarray(material.absorption, np.float64) + material.scattering
+    held = held_inside(float(material.refractive_index))
+    fluxes = np.stack([*material.fluxes, np.full(3, held)])
     dampen(
         (surface.covered, surface.depth, surface.normal, surface.thickness, float(surface.grain)),
         (behind.depth, *(np.ascontiguousarray(g, np.float32) for g in ground)),
-        np.array([*camera.focal, *camera.center, *(1.0 / f for f in camera.focal)], np.float64), pose, extinction,
+        np.array([*camera.focal, *camera.center, *(1.0 / f for f in camera.focal)], np.float64), pose, fluxes,
         np.stack(wet_table(float(material.refractive_index))), _slants(float(material.refractive_index)), shaded,
         np.zeros((0, 0, 4), np.float32) if behind.direct is None else np.asarray(behind.direct, np.float32), image,
     )  # fmt: skip
@@ -73,13 +75,29 @@ def _slants(index: float) -> np.ndarray:
     return np.stack([enters / index**2, 1.0 / np.sqrt(np.maximum(1.0 - (1.0 - cos**2) / index**2, 1e-6)), enters])
 
 
+@nb.njit(cache=True, inline="always")
+def _under_cloud(depth, cloud, held, back):
+    """How many times more light gets through a cloudy layer than fades over its depth (fading times m); and the share
+    of the ground's own light that comes back to it, from the cloud, and `back` from the surface of a clear layer.
+    cloud, held: as of `optics.passed`."""
+    if cloud <= 0.0:
+        return 1.0, back
+    twice, r = math.exp(-2.0 * depth), cloud * cloud
+    many = max(1.0 - r * twice, 1e-30)
+    thrown, through = cloud * (1.0 - twice) / many, (1.0 - r) / many
+    again = 1.0 / (1.0 - held * thrown)
+    return through * again, thrown + back * through * through * again
+
+
 @shared(lambda liquid, *_: (0, liquid[1].shape[0]), error_model="numpy")
-def dampen(lead, stop, liquid, ground, lens, pose, extinction, table, slants, shaded, direct, image):
+def dampen(lead, stop, liquid, ground, lens, pose, fluxes, table, slants, shaded, direct, image):
     """`wetted_plain`, pixel by pixel. liquid: covered, depth, normal, thickness, grain; ground: depth of what is
-    behind, albedo and depth of the ground alone; table: of `optics.wet_table`; slants: of `_slants`;
+    behind, albedo and depth of the ground alone; fluxes: fading (1/m) and cloud (`Material.fluxes`), and what the
+    surface holds inside; table: of `optics.wet_table`; slants: of `_slants`;
     direct: of `Behind`, or empty."""
     covered, near, normals, thickness, grain = liquid
     behind, albedo, own = ground
+    extinction, cloud, held = fluxes[0], fluxes[1], fluxes[2, 0]
     last = table.shape[1] - 1
     # the table is even in the roots of depths, and the root of a product is that of its factors
     roots = last * np.sqrt(extinction / table[0, -1])
@@ -119,8 +137,9 @@ def dampen(lead, stop, liquid, ground, lens, pose, extinction, table, slants, sh
                 part = at - low
                 arrives = table[1, low] + part * (table[1, low + 1] - table[1, low])
                 back = table[2, low] + part * (table[2, low + 1] - table[2, low])
+                through, back = _under_cloud(extinction[k] * height, cloud[k], held, back)
                 if not shaded:
-                    arrives *= table[3, low] + part * (table[3, low + 1] - table[3, low])
+                    arrives *= (table[3, low] + part * (table[3, low + 1] - table[3, low])) * through
                 color = np.float64(albedo[i, j, k]) if same else ALBEDO
                 first, light = 0.0, np.float64(image[i, j, k])
                 if direct.shape[0] > 0:
@@ -128,7 +147,7 @@ def dampen(lead, stop, liquid, ground, lens, pose, extinction, table, slants, sh
                     if shaded:  # by a straight way, and less what is mirrored straight on
                         way = math.exp(min(depth * (straight - longer), MOST)) / straight_in
                     else:
-                        way = fading(depth * longer)
+                        way = fading(depth * longer) * through
                     first, light = first * enters * way, light - first
                 wet = (light * arrives + first) / (1.0 - color * back)
                 image[i, j, k] += share * (wet - image[i, j, k])
@@ -149,8 +168,16 @@ def wetted_plain(
     albedo, depth = ground
     own = np.abs(behind.depth[wet] - depth[wet]) <= 1e-4 * depth[wet]
     color = np.where(own[:, None], albedo[wet], ALBEDO)
-    thick = height[wet, None] * (np.asarray(material.absorption) + material.scattering)
+    fade, cloud = material.fluxes
+    thick = height[wet, None] * fade
     arrives, back, straight = wet_light(thick, material.refractive_index)
+    # a cloud lets more through than fades, sends some back to the ground, and holds up what the surface throws back
+    many = 1.0 - cloud**2 * np.exp(-2.0 * thick)
+    through, thrown = (1.0 - cloud**2) / many, cloud * (1.0 - np.exp(-2.0 * thick)) / many
+    again = 1.0 / (1.0 - held_inside(float(material.refractive_index)) * thrown)
+    back = thrown + back * through**2 * again
+    through = through * again
+    straight = straight * through
     image = behind.image.copy()
     dry, first = image[wet], np.zeros((int(wet.sum()), 3))
     even = dry
@@ -160,7 +187,7 @@ def wetted_plain(
         even = dry - first
         index = material.refractive_index
         bent = np.sqrt(1.0 - (1.0 - slant**2) / index**2)
-        way = np.exp(-thick / bent)
+        way = np.exp(-thick / bent) * through
         if shaded:
             way = np.exp(np.minimum(thick / slant - thick / bent, MOST)) / (1.0 - fresnel(np.ones(1), index))
         first = first * way * (1.0 - fresnel(slant, index)) / index**2

@@ -42,8 +42,8 @@ ROOT = Path(fluidlift.__file__).parent
 MENTIONED = re.compile("|".join(f"[\"']{name}[\"']|{name.upper()}" for name in KINDS))
 """in the source of a file that is worth a closer look"""
 MAY_NAME = ("types/kind.py", "shape/kinds/")
-MAY_TABULATE = ("shape/kind.py", "synthetic/")
-"""the classifier's belief in each kind, and made scenes, which bear such names too"""
+MAY_TABULATE = ("shape/kind_weights.py", "synthetic/")
+"""what speaks for each kind, and made scenes, which bear such names too"""
 
 
 def is_named(node: ast.AST) -> bool:

@@ -123,7 +123,7 @@ def estimate_kind(
     f["followed"] *= 1.0 - f["spreading"]
     f["thrown"] = 0.0 if ways is None else thrown_up(ways) * f["followed"]
     f["returning"] *= 1.0 - f["thrown"]  # what rises comes back as well
-    wet = fluid.any(axis=0)
+    wet = np.any(fluid, axis=0)
     f["contained"] = max((rim.share_inside(wet) for rim in rims), default=0.0)
     weighed = terms(f, pitch)
     values = np.array([sum(w * weighed[term] for term, w in WEIGHTS[kind].items()) for kind in KINDS])

@@ -34,6 +34,7 @@ from fluidlift.config import build_config
 from fluidlift.io.video import probe, read_clip, write_video
 from fluidlift.pipeline import Inputs
 from fluidlift.pipeline.find import View, find_hints
+from fluidlift.synthetic.demo import demo_clip
 
 SECONDS = 1.2
 """of a clip that are looked at"""
@@ -62,6 +63,8 @@ CROPPED = 2 / 3
 """of either side of a picture, in a crop of it"""
 ENOUGH = 0.5
 """of the fluid, that a crop should show"""
+CASES = {"honey": "stream", "pisco": "stream", "river": "stream", "smoke": "plume"}
+"""of another simulator, and a surveyed river"""
 CUT = {"dyntex_fountain": "fountain fall"}
 """what parts of pictures show where it is something else: without its top a fountain cannot be told from a fall"""
 DRAWN = 40
@@ -226,8 +229,12 @@ def real_subjects(shared: Path, work: Path, window: str, seed: int | None) -> It
                 )
 
 
-def made_subjects(work: Path) -> Iterator[Subject]:
-    """Clips of the package."""
+def made_subjects(shared: Path | None, work: Path) -> Iterator[Subject]:
+    """Clips of the package, and the cases, where they are there."""
+    yield Subject("demo", "made", "stream", demo_clip)
+    for name, shows in CASES.items():
+        for video in () if shared is None else shared.glob(f"cases/{name}/video.mp4"):
+            yield Subject(f"case {name}", "made", shows, lambda v=video: v)
     for name, (shows, frames) in made_clips().items():
         out = work / f"{name.replace(' ', '_')}.mp4"
         yield Subject(name, "made", shows, lambda f=frames, o=out: write_video(o, *f(), quality=14, repeatable=True))
@@ -250,7 +257,9 @@ def main() -> int:
         raise SystemExit("no clips: set FLUIDLIFT_SHARED")
     wanted.work.mkdir(parents=True, exist_ok=True)
     subjects = (
-        made_subjects(wanted.work) if wanted.made else real_subjects(shared, wanted.work, wanted.window, wanted.crops)
+        made_subjects(shared, wanted.work)
+        if wanted.made
+        else real_subjects(shared, wanted.work, wanted.window, wanted.crops)
     )
     clips, looks = [], []
     for s in subjects:

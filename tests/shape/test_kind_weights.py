@@ -27,11 +27,11 @@ def rows(fit):
 
 
 def test_the_weights_of_the_package_are_fitted(fit, rows):
-    found = fit.fitted(rows, fit.by_hand(rows.terms))
+    found = fit.SHARPNESS * fit.fitted(rows, fit.by_hand(rows.terms))
     kept = np.array([[WEIGHTS[kind].get(term, 0.0) for term in rows.terms] for kind in KINDS])
     assert set(rows.terms) >= {term for weights in WEIGHTS.values() for term in weights}
     np.testing.assert_allclose(kept, found, atol=fit.LEAST + 0.005)  # smaller ones are left out; two decimals
-    assert np.abs(found - fit.by_hand(rows.terms)).max() > 0.15, "the clips say something"
+    assert np.abs(found - fit.SHARPNESS * fit.by_hand(rows.terms)).max() > 0.15, "the clips say something"
 
 
 def test_a_clip_counts_once_however_often_it_was_looked_at(fit, rows):

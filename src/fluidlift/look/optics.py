@@ -79,8 +79,11 @@ def transmittance(
 
 
 def passed(
-    fade: Float[np.ndarray, "*c"], cloud: Float[np.ndarray, "*c"], inside: float, depth: Float[np.ndarray, "*n"]
-) -> Float[np.ndarray, "*n"]:
+    fade: Float[np.ndarray, " c"],
+    cloud: Float[np.ndarray, " c"],
+    inside: float,
+    depth: float | Float[np.ndarray, "..."],
+) -> Float[np.ndarray, "... c"]:
     """Share of light that gets through `depth` metres of a cloudy body, straight on or scattered forward.
 
     Two fluxes of light, one each way (Kubelka and Munk 1931; Kubelka 1948): T = (1 - R^2) e / (1 - R^2 e^2) with
@@ -98,8 +101,11 @@ def passed(
 
 
 def shown_of_cloud(
-    fade: Float[np.ndarray, "*c"], cloud: Float[np.ndarray, "*c"], inside: float, depth: Float[np.ndarray, "*n"]
-) -> Float[np.ndarray, "*n"]:
+    fade: Float[np.ndarray, " c"],
+    cloud: Float[np.ndarray, " c"],
+    inside: float,
+    depth: float | Float[np.ndarray, "..."],
+) -> Float[np.ndarray, "... c"]:
     """How much of the colour of a deep body (`deep_color`) `depth` metres of it have before black, 0 to 1.
 
     Of two fluxes R_d / R = (1 - e^2) / (1 - R^2 e^2) with e = exp(-fade depth) returns; the surface throws a share

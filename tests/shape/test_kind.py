@@ -363,3 +363,16 @@ def test_what_lies_in_a_vessel_is_hardly_a_stream():
     assert odds[0] > 8.0 * odds[1] and plain["basin"] < seen["basin"] > seen["fall"], (plain, seen)
     beside = Ellipse((20.0, 20.0), rim.covariance / 16.0, 1.0)
     assert estimate_kind(frames, masks, *flow, rims=(beside,)).scores == plain
+
+
+def test_what_rises_as_a_whole_has_edges_where_it_is_a_liquid_and_none_where_it_is_smoke():
+    """A jet whose pattern moves by more than itself between two frames seems to go up."""
+    rng = np.random.default_rng(0)
+    frames, *rest = scene((np.abs(COL - 80) < 9) & (ROW < 70), (0.0, -3.0), GREY)
+    scores = []
+    for grain in (0.7, 8.0):  # px
+        pattern = gaussian_filter(rng.normal(size=(T, H, W)), (0.0, grain, grain))
+        drawn = np.clip(frames + 30.0 * (pattern / pattern.std() * rest[0])[..., None], 0, 255).astype(np.uint8)
+        found = estimate_kind(drawn, *rest)
+        scores.append((round(found.features["sharp"]), found.scores["pour"] > found.scores["plume"]))
+    assert scores == [(1, True), (0, False)]

@@ -46,7 +46,7 @@ IN_VESSEL = 0.1
 falls, seas and plumes none has a rim, of ten pours and pots four do"""
 SHARP = (6.0, 10.0)
 """grey levels of detail (`detail`) up to which a body may have no surface, and from which it has one. Smoke and steam
-have 4 to 8 in 13 looks at four clips, jets whose pattern seems to rise 9 to 24 in seven looks at three"""
+have 4 to 8 in ten looks at four clips, jets whose pattern seems to rise 9 to 24 in five looks at three"""
 FINE = 1.0 / 160.0
 """of the picture's longer side, standard deviation of the bell that takes what is coarse from it: 2 px of 320"""
 FEWEST_PAIRS = 12

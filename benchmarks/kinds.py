@@ -158,19 +158,15 @@ def write(clips: Sequence[Judged], figures: dict[str, float], command: str) -> N
 
 def made_clips() -> dict[str, tuple[str, Callable[[], tuple[np.ndarray, float]]]]:
     """Name, kinds, and what gives the pictures and the frames per second, of clips made by the package."""
-    from fluidlift.synthetic.clear_stream import ClearStream, film_of_bed
+    from fluidlift.synthetic.clear_stream import CAMERAS, ClearStream, film_of_bed
     from fluidlift.synthetic.fountain import FRAME_RATE, filmed_airborne
     from fluidlift.synthetic.hand_pour import hand_pour
     from fluidlift.synthetic.record import record
     from fluidlift.synthetic.riverside import Riverside, film, walk
     from fluidlift.synthetic.scenes import scene_of
-    from fluidlift.types import PinholeCamera
-
-    steep = PinholeCamera.looking((0.0, -2.6, 4.5), (0.0, 0.0, 0.0), 50.0, (192, 128))
-    oblique = PinholeCamera.looking((0.0, -5.0, 2.8), (0.0, 0.3, 0.0), 40.0, (192, 128))
 
     def bed(seed: int) -> np.ndarray:
-        return film_of_bed(ClearStream.make(seed), (steep, oblique)[seed], FRAMES).frames
+        return film_of_bed(ClearStream.make(seed), tuple(CAMERAS.values())[seed], FRAMES).frames
 
     def simulated(name: str, seed: int) -> tuple[np.ndarray, float]:
         scene = scene_of(name, size=(240, 176), seed=seed, cells=48)

@@ -8,14 +8,9 @@ import numpy as np
 
 from fluidlift.shape.ground_mesh import ground_mesh
 from fluidlift.shape.seen_bed import StillLayer, still_layer
-from fluidlift.synthetic.clear_stream import ClearStream, FilmedBed, film_of_bed
+from fluidlift.synthetic.clear_stream import CAMERAS, ClearStream, FilmedBed, film_of_bed
 from fluidlift.types import Grid, PinholeCamera, TriangleMesh
 
-CAMERAS = {
-    "steep": PinholeCamera.looking((0.0, -2.6, 4.5), (0.0, 0.0, 0.0), 50.0, (192, 128)),
-    "oblique": PinholeCamera.looking((0.0, -5.0, 2.8), (0.0, 0.3, 0.0), 40.0, (192, 128)),
-}
-"""they look down by 60 and by 28 degrees"""
 GRID = Grid((40, 44, 16), 0.1, (-2.0, -2.2, -1.0))
 
 

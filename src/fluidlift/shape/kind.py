@@ -42,8 +42,8 @@ ALL_RISES = (0.8, 0.95)
 moves by more than itself between two frames, and seems to go any way: up to 0.74 of it rises in seven pours, 0.98 to 1
 in smoke and in steam"""
 IN_VESSEL = 0.1
-"""share of the fluid within one rim from which it is in a vessel: splashes and jets are beside it. Of 30 real streams,
-falls, seas and plumes none has a rim, of ten pours and pots four do"""
+"""share of the fluid within one rim from which it is in a vessel: splashes and jets are beside it. Of 25 real streams,
+falls, seas and plumes none has a rim, of nine pours and pots four do"""
 SHARP = (6.0, 10.0)
 """grey levels of detail (`detail`) up to which a body may have no surface, and from which it has one. Smoke and steam
 have 4 to 8 in ten looks at four clips, jets whose pattern seems to rise 9 to 24 in five looks at three"""

@@ -28,6 +28,11 @@ GLOSS = 0.02
 """standard deviation of those slopes"""
 FOAM = np.array([0.75, 0.77, 0.78])
 """linear, of what drifts on the opaque twin"""
+CAMERAS = {
+    "steep": PinholeCamera.looking((0.0, -2.6, 4.5), (0.0, 0.0, 0.0), 50.0, (192, 128)),
+    "oblique": PinholeCamera.looking((0.0, -5.0, 2.8), (0.0, 0.3, 0.0), 40.0, (192, 128)),
+}
+"""they look down by 60 and by 28 degrees"""
 
 
 @dataclass(frozen=True)

@@ -67,7 +67,7 @@ class Shown:
         from fluidlift.backends.warp_device import warp_device
         from fluidlift.backends.warp_liquid import WarpLiquids
         from fluidlift.errors import FluidliftError
-        from fluidlift.numerics.splatting import View
+        from fluidlift.numerics.splatting import SplatCamera
         from fluidlift.numerics.splatting_torch import NumbaRasterizer
         from fluidlift.physics.numba_particles import ParticleWork
         from fluidlift.types import Gaussians
@@ -89,7 +89,7 @@ class Shown:
         low, high = tank.grid.low, tank.grid.high
         away, turn = 1.5 * float((high - low).max()), np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
         place = -turn @ (0.5 * (low + high) - [0.0, away, 0.0])
-        self.view = View(turn, place, (1000.0, 1000.0), (640.0, 360.0), (1280, 720))
+        self.view = SplatCamera(turn, place, (1000.0, 1000.0), (640.0, 360.0), (1280, 720))
         self.simulator = tank.simulator(work=ParticleWork(liquid=WarpLiquids(device)))
 
     def settled(self) -> None:

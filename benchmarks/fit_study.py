@@ -30,7 +30,7 @@ import numpy as np
 import torch
 from fit_twins import CONDITIONS, SCENES, fit_twin, per_cent, recoveries, table, tell, true_value, twin_of
 
-from fluidlift.fit.loss import LossWeights
+from fluidlift.fit.loss import VelocityLossWeights
 from fluidlift.physics.rollout import RolloutParameters, rollout
 from fluidlift.synthetic.twins import PLANS, Twin
 from fluidlift.types import CellType, FaceVelocity, FitResult, FluidParameters
@@ -38,13 +38,13 @@ from fluidlift.types import CellType, FaceVelocity, FitResult, FluidParameters
 NOISY = CONDITIONS[1]
 SEEN, HORIZON = 10, 6
 """frames that the fit sees, and that follow"""
-L2_ONLY = LossWeights(direction=0.0)
+L2_ONLY = VelocityLossWeights(direction=0.0)
 VARIANTS: dict[str, dict[str, Any]] = {
     "full loss": {},
     "without direction": {"weights": L2_ONLY},
-    "without magnitude": {"weights": LossWeights(direction=1.0, magnitude=0.0)},
-    "all cells weigh the same": {"weights": LossWeights(occupied=1.0)},
-    "surface cells only": {"weights": LossWeights(occupied=0.0)},
+    "without magnitude": {"weights": VelocityLossWeights(direction=1.0, magnitude=0.0)},
+    "all cells weigh the same": {"weights": VelocityLossWeights(occupied=1.0)},
+    "surface cells only": {"weights": VelocityLossWeights(occupied=0.0)},
     "one window": {"windows": 1},
     "windows of one frame": {"frames_per_window": 1},
     "last frame of windows only": {"compare": "last"},

@@ -33,7 +33,7 @@ from clips import default_shared
 from fluidlift.config import build_config
 from fluidlift.io.video import probe, read_clip, write_video
 from fluidlift.pipeline import Inputs
-from fluidlift.pipeline.find import View, find_hints
+from fluidlift.pipeline.find import FoundView, find_hints
 from fluidlift.synthetic.demo import demo_clip
 
 SECONDS = 1.2
@@ -111,7 +111,7 @@ def calibration(clips: Sequence[Judged]) -> dict[str, float]:
     }
 
 
-def found(video: Path, folder: Path, size: int, window: str) -> View:
+def found(video: Path, folder: Path, size: int, window: str) -> FoundView:
     """Mask, kind and tilt as `make` finds them."""
     info = probe(video)
     seconds = min(SECONDS, info.duration)

@@ -24,7 +24,7 @@ from scipy import ndimage
 from fluidlift.backends.mitsuba_renderer import MitsubaRenderer
 from fluidlift.backends.mitsuba_scene import FinalScene, described
 from fluidlift.look.environment import Environment
-from fluidlift.look.liquid import Behind, LiquidSurface, shaded
+from fluidlift.look.liquid import Behind, SurfaceBuffer, shaded
 from fluidlift.look.materials import Material
 from fluidlift.look.screen_space import mesh_surface
 from fluidlift.look.transparent import splat_surface
@@ -141,18 +141,18 @@ def traced(body: Body, camera: PinholeCamera, kind: str, material: Material, aro
     return np.asarray(mi.render(mi.load_dict(parts), spp=samples, seed=1))[..., :3]
 
 
-def surfaces(body: Body, camera: PinholeCamera) -> dict[str, LiquidSurface]:
+def surfaces(body: Body, camera: PinholeCamera) -> dict[str, SurfaceBuffer]:
     """The body as both quick ways see it."""
     splats = splat_surface(body.gaussians, body.normals, camera, volume=SPACING**3)
     return {"mesh": mesh_surface(body.mesh, camera), "splats": splats}
 
 
-def straight(exact: LiquidSurface, scene: Behind, material: Material) -> np.ndarray:
+def straight(exact: SurfaceBuffer, scene: Behind, material: Material) -> np.ndarray:
     """The picture without refraction and mirror."""
     return scene.image * np.exp(-exact.thickness[..., None] * np.asarray(material.absorption))
 
 
-def silhouette(exact: LiquidSurface, pixels: int = 2) -> np.ndarray:
+def silhouette(exact: SurfaceBuffer, pixels: int = 2) -> np.ndarray:
     """bool [h,w]: inside the outline by some pixels."""
     return ndimage.binary_erosion(exact.covered > 0.99, iterations=pixels)
 

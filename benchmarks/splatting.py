@@ -28,7 +28,7 @@ import torch
 from page_section import replace_section
 
 from fluidlift.errors import FluidliftError
-from fluidlift.numerics.splatting import View, bin_tiles, project, rasterize
+from fluidlift.numerics.splatting import SplatCamera, bin_tiles, project, rasterize
 from fluidlift.numerics.splatting_kernels import ALPHA_MAX, ALPHA_MIN
 from fluidlift.numerics.splatting_torch import NumbaRasterizer, ellipses
 from fluidlift.seams import Rasterizer, Splatted, SplatView
@@ -42,7 +42,7 @@ FORWARD = [100_000, 300_000, 1_000_000]
 class Scene:
     """What is drawn."""
 
-    view: View
+    view: SplatCamera
     arrays: tuple[np.ndarray, ...]
     """means, quats, scales, opacities, features"""
 
@@ -59,7 +59,8 @@ class Scene:
         quats = rng.normal(size=(count, 4))
         arrays = means, quats, scales, rng.uniform(0.2, 0.95, count), rng.random((count, 4))
         w, h = size
-        view = View(np.eye(3), np.array([0.0, 0.0, 2.6]), (1.05 * min(size), 1.05 * min(size)), (w / 2, h / 2), size)
+        focal = 1.05 * min(size)
+        view = SplatCamera(np.eye(3), np.array([0.0, 0.0, 2.6]), (focal, focal), (w / 2, h / 2), size)
         return cls(view, tuple(np.ascontiguousarray(a, np.float32) for a in arrays))
 
     def tensors(self, gradients: bool) -> list[torch.Tensor]:
@@ -78,7 +79,7 @@ class TorchRasterizer(Rasterizer):
         features: torch.Tensor, view: SplatView,
     ) -> Splatted:  # fmt: skip
         """See `seams.Rasterizer`."""
-        numbers = View(view.rotation, view.translation, view.focal, view.center, view.size, view.near)
+        numbers = SplatCamera(view.rotation, view.translation, view.focal, view.center, view.size, view.near)
         arrays = [x.detach().numpy() for x in (means, quats, scales, opacities)]
         bins = bin_tiles(project(numbers, *arrays), view.size)
         assert bins.whole is not None

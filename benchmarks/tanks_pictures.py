@@ -26,7 +26,7 @@ from fluidlift.physics.rigid import RigidBody
 from fluidlift.synthetic import tanks
 from fluidlift.synthetic.gauges import Gauge
 from fluidlift.synthetic.paint import SUN, LiquidPaint, lit, to_picture
-from fluidlift.synthetic.surface import Body, body_of, finer
+from fluidlift.synthetic.surface import LiquidDensity, body_of, finer
 from fluidlift.types import Grid, Particles, PinholeCamera
 
 WATER = LiquidPaint(body=(0.02, 0.12, 0.15), absorption=(9.0, 3.5, 2.5))
@@ -79,7 +79,7 @@ def _march(eyes, rays, start, stop, step, level, level_first, level_inverse, sol
 class Stage:
     """What a ray can meet."""
 
-    body: Body
+    body: LiquidDensity
     solid_grid: Grid
     solid: np.ndarray
     """signed distance at the nodes of that grid, bodies included"""

@@ -31,7 +31,7 @@ from pathlib import Path
 import numpy as np
 
 from fluidlift.io.asset_folder import update_manifest
-from fluidlift.pipeline.preview import Wish
+from fluidlift.pipeline.preview import PreviewRequest
 from fluidlift.scene.splat_files import write_frame
 from fluidlift.types import Gaussians
 from fluidlift.viewer.app import Viewer, ViewRequest
@@ -123,7 +123,7 @@ def live(folder: Path, rows: Rows, *, browser: bool) -> None:
 
 def _edit(viewer: Viewer, strength: float, page, sent: list[float]) -> tuple[float, ...]:
     """s to the first changed frame (wall, processor), s until the page says it, frames/s (made, sent), s each."""
-    wish = Wish({"parameters": {"gravity": [0.0, 0.0, -strength]}}, f"gravity {strength:g}")
+    wish = PreviewRequest({"parameters": {"gravity": [0.0, 0.0, -strength]}}, f"gravity {strength:g}")
     began, spent = time.perf_counter(), time.process_time()
     viewer.preview.ask(wish)
     while viewer.preview.shown is None or viewer.preview.shown.wish is not wish:

@@ -29,7 +29,7 @@ from fluidlift.look.whitewater_splats import FilmedFoam
 from fluidlift.physics.whitewater import FOAM, Ground, Whitewater, WhitewaterLaw
 from fluidlift.scene.build import Scene, SimulationRequest, scene_of
 from fluidlift.scene.simulator import simulator_of
-from fluidlift.scene.whitewater import SETTLED, Measured, measured
+from fluidlift.scene.whitewater import SETTLED, MeasuredWhitewater, measured
 
 BLUR = 0.03
 """of the maps before they are compared, shares of the picture's width: that of a patch of foam"""
@@ -78,7 +78,7 @@ def covered(water: Whitewater, camera, cell: float) -> np.ndarray:
     return 1.0 - clear
 
 
-def against_film(scene: Scene, found: Measured, foam: FilmedFoam, frames: int, potentials: bool) -> dict:
+def against_film(scene: Scene, found: MeasuredWhitewater, foam: FilmedFoam, frames: int, potentials: bool) -> dict:
     """As lifted, with white water everywhere, against a film."""
     height, width = foam.places.shape
     camera = scene.camera.resized((width, height))

@@ -3,7 +3,7 @@
 import numpy as np
 
 from fluidlift.look.environment import Environment
-from fluidlift.look.ground_picture import Ground
+from fluidlift.look.ground_picture import GroundMeshes
 from fluidlift.look.liquid import shaded
 from fluidlift.look.materials import Material
 from fluidlift.look.screen_space import mesh_surface
@@ -31,7 +31,7 @@ def floor(albedo: float, half: float = 0.3) -> TriangleMesh:
 
 def drawn(depth: float, albedo: float, material: Material, *, casts: bool = True) -> np.ndarray:
     world = Environment.white()
-    ground = Ground([floor(albedo)], world)
+    ground = GroundMeshes([floor(albedo)], world)
     surface = mesh_surface(slab(depth), CAMERA)
     dry = ground.picture(CAMERA, None, slab(depth) if casts else None, material=material)
     there = ground.albedo(CAMERA), ground.depth(CAMERA)

@@ -84,7 +84,7 @@ def test_a_first_job_says_that_it_compiles_and_leaves_no_process_behind(remember
         return started[-1]
 
     monkeypatch.setattr(kernels, "_worker", worker)
-    monkeypatch.setattr(kernels.os, "cpu_count", lambda: 2)
+    monkeypatch.setattr(kernels, "cores", lambda: 2)  # whatever the machine has, and OMP_NUM_THREADS leaves of it
     said = []
     with contextlib.suppress(RuntimeError), kernels.compiling_beside(said.append):
         raise RuntimeError("the job fails")
@@ -100,3 +100,10 @@ def test_a_first_job_says_that_it_compiles_and_leaves_no_process_behind(remember
 def test_where_nothing_can_be_remembered_nothing_is_compiled_beside(remembered, monkeypatch):
     monkeypatch.setattr(kernels, "_writable", lambda place: False)
     assert kernels.compiled()
+
+
+def test_on_one_processor_nothing_is_compiled_beside(remembered, monkeypatch):
+    monkeypatch.setattr(kernels, "_worker", lambda listed: pytest.fail("the job needs the processor"))
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    with kernels.compiling_beside(pytest.fail):
+        assert not kernels.compiled()

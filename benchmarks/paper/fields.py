@@ -13,7 +13,7 @@ from benchmarks.paper.tiles import Tile, arrows, coloured, sheet
 from benchmarks.paper.workshop import FIRST, Workshop, frames_of
 
 from fluidlift.evaluate.volumes import field_cosine, relative_l2
-from fluidlift.fit.loss import LossWeights
+from fluidlift.fit.loss import VelocityLossWeights
 from fluidlift.fit.optimize import fit_parameters
 from fluidlift.io.asset_folder import load_asset
 from fluidlift.io.kept_values import last_value
@@ -69,7 +69,7 @@ class Clip:
         self.domain = prepare_domain(self.cells, system, mainstream=self.terrain.mainstream, sweeps=5)
         self.wet = self.cells == CellType.FLUID
 
-    def fitted(self, start: FluidParameters, weights: LossWeights | None, restarts: int = 1):
+    def fitted(self, start: FluidParameters, weights: VelocityLossWeights | None, restarts: int = 1):
         """As the pipeline fits, with other weights or from another start."""
         return fit_parameters(
             self.motion.velocities, self.cells, self.terrain, self.grid, self.asset.interval, start,
@@ -104,7 +104,7 @@ def four_fields(shop: Workshop) -> None:
     draws = [random_parameters(start, rng) for _ in range(5)]
     rolled = [clip.simulated(p) for p in draws]
     middle = int(np.argsort([clip.misfit(r)[0] or 0.0 for r in rolled])[2])
-    weights = {"L2 alone": LossWeights(direction=0.0), "full loss": None}
+    weights = {"L2 alone": VelocityLossWeights(direction=0.0), "full loss": None}
     fits = {name: clip.fitted(start, w).parameters for name, w in weights.items()}
     fields = {"video": clip.motion.velocities[1 : AHEAD + 1], "random parameters": rolled[middle]}
     fields |= {name: clip.simulated(p) for name, p in fits.items()}

@@ -13,7 +13,7 @@ import numpy as np
 
 from fluidlift.synthetic.paint import LiquidPaint, smoothstep
 from fluidlift.synthetic.scenes import (
-    Scene,
+    SyntheticScene,
     _moving,
     _seeded,
     _solid_cells,
@@ -34,7 +34,7 @@ Field = Callable[[np.ndarray], np.ndarray]
 class Plan:
     """One example."""
 
-    scene: Callable[[], Scene]
+    scene: Callable[[], SyntheticScene]
     kind: str
     """of the fluid, as `--kind` has it"""
     frames: int
@@ -45,7 +45,7 @@ class Plan:
 def channel(
     name: str, bed: Field, level: Field, shares: Field, *, length: float, width: float, height: float, cells: int,
     parameters: FluidParameters, camera: PinholeCamera, stones: Field | None = None, **looks: Any,
-) -> Scene:  # fmt: skip
+) -> SyntheticScene:  # fmt: skip
     """A liquid that runs along +x over a bed, in at one end and out at the other.
 
     Args:
@@ -60,7 +60,7 @@ def channel(
         parameters: of the liquid; its inflow is the velocity at the start.
         camera: of the film.
         stones: signed distance of rocks, m.
-        looks: further fields of `Scene`.
+        looks: further fields of `SyntheticScene`.
     """
     h = length / cells
     grid = Grid((cells, round(width / h), round(height / h)), h, (-length / 2, -width / 2, 0.0))
@@ -77,13 +77,13 @@ def channel(
     types[open_cell & (centers[..., 0] > grid.high[0] - 2 * h)] = CellType.OUTFLOW
     moving = _moving(positions, volume, parameters, parameters.inflow_velocity)
     told: dict[str, Any] = {"settle": 1.2} | looks
-    return Scene(
+    return SyntheticScene(
         name, "stream", grid, ground, shares, _terrain(solid, grid, (1.0, 0.0, 0.0)), types, parameters, moving,
         volume, camera, **told,
     )  # fmt: skip
 
 
-def rapids() -> Scene:
+def rapids() -> SyntheticScene:
     """A steep brook 2.4 m long between five boulders, 9 cm deep."""
     slope, depth, half = 0.09, 0.10, 0.42
 
@@ -118,7 +118,7 @@ def rapids() -> Scene:
     )  # fmt: skip
 
 
-def fall() -> Scene:
+def fall() -> SyntheticScene:
     """A stream that goes over a ledge 0.5 m high into a pool."""
     lip, drop = -0.10, 0.50
 
@@ -152,7 +152,9 @@ CHOCOLATE = LiquidPaint(
 )
 
 
-def film(name: str, paint: LiquidPaint, viscosity: float, angle: float, thickness: float, winding: float) -> Scene:
+def film(
+    name: str, paint: LiquidPaint, viscosity: float, angle: float, thickness: float, winding: float
+) -> SyntheticScene:
     """A viscous film in a channel on a slope of `angle` degrees; it starts at the mean speed of its steady profile."""
     length, width, cells = 0.9, 0.46, 72
     slope = float(np.tan(np.radians(angle)))

@@ -46,9 +46,9 @@ interrupted = threading.Event()
 
 
 class Interrupted(KeyboardInterrupt):
-    """What is raised then: a class of its own, since of `python -m` CPython remembers that a KeyboardInterrupt proper
-    has left code which `exec` was given as text (a dataclass being defined, say), and at the end sends the process
-    SIGINT in place of its exit code, although the exception was caught (`run_eval_code_obj` in CPython)."""
+    """What is raised then. It is no plain KeyboardInterrupt: if one of those leaves code that `exec` runs (as when a
+    dataclass is defined), CPython remembers it, even if it is caught, and ends `python -m` by SIGINT in place of its
+    exit code (`run_eval_code_obj` in CPython)."""
 
 
 def _go_on() -> None:

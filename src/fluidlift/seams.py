@@ -1,4 +1,4 @@
-"""The sockets that back ends fill: one abstract class, one method each (the transfers are a pair)."""
+"""Interfaces that back ends implement: an abstract class each, with one method (the transfers have two)."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ class PoseSolver(ABC):
 
 
 class SplatView(Protocol):
-    """A pinhole camera as plain numbers (`numerics.splatting.View` is one): x_cam = rotation @ x + translation."""
+    """A pinhole camera as plain numbers, as `numerics.splatting.SplatCamera` is: x_cam = rotation @ x + translation."""
 
     @property
     def rotation(self) -> np.ndarray:

@@ -213,14 +213,14 @@ def _frames(folder: Path, manifest: dict[str, Any]) -> Iterator[Finding]:
 
 def _look_at(files: list[Path], interval: float) -> _Faults:
     """All frames, one after the other; of the one before only ids, positions and velocities are kept."""
-    from fluidlift.io.frame_checks import Particles, gaussian_faults, identity_faults, particle_faults
+    from fluidlift.io.frame_checks import ParticleFrame, gaussian_faults, identity_faults, particle_faults
     from fluidlift.scene.splat_files import read_frame
 
     found, before, last = _Faults(), None, -1
     for file in files:
         try:
             splats = read_frame(file)
-            now = Particles(splats.ids, splats.gaussians.means, splats.velocities)
+            now = ParticleFrame(splats.ids, splats.gaussians.means, splats.velocities)
         except InputRejected as error:
             found.read.append(f"{file.name}: {error.got}")
             before = None

@@ -8,7 +8,14 @@ import torch
 
 from fluidlift.backends import geocalib_network
 from fluidlift.backends.geocalib import FILE, LICENCE, LONGEST, PITCH_ERROR, SHORTER, GeoCalib
-from fluidlift.backends.geocalib_network import RANK, ROUNDS, GeoCalibNetwork, NetworkShape, completed_state, factorised
+from fluidlift.backends.geocalib_network import (
+    RANK,
+    ROUNDS,
+    GeoCalibNetwork,
+    GeoCalibShape,
+    completed_state,
+    factorised,
+)
 from fluidlift.backends.model_table import model_of
 from fluidlift.backends.perspective_field import field_of_camera
 from fluidlift.backends.registry import ModelChoice
@@ -16,7 +23,7 @@ from fluidlift.backends.view_model import VIEW_MODELS, make_view_estimator
 from fluidlift.errors import InputRejected
 from fluidlift.types import PinholeCamera
 
-SMALL = NetworkShape((8, 8, 12, 16), (1, 1, 2, 1), (16, 16, 24, 32), 8, 16)
+SMALL = GeoCalibShape((8, 8, 12, 16), (1, 1, 2, 1), (16, 16, 24, 32), 8, 16)
 
 
 def quiet(line: str) -> None:
@@ -49,7 +56,7 @@ def test_names_and_sizes_are_those_of_the_published_checkpoint():
     with torch.device("meta"):
         state = GeoCalibNetwork().state_dict()
     assert len(state) == 889  # tensors of the published file, as its users report
-    assert NetworkShape.of(state, "it") == NetworkShape()
+    assert GeoCalibShape.of(state, "it") == GeoCalibShape()
     assert state["backbone.block3.11.attn.spatial_gating_unit.conv2_1.weight"].shape == (320, 1, 1, 21)
     assert state["perspective_decoder.latitude_head.decoder.squeeze.conv.weight"].shape == (512, 1024, 1, 1)
     tensors = sum(t.numel() * t.element_size() for t in state.values())

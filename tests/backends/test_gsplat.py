@@ -11,17 +11,17 @@ from fluidlift.backends import gsplat_rasterizer
 from fluidlift.backends.gsplat_rasterizer import GsplatRasterizer, best_rasterizer
 from fluidlift.errors import FluidliftError, MissingPackage
 from fluidlift.numerics import splatting
-from fluidlift.numerics.splatting import View
+from fluidlift.numerics.splatting import SplatCamera
 from fluidlift.numerics.splatting_colors_torch import view_colors
 from fluidlift.numerics.splatting_torch import NumbaRasterizer
 
 
-def scene(count: int = 60, channels: int = 10) -> tuple[View, list[torch.Tensor]]:
+def scene(count: int = 60, channels: int = 10) -> tuple[SplatCamera, list[torch.Tensor]]:
     """A camera off the axis of anything, and Gaussians beside, behind and before it."""
     rng = np.random.default_rng(0)
     angle = 0.3
     turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
-    view = View(turn, np.array([0.2, -0.1, 2.5]), (40.0, 36.0), (17.0, 11.5), (30, 22), near=0.2)
+    view = SplatCamera(turn, np.array([0.2, -0.1, 2.5]), (40.0, 36.0), (17.0, 11.5), (30, 22), near=0.2)
     means = rng.normal(size=(count, 3)) * (0.8, 0.6, 0.4)
     means[0], means[1] = (0, 0, -4), (3, 0, 0)
     arrays = means, rng.normal(size=(count, 4)), 0.15 * np.exp(0.5 * rng.normal(size=(count, 3)))

@@ -8,7 +8,7 @@ import torch
 from fluidlift.backends.learned import FLOW_METHODS, MASK_METHODS, make_estimator, make_segmenter
 from fluidlift.backends.registry import ModelChoice
 from fluidlift.backends.sea_raft import SeaRaft
-from fluidlift.backends.sea_raft_network import NetworkShape, SeaRaftNetwork
+from fluidlift.backends.sea_raft_network import SeaRaftNetwork, SeaRaftShape
 from fluidlift.errors import InputRejected, MissingPackage
 
 
@@ -17,7 +17,7 @@ def quiet(line: str) -> None:
 
 
 def test_a_checkpoint_becomes_the_estimator_that_was_named(tmp_path):
-    network = SeaRaftNetwork(NetworkShape(blocks=(2, 2, 2), stem=8, stages=(8, 8, 8), width=8, radius=1))
+    network = SeaRaftNetwork(SeaRaftShape(blocks=(2, 2, 2), stem=8, stages=(8, 8, 8), width=8, radius=1))
     torch.save(network.state_dict(), tmp_path / "w.pth")
     said = []
     choice = ModelChoice(weights=tmp_path / "w.pth", announce=said.append)

@@ -18,7 +18,7 @@ from fluidlift.backends import model_download, model_get
 from fluidlift.backends.model_cache import RECORD, all_kept, alone, begun_folder, kept, models_folder, remove
 from fluidlift.backends.model_card import ModelCard, ModelFile
 from fluidlift.backends.model_download import HTTPS, Transport, fetch
-from fluidlift.backends.model_get import Wanted, get_model
+from fluidlift.backends.model_get import ModelRequest, get_model
 from fluidlift.backends.model_table import MODELS, every_model, model_of
 from fluidlift.backends.registry import BACK_ENDS
 from fluidlift.errors import FluidliftError, InputRejected
@@ -67,7 +67,9 @@ def files_in(folder) -> list[str]:
 def test_a_model_is_fetched_checked_and_found_again(server, cache):
     told = []
     card = card_of(server)
-    got = get_model(card, Wanted(transport=LOCAL, told=lambda file, done, total: told.append((file.name, done, total))))
+    got = get_model(
+        card, ModelRequest(transport=LOCAL, told=lambda file, done, total: told.append((file.name, done, total)))
+    )
     assert got == kept("tiny") == all_kept((card,))[0]
     assert (cache / "tiny" / "weights").read_bytes() == DATA
     assert files_in(cache) == ["tiny/config.json", "tiny/model.json", "tiny/weights"]
@@ -84,13 +86,13 @@ def test_a_model_is_fetched_checked_and_found_again(server, cache):
 
 def test_a_single_file_is_handed_over_by_itself(server):
     card = card_of(server)
-    got = get_model(replace(card, files=card.files[1:]), Wanted(transport=LOCAL))
+    got = get_model(replace(card, files=card.files[1:]), ModelRequest(transport=LOCAL))
     assert got.path.name == "weights" and got.path.read_bytes() == DATA
 
 
 def test_a_cut_connection_is_gone_on_with(server):
     server.cuts = [len(CONFIG), 1_200_000, 900_000]
-    got = get_model(card_of(server), Wanted(transport=LOCAL))
+    got = get_model(card_of(server), ModelRequest(transport=LOCAL))
     assert (got.folder / "weights").read_bytes() == DATA
     spans = [span for path, span in server.asked if path == "/weights"]
     assert spans == [None, "bytes=1200000-", "bytes=2100000-"]
@@ -99,10 +101,10 @@ def test_a_cut_connection_is_gone_on_with(server):
 def test_what_a_stopped_run_left_is_gone_on_with_by_the_next(server):
     server.cuts = [len(CONFIG), 1_000_000]
     with pytest.raises(FluidliftError, match="same command goes on"):
-        get_model(card_of(server), Wanted(transport=replace(LOCAL, tries=1)))
+        get_model(card_of(server), ModelRequest(transport=replace(LOCAL, tries=1)))
     assert kept("tiny") is None and (begun_folder("tiny") / "weights").stat().st_size == 1_000_000
     server.asked.clear()
-    get_model(card_of(server), Wanted(transport=LOCAL))
+    get_model(card_of(server), ModelRequest(transport=LOCAL))
     assert server.asked == [("/weights", "bytes=1000000-")]  # the other file is there and right
 
 
@@ -110,7 +112,7 @@ def test_what_a_stopped_run_left_is_gone_on_with_by_the_next(server):
 def test_what_is_no_beginning_of_the_file_does_not_stay(server, left):
     begun_folder("tiny").mkdir(parents=True)
     (begun_folder("tiny") / "weights").write_bytes(left)
-    wanted = Wanted(transport=LOCAL)
+    wanted = ModelRequest(transport=LOCAL)
     if len(left) < len(DATA):  # only the hash can tell: it is refused once, and gone
         with pytest.raises(InputRejected, match="SHA-256"):
             get_model(card_of(server), wanted)
@@ -119,13 +121,15 @@ def test_what_is_no_beginning_of_the_file_does_not_stay(server, left):
 
 def test_a_server_without_ranges_begins_anew(server):
     server.knows_ranges, server.cuts = False, [len(CONFIG), 1_000_000]
-    assert (get_model(card_of(server), Wanted(transport=LOCAL)).folder / "weights").read_bytes() == DATA
+    assert (get_model(card_of(server), ModelRequest(transport=LOCAL)).folder / "weights").read_bytes() == DATA
 
 
 def test_another_content_is_refused_and_deleted(server, cache):
     server.contents["weights"] = DATA[:-1] + bytes([DATA[-1] ^ 1])
     with pytest.raises(InputRejected, match="SHA-256") as told:
-        get_model(card_of(server), Wanted(transport=LOCAL, accept_unverified=True))  # which is for unknown hashes only
+        get_model(
+            card_of(server), ModelRequest(transport=LOCAL, accept_unverified=True)
+        )  # which is for unknown hashes only
     assert hashlib.sha256(DATA).hexdigest() in str(told.value)
     assert kept("tiny") is None and files_in(cache) == ["tiny.begun/config.json"]
 
@@ -134,36 +138,36 @@ def test_another_content_is_refused_and_deleted(server, cache):
 def test_more_than_the_file_has_is_not_taken_in(server, cache, tells_length):
     server.contents["weights"], server.tells_length = DATA + bytes(10_000_000), tells_length
     with pytest.raises(InputRejected, match=r"has 13000000 bytes|has more than"):
-        get_model(card_of(server), Wanted(transport=LOCAL))
+        get_model(card_of(server), ModelRequest(transport=LOCAL))
     assert all(p.stat().st_size <= len(DATA) for p in cache.rglob("*"))
 
 
 def test_a_file_of_unknown_size_has_a_bound_too(server, cache, monkeypatch):
     monkeypatch.setattr("fluidlift.backends.model_card.MOST_BYTES", 1_000_000)
     with pytest.raises(InputRejected, match="1000000 bytes"):
-        get_model(card_of(server, known=False), Wanted(transport=LOCAL, accept_unverified=True))
+        get_model(card_of(server, known=False), ModelRequest(transport=LOCAL, accept_unverified=True))
     assert all(p.stat().st_size <= 1_000_000 for p in cache.rglob("*"))
 
 
 def test_where_no_hash_is_known_somebody_has_to_vouch(server):
     card = card_of(server, known=False)
     with pytest.raises(InputRejected, match="--trust") as told:
-        get_model(card, Wanted(transport=LOCAL))
+        get_model(card, ModelRequest(transport=LOCAL))
     assert hashlib.sha256(CONFIG).hexdigest() in str(told.value) and kept("tiny") is None
     hashes = tuple(hashlib.sha256(d).hexdigest() for d in (CONFIG, DATA))
     with pytest.raises(InputRejected, match="'weights' of tiny"):
-        get_model(card, Wanted(transport=LOCAL, trust=hashes[:1]))
+        get_model(card, ModelRequest(transport=LOCAL, trust=hashes[:1]))
     server.asked.clear()
-    got = get_model(card, Wanted(transport=LOCAL, trust=hashes))
+    got = get_model(card, ModelRequest(transport=LOCAL, trust=hashes))
     assert got.checked == "trusted" and server.asked == []  # both came before, and are vouched for now
     remove("tiny")
-    assert get_model(card, Wanted(transport=LOCAL, accept_unverified=True)).checked == "unverified"
+    assert get_model(card, ModelRequest(transport=LOCAL, accept_unverified=True)).checked == "unverified"
 
 
 def test_an_unverified_download_is_never_pieced_together(server):
     """Nothing would tell whether the parts belong to the same file."""
     server.cuts = [len(CONFIG), 1_000_000]
-    get_model(card_of(server, known=False), Wanted(transport=LOCAL, accept_unverified=True))
+    get_model(card_of(server, known=False), ModelRequest(transport=LOCAL, accept_unverified=True))
     assert [span for _, span in server.asked] == [None, None, None]
 
 
@@ -171,7 +175,7 @@ def test_an_unverified_download_is_never_pieced_together(server):
 def test_a_server_that_leads_to_something_insecure_is_not_followed(server, there):
     server.redirect = there
     with pytest.raises((InputRejected, FluidliftError), match=r"not secure|302"):
-        get_model(card_of(server), Wanted(transport=LOCAL))
+        get_model(card_of(server), ModelRequest(transport=LOCAL))
     assert kept("tiny") is None
 
 
@@ -180,7 +184,7 @@ def test_a_redirect_to_storage_is_followed(server):
         storage.contents = {"weights": DATA}
         server.redirect = f"{storage.address}/weights"
         card = card_of(server)
-        got = get_model(replace(card, files=card.files[1:]), Wanted(transport=LOCAL))
+        got = get_model(replace(card, files=card.files[1:]), ModelRequest(transport=LOCAL))
         assert got.path.read_bytes() == DATA and storage.asked == [("/weights", None)]
 
 
@@ -197,7 +201,7 @@ def test_only_https_is_asked():
 def test_a_server_that_refuses_is_understood(server, status, says):
     server.status = status
     with pytest.raises(FluidliftError, match=rf"{status}.*{says}.*--from"):
-        get_model(card_of(server), Wanted(transport=LOCAL))
+        get_model(card_of(server), ModelRequest(transport=LOCAL))
 
 
 def test_without_a_network_the_way_out_is_told(server, tmp_path):
@@ -220,14 +224,14 @@ def test_a_full_disk_is_said_before_and_while_it_fills(server, monkeypatch):
     with monkeypatch.context() as patched:
         patched.setattr(model_get.shutil, "disk_usage", lambda path: usage)
         with pytest.raises(InputRejected, match=r"1 MB free.*FLUIDLIFT_MODELS"):
-            get_model(card_of(server), Wanted(transport=LOCAL))
+            get_model(card_of(server), ModelRequest(transport=LOCAL))
 
     def full(number):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(model_download.os, "fsync", full)
     with pytest.raises(InputRejected, match=r"disk full.*FLUIDLIFT_MODELS"):
-        get_model(card_of(server), Wanted(transport=LOCAL))
+        get_model(card_of(server), ModelRequest(transport=LOCAL))
 
 
 # brought by hand ---------------------------------------------------------------------------------------------------
@@ -243,26 +247,26 @@ def brought(tmp_path):
 
 
 def test_files_brought_by_hand_are_checked_alike(server, brought):
-    got = get_model(card_of(server), Wanted(brought))
+    got = get_model(card_of(server), ModelRequest(brought))
     assert (got.folder / "weights").read_bytes() == DATA and server.asked == []
     (brought / "weights").write_bytes(DATA[:-1] + b"?")
     with pytest.raises(InputRejected, match="SHA-256"):
-        get_model(card_of(server), Wanted(brought))
+        get_model(card_of(server), ModelRequest(brought))
     assert (got.folder / "weights").read_bytes() == DATA  # what was right before stays
     (brought / "weights").write_bytes(DATA[:-1])
     with pytest.raises(InputRejected, match="has 2999999 bytes"):
-        get_model(card_of(server), Wanted(brought))
+        get_model(card_of(server), ModelRequest(brought))
     (brought / "weights").unlink()
     with pytest.raises(InputRejected, match="cannot be read"):
-        get_model(card_of(server), Wanted(brought))
+        get_model(card_of(server), ModelRequest(brought))
     with pytest.raises(InputRejected, match="no file or folder"):
-        get_model(card_of(server), Wanted(brought / "nothing"))
+        get_model(card_of(server), ModelRequest(brought / "nothing"))
 
 
 def test_one_file_may_have_any_name(server, brought):
     os.rename(brought / "weights", brought / "download (1)")
     card = card_of(server)
-    got = get_model(replace(card, files=card.files[1:]), Wanted(brought / "download (1)"))
+    got = get_model(replace(card, files=card.files[1:]), ModelRequest(brought / "download (1)"))
     assert got.path.name == "weights"
 
 
@@ -270,11 +274,11 @@ def test_links_and_pipes_are_not_read(server, brought, tmp_path):
     os.rename(brought / "weights", tmp_path / "elsewhere")
     (brought / "weights").symlink_to(tmp_path / "elsewhere")
     with pytest.raises(InputRejected, match=r"is a link.*cp -L"):
-        get_model(card_of(server), Wanted(brought))
+        get_model(card_of(server), ModelRequest(brought))
     (brought / "weights").unlink()
     os.mkfifo(brought / "weights")
     with pytest.raises(InputRejected, match="no plain file"):
-        get_model(card_of(server), Wanted(brought))
+        get_model(card_of(server), ModelRequest(brought))
 
 
 @pytest.mark.parametrize("place", ["tiny.begun", "tiny"])
@@ -285,7 +289,7 @@ def test_nothing_is_written_through_a_link(server, cache, tmp_path, place):
     (cache / place).symlink_to(outside)
     assert kept("tiny") is None
     with pytest.raises(InputRejected, match="in the way"):
-        get_model(card_of(server), Wanted(transport=LOCAL))
+        get_model(card_of(server), ModelRequest(transport=LOCAL))
     assert list(outside.iterdir()) == []
     remove("tiny")
     assert outside.is_dir() and not (cache / place).is_symlink()
@@ -297,20 +301,20 @@ def test_a_link_in_the_place_of_a_file_that_was_begun_is_not_followed(server, tm
     secret.write_bytes(b"mine")
     (begun_folder("tiny") / "weights").symlink_to(secret)
     with pytest.raises(InputRejected, match="in the way"):
-        get_model(card_of(server), Wanted(transport=LOCAL))
+        get_model(card_of(server), ModelRequest(transport=LOCAL))
     assert secret.read_bytes() == b"mine"
 
 
 def test_one_process_at_a_time(server):
     with alone("tiny"), pytest.raises(InputRejected, match="another process"):
-        get_model(card_of(server), Wanted(transport=LOCAL))
+        get_model(card_of(server), ModelRequest(transport=LOCAL))
 
 
 @pytest.mark.parametrize(
     "record", ["", "[]", '{"name": "tiny"}', '{"name": "tiny", "files": {"../x": "0"}}', "{" * 9999]
 )
 def test_a_cache_that_somebody_else_wrote_counts_as_empty(server, cache, record):
-    get_model(card_of(server), Wanted(transport=LOCAL))
+    get_model(card_of(server), ModelRequest(transport=LOCAL))
     (cache / "tiny" / RECORD).write_text(record)
     assert kept("tiny") is None
 
@@ -342,9 +346,9 @@ def test_a_name_that_is_mistyped_is_understood():
 
 def test_generators_and_models_on_request_say_where_they_are(brought):
     with pytest.raises(InputRejected, match="fluidlift generators lgm"):
-        get_model(model_of("lgm"), Wanted())
+        get_model(model_of("lgm"), ModelRequest())
     with pytest.raises(InputRejected, match=r"on request only.*--from FOLDER"):
-        get_model(model_of("sam3"), Wanted())
+        get_model(model_of("sam3"), ModelRequest())
 
 
 def test_the_cache_lies_where_it_is_said_to(monkeypatch, tmp_path):
@@ -355,7 +359,7 @@ def test_the_cache_lies_where_it_is_said_to(monkeypatch, tmp_path):
 
 
 def test_a_record_names_no_user_and_no_folder(server, cache):
-    get_model(card_of(server), Wanted(transport=LOCAL))
+    get_model(card_of(server), ModelRequest(transport=LOCAL))
     text = (cache / "tiny" / RECORD).read_text()
     assert str(cache) not in text and set(json.loads(text)) == {"name", "files", "checked", "terms"}
     shutil.rmtree(cache)

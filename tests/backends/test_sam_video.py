@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from fluidlift.backends.mask_prompts import CLICKS, Clicks, clicks_from, labels_of_frame, ordered_from
+from fluidlift.backends.mask_prompts import CLICKS, PointPrompts, clicks_from, labels_of_frame, ordered_from
 from fluidlift.errors import InputRejected, MissingPackage
 from fluidlift.types import Label, PixelFlow, PixelLabels, VideoClip
 
@@ -134,7 +134,7 @@ def test_the_masks_are_those_of_transformers_own_propagation(tiny, clicked):
 
     model, folder = tiny
     frames = some_clip().frames
-    clicks = Clicks(clicked, np.array([[20, 24], [30, 20], [60, 5]], np.float32), np.array([True, True, False]))
+    clicks = PointPrompts(clicked, np.array([[20, 24], [30, 20], [60, 5]], np.float32), np.array([True, True, False]))
     found = dict(segmenter(folder).chances(frames, clicks))
     assert sorted(found) == list(range(SHAPE[0]))
 
@@ -168,7 +168,7 @@ def test_memory_does_not_grow_with_the_clip(tiny, monkeypatch):
     monkeypatch.setattr(Sam2Video, "_forget", counting)
     network = segmenter(tiny[1])
     frames = np.concatenate([some_clip().frames] * 3)
-    for _ in network.chances(frames, Clicks(9, np.array([[20, 24]], np.float32), np.array([True]))):
+    for _ in network.chances(frames, PointPrompts(9, np.array([[20, 24]], np.float32), np.array([True]))):
         pass
     assert len(held) == 27
     assert max(pictures for pictures, _ in held) == 0

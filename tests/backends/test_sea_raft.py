@@ -13,14 +13,14 @@ from fluidlift.backends.pair_network import LEAST, padded_pair, require_memory, 
 from fluidlift.backends.sea_raft import LICENCE, SeaRaft
 from fluidlift.backends.sea_raft_network import (
     CorrelationPyramid,
-    NetworkShape,
     SeaRaftNetwork,
+    SeaRaftShape,
     mixture_confidence,
     upsampled,
 )
 from fluidlift.errors import FluidliftError, InputRejected
 
-SMALL = NetworkShape(blocks=(2, 2, 2), stem=8, stages=(8, 12, 16), width=8, radius=2, refiners=2)
+SMALL = SeaRaftShape(blocks=(2, 2, 2), stem=8, stages=(8, 12, 16), width=8, radius=2, refiners=2)
 CPU = torch.device("cpu")
 
 
@@ -60,7 +60,7 @@ def test_names_and_sizes_are_those_of_the_published_variants():
     """M has a ResNet-34, S a ResNet-18, else they are alike; millions of parameters of the reference network."""
     for blocks, millions in (((3, 4, 6), 19.7), ((2, 2, 2), 8.9)):
         with torch.device("meta"):
-            network = SeaRaftNetwork(NetworkShape(blocks=blocks))
+            network = SeaRaftNetwork(SeaRaftShape(blocks=blocks))
         state = network.state_dict()
         assert state["cnet.conv1.weight"].shape == (64, 6, 7, 7)
         assert state["fnet.layer2.0.downsample.1.running_var"].shape == state["fnet.layer2.0.bn3.bias"].shape == (128,)
@@ -68,7 +68,7 @@ def test_names_and_sizes_are_those_of_the_published_variants():
         assert state["update_block.refine.1.pwconv2.weight"].shape == (384, 512)
         assert state["upsample_weight.2.bias"].shape == (576,) and state["flow_head.2.weight"].shape == (6, 256, 3, 3)
         assert f"fnet.layer3.{blocks[2] - 1}.bn2.num_batches_tracked" in state
-        assert NetworkShape.of(state, "it") == NetworkShape(blocks=blocks)
+        assert SeaRaftShape.of(state, "it") == SeaRaftShape(blocks=blocks)
         assert round(sum(p.numel() for p in network.parameters()) / 1e6, 1) == millions
 
 

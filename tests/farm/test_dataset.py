@@ -13,12 +13,12 @@ from fluidlift.errors import InputRejected
 from fluidlift.farm.dataset import COLUMNS, INDEX, read_index, sample_of, samples, write_index
 from fluidlift.farm.local import LocalEngine
 from fluidlift.farm.shots import ShotOptions, read_shots
-from fluidlift.farm.state import Outcome, list_names, read_outcome, write_outcome
+from fluidlift.farm.state import ShotOutcome, list_names, read_outcome, write_outcome
 from fluidlift.io.asset_folder import load_asset, read_manifest
 
 
-def told(name: str, **facts) -> Outcome:
-    return replace(Outcome(name, "done", 12.0, "", ""), **facts)
+def told(name: str, **facts) -> ShotOutcome:
+    return replace(ShotOutcome(name, "done", 12.0, "", ""), **facts)
 
 
 @pytest.fixture

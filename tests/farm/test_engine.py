@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from fluidlift.farm.local import LocalEngine
-from fluidlift.farm.making import Making, environment, make_shot
+from fluidlift.farm.making import RunningMakes, environment, make_shot
 from fluidlift.farm.state import claimed, is_running, names_of, read_outcome
 from fluidlift.farm.summary import Summary, status_of
 from fluidlift.machine import THREADS, cores
@@ -145,7 +145,7 @@ def test_a_damaged_or_strange_state_is_no_state(tmp_path, limits, shot, runs):
 
 
 def test_a_make_that_is_killed_is_not_written_down_at_once_where_its_maker_may_be_next(tmp_path, limits, shot):
-    making, out = Making(settle=1.0), tmp_path / "out"
+    making, out = RunningMakes(settle=1.0), tmp_path / "out"
     out.mkdir()
     maker = threading.Thread(target=make_shot, args=(shot("s", "slow"), out, limits, making))
     maker.start()

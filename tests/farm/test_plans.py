@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from fluidlift.cli import main
-from fluidlift.farm.plans import KINDS, Plan, written
+from fluidlift.farm.plans import KINDS, TaskPlan, written
 from fluidlift.farm.state import read_outcome
 
 
@@ -71,7 +71,7 @@ def test_an_open_job_description_passes_its_own_validator_and_runs(clips, tmp_pa
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_plan_has_as_many_tasks_as_shots(kind, tmp_path):
-    text = written(kind, Plan(["clips", "-o", "out"], 40, 2, 4e9), tmp_path).read_text()
+    text = written(kind, TaskPlan(["clips", "-o", "out"], 40, 2, 4e9), tmp_path).read_text()
     assert "1-40" in text or text.count("/40 ") == 40
 
 

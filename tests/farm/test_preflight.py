@@ -14,7 +14,7 @@ from fluidlift.farm import making, preflight
 from fluidlift.farm.engine import Limits, next_limits
 from fluidlift.farm.local import LocalEngine
 from fluidlift.farm.preflight import NOTE, Machine, looked_at, require_fit
-from fluidlift.farm.state import Outcome
+from fluidlift.farm.state import ShotOutcome
 from fluidlift.io.asset_lock import held
 
 OURS = Machine("here", "2.0", "ab", clock=1000.0)
@@ -73,8 +73,8 @@ def test_a_full_disk_ends_a_batch_before_the_next_shot(tmp_path, limits, shot, r
         next(LocalEngine().shots([shot("c")], out, limits, print, print))
 
 
-def outcome(failure: str) -> Outcome:
-    return Outcome("a", "failed" if failure else "done", 1.0, "", "", failure=failure)
+def outcome(failure: str) -> ShotOutcome:
+    return ShotOutcome("a", "failed" if failure else "done", 1.0, "", "", failure=failure)
 
 
 def test_a_shot_is_tried_again_where_that_can_help():

@@ -8,15 +8,15 @@ import numpy as np
 
 from fluidlift.cli import main
 from fluidlift.farm.page import doubt, page
-from fluidlift.farm.state import Outcome, list_names, write_outcome
+from fluidlift.farm.state import ShotOutcome, list_names, write_outcome
 from fluidlift.farm.summary import as_csv, status_of
 from fluidlift.io.pictures import write_png
 from fluidlift.io.video import write_video
 
 
-def outcome(name: str, folder, **values) -> Outcome:
+def outcome(name: str, folder, **values) -> ShotOutcome:
     given = {"outcome": "done", "seconds": 60.0, "asset": str(folder / f"{name}.fluid"), "log": ""} | values
-    return Outcome(name, **given)
+    return ShotOutcome(name, **given)
 
 
 def folder_of(tmp_path):

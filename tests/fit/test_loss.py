@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from fluidlift.fit.loss import LossWeights, grid_mask, residuals, surface_cells, velocity_loss
+from fluidlift.fit.loss import VelocityLossWeights, grid_mask, residuals, surface_cells, velocity_loss
 from fluidlift.types import CellType
 
 
@@ -26,7 +26,7 @@ def test_equal_velocities_lose_nothing_and_a_fluid_at_rest_loses_more_than_beta(
 def test_without_stagnation_the_direction_term_is_one_minus_cosine():
     target, mask = fields()
     other = fields(1)[0]
-    weights = LossWeights(direction=1.0, magnitude=0.0, stagnant=0.0)
+    weights = VelocityLossWeights(direction=1.0, magnitude=0.0, stagnant=0.0)
     cosine = (target * other).sum(-1) / (target.norm(dim=-1) * other.norm(dim=-1))
     expected = float((mask * (1 - cosine)).sum())
     assert float(velocity_loss(other, target, mask, speed=1.0, weights=weights)) == pytest.approx(expected, rel=1e-12)
@@ -34,7 +34,7 @@ def test_without_stagnation_the_direction_term_is_one_minus_cosine():
 
 def test_reversed_flow_loses_its_direction_in_full():
     target, mask = fields()
-    weights = LossWeights(direction=1.0, magnitude=0.0, stagnant=0.0)
+    weights = VelocityLossWeights(direction=1.0, magnitude=0.0, stagnant=0.0)
     assert float(velocity_loss(-target, target, mask, speed=1.0, weights=weights)) == pytest.approx(2.0, rel=1e-12)
 
 
@@ -73,7 +73,7 @@ def test_a_layout_without_fluid_is_refused():
 def test_errors_of_a_target_do_not_pass_for_friction():
     """Targets of one velocity with errors: the mean gradient of the direction term at the true one is zero."""
     rng = np.random.default_rng(0)
-    weights = LossWeights(magnitude=0.0, stagnant=0.4)
+    weights = VelocityLossWeights(magnitude=0.0, stagnant=0.4)
     slopes = {}
     for size in (0.1, 0.4, 1.0):
         target = torch.tensor([size, 0.0, 0.0]) + 0.14 * torch.tensor(rng.standard_normal((200_000, 3)))

@@ -127,9 +127,9 @@ def _history(folder: Path) -> None:
 def _history_files() -> list[Seed]:
     import json
 
-    from fluidlift.scene.edit_history import Edit
+    from fluidlift.scene.edit_history import EditRecord
 
-    edit = Edit.of(1, "set", "a: 1\n", "a: 2\n")
+    edit = EditRecord.of(1, "set", "a: 1\n", "a: 2\n")
     lines = [{"time": "", "what": "found", "text": "a: 1\n"}, edit.to_dict()]
     return [Seed(b"".join(json.dumps(line).encode() + b"\n" for line in lines))]
 

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from fluidlift.io.bars import Window, between_bars, find_bars
+from fluidlift.io.bars import PictureWindow, between_bars, find_bars
 from fluidlift.types import VideoClip
 
 
@@ -89,17 +89,17 @@ def test_a_black_clip_has_no_picture_between():
 
 
 def test_a_window_takes_whole_pixels_at_any_size():
-    window = Window(0.25, 1 / 6, 0.75, 5 / 6)
+    window = PictureWindow(0.25, 1 / 6, 0.75, 5 / 6)
     assert window.size((640, 360)) == (320, 240)
     assert window.of(np.zeros((36, 64, 3))).shape == (24, 32, 3)
     with pytest.raises(ValueError, match="window"):
-        Window(0.5, 0.0, 0.5, 1.0)
+        PictureWindow(0.5, 0.0, 0.5, 1.0)
 
 
 def test_a_clip_is_read_again_between_its_bars_and_else_once():
     frames, asked = barred(scene(), (20, 20), (0, 0)), []
 
-    def decode(window: Window | None = None) -> VideoClip:
+    def decode(window: PictureWindow | None = None) -> VideoClip:
         asked.append(window)
         kept = frames if window is None else np.stack([window.of(f) for f in frames])
         return VideoClip(kept, np.arange(len(kept)) / 25.0)

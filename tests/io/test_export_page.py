@@ -14,7 +14,7 @@ from PIL import Image
 
 from fluidlift.io.export_page import PageScene, write_page
 from fluidlift.io.frames import MovingMesh
-from fluidlift.io.page_frames import FrameEncoder, Range, decoded
+from fluidlift.io.page_frames import FrameEncoder, Quantization, decoded
 from fluidlift.look.rasterize import render
 from fluidlift.numerics.solid_mesh import box_mesh
 from fluidlift.types import Gaussians, PinholeCamera, TriangleMesh
@@ -43,7 +43,7 @@ def moving(count: int = 6, n: int = 400) -> list[tuple[Gaussians, np.ndarray]]:
 
 
 def page_of(path: Path, frames, terrain=None, **changes) -> Path:
-    held = Range.of(g for g, _ in frames)
+    held = Quantization.of(g for g, _ in frames)
     numbers = tuple(range(1001, 1001 + len(frames)))
     scene = PageScene(
         "a <river> & more", CAMERA, (0.0, 0.0, 0.0), 0.04, numbers, np.zeros((4, 6, 3), np.uint8), terrain
@@ -62,7 +62,7 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
 
 def test_frames_come_back_as_near_as_their_bytes_allow():
     frames = moving()
-    held = Range.of(g for g, _ in frames)
+    held = Quantization.of(g for g, _ in frames)
     encoder = FrameEncoder(held)
     packed = [encoder.encode(*f) for f in frames]
     for (g, _), records in zip(frames, decoded(packed, held.slots), strict=True):
@@ -77,7 +77,7 @@ def test_frames_come_back_as_near_as_their_bytes_allow():
 
 def test_what_stays_the_same_costs_next_to_nothing():
     g, ids = moving(1)[0]
-    encoder = FrameEncoder(Range.of([g]))
+    encoder = FrameEncoder(Quantization.of([g]))
     sizes = [len(encoder.encode(g, ids)) for _ in range(3)]
     # the second frame takes back the motion that the first one seemed to have
     assert sizes[2] < 0.02 * sizes[0]
@@ -85,7 +85,7 @@ def test_what_stays_the_same_costs_next_to_nothing():
 
 def test_frames_without_splats_are_frames():
     full, ids = moving(1)[0]
-    encoder = FrameEncoder(Range.of([full]))
+    encoder = FrameEncoder(Quantization.of([full]))
     packed = [encoder.encode(Gaussians.empty(), ids[:0]), encoder.encode(full, ids),
               encoder.encode(Gaussians.empty(), ids[:0])]  # fmt: skip
     alive = [int((r[:, 15] > 0).sum()) for r in decoded(packed, len(full))]

@@ -11,7 +11,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdVol, Vt
 
 from fluidlift.errors import MissingPackage
 from fluidlift.io.export_usd import UsdSettings, write_usd
-from fluidlift.io.frame_checks import Particles, gaussian_faults, identity_faults, particle_faults
+from fluidlift.io.frame_checks import ParticleFrame, gaussian_faults, identity_faults, particle_faults
 from fluidlift.io.frames import FluidFrame, MovingMesh
 from fluidlift.io.validate_usd import splat_rule_faults, validate_usd
 from fluidlift.io.volume_grid import VolumeGrid, write_vdb
@@ -203,9 +203,9 @@ def test_a_dictionary_in_place_of_a_number_is_a_fault_not_a_crash(tmp_path, what
     assert validate_usd(tmp_path / "a.usda") != []
 
 
-def particles(gaussians, **changes) -> Particles:
+def particles(gaussians, **changes) -> ParticleFrame:
     positions = gaussians(200).means
-    return Particles(np.arange(200), positions, np.zeros_like(positions))._replace(**changes)
+    return ParticleFrame(np.arange(200), positions, np.zeros_like(positions))._replace(**changes)
 
 
 def test_a_fast_particle_does_not_jump_but_one_that_changes_places_does(gaussians):

@@ -21,7 +21,7 @@ from fluidlift.look.optics import wet_light
 from fluidlift.numerics.srgb import srgb_from_linear
 from fluidlift.numerics.textures import sample_texture
 from fluidlift.shape.generate import background_plate
-from fluidlift.shape.ground_texture import STRIP, View, textured
+from fluidlift.shape.ground_texture import STRIP, GroundView, textured
 from fluidlift.types import Label
 
 DEEP = {"depth": 0.8, "absorption": (1.6, 0.9, 1.4), "slope": 0.03}
@@ -111,8 +111,8 @@ def test_the_ground_has_the_bed_that_was_filmed_instead_of_one_grown_from_the_ba
     true = srgb_from_linear(scene.albedo(places))
     score = []
     for view_of_it in (
-        View(plate.image, camera, labels, plate.seen),
-        View(np.where(under[..., None], picture, plate.image), camera, labels, plate.seen | known, under),
+        GroundView(plate.image, camera, labels, plate.seen),
+        GroundView(np.where(under[..., None], picture, plate.image), camera, labels, plate.seen | known, under),
     ):
         ground = textured(ground_of(scene), GRID, np.zeros(GRID.shape[:2]), view_of_it)
         error = bed_colours(ground, places) - true

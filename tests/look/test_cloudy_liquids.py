@@ -7,9 +7,9 @@ from level_slabs import ABSORBS, CAMERA, INDEX, drawn, floor, slab
 from fluidlift.backends.mitsuba_renderer import MitsubaRenderer
 from fluidlift.backends.mitsuba_scene import FinalScene
 from fluidlift.look.environment import Environment
-from fluidlift.look.liquid import Behind, LiquidSurface, shaded, shaded_plain
+from fluidlift.look.liquid import Behind, SurfaceBuffer, shaded, shaded_plain
 from fluidlift.look.materials import HONEY, LAVA, PRESETS, WATER, Material
-from fluidlift.look.optics import deep_color, fresnel, held_inside, passed, shown_of_cloud, two_fluxes
+from fluidlift.look.optics import deep_color, fresnel, held_inside, passed, two_fluxes
 from fluidlift.types import PinholeCamera
 
 WHITE = Environment.white()
@@ -18,6 +18,17 @@ WHITE = Environment.white()
 def cloudy(scattering: float) -> Material:
     color = deep_color(ABSORBS, scattering, INDEX)
     return Material("cloudy", INDEX, absorption=ABSORBS, scattering=scattering, albedo=tuple(color))
+
+
+def shown_of_cloud(fade, cloud, inside, depth):
+    """How much of the colour of a deep body (`deep_color`) `depth` metres of it have before black, 0 to 1.
+
+    Of two fluxes R_d / R = (1 - e^2) / (1 - R^2 e^2) with e = exp(-fade depth) returns; the surface throws a share
+    `inside` of that back, again and again. Arguments as of `passed`.
+    """
+    left = np.exp(-2.0 * fade * depth)
+    part = (1.0 - left) / np.maximum(1.0 - cloud * cloud * left, 1e-30)
+    return part * (1.0 - inside * cloud) / (1.0 - inside * cloud * part)
 
 
 def test_two_layers_on_each_other_are_one_of_their_depth():
@@ -89,7 +100,7 @@ def checked(material: Material) -> tuple[np.ndarray, np.ndarray]:
     camera = PinholeCamera.looking(np.array([0.0, 0.0, 1.0]), np.zeros(3), 20.0, (64, 64))
     flat = np.full((64, 64), 0.97, np.float32)
     up = np.zeros((64, 64, 3), np.float32) + np.float32([0, 0, 1])
-    surface = LiquidSurface(flat, up, np.full((64, 64), 0.03), np.full((64, 64, 3), 0.5), np.ones((64, 64)), -up)
+    surface = SurfaceBuffer(flat, up, np.full((64, 64), 0.03), np.full((64, 64, 3), 0.5), np.ones((64, 64)), -up)
     stripes = np.where(np.arange(64) // 2 % 2, 0.8, 0.2)
     ground = Behind(np.broadcast_to(stripes[None, :, None], (64, 64, 3)), np.ones((64, 64)))
     return tuple(f(surface, ground, camera, material, WHITE) for f in (shaded, shaded_plain))

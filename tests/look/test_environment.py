@@ -158,11 +158,6 @@ def test_a_turned_environment_shows_what_was_elsewhere():
     np.testing.assert_array_equal(environment.turned(0).radiance, environment.radiance)
 
 
-def test_brightened_light_is_brighter_everywhere():
-    environment, d = noise(16), directions(20)
-    np.testing.assert_allclose(environment.brightened(2.5).irradiance(d), 2.5 * environment.irradiance(d), rtol=1e-5)
-
-
 @pytest.mark.parametrize("toward", [(1.0, 0.2, 0.5), (-0.2, -1.0, 0.3), (0.0, 0.05, 1.0)])
 def test_the_strongest_light_is_found_where_it_is_and_is_all_there_is(toward):
     environment = lamp(toward)

@@ -5,7 +5,14 @@ import pytest
 import trimesh
 
 from fluidlift.look.environment import Environment
-from fluidlift.look.ground_picture import Ground, GroundLight, bounced, ground_picture, received, spread_directions
+from fluidlift.look.ground_picture import (
+    GroundLight,
+    GroundMeshes,
+    bounced,
+    ground_picture,
+    received,
+    spread_directions,
+)
 from fluidlift.look.liquid import Behind
 from fluidlift.look.materials import Material
 from fluidlift.numerics.srgb import linear_from_srgb
@@ -49,7 +56,7 @@ def test_a_white_world_is_white_in_every_cleft_and_beside_every_body():
     stays = [floor(color=white), *(TriangleMesh(*m, np.ones_like(m[0])) for m in [(walls.vertices, walls.faces)])]
     stone = TriangleMesh(np.array(ball.vertices), np.array(ball.faces), np.ones_like(ball.vertices))
     for moves in (False, True):
-        ground = Ground(stays if moves else [*stays, stone], WHITE)
+        ground = GroundMeshes(stays if moves else [*stays, stone], WHITE)
         picture = ground.picture(CAMERA, bodies=[stone] if moves else [])
         assert (picture.depth > 0).all()
         np.testing.assert_allclose(picture.image, 1.0, atol=1e-3)  # eight bits of the environment's own picture
@@ -170,7 +177,7 @@ def test_without_meshes_the_environment_is_seen_and_with_small_ones_around_them(
 
 def test_what_is_kept_from_frame_to_frame_changes_no_picture():
     sky = Environment.sky()
-    kept = Ground([floor()], sky)
+    kept = GroundMeshes([floor()], sky)
     slab = trimesh.creation.box((1.0, 1.0, 0.2))
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.4)
     other = PinholeCamera.looking((2.0, -3.0, 2.0), (0.0, 0.0, 0.0), 45.0, (120, 90))
@@ -180,7 +187,7 @@ def test_what_is_kept_from_frame_to_frame_changes_no_picture():
         liquid.apply_translation([x, 0.0, 0.5])
         obstacle.apply_translation([-1.0, x, 0.4])
         moving = {"caster": body(liquid), "material": water, "bodies": [body(obstacle)]}
-        one, fresh = (g.picture(camera, **moving) for g in (kept, Ground([floor()], sky)))
+        one, fresh = (g.picture(camera, **moving) for g in (kept, GroundMeshes([floor()], sky)))
         np.testing.assert_array_equal(one.image, fresh.image)
         np.testing.assert_array_equal(one.depth, fresh.depth)
     still = kept.picture(CAMERA)
@@ -191,7 +198,7 @@ def test_what_is_kept_from_frame_to_frame_changes_no_picture():
 def test_what_moves_is_lit_as_if_it_stayed():
     ball = trimesh.creation.icosphere(subdivisions=3, radius=0.5)
     ball.apply_translation([0.0, 0.0, 0.5])
-    apart = Ground([floor()], Environment.sky()).picture(CAMERA, bodies=[body(ball)])
+    apart = GroundMeshes([floor()], Environment.sky()).picture(CAMERA, bodies=[body(ball)])
     whole = ground_picture([floor(), body(ball)], CAMERA, Environment.sky())
     np.testing.assert_array_equal(apart.depth, whole.depth)
     # maps of their own for what moves: edges of shadows lie a texel beside, and the rest is the same
@@ -202,7 +209,7 @@ def test_what_moves_is_lit_as_if_it_stayed():
 def test_ground_that_a_caster_stands_out_over_is_lit_and_what_lies_deeper_is_not():
     sky, off = lamp((0.0, 0.0, 1.0), around=0.0), 0.1
     box = body(trimesh.creation.box((1.0, 1.0, 0.8)))
-    ground = Ground([floor()], sky, NO_AMBIENT)
+    ground = GroundMeshes([floor()], sky, NO_AMBIENT)
     whole, thin = (ground.picture(CAMERA, caster=box, inset=i).image.mean(axis=-1) for i in (0.0, off))
     middle = np.array(CAMERA.size[::-1]) // 2
     assert whole[tuple(middle)] < 0.01 and thin[tuple(middle)] < 0.01  # 0.4 m below its top

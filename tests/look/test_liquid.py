@@ -12,7 +12,7 @@ from fluidlift.look.liquid import (
     HOT,
     WARM,
     Behind,
-    LiquidSurface,
+    SurfaceBuffer,
     film_shown,
     followed,
     glow,
@@ -44,7 +44,7 @@ def slab(top=0.3, thick=0.25, **more):
     along = thick * np.linalg.norm(rays, axis=-1) / -rays[..., 2]
     shape = SIZE[::-1]
     normal = np.broadcast_to([0.0, 0.0, 1.0], (*shape, 3))
-    return LiquidSurface(level(top), normal, along, np.full((*shape, 3), 0.5), np.ones(shape), **more)
+    return SurfaceBuffer(level(top), normal, along, np.full((*shape, 3), 0.5), np.ones(shape), **more)
 
 
 def every_pixel():
@@ -196,7 +196,7 @@ def test_the_ground_cuts_the_thickness_off():
 
 def test_a_share_of_a_pixel_gets_a_share_of_the_liquids_light():
     surface = slab()
-    part = LiquidSurface(surface.depth, surface.normal, surface.thickness, surface.albedo, 0.25 * surface.covered)
+    part = SurfaceBuffer(surface.depth, surface.normal, surface.thickness, surface.albedo, 0.25 * surface.covered)
     behind = Behind(np.zeros((*SIZE[::-1], 3)), level(-0.6))
     whole = shaded(surface, behind, CAMERA, PRESETS["milk"], WHITE)
     np.testing.assert_allclose(shaded(part, behind, CAMERA, PRESETS["milk"], WHITE), 0.25 * whole, rtol=1e-5)
@@ -206,7 +206,7 @@ def test_normals_that_turn_within_a_pixel_are_as_rough_as_they_are():
     surface = slab()
     tilt = 0.05 * np.arange(SIZE[0]) * np.ones((SIZE[1], 1))
     bent = np.stack([np.sin(tilt), 0 * tilt, np.cos(tilt)], axis=-1)
-    curved = LiquidSurface(surface.depth, bent, surface.thickness, surface.albedo, surface.covered)
+    curved = SurfaceBuffer(surface.depth, bent, surface.thickness, surface.albedo, surface.covered)
     behind = Behind(np.zeros((*SIZE[::-1], 3)), level(-0.6))
     assert followed(surface, behind, CAMERA, every_pixel(), 1.3).spread.max() < 1e-3
     spread = followed(curved, behind, CAMERA, every_pixel(), 1.3).spread.reshape(SIZE[::-1])
@@ -295,7 +295,7 @@ def test_one_measure_of_heat_keeps_the_glow_of_what_stays():
     behind = Behind(np.zeros((*SIZE[::-1], 3)), level(-0.6))
     albedo = np.full((*SIZE[::-1], 3), 0.5)
     albedo[:, 40:] = 0.05  # a cold half that leaves the picture
-    both = LiquidSurface(*(getattr(slab(), k) for k in ("depth", "normal", "thickness")), albedo, slab().covered)
+    both = SurfaceBuffer(*(getattr(slab(), k) for k in ("depth", "normal", "thickness")), albedo, slab().covered)
     alone = slab()
     first, second = (shaded(s, behind, CAMERA, PRESETS["lava"], WHITE, usual=0.3)[:, :40] for s in (both, alone))
     np.testing.assert_array_equal(first, second)
@@ -307,7 +307,7 @@ def test_pictures_of_other_sizes_are_refused():
     with pytest.raises(ValueError, match="background"):
         shaded(slab(), Behind(np.zeros((10, 10, 3)), np.zeros((10, 10))), CAMERA, CLEAR, WHITE)
     with pytest.raises(ValueError, match="normal of shape"):
-        LiquidSurface(np.ones((4, 4)), np.ones((4, 4)), np.ones((4, 4)), np.ones((4, 4, 3)), np.ones((4, 4)))
+        SurfaceBuffer(np.ones((4, 4)), np.ones((4, 4)), np.ones((4, 4)), np.ones((4, 4, 3)), np.ones((4, 4)))
 
 
 def test_a_film_fades_with_its_height_over_the_ground_however_slanting_it_is_seen():

@@ -24,7 +24,6 @@ from fluidlift.look.relight import (
     environment_brdf,
     glow,
     heat,
-    lit_diffuse,
     own_albedo,
     reflectance,
     relit,
@@ -366,12 +365,6 @@ def test_hot_parts_glow_yellow_and_cool_ones_red_or_not_at_all():
     g = ball()
     dark = Environment.white(0.0)
     assert relit(g, *fluid_normals(g, SPACING), CAMERA, PRESETS["lava"], dark).max() > 1
-
-
-def test_dull_ground_is_its_albedo_times_what_falls_on_it():
-    normals = np.array([(0, 0, 1), (0, 0, -1)], np.float32)
-    lit = lit_diffuse(np.full((2, 3), 0.5), normals, gradient((0, 0, 1)))
-    np.testing.assert_allclose(lit, 0.5 * np.array([[1.6] * 3, [0.4] * 3]), rtol=5e-3)  # 32 rows
 
 
 def test_a_small_move_changes_the_light_little():

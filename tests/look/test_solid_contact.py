@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fluidlift.look.liquid import LiquidSurface
+from fluidlift.look.liquid import SurfaceBuffer
 from fluidlift.look.outlet_section import OpenEnd
 from fluidlift.look.solid_contact import carried_on, settled
 from fluidlift.types import Grid, PinholeCamera, Terrain, TriangleMesh
@@ -15,7 +15,7 @@ REACH, DEEP, BANK, STEEP = 0.1, 0.3, 0.5, np.tan(np.radians(60))
 SHORE = BANK + DEEP / STEEP
 
 
-def scene(gap: float) -> tuple[LiquidSurface, np.ndarray, np.ndarray]:
+def scene(gap: float) -> tuple[SurfaceBuffer, np.ndarray, np.ndarray]:
     """Water at z = 0 that ends `gap` (m) before its bank and at x = 0.4; the ground; where its plane is met."""
     rays, eye = CAMERA.rays(CAMERA.pixel_grid()), CAMERA.position
     z = -eye[2] / rays[..., 2]
@@ -27,7 +27,7 @@ def scene(gap: float) -> tuple[LiquidSurface, np.ndarray, np.ndarray]:
     flat, up = wet.astype(np.float32), np.zeros((*wet.shape, 3), np.float32)
     up[wet] = 0, 0, 1
     thick = flat * (ground - z) * np.linalg.norm(rays, axis=-1)
-    return LiquidSurface(flat * z, up, thick, 0.2 * np.ones_like(up), flat), ground, place
+    return SurfaceBuffer(flat * z, up, thick, 0.2 * np.ones_like(up), flat), ground, place
 
 
 @pytest.mark.parametrize("gap", [0.3, 0.8])

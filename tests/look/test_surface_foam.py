@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from fluidlift.look.environment import Environment
-from fluidlift.look.liquid import LiquidSurface
+from fluidlift.look.liquid import SurfaceBuffer
 from fluidlift.look.materials import HONEY, MUDDY_WATER, WATER
 from fluidlift.look.surface_foam import ALBEDO, BROAD, DARKEST_WHITE, FINE, FilmedWhite, _smoothed, with_foam
 from fluidlift.types import PinholeCamera
@@ -14,12 +14,12 @@ SIZE = (64, 48)
 INDEX = WATER.refractive_index
 
 
-def plane(camera: PinholeCamera, normal: np.ndarray, through: np.ndarray, color: np.ndarray) -> LiquidSurface:
+def plane(camera: PinholeCamera, normal: np.ndarray, through: np.ndarray, color: np.ndarray) -> SurfaceBuffer:
     """A surface that fills the picture, with a colour for each pixel."""
     rays = camera.rays(camera.pixel_grid())
     depth = ((through - camera.position) @ normal) / (rays @ normal)
     shape = depth.shape
-    return LiquidSurface(
+    return SurfaceBuffer(
         np.maximum(depth, 0.0), np.broadcast_to(normal, (*shape, 3)), np.ones(shape),
         np.broadcast_to(color, (*shape, 3)), np.ones(shape),
     )  # fmt: skip
@@ -63,7 +63,7 @@ def test_bumps_of_the_surface_are_none_of_the_face_of_a_fall():
     bumpy = river.normal.copy()
     bumpy[:, ::2, 0], bumpy[:, 1::2, 0] = -0.6, 0.6
     bumpy /= np.linalg.norm(bumpy, axis=-1, keepdims=True)
-    rough = LiquidSurface(river.depth, bumpy, river.thickness, river.albedo, river.covered)
+    rough = SurfaceBuffer(river.depth, bumpy, river.thickness, river.albedo, river.covered)
     assert middle(FilmedWhite(camera.position, 0.6).cover(rough, camera, INDEX)) < 0.05
 
 
@@ -96,7 +96,7 @@ def test_compiled_and_plain_foam_agree_and_a_broad_bell_is_found_in_a_small_pict
     normal = rng.normal(size=(200, 320, 3)) + [0, 0, 2]
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
     full = np.ones((200, 320), np.float32)
-    surface = LiquidSurface(depth, normal, full, rng.uniform(size=(200, 320, 3)), full)
+    surface = SurfaceBuffer(depth, normal, full, rng.uniform(size=(200, 320, 3)), full)
     white = FilmedWhite(np.array([1.0, -1.0, 2.0]), 0.5)
     np.testing.assert_allclose(
         white.cover(surface, camera, 1.333), white.cover_plain(surface, camera, 1.333), atol=1e-5

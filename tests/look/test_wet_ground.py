@@ -8,7 +8,7 @@ from fluidlift.backends.mitsuba_renderer import MitsubaRenderer
 from fluidlift.backends.mitsuba_scene import FinalScene
 from fluidlift.look.environment import Environment
 from fluidlift.look.environment_lookup import grid_directions
-from fluidlift.look.ground_picture import Ground
+from fluidlift.look.ground_picture import GroundMeshes
 from fluidlift.look.materials import Material
 from fluidlift.look.optics import fresnel, held_inside, wet_light
 from fluidlift.look.screen_space import mesh_surface
@@ -76,7 +76,7 @@ def test_a_layer_holds_what_its_surface_throws_back():
 
 def test_ground_below_a_gap_or_beside_the_liquid_stays_dry():
     world = Environment.white()
-    ground = Ground([floor(0.35)], world)
+    ground = GroundMeshes([floor(0.35)], world)
     wide = PinholeCamera.looking(np.array([0.0, -0.02, 1.2]), np.zeros(3), 34.0, (40, 40))
     lifted = TriangleMesh(slab(0.05).vertices + [0, 0, 0.3], slab(0.05).faces, np.full((8, 3), 0.5))
     for body, wet in ((slab(0.05), True), (lifted, False)):
@@ -103,7 +103,7 @@ def test_under_a_sun_the_ground_gets_what_one_bent_way_leaves(height, casts):
     """Snell, Fresnel and Beer for one direction, and the series of what the surface throws back."""
     toward = np.array([0.0, np.sqrt(1 - height**2), height])
     world = Environment(np.where((grid_directions(64) @ toward > 0.998)[..., None], 300.0, 0.0) * np.ones(3))
-    ground, depth, albedo = Ground([floor(0.35)], world), 0.03, 0.35
+    ground, depth, albedo = GroundMeshes([floor(0.35)], world), 0.03, 0.35
     surface = mesh_surface(slab(depth), CAMERA)
     behind = ground.picture(CAMERA, None, slab(depth) if casts else None, material=HONEY)
     there = ground.albedo(CAMERA), ground.depth(CAMERA)

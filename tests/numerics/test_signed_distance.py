@@ -3,18 +3,10 @@
 import numpy as np
 
 from fluidlift.numerics.sampling import sample_nodes
-from fluidlift.numerics.signed_distance import distance_of_heights, push_outside
+from fluidlift.numerics.signed_distance import push_outside
 from fluidlift.types import Grid
 
 GRID = Grid((16, 14, 12), 0.1, (-0.3, 0.2, 0.0))
-
-
-def test_a_tilted_bed_has_its_true_distance():
-    x = GRID.nodes()[:, :, 0, 0]
-    distance = distance_of_heights(0.4 + 0.5 * x, GRID)
-    nodes = GRID.nodes()
-    truth = (nodes[..., 2] - 0.4 - 0.5 * nodes[..., 0]) / np.sqrt(1.25)
-    np.testing.assert_allclose(distance, truth, atol=1e-6)
 
 
 def test_points_in_a_sphere_are_pushed_out_and_others_stay():

@@ -6,12 +6,12 @@ import pytest
 import torch
 
 from fluidlift.numerics import splatting, splatting_torch
-from fluidlift.numerics.splatting import View
+from fluidlift.numerics.splatting import SplatCamera
 
 NAMES = ("means", "quats", "scales", "opacities", "features")
 
 
-def scene(count: int, size: tuple[int, int], seed: int = 0) -> tuple[View, list[np.ndarray]]:
+def scene(count: int, size: tuple[int, int], seed: int = 0) -> tuple[SplatCamera, list[np.ndarray]]:
     """Gaussians of many shapes before a turned camera; one lies outside the picture and reaches into it."""
     rng = np.random.default_rng(seed)
     means = rng.normal(size=(count, 3)) * (0.6, 0.6, 0.3)
@@ -21,7 +21,7 @@ def scene(count: int, size: tuple[int, int], seed: int = 0) -> tuple[View, list[
     opacities, features = rng.uniform(0.05, 0.9999, count), rng.random((count, 5))
     c, s = np.cos(0.2), np.sin(0.2)
     w, h = size
-    view = View(np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]), np.array([0.1, -0.05, 2.5]), (1.3 * h, 1.2 * h),
+    view = SplatCamera(np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]), np.array([0.1, -0.05, 2.5]), (1.3 * h, 1.2 * h),
                 (w / 2 + 1, h / 2 - 2), size)  # fmt: skip
     return view, [np.ascontiguousarray(x, np.float32) for x in (means, quats, scales, opacities, features)]
 
@@ -144,7 +144,7 @@ def test_bands_of_tiles_make_the_same_picture_in_bounded_memory(monkeypatch):
 
 
 def test_tiles_that_a_needle_passes_by_do_not_get_it():
-    view = View(np.eye(3), np.zeros(3), (100.0, 100.0), (80, 80), (160, 160))
+    view = SplatCamera(np.eye(3), np.zeros(3), (100.0, 100.0), (80, 80), (160, 160))
     quats = np.float32([[np.cos(np.pi / 8), 0, 0, np.sin(np.pi / 8)]])  # turned by 45 degrees in the picture
     arrays = np.float32([[0, 0, 2]]), quats, np.float32([[0.6, 0.005, 0.005]]), np.float32([0.9])
     projected = splatting.project(view, *arrays)
@@ -157,7 +157,7 @@ def test_tiles_that_a_needle_passes_by_do_not_get_it():
 
 
 def test_no_gaussian_reaches_beyond_the_cap():
-    view = View(np.eye(3), np.zeros(3), (100.0, 100.0), (32, 32), (64, 64))
+    view = SplatCamera(np.eye(3), np.zeros(3), (100.0, 100.0), (32, 32), (64, 64))
     means, quats = np.float32([[0, 0, 1], [0, 0, 1]]), np.float32([[1, 0, 0, 0]] * 2)
     scales, opacities = np.full((2, 3), 0.05, np.float32), np.float32([1.0, 0.1])
     sigma = np.sqrt(5.0**2 + 0.3)
@@ -201,7 +201,7 @@ def test_any_number_of_channels_is_composited_alike(channels):
 
 
 def test_order_is_by_depth_and_ties_by_index():
-    view = View(np.eye(3), np.zeros(3), (100.0, 100.0), (8, 8), (16, 16))
+    view = SplatCamera(np.eye(3), np.zeros(3), (100.0, 100.0), (8, 8), (16, 16))
     means = np.float32([[0, 0, 3], [0, 0, 2], [0, 0, 2], [0, 0, -1]])
     quats, scales = np.tile(np.float32([1, 0, 0, 0]), (4, 1)), np.full((4, 3), 0.05, np.float32)
     opacities = np.full(4, 0.5, np.float32)

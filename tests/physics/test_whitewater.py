@@ -16,7 +16,7 @@ from fluidlift.physics.whitewater import (
     SPRAY,
     Ground,
     LiquidState,
-    Range,
+    PotentialRange,
     SeenBirths,
     Whitewater,
     WhitewaterLaw,
@@ -31,9 +31,9 @@ from fluidlift.types import Grid, Particles, Terrain, TriangleMesh
 
 H = 0.05
 G = (0.0, 0.0, -9.81)
-LAW = WhitewaterLaw(Range(0.02, 0.1), Range(2.0, 20.0), Range(0.05, 0.5), 200.0, 200.0)
+LAW = WhitewaterLaw(PotentialRange(0.02, 0.1), PotentialRange(2.0, 20.0), PotentialRange(0.05, 0.5), 200.0, 200.0)
 """limits between a pool at rest (0.003 m/s) and water that hits a wall (0.1 m/s)"""
-DAM = WhitewaterLaw(Range(0.12, 0.5), Range(8.0, 30.0), Range(0.05, 0.5), 200.0, 200.0)
+DAM = WhitewaterLaw(PotentialRange(0.12, 0.5), PotentialRange(8.0, 30.0), PotentialRange(0.05, 0.5), 200.0, 200.0)
 """of a dam of 0.4 m, whose front closes in on itself by up to 0.11 m/s as it runs out, and by 0.8 m/s at the wall"""
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fluidlift.pipeline.found_parts import ledge_lines, lines_of, outlines, parts_of
-from fluidlift.shape.composite import Parts
+from fluidlift.shape.composite import BodyParts
 from fluidlift.shape.filled_vessel import FilledVessel
 from fluidlift.shape.kind import level_camera
 from fluidlift.types import KindEvidence, PinholeCamera, UpEvidence, kind_of
@@ -22,7 +22,7 @@ def seen(kind="stream", *, chutes=(), vessel=None, ledges=None, motion=None, pud
     sight = SimpleNamespace(
         kind=kind_of(kind), kind_free=True, evidence=KindEvidence(kind, {kind: 0.8}, {}), mask=mask,
         motion=np.zeros((*SIZE, 2)) if motion is None else motion, trust=np.ones(SIZE),
-        parts=Parts((), mask, puddle=puddle, ledges=ledges),
+        parts=BodyParts((), mask, puddle=puddle, ledges=ledges),
     )  # fmt: skip
     canonical = level_camera(camera, UpEvidence(20.0, 0.0, "", 0.0))
     return SimpleNamespace(seen=sight, front=SimpleNamespace(chutes=chutes, vessel=vessel), canonical=canonical)

@@ -18,7 +18,7 @@ import torch
 from fluidlift.backends import model_table
 from fluidlift.backends.model_cache import kept
 from fluidlift.backends.model_card import ModelCard, ModelFile
-from fluidlift.backends.model_get import Wanted, get_model
+from fluidlift.backends.model_get import ModelRequest, get_model
 from fluidlift.cli import DONE, REJECTED, WITH_WARNINGS, main
 from fluidlift.config import JobConfig, build_config
 from fluidlift.errors import InputRejected, MissingPackage
@@ -109,11 +109,11 @@ def seeing(table, stick, monkeypatch):
     """A model of the view beside the others: a small GeoCalib, whose field is that of a camera that looks 70 degrees
     down and is turned by 4."""
     from fluidlift.backends.geocalib import GeoCalib
-    from fluidlift.backends.geocalib_network import GeoCalibNetwork, NetworkShape
+    from fluidlift.backends.geocalib_network import GeoCalibNetwork, GeoCalibShape
     from fluidlift.backends.perspective_field import field_of_camera
 
     torch.manual_seed(0)
-    state = GeoCalibNetwork(NetworkShape((8, 8, 8, 8), (1, 1, 1, 1), (8, 8, 8, 8), 8, 8)).state_dict()
+    state = GeoCalibNetwork(GeoCalibShape((8, 8, 8, 8), (1, 1, 1, 1), (8, 8, 8, 8), 8, 8)).state_dict()
     torch.save({"model": state}, stick / "geocalib-pinhole.tar")
     data = (stick / "geocalib-pinhole.tar").read_bytes()
     file = ModelFile("geocalib-pinhole.tar", "https://x.y/z", len(data), hashlib.sha256(data).hexdigest())
@@ -127,13 +127,13 @@ def seeing(table, stick, monkeypatch):
         return field_of_camera(70.0, 4.0, 1.1 * width, (width, height)), 1.0
 
     monkeypatch.setattr(GeoCalib, "field", field)
-    get_model(card, Wanted(stick))
+    get_model(card, ModelRequest(stick))
     return file.sha256
 
 
 def bring(table, stick, *names):
     for name in names:
-        get_model(table[name], Wanted(stick))
+        get_model(table[name], ModelRequest(stick))
 
 
 def test_nothing_changes_unless_it_is_asked_for(table, stick):
@@ -239,16 +239,17 @@ def test_motion_measures_with_the_model_that_it_was_told(capsys, table, stick, s
 def test_a_stage_depends_on_what_is_in_the_weights_and_not_on_where_they_are(table, stick, monkeypatch, tmp_path):
     bring(table, stick, "depth-1")
     config = with_models(JobConfig(), CLIP, "depth-1").config
+    in_key = Runner(tmp_path / "asset", (), progress=Silence())._part
     before = Weights.of(config.depth.weights)
     shutil.move(tmp_path / "cache", tmp_path / "elsewhere")
     monkeypatch.setenv("FLUIDLIFT_MODELS", str(tmp_path / "elsewhere"))
     after = Weights.of(config.depth.weights)
-    assert before.cache_key == after.cache_key and before.name != after.name
-    assert hashlib.sha256((stick / "moge.pt").read_bytes()).hexdigest() in before.cache_key
+    assert in_key(before) == in_key(after) and before.name != after.name
+    assert hashlib.sha256((stick / "moge.pt").read_bytes()).hexdigest() in str(in_key(before))
     (stick / "moge.pt").write_bytes(b"another version")
     other = replace(table["depth-1"], files=(ModelFile("moge.pt", "https://x.y/z"),))
-    get_model(other, Wanted(stick, accept_unverified=True))
-    assert Weights.of(config.depth.weights).cache_key != before.cache_key
+    get_model(other, ModelRequest(stick, accept_unverified=True))
+    assert in_key(Weights.of(config.depth.weights)) != in_key(before)
 
 
 def test_a_model_that_was_changed_or_is_gone_is_not_used(table, stick, tmp_path):

@@ -12,8 +12,8 @@ from fluidlift.pipeline import preview
 from fluidlift.pipeline.preview import (
     LivePreview,
     PreviewFrame,
+    PreviewRequest,
     PreviewSize,
-    Wish,
     coarse_asset,
     obstacles_of,
     preview_frames,
@@ -194,7 +194,7 @@ def until(condition, seconds=10.0):
 
 
 def wish(name, **edits):
-    return Wish({"name": name} | edits, f"{name} moved")
+    return PreviewRequest({"name": name} | edits, f"{name} moved")
 
 
 def test_what_an_edit_may_bring_is_rehearsed_on_a_scene_that_bears_it(tmp_path):

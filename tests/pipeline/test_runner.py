@@ -11,9 +11,8 @@ from fluidlift.io.kept_values import kept_value, last_value
 from fluidlift.io.stage_cache import load_stage, save_stage
 from fluidlift.machine import peak_memory_mb
 from fluidlift.pipeline import runner as running
-from fluidlift.pipeline.inputs import GivenFile, Weights
+from fluidlift.pipeline.inputs import BESIDE, GivenFile, Weights
 from fluidlift.pipeline.runner import Runner, digest_of
-from fluidlift.pipeline.settings import BESIDE
 from fluidlift.pipeline.work import Work
 from fluidlift.seams import Silence
 from fluidlift.types import FaceVelocity, Grid
@@ -248,21 +247,27 @@ def test_memory_is_told_in_megabytes():
 # earlier runs -----------------------------------------------------------------------------------------------------
 
 
+def made_from(keys: dict[str, str]) -> dict:
+    """What a manifest says of the stages."""
+    return {"provenance": {"stages": dict(keys)}}
+
+
 def test_a_value_is_recalled_by_its_key_and_known_to_what_follows(workshop):
     before, _ = workshop.run()
     runner = Runner(workshop.folder, STAGES, progress=Silence())
-    found = runner.recall("two", before.keys["two"], Sum)
+    found = runner.recall(made_from(before.keys), "two", Sum)
     assert found is not None and found.value == 2 and runner.timings["two"]["cached"]
     DONE.clear()
     runner.run("three", add, found, Added("three", 3))
     assert DONE == []
-    assert runner.recall("two", "0" * 64, Sum) is None
+    assert runner.recall(made_from({"two": "0" * 64}), "two", Sum) is None
+    assert runner.recall(made_from({}), "two", Sum) is None
 
 
 def test_what_is_forgotten_has_no_key(workshop):
     before, _ = workshop.run()
     runner = Runner(workshop.folder, STAGES, progress=Silence())
-    runner.recall("two", before.keys["two"], Sum)
+    runner.recall(made_from(before.keys), "two", Sum)
     runner.forget()
     assert runner.keys == {} == runner.timings
 

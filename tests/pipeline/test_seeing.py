@@ -13,7 +13,7 @@ from fluidlift.io.hashes import file_hash
 from fluidlift.messages import code_of
 from fluidlift.motion.optical_flow import estimate_flow, mean_flow
 from fluidlift.motion.steady_flow import mean_motion, pairs_of, spans_of
-from fluidlift.pipeline.hints import NO_HINTS, Hints
+from fluidlift.pipeline.hints import NO_HINTS, MaskHints
 from fluidlift.pipeline.inputs import GivenFile
 from fluidlift.pipeline.runner import Runner
 from fluidlift.pipeline.settings import FlowSettings, ReadSettings, SegmentSettings
@@ -184,12 +184,12 @@ def test_parts_cover_an_array_once(size):
 
 
 def test_hints_are_read_from_texts():
-    hints = Hints.of("1,2,30,40", ["5,6", "7.5,8"], ["9,10"])
+    hints = MaskHints.of("1,2,30,40", ["5,6", "7.5,8"], ["9,10"])
     assert hints.roi == (1, 2, 30, 40)
     assert hints.points == ((5, 6, True), (7.5, 8, True), (9, 10, False))
-    assert Hints.of(None, [], []) == NO_HINTS
+    assert MaskHints.of(None, [], []) == NO_HINTS
     with pytest.raises(InputRejected, match="--not-here"):
-        Hints.of(None, [], ["here"])
+        MaskHints.of(None, [], ["here"])
 
 
 def test_flow_by_a_learned_method_needs_its_weights(seen, tmp_path):
@@ -239,10 +239,10 @@ def fluid(seen, tmp_path):
 
 def test_hints_reach_a_learned_method_through_its_first_guess(fluid, monkeypatch):
     monkeypatch.setattr(segmenting, "make_segmenter", lambda name, choice, *, guess, **_: Recorder(guess))
-    whole, found = fluid("sam2"), fluid("sam2", Hints.of("0,0,48,64", [], []))
+    whole, found = fluid("sam2"), fluid("sam2", MaskHints.of("0,0,48,64", [], []))
     assert whole[:, 26:44, 70:].any() and found[:, 26:44, 8:40].any() and not found[:, :, 50:].any()
 
 
 def test_a_method_that_goes_by_words_takes_no_hints(fluid):
     with pytest.raises(InputRejected, match="sam3"):
-        fluid("sam3", Hints.of("0,0,48,64", [], []))
+        fluid("sam3", MaskHints.of("0,0,48,64", [], []))

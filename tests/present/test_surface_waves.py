@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fluidlift.look.liquid import LiquidSurface
+from fluidlift.look.liquid import SurfaceBuffer
 from fluidlift.look.wave_relief import WaveRelief
 from fluidlift.look.wave_spectrum import FilmedWaves
 from fluidlift.numerics.mesh_normals import vertex_normals
@@ -72,7 +72,7 @@ def seen(normal=(0.0, 0.0, 1.0)):
     depth = ((LEVEL - CAMERA.position[2]) / rays[..., 2]).astype(np.float32)
     depth[:, :10] = 0.0
     shape = depth.shape
-    return LiquidSurface(depth, np.broadcast_to(normal, (*shape, 3)), np.ones(shape), np.ones((*shape, 3)),
+    return SurfaceBuffer(depth, np.broadcast_to(normal, (*shape, 3)), np.ones(shape), np.ones((*shape, 3)),
                          (depth > 0).astype(np.float32))  # fmt: skip
 
 
@@ -104,7 +104,7 @@ def test_no_normal_turns_away_from_the_viewer():
     depth = np.where(down, (LEVEL - grazing.position[2]) / np.where(down, rays[..., 2], -1.0), 0.0)
     depth = np.where(depth < 9.0, depth, 0.0).astype(np.float32)
     shape, up = depth.shape, np.broadcast_to([0.0, 0.0, 1.0], (*depth.shape, 3))
-    surface = LiquidSurface(depth, up, np.ones(shape), np.ones((*shape, 3)), (depth > 0).astype(np.float32))
+    surface = SurfaceBuffer(depth, up, np.ones(shape), np.ones((*shape, 3)), (depth > 0).astype(np.float32))
     found = waves().tilted(surface, grazing, 1.0)
     away = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
     assert (depth > 0).any()
@@ -113,6 +113,6 @@ def test_no_normal_turns_away_from_the_viewer():
 
 def test_an_empty_picture_stays_empty():
     shape = (60, 80)
-    empty = LiquidSurface(np.zeros(shape), np.zeros((*shape, 3)), np.zeros(shape), np.zeros((*shape, 3)),
+    empty = SurfaceBuffer(np.zeros(shape), np.zeros((*shape, 3)), np.zeros(shape), np.zeros((*shape, 3)),
                           np.zeros(shape))  # fmt: skip
     assert waves().tilted(empty, CAMERA, 1.0) is empty

@@ -8,7 +8,6 @@ from scipy import ndimage
 
 from fluidlift.config import build_config
 from fluidlift.messages import code_of
-from fluidlift.numerics.signed_distance import distance_of_heights
 from fluidlift.physics.refill import Refill
 from fluidlift.pipeline.settings import SimulateSettings, taken
 from fluidlift.pipeline.stages import simulate
@@ -40,7 +39,9 @@ def flat(grid: Grid = GRID, wall: np.ndarray | None = None) -> Terrain:
     """A floor at z = 0.1, with heights of its own where `wall` says so."""
     heights = np.full((grid.shape[0] + 1, grid.shape[1] + 1), 0.1) if wall is None else wall
     mesh = TriangleMesh(np.zeros((3, 3), np.float32), np.array([[0, 1, 2]]), np.zeros((3, 3), np.float32))
-    return Terrain(grid, distance_of_heights(heights, grid), np.array([1.0, 0.0, 0.0]), mesh)
+    slope_x, slope_y = np.gradient(heights, grid.spacing)
+    away = (grid.nodes()[..., 2] - heights[..., None]) / np.sqrt(1.0 + slope_x**2 + slope_y**2)[..., None]
+    return Terrain(grid, away.astype(np.float32), np.array([1.0, 0.0, 0.0]), mesh)
 
 
 def types_of(terrain: Terrain) -> np.ndarray:

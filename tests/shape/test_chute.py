@@ -17,10 +17,10 @@ from fluidlift.shape.chute import (
     pieces,
     stand,
 )
-from fluidlift.shape.composite import Parts, trust_beside_jets, with_chute
-from fluidlift.shape.jets import Outline
+from fluidlift.shape.composite import BodyParts, trust_beside_jets, with_chute
+from fluidlift.shape.jets import JetOutline
 from fluidlift.shape.kind import level_camera
-from fluidlift.shape.plan import Footage
+from fluidlift.shape.plan import PlanEvidence
 from fluidlift.shape.registration import PlacedHeight, VelocityEvidence
 from fluidlift.shape.sections import SURE, estimate_sections
 from fluidlift.shape.slope import flow_patches, plane_axes
@@ -132,8 +132,8 @@ def test_what_spreads_fast_from_the_foot_of_a_jet_is_no_chute():
         """Where a jet of 6 px stands in the picture, over fluid."""
         pixels = np.zeros_like(mask)
         pixels[max(v - 20, 0) : v + 6, u - 3 : u + 3] = True
-        outline = Outline(pixels, np.array([[u, v - 20.0], [u, v + 6.0]]), np.array([3.0, 3.0]), False)
-        known = trust_beside_jets(Parts((outline,), mask), camera, motion, trust * ~pixels)
+        outline = JetOutline(pixels, np.array([[u, v - 20.0], [u, v + 6.0]]), np.array([3.0, 3.0]), False)
+        known = trust_beside_jets(BodyParts((outline,), mask), camera, motion, trust * ~pixels)
         return chutes_on_level(camera, mask, motion, known)
 
     assert front_with(*at) is None
@@ -340,7 +340,7 @@ def test_water_comes_in_at_the_top_of_a_chute_and_rests_in_its_bed():
     surface = PlacedHeight(front.height, still)
     assert surface.steps
     speed = np.where(mask, np.where(chute, 0.05, 0.012) / 0.04, np.nan)
-    seen = Footage(surface, labels, points, camera, np.array([1.0, 0.0, 0.0]), speed)
+    seen = PlanEvidence(surface, labels, points, camera, np.array([1.0, 0.0, 0.0]), speed)
     setting = channel_setting(seen, ChannelConfig("stream", 64, 400_000))
     cells, grid = setting.cell_types, setting.terrain.grid
     inlet = cells == CellType.INFLOW

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fluidlift.errors import InputRejected
-from fluidlift.shape.composite import LEVEL_SAID, Parts, level_prior, unused_marks, with_marks
+from fluidlift.shape.composite import LEVEL_SAID, BodyParts, level_prior, unused_marks, with_marks
 from fluidlift.shape.drawn import LABELS, carried, drawn_pixels, frame_at
 from fluidlift.shape.kind import level_camera
 from fluidlift.shape.registration import ruler_scale
@@ -96,16 +96,16 @@ MARKED = ClipHints(regions=(
 def test_marked_ledges_and_pools_belong_to_the_parts_of_a_stream():
     mask = np.zeros((40, 60), bool)
     mask[:, 20:] = True
-    parts = with_marks(Parts((), mask), MARKED.view, mask)
+    parts = with_marks(BodyParts((), mask), MARKED.view, mask)
     assert parts.ledges is not None and parts.ledges[5:15, 20:30].all()
     drawn = drawn_pixels(MARKED.regions[0].line, None, (40, 60))
     assert (parts.ledges == drawn & mask).all() and parts.ledges.sum() < drawn.sum()
     assert (parts.gentle == ~parts.ledges).all()
     still = np.zeros((40, 60, 2))
     assert level_prior(parts, still, np.ones((40, 60))) == LEVEL_SAID
-    assert with_marks(Parts((), mask), None, mask) == Parts((), mask)
+    assert with_marks(BodyParts((), mask), None, mask) == BodyParts((), mask)
     front = FrontSurface(np.ones((40, 60), np.float32), np.zeros((40, 60), np.float32), None)
     assert [w.code for w in unused_marks(parts, front)] == ["ledge-not-used"]
-    assert unused_marks(parts, replace(front, chutes=(mask,))) == [] == unused_marks(Parts((), mask), front)
-    assert level_prior(Parts((), mask), still, np.ones((40, 60))) < LEVEL_SAID
+    assert unused_marks(parts, replace(front, chutes=(mask,))) == [] == unused_marks(BodyParts((), mask), front)
+    assert level_prior(BodyParts((), mask), still, np.ones((40, 60))) < LEVEL_SAID
     assert all(LABELS[word] == Label.FLUID for word in ("ledge", "pool"))

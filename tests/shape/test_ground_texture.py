@@ -9,7 +9,7 @@ from scipy.ndimage import binary_dilation, binary_erosion
 
 from fluidlift.numerics.textures import sample_texture
 from fluidlift.shape.ground_mesh import ground_mesh
-from fluidlift.shape.ground_texture import STRIP, View, hidden_ground, over_bed, sky_pixels, textured
+from fluidlift.shape.ground_texture import STRIP, GroundView, hidden_ground, over_bed, sky_pixels, textured
 from fluidlift.types import Grid, Label, PinholeCamera
 
 GRID = Grid((24, 16, 6), 0.125, (-1.5, -1.0, -1.0))
@@ -34,7 +34,7 @@ def picture():
 def seen_on(heights, *, plate=None, labels=None, level=DRY, seen=None):
     plate = picture() if plate is None else plate
     labels = np.full(plate.shape[:2], Label.BACKGROUND) if labels is None else labels
-    view = View(
+    view = GroundView(
         plate.astype(np.uint8), CAMERA, labels.astype(np.uint8), np.ones(labels.shape, bool) if seen is None else seen
     )
     return textured(ground_mesh(GRID, heights), GRID, level, view)
@@ -71,7 +71,7 @@ def test_the_sides_and_the_floor_are_of_one_earthy_colour(level_ground):
 
 
 def test_a_texture_is_not_larger_than_it_may_be(level_ground):
-    view = View(picture().astype(np.uint8), CAMERA, np.zeros((150, 200), np.uint8), np.ones((150, 200), bool))
+    view = GroundView(picture().astype(np.uint8), CAMERA, np.zeros((150, 200), np.uint8), np.ones((150, 200), bool))
     small = textured(ground_mesh(GRID, np.zeros((25, 17))), GRID, DRY, view, longest=64)
     assert max(small.texture.shape) == 64 and max(level_ground.texture.shape) > 200
 
@@ -220,7 +220,7 @@ def test_the_cut_side_of_the_ground_is_no_part_of_the_picture_without_fluid():
     """The block ends somewhere; the scene does not, and earth is nothing that the clip shows there."""
     plate, seen = np.full((150, 200, 3), (30, 60, 120), np.uint8), np.zeros((150, 200), bool)
     seen[:2] = True
-    view = View(plate, CAMERA, np.full((150, 200), Label.BACKGROUND, np.uint8), seen)
+    view = GroundView(plate, CAMERA, np.full((150, 200), Label.BACKGROUND, np.uint8), seen)
     mesh = textured(ground_mesh(GRID, np.zeros((25, 17))), GRID, DRY, view)
     uv, _ = CAMERA.project(np.array([[0.0, -1.0, -0.1]]))  # on the side towards the camera, below much that lies
     x, y = np.round(uv[0] - 0.5).astype(int)
@@ -249,7 +249,7 @@ def water_before_a_wall():
     plate[20:, 60:120] = (150, 40, 40)  # whatever was painted there
     mesh = ground_mesh(GRID, wall + 0.0 * x)
     seen = labels != Label.FLUID
-    return textured(mesh, GRID, level, View(plate, FACING, labels.astype(np.uint8), seen)), plate, seen
+    return textured(mesh, GRID, level, GroundView(plate, FACING, labels.astype(np.uint8), seen)), plate, seen
 
 
 def test_no_ground_is_painted_over_the_scene_behind_water_that_stands():
@@ -288,7 +288,7 @@ def test_no_sky_is_laid_on_the_ground():
     y = GRID.nodes()[:, :, 0, 1]
     rises = np.clip(3.0 * (y + 0.3), 0.0, 1.2)
     labels = np.full((150, 200), Label.BACKGROUND, np.uint8)
-    view = View(landscape(), FACING, labels, np.ones((150, 200), bool))
+    view = GroundView(landscape(), FACING, labels, np.ones((150, 200), bool))
     assert textured(ground_mesh(GRID, rises), GRID, DRY, view).texture.max() < 160
     sky_seen = textured(ground_mesh(GRID, 0 * rises), GRID, DRY, replace(view, camera=CAMERA)).texture
     assert sky_seen.max() > 230  # a white thing on level ground stays

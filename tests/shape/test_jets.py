@@ -190,7 +190,7 @@ def test_a_turned_picture_shows_in_its_jets():
         """Found from a jet 100 px long that follows the vertical of a camera turned by so much."""
         down = jets.projected_vertical(level_camera(camera, UpEvidence(30.0, turn, "", 1.0)))[100, 120]
         centers = np.array([120.5, 100.5]) + np.linspace(-50, 50, 6)[:, None] * down
-        outline = jets.Outline(np.zeros((240, 320), bool), centers, np.full(6, half_width), cut=False)
+        outline = jets.JetOutline(np.zeros((240, 320), bool), centers, np.full(6, half_width), cut=False)
         return jets.roll_of([outline], level_camera(camera, UpEvidence(30.0, 0.0, "", 1.0)))
 
     assert abs(roll(0.0, 2.0)) < 0.1

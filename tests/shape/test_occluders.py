@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from fluidlift.shape.occluders import PRIOR, SURE, Behind, Outline, near_occluders, occluders
+from fluidlift.shape.occluders import PRIOR, SURE, HiddenFluid, OutlineFlow, near_occluders, occluders
 
 QUIET = 2.0
 """px of the blur that stands for the smoothness of optical flow"""
@@ -130,14 +130,14 @@ def test_ground_beside_a_sheet_is_not_looked_at():
 
 
 def test_odds_of_an_outline_are_those_of_the_two_models():
-    before = Outline(1.0, 1.0, 0.0, narrow=0.6)
-    within = Outline(0.4, 0.2, 0.38, narrow=0.6)
+    before = OutlineFlow(1.0, 1.0, 0.0, narrow=0.6)
+    within = OutlineFlow(0.4, 0.2, 0.38, narrow=0.6)
     assert before.probability > 0.999 and within.probability < 0.001
-    assert Outline(1.0, 1.0, 0.0, narrow=0.07).probability < SURE, "the wake of a twig is short"
-    alike = Outline(0.7, float("nan"), 0.3 / np.pi * 2.0, narrow=0.6)  # half way between both in what is seen
+    assert OutlineFlow(1.0, 1.0, 0.0, narrow=0.07).probability < SURE, "the wake of a twig is short"
+    alike = OutlineFlow(0.7, float("nan"), 0.3 / np.pi * 2.0, narrow=0.6)  # half way between both in what is seen
     assert alike.probability == pytest.approx(PRIOR / (1 + PRIOR), abs=0.01)
-    assert Outline(float("nan"), 1.0, 0.0, narrow=0.6).probability == 0.0, "nothing goes in"
-    slender = Outline(1.0, float("nan"), 0.0, narrow=0.05)
+    assert OutlineFlow(float("nan"), 1.0, 0.0, narrow=0.6).probability == 0.0, "nothing goes in"
+    slender = OutlineFlow(1.0, float("nan"), 0.0, narrow=0.05)
     assert slender.probability < SURE, "beside something slender water falls the same in both"
 
 
@@ -147,7 +147,7 @@ def test_hidden_fluid_looks_as_the_fluid_beside_it_at_the_same_height():
     hidden = scene.disc()
     rows, columns = np.mgrid[0 : scene.size[0], 0 : scene.size[1]]
     frames = np.stack([rows, columns, columns], axis=-1)[None].repeat(2, axis=0).astype(np.uint8)
-    behind = Behind.of(hidden, fluid)
+    behind = HiddenFluid.of(hidden, fluid)
     shown = behind.pictures(frames)
     assert len(shown) == 2 and len(list(shown)) == 2
     np.testing.assert_array_equal(shown[1][~hidden], frames[1][~hidden])
@@ -161,7 +161,7 @@ def test_hidden_fluid_looks_as_the_fluid_beside_it_at_the_same_height():
 def test_hidden_fluid_without_any_beside_it_looks_as_the_nearest():
     hidden, fluid = np.zeros((40, 60), bool), np.zeros((40, 60), bool)
     hidden[10:20], fluid[30:] = True, True
-    behind = Behind.of(hidden, fluid)
+    behind = HiddenFluid.of(hidden, fluid)
     assert (behind.lent[0] == 30).all()
-    bare = Behind.of(hidden, np.zeros_like(fluid))
+    bare = HiddenFluid.of(hidden, np.zeros_like(fluid))
     np.testing.assert_array_equal(bare.lent, np.stack(np.nonzero(hidden)))

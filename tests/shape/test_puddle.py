@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from fluidlift.shape.jets import Outline
+from fluidlift.shape.jets import JetOutline
 from fluidlift.shape.puddle import down_to_landing, jet_over_spreading, jets_into_puddle
 from fluidlift.types import PinholeCamera, UpEvidence
 
@@ -67,7 +67,7 @@ def test_without_a_jet_there_is_no_puddle():
 def test_a_jet_goes_on_over_the_way_on_which_its_flow_is_lost(below, reach):
     """Flow of 12 px a frame ends 12 px above the landing; where it is still trusted, the jet has ended."""
     pixels = (np.abs(COL - 80) < 6) & (ROW < 90)
-    outline = Outline(pixels, np.array([[80.0, 0.0], [80.0, 90.0]]), np.array([6.0, 6.0]), True)
+    outline = JetOutline(pixels, np.array([[80.0, 0.0], [80.0, 90.0]]), np.array([6.0, 6.0]), True)
     motion = np.zeros((H, W, 2))
     motion[pixels, 1] = 12.0
     drawn = down_to_landing(outline, np.ones((H, W), bool), motion, np.where(pixels, 0.8, below))

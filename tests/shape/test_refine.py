@@ -11,7 +11,14 @@ from fluidlift.errors import InputRejected
 from fluidlift.look.rasterize import render
 from fluidlift.shape import refine as module
 from fluidlift.shape.refine import refine
-from fluidlift.shape.regression_guard import Frame, ShapeFigures, broken, neighbours, picture_and_figures, plain_color
+from fluidlift.shape.regression_guard import (
+    LossFrame,
+    ShapeFigures,
+    broken,
+    neighbours,
+    picture_and_figures,
+    plain_color,
+)
 from fluidlift.types.camera import PinholeCamera
 from fluidlift.types.gaussians import Gaussians, concatenate
 
@@ -153,7 +160,7 @@ def test_the_guard_says_what_got_worse(change, word):
 def test_neighbouring_views_show_what_the_body_shows_from_there():
     image, mask, _ = truth()
     fine = half_ball(0.7, True)
-    frame = Frame.of(image, mask, CAMERA, (0.0, 0.0, 0.0))
+    frame = LossFrame.of(image, mask, CAMERA, (0.0, 0.0, 0.0))
     _, first = picture_and_figures(fine, frame)
     for beside in neighbours(frame, fine, first):
         seen = beside.weight > 0

@@ -12,7 +12,7 @@ from fluidlift.shape.airborne import airborne_setting, inside_body
 from fluidlift.shape.channel import BEYOND, MARGIN, OUTLET, ChannelConfig, above_rim, channel_setting, upper_rim
 from fluidlift.shape.filled_vessel import find_vessel
 from fluidlift.shape.heights import PlaneHeight
-from fluidlift.shape.plan import Footage
+from fluidlift.shape.plan import PlanEvidence
 from fluidlift.shape.terrain import signed_distance_from
 from fluidlift.types import CellType, FluidParameters, Label, Particles, PinholeCamera
 
@@ -39,7 +39,7 @@ def channel(mainstream=(1.0, 0.0, 0.0), *, slope=0.0, rock=True, along="x", tail
     told = {k: options.pop(k) for k in ("speed", "scene_depth", "closed") if k in options}
     if "ever" in options:  # what is wet at some time, beside what is so now
         told["ever"] = (labels == Label.FLUID) | options.pop("ever")(ground[..., 0], ground[..., 1])
-    seen = Footage(surface, labels.astype(np.uint8), visible, camera, np.array(mainstream), **told)
+    seen = PlanEvidence(surface, labels.astype(np.uint8), visible, camera, np.array(mainstream), **told)
     setting = channel_setting(seen, ChannelConfig(**{"kind": "stream", "longest": 48, "cell_limit": 120_000} | options))
     return SimpleNamespace(
         setting=setting, grid=setting.terrain.grid, cells=setting.cell_types, phi=setting.terrain.signed_distance,
@@ -354,7 +354,7 @@ def test_a_river_of_known_metres_is_shallow_and_a_pond_and_an_assumed_size_are_n
     ground = camera.position - rays * (camera.position[2] / rays[..., 2])[..., None]
     labels = np.where(np.abs(ground[..., 1]) < 12.0, Label.FLUID, Label.BACKGROUND).astype(np.uint8)
     water, along = ground[labels == Label.FLUID], np.array([1.0, 0, 0])
-    seen = Footage(PlaneHeight((0.0, 0.0), 0.0), labels, water, camera, along, closed=closed)
+    seen = PlanEvidence(PlaneHeight((0.0, 0.0), 0.0), labels, water, camera, along, closed=closed)
     deepest = []
     for in_metres in (False, True):
         setting = channel_setting(seen, ChannelConfig("stream", 48, 120_000, in_metres=in_metres))
@@ -371,7 +371,7 @@ def test_a_closed_puddle_has_a_bank_on_all_sides():
     rays = camera.rays(camera.pixel_grid())
     ground = camera.position - rays * (camera.position[2] / rays[..., 2])[..., None]
     labels = np.where(np.hypot(ground[..., 0], ground[..., 1]) < 0.7, Label.FLUID, Label.BACKGROUND).astype(np.uint8)
-    seen = Footage(
+    seen = PlanEvidence(
         PlaneHeight((0.0, 0.0), 0.0), labels, ground[labels == Label.FLUID], camera, np.array([1.0, 0, 0]), closed=True
     )
     setting = channel_setting(seen, ChannelConfig("stream", 48, 120_000))
@@ -394,7 +394,7 @@ def beach(shore=0.2, longest=48):
     ground = camera.position - rays * (camera.position[2] / rays[..., 2])[..., None]
     labels = np.where(ground[..., 1] > -shore, Label.FLUID, Label.BACKGROUND).astype(np.uint8)
     wet = labels == Label.FLUID
-    seen = Footage(
+    seen = PlanEvidence(
         PlaneHeight((0.0, 0.0), 0.0), labels, ground[wet], camera, np.array([1.0, 0, 0]), closed=True, goes_on=True,
         ever=wet,
     )  # fmt: skip

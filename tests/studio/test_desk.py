@@ -18,7 +18,7 @@ from fluidlift.pipeline.models import Chosen, ModelWish
 from fluidlift.studio.app import app_of, open_desk
 from fluidlift.studio.clips import name_for
 from fluidlift.studio.history import HintsHistory
-from fluidlift.studio.looking import LOOK_FLOW, LOOK_SECONDS, LOOK_SIZE, Wish, look_config
+from fluidlift.studio.looking import LOOK_FLOW, LOOK_SECONDS, LOOK_SIZE, FindRequest, look_config
 from fluidlift.studio.making import MakeJob
 from fluidlift.studio.making import main as making
 from fluidlift.studio.shelf import Shelf
@@ -228,7 +228,7 @@ def test_a_look_is_short_where_nothing_is_trimmed(duration):
 
 def test_a_newer_wish_overtakes_slow_work_only_where_that_depends_on_it(desk, tmp_path):
     def wish(**hints):
-        return Wish(tmp_path / "a.mp4", ClipHints(**hints), tmp_path)
+        return FindRequest(tmp_path / "a.mp4", ClipHints(**hints), tmp_path)
 
     looking, old = desk.looking, wish()
     for newer, at_once in ((wish(kind="pour"), False), (wish(start=1.0), True)):

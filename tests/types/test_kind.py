@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import fluidlift
-from fluidlift.cli.options import Scene
+from fluidlift.cli.options import SceneOptions
 from fluidlift.config.sections import ShapeConfig
 from fluidlift.errors import InputRejected
 from fluidlift.look.vessel import glass_of
@@ -109,7 +109,7 @@ def test_a_name_gives_its_kind_and_an_unknown_one_the_names_that_there_are():
 def test_what_a_user_may_say_is_what_there_is():
     asked = get_type_hints(ShapeConfig)["kind"]
     assert get_args(asked) == ("auto", *KINDS)
-    assert get_args(get_args(get_type_hints(Scene)["kind"])[0]) == ("auto", *KINDS)
+    assert get_args(get_args(get_type_hints(SceneOptions)["kind"])[0]) == ("auto", *KINDS)
 
 
 def test_kinds_differ_in_physics():

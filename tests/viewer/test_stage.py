@@ -14,7 +14,7 @@ from fluidlift.numerics.solid_mesh import box_mesh
 from fluidlift.types import Gaussians, TriangleMesh, concatenate
 from fluidlift.viewer.arrows import LONGEST, SHORTEST, arrows, barbed
 from fluidlift.viewer.frames import splat_frame
-from fluidlift.viewer.stage import Parts, Stage, vertical_fov, whole_fov
+from fluidlift.viewer.stage import Stage, VisibleLayers, vertical_fov, whole_fov
 
 TURN = np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])
 """a quarter about z"""
@@ -47,7 +47,7 @@ def obstacle(colors=None):
 
 
 def shown(stage, *found, **more):
-    stage.obstacles(found, None, Parts(), **more)
+    stage.obstacles(found, None, VisibleLayers(), **more)
     return stage._scene.nodes["/obstacles/box"]
 
 
@@ -87,7 +87,7 @@ def test_nothing_without_points_is_put_into_the_view(stage):
     empty = splat_frame(Gaussians.isotropic(np.zeros((0, 3)), 0.1, np.zeros((0, 3))), np.zeros((0, 3), np.float32))
     before = set(stage._scene.nodes)
     stage._scene.get_handle_by_name = lambda name: None
-    stage.show(empty, Parts(points=True, arrows=True), 0.1)
+    stage.show(empty, VisibleLayers(points=True, arrows=True), 0.1)
     assert set(stage._scene.nodes) == before
 
 
@@ -98,7 +98,7 @@ def test_the_surface_is_meshed_around_the_liquid_without_the_skin_that_is_painte
     splats = concatenate([Gaussians.isotropic(body, 0.02, np.full((5, 3), 0.5)), skin])
     asked = []
     stage._surfacer = SimpleNamespace(ask=lambda *wish: asked.append(wish), made=None)
-    stage.show(splat_frame(splats, np.zeros((8, 3)), cell=cell), Parts(splats=False, surface=True), cell)
+    stage.show(splat_frame(splats, np.zeros((8, 3)), cell=cell), VisibleLayers(splats=False, surface=True), cell)
     ((_, positions, _),) = asked
     np.testing.assert_allclose(positions, body)
 

@@ -4,7 +4,7 @@ import pytest
 
 from fluidlift.io.asset_folder import load_asset
 from fluidlift.pipeline import preview
-from fluidlift.pipeline.preview import LivePreview, PreviewSize, Wish
+from fluidlift.pipeline.preview import LivePreview, PreviewRequest, PreviewSize
 
 
 @pytest.fixture
@@ -32,11 +32,11 @@ def test_a_surprise_is_told_and_logged_and_the_next_wish_is_served(begun, caplog
         return frame.number
 
     worker = begun(size=PreviewSize(frames=3, seconds=None), keep=keep)
-    worker.ask(Wish({}, "gravity 3"))
+    worker.ask(PreviewRequest({}, "gravity 3"))
     until(lambda: not worker.busy)
     assert "gravity 3" in worker.problem and "ZeroDivisionError" in caplog.text
     broken.clear()
-    worker.ask(Wish({}, "gravity 4"))
+    worker.ask(PreviewRequest({}, "gravity 4"))
     until(lambda: worker.shown is not None and worker.shown.complete)
     assert worker.shown.frames == [0, 1, 2] and not worker.problem
 

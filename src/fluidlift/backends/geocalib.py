@@ -50,14 +50,14 @@ class GeoCalib(ViewModel):
     """
 
     def __init__(self, weights: Path | str, *, device: str = "cpu", announce: Announce = say) -> None:
-        from fluidlift.backends.geocalib_network import GeoCalibNetwork, NetworkShape, completed_state
+        from fluidlift.backends.geocalib_network import GeoCalibNetwork, GeoCalibShape, completed_state
 
         self._device = torch_device(device)
         announce(LICENCE)
         path = Path(weights)
         path = path / FILE if path.is_dir() else path
         state = read_state_dict(path, purpose="weights of GeoCalib", max_bytes=MOST_BYTES)
-        network = GeoCalibNetwork(NetworkShape.of(state, path.name))
+        network = GeoCalibNetwork(GeoCalibShape.of(state, path.name))
         fill_network(network, completed_state(state, network), path.name, f"{FILE} of its authors")
         self._network = network.eval().to(self._device)
 

@@ -26,7 +26,7 @@ SEED = 0
 
 
 @dataclass(frozen=True)
-class NetworkShape:
+class GeoCalibShape:
     """Channels and blocks; the defaults are those of the published checkpoint."""
 
     stages: tuple[int, ...] = (64, 128, 320, 512)
@@ -40,7 +40,7 @@ class NetworkShape:
     """channels that a decoder factorises"""
 
     @classmethod
-    def of(cls, state: Mapping[str, Tensor], name: str) -> NetworkShape:
+    def of(cls, state: Mapping[str, Tensor], name: str) -> GeoCalibShape:
         """The shape that a checkpoint was made for.
 
         Raises:
@@ -195,7 +195,7 @@ class Stem(nn.Module):
 class Backbone(nn.Module):
     """MSCAN: four stages of blocks, each at half of the size of the one before."""
 
-    def __init__(self, shape: NetworkShape) -> None:
+    def __init__(self, shape: GeoCalibShape) -> None:
         super().__init__()
         for i, width in enumerate(shape.stages):
             entry = Stem(width) if i == 0 else Halving(shape.stages[i - 1], width)
@@ -283,7 +283,7 @@ class Fusion(nn.Module):
 class Decoder(nn.Module):
     """Features of the picture's size, and the logarithm of the odds that what is made of them is right."""
 
-    def __init__(self, shape: NetworkShape) -> None:
+    def __init__(self, shape: GeoCalibShape) -> None:
         super().__init__()
         low, ham = shape.low, shape.ham
         self.squeeze = Convolution(sum(shape.stages), ham, 1)
@@ -305,7 +305,7 @@ class Decoder(nn.Module):
 class UpHead(nn.Module):
     """The direction of up in the picture."""
 
-    def __init__(self, shape: NetworkShape) -> None:
+    def __init__(self, shape: GeoCalibShape) -> None:
         super().__init__()
         self.decoder = Decoder(shape)
         self.linear_pred_up = nn.Conv2d(shape.low, 2, 1)
@@ -318,7 +318,7 @@ class UpHead(nn.Module):
 class LatitudeHead(nn.Module):
     """The sine of the angle between each ray and the level."""
 
-    def __init__(self, shape: NetworkShape) -> None:
+    def __init__(self, shape: GeoCalibShape) -> None:
         super().__init__()
         self.decoder = Decoder(shape)
         self.linear_pred_latitude = nn.Conv2d(shape.low, 1, 1)
@@ -331,7 +331,7 @@ class LatitudeHead(nn.Module):
 class PerspectiveDecoder(nn.Module):
     """Both heads."""
 
-    def __init__(self, shape: NetworkShape) -> None:
+    def __init__(self, shape: GeoCalibShape) -> None:
         super().__init__()
         self.up_head, self.latitude_head = UpHead(shape), LatitudeHead(shape)
 
@@ -343,9 +343,9 @@ class GeoCalibNetwork(nn.Module):
         shape: of the network.
     """
 
-    def __init__(self, shape: NetworkShape | None = None) -> None:
+    def __init__(self, shape: GeoCalibShape | None = None) -> None:
         super().__init__()
-        shape = shape or NetworkShape()
+        shape = shape or GeoCalibShape()
         self.backbone = Backbone(shape)
         self.ll_enc = LowLevel(shape.low)
         self.perspective_decoder = PerspectiveDecoder(shape)

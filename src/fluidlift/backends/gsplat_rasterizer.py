@@ -14,7 +14,7 @@ import numpy as np
 
 from fluidlift.errors import FluidliftError, MissingPackage, require
 from fluidlift.messages import Notice
-from fluidlift.numerics.splatting import View
+from fluidlift.numerics.splatting import SplatCamera
 from fluidlift.numerics.splatting_projection import BLUR
 from fluidlift.numerics.splatting_torch import NumbaRasterizer
 from fluidlift.seams import Rasterizer, Splatted, SplatView
@@ -77,7 +77,7 @@ class GsplatRasterizer(Rasterizer):
         import torch
 
         one = torch.ones(1, 3)
-        view = View(np.eye(3), np.zeros(3), (8.0, 8.0), (4.0, 4.0), (8, 8))
+        view = SplatCamera(np.eye(3), np.zeros(3), (8.0, 8.0), (4.0, 4.0), (8, 8))
         try:
             self.splat(2 * one, torch.tensor([[1.0, 0, 0, 0]]), one, 0.5 * torch.ones(1), one, view)
         except (ImportError, OSError, RuntimeError, AttributeError, TypeError) as error:

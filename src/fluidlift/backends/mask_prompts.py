@@ -17,7 +17,7 @@ SMALLEST_HOLE = 4e-4
 """share of the picture: smaller holes in the fluid are noise, as in `shape.segment`"""
 
 
-class Clicks(NamedTuple):
+class PointPrompts(NamedTuple):
     """What a person would click on one frame."""
 
     frame: int
@@ -27,7 +27,7 @@ class Clicks(NamedTuple):
     """True on the fluid, False beside it"""
 
 
-def clicks_from(labels: PixelLabels) -> Clicks:
+def clicks_from(labels: PixelLabels) -> PointPrompts:
     """Points deep inside what a first guess is surest of, on the frame where it is surest.
 
     The frame is the one with the largest sum of confidence over its fluid. Of its fluid, and of what is not, the
@@ -44,7 +44,7 @@ def clicks_from(labels: PixelLabels) -> Clicks:
     if not fluid.any():
         raise InputRejected("no fluid was found that a network could be shown", "a region that moves", "draw a mask")
     on, beside = (_deep_points(_surer_half(region, confidence)) for region in (fluid, ~fluid))
-    return Clicks(frame, np.concatenate([on, beside]), np.arange(len(on) + len(beside)) < len(on))
+    return PointPrompts(frame, np.concatenate([on, beside]), np.arange(len(on) + len(beside)) < len(on))
 
 
 def _surer_half(region: np.ndarray, confidence: np.ndarray) -> np.ndarray:

@@ -26,7 +26,7 @@ MARGIN = 2**26
 
 
 @dataclass(frozen=True)
-class Wanted:
+class ModelRequest:
     """How a model is to come, and what the user vouches for."""
 
     source: Path | None = None
@@ -40,7 +40,7 @@ class Wanted:
     """hears how far a file is"""
 
 
-def get_model(card: ModelCard, wanted: Wanted) -> KeptModel:
+def get_model(card: ModelCard, wanted: ModelRequest) -> KeptModel:
     """Bring all files of a model into the cache. One that is there already is replaced when the new one is right.
 
     Raises:
@@ -66,7 +66,7 @@ def get_model(card: ModelCard, wanted: Wanted) -> KeptModel:
     return found
 
 
-def _require_possible(card: ModelCard, wanted: Wanted) -> None:
+def _require_possible(card: ModelCard, wanted: ModelRequest) -> None:
     if not card.files:
         raise InputRejected(
             f"{card.name} is a generator, whose own environment fetches its weights", "a model with files of its own",
@@ -97,7 +97,7 @@ def _require_room(card: ModelCard, begun: Path) -> None:
         )  # fmt: skip
 
 
-def _brought(file: ModelFile, begun: Path, wanted: Wanted) -> str:
+def _brought(file: ModelFile, begun: Path, wanted: ModelRequest) -> str:
     """The SHA-256 of a file that is now in `begun`."""
     target = begun / file.name
 
@@ -121,7 +121,7 @@ def _vouched(target: Path, trust: tuple[str, ...]) -> str | None:
     return found if found in trust else None
 
 
-def _required_right(file: ModelFile, path: Path, found: str, card: ModelCard, wanted: Wanted) -> str:
+def _required_right(file: ModelFile, path: Path, found: str, card: ModelCard, wanted: ModelRequest) -> str:
     """Against what a hash was checked: card, trusted, unverified."""
     if file.sha256 is not None:
         if found == file.sha256:

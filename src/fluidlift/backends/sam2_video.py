@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from fluidlift.backends.mask_prompts import Clicks, clicks_from, labels_of_frame, ordered_from
+from fluidlift.backends.mask_prompts import PointPrompts, clicks_from, labels_of_frame, ordered_from
 from fluidlift.backends.model_weights import Announce, missing, say
 from fluidlift.backends.pair_network import memory_errors, torch_device
 from fluidlift.errors import InputRejected, MissingPackage
@@ -86,7 +86,7 @@ class Sam2Video(Segmenter):
                     self._progress(done, len(clip))
         return checked_labels(labels, confidence, "SAM 2")
 
-    def chances(self, frames: np.ndarray, clicks: Clicks) -> Iterable[tuple[int, np.ndarray]]:
+    def chances(self, frames: np.ndarray, clicks: PointPrompts) -> Iterable[tuple[int, np.ndarray]]:
         """Frame number and probability of fluid (float32 [H,W]), from the clicked frame on, then back from it."""
         import torch
         from transformers.models.sam2_video.modeling_sam2_video import Sam2VideoInferenceSession

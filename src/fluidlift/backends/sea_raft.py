@@ -41,13 +41,13 @@ class SeaRaft(FlowEstimator):
         announce: Announce = say,
         max_bytes: int = 4 * 2**30,
     ) -> None:
-        from fluidlift.backends.sea_raft_network import NetworkShape, SeaRaftNetwork, completed_state
+        from fluidlift.backends.sea_raft_network import SeaRaftNetwork, SeaRaftShape, completed_state
 
         require(iterations >= 0, f"{iterations} iterations", "0 or more")
         announce(LICENCE)
         path = Path(weights)
         state = completed_state(read_state_dict(path, purpose="weights of SEA-RAFT"))
-        network = SeaRaftNetwork(NetworkShape.of(state, path.name))
+        network = SeaRaftNetwork(SeaRaftShape.of(state, path.name))
         fill_network(network, state, path.name, "a checkpoint of its authors")
         self._device = torch_device(device)
         self._network = network.eval().to(self._device)

@@ -25,7 +25,7 @@ _BLOCKS = {"resnet18": (2, 2, 2), "resnet34": (3, 4, 6)}
 
 
 @dataclass(frozen=True)
-class NetworkShape:
+class SeaRaftShape:
     """What differs between the published variants."""
 
     blocks: tuple[int, int, int] = (3, 4, 6)
@@ -42,7 +42,7 @@ class NetworkShape:
     """ConvNeXt blocks per iteration"""
 
     @classmethod
-    def of(cls, state: Mapping[str, Tensor], name: str) -> NetworkShape:
+    def of(cls, state: Mapping[str, Tensor], name: str) -> SeaRaftShape:
         """The shape that a checkpoint was made for.
 
         Raises:
@@ -106,7 +106,7 @@ class ResidualBlock(nn.Module):
 class Encoder(nn.Module):
     """The first three stages of a ResNet, down to an eighth of the picture."""
 
-    def __init__(self, channels: int, out: int, shape: NetworkShape) -> None:
+    def __init__(self, channels: int, out: int, shape: SeaRaftShape) -> None:
         super().__init__()
         self.conv1 = nn.Conv2d(channels, shape.stem, 7, 2, padding=3)
         self.bn1 = nn.BatchNorm2d(shape.stem)
@@ -162,7 +162,7 @@ class Refiner(nn.Module):
 class UpdateBlock(nn.Module):
     """One iteration of the hidden state."""
 
-    def __init__(self, shape: NetworkShape) -> None:
+    def __init__(self, shape: SeaRaftShape) -> None:
         super().__init__()
         self.encoder = MotionEncoder(LEVELS * (2 * shape.radius + 1) ** 2, shape.width)
         self.refine = nn.ModuleList(Refiner(3 * shape.width, shape.width) for _ in range(shape.refiners))
@@ -204,7 +204,7 @@ class CorrelationPyramid:
 class SeaRaftNetwork(nn.Module):
     """Flow between two pictures with the mixture that says how sure it is."""
 
-    def __init__(self, shape: NetworkShape) -> None:
+    def __init__(self, shape: SeaRaftShape) -> None:
         super().__init__()
         self.shape, width = shape, shape.width
         self.cnet = Encoder(6, 2 * width, shape)

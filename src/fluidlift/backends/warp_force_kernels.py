@@ -65,7 +65,7 @@ def guide(
 
 
 @wp.struct
-class Memory:
+class NudgingState:
     """Of a `guidance.Nudging`, on the faces of the whole box."""
 
     target: Faces
@@ -82,7 +82,7 @@ def nudge(
     first: wp.vec3i,
     velocity: Faces,
     masses: Faces,
-    memory: Memory,
+    memory: NudgingState,
     gain: float,
     part: float,
     counts: int,

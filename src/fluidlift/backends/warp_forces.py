@@ -99,9 +99,9 @@ class _Guiding(WarpForce):
 
 class _Nudging(WarpForce):
     def __init__(self, force: Nudging, device: warp.Device) -> None:
-        from fluidlift.backends.warp_force_kernels import Memory
+        from fluidlift.backends.warp_force_kernels import NudgingState
 
-        self._force, self._memory = force, Memory()
+        self._force, self._memory = force, NudgingState()
         if force.fetch is not None:  # it has acted on a device before
             force.fetch()
         self._memory.target = faces_of(force.target.components, device)

@@ -44,7 +44,7 @@ class Given:
 
 
 @wp.struct
-class Parts:
+class NodeArrays:
     """Of the box of nodes."""
 
     roles: wp.array(dtype=wp.int8)
@@ -117,7 +117,7 @@ def unit(axis: int):
 
 
 @wp.kernel
-def assign_roles(given: Given, stress: Stress, parts: Parts, search: Search, directions: wp.array2d(dtype=float)):
+def assign_roles(given: Given, stress: Stress, parts: NodeArrays, search: Search, directions: wp.array2d(dtype=float)):
     """Roles and clearances of the faces of a node; whether something can flow in its cell; vectors cleared."""
     n = wp.tid()
     nodes = stress.nodes
@@ -211,7 +211,7 @@ def octant_share(given: Given, cell: wp.vec3i, si: int, sj: int, sk: int):
 
 
 @wp.kernel
-def fill_cells(given: Given, stress: Stress, parts: Parts):
+def fill_cells(given: Given, stress: Stress, parts: NodeArrays):
     """Liquid in the octants of a cell, and in the cell."""
     n = wp.tid()
     c = node_of(stress.nodes, n)
@@ -238,7 +238,7 @@ def fill_cells(given: Given, stress: Stress, parts: Parts):
 
 
 @wp.func
-def control_share(parts: Parts, nodes: wp.vec3i, n: int, x: int, y: int, z: int):
+def control_share(parts: NodeArrays, nodes: wp.vec3i, n: int, x: int, y: int, z: int):
     """Liquid share of the volume of cell n, moved down by half a cell along the axes given by 1."""
     total = float(0.0)
     count = int(0)
@@ -265,7 +265,7 @@ def gap_between(role_a: int, role_b: int, a: float, b: float):
 
 
 @wp.func
-def normal_factor(parts: Parts, o: int, next_o: int, wall_share: float):
+def normal_factor(parts: NodeArrays, o: int, next_o: int, wall_share: float):
     """Of the normal stress between two faces of a component; 0 unless it acts on a solved one."""
     r, s = int(parts.roles[o]), int(parts.roles[next_o])
     if r == AIR or s == AIR or (r != SOLVED and s != SOLVED):
@@ -276,7 +276,7 @@ def normal_factor(parts: Parts, o: int, next_o: int, wall_share: float):
 
 
 @wp.func
-def shear_factor(parts: Parts, oa: int, next_a: int, ob: int, next_b: int, wall_share: float):
+def shear_factor(parts: NodeArrays, oa: int, next_a: int, ob: int, next_b: int, wall_share: float):
     """Of the shear stress between two faces of component a, and two of b."""
     p, q, r, s = int(parts.roles[oa]), int(parts.roles[next_a]), int(parts.roles[ob]), int(parts.roles[next_b])
     if p == AIR or q == AIR or r == AIR or s == AIR:
@@ -293,7 +293,7 @@ def shear_factor(parts: Parts, oa: int, next_a: int, ob: int, next_b: int, wall_
 
 
 @wp.kernel
-def weigh_stresses(stress: Stress, parts: Parts, number: float, wall_share: float):
+def weigh_stresses(stress: Stress, parts: NodeArrays, number: float, wall_share: float):
     """normal = 2 V nu dt / h^2 at cells, shear = V nu dt / h^2 at edges, where number = nu dt / h^2."""
     n = wp.tid()
     nodes = stress.nodes
@@ -318,7 +318,7 @@ def weigh_stresses(stress: Stress, parts: Parts, number: float, wall_share: floa
 
 @wp.kernel
 def weigh_faces(
-    velocity: Faces, stress: Stress, parts: Parts, search: Search
+    velocity: Faces, stress: Stress, parts: NodeArrays, search: Search
 ):  # fmt: skip
     """Mass and inverse diagonal of the solved faces, the first guess (the velocity before) and its momentum."""
     n = wp.tid()
@@ -352,7 +352,7 @@ def weigh_faces(
 
 
 @wp.kernel
-def continue_behind_walls(stress: Stress, parts: Parts, search: Search, wall_share: float):
+def continue_behind_walls(stress: Stress, parts: NodeArrays, search: Search, wall_share: float):
     """Velocities of buried faces, linear through the wall's (0) from those beside them in the liquid."""
     n = wp.tid()
     nodes = stress.nodes
@@ -376,7 +376,7 @@ def continue_behind_walls(stress: Stress, parts: Parts, search: Search, wall_sha
 
 
 @wp.func
-def new_velocity(velocity: Faces, stress: Stress, parts: Parts, search: Search, a: int, c: wp.vec3i):
+def new_velocity(velocity: Faces, stress: Stress, parts: NodeArrays, search: Search, a: int, c: wp.vec3i):
     nodes = stress.nodes
     n = ((c[0] + RING) * nodes[1] + c[1] + RING) * nodes[2] + c[2] + RING
     o = a * node_count(nodes) + n
@@ -386,7 +386,7 @@ def new_velocity(velocity: Faces, stress: Stress, parts: Parts, search: Search, 
 
 
 @wp.kernel
-def carry_out(given: Given, velocity: Faces, stress: Stress, parts: Parts, search: Search, left: float):
+def carry_out(given: Given, velocity: Faces, stress: Stress, parts: NodeArrays, search: Search, left: float):
     """Solved faces on open sides of the grid follow the next inner ones; `left` of their difference stays."""
     n = wp.tid()
     cells = cells_of(stress.nodes)
@@ -404,7 +404,7 @@ def carry_out(given: Given, velocity: Faces, stress: Stress, parts: Parts, searc
 
 
 @wp.kernel
-def store(velocity: Faces, stress: Stress, parts: Parts, search: Search):
+def store(velocity: Faces, stress: Stress, parts: NodeArrays, search: Search):
     """The new velocities of the faces that were solved or lie behind walls; after `carry_out`."""
     n = wp.tid()
     cells = cells_of(stress.nodes)

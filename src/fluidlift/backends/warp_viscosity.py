@@ -58,7 +58,7 @@ class WarpViscosity:
         def zeros(size: int, dtype: Any = wp.float64) -> warp.array:
             return wp.zeros(size, dtype=dtype, device=device)
 
-        self._stress, self._search, self._parts = kernels.Stress(), kernels.Search(), assembly.Parts()
+        self._stress, self._search, self._parts = kernels.Stress(), kernels.Search(), assembly.NodeArrays()
         for name in ("mass", "inverse", "normal", "shear"):
             setattr(self._stress, name, zeros(3 * count, wp.float32))
         self._stress.nodes = wp.vec3i(*nodes)

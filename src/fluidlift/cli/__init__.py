@@ -416,7 +416,7 @@ def _require_sections(overrides: tuple[str, ...], sections: tuple[str, ...]) -> 
 
 def _mask(c: Mask) -> int:
     from fluidlift.config import build_config
-    from fluidlift.pipeline import Hints, Inputs, find_masks
+    from fluidlift.pipeline import Inputs, MaskHints, find_masks
 
     p = c.part
     flat = {
@@ -426,7 +426,7 @@ def _mask(c: Mask) -> int:
     _require_sections(c.set, ("read", "segment", "motion"))
     config = build_config(None, None, c.set, flat, base=LONGEST)
     config = _with_models(config, c.clip, c.learned.models, {}, ("masks", "flow"))
-    hints = Hints.of(c.roi, c.click, c.not_here)
+    hints = MaskHints.of(c.roi, c.click, c.not_here)
     with shown_progress() as progress:
         found = find_masks(
             Inputs(c.clip, camera=c.camera), c.out, config, hints=hints, force=c.force, progress=progress

@@ -192,7 +192,7 @@ TRIES = {"local": 1, "ray": 3}
 def _make(wanted: Batch, out: Path, shots: list[Shot], store: Store | None) -> int:
     from fluidlift.farm.engine import Limits
     from fluidlift.farm.state import LISTED, list_names
-    from fluidlift.farm.summary import SUMMARY, Pace, Summary
+    from fluidlift.farm.summary import SUMMARY, BatchPace, Summary
     from fluidlift.io.atomic import require_writable
 
     require_writable(out)
@@ -206,7 +206,7 @@ def _make(wanted: Batch, out: Path, shots: list[Shot], store: Store | None) -> i
         list_names(folder, [shot.name for shot in shots])
         store.put_file(LISTED)
         tell(f"made in {folder}; locks do not reach {store.url}: no two batches at a time should make the same shots")
-    outcomes, pace, summary = [], Pace(len(shots)), Summary(folder)
+    outcomes, pace, summary = [], BatchPace(len(shots)), Summary(folder)
     try:
         for outcome in _engine(wanted, store).shots(shots, folder, limits, tell, part):
             outcomes.append(outcome)
@@ -250,7 +250,7 @@ def _printers(wanted: Batch) -> tuple[Callable[[str], None], Callable[[str], Non
 def _plan(wanted: Batch, out: Path, shots: int) -> int:
     """Write a job instead of doing it; paths in it are absolute, as other machines of the farm see them."""
     from fluidlift.farm.engine import TASK_CORES, TASK_MEMORY
-    from fluidlift.farm.plans import Plan, written
+    from fluidlift.farm.plans import TaskPlan, written
     from fluidlift.io.atomic import require_writable
     from fluidlift.machine import cores
 
@@ -264,7 +264,7 @@ def _plan(wanted: Batch, out: Path, shots: int) -> int:
              "shots": wanted.shots}  # fmt: skip
     arguments += [f"--{name}={value}" for name, value in given.items() if value is not None]
     arguments += [f"--set={text}" for text in wanted.set]
-    plan = Plan(
+    plan = TaskPlan(
         arguments,
         shots,
         wanted.cores or min(cores(), TASK_CORES),

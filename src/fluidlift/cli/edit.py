@@ -15,7 +15,7 @@ from fluidlift.messages import as_plain, from_plain
 
 if TYPE_CHECKING:
     from fluidlift.messages import Notice
-    from fluidlift.scene.edit_history import Edit as Done
+    from fluidlift.scene.edit_history import EditRecord as Done
     from fluidlift.scene.edits import Change, EditSession
 
 _DONE, _WITH_WARNINGS = 0, 4

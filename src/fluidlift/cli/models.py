@@ -145,7 +145,7 @@ def explained(card: ModelCard) -> list[str]:
 
 def _get(card: ModelCard, c: Models) -> int:
     from fluidlift.backends.model_download import HTTPS
-    from fluidlift.backends.model_get import Wanted, get_model
+    from fluidlift.backends.model_get import ModelRequest, get_model
     from fluidlift.backends.model_table import lacking_packages
 
     source = None if c.from_ is None else Path(os.path.expanduser(c.from_))
@@ -154,7 +154,7 @@ def _get(card: ModelCard, c: Models) -> int:
     if any(len(t) != 64 or set(t.lower()) - set("0123456789abcdef") for t in c.trust):
         raise InputRejected(f"--trust {' '.join(c.trust)}", "a SHA-256 of 64 hexadecimal digits")
     trust = tuple(t.lower() for t in c.trust)
-    got = get_model(card, Wanted(source, trust, c.accept_unverified, TRANSPORT or HTTPS, _Shown()))
+    got = get_model(card, ModelRequest(source, trust, c.accept_unverified, TRANSPORT or HTTPS, _Shown()))
     if c.json:
         print(json_module.dumps(row_of(card), indent=1))
         return 0

@@ -16,7 +16,7 @@ Asset = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="ASSET")]
 
 
 @command
-class Scene:
+class SceneOptions:
     """What the clip does not say by itself."""
 
     kind: KindChoice | None = None
@@ -32,7 +32,7 @@ class Scene:
 
 
 @command
-class Part:
+class PartOptions:
     """Which part of the clip."""
 
     start: Seconds | None = None
@@ -44,7 +44,7 @@ class Part:
 
 
 @command
-class MakePart(Part):
+class MakePartOptions(PartOptions):
     """Which part of the clip."""
 
     shots: Literal["auto"] | None = None
@@ -53,7 +53,7 @@ class MakePart(Part):
 
 
 @command
-class Input:
+class InputOptions:
     """Files beside the clip."""
 
     mask: Path | None = None
@@ -67,7 +67,7 @@ class Input:
 
 
 @command
-class MakeInput(Input):
+class MakeInputOptions(InputOptions):
     """Files beside the clip."""
 
     hints: Path | None = None
@@ -75,7 +75,7 @@ class MakeInput(Input):
 
 
 @command
-class Learned:
+class LearnedOptions:
     """Learned models, which see some things better."""
 
     models: str | None = None
@@ -86,7 +86,7 @@ class Learned:
 
 
 @command
-class Body(Learned):
+class BodyOptions(LearnedOptions):
     """Learned models, or a body that something else made."""
 
     depth_model: Literal["none", "moge", "moge-onnx", "depth-anything", "depth-anything-3", "depth-pro"] | None = None
@@ -106,7 +106,7 @@ class Body(Learned):
 
 
 @command
-class Quality:
+class QualityOptions:
     """How fine, and how repeatable."""
 
     preset: Literal["draft", "standard", "hero", "paper"] | None = None
@@ -148,15 +148,15 @@ class Make:
     """print the outcome as JSON"""
     warnings_ok: bool = False
     """end with 0 instead of 4 where the asset has warnings"""
-    input: tyro.conf.OmitArgPrefixes[MakeInput] = field(default_factory=MakeInput)
+    input: tyro.conf.OmitArgPrefixes[MakeInputOptions] = field(default_factory=MakeInputOptions)
     """files beside the clip; what is not given is estimated"""
-    scene: tyro.conf.OmitArgPrefixes[Scene] = field(default_factory=Scene)
+    scene: tyro.conf.OmitArgPrefixes[SceneOptions] = field(default_factory=SceneOptions)
     """what you know of the fluid and of the camera"""
-    part: tyro.conf.OmitArgPrefixes[MakePart] = field(default_factory=MakePart)
+    part: tyro.conf.OmitArgPrefixes[MakePartOptions] = field(default_factory=MakePartOptions)
     """which part of the clip"""
-    quality: tyro.conf.OmitArgPrefixes[Quality] = field(default_factory=Quality)
+    quality: tyro.conf.OmitArgPrefixes[QualityOptions] = field(default_factory=QualityOptions)
     """how fine"""
-    body: tyro.conf.OmitArgPrefixes[Body] = field(default_factory=Body)
+    body: tyro.conf.OmitArgPrefixes[BodyOptions] = field(default_factory=BodyOptions)
     """learned models, or a body that something else made"""
     settings: tyro.conf.OmitArgPrefixes[Settings] = field(default_factory=Settings)
     """all else: --print-config lists every setting, such as read.max_pixels (docs/cli.md)"""
@@ -299,7 +299,7 @@ class Hints:
     """longer side of the working pictures, px (512)"""
     json: bool = False
     """print what was found as JSON"""
-    part: tyro.conf.OmitArgPrefixes[Part] = field(default_factory=Part)
+    part: tyro.conf.OmitArgPrefixes[PartOptions] = field(default_factory=PartOptions)
     """which part of the clip; it is written as a hint"""
 
 
@@ -327,9 +327,9 @@ class Mask:
     """run this stage (read, flow, segment, masks) and all after it again; may be repeated"""
     json: bool = False
     """print the outcome as JSON"""
-    learned: tyro.conf.OmitArgPrefixes[Learned] = field(default_factory=Learned)
+    learned: tyro.conf.OmitArgPrefixes[LearnedOptions] = field(default_factory=LearnedOptions)
     """learned models, which see some things better"""
-    part: tyro.conf.OmitArgPrefixes[Part] = field(default_factory=Part)
+    part: tyro.conf.OmitArgPrefixes[PartOptions] = field(default_factory=PartOptions)
     """which part of the clip"""
 
 
@@ -355,13 +355,13 @@ class Motion:
     """run this stage (read, flow, segment, geometry, velocities) and all after it again; may be repeated"""
     json: bool = False
     """print the outcome as JSON"""
-    learned: tyro.conf.OmitArgPrefixes[Learned] = field(default_factory=Learned)
+    learned: tyro.conf.OmitArgPrefixes[LearnedOptions] = field(default_factory=LearnedOptions)
     """learned models, which see some things better"""
-    input: tyro.conf.OmitArgPrefixes[Input] = field(default_factory=Input)
+    input: tyro.conf.OmitArgPrefixes[InputOptions] = field(default_factory=InputOptions)
     """files beside the clip; what is not given is estimated"""
-    scene: tyro.conf.OmitArgPrefixes[Scene] = field(default_factory=Scene)
+    scene: tyro.conf.OmitArgPrefixes[SceneOptions] = field(default_factory=SceneOptions)
     """what you know of the fluid and of the camera"""
-    part: tyro.conf.OmitArgPrefixes[Part] = field(default_factory=Part)
+    part: tyro.conf.OmitArgPrefixes[PartOptions] = field(default_factory=PartOptions)
     """which part of the clip"""
 
 

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from fluidlift.cli.options import Learned
+from fluidlift.cli.options import LearnedOptions
 from fluidlift.cli.quantities import command
 
 
@@ -22,7 +22,7 @@ class Studio:
     """of the page; the next free one where it is in use"""
     browser: bool = True
     """the page opens in the default browser; --no-browser leaves that to you"""
-    learned: tyro.conf.OmitArgPrefixes[Learned] = field(default_factory=Learned)
+    learned: tyro.conf.OmitArgPrefixes[LearnedOptions] = field(default_factory=LearnedOptions)
     """learned models, which see some things better"""
 
 

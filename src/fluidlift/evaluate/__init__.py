@@ -8,9 +8,9 @@ Modules of the face:
 
 from fluidlift.evaluate.case import Case, read_case
 from fluidlift.evaluate.of_run import arrays_of_run
-from fluidlift.evaluate.report import Evaluation, Figure
+from fluidlift.evaluate.report import Evaluation, Metric
 from fluidlift.evaluate.score import evaluate_arrays, evaluate_asset
 
 __all__ = [
-    "Case", "Evaluation", "Figure", "arrays_of_run", "as_filmed", "evaluate_arrays", "evaluate_asset", "read_case",
+    "Case", "Evaluation", "Metric", "arrays_of_run", "as_filmed", "evaluate_arrays", "evaluate_asset", "read_case",
 ]  # fmt: skip

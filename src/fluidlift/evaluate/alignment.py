@@ -11,7 +11,7 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from fluidlift.evaluate.case import Case
-from fluidlift.evaluate.report import Figure, figure
+from fluidlift.evaluate.report import Metric, figure
 from fluidlift.evaluate.space import Alignment
 from fluidlift.evaluate.volumes import behind, in_picture, lookup, occupancy_iou
 from fluidlift.types import CellType, FluidAsset, Similarity3
@@ -24,7 +24,7 @@ FIRST = (0.08, 0.08, 0.08, 0.05, 0.05, 0.05, 0.05)
 """first moves of the simplex: radians about three axes, logarithm of the scale, and shares of the body's size"""
 
 
-def score_aligned(asset: FluidAsset, case: Case, alignment: Alignment) -> list[Figure]:
+def score_aligned(asset: FluidAsset, case: Case, alignment: Alignment) -> list[Metric]:
     """Occupancy IoU after the similarity that makes it largest, found from two starts: the eyes on each other, and the
     middles and sizes of both bodies on each other. The same cells count as in `score_volume`."""
     fluid = np.isin(asset.cell_types, (CellType.FLUID, CellType.INFLOW))

@@ -16,7 +16,7 @@ from fluidlift.evaluate.images import (
     resample_nearest,
     ssim,
 )
-from fluidlift.evaluate.report import Figure, figure
+from fluidlift.evaluate.report import Metric, figure
 from fluidlift.types import Label
 
 EQUAL_DB = 99.0
@@ -53,7 +53,7 @@ def truth_flow(case: Case, frames: slice, size: tuple[int, int]) -> np.ndarray:
     return flow * np.array([size[0] / case.size[0], size[1] / case.size[1]], np.float32)
 
 
-def score_segmentation(arrays: Arrays, case: Case) -> tuple[list[Figure], Series]:
+def score_segmentation(arrays: Arrays, case: Case) -> tuple[list[Metric], Series]:
     """Mask IoU of the labels of the clip."""
     labels, why = picked(arrays, "labels", 3)
     if labels is None:
@@ -76,7 +76,7 @@ def _scored_pixels(arrays: Arrays, case: Case, start: int, n: int, size: tuple[i
     return mask
 
 
-def score_flow(arrays: Arrays, case: Case, rows: tuple[int, int] | None = None) -> list[Figure]:
+def score_flow(arrays: Arrays, case: Case, rows: tuple[int, int] | None = None) -> list[Metric]:
     """End-point error (mean, 90th percentile) and cosine of the raw, the completed and the re-simulated velocity.
 
     Raw and completed flow are scored where truth and run both say fluid (segmentation is scored by itself),
@@ -126,7 +126,7 @@ def score_flow(arrays: Arrays, case: Case, rows: tuple[int, int] | None = None) 
     return out
 
 
-def _observed_and_filled(arrays: Arrays, flow: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> list[Figure]:
+def _observed_and_filled(arrays: Arrays, flow: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> list[Metric]:
     """Error of the completed flow apart where it was observed and where it was filled in."""
     names = tuple(f"flow.completed.{k}" for k in ("epe_observed", "epe_filled", "filled_share"))
     observed, why = picked(arrays, "flow_observed", 3)
@@ -154,7 +154,7 @@ def _windows(arrays: Arrays, first: int, n: int) -> dict[str, np.ndarray]:
     return {"fitted": (frame >= low) & (frame < high), "predicted": frame >= high}
 
 
-def score_resimulation(arrays: Arrays, case: Case, video: np.ndarray | None) -> tuple[list[Figure], Series]:
+def score_resimulation(arrays: Arrays, case: Case, video: np.ndarray | None) -> tuple[list[Metric], Series]:
     """Mask IoU, PSNR and SSIM per frame of the re-simulation, inside the fitted window and beyond it.
 
     Args:
@@ -162,7 +162,7 @@ def score_resimulation(arrays: Arrays, case: Case, video: np.ndarray | None) -> 
         case: the truth.
         video: u8 [T,h,w,3] of the clip on the raster of the re-simulation; None where it cannot be read.
     """
-    out: list[Figure] = []
+    out: list[Metric] = []
     series: Series = {}
     first = number(arrays, "first_frame", 0)
     measured: dict[str, tuple[np.ndarray, str]] = {}
@@ -194,7 +194,7 @@ def score_resimulation(arrays: Arrays, case: Case, video: np.ndarray | None) -> 
     return out, series
 
 
-def score_conservation(arrays: Arrays, case: Case) -> list[Figure]:
+def score_conservation(arrays: Arrays, case: Case) -> list[Metric]:
     """Volume drift and leakage of the re-simulation's particles."""
     out = []
     volume, why = picked(arrays, "particle_volume", 1)

@@ -10,7 +10,7 @@ import numpy as np
 
 
 @dataclass(frozen=True)
-class Figure:
+class Metric:
     """One number, or the reason why there is none."""
 
     key: str
@@ -31,11 +31,11 @@ class Figure:
         return "-" if self.value is None else f"{self.value:.4g}"
 
 
-def figure(key: str, value: float | None, unit: str = "", note: str = "") -> Figure:
+def figure(key: str, value: float | None, unit: str = "", note: str = "") -> Metric:
     """A figure whose value is a finite Python float or None."""
     if value is not None and not np.isfinite(value):
-        return Figure(key, None, unit, f"not finite ({value}) {note}".strip())
-    return Figure(key, None if value is None else float(value), unit, note)
+        return Metric(key, None, unit, f"not finite ({value}) {note}".strip())
+    return Metric(key, None if value is None else float(value), unit, note)
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Evaluation:
     """How close an asset came to the truth of one case."""
 
     case: str
-    figures: tuple[Figure, ...]
+    figures: tuple[Metric, ...]
     series: dict[str, tuple[float, ...]] = field(default_factory=dict)
     """figures per frame"""
 

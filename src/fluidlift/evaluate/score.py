@@ -20,7 +20,7 @@ from fluidlift.evaluate.planar import (
     score_resimulation,
     score_segmentation,
 )
-from fluidlift.evaluate.report import Evaluation, Figure, figure
+from fluidlift.evaluate.report import Evaluation, Metric, figure
 from fluidlift.evaluate.solid import score_bed, score_up
 from fluidlift.evaluate.space import (
     align,
@@ -39,7 +39,7 @@ def _seconds(entry: Any) -> float | None:
     return float(value) if isinstance(value, int | float) else None
 
 
-def score_cost(manifest: Mapping[str, Any]) -> list[Figure]:
+def score_cost(manifest: Mapping[str, Any]) -> list[Metric]:
     """Seconds per stage (`timings`) and peak memory (`peak_memory_mb`, of its `metrics`)."""
     timings = manifest.get("timings")
     stages = {str(k): _seconds(v) for k, v in timings.items()} if isinstance(timings, Mapping) else {}

@@ -7,13 +7,13 @@ import numpy as np
 from fluidlift.evaluate.case import Case
 from fluidlift.evaluate.images import resample_nearest
 from fluidlift.evaluate.planar import Arrays, picked
-from fluidlift.evaluate.report import Figure, figure
+from fluidlift.evaluate.report import Metric, figure
 from fluidlift.evaluate.space import Alignment
 from fluidlift.look.scenery import terrain_depth
 from fluidlift.types import FluidAsset
 
 
-def score_bed(arrays: Arrays, asset: FluidAsset, case: Case, alignment: Alignment) -> list[Figure]:
+def score_bed(arrays: Arrays, asset: FluidAsset, case: Case, alignment: Alignment) -> list[Metric]:
     """How far the solid that the lines of sight through the fluid meet is from the true one."""
     keys = ("geometry.bed_error", "geometry.bed_error_relative")
     depth, why = picked(arrays, "front_depth", 2)
@@ -35,7 +35,7 @@ def score_bed(arrays: Arrays, asset: FluidAsset, case: Case, alignment: Alignmen
     ]
 
 
-def score_up(case: Case, alignment: Alignment) -> list[Figure]:
+def score_up(case: Case, alignment: Alignment) -> list[Metric]:
     """Angle between the asset's vertical and the case's, both as their cameras see them."""
     up = alignment.truth_from_asset.rotation @ np.array([0.0, 0.0, 1.0])
     gravity = case.scene.get("gravity")

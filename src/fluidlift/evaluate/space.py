@@ -12,7 +12,7 @@ import numpy as np
 from fluidlift.evaluate.case import Case
 from fluidlift.evaluate.images import depth_error, depth_scale, resample_nearest
 from fluidlift.evaluate.planar import Arrays, number, picked, truth_mask
-from fluidlift.evaluate.report import Figure, figure
+from fluidlift.evaluate.report import Metric, figure
 from fluidlift.evaluate.volumes import (
     align_cameras,
     behind,
@@ -47,7 +47,7 @@ class Alignment:
     """index of the key frame of the truth nearest to it"""
 
 
-def score_depth(arrays: Arrays, case: Case) -> tuple[list[Figure], float | None, int]:
+def score_depth(arrays: Arrays, case: Case) -> tuple[list[Metric], float | None, int]:
     """Depth error after one scale factor; returns the figures, that factor and the rest frame."""
     frame = int(np.clip(number(arrays, "rest_frame", number(arrays, "first_frame", 0)), 0, len(case) - 1))
     depth, why = picked(arrays, "front_depth", 2)
@@ -77,7 +77,7 @@ def align(asset: FluidAsset, case: Case, scale: float, frame: int) -> Alignment:
     return Alignment(align_cameras(case.camera, asset.camera, scale), frame, key)
 
 
-def score_surface_velocity(arrays: Arrays, asset: FluidAsset, case: Case, alignment: Alignment) -> list[Figure]:
+def score_surface_velocity(arrays: Arrays, asset: FluidAsset, case: Case, alignment: Alignment) -> list[Metric]:
     """Velocity of the visible surface at the rest frame in m/s, lifted with the run's own depth and camera.
 
     Scored at the pixels where run and truth both see fluid, in the truth's world; `share_found` is the factor of the
@@ -117,7 +117,7 @@ def true_surface_velocity(case: Case, t: int) -> np.ndarray:
     return np.where(mask[..., None], (second - first) / case.interval, 0.0)
 
 
-def score_volume(asset: FluidAsset, case: Case, alignment: Alignment) -> list[Figure]:
+def score_volume(asset: FluidAsset, case: Case, alignment: Alignment) -> list[Metric]:
     """Occupancy IoU, Chamfer distance and volume velocity against the truth's grid at the nearest key frame.
 
     Only cells whose centres are in the picture count, and truth that a solid hides from the camera
@@ -156,7 +156,7 @@ def score_volume(asset: FluidAsset, case: Case, alignment: Alignment) -> list[Fi
     return out
 
 
-def _score_surface(asset: FluidAsset, fluid: np.ndarray, case: Case, alignment: Alignment) -> list[Figure]:
+def _score_surface(asset: FluidAsset, fluid: np.ndarray, case: Case, alignment: Alignment) -> list[Metric]:
     """Chamfer distance between the surfaces of both bodies of fluid."""
     names = ("geometry.chamfer", "geometry.chamfer_cells")
     if case.level_set is None:
@@ -173,7 +173,7 @@ def _score_surface(asset: FluidAsset, fluid: np.ndarray, case: Case, alignment: 
     return [figure(names[0], chamfer, "m", note), figure(names[1], chamfer / case.grid.spacing, "truth cells")]
 
 
-def score_divergence(asset: FluidAsset) -> list[Figure]:
+def score_divergence(asset: FluidAsset) -> list[Metric]:
     """|div v| dx / mean speed of the asset's first velocity, with the open fractions that its solver uses."""
     system = build_system(asset.cell_types, asset.terrain, asset.grid)
     fluid = np.asarray(asset.cell_types) == CellType.FLUID
@@ -197,7 +197,7 @@ def _sigma(estimate: Estimate | None) -> float | None:
 
 def _recovery(
     name: str, value: np.ndarray, truth: np.ndarray | None, sigmas: list[float | None], unit: str, why: str = ""
-) -> list[Figure]:
+) -> list[Metric]:
     """Relative error of a scalar or vector (length-1 or length-3 arrays), and whether the truth lies in 2 sigma."""
     key = f"parameters.{name}"
     keys = (f"{key}.relative_error", f"{key}.within_2_sigma")
@@ -230,7 +230,7 @@ def _true_inflow(asset: FluidAsset, case: Case, alignment: Alignment) -> tuple[n
     return velocity @ alignment.truth_from_asset.rotation, ""
 
 
-def score_parameters(asset: FluidAsset, case: Case, alignment: Alignment) -> list[Figure]:
+def score_parameters(asset: FluidAsset, case: Case, alignment: Alignment) -> list[Metric]:
     """Recovery of gravity, viscosity and inflow velocity, in the axes of the asset and the lengths of the truth."""
     s, rotation = alignment.truth_from_asset.scale, alignment.truth_from_asset.rotation
     p, e = asset.parameters, asset.estimates

@@ -14,8 +14,8 @@ from fluidlift.export.job import (
     OWN_AXES,
     PICTURES,
     ExportJob,
+    ExportOutcome,
     ExportRequest,
-    Outcome,
     as_simulated,
     checked,
     every,
@@ -130,7 +130,7 @@ def _missing(job: ExportJob, manifest: dict[str, Any]) -> tuple[Notice, ...]:
             f"fluidlift sim {job.folder} makes the others"),)  # fmt: skip
 
 
-def _summary(out: Path, request: ExportRequest, outcome: Outcome, interval: float, seconds: float) -> Written:
+def _summary(out: Path, request: ExportRequest, outcome: ExportOutcome, interval: float, seconds: float) -> Written:
     facts = {
         "fps": round(1.0 / interval, 6), "to": request.to, "up_axis": OWN_AXES.get(request.to, request.up_axis),
         "meters_per_unit": request.meters_per_unit,
@@ -141,7 +141,7 @@ def _summary(out: Path, request: ExportRequest, outcome: Outcome, interval: floa
     return Written(out, seconds, outcome.warnings, {"export": {"seconds": round(seconds, 3)}}, facts, words)
 
 
-def _written(job: ExportJob) -> Outcome:
+def _written(job: ExportJob) -> ExportOutcome:
     """Hand the frames to the writer of the format."""
     to = job.request.to
     if to == "html":

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from fluidlift.errors import InputRejected
-from fluidlift.export.job import ExportRequest, Outcome
+from fluidlift.export.job import ExportOutcome, ExportRequest
 from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.io.kept_values import recalled
 from fluidlift.io.output_files import cleared, numbered
@@ -23,7 +23,7 @@ SENSOR = 36.0
 
 def write_clip_files(
     folder: Path, out: Path, asset: FluidAsset, request: ExportRequest, manifest: dict[str, Any], progress: Progress
-) -> Outcome:
+) -> ExportOutcome:
     """The files of one of the formats `OF_CLIP`.
 
     Raises:
@@ -54,7 +54,7 @@ def camera_facts(camera: PinholeCamera) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def write_camera(out: Path, asset: FluidAsset) -> Outcome:
+def write_camera(out: Path, asset: FluidAsset) -> ExportOutcome:
     """camera.json, as `fluidlift render --view` and `make --camera` take it."""
     from fluidlift.io.atomic import write_json
 
@@ -64,7 +64,7 @@ def write_camera(out: Path, asset: FluidAsset) -> Outcome:
     fov, film = facts["fov_degrees"], facts["film"]
     words = (f"field of view {fov['horizontal']:.2f} x {fov['vertical']:.2f} degrees, {film['focal_length_mm']:.2f} mm "
              f"on a film {SENSOR:g} mm wide; it stands still",)  # fmt: skip
-    return Outcome(words, (), {"frames": asset.frame_count, "first": FIRST_FRAME})
+    return ExportOutcome(words, (), {"frames": asset.frame_count, "first": FIRST_FRAME})
 
 
 def _recalled(folder: Path, manifest: dict[str, Any], names: tuple[str, ...], what: str) -> list[Any]:
@@ -89,7 +89,7 @@ def _wanted(request: ExportRequest, count: int, what: str) -> range:
     return range(first - FIRST_FRAME, last - FIRST_FRAME + 1)
 
 
-def _masks(labels: np.ndarray, out: Path, request: ExportRequest, progress: Progress) -> Outcome:
+def _masks(labels: np.ndarray, out: Path, request: ExportRequest, progress: Progress) -> ExportOutcome:
     """####.png of every frame of the clip: white is fluid."""
     from fluidlift.io.images import write_png
 
@@ -99,12 +99,12 @@ def _masks(labels: np.ndarray, out: Path, request: ExportRequest, progress: Prog
     for done, t in enumerate(wanted):
         progress.update(done, len(wanted))
         write_png(numbered(out, t, ".png"), np.where(np.asarray(labels[t]) == Label.FLUID, 255, 0).astype(np.uint8))
-    return Outcome(("white is fluid; of the working pictures of the clip",), (), _counted(wanted))
+    return ExportOutcome(("white is fluid; of the working pictures of the clip",), (), _counted(wanted))
 
 
 def _flow(
     flow: Flow, segmentation: Segmentation, motion: Motion, out: Path, request: ExportRequest, progress: Progress
-) -> Outcome:
+) -> ExportOutcome:
     """flow.####.exr or .flo from every frame of the clip to the next: completed along the mainstream where make has
     done so, else as measured; unknown outside the fluid."""
     from fluidlift.io.flow_files import write_flow
@@ -129,7 +129,7 @@ def _flow(
         write_flow(out, t, shown, np.where(wet, trust, 0.0), form)
     told = f"{completed} completed along the mainstream, {len(wanted) - completed} as measured between two frames"
     words = (f"{told}; px per frame of the working pictures", "fluidlift motion completes every frame")
-    return Outcome(words, (), _counted(wanted) | {"completed": completed})
+    return ExportOutcome(words, (), _counted(wanted) | {"completed": completed})
 
 
 def _counted(wanted: range) -> dict[str, Any]:

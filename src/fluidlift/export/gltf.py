@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from fluidlift.export.job import ExportJob, Outcome
+from fluidlift.export.job import ExportJob, ExportOutcome
 from fluidlift.export.whitewater import whitewater_of
 from fluidlift.io.frames import FIRST_FRAME
 
@@ -21,7 +21,7 @@ def hero_of(picked: range) -> int:
     return picked[len(picked) // 2]
 
 
-def write_hero(job: ExportJob, surfaced: Callable[[range], FluidFrame]) -> Outcome:
+def write_hero(job: ExportJob, surfaced: Callable[[range], FluidFrame]) -> ExportOutcome:
     """One frame as hero.glb (splats, terrain, camera) and surface.glb (the surface as a mesh instead of the splats, and
     white water as points).
 
@@ -41,4 +41,4 @@ def write_hero(job: ExportJob, surfaced: Callable[[range], FluidFrame]) -> Outco
                    whitewater=whitewater_of(frame))  # fmt: skip
         written += f" (splats) and {SURFACE} (mesh)"
     told = f"glTF holds one instant: frame {FIRST_FRAME + k} as {written}; another with --frames"
-    return Outcome((told,), (), {"frames": 1, "first": FIRST_FRAME + k})
+    return ExportOutcome((told,), (), {"frames": 1, "first": FIRST_FRAME + k})

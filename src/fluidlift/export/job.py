@@ -86,7 +86,7 @@ class ExportJob:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class ExportOutcome:
     """What a writer has to tell."""
 
     words: tuple[str, ...] = ()

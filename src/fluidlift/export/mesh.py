@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from fluidlift.export.bodies import write_bodies
 from fluidlift.export.job import (
     ExportJob,
-    Outcome,
+    ExportOutcome,
     write_terrain,
 )
 from fluidlift.export.whitewater import WhitewaterFiles
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     pass
 
 
-def write_meshes(job: ExportJob, frames: Iterator[FluidFrame]) -> Outcome:
+def write_meshes(job: ExportJob, frames: Iterator[FluidFrame]) -> ExportOutcome:
     """Numbered files of the surface, of white water and the terrain, in the axes and units that are asked for; with PLY
     the bodies."""
     from fluidlift.io.export_mesh import write_mesh, write_obj
@@ -38,4 +38,4 @@ def write_meshes(job: ExportJob, frames: Iterator[FluidFrame]) -> Outcome:
             write_mesh(path, mesh, velocities=place.vectors(frame.surface_velocities), comment=job.unit)
         white.write(k, frame)
     write_terrain(job)
-    return Outcome(warnings=write_bodies(job) if to == "mesh" else ())
+    return ExportOutcome(warnings=write_bodies(job) if to == "mesh" else ())

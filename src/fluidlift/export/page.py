@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fluidlift.export.job import ExportJob, Outcome
+from fluidlift.export.job import ExportJob, ExportOutcome
 from fluidlift.io.frames import FIRST_FRAME
 from fluidlift.messages import Notice
 from fluidlift.present.looping import FAINTEST
@@ -18,7 +18,7 @@ from fluidlift.types import Gaussians, PinholeCamera, Similarity3, concatenate, 
 
 if TYPE_CHECKING:
     from fluidlift.io.frames import MovingMesh
-    from fluidlift.io.page_frames import Range
+    from fluidlift.io.page_frames import Quantization
 
 MOST_SPLATS = 100_000
 """of a frame: what a phone and a laptop without a graphics card still draw"""
@@ -35,11 +35,9 @@ POSTER = 960
 _SPREAD = np.uint64(2654435761)
 """Knuth's multiplier: neighbouring ids become far ones, so that thinning leaves no holes"""
 
-Frames = Callable[[range], Iterator[tuple[Gaussians, np.ndarray]]]
-
 
 @dataclass(frozen=True)
-class Plan:
+class PageContent:
     """What of an asset goes into the page."""
 
     share: float
@@ -48,7 +46,7 @@ class Plan:
     """one frame of so many"""
 
 
-def write_page_of(job: ExportJob) -> Outcome:
+def write_page_of(job: ExportJob) -> ExportOutcome:
     """page.html in the folder, or the .html file that was named."""
     from fluidlift.export.usd import bodies_of
     from fluidlift.io.export_page import PageScene, write_page
@@ -80,7 +78,7 @@ def write_page_of(job: ExportJob) -> Outcome:
     path, size = write_page(page_path(job.out), frames(True), held, scene)
     words = (f"{path.name}: {size / 1e6:.1f} MB, {held.slots} splats at most, {len(picked)} frames; opens in any "
              "browser, without a network",)  # fmt: skip
-    return Outcome(words, tuple(warnings), {"bytes": size, "frames": len(picked), "file": str(path)})
+    return ExportOutcome(words, tuple(warnings), {"bytes": size, "frames": len(picked), "file": str(path)})
 
 
 def _drawn(job: ExportJob, picked: range) -> Iterator[tuple[Gaussians, np.ndarray]]:
@@ -118,7 +116,7 @@ def _seen(gaussians: Gaussians, camera: PinholeCamera) -> Gaussians:
     return replace(gaussians, sh=sh_from_rgb(np.clip(view_colors(gaussians, camera), 0.0, 1.0)))
 
 
-def _plan(job: ExportJob, splats: int) -> Plan:
+def _plan(job: ExportJob, splats: int) -> PageContent:
     """Splats at most `MOST_SPLATS`; then, by the size of the first frames, frames left out, and splats where that would
     not do."""
     from fluidlift.io.export_page import BASE64
@@ -132,16 +130,16 @@ def _plan(job: ExportJob, splats: int) -> Plan:
     every = min(int(np.ceil(excess)), max(1, int(1.0 / (job.interval * SLOWEST)))) if excess > 1 else 1
     if excess / every > 1:
         share = min(max(share * every / excess, FEWEST / max(splats, 1)), share)
-    return Plan(share, every)
+    return PageContent(share, every)
 
 
-def _range_of(frames: Iterator[Gaussians]) -> Range:
-    from fluidlift.io.page_frames import Range
+def _range_of(frames: Iterator[Gaussians]) -> Quantization:
+    from fluidlift.io.page_frames import Quantization
 
-    return Range.of(frames)
+    return Quantization.of(frames)
 
 
-def _warnings(plan: Plan, splats: int, job: ExportJob, frames: int) -> list[Notice]:
+def _warnings(plan: PageContent, splats: int, job: ExportJob, frames: int) -> list[Notice]:
     """What was left out, in words."""
     told = []
     if plan.share < 1.0:

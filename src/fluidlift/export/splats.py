@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fluidlift.export.job import ExportJob, Outcome, write_terrain
+from fluidlift.export.job import ExportJob, ExportOutcome, write_terrain
 from fluidlift.io.output_files import cleared, numbered
 from fluidlift.scene.splat_files import frames_of
 from fluidlift.types import Similarity3
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from fluidlift.io.frames import FluidFrame
 
 
-def write_spz_frames(job: ExportJob) -> Outcome:
+def write_spz_frames(job: ExportJob) -> ExportOutcome:
     """Numbered .spz files: y up, metres."""
     from fluidlift.io.spz import write_spz
 
@@ -26,7 +26,9 @@ def write_spz_frames(job: ExportJob) -> Outcome:
         job.progress.update(done, len(job.picked))
         size += write_spz(numbered(job.out, k, ".spz"), gaussians).stat().st_size
     each = size / max(len(job.picked), 1) / 1e6
-    return Outcome((f"{each:.2f} MB per frame; the format has no place for ids and velocities",), (), {"bytes": size})
+    return ExportOutcome(
+        (f"{each:.2f} MB per frame; the format has no place for ids and velocities",), (), {"bytes": size}
+    )
 
 
 def kind_column(frame: FluidFrame) -> dict[str, np.ndarray]:
@@ -34,7 +36,7 @@ def kind_column(frame: FluidFrame) -> dict[str, np.ndarray]:
     return {} if frame.kinds is None else {"kind": np.asarray(frame.kinds, np.int32)}
 
 
-def write_splats(job: ExportJob, frames: Iterator[FluidFrame]) -> Outcome:
+def write_splats(job: ExportJob, frames: Iterator[FluidFrame]) -> ExportOutcome:
     """Numbered .ply files and the terrain, in the axes and units that are asked for."""
     from fluidlift.io.ply import write_gaussians
 
@@ -47,4 +49,4 @@ def write_splats(job: ExportJob, frames: Iterator[FluidFrame]) -> Outcome:
             axes=axes, comments=[job.unit], extras=kind_column(frame),
         )  # fmt: skip
     write_terrain(job)
-    return Outcome()
+    return ExportOutcome()

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fluidlift.export.bodies import bodies_of
-from fluidlift.export.job import ExportJob, Outcome
+from fluidlift.export.job import ExportJob, ExportOutcome
 from fluidlift.io.frames import FIRST_FRAME, FluidFrame
 from fluidlift.messages import Notice
 from fluidlift.types import FluidAsset, kind_of
@@ -83,11 +83,11 @@ def _with_volumes(
         yield frame._replace(volume=path.relative_to(out).as_posix())
 
 
-def write_usd_files(job: ExportJob, frames: Iterator[FluidFrame]) -> Outcome:
+def write_usd_files(job: ExportJob, frames: Iterator[FluidFrame]) -> ExportOutcome:
     """One file with all of it, or one with a clip per frame."""
     from fluidlift.io.export_usd import UsdSettings
 
     layout = "clips" if job.request.to == "usd-clips" else "file"
     axes, unit = job.request.up_axis, job.request.meters_per_unit
     settings = UsdSettings(FIRST_FRAME + job.numbers.start, axes, unit, layout)
-    return Outcome(warnings=write_usd_asset(job, frames, settings))
+    return ExportOutcome(warnings=write_usd_asset(job, frames, settings))

@@ -9,7 +9,7 @@ import numpy as np
 
 from fluidlift.export.job import (
     ExportJob,
-    Outcome,
+    ExportOutcome,
 )
 from fluidlift.export.whitewater import shadow_of, whitewater_grids
 from fluidlift.io.frames import FluidFrame
@@ -28,7 +28,7 @@ FULL = 50.0
 """percentile of the cells' amounts that counts as a full cell"""
 
 
-def write_volumes(job: ExportJob, frames: Iterator[FluidFrame]) -> Outcome:
+def write_volumes(job: ExportJob, frames: Iterator[FluidFrame]) -> ExportOutcome:
     """Numbered OpenVDB files: `vel` (m/s) and `density` on cells of the simulation, `surface` (m) on half of them, and
     `spray`, `foam` and `bubbles` (1/m) on whole ones."""
     from fluidlift.io.volume_grid import VolumeGrid, velocity_grid, write_vdb
@@ -43,7 +43,7 @@ def write_volumes(job: ExportJob, frames: Iterator[FluidFrame]) -> Outcome:
             grids.append(level_set(frame.surface, 0.5 * h))
         grids += whitewater_grids(frame, job.asset.grid)
         write_vdb(numbered(job.out, k, ".vdb"), grids)
-    return Outcome()
+    return ExportOutcome()
 
 
 def level_set(mesh: TriangleMesh, spacing: float) -> VolumeGrid:

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from fluidlift.errors import InputRejected
-from fluidlift.farm.state import Outcome
+from fluidlift.farm.state import ShotOutcome
 from fluidlift.io.asset_folder import load_asset, read_manifest, read_parameters
 from fluidlift.types import FluidParameters, Gaussians, kind_of
 
@@ -84,7 +84,7 @@ def require_parquet() -> None:
         raise InputRejected("a data set without pyarrow", "the package", "pip install 'fluidlift[dataset]'")
 
 
-def write_index(folder: Path, outcomes: tuple[Outcome, ...]) -> tuple[Path, int]:
+def write_index(folder: Path, outcomes: tuple[ShotOutcome, ...]) -> tuple[Path, int]:
     """Write dataset.parquet into a folder of shots: a row per asset that is whole; the path, and how many rows.
 
     Args:
@@ -118,7 +118,7 @@ def _field(name: str, kind: str, text: str) -> Any:
     return pa.field(name, types[kind], metadata={"meaning": text} if text else None)
 
 
-def row_of(folder: Path, outcome: Outcome) -> dict[str, Any]:
+def row_of(folder: Path, outcome: ShotOutcome) -> dict[str, Any]:
     """What the index says of an asset; columns as `COLUMNS`, and its parameters and figures."""
     place = folder / f"{outcome.name}.fluid"
     manifest = read_manifest(place)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Protocol
 
 from fluidlift.farm.shots import Shot
-from fluidlift.farm.state import Outcome
+from fluidlift.farm.state import ShotOutcome
 
 Tell = Callable[[str], None]
 
@@ -42,7 +42,7 @@ class Limits:
 class Engine(Protocol):
     """Makes shots."""
 
-    def shots(self, shots: list[Shot], folder: Path, limits: Limits, tell: Tell, part: Tell) -> Iterator[Outcome]:
+    def shots(self, shots: list[Shot], folder: Path, limits: Limits, tell: Tell, part: Tell) -> Iterator[ShotOutcome]:
         """Each shot as it ends; of those that are finished what is known of them, and no process is started.
 
         Stopped (Ctrl-C, SIGTERM), the makes that run are told to end; what they finished is kept.
@@ -61,7 +61,7 @@ class Engine(Protocol):
         ...
 
 
-def next_limits(outcome: Outcome, limits: Limits, most: float) -> Limits | None:
+def next_limits(outcome: ShotOutcome, limits: Limits, most: float) -> Limits | None:
     """Those of the next try of a shot that failed; None where another one would end alike.
 
     What is wrong with the input stays wrong, and what took too long would again. What broke down, or was ended from

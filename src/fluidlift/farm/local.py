@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from fluidlift.farm.engine import Limits, Tell, next_limits
-from fluidlift.farm.making import Making, make_shot
+from fluidlift.farm.making import RunningMakes, make_shot
 from fluidlift.farm.preflight import looked_at, require_fit
 from fluidlift.farm.shots import Shot
-from fluidlift.farm.state import Outcome, list_names
+from fluidlift.farm.state import ShotOutcome, list_names
 from fluidlift.farm.store import Store
 from fluidlift.machine import available_memory, cores
 
@@ -25,12 +25,12 @@ class LocalEngine:
     store: Store | None = None
     """where assets belong, which are made in the folder; None: there"""
 
-    def shots(self, shots: list[Shot], folder: Path, limits: Limits, tell: Tell, part: Tell) -> Iterator[Outcome]:
+    def shots(self, shots: list[Shot], folder: Path, limits: Limits, tell: Tell, part: Tell) -> Iterator[ShotOutcome]:
         """As `Engine.shots`."""
         require_fit([looked_at(folder)], folder)
         list_names(folder, [shot.name for shot in shots])
         limits = limits if limits.threads else replace(limits, threads=max(cores() // self.jobs, 1))
-        making = Making(tell, part)
+        making = RunningMakes(tell, part)
         with ThreadPoolExecutor(self.jobs) as pool:
             waiting = [pool.submit(_shot, shot, folder, limits, making, self.store) for shot in shots]
             try:
@@ -43,7 +43,7 @@ class LocalEngine:
                 raise
 
 
-def _shot(shot: Shot, folder: Path, limits: Limits, making: Making, store: Store | None) -> Outcome | None:
+def _shot(shot: Shot, folder: Path, limits: Limits, making: RunningMakes, store: Store | None) -> ShotOutcome | None:
     """As `make_shot`, as often as it can help."""
     outcome = None
     bounds: Limits | None = limits

@@ -26,7 +26,7 @@ from fluidlift.farm.guard import WATCHED
 from fluidlift.farm.shots import Shot
 from fluidlift.farm.state import (
     LOG,
-    Outcome,
+    ShotOutcome,
     claimed,
     is_finished,
     manifest_digest,
@@ -53,7 +53,7 @@ _STAGE = re.compile(r"\[(\d+)/(\d+)\]", re.ASCII)
 
 
 @dataclass
-class Making:
+class RunningMakes:
     """Makes that run, to be ended with the batch; who is told how far they are."""
 
     tell: Tell = lambda text: None
@@ -73,7 +73,9 @@ class Making:
             _end(process)
 
 
-def make_shot(shot: Shot, folder: Path, limits: Limits, making: Making, store: Store | None = None) -> Outcome | None:
+def make_shot(
+    shot: Shot, folder: Path, limits: Limits, making: RunningMakes, store: Store | None = None
+) -> ShotOutcome | None:
     """What became of one; None where somebody else makes it, or it is not wanted.
 
     Args:
@@ -106,7 +108,7 @@ def make_shot(shot: Shot, folder: Path, limits: Limits, making: Making, store: S
         return outcome
 
 
-def finished(shot: Shot, folder: Path, store: Store | None = None) -> Outcome | None:
+def finished(shot: Shot, folder: Path, store: Store | None = None) -> ShotOutcome | None:
     """What is known of a shot with which nothing is left to do; None of others, and of one that somebody makes."""
     if store is not None:
         return store.finished(shot)
@@ -117,7 +119,7 @@ def finished(shot: Shot, folder: Path, store: Store | None = None) -> Outcome | 
         return None if lock is None else _known(shot, folder, shot.fingerprint())
 
 
-def _known(shot: Shot, folder: Path, fingerprint: str) -> Outcome | None:
+def _known(shot: Shot, folder: Path, fingerprint: str) -> ShotOutcome | None:
     """As `finished`, while its lock is held; what the list says of the clip is kept."""
     known = read_outcome(folder, shot.name)
     if known is None or not is_finished(folder, known, fingerprint):
@@ -136,7 +138,7 @@ def is_wanted(folder: Path, name: str, retry: str | None) -> bool:
     return known is not None and known.failure == retry
 
 
-def _made(shot: Shot, folder: Path, fingerprint: str, limits: Limits, making: Making, lock: int) -> Outcome:
+def _made(shot: Shot, folder: Path, fingerprint: str, limits: Limits, making: RunningMakes, lock: int) -> ShotOutcome:
     log, began = folder / f"{shot.name}{LOG}", time.monotonic()
     making.tell(f"{shot.name}: begun, {log.name} tells how far it is")
     with _started(shot, folder, limits, log, lock) as process:
@@ -152,7 +154,7 @@ def _made(shot: Shot, folder: Path, fingerprint: str, limits: Limits, making: Ma
         found = dict(json.loads(told))
     reason = "" if outcome in ("done", "done, warnings") else over or _last_words(log, code)
     stages, card = found.get("stages", {}), found.get("as_filmed", {})
-    return Outcome(
+    return ShotOutcome(
         shot.name, outcome, round(time.monotonic() - began, 1), str(folder / f"{shot.name}.fluid"), str(log),
         [str(w) for w in found.get("warnings", ())], reason, failure_of(outcome, code, reason),
         str(card.get("verdict") or ""), max((s.get("peak_memory_mb", 0.0) for s in stages.values()), default=0.0),
@@ -186,7 +188,9 @@ def _started(shot: Shot, folder: Path, limits: Limits, log: Path, lock: int) -> 
             os.close(read)
 
 
-def _watched(process: subprocess.Popen, log: Path, limits: Limits, began: float, making: Making) -> tuple[str, str]:
+def _watched(
+    process: subprocess.Popen, log: Path, limits: Limits, began: float, making: RunningMakes
+) -> tuple[str, str]:
     """What a make printed, once it has ended, and which limit it went over, in words."""
     over, shown = "", ""
     while True:

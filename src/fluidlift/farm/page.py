@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from fluidlift.errors import InputRejected
-from fluidlift.farm.state import Outcome
+from fluidlift.farm.state import ShotOutcome
 from fluidlift.farm.summary import Status
 
 WIDTH = 240
@@ -34,7 +34,7 @@ find.oninput = () => { const words = find.value.toLowerCase().split(/\\s+/).filt
 """
 
 
-def doubt(outcome: Outcome) -> float:
+def doubt(outcome: ShotOutcome) -> float:
     """How much an outcome should be looked at, 0 for nothing."""
     return (_DOUBT.get(outcome.verdict, 1.5) if outcome.well else 3.0) + 0.1 * len(outcome.warnings)
 
@@ -53,7 +53,7 @@ def page(folder: Path, status: Status) -> str:
     )
 
 
-def _article(folder: Path, outcome: Outcome) -> str:
+def _article(folder: Path, outcome: ShotOutcome) -> str:
     asset = folder / f"{outcome.name}.fluid"
     pictures = [p for p in (_overlay(asset), _preview(asset)) if p is not None] if outcome.well else []
     told = outcome.verdict or "not measured" if outcome.well else f"failed: {outcome.failure}"

@@ -21,7 +21,7 @@ MARGIN = 120.0
 
 
 @dataclass(frozen=True)
-class Plan:
+class TaskPlan:
     """What every task runs, and what it needs."""
 
     arguments: Sequence[str]
@@ -39,7 +39,7 @@ class Plan:
         return ["fluidlift", "batch", *self.arguments, "--shard", f"{task}/{self.shots}", "--warnings-ok"]
 
 
-def written(kind: str, plan: Plan, folder: Path) -> Path:
+def written(kind: str, plan: TaskPlan, folder: Path) -> Path:
     """The file of a plan, in the folder of the assets."""
     from fluidlift.io.atomic import write_bytes
 
@@ -49,7 +49,7 @@ def written(kind: str, plan: Plan, folder: Path) -> Path:
     return path
 
 
-def _openjd(plan: Plan) -> str:
+def _openjd(plan: TaskPlan) -> str:
     import yaml
 
     action: dict = {"command": "fluidlift", "args": [*plan.command("{{Task.Param.Shot}}")[1:], "--progress", "openjd"]}
@@ -77,7 +77,7 @@ def _openjd(plan: Plan) -> str:
     return yaml.safe_dump(job, sort_keys=False, width=1000)
 
 
-def _slurm(plan: Plan) -> str:
+def _slurm(plan: TaskPlan) -> str:
     limit = "" if plan.seconds is None else f"#SBATCH --time={math.ceil((plan.seconds + MARGIN) / 60)}\n"
     command = shlex.join(plan.command("TASK")).replace("TASK/", '"$SLURM_ARRAY_TASK_ID"/')
     return (
@@ -88,5 +88,5 @@ def _slurm(plan: Plan) -> str:
     )
 
 
-def _commands(plan: Plan) -> str:
+def _commands(plan: TaskPlan) -> str:
     return "".join(f"{shlex.join(plan.command(k))}\n" for k in range(1, plan.shots + 1))

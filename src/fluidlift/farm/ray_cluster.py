@@ -21,11 +21,11 @@ from typing import Any
 from fluidlift import __version__
 from fluidlift.errors import InputRejected
 from fluidlift.farm.engine import TASK_CORES, TASK_MEMORY, Limits, Tell, next_limits
-from fluidlift.farm.making import Making, finished, is_wanted, make_shot, now
+from fluidlift.farm.making import RunningMakes, finished, is_wanted, make_shot, now
 from fluidlift.farm.preflight import NOTE, Machine, looked_at, require_fit
 from fluidlift.farm.ray_session import session
 from fluidlift.farm.shots import Shot
-from fluidlift.farm.state import LOG, Outcome, claimed, list_names, write_outcome
+from fluidlift.farm.state import LOG, ShotOutcome, claimed, list_names, write_outcome
 from fluidlift.farm.store import Store
 from fluidlift.io.asset_lock import held
 
@@ -38,7 +38,8 @@ _ELSEWHERE = 60.0
 _LOOK = 120.0
 """s that a machine has to answer; the first process of a cold node takes ten"""
 _SETTLE = 3.0
-"""s, `Making.settle`: a worker whose driver died kills what it started, then leaves within 0.1 s on an idle machine"""
+"""s, `RunningMakes.settle`: a worker whose driver died kills what it started, then leaves within 0.1 s on an idle
+machine"""
 _LAST = 40.0
 """s that cancelled tasks have to end their makes"""
 
@@ -58,7 +59,7 @@ class RayEngine:
     store: Store | None = None
     """where assets belong, which each machine makes in a folder of its own; None: the folder, which all share"""
 
-    def shots(self, shots: list[Shot], folder: Path, limits: Limits, tell: Tell, part: Tell) -> Iterator[Outcome]:
+    def shots(self, shots: list[Shot], folder: Path, limits: Limits, tell: Tell, part: Tell) -> Iterator[ShotOutcome]:
         """As `Engine.shots`.
 
         Raises:
@@ -72,7 +73,7 @@ class RayEngine:
             tell(f"{cluster.words()}; each shot: {task.words()}")
             list_names(folder, [shot.name for shot in shots])
             limits = replace(limits, threads=task.cores, memory=task.memory)
-            batch = _Batch(cluster, task, folder, tell, deque(_Try(shot, limits) for shot in shots), self.store)
+            batch = _ShotQueue(cluster, task, folder, tell, deque(_Try(shot, limits) for shot in shots), self.store)
             try:
                 yield from batch.outcomes(self.jobs)
             finally:
@@ -80,7 +81,7 @@ class RayEngine:
 
 
 @dataclass(frozen=True)
-class _Task:
+class _TaskResources:
     """What a shot asks of a machine."""
 
     cores: int
@@ -114,7 +115,7 @@ class _Cluster:
     def largest(self, resource: str) -> float:
         return max((node["Resources"].get(resource, 0.0) for node in self.machines()), default=0.0)
 
-    def slots(self, task: _Task) -> int:
+    def slots(self, task: _TaskResources) -> int:
         """Shots that can be made at a time."""
 
         def of(node: dict[str, float]) -> int:
@@ -128,18 +129,18 @@ class _Cluster:
         cores = sum(node["Resources"].get("CPU", 0.0) for node in found)
         return f"Ray: {len(found)} machine{'s' * (len(found) != 1)}, {cores:.0f} cores"
 
-    def task_of(self, engine: RayEngine, limits: Limits) -> _Task:
+    def task_of(self, engine: RayEngine, limits: Limits) -> _TaskResources:
         """What a shot asks for.
 
         Raises:
             InputRejected: no machine has as much.
         """
         cores, memory = self.largest("CPU"), self.largest("memory")
-        task = _Task(
+        task = _TaskResources(
             engine.cores or max(min(TASK_CORES, int(cores)), 1),
             limits.memory or min(TASK_MEMORY, memory), engine.gpus,
         )  # fmt: skip
-        have = _Task(int(cores), memory, self.largest("GPU"))
+        have = _TaskResources(int(cores), memory, self.largest("GPU"))
         if task.cores > have.cores or task.memory > have.memory or task.gpus > have.gpus:
             raise InputRejected(
                 f"a shot asks for {task.words()}; the largest machine of the cluster has {have.words()}",
@@ -207,7 +208,7 @@ def _looker(ray: Any) -> Any:
     return ray.remote(num_cpus=0, max_retries=0)(look)
 
 
-def _make(shot: Shot, place: Path | Store, limits: Limits, version: str) -> Outcome | None:
+def _make(shot: Shot, place: Path | Store, limits: Limits, version: str) -> ShotOutcome | None:
     """What a task does.
 
     Raises:
@@ -218,22 +219,22 @@ def _make(shot: Shot, place: Path | Store, limits: Limits, version: str) -> Outc
     require_fit([Machine(node(), __version__)], folder, ours=Machine("", version))
     with suppress(ValueError):  # a batch that a shell began in the background ignores it, and so would a cancelled task
         signal.signal(signal.SIGINT, signal.default_int_handler)
-    return make_shot(shot, folder, limits, Making(settle=_SETTLE), store)
+    return make_shot(shot, folder, limits, RunningMakes(settle=_SETTLE), store)
 
 
 @dataclass
-class _Batch:
+class _ShotQueue:
     """Shots that wait and tasks in flight."""
 
     cluster: _Cluster
-    task: _Task
+    task: _TaskResources
     folder: Path
     tell: Tell
     waiting: deque[_Try]
     store: Store | None = None
     flying: dict[Any, _Try] = field(default_factory=dict)
 
-    def outcomes(self, jobs: int | None) -> Iterator[Outcome]:
+    def outcomes(self, jobs: int | None) -> Iterator[ShotOutcome]:
         """Each shot as it ends."""
         slots, counted = 0, -_POLL
         while self.waiting or self.flying:
@@ -258,7 +259,7 @@ class _Batch:
         except SystemError as error:  # how Ray wraps what a handler of a signal raises
             raise error.__cause__ or error from None
 
-    def _fill(self, room: int) -> Iterator[Outcome]:
+    def _fill(self, room: int) -> Iterator[ShotOutcome]:
         """Start what there is room for; what is finished already needs none."""
         for _ in range(len(self.waiting)):
             if len(self.flying) >= room:
@@ -278,7 +279,7 @@ class _Batch:
         )  # fmt: skip
         return task.remote(one.shot, self.store or self.folder, one.limits, __version__)
 
-    def _ended(self, ref: Any, one: _Try) -> Outcome | None:
+    def _ended(self, ref: Any, one: _Try) -> ShotOutcome | None:
         """What became of a try; None where there is another one, or somebody else makes the shot."""
         outcome = self._result(ref, one)
         if outcome is not None and self.store is not None:  # the machine that made it wrote that into its own folder
@@ -300,7 +301,7 @@ class _Batch:
             return
         self.waiting.append(replace(one, not_before=time.monotonic() + _POLL, elsewhere_since=since))
 
-    def _result(self, ref: Any, one: _Try) -> Outcome | None:
+    def _result(self, ref: Any, one: _Try) -> ShotOutcome | None:
         """What a task gave; where it was lost with its process or machine, that is what became of the shot."""
         errors = self.cluster.ray.exceptions
         try:
@@ -314,9 +315,9 @@ class _Batch:
         except errors.RayError as error:
             return self._lost(one, f"its process or machine was lost ({type(error).__name__})", "crash")
 
-    def _lost(self, one: _Try, reason: str, failure: str) -> Outcome:
+    def _lost(self, one: _Try, reason: str, failure: str) -> ShotOutcome:
         folder, name = self.folder, one.shot.name
-        outcome = Outcome(
+        outcome = ShotOutcome(
             name, "failed", 0.0, str(folder / f"{name}.fluid"), str(folder / f"{name}{LOG}"), reason=reason,
             failure=failure, version=__version__, ended=now(), clip=str(one.shot.clip), licence=one.shot.licence,
             source=one.shot.source,

@@ -30,7 +30,7 @@ LARGEST = 1 << 20
 
 
 @dataclass(frozen=True)
-class Outcome:
+class ShotOutcome:
     """How the make of one shot ended."""
 
     name: str
@@ -76,7 +76,7 @@ class Outcome:
         )
 
 
-def read_outcome(folder: Path, name: str) -> Outcome | None:
+def read_outcome(folder: Path, name: str) -> ShotOutcome | None:
     """What became of a shot; None where nothing has, or what is there is damaged."""
     try:
         with os.fdopen(os.open(folder / f"{name}{STATE}", os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0)), "rb") as file:
@@ -85,23 +85,23 @@ def read_outcome(folder: Path, name: str) -> Outcome | None:
         return None
 
 
-def parsed_outcome(data: bytes, name: str) -> Outcome | None:
+def parsed_outcome(data: bytes, name: str) -> ShotOutcome | None:
     """What a state file says of a shot; None of one that is damaged, or of another shot."""
     with suppress(ValueError, TypeError, KeyError):
         found = json.loads(data)
-        known = {f.name: type(f.default) for f in fields(Outcome)}
+        known = {f.name: type(f.default) for f in fields(ShotOutcome)}
         if found["name"] == name and all(isinstance(found[k], str) for k in ("outcome", "failure", "fingerprint")):
-            return Outcome(**{k: v for k, v in found.items() if k in known})
+            return ShotOutcome(**{k: v for k, v in found.items() if k in known})
     return None
 
 
-def write_outcome(folder: Path, outcome: Outcome) -> None:
+def write_outcome(folder: Path, outcome: ShotOutcome) -> None:
     """Beside the asset, whole or not at all."""
     with atomic_write(folder / f"{outcome.name}{STATE}") as file:
         file.write((json.dumps(asdict(outcome), indent=1) + "\n").encode())
 
 
-def is_finished(folder: Path, found: Outcome | None, fingerprint: str) -> bool:
+def is_finished(folder: Path, found: ShotOutcome | None, fingerprint: str) -> bool:
     """Whether nothing is left to do for a shot of this fingerprint."""
     if found is None or not found.well or found.fingerprint != fingerprint:
         return False

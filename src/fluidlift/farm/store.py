@@ -21,7 +21,7 @@ from typing import Any
 
 from fluidlift.errors import FluidliftError, InputRejected, MissingPackage
 from fluidlift.farm.shots import Shot, is_name
-from fluidlift.farm.state import LARGEST, LISTED, LOG, STATE, Outcome, parsed_outcome, write_outcome
+from fluidlift.farm.state import LARGEST, LISTED, LOG, STATE, ShotOutcome, parsed_outcome, write_outcome
 from fluidlift.farm.summary import PARQUET, SUMMARY, TABLE
 from fluidlift.io.asset_paths import require_no_links
 from fluidlift.io.atomic import write_bytes
@@ -138,7 +138,7 @@ class Store:
             fs, root = self._place()
             fs.put_file(str(local), f"{root}/{name}")
 
-    def finished(self, shot: Shot) -> Outcome | None:
+    def finished(self, shot: Shot) -> ShotOutcome | None:
         """What is known of a shot with which nothing is left to do: its state says so, and its manifest is that of the
         state. Raises as `read`."""
         found = self.read(f"{shot.name}{STATE}", LARGEST)
@@ -153,7 +153,7 @@ class Store:
             self._write_state(now)
         return now
 
-    def put(self, outcome: Outcome) -> Outcome:
+    def put(self, outcome: ShotOutcome) -> ShotOutcome:
         """Put what a make left in the folder there; how that is known from then on.
 
         Args:
@@ -199,7 +199,7 @@ class Store:
                     for path in old - {f"{base}/{file}" for file in files}:
                         fs.rm_file(path)
 
-    def _write_state(self, outcome: Outcome) -> None:
+    def _write_state(self, outcome: ShotOutcome) -> None:
         with self._errors("written"):
             fs, root = self._place()
             fs.pipe_file(f"{root}/{outcome.name}{STATE}", (json.dumps(asdict(outcome), indent=1) + "\n").encode())

@@ -14,7 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from fluidlift.farm.state import Outcome, is_running, names_of, read_outcome
+from fluidlift.farm.state import ShotOutcome, is_running, names_of, read_outcome
 
 SUMMARY, TABLE, PARQUET = "batch.json", "batch.csv", "batch.parquet"
 _HIDDEN = ("fingerprint", "manifest")
@@ -24,14 +24,14 @@ _HIDDEN = ("fingerprint", "manifest")
 class Status:
     """Of a folder."""
 
-    outcomes: tuple[Outcome, ...]
+    outcomes: tuple[ShotOutcome, ...]
     """of shots that ended, in the order of their list"""
     running: tuple[str, ...]
     """being made, as far as locks reach"""
     waiting: tuple[str, ...]
 
     @property
-    def done(self) -> tuple[Outcome, ...]:
+    def done(self) -> tuple[ShotOutcome, ...]:
         """Those that became assets."""
         return tuple(o for o in self.outcomes if o.well)
 
@@ -92,22 +92,22 @@ def status_of(folder: Path) -> Status:
     return Status(tuple(ended), tuple(running), tuple(waiting))
 
 
-def rows(outcomes: Sequence[Outcome]) -> list[dict]:
+def rows(outcomes: Sequence[ShotOutcome]) -> list[dict]:
     """Without what only resuming needs."""
     return [{k: v for k, v in dataclasses.asdict(o).items() if k not in _HIDDEN} for o in outcomes]
 
 
-def as_csv(outcomes: Sequence[Outcome]) -> str:
+def as_csv(outcomes: Sequence[ShotOutcome]) -> str:
     """A row per shot; of warnings their number."""
     file = io.StringIO()
-    names = [f.name for f in dataclasses.fields(Outcome) if f.name not in _HIDDEN]
+    names = [f.name for f in dataclasses.fields(ShotOutcome) if f.name not in _HIDDEN]
     writer = csv.DictWriter(file, names, lineterminator="\n")
     writer.writeheader()
     writer.writerows(row | {"warnings": len(row["warnings"])} for row in rows(outcomes))
     return file.getvalue()
 
 
-def write_parquet(folder: Path, outcomes: Sequence[Outcome]) -> Path:
+def write_parquet(folder: Path, outcomes: Sequence[ShotOutcome]) -> Path:
     """Write batch.parquet: a row per shot that ended.
 
     Args:
@@ -124,7 +124,7 @@ def write_parquet(folder: Path, outcomes: Sequence[Outcome]) -> Path:
 
     path = folder / PARQUET
     kinds = {"float": pa.float64(), "list[str]": pa.list_(pa.string())}
-    fields = [f for f in dataclasses.fields(Outcome) if f.name not in _HIDDEN]
+    fields = [f for f in dataclasses.fields(ShotOutcome) if f.name not in _HIDDEN]
     schema = pa.schema([(f.name, kinds.get(str(f.type), pa.string())) for f in fields])
     with atomic_path(path) as temporary:
         pq.write_table(pa.Table.from_pylist(rows(outcomes), schema=schema), temporary)
@@ -173,7 +173,7 @@ class Summary:
 
 
 @dataclass
-class Pace:
+class BatchPace:
     """How long a batch will take, by how fast its shots ended so far."""
 
     count: int
@@ -183,7 +183,7 @@ class Pace:
     made: int = 0
     """by this batch"""
 
-    def after(self, outcome: Outcome) -> str:
+    def after(self, outcome: ShotOutcome) -> str:
         """What to say behind the line of a shot that ended; nothing of the last one, nor of what was done before."""
         self.ended += 1
         with suppress(ValueError):

@@ -116,7 +116,7 @@ class Budget:
 
 
 @dataclass(frozen=True)
-class Evaluation:
+class Residuals:
     """Residuals of all windows at one point."""
 
     raw: Float[np.ndarray, " p"]
@@ -157,7 +157,7 @@ class Jacobian:
     """d residuals / d raw, and the products that a step needs."""
 
     columns: list[Float[np.ndarray, "p n"]]
-    """float32, per window; n residuals in the order of `Evaluation.residuals`, flattened. Most of a fit's memory: empty
+    """float32, per window; n residuals in the order of `Residuals.residuals`, flattened. Most of a fit's memory: empty
     where only the products are known"""
     normal: Float[np.ndarray, "p p"]
     """J^T J"""
@@ -171,12 +171,12 @@ def evaluate(
     raw: Float[np.ndarray, " p"],
     budget: Budget,
     guesses: Sequence[Sequence[np.ndarray]] | None = None,
-) -> Evaluation:
+) -> Residuals:
     """Roll all windows out."""
     rows = budget.each(problem, lambda w: _rolled(problem, space, raw, w, guesses), list(range(len(problem.windows))))
     budget.count(problem)
     found, potentials, reports = zip(*rows)
-    return Evaluation(np.array(raw, float), list(found), list(potentials), sum(reports, ()))
+    return Residuals(np.array(raw, float), list(found), list(potentials), sum(reports, ()))
 
 
 def losses(
@@ -229,7 +229,7 @@ def chunks(size: int) -> list[slice]:
 
 
 def jacobian(
-    problem: FitProblem, space: ParameterSpace, base: Evaluation, budget: Budget, reuse: Jacobian | None = None
+    problem: FitProblem, space: ParameterSpace, base: Residuals, budget: Budget, reuse: Jacobian | None = None
 ) -> Jacobian | None:
     """By forward differences; None where the budget is spent. The columns of `reuse` are overwritten.
 

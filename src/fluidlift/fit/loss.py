@@ -22,7 +22,7 @@ from fluidlift.types import CellType
 
 
 @dataclass(frozen=True)
-class LossWeights:
+class VelocityLossWeights:
     """alpha, beta and the mask of the paper (which states no values)."""
 
     direction: float = 0.5
@@ -49,14 +49,14 @@ def surface_cells(cell_types: np.ndarray) -> np.ndarray:
 
 
 def grid_mask(
-    cell_types: np.ndarray, weights: LossWeights | None = None, observed: np.ndarray | None = None
+    cell_types: np.ndarray, weights: VelocityLossWeights | None = None, observed: np.ndarray | None = None
 ) -> Float[np.ndarray, "nx ny nz"]:
     """Weight of each cell (paper: gridMask), summing to 1; SOLID, INFLOW, OUTFLOW and hidden cells count 0.
 
     Raises:
         ValueError: no cell has a weight.
     """
-    weights = weights or LossWeights()
+    weights = weights or VelocityLossWeights()
     fluid = cell_types == CellType.FLUID
     mask = np.where(fluid, weights.occupied, 0.0)
     mask = np.where(surface_cells(cell_types), weights.surface, mask)
@@ -94,7 +94,7 @@ def velocity_loss(
     mask: Float[Tensor, "*n"],
     *,
     speed: float,
-    weights: LossWeights | None = None,
+    weights: VelocityLossWeights | None = None,
     error: float = 0.0,
 ) -> Tensor:
     """The loss: 0 where equal; alpha / 2 + beta or more for a simulation at rest.
@@ -107,7 +107,7 @@ def velocity_loss(
         weights: alpha, beta and the stagnation floor.
         error: standard deviation of the error of a component of the target, m/s.
     """
-    weights = weights or LossWeights()
+    weights = weights or VelocityLossWeights()
     floor = weights.stagnant * speed
     a, b = _unit(simulated, floor, error), _unit(target, floor)
     # 1 - cos, in the form that stays exact when the floor makes a and b shorter than 1
@@ -122,11 +122,11 @@ def residuals(
     mask: Float[Tensor, "*n"],
     *,
     speed: float,
-    weights: LossWeights | None = None,
+    weights: VelocityLossWeights | None = None,
     error: float = 0.0,
 ) -> Float[Tensor, "*n 6"]:
     """Terms whose squares add up to `velocity_loss`: three of direction, three of magnitude per cell."""
-    weights = weights or LossWeights()
+    weights = weights or VelocityLossWeights()
     floor = weights.stagnant * speed
     root = torch.sqrt(mask)[..., None]
     turn = (0.5 * weights.direction) ** 0.5 * (_unit(simulated, floor, error) - _unit(target, floor))

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from fluidlift.fit.evaluation import BACKWARD, Budget, Evaluation, Jacobian, chunks, evaluate, jacobian
+from fluidlift.fit.evaluation import BACKWARD, Budget, Jacobian, Residuals, chunks, evaluate, jacobian
 from fluidlift.fit.identifiability import Curvature, noise_level
 from fluidlift.fit.problem import FitProblem
 from fluidlift.fit.ranges import ParameterSpace
@@ -34,7 +34,7 @@ class Minimum:
     """weight of the loss against the prior at the end"""
     jacobian: Jacobian | None = None
     """the last one"""
-    at: Evaluation | None = None
+    at: Residuals | None = None
     """residuals at `raw`"""
 
 
@@ -45,7 +45,7 @@ class _Objective:
     space: ParameterSpace
     scale: float
 
-    def value(self, there: Evaluation) -> float:
+    def value(self, there: Residuals) -> float:
         away = (there.raw - self.space.prior_raw) / self.space.prior_sigma
         return 0.5 * self.scale * there.loss + 0.5 * float(np.square(away).sum())
 
@@ -63,7 +63,7 @@ class _Objective:
 class _Search:
     """The state of Levenberg-Marquardt."""
 
-    here: Evaluation
+    here: Residuals
     damping: float = 1e-2
     slopes: Jacobian | None = None
     fresh: bool = False
@@ -101,7 +101,7 @@ class _Search:
         return False
 
 
-def carried_on(slopes: Jacobian, step: np.ndarray, before: Evaluation, after: Evaluation) -> Jacobian:
+def carried_on(slopes: Jacobian, step: np.ndarray, before: Residuals, after: Residuals) -> Jacobian:
     """The products of the Jacobian changed least so that it explains the last step (Broyden 1965).
 
     J' = J + m u^T, with m = r1 - r0 - J s what it missed and u = s / |s|^2. J' itself is not made.
@@ -180,7 +180,7 @@ def levenberg_marquardt(
     )
 
 
-def precision(problem: FitProblem, here: Evaluation) -> float:
+def precision(problem: FitProblem, here: Residuals) -> float:
     """N / L: turns the loss into twice a negative log likelihood."""
     return here.observations(problem) / noise_level(here.loss)
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from fluidlift.fit.evaluation import Budget, Evaluation, Jacobian, evaluate, jacobian, losses, products
+from fluidlift.fit.evaluation import Budget, Jacobian, Residuals, evaluate, jacobian, losses, products
 from fluidlift.fit.identifiability import BLOCK, Curvature, block_scatter, determined
 from fluidlift.fit.methods import adam, levenberg_marquardt, precision
 from fluidlift.fit.problem import FitProblem
@@ -29,7 +29,7 @@ VISCOSITIES = (0.01, 0.1, 1.0)
 
 
 @dataclass(frozen=True)
-class Found:
+class Optimum:
     """Where a fit ended."""
 
     raw: Float[np.ndarray, " p"]
@@ -69,7 +69,7 @@ def first_point(
 def minimise(
     problem: FitProblem, space: ParameterSpace, start: Float[np.ndarray, " p"], budget: Budget, options: FitOptions,
     *, errors: bool,
-) -> Found:  # fmt: skip
+) -> Optimum:  # fmt: skip
     """Minimise, correct the starts, hold what is not determined at its prior, and minimise the rest again.
 
     Args:
@@ -89,7 +89,7 @@ def minimise(
         broken = not math.isfinite(found.loss)
         reason = "the rollout breaks down at the start" if broken else "the budget ended early"
         curvature = Curvature(np.zeros((len(start), len(start))), found.loss, 1.0)
-        return Found(space.prior_raw, none, curvature, found.loss, tuple(found.history), False, found.solved, reason)
+        return Optimum(space.prior_raw, none, curvature, found.loss, tuple(found.history), False, found.solved, reason)
     raw, converged, history = found.raw, found.converged, list(found.history)
     slopes, here, moves = found.jacobian, found.at, None
     rounds = options.start_rounds if errors else 0
@@ -115,13 +115,13 @@ def minimise(
         history.append(here.loss)
         curvature = curvature_of(problem, here, slopes, with_starts=moves is not None)
     raw = np.where(keep, raw, space.prior_raw)
-    return Found(raw, keep, curvature, here.loss, tuple(history), converged, here.solved(problem))
+    return Optimum(raw, keep, curvature, here.loss, tuple(history), converged, here.solved(problem))
 
 
 def _again(
     problem: FitProblem, space: ParameterSpace, raw: np.ndarray, keep: np.ndarray, budget: Budget, slopes: Jacobian,
-    moves: list[np.ndarray] | None, here: Evaluation,
-) -> tuple[FitProblem, np.ndarray, Evaluation, bool]:  # fmt: skip
+    moves: list[np.ndarray] | None, here: Residuals,
+) -> tuple[FitProblem, np.ndarray, Residuals, bool]:  # fmt: skip
     """The minimum of the kept variables, the others at their prior."""
     if moves is not None:
         problem, raw, here = _stepped(problem, space, here, Profile(slopes, moves), budget, keep)
@@ -135,8 +135,8 @@ def _again(
 
 
 def _stepped(
-    problem: FitProblem, space: ParameterSpace, here: Evaluation, along: Profile, budget: Budget, keep: np.ndarray
-) -> tuple[FitProblem, np.ndarray, Evaluation]:
+    problem: FitProblem, space: ParameterSpace, here: Residuals, along: Profile, budget: Budget, keep: np.ndarray
+) -> tuple[FitProblem, np.ndarray, Residuals]:
     """One Gauss-Newton step of parameters and starts together, shortened until it is downhill.
 
     Variables that are not kept go to their prior, and the others make up for it as far as they can.
@@ -161,17 +161,17 @@ def _stepped(
     return problem, here.raw, here
 
 
-def _together(problem: FitProblem, here: Evaluation) -> list[np.ndarray]:
+def _together(problem: FitProblem, here: Residuals) -> list[np.ndarray]:
     return [np.concatenate([r.ravel(), s]) for r, s in zip(here.residuals, start_residuals(problem))]
 
 
-def _value(problem: FitProblem, space: ParameterSpace, here: Evaluation, scale: float) -> float:
+def _value(problem: FitProblem, space: ParameterSpace, here: Residuals, scale: float) -> float:
     away = (here.raw - space.prior_raw) / space.prior_sigma
     departed = sum(float(np.square(s).sum()) for s in start_residuals(problem))
     return 0.5 * scale * (here.loss + departed) + 0.5 * float(np.square(away).sum())
 
 
-def curvature_of(problem: FitProblem, here: Evaluation, slopes: Jacobian, *, with_starts: bool) -> Curvature:
+def curvature_of(problem: FitProblem, here: Residuals, slopes: Jacobian, *, with_starts: bool) -> Curvature:
     """The quadratic model of the loss, and the scatter of its gradient over blocks of cells."""
     p, parts = len(here.raw), []
     edge = _edge(problem, p)

@@ -28,7 +28,7 @@ from fluidlift.fit.coarsen import (
 from fluidlift.fit.evaluation import Budget, Progress, evaluate, single_thread
 from fluidlift.fit.identifiability import estimates
 from fluidlift.fit.inlet import boundary_prior, fluctuation_error
-from fluidlift.fit.minimise import Found, first_point, minimise
+from fluidlift.fit.minimise import Optimum, first_point, minimise
 from fluidlift.fit.problem import FitProblem, build_problem
 from fluidlift.fit.ranges import UNITS, ParameterSpace, parameter_space
 from fluidlift.fit.scene import FitScene, WindowPlan, build_scene, plan_windows
@@ -299,7 +299,7 @@ class _Fit:
 
     def one(
         self, scene: FitScene, plan: WindowPlan, problem: FitProblem, space: ParameterSpace, start: np.ndarray
-    ) -> Found:
+    ) -> Optimum:
         """The minimum from one start, first on wider cells where the layout is large."""
         errors = scene.noise > ERRORS_BEYOND * scene.speed or any(o is not None and not o.all() for o in scene.observed)
         begun = start
@@ -316,7 +316,7 @@ class _Fit:
         return minimise(problem, space, begun, self.budget, self.options, errors=errors)
 
     def result(
-        self, scene: FitScene, problem: FitProblem, space: ParameterSpace, best: Found, ends: list[Found],
+        self, scene: FitScene, problem: FitProblem, space: ParameterSpace, best: Optimum, ends: list[Optimum],
         at_prior: float,
     ) -> FitResult:  # fmt: skip
         """Numbers with their uncertainties, and what is to be said about them."""
@@ -367,7 +367,7 @@ class _Fit:
             ends=spread,
         )
 
-    def _tell(self, space: ParameterSpace, best: Found, known: dict[str, Estimate]) -> None:
+    def _tell(self, space: ParameterSpace, best: Optimum, known: dict[str, Estimate]) -> None:
         labels = [f.label for f in space.fitted]
         held = [label for label, keep in zip(labels, best.keep) if not keep]
         loose = [label for label, keep in zip(labels, best.keep) if keep and not known[label].identifiable]
@@ -385,7 +385,7 @@ class _Fit:
             self.notes.append("not determined by the data, kept at the prior: " + ", ".join(sorted(held)))
 
     def _ends(
-        self, space: ParameterSpace, best: Found, ends: list[Found], known: dict[str, Estimate]
+        self, space: ParameterSpace, best: Optimum, ends: list[Optimum], known: dict[str, Estimate]
     ) -> tuple[FluidParameters, ...]:
         if len(ends) < 2:
             return ()

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from fluidlift.messages import Notice
 from fluidlift.types import Estimate, FitResult, FluidParameters
-from fluidlift.types.parameter_table import PARAMETERS, Scale
+from fluidlift.types.parameter_table import PARAMETERS, FitVariable
 
 FITTED = "fitted"
 LOOSE = "fitted, known loosely"
@@ -122,11 +122,11 @@ def interval_of(label: str, e: Estimate) -> tuple[float, float] | None:
     if not math.isfinite(e.sigma):
         return None
     name, v, reach = family(label), e.value, WIDTH * e.sigma
-    scale = Scale.LOG if name == "size" else PARAMETERS[name].scale if name in PARAMETERS else Scale.LINEAR
-    if scale is Scale.LOG and v > 0:
+    scale = FitVariable.LOG if name == "size" else PARAMETERS[name].scale if name in PARAMETERS else FitVariable.LINEAR
+    if scale is FitVariable.LOG and v > 0:
         factor = math.exp(min(reach / v, 700.0))
         return v / factor, v * factor
-    if scale is Scale.LOGIT and 0 < v < 1:
+    if scale is FitVariable.LOGIT and 0 < v < 1:
         logit, wide = math.log(v / (1 - v)), min(reach / (v * (1 - v)), 700.0)
         return tuple(1 / (1 + math.exp(-min(max(logit + d, -700.0), 700.0))) for d in (-wide, wide))  # type: ignore[return-value]
     return v - reach, v + reach

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from fluidlift.fit.inlet import inflow_patterns
-from fluidlift.fit.loss import LossWeights, cell_velocity, grid_mask, residuals, velocity_loss
+from fluidlift.fit.loss import VelocityLossWeights, cell_velocity, grid_mask, residuals, velocity_loss
 from fluidlift.fit.scene import FitScene, WindowPlan, build_scene, plan_windows
 from fluidlift.fit.states import divergence_free, fill_hidden, smooth_in_time
 from fluidlift.physics import rollout_torch
@@ -22,7 +22,7 @@ from fluidlift.physics.rollout_pressure import RolloutOptions
 from fluidlift.physics.rollout_torch_domain import TorchDomain, box_to_flat, flat_to_box
 from fluidlift.types import SolveReport
 
-__all__ = ["FitProblem", "Run", "Window", "build_problem", "build_scene", "plan_windows"]
+__all__ = ["FitProblem", "RolloutWindow", "Run", "build_problem", "build_scene", "plan_windows"]
 
 UNSEEN = 0.05
 """weight of the fill of a hidden face, relative to that of a seen one. What a fill misses is one error for a whole
@@ -30,7 +30,7 @@ hidden region and not one per face: trusted like measured faces it would outvote
 
 
 @dataclass(frozen=True)
-class Window:
+class RolloutWindow:
     """One rollout to be compared with targets along it."""
 
     start: Float[Tensor, " f"]
@@ -68,10 +68,10 @@ class Run:
 class FitProblem:
     """All windows, and the scale of the flow."""
 
-    windows: tuple[Window, ...]
+    windows: tuple[RolloutWindow, ...]
     speed: float
     """U, mean speed of the targets in the fluid, m/s"""
-    weights: LossWeights
+    weights: VelocityLossWeights
     options: RolloutOptions
     device: str = "cpu"
     """"cpu": compiled kernels; any other of torch's: `rollout_torch`"""
@@ -180,7 +180,7 @@ def build_problem(
     scene: FitScene,
     plan: WindowPlan,
     *,
-    weights: LossWeights | None = None,
+    weights: VelocityLossWeights | None = None,
     options: RolloutOptions | None = None,
     compare: str = "all",
     device: str = "cpu",
@@ -195,7 +195,7 @@ def build_problem(
         compare: "all" frames of a window count, or its "last" (paper).
         device: of the rollouts: "cpu" (compiled kernels), or a device of torch's.
     """
-    weights, options = weights or LossWeights(), options or RolloutOptions()
+    weights, options = weights or VelocityLossWeights(), options or RolloutOptions()
     # a direction within the errors is noise
     floor = max(weights.stagnant, 2 * scene.noise / scene.speed)
     weights = replace(weights, stagnant=floor)
@@ -213,9 +213,9 @@ def _window(
     plan: WindowPlan,
     start: int,
     patterns: tuple[Tensor | None, ...],
-    weights: LossWeights,
+    weights: VelocityLossWeights,
     compare: str,
-) -> Window:
+) -> RolloutWindow:
     frames = [start if plan.steady else start + i for i in range(plan.frames + 1)]
     steps = [f for f in frames[:-1] for _ in range(plan.steps_per_frame)]
     compared = range(1, plan.frames + 1) if compare == "all" else [plan.frames]
@@ -234,7 +234,7 @@ def _window(
         else (scene.flat[start], scene.seen[start])
     )
     domain = scene.domains[start]
-    return Window(
+    return RolloutWindow(
         start=torch.from_numpy(fill_hidden(smooth, known, domain)).float(),
         measured=torch.from_numpy(fill_hidden(scene.flat[start], scene.seen[start], domain)).float(),
         trust=torch.from_numpy(_trust(scene, start, weights)).float(),
@@ -247,7 +247,7 @@ def _window(
     )
 
 
-def _trust(scene: FitScene, frame: int, weights: LossWeights) -> Float[np.ndarray, " f"]:
+def _trust(scene: FitScene, frame: int, weights: VelocityLossWeights) -> Float[np.ndarray, " f"]:
     """Weight of the measured start: that of the loss for the cells beside the face.
 
     So a smooth error costs the same in the start as in a target, whether or not faces err independently. A direction

@@ -18,7 +18,7 @@ from torch import Tensor
 from fluidlift.errors import require
 from fluidlift.physics.rollout import RolloutParameters
 from fluidlift.types import FluidParameters
-from fluidlift.types.parameter_table import FITTABLE, VECTORS, Scale
+from fluidlift.types.parameter_table import FITTABLE, VECTORS, FitVariable
 
 UNITS = {name: p.unit for name, p in FITTABLE.items()}
 """every parameter that can be fitted, and its unit"""
@@ -203,9 +203,9 @@ def parameter_space(
     units = {
         "density": 1000.0, "kinematic_viscosity": speed * spacing, "gravity": strength, "time_step": prior.time_step,
     }  # fmt: skip
-    maps = {Scale.LOG: Positive, Scale.LINEAR: Signed}
+    maps = {FitVariable.LOG: Positive, FitVariable.LINEAR: Signed}
     ranges: dict[str, Range] = {
-        name: Bounded() if p.scale is Scale.LOGIT else maps[p.scale](units.get(name, speed))
+        name: Bounded() if p.scale is FitVariable.LOGIT else maps[p.scale](units.get(name, speed))
         for name, p in FITTABLE.items()
     }
     floors = {"kinematic_viscosity": 1e-7, "inflow_fluctuation": 0.02 * speed}

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 
 from fluidlift.errors import require
-from fluidlift.fit.loss import LossWeights
+from fluidlift.fit.loss import VelocityLossWeights
 from fluidlift.physics.rollout_pressure import RolloutOptions
 from fluidlift.types.parameter_table import FITTABLE
 
@@ -43,7 +43,7 @@ class FitOptions:
     """parameters to fit"""
     prior_sigmas: dict[str, float] | None = None
     """raw prior widths instead of those of `types.parameter_table`"""
-    weights: LossWeights | None = None
+    weights: VelocityLossWeights | None = None
     """of the loss"""
     options: RolloutOptions | None = None
     """of the rollout: way through the pressure solve and gradient of advection"""

@@ -21,7 +21,7 @@ from jaxtyping import Float
 from scipy.optimize import fmin_l_bfgs_b
 from torch import Tensor
 
-from fluidlift.fit.evaluation import BACKWARD, Budget, Evaluation, Jacobian, products
+from fluidlift.fit.evaluation import BACKWARD, Budget, Jacobian, Residuals, products
 from fluidlift.fit.problem import FitProblem
 from fluidlift.fit.ranges import ParameterSpace
 
@@ -102,7 +102,7 @@ def start_residuals(problem: FitProblem) -> list[Float[np.ndarray, " f"]]:
 
 
 def profile(
-    problem: FitProblem, space: ParameterSpace, here: Evaluation, slopes: Jacobian, budget: Budget, *, iterations: int
+    problem: FitProblem, space: ParameterSpace, here: Residuals, slopes: Jacobian, budget: Budget, *, iterations: int
 ) -> Profile:
     """Derivatives along the best start, by conjugate gradients on the start's normal equations.
 

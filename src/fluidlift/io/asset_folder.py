@@ -79,10 +79,8 @@ FILES = {
     "parameters": "parameters.json",
     "scene": "scene.yaml",
 }
-"""where the parts lie, relative to the folder"""
-
-OPTIONAL = frozenset({"film", "force", "motion"})
-"""parts that not every asset has: old smoke has no film, only streams and falls are calibrated, motion is asked for"""
+"""where the parts lie, relative to the folder. Not every asset has film, force and motion: smoke of earlier versions
+has no film, only streams and falls are calibrated, motion is asked for"""
 
 _HASHED = frozenset(FILES) - {"scene"} | {"usd"}
 """parts whose SHA-256 the manifest keeps: all but what a person edits, and what is large"""

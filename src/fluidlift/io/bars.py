@@ -35,7 +35,7 @@ SAMPLES = 48
 
 
 @dataclass(frozen=True)
-class Window:
+class PictureWindow:
     """A part of a picture, in shares of its width and height."""
 
     left: float
@@ -63,7 +63,7 @@ class Window:
         return rows, slice(int(np.ceil(self.left * width - 1e-6)), int(np.floor(self.right * width + 1e-6)))
 
 
-def find_bars(frames: UInt8[np.ndarray, "t h w 3"]) -> Window | None:
+def find_bars(frames: UInt8[np.ndarray, "t h w 3"]) -> PictureWindow | None:
     """What lies between black bars that stay all through a clip; None where there are none.
 
     A bar reaches from one side of the picture to the other, is flat in every frame, has one like it on the opposite
@@ -86,10 +86,10 @@ def find_bars(frames: UInt8[np.ndarray, "t h w 3"]) -> Window | None:
         columns = _between(far[rows].T) or columns
     if (rows, columns) == (slice(0, height), slice(0, width)):
         return None
-    return Window(columns.start / width, rows.start / height, columns.stop / width, rows.stop / height)
+    return PictureWindow(columns.start / width, rows.start / height, columns.stop / width, rows.stop / height)
 
 
-def between_bars(decode: Callable[..., VideoClip]) -> tuple[VideoClip, Window | None]:
+def between_bars(decode: Callable[..., VideoClip]) -> tuple[VideoClip, PictureWindow | None]:
     """A clip without the bars beside its picture, and what was kept of it; None: it has none.
 
     Args:

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from fluidlift.errors import InputRejected
-from fluidlift.io.bars import Window
+from fluidlift.io.bars import PictureWindow
 from fluidlift.io.decode import Notes
 from fluidlift.io.limits import ReadLimits
 from fluidlift.io.pictures import fitted_size, resample_with_alpha, same_shape
@@ -43,7 +43,7 @@ class FrameStore(Protocol):
 
 
 @dataclass(frozen=True)
-class Wanted:
+class FrameSelection:
     """Which frames of a file are kept, and how large."""
 
     name: str
@@ -53,7 +53,7 @@ class Wanted:
     """s"""
     max_size: int
     """px"""
-    window: Window | None = None
+    window: PictureWindow | None = None
     """the part of each picture that is kept; None: all of it"""
 
 
@@ -82,7 +82,7 @@ class _InMemory:
 class Collector:
     """Keeps the wanted frames, small; everything else passes by."""
 
-    def __init__(self, wanted: Wanted, limits: ReadLimits, notes: Notes, store: FrameStore | None) -> None:
+    def __init__(self, wanted: FrameSelection, limits: ReadLimits, notes: Notes, store: FrameStore | None) -> None:
         self.name, self.start, self.end, self.max_size = wanted.name, wanted.start, wanted.end, wanted.max_size
         self.window = wanted.window
         self.limits, self.notes = limits, notes

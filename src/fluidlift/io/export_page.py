@@ -19,7 +19,7 @@ from fluidlift.errors import require
 from fluidlift.io.atomic import atomic_write, plain
 from fluidlift.io.export_gltf import encoded, once_per_corner
 from fluidlift.io.frames import MovingMesh
-from fluidlift.io.page_frames import FrameEncoder, Range
+from fluidlift.io.page_frames import FrameEncoder, Quantization
 from fluidlift.numerics.mesh_normals import vertex_normals
 from fluidlift.types import Gaussians, PinholeCamera, TriangleMesh
 
@@ -68,7 +68,7 @@ class PageScene:
 
 
 def write_page(
-    path: Path | str, frames: Iterable[tuple[Gaussians, np.ndarray]], held: Range, scene: PageScene
+    path: Path | str, frames: Iterable[tuple[Gaussians, np.ndarray]], held: Quantization, scene: PageScene
 ) -> tuple[Path, int]:
     """Write the page; frames (with ids int [n], each once) are taken one by one, and memory does not grow with them.
 
@@ -114,7 +114,7 @@ def _part(name: str) -> str:
     return (importlib.resources.files("fluidlift.io") / "page" / name).read_text(encoding="utf-8")
 
 
-def _head(scene: PageScene, held: Range, solids: list[Solid]) -> str:
+def _head(scene: PageScene, held: Quantization, solids: list[Solid]) -> str:
     terrain = _shown(scene.terrain)
     about: dict[str, Any] = {
         "range": held.to_dict(), "frames": len(scene.numbers), "numbers": scene.numbers, "interval": scene.interval,
@@ -137,7 +137,7 @@ def _head(scene: PageScene, held: Range, solids: list[Solid]) -> str:
     return re.sub("@([A-Z_]+)@", lambda found: fields[found[1]], _part("page.html"))
 
 
-def _extent(held: Range, scene: PageScene) -> float:
+def _extent(held: Quantization, scene: PageScene) -> float:
     """m, about the size of all that is seen."""
     reach = float(np.linalg.norm(np.subtract(scene.target, scene.camera.position)))
     terrain = _shown(scene.terrain)

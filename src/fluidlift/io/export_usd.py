@@ -26,7 +26,7 @@ from fluidlift.io.frames import FIRST_FRAME, FluidFrame, MovingMesh
 from fluidlift.io.pictures import write_png
 from fluidlift.io.ply import AXES
 from fluidlift.io.usd_camera import write_camera
-from fluidlift.io.usd_frames import ClippedFrames, Frames, SampledFrames, refer_to_clips, reload
+from fluidlift.io.usd_frames import ClippedFrames, SampledFrames, UsdFrames, refer_to_clips, reload
 from fluidlift.io.usd_materials import PreviewMaterial, bind, write_ground, write_material
 from fluidlift.io.usd_prims import linear_colors, ordered, placed, placed_mesh, write_mesh, write_volume
 from fluidlift.io.validate_usd import validate_usd
@@ -118,7 +118,7 @@ def write_usd(
         stage = Usd.Stage.CreateNew(str(temporary))
         _set_stage(stage, UsdGeom.Xform.Define(stage, "/Fluid").GetPrim(), fps, settings)
         _write_beside(stage, terrain, camera, bodies, path.stem + _TEXTURE, settings)
-        into: Frames = SampledFrames(stage, settings.half)
+        into: UsdFrames = SampledFrames(stage, settings.half)
         if settings.layout == "clips":
             into = ClippedFrames(path, stage, settings.half, fps)
         count = _write_frames(stage, frames, into, settings)
@@ -231,7 +231,9 @@ def _write_beside(
         _write_body(stage, solid, number, settings.start_frame, place or Similarity3())
 
 
-def _write_frames(stage: Usd.Stage, frames: Iterable[FluidFrame | tuple], into: Frames, settings: UsdSettings) -> int:
+def _write_frames(
+    stage: Usd.Stage, frames: Iterable[FluidFrame | tuple], into: UsdFrames, settings: UsdSettings
+) -> int:
     """The moving prims; the number of frames."""
     count, volumes, whitewater = 0, {}, None
     for count, given in enumerate(frames, start=1):  # the count is the result

@@ -18,7 +18,7 @@ FLATTEST = 3e3
 """ratio of a Gaussian's longest to its shortest axis: its square is what single precision can still tell from flat"""
 
 
-class Particles(NamedTuple):
+class ParticleFrame(NamedTuple):
     """What is compared between frames."""
 
     ids: np.ndarray
@@ -35,7 +35,7 @@ def repeated(ids: np.ndarray) -> int:
     return 0 if (steps > 0).all() else int((np.diff(np.sort(ids)) == 0).sum())
 
 
-def particle_faults(now: Particles) -> list[str]:
+def particle_faults(now: ParticleFrame) -> list[str]:
     """Ids that occur twice, and numbers that are not finite."""
     faults = []
     if twice := repeated(now.ids):
@@ -47,7 +47,7 @@ def particle_faults(now: Particles) -> list[str]:
     return faults
 
 
-def identity_faults(before: Particles, now: Particles, seconds: float) -> list[str]:
+def identity_faults(before: ParticleFrame, now: ParticleFrame, seconds: float) -> list[str]:
     """Whether an id names the same particle in both frames: it is where its velocity can have brought it.
 
     Args:

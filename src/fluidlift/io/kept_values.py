@@ -3,13 +3,24 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from fluidlift.io.stage_cache import load_stage, owner_of
 from fluidlift.io.stage_codec import Mistyped, unpacked
 from fluidlift.types.stages import Fit, Flow, Geometry, Motion, Read, Refined, Segmentation
 
 T = TypeVar("T")
+
+
+class KeptStage(NamedTuple):
+    """A stage that an asset was made from, as it lies in the cache."""
+
+    name: str
+    key: str
+    value: Any
+    seconds: float
+    """that its work took"""
+
 
 OF_CLIP: dict[str, type] = {
     "read": Read, "flow": Flow, "segment": Segmentation, "geometry": Geometry, "refine": Refined, "motion": Motion,
@@ -39,17 +50,25 @@ def last_value(folder: Path, name: str, kind: type[T]) -> T | None:
     return None if found is None else found[0]
 
 
+def kept_stage(folder: Path, manifest: dict[str, Any], name: str, kind: type) -> KeptStage | None:
+    """A stage that an asset was made from, or the one that corrected it; None where its value is gone.
+
+    Args:
+        folder: of the asset.
+        manifest: of the asset.
+        name: of the stage.
+        kind: type of its value.
+    """
+    keys = stage_keys(manifest)
+    stage = CORRECTED[name] if CORRECTED.get(name) in keys else name
+    found = None if stage not in keys else kept_value(folder, stage, keys[stage], kind)
+    return None if found is None else KeptStage(stage, keys[stage], *found)
+
+
 def recalled(folder: Path, manifest: dict[str, Any], name: str) -> Any:
     """The value of one stage of `OF_CLIP` that an asset was made from; None where it is gone."""
-    keys = stage_keys(manifest)
-    stage = that_counts(name, keys)
-    found = None if stage not in keys else kept_value(folder, stage, keys[stage], OF_CLIP[name])
-    return None if found is None else found[0]
-
-
-def that_counts(name: str, keys: dict[str, str]) -> str:
-    """The stage, of those with a key, whose value counts as that of a stage."""
-    return CORRECTED[name] if CORRECTED.get(name) in keys else name
+    found = kept_stage(folder, manifest, name, OF_CLIP[name])
+    return None if found is None else found.value
 
 
 def stage_keys(manifest: dict[str, Any]) -> dict[str, str]:

@@ -31,7 +31,7 @@ _PLANES = 6
 
 
 @dataclass(frozen=True)
-class Range:
+class Quantization:
     """What the stored numbers mean, for all frames of one page."""
 
     low: tuple[float, float, float]
@@ -45,7 +45,7 @@ class Range:
     """most splats at once"""
 
     @classmethod
-    def of(cls, frames: Iterable[Gaussians]) -> Range:
+    def of(cls, frames: Iterable[Gaussians]) -> Quantization:
         """The smallest range that holds all frames; they are taken one by one."""
         low, high = np.full(3, np.inf), np.full(3, -np.inf)
         small, large, slots, usual = np.inf, -np.inf, 1, []
@@ -116,7 +116,7 @@ def _quats(stored: np.ndarray) -> np.ndarray:
 class FrameEncoder:
     """Turns frames, in order, into what a page adds up."""
 
-    def __init__(self, held: Range) -> None:
+    def __init__(self, held: Quantization) -> None:
         self.range = held
         self._now = np.zeros((held.slots, RECORD), np.uint8)
         self._place = np.zeros((2, held.slots, 3), np.uint16)

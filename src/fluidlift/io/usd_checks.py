@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from pxr import Usd, UsdGeom, UsdVol
 
-from fluidlift.io.frame_checks import Particles, identity_faults, repeated
+from fluidlift.io.frame_checks import ParticleFrame, identity_faults, repeated
 from fluidlift.types import triple
 
 NORM = 1e-3
@@ -165,7 +165,7 @@ def _identities(prim: Usd.Prim, codes: list[float]) -> Iterator[str]:
         if len(arrays) < 3 or len({len(a) for a in arrays}) > 1 or repeated(arrays[0]):
             before = None
             continue
-        now = Particles(*triple(arrays))
+        now = ParticleFrame(*triple(arrays))
         if before is not None:
             seconds = (code - codes[k - 1]) / rate
             yield from (f"{prim.GetPath()} at {code:g}: {fault}" for fault in identity_faults(before, now, seconds))

@@ -23,7 +23,7 @@ _SAVE_AFTER = 128 * 2**20
 """bytes of samples; saved samples are read from the disk again only when needed, so memory stays bounded"""
 
 
-class Frames(Protocol):
+class UsdFrames(Protocol):
     """What both layouts can do."""
 
     def add(self, frame: FluidFrame, code: int) -> None:

@@ -21,8 +21,8 @@ import av.error
 import numpy as np
 
 from fluidlift.errors import InputRejected, require
-from fluidlift.io.bars import Window
-from fluidlift.io.collect import MIN_SIDE, Collector, FrameStore, Wanted
+from fluidlift.io.bars import PictureWindow
+from fluidlift.io.collect import MIN_SIDE, Collector, FrameSelection, FrameStore
 from fluidlift.io.decode import (
     Notes,
     decode_frames,
@@ -56,7 +56,7 @@ def read_clip(
     fps: float | None = None,
     limits: ReadLimits | None = None,
     store: FrameStore | None = None,
-    window: Window | None = None,
+    window: PictureWindow | None = None,
 ) -> VideoClip:
     """Decode a clip, scaled down so that its long side has at most `max_size` px (area average).
 
@@ -84,7 +84,7 @@ def read_clip(
         raise InputRejected(f"a duration of {duration} s", "more than 0 seconds", "change --duration")
     require(max_size >= MIN_SIDE, f"max_size {max_size}", f"at least {MIN_SIDE} px")
     path, notes = Path(path), Notes()
-    wanted = Wanted(path.name, start, math.inf if duration is None else start + duration, max_size, window)
+    wanted = FrameSelection(path.name, start, math.inf if duration is None else start + duration, max_size, window)
     collector = Collector(wanted, limits, notes, store)
     if is_sequence(path):
         _read_sequence(path, fps, limits, collector, notes)

@@ -73,10 +73,6 @@ class Environment:
         a, b = np.roll(self.radiance, whole, axis=1), np.roll(self.radiance, whole + 1, axis=1)
         return Environment((1 - part) * a + part * b if part > 1e-6 else a)
 
-    def brightened(self, factor: float | Float[np.ndarray, "3"]) -> Environment:
-        """All light times a factor, or one factor per channel (linear)."""
-        return Environment(self.radiance * np.asarray(factor, np.float32))
-
     def toward(self, directions: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
         """Linear radiance float32 that comes from these directions (of any length)."""
         return lookup(self.radiance, directions)

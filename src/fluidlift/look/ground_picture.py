@@ -1,7 +1,7 @@
 """Ground and obstacles in a picture, in the light of an environment, with the shadows that they and the liquid cast.
 
-What stays is prepared once (`Ground`): its shadow maps, and for a camera that stands still all of its picture. In every
-frame only what moves is drawn, with its shadow. Where light comes from is told in `ground_light`.
+What stays is prepared once (`GroundMeshes`): its shadow maps, and for a camera that stands still all of its picture. In
+every frame only what moves is drawn, with its shadow. Where light comes from is told in `ground_light`.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ if TYPE_CHECKING:
     from fluidlift.look.environment import Environment
 
 __all__ = [
-    "GRAY", "Ground", "GroundLight", "ground_picture", "place_of", "received", "spread_directions", "surroundings",
+    "GRAY", "GroundLight", "GroundMeshes", "ground_picture", "place_of", "received", "spread_directions",
+    "surroundings",
 ]  # fmt: skip
 
 STEP = 3
@@ -61,7 +62,7 @@ def ground_picture(
     material: Material | None = None,
     lit: GroundLight | None = None,
 ) -> Behind:
-    """Meshes lit by the environment, before what lies behind them. For many pictures: `Ground.picture`.
+    """Meshes lit by the environment, before what lies behind them. For many pictures: `GroundMeshes.picture`.
 
     Args:
         meshes: terrain and obstacles, with textures or vertex colours (sRGB), which are taken for the albedo of matt
@@ -79,10 +80,10 @@ def ground_picture(
     Raises:
         ValueError: `behind` of another size.
     """
-    return Ground(meshes, environment, lit).picture(camera, behind, caster, material=material)
+    return GroundMeshes(meshes, environment, lit).picture(camera, behind, caster, material=material)
 
 
-class Ground:
+class GroundMeshes:
     """Meshes that stay where they are, prepared for pictures.
 
     Args:
@@ -194,7 +195,7 @@ NOTHING: Moving = (None, None)
 class _Surfaces:
     """What a camera sees of surfaces, and how much light what stays leaves them."""
 
-    ground: Ground
+    ground: GroundMeshes
     camera: PinholeCamera
     depth: np.ndarray
     """[h,w] camera z, m; 0 where there are none"""
@@ -269,8 +270,8 @@ class _Surfaces:
         return found
 
     def image(self, moving: Moving) -> tuple[np.ndarray, np.ndarray | None]:
-        """Linear light [h,w,3], and what of it is the strongest light's, with its cosine (as `Behind.direct`); 0 where
-        there are no surfaces."""
+        """Linear light [h,w,3], and what of it is the strongest light's, with its cosine (as `Behind.direct`); 0
+        where there are no surfaces."""
         return self._lit(moving) if any(moving) else self._standing
 
     @cached_property

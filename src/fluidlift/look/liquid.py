@@ -63,7 +63,7 @@ other there"""
 
 
 @dataclass(frozen=True)
-class LiquidSurface:
+class SurfaceBuffer:
     """The nearest surface of a liquid in every pixel."""
 
     depth: Float[np.ndarray, "h w"]
@@ -129,7 +129,7 @@ class Behind:
 
 
 def shaded(
-    surface: LiquidSurface,
+    surface: SurfaceBuffer,
     behind: Behind,
     camera: PinholeCamera,
     material: Material,
@@ -183,20 +183,20 @@ def shaded(
     return picture
 
 
-def _arrays(surface: LiquidSurface) -> tuple:
+def _arrays(surface: SurfaceBuffer) -> tuple:
     back = np.zeros((0, 0, 3), np.float32) if surface.back_normal is None else surface.back_normal
     return (
         surface.covered, surface.depth, surface.normal, back, surface.thickness, surface.albedo, float(surface.grain)
     )  # fmt: skip
 
 
-def _scene(behind: Behind, surface: LiquidSurface, cloudy: bool = True) -> tuple:
+def _scene(behind: Behind, surface: SurfaceBuffer, cloudy: bool = True) -> tuple:
     # only where a far side is known is it known how wide its light is fanned out; a cloud scatters it as well
     return *pyramid(behind.image, deep=cloudy or surface.back_normal is not None), behind.depth, behind.rest
 
 
 def shaded_plain(
-    surface: LiquidSurface, behind: Behind, camera: PinholeCamera, material: Material, environment: Environment
+    surface: SurfaceBuffer, behind: Behind, camera: PinholeCamera, material: Material, environment: Environment
 ) -> Float[np.ndarray, "h w 3"]:
     """What `shaded` does, in NumPy, for reading."""
     _check(surface, behind, camera)
@@ -239,7 +239,7 @@ def shaded_plain(
     return picture
 
 
-def film_shown(surface: LiquidSurface, behind: Behind, camera: PinholeCamera) -> Float[np.ndarray, "h w"]:
+def film_shown(surface: SurfaceBuffer, behind: Behind, camera: PinholeCamera) -> Float[np.ndarray, "h w"]:
     """Share, 0 to 1, that is seen of the liquid, from 0 where it has no height over what it lies on to 1 at its grain.
 
     The plane that the picture behind shows in a pixel is n . p = 1, with the slopes of its inverse depth for n (of the
@@ -264,19 +264,19 @@ def film_shown(surface: LiquidSurface, behind: Behind, camera: PinholeCamera) ->
     return np.where(thick, 1.0, share)
 
 
-def _check(surface: LiquidSurface, behind: Behind, camera: PinholeCamera) -> None:
+def _check(surface: SurfaceBuffer, behind: Behind, camera: PinholeCamera) -> None:
     width, height = camera.size
     require(surface.depth.shape == (height, width), f"a surface of {surface.depth.shape}", f"({height}, {width})")
     require(behind.depth.shape == (height, width), f"a background of {behind.depth.shape}", f"({height}, {width})")
 
 
-def _seen(surface: LiquidSurface, behind: Behind) -> np.ndarray:
+def _seen(surface: SurfaceBuffer, behind: Behind) -> np.ndarray:
     """bool [h,w]: the liquid is there, and nothing before it."""
     there = (surface.covered > 0) & (surface.depth > 0)
     return there & ((behind.depth <= 0) | (surface.depth < behind.depth))
 
 
-def _usual(surface: LiquidSurface, behind: Behind) -> float:
+def _usual(surface: SurfaceBuffer, behind: Behind) -> float:
     carried = surface.albedo[_seen(surface, behind)]
     return float((carried @ LUMINANCE).mean()) if len(carried) else 1.0
 
@@ -338,7 +338,7 @@ class Followed:
 
 
 def followed(
-    surface: LiquidSurface, behind: Behind, camera: PinholeCamera, pixels: np.ndarray, refractive_index: float
+    surface: SurfaceBuffer, behind: Behind, camera: PinholeCamera, pixels: np.ndarray, refractive_index: float
 ) -> Followed:
     """Follow the light of `pixels` (int [n,2]: row, column) back through the liquid."""
     rays = np.zeros((len(pixels), NUMBERS))

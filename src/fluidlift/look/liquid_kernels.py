@@ -281,14 +281,16 @@ def _hazed(i, j, surface, behind, eye, ray):
 
 @shared(lambda pixels, *_: (0, pixels.shape[0]), error_model="numpy", pieces=PIECES)
 def follow(begin, end, pixels, surface, behind, eye, index, rays):
-    """The numbers [n, NUMBERS] of every pixel of `pixels` (row, column): the share of light mirrored; the directions
-    (world) of the mirrored ray and of the one that comes through; metres in the liquid; whether the latter's light is
-    the environment's (1) or the picture's (0); the share of it that is mirrored at the far side instead, and the
-    direction in which that is seen; the picture's colour; the spread of normals, in the units of GGX's alpha; and of
-    what is mirrored at the far side the metres that it goes on inside, whether it is the environment's (1), and the
-    picture's colour; how wide what comes through is fanned out, in the units of that spread; where in the picture it
-    comes from (px); the picture's colour as wide around there as light is scattered; and how free the far side is, from
-    0, where the liquid rests on something, to 1.
+    """What becomes of the ray of every pixel of `pixels` (row, column): [n, NUMBERS], in this order.
+
+    - share of light that the near side mirrors; directions (world) of the mirrored and of the refracted ray;
+    - the refracted ray: metres in the liquid; 1 where its light comes from the environment, 0 from the picture; share
+      that the far side mirrors back inside, and the direction in which that leaves; colour from the picture;
+    - spread of the normals, as GGX's alpha;
+    - what the far side mirrors back: metres that it goes on inside; 1 for the environment; colour from the picture;
+    - the refracted ray again: how wide it is fanned out (as GGX's alpha); where in the picture it ends (px); colour
+      around there, averaged as widely as light is scattered; and how free the far side is, from 0, where the liquid
+      rests on something, to 1.
 
     surface, behind, eye: as of `shade`.
     """

@@ -100,22 +100,6 @@ def passed(
     return (1.0 - r) * left / np.maximum(1.0 - r * left * left - inside * cloud * (1.0 - left * left), 1e-30)
 
 
-def shown_of_cloud(
-    fade: Float[np.ndarray, " c"],
-    cloud: Float[np.ndarray, " c"],
-    inside: float,
-    depth: float | Float[np.ndarray, "..."],
-) -> Float[np.ndarray, "... c"]:
-    """How much of the colour of a deep body (`deep_color`) `depth` metres of it have before black, 0 to 1.
-
-    Of two fluxes R_d / R = (1 - e^2) / (1 - R^2 e^2) with e = exp(-fade depth) returns; the surface throws a share
-    `inside` of that back, again and again. Arguments otherwise as of `passed`.
-    """
-    left = np.exp(-2.0 * fade * depth)
-    part = (1.0 - left) / np.maximum(1.0 - cloud * cloud * left, 1e-30)
-    return part * (1.0 - inside * cloud) / (1.0 - inside * cloud * part)
-
-
 def cloud_seen(
     fluxes: tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]],
     extinction: Float[np.ndarray, " c"],

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from fluidlift.errors import require
 from fluidlift.look.project import LARGEST, bounded_scales, camera_depths, sound, view_colors
 from fluidlift.numerics.sharing import shared
-from fluidlift.numerics.splatting import Bins, Projected, View, bin_tiles, project, rasterize_drawn, tiles_met
+from fluidlift.numerics.splatting import Bins, Projected, SplatCamera, bin_tiles, project, rasterize_drawn, tiles_met
 from fluidlift.numerics.splatting_kernels import WIDE_TILE
 from fluidlift.types.camera import PinholeCamera
 from fluidlift.types.gaussians import Gaussians
@@ -117,7 +117,7 @@ def _background(background: tuple[float, ...] | np.ndarray | None, shape: tuple[
 
 def _project_bounded(g: Gaussians, opacities: np.ndarray, camera: PinholeCamera) -> tuple[Projected, np.ndarray, Bins]:
     """Projection whose pairs of tile and Gaussian are not too many: the bound on the widths halves until they fit."""
-    view = View.of(camera)
+    view = SplatCamera.of(camera)
     depths = camera_depths(g.means, camera)
     opacities = np.clip(opacities, 0.0, 1.0)
     largest = LARGEST

@@ -27,7 +27,7 @@ from fluidlift.numerics.srgb import linear_from_srgb
 from fluidlift.types.camera import PinholeCamera
 from fluidlift.types.gaussians import Gaussians
 
-__all__ = ["environment_brdf", "fluid_normals", "heat", "lit_diffuse", "own_albedo", "reflectance", "relit"]
+__all__ = ["environment_brdf", "fluid_normals", "heat", "own_albedo", "reflectance", "relit"]
 
 SOURCE_GROUND = 0.3
 """guess of the clip's light: an even sky, and a ground that returns this share of it"""
@@ -159,13 +159,6 @@ def shade_kernel(begin, end, means, normals, share, body, pictures, numbers, out
                 g += fresnel * (dim * g0 + dull * g1)
                 b += fresnel * (dim * b0 + dull * b1)
             out[p, 0], out[p, 1], out[p, 2] = r, g, b
-
-
-def lit_diffuse(
-    colors_linear: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], environment: Environment
-) -> Float[np.ndarray, "n 3"]:
-    """Linear radiance, float32, of dull surfaces such as the terrain: their albedo times what falls on them."""
-    return np.asarray(colors_linear, np.float32) * environment.irradiance(normals)
 
 
 def own_albedo(

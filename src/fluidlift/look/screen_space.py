@@ -1,7 +1,7 @@
 """The surface of a liquid in a picture: of particles, drawn as spheres and smoothed in the picture, or of a mesh.
 
 Particles: van der Laan, Green and Sainz 2009 (screen-space fluids), smoothed after Truong and Yuksel 2018. A mesh: the
-rasteriser of `numerics.triangles`. Both give a `LiquidSurface`, which `liquid.shaded` lights.
+rasteriser of `numerics.triangles`. Both give a `SurfaceBuffer`, which `liquid.shaded` lights.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fluidlift.errors import require
-from fluidlift.look.liquid import LiquidSurface
+from fluidlift.look.liquid import SurfaceBuffer
 from fluidlift.look.screen_space_kernels import (
     depths_and_cover,
     filled_notches,
@@ -75,7 +75,7 @@ def particle_surface(
     spacing: float | None = None,
     ground: Float[np.ndarray, "h w"] | None = None,
     far_side: bool = False,
-) -> LiquidSurface:
+) -> SurfaceBuffer:
     """The surface of particles.
 
     Args:
@@ -118,7 +118,7 @@ def particle_surface(
     covered = np.empty_like(depth)
     depths_and_cover(inverse, bed, thickness, near, np.array([THIN * radius, *RIM], np.float32), depth, covered)
     back = _far_normals(depth, thickness, covered, camera, radius) if far_side else None
-    return LiquidSurface(depth, normal, thickness, albedo, covered, back, GRAIN * radius)
+    return SurfaceBuffer(depth, normal, thickness, albedo, covered, back, GRAIN * radius)
 
 
 def _far_normals(
@@ -233,7 +233,7 @@ def mesh_surface(
     *,
     radius: float = 0.0,
     normals: Float[np.ndarray, "v 3"] | None = None,
-) -> LiquidSurface:
+) -> SurfaceBuffer:
     """The surface of a closed mesh, with its smooth normals; the colours of its vertices are what it carries.
 
     Thickness is all of the liquid along the ray, in however many parts. A mesh with holes gives wrong ones there.
@@ -265,4 +265,4 @@ def mesh_surface(
     thickness = np.maximum(found.inside, 0.0) * along
     covered, depth = np.zeros_like(thickness), found.front.depth
     spread_edges(found.front.hit, depth, normal, thickness, albedo, back, covered)
-    return LiquidSurface(depth, normal, thickness, albedo, covered, back, GRAIN * radius)
+    return SurfaceBuffer(depth, normal, thickness, albedo, covered, back, GRAIN * radius)

@@ -125,11 +125,15 @@ def narrow_range(begin, end, q, out, across, focal, width, apart, limit, fall):
 
     After the narrow-range filter of Truong and Yuksel 2018: depths within `limit` (m) of what was met so far are
     averaged; what lies nearer ends the window on its side; what lies farther counts as if it fell off by `fall` (m),
-    which rounds outlines. Three changes: inverse depth is averaged, which is linear across the picture of a plane; a
-    straight line is fitted to it (local linear regression), so that planes stay as they are, also where the window is
-    open on one side alone; and ground close behind an outline is averaged like liquid, so that the surface runs out on
-    it instead of ending in a rim. `width` (m) is the standard deviation of the weights, of which `apart` samples are
-    taken at least: of wide bells every second, third ... pixel is enough.
+    which rounds outlines. Three things differ from the paper:
+
+    - inverse depth is averaged, which is linear across the picture of a plane;
+    - a straight line is fitted to it (local linear regression), so that planes stay planes, also where the window is
+      open on one side alone;
+    - ground close behind an outline is averaged like liquid, so that the surface runs out on it without a rim.
+
+    `width` (m) is the standard deviation of the Gaussian weights; wide ones skip pixels, but take `apart` samples per
+    standard deviation at least.
     """
     h, w = q.shape
     factor = np.float32(focal * width)

@@ -146,10 +146,12 @@ def sphere_depths(begin, end, centres, box, starts, listed, radius, across, down
     lambda centres, box, starts, *_: (0, (starts.shape[0] - 1)), error_model="numpy", fastmath=_FUSED, pieces=PIECES
 )
 def sphere_chords(begin, end, centres, box, starts, listed, radius, across, down, depth, colors, sums):
-    """Five pictures: the sum of the lengths (m, along the ray) in all spheres, then colours of those less than a
-    diameter from the nearest surface, weighted with their lengths and (1 - (distance / diameter)^2)^3, and these
-    weights: on a surface seen at a slant a colour is as flat as the surface is, and what is deeper than it, and thus
-    seen elsewhere, fades. Without colours (none of them) the sum alone.
+    """Five pictures `sums`: thickness, three of weighted colour, and their weight.
+
+    The thickness is the sum of the ray's lengths (m) in all spheres. The colours are those of spheres less than a
+    diameter from the nearest surface, weighted with their length and (1 - (distance / diameter)^2)^3: so a colour lies
+    on a surface seen at a slant as flat as the surface itself, and what is deeper, and seen elsewhere, fades. Without
+    `colors` (an empty array) the thickness alone.
 
     depth: as `sphere_depths` gives it, at `step` times the resolution of `sums`.
     """

@@ -241,7 +241,7 @@ def _bytes(values: np.ndarray) -> np.ndarray:
     return np.clip(np.rint(255.0 * values), 0, 255).astype(np.uint8)
 
 
-class Frames(Protocol):
+class FrameSequence(Protocol):
     """Pictures or masks one by one, of which a few are in memory at a time."""
 
     def __len__(self) -> int:
@@ -253,7 +253,9 @@ class Frames(Protocol):
         ...
 
 
-def smoke_layers(frames: Frames, fluid: Frames, behind: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def smoke_layers(
+    frames: FrameSequence, fluid: FrameSequence, behind: np.ndarray
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Color and opacity of each picture of a film, as `smoke_layer`.
 
     Args:

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from fluidlift.look.liquid import LiquidSurface
+from fluidlift.look.liquid import SurfaceBuffer
 from fluidlift.look.outlet_section import OpenEnd
 from fluidlift.look.smoothstep import smoothstep
 from fluidlift.numerics.sampling import sample_nodes
@@ -49,8 +49,8 @@ off, liquid does not go on level"""
 
 
 def carried_on(
-    surface: LiquidSurface, ground: Float[np.ndarray, "h w"], camera: PinholeCamera, reach: float
-) -> LiquidSurface:
+    surface: SurfaceBuffer, ground: Float[np.ndarray, "h w"], camera: PinholeCamera, reach: float
+) -> SurfaceBuffer:
     """The surface with its plane as far as ground that stands out of it within `reach`.
 
     In a plane n . p = 1 inverse depth is n . (x/z, y/z, 1), so that the mean of planes is one of their n. New liquid
@@ -134,7 +134,7 @@ def settled(
 
 
 def _planes(
-    surface: LiquidSurface, there: np.ndarray, rays: np.ndarray, some: tuple[slice, slice]
+    surface: SurfaceBuffer, there: np.ndarray, rays: np.ndarray, some: tuple[slice, slice]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Planes n [h,w,3] about the eye, n . p = 1, of the surface in some pixels, times their weights; the weights."""
     normal = surface.normal[some]
@@ -144,8 +144,8 @@ def _planes(
 
 
 def _filled(
-    surface: LiquidSurface, ground: np.ndarray, pixels: np.ndarray, found: np.ndarray, rays: np.ndarray, reach: float
-) -> LiquidSurface:
+    surface: SurfaceBuffer, ground: np.ndarray, pixels: np.ndarray, found: np.ndarray, rays: np.ndarray, reach: float
+) -> SurfaceBuffer:
     """The surface with new liquid in some pixels (row, column); found: what lies around them."""
     at = tuple(pixels.T)
     around = found[:, 1:11] / np.maximum(found[:, :1], 1e-6)

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fluidlift.look.environment import Environment
-from fluidlift.look.liquid import LiquidSurface
+from fluidlift.look.liquid import SurfaceBuffer
 from fluidlift.look.liquid_kernels import reflectance
 from fluidlift.look.optics import fresnel
 from fluidlift.look.smoothstep import eased, smoothstep
@@ -60,7 +60,7 @@ class FilmedWhite:
         brightest = float(np.percentile(linear_from_srgb(darkest), BRIGHTEST)) if len(darkest) else 1.0
         return cls(np.asarray(camera.position, np.float64), max(brightest, DARKEST_WHITE))
 
-    def cover(self, surface: LiquidSurface, camera: PinholeCamera, refractive_index: float) -> Float[np.ndarray, "h w"]:
+    def cover(self, surface: SurfaceBuffer, camera: PinholeCamera, refractive_index: float) -> Float[np.ndarray, "h w"]:
         """Share, 0 to 1, of each pixel's surface that foam hides.
 
         Args:
@@ -78,7 +78,7 @@ class FilmedWhite:
         return found
 
     def cover_plain(
-        self, surface: LiquidSurface, camera: PinholeCamera, refractive_index: float
+        self, surface: SurfaceBuffer, camera: PinholeCamera, refractive_index: float
     ) -> Float[np.ndarray, "h w"]:
         """What `cover` does, in NumPy, for reading."""
         found = np.zeros(surface.depth.shape, np.float32)
@@ -142,7 +142,7 @@ def _smoothed(normal: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
 
 def with_foam(
     image: Float[np.ndarray, "h w 3"],
-    surface: LiquidSurface,
+    surface: SurfaceBuffer,
     cover: Float[np.ndarray, "h w"],
     environment: Environment,
 ) -> Float[np.ndarray, "h w 3"]:

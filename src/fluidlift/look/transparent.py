@@ -15,14 +15,14 @@ import numpy as np
 from jaxtyping import Float
 
 from fluidlift.errors import require
-from fluidlift.look.liquid import LiquidSurface
+from fluidlift.look.liquid import SurfaceBuffer
 from fluidlift.look.project import sound
 from fluidlift.look.smoothstep import smoothstep
 from fluidlift.look.solid_contact import carried_on
 from fluidlift.look.transparent_kernels import far_normals, rated
 from fluidlift.numerics.nearest import nearest
 from fluidlift.numerics.sharing import shared
-from fluidlift.numerics.splatting import Bins, Projected, View, bin_tiles, project
+from fluidlift.numerics.splatting import Bins, Projected, SplatCamera, bin_tiles, project
 from fluidlift.numerics.splatting_kernels import TILE, exp_negative
 from fluidlift.numerics.splatting_projection import REACH_MAX
 from fluidlift.numerics.srgb import linear_from_srgb
@@ -72,7 +72,7 @@ def splat_surface(
     colors: Float[np.ndarray, "n 3"] | None = None,
     far_side: bool = True,
     ground: Float[np.ndarray, "h w"] | None = None,
-) -> LiquidSurface:
+) -> SurfaceBuffer:
     """The nearest surface of the liquid that Gaussians fill, and how much of it lies behind.
 
     The first `SKIN` spacings of liquid on each ray tell the surface: it lies half of them before their middle, with
@@ -195,7 +195,7 @@ def _projected(gaussians: Gaussians, camera: PinholeCamera, volume: float) -> Pr
     spacing = volume ** (1.0 / 3.0)
     scales = np.clip(gaussians.scales, WIDTHS[0] * spacing, WIDTHS[1] * spacing).astype(np.float32)
     opaque = np.ones(len(gaussians), np.float32)
-    return project(View.of(camera), gaussians.means, gaussians.quats, scales, opaque)
+    return project(SplatCamera.of(camera), gaussians.means, gaussians.quats, scales, opaque)
 
 
 def _in_order(
@@ -294,14 +294,14 @@ def thickness_plain(packed, skin, rays, total, first) -> None:
 
 def _surface(
     total: np.ndarray, skin: np.ndarray, camera: PinholeCamera, spacing: float, ground: np.ndarray | None
-) -> LiquidSurface:
+) -> SurfaceBuffer:
     """Sums along the rays to the surface that they make."""
     covered, depth = np.empty_like(total), np.empty_like(total)
     normal, albedo = (np.empty((*total.shape, 3), np.float32) for _ in range(2))
     numbers = np.array([*(spacing * share for share in COVERED), *AWAY, LEANING])
     rated(total, skin, _eye(camera), numbers, covered, depth, normal, albedo)
     thickness = np.where(covered > 0, _even(total, depth, camera, spacing, ground), 0.0)
-    return LiquidSurface(np.maximum(depth, 0.0), normal, thickness, albedo, covered, grain=FILM * spacing)
+    return SurfaceBuffer(np.maximum(depth, 0.0), normal, thickness, albedo, covered, grain=FILM * spacing)
 
 
 def _eye(camera: PinholeCamera) -> tuple[np.ndarray, np.ndarray]:
@@ -346,6 +346,6 @@ def _unit(vectors: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
     return np.where(length > 1e-9, vectors / np.maximum(length, 1e-9), otherwise)
 
 
-def _nothing(height: int, width: int) -> LiquidSurface:
+def _nothing(height: int, width: int) -> SurfaceBuffer:
     flat, deep = np.zeros((height, width), np.float32), np.zeros((height, width, 3), np.float32)
-    return LiquidSurface(flat, deep, flat, deep, flat)
+    return SurfaceBuffer(flat, deep, flat, deep, flat)

@@ -37,7 +37,7 @@ SLOW = 0.05
 """m/s that count to any current, so that still water next to still water has grown by nothing"""
 
 
-class Relief(NamedTuple):
+class SurfaceRelief(NamedTuple):
     """Of places on a surface."""
 
     height: Float[np.ndarray, " n"]
@@ -109,7 +109,7 @@ class WaveRelief:
 
     def at(
         self, places: Float[np.ndarray, "n 2"], time: float, *, blur: Float[np.ndarray, " n"] | float = 0.0
-    ) -> Relief:
+    ) -> SurfaceRelief:
         """At some places (x, y in m).
 
         Args:
@@ -130,7 +130,7 @@ class WaveRelief:
                 numbers = np.array([layer.weight, layer.tau, time, float(not layer.standing)])
                 add_waves(at, np.ascontiguousarray(waves[which]), layer.phases[which], numbers, out)
         out *= grown[:, None]
-        return Relief(out[:, 0], out[:, 1:3], out[:, 3])
+        return SurfaceRelief(out[:, 0], out[:, 1:3], out[:, 3])
 
     def _layers(self, time: float) -> list[_Layer]:
         """Those that are there at a time."""

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fluidlift.look.environment_stack import fading
-from fluidlift.look.liquid import Behind, LiquidSurface
+from fluidlift.look.liquid import Behind, SurfaceBuffer
 from fluidlift.look.liquid_kernels import CLOSED, RESTS, ROOM
 from fluidlift.look.materials import Material
 from fluidlift.look.optics import fresnel, held_inside, wet_light, wet_table
@@ -34,7 +34,7 @@ MOST = 1.5
 
 def wetted(
     behind: Behind,
-    surface: LiquidSurface,
+    surface: SurfaceBuffer,
     camera: PinholeCamera,
     material: Material,
     ground: tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]],
@@ -155,7 +155,7 @@ def dampen(lead, stop, liquid, ground, lens, pose, fluxes, table, slants, shaded
 
 def wetted_plain(
     behind: Behind,
-    surface: LiquidSurface,
+    surface: SurfaceBuffer,
     camera: PinholeCamera,
     material: Material,
     ground: tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]],
@@ -197,7 +197,7 @@ def wetted_plain(
 
 
 def standing(
-    surface: LiquidSurface, behind: Behind, camera: PinholeCamera
+    surface: SurfaceBuffer, behind: Behind, camera: PinholeCamera
 ) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
     """How much of what a pixel shows behind the liquid has that liquid standing on it, 0 to 1, and metres of it across
     its surface. The same gaps count as none as for the light that leaves it (`liquid_kernels`)."""

@@ -56,7 +56,7 @@ class Spread:
 
 
 @dataclass(frozen=True)
-class Memory:
+class RecordMemory:
     """How much a record says."""
 
     count: int
@@ -100,14 +100,14 @@ def correlation_length(record: Float[np.ndarray, "n ..."]) -> float:
     return max(total, (1.0 + beside) / (1.0 - beside), 1.0)
 
 
-def memory_of(record: Float[np.ndarray, "n ..."]) -> Memory:
+def memory_of(record: Float[np.ndarray, "n ..."]) -> RecordMemory:
     """Of a record: blocks of `MEMORIES` correlation lengths, at most a `FEWEST`-th of it."""
     n, length = len(record), correlation_length(record)
     block = int(np.clip(np.ceil(MEMORIES * length), 1, max(n // FEWEST, 1)))
     # of a process of first order with that memory; without any it is n / (n - block)
     share = (length - 1.0) / (length + 1.0)
     whole, part = _of_mean(share, n), _of_mean(share, block)
-    return Memory(n, block, whole * n / (block * (part - whole)) if n > block else 1.0)
+    return RecordMemory(n, block, whole * n / (block * (part - whole)) if n > block else 1.0)
 
 
 def _of_mean(share: float, count: int) -> float:
@@ -118,7 +118,7 @@ def _of_mean(share: float, count: int) -> float:
     return ((1.0 + share) / (1.0 - share) - decays) / count
 
 
-def resampled(memory: Memory, draws: int, seed: int) -> Int[np.ndarray, "draws n"]:
+def resampled(memory: RecordMemory, draws: int, seed: int) -> Int[np.ndarray, "draws n"]:
     """Numbers of the samples of other records that might have been: blocks of one, which is taken to be a ring."""
     require(memory.count > 0 and draws > 0, f"{memory.count} samples, {draws} times", "some of both")
     rng, each = np.random.default_rng(seed), -(-memory.count // memory.block)
@@ -126,7 +126,7 @@ def resampled(memory: Memory, draws: int, seed: int) -> Int[np.ndarray, "draws n
     return ((first[..., None] + np.arange(memory.block)) % memory.count).reshape(draws, -1)[:, : memory.count]
 
 
-def spread_of(drawn: Float[np.ndarray, " draws"], scale: Scale = "logarithm", *memories: Memory) -> Spread:
+def spread_of(drawn: Float[np.ndarray, " draws"], scale: Scale = "logarithm", *memories: RecordMemory) -> Spread:
     """Of a positive number, from what it was in records that were drawn by blocks.
 
     Args:

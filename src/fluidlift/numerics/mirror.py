@@ -30,7 +30,7 @@ def folded(
 
 
 @dataclass(frozen=True)
-class Found:
+class MirrorImages:
     """Which points stand for which places."""
 
     place: Int[np.ndarray, " m"]
@@ -97,7 +97,7 @@ class MirroredPoints:
         """The point nearest to the image of each place (m) once the pattern has moved on by `run` (m)."""
         return self._tree.query(self._images(np.asarray(places, np.float64), run, 0)[0])[1].reshape(-1)
 
-    def around(self, places: Float[np.ndarray, "n 3"], run: float = 0.0) -> Found:
+    def around(self, places: Float[np.ndarray, "n 3"], run: float = 0.0) -> MirrorImages:
         """All points in the box of a spacing around the image of each place (m) once the pattern has moved on by `run`.
 
         Where there is none, the next images are looked at.
@@ -114,13 +114,15 @@ class MirroredPoints:
                 offset = self._points[point] - images[own]
                 for axis, flip in ((self._along, turned[own]), (self._across, beside[own])):
                     offset[flip] -= 2.0 * (offset[flip] @ axis)[:, None] * axis
-                parts.append(Found(left[own], offset, point))
+                parts.append(MirrorImages(left[own], offset, point))
             left = left[count == 0]
             if len(left) == 0:
                 break
         if not parts:
-            return Found(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0, np.int64))
-        return Found(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("place", "offset", "point")))
+            return MirrorImages(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0, np.int64))
+        return MirrorImages(
+            *(np.concatenate([getattr(p, name) for p in parts]) for name in ("place", "offset", "point"))
+        )
 
     def _images(self, places: np.ndarray, run: float, attempt: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Where places are in the pattern, and whether mirrored along it and across it."""

@@ -6,18 +6,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numba import njit
 
-from fluidlift.errors import require
 from fluidlift.numerics.sharing import shared
 from fluidlift.types import Grid
-
-
-def distance_of_heights(heights: Float[np.ndarray, "nx+1 ny+1"], grid: Grid) -> Float[np.ndarray, "nx+1 ny+1 nz+1"]:
-    """First-order signed distance (m) to a height field: vertical distance over the length of the slope vector."""
-    require(heights.shape == (grid.shape[0] + 1, grid.shape[1] + 1), f"heights {heights.shape}", "one per node column")
-    slope_x, slope_y = np.gradient(np.asarray(heights, np.float64), grid.spacing)
-    z = grid.low[2] + np.arange(grid.shape[2] + 1) * grid.spacing
-    vertical = z[None, None, :] - heights[:, :, None]
-    return (vertical / np.sqrt(1.0 + slope_x**2 + slope_y**2)[:, :, None]).astype(np.float32)
 
 
 @njit(cache=True)

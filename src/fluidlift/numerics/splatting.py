@@ -46,7 +46,7 @@ is drawn in bands of tiles"""
 
 
 @dataclass(frozen=True)
-class View:
+class SplatCamera:
     """A pinhole camera as plain numbers: x_cam = rotation @ x + translation, u = fx x/z + cx."""
 
     rotation: Float[np.ndarray, "3 3"]
@@ -61,7 +61,7 @@ class View:
     """Gaussians whose centre is nearer than this (camera z, m) are not drawn"""
 
     @classmethod
-    def of(cls, camera: PinholeCamera, near: float = 1e-3) -> View:
+    def of(cls, camera: PinholeCamera, near: float = 1e-3) -> SplatCamera:
         """The numbers of a camera."""
         pose = camera.camera_from_world
         return cls(pose.rotation, pose.translation, camera.focal, camera.center, camera.size, near)
@@ -127,7 +127,7 @@ class Bins:
 
 
 def project(
-    view: View,
+    view: SplatCamera,
     means: Float[np.ndarray, "n 3"],
     quats: Float[np.ndarray, "n 4"],
     scales: Float[np.ndarray, "n 3"],
@@ -145,7 +145,7 @@ def project(
 
 
 def project_backward(
-    view: View,
+    view: SplatCamera,
     means: Float[np.ndarray, "n 3"],
     quats: Float[np.ndarray, "n 4"],
     scales: Float[np.ndarray, "n 3"],

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fluidlift.numerics import splatting
-from fluidlift.numerics.splatting import Projected, View
+from fluidlift.numerics.splatting import Projected, SplatCamera
 from fluidlift.numerics.splatting_kernels import ALPHA_MAX, TRANSMITTANCE_MIN
 from fluidlift.numerics.splatting_projection import ALPHA_MIN, BLUR
 from fluidlift.seams import Rasterizer, Splatted, SplatView
@@ -28,7 +28,7 @@ def _array(tensor: Tensor) -> np.ndarray:
 
 class _Project(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, view: View) -> Any:
+    def forward(ctx: Any, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, view: SplatCamera) -> Any:
         arrays = _array(means), _array(quats), _array(scales)
         projected = splatting.project(view, *arrays, _array(opacities))
         ctx.saved = (view, *arrays, projected)
@@ -70,7 +70,7 @@ def project(
     quats: Float[Tensor, "n 4"],
     scales: Float[Tensor, "n 3"],
     opacities: Float[Tensor, " n"],
-    view: View,
+    view: SplatCamera,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Centres [n,2] px, conics [n,3], depths [n] m and box sizes [n,2] px; the first two carry gradients.
 
@@ -98,7 +98,7 @@ def splat(
     scales: Float[Tensor, "n 3"],
     opacities: Float[Tensor, " n"],
     features: Float[Tensor, "n c"],
-    view: View,
+    view: SplatCamera,
 ) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
     """Picture of any features and the transmittance left, differentiable in all five operands (float32)."""
     uv, conics, depths, extents = project(means, quats, scales, opacities, view)
@@ -112,7 +112,7 @@ class NumbaRasterizer(Rasterizer):
         self, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, features: Tensor, view: SplatView
     ) -> Splatted:
         """See `seams.Rasterizer`."""
-        numbers = View(view.rotation, view.translation, view.focal, view.center, view.size, view.near)
+        numbers = SplatCamera(view.rotation, view.translation, view.focal, view.center, view.size, view.near)
         o = opacities.cpu()
         uv, conics, depths, extents = project(means.cpu(), quats.cpu(), scales.cpu(), o, numbers)
         if uv.requires_grad:
@@ -127,7 +127,7 @@ def splat_dense(
     scales: Float[Tensor, "n 3"],
     opacities: Float[Tensor, " n"],
     features: Float[Tensor, "n c"],
-    view: View,
+    view: SplatCamera,
 ) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
     """The plain twin of `splat`: n x h x w numbers, for small scenes and for reading."""
     dtype = means.dtype
@@ -157,7 +157,7 @@ def splat_dense(
 
 
 def ellipses(
-    means: Float[Tensor, "n 3"], quats: Float[Tensor, "n 4"], scales: Float[Tensor, "n 3"], view: View
+    means: Float[Tensor, "n 3"], quats: Float[Tensor, "n 4"], scales: Float[Tensor, "n 3"], view: SplatCamera
 ) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2 2"]]:
     """Centres (px) and covariances (px^2) in the picture: the plain twin of `project`."""
     rotation = torch.as_tensor(view.rotation, dtype=means.dtype)

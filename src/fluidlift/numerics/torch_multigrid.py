@@ -17,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fluidlift.errors import require
-from fluidlift.numerics.torch_poisson import DeviceSystem, Level, add_neighbours, interior
+from fluidlift.numerics.torch_poisson import DeviceSystem, ScaledLevel, add_neighbours, interior
 from fluidlift.types import SolveReport
 
 DEGREE = 3
@@ -42,7 +42,7 @@ def check_every(device: torch.device) -> int:
     return 1 if device.type == "cpu" else CHECK_EVERY
 
 
-def _smooth(level: Level, x: Tensor | None, b: Tensor) -> Tensor:
+def _smooth(level: ScaledLevel, x: Tensor | None, b: Tensor) -> Tensor:
     """A Chebyshev polynomial of the scaled operator on the residual (Saad 2003, algorithm 12.1); None: x = 0."""
     low, high = EIGENVALUES
     middle, half = (high + low) / 2, (high - low) / 2
@@ -58,13 +58,13 @@ def _smooth(level: Level, x: Tensor | None, b: Tensor) -> Tensor:
     return x
 
 
-def _residual(level: Level, x: Tensor, b: Tensor) -> Tensor:
+def _residual(level: ScaledLevel, x: Tensor, b: Tensor) -> Tensor:
     out = b - x
     add_neighbours(x, level.couplings, level, out, 1.0)
     return out
 
 
-def _restrict(fine: Level, coarse: Level, residual: Tensor) -> Tensor:
+def _restrict(fine: ScaledLevel, coarse: ScaledLevel, residual: Tensor) -> Tensor:
     """The scaled right side of the coarser level: sums over eight cells."""
     r = (fine.unscale * residual).view(fine.shape)[1:-1, 1:-1, 1:-1]
     r = r[0::2] + r[1::2]
@@ -88,7 +88,7 @@ def v_cycle(system: DeviceSystem, b: Float[Tensor, " n"], depth: int = 0) -> Flo
     return _smooth(level, x, b)
 
 
-def _solve_coarsest(system: DeviceSystem, level: Level, b: Tensor) -> Tensor:
+def _solve_coarsest(system: DeviceSystem, level: ScaledLevel, b: Tensor) -> Tensor:
     cells = system.cells
     for _ in system.levels[1:]:
         cells = ((cells[0] + 1) // 2, (cells[1] + 1) // 2, (cells[2] + 1) // 2)

@@ -25,7 +25,7 @@ COARSEST_CELLS = 216
 
 
 @dataclass(frozen=True)
-class Level:
+class ScaledLevel:
     """One level, scaled to a diagonal of 1: y - sum over neighbours of coupling times their y."""
 
     shape: tuple[int, int, int]
@@ -66,7 +66,7 @@ class DeviceSystem:
     """float64, flat, in units of 1 / h^2"""
     couplings: tuple[Tensor, Tensor, Tensor]
     """float64, flat, in units of 1 / h^2"""
-    levels: tuple[Level, ...]
+    levels: tuple[ScaledLevel, ...]
     inverse: Tensor
     """float32 [n,n]: pseudo-inverse of the scaled operator on the coarsest level"""
     closed_cells: Int[Tensor, " m"]
@@ -167,7 +167,7 @@ def _inverse_root(diagonal: np.ndarray) -> np.ndarray:
     return np.divide(1.0, np.sqrt(diagonal), out=np.zeros_like(diagonal), where=diagonal > 0)
 
 
-def _level(plain: PlainLevel, device: torch.device) -> Level:
+def _level(plain: PlainLevel, device: torch.device) -> ScaledLevel:
     """Scale a level and lay it out; the box is made even so that every coarse cell has eight."""
     diagonal = plain.diagonal()
     nx, ny, nz = (2 * ((n + 1) // 2) + 2 for n in diagonal.shape)
@@ -180,7 +180,7 @@ def _level(plain: PlainLevel, device: torch.device) -> Level:
     coarse = [2 * ((n // 2 + 1) // 2) + 2 for n in (nx - 2, ny - 2, nz - 2)]
     i, j, k = (np.where((np.arange(n) > 0) & (np.arange(n) < n - 1), (np.arange(n) + 1) // 2, 0) for n in shape)
     parent = (i[:, None, None] * coarse[1] + j[:, None]) * coarse[2] + k
-    return Level(
+    return ScaledLevel(
         shape=shape,
         couplings=_on_device([c.astype(np.float32) for c in couplings], device),
         scale=torch.from_numpy(scale.astype(np.float32).ravel()).to(device),
@@ -211,7 +211,9 @@ def interior(grid: Tensor, cells: tuple[int, int, int]) -> Tensor:
     return grid[1 : nx + 1, 1 : ny + 1, 1 : nz + 1]
 
 
-def add_neighbours(x: Tensor, couplings: tuple[Tensor, Tensor, Tensor], level: Level, out: Tensor, sign: float) -> None:
+def add_neighbours(
+    x: Tensor, couplings: tuple[Tensor, Tensor, Tensor], level: ScaledLevel, out: Tensor, sign: float
+) -> None:
     """out += sign times the sum over neighbours of coupling times x, without the first and last plane."""
     first, last = level.strides[0], level.size - level.strides[0]
     core = out[first:last]

@@ -128,7 +128,7 @@ def set_inflow(velocity: Box, domain: TorchDomain, parameters: RolloutParameters
     return velocity * domain.interior + given * domain.inflow
 
 
-class _Diffuse(torch.autograd.Function):
+class _DiffuseTorch(torch.autograd.Function):
     """x with (1 - c L + e W) x = b; gradients as `rollout_operators`."""
 
     @staticmethod
@@ -199,7 +199,7 @@ def diffuse(
     c = parameters.kinematic_viscosity * parameters.time_step
     prescribed = neighbour_sum(velocity * domain.inflow) * domain.dynamic / domain.spacing**2
     e = c * parameters.wall_damping * (2 / domain.spacing**2)
-    return _Diffuse.apply(velocity + c * prescribed, c, e, domain, failed)
+    return _DiffuseTorch.apply(velocity + c * prescribed, c, e, domain, failed)
 
 
 class _Pressure(torch.autograd.Function):

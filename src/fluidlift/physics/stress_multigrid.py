@@ -89,7 +89,7 @@ class StressSystem:
 
 
 @dataclass(frozen=True)
-class Level:
+class StressLevel:
     """A system and its work space, float32 [3,...]."""
 
     system: StressSystem
@@ -277,18 +277,18 @@ def fitting_threads(nodes: int) -> Iterator[None]:
         set_num_threads(before)
 
 
-def build_levels(system: StressSystem, *, coarsen: bool = True) -> list[Level]:
+def build_levels(system: StressSystem, *, coarsen: bool = True) -> list[StressLevel]:
     """The system on ever coarser grids, finest first; only the finest without `coarsen`."""
     systems = [system]
     while coarsen and max(systems[-1].shape) - 4 > COARSEST_NODES:
         systems.append(coarser(systems[-1]))
-    levels = [Level(s, *(np.zeros(s.mass.shape, np.float32) for _ in range(4))) for s in systems]
+    levels = [StressLevel(s, *(np.zeros(s.mass.shape, np.float32) for _ in range(4))) for s in systems]
     for fine, coarse in pairwise(levels):
         _measure_reach(fine.system.mass, coarse.system.mass, fine.reach)
     return levels
 
 
-def _sweep(level: Level, count: int, *, forward: bool) -> None:
+def _sweep(level: StressLevel, count: int, *, forward: bool) -> None:
     s = level.system
     if s.excluded.size < SMALL:
         kernels.sweeps_alone(
@@ -303,13 +303,13 @@ def _sweep(level: Level, count: int, *, forward: bool) -> None:
             )  # fmt: skip
 
 
-def _descend(fine: Level, coarse: Level) -> None:
+def _descend(fine: StressLevel, coarse: StressLevel) -> None:
     _sweep(fine, SWEEPS, forward=True)
     kernels.residual(fine.x, fine.rhs, fine.rest, *fine.system.operator)
     _gather(fine.rest, fine.reach, coarse.system.mass, coarse.rhs, coarse.x, *coarse.system.columns)
 
 
-def v_cycle(levels: list[Level]) -> None:
+def v_cycle(levels: list[StressLevel]) -> None:
     """levels[0].x, 0 before, becomes an approximate solution for levels[0].rhs: linear, symmetric, positive."""
     for fine, coarse in pairwise(levels):
         with fitting_threads(fine.system.excluded.size):

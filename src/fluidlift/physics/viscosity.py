@@ -83,7 +83,7 @@ class FaceRoles:
 
 
 @dataclass(frozen=True)
-class Region:
+class SolvedBox:
     """The box around the solved faces."""
 
     low: tuple[int, ...]
@@ -119,7 +119,7 @@ class Region:
         return out
 
 
-def _region(solved: tuple[np.ndarray, ...]) -> Region | None:
+def _region(solved: tuple[np.ndarray, ...]) -> SolvedBox | None:
     """The box around the solved faces with two layers of nodes on each side."""
     low, high = [np.iinfo(int).max] * 3, [-1] * 3
     for mask in solved:
@@ -129,10 +129,10 @@ def _region(solved: tuple[np.ndarray, ...]) -> Region | None:
                 low[axis], high[axis] = min(low[axis], int(hit[0])), max(high[axis], int(hit[-1]))
     if high[0] < 0:
         return None
-    return Region(tuple(a - 2 for a in low), tuple(b - a + 5 for a, b in zip(low, high)))
+    return SolvedBox(tuple(a - 2 for a in low), tuple(b - a + 5 for a, b in zip(low, high)))
 
 
-def _face_roles(roles: FaceRoles, region: Region) -> np.ndarray:
+def _face_roles(roles: FaceRoles, region: SolvedBox) -> np.ndarray:
     out = np.zeros((3, *region.shape), np.int8)
     for a in range(3):
         for code, masks in ((kernels.WALL, roles.walls), (kernels.FIXED, roles.fixed), (kernels.SOLVED, roles.solved)):
@@ -140,7 +140,7 @@ def _face_roles(roles: FaceRoles, region: Region) -> np.ndarray:
     return out
 
 
-def _stacked(velocity: FaceVelocity, region: Region) -> np.ndarray:
+def _stacked(velocity: FaceVelocity, region: SolvedBox) -> np.ndarray:
     """float64 [3,...]: the components in the box."""
     return np.stack([region.crop(c, 0.0, np.float64) for c in velocity.components])
 
@@ -180,7 +180,7 @@ def _all_six(faces: np.ndarray) -> np.ndarray:
     return out
 
 
-def _clearance(solid_distance: np.ndarray, region: Region) -> np.ndarray:
+def _clearance(solid_distance: np.ndarray, region: SolvedBox) -> np.ndarray:
     """float32 [3,...]: distance of the faces' centres from the solid, the mean of their corners."""
 
     def mean_with_next(field: np.ndarray, axis: int) -> np.ndarray:
@@ -220,7 +220,7 @@ def _continue_behind_walls(begin, end, x, clearance, mass, wall_share, buried):
 
 def build_system(
     roles: FaceRoles, *, viscosity: float | Float[np.ndarray, "nx ny nz"], dt: float, spacing: float, wall_share: float
-) -> tuple[StressSystem, Region, np.ndarray] | None:
+) -> tuple[StressSystem, SolvedBox, np.ndarray] | None:
     """The operator in a box around the solved faces, the box, and the faces in it that count as wall although they are
     partly open, since their centre lies in the solid; None where nothing is solved. Arguments as for `diffuse`.
     """

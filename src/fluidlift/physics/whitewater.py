@@ -69,7 +69,7 @@ Inside = Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
-class Range:
+class PotentialRange:
     """What counts of a potential: nothing below `least`, all above `most`."""
 
     least: float
@@ -119,11 +119,11 @@ class SeenBirths:
 class WhitewaterLaw:
     """How much white water a liquid makes."""
 
-    trapped: Range
+    trapped: PotentialRange
     """m/s, of closing"""
-    crest: Range
+    crest: PotentialRange
     """1/s: curvature times the speed along the normal"""
-    energy: Range
+    energy: PotentialRange
     """m^2/s^2: of motion, per mass"""
     trapped_rate: float
     """1/s, births in a full cell whose shares are 1"""

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from fluidlift.pipeline.compare import card_against
-    from fluidlift.pipeline.hints import Hints
+    from fluidlift.pipeline.hints import MaskHints
     from fluidlift.pipeline.inputs import Inputs
     from fluidlift.pipeline.make import STAGES, make
     from fluidlift.pipeline.mask_files import find_masks
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from fluidlift.present.as_filmed import card_of
 
 _FROM = {
-    "card_against": "pipeline.compare", "Hints": "pipeline.hints", "Inputs": "pipeline.inputs",
+    "card_against": "pipeline.compare", "MaskHints": "pipeline.hints", "Inputs": "pipeline.inputs",
     "STAGES": "pipeline.make", "make": "pipeline.make", "find_masks": "pipeline.mask_files",
     "MotionFiles": "pipeline.motion_files", "measure_motion": "pipeline.motion_files", "Refitted": "pipeline.refit",
     "refit": "pipeline.refit", "RenderRequest": "pipeline.render", "render_asset": "pipeline.render",
@@ -63,9 +63,9 @@ sys.modules[__name__].__class__ = _Face
 
 __all__ = [
     "STAGES",
-    "Hints",
     "Inputs",
     "Made",
+    "MaskHints",
     "MotionFiles",
     "Refitted",
     "RenderRequest",

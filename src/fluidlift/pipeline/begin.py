@@ -8,7 +8,7 @@ from dataclasses import replace
 from fluidlift.config import JobConfig
 from fluidlift.errors import InputRejected
 from fluidlift.pipeline import depths, given_body
-from fluidlift.pipeline.hints import NO_HINTS, Hints, laid_on, require_no_contradiction
+from fluidlift.pipeline.hints import NO_HINTS, MaskHints, laid_on, require_no_contradiction
 from fluidlift.pipeline.inputs import GivenFile, GivenFiles
 from fluidlift.pipeline.models import require_weights
 from fluidlift.pipeline.runner import Runner
@@ -89,7 +89,7 @@ def windows(runner: Runner, clip: GivenFile, config: JobConfig) -> tuple[JobConf
 
 
 def look(
-    runner: Runner, given: GivenFiles, config: JobConfig, hints: Hints = NO_HINTS, said: ClipHints = NOTHING_SAID
+    runner: Runner, given: GivenFiles, config: JobConfig, hints: MaskHints = NO_HINTS, said: ClipHints = NOTHING_SAID
 ) -> tuple[Read, Flow, Segmentation]:
     """Run read, flow, segment and, where regions were drawn, correct; what later stages are given is looked at first.
 
@@ -112,7 +112,7 @@ def look(
     if notice:
         runner.warn(notice)
     if drawn.roi is not None or drawn.clicks:
-        hints = Hints.drawn(drawn)
+        hints = MaskHints.drawn(drawn)
 
     def first() -> None:
         require_usable(clip.clip, told.mask, told.segment, hints)

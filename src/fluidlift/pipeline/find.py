@@ -16,7 +16,7 @@ from fluidlift.io.hints_file import content_hash
 from fluidlift.io.video import probe
 from fluidlift.messages import Notice, as_plain
 from fluidlift.pipeline import begin
-from fluidlift.pipeline.found_parts import Line, Part, lines_of, outlines, parts_of
+from fluidlift.pipeline.found_parts import FoundPart, Line, lines_of, outlines, parts_of
 from fluidlift.pipeline.inputs import GivenFiles, Inputs
 from fluidlift.pipeline.runner import Runner
 from fluidlift.pipeline.settings import GeometrySettings, GivenView, ReadSettings
@@ -41,7 +41,7 @@ STILL_PX = 1.0
 
 
 @dataclass(frozen=True)
-class View:
+class FoundView:
     """How the fluid stands before the camera: what geometry begins with, without ground and cells."""
 
     kind: str
@@ -56,7 +56,7 @@ class View:
     """px per frame"""
     mean_confidence: Float[np.ndarray, "h w"]
     rest_frame: int
-    parts: tuple[Part, ...] = ()
+    parts: tuple[FoundPart, ...] = ()
     lines: tuple[Line, ...] = ()
     level_share: float | None = None
     """probability that a stream runs level; None: nothing was asked"""
@@ -69,7 +69,7 @@ class View:
 
 def view(
     read: Read, flow: Flow, segmentation: Segmentation, given: GivenView, config: GeometrySettings, *, work: Work
-) -> View:
+) -> FoundView:
     """Kind, tilt, flow and scale.
 
     Raises:
@@ -77,7 +77,7 @@ def view(
     """
     s = sighted(read, flow, segmentation, given, config, work=work)
     seen, slope = s.seen, s.front.slope
-    return View(
+    return FoundView(
         seen.kind.name, seen.evidence, s.up, s.scale, s.sentence, s.canonical, seen.mask, np.asarray(seen.motion),
         np.asarray(seen.trust), seen.start, parts_of(s), lines_of(s), None if slope is None else slope.level_share,
         0.0 if slope is None else slope.slope, tuple(s.warnings),
@@ -92,7 +92,7 @@ class Found:
     identity: ClipIdentity
     read: Read
     segmentation: Segmentation
-    view: View
+    view: FoundView
     warnings: tuple[Notice, ...] = ()
 
     def facts(self) -> dict[str, Any]:
@@ -179,13 +179,13 @@ def fluid_facts(segmentation: Segmentation) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _slope_facts(g: View) -> dict[str, Any]:
+def _slope_facts(g: FoundView) -> dict[str, Any]:
     if g.level_share is None:
         return {}
     return {"slope": round(g.slope, 1), "level_probability": round(g.level_share, 2)}
 
 
-def _part_data(part: Part, k: float) -> dict[str, Any]:
+def _part_data(part: FoundPart, k: float) -> dict[str, Any]:
     area = {"area": [_px(p, k) for p in part.area]} if part.area else {}
     return {"is": part.what, "probability": round(part.probability, 2)} | area
 
@@ -252,7 +252,7 @@ def find_hints(
     return Found(identity, seen[0], seen[2], found, tuple(runner.warnings))
 
 
-def arrows(g: View) -> list[tuple[tuple[float, float], tuple[float, float]]]:
+def arrows(g: FoundView) -> list[tuple[tuple[float, float], tuple[float, float]]]:
     """Where the fluid moves and where to, px of the working picture: begin and end, the fastest a step long."""
     height, width = g.mask.shape
     step = max(height, width) / ARROWS

@@ -29,7 +29,7 @@ Points = tuple[tuple[float, float], ...]
 
 
 @dataclass(frozen=True)
-class Part:
+class FoundPart:
     """A part of the fluid, or what holds it."""
 
     what: str
@@ -59,21 +59,21 @@ def outlines(mask: np.ndarray) -> list[list[tuple[float, float]]]:
     return [[(float(u), float(v)) for u, v in line] for line in lines if len(line) >= 3]
 
 
-def parts_of(s: Sighted) -> tuple[Part, ...]:
+def parts_of(s: Sighted) -> tuple[FoundPart, ...]:
     """What the fluid consists of, what lies first."""
     seen, share = s.seen, s.seen.evidence.scores.get(s.seen.kind.name, 0.0)
     sure = share if seen.kind_free else 1.0
-    found = [Part(seen.kind.name, sure)]
+    found = [FoundPart(seen.kind.name, sure)]
     for jet in seen.parts.outlines:
-        found.append(Part("jet", _going_its_way(jet.pixels, seen.motion, seen.trust), _outline(jet.pixels)))
+        found.append(FoundPart("jet", _going_its_way(jet.pixels, seen.motion, seen.trust), _outline(jet.pixels)))
     marked = seen.parts.ledges is not None
     for pixels in s.front.chutes:
         going = 1.0 if marked else _going_its_way(pixels, seen.motion, seen.trust)
-        found.append(Part("ledge", going, _outline(pixels)))
+        found.append(FoundPart("ledge", going, _outline(pixels)))
     if s.front.vessel is not None:
-        found.append(Part("vessel", sure, _silhouette(s.front.vessel, s.canonical)))
+        found.append(FoundPart("vessel", sure, _silhouette(s.front.vessel, s.canonical)))
     if _pools(s):
-        found.append(Part("pool", 1.0 if seen.parts.level else sure, _outline(_level_pixels(s))))
+        found.append(FoundPart("pool", 1.0 if seen.parts.level else sure, _outline(_level_pixels(s))))
     return tuple(found)
 
 

@@ -19,7 +19,7 @@ from fluidlift.types.stages import Read
 
 
 @dataclass(frozen=True)
-class Hints:
+class MaskHints:
     """What a person says about where the fluid is, in px of the working picture."""
 
     roi: tuple[int, int, int, int] | None = None
@@ -28,7 +28,7 @@ class Hints:
     """x, y, and whether there is fluid there"""
 
     @classmethod
-    def of(cls, roi: str | None, here: Sequence[str], not_here: Sequence[str]) -> Hints:
+    def of(cls, roi: str | None, here: Sequence[str], not_here: Sequence[str]) -> MaskHints:
         """From texts such as "10,20,300,200" and "64,48".
 
         Raises:
@@ -40,7 +40,7 @@ class Hints:
         return cls(None if box is None else tuple(round(v) for v in box), tuple(points))  # type: ignore[arg-type]
 
     @classmethod
-    def drawn(cls, hints: ClipHints) -> Hints:
+    def drawn(cls, hints: ClipHints) -> MaskHints:
         """Those of a hints file, in px of the working picture (`ClipHints.at`)."""
         points = tuple((c.at[0], c.at[1], c.fluid) for c in hints.clicks)
         if hints.roi is None:
@@ -48,12 +48,8 @@ class Hints:
         x, y, width, height = hints.roi
         return cls((round(x), round(y), round(width), round(height)), points)
 
-    def clicks(self) -> list[tuple[float, float, int]]:
-        """The points as `shape.segment` takes them."""
-        return [(x, y, int(there)) for x, y, there in self.points]
 
-
-NO_HINTS = Hints()
+NO_HINTS = MaskHints()
 
 
 def laid_on(hints: ClipHints, read: Read) -> tuple[ClipHints, Notice]:

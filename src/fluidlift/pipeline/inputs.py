@@ -1,9 +1,9 @@
-"""The files of a job: where they are, and what is in them."""
+"""The files of a job: where they are, and what is in them. Only the content counts in the keys of stages."""
 
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,8 @@ from fluidlift.backends.model_cache import kept
 from fluidlift.errors import InputRejected
 from fluidlift.io.hashes import digest, file_hash
 
+BESIDE = {"keyed": False}
+"""metadata of a field that does not change the result of a stage: keys leave it out (`pipeline.runner`)"""
 OF_CACHE = "model:"
 """what weights begin with that are a model of the user's cache: no file that lies about is taken for it"""
 _OPTIONS = {"geometry": ("--geometry-from", "folder")}
@@ -39,30 +41,20 @@ class Inputs:
 class GivenFile:
     """A file or folder, and a hash of its content, which is what results depend on."""
 
-    path: Path
+    path: Path = field(metadata=BESIDE)
     content: str | list[str]
     """SHA-256; of numbered pictures one each"""
-
-    @property
-    def cache_key(self) -> Any:
-        """What a stage's key knows of it."""
-        return self.content
 
 
 @dataclass(frozen=True)
 class Weights:
     """Weights of a learned model, by their content where they are files here, else by their name."""
 
-    name: str
+    name: str = field(metadata=BESIDE)
     """file, folder, or name on the hub: what a back end is given"""
     content: str
-    model: str | None = None
+    model: str | None = field(default=None, metadata=BESIDE)
     """name of the model, where it is one of the user's cache"""
-
-    @property
-    def cache_key(self) -> str:
-        """What a stage's key knows of them."""
-        return self.content
 
     @property
     def label(self) -> str:

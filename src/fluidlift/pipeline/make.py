@@ -31,7 +31,7 @@ from fluidlift.scene.filmed_cells import filmed_shares
 from fluidlift.scene.simulator import particle_work
 from fluidlift.scene.splat_files import require_room
 from fluidlift.seams import Progress, Silence
-from fluidlift.shape.occluders import Behind
+from fluidlift.shape.occluders import HiddenFluid
 from fluidlift.types import Filmed, FluidAsset, kind_of
 from fluidlift.types.fluid_masks import FluidMasks
 from fluidlift.types.hints import NOTHING_SAID, ClipHints
@@ -200,7 +200,7 @@ def _write_film(lift: Lift, folder: Path) -> None:
     part = slice(first, first + MOST_FRAMES)
     frames, fluid, hidden = clip.frames[part], FluidMasks(lift.labels.labels)[part], lift.geometry.hidden
     if hidden is not None:
-        behind = Behind.of(hidden, lift.geometry.mask)
+        behind = HiddenFluid.of(hidden, lift.geometry.mask)
         frames, fluid = behind.pictures(frames), behind.pictures(fluid)
     if kind_of(lift.geometry.kind).is_gas:
         write_smoke(film, smoke_layers(frames, fluid, lift.geometry.plate), clip.interval)

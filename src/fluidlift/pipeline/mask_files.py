@@ -12,7 +12,7 @@ import numpy as np
 from fluidlift.config import JobConfig
 from fluidlift.io.output_files import Written, cleared, numbered
 from fluidlift.pipeline import begin
-from fluidlift.pipeline.hints import NO_HINTS, Hints
+from fluidlift.pipeline.hints import NO_HINTS, MaskHints
 from fluidlift.pipeline.inputs import GivenFiles, Inputs
 from fluidlift.pipeline.mask_facts import cleared_masks, require_unchanged, sealed
 from fluidlift.pipeline.models import allowed_models, provenance_of
@@ -30,7 +30,7 @@ def find_masks(
     folder: Path,
     config: JobConfig,
     *,
-    hints: Hints = NO_HINTS,
+    hints: MaskHints = NO_HINTS,
     force: Iterable[str] = (),
     progress: Progress | None = None,
 ) -> Written:

@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from fluidlift.io.obstacles import Obstacle
 
 __all__ = [
-    "LivePreview", "PreviewFrame", "PreviewSize", "Take", "Wish", "coarse_asset", "obstacles_of", "preview_frames",
-    "preview_scene", "thinned",
+    "LivePreview", "PreviewFrame", "PreviewRequest", "PreviewSize", "Take", "coarse_asset", "obstacles_of",
+    "preview_frames", "preview_scene", "thinned",
 ]  # fmt: skip
 
 LOG = logging.getLogger(__name__)
@@ -169,7 +169,7 @@ def rehearsals(asset: FluidAsset) -> tuple[dict[str, Any], ...]:
 
 
 @dataclass(frozen=True)
-class Wish:
+class PreviewRequest:
     """What somebody wants to see."""
 
     edits: dict[str, Any]
@@ -182,7 +182,7 @@ class Wish:
 class Take:
     """Frames of one wish, as far as they are there. Only the worker adds to it."""
 
-    wish: Wish
+    wish: PreviewRequest
     frames: list[Any] = field(default_factory=list)
     """as `keep` of the preview made them, the body at rest first"""
     total: int = 0
@@ -222,7 +222,7 @@ class LivePreview:
         self._asset, self._folder, self._size = asset, folder, size or PreviewSize()
         self._keep, self._told = keep, told
         self._news = threading.Condition()
-        self._wish: Wish | None = None
+        self._wish: PreviewRequest | None = None
         self._asked = self._done = 0
         self._held = self._closed = False
         self.shown: Take | None = None
@@ -238,7 +238,7 @@ class LivePreview:
         """Begin: kernels are compiled or read, and one frame is made, so that the first wish need not wait for it."""
         self._thread.start()
 
-    def ask(self, wish: Wish) -> int:
+    def ask(self, wish: PreviewRequest) -> int:
         """Want something else than before; the number of the wish."""
         with self._news:
             self._wish = wish
@@ -341,7 +341,7 @@ class LivePreview:
             LOG.exception("time of a live frame")
         return len(ends) > 1 and float(np.median(np.diff(ends))) > self._size.seconds
 
-    def _serve(self, coarse: FluidAsset, wish: Wish, number: int) -> None:
+    def _serve(self, coarse: FluidAsset, wish: PreviewRequest, number: int) -> None:
         """Work on a wish until it is done, or another one is there."""
 
         def other() -> bool:

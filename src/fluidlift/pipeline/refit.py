@@ -14,7 +14,7 @@ from fluidlift.config import JobConfig
 from fluidlift.config.of_asset import settings_of
 from fluidlift.errors import InputRejected
 from fluidlift.fit.outcome import in_words
-from fluidlift.io.kept_values import OF_CLIP, last_value, recalled, stage_keys, that_counts
+from fluidlift.io.kept_values import OF_CLIP, last_value, recalled, stage_keys
 from fluidlift.machine import peak_memory_mb
 from fluidlift.messages import Notice, as_plain, from_plain
 from fluidlift.pipeline.fit_request import request_of
@@ -128,10 +128,7 @@ def refit(
 
 def _recalled(runner: Runner, manifest: dict[str, Any]) -> tuple[Read, Segmentation, Geometry, Motion]:
     """What the fit starts from."""
-    keys, values = stage_keys(manifest), {}
-    for name in NEEDED:
-        stage = that_counts(name, keys)
-        values[name] = runner.recall(stage, keys[stage], OF_CLIP[name]) if stage in keys else None
+    values: dict[str, Any] = {name: runner.recall(manifest, name, OF_CLIP[name]) for name in NEEDED}
     missing = [name for name in NEEDED if values[name] is None]
     if missing:
         made = manifest.get("provenance", {}).get("versions", {})
@@ -149,8 +146,7 @@ def _recalled(runner: Runner, manifest: dict[str, Any]) -> tuple[Read, Segmentat
 
 def _elsewhere(runner: Runner, manifest: dict[str, Any]) -> tuple[Elsewhere, ...]:
     """Velocities at other times of a long clip, where `make` had some; as arguments of the fit."""
-    key = stage_keys(manifest).get(STAGE)
-    found = None if key is None else runner.recall(STAGE, key, Elsewhere)
+    found = runner.recall(manifest, STAGE, Elsewhere)
     return () if found is None else (found,)
 
 

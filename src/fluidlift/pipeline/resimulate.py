@@ -13,7 +13,7 @@ from fluidlift.config import JobConfig
 from fluidlift.config.of_asset import SECOND_HALF_SECTIONS, settings_of
 from fluidlift.errors import FluidliftError, InputRejected
 from fluidlift.io.asset_paths import asset_file
-from fluidlift.io.kept_values import OF_CLIP, stage_keys, that_counts
+from fluidlift.io.kept_values import OF_CLIP
 from fluidlift.machine import peak_memory_mb
 from fluidlift.messages import Notice, as_plain, code_of, from_plain
 from fluidlift.pipeline.runner import Runner
@@ -255,10 +255,9 @@ def write_filmed_numbers(folder: Path, found: Mapping[str, Estimate]) -> None:
 
 def recalled_lift(runner: Runner, manifest: dict[str, Any]) -> Lift | None:
     """What `make` found in the clip; None where any of it is gone, and the runner knows nothing of it then."""
-    keys, values = stage_keys(manifest), []
+    values = []
     for name, kind in OF_CLIP.items():
-        stage = that_counts(name, keys)
-        value = runner.recall(stage, keys[stage], kind) if stage in keys else None
+        value = runner.recall(manifest, name, kind)
         if value is None:
             runner.forget()
             return None

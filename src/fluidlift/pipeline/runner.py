@@ -24,7 +24,7 @@ import numpy as np
 
 from fluidlift.errors import InputRejected, MissingPackage
 from fluidlift.io.atomic import disk_errors, require_writable
-from fluidlift.io.kept_values import kept_value
+from fluidlift.io.kept_values import kept_stage, kept_value
 from fluidlift.io.stage_cache import Scratch, is_owner, mark_owner, save_stage
 from fluidlift.io.stage_codec import packed
 from fluidlift.machine import peak_memory_mb
@@ -120,14 +120,14 @@ class Runner:
         self.progress.finished(name, seconds, cached)
         return found[0]
 
-    def recall(self, name: str, key: str, kind: type[T]) -> T | None:
-        """The value of an earlier run by its key, without knowing how to make it; None where it is gone."""
-        found = kept_value(self.folder, name, key, kind)
+    def recall(self, manifest: dict[str, Any], name: str, kind: type[T]) -> T | None:
+        """The value that a stage had when the asset was made, without knowing how to make it; None where it is gone."""
+        found = kept_stage(self.folder, manifest, name, kind)
         if found is None:
             return None
-        self.keys[name] = key
-        self._note(name, found[0], key, found[1], True)
-        return found[0]
+        self.keys[found.name] = found.key
+        self._note(found.name, found.value, found.key, found.seconds, True)
+        return found.value
 
     def forget(self) -> None:
         """Know nothing of earlier runs any more."""

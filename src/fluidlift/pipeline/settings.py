@@ -14,15 +14,11 @@ from typing import Any, Literal, TypeVar
 
 from fluidlift.backends.registry import module_name, names
 from fluidlift.config import JobConfig
-from fluidlift.pipeline.inputs import GivenFile, GivenFiles, Weights
+from fluidlift.pipeline.inputs import BESIDE, GivenFile, GivenFiles, Weights
 from fluidlift.source import source_hash
 from fluidlift.types.hints import DrawnView
 
 T = TypeVar("T")
-
-
-BESIDE = {"keyed": False}
-"""metadata of a field that does not change the result"""
 
 
 def taken(kind: type[T], section: Any, **more: Any) -> T:

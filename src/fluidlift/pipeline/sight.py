@@ -1,4 +1,8 @@
-"""How the fluid stands before the camera: kind, up, visible surface, metres. The first half of the scene."""
+"""Kind of fluid, pose of the camera, visible surface and metric scale: the first half of the stage geometry.
+
+In the order of the calls: `_seen` (mask, mean motion, lens, kind, tilt), `_surface` (depth of the visible surface in
+the canonical frame, whose camera is level), `_scale` (metres per canonical unit).
+"""
 
 from __future__ import annotations
 
@@ -69,34 +73,37 @@ from fluidlift.types.kind import STREAM
 from fluidlift.types.stages import Flow, Read, Segmentation
 
 USUALLY = 0.25
-"""share of the frames in which a pixel is fluid, from which it counts to the body that may be thrown up: spray comes
-and goes"""
+"""share of the frames in which a pixel must be fluid to count as part of a body that may be thrown up: spray comes and
+goes"""
 
 
 @dataclass(frozen=True)
 class Sight:
-    """What the stages before have seen, and how the camera is taken to stand."""
+    """Kind of fluid and pose of the camera, with the evidence that they are inferred from; pixels are [h,w]."""
 
     start: int
     """frame of the body at rest"""
     united: int
     """frames in all that become one body"""
     mask: np.ndarray
+    """bool, of the body at rest"""
     motion: np.ndarray
+    """[h,w,2] px per frame, mean over the clip"""
     trust: np.ndarray
+    """confidence of `motion`, 0 to 1"""
     known: PinholeCamera
-    """its pose counts where `pose_given`"""
+    """the lens; its pose counts where `pose_given`"""
     pose_given: bool
     evidence: KindEvidence
     kind: FluidKind
-    parts: composite.Parts
+    parts: composite.BodyParts
     up: UpEvidence
     heading: float | None
     tilt_known: bool
     height: float | None
     """of the camera above the water, in the units of its file, where that is known"""
     unsure: Notice
-    """what to say of that height; empty: nothing"""
+    """warning that goes with that height; empty: none"""
     stood: standing.StandingBody | None = None
     """of a dam"""
     kind_free: bool = True
@@ -267,7 +274,7 @@ def _seen(
     if kind.starts_at_rest:
         start, united = dam.let_go(fluid), 1
         mask = fluid[start]
-        parts = composite.Parts((), mask)
+        parts = composite.BodyParts((), mask)
         stood = dam.stood(fluid, start, kinds.level_camera(known, up))
     horizon = config.drawn is not None and config.drawn.horizon is not None and up.raised == 0.0
     tilt_known = pose_given or config.pitch is not None or horizon
@@ -401,9 +408,9 @@ def _kind_and_up(
             poured = puddle.jet_over_spreading(tilt, mask) if kinds.spreads(evidence) else None
             poured = poured or puddle.jets_into_puddle(known, tilt, mask, motion, trust)
             if poured is not None:
-                kind, parts = STREAM, composite.Parts(poured.jets, poured.lying, puddle=True)
+                kind, parts = STREAM, composite.BodyParts(poured.jets, poured.lying, puddle=True)
     else:
-        parts = composite.Parts((), mask)
+        parts = composite.BodyParts((), mask)
     parts = composite.with_marks(parts, c.drawn, mask)
     if pose_given:
         return evidence, kind, parts, surveyed, heading, STEEP

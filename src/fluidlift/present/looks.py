@@ -17,8 +17,8 @@ from fluidlift.look.clear_water import absorption_in
 from fluidlift.look.display import displayed
 from fluidlift.look.environment import BUILT_IN, LUMINANCE, Environment, built_in
 from fluidlift.look.fluid_normals import OUTSIDE, fluid_depths, fluid_normals, fluid_surface
-from fluidlift.look.ground_picture import Ground, place_of
-from fluidlift.look.liquid import Behind, LiquidSurface, shaded
+from fluidlift.look.ground_picture import GroundMeshes, place_of
+from fluidlift.look.liquid import Behind, SurfaceBuffer, shaded
 from fluidlift.look.materials import WATER, Material, material_named
 from fluidlift.look.outlet_section import OpenEnd
 from fluidlift.look.rasterize import render
@@ -264,7 +264,7 @@ class Painter:
         frame: Frame,
         mesh: TriangleMesh | None,
         camera: PinholeCamera,
-        pictures: tuple[Behind, Behind, Ground | None],
+        pictures: tuple[Behind, Behind, GroundMeshes | None],
         backdrop: Backdrop,
     ) -> Lit:
         """A liquid that shows what lies behind it. pictures: as `_pictures` gives them."""
@@ -338,7 +338,7 @@ class Painter:
 
     def _pictures(
         self, camera: PinholeCamera, backdrop: Backdrop, shade: Shade
-    ) -> tuple[Behind, Behind, Ground | None]:
+    ) -> tuple[Behind, Behind, GroundMeshes | None]:
         """The picture without the fluid, beside it and through it, and the ground that is drawn in the latter; None: a
         photograph shows it."""
         if backdrop.fluid is not None:
@@ -378,8 +378,8 @@ class Painter:
         return fluid_surface(frame.fluid, 0.5 * self.terrain.grid.spacing)
 
     @cached_property
-    def _no_ground(self) -> Ground:
-        return Ground([], self.environment, self._quality.light)
+    def _no_ground(self) -> GroundMeshes:
+        return GroundMeshes([], self.environment, self._quality.light)
 
     def _glass(self, camera: PinholeCamera, backdrop: Backdrop) -> tuple[Pane, Pane] | None:
         """The vessel's walls before and behind the fluid, kept for a camera that stands still. None on a plate, which
@@ -440,7 +440,7 @@ class Painter:
         camera: PinholeCamera,
         behind: Behind,
         ends: Sequence[OpenEnd],
-    ) -> LiquidSurface:
+    ) -> SurfaceBuffer:
         fluid = frame.fluid
         if mesh is not None:
             normals = None if self._bed is None else settled(mesh.vertices, vertex_normals(mesh), self._bed, ends)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fluidlift.io.scene import SceneEdits
-from fluidlift.look.liquid import LiquidSurface
+from fluidlift.look.liquid import SurfaceBuffer
 from fluidlift.look.smoothstep import smoothstep
 from fluidlift.look.wave_relief import WaveRelief
 from fluidlift.messages import Notice
@@ -84,7 +84,7 @@ class SurfaceWaves:
             velocities[some, 2] += share[some] * found.rate
         return TriangleMesh(moved, mesh.faces, mesh.colors), velocities
 
-    def tilted(self, surface: LiquidSurface, camera: PinholeCamera, time: float) -> LiquidSurface:
+    def tilted(self, surface: SurfaceBuffer, camera: PinholeCamera, time: float) -> SurfaceBuffer:
         """A surface as a camera sees it, with normals that lean as the waves slope.
 
         Args:

@@ -15,7 +15,7 @@ import numpy as np
 from scipy import ndimage
 
 from fluidlift.look.environment import Environment
-from fluidlift.look.ground_picture import GRAY, Ground, GroundLight, place_of
+from fluidlift.look.ground_picture import GRAY, GroundLight, GroundMeshes, place_of
 from fluidlift.look.inflow import surface_level
 from fluidlift.look.liquid import Behind
 from fluidlift.look.materials import Material
@@ -90,13 +90,13 @@ class GroundPictures:
         self._lit = lit or GroundLight()
         self._grid, self._slab, self._environment, self._whole = grid, slab, environment, whole
         self.solid = slab.cut(whole, grid)
-        self._farther: tuple[tuple[bool, ...], Ground] | None = None
+        self._farther: tuple[tuple[bool, ...], GroundMeshes] | None = None
         self._plate: tuple[Backdrop, tuple, tuple[Behind, Behind]] | None = None
 
     @cached_property
-    def ground(self) -> Ground:
+    def ground(self) -> GroundMeshes:
         """As it is."""
-        return Ground([self.solid], self._environment, self._lit)
+        return GroundMeshes([self.solid], self._environment, self._lit)
 
     def light_on_floor(self, camera: PinholeCamera) -> np.ndarray:
         """Share [h,w,3] of the light that the ground leaves the floor that it stands on, 1 beside it."""
@@ -109,7 +109,7 @@ class GroundPictures:
         corners = [(middle[0] + x * reach, middle[1] + y * reach, low[2]) for x, y in SQUARE]
         floor = TriangleMesh(np.array(corners), np.array([[0, 1, 2], [0, 2, 3]]))
         empty = Behind(np.zeros(shape, np.float32), np.zeros(shape[:2], np.float32))
-        left = Ground([floor], self._environment, self._lit, casters=self.ground.casters).picture(camera, empty)
+        left = GroundMeshes([floor], self._environment, self._lit, casters=self.ground.casters).picture(camera, empty)
         in_the_open = linear_from_srgb(np.array(GRAY)) * self._environment.irradiance(np.array([0.0, 0.0, 1.0]))
         share = np.clip(left.image / np.maximum(in_the_open, 1e-6), 0.0, 1.0)
         return np.where((left.depth > 0)[..., None], share, 1.0).astype(np.float32)
@@ -122,18 +122,20 @@ class GroundPictures:
         return Beds(*(self._slab.cut(mesh, self._grid) for mesh in (found.cut, found.sunk, found.level)))
 
     @cached_property
-    def bed(self) -> Ground:
+    def bed(self) -> GroundMeshes:
         """Where a clip's plate shows fluid: no rock stands out of it, since the plate shows the rocks. It goes on
         beyond the ends. Its light is that of a white sky: under the clip's own the plate has its colours."""
         low = self._slab.carried_on(self._beds.sunk)
-        return Ground([low], WHITE, self._lit, casters=self._level.casters)
+        return GroundMeshes([low], WHITE, self._lit, casters=self._level.casters)
 
     @cached_property
-    def _around(self) -> Ground:
+    def _around(self) -> GroundMeshes:
         """Where a clip's plate shows dry ground."""
-        return Ground([self._slab.carried_on(self.solid)], WHITE, self._lit)
+        return GroundMeshes([self._slab.carried_on(self.solid)], WHITE, self._lit)
 
-    def through(self, camera: PinholeCamera, beside: Behind, far: np.ndarray, shade: Shade) -> tuple[Behind, Ground]:
+    def through(
+        self, camera: PinholeCamera, beside: Behind, far: np.ndarray, shade: Shade
+    ) -> tuple[Behind, GroundMeshes]:
         """Before the terrain: what is seen through the liquid, and the ground of that picture.
 
         Args:
@@ -148,7 +150,7 @@ class GroundPictures:
         if self._farther is None or self._farther[0] != inside:
             seen = replace(self._slab, ends=tuple(e for e, i in zip(self._slab.ends, inside, strict=True) if i))
             mesh = seen.carried_on(self._beds.level)
-            self._farther = inside, Ground([mesh], self._environment, self._lit, casters=self.ground.casters)
+            self._farther = inside, GroundMeshes([mesh], self._environment, self._lit, casters=self.ground.casters)
         low, s = self._farther[1], shade
         empty = Behind(far, np.zeros(far.shape[:2], np.float32))
         found = low.picture(camera, empty, s.caster, material=s.material, bodies=s.bodies, inset=s.inset)
@@ -163,8 +165,8 @@ class GroundPictures:
         ), self.ground
 
     @cached_property
-    def _cut(self) -> Ground:
-        return Ground([self._beds.cut], self._environment, self._lit)
+    def _cut(self) -> GroundMeshes:
+        return GroundMeshes([self._beds.cut], self._environment, self._lit)
 
     def on_plate(
         self, camera: PinholeCamera, backdrop: Backdrop, bodies: Sequence[TriangleMesh] = ()
@@ -230,8 +232,8 @@ class GroundPictures:
         return np.where(hidden & (bed > 0) & (depth > 0), bed, depth)
 
     @cached_property
-    def _level(self) -> Ground:
-        return Ground([self._slab.carried_on(self._beds.level)], WHITE, self._lit)
+    def _level(self) -> GroundMeshes:
+        return GroundMeshes([self._slab.carried_on(self._beds.level)], WHITE, self._lit)
 
     def depth_of_rocks(self, camera: PinholeCamera, depth: np.ndarray) -> np.ndarray:
         """Camera z (m) of what a clip's plate shows in its fluid, 0 beside it. A ray that misses the model of a rock

@@ -33,7 +33,7 @@ _MAX_BYTES = 256 * 2**20
 
 
 @dataclass(frozen=True)
-class Edit:
+class EditRecord:
     """One change of scene.yaml."""
 
     number: int
@@ -60,7 +60,7 @@ class Edit:
     """it is taken back at the moment, or was left behind by an edit after an undo"""
 
     @classmethod
-    def of(cls, number: int, what: str, before: str, after: str, **more: Any) -> Edit:
+    def of(cls, number: int, what: str, before: str, after: str, **more: Any) -> EditRecord:
         """The edit between two texts."""
         a, b = before.split("\n"), after.split("\n")
         head = 0
@@ -76,7 +76,7 @@ class Edit:
         )  # fmt: skip
 
     @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> Edit:
+    def from_dict(cls, data: dict[str, Any]) -> EditRecord:
         """As `to_dict` gave it; raises KeyError, TypeError, ValueError or OverflowError for other data."""
         lines = [tuple(str(x) for x in data[name]) for name in ("before", "after")]
         undoes, redoes = (None if data.get(name) is None else int(data[name]) for name in ("undoes", "redoes"))
@@ -140,7 +140,7 @@ class History:
 
     base: str
     """the text that all began with"""
-    edits: tuple[Edit, ...] = ()
+    edits: tuple[EditRecord, ...] = ()
     undoable: tuple[int, ...] = ()
     """numbers of edits, the last one to be undone first"""
     redoable: tuple[int, ...] = ()
@@ -150,14 +150,14 @@ class History:
         """Hash of the text after the last edit."""
         return self.edits[-1].new if self.edits else text_hash(self.base)
 
-    def with_edit(self, edit: Edit) -> History:
+    def with_edit(self, edit: EditRecord) -> History:
         """With one more, which must have the next number and begin where the last one ended."""
         if edit.number != len(self.edits) + 1 or edit.old != self.now:
             raise _does_not_fit()
         undo, redo = _stacks(list(self.undoable), list(self.redoable), edit)
         return History(self.base, (*self.edits, edit), tuple(undo), tuple(redo))
 
-    def __getitem__(self, number: int) -> Edit:
+    def __getitem__(self, number: int) -> EditRecord:
         return self.edits[number - 1]
 
     def text(self) -> str:
@@ -167,13 +167,13 @@ class History:
             text = edit.done_to(text)
         return text
 
-    def changes(self) -> tuple[Edit, ...]:
+    def changes(self) -> tuple[EditRecord, ...]:
         """The edits without undo and redo themselves, each saying whether it is undone."""
         own = [e for e in self.edits if e.undoes is None and e.redoes is None]
         return tuple(replace(e, undone=e.number not in self.undoable) for e in own)
 
 
-def _stacks(undo: list[int], redo: list[int], edit: Edit) -> tuple[list[int], list[int]]:
+def _stacks(undo: list[int], redo: list[int], edit: EditRecord) -> tuple[list[int], list[int]]:
     """What can be undone and redone after one more edit; an edit after an undo leaves what was undone behind."""
     if edit.undoes is None and edit.redoes is None:
         return [*undo, edit.number], []
@@ -199,7 +199,7 @@ def read_history(folder: Path) -> History | None:
         return None
     try:
         base = parse_json(lines[0])["text"]
-        edits = [Edit.from_dict(parse_json(line)) for line in lines[1:]]
+        edits = [EditRecord.from_dict(parse_json(line)) for line in lines[1:]]
         if not isinstance(base, str):
             raise TypeError("no text")
     except (ValueError, KeyError, TypeError, OverflowError) as error:
@@ -218,7 +218,7 @@ def read_history(folder: Path) -> History | None:
     return History(base, tuple(edits), tuple(undo), tuple(redo))
 
 
-def append(folder: Path, edit: Edit, *, base: str) -> None:
+def append(folder: Path, edit: EditRecord, *, base: str) -> None:
     """Write one more line; the first one begins the file with `base`."""
     path = asset_file(folder, HISTORY)
     with disk_errors(path):
@@ -252,7 +252,7 @@ def _line(data: dict[str, Any]) -> bytes:
     return (json.dumps(data, ensure_ascii=False) + "\n").encode()
 
 
-def announce(folder: Path, edit: Edit, text: str) -> None:
+def announce(folder: Path, edit: EditRecord, text: str) -> None:
     """Say what is about to happen: the edit, and scene.yaml after it."""
     write_json(asset_file(folder, PENDING), {"edit": edit.to_dict(), "text": text}, lasting=True)
 
@@ -262,14 +262,14 @@ def withdraw(folder: Path) -> None:
     asset_file(folder, PENDING).unlink(missing_ok=True)
 
 
-def announced(folder: Path) -> tuple[Edit, str] | None:
+def announced(folder: Path) -> tuple[EditRecord, str] | None:
     """An edit that a process was killed over, and scene.yaml after it; None: there is none."""
     path = asset_file(folder, PENDING)
     if not path.is_file():
         return None
     try:
         data = read_json(path, "announced edit", _MAX_BYTES)
-        edit, text = Edit.from_dict(data["edit"]), data["text"]
+        edit, text = EditRecord.from_dict(data["edit"]), data["text"]
     except (InputRejected, KeyError, TypeError, ValueError, OverflowError):
         return None
     return (edit, text) if isinstance(text, str) and text_hash(text) == edit.new else None

@@ -23,7 +23,7 @@ from fluidlift.io.scene_text import with_value, without
 from fluidlift.messages import Notice
 from fluidlift.scene import edit_history
 from fluidlift.scene.changes import Add, Change, Remove, Set
-from fluidlift.scene.edit_history import BY_HAND, Edit, History, text_hash, unified
+from fluidlift.scene.edit_history import BY_HAND, EditRecord, History, text_hash, unified
 from fluidlift.scene.forecast import outlook
 from fluidlift.scene.known_state import recalled, remember
 from fluidlift.scene.reshaping import HIGHEST
@@ -71,7 +71,7 @@ class EditSession:
         """scene.yaml as it is now, checked."""
         return read_edits(self.folder, meshes=self.meshes)
 
-    def set(self, path: str, value: Any) -> Edit | None:
+    def set(self, path: str, value: Any) -> EditRecord | None:
         """Another value at a place such as "parameters.gravity" or "obstacles.duck.position"; None takes it away.
 
         Returns:
@@ -85,11 +85,11 @@ class EditSession:
         items = self.scene[section]
         return f"{section}.{len(items) if section == 'terrain' else names_of(items)[-1]}"
 
-    def remove(self, path: str) -> Edit | None:
+    def remove(self, path: str) -> EditRecord | None:
         """Take an entry away."""
         return self.apply([Remove(path)])
 
-    def apply(self, changes: Sequence[Change], *, what: str = "") -> Edit | None:
+    def apply(self, changes: Sequence[Change], *, what: str = "") -> EditRecord | None:
         """Several changes as one edit, in their order.
 
         Args:
@@ -132,7 +132,7 @@ class EditSession:
         style = [] if self.edits.look.style != Look().style else [Set("look.style", "surface")]
         return [*physics, *style, Set("look.material", material)]
 
-    def undo(self) -> Edit:
+    def undo(self) -> EditRecord:
         """Take the last edit back.
 
         Raises:
@@ -149,7 +149,7 @@ class EditSession:
 
         return self._changed(back)
 
-    def redo(self) -> Edit:
+    def redo(self) -> EditRecord:
         """Bring back what was undone last.
 
         Raises:
@@ -164,7 +164,7 @@ class EditSession:
 
         return self._changed(again)
 
-    def reset(self) -> Edit | None:
+    def reset(self) -> EditRecord | None:
         """Back to the fluid as lifted: scene.yaml without what changes it. It can be undone."""
 
         def original(text: str, history: History) -> tuple[str, str, dict[str, int]]:
@@ -177,7 +177,7 @@ class EditSession:
         text, history = self._seen()
         return unified(_as_lifted(history.base), text)
 
-    def history(self) -> tuple[Edit, ...]:
+    def history(self) -> tuple[EditRecord, ...]:
         """All edits, the oldest first; each says whether it is undone."""
         return self._seen()[1].changes()
 
@@ -237,19 +237,19 @@ class EditSession:
 
     # --- inside -----------------------------------------------------------------------------------------------------
 
-    def _changed(self, change: Callable[[str, History], tuple[str, str, dict[str, int]]]) -> Edit:
+    def _changed(self, change: Callable[[str, History], tuple[str, str, dict[str, int]]]) -> EditRecord:
         edit = self._change(change)
         assert edit is not None  # an edit in the history changes something, back and forth
         return edit
 
-    def _change(self, change: Callable[[str, History], tuple[str, str, dict[str, int]]]) -> Edit | None:
+    def _change(self, change: Callable[[str, History], tuple[str, str, dict[str, int]]]) -> EditRecord | None:
         """Change scene.yaml and write the edit down, or neither."""
         with editing(self.folder):
             text, history = self._settled()
             new, what, links = change(text, history)
             if new == text:
                 return None
-            edit = Edit.of(len(history.edits) + 1, what, text, new, **links)
+            edit = EditRecord.of(len(history.edits) + 1, what, text, new, **links)
             edit_history.announce(self.folder, edit, new)
             try:
                 edit_history.write_scene(self.folder, new)
@@ -277,7 +277,7 @@ class EditSession:
             edit_history.append(self.folder, edit, base=history.base)
         return text, history
 
-    def _finish(self, edit: Edit, after: str) -> None:
+    def _finish(self, edit: EditRecord, after: str) -> None:
         """Do the rest of an edit that a process was killed over."""
         history = edit_history.read_history(self.folder)
         if edit.number != (0 if history is None else len(history.edits)) + 1:
@@ -295,7 +295,7 @@ class EditSession:
         if history is None:
             history = History(text)  # as it was found, whatever a person or an earlier version wrote
         if text_hash(text) != history.now:
-            edit = Edit.of(len(history.edits) + 1, BY_HAND, history.text(), text)
+            edit = EditRecord.of(len(history.edits) + 1, BY_HAND, history.text(), text)
             history = history.with_edit(edit)
         return text, history
 

@@ -53,20 +53,21 @@ meet, the motion of the film breaks off. Of 0.12, 0.3 and 0.6 a fall's current i
 clip 0.64, 0.50 and 0.35)"""
 
 LATER = 0.5
-"""of a film whose fluid is not where it was, at which it begins anew: what its later half shows is nearer to its end"""
+"""share of a film from which it begins anew where its fluid changed its place (a vessel that fills): the later half is
+nearer to where the fluid is then"""
 
 FEWEST_CELLS = 4.0
 """radius of a patch at least, cells"""
 
 UPRIGHT = 0.9
-"""cosine between gravity and straight down from which the surface has one height at each place"""
+"""cosine between gravity and straight down above which the surface is a height field"""
 
 COVERED = ((-0.6, -0.3), (0.6, 1.0))
-"""cells from the surface between which the skin takes over from what is below, and spray from the skin"""
+"""cells from the surface (negative: below) over which particles' splats fade out under the skin, and fade in above it,
+where they are spray"""
 
 LONELY = 0.3
-"""share of the surroundings of a place that are surface, below which what is there is spray; at a straight shore it is
-a half"""
+"""a place with a smaller share of surface around it is spray; at a straight shore that share is a half"""
 
 FAINT = 0.002
 """least opacity of a splat under the skin: not drawn, but there for other tools"""
@@ -93,9 +94,9 @@ SMALLEST = 0.02
 """standard deviation of a splat at least, cells: files hold its logarithm"""
 
 CALM = 1.0
-"""cells within which the surface of standing water that nobody edited is shown level: particles come to rest unevenly,
-by half a cell, and sink by as much. From flat above such a swell hides lengths of water behind it, and the film with
-the waves is laid on a plane"""
+"""cells of deviation up to which unedited standing water is shown level: particles come to rest unevenly, by half a
+cell, and sink by as much. From a low angle such a swell would hide lengths of water behind it; the film, with its
+waves, is laid on a plane"""
 
 REACH = 0.5
 """standard deviation of a splat under the skin at most, shares of its distance from the ground and `CLEAR`: wider ones

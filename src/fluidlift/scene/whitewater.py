@@ -26,7 +26,7 @@ from fluidlift.physics.whitewater import (
     FOAM,
     Ground,
     LiquidState,
-    Range,
+    PotentialRange,
     SeenBirths,
     Whitewater,
     WhitewaterLaw,
@@ -79,12 +79,12 @@ class Columns(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Measured:
+class MeasuredWhitewater:
     """What a scene as lifted, and its film, say about its white water."""
 
-    trapped: Range
-    crest: Range
-    energy: Range
+    trapped: PotentialRange
+    crest: PotentialRange
+    energy: PotentialRange
     rate: float
     """1/s"""
     share: float
@@ -125,7 +125,7 @@ class Measured:
 class Kept:
     """A measure as a stage keeps it."""
 
-    found: Measured | None
+    found: MeasuredWhitewater | None
 
 
 def kept_measure(scene: Scene, device: str) -> Kept:
@@ -133,7 +133,7 @@ def kept_measure(scene: Scene, device: str) -> Kept:
     return Kept(measured(scene, device))
 
 
-def measured(scene: Scene, device: str = "cpu", foam: FilmedFoam | None = None) -> Measured | None:
+def measured(scene: Scene, device: str = "cpu", foam: FilmedFoam | None = None) -> MeasuredWhitewater | None:
     """What a scene as lifted and its film say about white water; None where the film shows none, or there is none.
 
     Args:
@@ -182,7 +182,7 @@ class FlowWatch:
         if len(self._seen) < self.wanted and len(particles):
             self._seen.append(self._columns(particles))
 
-    def found(self) -> Measured | None:
+    def found(self) -> MeasuredWhitewater | None:
         """What was seen says about white water; None where the flow did not settle."""
         if len(self._seen) <= self._settled:
             return None
@@ -207,7 +207,9 @@ class FlowWatch:
             )
             self._mean_flow = self._mean_flow + weight * (now.velocity - self._mean_flow)
         low, high = (float(q) for q in np.quantile(now.energy[now.wet], BY_ENERGY))
-        fast = Range(low, max(high, 1.25 * low, 1e-12))  # of this frame: the jerk of the first ones is not the flow's
+        fast = PotentialRange(
+            low, max(high, 1.25 * low, 1e-12)
+        )  # of this frame: the jerk of the first ones is not the flow's
         life = life_of(fast.share(now.energy))
         shown = births_in_columns(
             self._foam, scene.camera, scene.terrain.grid, self._mean_height, self._mean_flow, lasting(life), COVERS
@@ -221,7 +223,7 @@ class FlowWatch:
         births, breaking = _apart(asked, floats, shown.number)
         self._asked.append(asked)
         self._number = shown.number
-        nothing = Range(0.0, 1.0)
+        nothing = PotentialRange(0.0, 1.0)
         seen = SeenBirths(scene.terrain.grid, births, 0.0 * births, there, breaking)
         law = WhitewaterLaw(nothing, nothing, fast, 0.0, 0.0, seen=seen)
         if self._water is None:
@@ -282,7 +284,9 @@ def columns_of(state: LiquidState, scene: Scene) -> Columns:
     )  # fmt: skip
 
 
-def _fitted(frames: list[Columns], settled: int, foam: FilmedFoam, scene: Scene, filmed: np.ndarray) -> Measured:
+def _fitted(
+    frames: list[Columns], settled: int, foam: FilmedFoam, scene: Scene, filmed: np.ndarray
+) -> MeasuredWhitewater:
     """Limits and rate by which as much of the surface foams as of the film's, with the births and the breaking at its
     places, `filmed` [2,nx,ny]. The flow has `settled` with that frame."""
     grid, seen = scene.terrain.grid, frames[settled:]
@@ -298,7 +302,7 @@ def _fitted(frames: list[Columns], settled: int, foam: FilmedFoam, scene: Scene,
     life = life_of(law.energy.share(record.energy).mean(axis=0))
     lasts, flow = lasting(life), record.velocity.mean(axis=0)
     shown = births_in_columns(foam, scene.camera, grid, height, flow, lasts, COVERS)
-    return Measured(
+    return MeasuredWhitewater(
         law.trapped,
         law.crest,
         law.energy,
@@ -322,7 +326,7 @@ def _reached(potential: Float[np.ndarray, "t nx ny"]) -> Float[np.ndarray, "nx n
 class SceneWhitewater:
     """White water beside the splats of a scene, from its first frame on."""
 
-    def __init__(self, scene: Scene, found: Measured | None) -> None:
+    def __init__(self, scene: Scene, found: MeasuredWhitewater | None) -> None:
         """
         Args:
             scene: that is simulated.

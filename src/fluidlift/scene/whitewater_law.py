@@ -18,8 +18,8 @@ from jaxtyping import Float
 from scipy import ndimage
 
 from fluidlift.look.whitewater_splats import FADING, OPACITIES, SHAPE, SIZES, FilmedFoam
-from fluidlift.numerics.block_bootstrap import LEVEL, Memory, Spread, memory_of, resampled, spread_of
-from fluidlift.physics.whitewater import LIFE, Range
+from fluidlift.numerics.block_bootstrap import LEVEL, RecordMemory, Spread, memory_of, resampled, spread_of
+from fluidlift.physics.whitewater import LIFE, PotentialRange
 from fluidlift.types import Estimate
 
 BY_ENERGY = (0.1, 0.9)
@@ -64,11 +64,11 @@ class SurfaceRecord(NamedTuple):
 class Law(NamedTuple):
     """How much of it is made."""
 
-    trapped: Range
+    trapped: PotentialRange
     """m/s"""
-    crest: Range
+    crest: PotentialRange
     """1/s"""
-    energy: Range
+    energy: PotentialRange
     """m^2/s^2"""
     rate: float
     """1/s"""
@@ -94,9 +94,9 @@ def law_of(record: SurfaceRecord, share: float, spacing: float) -> Law:
     for values in (trapped, crest):
         # SPlisHSPlasH's FoamGenerator takes the mean of the frames' maxima as well
         least, most = np.quantile(values[wet], quantile), np.mean([v[w].max(initial=0.0) for v, w in zip(values, wet)])
-        limits.append(Range(float(least), float(max(most, 1.25 * least, 1e-9))))
+        limits.append(PotentialRange(float(least), float(max(most, 1.25 * least, 1e-9))))
     low, high = (float(q) for q in np.quantile(energy[wet], BY_ENERGY))
-    fast = Range(low, max(high, 1.25 * low, 1e-12))
+    fast = PotentialRange(low, max(high, 1.25 * low, 1e-12))
     shares = (limits[0].share(trapped) + limits[1].share(crest)) * fast.share(energy) * wet
     life, lasts = _lives(shares, fast.share(energy))
     cover = carried_cover(shares.mean(axis=0), np.mean(record.velocity, axis=0), spacing, life, lasts)
@@ -147,17 +147,17 @@ def _usual(record: SurfaceRecord) -> np.ndarray:
     return np.maximum(np.array(sizes), 1e-12)[None, :, None, None]
 
 
-def _drawn_shares(foam: FilmedFoam) -> tuple[Memory, np.ndarray]:
+def _drawn_shares(foam: FilmedFoam) -> tuple[RecordMemory, np.ndarray]:
     """Of other films of as many frames that might have been."""
     if not len(foam.by_frame):
-        return Memory(1, 1, 1.0), np.full(DRAWS, foam.share)
+        return RecordMemory(1, 1, 1.0), np.full(DRAWS, foam.share)
     memory = memory_of(foam.by_frame[:, 0] / np.maximum(foam.by_frame[:, 1], 1.0))
     found, fluid = foam.by_frame[resampled(memory, DRAWS, SEED)].sum(axis=1).T
     return memory, found / np.maximum(fluid, 1.0)
 
 
 def _estimate(
-    value: float, spread: Spread, unit: str, source: str, memories: tuple[Memory, ...], level: float
+    value: float, spread: Spread, unit: str, source: str, memories: tuple[RecordMemory, ...], level: float
 ) -> Estimate:
     """With its interval; of one that is 0, or of too short a record, nothing is known."""
     if value <= 0.0 or min(m.count for m in memories) < 2:

@@ -19,6 +19,7 @@ Modules of the face:
                       simulation)
     filled_vessel     The vessel that a pour fills: a solid of revolution about a vertical axis, from the silhouette
                       of what it holds
+    fluid_found       How much of the pictures was taken for fluid, and how sure labels and flow are there
     frame_pictures    Small steady pictures of a clip of any length: a bounded sample kept, the other frames made
                       when asked for
     framing           Where the fluid lies in the picture and in time: what a mask can say against itself before a
@@ -82,6 +83,7 @@ __all__ = [
     "external_body",
     "fill",
     "filled_vessel",
+    "fluid_found",
     "frame_pictures",
     "framing",
     "generate",

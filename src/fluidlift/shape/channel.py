@@ -13,7 +13,7 @@ from fluidlift.shape import cross_section
 from fluidlift.shape.cross_section import distance_inside
 from fluidlift.shape.depth_surface import solid_heights
 from fluidlift.shape.ground_mesh import ground_mesh
-from fluidlift.shape.plan import Extent, Footage, Plan, dry_columns, extent_of, plan_of, wide_ends, with_seen
+from fluidlift.shape.plan import Extent, Plan, PlanEvidence, dry_columns, extent_of, plan_of, wide_ends, with_seen
 from fluidlift.shape.terrain import at_cells, signed_distance_from, to_corners, unit
 from fluidlift.types import CellType, FluidKind, Grid, Label, Setting, Terrain, kind_of, triple
 
@@ -62,7 +62,7 @@ class ChannelConfig:
     """whether the width is known in metres, and not that of an assumed size"""
 
 
-def channel_setting(seen: Footage, config: ChannelConfig) -> Setting:
+def channel_setting(seen: PlanEvidence, config: ChannelConfig) -> Setting:
     """A fluid that lies on something: water depth grows from the banks, rocks stand out, the ends are open.
 
     Banks and rocks are as high as the scene's depth shows them, where there is one; else banks rise from the water and
@@ -145,7 +145,7 @@ def _bed_and_banks(
     return _Ground(shown, shown, wet & ~rock)
 
 
-def _as_seen(ground: _Ground, plan: Plan, grid: Grid, seen: Footage, extent: Extent) -> _Ground:
+def _as_seen(ground: _Ground, plan: Plan, grid: Grid, seen: PlanEvidence, extent: Extent) -> _Ground:
     """Banks and rocks as high as the scene's depth shows them, and the wall that closes the channel behind its inlet.
 
     Beside what is seen, the difference to the usual ground fades away over two cells. What stands higher over the
@@ -170,7 +170,7 @@ def _as_seen(ground: _Ground, plan: Plan, grid: Grid, seen: Footage, extent: Ext
     return _Ground(bed, shown, ground.water & ~upstream)
 
 
-def _fill_channel(grid, plan, ground: _Ground, reach, seen: Footage, kind) -> Setting:
+def _fill_channel(grid, plan, ground: _Ground, reach, seen: PlanEvidence, kind) -> Setting:
     h, bed, water = grid.spacing, ground.bed, ground.water
     gx, gy = np.gradient(bed, h)
     nodes = grid.nodes()

@@ -29,10 +29,10 @@ LARGEST = 1000.0
 
 
 @dataclass(frozen=True)
-class Parts:
+class BodyParts:
     """What lies and what falls onto it, in the picture."""
 
-    outlines: tuple[jets.Outline, ...]
+    outlines: tuple[jets.JetOutline, ...]
     lying: Bool[np.ndarray, "h w"]
     """the mask without what falls, and with what that hides"""
     puddle: bool = False
@@ -62,7 +62,7 @@ def split(
     trust: Float[np.ndarray, "h w"],
     *,
     free: bool,
-) -> tuple[FluidKind, Parts]:
+) -> tuple[FluidKind, BodyParts]:
     """The kind of the lying part, and the parts.
 
     A pour whose mask is a wide puddle below narrow threads is a stream with jets: a puddle does not stand on edge.
@@ -78,26 +78,26 @@ def split(
     """
     usual = kind.pitch_prior[0] if kind.rises_from_pool else LOOKING_DOWN[0]
     tilt = up or UpEvidence(usual, 0.0, "", 0.0)
-    found: list[jets.Outline] = []
+    found: list[jets.JetOutline] = []
     neck = None
     if kind.rises_from_pool:
-        return kind, Parts(*_rising(mask, motion, trust, tilt))
+        return kind, BodyParts(*_rising(mask, motion, trust, tilt))
     if kind.runs_nearly_level:
         found = jets.find_jets(level_camera(camera, tilt), mask, motion, trust)
     elif kind.fills_vessel and free:
         neck = jets.find_neck(mask, pitch=tilt.pitch)
         kind, found = (STREAM, [neck]) if neck is not None else (kind, [])
     lying = jets.lying_pixels(mask, jets.airborne_pixels(found, mask.shape))
-    return kind, Parts(tuple(found), lying, puddle=neck is not None)
+    return kind, BodyParts(tuple(found), lying, puddle=neck is not None)
 
 
-def _rising(mask, motion, trust, tilt: UpEvidence) -> tuple[tuple[jets.Outline, ...], np.ndarray]:
+def _rising(mask, motion, trust, tilt: UpEvidence) -> tuple[tuple[jets.JetOutline, ...], np.ndarray]:
     """Columns and pool of a fountain."""
     found, pool = find_columns(mask, motion, trust, pitch=tilt.pitch)
     return tuple(found), pool
 
 
-def with_roll(up: UpEvidence, parts: Parts, camera: PinholeCamera) -> UpEvidence:
+def with_roll(up: UpEvidence, parts: BodyParts, camera: PinholeCamera) -> UpEvidence:
     """The tilt, with the roll that the jets show."""
     if not parts.outlines or any(o.nozzle is not None for o in parts.outlines):  # wind leans what is thrown up
         return up
@@ -105,7 +105,7 @@ def with_roll(up: UpEvidence, parts: Parts, camera: PinholeCamera) -> UpEvidence
     return replace(up, roll=roll, source=f"{up.source}; roll from the direction of a jet")
 
 
-def level_prior(parts: Parts, motion: Float[np.ndarray, "h w 2"], trust: Float[np.ndarray, "h w"]) -> float:
+def level_prior(parts: BodyParts, motion: Float[np.ndarray, "h w 2"], trust: Float[np.ndarray, "h w"]) -> float:
     """Share of such streams that are level: few are where jets bring all there is, nearly all where one says so."""
     if parts.level:
         return LEVEL_SAID
@@ -114,7 +114,7 @@ def level_prior(parts: Parts, motion: Float[np.ndarray, "h w 2"], trust: Float[n
 
 
 def trust_beside_jets(
-    parts: Parts, camera: PinholeCamera, motion: Float[np.ndarray, "h w 2"], trust: Float[np.ndarray, "h w"]
+    parts: BodyParts, camera: PinholeCamera, motion: Float[np.ndarray, "h w 2"], trust: Float[np.ndarray, "h w"]
 ) -> Float[np.ndarray, "h w"]:
     """Trust in the motion of what lies, none in what spreads from the foot of a jet: that is as fast as what comes down
     a chute, and says nothing of a slope."""
@@ -125,7 +125,7 @@ def trust_beside_jets(
     return trust * ~np.any(spreads, axis=0) if spreads else trust
 
 
-def with_marks(parts: Parts, drawn: DrawnView | None, mask: Bool[np.ndarray, "h w"]) -> Parts:
+def with_marks(parts: BodyParts, drawn: DrawnView | None, mask: Bool[np.ndarray, "h w"]) -> BodyParts:
     """The parts, with the ledges and pools that a person marked on the working picture."""
     if drawn is None:
         return parts
@@ -133,7 +133,7 @@ def with_marks(parts: Parts, drawn: DrawnView | None, mask: Bool[np.ndarray, "h 
     return replace(parts, ledges=ledges if ledges.any() else None, level=drawn.level)
 
 
-def unused_marks(parts: Parts, front: FrontSurface) -> list[Notice]:
+def unused_marks(parts: BodyParts, front: FrontSurface) -> list[Notice]:
     """What to say of marked ledges of which the surface holds none."""
     if parts.ledges is None or front.chutes:
         return []
@@ -161,7 +161,7 @@ class Composite:
 
 
 def standing(
-    front: FrontSurface, parts: Parts, camera: PinholeCamera, mask: Bool[np.ndarray, "h w"]
+    front: FrontSurface, parts: BodyParts, camera: PinholeCamera, mask: Bool[np.ndarray, "h w"]
 ) -> tuple[FrontSurface, Composite]:
     """The visible side with the jets on it."""
     front, found, pixels = with_columns(front, list(parts.outlines), camera, mask)

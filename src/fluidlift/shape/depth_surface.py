@@ -19,7 +19,7 @@ from fluidlift.shape.given_depth import SceneDepth, robust_plane, without_rim
 from fluidlift.shape.heights import HeightModel, ProfileHeight
 from fluidlift.shape.plume import SIGHT
 from fluidlift.shape.surface import FrontSurface, inflated_surface, intersect_height
-from fluidlift.shape.view import Scene, habit_prior
+from fluidlift.shape.view import ViewContext, habit_prior
 from fluidlift.shape.view.habit import ROLL
 from fluidlift.types import FluidKind, Grid, Label, PinholeCamera, SlopeEvidence, UpEvidence, kind_of
 from fluidlift.types.kind import STEEPEST_STREAM, STREAM
@@ -170,7 +170,7 @@ def up_from_depth(
         pitch, roll = float(np.degrees(-np.arcsin(np.clip(up[2], -1, 1)))), float(np.degrees(np.arctan2(up[0], -up[1])))
         pitches.append(pitch)
         rolls.append(roll)
-        belief.append(np.exp(habit_prior(STREAM, np.array([pitch]), Scene())[0] - 0.5 * (roll / ROLL) ** 2))
+        belief.append(np.exp(habit_prior(STREAM, np.array([pitch]), ViewContext())[0] - 0.5 * (roll / ROLL) ** 2))
     weight = share * np.asarray(belief) + 1e-30
     best = float((angles * weight).sum() / weight.sum()) if flow is not None else 0.0
     k = int(np.argmin(np.abs(angles - best)))

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
-from fluidlift.shape.jets import TRUSTED, Outline
+from fluidlift.shape.jets import TRUSTED, JetOutline
 from fluidlift.shape.region import largest_piece
 
 MOVES = 0.25
@@ -36,7 +36,7 @@ def find_columns(
     trust: Float[np.ndarray, "h w"],
     *,
     pitch: float,
-) -> tuple[list[Outline], Bool[np.ndarray, "h w"]]:
+) -> tuple[list[JetOutline], Bool[np.ndarray, "h w"]]:
     """Columns of water in the air, and the pixels of their pool with what they hide of it; no columns where nothing
     moves along the vertical.
 
@@ -50,7 +50,7 @@ def find_columns(
     airborne = _in_the_air(whole, mask, motion, trust)
     if not airborne.any():
         return [], mask
-    found: list[Outline] = []
+    found: list[JetOutline] = []
     label, count = ndimage.label(airborne)
     for number in range(1, count + 1):
         part = label == number
@@ -98,7 +98,7 @@ def _in_the_air(whole: np.ndarray, mask: np.ndarray, motion: np.ndarray, trust: 
     return whole & (rows >= top) & (rows <= end)
 
 
-def _pool(whole: np.ndarray, airborne: np.ndarray, columns: list[Outline], pitch: float) -> np.ndarray:
+def _pool(whole: np.ndarray, airborne: np.ndarray, columns: list[JetOutline], pitch: float) -> np.ndarray:
     """bool [h,w]: what lies, with what the columns hide of it. Basins are convex, or cut by the picture's edge."""
     landing = np.any([_landing(column, whole.shape, pitch) for column in columns], axis=0)
     far = int(np.flatnonzero(landing.any(axis=1))[0])
@@ -113,7 +113,7 @@ def _pool(whole: np.ndarray, airborne: np.ndarray, columns: list[Outline], pitch
     return (out > 0) & (seen | (airborne & (rows >= far)))
 
 
-def _column(part: np.ndarray, motion: np.ndarray, trust: np.ndarray) -> Outline:
+def _column(part: np.ndarray, motion: np.ndarray, trust: np.ndarray) -> JetOutline:
     """Middle, width and nozzle of one column."""
     rows = np.flatnonzero(part.any(axis=1))
     top, foot = float(rows[0]), float(rows[-1] + 1)
@@ -129,7 +129,9 @@ def _column(part: np.ndarray, motion: np.ndarray, trust: np.ndarray) -> Outline:
     middle = np.full(len(at), np.average(centers, weights=halves))
     widths = np.concatenate([[0.5 * halves[0]], halves, [halves[-1]]])
     # its upper edge is where drops turn, no rim of a top
-    return Outline(part, np.stack([middle, at], axis=1), widths, cut=True, nozzle=_nozzle(part, motion, trust, edges))
+    return JetOutline(
+        part, np.stack([middle, at], axis=1), widths, cut=True, nozzle=_nozzle(part, motion, trust, edges)
+    )
 
 
 def _nozzle(part: np.ndarray, motion: np.ndarray, trust: np.ndarray, edges: np.ndarray) -> tuple[float, float]:
@@ -143,7 +145,7 @@ def _nozzle(part: np.ndarray, motion: np.ndarray, trust: np.ndarray, edges: np.n
     return float(np.average(columns, weights=np.maximum(weight, 1e-9))), foot
 
 
-def _landing(column: Outline, shape: tuple[int, int], pitch: float) -> np.ndarray:
+def _landing(column: JetOutline, shape: tuple[int, int], pitch: float) -> np.ndarray:
     """bool [h,w]: the circle that the column lands in, as the camera sees it."""
     (u, v), half = column.centers[-1], BEYOND * float(column.half_widths.max())
     flat = max(half * np.sin(np.radians(max(pitch, 3.0))), 2.0)

@@ -35,7 +35,7 @@ def setting_around(
 ) -> Setting:
     """Terrain and cells around a surface, whose size is known `in_metres` or assumed; `pool`, pixels that lie
     whether they are seen to or not; what is known beside it goes to
-    `plan.Footage`."""
+    `plan.PlanEvidence`."""
     mask = generate.united_mask(fluid[start : start + united])
     mask = mask if pool is None else mask | pool
     visible = mask & (depth > 0)
@@ -45,7 +45,7 @@ def setting_around(
         labels = seen_labels(fluid, start, united, falls)
         labels = labels if pool is None else np.where(pool, Label.FLUID, labels).astype(np.uint8)
         height = registration.PlacedHeight(front.height, to_world)
-        seen = plan.Footage(height, labels, near, camera, bulk, ever=fluid.any_frame(), **known)
+        seen = plan.PlanEvidence(height, labels, near, camera, bulk, ever=fluid.any_frame(), **known)
         return channel.channel_setting(
             seen, channel.ChannelConfig(kind, c.cells, c.cell_limit, c.depth_ratio, in_metres)
         )
@@ -73,7 +73,7 @@ def seen_labels(fluid, start: int, united: int, falls: np.ndarray) -> np.ndarray
     return np.where(solid, Label.SOLID, np.where(lying, Label.FLUID, Label.BACKGROUND)).astype(np.uint8)
 
 
-def textured(setting: Setting, view: ground_texture.View) -> Setting:
+def textured(setting: Setting, view: ground_texture.GroundView) -> Setting:
     """The setting, its terrain with the picture on it."""
     solid = setting.terrain
     mesh = ground_texture.textured(solid.mesh, solid.grid, cast(np.ndarray, setting.surface_height), view)

@@ -88,7 +88,7 @@ JOINT = 3
 
 
 @dataclass(frozen=True)
-class View:
+class GroundView:
     """What the ground was seen as."""
 
     plate: UInt8[np.ndarray, "h w 3"]
@@ -124,7 +124,7 @@ class _Map:
 
 
 def textured(
-    mesh: TriangleMesh, grid: Grid, level: Float[np.ndarray, "nx ny"], view: View, *, longest: int = LONGEST
+    mesh: TriangleMesh, grid: Grid, level: Float[np.ndarray, "nx ny"], view: GroundView, *, longest: int = LONGEST
 ) -> TriangleMesh:
     """A terrain's block with a texture, and with vertex colours taken from it.
 
@@ -227,7 +227,7 @@ def _texel(top: np.ndarray, camera: PinholeCamera, longest: int) -> float:
     return float(max(fine, size / longest, np.sqrt(area / (PER_PIXEL * camera.size[0] * camera.size[1]))))
 
 
-def _map(top: np.ndarray, level: np.ndarray, view: View, texel: float) -> _Map:
+def _map(top: np.ndarray, level: np.ndarray, view: GroundView, texel: float) -> _Map:
     """What the picture shows of the ground."""
     camera = view.camera
     low, size = top[0, 0, :2], top[-1, -1, :2] - top[0, 0, :2]

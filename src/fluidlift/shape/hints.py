@@ -18,7 +18,7 @@ from fluidlift.shape.evidence import Evidence
 from fluidlift.shape.min_cut import edge_weights, geodesic_distance, min_cut
 
 Point = tuple[float, float, int]
-"""x, y in px of the clip, 1 for fluid or 0 for none"""
+"""x, y in px of the clip, 1 (or True) for fluid or 0 (False) for none"""
 
 RADIUS = 3
 """px at working size: a click is a disc of this size"""

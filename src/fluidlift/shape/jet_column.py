@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from fluidlift.errors import require
-from fluidlift.shape.jets import Outline
+from fluidlift.shape.jets import JetOutline
 from fluidlift.shape.surface import FrontSurface
 from fluidlift.types import PinholeCamera, Similarity3
 
@@ -91,7 +91,7 @@ class Jet:
         return cls((float(x), float(y)), np.asarray(data["z"], float), np.asarray(data["radius"], float), nozzle)
 
 
-def stand(outline: Outline, camera: PinholeCamera, front: FrontSurface) -> Jet | None:
+def stand(outline: JetOutline, camera: PinholeCamera, front: FrontSurface) -> Jet | None:
     """The jet on the surface of the lying part; None where its foot is not on it.
 
     The lowest point of the silhouette is the near side of its foot, a radius before the axis.
@@ -141,7 +141,7 @@ def stand(outline: Outline, camera: PinholeCamera, front: FrontSurface) -> Jet |
 
 
 def with_columns(
-    front: FrontSurface, outlines: list[Outline], camera: PinholeCamera, mask: Bool[np.ndarray, "h w"]
+    front: FrontSurface, outlines: list[JetOutline], camera: PinholeCamera, mask: Bool[np.ndarray, "h w"]
 ) -> tuple[FrontSurface, list[Jet], Bool[np.ndarray, "h w"]]:
     """The visible side of the lying part and the jets above it, whichever is nearer; the jets; and where they are seen.
 

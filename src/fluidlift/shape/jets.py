@@ -58,7 +58,7 @@ vessel seen from the side is filled by a jet of a third of its width, and less o
 
 
 @dataclass(frozen=True)
-class Outline:
+class JetOutline:
     """A jet in the picture."""
 
     pixels: Bool[np.ndarray, "h w"]
@@ -87,7 +87,7 @@ def find_jets(
     mask: Bool[np.ndarray, "h w"],
     motion: Float[np.ndarray, "h w 2"],
     trust: Float[np.ndarray, "h w"],
-) -> list[Outline]:
+) -> list[JetOutline]:
     """Jets that fall onto a fluid which lies below them; none unless the evidence is strong (see the module).
 
     Args:
@@ -158,7 +158,7 @@ def _robust_fit(terms, values, weight, start) -> tuple[np.ndarray, float, np.nda
 
 def _outline(
     part: np.ndarray, mask: np.ndarray, direction: np.ndarray, upright: float, *, hidden_above: bool
-) -> Outline | None:
+) -> JetOutline | None:
     """Axis and widths of a falling part, completed up to the edge of the fluid and down to the surface; None where
     fluid goes on above it that it may not hide. `upright`: how long the vertical appears, of its true length."""
     direction = direction / np.linalg.norm(direction)
@@ -195,7 +195,7 @@ def _outline(
     return None if leans and foot - top > half else outline
 
 
-def _stations(whole: np.ndarray, direction: np.ndarray, across: np.ndarray, middle: float, ends) -> Outline:
+def _stations(whole: np.ndarray, direction: np.ndarray, across: np.ndarray, middle: float, ends) -> JetOutline:
     """Centre and half width at some places between its ends (slices): the top, the foot as far as it is seen, and where
     it meets the ground."""
     rows, cols = np.nonzero(whole)
@@ -218,10 +218,10 @@ def _stations(whole: np.ndarray, direction: np.ndarray, across: np.ndarray, midd
     height, width = whole.shape
     u, v = points[0] - 1.5 * direction
     cut = not (1.0 < u < width - 1.0 and 1.0 < v < height - 1.0)
-    return Outline(whole, points, np.array([halves[0], *halves, halves[-1]]), cut)
+    return JetOutline(whole, points, np.array([halves[0], *halves, halves[-1]]), cut)
 
 
-def _lands(outline: Outline, mask: np.ndarray, falls: np.ndarray, trust: np.ndarray) -> bool:
+def _lands(outline: JetOutline, mask: np.ndarray, falls: np.ndarray, trust: np.ndarray) -> bool:
     """Whether its motion ends on fluid: within its width below the foot there is fluid that falls much less."""
     step = outline.centers[-1] - outline.centers[-2]
     length = float(np.linalg.norm(step))
@@ -244,7 +244,7 @@ def _lands(outline: Outline, mask: np.ndarray, falls: np.ndarray, trust: np.ndar
 
 
 def feed_all(
-    outlines: list[Outline],
+    outlines: list[JetOutline],
     lying: Bool[np.ndarray, "h w"],
     motion: Float[np.ndarray, "h w 2"],
     trust: Float[np.ndarray, "h w"],
@@ -274,7 +274,7 @@ def feed_all(
     return float((over > slow).sum()) < ENTERS * m * float(np.sqrt(known.sum()))
 
 
-def find_neck(mask: Bool[np.ndarray, "h w"], *, pitch: float = 35.0) -> Outline | None:
+def find_neck(mask: Bool[np.ndarray, "h w"], *, pitch: float = 35.0) -> JetOutline | None:
     """Threads that hang into a wide puddle, from the silhouette alone; None where it does not show them.
 
     For jets without texture: a narrow part at the top of the mask (rows at most `NECK_SHARE` as wide as the widest),
@@ -312,7 +312,7 @@ def find_neck(mask: Bool[np.ndarray, "h w"], *, pitch: float = 35.0) -> Outline 
     return replace(outline, half_widths=np.minimum.accumulate(outline.half_widths))
 
 
-def airborne_pixels(outlines: list[Outline], shape: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
+def airborne_pixels(outlines: list[JetOutline], shape: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
     """All pixels of the jets."""
     out = np.zeros(shape, bool)
     for outline in outlines:
@@ -337,7 +337,7 @@ def lying_pixels(mask: Bool[np.ndarray, "h w"], airborne: Bool[np.ndarray, "h w"
     return lying | (airborne & (np.arange(mask.shape[0])[:, None] >= line[None]))
 
 
-def roll_of(outlines: list[Outline], camera: PinholeCamera) -> float:
+def roll_of(outlines: list[JetOutline], camera: PinholeCamera) -> float:
     """Degrees clockwise by which the picture is turned, as far as jets say so against the habit of holding a camera
     level (`view.habit.ROLL`); weighted by how well an axis is known from an outline of its length and width.
 

@@ -28,12 +28,13 @@ KINDS: tuple[str, ...] = tuple(name for name, kind in FLUID_KINDS.items() if kin
 """names of the kinds whose evidence is weighed"""
 
 LEAST_SURE = 0.7
-"""share of the belief below which a user is told what else it could be: of 34 real clips, each judged by the others, 9
-are, one of the two wrong ones among them; of 68 parts of their pictures 26 are, and 14 of the 23 wrong ones"""
+"""probability of the kind below which a user is warned and told the next one: so 9 of 34 real clips (each judged by
+weights fitted to the others), one of the two wrong ones among them; 26 of 68 parts of their pictures, 14 of the 23
+wrong ones"""
 FOLLOWED = 0.3
-"""share of the fluid that is seen to fall with reliable flow, from which it is followed. Under gravity h metres take
-0.45 s times the root of h, so of a jet a few decimetres long a pixel moves by more per frame than its own pattern: of
-six pours 0 to 0.09 of the fluid is seen to fall so, of five falls and fountains 0.27 to 0.57"""
+"""share of the fluid that reliable flow sees falling, from which the flow counts as able to follow it. A fall of h
+metres takes 0.45 s times the root of h, so a jet of a few decimetres moves farther per frame than its pattern is wide:
+in six pours 0 to 0.09 of the fluid is seen to fall, in five falls and fountains 0.27 to 0.57"""
 RECEDES = (1.0, 1.5)
 """growth of the log of the wander over the picture's height (`open_water.recession`) from which a fluid may lie, and
 from which it does: six falls and fountains have -0.6 to 0.9, eleven of 16 streams, seas and brooks 1.0 to 3.3"""

@@ -62,7 +62,7 @@ class _Sheet:
 
 
 @dataclass(frozen=True)
-class Outline:
+class OutlineFlow:
     """What the water does at the outline of something dry, in speeds of the sheet at the same height; nan: not seen."""
 
     enters: float
@@ -127,7 +127,7 @@ def near_occluders(hidden: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
 
 
 @dataclass(frozen=True)
-class Behind:
+class HiddenFluid:
     """What hidden fluid is taken to look like: as what is seen beside it, mirrored at the outline of what hides it."""
 
     hidden: Bool[np.ndarray, "h w"]
@@ -135,7 +135,7 @@ class Behind:
     """row and column that lends its look to each hidden pixel, in the order of `numpy.nonzero`"""
 
     @classmethod
-    def of(cls, hidden: Bool[np.ndarray, "h w"], fluid: Bool[np.ndarray, "h w"]) -> Behind:
+    def of(cls, hidden: Bool[np.ndarray, "h w"], fluid: Bool[np.ndarray, "h w"]) -> HiddenFluid:
         """Of the seen fluid at the same height, on the nearer side; of the nearest fluid where there is none."""
         clear = fluid & ~near_occluders(hidden)
         clear = clear if clear.any() else fluid & ~hidden
@@ -165,7 +165,7 @@ class Pictures:
     """Pictures [T,H,W,...], completed one by one when they are asked for."""
 
     frames: np.ndarray
-    behind: Behind
+    behind: HiddenFluid
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -226,7 +226,7 @@ def _enclosed(sheet: _Sheet) -> np.ndarray:
     return sheet.dry & above & ((left & right) | below)
 
 
-def at_outline(sheet: _Sheet, piece: Bool[np.ndarray, "h w"]) -> Outline:
+def at_outline(sheet: _Sheet, piece: Bool[np.ndarray, "h w"]) -> OutlineFlow:
     """What the water does at the outline of a dry piece of the turned picture."""
     rows, columns = np.nonzero(piece)
     half = 0.5 * float(np.ptp(columns) + 1)
@@ -247,7 +247,7 @@ def at_outline(sheet: _Sheet, piece: Bool[np.ndarray, "h w"]) -> Outline:
     )
     seen = [s for s in sides if np.isfinite(s)]
     narrow = (half / (half + 1.5 * sheet.gap)) ** 2
-    return Outline(enters, leaves, float(np.mean(seen)) if seen else float("nan"), float(narrow))
+    return OutlineFlow(enters, leaves, float(np.mean(seen)) if seen else float("nan"), float(narrow))
 
 
 def _usual(sheet: _Sheet, piece: np.ndarray, reach: float) -> np.ndarray:

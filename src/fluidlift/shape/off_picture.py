@@ -32,7 +32,7 @@ def continued(
     if setting.surface_height is None:
         return Gaussians.empty(), hull
     grid = setting.terrain.grid
-    level = _Level(setting)
+    level = _SurfaceHeight(setting)
     pattern = np.flatnonzero(
         in_picture(front.means, camera) & clear_of_shore(front.means, level(front.means[:, :2]), setting.terrain)
     )
@@ -64,7 +64,7 @@ def in_picture(points: Float[np.ndarray, "n 3"], camera: PinholeCamera) -> Bool[
 
 def _unseen_places(setting: Setting, camera: PinholeCamera) -> Float[np.ndarray, "n 3"]:
     """Middles of half cells in plan, on the surface of the body off the picture, m."""
-    grid, level = setting.terrain.grid, _Level(setting)
+    grid, level = setting.terrain.grid, _SurfaceHeight(setting)
     wet = body_cells(setting).any(axis=2)
     at = np.argwhere(np.kron(wet, np.ones((2, 2), bool)))
     xy = grid.low[:2] + (at + 0.5) * 0.5 * grid.spacing
@@ -78,7 +78,7 @@ def _half_cells(points: np.ndarray, setting: Setting) -> tuple[np.ndarray, np.nd
     return tuple(np.clip(index, 0, 2 * np.asarray(grid.shape[:2]) - 1).T)
 
 
-class _Level:
+class _SurfaceHeight:
     """(x, y [n,2]) -> z [n] of the free surface, m, between the columns of a setting."""
 
     def __init__(self, setting: Setting) -> None:

@@ -27,7 +27,7 @@ side decide on metres of water"""
 
 
 @dataclass(frozen=True)
-class Footage:
+class PlanEvidence:
     """What the picture says about a fluid that lies on something."""
 
     surface: HeightModel
@@ -101,7 +101,7 @@ class Extent:
     """the seen points in it"""
 
 
-def extent_of(seen: Footage) -> Extent:
+def extent_of(seen: PlanEvidence) -> Extent:
     """Extent of a stream from a coarse plan, opened by a disc of a twentieth of its width.
 
     Threads at the rim of a mask, and what a grazing view stretches, would otherwise decide how large the box is.
@@ -141,7 +141,7 @@ def extent_of(seen: Footage) -> Extent:
     )
 
 
-def _not_grazing(seen: Footage, plan: Plan, grid: Grid) -> np.ndarray:
+def _not_grazing(seen: PlanEvidence, plan: Plan, grid: Grid) -> np.ndarray:
     """Columns that are seen steeply enough."""
     points = np.concatenate([grid.centers()[:, :, 0, :2], plan.level[..., None]], axis=-1)
     # of the surface at large: its waves do not decide
@@ -176,7 +176,7 @@ def _width(wet: np.ndarray, spacing: float, closed: bool) -> float:
     return 2.0 / 0.9 * float(np.percentile(distance_inside(wet, spacing)[wet], share))
 
 
-def plan_of(seen: Footage, grid: Grid, extent: Extent | None = None) -> Plan:
+def plan_of(seen: PlanEvidence, grid: Grid, extent: Extent | None = None) -> Plan:
     """Look up each column of a grid in the picture.
 
     Args:
@@ -214,7 +214,7 @@ def plan_of(seen: Footage, grid: Grid, extent: Extent | None = None) -> Plan:
     return Plan(label, level, s, speed, known)
 
 
-def dry_columns(seen: Footage, plan: Plan, grid: Grid) -> Bool[np.ndarray, "nx ny"]:
+def dry_columns(seen: PlanEvidence, plan: Plan, grid: Grid) -> Bool[np.ndarray, "nx ny"]:
     """Columns that are seen, and that no water covers in the whole clip."""
     if seen.ever is None:
         return np.zeros(plan.label.shape, bool)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from fluidlift.shape.jets import Outline, airborne_pixels, find_jets, find_neck, lying_pixels
+from fluidlift.shape.jets import JetOutline, airborne_pixels, find_jets, find_neck, lying_pixels
 from fluidlift.shape.kind import level_camera
 from fluidlift.shape.region import largest_piece
 from fluidlift.shape.view.roundness import POOL_LIKENESS, fit_ellipse
@@ -31,7 +31,7 @@ level surface (`POOL_SPREAD` at 95 %)"""
 class Poured:
     """What is poured, and the pool it ends in."""
 
-    jets: tuple[Outline, ...]
+    jets: tuple[JetOutline, ...]
     lying: Bool[np.ndarray, "h w"]
     """pixels of the pool, with what the jets hide of it"""
 
@@ -69,7 +69,7 @@ def jet_over_spreading(up: UpEvidence | None, mask: Bool[np.ndarray, "h w"]) -> 
     return None if neck is None else _poured([neck], up, mask)
 
 
-def _poured(found: list[Outline], up: UpEvidence | None, mask: np.ndarray) -> Poured | None:
+def _poured(found: list[JetOutline], up: UpEvidence | None, mask: np.ndarray) -> Poured | None:
     """The jets with their pool, where that is one that is seen from above."""
     airborne = airborne_pixels(found, mask.shape)
     # wet traces on a bowl's rim, and what is left of a jet at the picture's edge, have no part in the outline
@@ -82,11 +82,11 @@ def _poured(found: list[Outline], up: UpEvidence | None, mask: np.ndarray) -> Po
 
 
 def down_to_landing(
-    outline: Outline,
+    outline: JetOutline,
     mask: Bool[np.ndarray, "h w"],
     motion: Float[np.ndarray, "h w 2"],
     trust: Float[np.ndarray, "h w"],
-) -> Outline:
+) -> JetOutline:
     """An outline that ends where its motion is lost, drawn on to where it lands.
 
     What lands within a frame is not seen again: optical flow ends a frame's way above the pool. How much of that way

@@ -23,7 +23,7 @@ from scipy.ndimage import distance_transform_edt
 
 from fluidlift.errors import InputRejected, require
 from fluidlift.numerics.harmonics import basis
-from fluidlift.numerics.splatting import View
+from fluidlift.numerics.splatting import SplatCamera
 from fluidlift.numerics.splatting_torch import NumbaRasterizer, rotation_matrices
 from fluidlift.seams import Rasterizer
 from fluidlift.shape.losses import (
@@ -36,7 +36,7 @@ from fluidlift.shape.losses import (
     volume_loss,
 )  # fmt: skip
 from fluidlift.shape.regression_guard import (
-    Frame,
+    LossFrame,
     ShapeFigures,
     broken,
     neighbours,
@@ -121,7 +121,7 @@ def refine(
         raise InputRejected("an empty fluid mask", "at least one fluid pixel in the frame to refine on")
     weights = weights or LossWeights()
     camera = camera if camera.size == (width, height) else camera.resized((width, height))
-    frame = Frame.of(image, mask, camera, plain_color(image, mask, background))
+    frame = LossFrame.of(image, mask, camera, plain_color(image, mask, background))
     picture, first = picture_and_figures(gaussians.select(_in_front(gaussians, frame.view)), frame)
     before = psnr(picture, frame)
     if first.coverage < 1e-4:
@@ -139,7 +139,7 @@ def refine(
 class _Raw:
     """The optimiser's variables (never seen outside this module) and Adam on them."""
 
-    def __init__(self, gaussians: Gaussians, view: View) -> None:
+    def __init__(self, gaussians: Gaussians, view: SplatCamera) -> None:
         rotation = np.asarray(view.rotation, np.float32)
         self.rotation = torch.from_numpy(rotation)
         depth = (gaussians.means @ rotation.T + np.float32(view.translation))[:, 2]
@@ -212,7 +212,7 @@ class _Raw:
 
 
 def _run(
-    gaussians: Gaussians, frame: Frame, start: tuple[ShapeFigures, float], iterations: int,
+    gaussians: Gaussians, frame: LossFrame, start: tuple[ShapeFigures, float], iterations: int,
     step: Callable[..., tuple[float, torch.Tensor]], seed: int, max_gaussians: int,
     progress: Callable[[int, int], None] | None,
 ) -> RefineResult:  # fmt: skip
@@ -266,7 +266,7 @@ def _run(
     return RefineResult(best, history, before, after, True, tuple(notes))
 
 
-def _in_front(gaussians: Gaussians, view: View) -> np.ndarray:
+def _in_front(gaussians: Gaussians, view: SplatCamera) -> np.ndarray:
     """bool [n]: finite and in front of the camera; the others take no part."""
     z = gaussians.means @ np.float32(view.rotation[2]) + np.float32(view.translation[2])
     finite = np.isfinite(gaussians.scales).all(1) & np.isfinite(gaussians.opacities) & np.isfinite(z)
@@ -274,7 +274,7 @@ def _in_front(gaussians: Gaussians, view: View) -> np.ndarray:
 
 
 def _step(
-    raw: _Raw, frame: Frame, unit: float, pace: float, *, weights: LossWeights, rasterizer: Rasterizer
+    raw: _Raw, frame: LossFrame, unit: float, pace: float, *, weights: LossWeights, rasterizer: Rasterizer
 ) -> tuple[float, torch.Tensor]:
     """One iteration; the loss and how hard the picture pulls at each Gaussian's centre (normalised coordinates)."""
     free = {k: v.detach().requires_grad_() for k, v in raw.free.items()}
@@ -300,7 +300,9 @@ def _step(
     return float(loss.detach()), splatted.pull().to(means.device).norm(dim=1) * (0.5 * max(frame.view.size))
 
 
-def _densify(raw: _Raw, pushes: torch.Tensor, room: int, view: View, depth: np.ndarray, rng: torch.Generator) -> None:
+def _densify(
+    raw: _Raw, pushes: torch.Tensor, room: int, view: SplatCamera, depth: np.ndarray, rng: torch.Generator
+) -> None:
     """More Gaussians where the picture pulls hardest: large ones are split, small ones cloned.
 
     A split moves the halves apart along the axis that is longest across the line of sight, and along it as the visible
@@ -343,7 +345,7 @@ def _densify(raw: _Raw, pushes: torch.Tensor, room: int, view: View, depth: np.n
 
 
 def _surface_step(
-    view: View, depth: np.ndarray, middle: np.ndarray, move: np.ndarray, scale: np.ndarray
+    view: SplatCamera, depth: np.ndarray, middle: np.ndarray, move: np.ndarray, scale: np.ndarray
 ) -> Float[np.ndarray, " n"]:
     """How far (m) along the line of sight the visible surface runs under a move across it; 0 away from the surface."""
     (u0, v0), z0 = _pixels(view, middle)
@@ -359,7 +361,7 @@ def _surface_step(
     return out
 
 
-def _pixels(view: View, points: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
+def _pixels(view: SplatCamera, points: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
     """Column and row (int64) of points, and their camera z (m)."""
     x = points @ np.float32(view.rotation.T) + np.float32(view.translation)
     focal, center = np.array(view.focal, np.float32), np.array(view.center, np.float32)
@@ -368,7 +370,7 @@ def _pixels(view: View, points: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarra
     return (column, row), x[:, 2]
 
 
-def _prune_background(raw: _Raw, frame: Frame) -> int:
+def _prune_background(raw: _Raw, frame: LossFrame) -> int:
     """Drop what turned into background: its colour, or transparent, and at the border of the mask or outside it.
 
     Generated bodies bridge rocks and reefs. On a plain background the picture asks for its colour there, and what has
@@ -383,7 +385,7 @@ def _prune_background(raw: _Raw, frame: Frame) -> int:
     return int(gone.sum())
 
 
-def _at_border(means: np.ndarray, frame: Frame) -> Bool[np.ndarray, " n"]:
+def _at_border(means: np.ndarray, frame: LossFrame) -> Bool[np.ndarray, " n"]:
     """Centres within the cut-out that lie outside the mask or within `BORDER` px of its edge."""
     (column, row), _ = _pixels(frame.view, means)
     height, width = frame.mask.shape
@@ -394,7 +396,7 @@ def _at_border(means: np.ndarray, frame: Frame) -> Bool[np.ndarray, " n"]:
     return outer
 
 
-def _wash_border(raw: _Raw, frame: Frame) -> None:
+def _wash_border(raw: _Raw, frame: LossFrame) -> None:
     """Take the background's tint from Gaussians at the border: their hue is that of the nearest pixel well inside."""
     means, _, _, colors = raw.activated(raw.free)
     deep = cv2.erode(frame.mask.astype(np.uint8), np.ones((2 * BORDER + 1,) * 2, np.uint8), borderValue=1) > 0

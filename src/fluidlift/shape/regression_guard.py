@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fluidlift.errors import require
-from fluidlift.numerics.splatting import View, bin_tiles, project, rasterize
+from fluidlift.numerics.splatting import SplatCamera, bin_tiles, project, rasterize
 from fluidlift.types import triple
 from fluidlift.types.camera import PinholeCamera
 from fluidlift.types.gaussians import SH_C0, Gaussians
@@ -25,10 +25,10 @@ MARGIN = 12
 
 
 @dataclass(frozen=True)
-class Frame:
+class LossFrame:
     """The part of the frame around the mask, as the loss needs it."""
 
-    view: View
+    view: SplatCamera
     target: np.ndarray
     """[h,w,3], composited on the plain background"""
     weight: np.ndarray
@@ -39,7 +39,9 @@ class Frame:
     """[h,w]: camera z of the body before the refinement, m; NaN where it is not to be held"""
 
     @classmethod
-    def of(cls, image: np.ndarray, mask: np.ndarray, camera: PinholeCamera, plain: tuple[float, float, float]) -> Frame:
+    def of(
+        cls, image: np.ndarray, mask: np.ndarray, camera: PinholeCamera, plain: tuple[float, float, float]
+    ) -> LossFrame:
         rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
         y0, y1 = max(0, rows[0] - MARGIN), min(mask.shape[0], rows[-1] + 1 + MARGIN)
         x0, x1 = max(0, columns[0] - MARGIN), min(mask.shape[1], columns[-1] + 1 + MARGIN)
@@ -47,12 +49,13 @@ class Frame:
         picture = np.where(inside[..., None], image[y0:y1, x0:x1].astype(np.float32) / 255, np.array(plain, np.float32))
         near = cv2.dilate(inside.astype(np.uint8), np.ones((2 * MARGIN + 1,) * 2, np.uint8))
         pose, (cx, cy) = camera.camera_from_world, camera.center
-        view = View(pose.rotation, pose.translation, camera.focal, (cx - x0, cy - y0), (int(x1 - x0), int(y1 - y0)))
+        center, size = (cx - x0, cy - y0), (int(x1 - x0), int(y1 - y0))
+        view = SplatCamera(pose.rotation, pose.translation, camera.focal, center, size)
         unknown = np.full(inside.shape, np.nan, np.float32)
         near, own = near.astype(np.float32), triple(map(float, plain))
         return cls(view, picture.astype(np.float32), near, inside, own, unknown)
 
-    def before_another_color(self) -> Frame:
+    def before_another_color(self) -> LossFrame:
         """The same on the complementary plain background."""
         plain = triple(1 - p for p in self.plain)
         target = np.where(self.mask[..., None], self.target, np.array(plain, np.float32))
@@ -75,8 +78,8 @@ def plain_color(image: np.ndarray, mask: np.ndarray, background: object) -> tupl
 
 
 def neighbours(
-    frame: Frame, gaussians: Gaussians, before: ShapeFigures, angles: tuple[float, ...] = NEIGHBOURS
-) -> list[Frame]:
+    frame: LossFrame, gaussians: Gaussians, before: ShapeFigures, angles: tuple[float, ...] = NEIGHBOURS
+) -> list[LossFrame]:
     """What the same frame would look like from the sides, by its depth before the refinement.
 
     The camera turns about the middle of the body, left, right, up and down by each angle (degrees). Every pixel of the
@@ -125,7 +128,7 @@ class ShapeFigures:
     """side of the square with the area of the mask, at the depth of the body, m"""
 
 
-def picture_and_figures(gaussians: Gaussians, frame: Frame) -> tuple[Float[np.ndarray, "h w 3"], ShapeFigures]:
+def picture_and_figures(gaussians: Gaussians, frame: LossFrame) -> tuple[Float[np.ndarray, "h w 3"], ShapeFigures]:
     """The cut-out as drawn on the plain background, and the figures of the body; constant harmonics only."""
     view, size = frame.view, frame.view.size
     g = gaussians
@@ -142,7 +145,7 @@ def picture_and_figures(gaussians: Gaussians, frame: Frame) -> tuple[Float[np.nd
     return image[..., :3] + light[..., None] * np.array(frame.plain, np.float32), figures
 
 
-def _extents(g: Gaussians, view: View) -> Float[np.ndarray, "3"]:
+def _extents(g: Gaussians, view: SplatCamera) -> Float[np.ndarray, "3"]:
     """Size along the camera's axes that holds 98 % of the cross-sections: splitting a Gaussian leaves it alone."""
     if len(g) == 0:
         return np.zeros(3)
@@ -157,7 +160,7 @@ def _extents(g: Gaussians, view: View) -> Float[np.ndarray, "3"]:
     return out
 
 
-def psnr(picture: Float[np.ndarray, "h w 3"], frame: Frame) -> float:
+def psnr(picture: Float[np.ndarray, "h w 3"], frame: LossFrame) -> float:
     """Likeness inside the mask, dB (at most 99)."""
     error = float(np.mean((picture[frame.mask] - frame.target[frame.mask]) ** 2))
     return -10 * float(np.log10(max(error, 10**-9.9)))

@@ -19,7 +19,7 @@ from scipy import ndimage
 from scipy.special import logsumexp
 
 from fluidlift.shape.heights import FARTHEST
-from fluidlift.shape.texture_gradient import TexturePatches, texture_evidence, weighed
+from fluidlift.shape.texture_gradient import WhitenedSpectra, texture_evidence, weighed
 from fluidlift.shape.view import PictureEvidence
 from fluidlift.shape.view.habit import ROLL
 from fluidlift.types import FluidKind, PinholeCamera, SlopeEvidence
@@ -224,7 +224,7 @@ def tilt_posterior(
 
 
 def _texture_evidence(
-    cameras: list[PinholeCamera], texture: TexturePatches, slopes: np.ndarray, headings: np.ndarray
+    cameras: list[PinholeCamera], texture: WhitenedSpectra, slopes: np.ndarray, headings: np.ndarray
 ) -> np.ndarray:
     """[n, k] for each camera and slope (degrees) with its heading (rad): every second camera's, and between them."""
     known = np.arange(0, len(cameras), 2)

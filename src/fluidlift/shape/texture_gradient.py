@@ -56,7 +56,7 @@ over is sure of a wrong plane"""
 
 
 @dataclass(frozen=True)
-class TexturePatches:
+class WhitenedSpectra:
     """Spectra of windows of the fluid's picture, in units of what is not explained of them (whitened)."""
 
     at: Float[np.ndarray, "n 2"]
@@ -70,7 +70,7 @@ class TexturePatches:
     """columns that belong to the picture and to no plane, whitened, times their priors' deviations"""
 
 
-def texture_patches(pictures: UInt8[np.ndarray, "t h w 3"], mask: Bool[np.ndarray, "h w"]) -> TexturePatches | None:
+def texture_patches(pictures: UInt8[np.ndarray, "t h w 3"], mask: Bool[np.ndarray, "h w"]) -> WhitenedSpectra | None:
     """Spectra of the windows that lie in the mask; None where there are fewer than `FEWEST`.
 
     Args:
@@ -94,7 +94,7 @@ def texture_patches(pictures: UInt8[np.ndarray, "t h w 3"], mask: Bool[np.ndarra
     )
 
 
-def texture_evidence(camera: PinholeCamera, patches: TexturePatches, normal: Float[np.ndarray, "3"]) -> float:
+def texture_evidence(camera: PinholeCamera, patches: WhitenedSpectra, normal: Float[np.ndarray, "3"]) -> float:
     """Logarithm of the evidence for a plane, but for a constant; minus infinity where it is not seen in all windows.
 
     Args:
@@ -177,7 +177,7 @@ def _window_power(window: np.ndarray, bins: np.ndarray) -> np.ndarray:
     return np.bincount(bins[own], power[own]) / np.bincount(bins[own])
 
 
-def _whitened(at, power, wave, count, pictures: int, scale: float) -> TexturePatches:
+def _whitened(at, power, wave, count, pictures: int, scale: float) -> WhitenedSpectra:
     """Log power over the noise, in units of what is left to chance and to each window's own pattern."""
     radius, angle = np.log(np.hypot(*wave.T)), 2.0 * np.arctan2(wave[:, 1], wave[:, 0])
     power = np.maximum(power, 1e-3 * np.median(power) + 1e-12)
@@ -199,7 +199,7 @@ def _whitened(at, power, wave, count, pictures: int, scale: float) -> TexturePat
     # a mean of any size; codecs prefer rows to columns by little
     fixed = np.stack([3.0 * np.ones_like(radius), *hats, 0.1 * np.cos(angle), 0.1 * np.sin(angle)], axis=-1)
     log = np.einsum("nkl,nl->nk", whitener, log - log.mean())
-    return TexturePatches(at, wave * scale, whitener, log, whitener @ fixed)
+    return WhitenedSpectra(at, wave * scale, whitener, log, whitener @ fixed)
 
 
 def _plane_jacobian(camera: PinholeCamera, at: np.ndarray, normal: np.ndarray) -> np.ndarray | None:

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 
 from fluidlift.errors import require
-from fluidlift.numerics.splatting import View, bin_tiles, project, rasterize
+from fluidlift.numerics.splatting import SplatCamera, bin_tiles, project, rasterize
 from fluidlift.seams import Rasterizer
 from fluidlift.shape.losses import LossWeights
 from fluidlift.shape.refine import RefineResult, refine
@@ -128,7 +128,7 @@ def _surface_at(depth: np.ndarray, uv: np.ndarray) -> np.ndarray:
 
 
 def _coverage(g: Gaussians, camera: PinholeCamera) -> Float[np.ndarray, "h w"]:
-    projected = project(View.of(camera), g.means, g.quats, g.scales, g.opacities)
+    projected = project(SplatCamera.of(camera), g.means, g.quats, g.scales, g.opacities)
     light = rasterize(
         projected, g.opacities, np.zeros((len(g), 1), np.float32), bin_tiles(projected, camera.size), camera.size
     )[1]

@@ -23,7 +23,7 @@ from fluidlift.io.hints_file import hints_beside
 from fluidlift.pipeline.models import NO_MODELS, ModelWish
 from fluidlift.studio.clips import Strip, clip_at, clips_in, jpeg
 from fluidlift.studio.history import HintsHistory
-from fluidlift.studio.looking import Looking, Wish, wished_at
+from fluidlift.studio.looking import FindRequest, Looking, wished_at
 from fluidlift.studio.making import MakeJob, Making
 from fluidlift.studio.shelf import SUFFIX, Shelf
 from fluidlift.types import Label
@@ -159,9 +159,9 @@ class Desk:
     def _ask(self) -> None:
         assert self.clip is not None and self.history is not None
         room = self.room / self.clip.name / "look"
-        self.looking.ask(wished_at(Wish(self.clip, self.history.hints, room, learned=self.learned)))
+        self.looking.ask(wished_at(FindRequest(self.clip, self.history.hints, room, learned=self.learned)))
 
-    def _found(self, wish: Wish, facts: dict[str, Any]) -> None:
+    def _found(self, wish: FindRequest, facts: dict[str, Any]) -> None:
         with self.lock:
             if self.clip == wish.clip and self.history is not None:
                 took = time.monotonic() - wish.asked

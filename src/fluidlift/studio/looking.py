@@ -36,7 +36,7 @@ class _Overtaken(FluidliftError):
 
 
 @dataclass(frozen=True)
-class Wish:
+class FindRequest:
     """What is to be looked at."""
 
     clip: Path
@@ -56,7 +56,7 @@ class Wish:
 
 
 @dataclass
-class Look:
+class FindState:
     """How far it is, and what is known."""
 
     clip: Path | None = None
@@ -88,23 +88,23 @@ class Looking:
         found: called from that thread with a wish and the facts that were found for it.
     """
 
-    def __init__(self, changed: Callable[[], None], found: Callable[[Wish, dict[str, Any]], None]) -> None:
+    def __init__(self, changed: Callable[[], None], found: Callable[[FindRequest, dict[str, Any]], None]) -> None:
         self._changed, self._found = changed, found
         self._wake = threading.Condition()
-        self._wish: Wish | None = None
+        self._wish: FindRequest | None = None
         self._ended = False
-        self._done: Wish | None = None
+        self._done: FindRequest | None = None
         self._memory: dict[str, tuple[str, Any]] = {}
         """what a click does not change, of the last clip"""
-        self.look = Look()
+        self.look = FindState()
         self._thread = threading.Thread(target=self._run, name="looking", daemon=True)
         self._thread.start()
 
-    def ask(self, wish: Wish | None) -> None:
+    def ask(self, wish: FindRequest | None) -> None:
         """Look at this; what is worked on gives way where it would be of no use."""
         with self._wake:
             if wish is None or wish.clip != self.look.clip:
-                self.look = Look(
+                self.look = FindState(
                     None if wish is None else wish.clip, pictures=self.look.pictures + 1, masks=self.look.masks + 1
                 )
             self._wish = wish
@@ -122,7 +122,7 @@ class Looking:
             self._wake.notify_all()
         self._thread.join(10.0)
 
-    def overtaken(self, wish: Wish, *, between: bool) -> bool:
+    def overtaken(self, wish: FindRequest, *, between: bool) -> bool:
         """Whether there is something newer; within a stage, only what that stage depends on counts."""
         now = self._wish
         if self._ended or now is None:
@@ -151,14 +151,14 @@ class Looking:
                 self._say(wish, error=f"unexpected {type(error).__name__}: {error}")
                 self._done = wish
 
-    def _say(self, wish: Wish, *, error: str = "") -> None:
+    def _say(self, wish: FindRequest, *, error: str = "") -> None:
         with self._wake:
             if self._wish is wish:
                 self.look.words, self.look.error, self.look.share = "", error, 0.0
                 self.look.waited = time.monotonic() - wish.asked
         self._changed()
 
-    def _work(self, wish: Wish) -> None:
+    def _work(self, wish: FindRequest) -> None:
         from fluidlift.pipeline.find import find_hints
 
         with self._wake:
@@ -175,7 +175,7 @@ class Looking:
         self._say(wish)
         self._found(wish, facts)
 
-    def told(self, wish: Wish, name: str, value: Any) -> None:
+    def told(self, wish: FindRequest, name: str, value: Any) -> None:
         """A stage has ended."""
         from fluidlift.pipeline.find import camera_facts, fluid_facts
 
@@ -195,7 +195,7 @@ class Looking:
                 look.so_far = look.so_far | fluid_facts(value)
         self._changed()
 
-    def progress(self, wish: Wish, **what: Any) -> None:
+    def progress(self, wish: FindRequest, **what: Any) -> None:
         """Tell how far it is."""
         with self._wake:
             for name, value in what.items():
@@ -232,7 +232,7 @@ def look_config(hints: ClipHints, learned: ModelWish = NO_MODELS) -> JobConfig:
 class _LookProgress:
     """Where the stages tell how far they are, and give way."""
 
-    def __init__(self, looking: Looking, wish: Wish) -> None:
+    def __init__(self, looking: Looking, wish: FindRequest) -> None:
         self._looking, self._wish, self._told = looking, wish, 0.0
 
     def stage(self, name: str, number: int, count: int) -> None:
@@ -259,6 +259,6 @@ class _LookProgress:
         """Nothing is simulated here."""
 
 
-def wished_at(wish: Wish) -> Wish:
+def wished_at(wish: FindRequest) -> FindRequest:
     """The wish with the time of now."""
     return replace(wish, asked=time.monotonic())

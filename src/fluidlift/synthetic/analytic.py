@@ -24,13 +24,6 @@ def uniform(velocity: tuple[float, float, float]) -> VectorField:
     return lambda x: np.broadcast_to(np.asarray(velocity, float), x.shape)
 
 
-def rigid_rotation(
-    angular_velocity: tuple[float, float, float], center: tuple[float, float, float] = (0.0, 0.0, 0.0)
-) -> VectorField:
-    """omega x (x - center): turns about an axis through `center` (m) with `angular_velocity` (rad/s)."""
-    return lambda x: np.cross(np.asarray(angular_velocity, float), x - np.asarray(center, float))
-
-
 def taylor_green(
     *, amplitude: float = 1.0, wavelength: float = 1.0, viscosity: float = 0.0, time: float = 0.0
 ) -> VectorField:

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from fluidlift.synthetic.paint import SUN, GroundPaint, Noise, lit, to_picture
-from fluidlift.synthetic.scenes import Scene
+from fluidlift.synthetic.scenes import SyntheticScene
 from fluidlift.synthetic.surface import (
-    Body,
+    LiquidDensity,
     Neighbours,
     box_range,
     finer,
@@ -28,7 +28,7 @@ VIEW_MARGIN = 1.0
 
 
 @dataclass(frozen=True)
-class Backdrop:
+class GroundRaster:
     """The ground without the liquid on one raster of rays."""
 
     camera: PinholeCamera
@@ -43,7 +43,9 @@ class Backdrop:
         return self.camera.rays(self.camera.pixel_grid().reshape(-1, 2))
 
 
-def backdrop(scene: Scene, camera: PinholeCamera, rng: np.random.Generator, *, colored: bool = True) -> Backdrop:
+def backdrop(
+    scene: SyntheticScene, camera: PinholeCamera, rng: np.random.Generator, *, colored: bool = True
+) -> GroundRaster:
     """Cast one ray per pixel of the camera at the ground."""
     wide = 2 * VIEW_MARGIN
     low = scene.grid.low - VIEW_MARGIN
@@ -56,7 +58,7 @@ def backdrop(scene: Scene, camera: PinholeCamera, rng: np.random.Generator, *, c
     color = np.tile([0.35, 0.40, 0.45], (len(rays), 1))
     seen = np.flatnonzero(np.isfinite(depth))
     if not colored or len(seen) == 0:
-        return Backdrop(camera, depth, color)
+        return GroundRaster(camera, depth, color)
     points = eye + depth[seen, None] * rays[seen]
     step = 0.15 * scene.grid.spacing
     slope = np.stack([scene.ground(points + e) - scene.ground(points - e) for e in step * np.eye(3)], -1)
@@ -67,10 +69,10 @@ def backdrop(scene: Scene, camera: PinholeCamera, rng: np.random.Generator, *, c
         Noise.make(rng, 2.2, blur=2.0), Noise.make(rng, 0.42, blur=0.9), Noise.make(rng, 0.19, blur=0.7)
     )
     color[seen] = lit(ground.color(points, scene.shares(points)), normals, _shadow(scene, points, normals))
-    return Backdrop(camera, depth, color)
+    return GroundRaster(camera, depth, color)
 
 
-def _shadow(scene: Scene, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+def _shadow(scene: SyntheticScene, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """0 in the shadow of the ground, 1 in the sun, soft between (cone tracing on the distance)."""
     at = points + 0.4 * scene.grid.spacing * normals
     light = np.ones(len(points))
@@ -82,14 +84,14 @@ def _shadow(scene: Scene, points: np.ndarray, normals: np.ndarray) -> np.ndarray
     return 0.25 + 0.75 * light
 
 
-def fine_opening(scene: Scene) -> np.ndarray:
+def fine_opening(scene: SyntheticScene) -> np.ndarray:
     """Open share of the cells of the fine grid."""
     fine = finer(scene.grid)
     return open_share(scene.solid(fine.centers().reshape(-1, 3)).reshape(fine.shape), fine.spacing)
 
 
 def paint_liquid(
-    scene: Scene, body: Body, behind: Backdrop, positions: np.ndarray, tracer: np.ndarray
+    scene: SyntheticScene, body: LiquidDensity, behind: GroundRaster, positions: np.ndarray, tracer: np.ndarray
 ) -> UInt8[np.ndarray, "h w 3"]:
     """A picture on the raster of the backdrop, shrunk by `SUPERSAMPLING`.
 
@@ -120,7 +122,7 @@ def paint_liquid(
     return to_picture(blocks.mean(axis=(1, 3)))
 
 
-def surface_depth(body: Body, camera: PinholeCamera, wall: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def surface_depth(body: LiquidDensity, camera: PinholeCamera, wall: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Depth (m, 0 = none) and mask [H,W] of the liquid at the pixel centres, before solids at depth `wall` [n]."""
     depth = see(body, camera, camera.pixel_grid().reshape(-1, 2), wall)
     w, h = camera.size

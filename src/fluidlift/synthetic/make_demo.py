@@ -13,14 +13,14 @@ import numpy as np
 from fluidlift.io.video import write_video
 from fluidlift.synthetic.demo import FILES
 from fluidlift.synthetic.record import Recording, record, write_case
-from fluidlift.synthetic.scenes import Scene, stream
+from fluidlift.synthetic.scenes import SyntheticScene, stream
 
 SIZE, FRAMES, CELLS = (320, 208), 40, 72
 COARSE = 4
 """pixels of the clip along one pixel of the shipped truth"""
 
 
-def on_coarse_raster(scene: Scene, recording: Recording) -> tuple[Scene, Recording]:
+def on_coarse_raster(scene: SyntheticScene, recording: Recording) -> tuple[SyntheticScene, Recording]:
     """The same truth for a picture of a quarter of the width: nearest samples, displacements in coarse pixels."""
     w, h = scene.camera.size
     camera = scene.camera.resized((w // COARSE, h // COARSE))

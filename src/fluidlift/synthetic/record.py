@@ -15,8 +15,8 @@ from fluidlift.io.video import write_video
 from fluidlift.physics.apic import LiquidSimulator
 from fluidlift.synthetic import film
 from fluidlift.synthetic.paint import Noise
-from fluidlift.synthetic.scenes import Scene, scene_of
-from fluidlift.synthetic.surface import Body, body_of, deposit
+from fluidlift.synthetic.scenes import SyntheticScene, scene_of
+from fluidlift.synthetic.surface import LiquidDensity, body_of, deposit
 from fluidlift.types import Particles
 
 Progress = Callable[[int, int], None]
@@ -65,19 +65,19 @@ class Births:
         return self._origin[ids]
 
 
-def tracers(scene: Scene, origins: np.ndarray, noises: tuple[Noise, Noise]) -> Float[np.ndarray, "n 2"]:
+def tracers(scene: SyntheticScene, origins: np.ndarray, noises: tuple[Noise, Noise]) -> Float[np.ndarray, "n 2"]:
     """Streaks and grain in [0, 1] of particles that came from `origins` (m)."""
     return np.stack([noises[0].at(origins * scene.stretch), noises[1].at(origins)], axis=-1)
 
 
-def cell_velocity(particles: Particles, scene: Scene) -> Float[np.ndarray, "nx ny nz 3"]:
+def cell_velocity(particles: Particles, scene: SyntheticScene) -> Float[np.ndarray, "nx ny nz 3"]:
     """Mean velocity (m/s) of the particles around each cell centre (trilinear weights); 0 where there is none."""
     weight = deposit(particles.positions, np.ones(len(particles)), scene.grid)
     sums = [deposit(particles.positions, particles.velocities[:, a], scene.grid) for a in range(3)]
     return np.where(weight[..., None] > 1e-3, np.stack(sums, -1) / np.maximum(weight, 1e-3)[..., None], 0.0)
 
 
-def _states(scene: Scene, frames: int, seed: int) -> Iterator[tuple[Particles, np.ndarray]]:
+def _states(scene: SyntheticScene, frames: int, seed: int) -> Iterator[tuple[Particles, np.ndarray]]:
     """Particles of each frame, one frame more than asked, with the origins of their tracers."""
     simulator = LiquidSimulator(
         scene.grid, scene.terrain, scene.parameters, scene.particles, cell_types=scene.cell_types, seed=seed
@@ -94,7 +94,7 @@ def _states(scene: Scene, frames: int, seed: int) -> Iterator[tuple[Particles, n
             births.update(simulator.particles, (k + 1) / scene.fps)
 
 
-def record(scene: Scene, frames: int, *, seed: int = 0, progress: Progress | None = None) -> Recording:
+def record(scene: SyntheticScene, frames: int, *, seed: int = 0, progress: Progress | None = None) -> Recording:
     """Simulate and film a scene.
 
     Args:
@@ -151,7 +151,7 @@ def _add_motion(out, camera, last, particles: Particles, depth: np.ndarray, radi
     out["dz"].append(change.astype(np.float16))
 
 
-def _add_volume(out, scene: Scene, particles: Particles, body: Body) -> None:
+def _add_volume(out, scene: SyntheticScene, particles: Particles, body: LiquidDensity) -> None:
     grid = scene.grid
     below = -scene.solid(grid.centers().reshape(-1, 3)).reshape(grid.shape) / grid.spacing
     phi = np.maximum(body.signed_cells(grid), np.clip(below, -3, 3))  # the smoothed body reaches into the ground
@@ -160,7 +160,7 @@ def _add_volume(out, scene: Scene, particles: Particles, body: Body) -> None:
     out["phi"].append(phi.astype(np.float16))
 
 
-def scene_record(scene: Scene, frames: int) -> dict[str, Any]:
+def scene_record(scene: SyntheticScene, frames: int) -> dict[str, Any]:
     """The true parameters, as scene.json has them."""
     p = scene.parameters
     return {
@@ -184,7 +184,7 @@ def scene_record(scene: Scene, frames: int) -> dict[str, Any]:
     }
 
 
-def write_case(scene: Scene, recording: Recording, folder: Path, *, quality: float = 16.0) -> Path:
+def write_case(scene: SyntheticScene, recording: Recording, folder: Path, *, quality: float = 16.0) -> Path:
     """Write video.mp4, camera.json, scene.json, truth.npz and solids.npz into a folder, which is made.
 
     Args:

@@ -22,7 +22,7 @@ PER_AXIS = 2
 
 
 @dataclass(frozen=True)
-class Scene:
+class SyntheticScene:
     """A liquid in its terrain, ready to run, and a camera."""
 
     name: str
@@ -112,7 +112,7 @@ def _solid_cells(grid: Grid, solid: ScalarField) -> np.ndarray:
     return types
 
 
-def stream(*, size: tuple[int, int] = (320, 208), seed: int = 0, cells: int = 72) -> Scene:
+def stream(*, size: tuple[int, int] = (320, 208), seed: int = 0, cells: int = 72) -> SyntheticScene:
     """A brook 2 m long with one large rock and two small ones, flowing along +x."""
     length, width, height, speed, slope, level = 2.0, 1.28, 0.44, 0.5, 0.008, 0.225
     h = length / cells
@@ -157,14 +157,14 @@ def stream(*, size: tuple[int, int] = (320, 208), seed: int = 0, cells: int = 72
     types[(types != CellType.SOLID) & (centers[..., 0] > grid.high[0] - 2 * h)] = CellType.OUTFLOW
     parameters = FluidParameters(inflow_velocity=(speed, 0.0, 0.0), time_step=0.02)
     camera = PinholeCamera.looking((0.10, -1.28, 1.25), (0.06, 0.01, 0.16), 47.0, size)
-    return Scene(
+    return SyntheticScene(
         "stream", "stream", grid, ground, shares, _terrain(solid, grid, (1.0, 0.0, 0.0)), types, parameters,
         _moving(positions, volume, parameters, parameters.inflow_velocity), volume, camera, settle=1.4,
         stretch=(0.5, 1.0, 1.0),
     )  # fmt: skip
 
 
-def pour(*, size: tuple[int, int] = (256, 256), seed: int = 0, cells: int = 56) -> Scene:
+def pour(*, size: tuple[int, int] = (256, 256), seed: int = 0, cells: int = 56) -> SyntheticScene:
     """Water poured from 0.3 m into a stone bowl that is already wet."""
     width, height, speed, radius, level = 0.42, 0.42, 0.9, 0.022, 0.075
     h = width / cells
@@ -191,14 +191,14 @@ def pour(*, size: tuple[int, int] = (256, 256), seed: int = 0, cells: int = 56) 
     types[jet & (centers[..., 2] > grid.high[2] - 3 * h)] = CellType.INFLOW
     parameters = FluidParameters(inflow_velocity=(0.12, 0.0, -speed), time_step=0.01)
     camera = PinholeCamera.looking((0.10, -0.52, 0.56), (0.0, 0.0, 0.15), 40.0, size)
-    return Scene(
+    return SyntheticScene(
         "pour", "pour", grid, ground, shares, _terrain(solid, grid, (0.0, 0.0, -1.0)), types, parameters,
         _moving(positions, volume, parameters, (0.0, 0.0, 0.0)), volume, camera, settle=0.5, fps=60.0,
         grain=(0.04, 0.015), paint=LiquidPaint(absorption=(60.0, 30.0, 28.0)),
     )  # fmt: skip
 
 
-def honey(*, size: tuple[int, int] = (288, 224), seed: int = 0, cells: int = 64) -> Scene:
+def honey(*, size: tuple[int, int] = (288, 224), seed: int = 0, cells: int = 64) -> SyntheticScene:
     """A viscous film 3 cm thick down a board of 22 degrees, at the speed of its steady half-parabola."""
     length, width, thickness, viscosity, angle = 0.42, 0.26, 0.03, 0.008, np.radians(22.0)
     h = length / cells
@@ -237,13 +237,13 @@ def honey(*, size: tuple[int, int] = (288, 224), seed: int = 0, cells: int = 64)
     amber = LiquidPaint(
         body=(0.50, 0.19, 0.02), absorption=(18.0, 60.0, 220.0), foam=(0.86, 0.55, 0.16), foam_from=0.42, foam_to=0.62
     )
-    return Scene(
+    return SyntheticScene(
         "honey", "pour", grid, ground, shares, _terrain(solid, grid, tuple(along)), types, parameters,
         _moving(positions, volume, parameters, inflow), volume, camera, settle=0.5, paint=amber, grain=(0.04, 0.016),
     )  # fmt: skip
 
 
-def dam(*, size: tuple[int, int] = (320, 240), seed: int = 0, cells: int = 64) -> Scene:
+def dam(*, size: tuple[int, int] = (320, 240), seed: int = 0, cells: int = 64) -> SyntheticScene:
     """A column of water 0.6 m high that collapses onto a dry floor, past a pillar, and runs back from unseen walls."""
     length, width, height = 2.0, 0.9, 0.8
     h = length / cells
@@ -267,16 +267,16 @@ def dam(*, size: tuple[int, int] = (320, 240), seed: int = 0, cells: int = 64) -
     )
     parameters = FluidParameters(time_step=0.01)
     camera = PinholeCamera.looking((0.6, -2.9, 1.7), (0.0, 0.0, 0.2), 45.0, size)
-    return Scene(
+    return SyntheticScene(
         "dam", "dam", grid, ground, shares, _terrain(solid, grid, (1.0, 0.0, 0.0)), _solid_cells(grid, solid),
         parameters, _moving(positions, volume, parameters, (0.0, 0.0, 0.0)), volume, camera, settle=0.0,
     )  # fmt: skip
 
 
-SCENES: dict[str, Callable[..., Scene]] = {"stream": stream, "pour": pour, "honey": honey, "dam": dam}
+SCENES: dict[str, Callable[..., SyntheticScene]] = {"stream": stream, "pour": pour, "honey": honey, "dam": dam}
 
 
-def scene_of(name: str, *, size: tuple[int, int], seed: int, cells: int) -> Scene:
+def scene_of(name: str, *, size: tuple[int, int], seed: int, cells: int) -> SyntheticScene:
     """A scene by name.
 
     Args:

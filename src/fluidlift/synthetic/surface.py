@@ -27,7 +27,7 @@ ScalarField = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, " n"]]
 
 
 @dataclass(frozen=True)
-class Body:
+class LiquidDensity:
     """A liquid as a density on a grid twice as fine as the simulation's."""
 
     grid: Grid
@@ -91,7 +91,7 @@ def body_of(
     volume: float | Float[np.ndarray, " n"],
     grid: Grid,
     opening: Float[np.ndarray, "fx fy fz"],
-) -> Body:
+) -> LiquidDensity:
     """The liquid of particles.
 
     Args:
@@ -106,7 +106,7 @@ def body_of(
     smooth = ndimage.gaussian_filter(amount, BLUR, mode="nearest")
     room = ndimage.gaussian_filter(opening, BLUR, mode="nearest")
     density = smooth / np.maximum(room, 0.25)
-    return Body(fine, (HALF - np.minimum(density, 1.5)).astype(np.float32))
+    return LiquidDensity(fine, (HALF - np.minimum(density, 1.5)).astype(np.float32))
 
 
 def box_range(grid: Grid, eye: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -190,7 +190,7 @@ def sphere_trace(
 
 
 def see(
-    body: Body,
+    body: LiquidDensity,
     camera: PinholeCamera,
     uv: Float[np.ndarray, "n 2"],
     wall: Float[np.ndarray, " n"],

@@ -242,6 +242,7 @@ class Refined:
     """Gaussians inside"""
     pruned: int
     prune_report: str
+    """how many Gaussians went, and why; for whoever looks into the cache"""
     psnr_before: float | None = None
     """dB against the picture, before the refinement; None where nothing was refined"""
     psnr_after: float | None = None

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from fluidlift.errors import FluidliftError, InputRejected
-from fluidlift.pipeline.preview import LivePreview, PreviewFrame, PreviewSize, Take, Wish, obstacles_of
+from fluidlift.pipeline.preview import LivePreview, PreviewFrame, PreviewRequest, PreviewSize, Take, obstacles_of
 from fluidlift.viewer.coloring import colored
 from fluidlift.viewer.comparing import Comparison
 from fluidlift.viewer.controls import controls_of
@@ -24,7 +24,7 @@ from fluidlift.viewer.jobs import Jobs
 from fluidlift.viewer.panels import Panels
 from fluidlift.viewer.ports import FIRST_PORT, free_port, is_local, open_server, require_viser
 from fluidlift.viewer.saved import SavedFrames
-from fluidlift.viewer.stage import Parts, Stage
+from fluidlift.viewer.stage import Stage, VisibleLayers
 from fluidlift.viewer.timeline import Timeline
 
 LOG = logging.getLogger(__name__)
@@ -105,7 +105,7 @@ class Viewer:
         self.pictures: InputPictures | None = None
         self.looking_for_pictures = True
         self.timeline = Timeline(self.saved.count, self.saved.interval)
-        self.parts, self.source, self.messages = Parts(), SAVED, ""
+        self.parts, self.source, self.messages = VisibleLayers(), SAVED, ""
         self.take: Take | None = None
         self.fastest = 0.0
         """m/s, of the frame in view"""
@@ -194,7 +194,7 @@ class Viewer:
     def changed(self) -> None:
         """The scene is another one: simulate it live, unless the machine is taken."""
         self._dirty = True
-        self.preview.ask(Wish(self.draft.scene, self.draft.last))
+        self.preview.ask(PreviewRequest(self.draft.scene, self.draft.last))
 
     def edited(self, act: Callable[[], None], done: str = "", *, moves: bool = True) -> bool:
         """Do an edit and tell how it went; whether it went well."""

@@ -9,7 +9,7 @@ from typing import Any
 
 from fluidlift.errors import require
 from fluidlift.types import Estimate, FluidKind, FluidParameters, kind_of
-from fluidlift.types.parameter_table import PARAMETERS, Scale
+from fluidlift.types.parameter_table import PARAMETERS, FitVariable
 
 STEPS = 200
 """of a slider, about"""
@@ -190,7 +190,7 @@ def _plain(
     known, value = PARAMETERS[name], float(getattr(fitted, name))
     span = span or known.span
     low, high = min(span[0], value) if value > 0 or not log else span[0], max(span[1], 2 * value)
-    if known.scale is Scale.LOGIT:
+    if known.scale is FitVariable.LOGIT:
         high = span[1]
     return Control(
         name, known.label, known.sign, low, high, min(max(value, low), high), lambda p: float(p[name]),

@@ -17,7 +17,7 @@ LARGEST = 4096
 
 
 @dataclass(frozen=True)
-class Layout:
+class PageLayout:
     """Of the page."""
 
     film: str = "small"
@@ -32,20 +32,20 @@ def place() -> Path:
     return (Path(base) if base else Path.home() / ".config") / "fluidlift" / "viewer.json"
 
 
-def read() -> Layout:
+def read() -> PageLayout:
     """What was kept; what is damaged or was never kept is as at first."""
     try:
         with place().open("rb") as file:
             found = json.loads(file.read(LARGEST))
     except (OSError, ValueError, RecursionError):
-        return Layout()
+        return PageLayout()
     if not isinstance(found, dict):
-        return Layout()
+        return PageLayout()
     film, folded = found.get("film"), found.get("folded")
-    return Layout(film if isinstance(film, str) and film in FILMS else "small", folded is True)
+    return PageLayout(film if isinstance(film, str) and film in FILMS else "small", folded is True)
 
 
-def keep(layout: Layout) -> None:
+def keep(layout: PageLayout) -> None:
     """Write it down; a disk that is full or read-only keeps nothing, and says nothing: the page goes on."""
     try:
         place().parent.mkdir(parents=True, exist_ok=True)

@@ -28,7 +28,7 @@ SMALLEST = 1e-6
 
 
 @dataclass(frozen=True)
-class Parts:
+class VisibleLayers:
     """What is on."""
 
     splats: bool = True
@@ -134,7 +134,7 @@ class Stage:
 
     # the fluid
 
-    def show(self, frame: SplatFrame, parts: Parts, spacing: float, color: np.ndarray | None = None) -> str:
+    def show(self, frame: SplatFrame, parts: VisibleLayers, spacing: float, color: np.ndarray | None = None) -> str:
         """One frame; what could not be shown, in words.
 
         Args:
@@ -216,7 +216,7 @@ class Stage:
 
     # obstacles
 
-    def obstacles(self, found: Any, poses: np.ndarray | None, parts: Parts, chosen: str = "") -> None:
+    def obstacles(self, found: Any, poses: np.ndarray | None, parts: VisibleLayers, chosen: str = "") -> None:
         """Solids in their poses.
 
         Args:

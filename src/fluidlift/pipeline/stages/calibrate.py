@@ -75,9 +75,9 @@ def calibrate(
     Args:
         scene: unedited.
         target: m/s, on the faces of its grid.
-        shares: of the clip's frames in which each pixel is fluid; None: nothing is known to stay dry, or wet. Of what
-            does not lie on ground it is all that is taken: no run is made, and no force learnt.
-        dry_for: s from the body at rest for which what is known to stay dry does.
+        shares: of the clip's frames in which each pixel is fluid; None: no cell is known to stay dry, or wet. For a
+            fluid that does not lie on ground these cells are the whole result: nothing is simulated, no force learnt.
+        dry_for: s from the body at rest for which cells that are known to stay dry do so.
         wanted: False leaves all as it is.
         device: of the simulation.
         work: told how many frames are done.
@@ -124,11 +124,9 @@ def calibrate(
         warnings.append(
             Notice(
                 "flow-not-held",
-                f"shape, measured motion and mass do not fit together: drawn towards the filmed flow, the "
-                f"simulation still "
-                f"differs from it by {100 * left:.0f} % of its speed; the level will rise or fall; a --mask, "
-                f"--pitch or "
-                "--size that is known would help",
+                "shape, measured motion and mass do not fit together: drawn towards the filmed flow, the simulation "
+                f"still differs from it by {100 * left:.0f} % of its speed; the level will rise or fall; a --mask, "
+                "--pitch or --size that is known would help",
             )
         )
     return Calibration(force, size, speed, left, frames, tuple(warnings), dry, dry_for, wet)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from fluidlift.errors import InputRejected
-from fluidlift.pipeline.fluid_found import fluid_figures
 from fluidlift.pipeline.work import Work
 from fluidlift.shape.drawn import LABELS, carried, drawn_pixels, frame_at
+from fluidlift.shape.fluid_found import fluid_figures
 from fluidlift.types import Label, PixelLabels
 from fluidlift.types.hints import Region
 from fluidlift.types.stages import Flow, Read, Segmentation

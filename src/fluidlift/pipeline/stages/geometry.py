@@ -197,7 +197,7 @@ def _coloured(
         if bed is not None:  # under water it is seen; what the plate shows there is inpainted
             shown, known = np.where((bed.known & ~known)[..., None], bed.picture, picture), known | bed.known
         under = None if bed is None else bed.known & ~np.asarray(plate.seen)
-        view = ground_texture.View(shown, camera, labels, known, under)
+        view = ground_texture.GroundView(shown, camera, labels, known, under)
         setting = ground.textured(setting, view)
         picture = ground_texture.over_bed(picture, plate.kept, setting.terrain.mesh, camera)
     setting = ground.finished(setting, picture, camera)

@@ -26,7 +26,7 @@ from fluidlift.types.fluid_masks import parts_of
 from fluidlift.types.stages import Read
 
 if TYPE_CHECKING:
-    from fluidlift.io.bars import Window
+    from fluidlift.io.bars import PictureWindow
     from fluidlift.motion.moving_camera import Walking
 
 BARS_STAY = Notice(
@@ -88,7 +88,7 @@ def read(clip: GivenFile, camera: GivenFile | None, config: ReadSettings, *, wor
     )
 
 
-def _cut_off(bars: Window) -> Notice:
+def _cut_off(bars: PictureWindow) -> Notice:
     wide = f"{100 * bars.left:.1f} to {100 * bars.right:.1f} % of its width"
     high = f"{100 * bars.top:.1f} to {100 * bars.bottom:.1f} % of its height"
     return Notice(

@@ -96,7 +96,7 @@ def refine(
     h = setting.terrain.grid.spacing
     fluid, frames, mask = labels.fluid, clip.frames, geometry.mask
     if geometry.hidden is not None:
-        behind = occluders.Behind.of(geometry.hidden, mask)
+        behind = occluders.HiddenFluid.of(geometry.hidden, mask)
         fluid, frames, mask = fluid | behind.hidden, behind.pictures(frames), mask | behind.hidden
     seen = _Seen(frames, fluid, flow.flow.displacement, geometry, config, work)
     made, fitted, later = _bodies(seen, bodies)

@@ -10,11 +10,11 @@ from fluidlift.backends.learned import MASK_METHODS, make_segmenter
 from fluidlift.backends.registry import ModelChoice
 from fluidlift.errors import InputRejected
 from fluidlift.messages import Notice
-from fluidlift.pipeline.fluid_found import fluid_figures
-from fluidlift.pipeline.hints import NO_HINTS, Hints
+from fluidlift.pipeline.hints import NO_HINTS, MaskHints
 from fluidlift.pipeline.settings import GivenMask, SegmentSettings
 from fluidlift.pipeline.work import Work
 from fluidlift.seams import Segmenter
+from fluidlift.shape.fluid_found import fluid_figures
 from fluidlift.types import PixelFlow, PixelLabels, VideoClip
 from fluidlift.types.fluid_masks import parts_of
 from fluidlift.types.stages import Flow, Read, Segmentation
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 def segment(
-    read: Read, flow: Flow, mask: GivenMask | None, config: SegmentSettings | None, hints: Hints, *, work: Work
+    read: Read, flow: Flow, mask: GivenMask | None, config: SegmentSettings | None, hints: MaskHints, *, work: Work
 ) -> Segmentation:
     """What each pixel shows.
 
@@ -49,7 +49,7 @@ def segment(
     else:
         drawn = None if mask is None else drawn_mask(clip, mask)
         labels = segment_clip(
-            clip, _flow_for_masks(clip, flow), user_mask=drawn, roi=hints.roi, points=hints.clicks(),
+            clip, _flow_for_masks(clip, flow), user_mask=drawn, roi=hints.roi, points=hints.points,
             progress=lambda part, _: work.step(round(100 * part), 100), out=out,
             clues=lambda: work.remembered("clues", clues, read, flow, hints.roi),
         )  # fmt: skip
@@ -78,7 +78,7 @@ def clues(read: Read, flow: Flow, roi: tuple[int, int, int, int] | None) -> Clue
     return clues_of(read.clip, _flow_for_masks(read.clip, flow), roi, read.fluid_evidence)
 
 
-def require_usable(clip: VideoClip, mask: GivenMask | None, config: SegmentSettings, hints: Hints) -> None:
+def require_usable(clip: VideoClip, mask: GivenMask | None, config: SegmentSettings, hints: MaskHints) -> None:
     """Look at what is given, before the flow is computed for nothing.
 
     Raises:
@@ -90,7 +90,7 @@ def require_usable(clip: VideoClip, mask: GivenMask | None, config: SegmentSetti
 
     width, height = clip.size
     region_of_interest(hints.roi, height, width)
-    clicks_at(hints.clicks(), clip.size, (height, width))
+    clicks_at(hints.points, clip.size, (height, width))
     if mask is not None:
         drawn_mask(clip, mask)
     elif config.method in MASK_METHODS:
@@ -99,7 +99,7 @@ def require_usable(clip: VideoClip, mask: GivenMask | None, config: SegmentSetti
             make_segmenter(config.method, ModelChoice())  # says which are needed
 
 
-def _require_hints(config: SegmentSettings, hints: Hints) -> None:
+def _require_hints(config: SegmentSettings, hints: MaskHints) -> None:
     if hints != NO_HINTS and config.method == "sam3":
         raise InputRejected(
             "--roi, --click or --not-here with sam3, which goes by words", "hints for segment.method=auto or sam2",
@@ -117,7 +117,7 @@ def _flow_for_masks(clip: VideoClip, flow: Flow) -> PixelFlow | PairReader:
     return lambda t: flow_of_pair(frames[t], frames[t + 1], estimator)
 
 
-def _learned(clip: VideoClip, config: SegmentSettings, hints: Hints, work: Work) -> Segmenter:
+def _learned(clip: VideoClip, config: SegmentSettings, hints: MaskHints, work: Work) -> Segmenter:
     """A learned segmentation with its weights; one that starts from our own is given the hints through it."""
     from fluidlift.shape.segment import segment as segment_clip
 
@@ -126,7 +126,7 @@ def _learned(clip: VideoClip, config: SegmentSettings, hints: Hints, work: Work)
 
     def guess(clip: VideoClip, flow: PixelFlow) -> PixelLabels:
         room = work.scratch.array("guess", shape, np.uint8), work.scratch.array("guess_trust", shape, np.float16)
-        return segment_clip(clip, flow, roi=hints.roi, points=hints.clicks(), out=room)
+        return segment_clip(clip, flow, roi=hints.roi, points=hints.points, out=room)
 
     weights = None if config.weights is None else config.weights.name
     choice = ModelChoice(weights, config.device, config.download)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ import numpy as np
 from fluidlift.export.whitewater import with_kinds
 from fluidlift.io.frames import FluidFrame
 from fluidlift.io.scene_look import Look
+from fluidlift.pipeline.inputs import BESIDE
 from fluidlift.pipeline.settings import ShowSettings
 from fluidlift.pipeline.work import Work
 from fluidlift.present.as_filmed import BEYOND, Reel, card_of_run
@@ -33,18 +34,13 @@ COVERS, COVERS_THIN = 0.5, 0.15
 class SeenLook:
     """The look of the fluid in pictures, by what they depend on."""
 
-    look: Look
+    look: Look = field(metadata=BESIDE)
     mark: dict[str, Any]
-    """`Look.mark`, with the colours of obstacles"""
-
-    @property
-    def cache_key(self) -> dict[str, Any]:
-        """What the stage's key knows of it."""
-        return self.mark
+    """`Look.mark`, with the colours of obstacles: all of the look that counts"""
 
 
 @dataclass(frozen=True)
-class Measured:
+class ComparedFrames:
     """What is compared with the clip, frame by frame, as it is drawn."""
 
     frames: Reel
@@ -82,7 +78,7 @@ def show(
 
     poses, step = simulation.poses, work.step
     count = len(poses)
-    measured = Measured(Reel(folder), Reel(folder), [])
+    measured = ComparedFrames(Reel(folder), Reel(folder), [])
     painter = _painter(scene, folder, seen.look)
     panels = _panels(scene, footage, folder, config, poses, measured, step, painter)
     if config.preview:
@@ -134,7 +130,7 @@ def _panels(
     folder: Path,
     config: ShowSettings,
     poses: np.ndarray,
-    measured: Measured,
+    measured: ComparedFrames,
     step: Callable[[int, int], None],
     painter: Painter | None,
 ) -> Iterator[np.ndarray]:

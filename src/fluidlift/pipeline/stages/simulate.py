@@ -19,7 +19,7 @@ from fluidlift.scene.simulation import advance, continued
 from fluidlift.scene.simulator import left_to_the_cpu, preflight, simulator_of
 from fluidlift.scene.splat_files import checkpoint_file, frame_file, frame_files, require_room
 from fluidlift.scene.surface_appearance import SurfaceAppearance
-from fluidlift.scene.whitewater import Measured, SceneWhitewater, kept_measure
+from fluidlift.scene.whitewater import MeasuredWhitewater, SceneWhitewater, kept_measure
 from fluidlift.types import Estimate, kind_of
 from fluidlift.types.stages import Simulation
 
@@ -113,7 +113,7 @@ def simulate(
     )
 
 
-def _estimates(scene: Scene, known: Measured | None) -> dict[str, Estimate]:
+def _estimates(scene: Scene, known: MeasuredWhitewater | None) -> dict[str, Estimate]:
     """What the film says of foam and waves, and with white water what was measured of it in the scene as lifted."""
     if scene.whitewater > 0 and scene.as_lifted is not None:
         return film_estimates(scene.as_lifted) | ({} if known is None else known.estimates)

@@ -16,8 +16,7 @@ from jaxtyping import Float, UInt8
 
 from fluidlift.errors import InputRejected
 from fluidlift.messages import Notice
-from fluidlift.pipeline.inputs import GivenFile
-from fluidlift.pipeline.settings import BESIDE
+from fluidlift.pipeline.inputs import BESIDE, GivenFile
 from fluidlift.pipeline.work import Work
 from fluidlift.types.stages import Window
 

@@ -1,6 +1,6 @@
 """Which way is up: what a picture says of it beside the fluid's motion, as log likelihoods of the camera's tilt."""
 
-from fluidlift.shape.view.habit import Scene, habit_prior
+from fluidlift.shape.view.habit import ViewContext, habit_prior
 from fluidlift.shape.view.horizon import Skyline, horizon_evidence, horizon_line, sky_of, tilt_of_horizon
 from fluidlift.shape.view.learned import LearnedTilt
 from fluidlift.shape.view.open_horizon import OpenHorizon, open_horizon
@@ -10,7 +10,7 @@ from fluidlift.shape.view.rims import drawn_rim, find_rims
 from fluidlift.shape.view.roundness import Ellipse
 
 __all__ = [
-    "Ellipse", "LearnedTilt", "MeasuredPlane", "OpenHorizon", "PictureEvidence", "Scene", "Skyline", "as_relief",
+    "Ellipse", "LearnedTilt", "MeasuredPlane", "OpenHorizon", "PictureEvidence", "Skyline", "ViewContext", "as_relief",
     "drawn_rim", "find_rims", "habit_prior", "horizon_evidence", "horizon_line", "look_at", "open_horizon", "sky_of",
     "tilt_of_horizon",
 ]  # fmt: skip

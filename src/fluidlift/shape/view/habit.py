@@ -33,7 +33,7 @@ clips: 0 to 10, median 2"""
 
 
 @dataclass(frozen=True)
-class Scene:
+class ViewContext:
     """What tells the two habits apart; None: not known."""
 
     open_ended: bool | None = None
@@ -45,7 +45,10 @@ class Scene:
 
 
 def habit_prior(
-    kind: FluidKind, pitches: Float[np.ndarray, " p"], scene: Scene, below: Float[np.ndarray, "p ..."] | None = None
+    kind: FluidKind,
+    pitches: Float[np.ndarray, " p"],
+    scene: ViewContext,
+    below: Float[np.ndarray, "p ..."] | None = None,
 ) -> Float[np.ndarray, "p ..."]:
     """Log prior of the pitch of a camera, with what the scene says of the habit.
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from fluidlift.shape.texture_gradient import TexturePatches
-from fluidlift.shape.view.habit import Scene, habit_prior, runs_out
+from fluidlift.shape.texture_gradient import WhitenedSpectra
+from fluidlift.shape.view.habit import ViewContext, habit_prior, runs_out
 from fluidlift.shape.view.horizon import MISTAKEN, Skyline, farthest_elevation, skyline, skyline_evidence, upper_outline
 from fluidlift.shape.view.learned import LearnedTilt
 from fluidlift.shape.view.open_horizon import OpenHorizon, open_horizon
@@ -56,9 +56,9 @@ class PictureEvidence:
     """of vessels"""
     waterline: Float[np.ndarray, "n 2"] | None = None
     """px, upper outline of a fluid that lies"""
-    texture: TexturePatches | None = None
+    texture: WhitenedSpectra | None = None
     """the fluid's own pattern, where it lies in one plane"""
-    scene: Scene = field(default_factory=Scene)
+    scene: ViewContext = field(default_factory=ViewContext)
     contained: bool = False
     """the fluid is a round pool, or in a vessel: it stirs in one place, and its motion and far edge are no stream's"""
     plane: MeasuredPlane | None = None
@@ -123,7 +123,7 @@ class PictureEvidence:
 
 def look_at(
     kind: FluidKind, picture: UInt8[np.ndarray, "h w 3"], ever: Bool[np.ndarray, "h w"],
-    fluid: Bool[np.ndarray, "h w"], texture: TexturePatches | None = None, *, stays: bool = False,
+    fluid: Bool[np.ndarray, "h w"], texture: WhitenedSpectra | None = None, *, stays: bool = False,
     drawn_sky: Skyline | None = None, rims: tuple[Ellipse, ...] | None = None,
 ) -> PictureEvidence:  # fmt: skip
     """Sky, plumb lines, rims, the shape of a pool and its waterline.
@@ -144,7 +144,7 @@ def look_at(
     if kind.fills_vessel:
         pool = round_pool(wide_part(fluid), JET_LIKENESS)
     contained = stays or pool is not None or any(rim.share_inside(fluid) > IN_VESSEL for rim in rims)
-    scene = Scene(runs_out(fluid) if lies else None, sky is not None, pool is not None or bool(rims))
+    scene = ViewContext(runs_out(fluid) if lies else None, sky is not None, pool is not None or bool(rims))
     waterline = upper_outline(fluid) if lies and not contained else None
     # what runs on may fall over a brink, which looks the same
     horizon = open_horizon(picture, ever) if kind.is_standing_water and not contained else None
